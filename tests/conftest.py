@@ -1,0 +1,26 @@
+"""Settings shared by every test: float64 available, strict promotion, the folder of truth files."""
+
+import os
+from pathlib import Path
+
+import jax
+import pytest
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+def _shared_folder() -> Path | None:
+    named = os.environ.get("POLHODE_SHARED")
+    folder = Path(named) if named else Path(__file__).resolve().parents[2] / "shared"
+    return folder if (folder / "spec").is_dir() else None
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The folder of recordings and truth states beside the checkout; the test is skipped without it."""
+    folder = _shared_folder()
+    if folder is None:
+        pytest.skip("the folder ../shared (recordings, truth states) is not beside this checkout")
+    return folder
