@@ -1,0 +1,59 @@
+"""Files that appear whole or not at all: written beside the target, synced, then renamed."""
+
+import contextlib
+import os
+import secrets
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import xarray
+
+
+@contextlib.contextmanager
+def whole_file(target: str | os.PathLike) -> Iterator[Path]:
+    """A temporary path in the folder of `target` that replaces `target` when the block succeeds.
+
+    When the block raises anything, KeyboardInterrupt included, the temporary file is removed and an
+    existing `target` is left as it was. The folder must exist.
+    """
+    target = Path(target).resolve()
+    # the suffix stays last: writers of figures choose the format by it
+    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(6)}.part{target.suffix}")
+    try:
+        yield temporary
+        with open(temporary, "rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(temporary, target)
+    finally:
+        temporary.unlink(missing_ok=True)
+    _sync_folder(target.parent)
+
+
+def _sync_folder(folder: Path) -> None:
+    if not hasattr(os, "O_DIRECTORY"):  # Windows cannot open folders
+        return
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def write_netcdf(dataset: "xarray.Dataset", target: str | os.PathLike) -> Path:
+    """Write a dataset (`Trajectory.to_xarray()`) as NetCDF-4, whole or not at all.
+
+    Needs xarray, h5netcdf and h5py (`pip install polhode[cli]`). Returns the path. Raises OSError
+    when the folder is missing, full or not writable; an existing file then stays as it was.
+    """
+    try:
+        import h5netcdf  # noqa: F401 - the engine that xarray is asked for below
+        import h5py  # noqa: F401 - which h5netcdf needs to write, but does not install
+    except ImportError as error:
+        raise ImportError(
+            "writing NetCDF needs xarray, h5netcdf and h5py: pip install 'polhode[cli]'"
+        ) from error
+    with whole_file(target) as temporary:
+        dataset.to_netcdf(temporary, engine="h5netcdf")
+    return Path(target)

@@ -1,0 +1,120 @@
+"""What a scene file says, checked, in SI units, as plain numpy: nothing here needs JAX."""
+
+import dataclasses
+import datetime
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """One kind of thing with its numbers: an inertia, a potential, a torque, a rotor."""
+
+    kind: str
+    values: Mapping[str, object]
+    where: str
+
+
+@dataclasses.dataclass(frozen=True)
+class EulerAngles:
+    """R = R_a(angle 1) R_b(angle 2) R_c(angle 3) for the letters of `sequence`; rad."""
+
+    sequence: str
+    angles: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class InitialState:
+    """Attitude (`wxyz` or `euler`) and rates or momentum at the first time."""
+
+    wxyz: np.ndarray
+    euler: EulerAngles | None
+    rate: str
+    value: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class Times:
+    """Sample times, s, with the unit used in tables and figures."""
+
+    seconds: np.ndarray
+    unit: str
+    unit_seconds: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Method:
+    """Which method and solver (None: left to the planner), tolerance or fixed step."""
+
+    kind: str
+    solver: str | None
+    rtol: float
+    step: float | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Spread:
+    """Standard deviation of one quantity in the Monte Carlo batch, SI, and where it comes from."""
+
+    quantity: str
+    sigma: np.ndarray
+    source: str
+
+
+@dataclasses.dataclass(frozen=True)
+class MonteCarlo:
+    clones: int
+    seed: int
+    spreads: tuple[Spread, ...]
+
+
+@dataclasses.dataclass(frozen=True)
+class PublishedValue:
+    """A published number to print beside ours, SI; `uncertainty` may be absent."""
+
+    name: str
+    value: float
+    uncertainty: float | None
+    source: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Observations:
+    """Observed attitudes (n, 4), body rates (n, 3) or NaN where a row has none; times (n,) s."""
+
+    seconds: np.ndarray
+    wxyz: np.ndarray
+    omega_body: np.ndarray
+    source: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Output:
+    file: str | None
+    figure: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneFile:
+    """A whole scene file; `read_scene` makes it, `build` turns it into polhode objects."""
+
+    path: Path
+    title: str
+    source: str
+    epoch: datetime.datetime | None
+    frame: str
+    axis_names: tuple[str, str, str]
+    inertia: Part
+    relative_moments: bool
+    state: InitialState
+    times: Times
+    potentials: tuple[Part, ...]
+    torques: tuple[Part, ...]
+    rotors: tuple[Part, ...]
+    method: Method
+    monte_carlo: MonteCarlo | None
+    published: tuple[PublishedValue, ...]
+    observations: Observations | None
+    output: Output

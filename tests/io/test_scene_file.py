@@ -1,0 +1,207 @@
+"""The scene file's schema: good files read as meant, bad ones name the key and the cure."""
+
+import datetime
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+from polhode.io import SceneFileError, parse_scene, read_scene
+
+GOOD = """
+title = "box"
+epoch = 2020-01-01T00:00:00Z
+[inertia]
+moments = [1.0, 2, 2.5]
+[state]
+euler = { sequence = "ZYZ", angles = [90, 0, 0], unit = "deg" }
+omega_body = { value = [0, 180, 0], unit = "deg/s" }
+[times]
+stop = 2.0
+number = 5
+unit = "min"
+[monte_carlo]
+clones = 3
+seed = 1
+moments = { relative_sigma = 0.01, source = "assumed" }
+omega_body = { sigma = [1, 0, 2], unit = "deg/s", source = "assumed" }
+[[published]]
+name = "P_psi"
+value = 2.0
+uncertainty = 0.1
+unit = "h"
+source = "nobody"
+[observations]
+rate_unit = "deg/s"
+rows = [ { utc = 2020-01-01T00:01:00Z, wxyz = [2, 0, 0, 0], omega_body = [0, 90, 0] },
+         { time = 90.0, angles = [0.1, 0.2, 0.3] } ]
+"""
+
+
+def test_values_are_read_in_si_units():
+    scene = parse_scene(GOOD, "box.toml")
+    half = math.sqrt(0.5)
+    np.testing.assert_allclose(scene.state.wxyz, [half, 0, 0, half], atol=1e-16)
+    np.testing.assert_allclose(scene.state.value, [0, math.pi, 0], rtol=1e-15)
+    np.testing.assert_allclose(scene.times.seconds, [0, 30, 60, 90, 120])
+    np.testing.assert_array_equal(scene.inertia.values["moments"], [1, 2, 2.5])
+    moments, omega = scene.monte_carlo.spreads
+    np.testing.assert_array_equal(moments.sigma, [0.01] * 3)
+    np.testing.assert_allclose(omega.sigma, np.deg2rad([1, 0, 2]))
+    assert scene.published[0].value == 7200
+    np.testing.assert_array_equal(scene.observations.seconds, [60, 90])
+    np.testing.assert_array_equal(scene.observations.wxyz[0], [1, 0, 0, 0])
+    np.testing.assert_allclose(scene.observations.omega_body[0], [0, math.pi / 2, 0])
+    assert np.isnan(scene.observations.omega_body[1]).all()
+    assert scene.epoch == datetime.datetime(2020, 1, 1, tzinfo=datetime.UTC)
+
+
+def test_euler_sequences_agree_with_scipy():
+    from scipy.spatial.transform import Rotation
+
+    angles = [0.3, -1.1, 2.5]
+    for sequence in ("zyz", "zxz", "xyz", "zyx", "yxy"):
+        text = (
+            GOOD.replace("ZYZ", sequence)
+            .replace("[90, 0, 0]", str(angles))
+            .replace("deg", "rad", 1)
+        )
+        mine = parse_scene(text).state.wxyz
+        # an upper-case sequence is intrinsic in SciPy: the product R_a R_b R_c
+        truth = Rotation.from_euler(sequence.upper(), angles).as_quat(scalar_first=True)
+        np.testing.assert_allclose(mine * np.sign(mine @ truth), truth, atol=4e-16)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "key", "hint"),
+    [
+        ("moments = [1.0", "momnets = [1.0", "[inertia] momnets", 'did you mean "moments"?'),
+        ("[state]", "[stat]", "stat", 'did you mean "state"?'),
+        ("[1.0, 2, 2.5]", "[1.0, 2]", "[inertia] moments", "3 finite numbers"),
+        ("[1.0, 2, 2.5]", "[1.0, 2, nan]", "[inertia] moments", "3 finite numbers"),
+        ("[1.0, 2, 2.5]", "[1.0, 2, true]", "[inertia] moments", "3 finite numbers"),
+        ("[1.0, 2, 2.5]", "'abc'", "[inertia] moments", "3 finite numbers"),
+        ("[1.0, 2, 2.5]", f"[1, 2, 1{'0' * 400}]", "[inertia] moments", "3 finite numbers"),
+        ("[1.0, 2, 2.5]", "[1.0, 2, 2.5]\nspherical = 1", "[inertia]", "exactly one of"),
+        ('"deg/s" }\n[times]', '"deg/sec" }\n[times]', "[state.omega_body] unit", "deg/s"),
+        ('"ZYZ"', '"ZZY"', "[state.euler] sequence", "neighbours different"),
+        ("stop = 2.0", "stop = 0.0", "[times] stop", "other than start"),
+        ("stop = 2.0\nnumber = 5", "values = [0, 2, 1]", "[times] values", "sort them"),
+        ("stop = 2.0\nnumber = 5", "values = [0, 0]", "[times] values", "sort them"),
+        ("stop = 2.0\nnumber = 5", "values = [1]", "[times] values", "two or more"),
+        ("stop = 2.0\nnumber = 5", "values = [1, 2]\nstop = 3", "[times]", "exactly one of"),
+        ("number = 5", "number = 5.5", "[times] number", "whole number"),
+        ("number = 5", "number = true", "[times] number", "whole number"),
+        ("number = 5", "number = 1", "[times] number", "whole number from 2"),
+        ("number = 5", "", "[times] number", "add `number = ...`"),
+        ("clones = 3", "clones = -3", "[monte_carlo] clones", "whole number from 1"),
+        ("relative_sigma = 0.01", "relative_sigma = -1", "relative_sigma", "none negative"),
+        ("relative_sigma = 0.01", "sigma = 0.01", "[monte_carlo.moments] sigma", "relative_sigma"),
+        (', source = "assumed" }\nom', " }\nom", "[monte_carlo.moments] source", "text"),
+        ('name = "P_psi"', 'name = "P_ksi"', "[published 1] name", 'did you mean "P_psi"?'),
+        ("epoch = 2020-01-01T00:00:00Z", "", "epoch", "add `epoch"),
+        ("epoch = 2020-01-01T00:00:00Z", "epoch = '2020'", "epoch", "without quotation marks"),
+        ("wxyz = [2, 0, 0, 0]", "wxyz = [0, 0, 0, 0]", "[observations row 1] wxyz", "not all zero"),
+        ("time = 90.0", "time = 60.0", "[observations] rows", "sort the rows"),
+        ("time = 90.0,", "", "[observations row 2]", "exactly one of utc, time"),
+        ("[state]", "[method]\nkind='fast'\n[state]", "[method] kind", "closed-form"),
+        ("[state]", "[method]\nsolver='Dopri8'\n[state]", "[method] solver", "lie-poisson"),
+        ("[state]", "[method]\nrtol=2\n[state]", "[method] rtol", "below 1"),
+        ("[state]", "[torque]\nkind='damping'\n[state]", "[torque] kind", "linear-damping"),
+        ("[state]", "[torque]\nkind='body'\n[state]", "[torque] n", "missing key"),
+        ("[state]", "[[rotors]]\naxis_body=[0,0,1]\ninertia=1\n[state]", "[rotors 1]", "speed"),
+        ("moments = [1.0, 2, 2.5]", "[[inertia.parts]]\nshape='box'\nradius=1", "radius", "size"),
+        ("title", "title = [", "", "TOML"),
+    ],
+)  # fmt: skip
+def test_each_mistake_is_named_with_its_cure(old, new, key, hint):
+    assert old in GOOD
+    with pytest.raises(SceneFileError) as caught:
+        parse_scene(GOOD.replace(old, new, 1), "box.toml")
+    message = str(caught.value)
+    assert message.startswith("box.toml: ")
+    assert key in message
+    assert hint in message
+    assert len(message) < 700
+
+
+def test_files_that_are_no_text(tmp_path):
+    with pytest.raises(SceneFileError, match="No such file"):
+        read_scene(tmp_path / "absent.toml")
+    with pytest.raises(SceneFileError, match="cannot be read"):
+        read_scene(tmp_path)
+    binary = tmp_path / "binary.toml"
+    binary.write_bytes(b"\xff\x00\x80")
+    with pytest.raises(SceneFileError, match="UTF-8"):
+        read_scene(binary)
+
+
+KEYS = ["title", "inertia", "moments", "unit", "state", "euler", "angles", "wxyz", "omega_body",
+        "value", "times", "stop", "number", "values", "torque", "kind", "monte_carlo", "seed",
+        "observations", "rows", "utc", "published", "rotors", "epoch", "x"]  # fmt: skip
+scalars = (
+    st.booleans() | st.integers() | st.floats() | st.text(max_size=8)
+    | st.sampled_from(["deg", "rad/s", "zxz", "box", "P_psi", "auto"])
+    | st.datetimes()
+)  # fmt: skip
+garbage = st.recursive(
+    scalars,
+    lambda inner: (
+        st.lists(inner, max_size=4) | st.dictionaries(st.sampled_from(KEYS), inner, max_size=4)
+    ),
+    max_leaves=12,
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.dictionaries(st.sampled_from(KEYS), garbage, max_size=6))
+def test_garbage_tables_only_ever_raise_the_one_error(tables):
+    _raises_or_reads(_toml(tables))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_good_file_with_one_value_turned_to_garbage(data):
+    lines = GOOD.splitlines()
+    index = data.draw(st.sampled_from([i for i, line in enumerate(lines) if "=" in line]))
+    name = lines[index].split("=")[0]
+    lines[index] = f"{name}= {_value(data.draw(garbage))}"
+    _raises_or_reads("\n".join(lines))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.text(max_size=200))
+def test_any_text_only_ever_raises_the_one_error(text):
+    _raises_or_reads(text)
+
+
+def _raises_or_reads(text):
+    try:
+        scene = parse_scene(text, "garbage.toml")
+    except SceneFileError as error:
+        error.args[0].index("garbage.toml: ")
+        return
+    assert np.isfinite(scene.times.seconds).all()
+    assert np.isfinite(scene.state.value).all()
+    assert abs(np.linalg.norm(scene.state.wxyz) - 1) < 1e-12
+
+
+def _toml(tables):
+    return "\n".join(f"{key} = {_value(value)}" for key, value in tables.items())
+
+
+def _value(value):
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, list):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{k} = {_value(v)}" for k, v in value.items()) + "}"
+    if isinstance(value, str):
+        return (
+            '"'
+            + "".join(f"\\U{ord(c):08x}" if not 0xD800 <= ord(c) < 0xE000 else "" for c in value)
+            + '"'
+        )
+    return value.isoformat() if isinstance(value, datetime.datetime) else repr(value)
