@@ -4,8 +4,16 @@ Every function takes arrays of shape (..., 4) (quaternions) and (..., 3) (vector
 leading axes together, and keeps the dtype of its input.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from polhode.rotation._scalar import length
+
+
+def identity(shape: tuple[int, ...] = (), dtype=None) -> Float[Array, "*b 4"]:
+    """Quaternions of no rotation, of leading shape ``shape``."""
+    return jnp.zeros((*shape, 4), dtype or jnp.result_type(float)).at[..., 0].set(1)
 
 
 def multiply(left: Float[Array, "*#b 4"], right: Float[Array, "*#b 4"]) -> Float[Array, "*b 4"]:
@@ -35,22 +43,28 @@ def rotate(wxyz: Float[Array, "*#b 4"], vector: Float[Array, "*#b 3"]) -> Float[
     return vector + w * twice + jnp.cross(axis, twice)
 
 
-def to_matrix(wxyz: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
-    """Rotation matrix R, ``x_space = R x_body`` (theory section 1), of a unit quaternion."""
-    w, x, y, z = (wxyz[..., i] for i in range(4))
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
 def normalise(wxyz: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
     """The unit quaternion of the same direction; the components must not all vanish.
 
     Scaled by the largest component first, so that neither tiny nor huge input is lost.
     """
-    scale = jnp.max(jnp.abs(wxyz), axis=-1, keepdims=True)
+    # The result does not depend on the scale, so that its derivative may be left out.
+    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(wxyz), axis=-1, keepdims=True))
     scaled = wxyz / scale
     return scaled / jnp.sqrt(jnp.sum(scaled * scaled, axis=-1, keepdims=True))
+
+
+def canonical(wxyz: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
+    """The one of the two quaternions of a rotation whose scalar part is not negative."""
+    return jnp.where(wxyz[..., :1] < 0, -wxyz, wxyz)
+
+
+def between(start: Float[Array, "*#b 4"], end: Float[Array, "*#b 4"]) -> Float[Array, "*b 4"]:
+    """Rotation that leads from ``start`` to ``end`` in body axes: ``end = start between``."""
+    return multiply(conjugate(start), end)
+
+
+def angle_between(start: Float[Array, "*#b 4"], end: Float[Array, "*#b 4"]) -> Float[Array, "*b"]:
+    """Angle in [0, pi] (rad) of the rotation that leads from one attitude to the other."""
+    turn = between(start, end)
+    return 2 * jnp.arctan2(length(turn[..., 1:]), jnp.abs(turn[..., 0]))
