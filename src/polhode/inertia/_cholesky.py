@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def _symmetric(diagonal, off):
+def symmetric(diagonal, off):
     """Matrix (..., 3, 3) of its diagonal and the entries (y, z), (z, x), (x, y)."""
     (a, b, c), (p, q, r) = diagonal, off
     rows = [[a, r, q], [r, b, p], [q, p, c]]
@@ -23,19 +23,19 @@ def second_moments(tensor: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
     """Second moments ``Sigma = tr(I)/2 - I`` (..., 3, 3), kg m^2, of inertia tensors."""
     a, b, c = (tensor[..., i, i] for i in range(3))
     off = (-tensor[..., 1, 2], -tensor[..., 0, 2], -tensor[..., 0, 1])
-    return _symmetric(((b + c - a) / 2, (c + a - b) / 2, (a + b - c) / 2), off)
+    return symmetric(((b + c - a) / 2, (c + a - b) / 2, (a + b - c) / 2), off)
 
 
 def inertia_of_second_moments(sigma: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
     """Inertia tensors ``I = tr(Sigma) - Sigma`` (..., 3, 3), kg m^2, of second moments."""
     a, b, c = (sigma[..., i, i] for i in range(3))
     off = (-sigma[..., 1, 2], -sigma[..., 0, 2], -sigma[..., 0, 1])
-    return _symmetric((b + c, c + a, a + b), off)
+    return symmetric((b + c, c + a, a + b), off)
 
 
 def _upper_product(d1, d2, d3, s12, s13, s23):
     """``S S^T`` of the upper triangle ``S = [[d1, s12, s13], [0, d2, s23], [0, 0, d3]]``."""
-    return _symmetric(
+    return symmetric(
         (d1 * d1 + s12 * s12 + s13 * s13, d2 * d2 + s23 * s23, d3 * d3),
         (s23 * d3, s13 * d3, s12 * d2 + s13 * s23),
     )

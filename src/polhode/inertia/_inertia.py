@@ -1,6 +1,5 @@
 """The inertia of a rigid body about a fixed point or its centre of mass, in body axes."""
 
-import enum
 from typing import Self
 
 import equinox as eqx
@@ -8,20 +7,22 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from polhode._checks import as_float_array, is_concrete, require
 from polhode.inertia._cholesky import inertia_from_log_cholesky, inertia_to_log_cholesky
 from polhode.inertia._eigen import principal
-from polhode.inertia._input import as_floats, require, require_positive, tolerance, values
+from polhode.inertia._input import (
+    as_floats,
+    check_moments,
+    check_tensor,
+    require_positive,
+    tolerance,
+)
+from polhode.inertia._shapes import AbstractShaped, Symmetry
+from polhode.inertia._tensor import check_points, of_points, turned
+from polhode.rotation import to_matrix
 
 
-class Symmetry(enum.Enum):
-    """Which moments are known, by construction, to be equal (static: it selects the program)."""
-
-    NONE = "no two moments known to be equal"
-    AXISYMMETRIC = "the moments about body x and y are equal"
-    SPHERICAL = "all three moments are equal"
-
-
-class Inertia(eqx.Module):
+class Inertia(AbstractShaped):
     """Inertia tensor I of a rigid body in body axes, kg m^2 (document 003; theory section 7).
 
     Exactly one of two leaves holds the numbers: ``diagonal`` (..., 3) when the body axes are
@@ -32,6 +33,8 @@ class Inertia(eqx.Module):
     diagonal: Float[Array, "*b 3"] | None = None
     full: Float[Array, "*b 3 3"] | None = None
     symmetry: Symmetry = eqx.field(static=True, default=Symmetry.NONE)
+
+    core_ranks = {"diagonal": 1, "full": 2}  # noqa: RUF012
 
     def __check_init__(self):
         require(
@@ -48,7 +51,7 @@ class Inertia(eqx.Module):
         that no body has (one greater than the sum of the two others; flat bodies, where it
         equals the sum, pass).
         """
-        return cls(diagonal=_checked_moments("moments", as_floats("moments", moments, (3,))))
+        return cls(_checked("moments", as_float_array("moments", moments, (3,))))
 
     @classmethod
     def axisymmetric(cls, transverse: ArrayLike, axial: ArrayLike) -> Self:
@@ -56,19 +59,15 @@ class Inertia(eqx.Module):
 
         Both of shape (...), kg m^2, broadcast together. Raises as ``from_moments`` does.
         """
-        first, last = as_floats("transverse", transverse, ()), as_floats("axial", axial, ())
-        require(
-            first.dtype == last.dtype,
-            f"transverse and axial must have one dtype, got {first.dtype} and {last.dtype}.",
-        )
-        first, last = jnp.broadcast_arrays(first, last)
+        first, last = as_floats(transverse=(transverse, ()), axial=(axial, ()))
         moments = jnp.stack([first, first, last], axis=-1)
-        return cls(_checked_moments("(transverse, transverse, axial)", moments), None, _AXIAL)
+        name = "(transverse, transverse, axial)"
+        return cls(_checked(name, moments), None, Symmetry.AXISYMMETRIC)
 
     @classmethod
     def spherical(cls, moment: ArrayLike) -> Self:
         """All moments equal (sphere, cube, ...): ``moment`` of shape (...), kg m^2, positive."""
-        single = as_floats("moment", moment, ())
+        single = as_float_array("moment", moment, ())
         require_positive("moment", single)
         return cls(jnp.stack([single] * 3, axis=-1), None, Symmetry.SPHERICAL)
 
@@ -80,14 +79,33 @@ class Inertia(eqx.Module):
         a wrong shape, NaN or infinity, a tensor that is not symmetric, or one whose principal
         moments are not positive or break the triangle inequality.
         """
-        array = as_floats("tensor", tensor, (3, 3))
-        _check_tensor(array)
+        array = as_float_array("tensor", tensor, (3, 3))
+        check_tensor("tensor", array)
         return cls(full=(array + jnp.swapaxes(array, -1, -2)) / 2)
+
+    @classmethod
+    def from_points(cls, masses: ArrayLike, positions: ArrayLike) -> Self:
+        """Point masses (..., n), kg, at ``positions`` (..., n, 3), m, about the origin.
+
+        ``I = sum m (x.x 1 - x x^T)`` (document 003 display 24). The origin is the point that the
+        body turns about; for a free body use ``MassProperties.from_points``, whose ``inertia`` is
+        about the centre of mass. Raises ValueError for an empty set, a negative mass, points
+        that all lie on one line through the origin, NaN or infinity.
+        """
+        masses, positions = as_floats(masses=(masses, (None,)), positions=(positions, (None, 3)))
+        check_points(masses, positions)
+        tensor = of_points(masses, positions)
+        check_tensor("the inertia of the points", tensor)
+        return cls(full=tensor)
+
+    @classmethod
+    def _of_shape(cls, mass: Array, moments: Array, symmetry: Symmetry) -> Self:
+        return cls(_checked("the principal moments", moments), None, symmetry)
 
     @classmethod
     def from_log_cholesky(cls, parameters: ArrayLike) -> Self:
         """A physical inertia from any real 6-vector (..., 6); see ``to_log_cholesky``."""
-        array = as_floats("parameters", parameters, (6,))
+        array = as_float_array("parameters", parameters, (6,))
         return cls(full=inertia_from_log_cholesky(array))
 
     def to_log_cholesky(self) -> Float[Array, "*b 6"]:
@@ -137,6 +155,25 @@ class Inertia(eqx.Module):
             jnp.eye(3, dtype=self.dtype), (*self.batch_shape, 3, 3)
         )
 
+    def turned(self, wxyz: Float[Array, "*#b 4"]) -> Self:
+        """The body turned by the unit quaternion (..., 4) in its axes: ``R I R^T``, a full tensor.
+
+        ``axes`` of the result is such a turn: ``Inertia(moments).turned(axes)`` is the body again.
+        """
+        return type(self)(full=turned(self.tensor, to_matrix(wxyz)))
+
+    def to_principal(self) -> tuple[Self, Float[Array, "*b 4"]]:
+        """The same body in principal axes, and the turn ``wxyz`` from those to the present axes.
+
+        ``wxyz`` is a constant for derivatives, and the products of inertia about it are dropped:
+        for derivatives of a motion with respect to a full tensor use ``principal``.
+        """
+        if self.diagonal is not None:
+            unit = jnp.asarray([1, 0, 0, 0], self.dtype)
+            return self, jnp.broadcast_to(unit, (*self.batch_shape, 4))
+        moments, wxyz, _ = principal(self.full)
+        return type(self)(moments), wxyz
+
     def momentum(self, omega: Float[Array, "*#b 3"]) -> Float[Array, "*b 3"]:
         """Body momentum ``I omega``, kg m^2/s, of body rates (..., 3), rad/s."""
         if self.diagonal is not None:
@@ -152,9 +189,6 @@ class Inertia(eqx.Module):
         batch = jnp.broadcast_shapes(self.batch_shape, momentum.shape[:-1])
         tensor = jnp.broadcast_to(self.full, (*batch, 3, 3))
         return _solve(tensor, jnp.broadcast_to(momentum, (*batch, 3)))
-
-
-_AXIAL = Symmetry.AXISYMMETRIC
 
 
 def _aligned(left, right):
@@ -177,51 +211,7 @@ def _solve(tensor, vector):
     return jnp.stack([x / a - l10 * y - l20 * z, y, z], axis=-1)
 
 
-def _check_tensor(array):
-    seen = values(array)
-    if seen is None or seen.size == 0:
-        return
-    require(
-        bool(np.isfinite(seen).all()),
-        "tensor must be finite, got NaN or infinite entries; check where they come from.",
-    )
-    slack = tolerance(array) * np.abs(seen).max(axis=(-2, -1), keepdims=True)
-    skew = np.abs(seen - np.swapaxes(seen, -1, -2))
-    require(
-        bool((skew <= slack).all()),
-        f"tensor must be symmetric, got entries that differ by up to {skew.max():g} from their "
-        "transposed ones; pass (A + A.T) / 2 if that is what is meant.",
-    )
-    _check_moments(
-        "the principal moments of tensor",
-        np.linalg.eigvalsh((seen + np.swapaxes(seen, -1, -2)) / 2),
-        tolerance(array),
-    )
-
-
-def _checked_moments(name, array):
-    seen = values(array)
-    if seen is not None and seen.size:
-        _check_moments(name, seen, tolerance(array))
-    return array
-
-
-def _check_moments(name, seen, slack):
-    require(
-        bool(np.isfinite(seen).all() and (seen > 0).all()),
-        f"{name} must be positive and finite (kg m^2), got {_worst(seen, seen.min(axis=-1))}; a "
-        "moment is zero only for a point or a line, which has no defined rotation about itself.",
-    )
-    excess = 2 * seen.max(axis=-1) - seen.sum(axis=-1)
-    require(
-        bool((excess <= slack * seen.max(axis=-1)).all()),
-        f"{name} must satisfy the triangle inequality (each at most the sum of the two others), "
-        f"got {_worst(seen, -excess)}; check units, and that these are moments of inertia, not "
-        "second moments or a gyration tensor.",
-    )
-
-
-def _worst(seen, badness):
-    """The first row with a NaN, or the one of smallest ``badness``."""
-    rows, scores = seen.reshape(-1, seen.shape[-1]), np.reshape(badness, -1)
-    return np.array2string(rows[int(np.argmin(np.where(np.isnan(scores), -np.inf, scores)))])
+def _checked(name, moments):
+    if is_concrete(moments):
+        check_moments(name, np.asarray(moments, np.float64), tolerance(moments))
+    return moments

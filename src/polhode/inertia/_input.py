@@ -1,66 +1,111 @@
 """Checks of what users hand in: shapes always, values only when they are concrete."""
 
-import jax
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
+
+from polhode._checks import as_float_array, is_concrete, require
 
 
-def as_floats(name, value, suffix):
-    """``value`` as a floating array whose trailing axes are ``suffix`` (None: any length)."""
+def as_floats(**given: tuple[Any, tuple[int | None, ...]]) -> tuple[Array, ...]:
+    """Arrays ``name=(value, suffix)`` of one floating dtype and with common batch axes.
+
+    Python numbers and lists follow the dtype of the arrays among them; alone, they take the
+    default one. A mixture of array dtypes takes the wider one.
+    """
+    kinds = [
+        value.dtype
+        for value, _ in given.values()
+        if hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jnp.floating)
+    ]
+    arrays = [as_float_array(name, value, suffix) for name, (value, suffix) in given.items()]
+    if kinds:
+        common = kinds[0]
+        for kind in kinds[1:]:
+            common = jnp.promote_types(common, kind)
+        arrays = [array.astype(common) for array in arrays]
+    tails = [len(suffix) for _, suffix in given.values()]
+    leading = [array.shape[: array.ndim - tail] for array, tail in zip(arrays, tails)]
     try:
-        array = jnp.asarray(value)
-    except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"{name} must be a rectangular array of numbers, got {value!r}; check that all rows "
-            "have the same length."
-        ) from error
-    if jnp.issubdtype(array.dtype, jnp.complexfloating) or array.dtype == jnp.bool_:
-        raise TypeError(f"{name} must hold real numbers, got dtype {array.dtype}.")
-    if not jnp.issubdtype(array.dtype, jnp.floating):
-        array = array.astype(jnp.result_type(float))
-    tail = array.shape[array.ndim - len(suffix) :] if array.ndim >= len(suffix) else None
-    if tail is None or any(want not in (None, got) for want, got in zip(suffix, tail, strict=True)):
-        wanted = ", ".join("n" if n is None else str(n) for n in suffix)
-        raise ValueError(
-            f"{name} must have shape (..., {wanted}), got {array.shape}; leading axes are a batch."
-        )
-    return array
+        batch = jnp.broadcast_shapes(*leading)
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(given, arrays))
+        raise ValueError(f"the batch axes must broadcast together, got {shapes}.") from error
+    return tuple(
+        jnp.broadcast_to(array, (*batch, *array.shape[array.ndim - tail :]))
+        for array, tail in zip(arrays, tails)
+    )
 
 
-def values(array):
-    """The numbers of a concrete array as numpy float64, or None while tracing."""
-    return None if isinstance(array, jax.core.Tracer) else np.asarray(array, np.float64)
-
-
-def tolerance(array):
+def tolerance(array: Array) -> float:
     """Relative tolerance of consistency checks: the square root of the dtype's rounding."""
     return float(np.sqrt(jnp.finfo(array.dtype).eps))
 
 
-def require(condition, message):
-    """ValueError with ``message`` unless ``condition`` holds."""
-    if not condition:
-        raise ValueError(message)
+def require_positive(name: str, array: Array, *, zero: bool = False) -> None:
+    """ValueError if a concrete array holds negative values (or zeros, unless ``zero``)."""
+    if not is_concrete(array) or array.size == 0:
+        return
+    least = float(jnp.min(array))
+    wanted = "zero or positive" if zero else "positive"
+    require(
+        least > 0 or (zero and least == 0),
+        f"{name} must be {wanted}, got {least:g}; check its sign and its units.",
+    )
 
 
-def require_finite(name, array):
-    """ValueError if a concrete array holds NaN or infinity."""
-    seen = values(array)
-    if seen is not None and not np.isfinite(seen).all():
-        bad = int((~np.isfinite(seen)).sum())
-        raise ValueError(
-            f"{name} must be finite, got {bad} NaN or infinite of {seen.size} values; remove or "
-            "repair them."
+def require_below(small_name: str, small: Array, large_name: str, large: Array) -> None:
+    """ValueError if a concrete ``small`` exceeds ``large`` anywhere."""
+    if is_concrete(small, large):
+        require(
+            small <= large,
+            f"{small_name} must not exceed {large_name}, got {float(jnp.max(small)):g} against "
+            f"{float(jnp.min(large)):g}; exchange them?",
         )
 
 
-def require_positive(name, array, zero_allowed=False):
-    """ValueError if a concrete array is not finite or holds negative (or zero) values."""
-    require_finite(name, array)
-    seen = values(array)
-    if seen is None or seen.size == 0:
+def check_moments(name: str, seen: np.ndarray, slack: float, least: float = 0.0) -> None:
+    """ValueError unless rows of principal moments are positive and obey the triangle inequality.
+
+    ``slack`` is the relative tolerance of the inequality (flat bodies), ``least`` the fraction of
+    the largest moment that counts as zero.
+    """
+    if seen.size == 0:
         return
-    worst = seen.min()
-    if worst < 0 or (worst == 0 and not zero_allowed):
-        wanted = "zero or positive" if zero_allowed else "positive"
-        raise ValueError(f"{name} must be {wanted}, got {worst:g}; check its sign and units.")
+    largest = seen.max(axis=-1)
+    require(
+        seen.min(axis=-1) > least * largest,
+        f"{name} must be positive (kg m^2), got {_worst(seen, seen.min(axis=-1))}; a moment is "
+        "zero only for a point or a thin line, which cannot turn about itself: give it a width.",
+    )
+    excess = 2 * largest - seen.sum(axis=-1)
+    require(
+        excess <= slack * largest,
+        f"{name} must satisfy the triangle inequality (each at most the sum of the two others), "
+        f"got {_worst(seen, -excess)}; check the units, and that these are moments of inertia, "
+        "not second moments or a gyration tensor.",
+    )
+
+
+def check_tensor(name: str, array: Array) -> None:
+    """ValueError unless a concrete tensor is symmetric with moments that a body can have."""
+    if not is_concrete(array) or array.size == 0:
+        return
+    seen = np.asarray(array, np.float64)
+    mirrored = np.swapaxes(seen, -1, -2)
+    skew = np.abs(seen - mirrored)
+    require(
+        skew <= tolerance(array) * np.abs(seen).max(axis=(-2, -1), keepdims=True),
+        f"{name} must be symmetric, got entries that differ by up to {skew.max():g} from their "
+        "transposed ones; pass (A + A.T) / 2 if that is what is meant.",
+    )
+    # moments within the rounding of the largest cannot be told from zero
+    least = 64 * float(jnp.finfo(array.dtype).eps)
+    moments = np.linalg.eigvalsh((seen + mirrored) / 2)
+    check_moments(f"the principal moments of {name}", moments, tolerance(array), least)
+
+
+def _worst(seen: np.ndarray, badness: np.ndarray) -> str:
+    return np.array2string(seen.reshape(-1, seen.shape[-1])[int(np.argmin(badness))])

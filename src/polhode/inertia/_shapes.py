@@ -1,0 +1,183 @@
+"""Homogeneous bodies of simple shape: their masses, centres and principal moments.
+
+Formulas in closed form without differences of nearly equal numbers, so that thin walls keep full
+accuracy; each is checked against its defining integral in the tests.
+"""
+
+import abc
+import enum
+from typing import Self
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
+
+from polhode.inertia._input import as_floats, require_below, require_positive
+
+
+class Symmetry(enum.Enum):
+    """Which moments are known, by construction, to be equal (static: it selects the program)."""
+
+    NONE = "no two moments known to be equal"
+    AXISYMMETRIC = "the moments about body x and y are equal"
+    SPHERICAL = "all three moments are equal"
+
+
+def _of_second_moments(mass: Array, x: Array, y: Array, z: Array) -> Array:
+    """Principal moments of a body with mean squares x, y, z of its coordinates."""
+    return mass[..., None] * jnp.stack([y + z, z + x, x + y], axis=-1)
+
+
+def _axial(mass: Array, transverse: Array, axial: Array) -> Array:
+    """Principal moments (transverse, transverse, axial) times mass."""
+    return mass[..., None] * jnp.stack([transverse, transverse, axial], axis=-1)
+
+
+class AbstractShaped(eqx.Module):
+    """Constructors from homogeneous simple shapes, all centred on the centre of mass.
+
+    Masses in kg (positive), lengths in m; leading axes of the arguments broadcast to a batch.
+    Rotational symmetry axes are body z, so that the result knows its symmetry. Every constructor
+    raises ValueError for a negative mass or length, NaN, infinity, or a wrong shape.
+    """
+
+    @classmethod
+    @abc.abstractmethod
+    def _of_shape(cls, mass: Array, moments: Array, symmetry: Symmetry) -> Self:
+        """The object for a mass and its central principal moments."""
+
+    @classmethod
+    def from_box(
+        cls, mass: ArrayLike, sides: ArrayLike, inner_sides: ArrayLike | None = None
+    ) -> Self:
+        """A solid box of edge lengths ``sides`` (..., 3), or a closed box around a cavity.
+
+        ``inner_sides`` (..., 3): edge lengths of a concentric empty box inside it.
+        """
+        if inner_sides is None:
+            mass, a = as_floats(mass=(mass, ()), sides=(sides, (3,)))
+            _check_size(mass, sides=a)
+            x, y, z = (a[..., i] ** 2 / 12 for i in range(3))
+            return cls._of_shape(mass, _of_second_moments(mass, x, y, z), Symmetry.NONE)
+        mass, a, b = as_floats(
+            mass=(mass, ()), sides=(sides, (3,)), inner_sides=(inner_sides, (3,))
+        )
+        _check_size(mass, sides=a)
+        require_positive("inner_sides", b, zero=True)
+        require_below("inner_sides", b, "sides", a)
+        wall = a - b
+        require_positive("the wall, max(sides - inner_sides),", jnp.max(wall, axis=-1))
+        squares = []
+        for i in range(3):
+            j, k = (i + 1) % 3, (i + 2) % 3
+            # a_i a_j a_k - b_i b_j b_k and the same with cubes in i, as sums of positive terms
+            face = a[..., j] * a[..., k]
+            face_wall = wall[..., j] * a[..., k] + b[..., j] * wall[..., k]
+            volume = wall[..., i] * face + b[..., i] * face_wall
+            cubes = a[..., i] ** 2 + a[..., i] * b[..., i] + b[..., i] ** 2
+            second = wall[..., i] * cubes * face + b[..., i] ** 3 * face_wall
+            squares.append(second / (12 * volume))
+        return cls._of_shape(mass, _of_second_moments(mass, *squares), Symmetry.NONE)
+
+    @classmethod
+    def from_ellipsoid(cls, mass: ArrayLike, semi_axes: ArrayLike) -> Self:
+        """A solid ellipsoid of semi-axes (..., 3)."""
+        mass, a = as_floats(mass=(mass, ()), semi_axes=(semi_axes, (3,)))
+        _check_size(mass, semi_axes=a)
+        moments = _of_second_moments(mass, *(a[..., i] ** 2 / 5 for i in range(3)))
+        return cls._of_shape(mass, moments, Symmetry.NONE)
+
+    @classmethod
+    def from_sphere(cls, mass: ArrayLike, radius: ArrayLike, inner_radius: ArrayLike = 0.0) -> Self:
+        """A solid ball, or a ball around a concentric cavity of ``inner_radius`` (...)."""
+        mass, outer, inner = as_floats(
+            mass=(mass, ()), radius=(radius, ()), inner_radius=(inner_radius, ())
+        )
+        _check_size(mass, radius=outer)
+        require_positive("inner_radius", inner, zero=True)
+        require_below("inner_radius", inner, "radius", outer)
+        q = inner / outer
+        # (1 - q^5)/(1 - q^3), both divided by 1 - q
+        ratio = (1 + q + q**2 + q**3 + q**4) / (1 + q + q**2)
+        square = outer**2 * ratio / 5
+        return cls._of_shape(
+            mass, _of_second_moments(mass, square, square, square), Symmetry.SPHERICAL
+        )
+
+    @classmethod
+    def from_shell(cls, mass: ArrayLike, radius: ArrayLike) -> Self:
+        """A thin spherical shell."""
+        return cls.from_sphere(mass, radius, radius)
+
+    @classmethod
+    def from_cylinder(
+        cls, mass: ArrayLike, radius: ArrayLike, length: ArrayLike, inner_radius: ArrayLike = 0.0
+    ) -> Self:
+        """A cylinder along body z, solid or (``inner_radius``) a tube."""
+        mass, radius, length, inner = as_floats(
+            mass=(mass, ()),
+            radius=(radius, ()),
+            length=(length, ()),
+            inner_radius=(inner_radius, ()),
+        )
+        _check_size(mass, radius=radius, length=length)
+        require_positive("inner_radius", inner, zero=True)
+        require_below("inner_radius", inner, "radius", radius)
+        axial = (radius**2 + inner**2) / 2
+        return cls._of_shape(
+            mass, _axial(mass, axial / 2 + length**2 / 12, axial), Symmetry.AXISYMMETRIC
+        )
+
+    @classmethod
+    def from_disc(cls, mass: ArrayLike, radius: ArrayLike, inner_radius: ArrayLike = 0.0) -> Self:
+        """A flat disc or ring normal to body z; the flattest body there is (Iz = Ix + Iy)."""
+        mass, radius, inner = as_floats(
+            mass=(mass, ()), radius=(radius, ()), inner_radius=(inner_radius, ())
+        )
+        _check_size(mass, radius=radius)
+        require_positive("inner_radius", inner, zero=True)
+        require_below("inner_radius", inner, "radius", radius)
+        axial = (radius**2 + inner**2) / 2
+        return cls._of_shape(mass, _axial(mass, axial / 2, axial), Symmetry.AXISYMMETRIC)
+
+    @classmethod
+    def from_rod(cls, mass: ArrayLike, length: ArrayLike, radius: ArrayLike = 0.0) -> Self:
+        """A round rod along body z. A thin one (radius 0) cannot turn by itself: as part only."""
+        mass, length, radius = as_floats(mass=(mass, ()), length=(length, ()), radius=(radius, ()))
+        _check_size(mass, length=length)
+        require_positive("radius", radius, zero=True)
+        axial = radius**2 / 2
+        return cls._of_shape(
+            mass, _axial(mass, axial / 2 + length**2 / 12, axial), Symmetry.AXISYMMETRIC
+        )
+
+    @classmethod
+    def from_cone(cls, mass: ArrayLike, radius: ArrayLike, height: ArrayLike) -> Self:
+        """A solid circular cone along body z, about its centre of mass.
+
+        The centre of mass lies ``height / 4`` above the base.
+        """
+        mass, radius, height = as_floats(mass=(mass, ()), radius=(radius, ()), height=(height, ()))
+        _check_size(mass, radius=radius, height=height)
+        axial = 3 * radius**2 / 10
+        return cls._of_shape(
+            mass, _axial(mass, axial / 2 + 3 * height**2 / 80, axial), Symmetry.AXISYMMETRIC
+        )
+
+    @classmethod
+    def from_torus(cls, mass: ArrayLike, ring_radius: ArrayLike, tube_radius: ArrayLike) -> Self:
+        """A solid torus around body z: tube centre at ``ring_radius``, tube of ``tube_radius``."""
+        mass, ring, tube = as_floats(
+            mass=(mass, ()), ring_radius=(ring_radius, ()), tube_radius=(tube_radius, ())
+        )
+        _check_size(mass, ring_radius=ring)
+        require_positive("tube_radius", tube, zero=True)
+        require_below("tube_radius", tube, "ring_radius", ring)
+        moments = _axial(mass, ring**2 / 2 + 5 * tube**2 / 8, ring**2 + 3 * tube**2 / 4)
+        return cls._of_shape(mass, moments, Symmetry.AXISYMMETRIC)
+
+
+def _check_size(mass: Array, **lengths: Array) -> None:
+    require_positive("mass", mass)
+    for name, array in lengths.items():
+        require_positive(name, array)
