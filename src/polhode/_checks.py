@@ -1,0 +1,70 @@
+"""Input checks shared by every constructor: what was given, what is expected, how to mend it."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+
+def is_concrete(*values: Any) -> bool:
+    """Whether every array leaf holds numbers now (is not being traced by jit, vmap or grad)."""
+    return not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(values))
+
+
+def require(condition: Any, message: str) -> None:
+    """Raise ``ValueError(message)`` unless ``condition`` holds everywhere."""
+    if not bool(np.all(np.asarray(condition))):
+        raise ValueError(message)
+
+
+def describe(value: Any, limit: int = 8) -> str:
+    """A short rendering of what the user gave."""
+    array = np.asarray(value)
+    if array.size <= limit:
+        return np.array2string(array, separator=", ").replace("\n", "")
+    return f"array of shape {array.shape}"
+
+
+def as_float_array(name: str, value: Any, suffix: Sequence[int | None] = ()) -> Array:
+    """A floating-point array whose trailing axes are ``suffix`` (None: any length).
+
+    Lists and integers become the default float type, floating arrays keep theirs.
+    Raises TypeError for what is no array of real numbers, ValueError for a wrong shape or,
+    where the values are known, for NaN or infinity.
+    """
+    try:
+        leaves = jax.tree.leaves(value, is_leaf=lambda leaf: leaf is None)
+        if any(leaf is None or isinstance(leaf, (str, bytes)) for leaf in leaves):
+            raise TypeError("no number")  # jax would read some strings as the name of a dtype
+        array = jnp.asarray(value)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise TypeError(
+            f"{name} must be an array of real numbers, got {type(value).__name__}: {value!r:.80}."
+        ) from error
+    if jnp.issubdtype(array.dtype, jnp.complexfloating) or array.dtype == jnp.bool_:
+        raise TypeError(f"{name} must hold real numbers, got dtype {array.dtype}.")
+    if not jnp.issubdtype(array.dtype, jnp.floating):
+        array = array.astype(jnp.result_type(float))
+    n = len(suffix)
+    tail = array.shape[array.ndim - n :] if n else ()
+    fits = array.ndim >= n and all(want in (None, got) for want, got in zip(suffix, tail))
+    if not fits:
+        wanted = ", ".join(["...", *("n" if s is None else str(s) for s in suffix)])
+        raise ValueError(
+            f"{name} must have shape ({wanted}), got {array.shape}: put batch axes first"
+            " and the components last."
+        )
+    if is_concrete(array) and not bool(np.all(np.isfinite(np.asarray(array)))):
+        raise ValueError(
+            f"{name} holds NaN or infinity ({describe(array)}): remove or mend these entries"
+            " before the call."
+        )
+    return array
+
+
+def as_number(name: str, value: Any) -> Array:
+    """A floating-point scalar or batch of scalars."""
+    return as_float_array(name, value, ())

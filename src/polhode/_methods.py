@@ -1,0 +1,276 @@
+"""Ways to move the bodies of a scene. Options are objects: a method is handed over whole."""
+
+import abc
+from typing import NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from polhode._lanes import along_time, is_lane_tree
+from polhode._scene import Scene
+from polhode._state import State
+from polhode._status import Status
+from polhode.hamiltonian import (
+    Dynamics,
+    canonical_from_momentum,
+    components,
+    euler_angle_field,
+    lie_poisson_field,
+    momentum_from_canonical,
+)
+from polhode.rotation import euler_to_wxyz, normalise, wxyz_to_euler
+
+
+class Record(eqx.Module):
+    """What to keep: attitude, rates, and whether only the last time (all static)."""
+
+    attitude: bool = eqx.field(static=True, default=True)
+    rates: bool = eqx.field(static=True, default=True)
+    final_only: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        if not (self.attitude or self.rates):
+            raise ValueError("Record keeps nothing: switch on attitude, rates or both.")
+
+
+class Samples(NamedTuple):
+    """What a method returns for N lanes: (N, T, 4), (N, T, 3), (N,), (N,)."""
+
+    wxyz: Array | None
+    omega_body: Array | None
+    status: Array
+    steps: Array
+
+
+class AbstractMethod(eqx.Module):
+    """Base of all methods. ``run`` moves N lanes; ``simulate`` does the checks and the batching."""
+
+    @abc.abstractmethod
+    def run(self, scene: Scene, state: State, ts: Array, rtol: float, record: Record) -> Samples:
+        """Samples at ``ts`` (T,) or (N, T) of lanes whose state holds at the first time."""
+
+
+class _LaneNorm(eqx.Module):
+    """Error of the worst lane: root mean square over its components, each times its weight.
+
+    A batch that shares its steps so keeps every body's own tolerance.
+    """
+
+    weights: Array
+
+    def __call__(self, y: Array) -> Array:
+        worst = jnp.max(jnp.mean((y * self.weights) ** 2, axis=0))
+        positive = worst > 0  # the root's slope at zero is infinite: keep it out of gradients
+        return jnp.where(positive, jnp.sqrt(jnp.where(positive, worst, 1)), 0)
+
+
+class AbstractDiffraxMethod(AbstractMethod):
+    """Base of the two charts that diffrax integrates in chunks of lanes sharing their steps."""
+
+    solver: eqx.AbstractVar[diffrax.AbstractSolver]
+    controller: eqx.AbstractVar[diffrax.AbstractStepSizeController | None]
+    dt0: eqx.AbstractVar[float | None]
+    max_steps: eqx.AbstractVar[int]
+    adjoint: eqx.AbstractVar[diffrax.AbstractAdjoint]
+    progress_meter: eqx.AbstractVar[diffrax.AbstractProgressMeter]
+    chunk: eqx.AbstractVar[int]
+    momenta: eqx.AbstractClassVar[tuple[bool, bool]]
+
+    @abc.abstractmethod
+    def field(self, t, y, dynamics: Dynamics):
+        """Vector field on the chart's component arrays."""
+
+    @abc.abstractmethod
+    def start(self, scene: Scene, state: State) -> tuple[PyTree[Array], Array]:
+        """Initial chart state of lanes, and which of them the chart can hold."""
+
+    @abc.abstractmethod
+    def finish(self, scene: Scene, y: PyTree[Array]) -> tuple[Array, Array, Array]:
+        """wxyz, omega_body and whether the chart is still sound, of sampled components (N, T)."""
+
+    def run(self, scene: Scene, state: State, ts: Array, rtol: float, record: Record) -> Samples:
+        n = state.wxyz.shape[0]
+        size = 1 if ts.ndim == 2 else min(self.chunk, n)
+        lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
+        if n == size and ts.ndim == 1:
+            return self._solve(scene, state, ts, rtol, record)
+        count = -(-n // size)
+
+        def pad(x):
+            fill = jnp.broadcast_to(x[-1:], (count * size - n, *x.shape[1:]))
+            return jnp.concatenate([x, fill]).reshape(count, size, *x.shape[1:])
+
+        def one(chunk):
+            lanes, times = chunk
+            scene, state = eqx.combine(lanes, shared)
+            times = ts if times is None else times[0]
+            return self._solve(scene, state, times, rtol, record)
+
+        chunks = jax.tree.map(pad, (lanes, ts if ts.ndim == 2 else None))
+        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], jax.lax.map(one, chunks))
+
+    def _stacked_field(self, t, y, dynamics):
+        """The field on one array (components, N): for a diffrax solver far faster than leaves."""
+        return _stack(self.field(t, _groups(y), dynamics))
+
+    def _weights(self, scene, state, t, groups) -> Array:
+        ones = jnp.ones_like(groups[0][0])
+        momenta = ones / momentum_scale(scene, state, t)
+        return _stack(
+            tuple(momenta if is_momentum else ones for _ in group)
+            for group, is_momentum in zip(groups, self.momenta)
+        )
+
+    def _solve(self, scene, state, ts, rtol, record) -> Samples:
+        """One chunk of lanes in one diffrax solve."""
+        dynamics = Dynamics(scene.hamiltonian, scene.torque)
+        groups, sound = self.start(scene, state)
+        y0 = _stack(groups)
+        controller = self.controller
+        if controller is None:
+            controller = diffrax.PIDController(
+                rtol=0.0,
+                atol=rtol,
+                norm=_LaneNorm(self._weights(scene, state, ts[0], groups)),
+            )
+        samples = diffrax.SubSaveAt(t1=True) if record.final_only else diffrax.SubSaveAt(ts=ts)
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(self._stacked_field),
+            self.solver,
+            ts[0],
+            ts[-1],
+            self.dt0,
+            y0,
+            dynamics,
+            saveat=diffrax.SaveAt(subs=[samples, diffrax.SubSaveAt(t1=True)]),
+            stepsize_controller=controller,
+            adjoint=self.adjoint,
+            max_steps=self.max_steps,
+            progress_meter=self.progress_meter,
+            throw=False,
+        )
+        samples, last = (_groups(jnp.moveaxis(y, 0, -1)) for y in solution.ys)
+        wxyz, omega, _ = self.finish(scene, samples)
+        *_, sound_at_end = self.finish(scene, last)
+        n = sound.shape[0]
+        status = _status(solution.result, wxyz, omega, sound & sound_at_end[:, -1])
+        return Samples(
+            wxyz if record.attitude else None,
+            omega if record.rates else None,
+            status,
+            jnp.broadcast_to(solution.stats["num_steps"], (n,)),
+        )
+
+
+def _stack(groups) -> Array:
+    return jnp.stack([x for group in groups for x in group])
+
+
+def _groups(y: Array):
+    return tuple(y[:3]), tuple(y[3:])
+
+
+def _status(result, wxyz, omega, sound) -> Array:
+    """Status per lane of one diffrax solve shared by all lanes."""
+    finite = jnp.all(jnp.isfinite(wxyz), axis=(-1, -2)) & jnp.all(
+        jnp.isfinite(omega), axis=(-1, -2)
+    )
+    reached = result == diffrax.RESULTS.successful
+    limit = result == diffrax.RESULTS.max_steps_reached
+    shared = jnp.where(
+        reached, Status.SUCCESSFUL, jnp.where(limit, Status.MAX_STEPS, Status.STEP_FAILED)
+    )
+    status = jnp.where(reached & ~finite, Status.NOT_FINITE, shared)
+    return jnp.where(~sound & (status != Status.SUCCESSFUL), Status.CHART_SINGULAR, status)
+
+
+def momentum_scale(scene: Scene, state: State, t: Array) -> Array:
+    """Natural unit of momentum of each lane: |L| together with what the torques can add to it."""
+    momentum = scene.inertia.momentum(state.omega_body)
+    y = (components(momentum), tuple(state.wxyz[..., i] for i in range(4)))
+    (push, _) = lie_poisson_field(t, y, Dynamics(scene.hamiltonian, scene.torque))
+    size = jnp.trace(scene.inertia.tensor, axis1=-2, axis2=-1)
+    square = jnp.sum(momentum**2, axis=-1) + size * jnp.sqrt(sum(x * x for x in push))
+    resting = square == 0
+    return jax.lax.stop_gradient(jnp.where(resting, 1, jnp.sqrt(jnp.where(resting, 1, square))))
+
+
+class LiePoisson(AbstractDiffraxMethod):
+    """Unit quaternion and body momentum, free of singularities, with any diffrax solver.
+
+    **Arguments:**
+
+    - ``solver``: any ``diffrax.AbstractSolver`` for ODEs.
+    - ``controller``: a diffrax step-size controller; None: error control by the ``rtol`` of
+      ``simulate``, the attitude in radians and the momentum relative to each body's own scale,
+      the worst body of a chunk deciding the step.
+    - ``dt0``: first (or constant) step [s], negative backwards; None: chosen.
+    - ``max_steps``, ``adjoint``, ``progress_meter``: as in diffrax. The default adjoint gives
+      reverse mode; hand in ``diffrax.ForwardMode()`` for ``jax.jvp``.
+    - ``chunk``: bodies that share their steps; chunks follow one another, so memory stays bounded.
+    """
+
+    solver: diffrax.AbstractSolver = diffrax.Dopri8()
+    controller: diffrax.AbstractStepSizeController | None = None
+    dt0: float | None = None
+    max_steps: int = eqx.field(static=True, default=2**16)
+    adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint()
+    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter()
+    chunk: int = eqx.field(static=True, default=40)
+
+    momenta = (True, False)
+
+    def field(self, t, y, dynamics):
+        return lie_poisson_field(t, y, dynamics)
+
+    def start(self, scene, state):
+        momentum = scene.inertia.momentum(state.omega_body)
+        wxyz = tuple(state.wxyz[..., i] for i in range(4))
+        return (components(momentum), wxyz), jnp.ones(state.wxyz.shape[0], bool)
+
+    def finish(self, scene, y):
+        momentum, wxyz = (jnp.stack(group, axis=-1) for group in y)
+        omega = along_time(scene.inertia, 1).rates(momentum)
+        return normalise(wxyz), omega, jnp.ones(momentum.shape[:-1], bool)
+
+
+class EulerAngles(AbstractDiffraxMethod):
+    """Canonical ZYZ Euler angles of document 000 by Hamilton's equations, with any diffrax solver.
+
+    A reference path: the chart breaks down where theta is 0 or pi, which is reported as
+    ``Status.CHART_SINGULAR``; passing near costs many steps. Arguments as ``ph.LiePoisson``;
+    one body at a time by default, for the worst body of a chunk would hold up the others.
+    """
+
+    solver: diffrax.AbstractSolver = diffrax.Dopri8()
+    controller: diffrax.AbstractStepSizeController | None = None
+    dt0: float | None = None
+    max_steps: int = eqx.field(static=True, default=2**16)
+    adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint()
+    progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter()
+    chunk: int = eqx.field(static=True, default=1)
+
+    momenta = (False, True)
+
+    def field(self, t, y, dynamics):
+        return euler_angle_field(t, y, dynamics)
+
+    def start(self, scene, state):
+        q = wxyz_to_euler(state.wxyz)
+        momentum = components(scene.inertia.momentum(state.omega_body))
+        return (q, canonical_from_momentum(q, momentum)), _away_from_poles(q)
+
+    def finish(self, scene, y):
+        q, p = y
+        momentum = jnp.stack(momentum_from_canonical(q, p), axis=-1)
+        omega = along_time(scene.inertia, 1).rates(momentum)
+        return euler_to_wxyz(*q), omega, _away_from_poles(q)
+
+
+def _away_from_poles(q) -> Array:
+    """Whether the chart keeps at least half of the digits (its error grows like 1/sin theta)."""
+    theta = q[1]
+    return jnp.abs(jnp.sin(theta)) > jnp.sqrt(jnp.finfo(theta.dtype).eps)

@@ -1,0 +1,146 @@
+"""The one entry point: a scene, a state and times give a trajectory."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from polhode._checks import as_float_array, describe, is_concrete, require
+from polhode._lanes import PARTS, common_batch, flatten
+from polhode._methods import AbstractMethod, LiePoisson, Record
+from polhode._scene import Scene
+from polhode._state import State
+from polhode._status import SimulationError, Status
+from polhode._trajectory import Trajectory
+
+
+def simulate(
+    scene: Scene,
+    state: State,
+    ts: Float[ArrayLike, "*#b t"],
+    method: AbstractMethod | None = None,
+    *,
+    rtol: float | None = None,
+    record: Record | None = None,
+    throw: bool = True,
+) -> Trajectory:
+    """Move every body of the scene from ``state`` at ``ts[0]`` through the times ``ts``.
+
+    **Arguments:**
+
+    - ``scene``, ``state``: see ``ph.Scene``, ``ph.State``; batch axes broadcast together.
+    - ``ts``: (T,) or (..., T) [s], strictly increasing or strictly decreasing.
+    - ``method``: None lets the library choose; or ``ph.LiePoisson(...)``, ``ph.EulerAngles(...)``.
+    - ``rtol``: error asked for, attitude in radians and momenta relative to their size;
+      None: 1e-9 in float64, 1e-5 in float32. Exact methods ignore it.
+    - ``record``: what to keep; None: attitude and rates at all times.
+    - ``throw``: raise ``ph.SimulationError`` when a body did not finish. Under ``jit``, ``vmap``
+      or ``grad`` nothing is raised: look at ``Trajectory.status``.
+
+    Raises ValueError or TypeError for bad input: wrong kinds or shapes, unsorted times, mixed
+    dtypes, a tolerance that the dtype cannot reach.
+    """
+    scene, state, ts, record = check_inputs(scene, state, ts, record)
+    method = LiePoisson() if method is None else method
+    if not isinstance(method, AbstractMethod):
+        raise TypeError(
+            "method must be None or an object such as ph.LiePoisson(), got"
+            f" {type(method).__name__}."
+        )
+    rtol = check_rtol(rtol, state.wxyz.dtype)
+    trajectory = run(method, scene, state, ts, rtol, record)
+    if throw and is_concrete(trajectory.status):
+        raise_on_failure(trajectory)
+    return trajectory
+
+
+@eqx.filter_jit
+def run(method, scene, state, ts, rtol, record) -> Trajectory:
+    """The compiled part: lanes out of batches, the method, and back."""
+    parts = (getattr(scene, name) for name in PARTS)
+    batch = common_batch(*parts, state, extra=(ts.shape[:-1],))
+    parts = {name: flatten(getattr(scene, name), batch) for name in PARTS}
+    lanes = flatten(state, batch, shared=False)
+    times = ts
+    if ts.ndim > 1:
+        times = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
+    samples = method.run(Scene(**parts), lanes, times, rtol, record)
+    wxyz, omega, status, steps = jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), samples)
+    kept = ts[..., -1:] if record.final_only else ts
+    return Trajectory(kept, wxyz, omega, status, steps, scene)
+
+
+def check_inputs(
+    scene: Any, state: Any, ts: Any, record: Any
+) -> tuple[Scene, State, Array, Record]:
+    """Kinds, dtypes and times, with messages that tell the mend."""
+    for name, value, kind in (("scene", scene, Scene), ("state", state, State)):
+        if not isinstance(value, kind):
+            raise TypeError(f"{name} must be a ph.{kind.__name__}, got {type(value).__name__}.")
+    record = Record() if record is None else record
+    if not isinstance(record, Record):
+        raise TypeError(f"record must be a ph.Record or None, got {type(record).__name__}.")
+    dtypes = {x.dtype for x in jax.tree.leaves(eqx.filter((scene, state), eqx.is_inexact_array))}
+    if len(dtypes) != 1:
+        raise TypeError(
+            f"scene and state mix the dtypes {sorted(map(str, dtypes))}: make all arrays of one"
+            " dtype, for example with jnp.asarray(x, jnp.float64)."
+        )
+    ts = as_float_array("ts", ts, (None,)).astype(dtypes.pop())
+    if is_concrete(ts):
+        check_times(np.asarray(ts))
+    return scene, state, ts, record
+
+
+def check_times(ts: np.ndarray) -> None:
+    """At least two times, strictly monotonic."""
+    require(
+        ts.shape[-1] >= 2,
+        f"ts must hold at least two times, got {describe(ts)}: the state holds at ts[0].",
+    )
+    steps = np.diff(ts, axis=-1)
+    good = np.all(steps > 0, axis=-1) | np.all(steps < 0, axis=-1)
+    if not np.all(good):
+        turn = int(np.argwhere((steps <= 0) if steps.flat[0] > 0 else (steps >= 0))[0][-1])
+        raise ValueError(
+            "ts must be strictly increasing or strictly decreasing (in the dtype of the state,"
+            f" {ts.dtype}); entries {turn} and {turn + 1} are {ts[..., turn].flat[0]!r} and"
+            f" {ts[..., turn + 1].flat[0]!r}: sort them and drop repeated ones."
+        )
+
+
+def check_rtol(rtol: float | None, dtype) -> Array:
+    """The tolerance as an array of the state's dtype."""
+    eps = float(jnp.finfo(dtype).eps)
+    if rtol is None:
+        rtol = 1e-9 if eps < 1e-9 else 1e-5
+    if is_concrete(rtol):
+        require(np.isfinite(rtol) and rtol > 0, f"rtol must be positive, got {rtol}.")
+        require(
+            float(rtol) >= 8 * eps,
+            f"rtol={rtol:g} is below what {jnp.dtype(dtype).name} can reach (about {8 * eps:.0e}):"
+            " raise rtol, or use float64 (jax.config.update('jax_enable_x64', True)).",
+        )
+    return jnp.asarray(rtol, dtype)
+
+
+def raise_on_failure(trajectory: Trajectory) -> None:
+    """SimulationError naming what happened to how many bodies, and which came first."""
+    status = np.asarray(trajectory.status)
+    if np.all(status == Status.SUCCESSFUL):
+        return
+    lines = []
+    for code in np.unique(status[status != Status.SUCCESSFUL]):
+        found = np.argwhere(status == code)
+        first = tuple(int(i) for i in found[0])
+        which = (
+            f"{len(found)} of {status.size} bodies (first: index {first})" if first else "the body"
+        )
+        lines.append(f"{which}: {Status(int(code)).explanation}")
+    raise SimulationError(
+        "; ".join(lines) + ". Pass throw=False to get the trajectory with its status per body.",
+        status,
+    )

@@ -1,0 +1,48 @@
+"""How the simulation of each body ended."""
+
+import enum
+
+
+class Status(enum.IntEnum):
+    """Outcome per body, as stored in ``Trajectory.status``."""
+
+    SUCCESSFUL = 0
+    MAX_STEPS = 1
+    NOT_FINITE = 2
+    CHART_SINGULAR = 3
+    STEP_FAILED = 4
+    INACCURATE = 5
+
+    @property
+    def explanation(self) -> str:
+        """What happened and how to mend it."""
+        return _EXPLANATIONS[self]
+
+
+_EXPLANATIONS = {
+    Status.SUCCESSFUL: "finished",
+    Status.MAX_STEPS: (
+        "the solver used up max_steps before the last time: raise max_steps on the method,"
+        " loosen rtol, or shorten ts"
+    ),
+    Status.NOT_FINITE: (
+        "a NaN or infinity appeared: look at this body's inertia, state, potential and torque"
+    ),
+    Status.CHART_SINGULAR: (
+        "theta reached 0 or pi, where Euler angles break down: use ph.LiePoisson (or leave"
+        " method=None) for this body"
+    ),
+    Status.STEP_FAILED: "the step-size controller or an implicit solve gave up",
+    Status.INACCURATE: (
+        "the error estimate exceeds the tolerance asked for: lower rtol's ambition or raise the"
+        " number of steps"
+    ),
+}
+
+
+class SimulationError(RuntimeError):
+    """Some bodies did not finish; ``status`` (the batch's shape) tells which and why."""
+
+    def __init__(self, message: str, status):
+        super().__init__(message)
+        self.status = status

@@ -1,0 +1,144 @@
+"""The result of a simulation: sampled attitude and rates, everything else on demand."""
+
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from polhode import rotation
+from polhode._lanes import PARTS, along_time
+from polhode._scene import Scene
+from polhode._status import Status
+from polhode.hamiltonian import components, from_quaternion
+
+
+class Trajectory(eqx.Module):
+    """Samples of the motion; leading axes (...) are the batch, then T times.
+
+    **Fields:** ``ts`` (T,) or (..., T) [s]; ``wxyz`` (..., T, 4) body -> space, or None when not
+    recorded; ``omega_body`` (..., T, 3) [rad/s], or None; ``status`` (...): ``ph.Status`` per
+    body; ``steps`` (...): solver steps taken (0 for an exact solution); ``scene``.
+    """
+
+    ts: Float[Array, "*t"]
+    wxyz: Float[Array, "*b t 4"] | None
+    omega_body: Float[Array, "*b t 3"] | None
+    status: Int[Array, "*b"]
+    steps: Int[Array, "*b"]
+    scene: Scene
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading axes."""
+        return self.status.shape
+
+    @property
+    def successful(self) -> Array:
+        """Which bodies finished, (...) of bool."""
+        return self.status == Status.SUCCESSFUL
+
+    def _need(self, name: str) -> Array:
+        value = getattr(self, name)
+        if value is None:
+            raise ValueError(
+                f"this trajectory holds no {name}: ask for it with"
+                " record=ph.Record(attitude=True, rates=True) in ph.simulate."
+            )
+        return value
+
+    @property
+    def _scene(self) -> Scene:
+        """The scene with arrays shaped to broadcast against (..., T) samples."""
+        rank = len(self.batch_shape)
+        parts = {name: along_time(getattr(self.scene, name), rank) for name in PARTS}
+        return Scene(**parts)
+
+    @property
+    def _t(self) -> Array:
+        return self.ts.reshape((1,) * (len(self.batch_shape) + 1 - self.ts.ndim) + self.ts.shape)
+
+    @property
+    def momentum_body(self) -> Float[Array, "*b t 3"]:
+        """Angular momentum in body axes [kg m^2/s]."""
+        return self._scene.inertia.momentum(self._need("omega_body"))
+
+    @property
+    def momentum_space(self) -> Float[Array, "*b t 3"]:
+        """Angular momentum in space axes [kg m^2/s]."""
+        return rotation.rotate(self._need("wxyz"), self.momentum_body)
+
+    @property
+    def energy(self) -> Float[Array, "*b t"]:
+        """Kinetic plus potential energy [J]: the one Hamiltonian at every sample."""
+        scene = self._scene
+        attitude = None
+        if scene.potential is not None:
+            wxyz = self._need("wxyz")
+            attitude = from_quaternion(tuple(wxyz[..., i] for i in range(4)))
+        return scene.hamiltonian(components(self.momentum_body), attitude, self._t)
+
+    def euler(self) -> tuple[Array, Array, Array]:
+        """ZYZ Euler angles (phi, theta, psi) [rad], each (..., T)."""
+        return rotation.wxyz_to_euler(self._need("wxyz"))
+
+    def to_xarray(self) -> Any:
+        """An ``xarray.Dataset`` with named dimensions, units and attributes (needs xarray)."""
+        try:
+            import xarray
+        except ImportError as error:
+            raise ImportError("to_xarray needs xarray: pip install 'polhode[cli]'") from error
+
+        rank = len(self.batch_shape)
+        batch = ("body",) if rank == 1 else tuple(f"batch_{i}" for i in range(rank))
+        time = ("time",) if self.ts.ndim == 1 else (*batch, "time")
+        data: dict[str, Any] = {}
+
+        def put(name, array, dims, units, long_name):
+            data[name] = (dims, np.asarray(array), {"units": units, "long_name": long_name})
+
+        if self.wxyz is not None:
+            put(
+                "wxyz",
+                self.wxyz,
+                (*batch, "time", "quaternion"),
+                "1",
+                "attitude quaternion, scalar first, body to space",
+            )
+        if self.omega_body is not None:
+            put(
+                "omega_body",
+                self.omega_body,
+                (*batch, "time", "axis"),
+                "rad s-1",
+                "angular velocity in body axes",
+            )
+            if self.scene.potential is None or self.wxyz is not None:
+                put("energy", self.energy, (*batch, "time"), "J", "kinetic plus potential energy")
+            if self.wxyz is not None:
+                put(
+                    "momentum_space",
+                    self.momentum_space,
+                    (*batch, "time", "axis"),
+                    "kg m2 s-1",
+                    "angular momentum in space axes",
+                )
+        put("status", self.status, batch, "1", "outcome per body (0: finished)")
+        data["status"][2].update(
+            flag_values=np.array([int(s) for s in Status]),
+            flag_meanings=" ".join(s.name.lower() for s in Status),
+        )
+        coords: dict[str, Any] = {
+            "quaternion": list("wxyz"),
+            "axis": list("xyz"),
+        }
+        times = (time, np.asarray(self.ts), {"units": "s", "long_name": "time"})
+        (coords if self.ts.ndim == 1 else data)["time" if self.ts.ndim == 1 else "ts"] = times
+        from polhode import __version__
+
+        attributes = {
+            "title": "Rotating rigid bodies",
+            "source": f"polhode {__version__}",
+            "convention": "wxyz scalar first, body -> space; R = Rz(phi) Ry(theta) Rz(psi)",
+        }
+        return xarray.Dataset(data, coords=coords, attrs=attributes)

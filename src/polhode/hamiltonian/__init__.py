@@ -1,0 +1,32 @@
+"""The one Hamiltonian, the two charts derived from it, and document 000 as a reference."""
+
+from polhode.hamiltonian import _document_000 as document_000
+from polhode.hamiltonian._attitude import (
+    Attitude as Attitude,
+    components as components,
+    cross as cross,
+    dot as dot,
+    from_euler_angles as from_euler_angles,
+    from_quaternion as from_quaternion,
+)
+from polhode.hamiltonian._energy import (
+    Hamiltonian as Hamiltonian,
+    inverse_components as inverse_components,
+    inverse_inertia as inverse_inertia,
+)
+from polhode.hamiltonian._euler_chart import (
+    CanonicalHamiltonian as CanonicalHamiltonian,
+    canonical_from_momentum as canonical_from_momentum,
+    euler_angle_field as euler_angle_field,
+    hamiltonian as hamiltonian,
+    hamiltons_equations as hamiltons_equations,
+    momentum_from_canonical as momentum_from_canonical,
+    rates_from_angle_rates as rates_from_angle_rates,
+)
+from polhode.hamiltonian._lie_poisson import (
+    Dynamics as Dynamics,
+    lie_poisson_field as lie_poisson_field,
+    quaternion_rate as quaternion_rate,
+)
+
+__all__ = ["document_000"]

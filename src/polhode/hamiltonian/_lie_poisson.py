@@ -1,0 +1,71 @@
+"""The Lie-Poisson chart: unit quaternion and body angular momentum, free of singularities.
+
+dL/dt = L x dH/dL + sum_j r_j x dH/dr_j + N,   dq/dt = q (0, dH/dL) / 2,
+
+r_j the rows of R (body components of the space axes). Both derivatives of H come from one
+``jax.grad``; for V = 0 this is Euler's equation in body axes (theory section 7).
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from polhode.hamiltonian._attitude import Attitude, Vector, cross, from_quaternion, from_rows
+from polhode.hamiltonian._energy import Hamiltonian
+
+
+def quaternion_rate(wxyz: Sequence[Array], omega: Sequence[Array]) -> tuple[Array, ...]:
+    """dq/dt = q (0, omega) / 2 for body rates omega [rad/s]."""
+    w, x, y, z = wxyz
+    a, b, c = (rate / 2 for rate in omega)
+    return (
+        -x * a - y * b - z * c,
+        w * a + y * c - z * b,
+        w * b + z * a - x * c,
+        w * c + x * b - y * a,
+    )
+
+
+def rates_and_torque(
+    hamiltonian: Hamiltonian, momentum: Sequence[Array], attitude: Attitude, t: Array | float
+) -> tuple[Vector, Vector | None]:
+    """Body rates dH/dL [rad/s] and the potential's torque in body axes [N m] (None without one)."""
+    rows = {i: attitude.row(i) for i in hamiltonian.rows_used(attitude, t)}
+
+    def total(momentum, rows):
+        return jnp.sum(hamiltonian(momentum, from_rows(rows), t))
+
+    omega, slopes = jax.grad(total, argnums=(0, 1))(tuple(momentum), rows)
+    if not rows:
+        return omega, None
+    turns = [cross(rows[i], slopes[i]) for i in rows]
+    return omega, tuple(sum(parts[1:], start=parts[0]) for parts in zip(*turns))
+
+
+class Dynamics(eqx.Module):
+    """What moves a body: the Hamiltonian and the external torque (``AbstractTorque`` or None)."""
+
+    hamiltonian: Hamiltonian
+    torque: Any = None
+
+
+def lie_poisson_field(t, y, dynamics: Dynamics):
+    """The vector field on component arrays, with the call signature of a diffrax term.
+
+    ``y = (momentum, wxyz)``: three arrays [kg m^2/s] and four arrays of one shape. The result
+    has the structure of the state.
+    """
+    momentum, wxyz = y
+    attitude = from_quaternion(wxyz)
+    omega, turn = rates_and_torque(dynamics.hamiltonian, momentum, attitude, t)
+    rate = cross(momentum, omega)
+    if turn is not None:
+        rate = tuple(a + b for a, b in zip(rate, turn))
+    if dynamics.torque is not None:
+        push = dynamics.torque.body_components(t, attitude, omega)
+        rate = tuple(a + b for a, b in zip(rate, push))
+    return rate, quaternion_rate(wxyz, omega)

@@ -1,0 +1,110 @@
+"""External torques in body or space axes, constant or functions of time; damping."""
+
+import abc
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from polhode._checks import as_float_array, is_concrete, require
+from polhode.hamiltonian import Attitude, components
+
+
+class AbstractTorque(eqx.Module):
+    """Base of all torques; they add with ``+``.
+
+    ``body_components(t, attitude, omega)`` returns the torque [N m] as three body components,
+    ``omega`` three components of the body rates [rad/s]. ``core_ranks`` names the array fields
+    with their ranks without batch axes.
+    """
+
+    core_ranks: eqx.AbstractClassVar[dict[str, int]]
+
+    @abc.abstractmethod
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
+        """Torque in body axes [N m]."""
+
+    def __add__(self, other: "AbstractTorque") -> "TorqueSum":
+        if not isinstance(other, AbstractTorque):
+            raise TypeError(f"a torque adds to another torque, not to {type(other).__name__}")
+        return TorqueSum((*_terms(self), *_terms(other)))
+
+
+def _terms(torque: AbstractTorque) -> tuple[AbstractTorque, ...]:
+    return torque.terms if isinstance(torque, TorqueSum) else (torque,)
+
+
+class TorqueSum(AbstractTorque):
+    """Sum of torques."""
+
+    terms: tuple[AbstractTorque, ...]
+
+    core_ranks = {}  # noqa: RUF012
+
+    def body_components(self, t, attitude, omega):
+        parts = zip(*(term.body_components(t, attitude, omega) for term in self.terms))
+        return tuple(sum(rest, start=first) for first, *rest in parts)
+
+
+def _constant_or_function(name: str, n):
+    return n if callable(n) else as_float_array(name, n, (3,))
+
+
+def _value(n, t):
+    return components(jnp.asarray(n(t)) if callable(n) else n)
+
+
+class BodyTorque(AbstractTorque):
+    """Torque given in body axes [N m]: constant (..., 3) or a function of time [s] -> (3,)."""
+
+    n: Float[Array, "*#b 3"] | Callable
+
+    core_ranks = {"n": 1}  # noqa: RUF012
+
+    def __init__(self, n):
+        self.n = _constant_or_function("BodyTorque n", n)
+
+    def body_components(self, t, attitude, omega):
+        return _value(self.n, t)
+
+
+class SpaceTorque(AbstractTorque):
+    """Torque given in space axes [N m]: constant (..., 3) or a function of time [s] -> (3,)."""
+
+    n: Float[Array, "*#b 3"] | Callable
+
+    core_ranks = {"n": 1}  # noqa: RUF012
+
+    def __init__(self, n):
+        self.n = _constant_or_function("SpaceTorque n", n)
+
+    def body_components(self, t, attitude, omega):
+        return attitude.to_body(_value(self.n, t))
+
+
+class LinearDamping(AbstractTorque):
+    """Linear damping N = -c omega, component by component in body axes.
+
+    ``c`` (..., 3), or (...) for the same about every axis [N m s]; it must not be negative.
+    """
+
+    c: Float[Array, "*#b 3"]
+
+    core_ranks = {"c": 1}  # noqa: RUF012
+
+    def __init__(self, c):
+        c = as_float_array("LinearDamping c", c)
+        if c.ndim == 0:
+            c = jnp.broadcast_to(c, (3,))
+        self.c = as_float_array("LinearDamping c", c, (3,))
+        if is_concrete(self.c):
+            require(
+                self.c >= 0,
+                f"LinearDamping c must not be negative, got {c}: a positive c takes energy away.",
+            )
+
+    def body_components(self, t, attitude, omega):
+        return tuple(-c * rate for c, rate in zip(components(self.c), omega))
