@@ -1,16 +1,18 @@
 """The parts of a scene file that are chosen by kind: inertia, potentials, torques, rotors."""
 
 from polhode.io import _unit
-from polhode.io._specification import Part
-from polhode.io._table import Table
+from polhode.io._specification import Attitudes, Part
+from polhode.io._table import REQUIRED, Table
 
 INERTIA_KINDS = ("moments", "tensor", "axisymmetric", "spherical", "parts")
-# shape of a uniform solid -> its lengths: name and number of components
+# shape of a uniform solid -> its lengths: (number of components, whether it may be left out)
 SOLIDS = {
-    "box": {"size": (3,)},
-    "ellipsoid": {"semi_axes": (3,)},
-    "sphere": {"radius": ()},
-    "cylinder": {"radius": (), "height": ()},
+    "box": {"sides": ((3,), False), "inner_sides": ((3,), True)},
+    "ellipsoid": {"semi_axes": ((3,), False)},
+    "sphere": {"radius": ((), False), "inner_radius": ((), True)},
+    "cylinder": {"radius": ((), False), "length": ((), False), "inner_radius": ((), True)},
+    "cone": {"radius": ((), False), "height": ((), False)},
+    "torus": {"ring_radius": ((), False), "tube_radius": ((), False)},
 }
 # key of the file -> kind -> fields: name -> (shape, whether it may be left out)
 KINDS = {
@@ -36,6 +38,27 @@ KINDS = {
         }
     },
 }
+
+
+SEQUENCES = tuple(a + b + c for a in "xyz" for b in "xyz" for c in "xyz" if a != b and b != c)
+
+
+def read_sequence(table: Table, default: object = REQUIRED) -> str:
+    """Three letters, lower case."""
+    given = table.text("sequence", default)
+    if given.lower() not in SEQUENCES:
+        raise table.wrong(
+            "sequence", "unknown Euler sequence", given,
+            "three letters of x, y, z, neighbours different",
+        )  # fmt: skip
+    return given.lower()
+
+
+def read_euler(parent: Table) -> Attitudes:
+    """`euler = { sequence = "zyz", angles = [..], unit = "deg" }`."""
+    table = parent.table("euler", ("sequence", "angles", "unit"))
+    factor = _unit.ANGLES[table.choice("unit", tuple(_unit.ANGLES), "rad")]
+    return Attitudes(table.array("angles", (3,)) * factor, read_sequence(table, "zyz"))
 
 
 def read_inertia(top: Table) -> tuple[Part, bool]:
@@ -66,21 +89,28 @@ def _solids(inertia: Table):
     rows = inertia.rows("parts")
     if not rows:
         raise inertia.wrong("parts", "no part", rows, "one or more [[inertia.parts]]")
+    lengths = sorted({name for sizes in SOLIDS.values() for name in sizes})
     for index, data in enumerate(rows):
         where = f"inertia.parts {index + 1}"
-        lengths = tuple({name for sizes in SOLIDS.values() for name in sizes})
-        table = Table(inertia.file, where, data, ("shape", "mass", "centre", *sorted(lengths)))
-        shape = table.choice("shape", tuple(SOLIDS))
+        common = ("shape", "mass", "centre", "euler")
+        shape = Table(inertia.file, where, data, (*common, *lengths)).choice("shape", tuple(SOLIDS))
         sizes = SOLIDS[shape]
-        # read again with the keys of this shape only, so that a radius of a box is an error
-        table = Table(inertia.file, where, data, ("shape", "mass", "centre", *sizes))
-        values = {name: table.array(name, size) for name, size in sizes.items()}
+        # again with the keys of this shape only, so that the radius of a box is an error
+        table = Table(inertia.file, where, data, (*common, *sizes))
+        values = {
+            name: table.array(name, size)
+            for name, (size, optional) in sizes.items()
+            if name in table or not optional
+        }
         for name, value in values.items():
             if value.min() <= 0:
                 raise table.wrong(name, "not positive", data[name], "positive lengths in m")
         values["mass"] = table.number("mass", positive=True)
-        values["centre"] = table.array("centre", (3,)) if "centre" in table else (0.0, 0.0, 0.0)
-        yield Part(shape, values, f"[{where}]")
+        place = {
+            "centre": table.array("centre", (3,)) if "centre" in table else (0.0, 0.0, 0.0),
+            "euler": read_euler(table) if "euler" in table else None,
+        }
+        yield Part(shape, values, f"[{where}]"), place
 
 
 def read_parts(top: Table, key: str) -> tuple[Part, ...]:

@@ -8,11 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from polhode.io import _unit
-from polhode.io._attitude import SEQUENCES, quaternion_of_sequence
 from polhode.io._error import SceneFileError, shorten
-from polhode.io._parts import read_inertia, read_parts
+from polhode.io._parts import read_euler, read_inertia, read_parts, read_sequence
 from polhode.io._specification import (
-    EulerAngles,
+    Attitudes,
     InitialState,
     Method,
     MonteCarlo,
@@ -23,7 +22,7 @@ from polhode.io._specification import (
     Spread,
     Times,
 )
-from polhode.io._table import REQUIRED, Table
+from polhode.io._table import Table
 
 TOP = (
     "title", "source", "epoch", "frame", "axis_names", "inertia", "state", "times", "potential",
@@ -114,38 +113,22 @@ def _axis_names(top: Table) -> tuple[str, str, str]:
 
 def _state(top: Table) -> InitialState:
     table = top.table("state", ("wxyz", "euler", "omega_body", "momentum_body"))
-    wxyz, euler = np.array([1.0, 0.0, 0.0, 0.0]), None
+    attitude = Attitudes(np.array([1.0, 0.0, 0.0, 0.0]))
     if "wxyz" in table or "euler" in table:
         if table.one_of("wxyz", "euler") == "wxyz":
-            wxyz = _quaternion(table, "wxyz")
+            attitude = Attitudes(_quaternion(table))
         else:
-            euler = _euler(table.table("euler", ("sequence", "angles", "unit")))
-            wxyz = quaternion_of_sequence(euler.sequence, euler.angles)
+            attitude = read_euler(table)
     rate = table.one_of("omega_body", "momentum_body")
     units = _unit.ANGULAR_RATES if rate == "omega_body" else {"kg m^2/s": 1.0}
-    return InitialState(wxyz, euler, rate, table.quantity(rate, (3,), units)[0])
+    return InitialState(attitude, rate, table.quantity(rate, (3,), units)[0])
 
 
-def _quaternion(table: Table, key: str) -> np.ndarray:
-    value = table.array(key, (4,))
+def _quaternion(table: Table) -> np.ndarray:
+    value = table.array("wxyz", (4,))
     if not value.any():
-        raise table.wrong(key, "zero quaternion", value.tolist(), "four numbers, not all zero")
-    value = value / np.abs(value).max()
-    return value / np.linalg.norm(value)
-
-
-def _sequence(table: Table, key: str, default: object = REQUIRED) -> str:
-    given = table.text(key, default)
-    if given.lower() not in SEQUENCES:
-        raise table.wrong(
-            key, "unknown Euler sequence", given, "three letters of x, y, z, neighbours different"
-        )
-    return given.lower()
-
-
-def _euler(table: Table) -> EulerAngles:
-    factor = _unit.ANGLES[table.choice("unit", tuple(_unit.ANGLES), "rad")]
-    return EulerAngles(_sequence(table, "sequence", "zyz"), table.array("angles", (3,)) * factor)
+        raise table.wrong("wxyz", "zero quaternion", value.tolist(), "four numbers, not all zero")
+    return value
 
 
 def _times(top: Table) -> Times:
@@ -211,7 +194,7 @@ def _monte_carlo(top: Table, inertia: str, state: InitialState) -> MonteCarlo | 
         table.one_of(*QUANTITIES)
     needs = {
         "moments": (inertia == "moments", "only for an [inertia] given by its moments"),
-        "euler": (state.euler is not None, "only for a [state] given by Euler angles"),
+        "euler": (state.attitude.sequence is not None, "only for a [state] given by Euler angles"),
         "omega_body": (state.rate == "omega_body", "only for a [state] with omega_body"),
         "momentum_body": (state.rate == "momentum_body", "only for a [state] with momentum_body"),
     }
@@ -260,14 +243,15 @@ def _observations(top: Table, epoch: datetime.datetime | None) -> Observations |
         return None
     head = ("source", "sequence", "angle_unit", "rate_unit", "time_unit", "rows")
     table = top.table("observations", head)
-    sequence = _sequence(table, "sequence", "zyz")
+    sequence = read_sequence(table, "zyz")
     angle = _unit.ANGLES[table.choice("angle_unit", tuple(_unit.ANGLES), "rad")]
     rate = _unit.ANGULAR_RATES[table.choice("rate_unit", tuple(_unit.ANGULAR_RATES), "rad/s")]
     second = _unit.SECONDS[table.choice("time_unit", tuple(_unit.SECONDS), "s")]
     rows = table.rows("rows")
     if not rows:
         raise table.wrong("rows", "no observation", rows, "one or more rows { time = .., ... }")
-    seconds, wxyz, omega = [], [], []
+    seconds, attitudes, omega = [], [], []
+    kind = "angles" if any("angles" in row for row in rows) else "wxyz"
     for index, data in enumerate(rows):
         row = Table(
             top.file, f"observations row {index + 1}", data,
@@ -282,10 +266,14 @@ def _observations(top: Table, epoch: datetime.datetime | None) -> Observations |
             seconds.append((_moment(row, "utc") - epoch).total_seconds())
         else:
             seconds.append(row.number("time") * second)
-        if row.one_of("angles", "wxyz") == "wxyz":
-            wxyz.append(_quaternion(row, "wxyz"))
+        if kind == "angles" and "wxyz" in row:
+            raise row.wrong("wxyz", "mixed kinds of attitude", data, "angles in every row, or wxyz")
+        if kind not in row and "omega_body" not in row:
+            row.one_of(kind, "omega_body")
+        if kind not in row:
+            attitudes.append([np.nan] * (3 if kind == "angles" else 4))
         else:
-            wxyz.append(quaternion_of_sequence(sequence, row.array("angles", (3,)) * angle))
+            attitudes.append(_quaternion(row) if kind == "wxyz" else row.array(kind, (3,)) * angle)
         rates = row.array("omega_body", (3,)) * rate if "omega_body" in row else [np.nan] * 3
         omega.append(rates)
     if np.any(np.diff(seconds) <= 0):
@@ -295,7 +283,10 @@ def _observations(top: Table, epoch: datetime.datetime | None) -> Observations |
             "rows in the order of time", "sort the rows",
         )  # fmt: skip
     return Observations(
-        np.array(seconds), np.array(wxyz), np.array(omega), table.text("source", "")
+        np.array(seconds),
+        Attitudes(np.array(attitudes), sequence if kind == "angles" else None),
+        np.array(omega),
+        table.text("source", ""),
     )
 
 

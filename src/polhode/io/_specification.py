@@ -18,19 +18,22 @@ class Part:
 
 
 @dataclasses.dataclass(frozen=True)
-class EulerAngles:
-    """R = R_a(angle 1) R_b(angle 2) R_c(angle 3) for the letters of `sequence`; rad."""
+class Attitudes:
+    """Attitudes as the file gives them: quaternions (..., 4), or Euler angles (..., 3) in rad.
 
-    sequence: str
-    angles: np.ndarray
+    R = R_a(angle 1) R_b(angle 2) R_c(angle 3) for the letters abc of `sequence` (None: quaternions
+    `wxyz`, not yet normalised), body -> space.
+    """
+
+    values: np.ndarray
+    sequence: str | None = None
 
 
 @dataclasses.dataclass(frozen=True)
 class InitialState:
-    """Attitude (`wxyz` or `euler`) and rates or momentum at the first time."""
+    """Attitude, and rates or momentum (`rate` says which), at the first time."""
 
-    wxyz: np.ndarray
-    euler: EulerAngles | None
+    attitude: Attitudes
     rate: str
     value: np.ndarray
 
@@ -82,10 +85,10 @@ class PublishedValue:
 
 @dataclasses.dataclass(frozen=True)
 class Observations:
-    """Observed attitudes (n, 4), body rates (n, 3) or NaN where a row has none; times (n,) s."""
+    """Attitudes and body rates (n, 3) observed at n times (s); NaN where a row has none."""
 
     seconds: np.ndarray
-    wxyz: np.ndarray
+    attitudes: Attitudes
     omega_body: np.ndarray
     source: str
 

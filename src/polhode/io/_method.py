@@ -1,0 +1,56 @@
+"""The [method] of a scene file as a method object."""
+
+import inspect
+
+import diffrax
+
+import polhode
+from polhode import solvers
+from polhode.io._build import blamed
+from polhode.io._error import SceneFileError
+from polhode.io._specification import SceneFile
+from polhode.io._table import suggestion
+
+
+def build_method(file: SceneFile) -> "polhode.AbstractMethod | None":
+    """The method object, or None when the planner is to choose.
+
+    Raises SceneFileError for a solver that neither polhode nor diffrax has.
+    """
+    method = file.method
+    if method.kind == "auto":
+        return None
+    if method.kind == "closed-form":
+        return polhode.ClosedForm()
+    chart = {"lie-poisson": polhode.LiePoisson, "euler-angles": polhode.EulerAngles}[method.kind]
+    options = {}
+    with blamed(file, "[method]"):
+        if method.solver is not None:
+            options["solver"] = _solver(file, method.solver)
+        if method.step is not None:
+            options["dt0"] = method.step * _direction(file)
+            options["controller"] = diffrax.ConstantStepSize()
+        return chart(**options)
+
+
+def _direction(file: SceneFile) -> float:
+    seconds = file.times.seconds
+    return 1.0 if seconds[-1] > seconds[0] else -1.0
+
+
+def _solver(file: SceneFile, name: str) -> diffrax.AbstractSolver:
+    known = {
+        key: value
+        for room in (diffrax, solvers)
+        for key, value in vars(room).items()
+        if inspect.isclass(value)
+        and issubclass(value, diffrax.AbstractSolver)
+        and not key.startswith("Abstract")
+    }
+    if name not in known:
+        raise SceneFileError(
+            file.path, "[method] solver", "unknown solver", name,
+            "the name of a solver of diffrax or polhode.solvers, such as Dopri8",
+            suggestion(name, tuple(known)),
+        )  # fmt: skip
+    return known[name]()

@@ -1,0 +1,81 @@
+"""The scenes that come with the project read, build in both dtypes and say what they claim."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from polhode.io import build_scene, build_state, draw_clones, read_scene
+
+FOLDER = Path(__file__).parents[2] / "scenes"
+SCENES = sorted(FOLDER.glob("*.toml"))
+
+
+def test_there_are_scenes():
+    assert len(SCENES) >= 5
+
+
+@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_scene_builds(path, dtype):
+    file = read_scene(path)
+    scene = build_scene(file, dtype)
+    state = build_state(file, dtype, scene.inertia)
+    assert scene.inertia.dtype == state.wxyz.dtype == state.omega_body.dtype == dtype
+    np.testing.assert_allclose(np.linalg.norm(state.wxyz), 1, rtol=1e-6)
+    assert file.source
+    if file.monte_carlo is not None:
+        assert all(spread.source for spread in file.monte_carlo.spreads)
+
+
+def test_wing_nut_spins_about_its_intermediate_axis():
+    file = read_scene(FOLDER / "wing_nut.toml")
+    inertia = build_scene(file, np.float64).inertia
+    along_spin = np.asarray(inertia.tensor)[0, 0]
+    smallest, middle, largest = np.sort(inertia.moments)
+    assert smallest < middle < largest
+    np.testing.assert_allclose(along_spin, middle, rtol=1e-12)
+
+
+def test_clones_are_drawn_as_the_file_says():
+    file = read_scene(FOLDER / "toutatis.toml")
+    clones = draw_clones(file, np.float64)
+    again = draw_clones(file, np.float64)
+    assert clones.redrawn == 0
+    moments, omega = np.asarray(clones.inertia.moments), np.asarray(clones.state.omega_body)
+    np.testing.assert_array_equal(moments, again.inertia.moments)
+    assert moments.shape == omega.shape == (1001, 3)
+    np.testing.assert_array_equal(moments[0], [3.0836, 3.235, 1.0])
+    np.testing.assert_array_equal(moments[:, 2], 1.0)
+    np.testing.assert_array_equal(omega[0], file.state.value)
+    # mean and spread of 1000 draws, five standard errors wide
+    relative = moments[1:, :2] / moments[0, :2] - 1
+    assert np.abs(relative.mean(axis=0)).max() < 5 * 0.01 / np.sqrt(1000)
+    np.testing.assert_allclose(relative.std(axis=0), 0.01, rtol=5 / np.sqrt(2000))
+    rates = np.rad2deg(omega[1:] - omega[0]) * 86400
+    np.testing.assert_allclose(rates.std(axis=0), 0.08, rtol=5 / np.sqrt(2000))
+    # independent streams: no correlation between quantities
+    assert abs(np.corrcoef(relative[:, 0], rates[:, 0])[0, 1]) < 5 / np.sqrt(1000)
+    # the same draws in float32, and unchanged when another spread is taken out
+    single = draw_clones(file, np.float32)
+    np.testing.assert_allclose(single.inertia.moments, moments, rtol=1e-6)
+
+
+def test_impossible_moments_are_drawn_again_or_refused(tmp_path):
+    from polhode.io import SceneFileError, parse_scene
+
+    text = """
+    inertia = { moments = [1.0, 1.0, 1.99] }
+    state = { omega_body = [1.0, 0.0, 0.0] }
+    times = { stop = 1.0, number = 2 }
+    monte_carlo = { clones = 500, seed = 2, moments = { relative_sigma = SIZE, source = "test" } }
+    """
+    clones = draw_clones(parse_scene(text.replace("SIZE", "0.1")), np.float64)
+    moments = np.asarray(clones.inertia.moments)
+    assert clones.redrawn > 100
+    assert moments.shape == (501, 3)
+    assert (2 * moments.max(axis=1) <= moments.sum(axis=1)).all()
+    with pytest.raises(SceneFileError, match="make relative_sigma smaller"):
+        draw_clones(parse_scene(text.replace("SIZE", "[0, 0, 1e9]")), np.float64)
+    with pytest.raises(SceneFileError, match="triangle inequality"):
+        draw_clones(parse_scene(text.replace("1.99", "2.5").replace("SIZE", "0.1")), np.float64)
