@@ -113,7 +113,8 @@ def principal(
     Derivatives: ``wxyz`` carries none. ``moments`` and ``products`` carry those of ``R^T I R`` at
     fixed R, which exist for equal moments too; for separate moments those of ``moments`` are the
     usual ones. What depends on the tensor alone has its right derivative when it is computed from
-    moments, products and wxyz together.
+    moments, products and wxyz together. This holds to first order: the second derivative of an
+    eigenvalue needs the turning of the axes, which is left out.
     """
     entries = [[(tensor[..., i, j] + tensor[..., j, i]) / 2 for j in range(3)] for i in range(3)]
     fixed = jax.lax.stop_gradient(tensor)

@@ -1,6 +1,7 @@
 """Homogeneous bodies bounded by triangle meshes: exact volume integrals."""
 
 from os import PathLike
+from os.path import isfile
 
 import jax
 import jax.numpy as jnp
@@ -105,7 +106,8 @@ def mesh_integrals(
 def load_mesh(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (v, 3) and faces (f, 3) of a mesh file (STL, OBJ, PLY, ...), read by trimesh.
 
-    Raises ImportError without trimesh, ValueError when the file cannot be read as one mesh.
+    Raises ImportError without trimesh, FileNotFoundError without the file, ValueError when it
+    cannot be read as one mesh.
     """
     try:
         import trimesh
@@ -113,10 +115,10 @@ def load_mesh(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
         raise ImportError(
             "reading mesh files needs trimesh: pip install 'polhode[mesh]'."
         ) from error
+    if not isfile(path):
+        raise FileNotFoundError(f"there is no mesh file {path}.")
     try:
         mesh = trimesh.load_mesh(path, process=True)
-    except FileNotFoundError:
-        raise
     except Exception as error:
         raise ValueError(f"{path} could not be read as a mesh: {error}") from error
     faces = np.asarray(getattr(mesh, "faces", np.zeros((0, 3), int)))
