@@ -108,7 +108,7 @@ def wxyz_to_euler(
     else:
         parity = _parity(i, j, k)
         along_k = parity * wxyz[..., 1 + k]
-        # R_i(a) R_j(b) R_k(c), turned on by a quarter about j, is R_i(a) R_j(b + pi/2) R_i(+-c).
+        # R_i(a) R_j(b) R_k(c), turned on by a quarter about j, is R_i(a) R_j(b + pi/2) R_i(-parity c).
         sums = (w - along_j, along_i - along_k)
         differences = (w + along_j, along_i + along_k)
     sum_size, sum_cos, sum_sin = _phase(*sums)
@@ -125,7 +125,7 @@ def wxyz_to_euler(
     if sequence.is_proper:
         second = 2 * jnp.arctan2(difference_size, sum_size)
     else:
-        third = parity * third
+        third = -parity * third
         sine = 2 * (w * along_j + along_i * along_k)
         second = jnp.arctan2(sine, sum_size * difference_size)
     if sequence.is_extrinsic:

@@ -25,8 +25,7 @@ def modified_rodrigues_to_wxyz(parameters: Float[Array, "*b 3"]) -> Float[Array,
     one, scaled = 1 / scale, parameters / scale
     squared = jnp.sum(scaled * scaled, axis=-1, keepdims=True)
     total = one * one + squared
-    size = length(scaled)[..., None]
-    scalar = (one - size) * (one + size) / total
+    scalar = 2 * (one * one / total) - 1  # its derivative has no cancellation for long parameters
     return jnp.concatenate([scalar, 2 * one * scaled / total], axis=-1)
 
 
