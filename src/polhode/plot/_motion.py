@@ -1,0 +1,122 @@
+"""What is plotted: samples of one or many bodies as plain numpy arrays."""
+
+import dataclasses
+
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from polhode._trajectory import Trajectory
+from polhode.inertia import Inertia
+
+
+@dataclasses.dataclass(frozen=True)
+class Motion:
+    """Samples of N bodies: ts (N, T), wxyz (N, T, 4), omega_body (N, T, 3), tensor (N, 3, 3).
+
+    `wxyz`, `tensor` and `energy` (N, T) may be None: the plots that need them say so.
+    """
+
+    ts: np.ndarray
+    omega_body: np.ndarray
+    wxyz: np.ndarray | None = None
+    tensor: np.ndarray | None = None
+    energy: np.ndarray | None = None
+
+    def need(self, name: str, what: str) -> np.ndarray:
+        value = getattr(self, name)
+        if value is None:
+            mend = "inertia" if name in ("tensor", "energy") else name
+            raise ValueError(
+                f"plotting {what} needs {mend}, which was not given: pass it to plot.motion, or "
+                "plot a Trajectory that recorded attitude and rates."
+            )
+        return value
+
+    @property
+    def count(self) -> int:
+        """How many bodies."""
+        return self.omega_body.shape[0]
+
+    @property
+    def momentum_body(self) -> np.ndarray:
+        tensor = self.need("tensor", "the angular momentum")
+        return np.einsum("nij,ntj->nti", tensor, self.omega_body)
+
+    @property
+    def matrices(self) -> np.ndarray:
+        """R (N, T, 3, 3), body -> space: column k is body axis k in space."""
+        return matrices(self.need("wxyz", "the attitude"))
+
+    @property
+    def momentum_space(self) -> np.ndarray:
+        return np.einsum("ntij,ntj->nti", self.matrices, self.momentum_body)
+
+
+def motion(
+    ts: Float[ArrayLike, "*#b t"],
+    omega_body: Float[ArrayLike, "*#b t 3"],
+    wxyz: Float[ArrayLike, "*#b t 4"] | None = None,
+    inertia: Inertia | None = None,
+) -> Motion:
+    """Arrays to plot: times (..., T) s, body rates (..., T, 3) rad/s, attitudes (..., T, 4).
+
+    Leading axes are flattened to one axis of bodies. Raises ValueError for shapes that do not fit
+    together.
+    """
+    omega = np.asarray(omega_body, np.float64)
+    if omega.ndim < 2 or omega.shape[-1] != 3:
+        raise ValueError(f"omega_body must have shape (..., T, 3), got {omega.shape}.")
+    lead, samples = omega.shape[:-2], omega.shape[-2]
+
+    def flat(name, value, core):
+        value = np.asarray(value, np.float64)
+        if value.shape[value.ndim - len(core) :] != core:
+            raise ValueError(f"{name} must have shape (..., {core}), got {value.shape}.")
+        return np.broadcast_to(value, lead + core).reshape(-1, *core)
+
+    energy = tensor = None
+    if inertia is not None:
+        tensor = flat("inertia", inertia.tensor, (3, 3))
+        energy = np.einsum("nti,nij,ntj->nt", omega.reshape(-1, samples, 3), tensor,
+                           omega.reshape(-1, samples, 3)) / 2  # fmt: skip
+    return Motion(
+        flat("ts", ts, (samples,)),
+        omega.reshape(-1, samples, 3),
+        None if wxyz is None else flat("wxyz", wxyz, (samples, 4)),
+        tensor,
+        energy,
+    )
+
+
+def as_motion(what: Trajectory | Motion) -> Motion:
+    """The motion of a trajectory, or the motion itself."""
+    if isinstance(what, Motion):
+        return what
+    if not isinstance(what, Trajectory):
+        raise TypeError(
+            f"expected a ph.Trajectory or a plot.motion(...), got {type(what).__name__}."
+        )
+    made = motion(what.ts, what.omega_body, what.wxyz, what.scene.inertia)
+    has_energy = what.scene.potential is None or what.wxyz is not None
+    energy = np.asarray(what.energy, np.float64).reshape(made.ts.shape) if has_energy else None
+    return dataclasses.replace(made, energy=energy)
+
+
+def pick(what: Trajectory | Motion, body: int | None) -> tuple[Motion, int]:
+    """The motion and the index of the body to plot (counted over flattened batch axes)."""
+    made = as_motion(what)
+    body = 0 if body is None else body
+    if not -made.count <= body < made.count:
+        raise ValueError(f"body must be below the number of bodies, {made.count}, got {body}.")
+    return made, body % made.count
+
+
+def matrices(wxyz: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
+    w, x, y, z = np.moveaxis(wxyz, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))

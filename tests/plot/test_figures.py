@@ -1,0 +1,211 @@
+"""Figures draw what they say; bad input is named; the user's settings stay as they are."""
+
+import sys
+
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import pytest
+
+matplotlib.use("agg")
+from matplotlib import pyplot as plt
+
+import polhode as ph
+from polhode import plot
+from polhode.plot import _animate, _polhode
+
+MOMENTS = np.array([1.0, 2.0, 2.5])
+
+
+@pytest.fixture(scope="module")
+def trajectory():
+    """Two bodies in free motion."""
+    scene = ph.Scene(ph.Inertia.from_moments(MOMENTS))
+    omega = jnp.array([[0.1, 1.0, 0.2], [1.0, 0.3, 0.1]])
+    state = ph.State(wxyz=jnp.array([1.0, 0.0, 0.0, 0.0]), omega_body=omega)
+    return ph.simulate(scene, state, np.linspace(0, 20, 201), ph.LiePoisson())
+
+
+@pytest.fixture(autouse=True)
+def _close_figures():
+    yield
+    plt.close("all")
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_family_curves_have_the_energy_and_momentum_they_are_drawn_for(axis):
+    for inertia in (1.2, 1.9) if axis == 0 else (2.1, 2.45):
+        curves = list(_polhode._level(MOMENTS, 3.0, inertia, axis))
+        assert len(curves) == 2
+        for side, curve in zip((1, -1), curves, strict=True):
+            np.testing.assert_allclose(curve**2 @ MOMENTS, 3.0, rtol=1e-13)
+            np.testing.assert_allclose(curve**2 @ MOMENTS**2, 3.0 * inertia, rtol=1e-13)
+            assert (side * curve[:, axis] > 0).all()
+
+
+def test_separatrix_passes_through_the_intermediate_axis():
+    for curve in _polhode._separatrix(MOMENTS, 3.0):
+        np.testing.assert_allclose(curve**2 @ MOMENTS**2, 3.0 * 2.0, rtol=1e-13)
+        assert np.abs(curve[:, 1]).max() == pytest.approx(np.sqrt(3.0 / 2.0))
+        assert np.abs(curve[:, 2]).min() < 1e-7
+    assert not list(_polhode._separatrix(np.array([1.0, 1.0, 2.0]), 3.0))
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_polhode_curve_lies_on_the_ellipsoid(trajectory, turned):
+    made = plot.motion(
+        trajectory.ts,
+        trajectory.omega_body,
+        inertia=ph.Inertia.from_tensor(_tensor()) if turned else trajectory.scene.inertia,
+    )
+    ax = plot.polhode(made, body=1)
+    drawn = [line for line in ax.lines if line.get_linewidth() == 2.4]
+    points = np.concatenate([np.stack(line.get_data_3d(), axis=-1) for line in drawn])
+    points = points[np.isfinite(points).all(axis=-1)]
+    assert len(points) >= 201
+    tensor = made.tensor[1]
+    twice = made.omega_body[1, 0] @ tensor @ made.omega_body[1, 0]
+    semi = np.sqrt(twice / np.linalg.eigvalsh(tensor).min())
+    if not turned:
+        energy = np.einsum("pi,ij,pj->p", points * semi, tensor, points * semi)
+        np.testing.assert_allclose(energy, twice, rtol=1e-6)
+    rates = {tuple(np.round(p, 9)) for p in made.omega_body[1] / semi}
+    assert {tuple(np.round(p, 9)) for p in points} == rates
+
+
+def _tensor():
+    turn = np.linalg.qr(np.arange(9.0).reshape(3, 3) + np.eye(3))[0]
+    return turn @ np.diag(MOMENTS) @ turn.T
+
+
+def test_herpolhode_stays_between_its_circles(trajectory):
+    ax = plot.herpolhode(trajectory)
+    inner, outer, curve = ax.lines[:3]
+    radius = np.hypot(*curve.get_data())
+    assert np.hypot(*inner.get_data()).max() == pytest.approx(radius.min())
+    assert np.hypot(*outer.get_data()).max() == pytest.approx(radius.max())
+    # |w|^2 = (part along L)^2 + radius^2, and the part along L is 2T/|L|
+    omega, momentum = np.asarray(trajectory.omega_body[0]), np.asarray(trajectory.momentum_body[0])
+    along = np.sum(omega * momentum, axis=-1) / np.linalg.norm(momentum, axis=-1)
+    np.testing.assert_allclose(radius**2, np.sum(omega**2, axis=-1) - along**2, rtol=1e-6)
+
+
+def test_history_shows_rates_attitude_and_drift(trajectory):
+    figure = plot.history(trajectory, body=1)
+    rates, attitude, drift = figure.axes
+    np.testing.assert_array_equal(rates.lines[0].get_ydata(), trajectory.omega_body[1, :, 0])
+    np.testing.assert_array_equal(attitude.lines[3].get_ydata(), trajectory.wxyz[1, :, 3])
+    energy = np.asarray(trajectory.energy[1])
+    want = np.abs(energy / energy[0] - 1)
+    np.testing.assert_allclose(np.nan_to_num(drift.lines[0].get_ydata()), want, rtol=1e-12)
+    bare = plot.history(plot.motion(trajectory.ts, trajectory.omega_body))
+    assert len(bare.axes) == 1
+
+
+def test_work_precision_sorts_and_names_failures():
+    curves = {"good": ([1e-3, 1e-6], [2.0, 1.0]), "bad": ([np.nan], [1.0])}
+    ax = plot.work_precision(curves, highlight="good")
+    np.testing.assert_array_equal(ax.lines[0].get_xdata(), [1.0, 2.0])
+    np.testing.assert_array_equal(ax.lines[0].get_ydata(), [1e-6, 1e-3])
+    names = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert names == ["good", "bad (failed)"]
+    with pytest.raises(ValueError, match="one length"):
+        plot.work_precision({"odd": ([1.0, 2.0], [1.0])})
+    with pytest.raises(ValueError, match="at least one"):
+        plot.work_precision({})
+
+
+def test_overview_draws_bands_and_observations(trajectory):
+    first = slice(0, 3)
+    seen = plot.motion(
+        trajectory.ts[first], trajectory.omega_body[0, first], trajectory.wxyz[0, first]
+    )
+    three = plot.motion(
+        trajectory.ts,
+        trajectory.omega_body[np.array([0, 1, 1])],
+        trajectory.wxyz[np.array([0, 1, 1])],
+        trajectory.scene.inertia,
+    )
+    figure = plot.overview(three, observed=seen, title="two bodies")
+    panel = figure.axes[0]
+    assert len(panel.collections) == 3
+    line, dots = panel.lines[0], panel.lines[1]
+    # body x axis along space x: the first matrix entry
+    _, _, y, z = np.moveaxis(np.asarray(trajectory.wxyz[0]), -1, 0)
+    np.testing.assert_allclose(line.get_ydata(), 1 - 2 * (y**2 + z**2), atol=1e-15)
+    np.testing.assert_array_equal(dots.get_ydata(), line.get_ydata()[first])
+
+
+def test_boxes_have_the_inertia_of_their_body():
+    tensor = _tensor()
+    corners = _animate._box(tensor)
+    # a homogeneous box has one third of its corners' second moments
+    second = corners.T @ corners / 8 / 3
+    inertia = np.trace(second) * np.eye(3) - second
+    np.testing.assert_allclose(inertia / np.trace(inertia), tensor / np.trace(tensor), atol=1e-14)
+    assert np.linalg.norm(corners[0] - corners[-1]) == pytest.approx(1)
+
+
+def test_interpolation_takes_the_short_way_and_meets_the_samples():
+    ts = np.array([0.0, 1.0, 2.0])
+    half = np.array([0.0, 0.3, 0.6])
+    wxyz = np.stack([np.cos(half), np.sin(half), 0 * half, 0 * half], axis=-1)
+    wxyz[1] *= -1
+    at = _animate._interpolate(np.array([0.5, 1.0, 2.0]), ts, wxyz)
+    angle = np.arctan2(at[:, 2, 1], at[:, 1, 1])
+    np.testing.assert_allclose(angle, [0.3, 0.6, 1.2], atol=1e-12)
+    back = _animate._interpolate(np.array([0.5, 1.0, 2.0]), ts[::-1], wxyz[::-1])
+    np.testing.assert_allclose(back, at, atol=1e-12)
+
+
+@pytest.mark.parametrize("ending", ["gif", "html"])
+def test_animation_is_written_whole(trajectory, tmp_path, ending):
+    path = tmp_path / f"two.{ending}"
+    animation = plot.animate(trajectory, path, seconds=0.2, fps=10, dpi=30)
+    assert list(tmp_path.iterdir()) == [path]
+    assert path.stat().st_size > 500
+    plt.close(animation._fig)
+
+
+def test_animation_refuses_what_it_cannot_write(trajectory, tmp_path):
+    with pytest.raises(ValueError, match=r"\.gif, \.mp4 or \.html"):
+        plot.animate(trajectory, tmp_path / "a.avi")
+    with pytest.raises(ValueError, match="1 to 64 bodies"):
+        plot.animate(trajectory, bodies=[])
+    if not matplotlib.animation.writers.is_available("ffmpeg"):
+        with pytest.raises(RuntimeError, match="ffmpeg"):
+            plot.animate(trajectory, tmp_path / "a.mp4")
+    assert not list(tmp_path.iterdir())
+
+
+def test_missing_data_and_wrong_bodies_are_named(trajectory):
+    bare = plot.motion(trajectory.ts, trajectory.omega_body)
+    with pytest.raises(ValueError, match="needs inertia"):
+        plot.polhode(bare)
+    with pytest.raises(ValueError, match="needs wxyz"):
+        plot.herpolhode(bare)
+    with pytest.raises(ValueError, match="number of bodies, 2"):
+        plot.history(bare, body=2)
+    with pytest.raises(TypeError, match=r"ph\.Trajectory"):
+        plot.polhode(np.zeros((3, 3)))
+    with pytest.raises(ValueError, match="omega_body must have shape"):
+        plot.motion([0.0, 1.0], [1.0, 2.0])
+    with pytest.raises(ValueError, match="ts must have shape"):
+        plot.motion([0.0, 1.0, 2.0], np.zeros((2, 3)))
+    rest = plot.motion(
+        [0.0, 1.0], np.zeros((2, 3)), inertia=ph.Inertia.from_moments([1.0, 2.0, 2.5])
+    )
+    with pytest.raises(ValueError, match="at rest"):
+        plot.polhode(rest)
+
+
+def test_settings_of_the_user_are_left_alone(trajectory):
+    before = dict(matplotlib.rcParams)
+    plot.history(trajectory)
+    assert dict(matplotlib.rcParams) == before
+
+
+def test_message_without_matplotlib(trajectory, monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    with pytest.raises(ImportError, match=r"pip install 'polhode\[cli\]'"):
+        plot.history(trajectory)
