@@ -1,5 +1,11 @@
 """Elliptic integrals and functions with analytic derivatives; nothing about bodies."""
 
+from polhode.elliptic._carlson import (
+    carlson_rc as carlson_rc,
+    carlson_rd as carlson_rd,
+    carlson_rf as carlson_rf,
+    carlson_rj as carlson_rj,
+)
 from polhode.elliptic._complete import (
     associate_b as associate_b,
     associate_d as associate_d,
@@ -13,3 +19,9 @@ from polhode.elliptic._incomplete import (
     ellipf_sincos as ellipf_sincos,
 )
 from polhode.elliptic._jacobi import ellipj as ellipj, jacobi_epsilon as jacobi_epsilon
+from polhode.elliptic._third import (
+    associate_j as associate_j,
+    ellippi as ellippi,
+    ellippi_inc as ellippi_inc,
+    ellippi_inc_sincos as ellippi_inc_sincos,
+)
