@@ -6,7 +6,7 @@ from jax import Array
 from jaxtyping import ArrayLike, Float
 
 from polhode.elliptic._argument import as_floats, parameter_pair
-from polhode.elliptic._nome import HALF_PI, Nome, nome, period_log
+from polhode.elliptic._nome import HALF_PI, Nome, nome, period_parts
 
 # (2 theta4''(q) / 16 - theta4(q) theta2(q)^4 / 16) / q^2, highest power first.
 _S_NUMERATOR = (-40, 32, -28, 28, -16, 16, -16, 12, -8, 4, -4, 2)
@@ -20,7 +20,7 @@ def _smaller_first_kind(parameter: Nome) -> Array:
 def first_kind(m: Array, m1: Array) -> Array:
     """K for a pair already made by `parameter_pair`."""
     p = nome(m, m1)
-    logarithmic = jnp.where(p.q > 0, 0.5 * (1 + p.excess) * period_log(p), jnp.inf)
+    logarithmic = jnp.where(p.q > 0, 0.5 * period_parts(p)[0], jnp.inf)
     # The inequality also lets NaN through: it is False on both sides.
     value = jnp.where(p.circular, _smaller_first_kind(p), logarithmic)
     return jnp.where(jnp.isnan(m), jnp.nan, value)
@@ -39,7 +39,7 @@ def second_kind(m: Array, m1: Array) -> Array:
     smaller = _smaller_first_kind(p)
     deficit = p.x * p.deficit_per_x
     # m > 1/2: Legendre's relation E = (pi/2) / K' + K (1 - E'/K'), all terms positive.
-    legendre = HALF_PI / smaller + 0.5 * (1 + p.excess) * period_log(p) * deficit
+    legendre = HALF_PI / smaller + 0.5 * period_parts(p)[0] * deficit
     return jnp.where(p.circular, smaller * (1 - deficit), legendre)
 
 
@@ -71,8 +71,9 @@ def associate_b_of(m: Array, m1: Array) -> Array:
     p = nome(m, m1)
     series = _smaller_first_kind(p) * (1 - p.deficit_per_x)
     larger = jnp.where(p.circular, 1, m)
-    first = jnp.where(p.q > 0, 0.5 * (1 + p.excess) * period_log(p), 0)
-    return jnp.where(p.circular, series, (second_kind(m, m1) - m1 * first) / larger)
+    return jnp.where(
+        p.circular, series, (second_kind(m, m1) - m1 * 0.5 * period_parts(p)[0]) / larger
+    )
 
 
 @associate_b_of.defjvp

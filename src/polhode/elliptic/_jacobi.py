@@ -15,7 +15,7 @@ from jaxtyping import ArrayLike, Float
 
 from polhode.elliptic._argument import as_floats, parameter_pair
 from polhode.elliptic._complete import associate_b_of, associate_d_of, second_kind
-from polhode.elliptic._nome import Nome, nome, period_log
+from polhode.elliptic._nome import Nome, nome, period_parts
 
 # pi in three parts; the first two have 26 (10) significant bits, so that their products with a
 # count of half periods below 2^27 (2^14) are exact.
@@ -57,11 +57,14 @@ def phase(u: Array, p: Nome) -> Phase:
     """Reduce u and evaluate the few transcendental functions that the series need."""
     # v = u / (1 + excess) as u - u excess/(1 + excess): only the small part is rounded twice.
     circular_turns, v = reduce_half_turns(u, u * (p.excess / (1 + p.excess)))
-    first = 0.5 * (1 + p.excess) * period_log(p)
+    period, period_rest = period_parts(p)
     endless = (p.q == 0) | p.circular
-    period = jnp.where(endless, 1, 2 * first)
+    period = jnp.where(endless, 1, period)
     count = jax.lax.stop_gradient(jnp.where(endless, 0, jnp.round(u / period)))
-    r = u - count * period
+    # A head of half the bits, so that its product with the count is exact.
+    bits = (11, 25) if u.dtype == jnp.float64 else (8, 11)
+    head = jax.lax.reduce_precision(jax.lax.stop_gradient(period), *bits)
+    r = (u - count * head) - count * ((period - head) + period_rest)
     w = jnp.abs(r)
     # Beyond `largest` cn and dn underflow; the bound keeps their derivatives finite.
     largest = -0.98 * math.log(jnp.finfo(u.dtype).tiny)

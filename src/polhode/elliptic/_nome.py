@@ -7,6 +7,7 @@ Source: NIST DLMF 20.2, 20.7(viii), 22.2; the series of q in lambda: DLMF 19.5.5
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -55,7 +56,35 @@ def nome(m: Array, m1: Array) -> Nome:
     return Nome(circular, x, q, per_x, excess, theta2, theta3, theta4, deficit_per_x)
 
 
-def period_log(parameter: Nome) -> Array:
-    """-log(q), with 0 in place of infinity at q = 0."""
+_LN2_HEAD, _LN2_TAIL = 0.693145751953125, 1.4286068203094173e-06
+
+
+@jax.custom_jvp
+def log_parts(q: Array) -> tuple[Array, Array]:
+    """-log(q) for 0 < q <= 1 as an unevaluated sum, to a tenth of an ulp."""
+    fraction, exponent = jnp.frexp(q)
+    exponent = exponent.astype(q.dtype)
+    # The head of ln 2 has 16 bits: its product with an exponent is exact in float64, and in
+    # float32 as long as the exponent has at most 8 bits.
+    head = -exponent * _LN2_HEAD
+    tail = -exponent * _LN2_TAIL - jnp.log(fraction)
+    total = head + tail
+    back = total - head
+    return total, (head - (total - back)) + (tail - back)
+
+
+@log_parts.defjvp
+def _log_parts_rule(primals, tangents):
+    (q,), (dq,) = primals, tangents
+    total, rest = log_parts(q)
+    slope = -dq / q
+    return (total, rest), (slope, jnp.zeros_like(slope))
+
+
+def period_parts(parameter: Nome) -> tuple[Array, Array]:
+    """2K of m > 1/2 as an unevaluated sum, (1 + excess) (-log q); 0 at q = 0."""
     q = parameter.q
-    return -jnp.log(jnp.where(q > 0, q, 1))
+    large, rest = log_parts(jnp.where(q > 0, q, 1))
+    rest = rest + large * parameter.excess
+    total = large + rest
+    return total, rest - (total - large)
