@@ -1,0 +1,1 @@
+from polhode.solvers._extrapolation import Extrapolation as Extrapolation
