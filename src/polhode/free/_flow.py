@@ -1,0 +1,134 @@
+"""The exact free motion at given times."""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from polhode.free._exact import turns
+from polhode.free._motion import Swing, Turning
+from polhode.free._phase import cosine_sine, horner, parity, sine_half, sinh
+from polhode.free._roles import Triple, restore
+
+Scalars = Float[Array, "*b"]
+_barrier = jax.lax.optimization_barrier
+
+
+def sweep(swing: Swing, t: Scalars) -> tuple[Scalars, Scalars]:
+    """Half turns of the theta functions' argument: a whole number and the remainder."""
+    whole, rest = turns(swing.pace, t)
+    far = 2 * math.log(2) * {4: 55, 8: 450}[rest.dtype.itemsize]
+    rest = jnp.where(swing.endless, jnp.clip(swing.pace * t, -far, far), rest)
+    whole = jnp.where(swing.endless, 0, whole)
+    return whole, rest
+
+
+def jacobi(swing: Swing, rest: Scalars):
+    """sn / omega_p, cn, dn of the time since the last half turn, and the base sine."""
+    half = jnp.where(swing.circular, sine_half(rest), sinh(swing.span * rest))
+    half = _barrier(half)
+    sign = jnp.where(swing.circular, 1.0, -1.0).astype(half.dtype)
+    base = sign * half * half
+    cosine = 1 - 2 * base
+    other = jnp.sqrt(1 - base)
+    sine = 2 * half * other
+    z = sign * sine * sine
+    h = swing.nome
+    h2 = h * h
+    h4 = h2 * h2
+    h6, h8 = h4 * h2, h4 * h4
+    h9, h12 = h8 * h, h6 * h6
+    n1 = 1 - 3 * h2 + 5 * h6 - 7 * h12
+    n2 = 1 + h2 + h6 + h12
+    n3 = 1 + 2 * h + 2 * h4 + 2 * h9
+    n4 = 1 - 2 * h + 2 * h4 - 2 * h9
+    p1 = horner((n1, 4 * h2 - 20 * h6 + 56 * h12, 16 * h6 - 112 * h12, 64 * h12), z) / n1
+    p2 = horner((n2, -4 * h2 - 12 * h6 - 24 * h12, 16 * h6 + 80 * h12, -64 * h12), z) / n2
+    p3 = horner((n3, -4 * h - 16 * h4 - 36 * h9, 16 * h4 + 96 * h9, -64 * h9), z) / n3
+    p4 = horner((n4, 4 * h - 16 * h4 + 36 * h9, 16 * h4 - 96 * h9, 64 * h9), z) / n4
+    turned = cosine * p2
+    below = 1 / jnp.where(swing.circular, p4, turned)
+    sn = sine * p1 * below * swing.inverse_rate
+    cn = jnp.where(swing.circular, turned, p4) * below
+    dn = p3 * below
+    return half, (sn, cn, dn)
+
+
+def momentum(swing: Swing, functions: Triple) -> Triple:
+    """L along axes 1, 2, 3 from its initial value, by the addition theorems."""
+    S, C, N = functions
+    l1, l2, l3 = swing.momentum
+    k = swing.sense * swing.parity
+    below = 1 / (C * C + swing.r * swing.s * (l3 * l3) * (S * S))
+    return (
+        (l1 * C - k * (swing.r * l2 * l3) * S * N) * below,
+        (l2 * C * N + k * (swing.s * l1 * l3) * S) * below,
+        (l3 * N - k * (swing.p * l1 * l2) * S * C) * below,
+    )
+
+
+def attitude(
+    swing: Swing, turning: Turning, t: Scalars, rest, half, functions: Triple, now: Triple
+):
+    """Attitude from the angle about the momentum and the minimal rotation to axis 3."""
+    S, C, N = functions
+    whole, turned = turns(turning.pace, t)
+    turned = turned + turning.sway * rest
+    extra = jnp.round(turned)
+    cosine, sine = cosine_sine(turned - extra)
+    sign = parity(whole + extra)
+    cosine, sine = _barrier((sign * cosine, sign * sine))
+    square = half * half
+    other = jnp.sqrt(1 + jnp.where(swing.circular, -square, square))
+    double = 2 * half * other
+    z = jnp.where(swing.circular, double * double, square)
+    real = horner(turning.real, z) * jnp.where(swing.circular, 1, other)
+    imaginary = horner(turning.imaginary, z) * jnp.where(
+        swing.circular, 2 * double * (1 - 2 * square), half
+    )
+    real, imaginary = _barrier((real, imaginary))
+    l1, l2, l3 = now
+    first2, first3 = swing.momentum[1], jnp.abs(swing.momentum[2])
+    mu = turning.peak / turning.length
+    y, w = first3 / turning.peak, jnp.abs(l3) / turning.peak
+    a = mu * (1 + N) * (1 + y) * (1 + w) + (1 - mu) * (1 + N + y + w)
+    b = turning.bend * S * first2 * l2
+    # (cosine + i sine) (real - i imaginary) (a + i b)
+    f, g = real * a + imaginary * b, real * b - imaginary * a
+    c, s = cosine * f - sine * g, cosine * g + sine * f
+    height = turning.length + jnp.abs(l3)
+    scale = jax.lax.rsqrt((c * c + s * s) * (height * height + l1 * l1 + l2 * l2))
+    c, s = _barrier((c * scale, s * scale))
+    facing = jnp.copysign(1, swing.momentum[2])
+    side = swing.parity * facing
+    v1, v2, v3 = restore(
+        (s * l1 + side * c * l2, s * l2 - side * c * l1, facing * s * height),
+        swing.middle,
+        swing.circled,
+    )
+    v0 = c * height
+    v0, v1, v2, v3 = _barrier((v0, v1, v2, v3))
+    q0, q1, q2, q3 = turning.start
+    return (
+        q0 * v0 - q1 * v1 - q2 * v2 - q3 * v3,
+        q0 * v1 + q1 * v0 + q2 * v3 - q3 * v2,
+        q0 * v2 + q2 * v0 + q3 * v1 - q1 * v3,
+        q0 * v3 + q3 * v0 + q1 * v2 - q2 * v1,
+    )
+
+
+def flow(swing: Swing, turning: Turning | None, t: Scalars, rates: bool):
+    """Rates (x, y, z) and attitude at time t; what is not asked is None."""
+    whole, rest = _barrier(sweep(swing, t))
+    half, (S, C, N) = jacobi(swing, rest)
+    sign = parity(whole)
+    S, C, N = _barrier((sign * S, sign * C, N))
+    now = _barrier(momentum(swing, (S, C, N)))
+    omega = wxyz = None
+    if rates:
+        spin = tuple(swing.pulse * (l * d) for l, d in zip(now, swing.inverse, strict=True))
+        omega = restore(spin, swing.middle, swing.circled)
+    if turning is not None:
+        wxyz = attitude(swing, turning, t, rest, half, (S, C, N), now)
+    return omega, wxyz
