@@ -32,14 +32,14 @@ class Attitude:
     which rows were asked for.
     """
 
-    def __init__(self, row: Callable[[int], Vector]):
-        self._row = row
+    def __init__(self, compute: Callable[[int], Vector]):
+        self.compute = compute
         self._rows: dict[int, Vector] = {}
 
     def row(self, i: int) -> Vector:
         """Body components of the unit vector along space axis ``i``."""
         if i not in self._rows:
-            self._rows[i] = self._row(i)
+            self._rows[i] = self.compute(i)
         return self._rows[i]
 
     @property

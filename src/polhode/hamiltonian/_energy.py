@@ -72,7 +72,7 @@ class Hamiltonian(eqx.Module):
         """Which rows of R the potential looks at (found by tracing it once; none without one)."""
         if self.potential is None:
             return ()
-        row = jax.eval_shape(lambda: attitude.row(2))
+        row = jax.eval_shape(lambda: attitude.compute(2))  # not kept: no leak
         used: tuple[int, ...] = ()
 
         def look(rows):

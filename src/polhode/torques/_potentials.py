@@ -4,7 +4,6 @@ import abc
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -77,9 +76,12 @@ class UniformGravity(AbstractPotential):
         return -self.mass * dot(components(self.gravity_space), arm_space)
 
 
-def position_components(position, t):
-    """Components of a position that is constant or a function of time."""
-    return components(jnp.asarray(position(t)) if callable(position) else position)
+def value_at(vector, t):
+    """Components of a vector that is constant or a function ``fn(t) -> (3,)`` of one time.
+
+    ``t`` may be an array of times; the function is mapped over it.
+    """
+    return components(jnp.vectorize(vector, signature="()->(3)")(t) if callable(vector) else vector)
 
 
 class GravityGradient(AbstractPotential):
@@ -111,7 +113,7 @@ class GravityGradient(AbstractPotential):
                 )
 
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array:
-        place = position_components(self.position_space, t)
+        place = value_at(self.position_space, t)
         square = dot(place, place)
         distance = jnp.sqrt(square)
         along = attitude.to_body(tuple(x / distance for x in place))
@@ -143,8 +145,4 @@ class Potential(AbstractPotential):
         self.fn = fn
 
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array:
-        matrix = attitude.matrix
-        one = self.fn
-        for _ in range(matrix.ndim - 2):
-            one = jax.vmap(one, in_axes=(0, None))
-        return one(matrix, t)
+        return jnp.vectorize(self.fn, signature="(3,3),()->()")(attitude.matrix, t)

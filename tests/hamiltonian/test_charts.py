@@ -1,0 +1,165 @@
+"""Both charts come from the one H and describe the same motion; H stands in one place."""
+
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import polhode as ph
+from polhode import rotation
+from polhode.hamiltonian import (
+    Attitude,
+    Hamiltonian,
+    from_quaternion,
+    inverse_inertia,
+)
+
+SOURCE = Path(ph.__file__).parent
+
+
+def skew_potential(matrix, t):
+    """Looks at all of R and at t."""
+    return matrix[0, 1] * 0.3 - matrix[2, 2] + 0.2 * matrix[1, 0] * matrix[2, 1] * jnp.cos(t)
+
+
+SCENES = {
+    "general_tensor": ph.Scene(
+        ph.Inertia.from_tensor([[1.0, 0.1, 0.2], [0.1, 1.5, -0.1], [0.2, -0.1, 1.25]])
+    ),
+    "weight": ph.Scene(
+        ph.Inertia.from_moments([1.0, 1.5, 2.0]),
+        ph.UniformGravity(1.0, [0.1, -0.2, 0.3], [0.5, 0.25, -2.0]),
+    ),
+    "any_potential_and_torques": ph.Scene(
+        ph.Inertia.from_moments([1.0, 1.5, 2.0]),
+        ph.Potential(skew_potential)
+        + ph.GravityGradient(0.5, lambda t: jnp.stack([jnp.cos(t), jnp.sin(t), 0 * t + 0.5])),
+        ph.BodyTorque([0.1, 0.0, -0.1])
+        + ph.SpaceTorque(lambda t: jnp.stack([0 * t, jnp.sin(t), 0 * t]))
+        + ph.LinearDamping(0.05),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_both_charts_give_the_same_motion(name):
+    scene = SCENES[name]
+    state = ph.State.from_euler(0.3, 1.1, 0.7, rates=[0.4, -0.6, 0.9])
+    ts = jnp.linspace(0, 3, 4)
+    one, other = (
+        ph.simulate(scene, state, ts, method, rtol=1e-12)
+        for method in (ph.LiePoisson(), ph.EulerAngles())
+    )
+    angle = rotation.angle_between(one.wxyz, other.wxyz)
+    assert float(jnp.max(angle)) < 2e-10
+    np.testing.assert_allclose(one.omega_body, other.omega_body, atol=2e-10)
+    np.testing.assert_allclose(one.energy, other.energy, rtol=1e-9)
+    if scene.torque is None:
+        np.testing.assert_allclose(one.energy, one.energy[0], rtol=1e-10)
+
+
+def test_potential_torque_is_the_slope_along_body_turns():
+    """N_k = -dV along a small turn about body axis k, for any potential."""
+    from polhode.hamiltonian._lie_poisson import rates_and_torque
+
+    scene = SCENES["any_potential_and_torques"]
+    wxyz = rotation.normalise(jnp.array([0.7, -0.3, 0.5, 0.2]))
+
+    def energy(turn):
+        turned = rotation.multiply(wxyz, rotation.rotation_vector_to_wxyz(turn))
+        return scene.potential.energy(from_quaternion(tuple(turned)), 0.3, scene.inertia)
+
+    momentum = tuple(jnp.array([0.3, 0.2, 0.1]))
+    _, torque = rates_and_torque(scene.hamiltonian, momentum, from_quaternion(tuple(wxyz)), 0.3)
+    slope = jax.jacfwd(energy)(jnp.zeros(3))
+    np.testing.assert_allclose(jnp.stack(torque), -slope, atol=1e-14)
+
+
+def test_gravity_gradient_torque_is_three_mu_over_r_cubed():
+    from polhode.hamiltonian._lie_poisson import rates_and_torque
+
+    inertia = ph.Inertia.from_moments([1.0, 1.5, 2.0])
+    place, mu = jnp.array([3.0, -1.0, 2.0]), 7.0
+    scene = ph.Scene(inertia, ph.GravityGradient(mu, place))
+    wxyz = rotation.normalise(jnp.array([0.7, -0.3, 0.5, 0.2]))
+    _, torque = rates_and_torque(
+        scene.hamiltonian, tuple(jnp.zeros(3)), from_quaternion(tuple(wxyz)), 0.0
+    )
+    r = np.linalg.norm(place)
+    n = np.asarray(rotation.wxyz_to_matrix(wxyz)).T @ np.asarray(place) / r
+    np.testing.assert_allclose(
+        jnp.stack(torque), 3 * mu / r**3 * np.cross(n, np.array([1.0, 1.5, 2.0]) * n), atol=1e-15
+    )
+
+
+def test_only_the_rows_that_are_looked_at_are_computed():
+    class LooksUp(ph.AbstractPotential):
+        core_ranks = {}  # noqa: RUF012
+
+        def energy(self, attitude, t, inertia):
+            return attitude.row(2)[0] ** 2
+
+    inertia = ph.Inertia.from_moments([1.0, 1.5, 2.0])
+    attitude = from_quaternion(tuple(jnp.array([1.0, 0.0, 0.0, 0.0])))
+    hamiltonian = Hamiltonian(inverse_inertia(inertia), inertia, LooksUp())
+    assert hamiltonian.rows_used(attitude, 0.0) == (2,)
+    assert attitude.used == ()
+    assert Hamiltonian(inverse_inertia(inertia), inertia).rows_used(attitude, 0.0) == ()
+
+
+def test_attitude_of_angles_and_quaternion_agree():
+    from polhode.hamiltonian import from_euler_angles
+
+    angles = (0.3, 1.1, 0.7)
+    wxyz = rotation.euler_to_wxyz(*angles)
+    one = from_euler_angles(*(jnp.array(a) for a in angles))
+    other = from_quaternion(tuple(wxyz))
+    np.testing.assert_allclose(one.matrix, other.matrix, atol=4e-16)
+    assert isinstance(one, Attitude)
+    vector = tuple(jnp.array([0.2, -0.5, 0.7]))
+    back = one.to_body(one.to_space(vector))
+    np.testing.assert_allclose(jnp.stack(back), jnp.stack(vector), atol=4e-16)
+
+
+def test_the_formula_of_h_stands_once():
+    """Kinetic plus potential energy is written in one function of one file."""
+    hits = [
+        path.name
+        for path in SOURCE.rglob("*.py")
+        for line in path.read_text().splitlines()
+        if re.search(r"potential\.energy\(", line) and "self.potential" in line and "return" in line
+    ]
+    assert hits == ["_energy.py"]
+
+
+def test_imports_go_one_way():
+    """Rooms import only from lower floors (the house's order)."""
+    floors = [
+        {"_checks", "rotation", "elliptic"},
+        {"inertia"},
+        {"hamiltonian"},
+        {"torques"},
+        {"free", "solvers", "tops"},
+        {"_state", "_scene", "_lanes", "_status"},
+        {"_trajectory"},
+        {"_methods"},
+        {"_plan"},
+        {"_simulate", "frames"},
+        {"fit"},
+        {"io"},
+        {"plot"},
+        {"cli"},
+    ]
+    level = {room: i for i, floor in enumerate(floors) for room in floor}
+    wrong = []
+    for path in SOURCE.rglob("*.py"):
+        room = path.relative_to(SOURCE).parts[0].removesuffix(".py")
+        if room in ("__init__", "__main__"):
+            continue
+        for used in re.findall(r"^\s*(?:from|import) polhode\.(\w+)", path.read_text(), re.M):
+            if used != room and level.get(used, 99) >= level[room]:
+                wrong.append(f"{path.relative_to(SOURCE)} imports {used}")
+    assert not wrong, wrong

@@ -1,0 +1,49 @@
+"""Writes truth.json: ``python tests/systems/make_truth.py`` (a few minutes)."""
+
+import json
+import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import table
+import taylor
+from mpmath import mp, mpf
+
+STEP = mpf(10) ** -18
+
+
+def final(system, moments, steps):
+    wxyz = [mpf(x) for x in system.wxyz]
+    norm = mp.sqrt(sum(x * x for x in wxyz))
+    start = [mpf(x) for x in system.omega] + [x / norm for x in wxyz]
+    return taylor.integrate(
+        taylor.body(moments, system.torque(moments)), start, *system.span, steps
+    )
+
+
+def main():
+    mp.dps = taylor.DIGITS
+    entries = {}
+    for system in table.SYSTEMS:
+        moments = [mpf(m) for m in system.moments]
+        state = final(system, moments, system.steps)
+        check = final(system, moments, system.steps + 9)
+        gap = max(abs(a - b) for a, b in zip(state, check))
+        assert gap < mpf(10) ** -40, (system.name, gap)
+        columns = []
+        for i in range(3):
+            up, down = list(moments), list(moments)
+            up[i], down[i] = up[i] + STEP, down[i] - STEP
+            ends = final(system, up, system.steps), final(system, down, system.steps)
+            columns.append([(a - b) / (2 * STEP) for a, b in zip(*ends)])
+        entries[system.name] = {
+            "state": [mp.nstr(x, 25) for x in state],
+            "gradient": [[mp.nstr(column[k], 25) for column in columns] for k in range(7)],
+        }
+        print(system.name, "agreement of two step sizes", mp.nstr(gap, 3), flush=True)
+    table.TRUTH.write_text(json.dumps(entries, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,108 @@
+# ruff: noqa: E501 (one system, one line)
+"""The systems that every way of moving a body is tested on; README.md derives them.
+
+One entry is one file of numbers: inertia, initial state, times, what acts. ``truth.json`` holds
+the exact final state and its exact gradient with respect to the principal moments, made by
+``python tests/systems/make_truth.py`` with 50 digits, independently of the package.
+"""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from mpmath import mpf
+
+TRUTH = Path(__file__).with_name("truth.json")
+
+
+@dataclass(frozen=True)
+class System:
+    """A body in exactly representable numbers, and what acts on it."""
+
+    name: str
+    moments: tuple[float, float, float]
+    wxyz: tuple[float, float, float, float]
+    omega: tuple[float, float, float]
+    span: tuple[float, float]
+    acts: dict[str, Any] = field(default_factory=dict)
+    steps: int = 40
+
+    def torque(self, moments):
+        """Torque in body axes for the reference integrator, written out from Newton's law."""
+        acts = self.acts
+        if not acts:
+            return None
+
+        def torque(t, omega, rows):
+            total = [omega[0] * mpf(0)] * 3
+            if "gravity" in acts:
+                weight, centre = acts["gravity"]
+                up = rows[2]
+                for i in range(3):
+                    j, k = (i + 1) % 3, (i + 2) % 3
+                    turn = up[j] * mpf(centre[k]) - up[k] * mpf(centre[j])
+                    total[i] = total[i] + turn * mpf(weight)
+            if "gradient" in acts:
+                strength, along_space = acts["gradient"]
+                n = [sum(rows[j][i] * mpf(along_space[j]) for j in range(3)) for i in range(3)]
+                turned = [x * mpf(m) for x, m in zip(n, moments)]
+                for i in range(3):
+                    j, k = (i + 1) % 3, (i + 2) % 3
+                    total[i] = total[i] + (n[j] * turned[k] - n[k] * turned[j]) * mpf(strength)
+            if "body" in acts:
+                total = [x + mpf(n) for x, n in zip(total, acts["body"])]
+            if "damping" in acts:
+                total = [x - w * mpf(c) for x, w, c in zip(total, omega, acts["damping"])]
+            if "space" in acts:
+                push = acts["space"]
+                turn = [sum(rows[j][i] * mpf(push[j]) for j in range(3)) for i in range(3)]
+                total = [x + n for x, n in zip(total, turn)]
+            return total
+
+        return torque
+
+
+SYSTEMS = [
+    System("free_long_axis_mode", (1.0, 2.0, 3.0), (1, 0, 0, 0), (1.0, 0.25, -0.5), (0, 10)),
+    System("free_short_axis_mode", (1.0, 2.0, 3.0), (0.5, 0.5, -0.5, 0.5), (0.25, 0.25, 1.0), (0, 10)),
+    System("free_near_separatrix", (3.0, 5.0, 9.0), (1, 0, 0, 0), (0.0, 0.5, 0.001953125), (0, 40), {}, 80),
+    System("free_backwards", (2.0, 1.25, 1.5), (1, 0, 0, 0), (-0.5, 1.0, 0.75), (3, -5)),
+    System("symmetric_prolate", (2.0, 2.0, 0.5), (0.5, -0.5, 0.5, 0.5), (0.5, 0.25, 2.0), (0, 8)),
+    System("detest_b5", (0.5, 0.75, 1.0), (1, 0, 0, 0), (0.25, 1.5, -0.75), (0, 8)),
+    System(
+        "heavy_asymmetric_top", (1.0, 1.5, 2.0), (0.5, 0.5, 0.5, -0.5), (0.5, -1.0, 0.75), (0, 6),
+        {"gravity": (2.0, (0.125, 0.0, 0.5))},
+    ),
+    System(
+        "lagrange_top", (1.0, 1.0, 0.5), (0.75, 0.5, -0.25, 0.3535533905932738), (0.25, -0.5, 5.0), (0, 6),
+        {"gravity": (2.0, (0.0, 0.0, 0.5))},
+    ),
+    System(
+        "gravity_gradient", (1.0, 1.5, 2.0), (0.75, 0.5, -0.25, 0.3535533905932738), (0.1, -0.2, 0.3), (0, 10),
+        {"gradient": (0.75, (0.6, 0.0, 0.8))},
+    ),
+    System(
+        "driven_and_damped", (1.0, 1.5, 2.0), (1, 0, 0, 0), (0.5, -0.25, 1.0), (0, 5),
+        {"body": (0.25, 0.0, -0.125), "damping": (0.25, 0.125, 0.5)},
+    ),
+    System(
+        "pushed_in_space", (1.0, 1.5, 2.0), (1, 0, 0, 0), (0.5, -0.25, 1.0), (0, 5),
+        {"space": (0.25, -0.5, 0.125)},
+    ),
+    System(
+        "spin_about_one_axis", (1.0, 1.5, 2.0), (1, 0, 0, 0), (0.0, 0.0, 1.0), (0, 5),
+        {"body": (0.0, 0.0, 0.25), "damping": (0.0, 0.0, 0.5)},
+    ),
+]  # fmt: skip
+
+BY_NAME = {system.name: system for system in SYSTEMS}
+
+
+def truth(name: str) -> dict[str, Any]:
+    """Exact ``state`` (omega, q) and ``gradient`` (7 x 3) at the last time, as floats."""
+    entry = json.loads(TRUTH.read_text())[name]
+    return {
+        "state": [float(x) for x in entry["state"]],
+        "gradient": [[float(x) for x in row] for row in entry["gradient"]],
+    }

@@ -1,0 +1,127 @@
+"""Bad input gets a clear error: what was given, what is expected, how to mend it."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings, strategies as st
+
+import polhode as ph
+
+INERTIA = ph.Inertia.from_moments([1.0, 1.5, 2.0])
+SCENE = ph.Scene(INERTIA)
+STATE = ph.State([1.0, 0, 0, 0], [0.1, 0.2, 0.3])
+TS = [0.0, 1.0]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ph.State([0.0, 0, 0, 0], [0.0, 0, 1]), r"wxyz must not be zero.*scalar first"),
+        (
+            lambda: ph.State([1.0, 0, 0], [0.0, 0, 1]),
+            r"wxyz must have shape \(\.\.\., 4\), got \(3,\)",
+        ),
+        (lambda: ph.State([1.0, 0, 0, np.nan], [0.0, 0, 1]), "wxyz holds NaN or infinity"),
+        (lambda: ph.State([1.0, 0, 0, 0], [np.inf, 0, 1]), "omega_body holds NaN or infinity"),
+        (lambda: ph.State(np.ones((2, 4)), np.ones((3, 3))), "broadcast together"),
+        (lambda: ph.State.from_euler(0.1, 0.2, 0.3), "exactly one of rates"),
+        (
+            lambda: ph.State.from_euler(0.1, 0.0, 0.3, momenta=[1.0, 2, 3], inertia=INERTIA),
+            "theta at 0 or pi",
+        ),
+        (lambda: ph.Inertia.from_moments([1.0, -1.0, 1.0]), "positive"),
+        (lambda: ph.Inertia.from_moments([1.0, 1.0, 3.0]), "triangle inequality"),
+        (lambda: ph.UniformGravity(-1.0, [0.0, 0, 1]), "mass must not be negative"),
+        (lambda: ph.GravityGradient(1.0, [0.0, 0, 0]), "must not be zero"),
+        (lambda: ph.LinearDamping([0.1, -0.1, 0.1]), "must not be negative"),
+        (lambda: ph.BodyTorque([1.0, 2.0]), r"shape \(\.\.\., 3\)"),
+        (lambda: ph.simulate(SCENE, STATE, [0.0]), "at least two times"),
+        (lambda: ph.simulate(SCENE, STATE, [0.0, 1.0, 1.0]), "entries 1 and 2"),
+        (lambda: ph.simulate(SCENE, STATE, [0.0, 2.0, 1.0]), "strictly increasing or strictly"),
+        (lambda: ph.simulate(SCENE, STATE, [0.0, np.nan]), "ts holds NaN"),
+        (lambda: ph.simulate(SCENE, STATE, TS, rtol=-1.0), "rtol must be positive"),
+        (lambda: ph.simulate(SCENE, STATE, TS, rtol=1e-17), "below what float64 can reach"),
+    ],
+)
+def test_values(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ph.Scene([1.0, 2.0, 3.0]), r"ph\.Inertia\.from_moments"),
+        (lambda: ph.Scene(INERTIA, potential=ph.LinearDamping(0.1)), "must be a potential"),
+        (lambda: ph.Scene(INERTIA, torque=3.0), "must be a torque"),
+        (lambda: ph.simulate(STATE, SCENE, TS), r"scene must be a ph\.Scene, got State"),
+        (lambda: ph.simulate(SCENE, STATE, TS, "rk4"), "object such as"),
+        (lambda: ph.simulate(SCENE, STATE, TS, record="all"), r"ph\.Record"),
+        (lambda: ph.State("up", [0.0, 0, 1]), "wxyz must be an array of real numbers"),
+        (lambda: ph.State([1j, 0, 0, 0], [0.0, 0, 1]), "real numbers"),
+        (lambda: ph.BodyTorque([0.0, 0, 1]) + ph.Potential(lambda r, t: 0.0), "torque adds to"),
+        (lambda: ph.Potential(3.0), "takes a function"),
+    ],
+)
+def test_kinds(call, message):
+    with pytest.raises(TypeError, match=message):
+        call()
+
+
+def test_mixed_dtypes_and_batches_that_do_not_fit():
+    single = ph.State(np.array([1, 0, 0, 0], np.float32), np.array([0, 0, 1], np.float32))
+    with pytest.raises(TypeError, match=r"mix the dtypes \['float32', 'float64'\]"):
+        ph.simulate(SCENE, single, TS)
+    three = ph.State(np.ones((3, 4)), np.ones((3, 3)))
+    two = ph.Scene(ph.Inertia.from_moments(np.ones((2, 3))))
+    with pytest.raises(ValueError, match="do not broadcast together"):
+        ph.simulate(two, three, TS)
+    scene = ph.Scene(ph.Inertia.from_moments(np.ones(3, np.float32)))
+    with pytest.raises(ValueError, match="float32 can reach"):
+        ph.simulate(scene, single, TS, rtol=1e-9)
+
+
+def test_non_unit_quaternions_are_normalised_at_every_scale():
+    for scale in (1e-300, 1e-5, 1.0, 1e300):
+        state = ph.State(np.array([3.0, 0, 4.0, 0]) * scale, [0.0, 0, 1])
+        np.testing.assert_allclose(state.wxyz, [0.6, 0, 0.8, 0], rtol=4e-16)
+
+
+garbage = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.text(max_size=3),
+    st.integers(-(2**70), 2**70),
+    st.floats(),
+    st.complex_numbers(),
+    st.lists(st.floats(), max_size=5),
+    st.lists(st.lists(st.floats(), max_size=5), max_size=4),
+    st.dictionaries(st.text(max_size=2), st.floats(), max_size=2),
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(first=garbage, second=garbage)
+def test_garbage_never_passes_silently(first, second):
+    """A constructor raises ValueError or TypeError, or holds finite arrays of the right rank."""
+    makers = [
+        lambda: ph.State(first, second),
+        lambda: ph.UniformGravity(first, second),
+        lambda: ph.GravityGradient(first, second),
+        lambda: ph.BodyTorque(first),
+        lambda: ph.SpaceTorque(second),
+        lambda: ph.LinearDamping(first),
+        lambda: ph.Inertia.from_moments(first),
+        lambda: ph.Inertia.from_tensor(second),
+        lambda: ph.State.from_euler(first, second, 0.3, rates=second),
+    ]
+    for make in makers:
+        try:
+            made = make()
+        except (ValueError, TypeError):
+            continue
+        for name, rank in made.core_ranks.items():
+            value = getattr(made, name)
+            if value is not None:
+                assert bool(jnp.all(jnp.isfinite(value)))
+                assert value.ndim >= rank

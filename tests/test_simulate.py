@@ -1,0 +1,198 @@
+"""simulate: batches, times, records, outcomes per body, derivatives, labelled output."""
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems.table import BY_NAME, truth
+
+import polhode as ph
+from polhode import rotation
+
+MOMENTS = jnp.array([1.0, 1.5, 2.0])
+STATE = ph.State([0.5, 0.5, 0.5, -0.5], [0.5, -1.0, 0.75])
+METHOD = ph.LiePoisson()
+TS = jnp.linspace(0, 2, 5)
+
+
+def free(moments=MOMENTS):
+    return ph.Scene(ph.Inertia.from_moments(moments))
+
+
+def one_by_one(scene_of, n, **kwargs):
+    runs = [ph.simulate(*scene_of(i), TS, METHOD, rtol=1e-12, **kwargs) for i in range(n)]
+    return jnp.stack([r.wxyz for r in runs]), jnp.stack([r.omega_body for r in runs])
+
+
+def test_batch_equals_single_bodies_in_any_shape():
+    """Leaves (3, 1, 3) of inertia, (2, 4) of attitude and (3,) of gravity: 3 x 2 bodies."""
+    moments = jnp.array([[[1.0, 1.5, 2.0]], [[2.0, 1.5, 1.0]], [[0.5, 0.5, 0.75]]])
+    wxyz = rotation.normalise(jnp.array([[1.0, 0, 0, 0.25], [0.5, -0.5, 0.5, 0.5]]))
+    omega = jnp.array([0.5, -1.0, 0.75])
+    weight = ph.UniformGravity(1.0, jnp.array([[0.1, 0, 0.2], [0.0, 0.3, 0.1]]), [0.0, 0, -1.0])
+    scene = ph.Scene(ph.Inertia.from_moments(moments), weight, ph.LinearDamping(0.1))
+    batch = ph.simulate(scene, ph.State(wxyz, omega), TS, METHOD, rtol=1e-12)
+    assert batch.wxyz.shape == (3, 2, 5, 4)
+    assert batch.omega_body.shape == (3, 2, 5, 3)
+    assert batch.status.shape == batch.steps.shape == (3, 2)
+    assert batch.energy.shape == (3, 2, 5)
+    for i, j in ((0, 1), (2, 0)):
+        alone = ph.UniformGravity(1.0, weight.centre_body[j], [0.0, 0, -1.0])
+        scene = ph.Scene(ph.Inertia.from_moments(moments[i, 0]), alone, ph.LinearDamping(0.1))
+        single = ph.simulate(scene, ph.State(wxyz[j], omega), TS, METHOD, rtol=1e-12)
+        np.testing.assert_allclose(batch.wxyz[i, j], single.wxyz, atol=1e-10)
+        np.testing.assert_allclose(batch.energy[i, j], single.energy, atol=1e-10)
+        np.testing.assert_allclose(batch.momentum_space[i, j], single.momentum_space, atol=1e-10)
+
+
+def test_chunks_with_a_remainder_and_vmap_agree():
+    rng = np.random.default_rng(0)
+    wxyz, omega = jnp.asarray(rng.normal(size=(7, 4))), jnp.asarray(rng.normal(size=(7, 3)))
+    state = ph.State(wxyz, omega)
+    chunked = ph.simulate(free(), state, TS, ph.LiePoisson(chunk=3), rtol=1e-11)
+    whole = ph.simulate(free(), state, TS, ph.LiePoisson(chunk=40), rtol=1e-11)
+    mapped = jax.vmap(lambda s: ph.simulate(free(), s, TS, METHOD, rtol=1e-11).wxyz)(state)
+    assert len(set(np.asarray(chunked.steps).tolist())) > 1  # chunks choose their own steps
+    np.testing.assert_allclose(chunked.wxyz, whole.wxyz, atol=1e-8)
+    np.testing.assert_allclose(mapped, whole.wxyz, atol=1e-8)
+
+
+def test_times_per_body_and_backwards():
+    ts = jnp.stack([TS, TS[::-1], -2 * TS])
+    state = ph.State(jnp.tile(STATE.wxyz, (3, 1)), STATE.omega_body)
+    traj = ph.simulate(free(), state, ts, METHOD, rtol=1e-12)
+    there = ph.simulate(free(), STATE, TS, METHOD, rtol=1e-12)
+    np.testing.assert_allclose(traj.wxyz[0], there.wxyz, atol=1e-11)
+    back = ph.State(there.wxyz[-1], there.omega_body[-1])
+    again = ph.simulate(free(), back, TS[::-1], METHOD, rtol=1e-12)
+    np.testing.assert_allclose(again.wxyz[-1], STATE.wxyz, atol=1e-10)
+    momentum = jnp.broadcast_to(there.momentum_space[:1], (5, 3))
+    np.testing.assert_allclose(traj.momentum_space[2], momentum, atol=1e-10)
+    assert traj.to_xarray()["ts"].dims == ("body", "time")
+
+
+def test_record_keeps_what_is_asked():
+    rates = ph.simulate(free(), STATE, TS, METHOD, record=ph.Record(attitude=False))
+    assert rates.wxyz is None
+    assert rates.energy.shape == (5,)
+    with pytest.raises(ValueError, match="holds no wxyz"):
+        rates.euler()
+    last = ph.simulate(free(), STATE, TS, METHOD, record=ph.Record(final_only=True))
+    assert last.wxyz.shape == (1, 4)
+    assert last.ts.tolist() == [2.0]
+    with pytest.raises(ValueError, match="keeps nothing"):
+        ph.Record(attitude=False, rates=False)
+
+
+def test_step_limit_is_reported_per_body():
+    wxyz = jnp.tile(STATE.wxyz, (2, 1))
+    omega = jnp.array([[0.1, 0.1, 0.1], [300.0, -200.0, 100.0]])
+    method = ph.LiePoisson(chunk=1, max_steps=64)
+    with pytest.raises(
+        ph.SimulationError, match=r"1 of 2 bodies \(first: index \(1,\)\).*max_steps"
+    ):
+        ph.simulate(free(), ph.State(wxyz, omega), TS, method)
+    traj = ph.simulate(free(), ph.State(wxyz, omega), TS, method, throw=False)
+    assert traj.status.tolist() == [ph.Status.SUCCESSFUL, ph.Status.MAX_STEPS]
+    assert traj.successful.tolist() == [True, False]
+    traced = jax.jit(lambda s: ph.simulate(free(), s, TS, method).status)(ph.State(wxyz, omega))
+    assert traced.tolist() == [ph.Status.SUCCESSFUL, ph.Status.MAX_STEPS]
+
+
+def test_nan_is_reported_per_body():
+    state = ph.State(jnp.tile(STATE.wxyz, (2, 1)), STATE.omega_body)
+    poisoned = ph.BodyTorque(lambda t: jnp.full(3, jnp.nan))
+    scene = ph.Scene(ph.Inertia.from_moments(MOMENTS), torque=poisoned)
+    fixed = ph.LiePoisson(controller=diffrax.ConstantStepSize(), dt0=0.5)
+    traj = ph.simulate(scene, state, TS, fixed, throw=False)
+    assert (traj.status == ph.Status.NOT_FINITE).all()
+    with pytest.raises(ph.SimulationError, match="NaN or infinity"):
+        ph.simulate(scene, state, TS, fixed)
+
+
+def test_the_poles_of_the_chart_are_reported_per_body():
+    wxyz = jnp.stack([STATE.wxyz, jnp.array([1.0, 0, 0, 0]), jnp.array([0.0, 1.0, 0, 0])])
+    state = ph.State(wxyz, STATE.omega_body)
+    traj = ph.simulate(free(), state, TS, ph.EulerAngles(max_steps=256), throw=False)
+    singular = ph.Status.CHART_SINGULAR
+    assert traj.status.tolist() == [ph.Status.SUCCESSFUL, singular, singular]
+    with pytest.raises(ph.SimulationError, match=r"use ph\.LiePoisson"):
+        ph.simulate(free(), state, TS, ph.EulerAngles(max_steps=256))
+
+
+@pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Kvaerno5(), diffrax.Heun()])
+def test_any_diffrax_solver_and_controller(solver):
+    """Adaptive, implicit, and constant steps, all handed over whole."""
+    constant = isinstance(solver, diffrax.Heun)
+    controller = diffrax.ConstantStepSize() if constant else None
+    method = ph.LiePoisson(solver, controller, dt0=1e-3 if constant else None)
+    traj = ph.simulate(free(), STATE, TS, method, rtol=1e-8)
+    want = ph.simulate(free(), STATE, TS, METHOD, rtol=1e-12)
+    assert float(jnp.max(rotation.angle_between(traj.wxyz, want.wxyz))) < 1e-5
+
+
+def test_forward_mode_and_times():
+    """d/dt of the samples is the field; jvp by diffrax.ForwardMode, grad by the default."""
+    forward = ph.LiePoisson(adjoint=diffrax.ForwardMode())
+
+    def last_rates(end, method):
+        return ph.simulate(
+            free(), STATE, jnp.stack([0.0 * end, end]), method, rtol=1e-12
+        ).omega_body[-1]
+
+    end = jnp.array(2.0)
+    rate = jax.jvp(lambda t: last_rates(t, forward), (end,), (jnp.ones_like(end),))[1]
+    omega = last_rates(end, METHOD)
+    want = jnp.cross(MOMENTS * omega, omega) / MOMENTS
+    np.testing.assert_allclose(rate, want, atol=1e-9)
+    np.testing.assert_allclose(jax.jacrev(lambda t: last_rates(t, METHOD))(end), want, atol=1e-9)
+
+
+def test_gradient_with_respect_to_the_initial_state():
+    """Time runs back: d(end)/d(start) times d(start)/d(end) is the identity."""
+    name = "free_short_axis_mode"
+    system, exact = BY_NAME[name], truth(name)
+    scene = free(jnp.array(system.moments))
+    span = jnp.array(system.span, dtype=float)
+
+    def flow(omega, wxyz, ts):
+        end = ph.simulate(scene, ph.State(wxyz, omega), ts, METHOD, rtol=1e-13)
+        return end.omega_body[-1]
+
+    start = jnp.array(system.omega)
+    there = jax.jacrev(flow)(start, jnp.array(system.wxyz, dtype=float), span)
+    end, wxyz = jnp.array(exact["state"][:3]), jnp.array(exact["state"][3:])
+    back = jax.jacrev(flow)(end, wxyz, span[::-1])
+    np.testing.assert_allclose(back @ there, np.eye(3), atol=1e-8)
+
+
+def test_progress_meter_does_not_break_the_gradient(capfd):
+    method = ph.LiePoisson(progress_meter=diffrax.TextProgressMeter())
+    slope = jax.grad(lambda m: ph.simulate(free(m), STATE, TS, method).energy[-1])(MOMENTS)
+    assert bool(jnp.all(jnp.isfinite(slope)))
+    assert "100.00%" in capfd.readouterr().out
+
+
+def test_to_xarray_names_dimensions_and_units():
+    state = ph.State(jnp.tile(STATE.wxyz, (2, 1)), STATE.omega_body)
+    data = ph.simulate(free(), state, TS, METHOD).to_xarray()
+    assert data["wxyz"].dims == ("body", "time", "quaternion")
+    assert data["omega_body"].attrs["units"] == "rad s-1"
+    assert data["energy"].dims == ("body", "time")
+    assert list(data["quaternion"].values) == ["w", "x", "y", "z"]
+    assert "body -> space" in data.attrs["convention"]
+    alone = ph.simulate(free(), STATE, TS, METHOD, record=ph.Record(rates=False)).to_xarray()
+    assert set(alone.data_vars) == {"wxyz", "status"}
+
+
+def test_import_has_no_side_effects():
+    import subprocess
+    import sys
+
+    code = (
+        "import jax; before = dict(jax.config.values); import polhode;"
+        "assert before == dict(jax.config.values); assert not jax.config.jax_enable_x64;"
+        "import sys; assert 'matplotlib' not in sys.modules and 'xarray' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
