@@ -49,5 +49,6 @@ def parameter_pair(
         m1 = 1 - m
     else:
         m, m1 = _one_parameter(*broadcast(m, m1))
-    valid = (m >= 0) & (m1 >= 0)
-    return jnp.where(valid, m, jnp.nan), jnp.where(valid, m1, jnp.nan)
+    # As a factor, so that derivatives outside the domain are NaN too and not a silent 0.
+    valid = jnp.where((m >= 0) & (m1 >= 0), 1, jnp.nan).astype(m.dtype)
+    return m * valid, m1 * valid

@@ -39,6 +39,20 @@ def _series(e2: Array, e3: Array, e4: Array, e5: Array) -> Array:
     )
 
 
+@jax.custom_jvp
+def _root(x: Array) -> Array:
+    return jnp.sqrt(x)
+
+
+@_root.defjvp
+def _root_rule(primals, tangents):
+    (x,), (dx,) = primals, tangents
+    value = _root(x)
+    # At x = 0 an argument that does not move contributes 0, not 0 * inf.
+    still = (x == 0) & (dx == 0)
+    return value, jnp.where(still, 0, dx / (2 * jnp.where(still, 1, value)))
+
+
 def _rf_core(x: Array, y: Array, z: Array) -> Array:
     def wide(state):
         steps, x, y, z = state
@@ -48,7 +62,7 @@ def _rf_core(x: Array, y: Array, z: Array) -> Array:
 
     def duplicate(state):
         steps, x, y, z = state
-        a, b, c = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
+        a, b, c = _root(x), _root(y), _root(z)
         add = a * b + b * c + c * a
         return steps + 1, (x + add) / 4, (y + add) / 4, (z + add) / 4
 
@@ -71,7 +85,7 @@ def _rd_core(x: Array, y: Array, z: Array) -> Array:
 
     def duplicate(state):
         steps, x, y, z, total, weight = state
-        a, b, c = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
+        a, b, c = _root(x), _root(y), _root(z)
         add = a * b + b * c + c * a
         total = total + weight / (c * (z + add))
         return steps + 1, (x + add) / 4, (y + add) / 4, (z + add) / 4, total, weight / 4
@@ -103,7 +117,7 @@ def _rc_of_one(e: Array, one_plus_e: Array) -> Array:
     return jnp.where(near, series, jnp.where(above, circular, logarithm))
 
 
-def _rj_core(x: Array, y: Array, z: Array, p: Array) -> Array:
+def rj_core(x: Array, y: Array, z: Array, p: Array) -> Array:
     def wide(state):
         steps, x, y, z, p, *_ = state
         mean = (x + y + z + 2 * p) / 5
@@ -115,7 +129,7 @@ def _rj_core(x: Array, y: Array, z: Array, p: Array) -> Array:
 
     def duplicate(state):
         steps, x, y, z, p, total, weight = state
-        a, b, c, r = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z), jnp.sqrt(p)
+        a, b, c, r = _root(x), _root(y), _root(z), _root(p)
         add = a * b + b * c + c * a
         ra, rb, rc = r + a, r + b, r + c
         d = ra * rb * rc
@@ -140,7 +154,7 @@ def _rj_core(x: Array, y: Array, z: Array, p: Array) -> Array:
     return 6 * total + weight * _series(e2, e3, e4, e5) / (mean * jnp.sqrt(mean))
 
 
-def _rc_core(x: Array, y: Array) -> Array:
+def rc_core(x: Array, y: Array) -> Array:
     # y < 0: Cauchy's principal value, RC(x, y) = sqrt(x/(x - y)) RC(x - y, -y), DLMF 19.2.20.
     negative = y < 0
     factor = jnp.where(negative, jnp.sqrt(x / jnp.where(negative, x - y, 1)), 1)
@@ -156,8 +170,8 @@ def _each(count: int):
 
 
 rd = with_forward_partials(_rd_core, _each(3))
-rj = with_forward_partials(_rj_core, _each(4))
-rc = with_forward_partials(_rc_core, _each(2))
+rj = with_forward_partials(rj_core, _each(4))
+rc = with_forward_partials(rc_core, _each(2))
 
 
 @jax.custom_jvp

@@ -13,7 +13,7 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import ArrayLike, Float
 
 from polhode.elliptic._argument import as_floats, broadcast, parameter_pair
-from polhode.elliptic._carlson import rc, rj
+from polhode.elliptic._carlson import rc_core, rj_core
 from polhode.elliptic._complete import first_kind
 from polhode.elliptic._incomplete import angle_parts, first_of, sincos_arguments
 from polhode.elliptic._partials import with_forward_partials
@@ -51,10 +51,16 @@ def _complete_core(n: Array, m: Array, m1: Array) -> tuple[Array, Array]:
     excess = _excess_of_small(small, m, m1)
     away = jnp.where(n > 0.5, m1 - (1 - n), n - m)
     ratio = n / jnp.where(far, away, n - 1)
-    swapped = 0.5 * jnp.pi * jnp.sqrt(jnp.where(far, ratio / (1 - n), 1)) - small * excess
+    # Two roots: their quotient neither overflows nor underflows for any n.
+    turn = jnp.sqrt(jnp.where(far, ratio, 1)) / jnp.sqrt(jnp.where(far, 1 - n, 1))
     first = first_kind(m, m1)
-    value = jnp.where(far, swapped, first + n * excess)
-    return value, jnp.where(far, (value - first) / safe, excess)
+    value = jnp.where(far, 0.5 * jnp.pi * turn - small * excess, first + n * excess)
+    # Infinite for every n; the factor keeps the NaN of an n outside the domain.
+    endless = m1 == 0
+    return (
+        jnp.where(endless, first * (1 + 0 * n), value),
+        jnp.where(far & ~endless, (value - first) / safe, excess),
+    )
 
 
 def _complete_value(n: Array, m: Array, m1: Array) -> Array:
@@ -80,11 +86,11 @@ def _quarter_core(n: Array, m: Array, m1: Array, s: Array, c: Array) -> Array:
     q = c2 + m1 * s2 / (1 - n)
     p = c2 + (1 - n) * s2
     pole = jnp.where(far, q, p)
-    cubic = s2 * s / 3 * rj(x, y, r2, jnp.where(pole > 0, pole, r2))
-    arc = s * c * rc(jnp.where(far, d2 * r2, 1), jnp.where(far, p * q, 1))
+    cubic = s2 * s / 3 * rj_core(x, y, r2, jnp.where(pole > 0, pole, r2))
+    arc = s * c * rc_core(jnp.where(far, d2 * r2, 1), jnp.where(far, p * q, 1))
     swapped = (first - n * (arc + m1 / (1 - n) * cubic)) / (1 - n)
     value = jnp.where(far, swapped, first + n * cubic)
-    return jnp.where(endless, first, value)
+    return jnp.where(endless, first * (1 + 0 * n), value)
 
 
 _quarter_parts = with_forward_partials(_quarter_core, (*_THIRD, ((3, 1.0),), ((4, 1.0),)))
@@ -121,14 +127,14 @@ _quarter.defjvp(_quarter_rule, symbolic_zeros=True)
 
 def _any_angle(turns: Array, s: Array, c: Array, n: Array, m: Array, m1: Array) -> Array:
     """Pi of the angle turns pi + atan2(s, c)."""
+    n = n * jnp.where(n < 1, 1, jnp.nan)
     turns, s, c, n, m, m1 = broadcast(turns, s, c, n, m, m1)
     behind = c < 0
     side = jnp.where(behind, -1, 1).astype(s.dtype)
     turns = turns + jnp.where(behind, jnp.where(s < 0, -1, 1), 0).astype(s.dtype)
     none = turns == 0
     whole = jnp.where(none, 0, 2 * turns * third_complete(n, m, jnp.where(none, 1 - m, m1)))
-    value = side * _quarter(n, m, m1, s, side * c) + whole
-    return jnp.where(n < 1, value, jnp.nan)
+    return side * _quarter(n, m, m1, s, side * c) + whole
 
 
 @jax.jit
@@ -146,8 +152,7 @@ def ellippi(
     1 - m may be handed in beside it. Source: DLMF 19.2.8, 19.7.9, 19.8.6.
     """
     n, m, m1 = _third_arguments(n, m, m1)
-    value = third_complete(jnp.where(n < 1, n, 0), m, m1)
-    return jnp.where(n < 1, value, jnp.where(n == 1, jnp.inf, jnp.nan))
+    return third_complete(n, m, m1)
 
 
 @jax.jit
@@ -164,8 +169,7 @@ def associate_j(
     Source: Fukushima (2012), J. Comput. Appl. Math. 236, 1961.
     """
     n, m, m1 = _third_arguments(n, m, m1)
-    value = third_excess(jnp.where(n < 1, n, 0), m, m1)
-    return jnp.where(n < 1, value, jnp.where(n == 1, jnp.inf, jnp.nan))
+    return third_excess(n, m, m1)
 
 
 @jax.jit
@@ -207,4 +211,4 @@ def _third_arguments(n: ArrayLike, m: ArrayLike, m1: ArrayLike | None):
     else:
         n, m, m1 = as_floats(n, m, m1)
         m, m1 = parameter_pair(m, m1)
-    return broadcast(n, m, m1)
+    return broadcast(n * jnp.where(n <= 1, 1, jnp.nan), m, m1)
