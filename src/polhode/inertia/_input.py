@@ -85,7 +85,7 @@ def check_moments(name: str, seen: np.ndarray, slack: float, least: float = 0.0)
         excess <= slack * largest,
         f"{name} must satisfy the triangle inequality (each at most the sum of the two others), "
         f"got {_worst(seen, -excess)}; check the units, and that these are moments of inertia, "
-        "not second moments or a gyration tensor.",
+        "not second moments or a gyration tensor. Inertia(diagonal=...) takes what no body has.",
     )
 
 
