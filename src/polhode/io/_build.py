@@ -5,6 +5,8 @@ import functools
 import operator
 from collections.abc import Iterator
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, DTypeLike, Float
 
@@ -71,7 +73,9 @@ def _objects(file: SceneFile, parts: tuple[Part, ...], dtype: DTypeLike) -> list
     for part in parts:
         kind = getattr(polhode, _CLASSES[part.kind])
         with blamed(file, part.where):
-            made.append(kind(**{k: np.asarray(v, dtype) for k, v in part.values.items()}))
+            thing = kind(**{k: np.asarray(v, dtype) for k, v in part.values.items()})
+        # defaults that the file leaves out take the dtype too
+        made.append(jax.tree.map(lambda x: jnp.asarray(x, dtype), thing))
     return made
 
 

@@ -167,7 +167,7 @@ def _first_unsorted(steps: np.ndarray) -> int:
 
 def _method(top: Table) -> Method:
     if "method" not in top:
-        return Method("auto", None, 1e-9, None)
+        return Method("auto", None, None, None)
     table = top.table("method", ("kind", "solver", "rtol", "step"))
     kind = table.choice("kind", METHODS, "auto")
     solver = table.text("solver", None)
@@ -179,8 +179,8 @@ def _method(top: Table) -> Method:
     step = table.number("step", None, positive=True)
     if step is not None and solver is None:
         raise table.wrong("step", "a step without a solver", step, "a solver that takes this step")
-    rtol = table.number("rtol", 1e-9, positive=True)
-    if rtol >= 1:
+    rtol = table.number("rtol", None, positive=True)
+    if rtol is not None and rtol >= 1:
         raise table.wrong("rtol", "too large a relative tolerance", rtol, "a number below 1")
     return Method(kind, solver, rtol, step)
 

@@ -49,11 +49,11 @@ class Times:
 
 @dataclasses.dataclass(frozen=True)
 class Method:
-    """Which method and solver (None: left to the planner), tolerance or fixed step."""
+    """Which method and solver, tolerance and fixed step, s; None: left to the planner."""
 
     kind: str
     solver: str | None
-    rtol: float
+    rtol: float | None
     step: float | None
 
 

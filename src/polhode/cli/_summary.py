@@ -1,0 +1,151 @@
+"""The table that `polhode run` prints."""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import polhode
+from polhode.cli._job import Job, Outcome, Residuals
+from polhode.plot import Scale
+
+_MEANINGS = {
+    "P_psi": "turn about long axis",
+    "P_phi": "mean precession",
+}
+
+
+class Figures(NamedTuple):
+    """Figures of merit of a run; `periods` name -> (bodies,) s, None unless the body is free."""
+
+    periods: dict[str, np.ndarray] | None
+    modes: list[str] | None
+    energy: float | None
+    momentum: float | None
+
+
+def measure(job: Job, outcome: Outcome) -> Figures:
+    """Periods of every body; the largest change of energy and of angular momentum in space.
+
+    Energy is given where H does not depend on time through torques, momentum where nothing acts.
+    """
+    scene, trajectory = job.scene, outcome.trajectory
+    energy = momentum = periods = modes = None
+    if scene.torque is None:
+        energies = np.asarray(trajectory.energy, np.float64)
+        energies = energies.reshape(-1, energies.shape[-1])
+        scale = np.abs(_kinetic(trajectory)).reshape(energies.shape).max(axis=-1, keepdims=True)
+        energy = _largest((energies - energies[:, :1]) / np.where(scale > 0, scale, 1))
+    if scene.is_free:
+        vector = np.asarray(trajectory.momentum_space, np.float64)
+        size = np.linalg.norm(vector[..., :1, :], axis=-1)
+        change = np.linalg.norm(vector - vector[..., :1, :], axis=-1)
+        momentum = _largest(change / np.where(size > 0, size, 1))
+        found = polhode.periods(scene.inertia, job.state)
+        periods = {name: np.atleast_1d(np.asarray(getattr(found, name))) for name in _MEANINGS}
+        modes = _mode_names(found.mode)
+    return Figures(periods, modes, energy, momentum)
+
+
+def _kinetic(trajectory) -> np.ndarray:
+    omega, momentum = trajectory.omega_body, trajectory.momentum_body
+    return np.einsum("...i,...i->...", np.asarray(omega, float), np.asarray(momentum, float)) / 2
+
+
+def _largest(relative: np.ndarray) -> float:
+    return float(np.nanmax(np.abs(relative))) if np.isfinite(relative).any() else float("nan")
+
+
+def _mode_names(mode: Any) -> list[str]:
+    return [polhode.Mode(int(code)).name for code in np.atleast_1d(np.asarray(mode))]
+
+
+def table(job: Job, outcome: Outcome, figures: Figures, residuals: Residuals | None):
+    """The summary as a rich Table."""
+    from rich.table import Table
+    from rich.text import Text
+
+    file, bodies = job.file, job.bodies
+    unit, size = file.times.unit, file.times.unit_seconds
+    clones = bodies - 1
+    grid = Table(
+        title=Text(file.title, style="bold"),
+        title_justify="left",
+        caption=_caption(job, outcome, clones),
+        caption_justify="left",
+        show_edge=False,
+        pad_edge=False,
+    )
+    grid.add_column("")
+    grid.add_column("nominal", justify="right")
+    if clones:
+        grid.add_column(f"{clones:,} clones", justify="right")
+    if file.published:
+        grid.add_column("published", justify="right")
+
+    def row(name, nominal, spread="", published=""):
+        cells = [name, nominal]
+        cells += [spread] if clones else []
+        cells += [published] if file.published else []
+        grid.add_row(*map(Text, cells))  # Text: brackets are units here, not markup
+
+    if figures.periods is not None:
+        for name, meaning in _MEANINGS.items():
+            values = figures.periods[name] / size
+            row(f"{name}  {meaning} [{unit}]", f"{values[0]:.4f}", _spread(values[1:]),
+                _published(file, name, size))  # fmt: skip
+        row("mode", figures.modes[0], _count(figures.modes[1:]))
+    if figures.energy is not None:
+        row("largest relative change of energy", f"{figures.energy:.1e}")
+    if figures.momentum is not None:
+        row("largest relative change of momentum", f"{figures.momentum:.1e}")
+    for name, value in _misfits(residuals, Scale.of(np.ptp(file.times.seconds))):
+        row(name, value)
+    row("compilation [s]", f"{outcome.compile_seconds:.2f}")
+    row("simulation [s]", f"{outcome.run_seconds:.2f}")
+    return grid
+
+
+def _spread(values: np.ndarray) -> str:
+    if not len(values) or not np.isfinite(values).any():
+        return ""
+    return f"{np.nanmean(values):.4f} ± {np.nanstd(values):.4f}"
+
+
+def _count(modes: list[str]) -> str:
+    return ", ".join(f"{modes.count(name):,} {name}" for name in sorted(set(modes)))
+
+
+def _published(file, name: str, size: float) -> str:
+    found = [value for value in file.published if value.name == name]
+    texts = [
+        f"{value.value / size:.2f}"
+        + ("" if value.uncertainty is None else f" ± {value.uncertainty / size:.2f}")
+        for value in found
+    ]
+    return "; ".join(texts)
+
+
+def _misfits(residuals: Residuals | None, scale: Scale):
+    if residuals is None:
+        return
+    angle = np.degrees(residuals.angle[np.isfinite(residuals.angle)])
+    if angle.size:
+        yield f"median misfit, {angle.size} attitudes [deg]", f"{np.median(angle):.3g}"
+    rates = np.linalg.norm(residuals.rates, axis=-1) / scale.radians_per_second
+    rates = rates[np.isfinite(rates)]
+    if rates.size:
+        yield f"median misfit, {rates.size} rates [{scale.rate}]", f"{np.median(rates):.3g}"
+
+
+def _caption(job: Job, outcome: Outcome, clones: int) -> str:
+    file = job.file
+    lines = [f"{job.bodies:,} bodies, {len(job.ts):,} samples, {job.ts.dtype}"]
+    if file.published:
+        sources = dict.fromkeys(value.source for value in file.published)
+        lines.append(f"published: {'; '.join(sources)}")
+    if clones:
+        lines.append("clones: mean ± standard deviation, drawn from the spread of")
+        lines += [f"  {spread.quantity}: {spread.source}" for spread in file.monte_carlo.spreads]
+    if job.redrawn:
+        lines.append(f"  {job.redrawn:,} draws had moments that no body has, and were drawn again")
+    return "\n".join(lines)

@@ -1,0 +1,261 @@
+"""The command line: what it writes and prints, its exit codes, and what is left after a failure."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import xarray
+
+import polhode as ph
+from polhode.cli import main
+from polhode.io import build_scene, build_state, read_scene
+
+SCENES = Path(__file__).parents[2] / "scenes"
+TOP = """
+title = "small top"
+source = "test"
+[inertia]
+moments = [1.0, 1.5, 2.0]
+[state]
+euler = { angles = [10, 30, 0], unit = "deg" }
+omega_body = [0.5, 0.2, 3.0]
+[potential]
+kind = "uniform-gravity"
+mass = 1.0
+centre_body = [0.0, 0.0, 0.1]
+[times]
+stop = 2.0
+number = 11
+[monte_carlo]
+clones = 120
+seed = 5
+moments = { relative_sigma = 0.01, source = "assumed: for the test" }
+"""
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """An empty current folder with the small scene in it."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "top.toml").write_text(TOP)
+    return tmp_path
+
+
+def run(*arguments):
+    return main(["run", *map(str, arguments)])
+
+
+def test_run_writes_data_and_figure_and_prints_a_summary(here, capsys):
+    assert run("top.toml", "-o", "new/top.nc") == 0
+    out = capsys.readouterr().out
+    assert "small top" in out
+    assert "change of energy" in out
+    assert "assumed: for the test" in out
+    assert sorted(path.name for path in (here / "new").iterdir()) == ["top.nc", "top.png"]
+    assert (here / "new" / "top.png").read_bytes()[:4] == b"\x89PNG"
+    with xarray.open_dataset(here / "new" / "top.nc", engine="h5netcdf") as data:
+        assert data.sizes == {"clone": 121, "time": 11, "quaternion": 4, "axis": 3}
+        assert data.attrs["title"] == "small top"
+        assert data.attrs["scene"] == TOP
+        np.testing.assert_array_equal(data["moments"][0], [1, 1.5, 2])
+        # the nominal body and the last clone, computed without the command line
+        file = read_scene("top.toml")
+        scene = build_scene(file, np.float64)
+        state = build_state(file, np.float64, scene.inertia)
+        for clone in (0, 120):
+            body = ph.Inertia.from_moments(data["moments"].values[clone])
+            single = ph.Scene(body, scene.potential)
+            alone = ph.simulate(single, state, file.times.seconds)
+            np.testing.assert_allclose(data["wxyz"][clone], alone.wxyz, atol=2e-7)
+        assert (data["status"] == 0).all()
+
+
+def test_options_replace_the_scene(here, capsys):
+    assert run("top.toml", "--clones", 3, "--seed", 9, "--no-figure", "--precision", "float32") == 0
+    assert "3 clones" in capsys.readouterr().out
+    assert not (here / "top.png").exists()
+    with xarray.open_dataset("top.nc", engine="h5netcdf") as data:
+        assert data.sizes["clone"] == 4
+        assert data["wxyz"].dtype == np.float32
+        first = data["moments"].values[1:]
+    assert run("top.toml", "--clones", 3, "--seed", 10, "--no-figure", "-q") == 0
+    captured = capsys.readouterr()
+    assert captured.out == captured.err == ""
+    with xarray.open_dataset("top.nc", engine="h5netcdf") as data:
+        assert np.abs(data["moments"].values[1:] - first).max() > 1e-3
+    assert run("top.toml", "--clones", 0, "--no-figure", "-q") == 0
+    with xarray.open_dataset("top.nc", engine="h5netcdf") as data:
+        assert "clone" not in data.sizes
+
+
+def test_chunks_cover_every_body_once(here):
+    from polhode.cli import _job
+
+    job = _job.prepare(read_scene("top.toml"), "float64")
+    seen = []
+    outcome = _job.run(job, seen.append)
+    assert seen == [50, 100, 121]
+    whole = ph.simulate(job.scene, job.state, job.ts, job.method)
+    np.testing.assert_allclose(outcome.trajectory.wxyz, whole.wxyz, atol=2e-7)
+    assert outcome.compile_seconds >= 0
+    assert outcome.run_seconds > 0
+
+
+def test_compile_time_counts_nested_reports_once(monkeypatch):
+    from polhode.cli import _job
+
+    clock, now = _job._CompileClock(), iter([1.0, 3.0, 4.0, 9.0, 20.0])
+    monkeypatch.setattr(_job.time, "perf_counter", lambda: next(now))
+    # (end, duration): 0.5-1 before the start, 2.5-3 inside 2-4, 8-9 apart, 1 of another kind
+    for duration in (0.5, 0.5, 2.0, 1.0):
+        clock.listen("/jax/core/compile/jaxpr_trace_duration", duration, fun_name="f")
+    clock.listen("/jax/other", 1.0)
+    assert clock.since(1.5) == 3.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "hints"),
+    [
+        (["run", "absent.toml"], 2, ["absent.toml", "No such file"]),
+        (["run", "bad.toml"], 2, ["bad.toml", "momnets", 'did you mean "moments"']),
+        (["explain", "bad.toml"], 2, ["bad.toml", "momnets"]),
+        (["run", "flat.toml"], 2, ["flat.toml", "[inertia] moments", "triangle"]),
+        (["run", "method.toml"], 2, ["[method] solver", 'did you mean "Dopri8"']),
+        (["run", "slow.toml"], 1, ["nominal body did not finish", "max_steps"]),
+        (["run", "single.toml", "--clones", "5"], 2, ["[monte_carlo]", "--clones"]),
+        (["run", "top.toml", "-o", "folder.nc"], 1, ["is a folder"]),
+    ],
+)
+def test_failures_are_one_readable_block(here, capsys, arguments, code, hints):
+    (here / "folder.nc").mkdir()
+    texts = {
+        "bad": TOP.replace("moments = [1.0", "momnets = [1.0"),
+        "flat": TOP.replace("1.5, 2.0]", "1.5, 3.0]"),
+        "method": TOP + "[method]\nkind = 'lie-poisson'\nsolver = 'Dorpi8'\n",
+        "slow": TOP[: TOP.index("[monte_carlo]")]
+        + "[method]\nkind = 'lie-poisson'\nsolver = 'Euler'\nstep = 1e-6\n",
+        "single": TOP[: TOP.index("[monte_carlo]")],
+    }
+    for name, text in texts.items():
+        (here / f"{name}.toml").write_text(text)
+    old = here / "slow.nc"
+    old.write_text("old")
+    before = sorted(here.iterdir())
+    assert main(arguments) == code
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.startswith("polhode: ")
+    assert "Traceback" not in captured.err
+    for hint in hints:
+        assert hint in captured.err
+    assert sorted(here.iterdir()) == before
+    assert old.read_text() == "old"
+    assert main([*arguments, "--debug"]) == code
+    assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "hint"),
+    [
+        ([], "required"),
+        (["rnu"], "invalid choice"),
+        (["run"], "SCENE"),
+        (["run", "top.toml", "--clones", "-1"], "whole number from 0"),
+        (["run", "top.toml", "--clones", "many"], "whole number from 0"),
+        (["run", "top.toml", "--precision", "float16"], "float64"),
+        (["run", "top.toml", "--nofigure"], "unrecognized arguments"),
+    ],
+)
+def test_wrong_options_are_usage_errors(here, capsys, arguments, hint):
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert hint in capsys.readouterr().err
+
+
+def test_help_and_version(capsys):
+    for arguments, text in ((["--help"], "explain"), (["run", "--help"], "--precision"),
+                            (["--version"], ph.__version__)):  # fmt: skip
+        with pytest.raises(SystemExit) as caught:
+            main(arguments)
+        assert caught.value.code == 0
+        assert text in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("failure", [OSError("disk full"), KeyboardInterrupt()])
+def test_failed_write_keeps_the_old_file(here, capsys, monkeypatch, failure):
+    (here / "top.nc").write_text("old")
+
+    def half(self, path, **_):
+        Path(path).write_text("half")
+        raise failure
+
+    monkeypatch.setattr(xarray.Dataset, "to_netcdf", half)
+    code = run("top.toml", "--clones", 2)
+    assert code == (130 if isinstance(failure, KeyboardInterrupt) else 1)
+    assert ("interrupted" if code == 130 else "disk full") in capsys.readouterr().err
+    assert (here / "top.nc").read_text() == "old"
+    assert sorted(path.name for path in here.iterdir()) == ["top.nc", "top.toml"]
+
+
+def test_termination_unwinds(here, monkeypatch):
+    before = signal.getsignal(signal.SIGTERM)
+    monkeypatch.setattr(ph, "simulate", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM))
+    with pytest.raises(SystemExit) as caught:
+        run("top.toml", "--clones", 2)
+    assert caught.value.code == 143
+    assert signal.getsignal(signal.SIGTERM) is before
+    assert [path.name for path in here.iterdir()] == ["top.toml"]
+
+
+def test_clones_that_do_not_finish_are_reported(here, capsys, monkeypatch):
+    simulate = ph.simulate
+
+    def failing(*arguments, **options):
+        made = simulate(*arguments, **options)
+        import dataclasses
+
+        return dataclasses.replace(made, status=made.status.at[-1].set(ph.Status.NOT_FINITE))
+
+    monkeypatch.setattr(ph, "simulate", failing)
+    assert run("top.toml", "--clones", 2, "--no-figure") == 1
+    assert "1 of 3 bodies did not finish, the first being clone 2" in capsys.readouterr().err
+    with xarray.open_dataset("top.nc", engine="h5netcdf") as data:
+        np.testing.assert_array_equal(data["status"], [0, 0, ph.Status.NOT_FINITE])
+
+
+def test_interrupt_of_a_running_process_leaves_nothing_half_written(here):
+    output = here / "new" / "top.nc"
+    command = [sys.executable, "-m", "polhode.cli", "run", "top.toml", "-o", str(output),
+               "--clones", "1000000"]  # fmt: skip
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 120
+        # the folder is made once the scene is read and the work is about to begin
+        while not output.parent.exists() and time.monotonic() < deadline:
+            assert process.poll() is None
+            time.sleep(0.05)
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        errors = process.communicate(timeout=120)[1]
+    assert process.returncode == 130
+    assert "interrupted" in errors
+    assert "Traceback" not in errors
+    assert list(output.parent.iterdir()) == []
+
+
+def test_explain_names_the_method(here, capsys):
+    assert main(["explain", "top.toml"]) == 0
+    out = capsys.readouterr().out
+    assert "small top" in out
+    assert "120 clones, seed 5" in out
+    assert str(ph.explain(ph.Scene(ph.Inertia.from_moments(jnp.ones(3))), *_still())) not in out
+
+
+def _still():
+    return ph.State(wxyz=jnp.eye(4)[0], omega_body=jnp.ones(3)), jnp.array([0.0, 1.0])
