@@ -7,6 +7,7 @@ from polhode.rotation._direct import (
     axis_angle_to_euler as axis_angle_to_euler,
     euler_to_axis_angle as euler_to_axis_angle,
     euler_to_matrix as euler_to_matrix,
+    euler_to_matrix_k as euler_to_matrix_k,
     euler_to_modified_rodrigues as euler_to_modified_rodrigues,
     euler_to_rotation_vector as euler_to_rotation_vector,
     matrix_to_euler as matrix_to_euler,

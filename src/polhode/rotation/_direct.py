@@ -5,6 +5,7 @@ through it loses nothing: small rotations keep their relative accuracy, half tur
 All angles are in rad; ``sequence`` defaults to the documents' ZYZ.
 """
 
+import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode.rotation._euler import euler_to_wxyz, wxyz_to_euler
@@ -91,3 +92,15 @@ def modified_rodrigues_to_euler(
 ) -> _Angles:
     """Euler angles of modified Rodrigues parameters, either set."""
     return wxyz_to_euler(modified_rodrigues_to_wxyz(parameters), sequence)
+
+
+def euler_to_matrix_k(
+    phi: Float[ArrayLike, "*#b"], theta: Float[ArrayLike, "*#b"], psi: Float[ArrayLike, "*#b"]
+) -> Float[Array, "*b 3 3"]:
+    """Document 002's matrix K (eq. 1): R of the same ZYZ angles with the y and z axes reversed.
+
+    ``K(phi, theta, psi) = D R D = R(-phi, -theta, -psi) = R(psi, theta, phi)^T``, with
+    ``D = diag(1, -1, -1)`` (theory section 5.1). K is neither R nor its transpose.
+    """
+    w, x, y, z = jnp.moveaxis(euler_to_wxyz(phi, theta, psi), -1, 0)
+    return wxyz_to_matrix(jnp.stack([w, x, -y, -z], axis=-1))

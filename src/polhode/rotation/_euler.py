@@ -4,7 +4,6 @@ ZYZ, ``R = Rz(phi) Ry(theta) Rz(psi)``, is the documents' convention (theory sec
 the other sequences are reduced to the same formulas by a quarter turn (Bernardes and Viollet 2022).
 """
 
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -108,7 +107,8 @@ def wxyz_to_euler(
     else:
         parity = _parity(i, j, k)
         along_k = parity * wxyz[..., 1 + k]
-        # R_i(a) R_j(b) R_k(c), turned on by a quarter about j, is R_i(a) R_j(b + pi/2) R_i(-parity c).
+        # R_i(a) R_j(b) R_k(c), turned on by a quarter about j, is
+        # R_i(a) R_j(b + pi/2) R_i(-parity c).
         sums = (w - along_j, along_i - along_k)
         differences = (w + along_j, along_i + along_k)
     sum_size, sum_cos, sum_sin = _phase(*sums)
