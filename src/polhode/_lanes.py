@@ -112,3 +112,21 @@ def along_time(part: Any, batch_rank: int) -> Any:
         return x.reshape((1,) * (batch_rank - len(lead)) + lead + (1, *core))
 
     return map_arrays(part, expand)
+
+
+def map_chunks(fn: Callable[[Any], Any], lanes: Any, n: int, size: int) -> Any:
+    """``fn`` over chunks of at most ``size`` of the ``n`` lanes, one after the other.
+
+    Memory stays bounded by a chunk and its arrays stay in the cache. The last chunk is filled up
+    with copies of the last lane, which are dropped again.
+    """
+    if n <= size:
+        return fn(lanes)
+    count = -(-n // size)
+
+    def split(x):
+        fill = jnp.broadcast_to(x[-1:], (count * size - n, *x.shape[1:]))
+        return jnp.concatenate([x, fill]).reshape(count, size, *x.shape[1:])
+
+    chunks = jax.lax.map(fn, jax.tree.map(split, lanes))
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], chunks)

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from polhode._lanes import along_time, is_lane_tree
+from polhode._lanes import along_time, is_lane_tree, map_chunks
 from polhode._scene import Scene
 from polhode._state import State
 from polhode._status import Status
@@ -92,25 +92,16 @@ class AbstractDiffraxMethod(AbstractMethod):
         """wxyz, omega_body and whether the chart is still sound, of sampled components (N, T)."""
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: float, record: Record) -> Samples:
-        n = state.wxyz.shape[0]
-        size = 1 if ts.ndim == 2 else min(self.chunk, n)
+        size = 1 if ts.ndim == 2 else self.chunk
         lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
-        if n == size and ts.ndim == 1:
-            return self._solve(scene, state, ts, rtol, record)
-        count = -(-n // size)
-
-        def pad(x):
-            fill = jnp.broadcast_to(x[-1:], (count * size - n, *x.shape[1:]))
-            return jnp.concatenate([x, fill]).reshape(count, size, *x.shape[1:])
 
         def one(chunk):
             lanes, times = chunk
             scene, state = eqx.combine(lanes, shared)
-            times = ts if times is None else times[0]
-            return self._solve(scene, state, times, rtol, record)
+            return self._solve(scene, state, ts if times is None else times[0], rtol, record)
 
-        chunks = jax.tree.map(pad, (lanes, ts if ts.ndim == 2 else None))
-        return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], jax.lax.map(one, chunks))
+        times = ts if ts.ndim == 2 else None
+        return map_chunks(one, (lanes, times), state.wxyz.shape[0], size)
 
     def _stacked_field(self, t, y, dynamics):
         """The field on one array (components, N): for a diffrax solver far faster than leaves."""
