@@ -1,6 +1,7 @@
 """The exact free motion at given times."""
 
 import math
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +10,9 @@ from jaxtyping import Array, Float
 from polhode.free._exact import turns
 from polhode.free._motion import Swing, Turning
 from polhode.free._phase import cosine_sine, horner, parity, sine_half, sinh
-from polhode.free._roles import Triple, restore
+from polhode.free._roles import Triple, restore, settle
 
 Scalars = Float[Array, "*b"]
-_barrier = jax.lax.optimization_barrier
 
 
 def sweep(swing: Swing, t: Scalars) -> tuple[Scalars, Scalars]:
@@ -24,10 +24,9 @@ def sweep(swing: Swing, t: Scalars) -> tuple[Scalars, Scalars]:
     return whole, rest
 
 
-def jacobi(swing: Swing, rest: Scalars):
+def jacobi(swing: Swing, rest: Scalars, stage):
     """sn / omega_p, cn, dn of the time since the last half turn, and the base sine."""
-    half = jnp.where(swing.circular, sine_half(rest), sinh(swing.span * rest))
-    half = _barrier(half)
+    half = stage(jnp.where(swing.circular, sine_half(rest), sinh(swing.span * rest)))
     sign = jnp.where(swing.circular, 1.0, -1.0).astype(half.dtype)
     base = sign * half * half
     cosine = 1 - 2 * base
@@ -68,17 +67,25 @@ def momentum(swing: Swing, functions: Triple) -> Triple:
     )
 
 
-def attitude(
-    swing: Swing, turning: Turning, t: Scalars, rest, half, functions: Triple, now: Triple
-):
-    """Attitude from the angle about the momentum and the minimal rotation to axis 3."""
-    S, C, N = functions
-    whole, turned = turns(turning.pace, t)
-    turned = turned + turning.sway * rest
-    extra = jnp.round(turned)
-    cosine, sine = cosine_sine(turned - extra)
+class Moment(NamedTuple):
+    """The motion at one time, axes in their roles, scaled units."""
+
+    whole: Scalars  # half turns of the theta functions' argument
+    folded: Triple  # S, C, N less their half turns
+    functions: Triple  # S = sn / omega_p, C = cn, N = dn
+    momentum: Triple
+    half: tuple[Scalars, Scalars] | None  # cosine and sine of half the angle about L, over |M|
+
+
+def half_angle(swing: Swing, turning: Turning, t: Scalars, rest, half, N, turned: Triple, stage):
+    """Cosine and sine of half of the angle about L; divided by the tilt (|L| + |L3|, L x n3)."""
+    S, l2, l3 = turned
+    whole, angle = turns(turning.pace, t)
+    angle = angle + turning.sway * rest
+    extra = jnp.round(angle)
+    cosine, sine = cosine_sine(angle - extra)
     sign = parity(whole + extra)
-    cosine, sine = _barrier((sign * cosine, sign * sine))
+    cosine, sine = stage((sign * cosine, sign * sine))
     square = half * half
     other = jnp.sqrt(1 + jnp.where(swing.circular, -square, square))
     double = 2 * half * other
@@ -87,28 +94,55 @@ def attitude(
     imaginary = horner(turning.imaginary, z) * jnp.where(
         swing.circular, 2 * double * (1 - 2 * square), half
     )
-    real, imaginary = _barrier((real, imaginary))
-    l1, l2, l3 = now
-    first2, first3 = swing.momentum[1], jnp.abs(swing.momentum[2])
+    real, imaginary = stage((real, imaginary))
     mu = turning.peak / turning.length
-    y, w = first3 / turning.peak, jnp.abs(l3) / turning.peak
+    y, w = jnp.abs(swing.momentum[2]) / turning.peak, jnp.abs(l3) / turning.peak
+    # The series hold for the motion that starts where L3 is largest; the addition theorem of the
+    # third kind carries them to the actual start.
     a = mu * (1 + N) * (1 + y) * (1 + w) + (1 - mu) * (1 + N + y + w)
-    b = turning.bend * S * first2 * l2
+    b = turning.bend * S * swing.momentum[1] * l2
     # (cosine + i sine) (real - i imaginary) (a + i b)
     f, g = real * a + imaginary * b, real * b - imaginary * a
-    c, s = cosine * f - sine * g, cosine * g + sine * f
+    return cosine * f - sine * g, cosine * g + sine * f
+
+
+def advance(swing: Swing, turning: Turning | None, t: Scalars, many: bool) -> Moment:
+    """The motion at time t."""
+    # One kernel per output repeats the arithmetic of all stages, which costs less than to write
+    # and read them when every lane has many times, and more when it has one.
+    stage = (lambda x: x) if many else (lambda x: settle(x, swing.one))
+    whole, rest = sweep(swing, t)
+    half, folded = jacobi(swing, rest, stage)
+    sign = parity(whole)
+    S, C, N = stage((sign * folded[0], sign * folded[1], folded[2]))
+    l1, l2, l3 = now = stage(momentum(swing, (S, C, N)))
+    if turning is None:
+        return Moment(whole, folded, (S, C, N), now, None)
+    c, s = half_angle(swing, turning, t, rest, half, N, (S, l2, l3), stage)
     height = turning.length + jnp.abs(l3)
     scale = jax.lax.rsqrt((c * c + s * s) * (height * height + l1 * l1 + l2 * l2))
-    c, s = _barrier((c * scale, s * scale))
+    return Moment(whole, folded, (S, C, N), now, stage((c * scale, s * scale)))
+
+
+def rates(swing: Swing, at: Moment) -> Triple:
+    """Body rates along x, y, z."""
+    spin = tuple(swing.pulse * (l * d) for l, d in zip(at.momentum, swing.inverse, strict=True))
+    return restore(spin, swing.middle, swing.circled)
+
+
+def attitude(swing: Swing, turning: Turning, at: Moment) -> tuple[Scalars, ...]:
+    """Attitude: the start, the turn about axis 3, and the minimal rotation carrying L to it."""
+    l1, l2, l3 = at.momentum
+    c, s = at.half
+    height = turning.length + jnp.abs(l3)
     facing = jnp.copysign(1, swing.momentum[2])
     side = swing.parity * facing
+    v0 = c * height
     v1, v2, v3 = restore(
         (s * l1 + side * c * l2, s * l2 - side * c * l1, facing * s * height),
         swing.middle,
         swing.circled,
     )
-    v0 = c * height
-    v0, v1, v2, v3 = _barrier((v0, v1, v2, v3))
     q0, q1, q2, q3 = turning.start
     return (
         q0 * v0 - q1 * v1 - q2 * v2 - q3 * v3,
@@ -116,19 +150,3 @@ def attitude(
         q0 * v2 + q2 * v0 + q3 * v1 - q1 * v3,
         q0 * v3 + q3 * v0 + q1 * v2 - q2 * v1,
     )
-
-
-def flow(swing: Swing, turning: Turning | None, t: Scalars, rates: bool):
-    """Rates (x, y, z) and attitude at time t; what is not asked is None."""
-    whole, rest = _barrier(sweep(swing, t))
-    half, (S, C, N) = jacobi(swing, rest)
-    sign = parity(whole)
-    S, C, N = _barrier((sign * S, sign * C, N))
-    now = _barrier(momentum(swing, (S, C, N)))
-    omega = wxyz = None
-    if rates:
-        spin = tuple(swing.pulse * (l * d) for l, d in zip(now, swing.inverse, strict=True))
-        omega = restore(spin, swing.middle, swing.circled)
-    if turning is not None:
-        wxyz = attitude(swing, turning, t, rest, half, (S, C, N), now)
-    return omega, wxyz

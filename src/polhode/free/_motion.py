@@ -3,12 +3,11 @@
 import math
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from polhode.free._phase import arc
-from polhode.free._roles import Roles, Triple, restore
+from polhode.free._roles import Roles, Triple, restore, settle
 
 Scalars = Float[Array, "*b"]
 
@@ -44,8 +43,9 @@ class Swing(NamedTuple):
     parity: Scalars
     pulse: Scalars
     heft: Scalars
-    middle: Int[Array, "*b"]
-    circled: Int[Array, "*b"]
+    middle: Scalars
+    circled: Scalars
+    one: Scalars
 
 
 class Turning(NamedTuple):
@@ -92,6 +92,7 @@ def _nome(square: Scalars, root: Scalars) -> Scalars:
 def prepare_swing(roles: Roles) -> Swing:
     """Parameter, periods and amplitudes of the momentum in the body."""
     i1, i2, i3 = roles.moments
+    one = roles.one
     w1, w2, w3 = roles.rates
     floor, _ = _limits(i1.dtype)
     d1, d2, d3 = 1 / i1, 1 / i2, 1 / i3
@@ -100,6 +101,7 @@ def prepare_swing(roles: Roles) -> Swing:
     p, r, s = d12 * d1 * d2, d23 * d2 * d3, d13 * d1 * d3
     A = (l1 * w1 * d13 + l2 * w2 * d23) * d3
     B = (l2 * w2 * d12 + l3 * w3 * d13) * d1
+    A, B = settle((A, B), one)
     x = B * r
     moving = x > 0
     divisor = jnp.where(moving, x, 1)
@@ -110,21 +112,23 @@ def prepare_swing(roles: Roles) -> Swing:
     square = jnp.where(circular, m, m1)
     other = jnp.sqrt(jnp.where(circular, m1, m))
     omega = jnp.sqrt(x)
-    square, other, omega = jax.lax.optimization_barrier((square, other, omega))
     a, b = 1.0, other
     for _ in range(_STEPS - 1):
         a, b = (a + b) / 2, jnp.sqrt(a * b)
     mean = (a + b) / 2
     nome = _nome(square, jnp.sqrt(other))
-    mean, nome = jax.lax.optimization_barrier((mean, nome))
+    mean, nome = settle((mean, nome), one)
     log_nome = jnp.where(circular | endless, 1, -jnp.log(jnp.where(circular | endless, 0.5, nome)))
     rate = omega * mean
+    rate = settle(rate, one)
     pace = rate / jnp.where(circular, math.pi, log_nome) * roles.pulse
+    inverse_rate = jnp.where(moving, 1 / jnp.where(moving, rate, 1), 0)
+    pace = settle(pace, one)
     return Swing(
         (l1, l2, l3), (d1, d2, d3), roles.moments, p, r, s, A, B, m, m1, circular, endless,
         jnp.where(endless, 0, nome), mean, log_nome, rate,
-        jnp.where(moving, 1 / jnp.where(moving, rate, 1), 0), pace, log_nome / 2,
-        roles.sense, roles.parity, roles.pulse, roles.heft, roles.middle, roles.circled,
+        inverse_rate, pace, log_nome / 2,
+        roles.sense, roles.parity, roles.pulse, roles.heft, roles.middle, roles.circled, one,
     )  # fmt: skip
 
 
@@ -143,14 +147,12 @@ def _descend(swing: Swing, length: Scalars) -> Scalars:
     d = jnp.where(held, length * jnp.sqrt(ratio), 1)
     a, b = jnp.ones_like(other), other
     above, below = start, jnp.ones_like(other)
-    for step in range(_STEPS):
+    for _ in range(_STEPS):
         mean = (a + b) / 2
         grown = jnp.sqrt(a * mean * ((b + d) / (a + d)))
         above = above * jnp.where(swing.circular, 2 * mean, grown)
         below = below * jnp.where(swing.circular, a + d, a)
         a, b, d = mean, jnp.sqrt(a * b), grown
-        if step % 2:
-            a, b, d, above, below = jax.lax.optimization_barrier((a, b, d, above, below))
     return above / below
 
 
@@ -160,6 +162,7 @@ def _circular_series(swing: Swing, shift: Scalars):
     q2 = q * q
     even = q * (1 + 2 * shift * shift)  # q cosh 2b
     odd = 2 * (q * shift) * jnp.sqrt(1 + shift * shift)  # q sinh 2b
+    even, odd = settle((even, odd), swing.one)
     c2, s2 = q2 * (2 * even * even - q2), 2 * q2 * even * odd
     c3 = q2 * q2 * q2 * even * (4 * even * even - 3 * q2)
     s3 = q2 * q2 * q2 * odd * (4 * odd * odd + 3 * q2)
@@ -187,6 +190,7 @@ def _hyperbolic_series(swing: Swing, tangent: Scalars):
     double_sine = tangent * double_cosine
     cosine = jnp.sqrt((1 + double_cosine) / 2)
     sine = double_sine / (2 * cosine)
+    double_sine = 2 * sine * cosine
     angle = arc(double_sine / (1 + double_cosine))
     cosines, sines = (
         [cosine, cosine * (2 * double_cosine - 1)],
@@ -229,8 +233,7 @@ def prepare_turning(swing: Swing, wxyz: tuple[Scalars, ...]) -> Turning:
     divisor = jnp.where(uneven, swing.s, 1)
     peak = jnp.where(uneven, jnp.sqrt(swing.B / divisor), jnp.abs(l3))
     across = jnp.where(uneven, swing.A / divisor, l1 * l1 + l2 * l2)  # largest L1^2
-    length, peak, across = jax.lax.optimization_barrier((length, peak, across))
-    shift = jax.lax.optimization_barrier(_descend(swing, length))
+    shift = _descend(swing, length)
     real_c, imaginary_c, slope_c = _circular_series(swing, shift)
     real_h, imaginary_h, slope_h, beta = _hyperbolic_series(swing, shift)
     pick = swing.circular
@@ -238,11 +241,13 @@ def prepare_turning(swing: Swing, wxyz: tuple[Scalars, ...]) -> Turning:
     imaginary = tuple(
         swing.sense * jnp.where(pick, x, y) for x, y in zip(imaginary_c, imaginary_h, strict=True)
     )
+    real, imaginary = settle((real, imaginary), swing.one)
     # At the start of the reference motion the momentum is (sqrt(across), 0, peak).
     begin = (d3 * peak + d1 * across / (length + peak)) / 2
     slope = jnp.where(pick, slope_c, slope_h)
     still = pick | swing.endless
     sway = jnp.where(still, 0, swing.sense * 2 * beta)
+    sway, slope = settle((sway, slope), swing.one)
     half_rate = begin + swing.rate * (swing.sense * slope - sway / swing.log_nome)
     # The minimal rotation carrying L to axis 3 is (|L| + |L3|, L x n3); the start undoes it.
     side = swing.parity * jnp.copysign(1, l3)
@@ -251,6 +256,8 @@ def prepare_turning(swing: Swing, wxyz: tuple[Scalars, ...]) -> Turning:
     q0, q1, q2, q3 = wxyz
     t1, t2, t3 = tilt
     scale = 1 / jnp.sqrt((q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3) * (w * w + l1 * l1 + l2 * l2))
+    tilt, w, scale = settle(((t1, t2, t3), w, scale), swing.one)
+    t1, t2, t3 = tilt
     start = (
         (q0 * w + q1 * t1 + q2 * t2 + q3 * t3) * scale,
         (q1 * w - q0 * t1 - q2 * t3 + q3 * t2) * scale,

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from polhode.free._exact import (
     Pair,
@@ -18,6 +18,20 @@ from polhode.free._exact import (
 
 Scalars = Float[Array, "*b"]
 Triple = tuple[Scalars, Scalars, Scalars]
+
+
+def one_of(x: Scalars) -> Scalars:
+    """Ones that the compiler cannot know to be ones (NaN where x is)."""
+    return jnp.where(jnp.isnan(x), x, 1)
+
+
+def settle(values, one: Scalars):
+    """The same values, computed once and not again in every kernel that uses them.
+
+    The compiler repeats cheap arithmetic in every fused loop that needs its result, but never a
+    division; it drops optimisation barriers before fusing on the CPU.
+    """
+    return jax.tree.map(lambda x: x / one, values)
 
 
 class Roles(NamedTuple):
@@ -35,14 +49,21 @@ class Roles(NamedTuple):
     gap: Scalars  # |I3 w3^2 (I3 - I2) - I1 w1^2 (I2 - I1)|, the distance from the separatrix
     sense: Scalars  # +1 when axis 3 has the largest moment, -1 when the smallest
     parity: Scalars  # +1 when axes 1, 2, 3 are a right-handed system
-    middle: Int[Array, "*b"]  # where axis 2 stands among x, y, z
-    circled: Int[Array, "*b"]  # where axis 3 stands
+    middle: Scalars  # where axis 2 stands among x, y, z: 0, 1 or 2
+    circled: Scalars  # where axis 3 stands
+    one: Scalars
 
 
-def _ordered(swap: Bool[Array, "*b"], a: tuple, b: tuple) -> tuple[tuple, tuple]:
-    lower = tuple(jnp.where(swap, y, x) for x, y in zip(a, b, strict=True))
-    upper = tuple(jnp.where(swap, x, y) for x, y in zip(a, b, strict=True))
-    return lower, upper
+def pick(values: Triple, index) -> Scalars:
+    """The value that stands at an index 0, 1 or 2."""
+    return jnp.where(index == 0, values[0], jnp.where(index == 1, values[1], values[2]))
+
+
+def _extremes(x: Scalars, y: Scalars, z: Scalars) -> tuple[Int[Array, "*b"], Int[Array, "*b"]]:
+    """Where the smallest and the largest of three values stand; never the same place."""
+    low = jnp.where(y < x, jnp.where(z < y, 2, 1), jnp.where(z < x, 2, 0))
+    high = jnp.where(y >= x, jnp.where(z >= y, 2, 1), jnp.where(z >= x, 2, 0))
+    return low, high
 
 
 def _pull(moment: Scalars, rate: Scalars, above: Scalars, below: Scalars) -> Pair:
@@ -55,38 +76,38 @@ def assign_roles(moments: Triple, rates: Triple) -> Roles:
     largest = jnp.maximum(jnp.maximum(jnp.abs(rates[0]), jnp.abs(rates[1])), jnp.abs(rates[2]))
     pulse = binade(largest)
     heft = binade(jnp.maximum(jnp.maximum(moments[0], moments[1]), moments[2]))
-    axes = [
-        (i / heft, w / pulse, jnp.full(jnp.shape(i), k, jnp.int32))
-        for k, (i, w) in enumerate(zip(moments, rates, strict=True))
-    ]
-    for a, b in ((0, 1), (1, 2), (0, 1)):
-        axes[a], axes[b] = _ordered(axes[a][0] > axes[b][0], axes[a], axes[b])
-    axes = jax.lax.optimization_barrier(axes)
-    (low, w_low, k_low), (mid, w_mid, k_mid), (high, w_high, k_high) = axes
+    one = one_of(moments[0])
+    k_low, k_high = _extremes(*moments)
+    k_mid = 3 - k_low - k_high
+    low, mid, high = (pick(moments, k) / heft for k in (k_low, k_mid, k_high))
+    w_low, w_mid, w_high = (pick(rates, k) / pulse for k in (k_low, k_mid, k_high))
     resting = largest == 0
     w_high = jnp.where(resting, 1, w_high)
     # Exact next to the separatrix, where the two terms cancel and all depends on the difference.
     gap = subtract_pairs(_pull(high, w_high, high, mid), _pull(low, w_low, mid, low)).value
+    gap = settle(gap, one)
     # A tie is the separatrix, or a spin about an axis across that of a symmetric body: there the
     # circled axis must be one of the two equal ones.
     above = (gap > 0) | ((gap == 0) & (high - mid <= mid - low))
-    gap, above = jax.lax.optimization_barrier((gap, above))
-    (i1, w1, k1), (i3, w3, k3) = _ordered(~above, (low, w_low, k_low), (high, w_high, k_high))
-    one = jnp.ones_like(i1)
+    sense = settle(jnp.where(above, 1, -1).astype(low.dtype), one)
+    above = sense > 0
+    k1, k3 = jnp.where(above, k_low, k_high), jnp.where(above, k_high, k_low)
+    right = (k_mid - k1 == 1) | (k_mid - k1 == -2)
     return Roles(
-        (i1, mid, i3),
-        (w1, w_mid, w3),
-        jnp.where(resting, 0, pulse),
-        heft,
+        settle((jnp.where(above, low, high), mid, jnp.where(above, high, low)), one),
+        settle((jnp.where(above, w_low, w_high), w_mid, jnp.where(above, w_high, w_low)), one),
+        settle(jnp.where(resting, 0, pulse), one),
+        settle(heft, one),
         jnp.abs(gap),
-        jnp.where(above, one, -one),
-        jnp.where((k_mid - k1) % 3 == 1, one, -one),
-        k_mid,
-        k3,
+        sense,
+        settle(jnp.where(right, 1, -1).astype(low.dtype), one),
+        settle(k_mid.astype(low.dtype), one),
+        settle(k3.astype(low.dtype), one),
+        one,
     )
 
 
-def restore(roles_values: Triple, middle: Int[Array, "*b"], circled: Int[Array, "*b"]) -> Triple:
+def restore(roles_values: Triple, middle: Scalars, circled: Scalars) -> Triple:
     """Values along axes 1, 2, 3 put back along x, y, z."""
     first, second, third = roles_values
     return tuple(

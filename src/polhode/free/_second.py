@@ -1,0 +1,76 @@
+"""Integrals of the second kind that the tangent of the free motion needs."""
+
+import math
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from polhode.free._motion import Swing
+from polhode.free._roles import Triple
+
+Scalars = Float[Array, "*b"]
+
+_DUPLICATIONS = 14
+
+
+def _tail(x: Scalars, y: Scalars, z: Scalars) -> Scalars:
+    """R_D of three nearly equal arguments (Carlson, Numer. Algorithms 10 (1995), eq. 2.28)."""
+    mean = (x + y + 3 * z) / 5
+    a, b = 1 - x / mean, 1 - y / mean
+    c = -(a + b) / 3
+    e2, e3 = a * b - 6 * c * c, (3 * a * b - 8 * c * c) * c
+    e4, e5 = 3 * (a * b - c * c) * c * c, a * b * c * c * c
+    series = 1 - 3 / 14 * e2 + e3 / 6 + 9 / 88 * e2 * e2 - 3 / 22 * e4
+    return (series - 9 / 52 * e2 * e3 + 3 / 26 * e5) / (mean * jnp.sqrt(mean))
+
+
+def _incomplete(S: Scalars, C: Scalars, N: Scalars) -> tuple[Scalars, Scalars]:
+    """Integrals of S^2 and (S/N)^2 over less than half a turn, by Carlson's duplication.
+
+    They are S^3/3 R_D(C^2, N^2, 1) and S^3/3 R_D(C^2, 1, N^2), which share their square roots.
+    """
+    x, y, z = C * C, N * N, jnp.ones_like(N)
+    first = second = jnp.zeros_like(N)
+    share = 1.0
+    for _ in range(_DUPLICATIONS):
+        u, v, w = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
+        grow = u * v + v * w + w * u
+        first = first + share / (w * (z + grow))
+        second = second + share / (v * (y + grow))
+        x, y, z = (x + grow) / 4, (y + grow) / 4, (z + grow) / 4
+        share /= 4
+    cube = S * S * S
+    return cube * (first + share / 3 * _tail(x, y, z)), cube * (second + share / 3 * _tail(x, z, y))
+
+
+def complete(swing: Swing) -> tuple[Scalars, Scalars]:
+    """The same integrals over a quarter of the momentum's period."""
+    circular = swing.circular
+    square = jnp.where(circular, swing.m, swing.m1)
+    other = jnp.sqrt(jnp.where(circular, swing.m1, swing.m))
+    a, b = (1 + other) / 2, jnp.sqrt(other)
+    part = 1 / (2 * (1 + other))
+    gap = square * part
+    total, weight = 1 + 2 * gap * part, 2
+    for _ in range(3):
+        a, b = (a + b) / 2, jnp.sqrt(a * b)
+        part, gap = gap * part / (4 * a), gap * gap / (4 * a)
+        weight *= 2
+        total = total + weight * gap * part
+    half = total / 2
+    mean = swing.mean
+    quarter = jnp.where(circular, math.pi, swing.log_nome) / (2 * mean)
+    m = jnp.where(circular, 1, swing.m)
+    first = jnp.where(circular, quarter * half, (quarter * (1 - swing.m1 * half) - mean) / m)
+    second = jnp.where(circular, quarter * (1 - half), (mean + quarter * swing.m1 * (half - 1)) / m)
+    inverse = swing.inverse_rate * mean
+    cube = inverse * inverse * inverse
+    bounded = jnp.where(swing.endless, 0, cube)
+    return first * bounded, second * bounded / jnp.where(swing.endless, 1, swing.m1)
+
+
+def second_kind(swing: Swing, whole: Scalars, folded: Triple) -> tuple[Scalars, Scalars]:
+    """Integrals of S^2 and (S/N)^2 from the start; ``folded``: S, C, N less their half turns."""
+    first, second = _incomplete(*folded)
+    turn_first, turn_second = complete(swing)
+    return first + 2 * whole * turn_first, second + 2 * whole * turn_second

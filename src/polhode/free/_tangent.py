@@ -1,0 +1,194 @@
+"""The tangent of the exact free motion: how L(t) and the attitude answer to what they start from.
+
+The momentum is an algebraic function of its initial value and of S = sn/omega_p, C = cn, N = dn,
+which depend on x = B r and y = A p alone; their derivatives need the integrals of S^2 and
+(S/N)^2. Products of inertia turn the principal axes: the quotients by differences of inverse
+moments are carried out on paper, so that nothing is divided by a difference that may vanish.
+
+The attitude follows from two conserved quantities. With e the variation of the attitude (a
+rotation vector in body axes), R e x L = delta(ell) - R delta L is known because ell = R L is
+constant, and e . L = t delta E + 1/2 delta D : integral of L L^T, because the rate of e . L is
+omega . delta L + L . delta D L, of which omega . delta L + 1/2 L . delta D L is the constant
+delta E (D: inverse inertia tensor, E: energy).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from polhode.free._motion import Swing
+from polhode.free._roles import Triple
+
+Scalars = Float[Array, "*b"]
+
+
+class Change(NamedTuple):
+    """Variation of the start, axes in their roles, scaled units."""
+
+    momentum: Triple
+    inverse: Triple  # of the inverse moments
+    crossed: Triple  # of the inverse tensor's entries 12, 13, 23
+
+
+class Partials(NamedTuple):
+    """Derivatives of S, C, N with respect to x and y."""
+
+    S: tuple[Scalars, Scalars]
+    C: tuple[Scalars, Scalars]
+    N: tuple[Scalars, Scalars]
+
+    def along(self, dx: Scalars, dy: Scalars) -> Triple:
+        return tuple(fx * dx + fy * dy for fx, fy in self)
+
+
+def partials(x: Scalars, y: Scalars, functions: Triple, first: Scalars, second: Scalars):
+    """Derivatives of S, C, N from the integrals of S^2 and (S/N)^2."""
+    S, C, N = functions
+    both = first + second
+    bend = S * S * S - C * N * both
+    return Partials(
+        (-bend / 2, -C * N * second / 2),
+        (-S * (S * C + x * N * both) / 2, x * S * N * second / 2),
+        (y * S * bend / (2 * N), -S * (S / N - y * C * second) / 2),
+    )
+
+
+class Setting(NamedTuple):
+    """What the integrals of products of momenta depend on."""
+
+    momentum: Triple
+    p: Scalars
+    r: Scalars
+    s: Scalars
+    A: Scalars
+    B: Scalars
+
+
+def _quotients(at: Setting, functions: Triple):
+    """Delta, (1 - C)/r, (1 - N)/p and (CN - Delta)/s, none with a vanishing divisor."""
+    S, C, N = functions
+    (l1, l2, l3), p, r, s, A, B = at
+    square = S * S
+    delta = C * C + r * s * (l3 * l3) * square
+    ahead = C >= 0
+    up = jnp.where(ahead, square * B / jnp.where(ahead, 1 + C, 1), (1 - C) / jnp.where(ahead, 1, r))
+    tilt = square * A / (1 + N)
+    mixed = p * (l1 * l2) ** 2 + s * (l1 * l3) ** 2 + r * (l2 * l3) ** 2
+    near = square * (p * r * square * mixed - (r * l3 * l3 + p * l1 * l1))
+    product = C * N
+    skew = jnp.where(
+        ahead,
+        near / jnp.where(ahead, product + delta, 1),
+        (product - delta) / jnp.where(ahead, 1, s),
+    )
+    return delta, up, tilt, skew
+
+
+def products_of_momenta(at: Setting, functions: Triple, hand: Scalars) -> Triple:
+    """Integrals of L1 L2, L1 L3, L2 L3 over the time from the start."""
+    S, C, N = functions
+    l1, l2, l3 = at.momentum
+    delta, up, tilt, skew = _quotients(at, functions)
+    square = S * S
+    return (
+        (l1 * l2 * S * C + hand * l3 * (tilt - at.r * l2 * l2 * square)) / delta,
+        (l1 * l3 * S + hand * l2 * skew) / delta,
+        (l2 * l3 * S * N + hand * l1 * (up - at.p * l2 * l2 * square)) / delta,
+    )
+
+
+def _crossed(at: Setting, functions: Triple, now: Triple, by: Partials, hand, sense) -> tuple:
+    """Answers of L(t) to the entries 12, 13, 23 of the inverse tensor."""
+    S, C, N = functions
+    (l1, l2, l3), p, r, s, _, _ = at
+    n1, n2, n3 = now
+    delta, up, tilt, _ = _quotients(at, functions)
+    square = S * S
+    uneven = s > 0
+    span = jnp.where(uneven, s, 1)
+    ahead = C >= 0
+    split = jnp.where(
+        ahead,
+        -square * (r * l3 * l3 - p * l1 * l1) / jnp.where(ahead, C + N, 1),
+        (C - N) / span,
+    )
+    blend = jnp.where(uneven, (p * C + r * N) / span, 1)
+
+    def answer(dx, dy, dd, heads):
+        dS, dC, dN = by.along(dx, dy)
+        dd = dd - 2 * p * r * l2 * l2 * S * dS
+        rest = (
+            -l1 * dC + hand * r * l2 * l3 * (dS * N + S * dN) + n1 * dd,
+            -l2 * (dC * N + C * dN) - hand * s * l1 * l3 * dS + n2 * dd,
+            -l3 * dN + hand * p * l1 * l2 * (dS * C + S * dC) + n3 * dd,
+        )
+        return tuple(sense * (a + b) / delta for a, b in zip(heads, rest, strict=True))
+
+    q12, q13, q23 = l1 * l2, l1 * l3, l2 * l3
+    swap = 1 + r * tilt
+    turn = 1 + p * up
+    return (
+        answer(2 * r * q12, -2 * p * q12, -2 * r * q12 * square, (
+            l2 * C * tilt - hand * q13 * S * swap,
+            l1 * C * tilt + hand * q23 * S * swap,
+            hand * (l1 * l1 - l2 * l2) * S * C,
+        )),
+        answer(2 * r * q13, -2 * p * q13, jnp.zeros_like(S), (
+            l3 * split + hand * q12 * S * blend,
+            -hand * (l1 * l1 - l3 * l3) * S,
+            l1 * split - hand * q23 * S * blend,
+        )),
+        answer(2 * r * q23, -2 * p * q23, 2 * p * q23 * square, (
+            hand * (l2 * l2 - l3 * l3) * S * N,
+            -l3 * N * up - hand * q12 * S * turn,
+            -l2 * N * up + hand * q13 * S * turn,
+        )),
+    )  # fmt: skip
+
+
+def momentum_tangent(
+    swing: Swing, functions: Triple, now: Triple, by: Partials, change: Change
+) -> Triple:
+    """Variation of L(t) - L(0)."""
+    hand = swing.sense * swing.parity
+    (l1, l2, _), (e1, e2, e3) = swing.momentum, change.inverse
+    g1, g2, g3 = change.momentum
+    at = Setting(swing.momentum, swing.p, swing.r, swing.s, swing.A, swing.B)
+    dp, dr, ds = (swing.sense * d for d in (e1 - e2, e2 - e3, e1 - e3))
+    l3 = swing.momentum[2]
+    dA = 2 * (l1 * g1 * swing.s + l2 * g2 * swing.r) + l1 * l1 * ds + l2 * l2 * dr
+    dB = 2 * (l2 * g2 * swing.p + l3 * g3 * swing.s) + l2 * l2 * dp + l3 * l3 * ds
+    moved = by.along(dB * swing.r + swing.B * dr, dA * swing.p + swing.A * dp)
+    (j12, j13, j23), (k12, k13, k23) = jax.jvp(
+        lambda a, f: products_of_momenta(a, f, hand),
+        (at, functions),
+        (Setting(change.momentum, dp, dr, ds, dA, dB), moved),
+    )
+    straight = (
+        -hand * (dr * j23 + swing.r * k23),
+        hand * (ds * j13 + swing.s * k13),
+        -hand * (dp * j12 + swing.p * k12),
+    )
+    if change.crossed is None:
+        return straight
+    answers = _crossed(at, functions, now, by, hand, swing.sense)
+    return tuple(
+        total + sum(a[k] * h for a, h in zip(answers, change.crossed, strict=True))
+        for k, total in enumerate(straight)
+    )
+
+
+def squares_of_momenta(swing: Swing, S: Scalars, now: Triple, first: Scalars, t: Scalars):
+    """Integrals of L1^2, L2^2, L3^2 over the time from the start."""
+    l1, l2, l3 = swing.momentum
+    middle = swing.A * swing.B * first + S * l2 * now[1]
+    less = l2 * l2 * t - middle
+    uneven = swing.s > 0
+    span = jnp.where(uneven, swing.s, 1)
+    return (
+        l1 * l1 * t + swing.r / span * less,
+        middle,
+        l3 * l3 * t + swing.p / span * less,
+    )
