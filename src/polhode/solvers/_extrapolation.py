@@ -1,7 +1,7 @@
 """Extrapolated midpoint rule (Gragg, Bulirsch, Stoer): any even order from one table."""
 
 from fractions import Fraction
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import diffrax
 import equinox as eqx
@@ -11,6 +11,7 @@ from jaxtyping import PyTree
 
 from polhode.solvers._dense import CollocationInterpolation, collocate
 from polhode.solvers._kernel import kernel, map_blocks
+from polhode.solvers._problem import Problem
 
 
 SEQUENCES = {
@@ -107,33 +108,17 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
                 y, times, problem
             )
 
-        arrays, static = eqx.partition((terms, args), eqx.is_array)
-        problem = _Problem(arrays, static)
+        problem = Problem.of(terms, args)
         y1, error = map_blocks(advance, self.block, y0, ((t0, t1), problem))
         dense = collocate(terms, t0, t1, y0, y1, args, self.formal_order)
         return y1, error, dense, None, diffrax.RESULTS.successful
-
-
-class _Problem(eqx.Module):
-    """Term and arguments: their arrays, and everything else as static structure."""
-
-    arrays: Any
-    static: Any = eqx.field(static=True)
-
-    def control(self, t0, t1):
-        terms, _ = eqx.combine(self.arrays, self.static)
-        return terms.contr(t0, t1)
-
-    def increment(self, t, y, control):
-        terms, args = eqx.combine(self.arrays, self.static)
-        return terms.vf_prod(t, y, args, control)
 
 
 def _add(a: PyTree, b: PyTree) -> PyTree:
     return jax.tree.map(jnp.add, a, b)
 
 
-def _step(order: int, problem: _Problem, times, y):
+def _step(order: int, problem: Problem, times, y):
     """New state and error estimate; the column with most substeps is the base of both sums.
 
     The others enter by their small differences to it, so that rounded weights cannot rescale

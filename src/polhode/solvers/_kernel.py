@@ -7,6 +7,29 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.experimental.xla_metadata import set_xla_metadata
+from jax.interpreters import partial_eval
+
+_PLAIN = frozenset(
+    "abs add add_any and atan atan2 broadcast_in_dim ceil clamp concatenate convert_element_type"
+    " copy cos cosh custom_jvp_call custom_vjp_call div dynamic_slice dynamic_update_slice eq exp"
+    " exp2 expm1 floor ge gt integer_pow is_finite jit le log log1p logistic lt max min mul ne neg"
+    " not or pad pjit pow reduce_sum rem reshape round rsqrt scan select_n sign sin sinh slice"
+    " split sqrt square squeeze stop_gradient sub tan tanh transpose while xor".split()
+)
+"""Operations that a single compiled unit may hold; anything else keeps the usual way."""
+
+
+def _is_plain(jaxpr) -> bool:
+    for equation in jaxpr.eqns:
+        if equation.primitive.name not in _PLAIN:
+            return False
+        for value in jax.tree.leaves(
+            list(equation.params.values()), is_leaf=lambda v: hasattr(v, "eqns")
+        ):
+            nested = getattr(value, "jaxpr", value)
+            if hasattr(nested, "eqns") and not _is_plain(nested):
+                return False
+    return True
 
 
 def kernel(fn: Callable) -> Callable:
@@ -14,15 +37,31 @@ def kernel(fn: Callable) -> Callable:
 
     A step is made of many short loops over the bodies. As separate tasks each costs a dispatch,
     and fusion across them repeats the work of one in the next. The mark keeps the call and asks
-    for a single function; it is a hint that changes no value, and is given on the CPU only.
+    for a single function; it is a hint that changes no value. It is given on the CPU only, to
+    plain arithmetic only, and the call carries no operand that goes unused: XLA requires both.
     """
-    unit = jax.jit(fn)
 
     def call(*operands):
         if jax.default_backend() != "cpu":
             return fn(*operands)
+        leaves, tree = jax.tree.flatten(operands)
+
+        def flat(*leaves):
+            return fn(*jax.tree.unflatten(tree, leaves))
+
+        closed, shape = jax.make_jaxpr(flat, return_shape=True)(*leaves)
+        jaxpr = closed.jaxpr
+        if not _is_plain(jaxpr):
+            return fn(*operands)
+        _, used = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
+
+        def needed(*given):
+            given = iter(given)
+            full = [next(given) if u else jnp.zeros_like(x) for u, x in zip(used, leaves)]
+            return flat(*full)
+
         with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-            return unit(*operands)
+            return jax.jit(needed)(*(x for u, x in zip(used, leaves) if u))
 
     return call
 

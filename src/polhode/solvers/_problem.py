@@ -1,0 +1,33 @@
+"""A term with its arguments, as one pytree that can be cut into blocks and handed to kernels."""
+
+from typing import Any
+
+import equinox as eqx
+from diffrax import AbstractTerm
+from jaxtyping import PyTree
+
+
+class Problem(eqx.Module):
+    """Term and arguments: their arrays, and everything else as static structure."""
+
+    arrays: Any
+    static: Any = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, terms: AbstractTerm, args: PyTree) -> "Problem":
+        return cls(*eqx.partition((terms, args), eqx.is_array))
+
+    def control(self, t0, t1):
+        """The increment of the term's control, for an ODE the (signed) time step."""
+        terms, _ = eqx.combine(self.arrays, self.static)
+        return terms.contr(t0, t1)
+
+    def field(self, t, y):
+        """The vector field."""
+        terms, args = eqx.combine(self.arrays, self.static)
+        return terms.vf(t, y, args)
+
+    def increment(self, t, y, control):
+        """Vector field times control."""
+        terms, args = eqx.combine(self.arrays, self.static)
+        return terms.vf_prod(t, y, args, control)
