@@ -7,7 +7,6 @@ import sys
 import time
 from pathlib import Path
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray
@@ -127,6 +126,8 @@ def test_compile_time_counts_nested_reports_once(monkeypatch):
         (["explain", "bad.toml"], 2, ["bad.toml", "momnets"]),
         (["run", "flat.toml"], 2, ["flat.toml", "[inertia] moments", "triangle"]),
         (["run", "method.toml"], 2, ["[method] solver", 'did you mean "Dopri8"']),
+        (["run", "sharp.toml", "--precision", "float32"], 2, ["sharp.toml", "rtol", "float32"]),
+        (["explain", "sharp.toml", "--precision", "float32"], 2, ["sharp.toml", "rtol"]),
         (["run", "slow.toml"], 1, ["nominal body did not finish", "max_steps"]),
         (["run", "single.toml", "--clones", "5"], 2, ["[monte_carlo]", "--clones"]),
         (["run", "top.toml", "-o", "folder.nc"], 1, ["is a folder"]),
@@ -140,6 +141,7 @@ def test_failures_are_one_readable_block(here, capsys, arguments, code, hints):
         "method": TOP + "[method]\nkind = 'lie-poisson'\nsolver = 'Dorpi8'\n",
         "slow": TOP[: TOP.index("[monte_carlo]")]
         + "[method]\nkind = 'lie-poisson'\nsolver = 'Euler'\nstep = 1e-6\n",
+        "sharp": TOP + "[method]\nrtol = 1e-12\n",
         "single": TOP[: TOP.index("[monte_carlo]")],
     }
     for name, text in texts.items():
@@ -254,8 +256,7 @@ def test_explain_names_the_method(here, capsys):
     out = capsys.readouterr().out
     assert "small top" in out
     assert "120 clones, seed 5" in out
-    assert str(ph.explain(ph.Scene(ph.Inertia.from_moments(jnp.ones(3))), *_still())) not in out
-
-
-def _still():
-    return ph.State(wxyz=jnp.eye(4)[0], omega_body=jnp.ones(3)), jnp.array([0.0, 1.0])
+    assert "LiePoisson" in out
+    (here / "free.toml").write_text(TOP[: TOP.index("[potential]")] + TOP[TOP.index("[times]") :])
+    assert main(["explain", "free.toml"]) == 0
+    assert "ClosedForm" in capsys.readouterr().out

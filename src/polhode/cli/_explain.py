@@ -21,9 +21,12 @@ def explain(arguments: argparse.Namespace) -> int:
     """Print the scene in short and the plan."""
     import polhode
     from polhode.cli._job import prepare
+    from polhode.io import blamed
 
     file = read(arguments)
     job = prepare(file, arguments.precision)
+    with blamed(file, ""):
+        plan = polhode.explain(job.scene, job.state, job.ts, job.method, rtol=job.rtol)
     times, carlo = file.times, file.monte_carlo
     span = (
         f"{times.seconds[0] / times.unit_seconds:g} to {times.seconds[-1] / times.unit_seconds:g}"
@@ -35,6 +38,5 @@ def explain(arguments: argparse.Namespace) -> int:
         for spread in carlo.spreads:
             print(f"    {spread.quantity}: {spread.source}")
     print()
-    plan = polhode.explain(job.scene, job.state, job.ts, job.method, **job.tolerance)
     print(plan)
     return 0

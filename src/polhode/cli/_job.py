@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array
 
 import polhode
+from polhode import rotation
 from polhode.inertia import Inertia
 from polhode.io import (
     SceneFile,
+    blamed,
     build_attitudes,
     build_method,
     build_scene,
@@ -31,7 +32,7 @@ class Job(NamedTuple):
     state: polhode.State
     ts: np.ndarray
     method: Any
-    tolerance: dict[str, float]
+    rtol: float | None
     redrawn: int
 
     @property
@@ -57,14 +58,13 @@ def prepare(file: SceneFile, precision: str) -> Job:
     jax.config.update("jax_enable_x64", True)
     dtype = np.dtype(precision)
     clones = draw_clones(file, dtype)
-    rtol = file.method.rtol
     return Job(
         file,
         build_scene(file, dtype, clones.inertia),
         clones.state,
         file.times.seconds.astype(dtype),
         build_method(file),
-        {} if rtol is None else {"rtol": rtol},
+        file.method.rtol,
         clones.redrawn,
     )
 
@@ -77,10 +77,10 @@ class _CompileClock:
     def __init__(self):
         self.spans: list[tuple[float, float]] = []
 
-    def listen(self, event: str, duration: float, **_) -> None:
+    def listen(self, event: str, duration_secs: float, **kwargs) -> None:
         if event.startswith("/jax/core/compile/"):
             now = time.perf_counter()
-            self.spans.append((now - duration, now))
+            self.spans.append((now - duration_secs, now))
 
     def since(self, start: float) -> float:
         total, reached = 0.0, start
@@ -105,7 +105,6 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
     size = min(total, max(_LEAST_CHUNK, -(-total // _CHUNKS)))
     fields = ("wxyz", "omega_body", "status", "steps")
     kept: dict[str, np.ndarray] = {}
-    piece = None
     for start in range(0, total, size):
         first = min(start, total - size)  # the last chunk overlaps: all have one shape
         piece = _simulate(job, slice(first, first + size) if job.batch_shape else None)
@@ -130,16 +129,16 @@ def _simulate(job: Job, part: slice | None) -> polhode.Trajectory:
     if part is not None:
         scene = dataclasses.replace(scene, inertia=_cut(scene.inertia, part))
         state = jax.tree.map(lambda x: x[part] if x.ndim > 1 else x, state)
-    return jax.block_until_ready(
-        polhode.simulate(scene, state, job.ts, job.method, throw=False, **job.tolerance)
-    )
+    with blamed(job.file, ""):
+        trajectory = polhode.simulate(scene, state, job.ts, job.method, rtol=job.rtol, throw=False)
+    return jax.block_until_ready(trajectory)
 
 
 def _cut(inertia: Inertia, part: slice) -> Inertia:
     return jax.tree.map(lambda x: x[part], inertia) if inertia.batch_shape else inertia
 
 
-def _require_nominal(status: Array) -> None:
+def _require_nominal(status: np.ndarray) -> None:
     code = polhode.Status(int(np.reshape(status, -1)[0]))
     if code != polhode.Status.SUCCESSFUL:
         raise polhode.SimulationError(
@@ -172,6 +171,6 @@ def compare(job: Job) -> Residuals | None:
     nominal = job._replace(scene=scene, state=state, ts=ts)
     there = _simulate(nominal, None)
     attitudes = build_attitudes(seen.attitudes, dtype)[later][order]
-    angle = polhode.rotation.angle_between(there.wxyz[1:], attitudes)
+    angle = rotation.angle_between(there.wxyz[1:], attitudes)
     rates = seen.omega_body[later][order] - np.asarray(there.omega_body[1:])
     return Residuals(np.asarray(ts[1:]), np.asarray(angle), rates)

@@ -2,6 +2,7 @@
 
 from polhode.io._atomic import whole_file as whole_file, write_netcdf as write_netcdf
 from polhode.io._build import (
+    blamed as blamed,
     build_attitudes as build_attitudes,
     build_inertia as build_inertia,
     build_scene as build_scene,

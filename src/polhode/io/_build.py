@@ -4,6 +4,7 @@ import contextlib
 import functools
 import operator
 from collections.abc import Iterator
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,11 +41,11 @@ def blamed(file: SceneFile, where: str) -> Iterator[None]:
 
 def build_attitudes(attitudes: Attitudes, dtype: DTypeLike) -> Float[Array, "*b 4"]:
     """Unit quaternions `wxyz`, body -> space."""
-    values = np.asarray(attitudes.values, dtype)
+    values = jnp.asarray(attitudes.values, dtype)
     if attitudes.sequence is None:
         return rotation.normalise(values)
     sequence = rotation.Sequence[attitudes.sequence.upper()]
-    return rotation.euler_to_wxyz(*(values[..., i] for i in range(3)), sequence)
+    return rotation.euler_to_wxyz(values[..., 0], values[..., 1], values[..., 2], sequence)
 
 
 def build_inertia(file: SceneFile, dtype: DTypeLike) -> Inertia:
@@ -52,7 +53,8 @@ def build_inertia(file: SceneFile, dtype: DTypeLike) -> Inertia:
     part = file.inertia
     with blamed(file, part.where):
         if part.kind == "parts":
-            solids = [_solid(*entry, dtype) for entry in part.values["parts"]]
+            parts: Any = part.values["parts"]
+            solids = [_solid(solid, place, dtype) for solid, place in parts]
             return compose(solids).inertia
         values = {name: np.asarray(value, dtype) for name, value in part.values.items()}
         if part.kind == "axisymmetric":
@@ -100,6 +102,6 @@ def build_scene(
 def build_state(file: SceneFile, dtype: DTypeLike, inertia: Inertia) -> "polhode.State":
     """The nominal state at the first time."""
     with blamed(file, "[state]"):
-        value = np.asarray(file.state.value, dtype)
+        value = jnp.asarray(file.state.value, dtype)
         omega = inertia.rates(value) if file.state.rate == "momentum_body" else value
         return polhode.State(wxyz=build_attitudes(file.state.attitude, dtype), omega_body=omega)

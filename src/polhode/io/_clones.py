@@ -49,7 +49,7 @@ def draw_clones(file: SceneFile, dtype: DTypeLike) -> Clones:
         attitude = Attitudes(_around(attitude.values, noise["euler"], count), attitude.sequence)
     wxyz = build_attitudes(attitude, dtype)
     if "attitude" in noise:
-        turns = _around(np.zeros(3), noise["attitude"], count).astype(dtype)
+        turns = jnp.asarray(_around(np.zeros(3), noise["attitude"], count), dtype)
         wxyz = rotation.multiply(jnp.broadcast_to(wxyz, (count + 1, 4)),
                                  rotation.rotation_vector_to_wxyz(turns))  # fmt: skip
     rates = file.state.value

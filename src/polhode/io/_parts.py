@@ -1,5 +1,7 @@
 """The parts of a scene file that are chosen by kind: inertia, potentials, torques, rotors."""
 
+from typing import Any
+
 from polhode.io import _unit
 from polhode.io._specification import Attitudes, Part
 from polhode.io._table import REQUIRED, Table
@@ -43,7 +45,7 @@ KINDS = {
 SEQUENCES = tuple(a + b + c for a in "xyz" for b in "xyz" for c in "xyz" if a != b and b != c)
 
 
-def read_sequence(table: Table, default: object = REQUIRED) -> str:
+def read_sequence(table: Table, default: Any = REQUIRED) -> str:
     """Three letters, lower case."""
     given = table.text("sequence", default)
     if given.lower() not in SEQUENCES:

@@ -4,6 +4,7 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -42,11 +43,13 @@ class Table:
             return key
         return f"[{self.where}] {key}".rstrip()
 
-    def wrong(self, key: str, problem: str, given: object, expected: str, mend: str = ""):
+    def wrong(
+        self, key: str, problem: str, given: object, expected: str, mend: str = ""
+    ) -> SceneFileError:
         """The error for one key; the caller raises it."""
         return SceneFileError(self.file, self.name(key), problem, shorten(given), expected, mend)
 
-    def raw(self, key: str, expected: str, default: object = REQUIRED):
+    def raw(self, key: str, expected: str, default: Any = REQUIRED) -> Any:
         if key in self.data:
             return self.data[key]
         if default is not REQUIRED:
@@ -71,7 +74,7 @@ class Table:
             )
         return present[0]
 
-    def text(self, key: str, default: object = REQUIRED):
+    def text(self, key: str, default: Any = REQUIRED) -> Any:
         value = self.raw(key, "a text in quotation marks", default)
         if key in self.data and not isinstance(value, str):
             raise self.wrong(key, "not a text", value, "a text in quotation marks")
@@ -83,14 +86,14 @@ class Table:
             raise self.wrong(key, "not a yes or no", value, "true or false")
         return value
 
-    def choice(self, key: str, options: Sequence[str], default: object = REQUIRED):
+    def choice(self, key: str, options: Sequence[str], default: Any = REQUIRED) -> Any:
         value = self.raw(key, f"one of {', '.join(options)}", default)
         if key in self.data and value not in options:
             mend = suggestion(value, options) if isinstance(value, str) else ""
             raise self.wrong(key, "unknown choice", value, f"one of {', '.join(options)}", mend)
         return value
 
-    def integer(self, key: str, least: int, most: int, default: object = REQUIRED):
+    def integer(self, key: str, least: int, most: int, default: Any = REQUIRED) -> Any:
         expected = f"a whole number from {least} to {most}"
         value = self.raw(key, expected, default)
         if key not in self.data:
@@ -99,7 +102,7 @@ class Table:
             raise self.wrong(key, "not a fitting whole number", value, expected)
         return value
 
-    def number(self, key: str, default: object = REQUIRED, positive: bool = False):
+    def number(self, key: str, default: Any = REQUIRED, positive: bool = False) -> Any:
         expected = "a positive number" if positive else "a finite number"
         value = self.raw(key, expected, default)
         if key not in self.data:

@@ -96,6 +96,10 @@ def as_motion(what: Trajectory | Motion) -> Motion:
         raise TypeError(
             f"expected a ph.Trajectory or a plot.motion(...), got {type(what).__name__}."
         )
+    if what.omega_body is None:
+        raise ValueError(
+            "this trajectory holds no omega_body: simulate with record=ph.Record(rates=True)."
+        )
     made = motion(what.ts, what.omega_body, what.wxyz, what.scene.inertia)
     has_energy = what.scene.potential is None or what.wxyz is not None
     energy = np.asarray(what.energy, np.float64).reshape(made.ts.shape) if has_energy else None

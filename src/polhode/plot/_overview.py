@@ -81,14 +81,15 @@ def _dots(ax, t, values, color):
 
 def _key(ax, observed, clones):
     """What lines, bands and dots mean."""
+    from matplotlib.artist import Artist
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    entries = [(Line2D([], [], color=INK, linewidth=1.3), "nominal body")]
+    entries: list[tuple[Artist, str]] = [(Line2D([], [], color=INK, linewidth=1.3), "nominal body")]
     if clones > 1:
         entries.append((Patch(color=INK, alpha=0.22), f"5 % to 95 % of {clones:,} clones"))
     if observed:
         dot = Line2D([], [], color=INK, marker="o", linestyle="", markersize=4.2)
-        entries.append((dot, "published observations"))
+        entries.append((dot, "published values"))
     ax.set_axis_off()
     ax.legend(*zip(*entries, strict=True), loc="center")
