@@ -10,7 +10,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from polhode._checks import as_float_array, describe, is_concrete, require
 from polhode._lanes import PARTS, common_batch, flatten
-from polhode._methods import AbstractMethod, LiePoisson, Record
+from polhode._methods import AbstractMethod, Record
+from polhode._plan import Plan, choose, plan
 from polhode._scene import Scene
 from polhode._state import State
 from polhode._status import SimulationError, Status
@@ -44,12 +45,9 @@ def simulate(
     dtypes, a tolerance that the dtype cannot reach.
     """
     scene, state, ts, record = check_inputs(scene, state, ts, record)
-    method = LiePoisson() if method is None else method
-    if not isinstance(method, AbstractMethod):
-        raise TypeError(
-            "method must be None or an object such as ph.LiePoisson(), got"
-            f" {type(method).__name__}."
-        )
+    check_method(method)
+    if method is None:
+        method, _ = choose(scene)
     rtol = check_rtol(rtol, state.wxyz.dtype)
     trajectory = run(method, scene, state, ts, rtol, record)
     if throw and is_concrete(trajectory.status):
@@ -57,9 +55,28 @@ def simulate(
     return trajectory
 
 
+def explain(
+    scene: Scene,
+    state: State,
+    ts: Float[ArrayLike, "*#b t"],
+    method: AbstractMethod | None = None,
+    *,
+    rtol: float | None = None,
+    record: Record | None = None,
+) -> Plan:
+    """What ``simulate`` would run with the same arguments, what is skipped, and why: print it.
+
+    Nothing is simulated. Raises as ``simulate`` does for bad input.
+    """
+    scene, state, ts, record = check_inputs(scene, state, ts, record)
+    check_method(method)
+    return plan(scene, state, ts, method, check_rtol(rtol, state.wxyz.dtype), record)
+
+
 @eqx.filter_jit
 def run(method, scene, state, ts, rtol, record) -> Trajectory:
     """The compiled part: lanes out of batches, the method, and back."""
+    scene = scene.settled(state, ts[..., 0])
     parts = (getattr(scene, name) for name in PARTS)
     batch = common_batch(*parts, state, extra=(ts.shape[:-1],))
     parts = {name: flatten(getattr(scene, name), batch) for name in PARTS}
@@ -71,6 +88,15 @@ def run(method, scene, state, ts, rtol, record) -> Trajectory:
     wxyz, omega, status, steps = jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), samples)
     kept = ts[..., -1:] if record.final_only else ts
     return Trajectory(kept, wxyz, omega, status, steps, scene)
+
+
+def check_method(method: Any) -> None:
+    """Methods are objects, never strings."""
+    if method is not None and not isinstance(method, AbstractMethod):
+        raise TypeError(
+            "method must be None or an object such as ph.LiePoisson(), got"
+            f" {type(method).__name__}."
+        )
 
 
 def check_inputs(

@@ -1,0 +1,137 @@
+"""The planner: the cheapest way that is exact enough, from the scene's structure alone."""
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from polhode._closed_form import ClosedForm
+from polhode._lanes import PARTS, common_batch
+from polhode._methods import AbstractDiffraxMethod, AbstractMethod, LiePoisson, Record
+from polhode._scene import Scene
+from polhode._state import State
+from polhode.inertia import Symmetry
+
+_FREE_LAWS = {
+    Symmetry.NONE: "nothing acts on the body: exact motion in Jacobi elliptic functions",
+    Symmetry.AXISYMMETRIC: "free and known to be axisymmetric: exact steady precession",
+    Symmetry.SPHERICAL: "free and known to be spherical: exact turn about a fixed axis",
+}
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What will run, what is skipped and why; ``print`` it.
+
+    **Fields:** ``method``; ``law``: why this one; ``skipped``: what is absent from the compiled
+    program, with the reason; ``bodies``, ``samples``, ``dtype``: the size of the work;
+    ``seconds``: predicted run time on one core once compiled (None: unknown); ``error``:
+    predicted attitude error in words.
+    """
+
+    method: AbstractMethod
+    law: str
+    skipped: tuple[str, ...]
+    bodies: int
+    samples: int
+    dtype: str
+    seconds: float | None
+    error: str
+
+    def __str__(self) -> str:
+        cost = "unknown" if self.seconds is None else f"about {_duration(self.seconds)} on one core"
+        lines = [
+            f"{self.bodies:,} {'body' if self.bodies == 1 else 'bodies'} x {self.samples:,}"
+            f" {'sample' if self.samples == 1 else 'samples'}, {self.dtype}",
+            f"runs    {type(self.method).__name__}: {self.law}",
+            *(
+                f"{'skips   ' if i == 0 else '        '}{reason}"
+                for i, reason in enumerate(self.skipped)
+            ),
+            f"cost    {cost}, once compiled",
+            f"error   {self.error}",
+        ]
+        return "\n".join(lines)
+
+
+def choose(scene: Scene) -> tuple[AbstractMethod, str]:
+    """The method that ``simulate(..., method=None)`` uses for a scene, and why."""
+    if scene.is_free:
+        return ClosedForm(), _FREE_LAWS[scene.inertia.symmetry]
+    return LiePoisson(), "something acts on the body: integrated step by step"
+
+
+def plan(
+    scene: Scene,
+    state: State,
+    ts: Array,
+    method: AbstractMethod | None,
+    rtol: Array,
+    record: Record,
+) -> Plan:
+    """The plan of checked input (see ``ph.explain``)."""
+    law = "as asked for"
+    if method is None:
+        method, law = choose(scene)
+    parts = (getattr(scene, name) for name in PARTS)
+    bodies = int(np.prod(common_batch(*parts, state, extra=(ts.shape[:-1],)), dtype=int))
+    samples = 1 if record.final_only else ts.shape[-1]
+    eps = float(jnp.finfo(state.wxyz.dtype).eps)
+    if isinstance(method, ClosedForm):
+        seconds, error = _exact_cost(scene, state, ts, bodies, samples, record, eps)
+    else:
+        seconds = None
+        error = f"local error {float(rtol):.0e} per step, of the worst body of each chunk"
+    return Plan(
+        method, law, _skipped(scene, method, record), bodies, samples,
+        str(state.wxyz.dtype), seconds, error,
+    )  # fmt: skip
+
+
+def _skipped(scene: Scene, method: AbstractMethod, record: Record) -> tuple[str, ...]:
+    reasons = []
+    absent = [name for name in PARTS if getattr(scene, name) is None]
+    if absent:
+        reasons.append(f"{', '.join(absent)}: not in the scene")
+    if isinstance(method, ClosedForm):
+        reasons.append("steps, error control, checkpoints: the solution is exact")
+        if scene.inertia.symmetry is not Symmetry.NONE:
+            reasons.append("elliptic functions: circular ones do for this symmetry")
+        reasons.append("energy and momentum per sample: constants of the motion")
+    if scene.inertia.is_principal:
+        reasons.append("principal axes: the body axes are principal")
+    if not record.attitude:
+        reasons.append("attitude and the integral of the third kind: only rates are recorded")
+    if not record.rates:
+        reasons.append("rates at the samples: only the attitude is recorded")
+    if record.final_only:
+        reasons.append("the trajectory buffer: only the last time is recorded")
+    if isinstance(method, AbstractDiffraxMethod):
+        reasons.append("checkpoints: kept only under jax.grad")
+    return tuple(reasons)
+
+
+# Nanoseconds on one core of a server of 2020s make, float64: (set-up per body, per sample), with
+# and without attitude; benchmarks/scene_cost.py measures them again.
+_EXACT_NS = {(Symmetry.NONE, True): (450, 100), (Symmetry.NONE, False): (250, 40)}
+_SYMMETRIC_NS = (60, 60)
+
+
+def _exact_cost(scene, state, ts, bodies, samples, record, eps) -> tuple[float, str]:
+    start, each = _EXACT_NS.get((scene.inertia.symmetry, record.attitude), _SYMMETRIC_NS)
+    seconds = 1e-9 * bodies * (start + each * samples)
+    rate = jnp.max(jnp.linalg.norm(jax.lax.stop_gradient(state.omega_body), axis=-1))
+    turned = float(rate) * float(jnp.max(jnp.abs(ts[..., -1] - ts[..., 0])))
+    return seconds, (
+        f"rounding only: about {max(1.0, turned) * eps:.0e} rad at the last time"
+        f" (one unit in the last place of {turned:.2g} rad turned)"
+    )
+
+
+def _duration(seconds: float) -> str:
+    for unit, size in (("s", 1.0), ("ms", 1e-3), ("us", 1e-6)):
+        if seconds >= size:
+            return f"{seconds / size:.2g} {unit}"
+    return f"{seconds * 1e9:.2g} ns"
