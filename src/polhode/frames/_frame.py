@@ -1,0 +1,299 @@
+"""Rotating frames: transformations and the forces that appear in them (document 003)."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from polhode._checks import as_float_array, is_concrete, require
+from polhode._trajectory import Trajectory
+from polhode.frames._interpolation import SampledAttitude
+from polhode.frames._sensors import angular_acceleration
+from polhode.frames._turning import (
+    AbstractTurning,
+    ConstantRate,
+    PrescribedAttitude,
+    VariableRate,
+    rate_of_change,
+)
+from polhode.rotation import conjugate, identity, normalise, rotate
+
+Time = Float[ArrayLike, "*#b"]
+Vector = Float[Array, "*#b 3"]
+
+
+def _at_times(function: Callable, t: Array):
+    """The function of one time, at every entry of an array of times."""
+    for _ in range(t.ndim):
+        function = jax.vmap(function)
+    return function(t)
+
+
+def _cross(left: Array, right: Array) -> Array:
+    return jnp.cross(*_aligned(left, right))
+
+
+def _aligned(*arrays: Array) -> list[Array]:
+    """Arrays with leading axes of length one, so that all have the same rank."""
+    rank = max(array.ndim for array in arrays)
+    return [array.reshape((1,) * (rank - array.ndim) + array.shape) for array in arrays]
+
+
+def _sum(terms: list[Array | None]) -> Array:
+    present = [term for term in terms if term is not None]
+    total = present[0]
+    for term in present[1:]:
+        left, right = _aligned(total, term)
+        total = left + right
+    return total
+
+
+class RotatingFrame(eqx.Module):
+    """A rotating frame, ``x_space = origin + R x_frame`` (document 003 display 3).
+
+    Built by `from_rate`, `from_attitude` or `from_trajectory`. Vectors have shape (..., 3), times
+    are scalars or arrays that broadcast against the leading axes; "frame" components are along the
+    rotating axes, "space" components along inertial ones. A frame is one frame: for a batch of
+    frames use ``jax.vmap``. What a frame lacks is None and costs nothing: a constant angular
+    velocity has no Euler force, an origin at rest no origin force.
+
+    ``turning`` tells attitude and rates; ``origin`` is None or a function of time giving the
+    origin's position in space components [m], whose derivatives are found by differentiation.
+    """
+
+    turning: AbstractTurning
+    origin: Callable[[Array], Float[Array, "3"]] | None = None
+
+    @classmethod
+    def from_rate(
+        cls,
+        omega_body: Float[ArrayLike, "3"] | Callable[[Array], Float[Array, "3"]],
+        origin: Callable[[Array], Float[Array, "3"]] | None = None,
+        *,
+        wxyz: Float[ArrayLike, "4"] | None = None,
+        t0: float | Array = 0.0,
+    ) -> "RotatingFrame":
+        """From an angular velocity along the rotating axes [rad/s]: constant, or a function of t.
+
+        ``wxyz`` is the attitude at ``t0``, axes aligned with space by default. With a function of
+        time the attitude is integrated from ``t0`` each time it is asked for.
+        """
+        varies = callable(omega_body)
+        omega = None if varies else as_float_array("omega_body", omega_body, (3,))
+        if omega is not None and omega.ndim != 1:
+            raise ValueError(
+                f"omega_body must have shape (3,), got {omega.shape}: a RotatingFrame is one"
+                " frame; build a batch with jax.vmap(ph.RotatingFrame.from_rate)."
+            )
+        dtype = None if omega is None else omega.dtype
+        if wxyz is None:
+            start = identity((), dtype)
+        else:
+            start = as_float_array("wxyz", wxyz, (4,))
+            if is_concrete(start):
+                require(
+                    np.any(np.asarray(start) != 0), "wxyz must not be zero: it has no attitude."
+                )
+            start = normalise(start)
+        t0 = jnp.asarray(t0, start.dtype)
+        if varies:
+            return cls(VariableRate(omega_body, start, t0), origin)
+        return cls(ConstantRate(omega, start, t0), origin)
+
+    @classmethod
+    def from_attitude(
+        cls,
+        attitude: Callable[[Array], Array],
+        origin: Callable[[Array], Float[Array, "3"]] | None = None,
+    ) -> "RotatingFrame":
+        """From the attitude as a function of time: a matrix R(t) (3, 3) or a quaternion (4,).
+
+        Angular velocity and angular acceleration come from it by forward-mode differentiation.
+        """
+        if not callable(attitude):
+            raise TypeError(
+                f"attitude must be a function of time, got {type(attitude).__name__}: for a frame"
+                " that turns steadily use RotatingFrame.from_rate."
+            )
+        return cls(PrescribedAttitude(attitude), origin)
+
+    @classmethod
+    def from_trajectory(
+        cls,
+        trajectory: Trajectory,
+        origin: Callable[[Array], Float[Array, "3"]] | None = None,
+    ) -> "RotatingFrame":
+        """The body axes of one simulated body.
+
+        Attitude, rate and angular acceleration are exact at the samples and interpolated between
+        them with errors O(h^6), O(h^5), O(h^4) for samples h apart (`SampledAttitude`).
+        Raises ValueError for a batch of bodies, missing records, or samples half a turn apart.
+        """
+        wxyz, omega = trajectory.wxyz, trajectory.omega_body
+        if wxyz is None or omega is None:
+            raise ValueError(
+                "the trajectory lacks attitude or rates: simulate with"
+                " record=ph.Record(attitude=True, rates=True)"
+            )
+        if wxyz.ndim != 2:
+            raise ValueError(
+                f"the trajectory holds a batch of bodies of shape {wxyz.shape[:-2]}: choose one"
+                " body, or build the frames under jax.vmap."
+            )
+        ts = trajectory.ts
+        if is_concrete(ts, omega):
+            speed = np.linalg.norm(np.asarray(omega), axis=-1)
+            turn = np.abs(np.diff(np.asarray(ts))) * np.maximum(speed[1:], speed[:-1])
+            require(
+                np.all(turn < np.pi),
+                f"the body turns by up to {turn.max():.3g} rad between samples; less than pi is"
+                " needed to interpolate: ask for more times in ph.simulate.",
+            )
+        bend = angular_acceleration(trajectory)
+        return cls(PrescribedAttitude(SampledAttitude(ts, wxyz, omega, bend)), origin)
+
+    # --- the frame itself -------------------------------------------------------------------------
+
+    @property
+    def is_uniform(self) -> bool:
+        """Whether the angular velocity is constant (static): there is no Euler force then."""
+        return isinstance(self.turning, ConstantRate)
+
+    def attitude(self, t: Time) -> Float[Array, "*b 4"]:
+        """Unit quaternion, frame -> space."""
+        return _at_times(self.turning.attitude, jnp.asarray(t))
+
+    def omega_body(self, t: Time) -> Float[Array, "*b 3"]:
+        """Angular velocity in frame components [rad/s]."""
+        return self._rates(t)[0]
+
+    def angular_acceleration(self, t: Time) -> Float[Array, "*b 3"]:
+        """Its derivative in frame components [rad/s^2]."""
+        omega, slope = self._rates(t)
+        return jnp.zeros_like(omega) if slope is None else slope
+
+    def _rates(self, t: Time) -> tuple[Array, Array | None]:
+        if self.is_uniform:
+            return self.turning.rates(t)
+        return _at_times(self.turning.rates, jnp.asarray(t))
+
+    def _origin(self, t: Time) -> tuple[Array, Array, Array]:
+        """Position, velocity and acceleration of the origin in space components."""
+
+        def moving(time):
+            def velocity(s):
+                return rate_of_change(self.origin, s)[1]
+
+            return self.origin(time), *rate_of_change(velocity, time)
+
+        return _at_times(moving, jnp.asarray(t))
+
+    def _turned(self, t: Time, vector: Array, wxyz: Array | None = None) -> Array:
+        return rotate(*_aligned(self.attitude(t) if wxyz is None else wxyz, vector))
+
+    def _turned_back(self, t: Time, vector: Array, wxyz: Array | None = None) -> Array:
+        wxyz = self.attitude(t) if wxyz is None else wxyz
+        return rotate(*_aligned(conjugate(wxyz), vector))
+
+    # --- transformations, both ways (document 003 displays 4-19) ----------------------------------
+
+    def position_to_space(self, t: Time, position: Vector, *, wxyz=None) -> Vector:
+        """Space position [m] of a point at frame ``position``. ``wxyz``: the attitude, if known."""
+        turned = self._turned(t, position, wxyz)
+        return turned if self.origin is None else _sum([turned, self._origin(t)[0]])
+
+    def position_to_frame(self, t: Time, position_space: Vector) -> Vector:
+        """Frame position [m] of a point in space."""
+        if self.origin is not None:
+            position_space = _sum([position_space, -self._origin(t)[0]])
+        return self._turned_back(t, position_space)
+
+    def velocity_to_space(
+        self, t: Time, position: Vector, velocity: Vector, *, wxyz=None
+    ) -> Vector:
+        """Space velocity [m/s] of a point with frame position and velocity (display 8)."""
+        carried = _sum([velocity, _cross(self.omega_body(t), position)])
+        turned = self._turned(t, carried, wxyz)
+        return turned if self.origin is None else _sum([turned, self._origin(t)[1]])
+
+    def velocity_to_frame(self, t: Time, position_space: Vector, velocity_space: Vector) -> Vector:
+        """Frame velocity [m/s] of a point with space position and velocity."""
+        position = self.position_to_frame(t, position_space)
+        if self.origin is not None:
+            velocity_space = _sum([velocity_space, -self._origin(t)[1]])
+        relative = self._turned_back(t, velocity_space)
+        return _sum([relative, -_cross(self.omega_body(t), position)])
+
+    def acceleration_to_space(
+        self, t: Time, position: Vector, velocity: Vector, acceleration: Vector
+    ) -> Vector:
+        """Space acceleration [m/s^2] of a point with this motion in the frame (display 19)."""
+        apparent = self._without_origin(t, position, velocity)
+        turned = self._turned(t, _sum([acceleration, -apparent]))
+        return turned if self.origin is None else _sum([turned, self._origin(t)[2]])
+
+    def acceleration_to_frame(
+        self, t: Time, position_space: Vector, velocity_space: Vector, acceleration_space: Vector
+    ) -> Vector:
+        """Frame acceleration [m/s^2] of a point with this motion in space."""
+        position = self.position_to_frame(t, position_space)
+        velocity = self.velocity_to_frame(t, position_space, velocity_space)
+        if self.origin is not None:
+            acceleration_space = _sum([acceleration_space, -self._origin(t)[2]])
+        relative = self._turned_back(t, acceleration_space)
+        return _sum([relative, self._without_origin(t, position, velocity)])
+
+    # --- forces by name (document 003 displays 20, 21) --------------------------------------------
+
+    def centrifugal(self, t: Time, position: Vector, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
+        """Centrifugal force [N], ``-mass omega x (omega x r)``; zero on the axis."""
+        omega = self.omega_body(t)
+        return _times(mass, -_cross(omega, _cross(omega, position)))
+
+    def coriolis(self, t: Time, velocity: Vector, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
+        """Coriolis force [N], ``-2 mass omega x v``."""
+        return _times(mass, -2 * _cross(self.omega_body(t), velocity))
+
+    def euler(self, t: Time, position: Vector, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
+        """Euler force [N], ``-mass d(omega)/dt x r``; plain zeros for a constant rate."""
+        slope = self._rates(t)[1]
+        if slope is None:
+            return jnp.zeros_like(position)
+        return _times(mass, -_cross(slope, position))
+
+    def origin_force(self, t: Time, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
+        """Force of the accelerating origin [N], ``-mass R^T d2(origin)/dt2``."""
+        if self.origin is None:
+            return jnp.zeros_like(self.omega_body(t))
+        return _times(mass, -self._turned_back(t, self._origin(t)[2]))
+
+    def _without_origin(self, t: Time, position: Vector, velocity: Vector | None) -> Vector:
+        omega, slope = self._rates(t)
+        carried = _cross(omega, position)
+        if velocity is not None:
+            carried = carried + 2 * velocity
+        turning = -_cross(omega, carried)
+        return turning if slope is None else _sum([turning, -_cross(slope, position)])
+
+    def apparent_acceleration(
+        self, t: Time, position: Vector, velocity: Vector | None = None, *, wxyz=None
+    ) -> Vector:
+        """All apparent forces per unit mass [m/s^2], of a particle at rest without ``velocity``.
+
+        Only the terms that this frame has are computed. ``wxyz``: the attitude, if it is known.
+        """
+        apparent = self._without_origin(t, position, velocity)
+        if self.origin is None:
+            return apparent
+        return _sum([apparent, -self._turned_back(t, self._origin(t)[2], wxyz)])
+
+
+def _times(mass: ArrayLike, vector: Array) -> Array:
+    mass = jnp.asarray(mass, vector.dtype)
+    if mass.ndim == 0:
+        return mass * vector
+    left, right = _aligned(mass[..., None], vector)
+    return left * right

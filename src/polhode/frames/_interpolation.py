@@ -1,0 +1,73 @@
+"""A smooth attitude between samples: quintic Hermite interpolation in the rotation vector."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from polhode.frames._turning import quaternion_rate
+from polhode.rotation import (
+    conjugate,
+    multiply,
+    rotation_vector_to_wxyz,
+    wxyz_to_rotation_vector,
+)
+
+
+@jax.jit
+def _slopes(ts, wxyz, omega_body, angular_acceleration) -> tuple[Array, Array]:
+    """Rotation vector of each interval and its two derivatives by t/h, at start and end."""
+    start, end = slice(None, -1), slice(1, None)
+    origin = conjugate(wxyz[start])
+    rate = quaternion_rate(wxyz, omega_body)
+    bend = quaternion_rate(rate, omega_body) + quaternion_rate(wxyz, angular_acceleration)
+
+    def vector(h):
+        path = wxyz[end] + h * rate[end] + h * h / 2 * bend[end]
+        return wxyz_to_rotation_vector(multiply(origin, path))
+
+    def slope(h):
+        return jax.jvp(vector, (h,), (jnp.ones_like(h),))[1]
+
+    zero = jnp.zeros((), ts.dtype)
+    first, second = jax.jvp(slope, (zero,), (jnp.ones_like(zero),))
+    step = (ts[end] - ts[start])[:, None]
+    here = [jnp.zeros_like(first), step * omega_body[start], step**2 * angular_acceleration[start]]
+    there = [vector(zero), step * first, step**2 * second]
+    return jnp.stack(here, axis=1), jnp.stack(there, axis=1)
+
+
+class SampledAttitude(eqx.Module):
+    """Attitude through samples, with their angular velocities and angular accelerations.
+
+    Between two samples the rotation vector from the earlier one is the polynomial of degree five
+    that matches attitude, rate and acceleration at both. For samples h apart the attitude is in
+    error by O(h^6), the angular velocity by O(h^5), the angular acceleration by O(h^4); at the
+    samples all three are exact. Beyond the samples the nearest polynomial goes on.
+    """
+
+    ts: Float[Array, " t"]
+    wxyz: Float[Array, "t 4"]
+    start_slope: Float[Array, "t-1 3 3"]
+    end_slope: Float[Array, "t-1 3 3"]
+
+    def __init__(self, ts, wxyz, omega_body, angular_acceleration):
+        """Samples (T,), (T, 4), (T, 3), (T, 3); less than half a turn from one to the next."""
+        self.ts, self.wxyz = ts, wxyz
+        slopes = _slopes(ts, wxyz, omega_body, angular_acceleration)
+        self.start_slope, self.end_slope = slopes
+
+    def __call__(self, t: Float[Array, ""]) -> Float[Array, "4"]:
+        backwards = self.ts[-1] < self.ts[0]
+        times, wanted = jnp.where(backwards, -self.ts, self.ts), jnp.where(backwards, -t, t)
+        last = self.ts.shape[0] - 2
+        k = jnp.clip(jnp.searchsorted(times, wanted, side="right") - 1, 0, last)
+        s = (t - self.ts[k]) / (self.ts[k + 1] - self.ts[k])
+        (_, v0, a0), (p1, v1, a1) = self.start_slope[k], self.end_slope[k]
+        # Taylor at the start, and three terms that meet value, slope and bend at the end
+        value, slope, bend = p1 - v0 - a0 / 2, v1 - v0 - a0, a1 - a0
+        cubic = 10 * value - 4 * slope + bend / 2
+        quartic = -15 * value + 7 * slope - bend
+        quintic = 6 * value - 3 * slope + bend / 2
+        vector = s * (v0 + s * (a0 / 2 + s * (cubic + s * (quartic + s * quintic))))
+        return multiply(self.wxyz[k], rotation_vector_to_wxyz(vector))

@@ -1,0 +1,200 @@
+"""Particles that move in a rotating frame under any force (document 003 display 20)."""
+
+from collections.abc import Callable
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from polhode._checks import as_float_array, is_concrete, require
+from polhode._simulate import check_rtol, check_times
+from polhode.frames._frame import RotatingFrame
+from polhode.frames._turning import VariableRate, quaternion_rate
+from polhode.rotation import conjugate, normalise, rotate
+
+
+class FrameForce(eqx.Module):
+    """A force [N] in frame components, ``function(t, position, velocity)``, all (..., 3)."""
+
+    function: Callable[[Array, Array, Array], Array]
+
+
+class SpaceForce(eqx.Module):
+    """A force [N] in space components, ``function(t, position_space, velocity_space)``.
+
+    The attitude of the frame is computed at every step for it; a `FrameForce` needs none.
+    """
+
+    function: Callable[[Array, Array, Array], Array]
+
+
+class ParticlePaths(eqx.Module):
+    """Paths of particles in a rotating frame.
+
+    **Fields:** ``ts`` (T,) [s]; ``position`` (..., T, 3) [m] and ``velocity`` (..., T, 3) [m/s] in
+    frame components; ``frame``; ``successful``: whether the last time was reached; ``steps``.
+    """
+
+    ts: Float[Array, " t"]
+    position: Float[Array, "*b t 3"]
+    velocity: Float[Array, "*b t 3"]
+    frame: RotatingFrame
+    successful: Array
+    steps: Array
+
+    @property
+    def position_space(self) -> Float[Array, "*b t 3"]:
+        """Positions in space components [m]."""
+        return self.frame.position_to_space(self.ts, self.position)
+
+    @property
+    def velocity_space(self) -> Float[Array, "*b t 3"]:
+        """Velocities relative to space, in space components [m/s]."""
+        return self.frame.velocity_to_space(self.ts, self.position, self.velocity)
+
+
+def _acceleration(frame, force, mass, t, position, velocity, wxyz):
+    total = frame.apparent_acceleration(t, position, velocity, wxyz=wxyz)
+    if force is None:
+        return total
+    if isinstance(force, FrameForce):
+        return total + force.function(t, position, velocity) / mass
+    wxyz = frame.attitude(t) if wxyz is None else wxyz
+    position_space = frame.position_to_space(t, position, wxyz=wxyz)
+    velocity_space = frame.velocity_to_space(t, position, velocity, wxyz=wxyz)
+    push = force.function(t, position_space, velocity_space) / mass
+    back = conjugate(wxyz).reshape((1,) * (push.ndim - 1) + (4,))
+    return total + rotate(back, push)
+
+
+def _size(vector: Array) -> Array:
+    squared = jnp.sum(vector * vector, axis=-1, keepdims=True)
+    positive = squared > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, squared, 1)), 0)
+
+
+def _largest(tree) -> Array:
+    """Error norm: the worst component of the worst particle."""
+    return jnp.max(jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in jax.tree.leaves(tree)]))
+
+
+@eqx.filter_jit
+def _solve(frame, force, mass, position, velocity, ts, rtol, solver, controller, adjoint, limit):
+    turning = frame.turning
+    needs_attitude = isinstance(force, SpaceForce) or frame.origin is not None
+    # A frame given by a rate alone has its attitude integrated along with the particles.
+    along = needs_attitude and isinstance(turning, VariableRate)
+    start = turning.attitude(ts[0]) if along else None
+    push = _acceleration(frame, force, mass, ts[0], position, velocity, start)
+    # Natural units of each particle: what it has now, and what it gains by the second time.
+    step = jnp.abs(ts[1] - ts[0])
+    length = _size(position) + step * _size(velocity) + step**2 * _size(push)
+    length = jax.lax.stop_gradient(jnp.where(length > 0, length, jnp.ones_like(length)))
+    speed = _size(velocity) + step * _size(push)
+    speed = jax.lax.stop_gradient(jnp.where(speed > 0, speed, length / step))
+
+    def field(t, y, _):
+        at, moving = y[0] * length, y[1] * speed
+        wxyz = normalise(y[2]) if along else None
+        pushed = _acceleration(frame, force, mass, t, at, moving, wxyz)
+        rates = (moving / length, pushed / speed)
+        return (*rates, quaternion_rate(wxyz, turning.omega_body(t))) if along else rates
+
+    y0 = (position / length, velocity / speed)
+    if controller is None:
+        controller = diffrax.ClipStepSizeController(
+            diffrax.PIDController(rtol=rtol, atol=rtol, norm=_largest), step_ts=ts
+        )
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        solver,
+        ts[0],
+        ts[-1],
+        None,
+        (*y0, start) if along else y0,
+        saveat=diffrax.SaveAt(ts=ts),
+        stepsize_controller=controller,
+        adjoint=adjoint,
+        max_steps=limit,
+        throw=False,
+    )
+    position, velocity = (jnp.moveaxis(part, 0, -2) for part in solution.ys[:2])
+    reached = solution.result == diffrax.RESULTS.successful
+    position, velocity = position * length[..., None, :], velocity * speed[..., None, :]
+    finite = jnp.isfinite(position).all() & jnp.isfinite(velocity).all()
+    return position, velocity, reached & finite, solution.stats["num_steps"]
+
+
+def simulate_particles(
+    frame: RotatingFrame,
+    position: Float[ArrayLike, "*#b 3"],
+    velocity: Float[ArrayLike, "*#b 3"],
+    ts: Float[ArrayLike, " t"],
+    force: FrameForce | SpaceForce | None = None,
+    mass: Float[ArrayLike, "*#b"] = 1.0,
+    *,
+    rtol: float | None = None,
+    solver: diffrax.AbstractSolver | None = None,
+    controller: diffrax.AbstractStepSizeController | None = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    max_steps: int = 2**16,
+    throw: bool = True,
+) -> ParticlePaths:
+    """Move particles in a rotating frame, all with shared steps, by any diffrax solver.
+
+    **Arguments:**
+
+    - ``position`` [m], ``velocity`` [m/s]: at ``ts[0]``, frame components (..., 3).
+    - ``ts``: (T,) [s], strictly increasing or strictly decreasing; every one is stepped to exactly.
+    - ``force``: None (a free particle), `FrameForce` or `SpaceForce` [N]; ``mass`` [kg], (...).
+    - ``rtol``: error per step relative to each particle's own length and speed; None: 1e-9 in
+      float64, 1e-5 in float32.
+    - ``solver`` (Dopri8), ``controller``, ``adjoint``, ``max_steps``: as in diffrax.
+    - ``throw``: raise RuntimeError when the last time was not reached. Nothing is raised under
+      ``jit``, ``vmap`` or ``grad``: look at ``ParticlePaths.successful``.
+
+    Raises TypeError or ValueError for wrong kinds, shapes, dtypes, times or masses.
+    """
+    if not isinstance(frame, RotatingFrame):
+        raise TypeError(f"frame must be a ph.RotatingFrame, got {type(frame).__name__}.")
+    if not isinstance(force, FrameForce | SpaceForce | None):
+        raise TypeError(
+            f"force must be None, FrameForce(function) or SpaceForce(function), got"
+            f" {type(force).__name__}: the class tells in which axes the function works."
+        )
+    position = as_float_array("position", position, (3,))
+    velocity = as_float_array("velocity", velocity, (3,))
+    ts, mass = as_float_array("ts", ts, (None,)), as_float_array("mass", mass)
+    leaves = (frame, position, velocity)
+    dtypes = {x.dtype for x in jax.tree.leaves(eqx.filter(leaves, eqx.is_inexact_array))}
+    if len(dtypes) != 1:
+        raise TypeError(
+            f"frame, position and velocity mix the dtypes {sorted(map(str, dtypes))}: make all of"
+            " them one dtype."
+        )
+    dtype = position.dtype
+    ts, mass = ts.astype(dtype), mass.astype(dtype)[..., None]
+    if ts.ndim != 1:
+        raise ValueError(f"ts must have shape (T,), got {ts.shape}: particles share their times.")
+    if is_concrete(ts):
+        check_times(np.asarray(ts))
+    if is_concrete(mass):
+        require(np.asarray(mass) > 0, "mass must be positive.")
+    batch = jnp.broadcast_shapes(position.shape, velocity.shape, (*mass.shape[:-1], 3))
+    position, velocity = (jnp.broadcast_to(x, batch) for x in (position, velocity))
+    mass = jnp.broadcast_to(mass, (*batch[:-1], 1))
+    *paths, steps = _solve(
+        frame, force, mass, position, velocity, ts, check_rtol(rtol, dtype),
+        diffrax.Dopri8() if solver is None else solver, controller,
+        diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint, max_steps,
+    )  # fmt: skip
+    made = ParticlePaths(ts, paths[0], paths[1], frame, paths[2], steps)
+    if throw and is_concrete(made.successful) and not bool(made.successful):
+        raise RuntimeError(
+            f"the last time was not reached in {int(steps)} steps or the path is not finite: look"
+            " for a singular force, raise max_steps or rtol, or pass throw=False."
+        )
+    return made
