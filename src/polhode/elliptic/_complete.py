@@ -101,7 +101,8 @@ def ellipk(
     """Complete elliptic integral of the first kind, K(m) = integral of 1/sqrt(1 - m sin^2).
 
     `m` in [0, 1] is the parameter (the square of the modulus); `m1` = 1 - m may be handed in
-    beside it when m is close to 1. K(1) is inf, an m outside [0, 1] gives NaN.
+    beside it when m is close to 1 (below 16 times the smallest normal number it counts as 0).
+    K(1) is inf, an m outside [0, 1] gives NaN.
     Source: DLMF 19.8, 22.2 (theta constants of the nome).
     """
     return first_kind(*_pair(m, m1))

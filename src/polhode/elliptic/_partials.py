@@ -13,29 +13,39 @@ def with_forward_partials(core: Callable, directions: tuple[Direction, ...]) -> 
     """`core` with a rule that carries the partial derivatives forward through its recursion.
 
     A direction lists (argument, weight) pairs that move together; the tangent of its first
-    argument leads. Every partial is itself a function with such a rule, so any order works, and
-    reverse mode stores the partials only, nothing of the recursion. All arguments share a shape.
+    argument leads. The partials share one pass of the recursion and are themselves a function with
+    such a rule, so any order works, and reverse mode stores the partials only, nothing of the
+    recursion. All arguments share one shape; the result may have axes in front of it.
     """
     function = jax.custom_jvp(core)
 
-    def slope(direction: Direction) -> Callable:
-        weights = dict(direction)
+    def slopes(active: tuple[Direction, ...]) -> Callable:
+        moving = sorted({i for direction in active for i, _ in direction})
 
-        def partial(*arguments):
+        def partials(*arguments):
+            def restricted(*some):
+                everything = list(arguments)
+                for i, value in zip(moving, some, strict=True):
+                    everything[i] = value
+                return core(*everything)
+
+            primals = tuple(arguments[i] for i in moving)
             units = tuple(
-                jnp.full_like(argument, weights.get(i, 0.0)) for i, argument in enumerate(arguments)
+                jnp.stack([jnp.full_like(x, dict(d).get(i, 0.0)) for d in active])
+                for i, x in zip(moving, primals, strict=True)
             )
-            return jax.jvp(core, arguments, units)[1]
+            return jax.vmap(lambda *unit: jax.jvp(restricted, primals, unit)[1])(*units)
 
-        return with_forward_partials(partial, directions)
+        return with_forward_partials(partials, directions)
 
     def rule(primals, tangents):
         value = function(*primals)
+        active = tuple(d for d in directions if not isinstance(tangents[d[0][0]], SymbolicZero))
         total = jnp.zeros_like(value)
-        for direction in directions:
-            leading = tangents[direction[0][0]]
-            if not isinstance(leading, SymbolicZero):
-                total = total + slope(direction)(*primals) * leading
+        if active:
+            for slope, direction in zip(slopes(active)(*primals), active, strict=True):
+                leading = tangents[direction[0][0]]
+                total = total + slope * leading[(None,) * (value.ndim - leading.ndim)]
         return value, total
 
     function.defjvp(rule, symbolic_zeros=True)

@@ -24,14 +24,14 @@ _STEPS_64, _STEPS_32 = 14, 10
 _THIRD = (((0, 1.0),), ((1, 1.0), (2, -1.0)))
 
 
-def _excess_of_small(n: Array, m: Array, m1: Array) -> Array:
-    """(Pi(n, m) - K(m)) / n where 1 - n is of order 1: DLMF 19.8.6, less its first term."""
+def _excess_of_small(p2: Array, m: Array, m1: Array) -> Array:
+    """(Pi(n, m) - K(m)) / n for p2 = 1 - n in [1 - sqrt(m), 2]: DLMF 19.8.6 less its first term."""
+    lead = p2
     a, g = jnp.ones_like(m1), jnp.sqrt(m1)
-    p2 = 1 - n
     p = jnp.sqrt(p2)
-    weight = jnp.ones_like(n)
+    weight = jnp.ones_like(p2)
     total = weight
-    for _ in range(_STEPS_64 if n.dtype == jnp.float64 else _STEPS_32):
+    for _ in range(_STEPS_64 if p2.dtype == jnp.float64 else _STEPS_32):
         product = a * g
         both = p2 + product
         weight = 0.5 * weight * ((p2 - product) / both)
@@ -39,7 +39,7 @@ def _excess_of_small(n: Array, m: Array, m1: Array) -> Array:
         p = both / (2 * p)
         p2 = p * p
         a, g = 0.5 * (a + g), jnp.sqrt(product)
-    return first_kind(m, m1) * total / (2 * (1 - n))
+    return first_kind(m, m1) * total / (2 * lead)
 
 
 def _complete_core(n: Array, m: Array, m1: Array) -> tuple[Array, Array]:
@@ -48,8 +48,9 @@ def _complete_core(n: Array, m: Array, m1: Array) -> tuple[Array, Array]:
     far = (n < -1) | ((n > 0.5) & (n * n > m))
     safe = jnp.where(far, n, 1)
     small = jnp.where(far, m / safe, n)
-    excess = _excess_of_small(small, m, m1)
     away = jnp.where(n > 0.5, m1 - (1 - n), n - m)
+    # 1 - m/n as (n - m)/n: nothing is lost where both are close to 1.
+    excess = _excess_of_small(jnp.where(far, away / safe, 1 - n), m, m1)
     ratio = n / jnp.where(far, away, n - 1)
     # Two roots: their quotient neither overflows nor underflows for any n.
     turn = jnp.sqrt(jnp.where(far, ratio, 1)) / jnp.sqrt(jnp.where(far, 1 - n, 1))
