@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-PARTS = ("inertia", "potential", "torque")
+PARTS = ("inertia", "potential", "torque", "rotors")
 """The parts of a scene that may carry batch axes."""
 
 
@@ -19,6 +19,11 @@ def _fields(part: Any) -> list[tuple[str, int]]:
     return [
         (name, rank) for name, rank in part.core_ranks.items() if eqx.is_array(getattr(part, name))
     ]
+
+
+def _inner(part: Any) -> list[str]:
+    """Fields that are parts themselves, such as an orbit."""
+    return [name for name in part.core_ranks if hasattr(getattr(part, name), "core_ranks")]
 
 
 def _lead(array, rank: int) -> tuple[int, ...]:
@@ -32,6 +37,9 @@ def map_arrays(part: Any, fn: Callable[[Any, int], Any]) -> Any:
     terms = getattr(part, "terms", None)
     if terms is not None:
         return eqx.tree_at(lambda p: p.terms, part, tuple(map_arrays(t, fn) for t in terms))
+    for name in _inner(part):
+        inner = map_arrays(getattr(part, name), fn)
+        part = eqx.tree_at(lambda p, name=name: getattr(p, name), part, inner)
     fields = _fields(part)
     if not fields:
         return part
@@ -90,6 +98,9 @@ def is_lane_tree(parts: Any) -> Any:
         if terms is not None:
             new = tuple(mark(t, s) for t, s in zip(target.terms, terms))
             return eqx.tree_at(lambda p: p.terms, target, new)
+        for name in _inner(source):
+            inner = mark(getattr(target, name), getattr(source, name))
+            target = eqx.tree_at(lambda p, name=name: getattr(p, name), target, inner)
         names = [name for name, rank in _fields(source) if getattr(source, name).ndim > rank]
         if not names:
             return target

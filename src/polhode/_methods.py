@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from polhode._lanes import along_time, is_lane_tree, map_chunks
+from polhode._lanes import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._scene import Scene
 from polhode._state import State
 from polhode._status import Status
@@ -84,11 +84,11 @@ class AbstractDiffraxMethod(AbstractMethod):
         """Vector field on the chart's component arrays."""
 
     @abc.abstractmethod
-    def start(self, scene: Scene, state: State) -> tuple[PyTree[Array], Array]:
+    def start(self, scene: Scene, state: State, t: Array) -> tuple[PyTree[Array], Array]:
         """Initial chart state of lanes, and which of them the chart can hold."""
 
     @abc.abstractmethod
-    def finish(self, scene: Scene, y: PyTree[Array]) -> tuple[Array, Array, Array]:
+    def finish(self, scene: Scene, y: PyTree[Array], t: Array) -> tuple[Array, Array, Array]:
         """wxyz, omega_body and whether the chart is still sound, of sampled components (N, T)."""
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: float, record: Record) -> Samples:
@@ -118,7 +118,7 @@ class AbstractDiffraxMethod(AbstractMethod):
     def _solve(self, scene, state, ts, rtol, record) -> Samples:
         """One chunk of lanes in one diffrax solve."""
         dynamics = Dynamics(scene.hamiltonian, scene.torque)
-        groups, sound = self.start(scene, state)
+        groups, sound = self.start(scene, state, ts[0])
         y0 = _stack(groups)
         controller = self.controller
         if controller is None:
@@ -144,8 +144,10 @@ class AbstractDiffraxMethod(AbstractMethod):
             throw=False,
         )
         samples, last = (_groups(jnp.moveaxis(y, 0, -1)) for y in solution.ys)
-        wxyz, omega, _ = self.finish(scene, samples)
-        *_, sound_at_end = self.finish(scene, last)
+        later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
+        kept = ts[-1:] if record.final_only else ts
+        wxyz, omega, _ = self.finish(later, samples, kept[None])
+        *_, sound_at_end = self.finish(later, last, ts[None, -1:])
         n = sound.shape[0]
         status = _status(solution.result, wxyz, omega, sound & sound_at_end[:, -1])
         return Samples(
@@ -180,7 +182,7 @@ def _status(result, wxyz, omega, sound) -> Array:
 
 def momentum_scale(scene: Scene, state: State, t: Array) -> Array:
     """Natural unit of momentum of each lane: |L| together with what the torques can add to it."""
-    momentum = scene.inertia.momentum(state.omega_body)
+    momentum = scene.momentum(state.omega_body, t)
     y = (components(momentum), tuple(state.wxyz[..., i] for i in range(4)))
     (push, _) = lie_poisson_field(t, y, Dynamics(scene.hamiltonian, scene.torque))
     size = jnp.trace(scene.inertia.tensor, axis1=-2, axis2=-1)
@@ -217,14 +219,14 @@ class LiePoisson(AbstractDiffraxMethod):
     def field(self, t, y, dynamics):
         return lie_poisson_field(t, y, dynamics)
 
-    def start(self, scene, state):
-        momentum = scene.inertia.momentum(state.omega_body)
+    def start(self, scene, state, t):
+        momentum = scene.momentum(state.omega_body, t)
         wxyz = tuple(state.wxyz[..., i] for i in range(4))
         return (components(momentum), wxyz), jnp.ones(state.wxyz.shape[0], bool)
 
-    def finish(self, scene, y):
+    def finish(self, scene, y, t):
         momentum, wxyz = (jnp.stack(group, axis=-1) for group in y)
-        omega = along_time(scene.inertia, 1).rates(momentum)
+        omega = scene.rates(momentum, t)
         return normalise(wxyz), omega, jnp.ones(momentum.shape[:-1], bool)
 
 
@@ -249,15 +251,15 @@ class EulerAngles(AbstractDiffraxMethod):
     def field(self, t, y, dynamics):
         return euler_angle_field(t, y, dynamics)
 
-    def start(self, scene, state):
+    def start(self, scene, state, t):
         q = wxyz_to_euler(state.wxyz)
-        momentum = components(scene.inertia.momentum(state.omega_body))
+        momentum = components(scene.momentum(state.omega_body, t))
         return (q, canonical_from_momentum(q, momentum)), _away_from_poles(q)
 
-    def finish(self, scene, y):
+    def finish(self, scene, y, t):
         q, p = y
         momentum = jnp.stack(momentum_from_canonical(q, p), axis=-1)
-        omega = along_time(scene.inertia, 1).rates(momentum)
+        omega = scene.rates(momentum, t)
         return euler_to_wxyz(*q), omega, _away_from_poles(q)
 
 

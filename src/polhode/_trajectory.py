@@ -18,7 +18,8 @@ class Trajectory(eqx.Module):
 
     **Fields:** ``ts`` (T,) or (..., T) [s]; ``wxyz`` (..., T, 4) body -> space, or None when not
     recorded; ``omega_body`` (..., T, 3) [rad/s], or None; ``status`` (...): ``ph.Status`` per
-    body; ``steps`` (...): solver steps taken (0 for an exact solution); ``scene``.
+    body; ``steps`` (...): solver steps taken (0 for an exact solution); ``scene``, the motion of its
+    rotors fixed by the initial state.
     """
 
     ts: Float[Array, "*t"]
@@ -60,8 +61,8 @@ class Trajectory(eqx.Module):
 
     @property
     def momentum_body(self) -> Float[Array, "*b t 3"]:
-        """Angular momentum in body axes [kg m^2/s]."""
-        return self._scene.inertia.momentum(self._need("omega_body"))
+        """Angular momentum in body axes, that of rotors included [kg m^2/s]."""
+        return self._scene.momentum(self._need("omega_body"), self._t)
 
     @property
     def momentum_space(self) -> Float[Array, "*b t 3"]:
@@ -70,13 +71,20 @@ class Trajectory(eqx.Module):
 
     @property
     def energy(self) -> Float[Array, "*b t"]:
-        """Kinetic plus potential energy [J]: the one Hamiltonian at every sample."""
+        """Kinetic plus potential energy [J]: the one Hamiltonian at every sample.
+
+        Of wheels that spin freely or by a motor the spin energy is included; with wheels held at
+        their speed it is the energy of the body turning with them locked, which is what then stays
+        constant.
+        """
         scene = self._scene
         attitude = None
         if scene.potential is not None:
             wxyz = self._need("wxyz")
             attitude = from_quaternion(tuple(wxyz[..., i] for i in range(4)))
-        return scene.hamiltonian(components(self.momentum_body), attitude, self._t)
+        energy = scene.hamiltonian(components(self.momentum_body), attitude, self._t)
+        spinning = None if scene.rotors is None else scene.rotors.energy(self._t)
+        return energy if spinning is None else energy + spinning
 
     def euler(self) -> tuple[Array, Array, Array]:
         """ZYZ Euler angles (phi, theta, psi) [rad], each (..., T)."""

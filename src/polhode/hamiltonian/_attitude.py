@@ -32,8 +32,12 @@ class Attitude:
     which rows were asked for.
     """
 
-    def __init__(self, compute: Callable[[int], Vector]):
-        self.compute = compute
+    def __init__(
+        self,
+        compute: Callable[[int], Vector],
+        quaternion: Callable[[], tuple[Array, ...]] | None = None,
+    ):
+        self.compute, self._quaternion = compute, quaternion
         self._rows: dict[int, Vector] = {}
 
     def row(self, i: int) -> Vector:
@@ -41,6 +45,15 @@ class Attitude:
         if i not in self._rows:
             self._rows[i] = self.compute(i)
         return self._rows[i]
+
+    @property
+    def wxyz(self) -> tuple[Array, ...]:
+        """Unit quaternion, scalar first, as four component arrays (for torques; not potentials)."""
+        if self._quaternion is None:
+            raise ValueError(
+                "a potential sees the attitude by its rows: use row(i), to_body, to_space, matrix."
+            )
+        return self._quaternion()
 
     @property
     def used(self) -> tuple[int, ...]:
@@ -75,7 +88,7 @@ def from_quaternion(wxyz: Sequence[Array]) -> Attitude:
             return 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
         return 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
 
-    return Attitude(row)
+    return Attitude(row, lambda: tuple(wxyz))
 
 
 def from_euler_angles(phi: Array, theta: Array, psi: Array) -> Attitude:
@@ -90,7 +103,17 @@ def from_euler_angles(phi: Array, theta: Array, psi: Array) -> Attitude:
             return ct * sf * cp + cf * sp, -ct * sf * sp + cf * cp, st * sf
         return -st * cp, st * sp, ct
 
-    return Attitude(row)
+    def quaternion() -> tuple[Array, ...]:
+        half, sum_, difference = theta / 2, (psi + phi) / 2, (psi - phi) / 2
+        c, s = jnp.cos(half), jnp.sin(half)
+        return (
+            c * jnp.cos(sum_),
+            s * jnp.sin(difference),
+            s * jnp.cos(difference),
+            c * jnp.sin(sum_),
+        )
+
+    return Attitude(row, quaternion)
 
 
 def from_rows(rows: dict[int, Vector]) -> Attitude:

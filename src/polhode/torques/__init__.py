@@ -1,5 +1,9 @@
 """Potentials, external torques, damping and rotors: one small class each."""
 
+from polhode.torques._orbit import (
+    KeplerOrbit as KeplerOrbit,
+    eccentric_anomaly as eccentric_anomaly,
+)
 from polhode.torques._potentials import (
     AbstractPotential as AbstractPotential,
     GravityGradient as GravityGradient,
@@ -7,10 +11,18 @@ from polhode.torques._potentials import (
     PotentialSum as PotentialSum,
     UniformGravity as UniformGravity,
 )
+from polhode.torques._rotors import (
+    AbstractRotor as AbstractRotor,
+    Rotor as Rotor,
+    RotorSum as RotorSum,
+    Wheels as Wheels,
+)
 from polhode.torques._torques import (
     AbstractTorque as AbstractTorque,
     BodyTorque as BodyTorque,
+    FeedbackTorque as FeedbackTorque,
     LinearDamping as LinearDamping,
+    QuadraticDamping as QuadraticDamping,
     SpaceTorque as SpaceTorque,
     TorqueSum as TorqueSum,
 )

@@ -81,7 +81,11 @@ def value_at(vector, t):
 
     ``t`` may be an array of times; the function is mapped over it.
     """
-    return components(jnp.vectorize(vector, signature="()->(3)")(t) if callable(vector) else vector)
+    if not callable(vector):
+        return components(vector)
+    if hasattr(vector, "core_ranks"):  # carries the batch axes itself, such as KeplerOrbit
+        return components(vector(t))
+    return components(jnp.vectorize(vector, signature="()->(3)")(t))
 
 
 class GravityGradient(AbstractPotential):

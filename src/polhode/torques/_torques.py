@@ -1,9 +1,10 @@
-"""External torques in body or space axes, constant or functions of time; damping."""
+"""External torques in body or space axes, constant, of time or of the state; damping."""
 
 import abc
 from collections.abc import Callable, Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -85,6 +86,19 @@ class SpaceTorque(AbstractTorque):
         return attitude.to_body(_value(self.n, t))
 
 
+def _coefficients(name: str, c) -> Array:
+    """Damping about three axes, from one number or three."""
+    given, c = c, as_float_array(f"{name} c", c)
+    if c.ndim == 0:
+        c = jnp.broadcast_to(c, (3,))
+    c = as_float_array(f"{name} c", c, (3,))
+    if is_concrete(c):
+        require(
+            c >= 0, f"{name} c must not be negative, got {given}: a positive c takes energy away."
+        )
+    return c
+
+
 class LinearDamping(AbstractTorque):
     """Linear damping N = -c omega, component by component in body axes.
 
@@ -96,15 +110,56 @@ class LinearDamping(AbstractTorque):
     core_ranks = {"c": 1}  # noqa: RUF012
 
     def __init__(self, c):
-        c = as_float_array("LinearDamping c", c)
-        if c.ndim == 0:
-            c = jnp.broadcast_to(c, (3,))
-        self.c = as_float_array("LinearDamping c", c, (3,))
-        if is_concrete(self.c):
-            require(
-                self.c >= 0,
-                f"LinearDamping c must not be negative, got {c}: a positive c takes energy away.",
-            )
+        self.c = _coefficients("LinearDamping", c)
 
     def body_components(self, t, attitude, omega):
         return tuple(-c * rate for c, rate in zip(components(self.c), omega))
+
+
+class QuadraticDamping(AbstractTorque):
+    """Quadratic damping N = -c |omega| omega, component by component in body axes.
+
+    ``c`` (..., 3), or (...) for the same about every axis [N m s^2]; it must not be negative.
+    """
+
+    c: Float[Array, "*#b 3"]
+
+    core_ranks = {"c": 1}  # noqa: RUF012
+
+    def __init__(self, c):
+        self.c = _coefficients("QuadraticDamping", c)
+
+    def body_components(self, t, attitude, omega):
+        square = omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2
+        turning = square > 0  # the slope of the root is infinite at rest, that of the torque is 0
+        size = jnp.where(turning, jnp.sqrt(jnp.where(turning, square, 1)), 0)
+        return tuple(-c * size * rate for c, rate in zip(components(self.c), omega))
+
+
+class FeedbackTorque(AbstractTorque):
+    """Torque as a function of time and state: ``fn(t, wxyz, omega_body)`` in body axes [N m].
+
+    ``fn`` sees one body: t [s], unit quaternion (4,) body -> space (of either sign), body rates
+    (3,) [rad/s], and returns (3,); batches are mapped over it. Arrays that ``fn`` carries (an
+    ``eqx.Module``) are shared by all bodies.
+    """
+
+    fn: Callable
+
+    core_ranks = {}  # noqa: RUF012
+
+    def __init__(self, fn: Callable):
+        if not callable(fn):
+            raise TypeError(
+                "FeedbackTorque takes a function fn(t, wxyz, omega_body), got"
+                f" {type(fn).__name__}; for a constant torque use ph.BodyTorque."
+            )
+        self.fn = fn
+
+    def body_components(self, t, attitude, omega):
+        wxyz = jnp.stack(jnp.broadcast_arrays(*attitude.wxyz), axis=-1)
+        rates = jnp.stack(jnp.broadcast_arrays(*omega), axis=-1)
+        one = self.fn
+        for _ in range(rates.ndim - 1):
+            one = jax.vmap(one, in_axes=(None, 0, 0))
+        return components(jnp.asarray(one(t, wxyz, rates)))

@@ -1,0 +1,282 @@
+"""Rotors (wheels) whose axes are fixed in the body: gyrostats.
+
+The inertia of the scene is that of the whole body with its wheels locked, their moments about
+their own axes included (Basilisk's hub inertia has the same meaning there; some texts leave the
+wheels out). A wheel of moment J about the unit axis a, at the speed Omega relative to the body,
+adds J Omega a to L = I omega. Held at that speed: L = I omega + J Omega a. Turned by a motor of
+torque tau about its axis (0: it spins freely) its momentum c = J (a . omega + Omega) obeys
+dc/dt = tau, and L = (I - J a a^T) omega + c a: in both cases the one Hamiltonian with a momentum
+h(t) subtracted from L (Hughes, Spacecraft Attitude Dynamics, 1986, section 3.4, 6).
+"""
+
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from polhode._checks import as_float_array, as_number, is_concrete, require
+from polhode.hamiltonian._attitude import Vector
+from polhode.inertia import Inertia, Symmetry
+
+
+class AbstractRotor(eqx.Module):
+    """Base of rotors; they add with ``+``."""
+
+    core_ranks: eqx.AbstractClassVar[dict[str, int]]
+
+    @property
+    @abc.abstractmethod
+    def wheels(self) -> tuple["Rotor", ...]:
+        """One by one."""
+
+    def __add__(self, other: "AbstractRotor") -> "RotorSum":
+        if not isinstance(other, AbstractRotor):
+            raise TypeError(f"a rotor adds to another rotor, not to {type(other).__name__}")
+        return RotorSum((*self.wheels, *other.wheels))
+
+    def check_within(self, inertia: Inertia) -> None:
+        """ValueError for a wheel whose moment is not part of the body's about its axis."""
+        for wheel in self.wheels:
+            if wheel.inertia is None:
+                continue
+            axis = wheel.axis_body
+            about = jnp.sum(axis * inertia.momentum(axis), axis=-1)
+            about, own = jnp.broadcast_arrays(about, wheel.inertia)
+            require(
+                own < about,
+                f"a rotor's inertia ({wheel.inertia} kg m^2) must be less than the body's about the"
+                f" same axis ({about}): the scene's inertia is that of the whole body, its wheels"
+                " locked and included. Add the wheels to it.",
+            )
+
+    def settle(self, omega_body: Float[Array, "*#b 3"], start: Array) -> "Wheels":
+        """The wheels of bodies with rates ``omega_body`` at the time ``start`` (...)."""
+        columns = [wheel.column(omega_body, start) for wheel in self.wheels]
+        lead = np.broadcast_shapes(*(x.shape for column in columns for x in column[1:]))
+        lead = np.broadcast_shapes(lead, *(column[0].shape[:-1] for column in columns))
+        axes = jnp.stack([jnp.broadcast_to(c[0], (*lead, 3)) for c in columns], axis=-2)
+        rest = [
+            jnp.stack([jnp.broadcast_to(column[i], lead) for column in columns], axis=-1)
+            for i in (1, 2, 3)
+        ]
+        return Wheels(
+            axes,
+            *rest,
+            start,
+            tuple(wheel.impulse for wheel in self.wheels),
+            tuple(wheel.is_held for wheel in self.wheels),
+            tuple(wheel.along for wheel in self.wheels),
+        )
+
+
+class RotorSum(AbstractRotor):
+    """Several rotors."""
+
+    terms: tuple["Rotor", ...]
+
+    core_ranks = {}  # noqa: RUF012
+
+    @property
+    def wheels(self):
+        return self.terms
+
+
+class Rotor(AbstractRotor):
+    """A wheel on an axis fixed in the body.
+
+    **Arguments:**
+
+    - ``axis_body`` (..., 3): its axis in body axes (normalised).
+    - ``inertia`` (...): its moment J about that axis [kg m^2]; already part of the body's inertia.
+      May be left out when ``momentum`` is given and no ``torque`` or ``impulse``.
+    - exactly one of ``momentum`` (...) = J Omega [kg m^2/s] and ``speed`` (...) = Omega [rad/s],
+      both relative to the body, at the first time.
+    - ``torque`` (...) [N m]: what the motor exerts on the wheel about its axis, the body taking the
+      reaction; 0: the wheel spins freely. None: the motor holds the speed.
+    - ``impulse``: instead of ``torque``, an antiderivative of a motor torque that varies: a
+      function of time [s] returning N m s.
+
+    Raises ValueError for a zero axis, J <= 0, or more or less than one of momentum and speed.
+    """
+
+    axis_body: Float[Array, "*#b 3"]
+    inertia: Float[Array, "*#b"] | None
+    momentum: Float[Array, "*#b"] | None
+    speed: Float[Array, "*#b"] | None
+    torque: Float[Array, "*#b"] | None
+    impulse: Callable | None
+    along: int | None = eqx.field(static=True)
+
+    core_ranks = {"axis_body": 1, "inertia": 0, "momentum": 0, "speed": 0, "torque": 0}  # noqa: RUF012
+
+    def __init__(
+        self, axis_body, inertia=None, momentum=None, speed=None, torque=None, impulse=None
+    ):
+        axis = as_float_array("axis_body", axis_body, (3,))
+        self.along = None
+        if is_concrete(axis):
+            require(
+                jnp.any(axis != 0, axis=-1),
+                f"axis_body must not be zero, got {axis_body}: give the wheel's axis in body axes.",
+            )
+            self.along = _body_axis(np.asarray(axis))
+        self.axis_body = axis / jnp.sqrt(jnp.sum(axis**2, axis=-1, keepdims=True))
+        if (momentum is None) == (speed is None):
+            raise ValueError(
+                "Rotor takes exactly one of momentum (J Omega relative to the body, kg m^2/s) and"
+                " speed (Omega relative to the body, rad/s)."
+            )
+        if torque is not None and impulse is not None:
+            raise ValueError(
+                "Rotor takes torque (a constant motor torque, N m) or impulse (a function of time,"
+                " N m s: the antiderivative of a varying one), not both."
+            )
+        if callable(torque):
+            raise TypeError(
+                "Rotor torque must be a number; for a motor torque that varies with time give its"
+                " antiderivative: impulse=lambda t: ... [N m s], so that the wheel's momentum is"
+                " exact."
+            )
+        if impulse is not None and not callable(impulse):
+            raise TypeError(f"impulse must be a function of time, got {type(impulse).__name__}.")
+        given = {"inertia": inertia, "momentum": momentum, "speed": speed, "torque": torque}
+        for name, value in given.items():
+            setattr(self, name, None if value is None else as_number(name, value))
+        self.impulse = impulse
+        if inertia is None and (speed is not None or not self.is_held):
+            raise ValueError(
+                "Rotor needs inertia, the wheel's moment about its axis in kg m^2, unless it is"
+                " held at a given momentum."
+            )
+        if inertia is not None and is_concrete(self.inertia):
+            require(
+                self.inertia > 0,
+                f"the rotor's inertia must be positive, got {inertia}: give it in kg m^2.",
+            )
+
+    @property
+    def is_held(self) -> bool:
+        """Whether a motor holds the speed relative to the body (static)."""
+        return self.torque is None and self.impulse is None
+
+    @property
+    def wheels(self):
+        return (self,)
+
+    def column(self, omega_body: Array, start: Array) -> tuple[Array, Array, Array, Array]:
+        """Axis, its momentum at the start (relative if held, else absolute), J, motor torque."""
+        parts = (self.axis_body, self.inertia, self.momentum, self.speed, self.torque)
+        shapes = [x.shape[:-1] if x is self.axis_body else x.shape for x in parts if x is not None]
+        if not self.is_held:
+            shapes += [omega_body.shape[:-1], start.shape]
+        lead = np.broadcast_shapes(*shapes)
+        zero = jnp.zeros(lead, self.axis_body.dtype)
+        axis = jnp.broadcast_to(self.axis_body, (*lead, 3))
+        inertia, momentum, speed, torque = (zero if x is None else x + zero for x in parts[1:])
+        if self.momentum is None:
+            momentum = inertia * speed
+        if self.is_held:
+            return axis, momentum, zero, zero
+        turning = jnp.sum(axis * jnp.broadcast_to(omega_body, (*lead, 3)), axis=-1)
+        return axis, momentum + inertia * turning, inertia, torque
+
+
+def _body_axis(axis: np.ndarray) -> int | None:
+    """Which body axis all of the axes lie on, or None."""
+    used = [i for i in range(3) if np.any(axis[..., i] != 0)]
+    return used[0] if len(used) == 1 else None
+
+
+class Wheels(AbstractRotor):
+    """Rotors whose motion is known: what ``Rotor`` becomes once the state of the body is.
+
+    ``axes`` (..., m, 3); ``momentum`` (..., m) at the time ``start`` (...), relative to the body
+    where ``held``, else absolute; ``inertia`` and ``torque`` (..., m), 0 where held.
+    """
+
+    axes: Float[Array, "*#b m 3"]
+    momentum: Float[Array, "*#b m"]
+    inertia: Float[Array, "*#b m"]
+    torque: Float[Array, "*#b m"]
+    start: Float[Array, "*#b"]
+    impulses: tuple[Callable | None, ...]
+    held: tuple[bool, ...] = eqx.field(static=True)
+    along: tuple[int | None, ...] = eqx.field(static=True)
+
+    core_ranks = {"axes": 2, "momentum": 1, "inertia": 1, "torque": 1, "start": 0}  # noqa: RUF012
+
+    @property
+    def wheels(self):
+        raise ValueError(
+            "these rotors belong to a simulated scene and are settled already: build the new scene"
+            " from ph.Rotor objects."
+        )
+
+    def check_within(self, inertia):
+        """Nothing: the rotors were checked before they were settled."""
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether every wheel is held (static); the momentum may be constant all the same."""
+        return all(self.held)
+
+    def settle(self, omega_body, start):
+        return self
+
+    def axial_momentum(self, i: int, t: Array | float) -> Array:
+        """Momentum of wheel i along its axis (see the class) at time t [kg m^2/s]."""
+        momentum = self.momentum[..., i]
+        if self.held[i]:
+            return momentum
+        impulse = self.impulses[i]
+        if impulse is None:
+            return momentum + self.torque[..., i] * (t - self.start)
+        given = jnp.vectorize(impulse, signature="()->()")
+        return momentum + (given(t) - given(self.start))
+
+    def body_momentum(self, t: Array | float) -> Vector:
+        """h(t): what L is more than the momentum of the body [kg m^2/s], body components."""
+        parts = [
+            tuple(self.axial_momentum(i, t) * self.axes[..., i, k] for k in range(3))
+            for i in range(len(self.held))
+        ]
+        return tuple(sum(column[1:], start=column[0]) for column in zip(*parts))
+
+    def energy(self, t: Array | float) -> Array | None:
+        """c^2/(2J) of the wheels that are not held [J]; None without such."""
+        parts = [
+            self.axial_momentum(i, t) ** 2 / (2 * self.inertia[..., i])
+            for i, held in enumerate(self.held)
+            if not held
+        ]
+        return sum(parts[1:], start=parts[0]) if parts else None
+
+    def carrier(self, inertia: Inertia) -> Inertia:
+        """The inertia that turns with the body: less that of wheels free about their axes."""
+        loose = [i for i, held in enumerate(self.held) if not held]
+        if not loose:
+            return inertia
+        if inertia.is_principal and all(self.along[i] is not None for i in loose):
+            less = jnp.zeros((3,), inertia.dtype)
+            for i in loose:
+                column = [jnp.zeros_like(self.inertia[..., i])] * 3
+                column[self.along[i]] = self.inertia[..., i]
+                less = _plus(less, jnp.stack(column, axis=-1))
+            axial = all(self.along[i] == 2 for i in loose)
+            symmetric = axial and inertia.symmetry is not Symmetry.NONE
+            kind = Symmetry.AXISYMMETRIC if symmetric else Symmetry.NONE
+            return Inertia(_plus(inertia.diagonal, -less), None, kind)
+        tensor = inertia.tensor
+        for i in loose:
+            axis = self.axes[..., i, :]
+            outer = axis[..., :, None] * axis[..., None, :]
+            tensor = _plus(tensor, -self.inertia[..., i, None, None] * outer)
+        return Inertia(full=tensor)
+
+
+def _plus(a: Array, b: Array) -> Array:
+    shape = np.broadcast_shapes(a.shape, b.shape)
+    return jnp.broadcast_to(a, shape) + jnp.broadcast_to(b, shape)
