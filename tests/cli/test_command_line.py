@@ -106,6 +106,43 @@ def test_chunks_cover_every_body_once(here):
     assert outcome.run_seconds > 0
 
 
+def test_observations_within_the_times_are_compared(here):
+    """Backwards in time, at the first time, between samples, and outside on both sides."""
+    from polhode.cli import _job
+
+    text = """
+    inertia = { spherical = 2.0 }
+    state = { omega_body = [0.0, 0.5, 0.0] }
+    times = { start = 3.0, stop = 0.0, number = 4 }
+    [observations]
+    rows = [ { time = -1.0, omega_body = [9, 9, 9] },
+             { time = 0.5, wxyz = [1, 0, 0, 0] },
+             { time = 3.0, wxyz = [1, 0, 0, 0], omega_body = [0.0, 0.25, 0.0] },
+             { time = 4.0, omega_body = [9, 9, 9] } ]
+    """
+    (here / "ball.toml").write_text(text)
+    outcome = _job.run(_job.prepare(read_scene("ball.toml"), "float64"), lambda _: None)
+    np.testing.assert_array_equal(outcome.trajectory.ts, [3.0, 2.0, 1.0, 0.0])
+    assert outcome.trajectory.wxyz.shape == (4, 4)
+    # a ball turns at a constant rate: 0.5 rad/s for the 2.5 s from 3.0 back to 0.5
+    found = outcome.residuals
+    np.testing.assert_array_equal(found.seconds, [0.5, 3.0])
+    np.testing.assert_allclose(found.angle, [1.25, 0.0], atol=1e-7)
+    np.testing.assert_allclose(found.rates[1], [0.0, -0.25, 0.0], atol=1e-12)
+    assert np.isnan(found.rates[0]).all()
+
+
+@pytest.mark.parametrize(
+    ("value", "width", "text"),
+    [(5.38, 0.03, "5.38 ± 0.03"), (7.4, 0.03, "7.40 ± 0.03"), (5.3685, 0.0624, "5.369 ± 0.062"),
+     (1234.5, 12.3, "1234 ± 12"), (5.0, None, "5"), (3.0, 0.0, "3"), (2.0, 1e-9, "2 ± 1e-09")],
+)  # fmt: skip
+def test_values_are_printed_with_the_digits_of_their_spread(value, width, text):
+    from polhode.cli import _summary
+
+    assert _summary._plus_minus(value, width) == text
+
+
 def test_compile_time_counts_nested_reports_once(monkeypatch):
     from polhode.cli import _job
 

@@ -17,7 +17,6 @@ from polhode.io import (
     build_attitudes,
     build_method,
     build_scene,
-    build_state,
     draw_clones,
 )
 
@@ -25,12 +24,17 @@ _CHUNKS, _LEAST_CHUNK = 20, 50  # pieces of progress, and bodies below which a p
 
 
 class Job(NamedTuple):
-    """A scene ready to run: body 0 is the nominal one."""
+    """A scene ready to run: body 0 is the nominal one.
+
+    `all_ts` are the sample times `ts` and those of the observations among them, in one row, so that
+    one compiled program gives both.
+    """
 
     file: SceneFile
     scene: polhode.Scene
     state: polhode.State
     ts: np.ndarray
+    all_ts: np.ndarray
     method: Any
     rtol: float | None
     redrawn: int
@@ -46,9 +50,10 @@ class Job(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The trajectory of all bodies and what it took."""
+    """The trajectory of all bodies, the misfit of the nominal one, and what it took."""
 
     trajectory: polhode.Trajectory
+    residuals: "Residuals | None"
     compile_seconds: float
     run_seconds: float
 
@@ -58,15 +63,25 @@ def prepare(file: SceneFile, precision: str) -> Job:
     jax.config.update("jax_enable_x64", True)
     dtype = np.dtype(precision)
     clones = draw_clones(file, dtype)
+    ts = file.times.seconds.astype(dtype)
+    seen = () if file.observations is None else _within(file.observations.seconds, ts)
+    all_ts = np.unique(np.concatenate([ts, np.asarray(seen, dtype)]))
     return Job(
         file,
         build_scene(file, dtype, clones.inertia),
         clones.state,
-        file.times.seconds.astype(dtype),
+        ts,
+        all_ts if ts[0] < ts[-1] else all_ts[::-1],
         build_method(file),
         file.method.rtol,
         clones.redrawn,
     )
+
+
+def _within(seconds: np.ndarray, ts: np.ndarray) -> np.ndarray:
+    """The observed times that lie in the simulated span, in the dtype of `ts`."""
+    seconds = seconds.astype(ts.dtype)
+    return seconds[(seconds >= ts.min()) & (seconds <= ts.max())]
 
 
 class _CompileClock:
@@ -103,25 +118,36 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
     began = time.perf_counter()
     total = job.bodies
     size = min(total, max(_LEAST_CHUNK, -(-total // _CHUNKS)))
-    fields = ("wxyz", "omega_body", "status", "steps")
     kept: dict[str, np.ndarray] = {}
+    residuals = None
+    sampled = _index(job, job.ts)
     for start in range(0, total, size):
         first = min(start, total - size)  # the last chunk overlaps: all have one shape
         piece = _simulate(job, slice(first, first + size) if job.batch_shape else None)
-        for name in fields:
+        if start == 0:
+            _require_nominal(np.asarray(piece.status))
+            residuals = _residuals(job, piece)
+        for name in ("wxyz", "omega_body", "status", "steps"):
             part = np.asarray(getattr(piece, name))
+            if name in ("wxyz", "omega_body"):
+                part = part[..., sampled, :]
             if not job.batch_shape:
                 kept[name] = part
                 continue
             whole = kept.setdefault(name, np.empty((total, *part.shape[1:]), part.dtype))
             whole[first : first + size] = part
-        if start == 0:
-            _require_nominal(kept["status"])
         progress(min(start + size, total))
     seconds = time.perf_counter() - began
     compiling = _CLOCK.since(began)
-    trajectory = dataclasses.replace(piece, scene=job.scene, **kept)
-    return Outcome(trajectory, compiling, seconds - compiling)
+    trajectory = dataclasses.replace(piece, ts=job.ts, scene=job.scene, **kept)
+    return Outcome(trajectory, residuals, compiling, seconds - compiling)
+
+
+def _index(job: Job, ts: np.ndarray) -> np.ndarray:
+    """Where the times `ts` stand among all times."""
+    if job.all_ts[0] < job.all_ts[-1]:
+        return np.searchsorted(job.all_ts, ts)
+    return len(job.all_ts) - 1 - np.searchsorted(job.all_ts[::-1], ts)
 
 
 def _simulate(job: Job, part: slice | None) -> polhode.Trajectory:
@@ -130,7 +156,9 @@ def _simulate(job: Job, part: slice | None) -> polhode.Trajectory:
         scene = dataclasses.replace(scene, inertia=_cut(scene.inertia, part))
         state = jax.tree.map(lambda x: x[part] if x.ndim > 1 else x, state)
     with blamed(job.file, ""):
-        trajectory = polhode.simulate(scene, state, job.ts, job.method, rtol=job.rtol, throw=False)
+        trajectory = polhode.simulate(
+            scene, state, job.all_ts, job.method, rtol=job.rtol, throw=False
+        )
     return jax.block_until_ready(trajectory)
 
 
@@ -147,30 +175,24 @@ def _require_nominal(status: np.ndarray) -> None:
 
 
 class Residuals(NamedTuple):
-    """Observed minus computed: rotation angle, rad (n,), and body rates, rad/s (n, 3)."""
+    """Observed against computed: rotation angle, rad (n,), and body rates, rad/s (n, 3)."""
 
     seconds: np.ndarray
     angle: np.ndarray
     rates: np.ndarray
 
 
-def compare(job: Job) -> Residuals | None:
-    """The nominal body against the file's observations after the first time; None without any."""
+def _residuals(job: Job, piece: polhode.Trajectory) -> Residuals | None:
+    """The nominal body against the file's observations within the times; None without any."""
     seen = job.file.observations
     if seen is None:
         return None
-    start, stop = job.file.times.seconds[[0, -1]]
-    later = (seen.seconds - start) * np.sign(stop - start) > 0
-    if not later.any():
-        return None
-    dtype = job.ts.dtype
-    order = slice(None) if stop > start else slice(None, None, -1)
-    ts = np.concatenate([[start], seen.seconds[later][order]]).astype(dtype)
-    scene = build_scene(job.file, dtype)
-    state = build_state(job.file, dtype, scene.inertia)
-    nominal = job._replace(scene=scene, state=state, ts=ts)
-    there = _simulate(nominal, None)
-    attitudes = build_attitudes(seen.attitudes, dtype)[later][order]
-    angle = rotation.angle_between(there.wxyz[1:], attitudes)
-    rates = seen.omega_body[later][order] - np.asarray(there.omega_body[1:])
-    return Residuals(np.asarray(ts[1:]), np.asarray(angle), rates)
+    seconds = _within(seen.seconds, job.ts)
+    rows = np.isin(seen.seconds.astype(seconds.dtype), seconds)
+    at = _index(job, seconds)
+    wxyz, omega = np.asarray(piece.wxyz), np.asarray(piece.omega_body)
+    if job.batch_shape:
+        wxyz, omega = wxyz[0], omega[0]
+    observed = np.asarray(build_attitudes(seen.attitudes, job.ts.dtype))[rows]
+    angle = np.asarray(rotation.angle_between(wxyz[at], observed))
+    return Residuals(seconds, angle, seen.omega_body[rows] - omega[at])

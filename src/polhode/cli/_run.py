@@ -44,7 +44,6 @@ def run(arguments: argparse.Namespace) -> int:
         job = _job.prepare(file, arguments.precision)
     outcome = _with_progress(messages, job)
     with messages.status("measuring and writing ..."):
-        residuals = _job.compare(job)
         figures = _summary.measure(job, outcome)
         dataset = _dataset(job, outcome, figures)
         written = [write_netcdf(dataset, output)]
@@ -52,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
             written.append(_draw(job, outcome, output.with_suffix(".png")))
     if not arguments.quiet:
         out = Console(soft_wrap=not sys.stdout.isatty())
-        out.print(_summary.table(job, outcome, figures, residuals))
+        out.print(_summary.table(job, outcome, figures))
         out.print("written: " + ", ".join(map(str, written)), highlight=False)
     return _failures(outcome.trajectory.status)
 
@@ -96,7 +95,7 @@ def _dataset(job, outcome, figures):
         dataset = dataset.assign_coords(clone=("clone", list(numbers)))
         dataset["clone"].attrs["long_name"] = "number of the clone; 0 is the nominal body"
         lead = ("clone",)
-    for name, values in (figures.periods or {}).items():
+    for name, values in figures.periods.items():
         values = values if lead else values[0]
         dataset[name] = (lead, values, {"units": "s", "long_name": f"period {name}"})
     dataset["moments"] = (

@@ -15,10 +15,10 @@ _MEANINGS = {
 
 
 class Figures(NamedTuple):
-    """Figures of merit of a run; `periods` name -> (bodies,) s, None unless the body is free."""
+    """Figures of merit of a run; `periods` name -> (bodies,) s, empty unless the body is free."""
 
-    periods: dict[str, np.ndarray] | None
-    modes: list[str] | None
+    periods: dict[str, np.ndarray]
+    modes: list[str]
     energy: float | None
     momentum: float | None
 
@@ -29,7 +29,8 @@ def measure(job: Job, outcome: Outcome) -> Figures:
     Energy is given where H does not depend on time through torques, momentum where nothing acts.
     """
     scene, trajectory = job.scene, outcome.trajectory
-    energy = momentum = periods = modes = None
+    energy = momentum = None
+    periods, modes = {}, []
     if scene.torque is None:
         energies = np.asarray(trajectory.energy, np.float64)
         energies = energies.reshape(-1, energies.shape[-1])
@@ -40,6 +41,7 @@ def measure(job: Job, outcome: Outcome) -> Figures:
         size = np.linalg.norm(vector[..., :1, :], axis=-1)
         change = np.linalg.norm(vector - vector[..., :1, :], axis=-1)
         momentum = _largest(change / np.where(size > 0, size, 1))
+    if scene.is_free and hasattr(polhode, "periods"):
         found = polhode.periods(scene.inertia, job.state)
         periods = {name: np.atleast_1d(np.asarray(getattr(found, name))) for name in _MEANINGS}
         modes = _mode_names(found.mode)
@@ -59,7 +61,7 @@ def _mode_names(mode: Any) -> list[str]:
     return [polhode.Mode(int(code)).name for code in np.atleast_1d(np.asarray(mode))]
 
 
-def table(job: Job, outcome: Outcome, figures: Figures, residuals: Residuals | None):
+def table(job: Job, outcome: Outcome, figures: Figures):
     """The summary as a rich Table."""
     from rich.table import Table
     from rich.text import Text
@@ -88,17 +90,17 @@ def table(job: Job, outcome: Outcome, figures: Figures, residuals: Residuals | N
         cells += [published] if file.published else []
         grid.add_row(*map(Text, cells))  # Text: brackets are units here, not markup
 
-    if figures.periods is not None:
+    if figures.periods:
         for name, meaning in _MEANINGS.items():
             values = figures.periods[name] / size
-            row(f"{name}  {meaning} [{unit}]", f"{values[0]:.4f}", _spread(values[1:]),
+            row(f"{name}  {meaning} [{unit}]", f"{values[0]:#.5g}", _spread(values[1:]),
                 _published(file, name, size))  # fmt: skip
         row("mode", figures.modes[0], _count(figures.modes[1:]))
     if figures.energy is not None:
         row("largest relative change of energy", f"{figures.energy:.1e}")
     if figures.momentum is not None:
         row("largest relative change of momentum", f"{figures.momentum:.1e}")
-    for name, value in _misfits(residuals, Scale.of(np.ptp(file.times.seconds))):
+    for name, value in _misfits(outcome.residuals, Scale.of(np.ptp(file.times.seconds))):
         row(name, value)
     row("compilation [s]", f"{outcome.compile_seconds:.2f}")
     row("simulation [s]", f"{outcome.run_seconds:.2f}")
@@ -108,7 +110,18 @@ def table(job: Job, outcome: Outcome, figures: Figures, residuals: Residuals | N
 def _spread(values: np.ndarray) -> str:
     if not len(values) or not np.isfinite(values).any():
         return ""
-    return f"{np.nanmean(values):.4f} ± {np.nanstd(values):.4f}"
+    return _plus_minus(float(np.nanmean(values)), float(np.nanstd(values)))
+
+
+def _plus_minus(value: float, width: float | None) -> str:
+    """Value ± width, the width with two digits and the value with as many decimals."""
+    if not width:
+        return f"{value:.5g}"
+    text = f"{width:.2g}"
+    if "e" in text:
+        return f"{value:.8g} ± {text}"
+    decimals = len(text.partition(".")[2])
+    return f"{value:.{decimals}f} ± {text}"
 
 
 def _count(modes: list[str]) -> str:
@@ -117,12 +130,10 @@ def _count(modes: list[str]) -> str:
 
 def _published(file, name: str, size: float) -> str:
     found = [value for value in file.published if value.name == name]
-    texts = [
-        f"{value.value / size:.2f}"
-        + ("" if value.uncertainty is None else f" ± {value.uncertainty / size:.2f}")
+    return "; ".join(
+        _plus_minus(value.value / size, value.uncertainty and value.uncertainty / size)
         for value in found
-    ]
-    return "; ".join(texts)
+    )
 
 
 def _misfits(residuals: Residuals | None, scale: Scale):
@@ -143,7 +154,7 @@ def _caption(job: Job, outcome: Outcome, clones: int) -> str:
     if file.published:
         sources = dict.fromkeys(value.source for value in file.published)
         lines.append(f"published: {'; '.join(sources)}")
-    if clones:
+    if file.monte_carlo is not None:
         lines.append("clones: mean ± standard deviation, drawn from the spread of")
         lines += [f"  {spread.quantity}: {spread.source}" for spread in file.monte_carlo.spreads]
     if job.redrawn:
