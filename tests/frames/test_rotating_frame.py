@@ -1,0 +1,198 @@
+"""Rotating frames: published forces, transformations both ways, terms that are not computed."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from polhode import rotation
+from polhode.frames import RotatingFrame
+
+# theory section 8.3
+OMEGA, SLOPE = np.array([0.3, -0.5, 0.7]), np.array([0.1, 0.2, -0.3])
+POSITION, VELOCITY, MASS = np.array([1.0, -2.0, 0.5]), np.array([0.4, 0.3, -0.2]), 2.0
+TIME = 0.4
+
+
+def variable_frame(dtype=np.float64, **more):
+    """A frame whose rate and its derivative are those of theory 8.3 at ``TIME``."""
+    omega, slope = OMEGA.astype(dtype), SLOPE.astype(dtype)
+    start = jnp.asarray([0.5, -0.5, 0.1, 0.7], dtype)
+    rate = lambda t: omega + slope * (t - dtype(TIME))  # noqa: E731
+    return RotatingFrame.from_rate(rate, wxyz=start, **more)
+
+
+def wobbling_attitude(t):
+    return rotation.euler_to_matrix(0.3 + 0.7 * t, 1.1 + 0.4 * jnp.sin(t), jnp.cos(2 * t))
+
+
+def wobbling_origin(t):
+    return jnp.stack([jnp.sin(t), t * t, 0.3 * t**3])
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
+def test_published_forces(dtype):
+    frame = variable_frame(dtype)
+    t, position, velocity = dtype(TIME), POSITION.astype(dtype), VELOCITY.astype(dtype)
+    position, velocity, t = (jnp.asarray(x) for x in (position, velocity, t))
+    tolerance = {"rtol": 0, "atol": 8 * np.finfo(dtype).eps}
+    centrifugal = frame.centrifugal(t, position, MASS)
+    coriolis, euler = frame.coriolis(t, velocity, MASS), frame.euler(t, position, MASS)
+    np.testing.assert_allclose(centrifugal, [0.67, -1.67, -1.48], **tolerance)
+    np.testing.assert_allclose(coriolis, [0.44, -1.36, -1.16], **tolerance)
+    np.testing.assert_allclose(euler, [1.0, 0.7, 0.8], **tolerance)
+    total = (centrifugal + coriolis + euler) / MASS
+    np.testing.assert_allclose(
+        frame.apparent_acceleration(t, position, velocity), total, **tolerance
+    )
+    assert total.dtype == dtype
+
+
+def test_published_velocity():
+    frame = RotatingFrame.from_rate(OMEGA)
+    zero = jnp.zeros(())
+    moved = frame.velocity_to_space(zero, jnp.asarray(POSITION), jnp.asarray(VELOCITY))
+    np.testing.assert_allclose(moved, [1.55, 0.85, -0.3], atol=1e-15)
+
+
+def test_forces_vanish_where_they_must():
+    frame = RotatingFrame.from_rate(OMEGA)
+    on_axis, t = jnp.asarray(3 * OMEGA), jnp.zeros(())
+    assert np.abs(frame.centrifugal(t, on_axis)).max() < 1e-15
+    assert np.abs(frame.coriolis(t, on_axis)).max() < 1e-15
+    assert not frame.euler(t, on_axis).any()
+    assert not frame.origin_force(t).any()
+
+
+@pytest.mark.parametrize("with_origin", [False, True], ids=["fixed", "moving origin"])
+def test_transformations_against_differentiated_paths(with_origin):
+    """x_space(t) = origin + R x(t) differentiated directly, and back again."""
+    origin = wobbling_origin if with_origin else None
+    frame = RotatingFrame.from_attitude(wobbling_attitude, origin)
+
+    def path(t):
+        return jnp.stack([jnp.cos(3 * t), t - 1, 0.2 * t * t])
+
+    def in_space(t):
+        moved = wobbling_attitude(t) @ path(t)
+        return moved + wobbling_origin(t) if with_origin else moved
+
+    @jax.jit
+    def run(t):
+        def twice(function):
+            first = jax.jacfwd(function)
+            return function(t), first(t), jax.jacfwd(first)(t)
+
+        here, there = twice(path), twice(in_space)
+        space = (
+            frame.position_to_space(t, here[0]),
+            frame.velocity_to_space(t, *here[:2]),
+            frame.acceleration_to_space(t, *here),
+        )
+        back = (
+            frame.position_to_frame(t, there[0]),
+            frame.velocity_to_frame(t, *there[:2]),
+            frame.acceleration_to_frame(t, *there),
+        )
+        return here, there, space, back
+
+    here, there, space, back = run(jnp.asarray(0.83))
+    for made, true in zip((*space, *back), (*there, *here), strict=True):
+        np.testing.assert_allclose(made, true, rtol=0, atol=3e-14)
+
+
+def test_attitude_as_matrix_or_as_quaternion_of_any_scale():
+    def quaternion(t):
+        return (1 + t * t) * rotation.matrix_to_wxyz(wobbling_attitude(t))
+
+    times = jnp.linspace(-1.0, 2.0, 7)
+    one = RotatingFrame.from_attitude(wobbling_attitude)
+    other = RotatingFrame.from_attitude(quaternion)
+
+    @jax.jit
+    def run(times):
+        return [
+            (frame.omega_body(times), frame.angular_acceleration(times), frame.attitude(times))
+            for frame in (one, other)
+        ]
+
+    made = run(times)
+    for left, right in zip(*made, strict=True):
+        np.testing.assert_allclose(left, right, rtol=0, atol=1e-13)
+
+
+def test_attitude_of_a_constant_rate_is_exact_and_of_a_variable_one_integrated():
+    start = np.array([0.5, -0.5, 0.1, 0.7]) / 1.0
+    steady = RotatingFrame.from_rate(OMEGA, wxyz=start, t0=0.2)
+    varying = RotatingFrame.from_rate(lambda t: jnp.asarray(OMEGA), wxyz=start, t0=0.2)
+    for t in (jnp.asarray(0.2), jnp.asarray(5.0), jnp.asarray(-3.0)):
+        apart = rotation.angle_between(steady.attitude(t), eqx.filter_jit(varying.attitude)(t))
+        assert apart < 1e-12
+    speed = np.linalg.norm(OMEGA)
+    period = jnp.asarray(0.2 + 2 * np.pi / speed)
+    assert (
+        rotation.angle_between(steady.attitude(period), steady.attitude(jnp.asarray(0.2))) < 1e-15
+    )
+
+
+def test_times_broadcast_against_particles():
+    frame = RotatingFrame.from_attitude(wobbling_attitude)
+    times = jnp.linspace(0.0, 1.0, 5)
+    positions = jnp.asarray(np.random.default_rng(0).normal(size=(3, 1, 5, 3)))
+    move = eqx.filter_jit(frame.position_to_space)
+    together, alone = move(times, positions), move(times[2], positions[1, 0, 2])
+    assert together.shape == (3, 1, 5, 3)
+    np.testing.assert_allclose(together[1, 0, 2], alone, atol=1e-15)
+    masses = jnp.asarray([[[1.0]], [[2.0]], [[3.0]]]) * jnp.ones((3, 1, 5))
+    forces = frame.coriolis(times, positions, masses)
+    np.testing.assert_allclose(forces[2], 3 * frame.coriolis(times, positions[2]), atol=1e-14)
+
+
+def _multiplications(frame, moving: bool) -> int:
+    """Products in the compiled-to-be program, nested calls included."""
+
+    def count(jaxpr) -> int:
+        total = 0
+        for equation in jaxpr.eqns:
+            total += equation.primitive.name in ("mul", "dot_general")
+            for value in equation.params.values():
+                for item in value if isinstance(value, tuple | list) else [value]:
+                    inner = getattr(item, "jaxpr", item)
+                    total += count(inner) if hasattr(inner, "eqns") else 0
+        return total
+
+    def program(t, position, velocity):
+        return frame.apparent_acceleration(t, position, velocity if moving else None)
+
+    args = jnp.asarray(TIME), jnp.asarray(POSITION), jnp.asarray(VELOCITY)
+    return count(jax.make_jaxpr(program)(*args).jaxpr)
+
+
+def test_absent_terms_are_not_computed():
+    """One cross product of two vectors counts six."""
+    steady = RotatingFrame.from_rate(OMEGA)
+    assert _multiplications(steady, moving=False) == 2 * 6
+    # Coriolis shares its cross product with the centrifugal force: only 2 v is new
+    assert _multiplications(steady, moving=True) == 2 * 6 + 1
+    slope = jnp.asarray(SLOPE)
+    varying = RotatingFrame.from_rate(lambda t: jnp.asarray(OMEGA) + slope * t)
+    # the given rate and its derivative cost two, the Euler term one cross product
+    assert _multiplications(varying, moving=True) == 2 * 6 + 1 + 2 + 6
+    moving = RotatingFrame.from_rate(OMEGA, wobbling_origin)
+    assert _multiplications(moving, moving=True) > 2 * 6 + 1 + 12
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: RotatingFrame.from_rate([1.0, 2.0]), ValueError, "omega_body must have shape"),
+        (lambda: RotatingFrame.from_rate(np.zeros((2, 3))), ValueError, "one frame"),
+        (lambda: RotatingFrame.from_rate([1.0, np.nan, 0]), ValueError, "NaN"),
+        (lambda: RotatingFrame.from_rate(OMEGA, wxyz=np.zeros(4)), ValueError, "zero"),
+        (lambda: RotatingFrame.from_attitude(np.eye(3)), TypeError, "function of time"),
+    ],
+)
+def test_bad_input_is_named(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
