@@ -132,6 +132,18 @@ def test_observations_within_the_times_are_compared(here):
     assert np.isnan(found.rates[0]).all()
 
 
+@pytest.mark.parametrize("name", ["nasa_brick", "symmetric_top"])
+def test_scenes_meet_the_reference_values_they_carry(name):
+    """Rates and attitudes recomputed with 34 digits, printed with 12 decimals or more."""
+    from polhode.cli import _job
+
+    job = _job.prepare(read_scene(SCENES / f"{name}.toml"), "float64")
+    found = _job.run(job, lambda _: None).residuals
+    assert len(found.seconds) == len(job.file.observations.seconds)
+    assert np.nanmax(found.angle) < 1e-13
+    assert np.abs(found.rates).max() < 1e-13
+
+
 @pytest.mark.parametrize(
     ("value", "width", "text"),
     [(5.38, 0.03, "5.38 ± 0.03"), (7.4, 0.03, "7.40 ± 0.03"), (5.3685, 0.0624, "5.369 ± 0.062"),

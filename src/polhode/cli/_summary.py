@@ -150,7 +150,8 @@ def _misfits(residuals: Residuals | None, scale: Scale):
 
 def _caption(job: Job, outcome: Outcome, clones: int) -> str:
     file = job.file
-    lines = [f"{job.bodies:,} bodies, {len(job.ts):,} samples, {job.ts.dtype}"]
+    count = "1 body" if job.bodies == 1 else f"{job.bodies:,} bodies"
+    lines = [f"{count}, {len(job.ts):,} samples, {job.ts.dtype}"]
     if file.published:
         sources = dict.fromkeys(value.source for value in file.published)
         lines.append(f"published: {'; '.join(sources)}")
