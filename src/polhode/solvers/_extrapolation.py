@@ -10,9 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import PyTree
 
 from polhode.solvers._dense import CollocationInterpolation, collocate
-from polhode.solvers._kernel import kernel, map_blocks
+from polhode.solvers._kernel import check_layout, kernel, map_blocks
 from polhode.solvers._problem import Problem
-
 
 SEQUENCES = {
     4: (2, 4),
@@ -61,7 +60,11 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
       for every body. One-step: the step may change at will.
     - Evaluations per step: $p(p + 2)/4 - p/2 + 1$ (order 8: 17, order 12: 37, order 16: 65).
     - Conserves nothing exactly; $|q|$, energy and momenta to the accuracy of the step.
-    - Dense output: collocation polynomial of the same accuracy, evaluated only when asked for.
+    - ``substeps``: equal steps of the method inside one diffrax step, whose own cost (microseconds)
+      is then shared; the error estimate is the sum of their absolute values.
+    - Dense output: collocation polynomials of the same accuracy on the substeps. They cost some
+      times the step itself, and nothing unless interpolated: to record at given times, step to
+      them (``diffrax.StepTo`` with ``diffrax.SaveAt(t0=True, steps=True)``).
     - ``block``: bodies handled together inside a step, so that large batches stay in the cache.
       Needs a vector field that treats bodies separately, with bodies on the last axis of every
       array of the state, and of every array of the term and of ``args`` that differs from body
@@ -75,6 +78,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
 
     formal_order: int = eqx.field(static=True, default=12)
     block: int | None = eqx.field(static=True, default=None)
+    substeps: int = eqx.field(static=True, default=1)
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = CollocationInterpolation
@@ -84,8 +88,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
             raise ValueError(
                 f"Extrapolation({self.formal_order}): the order must be even and from 4 to 20."
             )
-        if self.block is not None and self.block < 1:
-            raise ValueError(f"block={self.block}: give the number of bodies (about 128) or None.")
+        check_layout(self.block, self.substeps)
 
     def order(self, terms) -> int:
         return self.formal_order
@@ -103,14 +106,13 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         del solver_state, made_jump
 
         def advance(y, rest):
-            times, problem = rest
-            return kernel(lambda y, times, p: _step(self.formal_order, p, times, y))(
-                y, times, problem
-            )
+            run = kernel(lambda *operands: _steps(self.formal_order, self.substeps, *operands))
+            return run(*rest, y)
 
         problem = Problem.of(terms, args)
-        y1, error = map_blocks(advance, self.block, y0, ((t0, t1), problem))
-        dense = collocate(terms, t0, t1, y0, y1, args, self.formal_order)
+        rest = (problem, (t0, t1 - t0), problem.control(t0, t1))
+        y1, error, nodes = map_blocks(advance, self.block, y0, rest)
+        dense = collocate(terms, t0, t1, nodes, y1, args, self.formal_order)
         return y1, error, dense, None, diffrax.RESULTS.successful
 
 
@@ -118,7 +120,26 @@ def _add(a: PyTree, b: PyTree) -> PyTree:
     return jax.tree.map(jnp.add, a, b)
 
 
-def _step(order: int, problem: Problem, times, y):
+def _add_share(a: PyTree, share: float, b: PyTree) -> PyTree:
+    return jax.tree.map(lambda x, y: x + share * y, a, b)
+
+
+def _steps(order: int, count: int, problem: Problem, times, control, y):
+    """State after ``count`` equal steps, summed size of their errors, states they started from."""
+    t0, width = times
+    share = jax.tree.map(lambda c: c / count, control)
+
+    def one(carry, i):
+        y, total = carry
+        new, error = _step(order, problem, (t0 + i * (width / count), width / count), share, y)
+        return (new, jax.tree.map(lambda s, e: s + jnp.abs(e), total, error)), y
+
+    start = (y, jax.tree.map(jnp.zeros_like, y))
+    (y, error), nodes = jax.lax.scan(one, start, jnp.arange(count, dtype=jnp.result_type(width)))
+    return y, error, nodes
+
+
+def _step(order: int, problem: Problem, times, control, y):
     """New state and error estimate; the column with most substeps is the base of both sums.
 
     The others enter by their small differences to it, so that rounded weights cannot rescale
@@ -127,8 +148,7 @@ def _step(order: int, problem: Problem, times, y):
     sequence = SEQUENCES[order]
     weights = extrapolation_weights(sequence)
     lower = (Fraction(0), *extrapolation_weights(sequence[1:]))
-    t0, t1 = times
-    control = problem.control(t0, t1)
+    t0, width = times
     start = kernel(lambda y, t, control, p: p.increment(t, y, control))(y, t0, control, problem)
 
     @kernel
@@ -136,7 +156,7 @@ def _step(order: int, problem: Problem, times, y):
         return _add(a, p.increment(t, b, control))
 
     def column(n):
-        h = (t1 - t0) / n
+        h = width / n
         # a share of the whole control: differences of two late times would be rounded
         twice = jax.tree.map(lambda c: c * (2 / n), control)
         a, b = y, jax.tree.map(lambda y, f: y + f / n, y, start)
@@ -148,12 +168,12 @@ def _step(order: int, problem: Problem, times, y):
             return a, leap(b, a, t + h, twice, problem)
 
         a, b = jax.lax.fori_loop(0, n // 2 - 1, pair, (a, b))
-        return leap(a, b, t1 - h, twice, problem)
+        return leap(a, b, t0 + (width - h), twice, problem)
 
     base = column(sequence[-1])
     new, error = base, jax.tree.map(jnp.zeros_like, base)
     for n, weight, low in zip(sequence[:-1], weights, lower):
         difference = jax.tree.map(jnp.subtract, column(n), base)
-        new = jax.tree.map(lambda y, d: y + float(weight) * d, new, difference)
-        error = jax.tree.map(lambda y, d: y + float(weight - low) * d, error, difference)
+        new = _add_share(new, float(weight), difference)
+        error = _add_share(error, float(weight - low), difference)
     return new, error

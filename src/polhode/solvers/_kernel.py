@@ -10,11 +10,11 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.interpreters import partial_eval
 
 _PLAIN = frozenset(
-    "abs add add_any and atan atan2 broadcast_in_dim ceil clamp concatenate convert_element_type"
-    " copy cos cosh custom_jvp_call custom_vjp_call div dynamic_slice dynamic_update_slice eq exp"
-    " exp2 expm1 floor ge gt integer_pow is_finite jit le log log1p logistic lt max min mul ne neg"
-    " not or pad pjit pow reduce_sum rem reshape round rsqrt scan select_n sign sin sinh slice"
-    " split sqrt square squeeze stop_gradient sub tan tanh transpose while xor".split()
+    """abs add add_any and atan atan2 broadcast_in_dim ceil clamp concatenate convert_element_type
+     copy cos cosh custom_jvp_call custom_vjp_call div dynamic_slice dynamic_update_slice eq exp
+     exp2 expm1 floor ge gt integer_pow is_finite jit le log log1p logistic lt max min mul ne neg
+     not or pad pjit pow reduce_sum rem reshape round rsqrt scan select_n sign sin sinh slice
+     split sqrt square squeeze stop_gradient sub tan tanh transpose while xor""".split()  # noqa: SIM905
 )
 """Operations that a single compiled unit may hold; anything else keeps the usual way."""
 
@@ -39,6 +39,7 @@ def kernel(fn: Callable) -> Callable:
     and fusion across them repeats the work of one in the next. The mark keeps the call and asks
     for a single function; it is a hint that changes no value. It is given on the CPU only, to
     plain arithmetic only, and the call carries no operand that goes unused: XLA requires both.
+    Derivatives are those of ``fn``, unmarked. ``fn`` must not close over traced values.
     """
 
     def call(*operands):
@@ -46,24 +47,39 @@ def kernel(fn: Callable) -> Callable:
             return fn(*operands)
         leaves, tree = jax.tree.flatten(operands)
 
-        def flat(*leaves):
-            return fn(*jax.tree.unflatten(tree, leaves))
+        @jax.custom_jvp
+        def marked(*leaves):
+            return _marked(lambda *given: fn(*jax.tree.unflatten(tree, given)), leaves)
 
-        closed, shape = jax.make_jaxpr(flat, return_shape=True)(*leaves)
-        jaxpr = closed.jaxpr
-        if not _is_plain(jaxpr):
-            return fn(*operands)
-        _, used = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
+        @marked.defjvp
+        def _(leaves, tangents):
+            return jax.jvp(lambda *x: fn(*jax.tree.unflatten(tree, x)), leaves, tangents)
 
-        def needed(*given):
-            given = iter(given)
-            full = [next(given) if u else jnp.zeros_like(x) for u, x in zip(used, leaves)]
-            return flat(*full)
-
-        with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-            return jax.jit(needed)(*(x for u, x in zip(used, leaves) if u))
+        return marked(*leaves)
 
     return call
+
+
+def _marked(flat: Callable, leaves: tuple) -> Any:
+    closed = jax.make_jaxpr(flat)(*leaves)
+    if not _is_plain(closed.jaxpr):
+        return flat(*leaves)
+    _, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
+
+    def needed(*given):
+        given = iter(given)
+        return flat(*(next(given) if u else jnp.zeros_like(x) for u, x in zip(used, leaves)))
+
+    with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+        return jax.jit(needed)(*(x for u, x in zip(used, leaves) if u))
+
+
+def check_layout(block: int | None, substeps: int) -> None:
+    """Raises ValueError unless both counts, options of the solvers here, make sense."""
+    if block is not None and block < 1:
+        raise ValueError(f"block={block}: give the number of bodies (about 128) or None.")
+    if substeps < 1:
+        raise ValueError(f"substeps={substeps}: give the number of equal steps, at least 1.")
 
 
 def _is_lane(leaf: Any, bodies: int) -> bool:

@@ -10,11 +10,12 @@ import numpy as np
 from jaxtyping import Array
 
 from polhode.solvers._dense import CollocationInterpolation, collocate
-from polhode.solvers._kernel import kernel, map_blocks
+from polhode.solvers._kernel import check_layout, kernel, map_blocks
 from polhode.solvers._problem import Problem
 from polhode.solvers._schemes import SCHEMES, Scheme
 
-Body = tuple[tuple[Array, Array, Array], tuple[Array, Array, Array, Array]]
+Vector = tuple[Array, Array, Array]
+Quaternion = tuple[Array, Array, Array, Array]
 
 
 class Splitting(diffrax.AbstractSolver):
@@ -37,7 +38,7 @@ class Splitting(diffrax.AbstractSolver):
     - No error estimate. Dense output: collocation polynomial.
     - ``middle``: the axis (0, 1, 2) whose moment is the middle one; for an axisymmetric body
       either transverse axis. Another choice costs accuracy only.
-    - ``block``: as in ``Extrapolation``.
+    - ``block``, ``substeps``: as in ``Extrapolation``.
 
     ??? cite "Reference"
         R. I. McLachlan, Phys. Rev. Lett. 71 (1993) 3043; E. Hairer, C. Lubich, G. Wanner,
@@ -48,6 +49,7 @@ class Splitting(diffrax.AbstractSolver):
     formal_order: int = eqx.field(static=True, default=4)
     middle: int = eqx.field(static=True, default=1)
     block: int | None = eqx.field(static=True, default=None)
+    substeps: int = eqx.field(static=True, default=1)
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = CollocationInterpolation
@@ -59,6 +61,7 @@ class Splitting(diffrax.AbstractSolver):
             )
         if self.middle not in (0, 1, 2):
             raise ValueError(f"middle={self.middle}: give a body axis 0, 1 or 2.")
+        check_layout(self.block, self.substeps)
 
     @property
     def scheme(self) -> Scheme:
@@ -67,119 +70,150 @@ class Splitting(diffrax.AbstractSolver):
     def order(self, terms) -> int:
         return self.formal_order
 
-    def init(self, terms, t0, t1, y0, args) -> None:
-        return None
+    def init(self, terms, t0, t1, y0, args) -> Vector:
+        """The momentum in space axes: from step to step it passes unrounded."""
+        return _rotate(y0[1], y0[0])
 
-    def func(self, terms, t0, y0, args) -> Body:
+    def func(self, terms, t0, y0, args) -> tuple[Vector, Quaternion]:
         return terms.vf(t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        del solver_state, made_jump
+        momentum_space = jax.tree.map(
+            lambda kept, fresh: jnp.where(made_jump, fresh, kept),
+            solver_state,
+            _rotate(y0[1], y0[0]),
+        )
 
-        def advance(y, rest):
-            t, control, problem = rest
-            run = kernel(lambda *operands: _step(self.scheme, self.middle, *operands))
-            return run(problem, t, control, y)
+        def advance(state, rest):
+            def run(*operands):
+                return _steps(self.scheme, self.middle, self.substeps, *operands)
+
+            return kernel(run)(*rest, state)
 
         problem = Problem.of(terms, args)
-        # every time inside the step is t0 plus a share of the step, as seen by the vector field
-        rest = ((t0, t1 - t0), problem.control(t0, t1), problem)
-        y1 = map_blocks(advance, self.block, y0, rest)
-        dense = collocate(terms, t0, t1, y0, y1, args, self.formal_order)
-        return y1, None, dense, None, diffrax.RESULTS.successful
+        rest = (problem, (t0, t1 - t0), problem.control(t0, t1))
+        state, nodes = map_blocks(advance, self.block, (momentum_space, tuple(y0[1])), rest)
+        y1 = (_rotate_back(state[1], state[0]), state[1])
+        nodes = (_rotate_back(nodes[1], nodes[0]), nodes[1])
+        dense = collocate(terms, t0, t1, nodes, y1, args, self.formal_order)
+        return y1, None, dense, state[0], diffrax.RESULTS.successful
 
 
-def _turn(y: Body, axis: int, half: Array) -> Body:
-    """Rotation of the body by the angle ``2 half`` about one of its axes.
+def _cross(a, b):
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
-    The momentum is moved by small differences: equal steps round sine and cosine in the same way
-    each time, and ``cos^2 + sin^2 != 1`` would change its length in proportion to the steps.
-    """
-    momentum, wxyz = y
+
+def _rotate(wxyz, vector):
+    """Space components of a vector given in body axes."""
+    twice = tuple(2 * x for x in _cross(wxyz[1:], vector))
+    return tuple(v + (wxyz[0] * a + b) for v, a, b in zip(vector, twice, _cross(wxyz[1:], twice)))
+
+
+def _rotate_back(wxyz, vector):
+    """Body components of a vector given in space axes."""
+    return _rotate((wxyz[0], *(-x for x in wxyz[1:])), vector)
+
+
+def _turn(wxyz, axis: int, half: Array):
+    """Rotation of the body by the angle ``2 half`` about one of its own axes."""
     j, k = (axis + 1) % 3, (axis + 2) % 3
     c, s = jnp.cos(half), jnp.sin(half)
-    versine, sine = 2 * s * s, 2 * s * c
-    new = [momentum[axis]] * 3
-    new[j] = momentum[j] + (momentum[k] * sine - momentum[j] * versine)
-    new[k] = momentum[k] - (momentum[j] * sine + momentum[k] * versine)
     w, v = wxyz[0], wxyz[1:]
     turned = [v[axis] * c + w * s] * 3
     turned[j] = v[j] * c + v[k] * s
     turned[k] = v[k] * c - v[j] * s
-    return tuple(new), (w * c - v[axis] * s, *turned)
+    return (w * c - v[axis] * s, *turned)
 
 
-def _spin(y: Body, inverse: Array) -> Body:
-    """Turn of the attitude about the constant momentum, by the angle ``|L| inverse``."""
-    momentum, (w, x, y_, z) = y
+def _spin(wxyz, momentum, inverse: Array):
+    """Rotation of the body about the momentum, fixed in space, by the angle ``|L| inverse``."""
     half = [m * (inverse / 2) for m in momentum]
     square = half[0] * half[0] + half[1] * half[1] + half[2] * half[2]
     resting = square == 0  # the root has no slope there, but cos and sin(x) / x have one: zero
     angle = jnp.sqrt(jnp.where(resting, 1, square))
     c = jnp.where(resting, 1, jnp.cos(angle))
     sinc = jnp.where(resting, 1, jnp.sin(angle) / angle)
-    a, b, d = (sinc * h for h in half)
-    return momentum, (
-        w * c - x * a - y_ * b - z * d,
-        x * c + w * a + y_ * d - z * b,
-        y_ * c + w * b + z * a - x * d,
-        z * c + w * d + x * b - y_ * a,
+    axis = tuple(sinc * h for h in half)
+    w, v = wxyz[0], wxyz[1:]
+    along = axis[0] * v[0] + axis[1] * v[1] + axis[2] * v[2]
+    turned = (c * x + (w * a + b) for x, a, b in zip(v, axis, _cross(axis, v)))
+    return (w * c - along, *turned)
+
+
+def _normalise(wxyz):
+    """Takes off what rounding has added to ``|q|``, by one Newton step towards length one."""
+    scale = (3 - sum((x * x for x in wxyz[1:]), wxyz[0] * wxyz[0])) / 2
+    return tuple(scale * x for x in wxyz)
+
+
+def _rates(problem: Problem, t, momentum):
+    """Body rates dH/dL, read off from the attitude's rate at the identity."""
+    zero = jnp.zeros_like(momentum[0])
+    _, (_, *half) = problem.field(t, (tuple(momentum), (zero + 1, zero, zero, zero)))
+    return [2 * h for h in half]
+
+
+def _along(axis: int, value: Array) -> list[Array]:
+    return [value if i == axis else jnp.zeros_like(value) for i in range(3)]
+
+
+def _steps(scheme: Scheme, middle: int, count: int, problem: Problem, times, control, state):
+    """Space momentum and attitude after ``count`` equal steps, and those they started from."""
+    t0, width = times
+
+    def one(state, i):
+        inner = (t0 + i * (width / count), width / count)
+        return _step(scheme, middle, problem, inner, control / count, state), state
+
+    return jax.lax.scan(one, state, jnp.arange(count, dtype=jnp.result_type(width)))
+
+
+def _step(scheme: Scheme, middle: int, problem: Problem, times, control, state):
+    """One step. The momentum is carried in space axes, where only the kick changes it: turned
+    with the body, equal steps would round alike and shift a conserved component steadily."""
+    t0, width = times
+    momentum, wxyz = state
+    one = jnp.ones_like(momentum[0])
+    inverse = (
+        _rates(problem, t0, _along(middle, one))[middle]
+        - _rates(problem, t0, _along(middle, 0 * one))[middle]
     )
 
-
-def _normalise(y: Body) -> Body:
-    """Takes off what rounding has added to ``|q|``, by one Newton step towards length one."""
-    momentum, wxyz = y
-    scale = (3 - sum(x * x for x in wxyz[1:]) - wxyz[0] * wxyz[0]) / 2
-    return momentum, tuple(scale * x for x in wxyz)
-
-
-def _step(scheme: Scheme, middle: int, problem: Problem, times, control, y: Body) -> Body:
-    t0, width = times
-    zero = jnp.zeros_like(y[0][0])
-    identity = (zero + 1, zero, zero, zero)
-
-    def rates(problem, momentum):
-        _, (_, *half) = problem.field(t0, (tuple(momentum), identity))
-        return [2 * h for h in half]
-
-    unit = [zero] * 3
-    unit[middle] = zero + 1
-    inverse = rates(problem, unit)[middle] - rates(problem, [zero] * 3)[middle]
-
     @kernel
-    def kick(problem, t, span, y):
-        momentum, wxyz = y
+    def kick(problem, t, span, momentum, wxyz):
+        zero = jnp.zeros_like(momentum[0])
         torque, _ = problem.field(t, ((zero,) * 3, wxyz))
-        return tuple(m + span * n for m, n in zip(momentum, torque)), wxyz
+        push = _rotate(wxyz, tuple(span * n for n in torque))
+        return tuple(m + p for m, p in zip(momentum, push))
 
     def turn(axis):
         @kernel
-        def flow(problem, inverse, span, y):
-            excess = rates(problem, y[0])[axis] - inverse * y[0][axis]
-            return _turn(y, axis, excess * (span / 2))
+        def flow(problem, t, inverse, span, momentum, wxyz):
+            along = _rotate_back(wxyz, momentum)[axis]
+            excess = _rates(problem, t, _along(axis, along))[axis] - inverse * along
+            return _turn(wxyz, axis, excess * (span / 2))
 
         return flow
 
     turns = [turn((middle + 1) % 3), turn(middle), turn((middle + 2) % 3)]
-    spin = kernel(lambda inverse, span, y: _spin(y, inverse * span))
+    spin = kernel(lambda inverse, span, momentum, wxyz: _spin(wxyz, momentum, inverse * span))
 
-    def pair(y, shares):
+    def pair(state, shares):
         """chi, then its adjoint; the kick that ended the pair before is merged into the first."""
+        momentum, wxyz = state
         time, before, first, second = shares
-        y = kick(problem, t0 + time * width, (before + first) * control, y)
+        momentum = kick(problem, t0 + time * width, (before + first) * control, momentum, wxyz)
         for flow in turns:
-            y = flow(problem, inverse, first * control, y)
-        y = spin(inverse, (first + second) * control, y)
+            wxyz = flow(problem, t0, inverse, first * control, momentum, wxyz)
+        wxyz = spin(inverse, (first + second) * control, momentum, wxyz)
         for flow in reversed(turns):
-            y = flow(problem, inverse, second * control, y)
-        return y, None
+            wxyz = flow(problem, t0, inverse, second * control, momentum, wxyz)
+        return (momentum, wxyz), None
 
     pairs = np.reshape(scheme.coefficients, (-1, 2))
     time = np.concatenate([[0.0], np.cumsum(pairs.sum(axis=1))[:-1]])
     before = np.concatenate([[0.0], pairs[:-1, 1]])
-    dtype = zero.dtype
-    shares = [jnp.asarray(x, dtype) for x in (time, before, pairs[:, 0], pairs[:, 1])]
-    y, _ = jax.lax.scan(pair, y, shares)
-    y = kick(problem, t0 + width, float(pairs[-1, 1]) * control, y)
-    return _normalise(y)
+    shares = [jnp.asarray(x, one.dtype) for x in (time, before, pairs[:, 0], pairs[:, 1])]
+    (momentum, wxyz), _ = jax.lax.scan(pair, state, shares)
+    momentum = kick(problem, t0 + width, float(pairs[-1, 1]) * control, momentum, wxyz)
+    return momentum, _normalise(wxyz)
