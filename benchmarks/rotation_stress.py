@@ -318,6 +318,56 @@ def euler_cases(sequence: Sequence, count: int, stride: int = 1) -> list[Case]:
     ]  # fmt: skip
 
 
+def composed_cases(count: int, stride: int = 1) -> list[Case]:
+    """From the documents' ZYZ angles straight to every other description."""
+
+    def angles(row):
+        return row[..., 0], row[..., 1], row[..., 2]
+
+    def axis_angle(row):
+        axis, angle = rotation.euler_to_axis_angle(*angles(row))
+        return jnp.concatenate([axis, angle[..., None]], axis=-1)
+
+    def matrix(row):
+        return rotation.euler_to_matrix(*angles(row)).reshape(*row.shape[:-1], 9)
+
+    def quaternion(point):
+        return truth.from_euler(point, (2, 1, 2), False)
+
+    def through(target):
+        def fixed(point):
+            sign = truth.side(quaternion(point))
+            return lambda moved: target(quaternion(moved), sign)
+
+        return fixed
+
+    def points(dtype):
+        return [truth.exact(row) for row in eulers(dtype, count, True, stride)]
+
+    def unmoved(point):
+        return truth.norm(quaternion(point)[1:]) < 1e-40
+
+    def size(point):
+        return truth.norm(quaternion(point)[1:])
+
+    rows = [
+        ("rotation vector", lambda row: rotation.euler_to_rotation_vector(*angles(row)),
+         truth.to_vector, measure_vector),
+        ("axis-angle", axis_angle, truth.to_axis_angle, measure_axis_angle),
+        ("Rodrigues", lambda row: rotation.euler_to_modified_rodrigues(*angles(row)),
+         truth.to_rodrigues, measure_vector),
+        ("matrix", matrix, lambda moved, _: truth.to_matrix(moved), measure_matrix),
+    ]  # fmt: skip
+    return [
+        Case(
+            f"Euler ZYZ -> {name}", function, through(target), points, _straight, measure,
+            singular=unmoved if name == "axis-angle" else lambda point: False,
+            near=size if name == "axis-angle" else lambda point: mp.mpf(1),
+        )
+        for name, function, target, measure in rows
+    ]  # fmt: skip
+
+
 # --- running --------------------------------------------------------------------------------------
 
 
@@ -422,7 +472,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     count = 20 if quick else 200
     sequences = [Sequence.ZYZ, Sequence.XYZ] if quick else list(Sequence)
-    cases = plain_cases(count)
+    cases = plain_cases(count) + composed_cases(count // 4)
     for sequence in sequences:
         cases += euler_cases(sequence, count // 4)
     print("worst errors in units of eps (float64 2.2e-16, float32 1.2e-7)")
