@@ -255,6 +255,18 @@ def test_failed_write_keeps_the_old_file(here, capsys, monkeypatch, failure):
     assert sorted(path.name for path in here.iterdir()) == ["top.nc", "top.toml"]
 
 
+def test_missing_packages_are_named_before_the_work(here, capsys, monkeypatch):
+    from polhode.cli import _run
+
+    find = _run.importlib.util.find_spec
+    monkeypatch.setattr(
+        _run.importlib.util, "find_spec", lambda name: None if name == "h5py" else find(name)
+    )
+    assert run("top.toml") == 1
+    assert "needs h5py: pip install 'polhode[cli]'" in capsys.readouterr().err
+    assert [path.name for path in here.iterdir()] == ["top.toml"]
+
+
 def test_termination_unwinds(here, monkeypatch):
     before = signal.getsignal(signal.SIGTERM)
     monkeypatch.setattr(ph, "simulate", lambda *_, **__: os.kill(os.getpid(), signal.SIGTERM))

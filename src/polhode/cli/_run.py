@@ -1,6 +1,7 @@
 """`polhode run SCENE`: simulate a scene file, write NetCDF and a figure, print a summary."""
 
 import argparse
+import importlib.util
 import sys
 from pathlib import Path
 
@@ -30,9 +31,11 @@ def register(commands) -> argparse.ArgumentParser:
 
 def run(arguments: argparse.Namespace) -> int:
     """Do the job; 0, or 1 when some clones did not finish."""
+    file = read(arguments)
+    with_figure = file.output.figure and not arguments.no_figure
+    _require("rich", "xarray", "h5netcdf", "h5py", *(("matplotlib",) if with_figure else ()))
     from rich.console import Console
 
-    file = read(arguments)
     output = _target(arguments.output or file.output.file or Path(file.path.stem + ".nc"))
     messages = Console(stderr=True)
     # progress is for people who watch: nothing of it goes into a log file
@@ -47,13 +50,20 @@ def run(arguments: argparse.Namespace) -> int:
         figures = _summary.measure(job, outcome)
         dataset = _dataset(job, outcome, figures)
         written = [write_netcdf(dataset, output)]
-        if file.output.figure and not arguments.no_figure:
+        if with_figure:
             written.append(_draw(job, outcome, output.with_suffix(".png")))
     if not arguments.quiet:
         out = Console(soft_wrap=not sys.stdout.isatty())
         out.print(_summary.table(job, outcome, figures))
         out.print("written: " + ", ".join(map(str, written)), highlight=False)
     return _failures(outcome.trajectory.status)
+
+
+def _require(*packages: str) -> None:
+    """ImportError now, rather than after the work, when a package is missing."""
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ImportError(f"`polhode run` needs {', '.join(missing)}: pip install 'polhode[cli]'")
 
 
 def _target(path: Path | str) -> Path:
