@@ -12,6 +12,7 @@ class Status(enum.IntEnum):
     CHART_SINGULAR = 3
     STEP_FAILED = 4
     INACCURATE = 5
+    WRONG_LAW = 6
 
     @property
     def explanation(self) -> str:
@@ -36,6 +37,10 @@ _EXPLANATIONS = {
     Status.INACCURATE: (
         "the error estimate exceeds the tolerance asked for: lower rtol's ambition or raise the"
         " number of steps"
+    ),
+    Status.WRONG_LAW: (
+        "the law of the method asked for does not hold for this body (symmetry, centre of mass or"
+        " initial state): leave method=None"
     ),
 }
 

@@ -65,6 +65,10 @@ class Orbit(NamedTuple):
     nu: Array
     spinors: Spinor
 
+    def along_time(self) -> "Orbit":
+        """With a last axis of length 1 on every array, ready for samples."""
+        return jax.tree.map(lambda x: x[..., None], self)
+
 
 def _only(condition: Array, value: Array, other=0) -> Array:
     return jnp.where(condition, value, other)

@@ -55,21 +55,41 @@ class UniformGravity(AbstractPotential):
     of mass [m], body axes; ``gravity_space`` (..., 3) [m/s^2], space axes. The inertia of the
     scene is then the one about the fixed point.
 
+    ``on_axis`` (static): whether the centre is known to lie on body z; see ``axial``.
+
     Raises ValueError for a negative mass, NaN, or wrong shapes.
     """
 
     mass: Float[Array, "*#b"]
     centre_body: Float[Array, "*#b 3"]
     gravity_space: Float[Array, "*#b 3"]
+    on_axis: bool = eqx.field(static=True, default=False)
 
     core_ranks = {"mass": 0, "centre_body": 1, "gravity_space": 1}  # noqa: RUF012
 
-    def __init__(self, mass, centre_body, gravity_space=(0.0, 0.0, -9.80665)):
+    def __init__(self, mass, centre_body, gravity_space=(0.0, 0.0, -9.80665), on_axis=False):
         self.mass = as_number("mass", mass)
         self.centre_body = as_float_array("centre_body", centre_body, (3,))
         self.gravity_space = as_float_array("gravity_space", gravity_space, (3,))
         if is_concrete(self.mass):
             require(self.mass >= 0, f"mass must not be negative, got {mass}: give it in kg.")
+        self.on_axis = bool(on_axis)
+        if self.on_axis and is_concrete(self.centre_body):
+            require(
+                self.centre_body[..., :2] == 0,
+                f"on_axis says that the centre lies on body z, got {centre_body}: leave it out.",
+            )
+
+    @classmethod
+    def axial(cls, mass, distance, gravity_space=(0.0, 0.0, -9.80665)) -> "UniformGravity":
+        """A centre of mass on body z, ``distance`` (...) [m] from the fixed point.
+
+        With ``Inertia.axisymmetric`` this is Lagrange's top by construction: the exact motion is
+        found under ``jit`` and ``grad`` too.
+        """
+        distance = as_number("distance", distance)
+        zero = jnp.zeros_like(distance)
+        return cls(mass, jnp.stack([zero, zero, distance], axis=-1), gravity_space, True)
 
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array:
         arm_space = attitude.to_space(components(self.centre_body))
