@@ -1,2 +1,7 @@
+from polhode.solvers._choice import (
+    Choice as Choice,
+    choose as choose,
+    natural_rate as natural_rate,
+)
 from polhode.solvers._extrapolation import Extrapolation as Extrapolation
 from polhode.solvers._splitting import Splitting as Splitting
