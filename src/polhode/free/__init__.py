@@ -6,6 +6,7 @@ from polhode.free._evaluate import (
     prepare as prepare,
 )
 from polhode.free._motion import FreeMotion as FreeMotion
+from polhode.free._periods import Mode as Mode, Periods as Periods, periods as periods
 from polhode.free._symmetric import (
     spherical_motion as spherical_motion,
     symmetric_motion as symmetric_motion,

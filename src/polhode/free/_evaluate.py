@@ -8,8 +8,9 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from polhode.free._flow import Moment, advance, attitude, rates
+from polhode.free._frame import Frame, Quadruple, cross, dot, hamilton, matrix
 from polhode.free._motion import FreeMotion, Swing, Turning, prepare_swing, prepare_turning
-from polhode.free._roles import Triple, assign_roles, pick, restore
+from polhode.free._roles import Triple, assign_roles
 from polhode.free._second import second_kind
 from polhode.free._tangent import (
     Change,
@@ -21,7 +22,6 @@ from polhode.free._tangent import (
 )
 
 Scalars = Float[Array, "*b"]
-Quadruple = tuple[Scalars, Scalars, Scalars, Scalars]
 
 
 def components(values, count: int) -> tuple[Scalars, ...]:
@@ -94,7 +94,7 @@ def _evaluate(asked, constants, given):
     return _results(asked, swing, turning, advance(swing, turning, given[-1], asked[2]))
 
 
-def _tangent_or_zero(tangents, primals):
+def zero_where_symbolic(tangents, primals):
     """None where every tangent is zero, arrays otherwise."""
     if tangents is None or all(isinstance(x, SymbolicZero) for x in jax.tree.leaves(tangents)):
         return None
@@ -103,51 +103,7 @@ def _tangent_or_zero(tangents, primals):
     )
 
 
-class _Frame:
-    """Passage between x, y, z and the right-handed axes 1, 2, 3 on which L3 is positive."""
-
-    def __init__(self, swing: Swing):
-        self.swing = swing
-        facing = jnp.copysign(1, swing.momentum[2])
-        self.signs = (jnp.ones_like(facing), swing.parity * facing, facing)
-        self.index = (3 - swing.middle - swing.circled, swing.middle, swing.circled)
-
-    def to_roles(self, values: Triple) -> Triple:
-        return tuple(pick(values, k) for k in self.index)
-
-    def to_pairs(self, values: Triple) -> Triple:
-        """Entries xy, xz, yz as entries 12, 13, 23."""
-        i, j, k = self.index
-        return tuple(pick(values, n - 1) for n in (i + j, i + k, j + k))
-
-    def to_body(self, values: Triple) -> Triple:
-        return restore(values, self.swing.middle, self.swing.circled)
-
-    def turned(self, values: Triple) -> Triple:
-        return tuple(e * x for e, x in zip(self.signs, values, strict=True))
-
-
-def _cross(a: Triple, b: Triple) -> Triple:
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
-
-
-def _dot(a, b) -> Scalars:
-    return sum(x * y for x, y in zip(a, b, strict=True))
-
-
-def _hamilton(a: Quadruple, b: Quadruple) -> Quadruple:
-    v = _cross(a[1:], b[1:])
-    return (
-        a[0] * b[0] - _dot(a[1:], b[1:]),
-        *(a[0] * b[k + 1] + a[k + 1] * b[0] + v[k] for k in range(3)),
-    )
-
-
-def _start_change(swing: Swing, frame: _Frame, dm, dp, dw) -> Change:
+def change_of_start(swing: Swing, frame: Frame, dm, dp, dw) -> Change:
     """Variation of the initial momentum and of the inverse tensor, in roles and scaled units."""
     zero = (jnp.zeros_like(swing.heft),) * 3
     inverse_pulse = 1 / jnp.where(swing.pulse > 0, swing.pulse, 1)
@@ -168,21 +124,7 @@ def _start_change(swing: Swing, frame: _Frame, dm, dp, dw) -> Change:
     return Change(gain, inverse, (-d1 * d2 * p12, -d1 * d3 * p13, -d2 * d3 * p23))
 
 
-def _matrix(change: Change, vector: Triple) -> Triple:
-    """The variation of the inverse tensor, applied."""
-    a, b, c = vector
-    plain = tuple(e * x for e, x in zip(change.inverse, vector, strict=True))
-    if change.crossed is None:
-        return plain
-    h12, h13, h23 = change.crossed
-    return (
-        plain[0] + h12 * b + h13 * c,
-        plain[1] + h12 * a + h23 * c,
-        plain[2] + h13 * a + h23 * b,
-    )
-
-
-def _relative_turn(swing: Swing, turning: Turning, frame: _Frame, at: Moment, step: Triple):
+def _relative_turn(swing: Swing, turning: Turning, frame: Frame, at: Moment, step: Triple):
     """Quaternion from the attitude at t to that at the start, its vector part exact when small."""
     l1, l2, l3 = frame.turned(swing.momentum)
     s1, s2, s3 = frame.turned(step)
@@ -193,7 +135,7 @@ def _relative_turn(swing: Swing, turning: Turning, frame: _Frame, at: Moment, st
     along = s * (tilt * tilt / turning.length)
     v0 = c * s3
     v = (c * s2 + s * s1, s * s2 - c * s1, s * s3)
-    back = _cross((l2, -l1, jnp.zeros_like(l1)), v)
+    back = cross((l2, -l1, jnp.zeros_like(l1)), v)
     vector = (
         along * l1 + height * v[0] - v0 * l2 - back[0],
         along * l2 + height * v[1] + v0 * l1 - back[1],
@@ -203,7 +145,7 @@ def _relative_turn(swing: Swing, turning: Turning, frame: _Frame, at: Moment, st
     return scalar, vector
 
 
-def _turn_tangent(swing, turning, frame: _Frame, at: Moment, change: Change, moved, first, t):
+def _turn_tangent(swing, turning, frame: Frame, at: Moment, change: Change, moved, first, t):
     """Variation of the attitude: a rotation vector along axes 1, 2, 3 at time t."""
     hand = swing.sense * swing.parity
     setting = Setting(swing.momentum, swing.p, swing.r, swing.s, swing.A, swing.B)
@@ -211,35 +153,48 @@ def _turn_tangent(swing, turning, frame: _Frame, at: Moment, change: Change, mov
     step = (-hand * swing.r * j23, hand * swing.s * j13, -hand * swing.p * j12)
     scalar, vector = _relative_turn(swing, turning, frame, at, step)
     gain = frame.turned(change.momentum)
-    once = _cross(vector, gain)
-    twice = _cross(vector, once)
+    once = cross(vector, gain)
+    twice = cross(vector, once)
     lag = tuple(
         2 * (b - scalar * a) - m for a, b, m in zip(once, twice, frame.turned(moved), strict=True)
     )
     squares = squares_of_momenta(swing, at.functions[0], at.momentum, first, t)
     start = swing.momentum
     spin = tuple(x * y for x, y in zip(start, swing.inverse, strict=True))
-    energy = _dot(spin, change.momentum) + _dot(start, _matrix(change, start)) / 2
-    about = t * energy + _dot(change.inverse, squares) / 2
+    energy = dot(spin, change.momentum) + dot(start, matrix(change, start)) / 2
+    about = t * energy + dot(change.inverse, squares) / 2
     if change.crossed is not None:
-        about = about + _dot(change.crossed, (j12, j13, j23))
+        about = about + dot(change.crossed, (j12, j13, j23))
     now = frame.turned(at.momentum)
     inverse = 1 / (turning.length * turning.length)
-    turn = tuple((a + about * b) * inverse for a, b in zip(_cross(now, lag), now, strict=True))
+    turn = tuple((a + about * b) * inverse for a, b in zip(cross(now, lag), now, strict=True))
     return frame.turned(turn)
+
+
+def _with_still_time(swing: Swing, at: Moment, t: Scalars) -> Moment:
+    """Where omega_p is zero S is the time; the momentum itself does not need it there."""
+    still = swing.inverse_rate == 0
+
+    def mend(functions: Triple) -> Triple:
+        return jnp.where(still, t, functions[0]), *functions[1:]
+
+    return at._replace(folded=mend(at.folded), functions=mend(at.functions))
 
 
 def _evaluate_rule(asked, primals, tangents):
     (swing, turning), given = primals
-    dm, dp, dw, dq, dt = (_tangent_or_zero(d, x) for d, x in zip(tangents[1], given, strict=True))
+    dm, dp, dw, dq, dt = (
+        zero_where_symbolic(d, x) for d, x in zip(tangents[1], given, strict=True)
+    )
     t = given[-1]
     at = advance(swing, turning, t, asked[2])
     omega, wxyz = results = _results(asked, swing, turning, at)
-    frame = _Frame(swing)
+    frame = Frame(swing)
     resting = swing.pulse == 0
     hand = swing.sense * swing.parity
     scaled = t * swing.pulse
-    change = _start_change(swing, frame, dm, dp, dw)
+    change = change_of_start(swing, frame, dm, dp, dw)
+    at = _with_still_time(swing, at, scaled)
     first, second = second_kind(swing, at.whole, at.folded)
     by = partials(swing.B * swing.r, swing.A * swing.p, at.functions, first, second)
     moved = momentum_tangent(swing, at.functions, at.momentum, by, change)
@@ -257,7 +212,7 @@ def _evaluate_rule(asked, primals, tangents):
             )
         spun = tuple(
             swing.pulse * (d * x + e)
-            for d, x, e in zip(swing.inverse, total, _matrix(change, now), strict=True)
+            for d, x, e in zip(swing.inverse, total, matrix(change, now), strict=True)
         )
         d_omega = tuple(
             jnp.where(resting, h, x) for h, x in zip(held, frame.to_body(spun), strict=True)
@@ -272,7 +227,7 @@ def _evaluate_rule(asked, primals, tangents):
         turn = tuple(
             jnp.where(resting, t * h, e) / 2 for h, e in zip(held, frame.to_body(turn), strict=True)
         )
-        d_wxyz = _hamilton(wxyz, (jnp.zeros_like(n1), *turn))
+        d_wxyz = hamilton(wxyz, (jnp.zeros_like(n1), *turn))
         if dq is not None:
             d_wxyz = _start_tangent(given[3], dq, wxyz, d_wxyz)
     return results, (d_omega, d_wxyz)
@@ -280,11 +235,11 @@ def _evaluate_rule(asked, primals, tangents):
 
 def _start_tangent(start: Quadruple, change: Quadruple, now: Quadruple, other: Quadruple):
     """Adds the answer to the initial attitude, which is normalised before use."""
-    inverse = 1 / _dot(start, start)
-    along = _dot(start, change)
+    inverse = 1 / dot(start, start)
+    along = dot(start, change)
     unit = tuple((d - along * inverse * q) * inverse for d, q in zip(change, start, strict=True))
-    left = _hamilton(unit, (start[0], -start[1], -start[2], -start[3]))
-    return tuple(a + b for a, b in zip(other, _hamilton(left, now), strict=True))
+    left = hamilton(unit, (start[0], -start[1], -start[2], -start[3]))
+    return tuple(a + b for a, b in zip(other, hamilton(left, now), strict=True))
 
 
 _evaluate.defjvp(_evaluate_rule, symbolic_zeros=True)

@@ -132,7 +132,7 @@ def prepare_swing(roles: Roles) -> Swing:
     )  # fmt: skip
 
 
-def _descend(swing: Swing, length: Scalars) -> Scalars:
+def descend(swing: Swing, length: Scalars) -> Scalars:
     """sinh of the imaginary shift b (circular) or tan of twice the angle beta (hyperbolic).
 
     Gauss's transformation, every step a sum of positive terms.
@@ -233,7 +233,7 @@ def prepare_turning(swing: Swing, wxyz: tuple[Scalars, ...]) -> Turning:
     divisor = jnp.where(uneven, swing.s, 1)
     peak = jnp.where(uneven, jnp.sqrt(swing.B / divisor), jnp.abs(l3))
     across = jnp.where(uneven, swing.A / divisor, l1 * l1 + l2 * l2)  # largest L1^2
-    shift = _descend(swing, length)
+    shift = descend(swing, length)
     real_c, imaginary_c, slope_c = _circular_series(swing, shift)
     real_h, imaginary_h, slope_h, beta = _hyperbolic_series(swing, shift)
     pick = swing.circular

@@ -148,18 +148,23 @@ def _crossed(at: Setting, functions: Triple, now: Triple, by: Partials, hand, se
     )  # fmt: skip
 
 
+def change_of_invariants(swing: Swing, change: Change):
+    """Variations of r, s, p, A and B, those of the tensor's entries 12, 13, 23 left aside."""
+    (l1, l2, l3), (e1, e2, e3) = swing.momentum, change.inverse
+    g1, g2, g3 = change.momentum
+    dp, dr, ds = (swing.sense * d for d in (e1 - e2, e2 - e3, e1 - e3))
+    dA = 2 * (l1 * g1 * swing.s + l2 * g2 * swing.r) + l1 * l1 * ds + l2 * l2 * dr
+    dB = 2 * (l2 * g2 * swing.p + l3 * g3 * swing.s) + l2 * l2 * dp + l3 * l3 * ds
+    return dr, ds, dp, dA, dB
+
+
 def momentum_tangent(
     swing: Swing, functions: Triple, now: Triple, by: Partials, change: Change
 ) -> Triple:
     """Variation of L(t) - L(0)."""
     hand = swing.sense * swing.parity
-    (l1, l2, _), (e1, e2, e3) = swing.momentum, change.inverse
-    g1, g2, g3 = change.momentum
     at = Setting(swing.momentum, swing.p, swing.r, swing.s, swing.A, swing.B)
-    dp, dr, ds = (swing.sense * d for d in (e1 - e2, e2 - e3, e1 - e3))
-    l3 = swing.momentum[2]
-    dA = 2 * (l1 * g1 * swing.s + l2 * g2 * swing.r) + l1 * l1 * ds + l2 * l2 * dr
-    dB = 2 * (l2 * g2 * swing.p + l3 * g3 * swing.s) + l2 * l2 * dp + l3 * l3 * ds
+    dr, ds, dp, dA, dB = change_of_invariants(swing, change)
     moved = by.along(dB * swing.r + swing.B * dr, dA * swing.p + swing.A * dp)
     (j12, j13, j23), (k12, k13, k23) = jax.jvp(
         lambda a, f: products_of_momenta(a, f, hand),
