@@ -8,7 +8,7 @@ from polhode._methods import (
     LiePoisson as LiePoisson,
     Record as Record,
 )
-from polhode._plan import Plan as Plan
+from polhode._plan import Plan as Plan, choose as choose
 from polhode._scene import Scene as Scene
 from polhode._simulate import explain as explain, simulate as simulate
 from polhode._state import State as State

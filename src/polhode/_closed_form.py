@@ -1,11 +1,12 @@
 """The exact motion of the free body as a method: nothing is stepped."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode import free, rotation
-from polhode._lanes import along_time, is_lane_tree, map_chunks
+from polhode._lanes import map_chunks
 from polhode._methods import AbstractMethod, Record, Samples
 from polhode._scene import Scene
 from polhode._state import State
@@ -31,63 +32,71 @@ class ClosedForm(AbstractMethod):
                 "ph.ClosedForm solves free bodies only, and this scene has a potential, a torque or"
                 " rotors: leave method=None, or use ph.LiePoisson()."
             )
-        count = 1 if record.final_only else ts.shape[-1]
-        size = max(1, (_CHUNK if self.chunk is None else self.chunk) // count)
-        lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
+        kept = ts[..., -1:] if record.final_only else ts
+        t = kept - ts[..., :1]
+        inertia = scene.inertia
+        axes = products = None
+        moments, wxyz, omega = inertia.diagonal, state.wxyz, state.omega_body
+        if moments is None:
+            whole = jnp.broadcast_to(inertia.full, (wxyz.shape[0], 3, 3))
+            moments, axes, products = principal(whole)
+            products = products[..., ::-1]  # (yz, zx, xy) -> (xy, xz, yz)
+            wxyz = rotation.multiply(wxyz, axes)
+            omega = rotation.rotate(rotation.conjugate(axes), omega)
+        n, wanted = wxyz.shape[0], {"attitude": record.attitude, "rates": record.rates}
+        given = jax.tree.map(lambda x: jnp.broadcast_to(x, (n, x.shape[-1])), (moments, products))
+        times = t if t.ndim == 2 else None
 
         def one(chunk):
-            lanes, times = chunk
-            scene, state = eqx.combine(lanes, shared)
-            return _motion(scene, state, ts if times is None else times, record)
+            (moments, products), wxyz, omega, times = chunk
+            times = t[None] if times is None else times
+            return _MOTION[inertia.symmetry](moments, products, wxyz, omega, times, wanted)
 
-        times = ts if ts.ndim == 2 else None
-        return map_chunks(one, (lanes, times), state.wxyz.shape[0], size)
+        size = max(1, (_CHUNK if self.chunk is None else self.chunk) // t.shape[-1])
+        # Components are put together only here: fused with the motion, the stacking would have
+        # all of them worked out anew for each entry.
+        omega, wxyz = jax.lax.optimization_barrier(
+            map_chunks(one, (given, wxyz, omega, times), n, size)
+        )
+        omega, wxyz = (None if x is None else jnp.stack(x, axis=-1) for x in (omega, wxyz))
+        if axes is not None:
+            axes = axes[:, None]
+            wxyz = None if wxyz is None else rotation.multiply(wxyz, rotation.conjugate(axes))
+            omega = None if omega is None else rotation.rotate(axes, omega)
+        finite = jnp.ones(n, bool)
+        for part in (wxyz, omega):
+            if part is not None:
+                finite = finite & jnp.all(jnp.isfinite(part), axis=(-1, -2))
+        status = jnp.where(finite, Status.SUCCESSFUL, Status.NOT_FINITE)
+        return Samples(wxyz, omega, status, jnp.zeros(n, status.dtype))
 
 
-_CHUNK = 2**14
+_CHUNK = 2**13
 """Bodies times samples per chunk: by measurement the largest that stays in a core's cache."""
 
 
-def _motion(scene: Scene, state: State, ts: Array, record: Record) -> Samples:
-    """Samples of one chunk of lanes."""
-    kept = ts[..., -1:] if record.final_only else ts
-    t = kept - ts[..., :1]
-    t = t if t.ndim == 2 else t[None]
-    inertia, wanted = scene.inertia, {"attitude": record.attitude, "rates": record.rates}
-    if inertia.symmetry is Symmetry.NONE:
-        wxyz, omega = _general(inertia, state, t, wanted)
-    else:
-        wxyz, omega = state.wxyz[:, None], state.omega_body[:, None]
-        if inertia.symmetry is Symmetry.SPHERICAL:
-            wxyz, omega = free.spherical_motion(wxyz, omega, t, **wanted)
-        else:
-            moments = along_time(inertia, 1).moments
-            wxyz, omega = free.symmetric_motion(moments, wxyz, omega, t, **wanted)
-    n = state.wxyz.shape[0]
-    finite = jnp.ones(n, bool)
-    for part in (wxyz, omega):
-        if part is not None:
-            finite = finite & jnp.all(jnp.isfinite(part), axis=(-1, -2))
-    status = jnp.where(finite, Status.SUCCESSFUL, Status.NOT_FINITE)
-    return Samples(wxyz, omega, status, jnp.zeros(n, status.dtype))
+def _triaxial(moments, products, wxyz, omega, t, wanted):
+    return free.free_motion(moments, wxyz, omega, t, products, **wanted)
 
 
-def _general(inertia, state, t, wanted):
-    """Any inertia: into principal axes (found once), the exact motion, and back."""
-    n = state.wxyz.shape[0]
-    wxyz, omega, axes, products = state.wxyz, state.omega_body, None, None
-    moments = inertia.diagonal
-    if moments is None:
-        moments, axes, products = principal(inertia.full)
-        products = products[..., ::-1]  # (yz, zx, xy) -> (xy, xz, yz)
-        axes, products = (jnp.broadcast_to(x, (n, x.shape[-1])) for x in (axes, products))
-        wxyz = rotation.multiply(wxyz, axes)
-        omega = rotation.rotate(rotation.conjugate(axes), omega)
-    moments = jnp.broadcast_to(moments, (n, 3))
-    omega, wxyz = free.free_motion(moments, wxyz, omega, t, products, **wanted)
-    wxyz, omega = (None if x is None else jnp.stack(x, axis=-1) for x in (wxyz, omega))
-    if axes is not None:
-        axes = axes[:, None]
-        wxyz = None if wxyz is None else rotation.multiply(wxyz, rotation.conjugate(axes))
-        omega = None if omega is None else rotation.rotate(axes, omega)
-    return wxyz, omega
+def _symmetric(moments, products, wxyz, omega, t, wanted):
+    moments, wxyz, omega = (x[:, None] for x in (moments, wxyz, omega))
+    return _components(free.symmetric_motion(moments, wxyz, omega, t, **wanted))
+
+
+def _spherical(moments, products, wxyz, omega, t, wanted):
+    return _components(free.spherical_motion(wxyz[:, None], omega[:, None], t, **wanted))
+
+
+def _components(motion):
+    wxyz, omega = motion
+    return tuple(
+        None if x is None else tuple(x[..., k] for k in range(x.shape[-1])) for x in (omega, wxyz)
+    )
+
+
+_MOTION = {
+    Symmetry.NONE: _triaxial,
+    Symmetry.AXISYMMETRIC: _symmetric,
+    Symmetry.SPHERICAL: _spherical,
+}

@@ -1,0 +1,145 @@
+"""The planner skips what a scene does not need: asserted on the compiled programs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import polhode as ph
+from benchmarks.scene_cost import counts, program, scenes, states
+from polhode import rotation
+
+N = 64
+
+
+@pytest.fixture(scope="module")
+def costs():
+    """Operations, transcendental functions, bytes and text of the program of each free scene."""
+    found = {}
+    for name, (scene, record, times) in scenes().items():
+        if scene.is_free and "100" not in name:
+            compiled, _ = program(scene, states(N), jnp.linspace(0.0, 100.0, times), record)
+            found[name] = {**counts(compiled), "text": compiled.compiled.as_text()}
+    return found
+
+
+def test_rates_alone_carry_no_attitude_and_no_third_kind(costs):
+    both, rates = costs["free, final state"], costs["free, rates only, final state"]
+    assert rates["flops"] < 0.5 * both["flops"]
+    assert rates["transcendentals"] < 0.5 * both["transcendentals"]
+    assert f"f64[{N},4]" not in rates["text"].split("ENTRY")[1].split("ROOT")[1]
+
+
+def test_symmetric_bodies_evaluate_no_elliptic_function(costs):
+    """No arithmetic-geometric mean: hardly a root is left, and few transcendental functions."""
+    general = costs["free, final state"]
+    for name in ("free, axisymmetric, final state", "free, spherical, final state"):
+        assert costs[name]["flops"] < 0.1 * general["flops"]
+        assert costs[name]["transcendentals"] <= 8 * N
+    assert (
+        costs["free, spherical, final state"]["flops"]
+        < costs["free, axisymmetric, final state"]["flops"]
+    )
+
+
+def test_principal_axes_are_found_only_for_general_tensors(costs):
+    general, principal = costs["free, general tensor, final state"], costs["free, final state"]
+    assert general["flops"] > principal["flops"]
+
+
+def field_operations(scene):
+    """Floating-point operations of one evaluation of the field for one body."""
+    from polhode.hamiltonian import Dynamics, lie_poisson_field
+
+    y = (tuple(jnp.ones(N) for _ in range(3)), tuple(jnp.ones(N) for _ in range(4)))
+    system = Dynamics(scene.hamiltonian, scene.torque)
+    # before fusion: XLA works shared parts out anew in every output, which is not what is asked
+    return jax.jit(lie_poisson_field).lower(0.0, y, system).cost_analysis()["flops"] / N
+
+
+def test_absent_parts_cost_no_operation():
+    """The free field costs what Euler's equations and the quaternion rate cost by hand: 39."""
+    inertia = ph.Inertia.from_moments([1.0, 2.0, 3.0])
+    free = field_operations(ph.Scene(inertia))
+    by_hand = 3 + 9 + 3 + 24  # L/I; L x w; w/2; the quaternion product (negations count)
+    assert free <= by_hand + 9  # jax.grad of the squares
+    up = ph.UniformGravity(1.0, [0.0, 0.0, 0.5], [0.0, 0.0, -2.0])
+    damping = ph.LinearDamping(0.1)
+    assert field_operations(ph.Scene(inertia, up)) > free
+    assert free + 3 <= field_operations(ph.Scene(inertia, torque=damping)) <= free + 9
+
+
+def test_final_state_keeps_no_trajectory_buffer():
+    scene, state = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0])), states(N)
+    ts = jnp.linspace(0.0, 100.0, 500)
+    last, _ = program(scene, state, ts, ph.Record(final_only=True))
+    every, _ = program(scene, state, ts, ph.Record())
+    memory = [p.compiled.memory_analysis() for p in (last, every)]
+    assert memory[0].output_size_in_bytes < 0.02 * memory[1].output_size_in_bytes
+    assert memory[0].temp_size_in_bytes < 0.2 * memory[1].temp_size_in_bytes
+
+
+def test_the_choice_follows_the_structure():
+    inertia = ph.Inertia.from_moments([1.0, 2.0, 3.0])
+    assert isinstance(ph.choose(ph.Scene(inertia))[0], ph.ClosedForm)
+    pushed = ph.Scene(inertia, torque=ph.BodyTorque(lambda t: jnp.stack([t, 0 * t, 0 * t])))
+    assert not isinstance(ph.choose(pushed)[0], ph.ClosedForm)
+    with pytest.raises(ValueError, match="free bodies only"):
+        ph.simulate(pushed, ph.State([1.0, 0, 0, 0], [0.0, 0, 1]), [0.0, 1.0], ph.ClosedForm())
+
+
+def test_explain_says_what_runs_what_is_skipped_and_why():
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]))
+    state, ts = states(1000), [0.0, 50.0, 100.0]
+    text = str(ph.explain(scene, state, ts))
+    for part in (
+        "1,000 bodies x 3 samples, float64", "runs    ClosedForm", "nothing acts", "skips   ",
+        "potential, torque", "not in the scene", "cost    about", "error   rounding only",
+    ):  # fmt: skip
+        assert part in text, text
+    asked = str(ph.explain(scene, state, ts, ph.LiePoisson(), record=ph.Record(final_only=True)))
+    assert "LiePoisson: as asked for" in asked
+    assert "only the last time is recorded" in asked
+    with pytest.raises(ValueError, match="strictly"):
+        ph.explain(scene, state, [0.0, 0.0])
+
+
+@pytest.mark.parametrize("inertia", [ph.Inertia.axisymmetric(2.0, 0.5), ph.Inertia.spherical(2.0)])
+def test_static_symmetry_gives_the_same_motion_and_slope(inertia):
+    """The programs for known symmetry agree with the general one (itself held to 50 digits)."""
+    general = ph.Inertia.from_moments(inertia.moments)
+    state, ts = states(5), jnp.linspace(0.0, 20.0, 4)
+    one, other = (ph.simulate(ph.Scene(i), state, ts) for i in (inertia, general))
+    assert float(jnp.max(rotation.angle_between(one.wxyz, other.wxyz))) < 1e-13
+    np.testing.assert_allclose(one.omega_body, other.omega_body, atol=1e-13)
+    only = ph.simulate(ph.Scene(inertia), state, ts, record=ph.Record(attitude=False))
+    np.testing.assert_array_equal(only.omega_body, one.omega_body)
+
+    def last(inertia, omega):
+        end = ph.simulate(ph.Scene(inertia), ph.State(state.wxyz, omega), ts)
+        return jnp.sum(end.omega_body[:, -1, 0] + end.wxyz[:, -1, 1] ** 2)
+
+    slopes = [jax.grad(last, argnums=1)(i, state.omega_body) for i in (inertia, general)]
+    np.testing.assert_allclose(slopes[0], slopes[1], atol=1e-11)
+
+
+def test_general_tensor_equals_its_principal_frame():
+    """A tensor turned out of its axes moves as the body it is; its gradient is the tensor's."""
+    turn = rotation.normalise(jnp.array([0.7, -0.3, 0.5, 0.2]))
+    tensor = ph.Inertia.from_moments([1.0, 1.5, 2.0]).tensor
+    matrix = rotation.wxyz_to_matrix(turn)
+    tilted = matrix @ tensor @ matrix.T
+    state, ts = ph.State([0.5, 0.5, -0.5, 0.5], [0.3, -0.8, 0.5]), jnp.array([0.0, 7.0])
+    exact = ph.simulate(ph.Scene(ph.Inertia.from_tensor(tilted)), state, ts)
+    stepped = ph.simulate(
+        ph.Scene(ph.Inertia.from_tensor(tilted)), state, ts, ph.LiePoisson(), rtol=1e-13
+    )
+    assert float(rotation.angle_between(exact.wxyz[-1], stepped.wxyz[-1])) < 1e-10
+
+    def loss(tensor, method):
+        scene = ph.Scene(ph.Inertia.from_tensor(tensor))
+        return jnp.sum(ph.simulate(scene, state, ts, method, rtol=1e-13).omega_body[-1] ** 3)
+
+    for given in (tilted, matrix @ jnp.diag(jnp.array([1.0, 1.0, 1.75])) @ matrix.T):
+        slopes = [jax.grad(loss)(given, method) for method in (None, ph.LiePoisson())]
+        np.testing.assert_allclose(slopes[0], slopes[1], rtol=0, atol=1e-9)
