@@ -108,9 +108,12 @@ def table(job: Job, outcome: Outcome, figures: Figures):
 
 
 def _spread(values: np.ndarray) -> str:
-    if not len(values) or not np.isfinite(values).any():
-        return ""
-    return _plus_minus(float(np.nanmean(values)), float(np.nanstd(values)))
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return "infinite" if len(values) else ""
+    text = _plus_minus(float(finite.mean()), float(finite.std()))
+    endless = len(values) - finite.size
+    return f"{text}, {endless:,} infinite" if endless else text
 
 
 def _plus_minus(value: float, width: float | None) -> str:
