@@ -59,7 +59,7 @@ def scenes() -> dict[str, tuple[ph.Scene, ph.Record, int]]:
 
 def program(scene, state, ts, record, rtol=1e-9):
     """The compiled program that ``simulate`` runs for a scene."""
-    method, _ = ph.choose(scene)
+    method, _ = ph.choose(scene, state, record)
     arguments = (method, scene, state, ts, jnp.asarray(rtol, ts.dtype), record)
     return run.lower(*arguments).compile(), arguments
 

@@ -81,9 +81,10 @@ def test_final_state_keeps_no_trajectory_buffer():
 
 def test_the_choice_follows_the_structure():
     inertia = ph.Inertia.from_moments([1.0, 2.0, 3.0])
-    assert isinstance(ph.choose(ph.Scene(inertia))[0], ph.ClosedForm)
+    given = states(2), ph.Record()
+    assert isinstance(ph.choose(ph.Scene(inertia), *given)[0], ph.ClosedForm)
     pushed = ph.Scene(inertia, torque=ph.BodyTorque(lambda t: jnp.stack([t, 0 * t, 0 * t])))
-    assert not isinstance(ph.choose(pushed)[0], ph.ClosedForm)
+    assert not isinstance(ph.choose(pushed, *given)[0], ph.ClosedForm)
     with pytest.raises(ValueError, match="free bodies only"):
         ph.simulate(pushed, ph.State([1.0, 0, 0, 0], [0.0, 0, 1]), [0.0, 1.0], ph.ClosedForm())
 

@@ -1,6 +1,6 @@
 """polhode: rotating rigid bodies in JAX (simulate, differentiate, identify)."""
 
-from polhode import rotation as rotation
+from polhode import elliptic as elliptic, free as free, rotation as rotation, solvers as solvers
 from polhode._closed_form import ClosedForm as ClosedForm
 from polhode._methods import (
     AbstractMethod as AbstractMethod,
@@ -8,12 +8,25 @@ from polhode._methods import (
     LiePoisson as LiePoisson,
     Record as Record,
 )
+from polhode._periods import periods as periods
 from polhode._plan import Plan as Plan, choose as choose
 from polhode._scene import Scene as Scene
 from polhode._simulate import explain as explain, simulate as simulate
 from polhode._state import State as State
 from polhode._status import SimulationError as SimulationError, Status as Status
+from polhode._top_methods import (
+    FixedAxis as FixedAxis,
+    LagrangeTop as LagrangeTop,
+    SymmetricTop as SymmetricTop,
+)
 from polhode._trajectory import Trajectory as Trajectory
+from polhode.frames import (
+    RotatingFrame as RotatingFrame,
+    accelerometer as accelerometer,
+    gyroscope as gyroscope,
+    simulate_particles as simulate_particles,
+)
+from polhode.free import Mode as Mode, Periods as Periods
 from polhode.hamiltonian import (
     hamiltonian as hamiltonian,
     hamiltons_equations as hamiltons_equations,
@@ -21,11 +34,16 @@ from polhode.hamiltonian import (
 from polhode.inertia import Inertia as Inertia, MassProperties as MassProperties
 from polhode.torques import (
     AbstractPotential as AbstractPotential,
+    AbstractRotor as AbstractRotor,
     AbstractTorque as AbstractTorque,
     BodyTorque as BodyTorque,
+    FeedbackTorque as FeedbackTorque,
     GravityGradient as GravityGradient,
+    KeplerOrbit as KeplerOrbit,
     LinearDamping as LinearDamping,
     Potential as Potential,
+    QuadraticDamping as QuadraticDamping,
+    Rotor as Rotor,
     SpaceTorque as SpaceTorque,
     UniformGravity as UniformGravity,
 )

@@ -12,6 +12,7 @@ from polhode._lanes import PARTS, common_batch
 from polhode._methods import AbstractDiffraxMethod, AbstractMethod, LiePoisson, Record
 from polhode._scene import Scene
 from polhode._state import State
+from polhode._top_methods import AbstractTopMethod, exact_top
 from polhode.inertia import Symmetry
 
 _FREE_LAWS = {
@@ -56,10 +57,17 @@ class Plan:
         return "\n".join(lines)
 
 
-def choose(scene: Scene) -> tuple[AbstractMethod, str]:
-    """The method that ``simulate(..., method=None)`` uses for a scene, and why."""
+def choose(scene: Scene, state: State, record: Record) -> tuple[AbstractMethod, str]:
+    """The method that ``simulate(..., method=None)`` uses, and why.
+
+    The scene's structure decides; values only where they are known (not traced), for the laws
+    that hold for special bodies and states.
+    """
     if scene.is_free:
         return ClosedForm(), _FREE_LAWS[scene.inertia.symmetry]
+    exact = exact_top(scene, state, record)
+    if exact is not None:
+        return exact, exact.law
     return LiePoisson(), "something acts on the body: integrated step by step"
 
 
@@ -74,13 +82,15 @@ def plan(
     """The plan of checked input (see ``ph.explain``)."""
     law = "as asked for"
     if method is None:
-        method, law = choose(scene)
+        method, law = choose(scene, state, record)
     parts = (getattr(scene, name) for name in PARTS)
     bodies = int(np.prod(common_batch(*parts, state, extra=(ts.shape[:-1],)), dtype=int))
     samples = 1 if record.final_only else ts.shape[-1]
     eps = float(jnp.finfo(state.wxyz.dtype).eps)
     if isinstance(method, ClosedForm):
         seconds, error = _exact_cost(scene, state, ts, bodies, samples, record, eps)
+    elif isinstance(method, AbstractTopMethod):
+        seconds, error = None, "rounding only: a few units in the last place of the angle turned"
     else:
         seconds = None
         error = f"local error {float(rtol):.0e} per step, of the worst body of each chunk"
@@ -95,8 +105,9 @@ def _skipped(scene: Scene, method: AbstractMethod, record: Record) -> tuple[str,
     absent = [name for name in PARTS if getattr(scene, name) is None]
     if absent:
         reasons.append(f"{', '.join(absent)}: not in the scene")
-    if isinstance(method, ClosedForm):
+    if isinstance(method, ClosedForm | AbstractTopMethod):
         reasons.append("steps, error control, checkpoints: the solution is exact")
+    if isinstance(method, ClosedForm):
         if scene.inertia.symmetry is not Symmetry.NONE:
             reasons.append("elliptic functions: circular ones do for this symmetry")
         reasons.append("energy and momentum per sample: constants of the motion")

@@ -47,7 +47,7 @@ def simulate(
     scene, state, ts, record = check_inputs(scene, state, ts, record)
     check_method(method)
     if method is None:
-        method, _ = choose(scene)
+        method, _ = choose(scene, state, record)
     rtol = check_rtol(rtol, state.wxyz.dtype)
     trajectory = run(method, scene, state, ts, rtol, record)
     if throw and is_concrete(trajectory.status):

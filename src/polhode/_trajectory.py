@@ -18,7 +18,7 @@ class Trajectory(eqx.Module):
 
     **Fields:** ``ts`` (T,) or (..., T) [s]; ``wxyz`` (..., T, 4) body -> space, or None when not
     recorded; ``omega_body`` (..., T, 3) [rad/s], or None; ``status`` (...): ``ph.Status`` per
-    body; ``steps`` (...): solver steps taken (0 for an exact solution); ``scene``, the motion of its
+    body; ``steps`` (...): solver steps (0 for an exact solution); ``scene``, the motion of its
     rotors fixed by the initial state.
     """
 
