@@ -6,6 +6,7 @@ import numpy as np
 
 import polhode
 from polhode.cli._job import Job, Outcome, Residuals
+from polhode.free import Mode
 from polhode.plot import Scale
 
 _MEANINGS = {
@@ -41,7 +42,6 @@ def measure(job: Job, outcome: Outcome) -> Figures:
         size = np.linalg.norm(vector[..., :1, :], axis=-1)
         change = np.linalg.norm(vector - vector[..., :1, :], axis=-1)
         momentum = _largest(change / np.where(size > 0, size, 1))
-    if scene.is_free and hasattr(polhode, "periods"):
         found = polhode.periods(scene.inertia, job.state)
         periods = {name: np.atleast_1d(np.asarray(getattr(found, name))) for name in _MEANINGS}
         modes = _mode_names(found.mode)
@@ -58,7 +58,7 @@ def _largest(relative: np.ndarray) -> float:
 
 
 def _mode_names(mode: Any) -> list[str]:
-    return [polhode.Mode(int(code)).name for code in np.atleast_1d(np.asarray(mode))]
+    return [Mode(int(code)).name for code in np.atleast_1d(np.asarray(mode))]
 
 
 def table(job: Job, outcome: Outcome, figures: Figures):
