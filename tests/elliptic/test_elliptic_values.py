@@ -45,7 +45,7 @@ def test_values_are_within_a_few_ulps(cell):
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_limits_are_exact(dtype):
     zero, one = dtype(0), dtype(1)
-    tolerance = 2 * np.finfo(dtype).eps
+    tolerance = 2 * float(np.finfo(dtype).eps)
     half_pi = np.pi / 2
     assert elliptic.ellipk(zero) == pytest.approx(half_pi, rel=tolerance)
     assert elliptic.ellipe(zero) == pytest.approx(half_pi, rel=tolerance)
@@ -78,20 +78,27 @@ def test_limits_are_exact(dtype):
 
 
 def test_outside_the_domain_is_nan_in_value_and_slope():
+    def everything(m):
+        return jnp.stack(
+            [
+                elliptic.ellipk(m),
+                elliptic.ellipe(m),
+                *elliptic.ellipj(0.3, m),
+                elliptic.ellipf(0.3, m),
+                elliptic.ellipe_inc(0.3, m),
+                elliptic.ellippi(-2.0, m),
+                elliptic.ellippi_inc(-2.0, 0.3, m),
+            ]
+        )
+
+    values_and_slopes = jax.jit(lambda m: jax.jvp(everything, (m,), (jnp.ones_like(m),)))
     for m in (-0.1, 1.1, np.nan):
-        for function in (
-            elliptic.ellipk,
-            elliptic.ellipe,
-            lambda x: elliptic.ellipj(0.3, x)[2],
-            lambda x: elliptic.ellipf(0.3, x),
-            lambda x: elliptic.ellipe_inc(0.3, x),
-            lambda x: elliptic.ellippi(-2.0, x),
-            lambda x: elliptic.ellippi_inc(-2.0, 0.3, x),
-        ):
-            assert np.isnan(function(m))
-            assert np.isnan(jax.grad(function)(m))
+        values, slopes = values_and_slopes(m)
+        assert np.isnan(values).all()
+        assert np.isnan(slopes).all()
+    assert np.isfinite(values_and_slopes(0.4)).all()
     assert np.isnan(elliptic.ellippi(1.5, 0.3))
-    assert np.isnan(jax.grad(elliptic.ellippi)(1.5, 0.3))
+    assert np.isnan(jax.jvp(lambda n: elliptic.ellippi(n, 0.3), (1.5,), (1.0,))[1])
     assert np.isnan(elliptic.ellippi_inc(1.5, 0.2, 0.3))
     assert np.isnan(elliptic.ellippi_inc_sincos(1.5, 1.0, 0.0, 1.0))
     assert np.isnan(elliptic.carlson_rf(0.0, 0.0, 1.0))
@@ -191,7 +198,6 @@ def test_sine_and_cosine_of_any_length_and_quadrant():
     s, c = 700 * np.sin(angles), 700 * np.cos(angles)
     for first, second in (
         (elliptic.ellipf(angles, 0.6), elliptic.ellipf_sincos(s, c, 0.6)),
-        (elliptic.ellipe_inc(angles, 0.6), elliptic.ellipe_inc_sincos(s, c, 0.6)),
         (
             elliptic.ellippi_inc(-4.0, angles, 0.6),
             elliptic.ellippi_inc_sincos(-4.0, s, c, 0.6),

@@ -53,6 +53,17 @@ def _root_rule(primals, tangents):
     return value, jnp.where(still, 0, dx / (2 * jnp.where(still, 1, value)))
 
 
+def _rf_series(x: Array, y: Array, z: Array) -> Array:
+    """RF of arguments within the spread: DLMF 19.36.1."""
+    mean = (x + y + z) / 3
+    x, y = 1 - x / mean, 1 - y / mean
+    z = -(x + y)
+    e2, e3 = x * y - z * z, x * y * z
+    series = 1 - e2 / 10 + e3 / 14 + e2 * e2 / 24 - 3 * e2 * e3 / 44
+    series = series - 5 * e2**3 / 208 + 3 * e3 * e3 / 104 + e2 * e2 * e3 / 16
+    return series / jnp.sqrt(mean)
+
+
 def _rf_core(x: Array, y: Array, z: Array) -> Array:
     def wide(state):
         steps, x, y, z = state
@@ -67,13 +78,7 @@ def _rf_core(x: Array, y: Array, z: Array) -> Array:
         return steps + 1, (x + add) / 4, (y + add) / 4, (z + add) / 4
 
     _, x, y, z = jax.lax.while_loop(wide, duplicate, (0, x, y, z))
-    mean = (x + y + z) / 3
-    x, y = 1 - x / mean, 1 - y / mean
-    z = -(x + y)
-    e2, e3 = x * y - z * z, x * y * z
-    series = 1 - e2 / 10 + e3 / 14 + e2 * e2 / 24 - 3 * e2 * e3 / 44
-    series = series - 5 * e2**3 / 208 + 3 * e3 * e3 / 104 + e2 * e2 * e3 / 16
-    return series / jnp.sqrt(mean)
+    return _rf_series(x, y, z)
 
 
 def _rd_core(x: Array, y: Array, z: Array) -> Array:
@@ -117,7 +122,9 @@ def _rc_of_one(e: Array, one_plus_e: Array) -> Array:
     return jnp.where(near, series, jnp.where(above, circular, logarithm))
 
 
-def rj_core(x: Array, y: Array, z: Array, p: Array) -> Array:
+def rf_rj_core(x: Array, y: Array, z: Array, p: Array) -> tuple[Array, Array]:
+    """RF(x, y, z) and RJ(x, y, z, p), which share their duplications."""
+
     def wide(state):
         steps, x, y, z, p, *_ = state
         mean = (x + y + z + 2 * p) / 5
@@ -142,6 +149,7 @@ def rj_core(x: Array, y: Array, z: Array, p: Array) -> Array:
 
     start = (0, x, y, z, p, jnp.zeros_like(x), jnp.ones((), x.dtype))
     _, x, y, z, p, total, weight = jax.lax.while_loop(wide, duplicate, start)
+    first = _rf_series(x, y, z)
     mean = (x + y + z + 2 * p) / 5
     x, y, z = 1 - x / mean, 1 - y / mean, 1 - z / mean
     p = -(x + y + z) / 2
@@ -151,7 +159,12 @@ def rj_core(x: Array, y: Array, z: Array, p: Array) -> Array:
     e3 = xyz + 2 * e2 * p + 4 * p2 * p
     e4 = (2 * xyz + e2 * p + 3 * p2 * p) * p
     e5 = xyz * p2
-    return 6 * total + weight * _series(e2, e3, e4, e5) / (mean * jnp.sqrt(mean))
+    third = 6 * total + weight * _series(e2, e3, e4, e5) / (mean * jnp.sqrt(mean))
+    return first, third
+
+
+def _rj_core(x: Array, y: Array, z: Array, p: Array) -> Array:
+    return rf_rj_core(x, y, z, p)[1]
 
 
 def rc_core(x: Array, y: Array) -> Array:
@@ -170,7 +183,7 @@ def _each(count: int):
 
 
 rd = with_forward_partials(_rd_core, _each(3))
-rj = with_forward_partials(rj_core, _each(4))
+rj = with_forward_partials(_rj_core, _each(4))
 rc = with_forward_partials(rc_core, _each(2))
 
 
