@@ -79,3 +79,52 @@ def test_impossible_moments_are_drawn_again_or_refused(tmp_path):
         draw_clones(parse_scene(text.replace("SIZE", "[0, 0, 1e9]")), np.float64)
     with pytest.raises(SceneFileError, match="triangle inequality"):
         draw_clones(parse_scene(text.replace("1.99", "2.5").replace("SIZE", "0.1")), np.float64)
+
+
+def test_everything_that_acts_is_built_and_adds_up():
+    import polhode as ph
+    from polhode.io import parse_scene
+
+    text = """
+    inertia = { moments = [1.0, 1.5, 2.0] }
+    state = { omega_body = [1.0, 0.0, 0.0] }
+    times = { stop = 1.0, number = 2 }
+    [[potential]]
+    kind = "uniform-gravity"
+    mass = 2.0
+    centre_body = [0.0, 0.0, 0.1]
+    [[potential]]
+    kind = "gravity-gradient"
+    mu = 3.0
+    position_space = [5.0, 0.0, 0.0]
+    [[torque]]
+    kind = "body"
+    n = [0.1, 0.0, 0.0]
+    [[torque]]
+    kind = "space"
+    n = [0.0, 0.2, 0.0]
+    [[torque]]
+    kind = "linear-damping"
+    c = [0.01, 0.02, 0.03]
+    [[rotors]]
+    axis_body = [0.0, 0.0, 2.0]
+    inertia = 0.1
+    speed = 7.0
+    [[rotors]]
+    axis_body = [1.0, 0.0, 0.0]
+    momentum = 0.3
+    """
+    for dtype in (np.float32, np.float64):
+        scene = build_scene(parse_scene(text), dtype)
+        gravity, gradient = scene.potential.terms
+        np.testing.assert_allclose(gravity.gravity_space, [0, 0, -9.80665], rtol=1e-7)
+        np.testing.assert_array_equal(gradient.position_space, [5, 0, 0])
+        names = [type(term).__name__ for term in scene.torque.terms]
+        assert names == ["BodyTorque", "SpaceTorque", "LinearDamping"]
+        wheel, flywheel = scene.rotors.terms
+        np.testing.assert_array_equal(wheel.axis_body, [0, 0, 1])
+        assert float(wheel.speed) == 7
+        np.testing.assert_allclose(flywheel.momentum, 0.3, rtol=1e-7)
+        made = {x.dtype for x in (gravity.gravity_space, wheel.speed, scene.torque.terms[2].c)}
+        assert made == {np.dtype(dtype)}
+    assert isinstance(scene, ph.Scene)

@@ -27,12 +27,12 @@ class Figures(NamedTuple):
 def measure(job: Job, outcome: Outcome) -> Figures:
     """Periods of every body; the largest change of energy and of angular momentum in space.
 
-    Energy is given where H does not depend on time through torques, momentum where nothing acts.
+    Energy is given where no torque and no motor works on the body, momentum where nothing acts.
     """
     scene, trajectory = job.scene, outcome.trajectory
     energy = momentum = None
     periods, modes = {}, []
-    if scene.torque is None:
+    if scene.torque is None and scene.rotors is None:
         energies = np.asarray(trajectory.energy, np.float64)
         energies = energies.reshape(-1, energies.shape[-1])
         scale = np.abs(_kinetic(trajectory)).reshape(energies.shape).max(axis=-1, keepdims=True)

@@ -92,9 +92,7 @@ def build_scene(
     acting = {}
     for key, parts in zip(KINDS, (file.potentials, file.torques, file.rotors), strict=True):
         objects = _objects(file, parts, dtype)
-        if objects and key == "rotors":
-            acting[key] = tuple(objects)
-        elif objects:
+        if objects:
             acting[key] = functools.reduce(operator.add, objects)
     return polhode.Scene(inertia, **acting)
 

@@ -34,9 +34,10 @@ KINDS = {
     "rotors": {
         "rotor": {
             "axis_body": ((3,), False),
-            "inertia": ((), False),
+            "inertia": ((), True),
             "momentum": ((), True),
             "speed": ((), True),
+            "torque": ((), True),
         }
     },
 }
