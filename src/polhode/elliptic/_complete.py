@@ -145,5 +145,7 @@ def associate_d(
 
 def _pair(m: ArrayLike, m1: ArrayLike | None) -> tuple[Array, Array]:
     if m1 is None:
-        return parameter_pair(*as_floats(m), None)
-    return parameter_pair(*as_floats(m, m1))
+        (m,) = as_floats(m)
+        return parameter_pair(m, None)
+    m, m1 = as_floats(m, m1)
+    return parameter_pair(m, m1)
