@@ -132,6 +132,20 @@ def test_observations_within_the_times_are_compared(here):
     assert np.isnan(found.rates[0]).all()
 
 
+def test_a_scene_with_a_wheel_runs(here, capsys):
+    spread = 'omega_body = { sigma = 0.1, source = "test" }\n'
+    text = TOP[: TOP.index("[potential]")] + TOP[TOP.index("[times]") : TOP.rindex("moments")]
+    text = text.replace("120", "2") + spread
+    wheel = "[[rotors]]\naxis_body = [0, 0, 1]\ninertia = 0.1\nmomentum = 2.0\n"
+    (here / "wheel.toml").write_text(text + wheel)
+    assert run("wheel.toml", "--no-figure") == 0
+    assert "P_psi" not in capsys.readouterr().out  # periods are those of bodies without wheels
+    with xarray.open_dataset("wheel.nc", engine="h5netcdf") as data:
+        momentum = data["momentum_space"].values
+        drift = np.linalg.norm(momentum - momentum[:, :1], axis=-1)
+        assert drift.max() < 1e-6 * np.linalg.norm(momentum[0, 0])
+
+
 @pytest.mark.parametrize("name", ["nasa_brick", "symmetric_top"])
 def test_scenes_meet_the_reference_values_they_carry(name):
     """Rates and attitudes recomputed with 34 digits, printed with 12 decimals or more."""

@@ -139,7 +139,8 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
         progress(min(start + size, total))
     seconds = time.perf_counter() - began
     compiling = _CLOCK.since(began)
-    trajectory = dataclasses.replace(piece, ts=job.ts, scene=job.scene, **kept)
+    scene = job.scene.settled(job.state, job.ts[0])
+    trajectory = dataclasses.replace(piece, ts=job.ts, scene=scene, **kept)
     return Outcome(trajectory, residuals, compiling, seconds - compiling)
 
 

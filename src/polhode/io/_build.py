@@ -94,7 +94,8 @@ def build_scene(
         objects = _objects(file, parts, dtype)
         if objects:
             acting[key] = functools.reduce(operator.add, objects)
-    return polhode.Scene(inertia, **acting)
+    with blamed(file, ""):
+        return polhode.Scene(inertia, **acting)
 
 
 def build_state(file: SceneFile, dtype: DTypeLike, inertia: Inertia) -> "polhode.State":
