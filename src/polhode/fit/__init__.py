@@ -1,0 +1,34 @@
+"""Inertia from recordings: fits that are physical and honest about their uncertainty."""
+
+from polhode.fit._csv import read_recording as read_recording
+from polhode.fit._fit import (
+    FitError as FitError,
+    fit_inertia as fit_inertia,
+    fit_recordings as fit_recordings,
+    windows as windows,
+)
+from polhode.fit._motion import (
+    AbstractMotion as AbstractMotion,
+    Drag as Drag,
+    FreeMotion as FreeMotion,
+    Motion as Motion,
+    SteppedMotion as SteppedMotion,
+)
+from polhode.fit._parameters import (
+    AbstractInertiaUnknown as AbstractInertiaUnknown,
+    FullTensor as FullTensor,
+    MomentsOnly as MomentsOnly,
+    Parameters as Parameters,
+)
+from polhode.fit._recording import Recording as Recording, stack as stack
+from polhode.fit._residuals import (
+    Huber as Huber,
+    Model as Model,
+    predict as predict,
+    residuals as residuals,
+)
+from polhode.fit._result import (
+    Finding as Finding,
+    InertiaFit as InertiaFit,
+    sensor_axes as sensor_axes,
+)

@@ -1,0 +1,165 @@
+"""``fit_inertia``: the inertia of bodies from recordings of their motion."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import ArrayLike
+
+from polhode._checks import require
+from polhode.fit._motion import AbstractMotion, FreeMotion
+from polhode.fit._parameters import AbstractInertiaUnknown, FullTensor
+from polhode.fit._recording import Recording, stack
+from polhode.fit._residuals import Huber
+from polhode.fit._result import CURES, Finding, InertiaFit, conclude
+from polhode.fit._solve import Problem, solve
+from polhode.inertia import Inertia
+
+
+class FitError(RuntimeError):
+    """A fit that must not be used as it is; the message says why and what helps."""
+
+
+def fit_inertia(
+    times: ArrayLike,
+    omega_body: ArrayLike | None = None,
+    *,
+    wxyz: ArrayLike | None = None,
+    force_body: ArrayLike | None = None,
+    wheel_speed: ArrayLike | None = None,
+    omega_noise: ArrayLike | None = None,
+    attitude_noise: ArrayLike | None = None,
+    force_noise: ArrayLike | None = None,
+    motion: AbstractMotion | None = None,
+    unknown: AbstractInertiaUnknown | None = None,
+    known: Inertia | None = None,
+    bias: bool = False,
+    mounting: bool = False,
+    robust: Huber | None = None,
+    starts: int = 1,
+    solver: Any = None,
+    max_steps: int = 100,
+    throw: bool = True,
+) -> InertiaFit:
+    """Inertia of a body, or a batch of bodies, from one recording each.
+
+    **Arguments:** ``times`` (..., T), s, increasing; ``omega_body`` (..., T, 3), rad/s, the
+    gyroscope in right-handed sensor axes; ``wxyz`` (..., T, 4) attitudes body -> space;
+    ``force_body`` (..., T, 3), m/s^2, accelerometer; rows with NaN are gaps. ``..._noise``:
+    standard deviations (None: one for all channels, taken from the residuals). ``motion``:
+    ``FreeMotion()`` (exact, torque-free) or ``SteppedMotion`` (drag, a wheel of ``wheel_speed``
+    (..., T), rad/s). ``unknown``: ``FullTensor()`` or ``MomentsOnly()``. ``known``: an inertia to
+    start from. ``bias``, ``mounting``: whether to fit them. ``robust``: ``Huber(threshold)``, in
+    standard deviations, needs a known noise. ``starts``: how many starting bodies are tried (1:
+    that of a regression). ``solver``: any optimistix least-squares solver.
+
+    Torque-free rates show only the ratios of the moments: see ``InertiaFit.scale_known``. Every
+    iterate is a physical body. Left-handed axes are not fitted away: with attitudes they are
+    noticed; without, ``InertiaFit.mirrored`` tells what the rates would mean then.
+
+    Raises ValueError for bad input, and unless ``throw=False`` FitError when a fit is not finite,
+    stopped early, or rates and attitudes disagree about the axes; ``finding`` has the flags.
+    """
+    noise = {
+        "omega_noise": omega_noise,
+        "attitude_noise": attitude_noise,
+        "force_noise": force_noise,
+    }
+    recording = Recording.of(
+        times,
+        omega_body,
+        wxyz=wxyz,
+        force_body=force_body,
+        wheel_speed=wheel_speed,
+        **{name: 1.0 if value is None else value for name, value in noise.items()},
+    )
+    problem = Problem(
+        FreeMotion() if motion is None else motion,
+        FullTensor() if unknown is None else unknown,
+        known,
+        robust,
+        bias,
+        mounting,
+        any(value is not None for value in noise.values()),
+        starts,
+        solver,
+        max_steps,
+    )
+    batch = recording.batch_shape
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, 1, *leaf.shape[len(batch) :]), recording)
+    result = _batch(flat, problem)
+    return _finished(
+        jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), result), throw
+    )
+
+
+def fit_recordings(
+    recordings: Sequence[Recording],
+    *,
+    motion: AbstractMotion | None = None,
+    unknown: AbstractInertiaUnknown | None = None,
+    known: Inertia | None = None,
+    bias: bool = False,
+    mounting: bool = False,
+    robust: Huber | None = None,
+    noise_known: bool = False,
+    starts: int = 1,
+    solver: Any = None,
+    max_steps: int = 100,
+    throw: bool = True,
+) -> InertiaFit:
+    """One inertia from several recordings of the same body (``Recording.of``); see ``fit_inertia``.
+
+    Windows of one long recording are recordings too: their initial rates are then fitted
+    separately (multiple shooting), which keeps a long or chaotic motion tractable.
+    """
+    problem = Problem(
+        FreeMotion() if motion is None else motion,
+        FullTensor() if unknown is None else unknown,
+        known,
+        robust,
+        bias,
+        mounting,
+        noise_known,
+        starts,
+        solver,
+        max_steps,
+    )
+    together = jax.tree.map(lambda leaf: leaf[None], stack(recordings))
+    result = _batch(together, problem)
+    return _finished(jax.tree.map(lambda leaf: leaf[0], result), throw)
+
+
+def windows(recording: Recording, length: int) -> list[Recording]:
+    """A recording (without batch) cut into windows of ``length`` samples sharing their ends."""
+    count = recording.times.shape[-1]
+    require(
+        4 <= length <= count,
+        f"a window needs 4 to {count} samples, got {length}.",
+    )
+    starts = range(0, count - 3, length - 1)
+    cuts = [(first, min(first + length, count)) for first in starts]
+    return [
+        jax.tree.map(lambda leaf, a=a, b=b: leaf[a:b], recording) for a, b in cuts if b - a >= 4
+    ]
+
+
+@eqx.filter_jit
+def _batch(recording: Recording, problem: Problem) -> InertiaFit:
+    """Fits of all bodies (leading axis) in one compiled call."""
+    return jax.vmap(lambda one: conclude(solve(one, problem), one, problem))(recording)
+
+
+def _finished(result: InertiaFit, throw: bool) -> InertiaFit:
+    fatal = Finding.STEP_LIMIT | Finding.NOT_FINITE | Finding.AXES_DISAGREE
+    codes = np.atleast_1d(np.asarray(result.finding))
+    if throw and (codes & int(fatal)).any():
+        said = [
+            f"{int(((codes & int(flag)) != 0).sum())} of {codes.size}: {text}"
+            for flag, text in CURES.items()
+            if flag & fatal and (codes & int(flag)).any()
+        ]
+        raise FitError("; ".join(said) + ". Pass throw=False to get the result with its flags.")
+    return result

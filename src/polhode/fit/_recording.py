@@ -1,0 +1,198 @@
+"""What was measured: gyroscope rates, attitudes, accelerometer readings, and their noise."""
+
+from collections.abc import Sequence
+from typing import Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from polhode._checks import as_float_array, is_concrete, require
+from polhode.rotation import normalise
+
+# angles per sample above which a record under-samples its own rotation
+_TURN_PER_SAMPLE = np.pi
+
+
+class Recording(eqx.Module):
+    """One recording of a tumbling body, or a batch of them with leading axes.
+
+    **Fields:** ``times`` (..., T), s, strictly increasing; any of ``omega`` (..., T, 3), rad/s, the
+    gyroscope; ``wxyz`` (..., T, 4), attitudes body -> space; ``force`` (..., T, 3), m/s^2, the
+    accelerometer (specific force); each with its standard deviation ``omega_noise``,
+    ``attitude_noise`` (rad), ``force_noise``, broadcast against it (1 where unknown: then the
+    scatter is taken from the residuals); ``present`` (..., T): 1 for a sample, 0 for a gap;
+    ``wheel`` (..., T), rad/s: speed of a wheel relative to the body, if there is one.
+    """
+
+    times: Float[Array, "*b t"]
+    present: Float[Array, "*b t"]
+    omega: Float[Array, "*b t 3"] | None = None
+    wxyz: Float[Array, "*b t 4"] | None = None
+    force: Float[Array, "*b t 3"] | None = None
+    wheel: Float[Array, "*b t"] | None = None
+    omega_noise: Float[Array, "*b t 3"] | None = None
+    attitude_noise: Float[Array, "*b t"] | None = None
+    force_noise: Float[Array, "*b t 3"] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        times: ArrayLike,
+        omega_body: ArrayLike | None = None,
+        *,
+        wxyz: ArrayLike | None = None,
+        force_body: ArrayLike | None = None,
+        wheel_speed: ArrayLike | None = None,
+        omega_noise: ArrayLike = 1.0,
+        attitude_noise: ArrayLike = 1.0,
+        force_noise: ArrayLike = 1.0,
+    ) -> Self:
+        """A checked recording. A sample whose row holds NaN is a gap and is left out.
+
+        Times must increase; they are shared or carry the same leading axes as the data. Raises
+        ValueError for unsorted or repeated times, fewer than four samples, shapes that do not fit,
+        infinite values, noise that is not positive, and rates that turn the body by more than
+        half a turn between samples (degrees taken for radians?).
+        """
+        times = as_float_array("times", times, (None,))
+        require(
+            times.shape[-1] >= 4, f"a recording needs at least 4 samples, got {times.shape[-1]}."
+        )
+        if is_concrete(times):
+            step = np.diff(np.asarray(times), axis=-1)
+            place = int(np.argmin(step.reshape(-1, step.shape[-1]).min(axis=0)))
+            require(
+                step > 0,
+                f"times must be strictly increasing, got a step of {step.min():g} s after sample "
+                f"{place}; sort the rows and drop repeated ones.",
+            )
+        count = times.shape[-1]
+        given = {
+            "omega_body": (omega_body, (count, 3)),
+            "wxyz": (wxyz, (count, 4)),
+            "force_body": (force_body, (count, 3)),
+            "wheel_speed": (wheel_speed, (count,)),
+        }
+        arrays = {
+            name: None if value is None else _with_gaps(name, value, suffix, times.dtype)
+            for name, (value, suffix) in given.items()
+        }
+        require(
+            any(arrays[name] is not None for name in ("omega_body", "wxyz")),
+            "a recording needs rates (omega_body), attitudes (wxyz) or both, got neither.",
+        )
+        tails = {"omega_body": 2, "wxyz": 2, "force_body": 2, "wheel_speed": 1}
+        batch = jnp.broadcast_shapes(
+            times.shape[:-1],
+            *(a.shape[: a.ndim - tails[n]] for n, a in arrays.items() if a is not None),
+        )
+        arrays = {
+            name: None if a is None else jnp.broadcast_to(a, (*batch, *a.shape[-tails[name] :]))
+            for name, a in arrays.items()
+        }
+        times = jnp.broadcast_to(times, (*batch, count))
+        present = jnp.ones_like(times)
+        for name, array in arrays.items():
+            if array is not None:
+                whole = jnp.isfinite(array)
+                whole = jnp.all(whole, axis=-1) if tails[name] == 2 else whole
+                present = present * whole.astype(times.dtype)
+        filled = {
+            name: None if a is None else jnp.where(jnp.isfinite(a), a, _blank(name, a))
+            for name, a in arrays.items()
+        }
+        omega, attitude = filled["omega_body"], filled["wxyz"]
+        if is_concrete(present):
+            least = int(jnp.min(jnp.sum(present, axis=-1)))
+            require(least >= 4, f"a recording needs at least 4 samples without NaN, got {least}.")
+        if omega is not None and is_concrete(omega, times):
+            _check_rates(omega, times)
+        noises = {
+            "omega_noise": (omega_noise, omega, 3),
+            "attitude_noise": (attitude_noise, attitude, 0),
+            "force_noise": (force_noise, filled["force_body"], 3),
+        }
+        spread = {
+            name: None if of is None else _noise(name, value, (*batch, count), tail, times.dtype)
+            for name, (value, of, tail) in noises.items()
+        }
+        return cls(
+            times,
+            present,
+            omega,
+            None if attitude is None else normalise(attitude),
+            filled["force_body"],
+            filled["wheel_speed"],
+            **spread,
+        )
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading axes."""
+        return self.times.shape[:-1]
+
+    def mirrored(self) -> "Recording":
+        """The rates with every sign reversed: what the other handedness of axes would read."""
+        return eqx.tree_at(lambda r: r.omega, self, -self.omega)
+
+
+def stack(recordings: Sequence[Recording]) -> Recording:
+    """Recordings of one body as one batch; shorter ones are filled up with gaps."""
+    require(len(recordings) > 0, "at least one recording is needed, got none.")
+    longest = max(r.times.shape[-1] for r in recordings)
+
+    def filled(r):
+        short = longest - r.times.shape[-1]
+        if short == 0:
+            return r
+        later = r.times[-1] + (r.times[-1] - r.times[-2]) * jnp.arange(
+            1, short + 1, dtype=r.times.dtype
+        )
+
+        def pad(array):
+            return jnp.concatenate([array, jnp.repeat(array[-1:], short, axis=0)])
+
+        longer = jax.tree.map(pad, r)
+        gaps = jnp.concatenate([r.present, jnp.zeros(short, r.present.dtype)])
+        return eqx.tree_at(
+            lambda s: (s.times, s.present), longer, (jnp.concatenate([r.times, later]), gaps)
+        )
+
+    kinds = {jax.tree.structure(r) for r in recordings}
+    require(len(kinds) == 1, "the recordings must hold the same kinds of data, got a mixture.")
+    return jax.tree.map(lambda *parts: jnp.stack(parts), *map(filled, recordings))
+
+
+def _with_gaps(name, value, suffix, dtype):
+    """Like ``as_float_array``, but NaN is allowed: it marks a gap."""
+    raw = np.asarray(value) if is_concrete(value) else value
+    holes = np.isnan(raw) if is_concrete(raw) and raw.dtype.kind == "f" else None
+    clean = raw if holes is None else np.where(holes, np.zeros((), raw.dtype), raw)
+    array = as_float_array(name, clean, suffix).astype(dtype)
+    return array if holes is None else jnp.where(jnp.asarray(holes), jnp.nan, array)
+
+
+def _blank(name, array):
+    if name == "wxyz":
+        return jnp.broadcast_to(jnp.asarray([1, 0, 0, 0], array.dtype), array.shape)
+    return jnp.zeros_like(array)
+
+
+def _check_rates(omega, times):
+    turn = np.linalg.norm(np.asarray(omega), axis=-1)[..., 1:] * np.diff(np.asarray(times), axis=-1)
+    require(
+        turn <= _TURN_PER_SAMPLE,
+        f"omega_body turns the body by up to {turn.max():.3g} rad between samples, more than half "
+        "a turn; are the rates in deg/s (multiply by pi/180) or the times in ms (divide by 1000)?",
+    )
+
+
+def _noise(name, value, shape, tail, dtype):
+    array = as_float_array(name, value).astype(dtype)
+    if is_concrete(array):
+        require(array > 0, f"{name} must be positive (a standard deviation), got {array}.")
+    full = (*shape, tail) if tail else shape
+    return jnp.broadcast_to(array, full)

@@ -1,0 +1,103 @@
+"""Data minus model in units of the noise: the function that every optimiser needs."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from polhode.fit._motion import AbstractMotion, Motion
+from polhode.fit._parameters import Parameters, rotation_of, tensor_of
+from polhode.fit._recording import Recording
+from polhode.rotation import conjugate, multiply, rotate
+
+
+class Huber(eqx.Module):
+    """Robust loss: residuals beyond ``threshold`` standard deviations count linearly."""
+
+    threshold: float = 3.0
+
+    def __call__(self, residual: Array) -> Array:
+        size = jnp.abs(residual)
+        inside = size <= self.threshold
+        far = jnp.where(inside, self.threshold, size)
+        outside = jnp.sqrt(2 * self.threshold * far - self.threshold**2)
+        return jnp.where(inside, residual, jnp.sign(residual) * outside)
+
+
+class Model(eqx.Module):
+    """What is known of a fit: the motion, the free directions of the inertia, the start attitude.
+
+    ``base`` (6,) log-Cholesky parameters from which ``Parameters.shape`` counts, ``columns``
+    (static) its directions, ``attitude`` (r, 4) or None, ``robust`` loss or None.
+    """
+
+    motion: AbstractMotion
+    base: Float[Array, " 6"]
+    attitude: Float[Array, "r 4"] | None = None
+    robust: Huber | None = None
+    columns: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=())
+    scale_known: bool = eqx.field(static=True, default=False)
+
+    @property
+    def is_full(self) -> bool:
+        """Whether products of inertia are free (static)."""
+        return any(any(row) for row in self.columns[3:])
+
+    def tensor(self, parameters: Parameters) -> Float[Array, "3 3"]:
+        """Inertia tensor (3, 3) in sensor axes, kg m^2 (or to scale)."""
+        return tensor_of(parameters.shape, self.base, np.array(self.columns))
+
+
+def predict(
+    parameters: Parameters, recording: Recording, model: Model, tensor: Array | None = None
+) -> Motion:
+    """Motion of every recording (leading axis r) for these parameters, body axes.
+
+    ``tensor`` (3, 3) stands in for that of ``parameters.shape`` when it is given.
+    """
+    if tensor is None:
+        tensor = model.tensor(parameters)
+    attitude = model.attitude
+    if attitude is not None and parameters.attitude is not None:
+        attitude = multiply(attitude, rotation_of(parameters.attitude))
+
+    def one(omega, wxyz, times, wheel):
+        return model.motion(tensor, omega, wxyz, times, wheel, parameters.motion)
+
+    return jax.vmap(one)(parameters.omega, attitude, recording.times, recording.wheel)
+
+
+def residuals(
+    parameters: Parameters, recording: Recording, model: Model, tensor: Array | None = None
+) -> dict[str, Float[Array, "r t 3"]]:
+    """Residuals of rates, attitudes (rotation vectors) and accelerometer, over their noise.
+
+    ``recording`` carries one leading axis r: recordings of one body. Gaps count zero. Any
+    optimiser can minimise the sum of squares; ``jax.grad`` and ``jax.jacfwd`` go through it.
+    """
+    motion = predict(parameters, recording, model, tensor)
+    weight = recording.present[..., None]
+    parts = {}
+    if recording.omega is not None:
+        seen = motion.omega
+        if parameters.mounting is not None:
+            turn = conjugate(rotation_of(parameters.mounting))
+            seen = rotate(jnp.broadcast_to(turn, (*seen.shape[:-1], 4)), seen)
+        if parameters.bias is not None:
+            seen = seen + parameters.bias[None, None]
+        parts["omega"] = weight * (recording.omega - seen) / recording.omega_noise
+    if recording.wxyz is not None:
+        apart = multiply(conjugate(motion.wxyz), recording.wxyz)
+        sign = jnp.where(apart[..., :1] < 0, -1, 1).astype(apart.dtype)
+        vector = 2 * sign * apart[..., 1:]
+        parts["attitude"] = weight * vector / recording.attitude_noise[..., None]
+    if recording.force is not None:
+        lever = jnp.broadcast_to(parameters.lever, motion.omega.shape)
+        felt = jnp.cross(motion.omega_dot, lever) + jnp.cross(
+            motion.omega, jnp.cross(motion.omega, lever)
+        )
+        parts["force"] = weight * (recording.force - felt) / recording.force_noise
+    if model.robust is not None:
+        parts = {name: model.robust(part) for name, part in parts.items()}
+    return parts

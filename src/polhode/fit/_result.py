@@ -1,0 +1,257 @@
+"""What a fit found, how well it is known, and what the data cannot say."""
+
+import enum
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.stats import chi2, norm
+from jaxtyping import Array, Float
+
+from polhode.fit._parameters import Parameters
+from polhode.fit._recording import Recording
+from polhode.fit._residuals import Model
+from polhode.fit._solve import Problem, Solution
+from polhode.inertia import Inertia, physical_margin, principal
+from polhode.rotation import conjugate, multiply, to_matrix
+
+
+class Finding(enum.IntFlag):
+    """What to know about a fit before using it (per body; 0: nothing to remark)."""
+
+    NONE = 0
+    STEP_LIMIT = 1
+    NOT_FINITE = 2
+    NEARLY_FLAT = 4
+    UNDETERMINED = 8
+    AXES_DISAGREE = 16
+    NOT_WHITE = 32
+
+
+CURES = {
+    Finding.STEP_LIMIT: "the optimiser stopped at its step limit: raise max_steps, try more "
+    "starts, or shorten the recording into windows",
+    Finding.NOT_FINITE: "the fit is not finite: look for outliers (robust=Huber()), wrong units or "
+    "a recording with too little rotation",
+    Finding.NEARLY_FLAT: "the best body is flat (one moment is the sum of the two others): the "
+    "limit of what is physical; intervals are one-sided there, and drag or bias left out of the "
+    "model may have pushed it there",
+    Finding.UNDETERMINED: "some of the tensor does not show in this motion (an axis hardly "
+    "excited, or a symmetric body): their intervals are infinite; add a recording of another spin",
+    Finding.AXES_DISAGREE: "the rates do not turn the attitudes as right-handed axes would: one "
+    "axis is inverted, or axes are exchanged; mend the columns (sensor_axes shows how)",
+    Finding.NOT_WHITE: "the residuals are correlated in time: the model lacks something (drag, "
+    "bias, a moving part) and the intervals are too narrow",
+}
+
+
+class InertiaFit(eqx.Module):
+    """Result of ``fit_inertia``; leading axes are those of the bodies.
+
+    **Fields:** ``inertia``: full tensor in sensor axes; where ``scale_known`` (static) is false the
+    data show only its shape, and it is given with a largest moment of 1. ``moments`` (..., 3),
+    ascending; ``axes`` (..., 4), ``wxyz`` principal -> sensor axes; ``ratios`` (..., 3) to the
+    largest moment. ``moments_std``, ``ratios_std``: standard deviations (infinite for what the data
+    cannot say); ``axes_std`` (..., 3), rad, about each principal axis. ``covariance`` (..., p, p)
+    of the tensor's entries (xx, yy, zz, yz, zx, xy) followed by the other ``parameters``, by
+    the pseudo-inverse of ``information``; ``null_directions`` (..., p) how many directions of that
+    space are not determined (one for the unknown scale). ``noise``: standard deviation of the
+    residuals over that assumed (reduced chi); ``whiteness``: probability of correlations as large
+    as those seen, were the residuals independent. ``finding`` (...): ``Finding`` flags.
+    """
+
+    inertia: Inertia
+    moments: Float[Array, "*b 3"]
+    axes: Float[Array, "*b 4"]
+    ratios: Float[Array, "*b 3"]
+    moments_std: Float[Array, "*b 3"]
+    ratios_std: Float[Array, "*b 3"]
+    axes_std: Float[Array, "*b 3"]
+    information: Float[Array, "*b p p"]
+    covariance: Float[Array, "*b p p"]
+    null_count: Array
+    noise: Float[Array, "*b"]
+    whiteness: Float[Array, "*b"]
+    rms: Float[Array, "*b"]
+    finding: Array
+    steps: Array
+    parameters: Parameters
+    model: Model
+    residuals: dict[str, Array]
+    scale_known: bool = eqx.field(static=True)
+    free_rates: bool = eqx.field(static=True)
+
+    @property
+    def mirrored(self) -> Inertia:
+        """The body that the same rates mean if the sensor axes are left-handed, largest moment 1.
+
+        Reversing one rate (or exchanging two) changes the sign of ``omega x I omega`` and nothing
+        else, which is the free motion of the body ``I Sigma`` with ``Sigma = tr(I)/2 - I``: the
+        ratios ``I_k (I_i + I_j - I_k)``. It is as physical as the first, so free rates alone cannot
+        tell the handedness; attitudes, a wheel or knowledge of the body can.
+        """
+        values = self.moments
+        other = values * (jnp.sum(values, axis=-1, keepdims=True) - 2 * values)
+        other = other / jnp.max(other, axis=-1, keepdims=True)
+        diagonal = other[..., None] * jnp.broadcast_to(
+            jnp.eye(3, dtype=values.dtype), (*other.shape, 3)
+        )
+        matrix = to_matrix(self.axes)
+        return Inertia(full=matrix @ diagonal @ jnp.swapaxes(matrix, -1, -2))
+
+    def interval(self, level: float = 0.95) -> tuple[Array, Array]:
+        """Ends (..., 3) of the intervals of ``ratios``, or of ``moments`` if the scale is known."""
+        value, spread = (
+            (self.moments, self.moments_std) if self.scale_known else (self.ratios, self.ratios_std)
+        )
+        reach = float(norm.ppf(0.5 + level / 2)) * spread
+        return value - reach, value + reach
+
+    def report(self) -> str:
+        """A short text per body: moments, uncertainty, remarks with cause and cure."""
+        lines = []
+        if not self.scale_known:
+            lines.append(
+                "Only ratios of moments are determined: free motion does not depend on the size "
+                "of the inertia (null direction of the information matrix). A known wheel, torque "
+                "or moment would fix it."
+            )
+        flat = jax.tree.map(np.atleast_1d, self.finding)
+        ratios = np.asarray(self.ratios).reshape(-1, 3)
+        spread = np.asarray(self.ratios_std).reshape(-1, 3)
+        moments = np.asarray(self.moments).reshape(-1, 3)
+        rms, noise = np.asarray(self.rms).reshape(-1), np.asarray(self.noise).reshape(-1)
+        twins = np.sort(np.asarray(self.mirrored.moments).reshape(-1, 3), axis=-1)
+        for k, code in enumerate(np.asarray(flat).reshape(-1)):
+            shown = " : ".join(f"{r:.4f}({s:.1g})" for r, s in zip(ratios[k], spread[k]))
+            size = "" if not self.scale_known else f"; moments {moments[k]} kg m^2"
+            lines.append(f"body {k}: {shown}{size}; rms {rms[k]:.3g} rad/s, chi {noise[k]:.3g}")
+            if not self.scale_known and self.free_rates:
+                lines.append(
+                    "  - free rates do not show the handedness of the axes: with one axis inverted "
+                    f"the same data mean {twins[k][0]:.4f} : {twins[k][1]:.4f} : 1; compare with "
+                    "what you know of the body"
+                )
+            lines += [f"  - {text}" for flag, text in CURES.items() if int(code) & flag]
+        return "\n".join(lines)
+
+
+def conclude(solution: Solution, recording: Recording, problem: Problem) -> InertiaFit:
+    """Uncertainty and diagnostics of one body (under jit and vmap)."""
+    tensor, model = solution.tensor, solution.model
+    dtype = tensor.dtype
+    eps = float(jnp.finfo(dtype).eps)
+    jacobian = solution.jacobian
+    information = jacobian.T @ jacobian
+    # equilibrated: a direction counts as null by its own information, whatever its unit
+    size = jnp.sqrt(jnp.diagonal(information))
+    safe = jnp.where(size > 0, size, 1)
+    values, vectors = jnp.linalg.eigh(information / safe[:, None] / safe[None])
+    known = values > 1e3 * eps * values[-1]
+    inverse = jnp.where(known, 1 / jnp.where(known, values, 1), 0)
+    channels = 3 * sum(part is not None for part in solution.residual.values())
+    data = jnp.sum(recording.present) * channels
+    freedom = jnp.maximum(data - jnp.sum(known).astype(dtype), 1)
+    noise = jnp.sqrt(2 * solution.cost / freedom)
+    variance = jnp.asarray(1, dtype) if problem.noise_known else noise**2
+    covariance = (vectors * inverse[None]) @ vectors.T / safe[:, None] / safe[None] * variance
+    null = jnp.where(known, 0, 1)[None] * vectors / safe[:, None]
+
+    moments, axes, _ = principal(tensor)
+    count = 6 if model.is_full else 3
+    entries = jnp.concatenate(
+        [
+            jnp.stack([tensor[0, 0], tensor[1, 1], tensor[2, 2]]),
+            jnp.stack([tensor[1, 2], tensor[2, 0], tensor[0, 1]]),
+        ]
+    )[:count]
+
+    def derived(vector):
+        (a, b, c), above = vector[:3], vector[3:] if count == 6 else jnp.zeros(3, dtype)
+        p, q, r = above
+        whole = jnp.stack([jnp.stack([a, r, q]), jnp.stack([r, b, p]), jnp.stack([q, p, c])])
+        values, _, products = principal(whole)
+        return jnp.concatenate([values, values / values[2], products])
+
+    slope = jax.jacfwd(derived)(entries)
+    full = jnp.concatenate([slope, jnp.zeros((9, jacobian.shape[1] - count), dtype)], axis=1)
+    spread = jnp.sqrt(jnp.maximum(jnp.sum((full @ covariance) * full, axis=1), 0))
+    # what leans on a null direction is not known at all
+    leaning = jnp.sqrt(jnp.sum((full @ null) ** 2, axis=1))
+    reach = jnp.sqrt(jnp.sum((full / safe[None]) ** 2, axis=1))
+    reach = jnp.concatenate([reach[:3], reach[:3] / moments[2], reach[6:]])
+    spread = jnp.where(leaning > 1e-3 * reach, jnp.inf, spread)
+    gaps = jnp.stack([moments[2] - moments[1], moments[2] - moments[0], moments[1] - moments[0]])
+    axes_std = jnp.where(gaps > 0, spread[6:] / jnp.where(gaps > 0, gaps, 1), jnp.inf)
+
+    whiteness = _whiteness(solution.residual, recording.present)
+    rates = solution.residual.get("omega")
+    if rates is None:
+        rms = jnp.asarray(jnp.nan, dtype)
+    else:
+        mean = jnp.sum((rates * recording.omega_noise) ** 2) / jnp.sum(recording.present) / 3
+        rms = jnp.sqrt(mean)
+    trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
+    finite = jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(tensor))
+    flags = (
+        (Finding.STEP_LIMIT, ~solution.stopped),
+        (Finding.NOT_FINITE, ~finite),
+        (Finding.NEARLY_FLAT, physical_margin(tensor) < 1e-4 * trace),
+        (Finding.UNDETERMINED, jnp.any(~jnp.isfinite(spread[3:6]))),
+        (Finding.NOT_WHITE, whiteness < 1e-4),
+        (Finding.AXES_DISAGREE, _axes_disagree(recording, problem)),
+    )
+    finding = sum(jnp.where(seen, int(flag), 0) for flag, seen in flags)
+    return InertiaFit(
+        Inertia(full=tensor), moments, axes, moments / moments[2],
+        spread[:3], spread[3:6], axes_std, information, covariance, jnp.sum(~known),
+        noise, whiteness, rms, finding, solution.steps, solution.parameters, model,
+        solution.residual, model.scale_known, recording.wxyz is None,
+    )  # fmt: skip
+
+
+def sensor_axes(recording: Recording) -> Float[Array, "*b 3 3"]:
+    """Matrix M (..., 3, 3) with ``rates = M (rates of the attitudes)``, by linear regression.
+
+    The identity for a gyroscope aligned with the attitudes' body axes; near -1 in place of 1 on the
+    diagonal for an inverted axis, a permutation for exchanged ones, a rotation for a mounting.
+    """
+    turn = multiply(conjugate(recording.wxyz[..., :-1, :]), recording.wxyz[..., 1:, :])
+    sign = jnp.where(turn[..., :1] < 0, -1, 1).astype(turn.dtype)
+    weight = (recording.present[..., 1:] * recording.present[..., :-1])[..., None]
+    seen = weight * 2 * sign * turn[..., 1:]
+    step = jnp.diff(recording.times, axis=-1)[..., None] * weight
+    measured = step * (recording.omega[..., 1:, :] + recording.omega[..., :-1, :]) / 2
+    mixed = jnp.einsum("...ti,...tj->...ij", measured, seen)
+    square = jnp.einsum("...ti,...tj->...ij", seen, seen)
+    return jnp.swapaxes(jnp.linalg.solve(square, jnp.swapaxes(mixed, -1, -2)), -1, -2)
+
+
+def _axes_disagree(recording: Recording, problem: Problem) -> Array:
+    """Whether gyroscope and attitudes contradict each other beyond any mounting rotation."""
+    if recording.omega is None or recording.wxyz is None:
+        return jnp.asarray(False)
+    matrix = jnp.mean(sensor_axes(recording), axis=0)
+    inverted = jnp.linalg.det(matrix) < 0
+    if problem.mounting:
+        return inverted
+    trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
+    # less than this is a turn of more than 60 degrees between the axes
+    return inverted | (trace < 2)
+
+
+def _whiteness(parts: dict[str, Array], present: Array, lags: int = 5) -> Array:
+    """Ljung-Box probability of the first autocorrelations of all channels together."""
+    statistic, count = 0.0, 0
+    for part in parts.values():
+        total = jnp.sum(present, axis=-1)[:, None]
+        mean = jnp.sum(part, axis=1) / total
+        rest = (part - mean[:, None]) * present[..., None]
+        power = jnp.sum(rest**2, axis=1)
+        safe = jnp.where(power > 0, power, 1)
+        for lag in range(1, lags + 1):
+            correlation = jnp.sum(rest[:, lag:] * rest[:, :-lag], axis=1) / safe
+            statistic += jnp.sum(total * (total + 2) / (total - lag) * correlation**2)
+            count += correlation.size
+    return chi2.sf(statistic, jnp.asarray(count, present.dtype))

@@ -1,0 +1,152 @@
+"""Fits of free bodies: errors against the Cramer-Rao bound, scale, handedness, gaps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from polhode.fit import Finding, FreeMotion, Recording, fit_inertia, stack
+from polhode.fit._start import regression
+from polhode.inertia import inertia_from_log_cholesky, is_physical
+
+BODIES, SAMPLES = 200, 80
+SIGMA = np.where(np.arange(BODIES) % 2 == 0, 0.01, 0.05)
+
+
+def tumble(tensors, starts, times):
+    """Rates (n, t, 3) of free bodies by DOP853: independent of the package."""
+    inverse = np.linalg.inv(tensors)
+
+    def field(_, flat):
+        w = flat.reshape(-1, 3)
+        spin = np.einsum("nij,nj->ni", tensors, w)
+        return np.einsum("nij,nj->ni", inverse, np.cross(spin, w)).ravel()
+
+    path = solve_ivp(field, times[[0, -1]], starts.ravel(), "DOP853", times, rtol=1e-11, atol=1e-11)
+    return np.moveaxis(path.y.reshape(-1, 3, len(times)), -1, 1)
+
+
+@pytest.fixture(scope="module")
+def cases():
+    rng = np.random.default_rng(11)
+    sigma = rng.uniform(0.2, 1.0, (BODIES, 3))
+    axes = np.linalg.qr(rng.normal(size=(BODIES, 3, 3)))[0]
+    second = np.einsum("nij,nj,nkj->nik", axes, sigma, axes)
+    tensors = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
+    starts = rng.normal(size=(BODIES, 3)) * 2
+    starts *= (6 / np.linalg.norm(starts, axis=-1))[:, None]
+    times = 3.0 + (np.arange(SAMPLES) + rng.uniform(0, 0.5, SAMPLES)) * 0.0375
+    clean = tumble(tensors, starts, times)
+    noisy = clean + SIGMA[:, None, None] * rng.normal(size=clean.shape)
+    ratios = np.linalg.eigvalsh(tensors)
+    return times, clean, noisy, ratios / ratios[:, 2:], tensors
+
+
+def fitted(times, rates):
+    return fit_inertia(times, rates, omega_noise=SIGMA[:, None, None], max_steps=60, throw=False)
+
+
+@pytest.fixture(scope="module")
+def fits(cases):
+    return fitted(cases[0], cases[2])
+
+
+def test_every_fit_ends_in_a_physical_body(fits):
+    stopped = np.asarray(fits.finding) & int(Finding.STEP_LIMIT | Finding.NOT_FINITE)
+    assert not stopped.any()
+    assert bool(jnp.all(is_physical(fits.inertia.tensor, slack=1e-12)))
+
+
+def test_errors_are_as_large_as_the_bound_says(fits, cases):
+    known = np.isfinite(np.asarray(fits.ratios_std)[:, :2])
+    assert known.mean() > 0.97
+    pulls = (np.asarray(fits.ratios) - cases[3])[:, :2] / np.asarray(fits.ratios_std)[:, :2]
+    pulls = pulls[known]
+    # robust against the few bodies whose valley is curved on the scale of the noise
+    spread = np.quantile(np.abs(pulls), 0.6827)
+    assert 0.9 < spread < 1.1
+    assert 0.92 < np.mean(np.abs(pulls) < 1.96) < 0.98
+    low, high = fits.interval(0.95)
+    inside = (np.asarray(low) <= cases[3]) & (cases[3] <= np.asarray(high))
+    assert 0.92 < inside[:, :2][known].mean() < 0.98
+    assert abs(np.asarray(fits.noise).mean() - 1) < 0.02
+
+
+def test_the_scale_is_reported_as_unknown(fits):
+    assert not fits.scale_known
+    assert np.all(np.asarray(fits.null_count) >= 1)
+    assert np.mean(np.asarray(fits.null_count) == 1) > 0.97
+    np.testing.assert_allclose(fits.moments[:, 2], 1, rtol=1e-12)
+    assert np.all(np.isinf(fits.moments_std))
+    # the tensor itself is the direction that changes nothing
+    tensor, information = np.asarray(fits.inertia.tensor), np.asarray(fits.information)
+    first = np.stack(
+        [tensor[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))], axis=-1
+    )
+    change = np.einsum("nij,nj->ni", information[:, :6, :6], first)
+    assert np.abs(change).max() < 1e-8 * np.abs(information[:, :6, :6]).max()
+    assert "Only ratios" in fits.report()
+
+
+def test_an_inverted_axis_means_the_mirrored_body(cases, fits):
+    wrong = fitted(cases[0], cases[2] * np.array([1, 1, -1.0]))
+    twins = np.sort(np.asarray(wrong.mirrored.moments), axis=-1)
+    np.testing.assert_allclose(twins, np.asarray(fits.ratios), atol=1e-3)
+    assert np.abs(np.asarray(wrong.ratios) - np.asarray(fits.ratios)).max() > 0.1
+
+
+def test_gaps_are_left_out(cases, fits):
+    holed = cases[2].copy()
+    holed[:, 10:20, 1] = np.nan
+    other = fitted(cases[0], holed)
+    far = (
+        np.abs(np.asarray(other.ratios - fits.ratios))[:, :2] / np.asarray(other.ratios_std)[:, :2]
+    )
+    assert np.nanmedian(far) < 0.6
+    assert np.nanmedian(np.asarray(other.ratios_std)[:, 0] / np.asarray(fits.ratios_std)[:, 0]) > 1
+
+
+def test_regression_on_clean_data_finds_the_shape():
+    times = np.linspace(0, 2, 400)
+    tensor = np.array([[2, 0.1, 0.2], [0.1, 2.5, -0.3], [0.2, -0.3, 3.0]])
+    rates = tumble(tensor[None], np.array([[2.0, 4.0, 3.0]]), times)
+    start, misfit = jax.jit(regression)(rates, times[None], np.ones((1, 400)))
+    found = np.asarray(inertia_from_log_cholesky(start))
+    np.testing.assert_allclose(found / found[0, 0] * 2, tensor, atol=1e-3)
+    assert float(misfit) < 1e-8
+
+
+def test_prediction_is_the_exact_motion_and_differentiable(cases):
+    times, clean, _, _, tensors = cases
+    model = FreeMotion()
+    path = model(
+        jnp.asarray(tensors[3]), jnp.asarray(clean[3, 0]), None, jnp.asarray(times), None, None
+    )
+    np.testing.assert_allclose(path.omega, clean[3], atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("times", "rates", "message"),
+    [
+        ([0, 1, 2], np.ones((3, 3)), "at least 4 samples"),
+        ([0, 1, 1, 2], np.ones((4, 3)), "strictly increasing"),
+        ([0, 2, 1, 3], np.ones((4, 3)), "strictly increasing"),
+        ([0, 1, 2, 3], np.ones((5, 3)), "shape"),
+        ([0, 1, 2, 3], None, "neither"),
+        ([0, 1, 2, 3], np.full((4, 3), np.nan), "without NaN"),
+        ([0, 1, 2, 3], np.full((4, 3), np.inf), "infinity"),
+        ([0, 1, 2, 3], np.full((4, 3), 200.0), "deg/s"),
+    ],
+)
+def test_bad_recordings_are_refused(times, rates, message):
+    with pytest.raises(ValueError, match=message):
+        fit_inertia(times, rates)
+
+
+def test_recordings_of_different_length_stack():
+    one = Recording.of([0.0, 1, 2, 3], np.ones((4, 3)))
+    two = Recording.of([0.0, 1, 2, 3, 4], np.ones((5, 3)))
+    both = stack([one, two])
+    assert both.times.shape == (2, 5)
+    np.testing.assert_array_equal(both.present, [[1, 1, 1, 1, 0], [1, 1, 1, 1, 1]])
