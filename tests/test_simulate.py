@@ -72,6 +72,13 @@ def test_times_per_body_and_backwards():
     assert traj.to_xarray()["ts"].dims == ("body", "time")
 
 
+def test_samples_are_as_accurate_as_steps():
+    """No interpolant: energy at 50 samples keeps to the tolerance of the steps."""
+    ts = jnp.linspace(0, 20, 50)
+    traj = ph.simulate(free(), STATE, ts, METHOD, rtol=1e-12)
+    np.testing.assert_allclose(traj.energy, traj.energy[0], rtol=1e-11)
+
+
 def test_record_keeps_what_is_asked():
     rates = ph.simulate(free(), STATE, TS, METHOD, record=ph.Record(attitude=False))
     assert rates.wxyz is None
@@ -117,6 +124,8 @@ def test_the_poles_of_the_chart_are_reported_per_body():
     traj = ph.simulate(free(), state, TS, ph.EulerAngles(max_steps=256), throw=False)
     singular = ph.Status.CHART_SINGULAR
     assert traj.status.tolist() == [ph.Status.SUCCESSFUL, singular, singular]
+    assert bool(jnp.all(jnp.isnan(traj.wxyz[1:])))
+    assert bool(jnp.all(jnp.isfinite(traj.wxyz[0])))
     with pytest.raises(ph.SimulationError, match=r"use ph\.LiePoisson"):
         ph.simulate(free(), state, TS, ph.EulerAngles(max_steps=256))
 

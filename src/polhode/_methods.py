@@ -85,7 +85,11 @@ class AbstractDiffraxMethod(AbstractMethod):
 
     @abc.abstractmethod
     def start(self, scene: Scene, state: State, t: Array) -> tuple[PyTree[Array], Array]:
-        """Initial chart state of lanes, and which of them the chart can hold."""
+        """Initial chart state of lanes, and which of them the chart can hold.
+
+        A lane that it cannot hold starts from some sound state instead, so that it does not hold
+        up the others; its samples are NaN and its status says why.
+        """
 
     @abc.abstractmethod
     def finish(self, scene: Scene, y: PyTree[Array], t: Array) -> tuple[Array, Array, Array]:
@@ -127,6 +131,8 @@ class AbstractDiffraxMethod(AbstractMethod):
                 atol=rtol,
                 norm=_LaneNorm(self._weights(scene, state, ts[0], groups)),
             )
+            if not record.final_only:  # samples as accurate as steps, not as the interpolant
+                controller = diffrax.ClipStepSizeController(controller, step_ts=ts)
         samples = diffrax.SubSaveAt(t1=True) if record.final_only else diffrax.SubSaveAt(ts=ts)
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(self._stacked_field),
@@ -149,7 +155,8 @@ class AbstractDiffraxMethod(AbstractMethod):
         wxyz, omega, _ = self.finish(later, samples, kept[None])
         *_, sound_at_end = self.finish(later, last, ts[None, -1:])
         n = sound.shape[0]
-        status = _status(solution.result, wxyz, omega, sound & sound_at_end[:, -1])
+        wxyz, omega = (jnp.where(sound[:, None, None], x, jnp.nan) for x in (wxyz, omega))
+        status = _status(solution.result, wxyz, omega, sound, sound_at_end[:, -1])
         return Samples(
             wxyz if record.attitude else None,
             omega if record.rates else None,
@@ -166,7 +173,7 @@ def _groups(y: Array):
     return tuple(y[:3]), tuple(y[3:])
 
 
-def _status(result, wxyz, omega, sound) -> Array:
+def _status(result, wxyz, omega, sound, sound_at_end) -> Array:
     """Status per lane of one diffrax solve shared by all lanes."""
     finite = jnp.all(jnp.isfinite(wxyz), axis=(-1, -2)) & jnp.all(
         jnp.isfinite(omega), axis=(-1, -2)
@@ -177,7 +184,8 @@ def _status(result, wxyz, omega, sound) -> Array:
         reached, Status.SUCCESSFUL, jnp.where(limit, Status.MAX_STEPS, Status.STEP_FAILED)
     )
     status = jnp.where(reached & ~finite, Status.NOT_FINITE, shared)
-    return jnp.where(~sound & (status != Status.SUCCESSFUL), Status.CHART_SINGULAR, status)
+    lost = ~sound | (~sound_at_end & (status != Status.SUCCESSFUL))
+    return jnp.where(lost, Status.CHART_SINGULAR, status)
 
 
 def momentum_scale(scene: Scene, state: State, t: Array) -> Array:
@@ -252,9 +260,12 @@ class EulerAngles(AbstractDiffraxMethod):
         return euler_angle_field(t, y, dynamics)
 
     def start(self, scene, state, t):
-        q = wxyz_to_euler(state.wxyz)
+        phi, theta, psi = q = wxyz_to_euler(state.wxyz)
+        sound = _away_from_poles(q)
+        q = (phi, jnp.where(sound, theta, jnp.pi / 2), psi)
         momentum = components(scene.momentum(state.omega_body, t))
-        return (q, canonical_from_momentum(q, momentum)), _away_from_poles(q)
+        p = canonical_from_momentum(q, momentum)
+        return (q, tuple(jnp.where(sound, x, 0) for x in p)), sound
 
     def finish(self, scene, y, t):
         q, p = y
