@@ -30,7 +30,8 @@ def collocate(terms, t0, t1, nodes, y1, args, order: int) -> dict:
     x, matrix, series = _tables(order + 2)
     count = jax.tree.leaves(nodes)[0].shape[0]
     ends = jax.tree.map(lambda y, end: jnp.concatenate([y[1:], end[None]]), nodes, y1)
-    control = jax.tree.map(lambda c: c / count, terms.contr(t0, t1))
+    precision = jnp.result_type(*jax.tree.leaves(y1))
+    control = jax.tree.map(lambda c: jnp.asarray(c / count, precision), terms.contr(t0, t1))
     width = (t1 - t0) / count
     dtype = jnp.result_type(width)
 

@@ -110,7 +110,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
             return run(*rest, y)
 
         problem = Problem.of(terms, args)
-        rest = (problem, (t0, t1 - t0), problem.control(t0, t1))
+        rest = (problem, (t0, t1 - t0), problem.control(t0, t1, y0))
         y1, error, nodes = map_blocks(advance, self.block, y0, rest)
         dense = collocate(terms, t0, t1, nodes, y1, args, self.formal_order)
         return y1, error, dense, None, diffrax.RESULTS.successful

@@ -1,6 +1,7 @@
 """One compiled unit for a piece of a step, and blocks of bodies that stay in the cache."""
 
 from collections.abc import Callable
+from contextvars import ContextVar
 from typing import Any
 
 import equinox as eqx
@@ -11,12 +12,16 @@ from jax.interpreters import partial_eval
 
 _PLAIN = frozenset(
     """abs add add_any and atan atan2 broadcast_in_dim ceil clamp concatenate convert_element_type
-     copy cos cosh custom_jvp_call custom_vjp_call div dynamic_slice dynamic_update_slice eq exp
-     exp2 expm1 floor ge gt integer_pow iota is_finite jit le log log1p logistic lt max min mul ne neg
-     not or pad pjit pow reduce_sum rem reshape round rsqrt scan select_n sign sin sinh slice
+     copy cos cosh div dynamic_slice dynamic_update_slice eq exp
+     exp2 expm1 floor ge gt integer_pow iota is_finite jit le log log1p logistic lt max min mul
+     ne neg not or pad pjit pow reduce_sum rem reshape round rsqrt scan select_n sign sin sinh slice
      split sqrt square squeeze stop_gradient sub tan tanh transpose while xor""".split()  # noqa: SIM905
 )
 """Operations that a single compiled unit may hold; anything else keeps the usual way."""
+
+
+_ANALYSING = ContextVar("analysing", default=False)
+"""Set while a unit is looked through: the units inside it then show what they are made of."""
 
 
 def _is_plain(jaxpr) -> bool:
@@ -43,7 +48,7 @@ def kernel(fn: Callable) -> Callable:
     """
 
     def call(*operands):
-        if jax.default_backend() != "cpu":
+        if _ANALYSING.get() or jax.default_backend() != "cpu":
             return fn(*operands)
         leaves, tree = jax.tree.flatten(operands)
 
@@ -61,14 +66,22 @@ def kernel(fn: Callable) -> Callable:
 
 
 def _marked(flat: Callable, leaves: tuple) -> Any:
-    closed = jax.make_jaxpr(flat)(*leaves)
+    if not any(isinstance(leaf, jax.core.Tracer) for leaf in leaves):
+        return flat(*leaves)  # run at once, the mark would reach every call inside as well
+    analysing = _ANALYSING.set(True)
+    try:
+        closed = jax.make_jaxpr(flat)(*leaves)
+    finally:
+        _ANALYSING.reset(analysing)
     if not _is_plain(closed.jaxpr):
         return flat(*leaves)
     _, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
 
     def needed(*given):
         given = iter(given)
-        return flat(*(next(given) if u else jnp.zeros_like(x) for u, x in zip(used, leaves)))
+        full = (next(given) if u else jnp.zeros_like(x) for u, x in zip(used, leaves))
+        with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):  # the call's own only
+            return flat(*full)
 
     with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
         return jax.jit(needed)(*(x for u, x in zip(used, leaves) if u))

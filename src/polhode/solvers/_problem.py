@@ -3,6 +3,8 @@
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 from diffrax import AbstractTerm
 from jaxtyping import PyTree
 
@@ -17,10 +19,12 @@ class Problem(eqx.Module):
     def of(cls, terms: AbstractTerm, args: PyTree) -> "Problem":
         return cls(*eqx.partition((terms, args), eqx.is_array))
 
-    def control(self, t0, t1):
-        """The increment of the term's control, for an ODE the (signed) time step."""
+    def control(self, t0, t1, y):
+        """The increment of the term's control, for an ODE the (signed) time step, in the
+        precision of the state."""
         terms, _ = eqx.combine(self.arrays, self.static)
-        return terms.contr(t0, t1)
+        dtype = jnp.result_type(*jax.tree.leaves(y))
+        return jax.tree.map(lambda c: jnp.asarray(c, dtype), terms.contr(t0, t1))
 
     def field(self, t, y):
         """The vector field."""

@@ -91,7 +91,7 @@ class Splitting(diffrax.AbstractSolver):
             return kernel(run)(*rest, state)
 
         problem = Problem.of(terms, args)
-        rest = (problem, (t0, t1 - t0), problem.control(t0, t1))
+        rest = (problem, (t0, t1 - t0), problem.control(t0, t1, y0))
         state, nodes = map_blocks(advance, self.block, (momentum_space, tuple(y0[1])), rest)
         y1 = (_rotate_back(state[1], state[0]), state[1])
         nodes = (_rotate_back(nodes[1], nodes[0]), nodes[1])
@@ -213,7 +213,8 @@ def _step(scheme: Scheme, middle: int, problem: Problem, times, control, state):
     pairs = np.reshape(scheme.coefficients, (-1, 2))
     time = np.concatenate([[0.0], np.cumsum(pairs.sum(axis=1))[:-1]])
     before = np.concatenate([[0.0], pairs[:-1, 1]])
-    shares = [jnp.asarray(x, one.dtype) for x in (time, before, pairs[:, 0], pairs[:, 1])]
+    weights = (jnp.asarray(x, one.dtype) for x in (before, pairs[:, 0], pairs[:, 1]))
+    shares = (jnp.asarray(time, jnp.result_type(width)), *weights)
     (momentum, wxyz), _ = jax.lax.scan(pair, state, shares)
     momentum = kick(problem, t0 + width, float(pairs[-1, 1]) * control, momentum, wxyz)
     return momentum, _normalise(wxyz)

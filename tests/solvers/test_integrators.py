@@ -1,0 +1,323 @@
+"""Order, accuracy, conservation, derivatives and dense output against 40-digit Taylor series."""
+
+from functools import cache
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+
+from benchmarks.integrators import heavy_top, taylor_truth
+from polhode.solvers import Extrapolation, Splitting, choose, natural_rate
+from polhode.solvers._extrapolation import SEQUENCES
+from polhode.solvers._kernel import kernel
+from polhode.solvers._schemes import SCHEMES
+
+MOMENTS = (1.0, 1.5, 2.0)
+STRENGTH = 1.0
+WXYZ = np.array([[0.5, 0.5, -0.5, 0.5], [0.8, 0.0, 0.6, 0.0], [0.28, 0.96, 0.0, 0.0]])
+OMEGA = np.array([[1.25, -0.5, 0.75], [0.25, 1.5, -0.5], [-1.0, 0.5, 1.0]])
+END = 3.0
+TERM = diffrax.ODETerm(heavy_top)
+
+
+@cache
+def exact(times=(END,)):
+    """(times, bodies, 7): wxyz and momentum_body, correct in every digit of float64."""
+    states = [taylor_truth(MOMENTS, STRENGTH, q, w, times, digits=36) for q, w in zip(WXYZ, OMEGA)]
+    scale = [1.0] * 4 + list(MOMENTS)
+    return np.array([[[float(v * s) for v, s in zip(x, scale)] for x in b] for b in states])
+
+
+def start(dtype=jnp.float64):
+    momentum = tuple(jnp.asarray(MOMENTS[i] * OMEGA[:, i], dtype) for i in range(3))
+    return momentum, tuple(jnp.asarray(WXYZ[:, i], dtype) for i in range(4))
+
+
+def parameters(dtype=jnp.float64, strength=STRENGTH):
+    inverse = tuple(jnp.full(3, 1 / i, dtype) for i in MOMENTS)
+    return inverse, jnp.full(3, strength, dtype)
+
+
+def solve(solver, steps, y=None, args=None, **options):
+    y = start() if y is None else y
+    # times in the precision of the state: diffrax promotes the state to that of the times
+    t0, t1 = (jnp.asarray(t, y[0][0].dtype) for t in (0, END))
+    dt0 = None if "stepsize_controller" in options else t1 / steps
+    return diffrax.diffeqsolve(
+        TERM, solver, t0, t1, dt0, y, parameters() if args is None else args, **options
+    )
+
+
+def stacked(ys):
+    """(times, bodies, 7) of the components of a solution."""
+    momentum, wxyz = ys
+    return np.stack([np.asarray(x) for x in (*wxyz, *momentum)], axis=-1)
+
+
+def worst(solution, truth):
+    return np.abs(stacked(solution.ys) - np.moveaxis(truth, 1, 0)).max()
+
+
+@cache
+def stepper(solver):
+    """Final state after a number of steps that is not known when compiling."""
+
+    @jax.jit
+    def run(steps):
+        dt = END / steps
+
+        def body(i, carry):
+            y, memory = carry
+            t = i * dt
+            y, _, _, memory, _ = solver.step(TERM, t, t + dt, y, parameters(), memory, False)
+            return y, memory
+
+        y = start()
+        carry = (y, solver.init(TERM, 0.0, dt, y, parameters()))
+        return jax.lax.fori_loop(0, steps, body, carry)[0]
+
+    return run
+
+
+def measured_order(solver, coarse, fine):
+    truth = exact()[:, 0]
+    errors = [
+        np.abs(stacked(stepper(solver)(jnp.asarray(n))) - truth).max() for n in (coarse, fine)
+    ]
+    return np.log(errors[0] / errors[1]) / np.log(fine / coarse), errors
+
+
+EXTRAPOLATION_STEPS = {
+    4: (40, 80),
+    6: (20, 40),
+    8: (12, 24),
+    10: (5, 10),
+    12: (1, 2),
+    14: (1, 2),
+    16: (1, 2),
+    18: (1, 2),
+    20: (1, 2),
+}
+
+
+@pytest.mark.parametrize("order", EXTRAPOLATION_STEPS)
+def test_extrapolation_has_its_order(order):
+    found, errors = measured_order(Extrapolation(order), *EXTRAPOLATION_STEPS[order])
+    assert errors[1] > 1e-14  # above rounding: the slope means something
+    assert abs(found - order) < 0.1 * order
+
+
+@pytest.mark.parametrize(("order", "steps"), [(2, 60), (4, 30), (6, 20), (8, 16)])
+def test_splitting_has_its_order(order, steps):
+    found, errors = measured_order(Splitting(order), steps, 2 * steps)
+    assert errors[1] > 1e-14
+    assert abs(found - order) < 0.08 * order
+    assert Splitting(order).order(TERM) == order
+
+
+@pytest.mark.parametrize("scheme", SCHEMES.values(), ids=lambda s: s.order)
+def test_schemes_are_consistent_palindromes(scheme):
+    assert sum(scheme.coefficients) == pytest.approx(1, abs=1e-14)
+    assert scheme.coefficients == pytest.approx(scheme.coefficients[::-1], abs=1e-14)
+
+
+@pytest.mark.parametrize("middle", [0, 2])
+def test_any_axis_may_be_taken_out(middle):
+    solution = solve(Splitting(6, middle=middle, substeps=10), 60)
+    assert worst(solution, exact()) < 1e-7
+
+
+def _invariants(y, args):
+    momentum, (w, x, y_, z) = y
+    inverse, strength = args
+    rows = (2 * (x * z - w * y_), 2 * (y_ * z + w * x), 1 - 2 * (x * x + y_ * y_))
+    energy = sum(m * m * i for m, i in zip(momentum, inverse)) / 2 + strength * rows[2]
+    vertical = sum(m * r for m, r in zip(momentum, rows))
+    return energy, vertical, w * w + x * x + y_ * y_ + z * z
+
+
+def test_splitting_conserves():
+    args, y0 = parameters(), start()
+    solver = Splitting(4)
+    reference = _invariants(y0, args)
+
+    def record(carry, _):
+        y, memory = carry
+        y, _, _, memory, _ = solver.step(TERM, 0.0, 0.1, y, args, memory, False)
+        return (y, memory), [abs(a - b) for a, b in zip(_invariants(y, args), reference)]
+
+    carry = (y0, solver.init(TERM, 0.0, 0.1, y0, args))
+    _, (energy, vertical, norm) = jax.jit(
+        lambda carry: jax.lax.scan(record, carry, None, length=20_000)
+    )(carry)
+    assert np.max(vertical) < 3e-14
+    assert np.max(norm) < 3e-15
+    assert np.max(energy) > 1e-10  # the bound below is not met by solving exactly
+    assert np.max(energy[1000:]) < 1.2 * np.max(energy[:1000])
+
+
+def test_splitting_keeps_the_momentum_of_a_free_body():
+    solution = solve(Splitting(2, substeps=500), 60, args=parameters(strength=0.0))
+    before = np.sqrt(sum(m * m for m in start()[0]))
+    after = np.sqrt(sum(m[0] * m[0] for m in solution.ys[0]))
+    np.testing.assert_allclose(after, before, rtol=2e-15)
+
+
+def test_splitting_is_reversible():
+    solver = Splitting(4, substeps=10)
+    forward = solve(solver, 3)
+    y1 = jax.tree.map(lambda x: x[0], forward.ys)
+    back = diffrax.diffeqsolve(TERM, solver, END, 0.0, -END / 3, y1, parameters())
+    np.testing.assert_allclose(stacked(back.ys)[0], stacked(start()), atol=1e-13)
+    assert worst(forward, exact()) > 1e-8  # far less exact than it is reversible
+
+
+@pytest.mark.parametrize("solver", [Extrapolation(8), Splitting(4)], ids=lambda s: type(s).__name__)
+def test_float32(solver):
+    solution = solve(solver, 30, start(jnp.float32), parameters(jnp.float32))
+    assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(solution.ys))
+    assert worst(solution, exact()) < 1e-5
+
+
+TIMES = (0.1, 0.75, 1.3, 2.95)
+
+
+@pytest.mark.parametrize(
+    ("solver", "steps", "bound"),
+    [(Extrapolation(12, substeps=3), 4, 2e-10), (Splitting(6, substeps=2), 40, 2e-9)],
+    ids=lambda s: type(s).__name__,
+)
+def test_dense_output_has_the_accuracy_of_the_step(solver, steps, bound):
+    solution = solve(solver, steps, saveat=diffrax.SaveAt(ts=jnp.asarray(TIMES)))
+    assert worst(solution, exact(TIMES)) < bound
+
+
+def test_blocks_and_stepping_to_times_change_nothing():
+    times = jnp.asarray((0.0, *TIMES, END))
+    options = {
+        "stepsize_controller": diffrax.StepTo(times),
+        "saveat": diffrax.SaveAt(steps=True),
+        "max_steps": 5,
+    }
+    whole = solve(Extrapolation(14, substeps=3), None, **options)
+    cut = solve(Extrapolation(14, block=2, substeps=3), None, **options)
+    np.testing.assert_allclose(stacked(cut.ys), stacked(whole.ys), atol=1e-14)
+    assert worst(whole, exact((*TIMES, END))) < 1e-10
+
+
+def _largest(tree):
+    return jnp.max(jnp.stack([jnp.abs(x).max() for x in jax.tree.leaves(tree)]))
+
+
+@pytest.mark.parametrize("rtol", [1e-5, 1e-10])
+def test_step_control_and_error_estimate(rtol):
+    control = diffrax.PIDController(rtol=0.0, atol=rtol, norm=_largest)
+    solution = solve(Extrapolation(10), None, stepsize_controller=control)
+    assert worst(solution, exact()) < 10 * rtol
+    solver = Extrapolation(10)
+    y1, error, *_ = solver.step(TERM, 0.0, 1.0, start(), parameters(), None, False)
+    actual = np.abs(stacked(y1) - exact((1.0,))[:, 0]).max(axis=1)
+    claimed = stacked(error).max(axis=1)
+    assert np.all(claimed > 0.3 * actual)
+    assert np.all(claimed < 1e3 * actual)
+
+
+def test_event_stops_the_solve():
+    event = diffrax.Event(lambda t, y, args, **_: t > 1.0)
+    solution = solve(Extrapolation(8), 12, event=event)
+    assert solution.event_mask
+    assert 1.0 < float(solution.ts[0]) < 1.6
+
+
+def _loss(first, strength, solver, adjoint):
+    inverse = (1 / first, *(jnp.asarray(1 / i) for i in MOMENTS[1:]))
+    args = (tuple(jnp.broadcast_to(i, 3) for i in inverse), jnp.broadcast_to(strength, 3))
+    ys = solve(solver, 30, args=args, adjoint=adjoint).ys
+    return sum(jnp.sum(x * (i + 1)) for i, x in enumerate((*ys[1], *ys[0])))
+
+
+def _slope(which):
+    """Derivative of the loss by central differences of the 40-digit solution."""
+    h = 2.0**-40
+    weights = np.arange(1, 8)
+    with mpmath.workdps(40):
+        total = mpmath.mpf(0)
+        for sign in (1, -1):
+            strength = STRENGTH + sign * h * (which == 1)
+            moments = (MOMENTS[0] + sign * h * (which == 0), *MOMENTS[1:])
+            scale = (1, 1, 1, 1, *(mpmath.mpf(m) for m in moments))
+            for q, w in zip(WXYZ, OMEGA):
+                exact_w = [
+                    mpmath.mpf(m * r) / mpmath.mpf(i) for m, r, i in zip(MOMENTS, w, moments)
+                ]
+                (state,) = taylor_truth(moments, strength, q, exact_w, [END], digits=36)
+                total += sign * sum(int(c) * v * s for c, v, s in zip(weights, state, scale))
+        return float(total / (2 * mpmath.mpf(h)))
+
+
+@pytest.mark.parametrize(
+    "solver", [Extrapolation(8), Splitting(6, substeps=4)], ids=lambda s: type(s).__name__
+)
+def test_gradients(solver):
+    point = (jnp.asarray(MOMENTS[0]), jnp.asarray(STRENGTH))
+    truth = [_slope(0), _slope(1)]
+    reverse = jax.jit(
+        jax.grad(lambda *p: _loss(*p, solver, diffrax.RecursiveCheckpointAdjoint()), (0, 1))
+    )(*point)
+    np.testing.assert_allclose(reverse, truth, rtol=1e-9)
+    if isinstance(solver, Extrapolation):
+        forward = jax.jit(
+            jax.jacfwd(lambda *p: _loss(*p, solver, diffrax.ForwardMode()), argnums=(0, 1))
+        )(*point)
+        np.testing.assert_allclose(forward, truth, rtol=1e-9)
+
+
+@pytest.mark.parametrize("rtol", [1e-5, 1e-9])
+def test_choice_reaches_what_was_asked(rtol):
+    momentum, _ = start()
+    inverse, strength = parameters()
+    rate = natural_rate(momentum, inverse, strength)
+    choice = choose(rtol, END, np.asarray(rate))
+    assert choice.steps.shape == (3,)
+    # the fit is for long horizons, where rates and errors average out: here only the upper side
+    assert worst(solve(choice.solver, int(choice.steps.max())), exact()) < 10 * rtol
+
+
+def test_choice_spends_more_for_more():
+    choices = [choose(rtol, 100.0, 2.5) for rtol in (1e-3, 1e-6, 1e-9)]
+    work = [int(c.steps) * sum(SEQUENCES[c.solver.formal_order]) for c in choices]
+    assert work == sorted(work)
+    assert choose(1e-9, 100.0, 2.5, interval=0.1).steps % 1000 == 0
+    orders = [c.solver.formal_order for c in (choices[0], choices[-1])]
+    assert orders[0] < orders[1]
+    with pytest.raises(ValueError, match="rtol"):
+        choose(0.0, 1.0, 1.0)
+    with pytest.raises(ValueError, match="rate"):
+        choose(1e-6, 1.0, np.array([1.0, np.nan]))
+
+
+@pytest.mark.parametrize(
+    ("make", "named"),
+    [
+        (lambda: Extrapolation(7), "order"),
+        (lambda: Extrapolation(8, block=0), "block"),
+        (lambda: Extrapolation(8, substeps=0), "substeps"),
+        (lambda: Splitting(3), "order"),
+        (lambda: Splitting(4, middle=3), "middle"),
+    ],
+)
+def test_options_are_checked(make, named):
+    with pytest.raises(ValueError, match=named):
+        make()
+
+
+def test_kernel_with_unused_operands_and_other_operations():
+    x = jnp.arange(5.0)
+    add = kernel(lambda a, unused, b: a + b)
+    np.testing.assert_array_equal(jax.jit(add)(x, x * 2, x), 2 * x)
+    np.testing.assert_array_equal(jax.jit(kernel(lambda a: jnp.sort(-a)))(x), -x[::-1])
+    assert jax.jit(jax.grad(lambda a: add(a, a, a * a).sum()))(x)[2] == 5.0
+    np.testing.assert_array_equal(jax.vmap(add)(x, x, x), 2 * x)
