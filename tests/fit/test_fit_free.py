@@ -11,6 +11,10 @@ from polhode.fit._start import regression
 from polhode.inertia import inertia_from_log_cholesky, is_physical
 
 BODIES, SAMPLES = 200, 80
+UNFINISHED = pytest.mark.xfail(
+    reason="from the single regression start some of the bodies stop at the step limit or in "
+    "another valley; these must pass before the fit is called reliable"
+)
 SIGMA = np.where(np.arange(BODIES) % 2 == 0, 0.01, 0.05)
 
 
@@ -36,7 +40,7 @@ def cases():
     tensors = np.trace(second, axis1=1, axis2=2)[:, None, None] * np.eye(3) - second
     starts = rng.normal(size=(BODIES, 3)) * 2
     starts *= (6 / np.linalg.norm(starts, axis=-1))[:, None]
-    times = 3.0 + (np.arange(SAMPLES) + rng.uniform(0, 0.5, SAMPLES)) * 0.0375
+    times = 3.0 + np.sort(rng.uniform(0, 4, SAMPLES))
     clean = tumble(tensors, starts, times)
     noisy = clean + SIGMA[:, None, None] * rng.normal(size=clean.shape)
     ratios = np.linalg.eigvalsh(tensors)
@@ -44,7 +48,7 @@ def cases():
 
 
 def fitted(times, rates):
-    return fit_inertia(times, rates, omega_noise=SIGMA[:, None, None], max_steps=60, throw=False)
+    return fit_inertia(times, rates, omega_noise=SIGMA[:, None, None], throw=False)
 
 
 @pytest.fixture(scope="module")
@@ -52,10 +56,14 @@ def fits(cases):
     return fitted(cases[0], cases[2])
 
 
-def test_every_fit_ends_in_a_physical_body(fits):
-    stopped = np.asarray(fits.finding) & int(Finding.STEP_LIMIT | Finding.NOT_FINITE)
-    assert not stopped.any()
+def test_every_fit_is_a_physical_body(fits):
+    assert not (np.asarray(fits.finding) & int(Finding.NOT_FINITE)).any()
     assert bool(jnp.all(is_physical(fits.inertia.tensor, slack=1e-12)))
+
+
+@UNFINISHED
+def test_every_fit_converges(fits):
+    assert not (np.asarray(fits.finding) & int(Finding.STEP_LIMIT)).any()
 
 
 def test_errors_are_as_large_as_the_bound_says(fits, cases):
@@ -89,10 +97,11 @@ def test_the_scale_is_reported_as_unknown(fits):
     assert "Only ratios" in fits.report()
 
 
+@UNFINISHED
 def test_an_inverted_axis_means_the_mirrored_body(cases, fits):
     wrong = fitted(cases[0], cases[2] * np.array([1, 1, -1.0]))
     twins = np.sort(np.asarray(wrong.mirrored.moments), axis=-1)
-    np.testing.assert_allclose(twins, np.asarray(fits.ratios), atol=1e-3)
+    np.testing.assert_allclose(twins, np.asarray(fits.ratios), atol=2e-4)
     assert np.abs(np.asarray(wrong.ratios) - np.asarray(fits.ratios)).max() > 0.1
 
 
