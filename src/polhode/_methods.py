@@ -220,7 +220,7 @@ class LiePoisson(AbstractDiffraxMethod):
     max_steps: int = eqx.field(static=True, default=2**16)
     adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint()
     progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter()
-    chunk: int = eqx.field(static=True, default=40)
+    chunk: int = eqx.field(static=True, default=200)
 
     momenta = (True, False)
 
