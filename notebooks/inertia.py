@@ -97,7 +97,7 @@ def draw_box(ax, sides, offset=(0.0, 0.0, 0.0), wxyz=(1.0, 0.0, 0.0, 0.0), color
     ax.add_collection3d(solid)
 
 
-fig = plt.figure(figsize=(7.2, 5.6))
+fig = plt.figure(figsize=(8.0, 5.4))
 ax = fig.add_subplot(projection="3d")
 draw_box(ax, bus_sides, color="#C9B458")
 for side in (-1.6, 1.6):
@@ -109,15 +109,14 @@ for column, color, moment in zip(axes.T, (RED, GREEN, BLUE), principal.moments, 
     direction = column * np.sign(column[np.argmax(np.abs(column))])
     end = centre + 1.9 * direction
     ax.plot(*np.stack([centre, end]).T, color=color, linewidth=2.4, zorder=10)
-    ax.text(
-        *(centre + 2.15 * direction), f"{moment:.0f} kg m²", color=color, ha="center", zorder=11
-    )
+    label = centre + 1.9 * direction + np.array([0.0, 0.0, 0.12])
+    ax.text(*label, f"{moment:.0f} kg m²", color=color, ha="center", va="bottom", zorder=11)
 ax.plot([0, 0], [0, 0], [0, 2.0], color=GREY, linewidth=1.2, linestyle="--")
-ax.text(0, 0, 2.1, "designer's z", color=GREY, ha="center")
+ax.text(0, 0, 2.1, "designer's z ", color=GREY, ha="right")
 ax.set_proj_type("ortho")
-ax.view_init(20, -28)
-ax.set(xlim=(-1.8, 1.8), ylim=(-1.8, 1.8), zlim=(-1.6, 2.0))
-ax.set_box_aspect((1, 1, 1), zoom=1.45)
+ax.view_init(22, 38)
+ax.set(xlim=(-2.2, 2.2), ylim=(-2.2, 2.2), zlim=(-1.8, 2.6))
+ax.set_box_aspect((1, 1, 1), zoom=1.5)
 ax.set_axis_off()
 plt.show()
 

@@ -42,7 +42,7 @@ print(ph.explain(scene, state, ts))
 fig, ax = plt.subplots(figsize=(8, 3))
 ax.plot(traj.ts, traj.omega_body, label=["x", "y", "z"])
 ax.set(xlabel="time (s)", ylabel="body rates (rad/s)", title="The intermediate axis flips over")
-ax.legend(loc="upper right")
+ax.legend(loc="upper right", ncols=3)
 fig.tight_layout()
 
 # %% [markdown]
@@ -80,7 +80,7 @@ def turned_away(moments):
     end = ph.simulate(
         ph.Scene(ph.Inertia.from_moments(moments)),
         state,
-        jnp.array([0.0, 10.0]),
+        jnp.array([0.0, 20.0]),
         record=ph.Record(final_only=True),
     )
     y_axis = ph.rotation.rotate(end.wxyz[0], jnp.array([0.0, 1.0, 0.0]))
