@@ -23,6 +23,9 @@ from polhode.free._tangent import (
 
 Scalars = Float[Array, "*b"]
 
+# States that a core keeps in its nearest caches through all stages.
+_CHUNK = 8192
+
 
 def components(values, count: int) -> tuple[Scalars, ...]:
     """A tuple of component arrays, from one or from an array with the components last."""
@@ -76,9 +79,48 @@ def evaluate(
 def free_motion(
     moments, wxyz, omega, t, products=None, *, attitude: bool = True, rates: bool = True
 ) -> tuple[Triple | None, Quadruple | None]:
-    """The exact free motion: `prepare` and `evaluate` in one call."""
-    motion = prepare(moments, wxyz if attitude else None, omega, products)
-    return evaluate(motion, t, attitude=attitude, rates=rates)
+    """The exact free motion: `prepare` and `evaluate` in one call.
+
+    A long batch of one axis is worked off in chunks that fit the cache of a processor core.
+    """
+    parts = (
+        components(moments, 3),
+        components(wxyz, 4) if attitude else None,
+        components(omega, 3),
+        None if products is None else components(products, 3),
+    )
+
+    def whole(given, t):
+        motion = prepare(*given)
+        return evaluate(motion, t, attitude=attitude, rates=rates)
+
+    t = jnp.asarray(t)
+    return _chunked(whole, parts, t)
+
+
+def _chunked(fn, parts, t):
+    """``fn(parts, t)``, a few thousand states at a time where a processor has many to do."""
+    lanes = parts[0][0]
+    times = t.shape[1] if t.ndim == 2 else 1
+    rows = max(1, _CHUNK // max(times, 1))
+    if jax.default_backend() != "cpu" or lanes.ndim != 1 or lanes.shape[0] < 2 * rows:
+        return fn(parts, t)
+    count = lanes.shape[0]
+    # A divisor spares the copies that padding makes.
+    even = [n for n in range(rows // 4, rows + 1) if n > 0 and count % n == 0]
+    rows = max(even, default=rows)
+    missing = -count % rows
+
+    def cut(x):
+        if missing == 0:
+            return x.reshape(-1, rows, *x.shape[1:])
+        last = jnp.broadcast_to(x[-1:], (missing, *x.shape[1:]))
+        return jnp.concatenate([x, last]).reshape(-1, rows, *x.shape[1:])
+
+    own = t.ndim > 0 and t.shape[0] == count
+    pieces = jax.tree.map(cut, (parts, t) if own else (parts, None))
+    out = jax.lax.map(lambda p: fn(p[0], p[1] if own else t), pieces)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], out)
 
 
 def _results(asked, swing: Swing, turning: Turning | None, at: Moment):
@@ -188,7 +230,7 @@ def _evaluate_rule(asked, primals, tangents):
     )
     t = given[-1]
     at = advance(swing, turning, t, asked[2])
-    omega, wxyz = results = _results(asked, swing, turning, at)
+    results = _results(asked, swing, turning, at)
     frame = Frame(swing)
     resting = swing.pulse == 0
     hand = swing.sense * swing.parity
@@ -227,9 +269,9 @@ def _evaluate_rule(asked, primals, tangents):
         turn = tuple(
             jnp.where(resting, t * h, e) / 2 for h, e in zip(held, frame.to_body(turn), strict=True)
         )
-        d_wxyz = hamilton(wxyz, (jnp.zeros_like(n1), *turn))
+        d_wxyz = hamilton(results[1], (jnp.zeros_like(n1), *turn))
         if dq is not None:
-            d_wxyz = _start_tangent(given[3], dq, wxyz, d_wxyz)
+            d_wxyz = _start_tangent(given[3], dq, results[1], d_wxyz)
     return results, (d_omega, d_wxyz)
 
 

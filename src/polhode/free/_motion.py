@@ -77,13 +77,13 @@ class FreeMotion(NamedTuple):
 
 
 def _limits(dtype) -> tuple[float, float]:
-    """Smallest complementary parameter and smallest ratio of differences that are told from zero."""
+    """Smallest complementary parameter and ratio of differences that are told from zero."""
     bits = {4: 110, 8: 900}[jnp.dtype(dtype).itemsize]
     return 2.0**-bits, 2.0 ** -(bits // 2)
 
 
 def _nome(square: Scalars, root: Scalars) -> Scalars:
-    """The nome of parameter ``square`` <= 0.8; ``root`` is the square root of the complementary modulus."""
+    """The nome of parameter ``square`` <= 0.8; ``root``: root of the complementary modulus."""
     e = square / (2 * (1 + root * root) * (1 + root) ** 2)
     f = e**4
     return e * (1 + f * (2 + f * (15 + f * (150 + f * (1707 + f * 20910)))))

@@ -1,0 +1,224 @@
+"""The exact free motion against 50-digit states and derivatives (free_cases.json), every regime."""
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from polhode import free
+
+CASES = json.loads(Path(__file__).with_name("free_cases.json").read_text())
+FAMILIES = sorted({case["family"] for case in CASES})
+# Largest errors: attitude [rad], rates and derivatives relative to the largest of their block.
+BOUNDS = {"float64": (5e-15, 5e-15, 1e-13), "float32": (2e-6, 2e-6, 3e-5)}
+
+
+def _fits_single(case: dict) -> bool:
+    numbers = np.array([*case["moments"], *case["omega"], *case["wxyz"], case["t"]])
+    size = np.abs(numbers)
+    if np.any((size > 0) & ((size < 1e-15) | (size > 1e15))):
+        return False
+    return bool(np.all(numbers.astype(np.float32) == numbers))
+
+
+@pytest.fixture(scope="module", params=["float64", "float32"])
+def solved(request):
+    """States and derivatives (forward and reverse) of all cases that the dtype can hold."""
+    dtype = request.param
+    table = [c for c in CASES if dtype == "float64" or _fits_single(c)]
+
+    def state(moments, products, omega, t, wxyz):
+        rates, attitude = free.free_motion(moments, wxyz, omega, t, products)
+        return jnp.stack([*attitude, *rates])
+
+    def everything(*given):
+        parts = (0, 1, 2, 3)
+        forward = jax.jacfwd(state, parts)(*given)
+        reverse = jax.jacrev(state, parts)(*given)
+        flat = [jnp.concatenate([x.reshape(7, -1) for x in j], 1) for j in (forward, reverse)]
+        return state(*given), *flat
+
+    def column(name):
+        return jnp.asarray(np.array([c[name] for c in table]), dtype)
+
+    products = jnp.zeros((len(table), 3), dtype)
+    given = column("moments"), products, column("omega"), column("t"), column("wxyz")
+    value, forward, reverse = jax.jit(jax.vmap(everything))(*given)
+    assert value.dtype == dtype
+    rows = zip(table, *(np.asarray(x, float) for x in (value, forward, reverse)), strict=True)
+    return BOUNDS[dtype], list(rows)
+
+
+def _attitude_error(found, exact) -> float:
+    sign = np.sign(np.dot(found, exact))
+    return 2 * np.linalg.norm(sign * found - exact)
+
+
+def _size(vector) -> float:
+    largest = np.abs(vector).max()
+    return largest * np.linalg.norm(vector / largest) if largest > 0 else 1.0
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_states(solved, family):
+    (attitude, rate, _), rows = solved
+    for case, value, _, _ in rows:
+        if case["family"] != family:
+            continue
+        exact = np.array(case["omega_t"])
+        assert _attitude_error(value[:4], np.array(case["wxyz_t"])) < attitude, case["name"]
+        assert abs(np.linalg.norm(value[:4]) - 1) < attitude, case["name"]
+        assert _size((value[4:] - exact) / _size(exact)) * np.any(value[4:] != exact) < rate, case[
+            "name"
+        ]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_derivatives(solved, family):
+    (_, _, bound), rows = solved
+    for case, value, *found in rows:
+        if case["family"] != family:
+            continue
+        exact = np.array(case["jacobian"]).T
+        sign = np.sign(np.dot(value[:4], case["wxyz_t"]))
+        for jacobian in found:
+            scaled = jacobian * np.array(case["unit"])
+            for block, factor in ((slice(0, 4), sign), (slice(4, 7), 1)):
+                largest = np.abs(exact[block]).max()
+                off = np.abs(factor * scaled[block] - exact[block]).max()
+                assert off <= bound * largest, (case["name"], block)
+
+
+def test_initial_state_is_returned_at_time_zero():
+    moments, wxyz = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.5, -0.5, 0.5, 0.5])
+    omega = jnp.array([0.3, -0.2, 0.9])
+    rates, attitude = free.free_motion(moments, wxyz, omega, jnp.array(0.0))
+    np.testing.assert_allclose(np.stack(rates), omega, rtol=3e-16)
+    np.testing.assert_allclose(np.stack(attitude), wxyz, atol=3e-16)
+
+
+def test_initial_attitude_carries_its_derivative():
+    moments, omega, t = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.3, -0.2, 0.9]), jnp.array(3.0)
+    wxyz, change = jnp.array([0.6, -0.5, 0.7, 0.1]), np.array([0.3, 0.1, -0.2, 0.4])
+
+    def attitude(q):
+        return jnp.stack(free.free_motion(moments, q, omega, t, rates=False)[1])
+
+    _, found = jax.jvp(attitude, (wxyz,), (jnp.asarray(change),))
+    # The turn from the start is the same for every start: q(t) = q(0) p.
+    turn = np.asarray(attitude(jnp.array([1.0, 0.0, 0.0, 0.0])))
+    unit = np.asarray(wxyz) / np.linalg.norm(wxyz)
+    moved = (change - unit * (unit @ change)) / np.linalg.norm(wxyz)
+    a, b, c, d = turn
+    right = np.array([[a, -b, -c, -d], [b, a, d, -c], [c, -d, a, b], [d, c, -b, a]])
+    np.testing.assert_allclose(np.asarray(found), right @ moved, atol=1e-14)
+
+
+def test_many_times_agree_with_single_ones_and_chunks_with_the_whole():
+    rng = np.random.default_rng(5)
+    count, times = 300, 70
+    moments = jnp.asarray(rng.uniform(0.5, 1.0, (count, 3)))
+    wxyz, omega = jnp.asarray(rng.normal(size=(count, 4))), jnp.asarray(rng.normal(size=(count, 3)))
+    ts = jnp.linspace(-3.0, 40.0, times)
+    together = jax.jit(free.free_motion)(moments, wxyz, omega, ts[None, :])
+    motion = free.prepare(moments, wxyz, omega)
+    single = free.evaluate(motion, ts[-1])
+    for part, alone in zip(together, single, strict=True):
+        for x, y in zip(part, alone, strict=True):
+            assert x.shape == (count, times)
+            np.testing.assert_allclose(x[:, -1], y, atol=2e-13)
+
+
+def test_conserved_over_long_times():
+    rng = np.random.default_rng(6)
+    moments = jnp.asarray(rng.uniform(0.5, 1.0, (200, 3)))
+    wxyz, omega = jnp.asarray(rng.normal(size=(200, 4))), jnp.asarray(rng.normal(size=(200, 3)))
+    rates, attitude = free.free_motion(moments, wxyz, omega, jnp.full(200, 1e7))
+    now, before = np.stack(rates, -1) * moments, np.asarray(omega * moments)
+    np.testing.assert_allclose((now**2).sum(-1), (before**2).sum(-1), rtol=1e-14)
+    energy = (now**2 / moments).sum(-1)
+    np.testing.assert_allclose(energy, (before**2 / moments).sum(-1), rtol=1e-14)
+    np.testing.assert_allclose(np.linalg.norm(np.stack(attitude, -1), axis=-1), 1, rtol=1e-15)
+
+
+def test_rates_alone_compile_to_less():
+    shapes = jnp.ones((8, 3)), jnp.ones((8, 3)), jnp.ones(8)
+
+    def operations(**wanted):
+        def motion(moments, omega, t):
+            wxyz = jnp.ones((8, 4)) if wanted.get("attitude", True) else None
+            return free.free_motion(moments, wxyz, omega, t, **wanted)
+
+        return str(jax.make_jaxpr(motion)(*shapes)).count("\n")
+
+    assert operations(attitude=False) < 0.6 * operations()
+
+
+def test_wrong_use_is_explained():
+    motion = free.prepare(jnp.ones((2, 3)), None, jnp.ones((2, 3)))
+    with pytest.raises(ValueError, match="prepared without wxyz"):
+        free.evaluate(motion, jnp.zeros(2))
+    with pytest.raises(ValueError, match="one more"):
+        free.evaluate(motion, jnp.zeros((2, 3, 4)), attitude=False)
+
+
+def _published(shared):
+    table = json.loads((shared / "data" / "published_cases.json").read_text())
+    return {case["id"]: case for case in table["cases"]}
+
+
+def test_published_states(shared):
+    cases = _published(shared)
+
+    def run(case, t):
+        moments = np.array(case["inertia"], float)
+        if "omega0_body" in case:
+            omega = np.array(case["omega0_body"], float)
+        else:
+            omega = np.array(case["momentum0_body"], float) / moments
+        given = (moments, np.array(case["q0"], float), omega, np.array(t, float))
+        rates, attitude = free.free_motion(*map(jnp.asarray, given))
+        return np.stack(rates), np.stack(attitude), moments
+
+    def check(found, omega, wxyz, tolerance=2e-15):
+        rates, attitude, _ = found
+        np.testing.assert_allclose(rates, omega, atol=tolerance * np.linalg.norm(omega))
+        unit = np.array(wxyz) / np.linalg.norm(wxyz)
+        assert _attitude_error(attitude, unit) < 2 * tolerance
+
+    dzhanibekov = cases["principia_dzhanibekov"]
+    for t, key in ((5, "state_t5"), (100, "state_t100")):
+        exact = dzhanibekov["expected"][key]
+        check(run(dzhanibekov, t), exact["omega"], exact["q"], 4e-14)
+    cylinder = cases["drake_free_body_cylinder"]
+    for key in ("t1", "t2"):
+        exact = cylinder["expected"][key]
+        check(run(cylinder, exact["t"]), exact["omega"], exact["q"], 2e-14)
+    top = cases["jsbsim_vanzon_schofield_top"]
+    check(run(top, top["t"]), top["expected"]["omega"], top["expected"]["q"], 5e-14)
+    problem = cases["hipparchus_problem8"]["expected"]
+    found = run(cases["hipparchus_problem8"], 20.0)
+    check(found, problem["omega"], problem["q_if_q0_is_body_to_space"], 5e-14)
+    for name in ("hairer_vilmart_asymmetric", "gni_example_5_4_free"):
+        case = cases[name]
+        rates, attitude, moments = run(case, case["t"])
+        exact = np.array(case["expected"]["momentum_body"]) / moments
+        check((rates, attitude, moments), exact, case["expected"]["q"], 2e-14)
+    sphere = dict(cases["principia_sphere"], q0=[1, 0, 0, 0])
+    np.testing.assert_allclose(run(sphere, 10)[0], sphere["expected"]["omega_body"], rtol=1e-15)
+
+
+def test_principal_spins_keep_their_rates_to_the_bit():
+    for axis, (size, angle) in enumerate(((5.0, 25.0), (6.0, 20.0), (7.0, 14.0))):
+        moments = np.array([2.0, 3.0, 5.0])
+        omega = np.zeros(3)
+        omega[axis] = size / moments[axis]
+        given = moments, np.array([1.0, 0, 0, 0]), omega, np.array(10.0)
+        rates, attitude = free.free_motion(*map(jnp.asarray, given))
+        exact = np.zeros(4)
+        exact[0], exact[1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
+        np.testing.assert_allclose(np.stack(rates), omega, rtol=2.3e-16)
+        assert _attitude_error(np.stack(attitude), exact) < 17 * 2.0**-52 * angle

@@ -1,0 +1,143 @@
+"""Periods of tumbling bodies against published values, mpmath and symmetric limits."""
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+
+from polhode import free
+from polhode.free import Mode
+
+# Compiled once: eager dispatch would cost far more than the numbers.
+_periods = jax.jit(free.periods)
+
+TOUTATIS = (3.0836, 3.235, 1.0), np.deg2rad([14.51, 33.529, -98.709])  # rad per day
+
+
+def test_toutatis():
+    found = _periods(jnp.array(TOUTATIS[0]), jnp.asarray(TOUTATIS[1]))
+    assert abs(float(found.P_psi) - 5.36853031) < 5e-9
+    assert abs(float(found.P_phi) - 7.41165227) < 5e-9
+    assert int(found.mode) == Mode.LAM
+
+
+def test_halley():
+    """Belton et al. 1991: axisymmetric, theta 66 deg, P_phi 3.69 d, P_psi 7.1 d."""
+    theta, precession, spin = np.deg2rad(66.0), 2 * np.pi / 3.69, 2 * np.pi / 7.1
+    axial = precession * np.cos(theta) + spin
+    ratio = axial / (precession * np.cos(theta))  # of the greater to the least moment
+    omega = jnp.array([precession * np.sin(theta), 0.0, axial])
+    found = _periods(jnp.array([ratio, ratio, 1.0]), omega)
+    np.testing.assert_allclose(found.P_phi, 3.69, rtol=1e-14)
+    np.testing.assert_allclose(found.P_psi, 7.1, rtol=1e-14)
+    np.testing.assert_allclose([found.theta_min, found.theta_max], theta, rtol=1e-14)
+    assert int(found.mode) == Mode.PROLATE
+    assert abs(ratio - 2.2778) < 1e-4
+
+
+def _by_quadrature(moments, omega):
+    """P_psi by mpmath's K; P_phi by the mean of the long axis' precession over a period."""
+    with mp.workdps(30):
+        low, mid, high = sorted(range(3), key=lambda k: moments[k])
+        I = [mp.mpf(float(x)) for x in moments]
+        w = [mp.mpf(float(x)) for x in omega]
+        M2 = sum((a * b) ** 2 for a, b in zip(I, w, strict=True))
+        E2 = sum(a * b * b for a, b in zip(I, w, strict=True))
+        l, i, s = I[low], I[mid], I[high]
+        short = E2 * i < M2
+        above, below = (i - l) * (E2 * s - M2), (s - i) * (M2 - E2 * l)
+        k2 = above / below if short else below / above
+        rate = mp.sqrt((below if short else above) / (l * i * s))
+        P = 4 * mp.ellipk(k2) / rate
+        a, c = (low, high) if short else (high, low)
+        first = (M2 - E2 * I[c]) / (I[a] * (I[a] - I[c]))
+        second = (M2 - E2 * I[c]) / (i * (i - I[c]))
+        third = (M2 - E2 * I[a]) / (I[c] * (I[c] - I[a]))
+
+        def precession(u):
+            sn, cn, dn = (mp.ellipfun(k, u, m=k2) for k in ("sn", "cn", "dn"))
+            square = {a: first * cn**2, mid: second * sn**2, c: third * dn**2}
+            above = i * square[mid] + s * square[high]
+            return mp.sqrt(M2) * above / (i * i * square[mid] + s * s * square[high])
+
+        mean = mp.quad(precession, mp.linspace(0, mp.ellipk(k2), 9)) / mp.ellipk(k2)
+        return float(P), float(2 * mp.pi / mean), float(k2), Mode.SAM if short else Mode.LAM
+
+
+@pytest.mark.parametrize(
+    ("moments", "omega"),
+    [
+        ((1.0, 2.0, 3.0), (0.3, 0.2, 1.0)),
+        ((2.0, 3.0, 1.0), (0.3, 0.2, 1.0)),
+        ((1.0, 2.0, 3.0), (0.95, 0.3, 0.6)),
+        ((1.0, 2.0, 3.0), (1.0, 0.3, 0.575)),
+        ((1.0, 1.001, 0.01), (0.3, 0.2, 5.0)),
+    ],
+)
+def test_against_quadrature(moments, omega):
+    found = _periods(jnp.array(moments), jnp.array(omega))
+    P_psi, P_phi, k2, mode = _by_quadrature(moments, omega)
+    np.testing.assert_allclose(found.P_psi, P_psi, rtol=5e-15)
+    np.testing.assert_allclose(found.P_phi, P_phi, rtol=2e-14)
+    np.testing.assert_allclose(found.k2, k2, rtol=2e-14)
+    assert int(found.mode) == mode
+
+
+def test_modes_without_a_period():
+    moments = jnp.array([[1.0, 1, 1], [1, 2, 3], [1, 2, 2.25], [1, 2, 2], [1, 1, 2]])
+    omega = jnp.array([[0.3, 0.4, 0], [0, 0, 0], [0.75, 0.5, 1], [0, 0.6, 0.8], [0.6, 0.8, 0]])
+    found = _periods(moments, omega)
+    names = [Mode.SPHERICAL, Mode.AT_REST, Mode.SEPARATRIX, Mode.PROLATE, Mode.OBLATE]
+    assert [Mode(int(m)) for m in found.mode] == names
+    assert np.all(np.isinf(found.P_psi))
+    length = np.linalg.norm(np.asarray(moments * omega), axis=-1)
+    rates = np.array([length[0], 0, length[2] / 2, length[3] / 2, length[4]])
+    with np.errstate(divide="ignore"):
+        np.testing.assert_allclose(found.P_phi, 2 * np.pi / rates, rtol=4e-16)
+    assert not np.any(np.isnan(np.stack([found.theta_min, found.theta_max])))
+
+
+def _numbers(i, w, products):
+    found = free.periods(i, w, products)
+    return jnp.stack([found.P_psi, found.P_phi, found.k2, found.theta_min, found.theta_max])
+
+
+@jax.jit
+def _jacobians(*given):
+    return jax.jacfwd(_numbers, (0, 1, 2))(*given), jax.jacrev(_numbers, (0, 1, 2))(*given)
+
+
+@pytest.mark.parametrize("omega", [(0.3, 0.2, 1.0), (1.0, 0.2, 0.2), (0.95, 0.3, 0.6)])
+def test_derivatives(omega):
+    moments, omega = np.array([1.0, 2.0, 3.0]), np.array(omega)
+
+    given = jnp.asarray(moments), jnp.asarray(omega), jnp.zeros(3)
+    forward, reverse = _jacobians(*given)
+    np.testing.assert_allclose(np.hstack(forward), np.hstack(reverse), atol=1e-13)
+
+    def exact(tensor, w):
+        values, axes = np.linalg.eigh(tensor)
+        return np.array(_by_quadrature(values, axes.T @ w)[:3])
+
+    step = 1e-5
+    columns = []
+    for i, j in ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2)):
+        change = np.zeros((3, 3))
+        change[i, j] = change[j, i] = step
+        up, down = exact(np.diag(moments) + change, omega), exact(np.diag(moments) - change, omega)
+        columns.append((up - down) / (2 * step))
+    found = np.hstack([forward[0], forward[2]])[:3]
+    np.testing.assert_allclose(found, np.array(columns).T, rtol=1e-7, atol=1e-7)
+
+
+def test_derivatives_are_finite_in_the_limits():
+    moments = jnp.array([[1.0, 1, 1], [1, 2, 3], [1, 1, 2], [1, 2, 2], [1, 2, 2.25]])
+    omega = jnp.array([[0.3, 0.4, 0], [0, 0, 0], [0.3, 0.2, 1], [1, 0.1, 0.1], [0, 0, 1]])
+
+    def finite(i, w):
+        found = _periods(i, w)
+        return jnp.where(jnp.isinf(found.P_psi), 0.0, found.P_psi).sum() + found.k2.sum()
+
+    for part in jax.jit(jax.grad(finite, (0, 1)))(moments, omega):
+        assert np.all(np.isfinite(part))
