@@ -2,6 +2,7 @@
 
 from polhode import elliptic as elliptic, free as free, rotation as rotation, solvers as solvers
 from polhode._closed_form import ClosedForm as ClosedForm
+from polhode._extrapolated import Extrapolated as Extrapolated
 from polhode._methods import (
     AbstractMethod as AbstractMethod,
     EulerAngles as EulerAngles,

@@ -7,13 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from polhode._checks import is_concrete
 from polhode._closed_form import ClosedForm
+from polhode._extrapolated import Extrapolated
 from polhode._lanes import PARTS, common_batch
 from polhode._methods import AbstractDiffraxMethod, AbstractMethod, LiePoisson, Record
 from polhode._scene import Scene
 from polhode._state import State
 from polhode._top_methods import AbstractTopMethod, exact_top
 from polhode.inertia import Symmetry
+from polhode.torques import UniformGravity
 
 _FREE_LAWS = {
     Symmetry.NONE: "nothing acts on the body: exact motion in Jacobi elliptic functions",
@@ -57,7 +60,9 @@ class Plan:
         return "\n".join(lines)
 
 
-def choose(scene: Scene, state: State, record: Record) -> tuple[AbstractMethod, str]:
+def choose(
+    scene: Scene, state: State, record: Record, rtol: Array | float = 1e-9
+) -> tuple[AbstractMethod, str]:
     """The method that ``simulate(..., method=None)`` uses, and why.
 
     The scene's structure decides; values only where they are known (not traced), for the laws
@@ -68,7 +73,37 @@ def choose(scene: Scene, state: State, record: Record) -> tuple[AbstractMethod, 
     exact = exact_top(scene, state, record)
     if exact is not None:
         return exact, exact.law
-    return LiePoisson(), "something acts on the body: integrated step by step"
+    bodies = np.prod(common_batch(*(getattr(scene, name) for name in PARTS), state), dtype=int)
+    if scene.potential is not None and scene.torque is None and bodies >= _MANY:
+        method = Extrapolated(_order(rtol), upright=_falls(scene.potential))
+        return method, (
+            f"a potential acts on many bodies: extrapolated midpoint rule of order {method.order}"
+            " in equal steps by each body's natural rate"
+        )
+    return LiePoisson(at_end=True), (
+        "something acts on the body: stepped with an error estimate, held to rtol at the last time"
+    )
+
+
+_MANY = 32
+"""Bodies from which the faster steps of the extrapolation are worth its longer compilation."""
+
+
+def _order(rtol) -> int:
+    """Order of least work for a tolerance (benchmarks/integrators.py); 12 while it is traced."""
+    if not is_concrete(rtol):
+        return 12
+    return next((o for o, bound in ((10, 1e-4), (12, 3e-10), (14, 1e-11)) if rtol >= bound), 16)
+
+
+def _falls(potential) -> bool:
+    """Whether the potential is uniform gravity that is known not to vanish."""
+    if not isinstance(potential, UniformGravity):
+        return False
+    force = (potential.mass, potential.gravity_space)
+    return is_concrete(force) and bool(
+        np.all(np.asarray(force[0]) > 0) and np.all(np.any(np.asarray(force[1]) != 0, axis=-1))
+    )
 
 
 def plan(
@@ -82,7 +117,7 @@ def plan(
     """The plan of checked input (see ``ph.explain``)."""
     law = "as asked for"
     if method is None:
-        method, law = choose(scene, state, record)
+        method, law = choose(scene, state, record, rtol)
     parts = (getattr(scene, name) for name in PARTS)
     bodies = int(np.prod(common_batch(*parts, state, extra=(ts.shape[:-1],)), dtype=int))
     samples = 1 if record.final_only else ts.shape[-1]
@@ -93,7 +128,10 @@ def plan(
         seconds, error = None, "rounding only: a few units in the last place of the angle turned"
     else:
         seconds = None
-        error = f"local error {float(rtol):.0e} per step, of the worst body of each chunk"
+        lasting = isinstance(method, Extrapolated) or getattr(method, "at_end", False)
+        error = f"about {float(rtol):.0e} " + (
+            "rad at the last time" if lasting else "per step, of the worst body of each chunk"
+        )
     return Plan(
         method, law, _skipped(scene, method, record), bodies, samples,
         str(state.wxyz.dtype), seconds, error,
@@ -119,7 +157,7 @@ def _skipped(scene: Scene, method: AbstractMethod, record: Record) -> tuple[str,
         reasons.append("rates at the samples: only the attitude is recorded")
     if record.final_only:
         reasons.append("the trajectory buffer: only the last time is recorded")
-    if isinstance(method, AbstractDiffraxMethod):
+    if isinstance(method, AbstractDiffraxMethod | Extrapolated):
         reasons.append("checkpoints: kept only under jax.grad")
     return tuple(reasons)
 

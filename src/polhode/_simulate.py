@@ -35,7 +35,8 @@ def simulate(
     - ``scene``, ``state``: see ``ph.Scene``, ``ph.State``; batch axes broadcast together.
     - ``ts``: (T,) or (..., T) [s], strictly increasing or strictly decreasing.
     - ``method``: None lets the library choose; or ``ph.LiePoisson(...)``, ``ph.EulerAngles(...)``.
-    - ``rtol``: error asked for, attitude in radians and momenta relative to their size;
+    - ``rtol``: error asked for, attitude in radians and momenta relative to their size, at the
+      last time when the library chooses the method, of each step where the method says so;
       None: 1e-9 in float64, 1e-5 in float32. Exact methods ignore it.
     - ``record``: what to keep; None: attitude and rates at all times.
     - ``throw``: raise ``ph.SimulationError`` when a body did not finish. Under ``jit``, ``vmap``
@@ -46,9 +47,9 @@ def simulate(
     """
     scene, state, ts, record = check_inputs(scene, state, ts, record)
     check_method(method)
-    if method is None:
-        method, _ = choose(scene, state, record)
     rtol = check_rtol(rtol, state.wxyz.dtype)
+    if method is None:
+        method, _ = choose(scene, state, record, rtol)
     trajectory = run(method, scene, state, ts, rtol, record)
     if throw and is_concrete(trajectory.status):
         raise_on_failure(trajectory)

@@ -146,7 +146,7 @@ def test_imports_go_one_way():
         {"_state", "_scene", "_lanes", "_status"},
         {"_trajectory"},
         {"_methods"},
-        {"_closed_form", "_top_methods", "_periods"},
+        {"_closed_form", "_extrapolated", "_top_methods", "_periods"},
         {"_plan"},
         {"_simulate"},
         {"frames"},

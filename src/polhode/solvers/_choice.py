@@ -46,6 +46,17 @@ def natural_rate(
     return jnp.sqrt(square + 8 * torque * stiffest)
 
 
+def steps_for(order: int, rtol: Array, rate: Array, horizon: Array) -> Float[Array, "..."]:
+    """Equal steps (whole, but a float) of ``Extrapolation(order)`` for an error of ``rtol`` [rad].
+
+    The rule of ``choose`` on arrays that may be traced; see there.
+    """
+    turned = rate * horizon
+    constant = 10.0 ** ERROR_CONSTANTS[order]
+    step = (rtol / (constant * jnp.maximum(turned, 1))) ** (1 / order)
+    return jnp.ceil(jnp.maximum(turned / step, 1))
+
+
 def choose(
     rtol: float,
     horizon: float,

@@ -8,4 +8,4 @@ from polhode.tops._elementary import (
     turn as turn,
 )
 from polhode.tops._lagrange import Orbit as Orbit, at as at, orbit as orbit
-from polhode.tops._vertical import lagrange_motion as lagrange_motion
+from polhode.tops._vertical import lagrange_motion as lagrange_motion, upward as upward

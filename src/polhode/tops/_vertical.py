@@ -1,42 +1,51 @@
 """Lagrange's top for any direction of gravity: the frame of the vertical, and back."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode.rotation import conjugate, multiply
-from polhode.tops._complex import Complex
+from polhode.hamiltonian import components
+from polhode.tops._complex import Complex, opaque_one, settle
 from polhode.tops._lagrange import at, orbit
 
 
-def _upward(force: Float[Array, "*b 3"]) -> tuple[Array, Array]:
-    """Unit quaternion turning space z to an axis along +-force (never downwards), and the signed
+def upward(force: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array, Array], Array]:
+    """Turn (w, x, y; z = 0) of space z to an axis along +-force (never downwards), and the signed
     size of the force along it.
 
     Without force the axis is z: the motion does not depend on it. Its derivative with respect to
     the horizontal force then does, and is left out.
     """
-    x, y, z = (force[..., i] for i in range(3))
-    square = x * x + y * y + z * z
+    square = sum(x * x for x in force)
     acting = square > 0
     size = jnp.sqrt(jnp.where(acting, square, 1))
-    up = jnp.where(z < 0, -1, 1).astype(size.dtype)
-    a, b, c = (
-        jnp.where(acting, up * value / size, unit) for value, unit in zip((x, y, z), (0, 0, 1))
-    )
+    up = jnp.where(force[2] < 0, -1, 1).astype(size.dtype)
+    a, b, c = (jnp.where(acting, up * v / size, w) for v, w in zip(force, (0, 0, 1)))
     half = jnp.sqrt((1 + c) / 2)
-    turn = jnp.stack([half, -b / (2 * half), a / (2 * half), jnp.zeros_like(half)], axis=-1)
-    return turn, jnp.where(acting, up * size, z)
+    return (half, -b / (2 * half), a / (2 * half)), jnp.where(acting, up * size, force[2])
+
+
+def _turned(turn: tuple[Array, Array, Array], q: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Quaternion product (w, x, y, 0) q on components."""
+    a, b, c = turn
+    w, x, y, z = q
+    return (
+        a * w - b * x - c * y,
+        a * x + b * w + c * z,
+        a * y - b * z + c * w,
+        a * z + b * y - c * x,
+    )
 
 
 def lagrange_motion(
-    transverse: Float[Array, "*b"],
-    force_space: Float[Array, "*b 3"],
-    distance: Float[Array, "*b"],
-    wxyz: Float[Array, "*b 4"],
-    omega: Float[Array, "*b 3"],
-    axial_momentum: Float[Array, "*b"],
-    elapsed: Float[Array, "*b t"],
-) -> tuple[Float[Array, "*b t 4"], Float[Array, "*b t 3"]]:
+    transverse: Float[Array, " n"],
+    force_space: Float[Array, "n 3"],
+    distance: Float[Array, " n"],
+    wxyz: Float[Array, "n 4"],
+    omega: Float[Array, "n 3"],
+    axial_momentum: Float[Array, " n"],
+    elapsed: Float[Array, "n t"],
+) -> tuple[Float[Array, "n t 4"], Float[Array, "n t 3"]]:
     """Attitude and body rates after ``elapsed`` [s] of a symmetric body about a fixed point.
 
     ``transverse``: moment about any axis through the point and across body z [kg m^2];
@@ -44,17 +53,25 @@ def lagrange_motion(
     ``omega`` [rad/s]: initial state; ``axial_momentum`` along body z [kg m^2/s], that of wheels on
     the axis included. Klein & Sommerfeld, Theorie des Kreisels, VI; see ``_lagrange``.
     """
-    turn, size = _upward(force_space)
-    q = multiply(conjugate(turn), wxyz)
-    alpha, beta = Complex(q[..., 0], q[..., 3]), Complex(q[..., 2], q[..., 1])
-    spin = omega[..., 2]
-    momentum = (transverse * omega[..., 0], transverse * omega[..., 1], axial_momentum)
-    motion = orbit(transverse, spin, -size * distance, (alpha, beta), momentum)
-    alpha, beta, across = at(motion.along_time(), elapsed)
-    scale = 1 / jnp.sqrt(alpha.square + beta.square)
-    q = jnp.stack([alpha.re, beta.im, beta.re, alpha.im], axis=-1) * scale[..., None]
-    square = (scale * scale)[..., None]
-    rates = jnp.stack([across.im, across.re], axis=-1) * square
-    axial = jnp.broadcast_to(spin[..., None, None], (*rates.shape[:-1], 1))
-    turn = jnp.broadcast_to(turn[..., None, :], q.shape)
-    return multiply(turn, q), jnp.concatenate([rates, axial], axis=-1)
+    one = opaque_one(transverse)
+    wxyz, omega = settle((tuple(wxyz[..., i] for i in range(4)), components(omega)), one)
+    turn, size = settle(upward(components(force_space)), one)
+    back = (turn[0], -turn[1], -turn[2])
+    q, spin = settle(_turned(back, wxyz), one), omega[2]
+    momentum = (transverse * omega[0], transverse * omega[1], axial_momentum)
+    spinor = Complex(q[0], q[3]), Complex(q[2], q[1])
+    motion = orbit(transverse, spin, -size * distance, spinor, momentum)
+    # The compiler makes vectors of the last axis only: let it be the longer one.
+    lanes_last = elapsed.shape[-1] < elapsed.shape[-2]
+    axis = -2 if lanes_last else -1
+    times = elapsed.swapaxes(-1, -2) if lanes_last else elapsed
+    alpha, beta, across = at(motion.along_time(axis), times)
+    square = 1 / (alpha.square + beta.square)
+    scale = jnp.sqrt(square)
+    turn = tuple(jnp.expand_dims(x, axis) * scale for x in turn)
+    q = _turned(turn, (alpha.re, beta.im, beta.re, alpha.im))
+    axial = jnp.broadcast_to(jnp.expand_dims(spin, axis), scale.shape)
+    rates = (across.im * square, across.re * square, axial)
+    if lanes_last:
+        q, rates = jax.tree.map(lambda x: x.swapaxes(-1, -2), (q, rates))
+    return jnp.stack(q, axis=-1), jnp.stack(rates, axis=-1)

@@ -55,7 +55,8 @@ class UniformGravity(AbstractPotential):
     of mass [m], body axes; ``gravity_space`` (..., 3) [m/s^2], space axes. The inertia of the
     scene is then the one about the fixed point.
 
-    ``on_axis`` (static): whether the centre is known to lie on body z; see ``axial``.
+    ``on_axis`` (static): whether the centre is known to lie on body z; see ``axial``. ``vertical``
+    (static): whether gravity is known to be along space z; then its other components are not used.
 
     Raises ValueError for a negative mass, NaN, or wrong shapes.
     """
@@ -64,16 +65,29 @@ class UniformGravity(AbstractPotential):
     centre_body: Float[Array, "*#b 3"]
     gravity_space: Float[Array, "*#b 3"]
     on_axis: bool = eqx.field(static=True, default=False)
+    vertical: bool = eqx.field(static=True, default=False)
 
     core_ranks = {"mass": 0, "centre_body": 1, "gravity_space": 1}  # noqa: RUF012
 
-    def __init__(self, mass, centre_body, gravity_space=(0.0, 0.0, -9.80665), on_axis=False):
+    def __init__(
+        self,
+        mass,
+        centre_body,
+        gravity_space=(0.0, 0.0, -9.80665),
+        on_axis=False,
+        vertical=False,
+    ):
         self.mass = as_number("mass", mass)
         self.centre_body = as_float_array("centre_body", centre_body, (3,))
         self.gravity_space = as_float_array("gravity_space", gravity_space, (3,))
         if is_concrete(self.mass):
             require(self.mass >= 0, f"mass must not be negative, got {mass}: give it in kg.")
-        self.on_axis = bool(on_axis)
+        self.on_axis, self.vertical = bool(on_axis), bool(vertical)
+        if self.vertical and is_concrete(self.gravity_space):
+            require(
+                self.gravity_space[..., :2] == 0,
+                f"vertical says that gravity is along space z, got {gravity_space}: leave it out.",
+            )
         if self.on_axis and is_concrete(self.centre_body):
             require(
                 self.centre_body[..., :2] == 0,
@@ -92,8 +106,14 @@ class UniformGravity(AbstractPotential):
         return cls(mass, jnp.stack([zero, zero, distance], axis=-1), gravity_space, True)
 
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array:
-        arm_space = attitude.to_space(components(self.centre_body))
-        return -self.mass * dot(components(self.gravity_space), arm_space)
+        centre, gravity = components(self.centre_body), components(self.gravity_space)
+
+        def along(i):
+            row = attitude.row(i)
+            return gravity[i] * (row[2] * centre[2] if self.on_axis else dot(row, centre))
+
+        work = along(2) if self.vertical else along(0) + along(1) + along(2)
+        return -self.mass * work
 
 
 def value_at(vector, t):
