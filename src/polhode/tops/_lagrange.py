@@ -65,9 +65,9 @@ class Orbit(NamedTuple):
     nu: Array
     spinors: Spinor
 
-    def along_time(self) -> "Orbit":
-        """With a last axis of length 1 on every array, ready for samples."""
-        return jax.tree.map(lambda x: x[..., None], self)
+    def along_time(self, axis: int) -> "Orbit":
+        """With an axis of length 1 after (-1) or before (-2) the lanes, ready for samples."""
+        return jax.tree.map(lambda x: jnp.expand_dims(x, axis), self)
 
 
 def _only(condition: Array, value: Array, other=0) -> Array:
@@ -135,6 +135,24 @@ def _places(f: Cubic, c: Curve, one: Array):
     return settle(jax.vmap(point, in_axes=(0, None, None))(stacked, c, one), one)
 
 
+def _settled_start(c: Curve, start: Complex, partner: Complex):
+    """E and h/E so that their product is h although it may be rounding (near the separatrix).
+
+    E and E/h are the same place; taken is the one far from 0, unless both are small.
+    """
+    large, other = start.square > _SMALL**2, partner.square > _SMALL**2
+    one = Complex(jnp.ones_like(c.h), jnp.zeros_like(c.h))
+    inverse = where(large, start, where(other, partner, one)).inverse
+    return (
+        where(~large & other, inverse, start),
+        where(large, inverse * c.h, where(other, partner * c.h, partner)),
+    )
+
+
+_SMALL = 0.05
+"""Above the greatest nome exp(-pi), which |E| is where E and h/E are conjugate."""
+
+
 def orbit(
     transverse: Array,
     spin: Array,
@@ -156,7 +174,7 @@ def orbit(
     f = settle(cubic(2 * transverse * pull, vertical, momentum), one)
     c = settle(curve(f.square), one)
     places, partners = _places(f, c, one)
-    start, partner = places.at(0), partners.at(0)
+    start, partner = _settled_start(c, places.at(0), partners.at(0))
     nu = jnp.sqrt(f.width) / (4 * c.stretch)
     zero = jnp.zeros_like(nu)
     nu_complex = Complex(_only(f.circular, nu), _only(~f.circular, nu))
@@ -169,21 +187,22 @@ def orbit(
 
     def parameter(value, rate, below):
         x, mirror = (where(below, v.at(1), v.at(2)) for v in (places, partners))
+        x, mirror = settle((x, mirror), one)
         turning = settle(log_slope(x, c.weights) - log_slope(mirror, c.weights), one)
         k = -(nu_complex * (1 + 2 * turning)) - f.momentum / 2
-        ahead, behind = mirror * start, x * partner
+        ahead, behind = settle((mirror * start, x * partner), one)
         behind_value, behind_slope = settle(product(behind, c.weights), one)
         ahead_value, ahead_slope = settle(product(ahead, c.weights), one)
         ratios = ahead_slope * ahead_value.inverse, behind_slope * behind_value.inverse
         inner = settle(base + ratios[0] - ratios[1], one)
         # From the rate at the start. Where nothing nutates (nu = 0) the phase alone turns.
         steady = (rate * value.conj).im / safe(value.square > 0, value.square)
-        k = where(f.live, k, Complex(steady, zero))
+        k = settle(where(f.live, k, Complex(steady, zero)), one)
         drift = (k * value).times_i - rate
         d = drift * (-nu_complex.conj.times_i) * (1 / (2 * nu * nu)) + inner * value
         d = settle(where(f.live, d, Complex(zero, zero)), one)
         scale = settle(origin * (ahead_value * behind_value).inverse, one)
-        angle = where(f.circular, Complex(jnp.ones_like(zero), zero), x)
+        angle = where(f.circular | (x.square == 0), Complex(jnp.ones_like(zero), zero), x)
         return Spinor(
             scale * (value + d),
             scale * d,
@@ -208,10 +227,9 @@ def at(o: Orbit, elapsed: Array) -> tuple[Complex, Complex, Complex]:
     weights, circular = o.curve.weights, o.circular
     angle = 2 * o.nu * elapsed
     # Whole periods of real exponentials; on the separatrix itself there is none.
-    size = jnp.sqrt(o.start.square)
-    periodic = ~circular & (o.curve.h > 0) & (size > 0)
+    periodic = ~circular & (o.curve.h > 0)
     period = -jnp.log(safe(periodic, o.curve.h))
-    count = jnp.floor((angle - jnp.log(safe(periodic, size))) / safe(periodic, period))
+    count = jnp.round(angle / safe(periodic, period))
     count = _only(periodic, jax.lax.stop_gradient(count))
     limit = 0.4 * math.log(jnp.finfo(angle.dtype).max)
     fall = jnp.clip(_only(periodic, count * period) - angle, -limit, limit)
@@ -240,6 +258,6 @@ def at(o: Orbit, elapsed: Array) -> tuple[Complex, Complex, Complex]:
         slope = where(circular, slope * nu, slope.times_i * nu)
         return settle((factor * whole, factor * (s.rate * whole + slope)), one)
 
-    values, rates = jax.vmap(parameter)(o.spinors)
-    alpha, beta = values.at(0), values.at(1)
-    return alpha, beta, (alpha * rates.at(1) - beta * rates.at(0)).times_i * 2
+    alpha, alpha_rate = parameter(jax.tree.map(lambda x: x[0], o.spinors))
+    beta, beta_rate = parameter(jax.tree.map(lambda x: x[1], o.spinors))
+    return alpha, beta, (alpha * beta_rate - beta * alpha_rate).times_i * 2

@@ -21,13 +21,23 @@ def eccentric_anomaly(mean: Float[Array, "*b"], eccentricity: Float[Array, "*b"]
     root = jnp.minimum(bounds, jnp.cbrt(m * (6 / 0.506)))
 
     def step(x, m, e):
-        return x - (x - e * jnp.sin(x) - m) / (1 - e * jnp.cos(x))
+        half = jnp.sin(x / 2)
+        return x - ((1 - e) * x + e * _lag(x) - m) / (1 - e + 2 * e * half * half)
 
     root = jax.lax.fori_loop(0, 8, lambda _, x: step(x, m, e), root)
     root = jax.lax.stop_gradient(root)
     for _ in range(2):
         root = step(root, sign * mean, eccentricity)
     return sign * root
+
+
+def _lag(x: Array) -> Array:
+    """x - sin x, without cancellation at small x."""
+    square = x * x
+    total = jnp.ones_like(x)
+    for k in range(8, 0, -1):  # below 1/2 the last term is under 1e-20
+        total = 1 - square * total / ((2 * k + 2) * (2 * k + 3))
+    return jnp.where(square < 0.25, x * square / 6 * total, x - jnp.sin(x))
 
 
 class KeplerOrbit(eqx.Module):
