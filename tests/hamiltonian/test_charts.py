@@ -152,6 +152,7 @@ def test_imports_go_one_way():
         {"frames"},
         {"fit"},
         {"io"},
+        {"ensemble"},
         {"plot"},
         {"cli"},
     ]
