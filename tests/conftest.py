@@ -24,7 +24,7 @@ def _shared_folder() -> Path | None:
 
 @pytest.fixture(scope="session")
 def shared() -> Path:
-    """The folder of recordings and truth states beside the checkout; the test is skipped without it."""
+    """The folder of recordings and truth states; the test is skipped where it is absent."""
     folder = _shared_folder()
     if folder is None:
         pytest.skip("the folder ../shared (recordings, truth states) is not beside this checkout")

@@ -21,6 +21,7 @@ from polhode._top_methods import (
     SymmetricTop as SymmetricTop,
 )
 from polhode._trajectory import Trajectory as Trajectory
+from polhode._version import __version__ as __version__
 from polhode.frames import (
     RotatingFrame as RotatingFrame,
     accelerometer as accelerometer,
@@ -48,5 +49,3 @@ from polhode.torques import (
     SpaceTorque as SpaceTorque,
     UniformGravity as UniformGravity,
 )
-
-__version__ = "0.1.0"

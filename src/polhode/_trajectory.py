@@ -10,6 +10,7 @@ from polhode import rotation
 from polhode._lanes import PARTS, along_time
 from polhode._scene import Scene
 from polhode._status import Status
+from polhode._version import __version__
 from polhode.hamiltonian import components, from_quaternion
 
 
@@ -142,8 +143,6 @@ class Trajectory(eqx.Module):
         }
         times = (time, np.asarray(self.ts), {"units": "s", "long_name": "time"})
         (coords if self.ts.ndim == 1 else data)["time" if self.ts.ndim == 1 else "ts"] = times
-        from polhode import __version__
-
         attributes = {
             "title": "Rotating rigid bodies",
             "source": f"polhode {__version__}",
