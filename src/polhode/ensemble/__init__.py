@@ -1,0 +1,15 @@
+"""Ensembles of any size: drawn by index, streamed into a store, resumed after a kill."""
+
+from polhode.ensemble._ensemble import Ensemble as Ensemble
+from polhode.ensemble._spreads import (
+    AnyAttitude as AnyAttitude,
+    Deviate as Deviate,
+    SpreadAttitude as SpreadAttitude,
+    SpreadEuler as SpreadEuler,
+    SpreadMoments as SpreadMoments,
+    SpreadMomentum as SpreadMomentum,
+    SpreadRates as SpreadRates,
+)
+from polhode.ensemble._statistics import Statistic as Statistic, quantile as quantile
+from polhode.ensemble._store import StoreError as StoreError
+from polhode.ensemble._stream import Progress as Progress, stream as stream

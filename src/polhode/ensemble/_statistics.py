@@ -1,0 +1,129 @@
+"""Statistics over the bodies of an ensemble at each time, kept instead of trajectories."""
+
+import dataclasses
+from collections.abc import Callable
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from polhode import rotation
+from polhode._trajectory import Trajectory
+
+
+@dataclasses.dataclass(frozen=True)
+class Statistic:
+    """One quantity whose distribution over the bodies is kept at every time.
+
+    ``quantity(trajectory)`` gives (bodies, T). Mean, standard deviation, least and greatest are
+    always kept; with ``low < high`` also a histogram of ``bins`` equal bins between them (and what
+    lies outside), from which quantiles follow to within a bin. Bodies that did not finish do not
+    count. Raises ValueError for a range or number of bins that makes no histogram.
+    """
+
+    name: str
+    quantity: Callable[[Trajectory], Array]
+    units: str = "1"
+    low: float | None = None
+    high: float | None = None
+    bins: int = 100
+
+    def __post_init__(self):
+        if not self.name.isidentifier():
+            raise ValueError(f"the name of a statistic must be an identifier, got {self.name!r}.")
+        if (self.low is None) != (self.high is None):
+            raise ValueError(f"statistic {self.name}: give both low and high, or neither.")
+        if self.low is not None and not self.low < self.high:
+            raise ValueError(f"statistic {self.name}: low {self.low} must be below {self.high}.")
+        if self.bins < 1:
+            raise ValueError(f"statistic {self.name}: bins must be positive, got {self.bins}.")
+
+    @property
+    def edges(self) -> np.ndarray:
+        """(bins + 1,) edges of the histogram."""
+        return np.linspace(self.low, self.high, self.bins + 1)
+
+
+def rate(trajectory: Trajectory) -> Array:
+    """|omega| [rad/s]."""
+    return jnp.linalg.norm(trajectory.omega_body, axis=-1)
+
+
+def tilt(trajectory: Trajectory) -> Array:
+    """Angle [rad] between the body's z axis and that of space."""
+    matrix = rotation.to_matrix(trajectory.wxyz)
+    return jnp.arctan2(jnp.hypot(matrix[..., 0, 2], matrix[..., 1, 2]), matrix[..., 2, 2])
+
+
+def energy(trajectory: Trajectory) -> Array:
+    """Kinetic plus potential energy [J]."""
+    return trajectory.energy
+
+
+def momentum(trajectory: Trajectory) -> Array:
+    """Size of the angular momentum [kg m^2/s]."""
+    return jnp.linalg.norm(trajectory.momentum_body, axis=-1)
+
+
+QUANTITIES = {
+    "rate": (rate, "rad s-1"),
+    "tilt": (tilt, "rad"),
+    "energy": (energy, "J"),
+    "momentum": (momentum, "kg m2 s-1"),
+}
+"""What scene files can name: quantity and units."""
+
+
+def summarise(statistic: Statistic, trajectory: Trajectory, real: Bool[Array, "n"]) -> dict:
+    """Count, mean, sum of squared deviations, extremes and histogram of the bodies of a block that
+    are ``real`` and finished; arrays (T,), the histogram (T, bins + 2) with both outsides.
+    """
+    values: Float[Array, "n t"] = statistic.quantity(trajectory)
+    good = (real & trajectory.successful)[:, None] & jnp.isfinite(values)
+    count = jnp.sum(good, axis=0, dtype=jnp.int32)
+    weight = jnp.maximum(count, 1).astype(values.dtype)
+    mean = jnp.sum(jnp.where(good, values, 0), axis=0) / weight
+    found = {
+        "count": count,
+        "mean": mean,
+        "squares": jnp.sum(jnp.where(good, (values - mean[None]) ** 2, 0), axis=0),
+        "least": jnp.min(jnp.where(good, values, jnp.inf), axis=0),
+        "greatest": jnp.max(jnp.where(good, values, -jnp.inf), axis=0),
+    }
+    if statistic.low is not None:
+        edges = jnp.asarray(statistic.edges, values.dtype)
+        place = jnp.where(good, jnp.searchsorted(edges, values, side="right"), 0)
+        columns = jnp.broadcast_to(jnp.arange(values.shape[1])[None], values.shape)
+        empty = jnp.zeros((values.shape[1], statistic.bins + 2), jnp.int32)
+        found["histogram"] = empty.at[columns, place].add(good.astype(jnp.int32))
+    return found
+
+
+def merge(count: np.ndarray, mean: np.ndarray, squares: np.ndarray) -> tuple:
+    """Counts, means and sums of squares of blocks (blocks, T) as those of all, (T,) float64: block
+    after block, so that the result does not depend on who computed them (Chan et al. 1979).
+    """
+    total = np.zeros(count.shape[1])
+    average, spread = np.zeros_like(total), np.zeros_like(total)
+    for n, m, s in zip(count.astype(float), mean.astype(float), squares.astype(float)):
+        both = np.maximum(total + n, 1)
+        away = m - average
+        average = average + away * n / both
+        spread = spread + s + away**2 * total * n / both
+        total = total + n
+    return total, average, spread
+
+
+def quantile(histogram: np.ndarray, edges: np.ndarray, q: float) -> np.ndarray:
+    """The q-quantile at each time from histograms (T, bins + 2), linear within a bin; NaN where it
+    lies outside the edges or nothing was counted.
+    """
+    sums = np.cumsum(histogram, axis=-1, dtype=float)
+    out = np.full(len(sums), np.nan)
+    for k, row in enumerate(sums):
+        target = q * row[-1]
+        j = int(np.searchsorted(row, target, side="left"))
+        if row[-1] and 1 <= j < len(edges):
+            part = (target - row[j - 1]) / (row[j] - row[j - 1])
+            out[k] = edges[j - 1] + part * (edges[j] - edges[j - 1])
+    return out

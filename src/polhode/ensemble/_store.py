@@ -1,0 +1,225 @@
+"""The Zarr store of an ensemble run: finished chunks stay valid whatever happens to the writer.
+
+A chunk of bodies is one chunk in each array along ``body``. Its data are written and synced first,
+then its cell of ``checksum``, a chunk file of its own: a chunk counts as finished only when the
+checksum of what can be read equals that cell. Nothing else needs to be kept for resuming.
+"""
+
+import contextlib
+import errno
+import json
+import os
+import secrets
+import shutil
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_MARK = 1 << 32  # above every 32-bit checksum: an empty cell is 0
+
+
+class StoreError(RuntimeError):
+    """A store that cannot be used as asked: of another run, in use, not ours, or a full disk."""
+
+
+def _zarr() -> Any:
+    try:
+        import zarr
+    except ImportError as error:
+        raise ImportError("ensembles on disk need zarr: pip install 'polhode[scale]'") from error
+    return zarr
+
+
+@contextlib.contextmanager
+def locked(path: Path, process: int, processes: int) -> Iterator[None]:
+    """Hold the store for this process; the system lets go when the process ends, however it ends.
+
+    One process holds it alone; of several, each holds its own number and all share the store.
+    """
+    try:
+        import fcntl
+    except ImportError as error:  # Windows
+        raise StoreError("stores of ensembles need the file locks of Unix") from error
+
+    with contextlib.ExitStack() as stack:
+
+        def hold(name: str, kind: int, who: str) -> None:
+            try:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                file = stack.enter_context(open(path.with_name(name), "a"))
+            except OSError as error:
+                raise StoreError(
+                    f"cannot write beside {path}: {error.strerror}; name a place that you can"
+                    " write to."
+                ) from error
+            try:
+                fcntl.flock(file, kind | fcntl.LOCK_NB)
+            except OSError as error:
+                raise StoreError(
+                    f"{path} is in use by {who}: wait until it ends, or write to another store."
+                ) from error
+
+        alone = processes == 1
+        hold(f".{path.name}.lock", fcntl.LOCK_EX if alone else fcntl.LOCK_SH, "another run")
+        if not alone:
+            hold(f".{path.name}.lock{process}", fcntl.LOCK_EX, f"another process {process}")
+        yield
+
+
+class Store:
+    """An opened store; ``identity`` is what must agree for a run to go on with it."""
+
+    def __init__(self, path: Path, identity: dict[str, Any]):
+        zarr = _zarr()
+        self.path = path
+        try:
+            # values that equal the fill value are written too: every finished chunk has its files
+            with zarr.config.set({"array.write_empty_chunks": True}):
+                self.group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
+                arrays = dict(self.group.arrays())
+            found = self.group.attrs["polhode"]
+        except (KeyError, ValueError, OSError) as error:
+            raise StoreError(
+                f"{path} exists and is no store of an ensemble run ({type(error).__name__}): it was"
+                " left as it is; name another path."
+            ) from error
+        found = json.loads(found)
+        different = [
+            f"  {key}: the store has {_short(found.get(key))}, this run {_short(value)}"
+            for key, value in identity.items()
+            if found.get(key) != value
+        ]
+        if different:
+            raise StoreError(
+                f"{path} holds another run and was left as it is:\n" + "\n".join(different) + "\n"
+                "  to mend: use the scene and versions of the store, or name another path."
+            )
+        self.chunk = int(found["chunk"])
+        self.marks = arrays["checksum"]
+        self.arrays = {
+            name: array
+            for name, array in arrays.items()
+            if array.attrs.get("rows_per_chunk") is not None
+        }
+
+    def sweep(self) -> None:
+        """Remove half-written files of a writer that was killed."""
+        for file in self.path.rglob("*.partial"):
+            file.unlink(missing_ok=True)
+
+    def finished(self) -> np.ndarray:
+        """(chunks,) whether a chunk was marked as finished; the data are not looked at."""
+        return self.marks[:] != 0
+
+    def rows(self, name: str, chunk: int) -> slice:
+        """The rows of an array that belong to a chunk."""
+        step = int(self.arrays[name].attrs["rows_per_chunk"])
+        return slice(chunk * step, min((chunk + 1) * step, self.arrays[name].shape[0]))
+
+    def valid(self, chunk: int) -> bool:
+        """Whether the chunk can be read and has the checksum it was given."""
+        try:
+            parts = {name: a[self.rows(name, chunk)] for name, a in self.arrays.items()}
+            return int(self.marks[chunk]) == checksum(parts)
+        except Exception:  # a damaged file fails in whichever codec meets it first
+            return False
+
+    def write(self, chunk: int, parts: dict[str, np.ndarray]) -> None:
+        """Write a chunk so that it is whole and on the disk before it counts as finished."""
+        try:
+            for name, values in parts.items():
+                self.arrays[name][self.rows(name, chunk)] = values
+                self._sync(name, self.arrays[name], chunk)
+            self.marks[chunk] = np.uint64(checksum(parts))
+            self._sync("checksum", self.marks, chunk)
+        except OSError as error:
+            if error.errno in (errno.ENOSPC, errno.EDQUOT):
+                raise StoreError(
+                    f"the disk of {self.path} is full: {int(self.finished().sum())} of"
+                    f" {self.marks.shape[0]} chunks are finished and kept; make room and give the"
+                    " same command again."
+                ) from error
+            raise
+
+    def _sync(self, name: str, array: Any, chunk: int) -> None:
+        key = array.metadata.encode_chunk_key((chunk,) + (0,) * (array.ndim - 1))
+        with open(self.path / name / key, "rb") as file:
+            os.fsync(file.fileno())
+
+
+def _absent(dtype: Any) -> Any:
+    """What readers see where a chunk is not finished: NaN, or -1 for whole numbers."""
+    return np.nan if np.issubdtype(dtype, np.floating) else -1
+
+
+def _short(value: Any) -> str:
+    text = str(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def consolidate(path: Path) -> None:
+    """Gather the metadata of all arrays in one file, which xarray looks for first."""
+    with warnings.catch_warnings():
+        # Zarr points out that version 3 of its specification does not have this yet
+        warnings.simplefilter("ignore", UserWarning)
+        _zarr().consolidate_metadata(path, zarr_format=3)
+
+
+def checksum(parts: dict[str, np.ndarray]) -> int:
+    """CRC-32C over the bytes of all parts in the order of their names, and a mark above."""
+    import google_crc32c
+
+    value = 0
+    for name in sorted(parts):
+        value = google_crc32c.extend(value, np.ascontiguousarray(parts[name]).tobytes())
+    return _MARK | value
+
+
+def create(
+    path: Path,
+    identity: dict[str, Any],
+    chunk: int,
+    ts: np.ndarray,
+    layout: dict[str, tuple],
+    attributes: dict[str, Any],
+) -> None:
+    """Make an empty store, whole or not at all; nothing happens when another process was faster.
+
+    ``layout``: name -> (shape, rows per chunk, dtype, dimensions, attributes).
+    """
+    zarr = _zarr()
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
+    try:
+        settings = json.dumps(identity | {"chunk": chunk})
+        group = zarr.create_group(
+            temporary, zarr_format=3, attributes=attributes | {"polhode": settings}
+        )
+        time = group.create_array(
+            "time", shape=ts.shape, chunks=ts.shape, dtype=ts.dtype, dimension_names=("time",),
+            attributes={"units": "s", "long_name": "time"},
+        )  # fmt: skip
+        time[:] = ts
+        for name, (shape, rows, dtype, dimensions, words) in layout.items():
+            group.create_array(
+                name, shape=shape, chunks=(rows, *shape[1:]), dtype=dtype,
+                dimension_names=dimensions, attributes=words | {"rows_per_chunk": rows},
+                compressors=[zarr.codecs.Crc32cCodec()], fill_value=_absent(dtype),
+            )  # fmt: skip
+        count = -(-identity["bodies"] // chunk)
+        group.create_array(
+            "checksum", shape=(count,), chunks=(1,), dtype="uint64", dimension_names=("chunk",),
+            attributes={"long_name": "CRC-32C of each finished chunk plus 2^32; 0: not finished"},
+            compressors=[zarr.codecs.Crc32cCodec()],
+        )  # fmt: skip
+        consolidate(temporary)
+        # a rename does not replace a folder that holds something
+        with contextlib.suppress(FileExistsError):
+            os.rename(temporary, path)
+    except OSError as error:
+        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+            raise StoreError(f"cannot make the store {path}: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
