@@ -1,0 +1,151 @@
+import dataclasses
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+import top_cases
+
+import polhode as ph
+from polhode import tops
+from polhode._top_methods import LagrangeTop
+from polhode.torques import Rotor, UniformGravity
+
+NAMES = list(top_cases.CASES)
+NUMBERS = np.array(list(top_cases.CASES.values())).T  # (10, cases): cases are lanes
+
+
+def moved(numbers, t):
+    """State (7, N) after t (N,) of lanes of ten numbers."""
+    a, c, pull, *rest = numbers
+    omega = jnp.stack(rest[:3], axis=-1)
+    q = jnp.stack(rest[3:], axis=-1)
+    q = q / jnp.sqrt(jnp.sum(q * q, axis=-1, keepdims=True))
+    zero = jnp.zeros_like(pull)
+    force = jnp.stack([zero, zero, -pull], axis=-1)
+    wxyz, rates = tops.lagrange_motion(
+        a, force, jnp.ones_like(pull), q, omega, c * omega[:, 2], t[:, None]
+    )
+    return jnp.concatenate([rates[:, 0], wxyz[:, 0]], axis=-1).T
+
+
+VALUE = jax.jit(moved)
+SLOPE = jax.jit(lambda x, d, t: jax.jvp(lambda y: moved(y, t), (x,), (d,))[1])
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return [top_cases.truth(name) for name in NAMES]
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(jnp.float64, 2e-14), (jnp.float32, 2e-5)])
+def test_every_regime_is_exact(exact, dtype, bound):
+    x = jnp.asarray(NUMBERS, dtype)
+    got = np.array(VALUE(tuple(x), jnp.full(len(NAMES), top_cases.TIME, dtype)), float).T
+    for name, state, entry in zip(NAMES, got, exact):
+        error = np.abs(state - entry["state"]).max() / max(1, np.abs(entry["state"]).max())
+        # an unstable equilibrium or separatrix multiplies the rounding of the numbers given
+        growth = max(1.0, np.abs(entry["gradient"]).max() / 10)
+        assert error < bound * growth, (name, error)
+
+
+def test_every_gradient_is_exact(exact):
+    x = tuple(jnp.asarray(NUMBERS))
+    t = jnp.full(len(NAMES), top_cases.TIME)
+    columns = []
+    for i in range(10):
+        direction = tuple(
+            jnp.ones_like(v) if k == i else jnp.zeros_like(v) for k, v in enumerate(x)
+        )
+        columns.append(np.array(SLOPE(x, direction, t)))
+    gradients = np.stack(columns, axis=-1)  # (7, cases, 10)
+    for j, (name, entry) in enumerate(zip(NAMES, exact)):
+        if name == "marginal_sleeping":
+            continue  # three equal roots: the value is exact, the gradient is not
+        want = np.array(entry["gradient"])
+        error = np.abs(gradients[:, j] - want).max() / np.abs(want).max()
+        assert error < 1e-11, (name, error)
+
+
+def test_the_error_does_not_depend_on_the_horizon(shared):
+    truth = np.load(shared / "peers" / "truth" / "J3_lag.npz")
+    q, w = truth["q0"], truth["w0"]
+    scene = ph.Scene(
+        ph.Inertia.axisymmetric(1.0, 0.5), UniformGravity.axial(1.0, 0.5, (0, 0, -2.0))
+    )
+    ts = np.concatenate([[0.0], truth["times"]])
+    got = ph.simulate(scene, ph.State(q, w), ts, LagrangeTop())
+    for k in (0, len(truth["times"]) // 2, -1):
+        a, b = np.array(got.wxyz)[:, 1:][:, k], truth["q"][:, k]
+        a = a * np.sign(np.sum(a * b, -1, keepdims=True))
+        angle = 2 * np.linalg.norm((a - b) - truth["q_lo"][:, k], axis=-1)
+        assert np.median(angle) < 1e-13, (k, np.median(angle))
+        assert angle.max() < 1e-12
+
+
+def test_any_direction_of_gravity_and_wheels_on_the_axis():
+    scene = ph.Scene(
+        ph.Inertia.axisymmetric(1.3, 0.5),
+        UniformGravity(1.2, (0, 0, -0.5), (1.0, -2.0, 0.7)),
+        rotors=Rotor([0, 0, 1.0], inertia=0.1, speed=3.0, torque=0.0)
+        + Rotor([0, 0, 2.0], momentum=0.7),
+    )
+    state = ph.State([0.5, 0.5, 0.5, -0.5], [[0.3, 0.2, 0.7], [0.0, -1.0, -2.0]])
+    got = ph.simulate(scene, state, [0.0, 1.0, 7.0], LagrangeTop())
+    want = ph.simulate(scene, state, [0.0, 1.0, 7.0], ph.LiePoisson(), rtol=1e-12)
+    assert np.abs(np.array(got.omega_body - want.omega_body)).max() < 1e-9
+    assert np.abs(np.array(got.energy - got.energy[:, :1])).max() < 1e-13
+    vertical = np.array(scene.potential.gravity_space)
+    about = np.array(got.momentum_space) @ vertical
+    assert np.abs(about - about[:, :1]).max() < 1e-13
+    assert np.abs(np.array(got.wxyz - want.wxyz)).max() < 1e-9
+
+
+def test_gni_lagrange_top():
+    """Hairer, Lubich & Wanner, Geometric Numerical Integration, VII.5, example 5.4, to t = 30."""
+    momentum, q = np.array([0.2, 1.0, 0.4]), np.array([0.4, 0.2, 0.4, 0.8])
+    moments = np.array([0.5, 0.5, 1.0])
+    numbers = (0.5, 1.0, 1.0, *(momentum / moments), *q)
+    lanes = tuple(jnp.full(len(NAMES), x) for x in numbers)
+    got = np.array(VALUE(lanes, jnp.full(len(NAMES), 30.0)))[:, 0]
+    want = [0.9599571778198639, -0.36416972569944916, 0.4]
+    assert np.abs(got[:3] * moments - want).max() < 1e-13
+    wxyz = np.array([
+        -0.43556098558439443, -0.3700636549040742, 0.26480479131047296, -0.7766710639999446,
+    ])  # fmt: skip
+    assert np.abs(got[3:] * np.sign(got[3:] @ wxyz) - wxyz).max() < 1e-13
+
+
+def test_what_the_law_asks_for():
+    record = ph.Record()
+    state = ph.State([1.0, 0, 0, 0], [0.0, 0.1, 1.0])
+    axial = UniformGravity.axial(1.0, 0.5)
+    top = ph.Scene(ph.Inertia.axisymmetric(1.0, 0.5), axial)
+    law = LagrangeTop()
+    assert law.why_not(top, state, record) is None
+    assert (
+        law.why_not(ph.Scene(ph.Inertia.from_moments([1.0, 1.0, 0.5]), axial), state, record)
+        is None
+    )
+    refused = {
+        "differ": ph.Scene(ph.Inertia.from_moments([1.0, 1.1, 0.5]), axial),
+        "centre": dataclasses.replace(top, potential=UniformGravity(1.0, (0.1, 0.0, 0.5))),
+        "uniform gravity": ph.Scene(ph.Inertia.axisymmetric(1.0, 0.5)),
+        "torque": dataclasses.replace(top, torque=ph.BodyTorque([0.0, 0.0, 1.0])),
+        "body z": dataclasses.replace(top, rotors=Rotor([1.0, 0, 0], momentum=1.0)),
+        "motor": dataclasses.replace(top, rotors=Rotor([0, 0, 1.0], 0.1, speed=1.0, torque=0.1)),
+    }
+    for word, scene in refused.items():
+        assert word in law.why_not(scene, state, record)
+    known = []
+    jax.jit(lambda s: known.append(law.why_not(s, state, record)) or 0)(top)
+    assert known == [None]
+    with pytest.raises(ph.SimulationError, match="law"):
+        ph.simulate(refused["differ"], state, [0.0, 1.0], law)
+    with pytest.raises(ValueError, match="torque acts"):
+        ph.simulate(refused["torque"], state, [0.0, 1.0], law)

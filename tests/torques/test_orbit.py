@@ -1,0 +1,90 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from mpmath import mp, mpf
+
+import polhode as ph
+from polhode.torques import KeplerOrbit, eccentric_anomaly
+
+ECCENTRICITIES = [0.0, 0.01, 0.3, 0.7, 0.95, 0.999]
+ANOMALIES = [-3.14, -1.5, -1e-3, 0.0, 1e-6, 0.02, 0.4, 2.0, 3.1]
+
+
+def _root(m, e):
+    with mp.workdps(40):
+        return mp.findroot(
+            lambda x: x - mpf(e) * mp.sin(x) - mpf(m), mpf(m) + mpf(e) * mp.sign(m) / 2
+        )
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(jnp.float64, 4e-16), (jnp.float32, 2e-7)])
+def test_keplers_equation(dtype, bound):
+    e, m = (x.ravel().astype(dtype) for x in np.meshgrid(ECCENTRICITIES, ANOMALIES))
+    got = jax.jit(eccentric_anomaly)(jnp.asarray(m), jnp.asarray(e))
+    slopes = jax.vmap(jax.grad(eccentric_anomaly, (0, 1)))(jnp.asarray(m), jnp.asarray(e))
+    for k in range(len(m)):
+        root = _root(float(m[k]), float(e[k]))
+        flat = 1 - mpf(float(e[k])) * mp.cos(root)
+        # an error of one ulp in M moves E by 1/(1 - e cos E)
+        scale = max(abs(float(root)), abs(float(m[k])) / float(flat), 1e-6)
+        assert abs(float(got[k]) - float(root)) < 8 * bound * scale, (m[k], e[k])
+        for slope, want in zip(slopes, (1 / flat, mp.sin(root) / flat)):
+            tolerance = 100 * bound * max(abs(float(want)), 1) / float(flat)
+            assert abs(float(slope[k]) - float(want)) < tolerance, (m[k], e[k])
+
+
+def test_the_orbit_obeys_newton():
+    orbit = KeplerOrbit([1.0, 2.5], 1.3, 0.4, 0.7, 0.3, 1.1, 0.2, 0.5)
+    for t in (-3.0, 0.0, 2.0, 40.0):
+        velocity = jax.jacfwd(orbit)
+        place, push = orbit(t), jax.jacfwd(velocity)(t)
+        pull = orbit.mu[:, None] * place / jnp.linalg.norm(place, axis=-1, keepdims=True) ** 3
+        assert np.abs(np.array(push + pull)).max() < 1e-12
+        speed = jnp.sum(velocity(t) ** 2, axis=-1)
+        energy = speed / 2 - orbit.mu / jnp.linalg.norm(place, axis=-1)
+        assert np.abs(np.array(energy + orbit.mu / (2 * 1.3))).max() < 1e-14
+        normal = jnp.cross(place, velocity(t))
+        pole = [np.sin(0.7) * np.sin(0.3), -np.sin(0.7) * np.cos(0.3), np.cos(0.7)]
+        assert (
+            np.abs(np.array(normal / jnp.linalg.norm(normal, axis=-1, keepdims=True)) - pole).max()
+            < 1e-14
+        )
+
+
+def test_refused_orbits():
+    with pytest.raises(ValueError, match="eccentricity"):
+        KeplerOrbit(1.0, 1.0, 1.0)
+    with pytest.raises(ValueError, match="semi_major_axis"):
+        KeplerOrbit(1.0, -1.0)
+
+
+def test_pitch_libration_on_a_circular_orbit():
+    """theta'' = -3 n^2 (Ix - Iz)/Iy sin theta cos theta in the orbit's turning frame.
+
+    Small librations, and their derivative with respect to the moments.
+    """
+    n, a = 0.5, 2.0
+    orbit = KeplerOrbit(n**2 * a**3, a, inclination=np.pi / 2)  # normal: space -y
+    small, t = 1e-5, 7.0
+
+    def angle(moments):
+        scene = ph.Scene(ph.Inertia.from_moments(moments), ph.GravityGradient(n**2 * a**3, orbit))
+        # the body's z axis points along the radius (space x), tilted by a small angle about -y
+        tilt = -(jnp.pi / 2) * -1 - small
+        q = jnp.stack([jnp.cos(tilt / 2), 0 * tilt, jnp.sin(tilt / 2), 0 * tilt])
+        state = ph.State(q, jnp.array([0.0, -n, 0.0]))
+        got = ph.simulate(scene, state, jnp.array([0.0, t]), ph.LiePoisson(), rtol=1e-11)
+        w, _, y, _ = got.wxyz[-1]
+        turned = -2 * jnp.arctan2(y, w)  # about the normal
+        return jnp.sin(turned - n * t + jnp.pi / 2)
+
+    moments = jnp.array([2.0, 2.2, 1.0])
+    value, slope = jax.jit(jax.value_and_grad(angle))(moments)
+
+    def linear(i):
+        return small * jnp.cos(jnp.sqrt(3 * (i[0] - i[2]) / i[1]) * n * t)
+
+    want, want_slope = jax.value_and_grad(linear)(moments)
+    assert abs(value - want) < 1e-8 * small + 2 * small**3 + 1e-11
+    assert np.abs(np.array(slope - want_slope)).max() < 1e-3 * small

@@ -1,0 +1,57 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import polhode as ph
+from polhode.torques import FeedbackTorque, QuadraticDamping
+
+
+def test_quadratic_damping_about_one_axis():
+    """I domega/dt = -c omega^2: omega = w/(1 + c w t/I), with its derivative; at rest nothing."""
+    state = ph.State([1.0, 0, 0, 0], [[0.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
+    ts = jnp.array([0.0, 3.0])
+
+    def last(c):
+        scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 2.5]), torque=QuadraticDamping(c))
+        return ph.simulate(scene, state, ts, ph.LiePoisson(), rtol=1e-11).omega_body[:, -1, 1]
+
+    got, slope = last(0.3), jax.jacrev(last)(0.3)
+    assert abs(got[0] - 2 / (1 + 0.3 * 2 * 3 / 2)) < 1e-10
+    assert abs(slope[0] + 2 * 3 / (1 + 0.9) ** 2) < 1e-9
+    assert got[1] == 0
+    assert slope[1] == 0
+    with pytest.raises(ValueError, match="must not be negative"):
+        QuadraticDamping([0.1, -0.1, 0.1])
+
+
+def test_feedback_in_both_charts():
+    """A torque that restores the attitude and damps."""
+
+    def law(t, wxyz, omega):
+        assert wxyz.shape == (4,)
+        return -0.3 * jnp.sign(wxyz[0]) * wxyz[1:] - 0.1 * omega + 0.01 * jnp.sin(t)
+
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 2.5]), torque=FeedbackTorque(law))
+    state = ph.State([0.8, 0.3, 0.4, 0.2], [[0.1, 0.2, 0.3], [0.4, -0.5, 0.1]])
+    ts = [0.0, 2.0, 4.0]
+    got = ph.simulate(scene, state, ts, ph.LiePoisson(), rtol=1e-11)
+    chart = ph.simulate(scene, state, ts, ph.EulerAngles(), rtol=1e-11)
+    assert np.abs(np.array(got.omega_body - chart.omega_body)).max() < 1e-8
+    with pytest.raises(TypeError, match="fn\\(t, wxyz, omega_body\\)"):
+        FeedbackTorque([1.0, 0.0, 0.0])
+
+
+def test_kovalevskaya_top():
+    """A = B = 2 C, centre in the equator: |(w1 + i w2)^2 - (mu/C)(u1 + i u2)|^2 is constant."""
+    c, mu = 0.5, 0.7
+    inertia = ph.Inertia.from_moments([2 * c, 2 * c, c])
+    scene = ph.Scene(inertia, ph.UniformGravity(1.0, (mu, 0.0, 0.0), (0.0, 0.0, -1.0)))
+    state = ph.State([0.8, 0.3, 0.4, 0.2], [[0.1, 0.2, 0.3], [0.4, -0.5, 1.5]])
+    got = ph.simulate(scene, state, jnp.linspace(0, 8, 9), ph.LiePoisson(), rtol=1e-12)
+    w, u = np.array(got.omega_body), np.array(ph.rotation.to_matrix(got.wxyz))[..., 2, :]
+    xi = (w[..., 0] + 1j * w[..., 1]) ** 2 + mu / c * (u[..., 0] + 1j * u[..., 1])
+    minus = (w[..., 0] + 1j * w[..., 1]) ** 2 - mu / c * (u[..., 0] + 1j * u[..., 1])
+    spread = min(np.ptp(np.abs(x), axis=-1).max() for x in (xi, minus))
+    assert spread < 1e-9
+    assert max(np.ptp(np.abs(x), axis=-1).max() for x in (xi, minus)) > 0.1  # the sign matters
