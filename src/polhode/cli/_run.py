@@ -5,6 +5,7 @@ import importlib.util
 import sys
 from pathlib import Path
 
+from polhode.cli import _ensemble
 from polhode.cli._options import add_scene, read
 
 
@@ -25,6 +26,7 @@ def register(commands) -> argparse.ArgumentParser:
     )  # fmt: skip
     command.add_argument("--no-figure", action="store_true", help="do not draw the figure")
     command.add_argument("-q", "--quiet", action="store_true", help="print errors only")
+    _ensemble.add_options(command)
     command.set_defaults(command=run)
     return command
 
@@ -32,6 +34,10 @@ def register(commands) -> argparse.ArgumentParser:
 def run(arguments: argparse.Namespace) -> int:
     """Do the job; 0, or 1 when some clones did not finish."""
     file = read(arguments)
+    if file.ensemble is not None:
+        _require("rich", "zarr", extra="scale")
+        return _ensemble.run(arguments, file, arguments.output)
+    _ensemble.refuse_options(arguments, file)
     with_figure = file.output.figure and not arguments.no_figure
     _require("rich", "xarray", "h5netcdf", "h5py", *(("matplotlib",) if with_figure else ()))
     from rich.console import Console
@@ -59,11 +65,13 @@ def run(arguments: argparse.Namespace) -> int:
     return _failures(outcome.trajectory.status)
 
 
-def _require(*packages: str) -> None:
+def _require(*packages: str, extra: str = "cli") -> None:
     """ImportError now, rather than after the work, when a package is missing."""
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:
-        raise ImportError(f"`polhode run` needs {', '.join(missing)}: pip install 'polhode[cli]'")
+        raise ImportError(
+            f"`polhode run` needs {', '.join(missing)}: pip install 'polhode[{extra}]'"
+        )
 
 
 def _target(path: Path | str) -> Path:

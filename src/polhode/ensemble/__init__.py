@@ -1,6 +1,7 @@
 """Ensembles of any size: drawn by index, streamed into a store, resumed after a kill."""
 
 from polhode.ensemble._ensemble import Ensemble as Ensemble
+from polhode.ensemble._scene_file import build_ensemble as build_ensemble
 from polhode.ensemble._spreads import (
     AnyAttitude as AnyAttitude,
     Deviate as Deviate,

@@ -61,7 +61,7 @@ class Ensemble(eqx.Module):
         each, shared = eqx.partition(parts, is_lane_tree(parts))
         return jax.tree.map(lambda x: x[indices], each), shared
 
-    def draw(self, indices: Int[np.ndarray, "n"]) -> tuple[Scene, State]:
+    def draw(self, indices: Int[np.ndarray, " n"]) -> tuple[Scene, State]:
         """Scene and state of the bodies ``indices`` (n,), with the leading axis n."""
         each, shared = self.lanes(indices)
         return draw(each, shared, jnp.asarray(indices, jnp.uint32), self.spreads, self.seed)

@@ -39,7 +39,7 @@ class Block:
     def __init__(
         self,
         ensemble: Ensemble,
-        ts: Float[Array, "t"],
+        ts: Float[Array, " t"],
         method: AbstractMethod | None,
         rtol: float | None,
         trajectories: bool,

@@ -26,7 +26,7 @@ class Deviate(eqx.Module):
     in +-``scale`` with ``uniform=True``.
     """
 
-    scale: Float[Array, "3"]
+    scale: Float[Array, " 3"]
     uniform: bool = eqx.field(static=True, default=False)
 
     def __call__(self, key: Array) -> Array:
@@ -90,7 +90,7 @@ class AnyAttitude(eqx.Module):
 class SpreadEuler(eqx.Module):
     """Euler ``angles`` (3,) [rad] of a sequence, each with its deviate [rad]."""
 
-    angles: Float[Array, "3"]
+    angles: Float[Array, " 3"]
     deviate: Deviate
     sequence: rotation.Sequence = eqx.field(static=True)
 
@@ -115,7 +115,7 @@ class SpreadMomentum(eqx.Module):
     that the spreads before this one left.
     """
 
-    momentum: Float[Array, "3"]
+    momentum: Float[Array, " 3"]
     deviate: Deviate | None = None
 
     def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:

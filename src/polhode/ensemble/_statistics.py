@@ -74,7 +74,7 @@ QUANTITIES = {
 """What scene files can name: quantity and units."""
 
 
-def summarise(statistic: Statistic, trajectory: Trajectory, real: Bool[Array, "n"]) -> dict:
+def summarise(statistic: Statistic, trajectory: Trajectory, real: Bool[Array, " n"]) -> dict:
     """Count, mean, sum of squared deviations, extremes and histogram of the bodies of a block that
     are ``real`` and finished; arrays (T,), the histogram (T, bins + 2) with both outsides.
     """

@@ -39,7 +39,7 @@ class Progress(NamedTuple):
 
 def stream(
     ensemble: Ensemble,
-    ts: Float[ArrayLike, "t"],
+    ts: Float[ArrayLike, " t"],
     path: str | os.PathLike,
     *,
     method: AbstractMethod | None = None,
@@ -68,8 +68,8 @@ def stream(
       ``processes``. The last to finish writes the summaries of the statistics.
     - ``attributes``: text to keep in the store, such as the scene file; part of its identity.
 
-    Raises ``polhode.ensemble.StoreError`` for a store of another scene or version, in use, or on a full disk, and
-    ValueError for a chunk or memory that does not fit.
+    Raises ``polhode.ensemble.StoreError`` for a store of another scene or version, in use, or on
+    a full disk, and ValueError for a chunk or memory that does not fit.
     """
     path = Path(path).resolve()
     statistics = tuple(statistics)

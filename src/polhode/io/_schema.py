@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from polhode.io import _unit
+from polhode.io._ensemble import read_ensemble
 from polhode.io._error import SceneFileError, shorten
 from polhode.io._parts import read_euler, read_inertia, read_parts, read_sequence
 from polhode.io._specification import (
@@ -27,6 +28,7 @@ from polhode.io._table import Table
 TOP = (
     "title", "source", "epoch", "frame", "axis_names", "inertia", "state", "times", "potential",
     "torque", "rotors", "method", "monte_carlo", "published", "observations", "output",
+    "ensemble",
 )  # fmt: skip
 METHODS = ("auto", "closed-form", "lie-poisson", "euler-angles")
 QUANTITIES = ("moments", "euler", "attitude", "omega_body", "momentum_body")
@@ -85,6 +87,7 @@ def parse_scene(text: str, path: str | os.PathLike = "<text>") -> SceneFile:
         published=tuple(_published(top)),
         observations=_observations(top, epoch),
         output=_output(top),
+        ensemble=read_ensemble(top, inertia.kind, state),
     )
 
 

@@ -74,6 +74,36 @@ class MonteCarlo:
 
 
 @dataclasses.dataclass(frozen=True)
+class Draw:
+    """How one quantity of an ensemble is drawn: deviates of `scale` (3,), SI, normal or uniform;
+    scale None: every attitude alike.
+    """
+
+    quantity: str
+    scale: np.ndarray | None
+    uniform: bool
+
+
+@dataclasses.dataclass(frozen=True)
+class Kept:
+    """A quantity whose distribution over the bodies is kept; SI, histogram unless low is None."""
+
+    quantity: str
+    low: float | None
+    high: float | None
+    bins: int
+
+
+@dataclasses.dataclass(frozen=True)
+class EnsemblePlan:
+    bodies: int
+    seed: int
+    trajectories: bool
+    draws: tuple[Draw, ...]
+    statistics: tuple[Kept, ...]
+
+
+@dataclasses.dataclass(frozen=True)
 class PublishedValue:
     """A published number to print beside ours, SI; `uncertainty` may be absent."""
 
@@ -121,3 +151,4 @@ class SceneFile:
     published: tuple[PublishedValue, ...]
     observations: Observations | None
     output: Output
+    ensemble: EnsemblePlan | None = None

@@ -1,0 +1,58 @@
+"""From the [ensemble] of a scene file to an `Ensemble` and its statistics."""
+
+import jax.numpy as jnp
+from jaxtyping import DTypeLike
+
+from polhode import rotation
+from polhode.ensemble._ensemble import Ensemble
+from polhode.ensemble._spreads import (
+    AnyAttitude,
+    Deviate,
+    SpreadAttitude,
+    SpreadEuler,
+    SpreadMoments,
+    SpreadMomentum,
+    SpreadRates,
+)
+from polhode.ensemble._statistics import QUANTITIES, Statistic
+from polhode.io import SceneFile, build_inertia, build_scene, build_state
+
+
+def build_ensemble(file: SceneFile, dtype: DTypeLike) -> tuple[Ensemble, tuple[Statistic, ...]]:
+    """The ensemble and the statistics to keep. Raises SceneFileError for impossible numbers and
+    ValueError for a file without [ensemble].
+    """
+    plan = file.ensemble
+    if plan is None:
+        raise ValueError(f"{file.path} has no [ensemble]: add one, with `bodies` and `seed`.")
+    inertia = build_inertia(file, dtype)
+    spreads = [_spread(draw, file, dtype) for draw in plan.draws]
+    drawn = {draw.quantity for draw in plan.draws}
+    if file.state.rate == "momentum_body" and "momentum_body" not in drawn:
+        spreads.append(SpreadMomentum(jnp.asarray(file.state.value, dtype)))
+    ensemble = Ensemble(
+        build_scene(file, dtype, inertia),
+        build_state(file, dtype, inertia),
+        plan.bodies,
+        tuple(spreads),
+        plan.seed,
+    )
+    kept = tuple(
+        Statistic(k.quantity, *QUANTITIES[k.quantity], k.low, k.high, k.bins)
+        for k in plan.statistics
+    )
+    return ensemble, kept
+
+
+def _spread(draw, file: SceneFile, dtype: DTypeLike):
+    if draw.scale is None:
+        return AnyAttitude()
+    deviate = Deviate(jnp.asarray(draw.scale, dtype), draw.uniform)
+    state = file.state
+    if draw.quantity == "euler":
+        angles = jnp.asarray(state.attitude.values, dtype)
+        return SpreadEuler(angles, deviate, rotation.Sequence[state.attitude.sequence.upper()])
+    if draw.quantity == "momentum_body":
+        return SpreadMomentum(jnp.asarray(state.value, dtype), deviate)
+    kinds = {"moments": SpreadMoments, "attitude": SpreadAttitude, "omega_body": SpreadRates}
+    return kinds[draw.quantity](deviate)
