@@ -1,0 +1,216 @@
+"""The stress suite of the exact free motion: worst errors of every family, printed and drawn.
+
+    python -m benchmarks.stress [--quick] [--output stress.json]
+
+Bodies: benchmarks/stress_families.py. Truth: tests/stress/stress_truth.json, from 50 digits. The
+motion goes through ``ph.simulate(..., ph.ClosedForm())``, Euler angles through
+``ph.State.from_euler``. Errors are in units of eps x max(1, angle), the angle [rad] that the body
+turned through: of the attitude [rad], of the rates relative to their size, and of the derivatives
+along two directions (a relative change of the inertia; one of attitude, rates and time), forward
+and reverse, relative to the larger of the exact derivative and the natural size (1 rad, the rate).
+The figure, beside the output, is drawn from the JSON.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import polhode as ph
+from benchmarks.stress_families import Body, bodies
+
+TRUTH = Path(__file__).resolve().parents[1] / "tests" / "stress" / "stress_truth.json"
+COLUMNS = ("attitude", "rates", "forward", "reverse")
+
+
+def load() -> list[tuple[Body, dict]]:
+    """Bodies with their truth."""
+    table = {(c["family"], c["name"]): c for c in json.loads(TRUTH.read_text())}
+    pairs = [(body, table[body.family, body.name]) for body in bodies()]
+    for body, row in pairs:
+        if row["inputs"] != body.inputs:
+            raise ValueError(f"{body.family}, {body.name}: run tests/stress/make_stress_truth.py")
+    return pairs
+
+
+def _final(inertia: ph.Inertia, state: ph.State, t):
+    ts = jnp.stack([jnp.zeros_like(t), t], axis=-1)
+    record = ph.Record(final_only=True)
+    done = ph.simulate(ph.Scene(inertia=inertia), state, ts, ph.ClosedForm(), record=record)
+    return jnp.concatenate([done.wxyz[..., 0, :], done.omega_body[..., 0, :]], axis=-1)
+
+
+def _tensor(x):
+    xx, yy, zz, xy, xz, yz = (x[:, k] for k in range(6))
+    rows = ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def final_states(inputs: dict) -> dict:
+    """Attitude and rates (n, 7) of the bodies of each kind from their inputs (n, k)."""
+    plain, angles = inputs["diagonal"], inputs["euler"]
+    given = ph.State.from_euler(angles[:, 3], angles[:, 4], angles[:, 5], rates=angles[:, 6:9])
+    state = ph.State(
+        jnp.concatenate([plain[:, 3:7], given.wxyz]),
+        jnp.concatenate([plain[:, 7:10], given.omega_body]),
+    )
+    moments = jnp.concatenate([plain[:, :3], angles[:, :3]])
+    t = jnp.concatenate([plain[:, -1], angles[:, -1]])
+    both = _final(ph.Inertia(diagonal=moments), state, t)
+    out = {"diagonal": both[: len(plain)], "euler": both[len(plain) :]}
+    for kind in ("tensor", "axisymmetric", "spherical"):
+        x = inputs[kind]
+        if kind == "tensor":
+            inertia = ph.Inertia(full=_tensor(x))
+        elif kind == "axisymmetric":
+            inertia = ph.Inertia.axisymmetric(x[:, 0], x[:, 1])
+        else:
+            inertia = ph.Inertia.spherical(x[:, 0])
+        out[kind] = _final(inertia, ph.State(x[:, -8:-4], x[:, -4:-1]), x[:, -1])
+    return out
+
+
+def slopes(inputs: dict, moves: dict, weights: dict) -> tuple[dict, dict]:
+    """Derivatives along the moves (2, n, k), forward; and those of the weighted sum, reverse."""
+    forward = jax.vmap(lambda v: jax.jvp(final_states, (inputs,), (v,))[1])(moves)
+    (pulled,) = jax.vjp(final_states, inputs)[1](weights)
+    reverse = {kind: jnp.sum(pulled[kind][None] * moves[kind], axis=-1) for kind in moves}
+    return forward, reverse
+
+
+def _exact(words) -> np.ndarray:
+    return np.array([[np.longdouble(x) for x in row] for row in words])
+
+
+def _relative(error: np.ndarray, size) -> np.longdouble:
+    """NaN for an error where nothing else is right."""
+    off = np.sqrt(np.sum(error**2))
+    return np.longdouble(0) if off == 0 else off / size if size > 0 else np.longdouble(np.inf)
+
+
+def measure(dtype, pairs: list, gradient: bool = True) -> list[dict]:
+    """Errors of every body that the dtype holds, in units of eps x max(1, angle)."""
+    pairs = [p for p in pairs if dtype == np.float64 or p[0].fits_single]
+    kinds = {}
+    for body, row in pairs:
+        kinds.setdefault(body.kind, []).append((body, row))
+    inputs, moves, weights = {}, {}, {}
+    rng = np.random.default_rng(4)
+    for kind, members in kinds.items():
+        inputs[kind] = jnp.asarray(np.array([b.inputs for b, _ in members]), dtype)
+        moves[kind] = jnp.asarray(np.array([b.moves() for b, _ in members]), dtype).swapaxes(0, 1)
+        sizes = [_size(_exact([row["omega_t"]])[0]) for _, row in members]
+        weight = rng.normal(size=(len(members), 7)) / np.array([[1] * 4 + [s] * 3 for s in sizes])
+        weights[kind] = jnp.asarray(weight.astype(dtype))
+    values = jax.jit(final_states)(inputs)
+    derived = jax.jit(slopes)(inputs, moves, weights) if gradient else None
+    scores = []
+    for kind, members in kinds.items():
+        for n, (body, row) in enumerate(members):
+            found = np.asarray(values[kind][n]).astype(np.longdouble)
+            unit = np.finfo(dtype).eps * max(1.0, row["angle"])
+            score = dict(zip(COLUMNS, _value_errors(found, row), strict=False))
+            if gradient:
+                ahead, back = (np.asarray(d[kind][:, n]).astype(np.longdouble) for d in derived)
+                weight = np.asarray(weights[kind][n]).astype(np.longdouble)
+                errors = _slope_errors(found, row, ahead, back, weight)
+                score.update(zip(COLUMNS[2:], errors, strict=True))
+            score = {name: float(error / unit) for name, error in score.items()}
+            scores.append({"family": body.family, "name": body.name, **score})
+    return scores
+
+
+def _size(vector: np.ndarray) -> np.longdouble:
+    """The length, or 1 of nothing."""
+    return np.sqrt(np.sum(vector**2)) or np.longdouble(1)
+
+
+def _sign(found, exact):
+    return -1 if np.sum(found[:4] * exact) < 0 else 1
+
+
+def _value_errors(found, row):
+    attitude, rates = _exact([row["wxyz_t"]])[0], _exact([row["omega_t"]])[0]
+    turned = 2 * _relative(_sign(found, attitude) * found[:4] - attitude, 1)
+    return turned, _relative(found[4:] - rates, np.sqrt(np.sum(rates**2)))
+
+
+def _slope_errors(found, row, ahead, back, weight):
+    exact = _exact(row["slopes"])
+    exact[:, :4] *= _sign(found, _exact([row["wxyz_t"]])[0])
+    rate = _size(_exact([row["omega_t"]])[0])
+    forward = reverse = np.longdouble(0)
+    for a, b, e in zip(ahead, back, exact, strict=True):
+        sizes = [max(_size(e[:4]), 1), max(_size(e[4:]) if np.any(e[4:]) else 0, rate)]
+        errors = [_relative(a[:4] - e[:4], sizes[0]), _relative(a[4:] - e[4:], sizes[1])]
+        room = _size(weight[:4]) * sizes[0] + _size(weight[4:]) * sizes[1]
+        forward = np.max([forward, *errors])
+        reverse = np.max([reverse, abs(b - np.sum(weight * e)) / room])
+    return forward, reverse
+
+
+def worst(scores: list[dict]) -> dict[str, dict]:
+    """Per family the largest of each error (NaN wins) and the body it belongs to."""
+    found = {}
+    for score in scores:
+        entry = found.setdefault(score["family"], {"bodies": 0})
+        entry["bodies"] += 1
+        for name in COLUMNS:
+            if name in score and not score[name] <= entry.get(name, (-1.0, ""))[0]:
+                entry[name] = (score[name], score["name"])
+    return found
+
+
+def draw(result: dict, path: Path) -> None:
+    """Every body's errors by family; the worst are ringed."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 7), layout="constrained")
+    panels = figure.subplots(len(result), 1, sharex=True, squeeze=False)[:, 0]
+    for panel, (dtype, scores) in zip(panels, result.items(), strict=True):
+        families = list(dict.fromkeys(score["family"] for score in scores))
+        for shift, name in enumerate(COLUMNS):
+            x = np.array([families.index(s["family"]) + 0.18 * (shift - 1.5) for s in scores])
+            y = np.array([max(s[name], 1e-2) for s in scores])
+            (line,) = panel.plot(x, y, "_", alpha=0.5, markersize=9)
+            top = [y[x == place].max() for place in np.unique(x)]
+            label = "gradient, " + name if shift > 1 else name
+            panel.plot(
+                np.unique(x), top, "o", color=line.get_color(), fillstyle="none", label=label
+            )
+        panel.set_yscale("log")
+        panel.set_xticks(range(len(families)), families)
+        panel.set_ylabel("error [eps x max(1, angle)]")
+        panel.set_title(dtype)
+        panel.grid(axis="y", alpha=0.3)
+    panels[0].legend(ncols=4, frameon=False)
+    figure.savefig(path, dpi=120)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--quick", action="store_true", help="values only, no derivatives")
+    parser.add_argument("--output", type=Path, help="JSON of all errors; a figure goes beside it")
+    given = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    pairs, result = load(), {}
+    columns = COLUMNS[:2] if given.quick else COLUMNS
+    print("worst errors in units of eps x max(1, angle turned)")
+    for dtype in (np.float64, np.float32):
+        scores = measure(dtype, pairs, gradient=not given.quick)
+        result[dtype.__name__] = scores
+        print(f"\n{dtype.__name__:<12}{'bodies':>7}" + "".join(f"{c:>10}" for c in columns))
+        for family, entry in worst(scores).items():
+            cells = "".join(f"{entry[c][0]:>10.2f}" for c in columns)
+            print(f"{family:<12}{entry['bodies']:>7}{cells}   {entry[columns[-1]][1]}")
+    if given.output:
+        given.output.write_text(json.dumps(result, indent=1) + "\n")
+        if not given.quick:
+            draw(json.loads(given.output.read_text()), given.output.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""The stress suite: every family against 50 digits in value and gradient, and Principia's cases."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import polhode as ph
+from benchmarks import stress
+from polhode import rotation
+
+PAIRS = stress.load()
+FAMILIES = list(dict.fromkeys(body.family for body, _ in PAIRS))
+# In units of eps x max(1, angle turned): attitude, rates, gradient forward and reverse; about twice
+# the worst of the table that benchmarks/stress.py prints.
+BOUND = {"attitude": 20.0, "rates": 20.0, "forward": 60.0, "reverse": 60.0}
+ROOM = {}
+
+
+@pytest.fixture(scope="module", params=[np.float64, np.float32], ids=["float64", "float32"])
+def scores(request):
+    return stress.measure(request.param, PAIRS)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_family(scores, family):
+    table = [score for score in scores if score["family"] == family]
+    assert table
+    for score in table:
+        for name in stress.COLUMNS:  # NaN fails too
+            assert score[name] <= ROOM.get(family, 1) * BOUND[name], (score["name"], name)
+
+
+def test_every_family_is_long_enough():
+    assert len(PAIRS) > 240
+    assert sum(body.fits_single for body, _ in PAIRS) > 120
+
+
+# --- Principia's euler_solver_test.cpp, with its own tolerances -----------------------------------
+
+EPS = 2.0**-52
+IDENTITY = (1.0, 0.0, 0.0, 0.0)
+
+
+def _run(moments, momentum, ts, wxyz=IDENTITY):
+    moments, momentum = np.array(moments, float), np.array(momentum, float)
+    state = ph.State(jnp.array(wxyz), jnp.asarray(momentum / moments))
+    scene = ph.Scene(inertia=ph.Inertia(diagonal=jnp.asarray(moments)))
+    done = ph.simulate(scene, state, jnp.asarray(ts), ph.ClosedForm())
+    return np.asarray(done.wxyz), np.asarray(done.omega_body)
+
+
+def test_principia_short_fat_symmetric_top():
+    ts = np.arange(51) / 10
+    wxyz, omega = _run((3, 3, 9), (0, 5, 7), ts)
+    momentum = omega * np.array([3, 3, 9])
+    slip = -14 / 9 * ts
+    exact = np.stack([5 * np.sin(slip), 5 * np.cos(slip), np.full(51, 7.0)], -1)
+    size = np.hypot(5, 7)
+    assert np.linalg.norm(momentum - exact, axis=-1).max() <= 102 * EPS * size
+    space = np.asarray(rotation.rotate(jnp.asarray(wxyz), jnp.asarray(momentum)))
+    assert np.linalg.norm(space - (0, 5, 7), axis=-1).max() <= 32 * EPS * size
+    energy = (omega * momentum).sum(-1)
+    np.testing.assert_allclose(energy, 25 / 3 + 49 / 9, rtol=8 * EPS)
+
+
+def test_principia_dzhanibekov():
+    ts = np.arange(1001) / 10
+    wxyz, omega = _run((3, 5, 9), (0, 2, 0.01), ts)
+    momentum = omega * np.array([3, 5, 9])
+    x, y, z = np.asarray(rotation.rotate(jnp.asarray(wxyz), jnp.asarray(momentum))).T
+    assert np.abs(x).max() <= 10 * EPS
+    assert np.abs(y - 2).max() <= 16 * np.spacing(2.0)
+    assert np.abs(z - 0.01).max() <= 965 * np.spacing(0.01)
+    energy = (omega * momentum).sum(-1)
+    np.testing.assert_allclose(energy, 4 / 5 + 1e-4 / 9, rtol=39 * EPS)
+    # 34-digit Taylor series, t = 100
+    exact = np.array([0.06969808760992535, 0.3944970962189294, 0.028475810857311386])
+    np.testing.assert_allclose(omega[-1], exact, atol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("axis", "size", "angle", "ulps"), [(0, 5, 25, 17), (1, 6, 20, 1), (2, 7, 14, 148)]
+)
+def test_principia_principal_spins(axis, size, angle, ulps):
+    momentum = np.eye(3)[axis] * size
+    wxyz, omega = _run((2, 3, 5), momentum, [0.0, 10.0])
+    exact = np.array([np.cos(angle / 2), *(np.eye(3)[axis] * np.sin(angle / 2))])
+    off = min(np.linalg.norm(wxyz[-1] - exact), np.linalg.norm(wxyz[-1] + exact))
+    assert 2 * off <= ulps * np.spacing(float(angle))
+    assert np.array_equal(omega[-1], omega[0])
+
+
+def test_principia_sphere():
+    a, b, c = (np.array([np.cos(x / 2), *(np.array(u) * np.sin(x / 2))]) for x, u in (
+        (0.5, (0, 1, 0)), (1.5, (0, 0, 1)), (-2.5, (0, 1, 0)),
+    ))  # fmt: skip
+    a, b, c = map(jnp.asarray, (a, b, c))
+    start = rotation.multiply(rotation.multiply(a, b), c)
+    wxyz, omega = _run((3, 3, 3), (1, 2, 4), [0.0, 10.0], start)
+    np.testing.assert_allclose(omega[-1], (1 / 3, 2 / 3, 4 / 3), rtol=10 * EPS)
+    rate = np.sqrt(21) / 3
+    axis = np.array([1, 2, 4]) / np.sqrt(21)
+    own = jnp.array([np.cos(5 * rate), *(axis * np.sin(5 * rate))])
+    exact = np.asarray(rotation.multiply(start, own))
+    off = min(np.linalg.norm(wxyz[-1] - exact), np.linalg.norm(wxyz[-1] + exact))
+    assert off <= 114 * EPS
