@@ -20,4 +20,5 @@ def test_eight_devices_are_as_one_and_exchange_nothing(tmp_path):
     assert found == {
         "devices": 8, "wxyz": True, "omega_body": True, "status": True, "collectives": [],
         "shards": 8, "rows": 8192,
+        "same": True, "kept": True, "each": 10_000, "exchanges": [],
     }  # fmt: skip

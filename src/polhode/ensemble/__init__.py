@@ -2,6 +2,7 @@
 
 from polhode.ensemble._ensemble import Ensemble as Ensemble
 from polhode.ensemble._scene_file import build_ensemble as build_ensemble
+from polhode.ensemble._sharded import simulate_sharded as simulate_sharded
 from polhode.ensemble._spreads import (
     AnyAttitude as AnyAttitude,
     Deviate as Deviate,
