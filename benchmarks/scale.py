@@ -95,7 +95,7 @@ def kills(count: int, folder: Path) -> dict:
         for _ in range(4):
             child = _child(path)
             try:
-                child.wait(random.uniform(0.3, 1.0) * usual)
+                child.wait(random.uniform(0.2, 0.8) * usual)
                 break
             except subprocess.TimeoutExpired:
                 child.send_signal(signal.SIGKILL)
