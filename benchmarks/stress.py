@@ -5,9 +5,11 @@
 Bodies: benchmarks/stress_families.py. Truth: tests/stress/stress_truth.json, from 50 digits. The
 motion goes through ``ph.simulate(..., ph.ClosedForm())``, Euler angles through
 ``ph.State.from_euler``. Errors are in units of eps x max(1, angle), the angle [rad] that the body
-turned through: of the attitude [rad], of the rates relative to their size, and of the derivatives
-along two directions (a relative change of the inertia; one of attitude, rates and time), forward
-and reverse, relative to the larger of the exact derivative and the natural size (1 rad, the rate).
+turned through: of the attitude [rad], of the rates relative to their size (for states given
+in Euler angles, to that of the angles' rates where these are larger and cancel), and of the
+derivatives along two directions (a relative change of the inertia; one of attitude, rates and
+time), forward and reverse, relative to the larger of the exact derivative and the natural size
+(1 rad, the rate).
 The figure, beside the output, is drawn from the JSON.
 """
 
@@ -73,12 +75,18 @@ def final_states(inputs: dict) -> dict:
     return out
 
 
-def slopes(inputs: dict, moves: dict, weights: dict) -> tuple[dict, dict]:
-    """Derivatives along the moves (2, n, k), forward; and those of the weighted sum, reverse."""
-    forward = jax.vmap(lambda v: jax.jvp(final_states, (inputs,), (v,))[1])(moves)
-    (pulled,) = jax.vjp(final_states, inputs)[1](weights)
-    reverse = {kind: jnp.sum(pulled[kind][None] * moves[kind], axis=-1) for kind in moves}
-    return forward, reverse
+def solve(inputs: dict, moves: dict, weights: dict, forward: bool, reverse: bool) -> tuple:
+    """Final states; derivatives along the moves (2, n, k); those of the weighted sum, reverse."""
+    values, ahead, back = None, None, None
+    if reverse:
+        values, pull = jax.vjp(final_states, inputs)
+        (pulled,) = pull(weights)
+        back = {kind: jnp.sum(pulled[kind][None] * moves[kind], axis=-1) for kind in moves}
+    if forward:
+        values, ahead = jax.vmap(
+            lambda v: jax.jvp(final_states, (inputs,), (v,)), out_axes=(None, 0)
+        )(moves)
+    return final_states(inputs) if values is None else values, ahead, back
 
 
 def _exact(words) -> np.ndarray:
@@ -86,12 +94,12 @@ def _exact(words) -> np.ndarray:
 
 
 def _relative(error: np.ndarray, size) -> np.longdouble:
-    """NaN for an error where nothing else is right."""
+    """Infinite for any error of a vector that should vanish."""
     off = np.sqrt(np.sum(error**2))
     return np.longdouble(0) if off == 0 else off / size if size > 0 else np.longdouble(np.inf)
 
 
-def measure(dtype, pairs: list, gradient: bool = True) -> list[dict]:
+def measure(dtype, pairs: list, forward: bool = True, reverse: bool = True) -> list[dict]:
     """Errors of every body that the dtype holds, in units of eps x max(1, angle)."""
     pairs = [p for p in pairs if dtype == np.float64 or p[0].fits_single]
     kinds = {}
@@ -102,22 +110,25 @@ def measure(dtype, pairs: list, gradient: bool = True) -> list[dict]:
     for kind, members in kinds.items():
         inputs[kind] = jnp.asarray(np.array([b.inputs for b, _ in members]), dtype)
         moves[kind] = jnp.asarray(np.array([b.moves() for b, _ in members]), dtype).swapaxes(0, 1)
-        sizes = [_size(_exact([row["omega_t"]])[0]) for _, row in members]
+        sizes = [_natural_rate(body, row) or 1.0 for body, row in members]
         weight = rng.normal(size=(len(members), 7)) / np.array([[1] * 4 + [s] * 3 for s in sizes])
         weights[kind] = jnp.asarray(weight.astype(dtype))
-    values = jax.jit(final_states)(inputs)
-    derived = jax.jit(slopes)(inputs, moves, weights) if gradient else None
+    program = jax.jit(solve, static_argnums=(3, 4))
+    values, ahead, back = program(inputs, moves, weights, forward, reverse)
     scores = []
     for kind, members in kinds.items():
         for n, (body, row) in enumerate(members):
             found = np.asarray(values[kind][n]).astype(np.longdouble)
+            rate = _natural_rate(body, row)
+            score = dict(zip(COLUMNS, _value_errors(found, row, rate), strict=False))
+            exact = _exact(row["slopes"])
+            exact[:, :4] *= _sign(found, _exact([row["wxyz_t"]])[0])
+            rate = rate or np.longdouble(1)
+            if ahead is not None:
+                score["forward"] = _forward_error(ahead[kind][:, n], exact, rate)
+            if back is not None:
+                score["reverse"] = _reverse_error(back[kind][:, n], exact, weights[kind][n], rate)
             unit = np.finfo(dtype).eps * max(1.0, row["angle"])
-            score = dict(zip(COLUMNS, _value_errors(found, row), strict=False))
-            if gradient:
-                ahead, back = (np.asarray(d[kind][:, n]).astype(np.longdouble) for d in derived)
-                weight = np.asarray(weights[kind][n]).astype(np.longdouble)
-                errors = _slope_errors(found, row, ahead, back, weight)
-                score.update(zip(COLUMNS[2:], errors, strict=True))
             score = {name: float(error / unit) for name, error in score.items()}
             scores.append({"family": body.family, "name": body.name, **score})
     return scores
@@ -132,24 +143,40 @@ def _sign(found, exact):
     return -1 if np.sum(found[:4] * exact) < 0 else 1
 
 
-def _value_errors(found, row):
+def _natural_rate(body: Body, row: dict) -> np.longdouble:
+    """Of the body; the rates of Euler's angles where those are larger and cancel."""
+    rates = [row["omega_t"]] + ([body.rates] if body.kind == "euler" else [])
+    return max(np.sqrt(np.sum(_exact([x])[0] ** 2)) for x in rates)
+
+
+def _value_errors(found, row, rate):
     attitude, rates = _exact([row["wxyz_t"]])[0], _exact([row["omega_t"]])[0]
     turned = 2 * _relative(_sign(found, attitude) * found[:4] - attitude, 1)
-    return turned, _relative(found[4:] - rates, np.sqrt(np.sum(rates**2)))
+    return turned, _relative(found[4:] - rates, rate)
 
 
-def _slope_errors(found, row, ahead, back, weight):
-    exact = _exact(row["slopes"])
-    exact[:, :4] *= _sign(found, _exact([row["wxyz_t"]])[0])
-    rate = _size(_exact([row["omega_t"]])[0])
-    forward = reverse = np.longdouble(0)
-    for a, b, e in zip(ahead, back, exact, strict=True):
-        sizes = [max(_size(e[:4]), 1), max(_size(e[4:]) if np.any(e[4:]) else 0, rate)]
-        errors = [_relative(a[:4] - e[:4], sizes[0]), _relative(a[4:] - e[4:], sizes[1])]
-        room = _size(weight[:4]) * sizes[0] + _size(weight[4:]) * sizes[1]
-        forward = np.max([forward, *errors])
-        reverse = np.max([reverse, abs(b - np.sum(weight * e)) / room])
-    return forward, reverse
+def _sizes(exact, rate):
+    """Of a derivative of the attitude and of one of the rates, at least the natural ones."""
+    length = [np.sqrt(np.sum(part**2)) for part in (exact[:4], exact[4:])]
+    return max(length[0], np.longdouble(1)), max(length[1], rate)
+
+
+def _forward_error(found, exact, rate):
+    errors = []
+    for a, e in zip(np.asarray(found).astype(np.longdouble), exact, strict=True):
+        attitude, rates = _sizes(e, rate)
+        errors += [_relative(a[:4] - e[:4], attitude), _relative(a[4:] - e[4:], rates)]
+    return np.max(errors)  # keeps NaN
+
+
+def _reverse_error(found, exact, weight, rate):
+    weight = np.asarray(weight).astype(np.longdouble)
+    errors = []
+    for b, e in zip(np.asarray(found).astype(np.longdouble), exact, strict=True):
+        attitude, rates = _sizes(e, rate)
+        room = _size(weight[:4]) * attitude + _size(weight[4:]) * rates
+        errors.append(abs(b - np.sum(weight * e)) / room)
+    return np.max(errors)
 
 
 def worst(scores: list[dict]) -> dict[str, dict]:
@@ -200,7 +227,7 @@ def main() -> None:
     columns = COLUMNS[:2] if given.quick else COLUMNS
     print("worst errors in units of eps x max(1, angle turned)")
     for dtype in (np.float64, np.float32):
-        scores = measure(dtype, pairs, gradient=not given.quick)
+        scores = measure(dtype, pairs, not given.quick, not given.quick)
         result[dtype.__name__] = scores
         print(f"\n{dtype.__name__:<12}{'bodies':>7}" + "".join(f"{c:>10}" for c in columns))
         for family, entry in worst(scores).items():
