@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 from polhode.free._flow import Moment, advance, attitude, rates
 from polhode.free._frame import Frame, Quadruple, cross, dot, hamilton, matrix
 from polhode.free._motion import FreeMotion, Swing, Turning, prepare_swing, prepare_turning
-from polhode.free._roles import Triple, assign_roles
+from polhode.free._roles import Triple, assign_roles, settle
 from polhode.free._second import second_kind
 from polhode.free._tangent import (
     Change,
@@ -46,9 +46,9 @@ def prepare(moments, wxyz, omega, products=None) -> FreeMotion:
     moments, omega = components(moments, 3), components(omega, 3)
     products = None if products is None else components(products, 3)
     wxyz = None if wxyz is None else components(wxyz, 4)
-    still = jax.lax.stop_gradient((moments, omega, wxyz))
-    swing = prepare_swing(assign_roles(*still[:2]))
-    turning = None if wxyz is None else prepare_turning(swing, still[2])
+    # First derivatives do not pass through these constants (see _evaluate_rule), second ones do.
+    swing = prepare_swing(assign_roles(moments, omega))
+    turning = None if wxyz is None else prepare_turning(swing, wxyz)
     return FreeMotion(moments, products, omega, wxyz, swing, turning)
 
 
@@ -82,6 +82,10 @@ def free_motion(
     """The exact free motion: `prepare` and `evaluate` in one call.
 
     A long batch of one axis is worked off in chunks that fit the cache of a processor core.
+
+    First derivatives, forward and reverse, are exact in every regime. Second derivatives come from
+    differentiating those formulas, and hold for bodies of three distinct moments off the
+    separatrix and off the principal axes; elsewhere they may be NaN or miss a term.
     """
     parts = (
         components(moments, 3),
@@ -235,11 +239,14 @@ def _evaluate_rule(asked, primals, tangents):
     resting = swing.pulse == 0
     hand = swing.sense * swing.parity
     scaled = t * swing.pulse
-    change = change_of_start(swing, frame, dm, dp, dw)
+    # The transpose of a stage is a stage: it keeps cotangents from being summed again and again.
+    stage = (lambda x: x) if asked[2] else (lambda x: settle(x, swing.one))
+    change = stage(change_of_start(swing, frame, dm, dp, dw))
     at = _with_still_time(swing, at, scaled)
     first, second = second_kind(swing, at.whole, at.folded)
-    by = partials(swing.B * swing.r, swing.A * swing.p, at.functions, first, second)
-    moved = momentum_tangent(swing, at.functions, at.momentum, by, change)
+    first, second = stage((first, second))
+    by = stage(partials(swing.B * swing.r, swing.A * swing.p, at.functions, first, second))
+    moved = stage(momentum_tangent(swing, at.functions, at.momentum, by, change, stage))
     n1, n2, n3 = now = at.momentum
     held = (jnp.zeros_like(n1),) * 3 if dw is None else tuple(dw)
     d_omega = d_wxyz = None

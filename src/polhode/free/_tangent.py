@@ -159,13 +159,13 @@ def change_of_invariants(swing: Swing, change: Change):
 
 
 def momentum_tangent(
-    swing: Swing, functions: Triple, now: Triple, by: Partials, change: Change
+    swing: Swing, functions: Triple, now: Triple, by: Partials, change: Change, stage
 ) -> Triple:
     """Variation of L(t) - L(0)."""
     hand = swing.sense * swing.parity
     at = Setting(swing.momentum, swing.p, swing.r, swing.s, swing.A, swing.B)
-    dr, ds, dp, dA, dB = change_of_invariants(swing, change)
-    moved = by.along(dB * swing.r + swing.B * dr, dA * swing.p + swing.A * dp)
+    dr, ds, dp, dA, dB = stage(change_of_invariants(swing, change))
+    moved = stage(by.along(dB * swing.r + swing.B * dr, dA * swing.p + swing.A * dp))
     (j12, j13, j23), (k12, k13, k23) = jax.jvp(
         lambda a, f: products_of_momenta(a, f, hand),
         (at, functions),
