@@ -186,7 +186,8 @@ def worst(scores: list[dict]) -> dict[str, dict]:
         entry = found.setdefault(score["family"], {"bodies": 0})
         entry["bodies"] += 1
         for name in COLUMNS:
-            if name in score and not score[name] <= entry.get(name, (-1.0, ""))[0]:
+            old = entry.get(name, (-1.0, ""))[0]
+            if name in score and not np.isnan(old) and not score[name] <= old:
                 entry[name] = (score[name], score["name"])
     return found
 

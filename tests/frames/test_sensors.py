@@ -130,3 +130,16 @@ def test_missing_records_and_coarse_samples_are_named(tumble):
     )  # fmt: skip
     with pytest.raises(ValueError, match="more times"):
         RotatingFrame.from_trajectory(coarse)
+
+
+def test_angular_acceleration_with_a_driven_wheel():
+    """Free floating about one axis: the motor's torque on the wheel acts on the body reversed."""
+    inertia = ph.Inertia.from_moments(jnp.array([[1.0, 1.5, 2.0], [1.0, 1.5, 2.5]]))
+    wheel = ph.Rotor([0.0, 0.0, 1.0], inertia=0.25, speed=3.0, torque=0.125)
+    state = ph.State([1.0, 0.0, 0.0, 0.0], jnp.array([[0.0, 0.0, 0.5]] * 2))
+    traj = ph.simulate(ph.Scene(inertia, rotors=wheel), state, jnp.linspace(0.0, 2.0, 3))
+    slope = angular_acceleration(traj)
+    want = jnp.array([-0.125 / (2.0 - 0.25), -0.125 / (2.5 - 0.25)])
+    np.testing.assert_allclose(slope[..., 2], jnp.broadcast_to(want[:, None], (2, 3)), rtol=1e-12)
+    step = (traj.omega_body[:, -1, 2] - traj.omega_body[:, 0, 2]) / 2.0
+    np.testing.assert_allclose(step, want, rtol=1e-7)

@@ -1,6 +1,7 @@
 """The two sensors that recordings come from: gyroscope and accelerometer, fixed in the body."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
@@ -29,10 +30,14 @@ def angular_acceleration(trajectory: Trajectory) -> Float[Array, "*b t 3"]:
         wxyz = jnp.zeros((*omega.shape[:-1], 4), omega.dtype).at[..., 0].set(1)
     else:
         wxyz = _recorded(trajectory, "wxyz")
-    momentum = scene.inertia.momentum(omega)
+    momentum = scene.momentum(omega, t)
     state = (tuple(momentum[..., i] for i in range(3)), tuple(wxyz[..., i] for i in range(4)))
     push, _ = lie_poisson_field(t, state, Dynamics(scene.hamiltonian, scene.torque))
-    return scene.inertia.rates(jnp.stack(jnp.broadcast_arrays(*push), axis=-1))
+    rate = jnp.stack(jnp.broadcast_arrays(*push), axis=-1)
+    if scene.rotors is not None:  # what the wheels take up does not turn the body
+        taken = jax.jvp(scene.wheel_momentum, (t,), (jnp.ones_like(t),))[1]
+        rate = rate - jnp.broadcast_to(taken, rate.shape)
+    return scene.carrier.rates(rate)
 
 
 def gyroscope(trajectory: Trajectory) -> Float[Array, "*b t 3"]:

@@ -43,7 +43,8 @@ class AbstractRotor(eqx.Module):
             if wheel.inertia is None:
                 continue
             axis = wheel.axis_body
-            about = jnp.sum(axis * inertia.momentum(axis), axis=-1)
+            turned = inertia.momentum(axis)
+            about = jnp.sum(jnp.broadcast_to(axis, turned.shape) * turned, axis=-1)
             about, own = jnp.broadcast_arrays(about, wheel.inertia)
             require(
                 own < about,
