@@ -6,6 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -191,3 +192,24 @@ def test_bad_sizes_are_refused(tmp_path):
     with pytest.raises(ValueError, match="nothing to keep"):
         ens.stream(make(), TS, path, trajectories=False)
     assert not path.exists()
+
+
+def test_spreads_of_one_name_draw_independently():
+    """Two lambdas share their name; their draws must not be the same numbers."""
+
+    def shifted(axis):
+        def spread(key, scene, state):
+            push = jax.random.normal(key, dtype=state.omega_body.dtype)
+            return scene, ph.State(state.wxyz, state.omega_body.at[axis].add(push))
+
+        return spread
+
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]))
+    state = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 0.0])
+    bodies = ens.Ensemble(scene, state, 200, (shifted(0), shifted(1)), seed=3)
+    _, drawn = bodies.draw(jnp.arange(200))
+    x, y = np.asarray(drawn.omega_body[:, :2]).T
+    assert abs(np.corrcoef(x, y)[0, 1]) < 0.3
+    alone = ens.Ensemble(scene, state, 200, (shifted(0),), seed=3)
+    _, first = alone.draw(jnp.arange(200))
+    np.testing.assert_array_equal(first.omega_body[:, 0], x)

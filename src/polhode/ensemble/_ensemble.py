@@ -74,8 +74,14 @@ def draw(each: Any, shared: Any, indices: Array, spreads: Any, seed: int) -> tup
     def one(index, own):
         scene, state = eqx.combine(own, shared)
         key = jax.random.fold_in(root, index)
+        streams: list[int] = []
         for spread in spreads:
-            scene, state = spread(jax.random.fold_in(key, stream_of(spread)), scene, state)
+            stream = stream_of(spread)
+            own_key = jax.random.fold_in(key, stream)
+            if stream in streams:  # spreads of one name draw independently
+                own_key = jax.random.fold_in(own_key, streams.count(stream))
+            streams.append(stream)
+            scene, state = spread(own_key, scene, state)
         return scene, state
 
     return eqx.filter_vmap(one, in_axes=(0, eqx.if_array(0)), out_axes=eqx.if_array(0))(
