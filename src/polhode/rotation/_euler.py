@@ -99,14 +99,13 @@ def wxyz_to_euler(
     i, j, k = sequence.axes
     if sequence.is_extrinsic:
         i, j, k = k, j, i
+    k = 3 - i - j
+    parity = _parity(i, j, k)
     w, along_i, along_j = wxyz[..., 0], wxyz[..., 1 + i], wxyz[..., 1 + j]
+    along_k = parity * wxyz[..., 1 + k]
     if sequence.is_proper:
-        k = 3 - i - j
-        along_k = _parity(i, j, k) * wxyz[..., 1 + k]
         sums, differences = (w, along_i), (along_j, along_k)
     else:
-        parity = _parity(i, j, k)
-        along_k = parity * wxyz[..., 1 + k]
         # R_i(a) R_j(b) R_k(c), turned on by a quarter about j, is
         # R_i(a) R_j(b + pi/2) R_i(-parity c).
         sums = (w - along_j, along_i - along_k)
