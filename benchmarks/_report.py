@@ -1,0 +1,207 @@
+"""What every benchmark shares: how it times, what it writes, where it reads.
+
+A result is one JSON file with the fields ``name``, ``command``, ``date``, ``versions``,
+``machine``, ``flags``, ``threads`` and ``numbers``; figures and tables are made from such files
+only. Call ``one_thread()`` before the first import of jax for single-threaded numbers.
+"""
+
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import statistics
+import sys
+import time
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, NamedTuple
+
+RESULTS = Path(__file__).resolve().parent / "results"
+"""The committed results of the last full runs."""
+
+OUT = Path(__file__).resolve().parents[1] / "out" / "benchmarks"
+"""Where runs write when nothing else is asked for."""
+
+PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "numpy")
+ONE_THREAD = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+
+
+def one_thread() -> None:
+    """Keep XLA to one thread and this process on one core; no effect once jax is running."""
+    os.environ.setdefault("XLA_FLAGS", ONE_THREAD)
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+
+def machine() -> dict[str, Any]:
+    """The machine in general terms: kind of processor, cores, memory, accelerator if any."""
+    processor = platform.machine()
+    about = Path("/proc/cpuinfo")
+    if about.exists():
+        flags = set(next((x for x in about.read_text().split("\n") if "flags" in x), "").split())
+        wide = [name for name in ("avx512f", "avx2", "avx") if name in flags]
+        processor += f" with {wide[0].upper().removesuffix('F')}" if wide else ""
+    found: dict[str, Any] = {"processor": processor, "cores": os.cpu_count()}
+    if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        found["memory_GB"] = round(memory / 2**30)
+    found["system"] = platform.system()
+    if "jax" in sys.modules:
+        device = sys.modules["jax"].devices()[0]
+        found["device"] = device.device_kind if device.platform != "cpu" else "cpu"
+    return found
+
+
+def versions(*more: str) -> dict[str, str | None]:
+    """Versions of Python, polhode, JAX and what else is named; None: not installed."""
+    found: dict[str, str | None] = {"python": platform.python_version()}
+    for name in ("polhode", *PACKAGES, *more):
+        if name in sys.modules and hasattr(sys.modules[name], "__version__"):
+            found[name] = sys.modules[name].__version__
+            continue
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = None
+    return found
+
+
+def threads() -> int:
+    """Cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def command(module: str) -> str:
+    """The command of this run, without where it wrote to."""
+    words, given = [], iter(sys.argv[1:])
+    for word in given:
+        if word in ("--output", "--out"):
+            next(given, None)
+        elif not word.startswith(("--output=", "--out=")):
+            words.append(word)
+    return " ".join(["python -m", f"benchmarks.{module}", *words])
+
+
+def write(
+    name: str, numbers: Any, *, path: str | os.PathLike | None = None, packages: tuple = ()
+) -> Path:
+    """Write ``numbers`` (anything JSON can hold) of benchmark ``name``; returns the file.
+
+    ``path``: a file; None: ``out/benchmarks/<name>.json``. ``packages``: peers whose versions to
+    record beside ours. Not-a-number and infinite values become null. Whole or not at all.
+    """
+    from polhode.io import whole_file
+
+    path = OUT / f"{name}.json" if path is None else Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    report = {
+        "name": name,
+        "command": command(name),
+        "date": datetime.now(UTC).date().isoformat(),
+        "versions": versions(*packages),
+        "machine": machine(),
+        "flags": os.environ.get("XLA_FLAGS", ""),
+        "threads": threads(),
+        "numbers": _plain(numbers),
+    }
+    with whole_file(path) as partial:
+        Path(partial).write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
+    return path
+
+
+def read(what: str | os.PathLike) -> dict[str, Any]:
+    """A result: a file, or the name of a committed one."""
+    path = Path(what)
+    if path.suffix != ".json":
+        path = RESULTS / f"{what}.json"
+    report = json.loads(path.read_text())
+    if missing := {"name", "command", "versions", "machine", "numbers"} - set(report):
+        raise ValueError(f"{path.name} is no result of benchmarks: it lacks {sorted(missing)}.")
+    return report
+
+
+def _plain(value):
+    """Without arrays and without numbers that JSON lacks; floats to five digits."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if hasattr(value, "tolist"):
+        return _plain(value.tolist())
+    if isinstance(value, float):
+        return float(f"{value:.5g}") if math.isfinite(value) else None
+    return value
+
+
+class Timing(NamedTuple):
+    """Seconds of one call: median and least of the repeats, half the interquartile range over the
+    median, how many repeats, and the seconds of the first call (compiling included)."""
+
+    median: float
+    least: float
+    spread: float
+    repeats: int
+    first: float
+
+
+def clock(call: Callable[[], Any], **options) -> Timing:
+    """``in_turn`` of one."""
+    return in_turn({"": call}, **options)[""]
+
+
+def in_turn(
+    calls: Mapping[str, Callable[[], Any]],
+    *,
+    repeats: int = 7,
+    least: float = 2e-3,
+    budget: float = 1.0,
+) -> dict[str, Timing]:
+    """Time calls that return when they are done (block on JAX's results), taking turns.
+
+    Turns make the ratios robust against a machine whose speed changes. Each repeat lasts at least
+    ``least`` seconds (calls are repeated within it); a call stops taking part when it has used
+    ``budget`` seconds, but not before two repeats, or one where a single call lasts longer than
+    that. The first call of each warms up and is not counted.
+    """
+    first, count, spent = {}, {}, dict.fromkeys(calls, 0.0)
+    spans: dict[str, list[float]] = {name: [] for name in calls}
+    for name, call in calls.items():
+        begin = time.perf_counter()
+        call()
+        first[name] = time.perf_counter() - begin
+        begin = time.perf_counter()
+        call()
+        once = time.perf_counter() - begin
+        spent[name] = once
+        count[name] = max(1, math.ceil(least / max(once, 1e-9)))
+        if count[name] == 1:
+            spans[name].append(once)
+    for _ in range(repeats):
+        for name, call in calls.items():
+            enough = 1 if spans[name] and spans[name][0] > budget else 2
+            if len(spans[name]) >= enough and spent[name] > budget:
+                continue
+            if len(spans[name]) >= repeats:
+                continue
+            begin = time.perf_counter()
+            for _ in range(count[name]):
+                call()
+            span = time.perf_counter() - begin
+            spent[name] += span
+            spans[name].append(span / count[name])
+    return {name: _summary(spans[name], first[name]) for name in calls}
+
+
+def _summary(spans: list[float], first: float) -> Timing:
+    middle = statistics.median(spans)
+    spread = 0.0
+    if len(spans) > 1:
+        low, _, high = statistics.quantiles(spans, n=4, method="inclusive")
+        spread = (high - low) / 2 / middle
+    return Timing(middle, min(spans), spread, len(spans), first)
