@@ -199,6 +199,12 @@ def _states(made: _List) -> None:
             rates[axis] = -1.25
             name = f"axis {axis}, off {off:g}"
             made.add("axes", name, (1.0, 2.0, 3.0), rates, exact=0 < off < 1e-37)
+    # Long at the unstable axis, where neighbours part by nine decades (four in single precision).
+    for off in (0.0, 1e-14, 1e-8, 1e-4):
+        for lowest, t, exact in ((2.1, 22.0, True), (2.0, 10.0, False)):
+            for rates in ((off, 2.0, 0.0), (0.0, -2.0, off)):
+                made.add("dwelling", f"{lowest}, {rates}", (lowest, 3, 5), rates, t, exact)
+    made.add("dwelling", "from the separatrix", moments, (0.75, 0.5, 1.0), -22.0)
     near = (1e-300, 1e-160, *single((1e-30, 1e-16, 1e-8, 1e-3)))
     thetas = [0.0, *near, -1e-300, math.pi, math.nextafter(math.pi, 4.0)]
     thetas += [math.pi - 1e-15, math.pi - 1e-8, math.pi - 1e-3, float(np.float32(np.pi))]

@@ -131,6 +131,35 @@ def test_derivatives(omega):
     np.testing.assert_allclose(found, np.array(columns).T, rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.parametrize("off", [1e-4, -1e-9, 1e-13])
+def test_derivatives_next_to_the_separatrix(off):
+    """P_psi there is a logarithm of the distance: against 50-digit differences of 4 K / rate."""
+    moments, omega = (1.0, 2.0, 2.25), (0.75, 0.5, 1.0 + off)
+
+    def exact(a, b, c, u, v, w):
+        above = c * w * w * (c - b) - a * u * u * (b - a)
+        outer = b * v * v * (b - a) + c * w * w * (c - a)
+        inner = a * u * u * (c - a) + b * v * v * (c - b)
+        square, share = ((c - b) * outer, (b - a) * inner) if above > 0 else (
+            (b - a) * inner, (c - b) * outer
+        )  # fmt: skip
+        return 4 * mp.ellipk(share / square) / mp.sqrt(square / a / b / c)
+
+    with mp.workdps(60):
+        point = [mp.mpf(x) for x in (*moments, *omega)]
+        slopes = []
+        for k in range(6):
+            ends = []
+            for step in (mp.mpf(10) ** -25, -(mp.mpf(10) ** -25)):
+                moved = list(point)
+                moved[k] += step
+                ends.append(exact(*moved))
+            slopes.append(float((ends[0] - ends[1]) / mp.mpf(10) ** -25 / 2))
+    forward, _ = _jacobians(jnp.array(moments), jnp.array(omega), jnp.zeros(3))
+    found = np.concatenate([forward[0][0], forward[1][0]])
+    np.testing.assert_allclose(found, slopes, rtol=1e-14, atol=1e-14 * max(map(abs, slopes)))
+
+
 def test_derivatives_are_finite_in_the_limits():
     moments = jnp.array([[1.0, 1, 1], [1, 2, 3], [1, 1, 2], [1, 2, 2], [1, 2, 2.25]])
     omega = jnp.array([[0.3, 0.4, 0], [0, 0, 0], [0.3, 0.2, 1], [1, 0.1, 0.1], [0, 0, 1]])

@@ -217,12 +217,19 @@ def _turn_tangent(swing, turning, frame: Frame, at: Moment, change: Change, move
     return frame.turned(turn)
 
 
-def _with_still_time(swing: Swing, at: Moment, t: Scalars) -> Moment:
-    """Where omega_p is zero S is the time; the momentum itself does not need it there."""
+def _for_tangent(swing: Swing, at: Moment, t: Scalars) -> Moment:
+    """S, C, N as the tangent needs them; the momentum itself does not.
+
+    Where omega_p is zero S is the time. On the separatrix derivatives grow without bound: they are
+    held where their products would overflow.
+    """
     still = swing.inverse_rate == 0
+    least = 2.0 ** -{4: 17, 8: 140}[t.dtype.itemsize]
 
     def mend(functions: Triple) -> Triple:
-        return jnp.where(still, t, functions[0]), *functions[1:]
+        S, C, N = functions
+        C, N = (jnp.where(swing.endless, jnp.maximum(x, least), x) for x in (C, N))
+        return jnp.where(still, t, S), C, N
 
     return at._replace(folded=mend(at.folded), functions=mend(at.functions))
 
@@ -242,7 +249,7 @@ def _evaluate_rule(asked, primals, tangents):
     # The transpose of a stage is a stage: it keeps cotangents from being summed again and again.
     stage = (lambda x: x) if asked[2] else (lambda x: settle(x, swing.one))
     change = stage(change_of_start(swing, frame, dm, dp, dw))
-    at = _with_still_time(swing, at, scaled)
+    at = _for_tangent(swing, at, scaled)
     first, second = second_kind(swing, at.whole, at.folded)
     first, second = stage((first, second))
     by = stage(partials(swing.B * swing.r, swing.A * swing.p, at.functions, first, second))

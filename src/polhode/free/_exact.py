@@ -85,6 +85,8 @@ def subtract_pairs(x: Pair, y: Pair) -> Pair:
 def turns(rate: Scalars, time: Scalars) -> tuple[Scalars, Scalars]:
     """rate * time as a whole number and a remainder in [-1/2, 1/2], nothing lost to its size."""
     x, y = split(rate), split(time)
-    whole = jnp.round(rate * time)
+    product = rate * time
+    whole = jnp.round(product)
     rest = (x.high * y.high - whole) + (x.high * y.low + x.low * y.high) + x.low * y.low
-    return whole, rest
+    # The low parts of a tiny product would underflow.
+    return whole, jnp.where(whole == 0, product, rest)

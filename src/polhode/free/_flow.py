@@ -18,7 +18,8 @@ Scalars = Float[Array, "*b"]
 def sweep(swing: Swing, t: Scalars) -> tuple[Scalars, Scalars]:
     """Half turns of the theta functions' argument: a whole number and the remainder."""
     whole, rest = turns(swing.pace, t)
-    far = 2 * math.log(2) * {4: 55, 8: 450}[rest.dtype.itemsize]
+    # Farther out the momentum has reached the middle axis and nothing but overflow would follow.
+    far = math.log(2) * {4: 55, 8: 450}[rest.dtype.itemsize]
     rest = jnp.where(swing.endless, jnp.clip(swing.pace * t, -far, far), rest)
     whole = jnp.where(swing.endless, 0, whole)
     return whole, rest
@@ -60,11 +61,13 @@ def momentum(swing: Swing, functions: Triple) -> Triple:
     l1, l2, l3 = swing.momentum
     k = swing.sense * swing.parity
     below = 1 / (C * C + swing.r * swing.s * (l3 * l3) * (S * S))
-    return (
+    now = (
         (l1 * C - k * (swing.r * l2 * l3) * S * N) * below,
         (l2 * C * N + k * (swing.s * l1 * l3) * S) * below,
         (l3 * N - k * (swing.p * l1 * l2) * S * C) * below,
     )
+    # Exact spin about a principal axis keeps its rates to the last bit.
+    return tuple(jnp.where(swing.steady, l, x) for l, x in zip(swing.momentum, now, strict=True))
 
 
 class Moment(NamedTuple):

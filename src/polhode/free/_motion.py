@@ -32,6 +32,7 @@ class Swing(NamedTuple):
     m1: Scalars
     circular: Bool[Array, "*b"]  # series in sines (else hyperbolic, near the separatrix)
     endless: Bool[Array, "*b"]  # on the separatrix: infinite period
+    steady: Bool[Array, "*b"]  # exact spin about a principal axis
     nome: Scalars
     mean: Scalars  # the arithmetic-geometric mean, for the second kind
     log_nome: Scalars  # minus the logarithm of the nome
@@ -109,6 +110,7 @@ def prepare_swing(roles: Roles) -> Swing:
     m1 = jnp.where(moving, s * roles.gap * d2 / divisor, 1)
     circular = m1 > 1 - _TURNING
     endless = moving & (m1 < floor)
+    steady = (jnp.abs(l1) + jnp.minimum(jnp.abs(l2), jnp.abs(l3))) == 0
     square = jnp.where(circular, m, m1)
     other = jnp.sqrt(jnp.where(circular, m1, m))
     omega = jnp.sqrt(x)
@@ -125,7 +127,7 @@ def prepare_swing(roles: Roles) -> Swing:
     inverse_rate = jnp.where(moving, 1 / jnp.where(moving, rate, 1), 0)
     pace = settle(pace, one)
     return Swing(
-        (l1, l2, l3), (d1, d2, d3), roles.moments, p, r, s, A, B, m, m1, circular, endless,
+        (l1, l2, l3), (d1, d2, d3), roles.moments, p, r, s, A, B, m, m1, circular, endless, steady,
         jnp.where(endless, 0, nome), mean, log_nome, rate,
         inverse_rate, pace, log_nome / 2,
         roles.sense, roles.parity, roles.pulse, roles.heft, roles.middle, roles.circled, one,
@@ -264,7 +266,7 @@ def prepare_turning(swing: Swing, wxyz: tuple[Scalars, ...]) -> Turning:
         (q2 * w - q0 * t2 - q3 * t1 + q1 * t3) * scale,
         (q3 * w - q0 * t3 - q1 * t2 + q2 * t1) * scale,
     )
-    bend = swing.sense * swing.p * across / (peak_or_one(peak) * length * (length + peak))
+    bend = swing.sense * swing.p * (across / (length * (length + peak))) / peak_or_one(peak)
     return Turning(
         half_rate * swing.pulse / math.pi,
         sway / math.pi,

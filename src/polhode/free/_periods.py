@@ -138,7 +138,7 @@ def _periods_rule(primals, tangents):
     P_psi, P_phi, k2, _, _ = values
     dm, dp, dw = (zero_where_symbolic(d, x) for d, x in zip(tangents[0], given, strict=True))
     change = change_of_start(swing, Frame(swing), dm, dp, dw)
-    dr, ds, dpp, dA, dB = change_of_invariants(swing, change)
+    dr, ds, dpp, dA, dB, dz = change_of_invariants(swing, change)
     start = swing.momentum
     spin = tuple(x * y for x, y in zip(start, swing.inverse, strict=True))
     energy = dot(spin, change.momentum) + dot(start, matrix(change, start)) / 2
@@ -147,14 +147,16 @@ def _periods_rule(primals, tangents):
         l1, l2, l3 = start
         h12, h13, h23 = change.crossed
         cross = 2 * swing.sense * (h12 * l1 * l2 + h13 * l1 * l3 + h23 * l2 * l3)
-    dA, dB = dA + cross, dB - cross
-    x, y = swing.B * swing.r, swing.A * swing.p
+    dA, dB, dz = dA + cross, dB - cross, dz - swing.s * cross
+    x = swing.B * swing.r
     dx, dy = dB * swing.r + swing.B * dr, dA * swing.p + swing.A * dpp
     first, second = complete(swing)
     quarter = P_psi * swing.pulse / 4
     quarter = jnp.where(steady, 1, quarter)
     divisor = jnp.where(x > 0, x, 1)
-    dquarter = (second * dy - (quarter + y * second) / divisor * dx) / 2
+    # By dx and dz = dx - dy, which alone counts next to the separatrix.
+    relative = dx / divisor
+    dquarter = (second * (swing.m1 * dx - dz) - quarter * relative) / 2
     period = 4 * quarter
     middle = swing.A * swing.B * 4 * first
     less = start[1] ** 2 * period - middle
@@ -180,11 +182,13 @@ def _periods_rule(primals, tangents):
     dP_psi = jnp.where(steady, 0, 4 * dquarter / pulse)
     dP_phi = jnp.where(moving, -P_phi / jnp.where(moving, rate, 1) * drate, 0)
     dP_phi = jnp.where(moving, dP_phi, 0)
+    dm1 = jnp.where(x > 0, (dz - swing.m1 * dx) / divisor, 0)
     dk2 = jnp.where(x > 0, (dy - k2 * dx) / divisor, 0)
+    dm1, dk2 = jnp.where(swing.circular, -dk2, dm1), jnp.where(swing.circular, dk2, -dm1)
     angles = jax.jvp(
         lambda *a: _angles(swing.sense, *a),
         (swing.A, swing.B, swing.r, swing.s, swing.m1),
-        (dA, dB, dr, ds, -dk2),
+        (dA, dB, dr, ds, dm1),
     )[1]
     resting = swing.pulse == 0
     angles = tuple(jnp.where(resting, 0, a) for a in angles)

@@ -37,9 +37,9 @@ def settle(values, one: Scalars):
 class Roles(NamedTuple):
     """One body with its axes renumbered: 3 is the axis that the momentum circles, 2 the middle one.
 
-    Moments are divided by a power of two near the largest, rates by one near the largest rate;
-    time is to be multiplied by ``pulse``, which is zero for a body at rest (its direction is
-    then a dummy).
+    Rates are divided by a power of two near the largest, moments by one that leaves the largest
+    momentum near one, so that no product of momenta leaves the range of the dtype; time is to be
+    multiplied by ``pulse``, which is zero for a body at rest (its direction is then a dummy).
     """
 
     moments: Triple
@@ -83,6 +83,11 @@ def assign_roles(moments: Triple, rates: Triple) -> Roles:
     w_low, w_mid, w_high = (pick(rates, k) / pulse for k in (k_low, k_mid, k_high))
     resting = largest == 0
     w_high = jnp.where(resting, 1, w_high)
+    lift = binade(
+        jnp.maximum(jnp.maximum(jnp.abs(low * w_low), jnp.abs(mid * w_mid)), jnp.abs(high * w_high))
+    )
+    heft = heft * lift
+    low, mid, high = low / lift, mid / lift, high / lift
     # Exact next to the separatrix, where the two terms cancel and all depends on the difference.
     gap = subtract_pairs(_pull(high, w_high, high, mid), _pull(low, w_low, mid, low)).value
     gap = settle(gap, one)

@@ -33,25 +33,25 @@ class Change(NamedTuple):
 
 
 class Partials(NamedTuple):
-    """Derivatives of S, C, N with respect to x and y."""
+    """Derivatives of S, C, N with respect to x, at fixed z = x - y, and to z."""
 
     S: tuple[Scalars, Scalars]
     C: tuple[Scalars, Scalars]
     N: tuple[Scalars, Scalars]
 
-    def along(self, dx: Scalars, dy: Scalars) -> Triple:
-        return tuple(fx * dx + fy * dy for fx, fy in self)
+    def along(self, dx: Scalars, dz: Scalars) -> Triple:
+        return tuple(fx * dx + fz * dz for fx, fz in self)
 
 
 def partials(x: Scalars, y: Scalars, functions: Triple, first: Scalars, second: Scalars):
     """Derivatives of S, C, N from the integrals of S^2 and (S/N)^2."""
     S, C, N = functions
-    both = first + second
-    bend = S * S * S - C * N * both
+    square = S * S
+    # z is what vanishes on the separatrix, where ``second`` grows without bound.
     return Partials(
-        (-bend / 2, -C * N * second / 2),
-        (-S * (S * C + x * N * both) / 2, x * S * N * second / 2),
-        (y * S * bend / (2 * N), -S * (S / N - y * C * second) / 2),
+        ((C * N * first - square * S) / 2, C * N * second / 2),
+        (-S * (S * C + x * N * first) / 2, -x * S * N * second / 2),
+        (-S * (S * N + y * C * first) / 2, S * (S / N - y * C * second) / 2),
     )
 
 
@@ -69,14 +69,14 @@ class Setting(NamedTuple):
 def _quotients(at: Setting, functions: Triple):
     """Delta, (1 - C)/r, (1 - N)/p and (CN - Delta)/s, none with a vanishing divisor."""
     S, C, N = functions
-    (l1, l2, l3), p, r, s, A, B = at
+    (l1, _, l3), p, r, s, A, B = at
     square = S * S
-    delta = C * C + r * s * (l3 * l3) * square
+    tail = r * s * (l3 * l3) * square
+    delta = C * C + tail
     ahead = C >= 0
     up = jnp.where(ahead, square * B / jnp.where(ahead, 1 + C, 1), (1 - C) / jnp.where(ahead, 1, r))
     tilt = square * A / (1 + N)
-    mixed = p * (l1 * l2) ** 2 + s * (l1 * l3) ** 2 + r * (l2 * l3) ** 2
-    near = square * (p * r * square * mixed - (r * l3 * l3 + p * l1 * l1))
+    near = square * (p * (l1 * l1) * tail - delta * (p * l1 * l1 + r * l3 * l3))
     product = C * N
     skew = jnp.where(
         ahead,
@@ -90,12 +90,21 @@ def products_of_momenta(at: Setting, functions: Triple, hand: Scalars) -> Triple
     """Integrals of L1 L2, L1 L3, L2 L3 over the time from the start."""
     S, C, N = functions
     l1, l2, l3 = at.momentum
-    delta, up, tilt, skew = _quotients(at, functions)
+    delta, _, _, skew = _quotients(at, functions)
     square = S * S
+    # (1 - C)/r - p (l2 S)^2 and (1 - N)/p - r (l2 S)^2: on a spin about the middle axis the second
+    # term takes all but the last digits of the first.
+    ahead = C >= 0
+    up = (at.s * l3 * l3 - at.p * l2 * l2 * C) * jnp.where(
+        ahead,
+        square / jnp.where(ahead, 1 + C, 1),
+        (1 - C) / jnp.where(ahead, 1, at.r * at.B),
+    )
+    tilt = (at.s * l1 * l1 - at.r * l2 * l2 * N) * square / (1 + N)
     return (
-        (l1 * l2 * S * C + hand * l3 * (tilt - at.r * l2 * l2 * square)) / delta,
+        (l1 * l2 * S * C + hand * l3 * tilt) / delta,
         (l1 * l3 * S + hand * l2 * skew) / delta,
-        (l2 * l3 * S * N + hand * l1 * (up - at.p * l2 * l2 * square)) / delta,
+        (l2 * l3 * S * N + hand * l1 * up) / delta,
     )
 
 
@@ -116,8 +125,8 @@ def _crossed(at: Setting, functions: Triple, now: Triple, by: Partials, hand, se
     )
     blend = jnp.where(uneven, (p * C + r * N) / span, 1)
 
-    def answer(dx, dy, dd, heads):
-        dS, dC, dN = by.along(dx, dy)
+    def answer(product, dd, heads):
+        dS, dC, dN = by.along(2 * r * product, 2 * s * product)
         dd = dd - 2 * p * r * l2 * l2 * S * dS
         rest = (
             -l1 * dC + hand * r * l2 * l3 * (dS * N + S * dN) + n1 * dd,
@@ -130,17 +139,17 @@ def _crossed(at: Setting, functions: Triple, now: Triple, by: Partials, hand, se
     swap = 1 + r * tilt
     turn = 1 + p * up
     return (
-        answer(2 * r * q12, -2 * p * q12, -2 * r * q12 * square, (
+        answer(q12, -2 * r * q12 * square, (
             l2 * C * tilt - hand * q13 * S * swap,
             l1 * C * tilt + hand * q23 * S * swap,
             hand * (l1 * l1 - l2 * l2) * S * C,
         )),
-        answer(2 * r * q13, -2 * p * q13, jnp.zeros_like(S), (
+        answer(q13, jnp.zeros_like(S), (
             l3 * split + hand * q12 * S * blend,
             -hand * (l1 * l1 - l3 * l3) * S,
             l1 * split - hand * q23 * S * blend,
         )),
-        answer(2 * r * q23, -2 * p * q23, 2 * p * q23 * square, (
+        answer(q23, 2 * p * q23 * square, (
             hand * (l2 * l2 - l3 * l3) * S * N,
             -l3 * N * up - hand * q12 * S * turn,
             -l2 * N * up + hand * q13 * S * turn,
@@ -149,13 +158,15 @@ def _crossed(at: Setting, functions: Triple, now: Triple, by: Partials, hand, se
 
 
 def change_of_invariants(swing: Swing, change: Change):
-    """Variations of r, s, p, A and B, those of the tensor's entries 12, 13, 23 left aside."""
+    """Variations of r, s, p, A, B and B r - A p, but for the tensor's entries 12, 13, 23."""
     (l1, l2, l3), (e1, e2, e3) = swing.momentum, change.inverse
     g1, g2, g3 = change.momentum
     dp, dr, ds = (swing.sense * d for d in (e1 - e2, e2 - e3, e1 - e3))
     dA = 2 * (l1 * g1 * swing.s + l2 * g2 * swing.r) + l1 * l1 * ds + l2 * l2 * dr
     dB = 2 * (l2 * g2 * swing.p + l3 * g3 * swing.s) + l2 * l2 * dp + l3 * l3 * ds
-    return dr, ds, dp, dA, dB
+    gap = swing.r * l3 * l3 - swing.p * l1 * l1
+    dgap = 2 * (l3 * g3 * swing.r - l1 * g1 * swing.p) + l3 * l3 * dr - l1 * l1 * dp
+    return dr, ds, dp, dA, dB, gap * ds + swing.s * dgap
 
 
 def momentum_tangent(
@@ -164,8 +175,8 @@ def momentum_tangent(
     """Variation of L(t) - L(0)."""
     hand = swing.sense * swing.parity
     at = Setting(swing.momentum, swing.p, swing.r, swing.s, swing.A, swing.B)
-    dr, ds, dp, dA, dB = stage(change_of_invariants(swing, change))
-    moved = stage(by.along(dB * swing.r + swing.B * dr, dA * swing.p + swing.A * dp))
+    dr, ds, dp, dA, dB, dz = stage(change_of_invariants(swing, change))
+    moved = stage(by.along(dB * swing.r + swing.B * dr, dz))
     (j12, j13, j23), (k12, k13, k23) = jax.jvp(
         lambda a, f: products_of_momenta(a, f, hand),
         (at, functions),
