@@ -96,7 +96,7 @@ def _box(tensor: np.ndarray) -> np.ndarray:
 
 
 def _shade(turn: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Face colours: one hue per body axis pair, lit from above."""
+    """Face colours: one hue per body axis, paler on its negative side, lit from above."""
     from matplotlib.colors import to_rgb
 
     light = np.array([0.35, -0.5, 0.8])
@@ -106,7 +106,10 @@ def _shade(turn: np.ndarray, corners: np.ndarray) -> np.ndarray:
         centre = corners[face].mean(axis=0)
         normal = turn @ (centre / np.linalg.norm(centre))
         # the hue of the body axis nearest to the face's normal
-        hue = np.array(to_rgb(AXES[int(np.argmax(np.abs(centre / np.linalg.norm(centre))))]))
+        axis = int(np.argmax(np.abs(centre)))
+        hue = np.array(to_rgb(AXES[axis]))
+        if centre[axis] < 0:  # a body that has turned over must look different
+            hue = 0.35 * hue + 0.65
         colors.append(np.clip(hue * 0.55 + 0.25 + 0.25 * (normal @ light), 0, 1))
     return np.array(colors)
 

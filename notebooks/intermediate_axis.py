@@ -1,0 +1,162 @@
+# ---
+# jupyter:
+#   jupytext:
+#     formats: ipynb,py:percent
+#   kernelspec:
+#     display_name: Python 3
+#     language: python
+#     name: python3
+# ---
+
+# %% [markdown]
+# # Why does it turn over? The intermediate axis
+#
+# In 1985 Vladimir Dzhanibekov unscrewed a wing nut in orbit: it flew off spinning, turned over,
+# flew on, turned over again. Nothing acts on it. A body spins steadily about its axis of least
+# and of greatest inertia, and turns over, again and again, when spun about the one between.
+
+# %%
+import tempfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from IPython.display import Image
+
+import polhode as ph
+from polhode import plot
+
+jax.config.update("jax_enable_x64", True)
+plt.rcParams.update({"figure.dpi": 80, "axes.spines.top": False, "axes.spines.right": False})
+
+nut = ph.Inertia.from_moments([1.0, 2.0, 2.5])  # kg m^2: least about x, greatest about z
+scene = ph.Scene(nut)
+
+# %% [markdown]
+# ## Three axes, three fates
+# The same spin of 1 rad/s about each axis, with the same push of a hundredth sideways. One call
+# moves all three.
+
+# %%
+push = 0.01
+omega = jnp.full((3, 3), push).at[jnp.arange(3), jnp.arange(3)].set(1.0)
+ts = jnp.linspace(0.0, 60.0, 1201)
+three = ph.simulate(scene, ph.State([1.0, 0.0, 0.0, 0.0], omega), ts)
+
+fig, panels = plt.subplots(1, 3, figsize=(10, 2.8), sharey=True, layout="constrained")
+for k, (ax, name) in enumerate(zip(panels, ("least", "intermediate", "greatest"), strict=True)):
+    ax.plot(ts, three.omega_body[k], label=["x", "y", "z"])
+    ax.set(title=f"about the axis of {name} inertia", xlabel="time (s)")
+panels[0].set_ylabel("body rates (rad/s)")
+panels[0].legend(loc="center right", frameon=False)
+plt.show()
+
+# %% [markdown]
+# ## The picture that explains it
+# Energy and the size of the angular momentum stay as they are. Each is an ellipsoid in the space of
+# body rates, and the tip of the rate moves along the curve where the two meet: the **polhode**.
+# Around the axes of least and greatest inertia these curves are small closed loops. Through the
+# intermediate axis run the two curves of the separatrix (dashed), and a body started there is
+# carried along them to the other side of the ellipsoid: it turns over.
+
+# %%
+fig = plt.figure(figsize=(8.6, 3.1), layout="constrained")
+for k in range(3):
+    plot.polhode(three, body=k, ax=fig.add_subplot(1, 3, k + 1, projection="3d"), view=(22, 35))
+plt.show()
+
+# %% [markdown]
+# Seen from space, the tip of the rate wanders in a plane normal to the angular momentum: the
+# **herpolhode**. About a stable axis it stays in a narrow ring around the momentum; about the
+# intermediate axis it comes from the middle and returns to it with every turn.
+
+# %%
+fig, panels = plt.subplots(1, 3, figsize=(8.6, 3.1), layout="constrained")
+for k, ax in enumerate(panels):
+    plot.herpolhode(three, body=k, ax=ax)
+plt.show()
+
+# %% [markdown]
+# ## The flip itself
+# Faces on the negative side of a body axis are paler. The box turns over; its angular momentum
+# stays where it was.
+
+# %%
+flip = ph.simulate(scene, ph.State([1.0, 0.0, 0.0, 0.0], omega[1]), jnp.linspace(0.0, 32.0, 801))
+with tempfile.TemporaryDirectory() as folder:
+    movie = Path(folder) / "flip.gif"
+    plot.animate(flip, movie, seconds=5.4, fps=10, dpi=45)
+    plt.close("all")
+    shown = Image(movie.read_bytes(), alt="A box spinning about its intermediate axis turns over")
+shown
+
+# %% [markdown]
+# ## How often?
+# Next to the axis a push grows like $e^{\lambda t}$ with
+# $\lambda = \omega\sqrt{(I_2-I_1)(I_3-I_2)/(I_1I_3)}$, so the wait depends on the logarithm of the
+# push: a push ten times smaller waits only $\ln 10/\lambda$ longer. The exact period is a complete
+# elliptic integral, `ph.periods`, and holds down to pushes that no stepping method would resolve.
+
+# %%
+small, middle, great = 1.0, 2.0, 2.5
+growth = np.sqrt((middle - small) * (great - middle) / (small * great))
+pushes = jnp.logspace(-15, -0.5, 59)
+tilted = jnp.stack([pushes, jnp.ones_like(pushes), pushes], axis=-1)
+body = ph.periods(nut, ph.State([1.0, 0.0, 0.0, 0.0], tilted))
+
+measured = []
+for size in (1e-2, 1e-6, 1e-10):
+    start = ph.State([1.0, 0.0, 0.0, 0.0], [size, 1.0, size])
+    fine = jnp.linspace(0.0, 240.0, 24001)
+    about_y = np.asarray(ph.simulate(scene, start, fine).omega_body[:, 1])
+    crossings = np.flatnonzero(np.diff(np.sign(about_y)))
+    measured.append(float(fine[crossings[1]] - fine[crossings[0]]))
+
+fig, ax = plt.subplots(figsize=(8, 3.4), layout="constrained")
+ax.semilogx(pushes, body.P_psi / 2, color="C0", label="half of ph.periods(...).P_psi")
+slope = -2 * np.log(np.asarray(pushes)) / growth
+offset = float(body.P_psi[8] / 2 - slope[8])
+ax.semilogx(pushes, slope + offset, "--", color="0.5", label=r"$-(2/\lambda)\ln$ push + constant")
+ax.semilogx([1e-2, 1e-6, 1e-10], measured, "o", color="C1", label="simulated")
+ax.set(xlabel="sideways push (rad/s)", ylabel="between two flips (s)")
+ax.legend(frameon=False)
+plt.show()
+for size, seen in zip((1e-2, 1e-6, 1e-10), measured, strict=True):
+    start = ph.State([1.0, 0.0, 0.0, 0.0], [size, 1.0, size])
+    exact = float(ph.periods(nut, start).P_psi) / 2
+    print(f"push {size:.0e}: flips every {seen:.2f} s, ph.periods gives {exact:.4f} s")
+
+# %% [markdown]
+# ## And with friction inside?
+# Nothing above depends on how a nut is made. Real bodies bend and slosh a little: energy is lost,
+# angular momentum is not, and every body ends up spinning about its axis of *greatest* inertia.
+# That is what surprised the builders of Explorer 1 in 1958. `ph.FeedbackTorque` takes any torque
+# that depends on the state; one that acts along $L\times(L\times\omega)$ removes energy and leaves
+# the size of the momentum alone.
+
+
+# %%
+def rubbing(t, wxyz, omega_body):
+    """A torque normal to the momentum that lowers the energy."""
+    momentum = nut.diagonal * omega_body
+    return 0.03 * jnp.cross(momentum, jnp.cross(momentum, omega_body))
+
+
+long = jnp.linspace(0.0, 600.0, 3001)
+slow = ph.simulate(
+    ph.Scene(nut, torque=ph.FeedbackTorque(rubbing)),
+    ph.State([1.0, 0.0, 0.0, 0.0], [1.0, 0.02, 0.02]),
+    long,
+    rtol=1e-8,
+)
+fig, ax = plt.subplots(figsize=(8, 3), layout="constrained")
+ax.plot(long, slow.omega_body, label=["x (least)", "y", "z (greatest)"], linewidth=0.9)
+ax.set(xlabel="time (s)", ylabel="body rates (rad/s)")
+ax.legend(loc="center right", frameon=False)
+plt.show()
+size = jnp.linalg.norm(slow.momentum_space, axis=-1)
+print(f"momentum changed by {float(jnp.ptp(size) / size[0]):.1e} of itself,"
+      f" energy fell to {float(slow.energy[-1] / slow.energy[0]):.4f} of its start;"
+      f" {small / great} belongs to spin about z")  # fmt: skip
