@@ -89,8 +89,8 @@ with tempfile.TemporaryDirectory() as folder:
     movie = Path(folder) / "flip.gif"
     plot.animate(flip, movie, seconds=5.4, fps=10, dpi=45)
     plt.close("all")
-    shown = Image(movie.read_bytes(), alt="A box spinning about its intermediate axis turns over")
-shown
+    picture = Image(movie.read_bytes(), alt="A box spinning about its intermediate axis turns over")
+picture  # noqa: B018
 
 # %% [markdown]
 # ## How often?
