@@ -1,30 +1,84 @@
-"""``python -m benchmarks [--quick]``: the tables one after the other, each in its own process."""
+"""``python -m benchmarks``: run them all, draw figures, compare results, write the results page.
+
+python -m benchmarks [--quick] [--output FOLDER]   every benchmark, each in its own process
+python -m benchmarks figures FILE ... [--output FOLDER]
+python -m benchmarks compare OLD NEW
+python -m benchmarks page                          benchmarks/README.md and README.md
+"""
 
 import argparse
+import importlib.util
 import subprocess
 import sys
+import time
+from pathlib import Path
 
-TABLES = {
-    "document_000": ([], []),
-    "charts": (["--bodies", "200", "--euler-bodies", "10"], []),
-    "scene_cost": (["--bodies", "200"], []),
+from benchmarks import _compare, _figures, _page, _report
+
+QUICK: dict[str, list[str]] = {
+    "work_precision": ["--quick"],
+    "gradients": ["--quick"],
+    "scene_cost": ["--quick"],
 }
-"""Module -> options of the quick and of the full table."""
+FULL: dict[str, list[str]] = {
+    "work_precision": [], "gradients": [], "scene_cost": [], "scaling": [], "stress": [],
+    "identification": [], "accelerator": [],
+}  # fmt: skip
+
+
+def run(quick: bool, folder: Path) -> int:
+    """Run benchmarks and draw their figures; the number of those that failed."""
+    failed, began = 0, time.perf_counter()
+    for name, given in (QUICK if quick else FULL).items():
+        if importlib.util.find_spec(f"benchmarks.{name}") is None:
+            continue
+        print(f"\n=== {name}", flush=True)
+        target = folder / f"{name}.json"
+        words = [sys.executable, "-m", f"benchmarks.{name}", *given, "--output", str(target)]
+        failed += subprocess.run(words).returncode != 0
+    made = sorted(folder.glob("*.json"))
+    for path in _figures.draw(made, folder):
+        print(f"figure: {path}")
+    print(f"{time.perf_counter() - began:.0f} s in all, {failed} failed")
+    return failed
 
 
 def main() -> int:
-    """Run them; the number of those that failed."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="small sizes, a few minutes")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--quick", action="store_true", help="small sizes, under five minutes")
+    parser.add_argument("--output", type=Path, default=_report.OUT, help="folder for what is made")
+    actions = parser.add_subparsers(dest="action")
+    figures = actions.add_parser("figures", help="draw figures from results")
+    figures.add_argument("files", nargs="+", type=Path)
+    figures.add_argument("--output", type=Path, default=_report.OUT)
+    figures.add_argument("--format", choices=("svg", "png"), default="svg")
+    compare = actions.add_parser("compare", help="what changed beyond noise")
+    compare.add_argument("old", type=Path)
+    compare.add_argument("new", type=Path)
+    actions.add_parser("page", help="write benchmarks/README.md and the tables of README.md")
     options = parser.parse_args()
-    failed = 0
-    for name, (quick, full) in TABLES.items():
-        print(f"\n{name}", flush=True)
-        given = quick if options.quick else full
-        failed += (
-            subprocess.run([sys.executable, "-m", f"benchmarks.{name}", *given]).returncode != 0
-        )
-    return failed
+    if options.action == "figures":
+        for path in _figures.draw(options.files, options.output, f".{options.format}"):
+            print(path)
+        return 0
+    if options.action == "compare":
+        old, new = _report.read(options.old), _report.read(options.new)
+        print(_compare.show(_compare.compare(old, new)))
+        return 0
+    if options.action == "page":
+        merged = _page.merged()
+        if merged:
+            drawn = _figures.work_precision(merged)
+            _figures.save(drawn, _report.RESULTS / "work_precision.svg")
+        others = [_report.RESULTS / f"{name}.json" for name in ("scaling", "gradients")]
+        _figures.draw([path for path in others if path.exists()], _report.RESULTS)
+        for path in _page.write():
+            print(path.relative_to(_page.ROOT))
+        return 0
+    options.output.mkdir(parents=True, exist_ok=True)
+    return run(options.quick, options.output)
 
 
 if __name__ == "__main__":

@@ -1,20 +1,19 @@
 """What each kind of scene costs, and what skipping saves.
 
-    python -m benchmarks.scene_cost [--bodies 1000] [--output out/scene_cost.json]
+    python -m benchmarks.scene_cost [--quick] [--bodies 1000] [--output out/scene_cost.json]
 
 For every scene: floating-point operations and bytes per body as counted by the compiler (a loop's
 body is counted once), and measured nanoseconds per body on one core, median of repeats.
 """
 
 import argparse
-import json
-import os
 import time
 from pathlib import Path
 
-os.environ.setdefault(
-    "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-)
+from benchmarks import _report
+
+if __name__ == "__main__":
+    _report.one_thread()
 
 import jax
 import jax.numpy as jnp
@@ -79,17 +78,13 @@ def measure(name: str, n: int, repeats: int = 7) -> dict[str, float | str]:
     start = time.perf_counter()
     compiled, arguments = program(scene, state, ts, record)
     compile_time = time.perf_counter() - start
-    jax.block_until_ready(compiled(*arguments))
-    walls = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        jax.block_until_ready(compiled(*arguments))
-        walls.append(time.perf_counter() - start)
+    wall = _report.clock(lambda: jax.block_until_ready(compiled(*arguments)), repeats=repeats)
     row = {key: value / n for key, value in counts(compiled).items()}
     return {
         "scene": name,
         **row,
-        "ns": 1e9 * float(np.median(walls)) / n,
+        "ns": 1e9 * wall.median / n,
+        "spread": wall.spread,
         "compile_s": compile_time,
     }
 
@@ -100,17 +95,17 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--bodies", type=int, default=1000)
     parser.add_argument("--output", type=Path)
+    parser.add_argument("--quick", action="store_true", help="200 bodies")
     options = parser.parse_args()
-    rows = [measure(name, options.bodies) for name in scenes()]
+    bodies = 200 if options.quick else options.bodies
+    rows = [measure(name, bodies) for name in scenes()]
     print(f"{'per body':<38}{'flops':>9}{'transc.':>9}{'bytes':>9}{'ns':>11}{'compile s':>11}")
     for row in rows:
         print(
             f"{row['scene']:<38}{row['flops']:>9.0f}{row['transcendentals']:>9.1f}"
             f"{row['bytes accessed']:>9.0f}{row['ns']:>11.0f}{row['compile_s']:>11.2f}"
         )
-    if options.output:
-        options.output.parent.mkdir(parents=True, exist_ok=True)
-        options.output.write_text(json.dumps({"bodies": options.bodies, "rows": rows}, indent=1))
+    _report.write("scene_cost", {"bodies": bodies, "rows": rows}, path=options.output)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,163 @@
+"""Figures of the benchmarks, drawn from their JSON only."""
+
+from pathlib import Path
+
+from benchmarks._report import read
+
+PEERS = ("polhode (default)", "polhode LiePoisson", "heyoka", "diffrax", "diffrax (Euler angles)",
+         "SciPy closed form", "SciPy solve_ivp", "Numba", "MuJoCo")  # fmt: skip
+SHOWN = {"bodies": 1000, "dtype": "float64"}
+
+
+def _name(peer: str, program: str) -> str:
+    if peer == "polhode":
+        return PEERS[0] if program.startswith("default") else PEERS[1]
+    return "diffrax (Euler angles)" if "Euler" in program else peer
+
+
+def fronts(rows: list[dict]) -> dict[str, tuple[list, list]]:
+    """Name -> errors and times of a peer's settings that none of its own others beat."""
+    points: dict[str, list] = {}
+    for row in rows:
+        if row["attitude_median"] is not None:
+            point = (row["ns_per_body"] * 1e-3, row["attitude_median"])
+            points.setdefault(_name(row["peer"], row["program"]), []).append(point)
+    found = {name: ([], []) for name in dict.fromkeys((*PEERS, *points))}
+    for name, several in points.items():
+        best = float("inf")
+        for time, error in sorted(several):
+            if error < best:
+                best = error
+                found[name][0].append(error)
+                found[name][1].append(time)
+    return found
+
+
+def work_precision(report: dict, families: list[str] | None = None, **shown):
+    """A panel per family: attitude error of the median body against time per body."""
+    import matplotlib.pyplot as plt
+
+    from polhode import plot
+    from polhode.plot._matplotlib import STYLE
+
+    shown = SHOWN | shown
+    tables = [
+        t for t in report["numbers"]["tables"]
+        if all(t[k] == v for k, v in shown.items()) and (not families or t["family"] in families)
+    ]  # fmt: skip
+    if not tables:
+        raise ValueError(f"the result holds no table with {shown}")
+    columns = min(3, len(tables))
+    rows = -(-len(tables) // columns)
+    with plt.rc_context(STYLE):
+        figure = plt.figure(figsize=(3.3 * columns + 1.9, 2.6 * rows + 0.3), layout="constrained")
+        axes = list(figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat)
+        drawn = {}
+        for ax, table in zip(axes, tables):
+            plot.work_precision(
+                fronts(table["rows"]), ax=ax, highlight=PEERS[0], error_label="", time_label=""
+            )
+            for line in ax.lines:
+                if len(line.get_xdata()):
+                    drawn[line.get_label()] = line
+                if len(line.get_xdata()) == 1:  # an exact method: one point serves every error
+                    line.set_markersize(10)
+            ax.get_legend().remove()
+            ax.set_title(table["title"])
+            ax.set_ylim(3e-16 if shown["dtype"] == "float64" else 1e-8, 5)
+            ax.minorticks_off()
+            ax.label_outer()
+            for text in ax.texts:
+                text.remove()
+        for ax in axes[len(tables) :]:
+            ax.set_axis_off()
+        figure.supxlabel("time per body [µs]", fontsize=9.5)
+        figure.supylabel("attitude error at the end [rad], median body", fontsize=9.5)
+        order = list(drawn)
+        figure.legend([drawn[name] for name in order], order, loc="outside right upper")
+    return figure
+
+
+def save(figure, path: Path) -> Path:
+    """Write a figure, whole or not at all, without anything that changes from run to run."""
+    import matplotlib.pyplot as plt
+
+    from polhode.io import whole_file
+
+    path.parent.mkdir(parents=True, exist_ok=True)
+    quiet = {"svg.hashsalt": "polhode", "svg.fonttype": "path"}
+    with plt.rc_context(quiet), whole_file(path) as partial:
+        figure.savefig(partial, metadata={"Date": None} if path.suffix == ".svg" else None)
+    plt.close(figure)
+    return path
+
+
+def scaling(report: dict):
+    """Time and memory per body against the number of bodies, the horizon and saved times."""
+    import matplotlib.pyplot as plt
+
+    from polhode.plot._matplotlib import STYLE
+
+    sweeps = ("bodies", "horizon", "saves")
+    labels = {"bodies": "bodies", "horizon": "horizon [s]", "saves": "saved times"}
+    with plt.rc_context(STYLE):
+        figure = plt.figure(figsize=(10.5, 5.0), layout="constrained")
+        axes = figure.subplots(2, 3, sharex="col", sharey="row")
+        for column, sweep in enumerate(sweeps):
+            for name, points in report["numbers"][sweep].items():
+                x = [point[sweep] for point in points]
+                axes[0, column].plot(x, [p["ns_per_body"] * 1e-3 for p in points], "o-", label=name)
+                memory = [p["memory_MB"] for p in points]
+                axes[1, column].plot(x, memory, "o-", label=name)
+            axes[1, column].set_xlabel(labels[sweep])
+            for ax in axes[:, column]:
+                ax.set_xscale("log")
+                ax.set_yscale("log")
+                ax.label_outer()
+        axes[0, 0].set_ylabel("time per body [µs]")
+        axes[1, 0].set_ylabel("memory of the program [MB]")
+        axes[0, 2].legend(loc="upper left")
+    return figure
+
+
+def gradients(report: dict):
+    """Cost of value and gradient over the forward run, and the error of the gradient."""
+    import matplotlib.pyplot as plt
+
+    from polhode.plot._matplotlib import STYLE
+
+    rows = report["numbers"]["rows"]
+    with plt.rc_context(STYLE):
+        figure = plt.figure(figsize=(10.5, 0.3 * len(rows) + 0.9), layout="constrained")
+        left, right = figure.subplots(1, 2, sharey=True)
+        kinds = {"polhode": "#222222", "diffrax": "#CC79A7", "heyoka": "#009E73"}
+        for k, row in enumerate(rows):
+            style = {"color": kinds[row["peer"]], "height": 0.6}
+            left.barh(k, row["ns_gradient"] * 1e-3, **style)
+            left.text(row["ns_gradient"] * 1.15e-3, k, f"{row['ratio']:.2g} x", va="center", size=8)
+            right.barh(k, row["error_median"], **style)
+        names = [f"{row['title']}: {row['peer']}, {row['setting']}" for row in rows]
+        left.set_yticks(range(len(rows)), names)
+        left.invert_yaxis()
+        left.set_xscale("log")
+        left.margins(x=0.12)
+        left.set_xlabel("value and gradient per body [µs]; over the value alone")
+        right.set_xscale("log")
+        right.set_xlim(1e-16, 1)
+        right.set_xlabel("relative error of the gradient, median body")
+        for ax in (left, right):
+            ax.grid(visible=False, axis="y")
+    return figure
+
+
+DRAWN = {"work_precision": work_precision, "scaling": scaling, "gradients": gradients}
+
+
+def draw(paths: list[Path], folder: Path, suffix: str = ".svg") -> list[Path]:
+    """Draw the figures of the results at ``paths`` into ``folder``; the files."""
+    made = []
+    for path in paths:
+        report = read(path)
+        if report["name"] in DRAWN:
+            made.append(save(DRAWN[report["name"]](report), folder / f"{report['name']}{suffix}"))
+    return made

@@ -1,0 +1,87 @@
+"""polhode itself: what the planner chooses, and LiePoisson where it would choose something else."""
+
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import polhode as ph
+from benchmarks.peers import Program
+from benchmarks.problems import DIRECTION, Problem
+from polhode._simulate import run
+
+NAME = "polhode"
+DEFAULT = "default"
+PACKAGES = ()
+
+
+def scene(problem: Problem, dtype) -> ph.Scene:
+    """The problem as a scene."""
+    a, _, c = problem.moments
+    if problem.name == "lagrange":
+        inertia = ph.Inertia.axisymmetric(jnp.asarray(a, dtype), jnp.asarray(c, dtype))
+    else:
+        inertia = ph.Inertia.from_moments(jnp.asarray(problem.moments, dtype))
+    if problem.weight:
+        gravity = jnp.asarray([0.0, 0.0, -problem.weight], dtype)
+        one = jnp.ones((), dtype)
+        return ph.Scene(inertia, ph.UniformGravity.axial(one, one, gravity))
+    if problem.gradient:
+        mu = jnp.asarray(problem.gradient / 3, dtype)
+        return ph.Scene(inertia, ph.GravityGradient(mu, jnp.asarray(DIRECTION, dtype)))
+    return ph.Scene(inertia)
+
+
+def programs(problem: Problem, n, dtype, tolerances, quick) -> list[Program]:
+    given, record = scene(problem, dtype), ph.Record(final_only=problem.saves == 1)
+    count = 3 if n == 1 else n
+    wxyz, omega = (jnp.asarray(x, dtype) for x in problem.states(count))
+    starts = list(zip(wxyz, omega)) if n == 1 else [(wxyz, omega)]
+    ts = jnp.asarray(problem.times, dtype)
+    floor = 4 * float(np.finfo(dtype).eps)
+    tolerances = [t for t in tolerances if t >= floor]
+    asked = [(DEFAULT, t, ph.choose(given, ph.State(*starts[0]), record, t)[0]) for t in tolerances]
+    stepped = not isinstance(asked[0][2], ph.ClosedForm | ph.LagrangeTop)
+    if not stepped:
+        asked = asked[:1]
+    if not quick and problem.horizon < 1e4 and n <= 1000:
+        own = ph.LiePoisson(at_end=True)
+        asked += [("LiePoisson", t, own) for t in tolerances if own != asked[0][2]]
+    built, found = {}, []
+    for label, tolerance, method in asked:
+        spent = None
+        if repr(method) not in built:
+            begin = time.perf_counter()
+            built[repr(method)] = _compiled(method, given, starts[0], ts, record)
+            spent = time.perf_counter() - begin
+        name = f"{label}: {type(method).__name__}" if label == DEFAULT else label
+        if isinstance(method, ph.Extrapolated):
+            name = f"{label}: Extrapolated"
+        exact = isinstance(method, ph.ClosedForm | ph.LagrangeTop)
+        call = _call(built[repr(method)], starts, jnp.asarray(tolerance, dtype), record, n)
+        setting = "exact" if exact else f"{tolerance:.0e}"
+        found.append(Program(name, setting, call, count, spent))
+    return found
+
+
+def _compiled(method, given, start, ts, record):
+    """What ``jax.jit`` of a call of ``ph.simulate`` gives, compiled."""
+
+    @jax.jit
+    def simulated(wxyz, omega, rtol):
+        made = run(method, given, ph.State(wxyz, omega), ts, rtol, record)
+        return made.wxyz, made.omega_body
+
+    return simulated.lower(*start, jnp.asarray(1e-3, ts.dtype)).compile()
+
+
+def _call(program, starts, rtol, record, n):
+    skip = 0 if record.final_only else 1
+
+    def call():
+        made = jax.block_until_ready([program(*start, rtol) for start in starts])
+        q, w = (np.stack(x) if n == 1 else np.asarray(x[0]) for x in zip(*made))
+        return q[:, skip:], w[:, skip:]
+
+    return call

@@ -1,0 +1,310 @@
+"""Every benchmark runs at a tiny size, scores right, and pages hold what the results say."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+from benchmarks import _compare, _figures, _levels, _page, _report, problems, truth
+from benchmarks.problems import PROBLEMS
+
+FREE = PROBLEMS["free"]
+
+
+# Truth and scores
+
+
+@pytest.mark.filterwarnings("ignore:Descending:DeprecationWarning")
+@pytest.mark.parametrize("name", ["near_symmetric", "heavy_top", "gradient"])
+def test_truth_is_what_another_taylor_series_gives(name):
+    from mpmath import mp, mpf
+    from systems import taylor
+    from systems.table import System
+
+    problem = PROBLEMS[name]
+    acts = {}
+    if problem.weight:
+        acts["gravity"] = (problem.weight, (0.0, 0.0, 1.0))
+    if problem.gradient:
+        acts["gradient"] = (problem.gradient, problems.DIRECTION)
+    wxyz, omega = (x[0] for x in problem.states(1))
+    system = System(name, problem.moments, tuple(wxyz), tuple(omega), (0, 1), acts)
+    field = taylor.body(problem.moments, system.torque(problem.moments))
+    with mp.workdps(50):
+        q = [mpf(x) for x in wxyz]
+        size = mp.sqrt(sum(x * x for x in q))
+        other = taylor.integrate(field, [*map(mpf, omega), *(x / size for x in q)], 0, 1, 4)
+        found = truth.motion(problem, wxyz, omega, [1.0])[0]
+        apart = max(abs(a - b) for a, b in zip(found, [*other[3:], *other[:3]]))
+    # the direction (0.6, 0, 0.8) is a unit vector to rounding only
+    assert apart < mpf(10) ** (-16 if problem.gradient else -24)
+
+
+def test_long_motion_in_whole_periods_is_the_motion_step_by_step():
+    import mpmath as mp
+
+    for flip in (FREE, PROBLEMS["separatrix"]):
+        wxyz, omega = (x[0] for x in flip.states(1))
+        far = truth.motion(flip, wxyz, omega, [60.0])[0]
+        with mp.workdps(50):
+            moments = [mp.mpf(m) for m in flip.moments]
+            q = [mp.mpf(float(x)) for x in wxyz]
+            size = mp.sqrt(mp.fdot(q, q))
+            q, w = [x / size for x in q], [mp.mpf(float(x)) for x in omega]
+            by_periods = truth._long(moments, q, w, mp.mpf(60), truth.DIGITS)
+            assert max(abs(a - b) for a, b in zip(far, by_periods)) < mp.mpf(10) ** -28
+
+
+@pytest.mark.parametrize("name", PROBLEMS)
+def test_saved_truth_is_scored_at_the_last_time_and_belongs_to_the_bodies(name):
+    problem, exact = PROBLEMS[name], truth.truth(PROBLEMS[name])
+    assert exact["index"][-1] == problem.saves - 1
+    assert exact["wxyz"].shape == (truth.BODIES, len(exact["index"]), 4)
+    np.testing.assert_allclose(np.linalg.norm(exact["wxyz"], axis=-1), 1, atol=1e-15)
+    _, omega = problem.states(truth.BODIES)
+    moments = np.array(problem.moments)
+    if problem.free:
+        energy = np.sum(moments * omega**2, axis=-1)
+        later = np.sum(moments * exact["omega"] ** 2, axis=-1)
+        np.testing.assert_allclose(later, np.broadcast_to(energy[:, None], later.shape), rtol=1e-14)
+
+
+def test_errors_are_angles_and_a_failure_counts_as_one():
+    q = np.array([[[1.0, 0, 0, 0]], [[1.0, 0, 0, 0]], [[1.0, 0, 0, 0]]])
+    exact = {"index": np.array([0]), "wxyz": q, "omega": np.ones((3, 1, 3))}
+    turned = q.copy()
+    turned[1, 0] = [-math.cos(1e-9), -math.sin(1e-9), 0, 0]  # the other sign, off by 2e-9 rad
+    found = problems.errors(exact, turned, np.ones((3, 1, 3)) * 1.5)
+    assert found["attitude_worst"] == pytest.approx(2e-9, rel=1e-6)
+    assert found["attitude_median"] == 0
+    assert found["rate_worst"] == pytest.approx(0.5)
+    assert found["failed"] == 0
+    turned[2] = np.nan
+    found = problems.errors(exact, turned, None)
+    assert (found["failed"], found["attitude_worst"]) == (1, math.pi)
+    turned[2, 0] = [0, 0, 1, 0]
+    assert problems.errors(exact, turned, None)["attitude_worst"] == pytest.approx(math.pi)
+
+
+# Peers move the same bodies
+
+
+@pytest.mark.parametrize("name", [name for name in PROBLEMS if name != "long"])
+def test_solve_ivp_moves_every_problem_as_the_truth_says(name):
+    from benchmarks.peers import scipy_ivp
+
+    problem = PROBLEMS[name]
+    alone, together = (
+        found[-1] for found in (
+            scipy_ivp.programs(problem, n, np.float64, [1e-9], True) for n in (1, 4)
+        )
+    )  # fmt: skip
+    for program in (alone, together):
+        found = problems.errors(truth.truth(problem), *program.call())
+        assert found["scored"] == program.bodies
+        assert found["attitude_median"] < 2e-5
+        assert found["rate_median"] < 2e-5
+
+
+@pytest.mark.parametrize("name", ["free", "near_symmetric", "extreme", "dense", "long"])
+def test_scipy_closed_form_is_exact(name):
+    from benchmarks.peers import scipy_closed_form
+
+    (program,) = scipy_closed_form.programs(PROBLEMS[name], 20, np.float64, [], True)
+    found = problems.errors(truth.truth(PROBLEMS[name]), *program.call())
+    assert found["attitude_median"] < (1e-10 if name == "long" else 1e-11)
+    assert found["rate_median"] < (1e-10 if name == "long" else 1e-11)
+
+
+def test_stock_diffrax_moves_the_same_bodies_in_both_charts():
+    from benchmarks.peers import stock_diffrax
+
+    problem = dataclasses.replace(PROBLEMS["heavy_top"], horizon=2.0)
+    wxyz, omega = problem.states(3)
+    exact = [truth.motion(problem, *s, [2.0], 20)[0] for s in zip(wxyz, omega)]
+    exact = np.array([[[float(x) for x in state]] for state in exact])
+    exact = {"index": np.array([0]), "wxyz": exact[..., :4], "omega": exact[..., 4:]}
+    for program in stock_diffrax.programs(problem, 1, np.float64, [1e-9], True):
+        assert problems.errors(exact, *program.call())["attitude_worst"] < 1e-6
+
+
+def test_every_installed_peer_is_in_the_table_and_the_others_are_named():
+    from benchmarks import peers
+
+    installed, missing = peers.load()
+    assert len(installed) + len(missing) == len(peers.MODULES)
+    assert {"diffrax", "SciPy solve_ivp", "SciPy closed form"} <= set(installed)
+    assert all("not installed" in why for why in missing.values())
+
+
+# The benchmarks themselves
+
+
+def test_work_precision_times_and_scores_polhode():
+    from benchmarks.peers import polhode_own
+
+    for name, n, bound in (("dense", 20, 1e-12), ("heavy_top", 1, 1e-4)):
+        program = polhode_own.programs(PROBLEMS[name], n, np.float64, [1e-7], True)[-1]
+        found = problems.errors(truth.truth(PROBLEMS[name]), *program.call())
+        assert found["attitude_median"] < bound
+        assert found["scored"] == (3 if n == 1 else n)
+        assert program.compile_s > 0
+
+
+def test_tables_take_turns_and_keep_error_beside_time(monkeypatch):
+    from benchmarks import peers, work_precision
+    from benchmarks.peers import polhode_own, scipy_closed_form
+
+    closed = {"SciPy closed form": scipy_closed_form}
+    monkeypatch.setattr(peers, "load", lambda: (closed, {}))
+    monkeypatch.setattr(polhode_own, "programs", lambda *a: [])
+    rows = work_precision.table("free", 1, "float64", (1e-6,), True, repeats=2, budget=0.05)
+    assert [row["peer"] for row in rows] == ["SciPy closed form"]
+    assert rows[0]["ns_per_body"] > 0
+    assert rows[0]["attitude_worst"] < 1e-12
+
+
+def test_gradients_are_scored_against_high_precision(monkeypatch):
+    from benchmarks import gradients
+
+    problem = dataclasses.replace(PROBLEMS["lagrange"], horizon=1.0)
+    exact = truth.slopes(problem, 2, gradients.WEIGHTS, 30)
+    made = gradients.stock(problem, 2, 1e-9, chunk=2)
+    row = gradients.measure_jax("diffrax", made, problem, 2, "1e-09", exact)
+    assert row["error_worst"] < 1e-6
+    assert row["ratio"] > 1
+
+
+def test_scaling_and_scene_cost_run():
+    from benchmarks import scaling, scene_cost
+
+    rows = scaling.measure("free", 8, 1, (1.0, 100.0), budget=0.01)
+    assert [row["horizon"] for row in rows] == [1.0, 100.0]
+    assert all(row["ns_per_body"] > 0 and row["memory_MB"] > 0 for row in rows)
+    row = scene_cost.measure("free, spherical, final state", 4, repeats=1)
+    assert row["ns"] > 0
+    assert row["flops"] > 0
+
+
+# Results, comparisons, pages
+
+
+def test_a_result_comes_back_and_holds_no_number_that_json_lacks(tmp_path, monkeypatch):
+    monkeypatch.setattr("sys.argv", ["x", "--quick", "--output", "/somewhere/a.json"])
+    numbers = {"rows": [{"ns": np.float64(1.23456789), "error": math.nan, "n": np.int64(3)}]}
+    path = _report.write("thing", numbers, path=tmp_path / "new" / "a.json", packages=("absent",))
+    report = _report.read(path)
+    assert report["numbers"] == {"rows": [{"ns": 1.2346, "error": None, "n": 3}]}
+    assert report["command"] == "python -m benchmarks.thing --quick"
+    assert report["versions"]["absent"] is None
+    assert report["versions"]["polhode"]
+    path.write_text(json.dumps({"numbers": []}))
+    with pytest.raises(ValueError, match="lacks"):
+        _report.read(path)
+
+
+def test_programs_take_turns_and_slow_ones_are_run_less_often():
+    calls: dict[str, int] = {"quick": 0, "slow": 0}
+
+    def call(name, span):
+        calls[name] += 1
+        until = _report.time.perf_counter() + span
+        while _report.time.perf_counter() < until:
+            pass
+
+    found = _report.in_turn(
+        {"quick": lambda: call("quick", 1e-4), "slow": lambda: call("slow", 0.02)},
+        repeats=5, least=1e-3, budget=0.015,
+    )  # fmt: skip
+    assert found["quick"].median == pytest.approx(1e-4, rel=0.5)
+    assert found["slow"].median == pytest.approx(0.02, rel=0.5)
+    assert calls["slow"] <= 3 < found["quick"].repeats <= 5
+
+
+def _table(times, errors=(1e-4, 1e-8, 1e-12)):
+    def row(peer, program, time, error):
+        return {
+            "peer": peer, "program": program, "setting": f"{error:.0e}", "ns_per_body": time,
+            "spread": 0.01, "attitude_median": error, "attitude_worst": 10 * error, "failed": 0,
+            "compile_s": None,
+        }  # fmt: skip
+
+    rows = [row("other", "stepper", t, e) for t, e in zip(times, errors)]
+    return {
+        "family": "free", "title": "free", "bodies": 1000, "dtype": "float64",
+        "rows": [row("polhode", "default: ClosedForm", 50.0, 1e-14), *rows],
+    }  # fmt: skip
+
+
+def test_time_at_a_level_is_interpolated_and_never_extrapolated():
+    rows = _table((100.0, 400.0, 1600.0))["rows"][1:]
+    assert _levels.time_at(rows, 1e-3) == 100  # cheaper settings were not run
+    assert _levels.time_at(rows, 1e-6) == pytest.approx(200)
+    assert _levels.time_at(rows, 1e-12) == 1600
+    assert _levels.time_at(rows, 1e-13) is None
+    assert _levels.time_at(rows, 1e-6, "attitude_worst") > 200
+    rows[1]["failed"] = 1
+    assert _levels.time_at(rows, 1e-8) == pytest.approx(100 * 16**0.5)
+
+
+def test_standing_names_the_peer_that_is_faster():
+    slow, fast = (_levels.standing(_table(t)) for t in ((100.0, 400.0, 1600.0), (10.0, 40.0, 60.0)))
+    assert [at["ratio"] for at in slow] == pytest.approx([2, 4, 11.3137085, 32], rel=1e-6)
+    assert fast[0]["ratio"] == pytest.approx(0.2)
+    assert fast[0]["peer"] == "other"
+    report = {"numbers": {"tables": [_table((10.0, 40.0, 60.0))]}}
+    assert any("other (stepper) reaches 1e-03" in line for line in _page.behind(report))
+
+
+def _result(times, **more):
+    numbers = {"tables": [_table(times)], **more}
+    return {"name": "work_precision", "numbers": numbers}
+
+
+def test_compare_leaves_noise_and_a_slower_machine_alone():
+    old, new = _result((100.0, 400.0, 1600.0)), _result((150.0, 606.0, 2400.0))
+    new["numbers"]["tables"][0]["rows"][0]["ns_per_body"] *= 1.5
+    found = _compare.compare(old, new)
+    assert found["pace"] == pytest.approx(1.5)
+    assert not found["changed"]
+    assert "nothing changed" in _compare.show(found)
+
+
+def test_compare_names_what_is_slower_wrong_gone_and_new():
+    old = _result((100.0, 400.0, 1600.0), extra=1.0)
+    new = _result((100.0, 800.0, 1600.0), other=1.0)
+    new["numbers"]["tables"][0]["rows"][3]["attitude_median"] = 1e-9
+    found = _compare.compare(old, new)
+    kinds = sorted((path[-1], kind) for path, kind, *_ in found["changed"])
+    assert kinds == [("attitude_median", "error"), ("ns_per_body", "time")]
+    text = _compare.show(found)
+    assert "slower" in text
+    assert "stepper, 1e-08" in text
+    assert found["gone"] == [("extra",)]
+    assert found["fresh"] == [("other",)]
+    with pytest.raises(ValueError, match="different"):
+        _compare.compare(old, {"name": "stress", "numbers": {}})
+
+
+def test_figures_are_drawn_from_results(tmp_path):
+    import matplotlib
+
+    matplotlib.use("agg")
+    path = tmp_path / "work_precision.json"
+    path.write_text(json.dumps({**_result((100.0, 400.0, 1600.0)), "command": "", "versions": {},
+                                "machine": {}}))  # fmt: skip
+    (made,) = _figures.draw([path], tmp_path)
+    text = made.read_text()
+    assert "<svg" in text
+    assert made.read_text() == (_figures.draw([path], tmp_path)[0]).read_text()
+
+
+def test_pages_hold_the_numbers_of_the_committed_results():
+    readme = (_page.ROOT / "README.md").read_text(encoding="utf-8")
+    page = _page.ROOT / "benchmarks" / "README.md"
+    mend = "run: python -m benchmarks page"
+    assert page.read_text(encoding="utf-8") == _page.page(), mend
+    if _page.merged() is not None:
+        assert _page.readme_block() in readme, mend
