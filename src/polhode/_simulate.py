@@ -1,5 +1,6 @@
 """The one entry point: a scene, a state and times give a trajectory."""
 
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -10,7 +11,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from polhode._checks import as_float_array, describe, is_concrete, require
 from polhode._lanes import PARTS, common_batch, flatten
-from polhode._methods import AbstractMethod, Record
+from polhode._mesh import Split, on_devices, place, split_of
+from polhode._methods import AbstractMethod, Record, Samples
 from polhode._plan import Plan, choose, plan
 from polhode._scene import Scene
 from polhode._state import State
@@ -32,7 +34,10 @@ def simulate(
 
     **Arguments:**
 
-    - ``scene``, ``state``: see ``ph.Scene``, ``ph.State``; batch axes broadcast together.
+    - ``scene``, ``state``: see ``ph.Scene``, ``ph.State``; batch axes broadcast together. A batch
+      that is sharded over several devices (``NamedSharding``) stays so: each device moves its own
+      bodies and the compiled program exchanges nothing (see docs/scale.md; under ``jit`` and
+      ``grad`` for meshes of explicit axes).
     - ``ts``: (T,) or (..., T) [s], strictly increasing or strictly decreasing.
     - ``method``: None lets the library choose; or ``ph.LiePoisson(...)``, ``ph.EulerAngles(...)``.
     - ``rtol``: error asked for, attitude in radians and momenta relative to their size, at the
@@ -50,7 +55,10 @@ def simulate(
     rtol = check_rtol(rtol, state.wxyz.dtype)
     if method is None:
         method, _ = choose(scene, state, record, rtol)
-    trajectory = run(method, scene, state, ts, rtol, record)
+    split = split_of(scene, state, ts)
+    if split is not None and is_concrete(scene, state, ts):
+        scene, state, ts = place(split, scene, state, ts)
+    trajectory = run(method, scene, state, ts, rtol, record, split)
     if throw and is_concrete(trajectory.status):
         raise_on_failure(trajectory)
     return trajectory
@@ -75,9 +83,19 @@ def explain(
 
 
 @eqx.filter_jit
-def run(method, scene, state, ts, rtol, record) -> Trajectory:
+def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> Trajectory:
     """The compiled part: lanes out of batches, the method, and back."""
     scene = scene.settled(state, ts[..., 0])
+    if split is None:
+        found = _moved(record, method, scene, state, ts, rtol)
+    else:
+        found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
+    wxyz, omega, status, steps = found
+    kept = ts[..., -1:] if record.final_only else ts
+    return Trajectory(kept, wxyz, omega, status, steps, scene)
+
+
+def _moved(record, method, scene, state, ts, rtol) -> Samples:
     parts = (getattr(scene, name) for name in PARTS)
     batch = common_batch(*parts, state, extra=(ts.shape[:-1],))
     parts = {name: flatten(getattr(scene, name), batch) for name in PARTS}
@@ -86,9 +104,7 @@ def run(method, scene, state, ts, rtol, record) -> Trajectory:
     if ts.ndim > 1:
         times = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
     samples = method.run(Scene(**parts), lanes, times, rtol, record)
-    wxyz, omega, status, steps = jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), samples)
-    kept = ts[..., -1:] if record.final_only else ts
-    return Trajectory(kept, wxyz, omega, status, steps, scene)
+    return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), samples)
 
 
 def check_method(method: Any) -> None:

@@ -17,8 +17,17 @@ def test_eight_devices_are_as_one_and_exchange_nothing(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
+    for name, bound, each in (
+        ("closed", 1e-14, [10_000, 3, 3]),
+        ("stepped", 1e-9, [2, 3, 3, 3]),
+        ("explicit", 1e-14, [10_000, 3, 3]),
+    ):
+        case = found.pop(name)
+        assert case.pop("away") < bound
+        assert case == {"kept": True, "energy": True, "each": each, "exchanges": []}
+    assert "in different ways" in found.pop("mixed")
+    same = [True, True, True]
     assert found == {
-        "devices": 8, "wxyz": True, "omega_body": True, "status": True, "collectives": [],
+        "devices": 8, "wxyz": same, "omega_body": same, "status": same, "collectives": [],
         "shards": 8, "rows": 8192,
-        "same": True, "kept": True, "each": 10_000, "exchanges": [],
     }  # fmt: skip

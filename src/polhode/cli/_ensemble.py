@@ -9,7 +9,8 @@ from pathlib import Path
 from polhode.cli._options import whole_number
 
 _SIZES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
-_OPTIONS = ("memory", "chunk", "devices", "process", "processes")
+_OPTIONS = ("memory", "chunk", "devices", "process", "processes", "coordinator", "cluster",
+            "patience", "no_verify")  # fmt: skip
 
 
 def byte_count(text: str) -> int:
@@ -23,6 +24,16 @@ def byte_count(text: str) -> int:
 
 def _device_count(text: str) -> int | None:
     return None if text == "all" else whole_number(1)(text)
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds above 0")
+    return value
 
 
 def add_options(command: argparse.ArgumentParser) -> None:
@@ -39,6 +50,16 @@ def add_options(command: argparse.ArgumentParser) -> None:
                        help="number of this process, from 0")  # fmt: skip
     group.add_argument("--processes", type=whole_number(1), default=absent, metavar="N",
                        help="number of processes that share the store")  # fmt: skip
+    group.add_argument("--coordinator", default=absent, metavar="HOST:PORT",
+                       help="where process 0 waits for the others (jax.distributed); "
+                       "needs --processes and --process")  # fmt: skip
+    group.add_argument("--cluster", action="store_true", default=absent,
+                       help="let JAX find coordinator and numbers: SLURM, Open MPI, Kubernetes, "
+                       "or JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES, JAX_PROCESS_ID")  # fmt: skip
+    group.add_argument("--patience", type=_seconds, default=absent, metavar="S",
+                       help="seconds to wait for the other processes (default: 300)")  # fmt: skip
+    group.add_argument("--no-verify", action="store_true", default=absent,
+                       help="take finished chunks for good without reading them")  # fmt: skip
 
 
 def refuse_options(arguments: argparse.Namespace, file) -> None:
@@ -48,7 +69,8 @@ def refuse_options(arguments: argparse.Namespace, file) -> None:
     for name in _OPTIONS:
         if hasattr(arguments, name):
             raise SceneFileError(
-                file.path, "[ensemble]", "missing table", f"--{name} on the command line",
+                file.path, "[ensemble]", "missing table",
+                f"--{name.replace('_', '-')} on the command line",
                 "a scene with an [ensemble]", "add [ensemble], or drop the option",
             )  # fmt: skip
 
@@ -62,6 +84,7 @@ def run(arguments: argparse.Namespace, file, output: Path | None) -> int:
     path = Path(output or file.output.file or f"{file.path.stem}.zarr")
     if path.suffix != ".zarr":
         path = path.with_name(path.name + ".zarr")
+    options = {name: getattr(arguments, name) for name in _OPTIONS if hasattr(arguments, name)}
     with messages.status("starting ..."):
         import jax
 
@@ -69,8 +92,9 @@ def run(arguments: argparse.Namespace, file, output: Path | None) -> int:
         from polhode.ensemble import build_ensemble, stream
         from polhode.io import build_method
 
+        _meet(path, options)
         ensemble, statistics = build_ensemble(file, arguments.precision)
-    options = {name: getattr(arguments, name) for name in _OPTIONS if hasattr(arguments, name)}
+    options["verify"] = not options.pop("no_verify", False)
     if "devices" in options:
         options["devices"] = _devices(options["devices"])
     text = file.path.read_text(encoding="utf-8")
@@ -81,7 +105,7 @@ def run(arguments: argparse.Namespace, file, output: Path | None) -> int:
                 ensemble, file.times.seconds, path,
                 method=build_method(file), rtol=file.method.rtol,
                 trajectories=file.ensemble.trajectories, statistics=statistics,
-                attributes=words, progress=meter, **options,
+                attributes=words, progress=meter, warn=_warn, **options,
             )  # fmt: skip
     except KeyboardInterrupt:
         print("\npolhode: interrupted; the same command finishes what is missing", file=sys.stderr)
@@ -91,6 +115,34 @@ def run(arguments: argparse.Namespace, file, output: Path | None) -> int:
         rate = "nothing was missing" if last.rate is None else f"{last.rate:,.0f} bodies/s"
         print(f"{last.done:,} bodies ({last.reused:,} from before), {rate}\nwritten: {path}")
     return _failures(path)
+
+
+def _meet(path: Path, options: dict) -> None:
+    """Find the number of this process and of all, with the others where they are to meet; before
+    anything is computed. The options of that go out of ``options``.
+    """
+    from polhode.ensemble import StoreError, claimed, join
+
+    cluster, coordinator = options.pop("cluster", False), options.pop("coordinator", None)
+    patience = {"patience": options.pop("patience")} if "patience" in options else {}
+    known = options.get("processes"), options.get("process")
+    if coordinator is None and not cluster:
+        if known[0] is None and known[1] is not None:
+            raise StoreError("--process needs --processes, the number of all of them.")
+        if (known[0] or 1) > 1 and known[1] is None:
+            raise StoreError("--processes needs --process, the number of this one, from 0.")
+        if patience:
+            raise StoreError("--patience needs --coordinator or --cluster.")
+        return
+    if coordinator is not None and not cluster and None in known:
+        raise StoreError("--coordinator needs --processes and --process.")
+    # two processes of one number on this machine are told apart before they disturb the others
+    with claimed(path, *known):
+        options["process"], options["processes"] = join(coordinator, *known, **patience)[:2]
+
+
+def _warn(words: str) -> None:
+    print(f"polhode: {words}", file=sys.stderr)
 
 
 def _devices(count: int | None) -> list:

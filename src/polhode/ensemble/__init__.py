@@ -1,8 +1,9 @@
 """Ensembles of any size: drawn by index, streamed into a store, resumed after a kill."""
 
 from polhode.ensemble._ensemble import Ensemble as Ensemble
+from polhode.ensemble._fill import Progress as Progress
+from polhode.ensemble._processes import claimed as claimed, join as join
 from polhode.ensemble._scene_file import build_ensemble as build_ensemble
-from polhode.ensemble._sharded import simulate_sharded as simulate_sharded
 from polhode.ensemble._spreads import (
     AnyAttitude as AnyAttitude,
     Deviate as Deviate,
@@ -11,7 +12,8 @@ from polhode.ensemble._spreads import (
     SpreadMoments as SpreadMoments,
     SpreadMomentum as SpreadMomentum,
     SpreadRates as SpreadRates,
+    SpreadTorque as SpreadTorque,
 )
 from polhode.ensemble._statistics import Statistic as Statistic, quantile as quantile
 from polhode.ensemble._store import StoreError as StoreError
-from polhode.ensemble._stream import Progress as Progress, stream as stream
+from polhode.ensemble._stream import stream as stream

@@ -6,8 +6,8 @@ the compiled block. Blocks have a size that only the number of samples decides, 
 stands at place i modulo that size: chunk size, device count and process count change nothing.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -57,64 +57,72 @@ class Block:
             method = eqx.filter_eval_shape(lambda s, x: _Chosen(choose(s, x, record)[0]), scene,
                                            state).method  # fmt: skip
         self.method = method
-        rtol = check_rtol(rtol, ts.dtype)
-        bodies, spreads, seed = ensemble.bodies, ensemble.spreads, ensemble.seed
-        size = self.size
-
-        def one(first, each, shared, spreads):
-            indices = first[0] + jnp.arange(size, dtype=jnp.uint32)
-            drawn = draw(each, shared, indices, spreads, seed)
-            trajectory = run(method, *drawn, ts, rtol, record)
-            real = indices < bodies
-            kept = {"status": trajectory.status.astype(jnp.int8)}
-            if trajectories:
-                kept |= {"wxyz": trajectory.wxyz, "omega_body": trajectory.omega_body}
-            for statistic in statistics:
-                found = summarise(statistic, trajectory, real)
-                kept |= {f"{statistic.name}_{name}": x[None] for name, x in found.items()}
-            return kept
-
+        self.rtol = check_rtol(rtol, ts.dtype)
+        mesh = None
         self.place = None
-        program = one
         if len(self.devices) > 1:
             mesh = Mesh(np.array(self.devices), ("body",))
-            split = PartitionSpec("body")
-            self.place = NamedSharding(mesh, split)
-
-            def program(first, each, shared, spreads):
-                arrays, rest = eqx.partition((shared, spreads), eqx.is_array)
-                each_arrays, each_rest = eqx.partition(each, eqx.is_array)
-
-                def local(first, each_arrays, arrays):
-                    shared, spreads = eqx.combine(arrays, rest)
-                    return one(first, eqx.combine(each_arrays, each_rest), shared, spreads)
-
-                return jax.shard_map(
-                    local,
-                    mesh=mesh,
-                    in_specs=(split, split, PartitionSpec()),
-                    out_specs=split,
-                    check_vma=False,
-                )(first, each_arrays, arrays)
-
-        self.program: Callable = eqx.filter_jit(program)
-        self.spreads = spreads
+            self.place = NamedSharding(mesh, PartitionSpec("body"))
+        self.settings = Settings(self.size, trajectories, statistics, mesh)
+        self.counts = np.array([ensemble.seed, ensemble.bodies], np.uint32)
 
     def inputs(self, first: int) -> tuple:
-        """The arguments of the compiled program for the group of blocks from the body ``first``."""
+        """The arguments of ``program`` for the group of blocks from the body ``first``."""
         count = len(self.devices)
         starts = np.asarray([first + i * self.size for i in range(count)], np.uint32)
         indices = np.arange(first, first + count * self.size)
         each, shared = self.ensemble.lanes(np.minimum(indices, self.ensemble.bodies - 1))
-        if self.place is not None:
-            starts = jax.device_put(starts, self.place)
-            each = jax.device_put(each, self.place)
-            return starts, each, shared, self.spreads
-        starts = jax.device_put(starts, self.devices[0])
-        return starts, each, shared, self.spreads
+        place = self.devices[0] if self.place is None else self.place
+        starts, each = jax.device_put((starts, each), place)
+        shared = (shared, self.ensemble.spreads, self.method, self.ts, self.rtol, self.counts)
+        return starts, each, shared, self.settings
 
     def __call__(self, first: int) -> dict[str, Array]:
-        return self.program(*self.inputs(first))
+        return program(*self.inputs(first))
+
+
+class Settings(NamedTuple):
+    """What the program is compiled for, beside the shapes."""
+
+    size: int
+    trajectories: bool
+    statistics: tuple[Statistic, ...]
+    mesh: Mesh | None
+
+
+@eqx.filter_jit
+def program(first: Array, each: Any, shared: Any, settings: Settings) -> dict[str, Array]:
+    """One block on each device; nothing goes from one to another. Compiled once per kind of run."""
+    if settings.mesh is None:
+        return _block(first, each, shared, settings)
+    arrays, rest = eqx.partition(shared, eqx.is_array_like)
+    each_arrays, each_rest = eqx.partition(each, eqx.is_array)
+
+    def local(first, each_arrays, arrays):
+        return _block(
+            first, eqx.combine(each_arrays, each_rest), eqx.combine(arrays, rest), settings
+        )
+
+    split = PartitionSpec("body")
+    return jax.shard_map(
+        local, mesh=settings.mesh, in_specs=(split, split, PartitionSpec()), out_specs=split,
+        check_vma=False,
+    )(first, each_arrays, arrays)  # fmt: skip
+
+
+def _block(first, each, shared, settings: Settings) -> dict[str, Array]:
+    shared, spreads, method, ts, rtol, (seed, bodies) = shared
+    indices = first[0] + jnp.arange(settings.size, dtype=jnp.uint32)
+    drawn = draw(each, shared, indices, spreads, seed)
+    trajectory = run(method, *drawn, ts, rtol, Record())
+    real = indices < bodies
+    kept = {"status": trajectory.status.astype(jnp.int8)}
+    if settings.trajectories:
+        kept |= {"wxyz": trajectory.wxyz, "omega_body": trajectory.omega_body}
+    for statistic in settings.statistics:
+        found = summarise(statistic, trajectory, real)
+        kept |= {f"{statistic.name}_{name}": x[None] for name, x in found.items()}
+    return kept
 
 
 class _Chosen(eqx.Module):

@@ -17,6 +17,7 @@ from polhode import rotation
 from polhode._scene import Scene
 from polhode._state import State
 from polhode.inertia import Inertia
+from polhode.torques import BodyTorque, SpaceTorque
 
 _MOST_DRAWS = 100
 
@@ -121,6 +122,31 @@ class SpreadMomentum(eqx.Module):
     def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
         momentum = self.momentum if self.deviate is None else self.momentum + self.deviate(key)
         return scene, State(state.wxyz, scene.inertia.rates(momentum))
+
+
+class SpreadTorque(eqx.Module):
+    """The constant torque of a scene (``BodyTorque`` or ``SpaceTorque``) plus a deviate [N m]."""
+
+    deviate: Deviate
+
+    def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
+        return with_torque(scene, constant_torque(scene) + self.deviate(key)), state
+
+
+def constant_torque(scene: Scene) -> Array:
+    """The numbers of the one constant torque of a scene [N m]. Raises TypeError without one."""
+    torque = scene.torque
+    if not isinstance(torque, BodyTorque | SpaceTorque) or not eqx.is_array(torque.n):
+        raise TypeError(
+            "torques of an ensemble vary around one constant ph.BodyTorque or ph.SpaceTorque, got"
+            f" {type(torque).__name__}: give the scene such a torque, or write your own spread."
+        )
+    return torque.n
+
+
+def with_torque(scene: Scene, n: Array) -> Scene:
+    """The scene with its constant torque replaced."""
+    return eqx.tree_at(lambda s: s.torque.n, scene, n)
 
 
 def stream_of(spread: Any) -> int:

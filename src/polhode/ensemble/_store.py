@@ -1,8 +1,8 @@
 """The Zarr store of an ensemble run: finished chunks stay valid whatever happens to the writer.
 
-A chunk of bodies is one chunk in each array along ``body``. Its data are written and synced first,
-then its cell of ``checksum``, a chunk file of its own: a chunk counts as finished only when the
-checksum of what can be read equals that cell. Nothing else needs to be kept for resuming.
+A chunk of bodies is one file, or a few, of each array. They are written and synced first, then its
+cell of ``checksum``, a file of its own: a chunk counts as finished only when the checksum of what
+can be read equals that cell. Nothing else needs to be kept for resuming.
 """
 
 import contextlib
@@ -11,12 +11,15 @@ import json
 import os
 import secrets
 import shutil
+import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from polhode.ensemble._layout import Field
 
 _MARK = 1 << 32  # above every 32-bit checksum: an empty cell is 0
 
@@ -55,18 +58,47 @@ def locked(path: Path, process: int, processes: int) -> Iterator[None]:
                     f"cannot write beside {path}: {error.strerror}; name a place that you can"
                     " write to."
                 ) from error
-            try:
-                fcntl.flock(file, kind | fcntl.LOCK_NB)
-            except OSError as error:
-                raise StoreError(
-                    f"{path} is in use by {who}: wait until it ends, or write to another store."
-                ) from error
+            failure = None
+            for trial in range(3):  # others look at a lock for an instant
+                try:
+                    fcntl.flock(file, kind | fcntl.LOCK_NB)
+                    return
+                except OSError as error:
+                    failure = error
+                    time.sleep(0.05 * trial)
+            raise StoreError(
+                f"{path} is in use by {who}: wait until it ends, or write to another store."
+            ) from failure
 
         alone = processes == 1
         hold(f".{path.name}.lock", fcntl.LOCK_EX if alone else fcntl.LOCK_SH, "another run")
         if not alone:
             hold(f".{path.name}.lock{process}", fcntl.LOCK_EX, f"another process {process}")
         yield
+
+
+@contextlib.contextmanager
+def in_turn(path: Path) -> Iterator[None]:
+    """One process after the other: wait for the turn."""
+    import fcntl
+
+    with open(path.with_name(f".{path.name}.turn"), "a") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def running(path: Path, process: int) -> bool:
+    """Whether another process holds the store under this number now."""
+    import fcntl
+
+    try:
+        with open(path.with_name(f".{path.name}.lock{process}")) as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except FileNotFoundError:
+        return False
+    except OSError:
+        return True
+    return False
 
 
 class Store:
@@ -112,29 +144,65 @@ class Store:
 
     def finished(self) -> np.ndarray:
         """(chunks,) whether a chunk was marked as finished; the data are not looked at."""
-        return self.marks[:] != 0
+        try:
+            return self.marks[:] != 0
+        except Exception:  # one of them is damaged: as if it were not there
+            return np.array([self._mark(k) != 0 for k in range(self.marks.shape[0])])
+
+    def _mark(self, chunk: int) -> int:
+        try:
+            return int(self.marks[chunk])
+        except Exception:
+            return 0
 
     def rows(self, name: str, chunk: int) -> slice:
         """The rows of an array that belong to a chunk."""
         step = int(self.arrays[name].attrs["rows_per_chunk"])
         return slice(chunk * step, min((chunk + 1) * step, self.arrays[name].shape[0]))
 
+    def pieces(self, chunk: int) -> Iterator[tuple[str, slice]]:
+        """Arrays and rows of the files of a chunk in the order of its checksum: first those of
+        the trajectories, piece by piece, then the arrays that have one file in a chunk.
+        """
+        split = [n for n, a in sorted(self.arrays.items()) if n in _SPLIT]
+        rest = [n for n in sorted(self.arrays) if n not in _SPLIT]
+        for names in (split, rest):
+            steps = {n: self.arrays[n].chunks[0] for n in names}
+            begin = {n: self.rows(n, chunk).start for n in names}
+            end = {n: self.rows(n, chunk).stop for n in names}
+            while any(begin[n] < end[n] for n in names):
+                for n in names:
+                    stop = min(begin[n] + steps[n], end[n])
+                    yield n, slice(begin[n], stop)
+                    begin[n] = stop
+
     def valid(self, chunk: int) -> bool:
         """Whether the chunk can be read and has the checksum it was given."""
         try:
-            parts = {name: a[self.rows(name, chunk)] for name, a in self.arrays.items()}
-            return int(self.marks[chunk]) == checksum(parts)
+            found = 0
+            for name, rows in self.pieces(chunk):
+                found = _extended(found, self.arrays[name][rows])
+            return int(self.marks[chunk]) == _MARK | found
         except Exception:  # a damaged file fails in whichever codec meets it first
             return False
 
-    def write(self, chunk: int, parts: dict[str, np.ndarray]) -> None:
-        """Write a chunk so that it is whole and on the disk before it counts as finished."""
-        try:
-            for name, values in parts.items():
-                self.arrays[name][self.rows(name, chunk)] = values
-                self._sync(name, self.arrays[name], chunk)
-            self.marks[chunk] = np.uint64(checksum(parts))
+    def write(self, name: str, rows: slice, values: np.ndarray, checksum: int) -> int:
+        """Write one file of a chunk, on the disk when this returns; the checksum with it."""
+        with self._blame():
+            self.arrays[name][rows] = values
+            self._sync(name, self.arrays[name], rows.start // self.arrays[name].chunks[0])
+        return _extended(checksum, values)
+
+    def finish(self, chunk: int, checksum: int) -> None:
+        """Mark a chunk, all of whose files are written, as finished."""
+        with self._blame():
+            self.marks[chunk] = np.uint64(_MARK | checksum)
             self._sync("checksum", self.marks, chunk)
+
+    @contextlib.contextmanager
+    def _blame(self) -> Iterator[None]:
+        try:
+            yield
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise StoreError(
@@ -144,10 +212,20 @@ class Store:
                 ) from error
             raise
 
-    def _sync(self, name: str, array: Any, chunk: int) -> None:
-        key = array.metadata.encode_chunk_key((chunk,) + (0,) * (array.ndim - 1))
-        with open(self.path / name / key, "rb") as file:
-            os.fsync(file.fileno())
+    def _sync(self, name: str, array: Any, piece: int) -> None:
+        """Have a file and its name in the folder on the disk, also when the power goes."""
+        key = array.metadata.encode_chunk_key((piece,) + (0,) * (array.ndim - 1))
+        file = self.path / name / key
+        for path in (file, file.parent):
+            handle = os.open(path, os.O_RDONLY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
+
+
+_SPLIT = ("wxyz", "omega_body")
+"""Arrays that may have several files in a chunk."""
 
 
 def _absent(dtype: Any) -> Any:
@@ -168,14 +246,13 @@ def consolidate(path: Path) -> None:
         _zarr().consolidate_metadata(path, zarr_format=3)
 
 
-def checksum(parts: dict[str, np.ndarray]) -> int:
-    """CRC-32C over the bytes of all parts in the order of their names, and a mark above."""
+def _extended(checksum: int, values: np.ndarray) -> int:
+    """CRC-32C of what came before and of the bytes of an array."""
     import google_crc32c
 
-    value = 0
-    for name in sorted(parts):
-        value = google_crc32c.extend(value, np.ascontiguousarray(parts[name]).tobytes())
-    return _MARK | value
+    view = np.ascontiguousarray(values).view()
+    view.setflags(write=False)  # google_crc32c takes nothing that could change meanwhile
+    return google_crc32c.extend(checksum, view)
 
 
 def create(
@@ -183,13 +260,10 @@ def create(
     identity: dict[str, Any],
     chunk: int,
     ts: np.ndarray,
-    layout: dict[str, tuple],
+    layout: Mapping[str, Field],
     attributes: dict[str, Any],
 ) -> None:
-    """Make an empty store, whole or not at all; nothing happens when another process was faster.
-
-    ``layout``: name -> (shape, rows per chunk, dtype, dimensions, attributes).
-    """
+    """Make an empty store, whole or not at all; nothing happens when another process was faster."""
     zarr = _zarr()
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
     try:
@@ -202,11 +276,12 @@ def create(
             attributes={"units": "s", "long_name": "time"},
         )  # fmt: skip
         time[:] = ts
-        for name, (shape, rows, dtype, dimensions, words) in layout.items():
+        for name, field in layout.items():
             group.create_array(
-                name, shape=shape, chunks=(rows, *shape[1:]), dtype=dtype,
-                dimension_names=dimensions, attributes=words | {"rows_per_chunk": rows},
-                compressors=[zarr.codecs.Crc32cCodec()], fill_value=_absent(dtype),
+                name, shape=field.shape, chunks=(field.piece, *field.shape[1:]), dtype=field.dtype,
+                dimension_names=field.dimensions,
+                attributes=field.attributes | {"rows_per_chunk": field.rows},
+                compressors=[zarr.codecs.Crc32cCodec()], fill_value=_absent(field.dtype),
             )  # fmt: skip
         count = -(-identity["bodies"] // chunk)
         group.create_array(

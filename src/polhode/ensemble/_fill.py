@@ -1,0 +1,193 @@
+"""The work of one process: compute what is missing, write it meanwhile, check what was there."""
+
+import collections
+import concurrent.futures
+import time
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from polhode.ensemble._program import Block
+from polhode.ensemble._store import Store
+
+_WAITING = 2  # files handed to the writer and not yet on the disk
+
+
+class Progress(NamedTuple):
+    """Bodies finished out of the share of this process; ``rate`` bodies/s of this run,
+    ``remaining`` seconds (None before the first chunk); ``reused`` bodies were there already.
+    """
+
+    done: int
+    total: int
+    reused: int
+    rate: float | None
+    remaining: float | None
+
+
+def fill(
+    store: Store, block: Block, share: range, verify: bool, progress: Callable[[Progress], None]
+) -> None:
+    """Compute the chunks of the share that are missing, then those that turn out damaged.
+
+    Finished chunks are read and checked in a thread of their own meanwhile. A chunk is begun when
+    the one before it is marked: whatever ends the process costs one chunk at most.
+    """
+    tally = _Tally(store, block.ensemble.bodies, share, progress)
+    marked = store.finished()
+    todo = collections.deque(n for n in share if not marked[n])
+    old = iter([n for n in share if marked[n]])
+    tally.begin(n for n in share if marked[n])
+    with (
+        concurrent.futures.ThreadPoolExecutor(1) as writer,
+        concurrent.futures.ThreadPoolExecutor(1) as reader,
+    ):
+        checks = _checks(store, reader, old) if verify else iter(())
+        pending = next(checks, None)
+        while todo or pending is not None:
+            while pending is not None and (pending[1].done() or not todo):
+                number, good = pending[0], pending[1].result()
+                if not good:
+                    tally.lost(number)
+                    todo.append(number)
+                pending = next(checks, None)
+            if todo:
+                number = todo.popleft()
+                _chunk(store, block, number, writer)
+                tally.done(number)
+
+
+def _checks(store: Store, reader, numbers: Iterator[int]):
+    for number in numbers:
+        yield number, reader.submit(store.valid, number)
+
+
+class _Tally:
+    """Counts bodies and reports them."""
+
+    def __init__(self, store: Store, bodies: int, share: range, progress):
+        self.chunk, self.bodies, self.progress = store.chunk, bodies, progress
+        self.total = sum(map(self.count, share))
+        self.reused = self.computed = 0
+        self.began = time.perf_counter()
+
+    def count(self, number: int) -> int:
+        return min(self.chunk, self.bodies - number * self.chunk)
+
+    def begin(self, marked: Iterator[int]) -> None:
+        self.reused = sum(map(self.count, marked))
+        self.report()
+
+    def lost(self, number: int) -> None:
+        self.reused -= self.count(number)
+        self.report()
+
+    def done(self, number: int) -> None:
+        self.computed += self.count(number)
+        self.report()
+
+    def report(self) -> None:
+        done, rate, remaining = self.reused + self.computed, None, None
+        if self.computed:
+            rate = self.computed / (time.perf_counter() - self.began)
+            remaining = (self.total - done) / rate
+        self.progress(Progress(done, self.total, self.reused, rate, remaining))
+
+
+def _chunk(store: Store, block: Block, number: int, writer) -> None:
+    """Compute a chunk and have it written and marked; one file is written while the next is
+    computed, and the next group of blocks is on its way while one is copied.
+    """
+    rows = {name: store.rows(name, number) for name in store.arrays}
+    # what has one file in a chunk is gathered; the trajectories go as they come
+    split = [n for n in store.arrays if n in ("wxyz", "omega_body")]
+    gathered = {
+        name: np.zeros((r.stop - r.start, *store.arrays[name].shape[1:]), store.arrays[name].dtype)
+        for name, r in rows.items()
+        if name not in split
+    }
+    step = block.size * len(block.devices)
+    first = number * store.chunk
+    last = min(first + store.chunk, block.ensemble.bodies)
+    waiting: collections.deque = collections.deque()
+    checksum = 0
+
+    def settle(most: int) -> None:
+        while len(waiting) > most:
+            waiting.popleft().result()
+
+    def write(name: str, rows: slice, values: np.ndarray) -> None:
+        nonlocal checksum  # of the writer's thread alone, until all is written
+        checksum = store.write(name, rows, values, checksum)
+
+    def send(name: str, rows: slice, values: np.ndarray) -> None:
+        settle(_WAITING - 1)
+        waiting.append(writer.submit(write, name, rows, values))
+
+    files = store.pieces(number)
+    cut = _Cutter(split)
+    wanted = next(files)
+    for offset, found in _groups(block, first, last, step):
+        _gather(gathered, offset, found, block.size, last - first)
+        cut.add(found)
+        while wanted is not None and wanted[0] in split:
+            ready = cut.take(wanted[0], wanted[1].stop - wanted[1].start)
+            if ready is None:
+                break
+            send(*wanted, ready)
+            wanted = next(files, None)
+    while wanted is not None:
+        name, at = wanted
+        send(name, at, gathered[name][at.start - rows[name].start : at.stop - rows[name].start])
+        wanted = next(files, None)
+    settle(0)
+    store.finish(number, checksum)
+
+
+def _groups(block: Block, first: int, last: int, step: int):
+    """(offset in the chunk, arrays) of each group of blocks, the next one begun before."""
+    ahead = None
+    for start in range(first, last, step):
+        now, ahead = ahead, (start - first, block(start))
+        if now is not None:
+            yield now
+    if ahead is not None:
+        yield ahead
+
+
+class _Cutter:
+    """Rows of some arrays in the order they come, cut into lengths."""
+
+    def __init__(self, names: list[str]):
+        self.parts: dict[str, collections.deque] = {name: collections.deque() for name in names}
+
+    def add(self, found: dict) -> None:
+        for name, parts in self.parts.items():
+            parts.append(np.asarray(found[name]))
+
+    def take(self, name: str, count: int) -> np.ndarray | None:
+        """The next ``count`` rows, without a copy where they lie together; None: not all there."""
+        parts = self.parts[name]
+        if sum(map(len, parts)) < count:
+            return None
+        taken = []
+        while count:
+            part = parts.popleft()
+            taken.append(part[:count])
+            if len(part) > count:
+                parts.appendleft(part[count:])
+            count -= len(taken[-1])
+        return taken[0] if len(taken) == 1 else np.concatenate(taken)
+
+
+def _gather(parts: dict, offset: int, found: dict, size: int, bodies: int) -> None:
+    real = -(-(bodies - offset) // size)  # blocks that hold bodies of this chunk
+    for name, part in parts.items():
+        values = np.asarray(found[name])
+        if name.endswith("_histogram"):
+            part[0] += values[:real].sum(axis=0)
+            continue
+        at = offset if name == "status" else offset // size
+        count = min(len(values), len(part) - at)
+        part[at : at + count] = values[:count]
