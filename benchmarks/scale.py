@@ -1,10 +1,13 @@
-"""Ensembles into a store: speed beside pure computing and raw writing, memory, and kills.
+"""Ensembles: speed beside computing and writing alone, memory, devices, kills, cost per body.
 
-    python -m benchmarks.scale [--bodies 1000000] [--times 100] [--folder DIR]
-    python -m benchmarks.scale --kills 20
+    python -m benchmarks.scale store        1e6 bodies x 100 times and 1e7 x 10 (free disk: 12 GB)
+    python -m benchmarks.scale cost         ns per body and per saved state, on one core
+    python -m benchmarks.scale devices      a sharded batch of 1e6 bodies beside one device
+    python -m benchmarks.scale kills        20 kills at random moments, and what each of them cost
+    python -m benchmarks.scale processes    1, 2 and 4 processes into one store
 
-The first prints one JSON line; both need free disk of twice the store. Kills are at random moments
-of a run in its own process; every resumed store is compared with an undisturbed one, bit by bit.
+Each writes ``scale_NAME.json``. Kills and processes are real ones; their stores are compared with
+an undisturbed one bit by bit.
 """
 
 import argparse
@@ -20,119 +23,284 @@ import tempfile
 import time
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
-import numpy as np
-
-import polhode as ph
-from polhode import ensemble as ens
-from polhode.ensemble._program import Block
+from benchmarks import _report
 
 ARRAYS = ("wxyz", "omega_body", "status")
+CASES = {"1e6 x 100": (1_000_000, 100), "1e7 x 10": (10_000_000, 10)}
+CHUNK = 16384
 
 
-def make(bodies: int) -> ens.Ensemble:
+def make(bodies: int):
     """Free triaxial bodies of any attitude."""
+    import jax.numpy as jnp
+
+    import polhode as ph
+    from polhode import ensemble as ens
+
     scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 2.5]))
     state = ph.State([1.0, 0.0, 0.0, 0.0], [0.1, 1.0, 0.2])
     spreads = (ens.AnyAttitude(), ens.SpreadRates(ens.Deviate(jnp.full(3, 0.1))))
     return ens.Ensemble(scene, state, bodies, spreads, 1)
 
 
-def measure(bodies: int, times: int, folder: Path) -> dict:
+def store(bodies: int, times: int, folder: Path) -> dict:
+    """The whole run beside the same blocks computed alone and the same bytes written alone."""
+    import jax
+    import numpy as np
+
+    from polhode import ensemble as ens
+    from polhode.ensemble._program import Block
+
     ensemble, ts = make(bodies), np.linspace(0.0, 100.0, times)
-    began = time.perf_counter()
     block = Block(ensemble, ts, None, None, True, (), jax.devices()[:1])
+    began = time.perf_counter()
     found = jax.block_until_ready(block(0))
     compiling = time.perf_counter() - began
     starts = range(0, bodies, block.size)
-    began = time.perf_counter()
-    for first in starts:
-        jax.block_until_ready(block(first))
-    computing = time.perf_counter() - began
+
+    def compute() -> float:
+        began = time.perf_counter()
+        ahead = block(0)
+        for first in starts[1:]:  # as the run does: one block ahead
+            now, ahead = ahead, block(first)
+            jax.block_until_ready(now)
+        jax.block_until_ready(ahead)
+        return time.perf_counter() - began
+
     whole = [np.asarray(found[name]) for name in ARRAYS]
-    began = time.perf_counter()
-    for k in range(len(starts)):
-        with open(folder / f"raw{k}", "wb") as file:
-            for part in whole:
-                file.write(part.data)
-            file.flush()
-            os.fsync(file.fileno())
-    writing = time.perf_counter() - began
-    for k in range(len(starts)):
-        (folder / f"raw{k}").unlink()
-    began = time.perf_counter()
-    ens.stream(ensemble, ts, folder / "run.zarr")
-    whole_run = time.perf_counter() - began
-    slower = max(computing, writing)
+
+    def write() -> float:
+        began = time.perf_counter()
+        for k in range(len(starts)):
+            with open(folder / f"raw{k}", "wb") as file:
+                for part in whole:
+                    file.write(part.data)
+                file.flush()
+                os.fsync(file.fileno())
+        spent = time.perf_counter() - began
+        for k in range(len(starts)):
+            (folder / f"raw{k}").unlink()
+        return spent
+
+    def run() -> float:
+        began = time.perf_counter()
+        ens.stream(ensemble, ts, folder / "run.zarr")
+        spent = time.perf_counter() - began
+        shutil.rmtree(folder / "run.zarr")
+        return spent
+
+    # the disk's speed changes from minute to minute: before and after
+    writing = [write()]
+    computing = [compute()]
+    running = run()
+    computing.append(compute())
+    writing.append(write())
+    compute_s, write_s = sum(computing) / 2, sum(writing) / 2
+    size = sum(part.nbytes for part in whole) * len(starts)
     return {
         "bodies": bodies,
         "times": times,
+        "GB": size / 1e9,
         "compile_s": compiling,
         "compute_s": computing,
         "raw_write_s": writing,
-        "store_s": whole_run,
-        "efficiency_with_compiling": slower / whole_run,
-        "efficiency": slower / (whole_run - compiling),
+        "run_s": running,
+        "efficiency": max(compute_s, write_s) / running,
+        "states_per_s": bodies * times / running,
+        "raw_write_GB_per_s": size / 1e9 / write_s,
         "peak_memory_MB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3,
     }
 
 
-def _child(path: Path) -> subprocess.Popen:
-    return subprocess.Popen([sys.executable, "-m", "benchmarks.scale", "--child", str(path)])
+def cost(bodies: int = 65_536) -> dict:
+    """Nanoseconds per body and per saved state from blocks of 10 and of 100 times, one core."""
+    import jax
+    import numpy as np
+
+    from polhode.ensemble._program import Block
+
+    each, spread = {}, 0.0
+    for times in (10, 100):
+        block = Block(
+            make(bodies), np.linspace(0.0, 100.0, times), None, None, True, (), jax.devices()[:1]
+        )
+
+        def call(block=block):
+            jax.block_until_ready([block(first) for first in range(0, bodies, block.size)][-1])
+
+        timing = _report.clock(call, budget=4.0)
+        each[times] = 1e9 * timing.median / bodies
+        spread = max(spread, timing.spread)
+    state = (each[100] - each[10]) / 90
+    return {
+        "ns_per_body": each[10] - 10 * state,
+        "ns_per_state": state,
+        "spread": spread,
+        "bytes_per_state": 7 * 8,
+        "bytes_per_body": 1,
+    }
+
+
+def devices(bodies: int, times: int) -> dict:
+    """Plain ``simulate`` of a batch on one device and sharded over 2, 4, 8 forced ones."""
+    import jax
+    import numpy as np
+    from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+    import polhode as ph
+
+    scene, state = make(bodies).draw(np.arange(bodies))
+    ts = np.linspace(0.0, 100.0, times)
+    calls, results = {}, {}
+    for count in (1, 2, 4, 8):
+        mesh = Mesh(np.array(jax.devices()[:count]), ("body",))
+        placed = jax.device_put(state, NamedSharding(mesh, PartitionSpec("body")))
+
+        def call(placed=placed, count=count):
+            results[count] = jax.block_until_ready(ph.simulate(scene, placed, ts).wxyz)
+
+        calls[str(count)] = call
+    timings = _report.in_turn(calls, repeats=5, budget=20.0)
+    one = timings["1"].median
+    return {
+        "bodies": bodies,
+        "times": times,
+        "seconds": {n: t.median for n, t in timings.items()},
+        "spread": {n: t.spread for n, t in timings.items()},
+        "over_one_device": {n: t.median / one - 1 for n, t in timings.items()},
+        "greatest_difference": {
+            str(n): float(np.abs(np.asarray(x) - np.asarray(results[1])).max())
+            for n, x in results.items()
+        },
+    }
+
+
+def child(path: str, begun: str, process: str = "0", processes: str = "1") -> None:
+    """One run of 300,000 bodies; the number of each chunk that is begun goes to a file."""
+    import numpy as np
+
+    from polhode import ensemble as ens
+    from polhode.ensemble import _fill
+
+    begin = _fill._chunk
+
+    def noted(store, block, number, writer):
+        with open(begun, "a") as file:
+            file.write(f"{number}\n")
+        begin(store, block, number, writer)
+
+    _fill._chunk = noted
+    ens.stream(
+        make(300_000), np.linspace(0.0, 10.0, 10), path, chunk=CHUNK,
+        process=int(process), processes=int(processes), warn=lambda _: None,
+    )  # fmt: skip
+
+
+def _child(*words: object) -> subprocess.Popen:
+    command = [sys.executable, "-m", "benchmarks.scale", "child", *map(str, words)]
+    return subprocess.Popen(command)
+
+
+def _equal(one: Path, other: Path) -> bool:
+    import numpy as np
+    import zarr
+
+    return all(
+        np.array_equal(*(zarr.open_array(p / name, mode="r")[:] for p in (one, other)))
+        for name in ARRAYS
+    )
 
 
 def kills(count: int, folder: Path) -> dict:
-    """Kill and restart one run after another; how many of the stores came out equal."""
-    import zarr
-
+    """Kill and restart one run after another."""
+    whole, begun = folder / "whole.zarr", folder / "begun"
     began = time.perf_counter()
-    assert _child(folder / "whole.zarr").wait() == 0
+    assert _child(whole, begun).wait() == 0
     usual = time.perf_counter() - began
-    done = equal = 0
-    while done < count:
-        path = folder / f"killed{done}.zarr"
-        for _ in range(4):
-            child = _child(path)
+    chunks = len(begun.read_text().split())
+    seen = []
+    while sum(row["kills"] for row in seen) < count:
+        path, begun = folder / f"killed{len(seen)}.zarr", folder / f"begun{len(seen)}"
+        done = 0
+        for _ in range(5):
+            running = _child(path, begun)
             try:
-                child.wait(random.uniform(0.2, 0.8) * usual)
+                running.wait(random.uniform(0.3, 0.95) * usual)
                 break
             except subprocess.TimeoutExpired:
-                child.send_signal(signal.SIGKILL)
-                child.wait()
+                running.send_signal(signal.SIGKILL)
+                running.wait()
                 done += 1
-        assert _child(path).wait() == 0
-        equal_now = all(
-            np.array_equal(
-                zarr.open_array(folder / "whole.zarr" / name, mode="r")[:],
-                zarr.open_array(path / name, mode="r")[:],
-            )
-            for name in ARRAYS
-        )
-        equal += equal_now
-        print(f"{done} kills, equal: {equal_now}", flush=True)
-        assert equal_now
+        assert _child(path, begun).wait() == 0
+        lost = len(begun.read_text().split()) - chunks
+        seen.append({"kills": done, "computed_again": lost, "equal": _equal(path, whole)})
+        print(seen[-1], flush=True)
         shutil.rmtree(path)
-    return {"kills": done, "stores_equal": equal}
+    return {
+        "kills": sum(row["kills"] for row in seen),
+        "chunks": chunks,
+        "computed_again": sum(row["computed_again"] for row in seen),
+        "most_again_per_kill": max(row["computed_again"] / max(1, row["kills"]) for row in seen),
+        "stores": len(seen),
+        "stores_equal": sum(row["equal"] for row in seen),
+    }
+
+
+def processes(folder: Path) -> dict:
+    """The same run by 1, 2 and 4 processes at a time."""
+    found = {}
+    for count in (1, 2, 4):
+        path = folder / f"{count}.zarr"
+        began = time.perf_counter()
+        running = [_child(path, folder / f"begun{count}{i}", i, count) for i in range(count)]
+        assert [p.wait() for p in running] == [0] * count
+        found[str(count)] = {
+            "seconds": time.perf_counter() - began,
+            "equal": _equal(path, folder / "1.zarr"),
+        }
+    return found
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--bodies", type=int, default=1_000_000)
-    parser.add_argument("--times", type=int, default=100)
-    parser.add_argument("--kills", type=int)
-    parser.add_argument("--child", type=Path, help=argparse.SUPPRESS)
-    parser.add_argument("--folder", type=Path)
+    parser.add_argument("what", choices=("store", "cost", "devices", "kills", "processes", "child"))
+    parser.add_argument("words", nargs="*", help=argparse.SUPPRESS)
+    parser.add_argument("--case", choices=CASES, help="one case of the store alone")
+    parser.add_argument("--kills", type=int, default=20)
+    parser.add_argument("--bodies", type=int, default=1_000_000, help="of the sharded batch")
+    parser.add_argument("--folder", type=Path, help="where the stores are made")
+    parser.add_argument("--output", type=Path, help="file to write")
     options = parser.parse_args()
+    if options.what == "cost":
+        _report.one_thread()
+    import jax
+
     jax.config.update("jax_enable_x64", True)
-    if options.child:
-        ens.stream(make(300_000), np.linspace(0.0, 10.0, 10), options.child, chunk=16384)
+    if options.what == "child":
+        child(*options.words)
         return
+    if options.what == "devices":
+        jax.config.update("jax_num_cpu_devices", 8)
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-        if options.kills:
-            print(json.dumps(kills(options.kills, Path(folder))))
+        if options.what == "store" and options.case is None:
+            found = {}
+            for case in CASES:  # memory is that of a process: one for each
+                part = Path(folder) / "part.json"
+                command = [sys.executable, "-m", "benchmarks.scale", "store", "--case", case]
+                where = ["--folder", folder, "--output", str(part)]
+                subprocess.run([*command, *where], check=True, stdout=subprocess.DEVNULL)
+                found[case] = json.loads(part.read_text())["numbers"]
         else:
-            print(json.dumps(measure(options.bodies, options.times, Path(folder))))
+            found = {
+                "store": lambda: store(*CASES[options.case], Path(folder)),
+                "cost": cost,
+                "devices": lambda: devices(options.bodies, 10),
+                "kills": lambda: kills(options.kills, Path(folder)),
+                "processes": lambda: processes(Path(folder)),
+            }[options.what]()
+    print(json.dumps(found, indent=1))
+    path = options.output or _report.OUT / f"scale_{options.what}.json"
+    _report.write("scale", found, path=path, packages=("zarr", "google-crc32c"))
 
 
 if __name__ == "__main__":

@@ -61,12 +61,108 @@ def test_mistakes_are_named(old, new, words):
         parse_scene(SCENE.replace(old, new))
 
 
-def test_run_writes_resumes_and_refuses(tmp_path, capsys):
+ARRAYS = """
+[inertia]
+moments = [1.0, 2.0, 2.5]
+[state]
+omega_body = [0.01, 1.0, 0.0]
+[times]
+stop = 6.0
+number = 3
+[torque]
+kind = "body"
+n = [0.0, 0.0, 0.1]
+[ensemble]
+bodies = 50
+seed = 3
+[ensemble.torque]
+half_width = 0.05
+[ensemble.arrays]
+moments = "moments.npy"
+omega_body = "omega.npy"
+"""
+
+
+def test_rows_of_files_and_torques(tmp_path):
+    numbers = np.random.default_rng(1)
+    moments = numbers.uniform(1.0, 1.9, (50, 3)).astype(np.float32)
+    omega = numbers.normal(size=(50, 3))
+    np.save(tmp_path / "moments.npy", moments)
+    np.save(tmp_path / "omega.npy", omega)
+    scene = tmp_path / "rows.toml"
+    ensemble, _ = build_ensemble(parse_scene(ARRAYS, scene), np.float64)
+    some = np.array([49, 7])
+    drawn, state = ensemble.draw(some)
+    np.testing.assert_array_equal(drawn.inertia.moments, moments[some])
+    np.testing.assert_array_equal(state.omega_body, omega[some])
+    away = np.asarray(ensemble.draw(np.arange(50))[0].torque.n) - [0.0, 0.0, 0.1]
+    assert np.all(np.abs(away) <= 0.05)
+    assert np.all(np.abs(away).max(axis=0) > 0.04)
+    moments[7] = [1.0, 1.0, 2.5]
+    np.save(tmp_path / "moments.npy", moments)
+    with pytest.raises(SceneFileError, match="row 7"):
+        parse_scene(ARRAYS, scene)
+    np.save(tmp_path / "moments.npy", moments[:-1])
+    with pytest.raises(SceneFileError, match="50 x 3 numbers"):
+        parse_scene(ARRAYS, scene)
+    with pytest.raises(SceneFileError, match=r"nothing\.npy"):
+        parse_scene(ARRAYS.replace("moments.npy", "nothing.npy"), scene)
+    with pytest.raises(SceneFileError, match="given twice"):
+        parse_scene(SCENE + '[ensemble.arrays]\nwxyz = "omega.npy"', scene)
+    with pytest.raises(SceneFileError, match=r"one .torque. of kind"):
+        parse_scene(SCENE + "[ensemble.torque]\nsigma = 1.0", scene)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--process", "1"], "--process needs --processes"),
+        (["--processes", "2"], "--processes needs --process"),
+        (["--processes", "2", "--process", "2"], "process must be from 0 to 1"),
+        (["--coordinator", "here:1"], "needs --processes and --process"),
+        (["--coordinator", "here", "--processes", "2", "--process", "1"], "must be HOST:PORT"),
+        (["--coordinator", "127.0.0.1:1", "--processes", "2", "--process", "1", "--patience",
+          "0.1"], "no coordinator answers at 127.0.0.1:1"),
+        (["--patience", "3"], "needs --coordinator or --cluster"),
+        (["--chunk", "1000"], "multiple of the block of 8192"),
+        (["--memory", "100MB"], "too small"),
+        (["--devices", "99"], "--devices 99: this machine has"),
+    ],
+)  # fmt: skip
+def test_bad_options_change_nothing(options, words, tmp_path, capsys):
+    scene = tmp_path / "big.toml"
+    scene.write_text(SCENE)
+    assert main(["run", str(scene), "-o", str(tmp_path / "big.zarr"), *options]) == 1
+    assert words in capsys.readouterr().err
+    assert not (tmp_path / "big.zarr").exists()
+
+
+def test_no_cluster_and_no_place_to_write(tmp_path, capsys, monkeypatch):
+    scene = tmp_path / "big.toml"
+    scene.write_text(SCENE)
+    assert main(["run", str(scene), "-o", str(tmp_path / "big.zarr"), "--cluster"]) == 1
+    assert "JAX finds no cluster" in capsys.readouterr().err
+    (tmp_path / "file").write_text("keep")
+    assert main(["run", str(scene), "-o", str(tmp_path / "file" / "big.zarr")]) == 1
+    assert "cannot write beside" in capsys.readouterr().err
+    assert (tmp_path / "file").read_text() == "keep"
+
+
+SLURM = {
+    "SLURM_JOB_ID": "17", "SLURM_STEP_NODELIST": "localhost", "SLURM_NTASKS": "1",
+    "SLURM_PROCID": "0", "SLURM_LOCALID": "0",
+}  # fmt: skip
+
+
+def test_run_writes_resumes_and_refuses(tmp_path, capsys, monkeypatch):
     scene = tmp_path / "big.toml"
     scene.write_text(SCENE)
     store = tmp_path / "out" / "big.zarr"
     command = ["run", str(scene), "-o", str(store), "--memory", "2GB"]
-    assert main(command) == 0
+    # as a task of SLURM: JAX finds the numbers
+    for name, value in SLURM.items():
+        monkeypatch.setenv(name, value)
+    assert main([*command, "--cluster"]) == 0
     with xarray.open_zarr(store) as data:
         assert data.attrs["scene"] == SCENE
         assert data.wxyz.shape == (9000, 3, 4)

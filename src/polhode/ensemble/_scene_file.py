@@ -13,6 +13,7 @@ from polhode.ensemble._spreads import (
     SpreadMoments,
     SpreadMomentum,
     SpreadRates,
+    SpreadTorque,
 )
 from polhode.ensemble._statistics import QUANTITIES, Statistic
 from polhode.io import SceneFile, build_inertia, build_scene, build_state
@@ -28,6 +29,7 @@ def build_ensemble(file: SceneFile, dtype: DTypeLike) -> tuple[Ensemble, tuple[S
     inertia = build_inertia(file, dtype)
     spreads = [_spread(draw, file, dtype) for draw in plan.draws]
     drawn = {draw.quantity for draw in plan.draws}
+    drawn |= set(plan.rows)
     if file.state.rate == "momentum_body" and "momentum_body" not in drawn:
         spreads.append(SpreadMomentum(jnp.asarray(file.state.value, dtype)))
     ensemble = Ensemble(
@@ -36,6 +38,7 @@ def build_ensemble(file: SceneFile, dtype: DTypeLike) -> tuple[Ensemble, tuple[S
         plan.bodies,
         tuple(spreads),
         plan.seed,
+        dict(plan.rows),
     )
     kept = tuple(
         Statistic(k.quantity, *QUANTITIES[k.quantity], k.low, k.high, k.bins)
@@ -54,5 +57,6 @@ def _spread(draw, file: SceneFile, dtype: DTypeLike):
         return SpreadEuler(angles, deviate, rotation.Sequence[state.attitude.sequence.upper()])
     if draw.quantity == "momentum_body":
         return SpreadMomentum(jnp.asarray(state.value, dtype), deviate)
-    kinds = {"moments": SpreadMoments, "attitude": SpreadAttitude, "omega_body": SpreadRates}
+    kinds = {"moments": SpreadMoments, "attitude": SpreadAttitude, "omega_body": SpreadRates,
+             "torque": SpreadTorque}  # fmt: skip
     return kinds[draw.quantity](deviate)

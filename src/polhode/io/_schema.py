@@ -68,6 +68,7 @@ def parse_scene(text: str, path: str | os.PathLike = "<text>") -> SceneFile:
     inertia, relative = read_inertia(top)
     state = _state(top)
     times = _times(top)
+    torques = read_parts(top, "torque")
     return SceneFile(
         path=path,
         title=top.text("title", path.stem),
@@ -80,14 +81,14 @@ def parse_scene(text: str, path: str | os.PathLike = "<text>") -> SceneFile:
         state=state,
         times=times,
         potentials=read_parts(top, "potential"),
-        torques=read_parts(top, "torque"),
+        torques=torques,
         rotors=read_parts(top, "rotors"),
         method=_method(top),
         monte_carlo=_monte_carlo(top, inertia.kind, state),
         published=tuple(_published(top)),
         observations=_observations(top, epoch),
         output=_output(top),
-        ensemble=read_ensemble(top, inertia.kind, state),
+        ensemble=read_ensemble(top, inertia.kind, state, torques),
     )
 
 

@@ -101,6 +101,7 @@ class EnsemblePlan:
     trajectories: bool
     draws: tuple[Draw, ...]
     statistics: tuple[Kept, ...]
+    rows: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
 
 @dataclasses.dataclass(frozen=True)
