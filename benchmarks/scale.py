@@ -5,9 +5,10 @@
     python -m benchmarks.scale devices      a sharded batch of 1e6 bodies beside one device
     python -m benchmarks.scale kills        20 kills at random moments, and what each of them cost
     python -m benchmarks.scale processes    1, 2 and 4 processes into one store
+    python -m benchmarks.scale model        the tables of docs/scale.md, from the committed results
 
-Each writes ``scale_NAME.json``. Kills and processes are real ones; their stores are compared with
-an undisturbed one bit by bit.
+Each but the last writes ``scale_NAME.json``. Kills and processes are real ones; their stores are
+compared with an undisturbed one bit by bit.
 """
 
 import argparse
@@ -27,6 +28,7 @@ from benchmarks import _report
 
 ARRAYS = ("wxyz", "omega_body", "status")
 CASES = {"1e6 x 100": (1_000_000, 100), "1e7 x 10": (10_000_000, 10)}
+PARTS = ("store", "cost", "devices", "kills", "processes")
 CHUNK = 16384
 
 
@@ -261,9 +263,67 @@ def processes(folder: Path) -> dict:
     return found
 
 
+BUS_GB_PER_S = 25.0
+"""Assumed: what a GPU hands to its host over 16 lanes of PCIe 4. Not measured."""
+
+
+def model() -> str:
+    """What 1e9 bodies take, from the committed cost and store; the same for what was measured."""
+    cost, store = (_report.read(f"scale_{name}")["numbers"] for name in ("cost", "store"))
+    body, state = cost["ns_per_body"] * 1e-9, cost["ns_per_state"] * 1e-9
+    disk = min(case["raw_write_GB_per_s"] for case in store.values())
+
+    def compute(bodies, times, cores):
+        return bodies * (body + times * state) / cores
+
+    def size(bodies, times):
+        return bodies * (times * cost["bytes_per_state"] + cost["bytes_per_body"]) / 1e9
+
+    lines = [
+        "| 1e9 bodies x | 1 core | 64 cores | 1 GPU, at least | 64 GPUs, at least | store |"
+        " written by one such disk |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    for times in (10, 100):
+        big = size(1e9, times)
+        spans = [compute(1e9, times, 1), compute(1e9, times, 64), big / BUS_GB_PER_S]
+        spans += [spans[-1] / 64]
+        cells = [*map(_span, spans), f"{big / 1e3:.2g} TB", _span(big / disk)]
+        lines.append(f"| {times} times | " + " | ".join(cells) + " |")
+    lines += [
+        "",
+        "| measured, two cores | model: computing | model: writing | run |",
+        "|---|---|---|---|",
+    ]
+    for case, found in store.items():
+        given = found["bodies"], found["times"]
+        lines.append(
+            f"| {case} | {compute(*given, 2):.0f} s | {size(*given) / disk:.0f} s |"
+            f" {found['run_s']:.0f} s |"
+        )
+    rate = cost["bytes_per_state"] / cost["ns_per_state"]
+    lines += [
+        "",
+        f"One core: {cost['ns_per_body']:.0f} ns per body and {cost['ns_per_state']:.0f} ns per"
+        f" saved state of {cost['bytes_per_state']} bytes, that is {rate:.2g} GB/s when many times"
+        f" are saved. The disk takes {disk:.2g} GB/s: from {disk / rate:.1f} cores on the store is"
+        " what one waits for.",
+    ]
+    return "\n".join(lines)
+
+
+def _span(seconds: float) -> str:
+    for unit, size in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= size:
+            return f"{seconds / size:.2g} {unit}"
+    return f"{seconds:.2g} s"
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("what", choices=("store", "cost", "devices", "kills", "processes", "child"))
+    parser.add_argument(
+        "what", choices=("store", "cost", "devices", "kills", "processes", "model", "child")
+    )
     parser.add_argument("words", nargs="*", help=argparse.SUPPRESS)
     parser.add_argument("--case", choices=CASES, help="one case of the store alone")
     parser.add_argument("--kills", type=int, default=20)
@@ -271,6 +331,9 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="where the stores are made")
     parser.add_argument("--output", type=Path, help="file to write")
     options = parser.parse_args()
+    if options.what == "model":
+        print(model())
+        return
     if options.what == "cost":
         _report.one_thread()
     import jax
