@@ -47,10 +47,10 @@ def count_chunks(path):
     """Have each chunk that is begun leave its number in a file, whatever comes after."""
     begin = _fill._chunk
 
-    def noted(store, block, number, writer):
+    def noted(store, block, number, *rest):
         with open(path, "a") as file:
             file.write(f"{number}\n")
-        begin(store, block, number, writer)
+        begin(store, block, number, *rest)
 
     _fill._chunk = noted
 

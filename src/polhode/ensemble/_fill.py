@@ -27,12 +27,18 @@ class Progress(NamedTuple):
 
 
 def fill(
-    store: Store, block: Block, share: range, verify: bool, progress: Callable[[Progress], None]
+    store: Store,
+    block: Block,
+    share: range,
+    verify: bool,
+    ahead: int,
+    progress: Callable[[Progress], None],
 ) -> None:
     """Compute the chunks of the share that are missing, then those that turn out damaged.
 
     Finished chunks are read and checked in a thread of their own meanwhile. A chunk is begun when
-    the one before it is marked: whatever ends the process costs one chunk at most.
+    the one before it is marked: whatever ends the process costs one chunk at most. ``ahead``
+    groups of blocks are computed at a time.
     """
     tally = _Tally(store, block.ensemble.bodies, share, progress)
     marked = store.finished()
@@ -54,7 +60,7 @@ def fill(
                 pending = next(checks, None)
             if todo:
                 number = todo.popleft()
-                _chunk(store, block, number, writer)
+                _chunk(store, block, number, writer, ahead)
                 tally.done(number)
 
 
@@ -95,9 +101,9 @@ class _Tally:
         self.progress(Progress(done, self.total, self.reused, rate, remaining))
 
 
-def _chunk(store: Store, block: Block, number: int, writer) -> None:
-    """Compute a chunk and have it written and marked; one file is written while the next is
-    computed, and the next group of blocks is on its way while one is copied.
+def _chunk(store: Store, block: Block, number: int, writer, ahead: int) -> None:
+    """Compute a chunk and have it written and marked; one file is written while the next ones are
+    computed.
     """
     rows = {name: store.rows(name, number) for name in store.arrays}
     # what has one file in a chunk is gathered; the trajectories go as they come
@@ -128,7 +134,7 @@ def _chunk(store: Store, block: Block, number: int, writer) -> None:
     files = store.pieces(number)
     cut = _Cutter(split)
     wanted = next(files)
-    for offset, found in _groups(block, first, last, step):
+    for offset, found in _groups(block, first, last, step, ahead):
         _gather(gathered, offset, found, block.size, last - first)
         cut.add(found)
         while wanted is not None and wanted[0] in split:
@@ -145,15 +151,14 @@ def _chunk(store: Store, block: Block, number: int, writer) -> None:
     store.finish(number, checksum)
 
 
-def _groups(block: Block, first: int, last: int, step: int):
-    """(offset in the chunk, arrays) of each group of blocks, the next one begun before."""
-    ahead = None
+def _groups(block: Block, first: int, last: int, step: int, ahead: int):
+    """(offset in the chunk, arrays) of each group of blocks in order, ``ahead`` in flight."""
+    flying: collections.deque = collections.deque()
     for start in range(first, last, step):
-        now, ahead = ahead, (start - first, block(start))
-        if now is not None:
-            yield now
-    if ahead is not None:
-        yield ahead
+        flying.append((start - first, block(start)))
+        if len(flying) >= ahead:
+            yield flying.popleft()
+    yield from flying
 
 
 class _Cutter:

@@ -6,9 +6,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 _PIECE_BYTES = 2**25
-_PIECES, _BLOCKS = 4, 64  # of a chunk: files per array; blocks where only statistics are kept
+_PIECES, _BLOCKS = 16, 64  # of a chunk: files per array; blocks where only statistics are kept
 _OWN_MEMORY = 600_000_000  # Python, JAX and the compiled program
 _COPIES, _PER_DEVICE = 5, 5  # pieces on their way to the disk; blocks being computed or copied
+_AHEAD_BYTES = 2**29
 
 
 class Rows(NamedTuple):
@@ -67,6 +68,17 @@ def rows(
     blocks = unit * -(-(_PIECES * piece if whole else _BLOCKS) // unit)
     blocks = min(blocks, piece * -(-total // piece))
     return Rows(blocks * block, (piece if whole else blocks) * block)
+
+
+def ahead(block_bytes: int, cores: int, devices: int, memory: int | None) -> int:
+    """Groups of blocks in flight at once. A block on a processor keeps about one core busy (its
+    chunks come one after the other): one for each core, and one that waits, as memory allows.
+    """
+    budget = _AHEAD_BYTES
+    if memory is not None:
+        budget = max(0, memory - _OWN_MEMORY - block_bytes * (_COPIES + _PER_DEVICE * devices))
+    extra = budget // (2 * block_bytes * devices)
+    return 2 + max(0, min(extra, -(-cores // devices) - 1))
 
 
 def fields(

@@ -73,10 +73,13 @@ def stream(
     devices = [jax.local_devices()[0]] if devices is None else list(devices)
     block = Block(ensemble, ts, method, rtol, trajectories, statistics, devices)
     times = np.asarray(block.ts)
-    body_bytes = 7 * times.size * times.itemsize * trajectories + 1
+    body_bytes = 7 * times.size * times.itemsize + 1  # to compute, if not to keep
     size = _layout.rows(
         ensemble.bodies, block.size, body_bytes, trajectories, len(devices), memory, chunk
     )
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    on_cores = cores if devices[0].platform == "cpu" else 1
+    ahead = _layout.ahead(block.size * body_bytes, on_cores, len(devices), memory)
     identity = _identity(block, rtol, trajectories, statistics, attributes or {})
     with locked(path, process, processes):
         if not path.exists():
@@ -87,7 +90,7 @@ def stream(
         store = Store(path, identity)
         if processes == 1:
             store.sweep()
-        fill(store, block, range(process, store.marks.shape[0], processes), verify, progress)
+        fill(store, block, range(process, store.marks.shape[0], processes), verify, ahead, progress)
         if store.finished().all():
             with in_turn(path):
                 write_summaries(store, statistics)
