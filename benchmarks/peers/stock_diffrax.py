@@ -36,7 +36,7 @@ def programs(problem: Problem, n, dtype, tolerances, quick) -> list[Program]:
         few = start[: min(n, 1000)]
         found += _rows("Dopri8, chunks of 40", _chunks, problem, few, times, tolerances, "quat")
         if not quick or problem.name == "free":
-            some = start[:100] if quick else few
+            some = few[: 100 if quick else 200]
             found += _rows("Dopri8, vmap", _vmap, problem, some, times, tolerances, "quat")
     if problem.name in ("free", "heavy_top") and dtype == np.float64 and n <= 1000:
         count = 3 if n == 1 else 20
