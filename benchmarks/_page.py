@@ -80,22 +80,20 @@ def best(table: dict, peer: str, level: float, error: str) -> float | None:
 
 
 def standings(report: dict, error: str) -> list[str]:
-    """Per table and level: time of the default, of the best peer, and their ratio."""
+    """Per table and level: how many times as long the best peer takes, and which it is."""
     lines = []
     for table in report["numbers"]["tables"]:
+        cells = []
         for at in _levels.standing(table, error):
-            if at["ours"] is None and at["peer"] is None:
-                continue
-            ratio = at["ratio"]
-            shown = "–" if ratio is None else f"{number(ratio)}"
-            if ratio is not None and ratio < 1:
-                shown = f"**{shown}**"
-            lines.append([
-                heading(table), f"{at['level']:.0e}", number(at["ours"], 1e3),
-                number(at["peer_time"], 1e3), at["peer"] or "none", shown,
-            ])  # fmt: skip
-    header = ["", "error [rad]", "polhode [µs]", "best peer [µs]", "which", "peer / polhode"]
-    return rows(header, lines)
+            if at["ratio"] is not None:
+                times = f"{number(at['ratio'])} x"
+                cells.append(f"{times if at['ratio'] >= 1 else f'**{times}**'} {at['peer']}")
+            elif at["ours"] is not None:
+                cells.append("only polhode")
+            else:
+                cells.append(f"**only {at['peer']}**" if at["peer"] else "none")
+        lines.append([heading(table), *cells])
+    return rows(["", *(f"{level:.0e} rad" for level in _levels.LEVELS)], lines)
 
 
 def per_peer(table: dict, error: str = "attitude_median") -> list[str]:
@@ -175,9 +173,10 @@ def work_precision(report: dict) -> list[str]:
         lines.append(f"- Missing: {name} ({why}).")
     lines += [
         "", "![error against time per body](results/work_precision.svg)", "",
-        "Time per body at which the median body's attitude error falls below a level; interpolated"
-        " between settings on logarithmic scales, never extrapolated. Where an exact method is"
-        " chosen it has one setting. In bold: a peer is faster.", "",
+        "How many times as long as polhode's default the best peer takes until the median body's"
+        " attitude error is below a level, and which peer that is. Interpolated between settings on"
+        " logarithmic scales, never extrapolated; an exact method has one setting. In bold: the"
+        " peer is faster, or the default does not get there at the settings run.", "",
         *standings(report, "attitude_median"),
         "<details><summary>The same for the worst body</summary>", "",
         *standings(report, "attitude_worst"), "</details>", "",
@@ -240,9 +239,9 @@ def scaling(report: dict) -> list[str]:
     ]  # fmt: skip
 
 
-def generic(report: dict) -> list[str]:
+def generic(report: dict, name: str) -> list[str]:
     """Any other result: its lists of rows as tables, its other numbers as a list."""
-    title = report["name"].replace("_", " ")
+    title = name.replace("_", " ")
     lines = [f"## {title[0].upper()}{title[1:]}", "", machine(report), ""]
 
     def cell(value: Any) -> str:
@@ -278,9 +277,15 @@ def generic(report: dict) -> list[str]:
 SECTIONS = {"gradients": gradients, "scene_cost": scene_cost, "scaling": scaling}
 
 
-def page() -> str:
-    """The text of benchmarks/README.md."""
-    lines = [INTRODUCTION]
+def names_on(text: str) -> list[str]:
+    """The results that a page was written from."""
+    return text.partition("<!-- results: ")[2].partition(" -->")[0].split()
+
+
+def page(names: list[str] | None = None) -> str:
+    """The text of benchmarks/README.md from the named results; None: from all."""
+    names = [path.stem for path in sorted(RESULTS.glob("*.json"))] if names is None else names
+    lines = [f"<!-- results: {' '.join(names)} -->", INTRODUCTION]
     found = merged()
     if found:
         lines += work_precision(found)
@@ -290,12 +295,11 @@ def page() -> str:
             " event detection and 128-bit or longer arithmetic, diffrax any equation in JAX;"
             " polhode does rotating rigid bodies only.", "",
         ]  # fmt: skip
-    names = [p.stem for p in sorted(RESULTS.glob("*.json"))]
     names = [name for name in names if not name.startswith("work_precision")]
     for name in (*SECTIONS, *(name for name in names if name not in SECTIONS)):
         if name in names:
             report = read(name)
-            lines += SECTIONS.get(report["name"], generic)(report)
+            lines += SECTIONS[name](report) if name in SECTIONS else generic(report, name)
     return "\n".join(lines).rstrip() + "\n"
 
 
