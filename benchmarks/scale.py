@@ -315,8 +315,25 @@ def model() -> str:
         f" saved state of {cost['bytes_per_state']} bytes, that is {rate:.2g} GB/s when many times"
         f" are saved. That disk takes {disk:.2g} GB/s: from {disk / rate:.1f} cores on the store is"
         " what one waits for.",
+        "",
+        _others(*(_report.read(f"scale_{name}")["numbers"] for name in ("kills", "devices"))),
     ]
     return "\n".join(lines)
+
+
+def _others(kills: dict, devices: dict) -> str:
+    over = ", ".join(f"{100 * devices['over_one_device'][n]:+.0f} %" for n in ("2", "4", "8"))
+    away = max(devices["greatest_difference"].values())
+    return (
+        f"Kills: {kills['kills']} at random moments of {kills['stores']} runs;"
+        f" {kills['computed_again']} chunks were computed again, at most"
+        f" {kills['most_again_per_kill']:.0f} a kill, and {kills['stores_equal']} of the"
+        f" {kills['stores']} stores equal an undisturbed one bit by bit.\n\n"
+        f"Devices: `ph.simulate` of {devices['bodies']:,} bodies x {devices['times']} times sharded"
+        f" over 2, 4 and 8 forced devices of two cores takes {over} against one device, and"
+        f" its attitudes lie within {away:.0e} of those (more than a factor of two cannot be seen"
+        " on two cores)."
+    )
 
 
 def _span(seconds: float) -> str:
