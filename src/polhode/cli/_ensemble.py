@@ -184,12 +184,13 @@ class _Meter:
 
 
 def _failures(path: Path) -> int:
+    import numpy as np
     import zarr
 
     status = zarr.open_array(path / "status", mode="r")
     failed, step = 0, status.chunks[0]
     for start in range(0, status.shape[0], step):
-        failed += int((status[start : start + step] > 0).sum())
+        failed += int((np.asarray(status[start : start + step]) > 0).sum())
     if failed:
         print(f"polhode: {failed:,} bodies did not finish; see `status` in {path}", file=sys.stderr)
     return 1 if failed else 0

@@ -102,7 +102,8 @@ def draw(each: Any, shared: Any, indices: Array, spreads: Any, seed: Array) -> t
 
     def one(index, own):
         own, rows = own
-        scene, state = _placed(*eqx.combine(own, shared), rows)
+        scene, state = eqx.combine(own, shared)
+        scene, state = _placed(scene, state, rows)
         key = jax.random.fold_in(root, index)
         streams: list[int] = []
         for spread in spreads:
