@@ -36,7 +36,7 @@ def flatten(value: Any, path: tuple = ()) -> dict[tuple, float]:
 def kind(path: tuple) -> str:
     """'compile', 'time', 'spread', 'error' or 'other', by the name of the leaf."""
     name = str(path[-1])
-    if name == "spread":
+    if name in ("spread", "repeats"):
         return "spread"
     if "compile" in name:
         return "compile"

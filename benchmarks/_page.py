@@ -116,6 +116,21 @@ def per_peer(table: dict, error: str = "attitude_median") -> list[str]:
     return rows(header, lines)
 
 
+def asked(report: dict) -> list[str]:
+    """What the default reaches where it steps, beside what it was asked for."""
+    lines = []
+    for table in report["numbers"]["tables"]:
+        for row in table["rows"]:
+            if _levels.ours(row) and row["setting"] != "exact":
+                lines.append([
+                    heading(table), row["program"].removeprefix("default: "), row["setting"],
+                    number(row["attitude_median"]), number(row["attitude_worst"]),
+                    number(row["ns_per_body"], 1e3),
+                ])  # fmt: skip
+    header = ["", "method", "rtol", "median error [rad]", "worst error [rad]", "time [µs/body]"]
+    return rows(header, lines) if lines else []
+
+
 def behind(report: dict) -> list[str]:
     """Where a peer is faster than the default, in words."""
     lines = []
@@ -180,6 +195,8 @@ def work_precision(report: dict) -> list[str]:
         *standings(report, "attitude_median"),
         "<details><summary>The same for the worst body</summary>", "",
         *standings(report, "attitude_worst"), "</details>", "",
+        "<details><summary>What the default reaches where it steps</summary>", "",
+        *asked(report), "</details>", "",
         "<details><summary>Every peer</summary>", "",
     ]  # fmt: skip
     for table in report["numbers"]["tables"]:

@@ -8,6 +8,7 @@ body is counted once), and measured nanoseconds per body on one core, median of 
 
 import argparse
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 from benchmarks import _report
@@ -71,22 +72,25 @@ def counts(compiled) -> dict[str, float]:
     }
 
 
-def measure(name: str, n: int, repeats: int = 7) -> dict[str, float | str]:
-    """One row of the table."""
+def build(name: str, n: int) -> tuple[dict, Callable]:
+    """A row of the table without its time, and the call to be timed."""
     scene, record, times = scenes()[name]
     state, ts = states(n), jnp.linspace(0.0, 100.0, times)
     start = time.perf_counter()
     compiled, arguments = program(scene, state, ts, record)
-    compile_time = time.perf_counter() - start
-    wall = _report.clock(lambda: jax.block_until_ready(compiled(*arguments)), repeats=repeats)
-    row = {key: value / n for key, value in counts(compiled).items()}
-    return {
-        "scene": name,
-        **row,
-        "ns": 1e9 * wall.median / n,
-        "spread": wall.spread,
-        "compile_s": compile_time,
-    }
+    spent = time.perf_counter() - start
+    row = {"scene": name, **{key: value / n for key, value in counts(compiled).items()}}
+    return row | {"compile_s": spent}, lambda: jax.block_until_ready(compiled(*arguments))
+
+
+def measure(names: list[str], n: int, repeats: int = 7) -> list[dict]:
+    """The table; the programs take turns."""
+    built = {name: build(name, n) for name in names}
+    walls = _report.in_turn({name: call for name, (_, call) in built.items()}, repeats=repeats)
+    return [
+        row | {"ns": 1e9 * walls[name].median / n, "spread": walls[name].spread}
+        for name, (row, _) in built.items()
+    ]
 
 
 def main() -> None:
@@ -98,7 +102,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="200 bodies")
     options = parser.parse_args()
     bodies = 200 if options.quick else options.bodies
-    rows = [measure(name, bodies) for name in scenes()]
+    rows = measure(list(scenes()), bodies)
     print(f"{'per body':<38}{'flops':>9}{'transc.':>9}{'bytes':>9}{'ns':>11}{'compile s':>11}")
     for row in rows:
         print(

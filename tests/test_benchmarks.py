@@ -183,7 +183,7 @@ def test_scaling_and_scene_cost_run():
     rows = scaling.measure("free", 8, 1, (1.0, 100.0), budget=0.01)
     assert [row["horizon"] for row in rows] == [1.0, 100.0]
     assert all(row["ns_per_body"] > 0 and row["memory_MB"] > 0 for row in rows)
-    row = scene_cost.measure("free, spherical, final state", 4, repeats=1)
+    (row,) = scene_cost.measure(["free, spherical, final state"], 4, repeats=1)
     assert row["ns"] > 0
     assert row["flops"] > 0
 
