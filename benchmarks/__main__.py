@@ -70,8 +70,9 @@ def main() -> int:
     if options.action == "page":
         merged = _page.merged()
         if merged:
-            drawn = _figures.work_precision(merged)
-            _figures.save(drawn, _report.RESULTS / "work_precision.svg")
+            for name, families in (("work_precision", _figures.MAIN), ("work_precision_all", ())):
+                drawn = _figures.work_precision(merged, families)
+                _figures.save(drawn, _report.RESULTS / f"{name}.svg")
         others = [_report.RESULTS / f"{name}.json" for name in ("scaling", "gradients")]
         _figures.draw([path for path in others if path.exists()], _report.RESULTS)
         for path in _page.write():

@@ -9,6 +9,10 @@ PEERS = ("polhode (default)", "polhode LiePoisson", "heyoka", "diffrax", "diffra
 SHOWN = {"bodies": 1000, "dtype": "float64"}
 
 
+MAIN = ("free", "separatrix", "lagrange", "heavy_top", "gradient", "dense")
+"""Families in the figure of the README."""
+
+
 def _name(peer: str, program: str) -> str:
     if peer == "polhode":
         return PEERS[0] if program.startswith("default") else PEERS[1]
@@ -33,7 +37,7 @@ def fronts(rows: list[dict]) -> dict[str, tuple[list, list]]:
     return found
 
 
-def work_precision(report: dict, families: list[str] | None = None, **shown):
+def work_precision(report: dict, families: tuple[str, ...] = (), **shown):
     """A panel per family: attitude error of the median body against time per body."""
     import matplotlib.pyplot as plt
 
@@ -47,7 +51,7 @@ def work_precision(report: dict, families: list[str] | None = None, **shown):
     ]  # fmt: skip
     if not tables:
         raise ValueError(f"the result holds no table with {shown}")
-    columns = min(3, len(tables))
+    columns = min(3 if len(tables) <= 6 else 5, len(tables))
     rows = -(-len(tables) // columns)
     with plt.rc_context(STYLE):
         figure = plt.figure(figsize=(3.3 * columns + 1.9, 2.6 * rows + 0.3), layout="constrained")

@@ -187,7 +187,7 @@ def work_precision(report: dict) -> list[str]:
     for name, why in report["numbers"]["missing"].items():
         lines.append(f"- Missing: {name} ({why}).")
     lines += [
-        "", "![error against time per body](results/work_precision.svg)", "",
+        "", "![error against time per body](results/work_precision_all.svg)", "",
         "How many times as long as polhode's default the best peer takes until the median body's"
         " attitude error is below a level, and which peer that is. Interpolated between settings on"
         " logarithmic scales, never extrapolated; an exact method has one setting. In bold: the"
