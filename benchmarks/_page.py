@@ -40,7 +40,7 @@ def number(value: float | None, unit: float = 1.0) -> str:
     value = value / unit
     if value == 0:
         return "0"
-    if 1e-2 <= abs(value) < 1e5:
+    if 1e-2 <= abs(value) < 1e7:
         digits = f"{value:.3g}"
         return f"{float(digits):,.0f}" if abs(value) >= 100 else digits
     return f"{value:.1e}"
@@ -264,7 +264,7 @@ def generic(report: dict, name: str) -> list[str]:
     def cell(value: Any) -> str:
         if isinstance(value, bool) or not isinstance(value, int | float):
             return "–" if value is None else str(value)
-        return number(value)
+        return f"{value:,}" if isinstance(value, int) else number(value)
 
     def walk(name: str, value: Any) -> None:
         if isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
