@@ -45,7 +45,8 @@ def bodies(case: str, count: int):
     r = np.random.Generator(np.random.PCG64(SEEDS[case])).standard_normal((count, 8))
     q = r[:, :4] / np.linalg.norm(r[:, :4], axis=1, keepdims=True)
     direction = r[:, 4:7] / np.linalg.norm(r[:, 4:7], axis=1, keepdims=True)
-    size = 1.5 + 0.5 * np.array([erf(x) for x in r[:, 7] / np.sqrt(2)])
+    # In this order of operations, to the last bit the inputs of the tables of truth.
+    size = 1.0 + 0.5 * (1.0 + np.array([erf(x) for x in r[:, 7] / np.sqrt(2.0)]))
     return q, direction * size[:, None]
 
 

@@ -21,9 +21,15 @@ class ClosedForm(AbstractMethod):
     circular functions only. Needs a scene without potential and torque. The error is rounding: a
     few units in the last place of the phase turned through. ``chunk`` bounds the bodies times
     samples worked on at once; None: chosen by the library. Steps are reported as 0.
+
+    ``compensated``: frequencies in sums of two floats (double-double in float64), so that over a
+    long horizon the error no longer grows with the phase. It costs a few hundred nanoseconds per
+    body, and 2 per sample, and no digit elsewhere. Bodies within 1e-15 of the separatrix or of a
+    symmetry, or known to be symmetric, have none of it.
     """
 
     chunk: int | None = eqx.field(static=True, default=None)
+    compensated: bool = eqx.field(static=True, default=False)
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         del rtol
@@ -46,11 +52,14 @@ class ClosedForm(AbstractMethod):
         n, wanted = wxyz.shape[0], {"attitude": record.attitude, "rates": record.rates}
         given = jax.tree.map(lambda x: jnp.broadcast_to(x, (n, x.shape[-1])), (moments, products))
         times = t if t.ndim == 2 else None
+        motion = _MOTION[inertia.symmetry]
+        if inertia.symmetry is Symmetry.NONE:
+            wanted["compensated"] = self.compensated
 
         def one(chunk):
             (moments, products), wxyz, omega, times = chunk
             times = t[None] if times is None else times
-            return _MOTION[inertia.symmetry](moments, products, wxyz, omega, times, wanted)
+            return motion(moments, products, wxyz, omega, times, wanted)
 
         size = max(1, (_CHUNK if self.chunk is None else self.chunk) // t.shape[-1])
         # Components are put together only here: fused with the motion, the stacking would have

@@ -69,6 +69,28 @@ def test_spin_about_the_unstable_axis_for_ever(dtype):
         assert np.all(np.isfinite(part))
 
 
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_compensated_horizons(dtype):
+    """Up to a million turns the error is that of the last operations, not of the phase."""
+    pairs = [pair for pair in PAIRS if pair[0].family in ("horizons", "separatrix", "ulps")]
+    pairs = [pair for pair in pairs if dtype == np.float64 or pair[0].fits_single]
+    x = jnp.asarray(np.array([body.inputs for body, _ in pairs]), dtype)
+    scene = ph.Scene(inertia=ph.Inertia(diagonal=x[:, :3]))
+    ts = jnp.stack([0 * x[:, -1], x[:, -1]], axis=-1)
+    method, record = ph.ClosedForm(compensated=True), ph.Record(final_only=True)
+    done = ph.simulate(scene, ph.State(x[:, 3:7], x[:, 7:10]), ts, method, record=record)
+    for n, (body, row) in enumerate(pairs):
+        q, w = (np.array(row[k], np.longdouble) for k in ("wxyz_t", "omega_t"))
+        found = np.asarray(done.wxyz)[n, 0].astype(np.longdouble)
+        off = 2 * min(np.linalg.norm(found - q), np.linalg.norm(found + q))
+        rates = np.asarray(done.omega_body)[n, 0]
+        off = max(off, np.linalg.norm(rates.astype(np.longdouble) - w) / np.linalg.norm(w))
+        # A product of two halves keeps a half more than the dtype.
+        phase = 2.0**-11 if dtype == np.float32 else 2.0**-27
+        room = 1 if body.family != "horizons" else phase
+        assert off <= np.finfo(dtype).eps * (6 + 2 * room * row["angle"]), body.name
+
+
 def test_every_family_is_long_enough():
     assert len(PAIRS) > 240
     assert sum(body.fits_single for body, _ in PAIRS) > 120

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
+from polhode.free._compensated import compensate
 from polhode.free._flow import Moment, advance, attitude, rates
 from polhode.free._frame import Frame, Quadruple, cross, dot, hamilton, matrix
 from polhode.free._motion import FreeMotion, Swing, Turning, prepare_swing, prepare_turning
@@ -34,21 +35,25 @@ def components(values, count: int) -> tuple[Scalars, ...]:
     return tuple(values[..., k] for k in range(count))
 
 
-def prepare(moments, wxyz, omega, products=None) -> FreeMotion:
+def prepare(moments, wxyz, omega, products=None, *, compensated: bool = False) -> FreeMotion:
     """Constants of the exact motion of free bodies.
 
     **Arguments:** principal ``moments`` (..., 3), positive, in any order; initial attitude
     ``wxyz`` (..., 4), or None when only rates will be asked; initial body rates ``omega``
     (..., 3) along the principal axes; ``products`` (..., 3), the entries xy, xz, yz of the inertia
     tensor, of value zero: they only carry tangents. Each may be a tuple of component arrays; all
-    components share one shape, the batch.
+    components share one shape, the batch. ``compensated``: the frequencies in sums of two floats,
+    for long horizons.
     """
     moments, omega = components(moments, 3), components(omega, 3)
     products = None if products is None else components(products, 3)
     wxyz = None if wxyz is None else components(wxyz, 4)
     # First derivatives do not pass through these constants (see _evaluate_rule), second ones do.
-    swing = prepare_swing(assign_roles(moments, omega))
+    roles = assign_roles(moments, omega)
+    swing = prepare_swing(roles)
     turning = None if wxyz is None else prepare_turning(swing, wxyz)
+    if compensated:
+        swing, turning = compensate(swing, turning, roles)
     return FreeMotion(moments, products, omega, wxyz, swing, turning)
 
 
@@ -77,7 +82,15 @@ def evaluate(
 
 
 def free_motion(
-    moments, wxyz, omega, t, products=None, *, attitude: bool = True, rates: bool = True
+    moments,
+    wxyz,
+    omega,
+    t,
+    products=None,
+    *,
+    attitude: bool = True,
+    rates: bool = True,
+    compensated: bool = False,
 ) -> tuple[Triple | None, Quadruple | None]:
     """The exact free motion: `prepare` and `evaluate` in one call.
 
@@ -95,7 +108,7 @@ def free_motion(
     )
 
     def whole(given, t):
-        motion = prepare(*given)
+        motion = prepare(*given, compensated=compensated)
         return evaluate(motion, t, attitude=attitude, rates=rates)
 
     t = jnp.asarray(t)

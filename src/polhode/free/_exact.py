@@ -82,6 +82,24 @@ def subtract_pairs(x: Pair, y: Pair) -> Pair:
     return quick_sum(high, low + (x.low - y.low))
 
 
+def add_pairs(x: Pair, y: Pair) -> Pair:
+    high, low = sum_of(x.high, y.high)
+    return quick_sum(high, low + (x.low + y.low))
+
+
+def divide_pairs(x: Pair, y: Pair) -> Pair:
+    high = x.high / y.high
+    rest = subtract_pairs(x, scale_pair(y, high))
+    return quick_sum(high, rest.high / y.high)
+
+
+def root_of(x: Pair) -> Pair:
+    """The square root of a positive pair."""
+    high = jnp.sqrt(x.high)
+    rest = subtract_pairs(x, product_of(high, high))
+    return quick_sum(high, rest.high / (2 * high))
+
+
 def turns(rate: Scalars, time: Scalars) -> tuple[Scalars, Scalars]:
     """rate * time as a whole number and a remainder in [-1/2, 1/2], nothing lost to its size."""
     x, y = split(rate), split(time)

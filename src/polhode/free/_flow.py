@@ -15,9 +15,14 @@ from polhode.free._roles import Triple, restore, settle
 Scalars = Float[Array, "*b"]
 
 
+def _phase(motion: Swing | Turning, t: Scalars) -> tuple[Scalars, Scalars]:
+    whole, rest = turns(motion.pace, t)
+    return whole, rest if motion.pace_low is None else rest + motion.pace_low * t
+
+
 def sweep(swing: Swing, t: Scalars) -> tuple[Scalars, Scalars]:
     """Half turns of the theta functions' argument: a whole number and the remainder."""
-    whole, rest = turns(swing.pace, t)
+    whole, rest = _phase(swing, t)
     # Farther out the momentum has reached the middle axis and nothing but overflow would follow.
     far = math.log(2) * {4: 55, 8: 450}[rest.dtype.itemsize]
     rest = jnp.where(swing.endless, jnp.clip(swing.pace * t, -far, far), rest)
@@ -83,7 +88,7 @@ class Moment(NamedTuple):
 def half_angle(swing: Swing, turning: Turning, t: Scalars, rest, half, N, turned: Triple, stage):
     """Cosine and sine of half of the angle about L; divided by the tilt (|L| + |L3|, L x n3)."""
     S, l2, l3 = turned
-    whole, angle = turns(turning.pace, t)
+    whole, angle = _phase(turning, t)
     angle = angle + turning.sway * rest
     extra = jnp.round(angle)
     cosine, sine = cosine_sine(angle - extra)

@@ -47,6 +47,7 @@ class Swing(NamedTuple):
     middle: Scalars
     circled: Scalars
     one: Scalars
+    pace_low: Scalars | None = None  # what the pace lacks, when it is compensated
 
 
 class Turning(NamedTuple):
@@ -60,6 +61,7 @@ class Turning(NamedTuple):
     peak: Scalars  # largest L3
     bend: Scalars
     start: tuple[Scalars, Scalars, Scalars, Scalars]  # initial attitude, less its tilt
+    pace_low: Scalars | None = None
 
 
 class FreeMotion(NamedTuple):
