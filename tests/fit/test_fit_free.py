@@ -8,13 +8,9 @@ from scipy.integrate import solve_ivp
 
 from polhode.fit import Finding, FreeMotion, Recording, fit_inertia, stack
 from polhode.fit._start import regression
-from polhode.inertia import inertia_from_log_cholesky, is_physical
+from polhode.inertia import inertia_of_second_moments, is_physical
 
 BODIES, SAMPLES = 200, 80
-UNFINISHED = pytest.mark.xfail(
-    reason="from the single regression start some of the bodies stop at the step limit or in "
-    "another valley; these must pass before the fit is called reliable"
-)
 SIGMA = np.where(np.arange(BODIES) % 2 == 0, 0.01, 0.05)
 
 
@@ -61,24 +57,34 @@ def test_every_fit_is_a_physical_body(fits):
     assert bool(jnp.all(is_physical(fits.inertia.tensor, slack=1e-12)))
 
 
-@UNFINISHED
 def test_every_fit_converges(fits):
     assert not (np.asarray(fits.finding) & int(Finding.STEP_LIMIT)).any()
+    assert np.asarray(fits.noise).max() < 1.25
 
 
 def test_errors_are_as_large_as_the_bound_says(fits, cases):
-    known = np.isfinite(np.asarray(fits.ratios_std)[:, :2])
-    assert known.mean() > 0.97
-    pulls = (np.asarray(fits.ratios) - cases[3])[:, :2] / np.asarray(fits.ratios_std)[:, :2]
-    pulls = pulls[known]
-    # robust against the few bodies whose valley is curved on the scale of the noise
-    spread = np.quantile(np.abs(pulls), 0.6827)
-    assert 0.9 < spread < 1.1
-    assert 0.92 < np.mean(np.abs(pulls) < 1.96) < 0.98
+    """Errors of all six entries at once, in the metric of the information about them."""
+    information = np.asarray(fits.information)
+    inner = np.linalg.solve(information[:, 6:, 6:], information[:, 6:, :6])
+    marginal = information[:, :6, :6] - information[:, :6, 6:] @ inner
+    truth = cases[4] / np.linalg.eigvalsh(cases[4])[:, 2, None, None]
+    error = entries(np.asarray(fits.inertia.tensor)) - entries(truth)
+    square = np.einsum("ni,nij,nj->n", error, marginal, error)
+    # a body that its motion hardly shows has a valley longer than the linear theory of it holds
+    told = np.asarray(fits.finding) & int(Finding.WEAK | Finding.NEARLY_FLAT) == 0
+    assert told.mean() > 0.95
+    # five directions are determined, the sixth is the scale
+    assert 0.9 < np.sqrt(square[told].mean() / 5) < 1.1
     low, high = fits.interval(0.95)
     inside = (np.asarray(low) <= cases[3]) & (cases[3] <= np.asarray(high))
-    assert 0.92 < inside[:, :2][known].mean() < 0.98
+    assert 0.93 < inside[told, :2].mean() < 0.97
     assert abs(np.asarray(fits.noise).mean() - 1) < 0.02
+
+
+def entries(tensors):
+    return np.stack(
+        [tensors[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))], axis=-1
+    )
 
 
 def test_the_scale_is_reported_as_unknown(fits):
@@ -89,19 +95,19 @@ def test_the_scale_is_reported_as_unknown(fits):
     assert np.all(np.isinf(fits.moments_std))
     # the tensor itself is the direction that changes nothing
     tensor, information = np.asarray(fits.inertia.tensor), np.asarray(fits.information)
-    first = np.stack(
-        [tensor[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))], axis=-1
-    )
-    change = np.einsum("nij,nj->ni", information[:, :6, :6], first)
+    change = np.einsum("nij,nj->ni", information[:, :6, :6], entries(tensor))
     assert np.abs(change).max() < 1e-8 * np.abs(information[:, :6, :6]).max()
     assert "Only ratios" in fits.report()
 
 
-@UNFINISHED
 def test_an_inverted_axis_means_the_mirrored_body(cases, fits):
     wrong = fitted(cases[0], cases[2] * np.array([1, 1, -1.0]))
     twins = np.sort(np.asarray(wrong.mirrored.moments), axis=-1)
-    np.testing.assert_allclose(twins, np.asarray(fits.ratios), atol=2e-4)
+    spread = np.asarray(fits.ratios_std)[:, :2]
+    far = np.abs(twins - np.asarray(fits.ratios))[:, :2]
+    known = np.max(spread, axis=1) < 0.02
+    assert known.mean() > 0.9
+    assert np.max(far[known] / spread[known]) < 0.02
     assert np.abs(np.asarray(wrong.ratios) - np.asarray(fits.ratios)).max() > 0.1
 
 
@@ -121,7 +127,7 @@ def test_regression_on_clean_data_finds_the_shape():
     tensor = np.array([[2, 0.1, 0.2], [0.1, 2.5, -0.3], [0.2, -0.3, 3.0]])
     rates = tumble(tensor[None], np.array([[2.0, 4.0, 3.0]]), times)
     start, misfit = jax.jit(regression)(rates, times[None], np.ones((1, 400)))
-    found = np.asarray(inertia_from_log_cholesky(start))
+    found = np.asarray(inertia_of_second_moments(start))
     np.testing.assert_allclose(found / found[0, 0] * 2, tensor, atol=1e-3)
     assert float(misfit) < 1e-8
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
@@ -16,6 +17,9 @@ from polhode.fit._residuals import Huber
 from polhode.fit._result import CURES, Finding, InertiaFit, conclude
 from polhode.fit._solve import Problem, solve
 from polhode.inertia import Inertia
+
+# Samples that a processor core works on together.
+_LANES = 1024
 
 
 class FitError(RuntimeError):
@@ -38,7 +42,7 @@ def fit_inertia(
     bias: bool = False,
     mounting: bool = False,
     robust: Huber | None = None,
-    starts: int = 1,
+    starts: int = 4,
     solver: Any = None,
     max_steps: int = 100,
     throw: bool = True,
@@ -105,7 +109,7 @@ def fit_recordings(
     mounting: bool = False,
     robust: Huber | None = None,
     noise_known: bool = False,
-    starts: int = 1,
+    starts: int = 4,
     solver: Any = None,
     max_steps: int = 100,
     throw: bool = True,
@@ -149,7 +153,27 @@ def windows(recording: Recording, length: int) -> list[Recording]:
 @eqx.filter_jit
 def _batch(recording: Recording, problem: Problem) -> InertiaFit:
     """Fits of all bodies (leading axis) in one compiled call."""
-    return jax.vmap(lambda one: conclude(solve(one, problem), one, problem))(recording)
+
+    def fit(one):
+        return conclude(solve(one, problem), one, problem)
+
+    # A processor core fills its vector units with the samples of a few bodies; more at a time would
+    # only wait for the slowest of them.
+    count = recording.times.shape[0]
+    at_once = max(1, _LANES // max(recording.times.shape[1] * recording.times.shape[2], 1))
+    if jax.default_backend() != "cpu" or count <= at_once:
+        return jax.vmap(fit)(recording)
+    rounds = -(-count // at_once)
+    at_once = -(-count // rounds)
+    missing = rounds * at_once - count
+
+    def cut(leaf):
+        # the last body fills up the last round: one program for all rounds
+        last = jnp.broadcast_to(leaf[-1:], (missing, *leaf.shape[1:]))
+        return jnp.concatenate([leaf, last]).reshape(rounds, at_once, *leaf.shape[1:])
+
+    found = jax.lax.map(jax.vmap(fit), jax.tree.map(cut, recording))
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], found)
 
 
 def _finished(result: InertiaFit, throw: bool) -> InertiaFit:

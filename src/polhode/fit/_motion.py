@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from polhode.free import free_motion
 from polhode.inertia import Inertia, angular_acceleration, principal
-from polhode.rotation import conjugate, multiply, rotate
+from polhode.rotation import conjugate, multiply, rotate, to_matrix
 
 
 class Motion(NamedTuple):
@@ -165,11 +165,30 @@ class FreeMotion(AbstractMotion):
             (xy, zx, yz),
             attitude=wxyz is not None,
         )
-        back = jnp.broadcast_to(axes, (*times.shape, 4))
-        path = rotate(back, jnp.stack(rates, axis=-1))
+        path = _combined(to_matrix(axes), rates)
         if turned is not None:
-            turned = multiply(jnp.stack(turned, axis=-1), conjugate(back))
+            turned = _combined(_right_product(conjugate(axes)), turned)
         return Motion(path, angular_acceleration(Inertia(full=tensor), path), turned)
+
+
+def _combined(matrix: Float[Array, "n n"], components: tuple[Array, ...]) -> Float[Array, "t n"]:
+    """``matrix`` times a vector of components that are arrays over time.
+
+    As a loop over the rows, for what a loop reads is worked out once: written as one expression,
+    the compiler would repeat the whole motion for every component of the result.
+    """
+
+    def row(weights):
+        return sum(weights[k] * part for k, part in enumerate(components))
+
+    return jax.lax.map(row, matrix).T
+
+
+def _right_product(q: Float[Array, " 4"]) -> Float[Array, "4 4"]:
+    """The matrix of ``p -> p q``."""
+    w, x, y, z = q
+    rows = ((w, -x, -y, -z), (x, w, z, -y), (y, -z, w, x), (z, y, -x, w))
+    return jnp.stack([jnp.stack(row) for row in rows])
 
 
 def _quaternion_rate(q, rates):

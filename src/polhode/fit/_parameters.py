@@ -1,14 +1,19 @@
 """The unknowns of a fit as plain numbers that may take any value, and the body that they mean."""
 
 import abc
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode.inertia import inertia_of_second_moments
+from polhode.inertia import inertia_of_second_moments, principal
+from polhode.rotation import to_matrix
+
+# Eigenvalues of the second moments, relative to their sum, around which a flat body is near.
+_SOFT = 5e-3
 
 
 class Parameters(eqx.Module):
@@ -31,7 +36,7 @@ class Parameters(eqx.Module):
 
 
 class AbstractInertiaUnknown(eqx.Module):
-    """Which inertias are possible: entries of the triangular factor that are free."""
+    """Which inertias are possible: entries of the second moments that are free."""
 
     @abc.abstractmethod
     def columns(self) -> np.ndarray:
@@ -52,7 +57,7 @@ class MomentsOnly(AbstractInertiaUnknown):
         return np.eye(6)[:, :3]
 
 
-# stretching the whole factor scales the body and changes nothing else
+# scaling a body changes its ratios not at all: with the size unknown the sum is kept
 _SCALE = np.array([1, 1, 1, 0, 0, 0]) / np.sqrt(3)
 
 
@@ -66,33 +71,63 @@ def free_columns(unknown: AbstractInertiaUnknown, scale_known: bool) -> np.ndarr
     return left[:, size > 0.5]
 
 
-def tensor_of(shape: Float[Array, " k"], base: Float[Array, " 6"], columns: np.ndarray) -> Array:
-    """Inertia tensor (3, 3) at ``shape``: physical for any real numbers, flat bodies included.
+class Base(NamedTuple):
+    """Where ``Parameters.shape`` counts from.
 
-    Second moments ``(B S)(B S)^T``: B is the Cholesky factor of ``base`` (log-Cholesky parameters),
-    S the upper triangle with diagonal ``1 + y1, 1 + y2, 1 + y3`` and y4, y5, y6 above it,
-    ``y = columns shape``. Relative to the start all unknowns are of order one, and a flat body
-    lies at finite ones, where the logarithm of a diagonal would have to run to minus infinity.
+    ``entries`` (6,): of a symmetric matrix S (diagonal, then yz, zx, xy), kg m^2; ``soft``, kg m^2:
+    the size of its eigenvalues below which the second moments bend away from zero.
     """
-    y = jnp.sum(jnp.asarray(columns, base.dtype) * shape[None], axis=1)
-    widths = jnp.exp(base[:3])
-    outer = _triangle(widths, base[3:] * widths[jnp.asarray([1, 2, 2])])
-    inner = _triangle(1 + y[:3], y[3:])
-    factor = [
-        [sum(outer[i][k] * inner[k][j] for k in range(i, j + 1)) for j in range(3)]
-        for i in range(3)
-    ]
-    sigma = [
-        [sum(factor[i][k] * factor[j][k] for k in range(3)) for j in range(3)] for i in range(3)
-    ]
-    return inertia_of_second_moments(jnp.stack([jnp.stack(row) for row in sigma]))
+
+    entries: Float[Array, " 6"]
+    soft: Float[Array, ""]
 
 
-def _triangle(diagonal, above):
-    a, b, c = diagonal
-    p, q, r = above
-    o = jnp.zeros_like(a)
-    return [[a, p, q], [o, b, r], [o, o, c]]
+def base_of(sigma: Float[Array, "3 3"], scale_known: bool) -> Base:
+    """The base whose tensor at ``shape = 0`` has second moments ``sigma``, or their shape."""
+    total = sigma[0, 0] + sigma[1, 1] + sigma[2, 2]
+    if not scale_known:
+        sigma, total = sigma / total, jnp.ones_like(total)
+    soft = _SOFT * total
+    matrix = sigma - soft**2 / 4 * jnp.linalg.inv(sigma)
+    diagonal = jnp.stack([matrix[0, 0], matrix[1, 1], matrix[2, 2]])
+    off = jnp.stack([matrix[1, 2], matrix[2, 0], matrix[0, 1]])
+    return Base(jnp.concatenate([diagonal, off]), soft)
+
+
+def tensor_of(shape: Float[Array, " k"], base: Base, columns: np.ndarray) -> Array:
+    """Inertia tensor (3, 3) at ``shape``: physical for any real numbers.
+
+    Second moments ``(S + sqrt(S^2 + soft^2)) / 2`` of a symmetric matrix S that is linear in
+    ``shape``. Away from flat bodies that is S itself: what data leave undetermined is a straight
+    valley in the entries of the tensor, and a curved one in those of a Cholesky factor, where an
+    optimiser crawls. Towards minus infinity an eigenvalue leads to a flat body.
+    """
+    scale = base.soft / _SOFT
+    y = base.entries + scale * jnp.sum(jnp.asarray(columns, shape.dtype) * shape[None], axis=1)
+    a, b, c, p, q, r = y
+    matrix = jnp.stack([jnp.stack([a, r, q]), jnp.stack([r, b, p]), jnp.stack([q, p, c])])
+    values, axes, (yz, zx, xy) = principal(matrix)
+    root = jnp.sqrt(values**2 + base.soft**2)
+    # without cancellation for negative eigenvalues
+    bent = jnp.where(values > 0, (values + root) / 2, base.soft**2 / (2 * (root - values)))
+
+    def slope(i, j):
+        # divided difference of the function above; the products that it multiplies are zero, and
+        # carry the tangent of turning axes
+        return (1 + (values[i] + values[j]) / (root[i] + root[j])) / 2
+
+    yz, zx, xy = slope(1, 2) * yz, slope(2, 0) * zx, slope(0, 1) * xy
+    inner = jnp.stack(
+        [
+            jnp.stack([bent[0], xy, zx]),
+            jnp.stack([xy, bent[1], yz]),
+            jnp.stack([zx, yz, bent[2]]),
+        ]
+    )
+    turn = to_matrix(axes)
+    exact = jax.lax.Precision.HIGHEST
+    sigma = jnp.einsum("ij,jk,lk->il", turn, inner, turn, precision=exact)
+    return inertia_of_second_moments(sigma)
 
 
 def rotation_of(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode.fit._motion import AbstractMotion, Motion
-from polhode.fit._parameters import Parameters, rotation_of, tensor_of
+from polhode.fit._parameters import Base, Parameters, rotation_of, tensor_of
 from polhode.fit._recording import Recording
 from polhode.rotation import conjugate, multiply, rotate
 
@@ -28,16 +28,20 @@ class Huber(eqx.Module):
 class Model(eqx.Module):
     """What is known of a fit: the motion, the free directions of the inertia, the start attitude.
 
-    ``base`` (6,) log-Cholesky parameters from which ``Parameters.shape`` counts, ``columns``
+    ``base``: from where ``Parameters.shape`` counts, ``columns``
     (static) its directions, ``attitude`` (r, 4) or None, ``robust`` loss or None.
     """
 
     motion: AbstractMotion
-    base: Float[Array, " 6"]
+    base: Base
     attitude: Float[Array, "r 4"] | None = None
     robust: Huber | None = None
     columns: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=())
     scale_known: bool = eqx.field(static=True, default=False)
+
+    def starting_at(self, attitude: Float[Array, "r 4"] | None) -> "Model":
+        """The same model with other start attitudes."""
+        return Model(self.motion, self.base, attitude, self.robust, self.columns, self.scale_known)
 
     @property
     def is_full(self) -> bool:

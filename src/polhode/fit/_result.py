@@ -9,6 +9,7 @@ import numpy as np
 from jax.scipy.stats import chi2, norm
 from jaxtyping import Array, Float
 
+from polhode.fit._linear import entries_of, whole_of
 from polhode.fit._parameters import Parameters
 from polhode.fit._recording import Recording
 from polhode.fit._residuals import Model
@@ -27,6 +28,8 @@ class Finding(enum.IntFlag):
     UNDETERMINED = 8
     AXES_DISAGREE = 16
     NOT_WHITE = 32
+    WEAK = 64
+    POOR = 128
 
 
 CURES = {
@@ -43,6 +46,11 @@ CURES = {
     "axis is inverted, or axes are exchanged; mend the columns (sensor_axes shows how)",
     Finding.NOT_WHITE: "the residuals are correlated in time: the model lacks something (drag, "
     "bias, a moving part) and the intervals are too narrow",
+    Finding.WEAK: "a ratio is known to no better than 5 % (a nearly symmetric body, a spin near a "
+    "principal axis, a short record): the interval is a rough one, since the valley of good fits "
+    "is longer than the linear theory of it holds",
+    Finding.POOR: "the residuals are more than twice as large as the noise: a wrong model, wrong "
+    "axes or units, outliers (robust=Huber()), or a valley that is not the best",
 }
 
 
@@ -76,6 +84,7 @@ class InertiaFit(eqx.Module):
     rms: Float[Array, "*b"]
     finding: Array
     steps: Array
+    attempts: Array
     parameters: Parameters
     model: Model
     residuals: dict[str, Array]
@@ -139,19 +148,17 @@ class InertiaFit(eqx.Module):
 
 def conclude(solution: Solution, recording: Recording, problem: Problem) -> InertiaFit:
     """Uncertainty and diagnostics of one body (under jit and vmap)."""
-    tensor, model = solution.tensor, solution.model
+    tensor, model, linear = solution.tensor, solution.model, solution.linear
     dtype = tensor.dtype
     eps = float(jnp.finfo(dtype).eps)
-    jacobian = solution.jacobian
-    information = jacobian.T @ jacobian
+    information = linear.information()
     # equilibrated: a direction counts as null by its own information, whatever its unit
     size = jnp.sqrt(jnp.diagonal(information))
     safe = jnp.where(size > 0, size, 1)
     values, vectors = jnp.linalg.eigh(information / safe[:, None] / safe[None])
     known = values > 1e3 * eps * values[-1]
     inverse = jnp.where(known, 1 / jnp.where(known, values, 1), 0)
-    channels = 3 * sum(part is not None for part in solution.residual.values())
-    data = jnp.sum(recording.present) * channels
+    data = jnp.sum(recording.present) * linear.rest.shape[-1]
     freedom = jnp.maximum(data - jnp.sum(known).astype(dtype), 1)
     noise = jnp.sqrt(2 * solution.cost / freedom)
     variance = jnp.asarray(1, dtype) if problem.noise_known else noise**2
@@ -159,23 +166,15 @@ def conclude(solution: Solution, recording: Recording, problem: Problem) -> Iner
     null = jnp.where(known, 0, 1)[None] * vectors / safe[:, None]
 
     moments, axes, _ = principal(tensor)
-    count = 6 if model.is_full else 3
-    entries = jnp.concatenate(
-        [
-            jnp.stack([tensor[0, 0], tensor[1, 1], tensor[2, 2]]),
-            jnp.stack([tensor[1, 2], tensor[2, 0], tensor[0, 1]]),
-        ]
-    )[:count]
+    entries = entries_of(tensor, model.is_full)
+    count = entries.shape[0]
 
     def derived(vector):
-        (a, b, c), above = vector[:3], vector[3:] if count == 6 else jnp.zeros(3, dtype)
-        p, q, r = above
-        whole = jnp.stack([jnp.stack([a, r, q]), jnp.stack([r, b, p]), jnp.stack([q, p, c])])
-        values, _, products = principal(whole)
+        values, _, products = principal(whole_of(vector, count))
         return jnp.concatenate([values, values / values[2], products])
 
     slope = jax.jacfwd(derived)(entries)
-    full = jnp.concatenate([slope, jnp.zeros((9, jacobian.shape[1] - count), dtype)], axis=1)
+    full = jnp.concatenate([slope, jnp.zeros((9, information.shape[0] - count), dtype)], axis=1)
     spread = jnp.sqrt(jnp.maximum(jnp.sum((full @ covariance) * full, axis=1), 0))
     # what leans on a null direction is not known at all
     leaning = jnp.sqrt(jnp.sum((full @ null) ** 2, axis=1))
@@ -185,8 +184,14 @@ def conclude(solution: Solution, recording: Recording, problem: Problem) -> Iner
     gaps = jnp.stack([moments[2] - moments[1], moments[2] - moments[0], moments[1] - moments[0]])
     axes_std = jnp.where(gaps > 0, spread[6:] / jnp.where(gaps > 0, gaps, 1), jnp.inf)
 
-    whiteness = _whiteness(solution.residual, recording.present)
-    rates = solution.residual.get("omega")
+    parts, channel = {}, 0
+    kinds = {"omega": recording.omega, "attitude": recording.wxyz, "force": recording.force}
+    for name, measured in kinds.items():
+        if measured is not None:
+            parts[name] = linear.rest[..., channel : channel + 3]
+            channel += 3
+    whiteness = _whiteness(parts, recording.present)
+    rates = parts.get("omega")
     if rates is None:
         rms = jnp.asarray(jnp.nan, dtype)
     else:
@@ -200,14 +205,17 @@ def conclude(solution: Solution, recording: Recording, problem: Problem) -> Iner
         (Finding.NEARLY_FLAT, physical_margin(tensor) < 1e-4 * trace),
         (Finding.UNDETERMINED, jnp.any(~jnp.isfinite(spread[3:6]))),
         (Finding.NOT_WHITE, whiteness < 1e-4),
+        (Finding.WEAK, jnp.any(spread[3:6] > 0.05)),
+        (Finding.POOR, 2 * solution.cost > 4 * solution.expected),
         (Finding.AXES_DISAGREE, _axes_disagree(recording, problem)),
     )
     finding = sum(jnp.where(seen, int(flag), 0) for flag, seen in flags)
     return InertiaFit(
         Inertia(full=tensor), moments, axes, moments / moments[2],
         spread[:3], spread[3:6], axes_std, information, covariance, jnp.sum(~known),
-        noise, whiteness, rms, finding, solution.steps, solution.parameters, model,
-        solution.residual, model.scale_known, recording.wxyz is None,
+        noise, whiteness, rms, finding, solution.steps,
+        solution.attempts, solution.parameters, model,
+        parts, model.scale_known, recording.wxyz is None,
     )  # fmt: skip
 
 

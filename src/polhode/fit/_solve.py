@@ -5,17 +5,33 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from polhode.fit._linear import Linear, linearise, unknowns
 from polhode.fit._motion import AbstractMotion
-from polhode.fit._parameters import AbstractInertiaUnknown, Parameters, free_columns
+from polhode.fit._optimiser import LevenbergMarquardt
+from polhode.fit._parameters import (
+    AbstractInertiaUnknown,
+    Base,
+    Parameters,
+    base_of,
+    free_columns,
+)
 from polhode.fit._recording import Recording
-from polhode.fit._residuals import Huber, Model, residuals
-from polhode.fit._start import alternatives, regression
-from polhode.inertia import Inertia, principal
+from polhode.fit._residuals import Huber, Model
+from polhode.fit._start import alternatives, regression, scatter
+from polhode.inertia import Inertia, principal, second_moments
 from polhode.rotation import conjugate, multiply
+
+# Parts of the recording that are fitted one after the other where the whole misleads at first.
+_PARTS = (0.125, 0.25, 0.5, 1.0)
+# Residuals up to this multiple of the noise, or of what neighbouring samples show of it, end the
+# search for a better valley.
+_GOOD = 1.5
+# Distance from the optimum, in standard deviations, at which the optimiser stops.
+_OFFSET = 1e-4
 
 
 class Problem(eqx.Module):
@@ -28,7 +44,7 @@ class Problem(eqx.Module):
     bias: bool = eqx.field(static=True, default=False)
     mounting: bool = eqx.field(static=True, default=False)
     noise_known: bool = eqx.field(static=True, default=False)
-    starts: int = eqx.field(static=True, default=1)
+    starts: int = eqx.field(static=True, default=4)
     solver: Any = None
     max_steps: int = eqx.field(static=True, default=60)
 
@@ -36,26 +52,42 @@ class Problem(eqx.Module):
 class Solution(eqx.Module):
     """The optimum and everything that is linear about it.
 
-    ``jacobian`` (m, p): of all residuals with respect to the entries of the tensor (xx, yy, zz,
-    and for a full one yz, zx, xy) and then the ravelled other parameters. ``cost``: half the sum
-    of squares.
+    ``linear``: residuals and Jacobian by the entries of the tensor (xx, yy, zz, and for a full one
+    yz, zx, xy) and the other unknowns. ``cost``: half the sum of squares. ``steps``: of all
+    attempts together. ``attempts``: how many starts were tried. ``expected``: the sum of squares
+    that noise alone would leave.
     """
 
     parameters: Parameters
     model: Model
     tensor: Float[Array, "3 3"]
-    residual: dict[str, Array]
-    jacobian: Float[Array, "m p"]
+    linear: Linear
     cost: Float[Array, ""]
     steps: Array
+    attempts: Array
     stopped: Array
-    start_misfit: Float[Array, ""]
+    expected: Float[Array, ""]
+
+
+class _Search(eqx.Module):
+    """Where the search stands: the job at hand, where it left off, and the best so far."""
+
+    job: Array
+    scaled: Parameters
+    best: Parameters
+    base: Base
+    linear: Linear
+    cost: Array
+    steps: Array
+    attempts: Array
+    stopped: Array
+    good: Array
 
 
 def solve(recording: Recording, problem: Problem) -> Solution:
     """Fit one body to its recordings (leading axis r). Pure; works under jit and vmap."""
     rates = _rates(recording)
-    bases, misfit = _bases(recording, rates, problem)
+    bases = _bases(recording, rates, problem)
     scale_known = problem.motion.fixes_scale()
     columns = free_columns(problem.unknown, scale_known)
     fixed = tuple(map(tuple, columns.tolist()))
@@ -76,59 +108,122 @@ def solve(recording: Recording, problem: Problem) -> Solution:
         motion=jax.tree.map(lambda x: jnp.asarray(x, dtype), problem.motion.start()),
     )
     scale = _scale(begin, recording, rates)
-    tolerance = float(jnp.finfo(dtype).eps) ** 0.55
-    solver = problem.solver or optx.LevenbergMarquardt(rtol=tolerance, atol=tolerance)
+    fresh = jax.tree.map(jnp.divide, begin, scale)
+    weight = _weight(recording, rates)
+    solver = problem.solver or LevenbergMarquardt(_OFFSET, float(jnp.finfo(dtype).eps) ** 0.75)
+    expected = _expected(recording, problem)
 
-    def run(base):
-        def misfits(scaled, _):
-            actual = jax.tree.map(jnp.multiply, scaled, scale)
-            return residuals(actual, recording, model_of(base))
-
-        found = optx.least_squares(
-            misfits,
-            solver,
-            jax.tree.map(jnp.divide, begin, scale),
-            max_steps=problem.max_steps,
-            throw=False,
-        )
-        parameters = jax.tree.map(jnp.multiply, found.value, scale)
+    def misfits(scaled, job):
+        base, within = job
         model = model_of(base)
-        tensor, jacobian, rest = _linearised(parameters, recording, model)
-        cost = sum(jnp.sum(part**2) for part in rest.values()) / 2
-        ended = found.result == optx.RESULTS.successful
-        count = found.stats["num_steps"]
-        return Solution(parameters, model, tensor, rest, jacobian, cost, count, ended, misfit)
+        shared, own, one = unknowns(jax.tree.map(jnp.multiply, scaled, scale), model)
+        # The Jacobian is made here, once and by blocks: what the optimiser differentiates is linear
+        at = jax.lax.stop_gradient((shared, own))
+        linear = linearise(*at, one, within, model)
+        return weight * linear.shifted(shared - at[0], own - at[1]), linear
 
-    found = jax.vmap(run)(bases)
-    best = jnp.argmin(jnp.where(jnp.isfinite(found.cost), found.cost, jnp.inf))
-    return jax.tree.map(lambda leaf: leaf[best], found)
+    jobs = _jobs(bases.soft.shape[0], problem.starts)
+    which, part = (jnp.asarray(column) for column in (jobs["base"], jobs["part"]))
+    part = part.astype(dtype)
+    span = recording.times[:, -1:] - recording.times[:, :1]
+    elapsed = recording.times - recording.times[:, :1]
+
+    def attempt(search):
+        job = search.job
+        early = (elapsed <= part[job] * span).astype(dtype)
+        within = recording.present * early
+        within = eqx.tree_at(lambda r: r.present, recording, within)
+        base = jax.tree.map(lambda leaf: leaf[which[job]], bases)
+        anew = jnp.asarray(jobs["anew"])[job]
+        start = jax.tree.map(lambda a, b: jnp.where(anew, a, b), fresh, search.scaled)
+        found = optx.least_squares(
+            misfits, solver, start, (base, within),
+            has_aux=True, max_steps=problem.max_steps, throw=False,
+        )  # fmt: skip
+        # the auxiliary output of the last accepted step; ``found.aux`` is that of the one before
+        linear = found.state.aux
+        cost = jnp.sum(linear.rest**2) / 2
+        whole = part[job] == 1
+        better = whole & (cost < search.cost)
+        new = (found.value, base, linear, cost, found.result == optx.RESULTS.successful)
+        old = (search.best, search.base, search.linear, search.cost, search.stopped)
+        best, base, linear, cost, stopped = jax.tree.map(
+            lambda a, b: jnp.where(better, a, b), new, old
+        )
+        return _Search(
+            job + 1, found.value, best, base, linear, cost,
+            search.steps + found.stats["num_steps"], search.attempts + jnp.where(whole, 1, 0),
+            stopped, stopped & (2 * cost <= _GOOD**2 * expected),
+        )  # fmt: skip
+
+    one = jax.tree.map(lambda leaf: leaf[0], bases)
+    _, struct = jax.eval_shape(misfits, fresh, (one, recording))
+    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), struct)
+    begun = _Search(
+        jnp.asarray(0), fresh, fresh, one, nothing, jnp.asarray(jnp.inf, dtype),
+        jnp.asarray(0), jnp.asarray(0), jnp.asarray(False), jnp.asarray(False),
+    )  # fmt: skip
+    count = len(jobs["base"])
+    ended = jax.lax.while_loop(lambda s: (s.job < count) & ~s.good, attempt, begun)
+    parameters = jax.tree.map(jnp.multiply, ended.best, scale)
+    model = model_of(ended.base)
+    tensor, linear = model.tensor(parameters), ended.linear
+    if not scale_known:
+        # size that the data do not show: a largest moment of one
+        largest = principal(tensor)[0][2]
+        entries = 6 if model.is_full else 3
+        factor = jnp.where(
+            jnp.arange(linear.shared.shape[-1]) < entries, largest, jnp.ones_like(largest)
+        )
+        tensor = tensor / largest
+        linear = linear._replace(shared=linear.shared * factor[None, None, None])
+    return Solution(
+        parameters, model, tensor, linear, ended.cost, ended.steps, ended.attempts, ended.stopped,
+        expected,
+    )
 
 
-def _linearised(parameters, recording, model):
-    """The tensor, the Jacobian by its own entries (regular for flat bodies too), the residuals.
+def _jobs(bases: int, attempts: int) -> dict[str, np.ndarray]:
+    """What is fitted in turn: the first start to all data, then each start to growing parts."""
+    rows = [(0, 1.0, True)]
+    for base in range(bases):
+        rows += [(base, part, part == _PARTS[0]) for part in _PARTS]
+    rows = rows[: 1 + (attempts - 1) * len(_PARTS)]
+    base, part, anew = zip(*rows, strict=True)
+    return {"base": np.array(base), "part": np.array(part), "anew": np.array(anew)}
 
-    A tensor whose size the data do not show is brought to a largest moment of one.
+
+def _expected(recording: Recording, problem: Problem) -> Float[Array, ""]:
+    """The sum of squares that noise alone would leave.
+
+    An unknown noise is taken from neighbouring samples; without rates nothing is known of it.
     """
-    tensor = model.tensor(parameters)
-    if not model.scale_known:
-        tensor = tensor / principal(tensor)[0][2]
-    full = model.is_full
-    diagonal = jnp.stack([tensor[0, 0], tensor[1, 1], tensor[2, 2]])
-    off = jnp.stack([tensor[1, 2], tensor[2, 0], tensor[0, 1]])
-    rest, back = ravel_pytree(eqx.tree_at(lambda p: p.shape, parameters, jnp.zeros(0, off.dtype)))
-    entries = jnp.concatenate([diagonal, off]) if full else diagonal
-    count = entries.shape[0]
+    kinds = sum(part is not None for part in (recording.omega, recording.wxyz, recording.force))
+    expected = jnp.sum(recording.present) * 3 * kinds
+    if problem.noise_known:
+        return expected
+    if recording.omega is None:
+        return jnp.full_like(expected, jnp.inf)
+    seen = jax.vmap(scatter)(recording.times, recording.omega, recording.present)
+    return expected * jnp.mean(seen / jnp.mean(recording.omega_noise, axis=(1, 2)) ** 2)
 
-    def flat_residual(vector):
-        (a, b, c), above = vector[:3], vector[3:count] if full else off
-        p, q, r = above
-        whole = jnp.stack([jnp.stack([a, r, q]), jnp.stack([r, b, p]), jnp.stack([q, p, c])])
-        parts = residuals(back(vector[count:]), recording, model, whole)
-        return ravel_pytree(parts)[0], parts
 
-    where = jnp.concatenate([entries, rest])
-    jacobian, parts = jax.jacfwd(flat_residual, has_aux=True)(where)
-    return tensor, jacobian, parts
+def _weight(recording: Recording, rates: Array) -> Float[Array, ""]:
+    """Brings the Jacobian to the order of ten, where the optimiser's first damping of one is mild.
+
+    The damping is absolute, so that residuals in units of a small noise would switch it off.
+    """
+    total = jnp.zeros((), rates.dtype)
+    if recording.omega is not None:
+        total += jnp.sum(recording.present[..., None] * (rates / recording.omega_noise) ** 2)
+    if recording.wxyz is not None:
+        total += jnp.sum(recording.present / recording.attitude_noise**2)
+    if recording.force is not None:
+        total += jnp.sum(
+            recording.present[..., None] * (recording.force / recording.force_noise) ** 2
+        )
+    mean = total / rates.shape[0]
+    return 10 / jnp.sqrt(jnp.where(mean > 0, mean, 1))
 
 
 def _rates(recording: Recording) -> Float[Array, "r t 3"]:
@@ -154,20 +249,21 @@ def _rates(recording: Recording) -> Float[Array, "r t 3"]:
     return jax.vmap(one)(recording.times, recording.present, recording.omega)
 
 
-def _bases(recording, rates, problem):
-    """Starting log-Cholesky vectors (s, 6) and the regression's misfit."""
+def _bases(recording, rates, problem) -> Base:
+    """Starting bodies (leading axis), the best first."""
     carried = None
     spin = getattr(problem.motion, "spin_inertia", None)
     if spin is not None:
         axis = jnp.asarray(problem.motion.axis, rates.dtype)
         carried = spin * recording.wheel[..., None] * axis[None, None]
-    first, misfit = regression(rates, recording.times, recording.present, carried)
+    first, _ = regression(rates, recording.times, recording.present, carried)
     if problem.known is not None:
-        first = problem.known.to_log_cholesky()
-    bases = jnp.stack([first, *alternatives(rates, first)[: problem.starts - 1]])
+        first = second_moments(problem.known.tensor)
+    bodies = jnp.stack([first, *alternatives(rates, first)])
     if problem.unknown.columns().shape[1] == 3:
-        bases = bases * jnp.asarray([1, 1, 1, 0, 0, 0], bases.dtype)[None]
-    return bases, misfit
+        bodies = bodies * jnp.eye(3, dtype=bodies.dtype)
+    known = problem.motion.fixes_scale()
+    return jax.vmap(lambda sigma: base_of(sigma, known))(bodies)
 
 
 def _scale(begin: Parameters, recording: Recording, rates: Array) -> Parameters:

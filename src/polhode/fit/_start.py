@@ -5,25 +5,52 @@ With the attitude R(t) relative to the first sample, found by integrating the ra
 needs no differentiation of noisy rates.
 """
 
+import math
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode.fit._parameters import rotation_of
-from polhode.inertia import inertia_of_second_moments, inertia_to_log_cholesky, second_moments
+from polhode.inertia import (
+    Inertia,
+    angular_acceleration,
+    inertia_of_second_moments,
+    second_moments,
+)
 from polhode.rotation import multiply, to_matrix
 
 # second moments below this part of their sum are lifted to it before the logarithm is taken
 _FLATTEST = 3e-3
+# rounds of interpolation with the tensor of the round before
+_ROUNDS = 3
 
 
-def integrate(omega: Float[Array, "t 3"], times: Float[Array, " t"]) -> Float[Array, "t 4"]:
-    """Attitude quaternions relative to the first sample, by Magnus steps."""
+def integrate(
+    omega: Float[Array, "t 3"], slope: Float[Array, "t 3"], times: Float[Array, " t"]
+) -> Float[Array, "t 4"]:
+    """Attitude quaternions relative to the first sample, from rates and their derivatives.
+
+    Cubic Hermite interpolation, two Magnus steps of order 4 (two Gauss points) per interval.
+    """
     step = jnp.diff(times)[:, None]
-    first, second = omega[:-1], omega[1:]
-    # rates linear between samples: their mean, and the commutator of both ends
-    vector = step / 2 * (first + second) + step**2 / 12 * jnp.cross(first, second)
-    turns = rotation_of(vector)
+    offset = jnp.asarray(3, omega.dtype) ** 0.5 / 12
+
+    def rate_at(s):
+        # Hermite's basis on [0, 1]
+        late = s * s * (3 - 2 * s)
+        start, end = s * (1 - s) ** 2, -s * s * (1 - s)
+        return (
+            (1 - late) * omega[:-1]
+            + late * omega[1:]
+            + step * (start * slope[:-1] + end * slope[1:])
+        )
+
+    def half(middle):
+        first, second = rate_at(middle - offset), rate_at(middle + offset)
+        return step / 4 * (first + second) + step**2 / 4 * offset * jnp.cross(first, second)
+
+    turns = multiply(rotation_of(half(0.25)), rotation_of(half(0.75)))
     path = jax.lax.associative_scan(multiply, turns)
     unit = jnp.asarray([[1, 0, 0, 0]], omega.dtype)
     return jnp.concatenate([unit, path])
@@ -38,13 +65,13 @@ def _design(omega: Float[Array, "t 3"]) -> Float[Array, "t 3 6"]:
 
 
 def _physical(entries: Float[Array, " 6"]) -> Float[Array, "3 3"]:
-    """The nearest tensor of a body that is not too flat."""
+    """Second moments of the nearest body that is not too flat."""
     a, b, c, p, q, r = entries
     tensor = jnp.stack([jnp.stack([a, r, q]), jnp.stack([r, b, p]), jnp.stack([q, p, c])])
     values, axes = jnp.linalg.eigh(second_moments(tensor))
     least = _FLATTEST * jnp.sum(jnp.abs(values))
     values = jnp.maximum(values, least)
-    return inertia_of_second_moments(jnp.einsum("ij,j,kj->ik", axes, values, axes))
+    return jnp.einsum("ij,j,kj->ik", axes, values, axes)
 
 
 def regression(
@@ -52,46 +79,89 @@ def regression(
     times: Float[Array, "r t"],
     present: Float[Array, "r t"],
     momentum: Float[Array, "r t 3"] | None = None,
-) -> tuple[Float[Array, " 6"], Float[Array, ""]]:
-    """Log-Cholesky start (6,) and the mean square misfit of the regression, relative.
+) -> tuple[Float[Array, "3 3"], Float[Array, ""]]:
+    """Second moments (3, 3) to start from, and the mean square misfit of the regression, relative.
 
     ``momentum``: body components of a wheel's momentum; without it the tensor is scaled to unit
-    Frobenius norm, since only its shape shows.
+    Frobenius norm, since only its shape shows. Without it, too, the rates between the samples are
+    interpolated with the derivatives that Euler's equations give for the tensor found before:
+    records of few samples per turn need that.
     """
-    attitude = jax.vmap(integrate)(omega, times)
-    turn = to_matrix(attitude) * present[..., None, None]
-    body = jnp.einsum("rtij,rtjk->rtik", turn, _design(omega))
-    total = jnp.sum(present, axis=1)[:, None, None]
-    # eliminate each recording's constant momentum: subtract the mean
-    mean = jnp.sum(body, axis=1) / total
-    centred = (body - mean[:, None]) * present[..., None, None]
-    gram = jnp.einsum("rtij,rtik->jk", centred, centred)
+
+    def centred(values, total):
+        # eliminate each recording's constant momentum: subtract the mean
+        mean = jnp.sum(values, axis=1, keepdims=True) / total
+        return (values - mean) * present.reshape(*present.shape, *[1] * (values.ndim - 2))
+
+    count = jnp.sum(present, axis=1)
+
+    def gram_of(slope):
+        attitude = jax.vmap(integrate)(omega, slope, times)
+        turn = to_matrix(attitude) * present[..., None, None]
+        body = jnp.einsum("rtij,rtjk->rtik", turn, _design(omega))
+        body = centred(body, count[:, None, None, None])
+        return jnp.einsum("rtij,rtik->jk", body, body), body, turn
+
+    first = jax.vmap(_slope)(omega, times)
     if momentum is None:
-        metric = jnp.asarray([1, 1, 1, 2, 2, 2], omega.dtype) ** 0.5
-        values, vectors = jnp.linalg.eigh(gram / metric[:, None] / metric[None])
-        entries = vectors[:, 0] / metric
-        entries = entries * jnp.where(jnp.sum(entries[:3]) < 0, -1, 1).astype(entries.dtype)
-        misfit = values[0] / jnp.sum(values)
-    else:
-        carried = jnp.einsum("rtij,rtj->rti", turn, momentum)
-        carried = carried - (jnp.sum(carried, axis=1) / total[:, :, 0])[:, None]
-        carried = carried * present[..., None]
-        right = -jnp.einsum("rtij,rti->j", centred, carried)
-        entries = jnp.linalg.solve(gram, right)
-        rest = jnp.einsum("rtij,j->rti", centred, entries) + carried
-        misfit = jnp.sum(rest**2) / jnp.sum(carried**2)
-    return inertia_to_log_cholesky(_physical(entries)), misfit
+
+        def again(_, carry):
+            gram, _, _ = gram_of(carry[0])
+            metric = jnp.asarray([1, 1, 1, 2, 2, 2], omega.dtype) ** 0.5
+            values, vectors = jnp.linalg.eigh(gram / metric[:, None] / metric[None])
+            entries = vectors[:, 0] / metric
+            entries = entries * jnp.where(jnp.sum(entries[:3]) < 0, -1, 1).astype(entries.dtype)
+            sigma = _physical(entries)
+            body = Inertia(full=inertia_of_second_moments(sigma))
+            return angular_acceleration(body, omega), sigma, values[0] / jnp.sum(values)
+
+        start = (first, jnp.eye(3, dtype=omega.dtype), jnp.zeros((), omega.dtype))
+        _, sigma, misfit = jax.lax.fori_loop(0, _ROUNDS, again, start)
+        return sigma, misfit
+    gram, body, turn = gram_of(first)
+    carried = centred(jnp.einsum("rtij,rtj->rti", turn, momentum), count[:, None, None])
+    entries = jnp.linalg.solve(gram, -jnp.einsum("rtij,rti->j", body, carried))
+    rest = jnp.einsum("rtij,j->rti", body, entries) + carried
+    misfit = jnp.sum(rest**2) / jnp.sum(carried**2)
+    return _physical(entries), misfit
 
 
-def alternatives(omega: Float[Array, "r t 3"], first: Float[Array, " 6"]) -> list[Array]:
-    """Other starts (6,): long, flat and middling bodies along the directions that rates prefer."""
+def _slope(omega, times):
+    """Central differences."""
+    step = jnp.diff(times)[:, None]
+    between = jnp.diff(omega, axis=0) / step
+    inner = (between[1:] * step[:-1] + between[:-1] * step[1:]) / (step[1:] + step[:-1])
+    return jnp.concatenate([between[:1], inner, between[-1:]])
+
+
+def alternatives(omega: Float[Array, "r t 3"], first: Float[Array, "3 3"]) -> list[Array]:
+    """Other second moments: long, flat and middling bodies along the directions of the rates."""
     spread = jnp.einsum("rti,rtj->ij", omega, omega)
     _, axes = jnp.linalg.eigh(spread)
-    size = jnp.mean(first[:3])
-    found = []
-    for widths in ((1.0, 0.4, 0.2), (0.2, 0.4, 1.0), (0.4, 1.0, 0.2)):
-        sigma = jnp.einsum("ij,j,kj->ik", axes, jnp.asarray(widths, omega.dtype), axes)
-        start = inertia_to_log_cholesky(inertia_of_second_moments(sigma))
-        shift = jnp.asarray([1, 1, 1, 0, 0, 0], omega.dtype) * (size - jnp.mean(start[:3]))
-        found.append(start + shift)
-    return found
+    size = first[0, 0] + first[1, 1] + first[2, 2]
+    return [
+        size * jnp.einsum("ij,j,kj->ik", axes, jnp.asarray(widths, omega.dtype), axes)
+        for widths in ((0.6, 0.25, 0.15), (0.15, 0.25, 0.6), (0.25, 0.6, 0.15))
+    ]
+
+
+def scatter(
+    times: Float[Array, " t"], omega: Float[Array, "t 3"], present: Float[Array, " t"]
+) -> Float[Array, ""]:
+    """Variance of the noise as neighbours show it: each sample against the cubic through four.
+
+    An upper bound in the mean: where the sampling is coarse the motion itself adds to it.
+    """
+    offset = jnp.stack([times[k : times.shape[0] - 4 + k] for k in range(5)]) - times[None, 2:-2]
+    value = jnp.stack([omega[k : times.shape[0] - 4 + k] for k in range(5)])
+    known = jnp.stack([present[k : times.shape[0] - 4 + k] for k in range(5)])
+    others = (0, 1, 3, 4)
+    weights = [
+        math.prod(offset[j] / (offset[j] - offset[k]) for j in others if j != k) for k in others
+    ]
+    guess = sum(w[:, None] * value[k] for w, k in zip(weights, others, strict=True))
+    share = 1 + sum(w * w for w in weights)
+    there = jnp.prod(known, axis=0)
+    total = jnp.sum(there)
+    square = jnp.sum(there * jnp.sum((value[2] - guess) ** 2, axis=1) / share) / 3
+    return jnp.where(total > 0, square / jnp.where(total > 0, total, 1), 0)

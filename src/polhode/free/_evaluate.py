@@ -263,7 +263,7 @@ def _evaluate_rule(asked, primals, tangents):
     stage = (lambda x: x) if asked[2] else (lambda x: settle(x, swing.one))
     change = stage(change_of_start(swing, frame, dm, dp, dw))
     at = _for_tangent(swing, at, scaled)
-    first, second = second_kind(swing, at.whole, at.folded)
+    first, second = second_kind(swing, at.whole, at.folded, asked[2])
     first, second = stage((first, second))
     by = stage(partials(swing.B * swing.r, swing.A * swing.p, at.functions, first, second))
     moved = stage(momentum_tangent(swing, at.functions, at.momentum, by, change, stage))

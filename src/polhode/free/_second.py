@@ -2,6 +2,7 @@
 
 import math
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -24,21 +25,30 @@ def _tail(x: Scalars, y: Scalars, z: Scalars) -> Scalars:
     return (series - 9 / 52 * e2 * e3 + 3 / 26 * e5) / (mean * jnp.sqrt(mean))
 
 
-def _incomplete(S: Scalars, C: Scalars, N: Scalars) -> tuple[Scalars, Scalars]:
+def _incomplete(S: Scalars, C: Scalars, N: Scalars, many: bool) -> tuple[Scalars, Scalars]:
     """Integrals of S^2 and (S/N)^2 over less than half a turn, by Carlson's duplication.
 
     They are S^3/3 R_D(C^2, N^2, 1) and S^3/3 R_D(C^2, 1, N^2), which share their square roots.
     """
-    x, y, z = C * C, N * N, jnp.ones_like(N)
-    first = second = jnp.zeros_like(N)
-    share = 1.0
-    for _ in range(_DUPLICATIONS):
+
+    def duplicate(_, carry):
+        first, second, x, y, z, share = carry
         u, v, w = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
         grow = u * v + v * w + w * u
         first = first + share / (w * (z + grow))
         second = second + share / (v * (y + grow))
-        x, y, z = (x + grow) / 4, (y + grow) / 4, (z + grow) / 4
-        share /= 4
+        return first, second, (x + grow) / 4, (y + grow) / 4, (z + grow) / 4, share / 4
+
+    zero, one = jnp.zeros_like(N), jnp.ones_like(N)
+    carry = (zero, zero, C * C, N * N, one, jnp.ones((), N.dtype))
+    if many:
+        # With many times per body several kernels need the result, and each would repeat all of
+        # it: as a loop it is worked out once, and compiles in half of the time.
+        carry = jax.lax.fori_loop(0, _DUPLICATIONS, duplicate, carry)
+    else:
+        for k in range(_DUPLICATIONS):
+            carry = duplicate(k, carry)
+    first, second, x, y, z, share = carry
     cube = S * S * S
     return cube * (first + share / 3 * _tail(x, y, z)), cube * (second + share / 3 * _tail(x, z, y))
 
@@ -69,8 +79,10 @@ def complete(swing: Swing) -> tuple[Scalars, Scalars]:
     return first * bounded, second * bounded / jnp.where(swing.endless, 1, swing.m1)
 
 
-def second_kind(swing: Swing, whole: Scalars, folded: Triple) -> tuple[Scalars, Scalars]:
+def second_kind(
+    swing: Swing, whole: Scalars, folded: Triple, many: bool
+) -> tuple[Scalars, Scalars]:
     """Integrals of S^2 and (S/N)^2 from the start; ``folded``: S, C, N less their half turns."""
-    first, second = _incomplete(*folded)
+    first, second = _incomplete(*folded, many)
     turn_first, turn_second = complete(swing)
     return first + 2 * whole * turn_first, second + 2 * whole * turn_second

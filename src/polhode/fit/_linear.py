@@ -1,0 +1,105 @@
+"""Residuals and their Jacobian in one pass, kept in the blocks that recordings make of it.
+
+What all recordings share (the tensor, a bias, a drag) fills one block per recording, what is its
+own (initial rates and attitude) another: the zeros between them are never computed.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from polhode.fit._parameters import Parameters
+from polhode.fit._recording import Recording
+from polhode.fit._residuals import Model, residuals
+
+
+class Linear(NamedTuple):
+    """Residuals (c channels side by side) and their derivatives by shared and own unknowns."""
+
+    rest: Float[Array, "r t c"]
+    shared: Float[Array, "r t c s"]
+    own: Float[Array, "r t c o"]
+
+    def shifted(
+        self, shared: Float[Array, " s"], own: Float[Array, "r o"]
+    ) -> Float[Array, "r t c"]:
+        """Residuals after small changes of the unknowns, to first order."""
+        return (
+            self.rest
+            + jnp.einsum("rtcs,s->rtc", self.shared, shared)
+            + jnp.einsum("rtco,ro->rtc", self.own, own)
+        )
+
+    def information(self) -> Float[Array, "p p"]:
+        """``J^T J`` in the order shared, then own unknowns recording by recording."""
+        recordings, size = self.own.shape[0], self.own.shape[-1]
+        corner = jnp.einsum("rtcs,rtcz->sz", self.shared, self.shared)
+        side = jnp.einsum("rtcs,rtco->sro", self.shared, self.own)
+        side = side.reshape(corner.shape[0], recordings * size)
+        blocks = jnp.einsum("rtco,rtcz->roz", self.own, self.own)
+        each = jnp.eye(recordings, dtype=corner.dtype)[:, None, :, None] * blocks[:, :, None, :]
+        below = each.reshape(recordings * size, recordings * size)
+        return jnp.block([[corner, side], [side.T, below]])
+
+
+def entries_of(tensor: Float[Array, "3 3"], full: bool) -> Float[Array, " e"]:
+    """xx, yy, zz and, for a full tensor, yz, zx, xy."""
+    diagonal = jnp.stack([tensor[0, 0], tensor[1, 1], tensor[2, 2]])
+    if not full:
+        return diagonal
+    return jnp.concatenate([diagonal, jnp.stack([tensor[1, 2], tensor[2, 0], tensor[0, 1]])])
+
+
+def whole_of(entries: Float[Array, " e"], count: int) -> Float[Array, "3 3"]:
+    """The tensor of its ``count`` (3 or 6) entries, products zero where they are absent."""
+    (a, b, c), (p, q, r) = entries[:3], entries[3:6] if count == 6 else jnp.zeros_like(entries[:3])
+    return jnp.stack([jnp.stack([a, r, q]), jnp.stack([r, b, p]), jnp.stack([q, p, c])])
+
+
+def unknowns(parameters: Parameters, model: Model) -> tuple[Array, Array, Callable]:
+    """Shared (s,) and own (r, o) unknowns as numbers, and the way back for one recording.
+
+    Shared: the tensor's entries, then bias, mounting, lever and the motion's own; own: rates, then
+    attitude. The tensor's entries are regular unknowns for flat bodies too.
+    """
+    entries = entries_of(model.tensor(parameters), model.is_full)
+    count = entries.shape[0]
+    common = (parameters.bias, parameters.mounting, parameters.lever, parameters.motion)
+    rest, back = ravel_pytree(common)
+    shared = jnp.concatenate([entries, rest.astype(entries.dtype)])
+    own = parameters.omega
+    if parameters.attitude is not None:
+        own = jnp.concatenate([own, parameters.attitude], axis=1)
+    none = jnp.zeros(0, entries.dtype)
+
+    def one(shared, own):
+        bias, mounting, lever, motion = back(shared[count:])
+        attitude = None if parameters.attitude is None else own[None, 3:]
+        found = Parameters(none, own[None, :3], attitude, bias, mounting, lever, motion)
+        return found, whole_of(shared[:count], count)
+
+    return shared, own, one
+
+
+def linearise(
+    shared: Array, own: Array, one: Callable, recording: Recording, model: Model
+) -> Linear:
+    """Residuals and Jacobian of all recordings: the motion appears once in the program."""
+
+    def misfit(shared, own, single, attitude):
+        parameters, tensor = one(shared, own)
+        lone = jax.tree.map(lambda leaf: leaf[None], single)
+        start = None if attitude is None else attitude[None]
+        parts = residuals(parameters, lone, model.starting_at(start), tensor)
+        rest = jnp.concatenate([part[0] for part in parts.values()], axis=-1)
+        return rest, rest
+
+    slopes = jax.jacfwd(misfit, argnums=(0, 1), has_aux=True)
+    (by_shared, by_own), rest = jax.vmap(slopes, in_axes=(None, 0, 0, 0))(
+        shared, own, recording, model.attitude
+    )
+    return Linear(rest, by_shared, by_own)
