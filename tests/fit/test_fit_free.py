@@ -126,9 +126,10 @@ def test_regression_on_clean_data_finds_the_shape():
     times = np.linspace(0, 2, 400)
     tensor = np.array([[2, 0.1, 0.2], [0.1, 2.5, -0.3], [0.2, -0.3, 3.0]])
     rates = tumble(tensor[None], np.array([[2.0, 4.0, 3.0]]), times)
-    start, misfit = jax.jit(regression)(rates, times[None], np.ones((1, 400)))
-    found = np.asarray(inertia_of_second_moments(start))
-    np.testing.assert_allclose(found / found[0, 0] * 2, tensor, atol=1e-3)
+    start, other, misfit = jax.jit(regression)(rates, times[None], np.ones((1, 400)))
+    for sigma in (start, other):
+        found = np.asarray(inertia_of_second_moments(sigma))
+        np.testing.assert_allclose(found / found[0, 0] * 2, tensor, atol=1e-3)
     assert float(misfit) < 1e-8
 
 

@@ -13,10 +13,10 @@ import threading
 import traceback
 from collections.abc import Iterator, Sequence
 
-from polhode.cli import _explain, _run
+from polhode.cli import _explain, _fit, _run
 
 SUCCESS, FAILURE, USAGE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
-_COMMANDS = (_run, _explain)
+_COMMANDS = (_run, _explain, _fit)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -45,8 +45,8 @@ def _parser() -> argparse.ArgumentParser:
 
     parser = argparse.ArgumentParser(
         prog="polhode",
-        description="Rotating rigid bodies: simulate scenes written as TOML files.",
-        epilog="Exit codes: 0 done, 1 failed, 2 wrong options or scene file, 130 interrupted.",
+        description="Rotating rigid bodies: simulate scenes written as TOML files, fit inertia.",
+        epilog="Exit codes: 0 done, 1 failed, 2 wrong options or input file, 130 interrupted.",
     )
     parser.add_argument("--version", action="version", version=f"polhode {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)

@@ -1,9 +1,4 @@
-"""Inertia from recordings: fits that are physical and say how uncertain they are.
-
-Experimental: free-flight fits of gyroscope rates work and report their covariance, but some do
-not converge from the one starting point (two tests are marked as expected failures), so nothing
-here is exported at the top level yet.
-"""
+"""Inertia from recordings: fits that are physical and say how uncertain they are."""
 
 from polhode.fit._csv import read_recording as read_recording
 from polhode.fit._fit import (
@@ -35,5 +30,7 @@ from polhode.fit._residuals import (
 from polhode.fit._result import (
     Finding as Finding,
     InertiaFit as InertiaFit,
+    is_unusable as is_unusable,
+    remarks as remarks,
     sensor_axes as sensor_axes,
 )

@@ -10,12 +10,18 @@ from polhode.fit._recording import Recording
 
 
 def read_recording(
-    path: str | PathLike[str], columns: Mapping[str, str], *, scale: float = 1.0
+    path: str | PathLike[str],
+    columns: Mapping[str, str],
+    *,
+    scale: float = 1.0,
+    time_scale: float = 1.0,
+    noise: float = 1.0,
 ) -> Recording:
     """A recording of rates from a CSV file with a header line.
 
     ``columns`` names the file's columns for ``t``, ``wx``, ``wy``, ``wz`` and optionally ``wheel``;
-    ``scale`` multiplies the rates (pi/180 for deg/s). An empty or NaN cell makes its row a gap.
+    ``scale`` multiplies the rates (pi/180 for deg/s), ``time_scale`` the times (1e-3 for ms);
+    ``noise``, rad/s: standard deviation of the rates. An empty or NaN cell makes its row a gap.
     Raises FileNotFoundError, and ValueError for missing columns, cells that are no numbers,
     unsorted or repeated times (each with its line) and rates that look like deg/s.
     """
@@ -49,7 +55,9 @@ def read_recording(
             f"ones ({wrong.size} such places)."
         )
     wheel = data[:, 4] if "wheel" in needed else None
-    return Recording.of(times, data[:, 1:4] * scale, wheel_speed=wheel)
+    return Recording.of(
+        times * time_scale, data[:, 1:4] * scale, wheel_speed=wheel, omega_noise=noise
+    )
 
 
 def _number(path, line, name, text):

@@ -14,7 +14,7 @@ from polhode.fit._motion import AbstractMotion, FreeMotion
 from polhode.fit._parameters import AbstractInertiaUnknown, FullTensor
 from polhode.fit._recording import Recording, stack
 from polhode.fit._residuals import Huber
-from polhode.fit._result import CURES, Finding, InertiaFit, conclude
+from polhode.fit._result import CURES, UNUSABLE, InertiaFit, conclude
 from polhode.fit._solve import Problem, solve
 from polhode.inertia import Inertia
 
@@ -42,7 +42,7 @@ def fit_inertia(
     bias: bool = False,
     mounting: bool = False,
     robust: Huber | None = None,
-    starts: int = 4,
+    starts: int = 6,
     solver: Any = None,
     max_steps: int = 100,
     throw: bool = True,
@@ -56,8 +56,10 @@ def fit_inertia(
     ``FreeMotion()`` (exact, torque-free) or ``SteppedMotion`` (drag, a wheel of ``wheel_speed``
     (..., T), rad/s). ``unknown``: ``FullTensor()`` or ``MomentsOnly()``. ``known``: an inertia to
     start from. ``bias``, ``mounting``: whether to fit them. ``robust``: ``Huber(threshold)``, in
-    standard deviations, needs a known noise. ``starts``: how many starting bodies are tried (1:
-    that of a regression). ``solver``: any optimistix least-squares solver.
+    standard deviations, needs a known noise. ``starts``: how many attempts are made at most (1:
+    from a regression only; the next ones follow where its result misses the data: from another
+    regression, to growing parts of the recording, from other bodies). ``solver``: any optimistix
+    least-squares solver.
 
     Torque-free rates show only the ratios of the moments: see ``InertiaFit.scale_known``. Every
     iterate is a physical body. Left-handed axes are not fitted away: with attitudes they are
@@ -109,7 +111,7 @@ def fit_recordings(
     mounting: bool = False,
     robust: Huber | None = None,
     noise_known: bool = False,
-    starts: int = 4,
+    starts: int = 6,
     solver: Any = None,
     max_steps: int = 100,
     throw: bool = True,
@@ -177,7 +179,7 @@ def _batch(recording: Recording, problem: Problem) -> InertiaFit:
 
 
 def _finished(result: InertiaFit, throw: bool) -> InertiaFit:
-    fatal = Finding.STEP_LIMIT | Finding.NOT_FINITE | Finding.AXES_DISAGREE
+    fatal = UNUSABLE
     codes = np.atleast_1d(np.asarray(result.finding))
     if throw and (codes & int(fatal)).any():
         said = [

@@ -42,7 +42,7 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
 
     def terminate(self, fn, y, args, options, state, tags):
         ended, result = super().terminate(fn, y, args, options, state, tags)
-        jacobian, rest = state.f_info.jac.as_matrix(), state.f_info.residual.ravel()
+        jacobian, rest = state.f_info.jac.as_matrix(), state.f_info.residual
         square, slope = jacobian.T @ jacobian, jacobian.T @ rest
         size = jnp.sqrt(jnp.diagonal(square))
         size = jnp.where(size > 0, size, 1)

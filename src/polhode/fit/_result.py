@@ -53,6 +53,9 @@ CURES = {
     "axes or units, outliers (robust=Huber()), or a valley that is not the best",
 }
 
+UNUSABLE = Finding.STEP_LIMIT | Finding.NOT_FINITE | Finding.AXES_DISAGREE
+"""Findings that raise an error unless ``throw=False``."""
+
 
 class InertiaFit(eqx.Module):
     """Result of ``fit_inertia``; leading axes are those of the bodies.
@@ -117,33 +120,52 @@ class InertiaFit(eqx.Module):
         reach = float(norm.ppf(0.5 + level / 2)) * spread
         return value - reach, value + reach
 
+    def findings(self, body: int = 0) -> list[str]:
+        """Names of the remarks on one body, in plain words."""
+        code = int(np.asarray(self.finding).reshape(-1)[body])
+        return [flag.name.lower().replace("_", " ") for flag in CURES if code & flag]
+
     def report(self) -> str:
         """A short text per body: moments, uncertainty, remarks with cause and cure."""
-        lines = []
-        if not self.scale_known:
-            lines.append(
-                "Only ratios of moments are determined: free motion does not depend on the size "
-                "of the inertia (null direction of the information matrix). A known wheel, torque "
-                "or moment would fix it."
-            )
-        flat = jax.tree.map(np.atleast_1d, self.finding)
-        ratios = np.asarray(self.ratios).reshape(-1, 3)
-        spread = np.asarray(self.ratios_std).reshape(-1, 3)
-        moments = np.asarray(self.moments).reshape(-1, 3)
+        count = np.asarray(self.finding).size
+        lines = [_SCALE] if not self.scale_known else []
+        ratios, spread, moments = (
+            np.asarray(x).reshape(-1, 3) for x in (self.ratios, self.ratios_std, self.moments)
+        )
         rms, noise = np.asarray(self.rms).reshape(-1), np.asarray(self.noise).reshape(-1)
-        twins = np.sort(np.asarray(self.mirrored.moments).reshape(-1, 3), axis=-1)
-        for k, code in enumerate(np.asarray(flat).reshape(-1)):
+        for k in range(count):
             shown = " : ".join(f"{r:.4f}({s:.1g})" for r, s in zip(ratios[k], spread[k]))
             size = "" if not self.scale_known else f"; moments {moments[k]} kg m^2"
             lines.append(f"body {k}: {shown}{size}; rms {rms[k]:.3g} rad/s, chi {noise[k]:.3g}")
-            if not self.scale_known and self.free_rates:
-                lines.append(
-                    "  - free rates do not show the handedness of the axes: with one axis inverted "
-                    f"the same data mean {twins[k][0]:.4f} : {twins[k][1]:.4f} : 1; compare with "
-                    "what you know of the body"
-                )
-            lines += [f"  - {text}" for flag, text in CURES.items() if int(code) & flag]
+            lines += [f"  - {text}" for text in remarks(self, k) if text != _SCALE]
         return "\n".join(lines)
+
+
+_SCALE = (
+    "Only ratios of moments are determined: free motion does not depend on the size of the inertia "
+    "(null direction of the information matrix). A known wheel, torque or moment would fix it."
+)
+
+
+def remarks(fit: InertiaFit, body: int = 0) -> list[str]:
+    """What to know before using a fit, with cause and cure, in sentences."""
+    code = int(np.asarray(fit.finding).reshape(-1)[body])
+    found = []
+    if not fit.scale_known:
+        found.append(_SCALE)
+        if fit.free_rates:
+            twin = np.sort(np.asarray(fit.mirrored.moments).reshape(-1, 3)[body])
+            found.append(
+                "free rates do not show the handedness of the axes: with one axis inverted the "
+                f"same data mean {twin[0]:.4f} : {twin[1]:.4f} : 1; compare with what you know of "
+                "the body"
+            )
+    return found + [text for flag, text in CURES.items() if code & flag]
+
+
+def is_unusable(fit: InertiaFit) -> bool:
+    """Whether some body's result must not be used: stopped early, not finite, axes contradict."""
+    return bool((np.asarray(fit.finding) & int(UNUSABLE)).any())
 
 
 def conclude(solution: Solution, recording: Recording, problem: Problem) -> InertiaFit:

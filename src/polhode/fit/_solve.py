@@ -26,10 +26,14 @@ from polhode.inertia import Inertia, principal, second_moments
 from polhode.rotation import conjugate, multiply
 
 # Parts of the recording that are fitted one after the other where the whole misleads at first.
-_PARTS = (0.125, 0.25, 0.5, 1.0)
+_PARTS = (0.1, 0.2, 0.35, 0.6, 1.0)
+# Spread of the shape about its start that is believed while a part alone hardly shows it.
+_SPREAD = 0.1
 # Residuals up to this multiple of the noise, or of what neighbouring samples show of it, end the
 # search for a better valley.
 _GOOD = 1.5
+# Relative difference of two costs that are those of one optimum.
+_SAME = 1e-4
 # Distance from the optimum, in standard deviations, at which the optimiser stops.
 _OFFSET = 1e-4
 
@@ -44,7 +48,7 @@ class Problem(eqx.Module):
     bias: bool = eqx.field(static=True, default=False)
     mounting: bool = eqx.field(static=True, default=False)
     noise_known: bool = eqx.field(static=True, default=False)
-    starts: int = eqx.field(static=True, default=4)
+    starts: int = eqx.field(static=True, default=6)
     solver: Any = None
     max_steps: int = eqx.field(static=True, default=60)
 
@@ -112,15 +116,19 @@ def solve(recording: Recording, problem: Problem) -> Solution:
     weight = _weight(recording, rates)
     solver = problem.solver or LevenbergMarquardt(_OFFSET, float(jnp.finfo(dtype).eps) ** 0.75)
     expected = _expected(recording, problem)
+    # of one residual: 1 where the noise is known
+    noise = jnp.sqrt(expected / jnp.sum(recording.present) / (3 * _kinds(recording)))
+    noise = jnp.where(jnp.isfinite(noise), noise, 0.1 / weight)
 
     def misfits(scaled, job):
-        base, within = job
+        base, within, belief = job
         model = model_of(base)
         shared, own, one = unknowns(jax.tree.map(jnp.multiply, scaled, scale), model)
         # The Jacobian is made here, once and by blocks: what the optimiser differentiates is linear
         at = jax.lax.stop_gradient((shared, own))
         linear = linearise(*at, one, within, model)
-        return weight * linear.shifted(shared - at[0], own - at[1]), linear
+        misfit = linear.shifted(shared - at[0], own - at[1])
+        return weight * jnp.concatenate([misfit.ravel(), belief * scaled.shape]), linear
 
     jobs = _jobs(bases.soft.shape[0], problem.starts)
     which, part = (jnp.asarray(column) for column in (jobs["base"], jobs["part"]))
@@ -135,9 +143,10 @@ def solve(recording: Recording, problem: Problem) -> Solution:
         within = eqx.tree_at(lambda r: r.present, recording, within)
         base = jax.tree.map(lambda leaf: leaf[which[job]], bases)
         anew = jnp.asarray(jobs["anew"])[job]
+        belief = jnp.where(part[job] < 1, noise / _SPREAD, 0)
         start = jax.tree.map(lambda a, b: jnp.where(anew, a, b), fresh, search.scaled)
         found = optx.least_squares(
-            misfits, solver, start, (base, within),
+            misfits, solver, start, (base, within, belief),
             has_aux=True, max_steps=problem.max_steps, throw=False,
         )  # fmt: skip
         # the auxiliary output of the last accepted step; ``found.aux`` is that of the one before
@@ -145,6 +154,8 @@ def solve(recording: Recording, problem: Problem) -> Solution:
         cost = jnp.sum(linear.rest**2) / 2
         whole = part[job] == 1
         better = whole & (cost < search.cost)
+        # two starts that lead to one place leave little hope for a third
+        again = whole & (jnp.abs(cost - search.cost) < _SAME * cost)
         new = (found.value, base, linear, cost, found.result == optx.RESULTS.successful)
         old = (search.best, search.base, search.linear, search.cost, search.stopped)
         best, base, linear, cost, stopped = jax.tree.map(
@@ -153,11 +164,11 @@ def solve(recording: Recording, problem: Problem) -> Solution:
         return _Search(
             job + 1, found.value, best, base, linear, cost,
             search.steps + found.stats["num_steps"], search.attempts + jnp.where(whole, 1, 0),
-            stopped, stopped & (2 * cost <= _GOOD**2 * expected),
+            stopped, stopped & (again | (2 * cost <= _GOOD**2 * expected)),
         )  # fmt: skip
 
     one = jax.tree.map(lambda leaf: leaf[0], bases)
-    _, struct = jax.eval_shape(misfits, fresh, (one, recording))
+    _, struct = jax.eval_shape(misfits, fresh, (one, recording, noise))
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), struct)
     begun = _Search(
         jnp.asarray(0), fresh, fresh, one, nothing, jnp.asarray(jnp.inf, dtype),
@@ -178,19 +189,31 @@ def solve(recording: Recording, problem: Problem) -> Solution:
         tensor = tensor / largest
         linear = linear._replace(shared=linear.shared * factor[None, None, None])
     return Solution(
-        parameters, model, tensor, linear, ended.cost, ended.steps, ended.attempts, ended.stopped,
+        parameters,
+        model,
+        tensor,
+        linear,
+        ended.cost,
+        ended.steps,
+        ended.attempts,
+        ended.stopped,
         expected,
     )
 
 
 def _jobs(bases: int, attempts: int) -> dict[str, np.ndarray]:
-    """What is fitted in turn: the first start to all data, then each start to growing parts."""
-    rows = [(0, 1.0, True)]
+    """What is fitted in turn: both regressions to all data, then each start to growing parts."""
+    tries = [[(0, 1.0, True)], [(1, 1.0, True)]]
     for base in range(bases):
-        rows += [(base, part, part == _PARTS[0]) for part in _PARTS]
-    rows = rows[: 1 + (attempts - 1) * len(_PARTS)]
+        tries.append([(base, part, part == _PARTS[0]) for part in _PARTS])
+    rows = [row for one in tries[: max(attempts, 1)] for row in one]
     base, part, anew = zip(*rows, strict=True)
     return {"base": np.array(base), "part": np.array(part), "anew": np.array(anew)}
+
+
+def _kinds(recording: Recording) -> int:
+    """How many of rates, attitudes and forces there are."""
+    return sum(part is not None for part in (recording.omega, recording.wxyz, recording.force))
 
 
 def _expected(recording: Recording, problem: Problem) -> Float[Array, ""]:
@@ -198,8 +221,7 @@ def _expected(recording: Recording, problem: Problem) -> Float[Array, ""]:
 
     An unknown noise is taken from neighbouring samples; without rates nothing is known of it.
     """
-    kinds = sum(part is not None for part in (recording.omega, recording.wxyz, recording.force))
-    expected = jnp.sum(recording.present) * 3 * kinds
+    expected = jnp.sum(recording.present) * 3 * _kinds(recording)
     if problem.noise_known:
         return expected
     if recording.omega is None:
@@ -256,10 +278,10 @@ def _bases(recording, rates, problem) -> Base:
     if spin is not None:
         axis = jnp.asarray(problem.motion.axis, rates.dtype)
         carried = spin * recording.wheel[..., None] * axis[None, None]
-    first, _ = regression(rates, recording.times, recording.present, carried)
+    first, second, _ = regression(rates, recording.times, recording.present, carried)
     if problem.known is not None:
         first = second_moments(problem.known.tensor)
-    bodies = jnp.stack([first, *alternatives(rates, first)])
+    bodies = jnp.stack([first, second, *alternatives(rates, first)])
     if problem.unknown.columns().shape[1] == 3:
         bodies = bodies * jnp.eye(3, dtype=bodies.dtype)
     known = problem.motion.fixes_scale()

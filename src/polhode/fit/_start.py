@@ -9,6 +9,7 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from polhode.fit._parameters import rotation_of
@@ -24,6 +25,7 @@ from polhode.rotation import multiply, to_matrix
 _FLATTEST = 3e-3
 # rounds of interpolation with the tensor of the round before
 _ROUNDS = 3
+_PIECES = 6
 
 
 def integrate(
@@ -79,8 +81,11 @@ def regression(
     times: Float[Array, "r t"],
     present: Float[Array, "r t"],
     momentum: Float[Array, "r t 3"] | None = None,
-) -> tuple[Float[Array, "3 3"], Float[Array, ""]]:
-    """Second moments (3, 3) to start from, and the mean square misfit of the regression, relative.
+) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"], Float[Array, ""]]:
+    """Second moments (3, 3) to start from, in two ways, and the relative misfit of the first.
+
+    The first takes the momentum as constant over each recording, the second over pieces of it,
+    which forgives errors of the integrated attitude and a slow loss of momentum.
 
     ``momentum``: body components of a wheel's momentum; without it the tensor is scaled to unit
     Frobenius norm, since only its shape shows. Without it, too, the rates between the samples are
@@ -88,42 +93,60 @@ def regression(
     records of few samples per turn need that.
     """
 
-    def centred(values, total):
-        # eliminate each recording's constant momentum: subtract the mean
-        mean = jnp.sum(values, axis=1, keepdims=True) / total
-        return (values - mean) * present.reshape(*present.shape, *[1] * (values.ndim - 2))
+    count = times.shape[1]
+    whole = jnp.ones((1, count), omega.dtype)
+    # parts in which errors of the integrated attitude have no time to grow
+    place = np.arange(count) * _PIECES // count
+    pieces = jnp.asarray(place == np.arange(_PIECES)[:, None], omega.dtype)
 
-    count = jnp.sum(present, axis=1)
+    def centred(values, parts):
+        # eliminate the constant momentum of each part: subtract its mean
+        shape = (*present.shape, *[1] * (values.ndim - 2))
+        weight = parts[None] * present[:, None]
+        total = jnp.sum(weight, axis=2)
+        safe = jnp.where(total > 0, total, 1)
+        mean = jnp.einsum("rpt,rt...->rp...", weight, values)
+        mean = mean / safe.reshape(*safe.shape, *shape[2:])
+        return (values - jnp.einsum("pt,rp...->rt...", parts, mean)) * present.reshape(shape)
 
-    def gram_of(slope):
+    def rows_of(slope):
         attitude = jax.vmap(integrate)(omega, slope, times)
         turn = to_matrix(attitude) * present[..., None, None]
-        body = jnp.einsum("rtij,rtjk->rtik", turn, _design(omega))
-        body = centred(body, count[:, None, None, None])
-        return jnp.einsum("rtij,rtik->jk", body, body), body, turn
+        return turn, jnp.einsum("rtij,rtjk->rtik", turn, _design(omega))
+
+    def square(rows):
+        return jnp.einsum("rtij,rtik->jk", rows, rows)
 
     first = jax.vmap(_slope)(omega, times)
     if momentum is None:
+        metric = jnp.asarray([1, 1, 1, 2, 2, 2], omega.dtype) ** 0.5
 
-        def again(_, carry):
-            gram, _, _ = gram_of(carry[0])
-            metric = jnp.asarray([1, 1, 1, 2, 2, 2], omega.dtype) ** 0.5
+        def null(gram):
             values, vectors = jnp.linalg.eigh(gram / metric[:, None] / metric[None])
             entries = vectors[:, 0] / metric
             entries = entries * jnp.where(jnp.sum(entries[:3]) < 0, -1, 1).astype(entries.dtype)
-            sigma = _physical(entries)
-            body = Inertia(full=inertia_of_second_moments(sigma))
-            return angular_acceleration(body, omega), sigma, values[0] / jnp.sum(values)
+            return _physical(entries), values[0] / jnp.sum(values)
 
-        start = (first, jnp.eye(3, dtype=omega.dtype), jnp.zeros((), omega.dtype))
+        def again(_, carry):
+            _, rows = rows_of(carry[0])
+            grams = jnp.stack([square(centred(rows, parts)) for parts in (whole, pieces)])
+            sigma, misfit = jax.vmap(null)(grams)
+            body = Inertia(full=inertia_of_second_moments(sigma[1]))
+            return angular_acceleration(body, omega), sigma, misfit
+
+        unit = jnp.eye(3, dtype=omega.dtype)
+        start = (first, jnp.stack([unit, unit]), jnp.zeros(2, omega.dtype))
         _, sigma, misfit = jax.lax.fori_loop(0, _ROUNDS, again, start)
-        return sigma, misfit
-    gram, body, turn = gram_of(first)
-    carried = centred(jnp.einsum("rtij,rtj->rti", turn, momentum), count[:, None, None])
-    entries = jnp.linalg.solve(gram, -jnp.einsum("rtij,rti->j", body, carried))
-    rest = jnp.einsum("rtij,j->rti", body, entries) + carried
-    misfit = jnp.sum(rest**2) / jnp.sum(carried**2)
-    return _physical(entries), misfit
+        return sigma[0], sigma[1], misfit[0]
+    turn, rows = rows_of(first)
+    carried = jnp.einsum("rtij,rtj->rti", turn, momentum)
+    found = []
+    for parts in (whole, pieces):
+        body, push = centred(rows, parts), centred(carried, parts)
+        entries = jnp.linalg.solve(square(body), -jnp.einsum("rtij,rti->j", body, push))
+        rest = jnp.einsum("rtij,j->rti", body, entries) + push
+        found.append((_physical(entries), jnp.sum(rest**2) / jnp.sum(push**2)))
+    return found[0][0], found[1][0], found[0][1]
 
 
 def _slope(omega, times):

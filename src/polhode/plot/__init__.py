@@ -1,6 +1,7 @@
 """Figures in one call, of a Trajectory or of arrays (needs matplotlib)."""
 
 from polhode.plot._animate import animate as animate
+from polhode.plot._fit import fit as fit
 from polhode.plot._herpolhode import herpolhode as herpolhode
 from polhode.plot._history import history as history
 from polhode.plot._motion import Motion as Motion, motion as motion

@@ -1,0 +1,175 @@
+"""One figure of a fit: data over model, residuals, uncertainty, and the numbers."""
+
+from typing import Any
+
+import numpy as np
+
+from polhode.plot._matplotlib import ACCENT, AXES, GREY, INK, new_figure, styled
+
+# chi-square of two degrees of freedom: 68 % and 95 % of a plane
+_LEVELS = {"68 %": 2.2957, "95 %": 5.9915}
+
+
+@styled
+def fit(result: Any, recording: Any, *, body: int = 0, title: str = ""):
+    """Figure of a ``fit.InertiaFit`` and the ``fit.Recording`` it was made from; returns it.
+
+    Left: rates of the first recording (dots) over the fitted motion (lines), and the residuals in
+    units of their noise. Right: the region of the two smaller ratios (or moments) that the data
+    allow, the limit of what a body can be, and a table of the results. ``body`` picks one of a
+    batch. Raises ValueError for a recording without rates.
+    """
+    if recording.omega is None:
+        raise ValueError("the figure of a fit needs a recording of rates, got attitudes alone.")
+    one = _single(result, recording, body)
+    figure = new_figure(11.0, 7.0)
+    grid = figure.add_gridspec(4, 2, width_ratios=(1.7, 1.0))
+    rows = [figure.add_subplot(grid[0, 0])]
+    rows += [figure.add_subplot(grid[k, 0], sharex=rows[0]) for k in (1, 2, 3)]
+    dense = one["times"].size > 300
+    for k, color in enumerate(AXES):
+        ax = rows[k]
+        ax.plot(one["times"], one["omega"][:, k], ".", color=GREY, label="data",
+                markersize=2 if dense else 5)  # fmt: skip
+        ax.plot(one["times"], one["model"][:, k], color=color, label="model")
+        ax.set_title(f"Rate about {'xyz'[k]}")
+        ax.set_ylabel("[rad/s]")
+        ax.legend(loc="upper right", ncols=2, borderpad=0.2)
+        rows[3].plot(one["times"], one["residual"][:, k], ".", color=color, markersize=3)
+    for size in (-2, 0, 2):
+        rows[3].axhline(size * one["chi"], color=GREY, linewidth=0.8, zorder=1)
+    rows[3].set_title("Residuals over noise, lines at twice their spread")
+    rows[3].set_xlabel("time [s]")
+    for ax in rows:
+        ax.margins(x=0.01)
+        ax.label_outer()
+    _region(figure.add_subplot(grid[:2, 1]), one)
+    _table(figure.add_subplot(grid[2:, 1]), one)
+    if title:
+        figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
+    return figure
+
+
+def _single(result, recording, body) -> dict[str, Any]:
+    """The numbers of one body and its first recording, as NumPy arrays."""
+    lead = np.asarray(result.finding).ndim
+    if not 0 <= body < max(np.asarray(result.finding).size, 1):
+        raise ValueError(f"body must be one of the fit's, got {body}.")
+
+    def pick(value, tail):
+        value = np.asarray(value)
+        return value.reshape(-1, *value.shape[value.ndim - tail :])[body]
+
+    omega, noise = np.asarray(recording.omega), np.asarray(recording.omega_noise)
+    place = body if lead else 0
+    samples = omega.shape[-2]
+    omega, noise = (x.reshape(-1, samples, 3)[place] for x in (omega, noise))
+    present = np.asarray(recording.present).reshape(-1, samples)[place] > 0
+    times = np.asarray(recording.times).reshape(-1, samples)[place]
+    residual = np.asarray(result.residuals["omega"])
+    residual = residual.reshape(-1, *residual.shape[-3:])[body][0]
+    # a loss that bounds outliers has shortened their residuals: shown as they were fitted
+    model = omega - residual * noise
+    hole = np.where(present, 1.0, np.nan)[:, None]
+    moments, axes = pick(result.moments, 1), pick(result.axes, 1)
+    value, spread = (
+        (result.moments, result.moments_std)
+        if result.scale_known
+        else (result.ratios, result.ratios_std)
+    )
+    return {
+        "times": times,
+        "omega": omega * hole,
+        "model": model * hole,
+        "residual": residual * hole,
+        "value": pick(value, 1),
+        "spread": pick(spread, 1),
+        "axes_std": pick(result.axes_std, 1),
+        "covariance": _of_values(
+            moments,
+            axes,
+            pick(result.covariance, 2),
+            result.scale_known,
+            6 if result.model.is_full else 3,
+        ),
+        "scale_known": result.scale_known,
+        "rms": float(pick(result.rms, 0)),
+        "chi": float(pick(result.noise, 0)),
+        "white": float(pick(result.whiteness, 0)),
+        "findings": result.findings(body),
+    }
+
+
+def _of_values(moments, axes, covariance, scale_known, count) -> np.ndarray:
+    """Covariance (2, 2) of the two smaller moments or ratios."""
+    w, x, y, z = axes
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+    slope = np.array(
+        [
+            [a * a, b * b, c * c, 2 * b * c, 2 * c * a, 2 * a * b]
+            for a, b, c in (turn[:, k] for k in range(3))
+        ]
+    )
+    slope = slope[:, :count]  # a fit of moments only knows no products
+    if not scale_known:
+        slope = (slope - (moments / moments[2])[:, None] * slope[2]) / moments[2]
+    return (slope @ covariance[:count, :count] @ slope.T)[:2, :2]
+
+
+def _region(ax, one):
+    """Ellipses of the two smaller values and, for ratios, the edge of what is physical."""
+    value, covariance = one["value"][:2], one["covariance"]
+    ax.set_title("What the data allow")
+    kind = "moment [kg m²]" if one["scale_known"] else "ratio to the largest moment"
+    ax.set_xlabel(f"smallest {kind}")
+    ax.set_ylabel(f"middle {kind}" if one["scale_known"] else "middle ratio")
+    ax.plot(*value, "+", color=INK, markersize=9)
+    if not np.isfinite(one["spread"][:2]).all():
+        ax.text(0.5, 0.1, "not determined", transform=ax.transAxes, ha="center", color=ACCENT)
+        return
+    sizes, vectors = np.linalg.eigh(covariance)
+    root = vectors * np.sqrt(np.maximum(sizes, 0))
+    circle = np.linspace(0, 2 * np.pi, 181)
+    unit = np.stack([np.cos(circle), np.sin(circle)])
+    for name, level in _LEVELS.items():
+        x, y = value[:, None] + np.sqrt(level) * (root @ unit)
+        ax.fill(x, y, facecolor=ACCENT, alpha=0.22, linewidth=0, label=name)
+    ax.autoscale_view()
+    if not one["scale_known"]:
+        limits = ax.get_xlim(), ax.get_ylim()
+        line = np.linspace(0, 1, 201)
+        ax.fill_between(line, 0, 1 - line, color=GREY, alpha=0.35, label="no body", linewidth=0)
+        ax.set_xlim(*limits[0])
+        ax.set_ylim(*limits[1])
+    ax.legend(loc="best")
+    ax.ticklabel_format(useOffset=False)
+    ax.locator_params(axis="x", nbins=4)
+
+
+def _table(ax, one):
+    """The numbers, and remarks in short."""
+    ax.set_axis_off()
+    head = "moments [kg m²]" if one["scale_known"] else "ratios"
+    lines = [f"{'principal ' + head:<28}axis known to"]
+    for value, spread, turn in zip(one["value"], one["spread"], one["axes_std"], strict=True):
+        known = f"{value:.6g} ± {spread:.1g}" if spread > 0 else f"{value:.6g}"
+        angle = f"{np.degrees(turn):.2g}°" if np.isfinite(turn) else "-"
+        lines.append(f"{known:<28}{angle}")
+    lines += [
+        "",
+        f"residual rms   {one['rms']:.3g} rad/s",
+        f"over the noise {one['chi']:.3g}",
+        f"whiteness      p = {one['white']:.2g}",
+        "scale          " + ("known" if one["scale_known"] else "not shown by free motion"),
+        "remarks        " + (", ".join(one["findings"]) or "none"),
+    ]
+    ax.text(
+        0.0, 0.95, "\n".join(lines), family="monospace", fontsize=8.5, va="top", linespacing=1.5,
+        transform=ax.transAxes, color=INK,
+    )  # fmt: skip
