@@ -4,23 +4,20 @@ Designs: 200 bodies each, several lengths and noises; the error of all entries o
 the metric of their information (1 is the bound), cover of 95 % intervals, what did not converge.
 Speed: one recording of 1,000 samples from raw rates to covariance, beside SciPy's ``least_squares``
 over ``solve_ivp`` (DOP853, log-Cholesky unknowns, the same start), errors of both; and 1,000
-bodies in one call. Data come from DOP853 at 1e-11. Single thread; run pinned to one core.
+bodies in one call. Data come from DOP853 at 1e-11. Single thread, one core.
 
     python -m benchmarks.identification [--quick] [--output benchmarks/results/identification.json]
 """
 
 import argparse
 import json
-import os
-import platform
 import sys
 import time
-from importlib.metadata import version
 from pathlib import Path
 
-os.environ.setdefault(
-    "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-)
+from benchmarks._report import one_thread, write
+
+one_thread()
 
 import jax
 import numpy as np
@@ -197,18 +194,11 @@ def main() -> int:
         rows.append(design(*row, count))
         print(json.dumps(rows[-1]), flush=True)
     numbers = {"designs": rows, "speed": speed(50 if options.quick else 1000, options.quick)}
-    result = {
-        "command": " ".join(["python -m benchmarks.identification", *sys.argv[1:]]),
-        "versions": {n: version(n) for n in ("jax", "numpy", "scipy", "optimistix", "lineax")}
-        | {"python": platform.python_version()},
-        "machine": {"processor": platform.machine(), "threads": 1},
-        "numbers": numbers,
-    }
-    text = json.dumps(result, indent=1)
-    print(text)
-    if options.output:
-        options.output.parent.mkdir(parents=True, exist_ok=True)
-        options.output.write_text(text + "\n", encoding="utf-8")
+    print(json.dumps(numbers["speed"], indent=1))
+    path = write(
+        "identification", numbers, path=options.output, packages=("scipy", "optimistix", "lineax")
+    )
+    print(f"written: {path}")
     return 0
 
 
