@@ -93,12 +93,7 @@ def fit_inertia(
         solver,
         max_steps,
     )
-    batch = recording.batch_shape
-    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, 1, *leaf.shape[len(batch) :]), recording)
-    result = _batch(flat, problem)
-    return _finished(
-        jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), result), throw
-    )
+    return _finished(_each(recording, problem), throw)
 
 
 def fit_recordings(
@@ -133,9 +128,7 @@ def fit_recordings(
         solver,
         max_steps,
     )
-    together = jax.tree.map(lambda leaf: leaf[None], stack(recordings))
-    result = _batch(together, problem)
-    return _finished(jax.tree.map(lambda leaf: leaf[0], result), throw)
+    return _finished(_together(stack(recordings), problem), throw)
 
 
 def windows(recording: Recording, length: int) -> list[Recording]:
@@ -153,8 +146,24 @@ def windows(recording: Recording, length: int) -> list[Recording]:
 
 
 @eqx.filter_jit
+def _together(recording: Recording, problem: Problem) -> InertiaFit:
+    """One body from its recordings (leading axis)."""
+    return conclude(solve(recording, problem), recording, problem)
+
+
+@eqx.filter_jit
+def _each(recording: Recording, problem: Problem) -> InertiaFit:
+    """Fits of all bodies (leading axes), one recording each, in one compiled call."""
+    batch = recording.batch_shape
+    if not batch:
+        return _together(jax.tree.map(lambda leaf: leaf[None], recording), problem)
+    flat = jax.tree.map(lambda leaf: leaf.reshape(-1, 1, *leaf.shape[len(batch) :]), recording)
+    found = _batch(flat, problem)
+    return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), found)
+
+
 def _batch(recording: Recording, problem: Problem) -> InertiaFit:
-    """Fits of all bodies (leading axis) in one compiled call."""
+    """Fits of bodies on one leading axis."""
 
     def fit(one):
         return conclude(solve(one, problem), one, problem)
@@ -165,6 +174,8 @@ def _batch(recording: Recording, problem: Problem) -> InertiaFit:
     at_once = max(1, _LANES // max(recording.times.shape[1] * recording.times.shape[2], 1))
     if jax.default_backend() != "cpu" or count <= at_once:
         return jax.vmap(fit)(recording)
+    if at_once == 1:
+        return jax.lax.map(fit, recording)
     rounds = -(-count // at_once)
     at_once = -(-count // rounds)
     missing = rounds * at_once - count

@@ -17,6 +17,10 @@ class Huber(eqx.Module):
 
     threshold: float = 3.0
 
+    def __check_init__(self):
+        if not self.threshold > 0:
+            raise ValueError(f"the threshold of Huber must be positive, got {self.threshold}.")
+
     def __call__(self, residual: Array) -> Array:
         size = jnp.abs(residual)
         inside = size <= self.threshold

@@ -1,0 +1,85 @@
+"""``polhode fit``: a recording in, a table, numbers and a figure out; bad files named as such."""
+
+import json
+
+import numpy as np
+import pytest
+
+from polhode.cli import main
+
+
+@pytest.fixture
+def toss(tmp_path):
+    """A long box tumbling freely, by small Runge-Kutta steps, in deg/s, with noise and a gap."""
+    moments = np.array([1.0, 2.6, 3.2])
+    rng = np.random.default_rng(5)
+
+    def field(w):
+        return np.cross(moments * w, w) / moments
+
+    rows, w, h = [], np.array([1.0, 9.0, 0.5]), 1e-3
+    for k in range(1001):
+        if k % 10 == 0:
+            rows.append([k * h, *(np.degrees(w) + rng.normal(size=3))])
+        k1 = field(w)
+        k2 = field(w + h / 2 * k1)
+        k3 = field(w + h / 2 * k2)
+        w = w + h / 6 * (k1 + 2 * k2 + 2 * k3 + field(w + h * k3))
+    lines = ["time,p,q,r", *(",".join(f"{x:.6g}" for x in row) for row in rows)]
+    lines[30] = lines[30].rsplit(",", 1)[0] + ","
+    path = tmp_path / "toss.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+NAMES = ["--columns", "t=time", "wx=p", "wy=q", "wz=r"]
+
+
+def test_a_recording_becomes_numbers_and_a_figure(toss, tmp_path, capsys):
+    output = tmp_path / "new" / "result"
+    noise = ["--degrees", "--noise", str(np.radians(1.0))]
+    assert main(["fit", str(toss), *NAMES, *noise, "-o", str(output)]) == 0
+    printed = capsys.readouterr().out
+    assert "smallest" in printed
+    assert "Only ratios" in printed
+    assert output.with_suffix(".png").read_bytes()[:4] == b"\x89PNG"
+    found = json.loads(output.with_suffix(".json").read_text())
+    assert found["samples"] == 100
+    assert found["gaps"] == 1
+    assert found["moments_std"] == [None] * 3
+    off = (np.array(found["ratios"]) - [1 / 3.2, 2.6 / 3.2, 1])[:2]
+    assert np.all(np.abs(off) < 4 * np.array(found["ratios_std"][:2]))
+    assert np.all(np.array(found["ratios_std"][:2]) < 0.01)
+    assert "step limit" not in found["findings"]
+
+
+def test_wrong_units_are_suspected(toss, capsys):
+    assert main(["fit", str(toss), *NAMES]) == 2
+    assert "deg/s" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--columns", "t=clock"], "missing: t -> clock"),
+        (["--columns", "time"], "NAME=COLUMN"),
+        ([*NAMES, "--robust", "3"], "--noise"),
+        ([*NAMES, "--wheel-inertia", "1e-6"], "wheel=COLUMN"),
+    ],
+)
+def test_bad_options_and_files_are_named(toss, capsys, more, message):
+    assert main(["fit", str(toss), *more]) == 2
+    assert message in capsys.readouterr().err
+
+
+def test_repeated_times_are_named(toss, capsys):
+    lines = toss.read_text().splitlines()
+    lines[5] = lines[4]
+    toss.write_text("\n".join(lines))
+    assert main(["fit", str(toss), *NAMES, "--degrees"]) == 2
+    assert "line 6" in capsys.readouterr().err
+
+
+def test_a_missing_file_is_an_error(tmp_path, capsys):
+    assert main(["fit", str(tmp_path / "none.csv")]) == 1
+    assert "none.csv" in capsys.readouterr().err

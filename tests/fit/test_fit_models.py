@@ -1,0 +1,240 @@
+"""Fits beyond plain free flight: a wheel and drag, biased and turned sensors, outliers, float32."""
+
+import importlib.util
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mpmath as mp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from polhode.fit import (
+    Drag,
+    Finding,
+    FreeMotion,
+    FullTensor,
+    Huber,
+    Model,
+    MomentsOnly,
+    Parameters,
+    Recording,
+    SteppedMotion,
+    fit_inertia,
+    fit_recordings,
+    residuals,
+    sensor_axes,
+    stack,
+    windows,
+)
+from polhode.fit._parameters import base_of, free_columns
+from polhode.rotation import to_matrix
+
+TENSOR = np.array([[2.0, 0.1, 0.2], [0.1, 2.5, -0.3], [0.2, -0.3, 3.2]])
+
+
+def flight(times, omega, *, wheel=None, drag=(0.0, 0.0)):
+    """Attitudes (t, 4) and rates (t, 3) by DOP853; ``wheel``: momentum along z as function of t."""
+    inverse = np.linalg.inv(TENSOR)
+
+    def field(t, y):
+        q, momentum = y[:4], y[4:]
+        carried = np.array([0, 0, 0 if wheel is None else wheel(t)])
+        w = inverse @ (momentum - carried)
+        torque = -(drag[0] + drag[1] * np.linalg.norm(w)) * w
+        turn = np.array(
+            [
+                -q[1:] @ w,
+                *(q[0] * w + np.cross(q[1:], w)),
+            ]
+        )
+        return np.concatenate([turn / 2, np.cross(momentum, w) + torque])
+
+    start = np.concatenate(
+        [[1, 0, 0, 0], TENSOR @ omega + [0, 0, 0 if wheel is None else wheel(times[0])]]
+    )
+    y = solve_ivp(field, times[[0, -1]], start, "DOP853", times, rtol=1e-10, atol=1e-10).y.T
+    carried = np.zeros((len(times), 3))
+    if wheel is not None:
+        carried[:, 2] = wheel(times)
+    return y[:, :4], (y[:, 4:] - carried) @ inverse.T
+
+
+def test_a_wheel_shows_the_scale_and_drag_and_delay_are_fitted():
+    rng = np.random.default_rng(3)
+    times = np.linspace(0, 2, 401)
+    delay, spin_inertia = 0.004, 0.01
+
+    def speed(t):
+        return 400 * (1 - np.exp(-2 * np.maximum(t, 0)))
+
+    _, omega = flight(
+        times,
+        np.array([5.0, 2.0, 3.0]),
+        wheel=lambda t: spin_inertia * speed(t - delay),
+        drag=(0.05, 0.02),
+    )
+    fit = fit_inertia(
+        times,
+        omega + 0.02 * rng.normal(size=omega.shape),
+        wheel_speed=speed(times),
+        omega_noise=0.02,
+        motion=SteppedMotion(spin_inertia, drag=Drag(), fit_drag=True, fit_delay=True),
+    )
+    assert fit.scale_known
+    assert int(fit.null_count) == 0
+    moments = np.linalg.eigvalsh(TENSOR)
+    off = (np.asarray(fit.moments) - moments) / np.asarray(fit.moments_std)
+    assert np.abs(off).max() < 4
+    assert np.max(np.asarray(fit.moments_std) / moments) < 0.01
+    # after the tensor: drag's two numbers and the delay, in the order of their names
+    spread = np.sqrt(np.diagonal(np.asarray(fit.covariance)))[6:9]
+    found = fit.parameters.motion
+    known = np.array([delay, 0.05, 0.02])
+    got = np.array([found["delay"], found["drag"].linear, found["drag"].quadratic])
+    assert np.all(np.abs(got - known) < 4 * spread)
+    assert spread[0] < 0.001
+    assert 0.9 < float(fit.noise) < 1.1
+
+
+TIMES = np.linspace(0, 3, 61)
+SENSOR = {"bias": np.array([0.3, -0.2, 0.1]), "turn": np.array([0.1, -0.15, 0.2])}
+
+
+def sensed(times, *, flip=(1, 1, 1), outliers=0):
+    """A biased gyroscope turned against the body, attitudes, an accelerometer on a lever arm."""
+    rng = np.random.default_rng(8)
+    wxyz, omega = flight(times, np.array([3.0, 1.0, -2.0]))
+    slope = np.linalg.solve(TENSOR, np.cross(omega @ TENSOR, omega).T).T
+    lever = np.array([0.05, -0.02, 0.1])
+    force = np.cross(slope, lever) + np.cross(omega, np.cross(omega, lever))
+    rates = Rotation.from_rotvec(SENSOR["turn"]).inv().apply(omega) + SENSOR["bias"]
+    rates = rates * np.array(flip) + 0.02 * rng.normal(size=omega.shape)
+    rates[rng.choice(len(times), outliers, replace=False)] += 3.0
+    small = 0.01 * rng.normal(size=(len(times), 3))
+    xyzw = np.concatenate([wxyz[:, 1:], wxyz[:, :1]], axis=1)
+    seen = (Rotation.from_quat(xyzw) * Rotation.from_rotvec(small)).as_quat()
+    return {
+        "times": times,
+        "omega_body": rates,
+        "wxyz": np.concatenate([seen[:, 3:], seen[:, :3]], axis=1),
+        "force_body": force + 0.02 * rng.normal(size=force.shape),
+        "omega_noise": 0.02,
+        "attitude_noise": 0.01,
+        "force_noise": 0.02,
+    }, lever
+
+
+def test_bias_mounting_lever_and_outliers():
+    data, lever = sensed(TIMES, outliers=4)
+    fit = fit_inertia(**data, bias=True, mounting=True, robust=Huber(3.0), throw=False)
+    spread = np.sqrt(np.diagonal(np.asarray(fit.covariance)))
+    found = fit.parameters
+    for got, known, place in (
+        (found.bias, SENSOR["bias"], 6),
+        (found.mounting, SENSOR["turn"], 9),
+        (found.lever, lever, 12),
+    ):
+        assert np.all(np.abs(np.asarray(got) - known) < 4 * spread[place : place + 3])
+    true = np.linalg.eigvalsh(TENSOR)
+    off = (np.asarray(fit.ratios) - true / true[2])[:2] / np.asarray(fit.ratios_std)[:2]
+    assert np.abs(off).max() < 4
+    assert not int(fit.finding) & int(Finding.STEP_LIMIT | Finding.AXES_DISAGREE)
+    # an inverted axis is refused, not fitted
+    wrong, _ = sensed(TIMES, flip=(1, 1, -1))
+    bad = fit_inertia(**wrong, bias=True, mounting=True, robust=Huber(3.0), throw=False)
+    assert int(bad.finding) & int(Finding.AXES_DISAGREE)
+    matrix = np.asarray(
+        sensor_axes(Recording.of(wrong["times"], wrong["omega_body"], wxyz=wrong["wxyz"]))
+    )
+    assert np.linalg.det(matrix) < 0
+
+
+def test_windows_of_a_long_recording_in_single_precision():
+    rng = np.random.default_rng(4)
+    times = np.linspace(0, 12, 241, dtype=np.float32)
+    moments = np.linalg.eigvalsh(TENSOR)
+    turn = np.linalg.eigh(TENSOR)[1]
+    turn = turn * np.sign(np.linalg.det(turn))
+    _, omega = flight(times.astype(float), turn @ np.array([0.5, 4.0, 1.0]))
+    rates = (omega @ turn + 0.02 * rng.normal(size=omega.shape)).astype(np.float32)
+    whole = Recording.of(times, rates, omega_noise=np.float32(0.02))
+    parts = windows(whole, 61)
+    assert len(parts) == 4
+    assert float(parts[1].times[0]) == float(parts[0].times[-1])
+    fit = fit_recordings(parts, unknown=MomentsOnly(), noise_known=True)
+    assert fit.moments.dtype == jnp.float32
+    assert fit.parameters.omega.shape == (4, 3)
+    off = (np.asarray(fit.ratios) - moments / moments[2])[:2] / np.asarray(fit.ratios_std)[:2]
+    assert np.abs(off).max() < 4
+    assert np.asarray(fit.ratios_std).max() < 0.01
+    angle = np.abs(np.asarray(to_matrix(fit.axes)))
+    np.testing.assert_allclose(angle, np.eye(3), atol=1e-6)
+    assert 0.9 < float(fit.noise) < 1.1
+
+
+def reference():
+    """The 50-digit series of tests/free."""
+    path = Path(__file__).parents[1] / "free" / "reference_free.py"
+    found = importlib.util.spec_from_file_location("reference_free", path)
+    module = importlib.util.module_from_spec(found)
+    found.loader.exec_module(module)
+    return module
+
+
+def test_gradient_of_the_residuals_against_50_digits():
+    taylor = reference()
+    sigma = np.diag([1.1, 0.7, 0.4])
+    base = base_of(jnp.asarray(sigma), True)
+    fixed = tuple(map(tuple, free_columns(FullTensor(), True).tolist()))
+    model = Model(FreeMotion(), base, None, None, fixed, True)
+    times = np.array([0.0, 0.4, 1.1, 2.5])
+    recording = stack([Recording.of(times, np.ones((4, 3)), omega_noise=0.1)])
+    omega = np.array([0.8, 2.0, -1.1])
+
+    def flat(shape, omega):
+        return residuals(Parameters(shape, omega[None]), recording, model)["omega"].ravel()
+
+    slopes = jax.jit(jax.jacfwd(flat, argnums=(0, 1)))(jnp.zeros(6), jnp.asarray(omega))
+    found = np.concatenate([np.asarray(s) for s in slopes], axis=1)
+    soft = mp.mpf(float(base.soft))
+    unit = float(base.soft) / 5e-3
+
+    def truth(y):
+        """The same residuals, everything by mpmath."""
+        with mp.workdps(50):
+            e = [mp.mpf(float(b)) + mp.mpf(unit) * x for b, x in zip(base.entries, y[:6])]
+            a, b, c, p, q, r = e
+            s = mp.matrix([[a, r, q], [r, b, p], [q, p, c]])
+            values, vectors = mp.eigsy(s)
+            bent = [(v + mp.sqrt(v * v + soft * soft)) / 2 for v in values]
+            second = vectors * mp.diag(bent) * vectors.T
+            total = second[0, 0] + second[1, 1] + second[2, 2]
+            inertia = mp.eye(3) * total - second
+            diagonal = [inertia[k, k] for k in range(3)]
+            off = [inertia[0, 1], inertia[0, 2], inertia[1, 2]]
+            rows = []
+            for t in times:
+                found = taylor.free_reference(diagonal, [1, 0, 0, 0], y[6:], mp.mpf(t), off)
+                rows += [(1 - w) / mp.mpf(0.1) for w in found[1]]
+            return rows
+
+    h = mp.mpf(10) ** -12
+    at = [mp.mpf(0)] * 6 + [mp.mpf(x) for x in omega]
+    for k in (0, 4, 7):
+        ends = []
+        for sign in (1, -1):
+            moved = list(at)
+            moved[k] += sign * h
+            ends.append(truth(moved))
+        column = np.array([float((a - b) / (2 * h)) for a, b in zip(*ends)])
+        error = np.abs(found[:, k] - column).max() / np.abs(column).max()
+        assert error < 1e-10, (k, error)
+
+
+@pytest.mark.parametrize("threshold", [0.0, -1.0])
+def test_a_loss_needs_a_positive_threshold(threshold):
+    with pytest.raises(ValueError, match="positive"):
+        Huber(threshold)
