@@ -23,9 +23,10 @@ def fit(result: Any, recording: Any, *, body: int = 0, title: str = ""):
         raise ValueError("the figure of a fit needs a recording of rates, got attitudes alone.")
     one = _single(result, recording, body)
     figure = new_figure(11.0, 7.0)
-    grid = figure.add_gridspec(4, 2, width_ratios=(1.7, 1.0))
-    rows = [figure.add_subplot(grid[0, 0])]
-    rows += [figure.add_subplot(grid[k, 0], sharex=rows[0]) for k in (1, 2, 3)]
+    sides = figure.add_gridspec(1, 2, width_ratios=(1.7, 1.0))
+    left, right = sides[0].subgridspec(4, 1), sides[1].subgridspec(2, 1, height_ratios=(1.2, 1.0))
+    rows = [figure.add_subplot(left[0])]
+    rows += [figure.add_subplot(left[k], sharex=rows[0]) for k in (1, 2, 3)]
     dense = one["times"].size > 300
     for k, color in enumerate(AXES):
         ax = rows[k]
@@ -34,8 +35,8 @@ def fit(result: Any, recording: Any, *, body: int = 0, title: str = ""):
         ax.plot(one["times"], one["model"][:, k], color=color, label="model")
         ax.set_title(f"Rate about {'xyz'[k]}")
         ax.set_ylabel("[rad/s]")
-        ax.legend(loc="upper right", ncols=2, borderpad=0.2)
         rows[3].plot(one["times"], one["residual"][:, k], ".", color=color, markersize=3)
+    rows[0].legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=2, borderpad=0)
     for size in (-2, 0, 2):
         rows[3].axhline(size * one["chi"], color=GREY, linewidth=0.8, zorder=1)
     rows[3].set_title("Residuals over noise, lines at twice their spread")
@@ -43,8 +44,8 @@ def fit(result: Any, recording: Any, *, body: int = 0, title: str = ""):
     for ax in rows:
         ax.margins(x=0.01)
         ax.label_outer()
-    _region(figure.add_subplot(grid[:2, 1]), one)
-    _table(figure.add_subplot(grid[2:, 1]), one)
+    _region(figure.add_subplot(right[0]), one)
+    _table(figure.add_subplot(right[1]), one)
     if title:
         figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
     return figure
@@ -144,7 +145,11 @@ def _region(ax, one):
     if not one["scale_known"]:
         limits = ax.get_xlim(), ax.get_ylim()
         line = np.linspace(0, 1, 201)
-        ax.fill_between(line, 0, 1 - line, color=GREY, alpha=0.35, label="no body", linewidth=0)
+        reached = limits[0][0] + limits[1][0] < 1
+        ax.fill_between(
+            line, 0, 1 - line, color=GREY, alpha=0.35, linewidth=0,
+            label="no body" if reached else None,
+        )  # fmt: skip
         ax.set_xlim(*limits[0])
         ax.set_ylim(*limits[1])
     ax.legend(loc="best")
@@ -158,7 +163,7 @@ def _table(ax, one):
     head = "moments [kg m²]" if one["scale_known"] else "ratios"
     lines = [f"{'principal ' + head:<28}axis known to"]
     for value, spread, turn in zip(one["value"], one["spread"], one["axes_std"], strict=True):
-        known = f"{value:.6g} ± {spread:.1g}" if spread > 0 else f"{value:.6g}"
+        known = _rounded(value, spread)
         angle = f"{np.degrees(turn):.2g}°" if np.isfinite(turn) else "-"
         lines.append(f"{known:<28}{angle}")
     lines += [
@@ -173,3 +178,16 @@ def _table(ax, one):
         0.0, 0.95, "\n".join(lines), family="monospace", fontsize=8.5, va="top", linespacing=1.5,
         transform=ax.transAxes, color=INK,
     )  # fmt: skip
+
+
+def _rounded(value, spread) -> str:
+    """A value with two digits of its spread."""
+    if not spread > 0:
+        return f"{value:.6g}"
+    if not np.isfinite(spread):
+        return f"{value:.6g} (not determined)"
+    power = int(np.floor(np.log10(abs(value)))) if value else 0
+    if abs(power) > 3:
+        return f"({_rounded(value / 10.0**power, spread / 10.0**power)}) 1e{power}"
+    digits = max(0, 1 - int(np.floor(np.log10(spread))))
+    return f"{value:.{digits}f} ± {spread:.{digits}f}"
