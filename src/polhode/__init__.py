@@ -22,6 +22,7 @@ from polhode._top_methods import (
 )
 from polhode._trajectory import Trajectory as Trajectory
 from polhode._version import __version__ as __version__
+from polhode.fit import fit_inertia as fit_inertia, fit_recordings as fit_recordings
 from polhode.frames import (
     RotatingFrame as RotatingFrame,
     accelerometer as accelerometer,

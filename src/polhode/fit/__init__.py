@@ -34,3 +34,4 @@ from polhode.fit._result import (
     remarks as remarks,
     sensor_axes as sensor_axes,
 )
+from polhode.fit._scene_motion import SceneMotion as SceneMotion

@@ -14,10 +14,10 @@ from polhode.rotation import conjugate, multiply, rotate, to_matrix
 
 
 class Motion(NamedTuple):
-    """Rates, their derivatives and (if asked for) attitudes at the times of a recording."""
+    """Rates, their derivatives (None: unknown) and, if asked for, attitudes at given times."""
 
     omega: Float[Array, "t 3"]
-    omega_dot: Float[Array, "t 3"]
+    omega_dot: Float[Array, "t 3"] | None
     wxyz: Float[Array, "t 4"] | None
 
 

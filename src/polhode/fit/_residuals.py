@@ -101,6 +101,11 @@ def residuals(
         vector = 2 * sign * apart[..., 1:]
         parts["attitude"] = weight * vector / recording.attitude_noise[..., None]
     if recording.force is not None:
+        if motion.omega_dot is None:
+            raise ValueError(
+                "force_body needs a motion that gives angular accelerations: FreeMotion or "
+                f"SteppedMotion, got {type(model.motion).__name__}."
+            )
         lever = jnp.broadcast_to(parameters.lever, motion.omega.shape)
         felt = jnp.cross(motion.omega_dot, lever) + jnp.cross(
             motion.omega, jnp.cross(motion.omega, lever)

@@ -13,7 +13,7 @@ from polhode.fit._linear import entries_of, whole_of
 from polhode.fit._parameters import Parameters
 from polhode.fit._recording import Recording
 from polhode.fit._residuals import Model
-from polhode.fit._solve import Problem, Solution
+from polhode.fit._solve import Problem, Solution, misfit_of
 from polhode.inertia import Inertia, physical_margin, principal
 from polhode.rotation import conjugate, multiply, to_matrix
 
@@ -154,7 +154,9 @@ def remarks(fit: InertiaFit, body: int = 0) -> list[str]:
     if not fit.scale_known:
         found.append(_SCALE)
         if fit.free_rates:
-            twin = np.sort(np.asarray(fit.mirrored.moments).reshape(-1, 3)[body])
+            values = np.asarray(fit.moments).reshape(-1, 3)[body]
+            twin = np.sort(values * (values.sum() - 2 * values))
+            twin = twin / twin[2]
             found.append(
                 "free rates do not show the handedness of the axes: with one axis inverted the "
                 f"same data mean {twin[0]:.4f} : {twin[1]:.4f} : 1; compare with what you know of "
@@ -228,7 +230,7 @@ def conclude(solution: Solution, recording: Recording, problem: Problem) -> Iner
         (Finding.UNDETERMINED, jnp.any(~jnp.isfinite(spread[3:6]))),
         (Finding.NOT_WHITE, whiteness < 1e-4),
         (Finding.WEAK, jnp.any(spread[3:6] > 0.05)),
-        (Finding.POOR, 2 * solution.cost > 4 * solution.expected),
+        (Finding.POOR, misfit_of(linear, problem.robust) > 4 * solution.expected),
         (Finding.AXES_DISAGREE, _axes_disagree(recording, problem)),
     )
     finding = sum(jnp.where(seen, int(flag), 0) for flag, seen in flags)
@@ -247,12 +249,7 @@ def sensor_axes(recording: Recording) -> Float[Array, "*b 3 3"]:
     The identity for a gyroscope aligned with the attitudes' body axes; near -1 in place of 1 on the
     diagonal for an inverted axis, a permutation for exchanged ones, a rotation for a mounting.
     """
-    turn = multiply(conjugate(recording.wxyz[..., :-1, :]), recording.wxyz[..., 1:, :])
-    sign = jnp.where(turn[..., :1] < 0, -1, 1).astype(turn.dtype)
-    weight = (recording.present[..., 1:] * recording.present[..., :-1])[..., None]
-    seen = weight * 2 * sign * turn[..., 1:]
-    step = jnp.diff(recording.times, axis=-1)[..., None] * weight
-    measured = step * (recording.omega[..., 1:, :] + recording.omega[..., :-1, :]) / 2
+    measured, seen = _turns(recording)
     mixed = jnp.einsum("...ti,...tj->...ij", measured, seen)
     square = jnp.einsum("...ti,...tj->...ij", seen, seen)
     return jnp.swapaxes(jnp.linalg.solve(square, jnp.swapaxes(mixed, -1, -2)), -1, -2)
@@ -262,13 +259,35 @@ def _axes_disagree(recording: Recording, problem: Problem) -> Array:
     """Whether gyroscope and attitudes contradict each other beyond any mounting rotation."""
     if recording.omega is None or recording.wxyz is None:
         return jnp.asarray(False)
-    matrix = jnp.mean(sensor_axes(recording), axis=0)
-    inverted = jnp.linalg.det(matrix) < 0
+    measured, seen = _turns(recording)
+    # the proper rotation nearest to the correlation of both, and how much its mirror image gains
+    left, sizes, right = jnp.linalg.svd(jnp.einsum("rti,rtj->ij", measured, seen))
+    hand = jnp.sign(jnp.linalg.det(left) * jnp.linalg.det(right))
+    inverted = (hand < 0) & (sizes[2] > 0.1 * sizes[1])
     if problem.mounting:
         return inverted
-    trace = matrix[0, 0] + matrix[1, 1] + matrix[2, 2]
+    signs = jnp.stack([jnp.ones_like(hand), jnp.ones_like(hand), hand])
+    turn = left @ (signs[:, None] * right)
     # less than this is a turn of more than 60 degrees between the axes
-    return inverted | (trace < 2)
+    return inverted | (turn[0, 0] + turn[1, 1] + turn[2, 2] < 2)
+
+
+def _turns(recording: Recording) -> tuple[Array, Array]:
+    """Turns between samples by the rates and by the attitudes (..., T-1, 3), means removed.
+
+    The mean of the difference is the gyroscope's bias.
+    """
+    turn = multiply(conjugate(recording.wxyz[..., :-1, :]), recording.wxyz[..., 1:, :])
+    sign = jnp.where(turn[..., :1] < 0, -1, 1).astype(turn.dtype)
+    weight = (recording.present[..., 1:] * recording.present[..., :-1])[..., None]
+    step = jnp.diff(recording.times, axis=-1)[..., None]
+    measured = step * (recording.omega[..., 1:, :] + recording.omega[..., :-1, :]) / 2
+    total = jnp.sum(weight, axis=-2, keepdims=True)
+
+    def centred(values):
+        return weight * (values - jnp.sum(weight * values, axis=-2, keepdims=True) / total)
+
+    return centred(measured), centred(2 * sign * turn[..., 1:])
 
 
 def _whiteness(parts: dict[str, Array], present: Array, lags: int = 5) -> Array:

@@ -164,7 +164,7 @@ def solve(recording: Recording, problem: Problem) -> Solution:
         return _Search(
             job + 1, found.value, best, base, linear, cost,
             search.steps + found.stats["num_steps"], search.attempts + jnp.where(whole, 1, 0),
-            stopped, stopped & (again | (2 * cost <= _GOOD**2 * expected)),
+            stopped, stopped & (again | (misfit_of(linear, problem.robust) <= _GOOD**2 * expected)),
         )  # fmt: skip
 
     one = jax.tree.map(lambda leaf: leaf[0], bases)
@@ -209,6 +209,12 @@ def _jobs(bases: int, attempts: int) -> dict[str, np.ndarray]:
     rows = [row for one in tries[: max(attempts, 1)] for row in one]
     base, part, anew = zip(*rows, strict=True)
     return {"base": np.array(base), "part": np.array(part), "anew": np.array(anew)}
+
+
+def misfit_of(linear: Linear, robust: Huber | None) -> Float[Array, ""]:
+    """The sum of squares that is to be compared with the noise: an outlier counts as its bound."""
+    square = linear.rest**2
+    return jnp.sum(square if robust is None else jnp.minimum(square, robust.threshold**2))
 
 
 def _kinds(recording: Recording) -> int:
@@ -283,7 +289,7 @@ def _bases(recording, rates, problem) -> Base:
         first = second_moments(problem.known.tensor)
     bodies = jnp.stack([first, second, *alternatives(rates, first)])
     if problem.unknown.columns().shape[1] == 3:
-        bodies = bodies * jnp.eye(3, dtype=bodies.dtype)
+        bodies = bodies * jnp.eye(3, dtype=bodies.dtype)[None]
     known = problem.motion.fixes_scale()
     return jax.vmap(lambda sigma: base_of(sigma, known))(bodies)
 

@@ -1,0 +1,49 @@
+"""The motion of any scene as the model of a fit: known torques, rotors, potentials, damping."""
+
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+
+from polhode._methods import AbstractMethod, LiePoisson
+from polhode._scene import Scene
+from polhode._simulate import simulate
+from polhode._state import State
+from polhode.fit._motion import AbstractMotion, Motion
+from polhode.inertia import Inertia
+
+
+class SceneMotion(AbstractMotion):
+    """Motion of the scene ``build(inertia, unknown)``, by ``ph.simulate``.
+
+    **Fields:** ``build`` makes a ``ph.Scene`` of an inertia and the motion's own unknowns;
+    ``unknown``: a pytree of their starting values, not zero where their size matters (it sets the
+    optimiser's unit), or None; ``shows_scale``: whether rates depend on the absolute size of the
+    inertia, true for known torques, rotors with known momentum and potentials; ``method``: one
+    that forward derivatives pass, by default steps of LiePoisson; ``rtol`` as in ``ph.simulate``.
+
+    A scene whose forces depend on the attitude needs attitudes in the recording, or starts from
+    the space axes. Accelerometer readings are not modelled.
+    """
+
+    build: Callable[[Inertia, Any], Scene] = eqx.field(static=True)
+    unknown: Any = None
+    shows_scale: bool = eqx.field(static=True, default=True)
+    method: AbstractMethod = LiePoisson(adjoint=diffrax.ForwardMode())
+    rtol: float | None = eqx.field(static=True, default=None)
+
+    def start(self):
+        return self.unknown
+
+    def fixes_scale(self):
+        return self.shows_scale
+
+    def __call__(self, tensor, omega, wxyz, times, wheel, unknown):
+        scene = self.build(Inertia(full=tensor), unknown)
+        start = jnp.asarray([1, 0, 0, 0], omega.dtype) if wxyz is None else wxyz
+        found = simulate(
+            scene, State(wxyz=start, omega_body=omega), times, self.method, rtol=self.rtol
+        )
+        return Motion(found.omega_body, None, None if wxyz is None else found.wxyz)
