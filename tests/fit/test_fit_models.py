@@ -27,6 +27,7 @@ from polhode.fit import (
     SteppedMotion,
     fit_inertia,
     fit_recordings,
+    log_density,
     residuals,
     sensor_axes,
     stack,
@@ -237,6 +238,10 @@ def test_gradient_of_the_residuals_against_50_digits():
 
     slopes = jax.jit(jax.jacfwd(flat, argnums=(0, 1)))(jnp.zeros(6), jnp.asarray(omega))
     found = np.concatenate([np.asarray(s) for s in slopes], axis=1)
+    density = log_density(recording, model)(Parameters(jnp.zeros(6), jnp.asarray(omega)[None]))
+    assert float(density) == pytest.approx(
+        -np.sum(np.asarray(flat(jnp.zeros(6), jnp.asarray(omega))) ** 2) / 2
+    )
     soft = mp.mpf(float(base.soft))
     unit = float(base.soft) / 5e-3
 

@@ -24,6 +24,7 @@ from polhode.fit._recording import Recording as Recording, stack as stack
 from polhode.fit._residuals import (
     Huber as Huber,
     Model as Model,
+    log_density as log_density,
     predict as predict,
     residuals as residuals,
 )

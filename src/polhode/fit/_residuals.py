@@ -1,5 +1,7 @@
 """Data minus model in units of the noise: the function that every optimiser needs."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -114,3 +116,22 @@ def residuals(
     if model.robust is not None:
         parts = {name: model.robust(part) for name, part in parts.items()}
     return parts
+
+
+def log_density(
+    recording: Recording, model: Model, prior: Callable[[Parameters], Array] | None = None
+) -> Callable[[Parameters], Float[Array, ""]]:
+    """Logarithm of the posterior density of ``Parameters``, up to a constant, for any sampler.
+
+    ``recording`` as in ``residuals`` (one leading axis: ``stack([recording])``), ``model`` that of
+    a fit, whose ``parameters`` are the place to start from; ``prior`` adds the logarithm of its
+    density (None: flat in the parameters, that is in the second moments away from flat bodies).
+    BlackJAX takes the result as it is; in NumPyro hand its negative to ``potential_fn``.
+    """
+
+    def density(parameters):
+        parts = residuals(parameters, recording, model)
+        misfit = -sum(jnp.sum(part**2) for part in parts.values()) / 2
+        return misfit if prior is None else misfit + prior(parameters)
+
+    return density
