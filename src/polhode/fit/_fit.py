@@ -58,8 +58,8 @@ def fit_inertia(
     start from. ``bias``, ``mounting``: whether to fit them. ``robust``: ``Huber(threshold)``, in
     standard deviations, needs a known noise. ``starts``: how many attempts are made at most (1:
     from a regression only; the next ones follow where its result misses the data: from another
-    regression, to growing parts of the recording, from other bodies). ``solver``: any optimistix
-    least-squares solver.
+    regression, to growing parts of the recording, from other bodies). ``solver``: any
+    Gauss-Newton solver of optimistix.
 
     Torque-free rates show only the ratios of the moments: see ``InertiaFit.scale_known``. Every
     iterate is a physical body. Left-handed axes are not fitted away: with attitudes they are

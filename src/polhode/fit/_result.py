@@ -249,7 +249,7 @@ def sensor_axes(recording: Recording) -> Float[Array, "*b 3 3"]:
     The identity for a gyroscope aligned with the attitudes' body axes; near -1 in place of 1 on the
     diagonal for an inverted axis, a permutation for exchanged ones, a rotation for a mounting.
     """
-    measured, seen = _turns(recording)
+    measured, seen = _turns(recording, centred=False)
     mixed = jnp.einsum("...ti,...tj->...ij", measured, seen)
     square = jnp.einsum("...ti,...tj->...ij", seen, seen)
     return jnp.swapaxes(jnp.linalg.solve(square, jnp.swapaxes(mixed, -1, -2)), -1, -2)
@@ -259,7 +259,7 @@ def _axes_disagree(recording: Recording, problem: Problem) -> Array:
     """Whether gyroscope and attitudes contradict each other beyond any mounting rotation."""
     if recording.omega is None or recording.wxyz is None:
         return jnp.asarray(False)
-    measured, seen = _turns(recording)
+    measured, seen = _turns(recording, centred=problem.bias)
     # the proper rotation nearest to the correlation of both, and how much its mirror image gains
     left, sizes, right = jnp.linalg.svd(jnp.einsum("rti,rtj->ij", measured, seen))
     hand = jnp.sign(jnp.linalg.det(left) * jnp.linalg.det(right))
@@ -272,22 +272,23 @@ def _axes_disagree(recording: Recording, problem: Problem) -> Array:
     return inverted | (turn[0, 0] + turn[1, 1] + turn[2, 2] < 2)
 
 
-def _turns(recording: Recording) -> tuple[Array, Array]:
-    """Turns between samples by the rates and by the attitudes (..., T-1, 3), means removed.
+def _turns(recording: Recording, centred: bool) -> tuple[Array, Array]:
+    """Turns between samples by the rates and by the attitudes (..., T-1, 3).
 
-    The mean of the difference is the gyroscope's bias.
+    ``centred``: less their means, whose difference may be the gyroscope's bias.
     """
     turn = multiply(conjugate(recording.wxyz[..., :-1, :]), recording.wxyz[..., 1:, :])
     sign = jnp.where(turn[..., :1] < 0, -1, 1).astype(turn.dtype)
     weight = (recording.present[..., 1:] * recording.present[..., :-1])[..., None]
     step = jnp.diff(recording.times, axis=-1)[..., None]
     measured = step * (recording.omega[..., 1:, :] + recording.omega[..., :-1, :]) / 2
-    total = jnp.sum(weight, axis=-2, keepdims=True)
-
-    def centred(values):
-        return weight * (values - jnp.sum(weight * values, axis=-2, keepdims=True) / total)
-
-    return centred(measured), centred(2 * sign * turn[..., 1:])
+    turned = 2 * sign * turn[..., 1:]
+    if centred:
+        total = jnp.sum(weight, axis=-2, keepdims=True)
+        measured, turned = (
+            x - jnp.sum(weight * x, axis=-2, keepdims=True) / total for x in (measured, turned)
+        )
+    return weight * measured, weight * turned
 
 
 def _whiteness(parts: dict[str, Array], present: Array, lags: int = 5) -> Array:

@@ -112,7 +112,13 @@ def solve(recording: Recording, problem: Problem) -> Solution:
         motion=jax.tree.map(lambda x: jnp.asarray(x, dtype), problem.motion.start()),
     )
     scale = _scale(begin, recording, rates)
-    fresh = jax.tree.map(jnp.divide, begin, scale)
+    # the optimiser counts in the default precision whatever that of the data
+    wide = jnp.result_type(float)
+    fresh = jax.tree.map(lambda a, b: (a / b).astype(wide), begin, scale)
+
+    def actual(scaled):
+        return jax.tree.map(lambda a, b: a.astype(dtype) * b, scaled, scale)
+
     weight = _weight(recording, rates)
     solver = problem.solver or LevenbergMarquardt(_OFFSET, float(jnp.finfo(dtype).eps) ** 0.75)
     expected = _expected(recording, problem)
@@ -123,12 +129,13 @@ def solve(recording: Recording, problem: Problem) -> Solution:
     def misfits(scaled, job):
         base, within, belief = job
         model = model_of(base)
-        shared, own, one = unknowns(jax.tree.map(jnp.multiply, scaled, scale), model)
+        shared, own, one = unknowns(actual(scaled), model)
         # The Jacobian is made here, once and by blocks: what the optimiser differentiates is linear
         at = jax.lax.stop_gradient((shared, own))
         linear = linearise(*at, one, within, model)
         misfit = linear.shifted(shared - at[0], own - at[1])
-        return weight * jnp.concatenate([misfit.ravel(), belief * scaled.shape]), linear
+        prior = belief * scaled.shape.astype(dtype)
+        return (weight * jnp.concatenate([misfit.ravel(), prior])).astype(wide), linear
 
     jobs = _jobs(bases.soft.shape[0], problem.starts)
     which, part = (jnp.asarray(column) for column in (jobs["base"], jobs["part"]))
@@ -176,7 +183,7 @@ def solve(recording: Recording, problem: Problem) -> Solution:
     )  # fmt: skip
     count = len(jobs["base"])
     ended = jax.lax.while_loop(lambda s: (s.job < count) & ~s.good, attempt, begun)
-    parameters = jax.tree.map(jnp.multiply, ended.best, scale)
+    parameters = actual(ended.best)
     model = model_of(ended.base)
     tensor, linear = model.tensor(parameters), ended.linear
     if not scale_known:
