@@ -159,7 +159,10 @@ def compiling(report: dict) -> list[str]:
             if row["compile_s"] is not None:
                 spans.setdefault(row["peer"], []).append(row["compile_s"])
     words = [f"{name} {min(x):.2f} to {max(x):.1f} s" for name, x in spans.items()]
-    return [f"- Compiling, per program: {'; '.join(words)}; SciPy and MuJoCo compile nothing."]
+    return [
+        f"- Compiling, per program: {'; '.join(words)} (least: found again in the same run);"
+        " SciPy and MuJoCo compile nothing."
+    ]
 
 
 def merged() -> dict | None:

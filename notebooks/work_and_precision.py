@@ -58,13 +58,16 @@ for name, setting in programs:
     found = curves.setdefault(name, ([], []))
     found[0].append(errors[name, setting]["attitude_median"])
     found[1].append(times[name, setting].median / programs[name, setting].bodies)
-ax = plot.work_precision(
+fig, ax = plt.subplots(figsize=(9, 4), layout="constrained")
+plot.work_precision(
     curves,
+    ax=ax,
     highlight=next(name for name in curves if name.startswith("polhode")),
     time_label="run time per body [s]",
     error_label="attitude error at t = 100 [rad], median body",
 )
 ax.set_title("Asymmetric heavy top, 40 bodies")
+plt.show()
 
 # %% [markdown]
 # Euler angles lose twice: their equations are longer, and a body that passes near a pole makes all
