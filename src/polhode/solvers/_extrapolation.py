@@ -11,7 +11,7 @@ from jaxtyping import PyTree
 
 from polhode.solvers._dense import CollocationInterpolation, collocate
 from polhode.solvers._kernel import check_layout, kernel, map_blocks
-from polhode.solvers._problem import Problem
+from polhode.solvers._problem import Prepared, Problem
 
 SEQUENCES = {
     4: (2, 4),
@@ -106,8 +106,10 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         del solver_state, made_jump
 
         def advance(y, rest):
+            problem, (t, width), control = rest
+            prepared = problem.prepared(t, y, control)
             run = kernel(lambda *operands: _steps(self.formal_order, self.substeps, *operands))
-            return run(*rest, y)
+            return run(prepared, (t, width), control, y)
 
         problem = Problem.of(terms, args)
         rest = (problem, (t0, t1 - t0), problem.control(t0, t1, y0))
@@ -124,7 +126,7 @@ def _add_share(a: PyTree, share: float, b: PyTree) -> PyTree:
     return jax.tree.map(lambda x, y: x + share * y, a, b)
 
 
-def _steps(order: int, count: int, problem: Problem, times, control, y):
+def _steps(order: int, count: int, problem: Prepared, times, control, y):
     """State after ``count`` equal steps, summed size of their errors, states they started from."""
     t0, width = times
     share = jax.tree.map(lambda c: c / count, control)
@@ -139,7 +141,7 @@ def _steps(order: int, count: int, problem: Problem, times, control, y):
     return y, error, nodes
 
 
-def _step(order: int, problem: Problem, times, control, y):
+def _step(order: int, problem: Prepared, times, control, y):
     """New state and error estimate; the column with most substeps is the base of both sums.
 
     The others enter by their small differences to it, so that rounded weights cannot rescale

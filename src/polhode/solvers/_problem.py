@@ -8,6 +8,8 @@ import jax.numpy as jnp
 from diffrax import AbstractTerm
 from jaxtyping import PyTree
 
+from polhode.solvers._specialise import specialise
+
 
 class Problem(eqx.Module):
     """Term and arguments: their arrays, and everything else as static structure."""
@@ -35,3 +37,28 @@ class Problem(eqx.Module):
         """Vector field times control."""
         terms, args = eqx.combine(self.arrays, self.static)
         return terms.vf_prod(t, y, args, control)
+
+    def prepared(self, t, y, control) -> "Prepared":
+        """The increment, for states like ``y``, with all that rests on the arguments done."""
+        arrays, tree = jax.tree.flatten(self.arrays)
+        state, state_tree = jax.tree.flatten((t, y, control))
+
+        def increment(*leaves):
+            problem = Problem(jax.tree.unflatten(tree, leaves[: len(arrays)]), self.static)
+            return problem.increment(*jax.tree.unflatten(state_tree, leaves[len(arrays) :]))
+
+        closed, shape = jax.make_jaxpr(increment, return_shape=True)(*arrays, *state)
+        held, run = specialise(closed, arrays)
+        return Prepared(held, (run, jax.tree.structure(shape)))
+
+
+class Prepared(eqx.Module):
+    """A problem's increment with the arrays that it rests on; see ``Problem.prepared``."""
+
+    held: Any
+    static: Any = eqx.field(static=True)
+
+    def increment(self, t, y, control):
+        """Vector field times control."""
+        run, tree = self.static
+        return jax.tree.unflatten(tree, run(self.held, *jax.tree.leaves((t, y, control))))
