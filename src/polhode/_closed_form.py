@@ -1,5 +1,7 @@
 """The exact motion of the free body as a method: nothing is stepped."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,6 +32,8 @@ class ClosedForm(AbstractMethod):
 
     chunk: int | None = eqx.field(static=True, default=None)
     compensated: bool = eqx.field(static=True, default=False)
+
+    exact: ClassVar[bool] = True
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         del rtol

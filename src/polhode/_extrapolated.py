@@ -14,8 +14,14 @@ from polhode._methods import AbstractMethod, Record, Samples
 from polhode._scene import Scene
 from polhode._state import State
 from polhode._status import Status
-from polhode.hamiltonian import Dynamics, components, lie_poisson_field
-from polhode.solvers import Extrapolation, natural_rate, steps_for
+from polhode.hamiltonian import (
+    Dynamics,
+    components,
+    external_power,
+    from_quaternion,
+    lie_poisson_field,
+)
+from polhode.solvers import Extrapolation, flow, natural_rate, steps_for
 from polhode.torques import UniformGravity
 
 _HALF = math.sqrt(0.5)
@@ -39,22 +45,26 @@ class Extrapolated(AbstractMethod):
     error at the last time is about ``rtol`` radians for the median body; chaotic bodies exceed it.
 
     **Arguments:** ``order``: even, 8 to 20 (low for loose tolerances); ``chunk``: bodies at once;
-    ``max_steps``; ``adjoint``: as in diffrax; its checkpoints bound the memory of a gradient;
+    ``max_steps``; ``adjoint``: None for reverse mode by the adjoint equations, integrated back with
+    the same steps (as accurate as the solution, memory of one step), or a diffrax adjoint, such as
+    ``diffrax.ForwardMode()`` for ``jax.jvp``;
     ``upright``: work in a space frame whose z axis is along the scene's ``UniformGravity``, which
-    must not vanish (a third of the work; other potentials and torques must be absent).
+    must not vanish (a third of the work; other potentials and torques must be absent);
+    ``on_axis``: with ``upright``, take the centre of mass to lie on body z.
     """
 
     order: int = eqx.field(static=True, default=12)
     chunk: int = eqx.field(static=True, default=256)
     max_steps: int = eqx.field(static=True, default=2**20)
-    adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=32)
+    adjoint: diffrax.AbstractAdjoint | None = None
     upright: bool = eqx.field(static=True, default=False)
+    on_axis: bool = eqx.field(static=True, default=False)
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         n = state.wxyz.shape[0]
         turn = None
         if self.upright:
-            scene, state, turn = _upright(scene, state)
+            scene, state, turn = _upright(scene, state, self.on_axis)
         rate = jax.lax.stop_gradient(lane_rates(scene, state, ts))
         order = jnp.argsort(rate) if n > self.chunk else jnp.arange(n)
         lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
@@ -68,7 +78,8 @@ class Extrapolated(AbstractMethod):
 
         size = 1 if ts.ndim == 2 else self.chunk
         found = map_chunks(one, sorted_lanes, n, size)
-        momentum, wxyz, status, steps = jax.tree.map(lambda x: x[jnp.argsort(order)], found)
+        path, status, steps = jax.tree.map(lambda x: x[jnp.argsort(order)], found)
+        momentum, wxyz, *work = path
         momentum, wxyz = (jnp.stack(x, axis=-1) for x in (momentum, wxyz))
         later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
         if turn is not None:
@@ -80,6 +91,7 @@ class Extrapolated(AbstractMethod):
             omega if record.rates else None,
             status,
             steps,
+            work[0] if record.work else None,
         )
 
     def _solve(self, scene, state, ts, rate, rtol, record):
@@ -89,6 +101,9 @@ class Extrapolated(AbstractMethod):
         dynamics = Dynamics(scene.hamiltonian, scene.torque)
         momentum = scene.momentum(state.omega_body, ts[0])
         y0 = (components(momentum), tuple(state.wxyz[..., i] for i in range(4)))
+        field = lie_poisson_field
+        if record.work:
+            y0, field = (*y0, jnp.zeros_like(y0[0][0])), _field_and_power
         horizon = jnp.abs(ts[-1] - ts[0])
         total = steps_for(self.order, rtol, jnp.max(rate), horizon)
 
@@ -96,8 +111,13 @@ class Extrapolated(AbstractMethod):
             start, end = interval
             share = jnp.ceil(total * jnp.abs(end - start) / (horizon * substeps))
             count = jax.lax.stop_gradient(jnp.maximum(share, 1))
+            if self.adjoint is None:
+                y, reached, steps = flow(
+                    field, dynamics, y, (start, end), count, solver, self.max_steps
+                )
+                return y, (y, reached, steps)
             solution = diffrax.diffeqsolve(
-                diffrax.ODETerm(lie_poisson_field),
+                diffrax.ODETerm(field),
                 solver,
                 start,
                 end,
@@ -125,7 +145,13 @@ class Extrapolated(AbstractMethod):
             finite = finite & jnp.all(jnp.isfinite(x), axis=-1)
         status = jnp.where(finite, Status.SUCCESSFUL, Status.NOT_FINITE)
         status = jnp.where(jnp.all(reached), status, Status.MAX_STEPS)
-        return *path, status, jnp.broadcast_to(substeps * jnp.sum(steps), status.shape)
+        return path, status, jnp.broadcast_to(substeps * jnp.sum(steps), status.shape)
+
+
+def _field_and_power(t, y, dynamics):
+    """The Lie-Poisson field with the work of the external torques as one more component."""
+    power = external_power(t, y[0], from_quaternion(y[1]), dynamics)
+    return *lie_poisson_field(t, y[:2], dynamics), power
 
 
 _SUBSTEPS = 5
@@ -159,15 +185,16 @@ def lane_rates(scene: Scene, state: State, ts: Array) -> Array:
     return natural_rate(axial, tuple(1 / m for m in components(moments)), largest)
 
 
-def _upright(scene: Scene, state: State) -> tuple[Scene, State, Array]:
+def _upright(scene: Scene, state: State, on_axis: bool) -> tuple[Scene, State, Array]:
     """Scene and lanes seen from a frame with z along gravity, and the turn (N, 4) back."""
     gravity = scene.potential
     force = jnp.asarray(gravity.mass)[..., None] * gravity.gravity_space
     (w, x, y), size = tops.upward(components(force))
     zero = jnp.zeros_like(size)
     along = jnp.stack([zero, zero, size], axis=-1)
+    axial = gravity.on_axis or on_axis
     weight = UniformGravity(
-        jnp.ones((), size.dtype), gravity.centre_body, along, gravity.on_axis, vertical=True
+        jnp.ones((), size.dtype), gravity.centre_body, along, axial, vertical=True
     )
     turn = jnp.broadcast_to(jnp.stack([w, x, y, zero], axis=-1), state.wxyz.shape)
     turned = rotation.multiply(rotation.conjugate(turn), state.wxyz)

@@ -1,7 +1,7 @@
 """Ways to move the bodies of a scene. Options are objects: a method is handed over whole."""
 
 import abc
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -14,10 +14,15 @@ from polhode._scene import Scene
 from polhode._state import State
 from polhode._status import Status
 from polhode.hamiltonian import (
+    Attitude,
     Dynamics,
+    Vector,
     canonical_from_momentum,
     components,
     euler_angle_field,
+    external_power,
+    from_euler_angles,
+    from_quaternion,
     lie_poisson_field,
     momentum_from_canonical,
 )
@@ -25,11 +30,18 @@ from polhode.rotation import euler_to_wxyz, normalise, wxyz_to_euler
 
 
 class Record(eqx.Module):
-    """What to keep: attitude, rates, and whether only the last time (all static)."""
+    """What to keep: attitude, rates, and whether only the last time (all static).
+
+    ``work``: also integrate the work [J] that the external torques do. ``error``: also estimate
+    the error of each body at the last time, by a second, coarser run that costs about as much
+    again, and mark bodies that miss the tolerance by more than ten times ``Status.INACCURATE``.
+    """
 
     attitude: bool = eqx.field(static=True, default=True)
     rates: bool = eqx.field(static=True, default=True)
     final_only: bool = eqx.field(static=True, default=False)
+    work: bool = eqx.field(static=True, default=False)
+    error: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
         if not (self.attitude or self.rates):
@@ -37,16 +49,28 @@ class Record(eqx.Module):
 
 
 class Samples(NamedTuple):
-    """What a method returns for N lanes: (N, T, 4), (N, T, 3), (N,), (N,)."""
+    """What a method returns for N lanes: (N, T, 4), (N, T, 3), (N,), (N,), (N, T), (N,)."""
 
     wxyz: Array | None
     omega_body: Array | None
     status: Array
     steps: Array
+    work: Array | None = None
+    error: Array | None = None
 
 
 class AbstractMethod(eqx.Module):
-    """Base of all methods. ``run`` moves N lanes; ``simulate`` does the checks and the batching."""
+    """Base of all methods. ``run`` moves N lanes; ``simulate`` does the checks and the batching.
+
+    ``exact``: whether nothing is stepped; such a method is not asked for the work.
+    """
+
+    exact: ClassVar[bool] = False
+
+    @property
+    def asked_at_end(self) -> bool | None:
+        """Whether ``rtol`` is the error at the last time, else of each step; None: not used."""
+        return True
 
     @abc.abstractmethod
     def run(self, scene: Scene, state: State, ts: Array, rtol: float, record: Record) -> Samples:
@@ -84,6 +108,14 @@ class AbstractDiffraxMethod(AbstractMethod):
     def field(self, t, y, dynamics: Dynamics):
         """Vector field on the chart's component arrays."""
 
+    @property
+    def asked_at_end(self) -> bool | None:
+        return self.at_end if self.controller is None else None
+
+    @abc.abstractmethod
+    def seen(self, y: PyTree[Array]) -> tuple[Vector, Attitude]:
+        """Body momentum and attitude of the chart's component arrays."""
+
     @abc.abstractmethod
     def start(self, scene: Scene, state: State, t: Array) -> tuple[PyTree[Array], Array]:
         """Initial chart state of lanes, and which of them the chart can hold.
@@ -112,6 +144,12 @@ class AbstractDiffraxMethod(AbstractMethod):
         """The field on one array (components, N): for a diffrax solver far faster than leaves."""
         return _stack(self.field(t, _groups(y), dynamics))
 
+    def _field_and_power(self, t, y, dynamics):
+        """The same with the work of the external torques as one more component."""
+        momentum, attitude = self.seen(_groups(y[:-1]))
+        power = external_power(t, momentum, attitude, dynamics)
+        return jnp.concatenate([self._stacked_field(t, y[:-1], dynamics), power[None]])
+
     def _weights(self, scene, state, t, groups) -> Array:
         ones = jnp.ones_like(groups[0][0])
         momenta = ones / momentum_scale(scene, state, t)
@@ -124,7 +162,11 @@ class AbstractDiffraxMethod(AbstractMethod):
         """One chunk of lanes in one diffrax solve."""
         dynamics = Dynamics(scene.hamiltonian, scene.torque)
         groups, sound = self.start(scene, state, ts[0])
-        y0 = _stack(groups)
+        y0, weights = _stack(groups), self._weights(scene, state, ts[0], groups)
+        field = self._stacked_field
+        if record.work:  # follows from the rest: it does not decide the step
+            field = self._field_and_power
+            y0, weights = (jnp.concatenate([x, jnp.zeros_like(x[:1])]) for x in (y0, weights))
         controller = self.controller
         if controller is None:
             if self.at_end:
@@ -133,13 +175,13 @@ class AbstractDiffraxMethod(AbstractMethod):
             controller = diffrax.PIDController(
                 rtol=0.0,
                 atol=rtol,
-                norm=_LaneNorm(self._weights(scene, state, ts[0], groups)),
+                norm=_LaneNorm(weights),
             )
             if not record.final_only:  # samples as accurate as steps, not as the interpolant
                 controller = diffrax.ClipStepSizeController(controller, step_ts=ts)
         samples = diffrax.SubSaveAt(t1=True) if record.final_only else diffrax.SubSaveAt(ts=ts)
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(self._stacked_field),
+            diffrax.ODETerm(field),
             self.solver,
             ts[0],
             ts[-1],
@@ -153,7 +195,11 @@ class AbstractDiffraxMethod(AbstractMethod):
             progress_meter=self.progress_meter,
             throw=False,
         )
-        samples, last = (_groups(jnp.moveaxis(y, 0, -1)) for y in solution.ys)
+        samples, last = (jnp.moveaxis(y, 0, -1) for y in solution.ys)
+        work = samples[-1] if record.work else None
+        if record.work:
+            samples, last = samples[:-1], last[:-1]
+        samples, last = _groups(samples), _groups(last)
         later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
         kept = ts[-1:] if record.final_only else ts
         wxyz, omega, _ = self.finish(later, samples, kept[None])
@@ -166,6 +212,7 @@ class AbstractDiffraxMethod(AbstractMethod):
             omega if record.rates else None,
             status,
             jnp.broadcast_to(solution.stats["num_steps"], (n,)),
+            work,
         )
 
 
@@ -234,6 +281,9 @@ class LiePoisson(AbstractDiffraxMethod):
     def field(self, t, y, dynamics):
         return lie_poisson_field(t, y, dynamics)
 
+    def seen(self, y):
+        return y[0], from_quaternion(y[1])
+
     def start(self, scene, state, t):
         momentum = scene.momentum(state.omega_body, t)
         wxyz = tuple(state.wxyz[..., i] for i in range(4))
@@ -266,6 +316,9 @@ class EulerAngles(AbstractDiffraxMethod):
 
     def field(self, t, y, dynamics):
         return euler_angle_field(t, y, dynamics)
+
+    def seen(self, y):
+        return momentum_from_canonical(*y), from_euler_angles(*y[0])
 
     def start(self, scene, state, t):
         phi, theta, psi = q = wxyz_to_euler(state.wxyz)

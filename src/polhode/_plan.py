@@ -75,7 +75,10 @@ def choose(
         return exact, exact.law
     bodies = np.prod(common_batch(*(getattr(scene, name) for name in PARTS), state), dtype=int)
     if scene.potential is not None and scene.torque is None and bodies >= _MANY:
-        method = Extrapolated(_order(rtol), upright=_falls(scene.potential))
+        falls = _falls(scene.potential)
+        method = Extrapolated(
+            _order(rtol), upright=falls, on_axis=falls and _balanced(scene.potential)
+        )
         return method, (
             f"a potential acts on many bodies: extrapolated midpoint rule of order {method.order}"
             " in equal steps by each body's natural rate"
@@ -90,10 +93,12 @@ _MANY = 32
 
 
 def _order(rtol) -> int:
-    """Order of least work for a tolerance (benchmarks/integrators.py); 12 while it is traced."""
+    """Order of least work for a tolerance (benchmarks/integrators.py); 14 while it is traced."""
     if not is_concrete(rtol):
-        return 12
-    return next((o for o, bound in ((10, 1e-4), (12, 3e-10), (14, 1e-11)) if rtol >= bound), 16)
+        return 14
+    return next(
+        (o for o, bound in ((10, 1e-4), (12, 1e-8), (14, 1e-10), (16, 1e-11)) if rtol >= bound), 18
+    )
 
 
 def _falls(potential) -> bool:
@@ -104,6 +109,11 @@ def _falls(potential) -> bool:
     return is_concrete(force) and bool(
         np.all(np.asarray(force[0]) > 0) and np.all(np.any(np.asarray(force[1]) != 0, axis=-1))
     )
+
+
+def _balanced(gravity: UniformGravity) -> bool:
+    """Whether the centre of mass is known to lie on body z."""
+    return is_concrete(gravity.centre_body) and not np.any(np.asarray(gravity.centre_body)[..., :2])
 
 
 def plan(

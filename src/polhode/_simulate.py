@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from polhode import rotation
 from polhode._checks import as_float_array, describe, is_concrete, require
 from polhode._lanes import PARTS, common_batch, flatten
 from polhode._mesh import Split, on_devices, place, split_of
@@ -90,9 +91,13 @@ def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> T
         found = _moved(record, method, scene, state, ts, rtol)
     else:
         found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
-    wxyz, omega, status, steps = found
+    wxyz, omega, status, steps, work, error = found
     kept = ts[..., -1:] if record.final_only else ts
-    return Trajectory(kept, wxyz, omega, status, steps, scene)
+    trajectory = Trajectory(kept, wxyz, omega, status, steps, scene, work, error)
+    if record.work and method.exact:
+        work = _work_of_exact(trajectory, state, ts[..., :1])
+        return eqx.tree_at(lambda t: t.work, trajectory, work, is_leaf=lambda x: x is None)
+    return trajectory
 
 
 def _moved(record, method, scene, state, ts, rtol) -> Samples:
@@ -103,8 +108,66 @@ def _moved(record, method, scene, state, ts, rtol) -> Samples:
     times = ts
     if ts.ndim > 1:
         times = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
-    samples = method.run(Scene(**parts), lanes, times, rtol, record)
+    if record.error:
+        samples = _with_error(method, Scene(**parts), lanes, times, rtol, record)
+    else:
+        samples = method.run(Scene(**parts), lanes, times, rtol, record)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), samples)
+
+
+def _work_of_exact(trajectory: Trajectory, state: State, start: Array) -> Array:
+    """Work of the torques in an exact motion: nothing, or what the rates gain (no potential)."""
+    if trajectory.scene.torque is None:
+        return jnp.zeros((*trajectory.batch_shape, trajectory.ts.shape[-1]), start.dtype)
+    batch = trajectory.batch_shape
+    wxyz, omega = (
+        jnp.broadcast_to(x[..., None, :], (*batch, 1, x.shape[-1]))
+        for x in (state.wxyz, state.omega_body)
+    )
+    first = Trajectory(start, wxyz, omega, trajectory.status, trajectory.steps, trajectory.scene)
+    return trajectory.energy - first.energy
+
+
+_COARSER = 30
+"""How much looser the second run is that an error estimate comes from."""
+
+_TRUSTED = 10
+"""What the distance of the two runs is divided by; 29 if errors kept to the tolerances."""
+
+_ALLOWED = 10
+"""How often an error may exceed the tolerance before the body is called inaccurate."""
+
+
+def _with_error(method, scene, lanes, times, rtol, record) -> Samples:
+    """The samples, and for each body the estimated error of its attitude at the last time [rad]."""
+    plain = Record(record.attitude, record.rates, record.final_only, record.work)
+    size = jnp.linalg.norm(jax.lax.stop_gradient(lanes.omega_body), axis=-1)
+    if method.exact:
+        turned = jnp.maximum(1, size * jnp.abs(times[..., -1] - times[..., 0]))
+        error = jnp.finfo(size.dtype).eps * turned
+        return method.run(scene, lanes, times, rtol, plain)._replace(error=error)
+    if method.asked_at_end is None:
+        raise ValueError(
+            "Record(error=True) compares two tolerances, and this method has a step-size controller"
+            " of its own: leave it out, or drop error=True."
+        )
+
+    def at(rtol):
+        return method.run(scene, lanes, times, rtol, plain)
+
+    both = jax.lax.map(at, jnp.stack([rtol, _COARSER * rtol]))
+    fine, coarse = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
+    if record.attitude:
+        gap = rotation.angle_between(fine.wxyz[:, -1], coarse.wxyz[:, -1])
+    else:
+        change = jnp.linalg.norm(fine.omega_body[:, -1] - coarse.omega_body[:, -1], axis=-1)
+        gap = change / jnp.maximum(jnp.linalg.norm(fine.omega_body[:, -1], axis=-1), size)
+    error = jax.lax.stop_gradient(gap) / _TRUSTED
+    status = fine.status
+    if method.asked_at_end:
+        good = (status != Status.SUCCESSFUL) | (error <= _ALLOWED * rtol)
+        status = jnp.where(good, status, Status.INACCURATE)
+    return fine._replace(status=status, error=error)
 
 
 def check_method(method: Any) -> None:

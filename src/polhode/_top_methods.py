@@ -32,6 +32,8 @@ class AbstractTopMethod(AbstractMethod):
     chunk: eqx.AbstractVar[int]
     law: eqx.AbstractClassVar[str]
 
+    exact: ClassVar[bool] = True
+
     @abc.abstractmethod
     def why_not(self, scene: Scene, state: State, record: Record) -> str | None:
         """Why the law does not hold for the scene, in words; None where it is known to hold.

@@ -20,7 +20,10 @@ class Trajectory(eqx.Module):
     **Fields:** ``ts`` (T,) or (..., T) [s]; ``wxyz`` (..., T, 4) body -> space, or None when not
     recorded; ``omega_body`` (..., T, 3) [rad/s], or None; ``status`` (...): ``ph.Status`` per
     body; ``steps`` (...): solver steps (0 for an exact solution); ``scene``, the motion of its
-    rotors fixed by the initial state.
+    rotors fixed by the initial state; ``work`` (..., T) [J]: done by the external torques since
+    the first time, or None (``Record(work=True)``); ``error`` (...) [rad]: estimated error of the
+    attitude at the last time, or None (``Record(error=True)``; without attitude that of the rates,
+    relative).
     """
 
     ts: Float[Array, "*t"]
@@ -29,6 +32,8 @@ class Trajectory(eqx.Module):
     status: Int[Array, "*b"]
     steps: Int[Array, "*b"]
     scene: Scene
+    work: Float[Array, "*b t"] | None = None
+    error: Float[Array, "*b"] | None = None
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -132,6 +137,10 @@ class Trajectory(eqx.Module):
                     "kg m2 s-1",
                     "angular momentum in space axes",
                 )
+        if self.work is not None:
+            put("work", self.work, (*batch, "time"), "J", "work done by the external torques")
+        if self.error is not None:
+            put("error", self.error, batch, "rad", "estimated error at the last time")
         put("status", self.status, batch, "1", "outcome per body (0: finished)")
         data["status"][2].update(
             flag_values=np.array([int(s) for s in Status]),

@@ -3,6 +3,7 @@
 from polhode.hamiltonian import _document_000 as document_000
 from polhode.hamiltonian._attitude import (
     Attitude as Attitude,
+    Vector as Vector,
     components as components,
     cross as cross,
     dot as dot,
@@ -25,6 +26,7 @@ from polhode.hamiltonian._euler_chart import (
 )
 from polhode.hamiltonian._lie_poisson import (
     Dynamics as Dynamics,
+    external_power as external_power,
     lie_poisson_field as lie_poisson_field,
     quaternion_rate as quaternion_rate,
 )

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode.hamiltonian._attitude import Attitude, Vector, cross, from_quaternion, from_rows
+from polhode.hamiltonian._attitude import Attitude, Vector, cross, dot, from_quaternion, from_rows
 from polhode.hamiltonian._energy import Hamiltonian
 
 
@@ -44,6 +44,16 @@ def rates_and_torque(
         return omega, None
     turns = [cross(rows[i], slopes[i]) for i in rows]
     return omega, tuple(sum(parts[1:], start=parts[0]) for parts in zip(*turns))
+
+
+def external_power(
+    t: Array | float, momentum: Sequence[Array], attitude: Attitude, dynamics: "Dynamics"
+) -> Array:
+    """Power N . omega [W] of the external torque, on component arrays; zero without one."""
+    if dynamics.torque is None:
+        return jnp.zeros_like(momentum[0])
+    omega, _ = rates_and_torque(dynamics.hamiltonian, momentum, attitude, t)
+    return dot(dynamics.torque.body_components(t, attitude, omega), omega)
 
 
 class Dynamics(eqx.Module):

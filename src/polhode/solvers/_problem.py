@@ -1,5 +1,6 @@
 """A term with its arguments, as one pytree that can be cut into blocks and handed to kernels."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -37,6 +38,24 @@ class Problem(eqx.Module):
         """Vector field times control."""
         terms, args = eqx.combine(self.arrays, self.static)
         return terms.vf_prod(t, y, args, control)
+
+    def coefficients(self, t, y) -> tuple[tuple[Any, ...], Callable[..., PyTree]]:
+        """Arrays that the field rests on, and the field as a function of them, time and state."""
+        arrays, tree = jax.tree.flatten(self.arrays)
+        state, state_tree = jax.tree.flatten((t, y))
+
+        def field(*leaves):
+            problem = Problem(jax.tree.unflatten(tree, leaves[: len(arrays)]), self.static)
+            return problem.field(*jax.tree.unflatten(state_tree, leaves[len(arrays) :]))
+
+        closed, shape = jax.make_jaxpr(field, return_shape=True)(*arrays, *state)
+        held, run = specialise(closed, arrays)
+        structure = jax.tree.structure(shape)
+
+        def of_coefficients(held, t, y):
+            return jax.tree.unflatten(structure, run(held, *jax.tree.leaves((t, y))))
+
+        return tuple(jnp.asarray(h) for h in held), of_coefficients
 
     def prepared(self, t, y, control) -> "Prepared":
         """The increment, for states like ``y``, with all that rests on the arguments done."""

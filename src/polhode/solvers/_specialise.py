@@ -169,6 +169,8 @@ class _Work:
         """What becomes of an operation with a known zero or factor; None where nothing does."""
         if not jnp.issubdtype(aval.dtype, jnp.inexact):
             return None
+        if any(isinstance(x, _Slot) and x.aval.shape != aval.shape for x in given):
+            return None  # one number of the loop meets an array
         if name == "neg":
             return self.times(given[0], _Held(aval.dtype.type(-1)), aval)
         if name in ("add", "add_any", "sub"):

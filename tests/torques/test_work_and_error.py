@@ -1,0 +1,123 @@
+"""Work of the external torques, the error estimate of each body, librations of a satellite."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import ellipk
+from systems.table import BY_NAME, truth
+
+import polhode as ph
+from polhode import rotation
+
+INERTIA = ph.Inertia.from_moments([1.0, 1.5, 2.0])
+GRAVITY = ph.UniformGravity(1.0, [0.1, 0.0, 0.5], [0.0, 0.0, -2.0])
+DRAG = ph.LinearDamping([0.1, 0.2, 0.05]) + ph.QuadraticDamping(0.05)
+DRIVE = ph.SpaceTorque(lambda t: jnp.stack([jnp.sin(t), 0.2 + 0 * t, 0.1 * t]))
+STATE = ph.State([0.5, 0.5, 0.5, -0.5], [0.5, -1.0, 0.75])
+TS = jnp.linspace(0.0, 6.0, 4)
+METHODS = [ph.LiePoisson(at_end=True), ph.EulerAngles(), ph.Extrapolated(12)]
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+def test_energy_changes_by_the_work(method):
+    scene = ph.Scene(INERTIA, GRAVITY, DRAG + DRIVE)
+    traj = ph.simulate(scene, STATE, TS, method, rtol=1e-11, record=ph.Record(work=True))
+    assert traj.work.shape == (4,)
+    assert abs(float(traj.work[-1])) > 0.1
+    np.testing.assert_allclose(traj.energy - traj.energy[0], traj.work, rtol=0, atol=1e-9)
+    plain = ph.simulate(scene, STATE, TS, method, rtol=1e-11)
+    assert plain.work is None
+    np.testing.assert_allclose(plain.wxyz, traj.wxyz, rtol=0, atol=1e-9)
+
+
+def test_work_on_a_damped_and_driven_spin():
+    """About one axis: -(I w0^2 / 2)(1 - exp(-2 c t / I)), and N times the angle."""
+    state, record = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 1.5]), ph.Record(work=True)
+    damped = ph.Scene(INERTIA, torque=ph.LinearDamping([0.0, 0.0, 0.3]))
+    driven = ph.Scene(INERTIA, torque=ph.BodyTorque([0.0, 0.0, 0.4]))
+    lost = -2.25 * (1 - np.exp(-0.3 * np.asarray(TS)))
+    gained = 0.4 * (1.5 * np.asarray(TS) + 0.1 * np.asarray(TS) ** 2)
+    for scene, want in ((damped, lost), (driven, gained)):
+        assert ph.choose(scene, state, record)[0].exact
+        for method, atol in ((None, 1e-14), (ph.LiePoisson(at_end=True), 1e-9)):
+            traj = ph.simulate(scene, state, TS, method, rtol=1e-11, record=record)
+            np.testing.assert_allclose(traj.work, want, rtol=0, atol=atol)
+    free = ph.simulate(ph.Scene(INERTIA), state, TS, record=record)
+    np.testing.assert_array_equal(free.work, 0.0)
+
+
+@pytest.mark.parametrize("rtol", [1e-6, 1e-10])
+def test_the_estimate_bounds_the_error(rtol):
+    """Heavy tops that end far apart, against a run near rounding; whoever misses is marked."""
+    keys = jax.random.split(jax.random.key(5), 2)
+    wxyz = rotation.normalise(jax.random.normal(keys[0], (40, 4)))
+    state = ph.State(wxyz, 2 * jax.random.normal(keys[1], (40, 3)))
+    scene, ts = ph.Scene(INERTIA, GRAVITY), jnp.array([0.0, 60.0])
+    record = ph.Record(final_only=True, error=True)
+    best = ph.simulate(scene, state, ts, ph.Extrapolated(16), rtol=2e-13)
+    traj = ph.simulate(scene, state, ts, rtol=rtol, record=record, throw=False)
+    error = np.asarray(rotation.angle_between(best.wxyz[:, -1], traj.wxyz[:, -1]))
+    calm = error < 1e-3  # of the others no digit is left to estimate
+    assert np.mean(error[calm] <= 3 * np.asarray(traj.error)[calm]) > 0.9
+    assert np.median(np.asarray(traj.error)[calm] / error[calm]) < 30
+    marked = np.asarray(traj.status) == ph.Status.INACCURATE
+    assert not np.any((error > 10 * rtol) & ~marked & (error > 3 * np.asarray(traj.error)))
+    assert np.all(marked == (np.asarray(traj.error) > 10 * rtol))
+    if np.any(marked):
+        with pytest.raises(ph.SimulationError, match="error estimate"):
+            ph.simulate(scene, state, ts, rtol=rtol, record=record)
+
+
+@pytest.mark.parametrize("name", ["driven_and_damped", "pushed_in_space", "gravity_gradient"])
+def test_reached_and_estimated_error_keep_to_what_was_asked(name):
+    from systems.test_systems import scene_of
+
+    system, exact = BY_NAME[name], truth(name)
+    state = ph.State(np.array(system.wxyz, float), system.omega)
+    scene, ts = scene_of(system, jnp.array(system.moments)), jnp.array(system.span, float)
+    for rtol in (1e-6, 1e-10):
+        end = ph.simulate(scene, state, ts, rtol=rtol, record=ph.Record(error=True))
+        error = float(rotation.angle_between(end.wxyz[-1], jnp.array(exact["state"][3:])))
+        assert error < 10 * rtol
+        assert error < max(10 * float(end.error), 1e-13)
+
+
+def test_exact_motions_estimate_rounding_and_own_controllers_are_refused():
+    import diffrax
+
+    record = ph.Record(error=True)
+    free = ph.simulate(ph.Scene(INERTIA), STATE, TS, record=record)
+    assert 1e-16 < float(free.error) < 1e-14
+    own = ph.LiePoisson(controller=diffrax.ConstantStepSize(), dt0=0.1)
+    with pytest.raises(ValueError, match="controller"):
+        ph.simulate(ph.Scene(INERTIA), STATE, TS, own, record=record)
+
+
+def test_libration_in_a_gravity_gradient():
+    """About one axis: I3 a'' = -(s/2)(I2 - I1) sin 2a, s = 3 mu/r^3: a pendulum of the angle 2a.
+
+    Its period is 4 K(sin a0) / Omega, Omega^2 = s (I2 - I1)/I3, and a quarter of it after release
+    the rate is -Omega sin a0; what I2 does to the angle there follows from the scaling of time.
+    """
+    s, a0, moments = 3.0, 0.01, jnp.array([1.0, 1.5, 2.0])
+    omega = np.sqrt(s * 0.5 / 2.0)
+    quarter = ellipk(np.sin(a0) ** 2) / omega
+    start = ph.State([np.cos(a0 / 2), 0.0, 0.0, np.sin(a0 / 2)], [0.0, 0.0, 0.0])
+    potential = ph.GravityGradient(s / 3, [1.0, 0.0, 0.0])
+
+    def angle(moments, time):
+        scene = ph.Scene(ph.Inertia.from_moments(moments), potential)
+        ts = jnp.stack([jnp.zeros_like(time), time])
+        method = ph.LiePoisson(at_end=True)
+        end = ph.simulate(scene, start, ts, method, rtol=1e-12, record=ph.Record(final_only=True))
+        return 2 * jnp.arctan2(end.wxyz[0, 3], end.wxyz[0, 0])
+
+    run = jax.jit(jax.value_and_grad(angle))
+    value, slope = run(moments, jnp.array(quarter))
+    assert abs(float(value)) < 1e-11
+    rate = -omega * np.sin(a0)
+    by_moment = np.array([-1 / 0.5, 1 / 0.5, -1 / 2.0]) / 2  # d log Omega
+    np.testing.assert_allclose(slope, rate * quarter * by_moment, rtol=1e-8)
+    whole, _ = run(moments, jnp.array(4 * quarter))
+    np.testing.assert_allclose(whole, a0, rtol=0, atol=1e-11)
