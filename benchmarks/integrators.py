@@ -1,21 +1,26 @@
 """Work-precision of the integrators on heavy tops, beside heyoka and stock diffrax.
 
-    taskset -c 1 python benchmarks/integrators.py --out integrators.json [--quick]
+    python -m benchmarks.integrators [--quick] [--output out/integrators.json]
 
 Two heavy tops about a fixed point (mass 1, g = 2, centre of mass 0.5 along body z): a fast
 Lagrange top, I = (1, 1, 0.5), and an asymmetric one, I = (1, 1.5, 2), some of whose bodies are
-chaotic; and the free asymmetric body (1, 2, 3). Random attitudes and rates, horizon 100 s. Truth
-is ../shared/peers/truth where present, else a 30-digit Taylor series made and cached here. All
-programs are timed in turn in one process; ratios to heyoka are the robust numbers.
+chaotic; and the free asymmetric body (1, 2, 3). "simulate" is the whole of ``ph.simulate`` with the
+planner's extrapolation; "Extrapolation" a bare diffrax solve of a field written by hand. Random
+attitudes and rates, horizon 100 s. Truth is ../shared/peers/truth where present, else a 30-digit
+Taylor series made and cached here. All programs are timed in turn in one process; ratios to heyoka
+are the robust numbers.
 """
 
 import argparse
-import json
 import math
-import os
 import time
 from functools import reduce
 from pathlib import Path
+
+from benchmarks import _report
+
+if __name__ == "__main__":
+    _report.one_thread()
 
 import diffrax
 import jax
@@ -23,6 +28,7 @@ import jax.numpy as jnp
 import mpmath
 import numpy as np
 
+import polhode as ph
 from polhode.solvers import Extrapolation, choose, natural_rate
 
 HORIZON = 100.0
@@ -183,6 +189,41 @@ class Polhode:
         return np.stack([np.reshape(x, -1) for x in wxyz], axis=1)
 
 
+class Simulated:
+    """``ph.simulate`` as the planner runs it on a general body, final state only."""
+
+    def __init__(self, case, n, rtol, dtype=jnp.float64):
+        moments, _, strength, _, _ = CASES[case]
+        wxyz, omega = (jnp.asarray(x, dtype) for x in initial_states(case, n))
+        weight = ph.UniformGravity(*(jnp.asarray(x, dtype) for x in weight_of(strength)))
+        scene = ph.Scene(ph.Inertia.from_moments(jnp.asarray(moments, dtype)), weight)
+        self.given = scene, ph.State(wxyz, omega), jnp.array([0.0, HORIZON], dtype)
+        self.record, self.rtol = ph.Record(final_only=True), rtol
+        self.method = stepped(self.given[0], rtol)
+        start = time.perf_counter()
+        self()
+        self.compile_s = time.perf_counter() - start
+        name = "" if dtype == jnp.float64 else " float32"
+        self.label = f"simulate{name} {rtol:.0e}, order {self.method.order}"
+
+    def __call__(self):
+        found = ph.simulate(*self.given, self.method, rtol=self.rtol, record=self.record)
+        self.steps = int(np.max(found.steps))
+        return np.asarray(found.wxyz[:, -1], float)
+
+
+def weight_of(strength):
+    """Mass, centre of mass and gravity of the tops."""
+    return 1.0, (0.0, 0.0, 0.5), (0.0, 0.0, -2.0 * strength)
+
+
+def stepped(scene, rtol):
+    """The planner's integrator, also where it would know the exact motion."""
+    general = ph.Scene(ph.Inertia.from_moments(jnp.array([1.0, 1.5, 2.0])), scene.potential)
+    many = ph.State(jnp.tile(jnp.array([1.0, 0, 0, 0]), (64, 1)), jnp.ones((64, 3)))
+    return ph.choose(general, many, ph.Record(final_only=True), rtol)[0]
+
+
 class Heyoka:
     """heyoka's adaptive Taylor integrator, eight bodies at a time."""
 
@@ -278,19 +319,22 @@ def chosen(case, n, rtol):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
-    parser.add_argument("--out", type=Path, default=Path("integrators.json"))
+    parser.add_argument("--output", type=Path, default=None)
     parser.add_argument("--quick", action="store_true", help="heavy tops, N = 1000 only")
     parser.add_argument("--repeats", type=int, default=5)
     options = parser.parse_args()
-    os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false")
     jax.config.update("jax_enable_x64", True)
     rows = []
     for case in CASES:
         if options.quick and case == "free":
             continue
-        exact = truth(case, options.out.resolve().parent / ".cache")
+        exact = truth(case, _report.OUT / ".cache")
         for n in (1000,) if options.quick else (1000, 1, 100_000):
             programs = [chosen(case, n, rtol) for rtol in (1e-6, 1e-9, 1e-12)]
+            if n > 1 and CASES[case][2]:
+                programs += [Simulated(case, n, rtol) for rtol in (1e-6, 1e-9, 1e-12)]
+            if n == 1000 and CASES[case][2]:
+                programs.append(Simulated(case, n, 1e-5, jnp.float32))
             if n != 100_000:
                 try:
                     programs += [Heyoka(case, n, t) for t in (1e-6, 1e-8, 1e-10, 1e-12, 1e-15)]
@@ -300,7 +344,7 @@ def main():
                 control = diffrax.PIDController(rtol=1e-9, atol=1e-9)
                 programs.append(Polhode(case, n, diffrax.Dopri8(), 1, control))
             rows += measure(programs, case, n, exact, 1 if n == 100_000 else options.repeats)
-    options.out.write_text(json.dumps({"jax": jax.__version__, "rows": rows}, indent=1))
+    _report.write("integrators", {"rows": rows}, path=options.output, packages=("heyoka",))
 
 
 if __name__ == "__main__":
