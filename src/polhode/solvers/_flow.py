@@ -31,7 +31,7 @@ def flow(
     of the steps themselves. No forward mode. Reference: L. S. Pontryagin et al., The Mathematical
     Theory of Optimal Processes (1962), chapter 1.
     """
-    held, run = Problem.of(diffrax.ODETerm(field), args).coefficients(span[0], y0)
+    held, run, shapes = Problem.of(diffrax.ODETerm(field), args).coefficients(span[0], y0)
 
     def solve(field, y, held, t0, t1, steps):
         found = diffrax.diffeqsolve(
@@ -55,9 +55,7 @@ def flow(
         smooth = [jnp.issubdtype(h.dtype, jnp.inexact) for h in held]
         # numbers that all entries share get a slope in each entry: no sum in the loop
         gathered = tuple(
-            jnp.zeros(jnp.broadcast_shapes(h.shape, zero.shape), h.dtype)
-            for h, is_smooth in zip(held, smooth)
-            if is_smooth
+            jnp.zeros(shape, h.dtype) for h, shape, s in zip(held, shapes, smooth) if s
         )
 
         def adjoint(t, state, held):

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.extend.core import ClosedJaxpr, Literal
+from jax.interpreters import partial_eval
 
 _FOLDS = {
     "add": np.add, "add_any": np.add, "sub": np.subtract, "mul": np.multiply,
@@ -46,19 +47,24 @@ class _Slot(NamedTuple):
 
 
 class Specialised(NamedTuple):
-    """``held``: arrays computed before the loop; ``run(held, *state_leaves)`` does the rest."""
+    """``held``: arrays computed before the loop; ``run(held, *state_leaves)`` does the rest.
+
+    ``shapes``: to what shape the loop broadcasts each, where that is one only, else its own.
+    """
 
     held: tuple[Any, ...]
     run: Callable[..., list[Any]]
+    shapes: tuple[tuple[int, ...], ...]
 
 
 def specialise(closed: ClosedJaxpr, known: Sequence[Any]) -> Specialised:
     """Takes the part of ``closed`` that needs only its first arguments, ``known``, out of it."""
+    jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals), True)
     work = _Work()
     known = [_Held(x) for x in known]
-    free = [work.slot(v.aval) for v in closed.jaxpr.invars[len(known) :]]
-    found = work.walk(closed.jaxpr, closed.consts, [*known, *free])
-    out = [(work.operand(x), v.aval) for x, v in zip(found, closed.jaxpr.outvars)]
+    free = [work.slot(v.aval) for v in jaxpr.invars[len(known) :]]
+    found = work.walk(jaxpr, closed.consts, [*known, *free])
+    out = [(work.operand(x, v.aval), v.aval) for x, v in zip(found, jaxpr.outvars)]
     steps = tuple(work.steps)
 
     def run(held, *state):
@@ -76,7 +82,11 @@ def specialise(closed: ClosedJaxpr, known: Sequence[Any]) -> Specialised:
             values.update(zip(made, found if isinstance(found, list | tuple) else [found]))
         return [read(*o) for o in out]
 
-    return Specialised(tuple(work.held), run)
+    shapes = tuple(
+        next(iter(seen)) if len(seen) == 1 else np.shape(value)
+        for value, seen in zip(work.held, work.seen)
+    )
+    return Specialised(tuple(work.held), run, shapes)
 
 
 class _Work:
@@ -84,6 +94,7 @@ class _Work:
 
     def __init__(self):
         self.held: list[Any] = []
+        self.seen: list[set[tuple[int, ...]]] = []
         self.steps: list[tuple[Any, Any, list[Any]]] = []
         self.count = 0
         self.scaled: dict[tuple[int, int], int] = {}
@@ -97,11 +108,11 @@ class _Work:
 
     def emit(self, bind, inputs, avals, outs) -> list[_Slot]:
         made = [self.slot(aval) for aval in outs]
-        operands = [(self.operand(x), aval) for x, aval in zip(inputs, avals)]
+        operands = [(self.operand(x, aval), aval) for x, aval in zip(inputs, avals)]
         self.steps.append(([s.index for s in made], bind, operands))
         return made
 
-    def operand(self, x) -> tuple[str, Any]:
+    def operand(self, x, aval) -> tuple[str, Any]:
         """Where the loop finds a value: a slot, a place among what is held, or a number."""
         if isinstance(x, _Slot):
             return "slot", x.index if x.scale is None else self.multiplied(x)
@@ -111,7 +122,10 @@ class _Work:
             self.alive.append(x.value)
             self.places[id(x.value)] = len(self.held)
             self.held.append(x.value)
-        return "held", self.places[id(x.value)]
+            self.seen.append(set())
+        place = self.places[id(x.value)]
+        self.seen[place].add(aval.shape)
+        return "held", place
 
     def multiplied(self, x: _Slot) -> int:
         key = (x.index, id(x.scale.value))
