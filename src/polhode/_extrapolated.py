@@ -21,7 +21,7 @@ from polhode.hamiltonian import (
     from_quaternion,
     lie_poisson_field,
 )
-from polhode.solvers import Extrapolation, flow, natural_rate, steps_for
+from polhode.solvers import Extrapolation, natural_rate, steps_for
 from polhode.torques import UniformGravity
 
 _HALF = math.sqrt(0.5)
@@ -45,9 +45,7 @@ class Extrapolated(AbstractMethod):
     error at the last time is about ``rtol`` radians for the median body; chaotic bodies exceed it.
 
     **Arguments:** ``order``: even, 8 to 20 (low for loose tolerances); ``chunk``: bodies at once;
-    ``max_steps``; ``adjoint``: None for reverse mode by the adjoint equations, integrated back with
-    the same steps (as accurate as the solution, memory of one step), or a diffrax adjoint, such as
-    ``diffrax.ForwardMode()`` for ``jax.jvp``;
+    ``max_steps``; ``adjoint``: as in diffrax; its checkpoints bound the memory of a gradient;
     ``upright``: work in a space frame whose z axis is along the scene's ``UniformGravity``, which
     must not vanish (a third of the work; other potentials and torques must be absent);
     ``on_axis``: with ``upright``, take the centre of mass to lie on body z.
@@ -56,7 +54,7 @@ class Extrapolated(AbstractMethod):
     order: int = eqx.field(static=True, default=12)
     chunk: int = eqx.field(static=True, default=256)
     max_steps: int = eqx.field(static=True, default=2**20)
-    adjoint: diffrax.AbstractAdjoint | None = None
+    adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint(checkpoints=32)
     upright: bool = eqx.field(static=True, default=False)
     on_axis: bool = eqx.field(static=True, default=False)
 
@@ -111,11 +109,6 @@ class Extrapolated(AbstractMethod):
             start, end = interval
             share = jnp.ceil(total * jnp.abs(end - start) / (horizon * substeps))
             count = jax.lax.stop_gradient(jnp.maximum(share, 1))
-            if self.adjoint is None:
-                y, reached, steps = flow(
-                    field, dynamics, y, (start, end), count, solver, self.max_steps
-                )
-                return y, (y, reached, steps)
             solution = diffrax.diffeqsolve(
                 diffrax.ODETerm(field),
                 solver,

@@ -93,9 +93,9 @@ _MANY = 32
 
 
 def _order(rtol) -> int:
-    """Order of least work for a tolerance (benchmarks/integrators.py); 14 while it is traced."""
+    """Order of least work for a tolerance (benchmarks/integrators.py); 12 while it is traced."""
     if not is_concrete(rtol):
-        return 14
+        return 12
     return next(
         (o for o, bound in ((10, 1e-4), (12, 1e-8), (14, 1e-10), (16, 1e-11)) if rtol >= bound), 18
     )

@@ -121,28 +121,3 @@ def test_libration_in_a_gravity_gradient():
     np.testing.assert_allclose(slope, rate * quarter * by_moment, rtol=1e-8)
     whole, _ = run(moments, jnp.array(4 * quarter))
     np.testing.assert_allclose(whole, a0, rtol=0, atol=1e-11)
-
-
-def test_gradient_by_the_adjoint_equations():
-    """Every kind of parameter: of each body, shared, in a function of time, and the last time."""
-    keys = jax.random.split(jax.random.key(7), 2)
-    wxyz = rotation.normalise(jax.random.normal(keys[0], (3, 4)))
-    omega = jax.random.normal(keys[1], (3, 3))
-    moments = jnp.array([[1.0, 1.5, 2.0], [1.2, 1.1, 0.9], [2.0, 1.5, 1.0]])
-    point = (moments, jnp.array([0.1, 0.0, 0.5]), jnp.array(0.7), omega, wxyz, jnp.array(3.0))
-
-    def loss(method, rtol, moments, centre, rate, omega, wxyz, last):
-        push = ph.BodyTorque(lambda t: jnp.stack([jnp.sin(rate * t), 0 * t, rate**2 + 0 * t]))
-        weight = ph.UniformGravity(1.0, centre, [0.5, 0.0, -2.0])
-        scene = ph.Scene(ph.Inertia.from_moments(moments), weight, push + ph.LinearDamping(0.1))
-        ts = jnp.stack([0 * last, last / 2, last])
-        end = ph.simulate(scene, ph.State(wxyz, omega), ts, method, rtol=rtol)
-        return jnp.sum(end.wxyz[:, -1, 1] ** 2) + jnp.sum(end.omega_body * jnp.arange(3.0))
-
-    argnums = tuple(range(6))
-    slopes = [
-        jax.jit(jax.grad(lambda *p, m=method: loss(m, 1e-12, *p), argnums))(*point)
-        for method in (ph.Extrapolated(12), ph.LiePoisson(at_end=True))
-    ]
-    for ours, other in zip(*slopes, strict=True):
-        np.testing.assert_allclose(ours, other, rtol=1e-8, atol=1e-9)

@@ -1,6 +1,5 @@
 """A term with its arguments, as one pytree that can be cut into blocks and handed to kernels."""
 
-from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -39,25 +38,6 @@ class Problem(eqx.Module):
         terms, args = eqx.combine(self.arrays, self.static)
         return terms.vf_prod(t, y, args, control)
 
-    def coefficients(self, t, y) -> tuple[tuple[Any, ...], Callable[..., PyTree], tuple]:
-        """Arrays that the field rests on, the field as a function of them, time and state, and
-        the shapes to which it broadcasts them."""
-        arrays, tree = jax.tree.flatten(self.arrays)
-        state, state_tree = jax.tree.flatten((t, y))
-
-        def field(*leaves):
-            problem = Problem(jax.tree.unflatten(tree, leaves[: len(arrays)]), self.static)
-            return problem.field(*jax.tree.unflatten(state_tree, leaves[len(arrays) :]))
-
-        closed, shape = jax.make_jaxpr(field, return_shape=True)(*arrays, *state)
-        held, run, shapes = specialise(closed, arrays)
-        structure = jax.tree.structure(shape)
-
-        def of_coefficients(held, t, y):
-            return jax.tree.unflatten(structure, run(held, *jax.tree.leaves((t, y))))
-
-        return tuple(jnp.asarray(h) for h in held), of_coefficients, shapes
-
     def prepared(self, t, y, control) -> "Prepared":
         """The increment, for states like ``y``, with all that rests on the arguments done."""
         arrays, tree = jax.tree.flatten(self.arrays)
@@ -68,7 +48,7 @@ class Problem(eqx.Module):
             return problem.increment(*jax.tree.unflatten(state_tree, leaves[len(arrays) :]))
 
         closed, shape = jax.make_jaxpr(increment, return_shape=True)(*arrays, *state)
-        held, run, _ = specialise(closed, arrays)
+        held, run = specialise(closed, arrays)
         return Prepared(held, (run, jax.tree.structure(shape)))
 
 

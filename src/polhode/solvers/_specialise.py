@@ -47,14 +47,10 @@ class _Slot(NamedTuple):
 
 
 class Specialised(NamedTuple):
-    """``held``: arrays computed before the loop; ``run(held, *state_leaves)`` does the rest.
-
-    ``shapes``: to what shape the loop broadcasts each, where that is one only, else its own.
-    """
+    """``held``: arrays computed before the loop; ``run(held, *state_leaves)`` does the rest."""
 
     held: tuple[Any, ...]
     run: Callable[..., list[Any]]
-    shapes: tuple[tuple[int, ...], ...]
 
 
 def specialise(closed: ClosedJaxpr, known: Sequence[Any]) -> Specialised:
@@ -64,7 +60,7 @@ def specialise(closed: ClosedJaxpr, known: Sequence[Any]) -> Specialised:
     known = [_Held(x) for x in known]
     free = [work.slot(v.aval) for v in jaxpr.invars[len(known) :]]
     found = work.walk(jaxpr, closed.consts, [*known, *free])
-    out = [(work.operand(x, v.aval), v.aval) for x, v in zip(found, jaxpr.outvars)]
+    out = [(work.operand(x), v.aval) for x, v in zip(found, jaxpr.outvars)]
     steps = tuple(work.steps)
 
     def run(held, *state):
@@ -82,11 +78,7 @@ def specialise(closed: ClosedJaxpr, known: Sequence[Any]) -> Specialised:
             values.update(zip(made, found if isinstance(found, list | tuple) else [found]))
         return [read(*o) for o in out]
 
-    shapes = tuple(
-        next(iter(seen)) if len(seen) == 1 else np.shape(value)
-        for value, seen in zip(work.held, work.seen)
-    )
-    return Specialised(tuple(work.held), run, shapes)
+    return Specialised(tuple(work.held), run)
 
 
 class _Work:
@@ -94,7 +86,6 @@ class _Work:
 
     def __init__(self):
         self.held: list[Any] = []
-        self.seen: list[set[tuple[int, ...]]] = []
         self.steps: list[tuple[Any, Any, list[Any]]] = []
         self.count = 0
         self.scaled: dict[tuple[int, int], int] = {}
@@ -108,11 +99,11 @@ class _Work:
 
     def emit(self, bind, inputs, avals, outs) -> list[_Slot]:
         made = [self.slot(aval) for aval in outs]
-        operands = [(self.operand(x, aval), aval) for x, aval in zip(inputs, avals)]
+        operands = [(self.operand(x), aval) for x, aval in zip(inputs, avals)]
         self.steps.append(([s.index for s in made], bind, operands))
         return made
 
-    def operand(self, x, aval) -> tuple[str, Any]:
+    def operand(self, x) -> tuple[str, Any]:
         """Where the loop finds a value: a slot, a place among what is held, or a number."""
         if isinstance(x, _Slot):
             return "slot", x.index if x.scale is None else self.multiplied(x)
@@ -122,10 +113,7 @@ class _Work:
             self.alive.append(x.value)
             self.places[id(x.value)] = len(self.held)
             self.held.append(x.value)
-            self.seen.append(set())
-        place = self.places[id(x.value)]
-        self.seen[place].add(aval.shape)
-        return "held", place
+        return "held", self.places[id(x.value)]
 
     def multiplied(self, x: _Slot) -> int:
         key = (x.index, id(x.scale.value))
