@@ -131,8 +131,11 @@ def _work_of_exact(trajectory: Trajectory, state: State, start: Array) -> Array:
 _COARSER = 30
 """How much looser the second run is that an error estimate comes from."""
 
-_TRUSTED = 10
+_TRUSTED = 3
 """What the distance of the two runs is divided by; 29 if errors kept to the tolerances."""
+
+_ROUNDING = (10, 1000)
+"""Units in the last place of the angle turned: always added; below, two runs differ by rounding."""
 
 _ALLOWED = 10
 """How often an error may exceed the tolerance before the body is called inaccurate."""
@@ -142,10 +145,10 @@ def _with_error(method, scene, lanes, times, rtol, record) -> Samples:
     """The samples, and for each body the estimated error of its attitude at the last time [rad]."""
     plain = Record(record.attitude, record.rates, record.final_only, record.work)
     size = jnp.linalg.norm(jax.lax.stop_gradient(lanes.omega_body), axis=-1)
+    turned = jnp.maximum(1, size * jnp.abs(times[..., -1] - times[..., 0]))
+    ulps = jnp.finfo(size.dtype).eps * turned
     if method.exact:
-        turned = jnp.maximum(1, size * jnp.abs(times[..., -1] - times[..., 0]))
-        error = jnp.finfo(size.dtype).eps * turned
-        return method.run(scene, lanes, times, rtol, plain)._replace(error=error)
+        return method.run(scene, lanes, times, rtol, plain)._replace(error=ulps)
     if method.asked_at_end is None:
         raise ValueError(
             "Record(error=True) compares two tolerances, and this method has a step-size controller"
@@ -162,7 +165,9 @@ def _with_error(method, scene, lanes, times, rtol, record) -> Samples:
     else:
         change = jnp.linalg.norm(fine.omega_body[:, -1] - coarse.omega_body[:, -1], axis=-1)
         gap = change / jnp.maximum(jnp.linalg.norm(fine.omega_body[:, -1], axis=-1), size)
-    error = jax.lax.stop_gradient(gap) / _TRUSTED
+    gap = jax.lax.stop_gradient(gap)
+    always, below = (count * ulps for count in _ROUNDING)
+    error = always + jnp.maximum(gap / _TRUSTED, jnp.minimum(gap, below))
     status = fine.status
     if method.asked_at_end:
         good = (status != Status.SUCCESSFUL) | (error <= _ALLOWED * rtol)
