@@ -137,6 +137,9 @@ def test_explain_says_what_runs_what_is_skipped_and_why():
         "potential, torque", "not in the scene", "cost    about", "error   rounding only",
     ):  # fmt: skip
         assert part in text, text
+    exact = ph.explain(scene, state, [0.0, 1e6], ph.ClosedForm(compensated=True))
+    assert "at any time" in exact.error
+    assert "at the last time" in ph.explain(scene, state, [0.0, 1e6]).error
     asked = str(ph.explain(scene, state, ts, ph.LiePoisson(), record=ph.Record(final_only=True)))
     assert "LiePoisson: as asked for" in asked
     assert "only the last time is recorded" in asked

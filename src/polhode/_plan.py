@@ -133,7 +133,9 @@ def plan(
     samples = 1 if record.final_only else ts.shape[-1]
     eps = float(jnp.finfo(state.wxyz.dtype).eps)
     if isinstance(method, ClosedForm):
-        seconds, error = _exact_cost(scene, state, ts, bodies, samples, record, eps)
+        seconds, error = _exact_cost(
+            scene, state, ts, bodies, samples, record, eps, method.compensated
+        )
     elif isinstance(method, AbstractTopMethod):
         seconds, error = None, "rounding only: a few units in the last place of the angle turned"
     else:
@@ -176,11 +178,15 @@ def _skipped(scene: Scene, method: AbstractMethod, record: Record) -> tuple[str,
 # and without attitude; benchmarks/scene_cost.py measures them again.
 _EXACT_NS = {(Symmetry.NONE, True): (450, 100), (Symmetry.NONE, False): (250, 40)}
 _SYMMETRIC_NS = (60, 60)
+_COMPENSATED_NS = 290
 
 
-def _exact_cost(scene, state, ts, bodies, samples, record, eps) -> tuple[float, str]:
+def _exact_cost(scene, state, ts, bodies, samples, record, eps, compensated) -> tuple[float, str]:
     start, each = _EXACT_NS.get((scene.inertia.symmetry, record.attitude), _SYMMETRIC_NS)
-    seconds = 1e-9 * bodies * (start + each * samples)
+    compensated = compensated and scene.inertia.symmetry is Symmetry.NONE
+    seconds = 1e-9 * bodies * (start + (_COMPENSATED_NS if compensated else 0) + each * samples)
+    if compensated:
+        return seconds, f"rounding only: about {4 * eps:.0e} rad at any time (compensated phases)"
     rate = jnp.max(jnp.linalg.norm(jax.lax.stop_gradient(state.omega_body), axis=-1))
     turned = float(rate) * float(jnp.max(jnp.abs(ts[..., -1] - ts[..., 0])))
     return seconds, (
