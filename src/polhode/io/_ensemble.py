@@ -85,16 +85,16 @@ def _arrays(ensemble: Table, bodies: int, needs) -> dict[str, np.ndarray]:
             raise table.wrong(
                 name, "given twice", f"{name} in arrays and [ensemble.{clash[0]}]", "one of them"
             )
-        path = Path(table.file).parent / table.text(name)
+        written = table.text(name)
         wanted = f"a file of NumPy (.npy) with {bodies} x {ROWS[name]} numbers"
         try:
-            rows = np.load(path, mmap_mode="r", allow_pickle=False)
+            rows = np.load(Path(table.file).parent / written, mmap_mode="r", allow_pickle=False)
         except (OSError, ValueError, EOFError) as error:
-            raise table.wrong(name, "cannot be read", f"{path} ({error})", wanted) from error
+            raise table.wrong(name, f"cannot be read: {error}", written, wanted) from error
         shape = getattr(rows, "shape", None)
         if shape != (bodies, ROWS[name]) or rows.dtype.kind not in "fiu":
             kind = getattr(rows, "dtype", type(rows).__name__)
-            raise table.wrong(name, "wrong shape or type", f"{path}: {shape} of {kind}", wanted)
+            raise table.wrong(name, "wrong shape or type", f"{written}: {shape} of {kind}", wanted)
         bad = _first_bad(name, rows)
         if bad is not None:
             raise table.wrong(
