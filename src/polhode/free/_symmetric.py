@@ -2,6 +2,7 @@
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -34,17 +35,22 @@ def symmetric_motion(
     slip = (transverse - axial) / transverse * omega_body[..., 2]
     turned = turned_rates = None
     if rates:
-        cos, sin = jnp.cos(slip * t), jnp.sin(slip * t)
+        # Here and below: once, and not anew for each component of what follows.
+        cos, sin = jax.lax.optimization_barrier((jnp.cos(slip * t), jnp.sin(slip * t)))
         x, y = omega_body[..., 0], omega_body[..., 1]
         spin = jnp.broadcast_to(omega_body[..., 2], cos.shape)
         turned_rates = jnp.stack([x * cos + y * sin, y * cos - x * sin, spin], axis=-1)
     if attitude:
-        momentum = rotation.rotate(wxyz, omega_body * moments) / transverse[..., None]
-        precession = rotation.rotation_vector_to_wxyz(momentum * t[..., None])
+        own_momentum = jax.lax.optimization_barrier(omega_body * moments)
+        momentum = rotation.rotate(wxyz, own_momentum) / transverse[..., None]
+        angle = jax.lax.optimization_barrier(momentum * t[..., None])
+        precession = rotation.rotation_vector_to_wxyz(angle)
         half = slip * t / 2
         zero = jnp.zeros_like(half)
         own = jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=-1)
-        turned = rotation.multiply(rotation.multiply(precession, wxyz), own)
+        precession, own = jax.lax.optimization_barrier((precession, own))
+        before = jax.lax.optimization_barrier(rotation.multiply(precession, wxyz))
+        turned = rotation.multiply(before, own)
     return SymmetricMotion(turned, turned_rates)
 
 
@@ -61,5 +67,6 @@ def spherical_motion(
     turned = None
     if attitude:
         turn = rotation.rotation_vector_to_wxyz(omega_body * t[..., None])
+        turn = jax.lax.optimization_barrier(turn)
         turned = rotation.multiply(wxyz, turn)
     return SymmetricMotion(turned, jnp.broadcast_to(omega_body, (*shape, 3)) if rates else None)
