@@ -1,5 +1,7 @@
 """Bad input gets a clear error: what was given, what is expected, how to mend it."""
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -85,6 +87,41 @@ def test_non_unit_quaternions_are_normalised_at_every_scale():
     for scale in (1e-300, 1e-5, 1.0, 1e300):
         state = ph.State(np.array([3.0, 0, 4.0, 0]) * scale, [0.0, 0, 1])
         np.testing.assert_allclose(state.wxyz, [0.6, 0, 0.8, 0], rtol=4e-16)
+
+
+def _parts(box, vertices, faces):
+    """One of every part that checks its values, from arrays that are known."""
+    upright, up, number = jnp.array([1.0, 0, 0, 0]), jnp.array([0.0, 0, 1]), jnp.array(0.01)
+    inertia = ph.Inertia.from_moments(box)
+    angles = jnp.array(0.1), jnp.array(0.2), jnp.array(0.3)
+    return (
+        ph.State(upright, up),
+        ph.State.from_euler(*angles, momenta=box, inertia=inertia),
+        ph.Scene(
+            inertia,
+            ph.UniformGravity(number, up, -up) + ph.GravityGradient(number, up),
+            ph.BodyTorque(up) + ph.LinearDamping(jnp.full(3, number)),
+            ph.Rotor(up, number, speed=number),
+        ),
+        ph.GravityGradient(number, ph.KeplerOrbit(number, number, number)),
+        ph.MassProperties.from_box(number, box, box / 2).moved(up),
+        ph.MassProperties.from_sphere(number, number, number / 2).moved(wxyz=upright),
+        ph.MassProperties.from_mesh(vertices, faces, density=number),
+        ph.fit.Recording.of(jnp.arange(9.0), jnp.ones((9, 3)), omega_noise=number),
+    )
+
+
+def test_parts_are_made_of_known_arrays_under_jit():
+    """What a traced function closes over is known, yet operations on it are traced."""
+    box = jnp.array([1.0, 1.5, 2.0])
+    vertices = np.concatenate([np.zeros((1, 3)), np.eye(3)])
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
+    plain = _parts(box, jnp.asarray(vertices), faces)
+    traced = eqx.filter_jit(lambda: _parts(box, jnp.asarray(vertices), faces))()
+    for want, got in zip(jax.tree.leaves(plain), jax.tree.leaves(traced), strict=True):
+        np.testing.assert_allclose(got, want, rtol=1e-14, atol=1e-16)
+    explained = eqx.filter_jit(lambda: str(ph.explain(SCENE, STATE, TS)) and jnp.zeros(()))()
+    assert explained == 0
 
 
 garbage = st.one_of(

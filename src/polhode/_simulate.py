@@ -223,8 +223,8 @@ def check_times(ts: np.ndarray) -> None:
         )
 
 
-def check_rtol(rtol: float | None, dtype) -> Array:
-    """The tolerance as an array of the state's dtype."""
+def check_rtol(rtol: float | None, dtype) -> Array | np.ndarray:
+    """The tolerance in the state's dtype; a number that is known stays known under ``jit``."""
     eps = float(jnp.finfo(dtype).eps)
     if rtol is None:
         rtol = 1e-9 if eps < 1e-9 else 1e-5
@@ -235,6 +235,7 @@ def check_rtol(rtol: float | None, dtype) -> Array:
             f"rtol={rtol:g} is below what {jnp.dtype(dtype).name} can reach (about {8 * eps:.0e}):"
             " raise rtol, or use float64 (jax.config.update('jax_enable_x64', True)).",
         )
+        return np.asarray(rtol, dtype)
     return jnp.asarray(rtol, dtype)
 
 

@@ -36,7 +36,7 @@ class State(eqx.Module):
         rates = as_float_array("omega_body", omega_body, (3,))
         if is_concrete(quaternion):
             require(
-                jnp.any(quaternion != 0, axis=-1),
+                np.any(np.asarray(quaternion) != 0, axis=-1),
                 f"wxyz must not be zero, got {describe(wxyz)}: a rotation is a unit quaternion,"
                 " scalar first; (1, 0, 0, 0) is no rotation.",
             )
@@ -81,7 +81,7 @@ class State(eqx.Module):
         momenta = as_float_array("momenta", momenta, (3,))
         if is_concrete(angles[1]):
             require(
-                jnp.sin(angles[1]) != 0,
+                np.sin(np.asarray(angles[1])) != 0,
                 "theta at 0 or pi: canonical momenta do not determine the body rates there;"
                 " give rates, or build the State from a quaternion.",
             )

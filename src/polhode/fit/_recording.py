@@ -193,6 +193,8 @@ def _check_rates(omega, times):
 def _noise(name, value, shape, tail, dtype):
     array = as_float_array(name, value).astype(dtype)
     if is_concrete(array):
-        require(array > 0, f"{name} must be positive (a standard deviation), got {array}.")
+        require(
+            np.asarray(array) > 0, f"{name} must be positive (a standard deviation), got {array}."
+        )
     full = (*shape, tail) if tail else shape
     return jnp.broadcast_to(array, full)

@@ -48,7 +48,7 @@ def require_positive(name: str, array: Array, *, zero: bool = False) -> None:
     """ValueError if a concrete array holds negative values (or zeros, unless ``zero``)."""
     if not is_concrete(array) or array.size == 0:
         return
-    least = float(jnp.min(array))
+    least = float(np.min(np.asarray(array)))
     wanted = "zero or positive" if zero else "positive"
     require(
         least > 0 or (zero and least == 0),
@@ -59,10 +59,11 @@ def require_positive(name: str, array: Array, *, zero: bool = False) -> None:
 def require_below(small_name: str, small: Array, large_name: str, large: Array) -> None:
     """ValueError if a concrete ``small`` exceeds ``large`` anywhere."""
     if is_concrete(small, large):
+        small, large = np.asarray(small), np.asarray(large)
         require(
             small <= large,
-            f"{small_name} must not exceed {large_name}, got {float(jnp.max(small)):g} against "
-            f"{float(jnp.min(large)):g}; exchange them?",
+            f"{small_name} must not exceed {large_name}, got {small.max():g} against "
+            f"{large.min():g}; exchange them?",
         )
 
 

@@ -159,7 +159,7 @@ class MassProperties(AbstractShaped):
             turn = as_float_array("wxyz", wxyz, (4,)).astype(dtype)
             if is_concrete(turn):
                 require(
-                    jnp.any(turn != 0, axis=-1),
+                    np.any(np.asarray(turn) != 0, axis=-1),
                     "wxyz must not be the zero quaternion; (1, 0, 0, 0) is no turn.",
                 )
             turn = normalise(turn)

@@ -38,7 +38,8 @@ def check_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, np.ndarray
     )
     _check_closed(faces)
     if is_concrete(vertices) and vertices.size:
-        volume = np.asarray(mesh_integrals(vertices, faces)[0])
+        with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
+            volume = np.asarray(mesh_integrals(vertices, faces)[0])
         require(
             volume > 0,
             f"the mesh must enclose a positive volume, got {volume.min():g}; a negative one means "

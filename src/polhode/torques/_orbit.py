@@ -3,6 +3,7 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_number, is_concrete, require
@@ -88,10 +89,11 @@ class KeplerOrbit(eqx.Module):
         for name in ("mu", "semi_major_axis"):
             value = getattr(self, name)
             if is_concrete(value):
-                require(value > 0, f"{name} must be positive, got {given[name]}.")
+                require(np.asarray(value) > 0, f"{name} must be positive, got {given[name]}.")
         if is_concrete(self.eccentricity):
+            given = np.asarray(self.eccentricity)
             require(
-                (self.eccentricity >= 0) & (self.eccentricity < 1),
+                (given >= 0) & (given < 1),
                 f"eccentricity must lie in [0, 1), got {eccentricity}: other conics are not"
                 " supported; hand GravityGradient any function of time instead.",
             )

@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_float_array, as_number, is_concrete, require
@@ -81,16 +82,18 @@ class UniformGravity(AbstractPotential):
         self.centre_body = as_float_array("centre_body", centre_body, (3,))
         self.gravity_space = as_float_array("gravity_space", gravity_space, (3,))
         if is_concrete(self.mass):
-            require(self.mass >= 0, f"mass must not be negative, got {mass}: give it in kg.")
+            require(
+                np.asarray(self.mass) >= 0, f"mass must not be negative, got {mass}: give it in kg."
+            )
         self.on_axis, self.vertical = bool(on_axis), bool(vertical)
         if self.vertical and is_concrete(self.gravity_space):
             require(
-                self.gravity_space[..., :2] == 0,
+                np.asarray(self.gravity_space)[..., :2] == 0,
                 f"vertical says that gravity is along space z, got {gravity_space}: leave it out.",
             )
         if self.on_axis and is_concrete(self.centre_body):
             require(
-                self.centre_body[..., :2] == 0,
+                np.asarray(self.centre_body)[..., :2] == 0,
                 f"on_axis says that the centre lies on body z, got {centre_body}: leave it out.",
             )
 
@@ -144,14 +147,16 @@ class GravityGradient(AbstractPotential):
     def __init__(self, mu, position_space):
         self.mu = as_number("mu", mu)
         if is_concrete(self.mu):
-            require(self.mu >= 0, f"mu must not be negative, got {mu}: give it in m^3/s^2.")
+            require(
+                np.asarray(self.mu) >= 0, f"mu must not be negative, got {mu}: give it in m^3/s^2."
+            )
         if callable(position_space):
             self.position_space = position_space
         else:
             self.position_space = as_float_array("position_space", position_space, (3,))
             if is_concrete(self.position_space):
                 require(
-                    jnp.any(self.position_space != 0, axis=-1),
+                    np.any(np.asarray(self.position_space) != 0, axis=-1),
                     "position_space must not be zero: it is the body's position relative to the"
                     " attracting centre, in metres.",
                 )

@@ -13,6 +13,7 @@ import abc
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -43,11 +44,11 @@ class AbstractRotor(eqx.Module):
             if wheel.inertia is None:
                 continue
             axis = wheel.axis_body
-            turned = inertia.momentum(axis)
-            about = jnp.sum(jnp.broadcast_to(axis, turned.shape) * turned, axis=-1)
-            about, own = jnp.broadcast_arrays(about, wheel.inertia)
+            with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
+                turned = inertia.momentum(axis)
+                about = jnp.sum(jnp.broadcast_to(axis, turned.shape) * turned, axis=-1)
             require(
-                own < about,
+                np.asarray(wheel.inertia) < np.asarray(about),
                 f"a rotor's inertia ({wheel.inertia} kg m^2) must be less than the body's about the"
                 f" same axis ({about}): the scene's inertia is that of the whole body, its wheels"
                 " locked and included. Add the wheels to it.",
@@ -120,7 +121,7 @@ class Rotor(AbstractRotor):
         self.along = None
         if is_concrete(axis):
             require(
-                jnp.any(axis != 0, axis=-1),
+                np.any(np.asarray(axis) != 0, axis=-1),
                 f"axis_body must not be zero, got {axis_body}: give the wheel's axis in body axes.",
             )
             self.along = _body_axis(np.asarray(axis))
@@ -154,7 +155,7 @@ class Rotor(AbstractRotor):
             )
         if inertia is not None and is_concrete(self.inertia):
             require(
-                self.inertia > 0,
+                np.asarray(self.inertia) > 0,
                 f"the rotor's inertia must be positive, got {inertia}: give it in kg m^2.",
             )
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_float_array, is_concrete, require
@@ -94,7 +95,8 @@ def _coefficients(name: str, c) -> Array:
     c = as_float_array(f"{name} c", c, (3,))
     if is_concrete(c):
         require(
-            c >= 0, f"{name} c must not be negative, got {given}: a positive c takes energy away."
+            np.asarray(c) >= 0,
+            f"{name} c must not be negative, got {given}: a positive c takes energy away.",
         )
     return c
 
