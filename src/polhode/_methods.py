@@ -102,6 +102,7 @@ class AbstractDiffraxMethod(AbstractMethod):
     progress_meter: eqx.AbstractVar[diffrax.AbstractProgressMeter]
     chunk: eqx.AbstractVar[int]
     at_end: eqx.AbstractVar[bool]
+    gradient_solver: eqx.AbstractVar[diffrax.AbstractSolver | None]
     momenta: eqx.AbstractClassVar[tuple[bool, bool]]
 
     @abc.abstractmethod
@@ -135,7 +136,10 @@ class AbstractDiffraxMethod(AbstractMethod):
         def one(chunk):
             lanes, times = chunk
             scene, state = eqx.combine(lanes, shared)
-            return self._solve(scene, state, ts if times is None else times[0], rtol, record)
+            times = ts if times is None else times[0]
+            if self.gradient_solver is None:
+                return self._solve(scene, state, times, rtol, record)
+            return _run_with_gradient((scene, state, times), self, rtol, record)
 
         times = ts if ts.ndim == 2 else None
         return map_chunks(one, (lanes, times), state.wxyz.shape[0], size)
@@ -216,6 +220,33 @@ class AbstractDiffraxMethod(AbstractMethod):
         )
 
 
+@eqx.filter_custom_vjp
+def _run_with_gradient(given, method, rtol, record):
+    """One chunk by the method's solver, differentiated as if run by its ``gradient_solver``."""
+    return method._solve(*given, rtol, record)
+
+
+@_run_with_gradient.def_fwd
+def _(perturbed, given, method, rtol, record):
+    del perturbed
+    return method._solve(*given, rtol, record), None
+
+
+@_run_with_gradient.def_bwd
+def _(residuals, cotangent, perturbed, given, method, rtol, record):
+    del residuals
+    method = eqx.tree_at(lambda m: m.solver, method, method.gradient_solver)
+    wanted, fixed = eqx.partition(given, jax.tree.map(bool, perturbed))
+
+    def seen(wanted):
+        out = method._solve(*eqx.combine(wanted, fixed), rtol, record)
+        return jax.tree.map(
+            lambda c, x: None if c is None else x, cotangent, out, is_leaf=lambda c: c is None
+        )
+
+    return eqx.filter_vjp(seen, wanted)[1](cotangent)[0]
+
+
 def _stack(groups) -> Array:
     return jnp.stack([x for group in groups for x in group])
 
@@ -265,6 +296,8 @@ class LiePoisson(AbstractDiffraxMethod):
     - ``chunk``: bodies that share their steps; chunks follow one another, so memory stays bounded.
     - ``at_end``: hold the error at the last time to ``rtol``, not that of each step: the steps'
       tolerance is ``rtol`` over the angle that the fastest body of the chunk turns through.
+    - ``gradient_solver``: solver for reverse mode, whose steps are differentiated in place of the
+      first one's (both follow the same motion to the tolerance); None: the same solver.
     """
 
     solver: diffrax.AbstractSolver = diffrax.Dopri8()
@@ -275,6 +308,7 @@ class LiePoisson(AbstractDiffraxMethod):
     progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter()
     chunk: int = eqx.field(static=True, default=200)
     at_end: bool = eqx.field(static=True, default=False)
+    gradient_solver: diffrax.AbstractSolver | None = None
 
     momenta = (True, False)
 
@@ -311,6 +345,7 @@ class EulerAngles(AbstractDiffraxMethod):
     progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter()
     chunk: int = eqx.field(static=True, default=1)
     at_end: bool = eqx.field(static=True, default=False)
+    gradient_solver: diffrax.AbstractSolver | None = None
 
     momenta = (False, True)
 
