@@ -56,7 +56,8 @@ def run(case, order, steps, dtype):
         width = step * substeps
         start, end, width = (jnp.asarray(t, dtype) for t in (0.0, count * width, width))
         return diffrax.diffeqsolve(
-            diffrax.ODETerm(heavy_top), solver, start, end, width, y, given, saveat=diffrax.SaveAt(steps=True), max_steps=count,
+            diffrax.ODETerm(heavy_top), solver, start, end, width, y, given,
+            saveat=diffrax.SaveAt(steps=True), max_steps=count,
         ).ys  # fmt: skip
 
     near = jax.jit(lambda y: solve(y, WINDOW, 1))

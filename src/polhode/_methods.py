@@ -1,6 +1,7 @@
 """Ways to move the bodies of a scene. Options are objects: a method is handed over whole."""
 
 import abc
+from functools import partial
 from typing import ClassVar, NamedTuple
 
 import diffrax
@@ -13,6 +14,7 @@ from polhode._lanes import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._scene import Scene
 from polhode._state import State
 from polhode._status import Status
+from polhode._stepping import LaneNorm, sampled, through
 from polhode.hamiltonian import (
     Attitude,
     Dynamics,
@@ -27,6 +29,7 @@ from polhode.hamiltonian import (
     momentum_from_canonical,
 )
 from polhode.rotation import euler_to_wxyz, normalise, wxyz_to_euler
+from polhode.solvers import Extrapolation
 
 
 class Record(eqx.Module):
@@ -75,20 +78,6 @@ class AbstractMethod(eqx.Module):
     @abc.abstractmethod
     def run(self, scene: Scene, state: State, ts: Array, rtol: float, record: Record) -> Samples:
         """Samples at ``ts`` (T,) or (N, T) of lanes whose state holds at the first time."""
-
-
-class _LaneNorm(eqx.Module):
-    """Error of the worst lane: root mean square over its components, each times its weight.
-
-    A batch that shares its steps so keeps every body's own tolerance.
-    """
-
-    weights: Array
-
-    def __call__(self, y: Array) -> Array:
-        worst = jnp.max(jnp.mean((y * self.weights) ** 2, axis=0))
-        positive = worst > 0  # the root's slope at zero is infinite: keep it out of gradients
-        return jnp.where(positive, jnp.sqrt(jnp.where(positive, worst, 1)), 0)
 
 
 class AbstractDiffraxMethod(AbstractMethod):
@@ -175,31 +164,33 @@ class AbstractDiffraxMethod(AbstractMethod):
         if controller is None:
             if self.at_end:
                 rate = jnp.max(jnp.linalg.norm(state.omega_body, axis=-1))
-                rtol = rtol / jax.lax.stop_gradient(jnp.maximum(1, rate * jnp.abs(ts[-1] - ts[0])))
+                turned = jnp.maximum(1, rate * jnp.abs(ts[-1] - ts[0]))
+                rtol = rtol / jax.lax.stop_gradient(2 * turned)  # and room for steps that miss it
+                rtol = jnp.maximum(rtol, _FINEST * jnp.finfo(rtol.dtype).eps)
             controller = diffrax.PIDController(
                 rtol=0.0,
                 atol=rtol,
-                norm=_LaneNorm(weights),
+                norm=LaneNorm(weights),
             )
-            if not record.final_only:  # samples as accurate as steps, not as the interpolant
-                controller = diffrax.ClipStepSizeController(controller, step_ts=ts)
-        samples = diffrax.SubSaveAt(t1=True) if record.final_only else diffrax.SubSaveAt(ts=ts)
-        solution = diffrax.diffeqsolve(
+        solve = partial(
+            diffrax.diffeqsolve,
             diffrax.ODETerm(field),
             self.solver,
-            ts[0],
-            ts[-1],
-            self.dt0,
-            y0,
-            dynamics,
-            saveat=diffrax.SaveAt(subs=[samples, diffrax.SubSaveAt(t1=True)]),
-            stepsize_controller=controller,
+            args=dynamics,
             adjoint=self.adjoint,
             max_steps=self.max_steps,
             progress_meter=self.progress_meter,
             throw=False,
         )
-        samples, last = (jnp.moveaxis(y, 0, -1) for y in solution.ys)
+        if isinstance(self.solver, Extrapolation) and self.controller is None:
+            width = self._first_width(scene, state, ts) if self.dt0 is None else self.dt0
+            found = through(solve, controller, ts, y0, width, record.final_only)
+        else:
+            if self.controller is None and not record.final_only:
+                # samples as accurate as steps, not as the interpolant
+                controller = diffrax.ClipStepSizeController(controller, step_ts=ts)
+            found = sampled(solve, controller, ts, y0, self.dt0, record.final_only)
+        samples, last, result, steps = found
         work = samples[-1] if record.work else None
         if record.work:
             samples, last = samples[:-1], last[:-1]
@@ -210,14 +201,24 @@ class AbstractDiffraxMethod(AbstractMethod):
         *_, sound_at_end = self.finish(later, last, ts[None, -1:])
         n = sound.shape[0]
         wxyz, omega = (jnp.where(sound[:, None, None], x, jnp.nan) for x in (wxyz, omega))
-        status = _status(solution.result, wxyz, omega, sound, sound_at_end[:, -1])
+        status = _status(result, wxyz, omega, sound, sound_at_end[:, -1])
         return Samples(
             wxyz if record.attitude else None,
             omega if record.rates else None,
             status,
-            jnp.broadcast_to(solution.stats["num_steps"], (n,)),
+            jnp.broadcast_to(steps, (n,)),
             work,
         )
+
+    def _first_width(self, scene, state, ts) -> Array:
+        """A first step well within what the fastest body of the chunk allows [s]."""
+        slowest = jnp.min(jnp.broadcast_to(scene.carrier.moments, (state.wxyz.shape[0], 3)), -1)
+        rate = jnp.max(momentum_scale(scene, state, ts[0]) / slowest)
+        return jax.lax.stop_gradient(jnp.sign(ts[-1] - ts[0]) * 0.3 / rate)
+
+
+_FINEST = 4
+"""Least tolerance of a step in units of rounding: below, the error estimate is rounding alone."""
 
 
 @eqx.filter_custom_vjp
@@ -295,7 +296,8 @@ class LiePoisson(AbstractDiffraxMethod):
       reverse mode; hand in ``diffrax.ForwardMode()`` for ``jax.jvp``.
     - ``chunk``: bodies that share their steps; chunks follow one another, so memory stays bounded.
     - ``at_end``: hold the error at the last time to ``rtol``, not that of each step: the steps'
-      tolerance is ``rtol`` over the angle that the fastest body of the chunk turns through.
+      tolerance is half ``rtol`` over the angle that the fastest body of the chunk turns through, or
+      what rounding allows.
     - ``gradient_solver``: solver for reverse mode, whose steps are differentiated in place of the
       first one's (both follow the same motion to the tolerance); None: the same solver.
     """

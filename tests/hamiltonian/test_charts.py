@@ -145,6 +145,7 @@ def test_imports_go_one_way():
         {"free", "solvers", "tops"},
         {"_state", "_scene", "_lanes", "_status"},
         {"_trajectory", "_mesh"},
+        {"_stepping"},
         {"_methods"},
         {"_closed_form", "_extrapolated", "_top_methods", "_periods"},
         {"_plan"},
