@@ -157,18 +157,23 @@ def test_long_batches_are_cut_without_a_trace():
             np.testing.assert_allclose(x, y, atol=1e-14)
 
 
-def test_second_derivatives_of_a_triaxial_body():
-    moments, omega, t = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.3, -0.2, 0.9]), jnp.array(3.0)
-
-    def number(i):
-        return free.free_motion(i, jnp.array([0.5, -0.5, 0.5, 0.5]), omega, t)[1][1]
-
-    hessian = jax.jit(jax.hessian(number))(moments)
-    gradient, step = jax.jit(jax.grad(number)), 1e-5
-    for k in range(3):
-        change = jnp.zeros(3).at[k].set(step)
-        exact = (gradient(moments + change) - gradient(moments - change)) / (2 * step)
-        np.testing.assert_allclose(hessian[k], exact, atol=1e-8)
+def test_a_sphere_has_no_axis_that_the_momentum_may_not_be_across():
+    """Any direction of the rates, along and across every axis, turns about itself."""
+    rates = np.array(np.meshgrid(*[(-1.0, 0.0, 0.5)] * 3)).reshape(3, -1).T
+    for dtype in (np.float64, np.float32):
+        omega, t = jnp.asarray(rates, dtype), jnp.full(len(rates), 1.5, dtype)
+        moments, wxyz = (
+            jnp.full(omega.shape, 2, dtype),
+            jnp.tile(jnp.eye(4, dtype=dtype)[0], (27, 1)),
+        )
+        found, turned = free.free_motion(moments, wxyz, omega, t)
+        np.testing.assert_array_equal(np.stack(found, -1), omega)
+        size = np.linalg.norm(rates, axis=-1, keepdims=True)
+        axis = rates / np.where(size > 0, size, 1)
+        exact = np.concatenate([np.cos(0.75 * size), axis * np.sin(0.75 * size)], -1)
+        turned = np.stack(turned, -1)
+        turned = turned * np.sign(np.sum(turned * exact, -1, keepdims=True))
+        np.testing.assert_allclose(turned, exact, atol=2 * np.finfo(dtype).eps)
 
 
 def test_conserved_over_long_times():

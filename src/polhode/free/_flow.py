@@ -60,18 +60,22 @@ def jacobi(swing: Swing, rest: Scalars, stage):
     return half, (sn, cn, dn)
 
 
-def momentum(swing: Swing, functions: Triple) -> Triple:
+def momentum_of(swing: Swing, functions: Triple) -> Triple:
     """L along axes 1, 2, 3 from its initial value, by the addition theorems."""
     S, C, N = functions
     l1, l2, l3 = swing.momentum
     k = swing.sense * swing.parity
     below = 1 / (C * C + swing.r * swing.s * (l3 * l3) * (S * S))
-    now = (
+    return (
         (l1 * C - k * (swing.r * l2 * l3) * S * N) * below,
         (l2 * C * N + k * (swing.s * l1 * l3) * S) * below,
         (l3 * N - k * (swing.p * l1 * l2) * S * C) * below,
     )
-    # Exact spin about a principal axis keeps its rates to the last bit.
+
+
+def momentum(swing: Swing, functions: Triple) -> Triple:
+    """The same; exact spin about a principal axis keeps its rates to the last bit."""
+    now = momentum_of(swing, functions)
     return tuple(jnp.where(swing.steady, l, x) for l, x in zip(swing.momentum, now, strict=True))
 
 

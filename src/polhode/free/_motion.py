@@ -92,6 +92,21 @@ def _nome(square: Scalars, root: Scalars) -> Scalars:
     return e * (1 + f * (2 + f * (15 + f * (150 + f * (1707 + f * 20910)))))
 
 
+def means(circular, endless, x: Scalars, m: Scalars, m1: Scalars, one: Scalars):
+    """Arithmetic-geometric mean, nome, minus its logarithm, and the rate of the argument."""
+    square = jnp.where(circular, m, m1)
+    other = jnp.sqrt(jnp.where(circular, m1, m))
+    omega = jnp.sqrt(x)
+    a, b = 1.0, other
+    for _ in range(_STEPS - 1):
+        a, b = (a + b) / 2, jnp.sqrt(a * b)
+    mean = (a + b) / 2
+    nome = _nome(square, jnp.sqrt(other))
+    mean, nome = settle((mean, nome), one)
+    log_nome = jnp.where(circular | endless, 1, -jnp.log(jnp.where(circular | endless, 0.5, nome)))
+    return mean, nome, log_nome, settle(omega * mean, one)
+
+
 def prepare_swing(roles: Roles) -> Swing:
     """Parameter, periods and amplitudes of the momentum in the body."""
     i1, i2, i3 = roles.moments
@@ -113,18 +128,7 @@ def prepare_swing(roles: Roles) -> Swing:
     circular = m1 > 1 - _TURNING
     endless = moving & (m1 < floor)
     steady = (jnp.abs(l1) + jnp.minimum(jnp.abs(l2), jnp.abs(l3))) == 0
-    square = jnp.where(circular, m, m1)
-    other = jnp.sqrt(jnp.where(circular, m1, m))
-    omega = jnp.sqrt(x)
-    a, b = 1.0, other
-    for _ in range(_STEPS - 1):
-        a, b = (a + b) / 2, jnp.sqrt(a * b)
-    mean = (a + b) / 2
-    nome = _nome(square, jnp.sqrt(other))
-    mean, nome = settle((mean, nome), one)
-    log_nome = jnp.where(circular | endless, 1, -jnp.log(jnp.where(circular | endless, 0.5, nome)))
-    rate = omega * mean
-    rate = settle(rate, one)
+    mean, nome, log_nome, rate = means(circular, endless, x, m, m1, one)
     pace = rate / jnp.where(circular, math.pi, log_nome) * roles.pulse
     inverse_rate = jnp.where(moving, 1 / jnp.where(moving, rate, 1), 0)
     pace = settle(pace, one)

@@ -8,10 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from polhode.free._evaluate import change_of_start, components, zero_where_symbolic
+from polhode.free._evaluate import components
 from polhode.free._frame import Frame, dot, matrix
 from polhode.free._motion import Swing, descend, prepare_swing, prepare_turning
 from polhode.free._roles import assign_roles
+from polhode.free._rule import change_of_start, zero_where_symbolic
 from polhode.free._second import complete
 from polhode.free._tangent import change_of_invariants
 

@@ -77,7 +77,11 @@ def assign_roles(moments: Triple, rates: Triple) -> Roles:
     pulse = binade(largest)
     heft = binade(jnp.maximum(jnp.maximum(moments[0], moments[1]), moments[2]))
     one = one_of(moments[0])
-    k_low, k_high = _extremes(*moments)
+    # The momentum of a sphere circles no axis: the one that it is nearest to, so that it is not
+    # across it.
+    sphere = (moments[0] == moments[1]) & (moments[1] == moments[2])
+    order = tuple(jnp.where(sphere, jnp.abs(w), i) for w, i in zip(rates, moments, strict=True))
+    k_low, k_high = _extremes(*order)
     k_mid = 3 - k_low - k_high
     low, mid, high = (pick(moments, k) / heft for k in (k_low, k_mid, k_high))
     w_low, w_mid, w_high = (pick(rates, k) / pulse for k in (k_low, k_mid, k_high))

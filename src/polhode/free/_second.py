@@ -25,28 +25,31 @@ def _tail(x: Scalars, y: Scalars, z: Scalars) -> Scalars:
     return (series - 9 / 52 * e2 * e3 + 3 / 26 * e5) / (mean * jnp.sqrt(mean))
 
 
-def _incomplete(S: Scalars, C: Scalars, N: Scalars, many: bool) -> tuple[Scalars, Scalars]:
+def incomplete(S: Scalars, C: Scalars, N: Scalars, many: bool) -> tuple[Scalars, Scalars]:
     """Integrals of S^2 and (S/N)^2 over less than half a turn, by Carlson's duplication.
 
     They are S^3/3 R_D(C^2, N^2, 1) and S^3/3 R_D(C^2, 1, N^2), which share their square roots.
     """
 
     def duplicate(_, carry):
-        first, second, x, y, z, share = carry
-        u, v, w = jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z)
+        *sums, x, y, z, share = carry
+        return halve(*sums, x, y, z, share, jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z))
+
+    def halve(first, second, x, y, z, share, u, v, w):
         grow = u * v + v * w + w * u
         first = first + share / (w * (z + grow))
         second = second + share / (v * (y + grow))
         return first, second, (x + grow) / 4, (y + grow) / 4, (z + grow) / 4, share / 4
 
     zero, one = jnp.zeros_like(N), jnp.ones_like(N)
-    carry = (zero, zero, C * C, N * N, one, jnp.ones((), N.dtype))
+    # The first roots are known: C and N are smooth where the root of C^2 is not.
+    carry = halve(zero, zero, C * C, N * N, one, jnp.ones((), N.dtype), C, N, one)
     if many:
         # With many times per body several kernels need the result, and each would repeat all of
         # it: as a loop it is worked out once, and compiles in half of the time.
-        carry = jax.lax.fori_loop(0, _DUPLICATIONS, duplicate, carry)
+        carry = jax.lax.fori_loop(1, _DUPLICATIONS, duplicate, carry)
     else:
-        for k in range(_DUPLICATIONS):
+        for k in range(1, _DUPLICATIONS):
             carry = duplicate(k, carry)
     first, second, x, y, z, share = carry
     cube = S * S * S
@@ -55,9 +58,14 @@ def _incomplete(S: Scalars, C: Scalars, N: Scalars, many: bool) -> tuple[Scalars
 
 def complete(swing: Swing) -> tuple[Scalars, Scalars]:
     """The same integrals over a quarter of the momentum's period."""
-    circular = swing.circular
-    square = jnp.where(circular, swing.m, swing.m1)
-    other = jnp.sqrt(jnp.where(circular, swing.m1, swing.m))
+    means = swing.mean, swing.log_nome, swing.inverse_rate
+    return quarter_turn(swing.circular, swing.endless, swing.m, swing.m1, *means)
+
+
+def quarter_turn(circular, endless, m, m1, mean, log_nome, inverse_rate):
+    """The same from the parameter, its complement and what comes of their mean."""
+    square = jnp.where(circular, m, m1)
+    other = jnp.sqrt(jnp.where(circular, m1, m))
     a, b = (1 + other) / 2, jnp.sqrt(other)
     part = 1 / (2 * (1 + other))
     gap = square * part
@@ -68,21 +76,20 @@ def complete(swing: Swing) -> tuple[Scalars, Scalars]:
         weight *= 2
         total = total + weight * gap * part
     half = total / 2
-    mean = swing.mean
-    quarter = jnp.where(circular, math.pi, swing.log_nome) / (2 * mean)
-    m = jnp.where(circular, 1, swing.m)
-    first = jnp.where(circular, quarter * half, (quarter * (1 - swing.m1 * half) - mean) / m)
-    second = jnp.where(circular, quarter * (1 - half), (mean + quarter * swing.m1 * (half - 1)) / m)
-    inverse = swing.inverse_rate * mean
+    quarter = jnp.where(circular, math.pi, log_nome) / (2 * mean)
+    m = jnp.where(circular, 1, m)
+    first = jnp.where(circular, quarter * half, (quarter * (1 - m1 * half) - mean) / m)
+    second = jnp.where(circular, quarter * (1 - half), (mean + quarter * m1 * (half - 1)) / m)
+    inverse = inverse_rate * mean
     cube = inverse * inverse * inverse
-    bounded = jnp.where(swing.endless, 0, cube)
-    return first * bounded, second * bounded / jnp.where(swing.endless, 1, swing.m1)
+    bounded = jnp.where(endless, 0, cube)
+    return first * bounded, second * bounded / jnp.where(endless, 1, m1)
 
 
 def second_kind(
     swing: Swing, whole: Scalars, folded: Triple, many: bool
 ) -> tuple[Scalars, Scalars]:
     """Integrals of S^2 and (S/N)^2 from the start; ``folded``: S, C, N less their half turns."""
-    first, second = _incomplete(*folded, many)
+    first, second = incomplete(*folded, many)
     turn_first, turn_second = complete(swing)
     return first + 2 * whole * turn_first, second + 2 * whole * turn_second

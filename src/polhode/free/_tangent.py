@@ -111,19 +111,21 @@ def products_of_momenta(at: Setting, functions: Triple, hand: Scalars) -> Triple
 def _crossed(at: Setting, functions: Triple, now: Triple, by: Partials, hand, sense) -> tuple:
     """Answers of L(t) to the entries 12, 13, 23 of the inverse tensor."""
     S, C, N = functions
-    (l1, l2, l3), p, r, s, _, _ = at
+    (l1, l2, l3), p, r, s, *_ = at
     n1, n2, n3 = now
     delta, up, tilt, _ = _quotients(at, functions)
     square = S * S
     uneven = s > 0
     span = jnp.where(uneven, s, 1)
     ahead = C >= 0
+    # (p C + r N) / s, whose derivative in a nearly spherical body is not to be divided by s.
+    share = p * r / span * square * (at.B / jnp.where(ahead, 1 + C, 1) + at.A / (1 + N))
+    blend = jnp.where(ahead, 1 - share, (p * C + r * N) / span)
     split = jnp.where(
         ahead,
         -square * (r * l3 * l3 - p * l1 * l1) / jnp.where(ahead, C + N, 1),
         (C - N) / span,
     )
-    blend = jnp.where(uneven, (p * C + r * N) / span, 1)
 
     def answer(product, dd, heads):
         dS, dC, dN = by.along(2 * r * product, 2 * s * product)
@@ -196,15 +198,38 @@ def momentum_tangent(
     )
 
 
-def squares_of_momenta(swing: Swing, S: Scalars, now: Triple, first: Scalars, t: Scalars):
+# Squares of the phase below which the series serves: its next term is then below the last bit, and
+# the quotient of differences loses no more than a factor of sixty.
+_SHORT = 2.0**-12
+
+
+def _spread(at: Setting, S: Scalars, first: Scalars, t: Scalars, short, span):
+    """((l2)^2 (t - S) - A B first) / s: a series where s may vanish."""
+    (l1, l2, l3), p, r, _, A, B = at
+    x, y = B * r, A * p
+    b, a = B * l1 * l1, A * l3 * l3
+    square = t * t
+    series = b + a
+    series = series - square / 20 * ((x + 7 * y) * b + (7 * x + y) * a)
+    cross = 104 * x * y
+    terms = (x * x + cross + 31 * y * y) * b + (31 * x * x + cross + y * y) * a
+    series = series + square * square / 840 * terms
+    series = -t * square / 6 * series
+    return jnp.where(short, series, (l2 * l2 * (t - S) - A * B * first) / span)
+
+
+def squares_of_momenta(swing, functions: Triple, now: Triple, first: Scalars, t: Scalars):
     """Integrals of L1^2, L2^2, L3^2 over the time from the start."""
+    S, _, _ = functions
     l1, l2, l3 = swing.momentum
+    hand = swing.sense * swing.parity
+    at = Setting(swing.momentum, swing.p, swing.r, swing.s, swing.A, swing.B)
     middle = swing.A * swing.B * first + S * l2 * now[1]
-    less = l2 * l2 * t - middle
-    uneven = swing.s > 0
-    span = jnp.where(uneven, swing.s, 1)
-    return (
-        l1 * l1 * t + swing.r / span * less,
-        middle,
-        l3 * l3 * t + swing.p / span * less,
+    # (l2^2 t - middle) / s, of which the change of L2 is a part.
+    short = (swing.B * swing.r + swing.A * swing.p) * t * t < _SHORT
+    span = jnp.where(short, 1, swing.s)
+    delta, _, _, skew = _quotients(at, functions)
+    less = _spread(at, S, first, t, short, span) - l2 * S * (
+        (l2 * skew + hand * l1 * l3 * S) / delta
     )
+    return l1 * l1 * t + swing.r * less, middle, l3 * l3 * t + swing.p * less
