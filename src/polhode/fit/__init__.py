@@ -7,6 +7,13 @@ from polhode.fit._fit import (
     fit_recordings as fit_recordings,
     windows as windows,
 )
+from polhode.fit._fit_balance import BalanceFit as BalanceFit, fit_balance as fit_balance
+from polhode.fit._instrument import (
+    Instrument as Instrument,
+    Tolerance as Tolerance,
+    averaged as averaged,
+    lever_arm as lever_arm,
+)
 from polhode.fit._motion import (
     AbstractMotion as AbstractMotion,
     Drag as Drag,

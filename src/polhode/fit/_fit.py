@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
 from polhode._checks import require
+from polhode.fit._compiled import compiled
 from polhode.fit._motion import AbstractMotion, FreeMotion
 from polhode.fit._parameters import AbstractInertiaUnknown, FullTensor
 from polhode.fit._recording import Recording, stack
@@ -145,13 +145,13 @@ def windows(recording: Recording, length: int) -> list[Recording]:
     ]
 
 
-@eqx.filter_jit
+@compiled
 def _together(recording: Recording, problem: Problem) -> InertiaFit:
     """One body from its recordings (leading axis)."""
     return conclude(solve(recording, problem), recording, problem)
 
 
-@eqx.filter_jit
+@compiled
 def _each(recording: Recording, problem: Problem) -> InertiaFit:
     """Fits of all bodies (leading axes), one recording each, in one compiled call."""
     batch = recording.batch_shape

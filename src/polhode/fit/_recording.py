@@ -24,7 +24,8 @@ class Recording(eqx.Module):
     accelerometer (specific force); each with its standard deviation ``omega_noise``,
     ``attitude_noise`` (rad), ``force_noise``, broadcast against it (1 where unknown: then the
     scatter is taken from the residuals); ``present`` (..., T): 1 for a sample, 0 for a gap;
-    ``wheel`` (..., T), rad/s: speed of a wheel relative to the body, if there is one.
+    ``wheel`` (..., T), rad/s: speed of a wheel relative to the body, if there is one, its gaps
+    bridged linearly; ``wheel_known`` (..., T): 1 where it was measured.
     """
 
     times: Float[Array, "*b t"]
@@ -36,6 +37,7 @@ class Recording(eqx.Module):
     omega_noise: Float[Array, "*b t 3"] | None = None
     attitude_noise: Float[Array, "*b t"] | None = None
     force_noise: Float[Array, "*b t 3"] | None = None
+    wheel_known: Float[Array, "*b t"] | None = None
 
     @classmethod
     def of(
@@ -51,6 +53,8 @@ class Recording(eqx.Module):
         force_noise: ArrayLike = 1.0,
     ) -> Self:
         """A checked recording. A sample whose row holds NaN is a gap and is left out.
+
+        A NaN of ``wheel_speed`` alone leaves the sample in, for the speed is interpolated there.
 
         Times must increase; they are shared or carry the same leading axes as the data. Raises
         ValueError for unsorted or repeated times, fewer than four samples, shapes that do not fit,
@@ -96,7 +100,7 @@ class Recording(eqx.Module):
         times = jnp.broadcast_to(times, (*batch, count))
         present = jnp.ones_like(times)
         for name, array in arrays.items():
-            if array is not None:
+            if array is not None and name != "wheel_speed":
                 whole = jnp.isfinite(array)
                 whole = jnp.all(whole, axis=-1) if tails[name] == 2 else whole
                 present = present * whole.astype(times.dtype)
@@ -105,6 +109,13 @@ class Recording(eqx.Module):
             for name, a in arrays.items()
         }
         omega, attitude = filled["omega_body"], filled["wxyz"]
+        wheel, known = filled["wheel_speed"], None
+        if wheel is not None:
+            known = jnp.isfinite(arrays["wheel_speed"]).astype(times.dtype)
+            if is_concrete(known):
+                least = int(jnp.min(jnp.sum(known, axis=-1)))
+                require(least >= 2, f"wheel_speed needs at least 2 numbers, got {least}.")
+            wheel = bridged(times, known, wheel)
         if is_concrete(present):
             least = int(jnp.min(jnp.sum(present, axis=-1)))
             require(least >= 4, f"a recording needs at least 4 samples without NaN, got {least}.")
@@ -125,8 +136,9 @@ class Recording(eqx.Module):
             omega,
             None if attitude is None else normalise(attitude),
             filled["force_body"],
-            filled["wheel_speed"],
+            wheel,
             **spread,
+            wheel_known=known,
         )
 
     @property
@@ -137,6 +149,26 @@ class Recording(eqx.Module):
     def mirrored(self) -> "Recording":
         """The rates with every sign reversed: what the other handedness of axes would read."""
         return eqx.tree_at(lambda r: r.omega, self, -self.omega)
+
+
+def bridged(
+    times: Float[Array, "*b t"], known: Float[Array, "*b t"], values: Float[Array, "*b t"]
+) -> Float[Array, "*b t"]:
+    """Values with those that are not ``known`` interpolated linearly between their neighbours."""
+
+    def one(times, known, values):
+        # the known ones to the front; what follows repeats the last of them
+        order = jnp.argsort(jnp.where(known > 0, times, jnp.inf))
+        count = jnp.sum(known > 0)
+        rank = jnp.arange(times.shape[0])
+        late = times[-1] - times[0] + jnp.max(times)
+        clock = jnp.where(rank < count, times[order], late)
+        last = values[order[count - 1]]
+        return jnp.interp(times, clock, jnp.where(rank < count, values[order], last))
+
+    shape = times.shape
+    flat = [x.reshape(-1, shape[-1]) for x in (times, known, values)]
+    return jax.vmap(one)(*flat).reshape(shape)
 
 
 def stack(recordings: Sequence[Recording]) -> Recording:

@@ -19,7 +19,7 @@ from polhode.fit._parameters import (
     base_of,
     free_columns,
 )
-from polhode.fit._recording import Recording
+from polhode.fit._recording import Recording, bridged
 from polhode.fit._residuals import Huber, Model
 from polhode.fit._start import alternatives, regression, scatter
 from polhode.inertia import Inertia, principal, second_moments
@@ -270,18 +270,10 @@ def _rates(recording: Recording) -> Float[Array, "r t 3"]:
         inner = (between[:, 1:] + between[:, :-1]) / 2
         return jnp.concatenate([between[:, :1], inner, between[:, -1:]], axis=1)
 
-    def one(times, present, omega):
-        # a missing sample takes the value interpolated between its present neighbours
-        clock = jnp.where(present > 0, times, jnp.inf)
-        order = jnp.argsort(clock)
-        count = jnp.sum(present > 0)
-        rank = jnp.arange(times.shape[0])
-        ordered = jnp.where(rank < count, clock[order], times[-1] - times[0] + jnp.max(times))
-        last = omega[order[count - 1]]
-        values = jnp.where((rank < count)[:, None], omega[order], last[None])
-        return jax.vmap(lambda v: jnp.interp(times, ordered, v), 1, 1)(values)
-
-    return jax.vmap(one)(recording.times, recording.present, recording.omega)
+    channels = [
+        bridged(recording.times, recording.present, recording.omega[..., k]) for k in range(3)
+    ]
+    return jnp.stack(channels, axis=-1)
 
 
 def _bases(recording, rates, problem) -> Base:

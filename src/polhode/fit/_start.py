@@ -117,7 +117,7 @@ def regression(
     def square(rows):
         return jnp.einsum("rtij,rtik->jk", rows, rows)
 
-    first = jax.vmap(_slope)(omega, times)
+    first = jax.vmap(central_slope)(omega, times)
     if momentum is None:
         metric = jnp.asarray([1, 1, 1, 2, 2, 2], omega.dtype) ** 0.5
 
@@ -149,7 +149,7 @@ def regression(
     return found[0][0], found[1][0], found[0][1]
 
 
-def _slope(omega, times):
+def central_slope(omega, times):
     """Central differences."""
     step = jnp.diff(times)[:, None]
     between = jnp.diff(omega, axis=0) / step

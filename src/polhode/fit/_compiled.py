@@ -1,0 +1,37 @@
+"""Compiling the programs of a fit in half the time."""
+
+import functools
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+from jax.errors import JaxRuntimeError
+
+# XLA's older way to emit loops: the same speed of the program for what a fit does, compiled in half
+# the time (jax 0.10 and 0.12, measured by benchmarks.identification)
+_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+
+
+def compiled(function: Callable) -> Callable:
+    """``eqx.filter_jit`` that compiles faster on processors, where this is the outermost jit."""
+    inner = eqx.filter_jit(function)
+    outermost = eqx.filter_jit(function, compiler_options=_OPTIONS)
+
+    @functools.wraps(function)
+    def call(*args):
+        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(args))
+        return (inner if traced or not _understood() else outermost)(*args)
+
+    return call
+
+
+@functools.cache
+def _understood() -> bool:
+    """Whether this jaxlib knows the options."""
+    if jax.default_backend() != "cpu":
+        return False
+    try:
+        jax.jit(lambda x: -x, compiler_options=_OPTIONS)(1.0)
+    except (JaxRuntimeError, ValueError):
+        return False
+    return True

@@ -1,0 +1,127 @@
+"""A gyroscope beside a wheel: what a data sheet leaves open, and readings made ready for a fit."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from polhode._checks import is_concrete, require
+from polhode.fit._recording import Recording
+from polhode.fit._start import central_slope, integrate
+from polhode.rotation import to_matrix
+
+
+class Instrument(eqx.Module):
+    """How readings mean rates and momentum: ``omega = (1 + skew) (reading - bias)``.
+
+    **Fields:** ``spin_inertia``, kg m^2, of the wheel; ``axis`` (3,) unit vector of its axis in
+    sensor axes; ``delay``, s: to a gyroscope's reading belongs the speed of ``delay`` before;
+    ``skew`` (3, 3): symmetric, traceless departure of the gyroscope's sensitivity from one (a
+    common factor is that of ``spin_inertia``, an antisymmetric part a turn of the axes); ``bias``
+    (3,), rad/s.
+    """
+
+    spin_inertia: Array | float
+    axis: Float[Array, " 3"] = eqx.field(converter=jnp.asarray, default=(0.0, 0.0, 1.0))
+    delay: Array | float = 0.0
+    skew: Float[Array, "3 3"] | None = None
+    bias: Float[Array, " 3"] | None = None
+
+    def __check_init__(self):
+        if is_concrete(self.spin_inertia):
+            require(
+                np.asarray(self.spin_inertia) > 0,
+                f"spin_inertia must be positive, got {self.spin_inertia}: without a wheel's "
+                "momentum the balance shows no scale (fit_inertia for free motion).",
+            )
+
+    def rates(self, reading: Float[Array, "*t 3"]) -> Float[Array, "*t 3"]:
+        """True rates, rad/s, sensor axes."""
+        if self.bias is not None:
+            reading = reading - jnp.broadcast_to(self.bias, reading.shape)
+        if self.skew is None:
+            return reading
+        return reading + jnp.einsum("ij,...j->...i", self.skew, reading)
+
+    def carried(self, times: Float[Array, " t"], wheel: Float[Array, " t"]) -> Float[Array, "t 3"]:
+        """Momentum of the wheel relative to the body, sensor axes; linear between the samples."""
+        speed = jnp.interp(times - self.delay, times, wheel)
+        return self.spin_inertia * speed[:, None] * self.axis[None]
+
+
+class Tolerance(NamedTuple):
+    """Standard deviations of what is fitted of an ``Instrument``; zero: taken as given.
+
+    ``axis``, rad; ``delay``, s; ``skew``, relative; ``bias``, rad/s: as a data sheet states them.
+    """
+
+    axis: float = 0.02
+    delay: float = 1e-3
+    skew: float = 0.01
+    bias: float = 0.02
+
+
+def averaged(recording: Recording, count: int) -> Recording:
+    """Means of blocks of ``count`` samples; a gap in a block makes it one. For fast recordings."""
+    length = recording.times.shape[-1] // count
+    require(
+        length >= 4,
+        f"blocks of {count} leave {length} of {recording.times.shape[-1]} samples, 4 are needed.",
+    )
+
+    def mean(array, tail):
+        array = jnp.take(array, jnp.arange(length * count), axis=array.ndim - 1 - tail)
+        place = array.ndim - 1 - tail
+        shape = (*array.shape[:place], length, count, *array.shape[place + 1 :])
+        return jnp.mean(array.reshape(shape), axis=place + 1)
+
+    tails = {"omega": 1, "wxyz": 1, "force": 1, "omega_noise": 1, "force_noise": 1}
+    found = {
+        name: mean(getattr(recording, name), tails.get(name, 0))
+        for name in recording.__dataclass_fields__
+        if getattr(recording, name) is not None
+    }
+    require("wxyz" not in found, "attitudes cannot be averaged; leave them out.")
+    for name in ("omega_noise", "force_noise"):
+        if name in found:
+            found[name] = found[name] / count**0.5
+    for name in ("present", "wheel_known"):
+        if name in found:
+            found[name] = jnp.floor(found[name])
+    return Recording(**found)
+
+
+@jax.jit
+def lever_arm(recording: Recording) -> Float[Array, "*b 3"]:
+    """Position (..., 3), m, of the accelerometer relative to the centre of mass, in free flight.
+
+    Linear least squares of ``force = alpha x r + omega x (omega x r) + R^T (a + b t)``: the angular
+    acceleration by central differences, and a drag of the air that changes little in space while
+    the body turns. ``averaged`` to samples of a few milliseconds the recording has less noise in
+    ``alpha``. Needs ``force`` and ``omega``.
+    """
+
+    def one(times, present, omega, force):
+        slope = central_slope(omega, times)
+        unit = jnp.eye(3, dtype=omega.dtype)
+
+        def felt(arm):
+            return jnp.cross(slope, arm) + jnp.cross(omega, jnp.cross(omega, arm))
+
+        turn = jnp.swapaxes(to_matrix(integrate(omega, slope, times)), -1, -2)
+        late = (times - times[0])[:, None, None]
+        design = jnp.concatenate([jax.vmap(felt, out_axes=-1)(unit), turn, late * turn], axis=-1)
+        # a difference reaches to both neighbours
+        whole = present * jnp.roll(present, 1) * jnp.roll(present, -1)
+        whole = whole.at[0].set(0).at[-1].set(0)
+        design = design * whole[:, None, None]
+        square = jnp.einsum("tij,tik->jk", design, design)
+        return jnp.linalg.solve(square, jnp.einsum("tij,ti->j", design, force))[:3]
+
+    batch = recording.batch_shape
+    parts = (recording.times, recording.present, recording.omega, recording.force)
+    flat = [part.reshape(-1, *part.shape[len(batch) :]) for part in parts]
+    return jax.vmap(one)(*flat).reshape(*batch, 3)
