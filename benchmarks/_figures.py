@@ -154,7 +154,51 @@ def gradients(report: dict):
     return figure
 
 
-DRAWN = {"work_precision": work_precision, "scaling": scaling, "gradients": gradients}
+def identification(report: dict):
+    """Errors over the bound and cover of intervals, two standard errors; times beside SciPy."""
+    import matplotlib.pyplot as plt
+
+    from polhode.plot._matplotlib import STYLE
+
+    numbers = report["numbers"]
+    rows = [*numbers["designs"], numbers["designs_pooled"]]
+    names = [
+        f"{row['turns']} turns, {100 * row['noise_over_rate']:g} %" if "turns" in row else "all"
+        for row in rows
+    ]
+    with plt.rc_context(STYLE):
+        figure = plt.figure(figsize=(10.5, 3.2), layout="constrained")
+        error, cover, speed = figure.subplots(1, 3)
+        for ax, name, target, label in (
+            (error, "error_over_bound", (0.9, 1.1), "error / Cramér-Rao bound"),
+            (cover, "interval_cover", (0.93, 0.97), "cover of 95 % intervals"),
+        ):
+            values = [row.get(name, row.get(f"{name}_95")) for row in rows]
+            spread = [2 * row[f"{name}_std"] for row in rows]
+            ax.axvspan(*target, color="#009E73", alpha=0.15, linewidth=0)
+            ax.errorbar(values, range(len(rows)), xerr=spread, fmt="o", color="#222222")
+            ax.set_yticks(range(len(rows)), names if ax is error else [""] * len(rows))
+            ax.invert_yaxis()
+            ax.set_xlabel(label)
+            ax.grid(visible=False, axis="y")
+        cases = numbers["speed"]["cases"]
+        for kind, colour in (("ours", "#222222"), ("scipy", "#CC79A7")):
+            times = [1e3 * case[f"{kind}_s"] for case in cases]
+            off = [case[f"error_{kind}"] for case in cases]
+            name = {"ours": "polhode", "scipy": "SciPy"}[kind]
+            speed.plot(times, off, "o", color=colour, label=name, alpha=0.8)
+        speed.set_xscale("log")
+        speed.set_yscale("log")
+        speed.set_xlabel("time of one fit [ms]")
+        speed.set_ylabel("error of the tensor")
+        speed.legend()
+    return figure
+
+
+DRAWN = {
+    "work_precision": work_precision, "scaling": scaling, "gradients": gradients,
+    "identification": identification,
+}  # fmt: skip
 
 
 def draw(paths: list[Path], folder: Path, suffix: str = ".svg") -> list[Path]:

@@ -78,7 +78,11 @@ def measure(found):
         everything, room.Instrument(SPIN), bodies=bodies, tolerance=room.Tolerance(), knot=KNOT,
         block=BLOCK,
     )  # fmt: skip
-    each = {name: fit.each(found[name], k) for k, name in enumerate(names)}
+    each = {
+        name: fit.each(found[name], k)
+        for k, name in enumerate(names)
+        if name not in (DEVICE, PROOF)
+    }
     slow = room.stack([room.averaged(one, BLOCK) for one in everything])
     arms = np.asarray(room.lever_arm(slow))
     arms = {name: arms[np.array(bodies) == k].mean(axis=0) for k, name in enumerate(names)}
@@ -148,7 +152,7 @@ def run(folder, configurations=None):
     joint = dict(zip(found, np.asarray(fit.inertia.tensor), strict=True))
     single = {name: np.asarray(one.inertia.tensor) for name, one in each.items()}
     scale, alone = objects(index, joint, single, arms)
-    _, together = objects(index, joint, {name: one[None] for name, one in joint.items()}, arms)
+    _, together = objects(index, joint, {name: joint[name][None] for name in single}, arms)
     device = fit.instrument
     return {
         "throws": sum(map(len, found.values())),

@@ -21,7 +21,8 @@ def read_recording(
 
     ``columns`` names the file's columns for ``t``, ``wx``, ``wy``, ``wz`` and optionally ``wheel``;
     ``scale`` multiplies the rates (pi/180 for deg/s), ``time_scale`` the times (1e-3 for ms);
-    ``noise``, rad/s: standard deviation of the rates. An empty or NaN cell makes its row a gap.
+    ``noise``, rad/s: standard deviation of the rates. An empty or NaN cell makes its row a gap
+    (one of ``wheel`` alone is bridged linearly).
     Raises FileNotFoundError, and ValueError for missing columns, cells that are no numbers,
     unsorted or repeated times (each with its line) and rates that look like deg/s.
     """

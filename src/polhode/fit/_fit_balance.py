@@ -23,7 +23,8 @@ class BalanceFit(eqx.Module):
 
     **Fields:** ``inertia``: tensors in sensor axes about the centre of mass, the wheel locked,
     kg m^2; ``moments`` (n, 3), ascending, and ``axes`` (n, 4), ``wxyz`` principal -> sensor axes,
-    with standard deviations ``moments_std`` and ``axes_std`` (n, 3), rad, about each principal axis;
+    with standard deviations ``moments_std`` and ``axes_std`` (n, 3), rad, about each principal
+    axis;
     ``covariance`` (n, 6, 6) of xx, yy, zz, yz, zx, xy; ``instrument`` as it was found; ``noise``
     found of the balance (``omega``, rad/s) and of the torque (``torque``, N m s^(1/2)) per body;
     ``residuals`` (r, t, 3) over their noise; ``converged``.
