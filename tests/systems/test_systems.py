@@ -14,7 +14,7 @@ ALL = [s.name for s in SYSTEMS]
 METHODS = {
     "closed_form": (ph.ClosedForm(), FREE),
     "lie_poisson": (ph.LiePoisson(Dopri8()), ALL),
-    "extrapolated": (ph.Extrapolated(14), ["gravity_gradient"]),
+    "extrapolated": (ph.Extrapolated(14), [s.name for s in SYSTEMS if s.acts]),
     "euler_angles": (ph.EulerAngles(Dopri8()), ["free_short_axis_mode", "heavy_asymmetric_top"]),
 }
 VALUE = [(method, name) for method, (_, names) in METHODS.items() for name in names]

@@ -5,4 +5,5 @@ from polhode.solvers._choice import (
     steps_for as steps_for,
 )
 from polhode.solvers._extrapolation import Extrapolation as Extrapolation
+from polhode.solvers._flow import flow as flow
 from polhode.solvers._splitting import Splitting as Splitting

@@ -48,7 +48,7 @@ class Problem(eqx.Module):
             return problem.increment(*jax.tree.unflatten(state_tree, leaves[len(arrays) :]))
 
         closed, shape = jax.make_jaxpr(increment, return_shape=True)(*arrays, *state)
-        held, run = specialise(closed, arrays)
+        held, run, _ = specialise(closed, arrays)
         return Prepared(held, (run, jax.tree.structure(shape)))
 
 

@@ -1,0 +1,106 @@
+"""A linear map that is computed by one program and transposed by another."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+
+Map = Callable[[Sequence[Any], Sequence[Any]], Sequence[Any]]
+
+
+def linear(
+    forward: Map, backward: Map, given: Sequence[Any], operands: Sequence[Any], like: Sequence[Any]
+) -> list[Any]:
+    """``forward(given, operands)``, linear in ``operands``; ``backward(given, out)`` transposes it.
+
+    All are lists of arrays; ``like``: arrays of the shapes and dtypes of the result. Neither
+    function may close over traced values. Unlike ``jax.custom_vjp`` this leaves forward mode as it
+    is, and unlike ``jax.custom_derivatives.linear_call`` it takes ``vmap`` and derivatives with
+    respect to ``given``.
+    """
+    shapes = tuple((tuple(x.shape), x.dtype) for x in like)
+    return _linear_p.bind(
+        *given, *operands, forward=forward, backward=backward, count=len(given), shapes=shapes
+    )
+
+
+_linear_p = Primitive("linear_map")
+_linear_p.multiple_results = True
+
+
+@_linear_p.def_impl
+def _compute(*arrays, forward, backward, count, shapes):
+    return list(forward(arrays[:count], arrays[count:]))
+
+
+@_linear_p.def_abstract_eval
+def _shapes(*_, forward, backward, count, shapes):
+    return [jax.core.ShapedArray(shape, dtype) for shape, dtype in shapes]
+
+
+def _jvp(arrays, tangents, *, count, **params):
+    out = _linear_p.bind(*arrays, count=count, **params)
+    given, operands = arrays[:count], arrays[count:]
+    moved = tangents[count:]
+    changes: list[Any] = []
+    if not all(isinstance(x, ad.Zero) for x in moved):
+        moved = [_zeros(x) if isinstance(x, ad.Zero) else x for x in moved]
+        changes = _linear_p.bind(*given, *moved, count=count, **params)
+    at = [i for i, x in enumerate(tangents[:count]) if _is_slope(x)]
+    if at:
+
+        def of_given(*some):
+            full = list(given)
+            for i, x in zip(at, some):
+                full[i] = x
+            return params["forward"](full, operands)
+
+        _, more = jax.jvp(of_given, [given[i] for i in at], [tangents[i] for i in at])
+        changes = [a + b for a, b in zip(changes, more)] if changes else more
+    return out, changes
+
+
+def _is_slope(x: Any) -> bool:
+    return not isinstance(x, ad.Zero) and x.dtype != jax.dtypes.float0
+
+
+def _zeros(x: Any) -> Any:
+    return jnp.zeros(x.aval.shape, x.aval.dtype)
+
+
+def _transpose(slopes, *arrays, forward, backward, count, shapes):
+    given, operands = arrays[:count], arrays[count:]
+    unknown = [ad.is_undefined_primal(x) for x in operands]
+    avals = [x.aval if u else x for u, x in zip(unknown, operands)]
+    slopes = [_zeros(x) if isinstance(x, ad.Zero) else x for x in slopes]
+    found = linear(backward, forward, given, slopes, avals)
+    return [None] * count + [x if u else None for u, x in zip(unknown, found)]
+
+
+def _batch(arrays, dims, *, forward, backward, count, shapes):
+    size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
+    given_dims, operands = dims[:count], []
+    for x, d in zip(arrays[count:], dims[count:]):
+        full = jnp.broadcast_to(x, (size, *x.shape)) if d is None else jnp.moveaxis(x, d, 0)
+        operands.append(full)
+
+    def batched(fn):
+        return lambda given, operands: jax.vmap(
+            lambda *both: list(fn(both[: len(given)], both[len(given) :])),
+            in_axes=(*given_dims, *[0] * len(operands)),
+        )(*given, *operands)
+
+    out = _linear_p.bind(
+        *arrays[:count], *operands, forward=batched(forward), backward=batched(backward),
+        count=count, shapes=tuple(((size, *shape), dtype) for shape, dtype in shapes),
+    )  # fmt: skip
+    return out, [0] * len(out)
+
+
+ad.primitive_jvps[_linear_p] = _jvp
+ad.primitive_transposes[_linear_p] = _transpose
+batching.primitive_batchers[_linear_p] = _batch
+mlir.register_lowering(_linear_p, mlir.lower_fun(_compute, multiple_results=True))
