@@ -259,6 +259,24 @@ def scaling(report: dict) -> list[str]:
     ]  # fmt: skip
 
 
+def stress(report: dict) -> list[str]:
+    lines = [
+        [row["family"], row["dtype"], str(row["bodies"]), number(row["attitude"]),
+         number(row["rates"]), number(row["forward"]), number(row["reverse"]), row["worst body"]]
+        for row in report["numbers"]["worst"]
+    ]  # fmt: skip
+    header = ["worst of the family", "dtype", "bodies", "attitude", "rates", "gradient, forward",
+              "gradient, reverse", "worst body (reverse)"]  # fmt: skip
+    return [
+        "## Stress suite of the exact free motion", "", machine(report), "",
+        "Errors against 50 digits in units of eps x max(1, angle turned): of the attitude in"
+        " radians, of the rates relative to their size, of derivatives relative to the larger of"
+        " the exact one and the natural size. Fast needles lose digits of the gradient in"
+        " proportion to the ratio of their moments.", "",
+        "![errors of every body by family](results/stress.svg)", "", *rows(header, lines),
+    ]  # fmt: skip
+
+
 def generic(report: dict, name: str) -> list[str]:
     """Any other result: its lists of rows as tables, its other numbers as a list."""
     title = name.replace("_", " ")
@@ -350,7 +368,7 @@ def throws(report: dict) -> list[str]:
 
 SECTIONS = {
     "gradients": gradients, "scene_cost": scene_cost, "scaling": scaling,
-    "identification": identification, "throws": throws,
+    "identification": identification, "throws": throws, "stress": stress,
 }  # fmt: skip
 
 

@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import polhode as ph
+from benchmarks import _figures, _report
 from benchmarks.stress_families import Body, bodies
 
 TRUTH = Path(__file__).resolve().parents[1] / "tests" / "stress" / "stress_truth.json"
@@ -192,17 +193,32 @@ def worst(scores: list[dict]) -> dict[str, dict]:
     return found
 
 
-def draw(result: dict, path: Path) -> None:
-    """Every body's errors by family; the worst are ringed."""
+def table(result: dict) -> list[dict]:
+    """Per dtype and family the largest of each error and the body of the largest derivative's."""
+    lines = []
+    for dtype, scores in result.items():
+        for family, entry in worst(scores).items():
+            found = {name: entry[name][0] for name in COLUMNS if name in entry}
+            last = list(found)[-1]
+            lines.append({
+                "dtype": dtype, "family": family, "bodies": entry["bodies"], **found,
+                "worst body": entry[last][1],
+            })  # fmt: skip
+    return lines
+
+
+def draw(report: dict, path: Path) -> None:
+    """Every body's errors by family, from the JSON; the worst are ringed."""
     from matplotlib.figure import Figure
 
+    result = report["numbers"]["bodies"]
     figure = Figure(figsize=(11, 7), layout="constrained")
     panels = figure.subplots(len(result), 1, sharex=True, squeeze=False)[:, 0]
     for panel, (dtype, scores) in zip(panels, result.items(), strict=True):
         families = list(dict.fromkeys(score["family"] for score in scores))
         for shift, name in enumerate(COLUMNS):
             x = np.array([families.index(s["family"]) + 0.18 * (shift - 1.5) for s in scores])
-            y = np.array([max(s[name], 1e-2) for s in scores])
+            y = np.array([max(s[name] or 0, 1e-2) for s in scores])
             (line,) = panel.plot(x, y, "_", alpha=0.5, markersize=9)
             top = [y[x == place].max() for place in np.unique(x)]
             label = "gradient, " + name if shift > 1 else name
@@ -215,7 +231,7 @@ def draw(result: dict, path: Path) -> None:
         panel.set_title(dtype)
         panel.grid(axis="y", alpha=0.3)
     panels[0].legend(ncols=4, frameon=False)
-    figure.savefig(path, dpi=120)
+    _figures.save(figure, path)
 
 
 def main() -> None:
@@ -234,10 +250,9 @@ def main() -> None:
         for family, entry in worst(scores).items():
             cells = "".join(f"{entry[c][0]:>10.2f}" for c in columns)
             print(f"{family:<12}{entry['bodies']:>7}{cells}   {entry[columns[-1]][1]}")
-    if given.output:
-        given.output.write_text(json.dumps(result, indent=1) + "\n")
-        if not given.quick:
-            draw(json.loads(given.output.read_text()), given.output.with_suffix(".png"))
+    path = _report.write("stress", {"worst": table(result), "bodies": result}, path=given.output)
+    if not given.quick:
+        draw(_report.read(path), path.with_suffix(".svg"))
 
 
 if __name__ == "__main__":

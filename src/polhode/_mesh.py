@@ -37,6 +37,8 @@ def split_of(scene: Scene, state: State, ts: Array) -> Split | None:
     Looks at the ``NamedSharding`` of the arrays, or while they are traced, of their types (a mesh
     with explicit axes). Raises ValueError when two arrays are divided differently.
     """
+    if jax.device_count() == 1:
+        return None
     found: list[tuple[NamedSharding, tuple[int, ...]]] = []
 
     def look(x, rank):

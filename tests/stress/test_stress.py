@@ -1,5 +1,7 @@
 """The stress suite: every family against 50 digits in value and gradient, and Principia's cases."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -166,3 +168,25 @@ def test_principia_sphere():
     exact = np.asarray(rotation.multiply(start, own))
     off = min(np.linalg.norm(wxyz[-1] - exact), np.linalg.norm(wxyz[-1] + exact))
     assert off <= 114 * EPS
+
+
+# --- Orekit's TorqueFreeTest.java, with its own tolerances ----------------------------------------
+
+
+def test_orekit_momentum_and_local_behaviour():
+    orders = [list(order) for order in itertools.permutations(range(3))]
+    moments = np.array([np.array([0.375, 0.5, 0.625])[a] for a in orders for _ in orders])
+    omega = np.array([np.array([0.05, 0.0, 0.04])[b] for _ in orders for b in orders])
+    starts = np.array([np.roll((0.9, 0.437, 0.0, 0.0), k) for k in range(4)] * 9)
+    for sign in (1, -1):
+        ts = sign * np.arange(4001) / 100
+        wxyz, rates = _run(moments, moments * omega, ts, starts)
+        now = rotation.rotate(jnp.asarray(wxyz), jnp.asarray(rates * moments[:, None]))
+        now = np.asarray(now)
+        off = np.cross(now, now[:, :1]) / np.sum(now[:, :1] ** 2, -1, keepdims=True)
+        assert np.linalg.norm(off, axis=-1).max() <= 1.6e-15
+        for t, apart in ((0.1, 5e-6), (1.0, 5e-4)):
+            turn = rotation.rotation_vector_to_wxyz(jnp.asarray(sign * t * omega))
+            fixed = rotation.multiply(rotation.normalise(jnp.asarray(starts)), turn)
+            angle = rotation.angle_between(fixed, jnp.asarray(wxyz[:, round(100 * t)]))
+            assert np.max(angle) <= apart
