@@ -145,10 +145,10 @@ def gradients(report: dict):
         left.invert_yaxis()
         left.set_xscale("log")
         left.margins(x=0.12)
-        left.set_xlabel("value and gradient per body [µs]; over the value alone")
+        left.set_xlabel("both, per body [µs]; over the value alone")
         right.set_xscale("log")
         right.set_xlim(1e-16, 1)
-        right.set_xlabel("relative error of the gradient, median body")
+        right.set_xlabel("relative error, median")
         for ax in (left, right):
             ax.grid(visible=False, axis="y")
     return figure

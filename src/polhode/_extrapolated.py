@@ -108,6 +108,10 @@ class Extrapolated(AbstractMethod):
         horizon = jnp.abs(ts[-1] - ts[0])
         total = steps_for(self.order, rtol, jnp.max(rate), horizon)
 
+        # the way back from states that a torque has drawn together starts anew from kept ones
+        intervals = 1 if record.final_only else ts.shape[0] - 1
+        restarts = 1 if scene.torque is None else -(-_RESTARTS // intervals)
+
         def across(y, interval):
             start, end = interval
             share = jnp.ceil(total * jnp.abs(end - start) / (horizon * substeps))
@@ -116,7 +120,13 @@ class Extrapolated(AbstractMethod):
                 taken = jnp.minimum(count, self.max_steps)
                 reached = taken == count
                 end = jnp.where(reached, end, start + (end - start) * (taken / count))
-                y = flow(field, dynamics, y, (start, end), taken, self.order)
+                each = jnp.ceil(taken / restarts)
+                nodes = start + (end - start) * jnp.arange(restarts + 1, dtype=ts.dtype) / restarts
+
+                def onward(y, span):
+                    return flow(field, dynamics, y, span, each, self.order), None
+
+                y, _ = jax.lax.scan(onward, y, (nodes[:-1], nodes[1:].at[-1].set(end)))
                 return y, (y, reached, taken.astype(jnp.int32))
             solution = diffrax.diffeqsolve(
                 diffrax.ODETerm(field),
@@ -155,6 +165,9 @@ def _field_and_power(t, y, dynamics):
     power = external_power(t, y[0], from_quaternion(y[1]), dynamics)
     return *lie_poisson_field(t, y[:2], dynamics), power
 
+
+_RESTARTS = 8
+"""Parts of the time simulated whose starts are kept for a gradient where a torque acts."""
 
 _SUBSTEPS = 5
 """Steps of the method inside one diffrax step, whose own cost they share."""

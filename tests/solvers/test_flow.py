@@ -21,10 +21,10 @@ METHOD = ph.Extrapolated(12, chunk=2)
 
 
 def driven(p):
-    """Gravity, a torque that depends on time through what it closes over, drag."""
+    """Gravity, a torque that depends on time through what it closes over, drag that stops it."""
     push = ph.BodyTorque(lambda t: jnp.stack([jnp.sin(p["rate"] * t), 0 * t, p["rate"] + 0 * t]))
     weight = ph.UniformGravity(p["rate"], p["centre"], 0 * p["centre"] - 2)
-    drag = ph.LinearDamping(0.1 * p["centre"])
+    drag = ph.LinearDamping(8 * p["centre"])
     return ph.Scene(ph.Inertia.from_moments(p["moments"]), weight, push + drag)
 
 
