@@ -25,8 +25,7 @@ def test_every_torqued_scene_is_extrapolated():
         method, _ = choose(scene, STATE, ph.Record())
         assert isinstance(method, ph.LiePoisson)
         assert isinstance(method.solver, Extrapolation)
-    many = ph.State(np.ones((40, 4)), np.ones((40, 3)))
-    method, _ = choose(ph.Scene(INERTIA, GRAVITY), many, ph.Record())
+    method, _ = choose(ph.Scene(INERTIA, GRAVITY), STATE, ph.Record())
     assert isinstance(method, ph.Extrapolated)
 
 

@@ -74,14 +74,13 @@ def choose(
     exact = exact_top(scene, state, record)
     if exact is not None:
         return exact, exact.law
-    bodies = np.prod(common_batch(*(getattr(scene, name) for name in PARTS), state), dtype=int)
-    if scene.potential is not None and scene.torque is None and bodies >= _MANY:
+    if scene.potential is not None and scene.torque is None:
         falls = _falls(scene.potential)
         method = Extrapolated(
             _order(rtol), upright=falls, on_axis=falls and _balanced(scene.potential)
         )
         return method, (
-            f"a potential acts on many bodies: extrapolated midpoint rule of order {method.order}"
+            f"a potential acts on the body: extrapolated midpoint rule of order {method.order}"
             " in equal steps by each body's natural rate"
         )
     order = 10 if state.wxyz.dtype == jnp.float32 else min(14, _order(rtol))
@@ -90,10 +89,6 @@ def choose(
         f"something acts on the body: extrapolated midpoint rule of order {order}, stepped with an"
         " error estimate, held to rtol at the last time"
     )
-
-
-_MANY = 32
-"""Bodies from which equal steps are worth their longer compilation."""
 
 
 def _order(rtol) -> int:
@@ -198,7 +193,7 @@ def _exact_cost(scene, state, ts, bodies, samples, record, eps, compensated) -> 
 
 
 # Seconds on the same core: an evaluation of the field for one body and for each of many, a step.
-_EVALUATION, _EVALUATION_OF_MANY, _STEP = 4.5e-8, 2.7e-9, 5e-6
+_EVALUATION, _EVALUATION_OF_MANY, _STEP = 4.5e-8, 2e-9, 5e-6
 
 
 def _stepped_cost(method, scene, state, ts, bodies, rtol) -> tuple[float | None, str]:
