@@ -22,7 +22,8 @@ QUICK: dict[str, list[str]] = {
 }
 FULL: dict[str, list[str]] = {
     "work_precision": [], "gradients": [], "scene_cost": [], "scaling": [], "stress": [],
-    "identification": [], "accelerator": [],
+    "identification": [], "accelerator": [], "free_body": [], "elliptic_accuracy": [],
+    "rotation_stress": [],
 }  # fmt: skip
 
 

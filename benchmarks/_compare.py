@@ -8,6 +8,7 @@ ERRORS = ("median", "worst", "error", "p90")
 LABELS = (
     "family", "case", "title", "bodies", "dtype", "peer", "program", "solver", "method", "scene",
     "name", "setting", "rtol", "tolerance", "quantity", "saves", "horizon",
+    "function", "region", "conversion", "t", "top", "order",
 )  # fmt: skip
 
 
@@ -20,12 +21,15 @@ def flatten(value: Any, path: tuple = ()) -> dict[tuple, float]:
                 found |= flatten(item, (*path, key))
         return found
     if isinstance(value, list):
-        found = {}
+        found, names = {}, set()
         for index, item in enumerate(value):
             name: Any = index
             if isinstance(item, dict):
                 labels = tuple(str(item[key]) for key in LABELS if key in item)
                 name = ", ".join(labels) or index
+                if name in names:
+                    name = f"{name}, {index}"
+                names.add(name)
             found |= flatten(item, (*path, name))
         return found
     if isinstance(value, bool) or not isinstance(value, int | float):

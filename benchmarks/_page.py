@@ -1,10 +1,11 @@
 """The results page and the tables of the README, written from the committed JSON only."""
 
 from pathlib import Path
-from typing import Any
 
 from benchmarks import _levels
+from benchmarks._markdown import machine, number, rows
 from benchmarks._report import RESULTS, read
+from benchmarks._sections import SECTIONS, generic
 
 ROOT = Path(__file__).resolve().parents[1]
 BEGIN, END = "<!-- benchmarks: begin -->", "<!-- benchmarks: end -->"
@@ -31,40 +32,6 @@ take turns, so that a machine whose speed changes shifts them all. Times are med
 apart; errors are angles in radians against Taylor series of 40 digits (`benchmarks/truth.py`),
 which use nothing of the package.
 """
-
-
-def number(value: float | None, unit: float = 1.0) -> str:
-    """Three digits, or a dash."""
-    if value is None:
-        return "–"
-    value = value / unit
-    if value == 0:
-        return "0"
-    if 1e-2 <= abs(value) < 1e7:
-        digits = f"{value:.3g}"
-        return f"{float(digits):,.0f}" if abs(value) >= 100 else digits
-    return f"{value:.1e}"
-
-
-def rows(header: list[str], lines: list[list[str]]) -> list[str]:
-    """A Markdown table; columns after the first are right-aligned."""
-    out = ["| " + " | ".join(header) + " |", "|---" + "|---:" * (len(header) - 1) + "|"]
-    return [*out, *("| " + " | ".join(line) + " |" for line in lines), ""]
-
-
-def machine(report: dict) -> str:
-    """One line on where and how a result was made."""
-    about = report["machine"]
-    names = {k: v for k, v in report["versions"].items() if v and k not in ("jaxlib", "equinox")}
-    flags = f", `XLA_FLAGS={report['flags']}`" if report["flags"] else ""
-    threads = report.get("threads")
-    return (
-        f"`{report['command']}` on {about['processor']}, {about['system']},"
-        f" {about.get('memory_GB', '?')} GB, {threads} core{'s' if threads != 1 else ''} of a"
-        f" shared virtual machine{flags}; "
-        + ", ".join(f"{name} {version}" for name, version in names.items())
-        + f"; {report.get('date', '')}."
-    )
 
 
 def heading(table: dict) -> str:
@@ -205,171 +172,6 @@ def work_precision(report: dict) -> list[str]:
     for table in report["numbers"]["tables"]:
         lines += [f"**{heading(table)}**", "", *per_peer(table)]
     return [*lines, "</details>", ""]
-
-
-def gradients(report: dict) -> list[str]:
-    lines = []
-    for row in report["numbers"]["rows"]:
-        lines.append([
-            f"{row['title']}: {row['peer']} {row['program']}", row["setting"],
-            number(row["ns_value"], 1e3), number(row["ns_gradient"], 1e3), number(row["ratio"]),
-            number(row["error_median"]), number(row["error_worst"]), number(row.get("memory_MB")),
-            number(row["compile_s"]),
-        ])  # fmt: skip
-    header = ["", "setting", "value [µs/body]", "value and gradient [µs/body]", "ratio",
-              "median error", "worst error", "memory [MB]", "compile [s]"]  # fmt: skip
-    return [
-        "## Gradients", "", machine(report), "",
-        f"Of a linear function of the final state by the three moments of each body, to t ="
-        f" {report['numbers']['horizon']:g}; errors relative, against 40-digit solutions.", "",
-        *rows(header, lines),
-    ]  # fmt: skip
-
-
-def scene_cost(report: dict) -> list[str]:
-    lines = [
-        [row["scene"], number(row["flops"]), number(row["transcendentals"]),
-         number(row["bytes accessed"]), number(row["ns"], 1e3), number(row["compile_s"])]
-        for row in report["numbers"]["rows"]
-    ]  # fmt: skip
-    header = ["per body", "operations", "transcendental", "bytes", "time [µs]", "compile [s]"]
-    return [
-        "## What each kind of scene costs", "", machine(report), "",
-        "Operations and bytes as the compiler counts them (the body of a loop once): what a scene"
-        " does not need is not in its program.", "", *rows(header, lines),
-    ]  # fmt: skip
-
-
-def scaling(report: dict) -> list[str]:
-    lines = []
-    for sweep in ("bodies", "horizon", "saves"):
-        for name, points in report["numbers"][sweep].items():
-            for p in points:
-                lines.append([
-                    f"{name}: {p['method']}", number(p["bodies"]), number(p["horizon"]),
-                    number(p["saves"]), number(p["ns_per_body"], 1e3), number(p["memory_MB"]),
-                    number(p["temporary_MB"]), f"{p['chunk']:,}",
-                ])  # fmt: skip
-    header = ["", "bodies", "horizon [s]", "saved times", "time per body [µs]", "memory [MB]",
-              "of it temporary", "chunk"]  # fmt: skip
-    return [
-        "## Scaling", "", machine(report), "",
-        "![time and memory against bodies, horizon and saved times](results/scaling.svg)", "",
-        *rows(header, lines),
-    ]  # fmt: skip
-
-
-def stress(report: dict) -> list[str]:
-    lines = [
-        [row["family"], row["dtype"], str(row["bodies"]), number(row["attitude"]),
-         number(row["rates"]), number(row["forward"]), number(row["reverse"]), row["worst body"]]
-        for row in report["numbers"]["worst"]
-    ]  # fmt: skip
-    header = ["worst of the family", "dtype", "bodies", "attitude", "rates", "gradient, forward",
-              "gradient, reverse", "worst body (reverse)"]  # fmt: skip
-    return [
-        "## Stress suite of the exact free motion", "", machine(report), "",
-        "Errors against 50 digits in units of eps x max(1, angle turned): of the attitude in"
-        " radians, of the rates relative to their size, of derivatives relative to the larger of"
-        " the exact one and the natural size. Fast needles lose digits of the gradient in"
-        " proportion to the ratio of their moments.", "",
-        "![errors of every body by family](results/stress.svg)", "", *rows(header, lines),
-    ]  # fmt: skip
-
-
-def generic(report: dict, name: str) -> list[str]:
-    """Any other result: its lists of rows as tables, its other numbers as a list."""
-    title = name.replace("_", " ")
-    lines = [f"## {title[0].upper()}{title[1:]}", "", machine(report), ""]
-
-    def cell(value: Any) -> str:
-        if isinstance(value, bool) or not isinstance(value, int | float):
-            return "–" if value is None else str(value)
-        return f"{value:,}" if isinstance(value, int) else number(value)
-
-    def walk(name: str, value: Any) -> None:
-        if isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
-            keys = list(dict.fromkeys(k for item in value for k, v in item.items()
-                                      if not isinstance(v, dict | list)))  # fmt: skip
-            if name:
-                lines.extend([f"**{name}**", ""])
-            table = [[cell(item.get(key)) for key in keys] for item in value]
-            lines.extend(rows([key.replace("_", " ") for key in keys], table))
-        elif isinstance(value, dict):
-            plain = {k: v for k, v in value.items() if not isinstance(v, dict | list)}
-            if plain:
-                if name:
-                    lines.extend([f"**{name}**", ""])
-                lines.extend(f"- {k.replace('_', ' ')}: {cell(v)}" for k, v in plain.items())
-                lines.append("")
-            for k, v in value.items():
-                if isinstance(v, dict | list):
-                    walk(f"{name}, {k}".strip(", ").replace("_", " "), v)
-        elif isinstance(value, list) and value:
-            lines.extend([f"- {name}: {', '.join(map(cell, value))}", ""])
-
-    walk("", report["numbers"])
-    return lines
-
-
-def identification(report: dict) -> list[str]:
-    numbers, lines = report["numbers"], []
-    for row in [*numbers["designs"], numbers["designs_pooled"]]:
-        kind = f"{row['turns']} turns, {row['samples']} samples" if "turns" in row else "pooled"
-        cells = [number(row.get(key)) for key in ("noise_over_rate", "bodies",
-                 "flagged_weak_or_flat", "flagged_not_converged")]  # fmt: skip
-        for key in ("error_over_bound", "interval_cover"):
-            value = row.get(key, row.get(f"{key}_95"))
-            cells.append(f"{value:.3f} ± {row[f'{key}_std']:.3f}")
-        lines.append([kind, *cells])
-    header = ["", "noise / rate", "bodies", "weak or flat", "not converged", "error / bound",
-              "cover of 95 %"]  # fmt: skip
-    speed = numbers["speed"]
-    cases = [
-        [f"{k + 1}", number(case["ours_s"], 1e-3), number(case["scipy_s"], 1e-3),
-         number(case["faster"]), number(case["error_ours"]), number(case["error_scipy"])]
-        for k, case in enumerate(speed["cases"])
-    ]  # fmt: skip
-    others = ["case", "polhode [ms]", "SciPy [ms]", "ratio", "error", "error of SciPy"]
-    return [
-        "## Identification", "", machine(report), "",
-        "![errors over the bound, cover, times](results/identification.svg)", "",
-        "Errors of the tensor over the Cramér-Rao bound and cover of 95 % intervals, with standard"
-        " errors; flagged bodies left out:", "", *rows(header, lines),
-        "One recording of 1,000 samples, from raw rates to covariance, beside `least_squares` over"
-        f" `solve_ivp`; tracing and compiling {number(speed['compile_and_trace_s'])} s once:", "",
-        *rows(others, cases),
-        f"{speed['batch_bodies']:,} bodies in one call cost"
-        f" {number(speed['batch_per_body_over_best_single'])} of the best single fit each"
-        f" ({number(speed['batch_s'])} s; compile {number(speed['batch_compile_and_trace_s'])} s)."
-        " Derivatives of the residuals against 50 digits: relative error"
-        f" {number(speed['residual_gradient_error'])}.", "",
-    ]  # fmt: skip
-
-
-def throws(report: dict) -> list[str]:
-    kinds = {"every_throw_alone": "alone", "throws_of_a_configuration_together": "together"}
-    lines = []
-    for kind, how in kinds.items():
-        for name, row in report["numbers"][kind].items():
-            moments = [sum(column) / len(row["moments"]) for column in zip(*row["moments"])]
-            lines.append([
-                f"{name}, {how}", *(number(m, 1e-6) for m in moments),
-                number(row.get("moments_error_percent")), number(row.get("axes_error_deg")),
-            ])  # fmt: skip
-    header = ["", "least moment [1e-6 kg m²]", "middle", "largest", "error [%]", "axes [deg]"]
-    return [
-        "## Throws with a flywheel", "", machine(report), "",
-        "Real recordings (TU Delft, arXiv:2503.13137; not part of the project); every throw alone,"
-        " the instrument known from all, or those of a configuration together. Errors where the"
-        " reference is known, means over throws.", "", *rows(header, lines),
-    ]  # fmt: skip
-
-
-SECTIONS = {
-    "gradients": gradients, "scene_cost": scene_cost, "scaling": scaling,
-    "identification": identification, "throws": throws, "stress": stress,
-}  # fmt: skip
 
 
 def names_on(text: str) -> list[str]:

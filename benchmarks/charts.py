@@ -10,6 +10,11 @@ import argparse
 import json
 from pathlib import Path
 
+from benchmarks import _report
+
+if __name__ == "__main__":
+    _report.one_thread()
+
 import diffrax
 import jax
 import numpy as np

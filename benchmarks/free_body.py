@@ -3,23 +3,23 @@
 Bodies, truth and scores are made here: four inertias, attitudes uniform on SO(3), isotropic rates
 with |w| uniform in [1, 2). Truth is a 34-digit Taylor series (tests/free/reference_free.py) for the
 first bodies of each case, kept in a cache beside this script, or the tables in ../shared where they
-are. Prints JSON.
+are. Times are the least of repeats on one core.
 
-    python benchmarks/free_body.py [--quick] [--output free_body.json]
+    python -m benchmarks.free_body [--quick] [--output free_body.json]
 """
 
 import argparse
 import hashlib
 import json
-import os
 import statistics
 import sys
 import time
 from pathlib import Path
 
-os.environ.setdefault(
-    "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-)
+from benchmarks import _report
+
+if __name__ == "__main__":
+    _report.one_thread()
 
 import jax
 import jax.numpy as jnp
@@ -131,6 +131,7 @@ def final_state(case: str, count: int, t: float, scored: int) -> dict:
     exact = truth(case, scored, t)
     return {
         "case": case,
+        "moments": CASES[case],
         "bodies": count,
         "t": t,
         "compile_s": compile_s,
@@ -188,6 +189,7 @@ def gradient(count: int, t: float = 100.0) -> dict:
     both, _ = timed(lambda: jax.block_until_ready(backward(moments)))
     row = {
         "bodies": count,
+        "t": t,
         "forward_ns_per_body": value / count * 1e9,
         "gradient_ns_per_body": both / count * 1e9,
         "ratio": both / value,
@@ -206,7 +208,7 @@ def gradient(count: int, t: float = 100.0) -> dict:
     return row
 
 
-def heyoka_final(case: str, count: int, t: float, tolerance: float = 1e-9) -> dict | None:
+def heyoka_final(case: str, count: int, t: float, tolerance: float) -> dict | None:
     """The same work by heyoka's Taylor integrator, eight bodies at a time."""
     try:
         import heyoka as hy
@@ -237,7 +239,7 @@ def heyoka_final(case: str, count: int, t: float, tolerance: float = 1e-9) -> di
             integrator.propagate_until(t)
             found[n : n + lanes] = integrator.state.T
 
-    least, _ = timed(run, 2)
+    least, _ = timed(run, 10)
     row = {"case": case, "bodies": count, "t": t, "tolerance": tolerance}
     row["ns_per_body"] = least / count * 1e9
     return row | score(found[:, 4:].T, found[:, :4].T, truth(case, min(count, 20), t))
@@ -251,25 +253,30 @@ def main() -> None:
     known = (HERE.parents[1] / "shared" / "peers" / "truth").is_dir()
     scored = 200 if known else 20 if options.quick else 100
     long = 1e5 if known else 1e3
-    report = {"jax": jax.__version__, "device": str(jax.devices()[0])}
-    report["J1"] = [final_state(case, 1000, 100.0, scored) for case in CASES]
-    report["J2"] = [final_state(case, 1000, long, 200 if known else 3) for case in CASES]
-    report["heyoka"] = heyoka_final("A", 200, 100.0)
-    if report["heyoka"]:
-        ours = report["J1"][0]["ns_per_body"]
-        report["times_faster_than_heyoka"] = report["heyoka"]["ns_per_body"] / ours
+    report = {
+        "truth": f"Taylor series, {'double-double' if known else '34 digits'}",
+        "final_states": [
+            final_state(case, 1000, t, n)
+            for t, n in ((100.0, scored), (long, 200 if known else 3))
+            for case in CASES
+        ],
+    }
+    ours = report["final_states"][0]["ns_per_body"]
+    report["heyoka"] = [
+        row | {"times_as_long": row["ns_per_body"] / ours}
+        for row in (heyoka_final("A", 200, 100.0, tolerance) for tolerance in (1e-9, 1e-15))
+        if row
+    ]
     report["saved_times"] = saved_times(1000, 100)
     report["latency"] = latency()
-    report["J4"] = gradient(1000)
+    report["gradient"] = gradient(1000)
     if not options.quick:
         report["linear"] = [
             {k: final_state("A", n, 100.0, scored)[k] for k in ("bodies", "ns_per_body")}
             for n in (1000, 10_000, 100_000, 1_000_000)
         ]
-    text = json.dumps(report, indent=1)
-    print(text)
-    if options.output:
-        options.output.write_text(text + "\n")
+    print(json.dumps(report, indent=1))
+    print(_report.write("free_body", report, path=options.output, packages=("heyoka",)))
 
 
 if __name__ == "__main__":

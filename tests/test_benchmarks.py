@@ -188,6 +188,29 @@ def test_scaling_and_scene_cost_run():
     assert row["flops"] > 0
 
 
+def test_accuracy_of_elliptic_functions_is_measured_per_region():
+    from benchmarks import elliptic_accuracy
+
+    found = list(elliptic_accuracy.measure(["ellipk"], 4))
+    assert len(found) == 2 * 4
+    assert all(0 <= row["worst"] < 5 and row["points"] == 4 for row in found)
+
+
+def test_exact_free_motion_is_scored_beside_heyoka(monkeypatch):
+    from benchmarks import free_body
+
+    wxyz, omega = free_body.bodies("A", 8)
+    assert FREE.moments == free_body.CASES["A"]
+    exact = [truth.motion(FREE, *s, [2.0], 20)[0] for s in zip(wxyz, omega)]
+    exact = np.array([[[float(x), 0.0] for x in state] for state in exact])
+    monkeypatch.setattr(free_body, "truth", lambda case, count, t: exact[:count])
+    row = free_body.final_state("A", 8, 2.0, 8)
+    assert row["attitude_worst"] < 1e-14
+    assert row["ns_per_body"] > 0
+    peer = free_body.heyoka_final("A", 8, 2.0, 1e-9)
+    assert peer is None or peer["attitude_worst"] < 1e-7
+
+
 # Results, comparisons, pages
 
 
@@ -282,6 +305,9 @@ def test_compare_names_what_is_slower_wrong_gone_and_new():
     text = _compare.show(found)
     assert "slower" in text
     assert "stepper, 1e-08" in text
+    assert _compare.flatten([{"name": "a", "x": 1}, {"name": "a", "x": 2}]) == {
+        ("a", "x"): 1.0, ("a, 1", "x"): 2.0,
+    }  # fmt: skip
     assert found["gone"] == [("extra",)]
     assert found["fresh"] == [("other",)]
     with pytest.raises(ValueError, match="different"):

@@ -1,0 +1,289 @@
+"""The sections of the results page: each from one result, as lines of Markdown."""
+
+import math
+from typing import Any
+
+from benchmarks._markdown import machine, number, rows
+
+
+def gradients(report: dict) -> list[str]:
+    lines = []
+    for row in report["numbers"]["rows"]:
+        lines.append([
+            f"{row['title']}: {row['peer']} {row['program']}", row["setting"],
+            number(row["ns_value"], 1e3), number(row["ns_gradient"], 1e3), number(row["ratio"]),
+            number(row["error_median"]), number(row["error_worst"]), number(row.get("memory_MB")),
+            number(row["compile_s"]),
+        ])  # fmt: skip
+    header = ["", "setting", "value [µs/body]", "value and gradient [µs/body]", "ratio",
+              "median error", "worst error", "memory [MB]", "compile [s]"]  # fmt: skip
+    return [
+        "## Gradients", "", machine(report), "",
+        f"Of a linear function of the final state by the three moments of each body, to t ="
+        f" {report['numbers']['horizon']:g}; errors relative, against 40-digit solutions.", "",
+        *rows(header, lines),
+    ]  # fmt: skip
+
+
+def scene_cost(report: dict) -> list[str]:
+    lines = [
+        [row["scene"], number(row["flops"]), number(row["transcendentals"]),
+         number(row["bytes accessed"]), number(row["ns"], 1e3), number(row["compile_s"])]
+        for row in report["numbers"]["rows"]
+    ]  # fmt: skip
+    header = ["per body", "operations", "transcendental", "bytes", "time [µs]", "compile [s]"]
+    return [
+        "## What each kind of scene costs", "", machine(report), "",
+        "Operations and bytes as the compiler counts them (the body of a loop once): what a scene"
+        " does not need is not in its program.", "", *rows(header, lines),
+    ]  # fmt: skip
+
+
+def scaling(report: dict) -> list[str]:
+    lines = []
+    for sweep in ("bodies", "horizon", "saves"):
+        for name, points in report["numbers"][sweep].items():
+            for p in points:
+                lines.append([
+                    f"{name}: {p['method']}", number(p["bodies"]), number(p["horizon"]),
+                    number(p["saves"]), number(p["ns_per_body"], 1e3), number(p["memory_MB"]),
+                    number(p["temporary_MB"]), f"{p['chunk']:,}",
+                ])  # fmt: skip
+    header = ["", "bodies", "horizon [s]", "saved times", "time per body [µs]", "memory [MB]",
+              "of it temporary", "chunk"]  # fmt: skip
+    return [
+        "## Scaling", "", machine(report), "",
+        "![time and memory against bodies, horizon and saved times](results/scaling.svg)", "",
+        *rows(header, lines),
+    ]  # fmt: skip
+
+
+def stress(report: dict) -> list[str]:
+    lines = [
+        [row["family"], row["dtype"], str(row["bodies"]), number(row["attitude"]),
+         number(row["rates"]), number(row["forward"]), number(row["reverse"]), row["worst body"]]
+        for row in report["numbers"]["worst"]
+    ]  # fmt: skip
+    header = ["worst of the family", "dtype", "bodies", "attitude", "rates", "gradient, forward",
+              "gradient, reverse", "worst body (reverse)"]  # fmt: skip
+    return [
+        "## Stress suite of the exact free motion", "", machine(report), "",
+        "Errors against 50 digits in units of eps x max(1, angle turned): of the attitude in"
+        " radians, of the rates relative to their size, of derivatives relative to the larger of"
+        " the exact one and the natural size. Fast needles lose digits of the gradient in"
+        " proportion to the ratio of their moments.", "",
+        "![errors of every body by family](results/stress.svg)", "", *rows(header, lines),
+    ]  # fmt: skip
+
+
+def generic(report: dict, name: str) -> list[str]:
+    """Any other result: its lists of rows as tables, its other numbers as a list."""
+    title = name.replace("_", " ")
+    lines = [f"## {title[0].upper()}{title[1:]}", "", machine(report), ""]
+
+    def cell(value: Any) -> str:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            return "–" if value is None else str(value)
+        return f"{value:,}" if isinstance(value, int) else number(value)
+
+    def walk(name: str, value: Any) -> None:
+        if isinstance(value, list) and value and all(isinstance(item, dict) for item in value):
+            keys = list(dict.fromkeys(k for item in value for k, v in item.items()
+                                      if not isinstance(v, dict | list)))  # fmt: skip
+            if name:
+                lines.extend([f"**{name}**", ""])
+            table = [[cell(item.get(key)) for key in keys] for item in value]
+            lines.extend(rows([key.replace("_", " ") for key in keys], table))
+        elif isinstance(value, dict):
+            plain = {k: v for k, v in value.items() if not isinstance(v, dict | list)}
+            if plain:
+                if name:
+                    lines.extend([f"**{name}**", ""])
+                lines.extend(f"- {k.replace('_', ' ')}: {cell(v)}" for k, v in plain.items())
+                lines.append("")
+            for k, v in value.items():
+                if isinstance(v, dict | list):
+                    walk(f"{name}, {k}".strip(", ").replace("_", " "), v)
+        elif isinstance(value, list) and value:
+            lines.extend([f"- {name}: {', '.join(map(cell, value))}", ""])
+
+    walk("", report["numbers"])
+    return lines
+
+
+def identification(report: dict) -> list[str]:
+    numbers, lines = report["numbers"], []
+    for row in [*numbers["designs"], numbers["designs_pooled"]]:
+        kind = f"{row['turns']} turns, {row['samples']} samples" if "turns" in row else "pooled"
+        cells = [number(row.get(key)) for key in ("noise_over_rate", "bodies",
+                 "flagged_weak_or_flat", "flagged_not_converged")]  # fmt: skip
+        for key in ("error_over_bound", "interval_cover"):
+            value = row.get(key, row.get(f"{key}_95"))
+            cells.append(f"{value:.3f} ± {row[f'{key}_std']:.3f}")
+        lines.append([kind, *cells])
+    header = ["", "noise / rate", "bodies", "weak or flat", "not converged", "error / bound",
+              "cover of 95 %"]  # fmt: skip
+    speed = numbers["speed"]
+    cases = [
+        [f"{k + 1}", number(case["ours_s"], 1e-3), number(case["scipy_s"], 1e-3),
+         number(case["faster"]), number(case["error_ours"]), number(case["error_scipy"])]
+        for k, case in enumerate(speed["cases"])
+    ]  # fmt: skip
+    others = ["case", "polhode [ms]", "SciPy [ms]", "ratio", "error", "error of SciPy"]
+    return [
+        "## Identification", "", machine(report), "",
+        "![errors over the bound, cover, times](results/identification.svg)", "",
+        "Errors of the tensor over the Cramér-Rao bound and cover of 95 % intervals, with standard"
+        " errors; flagged bodies left out:", "", *rows(header, lines),
+        "One recording of 1,000 samples, from raw rates to covariance, beside `least_squares` over"
+        f" `solve_ivp`; tracing and compiling {number(speed['compile_and_trace_s'])} s once:", "",
+        *rows(others, cases),
+        f"{speed['batch_bodies']:,} bodies in one call cost"
+        f" {number(speed['batch_per_body_over_best_single'])} of the best single fit each"
+        f" ({number(speed['batch_s'])} s; compile {number(speed['batch_compile_and_trace_s'])} s)."
+        " Derivatives of the residuals against 50 digits: relative error"
+        f" {number(speed['residual_gradient_error'])}.", "",
+    ]  # fmt: skip
+
+
+def throws(report: dict) -> list[str]:
+    kinds = {"every_throw_alone": "alone", "throws_of_a_configuration_together": "together"}
+    lines = []
+    for kind, how in kinds.items():
+        for name, row in report["numbers"][kind].items():
+            moments = [sum(column) / len(row["moments"]) for column in zip(*row["moments"])]
+            lines.append([
+                f"{name}, {how}", *(number(m, 1e-6) for m in moments),
+                number(row.get("moments_error_percent")), number(row.get("axes_error_deg")),
+            ])  # fmt: skip
+    header = ["", "least moment [1e-6 kg m²]", "middle", "largest", "error [%]", "axes [deg]"]
+    return [
+        "## Throws with a flywheel", "", machine(report), "",
+        "Real recordings (TU Delft, arXiv:2503.13137; not part of the project); every throw alone,"
+        " the instrument known from all, or those of a configuration together. Errors where the"
+        " reference is known, means over throws.", "", *rows(header, lines),
+    ]  # fmt: skip
+
+
+def free_body(report: dict) -> list[str]:
+    numbers = report["numbers"]
+    lines = [
+        [f"({', '.join(f'{m:g}' for m in row['moments'])})", f"{row['t']:,.0f}",
+         *(number(row[key]) for key in ("attitude_median", "attitude_worst", "rate_median",
+                                        "rate_worst")),
+         number(row["ns_per_body"])]
+        for row in numbers["final_states"]
+    ]  # fmt: skip
+    header = ["moments", "t", "attitude, median [rad]", "worst", "rates, median", "worst",
+              "time [ns/body]"]  # fmt: skip
+    out = [
+        "## The exact free motion", "", machine(report), "",
+        f"Final states of {numbers['final_states'][0]['bodies']:,} bodies by `ClosedForm`; errors"
+        " of the first"
+        f" {' or '.join(f'{n:,}' for n in sorted({r['scored'] for r in numbers['final_states']}))}"
+        f" of them against {numbers['truth']}.", "",
+        *rows(header, lines),
+    ]  # fmt: skip
+    if numbers["heyoka"]:
+        lines = [
+            [f"{row['tolerance']:.0e}", number(row["attitude_median"]),
+             number(row["attitude_worst"]), number(row["ns_per_body"]),
+             number(row["times_as_long"])]
+            for row in numbers["heyoka"]
+        ]  # fmt: skip
+        header = ["tolerance of heyoka", "attitude, median [rad]", "worst", "time [ns/body]",
+                  "times as long"]  # fmt: skip
+        out += ["heyoka on the bodies of the first row, eight at a time, in the same run:", "",
+                *rows(header, lines)]  # fmt: skip
+    slope, saved, call = numbers["gradient"], numbers["saved_times"], numbers["latency"]
+    error = ""
+    if "error_median" in slope:
+        error = (
+            f"; relative error {number(slope['error_median'])} (median),"
+            f" {number(slope['error_worst'])} (worst)"
+        )
+    out += [
+        f"- Gradient of a misfit with respect to the moments, t = {slope['t']:g}:"
+        f" {number(slope['gradient_ns_per_body'])} ns per body with the value,"
+        f" {number(slope['ratio'])} times the value alone{error}.",
+        f"- {saved['times']:,} saved times: {number(saved['ns_per_state_both'])} ns per state,"
+        f" {number(saved['ns_per_state_rates'])} without the attitude.",
+        f"- One body, one time: {number(call['us_per_call'])} µs a call.",
+        f"- Compiling: {number(numbers['final_states'][0]['compile_s'])} s, with the gradient"
+        f" {number(slope['compile_gradient_s'])} s.",
+    ]
+    if linear := numbers.get("linear"):
+        out.append("- " + "; ".join(
+            f"{row['bodies']:,} bodies {number(row['ns_per_body'])} ns each" for row in linear
+        ) + ".")  # fmt: skip
+    return [*out, ""]
+
+
+def elliptic_accuracy(report: dict) -> list[str]:
+    numbers, worst = report["numbers"], {}
+    for row in numbers["rows"]:
+        kinds = worst.setdefault(row["function"], {})
+        if row["worst"] is None or row["worst"] > kinds.get(row["dtype"], (-1.0,))[0]:
+            kinds[row["dtype"]] = (math.inf if row["worst"] is None else row["worst"],
+                                   row["region"])  # fmt: skip
+    allowed = numbers["allowed_elsewhere"]
+    lines = []
+    for name, kinds in worst.items():
+        cells = [f"`{name}`"]
+        for dtype in ("float64", "float32"):
+            where = kinds[dtype][1].replace("->", "→").replace("all", "–")
+            cells += [f"{kinds[dtype][0]:.2f}", where]
+        cells += [f"{limits[name]:,}" if name in limits else "–" for limits in allowed.values()]
+        lines.append(cells)
+    header = ["worst [eps]", "float64", "where", "float32", "where", *allowed]
+    return [
+        "## Elliptic functions", "", machine(report), "",
+        f"Worst errors over {numbers['points_per_function_and_dtype']:,} random and awkward points"
+        " per function and dtype against mpmath, in eps (2.2e-16, 1.2e-7) of the result, of 1"
+        " for sn and cn; of functions of u or an angle, what exceeds one eps of that argument."
+        " m1 = 1 - m is passed beside m. On the right what others allow in double precision: the"
+        " tests of Principia, in ulps (`elliptic_functions_test.cpp`,"
+        " `elliptic_integrals_test.cpp`; the rounding of the arguments and of 1 - m counts there too), and Fukushima, in his"
+        " machine epsilons (Numer. Math. 116, 687; Math. Comp. 80, 1725).", "",
+        *rows(header, lines),
+    ]  # fmt: skip
+
+
+def rotation_stress(report: dict) -> list[str]:
+    found: dict[str, dict] = {}
+    for row in report["numbers"]["rows"]:
+        found.setdefault(row["conversion"], {})[row["dtype"]] = row
+    kinds = {}  # the Euler sequences, worst of each direction
+    for name, each in found.items():
+        words = name.split(" ")
+        if "Euler" in words and "wxyz" in words:
+            given = words[0] == "Euler"
+            name = "Euler (any sequence) -> wxyz" if given else "wxyz -> Euler (any sequence)"
+        kinds.setdefault(name, []).append(each)
+    lines, columns = [], ("value", "first", "second")
+    for name, members in kinds.items():
+        cells = [f"{name}, worst of {len(members)}" if len(members) > 1 else name]
+        for dtype in ("float64", "float32"):
+            for column in columns:
+                values = [each[dtype][column] for each in members]
+                cells.append("∞" if None in values else f"{max(values):.2f}")
+        lines.append([cell.replace("->", "→") for cell in cells])
+    header = ["worst [eps]", "float64: value", "first derivative", "second", "float32: value",
+              "first derivative", "second"]  # fmt: skip
+    return [
+        "## Conversions of rotations", "", machine(report), "",
+        "Worst errors against 120 digits over random samples and samples at and near the identity,"
+        " half turns, the ends of the angle ranges and every threshold, in units of eps: values"
+        " relative to the rotation's angle where it is small, derivatives (forward and reverse)"
+        " relative to the largest of the sample.", "",
+        *rows(header, lines),
+    ]  # fmt: skip
+
+
+SECTIONS = {
+    "gradients": gradients, "scene_cost": scene_cost, "scaling": scaling,
+    "identification": identification, "throws": throws, "stress": stress,
+    "free_body": free_body, "elliptic_accuracy": elliptic_accuracy,
+    "rotation_stress": rotation_stress,
+}  # fmt: skip
+"""By name of the benchmark, in the order of the page; the others go through ``generic``."""
