@@ -243,8 +243,9 @@ def elliptic_accuracy(report: dict) -> list[str]:
         " for sn and cn; of functions of u or an angle, what exceeds one eps of that argument."
         " m1 = 1 - m is passed beside m. On the right what others allow in double precision: the"
         " tests of Principia, in ulps (`elliptic_functions_test.cpp`,"
-        " `elliptic_integrals_test.cpp`; the rounding of the arguments and of 1 - m counts there too), and Fukushima, in his"
-        " machine epsilons (Numer. Math. 116, 687; Math. Comp. 80, 1725).", "",
+        " `elliptic_integrals_test.cpp`; the rounding of the arguments and of 1 - m"
+        " counts there too), and Fukushima, in his machine epsilons"
+        " (Numer. Math. 116, 687; Math. Comp. 80, 1725).", "",
         *rows(header, lines),
     ]  # fmt: skip
 

@@ -53,6 +53,7 @@ def _derivative_program(function):
     return jax.jit(everything)
 
 
+@mp.workdps(truth.DIGITS)  # whatever ran before in this process
 def measure_case(case: Case, dtype) -> dict[str, float]:
     """Worst errors in units of eps: value, first derivative (both modes), second derivative."""
     eps = float(np.finfo(dtype).eps)

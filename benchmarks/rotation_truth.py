@@ -8,7 +8,8 @@ from collections.abc import Callable, Sequence as Seq
 
 import mpmath as mp
 
-mp.mp.dps = 120
+DIGITS = 120
+mp.mp.dps = DIGITS
 Vector = list
 
 
