@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode import free, rotation
+from polhode._kernel import kernel
 from polhode._lanes import map_chunks
 from polhode._methods import AbstractMethod, Record, Samples
 from polhode._scene import Scene
@@ -66,12 +67,11 @@ class ClosedForm(AbstractMethod):
             return motion(moments, products, wxyz, omega, times, wanted)
 
         size = max(1, (_CHUNK if self.chunk is None else self.chunk) // t.shape[-1])
-        # Components are put together only here: fused with the motion, the stacking would have
-        # all of them worked out anew for each entry.
-        omega, wxyz = jax.lax.optimization_barrier(
-            map_chunks(one, (given, wxyz, omega, times), n, size)
-        )
-        omega, wxyz = (None if x is None else jnp.stack(x, axis=-1) for x in (omega, wxyz))
+        omega, wxyz = map_chunks(one, (given, wxyz, omega, times), n, size)
+        # Components are put together only here, in a unit of its own: fused with the motion, the
+        # stacking would have what they share worked out anew for each.
+        stack = kernel(lambda *parts: jnp.stack(parts, axis=-1))
+        omega, wxyz = (None if x is None else stack(*x) for x in (omega, wxyz))
         if axes is not None:
             axes = axes[:, None]
             wxyz = None if wxyz is None else rotation.multiply(wxyz, rotation.conjugate(axes))

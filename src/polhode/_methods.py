@@ -143,6 +143,10 @@ class AbstractDiffraxMethod(AbstractMethod):
         power = external_power(t, momentum, attitude, dynamics)
         return jnp.concatenate([self._stacked_field(t, y[:-1], dynamics), power[None]])
 
+    def _components_and_power(self, t, y, dynamics):
+        power = external_power(t, *self.seen(y[:2]), dynamics)
+        return *self.field(t, y[:2], dynamics), power
+
     def _weights(self, scene, state, t, groups) -> Array:
         ones = jnp.ones_like(groups[0][0])
         momenta = ones / momentum_scale(scene, state, t)
@@ -155,11 +159,19 @@ class AbstractDiffraxMethod(AbstractMethod):
         """One chunk of lanes in one diffrax solve."""
         dynamics = Dynamics(scene.hamiltonian, scene.torque)
         groups, sound = self.start(scene, state, ts[0])
-        y0, weights = _stack(groups), self._weights(scene, state, ts[0], groups)
-        field = self._stacked_field
+        weights = self._weights(scene, state, ts[0], groups)
         if record.work:  # follows from the rest: it does not decide the step
-            field = self._field_and_power
-            y0, weights = (jnp.concatenate([x, jnp.zeros_like(x[:1])]) for x in (y0, weights))
+            weights = jnp.concatenate([weights, jnp.zeros_like(weights[:1])])
+        by_components = isinstance(self.solver, Extrapolation) and self.controller is None
+        if by_components:
+            y0, field = groups, self.field
+            if record.work:
+                y0, field = (*groups, jnp.zeros_like(groups[0][0])), self._components_and_power
+        else:
+            y0, field = _stack(groups), self._stacked_field
+            if record.work:
+                y0 = jnp.concatenate([y0, jnp.zeros_like(y0[:1])])
+                field = self._field_and_power
         controller = self.controller
         if controller is None:
             if self.at_end:
@@ -182,7 +194,7 @@ class AbstractDiffraxMethod(AbstractMethod):
             progress_meter=self.progress_meter,
             throw=False,
         )
-        if isinstance(self.solver, Extrapolation) and self.controller is None:
+        if by_components:
             width = self._first_width(scene, state, ts) if self.dt0 is None else self.dt0
             found = through(solve, controller, ts, y0, width, record.final_only)
         else:

@@ -4,7 +4,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 
 class LaneNorm(eqx.Module):
@@ -15,7 +15,8 @@ class LaneNorm(eqx.Module):
 
     weights: Array
 
-    def __call__(self, y: Array) -> Array:
+    def __call__(self, y: PyTree[Array]) -> Array:
+        y = jnp.stack(y) if len(y := jax.tree.leaves(y)) > 1 else y[0]
         worst = jnp.max(jnp.mean((y * self.weights) ** 2, axis=0))
         positive = worst > 0  # the root's slope at zero is infinite: keep it out of gradients
         return jnp.where(positive, jnp.sqrt(jnp.where(positive, worst, 1)), 0)
@@ -33,7 +34,7 @@ def sampled(solve, controller, ts, y0, width, final_only):
 
 
 def through(solve, controller, ts, y0, width, final_only):
-    """The same in one solve from each time to the next: nothing is interpolated.
+    """The same of a state in components, in one solve from each time to the next.
 
     A step starts as wide as those of the interval before; after a failure nothing moves.
     """
@@ -45,7 +46,7 @@ def through(solve, controller, ts, y0, width, final_only):
         end = jnp.where(result == good, end, start)
         solution = solve(t0=start, t1=end, dt0=width, y0=y, stepsize_controller=controller)
         result = diffrax.RESULTS.where(result == good, solution.result, result)
-        new = jnp.where(result == good, solution.ys[-1], jnp.nan)
+        new = jax.tree.map(lambda x: jnp.where(result == good, x[-1], jnp.nan), solution.ys)
         count = jnp.maximum(solution.stats["num_accepted_steps"], 1)
         width = jnp.where(end == start, width, jax.lax.stop_gradient(end - start) / count)
         return (new, width, result, steps + solution.stats["num_steps"]), new
@@ -54,5 +55,6 @@ def through(solve, controller, ts, y0, width, final_only):
     start = (y0, jnp.asarray(width, ts.dtype), good, jnp.array(0))
     (last, _, result, steps), path = jax.lax.scan(across, start, times)
     if not final_only:
-        path = jnp.concatenate([y0[None], path])
-    return jnp.moveaxis(path, 0, -1), last[..., None], result, steps
+        path = jax.tree.map(lambda first, x: jnp.concatenate([first[None], x]), y0, path)
+    path, last = (jnp.stack(jax.tree.leaves(x)) for x in (path, last))
+    return jnp.moveaxis(path, 1, -1), last[..., None], result, steps

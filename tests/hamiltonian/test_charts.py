@@ -138,7 +138,7 @@ def test_the_formula_of_h_stands_once():
 def test_imports_go_one_way():
     """Rooms import only from lower floors (the house's order)."""
     floors = [
-        {"_checks", "_version", "rotation", "elliptic"},
+        {"_checks", "_kernel", "_version", "rotation", "elliptic"},
         {"inertia"},
         {"hamiltonian"},
         {"torques"},

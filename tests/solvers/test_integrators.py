@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from benchmarks.integrators import heavy_top, taylor_truth
+from polhode._kernel import kernel
 from polhode.solvers import Extrapolation, Splitting, choose, natural_rate
 from polhode.solvers._extrapolation import SEQUENCES
-from polhode.solvers._kernel import kernel
 from polhode.solvers._schemes import SCHEMES
 
 MOMENTS = (1.0, 1.5, 2.0)

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from polhode._kernel import kernel
+from polhode.solvers._blocks import check_layout, map_blocks
 from polhode.solvers._dense import CollocationInterpolation, collocate
-from polhode.solvers._kernel import check_layout, kernel, map_blocks
 from polhode.solvers._problem import Prepared, Problem
 
 SEQUENCES = {

@@ -16,8 +16,8 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
+from polhode._kernel import kernel
 from polhode.solvers._extrapolation import SEQUENCES, extrapolation_weights
-from polhode.solvers._kernel import kernel
 from polhode.solvers._linear import linear
 from polhode.solvers._specialise import specialise
 

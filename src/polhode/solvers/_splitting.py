@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from polhode._kernel import kernel
+from polhode.solvers._blocks import check_layout, map_blocks
 from polhode.solvers._dense import CollocationInterpolation, collocate
-from polhode.solvers._kernel import check_layout, kernel, map_blocks
 from polhode.solvers._problem import Problem
 from polhode.solvers._schemes import SCHEMES, Scheme
 
