@@ -8,7 +8,6 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode import free, rotation
-from polhode._kernel import kernel
 from polhode._lanes import map_chunks
 from polhode._methods import AbstractMethod, Record, Samples
 from polhode._scene import Scene
@@ -61,17 +60,29 @@ class ClosedForm(AbstractMethod):
         if inertia.symmetry is Symmetry.NONE:
             wanted["compensated"] = self.compensated
 
+        chunk, samples = _CHUNK if self.chunk is None else self.chunk, t.shape[-1]
+        lone = n == 1 and samples >= _WORTH_TWO
+        size, lanes, pieces = max(1, chunk // samples), (given, wxyz, omega), n
+        if lone:  # one body at many times: as several bodies, each at a part of them
+            pieces = max(2, -(-samples // chunk))
+            each = -(-samples // pieces)
+            times = jnp.pad(t.reshape(-1), (0, pieces * each - samples), mode="edge")
+            times = times.reshape(pieces, each)
+            lanes = jax.tree.map(lambda x: jnp.repeat(x, pieces, axis=0), lanes)
+        elif n * samples >= _WORTH_TWO:
+            size = min(size, -(-n // 2))
+
         def one(chunk):
             (moments, products), wxyz, omega, times = chunk
             times = t[None] if times is None else times
             return motion(moments, products, wxyz, omega, times, wanted)
 
-        size = max(1, (_CHUNK if self.chunk is None else self.chunk) // t.shape[-1])
-        omega, wxyz = map_chunks(one, (given, wxyz, omega, times), n, size)
-        # Components are put together only here, in a unit of its own: fused with the motion, the
-        # stacking would have what they share worked out anew for each.
-        stack = kernel(lambda *parts: jnp.stack(parts, axis=-1))
-        omega, wxyz = (None if x is None else stack(*x) for x in (omega, wxyz))
+        # Components are put together only here: fused with the motion, the stacking would have
+        # all of them worked out anew for each entry. A loop of two chunks keeps them apart.
+        parts = map_chunks(one, (*lanes, times), pieces, size)
+        if lone:
+            parts = jax.tree.map(lambda x: x.reshape(1, -1)[:, :samples], parts)
+        omega, wxyz = (None if x is None else jnp.stack(x, axis=-1) for x in parts)
         if axes is not None:
             axes = axes[:, None]
             wxyz = None if wxyz is None else rotation.multiply(wxyz, rotation.conjugate(axes))
@@ -86,6 +97,10 @@ class ClosedForm(AbstractMethod):
 
 _CHUNK = 2**13
 """Bodies times samples per chunk: by measurement the largest that stays in a core's cache."""
+
+
+_WORTH_TWO = 8
+"""Bodies times samples from which two chunks cost less than one without a loop."""
 
 
 def _triaxial(moments, products, wxyz, omega, t, wanted):
