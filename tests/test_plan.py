@@ -89,6 +89,22 @@ def test_the_choice_follows_the_structure():
         ph.simulate(pushed, ph.State([1.0, 0, 0, 0], [0.0, 0, 1]), [0.0, 1.0], ph.ClosedForm())
 
 
+def test_long_horizons_have_compensated_frequencies():
+    """1e6 rad: the rounded phase is off by 2e-10 rad, far beyond 1e-12 and well within 1e-9."""
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]))
+    state, ts = ph.State([1.0, 0, 0, 0], [0.0, 0.6, 0.8]), jnp.array([0.0, 1e6])
+    assert ph.choose(scene, state, ph.Record(), 1e-12, ts)[0].compensated
+    assert not ph.choose(scene, state, ph.Record(), 1e-9, ts)[0].compensated
+    assert not ph.choose(scene, state, ph.Record(), 1e-12)[0].compensated
+    assert "sums of two floats" in str(ph.explain(scene, state, ts, rtol=1e-12))
+    chosen, plain = (
+        ph.simulate(scene, state, ts, rtol=rtol, record=ph.Record(final_only=True))
+        for rtol in (1e-12, 1e-9)
+    )
+    apart = float(rotation.angle_between(chosen.wxyz[-1], plain.wxyz[-1]))
+    assert 1e-13 < apart < 1e-9
+
+
 def test_many_bodies_under_a_potential_reach_the_error_asked_for():
     """The planner's steps for 40 heavy tops against the exact state of the systems table."""
     from systems.table import BY_NAME, truth

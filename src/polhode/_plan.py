@@ -62,14 +62,21 @@ class Plan:
 
 
 def choose(
-    scene: Scene, state: State, record: Record, rtol: Array | float = 1e-9
+    scene: Scene,
+    state: State,
+    record: Record,
+    rtol: Array | float = 1e-9,
+    ts: Array | None = None,
 ) -> tuple[AbstractMethod, str]:
     """The method that ``simulate(..., method=None)`` uses, and why.
 
     The scene's structure decides; values only where they are known (not traced), for the laws
-    that hold for special bodies and states.
+    that hold for special bodies and states, and, with the times ``ts``, for horizons so long that
+    the rounding of a phase would miss ``rtol`` tenfold.
     """
     if scene.is_free:
+        if scene.inertia.symmetry is Symmetry.NONE and _is_long(state, rtol, ts):
+            return ClosedForm(compensated=True), _FREE_LAWS[Symmetry.NONE] + _LONG
         return ClosedForm(), _FREE_LAWS[scene.inertia.symmetry]
     exact = exact_top(scene, state, record)
     if exact is not None:
@@ -89,6 +96,25 @@ def choose(
         f"something acts on the body: extrapolated midpoint rule of order {order}, stepped with an"
         " error estimate, held to rtol at the last time"
     )
+
+
+_LONG = ", its frequencies in sums of two floats: a rounded phase would miss rtol"
+
+
+def _is_long(state: State, rtol, ts) -> bool:
+    if ts is None or not is_concrete(state.omega_body, ts, rtol):
+        return False
+    if not getattr(state.omega_body, "is_fully_addressable", True):
+        return False
+    eps = float(jnp.finfo(state.omega_body.dtype).eps)
+    return eps * _turned(state, ts) > 10 * float(rtol)
+
+
+def _turned(state: State, ts) -> float:
+    """Angle [rad] that the fastest body turns through."""
+    xp = np if state.omega_body.size < 10_000 else jnp  # many: where they lie
+    fastest = xp.max(xp.linalg.norm(xp.asarray(state.omega_body), axis=-1))
+    return float(fastest) * float(xp.max(xp.abs(xp.asarray(ts[..., -1] - ts[..., 0]))))
 
 
 def _order(rtol) -> int:
@@ -126,7 +152,7 @@ def plan(
     """The plan of checked input (see ``ph.explain``)."""
     law = "as asked for"
     if method is None:
-        method, law = choose(scene, state, record, rtol)
+        method, law = choose(scene, state, record, rtol, ts)
     parts = (getattr(scene, name) for name in PARTS)
     bodies = int(np.prod(common_batch(*parts, state, extra=(ts.shape[:-1],)), dtype=int))
     samples = 1 if record.final_only else ts.shape[-1]
@@ -184,8 +210,7 @@ def _exact_cost(scene, state, ts, bodies, samples, record, eps, compensated) -> 
         return seconds, f"rounding only: about {4 * eps:.0e} rad at any time (compensated phases)"
     if not is_concrete(state.omega_body, ts):
         return seconds, f"rounding only: about {eps:.0e} per radian turned"
-    rate = np.max(np.linalg.norm(np.asarray(state.omega_body), axis=-1))
-    turned = float(rate * np.max(np.abs(np.asarray(ts[..., -1] - ts[..., 0]))))
+    turned = _turned(state, ts)
     return seconds, (
         f"rounding only: about {max(1.0, turned) * eps:.0e} rad at the last time"
         f" (one unit in the last place of {turned:.2g} rad turned)"

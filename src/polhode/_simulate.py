@@ -55,7 +55,7 @@ def simulate(
     check_method(method)
     rtol = check_rtol(rtol, state.wxyz.dtype)
     if method is None:
-        method, _ = choose(scene, state, record, rtol)
+        method, _ = choose(scene, state, record, rtol, ts)
     split = split_of(scene, state, ts)
     if split is not None and is_concrete(scene, state, ts):
         scene, state, ts = place(split, scene, state, ts)
@@ -194,7 +194,7 @@ def check_inputs(
     record = Record() if record is None else record
     if not isinstance(record, Record):
         raise TypeError(f"record must be a ph.Record or None, got {type(record).__name__}.")
-    dtypes = {x.dtype for x in jax.tree.leaves(eqx.filter((scene, state), eqx.is_inexact_array))}
+    dtypes = {x.dtype for x in jax.tree.leaves((scene, state)) if eqx.is_inexact_array(x)}
     if len(dtypes) != 1:
         raise TypeError(
             f"scene and state mix the dtypes {sorted(map(str, dtypes))}: make all arrays of one"
