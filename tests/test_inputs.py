@@ -124,6 +124,13 @@ def test_parts_are_made_of_known_arrays_under_jit():
     assert explained == 0
 
 
+def test_moments_near_the_largest_number_are_judged_like_others():
+    moments = ph.Inertia.from_moments(np.array([1.0, 1.5, 1.7]) * 1e308).moments
+    np.testing.assert_allclose(moments, np.array([1.0, 1.5, 1.7]) * 1e308)
+    with pytest.raises(ValueError, match="triangle inequality"):
+        ph.Inertia.from_moments(np.array([0.1, 0.2, 1.7]) * 1e308)
+
+
 garbage = st.one_of(
     st.none(),
     st.booleans(),

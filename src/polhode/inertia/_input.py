@@ -81,9 +81,9 @@ def check_moments(name: str, seen: np.ndarray, slack: float, least: float = 0.0)
         f"{name} must be positive (kg m^2), got {_worst(seen, seen.min(axis=-1))}; a moment is "
         "zero only for a point or a thin line, which cannot turn about itself: give it a width.",
     )
-    excess = 2 * largest - seen.sum(axis=-1)
+    excess = 2 - (seen / largest[..., None]).sum(axis=-1)  # of any size: nothing overflows
     require(
-        excess <= slack * largest,
+        excess <= slack,
         f"{name} must satisfy the triangle inequality (each at most the sum of the two others), "
         f"got {_worst(seen, -excess)}; check the units, and that these are moments of inertia, "
         "not second moments or a gyration tensor. Inertia(diagonal=...) takes what no body has.",
