@@ -1,5 +1,6 @@
 """Settings shared by every test: float64 available, strict promotion, the folder of truth files."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -29,3 +30,20 @@ def shared() -> Path:
     if folder is None:
         pytest.skip("the folder ../shared (recordings, truth states) is not beside this checkout")
     return folder
+
+
+def _resident() -> int:
+    """Bytes of memory that this process holds; 0 where the system does not tell."""
+    about = Path("/proc/self/statm")
+    if not about.exists():
+        return 0
+    return int(about.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def bounded_memory():
+    """Compiled programs are kept for as long as the process lives: let go of them in time."""
+    yield
+    if _resident() > 3 * 2**30:
+        jax.clear_caches()
+        gc.collect()
