@@ -202,3 +202,25 @@ def test_general_tensor_equals_its_principal_frame():
     for given in (tilted, matrix @ jnp.diag(jnp.array([1.0, 1.0, 1.75])) @ matrix.T):
         slopes = [jax.grad(loss)(given, method) for method in (None, ph.LiePoisson())]
         np.testing.assert_allclose(slopes[0], slopes[1], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("bodies", [1, 5_000])
+def test_known_states_and_times_may_be_closed_over_under_jit(bodies):
+    """The planner looks at values, which every operation under ``jit`` would turn into tracers."""
+    rng = np.random.default_rng(3)
+    state = ph.State(rng.normal(size=(bodies, 4)), rng.normal(size=(bodies, 3)))
+    ts = jnp.array([0.0, 3.0])
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]))
+    free, pushed = [], []
+
+    @jax.jit
+    def last():
+        free.append(str(ph.explain(scene, state, ts)))
+        torqued = ph.Scene(scene.inertia, None, ph.BodyTorque([0.1, 0, 0]))
+        pushed.append(str(ph.explain(torqued, state, ts)))
+        return ph.simulate(scene, state, ts).wxyz[:, -1]
+
+    want = ph.simulate(scene, state, ts).wxyz[:, -1]
+    np.testing.assert_allclose(last(), want, atol=1e-14)
+    assert free == [str(ph.explain(scene, state, ts))]
+    assert "rad at the last time" in pushed[0]

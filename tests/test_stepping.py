@@ -87,3 +87,17 @@ def test_gradient_through_another_solver_is_that_of_the_motion():
         values = [float(along(k * step)) for k in (-2, -1, 1, 2)]
         want = (values[0] - 8 * values[1] + 8 * values[2] - values[3]) / (12 * step)
         assert float(jnp.sum(slope * direction)) == pytest.approx(want, rel=3e-8, abs=3e-9)
+
+
+def test_a_torque_may_close_over_what_is_differentiated():
+    state = ph.State([0.6, 0, 0.8, 0], [1.0, -0.5, 0.3])
+
+    def loss(a):
+        drag = ph.FeedbackTorque(lambda t, attitude, omega: -a * omega)
+        push = ph.BodyTorque(lambda t: a * jnp.stack([jnp.sin(t), jnp.cos(t), 0 * t]))
+        got = ph.simulate(ph.Scene(INERTIA, None, drag + push), state, [0.0, 3.0])
+        return jnp.sum(got.omega_body[-1] * jnp.array([1.0, 2.0, 3.0]))
+
+    step = 1e-4
+    want = (loss(0.3 + step) - loss(0.3 - step)) / (2 * step)
+    np.testing.assert_allclose(jax.grad(loss)(0.3), want, rtol=1e-6)

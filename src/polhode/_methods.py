@@ -126,7 +126,8 @@ class AbstractDiffraxMethod(AbstractMethod):
             lanes, times = chunk
             scene, state = eqx.combine(lanes, shared)
             times = ts if times is None else times[0]
-            if self.gradient_solver is None:
+            # a function may close over what is differentiated, which a custom rule cannot follow
+            if self.gradient_solver is None or any(map(callable, jax.tree.leaves(scene))):
                 return self._solve(scene, state, times, rtol, record)
             return _run_with_gradient((scene, state, times), self, rtol, record)
 
