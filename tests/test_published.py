@@ -3,6 +3,7 @@
 The numbers are retyped facts; values of 16 digits are 34-digit recomputations of the cases.
 """
 
+import diffrax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -166,3 +167,126 @@ def test_nasa_brick_beside_five_simulators(shared):
     assert 1e-5 < errors["sim_05"] < 1e-4, errors  # the others really are that far off
     assert 1e-3 < errors["sim_02"] < 2e-3, errors
     assert 4e-3 < errors["sim_06"] < 5e-3, errors
+
+
+def test_basilisk_rotation():
+    """test_spacecraft.py::SCRotation: nine digits, tolerance 1e-8; z of space against L."""
+    moments, omega = np.array([500.0, 200.0, 300.0]), np.array([0.5, -0.4, 0.7])
+    third = -moments * omega / np.linalg.norm(moments * omega)
+    second = np.array([-0.1 * third[1] / third[0], 0.1, 0.0])
+    second /= np.linalg.norm(second)
+    rows = np.stack([np.cross(second, third), second, third])  # space axes in body components
+    wxyz = rotation.matrix_to_wxyz(jnp.asarray(rows))
+    sigma = rotation.wxyz_to_modified_rodrigues(wxyz)
+    np.testing.assert_allclose(sigma, (0.09734747, 0.62361776, 0.04678629), rtol=1e-7)
+    scene = ph.Scene(ph.Inertia.from_moments(moments))
+    end = ph.simulate(scene, ph.State(wxyz, omega), [0.0, 10.0]).wxyz[-1]
+    sigma = rotation.wxyz_to_modified_rodrigues(end)
+    np.testing.assert_allclose(sigma, (0.572693314, 0.510734375, -0.307377611), rtol=1e-8)
+
+
+def test_newton_bar_and_stem_turns_over():
+    """Newton's example_basic_dzhanibekov.py: a bar with a stem, spun about its middle axis.
+
+    It promises at least one flip; the inertia is worked out there from the two capsules as here.
+    """
+
+    def capsule(radius, half, density):
+        """Mass, moment along the axis, moment across, of a cylinder with two half-balls."""
+        tube = density * np.pi * radius**2 * 2 * half
+        ball = density * 4 / 3 * np.pi * radius**3
+        along = tube * radius**2 / 2 + ball * 2 / 5 * radius**2
+        across = tube * (radius**2 / 4 + half**2 / 3) + ball * (
+            2 / 5 * radius**2 + half**2 + 3 / 4 * half * radius
+        )
+        return tube + ball, along, across
+
+    (bar, bar_along, bar_across), (stem, stem_along, stem_across) = (
+        capsule(0.2, 1.0, 100.0), capsule(0.1, 0.5, 50.0)
+    )  # fmt: skip
+    shift = bar * stem / (bar + stem) * 0.7**2  # the stem's centre lies 0.7 below the bar's
+    moments = np.array([
+        bar_along + stem_across + shift, bar_across + stem_along, bar_across + stem_across + shift
+    ])  # fmt: skip
+    scene = ph.Scene(ph.Inertia.from_moments(moments))
+    assert moments.argsort().tolist() == [0, 1, 2]
+    state = ph.State(IDENTITY, [1e-3, 20.0, 1e-3])
+    got = ph.simulate(scene, state, np.linspace(0, 10, 400))
+    assert np.min(got.omega_body[:, 1]) < -19.9  # turned over
+    assert np.max(got.omega_body[200:, 1]) > 19.9  # and back
+    np.testing.assert_allclose(
+        got.momentum_space, np.broadcast_to(got.momentum_space[0], (400, 3)), atol=2e-10
+    )
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(np.float64, 5e-8), (np.float32, 5e-5)])
+def test_dojo_and_jax_md_conservation(dtype, bound):
+    """Dojo's test/momentum.jl: momentum to 1e-8 at h = 0.01, rates (10, 0.01, 0); jax_md's
+    test_nve_3d: energy of 40 bodies within 5e-8 (float32: 5e-5) over 100 steps of 1e-3."""
+    rng = np.random.default_rng(3)
+    omega = np.concatenate([[[10.0, 0.01, 0.0]], rng.standard_normal((39, 3))]).astype(dtype)
+    scene = ph.Scene(ph.Inertia.from_moments(np.array([1.0, 2.0, 2.5], dtype)))
+    state = ph.State(np.broadcast_to(np.array(IDENTITY, dtype), (40, 4)), omega)
+    method = ph.LiePoisson(controller=diffrax.ConstantStepSize(), dt0=0.01)
+    got = ph.simulate(scene, state, np.linspace(0, 1, 11, dtype=dtype), method)
+    assert got.wxyz.dtype == dtype
+    energy = np.asarray(got.energy, float)
+    assert np.max(np.abs(energy - energy[:, :1]) / np.maximum(energy[:, :1], 1)) < bound
+    momentum = np.asarray(got.momentum_space, float)
+    change = np.linalg.norm(momentum - momentum[:, :1], axis=-1)
+    assert np.max(change[0]) < (1e-8 if dtype == np.float64 else 1e-4)
+
+
+def test_gyrostat_precession():
+    """An axisymmetric gyrostat, wheel along its axis (P. C. Hughes, Spacecraft Attitude Dynamics,
+    chapter 7): the transverse rate turns at ((C - A) s + h)/A in the body."""
+    a, c, h, s = 2.0, 3.0, 1.5, 0.4
+    scene = ph.Scene(
+        ph.Inertia.from_moments([a, a, c]), rotors=ph.Rotor([0.0, 0.0, 1.0], momentum=h)
+    )
+    ts = np.linspace(0, 20, 5)
+    for method in (None, ph.LiePoisson(at_end=True)):
+        got = ph.simulate(scene, ph.State(GNI, [0.3, 0.0, s]), ts, method, rtol=1e-11)
+        phase = ((c - a) * s + h) / a * ts
+        want = np.stack([0.3 * np.cos(phase), 0.3 * np.sin(phase), s + 0 * ts], axis=-1)
+        np.testing.assert_allclose(got.omega_body, want, rtol=0, atol=1e-10)
+
+
+def test_satellite_with_products_of_inertia_librates():
+    """Gravity gradient as NASA's and Basilisk's check cases state it: 3 mu/r^5 r x I r with the
+    tensor in body axes; roll and yaw librate at the frequencies of DeBra and Delp (1961).
+
+    (J. Astronaut. Sci. 8, 14.) Small angles on a circular orbit: with k1 = (I2 - I3)/I1,
+    k3 = (I2 - I1)/I3 the frequencies w over n solve w^4 - (1 + 3 k1 + k1 k3) w^2 + 4 k1 k3 = 0.
+    """
+    moments = np.array([6.0, 8.0, 4.0])  # roll along the orbit, pitch normal to it, yaw radial
+    n, mu, radius = 0.001, 1e-6 * 7e6**3, 7e6
+    turn = rotation.normalise(jnp.array([0.9, 0.1, -0.2, 0.3]))
+    tensor = rotation.wxyz_to_matrix(turn) @ jnp.diag(moments) @ rotation.wxyz_to_matrix(turn).T
+    orbit = ph.KeplerOrbit(mu, radius)  # starts on space x, moves towards space y
+    # principal axes: 1 along the motion (y), 2 against the orbit's normal (-z), 3 to the centre
+    frame = jnp.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    tilt = 1e-6
+    start = rotation.multiply(rotation.matrix_to_wxyz(frame), jnp.array([1.0, tilt / 2, 0.0, 0.0]))
+    # at rest in the orbiting frame, which turns by -n about the pitch axis
+    rate = rotation.rotate(rotation.conjugate(start), jnp.array([0.0, 0.0, n]))
+    ts = np.linspace(0.0, 4 * 2 * np.pi / n, 25)
+    scene = ph.Scene(ph.Inertia.from_tensor(tensor), ph.GravityGradient(mu, orbit))
+    state = ph.State(
+        rotation.multiply(start, rotation.conjugate(turn)), rotation.rotate(turn, rate)
+    )
+    got = ph.simulate(scene, state, ts, rtol=1e-11)
+    principal = rotation.multiply(got.wxyz, turn)
+    angle = n * ts
+    about = jnp.stack([jnp.cos(angle / 2), 0 * angle, 0 * angle, jnp.sin(angle / 2)], axis=-1)
+    orbital = rotation.multiply(about, rotation.matrix_to_wxyz(frame))
+    small = rotation.multiply(rotation.conjugate(orbital), principal)
+    roll = 2 * np.asarray(small[:, 1] * jnp.sign(small[:, 0]))
+    k1, k3 = (8.0 - 4.0) / 6.0, (8.0 - 6.0) / 4.0
+    square = np.roots([1, -(1 + 3 * k1 + k1 * k3), 4 * k1 * k3]) * n**2
+    # roll'' = -4 n^2 k1 roll + n (1 - k1) yaw', with yaw'(0) = 0: two cosines
+    first = -4 * n**2 * k1
+    weight = (first + square[1]) / (square[1] - square[0])
+    want = tilt * (weight * np.cos(np.sqrt(square[0]) * ts) + (1 - weight) * np.cos(
+        np.sqrt(square[1]) * ts))  # fmt: skip
+    np.testing.assert_allclose(roll, want, rtol=0, atol=1e-4 * tilt)
