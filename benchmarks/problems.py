@@ -22,7 +22,9 @@ class Problem:
     from the fixed point [N m]; gravity is along -z of space. ``gradient``: 3 mu / r^3 [1/s^2].
     Attitudes are uniform on the sphere of quaternions, rates isotropic of size uniform in [1, 2)
     rad/s plus ``spin`` about body z; ``flip``: instead near the intermediate axis, off by 1e-6 to
-    1e-2 of the rate. The state is saved at ``saves`` equally spaced times up to ``horizon`` [s].
+    1e-2 of the rate. ``damping`` times the rates opposes them [N m s] and ``push`` is a constant
+    torque in body axes [N m]. The state is saved at ``saves`` equally spaced times up to
+    ``horizon`` [s].
     """
 
     name: str
@@ -35,6 +37,8 @@ class Problem:
     weight: float = 0.0
     gradient: float = 0.0
     flip: bool = False
+    damping: float = 0.0
+    push: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     @property
     def times(self) -> np.ndarray:
@@ -43,7 +47,7 @@ class Problem:
 
     @property
     def free(self) -> bool:
-        return not (self.weight or self.gradient)
+        return not (self.weight or self.gradient or self.damping or any(self.push))
 
     def states(self, n: int) -> tuple[np.ndarray, np.ndarray]:
         """Attitudes (n, 4) and body rates (n, 3)."""

@@ -73,6 +73,8 @@ def motion(problem: Problem, wxyz, omega, times, digits: int = DIGITS, moments=N
         if problem.free and times[-1] > 1e4:
             return [_long(moments, q, w, mp.mpf(float(t)), digits) for t in times]
         body = _Series(moments, mp.mpf(problem.weight), mp.mpf(problem.gradient), digits)
+        body.drag = [mp.mpf(problem.damping) / m for m in moments] if problem.damping else None
+        body.push = [mp.mpf(p) / m for p, m in zip(problem.push, moments)]
         state, now, out = [*q, *w, *_to_body(q, up)], mp.mpf(0), []
         for t in times:
             state = body.advance(state, mp.mpf(float(t)) - now)
@@ -107,6 +109,7 @@ class _Series:
         self.gradient = None
         if gradient:
             self.gradient = [gradient * (c - b) / a, gradient * (a - c) / b, gradient * (b - a) / c]
+        self.drag, self.push = None, [mp.mpf(0)] * 3  # over the moments
         self.unit = mp.mpf(1) / 4  # of time; follows the motion
 
     def advance(self, state, span):
@@ -144,6 +147,8 @@ class _Series:
         euler = [fixed(k) for k in self.euler]
         weight = None if self.weight is None else [fixed(k) for k in self.weight]
         gradient = None if self.gradient is None else [fixed(k) for k in self.gradient]
+        drag = None if self.drag is None else [fixed(k) for k in self.drag]
+        push = [fixed(k) for k in self.push]
         for n in range(self.order):
 
             def product(u, v, n=n):
@@ -156,6 +161,11 @@ class _Series:
             if gradient is not None:
                 for i, (u, v) in enumerate(((b, c), (c, a), (a, b))):
                     rates[i] += gradient[i] * product(u, v)
+            if drag is not None:
+                for i, v in enumerate((x, y, z)):
+                    rates[i] -= drag[i] * v[n]
+            if n == 0:
+                rates = [r + (p << bits) for r, p in zip(rates, push)]
             slopes = [
                 -(product(q1, x) + product(q2, y) + product(q3, z)) >> 1,
                 product(q0, x) + product(q2, z) - product(q3, y) >> 1,

@@ -82,4 +82,7 @@ def rigid_body(problem, q, w, sums):
         rate[0] = rate[0] + g * (c - b) / a * n[1] * n[2]
         rate[1] = rate[1] + g * (a - c) / b * n[2] * n[0]
         rate[2] = rate[2] + g * (b - a) / c * n[0] * n[1]
+    if problem.damping or any(problem.push):
+        acts = [p - problem.damping * v for p, v in zip(problem.push, w)]
+        rate = [r + n / m for r, n, m in zip(rate, acts, problem.moments)]
     return turn + rate

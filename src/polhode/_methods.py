@@ -14,7 +14,7 @@ from polhode._lanes import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._scene import Scene
 from polhode._state import State
 from polhode._status import Status
-from polhode._stepping import LaneNorm, sampled, through
+from polhode._stepping import LaneNorm, followed, sampled, through
 from polhode.hamiltonian import (
     Attitude,
     Dynamics,
@@ -87,16 +87,20 @@ class AbstractDiffraxMethod(AbstractMethod):
     controller: eqx.AbstractVar[diffrax.AbstractStepSizeController | None]
     dt0: eqx.AbstractVar[float | None]
     max_steps: eqx.AbstractVar[int]
-    adjoint: eqx.AbstractVar[diffrax.AbstractAdjoint]
+    adjoint: eqx.AbstractVar[diffrax.AbstractAdjoint | None]
     progress_meter: eqx.AbstractVar[diffrax.AbstractProgressMeter]
     chunk: eqx.AbstractVar[int]
     at_end: eqx.AbstractVar[bool]
-    gradient_solver: eqx.AbstractVar[diffrax.AbstractSolver | None]
     momenta: eqx.AbstractClassVar[tuple[bool, bool]]
 
     @abc.abstractmethod
     def field(self, t, y, dynamics: Dynamics):
         """Vector field on the chart's component arrays."""
+
+    @property
+    def _by_components(self) -> bool:
+        """Whether the state stays in components, from each time to the next."""
+        return isinstance(self.solver, Extrapolation) and self.controller is None
 
     @property
     def asked_at_end(self) -> bool | None:
@@ -119,6 +123,12 @@ class AbstractDiffraxMethod(AbstractMethod):
         """wxyz, omega_body and whether the chart is still sound, of sampled components (N, T)."""
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: float, record: Record) -> Samples:
+        if self.adjoint is None and not self._by_components:
+            raise ValueError(
+                f"ph.{type(self).__name__}(adjoint=None) needs a solver ph.solvers.Extrapolation"
+                f" and no controller, got {type(self.solver).__name__} and"
+                f" {type(self.controller).__name__}: hand in a diffrax adjoint."
+            )
         size = 1 if ts.ndim == 2 else self.chunk
         lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
 
@@ -126,10 +136,7 @@ class AbstractDiffraxMethod(AbstractMethod):
             lanes, times = chunk
             scene, state = eqx.combine(lanes, shared)
             times = ts if times is None else times[0]
-            # a function may close over what is differentiated, which a custom rule cannot follow
-            if self.gradient_solver is None or any(map(callable, jax.tree.leaves(scene))):
-                return self._solve(scene, state, times, rtol, record)
-            return _run_with_gradient((scene, state, times), self, rtol, record)
+            return self._solve(scene, state, times, rtol, record)
 
         times = ts if ts.ndim == 2 else None
         return map_chunks(one, (lanes, times), state.wxyz.shape[0], size)
@@ -163,8 +170,7 @@ class AbstractDiffraxMethod(AbstractMethod):
         weights = self._weights(scene, state, ts[0], groups)
         if record.work:  # follows from the rest: it does not decide the step
             weights = jnp.concatenate([weights, jnp.zeros_like(weights[:1])])
-        by_components = isinstance(self.solver, Extrapolation) and self.controller is None
-        if by_components:
+        if self._by_components:
             y0, field = groups, self.field
             if record.work:
                 y0, field = (*groups, jnp.zeros_like(groups[0][0])), self._components_and_power
@@ -187,18 +193,18 @@ class AbstractDiffraxMethod(AbstractMethod):
             )
         solve = partial(
             diffrax.diffeqsolve,
-            diffrax.ODETerm(field),
-            self.solver,
-            args=dynamics,
-            adjoint=self.adjoint,
+            solver=self.solver,
+            adjoint=diffrax.ForwardMode() if self.adjoint is None else self.adjoint,
             max_steps=self.max_steps,
             progress_meter=self.progress_meter,
             throw=False,
         )
-        if by_components:
+        if self._by_components:
             width = self._first_width(scene, state, ts) if self.dt0 is None else self.dt0
-            found = through(solve, controller, ts, y0, width, record.final_only)
+            move = through if self.adjoint is not None else followed
+            found = move(solve, field, dynamics, controller, ts, y0, width, record.final_only)
         else:
+            solve = partial(solve, diffrax.ODETerm(field), args=dynamics)
             if self.controller is None and not record.final_only:
                 # samples as accurate as steps, not as the interpolant
                 controller = diffrax.ClipStepSizeController(controller, step_ts=ts)
@@ -232,33 +238,6 @@ class AbstractDiffraxMethod(AbstractMethod):
 
 _FINEST = 4
 """Least tolerance of a step in units of rounding: below, the error estimate is rounding alone."""
-
-
-@eqx.filter_custom_vjp
-def _run_with_gradient(given, method, rtol, record):
-    """One chunk by the method's solver, differentiated as if run by its ``gradient_solver``."""
-    return method._solve(*given, rtol, record)
-
-
-@_run_with_gradient.def_fwd
-def _(perturbed, given, method, rtol, record):
-    del perturbed
-    return method._solve(*given, rtol, record), None
-
-
-@_run_with_gradient.def_bwd
-def _(residuals, cotangent, perturbed, given, method, rtol, record):
-    del residuals
-    method = eqx.tree_at(lambda m: m.solver, method, method.gradient_solver)
-    wanted, fixed = eqx.partition(given, jax.tree.map(bool, perturbed))
-
-    def seen(wanted):
-        out = method._solve(*eqx.combine(wanted, fixed), rtol, record)
-        return jax.tree.map(
-            lambda c, x: None if c is None else x, cotangent, out, is_leaf=lambda c: c is None
-        )
-
-    return eqx.filter_vjp(seen, wanted)[1](cotangent)[0]
 
 
 def _stack(groups) -> Array:
@@ -306,24 +285,23 @@ class LiePoisson(AbstractDiffraxMethod):
       the worst body of a chunk deciding the step.
     - ``dt0``: first (or constant) step [s], negative backwards; None: chosen.
     - ``max_steps``, ``adjoint``, ``progress_meter``: as in diffrax. The default adjoint gives
-      reverse mode; hand in ``diffrax.ForwardMode()`` for ``jax.jvp``.
+      reverse mode; hand in ``diffrax.ForwardMode()`` for ``jax.jvp``. None, for ``Extrapolation``
+      without a ``controller`` only: both, as derivatives of the exact flow, by the variational or
+      the adjoint equations integrated in as many steps (see ``ph.Extrapolated``).
     - ``chunk``: bodies that share their steps; chunks follow one another, so memory stays bounded.
     - ``at_end``: hold the error at the last time to ``rtol``, not that of each step: the steps'
       tolerance is half ``rtol`` over the angle that the fastest body of the chunk turns through, or
       what rounding allows.
-    - ``gradient_solver``: solver for reverse mode, whose steps are differentiated in place of the
-      first one's (both follow the same motion to the tolerance); None: the same solver.
     """
 
     solver: diffrax.AbstractSolver = diffrax.Dopri8()
     controller: diffrax.AbstractStepSizeController | None = None
     dt0: float | None = None
     max_steps: int = eqx.field(static=True, default=2**16)
-    adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint()
+    adjoint: diffrax.AbstractAdjoint | None = diffrax.RecursiveCheckpointAdjoint()
     progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter()
     chunk: int = eqx.field(static=True, default=200)
     at_end: bool = eqx.field(static=True, default=False)
-    gradient_solver: diffrax.AbstractSolver | None = None
 
     momenta = (True, False)
 
@@ -356,11 +334,10 @@ class EulerAngles(AbstractDiffraxMethod):
     controller: diffrax.AbstractStepSizeController | None = None
     dt0: float | None = None
     max_steps: int = eqx.field(static=True, default=2**16)
-    adjoint: diffrax.AbstractAdjoint = diffrax.RecursiveCheckpointAdjoint()
+    adjoint: diffrax.AbstractAdjoint | None = diffrax.RecursiveCheckpointAdjoint()
     progress_meter: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter()
     chunk: int = eqx.field(static=True, default=1)
     at_end: bool = eqx.field(static=True, default=False)
-    gradient_solver: diffrax.AbstractSolver | None = None
 
     momenta = (False, True)
 

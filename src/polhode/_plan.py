@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -92,7 +91,7 @@ def choose(
             " in equal steps by each body's natural rate"
         )
     order = 10 if state.wxyz.dtype == jnp.float32 else min(14, _order(rtol))
-    method = LiePoisson(Extrapolation(order), at_end=True, gradient_solver=diffrax.Dopri8())
+    method = LiePoisson(Extrapolation(order), at_end=True, adjoint=None)
     return method, (
         f"something acts on the body: extrapolated midpoint rule of order {order}, stepped with an"
         " error estimate, held to rtol at the last time"

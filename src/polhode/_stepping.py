@@ -1,10 +1,14 @@
 """Batches of lanes through diffrax: the norm of their errors, and their samples."""
 
+from functools import partial
+
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
+
+from polhode import solvers
 
 
 class LaneNorm(eqx.Module):
@@ -33,8 +37,40 @@ def sampled(solve, controller, ts, y0, width, final_only):
     return samples, last, solution.result, solution.stats["num_steps"]
 
 
-def through(solve, controller, ts, y0, width, final_only):
+def through(solve, field, args, controller, ts, y0, width, final_only):
     """The same of a state in components, in one solve from each time to the next.
+
+    ``solve`` takes the term and its arguments as well.
+    """
+    times = ts[jnp.array([0, -1])] if final_only else ts
+    solve = partial(solve, diffrax.ODETerm(field), args=args)
+    path, _, (result, steps) = _across(solve, controller, times, y0, width)
+    return *_stacked(path, final_only), result, steps
+
+
+def followed(solve, field, args, controller, ts, y0, width, final_only):
+    """The same with the derivatives of the exact flow (see ``solvers.path``)."""
+    times = ts[jnp.array([0, -1])] if final_only else ts
+
+    def steps(given, field, args, y0, times):
+        controller, width = given
+        solve_it = partial(solve, diffrax.ODETerm(field), args=args)
+        return _across(solve_it, controller, times, y0, width)
+
+    order = solve.keywords["solver"].formal_order
+    path, _, (result, steps) = solvers.path(
+        steps, (controller, width), field, args, y0, times, order, _PARTS
+    )
+    return *_stacked(path, final_only), result, steps
+
+
+_PARTS = 8
+"""Parts of the time simulated whose starts are kept for a gradient: on the way back from states
+that a torque has drawn together an error grows no longer than through one of them."""
+
+
+def _across(solve, controller, times, y0, width):
+    """States at the times (in front), steps taken in each interval, result and all steps tried.
 
     A step starts as wide as those of the interval before; after a failure nothing moves.
     """
@@ -49,12 +85,15 @@ def through(solve, controller, ts, y0, width, final_only):
         new = jax.tree.map(lambda x: jnp.where(result == good, x[-1], jnp.nan), solution.ys)
         count = jnp.maximum(solution.stats["num_accepted_steps"], 1)
         width = jnp.where(end == start, width, jax.lax.stop_gradient(end - start) / count)
-        return (new, width, result, steps + solution.stats["num_steps"]), new
+        return (new, width, result, steps + solution.stats["num_steps"]), (new, count)
 
-    times = (ts[:1], ts[-1:]) if final_only else (ts[:-1], ts[1:])
-    start = (y0, jnp.asarray(width, ts.dtype), good, jnp.array(0))
-    (last, _, result, steps), path = jax.lax.scan(across, start, times)
-    if not final_only:
-        path = jax.tree.map(lambda first, x: jnp.concatenate([first[None], x]), y0, path)
-    path, last = (jnp.stack(jax.tree.leaves(x)) for x in (path, last))
-    return jnp.moveaxis(path, 1, -1), last[..., None], result, steps
+    start = (y0, jnp.asarray(width, times.dtype), good, jnp.array(0))
+    (_, _, result, steps), (path, counts) = jax.lax.scan(across, start, (times[:-1], times[1:]))
+    path = jax.tree.map(lambda first, x: jnp.concatenate([first[None], x]), y0, path)
+    return path, counts, (result, steps)
+
+
+def _stacked(path, final_only):
+    """Samples and last state (components, N, T) of states with the times in front."""
+    path = jnp.moveaxis(jnp.stack(jax.tree.leaves(path)), 1, -1)
+    return path[..., -1:] if final_only else path, path[..., -1:]

@@ -6,4 +6,5 @@ from polhode.solvers._choice import (
 )
 from polhode.solvers._extrapolation import Extrapolation as Extrapolation
 from polhode.solvers._flow import flow as flow
+from polhode.solvers._path import path as path
 from polhode.solvers._splitting import Splitting as Splitting

@@ -46,6 +46,18 @@ def flow(
         E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I,
         section I.14, on the variational equations.
     """
+    equations, c = equations_of(field, args, y0, span[0], order)
+    leaves, tree = jax.tree.flatten(y0)
+    return jax.tree.unflatten(tree, equations.end(c, leaves, *span, count))
+
+
+def equations_of(
+    field: Callable[..., PyTree], args: PyTree, y0: PyTree[Array], t: Array, order: int
+) -> tuple["Equations", list[Array]]:
+    """The field on lists of arrays, and all arrays that it rests on.
+
+    What the functions in ``args`` close over is among them: it may be differentiated.
+    """
     leaves, tree = jax.tree.flatten(y0)
     arrays, static = eqx.partition(args, eqx.is_array)
     arrays, args_tree = jax.tree.flatten(arrays)
@@ -55,20 +67,24 @@ def flow(
         full = eqx.combine(jax.tree.unflatten(args_tree, given[len(leaves) :]), static)
         return jax.tree.leaves(field(t, y, full))
 
-    closed = jax.make_jaxpr(plain)(span[0], *leaves, *arrays)
-    # what the functions in ``args`` close over is an argument as well: it may be differentiated
-    equations = _Equations(closed.jaxpr, len(closed.consts), len(leaves), order)
-    out = equations.end([*closed.consts, *arrays], leaves, *span, count)
-    return jax.tree.unflatten(tree, out)
+    closed = jax.make_jaxpr(plain)(t, *leaves, *arrays)
+    equations = Equations(closed.jaxpr, len(closed.consts), len(leaves), order)
+    return equations, [*closed.consts, *arrays]
 
 
-class _Equations:
-    """A field on lists of arrays, f(t, y, c), its solutions and their derivatives."""
+class Equations:
+    """A field on lists of arrays, f(t, y, c), its solutions and their derivatives.
+
+    ``end(c, y, t0, t1, count)``: the state at t1. ``pinned(c, y, t0, t1, count, end)``: ``end``,
+    the same found by other means, with the derivatives of the solution.
+    """
 
     def __init__(self, jaxpr, closed_over: int, size: int, order: int):
         self.jaxpr, self.closed_over, self.size, self.order = jaxpr, closed_over, size, order
         self.end = jax.custom_jvp(self._end)
         self.end.defjvp(self._end_jvp, symbolic_zeros=True)
+        self.pinned = jax.custom_jvp(lambda c, y, t0, t1, count, end: list(end))
+        self.pinned.defjvp(self._pinned_jvp, symbolic_zeros=True)
 
     def field(self, c: Sequence[Any], t, y: Sequence[Any]) -> list[Any]:
         consts, arrays = c[: self.closed_over], c[self.closed_over :]
@@ -89,9 +105,16 @@ class _Equations:
         return self._solve(rates, self.folded(c, t0, y).held, y, [], (t0, t1), count)[0]
 
     def _end_jvp(self, primals, tangents):
+        end = self.end(*primals)
+        return end, self._moved(primals, tangents, end)
+
+    def _pinned_jvp(self, primals, tangents):
+        end = self.pinned(*primals)
+        return end, self._moved(primals[:-1], tangents[:-1], end)
+
+    def _moved(self, primals, tangents, end):
         c, y, t0, t1, count = primals
         dc, dy, dt0, dt1, _ = tangents
-        end = self.end(c, y, t0, t1, count)
         at = tuple(i for i, x in enumerate(dc) if _is_slope(x))
         dy = [_full(x) for x in dy]
         if _is_slope(dt0):
@@ -101,7 +124,7 @@ class _Equations:
         moved = linear(*maps, given, [*dy, *(dc[i] for i in at)], end)
         if _is_slope(dt1):
             moved = [a + dt1 * f for a, f in zip(moved, self.field(c, t1, end))]
-        return end, moved
+        return moved
 
     def _split(self, given):
         t0, t1, count, *rest = given
