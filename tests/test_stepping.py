@@ -82,3 +82,29 @@ def test_a_torque_may_close_over_what_is_differentiated():
     step = 1e-4
     want = (loss(0.3 + step) - loss(0.3 - step)) / (2 * step)
     np.testing.assert_allclose(jax.jit(jax.grad(loss))(0.3), want, rtol=1e-6)
+
+
+def test_a_gravity_gradient_is_the_same_seen_from_a_frame_upright_to_it():
+    """The planner turns space so that a resting centre lies on z; slopes go through the turn."""
+
+    def loss(place, mu, method):
+        scene = ph.Scene(INERTIA, ph.GravityGradient(mu, place))
+        got = ph.simulate(scene, STATE, [0.0, 1.0, 4.0], method)
+        return jnp.sum(jnp.sin(got.omega_body)) + jnp.sum(got.wxyz**3)
+
+    method, _ = choose(ph.Scene(INERTIA, ph.GravityGradient(1.0, [1.0, 0, 0])), STATE, ph.Record())
+    assert method.upright
+    given = jnp.array([0.5, -0.6, -0.8]), jnp.array(2.0)
+    plain = ph.Extrapolated(12)
+
+    @jax.jit
+    def both(*given):
+        return [jax.value_and_grad(loss, (0, 1))(*given, m) for m in (method, plain)]
+
+    upright, general = both(*given)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9), upright, general)
+    moving = ph.GravityGradient(1.0, lambda t: jnp.stack([t, 1 + t, t]))
+    method, _ = choose(ph.Scene(INERTIA, moving), STATE, ph.Record())
+    assert not method.upright
+    with pytest.raises(ValueError, match="along space z"):
+        ph.GravityGradient(1.0, [1.0, 0.0, 1.0], vertical=True)

@@ -22,7 +22,7 @@ from polhode.hamiltonian import (
     lie_poisson_field,
 )
 from polhode.solvers import Extrapolation, flow, natural_rate, steps_for
-from polhode.torques import UniformGravity
+from polhode.torques import GravityGradient, UniformGravity
 
 _HALF = math.sqrt(0.5)
 _TURNS = (
@@ -49,8 +49,9 @@ class Extrapolated(AbstractMethod):
     variational equations, reverse mode by the adjoint equations integrated back in as many steps
     (as accurate as the solution, without its path in memory), or a diffrax adjoint for the
     derivative of the steps, for bodies that drag stops within the time simulated;
-    ``upright``: work in a space frame whose z axis is along the scene's ``UniformGravity``, which
-    must not vanish (a third of the work; other potentials and torques must be absent);
+    ``upright``: work in a space frame whose z axis is along the scene's ``UniformGravity`` or the
+    constant position of its ``GravityGradient``, which must not vanish (a third of the work; other
+    potentials and torques must be absent);
     ``on_axis``: with ``upright``, take the centre of mass to lie on body z.
     """
 
@@ -207,17 +208,21 @@ gravity gradient, whose torque returns after half a turn."""
 
 
 def _upright(scene: Scene, state: State, on_axis: bool) -> tuple[Scene, State, Array]:
-    """Scene and lanes seen from a frame with z along gravity, and the turn (N, 4) back."""
-    gravity = scene.potential
-    force = jnp.asarray(gravity.mass)[..., None] * gravity.gravity_space
+    """Scene and lanes seen from a frame with z along the field, and the turn (N, 4) back."""
+    field = scene.potential
+    if isinstance(field, GravityGradient):
+        force = field.position_space
+    else:
+        force = jnp.asarray(field.mass)[..., None] * field.gravity_space
     (w, x, y), size = tops.upward(components(force))
     zero = jnp.zeros_like(size)
     along = jnp.stack([zero, zero, size], axis=-1)
-    axial = gravity.on_axis or on_axis
-    weight = UniformGravity(
-        jnp.ones((), size.dtype), gravity.centre_body, along, axial, vertical=True
-    )
+    if isinstance(field, GravityGradient):
+        field = GravityGradient(field.mu, along, vertical=True)
+    else:
+        axial, one = field.on_axis or on_axis, jnp.ones((), size.dtype)
+        field = UniformGravity(one, field.centre_body, along, axial, vertical=True)
     turn = jnp.broadcast_to(jnp.stack([w, x, y, zero], axis=-1), state.wxyz.shape)
     turned = rotation.multiply(rotation.conjugate(turn), state.wxyz)
     lanes = eqx.tree_at(lambda s: s.wxyz, state, turned)
-    return Scene(scene.inertia, weight, None, scene.rotors), lanes, turn
+    return Scene(scene.inertia, field, None, scene.rotors), lanes, turn

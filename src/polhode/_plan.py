@@ -17,7 +17,7 @@ from polhode._state import State
 from polhode._top_methods import AbstractTopMethod, exact_top
 from polhode.inertia import Symmetry
 from polhode.solvers import Extrapolation, steps_for
-from polhode.torques import UniformGravity
+from polhode.torques import GravityGradient, UniformGravity
 
 _FREE_LAWS = {
     Symmetry.NONE: "nothing acts on the body: exact motion in Jacobi elliptic functions",
@@ -84,7 +84,9 @@ def choose(
     if scene.potential is not None and scene.torque is None:
         falls = _falls(scene.potential)
         method = Extrapolated(
-            _order(rtol), upright=falls, on_axis=falls and _balanced(scene.potential)
+            _order(rtol),
+            upright=falls or _pulled(scene.potential),
+            on_axis=falls and _balanced(scene.potential),
         )
         return method, (
             f"a potential acts on the body: extrapolated midpoint rule of order {method.order}"
@@ -138,6 +140,11 @@ def _falls(potential) -> bool:
     return is_concrete(force) and bool(
         np.all(np.asarray(force[0]) > 0) and np.all(np.any(np.asarray(force[1]) != 0, axis=-1))
     )
+
+
+def _pulled(potential) -> bool:
+    """Whether the potential is a gravity gradient whose centre rests."""
+    return isinstance(potential, GravityGradient) and not callable(potential.position_space)
 
 
 def _balanced(gravity: UniformGravity) -> bool:

@@ -105,7 +105,7 @@ class Equations:
         return self._solve(rates, self.folded(c, t0, y).held, y, [], (t0, t1), count)[0]
 
     def _end_jvp(self, primals, tangents):
-        end = self.end(*primals)
+        end = self.end(*primals[:-1], primals[-1] * _FORWARD)
         return end, self._moved(primals, tangents, end)
 
     def _pinned_jvp(self, primals, tangents):
@@ -222,8 +222,11 @@ class Equations:
         return kernel(march)(held, t0, width, whole, list(y), list(quadratures))
 
 
-_FINER = 1.1
-"""Steps of the derivatives' equations over those of the state alone: equal errors measured."""
+_FORWARD = 1.25
+"""Steps of a state that is differentiated over those asked for: its slope is more sensitive."""
+
+_FINER = 1.15
+"""Steps of the derivatives' equations over those asked for the state alone."""
 
 
 def _step(order: int, rates, held, t0, width, dtype, y, quadratures):

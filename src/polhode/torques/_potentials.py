@@ -136,21 +136,27 @@ class GravityGradient(AbstractPotential):
 
     The torque is ``3 mu/r^3 n x (I n)``. **Arguments:** ``mu`` (...) [m^3/s^2]; ``position_space``:
     the body relative to the attracting centre, space axes [m], constant (..., 3) or a function of
-    time [s] returning (3,). Raises ValueError for mu < 0 or a position at the centre.
+    time [s] returning (3,). ``vertical`` (static): whether a constant position is known to be along
+    space z; then its other components are not used.
+
+    Raises ValueError for mu < 0, a position at the centre, or one that ``vertical`` denies.
     """
 
     mu: Float[Array, "*#b"]
     position_space: Float[Array, "*#b 3"] | Callable
+    vertical: bool = eqx.field(static=True, default=False)
 
     core_ranks = {"mu": 0, "position_space": 1}  # noqa: RUF012
 
-    def __init__(self, mu, position_space):
+    def __init__(self, mu, position_space, vertical=False):
         self.mu = as_number("mu", mu)
+        self.vertical = bool(vertical)
         if is_concrete(self.mu):
             require(
                 np.asarray(self.mu) >= 0, f"mu must not be negative, got {mu}: give it in m^3/s^2."
             )
         if callable(position_space):
+            require(not vertical, "vertical is for a constant position: leave it out.")
             self.position_space = position_space
         else:
             self.position_space = as_float_array("position_space", position_space, (3,))
@@ -160,12 +166,21 @@ class GravityGradient(AbstractPotential):
                     "position_space must not be zero: it is the body's position relative to the"
                     " attracting centre, in metres.",
                 )
+                require(
+                    not vertical or np.all(np.asarray(self.position_space)[..., :2] == 0),
+                    f"vertical says that the position is along space z, got {position_space}:"
+                    " leave it out.",
+                )
 
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array:
         place = value_at(self.position_space, t)
-        square = dot(place, place)
-        distance = jnp.sqrt(square)
-        along = attitude.to_body(tuple(x / distance for x in place))
+        if self.vertical:
+            distance = jnp.abs(place[2])
+            square, along = distance * distance, attitude.row(2)  # of either sign: a square
+        else:
+            square = dot(place, place)
+            distance = jnp.sqrt(square)
+            along = attitude.to_body(tuple(x / distance for x in place))
         if inertia.is_principal:
             moments = components(inertia.moments)
             trace = moments[0] + moments[1] + moments[2]
