@@ -311,7 +311,10 @@ def test_interrupt_of_a_running_process_leaves_nothing_half_written(here):
     output = here / "new" / "top.nc"
     command = [sys.executable, "-m", "polhode.cli", "run", "top.toml", "-o", str(output),
                "--clones", "1000000"]  # fmt: skip
+    before = signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        signal.signal(signal.SIGINT, before)
         deadline = time.monotonic() + 120
         # the folder is made once the scene is read and the work is about to begin
         while not output.parent.exists() and time.monotonic() < deadline:
