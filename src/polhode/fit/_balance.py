@@ -67,9 +67,7 @@ def _blocks(values: Array, count: int, block: int) -> Array:
 def balance_of(recording: Recording, body: Array, knots: int, block: int) -> Balance:
     """Prepare recordings (leading axis r) of the bodies with numbers ``body`` (r,)."""
     times = recording.times
-    omega = jnp.stack(
-        [bridged(times, recording.present, recording.omega[..., k]) for k in range(3)], axis=-1
-    )
+    omega = bridged(times, recording.present, recording.omega)
     sample = recording.present * recording.wheel_known
     count = times.shape[1] // block
     weight = jax.vmap(lambda x: jnp.floor(_blocks(x, count, block)))(sample)

@@ -18,29 +18,35 @@ from polhode.fit._residuals import Model, residuals
 
 
 class Linear(NamedTuple):
-    """Residuals (c channels side by side) and their derivatives by shared and own unknowns."""
+    """Residuals (c channels side by side) and what their derivatives amount to.
+
+    ``shared``, ``own``, ``left``: the triangular factor of a recording's derivatives by shared and
+    own unknowns and of its residuals, column block by column block. Sums of squares and products
+    are those of all samples, so that an optimiser works on a handful of rows. ``at``: the shared
+    unknowns of the place.
+    """
 
     rest: Float[Array, "r t c"]
-    shared: Float[Array, "r t c s"]
-    own: Float[Array, "r t c o"]
+    shared: Float[Array, "r q s"]
+    own: Float[Array, "r q o"]
+    left: Float[Array, "r q"]
+    at: Float[Array, " s"]
 
-    def shifted(
-        self, shared: Float[Array, " s"], own: Float[Array, "r o"]
-    ) -> Float[Array, "r t c"]:
-        """Residuals after small changes of the unknowns, to first order."""
+    def shifted(self, shared: Float[Array, " s"], own: Float[Array, "r o"]) -> Float[Array, "r q"]:
+        """``left`` after small changes of the unknowns, to first order."""
         return (
-            self.rest
-            + jnp.einsum("rtcs,s->rtc", self.shared, shared)
-            + jnp.einsum("rtco,ro->rtc", self.own, own)
+            self.left
+            + jnp.einsum("rqs,s->rq", self.shared, shared)
+            + jnp.einsum("rqo,ro->rq", self.own, own)
         )
 
     def information(self) -> Float[Array, "p p"]:
         """``J^T J`` in the order shared, then own unknowns recording by recording."""
         recordings, size = self.own.shape[0], self.own.shape[-1]
-        corner = jnp.einsum("rtcs,rtcz->sz", self.shared, self.shared)
-        side = jnp.einsum("rtcs,rtco->sro", self.shared, self.own)
+        corner = jnp.einsum("rqs,rqz->sz", self.shared, self.shared)
+        side = jnp.einsum("rqs,rqo->sro", self.shared, self.own)
         side = side.reshape(corner.shape[0], recordings * size)
-        blocks = jnp.einsum("rtco,rtcz->roz", self.own, self.own)
+        blocks = jnp.einsum("rqo,rqz->roz", self.own, self.own)
         each = jnp.eye(recordings, dtype=corner.dtype)[:, None, :, None] * blocks[:, :, None, :]
         below = each.reshape(recordings * size, recordings * size)
         return jnp.block([[corner, side], [side.T, below]])
@@ -102,4 +108,8 @@ def linearise(
     (by_shared, by_own), rest = jax.vmap(slopes, in_axes=(None, 0, 0, 0))(
         shared, own, recording, model.attitude
     )
-    return Linear(rest, by_shared, by_own)
+    columns = jnp.concatenate([by_shared, by_own, rest[..., None]], axis=-1)
+    columns = columns.reshape(rest.shape[0], -1, columns.shape[-1])
+    factor = jnp.linalg.qr(columns, mode="r")
+    count = shared.shape[0]
+    return Linear(rest, factor[..., :count], factor[..., count:-1], factor[..., -1], shared)

@@ -93,31 +93,35 @@ class Recording(eqx.Module):
             times.shape[:-1],
             *(a.shape[: a.ndim - tails[n]] for n, a in arrays.items() if a is not None),
         )
+        # what is known now is worked on by NumPy, which has a hundredth of JAX's overhead
+        xp = jnp
+        if is_concrete(times, *(a for a in arrays.values() if a is not None)):
+            xp, times, arrays = np, *jax.tree.map(np.asarray, (times, arrays))
         arrays = {
-            name: None if a is None else jnp.broadcast_to(a, (*batch, *a.shape[-tails[name] :]))
+            name: None if a is None else xp.broadcast_to(a, (*batch, *a.shape[-tails[name] :]))
             for name, a in arrays.items()
         }
-        times = jnp.broadcast_to(times, (*batch, count))
-        present = jnp.ones_like(times)
+        times = xp.broadcast_to(times, (*batch, count))
+        present = xp.ones_like(times)
         for name, array in arrays.items():
             if array is not None and name != "wheel_speed":
-                whole = jnp.isfinite(array)
-                whole = jnp.all(whole, axis=-1) if tails[name] == 2 else whole
+                whole = xp.isfinite(array)
+                whole = xp.all(whole, axis=-1) if tails[name] == 2 else whole
                 present = present * whole.astype(times.dtype)
         filled = {
-            name: None if a is None else jnp.where(jnp.isfinite(a), a, _blank(name, a))
+            name: None if a is None else xp.where(xp.isfinite(a), a, _blank(name, a))
             for name, a in arrays.items()
         }
         omega, attitude = filled["omega_body"], filled["wxyz"]
         wheel, known = filled["wheel_speed"], None
         if wheel is not None:
-            known = jnp.isfinite(arrays["wheel_speed"]).astype(times.dtype)
+            known = xp.isfinite(arrays["wheel_speed"]).astype(times.dtype)
             if is_concrete(known):
-                least = int(jnp.min(jnp.sum(known, axis=-1)))
+                least = int(np.min(np.sum(known, axis=-1)))
                 require(least >= 2, f"wheel_speed needs at least 2 numbers, got {least}.")
-            wheel = bridged(times, known, wheel)
+            wheel = bridged(*map(jnp.asarray, (times, known, wheel)))
         if is_concrete(present):
-            least = int(jnp.min(jnp.sum(present, axis=-1)))
+            least = int(np.min(np.sum(present, axis=-1)))
             require(least >= 4, f"a recording needs at least 4 samples without NaN, got {least}.")
         if omega is not None and is_concrete(omega, times):
             _check_rates(omega, times)
@@ -130,16 +134,12 @@ class Recording(eqx.Module):
             name: None if of is None else _noise(name, value, (*batch, count), tail, times.dtype)
             for name, (value, of, tail) in noises.items()
         }
-        return cls(
-            times,
-            present,
-            omega,
-            None if attitude is None else normalise(attitude),
-            filled["force_body"],
-            wheel,
-            **spread,
-            wheel_known=known,
-        )
+        force = filled["force_body"]
+        parts = jax.tree.map(jnp.asarray, (times, present, omega, attitude, force, wheel, known))
+        spread = jax.tree.map(jnp.asarray, spread)
+        times, present, omega, attitude, force, wheel, known = parts
+        attitude = None if attitude is None else normalise(attitude)
+        return cls(times, present, omega, attitude, force, wheel, **spread, wheel_known=known)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -151,24 +151,39 @@ class Recording(eqx.Module):
         return eqx.tree_at(lambda r: r.omega, self, -self.omega)
 
 
-def bridged(
-    times: Float[Array, "*b t"], known: Float[Array, "*b t"], values: Float[Array, "*b t"]
-) -> Float[Array, "*b t"]:
-    """Values with those that are not ``known`` interpolated linearly between their neighbours."""
+def bridged(times: Float[Array, "*b t"], known: Float[Array, "*b t"], values: Array) -> Array:
+    """Values with those that are not ``known`` interpolated linearly between their neighbours.
+
+    ``values`` (..., t), or (..., t, c) for channels with the same gaps. Before the first known one
+    and after the last they are held.
+    """
+    count = times.shape[-1]
 
     def one(times, known, values):
-        # the known ones to the front; what follows repeats the last of them
-        order = jnp.argsort(jnp.where(known > 0, times, jnp.inf))
-        count = jnp.sum(known > 0)
-        rank = jnp.arange(times.shape[0])
-        late = times[-1] - times[0] + jnp.max(times)
-        clock = jnp.where(rank < count, times[order], late)
-        last = values[order[count - 1]]
-        return jnp.interp(times, clock, jnp.where(rank < count, values[order], last))
+        place = jnp.arange(count)
+        there = known > 0
+        before = jnp.where(there, place, jnp.maximum(place - 1, 0))
+        after = jnp.where(there, place, jnp.minimum(place + 1, count - 1))
 
-    shape = times.shape
-    flat = [x.reshape(-1, shape[-1]) for x in (times, known, values)]
-    return jax.vmap(one)(*flat).reshape(shape)
+        # each round doubles the distance looked across
+        def farther(_, ends):
+            before, after = ends
+            return before[before], after[after]
+
+        rounds = max(count - 1, 1).bit_length()
+        before, after = jax.lax.fori_loop(0, rounds, farther, (before, after))
+        before, after = (
+            jnp.where(there[before], before, after),
+            jnp.where(there[after], after, before),
+        )
+        span = times[after] - times[before]
+        part = jnp.where(span > 0, (times - times[before]) / jnp.where(span > 0, span, 1), 0)
+        part = part.reshape(-1, *[1] * (values.ndim - 1))
+        return values[before] + part * (values[after] - values[before])
+
+    batch = times.shape[:-1]
+    flat = [x.reshape(-1, *x.shape[len(batch) :]) for x in (times, known, values)]
+    return jax.vmap(one)(*flat).reshape(values.shape)
 
 
 def stack(recordings: Sequence[Recording]) -> Recording:
@@ -209,8 +224,8 @@ def _with_gaps(name, value, suffix, dtype):
 
 def _blank(name, array):
     if name == "wxyz":
-        return jnp.broadcast_to(jnp.asarray([1, 0, 0, 0], array.dtype), array.shape)
-    return jnp.zeros_like(array)
+        return np.broadcast_to(np.asarray([1, 0, 0, 0], array.dtype), array.shape)
+    return np.zeros((), array.dtype)
 
 
 def _check_rates(omega, times):
@@ -225,8 +240,7 @@ def _check_rates(omega, times):
 def _noise(name, value, shape, tail, dtype):
     array = as_float_array(name, value).astype(dtype)
     if is_concrete(array):
-        require(
-            np.asarray(array) > 0, f"{name} must be positive (a standard deviation), got {array}."
-        )
+        array = np.asarray(array)
+        require(array > 0, f"{name} must be positive (a standard deviation), got {array}.")
     full = (*shape, tail) if tail else shape
-    return jnp.broadcast_to(array, full)
+    return (np if is_concrete(array) else jnp).broadcast_to(array, full)

@@ -9,7 +9,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from polhode.fit._linear import Linear, linearise, unknowns
+from polhode.fit._linear import Linear, entries_of, linearise, unknowns, whole_of
 from polhode.fit._motion import AbstractMotion
 from polhode.fit._optimiser import LevenbergMarquardt
 from polhode.fit._parameters import (
@@ -22,7 +22,7 @@ from polhode.fit._parameters import (
 from polhode.fit._recording import Recording, bridged
 from polhode.fit._residuals import Huber, Model
 from polhode.fit._start import alternatives, regression, scatter
-from polhode.inertia import Inertia, principal, second_moments
+from polhode.inertia import Inertia, inertia_of_second_moments, second_moments
 from polhode.rotation import conjugate, multiply
 
 # Parts of the recording that are fitted one after the other where the whole misleads at first.
@@ -56,10 +56,10 @@ class Problem(eqx.Module):
 class Solution(eqx.Module):
     """The optimum and everything that is linear about it.
 
-    ``linear``: residuals and Jacobian by the entries of the tensor (xx, yy, zz, and for a full one
-    yz, zx, xy) and the other unknowns. ``cost``: half the sum of squares. ``steps``: of all
-    attempts together. ``attempts``: how many starts were tried. ``expected``: the sum of squares
-    that noise alone would leave.
+    ``tensor``: of any size where the data show none. ``linear``: residuals and Jacobian by the
+    entries of the tensor (xx, yy, zz, and for a full one yz, zx, xy) and the other unknowns.
+    ``cost``: half the sum of squares. ``steps``: of all attempts together. ``attempts``: how many
+    starts were tried. ``expected``: the sum of squares that noise alone would leave.
     """
 
     parameters: Parameters
@@ -91,7 +91,7 @@ class _Search(eqx.Module):
 def solve(recording: Recording, problem: Problem) -> Solution:
     """Fit one body to its recordings (leading axis r). Pure; works under jit and vmap."""
     rates = _rates(recording)
-    bases = _bases(recording, rates, problem)
+    bases, first = _bases(recording, rates, problem)
     scale_known = problem.motion.fixes_scale()
     columns = free_columns(problem.unknown, scale_known)
     fixed = tuple(map(tuple, columns.tolist()))
@@ -126,13 +126,19 @@ def solve(recording: Recording, problem: Problem) -> Solution:
     noise = jnp.sqrt(expected / jnp.sum(recording.present) / (3 * _kinds(recording)))
     noise = jnp.where(jnp.isfinite(noise), noise, 0.1 / weight)
 
+    _, _, one_of = unknowns(begin, model_of(jax.tree.map(lambda leaf: leaf[0], bases)))
+
+    @jax.jit
+    def linear_at(shared, own, within, base):
+        # traced once, however often the optimiser asks
+        return linearise(shared, own, one_of, within, model_of(base))
+
     def misfits(scaled, job):
         base, within, belief = job
-        model = model_of(base)
-        shared, own, one = unknowns(actual(scaled), model)
+        shared, own, _ = unknowns(actual(scaled), model_of(base))
         # The Jacobian is made here, once and by blocks: what the optimiser differentiates is linear
         at = jax.lax.stop_gradient((shared, own))
-        linear = linearise(*at, one, within, model)
+        linear = linear_at(*at, within, base)
         misfit = linear.shifted(shared - at[0], own - at[1])
         prior = belief * scaled.shape.astype(dtype)
         return (weight * jnp.concatenate([misfit.ravel(), prior])).astype(wide), linear
@@ -177,6 +183,10 @@ def solve(recording: Recording, problem: Problem) -> Solution:
     one = jax.tree.map(lambda leaf: leaf[0], bases)
     _, struct = jax.eval_shape(misfits, fresh, (one, recording, noise))
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), struct)
+    # the body to begin with, should no attempt come to an end
+    full = problem.unknown.columns().shape[1] == 6
+    body = entries_of(inertia_of_second_moments(first), full)
+    nothing = nothing._replace(at=nothing.at.at[: body.shape[0]].set(body))
     begun = _Search(
         jnp.asarray(0), fresh, fresh, one, nothing, jnp.asarray(jnp.inf, dtype),
         jnp.asarray(0), jnp.asarray(0), jnp.asarray(False), jnp.asarray(False),
@@ -185,16 +195,8 @@ def solve(recording: Recording, problem: Problem) -> Solution:
     ended = jax.lax.while_loop(lambda s: (s.job < count) & ~s.good, attempt, begun)
     parameters = actual(ended.best)
     model = model_of(ended.base)
-    tensor, linear = model.tensor(parameters), ended.linear
-    if not scale_known:
-        # size that the data do not show: a largest moment of one
-        largest = principal(tensor)[0][2]
-        entries = 6 if model.is_full else 3
-        factor = jnp.where(
-            jnp.arange(linear.shared.shape[-1]) < entries, largest, jnp.ones_like(largest)
-        )
-        tensor = tensor / largest
-        linear = linear._replace(shared=linear.shared * factor[None, None, None])
+    linear = ended.linear
+    tensor = whole_of(linear.at, 6 if model.is_full else 3)
     return Solution(
         parameters,
         model,
@@ -270,14 +272,11 @@ def _rates(recording: Recording) -> Float[Array, "r t 3"]:
         inner = (between[:, 1:] + between[:, :-1]) / 2
         return jnp.concatenate([between[:, :1], inner, between[:, -1:]], axis=1)
 
-    channels = [
-        bridged(recording.times, recording.present, recording.omega[..., k]) for k in range(3)
-    ]
-    return jnp.stack(channels, axis=-1)
+    return bridged(recording.times, recording.present, recording.omega)
 
 
-def _bases(recording, rates, problem) -> Base:
-    """Starting bodies (leading axis), the best first."""
+def _bases(recording, rates, problem) -> tuple[Base, Array]:
+    """Starting bodies (leading axis), the best first, and the second moments of that one."""
     carried = None
     spin = getattr(problem.motion, "spin_inertia", None)
     if spin is not None:
@@ -290,7 +289,7 @@ def _bases(recording, rates, problem) -> Base:
     if problem.unknown.columns().shape[1] == 3:
         bodies = bodies * jnp.eye(3, dtype=bodies.dtype)[None]
     known = problem.motion.fixes_scale()
-    return jax.vmap(lambda sigma: base_of(sigma, known))(bodies)
+    return jax.vmap(lambda sigma: base_of(sigma, known))(bodies), bodies[0]
 
 
 def _scale(begin: Parameters, recording: Recording, rates: Array) -> Parameters:

@@ -10,7 +10,7 @@ from polhode.free._compensated import compensate
 from polhode.free._flow import Moment, advance, attitude, rates
 from polhode.free._frame import Quadruple
 from polhode.free._motion import FreeMotion, Swing, Turning, prepare_swing, prepare_turning
-from polhode.free._roles import Triple, assign_roles
+from polhode.free._roles import Triple, assign_roles, one_of
 from polhode.free._rule import Found, answer_rule
 
 Scalars = Float[Array, "*b"]
@@ -144,12 +144,15 @@ def _results(asked, swing: Swing, turning: Turning | None, at: Moment):
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _evaluate(asked, constants, given):
     swing, turning = constants
-    return _results(asked, swing, turning, advance(swing, turning, given[-1], asked[2]))
+    one = None if asked[2] else swing.one
+    return _results(asked, swing, turning, advance(swing, turning, given[-1], one))
 
 
 def _evaluate_rule(asked, primals, tangents):
     (swing, turning), given = primals
-    at = advance(swing, turning, jax.lax.stop_gradient(given[-1]), asked[2])
+    t = jax.lax.stop_gradient(given[-1])
+    # The tangent has many kernels, and each would repeat the motion itself.
+    at = advance(swing, turning, t, one_of(t * swing.one), fine=True)
     found = Found(swing, turning, at, _results(asked, swing, turning, at))
     return answer_rule(asked, (found, given), (None, tangents[1]))
 

@@ -118,13 +118,18 @@ def half_angle(swing: Swing, turning: Turning, t: Scalars, rest, half, N, turned
     return cosine * f - sine * g, cosine * g + sine * f
 
 
-def advance(swing: Swing, turning: Turning | None, t: Scalars, many: bool) -> Moment:
-    """The motion at time t."""
+def advance(swing: Swing, turning: Turning | None, t: Scalars, one: Scalars | None, fine=False):
+    """The ``Moment`` of time t; with ``one``, of the shape of t, in stages (see ``settle``).
+
+    ``fine``: in more stages, for results that many kernels need.
+    """
     # One kernel per output repeats the arithmetic of all stages, which costs less than to write
     # and read them when every lane has many times, and more when it has one.
-    stage = (lambda x: x) if many else (lambda x: settle(x, swing.one))
-    whole, rest = sweep(swing, t)
+    stage = (lambda x: x) if one is None else (lambda x: settle(x, one))
+    more = stage if fine else (lambda x: x)
+    whole, rest = more(sweep(swing, t))
     half, folded = jacobi(swing, rest, stage)
+    folded = more(folded)
     sign = parity(whole)
     S, C, N = stage((sign * folded[0], sign * folded[1], folded[2]))
     l1, l2, l3 = now = stage(momentum(swing, (S, C, N)))

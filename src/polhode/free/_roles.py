@@ -25,13 +25,18 @@ def one_of(x: Scalars) -> Scalars:
     return jnp.where(jnp.isnan(x), x, 1)
 
 
-def settle(values, one: Scalars):
+def settle(values, *ones: Scalars):
     """The same values, computed once and not again in every kernel that uses them.
 
     The compiler repeats cheap arithmetic in every fused loop that needs its result, but never a
-    division; it drops optimisation barriers before fusing on the CPU.
+    division; it drops optimisation barriers before fusing on the CPU. Each value is divided by the
+    one of its own shape, for a division by a broadcast scalar is a multiplication to the compiler.
     """
-    return jax.tree.map(lambda x: x / one, values)
+
+    def divided(x):
+        return x / next((one for one in ones if one.shape == x.shape), ones[0])
+
+    return jax.tree.map(divided, values)
 
 
 class Roles(NamedTuple):

@@ -19,7 +19,7 @@ from polhode.free._carry import (
 from polhode.free._flow import Moment
 from polhode.free._frame import Frame, Quadruple, cross, dot, hamilton, matrix
 from polhode.free._motion import Swing, Turning
-from polhode.free._roles import Triple, settle
+from polhode.free._roles import Triple, one_of, settle
 from polhode.free._second import second_kind
 from polhode.free._tangent import (
     Change,
@@ -134,6 +134,10 @@ def _for_tangent(swing: Swing, at: Moment, t: Scalars) -> Moment:
     return at._replace(folded=mend(at.folded), functions=mend(at.functions))
 
 
+def _settled(ones, values):
+    return settle(values, *ones)
+
+
 class _Tangent(NamedTuple):
     """Variations at time t along axes 1, 2, 3, scaled: of L, of the attitude, but for the time."""
 
@@ -148,9 +152,10 @@ class _Tangent(NamedTuple):
 def _tangent(many: bool, attitude: bool, found: Found, given, dm, dp, dw) -> _Tangent:
     """The formulas of _tangent.py, every value in them with a derivative of its own."""
     moments, _, omega, _, t = given
-    # The transpose of a stage is a stage: it keeps cotangents from being summed again and again.
-    stage = (lambda x: x) if many else (lambda x: settle(x, found.swing.one))
     scaled = t * found.swing.pulse
+    ones = one_of(scaled), found.swing.one
+    # The transpose of a stage is a stage: it keeps cotangents from being summed again and again.
+    stage = functools.partial(_settled, ones)
     swing = start_of(found.swing, moments, omega)
     frame = Frame(swing)
     change = stage(change_of_start(swing, frame, dm, dp, dw))
