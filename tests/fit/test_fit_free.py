@@ -166,3 +166,12 @@ def test_recordings_of_different_length_stack():
     both = stack([one, two])
     assert both.times.shape == (2, 5)
     np.testing.assert_array_equal(both.present, [[1, 1, 1, 1, 0], [1, 1, 1, 1, 1]])
+
+
+def test_a_missing_row_in_five_does_not_hide_the_noise(cases):
+    """Nor do readings of no noise at all count as far from it."""
+    times, clean, noisy, *_ = cases
+    holed = np.stack([noisy[2], noisy[4], np.broadcast_to(clean[0, :1], clean[0].shape)])
+    holed[:2, ::5] = np.nan
+    fit = fit_inertia(times, holed, throw=False)
+    assert not (np.asarray(fit.finding) & int(Finding.POOR)).any()

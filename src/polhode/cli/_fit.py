@@ -87,7 +87,9 @@ def fit(arguments: argparse.Namespace) -> int:
             )
             options = _options(arguments, room)
         except ValueError as error:
-            print(f"polhode: {error}", file=sys.stderr)
+            units = "deg/s" in str(error) and not (arguments.degrees and arguments.milliseconds)
+            hint = " See --degrees and --milliseconds." if units else ""
+            print(f"polhode: {error}{hint}", file=sys.stderr)
             return 2
         output = arguments.output or Path(arguments.recording.stem)
         output.parent.mkdir(parents=True, exist_ok=True)
@@ -98,7 +100,8 @@ def fit(arguments: argparse.Namespace) -> int:
         if not arguments.no_figure and recording.omega is not None:
             written.append(_draw(output, arguments, recording, result))
     if not arguments.quiet:
-        out = Console(soft_wrap=not sys.stdout.isatty())
+        here = sys.stdout.isatty()
+        out = Console(soft_wrap=not here, width=None if here else 110)
         out.print(_table(arguments, recording, result))
         for text in room.remarks(result):
             out.print(f"- {text}", highlight=False)
@@ -235,13 +238,14 @@ def _table(arguments, recording, result):
     axes = np.asarray(to_matrix(result.axes))
     turn = np.degrees(np.asarray(result.axes_std))
     for k, name in enumerate(("smallest", "middle", "largest")):
-        reach = "" if high[k] <= low[k] else f"{low[k]:.5g} to {high[k]:.5g}"
+        reach = "" if k == 2 and not known else f"{low[k]:.5g} to {high[k]:.5g}"
         grid.add_row(
             name,
             f"{values[k]:.6g}",
             reach if np.isfinite(high[k]) else "not determined",
-            "({:.3f}, {:.3f}, {:.3f})".format(*axes[:, k]),
-            f"{turn[k]:.2g} deg" if np.isfinite(turn[k]) else "-",
+            # without negative zeros
+            "({:.3f}, {:.3f}, {:.3f})".format(*(np.round(axes[:, k], 3) + 0.0)),
+            f"{turn[k]:.2g} deg" if turn[k] < 90 else "not determined",
         )
     grid.caption = (
         f"residual rms {float(result.rms):.3g} rad/s, {float(result.noise):.3g} of the noise"

@@ -230,6 +230,17 @@ def _blank(name, array):
 
 def _check_rates(omega, times):
     turn = np.linalg.norm(np.asarray(omega), axis=-1)[..., 1:] * np.diff(np.asarray(times), axis=-1)
+    flat = turn.reshape(-1, turn.shape[-1])
+    worst = flat.max(axis=0)
+    # a gap in an otherwise dense recording
+    if 0 < np.sum(worst > _TURN_PER_SAMPLE) <= 0.1 * worst.size:
+        place = int(np.argmax(worst))
+        require(
+            False,
+            f"times leave a gap after sample {place}, in which the body turns by some "
+            f"{worst[place]:.3g} rad: cut the recording there and give the pieces as recordings "
+            "of one body (fit_recordings).",
+        )
     require(
         turn <= _TURN_PER_SAMPLE,
         f"omega_body turns the body by up to {turn.max():.3g} rad between samples, more than half "

@@ -180,7 +180,9 @@ def conclude(solution: Solution, recording: Recording, problem: Problem) -> Iner
 
     def derived(vector):
         values, axes, products = principal(whole_of(vector, count))
-        return jnp.concatenate([values, values / values[2], products]), (values, axes)
+        # the largest is one to itself, rounding aside
+        ratios = (values / values[2]).at[2].set(1)
+        return jnp.concatenate([values, ratios, products]), (values, axes)
 
     slope, (moments, axes) = jax.jacfwd(derived, has_aux=True)(entries)
     if not model.scale_known:

@@ -242,7 +242,16 @@ def _expected(recording: Recording, problem: Problem) -> Float[Array, ""]:
     if recording.omega is None:
         return jnp.full_like(expected, jnp.inf)
     seen = jax.vmap(scatter)(recording.times, recording.omega, recording.present)
-    return expected * jnp.mean(seen / jnp.mean(recording.omega_noise, axis=(1, 2)) ** 2)
+    seen = seen / jnp.mean(recording.omega_noise, axis=(1, 2)) ** 2
+    # recordings without five samples in a row tell nothing
+    told = jnp.isfinite(seen)
+    count = jnp.maximum(jnp.sum(told), 1).astype(seen.dtype)
+    mean = jnp.sum(jnp.where(told, seen, 0)) / count
+    mean = jnp.where(jnp.any(told), mean, jnp.inf)
+    # readings without any noise are met to what the optimiser takes for rounding at best
+    rounding = float(jnp.finfo(mean.dtype).eps) ** 0.75
+    least = rounding**2 * jnp.mean((recording.omega / recording.omega_noise) ** 2)
+    return expected * jnp.maximum(mean, least)
 
 
 def _weight(recording: Recording, rates: Array) -> Float[Array, ""]:

@@ -173,7 +173,8 @@ def scatter(
 ) -> Float[Array, ""]:
     """Variance of the noise as neighbours show it: each sample against the cubic through four.
 
-    An upper bound in the mean: where the sampling is coarse the motion itself adds to it.
+    An upper bound in the mean: where the sampling is coarse the motion itself adds to it. Infinite
+    where no five samples follow each other.
     """
     offset = jnp.stack([times[k : times.shape[0] - 4 + k] for k in range(5)]) - times[None, 2:-2]
     value = jnp.stack([omega[k : times.shape[0] - 4 + k] for k in range(5)])
@@ -187,4 +188,4 @@ def scatter(
     there = jnp.prod(known, axis=0)
     total = jnp.sum(there)
     square = jnp.sum(there * jnp.sum((value[2] - guess) ** 2, axis=1) / share) / 3
-    return jnp.where(total > 0, square / jnp.where(total > 0, total, 1), 0)
+    return jnp.where(total > 0, square / jnp.where(total > 0, total, 1), jnp.inf)
