@@ -184,7 +184,10 @@ def racquet(report: dict) -> list[str]:
     return [
         "## Tosses of a racquet", "", machine(report), "",
         "Real recordings of a phone's gyroscope (University of British Columbia,"
-        " doi:10.14288/1.0448943; not part of the project). The trials of a round together:", "",
+        " doi:10.14288/1.0448943; not part of the project). The trials of a round together; the"
+        " seven of the first, fast spins about all axes, are not the free motion of one body, and"
+        " those of the fourth are mostly fast, where the air matters. Standard deviations are"
+        " those of white residuals, which these are not (the model lacks the air).", "",
         *rows(header, lines),
         f"Each of the {alone['trials']} trials alone: {alone['physical']} physical bodies,"
         f" {alone['converged']} usable, remarks: {flags}. Published: 0.0660 : 0.9348 : 1 at 0.32"
