@@ -70,6 +70,9 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
       Needs a vector field that treats bodies separately, with bodies on the last axis of every
       array of the state, and of every array of the term and of ``args`` that differs from body
       to body. None: all at once. About 128 is best where the first cache holds 32 KiB.
+    - ``compact``: the columns in one loop, so that the vector field stands in the program only a
+      few times: half the time to compile, or less, at the same speed. Reverse mode cannot pass
+      through such steps, forward mode can.
 
     ??? cite "Reference"
         W. B. Gragg, SIAM J. Numer. Anal. 2 (1965) 384; R. Bulirsch, J. Stoer, Numer. Math. 8
@@ -80,6 +83,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
     formal_order: int = eqx.field(static=True, default=12)
     block: int | None = eqx.field(static=True, default=None)
     substeps: int = eqx.field(static=True, default=1)
+    compact: bool = eqx.field(static=True, default=False)
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = CollocationInterpolation
@@ -115,7 +119,12 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         def advance(y, rest):
             problem, (t, width), control = rest
             prepared = problem.prepared(t, y, control)
-            run = kernel(lambda *operands: _steps(self.formal_order, self.substeps, *operands))
+            step = _compact_step if self.compact else _step
+
+            def run(*operands):
+                return _steps(step, self.formal_order, self.substeps, *operands)
+
+            run = kernel(run)
             return run(prepared, (t, width), control, y)
 
         problem = Problem.of(terms, args)
@@ -133,14 +142,14 @@ def _add_share(a: PyTree, share: float, b: PyTree) -> PyTree:
     return jax.tree.map(lambda x, y: x + share * y, a, b)
 
 
-def _steps(order: int, count: int, problem: Prepared, times, control, y):
+def _steps(step, order: int, count: int, problem: Prepared, times, control, y):
     """State after ``count`` equal steps, summed size of their errors, states they started from."""
     t0, width = times
     share = jax.tree.map(lambda c: c / count, control)
 
     def one(carry, i):
         y, total = carry
-        new, error = _step(order, problem, (t0 + i * (width / count), width / count), share, y)
+        new, error = step(order, problem, (t0 + i * (width / count), width / count), share, y)
         return (new, jax.tree.map(lambda s, e: s + jnp.abs(e), total, error)), y
 
     start = (y, jax.tree.map(jnp.zeros_like, y))
@@ -148,15 +157,9 @@ def _steps(order: int, count: int, problem: Prepared, times, control, y):
     return y, error, nodes
 
 
-def _step(order: int, problem: Prepared, times, control, y):
-    """New state and error estimate; the column with most substeps is the base of both sums.
-
-    The others enter by their small differences to it, so that rounded weights cannot rescale
-    the state.
-    """
-    sequence = SEQUENCES[order]
-    weights = extrapolation_weights(sequence)
-    lower = (Fraction(0), *extrapolation_weights(sequence[1:]))
+def _columns(problem: Prepared, times, control, y):
+    """The midpoint rule in ``n`` substeps, a column of the table, for numbers ``n`` that may be
+    traced integers."""
     t0, width = times
     start = kernel(lambda y, t, control, p: p.increment(t, y, control))(y, t0, control, problem)
 
@@ -167,7 +170,7 @@ def _step(order: int, problem: Prepared, times, control, y):
     def column(n):
         h = width / n
         # a share of the whole control: differences of two late times would be rounded
-        twice = jax.tree.map(lambda c: c * (2 / n), control)
+        twice = jax.tree.map(lambda c: c / (n // 2), control)
         a, b = y, jax.tree.map(lambda y, f: y + f / n, y, start)
 
         def pair(i, ab):
@@ -179,10 +182,54 @@ def _step(order: int, problem: Prepared, times, control, y):
         a, b = jax.lax.fori_loop(0, n // 2 - 1, pair, (a, b))
         return leap(a, b, t0 + (width - h), twice, problem)
 
-    base = column(sequence[-1])
+    return column
+
+
+def _shares(order: int) -> list[tuple[int, float, float]]:
+    """Substeps of each column but the last, its weight, and that of its part in the error."""
+    sequence = SEQUENCES[order]
+    weights = extrapolation_weights(sequence)
+    lower = (Fraction(0), *extrapolation_weights(sequence[1:]))
+    return [(n, float(w), float(w - v)) for n, w, v in zip(sequence[:-1], weights, lower)]
+
+
+def _step(order: int, problem: Prepared, times, control, y):
+    """New state and error estimate; the column with most substeps is the base of both sums.
+
+    The others enter by their small differences to it, so that rounded weights cannot rescale
+    the state.
+    """
+    column = _columns(problem, times, control, y)
+    base = column(SEQUENCES[order][-1])
     new, error = base, jax.tree.map(jnp.zeros_like, base)
-    for n, weight, low in zip(sequence[:-1], weights, lower):
+    for n, weight, share in _shares(order):
         difference = jax.tree.map(jnp.subtract, column(n), base)
-        new = _add_share(new, float(weight), difference)
-        error = _add_share(error, float(weight - low), difference)
+        new = _add_share(new, weight, difference)
+        error = _add_share(error, share, difference)
+    return new, error
+
+
+def _compact_step(order: int, problem: Prepared, times, control, y):
+    """The same in a loop over the columns, the base first."""
+    column = _columns(problem, times, control, y)
+    counts, *weights = zip((SEQUENCES[order][-1], 0.0, 0.0), *_shares(order))
+    dtype = jnp.result_type(*jax.tree.leaves(y))
+
+    def one(carry, entry):
+        base, new, error = carry
+        n, weight, share, is_base = entry
+        got = column(n)
+
+        def pick(a, b):
+            return jax.tree.map(lambda a, b: jnp.where(is_base, a, b), a, b)
+
+        base = pick(got, base)
+        difference = jax.tree.map(jnp.subtract, got, base)
+        new = pick(got, _add_share(new, weight, difference))
+        return (base, new, _add_share(error, share, difference)), None
+
+    none = jax.tree.map(jnp.zeros_like, y)
+    entries = (jnp.array(counts), *(jnp.array(x, dtype) for x in weights))
+    is_base = jnp.arange(len(counts)) == 0
+    (_, new, error), _ = jax.lax.scan(one, (none, none, none), (*entries, is_base))
     return new, error
