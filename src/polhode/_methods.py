@@ -14,7 +14,8 @@ from polhode._lanes import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._scene import Scene
 from polhode._state import State
 from polhode._status import Status
-from polhode._stepping import LaneNorm, followed, sampled, through
+from polhode._stepping import followed, sampled, through
+from polhode._tolerance import EndTolerance, controlled
 from polhode.hamiltonian import (
     Attitude,
     Dynamics,
@@ -138,8 +139,12 @@ class AbstractDiffraxMethod(AbstractMethod):
             times = ts if times is None else times[0]
             return self._solve(scene, state, times, rtol, record)
 
-        times = ts if ts.ndim == 2 else None
-        return map_chunks(one, (lanes, times), state.wxyz.shape[0], size)
+        n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
+        if not self.at_end or n <= size:
+            return map_chunks(one, (lanes, times), n, size)
+        order = jnp.argsort(self._rates(scene, state, ts))  # who shares steps is of like rate
+        found = map_chunks(one, jax.tree.map(lambda x: x[order], (lanes, times)), n, size)
+        return jax.tree.map(lambda x: x[jnp.argsort(order)], found)
 
     def _stacked_field(self, t, y, dynamics):
         """The field on one array (components, N): for a diffrax solver far faster than leaves."""
@@ -181,16 +186,7 @@ class AbstractDiffraxMethod(AbstractMethod):
                 field = self._field_and_power
         controller = self.controller
         if controller is None:
-            if self.at_end:
-                rate = jnp.max(jnp.linalg.norm(state.omega_body, axis=-1))
-                turned = jnp.maximum(1, rate * jnp.abs(ts[-1] - ts[0]))
-                rtol = rtol / jax.lax.stop_gradient(2 * turned)  # and room for steps that miss it
-                rtol = jnp.maximum(rtol, _FINEST * jnp.finfo(rtol.dtype).eps)
-            controller = diffrax.PIDController(
-                rtol=0.0,
-                atol=rtol,
-                norm=LaneNorm(weights),
-            )
+            controller = self._tolerance(scene, state, ts, rtol, weights)
         solve = partial(
             diffrax.diffeqsolve,
             solver=self.solver,
@@ -229,15 +225,27 @@ class AbstractDiffraxMethod(AbstractMethod):
             work,
         )
 
+    def _tolerance(self, scene, state, ts, rtol, weights):
+        """What keeps the error of each step, or at the last time, to ``rtol``."""
+        if not self.at_end:
+            return controlled(rtol, weights)
+        if self._by_components and self.momenta[0]:
+            size = jnp.trace(scene.inertia.tensor, axis1=-2, axis2=-1) / 3
+            size = jnp.broadcast_to(size, weights.shape[1:])
+            return EndTolerance(rtol, jax.lax.stop_gradient(size), ts[-1])
+        rate = jnp.max(jnp.linalg.norm(state.omega_body, axis=-1))
+        turned = jnp.maximum(1, rate * jnp.abs(ts[-1] - ts[0]))
+        return controlled(rtol / jax.lax.stop_gradient(2 * turned), weights)
+
     def _first_width(self, scene, state, ts) -> Array:
         """A first step well within what the fastest body of the chunk allows [s]."""
-        slowest = jnp.min(jnp.broadcast_to(scene.carrier.moments, (state.wxyz.shape[0], 3)), -1)
-        rate = jnp.max(momentum_scale(scene, state, ts[0]) / slowest)
+        rate = jnp.max(self._rates(scene, state, ts))
         return jax.lax.stop_gradient(jnp.sign(ts[-1] - ts[0]) * 0.3 / rate)
 
-
-_FINEST = 4
-"""Least tolerance of a step in units of rounding: below, the error estimate is rounding alone."""
+    def _rates(self, scene, state, ts) -> Array:
+        """Natural rates of lanes [rad/s], from above."""
+        slowest = jnp.min(jnp.broadcast_to(scene.carrier.moments, (state.wxyz.shape[0], 3)), -1)
+        return jax.lax.stop_gradient(momentum_scale(scene, state, ts[..., 0]) / slowest)
 
 
 def _stack(groups) -> Array:
@@ -290,8 +298,8 @@ class LiePoisson(AbstractDiffraxMethod):
       the adjoint equations integrated in as many steps (see ``ph.Extrapolated``).
     - ``chunk``: bodies that share their steps; chunks follow one another, so memory stays bounded.
     - ``at_end``: hold the error at the last time to ``rtol``, not that of each step: the steps'
-      tolerance is half ``rtol`` over the angle that the fastest body of the chunk turns through, or
-      what rounding allows.
+      tolerance follows from the angle that the fastest body of the chunk turns through, or what
+      rounding allows; for ``Extrapolation`` it is renewed on the way, as torques change the rates.
     """
 
     solver: diffrax.AbstractSolver = diffrax.Dopri8()

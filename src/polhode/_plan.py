@@ -17,7 +17,7 @@ from polhode._state import State
 from polhode._top_methods import AbstractTopMethod, exact_top
 from polhode.inertia import Symmetry
 from polhode.solvers import Extrapolation, steps_for
-from polhode.torques import GravityGradient, UniformGravity
+from polhode.torques import GravityGradient, PotentialSum, UniformGravity
 
 _FREE_LAWS = {
     Symmetry.NONE: "nothing acts on the body: exact motion in Jacobi elliptic functions",
@@ -81,7 +81,7 @@ def choose(
     exact = exact_top(scene, state, record)
     if exact is not None:
         return exact, exact.law
-    if scene.potential is not None and scene.torque is None:
+    if _is_steady(scene):
         falls = _falls(scene.potential)
         method = Extrapolated(
             _order(rtol),
@@ -93,10 +93,22 @@ def choose(
             " in equal steps by each body's natural rate"
         )
     order = 10 if state.wxyz.dtype == jnp.float32 else min(14, _order(rtol))
-    method = LiePoisson(Extrapolation(order), at_end=True, adjoint=None)
+    method = LiePoisson(Extrapolation(order, compact=True), at_end=True, adjoint=None)
     return method, (
         f"something acts on the body: extrapolated midpoint rule of order {order}, stepped with an"
         " error estimate, held to rtol at the last time"
+    )
+
+
+def _is_steady(scene: Scene) -> bool:
+    """Whether the natural rate alone says how finely to step: known, constant fields only."""
+    if scene.potential is None or scene.torque is not None or scene.rotors is not None:
+        return False
+    whole = scene.potential
+    return all(
+        isinstance(x, UniformGravity)
+        or (isinstance(x, GravityGradient) and not callable(x.position_space))
+        for x in (whole.terms if isinstance(whole, PotentialSum) else (whole,))
     )
 
 

@@ -1,29 +1,13 @@
-"""Batches of lanes through diffrax: the norm of their errors, and their samples."""
+"""Batches of lanes through diffrax, and their samples."""
 
 from functools import partial
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
 
 from polhode import solvers
-
-
-class LaneNorm(eqx.Module):
-    """Error of the worst lane: root mean square over its components, each times its weight.
-
-    A batch that shares its steps so keeps every body's own tolerance.
-    """
-
-    weights: Array
-
-    def __call__(self, y: PyTree[Array]) -> Array:
-        y = jnp.stack(y) if len(y := jax.tree.leaves(y)) > 1 else y[0]
-        worst = jnp.max(jnp.mean((y * self.weights) ** 2, axis=0))
-        positive = worst > 0  # the root's slope at zero is infinite: keep it out of gradients
-        return jnp.where(positive, jnp.sqrt(jnp.where(positive, worst, 1)), 0)
+from polhode._tolerance import EndTolerance
 
 
 def sampled(solve, controller, ts, y0, width, final_only):
@@ -40,11 +24,11 @@ def sampled(solve, controller, ts, y0, width, final_only):
 def through(solve, field, args, controller, ts, y0, width, final_only):
     """The same of a state in components, in one solve from each time to the next.
 
-    ``solve`` takes the term and its arguments as well.
+    ``solve`` takes the term and its arguments as well; ``controller``: of diffrax, or tolerances
+    that are renewed on the way.
     """
     times = ts[jnp.array([0, -1])] if final_only else ts
-    solve = partial(solve, diffrax.ODETerm(field), args=args)
-    path, _, (result, steps) = _across(solve, controller, times, y0, width)
+    path, _, (result, steps) = _across(solve, field, args, controller, times, y0, width)
     return *_stacked(path, final_only), result, steps
 
 
@@ -54,8 +38,7 @@ def followed(solve, field, args, controller, ts, y0, width, final_only):
 
     def steps(given, field, args, y0, times):
         controller, width = given
-        solve_it = partial(solve, diffrax.ODETerm(field), args=args)
-        return _across(solve_it, controller, times, y0, width)
+        return _across(solve, field, args, controller, times, y0, width)
 
     order = solve.keywords["solver"].formal_order
     path, _, (result, steps) = solvers.path(
@@ -69,27 +52,41 @@ _PARTS = 8
 that a torque has drawn together an error grows no longer than through one of them."""
 
 
-def _across(solve, controller, times, y0, width):
+def _across(solve, field, args, controller, times, y0, width):
     """States at the times (in front), steps taken in each interval, result and all steps tried.
 
     A step starts as wide as those of the interval before; after a failure nothing moves.
     """
     good = diffrax.RESULTS.successful
+    solve = partial(solve, diffrax.ODETerm(field), args=args)
+    renewed, parts = isinstance(controller, EndTolerance), 1
+    if renewed:
+        rate, _ = controller.rates(y0, field(times[0], y0, args))
+        times, parts = controller.nodes(times, rate)
 
     def across(carry, interval):
-        y, width, result, steps = carry
+        y, width, result, steps, turned = carry
         start, end = interval
         end = jnp.where(result == good, end, start)
-        solution = solve(t0=start, t1=end, dt0=width, y0=y, stepsize_controller=controller)
+        now = controller
+        if renewed:
+            now, rate = controller.at(start, y, field(start, y, args), turned)
+            turned = turned + rate * jnp.abs(end - start)
+        solution = solve(t0=start, t1=end, dt0=width, y0=y, stepsize_controller=now)
         result = diffrax.RESULTS.where(result == good, solution.result, result)
         new = jax.tree.map(lambda x: jnp.where(result == good, x[-1], jnp.nan), solution.ys)
-        count = jnp.maximum(solution.stats["num_accepted_steps"], 1)
-        width = jnp.where(end == start, width, jax.lax.stop_gradient(end - start) / count)
-        return (new, width, result, steps + solution.stats["num_steps"]), (new, count)
+        count = jnp.where(end == start, 0, solution.stats["num_accepted_steps"])
+        mean = jax.lax.stop_gradient(end - start) / jnp.maximum(count, 1)
+        width = jnp.where(end == start, width, mean)
+        steps = steps + solution.stats["num_steps"]
+        return (new, width, result, steps, turned), (new, count)
 
-    start = (y0, jnp.asarray(width, times.dtype), good, jnp.array(0))
-    (_, _, result, steps), (path, counts) = jax.lax.scan(across, start, (times[:-1], times[1:]))
-    path = jax.tree.map(lambda first, x: jnp.concatenate([first[None], x]), y0, path)
+    start = (y0, jnp.asarray(width, times.dtype), good, jnp.array(0), 0 * times[0])
+    (_, _, result, steps, _), (path, counts) = jax.lax.scan(across, start, (times[:-1], times[1:]))
+    counts = jnp.maximum(jnp.sum(counts.reshape(-1, parts), axis=1), 1)
+    path = jax.tree.map(
+        lambda first, x: jnp.concatenate([first[None], x[parts - 1 :: parts]]), y0, path
+    )
     return path, counts, (result, steps)
 
 

@@ -110,6 +110,14 @@ def test_extrapolation_has_its_order(order):
     assert abs(found - order) < 0.1 * order
 
 
+def test_compact_steps_are_the_same():
+    for order in (4, 12):
+        apart = stacked(stepper(Extrapolation(order))(2)) - stacked(
+            stepper(Extrapolation(order, compact=True))(2)
+        )
+        assert np.abs(apart).max() < 1e-14
+
+
 @pytest.mark.parametrize(("order", "steps"), [(2, 60), (4, 30), (6, 20), (8, 16)])
 def test_splitting_has_its_order(order, steps):
     found, errors = measured_order(Splitting(order), steps, 2 * steps)

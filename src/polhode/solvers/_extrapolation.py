@@ -168,14 +168,17 @@ def _columns(problem: Prepared, times, control, y):
         return _add(a, p.increment(t, b, control))
 
     def column(n):
-        h = width / n
+        def share(x, n):
+            return x / jnp.asarray(n, jnp.result_type(x))
+
+        h = share(width, n)
         # a share of the whole control: differences of two late times would be rounded
-        twice = jax.tree.map(lambda c: c / (n // 2), control)
-        a, b = y, jax.tree.map(lambda y, f: y + f / n, y, start)
+        twice = jax.tree.map(lambda c: share(c, n // 2), control)
+        a, b = y, jax.tree.map(lambda y, f: y + share(f, n), y, start)
 
         def pair(i, ab):
             a, b = ab
-            t = t0 + (2 * i + 1) * h
+            t = t0 + jnp.asarray(2 * i + 1, jnp.result_type(h)) * h
             a = leap(a, b, t, twice, problem)
             return a, leap(b, a, t + h, twice, problem)
 
