@@ -146,7 +146,8 @@ def main() -> None:
             for row in new:
                 print("  ".join(f"{v:.2g}" if isinstance(v, float) else f"{v}"
                                 for v in row.values()), flush=True)  # fmt: skip
-    print(_report.write("torqued", {"rows": rows}, path=options.output, packages=("heyoka",)))
+        path = _report.write("torqued", {"rows": rows}, path=options.output, packages=("heyoka",))
+    print(path)
 
 
 if __name__ == "__main__":

@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 from polhode.solvers._extrapolation import SEQUENCES, Extrapolation
 
 ERROR_CONSTANTS = {8: -8.1, 10: -10.4, 12: -12.9, 14: -15.6, 16: -18.3, 18: -21.0, 20: -23.5}
-"""log10 of C in: error of attitude = C x^order (rate horizon), x = rate * step.
+"""log10 of C in: error of attitude = C x^order (rate horizon), x = rate * step; beyond 650 radians
+the last factor grows like a square.
 
 Fitted to the median body of 200 asymmetric and 200 fast Lagrange tops over about 300 to 650
 radians (``benchmarks/integrators.py``); the two kinds lie within a factor 10 of the fit.
@@ -19,6 +20,15 @@ radians (``benchmarks/integrators.py``); the two kinds lie within a factor 10 of
 
 ROUNDING = {8: 4, 10: 9, 12: 13, 14: 17, 16: 18, 18: 28, 20: 41}
 """Amplification of rounding, sqrt(sum w_j^2 n_j), of each order's columns."""
+
+
+def _summed(turned, xp):
+    """What errors of the steps add up to: beyond the fit, those of the rates turn the body on."""
+    return xp.maximum(turned, 1) * xp.maximum(turned / _FITTED, 1)
+
+
+_FITTED = 650
+"""Angle [rad] up to which the errors were fitted."""
 
 
 class Choice(NamedTuple):
@@ -53,7 +63,7 @@ def steps_for(order: int, rtol: Array, rate: Array, horizon: Array) -> Float[Arr
     """
     turned = rate * horizon
     constant = 10.0 ** ERROR_CONSTANTS[order]
-    step = (rtol / (constant * jnp.maximum(turned, 1))) ** (1 / order)
+    step = (rtol / (constant * _summed(turned, jnp))) ** (1 / order)
     return jnp.ceil(jnp.maximum(turned / step, 1))
 
 
@@ -87,7 +97,7 @@ def choose(
 
     def steps(order, rate):
         constant = 10.0 ** ERROR_CONSTANTS[order]
-        x = (rtol / (constant * np.maximum(rate * horizon, 1))) ** (1 / order)
+        x = (rtol / (constant * _summed(rate * horizon, np))) ** (1 / order)
         whole = math.ceil(horizon / longest)
         return whole * np.ceil(np.maximum(rate * horizon / (x * whole), 1)).astype(int)
 
