@@ -19,9 +19,9 @@ def gradients(report: dict) -> list[str]:
               "median error", "worst error", "memory [MB]", "compile [s]"]  # fmt: skip
     return [
         "## Gradients", "", machine(report), "",
-        f"Of a linear function of the final state by the three moments of each body, to t ="
-        f" {report['numbers']['horizon']:g}; errors relative, against 40-digit solutions.", "",
-        *rows(header, lines),
+        "Of a linear function of the final state by the moments of each body, or by what is named,"
+        f" to t = {report['numbers']['horizon']:g}; errors relative, against 40-digit solutions.",
+        "", *rows(header, lines),
     ]  # fmt: skip
 
 

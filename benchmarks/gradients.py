@@ -31,8 +31,14 @@ from benchmarks.problems import DIRECTION, PROBLEMS, Problem
 
 WEIGHTS = (0.7, -0.4, 0.9, 0.3, -0.5, 0.8, 0.6)
 HORIZON = 20.0
-FAMILIES = ("free", "near_symmetric", "lagrange", "heavy_top", "gradient")
+FAMILIES = ("free", "near_symmetric", "lagrange", "heavy_top", "gradient", "damped_top")
 QUICK = ("free", "heavy_top")
+DAMPED = Problem(
+    "damped_top", "heavy top with drag and a torque", (1.0, 1.5, 2.0), 24, weight=1.0,
+    damping=0.05, push=(0.1, 0.02, 0.05),
+)  # fmt: skip
+FEW = 3
+"""Bodies scored where the derivatives are by other numbers than the moments."""
 SCORED = 8
 RTOLS = (1e-6, 1e-9)
 
@@ -42,8 +48,11 @@ def loss(wxyz, omega):
     return sum(w * jnp.sum(x) for w, x in zip(WEIGHTS, (*wxyz, *omega)))
 
 
-def own(problem: Problem, n: int, rtol: float):
-    """Value of polhode's default as a function of the moments (n, k) and the method's name."""
+def own(problem: Problem, n: int, rtol: float, by: str = "moments"):
+    """Value of polhode's default as a function of the moments (n, k) and the method's name.
+
+    ``by``: or of the ``state`` (n, 7), or of the ``weight`` of each heavy top (n, 1).
+    """
     wxyz, omega = (jnp.asarray(x) for x in problem.states(n))
     state, ts = ph.State(wxyz, omega), jnp.array([0.0, problem.horizon])
     record = ph.Record(final_only=True)
@@ -61,7 +70,10 @@ def own(problem: Problem, n: int, rtol: float):
         if problem.gradient:
             mu = jnp.asarray(problem.gradient / 3)
             potential = ph.GravityGradient(mu, jnp.asarray(DIRECTION))
-        return ph.Scene(inertia, potential)
+        torque = None
+        if problem.damping:
+            torque = ph.LinearDamping(problem.damping) + ph.BodyTorque(jnp.asarray(problem.push))
+        return ph.Scene(inertia, potential, torque)
 
     moments = np.array(problem.moments)[[0, 2]] if symmetric else np.array(problem.moments)
     moments = jnp.asarray(np.broadcast_to(moments, (n, len(moments))))
@@ -73,7 +85,25 @@ def own(problem: Problem, n: int, rtol: float):
         )  # fmt: skip
         return loss(end.wxyz[:, 0].T, end.omega_body[:, 0].T)
 
-    return value, moments, f"default: {type(method).__name__}"
+    name = f"default: {type(method).__name__}"
+    if by == "moments":
+        return value, moments, name
+
+    def of_others(given):
+        body, start = scene(moments), state
+        if by == "state":
+            start = ph.State(given[:, :4], given[:, 4:])
+        else:
+            gravity = jnp.concatenate([0 * given, 0 * given, -given], axis=1)
+            field = ph.UniformGravity.axial(jnp.ones(()), jnp.ones(()), gravity)
+            body = ph.Scene(body.inertia, field, body.torque)
+        end = ph.simulate(body, start, ts, method, rtol=rtol, record=record, throw=False)
+        return loss(end.wxyz[:, 0].T, end.omega_body[:, 0].T)
+
+    given = jnp.full((n, 1), problem.weight)
+    if by == "state":
+        given = jnp.concatenate([wxyz, omega], axis=1)
+    return of_others, given, f"{name}, by {by}"
 
 
 def stock(problem: Problem, n: int, tolerance: float, chunk: int = 40):
@@ -199,7 +229,8 @@ def _heyoka_call(made, start, size, horizon, width):
 
 def measure(family: str, n: int, quick: bool) -> list[dict]:
     """Rows of one family."""
-    problem = dataclasses.replace(PROBLEMS[family], horizon=HORIZON, saves=1)
+    known = PROBLEMS | {DAMPED.name: DAMPED}
+    problem = dataclasses.replace(known[family], horizon=HORIZON, saves=1)
     exact = truth.slopes(problem, SCORED, WEIGHTS)
     rows = []
     made = own(problem, n, RTOLS[-1])
@@ -210,6 +241,11 @@ def measure(family: str, n: int, quick: bool) -> list[dict]:
         for rtol in RTOLS[-1:] if quick else RTOLS:
             made = own(problem, n, rtol)
             rows.append(measure_jax("polhode", made, problem, n, f"{rtol:.0e}", exact))
+    if family == "heavy_top" and not quick:
+        for by in ("state", "weight"):
+            made = own(problem, n, RTOLS[-1], by)
+            others = truth.slopes(problem, FEW, WEIGHTS, by=by)
+            rows.append(measure_jax("polhode", made, problem, n, f"{RTOLS[-1]:.0e}", others))
     for tolerance in RTOLS[-1:] if quick else RTOLS:
         made = stock(problem, n, tolerance)
         rows.append(measure_jax("diffrax", made, problem, n, f"{tolerance:.0e}", exact))

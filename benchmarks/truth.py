@@ -14,6 +14,7 @@ rates' return), each of which turns it by the same angle about its angular momen
 
 import argparse
 import math
+from dataclasses import replace
 from functools import cache
 from operator import mul
 from pathlib import Path
@@ -61,10 +62,10 @@ def motion(problem: Problem, wxyz, omega, times, digits: int = DIGITS, moments=N
 
     with mp.workdps(digits + _GUARD):
         moments = [mp.mpf(m) for m in (problem.moments if moments is None else moments)]
-        q = [mp.mpf(float(x)) for x in wxyz]
+        q = [_number(x) for x in wxyz]
         norm = mp.sqrt(mp.fdot(q, q))
         q = [x / norm for x in q]
-        w = [mp.mpf(float(x)) for x in omega]
+        w = [_number(x) for x in omega]
         up = [mp.mpf(0), mp.mpf(0), mp.mpf(1)]
         if problem.gradient:
             up = [mp.mpf(x) for x in DIRECTION]
@@ -81,6 +82,12 @@ def motion(problem: Problem, wxyz, omega, times, digits: int = DIGITS, moments=N
             now = mp.mpf(float(t))
             out.append(state[:7])
         return out
+
+
+def _number(x):
+    import mpmath as mp
+
+    return x if isinstance(x, mp.mpf) else mp.mpf(float(x))
 
 
 def _to_body(q, v):
@@ -234,26 +241,35 @@ def _multiply(p, q):
 
 
 @cache
-def slopes(problem: Problem, bodies: int, weights: tuple, digits: int = 40) -> np.ndarray:
-    """Exact derivatives (bodies, 3) of ``weights . (wxyz, omega)`` at the end by the moments.
+def slopes(
+    problem: Problem, bodies: int, weights: tuple, digits: int = 40, by: str = "moments"
+) -> np.ndarray:
+    """Exact derivatives (bodies, k) of ``weights . (wxyz, omega)`` at the end.
 
-    Central differences of step 1e-14 relative in ``digits`` digits.
+    ``by``: the three moments, the ``state`` (seven numbers) or the ``weight``. Central differences
+    of step 1e-14 in ``digits`` digits.
     """
     import mpmath as mp
 
     wxyz, omega = problem.states(bodies)
-    out = np.zeros((bodies, 3))
+    size = {"moments": 3, "state": 7, "weight": 1}[by]
+    out = np.zeros((bodies, size))
+
+    def end(n, k, change):
+        given = [*problem.moments, *wxyz[n], *omega[n], problem.weight]
+        given = [mp.mpf(float(x)) for x in given]
+        at = {"moments": 0, "state": 3, "weight": 10}[by] + k
+        given[at] += change
+        body = replace(problem, weight=given[10])
+        start = given[3:7], given[7:10]
+        state = motion(body, *start, [problem.horizon], digits, given[:3])[-1]
+        return sum(mp.mpf(float(a)) * b for a, b in zip(weights, state))
+
     with mp.workdps(digits + _GUARD):
+        step = mp.mpf(10) ** -14
         for n in range(bodies):
-            for k in range(3):
-                ends = []
-                step = mp.mpf(problem.moments[k]) * mp.mpf(10) ** -14
-                for sign in (1, -1):
-                    moved = [mp.mpf(m) for m in problem.moments]
-                    moved[k] += sign * step
-                    end = motion(problem, wxyz[n], omega[n], [problem.horizon], digits, moved)[-1]
-                    ends.append(sum(mp.mpf(float(a)) * b for a, b in zip(weights, end)))
-                out[n, k] = float((ends[0] - ends[1]) / (2 * step))
+            for k in range(size):
+                out[n, k] = float((end(n, k, step) - end(n, k, -step)) / (2 * step))
     return out
 
 
