@@ -320,6 +320,7 @@ def torqued(report: dict) -> list[str]:
         " start less than ten times as strongly as that of a free turn (how many, in brackets, of"
         " 24; no method can keep the others), worst of both ways of moving them. Truth: 80-bit"
         " Taylor series by heyoka.", "",
+        *([f"Note: {note}.", ""] if (note := report["numbers"].get("note")) else []),
     ]  # fmt: skip
     cells: dict[tuple, dict] = {}
     for row in report["numbers"]["rows"]:
