@@ -140,7 +140,11 @@ def gradients(report: dict):
             left.barh(k, row["ns_gradient"] * 1e-3, **style)
             left.text(row["ns_gradient"] * 1.15e-3, k, f"{row['ratio']:.2g} x", va="center", size=8)
             right.barh(k, row["error_median"], **style)
-        names = [f"{row['title']}: {row['peer']}, {row['setting']}" for row in rows]
+        by = [row["program"].partition(", by ")[2] for row in rows]
+        names = [
+            f"{row['title']}{', by ' + what if what else ''}: {row['peer']}, {row['setting']}"
+            for row, what in zip(rows, by)
+        ]
         left.set_yticks(range(len(rows)), names)
         left.invert_yaxis()
         left.set_xscale("log")
