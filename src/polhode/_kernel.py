@@ -6,15 +6,17 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax import custom_derivatives
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.interpreters import partial_eval
 
 _PLAIN = frozenset(
-    """abs add add_any and atan atan2 broadcast_in_dim ceil clamp concatenate convert_element_type
-     copy cos cosh div dynamic_slice dynamic_update_slice eq exp
+    """abs add add_any and atan atan2 bitcast_convert_type broadcast_in_dim ceil clamp concatenate
+     convert_element_type copy cos cosh custom_jvp_call div dynamic_slice dynamic_update_slice eq exp
      exp2 expm1 floor ge gt integer_pow iota is_finite jit le log log1p logistic lt max min mul
-     ne neg not or pad pjit pow reduce_sum rem reshape round rsqrt scan select_n sign sin sinh slice
-     split sqrt square squeeze stack stop_gradient sub tan tanh transpose while xor""".split()  # noqa: SIM905
+     ne neg not or pad pjit pow reduce_sum rem reshape round rsqrt scan select_n
+     shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stop_gradient sub
+     tan tanh transpose while xor""".split()  # noqa: SIM905
 )
 """Operations that a single compiled unit may hold; anything else keeps the usual way."""
 
@@ -55,10 +57,21 @@ def kernel(fn: Callable) -> Callable:
         def marked(*leaves):
             return _marked(lambda *given: fn(*jax.tree.unflatten(tree, given)), leaves)
 
-        @marked.defjvp
-        def _(leaves, tangents):
-            return jax.jvp(lambda *x: fn(*jax.tree.unflatten(tree, x)), leaves, tangents)
+        def derivative(leaves, tangents):
+            # What has no tangent stays a constant: its derivative is not worked out at all.
+            moving = [
+                k for k, d in enumerate(tangents) if not isinstance(d, custom_derivatives.SymbolicZero)
+            ]
 
+            def of_moving(*given):
+                whole = list(leaves)
+                for k, x in zip(moving, given, strict=True):
+                    whole[k] = x
+                return fn(*jax.tree.unflatten(tree, whole))
+
+            return jax.jvp(of_moving, *([x[k] for k in moving] for x in (leaves, tangents)))
+
+        marked.defjvp(derivative, symbolic_zeros=True)
         return marked(*leaves)
 
     return call

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from polhode._kernel import kernel
 from polhode.free._compensated import compensate
 from polhode.free._flow import Moment, advance, attitude, rates
 from polhode.free._frame import Quadruple
@@ -106,7 +107,7 @@ def free_motion(
         return evaluate(motion, t, attitude=attitude, rates=rates)
 
     t = jnp.asarray(t)
-    return _chunked(whole, parts, t)
+    return _chunked(kernel(whole), parts, t)
 
 
 def _chunked(fn, parts, t):
