@@ -2,12 +2,14 @@
 
 from collections.abc import Callable
 from contextvars import ContextVar
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jax import custom_derivatives
+from jax.custom_derivatives import SymbolicZero
 from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import Literal
 from jax.interpreters import partial_eval
 
 _PLAIN = frozenset(
@@ -20,6 +22,9 @@ _PLAIN = frozenset(
 )
 """Operations that a single compiled unit may hold; anything else keeps the usual way."""
 
+
+_CALLS = {"jit": "jaxpr", "pjit": "jaxpr", "custom_jvp_call": "call_jaxpr"}
+"""Calls of functions, and the parameter that holds what is called."""
 
 _ANALYSING = ContextVar("analysing", default=False)
 """Set while a unit is looked through: the units inside it then show what they are made of."""
@@ -38,43 +43,72 @@ def _is_plain(jaxpr) -> bool:
     return True
 
 
-def kernel(fn: Callable) -> Callable:
+def kernel(fn: Callable, *, linearised: bool = False) -> Callable:
     """``fn`` compiled by XLA's CPU backend as one function instead of one task per array.
 
     A step is made of many short loops over the bodies. As separate tasks each costs a dispatch,
-    and fusion across them repeats the work of one in the next. The mark keeps the call and asks
-    for a single function; it is a hint that changes no value. It is given on the CPU only, to
-    plain arithmetic only, and the call carries no operand that goes unused: XLA requires both.
-    Derivatives are those of ``fn``, unmarked. ``fn`` must not close over traced values.
+    and fusion across them repeats the work of one in the next; and a function for each takes
+    longer to compile than one for all. The mark keeps the call and asks for a single function; it
+    is a hint that changes no value. It is given on the CPU only, to plain arithmetic only, and the
+    call carries no operand that goes unused: XLA requires both. ``fn`` must not close over traced
+    values.
+
+    Derivatives are those of ``fn``, unmarked; with ``linearised`` the value and all coefficients of
+    its derivative are a unit again, and only the linear map that is left is not. That suits
+    functions without loops of unknown length.
     """
 
     def call(*operands):
         if _ANALYSING.get() or jax.default_backend() != "cpu":
             return fn(*operands)
         leaves, tree = jax.tree.flatten(operands)
-
-        @jax.custom_jvp
-        def marked(*leaves):
-            return _marked(lambda *given: fn(*jax.tree.unflatten(tree, given)), leaves)
-
-        def derivative(leaves, tangents):
-            # What has no tangent stays a constant: its derivative is not worked out at all.
-            moving = [
-                k for k, d in enumerate(tangents) if not isinstance(d, custom_derivatives.SymbolicZero)
-            ]
-
-            def of_moving(*given):
-                whole = list(leaves)
-                for k, x in zip(moving, given, strict=True):
-                    whole[k] = x
-                return fn(*jax.tree.unflatten(tree, whole))
-
-            return jax.jvp(of_moving, *([x[k] for k in moving] for x in (leaves, tangents)))
-
-        marked.defjvp(derivative, symbolic_zeros=True)
-        return marked(*leaves)
+        return _unit(lambda *given: fn(*jax.tree.unflatten(tree, given)), linearised)(*leaves)
 
     return call
+
+
+def _unit(flat: Callable, linearised: bool) -> Callable:
+    @jax.custom_jvp
+    def marked(*leaves):
+        return _marked(flat, leaves)
+
+    def derivative(leaves, tangents):
+        # What has no tangent stays a constant: its derivative is not worked out at all.
+        moving = [k for k, d in enumerate(tangents) if not isinstance(d, SymbolicZero)]
+
+        def of_moving(whole, given):
+            whole = dict(enumerate(whole)) | dict(zip(moving, given, strict=True))
+            return flat(*whole.values())
+
+        if not linearised:
+            given = [leaves[k] for k in moving], [tangents[k] for k in moving]
+            return jax.jvp(lambda *x: of_moving(leaves, x), *given)
+        shape = []
+
+        def known(*leaves):
+            value, linear = jax.linearize(
+                lambda *x: of_moving(leaves, x), *(leaves[k] for k in moving)
+            )
+            kept, shape[:] = _split(linear)
+            return value, kept
+
+        value, kept = _unit(known, linearised)(*leaves)
+        tangents = [tangents[k] for k in moving]
+
+        def linear(*given):
+            own, along = given[: len(kept)], given[len(kept) :]
+            return jax.tree.unflatten(shape[0], own)(*along)
+
+        # Not marked: transposed, it would carry operands that go unused.
+        return value, linear(*kept, *tangents)
+
+    marked.defjvp(derivative, symbolic_zeros=True)
+    return marked
+
+
+def _split(linear) -> tuple[list, list]:
+    kept, tree = jax.tree.flatten(linear)
+    return kept, [tree]
 
 
 def _marked(flat: Callable, leaves: tuple) -> Any:
@@ -82,18 +116,52 @@ def _marked(flat: Callable, leaves: tuple) -> Any:
         return flat(*leaves)  # run at once, the mark would reach every call inside as well
     analysing = _ANALYSING.set(True)
     try:
-        closed = jax.make_jaxpr(flat)(*leaves)
+        closed, shape = jax.make_jaxpr(flat, return_shape=True)(*leaves)
     finally:
         _ANALYSING.reset(analysing)
+    tree = jax.tree.structure(shape)
     if not _is_plain(closed.jaxpr):
         return flat(*leaves)
-    _, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.jaxpr.outvars))
+    # An operand may go unused inside of what is called only.
+    closed = jax.make_jaxpr(partial(_inlined, closed.jaxpr, closed.consts))(*leaves)
+    jaxpr = closed.jaxpr
+    # Results that are operands or numbers stay outside.
+    worked_out = [
+        not isinstance(x, Literal) and x not in (*jaxpr.invars, *jaxpr.constvars)
+        for x in jaxpr.outvars
+    ]
+    jaxpr, used = partial_eval.dce_jaxpr(jaxpr, worked_out)
 
     def needed(*given):
-        given = iter(given)
-        full = (next(given) if u else jnp.zeros_like(x) for u, x in zip(used, leaves))
         with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):  # the call's own only
-            return flat(*full)
+            return _inlined(jaxpr, closed.consts, *given)
 
     with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-        return jax.jit(needed)(*(x for u, x in zip(used, leaves) if u))
+        found = iter(jax.jit(needed)(*(x for u, x in zip(used, leaves) if u)))
+    known = dict(zip((*closed.jaxpr.constvars, *closed.jaxpr.invars), (*closed.consts, *leaves)))
+    out = [
+        next(found) if inside else jnp.asarray(x.val) if isinstance(x, Literal) else known[x]
+        for x, inside in zip(closed.jaxpr.outvars, worked_out, strict=True)
+    ]
+    return jax.tree.unflatten(tree, out)
+
+
+def _inlined(jaxpr, consts, *given) -> list:
+    """The program run with no call left in it; rules of derivatives are lost."""
+    values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *given), strict=True))
+
+    def read(x):
+        return x.val if isinstance(x, Literal) else values[x]
+
+    for equation in jaxpr.eqns:
+        operands = [read(x) for x in equation.invars]
+        inner = equation.params.get(_CALLS.get(equation.primitive.name))
+        if inner is not None:
+            out = _inlined(inner.jaxpr, inner.consts, *operands)
+        else:
+            bound = equation.primitive.get_bind_params(equation.params)
+            functions, params = bound if isinstance(bound, tuple) else ((), bound)
+            out = equation.primitive.bind(*functions, *operands, **params)
+            out = out if equation.primitive.multiple_results else [out]
+        values.update(zip(equation.outvars, out, strict=True))
+    return [read(x) for x in jaxpr.outvars]

@@ -11,14 +11,17 @@ from jaxtyping import Array, ArrayLike, Float
 
 from polhode import rotation
 from polhode._checks import as_float_array, describe, is_concrete, require
+from polhode._closed_form import ClosedForm
 from polhode._lanes import PARTS, common_batch, flatten
 from polhode._mesh import Split, on_devices, place, split_of
 from polhode._methods import AbstractMethod, Record, Samples
 from polhode._plan import Plan, choose, plan
 from polhode._scene import Scene
+from polhode._shortcut import learn, shortcut
 from polhode._state import State
 from polhode._status import SimulationError, Status
 from polhode._trajectory import Trajectory
+from polhode.inertia import Symmetry
 
 
 def simulate(
@@ -51,18 +54,39 @@ def simulate(
     Raises ValueError or TypeError for bad input: wrong kinds or shapes, unsorted times, mixed
     dtypes, a tolerance that the dtype cannot reach.
     """
+    if method is None:
+        trajectory = shortcut(scene, state, ts, rtol, record)
+        if trajectory is not None:
+            return checked(trajectory, throw)
+    given = record
     scene, state, ts, record = check_inputs(scene, state, ts, record)
     check_method(method)
     rtol = check_rtol(rtol, state.wxyz.dtype)
+    split = split_of(scene, state, ts)
     if method is None:
         method, _ = choose(scene, state, record, rtol, ts)
-    split = split_of(scene, state, ts)
+        if split is None and _is_simple(method, scene, state, record):
+            depends = scene.inertia.symmetry is Symmetry.NONE
+            learn(partial(_trajectory, method), scene, state, given, record, looks_long=depends)
+            trajectory = shortcut(scene, state, ts, None, given)
+            if trajectory is not None:
+                return checked(trajectory, throw)
     if split is not None and is_concrete(scene, state, ts):
         scene, state, ts = place(split, scene, state, ts)
-    trajectory = run(method, scene, state, ts, rtol, record, split)
-    if throw and is_concrete(trajectory.status):
+    return checked(run(method, scene, state, ts, rtol, record, split), throw)
+
+
+def checked(trajectory: Trajectory, throw: bool) -> Trajectory:
+    """The trajectory; raises for bodies that did not finish where that is known."""
+    if throw and not isinstance(trajectory.status, jax.core.Tracer):
         raise_on_failure(trajectory)
     return trajectory
+
+
+def _is_simple(method, scene: Scene, state: State, record: Record) -> bool:
+    """Whether calls of this structure may take the short way."""
+    plain = isinstance(method, ClosedForm) and not (method.compensated or record.error)
+    return plain and not record.work and is_concrete(scene, state)
 
 
 def explain(
@@ -86,6 +110,10 @@ def explain(
 @eqx.filter_jit
 def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> Trajectory:
     """The compiled part: lanes out of batches, the method, and back."""
+    return _trajectory(method, scene, state, ts, rtol, record, split)
+
+
+def _trajectory(method, scene, state, ts, rtol, record, split=None) -> Trajectory:
     scene = scene.settled(state, ts[..., 0])
     if split is None:
         found = _moved(record, method, scene, state, ts, rtol)
@@ -242,7 +270,7 @@ def check_rtol(rtol: float | None, dtype) -> Array | np.ndarray:
 def raise_on_failure(trajectory: Trajectory) -> None:
     """SimulationError naming what happened to how many bodies, and which came first."""
     status = np.asarray(trajectory.status)
-    if np.all(status == Status.SUCCESSFUL):
+    if not status.any():  # all Status.SUCCESSFUL
         return
     lines = []
     for code in np.unique(status[status != Status.SUCCESSFUL]):
