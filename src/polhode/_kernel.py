@@ -92,7 +92,7 @@ def _unit(flat: Callable, linearised: bool) -> Callable:
             kept, shape[:] = _split(linear)
             return value, kept
 
-        value, kept = _unit(known, linearised)(*leaves)
+        value, kept = _unit(known, linearised=False)(*leaves)
         tangents = [tangents[k] for k in moving]
 
         def linear(*given):

@@ -79,7 +79,7 @@ def shortcut(scene: Any, state: Any, ts: Any, rtol: Any, record: Any) -> Traject
         return None
     if entry.looks_long:
         rates = state.omega_body
-        if rates.size > _FEW:
+        if not 0 < rates.size <= _FEW:
             return None
         # More than the length of the fastest rate: what is not surely short takes the long way.
         fastest = max(map(abs, np.asarray(rates).ravel().tolist())) * 2
