@@ -43,7 +43,7 @@ def _is_plain(jaxpr) -> bool:
     return True
 
 
-def kernel(fn: Callable, *, linearised: bool = False) -> Callable:
+def kernel(fn: Callable) -> Callable:
     """``fn`` compiled by XLA's CPU backend as one function instead of one task per array.
 
     A step is made of many short loops over the bodies. As separate tasks each costs a dispatch,
@@ -53,21 +53,19 @@ def kernel(fn: Callable, *, linearised: bool = False) -> Callable:
     call carries no operand that goes unused: XLA requires both. ``fn`` must not close over traced
     values.
 
-    Derivatives are those of ``fn``, unmarked; with ``linearised`` the value and all coefficients of
-    its derivative are a unit again, and only the linear map that is left is not. That suits
-    functions without loops of unknown length.
+    Derivatives are those of ``fn``, unmarked.
     """
 
     def call(*operands):
         if _ANALYSING.get() or jax.default_backend() != "cpu":
             return fn(*operands)
         leaves, tree = jax.tree.flatten(operands)
-        return _unit(lambda *given: fn(*jax.tree.unflatten(tree, given)), linearised)(*leaves)
+        return _unit(lambda *given: fn(*jax.tree.unflatten(tree, given)))(*leaves)
 
     return call
 
 
-def _unit(flat: Callable, linearised: bool) -> Callable:
+def _unit(flat: Callable) -> Callable:
     @jax.custom_jvp
     def marked(*leaves):
         return _marked(flat, leaves)
@@ -76,39 +74,14 @@ def _unit(flat: Callable, linearised: bool) -> Callable:
         # What has no tangent stays a constant: its derivative is not worked out at all.
         moving = [k for k, d in enumerate(tangents) if not isinstance(d, SymbolicZero)]
 
-        def of_moving(whole, given):
-            whole = dict(enumerate(whole)) | dict(zip(moving, given, strict=True))
+        def of_moving(*given):
+            whole = dict(enumerate(leaves)) | dict(zip(moving, given, strict=True))
             return flat(*whole.values())
 
-        if not linearised:
-            given = [leaves[k] for k in moving], [tangents[k] for k in moving]
-            return jax.jvp(lambda *x: of_moving(leaves, x), *given)
-        shape = []
-
-        def known(*leaves):
-            value, linear = jax.linearize(
-                lambda *x: of_moving(leaves, x), *(leaves[k] for k in moving)
-            )
-            kept, shape[:] = _split(linear)
-            return value, kept
-
-        value, kept = _unit(known, linearised=False)(*leaves)
-        tangents = [tangents[k] for k in moving]
-
-        def linear(*given):
-            own, along = given[: len(kept)], given[len(kept) :]
-            return jax.tree.unflatten(shape[0], own)(*along)
-
-        # Not marked: transposed, it would carry operands that go unused.
-        return value, linear(*kept, *tangents)
+        return jax.jvp(of_moving, *([x[k] for k in moving] for x in (leaves, tangents)))
 
     marked.defjvp(derivative, symbolic_zeros=True)
     return marked
-
-
-def _split(linear) -> tuple[list, list]:
-    kept, tree = jax.tree.flatten(linear)
-    return kept, [tree]
 
 
 def _marked(flat: Callable, leaves: tuple) -> Any:
