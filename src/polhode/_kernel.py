@@ -14,8 +14,8 @@ from jax.interpreters import partial_eval
 
 _PLAIN = frozenset(
     """abs add add_any and atan atan2 bitcast_convert_type broadcast_in_dim ceil clamp concatenate
-     convert_element_type copy cos cosh custom_jvp_call div dynamic_slice dynamic_update_slice eq exp
-     exp2 expm1 floor ge gt integer_pow iota is_finite jit le log log1p logistic lt max min mul
+     convert_element_type copy cos cosh custom_jvp_call div dynamic_slice dynamic_update_slice eq
+     exp exp2 expm1 floor ge gt integer_pow iota is_finite jit le log log1p logistic lt max min mul
      ne neg not or pad pjit pow reduce_sum rem reshape round rsqrt scan select_n
      shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stop_gradient sub
      tan tanh transpose while xor""".split()  # noqa: SIM905
