@@ -28,7 +28,8 @@ def test_repeated_calls_give_what_a_compiled_call_gives(taken, kind):
     slow = jax.jit(ph.simulate)(SCENE, state, jnp.array(TS))
     assert jax.tree.structure(fast) == jax.tree.structure(slow)
     for one, other in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):
-        assert one.dtype == other.dtype and one.shape == other.shape
+        assert one.dtype == other.dtype
+        assert one.shape == other.shape
         np.testing.assert_allclose(one, other, rtol=1e-14, atol=1e-14)
     assert not np.allclose(fast.wxyz, taken.wxyz)
 
