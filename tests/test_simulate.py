@@ -205,3 +205,14 @@ def test_import_has_no_side_effects():
         "import sys; assert 'matplotlib' not in sys.modules and 'xarray' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize(
+    "potential", [None, ph.UniformGravity(1.0, [0.1, 0.2, 0.3], [0.0, 0.0, -1.0])]
+)
+def test_no_bodies_give_an_empty_trajectory(potential):
+    state = ph.State(np.zeros((0, 4)), np.zeros((0, 3)))
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), potential)
+    got = ph.simulate(scene, state, [0.0, 1.0, 2.0])
+    assert got.wxyz.shape == (0, 3, 4)
+    assert got.status.shape == (0,)

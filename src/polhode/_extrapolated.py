@@ -107,7 +107,7 @@ class Extrapolated(AbstractMethod):
         if record.work:
             y0, field = (*y0, jnp.zeros_like(y0[0][0])), _field_and_power
         horizon = jnp.abs(ts[-1] - ts[0])
-        total = steps_for(self.order, rtol, jnp.max(rate), horizon)
+        total = steps_for(self.order, rtol, jnp.max(rate, initial=0), horizon)
 
         # the way back from states that a torque has drawn together starts anew from kept ones
         intervals = 1 if record.final_only else ts.shape[0] - 1

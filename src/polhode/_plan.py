@@ -127,6 +127,8 @@ def _is_long(state: State, rtol, ts) -> bool:
 def _turned(state: State, ts) -> float:
     """Angle [rad] that the fastest body turns through."""
     ts = np.asarray(ts)
+    if not state.omega_body.size:
+        return 0.0
     if state.omega_body.size < 10_000:
         fastest = np.max(np.linalg.norm(np.asarray(state.omega_body), axis=-1))
     else:
