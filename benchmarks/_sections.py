@@ -47,7 +47,8 @@ def scaling(report: dict) -> list[str]:
                 lines.append([
                     f"{name}: {p['method']}", number(p["bodies"]), number(p["horizon"]),
                     number(p["saves"]), number(p["ns_per_body"], 1e3), number(p["memory_MB"]),
-                    number(p["temporary_MB"]), f"{p['chunk']:,}",
+                    number(p["temporary_MB"]),
+                    "by size" if p["chunk"] is None else f"{p['chunk']:,}",
                 ])  # fmt: skip
     header = ["", "bodies", "horizon [s]", "saved times", "time per body [µs]", "memory [MB]",
               "of it temporary", "chunk"]  # fmt: skip
