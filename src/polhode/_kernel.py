@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import Literal
-from jax.interpreters import partial_eval
+from jax.interpreters import ad, partial_eval
 
 _PLAIN = frozenset(
     """abs add add_any and atan atan2 bitcast_convert_type broadcast_in_dim ceil clamp concatenate
@@ -43,7 +43,7 @@ def _is_plain(jaxpr) -> bool:
     return True
 
 
-def kernel(fn: Callable) -> Callable:
+def kernel(fn: Callable, *, linearised: bool = False) -> Callable:
     """``fn`` compiled by XLA's CPU backend as one function instead of one task per array.
 
     A step is made of many short loops over the bodies. As separate tasks each costs a dispatch,
@@ -53,19 +53,21 @@ def kernel(fn: Callable) -> Callable:
     call carries no operand that goes unused: XLA requires both. ``fn`` must not close over traced
     values.
 
-    Derivatives are those of ``fn``, unmarked.
+    Derivatives are those of ``fn``, unmarked; with ``linearised`` the value and all coefficients of
+    its derivative are a unit again, and only the linear map that is left is not. That suits
+    functions without loops of unknown length.
     """
 
     def call(*operands):
         if _ANALYSING.get() or jax.default_backend() != "cpu":
             return fn(*operands)
         leaves, tree = jax.tree.flatten(operands)
-        return _unit(lambda *given: fn(*jax.tree.unflatten(tree, given)))(*leaves)
+        return _unit(lambda *given: fn(*jax.tree.unflatten(tree, given)), linearised)(*leaves)
 
     return call
 
 
-def _unit(flat: Callable) -> Callable:
+def _unit(flat: Callable, linearised: bool) -> Callable:
     @jax.custom_jvp
     def marked(*leaves):
         return _marked(flat, leaves)
@@ -74,11 +76,29 @@ def _unit(flat: Callable) -> Callable:
         # What has no tangent stays a constant: its derivative is not worked out at all.
         moving = [k for k, d in enumerate(tangents) if not isinstance(d, SymbolicZero)]
 
-        def of_moving(*given):
-            whole = dict(enumerate(leaves)) | dict(zip(moving, given, strict=True))
+        def of_moving(whole, given):
+            whole = dict(enumerate(whole)) | dict(zip(moving, given, strict=True))
             return flat(*whole.values())
 
-        return jax.jvp(of_moving, *([x[k] for k in moving] for x in (leaves, tangents)))
+        # A derivative of the coefficients takes twice as long to compile as one of the formulas.
+        again = any(isinstance(x, ad.JVPTracer) for x in leaves)
+        if again or not linearised:
+            given = [leaves[k] for k in moving], [tangents[k] for k in moving]
+            return jax.jvp(lambda *x: of_moving(leaves, x), *given)
+        shape = []
+
+        def known(*leaves):
+            value, linear = jax.linearize(
+                lambda *x: of_moving(leaves, x), *(leaves[k] for k in moving)
+            )
+            kept, tree = jax.tree.flatten(linear)
+            shape[:] = [tree]
+            return value, kept
+
+        value, kept = _unit(known, linearised=False)(*leaves)
+        # Not marked: transposed, it would carry operands that go unused.
+        linear = jax.tree.unflatten(shape[0], kept)
+        return value, linear(*(tangents[k] for k in moving))
 
     marked.defjvp(derivative, symbolic_zeros=True)
     return marked

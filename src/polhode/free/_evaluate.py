@@ -107,7 +107,7 @@ def free_motion(
         return evaluate(motion, t, attitude=attitude, rates=rates)
 
     t = jnp.asarray(t)
-    return _chunked(kernel(whole), parts, t)
+    return _chunked(kernel(whole, linearised=True), parts, t)
 
 
 def _chunked(fn, parts, t):
