@@ -36,33 +36,36 @@ def test_halley():
     assert abs(ratio - 2.2778) < 1e-4
 
 
-def _by_quadrature(moments, omega):
+def _exact(I, w):
     """P_psi by mpmath's K; P_phi by the mean of the long axis' precession over a period."""
+    low, mid, high = sorted(range(3), key=lambda k: I[k])
+    M2 = sum((a * b) ** 2 for a, b in zip(I, w, strict=True))
+    E2 = sum(a * b * b for a, b in zip(I, w, strict=True))
+    l, i, s = I[low], I[mid], I[high]
+    short = E2 * i < M2
+    above, below = (i - l) * (E2 * s - M2), (s - i) * (M2 - E2 * l)
+    k2 = above / below if short else below / above
+    rate = mp.sqrt((below if short else above) / (l * i * s))
+    P = 4 * mp.ellipk(k2) / rate
+    a, c = (low, high) if short else (high, low)
+    first = (M2 - E2 * I[c]) / (I[a] * (I[a] - I[c]))
+    second = (M2 - E2 * I[c]) / (i * (i - I[c]))
+    third = (M2 - E2 * I[a]) / (I[c] * (I[c] - I[a]))
+
+    def precession(u):
+        sn, cn, dn = (mp.ellipfun(k, u, m=k2) for k in ("sn", "cn", "dn"))
+        square = {a: first * cn**2, mid: second * sn**2, c: third * dn**2}
+        above = i * square[mid] + s * square[high]
+        return mp.sqrt(M2) * above / (i * i * square[mid] + s * s * square[high])
+
+    mean = mp.quad(precession, mp.linspace(0, mp.ellipk(k2), 9)) / mp.ellipk(k2)
+    return P, 2 * mp.pi / mean, k2, Mode.SAM if short else Mode.LAM
+
+
+def _by_quadrature(moments, omega):
     with mp.workdps(30):
-        low, mid, high = sorted(range(3), key=lambda k: moments[k])
-        I = [mp.mpf(float(x)) for x in moments]
-        w = [mp.mpf(float(x)) for x in omega]
-        M2 = sum((a * b) ** 2 for a, b in zip(I, w, strict=True))
-        E2 = sum(a * b * b for a, b in zip(I, w, strict=True))
-        l, i, s = I[low], I[mid], I[high]
-        short = E2 * i < M2
-        above, below = (i - l) * (E2 * s - M2), (s - i) * (M2 - E2 * l)
-        k2 = above / below if short else below / above
-        rate = mp.sqrt((below if short else above) / (l * i * s))
-        P = 4 * mp.ellipk(k2) / rate
-        a, c = (low, high) if short else (high, low)
-        first = (M2 - E2 * I[c]) / (I[a] * (I[a] - I[c]))
-        second = (M2 - E2 * I[c]) / (i * (i - I[c]))
-        third = (M2 - E2 * I[a]) / (I[c] * (I[c] - I[a]))
-
-        def precession(u):
-            sn, cn, dn = (mp.ellipfun(k, u, m=k2) for k in ("sn", "cn", "dn"))
-            square = {a: first * cn**2, mid: second * sn**2, c: third * dn**2}
-            above = i * square[mid] + s * square[high]
-            return mp.sqrt(M2) * above / (i * i * square[mid] + s * s * square[high])
-
-        mean = mp.quad(precession, mp.linspace(0, mp.ellipk(k2), 9)) / mp.ellipk(k2)
-        return float(P), float(2 * mp.pi / mean), float(k2), Mode.SAM if short else Mode.LAM
+        *values, mode = _exact(*([mp.mpf(float(x)) for x in given] for given in (moments, omega)))
+        return *map(float, values), mode
 
 
 @pytest.mark.parametrize(
@@ -129,6 +132,29 @@ def test_derivatives(omega):
         columns.append((up - down) / (2 * step))
     found = np.hstack([forward[0], forward[2]])[:3]
     np.testing.assert_allclose(found, np.array(columns).T, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("omega", [(0.3, 0.2, 1.0), (1.0, 0.2, 0.2)])
+def test_second_derivatives(omega):
+    """Along a direction in moments and rates at once, against differences of 50 digits."""
+    point = np.array([1.0, 2.0, 3.0, *omega])
+    direction = np.array([0.25, -0.5, 0.125, 0.75, -0.25, 0.5])
+
+    def numbers(a):
+        x = point + a * direction
+        found = free.periods(x[:3], x[3:])
+        return jnp.stack([found.P_psi, found.P_phi, found.k2])
+
+    def moved(a):
+        x = [mp.mpf(p) + a * mp.mpf(d) for p, d in zip(point, direction, strict=True)]
+        return x[:3], x[3:]
+
+    with mp.workdps(50):
+        step = mp.mpf(10) ** -12
+        low, here, high = (_exact(*moved(k * step))[:3] for k in (-1, 0, 1))
+        exact = [float((a - 2 * b + c) / step**2) for a, b, c in zip(low, here, high, strict=True)]
+    second = jax.jit(jax.jacfwd(jax.jacrev(numbers)))
+    np.testing.assert_allclose(second(0.0), exact, rtol=1e-13)
 
 
 @pytest.mark.parametrize("off", [1e-4, -1e-9, 1e-13])
