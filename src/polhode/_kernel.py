@@ -18,7 +18,7 @@ _PLAIN = frozenset(
      exp exp2 expm1 floor ge gt integer_pow iota is_finite jit le log log1p logistic lt max min mul
      ne neg not or pad pjit pow reduce_sum rem reshape round rsqrt scan select_n
      shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stop_gradient sub
-     tan tanh transpose unstack while xor""".split()  # noqa: SIM905
+     tan tanh transpose while xor""".split()  # noqa: SIM905
 )
 """Operations that a single compiled unit may hold; anything else keeps the usual way."""
 

@@ -10,7 +10,6 @@ from jaxtyping import Array
 
 from polhode import rotation, tops
 from polhode._checks import is_concrete
-from polhode._kernel import kernel
 from polhode._lanes import is_lane_tree, map_chunks
 from polhode._methods import AbstractMethod, Record, Samples
 from polhode._scene import Scene
@@ -197,7 +196,7 @@ class LagrangeTop(AbstractTopMethod):
         gravity = scene.potential
         centre = _lanes(gravity.centre_body, n, 1)
         force = _lanes(gravity.mass, n)[:, None] * _lanes(gravity.gravity_space, n, 1)
-        wxyz, omega = kernel(tops.lagrange_motion)(
+        wxyz, omega = tops.lagrange_motion(
             transverse, force, centre[:, 2], state.wxyz, state.omega_body, axial, elapsed
         )
         lawful = (moments[:, 0] == moments[:, 1]) & (centre[:, 0] == 0) & (centre[:, 1] == 0)
