@@ -129,8 +129,10 @@ def _marked(flat: Callable, leaves: tuple) -> Any:
         with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):  # the call's own only
             return _inlined(jaxpr, closed.consts, *given)
 
+    # XLA moves a constant into what is called, whose operand then goes unused: it must not see one.
+    operands = jax.lax.optimization_barrier([x for u, x in zip(used, leaves) if u])
     with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-        found = iter(jax.jit(needed)(*(x for u, x in zip(used, leaves) if u)))
+        found = iter(jax.jit(needed)(*operands))
     known = dict(zip((*closed.jaxpr.constvars, *closed.jaxpr.invars), (*closed.consts, *leaves)))
     out = [
         next(found) if inside else jnp.asarray(x.val) if isinstance(x, Literal) else known[x]

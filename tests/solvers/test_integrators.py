@@ -329,3 +329,17 @@ def test_kernel_with_unused_operands_and_other_operations():
     np.testing.assert_array_equal(jax.jit(kernel(lambda a: jnp.sort(-a)))(x), -x[::-1])
     assert jax.jit(jax.grad(lambda a: add(a, a, a * a).sum()))(x)[2] == 5.0
     np.testing.assert_array_equal(jax.vmap(add)(x, x, x), 2 * x)
+
+
+def test_a_compiled_unit_takes_constants():
+    """XLA would move them inside, and abort the process over the operand then left unused."""
+    table = np.random.default_rng(0).normal(size=(1000, 4))
+
+    def motion(x, table):
+        for k in (1, 2, 3):
+            x = x / 2 + table[:, 0] * np.pi * k + table[:, k]
+        return x, 2 * x
+
+    x = np.linspace(0.0, 1.0, 1000)
+    found = jax.jit(lambda x: kernel(motion)(x * x, jnp.asarray(table)))(x)
+    np.testing.assert_allclose(found, motion(x * x, table), rtol=1e-14, atol=1e-14)
