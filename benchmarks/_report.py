@@ -5,6 +5,7 @@ A result is one JSON file with the fields ``name``, ``command``, ``date``, ``ver
 only. Call ``one_thread()`` before the first import of jax for single-threaded numbers.
 """
 
+import argparse
 import importlib.metadata
 import json
 import math
@@ -113,6 +114,17 @@ def write(
     with whole_file(path) as partial:
         Path(partial).write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
     return path
+
+
+def recordings(about: str, usual: Path) -> argparse.Namespace:
+    """Options of a benchmark on recordings that are no part of the project; ends where absent."""
+    parser = argparse.ArgumentParser(description=about)
+    parser.add_argument("--data", type=Path, default=usual)
+    parser.add_argument("--output", type=Path)
+    options = parser.parse_args()
+    if not options.data.exists():
+        parser.exit(2, f"no recordings in {options.data}; give their folder by --data\n")
+    return options
 
 
 def read(what: str | os.PathLike) -> dict[str, Any]:

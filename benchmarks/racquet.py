@@ -14,12 +14,11 @@ fitted motion and of the data.
     python -m benchmarks.racquet [--data FOLDER] [--output out/benchmarks/racquet.json]
 """
 
-import argparse
 import csv
 import sys
 from pathlib import Path
 
-from benchmarks._report import one_thread, write
+from benchmarks._report import one_thread, recordings, write
 
 one_thread()
 
@@ -119,14 +118,8 @@ def together(trials, motion=None):
 
 def main() -> int:
     """Run, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--output", type=Path)
-    options = parser.parse_args()
+    options = recordings(__doc__, DATA)
     jax.config.update("jax_enable_x64", True)
-    if not options.data.exists():
-        print(f"no recordings in {options.data}; give their folder by --data", file=sys.stderr)
-        return 2
     rounds = load(options.data)
     numbers = {"alone": alone([trial for trials in rounds.values() for trial in trials])}
     print(numbers["alone"], flush=True)

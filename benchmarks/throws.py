@@ -18,12 +18,11 @@ the data: |moments - reference| / |reference|, and the smallest turn between pri
     python -m benchmarks.throws [--data FOLDER] [--output out/benchmarks/throws.json]
 """
 
-import argparse
 import json
 import sys
 from pathlib import Path
 
-from benchmarks._report import one_thread, write
+from benchmarks._report import one_thread, recordings, write
 
 one_thread()
 
@@ -169,14 +168,8 @@ def run(folder, configurations=None):
 
 def main() -> int:
     """Run, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--data", type=Path, default=DATA)
-    parser.add_argument("--output", type=Path)
-    options = parser.parse_args()
+    options = recordings(__doc__, DATA)
     jax.config.update("jax_enable_x64", True)
-    if not options.data.exists():
-        print(f"no recordings in {options.data}; give their folder by --data", file=sys.stderr)
-        return 2
     numbers = run(options.data)
     for kind in ("every_throw_alone", "throws_of_a_configuration_together"):
         for name, row in numbers[kind].items():

@@ -115,14 +115,14 @@ class Equations:
     def _moved(self, primals, tangents, end):
         c, y, t0, t1, count = primals
         dc, dy, dt0, dt1, _ = tangents
-        at = tuple(i for i, x in enumerate(dc) if _is_slope(x))
+        at = tuple(i for i, x in enumerate(dc) if is_slope(x))
         dy = [_full(x) for x in dy]
-        if _is_slope(dt0):
+        if is_slope(dt0):
             dy = [a - dt0 * f for a, f in zip(dy, self.field(c, t0, y))]
         maps = (partial(self._tangent, at), partial(self._cotangent, at))
         given = [t0, t1, count, *y, *end, *c]
         moved = linear(*maps, given, [*dy, *(dc[i] for i in at)], end)
-        if _is_slope(dt1):
+        if is_slope(dt1):
             moved = [a + dt1 * f for a, f in zip(moved, self.field(c, t1, end))]
         return moved
 
@@ -290,7 +290,8 @@ def _put(values: Sequence[Any], at: Sequence[int], some: Sequence[Any]) -> list[
     return new
 
 
-def _is_slope(x: Any) -> bool:
+def is_slope(x: Any) -> bool:
+    """Whether a tangent is there at all."""
     return not isinstance(x, SymbolicZero) and x.dtype != jax.dtypes.float0
 
 

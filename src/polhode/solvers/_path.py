@@ -11,7 +11,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
-from polhode.solvers._flow import equations_of
+from polhode.solvers._flow import equations_of, is_slope
 
 Found = tuple[PyTree[Array], Array, PyTree[Array]]
 
@@ -58,7 +58,7 @@ def path(
         ends = [x[1:] for x in nodes]
         moving, shape = jax.tree.flatten(moving)
         changes = jax.tree.leaves(tangents[1:], is_leaf=lambda x: isinstance(x, SymbolicZero))
-        at = [i for i, x in enumerate(changes) if _is_slope(x)]
+        at = [i for i, x in enumerate(changes) if is_slope(x)]
 
         def followed(*some):
             full = list(moving)
@@ -89,10 +89,6 @@ def _refined(ts: Array, split: int) -> Array:
     shares = jnp.arange(split, dtype=ts.dtype) / split
     between = ts[:-1, None] + shares[None] * (ts[1:] - ts[:-1])[:, None]
     return jnp.concatenate([between.ravel(), ts[-1:]])
-
-
-def _is_slope(x: Any) -> bool:
-    return not isinstance(x, SymbolicZero) and x.dtype != jax.dtypes.float0
 
 
 def _still(x: Array) -> Any:
