@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from polhode.fit._instrument import Instrument, Tolerance
 from polhode.fit._linear import entries_of
+from polhode.fit._matrices import inverse
 from polhode.fit._parameters import base_of, tensor_of
 from polhode.fit._recording import Recording, bridged
 from polhode.fit._start import central_slope, integrate, regression
@@ -143,10 +144,13 @@ def balance(
 
         right = jnp.einsum("tk,tij,ti->kj", hats, lever, scaled).ravel()
         both = flat(normal + prior)
-        momenta = jax.scipy.linalg.solve(both, right, assume_a="pos").reshape(knots, 3)
+        # The inverse of the value and one step of Newton's: it brings the derivatives as well.
+        inverted = inverse(jax.lax.stop_gradient(both))
+        momenta = inverted @ jax.lax.stop_gradient(right)
+        momenta = momenta + inverted @ (right - both @ jax.lax.stop_gradient(momenta))
+        momenta = momenta.reshape(knots, 3)
         rest = scaled - jnp.einsum("tij,tj->ti", lever, hats @ momenta)
-        inner = jax.lax.stop_gradient((both, flat(prior)))
-        held = jnp.trace(jax.scipy.linalg.solve(*inner, assume_a="pos"))
+        held = jnp.sum(inverted * jax.lax.stop_gradient(flat(prior)))
         return Balanced(rest, jnp.diff(momenta, axis=0) / drift, held)
 
     return jax.vmap(one)(
@@ -210,7 +214,7 @@ def solve_balance(
     solver = optx.LevenbergMarquardt(rtol=1e-5, atol=1e-5)
 
     def attempt(unknown, noise):
-        weights = jnp.linalg.inv(parts(unknown)[0])
+        weights = inverse(parts(unknown)[0])
         found = optx.least_squares(
             misfit, solver, jax.tree.map(lambda x: x.astype(wide), unknown), (weights, noise),
             has_aux=True, max_steps=30, throw=False,
@@ -244,7 +248,7 @@ def solve_balance(
     slopes = jax.vmap(jax.jacfwd(entries))(unknown[0], bases)
     # the instrument, when it is not fitted, has no derivatives
     used = 6 * count + (11 if free else 0)
-    covariance = jnp.linalg.inv(linear[:, :used].T @ linear[:, :used]).astype(start.dtype)
+    covariance = inverse(linear[:, :used].T @ linear[:, :used]).astype(start.dtype)
     blocks = jnp.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(count)])
     blocks = slopes @ blocks @ jnp.swapaxes(slopes, 1, 2)
     return Fitted(tensors, instrument, noise, blocks, rest, converged)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import is_concrete, require
+from polhode.fit._matrices import solve
 from polhode.fit._recording import Recording
 from polhode.fit._start import central_slope, integrate
 from polhode.rotation import to_matrix
@@ -119,7 +120,7 @@ def lever_arm(recording: Recording) -> Float[Array, "*b 3"]:
         whole = whole.at[0].set(0).at[-1].set(0)
         design = design * whole[:, None, None]
         square = jnp.einsum("tij,tik->jk", design, design)
-        return jnp.linalg.solve(square, jnp.einsum("tij,ti->j", design, force))[:3]
+        return solve(square, jnp.einsum("tij,ti->j", design, force))[:3]
 
     batch = recording.batch_shape
     parts = (recording.times, recording.present, recording.omega, recording.force)

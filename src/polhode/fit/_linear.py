@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from polhode.fit._matrices import triangle
 from polhode.fit._parameters import Parameters
 from polhode.fit._recording import Recording
 from polhode.fit._residuals import Model, residuals
@@ -110,6 +111,6 @@ def linearise(
     )
     columns = jnp.concatenate([by_shared, by_own, rest[..., None]], axis=-1)
     columns = columns.reshape(rest.shape[0], -1, columns.shape[-1])
-    factor = jnp.linalg.qr(columns, mode="r")
+    factor = triangle(columns)
     count = shared.shape[0]
     return Linear(rest, factor[..., :count], factor[..., count:-1], factor[..., -1], shared)

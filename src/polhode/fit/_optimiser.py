@@ -3,8 +3,9 @@
 from collections.abc import Callable
 
 import jax.numpy as jnp
-import lineax as lx
 import optimistix as optx
+
+from polhode.fit._matrices import LeastSquares, solve
 
 # Squared derivatives (of a data vector of norm ten by unknowns of order one) that count as none.
 _FAINT = 1e-6
@@ -35,7 +36,7 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         # the usual criterion stays as the other way to end
         self.rtol = self.atol = floor
         self.norm = optx.max_norm
-        self.descent = optx.DampedNewtonDescent(linear_solver=lx.QR())
+        self.descent = optx.DampedNewtonDescent(linear_solver=LeastSquares())
         # For long valleys: enlarged as soon as the linear model is a fair guide
         self.search = optx.ClassicalTrustRegion(0.75, 0.1, 4.0, 0.25)
         self.verbose = _silent
@@ -50,7 +51,7 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         ridge = 30 * jnp.finfo(rest.dtype).eps * size.shape[0] + _FAINT / size**2
         square = square / size[:, None] / size[None] + jnp.diag(ridge)
         slope = slope / size
-        gain = slope @ jnp.linalg.solve(square, slope)
+        gain = slope @ solve(square, slope)
         freedom = max(rest.shape[0] - size.shape[0], 1)
         bound = self.offset**2 * jnp.sum(rest**2) / freedom * size.shape[0] + self.floor**2
         return ended | (~state.first_step & (gain < bound)), result

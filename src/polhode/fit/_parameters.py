@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from polhode.fit._matrices import inverse
 from polhode.inertia import inertia_of_second_moments, principal
 from polhode.rotation import to_matrix
 
@@ -88,7 +89,7 @@ def base_of(sigma: Float[Array, "3 3"], scale_known: bool) -> Base:
     if not scale_known:
         sigma, total = sigma / total, jnp.ones_like(total)
     soft = _SOFT * total
-    matrix = sigma - soft**2 / 4 * jnp.linalg.inv(sigma)
+    matrix = sigma - soft**2 / 4 * inverse(sigma)
     diagonal = jnp.stack([matrix[0, 0], matrix[1, 1], matrix[2, 2]])
     off = jnp.stack([matrix[1, 2], matrix[2, 0], matrix[0, 1]])
     return Base(jnp.concatenate([diagonal, off]), soft)

@@ -10,6 +10,7 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
 from polhode.fit._linear import entries_of, whole_of
+from polhode.fit._matrices import eigh, inverse, svd
 from polhode.fit._parameters import Parameters
 from polhode.fit._recording import Recording
 from polhode.fit._residuals import Model
@@ -196,14 +197,14 @@ def conclude(solution: Solution, recording: Recording, problem: Problem) -> Iner
     # equilibrated: a direction counts as null by its own information, whatever its unit
     size = jnp.sqrt(jnp.diagonal(information))
     safe = jnp.where(size > 0, size, 1)
-    values, vectors = jnp.linalg.eigh(information / safe[:, None] / safe[None])
+    values, vectors = eigh(information / safe[:, None] / safe[None])
     known = values > 1e3 * eps * values[-1]
-    inverse = jnp.where(known, 1 / jnp.where(known, values, 1), 0)
+    inverted = jnp.where(known, 1 / jnp.where(known, values, 1), 0)
     data = jnp.sum(recording.present) * linear.rest.shape[-1]
     freedom = jnp.maximum(data - jnp.sum(known).astype(dtype), 1)
     noise = jnp.sqrt(2 * solution.cost / freedom)
     variance = jnp.asarray(1, dtype) if problem.noise_known else noise**2
-    covariance = (vectors * inverse[None]) @ vectors.T / safe[:, None] / safe[None] * variance
+    covariance = (vectors * inverted[None]) @ vectors.T / safe[:, None] / safe[None] * variance
     null = jnp.where(known, 0, 1)[None] * vectors / safe[:, None]
 
     full = jnp.concatenate([slope, jnp.zeros((9, information.shape[0] - count), dtype)], axis=1)
@@ -261,7 +262,7 @@ def sensor_axes(recording: Recording) -> Float[Array, "*b 3 3"]:
     measured, seen = _turns(recording, centred=False)
     mixed = jnp.einsum("...ti,...tj->...ij", measured, seen)
     square = jnp.einsum("...ti,...tj->...ij", seen, seen)
-    return jnp.swapaxes(jnp.linalg.solve(square, jnp.swapaxes(mixed, -1, -2)), -1, -2)
+    return mixed @ inverse(square)
 
 
 def _axes_disagree(recording: Recording, problem: Problem) -> Array:
@@ -270,7 +271,7 @@ def _axes_disagree(recording: Recording, problem: Problem) -> Array:
         return jnp.asarray(False)
     measured, seen = _turns(recording, centred=problem.bias)
     # the proper rotation nearest to the correlation of both, and how much its mirror image gains
-    left, sizes, right = jnp.linalg.svd(jnp.einsum("rti,rtj->ij", measured, seen))
+    left, sizes, right = svd(jnp.einsum("rti,rtj->ij", measured, seen))
     hand = jnp.sign(jnp.linalg.det(left) * jnp.linalg.det(right))
     inverted = (hand < 0) & (sizes[2] > 0.1 * sizes[1])
     if problem.mounting:

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from polhode.fit._matrices import eigh, solve
 from polhode.fit._parameters import rotation_of
 from polhode.inertia import (
     Inertia,
@@ -70,7 +71,7 @@ def _physical(entries: Float[Array, " 6"]) -> Float[Array, "3 3"]:
     """Second moments of the nearest body that is not too flat."""
     a, b, c, p, q, r = entries
     tensor = jnp.stack([jnp.stack([a, r, q]), jnp.stack([r, b, p]), jnp.stack([q, p, c])])
-    values, axes = jnp.linalg.eigh(second_moments(tensor))
+    values, axes = eigh(second_moments(tensor))
     least = _FLATTEST * jnp.sum(jnp.abs(values))
     values = jnp.maximum(values, least)
     return jnp.einsum("ij,j,kj->ik", axes, values, axes)
@@ -122,7 +123,7 @@ def regression(
         metric = jnp.asarray([1, 1, 1, 2, 2, 2], omega.dtype) ** 0.5
 
         def null(gram):
-            values, vectors = jnp.linalg.eigh(gram / metric[:, None] / metric[None])
+            values, vectors = eigh(gram / metric[:, None] / metric[None])
             entries = vectors[:, 0] / metric
             entries = entries * jnp.where(jnp.sum(entries[:3]) < 0, -1, 1).astype(entries.dtype)
             return _physical(entries), values[0] / jnp.sum(values)
@@ -143,7 +144,7 @@ def regression(
     found = []
     for parts in (whole, pieces):
         body, push = centred(rows, parts), centred(carried, parts)
-        entries = jnp.linalg.solve(square(body), -jnp.einsum("rtij,rti->j", body, push))
+        entries = solve(square(body), -jnp.einsum("rtij,rti->j", body, push))
         rest = jnp.einsum("rtij,j->rti", body, entries) + push
         found.append((_physical(entries), jnp.sum(rest**2) / jnp.sum(push**2)))
     return found[0][0], found[1][0], found[0][1]
@@ -160,7 +161,7 @@ def central_slope(omega, times):
 def alternatives(omega: Float[Array, "r t 3"], first: Float[Array, "3 3"]) -> list[Array]:
     """Other second moments: long, flat and middling bodies along the directions of the rates."""
     spread = jnp.einsum("rti,rtj->ij", omega, omega)
-    _, axes = jnp.linalg.eigh(spread)
+    _, axes = eigh(spread)
     size = first[0, 0] + first[1, 1] + first[2, 2]
     return [
         size * jnp.einsum("ij,j,kj->ik", axes, jnp.asarray(widths, omega.dtype), axes)

@@ -1,0 +1,98 @@
+"""LAPACK is called for one matrix at a time: a batch of them could wait for itself for ever."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import polhode.fit._matrices as matrices
+from polhode.fit import (
+    FreeMotion,
+    FullTensor,
+    Instrument,
+    Recording,
+    Tolerance,
+    _fit,
+    _fit_balance,
+    stack,
+)
+from polhode.fit._solve import Problem
+
+BATCH = np.random.default_rng(3).normal(size=(2, 5, 4, 4))
+SPD = BATCH @ np.swapaxes(BATCH, -1, -2) + np.eye(4)
+
+
+@pytest.fixture
+def affected(monkeypatch):
+    """As with a jaxlib that shares the matrices of a batch among threads, whichever is here."""
+    monkeypatch.setattr(matrices, "_AFFECTED", True)
+    jax.clear_caches()
+    yield
+    jax.clear_caches()
+
+
+def largest_batch(function, *args):
+    """Most matrices that a call of LAPACK in the program has, and how many calls there are."""
+    text = jax.jit(function).lower(*args).as_text()
+    calls = [line for line in text.splitlines() if "@lapack_" in line]
+    shapes = [
+        [int(size) for size in shape.split("x")[:-1]]
+        for line in calls
+        for shape in re.findall(
+            r"tensor<([0-9x]+x[fi][0-9]+)>", line.rpartition("} : (")[2].split("->")[0]
+        )
+    ]
+    return max((int(np.prod(x[:-2])) for x in shapes if len(x) > 2), default=1), len(calls)
+
+
+def recordings(count):
+    times = np.linspace(0, 0.5, 20)
+    rates = np.stack([np.sin(3 * times), np.cos(4 * times), 1 + times], axis=-1)
+    return stack([Recording.of(times, k + rates, wheel_speed=100 * times) for k in range(count)])
+
+
+def test_the_fits_hand_over_no_batch(affected):
+    given = recordings(6)
+    problem = Problem(FreeMotion(), FullTensor())
+    for fit in (_fit._each, _fit._together):
+        batch, calls = largest_batch(fit.__wrapped__, given, problem)
+        assert (batch, calls > 4) == (1, True)
+
+    def balanced(given):
+        numbers = jnp.asarray([0, 1, 0, 1, 0, 1])
+        return _fit_balance._together.__wrapped__(
+            given, numbers, Instrument(1e-6), Tolerance(), 2, 9, 2, True
+        )
+
+    batch, calls = largest_batch(balanced, given)
+    assert (batch, calls > 2) == (1, True)
+
+
+def test_plain_calls_would_be_found():
+    assert largest_batch(jnp.linalg.eigh, SPD)[0] == 10
+    assert largest_batch(jax.vmap(jnp.linalg.cholesky), SPD)[0] == 10
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+def test_values_are_those_of_numpy(affected, dtype):
+    bound = 300 * np.finfo(dtype).eps
+    given, right = SPD.astype(dtype), BATCH[..., 0].astype(dtype)
+    values, axes = matrices.eigh(given)
+    np.testing.assert_allclose(axes * values[..., None, :] @ np.swapaxes(axes, -1, -2), given,
+                               atol=bound)  # fmt: skip
+    left, sizes, other = matrices.svd(given)
+    np.testing.assert_allclose(left * sizes[..., None, :] @ other, given, atol=bound)
+    want = np.linalg.solve(SPD, BATCH[..., :1])[..., 0]
+    np.testing.assert_allclose(matrices.solve(given, right), want, atol=bound)
+    np.testing.assert_allclose(matrices.inverse(given) @ given, np.eye(4) + 0 * SPD, atol=bound)
+    tall = np.concatenate([SPD, BATCH], axis=-2).astype(dtype)
+    factor = matrices.triangle(tall)
+    np.testing.assert_allclose(
+        np.swapaxes(factor, -1, -2) @ factor, np.swapaxes(tall, -1, -2) @ tall, atol=10 * bound
+    )
+    ahead = np.concatenate([right, 2 * right], axis=-1)
+    want = [np.linalg.lstsq(a, b)[0] for a, b in zip(tall.reshape(10, 8, 4), ahead.reshape(10, 8))]
+    got = matrices.least_squares(tall, ahead).reshape(10, 4)
+    np.testing.assert_allclose(got, want, atol=10 * bound)
