@@ -4,10 +4,8 @@ import gc
 import os
 from pathlib import Path
 
-if "PYTEST_XDIST_WORKER" in os.environ:  # one core a worker, set before JAX wakes up
-    os.environ.setdefault(
-        "XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
-    )
+if "PYTEST_XDIST_WORKER" in os.environ:  # one core a worker: XLA reads this when it wakes up
+    os.environ.setdefault("NPROC", "1")
 
 import jax
 import pytest
