@@ -21,7 +21,8 @@ from pathlib import Path
 
 from benchmarks._report import OUT, one_thread, read, write
 
-one_thread()
+if __name__ == "__main__":
+    one_thread()
 
 import jax
 import jax.numpy as jnp

@@ -20,7 +20,8 @@ from pathlib import Path
 
 from benchmarks._report import one_thread, recordings, write
 
-one_thread()
+if __name__ == "__main__":
+    one_thread()
 
 import jax
 import numpy as np

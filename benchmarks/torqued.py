@@ -146,6 +146,7 @@ def main() -> None:
             for row in new:
                 print("  ".join(f"{v:.2g}" if isinstance(v, float) else f"{v}"
                                 for v in row.values()), flush=True)  # fmt: skip
+        jax.clear_caches()  # the programs of all scenes at once do not fit
         path = _report.write("torqued", {"rows": rows}, path=options.output, packages=("heyoka",))
     print(path)
 
