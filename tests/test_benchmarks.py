@@ -1,8 +1,10 @@
 """Every benchmark runs at a tiny size, scores right, and pages hold what the results say."""
 
+import ast
 import dataclasses
 import json
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +13,14 @@ from benchmarks import _compare, _figures, _levels, _page, _report, problems, tr
 from benchmarks.problems import PROBLEMS
 
 FREE = PROBLEMS["free"]
+
+
+def test_only_a_benchmark_that_is_run_takes_one_core():
+    """One that a test imports would keep the rest of the tests, on all workers, on one core."""
+    for path in Path(_report.__file__).parent.glob("*.py"):
+        for line in ast.parse(path.read_text()).body:
+            if isinstance(line, ast.Expr) and isinstance(line.value, ast.Call):
+                assert "one_thread()" not in ast.unparse(line), path.name
 
 
 # Truth and scores
@@ -186,6 +196,19 @@ def test_scaling_and_scene_cost_run():
     (row,) = scene_cost.measure(["free, spherical, final state"], 4, repeats=1)
     assert row["ns"] > 0
     assert row["flops"] > 0
+
+
+def test_splittings_are_scored_beside_the_planner(monkeypatch):
+    from benchmarks import moser_veselov
+
+    monkeypatch.setattr(moser_veselov, "RTOLS", (1e-9,))
+    monkeypatch.setattr(moser_veselov, "WHOLE", {4: (100,)})
+    monkeypatch.setattr(moser_veselov, "ROTATIONS", {})
+    short = dataclasses.replace(PROBLEMS["gradient"], horizon=2.0)
+    planner, whole = moser_veselov.run(short, 4, 2)
+    assert planner["worst"] < 1e-8
+    assert 1e-15 < whole["worst"] < 1e-7
+    assert whole["us_per_body"] > 0
 
 
 def test_accuracy_of_elliptic_functions_is_measured_per_region():

@@ -290,3 +290,100 @@ def test_satellite_with_products_of_inertia_librates():
     want = tilt * (weight * np.cos(np.sqrt(square[0]) * ts) + (1 - weight) * np.cos(
         np.sqrt(square[1]) * ts))  # fmt: skip
     np.testing.assert_allclose(roll, want, rtol=0, atol=1e-4 * tilt)
+
+
+# NASA's JEOD (github.com/nasa/jeod, verif/SIM_dyncomp, runs 9A to 10D: orbital check cases of the
+# NESC): place and velocity, matrices from space to body axes, rates in body axes, after 8 hours
+MU = 3.986004415e14
+ORBITS = {
+    "circular": ([-4292653.41, 955168.47, 5139356.57], [109.649663, -7527.72649, 1484.521489]),
+    "elliptic": ([-4315967.74, 960356.2, 5167269.53], [129.091037, -7491.513855, 1452.515654]),
+}
+CYLINDER = [500.0, 12250.0, 12250.0]
+STARTS = {
+    "circular": [[-0.6443912270931274, 0.05284210190675609, 0.7628680480341864],
+                 [-0.7615617870471506, -0.1345758407161209, -0.6339660776454052],
+                 [0.06916350883930189, -0.9894933326514259, 0.1269620166955875]],
+    "elliptic": [[-0.6443912269484258, 0.0528421023505859, 0.762868048125672],
+                 [-0.7615617871967408, -0.1345758406652156, -0.6339660774765135],
+                 [0.0691635085403311, -0.9894933326346473, 0.1269620169892195]],
+}  # fmt: skip
+LIBRATIONS = {
+    "10A": ("circular",
+        [-1.97989570839746e-05, -0.001134281491669957, 0.0],
+        [[-0.1303977224153033, -0.9235551691194414, 0.3606137595567613],
+         [-0.9835635249313684, 0.0746803593168579, -0.1643947576928366],
+         [0.1248968631050554, -0.3761232424685627, -0.9181133263717784]],
+        [-1.97989570839746e-05, -0.001080027400090759, -0.0007098670173048437]),
+    "10B": ("circular",
+        [-1.97989570839746e-05, -0.0009597485664705242, 0.0],
+        [[-0.08177856896790536, -0.9485199619083543, 0.3059773643898119],
+         [-0.9880754391205183, 0.03697382401574778, -0.1494652566466455],
+         [0.1304576263173473, -0.3145517734793856, -0.9402329442944535]],
+        [-1.97989570839746e-05, -0.001039371917405715, -0.00068561832106255]),
+    "10C": ("elliptic",
+        [-1.958561461497211e-05, -0.001122059109806593, 0.0],
+        [[-0.1416223422259105, -0.9171375917053928, 0.372561068904521],
+         [-0.9814677649343182, 0.08101112610984618, -0.1736612329832083],
+         [0.1290896532541655, -0.3902509901681823, -0.9116139676943704]],
+        [-1.958561461497211e-05, -0.001102150420357001, -0.0007137081527530395]),
+    "10D": ("elliptic",
+        [-1.958561461497211e-05, -0.00094752618460716, 0.0],
+        [[-0.09270989340746383, -0.9435593558564048, 0.3179632331578974],
+         [-0.9864361111063251, 0.04359502545335181, -0.1582506633829749],
+         [0.1354572787627401, -0.3283218173249661, -0.9348027117518567]],
+        [-1.958561461497211e-05, -0.001062058853745821, -0.0006901638686869954]),
+}  # fmt: skip
+STATION = [[1.02e8, -6.96e6, -5.48e6], [-6.96e6, 0.91e8, 5.9e5], [-5.48e6, 5.9e5, 1.64e8]]
+STATION_START = [[0.1412307175854335, -0.9892782736897275, 0.03718039289432368],
+                 [-0.772691975098125, -0.1336331223242703, -0.6205556383087864],
+                 [0.6188707425862547, 0.05891252687959725, -0.7832804849780175]]  # fmt: skip
+THRUSTS = {
+    "9A": ([0.0, 0.0, 0.0],
+        [[0.1690520479948245, -0.9727191068763098, -0.1588676939673716],
+         [0.9656730014585525, 0.1312128771193781, 0.2241848235989362],
+         [-0.1972233741796006, -0.191313146427029, 0.9615103851136525]],
+        [9.751635347691358e-05, 8.882593782196596e-06, 1.53007486831241e-05]),
+    "9B": ([0.0, -0.001134454274550824, 0.0],
+        [[-0.110781359605145, -0.0346505107912517, -0.9932405712947602],
+         [-0.8498349541130382, -0.5148480361227724, 0.1127477293262038],
+         [-0.5152747239402747, 0.8565809020766398, 0.02758835018344352]],
+        [-0.0007282187220568775, -0.0008332384627087039, -0.0002424925044840342]),
+}  # fmt: skip
+
+
+def _wxyz(to_body):
+    return rotation.matrix_to_wxyz(jnp.array(to_body).T)
+
+
+@pytest.mark.parametrize("name", LIBRATIONS)
+def test_nasa_cylinder_librates_in_orbit(name):
+    """NESC orbital cases 10A and 10C (at rest to the orbit), 10B and 10D (with a rate)."""
+    where, omega, end, rates = LIBRATIONS[name]
+    scene = ph.Scene(
+        ph.Inertia.from_moments(CYLINDER), ph.GravityGradient(MU, ph.StateOrbit(MU, *ORBITS[where]))
+    )
+    got = ph.simulate(scene, ph.State(_wxyz(STARTS[where]), omega), [0.0, 28800.0], rtol=1e-10)
+    assert rotation.angle_between(got.wxyz[-1], _wxyz(end)) < 1e-9
+    np.testing.assert_allclose(got.omega_body[-1], rates, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", THRUSTS)
+def test_nasa_station_pushed_for_a_while(name):
+    """NESC orbital cases 9A and 9B: 10 N m along body x from 1000 to 2000 s.
+
+    The jumps are found by the step control, or stepped to because they are among the times.
+    """
+    omega, end, rates = THRUSTS[name]
+    body = ph.Inertia.from_tensor(STATION)
+
+    def push(t):
+        return jnp.where((t >= 1000) & (t < 2000), 10.0, 0.0) * jnp.array([1.0, 0.0, 0.0])
+
+    scene = ph.Scene(body, torque=ph.BodyTorque(push))
+    start = ph.State(_wxyz(STATION_START), omega)
+    found = ph.simulate(scene, start, [0.0, 28800.0])
+    known = ph.simulate(scene, start, [0.0, 1000.0, 2000.0, 28800.0], rtol=1e-11)
+    for got, bound in ((found, 1e-8), (known, 1e-10)):
+        assert rotation.angle_between(got.wxyz[-1], _wxyz(end)) < bound
+        np.testing.assert_allclose(got.omega_body[-1], rates, rtol=0, atol=bound * 1e-3)

@@ -108,3 +108,41 @@ def test_a_gravity_gradient_is_the_same_seen_from_a_frame_upright_to_it():
     assert isinstance(method, ph.LiePoisson)  # steps follow what changes with time
     with pytest.raises(ValueError, match="along space z"):
         ph.GravityGradient(1.0, [1.0, 0.0, 1.0], vertical=True)
+
+
+@pytest.mark.parametrize("kind", ["box", "bell"])
+def test_a_push_after_rest_or_on_a_turning_body_is_seen(kind):
+    """A torque that jumps beside the ends of a step is behind the estimate of the midpoint rule;
+    and before a bell-shaped one the body has next to no momentum to be exact to."""
+    state = ph.State([[1.0, 0, 0, 0]] * 2, [[0.0, 0, 0], [0.3, 0.1, -0.4]])
+
+    def push(t):
+        bell = jnp.exp(-(((t - 15) / 2) ** 2))
+        size = bell if kind == "bell" else jnp.where((t >= 10) & (t < 20), 1.0, 0.0)
+        return size * jnp.array([0.016, -0.008, 0.01])
+
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.7, 2.2]), torque=ph.BodyTorque(push))
+    got = ph.simulate(scene, state, [0.0, 60.0], rtol=1e-9)
+    times = [*range(11), *np.linspace(10, 20, 41)[1:], 60]  # the jumps are ends of steps
+    method = ph.LiePoisson(diffrax.Dopri8(), at_end=True)
+    want = ph.simulate(scene, state, np.array(times, float), method, rtol=1e-13)
+    assert np.max(rotation.angle_between(got.wxyz[:, -1], want.wxyz[:, -1])) < 1e-8
+    assert np.all(got.steps < 300)
+
+
+def test_a_brake_that_lets_go_at_a_rate():
+    """About one axis, with a constant torque down to a rate of 1/2: the angle is elementary."""
+    rates = np.array([0.8, -1.5])
+    state = ph.State([[1.0, 0, 0, 0], [0.6, 0, 0.8, 0]], rates[:, None] * [0, 0, 1.0])
+
+    def brake(t, attitude, omega):
+        size = jnp.where(jnp.abs(omega[2]) > 0.5, -0.2, 0.0)
+        return size * jnp.sign(omega[2]) * jnp.array([0.0, 0.0, 1.0])
+
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.7, 2.2]), torque=ph.FeedbackTorque(brake))
+    got = ph.simulate(scene, state, [0.0, 40.0])
+    braked = (np.abs(rates) - 0.5) / (0.2 / 2.2)
+    angle = np.sign(rates) * ((np.abs(rates) + 0.5) / 2 * braked + 0.5 * (40 - braked))
+    turn = np.stack([np.cos(angle / 2), 0 * angle, 0 * angle, np.sin(angle / 2)], axis=-1)
+    want = rotation.multiply(state.wxyz, jnp.array(turn))
+    assert np.max(rotation.angle_between(got.wxyz[:, -1], want)) < 1e-8

@@ -48,5 +48,6 @@ from polhode.torques import (
     QuadraticDamping as QuadraticDamping,
     Rotor as Rotor,
     SpaceTorque as SpaceTorque,
+    StateOrbit as StateOrbit,
     UniformGravity as UniformGravity,
 )

@@ -16,6 +16,7 @@ from polhode._state import State
 from polhode._status import Status
 from polhode.hamiltonian import (
     Dynamics,
+    LiePoissonCostate,
     components,
     external_power,
     from_quaternion,
@@ -52,7 +53,9 @@ class Extrapolated(AbstractMethod):
     ``upright``: work in a space frame whose z axis is along the scene's ``UniformGravity`` or the
     constant position of its ``GravityGradient``, which must not vanish (a third of the work; other
     potentials and torques must be absent);
-    ``on_axis``: with ``upright``, take the centre of mass to lie on body z.
+    ``on_axis``: with ``upright``, take the centre of mass to lie on body z;
+    ``compensated``: sum changes within a step and carry what rounding takes along (three to twenty
+    times less rounding, a third more work).
     """
 
     order: int = eqx.field(static=True, default=12)
@@ -61,6 +64,7 @@ class Extrapolated(AbstractMethod):
     adjoint: diffrax.AbstractAdjoint | None = None
     upright: bool = eqx.field(static=True, default=False)
     on_axis: bool = eqx.field(static=True, default=False)
+    compensated: bool = eqx.field(static=True, default=False)
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         n = state.wxyz.shape[0]
@@ -104,8 +108,9 @@ class Extrapolated(AbstractMethod):
         momentum = scene.momentum(state.omega_body, ts[0])
         y0 = (components(momentum), tuple(state.wxyz[..., i] for i in range(4)))
         field = lie_poisson_field
+        costate = LiePoissonCostate.of(dynamics, y0, ts[0])
         if record.work:
-            y0, field = (*y0, jnp.zeros_like(y0[0][0])), _field_and_power
+            y0, field, costate = (*y0, jnp.zeros_like(y0[0][0])), _field_and_power, None
         horizon = jnp.abs(ts[-1] - ts[0])
         total = steps_for(self.order, rtol, jnp.max(rate, initial=0), horizon)
 
@@ -125,7 +130,8 @@ class Extrapolated(AbstractMethod):
                 nodes = start + (end - start) * jnp.arange(restarts + 1, dtype=ts.dtype) / restarts
 
                 def onward(y, span):
-                    return flow(field, dynamics, y, span, each, self.order), None
+                    options = self.order, self.compensated, costate
+                    return flow(field, scene, y, span, each, *options), None
 
                 y, _ = jax.lax.scan(onward, y, (nodes[:-1], nodes[1:].at[-1].set(end)))
                 return y, (y, reached, taken.astype(jnp.int32))
@@ -182,7 +188,6 @@ def lane_rates(scene: Scene, state: State, ts: Array) -> Array:
     n = state.wxyz.shape[0]
     first, last = ts[..., 0], ts[..., -1]
     momentum = components(scene.momentum(state.omega_body, first))
-    finer = 1 if isinstance(scene.potential, UniformGravity) else _FINER
     acting = Dynamics(scene.hamiltonian, scene.torque)
     alone = Dynamics(Scene(scene.inertia, rotors=scene.rotors).hamiltonian)
     turns = jnp.array(_TURNS, state.wxyz.dtype)
@@ -199,12 +204,19 @@ def lane_rates(scene: Scene, state: State, ts: Array) -> Array:
         largest = jnp.maximum(largest, jnp.sqrt(jnp.max(jax.vmap(square)(turns), axis=0)))
     moments = jnp.broadcast_to(scene.carrier.moments, (n, 3))
     axial = components(moments * state.omega_body)
-    return finer * natural_rate(axial, tuple(1 / m for m in components(moments)), largest)
+    rate = natural_rate(axial, tuple(1 / m for m in components(moments)), largest)
+    if isinstance(scene.potential, UniformGravity):
+        return rate
+    turned = rate * jnp.abs(last - first)
+    return _FINER * jnp.maximum(turned / _SHORT, 1) ** _DRIFT * rate
 
 
 _FINER = 1.35
 """The steps were fitted to heavy tops; other potentials vary faster with the attitude, such as a
 gravity gradient, whose torque returns after half a turn."""
+
+_SHORT, _DRIFT = 500, 1 / 24
+"""Over more radians than these the phases of librations drift apart faster than those of tops."""
 
 
 def _upright(scene: Scene, state: State, on_axis: bool) -> tuple[Scene, State, Array]:

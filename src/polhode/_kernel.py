@@ -13,12 +13,12 @@ from jax.extend.core import Literal
 from jax.interpreters import ad, partial_eval
 
 _PLAIN = frozenset(
-    """abs add add_any and atan atan2 bitcast_convert_type broadcast_in_dim ceil clamp concatenate
-     convert_element_type copy cos cosh custom_jvp_call div dynamic_slice dynamic_update_slice eq
-     exp exp2 expm1 floor ge gt integer_pow iota is_finite jit le log log1p logistic lt max min mul
-     ne neg not or pad pjit pow reduce_sum rem reshape round rsqrt scan select_n
-     shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stop_gradient sub
-     tan tanh transpose while xor""".split()  # noqa: SIM905
+    """abs add add_any and atan atan2 bitcast_convert_type broadcast_in_dim ceil clamp
+     concatenate cond convert_element_type copy cos cosh custom_jvp_call div dynamic_slice
+     dynamic_update_slice eq exp exp2 expm1 floor ge gt integer_pow iota is_finite jit le log
+     log1p logistic lt max min mul ne neg not or pad pjit pow reduce_sum rem reshape round
+     rsqrt scan select_n shift_right_arithmetic sign sin sinh slice split sqrt square squeeze
+     stack stop_gradient sub tan tanh transpose unstack while xor""".split()  # noqa: SIM905
 )
 """Operations that a single compiled unit may hold; anything else keeps the usual way."""
 
@@ -65,6 +65,17 @@ def kernel(fn: Callable, *, linearised: bool = False) -> Callable:
         return _unit(lambda *given: fn(*jax.tree.unflatten(tree, given)), linearised)(*leaves)
 
     return call
+
+
+def apart(fn: Callable, *operands, when: jax.Array) -> Any:
+    """``fn(*operands)``, worked out once even where many results of a ``kernel`` need it.
+
+    XLA's CPU backend would form it again for each of them, but not what a branch returns. ``when``
+    is true, which XLA must not know; ``fn`` returns arrays as its first operand.
+    """
+    if jax.default_backend() != "cpu":
+        return fn(*operands)
+    return jax.lax.cond(when, fn, lambda first, *_: first, *operands)
 
 
 def _unit(flat: Callable, linearised: bool) -> Callable:
@@ -142,21 +153,52 @@ def _marked(flat: Callable, leaves: tuple) -> Any:
 
 
 def _inlined(jaxpr, consts, *given) -> list:
-    """The program run with no call left in it; rules of derivatives are lost."""
+    """The program run with no call left in it; rules of derivatives are lost.
+
+    What is taken out of arrays put together is taken from the parts: XLA sees as much later, when
+    a part that nothing takes has become an operand that goes unused.
+    """
     values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*consts, *given), strict=True))
+    joined: dict[int, tuple[Any, Any, list]] = {}  # by the identity of a value that is kept in it
 
     def read(x):
         return x.val if isinstance(x, Literal) else values[x]
 
     for equation in jaxpr.eqns:
+        name, params = equation.primitive.name, equation.params
         operands = [read(x) for x in equation.invars]
-        inner = equation.params.get(_CALLS.get(equation.primitive.name))
+        inner = params.get(_CALLS.get(name))
         if inner is not None:
             out = _inlined(inner.jaxpr, inner.consts, *operands)
+        elif name == "slice" and id(operands[0]) in joined:
+            _, join, parts = joined[id(operands[0])]
+            out = [_taken(operands[0], join, parts, params)]
         else:
-            bound = equation.primitive.get_bind_params(equation.params)
+            if name == "scan":
+                body = params["jaxpr"]
+                body = jax.make_jaxpr(partial(_inlined, body.jaxpr, body.consts))(*body.in_avals)
+                params = {**params, "jaxpr": body}
+            bound = equation.primitive.get_bind_params(params)
             functions, params = bound if isinstance(bound, tuple) else ((), bound)
             out = equation.primitive.bind(*functions, *operands, **params)
             out = out if equation.primitive.multiple_results else [out]
+        if name in ("stack", "concatenate"):
+            joined[id(out[0])] = (out[0], equation, operands)
         values.update(zip(equation.outvars, out, strict=True))
     return [read(x) for x in jaxpr.outvars]
+
+
+def _taken(whole: jax.Array, join: Any, parts: list, params: dict) -> jax.Array:
+    """A slice of joined parts, from the one part that it lies in if there is one."""
+    starts, limits = list(params["start_indices"]), list(params["limit_indices"])
+    stacked = join.primitive.name == "stack"
+    axis = join.params["axis" if stacked else "dimension"]
+    start = 0
+    for part in parts:
+        size = 1 if stacked else part.shape[axis]
+        if start <= starts[axis] and limits[axis] <= start + size:
+            whole = jax.lax.expand_dims(part, [axis]) if stacked else part
+            starts[axis], limits[axis] = starts[axis] - start, limits[axis] - start
+            break
+        start += size
+    return jax.lax.slice(whole, starts, limits, params["strides"])

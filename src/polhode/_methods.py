@@ -10,15 +10,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
+from polhode._equal_steps import check_split, equally
 from polhode._lanes import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._scene import Scene
 from polhode._state import State
 from polhode._status import Status
 from polhode._stepping import followed, sampled, through
-from polhode._tolerance import EndTolerance, controlled
+from polhode._tolerance import EndTolerance, controlled, momentum_scale, slow_momentum
 from polhode.hamiltonian import (
     Attitude,
     Dynamics,
+    LiePoissonCostate,
     Vector,
     canonical_from_momentum,
     components,
@@ -30,7 +32,7 @@ from polhode.hamiltonian import (
     momentum_from_canonical,
 )
 from polhode.rotation import euler_to_wxyz, normalise, wxyz_to_euler
-from polhode.solvers import Extrapolation
+from polhode.solvers import Extrapolation, Splitting
 
 
 class Record(eqx.Module):
@@ -104,8 +106,13 @@ class AbstractDiffraxMethod(AbstractMethod):
         return isinstance(self.solver, Extrapolation) and self.controller is None
 
     @property
+    def _splits(self) -> bool:
+        """Whether the flows of a split Hamiltonian move the bodies, in equal steps."""
+        return isinstance(self.solver, Splitting)
+
+    @property
     def asked_at_end(self) -> bool | None:
-        return self.at_end if self.controller is None else None
+        return self.at_end if self.controller is None and not self._splits else None
 
     @abc.abstractmethod
     def seen(self, y: PyTree[Array]) -> tuple[Vector, Attitude]:
@@ -124,6 +131,8 @@ class AbstractDiffraxMethod(AbstractMethod):
         """wxyz, omega_body and whether the chart is still sound, of sampled components (N, T)."""
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: float, record: Record) -> Samples:
+        if self._splits:
+            check_split(self, scene, record)
         if self.adjoint is None and not self._by_components:
             raise ValueError(
                 f"ph.{type(self).__name__}(adjoint=None) needs a solver ph.solvers.Extrapolation"
@@ -150,6 +159,10 @@ class AbstractDiffraxMethod(AbstractMethod):
         """The field on one array (components, N): for a diffrax solver far faster than leaves."""
         return _stack(self.field(t, _groups(y), dynamics))
 
+    def costate(self, dynamics, y, t):
+        """Equations for the slopes of a motion, where better ones than the usual are known."""
+        return None
+
     def _field_and_power(self, t, y, dynamics):
         """The same with the work of the external torques as one more component."""
         momentum, attitude = self.seen(_groups(y[:-1]))
@@ -160,9 +173,9 @@ class AbstractDiffraxMethod(AbstractMethod):
         power = external_power(t, *self.seen(y[:2]), dynamics)
         return *self.field(t, y[:2], dynamics), power
 
-    def _weights(self, scene, state, t, groups) -> Array:
+    def _weights(self, scene, state, ts, groups) -> Array:
         ones = jnp.ones_like(groups[0][0])
-        momenta = ones / momentum_scale(scene, state, t)
+        momenta = ones / momentum_scale(scene, state, ts)
         return _stack(
             tuple(momenta if is_momentum else ones for _ in group)
             for group, is_momentum in zip(groups, self.momenta)
@@ -172,10 +185,10 @@ class AbstractDiffraxMethod(AbstractMethod):
         """One chunk of lanes in one diffrax solve."""
         dynamics = Dynamics(scene.hamiltonian, scene.torque)
         groups, sound = self.start(scene, state, ts[0])
-        weights = self._weights(scene, state, ts[0], groups)
+        weights = self._weights(scene, state, ts, groups)
         if record.work:  # follows from the rest: it does not decide the step
             weights = jnp.concatenate([weights, jnp.zeros_like(weights[:1])])
-        if self._by_components:
+        if self._by_components or self._splits:
             y0, field = groups, self.field
             if record.work:
                 y0, field = (*groups, jnp.zeros_like(groups[0][0])), self._components_and_power
@@ -185,7 +198,7 @@ class AbstractDiffraxMethod(AbstractMethod):
                 y0 = jnp.concatenate([y0, jnp.zeros_like(y0[:1])])
                 field = self._field_and_power
         controller = self.controller
-        if controller is None:
+        if controller is None and not self._splits:
             controller = self._tolerance(scene, state, ts, rtol, weights)
         solve = partial(
             diffrax.diffeqsolve,
@@ -197,8 +210,13 @@ class AbstractDiffraxMethod(AbstractMethod):
         )
         if self._by_components:
             width = self._first_width(scene, state, ts) if self.dt0 is None else self.dt0
-            move = through if self.adjoint is not None else followed
+            move = through
+            if self.adjoint is None:
+                costate = None if record.work else self.costate(dynamics, groups, ts[0])
+                move = partial(followed, costate=costate)
             found = move(solve, field, dynamics, controller, ts, y0, width, record.final_only)
+        elif self._splits:
+            found = equally(solve, field, dynamics, self.dt0, ts, y0, record.final_only)
         else:
             solve = partial(solve, diffrax.ODETerm(field), args=dynamics)
             if self.controller is None and not record.final_only:
@@ -231,8 +249,8 @@ class AbstractDiffraxMethod(AbstractMethod):
             return controlled(rtol, weights)
         if self._by_components and self.momenta[0]:
             size = jnp.trace(scene.inertia.tensor, axis1=-2, axis2=-1) / 3
-            size = jnp.broadcast_to(size, weights.shape[1:])
-            return EndTolerance(rtol, jax.lax.stop_gradient(size), ts[-1])
+            sizes = jnp.broadcast_arrays(size, slow_momentum(scene, ts), weights[0])[:2]
+            return EndTolerance(rtol, *jax.lax.stop_gradient(sizes), ts[-1], _may_jump(scene))
         rate = jnp.max(jnp.linalg.norm(state.omega_body, axis=-1))
         turned = jnp.maximum(1, rate * jnp.abs(ts[-1] - ts[0]))
         return controlled(rtol / jax.lax.stop_gradient(2 * turned), weights)
@@ -245,7 +263,14 @@ class AbstractDiffraxMethod(AbstractMethod):
     def _rates(self, scene, state, ts) -> Array:
         """Natural rates of lanes [rad/s], from above."""
         slowest = jnp.min(jnp.broadcast_to(scene.carrier.moments, (state.wxyz.shape[0], 3)), -1)
-        return jax.lax.stop_gradient(momentum_scale(scene, state, ts[..., 0]) / slowest)
+        return jax.lax.stop_gradient(momentum_scale(scene, state, ts) / slowest)
+
+
+def _may_jump(scene: Scene) -> bool:
+    """Whether a function of the user's acts on the body: orbits of this package are smooth."""
+    parts = (scene.potential, scene.torque, scene.rotors)
+    found = (x for x in jax.tree.leaves(parts, is_leaf=callable) if callable(x))
+    return not all(hasattr(x, "core_ranks") for x in found)
 
 
 def _stack(groups) -> Array:
@@ -271,17 +296,6 @@ def _status(result, wxyz, omega, sound, sound_at_end) -> Array:
     return jnp.where(lost, Status.CHART_SINGULAR, status)
 
 
-def momentum_scale(scene: Scene, state: State, t: Array) -> Array:
-    """Natural unit of momentum of each lane: |L| together with what the torques can add to it."""
-    momentum = scene.momentum(state.omega_body, t)
-    y = (components(momentum), tuple(state.wxyz[..., i] for i in range(4)))
-    (push, _) = lie_poisson_field(t, y, Dynamics(scene.hamiltonian, scene.torque))
-    size = jnp.trace(scene.inertia.tensor, axis1=-2, axis2=-1)
-    square = jnp.sum(momentum**2, axis=-1) + size * jnp.sqrt(sum(x * x for x in push))
-    resting = square == 0
-    return jax.lax.stop_gradient(jnp.where(resting, 1, jnp.sqrt(jnp.where(resting, 1, square))))
-
-
 class LiePoisson(AbstractDiffraxMethod):
     """Unit quaternion and body momentum, free of singularities, with any diffrax solver.
 
@@ -289,9 +303,10 @@ class LiePoisson(AbstractDiffraxMethod):
 
     - ``solver``: any ``diffrax.AbstractSolver`` for ODEs.
     - ``controller``: a diffrax step-size controller; None: error control by the ``rtol`` of
-      ``simulate``, the attitude in radians and the momentum relative to each body's own scale,
-      the worst body of a chunk deciding the step.
-    - ``dt0``: first (or constant) step [s], negative backwards; None: chosen.
+      ``simulate``, the attitude in radians and the momentum relative to each body's own scale, at
+      least that of one radian in the whole time; the worst body of a chunk decides the step.
+    - ``dt0``: first (or constant) step [s], negative backwards; None: chosen. For ``Splitting``,
+      which has no error estimate, the longest step: equal ones lead from each time to the next.
     - ``max_steps``, ``adjoint``, ``progress_meter``: as in diffrax. The default adjoint gives
       reverse mode; hand in ``diffrax.ForwardMode()`` for ``jax.jvp``. None, for ``Extrapolation``
       without a ``controller`` only: both, as derivatives of the exact flow, by the variational or
@@ -299,7 +314,8 @@ class LiePoisson(AbstractDiffraxMethod):
     - ``chunk``: bodies that share their steps; chunks follow one another, so memory stays bounded.
     - ``at_end``: hold the error at the last time to ``rtol``, not that of each step: the steps'
       tolerance follows from the angle that the fastest body of the chunk turns through, or what
-      rounding allows; for ``Extrapolation`` it is renewed on the way, as torques change the rates.
+      rounding allows; for ``Extrapolation`` it is renewed at every step, as torques change the
+      rates, and torques that jump are looked for at its ends.
     """
 
     solver: diffrax.AbstractSolver = diffrax.Dopri8()
@@ -315,6 +331,9 @@ class LiePoisson(AbstractDiffraxMethod):
 
     def field(self, t, y, dynamics):
         return lie_poisson_field(t, y, dynamics)
+
+    def costate(self, dynamics, y, t):
+        return LiePoissonCostate.of(dynamics, y, t)
 
     def seen(self, y):
         return y[0], from_quaternion(y[1])

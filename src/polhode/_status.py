@@ -24,7 +24,8 @@ _EXPLANATIONS = {
     Status.SUCCESSFUL: "finished",
     Status.MAX_STEPS: (
         "the solver used up max_steps before the last time: raise max_steps on the method,"
-        " loosen rtol, or shorten ts"
+        " loosen rtol, or shorten ts; damping far faster than the motion wants an implicit solver,"
+        " such as ph.LiePoisson(diffrax.Kvaerno5(), chunk=1)"
     ),
     Status.NOT_FINITE: (
         "a NaN or infinity appeared: look at this body's inertia, state, potential and torque"

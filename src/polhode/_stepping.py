@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from polhode import solvers
 from polhode._tolerance import EndTolerance
+from polhode.solvers._problem import Problem
 
 
 def sampled(solve, controller, ts, y0, width, final_only):
@@ -32,7 +33,7 @@ def through(solve, field, args, controller, ts, y0, width, final_only):
     return *_stacked(path, final_only), result, steps
 
 
-def followed(solve, field, args, controller, ts, y0, width, final_only):
+def followed(solve, field, args, controller, ts, y0, width, final_only, costate=None):
     """The same with the derivatives of the exact flow (see ``solvers.path``)."""
     times = ts[jnp.array([0, -1])] if final_only else ts
 
@@ -42,7 +43,7 @@ def followed(solve, field, args, controller, ts, y0, width, final_only):
 
     order = solve.keywords["solver"].formal_order
     path, _, (result, steps) = solvers.path(
-        steps, (controller, width), field, args, y0, times, order, _PARTS
+        steps, (controller, width), field, args, y0, times, order, _PARTS, costate
     )
     return *_stacked(path, final_only), result, steps
 
@@ -58,21 +59,24 @@ def _across(solve, field, args, controller, times, y0, width):
     A step starts as wide as those of the interval before; after a failure nothing moves.
     """
     good = diffrax.RESULTS.successful
-    solve = partial(solve, diffrax.ODETerm(field), args=args)
-    renewed, parts = isinstance(controller, EndTolerance), 1
+    term = diffrax.ODETerm(field)
+    solve = partial(solve, term, args=args)
+    renewed, turned = isinstance(controller, EndTolerance), None
     if renewed:
-        rate, _ = controller.rates(y0, field(times[0], y0, args))
-        times, parts = controller.nodes(times, rate)
+        unit = jnp.ones((), jnp.result_type(*jax.tree.leaves(y0)))
+        prepared = Problem.of(term, args).prepared(times[0], y0, unit)
+        controller = controller.following(jax.tree_util.Partial(_slope, prepared, unit))
+        turned = controller.turned
+    saved = diffrax.SaveAt(t1=True, controller_state=renewed)
 
     def across(carry, interval):
         y, width, result, steps, turned = carry
         start, end = interval
         end = jnp.where(result == good, end, start)
-        now = controller
+        now = controller.after(turned) if renewed else controller
+        solution = solve(t0=start, t1=end, dt0=width, y0=y, stepsize_controller=now, saveat=saved)
         if renewed:
-            now, rate = controller.at(start, y, field(start, y, args), turned)
-            turned = turned + rate * jnp.abs(end - start)
-        solution = solve(t0=start, t1=end, dt0=width, y0=y, stepsize_controller=now)
+            turned = solution.controller_state[1]
         result = diffrax.RESULTS.where(result == good, solution.result, result)
         new = jax.tree.map(lambda x: jnp.where(result == good, x[-1], jnp.nan), solution.ys)
         count = jnp.where(end == start, 0, solution.stats["num_accepted_steps"])
@@ -81,13 +85,14 @@ def _across(solve, field, args, controller, times, y0, width):
         steps = steps + solution.stats["num_steps"]
         return (new, width, result, steps, turned), (new, count)
 
-    start = (y0, jnp.asarray(width, times.dtype), good, jnp.array(0), 0 * times[0])
+    start = (y0, jnp.asarray(width, times.dtype), good, jnp.array(0), turned)
     (_, _, result, steps, _), (path, counts) = jax.lax.scan(across, start, (times[:-1], times[1:]))
-    counts = jnp.maximum(jnp.sum(counts.reshape(-1, parts), axis=1), 1)
-    path = jax.tree.map(
-        lambda first, x: jnp.concatenate([first[None], x[parts - 1 :: parts]]), y0, path
-    )
-    return path, counts, (result, steps)
+    path = jax.tree.map(lambda first, x: jnp.concatenate([first[None], x]), y0, path)
+    return path, jnp.maximum(counts, 1), (result, steps)
+
+
+def _slope(problem, unit, t, y):
+    return problem.increment(t, y, unit)
 
 
 def _stacked(path, final_only):

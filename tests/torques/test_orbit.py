@@ -5,7 +5,7 @@ import pytest
 from mpmath import mp, mpf
 
 import polhode as ph
-from polhode.torques import KeplerOrbit, eccentric_anomaly
+from polhode.torques import KeplerOrbit, StateOrbit, eccentric_anomaly
 
 ECCENTRICITIES = [0.0, 0.01, 0.3, 0.7, 0.95, 0.999]
 ANOMALIES = [-3.14, -1.5, -1e-3, 0.0, 1e-6, 0.02, 0.4, 2.0, 3.1]
@@ -52,7 +52,70 @@ def test_the_orbit_obeys_newton():
         )
 
 
+def test_an_orbit_by_place_and_velocity_is_the_same_one():
+    """Of any eccentricity and inclination, long before and after the epoch; both precisions."""
+    for dtype, bound in ((jnp.float64, 2e-12), (jnp.float32, 2e-3)):
+        e, tilt = (jnp.array(x, dtype) for x in ([0.0, 1e-9, 0.3, 0.95], [0.0, 1.0, jnp.pi, 0.4]))
+        number = jnp.ones((), dtype)
+        elements = KeplerOrbit(1.7 * number, 1.3 * number, e, tilt, 0.3 * number, 1.1 * number,
+                               2.0 * number, 0.5 * number)  # fmt: skip
+        t0 = 4.0 * number
+        velocity = jax.jacfwd(elements)(t0)
+        by_state = StateOrbit(1.7 * number, elements(t0), velocity, t0)
+        for t in (-30.0, 0.0, 4.0, 7.5, 55.0):
+            got, want = by_state(t * number), elements(t * number)
+            assert got.dtype == dtype
+            assert np.abs(np.array(got - want)).max() < bound / (1 - 0.95)
+
+
+@pytest.mark.parametrize("e", [0.0, 1e-8, 0.4, 0.9])
+def test_slopes_of_an_orbit_by_state(e):
+    """Against 50 digits' differences; a circle and an orbit in the plane are no exceptions."""
+    mu, t = 1.7, 11.0
+    place, velocity = [1.2, 0.0, 0.0], [0.0, float(np.sqrt(mu * (1 + e) / 1.2)), 0.0]
+
+    def exact(given):
+        with mp.workdps(50):
+            r, v = mp.matrix(given[:3]), mp.matrix(given[3:])
+            size = mp.norm(r)
+            axis = 1 / (2 / size - (v.T * v)[0] / mpf(mu))
+            n = mp.sqrt(mpf(mu) / axis**3)
+            a, b = 1 - size / axis, (r.T * v)[0] / mp.sqrt(mpf(mu) * axis)
+            x = mp.findroot(
+                lambda x: x - a * mp.sin(x) + b * (1 - mp.cos(x)) - n * t, n * t, tol=1e-45
+            )
+            f = 1 - axis / size * (1 - mp.cos(x))
+            g = (size / axis * mp.sin(x) + b * (1 - mp.cos(x))) / n
+            return f * r + g * v
+
+    def place_at(given):
+        return StateOrbit(mu, given[:3], given[3:])(t)
+
+    given = [*place, *velocity]
+    got, slopes = place_at(jnp.array(given)), jax.jacfwd(place_at)(jnp.array(given))
+    back = jax.jacrev(place_at)(jnp.array(given))
+    want = exact([mpf(x) for x in given])
+    assert max(abs(float(a) - float(b)) for a, b in zip(got, want)) < 1e-13 / (1 - e) ** 2
+    for k in range(6):
+        with mp.workdps(50):
+            step = mpf(10) ** -20
+            up, down = (
+                [mpf(x) + s * step * (i == k) for i, x in enumerate(given)] for s in (1, -1)
+            )
+            slope = (exact(up) - exact(down)) / (2 * step)
+        for i in range(3):
+            scale = 1e-12 * max(1, abs(float(slope[i]))) / (1 - e) ** 3
+            assert abs(float(slopes[i, k]) - float(slope[i])) < scale
+            assert abs(float(back[i, k]) - float(slope[i])) < scale
+
+
 def test_refused_orbits():
+    with pytest.raises(ValueError, match=r"\|v\|\^2 \|r\|/mu below 2, got 4"):
+        StateOrbit(1.0, [1.0, 0, 0], [0, 2.0, 0])
+    with pytest.raises(ValueError, match="straight to or from"):
+        StateOrbit(1.0, [1.0, 0, 0], [0.5, 0, 0])
+    with pytest.raises(ValueError, match="must have shape"):
+        StateOrbit(1.0, [1.0, 0], [0.5, 0, 0])
     with pytest.raises(ValueError, match="eccentricity"):
         KeplerOrbit(1.0, 1.0, 1.0)
     with pytest.raises(ValueError, match="semi_major_axis"):

@@ -20,7 +20,7 @@ ROTORS = {
 
 
 @pytest.mark.parametrize("name", list(ROTORS))
-def test_momentum_energy_and_charts(name):
+def test_momentum_and_energy(name):
     scene = ph.Scene(INERTIA, rotors=ROTORS[name])
     got = ph.simulate(scene, STATE, TS, ph.LiePoisson(), rtol=1e-11)
     momentum = np.array(got.momentum_space)
@@ -33,9 +33,6 @@ def test_momentum_energy_and_charts(name):
     energy = np.array(got.energy)
     if name != "driven":
         assert np.abs(energy - energy[:, :1]).max() < 1e-9
-    if name == "driven":
-        chart = ph.simulate(scene, STATE, TS, ph.EulerAngles(), rtol=1e-11)
-        assert np.abs(np.array(got.omega_body - chart.omega_body)).max() < 1e-8
 
 
 def test_a_wheel_against_newton():
@@ -46,13 +43,13 @@ def test_a_wheel_against_newton():
 
     def last(torque):
         driven = Rotor([0.0, 0.0, 1.0], inertia=0.5, speed=2.0, torque=torque)
-        got = ph.simulate(ph.Scene(INERTIA, rotors=driven), state, TS, ph.LiePoisson(), rtol=1e-11)
+        got = ph.simulate(ph.Scene(INERTIA, rotors=driven), state, TS, rtol=1e-11)
         return got.omega_body[-1, 2]
 
     got = ph.simulate(scene, state, TS, ph.LiePoisson(), rtol=1e-11)
     want = 1 - np.array([[0.0], [0.3]]) / 2.0 * (np.array(TS) - 0.5)
     assert np.abs(np.array(got.omega_body)[..., 2] - want).max() < 1e-10
-    assert abs(jax.grad(last)(0.3) + 5.5 / 2.0) < 1e-9
+    assert abs(jax.jacfwd(last)(0.3) + 5.5 / 2.0) < 1e-9
 
 
 def test_the_inertia_includes_the_wheels():

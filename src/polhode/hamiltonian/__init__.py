@@ -10,6 +10,7 @@ from polhode.hamiltonian._attitude import (
     from_euler_angles as from_euler_angles,
     from_quaternion as from_quaternion,
 )
+from polhode.hamiltonian._costate import LiePoissonCostate as LiePoissonCostate
 from polhode.hamiltonian._energy import (
     Hamiltonian as Hamiltonian,
     inverse_components as inverse_components,

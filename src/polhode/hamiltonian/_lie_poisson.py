@@ -63,14 +63,10 @@ class Dynamics(eqx.Module):
     torque: Any = None
 
 
-def lie_poisson_field(t, y, dynamics: Dynamics):
-    """The vector field on component arrays, with the call signature of a diffrax term.
-
-    ``y = (momentum, wxyz)``: three arrays [kg m^2/s] and four arrays of one shape. The result
-    has the structure of the state.
-    """
-    momentum, wxyz = y
-    attitude = from_quaternion(wxyz)
+def momentum_rate(
+    t: Array | float, momentum: Sequence[Array], attitude: Attitude, dynamics: Dynamics
+) -> tuple[Vector, Vector]:
+    """dL/dt [N m] in body axes and the body rates [rad/s]."""
     omega, turn = rates_and_torque(dynamics.hamiltonian, momentum, attitude, t)
     rate = cross(momentum, omega)
     if turn is not None:
@@ -78,4 +74,15 @@ def lie_poisson_field(t, y, dynamics: Dynamics):
     if dynamics.torque is not None:
         push = dynamics.torque.body_components(t, attitude, omega)
         rate = tuple(a + b for a, b in zip(rate, push))
+    return rate, omega
+
+
+def lie_poisson_field(t, y, dynamics: Dynamics):
+    """The vector field on component arrays, with the call signature of a diffrax term.
+
+    ``y = (momentum, wxyz)``: three arrays [kg m^2/s] and four arrays of one shape. The result
+    has the structure of the state.
+    """
+    momentum, wxyz = y
+    rate, omega = momentum_rate(t, momentum, from_quaternion(wxyz), dynamics)
     return rate, quaternion_rate(wxyz, omega)

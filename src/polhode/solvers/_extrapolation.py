@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from polhode._kernel import kernel
+from polhode._kernel import apart, kernel
 from polhode.solvers._blocks import check_layout, map_blocks
 from polhode.solvers._dense import CollocationInterpolation, collocate
 from polhode.solvers._problem import Prepared, Problem
@@ -73,6 +73,8 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
     - ``compact``: the columns in one loop, so that the vector field stands in the program only a
       few times: half the time to compile, or less, at the same speed. Reverse mode cannot pass
       through such steps, forward mode can.
+    - ``compensated``: sums the changes within a step, not the states, and adds what rounding took
+      from the state after a step to the next one: less rounding, by a third longer.
 
     ??? cite "Reference"
         W. B. Gragg, SIAM J. Numer. Anal. 2 (1965) 384; R. Bulirsch, J. Stoer, Numer. Math. 8
@@ -84,6 +86,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
     block: int | None = eqx.field(static=True, default=None)
     substeps: int = eqx.field(static=True, default=1)
     compact: bool = eqx.field(static=True, default=False)
+    compensated: bool = eqx.field(static=True, default=False)
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = CollocationInterpolation
@@ -107,16 +110,17 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
     def error_order(self, terms) -> int:
         return self.formal_order - 1
 
-    def init(self, terms, t0, t1, y0, args) -> None:
-        return None
+    def init(self, terms, t0, t1, y0, args) -> PyTree:
+        return jax.tree.map(jnp.zeros_like, y0) if self.compensated else None
 
     def func(self, terms, t0, y0, args) -> PyTree:
         return terms.vf(t0, y0, args)
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        del solver_state, made_jump
+        del made_jump
 
-        def advance(y, rest):
+        def advance(given, rest):
+            y, low = given
             problem, (t, width), control = rest
             prepared = problem.prepared(t, y, control)
             step = _compact_step if self.compact else _step
@@ -125,13 +129,28 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
                 return _steps(step, self.formal_order, self.substeps, *operands)
 
             run = kernel(run)
-            return run(prepared, (t, width), control, y)
+            return run(prepared, (t, width), control, y, low)
 
         problem = Problem.of(terms, args)
         rest = (problem, (t0, t1 - t0), problem.control(t0, t1, y0))
-        y1, error, nodes = map_blocks(advance, self.block, y0, rest)
+        y1, low, error, nodes = map_blocks(advance, self.block, (y0, solver_state), rest)
         dense = collocate(terms, t0, t1, nodes, y1, args, self.formal_order)
-        return y1, error, dense, None, diffrax.RESULTS.successful
+        return y1, error, dense, low, diffrax.RESULTS.successful
+
+
+def carried_on(y: PyTree, low: PyTree, change: PyTree) -> tuple[PyTree, PyTree]:
+    """``y + low + change`` as a rounded sum and what rounding took from it.
+
+    D. E. Knuth, The Art of Computer Programming 2, section 4.2.2, theorem B.
+    """
+    change = _add(low, change)
+    new = _add(y, change)
+
+    def lost(a, c, s):
+        b = s - a
+        return (a - (s - b)) + (c - b)
+
+    return new, jax.tree.map(lost, y, change, new)
 
 
 def _add(a: PyTree, b: PyTree) -> PyTree:
@@ -142,26 +161,35 @@ def _add_share(a: PyTree, share: float, b: PyTree) -> PyTree:
     return jax.tree.map(lambda x, y: x + share * y, a, b)
 
 
-def _steps(step, order: int, count: int, problem: Prepared, times, control, y):
-    """State after ``count`` equal steps, summed size of their errors, states they started from."""
+def _steps(step, order: int, count: int, problem: Prepared, times, control, y, low):
+    """State after ``count`` equal steps, what rounding took from it (None: not followed), summed
+    size of their errors, states they started from."""
     t0, width = times
     share = jax.tree.map(lambda c: c / count, control)
 
     def one(carry, i):
-        y, total = carry
-        new, error = step(order, problem, (t0 + i * (width / count), width / count), share, y)
-        return (new, jax.tree.map(lambda s, e: s + jnp.abs(e), total, error)), y
+        y, low, total = carry
+        times = t0 + i * (width / count), width / count
+        new, error = step(order, problem, times, share, y, low is not None)
+        if low is not None:
+            new, low = carried_on(y, low, new)
+        return (new, low, jax.tree.map(lambda s, e: s + jnp.abs(e), total, error)), y
 
-    start = (y, jax.tree.map(jnp.zeros_like, y))
-    (y, error), nodes = jax.lax.scan(one, start, jnp.arange(count, dtype=jnp.result_type(width)))
-    return y, error, nodes
+    start = (y, low, jax.tree.map(jnp.zeros_like, y))
+    steps = jnp.arange(count, dtype=jnp.result_type(width))
+    (y, low, error), nodes = jax.lax.scan(one, start, steps)
+    return y, low, error, nodes
 
 
-def _columns(problem: Prepared, times, control, y):
+def _columns(problem: Prepared, times, control, y, compensated: bool):
     """The midpoint rule in ``n`` substeps, a column of the table, for numbers ``n`` that may be
-    traced integers."""
+    traced integers: the state after them, or its change where they are ``compensated``."""
     t0, width = times
     start = kernel(lambda y, t, control, p: p.increment(t, y, control))(y, t0, control, problem)
+    origin = jax.tree.map(jnp.zeros_like, y) if compensated else y
+
+    def place(a):
+        return apart(_add, y, a, when=jnp.isfinite(width)) if compensated else a
 
     @kernel
     def leap(a, b, t, control, p):
@@ -174,16 +202,16 @@ def _columns(problem: Prepared, times, control, y):
         h = share(width, n)
         # a share of the whole control: differences of two late times would be rounded
         twice = jax.tree.map(lambda c: share(c, n // 2), control)
-        a, b = y, jax.tree.map(lambda y, f: y + share(f, n), y, start)
+        a, b = origin, jax.tree.map(lambda y, f: y + share(f, n), origin, start)
 
         def pair(i, ab):
             a, b = ab
             t = t0 + jnp.asarray(2 * i + 1, jnp.result_type(h)) * h
-            a = leap(a, b, t, twice, problem)
-            return a, leap(b, a, t + h, twice, problem)
+            a = leap(a, place(b), t, twice, problem)
+            return a, leap(b, place(a), t + h, twice, problem)
 
         a, b = jax.lax.fori_loop(0, n // 2 - 1, pair, (a, b))
-        return leap(a, b, t0 + (width - h), twice, problem)
+        return leap(a, place(b), t0 + (width - h), twice, problem)
 
     return column
 
@@ -196,13 +224,13 @@ def _shares(order: int) -> list[tuple[int, float, float]]:
     return [(n, float(w), float(w - v)) for n, w, v in zip(sequence[:-1], weights, lower)]
 
 
-def _step(order: int, problem: Prepared, times, control, y):
-    """New state and error estimate; the column with most substeps is the base of both sums.
+def _step(order: int, problem: Prepared, times, control, y, compensated: bool):
+    """New state (or the change to it) and error estimate.
 
-    The others enter by their small differences to it, so that rounded weights cannot rescale
-    the state.
+    The column with most substeps is the base of both sums; the others enter by their small
+    differences to it, so that rounded weights cannot rescale the state.
     """
-    column = _columns(problem, times, control, y)
+    column = _columns(problem, times, control, y, compensated)
     base = column(SEQUENCES[order][-1])
     new, error = base, jax.tree.map(jnp.zeros_like, base)
     for n, weight, share in _shares(order):
@@ -212,9 +240,9 @@ def _step(order: int, problem: Prepared, times, control, y):
     return new, error
 
 
-def _compact_step(order: int, problem: Prepared, times, control, y):
+def _compact_step(order: int, problem: Prepared, times, control, y, compensated: bool):
     """The same in a loop over the columns, the base first."""
-    column = _columns(problem, times, control, y)
+    column = _columns(problem, times, control, y, compensated)
     counts, *weights = zip((SEQUENCES[order][-1], 0.0, 0.0), *_shares(order))
     dtype = jnp.result_type(*jax.tree.leaves(y))
 

@@ -16,8 +16,9 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
-from polhode._kernel import kernel
-from polhode.solvers._extrapolation import SEQUENCES, extrapolation_weights
+from polhode._kernel import apart, kernel
+from polhode.solvers._costates import FINER, AnyCostate, Costate, FlatCostate
+from polhode.solvers._extrapolation import SEQUENCES, carried_on, extrapolation_weights
 from polhode.solvers._linear import linear
 from polhode.solvers._specialise import specialise
 
@@ -29,11 +30,16 @@ def flow(
     span: tuple[Array, Array],
     count: Array,
     order: int,
+    compensated: bool = False,
+    costate: Costate | None = None,
 ) -> PyTree[Array]:
     r"""State at the time ``span[1]``, by ``count`` equal steps of ``Extrapolation(order)``.
 
     ``field(t, y, args)`` treats the bodies, the entries of the arrays of ``y``, separately; all
-    these arrays have one shape (n,). No derivative with respect to ``count``.
+    these arrays have one shape (n,). No derivative with respect to ``count``. ``compensated``: the
+    midpoint rule sums changes within a step, not states, and what rounding takes from the state
+    after a step is added to the next: less rounding, by a third longer. ``costate``: equations of
+    the slopes for states of special form, in place of those above.
 
     Reverse mode solves $y' = f$, $\lambda' = -\lambda\,\partial f/\partial y$,
     $\mu' = -\lambda\,\partial f/\partial c$ backwards, $c$ the coefficients that ``field`` is made
@@ -46,13 +52,19 @@ def flow(
         E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I,
         section I.14, on the variational equations.
     """
-    equations, c = equations_of(field, args, y0, span[0], order)
+    equations, c = equations_of(field, args, y0, span[0], order, compensated, costate)
     leaves, tree = jax.tree.flatten(y0)
     return jax.tree.unflatten(tree, equations.end(c, leaves, *span, count))
 
 
 def equations_of(
-    field: Callable[..., PyTree], args: PyTree, y0: PyTree[Array], t: Array, order: int
+    field: Callable[..., PyTree],
+    args: PyTree,
+    y0: PyTree[Array],
+    t: Array,
+    order: int,
+    compensated: bool = False,
+    costate: Costate | None = None,
 ) -> tuple["Equations", list[Array]]:
     """The field on lists of arrays, and all arrays that it rests on.
 
@@ -62,14 +74,17 @@ def equations_of(
     arrays, static = eqx.partition(args, eqx.is_array)
     arrays, args_tree = jax.tree.flatten(arrays)
 
+    def opened(given):
+        return eqx.combine(jax.tree.unflatten(args_tree, given), static)
+
     def plain(t, *given):
         y = jax.tree.unflatten(tree, given[: len(leaves)])
-        full = eqx.combine(jax.tree.unflatten(args_tree, given[len(leaves) :]), static)
-        return jax.tree.leaves(field(t, y, full))
+        return jax.tree.leaves(field(t, y, opened(given[len(leaves) :])))
 
     closed = jax.make_jaxpr(plain)(t, *leaves, *arrays)
-    equations = Equations(closed.jaxpr, len(closed.consts), len(leaves), order)
-    return equations, [*closed.consts, *arrays]
+    flat = None if costate is None else FlatCostate(costate, y0, t, arrays, opened)
+    c = [*closed.consts, *([] if flat is None else flat.consts), *arrays]
+    return Equations(closed.jaxpr, len(closed.consts), len(leaves), order, compensated, flat), c
 
 
 class Equations:
@@ -79,16 +94,30 @@ class Equations:
     the same found by other means, with the derivatives of the solution.
     """
 
-    def __init__(self, jaxpr, closed_over: int, size: int, order: int):
-        self.jaxpr, self.closed_over, self.size, self.order = jaxpr, closed_over, size, order
+    def __init__(self, jaxpr, closed_over, size, order, compensated, costate):
+        self.jaxpr, self.closed_over, self.size = jaxpr, closed_over, size
+        self.order, self.compensated = order, compensated
+        self.costate = AnyCostate(self.field) if costate is None else costate
         self.end = jax.custom_jvp(self._end)
         self.end.defjvp(self._end_jvp, symbolic_zeros=True)
         self.pinned = jax.custom_jvp(lambda c, y, t0, t1, count, end: list(end))
         self.pinned.defjvp(self._pinned_jvp, symbolic_zeros=True)
 
+    def _parts(self, c: Sequence[Any]):
+        """What the field closes over, what the costate does, arguments of both."""
+        known = len(getattr(self.costate, "consts", ()))
+        first, second = self.closed_over, self.closed_over + known
+        return list(c[:first]), list(c[first:second]), list(c[second:])
+
     def field(self, c: Sequence[Any], t, y: Sequence[Any]) -> list[Any]:
-        consts, arrays = c[: self.closed_over], c[self.closed_over :]
-        return jaxpr_as_fun(ClosedJaxpr(self.jaxpr, list(consts)))(t, *y, *arrays)
+        consts, _, arrays = self._parts(c)
+        return jaxpr_as_fun(ClosedJaxpr(self.jaxpr, consts))(t, *y, *arrays)
+
+    def back(self, c: Sequence[Any], t, z: Sequence[Any]) -> tuple[list[Any], Any]:
+        """Rates of state and costate, and the scalar whose slope by ``c`` is integrated."""
+        if isinstance(self.costate, AnyCostate):
+            return self.costate.rates(c, t, z)
+        return self.costate.at(*self._parts(c)[1:], t, z)
 
     def folded(self, c, t, y):
         """Coefficients that the field rests on, and what does the rest."""
@@ -152,22 +181,32 @@ class Equations:
         z = [*y, *dy]
         held, run, _ = specialise(jax.make_jaxpr(both)(*known, span[0], *z), known)
         z, _ = self._solve(
-            lambda h, t, z, along: (run(h, t, *z), []), held, z, [], span, count, _FINER
+            lambda h, t, z, along: (run(h, t, *z), []), held, z, [], span, count, FINER
         )
         return z[self.size :]
 
     def _cotangent(self, at, given, slopes):
         """The transpose: slopes with respect to the start and to ``c[i]``."""
-        span, count, _, end, c = self._split(given)
-        lane = end[0].shape
+        span, count, start, end, c = self._split(given)
+        z, size = self.costate.begin(end, slopes), len(c)
 
-        def coefficients(*some):
-            return list(self.folded(_put(c, at, some), span[0], end).held)
+        def paired(*given):
+            rates, k = self.back(given[:size], given[size], given[size + 1 :])
+            return [*rates, k]
 
-        made, run, seen = self.folded(c, span[0], end)
-        some = [c[i] for i in at]
-        which = _moving(coefficients, some)
-        held, pull = jax.vjp(lambda *some: [coefficients(*some)[i] for i in which], *some)
+        closed = jax.make_jaxpr(paired)(*c, span[0], *z)
+
+        def coefficients(fold, *some):
+            return list(specialise(closed, _put(c, at, some), fold=fold).held)
+
+        # components of what is differentiated are fewer than what folding makes of them
+        some, lane = [c[i] for i in at], end[0].shape
+        for fold in (False, True):
+            made, run, seen = specialise(closed, c, fold=fold)
+            which = _moving(partial(coefficients, fold), some)
+            if all(seen[i] == {lane} for i in which):
+                break
+        held, pull = jax.vjp(lambda *some: [coefficients(fold, *some)[i] for i in which], *some)
         del held
         # a number that all bodies share gets a slope in each: no sum in the loop
         shapes = [lane if seen[i] == {lane} else jnp.shape(made[i]) for i in which]
@@ -175,20 +214,18 @@ class Equations:
 
         def adjoint(*leaves, along=True):
             h, (t, *z) = leaves[: len(made)], leaves[len(made) :]
-            y, a = z[: self.size], z[self.size :]
 
-            def f(y, *some):
-                return run(_put(h, which, some), t, *y)
+            def pairing(*some):
+                *rates, k = run(_put(h, which, some), t, *z)
+                return jnp.sum(k), rates
 
             wide = [jnp.broadcast_to(h[i], s) for i, s in zip(which, shapes)]
-            if not along:
-                rate, pull = jax.vjp(f, y)
-                return [*rate, *(-x for x in pull(list(a))[0])]
-            rate, pull = jax.vjp(f, y, *wide)
-            slope, *quadratures = pull(list(a))
-            return [*rate, *(-x for x in slope), *(-x for x in quadratures)]
+            if not along or not which:
+                return pairing(*wide)[1]
+            moving = tuple(range(len(which)))
+            slopes, rates = jax.grad(pairing, argnums=moving, has_aux=True)(*wide)
+            return [*rates, *(-x for x in slopes)]
 
-        z = [*end, *slopes]
         full, bare = (
             specialise(jax.make_jaxpr(partial(adjoint, along=b))(*made, span[0], *z), made)
             for b in (True, False)
@@ -200,23 +237,30 @@ class Equations:
             found = full.run(held[0], t, *z)
             return found[: len(z)], found[len(z) :]
 
-        z, mu = self._solve(rates, (full.held, bare.held), z, mu, span[::-1], count, _FINER)
+        pace = self.costate.finer, self.costate.lower
+        z, mu = self._solve(rates, (full.held, bare.held), z, mu, span[::-1], count, *pace)
         mu = [_summed(m, jnp.shape(made[i])) for m, i in zip(mu, which)]
-        return [*z[self.size :], *pull(mu)]
+        return [*self.costate.finish(z, start, end, slopes), *pull(mu)]
 
-    def _solve(self, rates, held, y, quadratures, span, count, finer=1):
+    def _solve(self, rates, held, y, quadratures, span, count, finer=1.0, lower=0):
         """States and integrals at the end of equal steps."""
         t0, t1 = span
+        order = max(self.order - lower, min(SEQUENCES))
         dtype = jnp.result_type(*y)
         count = jnp.ceil(jnp.asarray(count, jnp.result_type(t0)) * finer)
         whole = count.astype(jnp.int32)
 
         def march(held, t0, width, whole, y, quadratures):
             def one(i, found):
+                y, low, sums = found
                 t = t0 + i.astype(width.dtype) * width
-                return _step(self.order, rates, held, t, width, dtype, *found)
+                change, more = _step(order, self.compensated, rates, held, t, width, dtype, y, sums)
+                y, low = carried_on(y, low, change) if self.compensated else (change, low)
+                return y, low, more
 
-            return jax.lax.fori_loop(0, whole, one, (y, quadratures))
+            low = [jnp.zeros_like(x) for x in y] if self.compensated else []
+            y, _, sums = jax.lax.fori_loop(0, whole, one, (y, low, quadratures))
+            return y, sums
 
         width = (t1 - t0) / count
         return kernel(march)(held, t0, width, whole, list(y), list(quadratures))
@@ -225,12 +269,12 @@ class Equations:
 _FORWARD = 1.25
 """Steps of a state that is differentiated over those asked for: its slope is more sensitive."""
 
-_FINER = 1.15
-"""Steps of the derivatives' equations over those asked for the state alone."""
 
+def _step(order: int, compensated: bool, rates, held, t0, width, dtype, y, quadratures):
+    """State after one extrapolated step, or its change where steps are ``compensated``; integrals.
 
-def _step(order: int, rates, held, t0, width, dtype, y, quadratures):
-    """One extrapolated step. Integrals of functions of the state need every other point only."""
+    Integrals of functions of the state need every other point only.
+    """
     sequence = SEQUENCES[order]
     weights = extrapolation_weights(sequence)
 
@@ -243,7 +287,11 @@ def _step(order: int, rates, held, t0, width, dtype, y, quadratures):
     def between(held, a, b, t, step):
         return _plus(a, step, rates(held, t, b, False)[0])
 
+    def place(a):
+        return apart(_sums, list(y), a, when=jnp.isfinite(width)) if compensated else a
+
     first = kernel(lambda held, t, y: rates(held, t, y, False)[0])(held, t0, y)
+    origin = [jnp.zeros_like(x) for x in y] if compensated else y
 
     def column(n):
         h = width / n
@@ -252,12 +300,12 @@ def _step(order: int, rates, held, t0, width, dtype, y, quadratures):
         def pair(i, found):
             a, b, sums = found
             t = t0 + (2 * i + 1).astype(h.dtype) * h
-            a, sums = whole(held, a, b, sums, t, step)
-            return a, between(held, b, a, t + h, step), sums
+            a, sums = whole(held, a, place(b), sums, t, step)
+            return a, between(held, b, place(a), t + h, step), sums
 
-        start = y, _plus(y, h.astype(dtype), first), [jnp.zeros_like(x) for x in quadratures]
-        found = jax.lax.fori_loop(0, n.astype(jnp.int32) // 2 - 1, pair, start)
-        return whole(held, *found, t0 + (width - h), step)
+        start = origin, _plus(origin, h.astype(dtype), first), [0 * x for x in quadratures]
+        a, b, sums = jax.lax.fori_loop(0, n.astype(jnp.int32) // 2 - 1, pair, start)
+        return whole(held, a, place(b), sums, t0 + (width - h), step)
 
     # one loop over the columns, the longest first, is compiled once
     counts = jnp.asarray((sequence[-1], *sequence[:-1]), jnp.result_type(width))
@@ -277,6 +325,10 @@ def _step(order: int, rates, held, t0, width, dtype, y, quadratures):
     empty = (list(y), [jnp.zeros_like(x) for x in quadratures])
     _, (y, sums) = jax.lax.fori_loop(0, len(sequence), add, (empty, empty))
     return y, [q + s for q, s in zip(quadratures, sums)]
+
+
+def _sums(y, a):
+    return [b + c for b, c in zip(y, a)]
 
 
 def _plus(y, step, f):

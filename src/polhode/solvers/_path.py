@@ -11,6 +11,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, PyTree
 
+from polhode.solvers._costates import Costate
 from polhode.solvers._flow import equations_of, is_slope
 
 Found = tuple[PyTree[Array], Array, PyTree[Array]]
@@ -25,6 +26,7 @@ def path(
     ts: Array,
     order: int,
     parts: int,
+    costate: Costate | None = None,
 ) -> Found:
     """States at ``ts`` by ``solve``, with the derivatives that ``flow`` of ``order`` has.
 
@@ -35,7 +37,7 @@ def path(
     them, forwards or backwards, in as many steps as the solver took there.
     """
     leaves, tree = jax.tree.flatten(y0)
-    equations, c = equations_of(field, args, y0, ts[0], order)
+    equations, c = equations_of(field, args, y0, ts[0], order, costate=costate)
     known, static = eqx.partition(given, eqx.is_array)
     split = -(-parts // (ts.shape[0] - 1))
 
@@ -69,7 +71,7 @@ def path(
 
             def across(y, part):
                 t0, t1, count, end = part
-                y = equations.pinned(c, y, t0, t1, count, end)
+                y = equations.pinned(c, y, t0, t1, _PACE * count.astype(ts.dtype), end)
                 return y, y
 
             _, later = jax.lax.scan(across, start, (times[:-1], times[1:], counts, ends))
@@ -82,6 +84,10 @@ def path(
 
     states, counts, rest = run(known, c, leaves, ts)
     return jax.tree.unflatten(tree, states), counts, rest
+
+
+_PACE = 0.8
+"""Steps of the derivatives over those of the solver, whose error estimate is of a lower order."""
 
 
 def _refined(ts: Array, split: int) -> Array:

@@ -25,10 +25,18 @@ def _from_strang(order: int, half: tuple[float, ...], reference: str) -> Scheme:
 
 def _from_two_parts(order: int, a: tuple[float, ...], b: tuple[float, ...], ref: str) -> Scheme:
     """The composition whose two-part form is a_1 b_1 a_2 b_2 ...; ``a`` and ``b`` are the halves
-    without the entries that consistency fixes (the middle a, the last b)."""
-    b = (*b, 0.5 - sum(b))
-    whole_a = (*a, 1 - 2 * sum(a), *reversed(a))
-    whole_b = (*b, *reversed(b))
+    without the entries that consistency fixes: of the one with an entry in the middle that, of the
+    other the last one of the half."""
+
+    def whole(half, has_middle):
+        if has_middle:
+            return (*half, 1 - 2 * sum(half), *reversed(half))
+        half = (*half, 0.5 - sum(half))
+        return (*half, *reversed(half))
+
+    # one a more than b in all; what is fixed counts once in the half or in the middle
+    middle_is_a = len(a) > len(b)
+    whole_a, whole_b = whole(a, middle_is_a), whole(b, not middle_is_a)
     coefficients = [whole_a[0]]
     for i, value in enumerate(whole_b):
         coefficients.append(value - coefficients[-1])
@@ -75,5 +83,39 @@ KAHAN_LI_8 = _from_strang(
     "W. Kahan, R.-C. Li, Math. Comp. 66 (1997) 1089, s17odr8a",
 )
 
+NYSTROM_4 = _from_two_parts(
+    4,
+    (0.0829844064174052, 0.396309801498368, -0.0390563049223486),
+    (0.245298957184271, 0.604872665711080),
+    "S. Blanes, P. C. Moan, J. Comput. Appl. Math. 142 (2002) 313, table 3, SRKN6b",
+)
+
+NYSTROM_6 = _from_two_parts(
+    6,
+    (
+        0.0,
+        0.09171915262446165,
+        0.183983170005006,
+        -0.05653436583288827,
+        0.004914688774712854,
+        0.143761127168358,
+        0.328567693746804,
+    ),
+    (
+        0.0378593198406116,
+        0.102635633102435,
+        -0.0258678882665587,
+        0.314241403071447,
+        -0.130144459517415,
+        0.106417700369543,
+        -0.00879424312851058,
+    ),
+    "S. Blanes, P. C. Moan, J. Comput. Appl. Math. 142 (2002) 313, table 3, SRKN14a",
+)
+
 SCHEMES = {s.order: s for s in (STRANG, BLANES_MOAN_4, BLANES_MOAN_6, KAHAN_LI_8)}
-"""The scheme used for each order."""
+"""The scheme of each order for any parts."""
+
+KICK_SCHEMES = {s.order: s for s in (STRANG, NYSTROM_4, NYSTROM_6, KAHAN_LI_8)}
+"""The scheme of each order for two parts, a kick and a motion whose energy is quadratic in the
+momenta: the two commute suitably (Runge-Kutta-Nyström), so fewer conditions hold up the order."""

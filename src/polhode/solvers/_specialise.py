@@ -24,6 +24,9 @@ _FOLDS = {
 _ELEMENTWISE = frozenset(
     (*_FOLDS, *"integer_pow square sqrt rsqrt sin cos exp log abs sign max min copy".split())  # noqa: SIM905
 )
+_TAKING_APART = frozenset(
+    "broadcast_in_dim convert_element_type copy gather reshape slice squeeze stop_gradient".split()  # noqa: SIM905
+)
 _CALLS = frozenset(("jit", "pjit", "closed_call"))
 
 
@@ -75,10 +78,13 @@ class _Step(NamedTuple):
     operands: list[tuple[Any, Any, tuple[int, ...]]]
 
 
-def specialise(closed: ClosedJaxpr, known: Sequence[Any]) -> Specialised:
-    """Takes the part of ``closed`` that needs only its first arguments, ``known``, out of it."""
+def specialise(closed: ClosedJaxpr, known: Sequence[Any], *, fold: bool = True) -> Specialised:
+    """Takes the part of ``closed`` that needs only its first arguments, ``known``, out of it.
+
+    Without ``fold`` these arguments are only taken apart: no arithmetic is done beforehand.
+    """
     jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals), True)
-    work = _Work()
+    work = _Work(fold)
     known = [_Held(x) for x in known]
     free = [work.slot(v.aval) for v in jaxpr.invars[len(known) :]]
     found = work.walk(jaxpr, closed.consts, [*known, *free])
@@ -125,7 +131,8 @@ def _needed(steps: list[_Step], out) -> tuple[_Step, ...]:
 class _Work:
     """Goes through a jaxpr once: computes what is known, notes down what is not."""
 
-    def __init__(self):
+    def __init__(self, fold: bool):
+        self.fold = fold
         self.steps: list[_Step] = []
         self.count = 0
         self.scaled: dict[Any, int] = {}
@@ -189,13 +196,26 @@ class _Work:
             inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
             return self.walk(inner.jaxpr, inner.consts, given)
         if not eqn.effects and all(isinstance(x, _Held) for x in given):
-            return self.known(eqn, given)
-        if len(eqn.outvars) == 1:
+            numbers = all(x.number is not None for x in given)
+            if self.fold or numbers or name in _TAKING_APART:
+                return self.known_once(eqn, given)
+        elif self.fold and len(eqn.outvars) == 1:
             simple = self.simplified(name, given, eqn.outvars[0].aval)
             if simple is not None:
                 return [simple]
         avals, outs = ([v.aval for v in vs] for vs in (eqn.invars, eqn.outvars))
         return self.emit(_binder(eqn), given, avals, outs, name in _ELEMENTWISE)
+
+    def known_once(self, eqn, given) -> list[_Held]:
+        """The same array for the same equation, when it is met again."""
+        name = eqn.primitive.name
+        if name not in _ELEMENTWISE and name not in _TAKING_APART:
+            return self.known(eqn, given)
+        key = (name, repr(eqn.params), eqn.outvars[0].aval, *(x.key for x in given))
+        if key not in self.found:
+            self.alive += [x.value for x in given]
+            (self.found[key],) = self.known(eqn, given)
+        return [self.found[key]]
 
     def known(self, eqn, given) -> list[_Held]:
         """An equation before the loop; numbers stay numbers as long as they can."""

@@ -10,10 +10,12 @@ import numpy as np
 from jaxtyping import Array
 
 from polhode._kernel import kernel
+from polhode.hamiltonian import cross, dot
 from polhode.solvers._blocks import check_layout, map_blocks
 from polhode.solvers._dense import CollocationInterpolation, collocate
+from polhode.solvers._moser_veselov import ORDERS, paced, prepare, tangents
 from polhode.solvers._problem import Problem
-from polhode.solvers._schemes import SCHEMES, Scheme
+from polhode.solvers._schemes import KICK_SCHEMES, SCHEMES, Scheme
 
 Vector = tuple[Array, Array, Array]
 Quaternion = tuple[Array, Array, Array, Array]
@@ -22,18 +24,26 @@ Quaternion = tuple[Array, Array, Array, Array]
 class Splitting(diffrax.AbstractSolver):
     r"""Composition of exactly solvable flows; order 2, 4, 6 or 8 with constant steps.
 
-    The Hamiltonian is taken apart into
-    - the kick: $L$ changes by the torque of the potential, the attitude rests;
-    - one rotation about each body axis, by what $1/I_i$ differs from the middle one, $1/I_b$;
-    - the symmetric part $|L|^2 / 2 I_b$, which turns the attitude about a constant $L$.
-    All three are exact, and for an axisymmetric body so is the free motion.
+    The Hamiltonian is taken apart into the kick, by which $L$ changes by the torque of the
+    potential while the attitude rests, and the free motion, which is moved in one of two ways:
+
+    - ``moser_veselov=None``: by exact flows of its parts. One rotation about each body axis, by
+      what $1/I_i$ differs from the middle one, $1/I_b$, and the symmetric part $|L|^2 / 2 I_b$,
+      which turns the attitude about a constant $L$. For an axisymmetric body the free motion is
+      exact. $\omega_i$ may be any function of $L_i$ and time: wheels along body axes.
+    - ``moser_veselov=p``: whole, by the preprocessed discrete Moser-Veselov step of order $p$ (2,
+      4, 6, 8 or 10). That takes a sixth of the time and leaves no error but that of $p$ and of the
+      kicks: the way to go for bodies without wheels. A part of a step must not turn the body by
+      much more than 1 rad; beyond 1.5 rad the state is NaN.
 
     State: ``(momentum, wxyz)``, three and four component arrays, body axes principal. The vector
     field must have the Lie-Poisson form with $\omega_i$ a function of $L_i$ only and a torque
-    that depends on attitude and time alone; flows and rates are read off from it.
+    that depends on attitude and time alone; flows and rates are read off from it, and the state is
+    NaN where axes are not principal.
 
-    - Order: that of the scheme (Strang; Blanes and Moan 4, 6; Kahan and Li 8), cost 1, 6, 10, 17
-      kicks and rotations about each axis per step.
+    - Order: that of the scheme, ``formal_order``, or $p$ if that is less. Parts of a step (kick and
+      free motion): 1, 6, 10, 17 (Strang; Blanes and Moan 4, 6; Kahan and Li 8), with
+      ``moser_veselov`` 1, 6, 14, 17 (Runge-Kutta-Nyström schemes of Blanes and Moan).
     - Exact up to rounding: $|q|$; $|L|$ without torque; the momentum along an axis of symmetry
       of the potential in space; time reversal. The energy error stays bounded.
     - No error estimate. Dense output: collocation polynomial.
@@ -43,14 +53,15 @@ class Splitting(diffrax.AbstractSolver):
 
     ??? cite "Reference"
         R. I. McLachlan, Phys. Rev. Lett. 71 (1993) 3043; E. Hairer, C. Lubich, G. Wanner,
-        Geometric Numerical Integration, sections II.4, V.3 and VII.5; the tables' sources stand
-        with the schemes.
+        Geometric Numerical Integration, sections II.4, V.3 and VII.5; E. Hairer, G. Vilmart,
+        J. Phys. A: Math. Gen. 39 (2006) 13225; the tables' sources stand with the schemes.
     """
 
     formal_order: int = eqx.field(static=True, default=4)
     middle: int = eqx.field(static=True, default=1)
     block: int | None = eqx.field(static=True, default=None)
     substeps: int = eqx.field(static=True, default=1)
+    moser_veselov: int | None = eqx.field(static=True, default=None)
 
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = CollocationInterpolation
@@ -62,14 +73,19 @@ class Splitting(diffrax.AbstractSolver):
             )
         if self.middle not in (0, 1, 2):
             raise ValueError(f"middle={self.middle}: give a body axis 0, 1 or 2.")
+        if self.moser_veselov not in (None, *ORDERS):
+            raise ValueError(
+                f"moser_veselov={self.moser_veselov}: the order of the free motion's step must be"
+                f" one of {ORDERS}, or None for rotations about the axes."
+            )
         check_layout(self.block, self.substeps)
 
     @property
     def scheme(self) -> Scheme:
-        return SCHEMES[self.formal_order]
+        return (SCHEMES if self.moser_veselov is None else KICK_SCHEMES)[self.formal_order]
 
     def order(self, terms) -> int:
-        return self.formal_order
+        return min(self.formal_order, self.moser_veselov or self.formal_order)
 
     def init(self, terms, t0, t1, y0, args) -> Vector:
         """The momentum in space axes: from step to step it passes unrounded."""
@@ -87,27 +103,25 @@ class Splitting(diffrax.AbstractSolver):
 
         def advance(state, rest):
             def run(*operands):
-                return _steps(self.scheme, self.middle, self.substeps, *operands)
+                return _steps(self, *operands)
 
-            return kernel(run)(*rest, state)
+            # a call of each piece costs as much as the few operations on hardly any body
+            whole = self.moser_veselov is None or state[0][0].size < 8
+            return (kernel(run) if whole else run)(*rest, state)
 
         problem = Problem.of(terms, args)
         rest = (problem, (t0, t1 - t0), problem.control(t0, t1, y0))
         state, nodes = map_blocks(advance, self.block, (momentum_space, tuple(y0[1])), rest)
         y1 = (_rotate_back(state[1], state[0]), state[1])
         nodes = (_rotate_back(nodes[1], nodes[0]), nodes[1])
-        dense = collocate(terms, t0, t1, nodes, y1, args, self.formal_order)
+        dense = collocate(terms, t0, t1, nodes, y1, args, self.order(terms))
         return y1, None, dense, state[0], diffrax.RESULTS.successful
-
-
-def _cross(a, b):
-    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def _rotate(wxyz, vector):
     """Space components of a vector given in body axes."""
-    twice = tuple(2 * x for x in _cross(wxyz[1:], vector))
-    return tuple(v + (wxyz[0] * a + b) for v, a, b in zip(vector, twice, _cross(wxyz[1:], twice)))
+    twice = tuple(2 * x for x in cross(wxyz[1:], vector))
+    return tuple(v + (wxyz[0] * a + b) for v, a, b in zip(vector, twice, cross(wxyz[1:], twice)))
 
 
 def _rotate_back(wxyz, vector):
@@ -137,7 +151,7 @@ def _spin(wxyz, momentum, inverse: Array):
     axis = tuple(sinc * h for h in half)
     w, v = wxyz[0], wxyz[1:]
     along = axis[0] * v[0] + axis[1] * v[1] + axis[2] * v[2]
-    turned = (c * x + (w * a + b) for x, a, b in zip(v, axis, _cross(axis, v)))
+    turned = (c * x + (w * a + b) for x, a, b in zip(v, axis, cross(axis, v)))
     return (w * c - along, *turned)
 
 
@@ -158,36 +172,44 @@ def _along(axis: int, value: Array) -> list[Array]:
     return [value if i == axis else jnp.zeros_like(value) for i in range(3)]
 
 
-def _steps(scheme: Scheme, middle: int, count: int, problem: Problem, times, control, state):
-    """Space momentum and attitude after ``count`` equal steps, and those they started from."""
+def _inverse_moments(problem: Problem, t, like: Array) -> tuple[list[Array], Array]:
+    """1/I_i, read off from the rates of unit momenta, and which bodies have rates without one.
+
+    NaN where the axes are not principal.
+    """
+    at_rest = _rates(problem, t, _along(0, jnp.zeros_like(like)))
+    inverse, oblique = [], jnp.zeros_like(like)
+    for i in range(3):
+        rates = [x - y for x, y in zip(_rates(problem, t, _along(i, jnp.ones_like(like))), at_rest)]
+        inverse.append(rates.pop(i))
+        oblique = jnp.maximum(oblique, jnp.maximum(*(abs(x) for x in rates)) / inverse[i])
+    principal = oblique <= jnp.sqrt(jnp.finfo(like.dtype).eps)
+    wheels = (at_rest[0] != 0) | (at_rest[1] != 0) | (at_rest[2] != 0)
+    return [jnp.where(principal, x, jnp.nan) for x in inverse], wheels
+
+
+def _steps(solver: Splitting, problem: Problem, times, control, state):
+    """Space momentum and attitude after equal steps, and those they started from."""
     t0, width = times
+    count, like = solver.substeps, state[0][0]
+    inverse, wheels = _inverse_moments(problem, t0, like)
+    if solver.moser_veselov is None:
+        move = _rotations(solver.middle, problem, inverse[solver.middle])
+    else:
+        inverse = [jnp.where(wheels, jnp.nan, x) for x in inverse]
+        move = _whole(solver.moser_veselov, inverse)
 
     def one(state, i):
         inner = (t0 + i * (width / count), width / count)
-        return _step(scheme, middle, problem, inner, control / count, state), state
+        return _step(solver.scheme, move, problem, inner, control / count, state), state
 
     return jax.lax.scan(one, state, jnp.arange(count, dtype=jnp.result_type(width)))
 
 
-def _step(scheme: Scheme, middle: int, problem: Problem, times, control, state):
-    """One step. The momentum is carried in space axes, where only the kick changes it: turned
-    with the body, equal steps would round alike and shift a conserved component steadily."""
-    t0, width = times
-    momentum, wxyz = state
-    one = jnp.ones_like(momentum[0])
-    inverse = (
-        _rates(problem, t0, _along(middle, one))[middle]
-        - _rates(problem, t0, _along(middle, 0 * one))[middle]
-    )
+def _rotations(middle: int, problem: Problem, inverse: Array):
+    """The free motion by rotations about the axes, the last ones undone in opposite order."""
 
-    @kernel
-    def kick(problem, t, span, momentum, wxyz):
-        zero = jnp.zeros_like(momentum[0])
-        torque, _ = problem.field(t, ((zero,) * 3, wxyz))
-        push = _rotate(wxyz, tuple(span * n for n in torque))
-        return tuple(m + p for m, p in zip(momentum, push))
-
-    def turn(axis):
+    def about(axis):
         @kernel
         def flow(problem, t, inverse, span, momentum, wxyz):
             along = _rotate_back(wxyz, momentum)[axis]
@@ -196,26 +218,76 @@ def _step(scheme: Scheme, middle: int, problem: Problem, times, control, state):
 
         return flow
 
-    turns = [turn((middle + 1) % 3), turn(middle), turn((middle + 2) % 3)]
+    turns = [about((middle + 1) % 3), about(middle), about((middle + 2) % 3)]
     spin = kernel(lambda inverse, span, momentum, wxyz: _spin(wxyz, momentum, inverse * span))
+
+    def move(times, spans, momentum, wxyz):
+        first, second = spans
+        for flow in turns:
+            wxyz = flow(problem, times[0], inverse, first, momentum, wxyz)
+        wxyz = spin(inverse, first + second, momentum, wxyz)  # time passes with it
+        for flow in reversed(turns):
+            wxyz = flow(problem, times[1], inverse, second, momentum, wxyz)
+        return wxyz
+
+    return move
+
+
+def _whole(order: int, inverse: list[Array]):
+    """The free motion in one step of Moser and Veselov. One unit for all of it would work out the
+    shared parts again for each component."""
+    prepared = kernel(lambda *inverse: prepare(inverse, order))(*inverse)
+
+    @kernel
+    def pace(prepared, span, momentum, wxyz):
+        return paced(prepared, span, _rotate_back(wxyz, momentum))
+
+    @kernel
+    def turned(wxyz, along, square):
+        cosine = 1 / jnp.sqrt(square)
+        w, *v = (cosine * x for x in wxyz)
+        rest = (x + (w * f + c) for x, f, c in zip(v, along, cross(v, along)))
+        return (w - dot(v, along), *rest)
+
+    def move(times, spans, momentum, wxyz):
+        angle, inverse = pace(prepared, spans[0] + spans[1], momentum, wxyz)
+        return turned(wxyz, *kernel(tangents)(angle, inverse))
+
+    return move
+
+
+def _step(scheme: Scheme, move, problem: Problem, times, control, state):
+    """One step. The momentum is carried in space axes, where only the kick changes it: turned
+    with the body, equal steps would round alike and shift a conserved component steadily."""
+    t0, width = times
+    momentum, wxyz = state
+
+    @kernel
+    def torque_of(problem, t, wxyz):
+        zero = jnp.zeros_like(wxyz[0])
+        return tuple(problem.field(t, ((zero,) * 3, wxyz))[0])
+
+    @kernel
+    def push(torque, span, momentum, wxyz):
+        return tuple(m + span * n for m, n in zip(momentum, _rotate(wxyz, torque)))
+
+    def kick(problem, t, span, momentum, wxyz):
+        return push(torque_of(problem, t, wxyz), span, momentum, wxyz)
 
     def pair(state, shares):
         """chi, then its adjoint; the kick that ended the pair before is merged into the first."""
         momentum, wxyz = state
-        time, before, first, second = shares
-        momentum = kick(problem, t0 + time * width, (before + first) * control, momentum, wxyz)
-        for flow in turns:
-            wxyz = flow(problem, t0, inverse, first * control, momentum, wxyz)
-        wxyz = spin(inverse, (first + second) * control, momentum, wxyz)
-        for flow in reversed(turns):
-            wxyz = flow(problem, t0, inverse, second * control, momentum, wxyz)
-        return (momentum, wxyz), None
+        time, after, before, first, second = shares
+        times = (t0 + time * width, t0 + after * width)
+        momentum = kick(problem, times[0], (before + first) * control, momentum, wxyz)
+        return (momentum, move(times, (first * control, second * control), momentum, wxyz)), None
 
     pairs = np.reshape(scheme.coefficients, (-1, 2))
-    time = np.concatenate([[0.0], np.cumsum(pairs.sum(axis=1))[:-1]])
+    after = np.cumsum(pairs.sum(axis=1))
+    time = np.concatenate([[0.0], after[:-1]])
     before = np.concatenate([[0.0], pairs[:-1, 1]])
-    weights = (jnp.asarray(x, one.dtype) for x in (before, pairs[:, 0], pairs[:, 1]))
-    shares = (jnp.asarray(time, jnp.result_type(width)), *weights)
-    (momentum, wxyz), _ = jax.lax.scan(pair, state, shares)
+    places = (jnp.asarray(x, jnp.result_type(width)) for x in (time, after))
+    weights = (jnp.asarray(x, momentum[0].dtype) for x in (before, pairs[:, 0], pairs[:, 1]))
+    (momentum, wxyz), _ = jax.lax.scan(pair, state, (*places, *weights))
     momentum = kick(problem, t0 + width, float(pairs[-1, 1]) * control, momentum, wxyz)
     return momentum, _normalise(wxyz)

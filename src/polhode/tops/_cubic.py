@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 
@@ -65,21 +66,34 @@ def _third_of_angle(x: Array) -> Array:
     return c
 
 
+@jax.custom_jvp
 def _isolated_root(f2: Array, f1: Array, f0: Array) -> tuple[Array, Array, Array]:
     """Of y^3 + f2 y^2 + f1 y + f0 (three real roots): the root farther from the middle one,
     whether it is the greatest, and a third of the spread of the roots."""
     q = (f2 * f2 - 3 * f1) / 9
     r = (2 * f2**3 - 9 * f2 * f1 + 27 * f0) / 54
     greatest = r <= 0
-    size = jnp.sqrt(jnp.maximum(jax.lax.stop_gradient(q), 0))
+    size = jnp.sqrt(jnp.maximum(q, 0))
     cube = size**3
     ratio = jnp.where(cube > 0, jnp.abs(r) / safe(cube > 0, cube), 1)
     part = 2 * size * _third_of_angle(jnp.minimum(ratio, 1))
-    y = jax.lax.stop_gradient(jnp.where(greatest, part, -part) - f2 / 3)
-    for _ in range(2):  # from a constant start: two steps carry the derivatives
+    y = jnp.where(greatest, part, -part) - f2 / 3
+    for _ in range(2):
         slope = (3 * y + 2 * f2) * y + f1
         y = y - jnp.where(slope > 0, (((y + f2) * y + f1) * y + f0) / safe(slope > 0, slope), 0)
     return y, greatest, size
+
+
+@_isolated_root.defjvp
+def _isolated_root_rule(primals, tangents):
+    (f2, f1, _), (d2, d1, d0) = primals, tangents
+    y, greatest, size = _isolated_root(*primals)
+    slope = (3 * y + 2 * f2) * y + f1
+    inverse = -jnp.where(slope > 0, 1 / safe(slope > 0, slope), 0)
+    dy = inverse * d0 + (inverse * y) * d1 + (inverse * y * y) * d2
+    # The others only choose between formulas.
+    none = np.zeros(greatest.shape, jax.dtypes.float0)
+    return (y, greatest, size), (dy, none, jnp.zeros_like(size))
 
 
 def cubic(weight: Array, vertical: tuple[Array, ...], momentum: tuple[Array, ...]) -> Cubic:

@@ -27,15 +27,7 @@ from jaxtyping import Array
 
 from polhode.tops._complex import Complex, opaque_one, settle, unit, where
 from polhode.tops._cubic import Cubic, cubic, positive, safe
-from polhode.tops._pochhammer import (
-    Curve,
-    curve,
-    from_opposite,
-    from_pole,
-    log_slope,
-    point,
-    product,
-)
+from polhode.tops._pochhammer import Curve, apart, curve, pair, point
 
 
 class Spinor(NamedTuple):
@@ -74,65 +66,71 @@ def _only(condition: Array, value: Array, other=0) -> Array:
     return jnp.where(condition, value, other)
 
 
-def _near_pole(f: Cubic, shift: Array, push: Complex, c: Curve):
-    """Place of a value g + shift/2 (see ``from_pole``); ``push``: twice dg/du there over depth."""
-    mean = f.reach * (f.total + shift)
-    step = push * f.reach
-    return from_pole(step + mean, -step + mean, c)
-
-
-def _near_third(f: Cubic, depth: Array, root: Complex, span: Array, c: Curve):
-    """The same for values nearer to the third root; ``root``: square root of the turned depth."""
-    scale = 1 / (f.amount * span)
-    lift, fall = (f.middle + depth) * scale, root * (jnp.sqrt(f.width) * scale)
-    return from_opposite(lift - fall, lift + fall, c)
-
-
 def _stack(*trees):
     return jax.tree.map(lambda *x: jnp.stack(x), *trees)
 
 
-def _choose(condition, a, b):
-    return type(a)(*(where(condition, x, y) for x, y in zip(a, b)))
+def _row(tree):
+    """Lanes (1, N), to go with several values per lane."""
+    return jax.tree.map(lambda x: x[None], tree)
+
+
+def _reciprocal(a: Complex, b: Complex, times: Array) -> tuple[Complex, Complex]:
+    """The pair so that its product is ``times`` where that is small and one is large, so that the
+    other is rounding: near three equal roots all would be."""
+    first, second = (x.square > 1 / 4 for x in (a, b))
+    large = where(first, a, where(second, b, Complex(jnp.ones_like(a.re), jnp.zeros_like(a.re))))
+    other = large.inverse * times
+    return where(second & ~first, other, a), where(first, other, b)
 
 
 def _places(f: Cubic, c: Curve, one: Array):
     """Places of the state, of g = -1 and of g = 1 (before the turning over), and their partners."""
     circular = f.circular
     zero = jnp.zeros_like(f.across)
-    # the state: g' is ``across``; nearer to the third root only where that bounds the motion
-    close = (~circular) & (f.depth < f.middle / 2)
-    span = jnp.sqrt(safe(close, f.times))
-    push = _only(~close, 2 * f.across / jnp.sqrt(safe(~close, positive(f.depth))))
-    far = _near_pole(
-        f._replace(total=_only(~close, f.total)),
-        zero,
-        Complex(_only(~circular, push), _only(circular, push)),
-        c,
-    )
-    third = _near_third(f, f.depth * _only(close, 1), Complex(-f.across / span, zero), span, c)
-    state = _choose(close, third, far)
+    # Twice dg/du at the place over the root of its depth; nearer to the third root (where that
+    # bounds the motion) the square root of the turned depth instead.
+    state_close = (~circular) & (f.depth < f.middle / 2)
+    state_span = jnp.sqrt(safe(state_close, f.times))
+    state_push = 2 * f.across / jnp.sqrt(safe(~state_close, positive(f.depth)))
+    state_push = _only(~state_close, state_push)
     # g = -1, where A g' = i (p + b)
-    push = -2 * (f.along + f.momentum * f.above) / jnp.sqrt(positive(f.depth + f.amount * f.above))
-    lower = _near_pole(f, 2 * f.above, Complex(_only(circular, push), _only(~circular, -push)), c)
+    lower_push = 2 * (f.along + f.momentum * f.above)
+    lower_push = -lower_push / jnp.sqrt(positive(f.depth + f.amount * f.above))
     # g = 1, where A g' = i (p - b)
     depth = f.depth - f.amount * f.below
     upright = f.along - f.momentum * f.below
     close = (depth < f.middle / 2) | ~circular
     span = jnp.sqrt(safe(close, positive(f.below**2 - f.total * f.below + f.times)))
-    far = _near_pole(
-        f._replace(total=_only(~close, f.total)),
-        _only(~close, -2 * f.below),
-        Complex(_only(~close, -2 * upright / jnp.sqrt(safe(~close, depth))), zero),
-        c,
+    push = _only(~close, -2 * upright / jnp.sqrt(safe(~close, depth)))
+    mean = jnp.stack([
+        _only(~state_close, f.total), f.total + 2 * f.above, _only(~close, f.total - 2 * f.below)
+    ])  # fmt: skip
+    step = Complex(
+        jnp.stack([_only(~circular, state_push), _only(circular, lower_push), push]),
+        jnp.stack([_only(circular, state_push), _only(~circular, -lower_push), zero]),
     )
+    # near the third root
     root = _only(close, upright) / span
-    third = _near_third(
-        f, _only(close, depth), Complex(_only(circular, root), _only(~circular, -root)), span, c
+    near = jnp.stack([state_close, jnp.zeros_like(close), close])
+    depth = jnp.stack([f.depth, zero, depth])
+    span = jnp.stack([state_span, jnp.ones_like(span), span])
+    fall = Complex(
+        jnp.stack([-f.across / state_span, zero, _only(circular, root)]),
+        jnp.stack([zero, zero, _only(~circular, -root)]),
     )
-    upper = _choose(close, third, far)
-    stacked = settle(_stack(state, lower, upper), one)
-    return settle(jax.vmap(point, in_axes=(0, None, None))(stacked, c, one), one)
+    f, c, one = _row((f, c, one))
+    scale = 1 / safe(near, f.amount * span)
+    lift, fall = settle(((f.middle + depth) * scale, fall * (scale * jnp.sqrt(f.width))), one)
+    mean, step = settle((mean * f.reach, step * f.reach), one)
+    e, partner = _reciprocal(step + mean, -step + mean, c.square)
+    half = settle(((1 + partner) * (1 + e).inverse).root, one)
+    lead = where(near, -fall + lift, e * half)
+    rest = where(near, fall + lift, partner * half.inverse)
+    lead, rest = settle((lead, rest), one)
+    pull = jnp.where(near, c.square, 1) * c.steps[0]
+    first, second = point(lead, rest, pull, c, one)
+    return settle((first * jnp.where(near, -1, c.per), second * jnp.where(near, -c.h, c.per)), one)
 
 
 def _settled_start(c: Curve, start: Complex, partner: Complex):
@@ -174,57 +172,84 @@ def orbit(
     f = settle(cubic(2 * transverse * pull, vertical, momentum), one)
     c = settle(curve(f.square), one)
     places, partners = _places(f, c, one)
-    start, partner = _settled_start(c, places.at(0), partners.at(0))
-    nu = jnp.sqrt(f.width) / (4 * c.stretch)
-    zero = jnp.zeros_like(nu)
-    nu_complex = Complex(_only(f.circular, nu), _only(~f.circular, nu))
+    start, partner = settle(_settled_start(c, places.at(0), partners.at(0)), one)
+    nu = settle(jnp.sqrt(f.width) / (4 * c.stretch), one)
+    origin, twist = pair(start.re + partner.re, c.h, jnp.ones_like(c.h), c.series)
+    base = settle((partner - start) * (twist / origin), one)
+    x, mirror = places.at(slice(1, 3)), partners.at(slice(1, 3))
+    turning = _turning(x, mirror, c, one)
+    # alpha vanishes where g = -1, before the turning over
+    upward = f.sign > 0
+    x, mirror, turning = (
+        _stack(where(upward, v.at(0), v.at(1)), where(upward, v.at(1), v.at(0)))
+        for v in (x, mirror, turning)
+    )
     push = Complex(momentum[1], momentum[0]) * (1 / (2 * f.unit))
-    base = log_slope(start, c.weights) - log_slope(partner, c.weights)
+    value, rate = settle((_stack(alpha, beta), _stack(-(beta.conj * push), alpha.conj * push)), one)
+    whole = Orbit(c, start, partner, f.circular, nu * f.unit / transverse, None)
     frequency = f.unit / transverse
 
-    origin = product(start, c.weights)[0] * product(partner, c.weights)[0]
-    base, origin = settle((base, origin), one)
-
-    def parameter(value, rate, below):
-        x, mirror = (where(below, v.at(1), v.at(2)) for v in (places, partners))
-        x, mirror = settle((x, mirror), one)
-        turning = settle(log_slope(x, c.weights) - log_slope(mirror, c.weights), one)
-        k = -(nu_complex * (1 + 2 * turning)) - f.momentum / 2
-        ahead, behind = settle((mirror * start, x * partner), one)
-        behind_value, behind_slope = settle(product(behind, c.weights), one)
-        ahead_value, ahead_slope = settle(product(ahead, c.weights), one)
-        ratios = ahead_slope * ahead_value.inverse, behind_slope * behind_value.inverse
-        inner = settle(base + ratios[0] - ratios[1], one)
-        # From the rate at the start. Where nothing nutates (nu = 0) the phase alone turns.
-        steady = (rate * value.conj).im / safe(value.square > 0, value.square)
-        k = settle(where(f.live, k, Complex(steady, zero)), one)
-        drift = (k * value).times_i - rate
-        d = drift * (-nu_complex.conj.times_i) * (1 / (2 * nu * nu)) + inner * value
-        d = settle(where(f.live, d, Complex(zero, zero)), one)
-        scale = settle(origin * (ahead_value * behind_value).inverse, one)
-        angle = where(f.circular | (x.square == 0), Complex(jnp.ones_like(zero), zero), x)
-        return Spinor(
-            scale * (value + d),
-            scale * d,
-            x,
-            mirror,
-            k * frequency + spin / 2,
-            jnp.arctan2(angle.im, angle.re),
-            below & ~f.circular,
-        )
-
-    lowered = f.sign > 0
-    spinors = jax.vmap(parameter)(
-        _stack(alpha, beta),
-        _stack(-(beta.conj * push), alpha.conj * push),
-        _stack(lowered, ~lowered),
+    f, c, one, start, partner, origin, base, nu, frequency, spin = _row(
+        (f, c, one, start, partner, origin, base, nu, frequency, spin)
     )
-    return Orbit(c, start, partner, f.circular, nu * frequency, settle(spinors, one))
+    zero = jnp.zeros_like(value.re)
+    nu_complex = Complex(_only(f.circular, nu), _only(~f.circular, nu))
+    ahead, behind = settle((mirror * start, x * partner), one)
+    theta, slope = settle(apart(ahead, behind, c.series, one), one)
+    inverse = settle(theta.inverse, one)
+    inner = settle(base + slope * inverse, one)
+    # From the rate at the start. Where nothing nutates (nu = 0) the phase alone turns.
+    steady = (rate * value.conj).im / safe(value.square > 0, value.square)
+    k = -(nu_complex * (1 + 2 * turning)) - f.momentum / 2
+    k = settle(where(f.live, k, Complex(steady, zero)), one)
+    drift = (k * value).times_i - rate
+    d = drift * (-nu_complex.conj.times_i) * (1 / (2 * nu * nu)) + inner * value
+    d = settle(where(f.live, d, Complex(zero, zero)), one)
+    # d : c = E : x. Where one of them is far below the other, the difference from the rate would
+    # leave it rounding, which exp(2 i nu t) near the separatrix makes large.
+    unsteady = f.live & ~f.circular
+    first = unsteady & (4 * start.square < x.square)
+    second = unsteady & (4 * x.square < start.square)
+    nothing = Complex(zero, zero)
+    large = where(first, x, where(second, start, nothing + 1))
+    ratio = where(first, start, where(second, x, nothing)) * large.inverse
+    most = settle(value * (1 - ratio).inverse, one)
+    least = settle(most * ratio, one)
+    whole_part, d = (
+        where(first, most, where(second, -least, value + d)),
+        where(first, least, where(second, -most, d)),
+    )
+    scale = settle(inverse * origin, one)
+    plain = f.circular | (x.square == 0)
+    spinors = Spinor(
+        scale * whole_part,
+        scale * d,
+        x,
+        mirror,
+        k * frequency + spin / 2,
+        jnp.arctan2(_only(~plain, x.im), jnp.where(plain, 1, x.re)),
+        jnp.stack([upward, ~upward]) & ~f.circular,
+    )
+    return whole._replace(spinors=settle(spinors, one))
+
+
+def _turning(x: Complex, mirror: Complex, c: Curve, one: Array) -> Complex:
+    """Difference of the logarithmic slopes at x and h/x, for the places of g = -1 and g = 1.
+
+    Of g = -1 it comes of the pair x, h/x, of g = 1 of h x, h/x: their sums are real.
+    """
+    ones = jnp.ones_like(c.h)
+    moved = x * jnp.stack([ones, c.h])
+    times, rise = jnp.stack([c.h, c.h * c.h]), jnp.stack([ones, 2 * c.h])
+    norm, twist = pair(moved.re + mirror.re, times, rise, _row(c.series))
+    turning = settle((mirror - moved) * (twist / norm), _row(one))
+    upper = x.at(1)
+    return _stack(turning.at(0), turning.at(1) + upper * (1 - upper).inverse)
 
 
 def at(o: Orbit, elapsed: Array) -> tuple[Complex, Complex, Complex]:
     """alpha, beta and omega_y + i omega_x at times [s] that broadcast against the lanes."""
-    weights, circular = o.curve.weights, o.circular
+    series, circular = o.curve.series, o.circular
     angle = 2 * o.nu * elapsed
     # Whole periods of real exponentials; on the separatrix itself there is none.
     periodic = ~circular & (o.curve.h > 0)
@@ -240,19 +265,17 @@ def at(o: Orbit, elapsed: Array) -> tuple[Complex, Complex, Complex]:
     forward, backward = o.start * f, o.partner * inverse
     one = opaque_one(angle)
     f, forward, backward = settle((f, forward, backward), one)
-    below = settle(product(forward, weights)[0], one) * settle(product(backward, weights)[0], one)
-    below = settle(below.inverse, one)
+    below = pair(forward.re + backward.re, o.curve.h, jnp.ones_like(o.curve.h), series)[0]
+    below = settle(1 / below, one)
 
     def parameter(s: Spinor):
-        first, first_slope = settle(product(settle(s.mirror * forward, one), weights), one)
-        second, second_slope = settle(product(settle(s.place * backward, one), weights), one)
+        ahead, behind = settle((s.mirror * forward, s.place * backward), one)
+        theta, twist = settle(apart(ahead, behind, series, one), one)
         fading = s.d * f
-        theta = first * second
-        whole = (s.c - fading) * theta
-        slope = (s.c - fading) * (first_slope * second - first * second_slope) - fading * theta
-        whole, slope = settle((whole, slope), one)
+        left = s.c - fading
+        whole, slope = settle((left * theta, left * twist - fading * theta), one)
         phase = unit(s.rate.re * elapsed + count * s.turn)
-        factor = below * phase * jnp.where(s.growing, 1 / half, 1)
+        factor = phase * (below * jnp.where(s.growing, 1 / half, 1))
         factor = settle(factor, one)
         nu = 2 * o.nu
         slope = where(circular, slope * nu, slope.times_i * nu)

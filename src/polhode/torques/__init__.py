@@ -2,6 +2,7 @@
 
 from polhode.torques._orbit import (
     KeplerOrbit as KeplerOrbit,
+    StateOrbit as StateOrbit,
     eccentric_anomaly as eccentric_anomaly,
 )
 from polhode.torques._potentials import (

@@ -60,7 +60,11 @@ def _value(n, t):
 
 
 class BodyTorque(AbstractTorque):
-    """Torque given in body axes [N m]: constant (..., 3) or a function of time [s] -> (3,)."""
+    """Torque given in body axes [N m]: constant (..., 3) or a function of time [s] -> (3,).
+
+    The function may jump. A pulse far shorter than a step can be missed: put its times among those
+    that are simulated, which are stepped to.
+    """
 
     n: Float[Array, "*#b 3"] | Callable
 
