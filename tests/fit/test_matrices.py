@@ -96,3 +96,9 @@ def test_values_are_those_of_numpy(affected, dtype):
     want = [np.linalg.lstsq(a, b)[0] for a, b in zip(tall.reshape(10, 8, 4), ahead.reshape(10, 8))]
     got = matrices.least_squares(tall, ahead).reshape(10, 4)
     np.testing.assert_allclose(got, want, atol=10 * bound)
+
+
+def test_an_inverse_has_derivatives_in_both_modes(affected):
+    want = -np.einsum("ai,jb->abij", np.linalg.inv(SPD[0, 0]), np.linalg.inv(SPD[0, 0]))
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(mode(matrices.inverse)(jnp.asarray(SPD[0, 0])), want, atol=1e-13)

@@ -47,9 +47,15 @@ def solve(matrix: Array, right: Array) -> Array:
 
 
 @_singly("(n,n)->(n,n)")
-def inverse(matrix: Array) -> Array:
-    """Inverses of matrices (..., n, n)."""
+def _inverse(matrix: Array) -> Array:
     return jnp.linalg.inv(matrix)
+
+
+def inverse(matrix: Array) -> Array:
+    """Inverses of matrices (..., n, n), with derivatives in both modes."""
+    fixed = jax.lax.stop_gradient(matrix)
+    found = _inverse(fixed)
+    return found - found @ (matrix - fixed) @ found  # loops of single matrices have none
 
 
 @_singly("(n,n)->(n,n),(n),(n,n)")
