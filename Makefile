@@ -3,32 +3,42 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN = $(VENV)/bin
 STAMP = $(VENV)/.installed-$(1)
+PYTEST = $(BIN)/python -m pytest -n 2 --dist worksteal --durations=25 --nbmake --nbmake-timeout=600
 
-.PHONY: demo test lint bench notebooks clean help
+.PHONY: demo test test-all test-versions lint bench docs notebooks clean help
 
 help:  ## show the commands
-	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
 
 demo: $(call STAMP,test)  ## simulate asteroid Toutatis with 1,000 clones; writes out/toutatis.nc and .png
 	@mkdir -p out
 	$(BIN)/polhode run scenes/toutatis.toml --output out/toutatis.nc
 
-test: $(call STAMP,test)  ## run the test suite, notebooks included
-	$(BIN)/python -m pytest -n 2 --dist worksteal --nbmake --nbmake-timeout=300 tests notebooks
+test: $(call STAMP,test)  ## run the tests but the slow ones, and one notebook
+	$(PYTEST) -m 'not slow' tests notebooks/quick_start.ipynb
+
+test-all: $(call STAMP,test) $(call STAMP,docs) test-versions  ## run every test and notebook, build the documentation, and the lowest and newest versions
+	$(PYTEST) tests notebooks
+
+test-versions:  ## a smoke test on the lowest and on the newest versions of what polhode needs
+	$(PYTHON) tests/versions.py
 
 lint: $(call STAMP,lint)  ## ruff and pyright
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/pyright
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
 bench: $(call STAMP,bench)  ## the quick benchmark tables and figures, beside the peers that are installed
 	$(BIN)/python -m benchmarks --quick
+
+docs: $(call STAMP,docs)  ## build the documentation into site/, without a network; a broken link is an error
+	$(BIN)/python -m mkdocs build
 
 notebooks: $(call STAMP,test)  ## execute the notebooks from their text forms, outputs kept
 	cd notebooks && for script in *.py; do ../$(BIN)/jupytext --to ipynb --execute $$script || exit 1; done
 
 clean:  ## remove what the commands made
-	rm -rf $(VENV) out
+	rm -rf $(VENV) .venv-lowest .venv-newest out site
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
@@ -48,4 +58,8 @@ $(call STAMP,bench): $(VENV)/bin/python pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[all]' --group test
 	$(BIN)/python -m pip install --quiet --group bench || for peer in numba heyoka mujoco; do \
 		$(BIN)/python -m pip install --quiet $$peer || echo "not installed: $$peer"; done
+	@touch $@
+
+$(call STAMP,docs): $(VENV)/bin/python pyproject.toml
+	$(BIN)/python -m pip install --quiet --editable '.[all]' --group docs
 	@touch $@

@@ -85,7 +85,7 @@ def own(problem: Problem, n: int, rtol: float, by: str = "moments"):
         )  # fmt: skip
         return loss(end.wxyz[:, 0].T, end.omega_body[:, 0].T)
 
-    name = f"default: {type(method).__name__}"
+    name = f"default: {type(getattr(method, 'solver', method)).__name__}"
     if by == "moments":
         return value, moments, name
 

@@ -63,8 +63,8 @@ def programs(problem, bodies, steps):
     for free, table in ((10, WHOLE), (None, ROTATIONS)):
         for order, counts in table.items():
             for count in counts[:steps]:
-                solver = Splitting(order, moser_veselov=free, substeps=50)
-                width = jnp.asarray(problem.horizon * solver.substeps / count)  # compiled once
+                solver = Splitting(order, moser_veselov=free)
+                width = jnp.asarray(problem.horizon / count)  # compiled once
                 method = ph.LiePoisson(solver, dt0=width)
                 kind = "rotations" if free is None else f"Moser-Veselov {free}"
                 found[f"{kind}, order {order}", f"{count} steps", order] = program(method)

@@ -11,6 +11,9 @@
 # %% [markdown]
 # # The Hamiltonian in Euler angles, and why the chart fails at the poles
 #
+# [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/euler_hamiltonian.ipynb)
+# (there, run `%pip install 'polhode[all]'` first)
+#
 # With ZYZ Euler angles $q=(\varphi,\theta,\psi)$ and their momenta $p$, the kinetic energy of a
 # rigid body is a quadratic form, $H=\tfrac12\,p\cdot V(q)\,p$. Done by hand, Hamilton's equations
 # take pages: $\dot q = Vp$, $\dot p_\varphi=0$, $\dot p_\theta=p\cdot\Theta p$,

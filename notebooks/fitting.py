@@ -11,6 +11,9 @@
 # %% [markdown]
 # # Inertia from a toss
 #
+# [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/fitting.ipynb)
+# (there, run `%pip install 'polhode[all]'` first)
+#
 # A box with a gyroscope inside is thrown. It tumbles for a second, freely but for the air, and the
 # gyroscope writes down three rates two hundred times a second. What is its inertia? The file
 # `toss.csv` is such a recording, made by a simulation so that the answer can be checked: a box of

@@ -11,6 +11,9 @@
 # %% [markdown]
 # # Inertia: which axis does this body really spin about?
 #
+# [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/inertia.ipynb)
+# (there, run `%pip install 'polhode[all]'` first)
+#
 # A spacecraft is drawn in its designer's axes and told to spin about z. Bodies do not know the
 # drawing: they know their principal axes. From parts to tensor, from tensor to axes, and from
 # there to the motion.

@@ -11,6 +11,9 @@
 # %% [markdown]
 # # Quick start: one body, a batch, a gradient
 #
+# [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/quick_start.ipynb)
+# (there, run `%pip install 'polhode[all]'` first)
+#
 # A rigid body is an inertia; its state is an attitude and body rates. polhode moves it, batches
 # of it, and differentiates through the motion. Everything is JAX: arrays in, arrays out.
 

@@ -11,6 +11,9 @@
 # %% [markdown]
 # # Rotating frames: three questions
 #
+# [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/rotating_frames.ipynb)
+# (there, run `%pip install 'polhode[all]'` first)
+#
 # A particle seen from a frame that turns feels forces that nobody exerts: centrifugal, Coriolis
 # and, when the turning changes, Euler's. `ph.RotatingFrame` knows them by name,
 # `ph.simulate_particles` moves particles under them.

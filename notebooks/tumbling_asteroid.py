@@ -11,6 +11,9 @@
 # %% [markdown]
 # # A tumbling asteroid against what was seen
 #
+# [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/tumbling_asteroid.ipynb)
+# (there, run `%pip install 'polhode[all]'` first)
+#
 # Toutatis, a rock of 4.6 km that passes the Earth every four years, does not spin: it tumbles.
 # Radar images of December 1992 gave its attitude on seventeen days. The scene file
 # `scenes/toutatis.toml` holds a published state and the published observations, with sources.

@@ -11,6 +11,9 @@
 # %% [markdown]
 # # What does a digit cost?
 #
+# [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/work_and_precision.ipynb)
+# (there, run `%pip install 'polhode[all]'` first)
+#
 # A fast answer that is wrong is worth nothing, and a conserved energy is no proof that it is right.
 # So time is only ever shown beside the error, and the error is measured against a solution that
 # nothing here had a hand in: Taylor series in 40-digit arithmetic (`benchmarks/truth.py`).

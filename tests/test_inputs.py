@@ -1,13 +1,15 @@
 """Bad input gets a clear error: what was given, what is expected, how to mend it."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 
 import polhode as ph
+from polhode.methods import check_options
 
 INERTIA = ph.Inertia.from_moments([1.0, 1.5, 2.0])
 SCENE = ph.Scene(INERTIA)
@@ -131,6 +133,190 @@ def test_moments_near_the_largest_number_are_judged_like_others():
         ph.Inertia.from_moments(np.array([0.1, 0.2, 1.7]) * 1e308)
 
 
+METHOD = ph.LiePoisson(max_steps=64)
+
+
+@pytest.mark.parametrize("odd", ["1e-6", True, [1e-6], np.array([1e-6]), 1j, object(), b"1"])
+def test_a_tolerance_is_one_number(odd):
+    with pytest.raises(TypeError, match=r"rtol must be one number.*got"):
+        ph.simulate(SCENE, STATE, TS, rtol=odd)
+    with pytest.raises(TypeError, match="rtol must be one number"):
+        ph.explain(SCENE, STATE, TS, rtol=odd)
+
+
+def test_a_tolerance_is_small():
+    for coarse in (1.0, 100.0):
+        with pytest.raises(ValueError, match="rtol must be below 1"):
+            ph.simulate(SCENE, STATE, TS, rtol=coarse)
+    assert ph.simulate(SCENE, STATE, TS, rtol=np.float32(1e-6)).successful
+
+
+@pytest.mark.parametrize(
+    ("method", "word"),
+    [
+        (ph.LiePoisson, r"the function LiePoisson: call it, ph\.LiePoisson\(\)"),
+        (ph.ClosedForm, r"the class ClosedForm: make an object of it, ph\.ClosedForm\(\)"),
+        (diffrax.Tsit5, r"hand it to a chart, ph\.LiePoisson\(diffrax\.Tsit5\(\)\)"),
+        (diffrax.Tsit5(), r"hand it to a chart, ph\.LiePoisson\(diffrax\.Tsit5\(\)\)"),
+        ("Tsit5", "got str"),
+    ],
+)
+def test_a_method_is_an_object(method, word):
+    for call in (ph.simulate, ph.explain):
+        with pytest.raises(TypeError, match=word):
+            call(SCENE, STATE, TS, method)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "word"),
+    [
+        ({"solver": diffrax.Tsit5}, TypeError, r"the class Tsit5.*diffrax\.Tsit5\(\)"),
+        ({"solver": "Tsit5"}, TypeError, "solver must be a diffrax object"),
+        ({"solver": None}, TypeError, "solver must be a diffrax object"),
+        ({"controller": diffrax.PIDController}, TypeError, "the class PIDController"),
+        ({"controller": 1e-6}, TypeError, "controller must be a diffrax object"),
+        ({"adjoint": diffrax.ForwardMode}, TypeError, "the class ForwardMode"),
+        ({"adjoint": diffrax.BacksolveAdjoint()}, ValueError, "RecursiveCheckpointAdjoint"),
+        ({"solver": diffrax.SemiImplicitEuler()}, ValueError, "positions from momenta"),
+        ({"dt0": 0.0}, ValueError, "dt0 must be one step"),
+        ({"dt0": "0.1"}, TypeError, "dt0 must be"),
+        ({"max_steps": 10.5}, TypeError, "max_steps must be an integer"),
+        ({"max_steps": True}, TypeError, "max_steps must be an integer"),
+        ({"chunk": 0}, ValueError, "chunk must be at least 1"),
+    ],
+)
+def test_options_of_stepped_methods(options, error, word):
+    with pytest.raises(error, match=word):
+        check_options(**{"solver": diffrax.Tsit5(), **options})
+
+
+def test_options_that_are_right_pass():
+    for solver in (diffrax.Kvaerno5(), ph.solvers.Extrapolation(12), ph.solvers.Splitting()):
+        check_options(solver, diffrax.ConstantStepSize(), diffrax.ForwardMode(), dt0=-0.1)
+    check_options(diffrax.Tsit5(), max_steps=np.int64(4), chunk=1)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float16, jnp.bfloat16])
+def test_half_precision_is_refused_by_name(dtype):
+    state = ph.State(jnp.array([1, 0, 0, 0], dtype), jnp.array([0, 0, 1], dtype))
+    scene = ph.Scene(ph.Inertia(diagonal=jnp.array([1, 1.5, 2], dtype)))
+    with pytest.raises(TypeError, match=f"of {jnp.dtype(dtype).name}.*float32 or float64"):
+        ph.simulate(scene, state, TS)
+
+
+def test_unsorted_times_have_a_status_where_they_are_traced():
+    @jax.jit
+    def status(ts):
+        return ph.simulate(SCENE, STATE, ts).status
+
+    for times, good in (
+        ([0.0, 1, 2], True), ([2.0, 1, 0], True), ([0.0, 2, 1], False), ([0.0, 1, 1], False),
+        ([0.0, np.nan, 1], False),
+    ):  # fmt: skip
+        want = ph.Status.SUCCESSFUL if good else ph.Status.BAD_TIMES
+        assert status(jnp.array(times)) == want
+    own = jnp.array([[0.0, 1, 2], [0.0, 2, 1]])
+    np.testing.assert_array_equal(status(own), [ph.Status.SUCCESSFUL, ph.Status.BAD_TIMES])
+
+
+FRAME = ph.RotatingFrame.from_rate([0.0, 0, 1])
+BALL = ph.MassProperties.from_sphere(1.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "word"),
+    [
+        (lambda: BALL + ph.Inertia.spherical(1.0), TypeError, "join with ph.MassProperties"),
+        (lambda: BALL - 1.0, TypeError, "join with ph.MassProperties"),
+        (lambda: ph.MassProperties.of(1.0, [0, 0, 0], [1, 2, 3]), TypeError, "inertia must be a"),
+        (lambda: INERTIA.rates(3.0), ValueError, "momentum must have shape"),
+        (lambda: INERTIA.momentum(np.ones(4)), ValueError, "omega must have shape"),
+        (lambda: ph.periods(ph.Inertia(diagonal=[1.0, -1, 2]), STATE), ValueError, "a body can"),
+        (lambda: ph.hamiltonian([1.0, 2, 3]), TypeError, "needs the body's ph.Inertia"),
+        (lambda: ph.hamiltonian(INERTIA, lambda R, t: 1.0), TypeError, "the potential must be"),
+        (lambda: FRAME.coriolis(0.0, jnp.ones(2)), ValueError, "vector must have shape"),
+        (
+            lambda: ph.simulate_particles(FRAME, [1, 0, 0], [0, 0, 0], TS, solver=diffrax.Tsit5),
+            TypeError,
+            "the class Tsit5",
+        ),
+    ],
+)
+def test_parts_in_each_other_s_place(call, error, word):
+    with pytest.raises(error, match=word):
+        call()
+
+
+def test_lists_do_where_vectors_do(unchecked):
+    np.testing.assert_allclose(INERTIA.momentum([1, 2, 3]), [1, 3, 6])
+    np.testing.assert_allclose(FRAME.centrifugal(0.0, [1, 0, 0]), [1, 0, 0], atol=1e-15)
+    np.testing.assert_allclose(FRAME.position_to_space(0.0, [1, 2, 3]), [1, 2, 3])
+
+
+def omega_of(scene, state=STATE):
+    return ph.simulate(scene, state, TS, METHOD, rtol=1e-7).omega_body
+
+
+@pytest.mark.parametrize("made", [[1.0, 1.5, 2.0], (1, 1.5, 2), np.array([1.0, 1.5, 2.0])])
+def test_numbers_put_in_by_an_edit_become_arrays(made):
+    edited = eqx.tree_at(lambda s: s.inertia.diagonal, SCENE, made)
+    assert ph.simulate(edited, STATE, TS).successful
+    np.testing.assert_array_equal(
+        ph.simulate(edited, STATE, TS).wxyz, ph.simulate(SCENE, STATE, TS).wxyz
+    )
+
+
+@pytest.mark.parametrize(
+    ("where", "made", "error", "word"),
+    [
+        (lambda s: s.inertia.diagonal, "abc", TypeError, r"scene\.inertia\.diagonal must be"),
+        (lambda s: s.inertia.diagonal, [1.0, 2], ValueError, r"diagonal must have shape"),
+        (lambda s: s.inertia.diagonal, jnp.ones(4), ValueError, r"diagonal must have shape"),
+        (lambda s: s.inertia.diagonal, None, ValueError, "not both and not neither"),
+        (lambda s: s.inertia, jnp.ones(3), TypeError, "Scene inertia must be ph.Inertia"),
+        (lambda s: s.inertia, None, TypeError, "Scene inertia must be ph.Inertia"),
+    ],
+)
+def test_edits_that_leave_no_scene(where, made, error, word):
+    with pytest.raises(error, match=word):
+        ph.simulate(eqx.tree_at(where, SCENE, made), STATE, TS)
+
+
+EDITS = {
+    "centre off the axis": (
+        ph.Scene(ph.Inertia.axisymmetric(1.0, 1.5), ph.UniformGravity.axial(1.0, 0.5)),
+        lambda s: s.potential.centre_body,
+        jnp.array([0.25, 0.0, 0.5]),
+        ph.Scene(ph.Inertia([1.0, 1.0, 1.5]), ph.UniformGravity(1.0, [0.25, 0.0, 0.5])),
+    ),
+    "wheel off its axis": (
+        ph.Scene(INERTIA, rotors=ph.Rotor([0.0, 0, 1], inertia=0.2, speed=3.0, torque=0.1)),
+        lambda s: s.rotors.axis_body,
+        jnp.array([1.2, 0.0, 1.6]),  # of any length
+        ph.Scene(INERTIA, rotors=ph.Rotor([0.6, 0, 0.8], inertia=0.2, speed=3.0, torque=0.1)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", list(EDITS))
+def test_numbers_win_over_what_a_part_was_made_for(name):
+    scene, where, value, meant = EDITS[name]
+    edited = eqx.tree_at(where, scene, value)
+    np.testing.assert_allclose(omega_of(edited), omega_of(meant), rtol=0, atol=1e-12)
+    assert np.max(np.abs(omega_of(edited) - omega_of(scene))) > 1e-3
+    traced = jax.jit(lambda s: ph.simulate(s, STATE, TS, METHOD, rtol=1e-7).status)
+    assert traced(scene) == ph.Status.SUCCESSFUL
+    assert traced(edited) == ph.Status.WRONG_LAW
+
+
+def test_a_state_stepped_off_unit_length_is_a_rotation_again():
+    plain = ph.simulate(SCENE, STATE, TS).wxyz
+    edited = eqx.tree_at(lambda s: s.wxyz, STATE, 1.25 * STATE.wxyz)
+    np.testing.assert_allclose(ph.simulate(SCENE, edited, TS).wxyz, plain, rtol=0, atol=1e-15)
+    none = eqx.tree_at(lambda s: s.wxyz, STATE, 0 * STATE.wxyz)
+    assert ph.simulate(SCENE, none, TS, throw=False).status == ph.Status.NOT_FINITE
+
+
 garbage = st.one_of(
     st.none(),
     st.booleans(),
@@ -144,9 +330,11 @@ garbage = st.one_of(
 )
 
 
-@settings(max_examples=150, deadline=None)
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
 @given(first=garbage, second=garbage)
-def test_garbage_never_passes_silently(first, second):
+def test_garbage_never_passes_silently(unchecked, first, second):
     """A constructor raises ValueError or TypeError, or holds finite arrays of the right rank."""
     makers = [
         lambda: ph.State(first, second),

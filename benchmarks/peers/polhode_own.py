@@ -46,7 +46,7 @@ def programs(problem: Problem, n, dtype, tolerances, quick) -> list[Program]:
     if not stepped:
         asked = asked[:1]
     if not quick and problem.horizon < 1e4 and n <= 1000:
-        own = ph.LiePoisson(at_end=True)
+        own = ph.LiePoisson()
         asked += [("LiePoisson", t, own) for t in tolerances if own != asked[0][2]]
     built, found = {}, []
     for label, tolerance, method in asked:
@@ -55,14 +55,17 @@ def programs(problem: Problem, n, dtype, tolerances, quick) -> list[Program]:
             begin = time.perf_counter()
             built[repr(method)] = _compiled(method, given, starts[0], ts, record)
             spent = time.perf_counter() - begin
-        name = f"{label}: {type(method).__name__}" if label == DEFAULT else label
-        if isinstance(method, ph.Extrapolated):
-            name = f"{label}: Extrapolated"
+        name = f"{label}: {_named(method)}" if label == DEFAULT else label
         exact = isinstance(method, ph.ClosedForm | ph.LagrangeTop)
         call = _call(built[repr(method)], starts, jnp.asarray(tolerance, dtype), record, n)
         setting = "exact" if exact else f"{tolerance:.0e}"
         found.append(Program(name, setting, call, count, spent))
     return found
+
+
+def _named(method) -> str:
+    """By its solver where it steps."""
+    return type(getattr(method, "solver", method)).__name__
 
 
 def _compiled(method, given, start, ts, record):

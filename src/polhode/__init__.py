@@ -1,53 +1,32 @@
-"""polhode: rotating rigid bodies in JAX (simulate, differentiate, identify)."""
+"""polhode: rotating rigid bodies in JAX (simulate, differentiate, identify).
 
-from polhode import elliptic as elliptic, free as free, rotation as rotation, solvers as solvers
-from polhode._closed_form import ClosedForm as ClosedForm
-from polhode._extrapolated import Extrapolated as Extrapolated
-from polhode._methods import (
-    AbstractMethod as AbstractMethod,
-    EulerAngles as EulerAngles,
-    LiePoisson as LiePoisson,
-    Record as Record,
-)
-from polhode._periods import periods as periods
-from polhode._plan import Plan as Plan, choose as choose
-from polhode._scene import Scene as Scene
-from polhode._simulate import explain as explain, simulate as simulate
-from polhode._state import State as State
-from polhode._status import SimulationError as SimulationError, Status as Status
-from polhode._top_methods import (
-    FixedAxis as FixedAxis,
-    LagrangeTop as LagrangeTop,
-    SymmetricTop as SymmetricTop,
-)
-from polhode._trajectory import Trajectory as Trajectory
+The names of `_public` are here, imported when the first of them is asked for: `polhode --help` and
+mistakes in a scene file are told before JAX is loaded.
+"""
+
+import importlib.util
+from typing import TYPE_CHECKING, Any
+
 from polhode._version import __version__ as __version__
-from polhode.fit import fit_inertia as fit_inertia, fit_recordings as fit_recordings
-from polhode.frames import (
-    RotatingFrame as RotatingFrame,
-    accelerometer as accelerometer,
-    gyroscope as gyroscope,
-    simulate_particles as simulate_particles,
-)
-from polhode.free import Mode as Mode, Periods as Periods
-from polhode.hamiltonian import (
-    hamiltonian as hamiltonian,
-    hamiltons_equations as hamiltons_equations,
-)
-from polhode.inertia import Inertia as Inertia, MassProperties as MassProperties
-from polhode.torques import (
-    AbstractPotential as AbstractPotential,
-    AbstractRotor as AbstractRotor,
-    AbstractTorque as AbstractTorque,
-    BodyTorque as BodyTorque,
-    FeedbackTorque as FeedbackTorque,
-    GravityGradient as GravityGradient,
-    KeplerOrbit as KeplerOrbit,
-    LinearDamping as LinearDamping,
-    Potential as Potential,
-    QuadraticDamping as QuadraticDamping,
-    Rotor as Rotor,
-    SpaceTorque as SpaceTorque,
-    StateOrbit as StateOrbit,
-    UniformGravity as UniformGravity,
-)
+
+if TYPE_CHECKING:
+    from polhode._public import *  # noqa: F403 - the names, for type checkers
+
+
+def __getattr__(name: str) -> Any:
+    if name.startswith("_") and name != "__all__":
+        raise AttributeError(f"module 'polhode' has no attribute {name!r}")
+    if importlib.util.find_spec(f"polhode.{name}") is not None:  # a room, not yet imported
+        return importlib.import_module(f"polhode.{name}")
+    public = importlib.import_module("polhode._public")
+    names = {key: value for key, value in vars(public).items() if not key.startswith("_")}
+    if name == "__all__":
+        return sorted(names)
+    globals().update(names)
+    if name in names:
+        return names[name]
+    raise AttributeError(f"module 'polhode' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__getattr__("__all__")})

@@ -1,6 +1,7 @@
 """Input checks shared by every constructor: what was given, what is expected, how to mend it."""
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import Any
 
 import jax
@@ -13,6 +14,24 @@ from jaxtyping import Array
 def is_concrete(*values: Any) -> bool:
     """Whether every array leaf holds numbers now (is not being traced by jit, vmap or grad)."""
     return not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(values))
+
+
+def numbers(*arrays: Any) -> Any:
+    """NumPy where the arrays hold numbers now, else ``jax.numpy``: a look at a few numbers then
+    costs no dispatch, and they stay known while something else is traced."""
+    return np if is_concrete(arrays) and all(_is_here(x) for x in arrays) else jnp
+
+
+def together(found: Sequence[Any]) -> Any:
+    """Where all of these truth values (...) hold, batch axes broadcast; None for none."""
+    if not found:
+        return None
+    xp = numbers(*found)
+    return reduce(xp.logical_and, xp.broadcast_arrays(*found))
+
+
+def _is_here(x: Any) -> bool:
+    return getattr(x, "is_fully_addressable", True)
 
 
 def require(condition: Any, message: str) -> None:
@@ -29,12 +48,14 @@ def describe(value: Any, limit: int = 8) -> str:
     return f"array of shape {array.shape}"
 
 
-def as_float_array(name: str, value: Any, suffix: Sequence[int | None] = ()) -> Array:
+def as_float_array(
+    name: str, value: Any, suffix: Sequence[int | None] = (), *, finite: bool = True
+) -> Array:
     """A floating-point array whose trailing axes are ``suffix`` (None: any length).
 
     Lists and integers become the default float type, floating arrays keep theirs.
     Raises TypeError for what is no array of real numbers, ValueError for a wrong shape or,
-    where the values are known, for NaN or infinity.
+    where the values are known and ``finite``, for NaN or infinity.
     """
     try:
         leaves = jax.tree.leaves(value, is_leaf=lambda leaf: leaf is None)
@@ -58,7 +79,7 @@ def as_float_array(name: str, value: Any, suffix: Sequence[int | None] = ()) -> 
             f"{name} must have shape ({wanted}), got {array.shape}: put batch axes first"
             " and the components last."
         )
-    if is_concrete(array) and not bool(np.all(np.isfinite(np.asarray(array)))):
+    if finite and is_concrete(array) and not bool(np.all(np.isfinite(np.asarray(array)))):
         raise ValueError(
             f"{name} holds NaN or infinity ({describe(array)}): remove or mend these entries"
             " before the call."
@@ -66,6 +87,49 @@ def as_float_array(name: str, value: Any, suffix: Sequence[int | None] = ()) -> 
     return array
 
 
+def as_vectors(name: str, value: Any, size: int = 3) -> Array:
+    """An array (..., size) of floats, also from lists; NaN passes, and arrays at no cost."""
+    fits = isinstance(value, jax.Array) and value.shape[-1:] == (size,)
+    if fits and jnp.issubdtype(value.dtype, jnp.floating):
+        return value
+    return as_float_array(name, value, (size,), finite=False)
+
+
 def as_number(name: str, value: Any) -> Array:
     """A floating-point scalar or batch of scalars."""
     return as_float_array(name, value, ())
+
+
+def as_floats(
+    *, finite: bool = True, **given: tuple[Any, tuple[int | None, ...]]
+) -> tuple[Array, ...]:
+    """Arrays ``name=(value, suffix)`` of one floating dtype and with common batch axes.
+
+    Python numbers and lists follow the dtype of the arrays among them; alone, they take the
+    default one. A mixture of array dtypes takes the wider one.
+    """
+    kinds = [
+        value.dtype
+        for value, _ in given.values()
+        if hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jnp.floating)
+    ]
+    arrays = [
+        as_float_array(name, value, suffix, finite=finite)
+        for name, (value, suffix) in given.items()
+    ]
+    if kinds:
+        common = kinds[0]
+        for kind in kinds[1:]:
+            common = jnp.promote_types(common, kind)
+        arrays = [array.astype(common) for array in arrays]
+    tails = [len(suffix) for _, suffix in given.values()]
+    leading = [array.shape[: array.ndim - tail] for array, tail in zip(arrays, tails)]
+    try:
+        batch = jnp.broadcast_shapes(*leading)
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(given, arrays))
+        raise ValueError(f"the batch axes must broadcast together, got {shapes}.") from error
+    return tuple(
+        jnp.broadcast_to(array, (*batch, *array.shape[array.ndim - tail :]))
+        for array, tail in zip(arrays, tails)
+    )

@@ -9,11 +9,11 @@ from jaxtyping import Array
 
 from polhode import free, rotation
 from polhode._lanes import map_chunks
-from polhode._methods import AbstractMethod, Record, Samples
 from polhode._scene import Scene
 from polhode._state import State
 from polhode._status import Status
 from polhode.inertia import Symmetry, principal
+from polhode.methods import AbstractMethod, Record, Samples
 
 
 class ClosedForm(AbstractMethod):
@@ -46,8 +46,8 @@ class ClosedForm(AbstractMethod):
         t = kept - ts[..., :1]
         inertia = scene.inertia
         axes = products = None
-        moments, wxyz, omega = inertia.diagonal, state.wxyz, state.omega_body
-        if moments is None:
+        moments, wxyz, omega = inertia.moments, state.wxyz, state.omega_body
+        if not inertia.is_principal:
             whole = jnp.broadcast_to(inertia.full, (wxyz.shape[0], 3, 3))
             moments, axes, products = principal(whole)
             products = products[..., ::-1]  # (yz, zx, xy) -> (xy, xz, yz)

@@ -2,8 +2,10 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from polhode import free, rotation
+from polhode._checks import describe, is_concrete, require
 from polhode._lanes import common_batch
 from polhode._state import State
 from polhode.free import Periods
@@ -26,9 +28,14 @@ def periods(inertia: Inertia, state: State) -> Periods:
             "periods takes a ph.Inertia and a ph.State, got"
             f" {type(inertia).__name__} and {type(state).__name__}."
         )
+    if is_concrete(inertia):
+        require(
+            np.asarray(inertia.is_possible),
+            f"periods needs moments that a body can have, got {describe(inertia.moments)}.",
+        )
     batch = common_batch(inertia, state)
-    moments, products, omega = inertia.diagonal, None, _spread(state.omega_body, batch)
-    if moments is None:
+    moments, products, omega = inertia.moments, None, _spread(state.omega_body, batch)
+    if not inertia.is_principal:
         moments, axes, products = principal(inertia.full)
         products = _spread(products[..., ::-1], batch)  # (yz, zx, xy) -> (xy, xz, yz)
         omega = rotation.rotate(rotation.conjugate(_spread(axes, batch)), omega)

@@ -1,10 +1,14 @@
 """What is in the scene: the body's inertia and what acts on it."""
 
+from functools import reduce
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array
+import numpy as np
+from jaxtyping import Array, Bool
 
-from polhode._checks import is_concrete
+from polhode._checks import is_concrete, together
 from polhode.hamiltonian import Hamiltonian, inverse_inertia
 from polhode.inertia import Inertia
 from polhode.torques import AbstractPotential, AbstractRotor, AbstractTorque, Wheels
@@ -27,6 +31,11 @@ class Scene(eqx.Module):
     rotors: AbstractRotor | None = None
 
     def __check_init__(self):
+        self._check_kinds()
+        if self.rotors is not None and is_concrete(self.inertia, self.rotors):
+            self.rotors.check_within(self.inertia)
+
+    def _check_kinds(self) -> None:
         kinds = (
             ("inertia", Inertia, "ph.Inertia, for example ph.Inertia.from_moments([1., 2., 3.])"),
             ("potential", AbstractPotential | None, "a potential (ph.UniformGravity, ...) or None"),
@@ -37,20 +46,62 @@ class Scene(eqx.Module):
             value = getattr(self, name)
             if not isinstance(value, kind):
                 raise TypeError(f"Scene {name} must be {wanted}, got {type(value).__name__}.")
-        if self.rotors is not None and is_concrete(self.inertia, self.rotors):
-            self.rotors.check_within(self.inertia)
+        self.inertia.check_form()
 
     @property
     def is_free(self) -> bool:
         """Whether nothing acts on the body and nothing turns in it (static)."""
         return self.potential is None and self.torque is None and self.rotors is None
 
-    def settled(self, state, start: Array) -> "Scene":
+    def settled(self, state, start: Array | np.ndarray) -> "Scene":
         """The scene with the motion of its wheels fixed by the state at the time ``start``."""
         if self.rotors is None:
             return self
         wheels = self.rotors.settle(state.omega_body, start)
         return Scene(self.inertia, self.potential, self.torque, wheels)
+
+    @property
+    def is_possible(self) -> Bool[Array, "*#b"]:
+        """Whether (...) a body can have this inertia and these wheels, also while traced."""
+        wheels = self.rotors
+        if not isinstance(wheels, Wheels) or wheels.is_constant:
+            return self.inertia.is_possible
+        found = self.inertia.is_possible, self.carrier.is_possible, wheels.is_possible
+        return reduce(jnp.logical_and, jnp.broadcast_arrays(*found))
+
+    @property
+    def is_as_declared(self) -> Any:
+        """Whether (...) the numbers are such as the parts were made for; None where any will do."""
+        found = [part.is_as_declared for part in (self.potential, self.rotors) if part is not None]
+        found = [x for x in found if x is not None]
+        return together(found)
+
+    def mended(self) -> "Scene":
+        """The scene with arrays where an edit left numbers or lists; see ``AbstractPart``."""
+        self._check_kinds()
+        scene = self
+        for name in ("inertia", "potential", "torque", "rotors"):
+            part = getattr(self, name)
+            new = None if part is None else part.mended(f"scene.{name}")
+            if new is not part:
+                scene = eqx.tree_at(lambda s, n=name: getattr(s, n), scene, new)
+        return scene
+
+    def declared_anew(self) -> "Scene":
+        """The scene with what its parts declare taken from their numbers, where these are known.
+
+        A number changed by ``eqx.tree_at`` may have left what its part was made for: a centre of
+        mass its axis, a wheel the body axis that it was on. The numbers count.
+        """
+        if not is_concrete(self.potential, self.rotors):
+            return self
+        scene = self
+        for name in ("potential", "rotors"):
+            part = getattr(self, name)
+            if part is None or (kept := part.is_as_declared) is None or bool(np.all(kept)):
+                continue
+            scene = eqx.tree_at(lambda s, n=name: getattr(s, n), scene, part.declared_anew())
+        return scene
 
     @property
     def _wheels(self) -> Wheels | None:
@@ -89,7 +140,9 @@ class Scene(eqx.Module):
         """The one Hamiltonian of this scene."""
         wheels = self._wheels
         carried = None if wheels is None else wheels.body_momentum
-        return Hamiltonian(inverse_inertia(self.carrier), self.inertia, self.potential, carried)
+        spinning = None if wheels is None or wheels.is_constant else wheels.energy
+        inverse = inverse_inertia(self.carrier)
+        return Hamiltonian(inverse, self.inertia, self.potential, carried, spinning)
 
 
 def _aligned(a: Array, b: Array) -> tuple[Array, Array]:

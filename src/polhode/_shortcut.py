@@ -72,7 +72,7 @@ def shortcut(scene: Any, state: Any, ts: Any, rtol: Any, record: Any) -> Traject
     eps = float(np.finfo(entry.dtype).eps)
     if rtol is None:
         rtol = 1e-9 if eps < 1e-9 else 1e-5
-    elif type(rtol) is not float or not 8 * eps <= rtol < math.inf:
+    elif type(rtol) is not float or not 8 * eps <= rtol < 1:
         return None
     span = _span(ts)
     if span is None:

@@ -1,27 +1,26 @@
 """The one entry point: a scene, a state and times give a trajectory."""
 
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode import rotation
-from polhode._checks import as_float_array, describe, is_concrete, require
+from polhode._checks import is_concrete
 from polhode._closed_form import ClosedForm
+from polhode._inputs import check_inputs, check_method, check_rtol, judged, raise_on_failure
 from polhode._lanes import PARTS, common_batch, flatten
 from polhode._mesh import Split, on_devices, place, split_of
-from polhode._methods import AbstractMethod, Record, Samples
 from polhode._plan import Plan, choose, plan
 from polhode._scene import Scene
 from polhode._shortcut import learn, shortcut
 from polhode._state import State
-from polhode._status import SimulationError, Status
+from polhode._status import Status
 from polhode._trajectory import Trajectory
 from polhode.inertia import Symmetry
+from polhode.methods import AbstractMethod, Record, Samples
 
 
 def simulate(
@@ -114,6 +113,7 @@ def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> T
 
 
 def _trajectory(method, scene, state, ts, rtol, record, split=None) -> Trajectory:
+    scene, state = scene.mended(), state.mended("state")  # shapes, whichever way led here
     scene = scene.settled(state, ts[..., 0])
     if split is None:
         found = _moved(record, method, scene, state, ts, rtol)
@@ -132,14 +132,15 @@ def _moved(record, method, scene, state, ts, rtol) -> Samples:
     parts = (getattr(scene, name) for name in PARTS)
     batch = common_batch(*parts, state, extra=(ts.shape[:-1],))
     parts = {name: flatten(getattr(scene, name), batch) for name in PARTS}
-    lanes = flatten(state, batch, shared=False)
+    lanes = flatten(state.as_unit(), batch, shared=False)
     times = ts
     if ts.ndim > 1:
         times = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
     if record.error:
         samples = _with_error(method, Scene(**parts), lanes, times, rtol, record)
     else:
-        samples = method.run(Scene(**parts), lanes, times, rtol, record)
+        samples = method.run(Scene(**parts), lanes, times, rtol, record)._replace(error=None)
+    samples = samples._replace(status=judged(samples.status, Scene(**parts), times, rtol))
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), samples)
 
 
@@ -159,28 +160,29 @@ def _work_of_exact(trajectory: Trajectory, state: State, start: Array) -> Array:
 _COARSER = 30
 """How much looser the second run is that an error estimate comes from."""
 
-_TRUSTED = 3
-"""What the distance of the two runs is divided by; 29 if errors kept to the tolerances."""
-
-_ROUNDING = (10, 1000)
-"""Units in the last place of the angle turned: always added; below, two runs differ by rounding."""
+_ROUNDING = 3
+"""Units in the last place of the angle turned that are always added to an estimate."""
 
 _ALLOWED = 10
 """How often an error may exceed the tolerance before the body is called inaccurate."""
 
 
 def _with_error(method, scene, lanes, times, rtol, record) -> Samples:
-    """The samples, and for each body the estimated error of its attitude at the last time [rad]."""
+    """The samples, and for each body the estimated error of its attitude at the last time [rad].
+
+    Two runs differ by the error of the coarser one, the finer one's is smaller by as much as the
+    sum of its steps' errors: how the motion itself spreads errors is the same in both.
+    """
     plain = Record(record.attitude, record.rates, record.final_only, record.work)
     size = jnp.linalg.norm(jax.lax.stop_gradient(lanes.omega_body), axis=-1)
     turned = jnp.maximum(1, size * jnp.abs(times[..., -1] - times[..., 0]))
     ulps = jnp.finfo(size.dtype).eps * turned
     if method.exact:
         return method.run(scene, lanes, times, rtol, plain)._replace(error=ulps)
-    if method.asked_at_end is None:
+    if not method.keeps_rtol:
         raise ValueError(
-            "Record(error=True) compares two tolerances, and this method has a step-size controller"
-            " of its own: leave it out, or drop error=True."
+            "Record(error=True) compares two tolerances, and the steps of this method do not follow"
+            " from rtol: leave its controller or dt0 out, or drop error=True."
         )
 
     def at(rtol):
@@ -193,94 +195,13 @@ def _with_error(method, scene, lanes, times, rtol, record) -> Samples:
     else:
         change = jnp.linalg.norm(fine.omega_body[:, -1] - coarse.omega_body[:, -1], axis=-1)
         gap = change / jnp.maximum(jnp.linalg.norm(fine.omega_body[:, -1], axis=-1), size)
-    gap = jax.lax.stop_gradient(gap)
-    always, below = (count * ulps for count in _ROUNDING)
-    error = always + jnp.maximum(gap / _TRUSTED, jnp.minimum(gap, below))
-    status = fine.status
-    if method.asked_at_end:
-        good = (status != Status.SUCCESSFUL) | (error <= _ALLOWED * rtol)
-        status = jnp.where(good, status, Status.INACCURATE)
+    if fine.error is None:
+        error = gap / _COARSER
+    else:
+        apart = coarse.error > 2 * fine.error  # else both took the same steps, few and short
+        share = fine.error / jnp.where(apart, coarse.error - fine.error, 1)
+        error = jnp.where(apart, gap * share, jnp.maximum(fine.error, gap))
+    error = jax.lax.stop_gradient(error) + _ROUNDING * ulps
+    good = (fine.status != Status.SUCCESSFUL) | (error <= _ALLOWED * rtol)
+    status = jnp.where(good, fine.status, Status.INACCURATE)
     return fine._replace(status=status, error=error)
-
-
-def check_method(method: Any) -> None:
-    """Methods are objects, never strings."""
-    if method is not None and not isinstance(method, AbstractMethod):
-        raise TypeError(
-            "method must be None or an object such as ph.LiePoisson(), got"
-            f" {type(method).__name__}."
-        )
-
-
-def check_inputs(
-    scene: Any, state: Any, ts: Any, record: Any
-) -> tuple[Scene, State, Array, Record]:
-    """Kinds, dtypes and times, with messages that tell the mend."""
-    for name, value, kind in (("scene", scene, Scene), ("state", state, State)):
-        if not isinstance(value, kind):
-            raise TypeError(f"{name} must be a ph.{kind.__name__}, got {type(value).__name__}.")
-    record = Record() if record is None else record
-    if not isinstance(record, Record):
-        raise TypeError(f"record must be a ph.Record or None, got {type(record).__name__}.")
-    dtypes = {x.dtype for x in jax.tree.leaves((scene, state)) if eqx.is_inexact_array(x)}
-    if len(dtypes) != 1:
-        raise TypeError(
-            f"scene and state mix the dtypes {sorted(map(str, dtypes))}: make all arrays of one"
-            " dtype, for example with jnp.asarray(x, jnp.float64)."
-        )
-    ts = as_float_array("ts", ts, (None,)).astype(dtypes.pop())
-    if is_concrete(ts):
-        check_times(np.asarray(ts))
-    return scene, state, ts, record
-
-
-def check_times(ts: np.ndarray) -> None:
-    """At least two times, strictly monotonic."""
-    if ts.shape[-1] < 2:  # the message costs more than a small simulation
-        raise ValueError(
-            f"ts must hold at least two times, got {describe(ts)}: the state holds at ts[0]."
-        )
-    steps = np.diff(ts, axis=-1)
-    good = np.all(steps > 0, axis=-1) | np.all(steps < 0, axis=-1)
-    if not np.all(good):
-        turn = int(np.argwhere((steps <= 0) if steps.flat[0] > 0 else (steps >= 0))[0][-1])
-        raise ValueError(
-            "ts must be strictly increasing or strictly decreasing (in the dtype of the state,"
-            f" {ts.dtype}); entries {turn} and {turn + 1} are {ts[..., turn].flat[0]!r} and"
-            f" {ts[..., turn + 1].flat[0]!r}: sort them and drop repeated ones."
-        )
-
-
-def check_rtol(rtol: float | None, dtype) -> Array | np.ndarray:
-    """The tolerance in the state's dtype; a number that is known stays known under ``jit``."""
-    eps = float(jnp.finfo(dtype).eps)
-    if rtol is None:
-        rtol = 1e-9 if eps < 1e-9 else 1e-5
-    if is_concrete(rtol):
-        require(np.isfinite(rtol) and rtol > 0, f"rtol must be positive, got {rtol}.")
-        require(
-            float(rtol) >= 8 * eps,
-            f"rtol={rtol:g} is below what {jnp.dtype(dtype).name} can reach (about {8 * eps:.0e}):"
-            " raise rtol, or use float64 (jax.config.update('jax_enable_x64', True)).",
-        )
-        return np.asarray(rtol, dtype)
-    return jnp.asarray(rtol, dtype)
-
-
-def raise_on_failure(trajectory: Trajectory) -> None:
-    """SimulationError naming what happened to how many bodies, and which came first."""
-    status = np.asarray(trajectory.status)
-    if not status.any():  # all Status.SUCCESSFUL
-        return
-    lines = []
-    for code in np.unique(status[status != Status.SUCCESSFUL]):
-        found = np.argwhere(status == code)
-        first = tuple(int(i) for i in found[0])
-        which = (
-            f"{len(found)} of {status.size} bodies (first: index {first})" if first else "the body"
-        )
-        lines.append(f"{which}: {Status(int(code)).explanation}")
-    raise SimulationError(
-        "; ".join(lines) + ". Pass throw=False to get the trajectory with its status per body.",
-        status,
-    )

@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 
 from polhode import rotation
 from polhode._checks import as_float_array, describe, is_concrete, require
+from polhode._part import AbstractPart, shaped
 from polhode.hamiltonian import (
     canonical_from_momentum,
     components,
@@ -16,7 +17,7 @@ from polhode.hamiltonian import (
 from polhode.inertia import Inertia
 
 
-class State(eqx.Module):
+class State(AbstractPart):
     """Attitude and body rates at one time.
 
     **Arguments:** ``wxyz`` (..., 4): unit quaternion, scalar first, body -> space; one that is not
@@ -26,10 +27,8 @@ class State(eqx.Module):
     Raises ValueError for a zero quaternion, NaN, wrong shapes or axes that do not broadcast.
     """
 
-    wxyz: Float[Array, "*#b 4"]
-    omega_body: Float[Array, "*#b 3"]
-
-    core_ranks = {"wxyz": 1, "omega_body": 1}  # noqa: RUF012
+    wxyz: Float[Array, "*#b 4"] = shaped(4)
+    omega_body: Float[Array, "*#b 3"] = shaped(3)
 
     def __init__(self, wxyz, omega_body):
         quaternion = as_float_array("wxyz", wxyz, (4,))
@@ -52,7 +51,7 @@ class State(eqx.Module):
 
     @classmethod
     def from_euler(cls, phi, theta, psi, rates=None, momenta=None, inertia=None) -> "State":
-        """State from the documents' ZYZ angles [rad] and their rates or canonical momenta.
+        """State from ZYZ Euler angles [rad] and their rates or canonical momenta.
 
         ``phi, theta, psi`` (...); exactly one of ``rates`` (..., 3) = d(phi, theta, psi)/dt
         [rad/s] and ``momenta`` (..., 3) = (p_phi, p_theta, p_psi) [kg m^2/s], the latter with
@@ -88,6 +87,13 @@ class State(eqx.Module):
         momentum = momentum_from_canonical(angles, components(momenta))
         momentum = jnp.stack(jnp.broadcast_arrays(*momentum), axis=-1)
         return cls(wxyz, inertia.rates(momentum))
+
+    def as_unit(self) -> "State":
+        """The state with quaternions of unit length, where an edit or a step left another."""
+        square = jnp.sum(self.wxyz * self.wxyz, axis=-1, keepdims=True)
+        unit = jnp.abs(square - 1) <= 8 * jnp.finfo(self.wxyz.dtype).eps
+        wxyz = jnp.where(unit, self.wxyz, rotation.normalise(self.wxyz))
+        return eqx.tree_at(lambda s: s.wxyz, self, wxyz)
 
     def canonical(self, inertia: Inertia) -> tuple[Array, Array]:
         """Angles q = (phi, theta, psi) [rad] and momenta p [kg m^2/s], arrays (..., 3)."""

@@ -13,6 +13,8 @@ class Status(enum.IntEnum):
     STEP_FAILED = 4
     INACCURATE = 5
     WRONG_LAW = 6
+    NOT_PHYSICAL = 7
+    BAD_TIMES = 8
 
     @property
     def explanation(self) -> str:
@@ -36,13 +38,21 @@ _EXPLANATIONS = {
     ),
     Status.STEP_FAILED: "the step-size controller or an implicit solve gave up",
     Status.INACCURATE: (
-        "the error estimate exceeds the tolerance asked for: lower rtol's ambition or raise the"
-        " number of steps"
+        "the estimated error exceeds the tolerance asked for tenfold: the body is chaotic, or its"
+        " rounding alone is more; loosen rtol, shorten ts, or use float64"
     ),
     Status.WRONG_LAW: (
         "the law of the method asked for does not hold for this body (symmetry, centre of mass or"
-        " initial state): leave method=None"
+        " initial state): leave method=None; or a number was changed in a part that was made for"
+        " others (ph.UniformGravity.axial, a wheel on a body axis): make the part anew"
     ),
+    Status.NOT_PHYSICAL: (
+        "no body has this inertia: moments must be positive and each at most the sum of the two"
+        " others, a tensor symmetric, and a wheel's moment less than the body's about its axis;"
+        " published numbers that break the inequality pass with"
+        " ph.Inertia.from_moments(..., physical=False)"
+    ),
+    Status.BAD_TIMES: "ts is not strictly increasing or strictly decreasing: sort it",
 }
 
 

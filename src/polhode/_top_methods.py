@@ -4,19 +4,19 @@ import abc
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from polhode import rotation, tops
 from polhode._checks import is_concrete
-from polhode._kernel import kernel
 from polhode._lanes import is_lane_tree, map_chunks
-from polhode._methods import AbstractMethod, Record, Samples
 from polhode._scene import Scene
 from polhode._state import State
 from polhode._status import Status
 from polhode.inertia import Symmetry
+from polhode.methods import AbstractMethod, Record, Samples
 from polhode.torques import (
     AbstractTorque,
     BodyTorque,
@@ -25,6 +25,7 @@ from polhode.torques import (
     UniformGravity,
     Wheels,
 )
+from polhode.xla import kernel
 
 
 class AbstractTopMethod(AbstractMethod):
@@ -124,9 +125,9 @@ def _not_symmetric(scene: Scene) -> str | None:
     if not inertia.is_principal:
         return "the body axes are not known to be principal"
     if inertia.symmetry is Symmetry.NONE:
-        if not is_concrete(inertia.diagonal):
+        if not is_concrete(inertia):
             return "the moments about body x and y are not known to be equal"
-        moments = np.asarray(inertia.diagonal)
+        moments = np.asarray(inertia.moments)
         if np.any(moments[..., 0] != moments[..., 1]):
             return "the moments about body x and y differ"
     return None
@@ -135,7 +136,7 @@ def _not_symmetric(scene: Scene) -> str | None:
 def _start(scene: Scene, state: State, rank: int = 1):
     """Moments A, C of the carrier, and the axial momentum, of lanes."""
     n = state.wxyz.shape[0]
-    moments = _lanes(scene.carrier.diagonal, n, 1)
+    moments = _lanes(scene.carrier.moments, n, 1)
     axial = moments[:, 2] * state.omega_body[:, 2]
     if scene.rotors is not None:
         axial = axial + _lanes(scene.rotors.body_momentum(scene.rotors.start)[2], n)
@@ -339,7 +340,7 @@ def _broadcast(*arrays):
 
 
 def _proportional(scene: Scene, damping) -> bool:
-    rates, moments = _broadcast(np.asarray(damping), np.asarray(scene.inertia.diagonal))
+    rates, moments = _broadcast(np.asarray(damping), np.asarray(scene.inertia.moments))
     rates = rates / moments
     return bool(np.all(_equal(rates[..., 0], rates[..., 2])))
 
@@ -362,8 +363,10 @@ class FixedAxis(AbstractTopMethod):
             return refusal
         if not is_concrete(scene.torque, state.omega_body):
             return "the rates are not known to lie along one principal axis"
-        push, _ = _push_values(scene)
-        used = np.logical_or(*_broadcast(np.asarray(push) != 0, np.asarray(state.omega_body) != 0))
+        with jax.ensure_compile_time_eval():  # known numbers, also inside of jit
+            push, _ = _push_values(scene)
+            acting = _broadcast(np.asarray(push) != 0, np.asarray(state.omega_body) != 0)
+            used = np.logical_or(*map(np.asarray, acting))
         if np.any(used.sum(axis=-1) > 1):
             return "rates or torques do not lie along one principal axis"
         return None
@@ -378,7 +381,7 @@ class FixedAxis(AbstractTopMethod):
     def _motion(self, scene, state, elapsed):
         n = state.wxyz.shape[0]
         push, damping = _push(scene, n)
-        moments = _lanes(scene.inertia.diagonal, n, 1)
+        moments = _lanes(scene.inertia.moments, n, 1)
         used = (push != 0) | (state.omega_body != 0)
         later = elapsed[:, :, None] * jnp.ones_like(moments)[:, None]
         omega, angles = tops.spin(
@@ -395,9 +398,12 @@ class FixedAxis(AbstractTopMethod):
         return wxyz, omega, jnp.sum(used, axis=-1) <= 1
 
 
+_LAWS = (LagrangeTop(), SymmetricTop(), FixedAxis())
+
+
 def exact_top(scene: Scene, state: State, record: Record) -> AbstractTopMethod | None:
     """The exact method whose law is known to hold for the scene, or None."""
-    for method in (LagrangeTop(), SymmetricTop(), FixedAxis()):
+    for method in _LAWS:
         if method.why_not(scene, state, record) is None:
             return method
     return None

@@ -20,10 +20,11 @@ class Trajectory(eqx.Module):
     **Fields:** ``ts`` (T,) or (..., T) [s]; ``wxyz`` (..., T, 4) body -> space, or None when not
     recorded; ``omega_body`` (..., T, 3) [rad/s], or None; ``status`` (...): ``ph.Status`` per
     body; ``steps`` (...): solver steps (0 for an exact solution); ``scene``, the motion of its
-    rotors fixed by the initial state; ``work`` (..., T) [J]: done by the external torques since
-    the first time, or None (``Record(work=True)``); ``error`` (...) [rad]: estimated error of the
-    attitude at the last time, or None (``Record(error=True)``; without attitude that of the rates,
-    relative).
+    rotors fixed by the initial state; ``work`` (..., T) [J]: done from outside since the first
+    time, by external torques, potentials that change with time (also orbits) and the motors of
+    wheels, so that ``energy - work`` is constant, or None (``Record(work=True)``); ``error`` (...)
+    [rad]: estimated error of the attitude at the last time, or None (``Record(error=True)``;
+    without attitude that of the rates, relative).
     """
 
     ts: Float[Array, "*t"]
@@ -81,16 +82,14 @@ class Trajectory(eqx.Module):
 
         Of wheels that spin freely or by a motor the spin energy is included; with wheels held at
         their speed it is the energy of the body turning with them locked, which is what then stays
-        constant.
+        constant. It changes by ``work`` and by nothing else (but a potential that jumps in time).
         """
         scene = self._scene
         attitude = None
         if scene.potential is not None:
             wxyz = self._need("wxyz")
             attitude = from_quaternion(tuple(wxyz[..., i] for i in range(4)))
-        energy = scene.hamiltonian(components(self.momentum_body), attitude, self._t)
-        spinning = None if scene.rotors is None else scene.rotors.energy(self._t)
-        return energy if spinning is None else energy + spinning
+        return scene.hamiltonian.total(components(self.momentum_body), attitude, self._t)
 
     def euler(self) -> tuple[Array, Array, Array]:
         """ZYZ Euler angles (phi, theta, psi) [rad], each (..., T)."""
@@ -141,18 +140,23 @@ class Trajectory(eqx.Module):
             put("work", self.work, (*batch, "time"), "J", "work done by the external torques")
         if self.error is not None:
             put("error", self.error, batch, "rad", "estimated error at the last time")
-        put("status", self.status, batch, "1", "outcome per body (0: finished)")
-        data["status"][2].update(
-            flag_values=np.array([int(s) for s in Status]),
-            flag_meanings=" ".join(s.name.lower() for s in Status),
+        data["status"] = (
+            batch,
+            np.asarray(self.status, np.int8),
+            {
+                "long_name": "outcome of each body",
+                "flag_values": np.array([int(s) for s in Status], np.int8),
+                "flag_meanings": " ".join(s.name.lower() for s in Status),
+            },
         )
         coords: dict[str, Any] = {
-            "quaternion": list("wxyz"),
-            "axis": list("xyz"),
+            "quaternion": ("quaternion", list("wxyz"), {"long_name": "part, the scalar first"}),
+            "axis": ("axis", list("xyz"), {"long_name": "axis of the frame that the name states"}),
         }
         times = (time, np.asarray(self.ts), {"units": "s", "long_name": "time"})
         (coords if self.ts.ndim == 1 else data)["time" if self.ts.ndim == 1 else "ts"] = times
         attributes = {
+            "Conventions": "CF-1.11",
             "title": "Rotating rigid bodies",
             "source": f"polhode {__version__}",
             "convention": "wxyz scalar first, body -> space; R = Rz(phi) Ry(theta) Rz(psi)",

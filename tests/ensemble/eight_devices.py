@@ -84,8 +84,10 @@ def main(folder):
         found[name] = [bool(np.array_equal(one, other)) for other in more]
     block = Block(ensemble, TS, None, None, True, (), jax.devices())
     found["collectives"] = exchanges(program.lower(*block.inputs(0)).compile())
-    found["shards"] = len(block(0)["wxyz"].addressable_shards)
-    found["rows"] = {s.data.shape[0] for s in block(0)["wxyz"].addressable_shards}.pop()
+    found["used"] = len({block(k * CHUNK)["wxyz"].device for k in range(8)})
+    found["layouts"] = [
+        dict(zarr.open_group(f"{folder}/{n}.zarr").attrs)["devices"] for n in (1, 8)
+    ]
     found |= sharded()
     print(json.dumps(found))
 

@@ -115,6 +115,7 @@ def test_statistics_are_those_of_the_trajectories(whole):
         np.testing.assert_allclose(data.tilt_quantiles, exact, atol=3.2 / 64)
 
 
+@pytest.mark.slow
 def test_processes_meet_one_dies_and_the_rest_is_made_good(whole, tmp_path):
     """Two processes under jax.distributed, one killed after its first chunk; then a damaged and a
     lost file, and one process that does what is missing.

@@ -124,6 +124,10 @@ def test_rows_of_files_and_torques(tmp_path):
         (["--coordinator", "127.0.0.1:1", "--processes", "2", "--process", "1", "--patience",
           "0.1"], "no coordinator answers at 127.0.0.1:1"),
         (["--patience", "3"], "needs --coordinator or --cluster"),
+        (["--seed", "5"], "[ensemble] seed"),
+        (["--clones", "5"], "write `bodies = 5`"),
+        (["--chunk", "1"], "--chunk 8192 or a multiple"),
+        (["--memory", "1kB"], "raise --memory to"),
         (["--chunk", "1000"], "multiple of the block of 8192"),
         (["--memory", "100MB"], "too small"),
         (["--devices", "99"], "--devices 99: this machine has"),
@@ -132,7 +136,8 @@ def test_rows_of_files_and_torques(tmp_path):
 def test_bad_options_change_nothing(options, words, tmp_path, capsys):
     scene = tmp_path / "big.toml"
     scene.write_text(SCENE)
-    assert main(["run", str(scene), "-o", str(tmp_path / "big.zarr"), *options]) == 1
+    reached = ("--coordinator" in options and "127.0.0.1:1" in options) or "here" in options
+    assert main(["run", str(scene), "-o", str(tmp_path / "big.zarr"), *options]) == 2 - reached
     assert words in capsys.readouterr().err
     assert not (tmp_path / "big.zarr").exists()
 

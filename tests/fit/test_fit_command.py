@@ -38,7 +38,7 @@ NAMES = ["--columns", "t=time", "wx=p", "wy=q", "wz=r"]
 def test_a_recording_becomes_numbers_and_a_figure(toss, tmp_path, capsys):
     output = tmp_path / "new" / "result"
     noise = ["--degrees", "--noise", str(np.radians(1.0))]
-    assert main(["fit", str(toss), *NAMES, *noise, "-o", str(output)]) == 0
+    assert main(["fit", str(toss), *NAMES, *noise, "--bias", "-o", str(output)]) == 0
     printed = capsys.readouterr().out
     assert "smallest" in printed
     assert "Only ratios" in printed
@@ -51,6 +51,24 @@ def test_a_recording_becomes_numbers_and_a_figure(toss, tmp_path, capsys):
     assert np.all(np.abs(off) < 4 * np.array(found["ratios_std"][:2]))
     assert np.all(np.array(found["ratios_std"][:2]) < 0.01)
     assert "step limit" not in found["findings"]
+    assert "bias of the gyroscope" in printed
+    assert "t = time, wx = p" in printed
+    bias, spread = np.array(found["bias_rad_per_s"]), np.array(found["bias_std_rad_per_s"])
+    assert np.all(np.abs(bias) < 5 * spread)
+    assert np.all(spread < 0.05)
+    assert "NaN" not in output.with_suffix(".json").read_text()
+
+
+def test_a_recording_that_shows_nothing_ends_with_an_error(tmp_path, capsys):
+    path = tmp_path / "still.csv"
+    path.write_text("t,wx,wy,wz\n" + "".join(f"{k / 100},0,0,0\n" for k in range(60)))
+    command = ["fit", str(path), "--moments-only", "--no-figure", "-o", str(tmp_path / "out")]
+    assert main(command) == 1
+    told = capsys.readouterr()
+    assert "--allow-undetermined" in told.err
+    assert "given" in told.out
+    json.loads((tmp_path / "out.json").read_text(), parse_constant=lambda word: 1 / 0)
+    assert main([*command, "--allow-undetermined"]) == 0
 
 
 def test_wrong_units_are_suspected(toss, capsys):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from polhode.fit import read_recording
+from polhode.fit import load_recording, read_recording
 
 COLUMNS = {"t": "time", "wx": "x", "wy": "y", "wz": "z"}
 GOOD = """time, x, y, z, n
@@ -76,3 +76,53 @@ def test_what_is_no_text_or_has_a_gap_is_named(tmp_path):
     path.write_text("\n".join(["time,x,y,z", *rows]))
     with pytest.raises(ValueError, match=r"bad\.csv: times leave a gap after sample 20"):
         read_recording(path, COLUMNS)
+
+
+@pytest.mark.parametrize(
+    ("head", "factor", "seconds"),
+    [
+        ("t,wx,wy,wz", 1.0, 1.0),
+        ("time_s,gyro_x,gyro_y,gyro_z", 1.0, 1.0),
+        ("time,omega_x,omega_y,omega_z", 1.0, 1.0),
+        ("Time [s],Gyro X [deg/s],Gyro Y [deg/s],Gyro Z [deg/s]", np.pi / 180, 1.0),
+        ("timestamp_ms,gyro_x_dps,gyro_y_dps,gyro_z_dps", np.pi / 180, 1e-3),
+        ("time (us),angular_velocity.x,angular_velocity.y,angular_velocity.z", 1.0, 1e-6),
+        ("seconds_elapsed,rotationRate x (rad/s),rotation_rate_y,rotation_rate_z", 1.0, 1.0),
+        ("t,p,q,r", 1.0, 1.0),
+        ("t (ms),wx (rpm),wy (rpm),wz (rpm)", np.pi / 30, 1e-3),
+    ],
+)
+def test_usual_names_and_units_are_found(tmp_path, head, factor, seconds):
+    path = tmp_path / "usual.csv"
+    rows = "".join(f"{k / 10 / seconds:g},1,2,3,7\n" for k in range(6))
+    path.write_text(f"{head},accel_x\n{rows}")
+    loaded = load_recording(path)
+    np.testing.assert_allclose(loaded.recording.omega[0], np.array([1, 2, 3]) * factor, rtol=1e-14)
+    np.testing.assert_allclose(loaded.recording.times, np.arange(6) / 10, rtol=1e-9)
+    assert list(loaded.columns.values()) == head.split(",")
+
+
+@pytest.mark.parametrize(
+    ("head", "message"),
+    [
+        ("t,wx,wy,wz,gyro_x", None),
+        ("t,gyro_x,wy,wz,omega_x", "gyro_x, omega_x could all be wx"),
+        ("t,gyro_x [deg/s],gyro_y,gyro_z [rad/s],n", "different units: deg/s, rad/s"),
+        ("t,gyro_x [ms],gyro_y,gyro_z,n", "states the unit ms"),
+        ("x,gyro_x,gyro_y,gyro_z,n", "missing: t -> t"),
+        ("t,p,q,z,n", "missing: wx -> wx, wy -> wy, wz -> wz"),
+    ],
+)
+def test_names_that_could_mean_several_things_are_refused(tmp_path, head, message):
+    path = tmp_path / "odd.csv"
+    path.write_text(f"{head}\n" + "".join(f"{k / 10},1,2,3,7\n" for k in range(6)))
+    if message is None:  # a name that is the role's own is taken
+        assert load_recording(path).columns["wx"] == "wx"
+        return
+    with pytest.raises(ValueError, match=message):
+        load_recording(path)
+
+
+def test_a_file_without_an_end_is_no_text():
+    with pytest.raises(ValueError, match="not text"):
+        read_recording("/dev/zero")

@@ -21,8 +21,8 @@ SCENES = {
 }
 METHODS = {
     "free": None,
-    "top": ph.Extrapolated(8, chunk=1),
-    "damped": ph.LiePoisson(ph.solvers.Extrapolation(8), chunk=1, at_end=True, adjoint=None),
+    "top": ph.LiePoisson(ph.solvers.Extrapolation(8), chunk=1),
+    "damped": ph.LiePoisson(ph.solvers.Extrapolation(8), chunk=1),
 }
 
 

@@ -1,4 +1,7 @@
-"""Writes truth.json: ``python tests/systems/make_truth.py`` (a few minutes)."""
+"""Writes truth.json: ``python tests/systems/make_truth.py [name ...]``, all or the ones named.
+
+All take a few minutes.
+"""
 
 import json
 import sys
@@ -24,8 +27,9 @@ def final(system, moments, steps):
 
 def main():
     mp.dps = taylor.DIGITS
-    entries = {}
-    for system in table.SYSTEMS:
+    wanted = sys.argv[1:] or list(table.BY_NAME)
+    entries = json.loads(table.TRUTH.read_text()) if sys.argv[1:] else {}
+    for system in (table.BY_NAME[name] for name in wanted):
         moments = [mpf(m) for m in system.moments]
         state = final(system, moments, system.steps)
         check = final(system, moments, system.steps + 9)

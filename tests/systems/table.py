@@ -54,6 +54,9 @@ class System:
                 total = [x + mpf(n) for x, n in zip(total, acts["body"])]
             if "damping" in acts:
                 total = [x - w * mpf(c) for x, w, c in zip(total, omega, acts["damping"])]
+            if "fading" in acts:
+                rate = mpf(acts["fading"])
+                total = [x - w * mpf(m) * rate for x, w, m in zip(total, omega, moments)]
             if "space" in acts:
                 push = acts["space"]
                 turn = [sum(rows[j][i] * mpf(push[j]) for j in range(3)) for i in range(3)]
@@ -66,7 +69,7 @@ class System:
 SYSTEMS = [
     System("free_long_axis_mode", (1.0, 2.0, 3.0), (1, 0, 0, 0), (1.0, 0.25, -0.5), (0, 10)),
     System("free_short_axis_mode", (1.0, 2.0, 3.0), (0.5, 0.5, -0.5, 0.5), (0.25, 0.25, 1.0), (0, 10)),
-    System("free_near_separatrix", (3.0, 5.0, 9.0), (1, 0, 0, 0), (0.0, 0.5, 0.001953125), (0, 40), {}, 80),
+    System("free_near_separatrix", (4.0, 5.0, 8.0), (1, 0, 0, 0), (0.0, 0.5, 0.001953125), (0, 40), {}, 80),
     System("free_backwards", (2.0, 1.25, 1.5), (1, 0, 0, 0), (-0.5, 1.0, 0.75), (3, -5)),
     System("symmetric_prolate", (2.0, 2.0, 0.5), (0.5, -0.5, 0.5, 0.5), (0.5, 0.25, 2.0), (0, 8)),
     System("detest_b5", (0.5, 0.75, 1.0), (1, 0, 0, 0), (0.25, 1.5, -0.75), (0, 8)),
@@ -93,6 +96,10 @@ SYSTEMS = [
     System(
         "spin_about_one_axis", (1.0, 1.5, 2.0), (1, 0, 0, 0), (0.0, 0.0, 1.0), (0, 5),
         {"body": (0.0, 0.0, 0.25), "damping": (0.0, 0.0, 0.5)},
+    ),
+    System(
+        "symmetric_fading", (1.5, 1.5, 2.0), (0.5, -0.5, 0.5, 0.5), (0.5, 0.25, -1.0), (0, 5),
+        {"fading": 0.125},
     ),
 ]  # fmt: skip
 

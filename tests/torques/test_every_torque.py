@@ -181,9 +181,12 @@ def truth():
 )
 def test_the_motion(method, bound):
     rtol = 1e-11 if method is None else 1e-9
-    record = ph.Record(final_only=True)
+    record = ph.Record(work=True)
     end = ph.simulate(*scene_of(START, jnp.float64), method, rtol=rtol, record=record)
-    wxyz, omega = (np.asarray(x[:, 0]) for x in (end.wxyz, end.omega_body))
+    wxyz, omega = (np.asarray(x[:, -1]) for x in (end.wxyz, end.omega_body))
+    balance = np.asarray(end.energy - end.work)
+    np.testing.assert_allclose(balance[:, 1], balance[:, 0], rtol=0, atol=bound)
+    assert np.all(np.abs(end.work[:, -1]) > 0.1)
     exact = truth()
     wxyz = wxyz * np.sign(np.sum(wxyz * exact[:, :4], axis=1, keepdims=True))
     np.testing.assert_allclose(wxyz, exact[:, :4], rtol=0, atol=bound)

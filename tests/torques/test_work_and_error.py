@@ -16,10 +16,14 @@ DRAG = ph.LinearDamping([0.1, 0.2, 0.05]) + ph.QuadraticDamping(0.05)
 DRIVE = ph.SpaceTorque(lambda t: jnp.stack([jnp.sin(t), 0.2 + 0 * t, 0.1 * t]))
 STATE = ph.State([0.5, 0.5, 0.5, -0.5], [0.5, -1.0, 0.75])
 TS = jnp.linspace(0.0, 6.0, 4)
-METHODS = [ph.LiePoisson(at_end=True), ph.EulerAngles(), ph.Extrapolated(12)]
+METHODS = {
+    "Dopri8": ph.LiePoisson(),
+    "EulerAngles": ph.EulerAngles(),
+    "Extrapolation": ph.LiePoisson(ph.solvers.Extrapolation(12)),
+}
 
 
-@pytest.mark.parametrize("method", METHODS, ids=lambda m: type(m).__name__)
+@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 def test_energy_changes_by_the_work(method):
     scene = ph.Scene(INERTIA, GRAVITY, DRAG + DRIVE)
     traj = ph.simulate(scene, STATE, TS, method, rtol=1e-11, record=ph.Record(work=True))
@@ -40,7 +44,7 @@ def test_work_on_a_damped_and_driven_spin():
     gained = 0.4 * (1.5 * np.asarray(TS) + 0.1 * np.asarray(TS) ** 2)
     for scene, want in ((damped, lost), (driven, gained)):
         assert ph.choose(scene, state, record)[0].exact
-        for method, atol in ((None, 1e-14), (ph.LiePoisson(at_end=True), 1e-9)):
+        for method, atol in ((None, 1e-14), (ph.LiePoisson(), 1e-9)):
             traj = ph.simulate(scene, state, TS, method, rtol=1e-11, record=record)
             np.testing.assert_allclose(traj.work, want, rtol=0, atol=atol)
     free = ph.simulate(ph.Scene(INERTIA), state, TS, record=record)
@@ -55,27 +59,34 @@ def test_the_estimate_bounds_the_error(rtol):
     state = ph.State(wxyz, 2 * jax.random.normal(keys[1], (40, 3)))
     scene, ts = ph.Scene(INERTIA, GRAVITY), jnp.array([0.0, 60.0])
     record = ph.Record(final_only=True, error=True)
-    best = ph.simulate(scene, state, ts, ph.Extrapolated(16), rtol=2e-13)
+    best = ph.simulate(scene, state, ts, ph.LiePoisson(ph.solvers.Extrapolation(16)), rtol=2e-13)
     traj = ph.simulate(scene, state, ts, rtol=rtol, record=record, throw=False)
     error = np.asarray(rotation.angle_between(best.wxyz[:, -1], traj.wxyz[:, -1]))
     calm = error < 1e-3  # of the others no digit is left to estimate
-    assert np.mean(error[calm] <= 3 * np.asarray(traj.error)[calm]) > 0.9
+    assert np.mean(error[calm] <= 10 * np.asarray(traj.error)[calm]) > 0.95
     assert np.median(np.asarray(traj.error)[calm] / error[calm]) < 30
     marked = np.asarray(traj.status) == ph.Status.INACCURATE
-    assert not np.any((error > 10 * rtol) & ~marked & (error > 3 * np.asarray(traj.error)))
+    assert np.sum((error > 10 * rtol) & ~marked) <= 1
     assert np.all(marked == (np.asarray(traj.error) > 10 * rtol))
     if np.any(marked):
-        with pytest.raises(ph.SimulationError, match="error estimate"):
+        with pytest.raises(ph.SimulationError, match="estimated error"):
             ph.simulate(scene, state, ts, rtol=rtol, record=record)
 
 
 @pytest.mark.parametrize("name", ["driven_and_damped", "pushed_in_space", "gravity_gradient"])
 def test_reached_and_estimated_error_keep_to_what_was_asked(name):
-    from systems.test_systems import scene_of
-
     system, exact = BY_NAME[name], truth(name)
     state = ph.State(np.array(system.wxyz, float), system.omega)
-    scene, ts = scene_of(system, jnp.array(system.moments)), jnp.array(system.span, float)
+    parts = {
+        "body": ph.BodyTorque,
+        "space": ph.SpaceTorque,
+        "damping": ph.LinearDamping,
+        "gradient": lambda pull: ph.GravityGradient(pull[0] / 3, pull[1]),
+    }
+    made = [parts[part](x) for part, x in system.acts.items()]
+    pull = made[0] if "gradient" in system.acts else None
+    push = None if pull is not None else sum(made[1:], start=made[0])
+    scene, ts = ph.Scene(ph.Inertia.from_moments(system.moments), pull, push), list(system.span)
     for rtol in (1e-6, 1e-10):
         end = ph.simulate(scene, state, ts, rtol=rtol, record=ph.Record(error=True))
         error = float(rotation.angle_between(end.wxyz[-1], jnp.array(exact["state"][3:])))
@@ -109,7 +120,7 @@ def test_libration_in_a_gravity_gradient():
     def angle(moments, time):
         scene = ph.Scene(ph.Inertia.from_moments(moments), potential)
         ts = jnp.stack([jnp.zeros_like(time), time])
-        method = ph.LiePoisson(at_end=True)
+        method = ph.LiePoisson()
         end = ph.simulate(scene, start, ts, method, rtol=1e-12, record=ph.Record(final_only=True))
         return 2 * jnp.arctan2(end.wxyz[0, 3], end.wxyz[0, 0])
 

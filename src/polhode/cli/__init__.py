@@ -1,3 +1,21 @@
-"""The command line: `polhode run`, `polhode explain`."""
+"""The command line: `polhode run`, `explain`, `fit`, `schema`."""
 
-from polhode.cli._main import main as main
+import sys
+from collections.abc import Sequence
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; returns the exit code.
+
+    0: done; 1: the simulation or the writing failed; 2: wrong options or a bad input file; 130:
+    interrupted (Ctrl-C). Raises SystemExit for --help, wrong options and termination (143).
+    """
+    try:
+        from polhode.cli._main import main as command_line
+    except ModuleNotFoundError as error:
+        words = sys.argv[1:] if argv is None else argv
+        command = " ".join(["polhode", *map(str, words[:1])])
+        print(f"polhode: `{command}` needs {error.name}: pip install 'polhode[cli]'",
+              file=sys.stderr)  # fmt: skip
+        return 1
+    return command_line(argv)

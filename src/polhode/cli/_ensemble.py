@@ -1,141 +1,170 @@
 """`polhode run` of a scene with an [ensemble]: into a Zarr store, chunk by chunk."""
 
-import argparse
 import math
-import re
 import sys
 from pathlib import Path
+from typing import Annotated, Any
 
-from polhode.cli._options import whole_number
+import typer
 
-_SIZES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
-_OPTIONS = ("memory", "chunk", "devices", "process", "processes", "coordinator", "cluster",
-            "patience", "no_verify")  # fmt: skip
+from polhode.cli._options import byte_count, device_count, positive, whole_number
+from polhode.cli._signals import heed
+from polhode.cli._targets import UsageError
 
-
-def byte_count(text: str) -> int:
-    """An argparse type: 4GB, 500MB, 2e9."""
-    match = re.fullmatch(r"([0-9.]+(?:e[0-9]+)?)\s*([kmgt]?)b?", text.strip().lower())
-    try:
-        return int(float(match[1]) * _SIZES[match[2]])
-    except (TypeError, ValueError, OverflowError):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a size such as 4GB") from None
+_PANEL = "for a scene with an [ensemble]: "
 
 
-def _device_count(text: str) -> int | None:
-    return None if text == "all" else whole_number(1)(text)
+def _option(name: str, parser: Any, metavar: str, words: str) -> Any:
+    return typer.Option(name, parser=parser, metavar=metavar, help=_PANEL + words)
 
 
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds above 0")
-    return value
+MemoryOption = Annotated[
+    int | None, _option("--memory", byte_count, "SIZE", "memory to stay within, such as 2GB")
+]
+ChunkOption = Annotated[
+    int | None,
+    _option("--chunk", whole_number(1), "N", "bodies per chunk, instead of the library's choice"),
+]
+DevicesOption = Annotated[
+    str | None, _option("--devices", device_count, "N|all", "devices to use (default: 1)")
+]
+ProcessOption = Annotated[
+    int | None, _option("--process", whole_number(0), "I", "number of this process, from 0")
+]
+ProcessesOption = Annotated[
+    int | None,
+    _option("--processes", whole_number(1), "N", "number of processes that share the store"),
+]
+CoordinatorOption = Annotated[
+    str | None,
+    typer.Option(
+        "--coordinator", metavar="HOST:PORT",
+        help=_PANEL + "where process 0 waits for the others (jax.distributed); needs --processes"
+        " and --process",
+    ),
+]  # fmt: skip
+ClusterOption = Annotated[
+    bool,
+    typer.Option(
+        "--cluster",
+        help=_PANEL + "let JAX find coordinator and numbers: SLURM, Open MPI, Kubernetes, or"
+        " JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES, JAX_PROCESS_ID",
+    ),
+]
+PatienceOption = Annotated[
+    float | None,
+    _option("--patience", positive, "S", "seconds to wait for the others (default: 300)"),
+]
+NoVerifyOption = Annotated[
+    bool,
+    typer.Option("--no-verify", help=_PANEL + "take finished chunks for good without reading them"),
+]
 
 
-def add_options(command: argparse.ArgumentParser) -> None:
-    """Options that only a scene with an [ensemble] takes; absent unless given."""
-    group = command.add_argument_group("for a scene with an [ensemble]")
-    absent = argparse.SUPPRESS
-    group.add_argument("--memory", type=byte_count, default=absent, metavar="SIZE",
-                       help="memory to stay within, such as 2GB")  # fmt: skip
-    group.add_argument("--chunk", type=whole_number(1), default=absent, metavar="N",
-                       help="bodies per chunk, instead of the library's choice")  # fmt: skip
-    group.add_argument("--devices", type=_device_count, default=absent, metavar="N|all",
-                       help="number of devices to share the bodies among (default: 1)")  # fmt: skip
-    group.add_argument("--process", type=whole_number(0), default=absent, metavar="I",
-                       help="number of this process, from 0")  # fmt: skip
-    group.add_argument("--processes", type=whole_number(1), default=absent, metavar="N",
-                       help="number of processes that share the store")  # fmt: skip
-    group.add_argument("--coordinator", default=absent, metavar="HOST:PORT",
-                       help="where process 0 waits for the others (jax.distributed); "
-                       "needs --processes and --process")  # fmt: skip
-    group.add_argument("--cluster", action="store_true", default=absent,
-                       help="let JAX find coordinator and numbers: SLURM, Open MPI, Kubernetes, "
-                       "or JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES, JAX_PROCESS_ID")  # fmt: skip
-    group.add_argument("--patience", type=_seconds, default=absent, metavar="S",
-                       help="seconds to wait for the other processes (default: 300)")  # fmt: skip
-    group.add_argument("--no-verify", action="store_true", default=absent,
-                       help="take finished chunks for good without reading them")  # fmt: skip
-
-
-def refuse_options(arguments: argparse.Namespace, file) -> None:
+def refuse(options: dict[str, Any], file: Any) -> None:
     """SceneFileError for an option that needs an [ensemble] which the scene does not have."""
     from polhode.io import SceneFileError
 
-    for name in _OPTIONS:
-        if hasattr(arguments, name):
-            raise SceneFileError(
-                file.path, "[ensemble]", "missing table",
-                f"--{name.replace('_', '-')} on the command line",
-                "a scene with an [ensemble]", "add [ensemble], or drop the option",
-            )  # fmt: skip
+    for name in options:
+        raise SceneFileError(
+            file.path, "[ensemble]", "missing table",
+            f"--{name.replace('_', '-')} on the command line",
+            "a scene with an [ensemble]", "add [ensemble], or drop the option",
+        )  # fmt: skip
 
 
-def run(arguments: argparse.Namespace, file, output: Path | None) -> int:
+def run(
+    file: Any, output: str | None, precision: str, options: dict[str, Any], *, quiet: bool,
+    no_cache: bool,
+) -> int:  # fmt: skip
     """Stream the ensemble into its store; 0, or 1 when some bodies did not finish."""
     from rich.console import Console
 
     messages = Console(stderr=True)
-    messages.quiet = arguments.quiet or not messages.is_terminal
-    path = Path(output or file.output.file or f"{file.path.stem}.zarr")
-    if path.suffix != ".zarr":
-        path = path.with_name(path.name + ".zarr")
-    options = {name: getattr(arguments, name) for name in _OPTIONS if hasattr(arguments, name)}
+    messages.quiet = quiet or not messages.is_terminal
+    path = _store_path(file, output)
     with messages.status("starting ..."):
         import jax
 
         jax.config.update("jax_enable_x64", True)
-        from polhode.ensemble import build_ensemble, stream
-        from polhode.io import build_method
+        from polhode.cli import _cache
+        from polhode.ensemble import StoreError, build_ensemble
+        from polhode.io import visible
 
         _meet(path, options)
-        ensemble, statistics = build_ensemble(file, arguments.precision)
+        ensemble, statistics = build_ensemble(file, precision)
     options["verify"] = not options.pop("no_verify", False)
     if "devices" in options:
         options["devices"] = _devices(options["devices"])
-    text = file.path.read_text(encoding="utf-8")
-    words = {"title": file.title, "scene": text, "scene_source": file.source, "frame": file.frame}
     try:
-        with _Meter(messages) as meter:
-            stream(
-                ensemble, file.times.seconds, path,
-                method=build_method(file), rtol=file.method.rtol,
-                trajectories=file.ensemble.trajectories, statistics=statistics,
-                attributes=words, progress=meter, warn=_warn, **options,
-            )  # fmt: skip
+        with _cache.kept_programs(not no_cache), _Meter(messages) as meter:
+            last = _stream(file, ensemble, statistics, path, precision, meter, options)
     except KeyboardInterrupt:
         print("\npolhode: interrupted; the same command finishes what is missing", file=sys.stderr)
         return 130
-    if not arguments.quiet:
-        last = meter.last
+    except StoreError:
+        raise
+    except ValueError as error:  # of sizes and numbers of processes, which options gave
+        raise UsageError(str(error)) from error
+    if not quiet:
         rate = "nothing was missing" if last.rate is None else f"{last.rate:,.0f} bodies/s"
-        print(f"{last.done:,} bodies ({last.reused:,} from before), {rate}\nwritten: {path}")
+        print(f"{last.done:,} bodies ({last.reused:,} from before), {rate}")
+        print(f"written: {visible(str(path))}")
     return _failures(path)
 
 
-def _meet(path: Path, options: dict) -> None:
+def _store_path(file: Any, output: str | None) -> Path:
+    from polhode.io import visible
+
+    text = output or file.output.file or f"{file.path.stem}.zarr"
+    path = Path(text)
+    if "\0" in text or path.name in ("", ".."):
+        raise UsageError(f"the output {visible(text)} names no store: give a name such as big.zarr")
+    if path.suffix != ".zarr":
+        path = path.with_name(path.name + ".zarr")
+    here = Path.cwd().resolve()
+    if output is None and not path.resolve().is_relative_to(here):
+        raise UsageError(f"[output] file: {visible(text)} leads out of the folder {here} by a link")
+    if path.is_symlink() and output is None:
+        raise UsageError(f"[output] file: {visible(text)} is a link: name a store")
+    return path
+
+
+def _stream(file, ensemble, statistics, path, precision, meter, options):
+    from polhode.cli._run import provenance
+    from polhode.ensemble import stream
+    from polhode.io import build_method
+
+    words = provenance(file, precision)
+    kept = ("title", "scene", "scene_source", "frame", "precision")
+    stream(
+        ensemble, file.times.seconds, path,
+        method=build_method(file), rtol=file.method.rtol,
+        trajectories=file.ensemble.trajectories, statistics=statistics,
+        attributes={name: words[name] for name in kept}, progress=meter, warn=_warn, **options,
+    )  # fmt: skip
+    return meter.last
+
+
+def _meet(path: Path, options: dict[str, Any]) -> None:
     """Find the number of this process and of all, with the others where they are to meet; before
     anything is computed. The options of that go out of ``options``.
     """
-    from polhode.ensemble import StoreError, claimed, join
+    from polhode.ensemble import claimed, join
 
     cluster, coordinator = options.pop("cluster", False), options.pop("coordinator", None)
     patience = {"patience": options.pop("patience")} if "patience" in options else {}
     known = options.get("processes"), options.get("process")
     if coordinator is None and not cluster:
         if known[0] is None and known[1] is not None:
-            raise StoreError("--process needs --processes, the number of all of them.")
+            raise UsageError("--process needs --processes, the number of all of them.")
         if (known[0] or 1) > 1 and known[1] is None:
-            raise StoreError("--processes needs --process, the number of this one, from 0.")
+            raise UsageError("--processes needs --process, the number of this one, from 0.")
         if patience:
-            raise StoreError("--patience needs --coordinator or --cluster.")
+            raise UsageError("--patience needs --coordinator or --cluster.")
         return
     if coordinator is not None and not cluster and None in known:
-        raise StoreError("--coordinator needs --processes and --process.")
+        raise UsageError("--coordinator needs --processes and --process.")
     # two processes of one number on this machine are told apart before they disturb the others
     with claimed(path, *known):
         options["process"], options["processes"] = join(coordinator, *known, **patience)[:2]
@@ -145,13 +174,14 @@ def _warn(words: str) -> None:
     print(f"polhode: {words}", file=sys.stderr)
 
 
-def _devices(count: int | None) -> list:
+def _devices(count: str) -> list[Any]:
     import jax
 
     found = jax.local_devices()
-    if count is not None and count > len(found):
-        raise RuntimeError(f"--devices {count}: this machine has {len(found)} (use fewer, or all)")
-    return found[:count]
+    wanted = len(found) if count == "all" else int(count)
+    if wanted > len(found):
+        raise UsageError(f"--devices {count}: this machine has {len(found)} (use fewer, or all)")
+    return found[:wanted]
 
 
 class _Meter:
@@ -160,7 +190,7 @@ class _Meter:
     def __init__(self, messages):
         from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-        self.last = None
+        self.last: Any = None
         self.bar = Progress(
             TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TextColumn("bodies"),
             TextColumn("{task.fields[rest]}"), console=messages, transient=True,
@@ -174,7 +204,8 @@ class _Meter:
     def __exit__(self, *_):
         self.bar.stop()
 
-    def __call__(self, report) -> None:
+    def __call__(self, report: Any) -> None:
+        heed()
         self.last = report
         rest = "compiling ..."
         if report.rate is not None:

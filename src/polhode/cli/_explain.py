@@ -1,42 +1,50 @@
-"""`polhode explain SCENE`: what would run, what is skipped, and why."""
+"""`polhode explain SCENE` and `polhode schema`: what would run, and what a scene file may say."""
 
-import argparse
-
-from polhode.cli._options import add_scene, read
-
-
-def register(commands) -> argparse.ArgumentParser:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "explain",
-        help="say how a scene would be computed, without computing it",
-        description="Read and check a scene file and say which method would run, and why.",
-    )
-    add_scene(command)
-    command.set_defaults(command=explain)
-    return command
+from polhode.cli._options import (
+    ClonesOption,
+    DebugOption,
+    PrecisionOption,
+    SceneName,
+    SeedOption,
+    read,
+)
 
 
-def explain(arguments: argparse.Namespace) -> int:
-    """Print the scene in short and the plan."""
+def explain(
+    scene: SceneName,
+    clones: ClonesOption = None,
+    seed: SeedOption = None,
+    precision: PrecisionOption = "float64",
+    debug: DebugOption = False,
+) -> int:
+    """Say how a scene would be computed, and why, without computing it."""
+    from polhode.io import visible
+
+    file = read(scene, clones, seed)
     import polhode
     from polhode.cli._job import prepare
     from polhode.io import blamed
 
-    file = read(arguments)
-    job = prepare(file, arguments.precision)
+    job = prepare(file, precision)
     with blamed(file, ""):
         plan = polhode.explain(job.scene, job.state, job.ts, job.method, rtol=job.rtol)
     times, carlo = file.times, file.monte_carlo
-    span = (
-        f"{times.seconds[0] / times.unit_seconds:g} to {times.seconds[-1] / times.unit_seconds:g}"
-    )
-    print(f"{file.title}\n  source: {file.source or 'not stated'}")
-    print(f"  {len(times.seconds)} samples from {span} {times.unit}, {arguments.precision}")
+    first, last = (times.seconds[k] / times.unit_seconds for k in (0, -1))
+    print(f"{visible(file.title)}\n  source: {visible(file.source) or 'not stated'}")
+    print(f"  {len(times.seconds)} samples from {first:g} to {last:g} {times.unit}, {precision}")
     if carlo is not None:
         print(f"  {carlo.clones} clones, seed {carlo.seed}, drawn from the spread of:")
         for spread in carlo.spreads:
-            print(f"    {spread.quantity}: {spread.source}")
-    print()
-    print(plan)
+            print(f"    {spread.quantity}: {visible(spread.source)}")
+    print(f"\n{plan}")
+    return 0
+
+
+def schema(debug: DebugOption = False) -> int:
+    """Print the JSON Schema of scene files, for editors."""
+    import json
+
+    from polhode.io._models import SceneText
+
+    print(json.dumps(SceneText.model_json_schema(), indent=1))
     return 0

@@ -1,180 +1,295 @@
 """`polhode fit RECORDING`: inertia from a CSV of times and rates, with a table and a figure."""
 
-import argparse
+import dataclasses
 import math
 import sys
 from pathlib import Path
+from typing import Annotated, Any
 
-_NAMES = ("t", "wx", "wy", "wz")
+import typer
 
+from polhode.cli._options import (
+    DebugOption,
+    ForceOption,
+    NoCacheOption,
+    NoFigureOption,
+    QuietOption,
+    positive,
+    require,
+)
+from polhode.cli._signals import heed
+from polhode.cli._targets import UsageError, target
 
-def register(commands) -> argparse.ArgumentParser:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "fit",
-        help="inertia from a recording of body rates (CSV)",
-        description="Fit the inertia of a tumbling body to a CSV file of times and gyroscope "
-        "rates. Writes the numbers (JSON) and a figure (PNG) and prints a summary.",
-        epilog="example: polhode fit toss.csv --columns t=time wx=gx wy=gy wz=gz -o toss",
-    )
-    command.add_argument("recording", metavar="RECORDING", type=Path, help="CSV with a header line")
-    command.add_argument(
-        "--columns", nargs="+", metavar="NAME=COLUMN", default=[],
-        help="columns of t [s], wx, wy, wz and, if there is a wheel, wheel [rad/s]; the names "
-        "themselves are taken for what is not given",
-    )  # fmt: skip
-    command.add_argument(
-        "-o", "--output", metavar="RESULT", type=Path,
-        help="write RESULT.json and RESULT.png (default: the name of the recording, here)",
-    )  # fmt: skip
-    command.add_argument("--degrees", action="store_true", help="rates are in deg/s")
-    command.add_argument("--milliseconds", action="store_true", help="times are in ms")
-    command.add_argument(
-        "--noise", type=_positive, metavar="SIGMA",
-        help="standard deviation of the rates, rad/s (default: from the residuals)",
-    )  # fmt: skip
-    command.add_argument(
-        "--moments-only", action="store_true", help="the sensor axes are principal axes"
-    )
-    command.add_argument("--bias", action="store_true", help="fit a constant bias of the gyroscope")
-    command.add_argument("--drag", action="store_true", help="fit a drag of the air")
-    command.add_argument(
-        "--robust", type=_positive, metavar="K",
-        help="count residuals beyond K noises linearly (needs --noise)",
-    )  # fmt: skip
-    command.add_argument(
-        "--wheel-inertia", type=_positive, metavar="J",
-        help="spin inertia of the wheel, kg m^2: fixes the absolute scale",
-    )  # fmt: skip
-    command.add_argument(
-        "--wheel-axis", nargs=3, type=float, metavar=("X", "Y", "Z"), default=(0.0, 0.0, 1.0),
-        help="axis of the wheel (default: 0 0 1)",
-    )  # fmt: skip
-    command.add_argument("--no-figure", action="store_true", help="do not draw the figure")
-    command.add_argument("-q", "--quiet", action="store_true", help="print errors only")
-    command.set_defaults(command=fit)
-    return command
+_ROLES = ("t", "wx", "wy", "wz", "wheel")
 
 
-def fit(arguments: argparse.Namespace) -> int:
-    """Do the job; 0, 1 when the fit must not be used, 2 for options or files that do not fit."""
-    try:
-        columns = _columns(arguments)
-    except ValueError as error:
-        print(f"polhode: {error}", file=sys.stderr)
-        return 2
-    from polhode.cli._run import _require
+def fit(
+    recording: Annotated[
+        list[str],
+        typer.Argument(metavar="RECORDING", show_default=False, help="CSV with a header line"),
+    ],
+    columns: Annotated[
+        list[str],
+        typer.Option(
+            metavar="NAME=COLUMN ...", show_default=False,
+            help="columns of t [s], wx, wy, wz and, if there is a wheel, wheel [rad/s]; those left"
+            " out are found by their usual names (t, time_s, wx, gyro_x, omega_x, ...)",
+        ),
+    ] = [],  # noqa: B006 - typer reads it
+    output: Annotated[
+        str | None,
+        typer.Option(
+            "-o", "--output", metavar="RESULT", show_default=False,
+            help="write RESULT.json and RESULT.png (default: the name of the recording, here)",
+        ),
+    ] = None,
+    degrees: Annotated[bool, typer.Option("--degrees", help="rates are in deg/s")] = False,
+    milliseconds: Annotated[bool, typer.Option("--milliseconds", help="times are in ms")] = False,
+    noise: Annotated[
+        float | None,
+        typer.Option(
+            parser=positive, metavar="SIGMA",
+            help="standard deviation of the rates, rad/s (default: from the residuals)",
+        ),
+    ] = None,
+    moments_only: Annotated[
+        bool, typer.Option("--moments-only", help="the sensor axes are principal axes")
+    ] = False,
+    bias: Annotated[bool, typer.Option("--bias", help="fit a constant gyroscope bias")] = False,
+    drag: Annotated[bool, typer.Option("--drag", help="fit a drag of the air")] = False,
+    robust: Annotated[
+        float | None,
+        typer.Option(
+            parser=positive, metavar="K",
+            help="count residuals beyond K noises linearly (needs --noise)",
+        ),
+    ] = None,
+    wheel_inertia: Annotated[
+        float | None,
+        typer.Option(
+            parser=positive, metavar="J",
+            help="spin inertia of the wheel, kg m^2: fixes the absolute scale",
+        ),
+    ] = None,
+    wheel_axis: Annotated[
+        tuple[float, float, float],
+        typer.Option(metavar="X Y Z", help="axis of the wheel"),
+    ] = (0.0, 0.0, 1.0),
+    allow_undetermined: Annotated[
+        bool,
+        typer.Option(
+            "--allow-undetermined",
+            help="exit with 0 although the recording does not show all ratios of moments",
+        ),
+    ] = False,
+    no_figure: NoFigureOption = False,
+    force: ForceOption = False,
+    no_cache: NoCacheOption = False,
+    quiet: QuietOption = False,
+    debug: DebugOption = False,
+) -> int:  # fmt: skip
+    """Fit the inertia of a tumbling body to a CSV file of times and gyroscope rates. Writes the
+    numbers (JSON) and a figure (PNG) and prints a summary. Exit code 1 when the fit must not be
+    used, or when the recording does not show all ratios of the moments.
+    """
+    asked = _Asked(
+        *_columns(recording, columns), degrees=degrees, milliseconds=milliseconds, noise=noise,
+        moments_only=moments_only, bias=bias, drag=drag, robust=robust,
+        wheel_inertia=wheel_inertia, wheel_axis=wheel_axis,
+    )  # fmt: skip
+    if wheel_inertia and "wheel" not in asked.columns:
+        raise UsageError("--wheel-inertia needs the wheel's speed: add wheel=COLUMN to --columns.")
+    if robust and not noise:
+        raise UsageError("--robust counts in noises: give --noise SIGMA too.")
+    if not math.hypot(*wheel_axis) > 0 or not math.isfinite(math.hypot(*wheel_axis)):
+        raise UsageError(f"--wheel-axis must have a direction, got {wheel_axis}.")
+    require("fit", "rich", *(() if no_figure else ("matplotlib",)))
+    require("fit", "optimistix", extra="cli,fit")
+    goals = [_goal(asked, output, ".json", force)]
+    if not no_figure:
+        goals.append(_goal(asked, output, ".png", force))
+    return _fit(asked, goals, quiet=quiet, no_cache=no_cache, allowed=allow_undetermined)
 
-    _require("rich", *(() if arguments.no_figure else ("matplotlib",)))
-    _require("optimistix", extra="fit")
+
+@dataclasses.dataclass(frozen=True)
+class _Asked:
+    """What the options say."""
+
+    path: Path
+    columns: dict[str, str]
+    degrees: bool
+    milliseconds: bool
+    noise: float | None
+    moments_only: bool
+    bias: bool
+    drag: bool
+    robust: float | None
+    wheel_inertia: float | None
+    wheel_axis: tuple[float, float, float]
+
+
+def _columns(words: list[str], given: list[str]) -> tuple[Path, dict[str, str]]:
+    """The recording and what --columns says, whose later items stand among the arguments."""
+    items = [word for word in words if word.partition("=")[0] in _ROLES and "=" in word]
+    files = [word for word in words if word not in items]
+    wrong = [x for x in given if x.partition("=")[0] not in _ROLES or not x.partition("=")[2]]
+    wrong += [word for word in files[1:] if "=" in word or given]
+    if wrong:
+        raise UsageError(
+            f"--columns takes NAME=COLUMN with NAME one of {', '.join(_ROLES)}, got {wrong[0]!r}."
+        )
+    if len(files) != 1:
+        raise UsageError(f"expected one RECORDING, got {', '.join(files) or 'none'}.")
+    if "\0" in files[0]:
+        raise UsageError("the name of the recording holds a NUL character.")
+    pairs = (item.partition("=") for item in (*given, *items))
+    return Path(files[0]), {name: column for name, _, column in pairs}
+
+
+def _goal(asked: _Asked, output: str | None, suffix: str, force: bool) -> Path:
+    name = output or asked.path.stem
+    return target(name + ("" if not Path(name).name.strip(".") else suffix), suffix, force=force)
+
+
+def _fit(asked: _Asked, goals: list[Path], *, quiet: bool, no_cache: bool, allowed: bool) -> int:
     from rich.console import Console
 
     messages = Console(stderr=True)
-    messages.quiet = arguments.quiet or not messages.is_terminal
+    messages.quiet = quiet or not messages.is_terminal
     with messages.status("reading ...") as status:
         import jax
 
         jax.config.update("jax_enable_x64", True)
         from polhode import fit as room
+        from polhode.cli import _cache
+        from polhode.io import visible
 
-        try:
-            recording = room.read_recording(
-                arguments.recording,
-                columns,
-                scale=math.pi / 180 if arguments.degrees else 1.0,
-                time_scale=1e-3 if arguments.milliseconds else 1.0,
-                noise=arguments.noise or 1.0,
-            )
-            options = _options(arguments, room)
-        except ValueError as error:
-            units = "deg/s" in str(error) and not (arguments.degrees and arguments.milliseconds)
-            hint = " See --degrees and --milliseconds." if units else ""
-            print(f"polhode: {error}{hint}", file=sys.stderr)
-            return 2
-        output = arguments.output or Path(arguments.recording.stem)
-        output.parent.mkdir(parents=True, exist_ok=True)
-        status.update(f"fitting {recording.times.shape[-1]} samples (compiling first) ...")
-        result = room.fit_recordings([recording], throw=False, **options)
-        status.update("writing ...")
-        written = [_write(output, arguments, recording, result)]
-        if not arguments.no_figure and recording.omega is not None:
-            written.append(_draw(output, arguments, recording, result))
-    if not arguments.quiet:
+        loaded = _read(asked, room)
+        recording = loaded.recording
+        with _cache.kept_programs(not no_cache):
+            status.update(f"fitting {recording.times.shape[-1]} samples (compiling first) ...")
+            result = room.fit_recordings([recording], throw=False, **_options(asked, room))
+            heed()
+            status.update("writing ...")
+            written = [_write(goals[0], asked, loaded, result)]
+            if len(goals) > 1 and recording.omega is not None:
+                heed()
+                written.append(_draw(goals[1], asked, recording, result))
+    undetermined = _undetermined(result)
+    if not quiet:
         here = sys.stdout.isatty()
         out = Console(soft_wrap=not here, width=None if here else 110)
-        out.print(_table(arguments, recording, result))
-        for text in room.remarks(result):
-            out.print(f"- {text}", highlight=False)
-        out.print("written: " + ", ".join(map(str, written)), highlight=False)
-    return 1 if room.is_unusable(result) else 0
+        out.print(_table(asked, recording, result))
+        for text in (_said(loaded), *room.remarks(result)):
+            out.print(f"- {text}", highlight=False, markup=False)
+        out.print("written: " + ", ".join(visible(str(path)) for path in written),
+                  highlight=False, markup=False)  # fmt: skip
+    if room.is_unusable(result):
+        print(f"polhode: the fit must not be used: {', '.join(result.findings())}",
+              file=sys.stderr)  # fmt: skip
+        return 1
+    if undetermined and not allowed:
+        print(
+            "polhode: the recording does not show all ratios of the moments (too little motion, or"
+            " about one axis only); --allow-undetermined takes what it shows",
+            file=sys.stderr,
+        )
+        return 1
+    return 0
 
 
-def _positive(text: str) -> float:
+def _read(asked: _Asked, room: Any) -> Any:
     try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not (value > 0 and math.isfinite(value)):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a positive number")
-    return value
+        return room.load_recording(
+            asked.path,
+            asked.columns,
+            scale=math.pi / 180 if asked.degrees else None,
+            time_scale=1e-3 if asked.milliseconds else None,
+            noise=asked.noise or 1.0,
+        )
+    except ValueError as error:
+        units = "deg/s" in str(error) and not (asked.degrees and asked.milliseconds)
+        hint = " See --degrees and --milliseconds." if units else ""
+        raise UsageError(f"{error}{hint}") from error
 
 
-def _columns(arguments) -> dict[str, str]:
-    """What --columns says, the rest by its own name."""
-    allowed = (*_NAMES, "wheel")
-    found = {name: name for name in _NAMES}
-    for text in arguments.columns:
-        name, mark, column = text.partition("=")
-        if not mark or name not in allowed or not column:
-            raise ValueError(
-                f"--columns takes NAME=COLUMN with NAME one of {', '.join(allowed)}, got {text!r}."
-            )
-        found[name] = column
-    if arguments.wheel_inertia and "wheel" not in found:
-        raise ValueError("--wheel-inertia needs the wheel's speed: add wheel=COLUMN to --columns.")
-    if arguments.robust and not arguments.noise:
-        raise ValueError("--robust counts in noises: give --noise SIGMA too.")
-    return found
+def _said(loaded: Any) -> str:
+    """Which columns were read, in which units."""
+    from polhode.io import visible
+
+    names = ", ".join(f"{role} = {visible(name)}" for role, name in loaded.columns.items())
+    units = ", ".join(f"{role} in {unit}" for role, unit in loaded.units.items())
+    return f"columns: {names}" + (f"; by their names {units}" if units else "")
 
 
-def _options(arguments, room) -> dict:
+def _options(asked: _Asked, room: Any) -> dict[str, Any]:
     """Keywords of ``fit_recordings``."""
     motion = room.FreeMotion()
-    if arguments.drag or arguments.wheel_inertia:
-        length = math.sqrt(sum(x * x for x in arguments.wheel_axis))
-        if not length > 0:
-            raise ValueError("--wheel-axis must have a direction, got 0 0 0.")
+    if asked.drag or asked.wheel_inertia:
+        length = math.hypot(*asked.wheel_axis)
         motion = room.SteppedMotion(
-            spin_inertia=arguments.wheel_inertia,
-            axis=tuple(x / length for x in arguments.wheel_axis),
-            drag=room.Drag() if arguments.drag else None,
-            fit_drag=arguments.drag,
+            spin_inertia=asked.wheel_inertia,
+            axis=tuple(x / length for x in asked.wheel_axis),
+            drag=room.Drag() if asked.drag else None,
+            fit_drag=asked.drag,
         )
     return {
         "motion": motion,
-        "unknown": room.MomentsOnly() if arguments.moments_only else room.FullTensor(),
-        "bias": arguments.bias,
-        "robust": room.Huber(arguments.robust) if arguments.robust else None,
-        "noise_known": arguments.noise is not None,
+        "unknown": room.MomentsOnly() if asked.moments_only else room.FullTensor(),
+        "bias": asked.bias,
+        "robust": room.Huber(asked.robust) if asked.robust else None,
+        "noise_known": asked.noise is not None,
     }
 
 
-def _write(output, arguments, recording, result) -> Path:
+def _undetermined(result: Any) -> bool:
+    """Whether a ratio of the moments is not shown at all, or to no better than its own size."""
+    import numpy as np
+
+    spread = np.asarray(result.ratios_std)[..., :2]
+    ratios = np.asarray(result.ratios)[..., :2]
+    return bool(np.any(~np.isfinite(spread) | (2 * spread > ratios)))
+
+
+def _bias(result: Any) -> tuple[Any, Any] | None:
+    """The gyroscope's bias, rad/s, and its standard deviation (3,); None where none was fitted."""
+    import numpy as np
+
+    if result.parameters.bias is None:
+        return None
+    first = 6 if result.model.is_full else 3  # the covariance begins with the tensor's entries
+    variance = np.diagonal(np.asarray(result.covariance))[first : first + 3]
+    return np.asarray(result.parameters.bias), np.sqrt(variance)
+
+
+def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
     import json
 
+    import jax
+    import jaxlib
     import numpy as np
 
     import polhode
     from polhode.io import whole_file
     from polhode.rotation import to_matrix
 
-    def plain(value):
-        return np.where(np.isfinite(value), value, None).tolist()
+    def plain(value: Any) -> Any:
+        value = np.asarray(value)
+        return np.asarray(np.where(np.isfinite(value), value, None)).tolist()
 
+    recording = loaded.recording
     low, high = result.interval(0.95)
+    found = _bias(result)
+    options = {name: value for name, value in dataclasses.asdict(asked).items()
+               if name not in ("path", "columns")}  # fmt: skip
     document = {
-        "recording": str(arguments.recording),
+        "recording": str(asked.path),
+        "columns": loaded.columns,
+        "units": loaded.units,
+        "options": options,
         "polhode": polhode.__version__,
+        "jax": jax.__version__,
+        "jaxlib": jaxlib.__version__,
         "samples": int(np.sum(recording.present)),
         "gaps": int(np.sum(np.asarray(recording.present) == 0)),
         "scale_known": result.scale_known,
@@ -185,72 +300,83 @@ def _write(output, arguments, recording, result) -> Path:
         "interval_95": [plain(low), plain(high)],
         "tensor": plain(result.inertia.tensor),
         "principal_axes_as_columns": plain(to_matrix(result.axes)),
-        "axes_std_rad": plain(result.axes_std),
+        "axes_std_rad": [0.0] * 3 if asked.moments_only else plain(result.axes_std),
+        "bias_rad_per_s": None if found is None else plain(found[0]),
+        "bias_std_rad_per_s": None if found is None else plain(found[1]),
         "mirrored_ratios": plain(np.sort(np.asarray(result.mirrored.moments))),
-        "rms_rad_per_s": float(result.rms),
-        "residual_over_noise": float(result.noise),
-        "whiteness": float(result.whiteness),
+        "rms_rad_per_s": plain(result.rms),
+        "residual_over_noise": plain(result.noise),
+        "whiteness": plain(result.whiteness),
         "steps": int(result.steps),
+        "undetermined": _undetermined(result),
         "findings": result.findings(),
     }
-    path = output.with_name(output.name + ".json")
+    text = json.dumps(document, indent=1, allow_nan=False)
     with whole_file(path) as temporary:
-        temporary.write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
+        temporary.write_text(text + "\n", encoding="utf-8")
     return path
 
 
-def _draw(output, arguments, recording, result) -> Path:
+def _draw(path: Path, asked: _Asked, recording: Any, result: Any) -> Path:
+    import io
+
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    from polhode import plot
+    from polhode import __version__, plot
     from polhode.io import whole_file
 
-    figure = plot.fit(result, recording, title=arguments.recording.name)
-    path = output.with_name(output.name + ".png")
-    with whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=160)
+    figure = plot.fit(result, recording, title=asked.path.name)
+    drawn = io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=160, metadata={"Software": f"polhode {__version__}"})
     plt.close(figure)
+    with whole_file(path) as temporary:
+        temporary.write_bytes(drawn.getvalue())
     return path
 
 
-def _table(arguments, recording, result):
+def _table(asked: _Asked, recording: Any, result: Any) -> Any:
     """The summary as a rich Table."""
     import numpy as np
     from rich.table import Table
+    from rich.text import Text
+
+    from polhode.io import visible
+    from polhode.rotation import to_matrix
 
     samples = int(np.sum(recording.present))
     grid = Table(
-        title=f"{arguments.recording.name}: {samples} samples",
+        title=Text(f"{visible(asked.path.name)}: {samples} samples"),
         title_justify="left",
         show_edge=False,
         pad_edge=False,
     )
     known = result.scale_known
     for name in ("", "moment [kg m^2]" if known else "ratio", "95 %", "axis in sensor axes", "+-"):
-        grid.add_column(name, justify="left" if name == "" else "right")
-    from polhode.rotation import to_matrix
-
+        grid.add_column(Text(name), justify="left" if name == "" else "right")
     values = np.asarray(result.moments if known else result.ratios)
     low, high = (np.asarray(end) for end in result.interval(0.95))
     axes = np.asarray(to_matrix(result.axes))
     turn = np.degrees(np.asarray(result.axes_std))
     for k, name in enumerate(("smallest", "middle", "largest")):
         reach = "" if k == 2 and not known else f"{low[k]:.5g} to {high[k]:.5g}"
+        shown = f"{turn[k]:.2g} deg" if turn[k] < 90 else "not determined"
         grid.add_row(
             name,
             f"{values[k]:.6g}",
-            reach if np.isfinite(high[k]) else "not determined",
+            reach if high[k] - values[k] <= values[k] else "not determined",
             # without negative zeros
             "({:.3f}, {:.3f}, {:.3f})".format(*(np.round(axes[:, k], 3) + 0.0)),
-            f"{turn[k]:.2g} deg" if turn[k] < 90 else "not determined",
+            "given" if asked.moments_only else shown,
         )
-    grid.caption = (
-        f"residual rms {float(result.rms):.3g} rad/s, {float(result.noise):.3g} of the noise"
-        if arguments.noise
-        else f"residual rms {float(result.rms):.3g} rad/s"
-    )
+    lines = [f"residual rms {float(result.rms):.3g} rad/s"]
+    if asked.noise:
+        lines[0] += f", {float(result.noise):.3g} of the noise"
+    if (found := _bias(result)) is not None:
+        parts = (f"{b:.3g} +- {s:.2g}" for b, s in zip(*found, strict=True))
+        lines.append(f"bias of the gyroscope, rad/s: {', '.join(parts)}")
+    grid.caption = Text("\n".join(lines))
     grid.caption_justify = "left"
     return grid

@@ -1,6 +1,7 @@
 """What `polhode run` computes: the batch of a scene file, chunk by chunk."""
 
 import dataclasses
+import os
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -62,6 +63,7 @@ def prepare(file: SceneFile, precision: str) -> Job:
     """Build the scene in the precision asked for; switches 64-bit numbers on for this process."""
     jax.config.update("jax_enable_x64", True)
     dtype = np.dtype(precision)
+    _require_memory(file, dtype.itemsize)
     clones = draw_clones(file, dtype)
     ts = file.times.seconds.astype(dtype)
     seen = () if file.observations is None else _within(file.observations.seconds, ts)
@@ -76,6 +78,22 @@ def prepare(file: SceneFile, precision: str) -> Job:
         file.method.rtol,
         clones.redrawn,
     )
+
+
+def _require_memory(file: SceneFile, itemsize: int) -> None:
+    """MemoryError now, rather than a process that the system ends, for what cannot fit."""
+    bodies = 1 if file.monte_carlo is None else file.monte_carlo.clones + 1
+    # attitude, rates, energy and momentum of every sample, and as much again to write them
+    need = 2 * 11 * itemsize * bodies * len(file.times.seconds)
+    try:
+        have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, ValueError, OSError):
+        return
+    if need > have:
+        raise MemoryError(
+            f"{bodies:,} bodies at {len(file.times.seconds):,} times take {need / 1e9:,.1f} GB,"
+            f" this machine has {have / 1e9:,.1f} GB"
+        )
 
 
 def _within(seconds: np.ndarray, ts: np.ndarray) -> np.ndarray:

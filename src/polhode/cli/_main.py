@@ -1,90 +1,150 @@
-"""The `polhode` command: options, exit codes and errors in one readable block.
+"""The `polhode` command: its commands, exit codes and errors in one readable block.
 
-Every command is a module of this room with `register(commands)`; nothing heavy is imported before
-a command runs, so that `--help` and mistakes in the options answer at once.
+Nothing heavy is imported before a command runs, so that `--help` and mistakes answer at once.
 """
 
-import argparse
-import contextlib
+import functools
 import os
-import signal
 import sys
-import threading
 import traceback
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Annotated, Any
 
-from polhode.cli import _explain, _fit, _run
+import typer
 
-SUCCESS, FAILURE, USAGE, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
-_COMMANDS = (_run, _explain, _fit)
+from polhode.cli import _explain, _fit, _look, _run, _targets
+from polhode.cli._signals import INTERRUPTED, TERMINATED, heeded
+from polhode.io import SceneFileError, visible
+
+SUCCESS, FAILURE, USAGE = 0, 1, 2
+_codes: list[int] = []
+
+app = typer.Typer(
+    name="polhode",
+    help="Rotating rigid bodies: simulate scenes written as TOML files, fit inertia, look at them.",
+    epilog="Exit codes: 0 done, 1 failed, 2 wrong options or input file, 130 interrupted.",
+    add_completion=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit code.
+def _version(wanted: bool) -> bool:
+    if wanted:
+        from polhode._version import __version__
 
-    0: done; 1: the simulation or the writing failed; 2: wrong options or a bad scene file; 130:
-    interrupted (Ctrl-C); 143: terminated. Raises SystemExit for --help and wrong options, as
-    argparse does.
-    """
-    arguments = _parser().parse_args(argv)
+        print(f"polhode {__version__}")
+        raise typer.Exit
+    return wanted
+
+
+@app.callback()
+def _top(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_version, help="show the version")
+    ] = False,
+) -> None:
+    """Rotating rigid bodies: simulate scenes written as TOML files, fit inertia."""
+
+
+def _guarded(command: Callable[..., int]) -> Callable[..., None]:
+    """The command with every error told in one block; its exit code is noted for `main`."""
+
+    @functools.wraps(command)
+    def guarded(*given: Any, **options: Any) -> None:
+        _codes.append(_run_guarded(functools.partial(command, *given, **options),
+                                   options.get("debug", False)))  # fmt: skip
+
+    return guarded
+
+
+def _run_guarded(command: Callable[[], int], debug: bool) -> int:
+    _targets.forget()
     try:
-        with _terminable():
-            return arguments.command(arguments)
+        with heeded(_leave), warnings.catch_warnings():
+            # numbers that overflow are told by the status, and letters without a picture are drawn
+            # as boxes; what else warns is told without its place in the source
+            warnings.simplefilter("ignore", RuntimeWarning)
+            warnings.filterwarnings("ignore", "Glyph", UserWarning)
+            warnings.showwarning = _warned
+            code = command()
+            sys.stdout.flush()
+            return code
     except KeyboardInterrupt:
-        print("\npolhode: interrupted; no file was changed", file=sys.stderr)
+        print(f"\npolhode: interrupted; {_state_of_files()}", file=sys.stderr)
         return INTERRUPTED
+    except SystemExit as ended:
+        if ended.code == TERMINATED:
+            print(f"\npolhode: terminated; {_state_of_files()}", file=sys.stderr)
+        raise
     except BrokenPipeError:  # the reader of our output went away: nobody to tell
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _silence(sys.stdout)
         return FAILURE
     except Exception as error:
-        return _report(error, arguments.debug)
+        return _report(error, debug)
 
 
-def _parser() -> argparse.ArgumentParser:
-    from polhode import __version__
+def _leave(code: int) -> None:
+    """End the process here and now."""
+    word = "terminated" if code == TERMINATED else "interrupted"
+    print(f"\npolhode: {word}; {_state_of_files()}", file=sys.stderr, flush=True)
+    os._exit(code)
 
-    parser = argparse.ArgumentParser(
-        prog="polhode",
-        description="Rotating rigid bodies: simulate scenes written as TOML files, fit inertia.",
-        epilog="Exit codes: 0 done, 1 failed, 2 wrong options or input file, 130 interrupted.",
-    )
-    parser.add_argument("--version", action="version", version=f"polhode {__version__}")
-    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for module in _COMMANDS:
-        command = module.register(commands)
-        command.add_argument(
-            "--debug", action="store_true", help="show the full traceback of an error"
-        )
-    return parser
+
+def _warned(message: Warning | str, *_: Any) -> None:
+    print(f"polhode: {visible(str(message))}", file=sys.stderr)
+
+
+def _state_of_files() -> str:
+    written, left = ([visible(str(path)) for path in paths] for paths in _targets.changed())
+    if not written:
+        return "no file was changed"
+    told = f"written: {', '.join(written)}"
+    return told + (f"; not written: {', '.join(left)}" if left else "")
 
 
 def _report(error: Exception, debug: bool) -> int:
     """Print the error to stderr; the exit code that belongs to it."""
-    from polhode.io import SceneFileError
-
     if debug:
         traceback.print_exception(error)
-    bad_input = isinstance(error, SceneFileError)
+    bad_input = isinstance(error, SceneFileError | _targets.UsageError)
     text = str(error) or type(error).__name__
+    if isinstance(error, MemoryError):
+        text = f"not enough memory ({text}): ask for fewer bodies or times, or use an [ensemble]"
     known = bad_input or isinstance(error, OSError | ImportError | RuntimeError | MemoryError)
     lead = "" if known else f"{type(error).__name__}: "
     hint = "" if known or debug else "\n  (run again with --debug to see where)"
-    print(f"polhode: {lead}{text}{hint}", file=sys.stderr)
+    block = "\n".join(map(visible, f"{lead}{text}{hint}".split("\n")))
+    print(f"polhode: {block}", file=sys.stderr)
+    try:
+        sys.stdout.flush()
+    except OSError:  # a full disk behind a redirection: nothing more can go there
+        _silence(sys.stdout)
     return USAGE if bad_input else FAILURE
 
 
-@contextlib.contextmanager
-def _terminable() -> Iterator[None]:
-    """Let SIGTERM unwind like an exception, so that temporary files are removed."""
-    if threading.current_thread() is not threading.main_thread():
-        yield
-        return
+def _silence(stream: Any) -> None:
+    os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
-    def stop(*_):
-        raise SystemExit(TERMINATED)
 
-    before = signal.signal(signal.SIGTERM, stop)
+_EXAMPLES = {
+    "run": "example: polhode run scenes/toutatis.toml -o toutatis.nc",
+    "fit": "example: polhode fit toss.csv --columns t=time wx=gx wy=gy wz=gz -o toss",
+}
+for _name, _command in (("run", _run.run), ("explain", _explain.explain), ("fit", _fit.fit),
+                        ("schema", _explain.schema), ("view", _look.view),
+                        ("lightcurve", _look.lightcurve)):  # fmt: skip
+    app.command(_name, epilog=_EXAMPLES.get(_name))(_guarded(_command))
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; see `polhode.cli.main`."""
+    _codes.clear()
+    words = None if argv is None else list(argv)
     try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+        typer.main.get_command(app).main(args=words, prog_name="polhode")
+    except SystemExit:
+        if not _codes:
+            raise
+    return _codes[-1]

@@ -1,63 +1,130 @@
-"""Options that several commands share."""
+"""Kinds of options that several commands share."""
 
-import argparse
+import math
+import re
+from collections.abc import Callable
+from typing import Annotated
+
+import typer
+
+_SIZES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 
 
-def whole_number(least: int):
-    """An argparse type: a whole number not below `least`."""
+def whole_number(least: int) -> Callable[[str], int]:
+    """A whole number not below `least`."""
 
-    def convert(text: str) -> int:
+    def convert(text: str | int) -> int:
         try:
-            value = int(text)
+            value = int(str(text))
         except ValueError:
             value = least - 1
         if value < least:
-            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from {least} up")
+            raise typer.BadParameter(f"{str(text)[:80]!r} is not a whole number from {least} up")
         return value
 
     return convert
 
 
-def add_scene(command: argparse.ArgumentParser) -> None:
-    command.add_argument(
-        "scene", metavar="SCENE", help="scene file (TOML), see docs/scene_files.md"
-    )
-    command.add_argument(
-        "--clones", type=whole_number(0), metavar="N",
+def positive(text: str | float) -> float:
+    """A finite number above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise typer.BadParameter(f"{str(text)[:80]!r} is not a positive number")
+    return value
+
+
+def byte_count(text: str | int) -> int:
+    """4GB, 500MB, 2e9."""
+    match = re.fullmatch(r"([0-9.]+(?:e[0-9]+)?)\s*([kmgt]?)b?", str(text).strip().lower())
+    try:
+        return int(float(match[1]) * _SIZES[match[2]])  # type: ignore[index]
+    except (TypeError, ValueError, OverflowError):
+        raise typer.BadParameter(f"{str(text)[:80]!r} is not a size such as 4GB") from None
+
+
+def device_count(text: str) -> str:
+    """A number of devices, or all."""
+    return text if text == "all" else str(whole_number(1)(text))
+
+
+SceneName = Annotated[
+    str, typer.Argument(metavar="SCENE", help="scene file (TOML), - for standard input",
+                        show_default=False)
+]  # fmt: skip
+ClonesOption = Annotated[
+    int | None,
+    typer.Option(
+        "--clones", parser=whole_number(0), metavar="N",
         help="number of Monte Carlo clones, instead of the scene's; 0: the nominal body only",
-    )  # fmt: skip
-    command.add_argument(
-        "--seed",
-        type=whole_number(0),
-        metavar="N",
+    ),
+]  # fmt: skip
+SeedOption = Annotated[
+    int | None,
+    typer.Option(
+        "--seed", parser=whole_number(0), metavar="N",
         help="seed of the clones, instead of the scene's",
-    )
-    command.add_argument(
-        "--precision", choices=("float64", "float32"), default="float64",
-        help="floating-point numbers to compute with (default: %(default)s)",
-    )  # fmt: skip
+    ),
+]  # fmt: skip
+PrecisionOption = Annotated[
+    str, typer.Option("--precision", parser=lambda text: _precision(text),
+                      metavar="float64|float32", help="numbers to compute with")
+]  # fmt: skip
+ForceOption = Annotated[
+    bool, typer.Option("--force", help="replace a file that polhode did not write")
+]
+NoFigureOption = Annotated[bool, typer.Option("--no-figure", help="do not draw the figure")]
+NoCacheOption = Annotated[
+    bool,
+    typer.Option("--no-cache", help="do not keep compiled programs (or set POLHODE_CACHE=off)"),
+]
+QuietOption = Annotated[bool, typer.Option("-q", "--quiet", help="print errors only")]
+DebugOption = Annotated[bool, typer.Option("--debug", help="show the full traceback of an error")]
 
 
-def read(arguments: argparse.Namespace):
+def _precision(text: str) -> str:
+    if text not in ("float64", "float32"):
+        raise typer.BadParameter(f"{text[:80]!r} is not float64 or float32")
+    return text
+
+
+def read(scene: str, clones: int | None, seed: int | None):
     """The scene file with the options put in place of its own entries."""
     import dataclasses
 
     from polhode.io import SceneFileError, read_scene
 
-    file = read_scene(arguments.scene)
-    given = {"clones": arguments.clones, "seed": arguments.seed}
+    file = read_scene(scene)
+    given = {"clones": clones, "seed": seed}
     given = {name: value for name, value in given.items() if value is not None}
     if not given:
         return file
+    name = next(iter(given))
+    if file.ensemble is not None:
+        key = {"seed": "seed", "clones": "bodies"}[name]
+        raise SceneFileError(
+            file.path, f"[ensemble] {key}", "not replaced by an option",
+            f"--{name} on the command line", "an [ensemble] that says what its store holds",
+            f"write `{key} = {given[name]}` into [ensemble], and name another store",
+        )  # fmt: skip
     if given.get("clones") == 0:
         return dataclasses.replace(file, monte_carlo=None)
     if file.monte_carlo is None:
         raise SceneFileError(
-            file.path,
-            "[monte_carlo]",
-            "missing table",
-            f"--{next(iter(given))} on the command line",
-            "a scene that states its uncertainties",
-            "add [monte_carlo], or drop the option",
-        )
+            file.path, "[monte_carlo]", "missing table", f"--{name} on the command line",
+            "a scene that states its uncertainties", "add [monte_carlo], or drop the option",
+        )  # fmt: skip
     return dataclasses.replace(file, monte_carlo=dataclasses.replace(file.monte_carlo, **given))
+
+
+def require(command: str, *packages: str, extra: str = "cli") -> None:
+    """ImportError now, rather than after the work, when a package is missing."""
+    import importlib.util
+
+    missing = [name for name in packages if importlib.util.find_spec(name) is None]
+    if missing:
+        raise ImportError(
+            f"`polhode {command}` needs {', '.join(missing)}: pip install 'polhode[{extra}]'"
+        )

@@ -1,91 +1,114 @@
 """`polhode run SCENE`: simulate a scene file, write NetCDF and a figure, print a summary."""
 
-import argparse
-import importlib.util
+import json
 import sys
 from pathlib import Path
+from typing import Annotated, Any
+
+import typer
 
 from polhode.cli import _ensemble
-from polhode.cli._options import add_scene, read
+from polhode.cli._options import (
+    ClonesOption,
+    DebugOption,
+    ForceOption,
+    NoCacheOption,
+    NoFigureOption,
+    PrecisionOption,
+    QuietOption,
+    SceneName,
+    SeedOption,
+    read,
+    require,
+)
+from polhode.cli._signals import heed
+from polhode.cli._targets import target
 
 
-def register(commands) -> argparse.ArgumentParser:
-    """Add the command to the parser."""
-    command = commands.add_parser(
-        "run",
-        help="simulate a scene; write a NetCDF file and a figure, print a summary",
-        description="Simulate a scene file with its Monte Carlo clones. Writes NetCDF and a PNG "
-        "figure beside it, each whole or not at all, and prints a summary table.",
-        epilog="example: polhode run scenes/toutatis.toml -o toutatis.nc",
-    )
-    add_scene(command)
-    command.add_argument(
-        "-o", "--output", metavar="FILE", type=Path,
-        help="NetCDF file to write (default: that of the scene's [output], or SCENE.nc here); its "
-        "folder is made if need be",
-    )  # fmt: skip
-    command.add_argument("--no-figure", action="store_true", help="do not draw the figure")
-    command.add_argument("-q", "--quiet", action="store_true", help="print errors only")
-    _ensemble.add_options(command)
-    command.set_defaults(command=run)
-    return command
-
-
-def run(arguments: argparse.Namespace) -> int:
-    """Do the job; 0, or 1 when some clones did not finish."""
-    file = read(arguments)
+def run(
+    scene: SceneName,
+    output: Annotated[
+        str | None,
+        typer.Option(
+            "-o", "--output", metavar="FILE", show_default=False,
+            help="NetCDF file to write (default: that of the scene's [output], or SCENE.nc here);"
+            " its folder is made if need be",
+        ),
+    ] = None,
+    clones: ClonesOption = None,
+    seed: SeedOption = None,
+    precision: PrecisionOption = "float64",
+    no_figure: NoFigureOption = False,
+    force: ForceOption = False,
+    no_cache: NoCacheOption = False,
+    quiet: QuietOption = False,
+    debug: DebugOption = False,
+    memory: _ensemble.MemoryOption = None,
+    chunk: _ensemble.ChunkOption = None,
+    devices: _ensemble.DevicesOption = None,
+    process: _ensemble.ProcessOption = None,
+    processes: _ensemble.ProcessesOption = None,
+    coordinator: _ensemble.CoordinatorOption = None,
+    cluster: _ensemble.ClusterOption = False,
+    patience: _ensemble.PatienceOption = None,
+    no_verify: _ensemble.NoVerifyOption = False,
+) -> int:  # fmt: skip
+    """Simulate a scene with its Monte Carlo clones. Writes a NetCDF file and a PNG figure beside
+    it, each whole or not at all, and prints a summary table. A scene with an [ensemble] goes into a
+    Zarr store instead.
+    """
+    file = read(scene, clones, seed)
+    options = {
+        "memory": memory, "chunk": chunk, "devices": devices, "process": process,
+        "processes": processes, "coordinator": coordinator, "cluster": cluster or None,
+        "patience": patience, "no_verify": no_verify or None,
+    }  # fmt: skip
+    options = {name: value for name, value in options.items() if value is not None}
     if file.ensemble is not None:
-        _require("rich", "zarr", extra="scale")
-        return _ensemble.run(arguments, file, arguments.output)
-    _ensemble.refuse_options(arguments, file)
-    with_figure = file.output.figure and not arguments.no_figure
-    _require("rich", "xarray", "h5netcdf", "h5py", *(("matplotlib",) if with_figure else ()))
+        require("run", "rich", "zarr", extra="cli,scale")
+        return _ensemble.run(file, output, precision, options, quiet=quiet, no_cache=no_cache)
+    _ensemble.refuse(options, file)
+    with_figure = file.output.figure and not no_figure
+    require("run", "rich", "xarray", "h5netcdf", "h5py", *(("matplotlib",) if with_figure else ()))
+    named = output or file.output.file
+    name = named or ("stdin" if scene == "-" else file.path.stem) + ".nc"
+    goal = target(name, ".nc", force=force, confined=output is None and named is not None)
+    picture = None
+    if with_figure:
+        picture = target(goal.with_suffix(".png"), ".png", force=force)
+    return _simulate(file, goal, picture, precision, quiet=quiet, no_cache=no_cache)
+
+
+def _simulate(
+    file: Any, goal: Path, picture: Path | None, precision: str, *, quiet: bool, no_cache: bool
+) -> int:
     from rich.console import Console
 
-    output = _target(arguments.output or file.output.file or Path(file.path.stem + ".nc"))
     messages = Console(stderr=True)
     # progress is for people who watch: nothing of it goes into a log file
-    messages.quiet = arguments.quiet or not messages.is_terminal
+    messages.quiet = quiet or not messages.is_terminal
     with messages.status("starting ..."):
-        from polhode.cli import _job, _summary
-        from polhode.io import write_netcdf
+        from polhode.cli import _cache, _job, _summary
+        from polhode.io import visible, write_netcdf
 
-        job = _job.prepare(file, arguments.precision)
-    outcome = _with_progress(messages, job)
-    with messages.status("measuring and writing ..."):
-        figures = _summary.measure(job, outcome)
-        dataset = _dataset(job, outcome, figures)
-        written = [write_netcdf(dataset, output)]
-        if with_figure:
-            written.append(_draw(job, outcome, output.with_suffix(".png")))
-    if not arguments.quiet:
+    with _cache.kept_programs(not no_cache):
+        with messages.status("starting ..."):
+            job = _job.prepare(file, precision)
+        outcome = _with_progress(messages, job)
+        with messages.status("measuring and writing ..."):
+            figures = _summary.measure(job, outcome)
+            dataset = _dataset(job, outcome, figures, precision)
+            heed()
+            written = [write_netcdf(dataset, goal)]
+            if picture is not None:
+                heed()
+                written.append(_draw(job, outcome, picture))
+    if not quiet:
         out = Console(soft_wrap=not sys.stdout.isatty())
         out.print(_summary.table(job, outcome, figures))
-        out.print("written: " + ", ".join(map(str, written)), highlight=False)
+        out.print("written: " + ", ".join(visible(str(path)) for path in written),
+                  highlight=False, markup=False)  # fmt: skip
     return _failures(outcome.trajectory.status)
-
-
-def _require(*packages: str, extra: str = "cli") -> None:
-    """ImportError now, rather than after the work, when a package is missing."""
-    missing = [name for name in packages if importlib.util.find_spec(name) is None]
-    if missing:
-        raise ImportError(
-            f"`polhode run` needs {', '.join(missing)}: pip install 'polhode[{extra}]'"
-        )
-
-
-def _target(path: Path | str) -> Path:
-    """The output path, its folder made; OSError before the work rather than after it."""
-    path = Path(path)
-    if path.suffix != ".nc":
-        path = path.with_name(path.name + ".nc")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.is_dir():
-        raise IsADirectoryError(f"{path} is a folder: name a file to write, such as {path}/out.nc")
-    probe = path.parent / f".{path.stem}.probe"
-    probe.touch()
-    probe.unlink()
-    return path
 
 
 def _with_progress(messages, job):
@@ -99,11 +122,22 @@ def _with_progress(messages, job):
     )  # fmt: skip
     with Progress(*columns, console=messages, transient=True) as progress:
         task = progress.add_task("", total=job.bodies)
-        return _job.run(job, lambda done: progress.update(task, completed=done))
+
+        def advance(done: int) -> None:
+            progress.update(task, completed=done)
+            heed()
+
+        return _job.run(job, advance)
 
 
-def _dataset(job, outcome, figures):
-    """The trajectory's dataset with the clones numbered, their periods and the scene's text."""
+# units of moments, and of what grows with them, where only ratios of moments are known
+_RELATIVE = {"energy": "s-2", "momentum_space": "s-1", "work": "s-2"}
+
+
+def _dataset(job, outcome, figures, precision: str):
+    """The trajectory's dataset with the clones numbered, their periods and what was run."""
+    from polhode.cli import _summary
+
     dataset = outcome.trajectory.to_xarray()
     file = job.file
     lead = ()
@@ -115,7 +149,8 @@ def _dataset(job, outcome, figures):
         lead = ("clone",)
     for name, values in figures.periods.items():
         values = values if lead else values[0]
-        dataset[name] = (lead, values, {"units": "s", "long_name": f"period {name}"})
+        words = f"period {name}: {_summary.MEANINGS[name]}"
+        dataset[name] = (lead, values, {"units": "s", "long_name": words})
     dataset["moments"] = (
         (*(lead if job.scene.inertia.batch_shape else ()), "axis"),
         job.scene.inertia.moments,
@@ -124,21 +159,64 @@ def _dataset(job, outcome, figures):
             "long_name": "principal moments of inertia",
         },
     )
-    text = file.path.read_text(encoding="utf-8")
-    dataset.attrs.update(title=file.title, scene_source=file.source, frame=file.frame, scene=text)
-    if file.epoch is not None:
-        dataset.attrs["epoch"] = file.epoch.isoformat()
+    if file.relative_moments:
+        for name in _RELATIVE.keys() & dataset.data_vars.keys():
+            words = dataset[name].attrs["long_name"]
+            dataset[name].attrs = {
+                "units": _RELATIVE[name], "long_name": f"{words}, per unit of the relative moments",
+            }  # fmt: skip
+    dataset.attrs.update(provenance(file, precision))
     return dataset
+
+
+def provenance(file, precision: str) -> dict[str, Any]:
+    """What was run, as attributes: the scene as parsed, the options, the versions."""
+    import jax
+    import jaxlib
+    import numpy as np
+
+    from polhode import __version__
+    from polhode.io import visible
+
+    carlo = file.monte_carlo
+    used: dict[str, Any] = {"precision": precision, "method": file.method.kind,
+                            "solver": file.method.solver, "rtol": file.method.rtol}  # fmt: skip
+    used |= {"clones": carlo.clones, "seed": carlo.seed} if carlo is not None else {"clones": 0}
+    found: dict[str, Any] = {
+        "title": visible(file.title),
+        "scene_source": visible(file.source),
+        "frame": visible(file.frame),
+        "scene": file.text.replace("\0", ""),
+        "options": json.dumps(used),
+        "precision": precision,
+        "clones": np.int64(used["clones"]),
+        "polhode_version": __version__,
+        "jax_version": jax.__version__,
+        "jaxlib_version": jaxlib.__version__,
+        "devices": device_layout(jax.local_devices()[:1]),
+    }
+    if carlo is not None:
+        found["seed"] = np.int64(carlo.seed)
+    if file.epoch is not None:
+        found["epoch"] = file.epoch.isoformat()
+    return found
+
+
+def device_layout(devices) -> str:
+    """Number and kind of the devices that computed."""
+    return f"{len(devices)} x {devices[0].platform} ({devices[0].device_kind})"
 
 
 def _draw(job, outcome, path: Path) -> Path:
     """Write the overview figure, without a display."""
+    import io
+
     import matplotlib
 
     matplotlib.use("agg")
     from matplotlib import pyplot
 
-    from polhode import plot
+    from polhode import __version__, plot
     from polhode.io import build_attitudes, whole_file
 
     file, seen = job.file, job.file.observations
@@ -153,9 +231,11 @@ def _draw(job, outcome, path: Path) -> Path:
         axis_names=file.axis_names,
         title=file.title,
     )
-    with whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=160)
+    drawn = io.BytesIO()
+    figure.savefig(drawn, dpi=160, metadata={"Software": f"polhode {__version__}"})
     pyplot.close(figure)
+    with whole_file(path) as temporary:
+        temporary.write_bytes(drawn.getvalue())
     return path
 
 

@@ -7,9 +7,10 @@ import numpy as np
 import polhode
 from polhode.cli._job import Job, Outcome, Residuals
 from polhode.free import Mode
+from polhode.io import visible
 from polhode.plot import Scale
 
-_MEANINGS = {
+MEANINGS = {
     "P_psi": "turn about long axis",
     "P_phi": "mean precession",
 }
@@ -43,7 +44,7 @@ def measure(job: Job, outcome: Outcome) -> Figures:
         change = np.linalg.norm(vector - vector[..., :1, :], axis=-1)
         momentum = _largest(change / np.where(size > 0, size, 1))
         found = polhode.periods(scene.inertia, job.state)
-        periods = {name: np.atleast_1d(np.asarray(getattr(found, name))) for name in _MEANINGS}
+        periods = {name: np.atleast_1d(np.asarray(getattr(found, name))) for name in MEANINGS}
         modes = _mode_names(found.mode)
     return Figures(periods, modes, energy, momentum)
 
@@ -70,7 +71,7 @@ def table(job: Job, outcome: Outcome, figures: Figures):
     unit, size = file.times.unit, file.times.unit_seconds
     clones = bodies - 1
     grid = Table(
-        title=Text(file.title, style="bold"),
+        title=Text(visible(file.title), style="bold"),
         title_justify="left",
         caption=_caption(job, outcome, clones),
         caption_justify="left",
@@ -91,7 +92,7 @@ def table(job: Job, outcome: Outcome, figures: Figures):
         grid.add_row(*map(Text, cells))  # Text: brackets are units here, not markup
 
     if figures.periods:
-        for name, meaning in _MEANINGS.items():
+        for name, meaning in MEANINGS.items():
             values = figures.periods[name] / size
             row(f"{name}  {meaning} [{unit}]", f"{values[0]:#.5g}", _spread(values[1:]),
                 _published(file, name, size))  # fmt: skip
@@ -151,7 +152,9 @@ def _misfits(residuals: Residuals | None, scale: Scale):
         yield f"median misfit, {rates.size} rates [{scale.rate}]", f"{np.median(rates):.3g}"
 
 
-def _caption(job: Job, outcome: Outcome, clones: int) -> str:
+def _caption(job: Job, outcome: Outcome, clones: int):
+    from rich.text import Text
+
     file = job.file
     count = "1 body" if job.bodies == 1 else f"{job.bodies:,} bodies"
     lines = [f"{count}, {len(job.ts):,} samples, {job.ts.dtype}"]
@@ -163,4 +166,4 @@ def _caption(job: Job, outcome: Outcome, clones: int) -> str:
         lines += [f"  {spread.quantity}: {spread.source}" for spread in file.monte_carlo.spreads]
     if job.redrawn:
         lines.append(f"  {job.redrawn:,} draws had moments that no body has, and were drawn again")
-    return "\n".join(lines)
+    return Text("\n".join(map(visible, lines)))

@@ -38,7 +38,7 @@ def fill(
 
     Finished chunks are read and checked in a thread of their own meanwhile. A chunk is begun when
     the one before it is marked: whatever ends the process costs one chunk at most. ``ahead``
-    groups of blocks are computed at a time.
+    blocks are computed at a time.
     """
     tally = _Tally(store, block.ensemble.bodies, share, progress)
     marked = store.finished()
@@ -113,7 +113,6 @@ def _chunk(store: Store, block: Block, number: int, writer, ahead: int) -> None:
         for name, r in rows.items()
         if name not in split
     }
-    step = block.size * len(block.devices)
     first = number * store.chunk
     last = min(first + store.chunk, block.ensemble.bodies)
     waiting: collections.deque = collections.deque()
@@ -134,8 +133,8 @@ def _chunk(store: Store, block: Block, number: int, writer, ahead: int) -> None:
     files = store.pieces(number)
     cut = _Cutter(split)
     wanted = next(files)
-    for offset, found in _groups(block, first, last, step, ahead):
-        _gather(gathered, offset, found, block.size, last - first)
+    for offset, found in _blocks(block, first, last, ahead):
+        _gather(gathered, offset, found, block.size)
         cut.add(found)
         while wanted is not None and wanted[0] in split:
             ready = cut.take(wanted[0], wanted[1].stop - wanted[1].start)
@@ -151,10 +150,10 @@ def _chunk(store: Store, block: Block, number: int, writer, ahead: int) -> None:
     store.finish(number, checksum)
 
 
-def _groups(block: Block, first: int, last: int, step: int, ahead: int):
-    """(offset in the chunk, arrays) of each group of blocks in order, ``ahead`` in flight."""
+def _blocks(block: Block, first: int, last: int, ahead: int):
+    """(offset in the chunk, arrays) of each block in order, ``ahead`` in flight."""
     flying: collections.deque = collections.deque()
-    for start in range(first, last, step):
+    for start in range(first, last, block.size):
         flying.append((start - first, block(start)))
         if len(flying) >= ahead:
             yield flying.popleft()
@@ -186,12 +185,11 @@ class _Cutter:
         return taken[0] if len(taken) == 1 else np.concatenate(taken)
 
 
-def _gather(parts: dict, offset: int, found: dict, size: int, bodies: int) -> None:
-    real = -(-(bodies - offset) // size)  # blocks that hold bodies of this chunk
+def _gather(parts: dict, offset: int, found: dict, size: int) -> None:
     for name, part in parts.items():
         values = np.asarray(found[name])
         if name.endswith("_histogram"):
-            part[0] += values[:real].sum(axis=0)
+            part[0] += values.sum(axis=0)
             continue
         at = offset if name == "status" else offset // size
         count = min(len(values), len(part) - at)

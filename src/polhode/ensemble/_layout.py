@@ -42,7 +42,9 @@ def rows(
     """Sizes in whole blocks. ``whole``: trajectories are kept. ValueError for what cannot be."""
     if chunk is not None and (chunk < 1 or chunk % block):
         raise ValueError(
-            f"chunk must be a positive multiple of the block of {block} bodies, got {chunk}."
+            f"chunk must be a positive multiple of the block of {block} bodies, got {chunk}: leave"
+            f" it out, or give --chunk {max(1, round(chunk / block)) * block} or a multiple of"
+            f" {block} (chunk= in Python)."
         )
     block_bytes = block * body_bytes
     budget = _PIECE_BYTES
@@ -50,8 +52,9 @@ def rows(
         least = _OWN_MEMORY + block_bytes * (_COPIES + _PER_DEVICE * devices)
         if memory < least:
             raise ValueError(
-                f"a memory of {memory:,} bytes is too small: {least:,} are the least for these"
-                " times and devices; raise it, or save fewer times."
+                f"a memory of {memory:,} bytes is too small: raise --memory to"
+                f" {math.ceil(least / 1e7) / 100}GB or more (memory={least} in Python), the least"
+                " for these times and devices, or save fewer times."
             )
         left = memory - _OWN_MEMORY - block_bytes * _PER_DEVICE * devices
         budget = min(budget, left // _COPIES)

@@ -6,6 +6,7 @@ the compiled block. Blocks have a size that only the number of samples decides, 
 stands at place i modulo that size: chunk size, device count and process count change nothing.
 """
 
+import concurrent.futures
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,14 +14,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float
 
-from polhode._methods import AbstractMethod, Record
+from polhode._inputs import check_inputs, check_method, check_rtol
 from polhode._plan import choose
-from polhode._simulate import check_inputs, check_method, check_rtol, run
+from polhode._simulate import run
 from polhode.ensemble._ensemble import Ensemble, draw
 from polhode.ensemble._statistics import Statistic, summarise
+from polhode.methods import AbstractMethod, Record
 
 _SAMPLES, _LEAST, _MOST = 2**20, 2**4, 2**13
 
@@ -32,8 +33,9 @@ def block_size(samples: int) -> int:
 
 
 class Block:
-    """``Block(...)(first)`` computes the blocks that start at the bodies ``first`` (one for each
-    device), and returns device arrays: the dictionary of what is kept.
+    """``Block(...)(first)`` computes the block that starts at the body ``first``, and returns
+    device arrays: the dictionary of what is kept. Blocks go to the devices in turn, each by the
+    same program of one device: how many devices there are changes no bit.
     """
 
     def __init__(
@@ -58,27 +60,35 @@ class Block:
                                            state).method  # fmt: skip
         self.method = method
         self.rtol = check_rtol(rtol, ts.dtype)
-        mesh = None
-        self.place = None
-        if len(self.devices) > 1:
-            mesh = Mesh(np.array(self.devices), ("body",))
-            self.place = NamedSharding(mesh, PartitionSpec("body"))
-        self.settings = Settings(self.size, trajectories, statistics, mesh)
+        self.settings = Settings(self.size, trajectories, statistics)
         self.counts = np.array([ensemble.seed, ensemble.bodies], np.uint32)
+        self.compiled: list[Any] = []
 
     def inputs(self, first: int) -> tuple:
-        """The arguments of ``program`` for the group of blocks from the body ``first``."""
-        count = len(self.devices)
-        starts = np.asarray([first + i * self.size for i in range(count)], np.uint32)
-        indices = np.arange(first, first + count * self.size)
+        """The arguments of ``program`` for the block from the body ``first``, on its device."""
+        device = self.devices[first // self.size % len(self.devices)]
+        indices = np.arange(first, first + self.size)
         each, shared = self.ensemble.lanes(np.minimum(indices, self.ensemble.bodies - 1))
-        place = self.devices[0] if self.place is None else self.place
-        starts, each = jax.device_put((starts, each), place)
+        start = np.asarray(first, np.uint32)
         shared = (shared, self.ensemble.spreads, self.method, self.ts, self.rtol, self.counts)
-        return starts, each, shared, self.settings
+        arrays, rest = eqx.partition((start, each, shared), eqx.is_array_like)
+        return *eqx.combine(jax.device_put(arrays, device), rest), self.settings
 
     def __call__(self, first: int) -> dict[str, Array]:
-        return program(*self.inputs(first))
+        if len(self.devices) == 1:
+            return program(*self.inputs(first))
+        if not self.compiled:
+            self.compiled = self._compile()
+        return self.compiled[first // self.size % len(self.devices)](*self.inputs(first))
+
+    def _compile(self) -> list[Any]:
+        """The program for each device, compiled at the same time; traced in this thread, since
+        settings such as ``jax.enable_x64`` may be those of a thread.
+        """
+        count = min(len(self.devices), -(-self.ensemble.bodies // self.size))
+        lowered = [program.lower(*self.inputs(k * self.size)) for k in range(count)]
+        with concurrent.futures.ThreadPoolExecutor(count) as threads:
+            return list(threads.map(lambda one: one.compile(), lowered))
 
 
 class Settings(NamedTuple):
@@ -87,32 +97,13 @@ class Settings(NamedTuple):
     size: int
     trajectories: bool
     statistics: tuple[Statistic, ...]
-    mesh: Mesh | None
 
 
 @eqx.filter_jit
 def program(first: Array, each: Any, shared: Any, settings: Settings) -> dict[str, Array]:
-    """One block on each device; nothing goes from one to another. Compiled once per kind of run."""
-    if settings.mesh is None:
-        return _block(first, each, shared, settings)
-    arrays, rest = eqx.partition(shared, eqx.is_array_like)
-    each_arrays, each_rest = eqx.partition(each, eqx.is_array)
-
-    def local(first, each_arrays, arrays):
-        return _block(
-            first, eqx.combine(each_arrays, each_rest), eqx.combine(arrays, rest), settings
-        )
-
-    split = PartitionSpec("body")
-    return jax.shard_map(
-        local, mesh=settings.mesh, in_specs=(split, split, PartitionSpec()), out_specs=split,
-        check_vma=False,
-    )(first, each_arrays, arrays)  # fmt: skip
-
-
-def _block(first, each, shared, settings: Settings) -> dict[str, Array]:
+    """One block on one device. Compiled once per kind of run and device."""
     shared, spreads, method, ts, rtol, (seed, bodies) = shared
-    indices = first[0] + jnp.arange(settings.size, dtype=jnp.uint32)
+    indices = first + jnp.arange(settings.size, dtype=jnp.uint32)
     drawn = draw(each, shared, indices, spreads, seed)
     trajectory = run(method, *drawn, ts, rtol, Record())
     real = indices < bodies

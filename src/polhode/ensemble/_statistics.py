@@ -33,7 +33,7 @@ class Statistic:
             raise ValueError(f"the name of a statistic must be an identifier, got {self.name!r}.")
         if (self.low is None) != (self.high is None):
             raise ValueError(f"statistic {self.name}: give both low and high, or neither.")
-        if self.low is not None and not self.low < self.high:
+        if self.low is not None and self.high is not None and not self.low < self.high:
             raise ValueError(f"statistic {self.name}: low {self.low} must be below {self.high}.")
         if self.bins < 1:
             raise ValueError(f"statistic {self.name}: bins must be positive, got {self.bins}.")
@@ -41,6 +41,8 @@ class Statistic:
     @property
     def edges(self) -> np.ndarray:
         """(bins + 1,) edges of the histogram."""
+        assert self.low is not None
+        assert self.high is not None
         return np.linspace(self.low, self.high, self.bins + 1)
 
 

@@ -13,13 +13,13 @@ import secrets
 import shutil
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from polhode.ensemble._layout import Field
+from polhode.ensemble._layout import Field, Rows
 
 _MARK = 1 << 32  # above every 32-bit checksum: an empty cell is 0
 
@@ -102,23 +102,25 @@ def running(path: Path, process: int) -> bool:
 
 
 class Store:
-    """An opened store; ``identity`` is what must agree for a run to go on with it."""
+    """An opened store; ``identity`` is what must agree for a run to go on with it.
+
+    Raises StoreError, and leaves the folder as it is, when it is no store of an ensemble run, its
+    settings are damaged, or they are those of another run.
+    """
 
     def __init__(self, path: Path, identity: dict[str, Any]):
         zarr = _zarr()
         self.path = path
         try:
-            # values that equal the fill value are written too: every finished chunk has its files
-            with zarr.config.set({"array.write_empty_chunks": True}):
-                self.group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-                arrays = dict(self.group.arrays())
-            found = self.group.attrs["polhode"]
-        except (KeyError, ValueError, OSError) as error:
+            self.group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
+            found = json.loads(self.group.attrs["polhode"])
+            if not isinstance(found, dict):
+                raise ValueError(f"the attribute polhode is a {type(found).__name__}")
+        except Exception as error:  # damaged metadata fail in whichever part reads them first
             raise StoreError(
-                f"{path} exists and is no store of an ensemble run ({type(error).__name__}): it was"
-                " left as it is; name another path."
+                f"{path} exists and is no store of an ensemble run ({type(error).__name__}:"
+                f" {str(error)[:200]}): it was left as it is; name another path."
             ) from error
-        found = json.loads(found)
         different = [
             f"  {key}: the store has {_short(found.get(key))}, this run {_short(value)}"
             for key, value in identity.items()
@@ -129,13 +131,67 @@ class Store:
                 f"{path} holds another run and was left as it is:\n" + "\n".join(different) + "\n"
                 "  to mend: use the scene and versions of the store, or name another path."
             )
-        self.chunk = int(found["chunk"])
+        self.chunk: int = found.get("chunk", 0)  # what is missing or no number is refused below
+        self.piece: int = found.get("piece", 0)
+        for name, unit in (("chunk", identity["block"]), ("piece", identity["block"])):
+            value = found.get(name)
+            if type(value) is not int or value < 1 or value % unit or self.chunk % value:
+                raise StoreError(
+                    f"{path}: its setting {name} is {_short(value)}, expected a multiple of {unit}"
+                    " bodies that fits: the store is damaged and was left as it is; name another"
+                    " path."
+                )
+
+    def mend(
+        self, ts: np.ndarray, layout: Mapping[str, Field], attributes: dict[str, Any],
+        layouts: Sequence[str], warn: Callable[[str], None],
+    ) -> None:  # fmt: skip
+        """Compare the arrays with the layout; what is lost or altered is made anew, and where that
+        held results, all chunks count as missing. ``layouts``: devices of the runs so far.
+        """
+        zarr = _zarr()
+        self.group = zarr.open_group(self.path, mode="r+", zarr_format=3, use_consolidated=False)
+        expected = zarr.create_group(zarr.storage.MemoryStore(), zarr_format=3)
+        make = _arrays(expected, ts, layout, -(-layout["status"].shape[0] // self.chunk))
+        lost = [name for name in make if not self._is_like(name, expected[name])]
+        if lost:
+            for name in lost:
+                _remove(self.path / name)
+                make[name](self.group)
+            told = f"{', '.join(lost)} of {self.path} were lost or altered and are made anew"
+            if lost != ["time"]:
+                _remove(self.path / "checksum")
+                make["checksum"](self.group)
+                told += "; every chunk is computed again"
+            warn(told + ".")
+        wanted = attributes | {"devices": sorted({*layouts, *self._devices()})}
+        altered = any(self.group.attrs.get(key) != value for key, value in wanted.items())
+        if altered:
+            self.group.attrs.update(wanted)
+        if altered or lost:
+            consolidate(self.path)
+        # values that equal the fill value are written too: every finished chunk has its files
+        with zarr.config.set({"array.write_empty_chunks": True}):
+            arrays = {name: self.group[name] for name in make}
         self.marks = arrays["checksum"]
-        self.arrays = {
-            name: array
-            for name, array in arrays.items()
-            if array.attrs.get("rows_per_chunk") is not None
-        }
+        self.arrays = {name: arrays[name] for name in layout}
+
+    def _devices(self) -> list[str]:
+        found = self.group.attrs.get("devices")
+        return [x for x in found if isinstance(x, str)] if isinstance(found, list) else []
+
+    def _is_like(self, name: str, expected: Any) -> bool:
+        """Whether an array is there with the metadata, and for times with the values, it began
+        with.
+        """
+        try:
+            found = self.group[name]
+            same = json.dumps(found.metadata.to_dict(), sort_keys=True, default=str) == json.dumps(
+                expected.metadata.to_dict(), sort_keys=True, default=str
+            )
+            return same and (name != "time" or np.array_equal(found[...], expected[...]))
+        except Exception:  # whatever cannot be read is not like it
+            return False
 
     def sweep(self) -> None:
         """Remove half-written files of a writer that was killed."""
@@ -228,6 +284,14 @@ _SPLIT = ("wxyz", "omega_body")
 """Arrays that may have several files in a chunk."""
 
 
+def _remove(path: Path) -> None:
+    """What lies in the place of an array, whatever it is."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
 def _absent(dtype: Any) -> Any:
     """What readers see where a chunk is not finished: NaN, or -1 for whole numbers."""
     return np.nan if np.issubdtype(dtype, np.floating) else -1
@@ -255,10 +319,44 @@ def _extended(checksum: int, values: np.ndarray) -> int:
     return google_crc32c.extend(checksum, view)
 
 
+def _arrays(
+    group: Any, ts: np.ndarray, layout: Mapping[str, Field], chunks: int
+) -> dict[str, Callable[[Any], None]]:
+    """Make the empty arrays of a store in a group; how to make each of them in another one."""
+    checked = [_zarr().codecs.Crc32cCodec()]
+
+    def time(group: Any) -> None:
+        made = group.create_array(
+            "time", shape=ts.shape, chunks=ts.shape, dtype=ts.dtype, dimension_names=("time",),
+            attributes={"units": "s", "long_name": "time"},
+        )  # fmt: skip
+        made[:] = ts
+
+    def one(name: str, field: Field) -> Callable[[Any], None]:
+        return lambda group: group.create_array(
+            name, shape=field.shape, chunks=(field.piece, *field.shape[1:]), dtype=field.dtype,
+            dimension_names=field.dimensions,
+            attributes=field.attributes | {"rows_per_chunk": field.rows},
+            compressors=checked, fill_value=_absent(field.dtype),
+        )  # fmt: skip
+
+    def checksum(group: Any) -> None:
+        group.create_array(
+            "checksum", shape=(chunks,), chunks=(1,), dtype="uint64", dimension_names=("chunk",),
+            attributes={"long_name": "CRC-32C of each finished chunk plus 2^32; 0: not finished"},
+            compressors=checked,
+        )  # fmt: skip
+
+    make = {"time": time, **{n: one(n, field) for n, field in layout.items()}, "checksum": checksum}
+    for fill in make.values():
+        fill(group)
+    return make
+
+
 def create(
     path: Path,
     identity: dict[str, Any],
-    chunk: int,
+    size: Rows,
     ts: np.ndarray,
     layout: Mapping[str, Field],
     attributes: dict[str, Any],
@@ -267,28 +365,11 @@ def create(
     zarr = _zarr()
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
     try:
-        settings = json.dumps(identity | {"chunk": chunk})
+        settings = json.dumps(identity | {"chunk": size.chunk, "piece": size.piece})
         group = zarr.create_group(
             temporary, zarr_format=3, attributes=attributes | {"polhode": settings}
         )
-        time = group.create_array(
-            "time", shape=ts.shape, chunks=ts.shape, dtype=ts.dtype, dimension_names=("time",),
-            attributes={"units": "s", "long_name": "time"},
-        )  # fmt: skip
-        time[:] = ts
-        for name, field in layout.items():
-            group.create_array(
-                name, shape=field.shape, chunks=(field.piece, *field.shape[1:]), dtype=field.dtype,
-                dimension_names=field.dimensions,
-                attributes=field.attributes | {"rows_per_chunk": field.rows},
-                compressors=[zarr.codecs.Crc32cCodec()], fill_value=_absent(field.dtype),
-            )  # fmt: skip
-        count = -(-identity["bodies"] // chunk)
-        group.create_array(
-            "checksum", shape=(count,), chunks=(1,), dtype="uint64", dimension_names=("chunk",),
-            attributes={"long_name": "CRC-32C of each finished chunk plus 2^32; 0: not finished"},
-            compressors=[zarr.codecs.Crc32cCodec()],
-        )  # fmt: skip
+        _arrays(group, ts, layout, -(-identity["bodies"] // size.chunk))
         consolidate(temporary)
         # a rename does not replace a folder that holds something
         with contextlib.suppress(FileExistsError):

@@ -10,7 +10,6 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from polhode._methods import AbstractMethod
 from polhode.ensemble import _layout
 from polhode.ensemble._ensemble import Ensemble
 from polhode.ensemble._fill import Progress, fill
@@ -20,6 +19,7 @@ from polhode.ensemble._program import Block
 from polhode.ensemble._statistics import Statistic
 from polhode.ensemble._store import Store, create, in_turn, locked
 from polhode.ensemble._summary import write_summaries
+from polhode.methods import AbstractMethod
 
 
 def stream(
@@ -79,15 +79,20 @@ def stream(
     )
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     on_cores = cores if devices[0].platform == "cpu" else 1
-    ahead = _layout.ahead(block.size * body_bytes, on_cores, len(devices), memory)
+    ahead = len(devices) * _layout.ahead(block.size * body_bytes, on_cores, len(devices), memory)
     identity = _identity(block, rtol, trajectories, statistics, attributes or {})
+
+    def layout(size: _layout.Rows) -> dict[str, _layout.Field]:
+        return _layout.fields(ensemble.bodies, size, block.size, times, trajectories, statistics)
+
     with locked(path, process, processes):
-        if not path.exists():
-            layout = _layout.fields(
-                ensemble.bodies, size, block.size, times, trajectories, statistics
-            )
-            create(path, identity, size.chunk, times, layout, _layout.title(attributes or {}))
+        words = _layout.title(attributes or {})
+        if not os.path.lexists(path):
+            create(path, identity, size, times, layout(size), words)
         store = Store(path, identity)
+        begun = _layout.Rows(store.chunk, store.piece)
+        with in_turn(path):
+            store.mend(times, layout(begun), words, [_device_names(devices)], warn)
         if processes == 1:
             store.sweep()
         fill(store, block, range(process, store.marks.shape[0], processes), verify, ahead, progress)
@@ -98,6 +103,11 @@ def stream(
             for words in absent(store, process, processes):
                 warn(words)
     return path
+
+
+def _device_names(devices: Sequence[Any]) -> str:
+    """Number and kind of the devices, as a store remembers them."""
+    return f"{len(devices)} x {devices[0].platform} ({devices[0].device_kind})"
 
 
 def _identity(block: Block, rtol, trajectories, statistics, attributes) -> dict[str, Any]:

@@ -1,6 +1,6 @@
 """Inertia from recordings: fits that are physical and say how uncertain they are."""
 
-from polhode.fit._csv import read_recording as read_recording
+from polhode.fit._csv import load_recording as load_recording, read_recording as read_recording
 from polhode.fit._fit import (
     FitError as FitError,
     fit_inertia as fit_inertia,

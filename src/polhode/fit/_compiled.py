@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import equinox as eqx
 import jax
+from jax.core import Tracer
 from jax.errors import JaxRuntimeError
 
 # XLA's older way to emit loops: for what a fit does the program is as fast and compiles in half the
@@ -19,7 +20,7 @@ def compiled(function: Callable) -> Callable:
 
     @functools.wraps(function)
     def call(*args):
-        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(args))
+        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(args))
         return (inner if traced or not _understood() else outermost)(*args)
 
     return call

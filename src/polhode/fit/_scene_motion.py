@@ -3,16 +3,15 @@
 from collections.abc import Callable
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 
-from polhode._methods import AbstractMethod, LiePoisson
 from polhode._scene import Scene
 from polhode._simulate import simulate
 from polhode._state import State
 from polhode.fit._motion import AbstractMotion, Motion
 from polhode.inertia import Inertia
+from polhode.methods import AbstractMethod, LiePoisson
 
 
 class SceneMotion(AbstractMotion):
@@ -31,7 +30,7 @@ class SceneMotion(AbstractMotion):
     build: Callable[[Inertia, Any], Scene] = eqx.field(static=True)
     unknown: Any = None
     shows_scale: bool = eqx.field(static=True, default=True)
-    method: AbstractMethod = LiePoisson(adjoint=diffrax.ForwardMode())
+    method: AbstractMethod = LiePoisson()
     rtol: float | None = eqx.field(static=True, default=None)
 
     def start(self):

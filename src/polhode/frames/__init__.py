@@ -1,4 +1,4 @@
-"""Rotating frames, the forces that appear in them, and sensors fixed in a body (document 003)."""
+"""Rotating frames, the forces in them, and sensors in a body (docs/equations.md, 003)."""
 
 from polhode.frames._frame import RotatingFrame as RotatingFrame
 from polhode.frames._interpolation import SampledAttitude as SampledAttitude

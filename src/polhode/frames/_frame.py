@@ -1,4 +1,4 @@
-"""Rotating frames: transformations and the forces that appear in them (document 003)."""
+"""Rotating frames: transformations and the forces in them (docs/equations.md, 003)."""
 
 from collections.abc import Callable
 
@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from polhode._checks import as_float_array, is_concrete, require
+from polhode._checks import as_float_array, as_vectors, is_concrete, require
+from polhode._functions import checked, kept, takes
 from polhode._trajectory import Trajectory
 from polhode.frames._interpolation import SampledAttitude
 from polhode.frames._sensors import angular_acceleration
@@ -33,7 +34,7 @@ def _at_times(function: Callable, t: Array):
 
 
 def _cross(left: Array, right: Array) -> Array:
-    return jnp.cross(*_aligned(left, right))
+    return jnp.cross(*_aligned(as_vectors("vector", left), as_vectors("vector", right)))
 
 
 def _aligned(*arrays: Array) -> list[Array]:
@@ -51,8 +52,14 @@ def _sum(terms: list[Array | None]) -> Array:
     return total
 
 
+def _origin(function):
+    if function is None:
+        return None
+    return checked("RotatingFrame origin", function, ("t",), ((),), (3,))
+
+
 class RotatingFrame(eqx.Module):
-    """A rotating frame, ``x_space = origin + R x_frame`` (document 003 display 3).
+    """A rotating frame, ``x_space = origin + R x_frame`` (docs/equations.md, 003: 3).
 
     Built by `from_rate`, `from_attitude` or `from_trajectory`. Vectors have shape (..., 3), times
     are scalars or arrays that broadcast against the leading axes; "frame" components are along the
@@ -65,7 +72,7 @@ class RotatingFrame(eqx.Module):
     """
 
     turning: AbstractTurning
-    origin: Callable[[Array], Float[Array, "3"]] | None = None
+    origin: Callable[[Array], Float[Array, "3"]] | None = eqx.field(default=None, converter=_origin)
 
     @classmethod
     def from_rate(
@@ -100,6 +107,7 @@ class RotatingFrame(eqx.Module):
             start = normalise(start)
         t0 = jnp.asarray(t0, start.dtype)
         if varies:
+            omega_body = checked("RotatingFrame.from_rate", omega_body, ("t",), ((),), (3,))
             return cls(VariableRate(omega_body, start, t0), origin)
         return cls(ConstantRate(omega, start, t0), origin)
 
@@ -118,7 +126,19 @@ class RotatingFrame(eqx.Module):
                 f"attitude must be a function of time, got {type(attitude).__name__}: for a frame"
                 " that turns steadily use RotatingFrame.from_rate."
             )
-        return cls(PrescribedAttitude(attitude), origin)
+        name = "RotatingFrame.from_attitude"
+        takes(name, attitude, ("t",))
+        attitude = kept(attitude)
+        t = jax.ShapeDtypeStruct((), jnp.result_type(float), weak_type=True)
+        found: list[tuple[int, ...]] = []
+
+        def look(t):
+            value = attitude(t)
+            found.append(() if value is None else jnp.shape(value))
+
+        jax.eval_shape(look, t)
+        shape = (3, 3) if found == [(3, 3)] else (4,)
+        return cls(PrescribedAttitude(checked(name, attitude, ("t",), ((),), shape)), origin)
 
     @classmethod
     def from_trajectory(
@@ -192,13 +212,14 @@ class RotatingFrame(eqx.Module):
         return _at_times(moving, jnp.asarray(t))
 
     def _turned(self, t: Time, vector: Array, wxyz: Array | None = None) -> Array:
+        vector = as_vectors("vector", vector)
         return rotate(*_aligned(self.attitude(t) if wxyz is None else wxyz, vector))
 
     def _turned_back(self, t: Time, vector: Array, wxyz: Array | None = None) -> Array:
         wxyz = self.attitude(t) if wxyz is None else wxyz
-        return rotate(*_aligned(conjugate(wxyz), vector))
+        return rotate(*_aligned(conjugate(wxyz), as_vectors("vector", vector)))
 
-    # --- transformations, both ways (document 003 displays 4-19) ----------------------------------
+    # --- transformations, both ways (docs/equations.md, 003: 4-19) -----------------------
 
     def position_to_space(self, t: Time, position: Vector, *, wxyz=None) -> Vector:
         """Space position [m] of a point at frame ``position``. ``wxyz``: the attitude, if known."""
@@ -214,7 +235,7 @@ class RotatingFrame(eqx.Module):
     def velocity_to_space(
         self, t: Time, position: Vector, velocity: Vector, *, wxyz=None
     ) -> Vector:
-        """Space velocity [m/s] of a point with frame position and velocity (display 8)."""
+        """Space velocity [m/s] of a point with frame position and velocity (003: 8)."""
         carried = _sum([velocity, _cross(self.omega_body(t), position)])
         turned = self._turned(t, carried, wxyz)
         return turned if self.origin is None else _sum([turned, self._origin(t)[1]])
@@ -230,7 +251,7 @@ class RotatingFrame(eqx.Module):
     def acceleration_to_space(
         self, t: Time, position: Vector, velocity: Vector, acceleration: Vector
     ) -> Vector:
-        """Space acceleration [m/s^2] of a point with this motion in the frame (display 19)."""
+        """Space acceleration [m/s^2] of a point with this motion in the frame (003: 19)."""
         apparent = self._without_origin(t, position, velocity)
         turned = self._turned(t, _sum([acceleration, -apparent]))
         return turned if self.origin is None else _sum([turned, self._origin(t)[2]])
@@ -246,7 +267,7 @@ class RotatingFrame(eqx.Module):
         relative = self._turned_back(t, acceleration_space)
         return _sum([relative, self._without_origin(t, position, velocity)])
 
-    # --- forces by name (document 003 displays 20, 21) --------------------------------------------
+    # --- forces by name (docs/equations.md, 003: 20, 21) ---------------------------------
 
     def centrifugal(self, t: Time, position: Vector, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
         """Centrifugal force [N], ``-mass omega x (omega x r)``; zero on the axis."""

@@ -5,11 +5,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode.frames._turning import quaternion_rate
 from polhode.rotation import (
     conjugate,
     multiply,
     rotation_vector_to_wxyz,
+    wxyz_rate,
     wxyz_to_rotation_vector,
 )
 
@@ -19,8 +19,8 @@ def _slopes(ts, wxyz, omega_body, angular_acceleration) -> tuple[Array, Array]:
     """Rotation vector of each interval and its two derivatives by t/h, at start and end."""
     start, end = slice(None, -1), slice(1, None)
     origin = conjugate(wxyz[start])
-    rate = quaternion_rate(wxyz, omega_body)
-    bend = quaternion_rate(rate, omega_body) + quaternion_rate(wxyz, angular_acceleration)
+    rate = wxyz_rate(wxyz, omega_body)
+    bend = wxyz_rate(rate, omega_body) + wxyz_rate(wxyz, angular_acceleration)
 
     def vector(h):
         path = wxyz[end] + h * rate[end] + h * h / 2 * bend[end]

@@ -1,4 +1,4 @@
-"""Particles that move in a rotating frame under any force (document 003 display 20)."""
+"""Particles that move in a rotating frame under any force (docs/equations.md, 003: 20)."""
 
 from collections.abc import Callable
 
@@ -10,16 +10,28 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode._checks import as_float_array, is_concrete, require
-from polhode._simulate import check_rtol, check_times
+from polhode._functions import kept, result_of, takes
+from polhode._inputs import check_rtol, check_times
 from polhode.frames._frame import RotatingFrame
-from polhode.frames._turning import VariableRate, quaternion_rate
-from polhode.rotation import conjugate, normalise, rotate
+from polhode.frames._turning import VariableRate
+from polhode.methods import check_options
+from polhode.rotation import conjugate, normalise, rotate, wxyz_rate
+
+_ARGUMENTS = ("t", "position", "velocity")
+
+
+def _force(name: str):
+    def converted(function):
+        takes(name, function, _ARGUMENTS)
+        return kept(function)
+
+    return eqx.field(converter=converted)
 
 
 class FrameForce(eqx.Module):
     """A force [N] in frame components, ``function(t, position, velocity)``, all (..., 3)."""
 
-    function: Callable[[Array, Array, Array], Array]
+    function: Callable[[Array, Array, Array], Array] = _force("FrameForce")
 
 
 class SpaceForce(eqx.Module):
@@ -28,7 +40,7 @@ class SpaceForce(eqx.Module):
     The attitude of the frame is computed at every step for it; a `FrameForce` needs none.
     """
 
-    function: Callable[[Array, Array, Array], Array]
+    function: Callable[[Array, Array, Array], Array] = _force("SpaceForce")
 
 
 class ParticlePaths(eqx.Module):
@@ -56,16 +68,27 @@ class ParticlePaths(eqx.Module):
         return self.frame.velocity_to_space(self.ts, self.position, self.velocity)
 
 
+def _pushed(force, t, position, velocity):
+    """The force on all particles, checked to be one for each, or one for all."""
+    name, given = type(force).__name__, (t, position, velocity)
+
+    def whole(*given):
+        value = jnp.asarray(force.function(*given))
+        return jnp.broadcast_to(value, position.shape) if value.shape == (3,) else value
+
+    return result_of(name, _ARGUMENTS, whole, position.shape, position.dtype, *given)
+
+
 def _acceleration(frame, force, mass, t, position, velocity, wxyz):
     total = frame.apparent_acceleration(t, position, velocity, wxyz=wxyz)
     if force is None:
         return total
     if isinstance(force, FrameForce):
-        return total + force.function(t, position, velocity) / mass
+        return total + _pushed(force, t, position, velocity) / mass
     wxyz = frame.attitude(t) if wxyz is None else wxyz
     position_space = frame.position_to_space(t, position, wxyz=wxyz)
     velocity_space = frame.velocity_to_space(t, position, velocity, wxyz=wxyz)
-    push = force.function(t, position_space, velocity_space) / mass
+    push = _pushed(force, t, position_space, velocity_space) / mass
     back = conjugate(wxyz).reshape((1,) * (push.ndim - 1) + (4,))
     return total + rotate(back, push)
 
@@ -101,7 +124,7 @@ def _solve(frame, force, mass, position, velocity, ts, rtol, solver, controller,
         wxyz = normalise(y[2]) if along else None
         pushed = _acceleration(frame, force, mass, t, at, moving, wxyz)
         rates = (moving / length, pushed / speed)
-        return (*rates, quaternion_rate(wxyz, turning.omega_body(t))) if along else rates
+        return (*rates, wxyz_rate(wxyz, turning.omega_body(t))) if along else rates
 
     y0 = (position / length, velocity / speed)
     if controller is None:
@@ -165,6 +188,8 @@ def simulate_particles(
             f"force must be None, FrameForce(function) or SpaceForce(function), got"
             f" {type(force).__name__}: the class tells in which axes the function works."
         )
+    solver = diffrax.Dopri8() if solver is None else solver
+    check_options(solver, controller, adjoint, max_steps=max_steps)
     position = as_float_array("position", position, (3,))
     velocity = as_float_array("velocity", velocity, (3,))
     ts, mass = as_float_array("ts", ts, (None,)), as_float_array("mass", mass)
@@ -188,7 +213,7 @@ def simulate_particles(
     mass = jnp.broadcast_to(mass, (*batch[:-1], 1))
     *paths, steps = _solve(
         frame, force, mass, position, velocity, ts, check_rtol(rtol, dtype),
-        diffrax.Dopri8() if solver is None else solver, controller,
+        solver, controller,
         diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint, max_steps,
     )  # fmt: skip
     made = ParticlePaths(ts, paths[0], paths[1], frame, paths[2], steps)

@@ -53,7 +53,7 @@ def accelerometer(
     """Reading of an accelerometer along the body axes [m/s^2], mounted at ``position_body`` [m].
 
     The reading is acceleration minus gravity:
-    ``omega x (omega x r) + d(omega)/dt x r - R^T gravity`` (document 003 displays 17-21), with
+    ``omega x (omega x r) + d(omega)/dt x r - R^T gravity`` (docs/equations.md, 003: 17-21), with
     the lever r from the point about which the body turns. ``gravity_space`` (3,) [m/s^2] is for a
     body that turns about a point fixed in space; leave it None for a body in free fall, where
     gravity and the acceleration of the mass centre cancel.

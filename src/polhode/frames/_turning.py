@@ -1,6 +1,6 @@
 """How a frame turns: attitude, angular velocity and its derivative as functions of time.
 
-All rates are components along the rotating axes (document 003 displays 5-12).
+All rates are components along the rotating axes (docs/equations.md, 003: 5-12).
 """
 
 import abc
@@ -18,6 +18,7 @@ from polhode.rotation import (
     multiply,
     normalise,
     rotation_vector_to_wxyz,
+    wxyz_rate,
 )
 
 Rates = tuple[Float[Array, "3"], Float[Array, "3"] | None]
@@ -26,11 +27,6 @@ Rates = tuple[Float[Array, "3"], Float[Array, "3"] | None]
 def rate_of_change(function: Callable, t: Array) -> tuple[Array, Array]:
     """A function of time and its time derivative, by forward-mode differentiation."""
     return jax.jvp(function, (t,), (jnp.ones_like(t),))
-
-
-def quaternion_rate(wxyz: Float[Array, "*b 4"], omega: Float[Array, "*b 3"]):
-    """dq/dt = q (0, omega)/2."""
-    return multiply(wxyz, jnp.concatenate([jnp.zeros_like(omega[..., :1]), omega], axis=-1)) / 2
 
 
 class AbstractTurning(eqx.Module):
@@ -73,7 +69,7 @@ class VariableRate(AbstractTurning):
         """One adaptive integration from ``t0``, at about 50 times the rounding error per step."""
         accuracy = 50 * float(jnp.finfo(self.start.dtype).eps)
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda s, wxyz, _: quaternion_rate(wxyz, self.omega_body(s))),
+            diffrax.ODETerm(lambda s, wxyz, _: wxyz_rate(wxyz, self.omega_body(s))),
             diffrax.Dopri8(),
             self.t0,
             t,

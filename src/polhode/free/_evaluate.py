@@ -6,13 +6,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._kernel import kernel
 from polhode.free._compensated import compensate
 from polhode.free._flow import Moment, advance, attitude, rates
 from polhode.free._frame import Quadruple
 from polhode.free._motion import FreeMotion, Swing, Turning, prepare_swing, prepare_turning
 from polhode.free._roles import Triple, assign_roles, one_of
 from polhode.free._rule import Found, answer_rule
+from polhode.xla import kernel
 
 Scalars = Float[Array, "*b"]
 

@@ -25,7 +25,7 @@ def symmetric_motion(
     attitude: bool = True,
     rates: bool = True,
 ) -> SymmetricMotion:
-    """Steady precession of a body with equal moments about body x and y (theory section 4).
+    """Steady precession of a body with equal moments about body x and y.
 
     ``moments`` (..., 3) [kg m^2], the first two taken as equal; ``t`` (...) [s] since the state
     ``wxyz``, ``omega_body`` held. The body turns about its axis at ``lambda = (1 - I3/I1) w3`` and

@@ -1,6 +1,6 @@
-"""The one Hamiltonian, the two charts derived from it, and document 000 as a reference."""
+"""The one Hamiltonian, its two charts, and closed forms to compare with (docs/equations.md)."""
 
-from polhode.hamiltonian import _document_000 as document_000
+from polhode.documents import document_000
 from polhode.hamiltonian._attitude import (
     Attitude as Attitude,
     Vector as Vector,
@@ -30,6 +30,11 @@ from polhode.hamiltonian._lie_poisson import (
     external_power as external_power,
     lie_poisson_field as lie_poisson_field,
     quaternion_rate as quaternion_rate,
+)
+from polhode.hamiltonian._units import (
+    FixedUnits as FixedUnits,
+    LiePoissonUnits as LiePoissonUnits,
+    relative as relative,
 )
 
 __all__ = ["document_000"]

@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from polhode.rotation import matrix_row
+
 Vector = tuple[Array, Array, Array]
 """Three component arrays of one common shape (structure of arrays)."""
 
@@ -79,20 +81,11 @@ class Attitude:
 
 def from_quaternion(wxyz: Sequence[Array]) -> Attitude:
     """Attitude of a unit quaternion given by four component arrays."""
-    w, x, y, z = wxyz
-
-    def row(i: int) -> Vector:
-        if i == 0:
-            return 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-        if i == 1:
-            return 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-        return 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-
-    return Attitude(row, lambda: tuple(wxyz))
+    return Attitude(lambda i: matrix_row(wxyz, i), lambda: tuple(wxyz))
 
 
 def from_euler_angles(phi: Array, theta: Array, psi: Array) -> Attitude:
-    """Attitude ``Rz(phi) Ry(theta) Rz(psi)`` (theory section 1) of three component arrays."""
+    """Attitude ``Rz(phi) Ry(theta) Rz(psi)`` of three component arrays."""
     cf, sf, ct = jnp.cos(phi), jnp.sin(phi), jnp.cos(theta)
     st, cp, sp = jnp.sin(theta), jnp.cos(psi), jnp.sin(psi)
 

@@ -20,27 +20,18 @@ from jaxtyping import Array
 
 from polhode.hamiltonian._attitude import cross, dot, from_quaternion, from_rows
 from polhode.hamiltonian._lie_poisson import Dynamics, momentum_rate, quaternion_rate
+from polhode.hamiltonian._units import relative
 
 _AXES = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
 class LiePoissonCostate(NamedTuple):
-    """The equations for ``solvers.flow``; ``row``: the only row of R that matters, or None.
+    """The equations for ``solvers.FlowAdjoint``; ``row``: the only row of R that matters, or None.
 
     The quaternion's length is taken to be kept: a slope along it is handed back as it came.
     """
 
     row: int | None
-
-    @property
-    def finer(self) -> float:
-        """Steps over those of the state: a row of R turns twice as fast as the quaternion."""
-        return 1.25 if self.row is None else 2.1
-
-    @property
-    def lower(self) -> int:
-        """How much lower their order: there the highest pays no more."""
-        return 0 if self.row is None else 2
 
     @classmethod
     def of(cls, dynamics: Dynamics, y, t) -> "LiePoissonCostate":
@@ -82,6 +73,22 @@ class LiePoissonCostate(NamedTuple):
         kept = _inner(slopes[1], end[1])
         wide = quaternion_rate(wxyz, tuple(4 * x for x in turn))
         return push, tuple(a + kept * q for a, q in zip(wide, wxyz))
+
+    def units(self, own, z, rates):
+        """Weights of the components of the state integrated backwards, and the natural rate."""
+        (momentum, place, push, turn), (torque, onward, *slopes) = z, rates
+        still = (place[0],) * (4 - len(place))
+        onward = tuple(x / 2 for x in onward) if still else onward  # a row turns by the whole angle
+        y = (*momentum, *place, *still)
+        moved = (*torque, *onward, *(jnp.zeros_like(x) for x in still))
+        weights, rate = own(y, moved)
+        if still:  # one row does not see the turn about itself
+            rate = rate + jnp.sqrt(dot(momentum, momentum)) / own.size
+        scale = weights[3] / 2
+        place_weights = [scale if still else weights[3]] * len(place)
+        dual = [*(1 / w for w in weights[:3]), *[jnp.ones_like(rate)] * 3]
+        own_size = relative(dual, (*push, *turn), (*slopes[0], *slopes[1]), rate)
+        return [*weights[:3], *place_weights, *own_size], rate
 
     def _attitude(self, place):
         return from_quaternion(place) if self.row is None else from_rows({self.row: place})

@@ -5,7 +5,7 @@ reports evaluate ``Hamiltonian.__call__``; nothing else in the package states th
 """
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import equinox as eqx
 import jax
@@ -15,6 +15,7 @@ from polhode.hamiltonian._attitude import Attitude, Vector, components
 from polhode.inertia import Inertia
 
 
+@runtime_checkable
 class EnergyOfAttitude(Protocol):
     """What the Hamiltonian asks of a potential (see ``polhode.torques.AbstractPotential``)."""
 
@@ -39,17 +40,19 @@ def inverse_inertia(inertia: Inertia) -> tuple[Array, ...]:
 
 
 class Hamiltonian(eqx.Module):
-    """H = (L - h) . I^-1 (L - h) / 2 + V(R, t), in joules (document 000 eq. 1 in body axes).
+    """H = (L - h) . I^-1 (L - h) / 2 + V(R, t), in joules (docs/equations.md, 000: 1).
 
     **Fields:** ``inverse`` entries of I^-1 (three or six component arrays), ``inertia`` handed on
     to the potential, ``potential`` or None, ``rotor_momentum`` or None: h(t) [kg m^2/s], body
-    components of the momentum that wheels carry relative to the body.
+    components of the momentum that wheels carry relative to the body, ``wheel_energy`` or None:
+    energy [J] of their turning about their axes, a function of time alone that moves nothing.
     """
 
     inverse: tuple[Array, ...]
     inertia: Inertia
     potential: EnergyOfAttitude | None = None
     rotor_momentum: Callable[[Array | float], Vector] | None = None
+    wheel_energy: Callable[[Array | float], Array] | None = None
 
     def __call__(
         self, momentum: Sequence[Array], attitude: Attitude | None, t: Array | float
@@ -67,6 +70,13 @@ class Hamiltonian(eqx.Module):
         if self.potential is None:
             return kinetic
         return kinetic + self.potential.energy(attitude, t, self.inertia)
+
+    def total(
+        self, momentum: Sequence[Array], attitude: Attitude | None, t: Array | float
+    ) -> Array:
+        """H and the energy of the wheels [J]: what changes by work from outside only."""
+        energy = self(momentum, attitude, t)
+        return energy if self.wheel_energy is None else energy + self.wheel_energy(t)
 
     def rows_used(self, attitude: Attitude, t: Array | float) -> tuple[int, ...]:
         """Which rows of R the potential looks at (found by tracing it once; none without one)."""
@@ -88,4 +98,14 @@ class Hamiltonian(eqx.Module):
 
 def free_hamiltonian(inertia: Inertia, potential: EnergyOfAttitude | None = None) -> Hamiltonian:
     """The Hamiltonian of a body without rotors."""
+    if not isinstance(inertia, Inertia):
+        raise TypeError(
+            "a Hamiltonian needs the body's ph.Inertia, such as ph.Inertia.from_moments([1., 2.,"
+            f" 3.]), got {type(inertia).__name__}."
+        )
+    if potential is not None and not callable(getattr(potential, "energy", None)):
+        raise TypeError(
+            "the potential must be one of ph.UniformGravity, ph.Potential, ... or None, got"
+            f" {type(potential).__name__}."
+        )
     return Hamiltonian(inverse_inertia(inertia), inertia, potential)

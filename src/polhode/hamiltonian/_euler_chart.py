@@ -1,4 +1,4 @@
-"""The canonical chart of document 000: ZYZ Euler angles (phi, theta, psi) and their momenta.
+"""The canonical chart (docs/equations.md, 000): ZYZ angles (phi, theta, psi) and their momenta.
 
 H(q, p) expresses the body momentum through (q, p) and hands it to the one Hamiltonian;
 Hamilton's equations are its derivatives by ``jax.grad``. The chart needs sin(theta) != 0.
@@ -18,7 +18,7 @@ from polhode.inertia import Inertia
 
 
 def momentum_from_canonical(q: Sequence[Array], p: Sequence[Array]) -> Vector:
-    """Body components of the angular momentum [kg m^2/s] from angles and momenta (theory 2)."""
+    """Body components of the angular momentum [kg m^2/s] from angles and momenta."""
     _, theta, psi = q
     p_phi, p_theta, p_psi = p
     s, c, st = jnp.sin(psi), jnp.cos(psi), jnp.sin(theta)
@@ -29,7 +29,7 @@ def momentum_from_canonical(q: Sequence[Array], p: Sequence[Array]) -> Vector:
 def canonical_from_momentum(q: Sequence[Array], momentum: Sequence[Array]) -> Vector:
     """Canonical momenta (p_phi, p_theta, p_psi) = B^T L of body momentum components.
 
-    The same map takes a body torque to its generalised force (theory section 4).
+    The same map takes a body torque to its generalised force.
     """
     _, theta, psi = q
     x, y, z = momentum
@@ -55,7 +55,7 @@ class CanonicalHamiltonian(eqx.Module):
 def hamiltonian(
     inertia: Inertia, potential: EnergyOfAttitude | None = None
 ) -> CanonicalHamiltonian:
-    """The one H in Euler angles (document 000 eq. 1), ``hamiltonian(inertia, potential)(q, p)``.
+    """The one H in Euler angles (docs/equations.md), ``hamiltonian(inertia, potential)(q, p)``.
 
     ``q`` (..., 3): phi, theta, psi in rad; ``p`` (..., 3) in kg m^2/s; the result (...) in J.
     """
@@ -65,7 +65,7 @@ def hamiltonian(
 def hamiltons_equations(
     H: Callable[..., Array],
 ) -> Callable[..., tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]]:
-    """Hamilton's equations of any ``H(q, p, ...)`` by ``jax.grad`` (document 000 eqs. 2, 3).
+    """Hamilton's equations of any ``H(q, p, ...)`` by ``jax.grad`` (docs/equations.md: 2, 3).
 
     Returns ``equations(q, p, *args) -> (dq/dt, dp/dt)``; leading batch axes are allowed as long
     as H treats them one by one.
@@ -79,7 +79,7 @@ def hamiltons_equations(
 
 
 def rates_from_angle_rates(q: Sequence[Array], rates: Sequence[Array]) -> Vector:
-    """Body rates omega = B dq/dt [rad/s] on component triples (theory section 1)."""
+    """Body rates omega = B dq/dt [rad/s] on component triples."""
     _, theta, psi = q
     phi_dot, theta_dot, psi_dot = rates
     s, c, st = jnp.sin(psi), jnp.cos(psi), jnp.sin(theta)

@@ -3,10 +3,10 @@
 dL/dt = L x dH/dL + sum_j r_j x dH/dr_j + N,   dq/dt = q (0, dH/dL) / 2,
 
 r_j the rows of R (body components of the space axes). Both derivatives of H come from one
-``jax.grad``; for V = 0 this is Euler's equation in body axes (theory section 7).
+``jax.grad``; for V = 0 this is Euler's equation in body axes.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -16,18 +16,7 @@ from jaxtyping import Array
 
 from polhode.hamiltonian._attitude import Attitude, Vector, cross, dot, from_quaternion, from_rows
 from polhode.hamiltonian._energy import Hamiltonian
-
-
-def quaternion_rate(wxyz: Sequence[Array], omega: Sequence[Array]) -> tuple[Array, ...]:
-    """dq/dt = q (0, omega) / 2 for body rates omega [rad/s]."""
-    w, x, y, z = wxyz
-    a, b, c = (rate / 2 for rate in omega)
-    return (
-        -x * a - y * b - z * c,
-        w * a + y * c - z * b,
-        w * b + z * a - x * c,
-        w * c + x * b - y * a,
-    )
+from polhode.rotation import quaternion_rate as quaternion_rate
 
 
 def rates_and_torque(
@@ -49,22 +38,42 @@ def rates_and_torque(
 def external_power(
     t: Array | float, momentum: Sequence[Array], attitude: Attitude, dynamics: "Dynamics"
 ) -> Array:
-    """Power N . omega [W] of the external torque, on component arrays; zero without one."""
-    if dynamics.torque is None:
-        return jnp.zeros_like(momentum[0])
-    omega, _ = rates_and_torque(dynamics.hamiltonian, momentum, attitude, t)
-    return dot(dynamics.torque.body_components(t, attitude, omega), omega)
+    """Power [W] that the energy of body and wheels grows by, on component arrays.
+
+    N . omega of the external torque, and the change of H with time itself: a potential that
+    depends on time, an orbit, a wheel turned by its motor (whose power is torque times speed).
+    """
+    hamiltonian = dynamics.hamiltonian
+    power = jnp.zeros_like(momentum[0])
+    if dynamics.torque is not None:
+        omega, _ = rates_and_torque(hamiltonian, momentum, attitude, t)
+        power = power + dot(dynamics.torque.body_components(t, attitude, omega), omega)
+    if hamiltonian.potential is None and hamiltonian.wheel_energy is None:
+        return power
+    rows = {i: attitude.row(i) for i in hamiltonian.rows_used(attitude, t)}
+    t = jnp.asarray(t, power.dtype)
+    # forwards: one time may be shared by many bodies
+    _, slope = jax.jvp(
+        lambda t: hamiltonian.total(momentum, from_rows(rows), t), (t,), (jnp.ones_like(t),)
+    )
+    return power + slope
 
 
 class Dynamics(eqx.Module):
-    """What moves a body: the Hamiltonian and the external torque (``AbstractTorque`` or None)."""
+    """What moves a body: the Hamiltonian and the external torque (``AbstractTorque`` or None).
+
+    For solvers that ask: ``units``, natural units of its states, and ``costate(dynamics, y, t)``
+    (static), the equations that carry slopes back along its motion; None: those of any field.
+    """
 
     hamiltonian: Hamiltonian
     torque: Any = None
+    units: Any = None
+    costate: Callable[..., Any] | None = eqx.field(static=True, default=None)
 
 
 def momentum_rate(
-    t: Array | float, momentum: Sequence[Array], attitude: Attitude, dynamics: Dynamics
+    t: Array | float, momentum: Sequence[Array], attitude: Attitude, dynamics: "Dynamics | Any"
 ) -> tuple[Vector, Vector]:
     """dL/dt [N m] in body axes and the body rates [rad/s]."""
     omega, turn = rates_and_torque(dynamics.hamiltonian, momentum, attitude, t)
@@ -77,7 +86,7 @@ def momentum_rate(
     return rate, omega
 
 
-def lie_poisson_field(t, y, dynamics: Dynamics):
+def lie_poisson_field(t, y, dynamics: "Dynamics | Any"):
     """The vector field on component arrays, with the call signature of a diffrax term.
 
     ``y = (momentum, wxyz)``: three arrays [kg m^2/s] and four arrays of one shape. The result

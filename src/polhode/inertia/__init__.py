@@ -1,4 +1,4 @@
-"""Inertia of rigid bodies: tensors, principal axes, mass properties (document 003)."""
+"""Inertia of rigid bodies: tensors, principal axes, mass properties (docs/equations.md, 003)."""
 
 from polhode.inertia._cholesky import (
     inertia_from_log_cholesky as inertia_from_log_cholesky,

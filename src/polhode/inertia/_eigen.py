@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from polhode.rotation import matrix_row
+
 # Cyclic Jacobi converges quadratically once the off-diagonal part is small against the gaps, and
 # linearly fast before that. Sweeps beyond the last needed one do nothing (t = 0 exactly or below
 # rounding). 4 sweeps reach float32 and 6 float64 rounding on every tensor tried, clustered
@@ -93,18 +95,13 @@ def _jacobi(diagonal, off):
 
 def _columns(q):
     """Columns of the rotation matrix of a unit quaternion: the principal axes in body axes."""
-    w, x, y, z = q
-    return (
-        (1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)),
-        (2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)),
-        (2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)),
-    )
+    return tuple(zip(*(matrix_row(q, i) for i in range(3))))
 
 
 def principal(
     tensor: Float[Array, "*b 3 3"],
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 4"], Float[Array, "*b 3"]]:
-    """Principal moments, axes and products of inertia of symmetric tensors (theory section 7).
+    """Principal moments, axes and products of inertia of symmetric tensors.
 
     Returns ``moments`` (..., 3), ascending; ``wxyz`` (..., 4), the right-handed turn from principal
     to body axes, ``I = R diag(moments) R^T``; and ``products`` (..., 3), the entries (y, z),

@@ -3,11 +3,13 @@
 from typing import Self
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
-from polhode._checks import as_float_array, is_concrete, require
+from polhode._checks import as_float_array, as_vectors, is_concrete, require
+from polhode._part import AbstractPart, shaped
 from polhode.inertia._cholesky import inertia_from_log_cholesky, inertia_to_log_cholesky
 from polhode.inertia._eigen import principal
 from polhode.inertia._input import (
@@ -17,77 +19,131 @@ from polhode.inertia._input import (
     require_positive,
     tolerance,
 )
+from polhode.inertia._physical import is_symmetric, possible_moments, possible_tensor
 from polhode.inertia._shapes import AbstractShaped, Symmetry
 from polhode.inertia._tensor import check_points, of_points, turned
 from polhode.rotation import to_matrix
 
+_ONE_FORM = (
+    "Inertia holds either principal moments or a full tensor, not both and not neither; use"
+    " Inertia.from_moments or Inertia.from_tensor."
+)
 
-class Inertia(AbstractShaped):
-    """Inertia tensor I of a rigid body in body axes, kg m^2 (document 003; theory section 7).
 
-    Exactly one of two leaves holds the numbers: ``diagonal`` (..., 3) when the body axes are
-    principal axes, ``full`` (..., 3, 3) otherwise. Leading axes are a batch of bodies. Build it
-    with the ``from_...`` constructors: they check the numbers; this one does not.
+class Inertia(AbstractShaped, AbstractPart):
+    """Inertia tensor I of a rigid body in body axes, kg m^2 (docs/equations.md, 003).
+
+    ``ph.Inertia(moments)``, of shape (..., 3), is ``Inertia.from_moments(moments)``; three rows of
+    three may be a tensor as well and are refused. The ``from_...`` constructors say what is meant.
+
+    The numbers stand in one of four forms, leading axes being a batch of bodies: ``diagonal``
+    (..., 3), moments about body x, y, z, which are principal axes; ``full`` (..., 3, 3), any axes;
+    ``transverse`` (...) and ``axial`` (...) of a body symmetric about body z; ``moment`` (...) of
+    one with three equal moments. So a symmetry cannot be lost: a step of an optimiser keeps it, and
+    a body that leaves it is one of another form. Given by these names numbers are taken as they
+    are, and judged when the body is moved (``ph.Status.NOT_PHYSICAL``).
+
+    ``physical`` (static): whether the triangle inequality is asked for; positive moments and a
+    symmetric tensor always are. Only numbers that are given by name may do without.
     """
 
-    diagonal: Float[Array, "*b 3"] | None = None
-    full: Float[Array, "*b 3 3"] | None = None
-    symmetry: Symmetry = eqx.field(static=True, default=Symmetry.NONE)
+    diagonal: Float[Array, "*b 3"] | None = shaped(3)
+    full: Float[Array, "*b 3 3"] | None = shaped(3, 3)
+    transverse: Float[Array, "*b"] | None = shaped()
+    axial: Float[Array, "*b"] | None = shaped()
+    moment: Float[Array, "*b"] | None = shaped()
+    physical: bool = eqx.field(static=True, kw_only=True)
 
-    core_ranks = {"diagonal": 1, "full": 2}  # noqa: RUF012
+    def __init__(
+        self,
+        moments: ArrayLike | None = None,
+        full: ArrayLike | None = None,
+        *,
+        diagonal: ArrayLike | None = None,
+        transverse: ArrayLike | None = None,
+        axial: ArrayLike | None = None,
+        moment: ArrayLike | None = None,
+        physical: bool | None = None,
+    ):
+        if moments is not None:
+            require(diagonal is None, _ONE_FORM)
+            diagonal, physical = _moments_meant(moments), physical is not False
+            if is_concrete(diagonal):
+                _checked("moments", diagonal, triangle=physical)
+        given = {
+            "diagonal": (diagonal, (3,)),
+            "full": (full, (3, 3)),
+            "transverse": (transverse, ()),
+            "axial": (axial, ()),
+            "moment": (moment, ()),
+        }
+        for name, (value, core) in given.items():
+            whole = None if value is None else as_float_array(name, value, core, finite=False)
+            setattr(self, name, whole)
+        self.physical = bool(physical)
+        self.check_form()
 
-    def __check_init__(self):
-        require(
-            (self.diagonal is None) != (self.full is None),
-            "Inertia holds either principal moments or a full tensor, not both and not neither; "
-            "use Inertia.from_moments or Inertia.from_tensor.",
-        )
+    def check_form(self) -> None:
+        """ValueError unless the numbers stand in one form, of which they are all there."""
+        forms = (self.diagonal, self.full, self.transverse, self.moment)
+        whole = (self.transverse is None) == (self.axial is None)
+        require(sum(x is not None for x in forms) == 1 and whole, _ONE_FORM)
 
     @classmethod
-    def from_moments(cls, moments: ArrayLike) -> Self:
+    def from_moments(cls, moments: ArrayLike, *, physical: bool = True) -> Self:
         """Principal moments (..., 3), kg m^2, about body x, y, z, which are principal axes.
 
+        ``physical=False`` lets numbers pass that no body has but that are published and move by
+        the same equations, such as (2, 1, 2/3): one greater than the sum of the two others.
+
         Raises ValueError for a wrong shape, values that are not positive and finite, or moments
-        that no body has (one greater than the sum of the two others; flat bodies, where it
-        equals the sum, pass).
+        that no body has (flat bodies, where one equals the sum of the two others, pass).
         """
-        return cls(_checked("moments", as_float_array("moments", moments, (3,))))
+        array = as_float_array("moments", moments, (3,))
+        return cls(diagonal=_checked("moments", array, physical), physical=physical)
 
     @classmethod
-    def axisymmetric(cls, transverse: ArrayLike, axial: ArrayLike) -> Self:
+    def axisymmetric(
+        cls, transverse: ArrayLike, axial: ArrayLike, *, physical: bool = True
+    ) -> Self:
         """A symmetric top: moments (transverse, transverse, axial), symmetry axis body z.
 
-        Both of shape (...), kg m^2, broadcast together. Raises as ``from_moments`` does.
+        Both of shape (...), kg m^2, broadcast together; they are its two leaves. ``physical`` and
+        errors are those of ``from_moments``.
         """
         first, last = as_floats(transverse=(transverse, ()), axial=(axial, ()))
-        moments = jnp.stack([first, first, last], axis=-1)
         name = "(transverse, transverse, axial)"
-        return cls(_checked(name, moments), None, Symmetry.AXISYMMETRIC)
+        _checked(name, jnp.stack([first, first, last], axis=-1), physical)
+        return cls(transverse=first, axial=last, physical=physical)
 
     @classmethod
     def spherical(cls, moment: ArrayLike) -> Self:
         """All moments equal (sphere, cube, ...): ``moment`` of shape (...), kg m^2, positive."""
         single = as_float_array("moment", moment, ())
         require_positive("moment", single)
-        return cls(jnp.stack([single] * 3, axis=-1), None, Symmetry.SPHERICAL)
+        return cls(moment=single, physical=True)
 
     @classmethod
-    def from_tensor(cls, tensor: ArrayLike) -> Self:
+    def from_tensor(cls, tensor: ArrayLike, *, physical: bool = True) -> Self:
         """Inertia tensor (..., 3, 3) in any body axes, kg m^2: symmetric, products negative-signed.
 
-        The off-diagonal entries are ``-integral x y dm`` (theory section 7). Raises ValueError for
-        a wrong shape, NaN or infinity, a tensor that is not symmetric, or one whose principal
-        moments are not positive or break the triangle inequality.
+        The off-diagonal entries are ``-integral x y dm``. ``physical`` as for
+        ``from_moments``. Raises ValueError for a wrong shape, NaN or infinity, a tensor that is not
+        symmetric, or one whose principal moments are not positive or break the triangle
+        inequality. While the numbers are traced a tensor that is not symmetric becomes NaN.
         """
         array = as_float_array("tensor", tensor, (3, 3))
-        check_tensor("tensor", array)
-        return cls(full=(array + jnp.swapaxes(array, -1, -2)) / 2)
+        check_tensor("tensor", array, triangle=physical)
+        symmetric = (array + jnp.swapaxes(array, -1, -2)) / 2
+        if not is_concrete(array):
+            symmetric = jnp.where(is_symmetric(array)[..., None, None], symmetric, jnp.nan)
+        return cls(full=symmetric, physical=physical)
 
     @classmethod
     def from_points(cls, masses: ArrayLike, positions: ArrayLike) -> Self:
         """Point masses (..., n), kg, at ``positions`` (..., n, 3), m, about the origin.
 
-        ``I = sum m (x.x 1 - x x^T)`` (document 003 display 24). The origin is the point that the
+        ``I = sum m (x.x 1 - x x^T)`` (docs/equations.md, 003: 24). The origin is the point that the
         body turns about; for a free body use ``MassProperties.from_points``, whose ``inertia`` is
         about the centre of mass. Raises ValueError for an empty set, a negative mass, points
         that all lie on one line through the origin, NaN or infinity.
@@ -96,17 +152,26 @@ class Inertia(AbstractShaped):
         check_points(masses, positions)
         tensor = of_points(masses, positions)
         check_tensor("the inertia of the points", tensor)
-        return cls(full=tensor)
+        return cls(full=tensor, physical=True)
 
     @classmethod
     def _of_shape(cls, mass: Array, moments: Array, symmetry: Symmetry) -> Self:
-        return cls(_checked("the principal moments", moments), None, symmetry)
+        return cls.of_symmetry(_checked("the principal moments", moments), symmetry)
+
+    @classmethod
+    def of_symmetry(cls, moments: Array, symmetry: Symmetry, physical: bool = True) -> Self:
+        """Moments (..., 3) in the form of a symmetry that they are known to have; unchecked."""
+        if symmetry is Symmetry.NONE:
+            return cls(diagonal=moments, physical=physical)
+        if symmetry is Symmetry.AXISYMMETRIC:
+            return cls(transverse=moments[..., 0], axial=moments[..., 2], physical=physical)
+        return cls(moment=moments[..., 0], physical=physical)
 
     @classmethod
     def from_log_cholesky(cls, parameters: ArrayLike) -> Self:
         """A physical inertia from any real 6-vector (..., 6); see ``to_log_cholesky``."""
         array = as_float_array("parameters", parameters, (6,))
-        return cls(full=inertia_from_log_cholesky(array))
+        return cls(full=inertia_from_log_cholesky(array), physical=True)
 
     def to_log_cholesky(self) -> Float[Array, "*b 6"]:
         """Unconstrained parameters (..., 6) of the tensor: log-Cholesky of its second moments.
@@ -116,19 +181,26 @@ class Inertia(AbstractShaped):
         return inertia_to_log_cholesky(self.tensor)
 
     @property
+    def symmetry(self) -> Symmetry:
+        """Which moments are equal by construction (static)."""
+        if self.moment is not None:
+            return Symmetry.SPHERICAL
+        return Symmetry.NONE if self.transverse is None else Symmetry.AXISYMMETRIC
+
+    @property
     def is_principal(self) -> bool:
         """Whether the body axes are principal axes by construction (static)."""
-        return self.diagonal is not None
+        return self.full is None
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
         """Leading axes."""
-        return self.full.shape[:-2] if self.diagonal is None else self.diagonal.shape[:-1]
+        return self.moments.shape[:-1] if self.full is None else self.full.shape[:-2]
 
     @property
     def dtype(self):
         """Floating dtype of the numbers."""
-        return (self.full if self.diagonal is None else self.diagonal).dtype
+        return jax.tree.leaves(self)[0].dtype
 
     @property
     def moments(self) -> Float[Array, "*b 3"]:
@@ -136,7 +208,25 @@ class Inertia(AbstractShaped):
 
         Differentiable; for equal moments of a full tensor see ``principal``.
         """
-        return principal(self.full)[0] if self.diagonal is None else self.diagonal
+        if self.diagonal is not None:
+            return self.diagonal
+        if self.full is not None:
+            return principal(self.full)[0]
+        if self.moment is not None:
+            return jnp.stack([self.moment] * 3, axis=-1)
+        transverse, axial = jnp.broadcast_arrays(self.transverse, self.axial)
+        return jnp.stack([transverse, transverse, axial], axis=-1)
+
+    @property
+    def is_possible(self) -> Bool[Array, "*b"]:
+        """Whether (...) a body can have these numbers, up to rounding: also while they are traced.
+
+        Positive moments that obey the triangle inequality (unless ``physical`` is False), a
+        symmetric tensor, neither NaN nor infinity.
+        """
+        if self.full is None:
+            return possible_moments(self.moments, self.physical)
+        return possible_tensor(self.full, self.physical)
 
     @property
     def axes(self) -> Float[Array, "*b 4"] | None:
@@ -144,15 +234,16 @@ class Inertia(AbstractShaped):
 
         Carries no derivative (``principal`` says how to get derivatives right).
         """
-        return principal(self.full)[1] if self.diagonal is None else None
+        return None if self.full is None else principal(self.full)[1]
 
     @property
     def tensor(self) -> Float[Array, "*b 3 3"]:
         """The tensor in body axes, kg m^2."""
-        if self.diagonal is None:
+        if self.full is not None:
             return self.full
-        return self.diagonal[..., None] * jnp.broadcast_to(
-            jnp.eye(3, dtype=self.dtype), (*self.batch_shape, 3, 3)
+        moments = self.moments
+        return moments[..., None] * jnp.broadcast_to(
+            jnp.eye(3, dtype=moments.dtype), (*moments.shape, 3)
         )
 
     def turned(self, wxyz: Float[Array, "*#b 4"]) -> Self:
@@ -160,7 +251,7 @@ class Inertia(AbstractShaped):
 
         ``axes`` of the result is such a turn: ``Inertia(moments).turned(axes)`` is the body again.
         """
-        return type(self)(full=turned(self.tensor, to_matrix(wxyz)))
+        return type(self)(full=turned(self.tensor, to_matrix(wxyz)), physical=self.physical)
 
     def to_principal(self) -> tuple[Self, Float[Array, "*b 4"]]:
         """The same body in principal axes, and the turn ``wxyz`` from those to the present axes.
@@ -168,23 +259,25 @@ class Inertia(AbstractShaped):
         ``wxyz`` is a constant for derivatives, and the products of inertia about it are dropped:
         for derivatives of a motion with respect to a full tensor use ``principal``.
         """
-        if self.diagonal is not None:
+        if self.full is None:
             unit = jnp.asarray([1, 0, 0, 0], self.dtype)
             return self, jnp.broadcast_to(unit, (*self.batch_shape, 4))
         moments, wxyz, _ = principal(self.full)
-        return type(self)(moments), wxyz
+        return type(self)(diagonal=moments, physical=self.physical), wxyz
 
-    def momentum(self, omega: Float[Array, "*#b 3"]) -> Float[Array, "*b 3"]:
+    def momentum(self, omega: Float[Array | np.ndarray, "*#b 3"]) -> Float[Array, "*b 3"]:
         """Body momentum ``I omega``, kg m^2/s, of body rates (..., 3), rad/s."""
-        if self.diagonal is not None:
-            return jnp.multiply(*_aligned(self.diagonal, omega))
+        omega = as_vectors("omega", omega)
+        if self.full is None:
+            return jnp.multiply(*_aligned(self.moments, omega))
         rows = [jnp.sum(jnp.multiply(*_aligned(self.full[..., i, :], omega)), -1) for i in range(3)]
         return jnp.stack(rows, axis=-1)
 
-    def rates(self, momentum: Float[Array, "*#b 3"]) -> Float[Array, "*b 3"]:
+    def rates(self, momentum: Float[Array | np.ndarray, "*#b 3"]) -> Float[Array, "*b 3"]:
         """Body rates ``I^-1 L``, rad/s, of body momenta (..., 3), kg m^2/s."""
-        if self.diagonal is not None:
-            moments, momentum = _aligned(self.diagonal, momentum)
+        momentum = as_vectors("momentum", momentum)
+        if self.full is None:
+            moments, momentum = _aligned(self.moments, momentum)
             return momentum / moments
         batch = jnp.broadcast_shapes(self.batch_shape, momentum.shape[:-1])
         tensor = jnp.broadcast_to(self.full, (*batch, 3, 3))
@@ -211,7 +304,29 @@ def _solve(tensor, vector):
     return jnp.stack([x / a - l10 * y - l20 * z, y, z], axis=-1)
 
 
-def _checked(name, moments):
+def _checked(name, moments, triangle=True):
     if is_concrete(moments):
-        check_moments(name, np.asarray(moments, np.float64), tolerance(moments))
+        slack = tolerance(moments) if triangle else np.inf
+        check_moments(name, np.asarray(moments, np.float64), slack)
     return moments
+
+
+def _moments_meant(given) -> Array:
+    """The moments of ``ph.Inertia(given)``; an error that names the constructor otherwise."""
+    if isinstance(given, eqx.Module):
+        raise TypeError(
+            f"Inertia takes numbers, got {type(given).__name__}: of ph.MassProperties take .inertia"
+            " or .about(point)."
+        )
+    array = as_float_array("Inertia(moments): moments", given)
+    if array.shape[-2:] == (3, 3):
+        raise ValueError(
+            f"Inertia(...) of shape {array.shape} may mean tensors or the moments of three bodies:"
+            " use Inertia.from_tensor or Inertia.from_moments."
+        )
+    if array.ndim == 0:
+        raise ValueError(
+            "Inertia(...) takes three moments, got one number: use Inertia.spherical(moment) for a"
+            " body with three equal ones."
+        )
+    return as_float_array("Inertia(moments): moments", given, (3,))

@@ -1,42 +1,10 @@
 """Checks of what users hand in: shapes always, values only when they are concrete."""
 
-from typing import Any
-
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polhode._checks import as_float_array, is_concrete, require
-
-
-def as_floats(**given: tuple[Any, tuple[int | None, ...]]) -> tuple[Array, ...]:
-    """Arrays ``name=(value, suffix)`` of one floating dtype and with common batch axes.
-
-    Python numbers and lists follow the dtype of the arrays among them; alone, they take the
-    default one. A mixture of array dtypes takes the wider one.
-    """
-    kinds = [
-        value.dtype
-        for value, _ in given.values()
-        if hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jnp.floating)
-    ]
-    arrays = [as_float_array(name, value, suffix) for name, (value, suffix) in given.items()]
-    if kinds:
-        common = kinds[0]
-        for kind in kinds[1:]:
-            common = jnp.promote_types(common, kind)
-        arrays = [array.astype(common) for array in arrays]
-    tails = [len(suffix) for _, suffix in given.values()]
-    leading = [array.shape[: array.ndim - tail] for array, tail in zip(arrays, tails)]
-    try:
-        batch = jnp.broadcast_shapes(*leading)
-    except ValueError as error:
-        shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(given, arrays))
-        raise ValueError(f"the batch axes must broadcast together, got {shapes}.") from error
-    return tuple(
-        jnp.broadcast_to(array, (*batch, *array.shape[array.ndim - tail :]))
-        for array, tail in zip(arrays, tails)
-    )
+from polhode._checks import as_floats as as_floats, is_concrete, require
 
 
 def tolerance(array: Array) -> float:
@@ -59,11 +27,11 @@ def require_positive(name: str, array: Array, *, zero: bool = False) -> None:
 def require_below(small_name: str, small: Array, large_name: str, large: Array) -> None:
     """ValueError if a concrete ``small`` exceeds ``large`` anywhere."""
     if is_concrete(small, large):
-        small, large = np.asarray(small), np.asarray(large)
+        least, most = np.asarray(small), np.asarray(large)
         require(
-            small <= large,
-            f"{small_name} must not exceed {large_name}, got {small.max():g} against "
-            f"{large.min():g}; exchange them?",
+            least <= most,
+            f"{small_name} must not exceed {large_name}, got {least.max():g} against "
+            f"{most.min():g}; exchange them?",
         )
 
 
@@ -86,12 +54,16 @@ def check_moments(name: str, seen: np.ndarray, slack: float, least: float = 0.0)
         excess <= slack,
         f"{name} must satisfy the triangle inequality (each at most the sum of the two others), "
         f"got {_worst(seen, -excess)}; check the units, and that these are moments of inertia, "
-        "not second moments or a gyration tensor. Inertia(diagonal=...) takes what no body has.",
+        "not second moments or a gyration tensor. Published numbers that no body has pass with "
+        "Inertia.from_moments(..., physical=False).",
     )
 
 
-def check_tensor(name: str, array: Array) -> None:
-    """ValueError unless a concrete tensor is symmetric with moments that a body can have."""
+def check_tensor(name: str, array: Array, *, triangle: bool = True) -> None:
+    """ValueError unless a concrete tensor is symmetric with moments that a body can have.
+
+    ``triangle``: whether these must obey the triangle inequality.
+    """
     if not is_concrete(array) or array.size == 0:
         return
     seen = np.asarray(array, np.float64)
@@ -105,8 +77,9 @@ def check_tensor(name: str, array: Array) -> None:
     # moments within the rounding of the largest cannot be told from zero
     least = 64 * float(jnp.finfo(array.dtype).eps)
     moments = np.linalg.eigvalsh((seen + mirrored) / 2)
-    check_moments(f"the principal moments of {name}", moments, tolerance(array), least)
+    slack = tolerance(array) if triangle else np.inf
+    check_moments(f"the principal moments of {name}", moments, slack, least)
 
 
-def _worst(seen: np.ndarray, badness: np.ndarray) -> str:
+def _worst(seen: np.ndarray, badness: np.ndarray | np.floating) -> str:
     return np.array2string(seen.reshape(-1, seen.shape[-1])[int(np.argmin(badness))])

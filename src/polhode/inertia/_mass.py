@@ -24,8 +24,8 @@ from polhode.inertia._input import (
 )
 from polhode.inertia._mesh import check_mesh, load_mesh, mesh_integrals
 from polhode.inertia._shapes import AbstractShaped, Symmetry
-from polhode.inertia._tensor import check_points, of_points, offset, turned
-from polhode.rotation import normalise, rotate, to_matrix
+from polhode.inertia._tensor import check_points, of_points, offset
+from polhode.rotation import normalise, rotate
 
 
 class MassProperties(AbstractShaped):
@@ -44,6 +44,11 @@ class MassProperties(AbstractShaped):
         """From known values; ``inertia`` about the centre of mass ``centre`` (..., 3)."""
         mass, centre = as_floats(mass=(mass, ()), centre=(centre, (3,)))
         require_positive("mass", mass)
+        if not isinstance(inertia, Inertia):
+            raise TypeError(
+                "inertia must be a ph.Inertia, such as ph.Inertia.from_moments([1., 2., 3.]), got"
+                f" {type(inertia).__name__}."
+            )
         return cls(mass, centre, inertia)
 
     @classmethod
@@ -57,7 +62,7 @@ class MassProperties(AbstractShaped):
         mass = jnp.sum(masses, axis=-1)
         centre = jnp.sum(masses[..., None] * positions, axis=-2) / mass[..., None]
         central = of_points(masses, positions - centre[..., None, :])
-        return cls(mass, centre, Inertia(full=central))
+        return cls(mass, centre, Inertia(full=central, physical=True))
 
     @classmethod
     def from_mesh(
@@ -87,7 +92,7 @@ class MassProperties(AbstractShaped):
         rho, total = (amount, amount * volume) if mass is None else (amount / volume, amount)
         tensor = rho[..., None, None] * inertia_of_second_moments(sigma)
         check_tensor("the inertia of the mesh", tensor)
-        return cls(total, centre, Inertia(full=tensor))
+        return cls(total, centre, Inertia(full=tensor, physical=True))
 
     @classmethod
     def from_mesh_file(
@@ -116,12 +121,12 @@ class MassProperties(AbstractShaped):
         mass, centre, tensor = pseudo_from_log_cholesky(
             as_float_array("parameters", parameters, (10,))
         )
-        return cls(mass, centre, Inertia(full=tensor))
+        return cls(mass, centre, Inertia(full=tensor, physical=True))
 
     @classmethod
     def _of_shape(cls, mass: Array, moments: Array, symmetry: Symmetry) -> Self:
         mass = jnp.broadcast_to(mass, moments.shape[:-1])
-        return cls(mass, jnp.zeros_like(moments), Inertia(moments, None, symmetry))
+        return cls(mass, jnp.zeros_like(moments), Inertia.of_symmetry(moments, symmetry))
 
     def to_log_cholesky(self) -> Float[Array, "*b 10"]:
         """Inverse of ``from_log_cholesky``; infinite for a flat body, which is on the boundary."""
@@ -130,7 +135,7 @@ class MassProperties(AbstractShaped):
     @property
     def inertia(self) -> Inertia:
         """Inertia about the centre of mass; ValueError if it is that of no extended body."""
-        if self.central.diagonal is None:
+        if not self.central.is_principal:
             check_tensor("the inertia", self.central.tensor)
         elif is_concrete(self.central):
             moments = self.central.moments
@@ -166,7 +171,7 @@ class MassProperties(AbstractShaped):
             batch = jnp.broadcast_shapes(turn.shape[:-1], self.mass.shape)
             turn = jnp.broadcast_to(turn, (*batch, 4))
             centre = rotate(turn, jnp.broadcast_to(centre, (*batch, 3)))
-            central = Inertia(full=turned(central.tensor, to_matrix(turn)))
+            central = central.turned(turn)
         batch = jnp.broadcast_shapes(shift.shape, centre.shape)
         centre = jnp.broadcast_to(centre, batch) + jnp.broadcast_to(shift, batch)
         return type(self)(jnp.broadcast_to(self.mass, batch[:-1]), centre, central)
@@ -178,6 +183,11 @@ class MassProperties(AbstractShaped):
         return self._joined(other, -1)
 
     def _joined(self, other: "MassProperties", sign: int) -> Self:
+        if not isinstance(other, MassProperties):
+            raise TypeError(
+                "ph.MassProperties join with ph.MassProperties, got"
+                f" {type(other).__name__}: the place of a part needs its mass and centre too."
+            )
         ours, theirs = jnp.broadcast_arrays(self.mass, other.mass)
         theirs = sign * theirs
         mass = ours + theirs
@@ -187,7 +197,8 @@ class MassProperties(AbstractShaped):
         lifted = jnp.broadcast_to(fraction[..., None], gap.shape)
         centre = _sum(self.centre, lifted * gap)
         parts = _sum(self.central.tensor, sign * other.central.tensor)
-        return type(self)(mass, centre, Inertia(full=_sum(parts, offset(ours * fraction, gap))))
+        central = _sum(parts, offset(ours * fraction, gap))
+        return type(self)(mass, centre, Inertia(full=central, physical=True))
 
 
 def compose(parts: Iterable[MassProperties]) -> MassProperties:

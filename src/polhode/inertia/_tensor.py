@@ -24,7 +24,7 @@ def check_points(masses: Array, positions: Array) -> None:
 def of_points(
     masses: Float[Array, "*b n"], positions: Float[Array, "*b n 3"]
 ) -> Float[Array, "*b 3 3"]:
-    """``sum m (x.x 1 - x x^T)`` about the origin (document 003 display 24)."""
+    """``sum m (x.x 1 - x x^T)`` about the origin (docs/equations.md, 003: 24)."""
     x, y, z = (positions[..., i] for i in range(3))
 
     def second(u, v):

@@ -1,15 +1,37 @@
-"""Scene files (TOML) and labelled output (NetCDF)."""
+"""Scene files (TOML) and labelled output (NetCDF).
+
+Reading and checking a file needs no JAX; what builds polhode's objects is imported when asked for.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from polhode.io._atomic import whole_file as whole_file, write_netcdf as write_netcdf
-from polhode.io._build import (
-    blamed as blamed,
-    build_attitudes as build_attitudes,
-    build_inertia as build_inertia,
-    build_scene as build_scene,
-    build_state as build_state,
-)
-from polhode.io._clones import Clones as Clones, draw_clones as draw_clones
-from polhode.io._error import SceneFileError as SceneFileError
-from polhode.io._method import build_method as build_method
-from polhode.io._schema import parse_scene as parse_scene, read_scene as read_scene
-from polhode.io._specification import SceneFile as SceneFile
+from polhode.io._error import SceneFileError as SceneFileError, visible as visible
+from polhode.io._read import parse_scene as parse_scene, read_scene as read_scene
+
+if TYPE_CHECKING:
+    from polhode.io._build import (
+        blamed as blamed,
+        build_attitudes as build_attitudes,
+        build_inertia as build_inertia,
+        build_scene as build_scene,
+        build_state as build_state,
+    )
+    from polhode.io._clones import Clones as Clones, draw_clones as draw_clones
+    from polhode.io._method import build_method as build_method
+    from polhode.io._specification import SceneFile as SceneFile
+
+_ROOMS = {
+    "_build": ("blamed", "build_attitudes", "build_inertia", "build_scene", "build_state"),
+    "_clones": ("Clones", "draw_clones"),
+    "_method": ("build_method",),
+    "_specification": ("SceneFile",),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for room, names in _ROOMS.items():
+        if name in names:
+            return getattr(importlib.import_module(f"polhode.io.{room}"), name)
+    raise AttributeError(f"module 'polhode.io' has no attribute {name!r}")

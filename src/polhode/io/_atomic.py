@@ -16,7 +16,8 @@ def whole_file(target: str | os.PathLike) -> Iterator[Path]:
     """A temporary path in the folder of `target` that replaces `target` when the block succeeds.
 
     When the block raises anything, KeyboardInterrupt included, the temporary file is removed and an
-    existing `target` is left as it was. The folder must exist.
+    existing `target` is left as it was. The folder must exist. An OSError of the system names the
+    target and its folder.
     """
     target = Path(target).resolve()
     # the suffix stays last: writers of figures choose the format by it
@@ -26,8 +27,16 @@ def whole_file(target: str | os.PathLike) -> Iterator[Path]:
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
         os.replace(temporary, target)
+    except OSError as error:
+        if error.errno is None or error.strerror is None:
+            raise
+        raise OSError(
+            error.errno, f"{error.strerror}: cannot write {target.name} in the folder"
+            f" {target.parent}; nothing was changed there",
+        ) from error  # fmt: skip
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
     _sync_folder(target.parent)
 
 
@@ -42,10 +51,11 @@ def _sync_folder(folder: Path) -> None:
 
 
 def write_netcdf(dataset: "xarray.Dataset", target: str | os.PathLike) -> Path:
-    """Write a dataset (`Trajectory.to_xarray()`) as NetCDF-4, whole or not at all.
+    """Write a dataset (`Trajectory.to_xarray()`) as compressed NetCDF-4, whole or not at all.
 
-    Needs xarray, h5netcdf and h5py (`pip install polhode[cli]`). Returns the path. Raises OSError
-    when the folder is missing, full or not writable; an existing file then stays as it was.
+    The file is made in memory first: HDF5 ends the process when the disk is full. Needs xarray,
+    h5netcdf and h5py (`pip install polhode[cli]`). Returns the path. Raises OSError when the
+    folder is missing, full or not writable; an existing file then stays as it was.
     """
     try:
         import h5netcdf  # noqa: F401 - the engine that xarray is asked for below
@@ -54,6 +64,10 @@ def write_netcdf(dataset: "xarray.Dataset", target: str | os.PathLike) -> Path:
         raise ImportError(
             "writing NetCDF needs xarray, h5netcdf and h5py: pip install 'polhode[cli]'"
         ) from error
+    packed = {"zlib": True, "complevel": 4, "shuffle": True}
+    large = {name: packed for name, array in dataset.variables.items()
+             if array.ndim and array.dtype.kind in "fiu"}  # fmt: skip
+    data = dataset.to_netcdf(engine="h5netcdf", encoding=large)
     with whole_file(target) as temporary:
-        dataset.to_netcdf(temporary, engine="h5netcdf")
+        temporary.write_bytes(data)
     return Path(target)

@@ -15,7 +15,6 @@ import polhode
 from polhode import rotation
 from polhode.inertia import Inertia, MassProperties, compose
 from polhode.io._error import SceneFileError
-from polhode.io._parts import KINDS
 from polhode.io._specification import Attitudes, Part, SceneFile
 
 _CLASSES = {
@@ -36,7 +35,7 @@ def blamed(file: SceneFile, where: str) -> Iterator[None]:
     except SceneFileError:
         raise
     except (ValueError, TypeError) as error:
-        raise SceneFileError(file.path, where, str(error)) from error
+        raise SceneFileError(file.path, where, str(error)[:500]) from error
 
 
 def build_attitudes(attitudes: Attitudes, dtype: DTypeLike) -> Float[Array, "*b 4"]:
@@ -90,7 +89,9 @@ def build_scene(
     """
     inertia = build_inertia(file, dtype) if inertia is None else inertia
     acting = {}
-    for key, parts in zip(KINDS, (file.potentials, file.torques, file.rotors), strict=True):
+    for key, parts in zip(
+        ("potential", "torque", "rotors"), (file.potentials, file.torques, file.rotors), strict=True
+    ):
         objects = _objects(file, parts, dtype)
         if objects:
             acting[key] = functools.reduce(operator.add, objects)

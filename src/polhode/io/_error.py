@@ -1,4 +1,4 @@
-"""The error of a scene file: file, key, what was given, what is expected, how to mend it."""
+"""The error of a scene file, and how text from files is shown on a terminal."""
 
 from pathlib import Path
 
@@ -18,11 +18,23 @@ class SceneFileError(ValueError):
         self.given, self.expected, self.mend = given, expected, mend
         place = f"{self.file}: {key}: " if key else f"{self.file}: "
         rows = [("given", given), ("expected", expected), ("to mend", mend)]
-        lines = [f"  {name + ':':<10}{text}" for name, text in rows if text]
-        super().__init__("\n".join([place + problem, *lines]))
+        lines = [visible(f"  {name + ':':<10}{text}") for name, text in rows if text]
+        super().__init__("\n".join([visible(place + problem), *lines]))
+
+
+def visible(text: str) -> str:
+    """The text on one line, with every character that a terminal would obey (escapes, line ends,
+    marks that reverse the direction) or cannot show written as \\x1b, \\u202e and the like.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def shorten(value: object, length: int = 80) -> str:
     """A value of the file as it is shown in a message, on one line and not too long."""
-    text = " ".join(repr(value).split())
+    try:
+        text = " ".join(repr(value).split())
+    except ValueError:  # an integer of more digits than Python writes out
+        return "a number of thousands of digits"
     return text if len(text) <= length else text[: length - 4] + " ..."

@@ -9,7 +9,7 @@ from polhode import solvers
 from polhode.io._build import blamed
 from polhode.io._error import SceneFileError
 from polhode.io._specification import SceneFile
-from polhode.io._table import suggestion
+from polhode.io._values import suggestion
 
 
 def build_method(file: SceneFile) -> "polhode.AbstractMethod | None":
@@ -53,4 +53,10 @@ def _solver(file: SceneFile, name: str) -> diffrax.AbstractSolver:
             "the name of a solver of diffrax or polhode.solvers, such as Dopri8",
             suggestion(name, tuple(known)),
         )  # fmt: skip
-    return known[name]()
+    try:
+        return known[name]()
+    except TypeError:
+        raise SceneFileError(
+            file.path, "[method] solver", "a solver that needs arguments", name,
+            "one that is made without, such as Dopri8", "use it from Python instead",
+        ) from None  # fmt: skip

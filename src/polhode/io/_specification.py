@@ -132,9 +132,10 @@ class Output:
 
 @dataclasses.dataclass(frozen=True)
 class SceneFile:
-    """A whole scene file; `read_scene` makes it, `build` turns it into polhode objects."""
+    """A whole scene file with the `text` it was read from; `read_scene` makes it."""
 
     path: Path
+    text: str
     title: str
     source: str
     epoch: datetime.datetime | None

@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from polhode.plot._matplotlib import ACCENT, AXES, GREY, INK, new_figure, styled
+from polhode.plot._matplotlib import ACCENT, AXES, GREY, INK, new_figure, plain, styled
 
 # chi-square of two degrees of freedom: 68 % and 95 % of a plane
 _LEVELS = {"68 %": 2.2957, "95 %": 5.9915}
@@ -47,7 +47,7 @@ def fit(result: Any, recording: Any, *, body: int = 0, title: str = ""):
     _region(figure.add_subplot(right[0]), one)
     _table(figure.add_subplot(right[1]), one)
     if title:
-        figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
+        figure.suptitle(plain(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
     return figure
 
 

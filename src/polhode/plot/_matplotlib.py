@@ -51,6 +51,15 @@ def styled(function):
     return wrapper
 
 
+def plain(text: str, length: int = 120) -> str:
+    """A user's text as it stands: `$` begins no formula, control characters are written out."""
+    from polhode.io import visible
+
+    text = visible(text)
+    text = text if len(text) <= length else text[: length - 4] + " ..."
+    return text.replace("$", r"\$")
+
+
 def new_figure(width: float, height: float):
     """A figure that belongs to pyplot, so that notebooks show it."""
     import matplotlib.pyplot as plt

@@ -3,7 +3,7 @@
 import numpy as np
 
 from polhode._trajectory import Trajectory
-from polhode.plot._matplotlib import AXES, INK, new_figure, styled
+from polhode.plot._matplotlib import AXES, INK, new_figure, plain, styled
 from polhode.plot._motion import Motion, as_motion
 from polhode.plot._polhode import polhode
 from polhode.plot._scale import Scale
@@ -27,6 +27,7 @@ def overview(
     `observed` (`plot.motion` of one body; NaN where nothing was observed). Right: the polhode.
     """
     made = as_motion(what)
+    names = tuple(plain(name, 30) for name in axis_names)
     scale = Scale.of(np.ptp(made.ts[0])) if scale is None else scale
     figure = new_figure(11.0, 7.6)
     grid = figure.add_gridspec(4, 2, width_ratios=(1.75, 1.0))
@@ -42,11 +43,11 @@ def overview(
                 _dots(ax, seen, observed.matrices[0, :, i, k], color)
         ax.set_ylim(-1.1, 1.1)
         letter = "xyz"[k]
-        name = "" if axis_names[k] == letter else f" ({axis_names[k]})"
+        name = "" if names[k] == letter else f" ({names[k]})"
         ax.set_title(f"Body {letter} axis{name}: direction in space")
     for k, color in enumerate(AXES):
         unit = scale.radians_per_second
-        _curve(rows[3], t, made.omega_body[:, :, k] / unit, color, axis_names[k], band)
+        _curve(rows[3], t, made.omega_body[:, :, k] / unit, color, names[k], band)
         if observed is not None:
             _dots(rows[3], seen, observed.omega_body[0, :, k] / unit, color)
     rows[3].set_title("Body rates")
@@ -59,11 +60,11 @@ def overview(
         ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=3, borderpad=0,
                   handlelength=1.4, columnspacing=1.2)  # fmt: skip
     ax = figure.add_subplot(grid[:3, 1], projection="3d")
-    polhode(made, ax=ax, axis_names=axis_names)
+    polhode(made, ax=ax, axis_names=names)
     ax.set_title("Polhode on the inertia ellipsoid", loc="center")
     _key(figure.add_subplot(grid[3, 1]), observed is not None, made.count - 1)
     if title:
-        figure.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
+        figure.suptitle(plain(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
     return figure
 
 

@@ -1,8 +1,13 @@
-"""Rotations: quaternions, Euler angles, axis-angle, matrices (document 002).
+"""Rotations: quaternions, Euler angles, axis-angle, matrices (docs/equations.md, 002).
 
 Conversions are named ``source_to_target``.
 """
 
+from polhode.rotation._components import (
+    matrix_row as matrix_row,
+    quaternion_rate as quaternion_rate,
+    wxyz_rate as wxyz_rate,
+)
 from polhode.rotation._direct import (
     axis_angle_to_euler as axis_angle_to_euler,
     euler_to_axis_angle as euler_to_axis_angle,

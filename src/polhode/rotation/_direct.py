@@ -2,7 +2,7 @@
 
 The quaternion is the only description that is smooth and well scaled everywhere, so that going
 through it loses nothing: small rotations keep their relative accuracy, half turns their axis.
-All angles are in rad; ``sequence`` defaults to the documents' ZYZ.
+All angles are in rad; ``sequence`` defaults to ZYZ.
 """
 
 import jax.numpy as jnp
@@ -31,11 +31,13 @@ def euler_to_matrix(
     psi: Float[ArrayLike, "*#b"],
     sequence: Sequence = Sequence.ZYZ,
 ) -> Float[Array, "*b 3 3"]:
-    """Rotation matrix R (theory section 1) of Euler angles."""
+    """Rotation matrix R of Euler angles."""
     return wxyz_to_matrix(euler_to_wxyz(phi, theta, psi, sequence))
 
 
-def matrix_to_euler(matrix: Float[Array, "*b 3 3"], sequence: Sequence = Sequence.ZYZ) -> _Angles:
+def matrix_to_euler(
+    matrix: Float[ArrayLike, "*b 3 3"], sequence: Sequence = Sequence.ZYZ
+) -> _Angles:
     """Euler angles of a rotation matrix; ranges and ends as in `wxyz_to_euler`."""
     return wxyz_to_euler(matrix_to_wxyz(matrix), sequence)
 
@@ -51,7 +53,7 @@ def euler_to_rotation_vector(
 
 
 def rotation_vector_to_euler(
-    rotation_vector: Float[Array, "*b 3"], sequence: Sequence = Sequence.ZYZ
+    rotation_vector: Float[ArrayLike, "*b 3"], sequence: Sequence = Sequence.ZYZ
 ) -> _Angles:
     """Euler angles of a rotation vector; ranges and ends as in `wxyz_to_euler`."""
     return wxyz_to_euler(rotation_vector_to_wxyz(rotation_vector), sequence)
@@ -63,17 +65,17 @@ def euler_to_axis_angle(
     psi: Float[ArrayLike, "*#b"],
     sequence: Sequence = Sequence.ZYZ,
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b"]]:
-    """Unit axis and angle in [0, pi] of Euler angles: the robust form of document 002 eqs. 3-12.
+    """Unit axis and angle in [0, pi] of Euler angles: robust (docs/equations.md, 002: 3-12).
 
-    For ZYZ the axis is that of R; the documents' K turns about ``(l, -m, -n)`` (theory 5.1).
+    For ZYZ the axis is that of R; the matrix K turns about ``(l, -m, -n)``.
     """
     return wxyz_to_axis_angle(euler_to_wxyz(phi, theta, psi, sequence))
 
 
 def axis_angle_to_euler(
-    axis: Float[Array, "*b 3"], angle: Float[ArrayLike, "*b"], sequence: Sequence = Sequence.ZYZ
+    axis: Float[ArrayLike, "*b 3"], angle: Float[ArrayLike, "*b"], sequence: Sequence = Sequence.ZYZ
 ) -> _Angles:
-    """Euler angles of the turn by ``angle`` about the unit vector ``axis`` (theory section 5.5)."""
+    """Euler angles of the turn by ``angle`` about the unit vector ``axis``."""
     return wxyz_to_euler(axis_angle_to_wxyz(axis, angle), sequence)
 
 
@@ -88,7 +90,7 @@ def euler_to_modified_rodrigues(
 
 
 def modified_rodrigues_to_euler(
-    parameters: Float[Array, "*b 3"], sequence: Sequence = Sequence.ZYZ
+    parameters: Float[ArrayLike, "*b 3"], sequence: Sequence = Sequence.ZYZ
 ) -> _Angles:
     """Euler angles of modified Rodrigues parameters, either set."""
     return wxyz_to_euler(modified_rodrigues_to_wxyz(parameters), sequence)
@@ -97,10 +99,10 @@ def modified_rodrigues_to_euler(
 def euler_to_matrix_k(
     phi: Float[ArrayLike, "*#b"], theta: Float[ArrayLike, "*#b"], psi: Float[ArrayLike, "*#b"]
 ) -> Float[Array, "*b 3 3"]:
-    """Document 002's matrix K (eq. 1): R of the same ZYZ angles with the y and z axes reversed.
+    """The matrix K (docs/equations.md, 002): R of the same ZYZ angles, y and z axes reversed.
 
     ``K(phi, theta, psi) = D R D = R(-phi, -theta, -psi) = R(psi, theta, phi)^T``, with
-    ``D = diag(1, -1, -1)`` (theory section 5.1). K is neither R nor its transpose.
+    ``D = diag(1, -1, -1)``. K is neither R nor its transpose.
     """
     w, x, y, z = jnp.moveaxis(euler_to_wxyz(phi, theta, psi), -1, 0)
     return wxyz_to_matrix(jnp.stack([w, x, -y, -z], axis=-1))

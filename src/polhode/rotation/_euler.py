@@ -1,6 +1,6 @@
 """Euler angles of every sequence, to and from unit quaternions.
 
-ZYZ, ``R = Rz(phi) Ry(theta) Rz(psi)``, is the documents' convention (theory sections 1, 5.4, 5.5);
+ZYZ, ``R = Rz(phi) Ry(theta) Rz(psi)``, is the convention of docs/equations.md;
 the other sequences are reduced to the same formulas by a quarter turn (Bernardes and Viollet 2022).
 """
 
@@ -8,15 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from polhode._checks import as_floats
+from polhode.rotation._input import as_quaternions, check_sequence
 from polhode.rotation._scalar import length
 from polhode.rotation._sequence import Sequence
-
-
-def _common(*angles: ArrayLike) -> list[Array]:
-    dtype = jnp.result_type(*angles)
-    if not jnp.issubdtype(dtype, jnp.floating):
-        dtype = jnp.result_type(float)
-    return jnp.broadcast_arrays(*(jnp.asarray(angle, dtype) for angle in angles))
 
 
 def _parity(i: int, j: int, k: int) -> int:
@@ -47,7 +42,8 @@ def euler_to_wxyz(
     The angles are given in the order of the sequence's axes. The sign of the quaternion follows the
     angles continuously; `canonical` picks the one with scalar part >= 0.
     """
-    first, second, third = _common(phi, theta, psi)
+    check_sequence(sequence)
+    first, second, third = as_floats(finite=False, phi=(phi, ()), theta=(theta, ()), psi=(psi, ()))
     i, j, k = sequence.axes
     if sequence.is_extrinsic:
         (i, j, k), first, third = (k, j, i), third, first
@@ -87,7 +83,7 @@ def _phase(real: Array, imaginary: Array) -> tuple[Array, Array, Array]:
 
 
 def wxyz_to_euler(
-    wxyz: Float[Array, "*b 4"], sequence: Sequence = Sequence.ZYZ
+    wxyz: Float[ArrayLike, "*b 4"], sequence: Sequence = Sequence.ZYZ
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
     """Euler angles (rad) of a quaternion (its scale and its sign do not matter).
 
@@ -95,7 +91,13 @@ def wxyz_to_euler(
     [-pi/2, pi/2]. Where the second angle reaches an end of its range only the sum or the difference
     of the other two is defined, and it is shared equally between them; derivatives of the angles
     do not exist there, and the missing parts are returned as zero.
+
+    Raises ValueError for a quaternion that is zero, TypeError for what is no ``Sequence``; the
+    angles of a traced quaternion that is zero are NaN.
     """
+    check_sequence(sequence)
+    wxyz = as_quaternions(wxyz)
+    wxyz = jnp.where(jnp.any(wxyz != 0, axis=-1, keepdims=True), wxyz, jnp.nan)
     i, j, k = sequence.axes
     if sequence.is_extrinsic:
         i, j, k = k, j, i

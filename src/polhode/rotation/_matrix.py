@@ -1,30 +1,35 @@
-"""Rotation matrices R, ``x_space = R x_body`` (theory section 1; document 003 display 3)."""
+"""Rotation matrices R, ``x_space = R x_body`` (docs/equations.md, 003: 3)."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
+from polhode.rotation._components import matrix_row
+from polhode.rotation._input import as_matrices, as_quaternions
 from polhode.rotation._quaternion import canonical
 
 
-def wxyz_to_matrix(wxyz: Float[Array, "*b 4"]) -> Float[Array, "*b 3 3"]:
-    """Rotation matrix of a unit quaternion; either sign of the quaternion gives the same matrix."""
-    w, x, y, z = (wxyz[..., i] for i in range(4))
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+def wxyz_to_matrix(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3 3"]:
+    """Rotation matrix of a unit quaternion; either sign of the quaternion gives the same matrix.
+
+    Raises ValueError for a quaternion that is known not to be of unit length.
+    """
+    wxyz = as_quaternions(wxyz, unit=True)
+    q = tuple(wxyz[..., i] for i in range(4))
+    return jnp.stack([jnp.stack(matrix_row(q, i), axis=-1) for i in range(3)], axis=-2)
 
 
-def matrix_to_wxyz(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
+def matrix_to_wxyz(matrix: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b 4"]:
     """Unit quaternion, scalar part >= 0, of a rotation matrix.
 
     The symmetric matrix ``4 q q^T`` is linear in R. Its row with the largest diagonal entry (at
     least 1) is parallel to q and far from zero, so that one normalisation gives q without
     cancellation for every rotation, half turns included (after Shepperd 1978).
     The derivative is the one for changes that keep the matrix a rotation.
+
+    Raises ValueError for a matrix that is no rotation (a reflection, a scaling, entries off by more
+    than 1e-3); while it is traced the quaternion of such a one is NaN.
     """
+    matrix, good = as_matrices(matrix)
     (a, b, c), (d, e, f), (g, h, i) = (
         (matrix[..., row, 0], matrix[..., row, 1], matrix[..., row, 2]) for row in range(3)
     )
@@ -38,4 +43,5 @@ def matrix_to_wxyz(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 4"]:
     diagonal = jnp.stack([outer[k][k] for k in range(4)], axis=-1)
     largest = jnp.argmax(diagonal, axis=-1)[..., None, None]
     row = jnp.take_along_axis(rows, largest, axis=-2)[..., 0, :]
-    return canonical(row / jnp.sqrt(jnp.sum(row * row, axis=-1, keepdims=True)))
+    unit = canonical(row / jnp.sqrt(jnp.sum(row * row, axis=-1, keepdims=True)))
+    return jnp.where(good[..., None], unit, jnp.nan)

@@ -6,18 +6,20 @@ Two sets describe each rotation, one for each sign of the quaternion: one of len
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
+from polhode.rotation._input import as_quaternions, as_vectors
 from polhode.rotation._quaternion import canonical
 from polhode.rotation._scalar import length
 
 
-def modified_rodrigues_to_wxyz(parameters: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
+def modified_rodrigues_to_wxyz(parameters: Float[ArrayLike, "*b 3"]) -> Float[Array, "*b 4"]:
     """Unit quaternion of modified Rodrigues parameters of any length.
 
     The scalar part is negative for parameters longer than 1, so that each set is given back by
     `wxyz_to_modified_rodrigues` or `wxyz_to_shadow` respectively.
     """
+    parameters = as_vectors("parameters", parameters, 3)
     # Both terms are scaled alike, which cannot change the quotient: no overflow for huge
     # parameters, and the derivative of the scale may be left out.
     largest = jnp.max(jnp.abs(parameters), axis=-1, keepdims=True)
@@ -33,23 +35,24 @@ def _project(wxyz: Array) -> Array:
     return wxyz[..., 1:] / (length(wxyz) + wxyz[..., 0])[..., None]
 
 
-def wxyz_to_modified_rodrigues(wxyz: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
+def wxyz_to_modified_rodrigues(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3"]:
     """The set of length at most 1, smooth at the identity; it jumps to its shadow at a half turn.
 
     The scale of the quaternion does not matter.
     """
-    return _project(canonical(wxyz))
+    return _project(canonical(as_quaternions(wxyz)))
 
 
-def wxyz_to_shadow(wxyz: Float[Array, "*b 4"]) -> Float[Array, "*b 3"]:
+def wxyz_to_shadow(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3"]:
     """The set of length at least 1 of a rotation; infinite at the identity."""
-    lower = -canonical(wxyz)
+    lower = -canonical(as_quaternions(wxyz))
     size = length(lower[..., 1:])
     # norm + scalar = vector**2/(norm - scalar), without cancellation for a negative scalar part
     return lower[..., 1:] * ((length(lower) - lower[..., 0]) / size)[..., None] / size[..., None]
 
 
-def shadow(parameters: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
+def shadow(parameters: Float[ArrayLike, "*b 3"]) -> Float[Array, "*b 3"]:
     """The other set of the same rotation, ``-p/|p|**2``; infinite for the identity."""
+    parameters = as_vectors("parameters", parameters, 3)
     size = length(parameters)[..., None]
     return -(parameters / size) / size

@@ -6,8 +6,9 @@ leading axes together, and keeps the dtype of its input.
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
+from polhode.rotation._input import as_quaternions, as_vectors
 from polhode.rotation._scalar import length
 
 
@@ -16,8 +17,11 @@ def identity(shape: tuple[int, ...] = (), dtype=None) -> Float[Array, "*b 4"]:
     return jnp.zeros((*shape, 4), dtype or jnp.result_type(float)).at[..., 0].set(1)
 
 
-def multiply(left: Float[Array, "*#b 4"], right: Float[Array, "*#b 4"]) -> Float[Array, "*b 4"]:
+def multiply(
+    left: Float[ArrayLike, "*#b 4"], right: Float[ArrayLike, "*#b 4"]
+) -> Float[Array, "*b 4"]:
     """Hamilton product ``left right``: first turn by ``right``, then by ``left``."""
+    left, right = as_vectors("left", left, 4), as_vectors("right", right, 4)
     a, b, c, d = (left[..., i] for i in range(4))
     w, x, y, z = (right[..., i] for i in range(4))
     return jnp.stack(
@@ -31,40 +35,53 @@ def multiply(left: Float[Array, "*#b 4"], right: Float[Array, "*#b 4"]) -> Float
     )
 
 
-def conjugate(wxyz: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
+def conjugate(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
     """Conjugate; for a unit quaternion the inverse rotation (space -> body)."""
+    wxyz = as_vectors("wxyz", wxyz, 4)
     return jnp.concatenate([wxyz[..., :1], -wxyz[..., 1:]], axis=-1)
 
 
-def rotate(wxyz: Float[Array, "*#b 4"], vector: Float[Array, "*#b 3"]) -> Float[Array, "*b 3"]:
-    """Space components of a vector given by its body components."""
+def rotate(
+    wxyz: Float[ArrayLike, "*#b 4"], vector: Float[ArrayLike, "*#b 3"]
+) -> Float[Array, "*b 3"]:
+    """Space components of a vector given by its body components, by a unit quaternion.
+
+    Raises ValueError for a quaternion that is known not to be of unit length.
+    """
+    wxyz, vector = as_quaternions(wxyz, unit=True), as_vectors("vector", vector, 3)
     w, axis = wxyz[..., :1], wxyz[..., 1:]
     twice = 2 * jnp.cross(axis, vector)
     return vector + w * twice + jnp.cross(axis, twice)
 
 
-def normalise(wxyz: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
+def normalise(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
     """The unit quaternion of the same direction; the components must not all vanish.
 
     Scaled by the largest component first, so that neither tiny nor huge input is lost.
     """
+    wxyz = as_quaternions(wxyz)
     # The result does not depend on the scale, so that its derivative may be left out.
     scale = jax.lax.stop_gradient(jnp.max(jnp.abs(wxyz), axis=-1, keepdims=True))
     scaled = wxyz / scale
     return scaled / jnp.sqrt(jnp.sum(scaled * scaled, axis=-1, keepdims=True))
 
 
-def canonical(wxyz: Float[Array, "*b 4"]) -> Float[Array, "*b 4"]:
+def canonical(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
     """The one of the two quaternions of a rotation whose scalar part is not negative."""
+    wxyz = as_vectors("wxyz", wxyz, 4)
     return jnp.where(wxyz[..., :1] < 0, -wxyz, wxyz)
 
 
-def between(start: Float[Array, "*#b 4"], end: Float[Array, "*#b 4"]) -> Float[Array, "*b 4"]:
+def between(
+    start: Float[ArrayLike, "*#b 4"], end: Float[ArrayLike, "*#b 4"]
+) -> Float[Array, "*b 4"]:
     """Rotation that leads from ``start`` to ``end`` in body axes: ``end = start between``."""
     return multiply(conjugate(start), end)
 
 
-def angle_between(start: Float[Array, "*#b 4"], end: Float[Array, "*#b 4"]) -> Float[Array, "*b"]:
+def angle_between(
+    start: Float[ArrayLike, "*#b 4"], end: Float[ArrayLike, "*#b 4"]
+) -> Float[Array, "*b"]:
     """Angle in [0, pi] (rad) of the rotation that leads from one attitude to the other."""
-    turn = between(start, end)
+    turn = between(as_quaternions(start, "start"), as_quaternions(end, "end"))
     return 2 * jnp.arctan2(length(turn[..., 1:]), jnp.abs(turn[..., 0]))

@@ -9,7 +9,7 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 
 def _dot(left: Array, right: Array) -> Array:
@@ -126,7 +126,7 @@ _ARC_SLOPE = (
 
 
 @jax.custom_jvp
-def arc_ratio(scalar: Float[Array, "*b"], vector: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
+def arc_ratio(scalar: Float[Array, "*b"], vector: Float[ArrayLike, "*b 3"]) -> Float[Array, "*b"]:
     """``atan2(r, scalar)/r`` with ``r`` the length of ``vector``, for ``scalar >= 0``.
 
     Half the rotation angle of a quaternion over the length of its vector part: 1/scalar at r = 0.

@@ -6,7 +6,7 @@ import enum
 class Sequence(enum.Enum):
     """Order of the three turns that Euler angles describe.
 
-    ``Sequence.ZYZ`` is the documents' convention, ``R = Rz(phi) Ry(theta) Rz(psi)``. A plain member
+    ``Sequence.ZYZ`` is the convention here, ``R = Rz(phi) Ry(theta) Rz(psi)``. A plain member
     is *intrinsic*: the second and third turn are about the axes that the body has by then, and
     ``R = R_i(first) R_j(second) R_k(third)``. A member ending in ``_SPACE`` is *extrinsic*: all
     turns are about fixed space axes, and ``R = R_k(third) R_j(second) R_i(first)``.

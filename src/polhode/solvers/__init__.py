@@ -1,10 +1,10 @@
-from polhode.solvers._choice import (
-    Choice as Choice,
-    choose as choose,
-    natural_rate as natural_rate,
-    steps_for as steps_for,
+"""Integrators made for rotating bodies, as solvers, controllers and adjoints of diffrax."""
+
+from polhode.solvers._equal_steps import EqualSteps as EqualSteps
+from polhode.solvers._extrapolation import (
+    Accuracy as Accuracy,
+    Extrapolation as Extrapolation,
 )
-from polhode.solvers._extrapolation import Extrapolation as Extrapolation
-from polhode.solvers._flow import flow as flow
-from polhode.solvers._path import path as path
+from polhode.solvers._flow_adjoint import FlowAdjoint as FlowAdjoint
+from polhode.solvers._march import GroupUnits as GroupUnits
 from polhode.solvers._splitting import Splitting as Splitting

@@ -1,28 +1,26 @@
 """The equations that carry slopes back along a motion, on lists of arrays."""
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
+from polhode.hamiltonian import relative
 
+
+@runtime_checkable
 class Costate(Protocol):
     """Equations of the slopes of a result, for states of special form.
 
     ``begin(y, slopes)``: the state z to integrate backwards from the end ``y``; ``rates(t, z,
     args)``: dz/dt, and K (n,), whose slope by any of ``args`` is that of the result per unit time;
     ``finish(z, start, end, slopes)``: the slopes by the start, ``slopes`` those at the end.
-    ``finer``: steps over those that the state alone needs; ``lower``: how much lower their order.
+    ``units(own, z, rates)``: weights of the components of z and the natural rate, ``own`` those of
+    the state.
     """
-
-    @property
-    def finer(self) -> float: ...
-
-    @property
-    def lower(self) -> int: ...
 
     def begin(self, y: PyTree, slopes: PyTree) -> PyTree: ...
 
@@ -30,17 +28,13 @@ class Costate(Protocol):
 
     def finish(self, z: PyTree, start: PyTree, end: PyTree, slopes: PyTree) -> PyTree: ...
 
-
-FINER = 1.15
-"""Steps of the derivatives' equations over those asked for the state alone."""
+    def units(self, own: Any, z: list[Array], rates: list[Array]) -> tuple[list[Array], Array]: ...
 
 
 class AnyCostate(NamedTuple):
     """Of any field f(c, t, y): z = (y, a), K = a . f, da/dt = -dK/dy."""
 
     field: Callable[..., list[Any]]
-    finer: float = FINER
-    lower: int = 0
 
     def begin(self, end, slopes):
         return [*end, *slopes]
@@ -59,20 +53,27 @@ class AnyCostate(NamedTuple):
     def finish(self, z, start, end, slopes):
         return z[len(z) // 2 :]
 
+    def units(self, own, z, rates):
+        half = len(z) // 2
+        weights, rate = own(z[:half], rates[:half])
+        dual = [jnp.where(w > 0, 1 / jnp.where(w > 0, w, 1), 0) for w in weights]
+        return [*weights, *relative(dual, z[half:], rates[half:], rate)], rate
+
 
 class FlatCostate:
-    """A costate on lists of arrays; ``consts``: what its functions close over."""
+    """A costate on lists of arrays; ``consts``: what its functions close over. ``opened(arrays)``:
+    the direction of time, 1 or -1, and the arguments."""
 
     def __init__(self, costate: Costate, y0: PyTree, t: Array, arrays: list[Array], opened):
         self.costate, self.tree = costate, jax.tree.structure(y0)
-        self.finer, self.lower = costate.finer, costate.lower
         z = jax.eval_shape(costate.begin, y0, y0)
         leaves, tree = jax.tree.flatten(z)
 
         def rates(t, *given):
             z = jax.tree.unflatten(tree, given[: len(leaves)])
-            found, k = costate.rates(t, z, opened(given[len(leaves) :]))
-            return [*jax.tree.leaves(found), k]
+            sign, args = opened(given[len(leaves) :])
+            found, k = costate.rates(sign * t, z, args)
+            return [sign.astype(x.dtype) * x for x in (*jax.tree.leaves(found), k)]
 
         closed = jax.make_jaxpr(rates)(t, *leaves, *arrays)
         self.jaxpr, self.consts, self.z_tree = closed.jaxpr, list(closed.consts), tree
@@ -87,6 +88,9 @@ class FlatCostate:
     def finish(self, z, start, end, slopes):
         z = jax.tree.unflatten(self.z_tree, z)
         return jax.tree.leaves(self.costate.finish(z, *map(self._y, (start, end, slopes))))
+
+    def units(self, own, z, rates):
+        return self.costate.units(own, *(jax.tree.unflatten(self.z_tree, x) for x in (z, rates)))
 
     def _y(self, leaves):
         return jax.tree.unflatten(self.tree, leaves)

@@ -1,4 +1,5 @@
-"""A linear map that is computed by one program and transposed by another."""
+"""Two primitives: a linear map that is computed by one program and transposed by another, and
+values found by other means with the derivatives of what they are."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -47,9 +48,9 @@ def _jvp(arrays, tangents, *, count, **params):
     moved = tangents[count:]
     changes: list[Any] = []
     if not all(isinstance(x, ad.Zero) for x in moved):
-        moved = [_zeros(x) if isinstance(x, ad.Zero) else x for x in moved]
+        moved = [zeros(x) if isinstance(x, ad.Zero) else x for x in moved]
         changes = _linear_p.bind(*given, *moved, count=count, **params)
-    at = [i for i, x in enumerate(tangents[:count]) if _is_slope(x)]
+    at = [i for i, x in enumerate(tangents[:count]) if is_slope(x)]
     if at:
 
         def of_given(*some):
@@ -63,11 +64,13 @@ def _jvp(arrays, tangents, *, count, **params):
     return out, changes
 
 
-def _is_slope(x: Any) -> bool:
+def is_slope(x: Any) -> bool:
+    """Whether a tangent is there at all."""
     return not isinstance(x, ad.Zero) and x.dtype != jax.dtypes.float0
 
 
-def _zeros(x: Any) -> Any:
+def zeros(x: Any) -> Any:
+    """What a tangent that is not there stands for."""
     return jnp.zeros(x.aval.shape, x.aval.dtype)
 
 
@@ -75,7 +78,7 @@ def _transpose(slopes, *arrays, forward, backward, count, shapes):
     given, operands = arrays[:count], arrays[count:]
     unknown = [ad.is_undefined_primal(x) for x in operands]
     avals = [x.aval if u else x for u, x in zip(unknown, operands)]
-    slopes = [_zeros(x) if isinstance(x, ad.Zero) else x for x in slopes]
+    slopes = [zeros(x) if isinstance(x, ad.Zero) else x for x in slopes]
     found = linear(backward, forward, given, slopes, avals)
     return [None] * count + [x if u else None for u, x in zip(unknown, found)]
 
@@ -104,3 +107,65 @@ ad.primitive_jvps[_linear_p] = _jvp
 ad.primitive_transposes[_linear_p] = _transpose
 batching.primitive_batchers[_linear_p] = _batch
 mlir.register_lowering(_linear_p, mlir.lower_fun(_compute, multiple_results=True))
+
+
+Rule = Callable[[Sequence[Any], Sequence[Any], Sequence[Any]], Sequence[Any]]
+
+
+def attached(rule: Rule, operands: Sequence[Any], values: Sequence[Any]) -> list[Any]:
+    """``values``, a function of ``operands`` found by other means, with its derivatives.
+
+    ``rule(operands, tangents, values)``: the tangents of the values; those of operands may be
+    absent (``is_slope``). It may not close over traced values. Derivatives of the rule see the
+    values with their derivatives. Unlike ``jax.custom_jvp`` this is never replaced by the
+    function itself, as loops do on the way to second derivatives.
+    """
+    return _attached_p.bind(*operands, *values, rule=rule, count=len(operands))
+
+
+_attached_p = Primitive("attached")
+_attached_p.multiple_results = True
+
+
+@_attached_p.def_impl
+def _values(*arrays, rule, count):
+    return list(arrays[count:])
+
+
+@_attached_p.def_abstract_eval
+def _shapes_of_values(*avals, rule, count):
+    return list(avals[count:])
+
+
+def _attached_jvp(arrays, tangents, *, rule, count):
+    out = _attached_p.bind(*arrays, rule=rule, count=count)
+    if not any(is_slope(x) for x in tangents[:count]):
+        return out, [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in out]
+    return out, list(rule(arrays[:count], tangents[:count], out))
+
+
+def _attached_batch(arrays, dims, *, rule, count):
+    size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
+    full = [
+        jnp.broadcast_to(x, (size, *x.shape)) if d is None else jnp.moveaxis(x, d, 0)
+        for x, d in zip(arrays, dims)
+    ]
+
+    def batched(operands, tangents, values):
+        at = [i for i, x in enumerate(tangents) if is_slope(x)]
+
+        def one(operands, some, values):
+            each = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in operands]
+            for i, x in zip(at, some):
+                each[i] = x
+            return [zeros(x) if isinstance(x, ad.Zero) else x for x in rule(operands, each, values)]
+
+        return jax.vmap(one)(list(operands), [tangents[i] for i in at], list(values))
+
+    out = _attached_p.bind(*full, rule=batched, count=count)
+    return out, [0] * len(out)
+
+
+ad.primitive_jvps[_attached_p] = _attached_jvp
+batching.primitive_batchers[_attached_p] = _attached_batch
+mlir.register_lowering(_attached_p, mlir.lower_fun(_values, multiple_results=True))

@@ -1,14 +1,17 @@
 """A term with its arguments, as one pytree that can be cut into blocks and handed to kernels."""
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from diffrax import AbstractTerm
+from jax.interpreters import partial_eval
 from jaxtyping import PyTree
 
-from polhode.solvers._specialise import specialise
+from polhode.xla import specialise
 
 
 class Problem(eqx.Module):
@@ -21,12 +24,14 @@ class Problem(eqx.Module):
     def of(cls, terms: AbstractTerm, args: PyTree) -> "Problem":
         return cls(*eqx.partition((terms, args), eqx.is_array))
 
-    def control(self, t0, t1, y):
-        """The increment of the term's control, for an ODE the (signed) time step, in the
-        precision of the state."""
+    def control(self, t0, t1, dtype):
+        """The increment of the term's control, for an ODE the (signed) time step."""
         terms, _ = eqx.combine(self.arrays, self.static)
-        dtype = jnp.result_type(*jax.tree.leaves(y))
         return jax.tree.map(lambda c: jnp.asarray(c, dtype), terms.contr(t0, t1))
+
+    def forward(self, dtype):
+        """The control of one second, for an ODE one: minus one where diffrax turns the time."""
+        return self.control(np.zeros(()), np.ones(()), dtype)
 
     def field(self, t, y):
         """The vector field."""
@@ -38,27 +43,37 @@ class Problem(eqx.Module):
         terms, args = eqx.combine(self.arrays, self.static)
         return terms.vf_prod(t, y, args, control)
 
-    def prepared(self, t, y, control) -> "Prepared":
-        """The increment, for states like ``y``, with all that rests on the arguments done."""
+    def prepared(self, t, y, dtype) -> "Prepared":
+        """Rates of states like ``y``, with all that rests on the arguments worked out."""
         arrays, tree = jax.tree.flatten(self.arrays)
-        state, state_tree = jax.tree.flatten((t, y, control))
+        leaves, state_tree = jax.tree.flatten(y)
 
-        def increment(*leaves):
-            problem = Problem(jax.tree.unflatten(tree, leaves[: len(arrays)]), self.static)
-            return problem.increment(*jax.tree.unflatten(state_tree, leaves[len(arrays) :]))
+        def rates(*given):
+            known, t, y = given[: len(arrays)], given[len(arrays)], given[len(arrays) + 1 :]
+            problem = Problem(jax.tree.unflatten(tree, known), self.static)
+            found = problem.increment(t, jax.tree.unflatten(state_tree, y), problem.forward(dtype))
+            return jax.tree.leaves(found)
 
-        closed, shape = jax.make_jaxpr(increment, return_shape=True)(*arrays, *state)
+        closed = jax.make_jaxpr(rates)(*arrays, t, *leaves)
         held, run, _ = specialise(closed, arrays)
-        return Prepared(held, (run, jax.tree.structure(shape)))
+        return Prepared(held, run, uses(closed.jaxpr, len(arrays)))
 
 
-class Prepared(eqx.Module):
-    """A problem's increment with the arrays that it rests on; see ``Problem.prepared``."""
+def uses(jaxpr, place: int) -> bool:
+    """Whether the results of a program depend on its operand at ``place``."""
+    _, used = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
+    return used[place]
 
-    held: Any
-    static: Any = eqx.field(static=True)
 
-    def increment(self, t, y, control):
-        """Vector field times control."""
-        run, tree = self.static
-        return jax.tree.unflatten(tree, run(self.held, *jax.tree.leaves((t, y, control))))
+class Prepared(NamedTuple):
+    """``held``: arrays that the rates rest on; ``run(held, t, *y)``: the rates; ``asks_time``:
+    whether these depend on the time. See ``Problem.prepared``."""
+
+    held: tuple[Any, ...]
+    run: Callable[..., list[Any]]
+    asks_time: bool
+
+    def rates(self, held, t, y) -> list[Any]:
+        """The rates, on lists of arrays; ``held`` is handed in again so that a compiled unit may
+        take it as its operand."""
+        return self.run(held, t, *y)

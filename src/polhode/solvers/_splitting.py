@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polhode._kernel import kernel
-from polhode.hamiltonian import cross, dot
-from polhode.solvers._blocks import check_layout, map_blocks
+from polhode.hamiltonian import cross, dot, from_quaternion
 from polhode.solvers._dense import CollocationInterpolation, collocate
+from polhode.solvers._equal_steps import EqualSteps
 from polhode.solvers._moser_veselov import ORDERS, paced, prepare, tangents
-from polhode.solvers._problem import Problem
+from polhode.solvers._problem import Problem, uses
 from polhode.solvers._schemes import KICK_SCHEMES, SCHEMES, Scheme
+from polhode.xla import kernel
 
 Vector = tuple[Array, Array, Array]
 Quaternion = tuple[Array, Array, Array, Array]
@@ -49,7 +49,6 @@ class Splitting(diffrax.AbstractSolver):
     - No error estimate. Dense output: collocation polynomial.
     - ``middle``: the axis (0, 1, 2) whose moment is the middle one; for an axisymmetric body
       either transverse axis. Another choice costs accuracy only.
-    - ``block``, ``substeps``: as in ``Extrapolation``.
 
     ??? cite "Reference"
         R. I. McLachlan, Phys. Rev. Lett. 71 (1993) 3043; E. Hairer, C. Lubich, G. Wanner,
@@ -59,8 +58,6 @@ class Splitting(diffrax.AbstractSolver):
 
     formal_order: int = eqx.field(static=True, default=4)
     middle: int = eqx.field(static=True, default=1)
-    block: int | None = eqx.field(static=True, default=None)
-    substeps: int = eqx.field(static=True, default=1)
     moser_veselov: int | None = eqx.field(static=True, default=None)
 
     term_structure: ClassVar = diffrax.AbstractTerm
@@ -78,11 +75,49 @@ class Splitting(diffrax.AbstractSolver):
                 f"moser_veselov={self.moser_veselov}: the order of the free motion's step must be"
                 f" one of {ORDERS}, or None for rotations about the axes."
             )
-        check_layout(self.block, self.substeps)
 
     @property
     def scheme(self) -> Scheme:
         return (SCHEMES if self.moser_veselov is None else KICK_SCHEMES)[self.formal_order]
+
+    def check(self, method, scene, record) -> None:
+        """Raises ValueError, saying what to do, unless it can move the scene as asked."""
+        name = "ph.LiePoisson(Splitting(...))"
+
+        def require(good: bool, message: str) -> None:
+            if not good:
+                raise ValueError(f"{name} {message}")
+
+        require(
+            not method.chart.canonical, "is the only form: its flows are not those of EulerAngles."
+        )
+        require(
+            method.dt0 is not None
+            and (
+                method.controller is None or isinstance(method.controller, diffrax.ConstantStepSize)
+            ),
+            "has no error estimate: give the longest step, dt0=..., and no controller.",
+        )
+        require(not record.work, "does not integrate the work: use Extrapolation for work=True.")
+        require(
+            scene.carrier.is_principal,
+            "needs principal body axes: state the body in them (Inertia.principal_axes), wheels"
+            " that are not held along them.",
+        )
+        require(
+            scene.torque is None or not _depends_on_rates(scene.torque),
+            "moves bodies under torques of attitude and time only; for damping and other torques of"
+            " the rates use Extrapolation, or leave the method to the library.",
+        )
+        require(
+            scene.rotors is None or self.moser_veselov is None,
+            "with moser_veselov moves bodies without rotors: leave it out.",
+        )
+
+    def stepping(self, asked):
+        """How ``ph.LiePoisson`` steps with it: equal steps from each time to the next."""
+        steps = EqualSteps(asked.ts, jnp.abs(jnp.asarray(asked.dt0, asked.ts.dtype)))
+        return asked.given(self, steps)
 
     def order(self, terms) -> int:
         return min(self.formal_order, self.moser_veselov or self.formal_order)
@@ -101,21 +136,31 @@ class Splitting(diffrax.AbstractSolver):
             _rotate(y0[1], y0[0]),
         )
 
-        def advance(state, rest):
-            def run(*operands):
-                return _steps(self, *operands)
-
-            # a call of each piece costs as much as the few operations on hardly any body
-            whole = self.moser_veselov is None or state[0][0].size < 8
-            return (kernel(run) if whole else run)(*rest, state)
+        def advance(*operands):
+            return _advanced(self, *operands)
 
         problem = Problem.of(terms, args)
-        rest = (problem, (t0, t1 - t0), problem.control(t0, t1, y0))
-        state, nodes = map_blocks(advance, self.block, (momentum_space, tuple(y0[1])), rest)
+        control = problem.control(t0, t1, y0[0][0].dtype)
+        # a call of each piece costs as much as the few operations on hardly any body
+        whole = self.moser_veselov is None or y0[0][0].size < 8
+        state = (kernel(advance) if whole else advance)(
+            problem, (t0, t1 - t0), control, (momentum_space, tuple(y0[1]))
+        )
         y1 = (_rotate_back(state[1], state[0]), state[1])
-        nodes = (_rotate_back(nodes[1], nodes[0]), nodes[1])
+        nodes = jax.tree.map(lambda x: x[None], y0)
         dense = collocate(terms, t0, t1, nodes, y1, args, self.order(terms))
         return y1, None, dense, state[0], diffrax.RESULTS.successful
+
+
+def _depends_on_rates(torque) -> bool:
+    one = jnp.ones((1,))
+
+    def push(omega, wxyz):
+        return torque.body_components(jnp.zeros(()), from_quaternion(wxyz), omega)
+
+    with jax.numpy_dtype_promotion("standard"):
+        jaxpr = jax.make_jaxpr(push)((one,) * 3, (one,) * 4).jaxpr
+    return any(uses(jaxpr, k) for k in range(3))
 
 
 def _rotate(wxyz, vector):
@@ -188,22 +233,15 @@ def _inverse_moments(problem: Problem, t, like: Array) -> tuple[list[Array], Arr
     return [jnp.where(principal, x, jnp.nan) for x in inverse], wheels
 
 
-def _steps(solver: Splitting, problem: Problem, times, control, state):
-    """Space momentum and attitude after equal steps, and those they started from."""
-    t0, width = times
-    count, like = solver.substeps, state[0][0]
-    inverse, wheels = _inverse_moments(problem, t0, like)
+def _advanced(solver: Splitting, problem: Problem, times, control, state):
+    """Space momentum and attitude after a step."""
+    inverse, wheels = _inverse_moments(problem, times[0], state[0][0])
     if solver.moser_veselov is None:
         move = _rotations(solver.middle, problem, inverse[solver.middle])
     else:
         inverse = [jnp.where(wheels, jnp.nan, x) for x in inverse]
         move = _whole(solver.moser_veselov, inverse)
-
-    def one(state, i):
-        inner = (t0 + i * (width / count), width / count)
-        return _step(solver.scheme, move, problem, inner, control / count, state), state
-
-    return jax.lax.scan(one, state, jnp.arange(count, dtype=jnp.result_type(width)))
+    return _step(solver.scheme, move, problem, times, control, state)
 
 
 def _rotations(middle: int, problem: Problem, inverse: Array):

@@ -1,12 +1,12 @@
 """Position on a Kepler orbit, for the gravity gradient."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_float_array, as_number, describe, is_concrete, require
+from polhode._part import AbstractPart, shaped
 
 
 def eccentric_anomaly(mean: Float[Array, "*b"], eccentricity: Float[Array, "*b"]) -> Array:
@@ -41,7 +41,7 @@ def _lag(x: Array) -> Array:
     return jnp.where(square < 0.25, x * square / 6 * total, x - jnp.sin(x))
 
 
-class KeplerOrbit(eqx.Module):
+class KeplerOrbit(AbstractPart):
     """Position of a body on an ellipse about an attracting centre: ``orbit(t)`` (..., 3) [m].
 
     **Arguments** (each (...), a batch broadcasts): ``mu`` [m^3/s^2]; ``semi_major_axis`` [m];
@@ -54,22 +54,14 @@ class KeplerOrbit(eqx.Module):
     outside [0, 1).
     """
 
-    mu: Float[Array, "*#b"]
-    semi_major_axis: Float[Array, "*#b"]
-    eccentricity: Float[Array, "*#b"]
-    inclination: Float[Array, "*#b"]
-    node: Float[Array, "*#b"]
-    periapsis: Float[Array, "*#b"]
-    mean_anomaly: Float[Array, "*#b"]
-    epoch: Float[Array, "*#b"]
-
-    core_ranks = dict.fromkeys(
-        (
-            "mu", "semi_major_axis", "eccentricity", "inclination", "node", "periapsis",
-            "mean_anomaly", "epoch",
-        ),
-        0,
-    )  # fmt: skip
+    mu: Float[Array, "*#b"] = shaped()
+    semi_major_axis: Float[Array, "*#b"] = shaped()
+    eccentricity: Float[Array, "*#b"] = shaped()
+    inclination: Float[Array, "*#b"] = shaped()
+    node: Float[Array, "*#b"] = shaped()
+    periapsis: Float[Array, "*#b"] = shaped()
+    mean_anomaly: Float[Array, "*#b"] = shaped()
+    epoch: Float[Array, "*#b"] = shaped()
 
     def __init__(
         self,
@@ -119,7 +111,7 @@ class KeplerOrbit(eqx.Module):
         return jnp.stack(jnp.broadcast_arrays(*place), axis=-1)
 
 
-class StateOrbit(eqx.Module):
+class StateOrbit(AbstractPart):
     """Position on the ellipse through a given place and velocity: ``orbit(t)`` (..., 3) [m].
 
     **Arguments** (a batch broadcasts): ``mu`` (...) [m^3/s^2]; ``position`` (..., 3) [m] from the
@@ -135,12 +127,10 @@ class StateOrbit(eqx.Module):
     centre.
     """
 
-    mu: Float[Array, "*#b"]
-    position: Float[Array, "*#b 3"]
-    velocity: Float[Array, "*#b 3"]
-    epoch: Float[Array, "*#b"]
-
-    core_ranks = {"mu": 0, "position": 1, "velocity": 1, "epoch": 0}  # noqa: RUF012
+    mu: Float[Array, "*#b"] = shaped()
+    position: Float[Array, "*#b 3"] = shaped(3)
+    velocity: Float[Array, "*#b 3"] = shaped(3)
+    epoch: Float[Array, "*#b"] = shaped()
 
     def __init__(self, mu, position, velocity, epoch=0.0):
         given = {

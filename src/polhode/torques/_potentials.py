@@ -2,30 +2,41 @@
 
 import abc
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, as_number, is_concrete, require
+from polhode._checks import as_float_array, as_number, is_concrete, numbers, require, together
+from polhode._functions import checked, mapped
+from polhode._part import AbstractPart, shaped
 from polhode.hamiltonian import Attitude, components, dot
 from polhode.inertia import Inertia
+from polhode.torques._torques import value_at, vector_of_time
 
 
-class AbstractPotential(eqx.Module):
+class AbstractPotential(AbstractPart):
     """Base of all potentials; they add with ``+``.
 
     ``energy(attitude, t, inertia)`` returns joules from component arrays: use
     ``attitude.row(i)``, ``to_body``, ``to_space`` (only the rows looked at are computed and
-    differentiated). ``core_ranks`` names the array fields with their ranks without batch axes.
+    differentiated).
     """
-
-    core_ranks: eqx.AbstractClassVar[dict[str, int]]
 
     @abc.abstractmethod
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array:
         """Potential energy [J]."""
+
+    @property
+    def is_as_declared(self) -> Any:
+        """Whether (...) the numbers are such as static fields say; None where these say nothing."""
+        return None
+
+    def declared_anew(self) -> "AbstractPotential":
+        """The same numbers with static fields that agree with them."""
+        return self
 
     def __add__(self, other: "AbstractPotential") -> "PotentialSum":
         if not isinstance(other, AbstractPotential):
@@ -42,7 +53,13 @@ class PotentialSum(AbstractPotential):
 
     terms: tuple[AbstractPotential, ...]
 
-    core_ranks = {}  # noqa: RUF012
+    @property
+    def is_as_declared(self):
+        found = [x for term in self.terms if (x := term.is_as_declared) is not None]
+        return together(found)
+
+    def declared_anew(self):
+        return PotentialSum(tuple(term.declared_anew() for term in self.terms))
 
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array:
         first, *rest = (term.energy(attitude, t, inertia) for term in self.terms)
@@ -62,13 +79,11 @@ class UniformGravity(AbstractPotential):
     Raises ValueError for a negative mass, NaN, or wrong shapes.
     """
 
-    mass: Float[Array, "*#b"]
-    centre_body: Float[Array, "*#b 3"]
-    gravity_space: Float[Array, "*#b 3"]
+    mass: Float[Array, "*#b"] = shaped()
+    centre_body: Float[Array, "*#b 3"] = shaped(3)
+    gravity_space: Float[Array, "*#b 3"] = shaped(3)
     on_axis: bool = eqx.field(static=True, default=False)
     vertical: bool = eqx.field(static=True, default=False)
-
-    core_ranks = {"mass": 0, "centre_body": 1, "gravity_space": 1}  # noqa: RUF012
 
     def __init__(
         self,
@@ -108,6 +123,16 @@ class UniformGravity(AbstractPotential):
         zero = jnp.zeros_like(distance)
         return cls(mass, jnp.stack([zero, zero, distance], axis=-1), gravity_space, True)
 
+    @property
+    def is_as_declared(self):
+        return _on_z(
+            self.centre_body if self.on_axis else None,
+            self.gravity_space if self.vertical else None,
+        )
+
+    def declared_anew(self):
+        return UniformGravity(self.mass, self.centre_body, self.gravity_space)
+
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array:
         centre, gravity = components(self.centre_body), components(self.gravity_space)
 
@@ -119,16 +144,12 @@ class UniformGravity(AbstractPotential):
         return -self.mass * work
 
 
-def value_at(vector, t):
-    """Components of a vector that is constant or a function ``fn(t) -> (3,)`` of one time.
-
-    ``t`` may be an array of times; the function is mapped over it.
-    """
-    if not callable(vector):
-        return components(vector)
-    if hasattr(vector, "core_ranks"):  # carries the batch axes itself, such as KeplerOrbit
-        return components(vector(t))
-    return components(jnp.vectorize(vector, signature="()->(3)")(t))
+def _on_z(*vectors: Array | None) -> Any:
+    """Whether (...) all of the vectors lie on the third axis; None for no vectors."""
+    given = [v for v in vectors if v is not None]
+    xp = numbers(*given)
+    found = [xp.all(xp.asarray(v)[..., :2] == 0, axis=-1) for v in given]
+    return together(found)
 
 
 class GravityGradient(AbstractPotential):
@@ -142,11 +163,9 @@ class GravityGradient(AbstractPotential):
     Raises ValueError for mu < 0, a position at the centre, or one that ``vertical`` denies.
     """
 
-    mu: Float[Array, "*#b"]
-    position_space: Float[Array, "*#b 3"] | Callable
+    mu: Float[Array, "*#b"] = shaped()
+    position_space: Float[Array, "*#b 3"] | Callable = shaped(3)
     vertical: bool = eqx.field(static=True, default=False)
-
-    core_ranks = {"mu": 0, "position_space": 1}  # noqa: RUF012
 
     def __init__(self, mu, position_space, vertical=False):
         self.mu = as_number("mu", mu)
@@ -157,7 +176,7 @@ class GravityGradient(AbstractPotential):
             )
         if callable(position_space):
             require(not vertical, "vertical is for a constant position: leave it out.")
-            self.position_space = position_space
+            self.position_space = vector_of_time("GravityGradient", position_space)
         else:
             self.position_space = as_float_array("position_space", position_space, (3,))
             if is_concrete(self.position_space):
@@ -172,8 +191,15 @@ class GravityGradient(AbstractPotential):
                     " leave it out.",
                 )
 
+    @property
+    def is_as_declared(self):
+        return _on_z(self.position_space if self.vertical else None)
+
+    def declared_anew(self):
+        return GravityGradient(self.mu, self.position_space)
+
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array:
-        place = value_at(self.position_space, t)
+        place = value_at("GravityGradient", self.position_space, t)
         if self.vertical:
             distance = jnp.abs(place[2])
             square, along = distance * distance, attitude.row(2)  # of either sign: a square
@@ -193,20 +219,24 @@ class GravityGradient(AbstractPotential):
         return -self.mu / (2 * square * distance) * (trace - 3 * project)
 
 
+_ARGUMENTS = ("R", "t")
+_SHAPES = ((3, 3), ())
+
+
 class Potential(AbstractPotential):
     """Any potential of the attitude: ``fn(R, t)`` in joules, R (3, 3) body -> space, t in s.
 
-    ``fn`` sees one body; batches are mapped over it. Its torque comes from ``jax.grad`` of H.
+    ``fn`` sees one body; batches are mapped over it. Its torque comes from ``jax.grad`` of H. A
+    plain function is static data of the scene, not a leaf of it; an ``eqx.Module`` keeps its arrays
+    as leaves, shared by all bodies.
+
+    Raises TypeError or ValueError for a function that takes or returns something else.
     """
 
     fn: Callable
 
-    core_ranks = {}  # noqa: RUF012
-
     def __init__(self, fn: Callable):
-        if not callable(fn):
-            raise TypeError(f"Potential takes a function fn(R, t), got {type(fn).__name__}.")
-        self.fn = fn
+        self.fn = checked("Potential", fn, _ARGUMENTS, _SHAPES, ())
 
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array:
-        return jnp.vectorize(self.fn, signature="(3,3),()->()")(attitude.matrix, t)
+        return mapped("Potential", self.fn, _ARGUMENTS, _SHAPES, (), attitude.matrix, t)

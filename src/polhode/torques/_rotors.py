@@ -11,6 +11,7 @@ h(t) subtracted from L (Hughes, Spacecraft Attitude Dynamics, 1986, section 3.4,
 
 import abc
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -18,20 +19,31 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, as_number, is_concrete, require
+from polhode._checks import as_float_array, as_number, is_concrete, numbers, require, together
+from polhode._functions import checked, mapped
+from polhode._part import AbstractPart, shaped
 from polhode.hamiltonian._attitude import Vector
 from polhode.inertia import Inertia, Symmetry
 
 
-class AbstractRotor(eqx.Module):
+class AbstractRotor(AbstractPart):
     """Base of rotors; they add with ``+``."""
-
-    core_ranks: eqx.AbstractClassVar[dict[str, int]]
 
     @property
     @abc.abstractmethod
     def wheels(self) -> tuple["Rotor", ...]:
         """One by one."""
+
+    @property
+    def is_as_declared(self) -> Any:
+        """Whether (...) each wheel is on the body axis that it was made on; None: on any."""
+        found = [_is_along(w.axis_body, w.along) for w in self.wheels if w.along is not None]
+        return together(found)
+
+    def declared_anew(self) -> "AbstractRotor":
+        """The same numbers with the body axes that they lie on."""
+        made = [w.declared_anew() for w in self.wheels]
+        return RotorSum(tuple(made))
 
     def __add__(self, other: "AbstractRotor") -> "RotorSum":
         if not isinstance(other, AbstractRotor):
@@ -79,8 +91,6 @@ class RotorSum(AbstractRotor):
 
     terms: tuple["Rotor", ...]
 
-    core_ranks = {}  # noqa: RUF012
-
     @property
     def wheels(self):
         return self.terms
@@ -104,15 +114,13 @@ class Rotor(AbstractRotor):
     Raises ValueError for a zero axis, J <= 0, or more or less than one of momentum and speed.
     """
 
-    axis_body: Float[Array, "*#b 3"]
-    inertia: Float[Array, "*#b"] | None
-    momentum: Float[Array, "*#b"] | None
-    speed: Float[Array, "*#b"] | None
-    torque: Float[Array, "*#b"] | None
+    axis_body: Float[Array, "*#b 3"] = shaped(3)
+    inertia: Float[Array, "*#b"] | None = shaped()
+    momentum: Float[Array, "*#b"] | None = shaped()
+    speed: Float[Array, "*#b"] | None = shaped()
+    torque: Float[Array, "*#b"] | None = shaped()
     impulse: Callable | None
     along: int | None = eqx.field(static=True)
-
-    core_ranks = {"axis_body": 1, "inertia": 0, "momentum": 0, "speed": 0, "torque": 0}  # noqa: RUF012
 
     def __init__(
         self, axis_body, inertia=None, momentum=None, speed=None, torque=None, impulse=None
@@ -125,7 +133,7 @@ class Rotor(AbstractRotor):
                 f"axis_body must not be zero, got {axis_body}: give the wheel's axis in body axes.",
             )
             self.along = _body_axis(np.asarray(axis))
-        self.axis_body = axis / jnp.sqrt(jnp.sum(axis**2, axis=-1, keepdims=True))
+        self.axis_body = _unit(axis)
         if (momentum is None) == (speed is None):
             raise ValueError(
                 "Rotor takes exactly one of momentum (J Omega relative to the body, kg m^2/s) and"
@@ -142,8 +150,8 @@ class Rotor(AbstractRotor):
                 " antiderivative: impulse=lambda t: ... [N m s], so that the wheel's momentum is"
                 " exact."
             )
-        if impulse is not None and not callable(impulse):
-            raise TypeError(f"impulse must be a function of time, got {type(impulse).__name__}.")
+        if impulse is not None:
+            impulse = checked("Rotor impulse", impulse, ("t",), ((),), ())
         given = {"inertia": inertia, "momentum": momentum, "speed": speed, "torque": torque}
         for name, value in given.items():
             setattr(self, name, None if value is None else as_number(name, value))
@@ -168,6 +176,11 @@ class Rotor(AbstractRotor):
     def wheels(self):
         return (self,)
 
+    def declared_anew(self):
+        return Rotor(
+            self.axis_body, self.inertia, self.momentum, self.speed, self.torque, self.impulse
+        )
+
     def column(self, omega_body: Array, start: Array) -> tuple[Array, Array, Array, Array]:
         """Axis, its momentum at the start (relative if held, else absolute), J, motor torque."""
         parts = (self.axis_body, self.inertia, self.momentum, self.speed, self.torque)
@@ -176,7 +189,7 @@ class Rotor(AbstractRotor):
             shapes += [omega_body.shape[:-1], start.shape]
         lead = np.broadcast_shapes(*shapes)
         zero = jnp.zeros(lead, self.axis_body.dtype)
-        axis = jnp.broadcast_to(self.axis_body, (*lead, 3))
+        axis = jnp.broadcast_to(_unit(self.axis_body), (*lead, 3))
         inertia, momentum, speed, torque = (zero if x is None else x + zero for x in parts[1:])
         if self.momentum is None:
             momentum = inertia * speed
@@ -186,10 +199,23 @@ class Rotor(AbstractRotor):
         return axis, momentum + inertia * turning, inertia, torque
 
 
+def _unit(axis: Array) -> Array:
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(axis), axis=-1, keepdims=True))
+    axis = axis / largest  # of any size: nothing overflows
+    return axis / jnp.sqrt(jnp.sum(axis**2, axis=-1, keepdims=True))
+
+
 def _body_axis(axis: np.ndarray) -> int | None:
     """Which body axis all of the axes lie on, or None."""
     used = [i for i in range(3) if np.any(axis[..., i] != 0)]
     return used[0] if len(used) == 1 else None
+
+
+def _is_along(axes: Array, axis: int) -> Any:
+    """Whether (...) axes lie on this body axis."""
+    axes = numbers(axes).asarray(axes)
+    first, second = (axes[..., k] for k in range(3) if k != axis)
+    return (first == 0) & (second == 0)
 
 
 class Wheels(AbstractRotor):
@@ -199,16 +225,14 @@ class Wheels(AbstractRotor):
     where ``held``, else absolute; ``inertia`` and ``torque`` (..., m), 0 where held.
     """
 
-    axes: Float[Array, "*#b m 3"]
-    momentum: Float[Array, "*#b m"]
-    inertia: Float[Array, "*#b m"]
-    torque: Float[Array, "*#b m"]
-    start: Float[Array, "*#b"]
+    axes: Float[Array, "*#b m 3"] = shaped(None, 3)
+    momentum: Float[Array, "*#b m"] = shaped(None)
+    inertia: Float[Array, "*#b m"] = shaped(None)
+    torque: Float[Array, "*#b m"] = shaped(None)
+    start: Float[Array, "*#b"] = shaped()
     impulses: tuple[Callable | None, ...]
     held: tuple[bool, ...] = eqx.field(static=True)
     along: tuple[int | None, ...] = eqx.field(static=True)
-
-    core_ranks = {"axes": 2, "momentum": 1, "inertia": 1, "torque": 1, "start": 0}  # noqa: RUF012
 
     @property
     def wheels(self):
@@ -219,6 +243,21 @@ class Wheels(AbstractRotor):
 
     def check_within(self, inertia):
         """Nothing: the rotors were checked before they were settled."""
+
+    @property
+    def is_as_declared(self):
+        pairs = [(self.axes[..., i, :], axis) for i, axis in enumerate(self.along)]
+        found = [_is_along(x, axis) for x, axis in pairs if axis is not None]
+        return together(found)
+
+    def declared_anew(self):
+        return self
+
+    @property
+    def is_possible(self) -> Array:
+        """Whether (...) each wheel that is not held has a positive moment."""
+        loose = [i for i, held in enumerate(self.held) if not held]
+        return jnp.all(self.inertia[..., np.array(loose, int)] > 0, axis=-1)
 
     @property
     def is_constant(self) -> bool:
@@ -236,7 +275,10 @@ class Wheels(AbstractRotor):
         impulse = self.impulses[i]
         if impulse is None:
             return momentum + self.torque[..., i] * (t - self.start)
-        given = jnp.vectorize(impulse, signature="()->()")
+
+        def given(t):
+            return mapped("Rotor impulse", impulse, ("t",), ((),), (), t)
+
         return momentum + (given(t) - given(self.start))
 
     def body_momentum(self, t: Array | float) -> Vector:
@@ -270,7 +312,7 @@ class Wheels(AbstractRotor):
             axial = all(self.along[i] == 2 for i in loose)
             symmetric = axial and inertia.symmetry is not Symmetry.NONE
             kind = Symmetry.AXISYMMETRIC if symmetric else Symmetry.NONE
-            return Inertia(_plus(inertia.diagonal, -less), None, kind)
+            return Inertia.of_symmetry(_plus(inertia.moments, -less), kind, physical=False)
         tensor = inertia.tensor
         for i in loose:
             axis = self.axes[..., i, :]

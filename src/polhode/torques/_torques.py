@@ -3,25 +3,22 @@
 import abc
 from collections.abc import Callable, Sequence
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_float_array, is_concrete, require
+from polhode._functions import checked, mapped
+from polhode._part import AbstractPart, shaped
 from polhode.hamiltonian import Attitude, components
 
 
-class AbstractTorque(eqx.Module):
+class AbstractTorque(AbstractPart):
     """Base of all torques; they add with ``+``.
 
     ``body_components(t, attitude, omega)`` returns the torque [N m] as three body components,
-    ``omega`` three components of the body rates [rad/s]. ``core_ranks`` names the array fields
-    with their ranks without batch axes.
+    ``omega`` three components of the body rates [rad/s].
     """
-
-    core_ranks: eqx.AbstractClassVar[dict[str, int]]
 
     @abc.abstractmethod
     def body_components(
@@ -44,51 +41,59 @@ class TorqueSum(AbstractTorque):
 
     terms: tuple[AbstractTorque, ...]
 
-    core_ranks = {}  # noqa: RUF012
-
     def body_components(self, t, attitude, omega):
         parts = zip(*(term.body_components(t, attitude, omega) for term in self.terms))
         return tuple(sum(rest, start=first) for first, *rest in parts)
 
 
-def _constant_or_function(name: str, n):
-    return n if callable(n) else as_float_array(name, n, (3,))
+def vector_of_time(name: str, n):
+    """A constant vector (..., 3), or a function fn(t) -> (3,) after a look at what it returns."""
+    if not callable(n):
+        return as_float_array(name, n, (3,))
+    return n if isinstance(n, AbstractPart) else checked(name, n, ("t",), ((),), (3,))
 
 
-def _value(n, t):
-    return components(jnp.asarray(n(t)) if callable(n) else n)
+def value_at(name: str, vector, t) -> tuple[Array, Array, Array]:
+    """Components of such a vector; ``t`` may be an array of times: a function is mapped over it."""
+    if not callable(vector):
+        return components(vector)
+    if isinstance(vector, AbstractPart):  # carries the batch axes itself, such as KeplerOrbit
+        return components(vector(t))
+    return components(mapped(name, vector, ("t",), ((),), (3,), t))
 
 
 class BodyTorque(AbstractTorque):
     """Torque given in body axes [N m]: constant (..., 3) or a function of time [s] -> (3,).
 
     The function may jump. A pulse far shorter than a step can be missed: put its times among those
-    that are simulated, which are stepped to.
+    that are simulated, which are stepped to. A plain function is static data of the scene, not a
+    leaf of it; an ``eqx.Module`` keeps its arrays as leaves.
+
+    Raises TypeError or ValueError for a function that takes or returns something else.
     """
 
-    n: Float[Array, "*#b 3"] | Callable
-
-    core_ranks = {"n": 1}  # noqa: RUF012
+    n: Float[Array, "*#b 3"] | Callable = shaped(3)
 
     def __init__(self, n):
-        self.n = _constant_or_function("BodyTorque n", n)
+        self.n = vector_of_time("BodyTorque", n)
 
     def body_components(self, t, attitude, omega):
-        return _value(self.n, t)
+        return value_at("BodyTorque", self.n, t)
 
 
 class SpaceTorque(AbstractTorque):
-    """Torque given in space axes [N m]: constant (..., 3) or a function of time [s] -> (3,)."""
+    """Torque given in space axes [N m]: constant (..., 3) or a function of time [s] -> (3,).
 
-    n: Float[Array, "*#b 3"] | Callable
+    Functions are kept and looked at as those of ``BodyTorque``.
+    """
 
-    core_ranks = {"n": 1}  # noqa: RUF012
+    n: Float[Array, "*#b 3"] | Callable = shaped(3)
 
     def __init__(self, n):
-        self.n = _constant_or_function("SpaceTorque n", n)
+        self.n = vector_of_time("SpaceTorque", n)
 
     def body_components(self, t, attitude, omega):
-        return attitude.to_body(_value(self.n, t))
+        return attitude.to_body(value_at("SpaceTorque", self.n, t))
 
 
 def _coefficients(name: str, c) -> Array:
@@ -111,9 +116,7 @@ class LinearDamping(AbstractTorque):
     ``c`` (..., 3), or (...) for the same about every axis [N m s]; it must not be negative.
     """
 
-    c: Float[Array, "*#b 3"]
-
-    core_ranks = {"c": 1}  # noqa: RUF012
+    c: Float[Array, "*#b 3"] = shaped(3)
 
     def __init__(self, c):
         self.c = _coefficients("LinearDamping", c)
@@ -128,9 +131,7 @@ class QuadraticDamping(AbstractTorque):
     ``c`` (..., 3), or (...) for the same about every axis [N m s^2]; it must not be negative.
     """
 
-    c: Float[Array, "*#b 3"]
-
-    core_ranks = {"c": 1}  # noqa: RUF012
+    c: Float[Array, "*#b 3"] = shaped(3)
 
     def __init__(self, c):
         self.c = _coefficients("QuadraticDamping", c)
@@ -142,30 +143,27 @@ class QuadraticDamping(AbstractTorque):
         return tuple(-c * size * rate for c, rate in zip(components(self.c), omega))
 
 
+_STATE = ("t", "wxyz", "omega_body")
+_STATE_SHAPES = ((), (4,), (3,))
+
+
 class FeedbackTorque(AbstractTorque):
     """Torque as a function of time and state: ``fn(t, wxyz, omega_body)`` in body axes [N m].
 
     ``fn`` sees one body: t [s], unit quaternion (4,) body -> space (of either sign), body rates
     (3,) [rad/s], and returns (3,); batches are mapped over it. Arrays that ``fn`` carries (an
-    ``eqx.Module``) are shared by all bodies.
+    ``eqx.Module``) are leaves of the scene, shared by all bodies; a plain function is static.
+
+    Raises TypeError or ValueError for a function that takes or returns something else.
     """
 
     fn: Callable
 
-    core_ranks = {}  # noqa: RUF012
-
     def __init__(self, fn: Callable):
-        if not callable(fn):
-            raise TypeError(
-                "FeedbackTorque takes a function fn(t, wxyz, omega_body), got"
-                f" {type(fn).__name__}; for a constant torque use ph.BodyTorque."
-            )
-        self.fn = fn
+        self.fn = checked("FeedbackTorque", fn, _STATE, _STATE_SHAPES, (3,))
 
     def body_components(self, t, attitude, omega):
         wxyz = jnp.stack(jnp.broadcast_arrays(*attitude.wxyz), axis=-1)
         rates = jnp.stack(jnp.broadcast_arrays(*omega), axis=-1)
-        one = self.fn
-        for _ in range(rates.ndim - 1):
-            one = jax.vmap(one, in_axes=(None, 0, 0))
-        return components(jnp.asarray(one(t, wxyz, rates)))
+        given = t, wxyz, rates
+        return components(mapped("FeedbackTorque", self.fn, _STATE, _STATE_SHAPES, (3,), *given))

@@ -1,0 +1,278 @@
+"""Whether ``rtol`` is kept: random scenes over six decades, against long-double truth.
+
+    python -m benchmarks.error_control [--bodies 150] [--quick] [--output FILE]
+
+Two tables. The first holds the estimate of a single step's error (see ``solvers/_march.py``) beside
+the step's true error, for orders and widths of step. The second holds the error of the attitude at
+the last time over the ``rtol`` asked for, on bodies whose moments, rates, fields and torques are
+drawn over six decades, ratios of torque to kinetic energy from 1e-6 to 1e3, 1 to 1,000 radians.
+
+Truth: Gragg's extrapolation of order 20 in 80-bit arithmetic, written out in NumPy from Newton's
+law, with two widths of step that must agree. ``spread``: how much more than linearly with the angle
+turned a small change of the momentum grows; beyond 100 a body counts as chaotic and is left out.
+"""
+
+import argparse
+from fractions import Fraction
+from pathlib import Path
+
+from benchmarks import _report
+
+if __name__ == "__main__":
+    _report.one_thread()
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import polhode as ph
+from polhode.methods import LiePoissonChart
+from polhode.solvers._columns import extrapolated, table
+from polhode.solvers._problem import Problem
+
+LONG = np.longdouble
+SEQUENCE = (2, 4, 6, 8, 10, 12, 14, 16, 24, 36)
+FAMILIES = {
+    "uniform gravity": ("gravity",),
+    "gravity gradient": ("gradient",),
+    "gravity and gradient": ("gravity", "gradient"),
+    "torque fixed in the body": ("body",),
+    "torque fixed in space": ("space",),
+    "gravity, damped": ("gravity", "damping"),
+}
+RTOLS = (1e-3, 1e-6, 1e-9, 1e-12)
+
+
+def weights() -> list:
+    """Of the columns, in long double."""
+    found = []
+    for j, n in enumerate(SEQUENCE):
+        weight = Fraction(1)
+        for i, m in enumerate(SEQUENCE):
+            weight *= Fraction(n * n, n * n - m * m) if i != j else 1
+        found.append(LONG(weight.numerator) / LONG(weight.denominator))
+    return found
+
+
+def cross(a, b):
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def rates(p: dict, y):
+    """dL/dt and dq/dt of bodies side by side, from Newton's law."""
+    momentum, (w, x, z, v) = y[:3], y[3:]  # quaternion w + x i + z j + v k
+    omega = [momentum[i] / p["moments"][i] for i in range(3)]
+    rows = [
+        [1 - 2 * (z * z + v * v), 2 * (x * z - w * v), 2 * (x * v + w * z)],
+        [2 * (x * z + w * v), 1 - 2 * (x * x + v * v), 2 * (z * v - w * x)],
+        [2 * (x * v - w * z), 2 * (z * v + w * x), 1 - 2 * (x * x + z * z)],
+    ]
+
+    def in_body(u):
+        return [sum(rows[j][i] * u[j] for j in range(3)) for i in range(3)]
+
+    push = cross(momentum, omega)
+    if "gravity" in p:
+        push = [a + b for a, b in zip(push, cross(p["centre"], in_body(p["gravity"])))]
+    if "gradient" in p:
+        n = in_body(p["gradient"])
+        turn = cross(n, [p["moments"][i] * n[i] for i in range(3)])
+        push = [a + p["strength"] * b for a, b in zip(push, turn)]
+    if "body" in p:
+        push = [a + b for a, b in zip(push, p["body"])]
+    if "space" in p:
+        push = [a + b for a, b in zip(push, in_body(p["space"]))]
+    if "damping" in p:
+        push = [a - p["damping"] * b for a, b in zip(push, omega)]
+    a, b, c = (o / 2 for o in omega)
+    turning = [
+        -x * a - z * b - v * c,
+        w * a + z * c - v * b,
+        w * b + v * a - x * c,
+        w * c + x * b - z * a,
+    ]
+    return np.stack([*push, *turning])
+
+
+def truth(p: dict, width: float, nudge=0.0):
+    """Final states (7, N) in steps of about ``width`` radians."""
+    p = {k: np.asarray(x, LONG) if k != "name" else x for k, x in p.items()}
+    y = np.concatenate([p["moments"] * p["omega"] * (1 + LONG(nudge)), p["wxyz"]])
+    y[3:] /= np.sqrt((y[3:] ** 2).sum(0))
+    steps = np.maximum(2, np.ceil(p["angle"].astype(float) / width)).astype(int)
+    order = np.argsort(-steps)  # the longest first: who has arrived is cut off at the end
+    p = {k: x[..., order] for k, x in p.items() if k != "name"}
+    y, steps = y[:, order], steps[order]
+    h, columns = p["span"] / steps, weights()
+    for k in range(steps[0]):
+        n = int(np.searchsorted(-steps, -k, side="left"))
+        q, now, step = {a: x[..., :n] for a, x in p.items()}, y[:, :n], h[:n]
+        first, ends = rates(q, now), []
+        for m in SEQUENCE:
+            a, b = now, now + step / m * first
+            for _ in range(m - 1):
+                a, b = b, a + 2 * step / m * rates(q, b)
+            ends.append(b)
+        new = ends[-1] + sum(w * (e - ends[-1]) for w, e in zip(columns, ends[:-1]))
+        new[3:] /= np.sqrt((new[3:] ** 2).sum(0))
+        y[:, :n] = new
+    back = np.empty_like(order)
+    back[order] = np.arange(order.size)
+    return y[:, back]
+
+
+def angle(p, q) -> np.ndarray:
+    """Between attitudes (4, N) [rad]."""
+    sign = np.where((p * q).sum(0) < 0, -1, 1)
+    gap = np.sqrt(((p - sign * q) ** 2).sum(0)).astype(float)
+    return 4 * np.arcsin(np.minimum(1, gap / 2))
+
+
+def draw(name: str, count: int, seed: int, longest: float) -> dict:
+    """Bodies of a family; everything over six decades."""
+    rng = np.random.default_rng(seed)
+
+    def decades(low, high, size=count):
+        return 10.0 ** rng.uniform(low, high, size)
+
+    def directions(size=3):
+        v = rng.normal(size=(size, count))
+        return v / np.linalg.norm(v, axis=0)
+
+    masses = decades(-1.5, 0, (3, count))  # on the three axes: moments that a body can have
+    moments = (masses.sum(0) - masses) * decades(-3, 3)
+    rate = decades(-3, 3)
+    omega = directions() * rate
+    energy = 0.5 * (moments * omega**2).sum(0)
+    strength = decades(-6, 3) * energy
+    p = {"name": name, "moments": moments, "omega": omega, "wxyz": directions(4)}
+    square = rate**2
+    for part in FAMILIES[name]:
+        if part == "gravity":
+            length = decades(-2, 0)
+            p["centre"], p["gravity"] = directions() * length, directions() * strength / length
+        if part == "gradient":
+            p["gradient"], p["strength"] = directions(), strength / moments.max(0)
+        if part in ("body", "space"):
+            p[part] = directions() * strength
+        if part == "damping":
+            p["damping"] = moments.min(0) * rate * decades(-4, -1)
+        else:
+            square = square + strength / moments.min(0)
+    p["angle"] = 10.0 ** rng.uniform(0, np.log10(longest), count)
+    return p | {"span": p["angle"] / np.sqrt(square)}
+
+
+def scene_and_state(p: dict) -> tuple[ph.Scene, ph.State, np.ndarray]:
+    potentials, torques = [], []
+    if "gravity" in p:
+        potentials.append(ph.UniformGravity(1.0, p["centre"].T, p["gravity"].T))
+    if "gradient" in p:
+        potentials.append(ph.GravityGradient(p["strength"] / 3, p["gradient"].T))
+    if "body" in p:
+        torques.append(ph.BodyTorque(p["body"].T))
+    if "space" in p:
+        torques.append(ph.SpaceTorque(p["space"].T))
+    if "damping" in p:
+        torques.append(ph.LinearDamping(np.stack([p["damping"]] * 3, -1)))
+    potential = sum(potentials[1:], start=potentials[0]) if potentials else None
+    torque = sum(torques[1:], start=torques[0]) if torques else None
+    scene = ph.Scene(ph.Inertia.from_moments(p["moments"].T), potential, torque)
+    ts = np.stack([np.zeros_like(p["span"]), p["span"]], -1)
+    return scene, ph.State(p["wxyz"].T, p["omega"].T), ts
+
+
+def kept(count: int, seed: int, longest: float) -> list[dict]:
+    """Rows of the second table."""
+    rows = []
+    for k, name in enumerate(FAMILIES):
+        p = draw(name, count, seed + k, longest)
+        best, check, moved = truth(p, 0.6), truth(p, 0.7), truth(p, 0.7, 1e-10)
+        spread = angle(check[3:], moved[3:]) / 1e-10 / np.maximum(1, p["angle"])
+        trusted = angle(best[3:], check[3:]) < 1e-13
+        calm = (spread < 100) & trusted
+        scene, state, ts = scene_and_state(p)
+        for rtol in RTOLS:
+            record = ph.Record(final_only=True, error=True)
+            found = ph.simulate(scene, state, ts, rtol=rtol, record=record, throw=False)
+            error = angle(np.asarray(found.wxyz[:, 0]).T, best[3:]) / rtol
+            status, estimate = np.asarray(found.status), np.asarray(found.error) / rtol / error
+            here = error[calm]
+            rows.append({
+                "family": name, "rtol": rtol,
+                "bodies": int(calm.sum()), "left_out": int((~calm).sum()),
+                "median": float(np.median(here)), "q95": float(np.quantile(here, 0.95)),
+                "worst": float(here.max()), "beyond_10": int((here > 10).sum()),
+                "spread_of_worst": float(spread[calm][np.argmax(here)]),
+                "unsuccessful": int(((status != 0) & (status != 5))[calm].sum()),
+                "estimate_within_10": float(np.mean(np.abs(np.log10(estimate[calm])) < 1)),
+                "false_alarms": int(((status == 5) & (error <= 10) & calm).sum()),
+                "missed": int(((status == 0) & (error > 10) & calm).sum()),
+                "steps": float(np.mean(np.asarray(found.steps)[calm])),
+            })  # fmt: skip
+            print(rows[-1], flush=True)
+    return rows
+
+
+def calibrated(count: int, seed: int) -> list[dict]:
+    """Rows of the first table: true error of one step over ``e^2 / d`` and over ``e``."""
+    rows = []
+    for name in ("uniform gravity", "gravity gradient"):
+        p = draw(name, count, seed, 1.0)
+        scene, state, ts = scene_and_state(p)
+        chart = LiePoissonChart()
+        dynamics = chart.dynamics(scene, state, jnp.asarray(ts[:, 0]))
+        y, _ = chart.start(scene, state, jnp.zeros(()))
+        leaves, zero = jax.tree.leaves(y), jnp.zeros(())
+        problem = Problem.of(diffrax.ODETerm(chart.field), dynamics).prepared(zero, y, jnp.float64)
+
+        def field(t, y, along, problem=problem):
+            return problem.rates(problem.held, t, y), []
+
+        @jax.jit
+        def step(y, width, given, field=field, zero=zero):
+            return extrapolated(field, given, zero, width, y, field(zero, y, False)[0], [])
+
+        first, _ = field(zero, leaves, False)
+        measure, rate = dynamics.units(leaves, first)
+
+        def size(error, measure=measure):
+            return np.sqrt(sum(np.asarray(w * e) ** 2 for w, e in zip(measure, error)))
+
+        for order in (8, 12, 16):
+            for wide in (0.3, 0.6, 1.0, 1.5, 2.2):
+                found = step(leaves, wide / rate, table(order, jnp.float64))
+                fine = leaves
+                for _ in range(8):
+                    fine = step(fine, wide / rate / 8, table(20, jnp.float64)).change
+                true = size([a - b for a, b in zip(found.change, fine)])
+                last, before = size(found.last), size(found.before)
+                seen = (true > 1e-13) & (true < 0.1)  # above rounding, where the table converges
+                if seen.sum() < count // 20:
+                    continue
+                ratio = (true / (last * np.minimum(1, last / before)))[seen]
+                quantiles = [float(x) for x in np.quantile(ratio, (0.05, 0.5, 0.95))]
+                rows.append({
+                    "family": name, "order": order, "radians": wide, "bodies": int(seen.sum()),
+                    "true_over_estimate": quantiles,
+                    "true_over_difference": float(np.median((true / last)[seen])),
+                })  # fmt: skip
+                print(rows[-1], flush=True)
+    return rows
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--bodies", type=int, default=150, help="of each family")
+    parser.add_argument("--quick", action="store_true", help="20 bodies, 30 radians")
+    parser.add_argument("--output", type=Path)
+    given = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    count, longest = (20, 30.0) if given.quick else (given.bodies, 1000.0)
+    found = {"steps": calibrated(10 * count, 3), "kept": kept(count, 11, longest)}
+    _report.write("error_control", found, path=given.output)
+
+
+if __name__ == "__main__":
+    main()

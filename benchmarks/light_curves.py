@@ -1,0 +1,261 @@
+"""How often the tumbling body is found from its light curve alone, and how fast trials are.
+
+Synthetic tumblers: ellipsoids whose inertia is not quite that of their shape, in both modes, seen
+on nights of 6 hours with gaps for a month of a circular orbit, with noise and an offset for every
+night. A case is found when the best solution has the right mode and both periods to 0.1 %; listed
+when another solution of the list has. ``--real FOLDER`` adds 2012 TC4 and Toutatis from the files
+described in docs/light_curves.md.
+
+    python -m benchmarks.light_curves [--count 100] [--noise 0.02 0.1] [--real FOLDER] [--speed]
+"""
+
+import argparse
+import csv
+import itertools
+import math
+import sys
+import time
+from pathlib import Path
+
+from benchmarks._report import one_thread, write
+
+if __name__ == "__main__" and "--speed" in sys.argv:
+    one_thread()
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import polhode as ph
+from polhode import lightcurve
+from polhode.lightcurve import _model, _search, _solutions
+
+TOUTATIS = {"P_phi": (7.41, 0.1), "P_psi": (5.38, 0.05), "pole": (180.2, -54.75)}
+
+
+def directions(jd, lean=0.1):
+    """Vectors to Sun and observer [au] of a body at 1.8 au, the observer at 1 au; circles."""
+
+    def circle(radius, longitude, tilt):
+        return radius * np.stack([
+            np.cos(longitude), np.sin(longitude) * np.cos(tilt), np.sin(longitude) * np.sin(tilt)
+        ], -1)  # fmt: skip
+
+    body = circle(1.8, 0.25 + 2 * np.pi * jd / (365.25 * 1.8**1.5), lean)
+    return -body, circle(1.0, 2 * np.pi * jd / 365.25, 0.0) - body
+
+
+def synthetic(seed: int, noise: float, *, nights=12, days=25.0, each=30, spread=0.02):
+    """A light curve and the truth behind it: P_phi, P_psi [day], mode, and the pole."""
+    rng = np.random.default_rng(seed)
+    start = np.sort(rng.choice(int(days), nights, replace=False)) + rng.uniform(-0.05, 0.05, nights)
+    start[0], start[-1] = 0.0, days
+    t = np.sort((start[:, None] + rng.uniform(0, 0.25, (nights, each))), axis=1).reshape(-1)
+    group = np.repeat(np.arange(nights), each)
+    clouded = rng.uniform(size=t.size) < 0.1
+    t, group = t[~clouded], group[~clouded]
+    sun, observer = directions(t)
+    while True:
+        b = rng.uniform(0.35, 0.9)
+        axes = np.array([1.0, b, b * rng.uniform(0.5, 0.95)])
+        square = (axes * np.exp(0.05 * rng.normal(size=3))) ** 2
+        moments = np.array([square[1] + square[2], square[0] + square[2], square[0] + square[1]])
+        omega = rng.normal(size=3) / moments
+        state = ph.State(rng.normal(size=4), omega)
+        found = ph.periods(ph.Inertia(moments), state)
+        P_phi = rng.uniform(0.4, 2.0)
+        scale = float(found.P_phi) / P_phi
+        P_psi, mode = float(found.P_psi) / scale, int(found.mode)
+        nutation = float(found.theta_max - found.theta_min)
+        wide = float(found.theta_max) > 0.25 if mode == 0 else nutation > 0.35
+        # within the grid of the default search, and not within 0.1 % of a spin about one axis
+        if wide and 2 / P_phi + 2 / P_psi < 5.5 and P_psi < 8:
+            break
+    bodies = _model.Bodies(
+        jnp.asarray(np.r_[
+            np.log(square[1:] / square[0]) / 2, np.log(axes[1:]), omega * scale, 0.3, 0.35
+        ])[None],
+        state.wxyz[None],
+    )  # fmt: skip
+    blank = lightcurve.LightCurve.of(t, 0 * t, sun, observer, group=group, calibrated=True)
+    points = blank.points(1.0)
+    light = np.asarray(_model.magnitudes(lightcurve.HG1G2(), bodies, points))[0, : t.size]
+    pole = _pole(bodies)
+    light = light + noise * rng.normal(size=t.size) + spread * rng.normal(size=nights)[group]
+    curve = blank._replace(magnitude=light, sigma=np.full(t.size, noise))
+    return curve, {"P_phi": P_phi, "P_psi": P_psi, "mode": mode, "pole": pole}
+
+
+def _pole(bodies):
+    x, y, z = _solutions.momentum(bodies)[0]
+    return math.degrees(math.atan2(y, x)) % 360, math.degrees(math.asin(z))
+
+
+def apart(a, b) -> float:
+    """Angle between two directions given by longitude and latitude [deg]."""
+    a, b = np.radians(a), np.radians(b)
+    value = np.sin(a[1]) * np.sin(b[1]) + np.cos(a[1]) * np.cos(b[1]) * np.cos(a[0] - b[0])
+    return float(np.degrees(np.arccos(np.clip(value, -1, 1))))
+
+
+def _right(solution, truth, tolerance=1e-3) -> bool:
+    return int(solution.mode) == truth["mode"] and all(
+        abs(getattr(solution, name) / truth[name] - 1) < tolerance for name in ("P_phi", "P_psi")
+    )
+
+
+def case(seed: int, noise: float, **options) -> dict:
+    """One synthetic tumbler: was it found, where in the list, how far off."""
+    curve, truth = synthetic(seed, noise)
+    began = time.perf_counter()
+    fit = lightcurve.fit_light_curve(curve, floor=0.01, **options)
+    place = next((k for k, s in enumerate(fit.solutions) if _right(s, truth)), None)
+    best = fit.best
+    return {
+        "seed": seed, "noise": noise, "truth": truth, "place": place, "rms": best.rms,
+        "P_phi": best.P_phi, "P_psi": best.P_psi, "mode": best.mode.name,
+        "odds": None if place is None else fit.solutions[place].probability,
+        "pole_error_deg": apart(best.pole, truth["pole"]),
+        "pole_error_listed_deg": min(apart(s.pole, truth["pole"]) for s in fit.solutions),
+        "said_ambiguous": any("Ambiguous" in note for note in fit.notes),
+        "seconds": time.perf_counter() - began,
+    }  # fmt: skip
+
+
+def speed(states: int = 100_000, samples: int = 400) -> dict:
+    """Seconds to score trial states, compiled before."""
+    curve, _ = synthetic(0, 0.02)
+    keep = np.linspace(0, curve.t.size - 1, samples - samples % 128).astype(int)
+    sun, observer = directions(np.sort(curve.t[keep]))
+    t = np.linspace(0, 25.0, samples)
+    sun, observer = directions(t)
+    points = lightcurve.LightCurve.of(t, 0 * t, sun, observer).points(0.02)
+    one = _search.Hypotheses(np.array([1.0]), np.array([1.3]), np.array([True]))
+    phase = lightcurve.HG1G2()
+    bodies, _ = _search.draw(jax.random.key(0), one, states, phase, 0.1)
+    _search.misfits(phase, jax.tree.map(lambda x: x[: _search.CHUNK], bodies), points)
+    began = time.perf_counter()
+    _search.misfits(phase, bodies, points)
+    taken = time.perf_counter() - began
+    return {"states": states, "samples": samples, "seconds": taken}
+
+
+def toutatis(folder: Path):
+    """The photometry of Spencer et al. 1995 as a light curve."""
+
+    def rows(name):
+        lines = [x for x in (folder / name).read_text().splitlines() if not x.startswith("#")]
+        return list(csv.DictReader(lines))
+
+    seen, geometry = rows("toutatis_1992.csv"), rows("toutatis_1992_directions.csv")
+
+    def column(table, *names):
+        return np.array([[float(row[n]) for n in names] for row in table])
+
+    r, delta, magnitude, error = column(seen, "r_au", "delta_au", "mag", "mag_err").T
+    return lightcurve.LightCurve.of(
+        column(geometry, "jd_utc_target")[:, 0], magnitude - 5 * np.log10(r * delta),
+        column(geometry, "sx", "sy", "sz"), column(geometry, "ox", "oy", "oz"), sigma=error,
+        group=[row["observer"] for row in seen], calibrated=True, at_body=True, reduced=True,
+    )  # fmt: skip
+
+
+def radar(folder: Path, solution, start: float, until=2449000.0 + 365) -> list[float]:
+    """Angles [deg] between a solution's attitudes and those by radar, over the body's symmetries.
+
+    An ellipsoid's light does not tell its half turns apart: the one of the four that fits best.
+    """
+    lines = (folder / "toutatis_radar_epochs.csv").read_text().splitlines()
+    table = list(csv.DictReader(x for x in lines if not x.startswith("#")))
+    jd = np.array([float(row["jd_utc"]) for row in table])
+    table, jd = [row for row, at in zip(table, jd) if at < until], jd[jd < until]
+    names = ("alpha_deg", "beta_deg", "gamma_deg")
+    angles = np.radians([[float(row[n]) for n in names] for row in table])
+    seen = [_passive(*row).T for row in angles]  # body -> space
+    ts = np.r_[start, jd] - start
+    order = np.argsort(solution.moments)  # long, middle, short
+    path = ph.simulate(
+        ph.Scene(ph.Inertia(solution.moments)), ph.State(solution.wxyz, solution.omega_body), ts
+    )
+    mine = np.asarray(ph.rotation.wxyz_to_matrix(path.wxyz[1:]))[:, :, order]
+    seen = np.array(seen)[:, :, [2, 0, 1]]  # from the source's axes middle, short, long
+    hand = np.linalg.det(mine[0]) * np.linalg.det(seen[0])
+    turns = [e for e in itertools.product((1, -1), repeat=3) if np.prod(e) * hand > 0]
+    traces = np.einsum("nij,nij,ej->en", mine, seen, np.array(turns, float))
+    angles = np.degrees(np.arccos(np.clip((traces - 1) / 2, -1, 1)))
+    return min(angles.tolist(), key=np.median)
+
+
+def _passive(alpha, beta, gamma):
+    """R3(gamma) R1(beta) R3(alpha), space -> body."""
+
+    def about(axis, angle):
+        c, s = np.cos(angle), np.sin(angle)
+        return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]] if axis == 3
+                        else [[1, 0, 0], [0, c, s], [0, -s, c]])  # fmt: skip
+
+    return about(3, gamma) @ about(1, beta) @ about(3, alpha)
+
+
+def real(folder: Path, **options) -> dict:
+    """2012 TC4 and Toutatis."""
+    tc4 = lightcurve.fit_light_curve(
+        lightcurve.read_light_curve(folder / "tc4_2012.csv", folder / "tc4_2012_vectors.csv"),
+        **options,
+    )
+    curve = toutatis(folder)
+    fit = lightcurve.fit_light_curve(curve, floor=0.05, **options)
+    listed = []
+    for k, s in enumerate(fit.solutions):
+        errors = radar(folder, s, curve.t[0])
+        listed.append({
+            "number": k, "P_phi": s.P_phi, "P_psi": s.P_psi, "mode": s.mode.name, "rms": s.rms,
+            "odds": s.probability, "pole": s.pole.tolist(), "moments": s.moments.tolist(),
+            "moments_std": s.moments_std.tolist(), "mirror_of": s.mirror_of,
+            "pole_error_deg": apart(s.pole, TOUTATIS["pole"]),
+            "radar_median_deg": float(np.median(errors)),
+        })  # fmt: skip
+    for row in listed:
+        print(row, flush=True)
+    minutes = [(s.P_phi * 1440, s.P_psi * 1440, s.mode.name, s.rms) for s in tc4.solutions]
+    return {"tc4_minutes": minutes, "toutatis": listed}
+
+
+def main() -> None:
+    jax.config.update("jax_enable_x64", True)
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=100)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--noise", type=float, nargs="*", default=[0.02, 0.1])
+    parser.add_argument("--trials", type=int, default=60_000)
+    parser.add_argument("--real", type=Path)
+    parser.add_argument("--speed", action="store_true")
+    parser.add_argument("--output", type=Path)
+    given = parser.parse_args()
+    result: dict = {"cases": []}
+    if given.speed:
+        result["speed"] = speed()
+        print(result["speed"], flush=True)
+    for noise in given.noise:
+        for seed in range(given.first, given.first + given.count):
+            row = case(seed, noise, trials=given.trials)
+            result["cases"].append(row)
+            t = row["truth"]
+            print(
+                f"{noise} {seed:3d} place {row['place']} {ph.Mode(t['mode']).name}"
+                f" {t['P_phi']:.4f} {t['P_psi']:.4f} found {row['mode']} {row['P_phi']:.4f}"
+                f" {row['P_psi']:.4f} rms {row['rms']:.3f} pole {row['pole_error_deg']:.0f}"
+                f" ({row['pole_error_listed_deg']:.0f}) {row['seconds']:.0f} s", flush=True,
+            )  # fmt: skip
+        rows = [r for r in result["cases"] if r["noise"] == noise]
+        first = sum(r["place"] == 0 for r in rows)
+        any_ = sum(r["place"] is not None for r in rows)
+        print(f"noise {noise}: best {first}, listed {any_} of {len(rows)}")
+    if given.real:
+        result["real"] = real(given.real, trials=given.trials)
+        print(result["real"])
+    print(write("light_curves", result, path=given.output))
+
+
+if __name__ == "__main__":
+    main()

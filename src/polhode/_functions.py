@@ -1,0 +1,159 @@
+"""Functions of users: asked once what they take and return, and kept so that trees stay of arrays.
+
+A plain function is no array: as a leaf it would stop ``jax.jit`` and ``jax.tree.map`` over a scene.
+It is therefore kept as static data, equal to itself only. What is a pytree already (an
+``eqx.Module``, ``jax.tree_util.Partial``) is kept as it is: its arrays are leaves of the scene.
+"""
+
+import functools
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+_NAMES = {
+    "t": {"t", "time", "seconds"},
+    "wxyz": {"wxyz", "q", "quat", "quaternion", "attitude"},
+    "omega_body": {"omega_body", "omega", "rates", "rate", "angular_velocity"},
+    "R": {"R", "r", "rotation", "matrix", "rotation_matrix"},
+    "position": {"position", "x", "position_space"},
+    "velocity": {"velocity", "v", "velocity_space"},
+}
+"""What users call an argument that we call by the first of these."""
+
+
+class Function(eqx.Module):
+    """A function of the user as static data: no leaf of the tree, equal to itself only."""
+
+    fn: Callable = eqx.field(static=True)
+
+    def __call__(self, *args: Any) -> Any:
+        return self.fn(*args)
+
+
+def kept(fn: Callable) -> Callable:
+    """The function, wrapped unless it is a pytree of its own (or wrapped already)."""
+    if not jax.tree_util.all_leaves([fn]):
+        return fn
+    try:
+        hash(fn)
+    except TypeError:
+        fn = functools.partial(fn)  # equal to itself only
+    return Function(fn)
+
+
+def takes(name: str, fn: Any, arguments: Sequence[str]) -> None:
+    """TypeError unless ``fn`` takes these arguments, in this order as far as its names tell."""
+    wanted = f"fn({', '.join(arguments)})"
+    if not callable(fn):
+        raise TypeError(f"{name} takes a function {wanted}, got {type(fn).__name__}: {fn!r:.80}.")
+    if isinstance(fn, type):
+        raise TypeError(
+            f"{name} takes a function {wanted}, got the class {fn.__name__}: make an object of it."
+        )
+    try:
+        signature = inspect.signature(fn)
+    except (TypeError, ValueError):  # some built-in functions have none
+        return
+    try:
+        given = signature.bind(*arguments).arguments
+    except TypeError as error:
+        raise TypeError(
+            f"{name} is called as {wanted}, but the function given takes {signature} ({error})."
+        ) from None
+    for own, called in given.items():
+        meant = next((k for k in arguments if own in _NAMES.get(k, ())), None)
+        if meant is not None and isinstance(called, str) and called != meant:
+            raise TypeError(
+                f"{name} is called as {wanted}, but the function given takes {signature}: its"
+                f" {own!r} would be given {called}. Put the arguments in the order {wanted}."
+            )
+
+
+def result_of(
+    name: str, arguments: Sequence[str], fn: Callable, shape: tuple[int, ...], dtype: Any, *args
+) -> Array:
+    """What ``fn(*args)`` returns as an array of ``shape`` and ``dtype`` (None: its own).
+
+    TypeError or ValueError for anything else, naming what was returned and what is expected; what
+    the function raises itself passes, with a note on how it was called.
+    """
+    called = f"{name}, called as fn({', '.join(arguments)})"
+    try:
+        value = fn(*args)
+    except Exception as error:
+        shapes = ", ".join(f"{k}: {jnp.shape(x)}" for k, x in zip(arguments, args))
+        error.add_note(
+            f"This was raised in the function given to {called} with the shapes {shapes}. It is"
+            " traced by JAX: write it with jax.numpy, and choose by jnp.where."
+        )
+        raise
+    expected = f"an array of shape {shape}" if shape else "a single number"
+    try:
+        if value is None or any(
+            isinstance(leaf, (str, bytes, dict)) or leaf is None
+            for leaf in jax.tree.leaves(value, is_leaf=lambda x: x is None or isinstance(x, dict))
+        ):
+            raise TypeError("no numbers")
+        array = jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"the function given to {called}, returned {type(value).__name__}: {value!r:.60};"
+            f" {expected} is expected."
+        ) from error
+    if jnp.issubdtype(array.dtype, jnp.complexfloating) or array.dtype == jnp.bool_:
+        raise TypeError(
+            f"the function given to {called}, returned dtype {array.dtype}; real numbers;"
+            f" {expected} is expected."
+        )
+    if array.shape != shape:
+        raise ValueError(
+            f"the function given to {called}, returned shape {array.shape}; {expected} is"
+            " expected. It sees one body at one time: batches are mapped over it."
+        )
+    if dtype is None:
+        return array
+    return array.astype(dtype)
+
+
+def checked(
+    name: str, fn: Any, arguments: Sequence[str], shapes: Sequence[tuple[int, ...]], shape
+) -> Callable:
+    """The function, kept (see ``kept``), after one look at what it takes and returns.
+
+    Nothing is computed: the function is traced once with arguments of the ``shapes``.
+    """
+    takes(name, fn, arguments)
+    fn = kept(fn)
+    dtype = jnp.result_type(float)
+    weak = [jax.ShapeDtypeStruct(s, dtype, weak_type=True) for s in shapes]  # of any dtype
+    with jax.numpy_dtype_promotion("standard"):  # the precision of the scene is not yet known
+        jax.eval_shape(lambda *args: result_of(name, arguments, fn, shape, None, *args), *weak)
+    return fn
+
+
+def mapped(
+    name: str,
+    fn: Callable,
+    arguments: Sequence[str],
+    shapes: Sequence[tuple[int, ...]],
+    shape: tuple[int, ...],
+    *args: Array,
+) -> Array:
+    """``fn`` over the leading axes of its arguments: an array (..., *shape) of their dtype."""
+    known = [x for x in args if hasattr(x, "dtype")]
+    dtype = jnp.result_type(*known) if known else None
+
+    def one(*args):
+        return result_of(name, arguments, fn, shape, dtype, *args)
+
+    def signature(sizes):
+        return "(" + ",".join(map(str, sizes)) + ")"
+
+    return jnp.vectorize(one, signature=",".join(map(signature, shapes)) + "->" + signature(shape))(
+        *args
+    )

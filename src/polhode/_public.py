@@ -1,0 +1,52 @@
+"""The public names of polhode, imported together when the first of them is asked for."""
+
+from polhode import elliptic as elliptic, free as free, rotation as rotation, solvers as solvers
+from polhode._closed_form import ClosedForm as ClosedForm
+from polhode._periods import periods as periods
+from polhode._plan import Plan as Plan, choose as choose
+from polhode._scene import Scene as Scene
+from polhode._simulate import explain as explain, simulate as simulate
+from polhode._state import State as State
+from polhode._status import SimulationError as SimulationError, Status as Status
+from polhode._top_methods import (
+    FixedAxis as FixedAxis,
+    LagrangeTop as LagrangeTop,
+    SymmetricTop as SymmetricTop,
+)
+from polhode._trajectory import Trajectory as Trajectory
+from polhode._version import __version__ as __version__
+from polhode.fit import fit_inertia as fit_inertia, fit_recordings as fit_recordings
+from polhode.frames import (
+    RotatingFrame as RotatingFrame,
+    accelerometer as accelerometer,
+    gyroscope as gyroscope,
+    simulate_particles as simulate_particles,
+)
+from polhode.free import Mode as Mode, Periods as Periods
+from polhode.hamiltonian import (
+    hamiltonian as hamiltonian,
+    hamiltons_equations as hamiltons_equations,
+)
+from polhode.inertia import Inertia as Inertia, MassProperties as MassProperties
+from polhode.methods import (
+    AbstractMethod as AbstractMethod,
+    EulerAngles as EulerAngles,
+    LiePoisson as LiePoisson,
+    Record as Record,
+)
+from polhode.torques import (
+    AbstractPotential as AbstractPotential,
+    AbstractRotor as AbstractRotor,
+    AbstractTorque as AbstractTorque,
+    BodyTorque as BodyTorque,
+    FeedbackTorque as FeedbackTorque,
+    GravityGradient as GravityGradient,
+    KeplerOrbit as KeplerOrbit,
+    LinearDamping as LinearDamping,
+    Potential as Potential,
+    QuadraticDamping as QuadraticDamping,
+    Rotor as Rotor,
+    SpaceTorque as SpaceTorque,
+    StateOrbit as StateOrbit,
+    UniformGravity as UniformGravity,
+)

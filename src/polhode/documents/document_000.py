@@ -1,0 +1,197 @@
+"""Document 000 in closed form: an independent reference for what ``jax.grad`` must give.
+
+Nothing here is used to move a body. Arrays: ``moments`` (..., 3) principal moments [kg m^2],
+``q`` (..., 3) = (phi, theta, psi) [rad], ``p`` (..., 3) momenta, ``qd`` (..., 3) angle rates;
+all broadcast. Equation numbers are the document's (docs/equations.md); misprints are corrected.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Vector3 = Float[Array, "*#b 3"]
+Matrix3 = Float[Array, "*b 3 3"]
+
+
+def _parts(moments, q):
+    ix, iy, iz = (moments[..., i] for i in range(3))
+    theta, psi = q[..., 1], q[..., 2]
+    return ix, iy, iz, jnp.sin(theta), jnp.cos(theta), jnp.sin(psi), jnp.cos(psi)
+
+
+def _symmetric(a, b, c, d, e, f):
+    a, b, c, d, e, f = jnp.broadcast_arrays(a, b, c, d, e, f)
+    rows = [[a, b, c], [b, d, e], [c, e, f]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def quadratic(form: Matrix3, vector: Vector3) -> Float[Array, "*b"]:
+    """v . M v."""
+    return jnp.einsum("...i,...ij,...j->...", vector, form, vector)
+
+
+def alpha(moments: Vector3, q: Vector3) -> Float[Array, "*b"]:
+    """Eq. 5: cos^2(psi)/Ix + sin^2(psi)/Iy [1/(kg m^2)]."""
+    ix, iy, _, _, _, s, c = _parts(moments, q)
+    return c**2 / ix + s**2 / iy
+
+
+def beta(moments: Vector3) -> Float[Array, "*b"]:
+    """Eq. 6: 1/Iy - 1/Ix [1/(kg m^2)]."""
+    return 1 / moments[..., 1] - 1 / moments[..., 0]
+
+
+def gamma(moments: Vector3, q: Vector3) -> Float[Array, "*b"]:
+    """Eq. 7: sin^2(psi)/Ix + cos^2(psi)/Iy [1/(kg m^2)]."""
+    ix, iy, _, _, _, s, c = _parts(moments, q)
+    return s**2 / ix + c**2 / iy
+
+
+def energy(moments: Vector3, q: Vector3, p: Vector3) -> Float[Array, "*b"]:
+    """Eq. 1 by way of eq. 11: p . V p / 2 [J]."""
+    return quadratic(inverse_mass_matrix(moments, q), p) / 2
+
+
+def inverse_mass_matrix(moments: Vector3, q: Vector3) -> Matrix3:
+    """Eq. 11: V, dq/dt = V p."""
+    _, _, iz, st, ct, s, c = _parts(moments, q)
+    al, be, ga = alpha(moments, q), beta(moments), gamma(moments, q)
+    return _symmetric(
+        al / st**2,
+        s * c * be / st,
+        -ct * al / st**2,
+        ga,
+        -s * c * ct * be / st,
+        1 / iz + ct**2 * al / st**2,
+    )
+
+
+def theta_form(moments: Vector3, q: Vector3) -> Matrix3:
+    """Eq. 14 (entry (3,2) without the stray p_theta): dp_theta/dt = p . Theta p."""
+    _, _, _, st, ct, s, c = _parts(moments, q)
+    al, be = alpha(moments, q), beta(moments)
+    corner = ct * al / st**3
+    return _symmetric(
+        corner,
+        s * c * ct * be / (2 * st**2),
+        -(1 + ct**2) * al / (2 * st**3),
+        jnp.zeros_like(corner),
+        -s * c * be / (2 * st**2),
+        corner,
+    )
+
+
+def psi_form(moments: Vector3, q: Vector3) -> Matrix3:
+    """Eq. 15: dp_psi/dt = p . Psi p."""
+    _, _, _, st, ct, s, c = _parts(moments, q)
+    al, be, ga = alpha(moments, q), beta(moments), gamma(moments, q)
+    return _symmetric(
+        -s * c * be / st**2,
+        (al - ga) / (2 * st),
+        ct * s * c * be / st**2,
+        s * c * be,
+        ct * (ga - al) / (2 * st),
+        -(ct**2) * s * c * be / st**2,
+    )
+
+
+def mass_matrix(moments: Vector3, q: Vector3) -> Matrix3:
+    """Eqs. 24, 28: V^-1, p = V^-1 dq/dt."""
+    ix, iy, iz, st, ct, s, c = _parts(moments, q)
+    al, be, ga = alpha(moments, q), beta(moments), gamma(moments, q)
+    return _symmetric(
+        ix * iy * st**2 * ga + iz * ct**2,
+        -ix * iy * s * c * st * be,
+        iz * ct,
+        ix * iy * al,
+        jnp.zeros_like(al),
+        iz * jnp.ones_like(al),
+    )
+
+
+def theta_velocity_form(moments: Vector3, q: Vector3) -> Matrix3:
+    """Eq. 25: V^-1 Theta V^-1."""
+    ix, iy, iz, st, ct, s, c = _parts(moments, q)
+    be, ga = beta(moments), gamma(moments, q)
+    zero = jnp.zeros_like(ga)
+    return _symmetric(
+        (ix * iy * ga - iz) * st * ct,
+        -ix * iy * s * c * ct * be / 2,
+        -iz * st / 2,
+        zero,
+        zero,
+        zero,
+    )
+
+
+def psi_velocity_form(moments: Vector3, q: Vector3) -> Matrix3:
+    """Eq. 26: V^-1 Psi V^-1."""
+    ix, iy, _, st, _, s, c = _parts(moments, q)
+    be = beta(moments)
+    turn = -ix * iy * (c**2 - s**2) * st * be / 2
+    zero = jnp.zeros_like(turn)
+    return _symmetric(-ix * iy * s * c * st**2 * be, turn, zero, ix * iy * s * c * be, zero, zero)
+
+
+def mass_matrix_rate(moments: Vector3, q: Vector3, qd: Vector3) -> Matrix3:
+    """Eqs. 27, 31-35: T = d(V^-1)/dt along the motion."""
+    ix, iy, iz, st, ct, s, c = _parts(moments, q)
+    be, ga = beta(moments), gamma(moments, q)
+    theta_dot, psi_dot = qd[..., 1], qd[..., 2]
+    t22 = 2 * ix * iy * s * c * be * psi_dot
+    zero = jnp.zeros_like(t22)
+    return _symmetric(
+        2 * (ix * iy * ga - iz) * st * ct * theta_dot - t22 * st**2,
+        -ix * iy * be * ((c**2 - s**2) * st * psi_dot + s * c * ct * theta_dot),
+        -iz * st * theta_dot,
+        t22,
+        zero,
+        zero,
+    )
+
+
+def generalised_force(moments: Vector3, q: Vector3, qd: Vector3) -> Float[Array, "*b 3"]:
+    """The unnumbered x after eq. 36: x = V^-1 d2q/dt2 [N m]."""
+    ix, iy, iz, st, ct, s, c = _parts(moments, q)
+    be, ga = beta(moments), gamma(moments, q)
+    f, h, g = (qd[..., i] for i in range(3))
+    cos2, k = c**2 - s**2, ix * iy * be
+    x1 = (
+        (2 * iz - 2 * ix * iy * ga) * st * ct * f * h
+        + 2 * k * st**2 * s * c * f * g
+        + k * s * c * ct * h**2
+        + (k * cos2 + iz) * st * h * g
+    )
+    x2 = (ix * iy * ga - iz) * st * ct * f**2 + (k * cos2 - iz) * st * f * g - 2 * k * s * c * h * g
+    x3 = -k * s * c * st**2 * f**2 + (iz - k * cos2) * st * f * h + k * s * c * h**2
+    return jnp.stack(jnp.broadcast_arrays(x1, x2, x3), axis=-1)
+
+
+def accelerations(moments: Vector3, q: Vector3, qd: Vector3) -> Float[Array, "*b 3"]:
+    """Eqs. 37-39 with eq. 39 corrected: d2(phi, theta, psi)/dt2 of the free body [rad/s^2]."""
+    ix, iy, iz, st, ct, s, c = _parts(moments, q)
+    al, be, ga = alpha(moments, q), beta(moments), gamma(moments, q)
+    f, h, g = (qd[..., i] for i in range(3))
+    sin2, k = 2 * s * c, ix * iy
+    e1, e2 = k * (c**2 / ix**2 + s**2 / iy**2), k * (s**2 / ix**2 + c**2 / iy**2)
+    skew = k * be * (al + ga) - iz * be
+    lift = 1 - e1 + iz * al
+    phi = (
+        sin2 * ct / 2 * skew * f**2
+        + ct / st * (iz * al - k * al * (al + ga)) * f * h
+        + sin2 / 2 * skew * f * g
+        + lift / st * h * g
+    )
+    theta = (
+        st * ct * (e2 - iz * ga) * f**2
+        - s * c * ct * skew * f * h
+        + st * (-1 + e2 - iz * ga) * f * g
+        - sin2 / 2 * skew * h * g
+    )
+    psi = (
+        sin2 / 2 * (-(ct**2) * skew - k / iz * be * st**2) * f**2
+        + (ct**2 / st * (k * al * (al + ga) - iz * al) + st * (k / iz * (al - ga) + 1)) * f * h
+        - sin2 * ct / 2 * skew * f * g
+        + k / (2 * iz) * sin2 * be * h**2
+        - ct / st * lift * h * g
+    )
+    return jnp.stack(jnp.broadcast_arrays(phi, theta, psi), axis=-1)

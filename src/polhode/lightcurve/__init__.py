@@ -1,0 +1,25 @@
+"""Tumbling bodies from their light curves."""
+
+from polhode.lightcurve._command import figure as figure, run as run, table as table
+from polhode.lightcurve._data import LightCurve as LightCurve
+from polhode.lightcurve._fit import fit_light_curve as fit_light_curve
+from polhode.lightcurve._frequencies import (
+    Pairs as Pairs,
+    fourier_pairs as fourier_pairs,
+    meaning as meaning,
+)
+from polhode.lightcurve._phase import (
+    HG as HG,
+    HG1G2 as HG1G2,
+    AbstractPhase as AbstractPhase,
+    LinearPhase as LinearPhase,
+    SeeligerPhase as SeeligerPhase,
+)
+from polhode.lightcurve._read import read_light_curve as read_light_curve
+from polhode.lightcurve._scattering import (
+    facets as facets,
+    seeliger_ellipsoid as seeliger_ellipsoid,
+    seeliger_sphere as seeliger_sphere,
+)
+from polhode.lightcurve._shape import Convex as Convex, harmonics as harmonics
+from polhode.lightcurve._solutions import Fit as Fit, Solution as Solution

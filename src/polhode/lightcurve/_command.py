@@ -1,0 +1,111 @@
+"""What ``polhode lightcurve FILE`` does."""
+
+import json
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+
+from polhode.lightcurve._fit import fit_light_curve
+from polhode.lightcurve._frequencies import fourier_pairs, meaning
+from polhode.lightcurve._read import read_light_curve
+from polhode.lightcurve._solutions import Fit
+
+
+def figure(fit: Fit, *, number: int = 0, title: str = ""):
+    """Data over solution ``number``, residuals, map of poles: a matplotlib figure."""
+    from polhode.lightcurve._figure import figure as draw
+
+    return draw(fit, number=number, title=title)
+
+
+def table(fit: Fit) -> str:
+    """The solutions, one a line, and what the light curve cannot show."""
+    unit, per = ("d", 1.0) if fit.best.P_phi > 0.3 else ("min", 1440.0)
+    lines = [
+        f"  #  rms [mag]  odds     P_phi [{unit}]          P_psi [{unit}]          mode"
+        "        moments              pole (lon, lat) [deg]"
+    ]
+    for k, s in enumerate(fit.solutions):
+        moments = " : ".join(f"{m:.3f}" for m in s.moments)
+        mirror = "" if s.mirror_of is None else f"  mirror of {s.mirror_of}"
+        lines.append(
+            f"{k:3d}  {s.rms:.4f}    {s.probability:7.1e}"
+            f"  {s.P_phi * per:9.5g} +- {s.P_phi_std * per:7.2g}"
+            f"  {s.P_psi * per:9.5g} +- {s.P_psi_std * per:7.2g}"
+            f"  {s.mode.name:<10s}  {moments}  {s.pole[0]:6.1f} {s.pole[1]:+6.1f}"
+            f" +- {s.pole_std:.1f}{mirror}"
+        )
+    return "\n".join([*lines, *(f"note: {note}" for note in fit.notes)])
+
+
+def frequency_table(pairs, count: int = 6) -> str:
+    """Candidate pairs of frequencies, and what each would mean."""
+    lines = ["  explained  f_phi [1/d]  f_psi [1/d]  meaning"]
+    for a, b, part in list(zip(pairs.f_phi, pairs.f_psi, pairs.explained))[:count]:
+        lines.append(f"  {part:8.1%}  {a:11.5g}  {b:11.5g}  {meaning(a, b)}")
+    return "\n".join(lines)
+
+
+def run(
+    path: str | PathLike[str],
+    *,
+    vectors: str | PathLike[str] | None = None,
+    output: str | PathLike[str] | None = None,
+    trials: int = 60_000,
+    highest: float | None = None,
+    floor: float = 0.03,
+    seed: int = 0,
+    say=print,
+) -> Fit | None:
+    """Read, fit, say the table, and write the figure and a JSON file beside each other.
+
+    ``output``: path of the files without suffix (default: that of ``path``, in the current folder).
+    Without directions to Sun and observer only the frequencies are listed, and None is returned.
+    Raises what `read_light_curve` raises.
+    """
+    path = Path(path)
+    curve = read_light_curve(path, vectors)
+    say(f"{path.name}: {curve.t.size} points, {len(curve.names)} groups, {np.ptp(curve.t):.4g} d")
+    if curve.sun is None:
+        pairs = fourier_pairs(
+            curve.t, curve.magnitude, columns=curve.columns(np.inf)[0], highest=highest
+        )
+        say(frequency_table(pairs))
+        for note in (*curve.notes, "without vectors to Sun and observer no body can be fitted."):
+            say(f"note: {note}")
+        return None
+    fit = fit_light_curve(curve, trials=trials, highest=highest, floor=floor, seed=seed)
+    say(frequency_table(fit.pairs))
+    say(table(fit))
+    output = Path(path.stem if output is None else output)
+    _write(fit, output, path.name, say)
+    return fit
+
+
+def _write(fit: Fit, output: Path, name: str, say) -> None:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    from polhode.io import whole_file
+
+    page = figure(fit, title=name)
+    picture = output.with_name(output.name + ".png")
+    with whole_file(picture) as temporary:
+        page.savefig(temporary, dpi=160)
+    plt.close(page)
+
+    def plain(value):
+        return value.tolist() if isinstance(value, np.ndarray) else value
+
+    listed = []
+    for solution in fit.solutions:
+        kept = {k: plain(v) for k, v in solution._asdict().items() if k not in ("model", "weights")}
+        listed.append(kept | {"mode": solution.mode.name})
+    document = output.with_name(output.name + ".json")
+    with whole_file(document) as temporary:
+        text = json.dumps({"file": name, "solutions": listed, "notes": fit.notes}, indent=1)
+        temporary.write_text(text + "\n", encoding="utf-8")
+    say(f"wrote {picture} and {document}")

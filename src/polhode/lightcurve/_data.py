@@ -1,0 +1,148 @@
+"""A light curve: times, magnitudes, who saw them, and where Sun and observer stood."""
+
+import math
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from polhode.lightcurve._model import Points
+from polhode.lightcurve._scattering import seeliger_sphere
+
+LIGHT_TIME = 499.00478384 / 86400  # days per au
+_GROWTH = 0.02  # of the floor, per degree of phase angle
+_BLOCK = 128  # samples are padded to multiples, so that few programs are compiled
+
+
+class LightCurve(NamedTuple):
+    """Photometry of one body. Build with ``LightCurve.of`` or ``read``.
+
+    Times in days (such as Julian dates), at which the light left the body; magnitudes reduced to
+    1 au from Sun and observer, where distances are known; unit vectors from the body to Sun and
+    observer in one space frame, None where unknown.
+    """
+
+    t: np.ndarray  # (n,)
+    magnitude: np.ndarray  # (n,)
+    sigma: np.ndarray  # (n,), 0 where not given
+    group: np.ndarray  # (n,) number of the night or observer
+    names: tuple[str, ...]  # of the groups
+    sun: np.ndarray | None  # (n, 3)
+    observer: np.ndarray | None  # (n, 3)
+    calibrated: bool  # magnitudes of different groups may be compared
+    notes: tuple[str, ...] = ()  # what a reader had to assume
+
+    @classmethod
+    def of(
+        cls, t, magnitude, sun=None, observer=None, *, sigma=0.0, group=None, calibrated=False,
+        at_body=False, reduced=False, notes=(),
+    ) -> "LightCurve":  # fmt: skip
+        """Check and reduce observations.
+
+        ``t`` (n,) [day]; ``magnitude`` (n,); ``sun``, ``observer`` (n, 3): vectors from the body
+        [au], or unit vectors where distances are unknown or already taken off (``at_body``: light
+        time, ``reduced``: 5 log10(r Delta)). ``sigma``: standard deviations, 0: unknown.
+        ``group`` (n,): names of nights or observers. ``calibrated``: groups share a zero point
+        but for small errors. Raises ValueError for shapes that differ and values not finite.
+        """
+        t, magnitude = np.asarray(t, float), np.asarray(magnitude, float)
+        if t.ndim != 1 or t.shape != magnitude.shape or t.size < 8:
+            raise ValueError(
+                "a light curve needs at least 8 times and as many magnitudes, got shapes"
+                f" {t.shape} and {magnitude.shape}."
+            )
+        bad = np.flatnonzero(~(np.isfinite(t) & np.isfinite(magnitude)))
+        if bad.size:
+            raise ValueError(f"times and magnitudes must be finite; point {bad[0]} is not.")
+        if (sun is None) != (observer is None):
+            raise ValueError("give both the vectors to the Sun and to the observer, or neither.")
+        if sun is not None:
+            sun, r = _directions("sun", sun, t.size)
+            observer, delta = _directions("observer", observer, t.size)
+            far = np.abs(delta - 1).max() > 1e-6
+            if far and not at_body:
+                t = t - LIGHT_TIME * delta
+            if far and not reduced:
+                magnitude = magnitude - 5 * np.log10(r * delta)
+        group = np.zeros(t.size, int) if group is None else np.asarray(group)
+        if group.shape != t.shape:
+            raise ValueError(f"group must name each of {t.size} points, got {group.shape}.")
+        names, number = np.unique(group, return_inverse=True)
+        sigma = np.broadcast_to(np.asarray(sigma, float), t.shape)
+        order = np.argsort(t, kind="stable")
+
+        def sort(x):
+            return None if x is None else np.ascontiguousarray(x[order])
+
+        return cls(
+            sort(t), sort(magnitude), sort(np.nan_to_num(np.maximum(sigma, 0))), sort(number),
+            tuple(str(x) for x in names), sort(sun), sort(observer), bool(calibrated), tuple(notes),
+        )  # fmt: skip
+
+    @property
+    def alpha(self) -> np.ndarray:
+        """Phase angles (n,) [rad]. Raises ValueError where the directions are unknown."""
+        sun, observer = self._known_directions()
+        across = np.linalg.norm(np.cross(sun, observer), axis=1)
+        return np.arctan2(across, np.sum(sun * observer, axis=1))
+
+    def _known_directions(self) -> tuple[np.ndarray, np.ndarray]:
+        if self.sun is None or self.observer is None:
+            raise ValueError(
+                "this light curve has no vectors to Sun and observer: only its frequencies can be"
+                " sought. Give them (columns sun_x ... observer_z of a CSV file)."
+            )
+        return self.sun, self.observer
+
+    def columns(self, offset_sigma: float | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Offsets as columns (c, n) and 1 / sigma^2 of each (c,).
+
+        One constant, and a deviation of each group with standard deviation ``offset_sigma``
+        (default: 0.2 mag when calibrated, free otherwise).
+        """
+        if offset_sigma is None:
+            offset_sigma = 0.2 if self.calibrated else math.inf
+        own = (self.group[None] == np.arange(len(self.names))[:, None]).astype(float)
+        if len(self.names) == 1:
+            return own, np.zeros(1)
+        if math.isinf(offset_sigma):
+            return own, np.zeros(len(own))
+        return np.vstack([np.ones((1, self.t.size)), own]), np.r_[
+            0.0, np.full(len(own), offset_sigma**-2.0)
+        ]
+
+    def points(self, floor: float, offset_sigma: float | None = None) -> Points:
+        """Arrays for the model; ``floor`` [mag] is added to the errors in quadrature.
+
+        It grows by 2 % per degree of phase angle, as the amplitudes of light curves do by 1 to 3 %
+        (Zappala et al. 1990, Astron. Astrophys. 231, 548): what the body's form departs from an
+        ellipsoid by shows the more, the flatter the light falls.
+        """
+        sun, observer = self._known_directions()
+        n, (columns, stiffness) = self.t.size, self.columns(offset_sigma)
+        missing, spare = -n % _BLOCK, -len(columns) % 4
+        floors = floor * (1 + _GROWTH * np.degrees(self.alpha))
+        weight = np.pad(1 / (self.sigma**2 + floors**2), (0, missing))
+        columns = np.pad(columns, ((0, spare), (0, missing)))
+        stiffness = np.pad(stiffness, (0, spare), constant_values=1.0)
+
+        def row(x):
+            return jnp.asarray(np.pad(x, (0, missing), mode="edge"))[None]
+
+        alpha = row(self.alpha)
+        return Points(
+            row(self.t - self.t[0]), tuple(map(row, sun.T)), tuple(map(row, observer.T)),
+            alpha, -2.5 * jnp.log10(jnp.maximum(seeliger_sphere(alpha), 1e-12)),
+            row(self.magnitude), jnp.asarray(weight)[None], jnp.asarray(columns),
+            jnp.asarray(stiffness),
+        )  # fmt: skip
+
+
+def _directions(name: str, vectors, count: int) -> tuple[np.ndarray, np.ndarray]:
+    vectors = np.asarray(vectors, float)
+    if vectors.shape != (count, 3):
+        raise ValueError(f"{name} must have shape ({count}, 3), got {vectors.shape}.")
+    length = np.linalg.norm(vectors, axis=1)
+    if not np.all(np.isfinite(length) & (length > 0)):
+        raise ValueError(f"{name} must hold finite vectors that are not zero.")
+    return vectors / length[:, None], length

@@ -1,0 +1,124 @@
+"""Magnitudes of a free ellipsoid from the unknowns of a fit, in batches, with exact derivatives."""
+
+from typing import NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from polhode import free, rotation
+from polhode.free._roles import Triple
+from polhode.lightcurve._phase import AbstractPhase
+from polhode.lightcurve._scattering import _cross, seeliger_ellipsoid
+
+Scalars = Float[Array, "*b"]
+
+# Unknowns besides the attitude: logarithms of the second and third semi-axis over the first, of
+# the homogeneous ellipsoid of the same inertia (2) and of the visible shape (2); body rates (3);
+# coefficients of the phase function; offsets. A step turns the attitude by a rotation vector (3).
+INERTIA, SHAPE, RATES, PHASE = slice(0, 2), slice(2, 4), slice(4, 7), 7
+
+
+class Points(NamedTuple):
+    """A light curve as the model needs it; rows (1, n), directions as component tuples."""
+
+    t: Float[Array, "1 n"]
+    sun: Triple
+    observer: Triple
+    alpha: Float[Array, "1 n"]
+    sphere: Float[Array, "1 n"]  # magnitude that the law itself gives a sphere
+    magnitude: Float[Array, "1 n"]
+    weight: Float[Array, "1 n"]  # 1 / sigma^2; 0 pads
+    columns: Float[Array, "c n"]  # of the offsets
+    stiffness: Float[Array, " c"]  # 1 / sigma^2 of what is known of them
+
+
+class Bodies(NamedTuple):
+    """A batch of trial bodies: unknowns (b, u) and attitudes at t = 0 (b, 4)."""
+
+    unknowns: Float[Array, "b u"]
+    wxyz: Float[Array, "b 4"]
+
+
+def moments_of(unknowns: Float[Array, "*b u"]) -> Triple:
+    """Moments, up to scale: those of the homogeneous ellipsoid with axes 1, e^u0, e^u1."""
+    y, z = jnp.exp(2 * unknowns[..., 0]), jnp.exp(2 * unknowns[..., 1])
+    return y + z, 1 + z, 1 + y
+
+
+def attitudes(unknowns: Float[Array, "b u"], wxyz: Float[Array, "b 4"], t: Float[Array, "1 n"]):
+    """Quaternion components (b, n) of the exact motion."""
+    omega = tuple(unknowns[:, k] for k in (4, 5, 6))
+    start = tuple(wxyz[:, k] for k in range(4))
+    return free.free_motion(moments_of(unknowns), start, omega, t, rates=False)[1]
+
+
+def _to_body(q, vector: Triple) -> Triple:
+    axis = tuple(-x for x in q[1:])
+    twice = tuple(2 * x for x in _cross(axis, vector))
+    again = _cross(axis, twice)
+    return tuple(x + q[0] * y + z for x, y, z in zip(vector, twice, again, strict=True))
+
+
+def _seen(phase: AbstractPhase, q, turn: Triple, shape, coefficients, points: Points) -> Scalars:
+    """Magnitudes but for offsets; all arguments by sample. ``turn``: small, of space."""
+    sun, observer = (
+        tuple(a - b for a, b in zip(v, _cross(turn, v), strict=True))
+        for v in (points.sun, points.observer)
+    )
+    b, c = jnp.exp(shape[0]), jnp.exp(shape[1])
+    light = seeliger_ellipsoid((jnp.ones_like(b), b, c), _to_body(q, sun), _to_body(q, observer))
+    # over the sphere of the same volume
+    light = jnp.maximum(light, 1e-12) / (jnp.pi / 2 * (b * c) ** (2 / 3))
+    return -2.5 * jnp.log10(light) - points.sphere + phase.magnitudes(points.alpha, coefficients)
+
+
+def magnitudes(phase: AbstractPhase, bodies: Bodies, points: Points) -> Float[Array, "b n"]:
+    """Reduced magnitudes, but for the offsets."""
+    q = attitudes(*bodies, points.t)
+    u, zero = bodies.unknowns[:, :, None], jnp.zeros(())
+    many = len(phase.typical)
+    coefficients = jnp.moveaxis(u[:, PHASE : PHASE + many], 1, -1)
+    return _seen(phase, q, (zero, zero, zero), (u[:, 2], u[:, 3]), coefficients, points)
+
+
+def magnitudes_and_slopes(phase: AbstractPhase, bodies: Bodies, points: Points):
+    """Magnitudes (b, n) and their derivatives (b, n, 10 + c), the turn in space (3) last.
+
+    The motion is differentiated by five numbers only, the light sample by sample in reverse.
+    """
+    u, wxyz = bodies
+    count = u.shape[0]
+
+    def moved(step):
+        return attitudes(u.at[:, jnp.array([0, 1, 4, 5, 6])].add(step), wxyz, points.t)
+
+    still = jnp.zeros(5, u.dtype)
+    q, by_motion = jax.vmap(lambda e: jax.jvp(moved, (still,), (e,)), out_axes=(None, -1))(
+        jnp.eye(5, dtype=u.dtype)
+    )  # 4 x (b, n), 4 x (b, n, 5)
+    many = len(phase.typical)
+    whole = (count, points.t.shape[1])
+
+    def spread(x):
+        return jnp.broadcast_to(x[:, None], whole)
+
+    turn = tuple(jnp.zeros(whole, u.dtype) for _ in range(3))
+    shape = tuple(spread(u[:, k]) for k in (2, 3))
+    coefficients = jnp.broadcast_to(u[:, None, PHASE : PHASE + many], (*whole, many))
+
+    def seen(q, turn, shape, coefficients):
+        return _seen(phase, q, turn, shape, coefficients, points)
+
+    value, pull = jax.vjp(seen, q, turn, shape, coefficients)
+    by_q, by_turn, by_shape, by_coefficients = pull(jnp.ones(whole, u.dtype))
+    motion = cast(Array, sum(a[..., None] * b for a, b in zip(by_q, by_motion, strict=True)))
+    slopes = [motion[..., :2], jnp.stack(by_shape, -1), motion[..., 2:], by_coefficients]
+    return value, jnp.concatenate([*slopes, jnp.stack(by_turn, -1)], axis=-1)
+
+
+def stepped(bodies: Bodies, step: Float[Array, "b u+3"]) -> Bodies:
+    """The bodies after a step of the unknowns and a turn in space."""
+    turn = rotation.rotation_vector_to_wxyz(step[:, -3:])
+    wxyz = rotation.normalise(rotation.multiply(turn, bodies.wxyz))
+    return Bodies(bodies.unknowns + step[:, :-3], wxyz)

@@ -1,0 +1,176 @@
+"""What a light curve tells of each body that explains it, and what it cannot tell."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from polhode import free, rotation
+from polhode.lightcurve._data import LightCurve
+from polhode.lightcurve._frequencies import Pairs
+from polhode.lightcurve._model import Bodies, moments_of
+from polhode.lightcurve._search import Hypotheses
+from polhode.lightcurve._steps import BATCH, Problem, State, normal_equations, picked
+
+
+class Solution(NamedTuple):
+    """A body that explains a light curve. Body axes: those of its shape and inertia."""
+
+    P_phi: float  # time unit of the light curve [day]
+    P_psi: float
+    P_phi_std: float
+    P_psi_std: float
+    mode: free.Mode
+    rms: float  # weighted, of the residuals [mag]
+    cost: float  # robust chi-square, priors included
+    probability: float  # exp(-(cost - best) / 2 / scale^2): 1 for the best
+    moments: np.ndarray  # (3,), of the greatest
+    moments_std: np.ndarray  # (3,)
+    axes: np.ndarray  # (3,) semi-axes over the longest
+    pole: np.ndarray  # (2,) longitude and latitude of the angular momentum [deg]
+    pole_std: float  # [deg]
+    wxyz: np.ndarray  # (4,) at t = 0, the first time
+    omega_body: np.ndarray  # (3,) [rad / time unit]
+    coefficients: np.ndarray  # of the phase function
+    offsets: np.ndarray  # of the columns
+    model: np.ndarray  # (n,) magnitudes, offsets included
+    weights: np.ndarray  # (n,) in [0, 1]: robust weight of each point
+    mirror_of: int | None  # number of the solution whose mirror image this is
+
+
+class Fit(NamedTuple):
+    """All distinct solutions, the best first."""
+
+    solutions: tuple[Solution, ...]
+    curve: LightCurve
+    pairs: Pairs
+    hypotheses: Hypotheses
+    scale: float  # residuals of the best over the errors assumed
+    notes: tuple[str, ...]  # what this light curve cannot show
+
+    @property
+    def best(self) -> Solution:
+        return self.solutions[0]
+
+
+def frequencies(bodies: Bodies):
+    """f_phi, f_psi, and mode of bodies."""
+    unknowns = jnp.asarray(bodies.unknowns)
+    found = free.periods(moments_of(unknowns), unknowns[:, 4:7])
+    return 1 / np.asarray(found.P_phi), 1 / np.asarray(found.P_psi), np.asarray(found.mode)
+
+
+def momentum(bodies: Bodies) -> np.ndarray:
+    """Unit vectors of the angular momentum in space (b, 3)."""
+    unknowns = jnp.asarray(bodies.unknowns)
+    body = jnp.stack(moments_of(unknowns), -1) * unknowns[:, 4:7]
+    space = np.asarray(rotation.rotate(jnp.asarray(bodies.wxyz), body))
+    return space / np.linalg.norm(space, axis=1, keepdims=True)
+
+
+def _derived(x, wxyz):
+    """ln P_phi, ln P_psi, moments over the greatest, direction of the momentum in space."""
+    unknowns, turn = x[:-3], x[-3:]
+    moments = moments_of(unknowns)
+    omega = unknowns[4:7]
+    found = free.periods(moments, tuple(omega))
+    moments = jnp.stack(moments)
+    attitude = rotation.multiply(rotation.rotation_vector_to_wxyz(turn), wxyz)
+    momentum = rotation.rotate(attitude, moments * omega)
+    return jnp.concatenate([
+        jnp.log(jnp.stack([found.P_phi, found.P_psi])),
+        moments / jnp.max(moments),
+        momentum / jnp.sqrt(jnp.sum(momentum**2)),
+    ])  # fmt: skip
+
+
+_derived_slopes = jax.jit(jax.vmap(jax.jacfwd(_derived)))
+
+
+def described(problem: Problem, state: State, order, curve: LightCurve, normals, limit):
+    """Solutions, and the residuals of the best over the errors assumed."""
+    n = curve.t.size
+    index = np.pad(order, (0, -len(order) % BATCH), mode="edge")
+    chosen = picked(state, index)
+    _, _, _, _, (value, robust) = normal_equations(
+        problem.phase, jax.tree.map(jnp.asarray, chosen.bodies), jnp.asarray(chosen.offsets),
+        problem.points, jnp.full(len(index), limit),
+    )  # fmt: skip
+    model = np.asarray(value + chosen.offsets @ problem.points.columns)[:, :n]
+    robust, weight = np.asarray(robust)[:, :n], np.asarray(problem.points.weight)[:, :n]
+    rest = model - curve.magnitude
+    freedom = max(n - chosen.matrix.shape[1] + int((problem.stiffness > 0).sum()), 1)
+    scale = float(np.sqrt((robust[0] * weight[0] * rest[0] ** 2).sum() / freedom))
+    f_phi, f_psi, mode = frequencies(chosen.bodies)
+    pole = momentum(chosen.bodies)
+    unknowns, wxyz = chosen.bodies
+    x = jnp.asarray(np.c_[unknowns, np.zeros((len(index), 3))])
+    slopes = np.asarray(_derived_slopes(x, jnp.asarray(wxyz)))
+    count = x.shape[1]
+    out = []
+    for k in range(len(order)):
+        covariance = np.linalg.pinv(chosen.matrix[k], hermitian=True)[:count, :count]
+        spread = scale**2 * slopes[k] @ covariance @ slopes[k].T
+        std = np.sqrt(np.maximum(np.diag(spread), 0))
+        images = 2 * normals * (normals @ pole[k])[:, None] - pole[k]
+        mirror = [
+            j for j in range(k)
+            if mode[j] == mode[k] and out[j].mirror_of is None
+            and abs(f_phi[j] / f_phi[k] - 1) + abs(f_psi[j] / f_psi[k] - 1) < 0.02
+            and (images @ pole[j]).max() > np.cos(np.radians(20))
+        ]  # fmt: skip
+        moments = np.array(moments_of(unknowns[k]))
+        axes = np.exp(np.r_[0.0, unknowns[k, 2:4]])
+        out.append(Solution(
+            1 / f_phi[k], 1 / f_psi[k], std[0] / f_phi[k], std[1] / f_psi[k],
+            free.Mode(int(mode[k])), float(np.sqrt(np.average(rest[k] ** 2, weights=weight[0]))),
+            float(chosen.cost[k]), float(np.exp((chosen.cost[0] - chosen.cost[k]) / 2 / scale**2)),
+            moments / moments.max(), std[2:5], axes / axes.max(),
+            np.degrees([np.arctan2(pole[k, 1], pole[k, 0]) % (2 * np.pi), np.arcsin(pole[k, 2])]),
+            float(np.degrees(np.linalg.norm(std[5:]))), wxyz[k], unknowns[k, 4:7],
+            unknowns[k, 7:], chosen.offsets[k], model[k], robust[k], mirror[0] if mirror else None,
+        ))  # fmt: skip
+    return tuple(out), scale
+
+
+def notes_on(curve: LightCurve, solutions, scale: float) -> tuple[str, ...]:
+    """What this light curve cannot show, in sentences."""
+    notes = list(curve.notes)
+    assert curve.sun is not None  # or it has no solutions
+    assert curve.observer is not None
+    directions = np.vstack([curve.sun, curve.observer])
+    wander = max(
+        np.degrees(np.arccos(np.clip((v @ v.mean(0) / np.linalg.norm(v.mean(0))).min(), -1, 1)))
+        for v in (curve.sun, curve.observer)
+    )
+    if wander < 5:
+        notes.append(
+            f"Sun and observer keep their directions within {wander:.1f} deg: every pole has a"
+            " mirror image in their plane that fits as well, and the absolute size of the shape's"
+            " axes along the momentum is hardly seen."
+        )
+    elif np.degrees(np.arcsin(np.linalg.svd(directions)[1][-1] / np.sqrt(len(directions)))) < 5:
+        notes.append(
+            "Sun and observer stay near one plane: poles mirrored in it fit nearly as well."
+        )
+    if np.degrees(curve.alpha.max()) < 3:
+        notes.append("All phase angles are below 3 deg: poles are known up to turns about the ray.")
+    span = np.ptp(curve.t)
+    best = solutions[0]
+    for name, period in (("P_phi", best.P_phi), ("P_psi", best.P_psi)):
+        if span < 3 * period:
+            notes.append(f"Fewer than three {name} were seen: it is uncertain beyond its error.")
+    rivals = [s for s in solutions[1:] if s.probability > 1e-3 and s.mirror_of is None]
+    if rivals:
+        notes.append(
+            f"Ambiguous: {len(rivals)} other solution(s) than the best, mirrors apart, cannot be"
+            " excluded at 1 in 1000."
+        )
+    if scale > 1.5:
+        notes.append(
+            f"Residuals are {scale:.1f} times the errors assumed: an ellipsoid is not the whole"
+            " truth, errors follow from the residuals, and neighbouring ones are alike; trust"
+            " none to better than a factor of two."
+        )
+    return tuple(notes)

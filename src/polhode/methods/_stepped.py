@@ -1,0 +1,286 @@
+"""Everything that is stepped: one chart, one solver, one controller, one adjoint, one solve."""
+
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from polhode._lanes import PARTS, along_time, is_lane_tree, map_chunks
+from polhode._scene import Scene
+from polhode._state import State
+from polhode._status import Status
+from polhode.hamiltonian import Dynamics
+from polhode.methods._base import AbstractMethod, Record, Samples
+from polhode.methods._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
+from polhode.methods._options import check_options
+from polhode.solvers import FlowAdjoint
+
+
+class Stepped(AbstractMethod):
+    """Bodies moved by a diffrax solver on one of the two charts; see ``LiePoisson``."""
+
+    chart: AbstractChart
+    solver: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController | None
+    dt0: float | Array | None
+    max_steps: int = eqx.field(static=True)
+    adjoint: diffrax.AbstractAdjoint
+    progress_meter: diffrax.AbstractProgressMeter
+    chunk: int = eqx.field(static=True)
+
+    @property
+    def keeps_rtol(self) -> bool:
+        """Whether the steps follow from ``rtol``."""
+        return self.controller is None and not hasattr(self.solver, "check")
+
+    def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
+        check = getattr(self.solver, "check", None)
+        if check is not None:
+            check(self, scene, record)
+        size = 1 if ts.ndim == 2 else self.chunk
+        lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
+
+        def one(chunk):
+            lanes, times = chunk
+            scene, state = eqx.combine(lanes, shared)
+            times = ts if times is None else times[0]
+            return self._solve(scene, state, times, rtol, record)
+
+        n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
+        if n <= size:
+            return map_chunks(one, (lanes, times), n, size)
+        order = jnp.argsort(natural_rates(scene, state, ts))  # who shares a chunk is of like rate
+        found = map_chunks(one, jax.tree.map(lambda x: x[order], (lanes, times)), n, size)
+        return jax.tree.map(lambda x: x[jnp.argsort(order)], found)
+
+    def _solve(self, scene, state, ts, rtol, record: Record) -> Samples:
+        """One chunk of lanes."""
+        dynamics = self.chart.dynamics(scene, state, ts)
+        y0, sound = self.chart.start(scene, state, ts[0])
+        field = self.chart.field
+        if record.work:
+            y0, field = (*y0, jnp.zeros_like(y0[0][0])), self.chart.field_and_power
+            dynamics = Dynamics(dynamics.hamiltonian, dynamics.torque, dynamics.units)
+        term = diffrax.ODETerm(field)
+        asked = _Asked(ts, rtol, self.dt0, self.max_steps, record.final_only, _may_jump(scene))
+        if self.controller is None:
+            make = getattr(self.solver, "stepping", None)
+            stepping = asked.stock(self.solver, y0, term, dynamics) if make is None else make(asked)
+        else:
+            stepping = asked.given(self.solver, self.controller)
+        solution = diffrax.diffeqsolve(
+            term,
+            stepping.solver,
+            t0=ts[0],
+            t1=ts[-1],
+            dt0=stepping.dt0,
+            y0=y0,
+            args=dynamics,
+            saveat=stepping.saveat,
+            stepsize_controller=stepping.controller,
+            adjoint=_in_parts(self.adjoint, scene),
+            max_steps=stepping.max_steps,
+            progress_meter=self.progress_meter,
+            throw=False,
+        )
+        return self._samples(scene, solution, ts, sound, record)
+
+    def _samples(self, scene, solution, ts, sound, record: Record) -> Samples:
+        samples, last = (_lanes_first(y) for y in solution.ys)
+        work = samples[2] if record.work else None
+        later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
+        kept = ts[-1:] if record.final_only else ts
+        wxyz, omega, _ = self.chart.finish(later, samples[:2], kept[None])
+        *_, sound_at_end = self.chart.finish(later, last[:2], ts[None, -1:])
+        wxyz, omega = (jnp.where(sound[:, None, None], x, jnp.nan) for x in (wxyz, omega))
+        taken, unfinished = _outcome(solution, sound.shape)
+        finite = jnp.all(jnp.isfinite(wxyz), axis=(-1, -2))
+        finite = finite & jnp.all(jnp.isfinite(omega), axis=(-1, -2))
+        done = unfinished == Status.SUCCESSFUL
+        status = jnp.where(done & ~finite, Status.NOT_FINITE, unfinished)
+        lost = ~sound | (~sound_at_end[:, -1] & ~done)
+        if self.chart.canonical:  # where steps become too short is where the chart ends
+            lost = lost | (unfinished == Status.STEP_FAILED)
+        return Samples(
+            wxyz if record.attitude else None,
+            omega if record.rates else None,
+            jnp.where(lost, Status.CHART_SINGULAR, status),
+            taken,
+            work,
+            getattr(solution.solver_state, "error", None),
+        )
+
+
+class Stepping(NamedTuple):
+    """What is handed to ``diffrax.diffeqsolve``."""
+
+    solver: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController
+    saveat: diffrax.SaveAt
+    max_steps: int
+    dt0: Any
+
+
+class _Asked(NamedTuple):
+    """What a solver is asked for: the times, the error at the last of them, the first or longest
+    step, how many at most; whether only the last state is kept, and whether the rates may jump."""
+
+    ts: Array
+    rtol: Array
+    dt0: Any
+    max_steps: int
+    final_only: bool
+    jumps: bool
+
+    def given(self, solver, controller) -> Stepping:
+        """Steps of a controller that the user chose."""
+        saved = self._saved(diffrax.SubSaveAt(ts=self.ts))
+        return Stepping(solver, controller, saved, self.max_steps, self.dt0)
+
+    def marched(self, solver) -> Stepping:
+        """One step from each time to the next, of a solver that divides it by itself."""
+        ends = self.ts[jnp.array([0, -1])] if self.final_only else self.ts
+        saved = self._saved(diffrax.SubSaveAt(t0=True, steps=1))
+        saved = eqx.tree_at(lambda s: s.solver_state, saved, True)
+        return Stepping(solver, diffrax.StepTo(ends), saved, ends.shape[0] - 1, None)
+
+    def stock(self, solver, y0, term, dynamics) -> Stepping:
+        """Steps of any solver with an error estimate."""
+        leaves = jax.tree.leaves(y0)
+        weights, rate = dynamics.units(leaves, jax.tree.leaves(term.vf(self.ts[0], y0, dynamics)))
+        turned = jnp.maximum(1, jnp.max(rate) * jnp.abs(self.ts[-1] - self.ts[0]))
+        weights = [*weights, *[jnp.zeros_like(x) for x in leaves[len(weights) :]]]
+        weights, turned = jax.lax.stop_gradient((weights, turned))
+        atol = jnp.maximum(self.rtol / (2 * turned), 8 * jnp.finfo(self.rtol.dtype).eps)
+        controller = diffrax.PIDController(rtol=0.0, atol=atol, norm=LaneNorm(tuple(weights)))
+        if not self.final_only:  # samples as accurate as steps, not as the interpolant
+            controller = diffrax.ClipStepSizeController(controller, step_ts=self.ts)
+        return self.given(solver, controller)
+
+    def _saved(self, samples) -> diffrax.SaveAt:
+        last = diffrax.SubSaveAt(t1=True)
+        return diffrax.SaveAt(subs=[last if self.final_only else samples, last])
+
+
+class LaneNorm(eqx.Module):
+    """Error of the worst lane: root mean square over its components, each times its weight.
+
+    A batch that shares its steps so keeps every body's own tolerance.
+    """
+
+    weights: tuple[Array, ...]
+
+    def __call__(self, y: PyTree[Array]) -> Array:
+        leaves = jax.tree.leaves(y)
+        square = sum((w * x) ** 2 for w, x in zip(self.weights, leaves))
+        worst = jnp.max(square) / len(leaves)
+        positive = worst > 0  # the root's slope at zero is infinite: keep it out of gradients
+        return jnp.where(positive, jnp.sqrt(jnp.where(positive, worst, 1)), 0)
+
+
+def _in_parts(adjoint: diffrax.AbstractAdjoint, scene: Scene) -> diffrax.AbstractAdjoint:
+    """On the way back from states that a torque has drawn together an error grows no longer than
+    through one of eight parts."""
+    if isinstance(adjoint, FlowAdjoint) and scene.torque is not None:
+        return FlowAdjoint(adjoint.rtol, max(adjoint.parts, 8))
+    return adjoint
+
+
+def _lanes_first(y):
+    """Saved states (T, N) as samples (N, T)."""
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), y)
+
+
+def _outcome(solution, shape) -> tuple[Array, Array]:
+    """Steps and status of every lane."""
+    told = getattr(solution.solver_state, "ended", None)
+    if told is not None:  # each lane has steps of its own
+        return solution.solver_state.steps.astype(jnp.int32), jnp.array(_ENDED)[told]
+    limit = solution.result == diffrax.RESULTS.max_steps_reached
+    status = jnp.where(limit, Status.MAX_STEPS, Status.STEP_FAILED)
+    good = solution.result == diffrax.RESULTS.successful
+    status = jnp.where(good, Status.SUCCESSFUL, status)
+    return (
+        jnp.broadcast_to(solution.stats["num_steps"], shape),
+        jnp.broadcast_to(status, shape),
+    )
+
+
+_ENDED = (Status.SUCCESSFUL, Status.MAX_STEPS, Status.STEP_FAILED, Status.NOT_FINITE)
+
+
+def _may_jump(scene: Scene) -> bool:
+    """Whether a function of the user's acts on the body: orbits of this package are smooth."""
+    parts = (scene.potential, scene.torque, scene.rotors)
+    found = (x for x in jax.tree.leaves(parts, is_leaf=callable) if callable(x))
+    return not all(hasattr(x, "core_ranks") for x in found)
+
+
+def LiePoisson(
+    solver: diffrax.AbstractSolver | None = None,
+    controller: diffrax.AbstractStepSizeController | None = None,
+    dt0: float | Array | None = None,
+    max_steps: int = 2**16,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+    chunk: int | None = None,
+) -> Stepped:
+    """Unit quaternion and body momentum, free of singularities, with any diffrax solver.
+
+    **Arguments:**
+
+    - ``solver``: a ``diffrax.AbstractSolver`` for ODEs, ours or diffrax's; None: ``Dopri8``.
+    - ``controller``: a diffrax step-size controller; None: the error at every saved time is held
+      to the ``rtol`` of ``simulate`` (attitude in radians, momentum relative to each body's own
+      scale) by the error that the steps find.
+    - ``dt0``: first (or constant) step [s], negative backwards; None: chosen. For ``Splitting``,
+      which has no error estimate, the longest step: equal ones lead from each time to the next.
+    - ``max_steps``: of each body, or of bodies that share their steps.
+    - ``adjoint``: None: ``ph.solvers.FlowAdjoint()``, the derivatives of the exact flow, in forward
+      and reverse mode; or an adjoint of diffrax, for the derivative of the steps (for bodies that
+      drag stops within the time simulated).
+    - ``progress_meter``: as in diffrax.
+    - ``chunk``: bodies that are moved together; chunks follow one another, so memory stays bounded.
+      None: 64 for ``Extrapolation``, 200 for others, whose bodies of a chunk share their steps.
+    """
+    return _stepped(LiePoissonChart(), 200, solver, controller, dt0, max_steps, adjoint,
+                    progress_meter, chunk)  # fmt: skip
+
+
+def EulerAngles(
+    solver: diffrax.AbstractSolver | None = None,
+    controller: diffrax.AbstractStepSizeController | None = None,
+    dt0: float | Array | None = None,
+    max_steps: int = 2**16,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+    chunk: int | None = None,
+) -> Stepped:
+    """Canonical ZYZ Euler angles by Hamilton's equations (docs/equations.md), any diffrax solver.
+
+    A reference path: the chart breaks down where theta is 0 or pi, which is reported as
+    ``Status.CHART_SINGULAR``; passing near costs many steps. Arguments as ``ph.LiePoisson``; with a
+    solver whose bodies share their steps one body at a time, for the worst would hold up the rest.
+    """
+    return _stepped(EulerChart(), 1, solver, controller, dt0, max_steps, adjoint,
+                    progress_meter, chunk)  # fmt: skip
+
+
+def _stepped(chart, alone, solver, controller, dt0, max_steps, adjoint, progress_meter, chunk):
+    solver = diffrax.Dopri8() if solver is None else solver
+    check_options(solver, controller, adjoint, dt0=dt0, max_steps=max_steps, chunk=chunk)
+    if chunk is None:
+        chunk = getattr(solver, "bodies_at_once", alone)
+    return Stepped(
+        chart,
+        solver,
+        controller,
+        dt0,
+        max_steps,
+        FlowAdjoint() if adjoint is None else adjoint,
+        diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
+        chunk,
+    )

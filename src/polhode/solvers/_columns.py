@@ -1,0 +1,197 @@
+"""The extrapolated midpoint rule, once: one step of it, for whatever is integrated here.
+
+Columns of n = 2, 4, ... leapfrog substeps are combined so that the error terms in h^2, h^4, ...
+cancel (W. B. Gragg, SIAM J. Numer. Anal. 2 (1965) 384; E. Hairer, S. P. Norsett, G. Wanner, Solving
+Ordinary Differential Equations I, section II.9). The columns are worked out in a loop over a table
+that is data of the program, so that one program serves every order.
+"""
+
+from collections.abc import Callable
+from fractions import Fraction
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+SEQUENCES = {
+    4: (2, 4),
+    6: (2, 4, 8),
+    8: (2, 4, 6, 12),
+    10: (2, 4, 6, 8, 14),
+    12: (2, 4, 6, 8, 10, 18),
+    14: (2, 4, 6, 8, 10, 14, 22),
+    16: (2, 4, 6, 8, 10, 12, 16, 30),
+    18: (2, 4, 6, 8, 10, 12, 14, 20, 32),
+    20: (2, 4, 6, 8, 10, 12, 14, 16, 24, 36),
+}
+"""Substeps of the columns of each order.
+
+Found by search over even numbers: within 15 % of the least work (evaluations per step over the
+step length that the error constant prod n_j^2 allows), the least amplification of rounding,
+sqrt(sum w_j^2 n_j). The harmonic sequence 2, 4, 6, ... amplifies it 3 (order 10) to 30 (order 20)
+times more.
+"""
+
+LONGEST = max(len(sequence) for sequence in SEQUENCES.values())
+
+
+def extrapolation_weights(sequence: tuple[int, ...]) -> tuple[Fraction, ...]:
+    """Weights of the columns in the value at zero step width, for an expansion in h^2.
+
+    w_j = prod_(i != j) n_j^2 / (n_j^2 - n_i^2): Hairer, Norsett, Wanner, Solving Ordinary
+    Differential Equations I, section II.9, equations (9.5) and (9.13).
+    """
+    weights = []
+    for j, n in enumerate(sequence):
+        weight = Fraction(1)
+        for i, m in enumerate(sequence):
+            if i != j:
+                weight *= Fraction(n * n, n * n - m * m)
+        weights.append(weight)
+    return tuple(weights)
+
+
+class Table(NamedTuple):
+    """Columns of one order, that with most substeps first and the others filled up with zeros.
+
+    ``counts`` (K,): substeps; ``weights`` (3, K): of the result, and of the differences of the
+    last two pairs of results of descending order, p - (p-2) and (p-2) - (p-4); ``length``: columns
+    that there are; ``order``.
+    """
+
+    counts: Array
+    weights: Array
+    length: Array
+    order: Array
+
+
+def _row(order: int) -> tuple[np.ndarray, np.ndarray]:
+    sequence = SEQUENCES[order]
+    place = [len(sequence) - 1, *range(len(sequence) - 1)]
+    sums = [
+        [Fraction(0)] * drop + list(extrapolation_weights(sequence[drop:])) for drop in range(3)
+    ]
+    if len(sequence) == 2:
+        sums[2] = [Fraction(0)] * 2
+    whole, first, second = sums
+    given = np.zeros((3, LONGEST))
+    counts = np.zeros(LONGEST)
+    for k, j in enumerate(place):
+        counts[k] = sequence[j]
+        if k:  # the others enter by their small differences to the base, which has weight one
+            given[:, k] = [float(x) for x in (whole[j], whole[j] - first[j], first[j] - second[j])]
+    return counts, given
+
+
+def table(order: int | Array, dtype: Any) -> Table:
+    """The columns of an order; a traced one must be a key of ``SEQUENCES``."""
+    orders = tuple(SEQUENCES)
+    counts, weights = (np.stack(x) for x in zip(*map(_row, orders)))
+    lengths = np.array([len(SEQUENCES[o]) for o in orders], np.int32)
+    index = orders.index(order) if isinstance(order, int) else (order - orders[0]) // 2
+    return Table(
+        jnp.asarray(counts, dtype)[index],
+        jnp.asarray(weights, dtype)[index],
+        jnp.asarray(lengths)[index],
+        jnp.asarray(order, dtype),
+    )
+
+
+Rates = Callable[[Array, list[Array], bool], tuple[list[Array], list[Array]]]
+
+
+def evaluations(order: int) -> int:
+    """Evaluations of the rates in one step."""
+    return sum(SEQUENCES[order]) - len(SEQUENCES[order]) + 1
+
+
+class Columns(NamedTuple):
+    """What one step yields: ``change`` of the state, or the new state where the step is not
+    compensated; ``sums``, what integrals have gained; ``last``, ``before``: differences of the
+    results of orders p and p - 2, and of p - 2 and p - 4."""
+
+    change: list[Array]
+    sums: list[Array]
+    last: list[Array]
+    before: list[Array]
+
+
+def extrapolated(
+    rates: Rates,
+    given: Table,
+    t: Array,
+    width: Array,
+    y: list[Array],
+    first: list[Array],
+    integrals: list[Array],
+    compensated: bool = False,
+) -> Columns:
+    """One step of the extrapolated midpoint rule.
+
+    ``rates(t, y, along)``: rates of the state and, where ``along``, of integrals along it, which
+    need every other point only. ``first``: rates of ``y``. ``t`` and ``width`` are numbers, or one
+    each for every entry of the arrays. ``compensated``: changes are summed, not states.
+    """
+    origin = [jnp.zeros_like(x) for x in y] if compensated else y
+
+    def place(a):
+        return [b + c for b, c in zip(y, a)] if compensated else a
+
+    def column(n):
+        h = width / n
+        step = [2 * h.astype(x.dtype) for x in y]
+
+        def pair(i, found):
+            a, b, sums = found
+            now = t + (2 * i + 1).astype(h.dtype) * h
+            f, g = rates(now, place(b), True)
+            a, sums = _plus(a, step, f), _plus(sums, [step[0]] * len(g), g)
+            f, _ = rates(now + h, place(a), False)
+            return a, _plus(b, step, f), sums
+
+        b = _plus(origin, [x / 2 for x in step], first)
+        start = origin, b, [jnp.zeros_like(x) for x in integrals]
+        a, b, sums = jax.lax.fori_loop(0, n.astype(jnp.int32) // 2 - 1, pair, start)
+        f, g = rates(t + (width - h), place(b), True)
+        return _plus(a, step, f), _plus(sums, [step[0]] * len(g), g)
+
+    def add(j, found):
+        base, (new, sums), last, before = found
+        count = jax.lax.dynamic_index_in_dim(given.counts, j, keepdims=False)
+        shares = jax.lax.dynamic_index_in_dim(given.weights, j, axis=1, keepdims=False)
+        shares = [jax.lax.squeeze(jax.lax.slice(shares, (k,), (k + 1,)), (0,)) for k in range(3)]
+        this = column(count.astype(jnp.result_type(width)))
+        base = jax.tree.map(lambda x, b: jnp.where(j == 0, x, b), this, base)
+        gap = jax.tree.map(jnp.subtract, this, base)
+
+        def combine(x, s, d):
+            return jnp.where(j == 0, x, s + shares[0].astype(d.dtype) * d)
+
+        new, sums = jax.tree.map(combine, this, (new, sums), gap)
+        last = [e + shares[1].astype(d.dtype) * d for e, d in zip(last, gap[0])]
+        before = [e + shares[2].astype(d.dtype) * d for e, d in zip(before, gap[0])]
+        return base, (new, sums), last, before
+
+    empty = [jnp.zeros_like(x) for x in y], [jnp.zeros_like(x) for x in integrals]
+    start = empty, empty, empty[0], empty[0]
+    _, (new, sums), last, before = jax.lax.fori_loop(0, given.length, add, start)
+    return Columns(new, [q + s for q, s in zip(integrals, sums)], last, before)
+
+
+def _plus(y, step, f):
+    return [a + h * b for a, h, b in zip(y, step, f)]
+
+
+def carried_on(
+    y: list[Array], low: list[Array], change: list[Array]
+) -> tuple[list[Array], list[Array]]:
+    """``y + low + change`` as a rounded sum and what rounding took from it.
+
+    D. E. Knuth, The Art of Computer Programming 2, section 4.2.2, theorem B.
+    """
+    change = [a + b for a, b in zip(low, change)]
+    new = [a + b for a, b in zip(y, change)]
+    lost = [(a - (s - (s - a))) + (c - (s - a)) for a, c, s in zip(y, change, new)]
+    return new, lost

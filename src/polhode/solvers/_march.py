@@ -1,0 +1,311 @@
+"""From one time to another in as many extrapolated steps as an error asked for needs.
+
+The error of a step is found from its own table. Let e be the difference of the results of orders p
+and p - 2, and d that of p - 2 and p - 4. In a converging table the results' errors fall by about
+the same factor from one to the next, so that the result itself is off by about e^2 / d. Over random
+tops and gravity gradients with six decades of every parameter, orders 8 to 16 and steps of 0.3 to
+2.2 radians the true error was 2 to 20 times that, 4.5 times in the median, for errors from 1e-13 to
+1e-2 (``benchmarks/error_control.py``); e alone is too large by anything up to 1,000.
+
+Steps are each body's own where the rates do not ask for the time: bodies march side by side, and
+the loop ends when the last has arrived. Where the rates do ask for it (an orbit, a torque that is
+a function of time) the bodies share their times, so that what depends on the time alone is worked
+out once for all of them, and the body that needs the smallest step decides.
+"""
+
+from collections.abc import Callable
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from polhode.solvers._columns import Rates, Table, carried_on, extrapolated
+
+Units = Callable[[list[Array], list[Array]], tuple[list[Array], Array]]
+"""Weights of the components of an error, whose squares are summed, and the natural rate [rad/s],
+of a state and its rates."""
+
+CALIBRATED = 5
+"""The error of a step over e^2 / d (see above)."""
+
+SHARE = 0.4
+"""Part of the tolerance that the steps' errors may add up to. They add up to more where the motion
+itself spreads errors (see ``docs/integrators.md``)."""
+
+DRIFT, LONG = 0.5, 650
+"""Over more than ``LONG`` radians an error of the rates turns the body on: the tolerance falls with
+this power of the angle."""
+
+CAUTION, MEMORY = 0.9, 0.3
+"""A step is this much shorter than its error allows; how much the last one's error counts."""
+
+ROUNDING = 8
+"""Units in the last place below which the error of a step is rounding."""
+
+ROUGH = 32
+"""How much the estimate may be too small where a torque jumps amid a step: the last two values of
+the table differ by less than their errors. Seen from errors that do not fall with the order of the
+method when a refused step is cut."""
+
+_TRIES = 4
+"""Steps that may be tried for each that may be taken."""
+
+GAP = 1 / 16
+"""Part of a step beside its ends, three times which is searched for jumps."""
+
+
+class Limits(NamedTuple):
+    """What a march keeps to: ``rtol``, the sum of errors [rad] at ``horizon`` [s] after its start;
+    ``steps``: most of them; ``jumps`` (static): whether the rates may jump."""
+
+    rtol: Array
+    horizon: Array
+    steps: int
+    jumps: bool
+
+
+class Progress(NamedTuple):
+    """What is carried from one march to the next; arrays of one entry a body.
+
+    ``width``: next step [s], 0: not known; ``turned``: angle so far [rad]; ``low``: what rounding
+    took from the state; ``steps``; ``error``: sum of the estimated errors [rad]; ``gone``: time
+    since the first start [s]; ``ended``: 0, or why the body was given up: 1 its steps were spent,
+    2 they became too short to lead anywhere, 3 there so because the rates are no numbers.
+    """
+
+    width: Array
+    turned: Array
+    low: list[Array]
+    steps: Array
+    error: Array
+    gone: Array
+    ended: Array
+
+
+def fresh(y: list[Array], compensated: bool, t: Array) -> Progress:
+    """Progress before the first step."""
+    zero = jnp.zeros_like(y[0])
+    low = [jnp.zeros_like(x) for x in y] if compensated else []
+    ended = jnp.zeros(zero.shape, jnp.int32)
+    return Progress(zero, zero, low, zero, zero, jnp.zeros_like(t), ended)
+
+
+class _Walk(NamedTuple):
+    """A march under way."""
+
+    tried: Array
+    gone: Array  # time since the start of this march
+    y: list[Array]
+    rates: list[Array]
+    low: list[Array]
+    integrals: list[Array]
+    width: Array
+    before: Array  # error over tolerance of the step before
+    refused: tuple[Array, Array]  # error and width of a step refused
+    turned: Array
+    error: Array
+    steps: Array
+
+
+def march(
+    rates: Rates,
+    units: Units,
+    given: Table,
+    limits: Limits,
+    own: bool,
+    span: tuple[Array, Array],
+    y: list[Array],
+    integrals: list[Array],
+    progress: Progress,
+) -> tuple[list[Array], list[Array], Progress]:
+    """State and integrals at ``span[1]``, of bodies that are the entries of arrays of one shape.
+
+    A body that has used up ``limits.steps`` ends as NaN. ``own`` (static): each body in steps of
+    its own; the rates must then not depend on the time.
+    """
+    compensated = bool(progress.low)
+    start, end = span
+    length, sign = jnp.abs(end - start), jnp.where(end < start, -1, 1)
+    dtype = y[0].dtype
+    eps = float(jnp.finfo(dtype).eps)
+    rest = jnp.abs(limits.horizon - progress.gone - length).astype(dtype)
+    whole_length, length = length, length.astype(dtype)
+    power = 1 / (given.order.astype(dtype) + 1)
+    zero = jnp.zeros_like(y[0])
+
+    def worst(x, dead):
+        """Of the bodies that share their steps, but for those that are given up."""
+        return x if own else jnp.broadcast_to(jnp.max(jnp.where(dead, 0, x)), x.shape)
+
+    def given_up(walk):
+        """Bodies whose steps ran out, or became so short that they lead nowhere."""
+        able = (walk.steps < limits.steps) & (walk.width > 0.1 * eps * length)
+        return ~(able & (progress.ended == 0))
+
+    def live(walk):
+        return (walk.gone < length) & ~given_up(walk)
+
+    def judged(walk, t, h, width, new, found, later):
+        """Error of a step, and what it may be."""
+        (weights, rate), (weights_, rate_) = units(walk.y, walk.rates), units(new, later)
+        # by the larger and faster of both ends: a body that a torque sets in motion is not held
+        # to digits of what it had at rest
+        weights = [jnp.minimum(a, b) for a, b in zip(weights, weights_)]
+        rate = jnp.maximum(rate, rate_)
+        last, before = (_size(weights, e) for e in (found.last, found.before))
+        error = CALIBRATED * last * jnp.where(last < before, last / before, 1)
+        if limits.jumps:
+            error = error + _missed(rates, t, h, walk, new, later, weights)
+            fall = (width / jnp.where(walk.refused[1] > 0, walk.refused[1], 1)) ** given.order
+            rough = (walk.refused[1] > 0) & (error > 2 * fall * walk.refused[0])
+            error = jnp.where(rough & (error > 128 * eps), ROUGH * error, error)
+        angle = rate * width
+        whole = walk.turned + angle + rate * (length - walk.gone - width + rest)
+        whole = jnp.maximum(whole, 1)
+        allowed = SHARE * limits.rtol * angle / (whole * jnp.maximum(whole / LONG, 1) ** DRIFT)
+        allowed = jnp.maximum(allowed, ROUNDING * eps)
+        sound = jnp.isfinite(error) & jnp.isfinite(angle)  # a step may well end beyond all numbers
+        error, allowed = jnp.where(sound, error, jnp.inf), jnp.where(sound, allowed, 1)
+        return jax.lax.stop_gradient((error, allowed, jnp.where(sound, angle, 0)))
+
+    def one(walk):
+        left = length - walk.gone
+        # no step is much shorter than its neighbours for the sake of the end
+        width = jnp.where(left <= walk.width, left, jnp.minimum(walk.width, left / 2))
+        width = jnp.where(live(walk), width, 0)
+        gone, h = (x if own else jnp.max(x) for x in (walk.gone, width))
+        t, h = start + sign * gone.astype(start.dtype), sign.astype(dtype) * h
+        found = extrapolated(rates, given, t, h, walk.y, walk.rates, walk.integrals, compensated)
+        low = walk.low
+        new = found.change
+        if compensated:
+            new, low = carried_on(walk.y, walk.low, found.change)
+        later, _ = rates(t + h.astype(t.dtype), new, False)
+        error, allowed, angle = judged(walk, t, h, width, new, found, later)
+        ratio = worst(error / allowed, given_up(walk))
+        good = (ratio <= 1) & live(walk)
+        sound = jnp.maximum(ratio, 1e-6)
+        follows = CAUTION * sound**-power * walk.before ** (MEMORY * power)
+        again = CAUTION * sound**-power
+        factor = jnp.where(good, jnp.clip(follows, 0.2, 4), jnp.clip(again, 0.1, 0.9))
+        wanted = jnp.where(good & (width < walk.width), jnp.maximum(walk.width, width * factor),
+                           width * factor)  # fmt: skip
+        wanted = jnp.where(live(walk), wanted, walk.width)
+        gone = jnp.where(good, jnp.where(width == left, length, walk.gone + width), walk.gone)
+
+        def pick(a, b):
+            return [jnp.where(good, x, y) for x, y in zip(a, b)]
+
+        refused = (good, 0, error), (good, 0, width)
+        return _Walk(
+            walk.tried + 1, gone, pick(new, walk.y), pick(later, walk.rates), pick(low, walk.low),
+            _picked(good, found.sums, walk.integrals), wanted, jnp.where(good, sound, walk.before),
+            tuple(jnp.where(*x) for x in refused),
+            walk.turned + jnp.where(good, angle, 0), walk.error + jnp.where(good, error, 0),
+            walk.steps + jnp.where(good, 1, 0),
+        )  # fmt: skip
+
+    first, _ = rates(start, y, False)
+    _, rate = units(y, first)
+    # at first half of what a smooth motion allows, at once the whole way if that is short
+    guess = 4 * limits.rtol.astype(dtype) ** power / jnp.maximum(rate, 1 / (length + rest))
+    guess = jnp.where(progress.width > 0, progress.width, guess)  # NaN where the rates are
+    guess = jax.lax.stop_gradient(guess)
+    if not own:
+        sound = jnp.where(guess > 0, guess, jnp.inf)  # a body that is no number holds up no other
+        guess = jnp.where(guess > 0, jnp.min(sound), guess)
+    walk = _Walk(
+        jnp.zeros((), start.dtype), zero, y, first, progress.low, integrals, guess, zero + 1,
+        (zero, zero), progress.turned, progress.error, progress.steps,
+    )  # fmt: skip
+
+    def on(walk):
+        return (jnp.sum(jnp.where(live(walk), 1, 0)) > 0) & (walk.tried < _TRIES * limits.steps)
+
+    walk = jax.lax.while_loop(on, one, walk)
+    arrived = (walk.gone >= length) & (progress.ended == 0)
+    y = [jnp.where(arrived, x, jnp.nan) for x in walk.y]
+    numbers = jnp.isfinite(walk.width) & jnp.isfinite(walk.refused[0])
+    left = (walk.steps < limits.steps) & (walk.tried < _TRIES * limits.steps)
+    why = jnp.where(left, jnp.where(numbers, 2, 3), 1)
+    ended = jnp.where(arrived, 0, jnp.where(progress.ended > 0, progress.ended, why))
+    gone = progress.gone + whole_length
+    new = Progress(
+        walk.width, walk.turned, walk.low, walk.steps, walk.error, gone, ended.astype(jnp.int32)
+    )
+    return y, walk.integrals, new
+
+
+def _picked(good, new, old):
+    """Integrals of shapes that all bodies share are kept or dropped with the step they share."""
+    return [
+        jnp.where(good if x.shape == good.shape else jnp.any(good), x, y) for x, y in zip(new, old)
+    ]
+
+
+def _size(weights: list[Array], error: list[Array]) -> Array:
+    square = sum((w * e) ** 2 for w, e in zip(weights, error))
+    return jnp.sqrt(jax.lax.stop_gradient(square))
+
+
+def _missed(rates, t, width, walk, new, later, weights) -> Array:
+    """Error by rates that jump beside an end of a step, unseen by its estimate.
+
+    No column of the midpoint rule looks between either end of a step and its first or last
+    substep but at the end itself, and steps that are refused again and again near a jump end up
+    with it there. Along a straight line, the tangent at the start or the chord at the end,
+    differences of smooth rates fall with their order; those of rates that jump do not.
+    """
+    gap = GAP * width
+    chord = [GAP * (a - b) for a, b in zip(walk.y, new)]
+    tangent = [gap * f for f in walk.rates]
+    total = jnp.zeros_like(walk.width)
+    eps = float(jnp.finfo(width.dtype).eps)
+    for base, there, part, sign, at in (
+        (walk.y, walk.rates, tangent, 1, t),
+        (new, later, chord, -1, t + width),
+    ):
+        rows = [there]
+        for k in (1, 2, 3):
+            now = (at + sign * k * gap).reshape(-1)[0]
+            rows.append(rates(now, [a + k * b for a, b in zip(base, part)], False)[0])
+        sizes = []
+        for _ in range(3):
+            rows = [[b - a for a, b in zip(p, q)] for p, q in pairwise(rows)]
+            sizes.append(_size(weights, rows[0]))
+        first, second, third = sizes
+        noise = 64 * eps * _size(weights, there)
+        jumps = third > jnp.maximum(0.5 * jnp.maximum(second, 0.5 * first), noise)
+        total = total + jnp.where(jumps, third * jnp.abs(4 * gap), 0)
+    return total
+
+
+class GroupUnits(eqx.Module):
+    """Natural units of any state: each subtree at its top is a vector, measured by its length.
+
+    What is zero is measured by what its rate makes of it in the time ``span`` [s].
+    """
+
+    groups: tuple[int, ...] = eqx.field(static=True)
+    span: Array
+
+    @classmethod
+    def of(cls, y: Any, span: Array) -> "GroupUnits":
+        """Of states like ``y``."""
+        parts = [y] if eqx.is_array(y) else jax.tree.leaves(y, is_leaf=lambda x: x is not y)
+        return cls(tuple(len(jax.tree.leaves(part)) for part in parts), span)
+
+    def __call__(self, y: list[Array], rates: list[Array]) -> tuple[list[Array], Array]:
+        weights, square, start = [], jnp.zeros_like(y[0]), 0
+        for count in self.groups:
+            these = slice(start, start + count)
+            size = sum(x * x for x in y[these])
+            size = size + 1e-6 * sum((self.span.astype(x.dtype) * x) ** 2 for x in rates[these])
+            weight = 1 / jnp.sqrt(jnp.where(size > 0, size, 1))
+            square = square + sum((weight * x) ** 2 for x in rates[these])
+            weights += [weight] * count
+            start += count
+        return weights, jnp.sqrt(square)

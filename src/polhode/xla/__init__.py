@@ -1,0 +1,9 @@
+"""What makes XLA's CPU backend fast: one compiled unit, coefficients folded beforehand.
+
+Nothing here changes a result by more than rounding; ``POLHODE_PLAIN=1`` in the environment switches
+all of it off. `README.md` beside this file says what each part buys.
+"""
+
+from polhode.xla._fold import Specialised as Specialised, specialise as specialise
+from polhode.xla._single_call import apart as apart, kernel as kernel
+from polhode.xla._switch import is_plain as is_plain

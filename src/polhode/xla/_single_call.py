@@ -1,0 +1,184 @@
+"""One compiled unit for a piece of a program."""
+
+from collections.abc import Callable, Sequence
+from contextvars import ContextVar
+from functools import reduce
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.custom_derivatives import SymbolicZero
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.interpreters import ad, partial_eval
+from jax.sharding import AxisType
+
+from polhode.xla._switch import is_plain
+
+_HOLDABLE = frozenset(
+    """abs add add_any and atan atan2 bitcast_convert_type broadcast_in_dim ceil clamp
+     concatenate cond convert_element_type copy cos cosh custom_jvp_call div dynamic_slice
+     dynamic_update_slice eq exp exp2 expm1 floor ge gt integer_pow iota is_finite jit le log
+     log1p logistic lt max min mul ne neg not or pad pjit pow reduce_and reduce_max reduce_min
+     reduce_or reduce_sum rem reshape round
+     rsqrt scan select_n shift_right_arithmetic sign sin sinh slice split sqrt square squeeze
+     stack stop_gradient sub tan tanh transpose unstack while xor""".split()  # noqa: SIM905
+)
+"""Operations that a single compiled unit may hold; anything else keeps the usual way."""
+
+_ANALYSING = ContextVar("analysing", default=False)
+"""Set while a unit is looked through: the units inside it then show what they are made of."""
+
+
+def kernel(fn: Callable, *, linearised: bool = False) -> Callable:
+    """``fn`` compiled by XLA's CPU backend as one function instead of one task per array.
+
+    A step is made of many short loops over the bodies. As separate tasks each costs a dispatch,
+    and fusion across them repeats the work of one in the next; and a function for each takes
+    longer to compile than one for all. The mark keeps the call and asks for a single function; it
+    is a hint that changes no value. It is given on the CPU only and to plain arithmetic only.
+
+    Derivatives are those of ``fn``, unmarked; with ``linearised`` the value and all coefficients of
+    its derivative are a unit again, and only the linear map that is left is not. That suits
+    functions without loops of unknown length.
+    """
+
+    def call(*operands):
+        if _ANALYSING.get() or not _is_of_use():
+            return fn(*operands)
+        leaves, tree = jax.tree.flatten(operands)
+        if not any(isinstance(leaf, Tracer) for leaf in leaves):
+            return fn(*operands)  # run at once, the mark would reach every call inside as well
+        analysing = _ANALYSING.set(True)
+        try:
+            closed, shape = jax.make_jaxpr(
+                lambda *given: fn(*jax.tree.unflatten(tree, given)), return_shape=True
+            )(*leaves)
+        finally:
+            _ANALYSING.reset(analysing)
+        if not _is_holdable(closed.jaxpr):
+            return fn(*operands)
+        # What fn closes over becomes an operand: it may be differentiated.
+        count = len(closed.consts)
+
+        def flat(*given):
+            return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, given[:count]))(*given[count:])
+
+        found = _unit(flat, linearised)(*closed.consts, *leaves)
+        return jax.tree.unflatten(jax.tree.structure(shape), found)
+
+    return call
+
+
+def apart(fn: Callable, *operands, when: jax.Array) -> Any:
+    """``fn(*operands)``, worked out once even where many results of a ``kernel`` need it.
+
+    XLA's CPU backend would form it again for each of them, but not what a branch returns. ``when``
+    is true, which XLA must not know; ``fn`` returns arrays as its first operand.
+    """
+    if not _is_of_use():
+        return fn(*operands)
+    return jax.lax.cond(when, fn, lambda first, *_: first, *operands)
+
+
+def _is_of_use() -> bool:
+    """On the CPU, and not where XLA may divide arrays among devices: a unit cannot be divided."""
+    if jax.default_backend() != "cpu" or is_plain():
+        return False
+    kinds = jax.sharding.get_abstract_mesh().axis_types
+    by_hand = len(kinds) > 0 and all(kind is AxisType.Manual for kind in kinds)
+    return by_hand or jax.device_count() == 1
+
+
+def _is_holdable(jaxpr) -> bool:
+    for equation in jaxpr.eqns:
+        if equation.primitive.name not in _HOLDABLE:
+            return False
+        for value in jax.tree.leaves(
+            list(equation.params.values()), is_leaf=lambda v: hasattr(v, "eqns")
+        ):
+            nested = getattr(value, "jaxpr", value)
+            if hasattr(nested, "eqns") and not _is_holdable(nested):
+                return False
+    return all(_is_packable(v.aval.dtype) for v in (*jaxpr.invars, *jaxpr.constvars))
+
+
+def _is_packable(dtype) -> bool:
+    """Numbers and truth values; not random keys, nor tangents of integers."""
+    return isinstance(dtype, np.dtype) and dtype != jax.dtypes.float0
+
+
+def _unit(flat: Callable, linearised: bool) -> Callable:
+    """``flat``, a function of arrays with a list of results, as one unit, differentiable."""
+
+    @jax.custom_jvp
+    def marked(*leaves):
+        return _marked(flat, leaves)
+
+    def derivative(leaves, tangents):
+        # What has no tangent stays a constant: its derivative is not worked out at all.
+        moving = [k for k, d in enumerate(tangents) if not isinstance(d, SymbolicZero)]
+
+        def of_moving(whole, given):
+            whole = dict(enumerate(whole)) | dict(zip(moving, given, strict=True))
+            return flat(*whole.values())
+
+        # A derivative of the coefficients takes twice as long to compile as one of the formulas.
+        again = any(isinstance(x, ad.JVPTracer) for x in leaves)
+        if again or not linearised:
+            given = [leaves[k] for k in moving], [tangents[k] for k in moving]
+            return jax.jvp(lambda *x: of_moving(leaves, x), *given)
+        shape = []
+
+        def known(*leaves):
+            value, linear = jax.linearize(
+                lambda *x: of_moving(leaves, x), *(leaves[k] for k in moving)
+            )
+            kept, tree = jax.tree.flatten(linear)
+            shape[:] = [tree, len(value)]
+            return [*value, *kept]
+
+        found = _unit(known, linearised=False)(*leaves)
+        tree, count = shape
+        # Not marked: transposed, it would carry operands that go unused.
+        linear = jax.tree.unflatten(tree, found[count:])
+        return found[:count], linear(*(tangents[k] for k in moving))
+
+    marked.defjvp(derivative, symbolic_zeros=True)
+    return marked
+
+
+def _marked(flat: Callable, given: Sequence[Any]) -> list[jax.Array]:
+    """The marked call of ``flat``, all of whose operands are surely used.
+
+    XLA ends the process over an operand of such a call that goes unused, and it folds away what a
+    program merely seems to use. One operand more is therefore two zeros that XLA cannot know: every
+    result is taken on the condition that the first is zero or a number of any operand is not.
+    """
+    closed = jax.make_jaxpr(flat)(*given)
+    jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals))
+    needed = [jnp.asarray(x) for x, keep in zip(given, used, strict=True) if keep]
+    operands = [x for x in needed if x.size]
+    if not operands:
+        return flat(*given)
+    empty = {k: (x.shape, x.dtype) for k, x in enumerate(needed) if not x.size}
+    # Behind a barrier, for XLA moves constants into what is called.
+    zeros, *operands = jax.lax.optimization_barrier([jnp.zeros(2, jnp.float32), *operands])
+
+    def whole(zeros, *operands):
+        with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):  # the call's own only
+            every = list(operands)
+            for k, (shape, dtype) in empty.items():
+                every.insert(k, jnp.zeros(shape, dtype))
+            found = jaxpr_as_fun(ClosedJaxpr(jaxpr, closed.consts))(*every)
+            firsts = (x[(0,) * x.ndim].astype(bool) for x in operands)
+            sure = reduce(jnp.logical_or, firsts, zeros[0] == 0)
+            return [
+                jax.lax.select(sure, x, jnp.broadcast_to(zeros[1].astype(x.dtype), x.shape))
+                for x in found
+            ]
+
+    with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+        return jax.jit(whole)(zeros, *operands)

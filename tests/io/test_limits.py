@@ -1,0 +1,76 @@
+"""Files made to keep the parser busy or to break it: refused at once, with the place named."""
+
+import time
+
+import pytest
+
+from polhode.io import SceneFileError, parse_scene, read_scene
+
+HEAD = "[inertia]\nmoments = [1.0, 2.0, 2.5]\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "hints"),
+    [
+        (HEAD + "x" + ".a" * 5000 + " = 1", ["nested too deeply", "line 3"]),
+        (HEAD + "[x" + " . a" * 50_000 + "]", ["nested too deeply"]),
+        ("[inertia]\nmoments = " + "[" * 100_000, ["[inertia] moments", "brackets", "line 2"]),
+        ("[inertia]\nmoments = " + "{a=" * 3000, ["[inertia] moments", "brackets"]),
+        ("[times]\nnumber = " + "9" * 5000, ["[times] number", "5,000 characters", "line 2"]),
+        ("[times]\nnumber = 0x" + "f" * 50_000, ["[times] number", "50,002 characters"]),
+        ("[times]\nnumber = 0x" + "f" * 3900, ["[times] stop", "missing key"]),
+        ("a" * 100_000 + " = 1", ["a number or key"]),
+        ("title = '''" + "\n[" * 50, ["title", "brackets"]),
+        ("title = \"" + "\\u0000" * 10 + '"\n' + HEAD, ["state", "missing"]),
+    ],
+)  # fmt: skip
+def test_what_would_take_the_parser_long_is_refused_at_once(text, hints):
+    began = time.perf_counter()
+    with pytest.raises(SceneFileError) as caught:
+        parse_scene(text, "big.toml")
+    assert time.perf_counter() - began < 1.0
+    message = str(caught.value)
+    assert message.startswith("big.toml: ")
+    assert len(message) < 700
+    for hint in hints:
+        assert hint in message
+
+
+def test_what_is_in_texts_and_comments_is_not_nested():
+    text = HEAD + "# [[[[[[[[[[[[[[[[[[[[[[[\n[state]\nomega_body = [0, 1, 0]\n[times]\nstop = 1\n"
+    text = 'title = "' + "[{" * 40 + ".a" * 40 + '\\""\n' + text + "number = 2\n"
+    assert parse_scene(text, "a.toml").title.startswith("[{[{")
+
+
+def test_a_file_without_an_end_is_refused(tmp_path):
+    with pytest.raises(SceneFileError, match="too large"):
+        read_scene("/dev/zero")
+    big = tmp_path / "big.toml"
+    big.write_bytes(b"#" * 2**24 + b"#\n")
+    with pytest.raises(SceneFileError, match="too large"):
+        read_scene(big)
+    with pytest.raises(SceneFileError, match="null byte"):
+        read_scene("a\0b")
+
+
+def test_the_schema_and_the_page_name_the_same_keys():
+    """Every key of the schema stands in docs/scene_files.md, and a scene of every kind fits."""
+    import re
+    from pathlib import Path
+
+    from polhode.io._models import SceneText
+
+    schema = SceneText.model_json_schema()
+    tables = [schema, *schema["$defs"].values()]
+    keys = {key for table in tables for key in table.get("properties", {})}
+    page = (Path(__file__).parents[2] / "docs" / "scene_files.md").read_text()
+    words = set(re.findall(r"\w+", " ".join(re.findall(r"`+[^`]+`+", page, re.DOTALL))))
+    assert len(keys) > 70
+    assert keys - words == set()
+    # choices too: shapes, kinds, units
+    choices = {c for t in tables for p in t.get("properties", {}).values()
+               for c in (*p.get("enum", ()), p.get("const"))} - {None}  # fmt: skip
+    choices = {c for c in choices if len(c) > 3 or c.isalpha()} - {a for a in choices if len(a) == 3
+                and set(a) <= set("xyz")}  # fmt: skip
+    assert {c for c in choices if c not in page} == set()
+    assert schema["additionalProperties"] is False

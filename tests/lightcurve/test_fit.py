@@ -1,0 +1,144 @@
+"""Tumblers found again from their light alone; derivatives, mirrors, messages."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import polhode as ph
+from benchmarks import light_curves
+from polhode import lightcurve
+from polhode.lightcurve import _fit, _model, _search, _solutions
+
+PHASE = lightcurve.HG1G2()
+
+
+@pytest.fixture(scope="module")
+def seen():
+    curve, truth = light_curves.synthetic(3, 0.02, nights=8, days=12.0, each=16)
+    return curve, truth, curve.points(0.01)
+
+
+@pytest.fixture(scope="module")
+def trial(seen):
+    """Two bodies of given periods, in both modes."""
+    meant = _search.Hypotheses(np.array([1.2, 1.2]), np.array([0.7, 0.7]), np.array([True, False]))
+    return _search.draw(jax.random.key(1), meant, 8, PHASE, 0.0)[0]
+
+
+def test_trial_bodies_have_the_periods_asked(trial):
+    f_phi, f_psi, mode = _solutions.frequencies(trial)
+    np.testing.assert_allclose(f_phi, 1.2, rtol=1e-9)
+    np.testing.assert_allclose(f_psi, 0.7, rtol=1e-2)
+    assert set(mode[:8]) == {ph.Mode.LAM}
+    assert set(mode[8:]) == {ph.Mode.SAM}
+
+
+def test_model_is_that_of_simulate(seen, trial):
+    """Light worked out by the public pieces, one body at a time."""
+    curve, _, points = seen
+    values = _model.magnitudes(PHASE, trial, points)
+    x = np.asarray(trial.unknowns[0])
+    inertia = ph.Inertia(np.stack(_model.moments_of(jnp.asarray(x))))
+    path = ph.simulate(ph.Scene(inertia), ph.State(trial.wxyz[0], x[4:7]), curve.t - curve.t[0])
+    back = ph.rotation.conjugate(path.wxyz)
+    sun, observer = (ph.rotation.rotate(back, jnp.asarray(v)) for v in (curve.sun, curve.observer))
+    axes = np.exp([0.0, *x[2:4]])
+    light = lightcurve.seeliger_ellipsoid(tuple(axes), tuple(sun.T), tuple(observer.T))
+    light = light / (np.pi / 2 * np.prod(axes) ** (2 / 3))
+    alpha = jnp.asarray(curve.alpha)
+    expected = -2.5 * jnp.log10(light / lightcurve.seeliger_sphere(alpha))
+    expected = expected + PHASE.magnitudes(alpha, jnp.asarray(x[7:9]))
+    np.testing.assert_allclose(values[0, : curve.t.size], expected, atol=1e-9)
+
+
+def test_derivatives_by_every_unknown(seen, trial):
+    _, _, points = seen
+    value, slopes = _model.magnitudes_and_slopes(PHASE, trial, points)
+    np.testing.assert_allclose(value, _model.magnitudes(PHASE, trial, points), atol=1e-12)
+    look = jax.jit(lambda step: _model.magnitudes(PHASE, _model.stepped(trial, step[None]), points))
+    size = 1e-6
+    for k in range(slopes.shape[-1]):
+        e = size * jnp.eye(slopes.shape[-1])[k]
+        measured = (look(e) - look(-e)) / (2 * size)
+        scale = jnp.max(jnp.abs(slopes[..., k]))
+        np.testing.assert_allclose(slopes[..., k] / scale, measured / scale, atol=1e-6)
+
+
+def test_mirror_gives_the_same_light(trial):
+    t = np.linspace(0, 5, 128)
+    sun, observer = np.tile([1.0, 0, 0], (128, 1)), np.tile([0.6, 0.48, 0.64], (128, 1))
+    curve = lightcurve.LightCurve.of(t, 0 * t, sun, observer)
+    normal = _fit._mirrors(curve)[0]
+    points = curve.points(0.01)
+    image = _fit._mirrored(jax.tree.map(np.asarray, trial), normal)
+    np.testing.assert_allclose(
+        _model.magnitudes(PHASE, image, points), _model.magnitudes(PHASE, trial, points), atol=1e-9
+    )
+    turned = 2 * normal * (_solutions.momentum(trial) @ normal)[:, None] - _solutions.momentum(
+        trial
+    )
+    np.testing.assert_allclose(_solutions.momentum(image), turned, atol=1e-9)
+
+
+def test_a_tumbler_is_found_again():
+    """One night of one geometry, with a gap: the body, or its mirror image."""
+    minute, rng = 1 / 1440, np.random.default_rng(1)
+    square = np.array([1.0, 0.6, 0.4]) ** 2
+    inertia = ph.Inertia(square.sum() - square)
+    start = ph.State([0.9, 0.1, -0.3, 0.3], np.array([0.45, 0.15, 0.2]) / minute)
+    truth = ph.periods(inertia, start)
+    t = np.sort(rng.uniform(0, 150, 250)) * minute
+    t = t[(t < 60 * minute) | (t > 75 * minute)]
+    sun, observer = np.array([1.0, 0, 0]), np.array([np.cos(0.7), np.sin(0.7), 0])
+    sun, observer = (np.tile(v, (t.size, 1)) for v in (sun, observer))
+    blank = lightcurve.LightCurve.of(t, 0 * t, sun, observer, sigma=0.02)
+    x = np.r_[np.log(square[1:]) / 2, np.log(square[1:]) / 2, start.omega_body]
+    body = _model.Bodies(jnp.asarray(x)[None], start.wxyz[None])
+    light = _model.magnitudes(lightcurve.SeeligerPhase(), body, blank.points(0.01))[0, : t.size]
+    curve = blank._replace(magnitude=np.asarray(light) + 0.02 * rng.normal(size=t.size))
+    fit = lightcurve.fit_light_curve(curve, floor=0.005, trials=8_000, starts=64)
+    best, text = fit.best, lightcurve.table(fit)
+    assert int(best.mode) == int(truth.mode), text
+    # the first time of the light curve is not that of the state: periods do not change
+    assert best.P_phi == pytest.approx(float(truth.P_phi), rel=2e-3), text
+    assert best.P_psi == pytest.approx(float(truth.P_psi), rel=5e-3), text
+    pole = np.asarray(_solutions.momentum(body))[0]
+    pole = np.degrees([np.arctan2(pole[1], pole[0]), np.arcsin(pole[2])])
+    assert min(light_curves.apart(s.pole, pole) for s in fit.solutions[:4]) < 15, text
+    assert best.rms < 0.025
+    costs = [s.cost for s in fit.solutions]
+    assert costs == sorted(costs)
+    assert all(note in text for note in fit.notes)
+
+
+def test_without_directions_only_frequencies(tmp_path):
+    t = np.linspace(0, 1, 60)
+    path = tmp_path / "points.csv"
+    rows = [f"{a},{10 + np.sin(20 * a) + 0.5 * np.sin(33 * a)}" for a in t]
+    path.write_text("\n".join(["t,mag", *rows]))
+    said = []
+    assert lightcurve.run(path, say=said.append) is None
+    assert "f_phi" in "\n".join(said)
+    assert any("no body can be fitted" in line for line in said)
+    with pytest.raises(ValueError, match="no vectors"):
+        lightcurve.fit_light_curve(lightcurve.read_light_curve(path))
+
+
+def test_tc4_in_the_night_of_2012(shared, tmp_path):
+    """Published: 12.25 and 8.5 = 1 / (1/12.23 + 1/27.8) min, long-axis mode (Lee et al. 2021)."""
+    folder = shared / "data" / "light_curves"
+    if not folder.exists():
+        pytest.skip("the folder of light curves is absent")
+    pytest.importorskip("matplotlib")
+    said = []
+    fit = lightcurve.run(
+        folder / "tc4_2012.csv", vectors=folder / "tc4_2012_vectors.csv", trials=30_000,
+        output=tmp_path / "tc4", say=said.append,
+    )  # fmt: skip
+    assert fit.best.mode == ph.Mode.LAM
+    assert fit.best.P_phi * 1440 == pytest.approx(12.23, abs=0.05)
+    assert fit.best.P_psi * 1440 == pytest.approx(27.8, abs=0.3)
+    assert any(s.mirror_of is not None for s in fit.solutions)
+    assert (tmp_path / "tc4.png").stat().st_size > 10_000
+    assert "solutions" in (tmp_path / "tc4.json").read_text()

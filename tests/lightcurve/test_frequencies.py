@@ -1,0 +1,59 @@
+"""Two-dimensional Fourier series against sums over the points, and what pairs mean."""
+
+import numpy as np
+import pytest
+
+from polhode import lightcurve
+from polhode.lightcurve import _frequencies, _search
+
+F_PHI, F_PSI = 1.7, 0.6
+
+
+@pytest.fixture(scope="module")
+def series():
+    """A series of sums of multiples of F_PHI and 2 F_PSI with gaps, an offset a night, noise."""
+    rng = np.random.default_rng(3)
+    t = np.sort(np.concatenate([k + 0.4 * rng.uniform(size=40) for k in (0, 1, 2, 4, 7, 8)]))
+    night = np.floor(t)
+    value = sum(
+        a * np.cos(2 * np.pi * (i * F_PHI + j * F_PSI) * t + p)
+        for i, j, a, p in ((2, 0, 0.3, 1.0), (2, 2, 0.2, 2.0), (1, 2, 0.1, 0.5))
+    )
+    value = value + 0.01 * rng.normal(size=t.size) + 0.1 * night
+    return t, value, (night[None] == np.unique(night)[:, None]).astype(float)
+
+
+@pytest.mark.parametrize("even", [True, False])
+def test_pairs_explain_what_least_squares_say(series, even):
+    t, value, columns = series
+    found = lightcurve.fourier_pairs(
+        t, value, columns=columns, highest=4.0, even=even, order=2 if even else 1, keep=200
+    )
+    basis = [columns.T]
+    multiples = _frequencies.terms(2 if even else 1, even)
+    for k in (0, 5):
+        phases = 2 * np.pi * np.outer(t, multiples @ [found.f_phi[k], found.f_psi[k]])
+        whole = np.hstack([*basis, np.cos(phases), np.sin(phases)])
+        left = [value - m @ np.linalg.lstsq(m, value, rcond=None)[0] for m in (columns.T, whole)]
+        explained = 1 - np.sum(left[1] ** 2) / np.sum(left[0] ** 2)
+        # sums near a multiple of one a day are almost constants of the nights
+        assert found.explained[k] == pytest.approx(explained, abs=0.01)
+    assert found.explained[0] > 0.9
+
+
+def test_hypotheses_hold_the_pair_itself(series):
+    t, value, columns = series
+    found = lightcurve.fourier_pairs(t, value, columns=columns, highest=5.0, order=1, even=False)
+    meant = _search.hypotheses(found)
+    near = np.hypot(meant.f_phi - F_PHI, meant.f_psi - F_PSI) < 0.5 * found.resolution
+    assert set(meant.long_axis[near]) == {True, False}
+    # no moment exceeds the sum of the other two: SAM turns no slower about L than its long axis
+    assert np.all(meant.long_axis | (meant.f_psi <= meant.f_phi))
+
+
+def test_meaning_names_mode_and_sums():
+    assert lightcurve.meaning(2.0, 1.0).startswith("LAM or SAM")
+    text = lightcurve.meaning(1.0, 2.0)
+    assert text.startswith("LAM only")
+    assert "f_phi = 1" in text
+    assert "2 f_phi = 2" in text

@@ -1,0 +1,114 @@
+"""Readers of light curves: what they take, what they assume, and what they say of bad files."""
+
+import numpy as np
+import pytest
+
+from polhode import lightcurve
+from polhode.lightcurve._data import LIGHT_TIME
+
+ROWS = 9
+JD = 2456210.6 + 0.01 * np.arange(ROWS)
+MAGNITUDE = 12.0 + 0.1 * np.sin(np.arange(ROWS))
+SUN, OBSERVER = np.array([-2.0, 0.1, 0.0]), np.array([-1.0, 0.2, 0.1])
+
+
+def _write(path, header, rows):
+    path.write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]) + "\n")
+    return path
+
+
+@pytest.fixture
+def table(tmp_path):
+    header = "JD,mag,mag_err,night,sun_x,sun_y,sun_z,earth_x,earth_y,earth_z"
+    rows = [
+        (t, m, 0.02, "ab"[k % 2], *SUN, *OBSERVER) for k, (t, m) in enumerate(zip(JD, MAGNITUDE))
+    ]
+    return _write(tmp_path / "curve.csv", header, rows)
+
+
+def test_table_is_reduced_to_unit_distance_and_to_the_body(table):
+    curve = lightcurve.read_light_curve(table)
+    r, delta = np.linalg.norm(SUN), np.linalg.norm(OBSERVER)
+    np.testing.assert_allclose(curve.t, JD - LIGHT_TIME * delta, atol=1e-9)
+    np.testing.assert_allclose(curve.magnitude, MAGNITUDE - 5 * np.log10(r * delta))
+    np.testing.assert_allclose(curve.sun[0], SUN / r)
+    assert curve.names == ("a", "b")
+    assert np.all(curve.sigma == 0.02)
+    cosine = SUN @ OBSERVER / r / delta
+    np.testing.assert_allclose(np.cos(curve.alpha), cosine)
+
+
+def test_flux_and_vectors_from_another_file(tmp_path):
+    flux = 10 ** (-0.4 * (MAGNITUDE - MAGNITUDE.mean()))
+    flux /= flux.mean()
+    path = _write(tmp_path / "flux.csv", "jd,brightness", zip(JD, flux))
+    names = ",".join(f"{b}_{c}" for b in ("sun", "observer") for c in "xyz")
+    ends = [(JD[0] - 0.01, *SUN, *OBSERVER), (JD[-1] + 0.01, *(SUN + 0.1), *OBSERVER)]
+    vectors = _write(tmp_path / "vectors.csv", f"jd,{names}", ends)
+    curve = lightcurve.read_light_curve(path, vectors)
+    np.testing.assert_allclose(curve.magnitude, -2.5 * np.log10(flux))
+    middle = SUN + 0.1 * (JD - JD[0] + 0.01)[:, None] / (JD[-1] - JD[0] + 0.02)
+    np.testing.assert_allclose(
+        curve.sun, middle / np.linalg.norm(middle, axis=1)[:, None], atol=1e-9
+    )
+    assert "mean 1" in curve.notes[0]
+    assert lightcurve.read_light_curve(path).sun is None
+
+
+def test_damit(tmp_path):
+    block = [
+        f"{t} {10 ** (-0.4 * m)} " + " ".join(map(str, (*SUN, *OBSERVER)))
+        for t, m in zip(JD, MAGNITUDE)
+    ]
+    path = tmp_path / "lc.txt"
+    path.write_text("\n".join(["2", f"{ROWS} 0", *block, f"{ROWS} 1", *block]) + "\n")
+    curve = lightcurve.read_light_curve(path)
+    assert curve.t.size == 2 * ROWS
+    assert len(curve.names) == 2
+    assert not curve.calibrated  # one of them is relative
+    np.testing.assert_allclose(curve.t[::2], JD)  # corrected for light time by definition
+    np.testing.assert_allclose(curve.magnitude[::2], MAGNITUDE)
+    path.write_text("\n".join(["2", f"{ROWS} 0", *block]))
+    with pytest.raises(ValueError, match="announces 2 light curves and holds 1"):
+        lightcurve.read_light_curve(path)
+
+
+def test_alcdef(tmp_path):
+    head = ["STARTMETADATA", "OBJECTNAME=Test", "DELIMITER=PIPE", "PHASE=10.0", "PABL=90.0",
+            "PABB=0.0", "ENDMETADATA"]  # fmt: skip
+    data = [f"DATA={t}|{m}|0.01" for t, m in zip(JD, MAGNITUDE)]
+    path = tmp_path / "alcdef.txt"
+    path.write_text("\n".join([*head, *data, "ENDDATA", *head, *data, "ENDDATA"]))
+    curve = lightcurve.read_light_curve(path)
+    assert len(curve.names) == 2
+    np.testing.assert_allclose(curve.alpha, np.radians(10))
+    np.testing.assert_allclose((curve.sun + curve.observer)[:, 1], -2 * np.cos(np.radians(5)))
+    assert any("approximate" in note for note in curve.notes)
+    path.write_text("\n".join([*(x for x in head if "PAB" not in x), *data]))
+    assert lightcurve.read_light_curve(path).sun is None
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "empty"),
+        ("jd,mag\n" + "1,2\n" * 3, "at least 8"),
+        ("jd,colour\n" + "1,2\n" * 9, "must have a column"),
+        ("jd,mag\n1,2\n1,x\n", "line 3, mag must be a number, got 'x'"),
+        ("jd,mag\n1,2,3\n", "line 2 has 3 cells"),
+        ("jd,flux\n1,1\n2,-1\n", "line 3: a flux must be positive"),
+        ("jd,mag,sun_x\n1,2,3\n", "lacks the columns sun_y"),
+    ],
+)
+def test_bad_files_are_named(tmp_path, text, message):
+    path = tmp_path / "bad.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        lightcurve.read_light_curve(path)
+
+
+def test_shapes_are_checked():
+    with pytest.raises(ValueError, match=r"sun must have shape \(9, 3\)"):
+        lightcurve.LightCurve.of(JD, MAGNITUDE, np.ones((8, 3)), np.ones((9, 3)))
+    with pytest.raises(ValueError, match="neither"):
+        lightcurve.LightCurve.of(JD, MAGNITUDE, np.ones((9, 3)))

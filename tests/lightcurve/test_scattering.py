@@ -1,0 +1,130 @@
+"""Light of ellipsoids, spheres and facets against integration over the surface."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from polhode import lightcurve
+
+RNG = np.random.default_rng(19)
+
+
+def _integrals(axes, sun, observer, n=500):
+    """Lommel-Seeliger and Lambert brightness by quadrature over the surface, from the laws."""
+    z, weight = np.polynomial.legendre.leggauss(n)
+    angle = (np.arange(2 * n) + 0.5) * np.pi / n
+    across = np.sqrt(1 - z * z)
+    unit = np.stack(
+        [across[:, None] * np.cos(angle), across[:, None] * np.sin(angle), z[:, None] + 0 * angle],
+        -1,
+    )
+    normal = unit / axes
+    size = np.linalg.norm(normal, axis=-1)
+    area = np.prod(axes) * size * weight[:, None] * np.pi / n
+    incidence = np.maximum(normal @ sun / size, 0)
+    emergence = np.maximum(normal @ observer / size, 0)
+    total = np.where(incidence + emergence > 0, incidence + emergence, 1)
+    product = incidence * emergence * area
+    return (product / total).sum(), product.sum()
+
+
+def _directions(alpha):
+    sun, other = RNG.normal(size=(2, 3))
+    sun = sun / np.linalg.norm(sun)
+    other = np.cross(sun, other)
+    other = other / np.linalg.norm(other)
+    return sun, np.cos(alpha) * sun + np.sin(alpha) * other
+
+
+ALPHAS = np.radians([0.0, 1e-5, 3.0, 40.0, 90.0, 140.0])
+CASES = [(np.exp(0.5 * RNG.normal(size=3)), *_directions(alpha)) for alpha in ALPHAS]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_ellipsoid_against_integration(case):
+    axes, sun, observer = case
+    value = lightcurve.seeliger_ellipsoid(tuple(axes), tuple(sun), tuple(observer))
+    assert value == pytest.approx(_integrals(axes, sun, observer)[0], rel=1e-4)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_derivatives_of_ellipsoid(case):
+    """Also at opposition, where an angle would have a corner and its logarithm a pole."""
+    whole = jnp.concatenate([jnp.asarray(x) for x in case])
+
+    def value(x):
+        return lightcurve.seeliger_ellipsoid(*(tuple(x[k : k + 3]) for k in (0, 3, 6)))
+
+    slopes = jax.grad(value)(whole)
+    step = 1e-4
+    ends = np.array([[value(whole + s * step * e) for s in (-1, 1)] for e in np.eye(9)])
+    measured = (ends[:, 1] - ends[:, 0]) / (2 * step)
+    # near opposition the third derivative grows as the logarithm of the step
+    np.testing.assert_allclose(slopes, measured, atol=2e-6)
+
+
+def test_sphere_and_darkness():
+    alpha = jnp.radians(jnp.array([0.0, 30.0, 120.0, 180.0]))
+    one, zero = jnp.ones(4), jnp.zeros(4)
+    sun, observer = (one, zero, zero), (jnp.cos(alpha), jnp.sin(alpha), zero)
+    found = lightcurve.seeliger_ellipsoid((one, one, one), sun, observer) / (jnp.pi / 2)
+    half = np.radians([30.0, 120.0]) / 2
+    published = 1 - np.sin(half) * np.tan(half) * np.log(1 / np.tan(half / 2))
+    np.testing.assert_allclose(found[1:3], published, rtol=1e-12)
+    np.testing.assert_allclose(found[0], 1, rtol=1e-14)
+    np.testing.assert_allclose(lightcurve.seeliger_sphere(alpha), found, atol=1e-12)
+    dark = jax.grad(
+        lambda y: lightcurve.seeliger_ellipsoid((1.0, 0.7, y), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
+    )
+    assert dark(0.5) == 0
+
+
+def test_facets_of_ellipsoid_and_of_harmonics():
+    axes, sun, observer = CASES[3]
+    body = lightcurve.Convex.from_ellipsoid(axes, 4000)
+    seeliger, lambert = _integrals(axes, sun, observer)
+    found = body.brightness(jnp.asarray(sun), jnp.asarray(observer), lambert=0.3)
+    assert found == pytest.approx(seeliger + 0.3 * lambert, rel=2e-3)
+    assert body.unclosed < 1e-3
+    # a body given by harmonics of its log density, fitted to those of the ellipsoid
+    density = np.log(np.asarray(body.areas))
+    basis = lightcurve.harmonics(body.normals, 8)
+    coefficients = np.linalg.lstsq(
+        np.asarray(basis).T, density - np.log(4 * np.pi / 4000), rcond=None
+    )[0]
+    again = lightcurve.Convex.from_harmonics(coefficients, 4000)
+    other = again.brightness(jnp.asarray(sun), jnp.asarray(observer), lambert=0.3)
+    assert other == pytest.approx(float(found), rel=0.02)
+
+
+def test_lambert_sphere_and_cube():
+    alpha = np.radians(70.0)
+    sun, observer = jnp.array([1.0, 0, 0]), jnp.array([np.cos(alpha), np.sin(alpha), 0])
+    ball = lightcurve.Convex.from_ellipsoid(jnp.ones(3), 4000)
+    found = ball.brightness(sun, observer, lambert=1.0, seeliger=0.0)
+    law = 2 / 3 * (np.sin(alpha) + (np.pi - alpha) * np.cos(alpha))
+    assert found == pytest.approx(law, rel=1e-3)
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)], float)
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    faces = np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))])
+    cube = lightcurve.Convex.from_mesh(corners, faces)
+    # only the face x = 1 is both lit and seen
+    assert cube.brightness(sun, observer) == pytest.approx(np.cos(alpha) / (1 + np.cos(alpha)))
+
+
+def test_harmonics_are_those_of_scipy():
+    special = pytest.importorskip("scipy.special")
+    directions = RNG.normal(size=(20, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    theta, phi = np.arccos(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])
+    rows = lightcurve.harmonics(jnp.asarray(directions), 5)
+    numbers = [(l, m) for l in range(6) for m in range(-l, l + 1)]
+    for row, (l, m) in zip(rows, numbers, strict=True):
+        value = special.sph_harm_y(l, abs(m), theta, phi) * (np.sqrt(2) * (-1) ** m if m else 1)
+        np.testing.assert_allclose(row, value.imag if m < 0 else value.real, atol=1e-12)
+
+
+def test_harmonics_need_a_square_number():
+    with pytest.raises(ValueError, match=r"1, 4, 9, 16"):
+        lightcurve.Convex.from_harmonics(jnp.zeros(5))

@@ -1,0 +1,101 @@
+"""What is no rotation is refused where it is known, and never read as another rotation."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from polhode import rotation
+from polhode.rotation import Sequence
+
+OF_QUATERNION = [
+    rotation.normalise, rotation.wxyz_to_matrix, rotation.wxyz_to_euler,
+    rotation.wxyz_to_rotation_vector, rotation.wxyz_to_axis_angle, rotation.wxyz_to_shadow,
+    rotation.wxyz_to_modified_rodrigues, rotation.wxyz_to_scipy,
+    lambda q: rotation.rotate(q, [1.0, 2.0, 3.0]),
+    lambda q: rotation.angle_between(q, [1, 0, 0, 0]),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("take", OF_QUATERNION)
+def test_quaternions_that_are_none(take):
+    with pytest.raises(ValueError, match="must not be zero"):
+        take(np.zeros(4))
+    with pytest.raises(ValueError, match="must not be zero"):
+        take(jnp.array([[1.0, 0, 0, 0], [0, 0, 0, 0]]))
+    for odd in ([1.0, 0, 0], np.ones((4, 3)), 1.0):
+        with pytest.raises(ValueError, match=r"shape \(\.\.\., 4\)"):
+            take(odd)
+    for odd in ("abcd", None, [1j, 0, 0, 0], [True, False, False, False]):
+        with pytest.raises(TypeError, match="real numbers"):
+            take(odd)
+    take([1, 0, 0, 0])
+
+
+@pytest.mark.parametrize(
+    ("take", "word"),
+    [
+        (lambda: rotation.rotate([2.0, 0, 0, 0], [1.0, 2, 3]), "unit length.*normalise"),
+        (lambda: rotation.to_matrix([0.0, 0.5, 0, 0]), "unit length, got length 0.5"),
+        (lambda: rotation.axis_angle_to_wxyz([0.0, 0, 2], 1.0), "divide the axis by its length"),
+        (lambda: rotation.axis_angle_to_wxyz([0.0, 0, 0], 1.0), "must not be zero"),
+        (
+            lambda: rotation.rotate([1.0, 0, 0, 0], [1.0, 2]),
+            r"vector must have shape \(\.\.\., 3\)",
+        ),
+        (lambda: rotation.euler_to_wxyz(np.ones(2), np.ones(3), 0.1), "broadcast together"),
+    ],
+)
+def test_wrong_lengths_and_shapes(take, word):
+    with pytest.raises(ValueError, match=word):
+        take()
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        np.diag([1.0, 1, -1]), -np.eye(3), 2 * np.eye(3), np.zeros((3, 3)), np.ones((3, 3)),
+        np.diag([1.0, 1, 1.01]), np.eye(3)[[1, 0, 2]], np.diag([1.0, 0, 0]),
+    ],
+)  # fmt: skip
+def test_matrices_that_are_no_rotations(matrix):
+    for take in (rotation.matrix_to_wxyz, rotation.matrix_to_euler):
+        with pytest.raises(ValueError, match=r"determinant \+1"):
+            take(matrix)
+        with pytest.raises(ValueError, match=r"determinant \+1"):
+            take(np.stack([np.eye(3), matrix]))
+    traced = jax.jit(rotation.matrix_to_wxyz)(jnp.stack([jnp.eye(3), jnp.asarray(matrix)]))
+    np.testing.assert_array_equal(jnp.isnan(traced).all(axis=-1), [False, True])
+
+
+def test_rounded_matrices_pass():
+    wxyz = rotation.normalise(np.random.default_rng(1).normal(size=(200, 4)))
+    matrix = np.round(np.asarray(rotation.to_matrix(wxyz)), 4)
+    back = rotation.matrix_to_wxyz(matrix)
+    assert float(jnp.max(rotation.angle_between(wxyz, back))) < 3e-4
+    assert jnp.isnan(rotation.matrix_to_wxyz(np.full((3, 3), np.nan))).all()
+
+
+def test_a_traced_zero_has_no_angles():
+    assert all(jnp.isnan(x) for x in jax.jit(rotation.wxyz_to_euler)(jnp.zeros(4)))
+
+
+@pytest.mark.parametrize("odd", ["ZYX", "zyx", None, 3, Sequence])
+def test_a_sequence_is_one(odd):
+    with pytest.raises(TypeError, match=r"Sequence\.ZYX"):
+        rotation.euler_to_wxyz(0.1, 0.2, 0.3, odd)
+    with pytest.raises(TypeError, match=r"Sequence\.ZYX"):
+        rotation.wxyz_to_euler([1.0, 0, 0, 0], odd)
+
+
+def test_lists_and_integers_are_arrays():
+    quarter = [0.5**0.5, 0, 0, 0.5**0.5]
+    np.testing.assert_allclose(rotation.rotate(quarter, [1, 2, 3]), [-2, 1, 3], atol=1e-15)
+    np.testing.assert_allclose(
+        rotation.matrix_to_wxyz([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), quarter, atol=1e-15
+    )
+    np.testing.assert_allclose(rotation.multiply([0, 1, 0, 0], [0, 0, 1, 0]), [0, 0, 0, 1])
+    np.testing.assert_allclose(rotation.axis_angle_to_wxyz([0, 0, 1], np.pi / 2), quarter)
+    np.testing.assert_allclose(rotation.rotation_vector_to_wxyz([0, 0, np.pi / 2]), quarter)
+    single = rotation.rotate(jnp.array([1, 0, 0, 0], jnp.float32), jnp.ones(3, jnp.float32))
+    assert single.dtype == jnp.float32

@@ -1,0 +1,111 @@
+"""What any supported set of versions must do: ``python tests/smoke.py [name ...]``.
+
+The README's ten lines, one scene of each kind with value and gradient, in both modes, and a fit;
+names take some of these. versions.py runs it.
+"""
+
+import re
+import sys
+import warnings
+from importlib.metadata import version
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import polhode as ph
+
+jax.config.update("jax_enable_x64", True)
+
+ROOT = Path(__file__).resolve().parents[1]
+MOMENTS = jnp.array([1.0, 1.5, 2.0])
+SYMMETRIC = jnp.array([1.0, 1.0, 0.5])
+TOP = ph.UniformGravity(1.0, [0.0, 0.0, 0.5])
+ORBIT = ph.GravityGradient(2.0, lambda t: jnp.stack([jnp.cos(t), jnp.sin(t), 0.5 + 0 * t]))
+
+
+def general(potential=None, torque=None, rotors=None):
+    return lambda m: ph.Scene(ph.Inertia.from_moments(m), potential, torque, rotors)
+
+
+def symmetric(potential=None, torque=None):
+    return lambda m: ph.Scene(ph.Inertia.axisymmetric(m[0], m[2]), potential, torque)
+
+
+SCENES = {
+    "free": (general(), MOMENTS),
+    "free, symmetric": (symmetric(), SYMMETRIC),
+    "Lagrange's top": (symmetric(ph.UniformGravity.axial(1.0, 0.5)), SYMMETRIC),
+    "heavy top": (general(TOP), MOMENTS),
+    "gravity gradient": (general(ph.GravityGradient(2.0, [0.6, 0.0, 0.8])), MOMENTS),
+    "gravity gradient in orbit": (general(ORBIT), MOMENTS),
+    "any potential": (general(ph.Potential(lambda R, t: R[0, 1] * jnp.cos(t) + R[2, 2])), MOMENTS),
+    "torques": (
+        general(
+            TOP,
+            ph.BodyTorque([0.1, 0.0, -0.1])
+            + ph.SpaceTorque(lambda t: jnp.stack([0 * t, jnp.sin(t), 0 * t]))
+            + ph.LinearDamping(0.05)
+            + ph.QuadraticDamping(0.01),
+        ),
+        MOMENTS,
+    ),
+    "rotor": (general(rotors=ph.Rotor([0.0, 0.0, 1.0], momentum=0.4)), MOMENTS),
+}
+
+
+def check_scene(scene, moments):
+    """The planner's value against another integrator, its gradient against differences."""
+    state = ph.State([0.5, 0.5, 0.5, -0.5], [0.5, -1.0, 0.75])
+
+    def end(m, method=None):
+        found = ph.simulate(scene(m), state, [0.0, 1.5], method, rtol=1e-10)
+        return found.omega_body[-1] @ jnp.array([0.3, 0.5, -0.7]) + found.wxyz[-1, 1]
+
+    value, slope = jax.jit(jax.value_and_grad(end))(moments)
+    np.testing.assert_allclose(value, end(moments, ph.LiePoisson()), rtol=0, atol=1e-8)
+    # two steps that keep a symmetric body symmetric
+    for step in (jnp.array([1.0, 1.0, 0.0]), jnp.array([0.0, 0.0, 1.0])):
+        ends = [end(moments + s * 1e-5 * step) for s in (1, -1)]
+        along = (ends[0] - ends[1]) / 2e-5
+        np.testing.assert_allclose(slope @ step, along, rtol=0, atol=1e-5)
+    pushed = jax.jvp(end, (moments,), (step,))[1]
+    np.testing.assert_allclose(pushed, slope @ step, rtol=0, atol=1e-8)
+
+
+def check_fit():
+    """The shape of a free body out of its rates, to the noise."""
+    times = np.linspace(0, 6, 150)
+    moments = np.array([1.0, 1.6, 2.1])
+    scene = ph.Scene(ph.Inertia.from_moments(moments))
+    rates = ph.simulate(scene, ph.State([1.0, 0, 0, 0], [0.4, 2.0, 0.5]), times).omega_body
+    noise = np.random.default_rng(1).normal(scale=1e-4, size=(150, 3))
+    found = ph.fit_inertia(times, np.asarray(rates) + noise)
+    fitted = np.linalg.eigvalsh(np.asarray(found.inertia.tensor))
+    np.testing.assert_allclose(fitted / fitted.sum(), moments / moments.sum(), rtol=2e-3)
+
+
+def main():
+    warnings.simplefilter("error")
+    packages = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "numpy")
+    print(*(f"{name} {version(name)}" for name in packages), sep=", ")
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    (lines,) = re.findall(r"## Ten lines\n\n```python\n(.*?)```", readme, re.S)
+    exec(lines, {})
+    failed, checks = [], {**SCENES, "fit": None}
+    for name, run in checks.items():
+        if sys.argv[1:] and name not in sys.argv[1:]:
+            continue
+        try:
+            check_scene(*run) if run else check_fit()
+        except Exception as error:
+            failed.append(name)
+            print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr)
+        else:
+            print(f"{name}: good", flush=True)
+    sys.exit(f"failed: {', '.join(failed)}" if failed else 0)
+
+
+if __name__ == "__main__":
+    main()

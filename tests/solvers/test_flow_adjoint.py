@@ -1,0 +1,365 @@
+"""Derivatives of the exact flow, forward and reverse, of any solver, in ``simulate`` and outside.
+
+Against differences of the values, slopes of 40 digits, and motions known in closed form.
+"""
+
+import json
+from functools import partial
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from solvers import make_integrators_truth as bodies
+
+import polhode as ph
+from benchmarks.integrators import heavy_top
+from polhode import rotation
+from polhode.hamiltonian import (
+    Dynamics,
+    Hamiltonian,
+    LiePoissonCostate,
+    LiePoissonUnits,
+    lie_poisson_field,
+)
+from polhode.solvers import Accuracy, Extrapolation, FlowAdjoint
+from polhode.solvers._linear import linear
+
+KEYS = jax.random.split(jax.random.key(7), 8)
+WXYZ = rotation.normalise(jax.random.normal(KEYS[0], (3, 4)))
+OMEGA = jax.random.normal(KEYS[1], (3, 3))
+MOMENTS = jnp.array([[1.0, 1.5, 2.0], [1.2, 1.1, 0.9], [2.0, 1.5, 1.0]])
+METHODS = {  # chunks smaller than the batch
+    "driven": ph.LiePoisson(Extrapolation(12), chunk=2),
+    "satellite": ph.LiePoisson(diffrax.Dopri8(), chunk=2, adjoint=FlowAdjoint(1e-12)),
+}
+
+
+def driven(p):
+    """Gravity, a torque that depends on time through what it closes over, drag that stops it."""
+    push = ph.BodyTorque(lambda t: jnp.stack([jnp.sin(p["rate"] * t), 0 * t, p["rate"] + 0 * t]))
+    weight = ph.UniformGravity(p["rate"], p["centre"], 0 * p["centre"] - 2)
+    drag = ph.LinearDamping(8 * p["centre"])
+    return ph.Scene(ph.Inertia.from_moments(p["moments"]), weight, push + drag)
+
+
+def satellite(p):
+    """A wheel, the gravity gradient of a centre that moves, a torque fixed in space."""
+
+    def position(t):
+        return jnp.stack([jnp.cos(p["rate"] * t), jnp.sin(p["rate"] * t), 0.1 + 0 * t])
+
+    wheel = ph.Rotor([0.0, 0.6, 0.8], 0.1, momentum=p["rate"])
+    pull = ph.GravityGradient(p["centre"][2], position)
+    return ph.Scene(ph.Inertia.from_moments(p["moments"]), pull, ph.SpaceTorque(p["centre"]), wheel)
+
+
+def loss(scene_of, p):
+    """Of three saved states, of all bodies, of the work (which takes the equations of any field for
+    the slopes); ``last`` moves the times."""
+    scene, state = scene_of(p), ph.State(p["wxyz"], p["omega"])
+    ts = jnp.stack([0.2 * p["last"], p["last"] / 2, p["last"]])
+    record = ph.Record(work=scene_of is driven)
+    rtol = 1e-12 if ts.dtype == jnp.float64 else 2e-6
+    end = ph.simulate(scene, state, ts, METHODS[scene_of.__name__], rtol=rtol, record=record)
+    work = 0 if end.work is None else jnp.sum(end.work)
+    return jnp.sum(end.wxyz[:, 1:, 1] ** 2) + jnp.sum(jnp.sin(end.omega_body)) + 0.1 * work
+
+
+def point():
+    return {
+        "moments": MOMENTS, "centre": jnp.array([0.1, 0.0, 0.5]), "rate": jnp.array(0.7),
+        "wxyz": WXYZ, "omega": OMEGA, "last": jnp.array(3.0),
+    }  # fmt: skip
+
+
+def difference(fn, p, direction, h=0.02):
+    """Eighth-order central difference."""
+    weights = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
+    steps = [h * k * s for k in range(1, 5) for s in (1, -1)]
+    values = [fn(jax.tree.map(lambda x, d, a=a: x + a * d, p, direction)) for a in steps]
+    pairs = zip(weights, values[::2], values[1::2])
+    return sum(w * (up - down) for w, up, down in pairs) / h
+
+
+def along(p, seed):
+    """A direction in which every parameter changes."""
+    leaves, tree = jax.tree.flatten(p)
+    keys = jax.random.split(jax.random.key(seed), len(leaves))
+    moves = [0.3 * jax.random.normal(k, x.shape, x.dtype) for k, x in zip(keys, leaves)]
+    return jax.tree.unflatten(tree, moves)
+
+
+@pytest.mark.parametrize("scene_of", [driven, satellite], ids=lambda f: f.__name__)
+def test_both_modes_are_the_slope(scene_of):
+    p = point()
+    direction = along(p, 3)
+    fn = partial(loss, scene_of)
+    want = difference(jax.jit(fn), p, direction)
+    slopes = jax.jit(jax.grad(fn))(p)
+    products = jax.tree.map(lambda s, d: jnp.sum(s * d), slopes, direction)
+    np.testing.assert_allclose(sum(jax.tree.leaves(products)), want, rtol=1e-9)
+    assert all(abs(float(x)) > 1e-6 for x in jax.tree.leaves(products))  # every one takes part
+    _, change = jax.jit(lambda p, d: jax.jvp(fn, (p,), (d,)))(p, direction)
+    np.testing.assert_allclose(change, want, rtol=1e-9)
+    if scene_of is satellite:
+        return
+    single = jax.tree.map(lambda x: x.astype(jnp.float32), p)
+    for exact, found in zip(*map(jax.tree.leaves, (slopes, jax.jit(jax.grad(fn))(single)))):
+        assert found.dtype == jnp.float32
+        np.testing.assert_allclose(found, exact, rtol=0, atol=1e-4 * float(jnp.max(abs(exact))))
+
+
+def value(inverse):
+    """Of heavy tops; each row of ``inverse`` is the reciprocal of one moment, for all bodies."""
+    dtype = inverse.dtype
+    numbers = (jnp.array(x, dtype) for x in (1.0, (0.1, 0.0, 0.5), (0.0, 0.0, -1.0)))
+    unit = ph.Inertia.from_moments(jnp.ones(3, dtype))
+    weight = ph.UniformGravity(*numbers, vertical=True)
+    energy = Hamiltonian(tuple(inverse), unit, weight)
+    units = LiePoissonUnits(jnp.ones(3, dtype), jnp.ones(3, dtype))
+    dynamics = Dynamics(energy, None, units, LiePoissonCostate.of)
+    y = jax.tree.map(lambda x: x.astype(dtype), (tuple(OMEGA.T), tuple(WXYZ.T)))
+    assert LiePoissonCostate.of(dynamics, y, jnp.zeros((), dtype)).row == 2
+    span = jnp.array([0.0, 1.0], dtype)
+    solver = Extrapolation(None, accuracy=Accuracy(1e-12 if dtype == jnp.float64 else 1e-6, 1.0))
+    end = diffrax.diffeqsolve(
+        diffrax.ODETerm(lie_poisson_field), solver, *span, None, y, dynamics,
+        stepsize_controller=diffrax.StepTo(span), adjoint=FlowAdjoint(), max_steps=1,
+    )  # fmt: skip
+    return sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(end.ys))
+
+
+def test_batches_of_slopes_and_second_derivatives():
+    """vmap over gradients, Jacobians both ways, the Hessian, which is symmetric; float32."""
+    point = 1 / MOMENTS.T
+    slopes = jax.jit(jax.vmap(jax.grad(value)))(jnp.stack([point, 1.1 * point]))
+    forward = jax.jit(jax.jacfwd(value))
+    np.testing.assert_allclose(slopes[0], forward(point), rtol=0, atol=1e-11)
+    hessian = jax.jit(jax.jacfwd(jax.grad(value)))(point).reshape(9, 9)
+    np.testing.assert_allclose(hessian, hessian.T, rtol=0, atol=1e-10)
+    step = jax.random.normal(KEYS[2], (3, 3)) / 3
+    change = difference(forward, point, step)
+    np.testing.assert_allclose(hessian @ step.ravel(), change.ravel(), rtol=0, atol=1e-9)
+    single = jax.jit(jax.grad(value))(point.astype(jnp.float32))
+    assert single.dtype == jnp.float32
+    np.testing.assert_allclose(single, slopes[0], rtol=0, atol=1e-5)
+
+
+def test_second_derivatives_of_chunks():
+    """Of bodies moved one chunk after another: the Hessian is that of one chunk, and symmetric."""
+    state, push = ph.State(WXYZ, OMEGA), ph.BodyTorque([0.1, 0.0, -0.2])
+
+    def loss(x, chunk):
+        weight = ph.UniformGravity(1.0, [0.1, 0.0, 0.5], jnp.array([0.0, 0.0, -1.0]) * x[0])
+        scene = ph.Scene(ph.Inertia.from_moments(MOMENTS * x[1]), weight, push)
+        method = ph.LiePoisson(Extrapolation(10), chunk=chunk)
+        record = ph.Record(final_only=True)
+        end = ph.simulate(scene, state, [0.0, 1.0], method, rtol=1e-11, record=record)
+        return jnp.sum(jnp.sin(end.omega_body)) + jnp.sum(end.wxyz[..., 1] ** 2)
+
+    x, step = jnp.array([1.0, 1.2]), jnp.array([0.6, -0.8])
+    cut = jax.jit(jax.hessian(partial(loss, chunk=2)))(x)
+    np.testing.assert_allclose(cut, cut.T, rtol=0, atol=1e-8)
+    change = difference(jax.jit(jax.grad(partial(loss, chunk=3))), x, step)
+    assert np.min(np.abs(change)) > 1e-2
+    np.testing.assert_allclose(cut @ step, change, rtol=0, atol=1e-8)
+
+
+TRUTH = json.loads(bodies.FILE.read_text())
+END = bodies.TIMES[-1]
+TIGHT = diffrax.PIDController(rtol=1e-12, atol=1e-12)
+SOLVES = {  # solver, controller, constant step
+    "marched": (Extrapolation(None, accuracy=Accuracy(1e-12, END)), None, None),
+    "constant": (Extrapolation(8), diffrax.ConstantStepSize(), END / 60),
+    "controlled": (Extrapolation(10), TIGHT, None),
+    "stock": (diffrax.Dopri8(), TIGHT, None),
+    "implicit": (diffrax.Kvaerno5(), diffrax.PIDController(rtol=1e-6, atol=1e-8), None),
+}
+
+
+def solved(name, args, ts, t0=0.0):
+    """Tops in diffrax alone: (7, T, N), wxyz first."""
+    solver, controller, dt0 = SOLVES[name]
+    saveat = diffrax.SaveAt(ts=ts)
+    if controller is None:  # a march has its states at its ends only
+        controller = diffrax.StepTo(jnp.concatenate([jnp.asarray(t0, ts.dtype)[None], ts]))
+        saveat = diffrax.SaveAt(steps=True)
+    y0 = tuple(
+        tuple(jnp.array(x) for x in np.transpose(part))
+        for part in (np.array(bodies.OMEGA) * bodies.MOMENTS, bodies.WXYZ)
+    )
+    momentum, wxyz = diffrax.diffeqsolve(
+        diffrax.ODETerm(heavy_top), solver, t0, ts[-1], dt0, y0, args, saveat=saveat,
+        stepsize_controller=controller, adjoint=FlowAdjoint(1e-12), max_steps=256,
+    ).ys  # fmt: skip
+    return jnp.stack([x[: ts.shape[0]] for x in (*wxyz, *momentum)])
+
+
+def arguments(first, strength):
+    inverse = (1 / first, *(jnp.asarray(1 / i) for i in bodies.MOMENTS[1:]))
+    return tuple(jnp.broadcast_to(i, 3) for i in inverse), jnp.broadcast_to(strength, 3)
+
+
+@pytest.mark.parametrize("name", SOLVES)
+def test_outside_of_simulate_any_solver_has_the_slopes_of_the_flow(name):
+    """Of the last state by a moment and the strength of the field, 40 digits; the steps of the
+    implicit one are coarse, its derivatives are not."""
+
+    def loss(p):
+        last = solved(name, arguments(*p), jnp.array([0.75, END]))[:, -1]
+        return jnp.sum(jnp.array(bodies.WEIGHTS, float)[:, None] * last)
+
+    p = jnp.array([bodies.MOMENTS[0], bodies.STRENGTH])
+    want = [float(x) for x in TRUTH["slopes"]]
+    rtol = 1e-4 if name == "implicit" else 1e-10  # it starts backwards from its own end
+    both = jax.jit(lambda p: (jax.jacrev(loss)(p), jax.jacfwd(loss)(p)))(p)
+    for slopes in both:
+        np.testing.assert_allclose(slopes, want, rtol=rtol)
+    np.testing.assert_allclose(*both, rtol=1e-5 if name == "implicit" else 2e-10)
+
+
+@pytest.mark.parametrize("name", ["marched", "stock"])
+def test_slopes_by_saved_times_are_the_field(name):
+    """At each of them; a later start alone is an earlier end."""
+    args, ts = arguments(jnp.array(bodies.MOMENTS[0]), jnp.array(bodies.STRENGTH)), bodies.TIMES
+    ts = jnp.array([t for t in ts if t not in (0.1, 1.0)])
+
+    @jax.jit
+    def slopes(ts, t0):
+        def moved(ts, t0):
+            return solved(name, args, ts, t0)
+
+        return moved(ts, t0), *jax.jacrev(moved, (0, 1))(ts, t0), *jax.jacfwd(moved, (0, 1))(ts, t0)
+
+    y, *found = slopes(ts, jnp.zeros(()))
+    rows = jax.tree.map(lambda x: x[None], args)
+    rate, turn = heavy_top(0.0, (tuple(y[4:]), tuple(y[:4])), rows)
+    field = jnp.stack([*turn, *rate])
+    own = jnp.einsum("ctn,ts->ctns", field, jnp.eye(len(ts)))
+    for by_ts, by_t0 in (found[:2], found[2:]):
+        np.testing.assert_allclose(by_ts, own, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(by_t0, -field, rtol=0, atol=1e-9)
+
+
+def drawn_together(t, y, args):
+    """The angle x and the rate v of what is pushed and dragged: v' = a (c^2 - v^2)."""
+    _, v = y
+    a, c = args
+    return v, a * (c**2 - v**2)
+
+
+@pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
+def test_parts_keep_the_way_back_from_states_drawn_together(mode):
+    """Like exp(-28): in one part the start would be found with exp(28) times the rounding."""
+    span = jnp.array([0.0, 4.0])
+
+    def exact(p):
+        a, c, v0 = p
+        k = jnp.arctanh(v0 / c)
+        log = [jnp.log(jnp.cosh(x)) for x in (a * c * span[1] + k, k)]
+        return (log[0] - log[1]) / a
+
+    def angle(p, parts):
+        a, c, v0 = p
+        y0 = jnp.zeros(1), v0[None]
+        end = diffrax.diffeqsolve(
+            diffrax.ODETerm(drawn_together), Extrapolation(None, accuracy=Accuracy(1e-12, 4.0)),
+            *span, None, y0, (a, c), stepsize_controller=diffrax.StepTo(span),
+            adjoint=FlowAdjoint(parts=parts), max_steps=1,
+        )  # fmt: skip
+        return end.ys[0][0, 0]
+
+    p = jnp.array([1.75, 2.0, 0.5])
+    want = jax.grad(exact)(p)
+    found = [jax.jit(mode(partial(angle, parts=parts)))(p) for parts in (1, 8)]
+    np.testing.assert_allclose(found[1], want, rtol=1e-9)
+    if mode is jax.jacrev:
+        assert np.max(np.abs(found[0] - want)) > 1e-8  # what the parts are for
+
+
+def test_what_cannot_be_differentiated_is_refused():
+    def last(saveat, event=None):
+        y0 = jnp.zeros(1), jnp.ones(1)
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(drawn_together), diffrax.Dopri8(), 0.0, 1.0, 0.1, y0, (1.0, 2.0),
+            saveat=saveat, adjoint=FlowAdjoint(), event=event,
+        )  # fmt: skip
+
+    both = diffrax.SaveAt(subs={"a": diffrax.SubSaveAt(t1=True), "b": diffrax.SubSaveAt(t0=True)})
+    event = diffrax.Event(lambda t, y, args, **_: t > 0.5)
+    for given in ((both,), (diffrax.SaveAt(t1=True), event)):
+        with pytest.raises(ValueError, match="FlowAdjoint differentiates states at saved times"):
+            last(*given)
+
+
+WEIGHTS = jnp.array([0.7, -0.4, 0.9, 0.3, -0.5, 0.8, 0.6])
+DRIVEN = {"moment": jnp.array(1.3), "drag": jnp.array(9.0), "push": jnp.array(7.0),
+          "rate": jnp.array(2.0)}  # fmt: skip
+
+
+def held(p, method):
+    """Of a body that a torque drives about its z axis and drag holds to one rate: law known.
+
+    Whatever the start, it forgets it like exp(-28).
+    """
+    along = jnp.array([0.0, 0.0, 1.0])
+    inertia = ph.Inertia.from_moments(jnp.array([0.8, 1.0, 0.0]) + along * p["moment"])
+    act = ph.BodyTorque(along * p["push"]) + ph.LinearDamping(p["drag"] * jnp.ones(3))
+    state = ph.State([0.6, 0.0, 0.8, 0.0], along * p["rate"])
+    record = ph.Record(final_only=True)
+    end = ph.simulate(ph.Scene(inertia, None, act), state, [0.0, 4.0], method, record=record)
+    return jnp.sum(WEIGHTS[:4] * end.wxyz[0]) + jnp.sum(WEIGHTS[4:] * end.omega_body[0])
+
+
+@pytest.mark.parametrize("solver", [Extrapolation(12), diffrax.Dopri8()], ids=("own", "stock"))
+def test_the_way_back_starts_anew_where_drag_draws_bodies_together(solver):
+    """By itself, in ``simulate``."""
+    method = ph.LiePoisson(solver)
+    exact = jax.grad(held)(DRIVEN, ph.FixedAxis())
+    found = jax.grad(held)(DRIVEN, method)
+    step = {name: jnp.array(x) for name, x in zip(DRIVEN, (0.5, -1.0, 0.7, 2.0))}
+    _, change = jax.jvp(lambda p: held(p, method), (DRIVEN,), (step,))
+    want = sum(jax.tree.leaves(jax.tree.map(jnp.multiply, exact, step)))
+    np.testing.assert_allclose(change, want, rtol=1e-9)
+    for name, want in exact.items():
+        np.testing.assert_allclose(found[name], want, rtol=1e-9, atol=1e-10, err_msg=name)
+
+
+def test_linear_maps_transpose_by_the_other_program():
+    """Zeros, known operands and batches included."""
+
+    def product(a, x, y):
+        forward = lambda given, v: [given[0] @ v[0] + v[1]]  # noqa: E731
+        backward = lambda given, w: [given[0].T @ w[0], w[0]]  # noqa: E731
+        return linear(forward, backward, [a], [x, y], [y])[0]
+
+    keys = jax.random.split(jax.random.key(0), 3)
+    a, x, y = (jax.random.normal(k, s) for k, s in zip(keys, ((2, 3), (3,), (2,))))
+
+    def loss(fn, a, x, y):
+        return jnp.sum(jnp.sin(fn(a, x, y)))
+
+    def plain(a, x, y):
+        return a @ x + y
+
+    for argnums in (1, 2, (1, 2)):
+        got, want = (
+            jax.grad(lambda *v, f=f: loss(f, *v), argnums)(a, x, y) for f in (product, plain)
+        )
+        jax.tree.map(lambda g, w: np.testing.assert_allclose(g, w, rtol=1e-14), got, want)
+    many, scales = jnp.stack([a, 2 * a]), jnp.array([0.5, 2.0])
+    for axis, given in ((0, many), (None, a)):
+
+        def over(fn, scales, axis=axis, given=given):
+            return jax.vmap(lambda a, s: loss(fn, a, s * x, y), (axis, 0))(given, scales)
+
+        for derive in (jax.jacrev, jax.jacfwd):
+            got, want = (derive(partial(over, fn))(scales) for fn in (product, plain))
+            np.testing.assert_allclose(got, want, rtol=1e-13, atol=1e-15)
+    got, want = (
+        jax.jvp(lambda a, x, f=f: loss(f, a, x, y), (a, x), (many[1], 1 + x))[1]
+        for f in (product, plain)
+    )
+    np.testing.assert_allclose(got, want, rtol=1e-14)

@@ -1,0 +1,89 @@
+"""Imports go one way: a room uses only what stands before it in the table of CONTRIBUTING.md."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import polhode as ph
+
+SOURCE = Path(ph.__file__).parent
+CONTRIBUTING = Path(__file__).resolve().parents[1] / "CONTRIBUTING.md"
+FACE = "__init__"
+
+
+def house() -> list[str]:
+    """Rooms (folders, and files at the root of the package) in the order of the table."""
+    text = CONTRIBUTING.read_text(encoding="utf-8")
+    section = text.partition("## The house")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| *\d+ *\|([^|]*)\|", section, re.M)
+    return [room for row in rows for room in re.findall(r"`(\w+)`", row)]
+
+
+def room_of(path: Path) -> str:
+    return path.relative_to(SOURCE).parts[0].removesuffix(".py")
+
+
+def rooms() -> set[str]:
+    return {room_of(path) for path in SOURCE.rglob("*.py")}
+
+
+def imported(text: str, package: tuple[str, ...], known: set[str]) -> Iterator[str]:
+    """Rooms that a module of ``package`` imports anywhere in its text, in whatever form."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            modules = [name.name.split(".") for name in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            above = list(package[: len(package) + 1 - node.level]) if node.level else []
+            base = above + (node.module.split(".") if node.module else [])
+            modules = [[*base, name.name] for name in node.names]
+        else:
+            continue
+        for module in modules:
+            if module[0] == "polhode":
+                yield module[1] if len(module) > 1 and module[1] in known else FACE
+
+
+@pytest.mark.parametrize(
+    ("text", "found"),
+    [
+        ("import polhode.tops", ["tops"]),
+        ("import numpy, polhode.tops._cubic as c", ["tops"]),
+        ("from polhode.tops import x", ["tops"]),
+        ("from polhode.tops._cubic import x, y", ["tops", "tops"]),
+        ("from polhode import tops, Scene", ["tops", FACE]),
+        ("from polhode import *", [FACE]),
+        ("import polhode", [FACE]),
+        ("import polhode as ph", [FACE]),
+        ("from ._motion import x", ["free"]),
+        ("from . import _motion", ["free"]),
+        ("from .. import tops", ["tops"]),
+        ("from ..tops._cubic import x", ["tops"]),
+        ("def f():\n    if True:\n        from polhode import tops", ["tops"]),
+        ("import polhodes, jax\nfrom numpy import tops", []),
+    ],
+)
+def test_every_form_of_import_is_seen(text, found):
+    assert list(imported(text, ("polhode", "free"), {"free", "tops"})) == found
+
+
+def test_every_room_stands_in_the_table_once():
+    listed = house()
+    assert len(set(listed)) == len(listed), "a room stands twice in CONTRIBUTING.md"
+    assert set(listed) == rooms(), "the table in CONTRIBUTING.md is not the rooms of src/polhode"
+
+
+def test_imports_go_one_way():
+    place = {room: i for i, room in enumerate(house())}
+    known, wrong, seen = rooms(), [], 0
+    for path in SOURCE.rglob("*.py"):
+        room = room_of(path)
+        package = ("polhode", *path.relative_to(SOURCE).parts[:-1])
+        for used in imported(path.read_text(encoding="utf-8"), package, known):
+            seen += 1
+            if used != room and place[used] >= place[room]:
+                wrong.append(f"{path.relative_to(SOURCE)} imports {used}")
+    assert seen > 100
+    assert not wrong, wrong

@@ -1,0 +1,69 @@
+"""The guards of the suite are alive: annotations are checked, programs are compiled once a run."""
+
+import os
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import jaxtyping
+import pytest
+
+import polhode as ph
+from polhode.inertia import _cholesky as inertia
+
+LEAST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
+PROGRAM = """
+import jax, jax.numpy as jnp, numpy as np
+met = []
+jax.monitoring.register_event_listener(lambda name, **_: met.append(name.split("/")[-1]))
+
+def program(x):
+    for _ in range(40):
+        x = jnp.sort(jnp.sin(x)[::-1] + x)
+    return x
+
+jax.jit(program)(np.arange(64.0))
+print(met.count("cache_hits"), met.count("cache_misses"))
+"""
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: inertia.inertia_to_log_cholesky(jnp.ones((3, 2))), "tensor"),
+        (lambda: inertia.inertia_from_log_cholesky("0.5"), "parameters"),
+        (lambda: inertia.inertia_from_log_cholesky(jnp.ones(5)), "parameters"),
+        (lambda: ph.hamiltonian(3.0), "inertia"),
+    ],
+)
+def test_wrong_shapes_and_kinds_are_refused_by_the_annotations(call, said):
+    with pytest.raises(jaxtyping.TypeCheckError, match=f"parameter '{said}'"):
+        call()
+
+
+def test_the_check_can_be_set_aside(unchecked):
+    with pytest.raises(TypeError, match="needs the body"):
+        ph.hamiltonian(3.0)
+
+
+def test_another_process_finds_what_one_has_compiled(tmp_path):
+    named = "JAX_COMPILATION_CACHE_DIR"
+    assert os.environ[named] == jax.config.jax_compilation_cache_dir
+    counts = []
+    for _ in range(2):
+        command, own = (
+            [sys.executable, "-c", PROGRAM],
+            os.environ | {named: str(tmp_path), LEAST: "0"},
+        )
+        counts.append(subprocess.run(command, env=own, capture_output=True, text=True, check=True))
+    first, second = ([int(n) for n in done.stdout.split()] for done in counts)
+    assert (first[0], second[0]) == (0, first[1])
+    assert first[1] > 0
+
+
+def test_wrong_input_meets_the_words_of_the_package():
+    with pytest.raises(TypeError, match="needs the body"):
+        ph.hamiltonian(3.0)
+    with pytest.raises(jaxtyping.TypeCheckError):
+        ph.hamiltonian(3.0)

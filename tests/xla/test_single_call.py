@@ -1,0 +1,116 @@
+"""The marked call: whatever XLA folds away, the process lives and the values stay."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+from xla import fuzz
+
+import polhode as ph
+from polhode.xla import _switch, kernel, specialise
+
+HERE = Path(__file__).parent
+
+
+def test_units_that_fold_away():
+    """In a process of its own; `folding_units.py each` names the unit that ends it."""
+    ran = subprocess.run(
+        [sys.executable, HERE / "folding_units.py"], capture_output=True, text=True, timeout=600
+    )
+    assert ran.returncode == 0, ran.stdout[-500:] + ran.stderr[-2000:]
+    lines = dict(line.rsplit(": ", 1) for line in ran.stdout.splitlines())
+    assert len(lines) > 250
+    refused = {name: away for name, away in lines.items() if away.endswith("Error")}
+    assert set(refused) <= {"its own reverse rule, second"}
+    off = {
+        name: away for name, away in lines.items() if name not in refused and float(away) > 1e-14
+    }
+    assert not off
+
+
+def _lowered():
+    return jax.jit(kernel(lambda a: jnp.sin(a) * a)).lower(jnp.ones(3)).as_text()
+
+
+def test_one_variable_switches_all_off(monkeypatch):
+    monkeypatch.setenv("POLHODE_PLAIN", "0")
+    assert "xla_cpu_small_call" in _lowered()
+    closed = jax.make_jaxpr(lambda p, x: p * 2 * x)(1.0, 2.0)
+    assert len(specialise(closed, [jnp.array(3.0)]).held) == 1
+    assert float(specialise(closed, [jnp.array(3.0)]).held[0]) == 6
+    monkeypatch.setenv("POLHODE_PLAIN", "1")
+    assert "xla_cpu_small_call" not in _lowered()
+    held, run, _ = specialise(closed, [jnp.array(3.0)])
+    assert float(held[0]) == 3
+    assert float(run(held, jnp.array(2.0))[0]) == 12
+
+
+@pytest.fixture
+def untested(monkeypatch, tmp_path):
+    """A version of jaxlib that the marks were not tested on, and no memory of a trial."""
+    monkeypatch.delenv("POLHODE_PLAIN", raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(_switch, "TESTED", ((0, 0, 1), (0, 0, 2)))
+    _switch._marks_work.cache_clear()
+    yield tmp_path / "polhode"
+    _switch._marks_work.cache_clear()
+
+
+def test_another_version_is_tried_out_once(untested, monkeypatch):
+    assert not _switch.is_plain()
+    assert [path.read_text() for path in untested.iterdir()] == ["work"]
+    _switch._marks_work.cache_clear()
+    monkeypatch.setattr(_switch, "_PROBE", ("-c", "import os; os.abort()"))
+    assert not _switch.is_plain()  # remembered
+
+
+def test_a_version_that_ends_the_process_runs_plain(untested, monkeypatch):
+    monkeypatch.setattr(_switch, "_PROBE", ("-c", "import os; os.abort()"))
+    with pytest.warns(UserWarning, match="POLHODE_PLAIN=1"):
+        assert _switch.is_plain()
+    assert _switch.is_plain()  # no second warning, which would be an error here
+    assert "xla_cpu_small_call" not in _lowered()
+    assert len(list(untested.iterdir())) == 1
+
+
+@pytest.mark.parametrize("kind", ["free", "lagrange", "damped"])
+def test_no_traced_value_outlives_its_program(kind):
+    """Of the exact motions: `diffrax.diffeqsolve` itself does not run under this check."""
+    force = ph.UniformGravity.axial(1.0, 0.5) if kind == "lagrange" else None
+    drag = ph.LinearDamping(0.1) if kind == "damped" else None
+    omega = [0.0, 0.0, 1.0] if kind == "damped" else [0.1, 1.0, 0.1]
+    state = ph.State([1.0, 0.0, 0.0, 0.0], omega)
+
+    @jax.jit
+    def end(moments):
+        body = ph.Inertia.from_moments(moments)
+        if kind == "lagrange":
+            body = ph.Inertia.axisymmetric(moments[0], moments[2])
+        scene = ph.Scene(body, force, drag)
+        return ph.simulate(scene, state, [0.0, 0.5], rtol=1e-3).wxyz
+
+    with jax.checking_leaks():
+        assert jnp.all(jnp.isfinite(end(jnp.array([1.0, 1.5, 2.0]))))
+
+
+def test_a_seeded_slice_of_the_fuzz():
+    """`fuzz.py` does thousands."""
+    ran, refused, largest, ends = fuzz.hunt_units(15, seed=7, each=15)
+    assert not ends
+    assert ran + refused == 15 * len(fuzz.WAYS)
+    assert ran > 50
+    assert largest < 1e-14
+
+
+def test_a_thrust_of_zero():
+    """The torque is nothing, which XLA sees and the traced program does not show."""
+    torque = ph.BodyTorque(lambda t: jnp.where(t < 1, 0.0, 0.0) * jnp.array([0.0, 0.0, 1.0]))
+    inertia = ph.Inertia.from_moments([1.0, 2.0, 3.0])
+    state = ph.State([1.0, 0.0, 0.0, 0.0], [0.1, 1.0, 0.1])
+    ts = [0.0, 0.5]
+    found = ph.simulate(ph.Scene(inertia, torque=torque), state, ts, rtol=1e-6)
+    free = ph.simulate(ph.Scene(inertia), state, ts)
+    assert jnp.max(jnp.abs(found.wxyz - free.wxyz)) < 1e-6
