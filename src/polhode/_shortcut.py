@@ -30,10 +30,10 @@ _FEW = 256
 """Numbers up to which lists are faster to look through than arrays."""
 
 
-def learn(run: Callable, scene, state, given, record, *, looks_long: bool) -> None:
+def learn(run: Callable, motion, scene, state, given, record, *, looks_long: bool) -> None:
     """Keep ``run(scene, state, ts, rtol, record)``, compiled, for calls of the same structure.
 
-    ``given``: the record as the caller gave it.
+    ``motion``: that of the trajectory, without arrays. ``given``: the record as the caller gave it.
     """
     tree = jax.tree.structure((scene, state, given))
     leaf = 0
@@ -48,7 +48,7 @@ def learn(run: Callable, scene, state, given, record, *, looks_long: bool) -> No
         return found.ts, found.wxyz, found.omega_body, found.status, found.steps
 
     kept = (leaf if wanted else None for wanted in (record.attitude, record.rates))
-    shape = jax.tree.structure(Trajectory(leaf, *kept, leaf, leaf, leaf))
+    shape = jax.tree.structure(Trajectory(leaf, *kept, leaf, leaf, leaf, motion=motion))
     _ENTRIES[tree] = _Entry(program, np.dtype(state.wxyz.dtype), shape, looks_long)
 
 

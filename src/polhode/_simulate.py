@@ -12,6 +12,7 @@ from polhode._checks import is_concrete
 from polhode._closed_form import ClosedForm
 from polhode._inputs import check_inputs, check_method, check_rtol, judged, raise_on_failure
 from polhode._lanes import PARTS, common_batch, flatten
+from polhode._motion import Motion
 from polhode._mesh import Split, on_devices, place, split_of
 from polhode._plan import Plan, choose, plan
 from polhode._scene import Scene
@@ -66,7 +67,8 @@ def simulate(
         method, _ = choose(scene, state, record, rtol, ts)
         if split is None and _is_simple(method, scene, state, record):
             depends = scene.inertia.symmetry is Symmetry.NONE
-            learn(partial(_trajectory, method), scene, state, given, record, looks_long=depends)
+            move, motion = partial(_trajectory, method), Motion.of(method, None)
+            learn(move, motion, scene, state, given, record, looks_long=depends)
             trajectory = shortcut(scene, state, ts, None, given)
             if trajectory is not None:
                 return checked(trajectory, throw)
@@ -121,7 +123,8 @@ def _trajectory(method, scene, state, ts, rtol, record, split=None) -> Trajector
         found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
     wxyz, omega, status, steps, work, error = found
     kept = ts[..., -1:] if record.final_only else ts
-    trajectory = Trajectory(kept, wxyz, omega, status, steps, scene, work, error)
+    motion = Motion.of(method, rtol)
+    trajectory = Trajectory(kept, wxyz, omega, status, steps, scene, work, error, motion)
     if record.work and method.exact:
         work = _work_of_exact(trajectory, state, ts[..., :1])
         return eqx.tree_at(lambda t: t.work, trajectory, work, is_leaf=lambda x: x is None)
