@@ -8,14 +8,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from polhode._lanes import PARTS, along_time, is_lane_tree, map_chunks
+from polhode._batch import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._scene import Scene
 from polhode._state import State
-from polhode._status import Status
 from polhode.hamiltonian import Dynamics
 from polhode.methods._base import AbstractMethod, Record, Samples
 from polhode.methods._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
 from polhode.methods._options import check_options
+from polhode.methods._status import Status
 from polhode.solvers import FlowAdjoint
 
 
