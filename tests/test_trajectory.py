@@ -96,8 +96,7 @@ def test_derivatives_of_a_motion_at_a_time(name):
         before, after = truth(name, times)[:, 4]
         np.testing.assert_allclose(in_time, (after - before) / (2 * step), rtol=1e-6)
         sides = [
-            truth(name, [time], np.asarray(STATE.omega_body) + [0, s * step, 0])[0, 4]
-            for s in (-1, 1)
+            truth(name, [time], np.add(STATE.omega_body, [0, s * step, 0]))[0, 4] for s in (-1, 1)
         ]
         np.testing.assert_allclose(in_rates[1], (sides[1] - sides[0]) / (2 * step), atol=1e-6)
         assert np.isfinite(in_moments).all()

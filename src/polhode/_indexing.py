@@ -22,7 +22,7 @@ def _entry(key: Any) -> Any:
     if key is Ellipsis or isinstance(key, slice) or is_integer(key):
         return key
     array = key if isinstance(key, jax.Array) else np.asarray(key)
-    if array.ndim and (array.dtype == bool or np.issubdtype(array.dtype, np.integer)):
+    if array.ndim and (array.dtype == np.bool_ or np.issubdtype(array.dtype, np.integer)):
         return array
     raise IndexError(
         "a trajectory is indexed by integers, slices, ... and arrays of integers or truth values,"
@@ -33,7 +33,7 @@ def _entry(key: Any) -> Any:
 
 def _taken(key: Any) -> int:
     """Axes that an entry stands for."""
-    return key.ndim if getattr(key, "dtype", None) == bool else 1
+    return key.ndim if getattr(key, "dtype", None) == np.bool_ else 1
 
 
 def split_key(key: Any, rank: int) -> tuple[tuple[Any, ...], Any]:

@@ -8,14 +8,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from polhode import rotation
+from polhode._batch import PARTS, flatten, map_arrays
 from polhode._checks import as_float_array
-from polhode._inputs import raise_on_failure
-from polhode._lanes import PARTS, flatten, map_arrays
 from polhode._scene import Scene
 from polhode._state import State
-from polhode._status import Status
 from polhode._trajectory import AbstractMotion, Trajectory
-from polhode.methods import AbstractMethod, Record
+from polhode.methods import AbstractMethod, Record, Status, raise_on_failure
 
 
 class Motion(AbstractMotion):
@@ -54,12 +52,12 @@ class Motion(AbstractMotion):
             )
         found = moved_to(trajectory, times)
         if not isinstance(found.status, jax.core.Tracer):
-            raise_on_failure(found)
+            raise_on_failure(found.status)
         return found
 
 
 def moved_to(trajectory: Trajectory, t: Array) -> Trajectory:
-    """The trajectory at times (K,) or (..., K) of its dtype, in any order; see ``Trajectory.at``."""
+    """The trajectory at times (K,) or (..., K) of its dtype, in any order; see ``at``."""
     return _moved(trajectory, t, False)
 
 

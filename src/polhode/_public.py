@@ -1,20 +1,13 @@
 """The public names of polhode, imported together when the first of them is asked for."""
 
 from polhode import elliptic as elliptic, free as free, rotation as rotation, solvers as solvers
-from polhode._closed_form import ClosedForm as ClosedForm
-from polhode._periods import periods as periods
-from polhode._plan import Plan as Plan, choose as choose
+from polhode._propagate import Propagation as Propagation, propagate as propagate
 from polhode._scene import Scene as Scene
 from polhode._simulate import explain as explain, simulate as simulate
 from polhode._state import State as State
-from polhode._status import SimulationError as SimulationError, Status as Status
-from polhode._top_methods import (
-    FixedAxis as FixedAxis,
-    LagrangeTop as LagrangeTop,
-    SymmetricTop as SymmetricTop,
-)
 from polhode._trajectory import Trajectory as Trajectory
 from polhode._version import __version__ as __version__
+from polhode.events import Crossings as Crossings, Event as Event, crossings as crossings
 from polhode.fit import fit_inertia as fit_inertia, fit_recordings as fit_recordings
 from polhode.frames import (
     RotatingFrame as RotatingFrame,
@@ -32,9 +25,22 @@ from polhode.methods import (
     AbstractMethod as AbstractMethod,
     EulerAngles as EulerAngles,
     LiePoisson as LiePoisson,
+    Plan as Plan,
     Record as Record,
+    SimulationError as SimulationError,
+    Status as Status,
+    choose as choose,
+)
+from polhode.methods.exact import (
+    ClosedForm as ClosedForm,
+    FixedAxis as FixedAxis,
+    LagrangeTop as LagrangeTop,
+    SymmetricTop as SymmetricTop,
+    periods as periods,
 )
 from polhode.torques import (
+    LVLH as LVLH,
+    AbstractOrbit as AbstractOrbit,
     AbstractPotential as AbstractPotential,
     AbstractRotor as AbstractRotor,
     AbstractTorque as AbstractTorque,
@@ -45,6 +51,7 @@ from polhode.torques import (
     LinearDamping as LinearDamping,
     Potential as Potential,
     QuadraticDamping as QuadraticDamping,
+    RelativeTorque as RelativeTorque,
     Rotor as Rotor,
     SpaceTorque as SpaceTorque,
     StateOrbit as StateOrbit,

@@ -8,20 +8,30 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode import rotation
+from polhode._batch import PARTS, Split, common_batch, flatten, on_devices, place, split_of
 from polhode._checks import is_concrete
-from polhode._closed_form import ClosedForm
-from polhode._inputs import check_inputs, check_method, check_rtol, judged, raise_on_failure
-from polhode._lanes import PARTS, common_batch, flatten
 from polhode._motion import Motion
-from polhode._mesh import Split, on_devices, place, split_of
-from polhode._plan import Plan, choose, plan
 from polhode._scene import Scene
 from polhode._shortcut import learn, shortcut
 from polhode._state import State
-from polhode._status import Status
 from polhode._trajectory import Trajectory
+from polhode.events import Event, check_until, stopped
 from polhode.inertia import Symmetry
-from polhode.methods import AbstractMethod, Record, Samples
+from polhode.methods import (
+    AbstractMethod,
+    Plan,
+    Record,
+    Samples,
+    Status,
+    check_inputs,
+    check_method,
+    check_rtol,
+    choose,
+    judged,
+    plan,
+    raise_on_failure,
+)
+from polhode.methods.exact import ClosedForm
 
 
 def simulate(
@@ -32,6 +42,7 @@ def simulate(
     *,
     rtol: float | None = None,
     record: Record | None = None,
+    until: Event | None = None,
     throw: bool = True,
 ) -> Trajectory:
     """Move every body of the scene from ``state`` at ``ts[0]`` through the times ``ts``.
@@ -48,12 +59,19 @@ def simulate(
       last time when the library chooses the method, of each step where the method says so;
       None: 1e-9 in float64, 1e-5 in float32. Exact methods ignore it.
     - ``record``: what to keep; None: attitude and rates at all times.
+    - ``until``: a ``ph.Event`` at which each body stops: its times and samples from there on are
+      those of the event, so that ``Trajectory.last`` is the state to go on from; its time is
+      ``Trajectory.event_time`` (inf for a body that does not meet it).
     - ``throw``: raise ``ph.SimulationError`` when a body did not finish. Under ``jit``, ``vmap``
       or ``grad`` nothing is raised: look at ``Trajectory.status``.
 
     Raises ValueError or TypeError for bad input: wrong kinds or shapes, unsorted times, mixed
     dtypes, a tolerance that the dtype cannot reach.
     """
+    if until is not None:
+        check_until(until, record)
+        found = simulate(scene, state, ts, method, rtol=rtol, throw=throw)
+        return checked(stopped(found, until), throw)
     if method is None:
         trajectory = shortcut(scene, state, ts, rtol, record)
         if trajectory is not None:
@@ -80,7 +98,7 @@ def simulate(
 def checked(trajectory: Trajectory, throw: bool) -> Trajectory:
     """The trajectory; raises for bodies that did not finish where that is known."""
     if throw and not isinstance(trajectory.status, jax.core.Tracer):
-        raise_on_failure(trajectory)
+        raise_on_failure(trajectory.status)
     return trajectory
 
 

@@ -1,7 +1,9 @@
 """The result of a simulation: sampled attitude and rates, everything else on demand."""
 
 import abc
-from typing import Any
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -9,14 +11,17 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from polhode import rotation
+from polhode._batch import PARTS, along_time, map_arrays
 from polhode._checks import is_concrete
+from polhode._exports import dataset, write_aem
 from polhode._indexing import check_key, is_integer, split_key
-from polhode._lanes import PARTS, along_time, map_arrays
 from polhode._scene import Scene
 from polhode._state import State
-from polhode._status import Status
-from polhode._version import __version__
 from polhode.hamiltonian import components, from_quaternion
+from polhode.methods import Status
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 
 class AbstractMotion(eqx.Module):
@@ -92,7 +97,7 @@ class Trajectory(eqx.Module):
 
     @property
     def last(self) -> State:
-        """The state (...) at the last sample, to go on from: ``ph.simulate(other, traj.last, ts)``."""
+        """The state (...) at the last sample, from which another simulation may go on."""
         return State(self._need("wxyz")[..., -1, :], self._need("omega_body")[..., -1, :])
 
     def __getitem__(self, key: Any) -> "Trajectory":
@@ -217,70 +222,32 @@ class Trajectory(eqx.Module):
             sequence = rotation.Sequence.of(sequence)
         return rotation.wxyz_to_euler(self._need("wxyz"), sequence)
 
-    def to_xarray(self) -> Any:
-        """An ``xarray.Dataset`` with named dimensions, units and attributes (needs xarray)."""
-        try:
-            import xarray
-        except ImportError as error:
-            raise ImportError("to_xarray needs xarray: pip install 'polhode[cli]'") from error
+    def to_scipy(self) -> "Rotation":
+        """The attitudes, body -> space, as one SciPy ``Rotation`` of all samples.
 
-        rank = len(self.batch_shape)
-        batch = ("body",) if rank == 1 else tuple(f"batch_{i}" for i in range(rank))
-        time = ("time",) if self.ts.ndim == 1 else (*batch, "time")
-        data: dict[str, Any] = {}
+        In the order of ``wxyz`` with its leading axes flattened. The other way: ``ph.State`` takes
+        a ``Rotation`` in place of a quaternion. Not under ``jit``.
+        """
+        return rotation.wxyz_to_scipy(self._need("wxyz"))
 
-        def put(name, array, dims, units, long_name):
-            data[name] = (dims, np.asarray(array), {"units": units, "long_name": long_name})
+    def to_xarray(self, labels: Sequence[str] | None = None) -> Any:
+        """An ``xarray.Dataset`` with named dimensions, units and attributes (needs xarray).
 
-        if self.wxyz is not None:
-            put(
-                "wxyz",
-                self.wxyz,
-                (*batch, "time", "quaternion"),
-                "1",
-                "attitude quaternion, scalar first, body to space",
-            )
-        if self.omega_body is not None:
-            put(
-                "omega_body",
-                self.omega_body,
-                (*batch, "time", "axis"),
-                "rad s-1",
-                "angular velocity in body axes",
-            )
-            if self.scene.potential is None or self.wxyz is not None:
-                put("energy", self.energy, (*batch, "time"), "J", "kinetic plus potential energy")
-            if self.wxyz is not None:
-                put(
-                    "momentum_space",
-                    self.momentum_space,
-                    (*batch, "time", "axis"),
-                    "kg m2 s-1",
-                    "angular momentum in space axes",
-                )
-        if self.work is not None:
-            put("work", self.work, (*batch, "time"), "J", "work done by the external torques")
-        if self.error is not None:
-            put("error", self.error, batch, "rad", "estimated error at the last time")
-        data["status"] = (
-            batch,
-            np.asarray(self.status, np.int8),
-            {
-                "long_name": "outcome of each body",
-                "flag_values": np.array([int(s) for s in Status], np.int8),
-                "flag_meanings": " ".join(s.name.lower() for s in Status),
-            },
-        )
-        coords: dict[str, Any] = {
-            "quaternion": ("quaternion", list("wxyz"), {"long_name": "part, the scalar first"}),
-            "axis": ("axis", list("xyz"), {"long_name": "axis of the frame that the name states"}),
-        }
-        times = (time, np.asarray(self.ts), {"units": "s", "long_name": "time"})
-        (coords if self.ts.ndim == 1 else data)["time" if self.ts.ndim == 1 else "ts"] = times
-        attributes = {
-            "Conventions": "CF-1.11",
-            "title": "Rotating rigid bodies",
-            "source": f"polhode {__version__}",
-            "convention": "wxyz scalar first, body -> space; R = Rz(phi) Ry(theta) Rz(psi)",
-        }
-        return xarray.Dataset(data, coords=coords, attrs=attributes)
+        ``labels``: names of the bodies of a batch of one axis, the coordinate ``body``.
+        """
+        return dataset(self, labels)
+
+    def to_aem(self, path: str | Path, epoch: str, **fields: Any) -> None:
+        """Write the attitudes as a CCSDS attitude ephemeris message (504.0-B-2), a text file.
+
+        **Arguments:** ``path``; ``epoch``: calendar time at which ``ts`` is zero, such as
+        ``"2029-04-13T21:46:00"``; fields of the message: ``object_name`` and ``object_id``
+        (required; for a batch one for each body), ``frame`` ("EME2000": that of space),
+        ``body_frame`` ("SC_BODY_1"), ``time_system`` ("TAI"), ``originator`` ("POLHODE"),
+        ``center_name`` (None), ``rates`` (True: body rates too), ``creation_date`` (now).
+
+        One segment a body, in the order of time. Seconds are counted on from ``epoch``: over a leap
+        second leave UTC to others. Raises ValueError or TypeError for fields that the standard does
+        not know, FileNotFoundError for a folder that is not there.
+        """
+        write_aem(path, self, epoch, **fields)

@@ -11,10 +11,16 @@ _MOST = 100
 
 
 def bracketed(
-    fn: Callable[[Array], Array], low: Array, high: Array, at_low: Array, at_high: Array, use: Array
-) -> Array:
+    fn: Callable[[Array], tuple[Array, Array]],
+    low: Array,
+    high: Array,
+    at_low: Array,
+    at_high: Array,
+    use: Array,
+) -> tuple[Array, Array]:
     """Roots of ``fn``, entry by entry, between ``low`` and ``high``, to a few units in the last
-    place of the larger; entries that are not in ``use`` stay at ``low``.
+    place of the larger; entries that are not in ``use`` stay at ``low``. ``fn`` returns its values
+    and something else, which is returned as it is where the root was last looked at.
 
     Inverse quadratic interpolation where it is safe, halving elsewhere: T. R. Chandrupatla, Adv.
     Eng. Software 28 (1997) 145.
@@ -26,9 +32,9 @@ def bracketed(
         return (count < _MOST) & ~jnp.all(done)
 
     def one(walk):
-        count, done, x1, x2, f1, f2, share = walk
+        count, done, x1, x2, f1, f2, share, more = walk
         x = x1 + share * (x2 - x1)
-        f = fn(jnp.where(done, low, x))
+        f, also = fn(jnp.where(done, low, x))
         same = jnp.sign(f) == jnp.sign(f1)
         x3, f3 = jnp.where(same, x1, x2), jnp.where(same, f1, f2)
         new2, g2 = jnp.where(same, x2, x1), jnp.where(same, f2, f1)
@@ -48,11 +54,13 @@ def bracketed(
             return jnp.where(done, old, new)
 
         found = kept(x1, x), kept(x2, new2), kept(f1, f), kept(f2, g2), kept(share, new)
+        found = (*found, kept(more, also))
         return count + 1, done | stop, *found
 
     zero = at_low == 0
     start = jnp.where(zero, low, high), low, jnp.where(zero, at_low, at_high), at_low
     done = ~use | zero | (at_high == 0)
-    walk = jax.lax.while_loop(on, one, (0, done, *start, jnp.full_like(low, 0.5)))
-    _, _, x1, x2, f1, f2, _ = walk
-    return jnp.where(use, jnp.where(jnp.abs(f1) <= jnp.abs(f2), x1, x2), low)
+    walk = (0, done, *start, jnp.full_like(low, 0.5), jnp.zeros_like(low))
+    _, _, x1, x2, f1, f2, _, more = jax.lax.while_loop(on, one, walk)
+    root = jnp.where(jnp.abs(f1) <= jnp.abs(f2), x1, x2)
+    return jnp.where(use, root, low), more

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from polhode._batch import PARTS, flatten
 from polhode._checks import is_concrete
-from polhode._lanes import PARTS, flatten
-from polhode._motion import moved_to, moved_through
+from polhode._motion import moved_through, moved_to
 from polhode._scene import Scene
 from polhode._trajectory import Trajectory
 from polhode.events._bracketed import bracketed
@@ -90,7 +90,9 @@ def crossings(
         looks = _looks(trajectory)
     if room is None:
         if not is_concrete(trajectory):
-            raise ValueError("under jit, vmap or grad the room for crossings must be known: most=8.")
+            raise ValueError(
+                "under jit, vmap or grad the room for crossings must be known: most=8."
+            )
         room = 16
     found = _found(trajectory, event, room, looks)
     while most is None and int(np.max(found.count, initial=0)) > room:
@@ -120,8 +122,8 @@ def _looks(trajectory: Trajectory) -> int:
     looks = 1 + -(-(looks - 1) // grain) * grain
     if looks * max(1, int(np.prod(trajectory.batch_shape))) > _TOO_MANY:
         raise ValueError(
-            f"{looks:,} looks at each body are needed for the {turned:.3g} rad that it turns: search"
-            " a shorter time or fewer bodies at once, or give samples= if the function is slow."
+            f"{looks:,} looks at each body are needed for the {turned:.3g} rad that it turns:"
+            " search a shorter time or fewer bodies at once, or give samples= for a slow function."
         )
     return looks
 
@@ -173,46 +175,56 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> Cross
     changes = sides[:, 1:] != sides[:, :-1]
     dips = _dips(grid, values, slopes, sides)
 
-    # what turns back towards zero between two looks is looked at where it turns
-    place, is_dip = _first_true(dips, most)
-    low, high, slope_low, slope_high = (
-        jnp.take_along_axis(x, place, axis=-1)
-        for x in (grid[:, :-1], grid[:, 1:], slopes[:, :-1], slopes[:, 1:])
-    )
-    turning = bracketed(lambda t: evaluate(t)[1], low, high, slope_low, slope_high, is_dip)
-    there, _ = evaluate(turning)
-    side = jnp.take_along_axis(sides, place, axis=-1)
-    pairs = is_dip & (jnp.where(there >= 0, 1, -1) != side)
-
-    # brackets: between looks, and on both sides of such a turning point
-    single, is_single = _first_true(changes, most)
-
     def at(x, place):
         return jnp.take_along_axis(x, place, axis=-1)
 
-    lows = [at(grid, single), low, turning]
-    highs = [at(grid, single + 1), turning, high]
-    at_low = [at(values, single), at(values, place), there]
-    at_high = [at(values, single + 1), there, at(values, place + 1)]
-    rising = [at(sides, single + 1) > 0, side < 0, side > 0]
-    use = [is_single, pairs, pairs]
-    lows, highs, at_low, at_high, rising, use = (
-        jnp.concatenate(x, axis=-1) for x in (lows, highs, at_low, at_high, rising, use)
-    )
+    # what turns back towards zero between two looks is looked at where it turns
+    place, is_dip = _first_true(dips, most)
+    single, is_single = _first_true(changes, most)
+    side = at(sides, place)
+    low, high = at(grid, place), at(grid, place + 1)
+    turns = low, high, at(slopes, place), at(slopes, place + 1), is_dip
+
+    def brackets(turning, there):
+        """Between looks, and on both sides of such a turning point; which are pairs of these."""
+        pairs = is_dip & (jnp.where(there >= 0, 1, -1) != side)
+        columns = (
+            (at(grid, single), low, turning),
+            (at(grid, single + 1), turning, high),
+            (at(values, single), at(values, place), there),
+            (at(values, single + 1), there, at(values, place + 1)),
+            (is_single, pairs, pairs),
+            (at(sides, single + 1) > 0, side < 0, side > 0),  # whether it rises along the motion
+        )
+        *columns, use, rising = (jnp.concatenate(x, axis=-1) for x in columns)
+        if event.direction:
+            use = use & (jnp.where(rising, 1, -1) * ahead == event.direction)
+        order = jnp.argsort(jnp.where(use, ahead * columns[0], jnp.inf), axis=-1)[:, :most]
+        return tuple(at(x, order) for x in (*columns, use)), pairs
+
+    def search(found, second):
+        """The turning points, then the roots: one copy of the motion in the program."""
+        given = [jnp.where(second, b, a) for a, b in zip(turns, brackets(*found)[0])]
+
+        def fn(t):
+            value, slope = evaluate(t)
+            return jnp.where(second, value, slope), value
+
+        found = bracketed(fn, *given)
+        return found, found
+
+    none = jnp.zeros_like(low)
+    _, (points, there) = jax.lax.scan(search, (none, none), jnp.array([False, True]))
+    (*_, use), pairs = brackets(points[0], there[0])
+    times = points[1]
+    each, counted = 2, changes
     if event.direction:
-        wanted = jnp.where(rising, 1, -1) * ahead == event.direction
-        use = use & wanted
-        counted = jnp.where(sides[:, 1:] > 0, 1, -1) * ahead == event.direction
-    else:
-        counted = jnp.ones_like(changes)
-    pair_count = 1 if event.direction else 2
-    count = jnp.sum(changes & counted, axis=-1) + pair_count * jnp.sum(pairs, axis=-1)
+        each = 1
+        counted = changes & (jnp.where(sides[:, 1:] > 0, 1, -1) * ahead == event.direction)
+    count = jnp.sum(counted, axis=-1) + each * jnp.sum(pairs, axis=-1)
     # dips beyond the room were not looked at: there may be as many pairs of them
-    unseen = jnp.sum(dips, axis=-1) > most
-    count = jnp.where(unseen, jnp.maximum(count, pair_count * jnp.sum(dips, axis=-1)), count)
-    order = jnp.argsort(jnp.where(use, ahead * lows, jnp.inf), axis=-1)[:, :most]
-    low, high, f_low, f_high, use = (at(x, order) for x in (lows, highs, at_low, at_high, use))
-    times = bracketed(lambda t: evaluate(t)[0], low, high, f_low, f_high, use)
+    dipping = jnp.sum(dips, axis=-1)
+    count = jnp.where(dipping > most, jnp.maximum(count, each * dipping), count)
     times, use = times.reshape(*batch, most), use.reshape(*batch, most)
     slope, times = _polished(trajectory, event, times, use)
     return Crossings(

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array
 
 from polhode import rotation
-from polhode._functions import checked, mapped
 from polhode._trajectory import Trajectory
+from polhode.parts import checked, mapped
 
 _ARGUMENTS = ("wxyz", "omega_body", "t")
 _SHAPES = ((4,), (3,), ())

@@ -9,6 +9,7 @@ from polhode._motion import moved_to
 from polhode._trajectory import Trajectory
 from polhode.events._crossings import crossings
 from polhode.events._event import Event
+from polhode.methods import Record
 
 
 def check_until(until: Any, record: Any) -> None:
@@ -17,7 +18,7 @@ def check_until(until: Any, record: Any) -> None:
         raise TypeError(
             f"until must be a ph.Event, got {type(until).__name__}: ph.Event(fn, direction)."
         )
-    if not (record.attitude and record.rates) or record.final_only or record.work or record.error:
+    if record is not None and record != Record():
         raise ValueError(
             "until= needs attitude and rates at all times and knows no work and error: leave"
             " record= out."
@@ -37,6 +38,4 @@ def _held(trajectory: Trajectory, time) -> Trajectory:
     event = time[..., None]
     past = jnp.where(back, ts <= event, ts >= event) & jnp.isfinite(event)
     held = moved_to(trajectory, jnp.where(past, event, ts))
-    return eqx.tree_at(
-        lambda t: t.event_time, held, time, is_leaf=lambda x: x is None
-    )
+    return eqx.tree_at(lambda t: t.event_time, held, time, is_leaf=lambda x: x is None)

@@ -1,6 +1,8 @@
 """Potentials, external torques, damping and rotors: one small class each."""
 
+from polhode.torques._frames import LVLH as LVLH, RelativeTorque as RelativeTorque
 from polhode.torques._orbit import (
+    AbstractOrbit as AbstractOrbit,
     KeplerOrbit as KeplerOrbit,
     StateOrbit as StateOrbit,
     eccentric_anomaly as eccentric_anomaly,

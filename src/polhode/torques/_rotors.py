@@ -20,10 +20,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_float_array, as_number, is_concrete, numbers, require, together
-from polhode._functions import checked, mapped
-from polhode._part import AbstractPart, shaped
 from polhode.hamiltonian._attitude import Vector
 from polhode.inertia import Inertia, Symmetry
+from polhode.parts import AbstractPart, checked, mapped, shaped
 
 
 class AbstractRotor(AbstractPart):
