@@ -31,7 +31,7 @@ def test_bodies_have_labels(traj):
 
 def test_scipy_there_and_back(traj):
     turned = traj[1].to_scipy()
-    pointing = ph.rotation.rotate(traj.wxyz[1], jnp.array([0.0, 0, 1]))
+    pointing = ph.rotation.rotate(traj.wxyz[1], jnp.array([[0.0, 0, 1]]))
     np.testing.assert_allclose(turned.apply([0, 0, 1]), pointing)
     back = ph.State(turned, traj.omega_body[1])
     assert float(ph.rotation.angle_between(back.wxyz, traj.wxyz[1]).max()) < 1e-15

@@ -74,12 +74,12 @@ def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
     samples = [
         x.reshape(-1, *x.shape[len(batch) :]) for x in (trajectory.wxyz, trajectory.omega_body)
     ]
-    finite = jnp.isfinite(t)
-    times = jnp.where(finite, t, ts[..., :1])
+    finite, times = jnp.isfinite(t), t
     if ts.ndim > 1 or times.ndim > 1:  # one row a body
         ts, times = (
             jnp.broadcast_to(x, (*batch, x.shape[-1])).reshape(-1, x.shape[-1]) for x in (ts, times)
         )
+    times = jnp.where(jnp.isfinite(times), times, ts[..., :1])
     move = _from_first if in_order or motion.method.exact else _from_nearest
     wxyz, omega, status, steps = move(motion, Scene(**parts), samples, ts, times)
     wxyz, omega = (x.reshape(*batch, *x.shape[1:]) for x in (wxyz, omega))

@@ -160,6 +160,7 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> Cross
     batch = trajectory.batch_shape
     ts = fixed.ts
     share = jnp.linspace(0, 1, looks, dtype=ts.dtype).at[0].set(_AT_START / (looks - 1))
+    share = share.reshape((1,) * (ts.ndim - 1) + share.shape)
     grid = ts[..., :1] + share * (ts[..., -1:] - ts[..., :1])
     values, slopes = event.values(moved_through(fixed, grid))
     values, slopes = (x.reshape(-1, looks) for x in (values, slopes))

@@ -73,13 +73,13 @@ def _lead(x: Array) -> Array:
 
 
 class AbstractOrbit(AbstractPart):
-    """Base of the orbits: position ``orbit(t)`` and ``velocity(t)`` of a body about a centre."""
+    """Base of the orbits: position ``orbit(t)`` and ``velocity_at(t)`` of a body about a centre."""
 
     @abc.abstractmethod
     def __call__(self, t: Array | float) -> Float[Array, "*b 3"]:
         """Position (..., 3) from the attracting centre, space axes [m], at the time t [s]."""
 
-    def velocity(self, t: Array | float) -> Float[Array, "*b 3"]:
+    def velocity_at(self, t: Array | float) -> Float[Array, "*b 3"]:
         """Velocity (..., 3) in space axes [m/s] at the time t [s]."""
         t = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(self)))
         return jax.jvp(self, (t,), (jnp.ones_like(t),))[1]
