@@ -35,10 +35,12 @@ from polhode.methods import (
     Record as Record,
 )
 from polhode.torques import (
+    AbstractCoupling as AbstractCoupling,
     AbstractPotential as AbstractPotential,
     AbstractRotor as AbstractRotor,
     AbstractTorque as AbstractTorque,
     BodyTorque as BodyTorque,
+    EnergySink as EnergySink,
     FeedbackTorque as FeedbackTorque,
     GravityGradient as GravityGradient,
     KeplerOrbit as KeplerOrbit,
@@ -49,4 +51,5 @@ from polhode.torques import (
     SpaceTorque as SpaceTorque,
     StateOrbit as StateOrbit,
     UniformGravity as UniformGravity,
+    ViscousCoupling as ViscousCoupling,
 )

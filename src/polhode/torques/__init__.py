@@ -1,5 +1,10 @@
 """Potentials, external torques, damping and rotors: one small class each."""
 
+from polhode.torques._couplings import (
+    AbstractCoupling as AbstractCoupling,
+    ViscousCoupling as ViscousCoupling,
+)
+from polhode.torques._dissipation import EnergySink as EnergySink
 from polhode.torques._orbit import (
     KeplerOrbit as KeplerOrbit,
     StateOrbit as StateOrbit,
