@@ -20,7 +20,7 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 import polhode as ph
-from polhode._top_methods import LagrangeTop
+from polhode.methods.exact import LagrangeTop
 
 HORIZON = 100.0
 

@@ -1,18 +1,9 @@
 """The public names of polhode, imported together when the first of them is asked for."""
 
 from polhode import elliptic as elliptic, free as free, rotation as rotation, solvers as solvers
-from polhode._closed_form import ClosedForm as ClosedForm
-from polhode._periods import periods as periods
-from polhode._plan import Plan as Plan, choose as choose
 from polhode._scene import Scene as Scene
 from polhode._simulate import explain as explain, simulate as simulate
 from polhode._state import State as State
-from polhode._status import SimulationError as SimulationError, Status as Status
-from polhode._top_methods import (
-    FixedAxis as FixedAxis,
-    LagrangeTop as LagrangeTop,
-    SymmetricTop as SymmetricTop,
-)
 from polhode._trajectory import Trajectory as Trajectory
 from polhode._version import __version__ as __version__
 from polhode.fit import fit_inertia as fit_inertia, fit_recordings as fit_recordings
@@ -32,7 +23,18 @@ from polhode.methods import (
     AbstractMethod as AbstractMethod,
     EulerAngles as EulerAngles,
     LiePoisson as LiePoisson,
+    Plan as Plan,
     Record as Record,
+    SimulationError as SimulationError,
+    Status as Status,
+    choose as choose,
+)
+from polhode.methods.exact import (
+    ClosedForm as ClosedForm,
+    FixedAxis as FixedAxis,
+    LagrangeTop as LagrangeTop,
+    SymmetricTop as SymmetricTop,
+    periods as periods,
 )
 from polhode.torques import (
     AbstractCoupling as AbstractCoupling,

@@ -8,19 +8,28 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode import rotation
+from polhode._batch import PARTS, Split, common_batch, flatten, on_devices, place, split_of
 from polhode._checks import is_concrete
-from polhode._closed_form import ClosedForm
-from polhode._inputs import check_inputs, check_method, check_rtol, judged, raise_on_failure
-from polhode._lanes import PARTS, common_batch, flatten
-from polhode._mesh import Split, on_devices, place, split_of
-from polhode._plan import Plan, choose, plan
 from polhode._scene import Scene
 from polhode._shortcut import learn, shortcut
 from polhode._state import State
-from polhode._status import Status
 from polhode._trajectory import Trajectory
 from polhode.inertia import Symmetry
-from polhode.methods import AbstractMethod, Record, Samples
+from polhode.methods import (
+    AbstractMethod,
+    Plan,
+    Record,
+    Samples,
+    Status,
+    check_inputs,
+    check_method,
+    check_rtol,
+    choose,
+    judged,
+    plan,
+    raise_on_failure,
+)
+from polhode.methods.exact import ClosedForm
 
 
 def simulate(
@@ -78,7 +87,7 @@ def simulate(
 def checked(trajectory: Trajectory, throw: bool) -> Trajectory:
     """The trajectory; raises for bodies that did not finish where that is known."""
     if throw and not isinstance(trajectory.status, jax.core.Tracer):
-        raise_on_failure(trajectory)
+        raise_on_failure(trajectory.status)
     return trajectory
 
 

@@ -7,7 +7,6 @@ from jaxtyping import Array, Float
 
 from polhode import rotation
 from polhode._checks import as_float_array, describe, is_concrete, require
-from polhode._part import AbstractPart, shaped
 from polhode.hamiltonian import (
     canonical_from_momentum,
     components,
@@ -15,6 +14,7 @@ from polhode.hamiltonian import (
     rates_from_angle_rates,
 )
 from polhode.inertia import Inertia
+from polhode.parts import AbstractPart, shaped
 
 
 class State(AbstractPart):

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from polhode import rotation
-from polhode._lanes import PARTS, along_time
+from polhode._batch import PARTS, along_time
 from polhode._scene import Scene
-from polhode._status import Status
 from polhode._version import __version__
 from polhode.hamiltonian import components, from_quaternion
+from polhode.methods import Status
 
 
 class Trajectory(eqx.Module):

@@ -6,7 +6,7 @@ from mpmath import mp, mpf
 
 import polhode as ph
 from polhode import tops
-from polhode._top_methods import FixedAxis, SymmetricTop, exact_top
+from polhode.methods.exact import FixedAxis, SymmetricTop, exact_top
 from polhode.torques import Rotor
 
 SYMMETRIC = ph.Inertia.axisymmetric(1.25, 0.5)

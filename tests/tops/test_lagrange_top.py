@@ -14,7 +14,7 @@ import top_cases
 
 import polhode as ph
 from polhode import tops
-from polhode._top_methods import LagrangeTop
+from polhode.methods.exact import LagrangeTop
 from polhode.torques import Rotor, UniformGravity
 
 NAMES = list(top_cases.CASES)

@@ -41,7 +41,7 @@ def test_the_flip_to_a_spin_about_the_largest_moment(name):
 def test_the_time_of_an_energy_sink():
     """tan theta = tan theta_0 exp(k L^2 (1/C - 1/A) t) about the axis of a symmetric body.
 
-    In value and slope by k; in both charts and single precision.
+    In value and slope by k, and in the other chart.
     """
     a, c, ts = 2.0, 0.5, np.array([0.0, 1.0, 3.0])
     inertia = ph.Inertia.axisymmetric(a, c)
@@ -49,13 +49,11 @@ def test_the_time_of_an_energy_sink():
     start = np.hypot(*momentum[:2]) / momentum[2]
     square, k = momentum @ momentum, 0.2
 
-    def tangent(k, method=None, dtype=jnp.float64):
-        rates = jnp.asarray(momentum / [a, a, c], dtype)
-        state = ph.State(jnp.asarray([0.8, 0.4, 0.4, 0.2], dtype), rates)
-        body = jax.tree.map(lambda x: jnp.asarray(x, dtype), inertia)
-        scene = ph.Scene(body, torque=ph.EnergySink(jnp.asarray(k, dtype)))
-        rtol = 1e-12 if dtype == jnp.float64 else 1e-5
-        found = ph.simulate(scene, state, ts, method, rtol=rtol).momentum_body
+    state = ph.State([0.8, 0.4, 0.4, 0.2], momentum / [a, a, c])
+
+    def tangent(k, method=None):
+        scene = ph.Scene(inertia, torque=ph.EnergySink(k))
+        found = ph.simulate(scene, state, ts, method, rtol=1e-12).momentum_body
         return jnp.hypot(found[:, 0], found[:, 1]) / found[:, 2]
 
     rate = square * (1 / c - 1 / a)
@@ -65,9 +63,6 @@ def test_the_time_of_an_energy_sink():
     np.testing.assert_allclose(value, want, rtol=1e-10)
     np.testing.assert_allclose(slope, want * rate * ts, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(tangent(k, ph.EulerAngles()), want, rtol=1e-9)
-    single = tangent(k, dtype=jnp.float32)
-    assert single.dtype == jnp.float32
-    np.testing.assert_allclose(single, want, rtol=1e-3)
 
 
 def test_a_wheel_with_friction_about_one_axis():
@@ -79,9 +74,6 @@ def test_a_wheel_with_friction_about_one_axis():
         coupling = ph.ViscousCoupling(friction)
         return ph.Scene(INERTIA, rotors=ph.Rotor([0, 0, 1.0], j, speed=speed, coupling=coupling))
 
-    def last(friction):
-        return ph.simulate(scene(friction), state, ts, rtol=1e-12).omega_body[-1, 2]
-
     state = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 1.0])
     got = ph.simulate(scene(friction), state, ts, rtol=1e-12, record=WORK)
     rate = 1 / j + 1 / (c - j)
@@ -92,8 +84,6 @@ def test_a_wheel_with_friction_about_one_axis():
     lost = -0.5 * speed**2 / rate * (1 - fade**2)
     np.testing.assert_allclose(got.motor_work[:, 0], lost, rtol=1e-10, atol=1e-14)
     np.testing.assert_allclose(got.work, lost, rtol=1e-10, atol=1e-14)
-    slope = jax.jit(jax.grad(last))(friction)
-    np.testing.assert_allclose(slope, j * speed / c * rate * ts[-1] * fade[-1], rtol=1e-9)
 
 
 def test_a_ring_against_newton_in_every_chart():
@@ -139,9 +129,9 @@ def test_slopes_of_a_damped_motion():
 
     x = jnp.array([0.2, 1.0, 0.05, *MOMENTS, 0.03, 1.5, 0.2, -0.3])
     slopes, step = jax.jit(jax.jacrev(last))(x), 1e-4
-    moved = x + step * jnp.array([-2.0, -1, 1, 2])[:, None, None] * jnp.eye(x.size)
-    four = jax.jit(lambda xs: jax.lax.map(last, xs))(moved.reshape(-1, x.size))
-    four = four.reshape(4, x.size, -1)
+    moved = np.asarray(x) + step * np.multiply.outer([-2.0, -1, 1, 2], np.eye(x.size))
+    run = jax.jit(last)
+    four = np.array([[run(row) for row in rows] for rows in moved])
     want = (four[0] - 8 * four[1] + 8 * four[2] - four[3]) / (12 * step)
     np.testing.assert_allclose(slopes.T, want, rtol=0, atol=1e-7)
 

@@ -13,7 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import polhode as ph
-from polhode._lanes import PARTS, flatten
+from polhode._batch import PARTS, flatten
 from polhode.hamiltonian import Dynamics, lie_poisson_field
 from polhode.torques import FeedbackTorque, KeplerOrbit, QuadraticDamping
 

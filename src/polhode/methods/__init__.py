@@ -9,7 +9,17 @@ from polhode.methods._charts import (
     EulerChart as EulerChart,
     LiePoissonChart as LiePoissonChart,
 )
+from polhode.methods._inputs import (
+    check_inputs as check_inputs,
+    check_method as check_method,
+    check_rtol as check_rtol,
+    check_times as check_times,
+    judged as judged,
+    raise_on_failure as raise_on_failure,
+)
 from polhode.methods._options import check_options as check_options, made as made
+from polhode.methods._plan import Plan as Plan, choose as choose, plan as plan
+from polhode.methods._status import SimulationError as SimulationError, Status as Status
 from polhode.methods._stepped import (
     EulerAngles as EulerAngles,
     LiePoisson as LiePoisson,

@@ -17,9 +17,9 @@ from polhode.torques._potentials import (
     PotentialSum as PotentialSum,
     UniformGravity as UniformGravity,
 )
+from polhode.torques._rotor import Rotor as Rotor
 from polhode.torques._rotors import (
     AbstractRotor as AbstractRotor,
-    Rotor as Rotor,
     RotorSum as RotorSum,
     Wheels as Wheels,
 )

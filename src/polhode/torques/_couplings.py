@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_number, is_concrete, require
-from polhode._part import AbstractPart, shaped
 from polhode.hamiltonian import Attitude
+from polhode.parts import AbstractPart, shaped
 
 
 class AbstractCoupling(AbstractPart):

@@ -24,9 +24,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_number, is_concrete, require
-from polhode._functions import checked, mapped
-from polhode._part import shaped
 from polhode.hamiltonian import Vector, cross
+from polhode.parts import checked, mapped, shaped
 from polhode.torques._torques import AbstractTorque
 
 _ARGUMENTS = ("momentum_body", "omega_body")

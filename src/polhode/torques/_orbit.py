@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_float_array, as_number, describe, is_concrete, require
-from polhode._part import AbstractPart, shaped
+from polhode.parts import AbstractPart, shaped
 
 
 def eccentric_anomaly(mean: Float[Array, "*b"], eccentricity: Float[Array, "*b"]) -> Array:

@@ -10,10 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_float_array, as_number, is_concrete, numbers, require, together
-from polhode._functions import checked, mapped
-from polhode._part import AbstractPart, shaped
 from polhode.hamiltonian import Attitude, components, dot
 from polhode.inertia import Inertia
+from polhode.parts import AbstractPart, checked, mapped, shaped
 from polhode.torques._torques import value_at, vector_of_time
 
 

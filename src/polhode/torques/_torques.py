@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_float_array, is_concrete, require
-from polhode._functions import checked, mapped
-from polhode._part import AbstractPart, shaped
 from polhode.hamiltonian import Attitude, Vector, components
+from polhode.parts import AbstractPart, checked, mapped, shaped
 
 
 class AbstractTorque(AbstractPart):

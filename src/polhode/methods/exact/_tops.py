@@ -10,13 +10,13 @@ import numpy as np
 from jaxtyping import Array
 
 from polhode import rotation, tops
+from polhode._batch import is_lane_tree, map_chunks
 from polhode._checks import is_concrete
-from polhode._lanes import is_lane_tree, map_chunks
 from polhode._scene import Scene
 from polhode._state import State
-from polhode._status import Status
 from polhode.inertia import Symmetry
-from polhode.methods import AbstractMethod, Record, Samples
+from polhode.methods._base import AbstractMethod, Record, Samples
+from polhode.methods._status import Status
 from polhode.torques import (
     AbstractTorque,
     BodyTorque,

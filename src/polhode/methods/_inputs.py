@@ -13,9 +13,9 @@ from jaxtyping import Array
 from polhode._checks import as_float_array, describe, is_concrete, require
 from polhode._scene import Scene
 from polhode._state import State
-from polhode._status import SimulationError, Status
-from polhode._trajectory import Trajectory
-from polhode.methods import AbstractMethod, Record, made
+from polhode.methods._base import AbstractMethod, Record
+from polhode.methods._options import made
+from polhode.methods._status import SimulationError, Status
 
 
 def check_method(method: Any) -> None:
@@ -119,22 +119,22 @@ def _number(name: str, value: Any) -> float:
         ) from error
 
 
-def raise_on_failure(trajectory: Trajectory) -> None:
+def raise_on_failure(status: Array) -> None:
     """SimulationError naming what happened to how many bodies, and which came first."""
-    status = np.asarray(trajectory.status)
-    if not status.any():  # all Status.SUCCESSFUL
+    ended = np.asarray(status)
+    if not ended.any():  # all Status.SUCCESSFUL
         return
     lines = []
-    for code in np.unique(status[status != Status.SUCCESSFUL]):
-        found = np.argwhere(status == code)
+    for code in np.unique(ended[ended != Status.SUCCESSFUL]):
+        found = np.argwhere(ended == code)
         first = tuple(int(i) for i in found[0])
         which = (
-            f"{len(found)} of {status.size} bodies (first: index {first})" if first else "the body"
+            f"{len(found)} of {ended.size} bodies (first: index {first})" if first else "the body"
         )
         lines.append(f"{which}: {Status(int(code)).explanation}")
     raise SimulationError(
         "; ".join(lines) + ". Pass throw=False to get the trajectory with its status per body.",
-        status,
+        ended,
     )
 
 

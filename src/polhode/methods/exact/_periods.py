@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from polhode import free, rotation
+from polhode._batch import common_batch
 from polhode._checks import describe, is_concrete, require
-from polhode._lanes import common_batch
 from polhode._state import State
 from polhode.free import Periods
 from polhode.inertia import Inertia, principal

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode import free, rotation
-from polhode._lanes import map_chunks
+from polhode._batch import map_chunks
 from polhode._scene import Scene
 from polhode._state import State
-from polhode._status import Status
 from polhode.inertia import Symmetry, principal
-from polhode.methods import AbstractMethod, Record, Samples
+from polhode.methods._base import AbstractMethod, Record, Samples
+from polhode.methods._status import Status
 
 
 class ClosedForm(AbstractMethod):

@@ -9,14 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from polhode._batch import PARTS, common_batch
 from polhode._checks import is_concrete
-from polhode._closed_form import ClosedForm
-from polhode._lanes import PARTS, common_batch
 from polhode._scene import Scene
 from polhode._state import State
-from polhode._top_methods import exact_top
 from polhode.inertia import Symmetry
-from polhode.methods import AbstractMethod, LiePoisson, LiePoissonChart, Record
+from polhode.methods._base import AbstractMethod, Record
+from polhode.methods._charts import LiePoissonChart
+from polhode.methods._stepped import LiePoisson
+from polhode.methods.exact import ClosedForm, exact_top
 from polhode.solvers import Extrapolation
 from polhode.torques import GravityGradient, UniformGravity
 

@@ -1,0 +1,10 @@
+"""What scenes are made of: parts with batch axes, and the functions that users give them."""
+
+from polhode.parts._functions import (
+    checked as checked,
+    kept as kept,
+    mapped as mapped,
+    result_of as result_of,
+    takes as takes,
+)
+from polhode.parts._part import AbstractPart as AbstractPart, shaped as shaped
