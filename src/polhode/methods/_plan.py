@@ -110,7 +110,7 @@ def _wanders(state: State, rtol, ts) -> bool:
         return state.wxyz.dtype == jnp.float32
     if rtol < 2000 * eps:
         return True
-    return _is_known(state, ts) and eps * _turned(state, ts) ** 1.5 > 5 * float(rtol)
+    return _is_known(state, ts) and eps * _turned(state, ts) ** 1.5 > 1.5 * float(rtol)
 
 
 _LONG = ", its frequencies in sums of two floats: a rounded phase would miss rtol"
