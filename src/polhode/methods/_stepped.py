@@ -29,18 +29,23 @@ class Stepped(AbstractMethod):
     max_steps: int = eqx.field(static=True)
     adjoint: diffrax.AbstractAdjoint
     progress_meter: diffrax.AbstractProgressMeter
-    chunk: int = eqx.field(static=True)
+    chunk: int | None = eqx.field(static=True)
 
     @property
     def keeps_rtol(self) -> bool:
         """Whether the steps follow from ``rtol``."""
         return self.controller is None and not hasattr(self.solver, "check")
 
+    @property
+    def _bodies_at_once(self) -> int:
+        """For a solver in which each body has its own steps."""
+        return self.solver.bodies_at_once if jax.default_backend() == "cpu" else _ON_ACCELERATOR
+
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         check = getattr(self.solver, "check", None)
         if check is not None:
             check(self, scene, record)
-        size = 1 if ts.ndim == 2 else self.chunk
+        size = 1 if ts.ndim == 2 else self.chunk or self._bodies_at_once
         lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
 
         def one(chunk):
@@ -112,6 +117,10 @@ class Stepped(AbstractMethod):
             work,
             getattr(solution.solver_state, "error", None),
         )
+
+
+_ON_ACCELERATOR = 2**18
+"""Bodies that are moved together there: enough to fill it, few enough for its memory."""
 
 
 class Stepping(NamedTuple):
@@ -244,7 +253,8 @@ def LiePoisson(
       drag stops within the time simulated).
     - ``progress_meter``: as in diffrax.
     - ``chunk``: bodies that are moved together; chunks follow one another, so memory stays bounded.
-      None: 64 for ``Extrapolation``, 200 for others, whose bodies of a chunk share their steps.
+      None: 200 where the bodies of a chunk share their steps; for ``Extrapolation``, in which each
+      has its own, 64, whose arrays a processor's cache holds, and 2^18 on an accelerator.
     """
     return _stepped(LiePoissonChart(), 200, solver, controller, dt0, max_steps, adjoint,
                     progress_meter, chunk)  # fmt: skip
@@ -272,8 +282,8 @@ def EulerAngles(
 def _stepped(chart, alone, solver, controller, dt0, max_steps, adjoint, progress_meter, chunk):
     solver = diffrax.Dopri8() if solver is None else solver
     check_options(solver, controller, adjoint, dt0=dt0, max_steps=max_steps, chunk=chunk)
-    if chunk is None:
-        chunk = getattr(solver, "bodies_at_once", alone)
+    if chunk is None and not hasattr(solver, "bodies_at_once"):
+        chunk = alone
     return Stepped(
         chart,
         solver,

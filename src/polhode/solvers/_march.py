@@ -175,6 +175,8 @@ def march(
         left = length - walk.gone
         # no step is much shorter than its neighbours for the sake of the end
         width = jnp.where(left <= walk.width, left, jnp.minimum(walk.width, left / 2))
+        # to a time that is a number: thousands of rounded sums would add up to another time
+        width = jnp.where(width == left, left, (walk.gone + width) - walk.gone)
         width = jnp.where(live(walk), width, 0)
         gone, h = (x if own else jnp.max(x) for x in (walk.gone, width))
         t, h = start + sign * gone.astype(start.dtype), sign.astype(dtype) * h
