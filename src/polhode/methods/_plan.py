@@ -17,15 +17,9 @@ from polhode.inertia import Symmetry
 from polhode.methods._base import AbstractMethod, Record
 from polhode.methods._charts import LiePoissonChart
 from polhode.methods._stepped import LiePoisson
-from polhode.methods.exact import ClosedForm, exact_top
+from polhode.methods.exact import ClosedForm, lawful
 from polhode.solvers import Extrapolation
 from polhode.torques import GravityGradient, UniformGravity
-
-_FREE_LAWS = {
-    Symmetry.NONE: "nothing acts on the body: exact motion in Jacobi elliptic functions",
-    Symmetry.AXISYMMETRIC: "free and known to be axisymmetric: exact steady precession",
-    Symmetry.SPHERICAL: "free and known to be spherical: exact turn about a fixed axis",
-}
 
 
 def _named(method: AbstractMethod) -> str:
@@ -41,7 +35,8 @@ class Plan:
 
     **Fields:** ``method``; ``law``: why this one; ``skipped``: what is absent from the compiled
     program, with the reason; ``bodies``, ``samples``, ``dtype``: the size of the work;
-    ``error``: the attitude error to be expected, in words.
+    ``error``: the attitude error to be expected, in words; ``refused``: the exact laws that do not
+    hold, with the reason, where the library chose to step.
     """
 
     method: AbstractMethod
@@ -51,19 +46,22 @@ class Plan:
     samples: int
     dtype: str
     error: str
+    refused: tuple[str, ...] = ()
 
     def __str__(self) -> str:
         lines = [
             f"{self.bodies:,} {'body' if self.bodies == 1 else 'bodies'} x {self.samples:,}"
             f" {'sample' if self.samples == 1 else 'samples'}, {self.dtype}",
             f"runs    {_named(self.method)}: {self.law}",
-            *(
-                f"{'skips   ' if i == 0 else '        '}{reason}"
-                for i, reason in enumerate(self.skipped)
-            ),
+            *_listed("skips", self.skipped),
+            *_listed("not", self.refused),
             f"error   {self.error}",
         ]
         return "\n".join(lines)
+
+
+def _listed(word: str, reasons: tuple[str, ...]) -> list[str]:
+    return [f"{'' if i else word:8}{reason}" for i, reason in enumerate(reasons)]
 
 
 def choose(
@@ -79,13 +77,12 @@ def choose(
     that hold for special bodies and states, and, with the times ``ts``, for horizons so long that
     the rounding of a phase would miss ``rtol`` tenfold.
     """
-    if scene.is_free:
-        if scene.inertia.symmetry is Symmetry.NONE and _is_long(state, rtol, ts):
-            return ClosedForm(compensated=True), _FREE_LAWS[Symmetry.NONE] + _LONG
-        return ClosedForm(), _FREE_LAWS[scene.inertia.symmetry]
-    exact = exact_top(scene, state, record)
-    if exact is not None:
-        return exact, exact.law
+    law, _ = lawful(scene, state, record)
+    if law is not None:
+        general = scene.is_free and scene.inertia.symmetry is Symmetry.NONE
+        if general and _is_long(state, rtol, ts):
+            return dataclasses.replace(law.method, compensated=True), law.says + _LONG
+        return law.method, law.says
     compensated = _wanders(state, rtol, ts)
     upright = scene.torque is None and _is_upright(scene.potential)
     return _stepped(upright, compensated), (
@@ -164,15 +161,17 @@ def plan(
     record: Record,
 ) -> Plan:
     """The plan of checked input (see ``ph.explain``)."""
-    law = "as asked for"
+    law, refused = "as asked for", ()
     if method is None:
         method, law = choose(scene, state, record, rtol, ts)
+        if not method.exact:
+            _, refused = lawful(scene, state, record)
     parts = (getattr(scene, name) for name in PARTS)
     bodies = int(np.prod(common_batch(*parts, state, extra=(ts.shape[:-1],)), dtype=int))
     samples = 1 if record.final_only else ts.shape[-1]
     return Plan(
         method, law, _skipped(scene, method, record), bodies, samples,
-        str(state.wxyz.dtype), _error(method, scene, state, ts, rtol),
+        str(state.wxyz.dtype), _error(method, scene, state, ts, rtol), refused,
     )  # fmt: skip
 
 
