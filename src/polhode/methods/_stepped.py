@@ -40,7 +40,8 @@ class Stepped(AbstractMethod):
     @property
     def _bodies_at_once(self) -> int:
         """For a solver in which each body has its own steps."""
-        return self.solver.bodies_at_once if jax.default_backend() == "cpu" else _ON_ACCELERATOR
+        on_cpu = jax.default_backend() == "cpu"
+        return getattr(self.solver, "bodies_at_once", 1) if on_cpu else _ON_ACCELERATOR
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         check = getattr(self.solver, "check", None)
