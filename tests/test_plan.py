@@ -163,6 +163,18 @@ def test_explain_says_what_runs_what_is_skipped_and_why():
         ph.explain(scene, state, [0.0, 0.0])
 
 
+def test_explain_says_why_no_exact_law_holds():
+    """Every row of the table is named once, each with a reason of its own; none where one runs."""
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]), ph.UniformGravity(1.0, [0, 0, 1.0]))
+    stepped = ph.explain(scene, states(1), [0.0, 1.0])
+    assert [line.partition(":")[0] for line in stepped.refused] == [
+        "free body", "Lagrange's top", "symmetric top", "fixed axis",
+    ]  # fmt: skip
+    for reason in ("has a potential", "moments about body x and y differ", "a potential acts"):
+        assert reason in str(stepped)
+    assert ph.explain(ph.Scene(scene.inertia), states(1), [0.0, 1.0]).refused == ()
+
+
 @pytest.mark.parametrize("inertia", [ph.Inertia.axisymmetric(2.0, 0.5), ph.Inertia.spherical(2.0)])
 def test_static_symmetry_gives_the_same_motion_and_slope(inertia):
     """The programs for known symmetry agree with the general one (itself held to 50 digits)."""

@@ -72,7 +72,9 @@ def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
     batch, ts = trajectory.batch_shape, trajectory.ts
     parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
     samples = [
-        x.reshape(-1, *x.shape[len(batch) :]) for x in (trajectory.wxyz, trajectory.omega_body)
+        x.reshape(-1, *x.shape[len(batch) :])
+        for x in (trajectory.wxyz, trajectory.omega_body, trajectory.spins)
+        if x is not None
     ]
     finite, times = jnp.isfinite(t), t
     if ts.ndim > 1 or times.ndim > 1:  # one row a body
@@ -81,24 +83,33 @@ def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
         )
     times = jnp.where(jnp.isfinite(times), times, ts[..., :1])
     move = _from_first if in_order or motion.method.exact else _from_nearest
-    wxyz, omega, status, steps = move(motion, Scene(**parts), samples, ts, times)
-    wxyz, omega = (x.reshape(*batch, *x.shape[1:]) for x in (wxyz, omega))
+    found, status, steps = move(motion, Scene(**parts), samples, ts, times)
+    wxyz, omega, *spins = (x.reshape(*batch, *x.shape[1:]) for x in found)
     asked = jnp.broadcast_to(finite, wxyz.shape[:-1])[..., None]
     status, steps = status.reshape(batch), steps.reshape(batch)
     good = trajectory.status == Status.SUCCESSFUL
+    wxyz, omega, *spins = (jnp.where(asked, x, jnp.nan) for x in (wxyz, omega, *spins))
     return Trajectory(
-        t, jnp.where(asked, wxyz, jnp.nan), jnp.where(asked, omega, jnp.nan),
-        jnp.where(good, status, trajectory.status), steps, trajectory.scene, motion=motion,
+        t, wxyz, omega, jnp.where(good, status, trajectory.status), steps, trajectory.scene,
+        spins=spins[0] if spins else None, motion=motion,
     )  # fmt: skip
+
+
+def _begun(scene: Scene, spins: list[Array]) -> Scene:
+    """The scene with these momenta of its coupled wheels, if there are such."""
+    if not spins:
+        return scene
+    return Scene(scene.inertia, scene.potential, scene.torque, scene.rotors.begun(*spins))
 
 
 def _from_first(motion: Motion, scene: Scene, samples, ts, times):
     """From the first sample: an exact law holds at every time."""
-    state = State(*(x[:, 0] for x in samples))
+    wxyz, omega, *spins = (x[:, 0] for x in samples)
     times = jnp.concatenate([ts[..., :1], times], axis=-1)
     rtol = None if motion.rtol is None else jnp.min(motion.rtol)
-    found = motion.method.run(scene, state, times, rtol, Record())
-    return found.wxyz[:, 1:], found.omega_body[:, 1:], found.status, found.steps
+    found = motion.method.run(_begun(scene, spins), State(wxyz, omega), times, rtol, Record())
+    kept = [x[:, 1:] for x in (found.wxyz, found.omega_body, found.spins) if x is not None]
+    return kept, found.status, found.steps
 
 
 def _from_nearest(motion: Motion, scene: Scene, samples, ts, times):
@@ -109,21 +120,23 @@ def _from_nearest(motion: Motion, scene: Scene, samples, ts, times):
     final = Record(final_only=True)
     unit = _gap(ts, times)
 
-    def moved(scene, start: State, begin, end, unit):
-        """Lanes at ``end`` () or (N,), and their status."""
+    def moved(scene, start, begin, end, unit):
+        """Lanes at ``end`` () or (N,), their status and steps."""
+        wxyz, omega, *spins = start
+        scene = _begun(scene, spins)
         there = begin == end
         span = jnp.stack([begin, jnp.where(there, begin + unit, end)], axis=-1)
-        found = motion.method.run(scene, start, span, rtol, final)
-        step = jnp.broadcast_to((end - begin)[..., None], (*start.wxyz.shape[:-1], 1))
+        found = motion.method.run(scene, State(wxyz, omega), span, rtol, final)
         # where no time passes, the sample itself, which has its rates for derivatives
-        omega_rate = scene.acceleration(start.wxyz, start.omega_body, begin)
-        wxyz_rate = rotation.wxyz_rate(start.wxyz, start.omega_body)
-        there = jnp.broadcast_to(there[..., None], step.shape)
+        step = jnp.broadcast_to((end - begin)[..., None], (*wxyz.shape[:-1], 1))
+        here = jnp.broadcast_to(there[..., None], step.shape)
+        rates = [rotation.wxyz_rate(wxyz, omega), *_rates(scene, wxyz, omega, spins, begin)]
+        ends = [x[:, 0] for x in (found.wxyz, found.omega_body, found.spins) if x is not None]
+        kept = [jnp.where(here, x + step * rate, end) for x, rate, end in zip(start, rates, ends)]
         return (
-            jnp.where(there, start.wxyz + step * wxyz_rate, found.wxyz[:, 0]),
-            jnp.where(there, start.omega_body + step * omega_rate, found.omega_body[:, 0]),
-            jnp.where(there[:, 0], Status.SUCCESSFUL, found.status),
-            jnp.where(there[:, 0], 0, found.steps),
+            kept,
+            jnp.where(here[:, 0], Status.SUCCESSFUL, found.status),
+            jnp.where(here[:, 0], 0, found.steps),
         )
 
     if ts.ndim == 1:
@@ -131,17 +144,17 @@ def _from_nearest(motion: Motion, scene: Scene, samples, ts, times):
 
         def one(given):
             k, t = given
-            return moved(scene, State(*(x[:, k] for x in samples)), ts[k], t, unit)
+            return moved(scene, [x[:, k] for x in samples], ts[k], t, unit)
 
-        wxyz, omega, status, steps = jax.lax.map(one, (place, times))
-        wxyz, omega = (jnp.moveaxis(x, 0, 1) for x in (wxyz, omega))
-        return wxyz, omega, jnp.max(status, axis=0), jnp.sum(steps, axis=0)
+        found, status, steps = jax.lax.map(one, (place, times))
+        found = [jnp.moveaxis(x, 0, 1) for x in found]
+        return found, jnp.max(status, axis=0), jnp.sum(steps, axis=0)
     n, count = times.shape
     place = jax.vmap(_nearest)(ts, times)
     begin = jnp.take_along_axis(ts, place, axis=-1).reshape(-1)
-    start = State(
-        *(jnp.take_along_axis(x, place[..., None], axis=1).reshape(n * count, -1) for x in samples)
-    )
+    start = [
+        jnp.take_along_axis(x, place[..., None], axis=1).reshape(n * count, -1) for x in samples
+    ]
 
     def each_time(x, rank):
         return x[:, None] if x.ndim > rank else x
@@ -149,8 +162,15 @@ def _from_nearest(motion: Motion, scene: Scene, samples, ts, times):
     parts = {name: map_arrays(getattr(scene, name), each_time) for name in PARTS}
     parts = {name: flatten(part, (n, count)) for name, part in parts.items()}
     found = moved(Scene(**parts), start, begin, times.reshape(-1), unit.reshape(-1))
-    wxyz, omega, status, steps = (x.reshape(n, count, *x.shape[1:]) for x in found)
-    return wxyz, omega, jnp.max(status, axis=-1), jnp.sum(steps, axis=-1)
+    found, status, steps = jax.tree.map(lambda x: x.reshape(n, count, *x.shape[1:]), found)
+    return found, jnp.max(status, axis=-1), jnp.sum(steps, axis=-1)
+
+
+def _rates(scene: Scene, wxyz: Array, omega: Array, spins: list[Array], t: Array) -> list[Array]:
+    """Acceleration of lanes, and what their coupled wheels gain."""
+    now = tuple(spins[0][..., i] for i in range(spins[0].shape[-1])) if spins else ()
+    acceleration, changes = scene.with_spins(now).changes(wxyz, omega, t)
+    return [acceleration, *([jnp.stack(changes, axis=-1)] if changes else [])]
 
 
 def _nearest(ts: Array, times: Array) -> Array:

@@ -40,11 +40,13 @@ from polhode.methods.exact import (
 )
 from polhode.torques import (
     LVLH as LVLH,
+    AbstractCoupling as AbstractCoupling,
     AbstractOrbit as AbstractOrbit,
     AbstractPotential as AbstractPotential,
     AbstractRotor as AbstractRotor,
     AbstractTorque as AbstractTorque,
     BodyTorque as BodyTorque,
+    EnergySink as EnergySink,
     FeedbackTorque as FeedbackTorque,
     GravityGradient as GravityGradient,
     KeplerOrbit as KeplerOrbit,
@@ -56,4 +58,5 @@ from polhode.torques import (
     SpaceTorque as SpaceTorque,
     StateOrbit as StateOrbit,
     UniformGravity as UniformGravity,
+    ViscousCoupling as ViscousCoupling,
 )

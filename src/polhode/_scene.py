@@ -1,5 +1,6 @@
 """What is in the scene: the body's inertia and what acts on it."""
 
+from collections.abc import Sequence
 from functools import reduce
 from typing import Any
 
@@ -140,19 +141,46 @@ class Scene(eqx.Module):
         """Derivative (..., 3) of the body rates [rad/s^2] by the equations of motion.
 
         ``wxyz`` (..., 4): attitude, None where nothing acts; ``omega`` (..., 3): body rates
-        [rad/s]; ``t``: time [s]. Leading axes of all broadcast, those of the parts included.
+        [rad/s]; ``t``: time [s]. Leading axes of all broadcast, those of the parts included. Of
+        coupled wheels see ``with_spins``.
         """
+        return self.changes(wxyz, omega, t)[0]
+
+    def changes(
+        self, wxyz: Array | None, omega: Array, t: Array | float
+    ) -> tuple[Array, tuple[Array, ...]]:
+        """The acceleration, and the torques (...) [N m] on the wheels that are coupled."""
         t = jnp.asarray(t, omega.dtype)
         if wxyz is None:
             wxyz = jnp.zeros((*omega.shape[:-1], 4), omega.dtype).at[..., 0].set(1)
         momentum = self.momentum(omega, t)
         state = (tuple(momentum[..., i] for i in range(3)), tuple(wxyz[..., i] for i in range(4)))
-        push, _ = lie_poisson_field(t, state, Dynamics(self.hamiltonian, self.torque))
+        dynamics = self.dynamics
+        spins = dynamics.wheels.spins if dynamics.coupled else ()
+        push, _, *moved = lie_poisson_field(t, (*state, spins) if spins else state, dynamics)
         rate = jnp.stack(jnp.broadcast_arrays(*push), axis=-1)
+        turned = tuple(moved[0]) if spins else ()
+
+        def carried(t, spins):
+            return self.with_spins(spins).wheel_momentum(t)
+
         if self.rotors is not None:  # what the wheels take up does not turn the body
-            taken = jax.jvp(self.wheel_momentum, (t,), (jnp.ones_like(t),))[1]
+            _, taken = jax.jvp(carried, (t, spins), (jnp.ones_like(t), turned))
             rate = rate - jnp.broadcast_to(taken, rate.shape)
-        return self.carrier.rates(rate)
+        return self.carrier.rates(rate), turned
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """What moves the body."""
+        wheels = self._wheels
+        loose = None if wheels is None or wheels.is_constant else wheels
+        return Dynamics(self.hamiltonian, self.torque, wheels=loose)
+
+    def with_spins(self, spins: Sequence[Array] = ()) -> "Scene":
+        """The scene at a moment when its coupled wheels have these momenta [kg m^2/s]."""
+        if not spins:
+            return self
+        return Scene(self.inertia, self.potential, self.torque, self._wheels.at(spins))
 
     @property
     def hamiltonian(self) -> Hamiltonian:

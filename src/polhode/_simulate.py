@@ -10,13 +10,12 @@ from jaxtyping import Array, ArrayLike, Float
 from polhode import rotation
 from polhode._batch import PARTS, Split, common_batch, flatten, on_devices, place, split_of
 from polhode._checks import is_concrete
+from polhode._dispatch import again, learn
 from polhode._motion import Motion
 from polhode._scene import Scene
-from polhode._shortcut import learn, shortcut
 from polhode._state import State
 from polhode._trajectory import Trajectory
 from polhode.events import Event, check_until, stopped
-from polhode.inertia import Symmetry
 from polhode.methods import (
     AbstractMethod,
     Plan,
@@ -30,8 +29,8 @@ from polhode.methods import (
     judged,
     plan,
     raise_on_failure,
+    ways_of,
 )
-from polhode.methods.exact import ClosedForm
 
 
 def simulate(
@@ -73,26 +72,24 @@ def simulate(
         found = simulate(scene, state, ts, method, rtol=rtol, throw=throw)
         return checked(stopped(found, until), throw)
     if method is None:
-        trajectory = shortcut(scene, state, ts, rtol, record)
+        trajectory = again(scene, state, ts, rtol, record)
         if trajectory is not None:
             return checked(trajectory, throw)
-    given = record
+    given, as_given = record, scene
     scene, state, ts, record = check_inputs(scene, state, ts, record)
     check_method(method)
-    rtol = check_rtol(rtol, state.wxyz.dtype)
+    checked_rtol = check_rtol(rtol, state.wxyz.dtype)
     split = split_of(scene, state, ts)
     if method is None:
-        method, _ = choose(scene, state, record, rtol, ts)
-        if split is None and _is_simple(method, scene, state, record):
-            depends = scene.inertia.symmetry is Symmetry.NONE
-            move, motion = partial(_trajectory, method), Motion.of(method, None)
-            learn(move, motion, scene, state, given, record, looks_long=depends)
-            trajectory = shortcut(scene, state, ts, None, given)
+        if split is None and scene is as_given and is_concrete(scene, state):
+            learn(_trajectory, scene, given, record, ways_of(scene, state, record))
+            trajectory = again(scene, state, ts, rtol, given)
             if trajectory is not None:
                 return checked(trajectory, throw)
+        method, _ = choose(scene, state, record, checked_rtol, ts)
     if split is not None and is_concrete(scene, state, ts):
         scene, state, ts = place(split, scene, state, ts)
-    return checked(run(method, scene, state, ts, rtol, record, split), throw)
+    return checked(run(method, scene, state, ts, checked_rtol, record, split), throw)
 
 
 def checked(trajectory: Trajectory, throw: bool) -> Trajectory:
@@ -100,12 +97,6 @@ def checked(trajectory: Trajectory, throw: bool) -> Trajectory:
     if throw and not isinstance(trajectory.status, jax.core.Tracer):
         raise_on_failure(trajectory.status)
     return trajectory
-
-
-def _is_simple(method, scene: Scene, state: State, record: Record) -> bool:
-    """Whether calls of this structure may take the short way."""
-    plain = isinstance(method, ClosedForm) and not (method.compensated or record.error)
-    return plain and not record.work and is_concrete(scene, state)
 
 
 def explain(
@@ -139,10 +130,12 @@ def _trajectory(method, scene, state, ts, rtol, record, split=None) -> Trajector
         found = _moved(record, method, scene, state, ts, rtol)
     else:
         found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
-    wxyz, omega, status, steps, work, error = found
+    wxyz, omega, status, steps, work, error, motors, spins = found
     kept = ts[..., -1:] if record.final_only else ts
     motion = Motion.of(method, rtol)
-    trajectory = Trajectory(kept, wxyz, omega, status, steps, scene, work, error, motion)
+    trajectory = Trajectory(
+        kept, wxyz, omega, status, steps, scene, work, error, motors, spins, motion
+    )
     if record.work and method.exact:
         work = _work_of_exact(trajectory, state, ts[..., :1])
         return eqx.tree_at(lambda t: t.work, trajectory, work, is_leaf=lambda x: x is None)

@@ -42,7 +42,10 @@ class Trajectory(eqx.Module):
     time, by external torques, potentials that change with time (also orbits) and the motors of
     wheels, so that ``energy - work`` is constant, or None (``Record(work=True)``); ``error`` (...)
     [rad]: estimated error of the attitude at the last time, or None (``Record(error=True)``;
-    without attitude that of the rates, relative); ``motion``: method and tolerance, for ``at``;
+    without attitude that of the rates, relative); ``motor_work`` (..., T, m) [J]: the part of
+    ``work`` that motor and friction of each wheel have done, or None without ``work`` or such;
+    ``spins`` (..., T, k) [kg m^2/s]: momenta of the wheels with a coupling, or None;
+    ``motion``: method and tolerance, for ``at``;
     ``event_time`` (...) [s]: of the event that ``ph.simulate(..., until=)`` stopped at, inf for a
     body that did not meet it, or None.
 
@@ -58,6 +61,8 @@ class Trajectory(eqx.Module):
     scene: Scene
     work: Float[Array, "*b t"] | None = None
     error: Float[Array, "*b"] | None = None
+    motor_work: Float[Array, "*b t m"] | None = None
+    spins: Float[Array, "*b t k"] | None = None
     motion: AbstractMotion | None = None
     event_time: Float[Array, "*b"] | None = None
 
@@ -68,8 +73,8 @@ class Trajectory(eqx.Module):
         any order, also outside the times simulated. Differentiable in ``t``, in the initial state
         and in the numbers of the scene; under ``jit`` and ``vmap`` too. Exact laws are evaluated at
         ``t``; a stepped body is moved there from its nearest sample, which keeps ``rtol`` and costs
-        a few steps for each time. A time that is not finite gives NaN. ``work`` and ``error`` are
-        None.
+        a few steps for each time. A time that is not finite gives NaN. ``work``, ``motor_work`` and
+        ``error`` are None.
 
         Raises ValueError where attitude or rates were not recorded, SimulationError as
         ``ph.simulate`` does.
@@ -97,7 +102,10 @@ class Trajectory(eqx.Module):
 
     @property
     def last(self) -> State:
-        """The state (...) at the last sample, from which another simulation may go on."""
+        """The state (...) at the last sample, from which another simulation may go on.
+
+        It holds attitude and rates; the speeds of wheels are ``wheel_speed[..., -1, :]``.
+        """
         return State(self._need("wxyz")[..., -1, :], self._need("omega_body")[..., -1, :])
 
     def __getitem__(self, key: Any) -> "Trajectory":
@@ -130,7 +138,8 @@ class Trajectory(eqx.Module):
         return Trajectory(
             of_both(self.ts, 1), of_both(self.wxyz, 2), of_both(self.omega_body, 2),
             of_bodies(self.status, 0), of_bodies(self.steps, 0), Scene(**parts),
-            of_both(self.work, 1), of_bodies(self.error, 0), self.motion,
+            of_both(self.work, 1), of_bodies(self.error, 0), of_both(self.motor_work, 2),
+            of_both(self.spins, 2), self.motion,
             of_bodies(self.event_time, 0),
         )  # fmt: skip
 
@@ -178,7 +187,8 @@ class Trajectory(eqx.Module):
         """The scene with arrays shaped to broadcast against (..., T) samples."""
         rank = len(self.batch_shape)
         parts = {name: along_time(getattr(self.scene, name), rank) for name in PARTS}
-        return Scene(**parts)
+        spins = () if self.spins is None else tuple(jnp.moveaxis(self.spins, -1, 0))
+        return Scene(**parts).with_spins(spins)
 
     @property
     def _t(self) -> Array:
@@ -193,6 +203,20 @@ class Trajectory(eqx.Module):
     def momentum_space(self) -> Float[Array, "*b t 3"]:
         """Angular momentum in space axes [kg m^2/s]."""
         return rotation.rotate(self._need("wxyz"), self.momentum_body)
+
+    @property
+    def wheel_speed(self) -> Float[Array, "*b t m"] | None:
+        """Speed of each wheel relative to the body [rad/s]; None without wheels.
+
+        NaN for a wheel that is held at a momentum, its inertia not given.
+        """
+        wheels = self._scene.rotors
+        if wheels is None:
+            return None
+        omega = components(self._need("omega_body"))
+        speeds = [wheels.speed(i, self._t, omega) for i in range(len(wheels.held))]
+        shape = omega[0].shape
+        return jnp.stack([jnp.broadcast_to(x, shape) for x in speeds], axis=-1)
 
     @property
     def energy(self) -> Float[Array, "*b t"]:

@@ -1,5 +1,10 @@
 """Potentials, external torques, damping and rotors: one small class each."""
 
+from polhode.torques._couplings import (
+    AbstractCoupling as AbstractCoupling,
+    ViscousCoupling as ViscousCoupling,
+)
+from polhode.torques._dissipation import EnergySink as EnergySink
 from polhode.torques._frames import LVLH as LVLH, RelativeTorque as RelativeTorque
 from polhode.torques._orbit import (
     AbstractOrbit as AbstractOrbit,
@@ -14,9 +19,9 @@ from polhode.torques._potentials import (
     PotentialSum as PotentialSum,
     UniformGravity as UniformGravity,
 )
+from polhode.torques._rotor import Rotor as Rotor
 from polhode.torques._rotors import (
     AbstractRotor as AbstractRotor,
-    Rotor as Rotor,
     RotorSum as RotorSum,
     Wheels as Wheels,
 )

@@ -1,22 +1,21 @@
 """The exact motion of the free body as a method: nothing is stepped."""
 
-from typing import ClassVar
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode import free, rotation
-from polhode._batch import map_chunks
+from polhode._batch import PARTS, map_chunks
 from polhode._scene import Scene
 from polhode._state import State
 from polhode.inertia import Symmetry, principal
-from polhode.methods._base import AbstractMethod, Record, Samples
+from polhode.methods._base import Record, Samples
 from polhode.methods._status import Status
+from polhode.methods.exact._law import AbstractExact, with_first
 
 
-class ClosedForm(AbstractMethod):
+class ClosedForm(AbstractExact):
     """The exact free motion in Jacobi elliptic functions, O(1) in time, for every inertia.
 
     Bodies known to be axisymmetric or spherical (``ph.Inertia.axisymmetric``, ``spherical``) use
@@ -33,16 +32,19 @@ class ClosedForm(AbstractMethod):
     chunk: int | None = eqx.field(static=True, default=None)
     compensated: bool = eqx.field(static=True, default=False)
 
-    exact: ClassVar[bool] = True
+    def objection(self, scene):
+        if scene.is_free:
+            return None
+        acting = (part for part in PARTS[1:] if getattr(scene, part) is not None)
+        return f"it solves free bodies only, and the scene has a {' and '.join(acting)}"
+
+    def why_not(self, scene, state, record):
+        return self.objection(scene)
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         del rtol
-        if not scene.is_free:
-            raise ValueError(
-                "ph.ClosedForm solves free bodies only, and this scene has a potential, a torque or"
-                " rotors: leave method=None, or use ph.LiePoisson()."
-            )
-        kept = ts[..., -1:] if record.final_only else ts
+        self.refuse(scene)
+        kept = ts[..., -1:] if record.final_only else ts[..., 1:]  # at the first it is given
         t = kept - ts[..., :1]
         inertia = scene.inertia
         axes = products = None
@@ -87,6 +89,8 @@ class ClosedForm(AbstractMethod):
             axes = axes[:, None]
             wxyz = None if wxyz is None else rotation.multiply(wxyz, rotation.conjugate(axes))
             omega = None if omega is None else rotation.rotate(axes, omega)
+        if not record.final_only:
+            wxyz, omega = with_first(state, wxyz, omega)
         finite = jnp.ones(n, bool)
         for part in (wxyz, omega):
             if part is not None:
