@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
 from polhode import rotation
@@ -14,6 +15,7 @@ from polhode._scene import Scene
 from polhode._state import State
 from polhode._trajectory import AbstractMotion, Trajectory
 from polhode.methods import AbstractMethod, Record, Status, raise_on_failure
+from polhode.torques import Wheels
 
 
 class Motion(AbstractMotion):
@@ -51,7 +53,7 @@ class Motion(AbstractMotion):
                 f" got {times.shape}."
             )
         found = moved_to(trajectory, times)
-        if not isinstance(found.status, jax.core.Tracer):
+        if not isinstance(found.status, Tracer):
             raise_on_failure(found.status)
         return found
 
@@ -68,7 +70,7 @@ def moved_through(trajectory: Trajectory, t: Array) -> Trajectory:
 
 @eqx.filter_jit
 def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
-    motion = trajectory.motion
+    motion: Any = trajectory.motion
     batch, ts = trajectory.batch_shape, trajectory.ts
     parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
     samples = [
@@ -97,7 +99,7 @@ def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
 
 def _begun(scene: Scene, spins: list[Array]) -> Scene:
     """The scene with these momenta of its coupled wheels, if there are such."""
-    if not spins:
+    if not spins or not isinstance(scene.rotors, Wheels):
         return scene
     return Scene(scene.inertia, scene.potential, scene.torque, scene.rotors.begun(*spins))
 

@@ -23,6 +23,9 @@ _A_TURN = 32
 _TOO_MANY = 20_000_000
 """Looks at all bodies together, which are held in memory."""
 
+_ROOM = 16
+"""Least number of places where the function turns back that are looked at."""
+
 _AT_START = 1e-6
 """Part of the time between two looks within which a crossing is the start itself."""
 
@@ -93,7 +96,7 @@ def crossings(
             raise ValueError(
                 "under jit, vmap or grad the room for crossings must be known: most=8."
             )
-        room = 16
+        room = _ROOM
     found = _found(trajectory, event, room, looks)
     while most is None and int(np.max(found.count, initial=0)) > room:
         room = 2 ** int(np.ceil(np.log2(np.max(found.count))))
@@ -174,14 +177,17 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> Cross
 
     sides = jnp.where(values >= 0, 1, -1)
     changes = sides[:, 1:] != sides[:, :-1]
+    if event.direction:
+        changes = changes & (sides[:, 1:] * ahead == event.direction)
+    room = max(most, _ROOM)
     dips = _dips(grid, values, slopes, sides)
 
     def at(x, place):
         return jnp.take_along_axis(x, place, axis=-1)
 
     # what turns back towards zero between two looks is looked at where it turns
-    place, is_dip = _first_true(dips, most)
-    single, is_single = _first_true(changes, most)
+    place, is_dip = _first_true(dips, room)
+    single, is_single = _first_true(changes, room)
     side = at(sides, place)
     low, high = at(grid, place), at(grid, place + 1)
     turns = low, high, at(slopes, place), at(slopes, place + 1), is_dip
@@ -200,7 +206,7 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> Cross
         *columns, use, rising = (jnp.concatenate(x, axis=-1) for x in columns)
         if event.direction:
             use = use & (jnp.where(rising, 1, -1) * ahead == event.direction)
-        order = jnp.argsort(jnp.where(use, ahead * columns[0], jnp.inf), axis=-1)[:, :most]
+        order = jnp.argsort(jnp.where(use, ahead * columns[0], jnp.inf), axis=-1)[:, :room]
         return tuple(at(x, order) for x in (*columns, use)), pairs
 
     def search(found, second):
@@ -218,15 +224,12 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> Cross
     _, (points, there) = jax.lax.scan(search, (none, none), jnp.array([False, True]))
     (*_, use), pairs = brackets(points[0], there[0])
     times = points[1]
-    each, counted = 2, changes
-    if event.direction:
-        each = 1
-        counted = changes & (jnp.where(sides[:, 1:] > 0, 1, -1) * ahead == event.direction)
-    count = jnp.sum(counted, axis=-1) + each * jnp.sum(pairs, axis=-1)
+    each = 1 if event.direction else 2
+    count = jnp.sum(changes, axis=-1) + each * jnp.sum(pairs, axis=-1)
     # dips beyond the room were not looked at: there may be as many pairs of them
     dipping = jnp.sum(dips, axis=-1)
-    count = jnp.where(dipping > most, jnp.maximum(count, each * dipping), count)
-    times, use = times.reshape(*batch, most), use.reshape(*batch, most)
+    count = jnp.where(dipping > room, jnp.maximum(count, each * dipping), count)
+    times, use = (x[:, :most].reshape(*batch, most) for x in (times, use))
     slope, times = _polished(trajectory, event, times, use)
     return Crossings(
         jnp.where(use, times, jnp.inf), jnp.where(use, slope, 0),

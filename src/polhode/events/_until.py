@@ -5,6 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
+from polhode._checks import is_concrete
 from polhode._motion import moved_to
 from polhode._trajectory import Trajectory
 from polhode.events._crossings import crossings
@@ -27,8 +28,10 @@ def check_until(until: Any, record: Any) -> None:
 
 def stopped(trajectory: Trajectory, until: Event) -> Trajectory:
     """The trajectory, each body held from its first event on."""
-    found = crossings(trajectory, until, most=1)
-    return _held(trajectory, found.times[..., 0])
+    known = is_concrete(trajectory)
+    found = crossings(trajectory, until, most=None if known else 1)
+    none = jnp.full((*trajectory.batch_shape, 1), jnp.inf, trajectory.ts.dtype)
+    return _held(trajectory, jnp.concatenate([found.times, none], axis=-1)[..., 0])
 
 
 @eqx.filter_jit

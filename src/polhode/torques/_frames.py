@@ -1,6 +1,7 @@
 """The frame that goes along with an orbit, and torques in it."""
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -34,7 +35,7 @@ class LVLH(AbstractPart):
     Astrodynamics and Applications, section 3.3.
     """
 
-    orbit: Float[Array, "*#b 3"] | Callable = shaped(3)
+    orbit: AbstractOrbit | Callable = shaped(3)
 
     def __init__(self, orbit):
         if not callable(orbit):
@@ -42,11 +43,12 @@ class LVLH(AbstractPart):
                 "LVLH takes an orbit (ph.KeplerOrbit, ph.StateOrbit) or a function of time, got"
                 f" {type(orbit).__name__}: a frame at rest needs none."
             )
-        self.orbit = vector_of_time("LVLH", orbit)
+        found: Any = vector_of_time("LVLH", orbit)
+        self.orbit = found
 
     def _along(self, t: Array, times: int) -> "LVLH":
         """With orbits shaped to broadcast against ``times`` axes of time."""
-        if not isinstance(self.orbit, AbstractPart):
+        if not isinstance(self.orbit, AbstractOrbit):
             return self
 
         def lift(x, rank):
@@ -60,7 +62,7 @@ class LVLH(AbstractPart):
         t = jnp.asarray(t)
 
         def place(t):
-            if isinstance(self.orbit, AbstractPart):
+            if isinstance(self.orbit, AbstractOrbit):
                 return self.orbit(t)
             return jnp.vectorize(self.orbit, signature="()->(n)")(t)
 

@@ -108,7 +108,7 @@ class KeplerOrbit(AbstractOrbit):
     periapsis: Float[Array, "*#b"] = shaped()
     mean_anomaly: Float[Array, "*#b"] = shaped()
     epoch: Float[Array, "*#b"] = shaped()
-    hyperbolic: bool = eqx.field(static=True)
+    hyperbolic: bool = eqx.field(static=True, default=False)
 
     def __init__(
         self,
@@ -196,7 +196,7 @@ class StateOrbit(AbstractOrbit):
     position: Float[Array, "*#b 3"] = shaped(3)
     velocity: Float[Array, "*#b 3"] = shaped(3)
     epoch: Float[Array, "*#b"] = shaped()
-    hyperbolic: bool = eqx.field(static=True)
+    hyperbolic: bool = eqx.field(static=True, default=False)
 
     def __init__(self, mu, position, velocity, epoch=0.0, hyperbolic=None):
         given = {
@@ -252,7 +252,10 @@ class StateOrbit(AbstractOrbit):
         bound = jnp.abs(bound)
         f = 1 - turn / bound
         g = (bound * sine + b * turn) / n
-        return f[..., None] * self.position + g[..., None] * self.velocity
+        place, velocity = (
+            jnp.broadcast_to(x, (*f.shape, 3)) for x in (self.position, self.velocity)
+        )
+        return f[..., None] * place + g[..., None] * velocity
 
 
 def _anomaly_since(mean: Array, a: Array, b: Array) -> Array:
