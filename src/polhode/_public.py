@@ -5,7 +5,6 @@ from polhode._scene import Scene as Scene
 from polhode._simulate import explain as explain, simulate as simulate
 from polhode._state import State as State
 from polhode._trajectory import Trajectory as Trajectory
-from polhode._version import __version__ as __version__
 from polhode.fit import fit_inertia as fit_inertia, fit_recordings as fit_recordings
 from polhode.frames import (
     RotatingFrame as RotatingFrame,
@@ -37,10 +36,12 @@ from polhode.methods.exact import (
     periods as periods,
 )
 from polhode.torques import (
+    AbstractCoupling as AbstractCoupling,
     AbstractPotential as AbstractPotential,
     AbstractRotor as AbstractRotor,
     AbstractTorque as AbstractTorque,
     BodyTorque as BodyTorque,
+    EnergySink as EnergySink,
     FeedbackTorque as FeedbackTorque,
     GravityGradient as GravityGradient,
     KeplerOrbit as KeplerOrbit,
@@ -51,4 +52,5 @@ from polhode.torques import (
     SpaceTorque as SpaceTorque,
     StateOrbit as StateOrbit,
     UniformGravity as UniformGravity,
+    ViscousCoupling as ViscousCoupling,
 )

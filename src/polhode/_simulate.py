@@ -10,11 +10,10 @@ from jaxtyping import Array, ArrayLike, Float
 from polhode import rotation
 from polhode._batch import PARTS, Split, common_batch, flatten, on_devices, place, split_of
 from polhode._checks import is_concrete
+from polhode._dispatch import again, learn
 from polhode._scene import Scene
-from polhode._shortcut import learn, shortcut
 from polhode._state import State
 from polhode._trajectory import Trajectory
-from polhode.inertia import Symmetry
 from polhode.methods import (
     AbstractMethod,
     Plan,
@@ -28,8 +27,8 @@ from polhode.methods import (
     judged,
     plan,
     raise_on_failure,
+    ways_of,
 )
-from polhode.methods.exact import ClosedForm
 
 
 def simulate(
@@ -63,25 +62,24 @@ def simulate(
     dtypes, a tolerance that the dtype cannot reach.
     """
     if method is None:
-        trajectory = shortcut(scene, state, ts, rtol, record)
+        trajectory = again(scene, state, ts, rtol, record)
         if trajectory is not None:
             return checked(trajectory, throw)
-    given = record
+    given, as_given = record, scene
     scene, state, ts, record = check_inputs(scene, state, ts, record)
     check_method(method)
-    rtol = check_rtol(rtol, state.wxyz.dtype)
+    checked_rtol = check_rtol(rtol, state.wxyz.dtype)
     split = split_of(scene, state, ts)
     if method is None:
-        method, _ = choose(scene, state, record, rtol, ts)
-        if split is None and _is_simple(method, scene, state, record):
-            depends = scene.inertia.symmetry is Symmetry.NONE
-            learn(partial(_trajectory, method), scene, state, given, record, looks_long=depends)
-            trajectory = shortcut(scene, state, ts, None, given)
+        if split is None and scene is as_given and is_concrete(scene, state):
+            learn(_trajectory, scene, given, record, ways_of(scene, state, record))
+            trajectory = again(scene, state, ts, rtol, given)
             if trajectory is not None:
                 return checked(trajectory, throw)
+        method, _ = choose(scene, state, record, checked_rtol, ts)
     if split is not None and is_concrete(scene, state, ts):
         scene, state, ts = place(split, scene, state, ts)
-    return checked(run(method, scene, state, ts, rtol, record, split), throw)
+    return checked(run(method, scene, state, ts, checked_rtol, record, split), throw)
 
 
 def checked(trajectory: Trajectory, throw: bool) -> Trajectory:
@@ -89,12 +87,6 @@ def checked(trajectory: Trajectory, throw: bool) -> Trajectory:
     if throw and not isinstance(trajectory.status, jax.core.Tracer):
         raise_on_failure(trajectory.status)
     return trajectory
-
-
-def _is_simple(method, scene: Scene, state: State, record: Record) -> bool:
-    """Whether calls of this structure may take the short way."""
-    plain = isinstance(method, ClosedForm) and not (method.compensated or record.error)
-    return plain and not record.work and is_concrete(scene, state)
 
 
 def explain(
@@ -128,9 +120,9 @@ def _trajectory(method, scene, state, ts, rtol, record, split=None) -> Trajector
         found = _moved(record, method, scene, state, ts, rtol)
     else:
         found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
-    wxyz, omega, status, steps, work, error = found
+    wxyz, omega, status, steps, work, error, motors, spins = found
     kept = ts[..., -1:] if record.final_only else ts
-    trajectory = Trajectory(kept, wxyz, omega, status, steps, scene, work, error)
+    trajectory = Trajectory(kept, wxyz, omega, status, steps, scene, work, error, motors, spins)
     if record.work and method.exact:
         work = _work_of_exact(trajectory, state, ts[..., :1])
         return eqx.tree_at(lambda t: t.work, trajectory, work, is_leaf=lambda x: x is None)

@@ -30,6 +30,7 @@ from polhode.hamiltonian._lie_poisson import (
     external_power as external_power,
     lie_poisson_field as lie_poisson_field,
     momentum_rate as momentum_rate,
+    motor_powers as motor_powers,
     quaternion_rate as quaternion_rate,
 )
 from polhode.hamiltonian._units import (

@@ -18,7 +18,13 @@ from polhode.methods._inputs import (
     raise_on_failure as raise_on_failure,
 )
 from polhode.methods._options import check_options as check_options, made as made
-from polhode.methods._plan import Plan as Plan, choose as choose, plan as plan
+from polhode.methods._plan import (
+    Plan as Plan,
+    Ways as Ways,
+    choose as choose,
+    plan as plan,
+    ways_of as ways_of,
+)
 from polhode.methods._status import SimulationError as SimulationError, Status as Status
 from polhode.methods._stepped import (
     EulerAngles as EulerAngles,

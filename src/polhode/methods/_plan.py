@@ -2,7 +2,9 @@
 
 import dataclasses
 import functools
+import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +19,7 @@ from polhode.inertia import Symmetry
 from polhode.methods._base import AbstractMethod, Record
 from polhode.methods._charts import LiePoissonChart
 from polhode.methods._stepped import LiePoisson
-from polhode.methods.exact import ClosedForm, lawful
+from polhode.methods.exact import LAWS, ClosedForm, lawful
 from polhode.solvers import Extrapolation
 from polhode.torques import GravityGradient, UniformGravity
 
@@ -77,18 +79,52 @@ def choose(
     that hold for special bodies and states, and, with the times ``ts``, for horizons so long that
     the rounding of a phase would miss ``rtol`` tenfold.
     """
+    ways = ways_of(scene, state, record)
+    number = int(_misses(ways, state, rtol, ts))
+    return ways.methods[number], ways.says[number]
+
+
+class Ways(NamedTuple):
+    """How a scene is moved: plainly, or with sums that are carried along in two floats where the
+    rounding of plain ones would miss ``rtol``.
+
+    ``methods``, ``says``: of the two. Rounding takes about ``eps * angle**power`` of the attitude,
+    and may take ``factor * rtol``; ``least``: the tolerance over eps from which plain sums do at
+    all. ``of_state``: whether other states of the same scene may be moved otherwise.
+    """
+
+    methods: tuple[AbstractMethod, AbstractMethod]
+    says: tuple[str, str]
+    power: float = 0.0
+    factor: float = math.inf
+    least: float = 0.0
+    of_state: bool = False
+
+    def reach(self, rtol: float, eps: float) -> float:
+        """Angle [rad] up to which plain sums are good enough."""
+        if self.factor == math.inf:
+            return math.inf
+        return (self.factor * rtol / eps) ** (1 / self.power) if rtol >= self.least * eps else 0.0
+
+
+def ways_of(scene: Scene, state: State, record: Record) -> Ways:
+    """The ways that the planner chooses from."""
     law, _ = lawful(scene, state, record)
-    if law is not None:
-        general = scene.is_free and scene.inertia.symmetry is Symmetry.NONE
-        if general and _is_long(state, rtol, ts):
-            return dataclasses.replace(law.method, compensated=True), law.says + _LONG
-        return law.method, law.says
-    compensated = _wanders(state, rtol, ts)
-    upright = scene.torque is None and _is_upright(scene.potential)
-    return _stepped(upright, compensated), (
-        "something acts on the body: extrapolated midpoint rule, stepped with an error estimate,"
-        f" held to rtol at every saved time{_COMPENSATED * compensated}"
-    )
+    if law is None:
+        upright = scene.torque is None and _is_upright(scene.potential)
+        says = (
+            "something acts on the body: extrapolated midpoint rule, stepped with an error"
+            " estimate, held to rtol at every saved time"
+        )
+        both = tuple(_stepped(upright, compensated) for compensated in (False, True))
+        also = says + ", its rounding carried along: it would miss rtol"
+        of_state = any(law.of_state and law.method.objection(scene) is None for law in LAWS)
+        return Ways(both, (says, also), 1.5, 1.5, 2000, of_state)
+    if not scene.is_free or scene.inertia.symmetry is not Symmetry.NONE:
+        return Ways((law.method, law.method), (law.says, law.says), of_state=law.of_state)
+    long = dataclasses.replace(law.method, compensated=True)
+    also = law.says + ", its frequencies in sums of two floats: a rounded phase would miss rtol"
+    return Ways((law.method, long), (law.says, also), 1.0, 10.0)
 
 
 @functools.cache
@@ -97,33 +133,21 @@ def _stepped(upright: bool, compensated: bool) -> AbstractMethod:
     return dataclasses.replace(method, chart=LiePoissonChart(upright))
 
 
-_COMPENSATED = ", its rounding carried along: it would miss rtol"
-
-
-def _wanders(state: State, rtol, ts) -> bool:
-    """Whether the rounding of plain steps, which wanders and turns the body on, may miss rtol."""
+def _misses(ways: Ways, state: State, rtol, ts) -> bool:
+    """Whether plain sums are known, or where nothing is known feared, to miss rtol."""
     eps = float(jnp.finfo(state.wxyz.dtype).eps)
     if not is_concrete(rtol):
-        return state.wxyz.dtype == jnp.float32
-    if rtol < 2000 * eps:
-        return True
-    return _is_known(state, ts) and eps * _turned(state, ts) ** 1.5 > 5 * float(rtol)
-
-
-_LONG = ", its frequencies in sums of two floats: a rounded phase would miss rtol"
+        return ways.least > 0 and state.wxyz.dtype == jnp.float32
+    reach = ways.reach(float(rtol), eps)
+    if reach in (0, math.inf):
+        return reach == 0
+    return _is_known(state, ts) and _turned(state, ts) > reach
 
 
 def _is_known(state: State, ts) -> bool:
     if ts is None or not is_concrete(state.omega_body, ts):
         return False
     return getattr(state.omega_body, "is_fully_addressable", True)
-
-
-def _is_long(state: State, rtol, ts) -> bool:
-    if not is_concrete(rtol) or not _is_known(state, ts):
-        return False
-    eps = float(jnp.finfo(state.omega_body.dtype).eps)
-    return eps * _turned(state, ts) > 10 * float(rtol)
 
 
 def _turned(state: State, ts) -> float:

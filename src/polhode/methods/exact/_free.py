@@ -12,7 +12,7 @@ from polhode._state import State
 from polhode.inertia import Symmetry, principal
 from polhode.methods._base import Record, Samples
 from polhode.methods._status import Status
-from polhode.methods.exact._law import AbstractExact
+from polhode.methods.exact._law import AbstractExact, with_first
 
 
 class ClosedForm(AbstractExact):
@@ -44,7 +44,7 @@ class ClosedForm(AbstractExact):
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         del rtol
         self.refuse(scene)
-        kept = ts[..., -1:] if record.final_only else ts
+        kept = ts[..., -1:] if record.final_only else ts[..., 1:]  # at the first it is given
         t = kept - ts[..., :1]
         inertia = scene.inertia
         axes = products = None
@@ -89,6 +89,8 @@ class ClosedForm(AbstractExact):
             axes = axes[:, None]
             wxyz = None if wxyz is None else rotation.multiply(wxyz, rotation.conjugate(axes))
             omega = None if omega is None else rotation.rotate(axes, omega)
+        if not record.final_only:
+            wxyz, omega = with_first(state, wxyz, omega)
         finite = jnp.ones(n, bool)
         for part in (wxyz, omega):
             if part is not None:

@@ -51,18 +51,21 @@ class AbstractTopMethod(AbstractExact):
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         del rtol
         self.refuse(scene)
-        count = 1 if record.final_only else ts.shape[-1]
+        count = 1 if record.final_only else ts.shape[-1] - 1
         lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
 
         def one(chunk):
             lanes, times = chunk
             scene, state = eqx.combine(lanes, shared)
             times = ts if times is None else times
-            kept = times[..., -1:] if record.final_only else times
+            kept = times[..., -1:] if record.final_only else times[..., 1:]  # the first is given
             elapsed = kept - times[..., :1]
             n = state.wxyz.shape[0]
             elapsed = jnp.broadcast_to(elapsed if elapsed.ndim == 2 else elapsed[None], (n, count))
-            return _samples(*self._motion(scene, state, elapsed), record)
+            wxyz, omega, lawful = self._motion(scene, state, elapsed)
+            if not record.final_only:
+                wxyz, omega = with_first(state, wxyz, omega)
+            return _samples(wxyz, omega, lawful, record)
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
         return map_chunks(one, (lanes, times), n, self._size(n, count))
@@ -70,6 +73,17 @@ class AbstractTopMethod(AbstractExact):
     def _size(self, n: int, count: int) -> int:
         """Lanes of a chunk."""
         return max(1, self.chunk // count)
+
+
+def with_first(
+    state: State, wxyz: Array | None, omega: Array | None
+) -> tuple[Array | None, Array | None]:
+    """Samples (N, T, ...) with the given state before them."""
+    both = ((state.wxyz, wxyz), (state.omega_body, omega))
+    wxyz, omega = (
+        None if x is None else jnp.concatenate([first[:, None], x], axis=1) for first, x in both
+    )
+    return wxyz, omega
 
 
 def _samples(wxyz, omega, lawful, record: Record) -> Samples:

@@ -16,12 +16,14 @@ class Law(NamedTuple):
     """One law: its name, what ``explain`` says where it runs, the method that computes it.
 
     ``symmetry``: the one that the inertia must be known to have; None: left to the method.
+    ``of_state``: whether it holds for some states of a scene only.
     """
 
     name: str
     says: str
     method: AbstractExact
     symmetry: Symmetry | None = None
+    of_state: bool = False
 
     def why_not(self, scene: Scene, state: State, record: Record) -> str | None:
         """Why it is not known to hold, in words; None where it is."""
@@ -65,6 +67,7 @@ LAWS = (
         "fixed axis",
         "spin about one fixed principal axis: exact motion in elementary functions",
         FixedAxis(),
+        of_state=True,
     ),
 )
 

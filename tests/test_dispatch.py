@@ -1,0 +1,173 @@
+"""Repeated plain calls: the same answers, the same care."""
+
+import gc
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import polhode as ph
+from polhode import _dispatch
+
+SCENE = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]))
+TS = [0.0, 1.0, 3.0]
+
+
+def _state(size=1.0):
+    return ph.State([1.0, 0.0, 0.0, 0.0], [0.3 * size, size, 0.2 * size])
+
+
+@pytest.fixture(autouse=True)
+def taken():
+    """Every test starts where the scene is known."""
+    return ph.simulate(SCENE, _state(), jnp.array(TS))
+
+
+@pytest.mark.parametrize("kind", [jnp.array, np.array, list])
+def test_repeated_calls_give_what_a_compiled_call_gives(taken, kind):
+    state = _state(1.5)
+    fast = ph.simulate(SCENE, state, kind(TS))
+    slow = jax.jit(ph.simulate)(SCENE, state, jnp.array(TS))
+    assert jax.tree.structure(fast) == jax.tree.structure(slow)
+    for one, other in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):
+        assert one.dtype == other.dtype
+        assert one.shape == other.shape
+        np.testing.assert_allclose(one, other, rtol=1e-14, atol=1e-14)
+    assert not np.allclose(fast.wxyz, taken.wxyz)
+
+
+def test_the_method_follows_the_numbers():
+    """A horizon so long that a rounded phase would miss rtol: not the method of the first call."""
+    ts, scene = jnp.array([0.0, 2e9, 4e9]), SCENE
+    exact = ph.simulate(scene, _state(), ts, ph.ClosedForm(compensated=True))
+    chosen = ph.simulate(scene, _state(), ts)
+    assert np.array_equal(chosen.wxyz, exact.wxyz)
+    assert np.array_equal(ph.simulate(scene, _state(1e9), ts / 1e9).ts, ts / 1e9)
+    assert "sums of two floats" in str(ph.explain(scene, _state(1e9), jnp.array([0.0, 2.0, 4.0])))
+    plain = ph.simulate(scene, _state(1e9), jnp.array([0.0, 2.0, 4.0]))
+    wanted = ph.ClosedForm(compensated=True)
+    wanted = ph.simulate(scene, _state(1e9), jnp.array([0.0, 2.0, 4.0]), wanted)
+    assert np.array_equal(plain.wxyz, wanted.wxyz)
+
+
+@pytest.mark.parametrize(
+    ("ts", "error", "said"),
+    [
+        ([0.0, 2.0, 1.0], ValueError, "strictly increasing"),
+        ([0.0, 1.0, 1.0], ValueError, "strictly increasing"),
+        ([0.0, np.nan, 1.0], ValueError, "NaN"),
+        ([0.0, 1.0, np.inf], ValueError, "infinity"),
+        ([0.0], ValueError, "at least two"),
+        ([[[0.0, 1.0, 3.0]], [[0.0, 1.0, 0.5]]], ValueError, "strictly increasing"),
+        (["a", "b", "c"], TypeError, "real numbers"),
+    ],
+)
+def test_bad_times_are_still_found(ts, error, said):
+    with pytest.raises(error, match=said):
+        ph.simulate(SCENE, _state(), ts)
+
+
+def test_bad_parts_are_still_found():
+    with pytest.raises(ValueError, match="rtol"):
+        ph.simulate(SCENE, _state(), TS, rtol=1e-30)
+    with pytest.raises(ValueError, match="rtol"):
+        ph.simulate(SCENE, _state(), TS, rtol=float("nan"))
+    with pytest.raises(TypeError, match="record"):
+        ph.simulate(SCENE, _state(), TS, record="all")
+    single = jax.tree.map(lambda x: x.astype("float32"), _state())
+    with pytest.raises(TypeError, match="mix the dtypes"):
+        ph.simulate(SCENE, single, TS)
+    with pytest.raises(TypeError, match="state must be"):
+        ph.simulate(SCENE, SCENE, TS)
+
+
+def test_a_body_that_fails_is_still_reported():
+    broken = jax.tree.map(lambda x: x * jnp.nan, _state())
+    with pytest.raises(ph.SimulationError, match="NaN or infinity"):
+        ph.simulate(SCENE, broken, TS)
+    assert ph.simulate(SCENE, broken, TS, throw=False).status == ph.Status.NOT_FINITE
+
+
+def test_traced_parts_take_the_long_way():
+    def last(size):
+        return ph.simulate(SCENE, _state(size), TS).omega_body[-1, 0]
+
+    slope = jax.grad(last)(1.0)
+    assert slope == pytest.approx(float((last(1 + 1e-6) - last(1 - 1e-6)) / 2e-6), rel=1e-7)
+
+
+I = ph.Inertia.from_moments([1.0, 1.5, 2.0])
+FALL = ph.UniformGravity(1.0, [0.1, 0.0, 0.3])
+KINDS = {
+    "top": (I, FALL),
+    "damped": (I, FALL, ph.LinearDamping(jnp.array([0.1, 0.2, 0.3]))),
+    "damped, nothing else": (I, None, ph.LinearDamping(jnp.array([0.1, 0.2, 0.3]))),
+    "Lagrange": (ph.Inertia.axisymmetric(1.0, 0.5), ph.UniformGravity(1.0, [0.0, 0.0, 0.3])),
+    "wheel": (I, None, None, ph.Rotor([0.0, 0.0, 1.0], 0.1, momentum=0.3)),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_scene_is_remembered(kind, monkeypatch):
+    """The second call does not check the scene again, and gives what the long way gives."""
+    scene, record = ph.Scene(*KINDS[kind]), ph.Record(work=kind == "damped")
+    ph.simulate(scene, _state(), TS, record=record)
+
+    def again(*_):
+        raise AssertionError("looked at the scene again")
+
+    monkeypatch.setattr("polhode._simulate.check_inputs", again)
+    fast = ph.simulate(scene, _state(1.5), np.array(TS), rtol=1e-7, record=record)
+    monkeypatch.undo()
+    slow = jax.jit(lambda state: ph.simulate(scene, state, TS, rtol=1e-7, record=record))
+    slow = slow(_state(1.5))
+    for one, other in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+    assert (fast.work is None) == (kind != "damped")
+    if kind == "wheel":  # whose momentum is that of its own initial state
+        assert fast.scene is not scene
+    np.testing.assert_allclose(fast.energy, slow.energy, rtol=1e-12)
+
+
+def test_a_state_that_another_law_holds_for_is_moved_by_it():
+    scene = ph.Scene(*KINDS["damped, nothing else"])
+    assert np.all(np.asarray(ph.simulate(scene, _state(), TS).steps) > 0)
+    about_one_axis = ph.State([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.7])
+    assert ph.simulate(scene, about_one_axis, TS).steps == 0
+    assert "one fixed principal axis" in str(ph.explain(scene, about_one_axis, TS))
+    assert np.all(np.asarray(ph.simulate(scene, _state(), TS).steps) > 0)
+
+
+def test_long_horizons_of_stepped_bodies_carry_their_rounding():
+    scene = ph.Scene(*KINDS["top"])
+    short = ph.simulate(scene, _state(), TS, rtol=1e-9)
+    for rtol in (1e-12, 3e-13):
+        found = ph.simulate(scene, _state(), TS, rtol=rtol)
+        method, _ = ph.choose(scene, _state(), ph.Record(), rtol, jnp.array(TS))
+        asked = ph.simulate(scene, _state(), TS, method, rtol=rtol)
+        assert method.solver.compensated == (rtol < 2000 * np.finfo(float).eps)
+        assert np.array_equal(found.wxyz, asked.wxyz)
+        assert not np.array_equal(found.wxyz, short.wxyz)
+
+
+def test_what_is_kept_of_a_scene_ends_with_it_and_programs_are_shared_and_few():
+    gc.collect()
+    scenes, programs = len(_dispatch._SCENES), len(_dispatch._PROGRAMS)
+    made = [ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0 + k / 9])) for k in range(3)]
+    found = [ph.simulate(scene, _state(), TS) for scene in made]
+    assert len(_dispatch._SCENES) == scenes + 3
+    assert len(_dispatch._PROGRAMS) <= programs + 1  # they differ in numbers
+    assert len({float(f.omega_body[-1, 0]) for f in found}) == 3
+    del made, found
+    gc.collect()
+    assert len(_dispatch._SCENES) == scenes
+    assert len(_dispatch._PROGRAMS) <= _dispatch._KEPT
+
+
+def test_the_first_sample_is_the_given_state():
+    wxyz = np.array([0.3, -0.5, 0.1, 0.7])
+    for scene in (SCENE, ph.Scene(*KINDS["Lagrange"])):
+        found = ph.simulate(scene, ph.State(wxyz, [0.1, 0.9, 0.2]), TS)
+        np.testing.assert_allclose(found.wxyz[0], wxyz / np.linalg.norm(wxyz), rtol=1e-15)
+        assert np.array_equal(found.omega_body[0], [0.1, 0.9, 0.2])
