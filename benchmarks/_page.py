@@ -237,7 +237,7 @@ def plain_calls_block() -> list[str]:
     lines = [
         [
             f"{row['title']}, {row['bodies']:,} {'body' if row['bodies'] == 1 else 'bodies'}",
-            number(row["ns_bare"], 1e3), number(row["ns_plain"], 1e3), number(row["ns_sample"], 1e3),
+            *(number(row[name], 1e3) for name in ("ns_bare", "ns_plain", "ns_sample")),
             f"{row['attitude_median']:.0e}",
         ]
         for row in read("plain_calls")["numbers"]["rows"]
