@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from polhode._version import __version__
+from polhode import __version__
 from polhode.methods import Status
 
 
