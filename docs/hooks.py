@@ -24,7 +24,7 @@ from polhode import plot
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = (
     "quick_start", "intermediate_axis", "euler_hamiltonian", "work_and_precision",
-    "tumbling_asteroid", "rotating_frames", "inertia", "fitting",
+    "tumbling_asteroid", "explorer", "rotating_frames", "inertia", "fitting",
 )  # fmt: skip
 PENDING = {
     "light_curves.md",
@@ -37,7 +37,7 @@ SECTIONS = {
     "Methods": "ClosedForm LagrangeTop SymmetricTop FixedAxis LiePoisson EulerAngles",
     "Bodies": "Inertia MassProperties periods Periods Mode",
     "What acts": "UniformGravity GravityGradient KeplerOrbit StateOrbit Potential BodyTorque "
-    "SpaceTorque FeedbackTorque LinearDamping QuadraticDamping Rotor",
+    "SpaceTorque FeedbackTorque LinearDamping QuadraticDamping EnergySink Rotor ViscousCoupling",
     "Frames and sensors": "RotatingFrame simulate_particles accelerometer gyroscope",
     "The Hamiltonian": "hamiltonian hamiltons_equations",
     "From data": "fit_inertia fit_recordings",

@@ -37,10 +37,12 @@ from polhode.methods.exact import (
     periods as periods,
 )
 from polhode.torques import (
+    AbstractCoupling as AbstractCoupling,
     AbstractPotential as AbstractPotential,
     AbstractRotor as AbstractRotor,
     AbstractTorque as AbstractTorque,
     BodyTorque as BodyTorque,
+    EnergySink as EnergySink,
     FeedbackTorque as FeedbackTorque,
     GravityGradient as GravityGradient,
     KeplerOrbit as KeplerOrbit,
@@ -51,4 +53,5 @@ from polhode.torques import (
     SpaceTorque as SpaceTorque,
     StateOrbit as StateOrbit,
     UniformGravity as UniformGravity,
+    ViscousCoupling as ViscousCoupling,
 )

@@ -1,5 +1,6 @@
 """What is in the scene: the body's inertia and what acts on it."""
 
+from collections.abc import Sequence
 from functools import reduce
 from typing import Any
 
@@ -9,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from polhode._checks import is_concrete, together
-from polhode.hamiltonian import Hamiltonian, inverse_inertia
+from polhode.hamiltonian import Dynamics, Hamiltonian, inverse_inertia
 from polhode.inertia import Inertia
 from polhode.torques import AbstractPotential, AbstractRotor, AbstractTorque, Wheels
 
@@ -134,6 +135,19 @@ class Scene(eqx.Module):
         if wheels is not None:
             momentum = jnp.subtract(*_aligned(momentum, wheels))
         return self.carrier.rates(momentum)
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """What moves the body."""
+        wheels = self._wheels
+        loose = None if wheels is None or wheels.is_constant else wheels
+        return Dynamics(self.hamiltonian, self.torque, wheels=loose)
+
+    def with_spins(self, spins: Sequence[Array] = ()) -> "Scene":
+        """The scene at a moment when its coupled wheels have these momenta [kg m^2/s]."""
+        if not spins:
+            return self
+        return Scene(self.inertia, self.potential, self.torque, self._wheels.at(spins))
 
     @property
     def hamiltonian(self) -> Hamiltonian:

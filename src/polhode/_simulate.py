@@ -120,9 +120,9 @@ def _trajectory(method, scene, state, ts, rtol, record, split=None) -> Trajector
         found = _moved(record, method, scene, state, ts, rtol)
     else:
         found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
-    wxyz, omega, status, steps, work, error = found
+    wxyz, omega, status, steps, work, error, motors, spins = found
     kept = ts[..., -1:] if record.final_only else ts
-    trajectory = Trajectory(kept, wxyz, omega, status, steps, scene, work, error)
+    trajectory = Trajectory(kept, wxyz, omega, status, steps, scene, work, error, motors, spins)
     if record.work and method.exact:
         work = _work_of_exact(trajectory, state, ts[..., :1])
         return eqx.tree_at(lambda t: t.work, trajectory, work, is_leaf=lambda x: x is None)

@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
@@ -24,7 +25,9 @@ class Trajectory(eqx.Module):
     time, by external torques, potentials that change with time (also orbits) and the motors of
     wheels, so that ``energy - work`` is constant, or None (``Record(work=True)``); ``error`` (...)
     [rad]: estimated error of the attitude at the last time, or None (``Record(error=True)``;
-    without attitude that of the rates, relative).
+    without attitude that of the rates, relative); ``motor_work`` (..., T, m) [J]: the part of
+    ``work`` that motor and friction of each wheel have done, or None without ``work`` or such;
+    ``spins`` (..., T, k) [kg m^2/s]: momenta of the wheels with a coupling, or None.
     """
 
     ts: Float[Array, "*t"]
@@ -35,6 +38,8 @@ class Trajectory(eqx.Module):
     scene: Scene
     work: Float[Array, "*b t"] | None = None
     error: Float[Array, "*b"] | None = None
+    motor_work: Float[Array, "*b t m"] | None = None
+    spins: Float[Array, "*b t k"] | None = None
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -60,7 +65,8 @@ class Trajectory(eqx.Module):
         """The scene with arrays shaped to broadcast against (..., T) samples."""
         rank = len(self.batch_shape)
         parts = {name: along_time(getattr(self.scene, name), rank) for name in PARTS}
-        return Scene(**parts)
+        spins = () if self.spins is None else tuple(jnp.moveaxis(self.spins, -1, 0))
+        return Scene(**parts).with_spins(spins)
 
     @property
     def _t(self) -> Array:
@@ -75,6 +81,20 @@ class Trajectory(eqx.Module):
     def momentum_space(self) -> Float[Array, "*b t 3"]:
         """Angular momentum in space axes [kg m^2/s]."""
         return rotation.rotate(self._need("wxyz"), self.momentum_body)
+
+    @property
+    def wheel_speed(self) -> Float[Array, "*b t m"] | None:
+        """Speed of each wheel relative to the body [rad/s]; None without wheels.
+
+        NaN for a wheel that is held at a momentum, its inertia not given.
+        """
+        wheels = self._scene.rotors
+        if wheels is None:
+            return None
+        omega = components(self._need("omega_body"))
+        speeds = [wheels.speed(i, self._t, omega) for i in range(len(wheels.held))]
+        shape = omega[0].shape
+        return jnp.stack([jnp.broadcast_to(x, shape) for x in speeds], axis=-1)
 
     @property
     def energy(self) -> Float[Array, "*b t"]:

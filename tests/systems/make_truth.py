@@ -21,7 +21,7 @@ def final(system, moments, steps):
     norm = mp.sqrt(sum(x * x for x in wxyz))
     start = [mpf(x) for x in system.omega] + [x / norm for x in wxyz]
     return taylor.integrate(
-        taylor.body(moments, system.torque(moments)), start, *system.span, steps
+        taylor.body(moments, system.torque(moments), system.sink), start, *system.span, steps
     )
 
 

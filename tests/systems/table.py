@@ -65,6 +65,11 @@ class System:
 
         return torque
 
+    @property
+    def sink(self) -> float:
+        """k of the slip k (L x omega) of a body that loses energy inside."""
+        return self.acts.get("sink", 0.0)
+
 
 SYSTEMS = [
     System("free_long_axis_mode", (1.0, 2.0, 3.0), (1, 0, 0, 0), (1.0, 0.25, -0.5), (0, 10)),
@@ -96,6 +101,10 @@ SYSTEMS = [
     System(
         "spin_about_one_axis", (1.0, 1.5, 2.0), (1, 0, 0, 0), (0.0, 0.0, 1.0), (0, 5),
         {"body": (0.0, 0.0, 0.25), "damping": (0.0, 0.0, 0.5)},
+    ),
+    System(
+        "energy_sink", (1.0, 1.5, 2.0), (0.75, 0.5, -0.25, 0.3535533905932738), (1.0, -0.25, 0.5), (0, 6),
+        {"sink": 0.125},
     ),
     System(
         "symmetric_fading", (1.5, 1.5, 2.0), (0.5, -0.5, 0.5, 0.5), (0.5, 0.25, -1.0), (0, 5),

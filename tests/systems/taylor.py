@@ -88,18 +88,24 @@ def rows(q):
     ]
 
 
-def body(moments, torque=None):
-    """Rates and quaternion of a body: y = (omega, q); ``torque(t, omega, rows)`` in body axes."""
+def body(moments, torque=None, sink=0):
+    """Rates and quaternion of a body: y = (omega, q); ``torque(t, omega, rows)`` in body axes.
+
+    ``sink``: k of the slip k (L x omega) by which the axes turn beside omega.
+    """
     moments = [mpf(m) for m in moments]
 
     def field(t, y):
         omega, q = y[:3], y[3:]
         momentum = [m * w for m, w in zip(moments, omega)]
-        push = cross(momentum, omega)
+        push, turning = cross(momentum, omega), omega
+        if sink:
+            turning = [a + b * mpf(sink) for a, b in zip(omega, push)]
+            push = cross(momentum, turning)
         if torque is not None:
             push = [a + b for a, b in zip(push, torque(t, omega, rows(q)))]
         w, x, y_, z = q
-        a, b, c = (r * mpf("0.5") for r in omega)
+        a, b, c = (r * mpf("0.5") for r in turning)
         return [p * (1 / m) for p, m in zip(push, moments)] + [
             -(x * a) - y_ * b - z * c,
             w * a + y_ * c - z * b,

@@ -22,7 +22,7 @@ for _name, _system in BY_NAME.items():
 FREE = ACTING[frozenset()]
 ALL = list(BY_NAME)
 SYMMETRIC = ["symmetric_prolate", "symmetric_fading"]
-UNDAMPED = [name for name in ALL if not {"damping", "fading"} & set(BY_NAME[name].acts)]
+UNDAMPED = [name for name in ALL if not {"damping", "fading", "sink"} & set(BY_NAME[name].acts)]
 
 
 @dataclass(frozen=True)
@@ -97,6 +97,8 @@ def acting(names: Sequence[str], moments):
     if "fading" in acts:
         rate = jnp.array([system.acts.get("fading", 0) for system in systems], dtype)
         torques.append(ph.LinearDamping(rate[:, None] * moments))
+    if "sink" in acts:
+        torques.append(ph.EnergySink(jnp.array([system.sink for system in systems], dtype)))
     potential = sum(potentials[1:], start=potentials[0]) if potentials else None
     torque = sum(torques[1:], start=torques[0]) if torques else None
     return potential, torque

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode.hamiltonian import Dynamics, external_power, from_quaternion, lie_poisson_field
+from polhode.hamiltonian import (
+    Dynamics,
+    external_power,
+    from_quaternion,
+    lie_poisson_field,
+    motor_powers,
+)
 
 INERTIA = ph.Inertia.from_tensor([[1.0, 0.1, 0.0], [0.1, 1.5, -0.2], [0.0, -0.2, 1.75]])
 STATE = ph.State([0.8, 0.2, 0.4, -0.4], [0.5, -0.25, 0.75])
@@ -40,6 +46,17 @@ PARTS = {
     "wheel free": {"rotors": ph.Rotor(AXIS, inertia=0.2, speed=3.0, torque=0.0)},
     "wheel driven": {"rotors": ph.Rotor(AXIS, inertia=0.2, speed=3.0, torque=0.5)},
     "wheel of an impulse": {"rotors": ph.Rotor(AXIS, inertia=0.2, speed=3.0, impulse=jnp.sin)},
+    "energy sink": {"torque": ph.EnergySink(0.3)},
+    "energy sink of a law": {"torque": ph.EnergySink(lambda L, w: 0.1 * jnp.sum(L * w))},
+    "energy sink under gravity": {
+        "torque": ph.EnergySink(0.3) + ph.LinearDamping(0.1),
+        "potential": ph.UniformGravity(0.5, [0.1, 0.2, 0.5]),
+    },
+    "ring damper": {
+        "rotors": ph.Rotor(AXIS, inertia=0.2, speed=3.0, coupling=ph.ViscousCoupling(0.1))
+        + ph.Rotor([1.0, 0, 0], inertia=0.1, speed=1.0, impulse=jnp.sin)
+        + ph.Rotor([0, 1.0, 0], inertia=0.1, speed=1.0),
+    },
 }
 PASSIVE = {
     "uniform gravity", "gravity gradient", "potential", "momentum held", "speed held", "wheel free"
@@ -50,15 +67,16 @@ def growth(scene):
     """Slope of the energy along the motion, and the power that is said to come from outside."""
     scene = scene.settled(STATE, jnp.array(0.25))
     momentum = tuple(scene.momentum(STATE.omega_body, TIME))
-    wxyz = tuple(STATE.wxyz)
-    dynamics = Dynamics(scene.hamiltonian, scene.torque)
-    rates = lie_poisson_field(TIME, (momentum, wxyz), dynamics)
+    wxyz, dynamics = tuple(STATE.wxyz), scene.dynamics
+    spins = ((jnp.array(0.7),),) if dynamics.coupled else ()  # any, not those of the start
+    y = (momentum, wxyz, *spins)
+    rates = lie_poisson_field(TIME, y, dynamics)
 
-    def energy(t, momentum, wxyz):
-        return scene.hamiltonian.total(momentum, from_quaternion(wxyz), t)
+    def energy(t, momentum, wxyz, *spins):
+        return dynamics.at(*spins).hamiltonian.total(momentum, from_quaternion(wxyz), t)
 
-    _, slope = jax.jvp(energy, (TIME, momentum, wxyz), (jnp.ones_like(TIME), *rates))
-    return slope, external_power(TIME, momentum, from_quaternion(wxyz), dynamics)
+    _, slope = jax.jvp(energy, (TIME, *y), (jnp.ones_like(TIME), *rates))
+    return slope, external_power(TIME, momentum, from_quaternion(wxyz), dynamics.at(*spins))
 
 
 @pytest.mark.parametrize("name", list(PARTS))
@@ -74,6 +92,21 @@ def test_the_power_of_a_motor_is_torque_times_speed():
     start = 0.2 * (axis @ np.asarray(STATE.omega_body) + 3.0)
     speed = (start + 0.5 * (1.25 - 0.25)) / 0.2 - axis @ np.asarray(STATE.omega_body)
     np.testing.assert_allclose(power, 0.5 * speed, rtol=1e-14)
+
+
+def test_the_power_of_each_wheel():
+    """Torque times relative speed: of a damper -c Omega^2, of a motor its impulse's slope times
+    Omega; a wheel that is held has none in this account."""
+    scene = ph.Scene(INERTIA, **PARTS["ring damper"]).settled(STATE, jnp.array(0.25))
+    momentum = tuple(scene.momentum(STATE.omega_body, TIME))
+    seen = momentum, from_quaternion(tuple(STATE.wxyz))
+    now = scene.dynamics.at((jnp.array(0.7),))
+    omega = np.asarray(scene.with_spins((jnp.array(0.7),)).rates(jnp.stack(momentum), TIME))
+    speed = 0.7 / 0.2 - np.array(AXIS) @ omega
+    start = 0.1 * (STATE.omega_body[0] + 1.0)
+    kicked = (start + np.sin(1.25) - np.sin(0.25)) / 0.1 - omega[0]
+    found = motor_powers(TIME, *seen, now, (0, 1, 2))
+    np.testing.assert_allclose(found, [-0.1 * speed**2, np.cos(1.25) * kicked, 0], rtol=1e-13)
 
 
 def test_one_time_is_shared_by_many_bodies():

@@ -7,7 +7,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from polhode._checks import as_float_array
 from polhode._trajectory import Trajectory
-from polhode.hamiltonian import Dynamics, lie_poisson_field
+from polhode.hamiltonian import lie_poisson_field
 from polhode.rotation import conjugate, rotate
 
 
@@ -32,10 +32,17 @@ def angular_acceleration(trajectory: Trajectory) -> Float[Array, "*b t 3"]:
         wxyz = _recorded(trajectory, "wxyz")
     momentum = scene.momentum(omega, t)
     state = (tuple(momentum[..., i] for i in range(3)), tuple(wxyz[..., i] for i in range(4)))
-    push, _ = lie_poisson_field(t, state, Dynamics(scene.hamiltonian, scene.torque))
+    dynamics, wheels = scene.dynamics, scene.rotors
+    spins = dynamics.wheels.spins if dynamics.coupled else ()
+    push, _, *changes = lie_poisson_field(t, (*state, spins) if spins else state, dynamics)
     rate = jnp.stack(jnp.broadcast_arrays(*push), axis=-1)
-    if scene.rotors is not None:  # what the wheels take up does not turn the body
-        taken = jax.jvp(scene.wheel_momentum, (t,), (jnp.ones_like(t),))[1]
+
+    def carried(t, spins):
+        return scene.with_spins(spins).wheel_momentum(t)
+
+    if wheels is not None:  # what the wheels take up does not turn the body
+        moved = jnp.ones_like(t), changes[0] if spins else ()
+        _, taken = jax.jvp(carried, (t, spins), moved)
         rate = rate - jnp.broadcast_to(taken, rate.shape)
     return scene.carrier.rates(rate)
 

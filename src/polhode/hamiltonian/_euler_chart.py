@@ -11,9 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode.hamiltonian._attitude import Vector, components, from_euler_angles
+from polhode.hamiltonian._attitude import Vector, components, cross, from_euler_angles
 from polhode.hamiltonian._energy import EnergyOfAttitude, Hamiltonian, free_hamiltonian
-from polhode.hamiltonian._lie_poisson import Dynamics
+from polhode.hamiltonian._lie_poisson import Dynamics, spin_rates
 from polhode.inertia import Inertia
 
 
@@ -90,13 +90,34 @@ def rates_from_angle_rates(q: Sequence[Array], rates: Sequence[Array]) -> Vector
     )
 
 
+def angle_rates_from_rates(q: Sequence[Array], omega: Sequence[Array]) -> Vector:
+    """Angle rates dq/dt = B^-1 omega [rad/s] on component triples."""
+    _, theta, psi = q
+    x, y, z = omega
+    s, c = jnp.sin(psi), jnp.cos(psi)
+    phi_dot = (s * y - c * x) / jnp.sin(theta)
+    return phi_dot, s * x + c * y, z - jnp.cos(theta) * phi_dot
+
+
 def euler_angle_field(t, y, dynamics: Dynamics):
-    """The canonical vector field on ``y = (q, p)``, two triples of component arrays."""
-    q, p = y
+    """The canonical vector field on ``y = (q, p)``, two triples of component arrays.
+
+    With coupled wheels a third group, their momenta.
+    """
+    q, p, *spins = y
+    dynamics = dynamics.at(*spins)
     chart = CanonicalHamiltonian(dynamics.hamiltonian)
     rate_q, rate_p = hamiltons_equations(chart.of_components)(q, p, t)
+    attitude, omega = from_euler_angles(*q), rates_from_angle_rates(q, rate_q)
     if dynamics.torque is not None:
-        omega = rates_from_angle_rates(q, rate_q)
-        push = dynamics.torque.body_components(t, from_euler_angles(*q), omega)
+        push = dynamics.torque.body_components(t, attitude, omega)
         rate_p = tuple(a + b for a, b in zip(rate_p, canonical_from_momentum(q, push)))
-    return rate_q, rate_p
+        momentum = momentum_from_canonical(q, p)
+        slip = dynamics.torque.slip(t, momentum, omega)
+        if slip is not None:  # axes that slip past a momentum which rests in space
+            moved = angle_rates_from_rates(q, slip), cross(momentum, slip)
+            _, more = jax.jvp(canonical_from_momentum, (q, momentum), moved)
+            rate_q = tuple(a + b for a, b in zip(rate_q, moved[0]))
+            rate_p = tuple(a + b for a, b in zip(rate_p, more))
+    moved = rate_q, rate_p
+    return (*moved, spin_rates(t, attitude, omega, dynamics)) if spins else moved

@@ -11,19 +11,23 @@ class LiePoissonUnits(eqx.Module):
     """Of body momentum and quaternion; renewed with the state, as torques change the rates.
 
     ``size`` (N,): of each inertia [kg m^2]; ``least`` (N,): momentum [kg m^2/s] by which a body at
-    rest is measured, which a torque may move later.
+    rest is measured, which a torque may move later; ``wheels`` (static): how many have momenta that
+    are part of the state.
     """
 
     size: Float[Array, "*n"]
     least: Float[Array, "*n"]
+    wheels: int = eqx.field(static=True, default=0)
 
     def __call__(self, y: Sequence[Array], rates: Sequence[Array]) -> tuple[list[Array], Array]:
         """Weights of the components, their squares to be summed (rad), and the rate [rad/s]."""
         push = jnp.sqrt(sum(x * x for x in rates[:3]))
-        unit = jnp.sqrt(sum(x * x for x in y[:3]) + self.least**2 + 3 * self.size * push)
+        carried = [*y[:3], *y[7 : 7 + self.wheels]]
+        unit = jnp.sqrt(sum(x * x for x in carried) + self.least**2 + 3 * self.size * push)
         turning = 4 * sum(x * x for x in rates[3:7])  # the square of the body rates
-        more = [jnp.zeros_like(unit)] * (len(y) - 7)  # the work follows from the rest
-        weights = [1 / unit] * 3 + [jnp.full_like(unit, 2)] * 4 + more
+        more = [jnp.zeros_like(unit)] * (len(y) - 7 - self.wheels)  # the work follows from the rest
+        spins = [1 / unit] * self.wheels
+        weights = [1 / unit] * 3 + [jnp.full_like(unit, 2)] * 4 + spins + more
         return weights, jnp.sqrt(turning + push / self.size)
 
 

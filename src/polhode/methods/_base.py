@@ -33,7 +33,8 @@ class Record(eqx.Module):
 class Samples(NamedTuple):
     """What a method returns for N lanes: (N, T, 4), (N, T, 3), (N,), (N,), (N, T), (N,).
 
-    ``error``: sum of the estimated errors of the steps, if the method knows it.
+    ``error``: sum of the estimated errors of the steps, if the method knows it. ``motor_work``,
+    ``spins`` (N, T, m): of every wheel, and momenta of the coupled ones, or None.
     """
 
     wxyz: Array | None
@@ -42,6 +43,8 @@ class Samples(NamedTuple):
     steps: Array
     work: Array | None = None
     error: Array | None = None
+    motor_work: Array | None = None
+    spins: Array | None = None
 
 
 class AbstractMethod(eqx.Module):

@@ -29,6 +29,7 @@ from polhode.hamiltonian import (
     from_quaternion,
     lie_poisson_field,
     momentum_from_canonical,
+    motor_powers,
 )
 from polhode.rotation import euler_to_wxyz, wxyz_to_euler
 from polhode.torques import AbstractPotential, GravityGradient, UniformGravity
@@ -36,6 +37,8 @@ from polhode.torques import AbstractPotential, GravityGradient, UniformGravity
 
 class AbstractChart(eqx.Module):
     """Base of the charts. A state is two groups of component arrays (N,).
+
+    With coupled wheels a third: their momenta.
 
     ``canonical``: whether these are coordinates and their momenta.
     """
@@ -67,10 +70,14 @@ class AbstractChart(eqx.Module):
         """wxyz, omega_body and whether the chart is still sound, of sampled components (N, T)."""
 
     def field_and_power(self, t, y, dynamics: Dynamics):
-        """The field, and the power [W] of the external torques: of the work as one more group."""
+        """The field, and the power [W] of what is not conservative as one more group: all of it,
+        then that of every wheel that is not held."""
         *state, _ = y
-        power = external_power(t, *self.seen(state), dynamics)
-        return *self.field(t, tuple(state), dynamics), power
+        now, seen = dynamics.at(*state[2:]), self.seen(state[:2])
+        powers = (external_power(t, *seen, now),)
+        if now.wheels is not None:
+            powers += tuple(motor_powers(t, *seen, now, now.wheels.loose))
+        return *self.field(t, tuple(state), dynamics), powers
 
 
 class LiePoissonChart(AbstractChart):
@@ -94,11 +101,13 @@ class LiePoissonChart(AbstractChart):
         size = jnp.trace(scene.inertia.tensor, axis1=-2, axis2=-1) / 3
         least = slow_momentum(scene, ts)
         size, least, _ = jax.lax.stop_gradient(jnp.broadcast_arrays(size, least, lane))
-        units = LiePoissonUnits(size, least)
+        moved = scene.dynamics
+        units = LiePoissonUnits(size, least, len(moved.coupled))
         if self.upright:
             _, potential = _upright(scene.potential)
             scene = Scene(scene.inertia, potential, scene.torque, scene.rotors)
-        return Dynamics(scene.hamiltonian, scene.torque, units, LiePoissonCostate.of)
+        costate = None if moved.coupled else LiePoissonCostate.of
+        return Dynamics(scene.hamiltonian, scene.torque, units, costate, moved.wheels)
 
     def start(self, scene, state, t):
         momentum = scene.momentum(state.omega_body, t)
@@ -107,16 +116,24 @@ class LiePoissonChart(AbstractChart):
             turn, _ = _upright(scene.potential)
             turn = jnp.broadcast_to(rotation.conjugate(turn), wxyz.shape)
             wxyz = rotation.multiply(turn, wxyz)
-        y = components(momentum), tuple(wxyz[..., i] for i in range(4))
+        y = components(momentum), tuple(wxyz[..., i] for i in range(4)), *_spins(scene, state)
         return y, jnp.ones(wxyz.shape[0], bool)
 
     def finish(self, scene, y, t):
-        momentum, wxyz = (jnp.stack(group, axis=-1) for group in y)
-        omega = scene.rates(momentum, t)
+        momentum, wxyz = (jnp.stack(group, axis=-1) for group in y[:2])
+        omega = scene.with_spins(*y[2:]).rates(momentum, t)
         if self.upright:
             turn, _ = _upright(scene.potential)
             wxyz = rotation.multiply(jnp.broadcast_to(turn, wxyz.shape), wxyz)
         return rotation.normalise(wxyz), omega, jnp.ones(momentum.shape[:-1], bool)
+
+
+def _spins(scene: Scene, state: State) -> tuple[tuple[Array, ...], ...]:
+    """Momenta of the coupled wheels as one more group of the state, or no group."""
+    wheels = scene.dynamics.wheels
+    if wheels is None or not wheels.coupled:
+        return ()
+    return (wheels.initial_spins(state.wxyz[..., 0]),)
 
 
 def _upright(field: UniformGravity | GravityGradient) -> tuple[Array, AbstractPotential]:
@@ -148,9 +165,9 @@ class EulerChart(AbstractChart):
 
     def dynamics(self, scene, state, ts):
         momenta = 1 / momentum_scale(scene, state, ts)
-        ones = jnp.ones_like(momenta)
-        units = FixedUnits((ones, ones, ones, momenta, momenta, momenta))
-        return Dynamics(scene.hamiltonian, scene.torque, units)
+        ones, moved = jnp.ones_like(momenta), scene.dynamics
+        units = FixedUnits((ones,) * 3 + (momenta,) * (3 + len(moved.coupled)))
+        return Dynamics(scene.hamiltonian, scene.torque, units, wheels=moved.wheels)
 
     def start(self, scene, state, t):
         phi, theta, psi = q = wxyz_to_euler(state.wxyz)
@@ -158,12 +175,12 @@ class EulerChart(AbstractChart):
         q = (phi, jnp.where(sound, theta, jnp.pi / 2), psi)
         momentum = components(scene.momentum(state.omega_body, t))
         p = canonical_from_momentum(q, momentum)
-        return (q, tuple(jnp.where(sound, x, 0) for x in p)), sound
+        return (q, tuple(jnp.where(sound, x, 0) for x in p), *_spins(scene, state)), sound
 
     def finish(self, scene, y, t):
-        q, p = y
+        q, p, *spins = y
         momentum = jnp.stack(momentum_from_canonical(q, p), axis=-1)
-        omega = scene.rates(momentum, t)
+        omega = scene.with_spins(*spins).rates(momentum, t)
         return euler_to_wxyz(*q), omega, _away_from_poles(q)
 
 
@@ -176,11 +193,12 @@ def _away_from_poles(q) -> Array:
 def momentum_scale(scene: Scene, state: State, ts: Array) -> Array:
     """Natural unit of momentum of each lane: |L|, what the torques can add to it, what is slow."""
     t = ts[..., 0]
-    momentum = scene.momentum(state.omega_body, t)
-    y = (components(momentum), tuple(state.wxyz[..., i] for i in range(4)))
-    (push, _) = lie_poisson_field(t, y, Dynamics(scene.hamiltonian, scene.torque))
+    momentum, spins = scene.momentum(state.omega_body, t), _spins(scene, state)
+    y = (components(momentum), tuple(state.wxyz[..., i] for i in range(4)), *spins)
+    push, *_ = lie_poisson_field(t, y, scene.dynamics)
     size = jnp.trace(scene.inertia.tensor, axis1=-2, axis2=-1)
-    square = jnp.sum(momentum**2, axis=-1) + size * jnp.sqrt(sum(x * x for x in push))
+    square = jnp.sum(momentum**2, axis=-1) + sum((x * x for group in spins for x in group), start=0)
+    square = square + size * jnp.sqrt(sum(x * x for x in push))
     square = square + slow_momentum(scene, ts) ** 2
     resting = square == 0
     return jax.lax.stop_gradient(jnp.where(resting, 1, jnp.sqrt(jnp.where(resting, 1, square))))

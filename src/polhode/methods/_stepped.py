@@ -1,5 +1,6 @@
 """Everything that is stepped: one chart, one solver, one controller, one adjoint, one solve."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import diffrax
@@ -68,8 +69,12 @@ class Stepped(AbstractMethod):
         y0, sound = self.chart.start(scene, state, ts[0])
         field = self.chart.field
         if record.work:
-            y0, field = (*y0, jnp.zeros_like(y0[0][0])), self.chart.field_and_power
-            dynamics = Dynamics(dynamics.hamiltonian, dynamics.torque, dynamics.units)
+            wheels, zero = dynamics.wheels, jnp.zeros_like(y0[0][0])
+            loose = () if wheels is None else wheels.loose
+            y0, field = (*y0, (zero,) * (1 + len(loose))), self.chart.field_and_power
+            dynamics = Dynamics(
+                dynamics.hamiltonian, dynamics.torque, dynamics.units, wheels=wheels
+            )
         term = diffrax.ODETerm(field)
         asked = _Asked(ts, rtol, self.dt0, self.max_steps, record.final_only, _may_jump(scene))
         if self.controller is None:
@@ -92,15 +97,21 @@ class Stepped(AbstractMethod):
             progress_meter=self.progress_meter,
             throw=False,
         )
-        return self._samples(scene, solution, ts, sound, record)
+        return self._samples(scene, solution, ts, sound, record, dynamics)
 
-    def _samples(self, scene, solution, ts, sound, record: Record) -> Samples:
+    def _samples(self, scene, solution, ts, sound, record: Record, dynamics) -> Samples:
         samples, last = (_lanes_first(y) for y in solution.ys)
-        work = samples[2] if record.work else None
+        work, motors, spins = None, None, None
+        if record.work:
+            *samples, (work, *powers) = samples
+            *last, _ = last
+            motors = _of_wheels(dynamics.wheels, powers) if powers else None
+        if dynamics.coupled:
+            spins = jnp.stack(samples[2], axis=-1)
         later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
         kept = ts[-1:] if record.final_only else ts
-        wxyz, omega, _ = self.chart.finish(later, samples[:2], kept[None])
-        *_, sound_at_end = self.chart.finish(later, last[:2], ts[None, -1:])
+        wxyz, omega, _ = self.chart.finish(later, tuple(samples), kept[None])
+        *_, sound_at_end = self.chart.finish(later, tuple(last), ts[None, -1:])
         wxyz, omega = (jnp.where(sound[:, None, None], x, jnp.nan) for x in (wxyz, omega))
         taken, unfinished = _outcome(solution, sound.shape)
         finite = jnp.all(jnp.isfinite(wxyz), axis=(-1, -2))
@@ -117,6 +128,8 @@ class Stepped(AbstractMethod):
             taken,
             work,
             getattr(solution.solver_state, "error", None),
+            motors,
+            spins,
         )
 
 
@@ -194,9 +207,16 @@ class LaneNorm(eqx.Module):
 def _in_parts(adjoint: diffrax.AbstractAdjoint, scene: Scene) -> diffrax.AbstractAdjoint:
     """On the way back from states that a torque has drawn together an error grows no longer than
     through one of eight parts."""
-    if isinstance(adjoint, FlowAdjoint) and scene.torque is not None:
+    if isinstance(adjoint, FlowAdjoint) and (scene.torque is not None or scene.dynamics.coupled):
         return FlowAdjoint(adjoint.rtol, max(adjoint.parts, 8))
     return adjoint
+
+
+def _of_wheels(wheels, loose: Sequence[Array]) -> Array:
+    """What belongs to the wheels that are not held, as (..., m) of all; zero where held."""
+    found = iter(loose)
+    zero = jnp.zeros_like(loose[0])
+    return jnp.stack([zero if held else next(found) for held in wheels.held], axis=-1)
 
 
 def _lanes_first(y):

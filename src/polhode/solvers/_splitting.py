@@ -113,6 +113,10 @@ class Splitting(diffrax.AbstractSolver):
             scene.rotors is None or self.moser_veselov is None,
             "with moser_veselov moves bodies without rotors: leave it out.",
         )
+        require(
+            not scene.dynamics.coupled,
+            "moves no wheels with a coupling: use Extrapolation, or leave the method open.",
+        )
 
     def stepping(self, asked):
         """How ``ph.LiePoisson`` steps with it: equal steps from each time to the next."""
@@ -156,6 +160,9 @@ def _depends_on_rates(torque) -> bool:
     one = jnp.ones((1,))
 
     def push(omega, wxyz):
+        slip = torque.slip(jnp.zeros(()), (one,) * 3, omega)
+        if slip is not None:
+            return slip
         return torque.body_components(jnp.zeros(()), from_quaternion(wxyz), omega)
 
     with jax.numpy_dtype_promotion("standard"):

@@ -1,5 +1,10 @@
 """Potentials, external torques, damping and rotors: one small class each."""
 
+from polhode.torques._couplings import (
+    AbstractCoupling as AbstractCoupling,
+    ViscousCoupling as ViscousCoupling,
+)
+from polhode.torques._dissipation import EnergySink as EnergySink
 from polhode.torques._orbit import (
     KeplerOrbit as KeplerOrbit,
     StateOrbit as StateOrbit,
@@ -12,9 +17,9 @@ from polhode.torques._potentials import (
     PotentialSum as PotentialSum,
     UniformGravity as UniformGravity,
 )
+from polhode.torques._rotor import Rotor as Rotor
 from polhode.torques._rotors import (
     AbstractRotor as AbstractRotor,
-    Rotor as Rotor,
     RotorSum as RotorSum,
     Wheels as Wheels,
 )

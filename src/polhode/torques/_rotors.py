@@ -6,11 +6,14 @@ wheels out). A wheel of moment J about the unit axis a, at the speed Omega relat
 adds J Omega a to L = I omega. Held at that speed: L = I omega + J Omega a. Turned by a motor of
 torque tau about its axis (0: it spins freely) its momentum c = J (a . omega + Omega) obeys
 dc/dt = tau, and L = (I - J a a^T) omega + c a: in both cases the one Hamiltonian with a momentum
-h(t) subtracted from L (Hughes, Spacecraft Attitude Dynamics, 1986, section 3.4, 6).
+h(t) subtracted from L (Hughes, Spacecraft Attitude Dynamics, 1986, section 3.4, 6). Where tau
+depends on the state (a coupling: friction, a motor with its limits), c is part of the state.
 """
 
 import abc
-from collections.abc import Callable
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -19,10 +22,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, as_number, is_concrete, numbers, require, together
-from polhode.hamiltonian._attitude import Vector
+from polhode._checks import numbers, require, together
+from polhode.hamiltonian import Attitude, Vector, dot
 from polhode.inertia import Inertia, Symmetry
-from polhode.parts import AbstractPart, checked, mapped, shaped
+from polhode.parts import AbstractPart, mapped, shaped
+from polhode.torques._couplings import Couplings
 
 
 class AbstractRotor(AbstractPart):
@@ -30,7 +34,7 @@ class AbstractRotor(AbstractPart):
 
     @property
     @abc.abstractmethod
-    def wheels(self) -> tuple["Rotor", ...]:
+    def wheels(self) -> tuple[Any, ...]:
         """One by one."""
 
     @property
@@ -75,139 +79,27 @@ class AbstractRotor(AbstractPart):
             jnp.stack([jnp.broadcast_to(column[i], lead) for column in columns], axis=-1)
             for i in (1, 2, 3)
         ]
+        couplings = tuple(w.coupling for w in self.wheels if w.coupling is not None)
         return Wheels(
             axes,
             *rest,
             start,
             tuple(wheel.impulse for wheel in self.wheels),
+            Couplings(couplings) if couplings else None,
             tuple(wheel.is_held for wheel in self.wheels),
             tuple(wheel.along for wheel in self.wheels),
+            tuple(i for i, wheel in enumerate(self.wheels) if wheel.coupling is not None),
         )
 
 
 class RotorSum(AbstractRotor):
     """Several rotors."""
 
-    terms: tuple["Rotor", ...]
+    terms: tuple[AbstractRotor, ...]
 
     @property
     def wheels(self):
         return self.terms
-
-
-class Rotor(AbstractRotor):
-    """A wheel on an axis fixed in the body.
-
-    **Arguments:**
-
-    - ``axis_body`` (..., 3): its axis in body axes (normalised).
-    - ``inertia`` (...): its moment J about that axis [kg m^2]; already part of the body's inertia.
-      May be left out when ``momentum`` is given and no ``torque`` or ``impulse``.
-    - exactly one of ``momentum`` (...) = J Omega [kg m^2/s] and ``speed`` (...) = Omega [rad/s],
-      both relative to the body, at the first time.
-    - ``torque`` (...) [N m]: what the motor exerts on the wheel about its axis, the body taking the
-      reaction; 0: the wheel spins freely. None: the motor holds the speed.
-    - ``impulse``: instead of ``torque``, an antiderivative of a motor torque that varies: a
-      function of time [s] returning N m s.
-
-    Raises ValueError for a zero axis, J <= 0, or more or less than one of momentum and speed.
-    """
-
-    axis_body: Float[Array, "*#b 3"] = shaped(3)
-    inertia: Float[Array, "*#b"] | None = shaped()
-    momentum: Float[Array, "*#b"] | None = shaped()
-    speed: Float[Array, "*#b"] | None = shaped()
-    torque: Float[Array, "*#b"] | None = shaped()
-    impulse: Callable | None
-    along: int | None = eqx.field(static=True)
-
-    def __init__(
-        self, axis_body, inertia=None, momentum=None, speed=None, torque=None, impulse=None
-    ):
-        axis = as_float_array("axis_body", axis_body, (3,))
-        self.along = None
-        if is_concrete(axis):
-            require(
-                np.any(np.asarray(axis) != 0, axis=-1),
-                f"axis_body must not be zero, got {axis_body}: give the wheel's axis in body axes.",
-            )
-            self.along = _body_axis(np.asarray(axis))
-        self.axis_body = _unit(axis)
-        if (momentum is None) == (speed is None):
-            raise ValueError(
-                "Rotor takes exactly one of momentum (J Omega relative to the body, kg m^2/s) and"
-                " speed (Omega relative to the body, rad/s)."
-            )
-        if torque is not None and impulse is not None:
-            raise ValueError(
-                "Rotor takes torque (a constant motor torque, N m) or impulse (a function of time,"
-                " N m s: the antiderivative of a varying one), not both."
-            )
-        if callable(torque):
-            raise TypeError(
-                "Rotor torque must be a number; for a motor torque that varies with time give its"
-                " antiderivative: impulse=lambda t: ... [N m s], so that the wheel's momentum is"
-                " exact."
-            )
-        if impulse is not None:
-            impulse = checked("Rotor impulse", impulse, ("t",), ((),), ())
-        given = {"inertia": inertia, "momentum": momentum, "speed": speed, "torque": torque}
-        for name, value in given.items():
-            setattr(self, name, None if value is None else as_number(name, value))
-        self.impulse = impulse
-        if inertia is None and (speed is not None or not self.is_held):
-            raise ValueError(
-                "Rotor needs inertia, the wheel's moment about its axis in kg m^2, unless it is"
-                " held at a given momentum."
-            )
-        if inertia is not None and is_concrete(self.inertia):
-            require(
-                np.asarray(self.inertia) > 0,
-                f"the rotor's inertia must be positive, got {inertia}: give it in kg m^2.",
-            )
-
-    @property
-    def is_held(self) -> bool:
-        """Whether a motor holds the speed relative to the body (static)."""
-        return self.torque is None and self.impulse is None
-
-    @property
-    def wheels(self):
-        return (self,)
-
-    def declared_anew(self):
-        return Rotor(
-            self.axis_body, self.inertia, self.momentum, self.speed, self.torque, self.impulse
-        )
-
-    def column(self, omega_body: Array, start: Array) -> tuple[Array, Array, Array, Array]:
-        """Axis, its momentum at the start (relative if held, else absolute), J, motor torque."""
-        parts = (self.axis_body, self.inertia, self.momentum, self.speed, self.torque)
-        shapes = [x.shape[:-1] if x is self.axis_body else x.shape for x in parts if x is not None]
-        if not self.is_held:
-            shapes += [omega_body.shape[:-1], start.shape]
-        lead = np.broadcast_shapes(*shapes)
-        zero = jnp.zeros(lead, self.axis_body.dtype)
-        axis = jnp.broadcast_to(_unit(self.axis_body), (*lead, 3))
-        inertia, momentum, speed, torque = (zero if x is None else x + zero for x in parts[1:])
-        if self.momentum is None:
-            momentum = inertia * speed
-        if self.is_held:
-            return axis, momentum, zero, zero
-        turning = jnp.sum(axis * jnp.broadcast_to(omega_body, (*lead, 3)), axis=-1)
-        return axis, momentum + inertia * turning, inertia, torque
-
-
-def _unit(axis: Array) -> Array:
-    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(axis), axis=-1, keepdims=True))
-    axis = axis / largest  # of any size: nothing overflows
-    return axis / jnp.sqrt(jnp.sum(axis**2, axis=-1, keepdims=True))
-
-
-def _body_axis(axis: np.ndarray) -> int | None:
-    """Which body axis all of the axes lie on, or None."""
-    used = [i for i in range(3) if np.any(axis[..., i] != 0)]
-    return used[0] if len(used) == 1 else None
 
 
 def _is_along(axes: Array, axis: int) -> Any:
@@ -221,7 +113,9 @@ class Wheels(AbstractRotor):
     """Rotors whose motion is known: what ``Rotor`` becomes once the state of the body is.
 
     ``axes`` (..., m, 3); ``momentum`` (..., m) at the time ``start`` (...), relative to the body
-    where ``held``, else absolute; ``inertia`` and ``torque`` (..., m), 0 where held.
+    where ``held``, else absolute; ``inertia`` (..., m), 0 where not known; ``torque`` (..., m).
+    ``coupled`` (static): the wheels whose momenta are part of the state, the initial ones standing
+    in ``momentum``; ``spins``: their momenta of the moment, see ``at``.
     """
 
     axes: Float[Array, "*#b m 3"] = shaped(None, 3)
@@ -230,8 +124,11 @@ class Wheels(AbstractRotor):
     torque: Float[Array, "*#b m"] = shaped(None)
     start: Float[Array, "*#b"] = shaped()
     impulses: tuple[Callable | None, ...]
+    couplings: Couplings | None = shaped()
     held: tuple[bool, ...] = eqx.field(static=True)
     along: tuple[int | None, ...] = eqx.field(static=True)
+    coupled: tuple[int, ...] = eqx.field(static=True)
+    spins: tuple[Array, ...] = ()
 
     @property
     def wheels(self):
@@ -263,15 +160,68 @@ class Wheels(AbstractRotor):
         """Whether every wheel is held (static); the momentum may be constant all the same."""
         return all(self.held)
 
+    @property
+    def loose(self) -> tuple[int, ...]:
+        """Which wheels are not held (static)."""
+        return tuple(i for i, held in enumerate(self.held) if not held)
+
     def settle(self, omega_body, start):
         return self
 
+    def at(self, spins: Sequence[Array]) -> "Wheels":
+        """The wheels at a moment when those that are coupled have these momenta [kg m^2/s]."""
+        return dataclasses.replace(self, spins=tuple(spins))
+
+    def initial_spins(self, like: Array) -> tuple[Array, ...]:
+        """Momenta of the coupled wheels at the start, of the shape of ``like``."""
+        return tuple(jnp.broadcast_to(self.momentum[..., i], like.shape) for i in self.coupled)
+
+    def speed(self, i: int, t: Array | float, omega: Sequence[Array]) -> Array:
+        """Speed of wheel i relative to the body [rad/s]; NaN where its inertia is not known."""
+        inertia, momentum = self.inertia[..., i], self.axial_momentum(i, t)
+        known = inertia > 0
+        own = jnp.where(known, momentum / jnp.where(known, inertia, 1), jnp.nan)
+        if self.held[i]:
+            return own
+        return own - dot(tuple(self.axes[..., i, k] for k in range(3)), omega)
+
+    def motor_torques(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> list[Array]:
+        """Torque [N m] on each wheel about its axis from the body; zero where it is held."""
+        found, couplings = [], iter(() if self.couplings is None else self.couplings.terms)
+        for i, held in enumerate(self.held):
+            if i in self.coupled:
+                speed = self.speed(i, t, omega)
+                found.append(next(couplings).torque(t, speed, attitude, omega))
+            elif held:
+                found.append(jnp.zeros_like(omega[0]))
+            else:
+                t = jnp.asarray(t, self.momentum.dtype)
+                change = partial(self.axial_momentum, i)
+                found.append(jax.jvp(change, (t,), (jnp.ones_like(t),))[1])
+        return found
+
+    def motor_power(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> list[Array]:
+        """Power [W] that motor and friction of each wheel give to the motion; zero where held."""
+        torques = self.motor_torques(t, attitude, omega)
+        return [
+            torque if held else torque * self.speed(i, t, omega)
+            for i, (held, torque) in enumerate(zip(self.held, torques))
+        ]
+
     def axial_momentum(self, i: int, t: Array | float) -> Array:
         """Momentum of wheel i along its axis (see the class) at time t [kg m^2/s]."""
+        if i in self.coupled and self.spins:
+            return self.spins[self.coupled.index(i)]
         momentum = self.momentum[..., i]
         if self.held[i]:
             return momentum
         impulse = self.impulses[i]
+        if i in self.coupled:
+            return momentum
         if impulse is None:
             return momentum + self.torque[..., i] * (t - self.start)
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_float_array, is_concrete, require
-from polhode.hamiltonian import Attitude, components
+from polhode.hamiltonian import Attitude, Vector, components
 from polhode.parts import AbstractPart, checked, mapped, shaped
 
 
@@ -24,6 +24,15 @@ class AbstractTorque(AbstractPart):
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> tuple[Array, Array, Array]:
         """Torque in body axes [N m]."""
+
+    def slip(
+        self, t: Array | float, momentum: Sequence[Array], omega: Sequence[Array]
+    ) -> Vector | None:
+        """Rates [rad/s] by which the body turns beside I^-1 L while it loses energy inside.
+
+        None where there are none; see ``EnergySink``.
+        """
+        return None
 
     def __add__(self, other: "AbstractTorque") -> "TorqueSum":
         if not isinstance(other, AbstractTorque):
@@ -43,6 +52,11 @@ class TorqueSum(AbstractTorque):
     def body_components(self, t, attitude, omega):
         parts = zip(*(term.body_components(t, attitude, omega) for term in self.terms))
         return tuple(sum(rest, start=first) for first, *rest in parts)
+
+    def slip(self, t, momentum, omega):
+        found = (term.slip(t, momentum, omega) for term in self.terms)
+        parts = list(zip(*(x for x in found if x is not None)))
+        return tuple(sum(rest, start=first) for first, *rest in parts) if parts else None
 
 
 def vector_of_time(name: str, n):

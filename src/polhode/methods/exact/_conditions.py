@@ -34,12 +34,13 @@ def axial_wheels(scene: Scene) -> str | None:
         return "a rotor is not known to lie on body z"
     if isinstance(rotors, Wheels):
         moved = not all(held or f is None for held, f in zip(rotors.held, rotors.impulses))
+        moved = moved or bool(rotors.coupled)
         torques = [rotors.torque]
     else:
-        moved = any(w.impulse is not None for w in rotors.wheels)
+        moved = any(not (w.impulse is None and w.coupling is None) for w in rotors.wheels)
         torques = [w.torque for w in rotors.wheels if w.torque is not None]
     if moved:
-        return "a motor turns a rotor by a function of time"
+        return "a motor turns a rotor by a function of time or state"
     if not all(is_concrete(x) and np.all(np.asarray(x) == 0) for x in torques):
         return "a motor turns a rotor"
     return None
@@ -74,7 +75,7 @@ def steady_wheels(scene: Scene, n: int) -> Array:
     wheels: Any = scene.rotors
     if wheels is None:
         return jnp.ones(n, bool)
-    if any(f is not None for f in wheels.impulses):
+    if wheels.coupled or any(f is not None for f in wheels.impulses):
         return jnp.zeros(n, bool)
     return jnp.all(as_lanes(wheels.torque, n, 1) == 0, axis=-1)
 
