@@ -235,8 +235,13 @@ def solve_balance(
     unknown = (jnp.zeros((count, 6), start.dtype), jnp.zeros(11, start.dtype))
     _, _, rest, linear, *_ = jax.eval_shape(again, (unknown, noise, 0, 0, 0, 0))
     nothing = [jnp.zeros(x.shape, x.dtype) for x in (rest, linear)]
+
+    def unsettled(carry):
+        *_, settled, rounds = carry
+        return ~settled & (rounds < _ROUNDS)
+
     unknown, noise, rest, linear, converged, _ = jax.lax.while_loop(
-        lambda carry: ~carry[4] & (carry[5] < _ROUNDS),
+        unsettled,
         again,
         (unknown, noise, *nothing, jnp.asarray(False), 0),
     )

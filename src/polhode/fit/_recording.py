@@ -96,7 +96,8 @@ class Recording(eqx.Module):
         # what is known now is worked on by NumPy, which has a hundredth of JAX's overhead
         xp = jnp
         if is_concrete(times, *(a for a in arrays.values() if a is not None)):
-            xp, times, arrays = np, *jax.tree.map(np.asarray, (times, arrays))
+            xp, times = np, np.asarray(times)
+            arrays = jax.tree.map(np.asarray, arrays)
         arrays = {
             name: None if a is None else xp.broadcast_to(a, (*batch, *a.shape[-tails[name] :]))
             for name, a in arrays.items()
@@ -149,6 +150,13 @@ class Recording(eqx.Module):
     def mirrored(self) -> "Recording":
         """The rates with every sign reversed: what the other handedness of axes would read."""
         return eqx.tree_at(lambda r: r.omega, self, -self.omega)
+
+
+def needed(name: str, array: Array | None) -> Array:
+    """The field ``name`` of a recording; ValueError where it is None."""
+    if array is None:
+        raise ValueError(f"the recording has no {name}: make it by Recording.of, which sets it.")
+    return array
 
 
 def bridged(times: Float[Array, "*b t"], known: Float[Array, "*b t"], values: Array) -> Array:

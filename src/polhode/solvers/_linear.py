@@ -39,7 +39,7 @@ def _compute(*arrays, forward, backward, count, shapes):
 
 @_linear_p.def_abstract_eval
 def _shapes(*_, forward, backward, count, shapes):
-    return [jax.core.ShapedArray(shape, dtype) for shape, dtype in shapes]
+    return [ShapedArray(shape, dtype) for shape, dtype in shapes]
 
 
 def _jvp(arrays, tangents, *, count, **params):
