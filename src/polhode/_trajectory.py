@@ -12,6 +12,7 @@ from polhode._batch import PARTS, along_time
 from polhode._scene import Scene
 from polhode.hamiltonian import components, from_quaternion
 from polhode.methods import Status
+from polhode.torques import Wheels
 
 
 class Trajectory(eqx.Module):
@@ -88,7 +89,7 @@ class Trajectory(eqx.Module):
         NaN for a wheel that is held at a momentum, its inertia not given.
         """
         wheels = self._scene.rotors
-        if wheels is None:
+        if not isinstance(wheels, Wheels):
             return None
         omega = components(self._need("omega_body"))
         speeds = [wheels.speed(i, self._t, omega) for i in range(len(wheels.held))]

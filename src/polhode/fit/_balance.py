@@ -20,7 +20,7 @@ from polhode.fit._instrument import Instrument, Tolerance
 from polhode.fit._linear import entries_of
 from polhode.fit._matrices import inverse
 from polhode.fit._parameters import base_of, tensor_of
-from polhode.fit._recording import Recording, bridged
+from polhode.fit._recording import Recording, bridged, needed
 from polhode.fit._start import central_slope, integrate, regression
 from polhode.rotation import to_matrix
 
@@ -69,7 +69,7 @@ def balance_of(recording: Recording, body: Array, knots: int, block: int) -> Bal
     """Prepare recordings (leading axis r) of the bodies with numbers ``body`` (r,)."""
     times = recording.times
     omega = bridged(times, recording.present, recording.omega)
-    sample = recording.present * recording.wheel_known
+    sample = recording.present * needed("wheel_known", recording.wheel_known)
     count = times.shape[1] // block
     weight = jax.vmap(lambda x: jnp.floor(_blocks(x, count, block)))(sample)
     end = jnp.max(jnp.where(sample > 0, times, times[:, :1]), axis=1)

@@ -129,7 +129,8 @@ class SteppedMotion(AbstractMotion):
         push, rates = jnp.stack(push, axis=-1), jnp.stack(rates, axis=-1)
         if wheel_at is not None:  # what the wheel takes up does not turn the body
             carried = jnp.stack(self._along(wheel_at(times)), axis=-1)
-            push = push - jnp.gradient(carried, axis=0) / jnp.gradient(times)[:, None]
+            gained, step = (jnp.asarray(jnp.gradient(x, axis=0)) for x in (carried, times))
+            push = push - gained / step[:, None]
         if attitude is not None:
             attitude = normalise(jnp.stack(attitude, axis=-1))
         return Motion(rates, inertia.rates(push), attitude)

@@ -112,7 +112,9 @@ def _functions_rule(many, primals, tangents):
     dS, dC, dN = dS + C * N * dt, dC - x * S * N * dt, dN - y * S * C * dt
     sign = parity(whole)
     _, change = jax.jvp(
-        lambda s, c, n: incomplete(s, c, n, many), (sign * S, sign * C, N), (sign * dS, sign * dC, dN)
+        lambda s, c, n: incomplete(s, c, n, many),
+        (sign * S, sign * C, N),
+        (sign * dS, sign * dC, dN),
     )
     _, turn = jax.jvp(functools.partial(_quarter, swing.circular, swing.endless), (x, z), (dx, dz))
     parts = tuple(

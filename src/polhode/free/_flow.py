@@ -89,6 +89,13 @@ class Instant(NamedTuple):
     momentum: Triple
     half: tuple[Scalars, Scalars] | None  # cosine and sine of half the angle about L, over |M|
 
+    @property
+    def turned(self) -> tuple[Scalars, Scalars]:
+        """``half``, which is known where ``advance`` was given a ``Turning``."""
+        if self.half is None:
+            raise ValueError("the motion was worked out for its rates alone: give a Turning.")
+        return self.half
+
 
 def half_angle(swing: Swing, turning: Turning, t: Scalars, rest, half, N, turned: Triple, stage):
     """(10)-(12): cosine and sine of half of the angle about L, over the length of the tilt."""
@@ -150,7 +157,7 @@ def rates(swing: Swing, at: Instant) -> Triple:
 def attitude(swing: Swing, turning: Turning, at: Instant) -> tuple[Scalars, ...]:
     """Attitude: the start, the turn about axis 3, and the minimal rotation carrying L to it."""
     l1, l2, l3 = at.momentum
-    c, s = at.half
+    c, s = at.turned
     height = turning.length + jnp.abs(l3)
     facing = jnp.copysign(1, swing.momentum[2])
     side = swing.parity * facing

@@ -77,7 +77,7 @@ def _relative_turn(swing: Swing, turning: Turning, frame: Frame, at: Instant, st
     """Quaternion from the attitude at t to that at the start, its vector part exact when small."""
     l1, l2, l3 = frame.turned(swing.momentum)
     s1, s2, s3 = frame.turned(step)
-    c, s = at.half
+    c, s = at.turned
     height = turning.length + l3
     tilt = jnp.sqrt(height * height + l1 * l1 + l2 * l2)
     c, s = c / tilt, s / tilt
