@@ -137,9 +137,10 @@ class SteppedMotion(AbstractMotion):
 
     def _wheel(self, times, wheel, delay) -> Callable[[Array], Array] | None:
         """The wheel's momentum along its axis as a function of time; None without a wheel."""
-        if self.spin_inertia is None:
+        spin = self.spin_inertia
+        if spin is None:
             return None
-        return lambda t: self.spin_inertia * jnp.interp(t - delay, times, wheel)
+        return lambda t: spin * jnp.interp(t - delay, times, wheel)
 
     def _along(self, size: Array) -> tuple[Array, ...]:
         return tuple(size * component for component in self.axis)

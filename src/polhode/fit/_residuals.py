@@ -1,6 +1,8 @@
 """Data minus model in units of the noise: the function that every optimiser needs."""
 
 from collections.abc import Callable
+from functools import reduce
+from operator import add
 
 import equinox as eqx
 import jax
@@ -133,7 +135,7 @@ def log_density(
 
     def density(parameters):
         parts = residuals(parameters, recording, model)
-        misfit = -sum(jnp.sum(part**2) for part in parts.values()) / 2
+        misfit = -reduce(add, (jnp.sum(part**2) for part in parts.values())) / 2
         return misfit if prior is None else misfit + prior(parameters)
 
     return density

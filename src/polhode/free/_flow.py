@@ -11,6 +11,7 @@ from polhode.free._exact import turns
 from polhode.free._motion import Swing, Turning
 from polhode.free._phase import cosine_sine, horner, parity, sine_half, sinh
 from polhode.free._roles import Triple, restore
+from polhode.hamiltonian import triple
 from polhode.xla import settled
 
 Scalars = Float[Array, "*b"]
@@ -77,7 +78,7 @@ def momentum_of(swing: Swing, functions: Triple) -> Triple:
 def momentum(swing: Swing, functions: Triple) -> Triple:
     """The same; exact spin about a principal axis keeps its rates to the last bit."""
     now = momentum_of(swing, functions)
-    return tuple(jnp.where(swing.steady, l, x) for l, x in zip(swing.momentum, now, strict=True))
+    return triple(jnp.where(swing.steady, l, x) for l, x in zip(swing.momentum, now, strict=True))
 
 
 class Instant(NamedTuple):

@@ -29,6 +29,7 @@ from polhode.free._tangent import (
     products_of_momenta,
     squares_of_momenta,
 )
+from polhode.hamiltonian import triple
 from polhode.xla import opaque_ones, settled
 
 Scalars = Float[Array, "*b"]
@@ -208,12 +209,14 @@ _relative.defjvp(_relative_rule, symbolic_zeros=True)
 
 
 def _turn_in_time(tangent: _Tangent, dt) -> Triple:
+    turn, swing = tangent.turn, tangent.swing
+    if turn is None:
+        raise ValueError("the tangent was worked out for the rates alone: ask for the attitude.")
     if dt is None:
-        return tangent.turn
-    swing = tangent.swing
-    return tuple(
+        return turn
+    return triple(
         e + n * d * (swing.pulse * dt)
-        for e, n, d in zip(tangent.turn, tangent.now, swing.inverse, strict=True)
+        for e, n, d in zip(turn, tangent.now, swing.inverse, strict=True)
     )
 
 

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import numbers, require, together
-from polhode.hamiltonian import Attitude, Vector, dot
+from polhode.hamiltonian import Attitude, Vector, dot, triple
 from polhode.inertia import Inertia, Symmetry
 from polhode.parts import AbstractPart, mapped, shaped
 from polhode.torques._couplings import Couplings
@@ -238,7 +238,7 @@ class Wheels(AbstractRotor):
             tuple(self.axial_momentum(i, t) * self.axes[..., i, k] for k in range(3))
             for i in range(len(self.held))
         ]
-        return tuple(sum(column[1:], start=column[0]) for column in zip(*parts))
+        return triple(sum(column[1:], start=column[0]) for column in zip(*parts))
 
     def energy(self, t: Array | float) -> Array | None:
         """c^2/(2J) of the wheels that are not held [J]; None without such."""

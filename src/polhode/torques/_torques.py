@@ -64,8 +64,9 @@ def vector_of_time(name: str, n: Any) -> Array | Callable:
     """A constant vector (..., 3), or a function fn(t) -> (3,) after a look at what it returns."""
     if not callable(n):
         return as_float_array(name, n, (3,))
-    own = isinstance(n, AbstractPart) and callable(n)
-    return n if own else checked(name, n, ("t",), ((),), (3,))
+    if isinstance(n, AbstractPart) and callable(n):
+        return n
+    return checked(name, n, ("t",), ((),), (3,))
 
 
 def value_at(name: str, vector, t) -> tuple[Array, Array, Array]:
