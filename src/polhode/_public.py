@@ -6,7 +6,11 @@ from polhode._simulate import explain as explain, simulate as simulate
 from polhode._state import State as State
 from polhode._trajectory import Trajectory as Trajectory
 from polhode._version import __version__ as __version__
-from polhode.fit import fit_inertia as fit_inertia, fit_recordings as fit_recordings
+from polhode.fit import (
+    fit_inertia as fit_inertia,
+    fit_recordings as fit_recordings,
+    fit_scene as fit_scene,
+)
 from polhode.frames import (
     RotatingFrame as RotatingFrame,
     accelerometer as accelerometer,
@@ -48,6 +52,7 @@ from polhode.torques import (
     KeplerOrbit as KeplerOrbit,
     LinearDamping as LinearDamping,
     Potential as Potential,
+    Pulses as Pulses,
     QuadraticDamping as QuadraticDamping,
     Rotor as Rotor,
     SpaceTorque as SpaceTorque,

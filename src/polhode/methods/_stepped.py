@@ -16,6 +16,7 @@ from polhode.hamiltonian import Dynamics
 from polhode.methods._base import AbstractMethod, Record, Samples
 from polhode.methods._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
 from polhode.methods._options import check_options
+from polhode.methods._segments import Moved, StepThrough, in_segments
 from polhode.methods._status import Status
 from polhode.solvers import FlowAdjoint
 
@@ -65,18 +66,37 @@ class Stepped(AbstractMethod):
 
     def _solve(self, scene, state, ts, rtol, record: Record) -> Samples:
         """One chunk of lanes."""
-        dynamics = self.chart.dynamics(scene, state, ts)
         y0, sound = self.chart.start(scene, state, ts[0])
+        if record.work:
+            wheels = scene.dynamics.wheels
+            loose = () if wheels is None else wheels.loose
+            y0 = (*y0, (jnp.zeros_like(y0[0][0]),) * (1 + len(loose)))
+        edges = None if scene.torque is None else scene.torque.edges
+        if edges is None:
+            found = self._moved(scene, state, y0, ts, rtol, record)
+            return self._samples(scene, found, ts, sound, record)
+
+        def move(middle, y, times, parts):
+            torque = scene.torque.during(middle)
+            now = Scene(scene.inertia, scene.potential, torque, scene.rotors)
+            share = jnp.maximum(rtol / parts, 8 * jnp.finfo(rtol.dtype).eps)
+            return self._moved(now, state, y, times, share, record, StepThrough)
+
+        found = in_segments(move, y0, ts, edges, record.final_only)
+        return self._samples(scene, found, ts, sound, record)
+
+    def _moved(self, scene, state, y0, ts, rtol, record, steps_to=diffrax.StepTo) -> Moved:
+        """States from ``y0`` on."""
+        dynamics = self.chart.dynamics(scene, state, ts)
         field = self.chart.field
         if record.work:
-            wheels, zero = dynamics.wheels, jnp.zeros_like(y0[0][0])
-            loose = () if wheels is None else wheels.loose
-            y0, field = (*y0, (zero,) * (1 + len(loose))), self.chart.field_and_power
+            wheels, field = dynamics.wheels, self.chart.field_and_power
             dynamics = Dynamics(
                 dynamics.hamiltonian, dynamics.torque, dynamics.units, wheels=wheels
             )
         term = diffrax.ODETerm(field)
-        asked = _Asked(ts, rtol, self.dt0, self.max_steps, record.final_only, _may_jump(scene))
+        jumps = _may_jump(scene)
+        asked = _Asked(ts, rtol, self.dt0, self.max_steps, record.final_only, jumps, steps_to)
         if self.controller is None:
             make = getattr(self.solver, "stepping", None)
             stepping = asked.stock(self.solver, y0, term, dynamics) if make is None else make(asked)
@@ -97,10 +117,12 @@ class Stepped(AbstractMethod):
             progress_meter=self.progress_meter,
             throw=False,
         )
-        return self._samples(scene, solution, ts, sound, record, dynamics)
+        error = getattr(solution.solver_state, "error", None)
+        return Moved(*solution.ys, *_outcome(solution, y0[0][0].shape), error)
 
-    def _samples(self, scene, solution, ts, sound, record: Record, dynamics) -> Samples:
-        samples, last = (_lanes_first(y) for y in solution.ys)
+    def _samples(self, scene, found: Moved, ts, sound, record: Record) -> Samples:
+        samples, last = (_lanes_first(y) for y in (found.samples, found.last))
+        dynamics = scene.dynamics
         work, motors, spins = None, None, None
         if record.work:
             *samples, (work, *powers) = samples
@@ -113,7 +135,7 @@ class Stepped(AbstractMethod):
         wxyz, omega, _ = self.chart.finish(later, tuple(samples), kept[None])
         *_, sound_at_end = self.chart.finish(later, tuple(last), ts[None, -1:])
         wxyz, omega = (jnp.where(sound[:, None, None], x, jnp.nan) for x in (wxyz, omega))
-        taken, unfinished = _outcome(solution, sound.shape)
+        taken, unfinished = found.steps, found.status
         finite = jnp.all(jnp.isfinite(wxyz), axis=(-1, -2))
         finite = finite & jnp.all(jnp.isfinite(omega), axis=(-1, -2))
         done = unfinished == Status.SUCCESSFUL
@@ -127,7 +149,7 @@ class Stepped(AbstractMethod):
             jnp.where(lost, Status.CHART_SINGULAR, status),
             taken,
             work,
-            getattr(solution.solver_state, "error", None),
+            found.error,
             motors,
             spins,
         )
@@ -149,7 +171,8 @@ class Stepping(NamedTuple):
 
 class _Asked(NamedTuple):
     """What a solver is asked for: the times, the error at the last of them, the first or longest
-    step, how many at most; whether only the last state is kept, and whether the rates may jump."""
+    step, how many at most; whether only the last state is kept, and whether the rates may jump;
+    ``steps_to``: the controller that leads from time to time."""
 
     ts: Array
     rtol: Array
@@ -157,6 +180,7 @@ class _Asked(NamedTuple):
     max_steps: int
     final_only: bool
     jumps: bool
+    steps_to: type[diffrax.StepTo] = diffrax.StepTo
 
     def given(self, solver, controller) -> Stepping:
         """Steps of a controller that the user chose."""
@@ -168,7 +192,7 @@ class _Asked(NamedTuple):
         ends = self.ts[jnp.array([0, -1])] if self.final_only else self.ts
         saved = self._saved(diffrax.SubSaveAt(t0=True, steps=1))
         saved = eqx.tree_at(lambda s: s.solver_state, saved, True)
-        return Stepping(solver, diffrax.StepTo(ends), saved, ends.shape[0] - 1, None)
+        return Stepping(solver, self.steps_to(ends), saved, ends.shape[0] - 1, None)
 
     def stock(self, solver, y0, term, dynamics) -> Stepping:
         """Steps of any solver with an error estimate."""

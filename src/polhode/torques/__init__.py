@@ -17,6 +17,7 @@ from polhode.torques._potentials import (
     PotentialSum as PotentialSum,
     UniformGravity as UniformGravity,
 )
+from polhode.torques._pulses import Pulses as Pulses
 from polhode.torques._rotor import Rotor as Rotor
 from polhode.torques._rotors import (
     AbstractRotor as AbstractRotor,
