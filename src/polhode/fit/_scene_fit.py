@@ -149,7 +149,8 @@ def fit_scene(
 
     **Arguments:** ``scene``: with starting values, one body; ``data``: a ``ph.fit.Recording`` (its
     leading axes are bodies, fitted one by one), or a list of recordings of the same body; ``free``:
-    function of the scene that returns the array or the list of arrays to fit. The initial rates of
+    function of the scene that returns the array or the list of arrays to fit (of a part: all its
+    arrays). The initial rates of
     each recording, and its initial attitude where attitudes were recorded, are always fitted too;
     ``attitude`` (4,): the initial one where none were (None: the space axes). ``bias``: also that
     of the gyroscope. ``noise_known``: whether the recording's noise is to be believed (else it is

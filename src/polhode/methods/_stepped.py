@@ -118,7 +118,9 @@ class Stepped(AbstractMethod):
             throw=False,
         )
         error = getattr(solution.solver_state, "error", None)
-        return Moved(*solution.ys, *_outcome(solution, y0[0][0].shape), error)
+        samples, last = solution.ys
+        steps, status = _outcome(solution, y0[0][0].shape)
+        return Moved(samples, last, steps, status, error)
 
     def _samples(self, scene, found: Moved, ts, sound, record: Record) -> Samples:
         samples, last = (_lanes_first(y) for y in (found.samples, found.last))

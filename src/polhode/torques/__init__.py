@@ -2,9 +2,18 @@
 
 from polhode.torques._couplings import (
     AbstractCoupling as AbstractCoupling,
+    CoulombFriction as CoulombFriction,
+    Motor as Motor,
     ViscousCoupling as ViscousCoupling,
 )
 from polhode.torques._dissipation import EnergySink as EnergySink
+from polhode.torques._laws import (
+    BDot as BDot,
+    DipoleField as DipoleField,
+    MagneticDipole as MagneticDipole,
+    Pointing as Pointing,
+    RateDamping as RateDamping,
+)
 from polhode.torques._orbit import (
     KeplerOrbit as KeplerOrbit,
     StateOrbit as StateOrbit,

@@ -26,10 +26,10 @@ class Pulses(AbstractTorque):
     Raises TypeError for what is no torque, ValueError for ends before starts or other shapes.
     """
 
-    torque: AbstractTorque = shaped()
     starts: Float[Array, " k"]
     ends: Float[Array, " k"]
     on: Array | None
+    torque: AbstractTorque = shaped()
 
     def __init__(self, torque, starts, ends):
         if not isinstance(torque, AbstractTorque):

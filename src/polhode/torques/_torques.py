@@ -126,7 +126,7 @@ class SpaceTorque(AbstractTorque):
         return attitude.to_body(value_at("SpaceTorque", self.n, t))
 
 
-def _coefficients(name: str, c) -> Array:
+def coefficients(name: str, c) -> Array:
     """Damping about three axes, from one number or three."""
     given, c = c, as_float_array(f"{name} c", c)
     if c.ndim == 0:
@@ -149,7 +149,7 @@ class LinearDamping(AbstractTorque):
     c: Float[Array, "*#b 3"] = shaped(3)
 
     def __init__(self, c):
-        self.c = _coefficients("LinearDamping", c)
+        self.c = coefficients("LinearDamping", c)
 
     def body_components(self, t, attitude, omega):
         return tuple(-c * rate for c, rate in zip(components(self.c), omega))
@@ -164,7 +164,7 @@ class QuadraticDamping(AbstractTorque):
     c: Float[Array, "*#b 3"] = shaped(3)
 
     def __init__(self, c):
-        self.c = _coefficients("QuadraticDamping", c)
+        self.c = coefficients("QuadraticDamping", c)
 
     def body_components(self, t, attitude, omega):
         square = omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2
