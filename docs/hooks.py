@@ -50,7 +50,10 @@ SECTIONS = {
 def public_modules() -> list[str]:
     """``polhode`` and its public submodules."""
     found = [m.name for m in pkgutil.iter_modules(ph.__path__) if not m.name.startswith("_")]
-    return ["polhode", *(f"polhode.{name}" for name in sorted(found) if name != "cli")]
+    return [
+        "polhode",
+        *(f"polhode.{name}" for name in sorted(found) if name not in ("cli", "parts")),
+    ]
 
 
 def public_names(module: str) -> list[str]:

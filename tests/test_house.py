@@ -38,7 +38,8 @@ def imported(text: str, package: tuple[str, ...], known: set[str]) -> Iterator[s
         elif isinstance(node, ast.ImportFrom):
             above = list(package[: len(package) + 1 - node.level]) if node.level else []
             base = above + (node.module.split(".") if node.module else [])
-            modules = [[*base, name.name] for name in node.names]
+            # every module may ask for the version: the package stands before its modules
+            modules = [[*base, name.name] for name in node.names if name.name != "__version__"]
         else:
             continue
         for module in modules:
@@ -62,6 +63,7 @@ def imported(text: str, package: tuple[str, ...], known: set[str]) -> Iterator[s
         ("from .. import tops", ["tops"]),
         ("from ..tops._cubic import x", ["tops"]),
         ("def f():\n    if True:\n        from polhode import tops", ["tops"]),
+        ("from polhode import __version__", []),
         ("import polhodes, jax\nfrom numpy import tops", []),
     ],
 )

@@ -7,7 +7,7 @@ mistakes in a scene file are told before JAX is loaded.
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
-from polhode._version import __version__ as __version__
+__version__ = "0.1.0"
 
 if TYPE_CHECKING:
     from polhode._public import *  # noqa: F403 - the names, for type checkers

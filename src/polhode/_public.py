@@ -5,7 +5,6 @@ from polhode._scene import Scene as Scene
 from polhode._simulate import explain as explain, simulate as simulate
 from polhode._state import State as State
 from polhode._trajectory import Trajectory as Trajectory
-from polhode._version import __version__ as __version__
 from polhode.fit import (
     fit_inertia as fit_inertia,
     fit_recordings as fit_recordings,

@@ -7,10 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from polhode import rotation
+from polhode import __version__, rotation
 from polhode._batch import PARTS, along_time
 from polhode._scene import Scene
-from polhode._version import __version__
 from polhode.hamiltonian import components, from_quaternion
 from polhode.methods import Status
 

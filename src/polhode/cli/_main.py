@@ -32,7 +32,7 @@ app = typer.Typer(
 
 def _version(wanted: bool) -> bool:
     if wanted:
-        from polhode._version import __version__
+        from polhode import __version__
 
         print(f"polhode {__version__}")
         raise typer.Exit

@@ -1,16 +1,28 @@
 """How the body moves between its first sample and the others: the model that a fit compares."""
 
 import abc
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode.free import free_motion
-from polhode.inertia import Inertia, angular_acceleration, principal
-from polhode.rotation import conjugate, multiply, rotate, to_matrix
+from polhode.hamiltonian import (
+    Dynamics,
+    Hamiltonian,
+    components,
+    inverse_inertia,
+    lie_poisson_field,
+    momentum_rate,
+)
+from polhode.inertia import Inertia, principal
+from polhode.rotation import conjugate, multiply, normalise, rotate, to_matrix
+from polhode.solvers._classical import ClassicalRungeKutta
+from polhode.torques import AbstractTorque, LinearDamping, QuadraticDamping
 
 
 class Motion(NamedTuple):
@@ -51,13 +63,19 @@ class Drag(eqx.Module):
     linear: Array | float = 0.0
     quadratic: Array | float = 0.0
 
+    def torque(self, dtype) -> AbstractTorque:
+        """The torque in a scene; a fit may try negative coefficients, which a scene refuses."""
+        parts = LinearDamping(1.0) + QuadraticDamping(1.0)
+        tried = [jnp.full(3, c, dtype) for c in (self.linear, self.quadratic)]
+        return eqx.tree_at(lambda s: [term.c for term in s.terms], parts, tried)
+
 
 class SteppedMotion(AbstractMotion):
     """Flight with air drag and a wheel of known speed, by Runge-Kutta steps of order 4.
 
-    The body momentum ``L = I omega + spin_inertia W(t - delay) axis`` obeys
-    ``dL/dt = L x omega - drag``; I is the inertia with the wheel locked. ``steps`` steps are made
-    between samples. What is None is absent; ``fit_...`` says which of the values are unknown.
+    The motion is that of H with the wheel's momentum ``spin_inertia W(t - delay) axis`` and the
+    drag as its torque; I is the inertia with the wheel locked. ``steps`` steps are made between
+    samples. What is None is absent; ``fit_...`` says which of the values are unknown.
     """
 
     spin_inertia: Array | float | None = None
@@ -80,68 +98,75 @@ class SteppedMotion(AbstractMotion):
     def __call__(self, tensor, omega, wxyz, times, wheel, unknown):
         inertia = Inertia(full=tensor)
         drag = unknown["drag"] if self.fit_drag else self.drag
-        delay = unknown["delay"] if self.fit_delay else self.delay
-        h = jnp.diff(times) / self.steps
-        halves = jnp.arange(2 * self.steps + 1, dtype=times.dtype)
-        nodes = times[:-1, None] + h[:, None] * halves[None] / 2
-        spin = self._spin(nodes, times, wheel, delay)
+        torque = None if drag is None else drag.torque(times.dtype)
+        inverse = inverse_inertia(inertia)
 
-        def torque(rates):
-            if drag is None:
-                return jnp.zeros_like(rates)
-            # the norm has no derivative at rest; there the quadratic drag vanishes
-            square = jnp.sum(rates * rates)
-            speed = jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
-            return -(drag.linear + drag.quadratic * speed) * rates
+        def dynamics(size) -> Dynamics:
+            carried = None if size is None else lambda t: self._along(size(t))
+            return Dynamics(Hamiltonian(inverse, inertia, None, carried), torque)
 
-        def rates_of(momentum, carried):
-            return inertia.rates(momentum - carried)
+        wheel_at = self._wheel(times, wheel, unknown["delay"] if self.fit_delay else self.delay)
+        halves = jnp.arange(2 * self.steps + 1, dtype=times.dtype) / (2 * self.steps)
+        nodes = times[:-1, None] + jnp.diff(times)[:, None] * halves[None]
+        solver, term = ClassicalRungeKutta(), diffrax.ODETerm(_field)
 
-        def field(state, carried):
-            rates = rates_of(state[0], carried)
-            turn = None if state[1] is None else _quaternion_rate(state[1], rates)
-            return jnp.cross(state[0], rates) + torque(rates), turn
-
-        def shifted(state, slope, by):
-            return jax.tree.map(lambda a, b: a + by * b, state, slope)
-
-        def interval(state, inputs):
-            step, carried = inputs
-            for k in range(self.steps):
-                first, middle, last = carried[2 * k], carried[2 * k + 1], carried[2 * k + 2]
-                k1 = field(state, first)
-                k2 = field(shifted(state, k1, step / 2), middle)
-                k3 = field(shifted(state, k2, step / 2), middle)
-                k4 = field(shifted(state, k3, step), last)
-                state = jax.tree.map(
-                    lambda y, a, b, c, d, step=step: y + step / 6 * (a + 2 * b + 2 * c + d),
-                    state,
-                    k1,
-                    k2,
-                    k3,
-                    k4,
+        def interval(y, inputs):
+            ts, spins = inputs
+            for k in range(0, 2 * self.steps, 2):
+                now = dynamics(
+                    None if spins is None else _parabola(ts[k : k + 3], spins[k : k + 3])
                 )
-            return state, state
+                y, *_ = solver.step(term, ts[k], ts[k + 2], y, now, None, made_jump=False)
+            return y, y
 
-        initial = (inertia.momentum(omega) + spin[0, 0], wxyz)
-        _, path = jax.lax.scan(interval, initial, (h, spin))
-        momentum, attitude = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), initial, path)
-        at_samples = jnp.concatenate([spin[:, 0], spin[-1:, -1]])
-        rates = rates_of(momentum, at_samples)
-        slope = jnp.gradient(at_samples, axis=0) / jnp.gradient(times)[:, None]
-        push = jnp.cross(momentum, rates) + jax.vmap(torque)(rates) - slope
+        momentum = inertia.momentum(omega)
+        if wheel_at is not None:
+            momentum = momentum + jnp.stack(self._along(wheel_at(times[0])))
+        y = components(momentum), None if wxyz is None else tuple(wxyz)
+        _, path = jax.lax.scan(interval, y, (nodes, wheel_at and wheel_at(nodes)))
+        momentum, attitude = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), y, path)
+        push, rates = momentum_rate(times, momentum, None, dynamics(wheel_at))
+        push, rates = jnp.stack(push, axis=-1), jnp.stack(rates, axis=-1)
+        if wheel_at is not None:  # what the wheel takes up does not turn the body
+            carried = jnp.stack(self._along(wheel_at(times)), axis=-1)
+            push = push - jnp.gradient(carried, axis=0) / jnp.gradient(times)[:, None]
         if attitude is not None:
-            attitude = attitude / jnp.sqrt(jnp.sum(attitude**2, axis=-1, keepdims=True))
+            attitude = normalise(jnp.stack(attitude, axis=-1))
         return Motion(rates, inertia.rates(push), attitude)
 
-    def _spin(self, nodes, times, wheel, delay):
-        """Body components of the wheel's momentum at the nodes (t, 2 steps + 1, 3)."""
+    def _wheel(self, times, wheel, delay) -> Callable[[Array], Array] | None:
+        """The wheel's momentum along its axis as a function of time; None without a wheel."""
         if self.spin_inertia is None:
-            return jnp.zeros((*nodes.shape, 3), nodes.dtype)
-        speed = jnp.interp((nodes - delay).ravel(), times, wheel).reshape(nodes.shape)
-        return (
-            self.spin_inertia * speed[..., None] * jnp.asarray(self.axis, nodes.dtype)[None, None]
-        )
+            return None
+        return lambda t: self.spin_inertia * jnp.interp(t - delay, times, wheel)
+
+    def _along(self, size: Array) -> tuple[Array, ...]:
+        return tuple(size * component for component in self.axis)
+
+
+def _parabola(ts: Array, values: Array) -> Callable[[Array], Array]:
+    """Through a step's two ends and its middle, where alone it is asked: no look-up in a table."""
+    first, middle, last = values
+
+    def at(t):
+        s = (t - ts[1]) / (ts[2] - ts[1])
+        return middle + s * ((last - first) / 2 + s * ((first + last) / 2 - middle))
+
+    return at
+
+
+def free_acceleration(inertia: Inertia, omega: Float[Array, "t 3"]) -> Float[Array, "t 3"]:
+    """d(omega)/dt of the free body."""
+    dynamics = Dynamics(Hamiltonian(inverse_inertia(inertia), inertia))
+    push, _ = momentum_rate(0.0, components(inertia.momentum(omega)), None, dynamics)
+    return inertia.rates(jnp.stack(push, axis=-1))
+
+
+def _field(t, y, dynamics):
+    """Rates of the body momentum and, where there is one, of the attitude."""
+    if y[1] is not None:
+        return lie_poisson_field(t, y, dynamics)
+    return momentum_rate(t, y[0], None, dynamics)[0], None
 
 
 class FreeMotion(AbstractMotion):
@@ -168,7 +193,7 @@ class FreeMotion(AbstractMotion):
         path = _combined(to_matrix(axes), rates)
         if turned is not None:
             turned = _combined(_right_product(conjugate(axes)), turned)
-        return Motion(path, angular_acceleration(Inertia(full=tensor), path), turned)
+        return Motion(path, free_acceleration(Inertia(full=tensor), path), turned)
 
 
 def _combined(matrix: Float[Array, "n n"], components: tuple[Array, ...]) -> Float[Array, "t n"]:
@@ -189,16 +214,3 @@ def _right_product(q: Float[Array, " 4"]) -> Float[Array, "4 4"]:
     w, x, y, z = q
     rows = ((w, -x, -y, -z), (x, w, z, -y), (y, -z, w, x), (z, y, -x, w))
     return jnp.stack([jnp.stack(row) for row in rows])
-
-
-def _quaternion_rate(q, rates):
-    w, x, y, z = q
-    a, b, c = rates / 2
-    return jnp.stack(
-        [
-            -x * a - y * b - z * c,
-            w * a + y * c - z * b,
-            w * b + z * a - x * c,
-            w * c + x * b - y * a,
-        ]
-    )

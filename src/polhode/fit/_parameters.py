@@ -136,14 +136,3 @@ def tensor_of(shape: Float[Array, " k"], base: Base, columns: np.ndarray) -> Arr
     exact = jax.lax.Precision.HIGHEST
     sigma = jnp.einsum("ij,jk,lk->il", turn, inner, turn, precision=exact)
     return inertia_of_second_moments(sigma)
-
-
-def rotation_of(vector: Float[Array, "*b 3"]) -> Float[Array, "*b 4"]:
-    """Unit quaternion of a rotation vector, smooth at zero."""
-    square = jnp.sum(vector * vector, axis=-1, keepdims=True)
-    safe = jnp.where(square > 0, square, 1)
-    angle = jnp.sqrt(safe)
-    # at exactly zero the series: sin(a/2)/a = 1/2 and cos(a/2) = 1 - a^2/8
-    ratio = jnp.where(square > 0, jnp.sin(angle / 2) / angle, 0.5 - square / 48)
-    scalar = jnp.where(square > 0, jnp.cos(angle / 2), 1 - square / 8)
-    return jnp.concatenate([scalar, ratio * vector], axis=-1)

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode.fit._motion import AbstractMotion, Motion
-from polhode.fit._parameters import Base, Parameters, rotation_of, tensor_of
+from polhode.fit._parameters import Base, Parameters, tensor_of
 from polhode.fit._recording import Recording
-from polhode.rotation import conjugate, multiply, rotate
+from polhode.rotation import conjugate, multiply, rotate, rotation_vector_to_wxyz
 
 
 class Huber(eqx.Module):
@@ -72,7 +72,7 @@ def predict(
         tensor = model.tensor(parameters)
     attitude = model.attitude
     if attitude is not None and parameters.attitude is not None:
-        attitude = multiply(attitude, rotation_of(parameters.attitude))
+        attitude = multiply(attitude, rotation_vector_to_wxyz(parameters.attitude))
 
     def one(omega, wxyz, times, wheel):
         return model.motion(tensor, omega, wxyz, times, wheel, parameters.motion)
@@ -94,7 +94,7 @@ def residuals(
     if recording.omega is not None:
         seen = motion.omega
         if parameters.mounting is not None:
-            turn = conjugate(rotation_of(parameters.mounting))
+            turn = conjugate(rotation_vector_to_wxyz(parameters.mounting))
             seen = rotate(jnp.broadcast_to(turn, (*seen.shape[:-1], 4)), seen)
         if parameters.bias is not None:
             seen = seen + parameters.bias[None, None]

@@ -16,13 +16,13 @@ from polhode._simulate import simulate
 from polhode._state import State
 from polhode.fit._fit import FitError, each, together
 from polhode.fit._motion import AbstractMotion, Motion
-from polhode.fit._parameters import NoInertia, rotation_of
+from polhode.fit._parameters import NoInertia
 from polhode.fit._recording import Recording, stack
 from polhode.fit._residuals import Huber
 from polhode.fit._result import CURES, UNUSABLE, Finding, by_kind, shown_by, whiteness_of
 from polhode.fit._solve import Problem, Solution, misfit_of
 from polhode.methods import AbstractMethod
-from polhode.rotation import multiply
+from polhode.rotation import multiply, rotation_vector_to_wxyz
 
 _LEANS = 1e-3
 """Part of an unknown in directions that the data do not show, above which it is not known."""
@@ -250,7 +250,7 @@ def conclude_scene(solution: Solution, recording: Recording, problem: Problem) -
         first += value.size
     initial = None
     if recording.wxyz is not None:
-        turned = multiply(recording.wxyz[:, 0], rotation_of(parameters.attitude))
+        turned = multiply(recording.wxyz[:, 0], rotation_vector_to_wxyz(parameters.attitude))
         initial = State(turned, parameters.omega)
     whiteness = whiteness_of(linear.rest, recording.present)
     finite = jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(linear.at))

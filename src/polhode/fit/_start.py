@@ -13,14 +13,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode.fit._matrices import eigh, solve
-from polhode.fit._parameters import rotation_of
+from polhode.fit._motion import free_acceleration
 from polhode.inertia import (
     Inertia,
-    angular_acceleration,
     inertia_of_second_moments,
     second_moments,
 )
-from polhode.rotation import multiply, to_matrix
+from polhode.rotation import multiply, rotation_vector_to_wxyz, to_matrix
 
 # second moments below this part of their sum are lifted to it before the logarithm is taken
 _FLATTEST = 3e-3
@@ -53,7 +52,7 @@ def integrate(
         first, second = rate_at(middle - offset), rate_at(middle + offset)
         return step / 4 * (first + second) + step**2 / 4 * offset * jnp.cross(first, second)
 
-    turns = multiply(rotation_of(half(0.25)), rotation_of(half(0.75)))
+    turns = multiply(rotation_vector_to_wxyz(half(0.25)), rotation_vector_to_wxyz(half(0.75)))
     path = jax.lax.associative_scan(multiply, turns)
     unit = jnp.asarray([[1, 0, 0, 0]], omega.dtype)
     return jnp.concatenate([unit, path])
@@ -133,7 +132,7 @@ def regression(
             grams = jnp.stack([square(centred(rows, parts)) for parts in (whole, pieces)])
             sigma, misfit = jax.vmap(null)(grams)
             body = Inertia(full=inertia_of_second_moments(sigma[1]))
-            return angular_acceleration(body, omega), sigma, misfit
+            return free_acceleration(body, omega), sigma, misfit
 
         unit = jnp.eye(3, dtype=omega.dtype)
         start = (first, jnp.stack([unit, unit]), jnp.zeros(2, omega.dtype))

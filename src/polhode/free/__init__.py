@@ -1,4 +1,4 @@
-"""The exact motion of the free body."""
+"""The exact motion of the free body, derived formula by formula in docs/free_motion.md."""
 
 from polhode.free._evaluate import (
     evaluate as evaluate,

@@ -4,7 +4,7 @@ Over a long horizon the error of the exact motion is that of its phases, one uni
 of the frequencies times the time. Here both are worked out in unevaluated sums of two floats, from
 the arithmetic-geometric mean: with circled axis 3, p = |1/I1 - 1/I2|, r = |1/I2 - 1/I3|, s = p + r,
 the momentum's half period is 2 K(m) / omega_p, and the mean rate of the Euler angle about L is
-|L| (1/I3 +- s Pi(-p/r, m) / K(m)). Pi/K by DLMF 19.8.6.
+|L| (1/I3 +- s Pi(-p/r, m) / K(m)), (13) of docs/free_motion.md. Pi/K by DLMF 19.8.6.
 """
 
 import jax
@@ -23,7 +23,8 @@ from polhode.free._exact import (
     sum_of,
 )
 from polhode.free._motion import Swing, Turning
-from polhode.free._roles import Roles, settle
+from polhode.free._roles import Roles
+from polhode.xla import settled
 
 Scalars = Float[Array, "*b"]
 
@@ -106,7 +107,7 @@ def frequencies(roles: Roles) -> tuple[Pair, Pair, Scalars]:
 def compensate(swing: Swing, turning: Turning | None, roles: Roles) -> tuple[Swing, Turning | None]:
     """Both motions with low parts of their paces, where the means have converged."""
     # Settled: the two parts of a pair must come out of one and the same sum.
-    pace, angle, left = settle(frequencies(roles), roles.one)
+    pace, angle, left = settled(frequencies(roles), roles.one)
     # Convergence is quadratic: what is left is the square of the last step.
     sound = (left < jnp.finfo(left.dtype).eps / 64) & ~swing.endless
     high, low = _beside(swing.pace, pace, sound, roles.pulse)

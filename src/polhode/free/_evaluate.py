@@ -7,12 +7,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode.free._compensated import compensate
-from polhode.free._flow import Moment, advance, attitude, rates
+from polhode.free._flow import Instant, advance, attitude, rates
 from polhode.free._frame import Quadruple
 from polhode.free._motion import FreeMotion, Swing, Turning, prepare_swing, prepare_turning
-from polhode.free._roles import Triple, assign_roles, one_of
+from polhode.free._roles import Triple, assign_roles
 from polhode.free._rule import Found, answer_rule
-from polhode.xla import kernel
+from polhode.xla import kernel, opaque_ones
 
 Scalars = Float[Array, "*b"]
 
@@ -135,7 +135,7 @@ def _chunked(fn, parts, t):
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], out)
 
 
-def _results(asked, swing: Swing, turning: Turning | None, at: Moment):
+def _results(asked, swing: Swing, turning: Turning | None, at: Instant):
     return (
         rates(swing, at) if asked[1] else None,
         attitude(swing, turning, at) if asked[0] else None,
@@ -153,7 +153,7 @@ def _evaluate_rule(asked, primals, tangents):
     (swing, turning), given = primals
     t = jax.lax.stop_gradient(given[-1])
     # The tangent has many kernels, and each would repeat the motion itself.
-    at = advance(swing, turning, t, one_of(t * swing.one), fine=True)
+    at = advance(swing, turning, t, opaque_ones(t * swing.one), fine=True)
     found = Found(swing, turning, at, _results(asked, swing, turning, at))
     return answer_rule(asked, (found, given), (None, tangents[1]))
 

@@ -1,4 +1,4 @@
-"""The exact free motion at given times."""
+"""The exact free motion at given times; (n) are the formulas of docs/free_motion.md."""
 
 import math
 from typing import NamedTuple
@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 from polhode.free._exact import turns
 from polhode.free._motion import Swing, Turning
 from polhode.free._phase import cosine_sine, horner, parity, sine_half, sinh
-from polhode.free._roles import Triple, restore, settle
+from polhode.free._roles import Triple, restore
+from polhode.xla import settled
 
 Scalars = Float[Array, "*b"]
 
@@ -31,7 +32,7 @@ def sweep(swing: Swing, t: Scalars) -> tuple[Scalars, Scalars]:
 
 
 def jacobi(swing: Swing, rest: Scalars, stage):
-    """sn / omega_p, cn, dn of the time since the last half turn, and the base sine."""
+    """(7): sn / omega_p, cn, dn of the time since the last half turn, and the base sine."""
     half = stage(jnp.where(swing.circular, sine_half(rest), sinh(swing.span * rest)))
     sign = jnp.where(swing.circular, 1.0, -1.0).astype(half.dtype)
     base = sign * half * half
@@ -61,7 +62,7 @@ def jacobi(swing: Swing, rest: Scalars, stage):
 
 
 def momentum_of(swing: Swing, functions: Triple) -> Triple:
-    """L along axes 1, 2, 3 from its initial value, by the addition theorems."""
+    """(6): L along axes 1, 2, 3 from its initial value, by the addition theorems."""
     S, C, N = functions
     l1, l2, l3 = swing.momentum
     k = swing.sense * swing.parity
@@ -79,7 +80,7 @@ def momentum(swing: Swing, functions: Triple) -> Triple:
     return tuple(jnp.where(swing.steady, l, x) for l, x in zip(swing.momentum, now, strict=True))
 
 
-class Moment(NamedTuple):
+class Instant(NamedTuple):
     """The motion at one time, axes in their roles, scaled units."""
 
     whole: Scalars  # half turns of the theta functions' argument
@@ -90,7 +91,7 @@ class Moment(NamedTuple):
 
 
 def half_angle(swing: Swing, turning: Turning, t: Scalars, rest, half, N, turned: Triple, stage):
-    """Cosine and sine of half of the angle about L; divided by the tilt (|L| + |L3|, L x n3)."""
+    """(10)-(12): cosine and sine of half of the angle about L, over the length of the tilt."""
     S, l2, l3 = turned
     whole, angle = _phase(turning, t)
     angle = angle + turning.sway * rest
@@ -109,8 +110,7 @@ def half_angle(swing: Swing, turning: Turning, t: Scalars, rest, half, N, turned
     real, imaginary = stage((real, imaginary))
     mu = turning.peak / turning.length
     y, w = jnp.abs(swing.momentum[2]) / turning.peak, jnp.abs(l3) / turning.peak
-    # The series hold for the motion that starts where L3 is largest; the addition theorem of the
-    # third kind carries them to the actual start.
+    # (12): the series hold for the motion that starts where L3 is largest.
     a = mu * (1 + N) * (1 + y) * (1 + w) + (1 - mu) * (1 + N + y + w)
     b = turning.bend * S * swing.momentum[1] * l2
     # (cosine + i sine) (real - i imaginary) (a + i b)
@@ -119,13 +119,13 @@ def half_angle(swing: Swing, turning: Turning, t: Scalars, rest, half, N, turned
 
 
 def advance(swing: Swing, turning: Turning | None, t: Scalars, one: Scalars | None, fine=False):
-    """The ``Moment`` of time t; with ``one``, of the shape of t, in stages (see ``settle``).
+    """The ``Instant`` of time t; with ``one``, of the shape of t, in stages (see ``settled``).
 
     ``fine``: in more stages, for results that many kernels need.
     """
     # One kernel per output repeats the arithmetic of all stages, which costs less than to write
     # and read them when every lane has many times, and more when it has one.
-    stage = (lambda x: x) if one is None else (lambda x: settle(x, one))
+    stage = (lambda x: x) if one is None else (lambda x: settled(x, one))
     more = stage if fine else (lambda x: x)
     whole, rest = more(sweep(swing, t))
     half, folded = jacobi(swing, rest, stage)
@@ -134,20 +134,20 @@ def advance(swing: Swing, turning: Turning | None, t: Scalars, one: Scalars | No
     S, C, N = stage((sign * folded[0], sign * folded[1], folded[2]))
     l1, l2, l3 = now = stage(momentum(swing, (S, C, N)))
     if turning is None:
-        return Moment(whole, folded, (S, C, N), now, None)
+        return Instant(whole, folded, (S, C, N), now, None)
     c, s = half_angle(swing, turning, t, rest, half, N, (S, l2, l3), stage)
     height = turning.length + jnp.abs(l3)
     scale = jax.lax.rsqrt((c * c + s * s) * (height * height + l1 * l1 + l2 * l2))
-    return Moment(whole, folded, (S, C, N), now, stage((c * scale, s * scale)))
+    return Instant(whole, folded, (S, C, N), now, stage((c * scale, s * scale)))
 
 
-def rates(swing: Swing, at: Moment) -> Triple:
+def rates(swing: Swing, at: Instant) -> Triple:
     """Body rates along x, y, z."""
     spin = tuple(swing.pulse * (l * d) for l, d in zip(at.momentum, swing.inverse, strict=True))
     return restore(spin, swing.middle, swing.circled)
 
 
-def attitude(swing: Swing, turning: Turning, at: Moment) -> tuple[Scalars, ...]:
+def attitude(swing: Swing, turning: Turning, at: Instant) -> tuple[Scalars, ...]:
     """Attitude: the start, the turn about axis 3, and the minimal rotation carrying L to it."""
     l1, l2, l3 = at.momentum
     c, s = at.half

@@ -1,4 +1,4 @@
-"""Constants of the exact free motion: everything that does not depend on time."""
+"""Constants of the exact free motion; (n) are the formulas of docs/free_motion.md."""
 
 import math
 from typing import NamedTuple
@@ -6,8 +6,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from polhode.elliptic._nome import nome_per_lambda
 from polhode.free._phase import arc
-from polhode.free._roles import Roles, Triple, restore, settle
+from polhode.free._roles import Roles, Triple, restore
+from polhode.xla import settled
 
 Scalars = Float[Array, "*b"]
 
@@ -88,12 +90,11 @@ def _limits(dtype) -> tuple[float, float]:
 def _nome(square: Scalars, root: Scalars) -> Scalars:
     """The nome of parameter ``square`` <= 0.8; ``root``: root of the complementary modulus."""
     e = square / (2 * (1 + root * root) * (1 + root) ** 2)
-    f = e**4
-    return e * (1 + f * (2 + f * (15 + f * (150 + f * (1707 + f * 20910)))))
+    return e * nome_per_lambda(e)
 
 
 def means(circular, endless, x: Scalars, m: Scalars, m1: Scalars, one: Scalars):
-    """Arithmetic-geometric mean, nome, minus its logarithm, and the rate of the argument."""
+    """Arithmetic-geometric mean, nome, minus its logarithm, and the rate of the argument v."""
     square = jnp.where(circular, m, m1)
     other = jnp.sqrt(jnp.where(circular, m1, m))
     omega = jnp.sqrt(x)
@@ -102,13 +103,13 @@ def means(circular, endless, x: Scalars, m: Scalars, m1: Scalars, one: Scalars):
         a, b = (a + b) / 2, jnp.sqrt(a * b)
     mean = (a + b) / 2
     nome = _nome(square, jnp.sqrt(other))
-    mean, nome = settle((mean, nome), one)
+    mean, nome = settled((mean, nome), one)
     log_nome = jnp.where(circular | endless, 1, -jnp.log(jnp.where(circular | endless, 0.5, nome)))
-    return mean, nome, log_nome, settle(omega * mean, one)
+    return mean, nome, log_nome, settled(omega * mean, one)
 
 
 def prepare_swing(roles: Roles) -> Swing:
-    """Parameter, periods and amplitudes of the momentum in the body."""
+    """(1), (3), (5): parameter, periods and amplitudes of the momentum in the body."""
     i1, i2, i3 = roles.moments
     one = roles.one
     w1, w2, w3 = roles.rates
@@ -119,7 +120,7 @@ def prepare_swing(roles: Roles) -> Swing:
     p, r, s = d12 * d1 * d2, d23 * d2 * d3, d13 * d1 * d3
     A = (l1 * w1 * d13 + l2 * w2 * d23) * d3
     B = (l2 * w2 * d12 + l3 * w3 * d13) * d1
-    A, B = settle((A, B), one)
+    A, B = settled((A, B), one)
     x = B * r
     moving = x > 0
     divisor = jnp.where(moving, x, 1)
@@ -131,7 +132,7 @@ def prepare_swing(roles: Roles) -> Swing:
     mean, nome, log_nome, rate = means(circular, endless, x, m, m1, one)
     pace = rate / jnp.where(circular, math.pi, log_nome) * roles.pulse
     inverse_rate = jnp.where(moving, 1 / jnp.where(moving, rate, 1), 0)
-    pace = settle(pace, one)
+    pace = settled(pace, one)
     return Swing(
         (l1, l2, l3), (d1, d2, d3), roles.moments, p, r, s, A, B, m, m1, circular, endless, steady,
         jnp.where(endless, 0, nome), mean, log_nome, rate,
@@ -141,7 +142,7 @@ def prepare_swing(roles: Roles) -> Swing:
 
 
 def descend(swing: Swing, length: Scalars) -> Scalars:
-    """sinh of the imaginary shift b (circular) or tan of twice the angle beta (hyperbolic).
+    """(9): sinh of the imaginary shift b (circular) or tan of twice the angle beta (hyperbolic).
 
     Gauss's transformation, every step a sum of positive terms.
     """
@@ -165,12 +166,12 @@ def descend(swing: Swing, length: Scalars) -> Scalars:
 
 
 def _circular_series(swing: Swing, shift: Scalars):
-    """theta_4(v + i b | q^2) in powers of sin(v)^2, and the slope of its argument at v = 0."""
+    """(10): theta_4(v + i b | q^2) in powers of sin(v)^2, the slope of its argument at v = 0."""
     q = swing.nome * swing.nome
     q2 = q * q
     even = q * (1 + 2 * shift * shift)  # q cosh 2b
     odd = 2 * (q * shift) * jnp.sqrt(1 + shift * shift)  # q sinh 2b
-    even, odd = settle((even, odd), swing.one)
+    even, odd = settled((even, odd), swing.one)
     c2, s2 = q2 * (2 * even * even - q2), 2 * q2 * even * odd
     c3 = q2 * q2 * q2 * even * (4 * even * even - 3 * q2)
     s3 = q2 * q2 * q2 * odd * (4 * odd * odd + 3 * q2)
@@ -192,7 +193,7 @@ def _circular_series(swing: Swing, shift: Scalars):
 
 
 def _hyperbolic_series(swing: Swing, tangent: Scalars):
-    """theta_2(beta - i w/2 | sqrt q') in powers of sinh(w/2)^2, the slope of its argument, beta."""
+    """(11): theta_2(beta - i w/2 | sqrt q') in powers of sinh(w/2)^2, its slope, and beta."""
     half = jnp.sqrt(swing.nome)
     double_cosine = 1 / jnp.sqrt(1 + tangent * tangent)
     double_sine = tangent * double_cosine
@@ -233,7 +234,7 @@ def _hyperbolic_series(swing: Swing, tangent: Scalars):
 
 
 def prepare_turning(swing: Swing, wxyz: tuple[Scalars, ...]) -> Turning:
-    """Mean rate of the angle about the momentum, its theta series, and the untilted start."""
+    """(10)-(12): mean rate of the angle about L, its theta series, and the untilted start."""
     l1, l2, l3 = swing.momentum
     d1, _, d3 = swing.inverse
     length = jnp.sqrt(l1 * l1 + l2 * l2 + l3 * l3)
@@ -249,13 +250,13 @@ def prepare_turning(swing: Swing, wxyz: tuple[Scalars, ...]) -> Turning:
     imaginary = tuple(
         swing.sense * jnp.where(pick, x, y) for x, y in zip(imaginary_c, imaginary_h, strict=True)
     )
-    real, imaginary = settle((real, imaginary), swing.one)
-    # At the start of the reference motion the momentum is (sqrt(across), 0, peak).
+    real, imaginary = settled((real, imaginary), swing.one)
+    # (8) at the start of the reference motion, where the momentum is (sqrt(across), 0, peak).
     begin = (d3 * peak + d1 * across / (length + peak)) / 2
     slope = jnp.where(pick, slope_c, slope_h)
     still = pick | swing.endless
     sway = jnp.where(still, 0, swing.sense * 2 * beta)
-    sway, slope = settle((sway, slope), swing.one)
+    sway, slope = settled((sway, slope), swing.one)
     half_rate = begin + swing.rate * (swing.sense * slope - sway / swing.log_nome)
     # The minimal rotation carrying L to axis 3 is (|L| + |L3|, L x n3); the start undoes it.
     side = swing.parity * jnp.copysign(1, l3)
@@ -264,7 +265,7 @@ def prepare_turning(swing: Swing, wxyz: tuple[Scalars, ...]) -> Turning:
     q0, q1, q2, q3 = wxyz
     t1, t2, t3 = tilt
     scale = 1 / jnp.sqrt((q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3) * (w * w + l1 * l1 + l2 * l2))
-    tilt, w, scale = settle(((t1, t2, t3), w, scale), swing.one)
+    tilt, w, scale = settled(((t1, t2, t3), w, scale), swing.one)
     t1, t2, t3 = tilt
     start = (
         (q0 * w + q1 * t1 + q2 * t2 + q3 * t3) * scale,

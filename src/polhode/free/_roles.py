@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
@@ -15,28 +14,10 @@ from polhode.free._exact import (
     subtract_pairs,
     sum_of,
 )
+from polhode.xla import opaque_ones, settled
 
 Scalars = Float[Array, "*b"]
 Triple = tuple[Scalars, Scalars, Scalars]
-
-
-def one_of(x: Scalars) -> Scalars:
-    """Ones that the compiler cannot know to be ones (NaN where x is)."""
-    return jnp.where(jnp.isnan(x), x, 1)
-
-
-def settle(values, *ones: Scalars):
-    """The same values, computed once and not again in every kernel that uses them.
-
-    The compiler repeats cheap arithmetic in every fused loop that needs its result, but never a
-    division; it drops optimisation barriers before fusing on the CPU. Each value is divided by the
-    one of its own shape, for a division by a broadcast scalar is a multiplication to the compiler.
-    """
-
-    def divided(x):
-        return x / next((one for one in ones if one.shape == x.shape), ones[0])
-
-    return jax.tree.map(divided, values)
 
 
 class Roles(NamedTuple):
@@ -81,7 +62,7 @@ def assign_roles(moments: Triple, rates: Triple) -> Roles:
     largest = jnp.maximum(jnp.maximum(jnp.abs(rates[0]), jnp.abs(rates[1])), jnp.abs(rates[2]))
     pulse = binade(largest)
     heft = binade(jnp.maximum(jnp.maximum(moments[0], moments[1]), moments[2]))
-    one = one_of(moments[0])
+    one = opaque_ones(moments[0])
     # The momentum of a sphere circles no axis: the one that it is nearest to, so that it is not
     # across it.
     sphere = (moments[0] == moments[1]) & (moments[1] == moments[2])
@@ -99,24 +80,24 @@ def assign_roles(moments: Triple, rates: Triple) -> Roles:
     low, mid, high = low / lift, mid / lift, high / lift
     # Exact next to the separatrix, where the two terms cancel and all depends on the difference.
     gap = subtract_pairs(_pull(high, w_high, high, mid), _pull(low, w_low, mid, low)).value
-    gap = settle(gap, one)
+    gap = settled(gap, one)
     # A tie is the separatrix, or a spin about an axis across that of a symmetric body: there the
     # circled axis must be one of the two equal ones.
     above = (gap > 0) | ((gap == 0) & (high - mid <= mid - low))
-    sense = settle(jnp.where(above, 1, -1).astype(low.dtype), one)
+    sense = settled(jnp.where(above, 1, -1).astype(low.dtype), one)
     above = sense > 0
     k1, k3 = jnp.where(above, k_low, k_high), jnp.where(above, k_high, k_low)
     right = (k_mid - k1 == 1) | (k_mid - k1 == -2)
     return Roles(
-        settle((jnp.where(above, low, high), mid, jnp.where(above, high, low)), one),
-        settle((jnp.where(above, w_low, w_high), w_mid, jnp.where(above, w_high, w_low)), one),
-        settle(jnp.where(resting, 0, pulse), one),
-        settle(heft, one),
+        settled((jnp.where(above, low, high), mid, jnp.where(above, high, low)), one),
+        settled((jnp.where(above, w_low, w_high), w_mid, jnp.where(above, w_high, w_low)), one),
+        settled(jnp.where(resting, 0, pulse), one),
+        settled(heft, one),
         jnp.abs(gap),
         sense,
-        settle(jnp.where(right, 1, -1).astype(low.dtype), one),
-        settle(k_mid.astype(low.dtype), one),
-        settle(k3.astype(low.dtype), one),
+        settled(jnp.where(right, 1, -1).astype(low.dtype), one),
+        settled(k_mid.astype(low.dtype), one),
+        settled(k3.astype(low.dtype), one),
         one,
     )
 

@@ -16,10 +16,10 @@ from polhode.free._carry import (
     start_of,
     turn_of_axes,
 )
-from polhode.free._flow import Moment
+from polhode.free._flow import Instant
 from polhode.free._frame import Frame, Quadruple, cross, dot, hamilton, matrix
 from polhode.free._motion import Swing, Turning
-from polhode.free._roles import Triple, one_of, settle
+from polhode.free._roles import Triple
 from polhode.free._second import second_kind
 from polhode.free._tangent import (
     Change,
@@ -29,6 +29,7 @@ from polhode.free._tangent import (
     products_of_momenta,
     squares_of_momenta,
 )
+from polhode.xla import opaque_ones, settled
 
 Scalars = Float[Array, "*b"]
 
@@ -38,7 +39,7 @@ class Found(NamedTuple):
 
     swing: Swing
     turning: Turning | None
-    at: Moment
+    at: Instant
     results: tuple[Triple | None, Quadruple | None]
 
 
@@ -72,7 +73,7 @@ def change_of_start(swing: Swing, frame: Frame, dm, dp, dw) -> Change:
     return Change(gain, inverse, (-d1 * d2 * p12, -d1 * d3 * p13, -d2 * d3 * p23))
 
 
-def _relative_turn(swing: Swing, turning: Turning, frame: Frame, at: Moment, step: Triple):
+def _relative_turn(swing: Swing, turning: Turning, frame: Frame, at: Instant, step: Triple):
     """Quaternion from the attitude at t to that at the start, its vector part exact when small."""
     l1, l2, l3 = frame.turned(swing.momentum)
     s1, s2, s3 = frame.turned(step)
@@ -117,7 +118,7 @@ def _turn_tangent(swing, frame: Frame, functions, now, relative, change: Change,
     return frame.turned(turn)
 
 
-def _for_tangent(swing: Swing, at: Moment, t: Scalars) -> Moment:
+def _for_tangent(swing: Swing, at: Instant, t: Scalars) -> Instant:
     """S, C, N as the tangent needs them; the momentum itself does not.
 
     Where omega_p is zero S is the time. On the separatrix derivatives grow without bound: they are
@@ -135,7 +136,7 @@ def _for_tangent(swing: Swing, at: Moment, t: Scalars) -> Moment:
 
 
 def _settled(ones, values):
-    return settle(values, *ones)
+    return settled(values, *ones)
 
 
 class _Tangent(NamedTuple):
@@ -153,7 +154,7 @@ def _tangent(many: bool, attitude: bool, found: Found, given, dm, dp, dw) -> _Ta
     """The formulas of _tangent.py, every value in them with a derivative of its own."""
     moments, _, omega, _, t = given
     scaled = t * found.swing.pulse
-    ones = one_of(scaled), found.swing.one
+    ones = opaque_ones(scaled), found.swing.one
     # The transpose of a stage is a stage: it keeps cotangents from being summed again and again.
     stage = functools.partial(_settled, ones)
     swing = start_of(found.swing, moments, omega)

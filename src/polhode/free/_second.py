@@ -1,4 +1,4 @@
-"""Integrals of the second kind that the tangent of the free motion needs."""
+"""Integrals of the second kind that the tangent needs: (14) of docs/free_motion.md."""
 
 import math
 

@@ -1,4 +1,5 @@
-"""The tangent of the exact free motion: how L(t) and the attitude answer to what they start from.
+"""The tangent of the exact free motion: how L(t) and the attitude answer to what they start from;
+(15) and (16) of docs/free_motion.md.
 
 The momentum is an algebraic function of its initial value and of S = sn/omega_p, C = cn, N = dn,
 which depend on x = B r and y = A p alone; their derivatives need the integrals of S^2 and
@@ -44,7 +45,7 @@ class Partials(NamedTuple):
 
 
 def partials(x: Scalars, y: Scalars, functions: Triple, first: Scalars, second: Scalars):
-    """Derivatives of S, C, N from the integrals of S^2 and (S/N)^2."""
+    """(15): derivatives of S, C, N from the integrals of S^2 and (S/N)^2."""
     S, C, N = functions
     square = S * S
     # z is what vanishes on the separatrix, where ``second`` grows without bound.

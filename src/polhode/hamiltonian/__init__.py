@@ -29,6 +29,7 @@ from polhode.hamiltonian._lie_poisson import (
     Dynamics as Dynamics,
     external_power as external_power,
     lie_poisson_field as lie_poisson_field,
+    momentum_rate as momentum_rate,
     motor_powers as motor_powers,
     quaternion_rate as quaternion_rate,
 )

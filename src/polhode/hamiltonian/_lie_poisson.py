@@ -21,10 +21,14 @@ from polhode.rotation import quaternion_rate as quaternion_rate
 
 
 def rates_and_torque(
-    hamiltonian: Hamiltonian, momentum: Sequence[Array], attitude: Attitude, t: Array | float
+    hamiltonian: Hamiltonian,
+    momentum: Sequence[Array],
+    attitude: Attitude | None,
+    t: Array | float,
 ) -> tuple[Vector, Vector | None]:
     """Body rates dH/dL [rad/s] and the potential's torque in body axes [N m] (None without one)."""
-    rows = {i: attitude.row(i) for i in hamiltonian.rows_used(attitude, t)}
+    used = () if hamiltonian.potential is None else hamiltonian.rows_used(attitude, t)
+    rows = {i: attitude.row(i) for i in used}
 
     def total(momentum, rows):
         return jnp.sum(hamiltonian(momentum, from_rows(rows), t))
@@ -113,9 +117,13 @@ def motor_powers(
 
 
 def momentum_rate(
-    t: Array | float, momentum: Sequence[Array], attitude: Attitude, dynamics: "Dynamics | Any"
+    t: Array | float,
+    momentum: Sequence[Array],
+    attitude: Attitude | None,
+    dynamics: "Dynamics | Any",
 ) -> tuple[Vector, Vector]:
-    """dL/dt [N m] in body axes and the rates [rad/s] at which these axes turn."""
+    """dL/dt [N m] in body axes and the rates [rad/s] at which these axes turn; no attitude where
+    nothing asks for one."""
     return _motion(t, momentum, attitude, dynamics)[:2]
 
 

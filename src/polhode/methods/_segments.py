@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
@@ -20,13 +19,6 @@ class Moved(NamedTuple):
     steps: Array
     status: Array
     error: Array | None
-
-
-class StepThrough(diffrax.StepTo):
-    """``diffrax.StepTo`` for times that may repeat."""
-
-    def wrap(self, direction):
-        return StepThrough(self.ts * direction)
 
 
 def in_segments(

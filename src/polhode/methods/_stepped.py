@@ -16,9 +16,9 @@ from polhode.hamiltonian import Dynamics
 from polhode.methods._base import AbstractMethod, Record, Samples
 from polhode.methods._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
 from polhode.methods._options import check_options
-from polhode.methods._segments import Moved, StepThrough, in_segments
+from polhode.methods._segments import Moved, in_segments
 from polhode.methods._status import Status
-from polhode.solvers import FlowAdjoint
+from polhode.solvers import FlowAdjoint, GivenTimes
 
 
 class Stepped(AbstractMethod):
@@ -80,12 +80,12 @@ class Stepped(AbstractMethod):
             torque = scene.torque.during(middle)
             now = Scene(scene.inertia, scene.potential, torque, scene.rotors)
             share = jnp.maximum(rtol / parts, 8 * jnp.finfo(rtol.dtype).eps)
-            return self._moved(now, state, y, times, share, record, StepThrough)
+            return self._moved(now, state, y, times, share, record)
 
         found = in_segments(move, y0, ts, edges, record.final_only)
         return self._samples(scene, found, ts, sound, record)
 
-    def _moved(self, scene, state, y0, ts, rtol, record, steps_to=diffrax.StepTo) -> Moved:
+    def _moved(self, scene, state, y0, ts, rtol, record) -> Moved:
         """States from ``y0`` on."""
         dynamics = self.chart.dynamics(scene, state, ts)
         field = self.chart.field
@@ -95,8 +95,7 @@ class Stepped(AbstractMethod):
                 dynamics.hamiltonian, dynamics.torque, dynamics.units, wheels=wheels
             )
         term = diffrax.ODETerm(field)
-        jumps = _may_jump(scene)
-        asked = _Asked(ts, rtol, self.dt0, self.max_steps, record.final_only, jumps, steps_to)
+        asked = _Asked(ts, rtol, self.dt0, self.max_steps, record.final_only, _may_jump(scene))
         if self.controller is None:
             make = getattr(self.solver, "stepping", None)
             stepping = asked.stock(self.solver, y0, term, dynamics) if make is None else make(asked)
@@ -173,8 +172,7 @@ class Stepping(NamedTuple):
 
 class _Asked(NamedTuple):
     """What a solver is asked for: the times, the error at the last of them, the first or longest
-    step, how many at most; whether only the last state is kept, and whether the rates may jump;
-    ``steps_to``: the controller that leads from time to time."""
+    step, how many at most; whether only the last state is kept, and whether the rates may jump."""
 
     ts: Array
     rtol: Array
@@ -182,7 +180,6 @@ class _Asked(NamedTuple):
     max_steps: int
     final_only: bool
     jumps: bool
-    steps_to: type[diffrax.StepTo] = diffrax.StepTo
 
     def given(self, solver, controller) -> Stepping:
         """Steps of a controller that the user chose."""
@@ -194,7 +191,7 @@ class _Asked(NamedTuple):
         ends = self.ts[jnp.array([0, -1])] if self.final_only else self.ts
         saved = self._saved(diffrax.SubSaveAt(t0=True, steps=1))
         saved = eqx.tree_at(lambda s: s.solver_state, saved, True)
-        return Stepping(solver, self.steps_to(ends), saved, ends.shape[0] - 1, None)
+        return Stepping(solver, GivenTimes(ends), saved, ends.shape[0] - 1, None)
 
     def stock(self, solver, y0, term, dynamics) -> Stepping:
         """Steps of any solver with an error estimate."""

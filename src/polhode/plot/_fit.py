@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from polhode.plot._matplotlib import ACCENT, AXES, GREY, INK, new_figure, plain, styled
+from polhode.plot._motion import matrices
 
 # chi-square of two degrees of freedom: 68 % and 95 % of a plane
 _LEVELS = {"68 %": 2.2957, "95 %": 5.9915}
@@ -103,14 +104,7 @@ def _single(result, recording, body) -> dict[str, Any]:
 
 def _of_values(moments, axes, covariance, scale_known, count) -> np.ndarray:
     """Covariance (2, 2) of the two smaller moments or ratios."""
-    w, x, y, z = axes
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turn = matrices(axes)
     slope = np.array(
         [
             [a * a, b * b, c * c, 2 * b * c, 2 * c * a, 2 * a * b]

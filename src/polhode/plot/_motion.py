@@ -7,6 +7,7 @@ from jaxtyping import ArrayLike, Float
 
 from polhode._trajectory import Trajectory
 from polhode.inertia import Inertia
+from polhode.rotation import matrix_row
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,10 +118,5 @@ def pick(what: Trajectory | Motion, body: int | None) -> tuple[Motion, int]:
 
 def matrices(wxyz: np.ndarray) -> np.ndarray:
     """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
-    w, x, y, z = np.moveaxis(wxyz, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(rows), (0, 1), (-2, -1))
+    q = tuple(np.moveaxis(wxyz, -1, 0))
+    return np.stack([np.stack(matrix_row(q, i), axis=-1) for i in range(3)], axis=-2)

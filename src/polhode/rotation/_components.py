@@ -1,13 +1,14 @@
 """Kinematics of a unit quaternion, on component arrays: its matrix and its rate, written once."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 
-def matrix_row(wxyz: Sequence[Array], i: int) -> tuple[Array, Array, Array]:
-    """Row ``i`` of the rotation matrix: body components of space axis ``i``."""
+def matrix_row(wxyz: Sequence[Any], i: int) -> tuple[Any, Any, Any]:
+    """Row ``i`` of the rotation matrix: body components of space axis ``i`` (JAX or NumPy)."""
     w, x, y, z = wxyz
     if i == 0:
         return 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -73,22 +72,3 @@ def unit(angle: Array) -> Complex:
 def where(condition: Array, a: Complex, b: Complex) -> Complex:
     """Elementwise choice."""
     return Complex(jnp.where(condition, a.re, b.re), jnp.where(condition, a.im, b.im))
-
-
-def settle(values, one: Array):
-    """The same values, divided by an array of ones that the compiler cannot see through.
-
-    It repeats cheap arithmetic in every fused loop that needs the result, and drops optimisation
-    barriers on the CPU before fusing, but never repeats a division.
-    """
-
-    def divided(x):
-        return x if x.dtype == bool else x / jnp.broadcast_to(one, x.shape)
-
-    return jax.tree.map(divided, values)
-
-
-def opaque_one(x: Array) -> Array:
-    """Ones of the shape of x (NaN where x is)."""
-    x = jax.lax.stop_gradient(x)
-    return jnp.where(jnp.isnan(x), x, 1)

@@ -25,9 +25,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode.tops._complex import Complex, opaque_one, settle, unit, where
+from polhode.tops._complex import Complex, unit, where
 from polhode.tops._cubic import Cubic, cubic, positive, safe
-from polhode.tops._pochhammer import Curve, apart, curve, pair, point
+from polhode.tops._pochhammer import Curve, curve, pair, point, unpaired
+from polhode.xla import opaque_ones, settled
 
 
 class Spinor(NamedTuple):
@@ -121,16 +122,16 @@ def _places(f: Cubic, c: Curve, one: Array):
     )
     f, c, one = _row((f, c, one))
     scale = 1 / safe(near, f.amount * span)
-    lift, fall = settle(((f.middle + depth) * scale, fall * (scale * jnp.sqrt(f.width))), one)
-    mean, step = settle((mean * f.reach, step * f.reach), one)
+    lift, fall = settled(((f.middle + depth) * scale, fall * (scale * jnp.sqrt(f.width))), one)
+    mean, step = settled((mean * f.reach, step * f.reach), one)
     e, partner = _reciprocal(step + mean, -step + mean, c.square)
-    half = settle(((1 + partner) * (1 + e).inverse).root, one)
+    half = settled(((1 + partner) * (1 + e).inverse).root, one)
     lead = where(near, -fall + lift, e * half)
     rest = where(near, fall + lift, partner * half.inverse)
-    lead, rest = settle((lead, rest), one)
+    lead, rest = settled((lead, rest), one)
     pull = jnp.where(near, c.square, 1) * c.steps[0]
     first, second = point(lead, rest, pull, c, one)
-    return settle((first * jnp.where(near, -1, c.per), second * jnp.where(near, -c.h, c.per)), one)
+    return settled((first * jnp.where(near, -1, c.per), second * jnp.where(near, -c.h, c.per)), one)
 
 
 def _settled_start(c: Curve, start: Complex, partner: Complex):
@@ -168,14 +169,14 @@ def orbit(
     alpha, beta = spinor
     both = alpha * beta
     vertical = (-2 * both.re, 2 * both.im, 2 * alpha.square, 2 * beta.square)
-    one = opaque_one(alpha.re)
-    f = settle(cubic(2 * transverse * pull, vertical, momentum), one)
-    c = settle(curve(f.square), one)
+    one = opaque_ones(alpha.re)
+    f = settled(cubic(2 * transverse * pull, vertical, momentum), one)
+    c = settled(curve(f.square), one)
     places, partners = _places(f, c, one)
-    start, partner = settle(_settled_start(c, places.at(0), partners.at(0)), one)
-    nu = settle(jnp.sqrt(f.width) / (4 * c.stretch), one)
+    start, partner = settled(_settled_start(c, places.at(0), partners.at(0)), one)
+    nu = settled(jnp.sqrt(f.width) / (4 * c.stretch), one)
     origin, twist = pair(start.re + partner.re, c.h, jnp.ones_like(c.h), c.series)
-    base = settle((partner - start) * (twist / origin), one)
+    base = settled((partner - start) * (twist / origin), one)
     x, mirror = places.at(slice(1, 3)), partners.at(slice(1, 3))
     turning = _turning(x, mirror, c, one)
     # alpha vanishes where g = -1, before the turning over
@@ -185,7 +186,9 @@ def orbit(
         for v in (x, mirror, turning)
     )
     push = Complex(momentum[1], momentum[0]) * (1 / (2 * f.unit))
-    value, rate = settle((_stack(alpha, beta), _stack(-(beta.conj * push), alpha.conj * push)), one)
+    value, rate = settled(
+        (_stack(alpha, beta), _stack(-(beta.conj * push), alpha.conj * push)), one
+    )
     whole = Orbit(c, start, partner, f.circular, nu * f.unit / transverse, None)
     frequency = f.unit / transverse
 
@@ -194,17 +197,17 @@ def orbit(
     )
     zero = jnp.zeros_like(value.re)
     nu_complex = Complex(_only(f.circular, nu), _only(~f.circular, nu))
-    ahead, behind = settle((mirror * start, x * partner), one)
-    theta, slope = settle(apart(ahead, behind, c.series, one), one)
-    inverse = settle(theta.inverse, one)
-    inner = settle(base + slope * inverse, one)
+    ahead, behind = settled((mirror * start, x * partner), one)
+    theta, slope = settled(unpaired(ahead, behind, c.series, one), one)
+    inverse = settled(theta.inverse, one)
+    inner = settled(base + slope * inverse, one)
     # From the rate at the start. Where nothing nutates (nu = 0) the phase alone turns.
     steady = (rate * value.conj).im / safe(value.square > 0, value.square)
     k = -(nu_complex * (1 + 2 * turning)) - f.momentum / 2
-    k = settle(where(f.live, k, Complex(steady, zero)), one)
+    k = settled(where(f.live, k, Complex(steady, zero)), one)
     drift = (k * value).times_i - rate
     d = drift * (-nu_complex.conj.times_i) * (1 / (2 * nu * nu)) + inner * value
-    d = settle(where(f.live, d, Complex(zero, zero)), one)
+    d = settled(where(f.live, d, Complex(zero, zero)), one)
     # d : c = E : x. Where one of them is far below the other, the difference from the rate would
     # leave it rounding, which exp(2 i nu t) near the separatrix makes large.
     unsteady = f.live & ~f.circular
@@ -213,13 +216,13 @@ def orbit(
     nothing = Complex(zero, zero)
     large = where(first, x, where(second, start, nothing + 1))
     ratio = where(first, start, where(second, x, nothing)) * large.inverse
-    most = settle(value * (1 - ratio).inverse, one)
-    least = settle(most * ratio, one)
+    most = settled(value * (1 - ratio).inverse, one)
+    least = settled(most * ratio, one)
     whole_part, d = (
         where(first, most, where(second, -least, value + d)),
         where(first, least, where(second, -most, d)),
     )
-    scale = settle(inverse * origin, one)
+    scale = settled(inverse * origin, one)
     plain = f.circular | (x.square == 0)
     spinors = Spinor(
         scale * whole_part,
@@ -230,7 +233,7 @@ def orbit(
         jnp.arctan2(_only(~plain, x.im), jnp.where(plain, 1, x.re)),
         jnp.stack([upward, ~upward]) & ~f.circular,
     )
-    return whole._replace(spinors=settle(spinors, one))
+    return whole._replace(spinors=settled(spinors, one))
 
 
 def _turning(x: Complex, mirror: Complex, c: Curve, one: Array) -> Complex:
@@ -242,7 +245,7 @@ def _turning(x: Complex, mirror: Complex, c: Curve, one: Array) -> Complex:
     moved = x * jnp.stack([ones, c.h])
     times, rise = jnp.stack([c.h, c.h * c.h]), jnp.stack([ones, 2 * c.h])
     norm, twist = pair(moved.re + mirror.re, times, rise, _row(c.series))
-    turning = settle((mirror - moved) * (twist / norm), _row(one))
+    turning = settled((mirror - moved) * (twist / norm), _row(one))
     upper = x.at(1)
     return _stack(turning.at(0), turning.at(1) + upper * (1 - upper).inverse)
 
@@ -263,23 +266,23 @@ def at(o: Orbit, elapsed: Array) -> tuple[Complex, Complex, Complex]:
     turn = unit(_only(circular, angle))
     f, inverse = turn * size, turn.conj * (1 / size)
     forward, backward = o.start * f, o.partner * inverse
-    one = opaque_one(angle)
-    f, forward, backward = settle((f, forward, backward), one)
+    one = opaque_ones(angle)
+    f, forward, backward = settled((f, forward, backward), one)
     below = pair(forward.re + backward.re, o.curve.h, jnp.ones_like(o.curve.h), series)[0]
-    below = settle(1 / below, one)
+    below = settled(1 / below, one)
 
     def parameter(s: Spinor):
-        ahead, behind = settle((s.mirror * forward, s.place * backward), one)
-        theta, twist = settle(apart(ahead, behind, series, one), one)
+        ahead, behind = settled((s.mirror * forward, s.place * backward), one)
+        theta, twist = settled(unpaired(ahead, behind, series, one), one)
         fading = s.d * f
         left = s.c - fading
-        whole, slope = settle((left * theta, left * twist - fading * theta), one)
+        whole, slope = settled((left * theta, left * twist - fading * theta), one)
         phase = unit(s.rate.re * elapsed + count * s.turn)
         factor = phase * (below * jnp.where(s.growing, 1 / half, 1))
-        factor = settle(factor, one)
+        factor = settled(factor, one)
         nu = 2 * o.nu
         slope = where(circular, slope * nu, slope.times_i * nu)
-        return settle((factor * whole, factor * (s.rate * whole + slope)), one)
+        return settled((factor * whole, factor * (s.rate * whole + slope)), one)
 
     alpha, alpha_rate = parameter(jax.tree.map(lambda x: x[0], o.spinors))
     beta, beta_rate = parameter(jax.tree.map(lambda x: x[1], o.spinors))

@@ -5,8 +5,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode.hamiltonian import components
-from polhode.tops._complex import Complex, opaque_one, settle
+from polhode.tops._complex import Complex
 from polhode.tops._lagrange import at, orbit
+from polhode.xla import opaque_ones, settled
 
 
 def upward(force: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array, Array], Array]:
@@ -53,11 +54,11 @@ def lagrange_motion(
     ``omega`` [rad/s]: initial state; ``axial_momentum`` along body z [kg m^2/s], that of wheels on
     the axis included. Klein & Sommerfeld, Theorie des Kreisels, VI; see ``_lagrange``.
     """
-    one = opaque_one(transverse)
-    wxyz, omega = settle((tuple(wxyz[..., i] for i in range(4)), components(omega)), one)
-    turn, size = settle(upward(components(force_space)), one)
+    one = opaque_ones(transverse)
+    wxyz, omega = settled((tuple(wxyz[..., i] for i in range(4)), components(omega)), one)
+    turn, size = settled(upward(components(force_space)), one)
     back = (turn[0], -turn[1], -turn[2])
-    q, spin = settle(_turned(back, wxyz), one), omega[2]
+    q, spin = settled(_turned(back, wxyz), one), omega[2]
     momentum = (transverse * omega[0], transverse * omega[1], axial_momentum)
     spinor = Complex(q[0], q[3]), Complex(q[2], q[1])
     motion = orbit(transverse, spin, -size * distance, spinor, momentum)
