@@ -178,9 +178,10 @@ class Scene(eqx.Module):
 
     def with_spins(self, spins: Sequence[Array] = ()) -> "Scene":
         """The scene at a moment when its coupled wheels have these momenta [kg m^2/s]."""
-        if not spins:
+        wheels = self._wheels
+        if wheels is None or not spins:
             return self
-        return Scene(self.inertia, self.potential, self.torque, self._wheels.at(spins))
+        return Scene(self.inertia, self.potential, self.torque, wheels.at(spins))
 
     @property
     def hamiltonian(self) -> Hamiltonian:

@@ -5,6 +5,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode import rotation
@@ -94,7 +95,7 @@ def simulate(
 
 def checked(trajectory: Trajectory, throw: bool) -> Trajectory:
     """The trajectory; raises for bodies that did not finish where that is known."""
-    if throw and not isinstance(trajectory.status, jax.core.Tracer):
+    if throw and not isinstance(trajectory.status, Tracer):
         raise_on_failure(trajectory.status)
     return trajectory
 

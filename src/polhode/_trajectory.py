@@ -19,6 +19,7 @@ from polhode._scene import Scene
 from polhode._state import State
 from polhode.hamiltonian import components, from_quaternion
 from polhode.methods import Status
+from polhode.torques import Wheels
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -129,10 +130,10 @@ class Trajectory(eqx.Module):
             return full[bodies] if bodies else full
 
         def of_both(x, rank):
-            if x is None:
+            kept = of_bodies(x, rank)
+            if kept is None:
                 return None
-            x = of_bodies(x, rank)
-            return x[(..., *times, *(slice(None),) * (rank - 1))]
+            return kept[(..., *times, *(slice(None),) * (rank - 1))]
 
         parts = {name: map_arrays(getattr(self.scene, name), of_bodies) for name in PARTS}
         return Trajectory(
@@ -211,7 +212,7 @@ class Trajectory(eqx.Module):
         NaN for a wheel that is held at a momentum, its inertia not given.
         """
         wheels = self._scene.rotors
-        if wheels is None:
+        if not isinstance(wheels, Wheels):
             return None
         omega = components(self._need("omega_body"))
         speeds = [wheels.speed(i, self._t, omega) for i in range(len(wheels.held))]

@@ -19,7 +19,7 @@ from polhode.fit._parameters import (
     base_of,
     free_columns,
 )
-from polhode.fit._recording import Recording, bridged
+from polhode.fit._recording import Recording, bridged, needed
 from polhode.fit._residuals import Huber, Model
 from polhode.fit._start import alternatives, regression, scatter
 from polhode.inertia import Inertia, inertia_of_second_moments, second_moments
@@ -184,8 +184,7 @@ def solve(recording: Recording, problem: Problem) -> Solution:
     _, struct = jax.eval_shape(misfits, fresh, (one, recording, noise))
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), struct)
     # the body to begin with, should no attempt come to an end
-    full = problem.unknown.columns().shape[1] == 6
-    body = entries_of(inertia_of_second_moments(first), full)
+    body = entries_of(inertia_of_second_moments(first), model_of(one).entries)
     nothing = nothing._replace(at=nothing.at.at[: body.shape[0]].set(body))
     begun = _Search(
         jnp.asarray(0), fresh, fresh, one, nothing, jnp.asarray(jnp.inf, dtype),
@@ -196,7 +195,7 @@ def solve(recording: Recording, problem: Problem) -> Solution:
     parameters = actual(ended.best)
     model = model_of(ended.base)
     linear = ended.linear
-    tensor = whole_of(linear.at, 6 if model.is_full else 3)
+    tensor = whole_of(linear.at, model.entries)
     return Solution(
         parameters,
         model,
@@ -211,8 +210,8 @@ def solve(recording: Recording, problem: Problem) -> Solution:
 
 
 def _jobs(bases: int, attempts: int) -> dict[str, np.ndarray]:
-    """What is fitted in turn: both regressions to all data, then each start to growing parts."""
-    tries = [[(0, 1.0, True)], [(1, 1.0, True)]]
+    """What is fitted in turn: the first two to all data, then each start to growing parts."""
+    tries = [[(base, 1.0, True)] for base in range(min(bases, 2))]
     for base in range(bases):
         tries.append([(base, part, part == _PARTS[0]) for part in _PARTS])
     rows = [row for one in tries[: max(attempts, 1)] for row in one]
@@ -241,8 +240,9 @@ def _expected(recording: Recording, problem: Problem) -> Float[Array, ""]:
         return expected
     if recording.omega is None:
         return jnp.full_like(expected, jnp.inf)
+    omega_noise = needed("omega_noise", recording.omega_noise)
     seen = jax.vmap(scatter)(recording.times, recording.omega, recording.present)
-    seen = seen / jnp.mean(recording.omega_noise, axis=(1, 2)) ** 2
+    seen = seen / jnp.mean(omega_noise, axis=(1, 2)) ** 2
     # recordings without five samples in a row tell nothing
     told = jnp.isfinite(seen)
     count = jnp.maximum(jnp.sum(told), 1).astype(seen.dtype)
@@ -250,7 +250,7 @@ def _expected(recording: Recording, problem: Problem) -> Float[Array, ""]:
     mean = jnp.where(jnp.any(told), mean, jnp.inf)
     # readings without any noise are met to what the optimiser takes for rounding at best
     rounding = float(jnp.finfo(mean.dtype).eps) ** 0.75
-    least = rounding**2 * jnp.mean((recording.omega / recording.omega_noise) ** 2)
+    least = rounding**2 * jnp.mean((recording.omega / omega_noise) ** 2)
     return expected * jnp.maximum(mean, least)
 
 
@@ -261,13 +261,14 @@ def _weight(recording: Recording, rates: Array) -> Float[Array, ""]:
     """
     total = jnp.zeros((), rates.dtype)
     if recording.omega is not None:
-        total += jnp.sum(recording.present[..., None] * (rates / recording.omega_noise) ** 2)
+        noise = needed("omega_noise", recording.omega_noise)
+        total += jnp.sum(recording.present[..., None] * (rates / noise) ** 2)
     if recording.wxyz is not None:
-        total += jnp.sum(recording.present / recording.attitude_noise**2)
+        noise = needed("attitude_noise", recording.attitude_noise)
+        total += jnp.sum(recording.present / noise**2)
     if recording.force is not None:
-        total += jnp.sum(
-            recording.present[..., None] * (recording.force / recording.force_noise) ** 2
-        )
+        noise = needed("force_noise", recording.force_noise)
+        total += jnp.sum(recording.present[..., None] * (recording.force / noise) ** 2)
     mean = total / rates.shape[0]
     return 10 / jnp.sqrt(jnp.where(mean > 0, mean, 1))
 
@@ -275,7 +276,8 @@ def _weight(recording: Recording, rates: Array) -> Float[Array, ""]:
 def _rates(recording: Recording) -> Float[Array, "r t 3"]:
     """Measured rates, or those between successive attitudes; gaps filled by interpolation."""
     if recording.omega is None:
-        turn = multiply(conjugate(recording.wxyz[:, :-1]), recording.wxyz[:, 1:])
+        wxyz = needed("wxyz", recording.wxyz)
+        turn = multiply(conjugate(wxyz[:, :-1]), wxyz[:, 1:])
         sign = jnp.where(turn[..., :1] < 0, -1, 1).astype(turn.dtype)
         between = 2 * sign * turn[..., 1:] / jnp.diff(recording.times, axis=-1)[..., None]
         inner = (between[:, 1:] + between[:, :-1]) / 2
@@ -286,6 +288,9 @@ def _rates(recording: Recording) -> Float[Array, "r t 3"]:
 
 def _bases(recording, rates, problem) -> tuple[Base, Array]:
     """Starting bodies (leading axis), the best first, and the second moments of that one."""
+    if problem.unknown.columns().shape[1] == 0:
+        first = jnp.eye(3, dtype=rates.dtype)
+        return jax.tree.map(lambda leaf: leaf[None], base_of(first, True)), first
     carried = None
     spin = getattr(problem.motion, "spin_inertia", None)
     if spin is not None:
@@ -319,5 +324,12 @@ def _scale(begin: Parameters, recording: Recording, rates: Array) -> Parameters:
         bias=like(begin.bias, typical),
         mounting=like(begin.mounting, one),
         lever=like(begin.lever, length),
-        motion=jax.tree.map(lambda x: jnp.where(x != 0, jnp.abs(x), one), begin.motion),
+        motion=jax.tree.map(_size, begin.motion),
     )
+
+
+def _size(start: Array) -> Array:
+    """Sizes of unknowns: of their start, where that is zero of the largest beside it, or one."""
+    largest = jnp.max(jnp.abs(start), initial=0)
+    beside = jnp.where(largest > 0, largest, 1)
+    return jnp.where(start != 0, jnp.abs(start), beside)

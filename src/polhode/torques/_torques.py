@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,6 +35,15 @@ class AbstractTorque(AbstractPart):
         """
         return None
 
+    @property
+    def edges(self) -> Array | None:
+        """Times (k,) [s] at which the torque jumps and steps have to end; None without such."""
+        return None
+
+    def during(self, t: Array | float) -> "AbstractTorque":
+        """What acts between the edges beside the time ``t``."""
+        return self
+
     def __add__(self, other: "AbstractTorque") -> "TorqueSum":
         if not isinstance(other, AbstractTorque):
             raise TypeError(f"a torque adds to another torque, not to {type(other).__name__}")
@@ -53,33 +63,43 @@ class TorqueSum(AbstractTorque):
         parts = zip(*(term.body_components(t, attitude, omega) for term in self.terms))
         return tuple(sum(rest, start=first) for first, *rest in parts)
 
+    @property
+    def edges(self):
+        found = [x for term in self.terms if (x := term.edges) is not None]
+        return jnp.concatenate(found) if found else None
+
+    def during(self, t):
+        return TorqueSum(tuple(term.during(t) for term in self.terms))
+
     def slip(self, t, momentum, omega):
         found = (term.slip(t, momentum, omega) for term in self.terms)
         parts = list(zip(*(x for x in found if x is not None)))
         return tuple(sum(rest, start=first) for first, *rest in parts) if parts else None
 
 
-def vector_of_time(name: str, n):
+def vector_of_time(name: str, n: Any) -> Array | Callable:
     """A constant vector (..., 3), or a function fn(t) -> (3,) after a look at what it returns."""
     if not callable(n):
         return as_float_array(name, n, (3,))
-    return n if isinstance(n, AbstractPart) else checked(name, n, ("t",), ((),), (3,))
+    if isinstance(n, AbstractPart) and callable(n):
+        return n
+    return checked(name, n, ("t",), ((),), (3,))
 
 
 def value_at(name: str, vector, t) -> tuple[Array, Array, Array]:
     """Components of such a vector; ``t`` may be an array of times: a function is mapped over it."""
     if not callable(vector):
         return components(vector)
-    if isinstance(vector, AbstractPart):  # carries the batch axes itself, such as KeplerOrbit
-        return components(vector(t))
+    if isinstance(vector, AbstractPart) and callable(vector):
+        return components(vector(t))  # carries the batch axes itself, such as KeplerOrbit
     return components(mapped(name, vector, ("t",), ((),), (3,), t))
 
 
 class BodyTorque(AbstractTorque):
     """Torque given in body axes [N m]: constant (..., 3) or a function of time [s] -> (3,).
 
-    The function may jump. A pulse far shorter than a step can be missed: put its times among those
-    that are simulated, which are stepped to. A plain function is static data of the scene, not a
+    The function may jump. A pulse far shorter than a step can be missed: ``ph.Pulses`` has edges
+    that steps end at. A plain function is static data of the scene, not a
     leaf of it; an ``eqx.Module`` keeps its arrays as leaves.
 
     Raises TypeError or ValueError for a function that takes or returns something else.
@@ -109,7 +129,7 @@ class SpaceTorque(AbstractTorque):
         return attitude.to_body(value_at("SpaceTorque", self.n, t))
 
 
-def _coefficients(name: str, c) -> Array:
+def coefficients(name: str, c) -> Array:
     """Damping about three axes, from one number or three."""
     given, c = c, as_float_array(f"{name} c", c)
     if c.ndim == 0:
@@ -132,7 +152,7 @@ class LinearDamping(AbstractTorque):
     c: Float[Array, "*#b 3"] = shaped(3)
 
     def __init__(self, c):
-        self.c = _coefficients("LinearDamping", c)
+        self.c = coefficients("LinearDamping", c)
 
     def body_components(self, t, attitude, omega):
         return tuple(-c * rate for c, rate in zip(components(self.c), omega))
@@ -147,7 +167,7 @@ class QuadraticDamping(AbstractTorque):
     c: Float[Array, "*#b 3"] = shaped(3)
 
     def __init__(self, c):
-        self.c = _coefficients("QuadraticDamping", c)
+        self.c = coefficients("QuadraticDamping", c)
 
     def body_components(self, t, attitude, omega):
         square = omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2
