@@ -224,8 +224,31 @@ def readme_block() -> str:
         "Made by `python -m benchmarks.work_precision`; quick tables by `make bench`; all results,"
         " other precisions and sizes, and where others are better:"
         " [benchmarks](benchmarks/README.md).",
+        "",
+        *plain_calls_block(),
         END,
     ])  # fmt: skip
+
+
+def plain_calls_block() -> list[str]:
+    """What the calls of a user cost, in a few rows."""
+    if not (RESULTS / "plain_calls.json").exists():
+        return []
+    lines = [
+        [
+            f"{row['title']}, {row['bodies']:,} {'body' if row['bodies'] == 1 else 'bodies'}",
+            *(number(row[name], 1e3) for name in ("ns_bare", "ns_plain", "ns_sample")),
+            f"{row['attitude_median']:.0e}",
+        ]
+        for row in read("plain_calls")["numbers"]["rows"]
+        if row["bodies"] == 1000 or (row["family"] == "heavy_top" and row["bodies"] == 1)
+    ]  # fmt: skip
+    return [
+        "What a call costs as it is typed, `ph.simulate(scene, state, [0, 100])`, beside its bare"
+        " program for the last state, microseconds per body (`python -m benchmarks.plain_calls`):",
+        "",
+        *rows(["", "bare", "plain call", "each of 100 saved times", "median error"], lines),
+    ]
 
 
 def write() -> list[Path]:

@@ -349,7 +349,32 @@ def torqued(report: dict) -> list[str]:
     return out
 
 
+def plain_calls(report: dict) -> list[str]:
+    lines = [
+        [row["title"], f"{row['bodies']:,}", number(row["ns_bare"], 1e3),
+         number(row["ns_plain"], 1e3), number(row["ratio"]), number(row["us_over_program"]),
+         number(row["ns_sample"]), number(row["attitude_median"]), number(row["attitude_worst"])]
+        for row in report["numbers"]["rows"]
+    ]  # fmt: skip
+    header = ["", "bodies", "bare [µs/body]", "plain [µs/body]", "ratio", "over the program [µs]",
+              "each of 100 saved times [ns]", "median error", "worst error"]  # fmt: skip
+    sweeps = [
+        [f"{sweep['bodies']:,}", number(sweep["spread"]),
+         ", ".join(f"{s}: {number(t)}" for s, t in zip(sweep["saves"], sweep["ns_per_body"]))]
+        for sweep in report["numbers"]["layouts"]
+    ]  # fmt: skip
+    return [
+        "## Plain calls", "", machine(report), "",
+        "`ph.simulate` as typed, with its checks and both times, beside the compiled program for"
+        " the last state alone.", "", *rows(header, lines),
+        "Free bodies by saved times, ns per body; how far the dearest lies above a straight line"
+        " between its neighbours:", "",
+        *rows(["bodies", "dearest over its neighbours", "saved times: ns per body"], sweeps),
+    ]  # fmt: skip
+
+
 SECTIONS = {
+    "plain_calls": plain_calls,
     "gradients": gradients, "scene_cost": scene_cost, "scaling": scaling,
     "identification": identification, "throws": throws, "racquet": racquet,
     "stress": stress,

@@ -28,8 +28,8 @@ import numpy as np
 
 import polhode as ph
 from polhode.methods import LiePoissonChart
+from polhode.solvers._bound_term import BoundTerm
 from polhode.solvers._columns import extrapolated, table
-from polhode.solvers._problem import Problem
 
 LONG = np.longdouble
 SEQUENCE = (2, 4, 6, 8, 10, 12, 14, 16, 24, 36)
@@ -225,7 +225,9 @@ def calibrated(count: int, seed: int) -> list[dict]:
         dynamics = chart.dynamics(scene, state, jnp.asarray(ts[:, 0]))
         y, _ = chart.start(scene, state, jnp.zeros(()))
         leaves, zero = jax.tree.leaves(y), jnp.zeros(())
-        problem = Problem.of(diffrax.ODETerm(chart.field), dynamics).prepared(zero, y, jnp.float64)
+        problem = BoundTerm.of(diffrax.ODETerm(chart.field), dynamics).prepared(
+            zero, y, jnp.float64
+        )
 
         def field(t, y, along, problem=problem):
             return problem.rates(problem.held, t, y), []

@@ -82,6 +82,7 @@ def main() -> None:
     parser.add_argument("families", nargs="*", help="all of the set when none is named")
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--bodies", type=int, nargs="+", help="numbers of bodies; all when none")
     parser.add_argument("--output", type=Path)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
@@ -91,6 +92,8 @@ def main() -> None:
     tables = []
     for family, n, dtype in QUICK if options.quick else FULL:
         if options.families and family not in options.families:
+            continue
+        if options.bodies and n not in options.bodies:
             continue
         rows = table(
             family, n, dtype, QUICK_TOLERANCES if options.quick else TOLERANCES, options.quick,
@@ -103,10 +106,16 @@ def main() -> None:
         }  # fmt: skip
         tables.append(entry)
         show(entry)
+        written(options, installed, missing, tables)
+    path = written(options, installed, missing, tables)
+    print(f"\nwritten: {path.name}")
+
+
+def written(options, installed, missing, tables) -> Path:
+    """Write what there is so far."""
     packages = tuple(p for module in installed.values() for p in module.PACKAGES)
     numbers = {"quick": options.quick, "missing": missing, "tables": tables}
-    path = _report.write("work_precision", numbers, path=options.output, packages=packages)
-    print(f"\nwritten: {path.name}")
+    return _report.write("work_precision", numbers, path=options.output, packages=packages)
 
 
 if __name__ == "__main__":

@@ -160,6 +160,7 @@ def test_what_a_balance_cannot_use_is_refused():
 
 
 @pytest.mark.skipif(not recipe.DATA.exists(), reason="needs ../shared/data/tudelft_throws")
+@pytest.mark.slow
 def test_throws_of_objects_whose_inertia_is_known():
     """Published regression on the same throws: 1.69 % and 2.8 degrees."""
     names = ("device_only", "proof_body", "config_empty", "config_a")

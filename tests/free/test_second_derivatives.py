@@ -19,7 +19,11 @@ def _fits_single(case: dict) -> bool:
     return bool(np.all(x.astype(np.float32) == x))
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
+@pytest.mark.parametrize(
+    "dtype",
+    [np.float64, pytest.param(np.float32, marks=pytest.mark.slow)],
+    ids=["float64", "float32"],
+)
 def test_second_derivatives(dtype):
     """Forward over reverse; in double precision also by entries off the tensor's diagonal."""
     whole = dtype == np.float64

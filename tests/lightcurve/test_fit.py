@@ -81,6 +81,7 @@ def test_mirror_gives_the_same_light(trial):
     np.testing.assert_allclose(_solutions.momentum(image), turned, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_tumbler_is_found_again():
     """One night of one geometry, with a gap: the body, or its mirror image."""
     minute, rng = 1 / 1440, np.random.default_rng(1)

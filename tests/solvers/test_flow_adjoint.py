@@ -91,7 +91,11 @@ def along(p, seed):
     return jax.tree.unflatten(tree, moves)
 
 
-@pytest.mark.parametrize("scene_of", [driven, satellite], ids=lambda f: f.__name__)
+@pytest.mark.parametrize(
+    "scene_of",
+    [pytest.param(driven, marks=pytest.mark.slow), satellite],
+    ids=lambda f: f.__name__,
+)
 def test_both_modes_are_the_slope(scene_of):
     p = point()
     direction = along(p, 3)
@@ -147,6 +151,7 @@ def test_batches_of_slopes_and_second_derivatives():
     np.testing.assert_allclose(single, slopes[0], rtol=0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_chunks():
     """Of bodies moved one chunk after another: the Hessian is that of one chunk, and symmetric."""
     state, push = ph.State(WXYZ, OMEGA), ph.BodyTorque([0.1, 0.0, -0.2])

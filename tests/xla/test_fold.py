@@ -9,7 +9,7 @@ import pytest
 import polhode as ph
 from benchmarks.integrators import heavy_top
 from polhode.hamiltonian import Dynamics, lie_poisson_field
-from polhode.solvers._problem import Problem
+from polhode.solvers._bound_term import BoundTerm
 from polhode.xla import specialise
 
 N = 5
@@ -40,7 +40,7 @@ def dynamics(scene):
 
 
 def prepared(system, t, y, control):
-    problem = Problem.of(diffrax.ODETerm(lie_poisson_field), system)
+    problem = BoundTerm.of(diffrax.ODETerm(lie_poisson_field), system)
     leaves, tree = jax.tree.flatten(y)
     ready = problem.prepared(t, y, jnp.float64)
     return jax.tree.unflatten(tree, [control * x for x in ready.rates(ready.held, t, leaves)])
@@ -84,7 +84,7 @@ def test_the_derived_field_costs_what_the_one_written_by_hand_does():
 
         @jax.jit
         def count(y, args, field=field):
-            problem = Problem.of(diffrax.ODETerm(field), args)
+            problem = BoundTerm.of(diffrax.ODETerm(field), args)
             ready = problem.prepared(jnp.zeros(()), y, jnp.float64)
             closed = jax.make_jaxpr(lambda *y: ready.rates(ready.held, 0.0, y))(*jax.tree.leaves(y))
             counts.append(_arithmetic(closed))

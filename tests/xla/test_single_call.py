@@ -76,7 +76,9 @@ def test_a_version_that_ends_the_process_runs_plain(untested, monkeypatch):
     assert len(list(untested.iterdir())) == 1
 
 
-@pytest.mark.parametrize("kind", ["free", "lagrange", "damped"])
+@pytest.mark.parametrize(
+    "kind", ["free", pytest.param("lagrange", marks=pytest.mark.slow), "damped"]
+)
 def test_no_traced_value_outlives_its_program(kind):
     """Of the exact motions: `diffrax.diffeqsolve` itself does not run under this check."""
     force = ph.UniformGravity.axial(1.0, 0.5) if kind == "lagrange" else None

@@ -33,6 +33,13 @@ class Nome(NamedTuple):
     deficit_per_x: Array
 
 
+def nome_per_lambda(lam: Array) -> Array:
+    """q over lambda = (1 - sqrt k') / (2 (1 + sqrt k')), to float64 for m <= 0.8: DLMF 20.9.2."""
+    z = lam * lam
+    z = z * z
+    return 1 + z * (2 + z * (15 + z * (150 + z * (1707 + z * 20910))))
+
+
 def nome(m: Array, m1: Array) -> Nome:
     """The nome and theta constants of min(m, m1), with m + m1 = 1, every number to a few ulps."""
     circular = m <= m1
@@ -41,9 +48,7 @@ def nome(m: Array, m1: Array) -> Nome:
     fourth = jnp.sqrt(root)
     lam_per_x = 0.5 / ((1 + root) * (1 + fourth) * (1 + fourth))
     lam = lam_per_x * x
-    z = lam * lam
-    z = z * z
-    correction = 1 + z * (2 + z * (15 + z * (150 + z * 1707)))
+    correction = nome_per_lambda(lam)
     q, per_x = lam * correction, lam_per_x * correction
     q2 = q * q
     q4 = q2 * q2

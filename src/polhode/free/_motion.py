@@ -6,6 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from polhode.elliptic._nome import nome_per_lambda
 from polhode.free._phase import arc
 from polhode.free._roles import Roles, Triple, restore
 from polhode.xla import settled
@@ -89,8 +90,7 @@ def _limits(dtype) -> tuple[float, float]:
 def _nome(square: Scalars, root: Scalars) -> Scalars:
     """The nome of parameter ``square`` <= 0.8; ``root``: root of the complementary modulus."""
     e = square / (2 * (1 + root * root) * (1 + root) ** 2)
-    f = e**4
-    return e * (1 + f * (2 + f * (15 + f * (150 + f * (1707 + f * 20910)))))
+    return e * nome_per_lambda(e)
 
 
 def means(circular, endless, x: Scalars, m: Scalars, m1: Scalars, one: Scalars):

@@ -1,4 +1,4 @@
-"""The Hamiltonian of the rigid body, written once. Everything that moves is a derivative of it.
+"""The Hamiltonian of the rigid body, written once. Whatever is stepped is a derivative of it.
 
 Both charts (ZYZ Euler angles; quaternion and body momentum) and every energy the library
 reports evaluate ``Hamiltonian.__call__``; nothing else in the package states the formula.

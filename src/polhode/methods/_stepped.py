@@ -17,7 +17,7 @@ from polhode.methods._base import AbstractMethod, Record, Samples
 from polhode.methods._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
 from polhode.methods._options import check_options
 from polhode.methods._status import Status
-from polhode.solvers import FlowAdjoint
+from polhode.solvers import FlowAdjoint, GivenTimes
 
 
 class Stepped(AbstractMethod):
@@ -168,7 +168,7 @@ class _Asked(NamedTuple):
         ends = self.ts[jnp.array([0, -1])] if self.final_only else self.ts
         saved = self._saved(diffrax.SubSaveAt(t0=True, steps=1))
         saved = eqx.tree_at(lambda s: s.solver_state, saved, True)
-        return Stepping(solver, diffrax.StepTo(ends), saved, ends.shape[0] - 1, None)
+        return Stepping(solver, GivenTimes(ends), saved, ends.shape[0] - 1, None)
 
     def stock(self, solver, y0, term, dynamics) -> Stepping:
         """Steps of any solver with an error estimate."""

@@ -1,6 +1,6 @@
 """Integrators made for rotating bodies, as solvers, controllers and adjoints of diffrax."""
 
-from polhode.solvers._equal_steps import EqualSteps as EqualSteps
+from polhode.solvers._equal_steps import EqualSteps as EqualSteps, GivenTimes as GivenTimes
 from polhode.solvers._extrapolation import (
     Accuracy as Accuracy,
     Extrapolation as Extrapolation,

@@ -12,12 +12,12 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
 from polhode.hamiltonian import relative
+from polhode.solvers._bound_term import BoundTerm, uses
 from polhode.solvers._columns import table
 from polhode.solvers._costates import AnyCostate, FlatCostate
 from polhode.solvers._extrapolation import order_for, units_of
 from polhode.solvers._linear import attached, is_slope, linear, zeros
 from polhode.solvers._march import Limits, fresh, march
-from polhode.solvers._problem import Problem, uses
 from polhode.xla import kernel, specialise
 
 _STEPS = 2**20
@@ -32,12 +32,12 @@ def equations_of(
     What the functions in ``args`` close over is among them: it may be differentiated.
     """
     leaves, tree = jax.tree.flatten(y0)
-    problem = Problem.of(terms, args)
+    problem = BoundTerm.of(terms, args)
     arrays, args_tree = jax.tree.flatten(problem.arrays)
     dtype = jnp.result_type(*leaves)
 
     def opened(given):
-        return Problem(jax.tree.unflatten(args_tree, given), problem.static)
+        return BoundTerm(jax.tree.unflatten(args_tree, given), problem.static)
 
     def directed(given):
         problem = opened(given)

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
+from polhode.solvers._bound_term import BoundTerm
 from polhode.solvers._columns import SEQUENCES, carried_on, evaluations, extrapolated, table
 from polhode.solvers._dense import CollocationInterpolation, collocate
 from polhode.solvers._march import GroupUnits, Limits, Progress, fresh, march
-from polhode.solvers._problem import Problem
 from polhode.xla import kernel
 
 
@@ -117,7 +117,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         """One step of the method."""
         y, tree = jax.tree.flatten(y0)
         dtype = jnp.result_type(*y)
-        problem = Problem.of(terms, args).prepared(t0, y0, dtype)
+        problem = BoundTerm.of(terms, args).prepared(t0, y0, dtype)
 
         def run(held, t, width, y, low):
             def rates(t, y, along):
@@ -140,7 +140,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         """As many as the error asked for needs."""
         y, tree = jax.tree.flatten(y0)
         dtype = jnp.result_type(*y)
-        problem = Problem.of(terms, args).prepared(t0, y0, dtype)
+        problem = BoundTerm.of(terms, args).prepared(t0, y0, dtype)
         rtol = jnp.asarray(accuracy.rtol, dtype)
         given = table(self.formal_order or order_for(rtol), dtype)
         horizon = jnp.asarray(accuracy.horizon, t0.dtype)

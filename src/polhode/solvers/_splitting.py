@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array
 
 from polhode.hamiltonian import cross, dot, from_quaternion
+from polhode.solvers._bound_term import BoundTerm, uses
 from polhode.solvers._dense import CollocationInterpolation, collocate
 from polhode.solvers._equal_steps import EqualSteps
 from polhode.solvers._moser_veselov import ORDERS, paced, prepare, tangents
-from polhode.solvers._problem import Problem, uses
 from polhode.solvers._schemes import KICK_SCHEMES, SCHEMES, Scheme
 from polhode.xla import kernel
 
@@ -143,7 +143,7 @@ class Splitting(diffrax.AbstractSolver):
         def advance(*operands):
             return _advanced(self, *operands)
 
-        problem = Problem.of(terms, args)
+        problem = BoundTerm.of(terms, args)
         control = problem.control(t0, t1, y0[0][0].dtype)
         # a call of each piece costs as much as the few operations on hardly any body
         whole = self.moser_veselov is None or y0[0][0].size < 8
@@ -213,7 +213,7 @@ def _normalise(wxyz):
     return tuple(scale * x for x in wxyz)
 
 
-def _rates(problem: Problem, t, momentum):
+def _rates(problem: BoundTerm, t, momentum):
     """Body rates dH/dL, read off from the attitude's rate at the identity."""
     zero = jnp.zeros_like(momentum[0])
     _, (_, *half) = problem.field(t, (tuple(momentum), (zero + 1, zero, zero, zero)))
@@ -224,7 +224,7 @@ def _along(axis: int, value: Array) -> list[Array]:
     return [value if i == axis else jnp.zeros_like(value) for i in range(3)]
 
 
-def _inverse_moments(problem: Problem, t, like: Array) -> tuple[list[Array], Array]:
+def _inverse_moments(problem: BoundTerm, t, like: Array) -> tuple[list[Array], Array]:
     """1/I_i, read off from the rates of unit momenta, and which bodies have rates without one.
 
     NaN where the axes are not principal.
@@ -240,7 +240,7 @@ def _inverse_moments(problem: Problem, t, like: Array) -> tuple[list[Array], Arr
     return [jnp.where(principal, x, jnp.nan) for x in inverse], wheels
 
 
-def _advanced(solver: Splitting, problem: Problem, times, control, state):
+def _advanced(solver: Splitting, problem: BoundTerm, times, control, state):
     """Space momentum and attitude after a step."""
     inverse, wheels = _inverse_moments(problem, times[0], state[0][0])
     if solver.moser_veselov is None:
@@ -251,7 +251,7 @@ def _advanced(solver: Splitting, problem: Problem, times, control, state):
     return _step(solver.scheme, move, problem, times, control, state)
 
 
-def _rotations(middle: int, problem: Problem, inverse: Array):
+def _rotations(middle: int, problem: BoundTerm, inverse: Array):
     """The free motion by rotations about the axes, the last ones undone in opposite order."""
 
     def about(axis):
@@ -301,7 +301,7 @@ def _whole(order: int, inverse: list[Array]):
     return move
 
 
-def _step(scheme: Scheme, move, problem: Problem, times, control, state):
+def _step(scheme: Scheme, move, problem: BoundTerm, times, control, state):
     """One step. The momentum is carried in space axes, where only the kick changes it: turned
     with the body, equal steps would round alike and shift a conserved component steadily."""
     t0, width = times

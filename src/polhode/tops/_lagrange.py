@@ -27,7 +27,7 @@ from jaxtyping import Array
 
 from polhode.tops._complex import Complex, unit, where
 from polhode.tops._cubic import Cubic, cubic, positive, safe
-from polhode.tops._pochhammer import Curve, apart, curve, pair, point
+from polhode.tops._pochhammer import Curve, curve, pair, point, unpaired
 from polhode.xla import opaque_ones, settled
 
 
@@ -198,7 +198,7 @@ def orbit(
     zero = jnp.zeros_like(value.re)
     nu_complex = Complex(_only(f.circular, nu), _only(~f.circular, nu))
     ahead, behind = settled((mirror * start, x * partner), one)
-    theta, slope = settled(apart(ahead, behind, c.series, one), one)
+    theta, slope = settled(unpaired(ahead, behind, c.series, one), one)
     inverse = settled(theta.inverse, one)
     inner = settled(base + slope * inverse, one)
     # From the rate at the start. Where nothing nutates (nu = 0) the phase alone turns.
@@ -273,7 +273,7 @@ def at(o: Orbit, elapsed: Array) -> tuple[Complex, Complex, Complex]:
 
     def parameter(s: Spinor):
         ahead, behind = settled((s.mirror * forward, s.place * backward), one)
-        theta, twist = settled(apart(ahead, behind, series, one), one)
+        theta, twist = settled(unpaired(ahead, behind, series, one), one)
         fading = s.d * f
         left = s.c - fading
         whole, slope = settled((left * theta, left * twist - fading * theta), one)

@@ -144,7 +144,7 @@ def _pair_rule(primals, tangents):
 
 
 @jax.custom_jvp
-def apart(a: Complex, b: Complex, series: Series, one: Array) -> tuple[Complex, Complex]:
+def unpaired(a: Complex, b: Complex, series: Series, one: Array) -> tuple[Complex, Complex]:
     """(a; h)(b; h), and a d/da less b d/db of it (Euler's series, DLMF 17.2.37)."""
     first = _first(series.weights)
     x, y = _polynomial(a, series.weights), _polynomial(b, series.weights)
@@ -153,7 +153,7 @@ def apart(a: Complex, b: Complex, series: Series, one: Array) -> tuple[Complex, 
     return x * y, dx * y - x * dy
 
 
-@apart.defjvp
+@unpaired.defjvp
 def _apart_rule(primals, tangents):
     a, b, series, one = primals
     da, db, dh = *tangents[:2], tangents[2].h
@@ -174,7 +174,7 @@ def _apart_rule(primals, tangents):
         dxh * y + dx * yh - xh * dy - x * dyh,
     )
     of_value, of_twist = settled((of_value, of_twist), one)
-    return apart(*primals), tuple(p * da + q * db + r * dh for p, q, r in (of_value, of_twist))
+    return unpaired(*primals), tuple(p * da + q * db + r * dh for p, q, r in (of_value, of_twist))
 
 
 @jax.custom_jvp

@@ -5,7 +5,9 @@ from polhode.torques._couplings import (
     ViscousCoupling as ViscousCoupling,
 )
 from polhode.torques._dissipation import EnergySink as EnergySink
+from polhode.torques._frames import LVLH as LVLH, RelativeTorque as RelativeTorque
 from polhode.torques._orbit import (
+    AbstractOrbit as AbstractOrbit,
     KeplerOrbit as KeplerOrbit,
     StateOrbit as StateOrbit,
     eccentric_anomaly as eccentric_anomaly,

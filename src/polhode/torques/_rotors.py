@@ -174,6 +174,13 @@ class Wheels(AbstractRotor):
         """The wheels at a moment when those that are coupled have these momenta [kg m^2/s]."""
         return dataclasses.replace(self, spins=tuple(spins))
 
+    def begun(self, spins: Array) -> "Wheels":
+        """The wheels with these initial momenta (..., k) of those that are coupled."""
+        shape = jnp.broadcast_shapes(spins.shape[:-1], self.momentum.shape[:-1])
+        momentum = jnp.broadcast_to(self.momentum, (*shape, self.momentum.shape[-1]))
+        places = np.array(self.coupled, int)
+        return dataclasses.replace(self, momentum=momentum.at[..., places].set(spins))
+
     def initial_spins(self, like: Array) -> tuple[Array, ...]:
         """Momenta of the coupled wheels at the start, of the shape of ``like``."""
         return tuple(jnp.broadcast_to(self.momentum[..., i], like.shape) for i in self.coupled)

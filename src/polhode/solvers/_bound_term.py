@@ -14,14 +14,14 @@ from jaxtyping import PyTree
 from polhode.xla import specialise
 
 
-class Problem(eqx.Module):
+class BoundTerm(eqx.Module):
     """Term and arguments: their arrays, and everything else as static structure."""
 
     arrays: Any
     static: Any = eqx.field(static=True)
 
     @classmethod
-    def of(cls, terms: AbstractTerm, args: PyTree) -> "Problem":
+    def of(cls, terms: AbstractTerm, args: PyTree) -> "BoundTerm":
         return cls(*eqx.partition((terms, args), eqx.is_array))
 
     def control(self, t0, t1, dtype):
@@ -50,7 +50,7 @@ class Problem(eqx.Module):
 
         def rates(*given):
             known, t, y = given[: len(arrays)], given[len(arrays)], given[len(arrays) + 1 :]
-            problem = Problem(jax.tree.unflatten(tree, known), self.static)
+            problem = BoundTerm(jax.tree.unflatten(tree, known), self.static)
             found = problem.increment(t, jax.tree.unflatten(state_tree, y), problem.forward(dtype))
             return jax.tree.leaves(found)
 
@@ -67,7 +67,7 @@ def uses(jaxpr, place: int) -> bool:
 
 class Prepared(NamedTuple):
     """``held``: arrays that the rates rest on; ``run(held, t, *y)``: the rates; ``asks_time``:
-    whether these depend on the time. See ``Problem.prepared``."""
+    whether these depend on the time. See ``BoundTerm.prepared``."""
 
     held: tuple[Any, ...]
     run: Callable[..., list[Any]]

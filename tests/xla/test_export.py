@@ -1,0 +1,39 @@
+"""Programs hold no callback of the host: they can be kept on disk, and exported."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+from jax import export
+
+import polhode as ph
+
+I = ph.Inertia.from_moments([1.0, 1.5, 2.0])
+FALL = ph.UniformGravity(1.0, [0.1, 0.0, 0.3])
+ORBIT = ph.KeplerOrbit(1.0, 2.0, 0.1)
+SCENES = {
+    "free": (I,),
+    "heavy top": (I, FALL),
+    "damped": (I, FALL, ph.LinearDamping(jnp.array([0.1, 0.2, 0.3]))),
+    "satellite": (I, ph.GravityGradient(1.0, ORBIT)),
+    "Lagrange": (ph.Inertia.axisymmetric(1.0, 0.5), ph.UniformGravity(1.0, [0.0, 0.0, 0.3])),
+}
+
+
+@pytest.mark.parametrize("kind", SCENES)
+@pytest.mark.parametrize("what", ["value", "gradient"])
+def test_programs_are_exported_for_other_platforms(kind, what):
+    """With the tricks for processors in them or not: what is lowered has no custom call."""
+    if what == "gradient" and kind == "Lagrange":
+        pytest.skip("its program is large; that of a free body is made in the same way")
+    scene = ph.Scene(*SCENES[kind])
+
+    def last(omega):
+        state = ph.State([1.0, 0.0, 0.0, 0.0], omega)
+        return jnp.sum(ph.simulate(scene, state, [0.0, 1.0]).wxyz[..., -1, 1:])
+
+    function = last if what == "value" else jax.grad(last)
+    shape = jax.ShapeDtypeStruct((8, 3), jnp.float64)
+    made = export.export(jax.jit(function), platforms=["cuda", "tpu"])(shape)
+    text = made.mlir_module()
+    assert "callback" not in text
+    assert made.platforms == ("cuda", "tpu")
