@@ -130,8 +130,10 @@ class Trajectory(eqx.Module):
             return full[bodies] if bodies else full
 
         def of_both(x, rank):
-            x = of_bodies(x, rank)
-            return None if x is None else x[(..., *times, *(slice(None),) * (rank - 1))]
+            kept = of_bodies(x, rank)
+            if kept is None:
+                return None
+            return kept[(..., *times, *(slice(None),) * (rank - 1))]
 
         parts = {name: map_arrays(getattr(self.scene, name), of_bodies) for name in PARTS}
         return Trajectory(
