@@ -24,7 +24,7 @@ from polhode import plot
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = (
     "quick_start", "intermediate_axis", "euler_hamiltonian", "work_and_precision",
-    "tumbling_asteroid", "explorer", "rotating_frames", "inertia", "fitting",
+    "tumbling_asteroid", "explorer", "detumbling", "rotating_frames", "inertia", "fitting",
 )  # fmt: skip
 PENDING = {
     "light_curves.md",
@@ -38,12 +38,13 @@ SECTIONS = {
     "Methods": "ClosedForm LagrangeTop SymmetricTop FixedAxis LiePoisson EulerAngles",
     "Bodies": "Inertia MassProperties periods Periods Mode",
     "What acts": "UniformGravity GravityGradient AbstractOrbit KeplerOrbit StateOrbit Potential "
-    "BodyTorque SpaceTorque FeedbackTorque LinearDamping QuadraticDamping EnergySink Rotor "
-    "ViscousCoupling",
+    "BodyTorque SpaceTorque FeedbackTorque LinearDamping QuadraticDamping EnergySink Pulses "
+    "Pointing RateDamping MagneticDipole BDot DipoleField "
+    "Rotor Motor ViscousCoupling CoulombFriction AbstractCoupling",
     "Frames and sensors": "LVLH RelativeTorque RotatingFrame simulate_particles "
     "accelerometer gyroscope",
     "The Hamiltonian": "hamiltonian hamiltons_equations",
-    "From data": "fit_inertia fit_recordings propagate Propagation",
+    "From data": "fit_inertia fit_recordings fit_scene propagate Propagation",
 }
 """Order of the names of ``polhode`` on its page; others follow under "More"."""
 

@@ -7,7 +7,11 @@ from polhode._simulate import explain as explain, simulate as simulate
 from polhode._state import State as State
 from polhode._trajectory import Trajectory as Trajectory
 from polhode.events import Crossings as Crossings, Event as Event, crossings as crossings
-from polhode.fit import fit_inertia as fit_inertia, fit_recordings as fit_recordings
+from polhode.fit import (
+    fit_inertia as fit_inertia,
+    fit_recordings as fit_recordings,
+    fit_scene as fit_scene,
+)
 from polhode.frames import (
     RotatingFrame as RotatingFrame,
     accelerometer as accelerometer,
@@ -44,14 +48,22 @@ from polhode.torques import (
     AbstractPotential as AbstractPotential,
     AbstractRotor as AbstractRotor,
     AbstractTorque as AbstractTorque,
+    BDot as BDot,
     BodyTorque as BodyTorque,
+    CoulombFriction as CoulombFriction,
+    DipoleField as DipoleField,
     EnergySink as EnergySink,
     FeedbackTorque as FeedbackTorque,
     GravityGradient as GravityGradient,
     KeplerOrbit as KeplerOrbit,
     LinearDamping as LinearDamping,
+    MagneticDipole as MagneticDipole,
+    Motor as Motor,
+    Pointing as Pointing,
     Potential as Potential,
+    Pulses as Pulses,
     QuadraticDamping as QuadraticDamping,
+    RateDamping as RateDamping,
     RelativeTorque as RelativeTorque,
     Rotor as Rotor,
     SpaceTorque as SpaceTorque,

@@ -53,7 +53,7 @@ def recordings(count):
 def test_the_fits_hand_over_no_batch(affected):
     given = recordings(6)
     problem = Problem(FreeMotion(), FullTensor())
-    for fit in (_fit._each, _fit._together):
+    for fit in (_fit.each, _fit.together):
         batch, calls = largest_batch(fit.__wrapped__, given, problem)
         assert (batch, calls > 4) == (1, True)
 

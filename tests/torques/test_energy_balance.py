@@ -57,6 +57,23 @@ PARTS = {
         + ph.Rotor([1.0, 0, 0], inertia=0.1, speed=1.0, impulse=jnp.sin)
         + ph.Rotor([0, 1.0, 0], inertia=0.1, speed=1.0),
     },
+    "motor and dry friction": {
+        "rotors": ph.Rotor(
+            AXIS,
+            0.2,
+            speed=3.0,
+            coupling=ph.Motor(lambda t, q, w, s: jnp.sin(t) + q[1] - w[0] - 0.1 * s, 0.5, 9.0)
+            + ph.CoulombFriction(0.1, 0.5),
+        )
+    },
+    "pointing": {"torque": ph.Pointing(0.3, [0.1, 0.2, 0.3], [0.5, 0.5, 0.5, -0.5])},
+    "rate damping": {"torque": ph.RateDamping(0.3, [0.1, 0.2, 0.3])},
+    "dipole": {
+        "torque": ph.MagneticDipole(
+            ph.BDot(0.2), ph.DipoleField([0, 0, -1e8]), ph.KeplerOrbit(2.0, 1.5, 0.3, 0.4)
+        )
+    },
+    "pulses": {"torque": ph.Pulses(ph.BodyTorque([0.1, 0.2, -0.3]), [1.0, 3.0], [2.0, 4.0])},
 }
 PASSIVE = {
     "uniform gravity", "gravity gradient", "potential", "momentum held", "speed held", "wheel free"

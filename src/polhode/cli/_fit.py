@@ -257,7 +257,7 @@ def _bias(result: Any) -> tuple[Any, Any] | None:
 
     if result.parameters.bias is None:
         return None
-    first = 6 if result.model.is_full else 3  # the covariance begins with the tensor's entries
+    first = result.model.entries  # the covariance begins with the tensor's entries
     variance = np.diagonal(np.asarray(result.covariance))[first : first + 3]
     return np.asarray(result.parameters.bias), np.sqrt(variance)
 

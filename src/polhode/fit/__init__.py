@@ -1,4 +1,7 @@
-"""Inertia from recordings: fits that are physical and say how uncertain they are."""
+"""Inertia and other numbers from recordings: fits that say how uncertain they are."""
+
+import sys
+import types
 
 from polhode.fit._csv import load_recording as load_recording, read_recording as read_recording
 from polhode.fit._fit import (
@@ -42,4 +45,19 @@ from polhode.fit._result import (
     remarks as remarks,
     sensor_axes as sensor_axes,
 )
+from polhode.fit._scene_fit import (
+    LeafMotion as LeafMotion,
+    SceneFit as SceneFit,
+    fit_scene as fit_scene,
+)
 from polhode.fit._scene_motion import SceneMotion as SceneMotion
+
+
+class _Callable(types.ModuleType):
+    """This package can be called: ``ph.fit(scene, data, free)`` is ``ph.fit_scene``."""
+
+    def __call__(self, *args, **options):
+        return fit_scene(*args, **options)
+
+
+sys.modules[__name__].__class__ = _Callable

@@ -248,7 +248,7 @@ def solve_balance(
     tensors, instrument = parts(unknown)
 
     def entries(shape, base):
-        return entries_of(tensor_of(shape, base, _ALL), True)
+        return entries_of(tensor_of(shape, base, _ALL), 6)
 
     slopes = jax.vmap(jax.jacfwd(entries))(unknown[0], bases)
     # the instrument, when it is not fitted, has no derivatives

@@ -1,6 +1,6 @@
 """``fit_inertia``: the inertia of bodies from recordings of their motion."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -93,7 +93,7 @@ def fit_inertia(
         solver,
         max_steps,
     )
-    return _finished(_each(recording, problem), throw)
+    return _finished(each(recording, problem), throw)
 
 
 def fit_recordings(
@@ -128,7 +128,7 @@ def fit_recordings(
         solver,
         max_steps,
     )
-    return _finished(_together(stack(recordings), problem), throw)
+    return _finished(together(stack(recordings), problem), throw)
 
 
 def windows(recording: Recording, length: int) -> list[Recording]:
@@ -146,23 +146,23 @@ def windows(recording: Recording, length: int) -> list[Recording]:
 
 
 @compiled
-def _together(recording: Recording, problem: Problem) -> InertiaFit:
-    """One body from its recordings (leading axis)."""
+def together(recording: Recording, problem: Problem, conclude: Callable = conclude) -> Any:
+    """One body from its recordings (leading axis); ``conclude`` makes the result."""
     return conclude(solve(recording, problem), recording, problem)
 
 
 @compiled
-def _each(recording: Recording, problem: Problem) -> InertiaFit:
+def each(recording: Recording, problem: Problem, conclude: Callable = conclude) -> Any:
     """Fits of all bodies (leading axes), one recording each, in one compiled call."""
     batch = recording.batch_shape
     if not batch:
-        return _together(jax.tree.map(lambda leaf: leaf[None], recording), problem)
+        return together(jax.tree.map(lambda leaf: leaf[None], recording), problem, conclude)
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, 1, *leaf.shape[len(batch) :]), recording)
-    found = _batch(flat, problem)
+    found = _batch(flat, problem, conclude)
     return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), found)
 
 
-def _batch(recording: Recording, problem: Problem) -> InertiaFit:
+def _batch(recording: Recording, problem: Problem, conclude: Callable) -> Any:
     """Fits of bodies on one leading axis."""
 
     def fit(one):

@@ -148,7 +148,7 @@ def _concluded(found, knots, block) -> BalanceFit:
             values, _, products = principal(whole_of(entries, 6))
             return jnp.concatenate([values, products])
 
-        slope = jax.jacfwd(derived)(entries_of(tensor, True))
+        slope = jax.jacfwd(derived)(entries_of(tensor, 6))
         spread = jnp.sqrt(jnp.maximum(jnp.sum((slope @ covariance) * slope, axis=1), 0))
         gaps = jnp.stack(
             [moments[2] - moments[1], moments[2] - moments[0], moments[1] - moments[0]]

@@ -53,16 +53,19 @@ class Linear(NamedTuple):
         return jnp.block([[corner, side], [side.T, below]])
 
 
-def entries_of(tensor: Float[Array, "3 3"], full: bool) -> Float[Array, " e"]:
-    """xx, yy, zz and, for a full tensor, yz, zx, xy."""
-    diagonal = jnp.stack([tensor[0, 0], tensor[1, 1], tensor[2, 2]])
-    if not full:
-        return diagonal
-    return jnp.concatenate([diagonal, jnp.stack([tensor[1, 2], tensor[2, 0], tensor[0, 1]])])
+def entries_of(tensor: Float[Array, "3 3"], count: int) -> Float[Array, " e"]:
+    """The ``count`` unknown entries: xx, yy, zz and, of 6, yz, zx, xy; none where it is known."""
+    a, b, c = tensor[0, 0], tensor[1, 1], tensor[2, 2]
+    return jnp.stack([a, b, c, tensor[1, 2], tensor[2, 0], tensor[0, 1]])[:count]
 
 
 def whole_of(entries: Float[Array, " e"], count: int) -> Float[Array, "3 3"]:
-    """The tensor of its ``count`` (3 or 6) entries, products zero where they are absent."""
+    """The tensor of its ``count`` (3 or 6) entries, products zero where they are absent.
+
+    Of none: any, for a motion that does not ask for it.
+    """
+    if count == 0:
+        return jnp.eye(3, dtype=entries.dtype)
     (a, b, c), (p, q, r) = entries[:3], entries[3:6] if count == 6 else jnp.zeros_like(entries[:3])
     return jnp.stack([jnp.stack([a, r, q]), jnp.stack([r, b, p]), jnp.stack([q, p, c])])
 
@@ -73,8 +76,8 @@ def unknowns(parameters: Parameters, model: Model) -> tuple[Array, Array, Callab
     Shared: the tensor's entries, then bias, mounting, lever and the motion's own; own: rates, then
     attitude. The tensor's entries are regular unknowns for flat bodies too.
     """
-    entries = entries_of(model.tensor(parameters), model.is_full)
-    count = entries.shape[0]
+    count = model.entries
+    entries = entries_of(model.tensor(parameters), count)
     common = (parameters.bias, parameters.mounting, parameters.lever, parameters.motion)
     rest, back = ravel_pytree(common)
     shared = jnp.concatenate([entries, rest.astype(entries.dtype)])

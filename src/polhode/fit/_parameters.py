@@ -58,6 +58,13 @@ class MomentsOnly(AbstractInertiaUnknown):
         return np.eye(6)[:, :3]
 
 
+class NoInertia(AbstractInertiaUnknown):
+    """Of the inertia nothing is unknown but what the motion itself asks for."""
+
+    def columns(self):
+        return np.zeros((6, 0))
+
+
 # scaling a body changes its ratios not at all: with the size unknown the sum is kept
 _SCALE = np.array([1, 1, 1, 0, 0, 0]) / np.sqrt(3)
 

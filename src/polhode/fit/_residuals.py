@@ -52,9 +52,11 @@ class Model(eqx.Module):
         return Model(self.motion, self.base, attitude, self.robust, self.columns, self.scale_known)
 
     @property
-    def is_full(self) -> bool:
-        """Whether products of inertia are free (static)."""
-        return any(any(row) for row in self.columns[3:])
+    def entries(self) -> int:
+        """How many entries of the tensor are unknown (static): 6, 3 without products, or none."""
+        if not any(self.columns):
+            return 0
+        return 6 if any(any(row) for row in self.columns[3:]) else 3
 
     def tensor(self, parameters: Parameters) -> Float[Array, "3 3"]:
         """Inertia tensor (3, 3) in sensor axes, kg m^2 (or to scale)."""

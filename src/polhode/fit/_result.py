@@ -1,6 +1,7 @@
 """What a fit found, how well it is known, and what the data cannot say."""
 
 import enum
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -9,7 +10,7 @@ import numpy as np
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
-from polhode.fit._linear import entries_of, whole_of
+from polhode.fit._linear import Linear, entries_of, whole_of
 from polhode.fit._matrices import eigh, inverse, svd
 from polhode.fit._parameters import Parameters
 from polhode.fit._recording import Recording, needed
@@ -172,13 +173,44 @@ def is_unusable(fit: InertiaFit) -> bool:
     return bool((np.asarray(fit.finding) & int(UNUSABLE)).any())
 
 
+class Shown(NamedTuple):
+    """What the data show of p unknowns: ``information`` and ``covariance`` (p, p), directions
+    ``null`` (p, p) that they do not show (zero columns for the others), natural sizes ``safe`` (p,)
+    of 1 over an unknown, how many are not shown, ``noise`` of the residuals over that assumed."""
+
+    information: Array
+    covariance: Array
+    null: Array
+    safe: Array
+    null_count: Array
+    noise: Array
+
+
+def shown_by(linear: Linear, recording: Recording, noise_known: bool) -> Shown:
+    """What the Jacobian of a fit says about its unknowns, in the order shared, then own."""
+    information = linear.information()
+    dtype = information.dtype
+    # equilibrated: a direction counts as null by its own information, whatever its unit
+    size = jnp.sqrt(jnp.diagonal(information))
+    safe = jnp.where(size > 0, size, 1)
+    values, vectors = eigh(information / safe[:, None] / safe[None])
+    known = values > 1e3 * float(jnp.finfo(dtype).eps) * values[-1]
+    inverted = jnp.where(known, 1 / jnp.where(known, values, 1), 0)
+    data = jnp.sum(recording.present) * linear.rest.shape[-1]
+    freedom = jnp.maximum(data - jnp.sum(known).astype(dtype), 1)
+    noise = jnp.sqrt(jnp.sum(linear.rest**2) / freedom)
+    variance = jnp.asarray(1, dtype) if noise_known else noise**2
+    covariance = (vectors * inverted[None]) @ vectors.T / safe[:, None] / safe[None] * variance
+    null = jnp.where(known, 0, 1)[None] * vectors / safe[:, None]
+    return Shown(information, covariance, null, safe, jnp.sum(~known), noise)
+
+
 def conclude(solution: Solution, recording: Recording, problem: Problem) -> InertiaFit:
     """Uncertainty and diagnostics of one body (under jit and vmap)."""
     tensor, model, linear = solution.tensor, solution.model, solution.linear
     dtype = tensor.dtype
-    eps = float(jnp.finfo(dtype).eps)
-    entries = entries_of(tensor, model.is_full)
-    count = entries.shape[0]
+    count = model.entries
+    entries = entries_of(tensor, count)
 
     def derived(vector):
         values, axes, products = principal(whole_of(vector, count))
@@ -194,19 +226,8 @@ def conclude(solution: Solution, recording: Recording, problem: Problem) -> Iner
         slope = slope * jnp.where(jnp.arange(9) // 3 == 1, size, 1)[:, None]
         sizes = jnp.where(jnp.arange(linear.shared.shape[-1]) < count, size, 1)
         linear = linear._replace(shared=linear.shared * sizes[None, None])
-    information = linear.information()
-    # equilibrated: a direction counts as null by its own information, whatever its unit
-    size = jnp.sqrt(jnp.diagonal(information))
-    safe = jnp.where(size > 0, size, 1)
-    values, vectors = eigh(information / safe[:, None] / safe[None])
-    known = values > 1e3 * eps * values[-1]
-    inverted = jnp.where(known, 1 / jnp.where(known, values, 1), 0)
-    data = jnp.sum(recording.present) * linear.rest.shape[-1]
-    freedom = jnp.maximum(data - jnp.sum(known).astype(dtype), 1)
-    noise = jnp.sqrt(2 * solution.cost / freedom)
-    variance = jnp.asarray(1, dtype) if problem.noise_known else noise**2
-    covariance = (vectors * inverted[None]) @ vectors.T / safe[:, None] / safe[None] * variance
-    null = jnp.where(known, 0, 1)[None] * vectors / safe[:, None]
+    shown = shown_by(linear, recording, problem.noise_known)
+    information, covariance, null, safe = shown[:4]
 
     full = jnp.concatenate([slope, jnp.zeros((9, information.shape[0] - count), dtype)], axis=1)
     spread = jnp.sqrt(jnp.maximum(jnp.sum((full @ covariance) * full, axis=1), 0))
@@ -218,14 +239,9 @@ def conclude(solution: Solution, recording: Recording, problem: Problem) -> Iner
     gaps = jnp.stack([moments[2] - moments[1], moments[2] - moments[0], moments[1] - moments[0]])
     axes_std = jnp.where(gaps > 0, spread[6:] / jnp.where(gaps > 0, gaps, 1), jnp.inf)
 
-    parts, channel = {}, 0
-    kinds = {"omega": recording.omega, "attitude": recording.wxyz, "force": recording.force}
-    for name, measured in kinds.items():
-        if measured is not None:
-            parts[name] = linear.rest[..., channel : channel + 3]
-            channel += 3
-    whiteness = _whiteness(linear.rest, recording.present)
-    rates = parts.get("omega")
+    parts = by_kind(linear, recording)
+    whiteness = whiteness_of(linear.rest, recording.present)
+    rates: Any = parts.get("omega")
     if rates is None:
         rms = jnp.asarray(jnp.nan, dtype)
     else:
@@ -247,8 +263,8 @@ def conclude(solution: Solution, recording: Recording, problem: Problem) -> Iner
     finding = sum(jnp.where(seen, int(flag), 0) for flag, seen in flags)
     return InertiaFit(
         Inertia(full=tensor), moments, axes, moments / moments[2],
-        spread[:3], spread[3:6], axes_std, information, covariance, jnp.sum(~known),
-        noise, whiteness, rms, finding, solution.steps,
+        spread[:3], spread[3:6], axes_std, information, covariance, shown.null_count,
+        shown.noise, whiteness, rms, finding, solution.steps,
         solution.attempts, solution.parameters, model,
         parts, model.scale_known, recording.wxyz is None,
     )  # fmt: skip
@@ -303,7 +319,18 @@ def _turns(recording: Recording, centred: bool) -> tuple[Array, Array]:
     return weight * measured, weight * turned
 
 
-def _whiteness(rest: Array, present: Array, lags: int = 5) -> Array:
+def by_kind(linear: Linear, recording: Recording) -> dict[str, Array]:
+    """Residuals of rates, attitudes and forces, each (r, t, 3), over their noise."""
+    parts, channel = {}, 0
+    kinds = {"omega": recording.omega, "attitude": recording.wxyz, "force": recording.force}
+    for name, measured in kinds.items():
+        if measured is not None:
+            parts[name] = linear.rest[..., channel : channel + 3]
+            channel += 3
+    return parts
+
+
+def whiteness_of(rest: Array, present: Array, lags: int = 5) -> Array:
     """Ljung-Box probability of the first autocorrelations of all channels together."""
     total = jnp.sum(present, axis=-1)[:, None]
     rest = (rest - (jnp.sum(rest, axis=1) / total)[:, None]) * present[..., None]

@@ -184,8 +184,7 @@ def solve(recording: Recording, problem: Problem) -> Solution:
     _, struct = jax.eval_shape(misfits, fresh, (one, recording, noise))
     nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), struct)
     # the body to begin with, should no attempt come to an end
-    full = problem.unknown.columns().shape[1] == 6
-    body = entries_of(inertia_of_second_moments(first), full)
+    body = entries_of(inertia_of_second_moments(first), model_of(one).entries)
     nothing = nothing._replace(at=nothing.at.at[: body.shape[0]].set(body))
     begun = _Search(
         jnp.asarray(0), fresh, fresh, one, nothing, jnp.asarray(jnp.inf, dtype),
@@ -196,7 +195,7 @@ def solve(recording: Recording, problem: Problem) -> Solution:
     parameters = actual(ended.best)
     model = model_of(ended.base)
     linear = ended.linear
-    tensor = whole_of(linear.at, 6 if model.is_full else 3)
+    tensor = whole_of(linear.at, model.entries)
     return Solution(
         parameters,
         model,
@@ -211,8 +210,8 @@ def solve(recording: Recording, problem: Problem) -> Solution:
 
 
 def _jobs(bases: int, attempts: int) -> dict[str, np.ndarray]:
-    """What is fitted in turn: both regressions to all data, then each start to growing parts."""
-    tries = [[(0, 1.0, True)], [(1, 1.0, True)]]
+    """What is fitted in turn: the first two to all data, then each start to growing parts."""
+    tries = [[(base, 1.0, True)] for base in range(min(bases, 2))]
     for base in range(bases):
         tries.append([(base, part, part == _PARTS[0]) for part in _PARTS])
     rows = [row for one in tries[: max(attempts, 1)] for row in one]
@@ -289,6 +288,9 @@ def _rates(recording: Recording) -> Float[Array, "r t 3"]:
 
 def _bases(recording, rates, problem) -> tuple[Base, Array]:
     """Starting bodies (leading axis), the best first, and the second moments of that one."""
+    if problem.unknown.columns().shape[1] == 0:
+        first = jnp.eye(3, dtype=rates.dtype)
+        return jax.tree.map(lambda leaf: leaf[None], base_of(first, True)), first
     carried = None
     spin = getattr(problem.motion, "spin_inertia", None)
     if spin is not None:
@@ -322,5 +324,12 @@ def _scale(begin: Parameters, recording: Recording, rates: Array) -> Parameters:
         bias=like(begin.bias, typical),
         mounting=like(begin.mounting, one),
         lever=like(begin.lever, length),
-        motion=jax.tree.map(lambda x: jnp.where(x != 0, jnp.abs(x), one), begin.motion),
+        motion=jax.tree.map(_size, begin.motion),
     )
+
+
+def _size(start: Array) -> Array:
+    """Sizes of unknowns: of their start, where that is zero of the largest beside it, or one."""
+    largest = jnp.max(jnp.abs(start), initial=0)
+    beside = jnp.where(largest > 0, largest, 1)
+    return jnp.where(start != 0, jnp.abs(start), beside)

@@ -16,6 +16,7 @@ from polhode.hamiltonian import Dynamics
 from polhode.methods._base import AbstractMethod, Record, Samples
 from polhode.methods._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
 from polhode.methods._options import check_options
+from polhode.methods._segments import Moved, in_segments
 from polhode.methods._status import Status
 from polhode.solvers import FlowAdjoint, GivenTimes
 
@@ -65,13 +66,31 @@ class Stepped(AbstractMethod):
 
     def _solve(self, scene, state, ts, rtol, record: Record) -> Samples:
         """One chunk of lanes."""
-        dynamics = self.chart.dynamics(scene, state, ts)
         y0, sound = self.chart.start(scene, state, ts[0])
+        if record.work:
+            wheels = scene.dynamics.wheels
+            loose = () if wheels is None else wheels.loose
+            y0 = (*y0, (jnp.zeros_like(y0[0][0]),) * (1 + len(loose)))
+        edges = None if scene.torque is None else scene.torque.edges
+        if edges is None:
+            found = self._moved(scene, state, y0, ts, rtol, record)
+            return self._samples(scene, found, ts, sound, record)
+
+        def move(middle, y, times, parts):
+            torque = scene.torque.during(middle)
+            now = Scene(scene.inertia, scene.potential, torque, scene.rotors)
+            share = jnp.maximum(rtol / parts, 8 * jnp.finfo(rtol.dtype).eps)
+            return self._moved(now, state, y, times, share, record)
+
+        found = in_segments(move, y0, ts, edges, record.final_only)
+        return self._samples(scene, found, ts, sound, record)
+
+    def _moved(self, scene, state, y0, ts, rtol, record) -> Moved:
+        """States from ``y0`` on."""
+        dynamics = self.chart.dynamics(scene, state, ts)
         field = self.chart.field
         if record.work:
-            wheels, zero = dynamics.wheels, jnp.zeros_like(y0[0][0])
-            loose = () if wheels is None else wheels.loose
-            y0, field = (*y0, (zero,) * (1 + len(loose))), self.chart.field_and_power
+            wheels, field = dynamics.wheels, self.chart.field_and_power
             dynamics = Dynamics(
                 dynamics.hamiltonian, dynamics.torque, dynamics.units, wheels=wheels
             )
@@ -97,10 +116,15 @@ class Stepped(AbstractMethod):
             progress_meter=self.progress_meter,
             throw=False,
         )
-        return self._samples(scene, solution, ts, sound, record, dynamics)
+        error = getattr(solution.solver_state, "error", None)
+        ys: Any = solution.ys
+        samples, last = ys
+        steps, status = _outcome(solution, y0[0][0].shape)
+        return Moved(samples, last, steps, status, error)
 
-    def _samples(self, scene, solution, ts, sound, record: Record, dynamics) -> Samples:
-        samples, last = (_lanes_first(y) for y in solution.ys)
+    def _samples(self, scene, found: Moved, ts, sound, record: Record) -> Samples:
+        samples, last = (_lanes_first(y) for y in (found.samples, found.last))
+        dynamics = scene.dynamics
         work, motors, spins = None, None, None
         if record.work:
             *samples, (work, *powers) = samples
@@ -113,7 +137,7 @@ class Stepped(AbstractMethod):
         wxyz, omega, _ = self.chart.finish(later, tuple(samples), kept[None])
         *_, sound_at_end = self.chart.finish(later, tuple(last), ts[None, -1:])
         wxyz, omega = (jnp.where(sound[:, None, None], x, jnp.nan) for x in (wxyz, omega))
-        taken, unfinished = _outcome(solution, sound.shape)
+        taken, unfinished = found.steps, found.status
         finite = jnp.all(jnp.isfinite(wxyz), axis=(-1, -2))
         finite = finite & jnp.all(jnp.isfinite(omega), axis=(-1, -2))
         done = unfinished == Status.SUCCESSFUL
@@ -127,7 +151,7 @@ class Stepped(AbstractMethod):
             jnp.where(lost, Status.CHART_SINGULAR, status),
             taken,
             work,
-            getattr(solution.solver_state, "error", None),
+            found.error,
             motors,
             spins,
         )

@@ -92,7 +92,7 @@ def _single(result, recording, body) -> dict[str, Any]:
             axes,
             pick(result.covariance, 2),
             result.scale_known,
-            6 if result.model.is_full else 3,
+            result.model.entries,
         ),
         "scale_known": result.scale_known,
         "rms": float(pick(result.rms, 0)),

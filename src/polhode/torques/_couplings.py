@@ -4,14 +4,15 @@ The wheel takes the torque, the body its reaction; the wheel's momentum is then 
 """
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_number, is_concrete, require
 from polhode.hamiltonian import Attitude
-from polhode.parts import AbstractPart, shaped
+from polhode.parts import AbstractPart, checked, mapped, shaped
 
 
 class AbstractCoupling(AbstractPart):
@@ -83,3 +84,88 @@ class ViscousCoupling(AbstractCoupling):
 
     def torque(self, t, speed, attitude, omega):
         return -self.c * speed
+
+
+class CoulombFriction(AbstractCoupling):
+    """Dry friction of a bearing, smoothed: -torque tanh(Omega / speed) on the wheel.
+
+    ``torque`` (...) [N m] and ``speed`` (...) [rad/s] below which it falls to zero, both not
+    negative, the speed positive. The step of dry friction itself has no solution that an explicit
+    integrator can follow at rest; here a wheel creeps to rest as if viscous, with torque / speed.
+    Raises ValueError for other numbers.
+    """
+
+    size: Float[Array, "*#b"] = shaped()
+    speed: Float[Array, "*#b"] = shaped()
+
+    def __init__(self, torque, speed):
+        self.size = _not_negative("CoulombFriction torque", torque)
+        self.speed = as_number("CoulombFriction speed", speed)
+        if is_concrete(self.speed):
+            require(
+                np.asarray(self.speed) > 0,
+                f"CoulombFriction speed must be positive, got {speed}: it smooths the step.",
+            )
+
+    def torque(self, t, speed, attitude, omega):
+        return -self.size * jnp.tanh(speed / self.speed)
+
+
+_COMMAND = ("t", "wxyz", "omega_body", "speed")
+_COMMAND_SHAPES = ((), (4,), (3,), ())
+
+
+class Motor(AbstractCoupling):
+    """A motor between body and wheel, with the limits of one.
+
+    **Arguments:** ``command``: torque on the wheel about its axis [N m], a number (...) or a
+    function ``fn(t, wxyz, omega_body, speed)`` of one body, the wheel's speed [rad/s] relative to
+    it; ``most_torque`` (...) [N m], positive: it gives no more than that; ``most_speed`` (...)
+    [rad/s], positive: what it gives in the direction of the speed falls linearly to nothing there
+    (the line of a DC motor), braking keeps the full torque. The speed needs the torque.
+
+    A wheel that holds a body's attitude, friction in its bearing:
+
+        def hold(t, wxyz, omega_body, speed):       # the body takes the reaction
+            return 0.4 * wxyz[1] * jnp.sign(wxyz[0]) + 0.5 * omega_body[0]
+
+        motor = ph.Motor(hold, most_torque=0.1, most_speed=600.0) + ph.ViscousCoupling(1e-5)
+        wheel = ph.Rotor([1.0, 0.0, 0.0], inertia=1e-3, speed=0.0, coupling=motor)
+
+    Raises TypeError or ValueError for other numbers, or a function that takes or returns something
+    else.
+    """
+
+    command: Float[Array, "*#b"] | Callable = shaped()
+    most_torque: Float[Array, "*#b"] | None = shaped()
+    most_speed: Float[Array, "*#b"] | None = shaped()
+
+    def __init__(self, command, most_torque=None, most_speed=None):
+        if callable(command):
+            self.command = checked("Motor", command, _COMMAND, _COMMAND_SHAPES, ())
+        else:
+            self.command = as_number("Motor command", command)
+        for name, value in (("most_torque", most_torque), ("most_speed", most_speed)):
+            number = None if value is None else as_number(f"Motor {name}", value)
+            if number is not None and is_concrete(number):
+                require(np.asarray(number) > 0, f"Motor {name} must be positive, got {value}.")
+            setattr(self, name, number)
+        if most_speed is not None and most_torque is None:
+            raise ValueError("Motor most_speed needs most_torque, the torque that falls with it.")
+
+    def torque(self, t, speed, attitude, omega):
+        wanted = self.command
+        if callable(wanted):
+            wxyz, rates = (
+                jnp.stack(jnp.broadcast_arrays(*x), axis=-1) for x in (attitude.wxyz, omega)
+            )
+            given = t, wxyz, rates, speed
+            wanted = mapped("Motor", wanted, _COMMAND, _COMMAND_SHAPES, (), *given)
+        if self.most_torque is None:
+            return wanted
+        low, high = -self.most_torque, self.most_torque
+        if self.most_speed is not None:
+            share = speed / self.most_speed
+            high = self.most_torque * jnp.clip(1 - share, 0, 1)
+            low = -self.most_torque * jnp.clip(1 + share, 0, 1)
+        return jnp.clip(wanted, low, high)

@@ -35,6 +35,15 @@ class AbstractTorque(AbstractPart):
         """
         return None
 
+    @property
+    def edges(self) -> Array | None:
+        """Times (k,) [s] at which the torque jumps and steps have to end; None without such."""
+        return None
+
+    def during(self, t: Array | float) -> "AbstractTorque":
+        """What acts between the edges beside the time ``t``."""
+        return self
+
     def __add__(self, other: "AbstractTorque") -> "TorqueSum":
         if not isinstance(other, AbstractTorque):
             raise TypeError(f"a torque adds to another torque, not to {type(other).__name__}")
@@ -53,6 +62,14 @@ class TorqueSum(AbstractTorque):
     def body_components(self, t, attitude, omega):
         parts = zip(*(term.body_components(t, attitude, omega) for term in self.terms))
         return tuple(sum(rest, start=first) for first, *rest in parts)
+
+    @property
+    def edges(self):
+        found = [x for term in self.terms if (x := term.edges) is not None]
+        return jnp.concatenate(found) if found else None
+
+    def during(self, t):
+        return TorqueSum(tuple(term.during(t) for term in self.terms))
 
     def slip(self, t, momentum, omega):
         found = (term.slip(t, momentum, omega) for term in self.terms)
@@ -81,8 +98,8 @@ def value_at(name: str, vector, t) -> tuple[Array, Array, Array]:
 class BodyTorque(AbstractTorque):
     """Torque given in body axes [N m]: constant (..., 3) or a function of time [s] -> (3,).
 
-    The function may jump. A pulse far shorter than a step can be missed: put its times among those
-    that are simulated, which are stepped to. A plain function is static data of the scene, not a
+    The function may jump. A pulse far shorter than a step can be missed: ``ph.Pulses`` has edges
+    that steps end at. A plain function is static data of the scene, not a
     leaf of it; an ``eqx.Module`` keeps its arrays as leaves.
 
     Raises TypeError or ValueError for a function that takes or returns something else.
@@ -112,7 +129,7 @@ class SpaceTorque(AbstractTorque):
         return attitude.to_body(value_at("SpaceTorque", self.n, t))
 
 
-def _coefficients(name: str, c) -> Array:
+def coefficients(name: str, c) -> Array:
     """Damping about three axes, from one number or three."""
     given, c = c, as_float_array(f"{name} c", c)
     if c.ndim == 0:
@@ -135,7 +152,7 @@ class LinearDamping(AbstractTorque):
     c: Float[Array, "*#b 3"] = shaped(3)
 
     def __init__(self, c):
-        self.c = _coefficients("LinearDamping", c)
+        self.c = coefficients("LinearDamping", c)
 
     def body_components(self, t, attitude, omega):
         return tuple(-c * rate for c, rate in zip(components(self.c), omega))
@@ -150,7 +167,7 @@ class QuadraticDamping(AbstractTorque):
     c: Float[Array, "*#b 3"] = shaped(3)
 
     def __init__(self, c):
-        self.c = _coefficients("QuadraticDamping", c)
+        self.c = coefficients("QuadraticDamping", c)
 
     def body_components(self, t, attitude, omega):
         square = omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2

@@ -1,0 +1,126 @@
+"""``fit_scene``: drag, wheels, gravity, orbits from recordings, and how well they are known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import polhode as ph
+from polhode.fit import Recording
+from polhode.fit._scene_fit import places_of
+
+BODY = ph.Inertia.from_moments([1.0, 2.0, 2.5])
+STATE = ph.State([0.8, 0.0, 0.6, 0.0], [1.2, -0.8, 1.0])
+NOISE = 0.01
+
+
+def noisy(key, values):
+    return values + NOISE * jax.random.normal(jax.random.key(key), values.shape)
+
+
+def test_intervals_of_a_drag_hold_the_truth():
+    """240 draws of the noise as one batch: normal deviates, of the size said."""
+    ts, true = jnp.linspace(0.0, 8.0, 25), np.array([0.1, 0.05, 0.2])
+    scene = ph.Scene(BODY, torque=ph.LinearDamping(true))
+    rates = ph.simulate(scene, STATE, ts).omega_body
+    drawn = Recording.of(ts, noisy(1, jnp.broadcast_to(rates, (240, 25, 3))), omega_noise=NOISE)
+    start = ph.Scene(BODY, torque=ph.LinearDamping(0.15))
+    found = ph.fit(start, drawn, free=lambda s: [s.torque.c], noise_known=True, rtol=1e-7, starts=1)
+    assert found.values[0].shape == found.std[0].shape == (240, 3)
+    off = (np.asarray(found.values[0]) - true) / np.asarray(found.std[0])
+    assert np.all(np.abs(off.mean(axis=0)) < 0.26)  # four standard deviations of the mean
+    assert np.all(np.abs(off.std(axis=0) - 1) < 0.19)
+    inside = np.mean(np.abs(off) < 1.96)
+    assert 0.92 < inside < 0.98, inside
+    np.testing.assert_allclose(np.mean(np.asarray(found.noise)), 1, atol=0.05)
+    assert np.all(np.asarray(found.null_count) == 0)
+    assert np.mean(np.asarray(found.finding) == 0) > 0.98
+
+
+def test_whatever_a_scene_holds():
+    """Offset of the centre of mass, orbit, drag and wheel together, from two recordings."""
+
+    def scene(centre, axis, drag, momentum):
+        gravity = ph.UniformGravity(1.0, centre, [0.0, 0.0, -2.0])
+        tide = ph.GravityGradient(2.0, ph.KeplerOrbit(2.0, axis, 0.2, 0.3))
+        wheel = ph.Rotor([0.0, 0.6, 0.8], momentum=momentum)
+        return ph.Scene(BODY, gravity + tide, ph.LinearDamping(drag), wheel)
+
+    true = ([0.1, 0.0, 0.5], 1.2, [0.1, 0.05, 0.2], 0.4)
+    ts, data = jnp.linspace(0.0, 6.0, 40), []
+    for k, rates in enumerate(([1.0, -0.8, 1.0], [-0.5, 1.5, 0.2])):
+        moved = ph.simulate(scene(*true), ph.State(STATE.wxyz, rates), ts)
+        turn = noisy(20 + k, jnp.zeros((40, 3))) / 2
+        wxyz = jnp.concatenate([jnp.ones((40, 1)), turn], axis=-1)
+        data.append(
+            Recording.of(
+                ts,
+                noisy(10 + k, moved.omega_body),
+                wxyz=ph.rotation.multiply(moved.wxyz, wxyz),
+                omega_noise=NOISE,
+                attitude_noise=NOISE,
+            )
+        )
+    start = scene([0.0, 0.05, 0.4], 1.3, 0.1, 0.3)
+    found = ph.fit_scene(
+        start, data,
+        lambda s: [
+            s.potential.terms[0].centre_body, s.potential.terms[1].position_space.semi_major_axis,
+            s.torque.c, s.rotors.momentum,
+        ],
+        noise_known=True, rtol=1e-7,
+    )  # fmt: skip
+    assert found.findings() == []
+    for value, std, exact in zip(found.values, found.std, true, strict=True):
+        assert np.all(np.asarray(std) < 0.05)
+        off = (np.asarray(value) - np.asarray(exact)) / np.asarray(std)
+        assert np.all(np.abs(off) < 4), off
+    assert abs(float(found.noise) - 1) < 0.15
+    assert found.initial.wxyz.shape == (2, 4)
+    np.testing.assert_allclose(found.omega, [[1.0, -0.8, 1.0], [-0.5, 1.5, 0.2]], atol=0.03)
+    np.testing.assert_array_equal(found.scene.rotors.momentum, found.values[3])
+    assert "+-" in found.report()
+
+
+def test_what_the_data_cannot_show_is_said():
+    """Damping over inertia is all that a damped body shows: their common size is anyone's."""
+    ts = jnp.linspace(0.0, 8.0, 25)
+    scene = ph.Scene(BODY, torque=ph.LinearDamping([0.1, 0.05, 0.2]))
+    data = Recording.of(ts, noisy(3, ph.simulate(scene, STATE, ts).omega_body), omega_noise=NOISE)
+    found = ph.fit_scene(
+        scene, data, lambda s: (s.inertia.diagonal, s.torque.c), rtol=1e-7, starts=1, throw=False
+    )
+    assert found.findings() == ["undetermined"]
+    assert int(found.null_count) == 1
+    assert not np.any(np.isfinite(np.concatenate(found.std)))
+    assert "standard deviations are infinite" in found.report()
+
+
+@pytest.mark.parametrize(
+    ("free", "word"),
+    [
+        (lambda s: [s.torque.c[0]], "arrays that the scene holds"),
+        (lambda s: [2 * s.torque.c], "arrays that the scene holds"),
+        (lambda s: [s.potential.mass], "arrays that the scene holds"),
+        (lambda s: [], "arrays that the scene holds"),
+        ("torque.c", "function of the scene"),
+    ],
+)
+def test_what_free_may_point_at(free, word):
+    scene = ph.Scene(BODY, torque=ph.LinearDamping(0.1))
+    assert places_of(scene, lambda s: s.torque) == places_of(scene, lambda s: [s.torque.c])
+    data = Recording.of(jnp.arange(5.0), jnp.ones((5, 3)) * 0.1)
+    with pytest.raises(TypeError, match=word):
+        ph.fit_scene(scene, data, free)
+
+
+def test_refused_scenes_and_data():
+    scene = ph.Scene(BODY, torque=ph.LinearDamping(0.1))
+    data = Recording.of(jnp.arange(5.0), jnp.ones((5, 3)) * 0.1)
+    with pytest.raises(ValueError, match="twice"):
+        ph.fit_scene(scene, data, lambda s: [s.torque.c, s.torque.c])
+    with pytest.raises(TypeError, match=r"Recording\.of"):
+        ph.fit_scene(scene, jnp.ones((5, 3)), lambda s: [s.torque.c])
+    several = ph.Scene(BODY, torque=ph.LinearDamping([[0.1, 0.1, 0.1]] * 2))
+    with pytest.raises(ValueError, match="one body"):
+        ph.fit_scene(several, data, lambda s: [s.torque.c])
