@@ -34,15 +34,17 @@ PENDING = {
 
 SECTIONS = {
     "Simulate": "simulate explain Scene State Trajectory Record Status SimulationError Plan choose",
+    "Events": "Event crossings Crossings",
     "Methods": "ClosedForm LagrangeTop SymmetricTop FixedAxis LiePoisson EulerAngles",
     "Bodies": "Inertia MassProperties periods Periods Mode",
-    "What acts": "UniformGravity GravityGradient KeplerOrbit StateOrbit Potential BodyTorque "
-    "SpaceTorque FeedbackTorque LinearDamping QuadraticDamping EnergySink Pulses "
+    "What acts": "UniformGravity GravityGradient AbstractOrbit KeplerOrbit StateOrbit Potential "
+    "BodyTorque SpaceTorque FeedbackTorque LinearDamping QuadraticDamping EnergySink Pulses "
     "Pointing RateDamping MagneticDipole BDot DipoleField "
     "Rotor Motor ViscousCoupling CoulombFriction AbstractCoupling",
-    "Frames and sensors": "RotatingFrame simulate_particles accelerometer gyroscope",
+    "Frames and sensors": "LVLH RelativeTorque RotatingFrame simulate_particles "
+    "accelerometer gyroscope",
     "The Hamiltonian": "hamiltonian hamiltons_equations",
-    "From data": "fit_inertia fit_recordings fit_scene",
+    "From data": "fit_inertia fit_recordings fit_scene propagate Propagation",
 }
 """Order of the names of ``polhode`` on its page; others follow under "More"."""
 

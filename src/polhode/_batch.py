@@ -208,8 +208,9 @@ def split_of(scene: Any, state: Any, ts: Array) -> Split | None:
 
 def _sharding(x: Any) -> NamedSharding | None:
     sharding = x.sharding if isinstance(x, jax.Array) and is_concrete(x) else _typed(x)
-    named = isinstance(sharding, NamedSharding) and sharding.mesh.size > 1
-    return sharding if named else None
+    if isinstance(sharding, NamedSharding) and sharding.mesh.size > 1:
+        return sharding
+    return None
 
 
 def _typed(x: Any) -> Any:

@@ -1,10 +1,12 @@
 """The public names of polhode, imported together when the first of them is asked for."""
 
 from polhode import elliptic as elliptic, free as free, rotation as rotation, solvers as solvers
+from polhode._propagate import Propagation as Propagation, propagate as propagate
 from polhode._scene import Scene as Scene
 from polhode._simulate import explain as explain, simulate as simulate
 from polhode._state import State as State
 from polhode._trajectory import Trajectory as Trajectory
+from polhode.events import Crossings as Crossings, Event as Event, crossings as crossings
 from polhode.fit import (
     fit_inertia as fit_inertia,
     fit_recordings as fit_recordings,
@@ -40,7 +42,9 @@ from polhode.methods.exact import (
     periods as periods,
 )
 from polhode.torques import (
+    LVLH as LVLH,
     AbstractCoupling as AbstractCoupling,
+    AbstractOrbit as AbstractOrbit,
     AbstractPotential as AbstractPotential,
     AbstractRotor as AbstractRotor,
     AbstractTorque as AbstractTorque,
@@ -60,6 +64,7 @@ from polhode.torques import (
     Pulses as Pulses,
     QuadraticDamping as QuadraticDamping,
     RateDamping as RateDamping,
+    RelativeTorque as RelativeTorque,
     Rotor as Rotor,
     SpaceTorque as SpaceTorque,
     StateOrbit as StateOrbit,

@@ -5,12 +5,13 @@ from functools import reduce
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool
 
 from polhode._checks import is_concrete, together
-from polhode.hamiltonian import Dynamics, Hamiltonian, inverse_inertia
+from polhode.hamiltonian import Dynamics, Hamiltonian, inverse_inertia, lie_poisson_field
 from polhode.inertia import Inertia
 from polhode.torques import AbstractPotential, AbstractRotor, AbstractTorque, Wheels
 
@@ -136,6 +137,38 @@ class Scene(eqx.Module):
             momentum = jnp.subtract(*_aligned(momentum, wheels))
         return self.carrier.rates(momentum)
 
+    def acceleration(self, wxyz: Array | None, omega: Array, t: Array | float) -> Array:
+        """Derivative (..., 3) of the body rates [rad/s^2] by the equations of motion.
+
+        ``wxyz`` (..., 4): attitude, None where nothing acts; ``omega`` (..., 3): body rates
+        [rad/s]; ``t``: time [s]. Leading axes of all broadcast, those of the parts included. Of
+        coupled wheels see ``with_spins``.
+        """
+        return self.changes(wxyz, omega, t)[0]
+
+    def changes(
+        self, wxyz: Array | None, omega: Array, t: Array | float
+    ) -> tuple[Array, tuple[Array, ...]]:
+        """The acceleration, and the torques (...) [N m] on the wheels that are coupled."""
+        t = jnp.asarray(t, omega.dtype)
+        if wxyz is None:
+            wxyz = jnp.zeros((*omega.shape[:-1], 4), omega.dtype).at[..., 0].set(1)
+        momentum = self.momentum(omega, t)
+        state = (tuple(momentum[..., i] for i in range(3)), tuple(wxyz[..., i] for i in range(4)))
+        dynamics = self.dynamics
+        spins = dynamics.wheels.spins if dynamics.coupled else ()
+        push, _, *moved = lie_poisson_field(t, (*state, spins) if spins else state, dynamics)
+        rate = jnp.stack(jnp.broadcast_arrays(*push), axis=-1)
+        turned = tuple(moved[0]) if spins else ()
+
+        def carried(t, spins):
+            return self.with_spins(spins).wheel_momentum(t)
+
+        if self.rotors is not None:  # what the wheels take up does not turn the body
+            _, taken = jax.jvp(carried, (t, spins), (jnp.ones_like(t), turned))
+            rate = rate - jnp.broadcast_to(taken, rate.shape)
+        return self.carrier.rates(rate), turned
+
     @property
     def dynamics(self) -> Dynamics:
         """What moves the body."""
@@ -145,9 +178,10 @@ class Scene(eqx.Module):
 
     def with_spins(self, spins: Sequence[Array] = ()) -> "Scene":
         """The scene at a moment when its coupled wheels have these momenta [kg m^2/s]."""
-        if not spins:
+        wheels = self._wheels
+        if wheels is None or not spins:
             return self
-        return Scene(self.inertia, self.potential, self.torque, self._wheels.at(spins))
+        return Scene(self.inertia, self.potential, self.torque, wheels.at(spins))
 
     @property
     def hamiltonian(self) -> Hamiltonian:

@@ -5,15 +5,18 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode import rotation
 from polhode._batch import PARTS, Split, common_batch, flatten, on_devices, place, split_of
 from polhode._checks import is_concrete
 from polhode._dispatch import again, learn
+from polhode._motion import Motion
 from polhode._scene import Scene
 from polhode._state import State
 from polhode._trajectory import Trajectory
+from polhode.events import Event, check_until, stopped
 from polhode.methods import (
     AbstractMethod,
     Plan,
@@ -39,6 +42,7 @@ def simulate(
     *,
     rtol: float | None = None,
     record: Record | None = None,
+    until: Event | None = None,
     throw: bool = True,
 ) -> Trajectory:
     """Move every body of the scene from ``state`` at ``ts[0]`` through the times ``ts``.
@@ -55,12 +59,19 @@ def simulate(
       last time when the library chooses the method, of each step where the method says so;
       None: 1e-9 in float64, 1e-5 in float32. Exact methods ignore it.
     - ``record``: what to keep; None: attitude and rates at all times.
+    - ``until``: a ``ph.Event`` at which each body stops: its times and samples from there on are
+      those of the event, so that ``Trajectory.last`` is the state to go on from; its time is
+      ``Trajectory.event_time`` (inf for a body that does not meet it).
     - ``throw``: raise ``ph.SimulationError`` when a body did not finish. Under ``jit``, ``vmap``
       or ``grad`` nothing is raised: look at ``Trajectory.status``.
 
     Raises ValueError or TypeError for bad input: wrong kinds or shapes, unsorted times, mixed
     dtypes, a tolerance that the dtype cannot reach.
     """
+    if until is not None:
+        check_until(until, record)
+        found = simulate(scene, state, ts, method, rtol=rtol, throw=throw)
+        return checked(stopped(found, until), throw)
     if method is None:
         trajectory = again(scene, state, ts, rtol, record)
         if trajectory is not None:
@@ -84,7 +95,7 @@ def simulate(
 
 def checked(trajectory: Trajectory, throw: bool) -> Trajectory:
     """The trajectory; raises for bodies that did not finish where that is known."""
-    if throw and not isinstance(trajectory.status, jax.core.Tracer):
+    if throw and not isinstance(trajectory.status, Tracer):
         raise_on_failure(trajectory.status)
     return trajectory
 
@@ -122,7 +133,10 @@ def _trajectory(method, scene, state, ts, rtol, record, split=None) -> Trajector
         found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
     wxyz, omega, status, steps, work, error, motors, spins = found
     kept = ts[..., -1:] if record.final_only else ts
-    trajectory = Trajectory(kept, wxyz, omega, status, steps, scene, work, error, motors, spins)
+    motion = Motion.of(method, rtol)
+    trajectory = Trajectory(
+        kept, wxyz, omega, status, steps, scene, work, error, motors, spins, motion
+    )
     if record.work and method.exact:
         work = _work_of_exact(trajectory, state, ts[..., :1])
         return eqx.tree_at(lambda t: t.work, trajectory, work, is_leaf=lambda x: x is None)

@@ -21,8 +21,8 @@ class State(AbstractPart):
     """Attitude and body rates at one time.
 
     **Arguments:** ``wxyz`` (..., 4): unit quaternion, scalar first, body -> space; one that is not
-    of unit length is normalised. ``omega_body`` (..., 3): angular velocity in body axes [rad/s].
-    Leading axes are a batch and broadcast together.
+    of unit length is normalised; or a SciPy ``Rotation``. ``omega_body`` (..., 3): angular velocity
+    in body axes [rad/s]. Leading axes are a batch and broadcast together.
 
     Raises ValueError for a zero quaternion, NaN, wrong shapes or axes that do not broadcast.
     """
@@ -31,6 +31,8 @@ class State(AbstractPart):
     omega_body: Float[Array, "*#b 3"] = shaped(3)
 
     def __init__(self, wxyz, omega_body):
+        if hasattr(wxyz, "as_quat"):
+            wxyz = rotation.scipy_to_wxyz(wxyz, getattr(omega_body, "dtype", None))
         quaternion = as_float_array("wxyz", wxyz, (4,))
         rates = as_float_array("omega_body", omega_body, (3,))
         if is_concrete(quaternion):

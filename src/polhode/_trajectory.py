@@ -1,17 +1,36 @@
 """The result of a simulation: sampled attitude and rates, everything else on demand."""
 
-from typing import Any
+import abc
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
-from polhode import __version__, rotation
-from polhode._batch import PARTS, along_time
+from polhode import rotation
+from polhode._batch import PARTS, along_time, map_arrays
+from polhode._checks import is_concrete
+from polhode._exports import dataset, write_aem
+from polhode._indexing import check_key, is_integer, split_key
 from polhode._scene import Scene
+from polhode._state import State
 from polhode.hamiltonian import components, from_quaternion
 from polhode.methods import Status
+from polhode.torques import Wheels
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+
+class AbstractMotion(eqx.Module):
+    """What moves the bodies of a trajectory to other times."""
+
+    @abc.abstractmethod
+    def at(self, trajectory: "Trajectory", t: ArrayLike) -> "Trajectory":
+        """The trajectory at times ``t`` (K,) or (..., K)."""
 
 
 class Trajectory(eqx.Module):
@@ -26,7 +45,13 @@ class Trajectory(eqx.Module):
     [rad]: estimated error of the attitude at the last time, or None (``Record(error=True)``;
     without attitude that of the rates, relative); ``motor_work`` (..., T, m) [J]: the part of
     ``work`` that motor and friction of each wheel have done, or None without ``work`` or such;
-    ``spins`` (..., T, k) [kg m^2/s]: momenta of the wheels with a coupling, or None.
+    ``spins`` (..., T, k) [kg m^2/s]: momenta of the wheels with a coupling, or None;
+    ``motion``: method and tolerance, for ``at``;
+    ``event_time`` (...) [s]: of the event that ``ph.simulate(..., until=)`` stopped at, inf for a
+    body that did not meet it, or None.
+
+    Between the samples: ``traj.at(t)``. Indexed, a trajectory is an array of shape (..., T) of
+    samples: ``traj[i]`` is a body of a batch, ``traj[..., ::10]`` every tenth sample.
     """
 
     ts: Float[Array, "*t"]
@@ -39,6 +64,105 @@ class Trajectory(eqx.Module):
     error: Float[Array, "*b"] | None = None
     motor_work: Float[Array, "*b t m"] | None = None
     spins: Float[Array, "*b t k"] | None = None
+    motion: AbstractMotion | None = None
+    event_time: Float[Array, "*b"] | None = None
+
+    def at(self, t: Float[ArrayLike, "*#b k"]) -> "Trajectory":
+        """The motion at other times ``t`` [s]: a trajectory of the same bodies at these.
+
+        ``t`` (K,) is shared by all bodies, (..., K) one row a body; a number is taken as (1,). In
+        any order, also outside the times simulated. Differentiable in ``t``, in the initial state
+        and in the numbers of the scene; under ``jit`` and ``vmap`` too. Exact laws are evaluated at
+        ``t``; a stepped body is moved there from its nearest sample, which keeps ``rtol`` and costs
+        a few steps for each time. A time that is not finite gives NaN. ``work``, ``motor_work`` and
+        ``error`` are None.
+
+        Raises ValueError where attitude or rates were not recorded, SimulationError as
+        ``ph.simulate`` does.
+
+            traj = ph.simulate(scene, state, [0.0, 10.0])
+            traj.at(jnp.linspace(0, 10, 501)).energy
+        """
+        for name in ("wxyz", "omega_body"):
+            self._need(name)
+        if self.motion is None:
+            raise ValueError(
+                "this trajectory was made by hand, without a method to move it by: use one that"
+                " ph.simulate returns."
+            )
+        return self.motion.at(self, t)
+
+    def state_at(self, t: Float[ArrayLike, "*#b"]) -> State:
+        """Attitude and rates (...) at one time ``t`` [s], () or one for each body; see ``at``."""
+        return self.at(jnp.asarray(t)[..., None]).last
+
+    @property
+    def first(self) -> State:
+        """The state (...) at the first sample."""
+        return State(self._need("wxyz")[..., 0, :], self._need("omega_body")[..., 0, :])
+
+    @property
+    def last(self) -> State:
+        """The state (...) at the last sample, from which another simulation may go on.
+
+        It holds attitude and rates; the speeds of wheels are ``wheel_speed[..., -1, :]``.
+        """
+        return State(self._need("wxyz")[..., -1, :], self._need("omega_body")[..., -1, :])
+
+    def __getitem__(self, key: Any) -> "Trajectory":
+        """Bodies and samples chosen as from an array of shape (..., T), body axes first.
+
+        Integers, slices, ``...``, arrays of integers or truth values. ``traj[3]`` is the fourth
+        body (of one body: the fourth sample); ``traj[3, ::10]``, ``traj[..., -1]``: bodies first,
+        then times. The axis of time stays: an integer there keeps one sample.
+        """
+        bodies, times = split_key(key, len(self.batch_shape))
+        shape = self.batch_shape
+        check_key(bodies, shape, "bodies")
+        check_key(times, self.ts.shape[-1:], "samples")
+        times = (jnp.asarray(times)[None],) if is_integer(times) else (times,)
+
+        def of_bodies(x, rank):
+            if x is None or (lead := x.shape[: x.ndim - rank]) == ():
+                return x
+            full = jnp.broadcast_to(x.reshape((1,) * (len(shape) - len(lead)) + x.shape),
+                                    (*shape, *x.shape[x.ndim - rank :]))  # fmt: skip
+            return full[bodies] if bodies else full
+
+        def of_both(x, rank):
+            kept = of_bodies(x, rank)
+            if kept is None:
+                return None
+            return kept[(..., *times, *(slice(None),) * (rank - 1))]
+
+        parts = {name: map_arrays(getattr(self.scene, name), of_bodies) for name in PARTS}
+        return Trajectory(
+            of_both(self.ts, 1), of_both(self.wxyz, 2), of_both(self.omega_body, 2),
+            of_bodies(self.status, 0), of_bodies(self.steps, 0), Scene(**parts),
+            of_both(self.work, 1), of_bodies(self.error, 0), of_both(self.motor_work, 2),
+            of_both(self.spins, 2), self.motion,
+            of_bodies(self.event_time, 0),
+        )  # fmt: skip
+
+    def between(self, start: float, end: float) -> "Trajectory":
+        """The samples from ``start`` to ``end`` [s], both included; of one row of times.
+
+        Not under ``jit``, where the number of samples must be known: use ``at``, or a slice.
+        Raises ValueError where no sample lies there, or where bodies have times of their own.
+        """
+        if not is_concrete(self.ts) or self.ts.ndim != 1:
+            raise ValueError(
+                "between needs one row of known times: use traj.at(times), or a slice such as"
+                " traj[..., 10:20]."
+            )
+        ts = np.asarray(self.ts)
+        (kept,) = np.nonzero((ts >= min(start, end)) & (ts <= max(start, end)))
+        if not kept.size:
+            raise ValueError(
+                f"no sample lies between {start} and {end}; they run from {ts[0]} to {ts[-1]}:"
+                " for times between samples use traj.at(times)."
+            )
+        return self[..., kept[0] : kept[-1] + 1]
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -88,7 +212,7 @@ class Trajectory(eqx.Module):
         NaN for a wheel that is held at a momentum, its inertia not given.
         """
         wheels = self._scene.rotors
-        if wheels is None:
+        if not isinstance(wheels, Wheels):
             return None
         omega = components(self._need("omega_body"))
         speeds = [wheels.speed(i, self._t, omega) for i in range(len(wheels.held))]
@@ -110,74 +234,45 @@ class Trajectory(eqx.Module):
             attitude = from_quaternion(tuple(wxyz[..., i] for i in range(4)))
         return scene.hamiltonian.total(components(self.momentum_body), attitude, self._t)
 
-    def euler(self) -> tuple[Array, Array, Array]:
-        """ZYZ Euler angles (phi, theta, psi) [rad], each (..., T)."""
-        return rotation.wxyz_to_euler(self._need("wxyz"))
+    def euler(
+        self, sequence: rotation.Sequence | str = rotation.Sequence.ZYZ
+    ) -> tuple[Array, Array, Array]:
+        """Euler angles [rad], each (..., T): by default ZYZ (phi, theta, psi).
 
-    def to_xarray(self) -> Any:
-        """An ``xarray.Dataset`` with named dimensions, units and attributes (needs xarray)."""
-        try:
-            import xarray
-        except ImportError as error:
-            raise ImportError("to_xarray needs xarray: pip install 'polhode[cli]'") from error
+        ``sequence``: a ``rotation.Sequence``, or its axes as SciPy writes them: ``"ZYX"`` turns
+        about the axes of the body one after the other (yaw, pitch, roll), ``"zyx"`` about those of
+        space. Angles are in the order of the axes. Raises ValueError for other letters.
+        """
+        if isinstance(sequence, str):
+            sequence = rotation.Sequence.of(sequence)
+        return rotation.wxyz_to_euler(self._need("wxyz"), sequence)
 
-        rank = len(self.batch_shape)
-        batch = ("body",) if rank == 1 else tuple(f"batch_{i}" for i in range(rank))
-        time = ("time",) if self.ts.ndim == 1 else (*batch, "time")
-        data: dict[str, Any] = {}
+    def to_scipy(self) -> "Rotation":
+        """The attitudes, body -> space, as one SciPy ``Rotation`` of all samples.
 
-        def put(name, array, dims, units, long_name):
-            data[name] = (dims, np.asarray(array), {"units": units, "long_name": long_name})
+        In the order of ``wxyz`` with its leading axes flattened. The other way: ``ph.State`` takes
+        a ``Rotation`` in place of a quaternion. Not under ``jit``.
+        """
+        return rotation.wxyz_to_scipy(self._need("wxyz"))
 
-        if self.wxyz is not None:
-            put(
-                "wxyz",
-                self.wxyz,
-                (*batch, "time", "quaternion"),
-                "1",
-                "attitude quaternion, scalar first, body to space",
-            )
-        if self.omega_body is not None:
-            put(
-                "omega_body",
-                self.omega_body,
-                (*batch, "time", "axis"),
-                "rad s-1",
-                "angular velocity in body axes",
-            )
-            if self.scene.potential is None or self.wxyz is not None:
-                put("energy", self.energy, (*batch, "time"), "J", "kinetic plus potential energy")
-            if self.wxyz is not None:
-                put(
-                    "momentum_space",
-                    self.momentum_space,
-                    (*batch, "time", "axis"),
-                    "kg m2 s-1",
-                    "angular momentum in space axes",
-                )
-        if self.work is not None:
-            put("work", self.work, (*batch, "time"), "J", "work done by the external torques")
-        if self.error is not None:
-            put("error", self.error, batch, "rad", "estimated error at the last time")
-        data["status"] = (
-            batch,
-            np.asarray(self.status, np.int8),
-            {
-                "long_name": "outcome of each body",
-                "flag_values": np.array([int(s) for s in Status], np.int8),
-                "flag_meanings": " ".join(s.name.lower() for s in Status),
-            },
-        )
-        coords: dict[str, Any] = {
-            "quaternion": ("quaternion", list("wxyz"), {"long_name": "part, the scalar first"}),
-            "axis": ("axis", list("xyz"), {"long_name": "axis of the frame that the name states"}),
-        }
-        times = (time, np.asarray(self.ts), {"units": "s", "long_name": "time"})
-        (coords if self.ts.ndim == 1 else data)["time" if self.ts.ndim == 1 else "ts"] = times
-        attributes = {
-            "Conventions": "CF-1.11",
-            "title": "Rotating rigid bodies",
-            "source": f"polhode {__version__}",
-            "convention": "wxyz scalar first, body -> space; R = Rz(phi) Ry(theta) Rz(psi)",
-        }
-        return xarray.Dataset(data, coords=coords, attrs=attributes)
+    def to_xarray(self, labels: Sequence[str] | None = None) -> Any:
+        """An ``xarray.Dataset`` with named dimensions, units and attributes (needs xarray).
+
+        ``labels``: names of the bodies of a batch of one axis, the coordinate ``body``.
+        """
+        return dataset(self, labels)
+
+    def to_aem(self, path: str | Path, epoch: str, **fields: Any) -> None:
+        """Write the attitudes as a CCSDS attitude ephemeris message (504.0-B-2), a text file.
+
+        **Arguments:** ``path``; ``epoch``: calendar time at which ``ts`` is zero, such as
+        ``"2029-04-13T21:46:00"``; fields of the message: ``object_name`` and ``object_id``
+        (required; for a batch one for each body), ``frame`` ("EME2000": that of space),
+        ``body_frame`` ("SC_BODY_1"), ``time_system`` ("TAI"), ``originator`` ("POLHODE"),
+        ``center_name`` (None), ``rates`` (True: body rates too), ``creation_date`` (now).
+
+        One segment a body, in the order of time. Seconds are counted on from ``epoch``: over a leap
+        second leave UTC to others. Raises ValueError or TypeError for fields that the standard does
+        not know, FileNotFoundError for a folder that is not there.
+        """
+        write_aem(path, self, epoch, **fields)

@@ -107,7 +107,8 @@ def program(first: Array, each: Any, shared: Any, settings: Settings) -> dict[st
     real = indices < bodies
     kept = {"status": trajectory.status.astype(jnp.int8)}
     if settings.trajectories:
-        kept |= {"wxyz": trajectory.wxyz, "omega_body": trajectory.omega_body}
+        recorded = {"wxyz": trajectory.wxyz, "omega_body": trajectory.omega_body}
+        kept |= {name: x for name, x in recorded.items() if x is not None}
     for statistic in settings.statistics:
         found = summarise(statistic, trajectory, real)
         kept |= {f"{statistic.name}_{name}": x[None] for name, x in found.items()}

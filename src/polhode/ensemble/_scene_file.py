@@ -53,8 +53,10 @@ def _spread(draw, file: SceneFile, dtype: DTypeLike):
     deviate = Deviate(jnp.asarray(draw.scale, dtype), draw.uniform)
     state = file.state
     if draw.quantity == "euler":
-        angles = jnp.asarray(state.attitude.values, dtype)
-        return SpreadEuler(angles, deviate, rotation.Sequence[state.attitude.sequence.upper()])
+        angles, sequence = jnp.asarray(state.attitude.values, dtype), state.attitude.sequence
+        if sequence is None:
+            raise ValueError("Euler angles spread only about Euler angles: give [state] euler.")
+        return SpreadEuler(angles, deviate, rotation.Sequence[sequence.upper()])
     if draw.quantity == "momentum_body":
         return SpreadMomentum(jnp.asarray(state.value, dtype), deviate)
     kinds = {"moments": SpreadMoments, "attitude": SpreadAttitude, "omega_body": SpreadRates,

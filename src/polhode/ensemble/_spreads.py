@@ -136,7 +136,7 @@ class SpreadTorque(eqx.Module):
 def constant_torque(scene: Scene) -> Array:
     """The numbers of the one constant torque of a scene [N m]. Raises TypeError without one."""
     torque = scene.torque
-    if not isinstance(torque, BodyTorque | SpaceTorque) or not eqx.is_array(torque.n):
+    if not isinstance(torque, BodyTorque | SpaceTorque) or not isinstance(torque.n, Array):
         raise TypeError(
             "torques of an ensemble vary around one constant ph.BodyTorque or ph.SpaceTorque, got"
             f" {type(torque).__name__}: give the scene such a torque, or write your own spread."

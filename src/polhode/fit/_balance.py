@@ -20,7 +20,7 @@ from polhode.fit._instrument import Instrument, Tolerance
 from polhode.fit._linear import entries_of
 from polhode.fit._matrices import inverse
 from polhode.fit._parameters import base_of, tensor_of
-from polhode.fit._recording import Recording, bridged
+from polhode.fit._recording import Recording, bridged, needed
 from polhode.fit._start import central_slope, integrate, regression
 from polhode.rotation import to_matrix
 
@@ -69,7 +69,7 @@ def balance_of(recording: Recording, body: Array, knots: int, block: int) -> Bal
     """Prepare recordings (leading axis r) of the bodies with numbers ``body`` (r,)."""
     times = recording.times
     omega = bridged(times, recording.present, recording.omega)
-    sample = recording.present * recording.wheel_known
+    sample = recording.present * needed("wheel_known", recording.wheel_known)
     count = times.shape[1] // block
     weight = jax.vmap(lambda x: jnp.floor(_blocks(x, count, block)))(sample)
     end = jnp.max(jnp.where(sample > 0, times, times[:, :1]), axis=1)
@@ -235,8 +235,13 @@ def solve_balance(
     unknown = (jnp.zeros((count, 6), start.dtype), jnp.zeros(11, start.dtype))
     _, _, rest, linear, *_ = jax.eval_shape(again, (unknown, noise, 0, 0, 0, 0))
     nothing = [jnp.zeros(x.shape, x.dtype) for x in (rest, linear)]
+
+    def unsettled(carry):
+        *_, settled, rounds = carry
+        return ~settled & (rounds < _ROUNDS)
+
     unknown, noise, rest, linear, converged, _ = jax.lax.while_loop(
-        lambda carry: ~carry[4] & (carry[5] < _ROUNDS),
+        unsettled,
         again,
         (unknown, noise, *nothing, jnp.asarray(False), 0),
     )

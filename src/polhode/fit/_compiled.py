@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,13 +11,13 @@ from jax.errors import JaxRuntimeError
 
 # XLA's older way to emit loops: for what a fit does the program is as fast and compiles in half the
 # time. The jaxlib of jax 0.10 knows the option, that of 0.12 no longer.
-_OPTIONS = {"xla_cpu_use_fusion_emitters": False}
+_OPTIONS: dict[str, Any] = {"compiler_options": {"xla_cpu_use_fusion_emitters": False}}
 
 
 def compiled(function: Callable) -> Callable:
     """``eqx.filter_jit`` that compiles faster on processors, where this is the outermost jit."""
     inner = eqx.filter_jit(function)
-    outermost = eqx.filter_jit(function, compiler_options=_OPTIONS)
+    outermost = eqx.filter_jit(function, **_OPTIONS)
 
     @functools.wraps(function)
     def call(*args):
@@ -32,7 +33,7 @@ def _understood() -> bool:
     if jax.default_backend() != "cpu":
         return False
     try:
-        jax.jit(lambda x: -x, compiler_options=_OPTIONS)(1.0)
+        jax.jit(lambda x: -x, **_OPTIONS)(1.0)
     except (JaxRuntimeError, ValueError):
         return False
     return True

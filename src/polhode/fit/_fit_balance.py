@@ -14,7 +14,7 @@ from polhode.fit._compiled import compiled
 from polhode.fit._fit import FitError
 from polhode.fit._instrument import Instrument, Tolerance
 from polhode.fit._linear import entries_of, whole_of
-from polhode.fit._recording import Recording, stack
+from polhode.fit._recording import Recording, needed, stack
 from polhode.inertia import Inertia, principal
 
 
@@ -101,7 +101,7 @@ def fit_balance(
         f"leaving one out, got {numbers.tolist()}.",
     )
     require(is_concrete(given.times) and knot > 0, "fit_balance takes arrays, not traced values.")
-    present = np.asarray(given.present * given.wheel_known) > 0
+    present = np.asarray(given.present * needed("wheel_known", given.wheel_known)) > 0
     require(
         present.sum(axis=1) >= 8,
         "each recording needs at least 8 samples with rates and wheel, got "

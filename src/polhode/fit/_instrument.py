@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from polhode._checks import is_concrete, require
 from polhode.fit._matrices import solve
-from polhode.fit._recording import Recording
+from polhode.fit._recording import Recording, needed
 from polhode.fit._start import central_slope, integrate
 from polhode.rotation import to_matrix
 
@@ -123,6 +123,7 @@ def lever_arm(recording: Recording) -> Float[Array, "*b 3"]:
         return solve(square, jnp.einsum("tij,ti->j", design, force))[:3]
 
     batch = recording.batch_shape
-    parts = (recording.times, recording.present, recording.omega, recording.force)
+    omega, force = needed("omega", recording.omega), needed("force", recording.force)
+    parts = (recording.times, recording.present, omega, force)
     flat = [part.reshape(-1, *part.shape[len(batch) :]) for part in parts]
     return jax.vmap(one)(*flat).reshape(*batch, 3)

@@ -129,16 +129,18 @@ class SteppedMotion(AbstractMotion):
         push, rates = jnp.stack(push, axis=-1), jnp.stack(rates, axis=-1)
         if wheel_at is not None:  # what the wheel takes up does not turn the body
             carried = jnp.stack(self._along(wheel_at(times)), axis=-1)
-            push = push - jnp.gradient(carried, axis=0) / jnp.gradient(times)[:, None]
+            gained, step = (jnp.asarray(jnp.gradient(x, axis=0)) for x in (carried, times))
+            push = push - gained / step[:, None]
         if attitude is not None:
             attitude = normalise(jnp.stack(attitude, axis=-1))
         return Motion(rates, inertia.rates(push), attitude)
 
     def _wheel(self, times, wheel, delay) -> Callable[[Array], Array] | None:
         """The wheel's momentum along its axis as a function of time; None without a wheel."""
-        if self.spin_inertia is None:
+        spin = self.spin_inertia
+        if spin is None:
             return None
-        return lambda t: self.spin_inertia * jnp.interp(t - delay, times, wheel)
+        return lambda t: spin * jnp.interp(t - delay, times, wheel)
 
     def _along(self, size: Array) -> tuple[Array, ...]:
         return tuple(size * component for component in self.axis)

@@ -73,7 +73,7 @@ class Recording(eqx.Module):
                 f"times must be strictly increasing, got a step of {step.min():g} s after sample "
                 f"{place}; sort the rows and drop repeated ones.",
             )
-        count = times.shape[-1]
+        count, dtype = times.shape[-1], times.dtype
         given = {
             "omega_body": (omega_body, (count, 3)),
             "wxyz": (wxyz, (count, 4)),
@@ -81,7 +81,7 @@ class Recording(eqx.Module):
             "wheel_speed": (wheel_speed, (count,)),
         }
         arrays = {
-            name: None if value is None else _with_gaps(name, value, suffix, times.dtype)
+            name: None if value is None else _with_gaps(name, value, suffix, dtype)
             for name, (value, suffix) in given.items()
         }
         require(
@@ -107,7 +107,7 @@ class Recording(eqx.Module):
             if array is not None and name != "wheel_speed":
                 whole = xp.isfinite(array)
                 whole = xp.all(whole, axis=-1) if tails[name] == 2 else whole
-                present = present * whole.astype(times.dtype)
+                present = present * whole.astype(dtype)
         filled = {
             name: None if a is None else xp.where(xp.isfinite(a), a, _blank(name, a))
             for name, a in arrays.items()
@@ -115,7 +115,7 @@ class Recording(eqx.Module):
         omega, attitude = filled["omega_body"], filled["wxyz"]
         wheel, known = filled["wheel_speed"], None
         if wheel is not None:
-            known = xp.isfinite(arrays["wheel_speed"]).astype(times.dtype)
+            known = xp.isfinite(arrays["wheel_speed"]).astype(dtype)
             if is_concrete(known):
                 least = int(np.min(np.sum(known, axis=-1)))
                 require(least >= 2, f"wheel_speed needs at least 2 numbers, got {least}.")
@@ -131,7 +131,7 @@ class Recording(eqx.Module):
             "force_noise": (force_noise, filled["force_body"], 3),
         }
         spread = {
-            name: None if of is None else _noise(name, value, (*batch, count), tail, times.dtype)
+            name: None if of is None else _noise(name, value, (*batch, count), tail, dtype)
             for name, (value, of, tail) in noises.items()
         }
         force = filled["force_body"]
@@ -148,7 +148,14 @@ class Recording(eqx.Module):
 
     def mirrored(self) -> "Recording":
         """The rates with every sign reversed: what the other handedness of axes would read."""
-        return eqx.tree_at(lambda r: r.omega, self, -self.omega)
+        return eqx.tree_at(lambda r: r.omega, self, -needed("omega", self.omega))
+
+
+def needed(name: str, array: Array | None) -> Array:
+    """The field ``name`` of a recording; ValueError where it is None."""
+    if array is None:
+        raise ValueError(f"the recording has no {name}: make it by Recording.of, which sets it.")
+    return array
 
 
 def bridged(times: Float[Array, "*b t"], known: Float[Array, "*b t"], values: Array) -> Array:

@@ -1,6 +1,8 @@
 """Data minus model in units of the noise: the function that every optimiser needs."""
 
 from collections.abc import Callable
+from functools import reduce
+from operator import add
 
 import equinox as eqx
 import jax
@@ -10,7 +12,7 @@ from jaxtyping import Array, Float
 
 from polhode.fit._motion import AbstractMotion, Motion
 from polhode.fit._parameters import Base, Parameters, tensor_of
-from polhode.fit._recording import Recording
+from polhode.fit._recording import Recording, needed
 from polhode.rotation import conjugate, multiply, rotate, rotation_vector_to_wxyz
 
 
@@ -92,29 +94,31 @@ def residuals(
     weight = recording.present[..., None]
     parts = {}
     if recording.omega is not None:
-        seen = motion.omega
+        seen, noise = motion.omega, needed("omega_noise", recording.omega_noise)
         if parameters.mounting is not None:
             turn = conjugate(rotation_vector_to_wxyz(parameters.mounting))
             seen = rotate(jnp.broadcast_to(turn, (*seen.shape[:-1], 4)), seen)
         if parameters.bias is not None:
             seen = seen + parameters.bias[None, None]
-        parts["omega"] = weight * (recording.omega - seen) / recording.omega_noise
+        parts["omega"] = weight * (recording.omega - seen) / noise
     if recording.wxyz is not None:
+        noise = needed("attitude_noise", recording.attitude_noise)
         apart = multiply(conjugate(motion.wxyz), recording.wxyz)
         sign = jnp.where(apart[..., :1] < 0, -1, 1).astype(apart.dtype)
         vector = 2 * sign * apart[..., 1:]
-        parts["attitude"] = weight * vector / recording.attitude_noise[..., None]
+        parts["attitude"] = weight * vector / noise[..., None]
     if recording.force is not None:
         if motion.omega_dot is None:
             raise ValueError(
                 "force_body needs a motion that gives angular accelerations: FreeMotion or "
                 f"SteppedMotion, got {type(model.motion).__name__}."
             )
+        noise = needed("force_noise", recording.force_noise)
         lever = jnp.broadcast_to(parameters.lever, motion.omega.shape)
         felt = jnp.cross(motion.omega_dot, lever) + jnp.cross(
             motion.omega, jnp.cross(motion.omega, lever)
         )
-        parts["force"] = weight * (recording.force - felt) / recording.force_noise
+        parts["force"] = weight * (recording.force - felt) / noise
     if model.robust is not None:
         parts = {name: model.robust(part) for name, part in parts.items()}
     return parts
@@ -133,7 +137,7 @@ def log_density(
 
     def density(parameters):
         parts = residuals(parameters, recording, model)
-        misfit = -sum(jnp.sum(part**2) for part in parts.values()) / 2
+        misfit = -reduce(add, (jnp.sum(part**2) for part in parts.values())) / 2
         return misfit if prior is None else misfit + prior(parameters)
 
     return density

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from polhode.fit._linear import Linear, entries_of, whole_of
 from polhode.fit._matrices import eigh, inverse, svd
 from polhode.fit._parameters import Parameters
-from polhode.fit._recording import Recording
+from polhode.fit._recording import Recording, needed
 from polhode.fit._residuals import Model
 from polhode.fit._solve import Problem, Solution, misfit_of
 from polhode.inertia import Inertia, principal
@@ -125,7 +125,8 @@ class InertiaFit(eqx.Module):
     def findings(self, body: int = 0) -> list[str]:
         """Names of the remarks on one body, in plain words."""
         code = int(np.asarray(self.finding).reshape(-1)[body])
-        return [flag.name.lower().replace("_", " ") for flag in CURES if code & flag]
+        named = Finding.__members__.items()
+        return [name.lower().replace("_", " ") for name, flag in named if code & flag]
 
     def report(self) -> str:
         """A short text per body: moments, uncertainty, remarks with cause and cure."""
@@ -303,11 +304,12 @@ def _turns(recording: Recording, centred: bool) -> tuple[Array, Array]:
 
     ``centred``: less their means, whose difference may be the gyroscope's bias.
     """
-    turn = multiply(conjugate(recording.wxyz[..., :-1, :]), recording.wxyz[..., 1:, :])
+    wxyz, omega = needed("wxyz", recording.wxyz), needed("omega", recording.omega)
+    turn = multiply(conjugate(wxyz[..., :-1, :]), wxyz[..., 1:, :])
     sign = jnp.where(turn[..., :1] < 0, -1, 1).astype(turn.dtype)
     weight = (recording.present[..., 1:] * recording.present[..., :-1])[..., None]
     step = jnp.diff(recording.times, axis=-1)[..., None]
-    measured = step * (recording.omega[..., 1:, :] + recording.omega[..., :-1, :]) / 2
+    measured = step * (omega[..., 1:, :] + omega[..., :-1, :]) / 2
     turned = 2 * sign * turn[..., 1:]
     if centred:
         total = jnp.sum(weight, axis=-2, keepdims=True)

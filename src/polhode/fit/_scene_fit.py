@@ -102,7 +102,7 @@ class SceneFit(eqx.Module):
     def findings(self, body: int = 0) -> list[str]:
         """Names of the remarks on one body, in plain words."""
         code = int(np.asarray(self.finding).reshape(-1)[body])
-        return [flag.name.lower().replace("_", " ") for flag in _CURES if code & flag]
+        return [str(flag.name).lower().replace("_", " ") for flag in _CURES if code & flag]
 
     def report(self, body: int = 0) -> str:
         """A short text on one body: values, uncertainty, remarks with cause and cure."""

@@ -19,7 +19,7 @@ from polhode.fit._parameters import (
     base_of,
     free_columns,
 )
-from polhode.fit._recording import Recording, bridged
+from polhode.fit._recording import Recording, bridged, needed
 from polhode.fit._residuals import Huber, Model
 from polhode.fit._start import alternatives, regression, scatter
 from polhode.inertia import Inertia, inertia_of_second_moments, second_moments
@@ -240,8 +240,9 @@ def _expected(recording: Recording, problem: Problem) -> Float[Array, ""]:
         return expected
     if recording.omega is None:
         return jnp.full_like(expected, jnp.inf)
+    omega_noise = needed("omega_noise", recording.omega_noise)
     seen = jax.vmap(scatter)(recording.times, recording.omega, recording.present)
-    seen = seen / jnp.mean(recording.omega_noise, axis=(1, 2)) ** 2
+    seen = seen / jnp.mean(omega_noise, axis=(1, 2)) ** 2
     # recordings without five samples in a row tell nothing
     told = jnp.isfinite(seen)
     count = jnp.maximum(jnp.sum(told), 1).astype(seen.dtype)
@@ -249,7 +250,7 @@ def _expected(recording: Recording, problem: Problem) -> Float[Array, ""]:
     mean = jnp.where(jnp.any(told), mean, jnp.inf)
     # readings without any noise are met to what the optimiser takes for rounding at best
     rounding = float(jnp.finfo(mean.dtype).eps) ** 0.75
-    least = rounding**2 * jnp.mean((recording.omega / recording.omega_noise) ** 2)
+    least = rounding**2 * jnp.mean((recording.omega / omega_noise) ** 2)
     return expected * jnp.maximum(mean, least)
 
 
@@ -260,13 +261,14 @@ def _weight(recording: Recording, rates: Array) -> Float[Array, ""]:
     """
     total = jnp.zeros((), rates.dtype)
     if recording.omega is not None:
-        total += jnp.sum(recording.present[..., None] * (rates / recording.omega_noise) ** 2)
+        noise = needed("omega_noise", recording.omega_noise)
+        total += jnp.sum(recording.present[..., None] * (rates / noise) ** 2)
     if recording.wxyz is not None:
-        total += jnp.sum(recording.present / recording.attitude_noise**2)
+        noise = needed("attitude_noise", recording.attitude_noise)
+        total += jnp.sum(recording.present / noise**2)
     if recording.force is not None:
-        total += jnp.sum(
-            recording.present[..., None] * (recording.force / recording.force_noise) ** 2
-        )
+        noise = needed("force_noise", recording.force_noise)
+        total += jnp.sum(recording.present[..., None] * (recording.force / noise) ** 2)
     mean = total / rates.shape[0]
     return 10 / jnp.sqrt(jnp.where(mean > 0, mean, 1))
 
@@ -274,7 +276,8 @@ def _weight(recording: Recording, rates: Array) -> Float[Array, ""]:
 def _rates(recording: Recording) -> Float[Array, "r t 3"]:
     """Measured rates, or those between successive attitudes; gaps filled by interpolation."""
     if recording.omega is None:
-        turn = multiply(conjugate(recording.wxyz[:, :-1]), recording.wxyz[:, 1:])
+        wxyz = needed("wxyz", recording.wxyz)
+        turn = multiply(conjugate(wxyz[:, :-1]), wxyz[:, 1:])
         sign = jnp.where(turn[..., :1] < 0, -1, 1).astype(turn.dtype)
         between = 2 * sign * turn[..., 1:] / jnp.diff(recording.times, axis=-1)[..., None]
         inner = (between[:, 1:] + between[:, :-1]) / 2

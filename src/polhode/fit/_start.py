@@ -5,7 +5,8 @@ With the attitude R(t) relative to the first sample, found by integrating the ra
 needs no differentiation of noisy rates.
 """
 
-import math
+from functools import reduce
+from operator import mul
 
 import jax
 import jax.numpy as jnp
@@ -181,7 +182,7 @@ def scatter(
     known = jnp.stack([present[k : times.shape[0] - 4 + k] for k in range(5)])
     others = (0, 1, 3, 4)
     weights = [
-        math.prod(offset[j] / (offset[j] - offset[k]) for j in others if j != k) for k in others
+        reduce(mul, (offset[j] / (offset[j] - offset[k]) for j in others if j != k)) for k in others
     ]
     guess = sum(w[:, None] * value[k] for w, k in zip(weights, others, strict=True))
     share = 1 + sum(w * w for w in weights)

@@ -202,12 +202,15 @@ class RotatingFrame(eqx.Module):
 
     def _origin(self, t: Time) -> tuple[Array, Array, Array]:
         """Position, velocity and acceleration of the origin in space components."""
+        origin = self.origin
+        if origin is None:
+            raise ValueError("the origin of this frame does not move: it was given none.")
 
         def moving(time):
             def velocity(s):
-                return rate_of_change(self.origin, s)[1]
+                return rate_of_change(origin, s)[1]
 
-            return self.origin(time), *rate_of_change(velocity, time)
+            return origin(time), *rate_of_change(velocity, time)
 
         return _at_times(moving, jnp.asarray(t))
 

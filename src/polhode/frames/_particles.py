@@ -143,7 +143,7 @@ def _solve(frame, force, mass, position, velocity, ts, rtol, solver, controller,
         max_steps=limit,
         throw=False,
     )
-    position, velocity = (jnp.moveaxis(part, 0, -2) for part in solution.ys[:2])
+    position, velocity = (jnp.moveaxis(x, 0, -2) for x in jax.tree.leaves(solution.ys)[:2])
     reached = solution.result == diffrax.RESULTS.successful
     position, velocity = position * length[..., None, :], velocity * speed[..., None, :]
     finite = jnp.isfinite(position).all() & jnp.isfinite(velocity).all()

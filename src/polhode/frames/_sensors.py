@@ -1,13 +1,11 @@
 """The two sensors that recordings come from: gyroscope and accelerometer, fixed in the body."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode._checks import as_float_array
 from polhode._trajectory import Trajectory
-from polhode.hamiltonian import lie_poisson_field
 from polhode.rotation import conjugate, rotate
 
 
@@ -26,25 +24,8 @@ def angular_acceleration(trajectory: Trajectory) -> Float[Array, "*b t 3"]:
     """Derivative of the body rates at every sample [rad/s^2], from the equations of motion."""
     scene, t = trajectory._scene, trajectory._t
     omega = _recorded(trajectory, "omega_body")
-    if trajectory.scene.is_free:
-        wxyz = jnp.zeros((*omega.shape[:-1], 4), omega.dtype).at[..., 0].set(1)
-    else:
-        wxyz = _recorded(trajectory, "wxyz")
-    momentum = scene.momentum(omega, t)
-    state = (tuple(momentum[..., i] for i in range(3)), tuple(wxyz[..., i] for i in range(4)))
-    dynamics, wheels = scene.dynamics, scene.rotors
-    spins = dynamics.wheels.spins if dynamics.coupled else ()
-    push, _, *changes = lie_poisson_field(t, (*state, spins) if spins else state, dynamics)
-    rate = jnp.stack(jnp.broadcast_arrays(*push), axis=-1)
-
-    def carried(t, spins):
-        return scene.with_spins(spins).wheel_momentum(t)
-
-    if wheels is not None:  # what the wheels take up does not turn the body
-        moved = jnp.ones_like(t), changes[0] if spins else ()
-        _, taken = jax.jvp(carried, (t, spins), moved)
-        rate = rate - jnp.broadcast_to(taken, rate.shape)
-    return scene.carrier.rates(rate)
+    wxyz = None if trajectory.scene.is_free else _recorded(trajectory, "wxyz")
+    return scene.acceleration(wxyz, omega, t)
 
 
 def gyroscope(trajectory: Trajectory) -> Float[Array, "*b t 3"]:

@@ -79,7 +79,8 @@ class VariableRate(AbstractTurning):
             max_steps=2**14,
             adjoint=diffrax.RecursiveCheckpointAdjoint(),
         )
-        return normalise(solution.ys[-1])
+        (path,) = jax.tree.leaves(solution.ys)
+        return normalise(path[-1])
 
 
 class PrescribedAttitude(AbstractTurning):

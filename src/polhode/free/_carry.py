@@ -19,6 +19,7 @@ from polhode.free._phase import parity
 from polhode.free._roles import Triple
 from polhode.free._second import incomplete, quarter_turn
 from polhode.free._tangent import partials
+from polhode.hamiltonian import triple
 
 Scalars = Float[Array, "*b"]
 
@@ -112,7 +113,9 @@ def _functions_rule(many, primals, tangents):
     dS, dC, dN = dS + C * N * dt, dC - x * S * N * dt, dN - y * S * C * dt
     sign = parity(whole)
     _, change = jax.jvp(
-        lambda *f: incomplete(*f, many), (sign * S, sign * C, N), (sign * dS, sign * dC, dN)
+        lambda s, c, n: incomplete(s, c, n, many),
+        (sign * S, sign * C, N),
+        (sign * dS, sign * dC, dN),
     )
     _, turn = jax.jvp(functools.partial(_quarter, swing.circular, swing.endless), (x, z), (dx, dz))
     parts = tuple(
@@ -165,18 +168,19 @@ def turn_of_axes(given, dm, dp, dw):
 def from_rest(resting, given, dw, dt) -> tuple[Triple, Triple]:
     """Variations of rates and attitude of a body at rest, to second order in the rates."""
     (i1, i2, i3), _, omega, _, t = given
-    w1, w2, w3 = w = tuple(jnp.where(resting, x, 0) for x in omega)
-    late = (jnp.zeros_like(t * i1),) * 3 if dt is None else tuple(x * dt for x in w)
+    w1, w2, w3 = w = triple(jnp.where(resting, x, 0) for x in omega)
+    zero = jnp.zeros_like(t * i1)
+    late = (zero, zero, zero) if dt is None else triple(x * dt for x in w)
     if dw is None:
-        return (jnp.zeros_like(t * i1),) * 3, late
+        return (zero, zero, zero), late
     h1, h2, h3 = dw
     gained = (
         (i2 - i3) / i1 * (h2 * w3 + h3 * w2) * t,
         (i3 - i1) / i2 * (h3 * w1 + h1 * w3) * t,
         (i1 - i2) / i3 * (h1 * w2 + h2 * w1) * t,
     )
-    push = tuple(h + g for h, g in zip(dw, gained, strict=True))
-    drift = tuple(
+    push = triple(h + g for h, g in zip(dw, gained, strict=True))
+    drift = triple(
         t * (h + (g - t * c) / 2) + e
         for h, g, c, e in zip(dw, gained, cross(w, dw), late, strict=True)
     )

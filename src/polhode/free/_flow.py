@@ -11,6 +11,7 @@ from polhode.free._exact import turns
 from polhode.free._motion import Swing, Turning
 from polhode.free._phase import cosine_sine, horner, parity, sine_half, sinh
 from polhode.free._roles import Triple, restore
+from polhode.hamiltonian import triple
 from polhode.xla import settled
 
 Scalars = Float[Array, "*b"]
@@ -77,7 +78,7 @@ def momentum_of(swing: Swing, functions: Triple) -> Triple:
 def momentum(swing: Swing, functions: Triple) -> Triple:
     """The same; exact spin about a principal axis keeps its rates to the last bit."""
     now = momentum_of(swing, functions)
-    return tuple(jnp.where(swing.steady, l, x) for l, x in zip(swing.momentum, now, strict=True))
+    return triple(jnp.where(swing.steady, l, x) for l, x in zip(swing.momentum, now, strict=True))
 
 
 class Instant(NamedTuple):
@@ -88,6 +89,13 @@ class Instant(NamedTuple):
     functions: Triple  # S = sn / omega_p, C = cn, N = dn
     momentum: Triple
     half: tuple[Scalars, Scalars] | None  # cosine and sine of half the angle about L, over |M|
+
+    @property
+    def turned(self) -> tuple[Scalars, Scalars]:
+        """``half``, which is known where ``advance`` was given a ``Turning``."""
+        if self.half is None:
+            raise ValueError("the motion was worked out for its rates alone: give a Turning.")
+        return self.half
 
 
 def half_angle(swing: Swing, turning: Turning, t: Scalars, rest, half, N, turned: Triple, stage):
@@ -150,7 +158,7 @@ def rates(swing: Swing, at: Instant) -> Triple:
 def attitude(swing: Swing, turning: Turning, at: Instant) -> tuple[Scalars, ...]:
     """Attitude: the start, the turn about axis 3, and the minimal rotation carrying L to it."""
     l1, l2, l3 = at.momentum
-    c, s = at.half
+    c, s = at.turned
     height = turning.length + jnp.abs(l3)
     facing = jnp.copysign(1, swing.momentum[2])
     side = swing.parity * facing

@@ -6,6 +6,7 @@ from jaxtyping import Array, Float
 from polhode.free._motion import Swing
 from polhode.free._roles import Triple, pick, restore
 from polhode.free._tangent import Change
+from polhode.hamiltonian import triple
 
 Scalars = Float[Array, "*b"]
 Quadruple = tuple[Scalars, Scalars, Scalars, Scalars]
@@ -21,18 +22,18 @@ class Frame:
         self.index = (3 - swing.middle - swing.circled, swing.middle, swing.circled)
 
     def to_roles(self, values: Triple) -> Triple:
-        return tuple(pick(values, k) for k in self.index)
+        return triple(pick(values, k) for k in self.index)
 
     def to_pairs(self, values: Triple) -> Triple:
         """Entries xy, xz, yz as entries 12, 13, 23."""
         i, j, k = self.index
-        return tuple(pick(values, n - 1) for n in (i + j, i + k, j + k))
+        return triple(pick(values, n - 1) for n in (i + j, i + k, j + k))
 
     def to_body(self, values: Triple) -> Triple:
         return restore(values, self.swing.middle, self.swing.circled)
 
     def turned(self, values: Triple) -> Triple:
-        return tuple(e * x for e, x in zip(self.signs, values, strict=True))
+        return triple(e * x for e, x in zip(self.signs, values, strict=True))
 
 
 def cross(a: Triple, b: Triple) -> Triple:
@@ -44,21 +45,20 @@ def cross(a: Triple, b: Triple) -> Triple:
 
 
 def dot(a, b) -> Scalars:
-    return sum(x * y for x, y in zip(a, b, strict=True))
+    x, y, z = (x * y for x, y in zip(a, b, strict=True))
+    return x + y + z
 
 
 def hamilton(a: Quadruple, b: Quadruple) -> Quadruple:
     v = cross(a[1:], b[1:])
-    return (
-        a[0] * b[0] - dot(a[1:], b[1:]),
-        *(a[0] * b[k + 1] + a[k + 1] * b[0] + v[k] for k in range(3)),
-    )
+    vector = triple(a[0] * b[k + 1] + a[k + 1] * b[0] + v[k] for k in range(3))
+    return a[0] * b[0] - dot(a[1:], b[1:]), *vector
 
 
 def matrix(change: Change, vector: Triple) -> Triple:
     """The variation of the inverse tensor, applied."""
     a, b, c = vector
-    plain = tuple(e * x for e, x in zip(change.inverse, vector, strict=True))
+    plain = triple(e * x for e, x in zip(change.inverse, vector, strict=True))
     if change.crossed is None:
         return plain
     h12, h13, h23 = change.crossed

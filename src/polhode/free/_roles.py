@@ -14,6 +14,7 @@ from polhode.free._exact import (
     subtract_pairs,
     sum_of,
 )
+from polhode.hamiltonian import triple
 from polhode.xla import opaque_ones, settled
 
 Scalars = Float[Array, "*b"]
@@ -105,6 +106,6 @@ def assign_roles(moments: Triple, rates: Triple) -> Roles:
 def restore(roles_values: Triple, middle: Scalars, circled: Scalars) -> Triple:
     """Values along axes 1, 2, 3 put back along x, y, z."""
     first, second, third = roles_values
-    return tuple(
+    return triple(
         jnp.where(circled == k, third, jnp.where(middle == k, second, first)) for k in range(3)
     )

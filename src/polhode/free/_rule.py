@@ -29,6 +29,7 @@ from polhode.free._tangent import (
     products_of_momenta,
     squares_of_momenta,
 )
+from polhode.hamiltonian import triple
 from polhode.xla import opaque_ones, settled
 
 Scalars = Float[Array, "*b"]
@@ -77,7 +78,7 @@ def _relative_turn(swing: Swing, turning: Turning, frame: Frame, at: Instant, st
     """Quaternion from the attitude at t to that at the start, its vector part exact when small."""
     l1, l2, l3 = frame.turned(swing.momentum)
     s1, s2, s3 = frame.turned(step)
-    c, s = at.half
+    c, s = at.turned
     height = turning.length + l3
     tilt = jnp.sqrt(height * height + l1 * l1 + l2 * l2)
     c, s = c / tilt, s / tilt
@@ -208,12 +209,14 @@ _relative.defjvp(_relative_rule, symbolic_zeros=True)
 
 
 def _turn_in_time(tangent: _Tangent, dt) -> Triple:
+    turn, swing = tangent.turn, tangent.swing
+    if turn is None:
+        raise ValueError("the tangent was worked out for the rates alone: ask for the attitude.")
     if dt is None:
-        return tangent.turn
-    swing = tangent.swing
-    return tuple(
+        return turn
+    return triple(
         e + n * d * (swing.pulse * dt)
-        for e, n, d in zip(tangent.turn, tangent.now, swing.inverse, strict=True)
+        for e, n, d in zip(turn, tangent.now, swing.inverse, strict=True)
     )
 
 

@@ -32,8 +32,8 @@ def incomplete(S: Scalars, C: Scalars, N: Scalars, many: bool) -> tuple[Scalars,
     """
 
     def duplicate(_, carry):
-        *sums, x, y, z, share = carry
-        return halve(*sums, x, y, z, share, jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z))
+        first, second, x, y, z, share = carry
+        return halve(first, second, x, y, z, share, jnp.sqrt(x), jnp.sqrt(y), jnp.sqrt(z))
 
     def halve(first, second, x, y, z, share, u, v, w):
         grow = u * v + v * w + w * u

@@ -21,6 +21,7 @@ from jaxtyping import Array, Float
 
 from polhode.free._motion import Swing
 from polhode.free._roles import Triple
+from polhode.hamiltonian import triple
 
 Scalars = Float[Array, "*b"]
 
@@ -41,7 +42,7 @@ class Partials(NamedTuple):
     N: tuple[Scalars, Scalars]
 
     def along(self, dx: Scalars, dz: Scalars) -> Triple:
-        return tuple(fx * dx + fz * dz for fx, fz in self)
+        return triple(fx * dx + fz * dz for fx, fz in self)
 
 
 def partials(x: Scalars, y: Scalars, functions: Triple, first: Scalars, second: Scalars):

@@ -9,6 +9,7 @@ from polhode.hamiltonian._attitude import (
     dot as dot,
     from_euler_angles as from_euler_angles,
     from_quaternion as from_quaternion,
+    triple as triple,
 )
 from polhode.hamiltonian._costate import LiePoissonCostate as LiePoissonCostate
 from polhode.hamiltonian._energy import (

@@ -1,6 +1,6 @@
 """The attitude as a potential or torque sees it: rows of R, computed only when asked for."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 
 import jax.numpy as jnp
 from jaxtyping import Array
@@ -19,6 +19,12 @@ def dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
 def cross(a: Sequence[Array], b: Sequence[Array]) -> Vector:
     """Vector product of two component triples."""
     return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def triple(values: Iterable[Array]) -> Vector:
+    """Three component arrays, one after the other, as a tuple of three; ValueError for others."""
+    x, y, z = values
+    return x, y, z
 
 
 def components(array: Array) -> Vector:
@@ -66,11 +72,11 @@ class Attitude:
         """Body components ``R^T v`` of a vector given by space components."""
         x, y, z = (self.row(i) for i in range(3))
         a, b, c = vector_space
-        return tuple(a * x[k] + b * y[k] + c * z[k] for k in range(3))
+        return triple(a * x[k] + b * y[k] + c * z[k] for k in range(3))
 
     def to_space(self, vector_body: Sequence[Array]) -> Vector:
         """Space components ``R v`` of a vector given by body components."""
-        return tuple(dot(self.row(i), vector_body) for i in range(3))
+        return triple(dot(self.row(i), vector_body) for i in range(3))
 
     @property
     def matrix(self) -> Array:

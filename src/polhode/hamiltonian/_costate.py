@@ -12,6 +12,7 @@ and N look at moves along. L. S. Pontryagin et al., The Mathematical Theory of O
 Viewpoint (2004), section 18.2.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -94,5 +95,5 @@ class LiePoissonCostate(NamedTuple):
         return from_quaternion(place) if self.row is None else from_rows({self.row: place})
 
 
-def _inner(a, b) -> Array:
+def _inner(a: Sequence[Array], b: Sequence[Array]) -> Array:
     return sum((x * y for x, y in zip(a[1:], b[1:])), start=a[0] * b[0])

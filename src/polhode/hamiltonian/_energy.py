@@ -80,7 +80,8 @@ class Hamiltonian(eqx.Module):
 
     def rows_used(self, attitude: Attitude, t: Array | float) -> tuple[int, ...]:
         """Which rows of R the potential looks at (found by tracing it once; none without one)."""
-        if self.potential is None:
+        potential = self.potential
+        if potential is None:
             return ()
         row = jax.eval_shape(lambda: attitude.compute(2))  # not kept: no leak
         used: tuple[int, ...] = ()
@@ -88,7 +89,7 @@ class Hamiltonian(eqx.Module):
         def look(rows):
             nonlocal used
             seen = Attitude(lambda i: rows[i])
-            energy = self.potential.energy(seen, t, self.inertia)
+            energy = potential.energy(seen, t, self.inertia)
             used = seen.used
             return energy
 

@@ -8,6 +8,7 @@ loses energy inside (``torques.EnergySink``), else absent.
 """
 
 from collections.abc import Callable, Sequence
+from operator import add
 from typing import Any
 
 import equinox as eqx
@@ -15,7 +16,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode.hamiltonian._attitude import Attitude, Vector, cross, dot, from_quaternion, from_rows
+from polhode.hamiltonian._attitude import (
+    Attitude,
+    Vector,
+    cross,
+    dot,
+    from_quaternion,
+    from_rows,
+    triple,
+)
 from polhode.hamiltonian._energy import Hamiltonian
 from polhode.rotation import quaternion_rate as quaternion_rate
 
@@ -27,8 +36,9 @@ def rates_and_torque(
     t: Array | float,
 ) -> tuple[Vector, Vector | None]:
     """Body rates dH/dL [rad/s] and the potential's torque in body axes [N m] (None without one)."""
-    used = () if hamiltonian.potential is None else hamiltonian.rows_used(attitude, t)
-    rows = {i: attitude.row(i) for i in used}
+    rows = {}
+    if attitude is not None:
+        rows = {i: attitude.row(i) for i in hamiltonian.rows_used(attitude, t)}
 
     def total(momentum, rows):
         return jnp.sum(hamiltonian(momentum, from_rows(rows), t))
@@ -37,7 +47,7 @@ def rates_and_torque(
     if not rows:
         return omega, None
     turns = [cross(rows[i], slopes[i]) for i in rows]
-    return omega, tuple(sum(parts[1:], start=parts[0]) for parts in zip(*turns))
+    return omega, triple(sum(parts[1:], start=parts[0]) for parts in zip(*turns))
 
 
 def external_power(
@@ -131,13 +141,13 @@ def _motion(t, momentum, attitude, dynamics) -> tuple[Vector, Vector, Vector]:
     """The same, and dH/dL [rad/s]."""
     omega, turn = rates_and_torque(dynamics.hamiltonian, momentum, attitude, t)
     slip = None if dynamics.torque is None else dynamics.torque.slip(t, momentum, omega)
-    turning = omega if slip is None else tuple(a + b for a, b in zip(omega, slip))
+    turning = omega if slip is None else triple(map(add, omega, slip))
     rate = cross(momentum, turning)
     if turn is not None:
-        rate = tuple(a + b for a, b in zip(rate, turn))
+        rate = triple(map(add, rate, turn))
     if dynamics.torque is not None:
         push = dynamics.torque.body_components(t, attitude, omega)
-        rate = tuple(a + b for a, b in zip(rate, push))
+        rate = triple(map(add, rate, push))
     return rate, turning, omega
 
 

@@ -148,7 +148,7 @@ def array(*shape: int, scalar: bool = False, positive: bool = False) -> Checked:
             and all(has_shape(entry, shape[1:]) for entry in value)
         )
 
-    def floats(value):
+    def floats(value: Any) -> Any:
         return [floats(v) for v in value] if isinstance(value, list) else float(value)
 
     def check(value: object) -> list:

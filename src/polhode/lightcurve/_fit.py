@@ -85,7 +85,8 @@ def fit_light_curve(
 
 def _blur(curve: LightCurve) -> float:
     """How far off the frequencies of a series may be: its grid, and the turn of the directions."""
-    bisector = curve.sun + curve.observer
+    sun, observer = curve._known_directions()
+    bisector = sun + observer
     bisector = bisector / np.linalg.norm(bisector, axis=1, keepdims=True)
     turned = np.arccos(
         np.clip((bisector @ bisector[:: max(1, len(bisector) // 50)].T).min(), -1, 1)
@@ -148,10 +149,9 @@ def _mirrors(curve: LightCurve) -> np.ndarray:
     The plane of Sun and observer: exactly, while they keep to it. The plane across the bisector of
     their directions, and the one across both: the better, the smaller the phase angle.
     """
-    assert curve.sun is not None  # or it has no points
-    assert curve.observer is not None
-    first = np.linalg.svd(np.vstack([curve.sun, curve.observer]))[2][-1]
-    middle = (curve.sun + curve.observer).sum(0)
+    sun, observer = curve._known_directions()
+    first = np.linalg.svd(np.vstack([sun, observer]))[2][-1]
+    middle = (sun + observer).sum(0)
     middle = middle - first * (first @ middle)
     middle = middle / np.linalg.norm(middle)
     return np.stack([first, middle, np.cross(first, middle)])

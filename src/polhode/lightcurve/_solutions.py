@@ -137,12 +137,11 @@ def described(problem: Problem, state: State, order, curve: LightCurve, normals,
 def notes_on(curve: LightCurve, solutions, scale: float) -> tuple[str, ...]:
     """What this light curve cannot show, in sentences."""
     notes = list(curve.notes)
-    assert curve.sun is not None  # or it has no solutions
-    assert curve.observer is not None
-    directions = np.vstack([curve.sun, curve.observer])
+    sun, observer = curve._known_directions()
+    directions = np.vstack([sun, observer])
     wander = max(
         np.degrees(np.arccos(np.clip((v @ v.mean(0) / np.linalg.norm(v.mean(0))).min(), -1, 1)))
-        for v in (curve.sun, curve.observer)
+        for v in (sun, observer)
     )
     if wander < 5:
         notes.append(

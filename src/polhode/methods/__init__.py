@@ -8,6 +8,7 @@ from polhode.methods._base import (
 from polhode.methods._charts import (
     EulerChart as EulerChart,
     LiePoissonChart as LiePoissonChart,
+    natural_rates as natural_rates,
 )
 from polhode.methods._inputs import (
     check_inputs as check_inputs,

@@ -18,17 +18,17 @@ from polhode._state import State
 from polhode.inertia import Symmetry
 from polhode.methods._base import AbstractMethod, Record
 from polhode.methods._charts import LiePoissonChart
-from polhode.methods._stepped import LiePoisson
+from polhode.methods._stepped import LiePoisson, Stepped
 from polhode.methods.exact import LAWS, ClosedForm, lawful
 from polhode.solvers import Extrapolation
 from polhode.torques import GravityGradient, UniformGravity
 
 
 def _named(method: AbstractMethod) -> str:
-    solver = getattr(method, "solver", None)
-    if solver is None:
+    if not isinstance(method, Stepped):
         return type(method).__name__
-    return f"{type(method.chart).__name__.removesuffix('Chart')}({type(solver).__name__})"
+    chart = type(method.chart).__name__.removesuffix("Chart")
+    return f"{chart}({type(method.solver).__name__})"
 
 
 @dataclass(frozen=True)
@@ -227,7 +227,7 @@ def _error(method: AbstractMethod, scene: Scene, state: State, ts: Array, rtol: 
     """The error of the attitude that is to be expected, in words."""
     eps = float(jnp.finfo(state.wxyz.dtype).eps)
     if not method.exact:
-        if getattr(method, "controller", None) is not None or hasattr(method.solver, "check"):
+        if not method.keeps_rtol:
             return "as the steps asked for make it"
         if not is_concrete(rtol):
             return "about rtol rad at every saved time, by an estimate that the steps compute"

@@ -117,7 +117,8 @@ class Stepped(AbstractMethod):
             throw=False,
         )
         error = getattr(solution.solver_state, "error", None)
-        samples, last = solution.ys
+        ys: Any = solution.ys
+        samples, last = ys
         steps, status = _outcome(solution, y0[0][0].shape)
         return Moved(samples, last, steps, status, error)
 

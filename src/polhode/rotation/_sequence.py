@@ -40,6 +40,20 @@ class Sequence(enum.Enum):
     ZXY_SPACE = ((2, 0, 1), True)
     ZYX_SPACE = ((2, 1, 0), True)
 
+    @classmethod
+    def of(cls, axes: str) -> "Sequence":
+        """The sequence that SciPy writes so: ``"ZYX"`` intrinsic, ``"zyx"`` extrinsic.
+
+        Raises ValueError for anything but three letters of one case, neighbours different.
+        """
+        name = axes.upper() + ("_SPACE" if axes.islower() else "")
+        if name not in cls.__members__ or not (axes.islower() or axes.isupper()):
+            raise ValueError(
+                f"no sequence is called {axes!r}: give three of XYZ about body axes or three of xyz"
+                ' about space axes, neighbours different, such as "ZYX" (yaw, pitch, roll).'
+            )
+        return cls[name]
+
     @property
     def axes(self) -> tuple[int, int, int]:
         """Axes in the order in which the angles are given; 0, 1, 2 are x, y, z."""

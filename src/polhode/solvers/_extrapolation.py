@@ -109,8 +109,9 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         del made_jump
-        move = self._one if self.accuracy is None else self._many
-        return move(terms, t0, t1, y0, args, solver_state)
+        if self.accuracy is None:
+            return self._one(terms, t0, t1, y0, args, solver_state)
+        return self._many(self.accuracy, terms, t0, t1, y0, args, solver_state)
 
     def _one(self, terms, t0, t1, y0, args, low):
         """One step of the method."""
@@ -135,14 +136,14 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         dense = collocate(terms, t0, t1, nodes, y1, args, self._fixed_order)
         return y1, error, dense, low, diffrax.RESULTS.successful
 
-    def _many(self, terms, t0, t1, y0, args, progress: Progress):
+    def _many(self, accuracy: Accuracy, terms, t0, t1, y0, args, progress: Progress):
         """As many as the error asked for needs."""
         y, tree = jax.tree.flatten(y0)
         dtype = jnp.result_type(*y)
         problem = BoundTerm.of(terms, args).prepared(t0, y0, dtype)
-        rtol = jnp.asarray(self.accuracy.rtol, dtype)
+        rtol = jnp.asarray(accuracy.rtol, dtype)
         given = table(self.formal_order or order_for(rtol), dtype)
-        horizon = jnp.asarray(self.accuracy.horizon, t0.dtype)
+        horizon = jnp.asarray(accuracy.horizon, t0.dtype)
         units = units_of(args, y0, horizon)
 
         def run(held, given, units, rtol, horizon, span, y, progress):

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -39,7 +40,7 @@ def _compute(*arrays, forward, backward, count, shapes):
 
 @_linear_p.def_abstract_eval
 def _shapes(*_, forward, backward, count, shapes):
-    return [jax.core.ShapedArray(shape, dtype) for shape, dtype in shapes]
+    return [ShapedArray(shape, dtype) for shape, dtype in shapes]
 
 
 def _jvp(arrays, tangents, *, count, **params):

@@ -7,6 +7,7 @@ from polhode.torques._couplings import (
     ViscousCoupling as ViscousCoupling,
 )
 from polhode.torques._dissipation import EnergySink as EnergySink
+from polhode.torques._frames import LVLH as LVLH, RelativeTorque as RelativeTorque
 from polhode.torques._laws import (
     BDot as BDot,
     DipoleField as DipoleField,
@@ -15,6 +16,7 @@ from polhode.torques._laws import (
     RateDamping as RateDamping,
 )
 from polhode.torques._orbit import (
+    AbstractOrbit as AbstractOrbit,
     KeplerOrbit as KeplerOrbit,
     StateOrbit as StateOrbit,
     eccentric_anomaly as eccentric_anomaly,

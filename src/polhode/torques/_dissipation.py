@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_number, is_concrete, require
-from polhode.hamiltonian import Vector, cross
+from polhode.hamiltonian import Vector, cross, triple
 from polhode.parts import checked, mapped, shaped
 from polhode.torques._torques import AbstractTorque
 
@@ -77,4 +77,4 @@ class EnergySink(AbstractTorque):
         if callable(rate):
             given = (jnp.stack(jnp.broadcast_arrays(*x), axis=-1) for x in (momentum, omega))
             rate = mapped("EnergySink", rate, _ARGUMENTS, _SHAPES, (), *given)
-        return tuple(rate * x for x in cross(momentum, omega))
+        return triple(rate * x for x in cross(momentum, omega))

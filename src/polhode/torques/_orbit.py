@@ -1,5 +1,8 @@
-"""Position on a Kepler orbit, for the gravity gradient."""
+"""Position and velocity on a Kepler orbit: gravity gradients and orbit frames follow it."""
 
+import abc
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,17 +44,60 @@ def _lag(x: Array) -> Array:
     return jnp.where(square < 0.25, x * square / 6 * total, x - jnp.sin(x))
 
 
-class KeplerOrbit(AbstractPart):
-    """Position of a body on an ellipse about an attracting centre: ``orbit(t)`` (..., 3) [m].
+def hyperbolic_anomaly(mean: Float[Array, "*b"], eccentricity: Float[Array, "*b"]) -> Array:
+    """F with e sinh F - F = M [rad] for e > 1; as ``eccentric_anomaly``."""
+    sign = jnp.where(mean < 0, -1, 1).astype(mean.dtype)
+    m, e = jax.lax.stop_gradient((jnp.abs(mean), eccentricity))
+    # sinh F >= F, sinh F - F >= F^3/6, and e sinh F = M + F with what bounds F
+    most = jnp.minimum(m / (e - 1), jnp.cbrt(6 * m / e))
+    root = jnp.minimum(most, jnp.arcsinh((m + most) / e))
 
-    **Arguments** (each (...), a batch broadcasts): ``mu`` [m^3/s^2]; ``semi_major_axis`` [m];
-    ``eccentricity`` in [0, 1); ``inclination``, ``node`` (longitude of the ascending node),
-    ``periapsis`` (its argument), ``mean_anomaly`` at the time ``epoch`` [rad, s]. Space axes: z is
-    the pole that the inclination is counted from, x the direction that the node is counted from.
+    def step(x, m, e):
+        half = jnp.sinh(x / 2)
+        return x - ((e - 1) * x + e * _lead(x) - m) / (e - 1 + 2 * e * half * half)
+
+    root = jax.lax.fori_loop(0, 8, lambda _, x: step(x, m, e), root)
+    root = jax.lax.stop_gradient(root)
+    for _ in range(2):
+        root = step(root, sign * mean, eccentricity)
+    return sign * root
+
+
+def _lead(x: Array) -> Array:
+    """sinh x - x, without cancellation at small x."""
+    square = x * x
+    total = jnp.ones_like(x)
+    for k in range(8, 0, -1):
+        total = 1 + square * total / ((2 * k + 2) * (2 * k + 3))
+    return jnp.where(square < 1, x * square / 6 * total, jnp.sinh(x) - x)
+
+
+class AbstractOrbit(AbstractPart):
+    """Base of the orbits: position ``orbit(t)`` and ``velocity_at(t)`` of a body about a centre."""
+
+    @abc.abstractmethod
+    def __call__(self, t: Array | float) -> Float[Array, "*b 3"]:
+        """Position (..., 3) from the attracting centre, space axes [m], at the time t [s]."""
+
+    def velocity_at(self, t: Array | float) -> Float[Array, "*b 3"]:
+        """Velocity (..., 3) in space axes [m/s] at the time t [s]."""
+        t = jnp.asarray(t, jnp.result_type(*jax.tree.leaves(self)))
+        return jax.jvp(self, (t,), (jnp.ones_like(t),))[1]
+
+
+class KeplerOrbit(AbstractOrbit):
+    """Position of a body on a conic about an attracting centre: ``orbit(t)`` (..., 3) [m].
+
+    **Arguments** (each (...), a batch broadcasts): ``mu`` [m^3/s^2]; ``semi_major_axis`` [m], of a
+    hyperbola negative; ``eccentricity``, in [0, 1) or of a hyperbola above 1; ``inclination``,
+    ``node`` (longitude of the ascending node), ``periapsis`` (its argument), ``mean_anomaly`` at
+    the time ``epoch`` [rad, s], counted from periapsis. Space axes: z is the pole that the
+    inclination is counted from, x the direction that the node is counted from. All orbits of a
+    batch are of one kind; ``hyperbolic`` (static) tells which where the numbers are traced.
 
     Hand it to ``ph.GravityGradient(mu, orbit)``; ``ph.StateOrbit`` takes place and velocity instead
-    of elements. Raises ValueError for mu or an axis that is not positive, or an eccentricity
-    outside [0, 1).
+    of elements. Raises ValueError for mu that is not positive, an axis of the wrong sign, or an
+    eccentricity that is negative or 1.
     """
 
     mu: Float[Array, "*#b"] = shaped()
@@ -62,6 +108,7 @@ class KeplerOrbit(AbstractPart):
     periapsis: Float[Array, "*#b"] = shaped()
     mean_anomaly: Float[Array, "*#b"] = shaped()
     epoch: Float[Array, "*#b"] = shaped()
+    hyperbolic: bool = eqx.field(static=True, default=False)
 
     def __init__(
         self,
@@ -73,36 +120,51 @@ class KeplerOrbit(AbstractPart):
         periapsis=0.0,
         mean_anomaly=0.0,
         epoch=0.0,
+        hyperbolic=None,
     ):
         given = locals()
         numbers = {name: as_number(name, given[name]) for name in self.core_ranks}
         dtype = jnp.result_type(*(x for x in numbers.values()))
         for name, value in numbers.items():
             setattr(self, name, value.astype(dtype))
-        for name in ("mu", "semi_major_axis"):
-            value = getattr(self, name)
-            if is_concrete(value):
-                require(np.asarray(value) > 0, f"{name} must be positive, got {given[name]}.")
+        if is_concrete(self.mu):
+            require(np.asarray(self.mu) > 0, f"mu must be positive, got {mu}.")
         if is_concrete(self.eccentricity):
-            given = np.asarray(self.eccentricity)
+            e = np.asarray(self.eccentricity)
+            if hyperbolic is None:
+                hyperbolic = bool(np.all(e > 1))
             require(
-                (given >= 0) & (given < 1),
-                f"eccentricity must lie in [0, 1), got {eccentricity}: other conics are not"
-                " supported; hand GravityGradient any function of time instead.",
+                e > 1 if hyperbolic else (e >= 0) & (e < 1),
+                f"eccentricity must lie in [0, 1), or for a batch of hyperbolas above 1, got"
+                f" {eccentricity}.",
+            )
+        self.hyperbolic = bool(hyperbolic)
+        if is_concrete(self.semi_major_axis):
+            axis = np.asarray(self.semi_major_axis)
+            require(
+                axis < 0 if self.hyperbolic else axis > 0,
+                "semi_major_axis must be positive, of a hyperbola (eccentricity above 1) negative,"
+                f" got {semi_major_axis}.",
             )
 
     @property
     def mean_motion(self) -> Array:
-        """sqrt(mu/a^3) [rad/s]."""
-        return jnp.sqrt(self.mu / self.semi_major_axis) / self.semi_major_axis
+        """sqrt(mu/|a|^3) [rad/s]."""
+        axis = jnp.abs(self.semi_major_axis)
+        return jnp.sqrt(self.mu / axis) / axis
 
     def __call__(self, t: Array | float) -> Float[Array, "*b 3"]:
         mean = self.mean_anomaly + self.mean_motion * (t - self.epoch)
-        mean = mean - 2 * jnp.pi * jnp.round(mean / (2 * jnp.pi))
         e = self.eccentricity
-        anomaly = eccentric_anomaly(*jnp.broadcast_arrays(mean, e))
-        along = self.semi_major_axis * (jnp.cos(anomaly) - e)
-        across = self.semi_major_axis * jnp.sqrt(1 - e * e) * jnp.sin(anomaly)
+        if self.hyperbolic:
+            anomaly = hyperbolic_anomaly(*jnp.broadcast_arrays(mean, e))
+            along = self.semi_major_axis * (jnp.cosh(anomaly) - e)
+            across = -self.semi_major_axis * jnp.sqrt(e * e - 1) * jnp.sinh(anomaly)
+        else:
+            mean = mean - 2 * jnp.pi * jnp.round(mean / (2 * jnp.pi))
+            anomaly = eccentric_anomaly(*jnp.broadcast_arrays(mean, e))
+            along = self.semi_major_axis * (jnp.cos(anomaly) - e)
+            across = self.semi_major_axis * jnp.sqrt(1 - e * e) * jnp.sin(anomaly)
         cw, sw = jnp.cos(self.periapsis), jnp.sin(self.periapsis)
         u, v = cw * along - sw * across, sw * along + cw * across
         cn, sn = jnp.cos(self.node), jnp.sin(self.node)
@@ -111,28 +173,32 @@ class KeplerOrbit(AbstractPart):
         return jnp.stack(jnp.broadcast_arrays(*place), axis=-1)
 
 
-class StateOrbit(AbstractPart):
-    """Position on the ellipse through a given place and velocity: ``orbit(t)`` (..., 3) [m].
+class StateOrbit(AbstractOrbit):
+    """Position on the conic through a given place and velocity: ``orbit(t)`` (..., 3) [m].
 
     **Arguments** (a batch broadcasts): ``mu`` (...) [m^3/s^2]; ``position`` (..., 3) [m] from the
     attracting centre and ``velocity`` (..., 3) [m/s] at the time ``epoch`` (...) [s], both in
     space axes. Derivatives are regular everywhere, also for circular and equatorial orbits, whose
-    elements (``KeplerOrbit``) are not.
+    elements (``KeplerOrbit``) are not. All orbits of a batch are ellipses, or all are hyperbolas,
+    for fly-bys; ``hyperbolic`` (static) tells which where the numbers are traced.
 
-    Lagrange's f and g functions of the difference in eccentric anomaly (R. H. Battin, An
-    Introduction to the Mathematics and Methods of Astrodynamics, 1999).
+    Lagrange's f and g functions of the difference in eccentric or hyperbolic anomaly (R. H. Battin,
+    An Introduction to the Mathematics and Methods of Astrodynamics, 1999).
 
-    Hand it to ``ph.GravityGradient(mu, orbit)``. Raises ValueError for mu that is not positive, or
-    a state that is not on an ellipse: too fast to be bound, or moving straight to or from the
-    centre.
+    Hand it to ``ph.GravityGradient(mu, orbit)`` or ``ph.LVLH(orbit)``. Raises ValueError for mu
+    that is not positive, or a state on neither: a parabola, ellipses among hyperbolas, or moving
+    straight to or from the centre.
+
+        flyby = ph.StateOrbit(3.986e14, position=[3.8e7, 0, 0], velocity=[0, 7.4e3, 0])
     """
 
     mu: Float[Array, "*#b"] = shaped()
     position: Float[Array, "*#b 3"] = shaped(3)
     velocity: Float[Array, "*#b 3"] = shaped(3)
     epoch: Float[Array, "*#b"] = shaped()
+    hyperbolic: bool = eqx.field(static=True, default=False)
 
-    def __init__(self, mu, position, velocity, epoch=0.0):
+    def __init__(self, mu, position, velocity, epoch=0.0, hyperbolic=None):
         given = {
             "mu": as_number("mu", mu),
             "position": as_float_array("position", position, (3,)),
@@ -148,11 +214,13 @@ class StateOrbit(AbstractPart):
             place, speed = np.asarray(self.position), np.asarray(self.velocity)
             distance = np.linalg.norm(place, axis=-1)
             excess = distance * np.sum(speed * speed, axis=-1) / np.asarray(self.mu)
+            if hyperbolic is None:
+                hyperbolic = bool(np.all(excess > 2))
             require(
-                (distance > 0) & (excess < 2),
-                f"position and velocity must lie on an ellipse, |v|^2 |r|/mu below 2, got"
-                f" {describe(excess)}: check the units, or hand GravityGradient any function of"
-                " time instead.",
+                (distance > 0) & ((excess > 2 + 1e-9) if hyperbolic else (excess < 2)),
+                "position and velocity must lie on an ellipse, |v|^2 |r|/mu below 2, or for a"
+                f" batch of hyperbolas above 2, got {describe(excess)}: check the units, or hand"
+                " GravityGradient any function of time instead.",
             )
             moment = np.linalg.norm(np.cross(place, speed), axis=-1)
             require(
@@ -162,22 +230,32 @@ class StateOrbit(AbstractPart):
                 f" {describe(speed)} at {describe(place)}.",
             )
 
+        self.hyperbolic = bool(hyperbolic)
+
     def __call__(self, t: Array | float) -> Float[Array, "*b 3"]:
         r0 = jnp.linalg.norm(self.position, axis=-1)
         bound = 2 - r0 * jnp.sum(self.velocity * self.velocity, axis=-1) / self.mu
-        axis = r0 / bound
+        axis = r0 / jnp.abs(bound)
         n = jnp.sqrt(self.mu / axis) / axis  # mean motion
         # e cos E and e sin E at the epoch
         a = 1 - bound
         b = jnp.sum(self.position * self.velocity, axis=-1) / jnp.sqrt(self.mu * axis)
         mean = n * (t - self.epoch)
-        mean = mean - 2 * jnp.pi * jnp.round(mean / (2 * jnp.pi))
-        x = _anomaly_since(*jnp.broadcast_arrays(mean, a, b))
-        half, sine = jnp.sin(x / 2), jnp.sin(x)
-        turn = 2 * half * half  # 1 - cos x
+        if self.hyperbolic:
+            x = _hyperbolic_since(*jnp.broadcast_arrays(mean, a, b))
+            half, sine = jnp.sinh(x / 2), jnp.sinh(x)
+        else:
+            mean = mean - 2 * jnp.pi * jnp.round(mean / (2 * jnp.pi))
+            x = _anomaly_since(*jnp.broadcast_arrays(mean, a, b))
+            half, sine = jnp.sin(x / 2), jnp.sin(x)
+        turn = 2 * half * half  # 1 - cos x, or cosh x - 1
+        bound = jnp.abs(bound)
         f = 1 - turn / bound
         g = (bound * sine + b * turn) / n
-        return f[..., None] * self.position + g[..., None] * self.velocity
+        place, velocity = (
+            jnp.broadcast_to(x, (*f.shape, 3)) for x in (self.position, self.velocity)
+        )
+        return f[..., None] * place + g[..., None] * velocity
 
 
 def _anomaly_since(mean: Array, a: Array, b: Array) -> Array:
@@ -193,4 +271,19 @@ def _anomaly_since(mean: Array, a: Array, b: Array) -> Array:
         half, sine = jnp.sin(x / 2), jnp.sin(x)
         turn = 2 * half * half
         x = x - (x - a * sine + b * turn - mean) / (1 - a * (1 - turn) + b * sine)
+    return x
+
+
+def _hyperbolic_since(mean: Array, a: Array, b: Array) -> Array:
+    """x with a sinh x + b (cosh x - 1) - x = mean, where a = e cosh F0 and b = e sinh F0."""
+    m, p, q = jax.lax.stop_gradient((mean, a, b))
+    eccentricity = jnp.sqrt((p - q) * (p + q))
+    at_epoch = jnp.arcsinh(q / eccentricity)
+    x = hyperbolic_anomaly(q - at_epoch + m, eccentricity) - at_epoch
+    x = jax.lax.stop_gradient(x)
+    for _ in range(2):  # these carry the derivatives
+        half, sine = jnp.sinh(x / 2), jnp.sinh(x)
+        turn = 2 * half * half
+        gap = (a - 1) * x + a * _lead(x) + b * turn - mean
+        x = x - gap / (a - 1 + a * turn + b * sine)
     return x

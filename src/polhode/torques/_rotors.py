@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import numbers, require, together
-from polhode.hamiltonian import Attitude, Vector, dot
+from polhode.hamiltonian import Attitude, Vector, dot, triple
 from polhode.inertia import Inertia, Symmetry
 from polhode.parts import AbstractPart, mapped, shaped
 from polhode.torques._couplings import Couplings
@@ -75,20 +75,22 @@ class AbstractRotor(AbstractPart):
         lead = np.broadcast_shapes(*(x.shape for column in columns for x in column[1:]))
         lead = np.broadcast_shapes(lead, *(column[0].shape[:-1] for column in columns))
         axes = jnp.stack([jnp.broadcast_to(c[0], (*lead, 3)) for c in columns], axis=-2)
-        rest = [
+        momentum, inertia, torque = (
             jnp.stack([jnp.broadcast_to(column[i], lead) for column in columns], axis=-1)
             for i in (1, 2, 3)
-        ]
+        )
         couplings = tuple(w.coupling for w in self.wheels if w.coupling is not None)
         return Wheels(
-            axes,
-            *rest,
-            start,
-            tuple(wheel.impulse for wheel in self.wheels),
-            Couplings(couplings) if couplings else None,
-            tuple(wheel.is_held for wheel in self.wheels),
-            tuple(wheel.along for wheel in self.wheels),
-            tuple(i for i, wheel in enumerate(self.wheels) if wheel.coupling is not None),
+            impulses=tuple(wheel.impulse for wheel in self.wheels),
+            held=tuple(wheel.is_held for wheel in self.wheels),
+            along=tuple(wheel.along for wheel in self.wheels),
+            coupled=tuple(i for i, wheel in enumerate(self.wheels) if wheel.coupling is not None),
+            axes=axes,
+            momentum=momentum,
+            inertia=inertia,
+            torque=torque,
+            start=start,
+            couplings=Couplings(couplings) if couplings else None,
         )
 
 
@@ -118,16 +120,16 @@ class Wheels(AbstractRotor):
     in ``momentum``; ``spins``: their momenta of the moment, see ``at``.
     """
 
+    impulses: tuple[Callable | None, ...]
+    held: tuple[bool, ...] = eqx.field(static=True)
+    along: tuple[int | None, ...] = eqx.field(static=True)
+    coupled: tuple[int, ...] = eqx.field(static=True)
     axes: Float[Array, "*#b m 3"] = shaped(None, 3)
     momentum: Float[Array, "*#b m"] = shaped(None)
     inertia: Float[Array, "*#b m"] = shaped(None)
     torque: Float[Array, "*#b m"] = shaped(None)
     start: Float[Array, "*#b"] = shaped()
-    impulses: tuple[Callable | None, ...]
     couplings: Couplings | None = shaped()
-    held: tuple[bool, ...] = eqx.field(static=True)
-    along: tuple[int | None, ...] = eqx.field(static=True)
-    coupled: tuple[int, ...] = eqx.field(static=True)
     spins: tuple[Array, ...] = ()
 
     @property
@@ -171,6 +173,13 @@ class Wheels(AbstractRotor):
     def at(self, spins: Sequence[Array]) -> "Wheels":
         """The wheels at a moment when those that are coupled have these momenta [kg m^2/s]."""
         return dataclasses.replace(self, spins=tuple(spins))
+
+    def begun(self, spins: Array) -> "Wheels":
+        """The wheels with these initial momenta (..., k) of those that are coupled."""
+        shape = jnp.broadcast_shapes(spins.shape[:-1], self.momentum.shape[:-1])
+        momentum = jnp.broadcast_to(self.momentum, (*shape, self.momentum.shape[-1]))
+        places = np.array(self.coupled, int)
+        return dataclasses.replace(self, momentum=momentum.at[..., places].set(spins))
 
     def initial_spins(self, like: Array) -> tuple[Array, ...]:
         """Momenta of the coupled wheels at the start, of the shape of ``like``."""
@@ -236,7 +245,7 @@ class Wheels(AbstractRotor):
             tuple(self.axial_momentum(i, t) * self.axes[..., i, k] for k in range(3))
             for i in range(len(self.held))
         ]
-        return tuple(sum(column[1:], start=column[0]) for column in zip(*parts))
+        return triple(sum(column[1:], start=column[0]) for column in zip(*parts))
 
     def energy(self, t: Array | float) -> Array | None:
         """c^2/(2J) of the wheels that are not held [J]; None without such."""
@@ -252,13 +261,14 @@ class Wheels(AbstractRotor):
         loose = [i for i, held in enumerate(self.held) if not held]
         if not loose:
             return inertia
-        if inertia.is_principal and all(self.along[i] is not None for i in loose):
+        along = [k for i in loose if (k := self.along[i]) is not None]
+        if inertia.is_principal and len(along) == len(loose):
             less = jnp.zeros((3,), inertia.dtype)
-            for i in loose:
+            for i, k in zip(loose, along):
                 column = [jnp.zeros_like(self.inertia[..., i])] * 3
-                column[self.along[i]] = self.inertia[..., i]
+                column[k] = self.inertia[..., i]
                 less = _plus(less, jnp.stack(column, axis=-1))
-            axial = all(self.along[i] == 2 for i in loose)
+            axial = all(k == 2 for k in along)
             symmetric = axial and inertia.symmetry is not Symmetry.NONE
             kind = Symmetry.AXISYMMETRIC if symmetric else Symmetry.NONE
             return Inertia.of_symmetry(_plus(inertia.moments, -less), kind, physical=False)

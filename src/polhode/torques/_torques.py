@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -76,19 +77,21 @@ class TorqueSum(AbstractTorque):
         return tuple(sum(rest, start=first) for first, *rest in parts) if parts else None
 
 
-def vector_of_time(name: str, n):
+def vector_of_time(name: str, n: Any) -> Array | Callable:
     """A constant vector (..., 3), or a function fn(t) -> (3,) after a look at what it returns."""
     if not callable(n):
         return as_float_array(name, n, (3,))
-    return n if isinstance(n, AbstractPart) else checked(name, n, ("t",), ((),), (3,))
+    if isinstance(n, AbstractPart) and callable(n):
+        return n
+    return checked(name, n, ("t",), ((),), (3,))
 
 
 def value_at(name: str, vector, t) -> tuple[Array, Array, Array]:
     """Components of such a vector; ``t`` may be an array of times: a function is mapped over it."""
     if not callable(vector):
         return components(vector)
-    if isinstance(vector, AbstractPart):  # carries the batch axes itself, such as KeplerOrbit
-        return components(vector(t))
+    if isinstance(vector, AbstractPart) and callable(vector):
+        return components(vector(t))  # carries the batch axes itself, such as KeplerOrbit
     return components(mapped(name, vector, ("t",), ((),), (3,), t))
 
 

@@ -187,7 +187,7 @@ class _Work:
             self.scaled[key] = self.emit(lax.mul, [a, b], [x.aval] * 2, [x.aval])[0].index
         return self.scaled[key]
 
-    def walk(self, jaxpr, consts, inputs) -> list[_Held | _Slot]:
+    def walk(self, jaxpr, consts, inputs) -> Sequence[_Held | _Slot]:
         env: dict[Any, Any] = dict(zip(jaxpr.constvars, map(_Held, consts)))
         env.update(zip(jaxpr.invars, inputs))
 
@@ -201,7 +201,7 @@ class _Work:
             env.update(zip(eqn.outvars, self.equation(eqn, given)))
         return [read(v) for v in jaxpr.outvars]
 
-    def equation(self, eqn, given) -> list[_Held | _Slot]:
+    def equation(self, eqn, given) -> Sequence[_Held | _Slot]:
         name = eqn.primitive.name
         if name in _CALLS:
             inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))

@@ -71,8 +71,8 @@ class AbstractTopMethod(AbstractExact):
         return map_chunks(one, (lanes, times), n, self._size(n, count))
 
     def _size(self, n: int, count: int) -> int:
-        """Lanes of a chunk."""
-        return max(1, self.chunk // count)
+        """Lanes of a chunk; without ``chunk`` all of them."""
+        return n if self.chunk is None else max(1, self.chunk // count)
 
 
 def with_first(

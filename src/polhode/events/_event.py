@@ -1,0 +1,68 @@
+"""What an event is: a function of attitude, rates and time that crosses zero."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from polhode import rotation
+from polhode._trajectory import Trajectory
+from polhode.parts import checked, mapped
+
+_ARGUMENTS = ("wxyz", "omega_body", "t")
+_SHAPES = ((4,), (3,), ())
+
+
+class Event(eqx.Module):
+    """A zero crossing of ``fn(wxyz, omega_body, t)``, a number of one body at one time.
+
+    **Arguments:** ``fn``: of the unit quaternion (4,) body -> space (of either sign), the body
+    rates (3,) [rad/s] and the time () [s], smooth; batches are mapped over it. ``direction``: 1
+    where fn rises through zero in time, -1 where it falls, 0 for both. ``samples``: at how many
+    equally spaced times the motion is looked at; None: 32 in a turn of the fastest natural rate
+    (see ``ph.crossings``); under ``jit`` it must be given.
+
+    Raises TypeError or ValueError for a function that takes or returns something else, another
+    direction, or fewer than two samples.
+
+        horizontal = ph.Event(lambda wxyz, omega_body, t: ph.rotation.rotate(wxyz, z)[2])
+    """
+
+    fn: Callable
+    direction: int = eqx.field(static=True)
+    samples: int | None = eqx.field(static=True)
+
+    def __init__(self, fn: Callable, direction: int = 0, samples: int | None = None):
+        self.fn = checked("Event", fn, _ARGUMENTS, _SHAPES, ())
+        if isinstance(direction, bool) or direction not in (-1, 0, 1):
+            raise ValueError(f"direction must be 1 (rising), -1 (falling) or 0, got {direction!r}.")
+        self.direction = int(direction)
+        self.samples = at_least("samples", samples, 2)
+
+    def values(self, trajectory: Trajectory) -> tuple[Array, Array]:
+        """The function and its rate of change [1/s] at every sample (..., T)."""
+        wxyz, omega = trajectory._need("wxyz"), trajectory._need("omega_body")
+        t = jnp.broadcast_to(trajectory._t, omega.shape[:-1])
+        slopes = (
+            rotation.wxyz_rate(wxyz, omega),
+            trajectory._scene.acceleration(wxyz, omega, trajectory._t),
+            jnp.ones_like(t),
+        )
+
+        def value(wxyz, omega, t):
+            return mapped("Event", self.fn, _ARGUMENTS, _SHAPES, (), wxyz, omega, t)
+
+        return jax.jvp(value, (wxyz, omega, t), slopes)
+
+
+def at_least(name: str, value: Any, least: int) -> int | None:
+    """A known integer not below ``least``, or None."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name} must be an integer, at least {least}, got {value!r:.40}.")
+    return int(value)

@@ -1,0 +1,157 @@
+"""Events: times known in closed form, pairs between looks, derivatives, and motions that stop."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import ellipk
+
+import polhode as ph
+
+RATE = 1.7
+BALL = ph.Scene(ph.Inertia.spherical(2.0))
+STATE = ph.State([1.0, 0.0, 0.0, 0.0], [0.0, RATE, 0.0])  # body x falls: its height is -sin(rate t)
+TS = jnp.array([0.0, 3.0, 10.0])
+
+
+class Height(eqx.Module):
+    """Of body x over a level; the level is a leaf, so that no new one compiles anything."""
+
+    level: jax.Array
+
+    def __call__(self, wxyz, omega_body, t):
+        return ph.rotation.rotate(wxyz, jnp.array([1.0, 0.0, 0.0]))[2] - self.level
+
+
+def height(level):
+    return Height(jnp.asarray(level, float))
+
+
+def known(level, rate=RATE, last=10.0):
+    """Times at which -sin(rate t) = level, by NumPy."""
+    base = np.arcsin(-level)
+    times = [(x + 2 * np.pi * k) / rate for k in range(40) for x in (base, np.pi - base)]
+    return np.sort([t for t in times if 1e-3 < t < last])
+
+
+@pytest.mark.parametrize("method", [None, ph.LiePoisson()], ids=["exact", "stepped"])
+def test_crossings_of_a_turning_ball(method):
+    """To 1e-12 of the time for exact laws; within what rtol allows for steps."""
+    tolerance = 1e-12 if method is None else 1e-9
+    traj = ph.simulate(BALL, STATE, TS, method, rtol=1e-11)
+    for level in (0.0, 0.4, -0.9):
+        found = ph.crossings(traj, height(level))
+        want = known(level)
+        assert int(found.count) == want.size == found.times.size
+        assert bool(found.complete)
+        np.testing.assert_allclose(found.times, want, rtol=tolerance)
+        np.testing.assert_allclose(found.slope, -RATE * np.cos(RATE * want), rtol=1e-8)
+    assert ph.crossings(traj, height(1.1)).times.shape == (0,)
+    # a pair far closer than the looks, and a maximum that stays just below
+    top = 1.5 * np.pi / RATE + 2 * np.pi / RATE * np.arange(2)
+    pair = ph.crossings(traj, height(1 - 1e-8))
+    apart = np.arccos(1 - 1e-8) / RATE
+    want = np.sort(np.concatenate([top - apart, top + apart]))
+    np.testing.assert_allclose(pair.times, want, rtol=0, atol=1e-7 if method is None else 1e-4)
+    assert ph.crossings(traj, height(1 + 1e-8)).count == 0
+
+
+def test_directions_and_time_that_runs_backwards():
+    traj = ph.simulate(BALL, STATE, -TS)
+    for direction in (-1, 1):
+        found = ph.crossings(traj, height(0.4), direction)
+        every = ph.crossings(traj, height(0.4))
+        wanted = np.sign(every.slope) == direction
+        np.testing.assert_allclose(found.times, np.asarray(every.times)[wanted], rtol=1e-14)
+        assert np.all(np.sign(found.slope) == direction)
+        assert np.all(np.diff(found.times) < 0)  # as the motion meets them
+
+
+def test_each_body_of_a_batch_has_times_of_its_own():
+    rates = np.array([0.05, 0.6, 1.3])
+    state = ph.State(STATE.wxyz, jnp.stack([jnp.zeros(3), jnp.asarray(rates), jnp.zeros(3)], -1))
+    traj = ph.simulate(BALL, state, TS)
+    found = ph.crossings(traj, height(0.4))
+    for k, rate in enumerate(rates):
+        want = known(0.4, rate)
+        assert found.count[k] == want.size
+        np.testing.assert_allclose(found.times[k, : want.size], want, rtol=1e-12)
+        assert np.all(np.isinf(found.times[k, want.size :]))
+    one = ph.crossings(traj, height(0.4), most=1)  # no room for all: told
+    np.testing.assert_array_equal(one.complete, found.count <= 1)
+    np.testing.assert_allclose(one.times[2, 0], known(0.4, 1.3)[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("method", [None, ph.LiePoisson()], ids=["exact", "stepped"])
+def test_event_times_have_derivatives(method):
+    """t = x / rate for a fixed phase x: dt/drate = -t/rate; and in the level, 1/slope."""
+
+    @jax.jit
+    @jax.value_and_grad
+    def second(given):
+        rate, level = given
+        state = ph.State(STATE.wxyz, jnp.stack([0 * rate, rate, 0 * rate]))
+        traj = ph.simulate(BALL, state, TS, method, rtol=1e-10)
+        return ph.crossings(traj, Height(level), most=3, samples=64).times[1]
+
+    time, (in_rate, in_level) = second((jnp.asarray(RATE), jnp.asarray(0.4)))
+    np.testing.assert_allclose(time, known(0.4)[1], rtol=1e-8)
+    np.testing.assert_allclose(in_rate, -time / RATE, rtol=1e-8)
+    np.testing.assert_allclose(in_level, -1 / (RATE * np.cos(RATE * time)), rtol=1e-7)
+
+
+def test_a_pendulum_passes_below_after_a_quarter_period():
+    """From rest at 1 rad: 4 K(sin^2(1/2)) / sqrt(m g l / I) by SciPy; its rate is gravity's."""
+    scene = ph.Scene(ph.Inertia.from_moments([0.8, 0.9, 0.5]), ph.UniformGravity(0.7, [0, 0, -0.3]))
+    state = ph.State([np.cos(0.5), np.sin(0.5), 0.0, 0.0], [0.0, 0.0, 0.0])
+    traj = ph.simulate(scene, state, [0.0, 6.0], rtol=1e-11)
+    found = ph.crossings(traj, lambda wxyz, omega_body, t: wxyz[1] * wxyz[0])
+    quarter = ellipk(np.sin(0.5) ** 2) / np.sqrt(0.7 * 9.80665 * 0.3 / 0.8)
+    want = quarter * np.arange(1, 40, 2)
+    np.testing.assert_allclose(found.times, want[want < 6], rtol=1e-9)
+
+
+def test_a_motion_stops_at_its_event_and_goes_on_with_another_scene():
+    """A thruster brings the body to a rate, w = a t; then it turns freely to an attitude."""
+    inertia = ph.Inertia.from_moments([1.0, 2.0, 2.5])
+    burning = ph.Scene(inertia, None, ph.BodyTorque([0.0, 0.5, 0.0]))  # 0.25 rad/s^2 about y
+    rest = ph.State([1.0, 0, 0, 0], jnp.zeros((2, 3)).at[1, 1].set(0.75))
+    reached = ph.Event(lambda wxyz, omega_body, t: omega_body[1] - 1.0, 1)
+    on = ph.simulate(burning, rest, jnp.linspace(0.0, 6.0, 4), until=reached)
+    np.testing.assert_allclose(on.event_time, [4.0, 1.0], rtol=1e-12)
+    np.testing.assert_allclose(on.ts, [[0, 2, 4, 4], [0, 1, 1, 1]], rtol=1e-12)
+    np.testing.assert_allclose(on.last.omega_body[:, 1], 1.0, rtol=1e-12)
+    np.testing.assert_allclose(on.omega_body[0, :2, 1], [0.0, 0.5], atol=1e-14)
+    ts = np.asarray(on.event_time)[:, None] + np.array([0.0, 5.0])
+    off = ph.simulate(ph.Scene(inertia), on.last, ts, until=ph.Event(height(0.0), -1))
+    turned = np.array([0.25 * 4**2 / 2, 0.75 + 0.25 / 2])  # at the switch; body x falls at 2 pi k
+    want = np.array([4.0, 1.0]) + (2 * np.pi - turned)
+    reached_again = want < np.asarray(ts[:, 1])
+    assert reached_again.tolist() == [True, False]
+    np.testing.assert_allclose(off.event_time, [want[0], np.inf], rtol=1e-11)
+    # at the surface of the event itself the motion starts: that is no crossing
+    again = ph.simulate(burning, on.last, ts, until=reached)
+    assert np.all(np.isinf(again.event_time))
+
+
+def test_what_cannot_be_searched_is_told():
+    traj = ph.simulate(BALL, STATE, TS)
+    with pytest.raises(ValueError, match="direction"):
+        ph.Event(height(0.0), 2)
+    with pytest.raises(ValueError, match="samples"):
+        ph.Event(height(0.0), samples=1)
+    with pytest.raises(TypeError, match="omega_body"):
+        ph.Event(lambda t: t)
+    with pytest.raises(ValueError, match="single number"):
+        ph.Event(lambda wxyz, omega_body, t: omega_body)
+    with pytest.raises(TypeError, match=r"ph\.Event"):
+        ph.simulate(BALL, STATE, TS, until=height(0.0))
+    with pytest.raises(ValueError, match="leave record"):
+        ph.simulate(BALL, STATE, TS, until=ph.Event(height(0.0)), record=ph.Record(rates=False))
+    for given, match in (({"most": 3}, "samples="), ({"samples": 30}, "most=")):
+        with pytest.raises(ValueError, match=match):
+            jax.jit(lambda traj, given=given: ph.crossings(traj, height(0.0), **given))(traj)
+    fast = ph.simulate(BALL, ph.State([1.0, 0, 0, 0], [0.0, 1e7, 0]), [0.0, 10.0])
+    with pytest.raises(ValueError, match="looks at each body"):
+        ph.crossings(fast, height(0.0))

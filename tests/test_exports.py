@@ -1,0 +1,102 @@
+"""What trajectories are written as: labels in xarray, SciPy's rotations, CCSDS messages."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import polhode as ph
+
+SCENE = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 2.5]))
+STATE = ph.State([0.9, 0.1, 0.2, 0.3], jnp.array([[0.1, 0.2, 0.3], [0.4, -0.1, 0.2]]))
+FIELDS = {"object_name": ["ONE", "TWO B"], "object_id": ["2020-224A", "2020-224B"]}
+
+
+@pytest.fixture(scope="module")
+def traj():
+    return ph.simulate(SCENE, STATE, jnp.array([0.0, 1.5, 4.0]))
+
+
+def test_bodies_have_labels(traj):
+    pytest.importorskip("xarray")
+    named = traj.to_xarray(labels=["first", "second"])
+    np.testing.assert_array_equal(named.wxyz.sel(body="second"), traj.wxyz[1])
+    assert "body" not in traj.to_xarray().coords
+    for labels in (["one"], ["a", "b", "c"]):
+        with pytest.raises(ValueError, match="labels name"):
+            traj.to_xarray(labels)
+    with pytest.raises(ValueError, match="labels name"):
+        traj[0].to_xarray(["one"])
+
+
+def test_scipy_there_and_back(traj):
+    turned = traj[1].to_scipy()
+    pointing = ph.rotation.rotate(traj.wxyz[1], jnp.array([[0.0, 0, 1]]))
+    np.testing.assert_allclose(turned.apply([0, 0, 1]), pointing)
+    back = ph.State(turned, traj.omega_body[1])
+    assert float(ph.rotation.angle_between(back.wxyz, traj.wxyz[1]).max()) < 1e-15
+    assert ph.State(turned, np.zeros(3, np.float32)).wxyz.dtype == np.float32
+    assert len(traj.to_scipy()) == 6
+
+
+def parsed(text):
+    """Header, and (metadata, rows) of each segment, by the rules of section 4 of the standard."""
+    head, segments, data, where = {}, [], [], "head"
+    for line in filter(None, map(str.strip, text.splitlines())):
+        if line == "META_START":
+            where, meta = "meta", {}
+        elif line in ("META_STOP", "DATA_STOP"):
+            where = "between"
+        elif line == "DATA_START":
+            where, data = "data", []
+            segments.append((meta, data))
+        elif where == "data":
+            data.append(line.split())
+        else:
+            key, _, value = line.partition(" = ")
+            (head if where == "head" else meta)[key] = value
+    return head, segments
+
+
+def test_a_message_of_the_ccsds_holds_the_motion(traj, tmp_path):
+    """Read back by its rules; A2B turns components in space to components in the body."""
+    path = tmp_path / "bodies.aem"
+    traj.to_aem(path, "2029-04-13T21:46:00.25", **FIELDS, center_name="EARTH")
+    head, segments = parsed(path.read_text("ascii"))
+    assert list(head) == ["CCSDS_AEM_VERS", "CREATION_DATE", "ORIGINATOR"]
+    assert head["CCSDS_AEM_VERS"] == "2.0"
+    order = ["OBJECT_NAME", "OBJECT_ID", "CENTER_NAME", "REF_FRAME_A", "REF_FRAME_B",
+             "TIME_SYSTEM", "START_TIME", "STOP_TIME", "ATTITUDE_TYPE", "ANGVEL_FRAME"]  # fmt: skip
+    vector = np.array([0.3, -0.5, 0.8])
+    assert len(segments) == 2
+    for k, (meta, rows) in enumerate(segments):
+        assert list(meta) == order
+        assert (meta["OBJECT_NAME"], meta["OBJECT_ID"]) == (
+            FIELDS["object_name"][k], FIELDS["object_id"][k])  # fmt: skip
+        assert meta["START_TIME"] == "2029-04-13T21:46:00.250000000"
+        assert meta["STOP_TIME"] == rows[-1][0] == "2029-04-13T21:46:04.250000000"
+        numbers = np.array([[float(x) for x in row[1:]] for row in rows])
+        np.testing.assert_allclose(np.deg2rad(numbers[:, 4:]), traj.omega_body[k], rtol=1e-15)
+        q1, q2, q3, qc = numbers[:, :4].T
+        x, y, z = vector  # the first row of the matrix of the standard's annex, A to B
+        first = ((q1**2 - q2**2 - q3**2 + qc**2) * x + 2 * (q1 * q2 + q3 * qc) * y
+                 + 2 * (q1 * q3 - q2 * qc) * z)  # fmt: skip
+        want = Rotation.from_quat(np.asarray(traj.wxyz[k])[:, [1, 2, 3, 0]]).inv().apply(vector)
+        np.testing.assert_allclose(first, want[:, 0], rtol=1e-14)
+
+
+def test_messages_that_nobody_could_read_are_not_written(traj, tmp_path):
+    path = tmp_path / "no.aem"
+    for fields, match in (
+        (FIELDS | {"object_id": ["one"]}, "each of 2 bodies"),
+        (FIELDS | {"time_system": "CET"}, "time_system"),
+        (FIELDS | {"originator": "a\nb"}, "originator"),
+        (FIELDS | {"frame": ""}, "frame"),
+        (FIELDS | {"creation_date": "today"}, "creation_date"),
+    ):
+        with pytest.raises(ValueError, match=match):
+            traj.to_aem(path, "2029-04-13T21:46:00", **fields)
+    for epoch in ("13 April", "2029-13-01T00:00:00", 0):
+        with pytest.raises(ValueError, match="epoch"):
+            traj.to_aem(path, epoch, **FIELDS)
+    assert not path.exists()

@@ -1,0 +1,180 @@
+"""A trajectory at any time, its bodies and its samples: against SciPy and numerical differences."""
+
+import pickle
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+import polhode as ph
+
+MOMENTS = (1.0, 1.5, 2.0)
+STATE = ph.State([0.9, 0.1, 0.2, 0.3], [0.2, 0.1, 3.0])
+TS = jnp.linspace(0.0, 6.0, 13)
+ASKED = jnp.array([5.21, 0.0, 6.0, 3.123, 2.5, -0.7, 6.4])  # unsorted, saved ones, outside
+CENTRE = (0.0, 0.1, 0.2)
+
+
+def push(t):
+    return jnp.stack([0.3 * jnp.sin(2 * t), jnp.zeros_like(t), 0.1 + 0 * t])
+
+
+INERTIA = ph.Inertia.from_moments(MOMENTS)
+WHEEL = ph.Rotor(axis_body=[0.0, 1.0, 0.0], inertia=0.05, speed=4.0)
+SCENES = {
+    "free": ph.Scene(INERTIA),
+    "top": ph.Scene(INERTIA, ph.UniformGravity(1.0, CENTRE)),
+    "pushed": ph.Scene(INERTIA, None, ph.BodyTorque(push)),
+    "wheel": ph.Scene(INERTIA, ph.UniformGravity(1.0, CENTRE), rotors=WHEEL),
+}
+
+
+def truth(name, times, rates=STATE.omega_body):
+    """Euler's equations written out by hand, and SciPy's DOP853 at 1e-13."""
+    moments = np.array(MOMENTS)
+    wheel = np.array([0.0, 0.05 * 4.0, 0.0]) if name == "wheel" else np.zeros(3)
+
+    def field(t, y):
+        q, w = y[:4], y[4:]
+        torque = np.zeros(3)
+        if name in ("top", "wheel"):
+            a, b, c, d = q
+            down = [b * d - a * c, c * d + a * b, a * a + d * d - q @ q / 2]  # space z, halved
+            torque = -2 * 9.80665 * np.cross(CENTRE, down) / (q @ q)
+        if name == "pushed":
+            torque = np.array([0.3 * np.sin(2 * t), 0, 0.1])
+        turned = np.concatenate([[-q[1:] @ w], q[0] * w + np.cross(q[1:], w)]) / 2
+        return np.concatenate([turned, (torque - np.cross(w, moments * w + wheel)) / moments])
+
+    start = np.concatenate([STATE.wxyz, rates])
+    rows = [
+        solve_ivp(field, (0, t), start, "DOP853", rtol=1e-13, atol=1e-13).y[:, -1] if t else start
+        for t in np.asarray(times, float)
+    ]
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("name", ["free", "pushed", "wheel"])
+def test_at_any_time(name):
+    """Within rtol where steps are taken, within rounding where the law is exact."""
+    traj = ph.simulate(SCENES[name], STATE, TS, rtol=1e-10)
+    found = traj.at(ASKED)
+    want = truth(name, ASKED)
+    angle = ph.rotation.angle_between(found.wxyz, jnp.asarray(want[:, :4]))
+    tolerance = 1e-12 if name == "free" else 3e-10
+    assert float(angle.max()) < tolerance
+    np.testing.assert_allclose(found.omega_body, want[:, 4:], rtol=0, atol=4 * tolerance)
+    np.testing.assert_allclose(found.ts, ASKED)
+    assert bool(found.successful)
+    saved = traj.state_at(2.5)  # a sample is met to rounding
+    np.testing.assert_allclose(saved.omega_body, traj.omega_body[5], rtol=0, atol=2e-14)
+    with_nan = traj.at(jnp.array([1.0, jnp.nan]))
+    assert np.isfinite(with_nan.wxyz[0]).all()
+    assert np.isnan(with_nan.wxyz[1]).all()
+
+
+@pytest.mark.parametrize("name", ["free", "top"])
+def test_derivatives_of_a_motion_at_a_time(name):
+    """In time, initial rates and moments: SciPy's, and differences of SciPy's motion."""
+    potential = SCENES[name].potential
+
+    @jax.jit
+    @jax.value_and_grad
+    def rate(given):
+        t, omega, moments = given
+        scene = ph.Scene(ph.Inertia(diagonal=moments), potential)
+        return ph.simulate(scene, ph.State(STATE.wxyz, omega), TS).at(t[None]).omega_body[0, 0]
+
+    for time in (3.3, 3.5, 0.0):  # between samples, at one, at the first
+        given = (jnp.asarray(time), STATE.omega_body, jnp.array(MOMENTS))
+        value, (in_time, in_rates, in_moments) = rate(given)
+        step = 1e-4
+        times = np.array([-1, 1]) * step + time
+        before, after = truth(name, times)[:, 4]
+        np.testing.assert_allclose(in_time, (after - before) / (2 * step), rtol=1e-6)
+        sides = [
+            truth(name, [time], np.add(STATE.omega_body, [0, s * step, 0]))[0, 4] for s in (-1, 1)
+        ]
+        np.testing.assert_allclose(in_rates[1], (sides[1] - sides[0]) / (2 * step), atol=1e-6)
+        assert np.isfinite(in_moments).all()
+        later = rate((given[0], given[1], given[2] + jnp.array([0, step, 0])))[0]
+        np.testing.assert_allclose(in_moments[1], (later - value) / step, rtol=2e-3, atol=2e-3)
+
+
+@pytest.fixture(scope="module", params=["free", "top"])
+def batch(request):
+    rates = STATE.omega_body * jnp.linspace(1, 2, 6)[:, None]
+    wxyz = jnp.broadcast_to(STATE.wxyz, (2, 3, 4))
+    mass = jnp.array([[1.0], [0.5]])  # a batch axis that broadcasts
+    potential = None if request.param == "free" else ph.UniformGravity(mass, CENTRE)
+    return ph.simulate(
+        ph.Scene(INERTIA, potential), ph.State(wxyz, rates.reshape(2, 3, 3)), TS, rtol=1e-11
+    )
+
+
+def test_bodies_and_samples_are_chosen_as_from_an_array(batch):
+    wxyz, energy = np.asarray(batch.wxyz), np.asarray(batch.energy)
+    mask = np.array([[True, False, True], [False, True, False]])
+    for key in (0, -1, (1, 2), (slice(None), [0, 2]), mask, (..., slice(2, 9, 3)), (0, slice(1))):
+        chosen = batch[key]
+        kept = wxyz[key]
+        np.testing.assert_array_equal(chosen.wxyz, kept)
+        np.testing.assert_allclose(chosen.energy, energy[key], rtol=1e-15)
+        assert chosen.batch_shape == kept.shape[:-2]
+        assert chosen.ts.shape[-1] == kept.shape[-2]
+    one = batch[1, 2]
+    assert [body.batch_shape for body in batch] == [(3,), (3,)]
+    np.testing.assert_array_equal(one[-1].ts, TS[-1:])  # the axis of time stays
+    np.testing.assert_array_equal(batch[..., -1].wxyz, wxyz[..., -1:, :])
+    np.testing.assert_array_equal(batch.between(2.0, 3.0).ts, [2.0, 2.5, 3.0])
+    np.testing.assert_array_equal(batch.last.wxyz, ph.rotation.normalise(batch.wxyz[..., -1, :]))
+    # each moves on by its own numbers
+    np.testing.assert_allclose(one.at(ASKED).wxyz, batch.at(ASKED).wxyz[1, 2], atol=1e-11)
+    own = jnp.broadcast_to(ASKED, (2, 3, ASKED.size)) + 0.1 * jnp.arange(3.0)[:, None]
+    np.testing.assert_allclose(batch.at(own).wxyz[1, 2], one.at(ASKED + 0.2).wxyz, atol=1e-11)
+
+
+def test_what_no_sample_has_is_refused(batch):
+    for key in (2, (0, 3), (0, 0, 13), (0, 0, 0, 0), "x", None, 1.5):
+        with pytest.raises(IndexError):
+            batch[key]
+    with pytest.raises(ValueError, match="between samples use"):
+        batch.between(2.1, 2.2)
+    with pytest.raises(ValueError, match=r"\(2, 3\)"):
+        batch.at(jnp.zeros((3, 2, 1)))
+    rates = ph.simulate(SCENES["free"], STATE, TS, record=ph.Record(attitude=False))
+    with pytest.raises(ValueError, match="holds no wxyz"):
+        rates.at(1.0)
+
+
+@pytest.mark.parametrize("name", ["free", "top"])
+def test_a_trajectory_is_data_everywhere(name):
+    """Out of jit and vmap, pickled, and put together again it still moves."""
+    scene = SCENES[name]
+
+    def moved(omega):
+        return ph.simulate(scene, ph.State(STATE.wxyz, omega), TS)
+
+    want = moved(STATE.omega_body).at(ASKED).wxyz
+    both = jax.vmap(moved)(jnp.stack([STATE.omega_body, 2 * STATE.omega_body]))
+    for traj in (
+        jax.jit(moved)(STATE.omega_body),
+        both[0],
+        jax.tree.map(lambda x: x, moved(STATE.omega_body)),
+        pickle.loads(pickle.dumps(moved(STATE.omega_body))),
+    ):
+        np.testing.assert_allclose(traj.at(ASKED).wxyz, want, rtol=0, atol=1e-9)
+
+
+def test_euler_angles_of_any_sequence_are_those_of_scipy():
+    traj = ph.simulate(SCENES["free"], STATE, TS)
+    scipy = Rotation.from_quat(np.asarray(ph.rotation.wxyz_to_xyzw(traj.wxyz)))
+    for axes in ("ZYX", "zyx", "XYZ", "yxz", "ZXZ", "zyz"):
+        np.testing.assert_allclose(np.stack(traj.euler(axes), -1), scipy.as_euler(axes), atol=1e-12)
+    np.testing.assert_array_equal(traj.euler(), traj.euler(ph.rotation.Sequence.ZYZ))
+    for wrong in ("ZZX", "ZyX", "abc", ""):
+        with pytest.raises(ValueError, match="no sequence is called"):
+            traj.euler(wrong)

@@ -1,0 +1,174 @@
+"""Hyperbolas, the frame that goes along with an orbit, torques in it, and Apophis in 2029."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+import polhode as ph
+
+MU = 3.986004418e14
+TURN = Rotation.from_euler("ZXZ", [0.4, 0.7, -0.3])
+
+
+def two_bodies(position, velocity, times):
+    """SciPy's DOP853 on Newton's law, at 1e-13."""
+
+    def field(_, y):
+        return np.concatenate([y[3:], -MU * y[:3] / np.linalg.norm(y[:3]) ** 3])
+
+    start = np.concatenate([position, velocity])
+    scale = 1e-13 * np.repeat([np.linalg.norm(position), np.linalg.norm(velocity)], 3)
+    return np.array([
+        solve_ivp(field, (0, t), start, "DOP853", rtol=1e-13, atol=scale).y[:, -1] if t else start
+        for t in times
+    ])  # fmt: skip
+
+
+@pytest.mark.parametrize("excess", [1.01, 1.5, 8.0])  # speed at periapsis over the circular one
+def test_orbits_of_both_kinds_obey_newtons_law(excess):
+    """A conic through a periapsis, as elements and as a state at another time."""
+    r0 = 4e7
+    v0 = excess * np.sqrt(MU / r0)
+    times = np.array([-2e5, -3e3, 0.0, 40.0, 2e4, 3e5])
+    position, velocity = TURN.apply([r0, 0, 0]), TURN.apply([0, v0, 0])
+    truth = two_bodies(position, velocity, times)
+    e = excess**2 - 1
+    elements = ph.KeplerOrbit(MU, r0 / (1 - e), e, inclination=0.7, node=0.4, periapsis=-0.3)
+    later = two_bodies(position, velocity, [7e3])[0]
+    state = ph.StateOrbit(MU, later[:3], later[3:], epoch=7e3)
+    assert elements.hyperbolic == state.hyperbolic == (e > 1)
+    scale = np.linalg.norm(truth[:, :3], axis=-1)
+    for orbit, tolerance in ((elements, 1e-11), (state, 1e-11)):
+        found, speed = (np.asarray(f(jnp.asarray(times))) for f in (orbit, orbit.velocity_at))
+        assert np.max(np.linalg.norm(found - truth[:, :3], axis=-1) / scale) < tolerance
+        np.testing.assert_allclose(speed, truth[:, 3:], rtol=0, atol=tolerance * v0)
+
+
+def test_orbits_that_are_neither_are_refused():
+    with pytest.raises(ValueError, match="eccentricity"):
+        ph.KeplerOrbit(MU, -1e7, 1.0)
+    with pytest.raises(ValueError, match="semi_major_axis"):
+        ph.KeplerOrbit(MU, 1e7, 1.2)
+    with pytest.raises(ValueError, match="hyperbolas"):  # one of each
+        ph.StateOrbit(MU, [4e7, 0, 0], [[0, 1e3, 0], [0, 1e4, 0]])
+    with pytest.raises(TypeError, match="orbit"):
+        ph.LVLH([1.0, 0, 0])
+    with pytest.raises(TypeError, match="torque and"):
+        ph.RelativeTorque(ph.LinearDamping(0.1), "lvlh")
+
+
+ECCENTRIC = ph.KeplerOrbit(MU, 9e6, 0.2, inclination=0.7, node=0.4, periapsis=-0.3)
+
+
+def test_the_frame_is_where_its_definition_puts_it():
+    """Axes from the two-body problem by NumPy, rates from differences of the axes."""
+    times = np.array([0.0, 1234.5, 6000.0])
+    orbits = (ECCENTRIC, lambda t: ECCENTRIC(t))  # of a function the plane may turn
+    start = np.concatenate([ECCENTRIC(0.0), ECCENTRIC.velocity_at(0.0)])
+    truth = two_bodies(start[:3], start[3:], times)
+    z = -truth[:, :3] / np.linalg.norm(truth[:, :3], axis=-1, keepdims=True)
+    y = -np.cross(truth[:, :3], truth[:, 3:])
+    y /= np.linalg.norm(y, axis=-1, keepdims=True)
+    axes = np.stack([np.cross(y, z), y, z], axis=-1)
+    for orbit in orbits:
+        frame = ph.LVLH(orbit)
+        found = ph.rotation.wxyz_to_matrix(frame.attitude(times))
+        np.testing.assert_allclose(found, axes, rtol=0, atol=1e-10)
+        step = 1.0
+        sides = [ph.rotation.wxyz_to_matrix(frame.attitude(times + s * step)) for s in (-1, 1)]
+        spin = np.swapaxes(found, -1, -2) @ np.asarray(sides[1] - sides[0]) / (2 * step)
+        rates = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=-1)
+        np.testing.assert_allclose(frame.omega(times), rates, rtol=0, atol=1e-9)
+
+    def tilting(t):  # a circle whose plane precesses about space z
+        c, s = jnp.cos(1e-5 * t), jnp.sin(1e-5 * t)
+        x, y, z = ph.KeplerOrbit(MU, 7e6, inclination=1.0)(t)
+        return jnp.stack([c * x - s * y, s * x + c * y, z])
+
+    frame, t = ph.LVLH(tilting), jnp.array([777.0])
+    sides = [ph.rotation.wxyz_to_matrix(frame.attitude(t + s)) for s in (-1, 1)]
+    spin = ph.rotation.wxyz_to_matrix(frame.attitude(t)).swapaxes(-1, -2) @ (sides[1] - sides[0])
+    rates = [spin[0, 2, 1] / 2, spin[0, 0, 2] / 2, spin[0, 1, 0] / 2]
+    np.testing.assert_allclose(frame.omega(t)[0], rates, rtol=0, atol=1e-9)
+    assert abs(rates[2]) > 1e-6
+
+
+def test_attitudes_go_in_and_out_of_the_frame():
+    """NASA's JEOD, SIM_dyncomp run 10A: a cylinder with the pitch rate of its circular orbit."""
+    place, speed = [-4292653.41, 955168.47, 5139356.57], [109.649663, -7527.72649, 1484.521489]
+    to_body = [[-0.6443912270931274, 0.05284210190675609, 0.7628680480341864],
+               [-0.7615617870471506, -0.1345758407161209, -0.6339660776454052],
+               [0.06916350883930189, -0.9894933326514259, 0.1269620166955875]]  # fmt: skip
+    wxyz = ph.rotation.matrix_to_wxyz(jnp.array(to_body).T)
+    frame = ph.LVLH(ph.StateOrbit(3.986004415e14, place, speed))
+    rates = jnp.array([-1.97989570839746e-05, -0.001134281491669957, 0.0])
+    relative, slow = frame.to_frame(wxyz, rates, 0.0)
+    # the body is pitched away from the local frame by its case's turn about y alone
+    back = frame.from_frame(relative, slow, 0.0)
+    assert float(ph.rotation.angle_between(back[0], wxyz)) < 1e-15
+    np.testing.assert_allclose(back[1], rates, rtol=0, atol=1e-18)
+    held = ph.State(*frame.from_frame([1.0, 0, 0, 0], [0.0, 0, 0], 0.0))
+    mean = np.linalg.norm(np.cross(place, speed)) / np.dot(place, place)
+    np.testing.assert_allclose(held.omega_body, [0, -mean, 0], rtol=0, atol=1e-16)
+
+
+def test_damping_against_the_frame_brings_a_body_to_its_rate():
+    """A ball at rest in space: about y its rate is -n (1 - exp(-c t / I)); roll and yaw stay 0."""
+    frame = ph.LVLH(ph.KeplerOrbit(MU, [7e6, 8e6]))
+    n = np.sqrt(MU / np.array([7e6, 8e6]) ** 3)
+    start, _ = frame.from_frame([1.0, 0, 0, 0], [0.0, 0, 0], 0.0)
+    damping = ph.LinearDamping(0.01)
+    scene = ph.Scene(ph.Inertia.from_moments([2.0, 2.0, 2.0]), None,
+                     ph.RelativeTorque(damping, frame))  # fmt: skip
+    ts = jnp.linspace(0.0, 1000.0, 6)
+    traj = ph.simulate(scene, ph.State(start, jnp.zeros((2, 3))), ts, rtol=1e-12)
+    rate = -n[:, None] * (1 - np.exp(-0.01 * np.asarray(ts) / 2))
+    np.testing.assert_allclose(traj.omega_body[..., 1], rate, rtol=0, atol=1e-14)
+    yaw, pitch, roll = frame.yaw_pitch_roll(traj)
+    np.testing.assert_allclose(np.stack([yaw, roll]), 0, atol=1e-9)
+    tau = 2 / 0.01
+    want = n[:, None] * tau * (1 - np.exp(-np.asarray(ts) / tau))  # integral of rate + n
+    np.testing.assert_allclose(pitch, want, rtol=1e-9, atol=1e-12)
+
+
+HOUR = 3600.0
+
+
+def test_apophis_is_spun_anew_in_2029():
+    """Perigee 38,000 km, 5.84 km/s at infinity; periods of 27.4 h and 263 h before.
+
+    C. J. Benson et al., Icarus 390 (2023) 115324: the effective spin rate could halve or double,
+    the pole is likely to shift by 10 degrees or more, and the short-axis mode to be kept. Moments
+    and energy: P. Pravec et al., Icarus 233 (2014) 48.
+    """
+    inertia = ph.Inertia.from_moments([0.61, 0.965, 1.0])
+    square = (1.024 - 1) / (1 / 0.965 - 1)
+    momentum = jnp.array([0.0, np.sqrt(square), np.sqrt(1 - square)])
+    one = ph.periods(inertia, ph.State([1.0, 0, 0, 0], inertia.rates(momentum)))
+    scale = one.P_phi / (27.38 * HOUR)
+    rates = inertia.rates(momentum) * scale
+    before = ph.periods(inertia, ph.State([1.0, 0, 0, 0], rates))
+    assert 230 < float(before.P_psi) / HOUR < 300  # 263 h follows from the moments
+    r0, far = 3.8e7, 5.84e3
+    flyby = ph.StateOrbit(MU, [r0, 0, 0], [0, np.sqrt(far**2 + 2 * MU / r0), 0])
+    # every phase of the tumbling, about the pole that is nearly opposite to the ecliptic's
+    rng = np.random.default_rng(2029)
+    ts = jnp.array([-3.0, 3.0]) * 24 * HOUR
+    wxyz = Rotation.random(100, rng).as_quat()[:, [3, 0, 1, 2]]
+    scene = ph.Scene(inertia, ph.GravityGradient(MU, flyby))
+    end = ph.simulate(scene, ph.State(wxyz, rates), ts)
+    L = np.linalg.norm(end.momentum_space, axis=-1)
+    kinetic = 0.5 * np.sum(np.asarray(end.omega_body * end.momentum_body), axis=-1)
+    spin = 2 * kinetic / L
+    change = spin[:, 1] / spin[:, 0]
+    first, last = (np.asarray(end.momentum_space[:, k]) / L[:, k, None] for k in (0, 1))
+    shift = np.rad2deg(np.arccos(np.clip(np.sum(first * last, -1), -1, 1)))
+    after = ph.periods(inertia, end.last)
+    short = np.mean(np.asarray(after.mode) == int(before.mode))
+    assert 0.45 < change.min() < 0.7
+    assert 1.3 < change.max() < 2.2
+    assert np.median(shift) > 10
+    assert short > 0.6
+    assert np.all(end.successful)
