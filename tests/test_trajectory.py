@@ -106,7 +106,7 @@ def test_derivatives_of_a_motion_at_a_time(name):
 
 @pytest.fixture(scope="module", params=["free", "top"])
 def batch(request):
-    rates = STATE.omega_body * jnp.linspace(1, 2, 6)[:, None]
+    rates = STATE.omega_body[None] * jnp.linspace(1, 2, 6)[:, None]
     wxyz = jnp.broadcast_to(STATE.wxyz, (2, 3, 4))
     mass = jnp.array([[1.0], [0.5]])  # a batch axis that broadcasts
     potential = None if request.param == "free" else ph.UniformGravity(mass, CENTRE)
@@ -120,7 +120,7 @@ def test_bodies_and_samples_are_chosen_as_from_an_array(batch):
     mask = np.array([[True, False, True], [False, True, False]])
     for key in (0, -1, (1, 2), (slice(None), [0, 2]), mask, (..., slice(2, 9, 3)), (0, slice(1))):
         chosen = batch[key]
-        kept = wxyz[key]
+        kept = np.stack([wxyz[..., c][key] for c in range(4)], axis=-1)
         np.testing.assert_array_equal(chosen.wxyz, kept)
         np.testing.assert_allclose(chosen.energy, energy[key], rtol=1e-15)
         assert chosen.batch_shape == kept.shape[:-2]
@@ -133,7 +133,7 @@ def test_bodies_and_samples_are_chosen_as_from_an_array(batch):
     np.testing.assert_array_equal(batch.last.wxyz, ph.rotation.normalise(batch.wxyz[..., -1, :]))
     # each moves on by its own numbers
     np.testing.assert_allclose(one.at(ASKED).wxyz, batch.at(ASKED).wxyz[1, 2], atol=1e-11)
-    own = jnp.broadcast_to(ASKED, (2, 3, ASKED.size)) + 0.1 * jnp.arange(3.0)[:, None]
+    own = jnp.broadcast_to(ASKED, (2, 3, ASKED.size)) + 0.1 * jnp.arange(3.0)[None, :, None]
     np.testing.assert_allclose(batch.at(own).wxyz[1, 2], one.at(ASKED + 0.2).wxyz, atol=1e-11)
 
 

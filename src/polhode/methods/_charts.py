@@ -141,7 +141,9 @@ def _upright(field: UniformGravity | GravityGradient) -> tuple[Array, AbstractPo
     if isinstance(field, GravityGradient):
         force = field.position_space
     else:
-        force = jnp.asarray(field.mass)[..., None] * field.gravity_space
+        mass, gravity = jnp.asarray(field.mass), field.gravity_space
+        lead = jnp.broadcast_shapes(mass.shape, gravity.shape[:-1])
+        force = mass[..., None] * jnp.broadcast_to(gravity, (*lead, 3))
     (w, x, y), size = tops.upward(components(force))
     zero = jnp.zeros_like(size)
     along = jnp.stack([zero, zero, size], axis=-1)
