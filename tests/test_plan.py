@@ -163,6 +163,20 @@ def test_explain_says_what_runs_what_is_skipped_and_why():
         ph.explain(scene, state, [0.0, 0.0])
 
 
+class Own(ph.AbstractMethod):
+    """A stepped method of a user, without chart, solver or controller."""
+
+    def run(self, scene, state, ts, rtol, record):
+        raise NotImplementedError
+
+
+def test_explain_knows_the_method_of_a_user():
+    """It asks of it what every method has, and promises no error in its name."""
+    plan = ph.explain(ph.Scene(ph.Inertia.from_moments([1.0, 2, 3])), states(1), [0.0, 1.0], Own())
+    assert "runs    Own: as asked for" in str(plan)
+    assert plan.error == "as the steps asked for make it"
+
+
 def test_explain_says_why_no_exact_law_holds():
     """Every row of the table is named once, each with a reason of its own; none where one runs."""
     scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]), ph.UniformGravity(1.0, [0, 0, 1.0]))

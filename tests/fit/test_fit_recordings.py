@@ -63,3 +63,10 @@ def test_a_toss_recorded_with_left_handed_axes():
     twin = np.sort(np.asarray(fit.mirrored.moments))
     np.testing.assert_allclose(twin / twin[0], [1, 18, 19], atol=5)
     assert "with one axis inverted" in fit.report()
+
+
+def test_a_recording_made_without_its_noise_is_told():
+    times = np.linspace(0, 1, 20)
+    bare = Recording(times, np.ones(20), np.stack([np.sin(times)] * 3, axis=-1))
+    with pytest.raises(ValueError, match=r"no omega_noise: make it by Recording\.of"):
+        fit_recordings([bare])

@@ -45,8 +45,8 @@ def cross(a: Triple, b: Triple) -> Triple:
 
 
 def dot(a, b) -> Scalars:
-    x, y, z = (x * y for x, y in zip(a, b, strict=True))
-    return x + y + z
+    first, *rest = (x * y for x, y in zip(a, b, strict=True))
+    return sum(rest, start=first)
 
 
 def hamilton(a: Quadruple, b: Quadruple) -> Quadruple:
