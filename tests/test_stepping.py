@@ -43,9 +43,9 @@ def test_the_field_of_a_heavy_top_stands_twelve_calls_below_simulate_at_most(mon
         return energy(self, *given)
 
     monkeypatch.setattr(ph.UniformGravity, "energy", watched)
-    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.25, 2.125]), GRAVITY)  # not yet compiled
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.25, 2.125]), GRAVITY)
     jax.make_jaxpr(lambda w: ph.simulate(scene, ph.State([1.0, 0, 0, 0], w), [0.0, 1.0]).wxyz)(
-        jnp.ones(3)
+        jnp.ones((13, 3))  # a batch that no other test has: not yet traced
     )
     depths = [1 + stack.index("lie_poisson_field") for stack in found]
     assert 3 < min(depths) <= 12, min(found, key=len)
