@@ -1,5 +1,8 @@
 """Passage between the body's axes and the axes in their roles, and small vector algebra."""
 
+from functools import reduce
+from operator import add
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -45,8 +48,8 @@ def cross(a: Triple, b: Triple) -> Triple:
 
 
 def dot(a, b) -> Scalars:
-    x, y, z = (x * y for x, y in zip(a, b, strict=True))
-    return x + y + z
+    """Scalar product of vectors or quaternions."""
+    return reduce(add, (x * y for x, y in zip(a, b, strict=True)))
 
 
 def hamilton(a: Quadruple, b: Quadruple) -> Quadruple:
