@@ -78,6 +78,24 @@ def test_a_motor_within_its_limits():
     np.testing.assert_allclose(got.energy - got.energy[0], got.work, rtol=0, atol=1e-9)
 
 
+def test_pulses_within_other_parts_keep_their_edges():
+    """In a sum, in each other, against an orbit frame."""
+    inner = ph.Pulses(ph.EnergySink(0.1) + ph.BodyTorque([0.0, 0, 1]), [1.0], [2.0])
+    outer = ph.Pulses(inner + ph.LinearDamping(0.1), [0.5], [4.0])
+    frame = ph.LVLH(ph.KeplerOrbit(4e14, 7e6))
+    whole = ph.RelativeTorque(outer, frame) + ph.LinearDamping(0.1)
+    assert sorted(np.asarray(whole.edges).tolist()) == [0.5, 1.0, 2.0, 4.0]
+    momentum, omega = (jnp.ones(()),) * 3, (jnp.zeros(()), jnp.ones(()), jnp.zeros(()))
+    want = 0.1 * np.cross(np.ones(3), [0, 1, 0])
+    for t, on in ((0.7, 0), (1.5, 1), (3.0, 0)):
+        for torque in (whole, whole.during(t)):
+            slip = torque.slip(jnp.array(t), momentum, omega)
+            np.testing.assert_allclose(slip, on * want, atol=1e-16)
+    # what acts between the edges does not ask the time again
+    np.testing.assert_allclose(whole.during(1.5).slip(jnp.array(9.0), momentum, omega), want)
+    np.testing.assert_array_equal(whole.during(3.0).slip(jnp.array(1.5), momentum, omega), 0)
+
+
 def components_of(torque, wxyz, omega, t=0.5):
     seen = from_quaternion(tuple(jnp.asarray(wxyz)))
     return np.stack(torque.body_components(jnp.array(t), seen, tuple(jnp.asarray(omega))))

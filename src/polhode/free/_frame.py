@@ -1,8 +1,5 @@
 """Passage between the body's axes and the axes in their roles, and small vector algebra."""
 
-from functools import reduce
-from operator import add
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -49,7 +46,8 @@ def cross(a: Triple, b: Triple) -> Triple:
 
 def dot(a, b) -> Scalars:
     """Scalar product of vectors or quaternions."""
-    return reduce(add, (x * y for x, y in zip(a, b, strict=True)))
+    first, *rest = (x * y for x, y in zip(a, b, strict=True))
+    return sum(rest, start=first)
 
 
 def hamilton(a: Quadruple, b: Quadruple) -> Quadruple:

@@ -164,3 +164,13 @@ class RelativeTorque(AbstractTorque):
         return self.torque.body_components(
             t, relative, tuple(w - f for w, f in zip(omega, turning))
         )
+
+    @property
+    def edges(self):
+        return self.torque.edges
+
+    def during(self, t):
+        return RelativeTorque(self.torque.during(t), self.frame)
+
+    def slip(self, t, momentum, omega):
+        return self.torque.slip(t, momentum, omega)
