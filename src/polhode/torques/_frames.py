@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from polhode import rotation
 from polhode._batch import map_arrays
 from polhode._checks import as_float_array
-from polhode.hamiltonian import Attitude, components, from_quaternion
+from polhode.hamiltonian import Attitude, components
 from polhode.parts import AbstractPart, shaped
 from polhode.torques._orbit import AbstractOrbit
 from polhode.torques._torques import AbstractTorque, vector_of_time
@@ -154,12 +154,16 @@ class RelativeTorque(AbstractTorque):
         self.torque, self.frame = torque, frame
 
     def body_components(self, t, attitude: Attitude, omega):
-        x, y, z, rates = self.frame.axes(jnp.asarray(t, omega[0].dtype))
-        frame = rotation.matrix_to_wxyz(jnp.stack([x, y, z], axis=-1))
-        body = jnp.stack(jnp.broadcast_arrays(*attitude.wxyz), axis=-1)
-        frame = jnp.broadcast_to(rotation.conjugate(frame), body.shape)
-        relative = rotation.multiply(frame, body)
-        relative = from_quaternion(tuple(relative[..., i] for i in range(4)))
+        *axes, rates = self.frame.axes(jnp.asarray(t, omega[0].dtype))
+
+        def quaternion():  # dear, and asked for by few
+            frame = rotation.matrix_to_wxyz(jnp.stack(axes, axis=-1))
+            body = jnp.stack(jnp.broadcast_arrays(*attitude.wxyz), axis=-1)
+            frame = jnp.broadcast_to(rotation.conjugate(frame), body.shape)
+            relative = rotation.multiply(frame, body)
+            return tuple(relative[..., i] for i in range(4))
+
+        relative = Attitude(lambda i: attitude.to_body(components(axes[i])), quaternion)
         turning = relative.to_body(components(rates))
         return self.torque.body_components(
             t, relative, tuple(w - f for w, f in zip(omega, turning))
