@@ -250,3 +250,10 @@ def test_known_states_and_times_may_be_closed_over_under_jit(bodies):
     np.testing.assert_allclose(last(), want, atol=1e-14)
     assert free == [str(ph.explain(scene, state, ts))]
     assert "about 1e-09 rad at every saved time" in pushed[0]
+
+
+def test_exact_laws_in_one_chunk():
+    """``chunk=None``: all bodies at once, the same motion."""
+    scene, ts = ph.Scene(ph.Inertia.axisymmetric(1.0, 2.0)), [0.0, 0.5, 1.0]
+    whole, parts = (ph.simulate(scene, states(3), ts, ph.SymmetricTop(chunk=n)) for n in (None, 2))
+    np.testing.assert_array_equal(whole.wxyz, parts.wxyz)

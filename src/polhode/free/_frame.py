@@ -45,6 +45,7 @@ def cross(a: Triple, b: Triple) -> Triple:
 
 
 def dot(a, b) -> Scalars:
+    """Scalar product of vectors or quaternions."""
     first, *rest = (x * y for x, y in zip(a, b, strict=True))
     return sum(rest, start=first)
 
