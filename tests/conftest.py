@@ -2,6 +2,7 @@
 promotion, annotations checked, the folder of truth files."""
 
 import contextlib
+import gc
 import os
 import sys
 from pathlib import Path
@@ -37,6 +38,29 @@ CHECKED = (
 )
 assert not [name for name in sys.modules if name.split(".")[0] == "polhode"]
 jaxtyping.install_import_hook([f"polhode.{room}" for room in CHECKED], "checked.checked")
+
+
+_MOST = 4 * 2**30
+"""Bytes that a worker may hold before it drops its programs: the next test reads from the disk
+those that it needs again. Two workers that keep the programs of a whole run take 24 GB."""
+
+
+def _held() -> int:
+    """Bytes of memory that this process holds; 0 where the system does not tell."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def few_programs():
+    """Programs do not pile up over a run."""
+    yield
+    if _held() > _MOST:
+        jax.clear_caches()
+        gc.collect()
 
 
 @contextlib.contextmanager
