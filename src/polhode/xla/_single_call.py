@@ -72,17 +72,6 @@ def kernel(fn: Callable, *, linearised: bool = False) -> Callable:
     return call
 
 
-def apart(fn: Callable, *operands, when: jax.Array) -> Any:
-    """``fn(*operands)``, worked out once even where many results of a ``kernel`` need it.
-
-    XLA's CPU backend would form it again for each of them, but not what a branch returns. ``when``
-    is true, which XLA must not know; ``fn`` returns arrays as its first operand.
-    """
-    if not _is_of_use():
-        return fn(*operands)
-    return jax.lax.cond(when, fn, lambda first, *_: first, *operands)
-
-
 def put(rows: jax.Array, place: jax.Array, values: jax.Array) -> jax.Array:
     """``rows`` (S, n, C) with ``values`` (n, C) of n bodies at ``place`` (n,) in S.
 
