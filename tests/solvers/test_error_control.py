@@ -63,7 +63,8 @@ def test_no_body_is_far_beyond_the_error_asked_for(kind):
         assert np.all(found.status == ph.Status.SUCCESSFUL)
         off = errors(found, exact(kind, False))
         assert np.max(off) < 10 * rtol, (rtol, np.argmax(off), np.max(off) / rtol)
-        assert 0.005 * rtol < np.median(off) < 3 * rtol, (rtol, np.median(off) / rtol)
+        usual = np.median(off[MADE[kind]["angle"] > 10])  # the way of several steps
+        assert 0.01 * rtol < usual < 3 * rtol, (rtol, usual / rtol)
 
 
 @pytest.mark.parametrize("kind", MADE)
