@@ -130,6 +130,60 @@ def test_every_kind_of_scene_is_remembered(kind, monkeypatch):
     np.testing.assert_allclose(fast.energy, slow.energy, rtol=1e-12)
 
 
+@pytest.mark.parametrize("kind", ["top", "damped", "wheel", "Lagrange"])
+def test_twenty_numbers_of_saved_times_compile_three_programs_at_most(kind):
+    scene = ph.Scene(*KINDS[kind])
+
+    def compiled():
+        return sum(made.call._cache_size() for made in _dispatch._PROGRAMS.values())
+
+    _dispatch._PROGRAMS.clear()
+    counts = [3, 4, 7, 8, 9, 12, 20, 33, 50, 64, 65, 80, 100, 101, 150, 200, 257, 300, 400, 500]
+    for count in counts:
+        ts = np.linspace(0.0, 2.0, count)
+        found = ph.simulate(scene, _state(), ts, rtol=10.0 ** -(3 + count % 5))
+        assert np.array_equal(found.ts, ts)
+        assert found.wxyz.shape == (count, 4)
+        assert found.energy.shape == (count,)
+        assert np.all(np.isfinite(found.wxyz))
+    assert 1 <= compiled() <= 3
+    record = ph.Record(final_only=True)
+    for count in (2, 3, 5, 90):
+        ph.simulate(scene, _state(), np.linspace(0.0, 2.0, count), record=record)
+    assert compiled() <= 4
+
+
+SPIN = ph.Rotor([0.0, 0.0, 1.0], 0.1, speed=0.3, coupling=ph.ViscousCoupling(0.05))
+PULSES = ph.Pulses(ph.BodyTorque([0.0, 0.3, 0.0]), [0.4, 1.1], [0.6, 1.3])
+
+
+@pytest.mark.parametrize("turned", [1.0, -1.0])
+@pytest.mark.parametrize(
+    "parts",
+    [
+        (ph.Inertia.from_moments([1.0, 2.0, 3.0]),),
+        (I, FALL),
+        (I, None, PULSES),
+        (I, FALL, None, SPIN),
+        (ph.Inertia.axisymmetric(1.0, 0.5), ph.UniformGravity(1.0, [0.0, 0.0, 0.3])),
+    ],
+    ids=["free", "top", "pulses", "coupled wheel", "Lagrange"],
+)
+def test_samples_do_not_depend_on_how_many_times_a_program_is_for(parts, turned):
+    """Thirteen times, for which a program of more serves, beside one of thirteen."""
+    scene, record = ph.Scene(*parts), ph.Record(work=len(parts) > 1)
+    ts = turned * np.linspace(0.0, 2.0, 13) + 0.5
+    for _ in range(2):
+        fast = ph.simulate(scene, _state(), ts, record=record)
+    slow = jax.jit(lambda state: ph.simulate(scene, state, ts, record=record))(_state())
+    assert jax.tree.structure(fast) == jax.tree.structure(slow)
+    for one, other in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):
+        assert one.shape == other.shape
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(fast.first.wxyz, _state().wxyz, rtol=1e-15)
+    np.testing.assert_allclose(fast.first.omega_body, _state().omega_body, rtol=1e-15)
+
+
 def test_a_state_that_another_law_holds_for_is_moved_by_it():
     scene = ph.Scene(*KINDS["damped, nothing else"])
     assert np.all(np.asarray(ph.simulate(scene, _state(), TS).steps) > 0)

@@ -31,6 +31,13 @@ _KEPT = 128
 _FEW = 256
 """Numbers up to which lists are faster to look through than arrays."""
 
+_SIZES = (8, 64, 512, 4096)
+"""Numbers of times that programs are compiled for: fewer times repeat the first."""
+
+_SPARE = {True: 2**11, False: 2**16}
+"""Samples up to which that is done, of exact laws and of stepped bodies: they cost less than a
+program."""
+
 
 class _Program(NamedTuple):
     """``run(method, ...)`` compiled, its result taken apart: the structure stands in ``shape``
@@ -127,6 +134,7 @@ def again(scene: Any, state: Any, ts: Any, rtol: Any, record: Any) -> Trajectory
     if times is None:
         return None
     ts, span = times
+    whole = ts
     eps = float(np.finfo(known.dtype).eps)
     if rtol is None:
         rtol = 1e-9 if eps < 1e-9 else 1e-5
@@ -138,11 +146,35 @@ def again(scene: Any, state: Any, ts: Any, rtol: Any, record: Any) -> Trajectory
     reach = known.ways.reach(rtol, eps)
     if 0 < reach < math.inf and not 2 * _fastest(omega) * span <= reach:
         return None
-    program = known.programs[0 if reach > 0 else 1]
+    number = 0 if reach > 0 else 1
+    program, size = known.programs[number], ts.size
+    if record is not None and record.final_only:
+        ts = np.asarray(ts)[[0, -1]]
+    elif size > 2:
+        most = _SPARE[known.ways.methods[number].exact] // (max(wxyz.size, omega.size) // 3)
+        size = min((n for n in _SIZES if size <= n <= most), default=size)
+        if size != ts.size:
+            ts = np.asarray(ts)
+            ts = np.concatenate([np.full(size - ts.size, ts[0]), ts])
     leaves = program.call(ts, np.asarray(rtol, known.dtype), wxyz, omega, *known.leaves)
     if program.place[0] is not None:
         leaves.insert(program.place[0], scene)
-    return jax.tree.unflatten(program.shape[0], leaves)
+    found = jax.tree.unflatten(program.shape[0], leaves)
+    return found if size == whole.size else _shortened(found, whole)
+
+
+def _shortened(found: Trajectory, ts: Any) -> Trajectory:
+    """Without the samples at the first time but one; nothing is compiled for it."""
+    kept = np.r_[0, np.arange(found.ts.size - ts.size + 1, found.ts.size)]
+
+    def of(x, axis):
+        return None if x is None else jax.numpy.asarray(np.asarray(x).take(kept, axis))
+
+    return dataclasses.replace(
+        found, ts=jax.numpy.asarray(ts), wxyz=of(found.wxyz, -2),
+        omega_body=of(found.omega_body, -2), work=of(found.work, -1),
+        motor_work=of(found.motor_work, -2), spins=of(found.spins, -2),
+    )  # fmt: skip
 
 
 def _is_local(x: Any) -> bool:

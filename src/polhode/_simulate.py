@@ -83,7 +83,8 @@ def simulate(
     split = split_of(scene, state, ts)
     if method is None:
         if split is None and scene is as_given and is_concrete(scene, state):
-            learn(_trajectory, scene, given, record, ways_of(scene, state, record))
+            plain = partial(_trajectory, in_order=True)
+            learn(plain, scene, given, record, ways_of(scene, state, record))
             trajectory = again(scene, state, ts, rtol, given)
             if trajectory is not None:
                 return checked(trajectory, throw)
@@ -124,11 +125,12 @@ def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> T
     return _trajectory(method, scene, state, ts, rtol, record, split)
 
 
-def _trajectory(method, scene, state, ts, rtol, record, split=None) -> Trajectory:
+def _trajectory(method, scene, state, ts, rtol, record, split=None, in_order=False) -> Trajectory:
+    """``in_order`` (static): the times are known to be, but for the first, which may be repeated."""
     scene, state = scene.mended(), state.mended("state")  # shapes, whichever way led here
     scene = scene.settled(state, ts[..., 0])
     if split is None:
-        found = _moved(record, method, scene, state, ts, rtol)
+        found = _moved(record, method, scene, state, ts, rtol, in_order)
     else:
         found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
     wxyz, omega, status, steps, work, error, motors, spins = found
@@ -143,7 +145,7 @@ def _trajectory(method, scene, state, ts, rtol, record, split=None) -> Trajector
     return trajectory
 
 
-def _moved(record, method, scene, state, ts, rtol) -> Samples:
+def _moved(record, method, scene, state, ts, rtol, in_order=False) -> Samples:
     parts = (getattr(scene, name) for name in PARTS)
     batch = common_batch(*parts, state, extra=(ts.shape[:-1],))
     parts = {name: flatten(getattr(scene, name), batch) for name in PARTS}
@@ -155,7 +157,8 @@ def _moved(record, method, scene, state, ts, rtol) -> Samples:
         samples = _with_error(method, Scene(**parts), lanes, times, rtol, record)
     else:
         samples = method.run(Scene(**parts), lanes, times, rtol, record)._replace(error=None)
-    samples = samples._replace(status=judged(samples.status, Scene(**parts), times, rtol))
+    status = judged(samples.status, Scene(**parts), times, rtol, in_order)
+    samples = samples._replace(status=status)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), samples)
 
 

@@ -63,7 +63,8 @@ def test_no_body_is_far_beyond_the_error_asked_for(kind):
         assert np.all(found.status == ph.Status.SUCCESSFUL)
         off = errors(found, exact(kind, False))
         assert np.max(off) < 10 * rtol, (rtol, np.argmax(off), np.max(off) / rtol)
-        assert 0.005 * rtol < np.median(off) < 3 * rtol, (rtol, np.median(off) / rtol)
+        usual = np.median(off[MADE[kind]["angle"] > 10])  # the way of several steps
+        assert 0.01 * rtol < usual < 3 * rtol, (rtol, usual / rtol)
 
 
 @pytest.mark.parametrize("kind", MADE)
@@ -80,3 +81,29 @@ def test_nor_in_single_precision(kind):
         assert np.median(off) > 0.005 * rtol
         assert np.all(off[angle < 10] < 10 * rtol), (rtol, np.max(off[angle < 10] / rtol))
         assert np.sum(angle < 10) > 5
+
+
+@pytest.mark.parametrize("count", [3, 30, 600])
+@pytest.mark.parametrize("kind", ["top", "gradient"])
+def test_saved_times_are_as_accurate_however_many_they_are(kind, count):
+    """Bodies of a batch go on to their next saved times without waiting for others, in steps of an
+    order for the way between these."""
+    rng = np.random.default_rng(count)
+    moments = 10 ** rng.uniform(0, 1, (100, 1)) * rng.uniform(1, 1.9, (100, 3))
+    if kind == "top":
+        field = ph.UniformGravity(1.0, jnp.asarray(10 ** rng.uniform(-3, -0.7, (100, 3))))
+    else:
+        field = ph.GravityGradient(jnp.asarray(10 ** rng.uniform(-2, 0.5, 100)), [1.0, 0.0, 0.0])
+    scene = ph.Scene(ph.Inertia.from_moments(jnp.asarray(moments)), field)
+    state = ph.State(
+        jnp.asarray(rng.normal(size=(100, 4))),
+        jnp.asarray(10 ** rng.uniform(-2, 0.5, (100, 1)) * rng.normal(size=(100, 3))),
+    )
+    ts = jnp.linspace(0.0, 20.0, count)
+    fine = ph.simulate(scene, state, ts, rtol=1e-12)
+    for rtol in (1e-3, 1e-6, 1e-9):
+        found = ph.simulate(scene, state, ts, rtol=rtol)
+        assert np.all(found.status == ph.Status.SUCCESSFUL)
+        off = np.max(np.asarray(rotation.angle_between(found.wxyz, fine.wxyz)), axis=1)
+        assert np.max(off) < 10 * rtol, (rtol, np.max(off) / rtol)
+        assert np.max(off) > 1e-3 * rtol or count == 600  # whose steps are short

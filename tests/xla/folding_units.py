@@ -13,7 +13,7 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import numpy as np
 
-from polhode.xla import apart, kernel
+from polhode.xla import kernel, put
 
 X, Y, N = np.linspace(0.5, 2.5, 5), np.linspace(-1.0, 1.0, 5), np.arange(5)
 NOTHING = np.zeros((0, 3))
@@ -67,7 +67,9 @@ UNITS = {
         lambda a, b, n: jax.lax.switch(n[1], [lambda a, b: a * 0, lambda a, b: b * 0], a, b),
         X, Y, N,
     ),
-    "apart": (lambda a, b: apart(lambda a, b: a + b * 0, a, b, when=jnp.isfinite(a[0])), X, Y),
+    "put": (
+        lambda a, b: put(jnp.stack([b] * 3)[..., None], (a > 0).astype(jnp.int32), a[:, None]), X, Y,
+    ),  # fmt: skip
     "a power of 0": (lambda a: a**0, X),
     "complex numbers": (lambda a: (a * 0).real, X + 1j),
     "two precisions": (lambda a, b: a.astype(float) + b, X.astype(np.float32), Y),

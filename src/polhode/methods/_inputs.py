@@ -138,11 +138,14 @@ def raise_on_failure(status: Array) -> None:
     )
 
 
-def judged(status: Array, scene: Scene, ts: Array, rtol: Array | float | None) -> Array:
+def judged(
+    status: Array, scene: Scene, ts: Array, rtol: Array | float | None, in_order: bool = False
+) -> Array:
     """The status (N,) of lanes, or what is wrong with the input of those that were given nonsense.
 
     What ``check_inputs`` refuses where numbers are known, found in the compiled program where they
-    are traced; a few operations for each body. ``scene``: that of the lanes; ``ts`` (T,) or (N, T).
+    are traced; a few operations for each body. ``scene``: that of the lanes; ``ts`` (T,) or (N, T);
+    ``in_order``: that they are in order is known.
     """
     if rtol is not None:
         least = 8 * float(jnp.finfo(ts.dtype).eps)
@@ -152,6 +155,8 @@ def judged(status: Array, scene: Scene, ts: Array, rtol: Array | float | None) -
     if declared is not None:
         status = jnp.where(declared, status, Status.WRONG_LAW)
     status = jnp.where(scene.is_possible, status, Status.NOT_PHYSICAL)
+    if in_order:
+        return status
     steps = jax.lax.stop_gradient(ts[..., 1:] - ts[..., :-1])
     ordered = jnp.all(steps > 0, axis=-1) | jnp.all(steps < 0, axis=-1)
     return jnp.where(ordered, status, Status.BAD_TIMES)

@@ -62,6 +62,10 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
         known = _Known(c, getattr(args, "units", None))
         given = (known, solver, stepsize_controller, saveat, t0, t1, init_state, rest)
         known, solver, controller, saveat, begin, end, state, rest = _stopped(given)
+        spanning = getattr(solver, "spanning", None)
+        steps = isinstance(controller, diffrax.StepTo) and _first(saveat.subs).steps == 1
+        if spanning is not None and steps:
+            solver, controller, state = spanning(controller, state)
         state, *more = diffrax.ForwardMode().loop(
             args=known, terms=diffrax.ODETerm(field), solver=solver, stepsize_controller=controller,
             event=event, saveat=saveat, t0=begin, t1=end, init_state=state, **rest,
@@ -69,6 +73,13 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
         if times is None:  # whatever steps the controller took
             times = _first(state.save_state).ts
         saved = jax.tree.leaves(_first(state.save_state).ys)
+        rows = getattr(state.solver_state, "rows", None)
+        if rows is not None:  # found in one step
+            count, room = times.shape[0], _first(state.save_state).ts
+            rows = jnp.moveaxis(rows[rows.shape[0] - count :], -1, 0)
+            saved = [jnp.concatenate([x, y[count:]]) for x, y in zip(rows, saved)]
+            ts = jnp.concatenate([_stopped(times), room[count:]])
+            state = eqx.tree_at(lambda s: _first(s.save_state).ts, state, ts)
         count = min(times.shape[0], saved[0].shape[0])  # rooms for more steps stay as they are
         kept = [x[:count] for x in saved]
         path = _path(equations, self.parts, c, leaves, t0, times[:count], kept)

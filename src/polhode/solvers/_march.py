@@ -23,6 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode.solvers._columns import Rates, Table, carried_on, extrapolated
+from polhode.xla import put
 
 Units = Callable[[list[Array], list[Array]], tuple[list[Array], Array]]
 """Weights of the components of an error, whose squares are summed, and the natural rate [rad/s],
@@ -31,7 +32,7 @@ of a state and its rates."""
 CALIBRATED = 5
 """The error of a step over e^2 / d (see above)."""
 
-SHARE = 0.6
+SHARE = 0.75
 """Part of the tolerance that the steps' errors may add up to. They add up to more where the motion
 itself spreads errors (see ``docs/integrators.md``)."""
 
@@ -80,7 +81,8 @@ class Progress(NamedTuple):
     ``width``: next step [s], 0: not known; ``turned``: angle so far [rad]; ``low``: what rounding
     took from the state; ``steps``; ``error``: sum of the estimated errors [rad]; ``gone``: time
     since the first start [s]; ``ended``: 0, or why the body was given up: 1 its steps were spent,
-    2 they became too short to lead anywhere, 3 there so because the rates are no numbers.
+    2 they became too short to lead anywhere, 3 there so because the rates are no numbers; ``rows``:
+    states (T, n, C) at times to be saved, where one march leads through all of them.
     """
 
     width: Array
@@ -90,6 +92,7 @@ class Progress(NamedTuple):
     error: Array
     gone: Array
     ended: Array
+    rows: Array | None = None
 
 
 def fresh(y: list[Array], compensated: bool, t: Array) -> Progress:
@@ -98,6 +101,37 @@ def fresh(y: list[Array], compensated: bool, t: Array) -> Progress:
     low = [jnp.zeros_like(x) for x in y] if compensated else []
     ended = jnp.zeros(zero.shape, jnp.int32)
     return Progress(zero, zero, low, zero, zero, jnp.zeros_like(t), ended)
+
+
+class _Saved(NamedTuple):
+    """States saved on the way: ``rows`` (T + 1, n, C), the last of them not used; ``place`` (n,):
+    the next one, which is ``due`` (n,) [s] after the start."""
+
+    rows: Array
+    place: Array
+    due: Array
+
+    @classmethod
+    def first(cls, rows: Array, elapsed: Array, y: list[Array]) -> "_Saved":
+        """Before the first step: what is saved at the start is the given state."""
+        now = elapsed <= 0
+        rows = jnp.where(now[:, None, None], jnp.stack(y, axis=-1), rows)
+        place = jnp.broadcast_to(jnp.sum(jnp.where(now, 1, 0)).astype(jnp.int32), y[0].shape)
+        rows = jnp.concatenate([rows, rows[-1:]])
+        return cls(rows, place, elapsed.at[place].get(mode="clip"))
+
+    def after(self, reached: Array, elapsed: Array, y: list[Array]) -> "_Saved":
+        """With the states of the bodies that have ``reached`` what was due."""
+
+        def once(carry):
+            saved, _ = carry
+            unused = saved.rows.shape[0] - 1
+            rows = put(saved.rows, jnp.where(reached, saved.place, unused), jnp.stack(y, axis=-1))
+            place = saved.place + jnp.where(reached, 1, 0)
+            return _Saved(rows, place, elapsed.at[place].get(mode="clip")), False
+
+        # once or not at all: a branch would copy all that is saved
+        return jax.lax.while_loop(lambda carry: carry[1], once, (self, jnp.any(reached)))[0]
 
 
 class _Walk(NamedTuple):
@@ -115,6 +149,7 @@ class _Walk(NamedTuple):
     turned: Array
     error: Array
     steps: Array
+    saved: _Saved | None
 
 
 def march(
@@ -127,11 +162,14 @@ def march(
     y: list[Array],
     integrals: list[Array],
     progress: Progress,
+    elapsed: Array | None = None,
 ) -> tuple[list[Array], list[Array], Progress]:
     """State and integrals at ``span[1]``, of bodies that are the entries of arrays of one shape.
 
     A body that has used up ``limits.steps`` ends as NaN. ``own`` (static): each body in steps of
-    its own; the rates must then not depend on the time.
+    its own; the rates must then not depend on the time. ``elapsed`` (T,): times since the start [s]
+    in order, the last that of the end, at which the states are to be saved, as the ``rows`` of the
+    progress: a body that has reached one goes on to its next without waiting for others.
     """
     compensated = bool(progress.low)
     start, end = span
@@ -153,7 +191,7 @@ def march(
         return ~(able & (progress.ended == 0))
 
     def live(walk):
-        return (walk.gone < length) & ~given_up(walk)
+        return (walk.gone < whole_length) & ~given_up(walk)
 
     def judged(walk, t, h, width, new, found, later):
         """Error of a step, and what it may be."""
@@ -170,7 +208,7 @@ def march(
             rough = (walk.refused[1] > 0) & (error > 2 * fall * walk.refused[0])
             error = jnp.where(rough & (error > 128 * eps), ROUGH * error, error)
         angle = rate * width
-        whole = walk.turned + angle + rate * (length - walk.gone - width + rest)
+        whole = walk.turned + angle + rate * (length - walk.gone.astype(dtype) - width + rest)
         whole = jnp.maximum(whole, 1)
         done = jnp.minimum(walk.turned / whole, 1)
         share = SHARE * (FIRST + 3 * (1 - FIRST) * done * done)
@@ -181,14 +219,16 @@ def march(
         return jax.lax.stop_gradient((error, allowed, jnp.where(sound, angle, 0)))
 
     def one(walk):
-        left = length - walk.gone
+        due = whole_length if walk.saved is None else walk.saved.due
+        left = (due - walk.gone).astype(dtype)
         # no step is much shorter than its neighbours for the sake of the end
         width = jnp.where(left <= walk.width, left, jnp.minimum(walk.width, left / 2))
         # to a time that is a number: thousands of rounded sums would add up to another time
-        width = jnp.where(width == left, left, (walk.gone + width) - walk.gone)
+        exact = ((walk.gone + width.astype(walk.gone.dtype)) - walk.gone).astype(dtype)
+        width = jnp.where(width == left, left, exact)
         width = jnp.where(live(walk), width, 0)
         gone, h = (x if own else jnp.max(x) for x in (walk.gone, width))
-        t, h = start + sign * gone.astype(start.dtype), sign.astype(dtype) * h
+        t, h = start + sign * gone, sign.astype(dtype) * h
         found = extrapolated(rates, given, t, h, walk.y, walk.rates, walk.integrals, compensated)
         low = walk.low
         new = found.change
@@ -202,10 +242,14 @@ def march(
         follows = CAUTION * sound**-power * walk.before ** (MEMORY * power)
         again = CAUTION * sound**-power
         factor = jnp.where(good, jnp.clip(follows, 0.2, 4), jnp.clip(again, 0.1, 0.9))
-        wanted = jnp.where(good & (width < walk.width), jnp.maximum(walk.width, width * factor),
-                           width * factor)  # fmt: skip
+        cut = good & (width < 0.999 * walk.width)  # for the sake of a time, not by rounding
+        wanted = jnp.where(cut, jnp.maximum(walk.width, width * factor), width * factor)
         wanted = jnp.where(live(walk), wanted, walk.width)
-        gone = jnp.where(good, jnp.where(width == left, length, walk.gone + width), walk.gone)
+        later_time = jnp.where(width == left, due, walk.gone + width.astype(walk.gone.dtype))
+        gone = jnp.where(good, later_time, walk.gone)
+        saved = walk.saved
+        if saved is not None:
+            saved = saved.after(good & (width == left), elapsed, new)
 
         def pick(a, b):
             return [jnp.where(good, x, y) for x, y in zip(a, b)]
@@ -216,7 +260,7 @@ def march(
             _picked(good, found.sums, walk.integrals), wanted, jnp.where(good, sound, walk.before),
             tuple(jnp.where(*x) for x in refused),
             walk.turned + jnp.where(good, angle, 0), walk.error + jnp.where(good, error, 0),
-            walk.steps + jnp.where(good, 1, 0),
+            walk.steps + jnp.where(good, 1, 0), saved,
         )  # fmt: skip
 
     first, _ = rates(start, y, False)
@@ -229,24 +273,26 @@ def march(
         sound = jnp.where(guess > 0, guess, jnp.inf)  # a body that is no number holds up no other
         guess = jnp.where(guess > 0, jnp.min(sound), guess)
     walk = _Walk(
-        jnp.zeros((), start.dtype), zero, y, first, progress.low, integrals, guess, zero + 1,
-        (zero, zero), progress.turned, progress.error, progress.steps,
+        jnp.zeros((), start.dtype), jnp.zeros(zero.shape, start.dtype), y, first, progress.low,
+        integrals, guess, zero + 1, (zero, zero), progress.turned, progress.error, progress.steps,
+        None if elapsed is None else _Saved.first(progress.rows, elapsed, y),
     )  # fmt: skip
 
     def on(walk):
         return (jnp.sum(jnp.where(live(walk), 1, 0)) > 0) & (walk.tried < _TRIES * limits.steps)
 
     walk = jax.lax.while_loop(on, one, walk)
-    arrived = (walk.gone >= length) & (progress.ended == 0)
+    arrived = (walk.gone >= whole_length) & (progress.ended == 0)
     y = [jnp.where(arrived, x, jnp.nan) for x in walk.y]
     numbers = jnp.isfinite(walk.width) & jnp.isfinite(walk.refused[0])
     left = (walk.steps < limits.steps) & (walk.tried < _TRIES * limits.steps)
     why = jnp.where(left, jnp.where(numbers, 2, 3), 1)
     ended = jnp.where(arrived, 0, jnp.where(progress.ended > 0, progress.ended, why))
-    gone = progress.gone + whole_length
+    gone, rows = progress.gone + whole_length, None if walk.saved is None else walk.saved.rows[:-1]
     new = Progress(
-        walk.width, walk.turned, walk.low, walk.steps, walk.error, gone, ended.astype(jnp.int32)
-    )
+        walk.width, walk.turned, walk.low, walk.steps, walk.error, gone, ended.astype(jnp.int32),
+        rows,
+    )  # fmt: skip
     return y, walk.integrals, new
 
 

@@ -20,7 +20,7 @@ from polhode.xla._switch import is_plain
 _HOLDABLE = frozenset(
     """abs add add_any and atan atan2 bitcast_convert_type broadcast_in_dim ceil clamp
      concatenate cond convert_element_type copy cos cosh custom_jvp_call div dynamic_slice
-     dynamic_update_slice eq exp exp2 expm1 floor ge gt integer_pow iota is_finite jit le log
+     dynamic_update_slice eq exp exp2 expm1 floor gather ge gt integer_pow iota is_finite jit le log
      log1p logistic lt max min mul ne neg not or pad pjit pow reduce_and reduce_max reduce_min
      reduce_or reduce_sum rem reshape round
      rsqrt scan select_n shift_right_arithmetic sign sin sinh slice split sqrt square squeeze
@@ -72,15 +72,19 @@ def kernel(fn: Callable, *, linearised: bool = False) -> Callable:
     return call
 
 
-def apart(fn: Callable, *operands, when: jax.Array) -> Any:
-    """``fn(*operands)``, worked out once even where many results of a ``kernel`` need it.
+def put(rows: jax.Array, place: jax.Array, values: jax.Array) -> jax.Array:
+    """``rows`` (S, n, C) with ``values`` (n, C) of n bodies at ``place`` (n,) in S.
 
-    XLA's CPU backend would form it again for each of them, but not what a branch returns. ``when``
-    is true, which XLA must not know; ``fn`` returns arrays as its first operand.
+    One after another on the CPU, where a unit cannot hold a scatter.
     """
-    if not _is_of_use():
-        return fn(*operands)
-    return jax.lax.cond(when, fn, lambda first, *_: first, *operands)
+    if jax.default_backend() != "cpu":
+        return rows.at[place, jnp.arange(place.size)].set(values)
+
+    def one(i, rows):
+        at = place[i].astype(i.dtype), i, jnp.zeros_like(i)
+        return jax.lax.dynamic_update_slice(rows, values[i][None, None], at)
+
+    return jax.lax.fori_loop(0, place.size, one, rows)
 
 
 def _is_of_use() -> bool:
