@@ -57,7 +57,8 @@ def _problem(kind: str):
 
     def loss(moments, omega):
         found = simulated(moments, omega)
-        return jnp.sum(found.wxyz[-1, 1:]) + jnp.sum(found.omega_body[-1])
+        end = found.last
+        return jnp.sum(end.wxyz[1:]) + jnp.sum(end.omega_body)
 
     return simulated, loss, (moments, omega)
 
@@ -119,7 +120,7 @@ def measure(kind: str, repeats: int) -> dict:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("kinds", nargs="*", choices=(*KINDS, []), help="which scenes; none: all")
     parser.add_argument("--quick", action="store_true", help="one process of each instead of two")
     parser.add_argument("--output", type=Path)

@@ -83,7 +83,7 @@ class ClosedForm(AbstractExact):
             times = t[None] if times is None else times
             return motion(moments, products, wxyz, omega, times, wanted)
 
-        def whole(parts, axes, state):
+        def finished(parts, axes, state):
             omega, wxyz = (None if x is None else jnp.stack(x, axis=-1) for x in parts)
             if axes is not None:
                 axes = axes[:, None]
@@ -99,7 +99,7 @@ class ClosedForm(AbstractExact):
 
         if abreast:
             wxyz, omega, finite = map_chunks(
-                lambda chunk: whole(one(chunk[0]), *chunk[1:]),
+                lambda chunk: finished(one(chunk[0]), *chunk[1:]),
                 ((*lanes, times), axes, state), n, size,
             )  # fmt: skip
         else:
@@ -108,7 +108,7 @@ class ClosedForm(AbstractExact):
             parts = map_chunks(one, (*lanes, times), pieces, size)
             if lone:
                 parts = jax.tree.map(lambda x: x.reshape(1, -1)[:, :samples], parts)
-            wxyz, omega, finite = whole(parts, axes, state)
+            wxyz, omega, finite = finished(parts, axes, state)
         status = jnp.where(finite, Status.SUCCESSFUL, Status.NOT_FINITE)
         return Samples(wxyz, omega, status, jnp.zeros(n, status.dtype))
 
