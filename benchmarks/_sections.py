@@ -385,7 +385,8 @@ def first_calls(report: dict) -> list[str]:
     return [
         "## First calls", "", machine(report), "",
         "Seconds of processor time of the first call and the first gradient of a new process"
-        " without a cache of programs, one body; the stages are those of one program under `jax.jit`.", "",
+        " without a cache of programs, one body; the stages are those of one program under"
+        " `jax.jit`.", "",
         *rows(header, lines),
     ]  # fmt: skip
 
