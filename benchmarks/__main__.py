@@ -23,7 +23,7 @@ QUICK: dict[str, list[str]] = {
 FULL: dict[str, list[str]] = {
     "work_precision": [], "gradients": [], "scene_cost": [], "scaling": [], "stress": [],
     "identification": [], "accelerator": [], "free_body": [], "elliptic_accuracy": [],
-    "rotation_stress": [], "torqued": [],
+    "rotation_stress": [], "torqued": [], "first_calls": [],
 }  # fmt: skip
 
 

@@ -373,8 +373,26 @@ def plain_calls(report: dict) -> list[str]:
     ]  # fmt: skip
 
 
+def first_calls(report: dict) -> list[str]:
+    lines = [
+        [row["title"], *(number(row[what]) for what in ("value", "gradient")),
+         *(" + ".join(number(row[f"{what}_stages"][s]) for s in ("trace", "lower", "compile"))
+           for what in ("value", "gradient"))]
+        for row in report["numbers"]["rows"]
+    ]  # fmt: skip
+    header = ["", "value [s]", "gradient [s]", "value: trace + lower + compile",
+              "gradient: trace + lower + compile"]  # fmt: skip
+    return [
+        "## First calls", "", machine(report), "",
+        "Seconds of processor time of the first call and the first gradient of a new process"
+        " without a cache of programs, one body; the stages are those of one program under"
+        " `jax.jit`.", "",
+        *rows(header, lines),
+    ]  # fmt: skip
+
+
 SECTIONS = {
-    "plain_calls": plain_calls,
+    "plain_calls": plain_calls, "first_calls": first_calls,
     "gradients": gradients, "scene_cost": scene_cost, "scaling": scaling,
     "identification": identification, "throws": throws, "racquet": racquet,
     "stress": stress,

@@ -10,7 +10,7 @@ import polhode as ph
 SCENE = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]))
 
 
-@pytest.mark.parametrize(("bodies", "times"), [(1, 1001), (3, 5), (7, 2)])
+@pytest.mark.parametrize(("bodies", "times"), [(1, 1001), (3, 5), (7, 2), (1031, 3)])
 @pytest.mark.parametrize("rates_only", [False, True])
 def test_chunks_change_nothing(bodies, times, rates_only):
     rng = np.random.default_rng(bodies)

@@ -2,7 +2,9 @@
 
 from polhode.free._evaluate import (
     evaluate as evaluate,
+    even_rows as even_rows,
     free_motion as free_motion,
+    is_abreast as is_abreast,
     prepare as prepare,
 )
 from polhode.free._motion import FreeMotion as FreeMotion

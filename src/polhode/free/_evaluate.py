@@ -19,6 +19,12 @@ Scalars = Float[Array, "*b"]
 # States that a core keeps in its nearest caches through all stages.
 _CHUNK = 8192
 
+_ABREAST = 64
+"""Bodies from which loops over them are long enough."""
+
+LANES = 512
+"""Bodies whose constants a core keeps near while it moves them to many times."""
+
 
 def components(values, count: int) -> tuple[Scalars, ...]:
     """A tuple of component arrays, from one or from an array with the components last."""
@@ -102,25 +108,57 @@ def free_motion(
         None if products is None else components(products, 3),
     )
 
-    def whole(given, t):
-        motion = prepare(*given, compensated=compensated)
-        return evaluate(motion, t, attitude=attitude, rates=rates)
-
     t = jnp.asarray(t)
-    return _chunked(kernel(whole, linearised=True), parts, t)
+    wanted = {"attitude": attitude, "rates": rates}
+    if t.ndim == 2 and parts[0][0].ndim == 1 and is_abreast(len(parts[0][0]), t.shape[1]):
+        return _chunked(lambda given, t: _abreast(given, t, compensated, wanted), parts, t, LANES)
+
+    def whole(given, t):
+        return evaluate(prepare(*given, compensated=compensated), t, **wanted)
+
+    rows = max(1, _CHUNK // max(t.shape[1] if t.ndim == 2 else 1, 1))
+    return _chunked(kernel(whole, linearised=True), parts, t, rows)
 
 
-def _chunked(fn, parts, t):
-    """``fn(parts, t)``, a few thousand states at a time where a processor has many to do."""
+def is_abreast(bodies: int, times: int) -> bool:
+    """Whether all bodies are moved to one time after the other: the loops are then over bodies."""
+    return jax.default_backend() == "cpu" and times > 1 and bodies >= _ABREAST
+
+
+def _abreast(given, t, compensated: bool, wanted):
+    """The motion of many bodies, one time after the other; the constants are worked out once."""
+
+    def constants(given):
+        motion = prepare(*given, compensated=compensated)
+        return motion.swing, motion.turning
+
+    found = kernel(constants)(jax.lax.stop_gradient(given))
+
+    def at(given, found, t):
+        moments, wxyz, omega, products = given
+        return evaluate(FreeMotion(moments, products, omega, wxyz, *found), t, **wanted)
+
+    # Coefficients of the derivative are worked out again where they are used: kept for all times
+    # they would go through the memory, which takes longer.
+    one = jax.checkpoint(kernel(at, linearised=True), prevent_cse=False)
+    samples = jax.lax.map(lambda t: one(given, found, t), t.T)
+    return jax.tree.map(jnp.transpose, samples)
+
+
+def even_rows(count: int, most: int = LANES) -> int:
+    """Bodies of a chunk: if possible a divisor, which spares the copies that padding makes."""
+    if count < 2 * most:
+        return count
+    return next((n for n in range(most, most // 4 - 1, -1) if n > 0 and count % n == 0), most)
+
+
+def _chunked(fn, parts, t, rows):
+    """``fn(parts, t)``, ``rows`` bodies at a time where a processor has many to do."""
     lanes = parts[0][0]
-    times = t.shape[1] if t.ndim == 2 else 1
-    rows = max(1, _CHUNK // max(times, 1))
     if jax.default_backend() != "cpu" or lanes.ndim != 1 or lanes.shape[0] < 2 * rows:
         return fn(parts, t)
     count = lanes.shape[0]
-    # A divisor spares the copies that padding makes.
-    even = [n for n in range(rows // 4, rows + 1) if n > 0 and count % n == 0]
-    rows = max(even, default=rows)
+    rows = even_rows(count, rows)
     missing = -count % rows
 
     def cut(x):

@@ -114,12 +114,16 @@ def _is_packable(dtype) -> bool:
     return isinstance(dtype, np.dtype) and dtype != jax.dtypes.float0
 
 
-def _unit(flat: Callable, linearised: bool) -> Callable:
-    """``flat``, a function of arrays with a list of results, as one unit, differentiable."""
+def _unit(flat: Callable, linearised: bool, traced: Any = None) -> Callable:
+    """``flat``, a function of arrays with a list of results, as one unit, differentiable.
+
+    ``traced``: the same where it is known already, and how many results are bare (``_marked``).
+    """
 
     @jax.custom_jvp
     def marked(*leaves):
-        return _marked(flat, leaves)
+        closed, bare = traced or (jax.make_jaxpr(flat)(*leaves), 0)
+        return _marked(closed, leaves, bare)
 
     def derivative(leaves, tangents):
         # What has no tangent stays a constant: its derivative is not worked out at all.
@@ -142,31 +146,42 @@ def _unit(flat: Callable, linearised: bool) -> Callable:
             )
             kept, tree = jax.tree.flatten(linear)
             shape[:] = [tree, len(value)]
-            return [*value, *kept]
+            return [*value, *kept, jnp.zeros((), jnp.float32)]
 
-        found = _unit(known, linearised=False)(*leaves)
+        first = jax.make_jaxpr(known)(*leaves)
         tree, count = shape
+        bare = len(first.out_avals) - 1 - count
+        *found, zero = _unit(jaxpr_as_fun(first), False, (first, bare))(*leaves)
         # Not marked: transposed, it would carry operands that go unused.
         linear = jax.tree.unflatten(tree, found[count:])
-        return found[:count], linear(*(tangents[k] for k in moving))
+        return found[:count], linear(*(_gated(zero, tangents[k]) for k in moving))
 
     marked.defjvp(derivative, symbolic_zeros=True)
     return marked
 
 
-def _marked(flat: Callable, given: Sequence[Any]) -> list[jax.Array]:
-    """The marked call of ``flat``, all of whose operands are surely used.
+def _gated(zero: jax.Array, tangent: jax.Array) -> jax.Array:
+    """The tangent, needing ``zero``, which is 0."""
+    if tangent.dtype == jax.dtypes.float0:
+        return tangent
+    sure = jnp.broadcast_to(zero == 0, tangent.shape)
+    return jax.lax.select(sure, tangent, jnp.zeros_like(tangent))
+
+
+def _marked(closed: ClosedJaxpr, given: Sequence[Any], bare: int) -> list[jax.Array]:
+    """The marked call of a traced function, all of whose operands are surely used.
 
     XLA ends the process over an operand of such a call that goes unused, and it folds away what a
     program merely seems to use. One operand more is therefore two zeros that XLA cannot know: every
-    result is taken on the condition that the first is zero or a number of any operand is not.
+    result is taken on the condition that the first is zero or a number of any operand is not. The
+    ``bare`` ones before the last are not: the choice would be one more copy of each, in a loop of
+    its own. They are of use together with the last result only, which is.
     """
-    closed = jax.make_jaxpr(flat)(*given)
     jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals))
     needed = [jnp.asarray(x) for x, keep in zip(given, used, strict=True) if keep]
     operands = [x for x in needed if x.size]
     if not operands:
-        return flat(*given)
+        return jaxpr_as_fun(closed)(*given)
     empty = {k: (x.shape, x.dtype) for k, x in enumerate(needed) if not x.size}
     # Behind a barrier, for XLA moves constants into what is called.
     zeros, *operands = jax.lax.optimization_barrier([jnp.zeros(2, jnp.float32), *operands])
@@ -179,9 +194,12 @@ def _marked(flat: Callable, given: Sequence[Any]) -> list[jax.Array]:
             found = jaxpr_as_fun(ClosedJaxpr(jaxpr, closed.consts))(*every)
             firsts = (x[(0,) * x.ndim].astype(bool) for x in operands)
             sure = reduce(jnp.logical_or, firsts, zeros[0] == 0)
+            chosen = {*range(len(found) - 1 - bare), len(found) - 1}
+            other = {
+                k: jnp.broadcast_to(zeros[1].astype(found[k].dtype), found[k].shape) for k in chosen
+            }
             return [
-                jax.lax.select(sure, x, jnp.broadcast_to(zeros[1].astype(x.dtype), x.shape))
-                for x in found
+                jax.lax.select(sure, x, other[k]) if k in chosen else x for k, x in enumerate(found)
             ]
 
     with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):

@@ -64,13 +64,17 @@ class ClosedForm(AbstractExact):
 
         chunk, samples = _CHUNK if self.chunk is None else self.chunk, t.shape[-1]
         lone = n == 1 and samples >= _WORTH_TWO
-        size, lanes, pieces = max(1, chunk // samples), (given, wxyz, omega), n
+        size, pieces = max(1, chunk // samples), n
+        lanes = (given, wxyz, omega)
+        abreast = self.chunk is None and motion is _triaxial and free.is_abreast(n, samples)
         if lone:  # one body at many times: as several bodies, each at a part of them
             pieces = max(2, -(-samples // chunk))
             each = -(-samples // pieces)
             times = jnp.pad(t.reshape(-1), (0, pieces * each - samples), mode="edge")
             times = times.reshape(pieces, each)
             lanes = jax.tree.map(lambda x: jnp.repeat(x, pieces, axis=0), lanes)
+        elif abreast:
+            size = free.even_rows(n)
         elif n * samples >= _WORTH_TWO:
             size = min(size, -(-n // 2))
 
@@ -79,22 +83,32 @@ class ClosedForm(AbstractExact):
             times = t[None] if times is None else times
             return motion(moments, products, wxyz, omega, times, wanted)
 
-        # Components are put together only here: fused with the motion, the stacking would have
-        # all of them worked out anew for each entry. A loop of two chunks keeps them apart.
-        parts = map_chunks(one, (*lanes, times), pieces, size)
-        if lone:
-            parts = jax.tree.map(lambda x: x.reshape(1, -1)[:, :samples], parts)
-        omega, wxyz = (None if x is None else jnp.stack(x, axis=-1) for x in parts)
-        if axes is not None:
-            axes = axes[:, None]
-            wxyz = None if wxyz is None else rotation.multiply(wxyz, rotation.conjugate(axes))
-            omega = None if omega is None else rotation.rotate(axes, omega)
-        if not record.final_only:
-            wxyz, omega = with_first(state, wxyz, omega)
-        finite = jnp.ones(n, bool)
-        for part in (wxyz, omega):
-            if part is not None:
-                finite = finite & jnp.all(jnp.isfinite(part), axis=(-1, -2))
+        def finished(parts, axes, state):
+            omega, wxyz = (None if x is None else jnp.stack(x, axis=-1) for x in parts)
+            if axes is not None:
+                axes = axes[:, None]
+                wxyz = None if wxyz is None else rotation.multiply(wxyz, rotation.conjugate(axes))
+                omega = None if omega is None else rotation.rotate(axes, omega)
+            if not record.final_only:
+                wxyz, omega = with_first(state, wxyz, omega)
+            finite = jnp.ones(state.wxyz.shape[0], bool)
+            for part in (wxyz, omega):
+                if part is not None:
+                    finite = finite & jnp.all(jnp.isfinite(part), axis=(-1, -2))
+            return wxyz, omega, finite
+
+        if abreast:
+            wxyz, omega, finite = map_chunks(
+                lambda chunk: finished(one(chunk[0]), *chunk[1:]),
+                ((*lanes, times), axes, state), n, size,
+            )  # fmt: skip
+        else:
+            # Components are put together only here: fused with the motion, the stacking would have
+            # all of them worked out anew for each entry. A loop of two chunks keeps them apart.
+            parts = map_chunks(one, (*lanes, times), pieces, size)
+            if lone:
+                parts = jax.tree.map(lambda x: x.reshape(1, -1)[:, :samples], parts)
+            wxyz, omega, finite = finished(parts, axes, state)
         status = jnp.where(finite, Status.SUCCESSFUL, Status.NOT_FINITE)
         return Samples(wxyz, omega, status, jnp.zeros(n, status.dtype))
 
