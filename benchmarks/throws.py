@@ -39,8 +39,8 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "tudelft_throws
 DEVICE, PROOF = "device_only", "proof_body"
 # kg m^2, of the wheel: where the balance begins; the proof body corrects it
 SPIN = 1.7e-6
-# samples averaged first, samples of those to a residual, seconds between knots
-FAST, BLOCK, KNOT = 4, 4, 0.01
+# samples averaged first, and samples of those to a residual
+FAST, BLOCK = 4, 4
 
 
 def load(folder, configurations=None):
@@ -75,7 +75,7 @@ def measure(found):
     everything = [one for name in names for one in found[name]]
     bodies = [k for k, name in enumerate(names) for _ in found[name]]
     fit = room.fit_balance(
-        everything, room.Instrument(SPIN), bodies=bodies, tolerance=room.Tolerance(), knot=KNOT,
+        everything, room.Instrument(SPIN), bodies=bodies, tolerance=room.Tolerance(),
         block=BLOCK,
     )  # fmt: skip
     each = {
