@@ -127,7 +127,7 @@ def study(size, number, together=40):
 
 def main() -> int:
     """Run, print and write."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--throws", type=int, default=300)
     parser.add_argument("--sizes", default="1,3,10,30")
     parser.add_argument("--output", default=None)

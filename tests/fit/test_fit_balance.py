@@ -96,6 +96,7 @@ def test_throws_in_air_show_the_tensor_and_the_instrument(throws):
     assert np.max(np.asarray(fit.moments_std) / true) < 0.02
     np.testing.assert_allclose(fit.instrument.delay, DELAY, atol=2e-4)
     np.testing.assert_allclose(fit.instrument.axis, AXIS, atol=3e-3)
+    assert fit.instrument.skew is not None
     found = np.asarray(fit.instrument.skew)
     np.testing.assert_allclose(found[[1, 2, 0], [2, 0, 1]], SKEW[[1, 2, 0], [2, 0, 1]], atol=2.5e-3)
     # four samples to a residual: half the noise of one

@@ -1,7 +1,7 @@
 """Inertia, drag, instrument and noise that make the readings of throws likeliest.
 
-Fisher's method of scoring on the likelihood of ``polhode.fit._filter``; tolerances of the instrument,
-and what is expected of drag and noise, are terms of it as well.
+Fisher's method of scoring on the likelihood of ``polhode.fit._filter``; tolerances of the
+instrument, and what is expected of drag and noise, are terms of it as well.
 """
 
 import equinox as eqx
@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode.fit._filter import Innovations, Noise, Readings, Score, innovations, score_of
+from polhode.fit._filter import Noise, Readings, Score, innovations, score_of
 from polhode.fit._instrument import Instrument, Tolerance
 from polhode.fit._linear import entries_of
 from polhode.fit._matrices import inverse, solve
@@ -31,7 +31,8 @@ _PARTS = np.cumsum([_TENSOR, _DRAG, _LEVEL, _COMMON])
 # Standard deviations expected: of the part of the spin that drag takes, of logarithms of the noise,
 # of its memory and of the wheel's noise
 _LOST, _WIDE, _NARROW = 0.15, 1.0, 0.7
-# steps at most, and the distance of the tensors from the best, in standard deviations, that ends them
+# steps at most, and the distance of the tensors from the best, in standard deviations, that ends
+# them
 _STEPS, _NEAR = 120, 0.03
 
 

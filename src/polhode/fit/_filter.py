@@ -1,11 +1,11 @@
 """How likely readings of gyroscope and wheel are, all that moves the body being uncertain.
 
-The gyroscope turns the frame, and the momentum ``L = R (I omega + h)`` is followed in it by a Kalman
-filter: drag and a torque with memory move it, and so does every error of the gyroscope, which turned
-the frame too. The rates that the filter expects are compared with those read. No measured rate stands
-on the side of the unknowns, so its noise does not pull the inertia down (errors in variables), and
-the determinants of the covariances make the likelihood that of the readings alone (the trajectory is
-integrated out: Schweppe, IEEE Trans. Inf. Theory 11 (1965) 61).
+The gyroscope turns the frame, and the momentum ``L = R (I omega + h)`` is followed in it by a
+Kalman filter: drag and a torque with memory move it, and so does every error of the gyroscope,
+which turned the frame too. The rates that the filter expects are compared with those read. No
+measured rate stands on the side of the unknowns, so its noise does not pull the inertia down
+(errors in variables), and the determinants of the covariances make the likelihood that of the
+readings alone (the trajectory is integrated out: Schweppe, IEEE Trans. Inf. Theory 11 (1965) 61).
 """
 
 from typing import NamedTuple
@@ -152,9 +152,7 @@ def innovations(
         mean = moves @ mean + jnp.concatenate([now.gained, jnp.zeros_like(rest)]) + gain @ rest
         spread = moves @ spread @ moves.T + jnp.block([[shaken, zero], [zero, fresh]])
         spread = spread - gain @ seen @ gain.T
-        found = Innovations(
-            jnp.where(now.known > 0, rest, 0), jnp.where(now.known > 0, seen, unit)
-        )
+        found = Innovations(jnp.where(now.known > 0, rest, 0), jnp.where(now.known > 0, seen, unit))
         return (mean, (spread + spread.T) / 2), found
 
     # nothing is known of the first momentum: its rates are as uncertain as rates are large

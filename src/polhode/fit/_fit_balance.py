@@ -59,7 +59,9 @@ class BalanceFit(eqx.Module):
             for k in range(len(recordings))
         ]  # fmt: skip
         joined = jax.tree.map(lambda *x: jnp.concatenate([jnp.atleast_1d(y) for y in x]), *found)
-        return eqx.tree_at(lambda fit: (fit.instrument, fit.noise), joined, (self.instrument, noise))
+        return eqx.tree_at(
+            lambda fit: (fit.instrument, fit.noise), joined, (self.instrument, noise)
+        )
 
 
 def fit_balance(
@@ -134,7 +136,9 @@ def _alone(recording, instrument, noise, tensor, block):
     sigma = (jnp.trace(tensor) / 2 * jnp.eye(3, dtype=tensor.dtype) - tensor)[None]
     data = readings_of(recording, jnp.zeros(1, int), block)
     noise = Noise(*(x[None] for x in noise[:5]), *noise[5:])
-    return _concluded(solve_balance(data, Known(sigma, instrument, Tolerance(), noise), "tensor"), block)
+    return _concluded(
+        solve_balance(data, Known(sigma, instrument, Tolerance(), noise), "tensor"), block
+    )
 
 
 def _concluded(found, block) -> BalanceFit:
