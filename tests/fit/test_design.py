@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from benchmarks import throws_synthetic as study
 from polhode.fit import Instrument, Noise, throw_information
@@ -23,6 +24,7 @@ def worth(omega, wheel):
     return jnp.linalg.slogdet(found)[1]
 
 
+@pytest.mark.slow  # compiles for a minute
 def test_the_log_determinant_has_derivatives():
     wheel = study.speed(TIMES)
     slopes = jax.jit(jax.grad(worth, argnums=(0, 1)))(SPIN, wheel)
