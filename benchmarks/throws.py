@@ -39,45 +39,93 @@ DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "tudelft_throws
 DEVICE, PROOF = "device_only", "proof_body"
 # kg m^2, of the wheel: where the balance begins; the proof body corrects it
 SPIN = 1.7e-6
-# samples averaged first, samples of those to a residual, seconds between knots
-FAST, BLOCK, KNOT = 4, 4, 0.01
+# samples averaged first, and samples of those to a residual
+FAST, BLOCK = 4, 4
 
 
-def load(folder, configurations=None):
-    """Index and recordings by configuration."""
+# What a choice of the recipe might change: window of the flight, s; how much more is left out where
+# the motor was switched, s; samples to a residual
+VARIED = {
+    "as it is": {},
+    "flight from 0.10 to 0.52 s": {"flight": (0.10, 0.52)},
+    "10 ms more left out at each switch": {"margin": 0.01},
+    "5 samples to a residual": {"block": 5},
+}
+
+
+def load(folder, configurations=None, **how):
+    """Index and recordings by configuration; ``how``: for ``recording``."""
     index = json.loads((folder / "index.json").read_text())
     arrays = np.load(folder / "throws.npz")
     found = {}
     for row in index["throws"]:
         if configurations is None or row["config"] in configurations:
-            found.setdefault(row["config"], []).append(recording(arrays[row["key"]].astype(float)))
+            found.setdefault(row["config"], []).append(
+                recording(arrays[row["key"]].astype(float), **how)
+            )
     return index, found
 
 
-def recording(table):
+def recording(table, flight=(0.08, 0.56), margin=0.0):
     """Free flight of one throw. Columns: time, rates, wheel, force."""
     times, wheel = table[:, 0], table[:, 4].copy()
     up = times[np.argmax((times > 0.1) & (wheel < -400))]
     down = times[np.argmax((times > 0.3) & (wheel > -900))]
-    switched = (times > up - 0.022) & (times < up + 0.037)
-    switched |= (times > down - 0.02) & (times < down + 0.014)
+    switched = (times > up - 0.022 - margin) & (times < up + 0.037 + margin)
+    switched |= (times > down - 0.02 - margin) & (times < down + 0.014 + margin)
     wheel[switched] = np.nan
-    flight = (times > 0.08) & (times < 0.56)
+    flight = (times > flight[0]) & (times < flight[1])
     given = room.Recording.of(
         times[flight], table[flight, 1:4], wheel_speed=wheel[flight], force_body=table[flight, 5:8]
     )
     return room.averaged(given, FAST)
 
 
+def together(found, block=BLOCK):
+    """Recordings, numbers of their bodies, and the joint fit."""
+    everything = [one for ones in found.values() for one in ones]
+    bodies = [k for k, ones in enumerate(found.values()) for _ in ones]
+    fit = room.fit_balance(
+        everything, room.Instrument(SPIN), bodies=bodies, tolerance=room.Tolerance(), block=block
+    )
+    return everything, bodies, fit
+
+
+def varied(folder, which=tuple(VARIED)):
+    """Moments of the joint fit under other choices: shifts over the standard deviation."""
+    table = {}
+    for name in which:
+        how = dict(VARIED[name])
+        block = how.pop("block", BLOCK)
+        _, found = load(folder, **how)
+        _, _, fit = together(found, block)
+        moments, spread = np.asarray(fit.moments), np.asarray(fit.moments_std)
+        table[name] = {
+            "moments": dict(zip(found, moments.tolist(), strict=True)),
+            "std": dict(zip(found, spread.tolist(), strict=True)),
+        }
+        print(name, json.dumps(table[name]), flush=True)
+    return table
+
+
+def agreement(joint, single, body):
+    """Means of single throws less the joint fit, %, and over what the errors stated make of it."""
+    moments, spread = np.asarray(joint.moments)[body], np.asarray(joint.moments_std)[body]
+    each, own = np.asarray(single.moments), np.asarray(single.moments_std)
+    apart = each.mean(axis=0) - moments
+    expected = np.sqrt((own**2 - spread**2).mean(axis=0) / len(each))
+    return {
+        "apart_percent": (100 * apart / moments).tolist(),
+        "apart_over_std": (apart / expected).tolist(),
+        "std_of_one_percent": (100 * np.median(own, axis=0) / moments).tolist(),
+        "scatter_of_one_percent": (100 * each.std(axis=0, ddof=1) / moments).tolist(),
+    }
+
+
 def measure(found):
     """Joint fit, tensors of every throw, and mean positions of the sensor, by configuration."""
     names = list(found)
-    everything = [one for name in names for one in found[name]]
-    bodies = [k for k, name in enumerate(names) for _ in found[name]]
-    fit = room.fit_balance(
-        everything, room.Instrument(SPIN), bodies=bodies, tolerance=room.Tolerance(), knot=KNOT,
-        block=BLOCK,
-    )  # fmt: skip
+    everything, bodies, fit = together(found)
     each = {
         name: fit.each(found[name], k)
         for k, name in enumerate(names)
@@ -161,6 +209,9 @@ def run(folder, configurations=None):
         "wheel_delay_s": float(device.delay),
         "gyroscope_skew": np.asarray(device.skew).tolist(),
         "gyroscope_bias_rad_s": np.asarray(device.bias).tolist(),
+        "single_throws_and_joint_fit": {
+            name: agreement(fit, one, list(found).index(name)) for name, one in each.items()
+        },
         "sensor_from_centre_m": {name: arm.tolist() for name, arm in arms.items()},
         "every_throw_alone": tables(index, alone),
         "throws_of_a_configuration_together": tables(index, together),
@@ -172,6 +223,8 @@ def main() -> int:
     options = recordings(__doc__, DATA)
     jax.config.update("jax_enable_x64", True)
     numbers = run(options.data)
+    for name, row in numbers["single_throws_and_joint_fit"].items():
+        print(name, {kind: np.round(value, 2).tolist() for kind, value in row.items()})
     for kind in ("every_throw_alone", "throws_of_a_configuration_together"):
         for name, row in numbers[kind].items():
             mean = np.mean(row["moments"], axis=0)

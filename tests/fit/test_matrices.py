@@ -60,7 +60,7 @@ def test_the_fits_hand_over_no_batch(affected):
     def balanced(given):
         numbers = jnp.asarray([0, 1, 0, 1, 0, 1])
         return _fit_balance._together.__wrapped__(
-            given, numbers, Instrument(1e-6), Tolerance(), 2, 9, 2, True
+            given, numbers, Instrument(1e-6), Tolerance(), 2, 2
         )
 
     batch, calls = largest_batch(balanced, given)

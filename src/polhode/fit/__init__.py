@@ -4,6 +4,8 @@ import sys
 import types
 
 from polhode.fit._csv import load_recording as load_recording, read_recording as read_recording
+from polhode.fit._design import throw_information as throw_information
+from polhode.fit._filter import Noise as Noise
 from polhode.fit._fit import (
     FitError as FitError,
     fit_inertia as fit_inertia,

@@ -1,28 +1,21 @@
-"""The balance of angular momentum along a measured motion, with torques that nobody knows.
+"""Inertia, drag, instrument and noise that make the readings of throws likeliest.
 
-The gyroscope turns the body frame itself: ``R(t)`` is integrated from its readings. With a wheel of
-momentum ``h`` the sum ``I omega + h - R^T L`` vanishes, where L is constant in space but for the
-torques of the air. These are taken for white noise, so L wanders as Brownian motion does: linear
-between knots, each step as likely as its length allows. Nothing is simulated, so an error of the
-wheel's speed stays where it is, and a gap in it costs its own samples only.
+Fisher's method of scoring on the likelihood of ``polhode.fit._filter``; tolerances of the
+instrument, and what is expected of drag and noise, are terms of it as well.
 """
-
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 from jaxtyping import Array, Float
 
+from polhode.fit._filter import Noise, Readings, Score, innovations, score_of
 from polhode.fit._instrument import Instrument, Tolerance
 from polhode.fit._linear import entries_of
-from polhode.fit._matrices import inverse
+from polhode.fit._matrices import inverse, solve
 from polhode.fit._parameters import base_of, tensor_of
-from polhode.fit._recording import Recording, bridged, needed
-from polhode.fit._start import central_slope, integrate, regression
-from polhode.rotation import to_matrix
+from polhode.fit._start import regression
 
 # directions of symmetric traceless matrices, orthonormal
 _SKEW = np.zeros((5, 3, 3))
@@ -31,54 +24,16 @@ _SKEW[1] = np.diag([1, 1, -2]) / np.sqrt(6)
 for _k, (_i, _j) in enumerate(((1, 2), (2, 0), (0, 1))):
     _SKEW[2 + _k, _i, _j] = _SKEW[2 + _k, _j, _i] = np.sqrt(0.5)
 _ALL = np.eye(6)
-# rounds of fitting and judging the noise at most, and the relative change of the noise in a round
-# that is the last
-_ROUNDS, _SETTLED = 60, 0.01
-
-
-class Noise(NamedTuple):
-    """Standard deviations per body: of the balance, rad/s; of the torque, N m s^(1/2)."""
-
-    omega: Float[Array, " n"]
-    torque: Float[Array, " n"]
-
-
-class Balance(eqx.Module):
-    """What all recordings bring to the balance, with the knots between which L is linear."""
-
-    times: Float[Array, "r t"]
-    omega: Float[Array, "r t 3"]
-    wheel: Float[Array, "r t"]
-    weight: Float[Array, "r b"]
-    hats: Float[Array, "r b k"]
-    spacing: Float[Array, " r"]
-    body: Array
-
-    @property
-    def block(self) -> int:
-        """Samples whose balance is averaged to one residual (static)."""
-        return self.times.shape[1] // self.weight.shape[1]
-
-
-def _blocks(values: Array, count: int, block: int) -> Array:
-    """Means of blocks of the first axis."""
-    return jnp.mean(values[: count * block].reshape(count, block, *values.shape[1:]), axis=1)
-
-
-def balance_of(recording: Recording, body: Array, knots: int, block: int) -> Balance:
-    """Prepare recordings (leading axis r) of the bodies with numbers ``body`` (r,)."""
-    times = recording.times
-    omega = bridged(times, recording.present, recording.omega)
-    sample = recording.present * needed("wheel_known", recording.wheel_known)
-    count = times.shape[1] // block
-    weight = jax.vmap(lambda x: jnp.floor(_blocks(x, count, block)))(sample)
-    end = jnp.max(jnp.where(sample > 0, times, times[:, :1]), axis=1)
-    spacing = (end - times[:, 0]) / (knots - 1)
-    place = (times - times[:, :1]) / spacing[:, None]
-    apart = jnp.abs(place[..., None] - jnp.arange(knots, dtype=times.dtype)[None, None])
-    hats = jax.vmap(lambda x: _blocks(x, count, block))(jnp.maximum(1 - apart, 0))
-    hats = hats * weight[..., None]
-    return Balance(times, omega, recording.wheel, weight, hats, spacing, body)
+# Unknowns of a recording: of its body's tensor, drag and noise, of the noise that all share, of the
+# instrument.
+_TENSOR, _DRAG, _LEVEL, _COMMON, _DEVICE = 6, 2, 5, 2, 11
+_PARTS = np.cumsum([_TENSOR, _DRAG, _LEVEL, _COMMON])
+# Standard deviations expected: of the part of the spin that drag takes, of logarithms of the noise,
+# of its memory and of the wheel's noise
+_LOST, _WIDE, _NARROW = 0.15, 1.0, 0.7
+# steps at most, and the distance of the tensors from the best, in standard deviations, that ends
+# them
+_STEPS, _NEAR = 120, 0.03
 
 
 def instrument_of(unknown: Float[Array, " 11"], given: Instrument, tolerance: Tolerance):
@@ -101,171 +56,146 @@ def instrument_of(unknown: Float[Array, " 11"], given: Instrument, tolerance: To
     )
 
 
-class Balanced(NamedTuple):
-    """Residuals in units of their noise, and what the noise is judged by."""
+class Known(eqx.Module):
+    """What the unknowns count from: bodies' second moments, the instrument, the noise."""
 
-    rest: Float[Array, "r t 3"]
-    steps: Float[Array, "r k 3"]
-    held: Float[Array, " r"]
+    sigma: Float[Array, "n 3 3"]
+    instrument: Instrument
+    tolerance: Tolerance
+    noise: Noise
 
-
-def balance(
-    data: Balance, tensors: Array, weights: Array, instrument: Instrument, noise: Noise
-) -> Balanced:
-    """Residuals for tensors (n, 3, 3), the momenta L eliminated by linear least squares.
-
-    ``weights`` (n, 3, 3): the inverse tensors that turn errors of momentum into those of rates.
-    ``held``: how many of the steps between knots the data leave to their own probability.
-    """
-
-    blocks = data.weight.shape[1], data.block
-
-    def one(times, omega, wheel, weight, hats, spacing, body):
-        sigma, drift = noise.omega[body], noise.torque[body] * jnp.sqrt(spacing)
-        rates = instrument.rates(omega)
-        turn = to_matrix(integrate(rates, central_slope(rates, times), times))
-        momentum = jnp.einsum("ij,tj->ti", tensors[body], rates) + instrument.carried(times, wheel)
-        # averaged in space, where it hardly moves, and turned back to the middle of the block
-        momentum = _blocks(jnp.einsum("tij,tj->ti", turn, momentum), *blocks)
-        turn = turn[blocks[1] // 2 :: blocks[1]][: blocks[0]]
-        momentum = jnp.einsum("tji,tj->ti", turn, momentum)
-        scaled = jnp.einsum("ij,tj->ti", weights[body], momentum) * weight[:, None] / sigma
-        lever = jnp.einsum("ij,tkj->tik", weights[body], turn) / sigma
-        knots = hats.shape[1]
-        square = jnp.einsum("tij,tik->tjk", lever, lever)
-        pairs = (hats[:, :, None] * hats[:, None, :]).reshape(hats.shape[0], -1)
-        normal = (pairs.T @ square.reshape(-1, 9)).reshape(knots, knots, 3, 3)
-        step = np.diff(np.eye(knots), axis=0)
-        chain = jnp.asarray(step.T @ step, omega.dtype)[:, :, None, None] / drift**2
-        prior = chain * jnp.eye(3, dtype=omega.dtype)[None, None]
-
-        def flat(blocks):
-            return jnp.swapaxes(blocks, 1, 2).reshape(3 * knots, 3 * knots)
-
-        right = jnp.einsum("tk,tij,ti->kj", hats, lever, scaled).ravel()
-        both = flat(normal + prior)
-        # The inverse of the value and one step of Newton's: it brings the derivatives as well.
-        inverted = inverse(jax.lax.stop_gradient(both))
-        momenta = inverted @ jax.lax.stop_gradient(right)
-        momenta = momenta + inverted @ (right - both @ jax.lax.stop_gradient(momenta))
-        momenta = momenta.reshape(knots, 3)
-        rest = scaled - jnp.einsum("tij,tj->ti", lever, hats @ momenta)
-        held = jnp.sum(inverted * jax.lax.stop_gradient(flat(prior)))
-        return Balanced(rest, jnp.diff(momenta, axis=0) / drift, held)
-
-    return jax.vmap(one)(
-        data.times, data.omega, data.wheel, data.weight, data.hats, data.spacing, data.body
-    )
+    def parts(self, unknown: Float[Array, " 26"], body: Array, drag: Array):
+        """Tensor, drag, instrument and noise of one recording; ``drag``: its unit, over size."""
+        shape, slowed, level, common, device = jnp.split(unknown, _PARTS)
+        sigma = self.sigma[body]
+        tensor = tensor_of(shape, base_of(sigma, True), _ALL)
+        own = [x[body] * jnp.exp(y) for x, y in zip(self.noise[:_LEVEL], level, strict=True)]
+        shared = [x * jnp.exp(y) for x, y in zip(self.noise[_LEVEL:], common, strict=True)]
+        instrument = instrument_of(device, self.instrument, self.tolerance)
+        return tensor, slowed * drag * jnp.trace(sigma), instrument, Noise(*own, *shared)
 
 
 class Fitted(eqx.Module):
     """Unknowns of a balance and their information."""
 
     tensors: Float[Array, "n 3 3"]
+    drag: Float[Array, "n 2"]
     instrument: Instrument
     noise: Noise
     covariance: Float[Array, "n 6 6"]
-    rest: Float[Array, "r t 3"]
+    rest: Float[Array, "r b 3"]
+    surprise: Float[Array, ""]
     converged: Array
 
 
-def solve_balance(
-    data: Balance,
-    start: Float[Array, "n 3 3"],
-    given: Instrument,
-    tolerance: Tolerance,
-    noise: Noise,
-    free: bool,
-) -> Fitted:
-    """Tensors by Levenberg-Marquardt; with ``free`` the instrument and the noise as well."""
-    count = start.shape[0]
-    bases = jax.vmap(lambda sigma: base_of(sigma, True))(start)
-    wide = jnp.result_type(float)
+def _expected() -> np.ndarray:
+    """Precisions of the unknowns of a recording, those of the tensor not expected at all."""
+    spread = [np.inf] * _TENSOR + [1.0] * _DRAG + [_WIDE] * _LEVEL + [_NARROW] * _COMMON
+    return 1 / np.array(spread + [1.0] * _DEVICE) ** 2
 
-    def parts(unknown):
-        shape, device = unknown
-        tensors = jax.vmap(lambda y, base: tensor_of(y, base, _ALL))(shape, bases)
-        instrument = instrument_of(device, given, tolerance) if free else given
-        return tensors, instrument
 
-    def misfit(unknown, args):
-        weights, noise = args
-        unknown = jax.tree.map(lambda x: x.astype(start.dtype), unknown)
-        tensors, instrument = parts(unknown)
-        found = balance(data, tensors, weights, instrument, noise)
-        every = [found.rest.ravel(), found.steps.ravel()] + ([unknown[1]] if free else [])
-        return jnp.concatenate(every).astype(wide), found
+def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
+    """The likeliest bodies. ``free``: "tensor" (and drag), "noise" as well, or "instrument" too."""
+    count, recordings = known.sigma.shape[0], data.body.shape[0]
+    ends = {"tensor": _PARTS[1], "noise": _PARTS[3], "instrument": _PARTS[3] + _DEVICE}
+    used, own = int(ends[free]), int(min(ends[free], _PARTS[2]))
+    dtype = known.sigma.dtype
+    # places of a recording's unknowns among all: its body's, then the common ones
+    common = count * own + np.arange(used - own)
+    place = jnp.concatenate(
+        [
+            data.body[:, None] * own + np.arange(own)[None],
+            jnp.broadcast_to(jnp.asarray(common), (recordings, used - own)),
+        ],
+        axis=1,
+    )
+    expected = _expected()
+    precision = jnp.asarray(
+        np.concatenate([np.tile(expected[:own], count), expected[own:used]]), dtype
+    )
+    # steps of the noise overshoot where it hardly shows, and are held back more than the others
+    soft = np.full(_PARTS[3] + _DEVICE, 1e-3)
+    soft[_PARTS[1] : _PARTS[3]] = 1
+    held = jnp.asarray(np.concatenate([np.tile(soft[:own], count), soft[own:used]]), dtype)
+    span = data.times[0, -1] - data.times[0, 0]
+    typical = jnp.sqrt(jnp.mean(jnp.sum(data.omega**2, axis=2)))
+    drag = _LOST / span * jnp.stack([jnp.ones_like(typical), 1 / typical])
 
-    def judged(found, noise):
-        """The noise that makes the residuals as large as they should be (evidence, MacKay 1992)."""
-        steps = 3 * (data.hats.shape[2] - 1)
-        samples = 3 * jnp.sum(data.weight, axis=1)
+    first = jnp.asarray(own * np.arange(count)[:, None] + np.arange(own)[None])
 
-        def by_body(values):
-            return jax.ops.segment_sum(values, data.body, count)
+    def one(data: Readings, unknown):
+        def found(unknown):
+            full = jnp.concatenate([unknown, jnp.zeros(_PARTS[3] + _DEVICE - used, dtype)])
+            got = innovations(data, *known.parts(full, data.body, drag))
+            return got, got
 
-        freedom = by_body(samples - 3 - steps + found.held) - 6
-        rest = by_body(jnp.sum(found.rest**2, axis=(1, 2)))
-        moved = by_body(jnp.sum(found.steps**2, axis=(1, 2)))
-        # steps that the data show; where they show none the noise of the torque is nothing
-        shown = jnp.maximum(by_body(steps - found.held), 1e-3)
-        return Noise(noise.omega * jnp.sqrt(rest / freedom), noise.torque * jnp.sqrt(moved / shown))
+        by, found = jax.jacfwd(found, has_aux=True)(unknown)
+        return score_of(found, by)
 
-    solver = optx.LevenbergMarquardt(rtol=1e-5, atol=1e-5)
-
-    def attempt(unknown, noise):
-        weights = inverse(parts(unknown)[0])
-        found = optx.least_squares(
-            misfit, solver, jax.tree.map(lambda x: x.astype(wide), unknown), (weights, noise),
-            has_aux=True, max_steps=30, throw=False,
-        )  # fmt: skip
-        unknown = jax.tree.map(lambda x: x.astype(start.dtype), found.value)
-        # of the last accepted step; ``found.aux`` is that of the one before
-        linear = found.state.f_info.jac.as_matrix()
-        return unknown, found.state.aux, linear, found.result == optx.RESULTS.successful
+    def scored(unknown) -> Score:
+        each = jax.vmap(one)(data, unknown[place])
+        value = jnp.sum(each.surprise) + jnp.sum(precision * unknown**2) / 2
+        slope = (precision * unknown).at[place].add(each.slope)
+        shown = jnp.diag(precision).at[place[:, :, None], place[:, None, :]].add(each.information)
+        return Score(value, slope, shown, each.rest)
 
     def again(carry):
-        unknown, noise, _, _, _, rounds = carry
-        unknown, found, linear, well = attempt(unknown, noise)
-        better = judged(found, noise) if free else noise
-        moved = jnp.max(jnp.abs(jnp.log(jnp.stack(better) / jnp.stack(noise))))
-        settled = well & (moved < _SETTLED) & (rounds > 0)
-        return unknown, better, found.rest, linear, settled, rounds + 1
+        unknown, score, damping, _, steps = carry
+        shown = score.information
+        move = -solve(shown + damping * jnp.diag(held * jnp.diagonal(shown)), score.slope)
+        tried = scored(unknown + move)
+        well = jnp.isfinite(tried.surprise) & (tried.surprise <= score.surprise)
+        kept = jax.tree.map(lambda a, b: jnp.where(well, a, b), tried, score)
+        unknown = jnp.where(well, unknown + move, unknown)
+        damping = jnp.where(well, damping / 3, jnp.maximum(damping * 10, 1e-3))
+        return unknown, kept, damping, far(kept), steps + 1
 
-    unknown = (jnp.zeros((count, 6), start.dtype), jnp.zeros(11, start.dtype))
-    _, _, rest, linear, *_ = jax.eval_shape(again, (unknown, noise, 0, 0, 0, 0))
-    nothing = [jnp.zeros(x.shape, x.dtype) for x in (rest, linear)]
+    def far(score):
+        """How far the bodies still are from the likeliest ones, in standard deviations."""
+        covariance = inverse(score.information)
+        left = (covariance @ score.slope) / jnp.sqrt(jnp.diagonal(covariance))
+        return jnp.max(jnp.abs(left[first[:, :_TENSOR]]))
 
     def unsettled(carry):
-        *_, settled, rounds = carry
-        return ~settled & (rounds < _ROUNDS)
+        *_, distance, steps = carry
+        return ~(distance < _NEAR) & (steps < _STEPS)
 
-    unknown, noise, rest, linear, converged, _ = jax.lax.while_loop(
-        unsettled,
-        again,
-        (unknown, noise, *nothing, jnp.asarray(False), 0),
+    begin = jnp.zeros(count * own + used - own, dtype)
+    state = (begin, scored(begin), jnp.asarray(1e-3, dtype), jnp.asarray(jnp.inf, dtype), 0)
+    unknown, score, _, distance, _ = jax.lax.while_loop(unsettled, again, state)
+    covariance = inverse(score.information)
+    shared = jnp.broadcast_to(unknown[count * own :], (count, used - own))
+    rest = jnp.zeros((count, _PARTS[3] + _DEVICE - used), dtype)
+    every = jnp.concatenate([unknown[first], shared, rest], axis=1)
+    bodies = jnp.arange(count)
+    tensors, slowed, instrument, noise = jax.vmap(known.parts, in_axes=(0, 0, None))(
+        every, bodies, drag
     )
-    tensors, instrument = parts(unknown)
+    # what all bodies share
+    instrument = jax.tree.map(lambda x: x[0], instrument)
+    noise = Noise(*noise[:_LEVEL], *(x[0] for x in noise[_LEVEL:]))
 
-    def entries(shape, base):
-        return entries_of(tensor_of(shape, base, _ALL), 6)
+    def entries(shape, sigma):
+        return entries_of(tensor_of(shape, base_of(sigma, True), _ALL), 6)
 
-    slopes = jax.vmap(jax.jacfwd(entries))(unknown[0], bases)
-    # the instrument, when it is not fitted, has no derivatives
-    used = 6 * count + (11 if free else 0)
-    covariance = inverse(linear[:, :used].T @ linear[:, :used]).astype(start.dtype)
-    blocks = jnp.stack([covariance[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] for k in range(count)])
+    slopes = jax.vmap(jax.jacfwd(entries))(every[:, :_TENSOR], known.sigma)
+    inner = first[:, :_TENSOR]
+    blocks = covariance[inner[:, :, None], inner[:, None, :]]
     blocks = slopes @ blocks @ jnp.swapaxes(slopes, 1, 2)
-    return Fitted(tensors, instrument, noise, blocks, rest, converged)
+    return Fitted(
+        tensors, slowed, instrument, noise, blocks, score.rest, score.surprise, distance < _NEAR
+    )
 
 
-def start_of(data: Balance, instrument: Instrument, count: int) -> tuple[Array, Noise]:
+def start_of(data: Readings, instrument: Instrument, count: int) -> tuple[Array, Noise]:
     """Second moments (n, 3, 3) by a regression with a constant momentum, and a noise."""
     rates = jax.vmap(instrument.rates)(data.omega)
     carried = jax.vmap(instrument.carried)(data.times, data.wheel)
+    blocks = data.known.shape[1]
+    block = (data.times.shape[1] - 1) // blocks
 
     def one(body):
-        weight = jnp.repeat(data.weight, data.block, axis=1)
+        weight = jnp.repeat(data.known, block, axis=1)
         weight = jnp.pad(weight, ((0, 0), (0, data.times.shape[1] - weight.shape[1])))
         weight = weight * (data.body == body).astype(data.times.dtype)[:, None]
         _, sigma, _ = regression(rates, data.times, weight, carried)
@@ -276,4 +206,9 @@ def start_of(data: Balance, instrument: Instrument, count: int) -> tuple[Array, 
     sigma, typical = jax.vmap(one)(jnp.arange(count))
     size = jnp.trace(sigma, axis1=1, axis2=2)
     span = data.times[0, -1] - data.times[0, 0]
-    return sigma, Noise(1e-3 * typical, 0.01 * size * typical / jnp.sqrt(span))
+    fast = jnp.max(jnp.abs(data.wheel))
+    white = 1e-3 * size * typical / jnp.sqrt(span)
+    return sigma, Noise(
+        3e-4 * typical, 1e-4 * typical, white, 0.3 * white, 0.01 * size * typical / span,
+        0.1 * span, 1e-3 * fast,
+    )  # fmt: skip

@@ -9,8 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import is_concrete, require
-from polhode.fit._balance import Noise, balance_of, solve_balance, start_of
+from polhode.fit._balance import Known, solve_balance, start_of
 from polhode.fit._compiled import compiled
+from polhode.fit._filter import Noise, readings_of
 from polhode.fit._fit import FitError
 from polhode.fit._instrument import Instrument, Tolerance
 from polhode.fit._linear import entries_of, whole_of
@@ -25,9 +26,10 @@ class BalanceFit(eqx.Module):
     kg m^2; ``moments`` (n, 3), ascending, and ``axes`` (n, 4), ``wxyz`` principal -> sensor axes,
     with standard deviations ``moments_std`` and ``axes_std`` (n, 3), rad, about each principal
     axis;
-    ``covariance`` (n, 6, 6) of xx, yy, zz, yz, zx, xy; ``instrument`` as it was found; ``noise``
-    found of the balance (``omega``, rad/s) and of the torque (``torque``, N m s^(1/2)) per body;
-    ``residuals`` (r, t, 3) over their noise; ``converged``.
+    ``covariance`` (n, 6, 6) of xx, yy, zz, yz, zx, xy; ``drag`` (n, 2): torque over rate, N m s,
+    and over rate times speed, N m s^2; ``instrument`` as it was found; ``noise`` found;
+    ``residuals`` (r, b, 3), of the rates expected from the readings before, over their noise;
+    ``surprise``: minus the logarithm of the likelihood, but for a constant; ``converged``.
     """
 
     inertia: Inertia
@@ -36,27 +38,30 @@ class BalanceFit(eqx.Module):
     moments_std: Float[Array, "n 3"]
     axes_std: Float[Array, "n 3"]
     covariance: Float[Array, "n 6 6"]
+    drag: Float[Array, "n 2"]
     instrument: Instrument
     noise: Noise
-    residuals: Float[Array, "r t 3"]
+    residuals: Float[Array, "r b 3"]
+    surprise: Float[Array, " *n"]
     converged: Array
-    knots: int = eqx.field(static=True)
     block: int = eqx.field(static=True)
 
     def each(self, recordings: Sequence[Recording], body: int = 0) -> "BalanceFit":
         """Every recording of a body by itself, with this instrument and the noise of that body."""
-        noise = Noise(self.noise.omega[body], self.noise.torque[body])
+        noise = Noise(*(x[body] if jnp.ndim(x) else x for x in self.noise))
         tensor = self.inertia.tensor[body]
         given = stack(recordings)
         found = [
             _alone(
                 jax.tree.map(lambda x, k=k: x[k : k + 1], given),
-                self.instrument, noise, tensor, self.knots, self.block,
+                self.instrument, noise, tensor, self.block,
             )
             for k in range(len(recordings))
         ]  # fmt: skip
         joined = jax.tree.map(lambda *x: jnp.concatenate([jnp.atleast_1d(y) for y in x]), *found)
-        return eqx.tree_at(lambda fit: fit.instrument, joined, self.instrument)
+        return eqx.tree_at(
+            lambda fit: (fit.instrument, fit.noise), joined, (self.instrument, noise)
+        )
 
 
 def fit_balance(
@@ -65,16 +70,15 @@ def fit_balance(
     *,
     bodies: Sequence[int] | None = None,
     tolerance: Tolerance | None = None,
-    knot: float = 0.02,
     block: int = 1,
     throw: bool = True,
 ) -> BalanceFit:
-    """Inertia tensors by the balance of angular momentum, the gyroscope turning the frame itself.
+    """Inertia tensors by the balance of angular momentum: the likeliest, and how sure they are.
 
-    For throws in air with a wheel of measured speed. ``I omega + h - R^T L = 0`` with the attitude
-    R integrated from the rates; L, constant in space without torques, wanders as Brownian motion
-    between knots ``knot`` seconds apart, by as much as the data say. Nothing need be known of the
-    drag, and errors do not build up along the flight as those of a simulated one do.
+    For throws in air with a wheel of measured speed. The gyroscope turns the frame in which
+    ``I omega + h`` is followed; drag, white torques and a torque with memory move it, by as much as
+    the data say. The rates read are compared with those expected (``polhode.fit._filter``): their
+    noise does not bias the moments, not even of a single short throw that hardly shows them.
 
     **Arguments:** ``recordings``: with rates and ``wheel_speed``, of free flight only (leave the
     hands out); NaN where a reading is not to be believed: the speed of a motor just switched on,
@@ -84,9 +88,9 @@ def fit_balance(
     ``block``: how many samples give one residual: so many that their noise is white. Readings much
     faster than the motion are best ``averaged`` first.
 
-    The noise is found by maximum evidence (MacKay, Neural Computation 4 (1992) 415). Every tensor
-    is physical. Raises ValueError for recordings without rates or wheel, and FitError when a fit is
-    not finite or did not converge, unless ``throw=False``.
+    Noise, drag and instrument are found together with the tensors. Every tensor is physical. Raises
+    ValueError for recordings without rates or wheel, and FitError when a fit is not finite or did
+    not converge, unless ``throw=False``.
     """
     given = stack(recordings)
     require(
@@ -100,20 +104,16 @@ def fit_balance(
         f"bodies must number the body of each of {len(recordings)} recordings from 0 on without "
         f"leaving one out, got {numbers.tolist()}.",
     )
-    require(is_concrete(given.times) and knot > 0, "fit_balance takes arrays, not traced values.")
+    require(is_concrete(given.times), "fit_balance takes arrays, not traced values.")
     present = np.asarray(given.present * needed("wheel_known", given.wheel_known)) > 0
     require(
         present.sum(axis=1) >= 8,
         "each recording needs at least 8 samples with rates and wheel, got "
         f"{present.sum(axis=1).min()}.",
     )
-    times = np.asarray(given.times)
-    span = max(float(t[p][-1] - t[0]) for t, p in zip(times, present, strict=True))
-    knots = max(round(span / knot), 1) + 1
-    free = tolerance is not None
     found = _together(
-        given, jnp.asarray(numbers), instrument, tolerance or Tolerance(), count, knots, block, free
-    )
+        given, jnp.asarray(numbers), instrument, tolerance, count, block,
+    )  # fmt: skip
     if throw and not bool(found.converged & jnp.all(jnp.isfinite(found.covariance))):
         raise FitError(
             "the balance of momentum did not converge or is not finite: look for recordings with "
@@ -124,23 +124,24 @@ def fit_balance(
 
 
 @compiled
-def _together(recording, numbers, instrument, tolerance, count, knots, block, free):
-    data = balance_of(recording, numbers, knots, block)
-    start, noise = start_of(data, instrument, count)
-    found = solve_balance(data, start, instrument, tolerance, noise, free)
-    return _concluded(found, knots, block)
+def _together(recording, numbers, instrument, tolerance, count, block):
+    data = readings_of(recording, numbers, block)
+    sigma, noise = start_of(data, instrument, count)
+    known = Known(sigma, instrument, tolerance or Tolerance(), noise)
+    return _concluded(solve_balance(data, known, "instrument" if tolerance else "noise"), block)
 
 
 @compiled
-def _alone(recording, instrument, noise, tensor, knots, block):
-    start = (jnp.trace(tensor) / 2 * jnp.eye(3, dtype=tensor.dtype) - tensor)[None]
-    data = balance_of(recording, jnp.zeros(1, int), knots, block)
-    noise = jax.tree.map(lambda x: x[None], noise)
-    found = solve_balance(data, start, instrument, Tolerance(), noise, False)
-    return _concluded(found, knots, block)
+def _alone(recording, instrument, noise, tensor, block):
+    sigma = (jnp.trace(tensor) / 2 * jnp.eye(3, dtype=tensor.dtype) - tensor)[None]
+    data = readings_of(recording, jnp.zeros(1, int), block)
+    noise = Noise(*(x[None] for x in noise[:5]), *noise[5:])
+    return _concluded(
+        solve_balance(data, Known(sigma, instrument, Tolerance(), noise), "tensor"), block
+    )
 
 
-def _concluded(found, knots, block) -> BalanceFit:
+def _concluded(found, block) -> BalanceFit:
     def one(tensor, covariance):
         moments, axes, _ = principal(tensor)
 
@@ -158,6 +159,6 @@ def _concluded(found, knots, block) -> BalanceFit:
 
     moments, axes, spread, turn = jax.vmap(one)(found.tensors, found.covariance)
     return BalanceFit(
-        Inertia(full=found.tensors), moments, axes, spread, turn, found.covariance,
-        found.instrument, found.noise, found.rest, found.converged, knots, block,
+        Inertia(full=found.tensors), moments, axes, spread, turn, found.covariance, found.drag,
+        found.instrument, found.noise, found.rest, found.surprise, found.converged, block,
     )  # fmt: skip

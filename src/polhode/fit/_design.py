@@ -1,0 +1,64 @@
+"""Which throw tells most: the information about the tensor that a planned throw would bring."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from polhode.fit._filter import Noise, Readings, innovations, score_of
+from polhode.fit._instrument import Instrument
+from polhode.fit._linear import entries_of, whole_of
+from polhode.fit._motion import SteppedMotion
+
+# spin that drag may take in a second, as a part of the whole, of which the throw tells the rest
+_LOST = 0.3
+
+
+def throw_information(
+    tensor: Float[Array, "3 3"],
+    omega: Float[Array, " 3"],
+    times: Float[Array, " t"],
+    wheel_speed: Float[Array, " t"],
+    instrument: Instrument,
+    noise: Noise,
+    block: int = 1,
+) -> Float[Array, "6 6"]:
+    """Fisher's information of one throw about the tensor, as ``fit_balance`` would find it.
+
+    **Arguments:** ``tensor``, kg m^2, sensor axes, the wheel locked; ``omega``, rad/s: rates at
+    ``times[0]``; ``wheel_speed``, rad/s, at ``times``, s; ``instrument`` (known; its axis not
+    traced); ``noise`` of one body, of residuals of ``block`` samples, such as a fit's. The throw is
+    flown without drag; that drag is unknown is accounted for.
+
+    Of xx, yy, zz, yz, zx, xy over half the trace of the tensor: the inverse is the Cramer-Rao bound
+    of their relative errors. Its log-determinant has derivatives by ``omega`` and ``wheel_speed``:
+
+        def worth(omega, wheel_speed):
+            found = throw_information(tensor, omega, times, wheel_speed, instrument, noise)
+            return jnp.linalg.slogdet(found)[1]
+        slopes = jax.grad(worth, argnums=(0, 1))(omega, wheel_speed)
+    """
+    x, y, z = (float(component) for component in np.asarray(instrument.axis))
+    flight = SteppedMotion(instrument.spin_inertia, (x, y, z), instrument.delay, steps=2)
+    unknown = {"drag": None, "delay": None}
+    rates = flight(tensor, omega, None, times, wheel_speed, unknown).omega
+    size = jnp.trace(tensor) / 2
+    count = (times.shape[0] - 1) // block
+    blocks = jnp.mean(wheel_speed[: count * block].reshape(count, block), axis=1)
+    fast = jnp.max(jnp.abs(jax.lax.stop_gradient(wheel_speed)))
+    stir = (blocks / jnp.where(fast > 0, fast, 1)) ** 2
+    data = Readings(times, rates, wheel_speed, jnp.ones_like(blocks), stir, jnp.zeros((), int))
+    typical = jnp.sqrt(jnp.mean(jnp.sum(rates**2, axis=1)))
+
+    def found(unknown):
+        drag = _LOST * size * jnp.stack([unknown[6], unknown[7] / typical])
+        got = innovations(data, size * whole_of(unknown[:6], 6), drag, instrument, noise)
+        return got, got
+
+    here = jnp.concatenate([entries_of(tensor / size, 6), jnp.zeros(2, tensor.dtype)])
+    by, got = jax.jacfwd(found, has_aux=True)(here)
+    every = score_of(got, by).information
+    air = every[6:, 6:] + jnp.eye(2, dtype=tensor.dtype)
+    determinant = air[0, 0] * air[1, 1] - air[0, 1] * air[1, 0]
+    swapped = jnp.stack([jnp.stack([air[1, 1], -air[0, 1]]), jnp.stack([-air[1, 0], air[0, 0]])])
+    return every[:6, :6] - every[:6, 6:] @ (swapped / determinant) @ every[6:, :6]

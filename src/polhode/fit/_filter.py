@@ -1,0 +1,222 @@
+"""How likely readings of gyroscope and wheel are, all that moves the body being uncertain.
+
+The gyroscope turns the frame, and the momentum ``L = R (I omega + h)`` is followed in it by a
+Kalman filter: drag and a torque with memory move it, and so does every error of the gyroscope,
+which turned the frame too. The rates that the filter expects are compared with those read. No
+measured rate stands on the side of the unknowns, so its noise does not pull the inertia down
+(errors in variables), and the determinants of the covariances make the likelihood that of the
+readings alone (the trajectory is integrated out: Schweppe, IEEE Trans. Inf. Theory 11 (1965) 61).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from polhode.fit._instrument import Instrument
+from polhode.fit._recording import Recording, bridged, needed
+from polhode.fit._start import central_slope, integrate
+from polhode.rotation import to_matrix
+
+
+class Noise(NamedTuple):
+    """Standard deviations; those of a body have its number on the leading axis n.
+
+    ``omega``, rad/s: of a residual, and ``omega_wheel`` what the fastest wheel adds; ``torque``,
+    N m s^(1/2), of white torques and ``torque_wheel`` what the fastest wheel adds (both grow with
+    the square of its speed, as an imbalance does); ``slow``, N m, of a torque that forgets within
+    ``memory``, s; ``wheel``, rad/s: of the wheel's speed in a residual.
+    """
+
+    omega: Float[Array, "*n"]
+    omega_wheel: Float[Array, "*n"]
+    torque: Float[Array, "*n"]
+    torque_wheel: Float[Array, "*n"]
+    slow: Float[Array, "*n"]
+    memory: Float[Array, ""]
+    wheel: Float[Array, ""]
+
+
+class Readings(NamedTuple):
+    """Recordings (leading axis r) cut into blocks, each of which gives one residual.
+
+    ``known`` (r, b): 1 where a block has rates and wheel; ``stir`` (r, b): square of the wheel's
+    speed over that of the fastest; ``body`` (r,): its number.
+    """
+
+    times: Float[Array, "*r t"]
+    omega: Float[Array, "*r t 3"]
+    wheel: Float[Array, "*r t"]
+    known: Float[Array, "*r b"]
+    stir: Float[Array, "*r b"]
+    body: Array
+
+
+def readings_of(recording: Recording, body: Array, block: int) -> Readings:
+    """Prepare recordings (leading axis r) of the bodies with numbers ``body`` (r,)."""
+    times = recording.times
+    omega = bridged(times, recording.present, recording.omega)
+    sample = recording.present * needed("wheel_known", recording.wheel_known)
+    count = (times.shape[1] - 1) // block
+
+    def blocks(values):
+        cut = values[:, : count * block]
+        return jnp.mean(cut.reshape(-1, count, block), axis=2)
+
+    known = jnp.floor(blocks(sample))
+    fast = jnp.max(jnp.abs(recording.wheel) * sample)
+    stir = (blocks(recording.wheel) / jnp.where(fast > 0, fast, 1)) ** 2
+    return Readings(times, omega, recording.wheel, known, stir, body)
+
+
+class Innovations(NamedTuple):
+    """Rates read less those expected from all read before, and the covariances of that."""
+
+    rest: Float[Array, "b 3"]
+    covariance: Float[Array, "b 3 3"]
+
+
+class _Moved(NamedTuple):
+    """What a step of the filter is given of a block (leading axis: blocks)."""
+
+    rates: Array  # mean rates
+    carried: Array  # mean momentum of the wheel, body axes
+    back: Array  # mean of R^T
+    turn: Array  # R in its middle
+    spun: Array  # what a rate's error does to the momentum within it
+    gained: Array  # momentum gained by drag
+    span: Array
+    known: Array
+    omega: Array  # variance of the rates
+    torque: Array  # of the white torque's push
+
+
+def innovations(
+    data: Readings,
+    tensor: Float[Array, "3 3"],
+    drag: Float[Array, " 2"],
+    instrument: Instrument,
+    noise: Noise,
+) -> Innovations:
+    """Of one recording; ``drag``: linear, N m s, and quadratic, N m s^2, isotropic.
+
+    Momenta are divided by half the trace of the tensor, so that all numbers are of the order of
+    rates.
+    """
+    count = data.known.shape[0]
+    block = (data.times.shape[0] - 1) // count
+    size = jnp.trace(tensor) / 2
+    unit = jnp.eye(3, dtype=tensor.dtype)
+    body = tensor / size
+    inverse = inverse_of(body)
+
+    def cut(values):
+        return values[: count * block].reshape(count, block, *values.shape[1:])
+
+    rates = instrument.rates(data.omega)
+    turn = to_matrix(integrate(rates, central_slope(rates, data.times), data.times))
+    carried = instrument.carried(data.times, data.wheel) / size
+    speed = jnp.sqrt(jnp.sum(rates**2, axis=1, keepdims=True) + jnp.finfo(rates.dtype).tiny)
+    push = -(drag[0] + drag[1] * speed) / size * rates
+    ends = data.times[: count * block + 1 : block]
+    span = jnp.diff(ends)
+    mean = jnp.mean(cut(rates), axis=1), jnp.mean(cut(carried), axis=1)
+    middle = cut(turn)[:, block // 2]
+    momentum = jnp.einsum("ij,bj->bi", body, mean[0]) + mean[1]
+    spun = jnp.einsum("bij,bjk->bik", middle, -_hat(momentum)) * span[:, None, None]
+    gained = jnp.mean(cut(jnp.einsum("tij,tj->ti", turn, push)), axis=1) * span[:, None]
+    omega = noise.omega**2 + (noise.omega_wheel * data.stir) ** 2
+    torque = (noise.torque**2 + (noise.torque_wheel * data.stir) ** 2) * span / size**2
+    along = jnp.einsum("ij,j->i", inverse, instrument.axis) * instrument.spin_inertia / size
+    wheel = noise.wheel**2 * along[:, None] * along[None]
+    slow = (noise.slow / size) ** 2
+
+    def step(state, now: _Moved):
+        # momentum and slow torque (6,), the latter in body axes
+        mean, spread = state
+        back = inverse @ now.back
+        # what acts throughout a block has acted for half of it when its rates are read, on average
+        expects = jnp.concatenate([back, now.span / 2 * back @ now.turn], axis=1)
+        rest = now.rates - (expects @ mean + back @ now.gained / 2 - inverse @ now.carried)
+        heard = unit + back @ now.spun / 2
+        seen = expects @ spread @ expects.T + now.omega * heard @ heard.T + wheel
+        stays = jnp.exp(-now.span / noise.memory)
+        moves = jnp.block([[unit, now.span * now.turn], [jnp.zeros_like(unit), stays * unit]])
+        shaken = now.torque * unit + now.omega * now.spun @ now.spun.T
+        fresh = slow * (1 - stays**2) * unit
+        zero = jnp.zeros_like(unit)
+        # the same error is in the reading and in the turn of the frame
+        both = jnp.concatenate([now.omega * now.spun @ heard.T, zero])
+        gain = (moves @ spread @ expects.T + both) @ inverse_of(seen) * now.known
+        mean = moves @ mean + jnp.concatenate([now.gained, jnp.zeros_like(rest)]) + gain @ rest
+        spread = moves @ spread @ moves.T + jnp.block([[shaken, zero], [zero, fresh]])
+        spread = spread - gain @ seen @ gain.T
+        found = Innovations(jnp.where(now.known > 0, rest, 0), jnp.where(now.known > 0, seen, unit))
+        return (mean, (spread + spread.T) / 2), found
+
+    # nothing is known of the first momentum: its rates are as uncertain as rates are large
+    wide = jnp.mean(speed**2)
+    zero = jnp.zeros_like(unit)
+    begin = jnp.block([[wide * body @ body.T, zero], [zero, slow * unit]])
+    start = jnp.concatenate([momentum[0], jnp.zeros_like(momentum[0])])
+    back = jnp.swapaxes(jnp.mean(cut(turn), axis=1), -1, -2)
+    moved = _Moved(*mean, back, middle, spun, gained, span, data.known, omega, torque)
+    _, found = jax.lax.scan(step, (start, begin), moved)
+    return found
+
+
+def _hat(vector: Float[Array, "b 3"]) -> Float[Array, "b 3 3"]:
+    """The matrix of ``vector x``."""
+    x, y, z = (vector[:, k] for k in range(3))
+    o = jnp.zeros_like(x)
+    rows = [[o, -z, y], [z, o, -x], [-y, x, o]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _cofactors(matrix: Float[Array, "*b 3 3"]) -> tuple[Array, Array]:
+    """Determinants and cofactors of symmetric matrices."""
+    a, b, c = (matrix[..., k, k] for k in range(3))
+    p, q, r = matrix[..., 1, 2], matrix[..., 2, 0], matrix[..., 0, 1]
+    rows = [
+        [b * c - p * p, p * q - r * c, r * p - q * b],
+        [p * q - r * c, a * c - q * q, q * r - p * a],
+        [r * p - q * b, q * r - p * a, a * b - r * r],
+    ]
+    found = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+    return jnp.sum(matrix[..., 0, :] * found[..., 0, :], axis=-1), found
+
+
+def inverse_of(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
+    """Inverses of symmetric matrices, written out."""
+    determinant, found = _cofactors(matrix)
+    return found / determinant[..., None, None]
+
+
+def surprise(found: Innovations) -> Float[Array, ""]:
+    """Minus the logarithm of the likelihood, but for a constant."""
+    weighed = jnp.einsum("bi,bij,bj->", found.rest, inverse_of(found.covariance), found.rest)
+    return (weighed + jnp.sum(jnp.log(_cofactors(found.covariance)[0]))) / 2
+
+
+class Score(NamedTuple):
+    """``surprise``, its slopes by p unknowns, and the information (expected second slopes)."""
+
+    surprise: Float[Array, "*r"]
+    slope: Float[Array, "*r p"]
+    information: Float[Array, "*r p p"]
+    rest: Float[Array, "*r b 3"]
+
+
+def score_of(found: Innovations, by: Innovations) -> Score:
+    """Of innovations whose derivatives by p unknowns (last axis) are ``by``."""
+    inverse = inverse_of(found.covariance)
+    pull = jnp.einsum("bij,bj->bi", inverse, found.rest)
+    relative = jnp.einsum("bij,bjkp->bikp", inverse, by.covariance)
+    slope = jnp.einsum("bip,bi->p", by.rest, pull)
+    slope = slope - jnp.einsum("bi,bijp,bj->p", pull, by.covariance, pull) / 2
+    slope = slope + jnp.einsum("biip->p", relative) / 2
+    shown = jnp.einsum("bip,bij,bjq->pq", by.rest, inverse, by.rest)
+    shown = shown + jnp.einsum("bikp,bkiq->pq", relative, relative) / 2
+    rest = found.rest / jnp.sqrt(jnp.diagonal(found.covariance, axis1=1, axis2=2))
+    return Score(surprise(found), slope, shown, rest)
