@@ -153,7 +153,7 @@ def best_possible(curve, body, floor=0.01) -> dict:
 
 
 def summary(cases, noise: float) -> dict:
-    """Counts of the cases of one noise; ``determined``: periods can be known to 0.1 % at 3 sigma."""
+    """Counts of one noise; ``determined``: the points allow 0.1 % in both periods at 3 sigma."""
     rows = [r for r in cases if r["noise"] == noise]
     sharp = [
         r for r in rows

@@ -23,7 +23,8 @@ def seen():
 def trial(seen):
     """Two bodies of given periods, in both modes."""
     meant = _search.Hypotheses(np.array([1.2, 1.2]), np.array([0.7, 0.7]), np.array([True, False]))
-    return _search.build(*_search.draw(jax.random.key(1), meant, 8, 0.0), PHASE)[0]
+    draws = _search.draw(jax.random.key(1), meant, 8, 0.0)
+    return jax.tree.map(jnp.asarray, _search.build(*draws, PHASE)[0])
 
 
 def test_trial_bodies_have_the_periods_asked(trial):

@@ -104,7 +104,9 @@ class LightCurve(NamedTuple):
         sigma = np.sqrt(np.bincount(place, self.sigma**2)) / many
         rows = (mean(self.t), mean(self.magnitude), sigma, np.rint(mean(self.group)).astype(int))
         order = np.argsort(rows[0], kind="stable")
-        sun, observer = (None if v is None else v[order] for v in map(means, (self.sun, self.observer)))
+        sun, observer = (
+            None if v is None else v[order] for v in map(means, (self.sun, self.observer))
+        )
         t, magnitude, sigma, group = (x[order] for x in rows)
         return self._replace(
             t=t, magnitude=magnitude, sigma=sigma, group=group, sun=sun, observer=observer

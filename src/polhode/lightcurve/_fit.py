@@ -101,7 +101,14 @@ def _blur(curve: LightCurve) -> float:
 
 
 def _searched(
-    key, meant: Hypotheses, trials: int, starts: int, few: Points, problem: Problem, blur, resolution
+    key,
+    meant: Hypotheses,
+    trials: int,
+    starts: int,
+    few: Points,
+    problem: Problem,
+    blur,
+    resolution,
 ) -> State:
     """Bodies of all hypotheses; then more with the periods found, whose pole may be wrong."""
     phase, rough = problem.phase, Problem(problem.phase, few)

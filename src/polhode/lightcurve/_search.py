@@ -163,7 +163,7 @@ def _in_chunks(function, total: int, *arrays):
 
 
 def build(draws: Draws, long_axis, phase: AbstractPhase, spread: float = 0.15):
-    """Bodies (b,), and which exist; logarithms of axes' ratios differ by ``spread`` from inertia's."""
+    """Bodies (b,), and which exist; ``spread``: of the shape's ratios by the inertia's, in ln."""
     total = len(long_axis)
     bodies, good = _in_chunks(
         lambda _, d, mode: _built(d, mode, spread), total, draws, np.asarray(long_axis)
@@ -224,8 +224,8 @@ def misfits(phase: AbstractPhase, bodies: Bodies, points: Points) -> tuple[np.nd
     Offsets are fitted, and the light's variations may be a little greater or smaller all over: by
     the gain, as other axes' ratios would make them.
     """
-    # weights and a slope by the phase angle: the phase function is not known yet
-    slope = points.alpha * (points.weight > 0)
+    # a slope by the phase angle: the phase function is not known yet
+    slope = jnp.where(points.weight > 0, points.alpha, 0.0)
     points = points._replace(
         columns=jnp.concatenate([points.columns, slope]),
         stiffness=jnp.append(points.stiffness, _SLOPE_SIGMA**-2.0),
