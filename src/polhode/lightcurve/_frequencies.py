@@ -201,22 +201,22 @@ def fourier_lattices(
     alone = np.stack([nodes, np.zeros_like(nodes)], -1)
     peaks = _maxima(scan.explained(alone, np.array([[1, 0]])))[:lines]
     found = []
-    for g in nodes[peaks]:
-        line = np.stack([np.full_like(nodes, g), nodes], -1)
+    for node in nodes[peaks]:
+        line = np.stack([np.full_like(nodes, node), nodes], -1)
         found.append(line[_maxima(scan.explained(line, terms(1, even=False)))[:keep]])
     found = np.concatenate(found)
     power = scan.explained(found, multiples)
     order = np.argsort(-power)
     kept: list[tuple[float, int, int]] = []
-    for part, (g, h) in zip(power[order], found[order]):
-        pair = max(g, h), min(g, h)
-        same = [max(abs(pair[0] - a), abs(pair[1] - b)) <= oversampling // 2 for _, a, b in kept]
-        if not any(same) and abs(g - h) > oversampling // 2:
-            kept.append((part, *pair))
+    for part, (one, other) in zip(power[order], found[order]):
+        g, h = int(max(one, other)), int(min(one, other))
+        same = [max(abs(g - a), abs(h - b)) <= oversampling // 2 for _, a, b in kept]
+        if not any(same) and g - h > oversampling // 2:
+            kept.append((float(part), g, h))
         if len(kept) == keep:
             break
-    power, g, h = np.array(kept).T
-    return Pairs(g * scan.step, h * scan.step, power, scan.resolution)
+    power, high, low = np.array(kept).T
+    return Pairs(high * scan.step, low * scan.step, power, scan.resolution)
 
 
 def _maxima(values: np.ndarray) -> np.ndarray:

@@ -290,6 +290,7 @@ def tried(
         np.minimum.at(best, whole.source, whole.misfit)
         most = max(4, int(part_of_hypotheses * len(best)))
         alive = np.sort(alive[np.argsort(best[alive])[:most]])
+    assert whole is not None  # there is a round
     return whole
 
 
