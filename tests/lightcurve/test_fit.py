@@ -15,7 +15,7 @@ PHASE = lightcurve.HG1G2()
 
 @pytest.fixture(scope="module")
 def seen():
-    curve, truth = light_curves.synthetic(3, 0.02, nights=8, days=12.0, each=16)
+    curve, truth, _ = light_curves.synthetic(3, 0.02, nights=8, days=12.0, each=16)
     return curve, truth, curve.points(0.01)
 
 
@@ -23,7 +23,8 @@ def seen():
 def trial(seen):
     """Two bodies of given periods, in both modes."""
     meant = _search.Hypotheses(np.array([1.2, 1.2]), np.array([0.7, 0.7]), np.array([True, False]))
-    return _search.draw(jax.random.key(1), meant, 8, PHASE, 0.0)[0]
+    draws = _search.draw(jax.random.key(1), meant, 8, 0.0)
+    return jax.tree.map(jnp.asarray, _search.build(*draws, PHASE)[0])
 
 
 def test_trial_bodies_have_the_periods_asked(trial):

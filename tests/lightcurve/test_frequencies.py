@@ -57,3 +57,26 @@ def test_meaning_names_mode_and_sums():
     assert text.startswith("LAM only")
     assert "f_phi = 1" in text
     assert "2 f_phi = 2" in text
+
+
+def test_lattices_find_the_sums_of_a_long_curve():
+    """A basis of the lattice comes first, and explains what least squares say."""
+    rng = np.random.default_rng(5)
+    start = np.sort(rng.choice(60, 20, replace=False))
+    t = np.sort(start[:, None] + rng.uniform(0, 0.3, (20, 20)), axis=1).ravel()
+    waves = ((2, 0, 0.3, 1.0), (2, 2, 0.2, 2.0), (1, 2, 0.1, 0.5))
+    value = sum(
+        a * np.cos(2 * np.pi * (i * F_PHI + j * F_PSI) * t + p) for i, j, a, p in waves
+    ) + 0.02 * rng.normal(size=t.size)
+    found = lightcurve.fourier_lattices(t, value, highest=5.0, keep=20)
+    assert np.all(np.diff(found.explained) <= 0)
+    assert found.explained[0] > 0.9
+    g, h = found.f_phi[0], found.f_psi[0]
+    sums = _frequencies.terms(2, even=False) @ [g, h]
+    # f_phi itself may be missing, of which its faint wave is an odd multiple
+    for i, j, *_ in waves[:2]:
+        assert np.abs(np.abs(sums) - (i * F_PHI + j * F_PSI)).min() < 0.5 * found.resolution
+    phases = 2 * np.pi * np.outer(t, sums)
+    whole = np.hstack([np.ones((t.size, 1)), np.cos(phases), np.sin(phases)])
+    left = value - whole @ np.linalg.lstsq(whole, value, rcond=None)[0]
+    assert found.explained[0] == pytest.approx(1 - left.var() / value.var(), abs=0.01)

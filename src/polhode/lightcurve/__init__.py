@@ -5,6 +5,7 @@ from polhode.lightcurve._data import LightCurve as LightCurve
 from polhode.lightcurve._fit import fit_light_curve as fit_light_curve
 from polhode.lightcurve._frequencies import (
     Pairs as Pairs,
+    fourier_lattices as fourier_lattices,
     fourier_pairs as fourier_pairs,
     meaning as meaning,
 )

@@ -4,14 +4,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from polhode import rotation
+from polhode import free, rotation
 from polhode.lightcurve._data import LightCurve
-from polhode.lightcurve._frequencies import Pairs, fourier_pairs
-from polhode.lightcurve._model import Bodies
+from polhode.lightcurve._frequencies import Pairs, fourier_lattices
+from polhode.lightcurve._model import Bodies, Points
 from polhode.lightcurve._phase import HG1G2, AbstractPhase, SeeligerPhase
-from polhode.lightcurve._search import Hypotheses, draw, hypotheses, misfits
+from polhode.lightcurve._search import Hypotheses, Trials, hypotheses, tried
 from polhode.lightcurve._solutions import Fit, described, frequencies, momentum, notes_on
 from polhode.lightcurve._steps import BATCH, Problem, State, picked, taken
+
+_FEW = 256  # points that a search looks at
+_AGAIN = 8  # pairs of periods searched again
+_LIMIT = 3.0  # of residuals in a search, in sigma
+_REACHED = 1.3  # chi-square per degree of freedom at which a search ends
 
 
 def fit_light_curve(
@@ -20,8 +25,9 @@ def fit_light_curve(
     phase: AbstractPhase | None = None,
     pairs: Pairs | None = None,
     highest: float | None = None,
-    trials: int = 60_000,
-    starts: int = 192,
+    trials: int = 100_000,
+    starts: int = 288,
+    searches: int = 3,
     floor: float = 0.03,
     offset_sigma: float | None = None,
     limit: float = 3.0,
@@ -55,21 +61,21 @@ def fit_light_curve(
         columns = curve.columns(np.inf)[0]
         if np.ptp(curve.alpha) > np.radians(1):
             columns = np.vstack([columns, curve.alpha, curve.alpha**2])
-        pairs = fourier_pairs(
-            curve.t, curve.magnitude, columns=columns, highest=highest, order=1, even=False, keep=60
-        )
+        pairs = fourier_lattices(curve.t, curve.magnitude, columns=columns, highest=highest)
     meant = hypotheses(pairs)
     key = jax.random.key(seed)
-    problem = Problem(phase, points)
-    bodies, misfit, source = _trials(key, meant, trials, phase, points, _blur(curve))
-    start = _varied(misfit, source, starts, each=4)
-    state = problem.start(taken(bodies, start), np.full(starts, 10.0))
-    for keep, bound, steps in ((3 * BATCH, 10.0, 8), (BATCH, 10.0, 12), (0, limit, 40)):
-        width = np.full(len(state.cost), bound)
-        state = problem.improve(state, width, steps)
-        if keep:
-            best = _varied(state.cost, np.zeros(len(state.cost)), keep, each=keep)
-            state = problem.look(*picked(state[:2], best), np.full(keep, limit))
+    few, problem = _thinned(points, _FEW), Problem(phase, points)
+    state = None
+    for _ in range(searches):
+        key, own = jax.random.split(key)
+        found = _searched(own, meant, trials, starts, few, problem, _blur(curve), pairs.resolution)
+        state = found if state is None else _joined(state, found)
+        # the errors assumed are reached: nothing is left to be found
+        freedom = max(curve.t.size - state.matrix.shape[1], 1)
+        if state.cost.min() < _REACHED * freedom:
+            break
+    assert state is not None
+    state = _better(problem, state, pairs.resolution, BATCH, limit, 40)
     normals = _mirrors(curve)
     order = _distinct(state, pairs.resolution)[: BATCH // 2]
     images = [_mirrored(taken(state.bodies, order), normal) for normal in normals]
@@ -77,7 +83,7 @@ def fit_light_curve(
     images = taken(images, np.arange(len(images.wxyz)))
     width = np.full(len(images.wxyz), limit)
     mirrored = problem.improve(problem.start(images, width), width, 30)
-    state = jax.tree.map(lambda *x: np.concatenate(x), state, mirrored)
+    state = _joined(state, mirrored)
     order = _distinct(state, pairs.resolution)[:most]
     solutions, scale = described(problem, state, order, curve, normals, limit)
     return Fit(solutions, curve, pairs, meant, scale, notes_on(curve, solutions, scale))
@@ -94,20 +100,75 @@ def _blur(curve: LightCurve) -> float:
     return float((0.125 + turned / (2 * np.pi)) / np.ptp(curve.t))
 
 
-def _trials(key, meant: Hypotheses, trials: int, phase, points, blur):
-    """Bodies of all hypotheses, then more of those that did best."""
-    count = len(meant.f_phi)
-    each = max(1, trials // 3 // count)
-    bodies, good = draw(jax.random.fold_in(key, 0), meant, each, phase, blur)
-    misfit = np.where(good, misfits(phase, bodies, points), np.inf)
-    source = np.repeat(np.arange(count), each)
-    best = np.sort(np.argsort(misfit.reshape(count, each).min(1))[: max(1, count // 4)])
-    more = max(1, (trials - len(misfit)) // len(best))
-    chosen = Hypotheses(*(x[best] for x in meant))
-    extra, good = draw(jax.random.fold_in(key, 1), chosen, more, phase, blur)
-    second = np.where(good, misfits(phase, extra, points), np.inf)
-    bodies = jax.tree.map(lambda *x: np.concatenate(x), bodies, extra)
-    return bodies, np.r_[misfit, second], np.r_[source, np.repeat(best, more)]
+def _searched(
+    key,
+    meant: Hypotheses,
+    trials: int,
+    starts: int,
+    few: Points,
+    problem: Problem,
+    blur,
+    resolution,
+) -> State:
+    """Bodies of all hypotheses; then more with the periods found, whose pole may be wrong."""
+    phase, rough = problem.phase, Problem(problem.phase, few)
+    trial = tried(jax.random.fold_in(key, 0), meant, trials, phase, few, blur)
+    state = _started(trial, starts, rough, each=3)
+    state = _better(problem, state, resolution, 3 * BATCH, 10.0, 12)
+    near, known = _near(state, resolution)
+    trial = tried(
+        jax.random.fold_in(key, 1), near, trials // 3, phase, few, 0.5 * resolution, known
+    )
+    again = _started(trial, starts // 3, rough, each=starts)
+    state = _joined(state, problem.start(again.bodies, np.full(len(again.cost), 10.0)))
+    return _better(problem, state, resolution, 2 * BATCH, _LIMIT, 12)
+
+
+def _started(trial: Trials, count: int, problem: Problem, each: int) -> State:
+    """A few steps from the best trials, at most ``each`` of one hypothesis."""
+    chosen = _varied(trial.misfit, trial.source, count, each)
+    bodies = taken(trial.bodies, chosen)
+    # the gain, as a first step of the shape
+    bodies.unknowns[: len(chosen), 2:4] *= trial.gain[chosen][:, None]
+    width = np.full(len(bodies.wxyz), 10.0)
+    return problem.improve(problem.start(bodies, width), width, 10)
+
+
+def _better(problem: Problem, state: State, resolution, keep: int, limit: float, steps: int):
+    """The ``keep`` best distinct ones, improved."""
+    best = _distinct(state, resolution)[:keep]
+    best = np.pad(best, (0, keep - len(best)), mode="edge")
+    width = np.full(keep, limit)
+    return problem.improve(problem.look(*picked(state[:2], best), width), width, steps)
+
+
+def _near(state: State, resolution: float) -> tuple[Hypotheses, Bodies]:
+    """Periods and modes of the best bodies, poles apart."""
+    f_phi, f_psi, mode = frequencies(state.bodies)
+    kept: list[int] = []
+    for k in np.argsort(state.cost):
+        if len(kept) < _AGAIN and np.isfinite(state.cost[k] + f_phi[k] + f_psi[k]):
+            size = [max(abs(f_phi[k] - f_phi[j]), abs(f_psi[k] - f_psi[j]))
+                    for j in kept if mode[j] == mode[k]]  # fmt: skip
+            if min(size, default=np.inf) > 0.3 * resolution:
+                kept.append(int(k))
+    meant = Hypotheses(f_phi[kept], f_psi[kept], mode[kept] == int(free.Mode.LAM))
+    return meant, picked(state.bodies, np.array(kept))
+
+
+def _joined(*states: State) -> State:
+    return jax.tree.map(lambda *x: np.concatenate(x), *states)
+
+
+def _thinned(points: Points, count: int) -> Points:
+    """``count`` of the points at most, evenly chosen."""
+    known = np.flatnonzero(np.asarray(points.weight[0]) > 0)
+    if len(known) <= count:
+        return points
+    index = known[np.arange(count) * len(known) // count]
+    return jax.tree.map(lambda x: x[..., index], points._replace(stiffness=None))._replace(
+        stiffness=points.stiffness
+    )
 
 
 def _varied(misfit, source, count: int, each: int) -> np.ndarray:

@@ -89,6 +89,51 @@ def _scan(tables, data, pairs, multiples):
     return jax.vmap(lambda pair: _equations(tables, data, multiples @ pair))(pairs)
 
 
+class _Scan(NamedTuple):
+    """Tables from which the normal equations of any pair of nodes are looked up."""
+
+    tables: tuple  # transforms of the window and of the columns projected out
+    data: Float[Array, " m"]
+    step: float
+    count: int  # nodes up to the highest frequency
+    size: int  # points
+    resolution: float
+
+    @classmethod
+    def of(cls, t, values, columns, highest, oversampling: int, multiples) -> "_Scan":
+        t, values = np.asarray(t, float), np.asarray(values, float)
+        t = t - t[0]
+        columns = np.ones((1, t.size)) if columns is None else np.asarray(columns, float)
+        basis = _orthonormal(columns)
+        values = values - basis.T @ (basis @ values)
+        values = values / np.sqrt(values @ values)
+        step = 1 / (oversampling * np.ptp(t))
+        if highest is None:
+            highest = min(_highest(t, values, step), _MOST * step)
+        count = int(np.ceil(highest / step)) + 1
+        most = 2 * (int(np.abs(multiples).sum(1).max()) * count + 1)
+        window, data, *rest = _transforms(
+            jnp.asarray(t), jnp.asarray(np.vstack([np.ones_like(t), values, basis])), step, most
+        )
+        return cls((window, jnp.stack(rest)), data, step, count, t.size, step * oversampling)
+
+    def explained(self, pairs: np.ndarray, multiples: np.ndarray) -> np.ndarray:
+        """Part of the variance (k,) that the series of pairs of nodes (k, 2) explain."""
+        chunk = min(_CHUNK, 256 * -(-len(pairs) // 256))
+        whole = np.concatenate([pairs, np.repeat(pairs[-1:], -len(pairs) % chunk, 0)])
+        power = np.empty(len(whole))
+        for start in range(0, len(whole), chunk):
+            part = slice(start, start + chunk)
+            gram, right = _scan(
+                self.tables, self.data, jnp.asarray(whole[part]), jnp.asarray(multiples)
+            )
+            # columns that coincide, or vanish, leave a singular matrix
+            gram = np.asarray(gram) + 1e-3 * self.size * np.eye(right.shape[-1])
+            right = np.asarray(right)
+            power[part] = np.sum(right * np.linalg.solve(gram, right[..., None])[..., 0], axis=-1)
+        return np.nan_to_num(power[: len(pairs)])
+
+
 def fourier_pairs(
     t: Float[Array | np.ndarray, " n"],
     values: Float[Array | np.ndarray, " n"],
@@ -108,40 +153,16 @@ def fourier_pairs(
     the grid, ``600 / oversampling`` turns within the light curve. Local maxima of the grid, the
     best ``keep``. Without ``even`` the two may be swapped, and ``f_phi`` is the higher one.
     """
-    t, values = np.asarray(t, float), np.asarray(values, float)
-    t = t - t[0]
-    span = np.ptp(t)
-    columns = np.ones((1, t.size)) if columns is None else np.asarray(columns, float)
-    basis = _orthonormal(columns)
-    values = values - basis.T @ (basis @ values)
-    values = values / np.sqrt(values @ values)
-    step = 1 / (oversampling * span)
-    if highest is None:
-        highest = min(_highest(t, values, step), _MOST * step)
-    count = int(np.ceil(highest / step)) + 1
     multiples = terms(order, even)
-    most = 2 * (int(np.abs(multiples).sum(1).max()) * count + 1)
-    window, data, *rest = _transforms(
-        jnp.asarray(t), jnp.asarray(np.vstack([np.ones_like(t), values, basis])), step, most
-    )
-    rest = jnp.stack(rest)
+    scan = _Scan.of(t, values, columns, highest, oversampling, multiples)
     # a tenth of a cycle at least; neither frequency may be that of the other
-    nodes = np.arange(max(oversampling // 2, 1), count)
+    nodes = np.arange(max(oversampling // 2, 1), scan.count)
     pairs = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), -1).reshape(-1, 2)
     if not even:
         pairs = pairs[pairs[:, 0] > pairs[:, 1]]
-    missing = -len(pairs) % _CHUNK
-    whole = np.concatenate([pairs, np.repeat(pairs[-1:], missing, 0)])
-    power = np.empty(len(whole))
-    for start in range(0, len(whole), _CHUNK):
-        part = slice(start, start + _CHUNK)
-        gram, right = _scan((window, rest), data, jnp.asarray(whole[part]), jnp.asarray(multiples))
-        # columns that coincide, or vanish, leave a singular matrix
-        gram = np.asarray(gram) + 1e-3 * t.size * np.eye(right.shape[-1])
-        right = np.asarray(right)
-        power[part] = np.sum(right * np.linalg.solve(gram, right[..., None])[..., 0], axis=-1)
+    power = scan.explained(pairs, multiples)
     grid = np.zeros((nodes.size, nodes.size))
-    grid[tuple((pairs - nodes[0]).T)] = np.nan_to_num(power[: len(pairs)])
+    grid[tuple((pairs - nodes[0]).T)] = power
     power = grid
     peak = np.pad(power, 1, constant_values=-1.0)
     around = [
@@ -150,8 +171,59 @@ def fourier_pairs(
     ]  # fmt: skip
     high = np.argwhere((power >= np.max(around, axis=0)) & (power > 0))
     best = high[np.argsort(-power[tuple(high.T)])][:keep]
-    found = nodes[best] * step
-    return Pairs(found[:, 0], found[:, 1], power[tuple(best.T)], 1 / span)
+    found = nodes[best] * scan.step
+    return Pairs(found[:, 0], found[:, 1], power[tuple(best.T)], scan.resolution)
+
+
+def fourier_lattices(
+    t: Float[Array | np.ndarray, " n"],
+    values: Float[Array | np.ndarray, " n"],
+    *,
+    columns: Float[Array | np.ndarray, "c n"] | None = None,
+    highest: float | None = None,
+    order: int = 2,
+    lines: int = 16,
+    oversampling: int = 5,
+    keep: int = 60,
+) -> Pairs:
+    """Pairs (g, h) whose sums of multiples up to ``order`` explain ``values`` best.
+
+    As `fourier_pairs` without ``even``, but g is only one of the ``lines`` highest peaks of the
+    spectrum of one frequency, of which aliases are some, and h is sought over the whole grid: the
+    strongest line of a body is always one of its sums, so that a long light curve, with thousands
+    of nodes, is searched by lines of the grid instead of all of it: with order 1, and the best of
+    every line again with ``order``. Which sums of multiples of the body's own frequencies g and h
+    are is left open.
+    """
+    multiples = terms(order, even=False)
+    scan = _Scan.of(t, values, columns, highest, oversampling, multiples)
+    nodes = np.arange(max(oversampling // 2, 1), scan.count)
+    alone = np.stack([nodes, np.zeros_like(nodes)], -1)
+    peaks = _maxima(scan.explained(alone, np.array([[1, 0]])))[:lines]
+    found = []
+    for node in nodes[peaks]:
+        line = np.stack([np.full_like(nodes, node), nodes], -1)
+        found.append(line[_maxima(scan.explained(line, terms(1, even=False)))[:keep]])
+    found = np.concatenate(found)
+    power = scan.explained(found, multiples)
+    order = np.argsort(-power)
+    kept: list[tuple[float, int, int]] = []
+    for part, (one, other) in zip(power[order], found[order]):
+        g, h = int(max(one, other)), int(min(one, other))
+        same = [max(abs(g - a), abs(h - b)) <= oversampling // 2 for _, a, b in kept]
+        if not any(same) and g - h > oversampling // 2:
+            kept.append((float(part), g, h))
+        if len(kept) == keep:
+            break
+    power, high, low = np.array(kept).T
+    return Pairs(high * scan.step, low * scan.step, power, scan.resolution)
+
+
+def _maxima(values: np.ndarray) -> np.ndarray:
+    """Numbers of the local maxima, the highest first."""
+    around = np.pad(values, 1, constant_values=-np.inf)
+    high = np.flatnonzero((values >= around[:-2]) & (values >= around[2:]))
+    return high[np.argsort(-values[high])]
 
 
 def _orthonormal(columns: np.ndarray) -> np.ndarray:

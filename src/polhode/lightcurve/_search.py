@@ -14,6 +14,13 @@ from polhode.lightcurve._phase import AbstractPhase
 
 CHUNK = 2048
 _BISECTIONS = 24
+# Part of all bodies in each round, and of all hypotheses that go on after it.
+_ROUNDS = ((0.3, 1.0), (0.25, 0.5), (0.15, 0.25), (0.15, 0.12), (0.15, 0.12))
+_ELITE = 6  # parents of each hypothesis
+_WIDTH = 0.4  # of the first bred
+_WORTH = (3.0, 0.03)  # what a series may leave, by that of the best, and of the whole
+_GAIN = (0.6, 1.7)  # of the variations, in a trial's score
+_SLOPE_SIGMA = 0.5  # of the phase function, in a trial's score [mag / rad]
 
 
 class Hypotheses(NamedTuple):
@@ -24,8 +31,8 @@ class Hypotheses(NamedTuple):
     long_axis: np.ndarray  # bool: LAM
 
 
-def hypotheses(pairs: Pairs, lattices: int = 30) -> Hypotheses:
-    """What the first ``lattices`` pairs of a Fourier series can mean.
+def hypotheses(pairs: Pairs, lattices: int = 30, most: int = 800) -> Hypotheses:
+    """What the first ``lattices`` pairs of a Fourier series can mean, ``most`` at most.
 
     A series tells the set of sums of multiples of two frequencies, g and h, not which of them is
     what. A body has ``i f_phi + 2 j f_psi``, of which those with odd i may be faint: f_phi is one
@@ -34,7 +41,9 @@ def hypotheses(pairs: Pairs, lattices: int = 30) -> Hypotheses:
     """
     sums = np.array([(1, 0), (0, 1), (1, 1), (1, -1)], float)
     found = []
-    for g in np.stack([pairs.f_phi, pairs.f_psi], -1)[:lattices]:
+    left = 1 - pairs.explained
+    worth = left <= _WORTH[0] * left.min() + _WORTH[1]
+    for g in np.stack([pairs.f_phi, pairs.f_psi], -1)[worth][:lattices]:
         size = np.abs(sums @ g)
         for i in range(4):
             for f_phi in (size[i], size[i] / 2):
@@ -43,103 +52,184 @@ def hypotheses(pairs: Pairs, lattices: int = 30) -> Hypotheses:
                     if min(f_phi, f_psi) >= 0.5 * pairs.resolution:
                         found += [(f_phi, f_psi, mode) for mode in (True, False)]
     table = np.array([row for row in found if row[2] or row[1] < row[0]], float)
-    # the same within a quarter of the resolution is the same
-    key = np.round(np.c_[table[:, :2] / pairs.resolution * 4, table[:, 2:]]).astype(int)
-    table = table[np.sort(np.unique(key, axis=0, return_index=True)[1])]
-    return Hypotheses(table[:, 0], table[:, 1], table[:, 2] > 0)
+    # the same within four tenths of the resolution is the same
+    scaled = table / np.array([0.4 * pairs.resolution, 0.4 * pairs.resolution, 1e-3])
+    kept: list[np.ndarray] = []
+    for row in scaled:
+        if not kept or np.abs(np.array(kept) - row).max(1).min() > 1:
+            kept.append(row)
+        if len(kept) == most:
+            break
+    table = np.array(kept) * np.array([0.4 * pairs.resolution, 0.4 * pairs.resolution, 1e-3])
+    return Hypotheses(table[:, 0], table[:, 1], table[:, 2] > 0.5)
+
+
+class Draws(NamedTuple):
+    """What a trial body is made from, besides its mode; arrays (b, ...)."""
+
+    inertia: Float[Array, "b 2"]  # in [0, 1]: axes' ratios of the homogeneous ellipsoid
+    late: Float[Array, " b"]  # part of a turn about the long axis, at t = 0
+    wxyz: Float[Array, "b 4"]  # not normalised
+    shape: Float[Array, "b 2"]  # normal deviates: logarithms of the shape's ratios by the inertia's
+    f_phi: Float[Array, " b"]
+    f_psi: Float[Array, " b"]
+
+
+def _axes(inertia):
+    """Logarithms of the second and third axis over the first."""
+    y = 0.2 + 0.8 * inertia[..., 0]
+    return jnp.log(jnp.stack([y, y * (0.3 + 0.7 * inertia[..., 1])], -1))
+
+
+def _spins(u, part, long_axis):
+    """From small nutation (part 0) to the separatrix (1), in the plane of axes x and z."""
+    a, b, c = moments_of(u)
+    split = jnp.arcsin(jnp.sqrt((1 / a - 1 / b) / (1 / a - 1 / c)))
+    along = jnp.broadcast_to(long_axis, split.shape)
+    angle = jnp.where(along, split * part, jnp.pi / 2 - (jnp.pi / 2 - split) * part)
+    omega = (jnp.cos(angle) / a, jnp.zeros_like(a), jnp.sin(angle) / c)
+    return (a, b, c), omega, free.periods((a, b, c), omega)
+
+
+def _allowed(u, long_axis, ratio):
+    found = _spins(u, 1e-3, long_axis)[2]
+    return found.P_phi / found.P_psi > ratio
 
 
 @jax.jit
-def _drawn(key, f_phi, f_psi, long_axis, spread):
-    """Bodies (b,) of the periods asked, and whether there are any for the inertia drawn."""
-    count, tries = f_phi.shape[0], 6
-    keys = jax.random.split(key, 5)
-    y = jax.random.uniform(keys[0], (tries, count), minval=0.2)
-    z = y * jax.random.uniform(keys[1], (tries, count), minval=0.3)
-    u = jnp.log(jnp.stack([y, z], -1))
-    ratio = f_psi / f_phi
-
-    def spins(u, part):
-        # From small nutation (part 0) to the separatrix (1), in the plane of axes x and z.
-        a, b, c = moments_of(u)
-        split = jnp.arcsin(jnp.sqrt((1 / a - 1 / b) / (1 / a - 1 / c)))
-        along = jnp.broadcast_to(long_axis, split.shape)
-        angle = jnp.where(along, split * part, jnp.pi / 2 - (jnp.pi / 2 - split) * part)
-        omega = (jnp.cos(angle) / a, jnp.zeros_like(a), jnp.sin(angle) / c)
-        return (a, b, c), omega, free.periods((a, b, c), omega)
-
-    _, _, still = spins(u, 1e-3)
-    allowed = still.P_phi / still.P_psi > ratio[None]
+def _fresh(key, f_phi, f_psi, long_axis, blur) -> Draws:
+    """Anything possible; of six inertias the first that allows the periods."""
+    count, keys = f_phi.shape[0], jax.random.split(key, 5)
+    shake = blur * jax.random.uniform(keys[0], (2, count), minval=-1.0)
+    f_phi, f_psi = (jnp.maximum(f + d, f / 2) for f, d in zip((f_phi, f_psi), shake, strict=True))
+    inertia = jax.random.uniform(keys[1], (6, count, 2))
+    allowed = _allowed(_axes(inertia), long_axis, (f_psi / f_phi)[None])
     pick = jnp.argmax(allowed, axis=0)
-    u = jnp.take_along_axis(u, pick[None, :, None], axis=0)[0]
-    allowed = jnp.any(allowed, axis=0)
+    return Draws(
+        jnp.take_along_axis(inertia, pick[None, :, None], axis=0)[0],
+        jax.random.uniform(keys[2], (count,)), jax.random.normal(keys[3], (count, 4)),
+        jax.random.normal(keys[4], (count, 2)), f_phi, f_psi,
+    )  # fmt: skip
+
+
+@jax.jit
+def _bred(key, parents: Draws, blur, width) -> Draws:
+    """Bodies near their parents, by ``width`` of what is possible."""
+    keys = iter(jax.random.split(key, 6))
+
+    def near(x, size):
+        return x + width * size * jax.random.normal(next(keys), x.shape)
+
+    unit = parents.wxyz / jnp.linalg.norm(parents.wxyz, axis=-1, keepdims=True)
+    return Draws(
+        jnp.clip(near(parents.inertia, 0.5), 0.0, 1.0), near(parents.late, 0.3), near(unit, 1.0),
+        near(parents.shape, 1.0), near(parents.f_phi, blur), near(parents.f_psi, blur),
+    )  # fmt: skip
+
+
+@jax.jit
+def _built(draws: Draws, long_axis, spread):
+    """Bodies (b,) with the periods asked, and whether there are any for the inertia drawn."""
+    u, ratio = _axes(draws.inertia), draws.f_psi / draws.f_phi
 
     def halve(_, ends):
         low, high = ends
         middle = (low + high) / 2
-        found = spins(u, middle)[2]
+        found = _spins(u, middle, long_axis)[2]
         fast = found.P_phi / found.P_psi > ratio
         return jnp.where(fast, middle, low), jnp.where(fast, high, middle)
 
     ends = (jnp.zeros_like(ratio), jnp.ones_like(ratio))
     low, high = jax.lax.fori_loop(0, _BISECTIONS, halve, ends)
-    moments, omega, found = spins(u, (low + high) / 2)
-    scale = found.P_phi * f_phi
+    moments, omega, found = _spins(u, (low + high) / 2, long_axis)
+    scale = found.P_phi * draws.f_phi
     omega = tuple(x * scale for x in omega)
-    late = jax.random.uniform(keys[2], ratio.shape) / f_psi
-    omega, _ = free.free_motion(moments, None, omega, late, attitude=False)
+    omega, _ = free.free_motion(moments, None, omega, draws.late / draws.f_psi, attitude=False)
     assert omega is not None  # the rates were not declined
-    shape = u + spread * jax.random.normal(keys[3], u.shape)
-    wxyz = jax.random.normal(keys[4], (count, 4))
     near = jnp.abs(found.P_phi / found.P_psi / ratio - 1) < 0.01
-    good = allowed & near & jnp.isfinite(sum(omega))
+    good = _allowed(u, long_axis, ratio) & near & jnp.isfinite(sum(omega))
+    shape = u + spread * draws.shape
+    wxyz = draws.wxyz / jnp.linalg.norm(draws.wxyz, axis=-1, keepdims=True)
     return Bodies(jnp.concatenate([u, shape, jnp.stack(omega, -1)], -1), wxyz), good
 
 
-def draw(
-    key, hypotheses: Hypotheses, each: int, phase: AbstractPhase, blur: float, spread: float = 0.15
-):
-    """``each`` bodies of every hypothesis; (h each,) bodies, and which exist.
-
-    Frequencies are drawn within ``blur`` of the hypothesis, logarithms of the axes' ratios within
-    ``spread`` of those that the inertia suggests, all else from everything possible.
-    """
-    f_phi, f_psi, long_axis = (jnp.asarray(np.repeat(x, each)) for x in hypotheses)
-    shake = blur * jax.random.uniform(
-        jax.random.fold_in(key, 1 << 30), (2, f_phi.size), minval=-1.0
-    )
-    f_phi, f_psi = (jnp.maximum(f + d, f / 2) for f, d in zip((f_phi, f_psi), shake, strict=True))
-    total = f_phi.shape[0]
+def _in_chunks(function, total: int, *arrays):
+    """``function(number, *chunks)`` of arrays (total, ...), joined."""
     parts = []
     for k, start in enumerate(range(0, total, CHUNK)):
         index = np.minimum(np.arange(start, start + CHUNK), total - 1)
-        parts.append(
-            _drawn(jax.random.fold_in(key, k), f_phi[index], f_psi[index], long_axis[index], spread)
-        )
-    bodies, good = jax.tree.map(lambda *x: jnp.concatenate(x)[:total], *parts)
-    typical = jnp.broadcast_to(jnp.asarray(phase.typical, float), (total, len(phase.typical)))
-    unknowns = jnp.concatenate([bodies.unknowns, typical], -1)
-    unit = bodies.wxyz / jnp.linalg.norm(bodies.wxyz, axis=-1, keepdims=True)
-    return Bodies(unknowns, unit), np.asarray(good)
+        parts.append(function(k, *jax.tree.map(lambda x, at=index: x[at], arrays)))
+    return jax.tree.map(lambda *x: np.concatenate(x)[:total], *parts)
 
 
-def _misfit(phase, bodies: Bodies, points: Points, solver) -> Float[Array, " b"]:
-    rest = magnitudes(phase, bodies, points) - points.magnitude
-    offsets = (rest * points.weight) @ points.columns.T @ solver
-    rest = (rest - offsets @ points.columns) ** 2
+def build(draws: Draws, long_axis, phase: AbstractPhase, spread: float = 0.15):
+    """Bodies (b,), and which exist; ``spread``: of the shape's ratios by the inertia's, in ln."""
+    total = len(long_axis)
+    bodies, good = _in_chunks(
+        lambda _, d, mode: _built(d, mode, spread), total, draws, np.asarray(long_axis)
+    )
+    typical = np.broadcast_to(np.asarray(phase.typical, float), (total, len(phase.typical)))
+    return Bodies(np.concatenate([bodies.unknowns, typical], -1), bodies.wxyz), good
+
+
+def draw(key, hypotheses: Hypotheses, each: int, blur: float) -> tuple[Draws, np.ndarray]:
+    """``each`` of every hypothesis, and their modes; frequencies within ``blur`` of it."""
+    f_phi, f_psi, long_axis = (np.repeat(x, each) for x in hypotheses)
+    made = _in_chunks(
+        lambda k, *x: _fresh(jax.random.fold_in(key, k), *x, blur),
+        len(f_phi), f_phi, f_psi, long_axis,
+    )  # fmt: skip
+    return made, long_axis
+
+
+def draws_of(key, bodies: Bodies, meant: Hypotheses, each: int) -> Draws:
+    """Bodies found, one of each hypothesis, as parents: all but the place on the polhode."""
+    axes = np.exp(bodies.unknowns[:, :2])
+    inertia = np.stack([(axes[:, 0] - 0.2) / 0.8, (axes[:, 1] / axes[:, 0] - 0.3) / 0.7], -1)
+    copies = (np.clip(inertia, 0, 1), bodies.wxyz, np.zeros_like(inertia), meant.f_phi, meant.f_psi)
+    inertia, wxyz, shape, f_phi, f_psi = (np.repeat(x, each, axis=0) for x in copies)
+    late = np.asarray(jax.random.uniform(key, (len(f_phi),)))
+    return Draws(inertia, late, wxyz, shape, f_phi, f_psi)
+
+
+def breed(key, parents: Draws, blur: float, width: float) -> Draws:
+    return _in_chunks(
+        lambda k, d: _bred(jax.random.fold_in(key, k), d, blur, width), len(parents.late), parents
+    )
+
+
+def _misfit(phase, bodies: Bodies, points: Points, solver):
+    """Misfit (b,) and gain (b,): what the body's variations are multiplied by to fit best."""
+
+    def free_of_offsets(x):
+        return x - ((x * points.weight) @ points.columns.T @ solver) @ points.columns
+
+    model = free_of_offsets(magnitudes(phase, bodies, points))
+    data = free_of_offsets(points.magnitude)
+    both, own = ((model * x * points.weight).sum(-1, keepdims=True) for x in (data, model))
+    gain = jnp.clip(both / jnp.maximum(own, 1e-12), *_GAIN)
+    rest = (gain * model - data) ** 2
     # the mean of |r| where it is large: single points do not decide
     scale = jnp.sum(rest * points.weight, -1, keepdims=True) / jnp.sum(points.weight)
-    return jnp.sum(points.weight * scale * jnp.log1p(rest / scale), -1) / jnp.sum(points.weight)
+    size = jnp.sum(points.weight * scale * jnp.log1p(rest / scale), -1) / jnp.sum(points.weight)
+    return size, gain[..., 0]
 
 
-_scored = jax.jit(
-    lambda phase, bodies, points, solver: _misfit(phase, bodies, points, solver),
-    static_argnums=0,
-)
+_scored = jax.jit(_misfit, static_argnums=0)
 
 
-def misfits(phase: AbstractPhase, bodies: Bodies, points: Points) -> np.ndarray:
-    """Robust mean squares of the residuals [mag^2] of each body, offsets fitted."""
+def misfits(phase: AbstractPhase, bodies: Bodies, points: Points) -> tuple[np.ndarray, np.ndarray]:
+    """Robust mean squares of the residuals [mag^2] of each body (b,), and gains (b,).
+
+    Offsets are fitted, and the light's variations may be a little greater or smaller all over: by
+    the gain, as other axes' ratios would make them.
+    """
+    # a slope by the phase angle: the phase function is not known yet
+    slope = jnp.where(points.weight > 0, points.alpha, 0.0)
+    points = points._replace(
+        columns=jnp.concatenate([points.columns, slope]),
+        stiffness=jnp.append(points.stiffness, _SLOPE_SIGMA**-2.0),
+    )
     c = np.asarray(points.columns)
     solver = np.linalg.inv((c * np.asarray(points.weight)) @ c.T + np.diag(points.stiffness))
     total = bodies.wxyz.shape[0]
@@ -148,4 +238,66 @@ def misfits(phase: AbstractPhase, bodies: Bodies, points: Points) -> np.ndarray:
         index = np.minimum(np.arange(start, start + CHUNK), total - 1)
         part = Bodies(bodies.unknowns[index], bodies.wxyz[index])
         out.append(np.asarray(_scored(phase, part, points, jnp.asarray(solver))))
-    return np.nan_to_num(np.concatenate(out)[:total], nan=np.inf)
+    misfit, gain = np.concatenate(out, axis=-1)[:, :total]
+    return np.nan_to_num(misfit, nan=np.inf), gain
+
+
+class Trials(NamedTuple):
+    """Bodies tried, scored; arrays (b, ...)."""
+
+    draws: Draws
+    bodies: Bodies
+    misfit: np.ndarray
+    gain: np.ndarray
+    source: np.ndarray  # number of the hypothesis
+
+
+def tried(
+    key, meant: Hypotheses, count: int, phase: AbstractPhase, points: Points, blur: float,
+    known: Bodies | None = None,
+) -> Trials:  # fmt: skip
+    """About ``count`` bodies, in rounds for ever fewer hypotheses.
+
+    A hypothesis is as good as its best body. A body within reach of the right one is one in some
+    hundreds that have the right periods: those of the later rounds are bred from the best of
+    their hypothesis, ever closer. ``known``: a body of each hypothesis, half of the first round
+    are near which.
+    """
+    alive = np.arange(len(meant.f_phi))
+    whole = None
+    for k, (part_of_bodies, part_of_hypotheses) in enumerate(_ROUNDS):
+        each = max(1, int(count * part_of_bodies) // len(alive))
+        source = np.repeat(alive, each)
+        own = jax.random.fold_in(key, k)
+        if whole is None:
+            made, _ = draw(own, meant, each, blur)
+            if known is not None:
+                parents = draws_of(own, known, meant, each)
+                near = breed(jax.random.fold_in(own, 1), parents, 0.1 * blur, _WIDTH / 2)
+                made = jax.tree.map(lambda *x: np.concatenate(x), made, near)
+                source = np.r_[source, source]
+        else:
+            parents = _parents(whole, alive, each)
+            made = breed(own, jax.tree.map(lambda x, at=parents: x[at], whole.draws), blur,
+                         _WIDTH * 0.7 ** (k - 1))  # fmt: skip
+        bodies, good = build(made, meant.long_axis[source], phase)
+        misfit, gain = misfits(phase, bodies, points)
+        part = Trials(made, bodies, np.where(good, misfit, np.inf), gain, source)
+        whole = part if whole is None else jax.tree.map(
+            lambda *x: np.concatenate(x), whole, part
+        )  # fmt: skip
+        best = np.full(len(meant.f_phi), np.inf)
+        np.minimum.at(best, whole.source, whole.misfit)
+        most = max(4, int(part_of_hypotheses * len(best)))
+        alive = np.sort(alive[np.argsort(best[alive])[:most]])
+    assert whole is not None  # there is a round
+    return whole
+
+
+def _parents(trials: Trials, alive, each: int) -> np.ndarray:
+    """Numbers (alive each,) of the best ones of every hypothesis, in turn."""
+    order = np.lexsort((trials.misfit, trials.source))
+    first = np.searchsorted(trials.source[order], alive)
+    many = np.searchsorted(trials.source[order], alive, side="right") - first
+    turn = np.arange(each)[None] % np.minimum(_ELITE, many)[:, None]
+    return order[first[:, None] + turn].reshape(-1)
