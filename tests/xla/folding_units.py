@@ -15,6 +15,7 @@ import numpy as np
 
 from polhode.xla import kernel, put
 
+WIDE = np.linspace(0.0, 1.0, 5000)
 X, Y, N = np.linspace(0.5, 2.5, 5), np.linspace(-1.0, 1.0, 5), np.arange(5)
 NOTHING = np.zeros((0, 3))
 
@@ -68,8 +69,11 @@ UNITS = {
         X, Y, N,
     ),
     "put": (
-        lambda a, b: put(jnp.stack([b] * 3)[..., None], (a > 0).astype(jnp.int32), a[:, None]), X, Y,
-    ),  # fmt: skip
+        lambda a, b: put(jnp.stack([b] * 3, 1)[..., None], (a > 0).astype(jnp.int32), a[:, None]),
+        X, Y,
+    ),
+    "a wide sum": (lambda a: jax.lax.fori_loop(0, 3, lambda i, c: c + jnp.sum(c) * 1e-7, a), WIDE),
+    "a wide maximum": (lambda a: jax.lax.fori_loop(0, 3, lambda i, c: c + jnp.max(c) * 1e-7, a), WIDE),
     "a power of 0": (lambda a: a**0, X),
     "complex numbers": (lambda a: (a * 0).real, X + 1j),
     "two precisions": (lambda a, b: a.astype(float) + b, X.astype(np.float32), Y),
