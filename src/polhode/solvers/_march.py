@@ -32,7 +32,7 @@ of a state and its rates."""
 CALIBRATED = 5
 """The error of a step over e^2 / d (see above)."""
 
-SHARE = 0.75
+SHARE = 0.6
 """Part of the tolerance that the steps' errors may add up to. They add up to more where the motion
 itself spreads errors (see ``docs/integrators.md``)."""
 

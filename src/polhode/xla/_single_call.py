@@ -96,7 +96,7 @@ def _any_of_all(size, batched, these):
 def put(rows: jax.Array, place: jax.Array, values: jax.Array) -> jax.Array:
     """``rows`` (..., S, C) with ``values`` (..., C) of bodies (...) at ``place`` (...) in S.
 
-    One after another on the CPU, where a unit cannot hold a scatter.
+    One after another on the CPU, where a unit cannot hold a scatter. Not for reverse mode.
     """
     bodies = place.shape
     if jax.default_backend() != "cpu":
