@@ -39,13 +39,21 @@ _SPARE = {True: 2**11, False: 2**16}
 program."""
 
 
+_TIMED = (
+    ("ts", -1), ("wxyz", -2), ("omega_body", -2), ("work", -1), ("motor_work", -2), ("spins", -2),
+)  # fmt: skip
+"""Fields of a trajectory with samples, the times first, and the axis of time."""
+
+
 class _Program(NamedTuple):
     """``run(method, ...)`` compiled, its result taken apart: the structure stands in ``shape``
-    from the first call on, with the scene a leaf at ``place`` where it is as it was given."""
+    from the first call on, with the scene a leaf at ``place`` where it is as it was given;
+    ``timed``: see ``_shortened``."""
 
     call: Callable
     shape: list[Any]
     place: list[int | None]
+    timed: list[tuple[int, int]]
 
 
 class _Known(NamedTuple):
@@ -91,6 +99,7 @@ def _program(run: Callable, method: AbstractMethod, tree: Any, record: Record) -
         return _PROGRAMS[key]
     shape: list[Any] = []
     place: list[int | None] = []
+    timed: list[tuple[int, int]] = []
 
     @jax.jit
     def call(ts, rtol, wxyz, omega, *leaves):
@@ -101,9 +110,12 @@ def _program(run: Callable, method: AbstractMethod, tree: Any, record: Record) -
         flat, structure = jax.tree.flatten(found)
         shape[:] = [structure]
         place[:] = [next((i for i, x in enumerate(flat) if x is _HERE), None)]
-        return [x for x in flat if x is not _HERE]
+        flat = [x for x in flat if x is not _HERE]
+        of_times = ((getattr(found, name), axis) for name, axis in _TIMED)
+        timed[:] = [(i, axis) for x, axis in of_times for i, y in enumerate(flat) if y is x]
+        return flat
 
-    made = _PROGRAMS[key] = _Program(call, shape, place)
+    made = _PROGRAMS[key] = _Program(call, shape, place, timed)
     if len(_PROGRAMS) > _KEPT:
         _PROGRAMS.popitem(last=False)
     return made
@@ -157,24 +169,20 @@ def again(scene: Any, state: Any, ts: Any, rtol: Any, record: Any) -> Trajectory
             ts = np.asarray(ts)
             ts = np.concatenate([np.full(size - ts.size, ts[0]), ts])
     leaves = program.call(ts, np.asarray(rtol, known.dtype), wxyz, omega, *known.leaves)
+    if size != whole.size:
+        _shortened(leaves, program.timed, whole, size)
     if program.place[0] is not None:
         leaves.insert(program.place[0], scene)
-    found = jax.tree.unflatten(program.shape[0], leaves)
-    return found if size == whole.size else _shortened(found, whole)
+    return jax.tree.unflatten(program.shape[0], leaves)
 
 
-def _shortened(found: Trajectory, ts: Any) -> Trajectory:
-    """Without the samples at the first time but one; nothing is compiled for it."""
-    kept = np.r_[0, np.arange(found.ts.size - ts.size + 1, found.ts.size)]
-
-    def of(x, axis):
-        return None if x is None else jax.numpy.asarray(np.asarray(x).take(kept, axis))
-
-    return dataclasses.replace(
-        found, ts=jax.numpy.asarray(ts), wxyz=of(found.wxyz, -2),
-        omega_body=of(found.omega_body, -2), work=of(found.work, -1),
-        motor_work=of(found.motor_work, -2), spins=of(found.spins, -2),
-    )  # fmt: skip
+def _shortened(leaves: list[Any], timed: list[tuple[int, int]], ts: Any, size: int) -> None:
+    """Only the samples at ``ts`` of ``size`` samples; nothing is compiled for it. ``timed``: places
+    of the leaves that have some, the times first, and on which axis."""
+    kept = np.r_[0, np.arange(size - ts.size + 1, size)]
+    for place, axis in timed[1:]:
+        leaves[place] = jax.numpy.asarray(np.asarray(leaves[place]).take(kept, axis))
+    leaves[timed[0][0]] = jax.numpy.asarray(ts)
 
 
 def _is_local(x: Any) -> bool:

@@ -126,7 +126,7 @@ def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> T
 
 
 def _trajectory(method, scene, state, ts, rtol, record, split=None, in_order=False) -> Trajectory:
-    """``in_order`` (static): the times are known to be, but for the first, which may be repeated."""
+    """``in_order`` (static): times known to be in order, whose first may be repeated."""
     scene, state = scene.mended(), state.mended("state")  # shapes, whichever way led here
     scene = scene.settled(state, ts[..., 0])
     if split is None:

@@ -13,8 +13,9 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import numpy as np
 
-from polhode.xla import kernel, put
+from polhode.xla import kernel
 
+WIDE = np.linspace(0.0, 1.0, 5000)
 X, Y, N = np.linspace(0.5, 2.5, 5), np.linspace(-1.0, 1.0, 5), np.arange(5)
 NOTHING = np.zeros((0, 3))
 
@@ -67,9 +68,8 @@ UNITS = {
         lambda a, b, n: jax.lax.switch(n[1], [lambda a, b: a * 0, lambda a, b: b * 0], a, b),
         X, Y, N,
     ),
-    "put": (
-        lambda a, b: put(jnp.stack([b] * 3)[..., None], (a > 0).astype(jnp.int32), a[:, None]), X, Y,
-    ),  # fmt: skip
+    "a wide sum": (lambda a: jax.lax.fori_loop(0, 3, lambda i, c: c + jnp.sum(c) * 1e-7, a), WIDE),
+    "a wide maximum": (lambda a: jax.lax.fori_loop(0, 3, lambda i, c: c + jnp.max(c) * 1e-7, a), WIDE),
     "a power of 0": (lambda a: a**0, X),
     "complex numbers": (lambda a: (a * 0).real, X + 1j),
     "two precisions": (lambda a, b: a.astype(float) + b, X.astype(np.float32), Y),

@@ -206,9 +206,9 @@ def fourier_lattices(
         found.append(line[_maxima(scan.explained(line, terms(1, even=False)))[:keep]])
     found = np.concatenate(found)
     power = scan.explained(found, multiples)
-    order = np.argsort(-power)
+    first = np.argsort(-power)
     kept: list[tuple[float, int, int]] = []
-    for part, (one, other) in zip(power[order], found[order]):
+    for part, (one, other) in zip(power[first], found[first]):
         g, h = int(max(one, other)), int(min(one, other))
         same = [max(abs(g - a), abs(h - b)) <= oversampling // 2 for _, a, b in kept]
         if not any(same) and g - h > oversampling // 2:

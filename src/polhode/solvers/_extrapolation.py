@@ -144,14 +144,14 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
     def spanning(self, controller: Any, state: Any) -> tuple["Extrapolation", Any, Any]:
         """Itself, the controller and the ``state`` of a solve by diffrax, with one step from the
         first of the controller's times to the last, that finds the states at all of them: the
-        ``rows`` (T, n, C) of its own state are C components of n bodies."""
+        ``rows`` (n, T + 1, C) of its own state are C components of n bodies."""
         leaves, times = jax.tree.leaves(state.y), getattr(controller, "ts", None)
         if self.accuracy is None or times is None or jnp.ndim(leaves[0]) != 1:
             return self, controller, state
         if times.shape[0] == 2:
             return self, controller, state
         dtype = jnp.result_type(*leaves)
-        rows = jnp.full((times.shape[0], leaves[0].size, len(leaves)), jnp.nan, dtype)
+        rows = jnp.full((leaves[0].size, times.shape[0] + 1, len(leaves)), jnp.nan, dtype)
         accuracy = Accuracy(self.accuracy.rtol, self.accuracy.horizon, times)
         solver = dataclasses.replace(self, accuracy=accuracy)
         progress = state.solver_state._replace(rows=rows)
@@ -177,7 +177,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
                 _, rate = units(y, rates(span[0], y, False)[0])
                 gap = jnp.abs(span[1] - span[0])
                 if elapsed is not None:
-                    gap = gap / jnp.sum((elapsed > 0).astype(gap.dtype))
+                    gap = gap / jnp.sum(jnp.where(elapsed > 0, 1, 0)).astype(gap.dtype)
                 order = order_for(rtol, jnp.max(rate) * gap.astype(dtype))
             given = table(order, dtype)
             limits = Limits(rtol, horizon, self.max_steps, self.jumps)

@@ -76,7 +76,7 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
         rows = getattr(state.solver_state, "rows", None)
         if rows is not None:  # found in one step
             count, room = times.shape[0], _first(state.save_state).ts
-            rows = jnp.moveaxis(rows[rows.shape[0] - count :], -1, 0)
+            rows = jnp.transpose(rows[:, -1 - count : -1], (2, 1, 0))
             saved = [jnp.concatenate([x, y[count:]]) for x, y in zip(rows, saved)]
             ts = jnp.concatenate([_stopped(times), room[count:]])
             state = eqx.tree_at(lambda s: _first(s.save_state).ts, state, ts)

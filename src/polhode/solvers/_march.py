@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode.solvers._columns import Rates, Table, carried_on, extrapolated
-from polhode.xla import put
+from polhode.xla import any_of, put
 
 Units = Callable[[list[Array], list[Array]], tuple[list[Array], Array]]
 """Weights of the components of an error, whose squares are summed, and the natural rate [rad/s],
@@ -32,7 +32,7 @@ of a state and its rates."""
 CALIBRATED = 5
 """The error of a step over e^2 / d (see above)."""
 
-SHARE = 0.75
+SHARE = 0.6
 """Part of the tolerance that the steps' errors may add up to. They add up to more where the motion
 itself spreads errors (see ``docs/integrators.md``)."""
 
@@ -82,7 +82,8 @@ class Progress(NamedTuple):
     took from the state; ``steps``; ``error``: sum of the estimated errors [rad]; ``gone``: time
     since the first start [s]; ``ended``: 0, or why the body was given up: 1 its steps were spent,
     2 they became too short to lead anywhere, 3 there so because the rates are no numbers; ``rows``:
-    states (T, n, C) at times to be saved, where one march leads through all of them.
+    states (n, T + 1, C) at times to be saved, where one march leads through all of them; the last
+    is not used.
     """
 
     width: Array
@@ -104,7 +105,7 @@ def fresh(y: list[Array], compensated: bool, t: Array) -> Progress:
 
 
 class _Saved(NamedTuple):
-    """States saved on the way: ``rows`` (T + 1, n, C), the last of them not used; ``place`` (n,):
+    """States saved on the way: ``rows`` (n, T + 1, C), the last of them not used; ``place`` (n,):
     the next one, which is ``due`` (n,) [s] after the start."""
 
     rows: Array
@@ -115,9 +116,9 @@ class _Saved(NamedTuple):
     def first(cls, rows: Array, elapsed: Array, y: list[Array]) -> "_Saved":
         """Before the first step: what is saved at the start is the given state."""
         now = elapsed <= 0
-        rows = jnp.where(now[:, None, None], jnp.stack(y, axis=-1), rows)
+        here = jnp.concatenate([now, jnp.zeros((1,), bool)])
+        rows = jnp.where(here[:, None], jnp.stack(y, axis=-1)[:, None], rows)
         place = jnp.broadcast_to(jnp.sum(jnp.where(now, 1, 0)).astype(jnp.int32), y[0].shape)
-        rows = jnp.concatenate([rows, rows[-1:]])
         return cls(rows, place, elapsed.at[place].get(mode="clip"))
 
     def after(self, reached: Array, elapsed: Array, y: list[Array]) -> "_Saved":
@@ -125,13 +126,14 @@ class _Saved(NamedTuple):
 
         def once(carry):
             saved, _ = carry
-            unused = saved.rows.shape[0] - 1
+            unused = saved.rows.shape[1] - 1
             rows = put(saved.rows, jnp.where(reached, saved.place, unused), jnp.stack(y, axis=-1))
             place = saved.place + jnp.where(reached, 1, 0)
             return _Saved(rows, place, elapsed.at[place].get(mode="clip")), False
 
+        some = any_of(reached.astype(self.due.dtype))
         # once or not at all: a branch would copy all that is saved
-        return jax.lax.while_loop(lambda carry: carry[1], once, (self, jnp.any(reached)))[0]
+        return jax.lax.while_loop(lambda carry: carry[1], once, (self, some))[0]
 
 
 class _Walk(NamedTuple):
@@ -279,7 +281,8 @@ def march(
     )  # fmt: skip
 
     def on(walk):
-        return (jnp.sum(jnp.where(live(walk), 1, 0)) > 0) & (walk.tried < _TRIES * limits.steps)
+        able = live(walk) & (walk.tried < _TRIES * limits.steps)
+        return any_of(able.astype(dtype))
 
     walk = jax.lax.while_loop(on, one, walk)
     arrived = (walk.gone >= whole_length) & (progress.ended == 0)
@@ -288,7 +291,10 @@ def march(
     left = (walk.steps < limits.steps) & (walk.tried < _TRIES * limits.steps)
     why = jnp.where(left, jnp.where(numbers, 2, 3), 1)
     ended = jnp.where(arrived, 0, jnp.where(progress.ended > 0, progress.ended, why))
-    gone, rows = progress.gone + whole_length, None if walk.saved is None else walk.saved.rows[:-1]
+    gone, rows = (
+        progress.gone + whole_length,
+        None if walk.saved is None else walk.saved.rows,
+    )
     new = Progress(
         walk.width, walk.turned, walk.low, walk.steps, walk.error, gone, ended.astype(jnp.int32),
         rows,

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
@@ -19,14 +20,17 @@ from polhode.xla._switch import is_plain
 
 _HOLDABLE = frozenset(
     """abs add add_any and atan atan2 bitcast_convert_type broadcast_in_dim ceil clamp
-     concatenate cond convert_element_type copy cos cosh custom_jvp_call div dynamic_slice
-     dynamic_update_slice eq exp exp2 expm1 floor gather ge gt integer_pow iota is_finite jit le log
-     log1p logistic lt max min mul ne neg not or pad pjit pow reduce_and reduce_max reduce_min
-     reduce_or reduce_sum rem reshape round
+     concatenate cond convert_element_type copy cos cosh custom_jvp_call custom_vmap_call div
+     dynamic_slice dynamic_update_slice eq exp exp2 expm1 floor gather ge gt integer_pow iota
+     is_finite jit le log log1p logistic lt max min mul ne neg not or pad pjit pow reduce_and
+     reduce_max reduce_min reduce_or reduce_sum rem reshape round
      rsqrt scan select_n shift_right_arithmetic sign sin sinh slice split sqrt square squeeze
      stack stop_gradient sub tan tanh transpose unstack while xor""".split()  # noqa: SIM905
 )
 """Operations that a single compiled unit may hold; anything else keeps the usual way."""
+
+_WIDE = 1024
+"""Floats in a sum, from which on a unit does not hold it."""
 
 _ANALYSING = ContextVar("analysing", default=False)
 """Set while a unit is looked through: the units inside it then show what they are made of."""
@@ -72,19 +76,51 @@ def kernel(fn: Callable, *, linearised: bool = False) -> Callable:
     return call
 
 
-def put(rows: jax.Array, place: jax.Array, values: jax.Array) -> jax.Array:
-    """``rows`` (S, n, C) with ``values`` (n, C) of n bodies at ``place`` (n,) in S.
+@custom_vmap
+def any_of(these: jax.Array) -> jax.Array:
+    """Whether any of these is not zero, under ``vmap`` any of the whole batch.
 
-    One after another on the CPU, where a unit cannot hold a scatter.
+    A loop with such a condition goes on for all. With one of each, JAX would keep what has ended by
+    copying everything that the loop carries, in every turn.
     """
+    return jnp.sum(jnp.where(these != 0, 1, 0)) > 0
+
+
+@any_of.def_vmap
+def _any_of_all(size, batched, these):
+    del size, batched
+    return any_of(these), False
+
+
+@custom_vmap
+def put(rows: jax.Array, place: jax.Array, values: jax.Array) -> jax.Array:
+    """``rows`` (..., S, C) with ``values`` (..., C) of bodies (...) at ``place`` (...) in S.
+
+    One after another on the CPU, where a unit cannot hold a scatter. Not for reverse mode.
+    """
+    bodies = place.shape
     if jax.default_backend() != "cpu":
-        return rows.at[place, jnp.arange(place.size)].set(values)
+        return rows.at[(*jnp.indices(bodies), place)].set(values)
 
     def one(i, rows):
-        at = place[i].astype(i.dtype), i, jnp.zeros_like(i)
-        return jax.lax.dynamic_update_slice(rows, values[i][None, None], at)
+        at, rest = (i,), i
+        if len(bodies) > 1:
+            at = ()
+            for size in bodies[::-1]:
+                at, rest = (rest % size, *at), rest // size
+        to = (*at, place[at].astype(i.dtype), jnp.zeros_like(i))
+        value = values[at].reshape(*(1,) * (len(at) + 1), values.shape[-1])
+        return jax.lax.dynamic_update_slice(rows, value, to)
 
     return jax.lax.fori_loop(0, place.size, one, rows)
+
+
+@put.def_vmap
+def _put_all(size, batched, *given):
+    """A batch of bodies is more bodies."""
+    return put(
+        *(x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(given, batched))
+    ), True
 
 
 def _is_of_use() -> bool:
@@ -98,7 +134,7 @@ def _is_of_use() -> bool:
 
 def _is_holdable(jaxpr) -> bool:
     for equation in jaxpr.eqns:
-        if equation.primitive.name not in _HOLDABLE:
+        if equation.primitive.name not in _HOLDABLE or _is_wide(equation):
             return False
         for value in jax.tree.leaves(
             list(equation.params.values()), is_leaf=lambda v: hasattr(v, "eqns")
@@ -107,6 +143,15 @@ def _is_holdable(jaxpr) -> bool:
             if hasattr(nested, "eqns") and not _is_holdable(nested):
                 return False
     return all(_is_packable(v.aval.dtype) for v in (*jaxpr.invars, *jaxpr.constvars))
+
+
+def _is_wide(equation) -> bool:
+    """Whether it sums or compares so many floats that XLA hands them to a library, which it cannot
+    do within a unit: from 4096 on, measured with jaxlib 0.10."""
+    if not equation.primitive.name.startswith("reduce_"):
+        return False
+    given = equation.invars[0].aval
+    return jnp.issubdtype(given.dtype, jnp.inexact) and given.size >= _WIDE
 
 
 def _is_packable(dtype) -> bool:
