@@ -69,7 +69,9 @@ UNITS = {
         X, Y, N,
     ),
     "a wide sum": (lambda a: jax.lax.fori_loop(0, 3, lambda i, c: c + jnp.sum(c) * 1e-7, a), WIDE),
-    "a wide maximum": (lambda a: jax.lax.fori_loop(0, 3, lambda i, c: c + jnp.max(c) * 1e-7, a), WIDE),
+    "a wide maximum": (
+        lambda a: jax.lax.fori_loop(0, 3, lambda i, c: c + jnp.max(c) * 1e-7, a), WIDE,
+    ),
     "a power of 0": (lambda a: a**0, X),
     "complex numbers": (lambda a: (a * 0).real, X + 1j),
     "two precisions": (lambda a, b: a.astype(float) + b, X.astype(np.float32), Y),
