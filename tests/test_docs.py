@@ -21,7 +21,7 @@ PAIRS = sorted({path.stem for path in NOTEBOOKS.glob("*.*") if path.suffix in ("
 NUMBERED = {"000": 39, "002": 12, "003": 29}
 LIMIT = 600_000  # bytes of an executed notebook
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
-SKETCHES = {"identifiability.md": 2}  # examples that need what polhode does not bring
+SKETCHES = {"identifiability.md": 2, "light_curves.md": 1}  # need what polhode does not bring
 BADGE = re.compile(
     r"\[!\[Open in Colab\]\(https://colab\.research\.google\.com/assets/colab-badge\.svg\)\]"
     r"\(https://colab\.research\.google\.com/github/([\w-]+/[\w-]+)/blob/main/notebooks/(\w+)\.ipynb\)"
