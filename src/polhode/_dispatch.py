@@ -163,7 +163,8 @@ def again(scene: Any, state: Any, ts: Any, rtol: Any, record: Any) -> Trajectory
     if record is not None and record.final_only:
         ts = np.asarray(ts)[[0, -1]]
     elif size > 2:
-        most = _SPARE[known.ways.methods[number].exact] // (max(wxyz.size, omega.size) // 3)
+        bodies = max(wxyz.size // 4, omega.size // 3, 1)
+        most = _SPARE[known.ways.methods[number].exact] // bodies
         size = min((n for n in _SIZES if size <= n <= most), default=size)
         if size != ts.size:
             ts = np.asarray(ts)

@@ -178,7 +178,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
                 gap = jnp.abs(span[1] - span[0])
                 if elapsed is not None:
                     gap = gap / jnp.sum(jnp.where(elapsed > 0, 1, 0)).astype(gap.dtype)
-                order = order_for(rtol, jnp.max(rate) * gap.astype(dtype))
+                order = order_for(rtol, jnp.max(rate, initial=0) * gap.astype(dtype))
             given = table(order, dtype)
             limits = Limits(rtol, horizon, self.max_steps, self.jumps)
             own = not problem.asks_time

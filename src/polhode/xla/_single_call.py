@@ -99,7 +99,7 @@ def put(rows: jax.Array, place: jax.Array, values: jax.Array) -> jax.Array:
     One after another on the CPU, where a unit cannot hold a scatter. Not for reverse mode.
     """
     bodies = place.shape
-    if jax.default_backend() != "cpu":
+    if place.size == 0 or jax.default_backend() != "cpu":
         return rows.at[(*jnp.indices(bodies), place)].set(values)
 
     def one(i, rows):
