@@ -76,6 +76,32 @@ def test_a_version_that_ends_the_process_runs_plain(untested, monkeypatch):
     assert len(list(untested.iterdir())) == 1
 
 
+def test_no_operation_of_an_orbit_keeps_it_out_of_a_unit():
+    """Kepler's equation takes cube roots and inverse hyperbolic functions."""
+    orbits = {"ellipse": ph.KeplerOrbit(1.0, 2.0, 0.1), "fly-by": ph.KeplerOrbit(1.0, -2.0, 1.4)}
+    for orbit in orbits.values():
+        drag = ph.RelativeTorque(ph.LinearDamping(0.1), ph.LVLH(orbit))
+        scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), None, drag)
+
+        def end(omega, scene=scene):
+            return ph.simulate(scene, ph.State([1.0, 0.0, 0.0, 0.0], omega), [0.0, 1.0]).wxyz
+
+        assert "xla_cpu_small_call" in jax.jit(end).lower(jnp.ones(3)).as_text()
+
+
+@pytest.mark.parametrize(
+    "name", ["acos", "acosh", "asin", "asinh", "atanh", "cbrt", "erf", "erf_inv", "erfc"]
+)
+def test_special_functions_in_units(name):
+    def fn(x):
+        return getattr(jax.lax, name)(x + 1 if name == "acosh" else x) * x
+
+    x = jnp.linspace(0.1, 0.9, 7)
+    unit = jax.jit(kernel(fn))
+    assert "xla_cpu_small_call" in unit.lower(x).as_text()
+    assert jnp.allclose(unit(x), fn(x), rtol=1e-15, atol=0)
+
+
 @pytest.mark.parametrize(
     "kind", [*(pytest.param(k, marks=pytest.mark.slow) for k in ("free", "lagrange")), "damped"]
 )
