@@ -1,6 +1,7 @@
 """The state of a rotating body: attitude and body rates."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -15,6 +16,9 @@ from polhode.hamiltonian import (
 )
 from polhode.inertia import Inertia
 from polhode.parts import AbstractPart, shaped
+
+
+_normalise = jax.jit(rotation.normalise)  # one program, not one for each operation
 
 
 class State(AbstractPart):
@@ -48,7 +52,7 @@ class State(AbstractPart):
                 f"wxyz {quaternion.shape} and omega_body {rates.shape} must have leading axes"
                 " that broadcast together."
             ) from error
-        self.wxyz = rotation.normalise(quaternion)
+        self.wxyz = _normalise(quaternion)
         self.omega_body = rates
 
     @classmethod
