@@ -7,13 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode import rotation
 from polhode._scene import Scene
 from polhode._simulate import simulate
 from polhode._state import State
-from polhode.methods import AbstractMethod, Status
+from polhode.methods import AbstractMethod, Status, check_inputs, check_rtol, raise_on_failure
 
 _NODES = 8
 """Gauss points that the effect of a disturbance is summed over; their error falls with the 16th
@@ -64,38 +65,50 @@ def propagate(
             "propagate takes one body, got a state of shapes"
             f" {state.wxyz.shape}, {state.omega_body.shape}: map it, jax.vmap(ph.propagate, ...)."
         )
-    found = _propagated(scene, state, dt, t, free, method, rtol)
-    wxyz, omega, jacobian, noise = found
+    dtype = state.omega_body.dtype
+    dt, t = jnp.asarray(dt, dtype), jnp.asarray(t, dtype)
+    scene, state, _, _ = check_inputs(scene, state, jnp.stack([t, t + dt]), None)
+    wxyz, omega, jacobian, noise, status = _propagated(
+        scene, state, dt, t, _places(scene, free), method, check_rtol(rtol, dtype)
+    )
+    if not isinstance(status, Tracer):
+        raise_on_failure(status)
     return Propagation(State(wxyz, omega), jacobian, noise)
 
 
-def _propagated(scene, state, dt, t, free, method, rtol):
-    dtype = state.omega_body.dtype
-    dt, t = jnp.asarray(dt, dtype), jnp.asarray(t, dtype)
+def _places(scene: Scene, free: Callable[[Scene], Any] | None) -> tuple[int, ...]:
+    """Where in the scene's leaves those are that ``free`` picks, in its order: unlike a function,
+    places tell a compiled program whether it is the one asked for."""
+    if free is None:
+        return ()
+    numbered = jax.tree.unflatten(jax.tree.structure(scene), range(len(jax.tree.leaves(scene))))
+    return tuple(jax.tree.leaves(free(numbered)))
+
+
+@eqx.filter_jit
+def _propagated(scene, state, dt, t, places, method, rtol):
+    dtype = dt.dtype
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     nodes, weights = (jnp.asarray(x, dtype) for x in ((1 + nodes) / 2, weights / 2))
     ts = t + dt * jnp.concatenate([jnp.zeros(1, dtype), nodes, jnp.ones(1, dtype)])
-    picked = [] if free is None else jax.tree.leaves(free(scene))
-    sizes = [x.size for x in picked]
+    leaves, tree = jax.tree.flatten(scene)
+    sizes = [leaves[k].size for k in places]
 
     def moved(error):
         turn = jnp.concatenate([jnp.ones(1, dtype), error[:3] / 2])
         start = State(rotation.multiply(state.wxyz, turn), state.omega_body + error[3:6])
-        body, place = scene, 6
-        if free is not None:
-            changes = []
-            for x, size in zip(picked, sizes):
-                changes.append(x + error[place : place + size].reshape(x.shape).astype(x.dtype))
-                place += size
-            tree = jax.tree.structure(free(scene))
-            body = eqx.tree_at(free, scene, jax.tree.unflatten(tree, changes))
+        changed, begin = list(leaves), 6
+        for k, size in zip(places, sizes):
+            change = error[begin : begin + size].reshape(leaves[k].shape)
+            changed[k], begin = leaves[k] + change.astype(leaves[k].dtype), begin + size
+        body = jax.tree.unflatten(tree, changed)
         traj = simulate(body, start, ts, method, rtol=rtol)
         good = traj.status == Status.SUCCESSFUL
         wxyz, omega = (jnp.where(good, x, jnp.nan) for x in (traj.wxyz, traj.omega_body))
-        return (wxyz, omega), (wxyz, omega)
+        return (wxyz, omega), (wxyz, omega, traj.status)
 
     none = jnp.zeros(6 + sum(sizes), dtype)
-    (turns, rates), (wxyz, omega) = jax.jacfwd(moved, has_aux=True)(none)
+    (turns, rates), (wxyz, omega, status) = jax.jacfwd(moved, has_aux=True)(none)
     back = rotation.conjugate(wxyz)
     turns = jnp.moveaxis(turns, -1, -2)  # (T, n, 4)
     along = jnp.broadcast_to(back[:, None], turns.shape)
@@ -112,4 +125,4 @@ def _propagated(scene, state, dt, t, free, method, rtol):
         return end @ jnp.linalg.solve(flow, push)
 
     noise = dt * jnp.tensordot(weights, jax.vmap(carried)(flow[1:-1]), 1)
-    return wxyz[-1], omega[-1], end, noise
+    return wxyz[-1], omega[-1], end, noise, status

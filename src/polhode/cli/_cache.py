@@ -36,7 +36,7 @@ def kept_programs(wanted: bool) -> Iterator[None]:
     if folder is not None:
         settings = {
             "jax_compilation_cache_dir": str(folder),
-            "jax_persistent_cache_min_compile_time_secs": 0.2,
+            "jax_persistent_cache_min_compile_time_secs": 0.0,
             "jax_persistent_cache_min_entry_size_bytes": -1,
         }
         if importlib.util.find_spec("filelock") is not None:

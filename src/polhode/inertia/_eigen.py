@@ -98,6 +98,7 @@ def _columns(q):
     return tuple(zip(*(matrix_row(q, i) for i in range(3))))
 
 
+@jax.jit  # a hundred operations: outside of a program each would be one of its own
 def principal(
     tensor: Float[Array, "*b 3 3"],
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 4"], Float[Array, "*b 3"]]:

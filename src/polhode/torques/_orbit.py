@@ -12,6 +12,7 @@ from polhode._checks import as_float_array, as_number, describe, is_concrete, re
 from polhode.parts import AbstractPart, shaped
 
 
+@jax.jit
 def eccentric_anomaly(mean: Float[Array, "*b"], eccentricity: Float[Array, "*b"]) -> Array:
     """E in [-pi, pi] with E - e sin E = M [rad] for 0 <= e < 1, M within [-pi, pi].
 
@@ -44,6 +45,7 @@ def _lag(x: Array) -> Array:
     return jnp.where(square < 0.25, x * square / 6 * total, x - jnp.sin(x))
 
 
+@jax.jit
 def hyperbolic_anomaly(mean: Float[Array, "*b"], eccentricity: Float[Array, "*b"]) -> Array:
     """F with e sinh F - F = M [rad] for e > 1; as ``eccentric_anomaly``."""
     sign = jnp.where(mean < 0, -1, 1).astype(mean.dtype)
