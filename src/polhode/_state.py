@@ -17,7 +17,6 @@ from polhode.hamiltonian import (
 from polhode.inertia import Inertia
 from polhode.parts import AbstractPart, shaped
 
-
 _normalise = jax.jit(rotation.normalise)  # one program, not one for each operation
 
 
