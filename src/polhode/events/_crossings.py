@@ -1,6 +1,7 @@
 """When a function of attitude, rates and time crosses zero along a trajectory."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,7 +18,7 @@ from polhode.events._bracketed import bracketed
 from polhode.events._event import Event, at_least
 from polhode.methods import natural_rates
 
-_A_TURN = 32
+A_TURN = 32
 """Looks in a turn of the fastest natural rate."""
 
 _TOO_MANY = 20_000_000
@@ -26,7 +27,7 @@ _TOO_MANY = 20_000_000
 _ROOM = 16
 """Least number of places where the function turns back that are looked at."""
 
-_AT_START = 1e-6
+AT_START = 1e-6
 """Part of the time between two looks within which a crossing is the start itself."""
 
 
@@ -120,7 +121,7 @@ def _looks(trajectory: Trajectory) -> int:
             " 32 or more in a turn of the fastest rate."
         )
     turned = np.max(np.asarray(_turned(trajectory)), initial=0)
-    looks = max(17, 1 + int(np.ceil(_A_TURN * turned / (2 * np.pi))) if np.isfinite(turned) else 17)
+    looks = max(17, 1 + int(np.ceil(A_TURN * turned / (2 * np.pi))) if np.isfinite(turned) else 17)
     grain = 2 ** max(0, int(np.log2(looks)) - 2)  # few numbers, for fewer compiled programs
     looks = 1 + -(-(looks - 1) // grain) * grain
     if looks * max(1, int(np.prod(trajectory.batch_shape))) > _TOO_MANY:
@@ -134,13 +135,17 @@ def _looks(trajectory: Trajectory) -> int:
 @eqx.filter_jit
 def _turned(trajectory: Trajectory) -> Array:
     """Most (...) that a body may turn from the first to the last time [rad]."""
-    scene, ts = trajectory._scene, trajectory._t
-    omega = trajectory.omega_body
-    slowest = jnp.min(scene.carrier.moments, axis=-1)
-    size = jnp.linalg.norm(scene.carrier.momentum(omega), axis=-1) / slowest
+    ts = trajectory._t
     span = jnp.max(ts, axis=-1) - jnp.min(ts, axis=-1)
-    rate = jnp.maximum(jnp.max(size, axis=-1), _natural_rates(trajectory))
-    return rate * span
+    rate = jnp.max(turning_rates(trajectory), axis=-1)
+    return jnp.maximum(rate, _natural_rates(trajectory)) * span
+
+
+def turning_rates(trajectory: Trajectory) -> Array:
+    """The most (..., T) that a body may turn at, by its momentum at each sample [rad/s]."""
+    carrier = trajectory._scene.carrier
+    size = jnp.linalg.norm(carrier.momentum(trajectory._need("omega_body")), axis=-1)
+    return size / jnp.min(carrier.moments, axis=-1)
 
 
 def _natural_rates(trajectory: Trajectory) -> Array:
@@ -162,17 +167,20 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> Cross
     fixed: Trajectory = eqx.combine(still(arrays), rest)
     batch = trajectory.batch_shape
     ts = fixed.ts
-    share = jnp.linspace(0, 1, looks, dtype=ts.dtype).at[0].set(_AT_START / (looks - 1))
+    share = jnp.linspace(0, 1, looks, dtype=ts.dtype).at[0].set(AT_START / (looks - 1))
     share = share.reshape((1,) * (ts.ndim - 1) + share.shape)
     grid = ts[..., :1] + share * (ts[..., -1:] - ts[..., :1])
-    values, slopes = event.values(moved_through(fixed, grid))
+    seen = moved_through(fixed, grid)
+    motion: Any = trajectory.motion
+    whence = fixed if motion.method.exact else seen  # what is stepped goes on from the nearest look
+    values, slopes = event.values(seen)
     values, slopes = (x.reshape(-1, looks) for x in (values, slopes))
     grid = jnp.broadcast_to(grid, (*batch, looks)).reshape(-1, looks)
     values, slopes, grid = still((values, slopes, grid))
     ahead = jnp.where(grid[:, -1:] < grid[:, :1], -1, 1).astype(grid.dtype)
 
     def evaluate(t):
-        found = event.values(moved_to(fixed, t.reshape(*batch, -1)))
+        found = event.values(moved_to(whence, t.reshape(*batch, -1)))
         return still(tuple(x.reshape(t.shape) for x in found))
 
     sides = jnp.where(values >= 0, 1, -1)
@@ -180,14 +188,14 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> Cross
     if event.direction:
         changes = changes & (sides[:, 1:] * ahead == event.direction)
     room = max(most, _ROOM)
-    dips = _dips(grid, values, slopes, sides)
+    dips = dips_of(grid, values, slopes, sides)
 
     def at(x, place):
         return jnp.take_along_axis(x, place, axis=-1)
 
     # what turns back towards zero between two looks is looked at where it turns
-    place, is_dip = _first_true(dips, room)
-    single, is_single = _first_true(changes, room)
+    place, is_dip = first_true(dips, room)
+    single, is_single = first_true(changes, room)
     side = at(sides, place)
     low, high = at(grid, place), at(grid, place + 1)
     turns = low, high, at(slopes, place), at(slopes, place + 1), is_dip
@@ -249,7 +257,7 @@ def _polished(trajectory: Trajectory, event: Event, times: Array, use: Array):
     return slope, safe + (change - jax.lax.stop_gradient(change)) + kept
 
 
-def _dips(grid, values, slopes, sides) -> Array:
+def dips_of(grid, values, slopes, sides) -> Array:
     """Between which looks (N, looks - 1) the function turns back before zero, and comes near it.
 
     Near by the cubic through values and slopes, whose error is a hundredth of what it changes by.
@@ -268,7 +276,7 @@ def _dips(grid, values, slopes, sides) -> Array:
     return turns & (lowest <= jnp.minimum(a, end) / 2)
 
 
-def _first_true(mask: Array, most: int) -> tuple[Array, Array]:
+def first_true(mask: Array, most: int) -> tuple[Array, Array]:
     """Places (N, most) of the first that are true, and which of these there are."""
     size = mask.shape[-1]
     places = jnp.where(mask, jnp.arange(size), size)
