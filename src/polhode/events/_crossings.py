@@ -16,7 +16,7 @@ from polhode._scene import Scene
 from polhode._trajectory import Trajectory
 from polhode.events._bracketed import bracketed
 from polhode.events._event import Event, at_least
-from polhode.methods import natural_rates
+from polhode.methods import Status, natural_rates
 
 A_TURN = 32
 """Looks in a turn of the fastest natural rate."""
@@ -77,8 +77,9 @@ def crossings(
     space does so. Functions that vary faster than the body turns (high powers, other frequencies
     of the time) and rates that rise and fall again between two saved samples need ``samples``.
 
-    Raises ValueError where the looks would be too many to be held in memory, or where ``jit`` does
-    not know how many there are.
+    Raises ValueError where the looks would be too many to be held in memory, where the steps of a
+    body run out on their way (under ``jit`` it is not ``complete``), or where ``jit`` does not know
+    how many there are.
 
         up = ph.crossings(traj, lambda wxyz, omega_body, t: omega_body[0], direction=1)
         traj.at(up.times).euler()
@@ -98,10 +99,15 @@ def crossings(
                 "under jit, vmap or grad the room for crossings must be known: most=8."
             )
         room = _ROOM
-    found = _found(trajectory, event, room, looks)
+    found, lost = _found(trajectory, event, room, looks)
+    if is_concrete(lost) and np.any(np.asarray(lost)):
+        raise ValueError(
+            f"the steps of a body ran out on its way through {looks:,} looks: search a shorter time"
+            " (traj.between), or ask for more steps, ph.LiePoisson(..., max_steps=2**20)."
+        )
     while most is None and int(np.max(found.count, initial=0)) > room:
         room = 2 ** int(np.ceil(np.log2(np.max(found.count))))
-        found = _found(trajectory, event, room, looks)
+        found, _ = _found(trajectory, event, room, looks)
     if most is None:
         found = _trimmed(found)
     return found
@@ -160,8 +166,8 @@ def _natural_rates(trajectory: Trajectory) -> Array:
 
 
 @eqx.filter_jit
-def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> Crossings:
-    """The first ``most`` crossings."""
+def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> tuple[Crossings, Array]:
+    """The first ``most`` crossings, and for which bodies (...) the looks could not be taken."""
     still = jax.lax.stop_gradient
     arrays, rest = eqx.partition(trajectory, eqx.is_inexact_array)
     fixed: Trajectory = eqx.combine(still(arrays), rest)
@@ -239,10 +245,9 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> Cross
     count = jnp.where(dipping > room, jnp.maximum(count, each * dipping), count)
     times, use = (x[:, :most].reshape(*batch, most) for x in (times, use))
     slope, times = _polished(trajectory, event, times, use)
-    return Crossings(
-        jnp.where(use, times, jnp.inf), jnp.where(use, slope, 0),
-        count.reshape(batch).astype(jnp.int32),
-    )  # fmt: skip
+    lost = (seen.status != Status.SUCCESSFUL) & (trajectory.status == Status.SUCCESSFUL)
+    count = jnp.where(lost, most + 1, count.reshape(batch)).astype(jnp.int32)
+    return Crossings(jnp.where(use, times, jnp.inf), jnp.where(use, slope, 0), count), lost
 
 
 def _polished(trajectory: Trajectory, event: Event, times: Array, use: Array):
