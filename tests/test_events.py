@@ -216,7 +216,7 @@ def test_what_cannot_be_searched_is_told():
     for given, match in (({"most": 3}, "samples="), ({"samples": 30}, "most=")):
         with pytest.raises(ValueError, match=match):
             jax.jit(lambda traj, given=given: ph.crossings(traj, height(0.0), **given))(traj)
-    few = ph.simulate(BALL, STATE, [0.0, 20.0], ph.LiePoisson(max_steps=40))
+    few = ph.simulate(BALL, STATE, [0.0, 20.0], ph.LiePoisson(max_steps=120))
     with pytest.raises(ValueError, match="steps of a body ran out"):
         ph.crossings(few, height(0.0))
     fast = ph.simulate(BALL, ph.State([1.0, 0, 0, 0], [0.0, 1e7, 0]), [0.0, 10.0])
