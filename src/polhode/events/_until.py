@@ -59,7 +59,8 @@ def stopped(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
         ts = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
     arrays, rest = eqx.partition((lanes, until), eqx.is_inexact_array)
     still = jax.lax.stop_gradient
-    met, lost, near, step = still(_first_event(*eqx.combine(still(arrays), rest), still(ts)))
+    fixed, event = eqx.combine(still(arrays), rest)
+    met, lost, near, step = still(_first_event(fixed, event, still(ts)))
     held = _held(lanes, ts, until, met, near, step)
     held = (*held[:3], jnp.where(lost, Status.MAX_STEPS, held[3]), *held[4:])
     wxyz, omega, spins, status, steps, times, event = (
@@ -232,8 +233,8 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
 
     samples, zero = [x[:, 0] for x in _samples(lanes)], jnp.zeros(n, dtype)
     alive = lanes.status == Status.SUCCESSFUL
-    nowhere = _Bracket(*[jnp.broadcast_to(first, (n,))] * 2, zero, zero, zero, samples)
-    nowhere = nowhere._replace(look=nowhere.low)
+    begin = jnp.broadcast_to(first, (n,))
+    nowhere = _Bracket(begin, begin, zero, zero, begin, samples)
     start = jnp.zeros((), dtype)
     width = width_by_rate(start, samples, alive)
     width = width if until.samples is not None else jnp.minimum(width, _FIRST)
@@ -269,7 +270,8 @@ def _held(lanes: Trajectory, ts: Array, until: Event, met: Array, near: Array, s
     change = jnp.where(slope == 0, 0, -value / known)
     # the motion in windows differed from this one by no more than the tolerance allows
     most = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(near)
-    if not lanes.motion.method.exact:
+    motion: Any = lanes.motion
+    if not motion.method.exact:
         most = jnp.maximum(most, 1e-4 * step.reshape(-1, 1))
     kept = jax.lax.stop_gradient(jnp.clip(change, -most, most))
     event = near + (change - jax.lax.stop_gradient(change)) + kept
