@@ -13,6 +13,7 @@ RATE = 1.7
 BALL = ph.Scene(ph.Inertia.spherical(2.0))
 STATE = ph.State([1.0, 0.0, 0.0, 0.0], [0.0, RATE, 0.0])  # body x falls: its height is -sin(rate t)
 TS = jnp.array([0.0, 3.0, 10.0])
+PENDULUM = ph.Scene(ph.Inertia.from_moments([0.8, 0.9, 0.5]), ph.UniformGravity(0.7, [0, 0, -0.3]))
 
 
 class Height(eqx.Module):
@@ -103,9 +104,8 @@ def test_event_times_have_derivatives(method):
 
 def test_a_pendulum_passes_below_after_a_quarter_period():
     """From rest at 1 rad: 4 K(sin^2(1/2)) / sqrt(m g l / I) by SciPy; its rate is gravity's."""
-    scene = ph.Scene(ph.Inertia.from_moments([0.8, 0.9, 0.5]), ph.UniformGravity(0.7, [0, 0, -0.3]))
     state = ph.State([np.cos(0.5), np.sin(0.5), 0.0, 0.0], [0.0, 0.0, 0.0])
-    traj = ph.simulate(scene, state, [0.0, 6.0], rtol=1e-11)
+    traj = ph.simulate(PENDULUM, state, [0.0, 6.0], rtol=1e-11)
     found = ph.crossings(traj, lambda wxyz, omega_body, t: wxyz[1] * wxyz[0])
     quarter = ellipk(np.sin(0.5) ** 2) / np.sqrt(0.7 * 9.80665 * 0.3 / 0.8)
     want = quarter * np.arange(1, 40, 2)
@@ -135,6 +135,70 @@ def test_a_motion_stops_at_its_event_and_goes_on_with_another_scene():
     assert np.all(np.isinf(again.event_time))
 
 
+def test_the_work_follows_from_the_event_and_not_from_the_last_time():
+    """Two pendulums from rest, in a span of 1e9 s: simulated to its end they would swing for
+    months; a quarter of their periods by SciPy."""
+    angles = np.array([1.0, 2.5])
+    wxyz = np.stack([np.cos(angles / 2), np.sin(angles / 2), 0 * angles, 0 * angles], axis=-1)
+    below = ph.Event(lambda wxyz, omega_body, t: wxyz[1] * wxyz[0])
+    found = ph.simulate(
+        PENDULUM, ph.State(wxyz, jnp.zeros(3)), [0.0, 1.0, 1e9], rtol=1e-11, until=below
+    )
+    want = ellipk(np.sin(angles / 2) ** 2) / np.sqrt(0.7 * 9.80665 * 0.3 / 0.8)
+    np.testing.assert_allclose(found.event_time, want, rtol=1e-10)
+    assert np.all(found.steps < 100)
+    np.testing.assert_allclose(found.ts[:, 1], np.minimum(want, 1.0))
+    np.testing.assert_allclose(found.last.wxyz[:, 1], 0, atol=1e-10)
+    energy = found.energy
+    np.testing.assert_allclose(energy, energy[:, :1] + 0 * energy, rtol=1e-9)
+
+
+def test_bodies_that_are_set_in_motion_are_looked_at_often_enough():
+    """From rest w = a t, and from rest by a pulse amid a span a thousand times as long."""
+    scene = ph.Scene(ph.Inertia.spherical(2.0), None, ph.BodyTorque([0.0, 1.0, 0.0]))
+    rest = ph.State([1.0, 0, 0, 0], jnp.zeros(3))
+    high = ph.Event(height(0.5), 1)  # -sin(t^2/4) = 1/2 for the first time rising
+    found = ph.simulate(scene, rest, [0.0, 1e5], until=high)
+    np.testing.assert_allclose(found.event_time, np.sqrt(4 * 7 * np.pi / 6), rtol=1e-12)
+    pushed = ph.Pulses(ph.BodyTorque([0.0, 50.0, 0.0]), [50.0], [50.1])
+    scene = ph.Scene(scene.inertia, None, pushed)
+    found = ph.simulate(scene, rest, [0.0, 1e3], until=high)  # turns by 2.5 (t - 50.05)
+    np.testing.assert_allclose(found.event_time, 50.05 + 7 * np.pi / 6 / 2.5, rtol=1e-9)
+
+
+def test_derivatives_of_a_motion_that_stops():
+    """At a fixed phase x = rate t: dt/drate = -t/rate; the attitude is the phase's, the same for
+    every rate, and moves with the level."""
+
+    @jax.jit
+    def stop(rate, level):
+        state = ph.State(STATE.wxyz, jnp.stack([0 * rate, rate, 0 * rate]))
+        span = jnp.array([0.0, 1000.0])
+        found = ph.simulate(BALL, state, span, until=ph.Event(Height(level)))
+        return found.event_time, found.last.wxyz
+
+    given = jnp.asarray(RATE), jnp.asarray(0.4)
+    time, _ = stop(*given)
+    (by_rate, by_level), (q_rate, q_level) = jax.jacrev(stop, (0, 1))(*given)
+    np.testing.assert_allclose(by_rate, -time / RATE, rtol=1e-12)
+    slope = -RATE * np.cos(RATE * time)
+    np.testing.assert_allclose(by_level, 1 / slope, rtol=1e-12)
+    np.testing.assert_allclose(q_rate, 0, atol=1e-14)
+    half = RATE * time / 2
+    change = np.array([-np.sin(half), 0, np.cos(half), 0]) * RATE / 2 / slope
+    np.testing.assert_allclose(q_level, change, rtol=1e-11, atol=1e-15)
+    many = jax.vmap(stop, (0, None))(jnp.array([0.6, 1.3]), given[1])[0]
+    np.testing.assert_allclose(many, [known(0.4, 0.6)[0], known(0.4, 1.3)[0]], rtol=1e-12)
+
+
+def test_what_is_never_met_is_given_up(monkeypatch):
+    monkeypatch.setattr("polhode.events._until._MOST", 10)
+    never = ph.Event(lambda wxyz, omega_body, t: omega_body[1] - 3.5)
+    with pytest.raises(ph.SimulationError, match="steps"):
+        ph.simulate(BALL, STATE, [0.0, 1e6], until=never)
+    assert ph.simulate(BALL, STATE, [0.0, 1.0], until=never).event_time == np.inf
+
+
 def test_what_cannot_be_searched_is_told():
     traj = ph.simulate(BALL, STATE, TS)
     with pytest.raises(ValueError, match="direction"):
@@ -152,6 +216,9 @@ def test_what_cannot_be_searched_is_told():
     for given, match in (({"most": 3}, "samples="), ({"samples": 30}, "most=")):
         with pytest.raises(ValueError, match=match):
             jax.jit(lambda traj, given=given: ph.crossings(traj, height(0.0), **given))(traj)
+    few = ph.simulate(BALL, STATE, [0.0, 20.0], ph.LiePoisson(max_steps=120))
+    with pytest.raises(ValueError, match="steps of a body ran out"):
+        ph.crossings(few, height(0.0))
     fast = ph.simulate(BALL, ph.State([1.0, 0, 0, 0], [0.0, 1e7, 0]), [0.0, 10.0])
     with pytest.raises(ValueError, match="looks at each body"):
         ph.crossings(fast, height(0.0))

@@ -61,7 +61,8 @@ def simulate(
     - ``record``: what to keep; None: attitude and rates at all times.
     - ``until``: a ``ph.Event`` at which each body stops: its times and samples from there on are
       those of the event, so that ``Trajectory.last`` is the state to go on from; its time is
-      ``Trajectory.event_time`` (inf for a body that does not meet it).
+      ``Trajectory.event_time`` (inf for a body that does not meet it). The work follows from where
+      the last event of all bodies is, not from the last of ``ts``.
     - ``throw``: raise ``ph.SimulationError`` when a body did not finish. Under ``jit``, ``vmap``
       or ``grad`` nothing is raised: look at ``Trajectory.status``.
 
@@ -70,9 +71,7 @@ def simulate(
     """
     if until is not None:
         check_until(until, record)
-        found = simulate(scene, state, ts, method, rtol=rtol, throw=throw)
-        return checked(stopped(found, until), throw)
-    if method is None:
+    if method is None and until is None:
         trajectory = again(scene, state, ts, rtol, record)
         if trajectory is not None:
             return checked(trajectory, throw)
@@ -82,7 +81,7 @@ def simulate(
     checked_rtol = check_rtol(rtol, state.wxyz.dtype)
     split = split_of(scene, state, ts)
     if method is None:
-        if split is None and scene is as_given and is_concrete(scene, state):
+        if until is None and split is None and scene is as_given and is_concrete(scene, state):
             plain = partial(_trajectory, in_order=True)
             learn(plain, scene, given, record, ways_of(scene, state, record))
             trajectory = again(scene, state, ts, rtol, given)
@@ -91,6 +90,8 @@ def simulate(
         method, _ = choose(scene, state, record, checked_rtol, ts)
     if split is not None and is_concrete(scene, state, ts):
         scene, state, ts = place(split, scene, state, ts)
+    if until is not None:
+        return checked(stopped(_begin(method, scene, state, ts, checked_rtol), ts, until), throw)
     return checked(run(method, scene, state, ts, checked_rtol, record, split), throw)
 
 
@@ -123,6 +124,30 @@ def explain(
 def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> Trajectory:
     """The compiled part: lanes out of batches, the method, and back."""
     return _trajectory(method, scene, state, ts, rtol, record, split)
+
+
+@eqx.filter_jit
+def _begin(method, scene, state, ts, rtol) -> Trajectory:
+    """The state at the first time, as the only sample of a trajectory."""
+    scene, state = scene.mended(), state.mended("state").as_unit()
+    scene = scene.settled(state, ts[..., 0])
+    parts = {name: getattr(scene, name) for name in PARTS}
+    batch = common_batch(*parts.values(), state, extra=(ts.shape[:-1],))
+    wxyz, omega = (
+        jnp.broadcast_to(x, (*batch, x.shape[-1])) for x in (state.wxyz, state.omega_body)
+    )
+    spins = scene.dynamics.wheels.initial_spins(omega[..., 0]) if scene.dynamics.coupled else ()
+    lanes = {name: flatten(part, batch) for name, part in parts.items()}
+    times = ts
+    if ts.ndim > 1:
+        times = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
+    good = jnp.full(omega[..., 0].size, Status.SUCCESSFUL)
+    status = judged(good, Scene(**lanes), times, rtol, False).reshape(batch)
+    return Trajectory(
+        ts[..., :1], wxyz[..., None, :], omega[..., None, :], status, jnp.zeros_like(status), scene,
+        spins=jnp.stack(spins, axis=-1)[..., None, :] if spins else None,
+        motion=Motion.of(method, rtol),
+    )  # fmt: skip
 
 
 def _trajectory(method, scene, state, ts, rtol, record, split=None, in_order=False) -> Trajectory:

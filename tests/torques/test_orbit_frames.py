@@ -95,23 +95,49 @@ def test_the_frame_is_where_its_definition_puts_it():
     assert abs(rates[2]) > 1e-6
 
 
-def test_attitudes_go_in_and_out_of_the_frame():
-    """NASA's JEOD, SIM_dyncomp run 10A: a cylinder with the pitch rate of its circular orbit."""
+# NASA's JEOD (github.com/nasa/jeod): models/utils/lvlh_frame/verif/SIM_LVLH_Frame, at 0, 1, 10 and
+# 40 s of a place (10 + 2 t, t, 0) m. Its quaternions are those of transformations, ours conjugate.
+JEOD_WXYZ = [
+    [0.5, 0.5, 0.5, -0.5],
+    [0.4787887112668437, 0.4787887112668437, 0.5203473551037182, -0.5203473551037181],
+    [0.4134526073152647, 0.4134526073152648, 0.5736348503222319, -0.573634850322232],
+    [0.3853120598769757, 0.3853120598769757, 0.5929035473948203, -0.5929035473948203],
+]
+JEOD_PITCH_RATE = [-0.1, -0.06896551724137931, -0.01, -0.001030927835051546]  # fmt: skip
+
+
+def test_the_frame_of_nasas_jeod():
+    """Its log of a body on a straight line, and the start of its SIM_dyncomp (state.py, run 9B):
+    yaw, pitch and roll of (0, -11.6, 0) degrees at rest to the frame of a circular orbit."""
+    times = jnp.array([0.0, 1.0, 10.0, 40.0])
+    line = ph.LVLH(lambda t: jnp.stack([10 + 2 * t, t, 0 * t]))
+    gap = ph.rotation.angle_between(line.attitude(times),
+                                    ph.rotation.conjugate(jnp.array(JEOD_WXYZ)))  # fmt: skip
+    np.testing.assert_allclose(gap, 0, atol=1e-15)
+    rates = np.array([[0.0, x, 0.0] for x in JEOD_PITCH_RATE])
+    np.testing.assert_allclose(line.omega(times), rates, rtol=1e-15)
+
     place, speed = [-4292653.41, 955168.47, 5139356.57], [109.649663, -7527.72649, 1484.521489]
-    to_body = [[-0.6443912270931274, 0.05284210190675609, 0.7628680480341864],
-               [-0.7615617870471506, -0.1345758407161209, -0.6339660776454052],
-               [0.06916350883930189, -0.9894933326514259, 0.1269620166955875]]  # fmt: skip
-    wxyz = ph.rotation.matrix_to_wxyz(jnp.array(to_body).T)
+    to_body = [[0.1412307175854335, -0.9892782736897275, 0.03718039289432368],
+               [-0.772691975098125, -0.1336331223242703, -0.6205556383087864],
+               [0.6188707425862547, 0.05891252687959725, -0.7832804849780175]]  # fmt: skip
     frame = ph.LVLH(ph.StateOrbit(3.986004415e14, place, speed))
-    rates = jnp.array([-1.97989570839746e-05, -0.001134281491669957, 0.0])
-    relative, slow = frame.to_frame(wxyz, rates, 0.0)
-    # the body is pitched away from the local frame by its case's turn about y alone
-    back = frame.from_frame(relative, slow, 0.0)
-    assert float(ph.rotation.angle_between(back[0], wxyz)) < 1e-15
-    np.testing.assert_allclose(back[1], rates, rtol=0, atol=1e-18)
-    held = ph.State(*frame.from_frame([1.0, 0, 0, 0], [0.0, 0, 0], 0.0))
-    mean = np.linalg.norm(np.cross(place, speed)) / np.dot(place, place)
-    np.testing.assert_allclose(held.omega_body, [0, -mean, 0], rtol=0, atol=1e-16)
+    pitched = ph.rotation.euler_to_wxyz(
+        0.0, np.deg2rad(-11.6), 0.0, sequence=ph.rotation.Sequence.ZYX
+    )
+    wxyz, omega = frame.from_frame(pitched, [0.0, 0, 0], 0.0)
+    want = ph.rotation.matrix_to_wxyz(jnp.array(to_body).T)
+    assert float(ph.rotation.angle_between(wxyz, want)) < 1e-13
+    np.testing.assert_allclose(omega, [0.0, -0.001134454274550824, 0.0], rtol=0, atol=1e-17)
+    back = frame.to_frame(wxyz, omega, 0.0)
+    assert float(ph.rotation.angle_between(back[0], pitched)) < 1e-15
+    np.testing.assert_allclose(back[1], 0, atol=1e-18)
+    held = ph.simulate(
+        ph.Scene(ph.Inertia.spherical(1.0)), ph.State(wxyz, omega), [0.0, 600.0, 1200.0]
+    )
+    yaw, pitch, roll = np.rad2deg(np.stack(frame.yaw_pitch_roll(held)))
+    np.testing.assert_allclose(np.stack([yaw, roll]), 0, atol=1e-9)
+    np.testing.assert_allclose(pitch, -11.6, atol=0.15)  # the orbit is nearly a circle
 
 
 def test_damping_against_the_frame_brings_a_body_to_its_rate():

@@ -1,6 +1,7 @@
 """When a function of attitude, rates and time crosses zero along a trajectory."""
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,9 +16,9 @@ from polhode._scene import Scene
 from polhode._trajectory import Trajectory
 from polhode.events._bracketed import bracketed
 from polhode.events._event import Event, at_least
-from polhode.methods import natural_rates
+from polhode.methods import Status, natural_rates
 
-_A_TURN = 32
+A_TURN = 32
 """Looks in a turn of the fastest natural rate."""
 
 _TOO_MANY = 20_000_000
@@ -26,7 +27,7 @@ _TOO_MANY = 20_000_000
 _ROOM = 16
 """Least number of places where the function turns back that are looked at."""
 
-_AT_START = 1e-6
+AT_START = 1e-6
 """Part of the time between two looks within which a crossing is the start itself."""
 
 
@@ -76,8 +77,9 @@ def crossings(
     space does so. Functions that vary faster than the body turns (high powers, other frequencies
     of the time) and rates that rise and fall again between two saved samples need ``samples``.
 
-    Raises ValueError where the looks would be too many to be held in memory, or where ``jit`` does
-    not know how many there are.
+    Raises ValueError where the looks would be too many to be held in memory, where the steps of a
+    body run out on their way (under ``jit`` it is not ``complete``), or where ``jit`` does not know
+    how many there are.
 
         up = ph.crossings(traj, lambda wxyz, omega_body, t: omega_body[0], direction=1)
         traj.at(up.times).euler()
@@ -97,10 +99,15 @@ def crossings(
                 "under jit, vmap or grad the room for crossings must be known: most=8."
             )
         room = _ROOM
-    found = _found(trajectory, event, room, looks)
+    found, lost = _found(trajectory, event, room, looks)
+    if is_concrete(lost) and np.any(np.asarray(lost)):
+        raise ValueError(
+            f"the steps of a body ran out on its way through {looks:,} looks: search a shorter time"
+            " (traj.between), or ask for more steps, ph.LiePoisson(..., max_steps=2**20)."
+        )
     while most is None and int(np.max(found.count, initial=0)) > room:
         room = 2 ** int(np.ceil(np.log2(np.max(found.count))))
-        found = _found(trajectory, event, room, looks)
+        found, _ = _found(trajectory, event, room, looks)
     if most is None:
         found = _trimmed(found)
     return found
@@ -120,7 +127,7 @@ def _looks(trajectory: Trajectory) -> int:
             " 32 or more in a turn of the fastest rate."
         )
     turned = np.max(np.asarray(_turned(trajectory)), initial=0)
-    looks = max(17, 1 + int(np.ceil(_A_TURN * turned / (2 * np.pi))) if np.isfinite(turned) else 17)
+    looks = max(17, 1 + int(np.ceil(A_TURN * turned / (2 * np.pi))) if np.isfinite(turned) else 17)
     grain = 2 ** max(0, int(np.log2(looks)) - 2)  # few numbers, for fewer compiled programs
     looks = 1 + -(-(looks - 1) // grain) * grain
     if looks * max(1, int(np.prod(trajectory.batch_shape))) > _TOO_MANY:
@@ -134,13 +141,17 @@ def _looks(trajectory: Trajectory) -> int:
 @eqx.filter_jit
 def _turned(trajectory: Trajectory) -> Array:
     """Most (...) that a body may turn from the first to the last time [rad]."""
-    scene, ts = trajectory._scene, trajectory._t
-    omega = trajectory.omega_body
-    slowest = jnp.min(scene.carrier.moments, axis=-1)
-    size = jnp.linalg.norm(scene.carrier.momentum(omega), axis=-1) / slowest
+    ts = trajectory._t
     span = jnp.max(ts, axis=-1) - jnp.min(ts, axis=-1)
-    rate = jnp.maximum(jnp.max(size, axis=-1), _natural_rates(trajectory))
-    return rate * span
+    rate = jnp.max(turning_rates(trajectory), axis=-1)
+    return jnp.maximum(rate, _natural_rates(trajectory)) * span
+
+
+def turning_rates(trajectory: Trajectory) -> Array:
+    """The most (..., T) that a body may turn at, by its momentum at each sample [rad/s]."""
+    carrier = trajectory._scene.carrier
+    size = jnp.linalg.norm(carrier.momentum(trajectory._need("omega_body")), axis=-1)
+    return size / jnp.min(carrier.moments, axis=-1)
 
 
 def _natural_rates(trajectory: Trajectory) -> Array:
@@ -155,24 +166,27 @@ def _natural_rates(trajectory: Trajectory) -> Array:
 
 
 @eqx.filter_jit
-def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> Crossings:
-    """The first ``most`` crossings."""
+def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> tuple[Crossings, Array]:
+    """The first ``most`` crossings, and for which bodies (...) the looks could not be taken."""
     still = jax.lax.stop_gradient
     arrays, rest = eqx.partition(trajectory, eqx.is_inexact_array)
     fixed: Trajectory = eqx.combine(still(arrays), rest)
     batch = trajectory.batch_shape
     ts = fixed.ts
-    share = jnp.linspace(0, 1, looks, dtype=ts.dtype).at[0].set(_AT_START / (looks - 1))
+    share = jnp.linspace(0, 1, looks, dtype=ts.dtype).at[0].set(AT_START / (looks - 1))
     share = share.reshape((1,) * (ts.ndim - 1) + share.shape)
     grid = ts[..., :1] + share * (ts[..., -1:] - ts[..., :1])
-    values, slopes = event.values(moved_through(fixed, grid))
+    seen = moved_through(fixed, grid)
+    motion: Any = trajectory.motion
+    whence = fixed if motion.method.exact else seen  # what is stepped goes on from the nearest look
+    values, slopes = event.values(seen)
     values, slopes = (x.reshape(-1, looks) for x in (values, slopes))
     grid = jnp.broadcast_to(grid, (*batch, looks)).reshape(-1, looks)
     values, slopes, grid = still((values, slopes, grid))
     ahead = jnp.where(grid[:, -1:] < grid[:, :1], -1, 1).astype(grid.dtype)
 
     def evaluate(t):
-        found = event.values(moved_to(fixed, t.reshape(*batch, -1)))
+        found = event.values(moved_to(whence, t.reshape(*batch, -1)))
         return still(tuple(x.reshape(t.shape) for x in found))
 
     sides = jnp.where(values >= 0, 1, -1)
@@ -180,14 +194,14 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> Cross
     if event.direction:
         changes = changes & (sides[:, 1:] * ahead == event.direction)
     room = max(most, _ROOM)
-    dips = _dips(grid, values, slopes, sides)
+    dips = dips_of(grid, values, slopes, sides)
 
     def at(x, place):
         return jnp.take_along_axis(x, place, axis=-1)
 
     # what turns back towards zero between two looks is looked at where it turns
-    place, is_dip = _first_true(dips, room)
-    single, is_single = _first_true(changes, room)
+    place, is_dip = first_true(dips, room)
+    single, is_single = first_true(changes, room)
     side = at(sides, place)
     low, high = at(grid, place), at(grid, place + 1)
     turns = low, high, at(slopes, place), at(slopes, place + 1), is_dip
@@ -231,10 +245,9 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> Cross
     count = jnp.where(dipping > room, jnp.maximum(count, each * dipping), count)
     times, use = (x[:, :most].reshape(*batch, most) for x in (times, use))
     slope, times = _polished(trajectory, event, times, use)
-    return Crossings(
-        jnp.where(use, times, jnp.inf), jnp.where(use, slope, 0),
-        count.reshape(batch).astype(jnp.int32),
-    )  # fmt: skip
+    lost = (seen.status != Status.SUCCESSFUL) & (trajectory.status == Status.SUCCESSFUL)
+    count = jnp.where(lost, most + 1, count.reshape(batch)).astype(jnp.int32)
+    return Crossings(jnp.where(use, times, jnp.inf), jnp.where(use, slope, 0), count), lost
 
 
 def _polished(trajectory: Trajectory, event: Event, times: Array, use: Array):
@@ -249,7 +262,7 @@ def _polished(trajectory: Trajectory, event: Event, times: Array, use: Array):
     return slope, safe + (change - jax.lax.stop_gradient(change)) + kept
 
 
-def _dips(grid, values, slopes, sides) -> Array:
+def dips_of(grid, values, slopes, sides) -> Array:
     """Between which looks (N, looks - 1) the function turns back before zero, and comes near it.
 
     Near by the cubic through values and slopes, whose error is a hundredth of what it changes by.
@@ -268,7 +281,7 @@ def _dips(grid, values, slopes, sides) -> Array:
     return turns & (lowest <= jnp.minimum(a, end) / 2)
 
 
-def _first_true(mask: Array, most: int) -> tuple[Array, Array]:
+def first_true(mask: Array, most: int) -> tuple[Array, Array]:
     """Places (N, most) of the first that are true, and which of these there are."""
     size = mask.shape[-1]
     places = jnp.where(mask, jnp.arange(size), size)

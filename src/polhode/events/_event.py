@@ -24,7 +24,7 @@ class Event(eqx.Module):
     rates (3,) [rad/s] and the time () [s], smooth; batches are mapped over it. ``direction``: 1
     where fn rises through zero in time, -1 where it falls, 0 for both. ``samples``: at how many
     equally spaced times the motion is looked at; None: 32 in a turn of the fastest natural rate
-    (see ``ph.crossings``); under ``jit`` it must be given.
+    (see ``ph.crossings``), which under ``jit`` must be given for ``crossings``.
 
     Raises TypeError or ValueError for a function that takes or returns something else, another
     direction, or fewer than two samples.

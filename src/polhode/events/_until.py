@@ -1,16 +1,39 @@
-"""Motions that stop at an event."""
+"""Motions that stop at an event: windows of the motion one after the other, until each body has
+met its own, so that the work follows from where the events are and not from the last time."""
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
-from polhode._checks import is_concrete
-from polhode._motion import moved_to
+from polhode import rotation
+from polhode._batch import PARTS, flatten
+from polhode._motion import moved_through, moved_to
+from polhode._scene import Scene
+from polhode._state import State
 from polhode._trajectory import Trajectory
-from polhode.events._crossings import crossings
+from polhode.events._bracketed import bracketed
+from polhode.events._crossings import A_TURN, AT_START, dips_of, first_true, turning_rates
 from polhode.events._event import Event
-from polhode.methods import Record
+from polhode.methods import Record, Status, natural_rates
+
+_LOOKS = 64
+"""Steps between looks in a window: two turns of the fastest body."""
+
+_FIRST, _GROWTH = 2**-10, 4.0
+"""Part of the whole that the first window is at most, and how much longer the next may be: a body
+that rests at first may be set in motion soon."""
+
+_FASTER = 1.5
+"""How much faster than at its start a body may turn within a window."""
+
+_MOST = 2**20
+"""Windows, of a thousandth of a second or less each: what has no event by then is given up."""
+
+_DIPS = 2
+"""Places in a window, of each body, where the function may turn back before zero."""
 
 
 def check_until(until: Any, record: Any) -> None:
@@ -26,19 +49,259 @@ def check_until(until: Any, record: Any) -> None:
         )
 
 
-def stopped(trajectory: Trajectory, until: Event) -> Trajectory:
-    """The trajectory, each body held from its first event on."""
-    known = is_concrete(trajectory)
-    found = crossings(trajectory, until, most=None if known else 1)
-    none = jnp.full((*trajectory.batch_shape, 1), jnp.inf, trajectory.ts.dtype)
-    return _held(trajectory, jnp.concatenate([found.times, none], axis=-1)[..., 0])
-
-
 @eqx.filter_jit
-def _held(trajectory: Trajectory, time) -> Trajectory:
-    ts = jnp.broadcast_to(trajectory._t, (*trajectory.batch_shape, trajectory.ts.shape[-1]))
-    back = ts[..., -1:] < ts[..., :1]
-    event = time[..., None]
-    past = jnp.where(back, ts <= event, ts >= event) & jnp.isfinite(event)
-    held = moved_to(trajectory, jnp.where(past, event, ts))
-    return eqx.tree_at(lambda t: t.event_time, held, time, is_leaf=lambda x: x is None)
+def stopped(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
+    """The motion from ``begin``, its state at the first of ``ts``, each body held from its first
+    event on."""
+    batch = begin.batch_shape
+    lanes = _of_lanes(begin)
+    if ts.ndim > 1:
+        ts = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
+    arrays, rest = eqx.partition((lanes, until), eqx.is_inexact_array)
+    still = jax.lax.stop_gradient
+    fixed, event = eqx.combine(still(arrays), rest)
+    met, lost, near, step = still(_first_event(fixed, event, still(ts)))
+    held = _held(lanes, ts, until, met, near, step)
+    held = (*held[:3], jnp.where(lost, Status.MAX_STEPS, held[3]), *held[4:])
+    wxyz, omega, spins, status, steps, times, event = (
+        None if x is None else x.reshape(*batch, *x.shape[1:]) for x in held
+    )
+    return Trajectory(
+        times, wxyz, omega, status, steps, begin.scene, spins=spins, motion=begin.motion,
+        event_time=event,
+    )  # fmt: skip
+
+
+def _of_lanes(begin: Trajectory) -> Trajectory:
+    """The same with one batch axis."""
+    batch = begin.batch_shape
+    n = begin.status.size
+    parts = {name: flatten(getattr(begin.scene, name), batch) for name in PARTS}
+    ts = begin.ts
+    if ts.ndim > 1:
+        ts = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(n, -1)
+    samples = (
+        None if x is None else x.reshape(n, *x.shape[len(batch) :])
+        for x in (begin.wxyz, begin.omega_body, begin.spins)
+    )
+    wxyz, omega, spins = samples
+    return Trajectory(
+        ts, wxyz, omega, begin.status.reshape(n), begin.steps.reshape(n), Scene(**parts),
+        spins=spins, motion=begin.motion,
+    )  # fmt: skip
+
+
+class _Bracket(NamedTuple):
+    """Where each of N bodies meets its event: between two times, the values there, and the look
+    before it."""
+
+    low: Array
+    high: Array
+    at_low: Array
+    at_high: Array
+    look: Array  # its time
+    samples: list[Array]
+
+
+class _Window(NamedTuple):
+    """The search under way: the next window begins at ``share`` of the whole, with ``samples``."""
+
+    tried: Array
+    share: Array
+    width: Array
+    samples: list[Array]
+    met: Array
+    alive: Array
+    found: _Bracket
+
+
+def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...]:
+    """Which bodies (N,) meet their event, and which were given up; when it is, and the time
+    between two looks there [s]."""
+    motion: Any = lanes.motion
+    exact = motion.method.exact
+    first, last = ts[..., 0], ts[..., -1]
+    span, dtype = last - first, ts.dtype
+    n = lanes.status.size
+    forward = jnp.broadcast_to(jnp.where(span < 0, -1, 1), (n,))
+    least = 4 * _LOOKS * float(jnp.finfo(dtype).eps)
+
+    def times(share):
+        """(K,) or (N, K) of parts (K,) of the whole."""
+        share = share.reshape((1,) * span.ndim + share.shape)
+        found = first[..., None] + share * span[..., None]
+        return jnp.where(share >= 1, last[..., None], found)
+
+    def at(time, samples, share_of_error=None):
+        """The bodies at a time () or (N,), one sample each."""
+        wxyz, omega, *spins = (x[:, None] for x in samples)
+        now = motion
+        if share_of_error is not None and motion.rtol is not None:
+            eps = jnp.finfo(motion.rtol.dtype).eps
+            rtol = jnp.maximum(motion.rtol * share_of_error.astype(motion.rtol.dtype), 8 * eps)
+            now = eqx.tree_at(lambda m: m.rtol, motion, rtol)
+        return Trajectory(
+            time[..., None], wxyz, omega, lanes.status, lanes.steps, lanes.scene,
+            spins=spins[0] if spins else None, motion=now,
+        )  # fmt: skip
+
+    def width_by_rate(share, samples, busy):
+        if until.samples is not None:
+            return jnp.asarray(_LOOKS / (until.samples - 1), dtype)
+        ends = jnp.stack(jnp.broadcast_arrays(times(share[None])[..., 0], last), axis=-1)
+        rates = natural_rates(lanes.scene, State(*samples[:2]), ends)
+        turned = jnp.max(jnp.where(busy & jnp.isfinite(rates), rates * jnp.abs(span), 0), initial=0)
+        turned = jnp.maximum(turned, jnp.finfo(dtype).tiny)
+        return jnp.maximum(_LOOKS * 2 * jnp.pi / A_TURN / turned, least).astype(dtype)
+
+    def one(walk: _Window) -> _Window:
+        busy = ~walk.met & walk.alive
+        width = jnp.minimum(walk.width, 1 - walk.share)
+        part = jnp.linspace(0, 1, _LOOKS + 1, dtype=dtype)
+        offset = jnp.where(walk.share == 0, AT_START / _LOOKS, 0).astype(dtype)
+        share = walk.share + width * part.at[0].set(offset)
+        share = share.at[-1].set(jnp.where(width < walk.width, 1, share[-1]))
+        begin = lanes if exact else at(times(walk.share[None])[..., 0], walk.samples, width)
+        seen = moved_through(begin, times(share))
+        values, slopes = until.values(seen)
+        grid = jnp.broadcast_to(seen.ts, values.shape)
+        sides = jnp.where(values >= 0, 1, -1)
+        changes = sides[:, 1:] != sides[:, :-1]
+        if until.direction:
+            changes = changes & (sides[:, 1:] * forward[:, None] == until.direction)
+        looks = jnp.arange(_LOOKS)
+        change = jnp.min(jnp.where(changes, looks, _LOOKS), axis=-1)
+        dips = (
+            dips_of(grid, values, slopes, sides) & (looks[None] < change[:, None]) & busy[:, None]
+        )
+        place, is_dip = first_true(dips, _DIPS + 1)
+
+        # as far as the bodies turn about as fast as thought, and no dip is left out
+        reach = jnp.min(jnp.where(is_dip[:, _DIPS], place[:, _DIPS], _LOOKS), initial=_LOOKS)
+        if until.samples is None:
+            turned = turning_rates(seen) * jnp.abs(span).reshape(-1, 1)
+            turned = jnp.where(busy[:, None] & jnp.isfinite(turned), turned, 0)
+            angle = jnp.max(turned, axis=0, initial=0) * width / _LOOKS
+            slow = (angle <= _FASTER * 2 * jnp.pi / A_TURN) | (width <= least)
+            fast = jnp.min(jnp.where(slow, _LOOKS, jnp.arange(_LOOKS + 1)))
+            reach = jnp.minimum(reach, jnp.maximum(fast, 1))
+        place, is_dip = place[:, :_DIPS], is_dip[:, :_DIPS] & (place[:, :_DIPS] < reach)
+
+        def look(x, k):
+            return jnp.take_along_axis(x, k, axis=-1)
+
+        low, high = look(grid, place), look(grid, place + 1)
+
+        def turning(_):
+            def fn(t):
+                value, slope = until.values(moved_to(begin if exact else seen, t))
+                return slope, value
+
+            return bracketed(fn, low, high, look(slopes, place), look(slopes, place + 1), is_dip)
+
+        none = low, jnp.zeros_like(values[:, :_DIPS])
+        lowest, there = jax.lax.cond(jnp.any(is_dip), turning, lambda _: none, 0)
+        side = look(sides, place)
+        across = is_dip & (jnp.where(there >= 0, 1, -1) != side)
+        pair, some = first_true(across, 1)
+        dip = jnp.where(some, look(place, pair), _LOOKS)[:, 0]
+        lowest, there, side = (look(x, pair)[:, 0] for x in (lowest, there, side))
+        dip_first = dip < change
+        event = jnp.minimum(dip, change)
+        new = busy & (event < reach)
+        here = jnp.where(new, event, 0)[:, None]
+        after = jnp.zeros(n, bool)  # of a pair the second, where the first has the other direction
+        if until.direction:
+            after = jnp.where(side < 0, 1, -1) * forward != until.direction
+        early, late = dip_first & ~after, dip_first & after
+        a, b, fa, fb = (look(x, here + k)[:, 0] for x in (grid, values) for k in (0, 1))
+        fresh = _Bracket(
+            jnp.where(late, lowest, a), jnp.where(early, lowest, b),
+            jnp.where(late, there, fa), jnp.where(early, there, fb),
+            a, [jnp.take_along_axis(x, here[..., None], axis=1)[:, 0] for x in _samples(seen)],
+        )  # fmt: skip
+        found = jax.tree.map(lambda x, y: jnp.where(_as(new, x), x, y), fresh, walk.found)
+        alive = walk.alive & (seen.status == Status.SUCCESSFUL)
+        samples, met = [x[:, reach] for x in _samples(seen)], walk.met | new
+        wider = jnp.where(reach < _LOOKS, width, _GROWTH * width)
+        wider = jnp.minimum(wider, width_by_rate(share[reach], samples, alive & ~met))
+        return _Window(walk.tried + 1, share[reach], wider, samples, met, alive, found)
+
+    def on(walk: _Window):
+        left = (walk.share < 1) & (walk.tried < _MOST)
+        return left & jnp.any(~walk.met & walk.alive)
+
+    samples, zero = [x[:, 0] for x in _samples(lanes)], jnp.zeros(n, dtype)
+    alive = lanes.status == Status.SUCCESSFUL
+    begin = jnp.broadcast_to(first, (n,))
+    nowhere = _Bracket(begin, begin, zero, zero, begin, samples)
+    start = jnp.zeros((), dtype)
+    width = width_by_rate(start, samples, alive)
+    width = width if until.samples is not None else jnp.minimum(width, _FIRST)
+    walk = _Window(
+        jnp.zeros((), jnp.int32), start, width, samples, jnp.zeros(n, bool), alive, nowhere
+    )
+    walk = jax.lax.while_loop(on, one, walk)
+    low, high, at_low, at_high, look, samples = walk.found
+
+    def fn(t):
+        value, _ = until.values(moved_to(lanes if exact else at(look, samples), t))
+        return value, value
+
+    given = (x[:, None] for x in (low, high, at_low, at_high, walk.met))
+    near, _ = bracketed(fn, *given)
+    lost = ~walk.met & walk.alive & (walk.share < 1)
+    return walk.met, lost, near[:, 0], jnp.abs(walk.width * span) / _LOOKS
+
+
+def _held(lanes: Trajectory, ts: Array, until: Event, met: Array, near: Array, step: Array):
+    """Samples, status, steps, times and event times, with the derivatives of the motion."""
+    back = ts[..., -1] < ts[..., 0]
+    sign = jnp.where(back, -1, 1).astype(ts.dtype)
+    end = jnp.where(met, near, ts[..., -1])
+    if ts.ndim == 1:  # as far as the last event of all bodies
+        end = sign * jnp.max(sign * end)
+    far = (sign * end)[..., None] < sign[..., None] * ts
+    moved = moved_through(lanes, jnp.where(far, end[..., None], ts))
+    near = jnp.where(met, near, ts[..., 0])[:, None]
+    there = moved_to(moved, near)
+    value, slope = until.values(there)
+    known = jax.lax.stop_gradient(jnp.where(slope == 0, 1, slope))
+    change = jnp.where(slope == 0, 0, -value / known)
+    # the motion in windows differed from this one by no more than the tolerance allows
+    most = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(near)
+    motion: Any = lanes.motion
+    if not motion.method.exact:
+        most = jnp.maximum(most, 1e-4 * step.reshape(-1, 1))
+    kept = jax.lax.stop_gradient(jnp.clip(change, -most, most))
+    event = near + (change - jax.lax.stop_gradient(change)) + kept
+    late = (event - jax.lax.stop_gradient(near))[..., None]
+    at_event = _shortly_after(there, late)
+    rows = jnp.broadcast_to(ts, (event.shape[0], ts.shape[-1]))
+    past = met[:, None] & (sign.reshape(-1, 1) * (rows - event) >= 0)
+    held = [
+        jnp.where(past[..., None], x, y) for x, y in zip(at_event, _samples(moved), strict=True)
+    ]
+    wxyz, omega, *spins = held
+    status = jnp.where(met, there.status, moved.status)
+    times = jnp.where(past, event, rows)
+    event = jnp.where(met, event[:, 0], jnp.inf)
+    return wxyz, omega, spins[0] if spins else None, status, moved.steps, times, event
+
+
+def _shortly_after(there: Trajectory, late: Array) -> list[Array]:
+    """Samples so little later that a straight line leads there."""
+    wxyz, omega, *spins = _samples(there)
+    acceleration, turned = there._scene.changes(wxyz, omega, there._t)
+    rates = [rotation.wxyz_rate(wxyz, omega), acceleration]
+    rates += [jnp.stack(jnp.broadcast_arrays(*turned), axis=-1)] if turned else []
+    return [x + late * rate for x, rate in zip((wxyz, omega, *spins), rates, strict=True)]
+
+
+def _samples(trajectory: Trajectory) -> list[Array]:
+    found = trajectory.wxyz, trajectory.omega_body, trajectory.spins
+    return [x for x in found if x is not None]
+
+
+def _as(mask: Array, x: Array) -> Array:
+    return mask.reshape(-1, *(1,) * (x.ndim - 1))

@@ -12,7 +12,7 @@ from polhode._batch import map_arrays
 from polhode._checks import as_float_array
 from polhode.hamiltonian import Attitude, components
 from polhode.parts import AbstractPart, shaped
-from polhode.torques._orbit import AbstractOrbit
+from polhode.torques._orbit import AbstractConic, AbstractOrbit
 from polhode.torques._torques import AbstractTorque, vector_of_time
 
 
@@ -60,26 +60,25 @@ class LVLH(AbstractPart):
     def axes(self, t: Array) -> tuple[Float[Array, "*b 3"], ...]:
         """Unit vectors x, y, z of the frame in space, and its rates [rad/s] along them."""
         t = jnp.asarray(t)
+        if isinstance(self.orbit, AbstractConic):
+            r = self.orbit(t)
+            momentum, normal = jnp.broadcast_to(self.orbit.momentum, r.shape), None
+        else:  # what is no conic may leave its plane
 
-        def place(t):
-            if isinstance(self.orbit, AbstractOrbit):
-                return self.orbit(t)
-            return jnp.vectorize(self.orbit, signature="()->(n)")(t)
+            def moving(t):
+                return jax.jvp(place, (t,), (jnp.ones_like(t),))
 
-        def moving(t):
-            return jax.jvp(place, (t,), (jnp.ones_like(t),))
-
-        r, v = moving(t)
-        momentum = jnp.cross(r, v)
+            place = self.orbit
+            if not isinstance(place, AbstractOrbit):
+                place = jnp.vectorize(place, signature="()->(n)")
+            (r, v), (_, force) = jax.jvp(moving, (t,), (jnp.ones_like(t),))
+            momentum = jnp.cross(r, v)
+            normal = jnp.sum(force * momentum, axis=-1, keepdims=True)
         size = jnp.linalg.norm(momentum, axis=-1, keepdims=True)
         distance = jnp.linalg.norm(r, axis=-1, keepdims=True)
         z, y = -r / distance, -momentum / size
         zero = jnp.zeros_like(distance)
-        yawing = zero
-        if not isinstance(self.orbit, AbstractOrbit):  # what is no conic may leave its plane
-            force = jax.jvp(lambda t: moving(t)[1], (t,), (jnp.ones_like(t),))[1]
-            normal = jnp.sum(force * momentum, axis=-1, keepdims=True) / size
-            yawing = -distance * normal / size
+        yawing = zero if normal is None else -distance * normal / size**2
         rates = jnp.concatenate([zero, -size / distance**2, yawing], axis=-1)
         return jnp.cross(y, z), y, z, rates
 

@@ -87,7 +87,16 @@ class AbstractOrbit(AbstractPart):
         return jax.jvp(self, (t,), (jnp.ones_like(t),))[1]
 
 
-class KeplerOrbit(AbstractOrbit):
+class AbstractConic(AbstractOrbit):
+    """Base of the orbits that keep their plane."""
+
+    @property
+    @abc.abstractmethod
+    def momentum(self) -> Float[Array, "*b 3"]:
+        """Angular momentum r x v (..., 3) for a unit of mass, space axes [m^2/s]; constant."""
+
+
+class KeplerOrbit(AbstractConic):
     """Position of a body on a conic about an attracting centre: ``orbit(t)`` (..., 3) [m].
 
     **Arguments** (each (...), a batch broadcasts): ``mu`` [m^3/s^2]; ``semi_major_axis`` [m], of a
@@ -155,6 +164,15 @@ class KeplerOrbit(AbstractOrbit):
         axis = jnp.abs(self.semi_major_axis)
         return jnp.sqrt(self.mu / axis) / axis
 
+    @property
+    def momentum(self) -> Float[Array, "*b 3"]:
+        parameter = self.semi_major_axis * (1 - self.eccentricity) * (1 + self.eccentricity)
+        cn, sn = jnp.cos(self.node), jnp.sin(self.node)
+        ci, si = jnp.cos(self.inclination), jnp.sin(self.inclination)
+        size = jnp.sqrt(self.mu * parameter)
+        pole = jnp.broadcast_arrays(sn * si * size, -cn * si * size, ci * size)
+        return jnp.stack(pole, axis=-1)
+
     def __call__(self, t: Array | float) -> Float[Array, "*b 3"]:
         mean = self.mean_anomaly + self.mean_motion * (t - self.epoch)
         e = self.eccentricity
@@ -175,7 +193,7 @@ class KeplerOrbit(AbstractOrbit):
         return jnp.stack(jnp.broadcast_arrays(*place), axis=-1)
 
 
-class StateOrbit(AbstractOrbit):
+class StateOrbit(AbstractConic):
     """Position on the conic through a given place and velocity: ``orbit(t)`` (..., 3) [m].
 
     **Arguments** (a batch broadcasts): ``mu`` (...) [m^3/s^2]; ``position`` (..., 3) [m] from the
@@ -233,6 +251,10 @@ class StateOrbit(AbstractOrbit):
             )
 
         self.hyperbolic = bool(hyperbolic)
+
+    @property
+    def momentum(self) -> Float[Array, "*b 3"]:
+        return jnp.cross(*jnp.broadcast_arrays(self.position, self.velocity))
 
     def __call__(self, t: Array | float) -> Float[Array, "*b 3"]:
         r0 = jnp.linalg.norm(self.position, axis=-1)

@@ -68,7 +68,8 @@ class Pulses(AbstractTorque):
         if self.on is not None:
             return self.on
         t = jnp.asarray(t, self.starts.dtype)
-        among = (self.starts <= t[..., None]) & (t[..., None] < self.ends)
+        starts, ends = (x.reshape((1,) * t.ndim + x.shape) for x in (self.starts, self.ends))
+        among = (starts <= t[..., None]) & (t[..., None] < ends)
         return jnp.where(jnp.any(among, axis=-1), 1, 0).astype(self.starts.dtype)
 
     def body_components(self, t, attitude, omega):
