@@ -14,7 +14,7 @@ from polhode.fit._filter import Noise, Readings, Score, innovations, score_of
 from polhode.fit._instrument import Instrument, Tolerance
 from polhode.fit._linear import entries_of
 from polhode.fit._matrices import inverse, solve
-from polhode.fit._parameters import base_of, tensor_of
+from polhode.fit._parameters import SCALE, FullTensor, base_of, free_columns, tensor_of
 from polhode.fit._start import regression
 
 # directions of symmetric traceless matrices, orthonormal
@@ -23,7 +23,9 @@ _SKEW[0] = np.diag([1, -1, 0]) / np.sqrt(2)
 _SKEW[1] = np.diag([1, 1, -2]) / np.sqrt(6)
 for _k, (_i, _j) in enumerate(((1, 2), (2, 0), (0, 1))):
     _SKEW[2 + _k, _i, _j] = _SKEW[2 + _k, _j, _i] = np.sqrt(0.5)
-_ALL = np.eye(6)
+# directions of the tensor: all six, or five and the size, which throws without a wheel do not show
+_SIZED = np.eye(6)
+_SIZELESS = np.concatenate([free_columns(FullTensor(), False), SCALE[:, None]], axis=1)
 # Unknowns of a recording: of its body's tensor, drag and noise, of the noise that all share, of the
 # instrument.
 _TENSOR, _DRAG, _LEVEL, _COMMON, _DEVICE = 6, 2, 5, 2, 11
@@ -64,12 +66,22 @@ class Known(eqx.Module):
     tolerance: Tolerance
     noise: Noise
 
+    def tensor(self, shape: Float[Array, " 6"], sigma: Float[Array, "3 3"]) -> Array:
+        """The tensor (3, 3); without a wheel ``shape`` leaves its size alone."""
+        if self.instrument.spin_inertia is not None:
+            return tensor_of(shape, base_of(sigma, True), _SIZED)
+        return tensor_of(shape.at[5].set(0), base_of(sigma, True), _SIZELESS)
+
     def parts(self, unknown: Float[Array, " 26"], body: Array, drag: Array):
         """Tensor, drag, instrument and noise of one recording; ``drag``: its unit, over size."""
         shape, slowed, level, common, device = jnp.split(unknown, _PARTS)
         sigma = self.sigma[body]
-        tensor = tensor_of(shape, base_of(sigma, True), _ALL)
+        tensor = self.tensor(shape, sigma)
         own = [x[body] * jnp.exp(y) for x, y in zip(self.noise[:_LEVEL], level, strict=True)]
+        # torques are as uncertain as the body is large: its size is not read off the scatter, which
+        # would pull it up by some 0.2 of its deviation where the wheel hardly moves the body
+        grown = jnp.trace(tensor) / (2 * jnp.trace(sigma))
+        own[2:] = [x * grown for x in own[2:]]
         shared = [x * jnp.exp(y) for x, y in zip(self.noise[_LEVEL:], common, strict=True)]
         instrument = instrument_of(device, self.instrument, self.tolerance)
         return tensor, slowed * drag * jnp.trace(sigma), instrument, Noise(*own, *shared)
@@ -88,9 +100,10 @@ class Fitted(eqx.Module):
     converged: Array
 
 
-def _expected() -> np.ndarray:
+def _expected(sized: bool) -> np.ndarray:
     """Precisions of the unknowns of a recording, those of the tensor not expected at all."""
-    spread = [np.inf] * _TENSOR + [1.0] * _DRAG + [_WIDE] * _LEVEL + [_NARROW] * _COMMON
+    # a size that nothing depends on stays where it is
+    spread = [np.inf] * (_TENSOR - 1) + [np.inf if sized else 1.0] + [1.0] * _DRAG + [_WIDE] * _LEVEL + [_NARROW] * _COMMON
     return 1 / np.array(spread + [1.0] * _DEVICE) ** 2
 
 
@@ -109,7 +122,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         ],
         axis=1,
     )
-    expected = _expected()
+    expected = _expected(known.instrument.spin_inertia is not None)
     precision = jnp.asarray(
         np.concatenate([np.tile(expected[:own], count), expected[own:used]]), dtype
     )
@@ -176,7 +189,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     noise = Noise(*noise[:_LEVEL], *(x[0] for x in noise[_LEVEL:]))
 
     def entries(shape, sigma):
-        return entries_of(tensor_of(shape, base_of(sigma, True), _ALL), 6)
+        return entries_of(known.tensor(shape, sigma), 6)
 
     slopes = jax.vmap(jax.jacfwd(entries))(every[:, :_TENSOR], known.sigma)
     inner = first[:, :_TENSOR]
@@ -190,7 +203,9 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
 def start_of(data: Readings, instrument: Instrument, count: int) -> tuple[Array, Noise]:
     """Second moments (n, 3, 3) by a regression with a constant momentum, and a noise."""
     rates = jax.vmap(instrument.rates)(data.omega)
-    carried = jax.vmap(instrument.carried)(data.times, data.wheel)
+    carried = None
+    if instrument.spin_inertia is not None:
+        carried = jax.vmap(instrument.carried)(data.times, data.wheel)
     blocks = data.known.shape[1]
     block = (data.times.shape[1] - 1) // blocks
 

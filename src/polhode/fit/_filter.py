@@ -57,7 +57,11 @@ def readings_of(recording: Recording, body: Array, block: int) -> Readings:
     """Prepare recordings (leading axis r) of the bodies with numbers ``body`` (r,)."""
     times = recording.times
     omega = bridged(times, recording.present, recording.omega)
-    sample = recording.present * needed("wheel_known", recording.wheel_known)
+    still = recording.wheel is None
+    wheel = jnp.zeros_like(times) if still else recording.wheel
+    sample = recording.present
+    if not still:
+        sample = sample * needed("wheel_known", recording.wheel_known)
     count = (times.shape[1] - 1) // block
 
     def blocks(values):
@@ -65,9 +69,9 @@ def readings_of(recording: Recording, body: Array, block: int) -> Readings:
         return jnp.mean(cut.reshape(-1, count, block), axis=2)
 
     known = jnp.floor(blocks(sample))
-    fast = jnp.max(jnp.abs(recording.wheel) * sample)
-    stir = (blocks(recording.wheel) / jnp.where(fast > 0, fast, 1)) ** 2
-    return Readings(times, omega, recording.wheel, known, stir, body)
+    fast = jnp.max(jnp.abs(wheel) * sample)
+    stir = (blocks(wheel) / jnp.where(fast > 0, fast, 1)) ** 2
+    return Readings(times, omega, wheel, known, stir, body)
 
 
 class Innovations(NamedTuple):
@@ -128,7 +132,8 @@ def innovations(
     gained = jnp.mean(cut(jnp.einsum("tij,tj->ti", turn, push)), axis=1) * span[:, None]
     omega = noise.omega**2 + (noise.omega_wheel * data.stir) ** 2
     torque = (noise.torque**2 + (noise.torque_wheel * data.stir) ** 2) * span / size**2
-    along = jnp.einsum("ij,j->i", inverse, instrument.axis) * instrument.spin_inertia / size
+    spin = 0.0 if instrument.spin_inertia is None else instrument.spin_inertia
+    along = jnp.einsum("ij,j->i", inverse, instrument.axis) * spin / size
     wheel = noise.wheel**2 * along[:, None] * along[None]
     slow = (noise.slow / size) ** 2
 

@@ -1,4 +1,4 @@
-"""``fit_balance``: inertia in absolute size from throws with a wheel aboard, in real air."""
+"""``fit_balance``: inertia from throws in real air, in absolute size with a wheel aboard."""
 
 from collections.abc import Sequence
 
@@ -23,7 +23,7 @@ class BalanceFit(eqx.Module):
     """Result of ``fit_balance``, bodies on the leading axis n.
 
     **Fields:** ``inertia``: tensors in sensor axes about the centre of mass, the wheel locked,
-    kg m^2; ``moments`` (n, 3), ascending, and ``axes`` (n, 4), ``wxyz`` principal -> sensor axes,
+    kg m^2; without a wheel only their shape shows, and the largest moment is 1; ``moments`` (n, 3), ascending, and ``axes`` (n, 4), ``wxyz`` principal -> sensor axes,
     with standard deviations ``moments_std`` and ``axes_std`` (n, 3), rad, about each principal
     axis;
     ``covariance`` (n, 6, 6) of xx, yy, zz, yz, zx, xy; ``drag`` (n, 2): torque over rate, N m s,
@@ -75,12 +75,13 @@ def fit_balance(
 ) -> BalanceFit:
     """Inertia tensors by the balance of angular momentum: the likeliest, and how sure they are.
 
-    For throws in air with a wheel of measured speed. The gyroscope turns the frame in which
+    For throws in air, with a wheel of measured speed or without one (``Instrument(None)``: then
+    the ratios of the moments show, not their size). The gyroscope turns the frame in which
     ``I omega + h`` is followed; drag, white torques and a torque with memory move it, by as much as
     the data say. The rates read are compared with those expected (``polhode.fit._filter``): their
     noise does not bias the moments, not even of a single short throw that hardly shows them.
 
-    **Arguments:** ``recordings``: with rates and ``wheel_speed``, of free flight only (leave the
+    **Arguments:** ``recordings``: with rates and, for a wheel, ``wheel_speed``, of free flight only (leave the
     hands out); NaN where a reading is not to be believed: the speed of a motor just switched on,
     say, without which the balance does as well. ``instrument``: as the data sheet has it;
     ``tolerance``: how far it may be off, fitted to all recordings together (None: taken as given).
@@ -93,9 +94,13 @@ def fit_balance(
     not converge, unless ``throw=False``.
     """
     given = stack(recordings)
+    wheel = instrument.spin_inertia is not None
+    require(given.omega is not None, "a balance needs omega_body in every recording.")
     require(
-        given.omega is not None and given.wheel is not None,
-        "a balance needs omega_body and wheel_speed in every recording.",
+        (given.wheel is not None) == wheel,
+        "an instrument with a wheel needs wheel_speed in every recording."
+        if wheel
+        else "recordings with wheel_speed need the wheel's spin_inertia in the instrument.",
     )
     numbers = np.zeros(len(recordings), int) if bodies is None else np.asarray(bodies)
     count = int(numbers.max()) + 1
@@ -105,7 +110,9 @@ def fit_balance(
         f"leaving one out, got {numbers.tolist()}.",
     )
     require(is_concrete(given.times), "fit_balance takes arrays, not traced values.")
-    present = np.asarray(given.present * needed("wheel_known", given.wheel_known)) > 0
+    present = np.asarray(given.present) > 0
+    if wheel:
+        present = present & (np.asarray(needed("wheel_known", given.wheel_known)) > 0)
     require(
         present.sum(axis=1) >= 8,
         "each recording needs at least 8 samples with rates and wheel, got "
@@ -142,23 +149,31 @@ def _alone(recording, instrument, noise, tensor, block):
 
 
 def _concluded(found, block) -> BalanceFit:
+    sized = found.instrument.spin_inertia is not None
+
     def one(tensor, covariance):
         moments, axes, _ = principal(tensor)
 
         def derived(entries):
             values, _, products = principal(whole_of(entries, 6))
-            return jnp.concatenate([values, products])
+            every = jnp.concatenate([values, products, entries])
+            return every if sized else every / values[2]
 
         slope = jax.jacfwd(derived)(entries_of(tensor, 6))
-        spread = jnp.sqrt(jnp.maximum(jnp.sum((slope @ covariance) * slope, axis=1), 0))
+        covariance = slope @ covariance @ slope.T
+        spread = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance)[:6], 0))
+        size = jnp.ones_like(moments[2]) if sized else moments[2]
+        tensor, moments = tensor / size, moments / size
         gaps = jnp.stack(
             [moments[2] - moments[1], moments[2] - moments[0], moments[1] - moments[0]]
         )
         turn = jnp.where(gaps > 0, spread[3:] / jnp.where(gaps > 0, gaps, 1), jnp.inf)
-        return moments, axes, spread[:3], turn
+        return tensor, moments, axes, spread[:3], turn, covariance[6:, 6:], size
 
-    moments, axes, spread, turn = jax.vmap(one)(found.tensors, found.covariance)
+    *parts, covariance, size = jax.vmap(one)(found.tensors, found.covariance)
+    noise = Noise(*(x if k in (0, 1, 5, 6) else x / size for k, x in enumerate(found.noise)))
+    tensors, *parts = parts
     return BalanceFit(
-        Inertia(full=found.tensors), moments, axes, spread, turn, found.covariance, found.drag,
-        found.instrument, found.noise, found.rest, found.surprise, found.converged, block,
+        Inertia(full=tensors), *parts, covariance, found.drag / size[:, None],
+        found.instrument, noise, found.rest, found.surprise, found.converged, block,
     )  # fmt: skip
