@@ -36,6 +36,8 @@ _LOST, _WIDE, _NARROW = 0.15, 1.0, 0.7
 # steps at most, and the distance of the tensors from the best, in standard deviations, that ends
 # them
 _STEPS, _NEAR = 120, 0.03
+# how much a step may change logarithms of the noise
+_LOUDER = 1.5
 
 
 def instrument_of(unknown: Float[Array, " 11"], given: Instrument, tolerance: Tolerance):
@@ -96,7 +98,9 @@ class Fitted(eqx.Module):
     noise: Noise
     covariance: Float[Array, "n 6 6"]
     rest: Float[Array, "r b 3"]
+    spread: Float[Array, "r b 3"]
     surprise: Float[Array, ""]
+    steps: Array
     converged: Array
 
 
@@ -130,6 +134,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     soft = np.full(_PARTS[3] + _DEVICE, 1e-3)
     soft[_PARTS[1] : _PARTS[3]] = 1
     held = jnp.asarray(np.concatenate([np.tile(soft[:own], count), soft[own:used]]), dtype)
+    loud = jnp.where(held == 1, 1, 0).astype(dtype)
     span = data.times[0, -1] - data.times[0, 0]
     typical = jnp.sqrt(jnp.mean(jnp.sum(data.omega**2, axis=2)))
     drag = _LOST / span * jnp.stack([jnp.ones_like(typical), 1 / typical])
@@ -150,12 +155,14 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         value = jnp.sum(each.surprise) + jnp.sum(precision * unknown**2) / 2
         slope = (precision * unknown).at[place].add(each.slope)
         shown = jnp.diag(precision).at[place[:, :, None], place[:, None, :]].add(each.information)
-        return Score(value, slope, shown, each.rest)
+        return Score(value, slope, shown, each.rest, each.spread)
 
     def again(carry):
         unknown, score, damping, _, steps = carry
         shown = score.information
         move = -solve(shown + damping * jnp.diag(held * jnp.diagonal(shown)), score.slope)
+        # from a start far off, noise so large that everything is likely would be a step away
+        move = move / jnp.maximum(1, jnp.max(jnp.abs(loud * move)) / _LOUDER)
         tried = scored(unknown + move)
         well = jnp.isfinite(tried.surprise) & (tried.surprise <= score.surprise)
         kept = jax.tree.map(lambda a, b: jnp.where(well, a, b), tried, score)
@@ -175,7 +182,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
 
     begin = jnp.zeros(count * own + used - own, dtype)
     state = (begin, scored(begin), jnp.asarray(1e-3, dtype), jnp.asarray(jnp.inf, dtype), 0)
-    unknown, score, _, distance, _ = jax.lax.while_loop(unsettled, again, state)
+    unknown, score, _, distance, steps = jax.lax.while_loop(unsettled, again, state)
     covariance = inverse(score.information)
     shared = jnp.broadcast_to(unknown[count * own :], (count, used - own))
     rest = jnp.zeros((count, _PARTS[3] + _DEVICE - used), dtype)
@@ -196,8 +203,9 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     blocks = covariance[inner[:, :, None], inner[:, None, :]]
     blocks = slopes @ blocks @ jnp.swapaxes(slopes, 1, 2)
     return Fitted(
-        tensors, slowed, instrument, noise, blocks, score.rest, score.surprise, distance < _NEAR
-    )
+        tensors, slowed, instrument, noise, blocks, score.rest, score.spread, score.surprise, steps,
+        distance < _NEAR,
+    )  # fmt: skip
 
 
 def start_of(data: Readings, instrument: Instrument, count: int) -> tuple[Array, Noise]:

@@ -205,12 +205,14 @@ def surprise(found: Innovations) -> Float[Array, ""]:
 
 
 class Score(NamedTuple):
-    """``surprise``, its slopes by p unknowns, and the information (expected second slopes)."""
+    """``surprise``, its slopes by p unknowns, the information (expected second slopes), and what
+    was read less what was expected, over its standard deviation ``spread``, rad/s."""
 
     surprise: Float[Array, "*r"]
     slope: Float[Array, "*r p"]
     information: Float[Array, "*r p p"]
     rest: Float[Array, "*r b 3"]
+    spread: Float[Array, "*r b 3"]
 
 
 def score_of(found: Innovations, by: Innovations) -> Score:
@@ -223,5 +225,5 @@ def score_of(found: Innovations, by: Innovations) -> Score:
     slope = slope + jnp.einsum("biip->p", relative) / 2
     shown = jnp.einsum("bip,bij,bjq->pq", by.rest, inverse, by.rest)
     shown = shown + jnp.einsum("bikp,bkiq->pq", relative, relative) / 2
-    rest = found.rest / jnp.sqrt(jnp.diagonal(found.covariance, axis1=1, axis2=2))
-    return Score(surprise(found), slope, shown, rest)
+    spread = jnp.sqrt(jnp.diagonal(found.covariance, axis1=1, axis2=2))
+    return Score(surprise(found), slope, shown, found.rest / spread, spread)

@@ -12,10 +12,10 @@ from polhode._checks import is_concrete, require
 from polhode.fit._balance import Known, solve_balance, start_of
 from polhode.fit._compiled import compiled
 from polhode.fit._filter import Noise, readings_of
-from polhode.fit._fit import FitError
 from polhode.fit._instrument import Instrument, Tolerance
 from polhode.fit._linear import entries_of, whole_of
 from polhode.fit._recording import Recording, needed, stack
+from polhode.fit._result import FitError
 from polhode.inertia import Inertia, principal
 
 
@@ -28,8 +28,9 @@ class BalanceFit(eqx.Module):
     axis;
     ``covariance`` (n, 6, 6) of xx, yy, zz, yz, zx, xy; ``drag`` (n, 2): torque over rate, N m s,
     and over rate times speed, N m s^2; ``instrument`` as it was found; ``noise`` found;
-    ``residuals`` (r, b, 3), of the rates expected from the readings before, over their noise;
-    ``surprise``: minus the logarithm of the likelihood, but for a constant; ``converged``.
+    ``residuals`` (r, b, 3), of the rates expected from the readings before, over their standard
+    deviations ``residuals_std``, rad/s; ``surprise``: minus the logarithm of the likelihood, but
+    for a constant; ``steps`` made; ``converged``.
     """
 
     inertia: Inertia
@@ -42,7 +43,9 @@ class BalanceFit(eqx.Module):
     instrument: Instrument
     noise: Noise
     residuals: Float[Array, "r b 3"]
+    residuals_std: Float[Array, "r b 3"]
     surprise: Float[Array, " *n"]
+    steps: Array
     converged: Array
     block: int = eqx.field(static=True)
 
@@ -175,5 +178,6 @@ def _concluded(found, block) -> BalanceFit:
     tensors, *parts = parts
     return BalanceFit(
         Inertia(full=tensors), *parts, covariance, found.drag / size[:, None],
-        found.instrument, noise, found.rest, found.surprise, found.converged, block,
+        found.instrument, noise, found.rest, found.spread, found.surprise, found.steps,
+        found.converged, block,
     )  # fmt: skip
