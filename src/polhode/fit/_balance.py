@@ -34,7 +34,7 @@ _PARTS = np.cumsum([_TENSOR, _DRAG, _LEVEL, _COMMON])
 # of its memory and of the wheel's noise
 _LOST, _WIDE, _NARROW = 0.15, 1.0, 0.7
 # steps at most, and the distance of the tensors from the best, in standard deviations, that ends
-# them
+# them (of all else: four times that)
 _STEPS, _NEAR = 120, 0.03
 # how much a step may change logarithms of the noise
 _LOUDER = 1.5
@@ -171,10 +171,10 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         return unknown, kept, damping, far(kept), steps + 1
 
     def far(score):
-        """How far the bodies still are from the likeliest ones, in standard deviations."""
+        """How far from the likeliest all is, in standard deviations; bodies count in full."""
         covariance = inverse(score.information)
         left = (covariance @ score.slope) / jnp.sqrt(jnp.diagonal(covariance))
-        return jnp.max(jnp.abs(left[first[:, :_TENSOR]]))
+        return jnp.maximum(jnp.max(jnp.abs(left[first[:, :_TENSOR]])), jnp.max(jnp.abs(left)) / 4)
 
     def unsettled(carry):
         *_, distance, steps = carry
