@@ -6,9 +6,9 @@ Every trial is fitted alone, all in one call, and those of a round (one mounting
 together; those of the third, the largest, also without the fast ones (more than 15 rad/s, where the
 drag of the air shows), these alone, and with a drag that is fitted. The likelihood of the readings
 (``fit_balance``, without a wheel) takes slow and fast ones of the third, as recorded and with 0.1 s
-cut off both ends, where hands may still touch; beside it the fit with a drag of the same cuts. Published: 0.067(13) : 0.909(320) : 1 by
-pendulum, 0.0660 : 0.9348 : 1 from 63 trials together at 0.32 rad/s rms, periods off by 16.9 %; of
-unconstrained single fits 54 of 117 fail.
+cut off both ends, where hands may still touch; beside it the fit with a drag of the same cuts.
+Published: 0.067(13) : 0.909(320) : 1 by pendulum, 0.0660 : 0.9348 : 1 from 63 trials together at
+0.32 rad/s rms, periods off by 16.9 %; of unconstrained single fits 54 of 117 fail.
 
 The flip period is the mean time between changes of sign of the rate about the middle axis, of the
 fitted motion and of the data.

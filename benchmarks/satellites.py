@@ -12,7 +12,7 @@ the first estimate gives (they hold no noise of the readings); ``fit_inertia`` w
 instrument. Printed: mean over runs of |tensor - true| / |true| (Frobenius), in per cent, and of the
 last the rms of errors of the moments over the standard deviations stated.
 
-    python -m benchmarks.satellites [--runs 40]
+    python -m benchmarks.satellites [--runs 20]
 """
 
 import argparse
@@ -166,7 +166,7 @@ def study(name, push, runs):
 def main() -> int:
     """Run, print and write."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
-    parser.add_argument("--runs", type=int, default=40)
+    parser.add_argument("--runs", type=int, default=20)
     parser.add_argument("--output", default=None)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)

@@ -23,9 +23,9 @@ class BalanceFit(eqx.Module):
     """Result of ``fit_balance``, bodies on the leading axis n.
 
     **Fields:** ``inertia``: tensors in sensor axes about the centre of mass, the wheel locked,
-    kg m^2; without a wheel only their shape shows, and the largest moment is 1; ``moments`` (n, 3), ascending, and ``axes`` (n, 4), ``wxyz`` principal -> sensor axes,
-    with standard deviations ``moments_std`` and ``axes_std`` (n, 3), rad, about each principal
-    axis;
+    kg m^2; without a wheel only their shape shows, and the largest moment is 1; ``moments``
+    (n, 3), ascending, and ``axes`` (n, 4), ``wxyz`` principal -> sensor axes, with standard
+    deviations ``moments_std`` and ``axes_std`` (n, 3), rad, about each principal axis;
     ``covariance`` (n, 6, 6) of xx, yy, zz, yz, zx, xy; ``drag`` (n, 2): torque over rate, N m s,
     and over rate times speed, N m s^2; ``instrument`` as it was found; ``noise`` found;
     ``residuals`` (r, b, 3), of the rates expected from the readings before, over their standard
@@ -84,8 +84,8 @@ def fit_balance(
     the data say. The rates read are compared with those expected (``polhode.fit._filter``): their
     noise does not bias the moments, not even of a single short throw that hardly shows them.
 
-    **Arguments:** ``recordings``: with rates and, for a wheel, ``wheel_speed``, of free flight only (leave the
-    hands out); NaN where a reading is not to be believed: the speed of a motor just switched on,
+    **Arguments:** ``recordings``: with rates and, for a wheel, ``wheel_speed``, of free flight only
+    (leave the hands out); NaN where a reading is not to be believed: the speed of a motor just switched on,
     say, without which the balance does as well. ``instrument``: as the data sheet has it;
     ``tolerance``: how far it may be off, fitted to all recordings together (None: taken as given).
     ``bodies``: number of the body that each recording shows, from 0 on (None: one body).
@@ -93,7 +93,7 @@ def fit_balance(
     faster than the motion are best ``averaged`` first.
 
     Noise, drag and instrument are found together with the tensors. Every tensor is physical. Raises
-    ValueError for recordings without rates or wheel, and FitError when a fit is not finite or did
+    ValueError for recordings without rates or the wheel's speed, and FitError when a fit is not finite or did
     not converge, unless ``throw=False``.
     """
     given = stack(recordings)

@@ -1,4 +1,4 @@
-"""What ``fit_inertia`` does where a wheel is aboard: the likelihood of the readings, body by body."""
+"""``fit_inertia`` where a wheel is aboard: the likelihood of the readings, body by body."""
 
 import jax
 import jax.numpy as jnp
