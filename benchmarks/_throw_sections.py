@@ -61,7 +61,7 @@ def satellites(report: dict) -> list[str]:
         for row in report["numbers"]["rows"]
     ]  # fmt: skip
     header = ["", "runs", *(kind.replace("_", " ") + " [%]" for kind in kinds),
-              "rms error of the moments over the one stated", "95 % intervals hold [%]"]  # fmt: skip
+              "rms error of the moments over the one stated", "95 % hold [%]"]  # fmt: skip
     return [
         "## Satellites with a wheel", "", machine(report), "",
         "Mean relative error of the tensor from 60 s of rates at 10 Hz with noise of 1e-4 rad/s;"

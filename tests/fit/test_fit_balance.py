@@ -19,7 +19,6 @@ from polhode.fit import (
     averaged,
     fit_balance,
     fit_inertia,
-    fit_recordings,
     lever_arm,
     stack,
 )
@@ -157,7 +156,7 @@ def test_throws_without_a_wheel_show_ratios():
     tensor = TENSORS[0] / np.linalg.eigvalsh(TENSORS[0])[2]
     rng = np.random.default_rng(2)
     given = []
-    for _ in range(4):
+    for _ in range(3):
         begin = rng.normal(size=3)
         begin *= 10 / np.linalg.norm(begin)
         moved = flight(
@@ -172,11 +171,6 @@ def test_throws_without_a_wheel_show_ratios():
     assert np.abs(off).max() < 4
     assert np.max(fit.moments_std) < 2e-3
     np.testing.assert_allclose(fit.noise.omega, 0.01, rtol=0.15)
-    # the fit of a motion that drag alone slows, here all there is, agrees
-    other = fit_recordings(
-        given, motion=SteppedMotion(drag=Drag(), fit_drag=True, steps=2), starts=1
-    )
-    np.testing.assert_allclose(fit.moments[0], other.ratios, atol=4e-3)
 
 
 @pytest.mark.slow

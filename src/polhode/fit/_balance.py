@@ -107,14 +107,9 @@ class Fitted(eqx.Module):
 def _expected(sized: bool) -> np.ndarray:
     """Precisions of the unknowns of a recording, those of the tensor not expected at all."""
     # a size that nothing depends on stays where it is
-    spread = (
-        [np.inf] * (_TENSOR - 1)
-        + [np.inf if sized else 1.0]
-        + [1.0] * _DRAG
-        + [_WIDE] * _LEVEL
-        + [_NARROW] * _COMMON
-    )
-    return 1 / np.array(spread + [1.0] * _DEVICE) ** 2
+    shape = [np.inf] * (_TENSOR - 1) + [np.inf if sized else 1.0]
+    noise = [_WIDE] * _LEVEL + [_NARROW] * _COMMON
+    return 1 / np.array(shape + [1.0] * _DRAG + noise + [1.0] * _DEVICE) ** 2
 
 
 def solve_balance(data: Readings, known: Known, free: str) -> Fitted:

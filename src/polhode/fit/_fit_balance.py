@@ -85,16 +85,16 @@ def fit_balance(
     noise does not bias the moments, not even of a single short throw that hardly shows them.
 
     **Arguments:** ``recordings``: with rates and, for a wheel, ``wheel_speed``, of free flight only
-    (leave the hands out); NaN where a reading is not to be believed: the speed of a motor just switched on,
-    say, without which the balance does as well. ``instrument``: as the data sheet has it;
-    ``tolerance``: how far it may be off, fitted to all recordings together (None: taken as given).
+    (leave the hands out); NaN where a reading is not to be believed: the speed of a motor just
+    switched on, say, without which the balance does as well. ``instrument``: as the data sheet has
+    it; ``tolerance``: how far it may be off, fitted to all recordings together (None: as given).
     ``bodies``: number of the body that each recording shows, from 0 on (None: one body).
     ``block``: how many samples give one residual: so many that their noise is white. Readings much
     faster than the motion are best ``averaged`` first.
 
     Noise, drag and instrument are found together with the tensors. Every tensor is physical. Raises
-    ValueError for recordings without rates or the wheel's speed, and FitError when a fit is not finite or did
-    not converge, unless ``throw=False``.
+    ValueError for recordings without rates or the wheel's speed, and FitError when a fit is not
+    finite or did not converge, unless ``throw=False``.
     """
     given = stack(recordings)
     wheel = instrument.spin_inertia is not None

@@ -19,10 +19,10 @@ class Instrument(eqx.Module):
     """How readings mean rates and momentum: ``omega = (1 + skew) (reading - bias)``.
 
     **Fields:** ``spin_inertia``, kg m^2, of the wheel (None: there is none); ``axis`` (3,) unit
-    vector of its axis in sensor axes; ``delay``, s: to a gyroscope's reading belongs the speed of ``delay`` before;
-    ``skew`` (3, 3): symmetric, traceless departure of the gyroscope's sensitivity from one (a
-    common factor is that of ``spin_inertia``, an antisymmetric part a turn of the axes); ``bias``
-    (3,), rad/s.
+    vector of its axis in sensor axes; ``delay``, s: to a gyroscope's reading belongs the speed of
+    ``delay`` before; ``skew`` (3, 3): symmetric, traceless departure of the gyroscope's sensitivity
+    from one (a common factor is that of ``spin_inertia``, an antisymmetric part a turn of the
+    axes); ``bias`` (3,), rad/s.
     """
 
     spin_inertia: Array | float | None
