@@ -83,10 +83,14 @@ class Known(eqx.Module):
         # torques are as uncertain as the body is large: its size is not read off the scatter, which
         # would pull it up by some 0.2 of its deviation where the wheel hardly moves the body
         grown = jnp.trace(tensor) / (2 * jnp.trace(sigma))
-        own[2:] = [x * grown for x in own[2:]]
         shared = [x * jnp.exp(y) for x, y in zip(self.noise[_LEVEL:], common, strict=True)]
         instrument = instrument_of(device, self.instrument, self.tolerance)
-        return tensor, slowed * drag * jnp.trace(sigma), instrument, Noise(*own, *shared)
+        return (
+            tensor,
+            slowed * drag * jnp.trace(sigma),
+            instrument,
+            Noise(*own, *shared).grown(grown),
+        )
 
 
 class Fitted(eqx.Module):

@@ -54,8 +54,7 @@ def throw_information(
         drag = _LOST * size * jnp.stack([unknown[6], unknown[7] / typical])
         body = whole_of(unknown[:6], 6)
         # as in the fit: torques are as uncertain as the body is large
-        torques = (x * jnp.trace(body) / 2 for x in noise[2:5])
-        shaken = Noise(*noise[:2], *torques, *noise[5:])
+        shaken = noise.grown(jnp.trace(body) / 2)
         got = innovations(data, size * body, drag, instrument, shaken)
         return got, got
 

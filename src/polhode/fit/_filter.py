@@ -37,6 +37,11 @@ class Noise(NamedTuple):
     memory: Float[Array, ""]
     wheel: Float[Array, ""]
 
+    def grown(self, factor: Array) -> "Noise":
+        """That of a body ``factor`` times as large: torques grow with it."""
+        torque, wheel, slow = (x * factor for x in (self.torque, self.torque_wheel, self.slow))
+        return self._replace(torque=torque, torque_wheel=wheel, slow=slow)
+
 
 class Readings(NamedTuple):
     """Recordings (leading axis r) cut into blocks, each of which gives one residual.

@@ -173,11 +173,11 @@ def _concluded(found, block) -> BalanceFit:
         turn = jnp.where(gaps > 0, spread[3:] / jnp.where(gaps > 0, gaps, 1), jnp.inf)
         return tensor, moments, axes, spread[:3], turn, covariance[6:, 6:], size
 
-    *parts, covariance, size = jax.vmap(one)(found.tensors, found.covariance)
-    noise = Noise(*(x if k in (0, 1, 5, 6) else x / size for k, x in enumerate(found.noise)))
-    tensors, *parts = parts
+    tensors, moments, axes, spread, turn, covariance, size = jax.vmap(one)(
+        found.tensors, found.covariance
+    )
     return BalanceFit(
-        Inertia(full=tensors), *parts, covariance, found.drag / size[:, None],
-        found.instrument, noise, found.rest, found.spread, found.surprise, found.steps,
-        found.converged, block,
+        Inertia(full=tensors), moments, axes, spread, turn, covariance, found.drag / size[:, None],
+        found.instrument, found.noise.grown(1 / size), found.rest, found.spread, found.surprise,
+        found.steps, found.converged, block,
     )  # fmt: skip
