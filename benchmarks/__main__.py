@@ -74,7 +74,9 @@ def main() -> int:
             for name, families in (("work_precision", _figures.MAIN), ("work_precision_all", ())):
                 drawn = _figures.work_precision(merged, families)
                 _figures.save(drawn, _report.RESULTS / f"{name}.svg")
-        others = [_report.RESULTS / f"{name}.json" for name in ("scaling", "gradients")]
+        others = [
+            _report.RESULTS / f"{name}.json" for name in ("scaling", "gradients", "throw_design")
+        ]
         _figures.draw([path for path in others if path.exists()], _report.RESULTS)
         for path in _page.write():
             print(path.relative_to(_page.ROOT))

@@ -199,9 +199,34 @@ def identification(report: dict):
     return figure
 
 
+def throw_design(report: dict):
+    """What a throw tells of the tensor, by direction of its spin and by program of the wheel."""
+    import matplotlib.pyplot as plt
+
+    from polhode.plot._matplotlib import STYLE
+
+    numbers = report["numbers"]
+    with plt.rc_context(STYLE):
+        figure = plt.figure(figsize=(10.0, 3.4), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        for ax, rows, columns, values, labels in (
+            (left, "tilt_deg", "turn_deg", "spread_of_spins",
+             ("spin about the wheel's axis, turned by [deg]", "tilted by [deg]")),
+            (right, "begin_s", "length_s", "spread_of_programs",
+             ("wheel is on for [s]", "switched on after [s]")),
+        ):  # fmt: skip
+            table = [[100 * value for value in row] for row in numbers[values]]
+            drawn = ax.contourf(numbers[columns], numbers[rows], table, levels=12, cmap="viridis_r")
+            figure.colorbar(drawn, ax=ax, label="spread of the tensor [%]")
+            ax.set_xlabel(labels[0])
+            ax.set_ylabel(labels[1])
+            ax.grid(visible=False)
+    return figure
+
+
 DRAWN = {
     "work_precision": work_precision, "scaling": scaling, "gradients": gradients,
-    "identification": identification,
+    "identification": identification, "throw_design": throw_design,
 }  # fmt: skip
 
 

@@ -116,11 +116,15 @@ def write(
     return path
 
 
-def recordings(about: str, usual: Path) -> argparse.Namespace:
+def recordings(
+    about: str, usual: Path, switches: dict[str, str] | None = None
+) -> argparse.Namespace:
     """Options of a benchmark on recordings that are no part of the project; ends where absent."""
     parser = argparse.ArgumentParser(description=about)
     parser.add_argument("--data", type=Path, default=usual)
     parser.add_argument("--output", type=Path)
+    for name, meaning in (switches or {}).items():
+        parser.add_argument(f"--{name}", action="store_true", help=meaning)
     options = parser.parse_args()
     if not options.data.exists():
         parser.exit(2, f"no recordings in {options.data}; give their folder by --data\n")

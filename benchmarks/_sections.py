@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 from benchmarks._markdown import machine, number, rows
+from benchmarks._throw_sections import satellites, throw_design, throws, throws_synthetic
 
 
 def gradients(report: dict) -> list[str]:
@@ -144,25 +145,6 @@ def identification(report: dict) -> list[str]:
         f" ({number(speed['batch_s'])} s; compile {number(speed['batch_compile_and_trace_s'])} s)."
         " Derivatives of the residuals against 50 digits: relative error"
         f" {number(speed['residual_gradient_error'])}.", "",
-    ]  # fmt: skip
-
-
-def throws(report: dict) -> list[str]:
-    kinds = {"every_throw_alone": "alone", "throws_of_a_configuration_together": "together"}
-    lines = []
-    for kind, how in kinds.items():
-        for name, row in report["numbers"][kind].items():
-            moments = [sum(column) / len(row["moments"]) for column in zip(*row["moments"])]
-            lines.append([
-                f"{name}, {how}", *(number(m, 1e-6) for m in moments),
-                number(row.get("moments_error_percent")), number(row.get("axes_error_deg")),
-            ])  # fmt: skip
-    header = ["", "least moment [1e-6 kg m²]", "middle", "largest", "error [%]", "axes [deg]"]
-    return [
-        "## Throws with a flywheel", "", machine(report), "",
-        "Real recordings (TU Delft, arXiv:2503.13137; not part of the project); every throw alone,"
-        " the instrument known from all, or those of a configuration together. Errors where the"
-        " reference is known, means over throws.", "", *rows(header, lines),
     ]  # fmt: skip
 
 
@@ -394,7 +376,9 @@ def first_calls(report: dict) -> list[str]:
 SECTIONS = {
     "plain_calls": plain_calls, "first_calls": first_calls,
     "gradients": gradients, "scene_cost": scene_cost, "scaling": scaling,
-    "identification": identification, "throws": throws, "racquet": racquet,
+    "identification": identification, "throws": throws,
+    "throws_synthetic": throws_synthetic, "throw_design": throw_design, "satellites": satellites,
+    "racquet": racquet,
     "stress": stress,
     "free_body": free_body, "elliptic_accuracy": elliptic_accuracy,
     "rotation_stress": rotation_stress, "torqued": torqued,

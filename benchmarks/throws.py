@@ -15,7 +15,9 @@ reference value of an object:
 Writes tensors of every throw and of every configuration, and their errors where a reference is in
 the data: |moments - reference| / |reference|, and the smallest turn between principal axes.
 
-    python -m benchmarks.throws [--data FOLDER] [--output out/benchmarks/throws.json]
+    python -m benchmarks.throws [--varied] [--data FOLDER] [--output out/benchmarks/throws.json]
+
+``--varied``: the joint fit again under other choices of the recipe as well (some minutes more).
 """
 
 import json
@@ -91,20 +93,29 @@ def together(found, block=BLOCK):
     return everything, bodies, fit
 
 
-def varied(folder, which=tuple(VARIED)):
-    """Moments of the joint fit under other choices: shifts over the standard deviation."""
-    table = {}
-    for name in which:
-        how = dict(VARIED[name])
+def varied(folder):
+    """Shifts of the joint fit's moments under other choices, over their standard deviation."""
+    table, usual = {}, None
+    for name, choice in VARIED.items():
+        how = dict(choice)
         block = how.pop("block", BLOCK)
         _, found = load(folder, **how)
         _, _, fit = together(found, block)
         moments, spread = np.asarray(fit.moments), np.asarray(fit.moments_std)
+        if usual is None:
+            usual = moments, spread
+            continue
+        shift = (moments - usual[0]) / usual[1]
         table[name] = {
-            "moments": dict(zip(found, moments.tolist(), strict=True)),
-            "std": dict(zip(found, spread.tolist(), strict=True)),
+            "shift_over_std": dict(zip(found, shift.tolist(), strict=True)),
+            "largest": float(np.abs(shift).max()),
+            "largest_percent": 100 * float(np.abs(moments / usual[0] - 1).max()),
+            "beyond_half": int((np.abs(shift) > 0.5).sum()),
         }
-        print(name, json.dumps(table[name]), flush=True)
+        print(
+            name,
+            {kind: table[name][kind] for kind in ("largest", "largest_percent", "beyond_half")},
+        )
     return table
 
 
@@ -220,9 +231,11 @@ def run(folder, configurations=None):
 
 def main() -> int:
     """Run, print and write."""
-    options = recordings(__doc__, DATA)
+    options = recordings(__doc__, DATA, {"varied": "other choices of the recipe as well"})
     jax.config.update("jax_enable_x64", True)
     numbers = run(options.data)
+    if options.varied:
+        numbers["varied"] = varied(options.data)
     for name, row in numbers["single_throws_and_joint_fit"].items():
         print(name, {kind: np.round(value, 2).tolist() for kind, value in row.items()})
     for kind in ("every_throw_alone", "throws_of_a_configuration_together"):

@@ -182,6 +182,11 @@ _FORMULA = re.compile(
 )
 
 
+def on_page_markdown(markdown: str, **_) -> str:
+    """Figures of benchmarks stand beside the page of results."""
+    return markdown.replace("](../benchmarks/results/", "](results/")
+
+
 def on_page_content(content: str, page, config, **_) -> str:
     """Formulas as MathML; pages that docstrings name as links."""
 

@@ -11,11 +11,14 @@ from scipy.integrate import solve_ivp
 
 from benchmarks import throws as recipe, throws_synthetic as study
 from polhode.fit import (
+    Drag,
     Instrument,
     Recording,
+    SteppedMotion,
     Tolerance,
     averaged,
     fit_balance,
+    fit_inertia,
     lever_arm,
     stack,
 )
@@ -123,6 +126,53 @@ def test_throws_in_air_show_the_tensor_and_the_instrument(throws):
     assert worse > 1.5 * np.abs(np.asarray(alone.moments) - true[1]).mean()
 
 
+def test_a_wheel_in_fit_inertia_is_the_likelihood_of_the_readings():
+    """Throws in moving air: the motion that takes the wheel at its word is far off."""
+    tensor = 10 * study.DEVICE
+    given = stack(study.throws(3, tensor, 2))
+    wheel = np.where(np.asarray(given.wheel_known) > 0, given.wheel, np.nan)
+    fit = fit_inertia(
+        given.times, given.omega, wheel_speed=wheel, instrument=Instrument(SPIN), block=4
+    )
+    true = np.linalg.eigvalsh(tensor)
+    assert fit.scale_known
+    assert fit.moments.shape == (2, 3)
+    assert fit.findings() == fit.findings(1) == []
+    np.testing.assert_allclose(fit.moments, np.broadcast_to(true, (2, 3)), rtol=0.03)
+    assert np.max(np.asarray(fit.moments_std) / true) < 0.01
+    np.testing.assert_allclose(fit.ratios, true / true[2] * np.ones((2, 1)), atol=0.02)
+    # a deviation of the ratio is at least the part of it that the moments do not share
+    assert np.all(np.asarray(fit.ratios_std)[:, 2] == 0)
+    assert np.all(np.asarray(fit.ratios_std)[:, :2] < np.asarray(fit.moments_std)[:, :2] / true[0])
+    np.testing.assert_allclose(fit.noise, 1, atol=0.4)
+    one = fit_balance([jax.tree.map(lambda x: x[1], given)], Instrument(SPIN), block=4)
+    np.testing.assert_allclose(fit.moments[1], one.moments[0], rtol=1e-9)
+    assert "kg m^2" in fit.report()
+
+
+def test_throws_without_a_wheel_show_ratios():
+    times = np.arange(0, 1, 0.01)
+    flight = SteppedMotion(drag=Drag(0.05, 0.005), steps=8)
+    tensor = TENSORS[0] / np.linalg.eigvalsh(TENSORS[0])[2]
+    rng = np.random.default_rng(2)
+    given = []
+    for _ in range(3):
+        begin = rng.normal(size=3)
+        begin *= 10 / np.linalg.norm(begin)
+        moved = flight(
+            jnp.asarray(tensor), jnp.asarray(begin), None, jnp.asarray(times), None,
+            {"drag": None, "delay": None},
+        )  # fmt: skip
+        given.append(Recording.of(times, moved.omega + 0.01 * rng.normal(size=(100, 3))))
+    fit = fit_balance(given, Instrument(None))
+    true = np.linalg.eigvalsh(tensor)
+    assert float(fit.moments[0, 2]) == pytest.approx(1, abs=1e-12)
+    off = (np.asarray(fit.moments[0]) - true)[:2] / np.asarray(fit.moments_std[0])[:2]
+    assert np.abs(off).max() < 4
+    assert np.max(fit.moments_std) < 2e-3
+    np.testing.assert_allclose(fit.noise.omega, 0.01, rtol=0.15)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1.0, 30.0])
 def test_single_throws_are_unbiased_and_their_errors_are_the_bound(size):
@@ -163,8 +213,25 @@ def test_what_a_balance_cannot_use_is_refused():
     times = np.linspace(0, 1, 20)
     rates = np.sin(np.outer(times, [3.0, 4, 5]))
     bare = Recording.of(times, rates)
-    with pytest.raises(ValueError, match="omega_body and wheel_speed"):
+    with pytest.raises(ValueError, match="needs wheel_speed in every recording"):
         fit_balance([bare], Instrument(SPIN))
+    with pytest.raises(ValueError, match="need the wheel's spin_inertia"):
+        fit_balance([Recording.of(times, rates, wheel_speed=times)], Instrument(None))
+    with pytest.raises(
+        ValueError, match=r"wheel_speed needs instrument=Instrument\(spin_inertia\)"
+    ):
+        fit_inertia(times, rates, wheel_speed=times)
+    with pytest.raises(ValueError, match="needs the wheel's speed"):
+        fit_inertia(times, rates, instrument=Instrument(SPIN))
+    with pytest.raises(ValueError, match="got also force_body, bias"):
+        fit_inertia(
+            times,
+            rates,
+            wheel_speed=times,
+            instrument=Instrument(SPIN),
+            force_body=rates,
+            bias=True,
+        )
     whole = Recording.of(times, rates, wheel_speed=times)
     with pytest.raises(ValueError, match=r"number the body of each of 2 recordings.*\[0, 2\]"):
         fit_balance([whole] * 2, Instrument(SPIN), bodies=[0, 2])

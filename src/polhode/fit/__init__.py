@@ -7,7 +7,6 @@ from polhode.fit._csv import load_recording as load_recording, read_recording as
 from polhode.fit._design import throw_information as throw_information
 from polhode.fit._filter import Noise as Noise
 from polhode.fit._fit import (
-    FitError as FitError,
     fit_inertia as fit_inertia,
     fit_recordings as fit_recordings,
     windows as windows,
@@ -42,6 +41,7 @@ from polhode.fit._residuals import (
 )
 from polhode.fit._result import (
     Finding as Finding,
+    FitError as FitError,
     InertiaFit as InertiaFit,
     is_unusable as is_unusable,
     remarks as remarks,

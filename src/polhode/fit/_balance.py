@@ -14,7 +14,7 @@ from polhode.fit._filter import Noise, Readings, Score, innovations, score_of
 from polhode.fit._instrument import Instrument, Tolerance
 from polhode.fit._linear import entries_of
 from polhode.fit._matrices import inverse, solve
-from polhode.fit._parameters import base_of, tensor_of
+from polhode.fit._parameters import SCALE, FullTensor, base_of, free_columns, tensor_of
 from polhode.fit._start import regression
 
 # directions of symmetric traceless matrices, orthonormal
@@ -23,7 +23,9 @@ _SKEW[0] = np.diag([1, -1, 0]) / np.sqrt(2)
 _SKEW[1] = np.diag([1, 1, -2]) / np.sqrt(6)
 for _k, (_i, _j) in enumerate(((1, 2), (2, 0), (0, 1))):
     _SKEW[2 + _k, _i, _j] = _SKEW[2 + _k, _j, _i] = np.sqrt(0.5)
-_ALL = np.eye(6)
+# directions of the tensor: all six, or five and the size, which throws without a wheel do not show
+_SIZED = np.eye(6)
+_SIZELESS = np.concatenate([free_columns(FullTensor(), False), SCALE[:, None]], axis=1)
 # Unknowns of a recording: of its body's tensor, drag and noise, of the noise that all share, of the
 # instrument.
 _TENSOR, _DRAG, _LEVEL, _COMMON, _DEVICE = 6, 2, 5, 2, 11
@@ -32,8 +34,10 @@ _PARTS = np.cumsum([_TENSOR, _DRAG, _LEVEL, _COMMON])
 # of its memory and of the wheel's noise
 _LOST, _WIDE, _NARROW = 0.15, 1.0, 0.7
 # steps at most, and the distance of the tensors from the best, in standard deviations, that ends
-# them
+# them (of all else: four times that)
 _STEPS, _NEAR = 120, 0.03
+# how much a step may change logarithms of the noise
+_LOUDER = 1.5
 
 
 def instrument_of(unknown: Float[Array, " 11"], given: Instrument, tolerance: Tolerance):
@@ -64,15 +68,29 @@ class Known(eqx.Module):
     tolerance: Tolerance
     noise: Noise
 
+    def tensor(self, shape: Float[Array, " 6"], sigma: Float[Array, "3 3"]) -> Array:
+        """The tensor (3, 3); without a wheel ``shape`` leaves its size alone."""
+        if self.instrument.spin_inertia is not None:
+            return tensor_of(shape, base_of(sigma, True), _SIZED)
+        return tensor_of(shape.at[5].set(0), base_of(sigma, True), _SIZELESS)
+
     def parts(self, unknown: Float[Array, " 26"], body: Array, drag: Array):
         """Tensor, drag, instrument and noise of one recording; ``drag``: its unit, over size."""
         shape, slowed, level, common, device = jnp.split(unknown, _PARTS)
         sigma = self.sigma[body]
-        tensor = tensor_of(shape, base_of(sigma, True), _ALL)
+        tensor = self.tensor(shape, sigma)
         own = [x[body] * jnp.exp(y) for x, y in zip(self.noise[:_LEVEL], level, strict=True)]
+        # torques are as uncertain as the body is large: its size is not read off the scatter, which
+        # would pull it up by some 0.2 of its deviation where the wheel hardly moves the body
+        grown = jnp.trace(tensor) / (2 * jnp.trace(sigma))
         shared = [x * jnp.exp(y) for x, y in zip(self.noise[_LEVEL:], common, strict=True)]
         instrument = instrument_of(device, self.instrument, self.tolerance)
-        return tensor, slowed * drag * jnp.trace(sigma), instrument, Noise(*own, *shared)
+        return (
+            tensor,
+            slowed * drag * jnp.trace(sigma),
+            instrument,
+            Noise(*own, *shared).grown(grown),
+        )
 
 
 class Fitted(eqx.Module):
@@ -84,14 +102,18 @@ class Fitted(eqx.Module):
     noise: Noise
     covariance: Float[Array, "n 6 6"]
     rest: Float[Array, "r b 3"]
+    spread: Float[Array, "r b 3"]
     surprise: Float[Array, ""]
+    steps: Array
     converged: Array
 
 
-def _expected() -> np.ndarray:
+def _expected(sized: bool) -> np.ndarray:
     """Precisions of the unknowns of a recording, those of the tensor not expected at all."""
-    spread = [np.inf] * _TENSOR + [1.0] * _DRAG + [_WIDE] * _LEVEL + [_NARROW] * _COMMON
-    return 1 / np.array(spread + [1.0] * _DEVICE) ** 2
+    # a size that nothing depends on stays where it is
+    shape = [np.inf] * (_TENSOR - 1) + [np.inf if sized else 1.0]
+    noise = [_WIDE] * _LEVEL + [_NARROW] * _COMMON
+    return 1 / np.array(shape + [1.0] * _DRAG + noise + [1.0] * _DEVICE) ** 2
 
 
 def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
@@ -109,7 +131,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         ],
         axis=1,
     )
-    expected = _expected()
+    expected = _expected(known.instrument.spin_inertia is not None)
     precision = jnp.asarray(
         np.concatenate([np.tile(expected[:own], count), expected[own:used]]), dtype
     )
@@ -117,6 +139,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     soft = np.full(_PARTS[3] + _DEVICE, 1e-3)
     soft[_PARTS[1] : _PARTS[3]] = 1
     held = jnp.asarray(np.concatenate([np.tile(soft[:own], count), soft[own:used]]), dtype)
+    loud = jnp.where(held == 1, 1, 0).astype(dtype)
     span = data.times[0, -1] - data.times[0, 0]
     typical = jnp.sqrt(jnp.mean(jnp.sum(data.omega**2, axis=2)))
     drag = _LOST / span * jnp.stack([jnp.ones_like(typical), 1 / typical])
@@ -137,12 +160,14 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         value = jnp.sum(each.surprise) + jnp.sum(precision * unknown**2) / 2
         slope = (precision * unknown).at[place].add(each.slope)
         shown = jnp.diag(precision).at[place[:, :, None], place[:, None, :]].add(each.information)
-        return Score(value, slope, shown, each.rest)
+        return Score(value, slope, shown, each.rest, each.spread)
 
     def again(carry):
         unknown, score, damping, _, steps = carry
         shown = score.information
         move = -solve(shown + damping * jnp.diag(held * jnp.diagonal(shown)), score.slope)
+        # from a start far off, noise so large that everything is likely would be a step away
+        move = move / jnp.maximum(1, jnp.max(jnp.abs(loud * move)) / _LOUDER)
         tried = scored(unknown + move)
         well = jnp.isfinite(tried.surprise) & (tried.surprise <= score.surprise)
         kept = jax.tree.map(lambda a, b: jnp.where(well, a, b), tried, score)
@@ -151,10 +176,10 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         return unknown, kept, damping, far(kept), steps + 1
 
     def far(score):
-        """How far the bodies still are from the likeliest ones, in standard deviations."""
+        """How far from the likeliest all is, in standard deviations; bodies count in full."""
         covariance = inverse(score.information)
         left = (covariance @ score.slope) / jnp.sqrt(jnp.diagonal(covariance))
-        return jnp.max(jnp.abs(left[first[:, :_TENSOR]]))
+        return jnp.maximum(jnp.max(jnp.abs(left[first[:, :_TENSOR]])), jnp.max(jnp.abs(left)) / 4)
 
     def unsettled(carry):
         *_, distance, steps = carry
@@ -162,7 +187,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
 
     begin = jnp.zeros(count * own + used - own, dtype)
     state = (begin, scored(begin), jnp.asarray(1e-3, dtype), jnp.asarray(jnp.inf, dtype), 0)
-    unknown, score, _, distance, _ = jax.lax.while_loop(unsettled, again, state)
+    unknown, score, _, distance, steps = jax.lax.while_loop(unsettled, again, state)
     covariance = inverse(score.information)
     shared = jnp.broadcast_to(unknown[count * own :], (count, used - own))
     rest = jnp.zeros((count, _PARTS[3] + _DEVICE - used), dtype)
@@ -176,21 +201,24 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     noise = Noise(*noise[:_LEVEL], *(x[0] for x in noise[_LEVEL:]))
 
     def entries(shape, sigma):
-        return entries_of(tensor_of(shape, base_of(sigma, True), _ALL), 6)
+        return entries_of(known.tensor(shape, sigma), 6)
 
     slopes = jax.vmap(jax.jacfwd(entries))(every[:, :_TENSOR], known.sigma)
     inner = first[:, :_TENSOR]
     blocks = covariance[inner[:, :, None], inner[:, None, :]]
     blocks = slopes @ blocks @ jnp.swapaxes(slopes, 1, 2)
     return Fitted(
-        tensors, slowed, instrument, noise, blocks, score.rest, score.surprise, distance < _NEAR
-    )
+        tensors, slowed, instrument, noise, blocks, score.rest, score.spread, score.surprise, steps,
+        distance < _NEAR,
+    )  # fmt: skip
 
 
 def start_of(data: Readings, instrument: Instrument, count: int) -> tuple[Array, Noise]:
     """Second moments (n, 3, 3) by a regression with a constant momentum, and a noise."""
     rates = jax.vmap(instrument.rates)(data.omega)
-    carried = jax.vmap(instrument.carried)(data.times, data.wheel)
+    carried = None
+    if instrument.spin_inertia is not None:
+        carried = jax.vmap(instrument.carried)(data.times, data.wheel)
     blocks = data.known.shape[1]
     block = (data.times.shape[1] - 1) // blocks
 

@@ -52,7 +52,10 @@ def throw_information(
 
     def found(unknown):
         drag = _LOST * size * jnp.stack([unknown[6], unknown[7] / typical])
-        got = innovations(data, size * whole_of(unknown[:6], 6), drag, instrument, noise)
+        body = whole_of(unknown[:6], 6)
+        # as in the fit: torques are as uncertain as the body is large
+        shaken = noise.grown(jnp.trace(body) / 2)
+        got = innovations(data, size * body, drag, instrument, shaken)
         return got, got
 
     here = jnp.concatenate([entries_of(tensor / size, 6), jnp.zeros(2, tensor.dtype)])

@@ -37,6 +37,11 @@ class Noise(NamedTuple):
     memory: Float[Array, ""]
     wheel: Float[Array, ""]
 
+    def grown(self, factor: Array) -> "Noise":
+        """That of a body ``factor`` times as large: torques grow with it."""
+        torque, wheel, slow = (x * factor for x in (self.torque, self.torque_wheel, self.slow))
+        return self._replace(torque=torque, torque_wheel=wheel, slow=slow)
+
 
 class Readings(NamedTuple):
     """Recordings (leading axis r) cut into blocks, each of which gives one residual.
@@ -57,7 +62,11 @@ def readings_of(recording: Recording, body: Array, block: int) -> Readings:
     """Prepare recordings (leading axis r) of the bodies with numbers ``body`` (r,)."""
     times = recording.times
     omega = bridged(times, recording.present, recording.omega)
-    sample = recording.present * needed("wheel_known", recording.wheel_known)
+    still = recording.wheel is None
+    wheel = jnp.zeros_like(times) if still else recording.wheel
+    sample = recording.present
+    if not still:
+        sample = sample * needed("wheel_known", recording.wheel_known)
     count = (times.shape[1] - 1) // block
 
     def blocks(values):
@@ -65,9 +74,9 @@ def readings_of(recording: Recording, body: Array, block: int) -> Readings:
         return jnp.mean(cut.reshape(-1, count, block), axis=2)
 
     known = jnp.floor(blocks(sample))
-    fast = jnp.max(jnp.abs(recording.wheel) * sample)
-    stir = (blocks(recording.wheel) / jnp.where(fast > 0, fast, 1)) ** 2
-    return Readings(times, omega, recording.wheel, known, stir, body)
+    fast = jnp.max(jnp.abs(wheel) * sample)
+    stir = (blocks(wheel) / jnp.where(fast > 0, fast, 1)) ** 2
+    return Readings(times, omega, wheel, known, stir, body)
 
 
 class Innovations(NamedTuple):
@@ -128,7 +137,8 @@ def innovations(
     gained = jnp.mean(cut(jnp.einsum("tij,tj->ti", turn, push)), axis=1) * span[:, None]
     omega = noise.omega**2 + (noise.omega_wheel * data.stir) ** 2
     torque = (noise.torque**2 + (noise.torque_wheel * data.stir) ** 2) * span / size**2
-    along = jnp.einsum("ij,j->i", inverse, instrument.axis) * instrument.spin_inertia / size
+    spin = 0.0 if instrument.spin_inertia is None else instrument.spin_inertia
+    along = jnp.einsum("ij,j->i", inverse, instrument.axis) * spin / size
     wheel = noise.wheel**2 * along[:, None] * along[None]
     slow = (noise.slow / size) ** 2
 
@@ -200,12 +210,14 @@ def surprise(found: Innovations) -> Float[Array, ""]:
 
 
 class Score(NamedTuple):
-    """``surprise``, its slopes by p unknowns, and the information (expected second slopes)."""
+    """``surprise``, its slopes by p unknowns, the information (expected second slopes), and what
+    was read less what was expected, over its standard deviation ``spread``, rad/s."""
 
     surprise: Float[Array, "*r"]
     slope: Float[Array, "*r p"]
     information: Float[Array, "*r p p"]
     rest: Float[Array, "*r b 3"]
+    spread: Float[Array, "*r b 3"]
 
 
 def score_of(found: Innovations, by: Innovations) -> Score:
@@ -218,5 +230,5 @@ def score_of(found: Innovations, by: Innovations) -> Score:
     slope = slope + jnp.einsum("biip->p", relative) / 2
     shown = jnp.einsum("bip,bij,bjq->pq", by.rest, inverse, by.rest)
     shown = shown + jnp.einsum("bikp,bkiq->pq", relative, relative) / 2
-    rest = found.rest / jnp.sqrt(jnp.diagonal(found.covariance, axis1=1, axis2=2))
-    return Score(surprise(found), slope, shown, rest)
+    spread = jnp.sqrt(jnp.diagonal(found.covariance, axis1=1, axis2=2))
+    return Score(surprise(found), slope, shown, found.rest / spread, spread)

@@ -1,4 +1,4 @@
-"""``fit_balance``: inertia in absolute size from throws with a wheel aboard, in real air."""
+"""``fit_balance``: inertia from throws in real air, in absolute size with a wheel aboard."""
 
 from collections.abc import Sequence
 
@@ -12,10 +12,10 @@ from polhode._checks import is_concrete, require
 from polhode.fit._balance import Known, solve_balance, start_of
 from polhode.fit._compiled import compiled
 from polhode.fit._filter import Noise, readings_of
-from polhode.fit._fit import FitError
 from polhode.fit._instrument import Instrument, Tolerance
 from polhode.fit._linear import entries_of, whole_of
 from polhode.fit._recording import Recording, needed, stack
+from polhode.fit._result import FitError
 from polhode.inertia import Inertia, principal
 
 
@@ -23,13 +23,14 @@ class BalanceFit(eqx.Module):
     """Result of ``fit_balance``, bodies on the leading axis n.
 
     **Fields:** ``inertia``: tensors in sensor axes about the centre of mass, the wheel locked,
-    kg m^2; ``moments`` (n, 3), ascending, and ``axes`` (n, 4), ``wxyz`` principal -> sensor axes,
-    with standard deviations ``moments_std`` and ``axes_std`` (n, 3), rad, about each principal
-    axis;
+    kg m^2; without a wheel only their shape shows, and the largest moment is 1; ``moments``
+    (n, 3), ascending, and ``axes`` (n, 4), ``wxyz`` principal -> sensor axes, with standard
+    deviations ``moments_std`` and ``axes_std`` (n, 3), rad, about each principal axis;
     ``covariance`` (n, 6, 6) of xx, yy, zz, yz, zx, xy; ``drag`` (n, 2): torque over rate, N m s,
     and over rate times speed, N m s^2; ``instrument`` as it was found; ``noise`` found;
-    ``residuals`` (r, b, 3), of the rates expected from the readings before, over their noise;
-    ``surprise``: minus the logarithm of the likelihood, but for a constant; ``converged``.
+    ``residuals`` (r, b, 3), of the rates expected from the readings before, over their standard
+    deviations ``residuals_std``, rad/s; ``surprise``: minus the logarithm of the likelihood, but
+    for a constant; ``steps`` made; ``converged``.
     """
 
     inertia: Inertia
@@ -42,7 +43,9 @@ class BalanceFit(eqx.Module):
     instrument: Instrument
     noise: Noise
     residuals: Float[Array, "r b 3"]
+    residuals_std: Float[Array, "r b 3"]
     surprise: Float[Array, " *n"]
+    steps: Array
     converged: Array
     block: int = eqx.field(static=True)
 
@@ -75,27 +78,32 @@ def fit_balance(
 ) -> BalanceFit:
     """Inertia tensors by the balance of angular momentum: the likeliest, and how sure they are.
 
-    For throws in air with a wheel of measured speed. The gyroscope turns the frame in which
+    For throws in air, with a wheel of measured speed or without one (``Instrument(None)``: then
+    the ratios of the moments show, not their size). The gyroscope turns the frame in which
     ``I omega + h`` is followed; drag, white torques and a torque with memory move it, by as much as
     the data say. The rates read are compared with those expected (``polhode.fit._filter``): their
     noise does not bias the moments, not even of a single short throw that hardly shows them.
 
-    **Arguments:** ``recordings``: with rates and ``wheel_speed``, of free flight only (leave the
-    hands out); NaN where a reading is not to be believed: the speed of a motor just switched on,
-    say, without which the balance does as well. ``instrument``: as the data sheet has it;
-    ``tolerance``: how far it may be off, fitted to all recordings together (None: taken as given).
+    **Arguments:** ``recordings``: with rates and, for a wheel, ``wheel_speed``, of free flight only
+    (leave the hands out); NaN where a reading is not to be believed: the speed of a motor just
+    switched on, say, without which the balance does as well. ``instrument``: as the data sheet has
+    it; ``tolerance``: how far it may be off, fitted to all recordings together (None: as given).
     ``bodies``: number of the body that each recording shows, from 0 on (None: one body).
     ``block``: how many samples give one residual: so many that their noise is white. Readings much
     faster than the motion are best ``averaged`` first.
 
     Noise, drag and instrument are found together with the tensors. Every tensor is physical. Raises
-    ValueError for recordings without rates or wheel, and FitError when a fit is not finite or did
-    not converge, unless ``throw=False``.
+    ValueError for recordings without rates or the wheel's speed, and FitError when a fit is not
+    finite or did not converge, unless ``throw=False``.
     """
     given = stack(recordings)
+    wheel = instrument.spin_inertia is not None
+    require(given.omega is not None, "a balance needs omega_body in every recording.")
     require(
-        given.omega is not None and given.wheel is not None,
-        "a balance needs omega_body and wheel_speed in every recording.",
+        (given.wheel is not None) == wheel,
+        "an instrument with a wheel needs wheel_speed in every recording."
+        if wheel
+        else "recordings with wheel_speed need the wheel's spin_inertia in the instrument.",
     )
     numbers = np.zeros(len(recordings), int) if bodies is None else np.asarray(bodies)
     count = int(numbers.max()) + 1
@@ -105,7 +113,9 @@ def fit_balance(
         f"leaving one out, got {numbers.tolist()}.",
     )
     require(is_concrete(given.times), "fit_balance takes arrays, not traced values.")
-    present = np.asarray(given.present * needed("wheel_known", given.wheel_known)) > 0
+    present = np.asarray(given.present) > 0
+    if wheel:
+        present = present & (np.asarray(needed("wheel_known", given.wheel_known)) > 0)
     require(
         present.sum(axis=1) >= 8,
         "each recording needs at least 8 samples with rates and wheel, got "
@@ -142,23 +152,32 @@ def _alone(recording, instrument, noise, tensor, block):
 
 
 def _concluded(found, block) -> BalanceFit:
+    sized = found.instrument.spin_inertia is not None
+
     def one(tensor, covariance):
         moments, axes, _ = principal(tensor)
 
         def derived(entries):
             values, _, products = principal(whole_of(entries, 6))
-            return jnp.concatenate([values, products])
+            every = jnp.concatenate([values, products, entries])
+            return every if sized else every / values[2]
 
         slope = jax.jacfwd(derived)(entries_of(tensor, 6))
-        spread = jnp.sqrt(jnp.maximum(jnp.sum((slope @ covariance) * slope, axis=1), 0))
+        covariance = slope @ covariance @ slope.T
+        spread = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance)[:6], 0))
+        size = jnp.ones_like(moments[2]) if sized else moments[2]
+        tensor, moments = tensor / size, moments / size
         gaps = jnp.stack(
             [moments[2] - moments[1], moments[2] - moments[0], moments[1] - moments[0]]
         )
         turn = jnp.where(gaps > 0, spread[3:] / jnp.where(gaps > 0, gaps, 1), jnp.inf)
-        return moments, axes, spread[:3], turn
+        return tensor, moments, axes, spread[:3], turn, covariance[6:, 6:], size
 
-    moments, axes, spread, turn = jax.vmap(one)(found.tensors, found.covariance)
+    tensors, moments, axes, spread, turn, covariance, size = jax.vmap(one)(
+        found.tensors, found.covariance
+    )
     return BalanceFit(
-        Inertia(full=found.tensors), moments, axes, spread, turn, found.covariance, found.drag,
-        found.instrument, found.noise, found.rest, found.surprise, found.converged, block,
+        Inertia(full=tensors), moments, axes, spread, turn, covariance, found.drag / size[:, None],
+        found.instrument, found.noise.grown(1 / size), found.rest, found.spread, found.surprise,
+        found.steps, found.converged, block,
     )  # fmt: skip

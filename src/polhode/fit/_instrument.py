@@ -18,25 +18,25 @@ from polhode.rotation import to_matrix
 class Instrument(eqx.Module):
     """How readings mean rates and momentum: ``omega = (1 + skew) (reading - bias)``.
 
-    **Fields:** ``spin_inertia``, kg m^2, of the wheel; ``axis`` (3,) unit vector of its axis in
-    sensor axes; ``delay``, s: to a gyroscope's reading belongs the speed of ``delay`` before;
-    ``skew`` (3, 3): symmetric, traceless departure of the gyroscope's sensitivity from one (a
-    common factor is that of ``spin_inertia``, an antisymmetric part a turn of the axes); ``bias``
-    (3,), rad/s.
+    **Fields:** ``spin_inertia``, kg m^2, of the wheel (None: there is none); ``axis`` (3,) unit
+    vector of its axis in sensor axes; ``delay``, s: to a gyroscope's reading belongs the speed of
+    ``delay`` before; ``skew`` (3, 3): symmetric, traceless departure of the gyroscope's sensitivity
+    from one (a common factor is that of ``spin_inertia``, an antisymmetric part a turn of the
+    axes); ``bias`` (3,), rad/s.
     """
 
-    spin_inertia: Array | float
+    spin_inertia: Array | float | None
     axis: Float[Array, " 3"] = eqx.field(converter=jnp.asarray, default=(0.0, 0.0, 1.0))
     delay: Array | float = 0.0
     skew: Float[Array, "3 3"] | None = None
     bias: Float[Array, " 3"] | None = None
 
     def __check_init__(self):
-        if is_concrete(self.spin_inertia):
+        if self.spin_inertia is not None and is_concrete(self.spin_inertia):
             require(
                 np.asarray(self.spin_inertia) > 0,
-                f"spin_inertia must be positive, got {self.spin_inertia}: without a wheel's "
-                "momentum the balance shows no scale (fit_inertia for free motion).",
+                f"spin_inertia must be positive, got {self.spin_inertia}; None stands for "
+                "no wheel.",
             )
 
     def rates(self, reading: Float[Array, "*t 3"]) -> Float[Array, "*t 3"]:
@@ -49,6 +49,8 @@ class Instrument(eqx.Module):
 
     def carried(self, times: Float[Array, " t"], wheel: Float[Array, " t"]) -> Float[Array, "t 3"]:
         """Momentum of the wheel relative to the body, sensor axes; linear between the samples."""
+        if self.spin_inertia is None:
+            return jnp.zeros((*times.shape, 3), times.dtype)
         speed = jnp.interp(times - self.delay, times, wheel)
         return self.spin_inertia * speed[:, None] * self.axis[None]
 

@@ -66,7 +66,7 @@ class NoInertia(AbstractInertiaUnknown):
 
 
 # scaling a body changes its ratios not at all: with the size unknown the sum is kept
-_SCALE = np.array([1, 1, 1, 0, 0, 0]) / np.sqrt(3)
+SCALE = np.array([1, 1, 1, 0, 0, 0]) / np.sqrt(3)
 
 
 def free_columns(unknown: AbstractInertiaUnknown, scale_known: bool) -> np.ndarray:
@@ -74,7 +74,7 @@ def free_columns(unknown: AbstractInertiaUnknown, scale_known: bool) -> np.ndarr
     columns = unknown.columns()
     if scale_known:
         return columns
-    flat = columns - np.outer(_SCALE, _SCALE @ columns)
+    flat = columns - np.outer(SCALE, SCALE @ columns)
     left, size, _ = np.linalg.svd(flat, full_matrices=False)
     return left[:, size > 0.5]
 

@@ -59,6 +59,10 @@ UNUSABLE = Finding.STEP_LIMIT | Finding.NOT_FINITE | Finding.AXES_DISAGREE
 """Findings that raise an error unless ``throw=False``."""
 
 
+class FitError(RuntimeError):
+    """A fit that must not be used as it is; the message says why and what helps."""
+
+
 class InertiaFit(eqx.Module):
     """Result of ``fit_inertia``; leading axes are those of the bodies.
 

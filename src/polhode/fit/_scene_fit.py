@@ -14,12 +14,12 @@ from polhode._checks import as_float_array
 from polhode._scene import Scene
 from polhode._simulate import simulate
 from polhode._state import State
-from polhode.fit._fit import FitError, each, together
+from polhode.fit._fit import each, together
 from polhode.fit._motion import AbstractMotion, Motion
 from polhode.fit._parameters import NoInertia
 from polhode.fit._recording import Recording, stack
 from polhode.fit._residuals import Huber
-from polhode.fit._result import CURES, UNUSABLE, Finding, by_kind, shown_by, whiteness_of
+from polhode.fit._result import CURES, UNUSABLE, Finding, FitError, by_kind, shown_by, whiteness_of
 from polhode.fit._solve import Problem, Solution, misfit_of
 from polhode.methods import AbstractMethod
 from polhode.rotation import multiply, rotation_vector_to_wxyz
