@@ -189,7 +189,7 @@ short = curve._replace(
     t=curve.t[one], magnitude=curve.magnitude[one], sigma=curve.sigma[one],
     group=curve.group[one] * 0, names=("one",), sun=curve.sun[one], observer=curve.observer[one],
 )  # fmt: skip
-night_fit = lightcurve.fit_light_curve(short, floor=0.02, trials=20_000, starts=96, searches=1)
+night_fit = lightcurve.fit_light_curve(short, floor=0.02, trials=10_000, searches=1)
 print(f"{len(night_fit.solutions)} distinct bodies, rms {night_fit.best.rms:.3f} mag; the first has"
       f" P_phi {night_fit.best.P_phi:.3f} d, P_psi {night_fit.best.P_psi:.3f} d")  # fmt: skip
 for note in night_fit.notes:
