@@ -7,7 +7,7 @@ within its errors (to three of its standard deviations, which are larger than th
 the best, but one of the solutions listed beside it with odds above 1 in 1000); told (wrong, and a
 note says that it may be); silent (wrong without a warning). The search was developed on seeds 0 to
 9: others count. ``--egg``: bodies that are no ellipsoids. ``--real FOLDER`` adds 2012 TC4 and
-Toutatis from the files described in docs/light_curves.md, the latter with ``--seeds`` of the search.
+Toutatis, the latter with ``--seeds`` of the search, from files described in docs/light_curves.md.
 
     python -m benchmarks.light_curves [--first 10] [--count 100] [--noise 0.02 0.1] [--egg 5]
         [--real FOLDER] [--speed]
