@@ -171,7 +171,7 @@ def _verdict(fit, truth) -> str:
     said = any(word in note for note in fit.notes for word in ("Ambiguous", "No second search"))
     if any(_right(s, truth, sigmas=3.0) and s.probability > 1e-3 for s in fit.solutions):
         return "listed"
-    return "told" if said or fit.scale > math.sqrt(_fit._REACHED) else "silent"
+    return "told" if said or fit.scale > math.sqrt(_solutions.REACHED) else "silent"
 
 
 def case(seed: int, noise: float, egg: bool = False, **options) -> dict:

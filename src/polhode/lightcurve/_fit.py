@@ -10,7 +10,7 @@ from polhode.lightcurve._frequencies import Pairs, fourier_lattices
 from polhode.lightcurve._model import Bodies, Points
 from polhode.lightcurve._phase import HG1G2, AbstractPhase, SeeligerPhase
 from polhode.lightcurve._search import Hypotheses, hypotheses, tried
-from polhode.lightcurve._solutions import Fit, described, frequencies, momentum, notes_on
+from polhode.lightcurve._solutions import REACHED, Fit, described, frequencies, momentum, notes_on
 from polhode.lightcurve._steps import BATCH, Problem, State, picked, taken
 
 _FEW = 160  # points that a search looks at
@@ -18,7 +18,6 @@ _DESCENT = ((1.0, 2), (0.5, 3), (0.25, 6))  # parts of the starts, and their ste
 _WIDE = 10.0  # limit of the first steps' residuals, in sigma
 _AGAIN, _MORE, _POLES = 8, 2000, 12  # pairs of periods searched again, by trials and starts of each
 _LIMIT = 3.0  # of residuals in a search, in sigma
-_REACHED = 1.3  # chi-square per degree of freedom at which a search ends
 
 
 def fit_light_curve(
@@ -40,7 +39,8 @@ def fit_light_curve(
 
     Pairs of frequencies from Fourier series, each with all it can mean; ``trials`` bodies of these
     periods, all else drawn at random; Levenberg-Marquardt, with exact derivatives, on the best
-    ``starts``; the mirror images of what is found; distinct solutions, the ``most`` best.
+    ``starts`` of each pair and meaning; the mirror images of what is found; distinct solutions, the
+    ``most`` best. Repeated until two searches agree, ``searches`` times at most.
 
     ``phase``: a phase function (default: ``HG1G2()`` where the phase angle changes by more than 5
     degrees, else ``SeeligerPhase()``). ``pairs``: instead of those from the series. ``highest``
@@ -77,7 +77,7 @@ def fit_light_curve(
         state = found if state is None else _joined(state, found)
         # found again, and the errors assumed are reached: nothing is left to be found
         freedom = max(curve.t.size - state.matrix.shape[1], 1)
-        if again and state.cost.min() < _REACHED * freedom:
+        if again and state.cost.min() < REACHED * freedom:
             break
     assert state is not None
     state = _with_poles(jax.random.fold_in(key, 1), state, rough, problem, pairs.resolution)
