@@ -123,8 +123,8 @@ print("as f_phi and f_psi, the first would mean:", lightcurve.meaning(*(x[0] for
 # these are tried.
 #
 # ## Every body that explains the points
-# Trial bodies with those periods, all else at random; the better ones have offspring; least squares
-# with exact derivatives on the best; then once more with the periods found, and the mirror images.
+# Trial bodies with those periods, all else at random; a few steps of least squares from the two best
+# of each meaning, more from what fits; once more with the periods found; the mirror images.
 
 # %%
 fit = lightcurve.fit_light_curve(curve, pairs=pairs, floor=0.02)
