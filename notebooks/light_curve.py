@@ -123,7 +123,7 @@ print("as f_phi and f_psi, the first would mean:", lightcurve.meaning(*(x[0] for
 # these are tried.
 #
 # ## Every body that explains the points
-# Trial bodies with those periods, all else at random; a few steps of least squares from the two best
+# Trial bodies with those periods, all else at random; least-squares steps from the two best
 # of each meaning, more from what fits; once more with the periods found; the mirror images.
 
 # %%
@@ -158,9 +158,9 @@ for k, solution in enumerate(fit.solutions[:4]):
           f" {solution.probability:.1g}")  # fmt: skip
 
 # %% [markdown]
-# Periods and moments are right to their errors or nearly so. The pole is off by several times its
+# Periods are right to two of their errors, moments to 8 %. The pole is off by several times its
 # error: that error takes the residuals for noise, but they are the rock's corners, and neighbouring
-# ones are alike. Mirror images of the pole fit almost as well.
+# ones are alike. Mirror images of the pole are in the list too.
 #
 # And the attitude, night for night? An ellipsoid looks the same after half a turn about each axis,
 # so the nearest of four attitudes counts.
