@@ -123,8 +123,8 @@ print("as f_phi and f_psi, the first would mean:", lightcurve.meaning(*(x[0] for
 # these are tried.
 #
 # ## Every body that explains the points
-# Trial bodies with those periods, all else at random; the better ones have offspring; least squares
-# with exact derivatives on the best; then once more with the periods found, and the mirror images.
+# Trial bodies with those periods, all else at random; least-squares steps from the two best
+# of each meaning, more from what fits; once more with the periods found; the mirror images.
 
 # %%
 fit = lightcurve.fit_light_curve(curve, pairs=pairs, floor=0.02)
@@ -158,9 +158,9 @@ for k, solution in enumerate(fit.solutions[:4]):
           f" {solution.probability:.1g}")  # fmt: skip
 
 # %% [markdown]
-# Periods and moments are right to their errors or nearly so. The pole is off by several times its
+# Periods are right to two of their errors, moments to 8 %. The pole is off by several times its
 # error: that error takes the residuals for noise, but they are the rock's corners, and neighbouring
-# ones are alike. Mirror images of the pole fit almost as well.
+# ones are alike. Mirror images of the pole are in the list too.
 #
 # And the attitude, night for night? An ellipsoid looks the same after half a turn about each axis,
 # so the nearest of four attitudes counts.
@@ -189,7 +189,7 @@ short = curve._replace(
     t=curve.t[one], magnitude=curve.magnitude[one], sigma=curve.sigma[one],
     group=curve.group[one] * 0, names=("one",), sun=curve.sun[one], observer=curve.observer[one],
 )  # fmt: skip
-night_fit = lightcurve.fit_light_curve(short, floor=0.02, trials=20_000, starts=96, searches=1)
+night_fit = lightcurve.fit_light_curve(short, floor=0.02, trials=10_000, searches=1)
 print(f"{len(night_fit.solutions)} distinct bodies, rms {night_fit.best.rms:.3f} mag; the first has"
       f" P_phi {night_fit.best.P_phi:.3f} d, P_psi {night_fit.best.P_psi:.3f} d")  # fmt: skip
 for note in night_fit.notes:

@@ -51,6 +51,12 @@ def test_hypotheses_hold_the_pair_itself(series):
     assert np.all(meant.long_axis | (meant.f_psi <= meant.f_phi))
 
 
+def test_light_that_does_not_vary_is_refused():
+    t = np.linspace(0, 1, 30)
+    with pytest.raises(ValueError, match="does not vary"):
+        lightcurve.fourier_pairs(t, np.full(30, 12.3))
+
+
 def test_meaning_names_mode_and_sums():
     assert lightcurve.meaning(2.0, 1.0).startswith("LAM or SAM")
     text = lightcurve.meaning(1.0, 2.0)

@@ -98,6 +98,10 @@ def test_alcdef(tmp_path):
         ("jd,mag\n1,2,3\n", "line 2 has 3 cells"),
         ("jd,flux\n1,1\n2,-1\n", "line 3: a flux must be positive"),
         ("jd,mag,sun_x\n1,2,3\n", "lacks the columns sun_y"),
+        ("jd,mag\n" + "1,2\n" * 9, "must span some time"),
+        ("0\n", "announces no light curve"),
+        ("1\n-3 0\n", "line 2, number of points must be a whole number above 0, got '-3'"),
+        ("1\n2 0\n1 1 1 0 0 1 0 0\n2 -1 1 0 0 1 0 0\n", "line 4: an intensity must be positive"),
     ],
 )
 def test_bad_files_are_named(tmp_path, text, message):

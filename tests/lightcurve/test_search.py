@@ -1,4 +1,4 @@
-"""Trial bodies: bred ones keep the periods asked, rounds get nearer, normal points."""
+"""Trial bodies: they have the periods asked, the best of each are kept; normal points."""
 
 import jax
 import jax.numpy as jnp
@@ -8,50 +8,46 @@ import pytest
 import polhode as ph
 from benchmarks import light_curves
 from polhode import lightcurve
-from polhode.lightcurve import _search, _solutions
+from polhode.lightcurve import _fit, _search, _solutions, _steps
 
 PHASE = lightcurve.HG1G2()
 MEANT = _search.Hypotheses(np.array([1.2, 1.9]), np.array([0.7, 0.5]), np.array([True, False]))
 
 
-def test_bred_bodies_have_the_periods_of_their_parents():
-    draws, mode = _search.draw(jax.random.key(0), MEANT, 32, 0.0)
-    bred = _search.breed(jax.random.key(1), draws, 0.0, 0.3)
-    for made in (draws, bred):
-        bodies, good = _search.build(made, mode, PHASE)
-        assert good.mean() > 0.5
-        f_phi, f_psi, found = _solutions.frequencies(bodies)
-        np.testing.assert_allclose(f_phi[good], np.repeat(MEANT.f_phi, 32)[good], rtol=1e-9)
-        np.testing.assert_allclose(f_psi[good], np.repeat(MEANT.f_psi, 32)[good], rtol=1e-2)
-        # never the other mode; inertias at their bounds have a symmetry, and a mode of their own
-        other = np.where(mode, ph.Mode.SAM, ph.Mode.LAM)
-        assert not np.any((found == other) & good)
-    assert not np.allclose(bred.wxyz, draws.wxyz)
+def test_bodies_have_the_periods_of_their_hypothesis():
+    bodies, good = _search.build(*_search.draw(jax.random.key(0), MEANT, 32, 0.0), PHASE)
+    mode = np.repeat(MEANT.long_axis, 32)
+    assert good.mean() > 0.5
+    f_phi, f_psi, found = _solutions.frequencies(bodies)
+    np.testing.assert_allclose(f_phi[good], np.repeat(MEANT.f_phi, 32)[good], rtol=1e-9)
+    np.testing.assert_allclose(f_psi[good], np.repeat(MEANT.f_psi, 32)[good], rtol=1e-2)
+    # never the other mode; inertias at their bounds have a symmetry, and a mode of their own
+    other = np.where(mode, ph.Mode.SAM, ph.Mode.LAM)
+    assert not np.any((found == other) & good)
 
 
-def test_draws_of_a_body_build_it_again_but_for_its_place_on_the_polhode():
-    draws, mode = _search.draw(jax.random.key(0), MEANT, 1, 0.0)
-    bodies, _ = _search.build(draws, mode, PHASE)
-    again = _search.draws_of(jax.random.key(2), bodies, MEANT, 1)
-    np.testing.assert_allclose(again.inertia, draws.inertia, atol=1e-9)
-    second, _ = _search.build(again, mode, PHASE)
-    np.testing.assert_allclose(second.wxyz, bodies.wxyz, atol=1e-12)
-    np.testing.assert_allclose(
-        _solutions.frequencies(second)[0], _solutions.frequencies(bodies)[0], rtol=1e-9
-    )
-
-
-def test_rounds_come_nearer_and_leave_the_wrong_periods():
+def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
     curve, truth, _ = light_curves.synthetic(9, 0.02, nights=10, days=12.0, each=12)
     points = curve.points(0.01)
     right = 1 / truth["P_phi"], 1 / truth["P_psi"]
     # the right one among eight that are off by one to eight steps of the resolution
     off = np.arange(9) * 1.5 / np.ptp(curve.t)
     meant = _search.Hypotheses(right[0] + off, right[1] + 0 * off, np.full(9, truth["mode"] == 0))
-    trials = _search.tried(jax.random.key(0), meant, 4000, PHASE, points, 0.0)
-    assert trials.source[np.argmin(trials.misfit)] == 0
-    own = trials.misfit[trials.source == 0]
-    assert own[len(own) // 2 :].min() < own[: len(own) // 4].min()
+    key = jax.random.key(0)
+    trials = _search.tried(key, meant, 1800, 3, PHASE, points, 0.0)
+    np.testing.assert_array_equal(trials.source, np.repeat(np.arange(9), 3))
+    f_phi, *_ = _solutions.frequencies(trials.bodies)
+    np.testing.assert_allclose(f_phi, meant.f_phi[trials.source], rtol=1e-9)
+    # the best of 200 fit better than others, and are in order
+    misfit, _ = _search.misfits(PHASE, trials.bodies, points)
+    misfit = misfit.reshape(9, 3)
+    assert np.all(np.diff(misfit, axis=1) >= 0)
+    few, _ = _search.build(*_search.draw(jax.random.key(1), meant, 3, 0.0), PHASE)
+    assert misfit.mean() < 0.7 * _search.misfits(PHASE, few, points)[0].mean()
+    state = _fit._started(key, meant, 1800, 3, _steps.Problem(PHASE, points), 0.0)
+    f_phi, f_psi, _ = _solutions.frequencies(state.bodies)
+    best = np.argmin(state.cost)
+    np.testing.assert_allclose([f_phi[best], f_psi[best]], right, rtol=3e-3)
 
 
 def test_misfit_is_that_of_the_light_times_the_gain():

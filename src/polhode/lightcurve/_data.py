@@ -43,7 +43,8 @@ class LightCurve(NamedTuple):
         [au], or unit vectors where distances are unknown or already taken off (``at_body``: light
         time, ``reduced``: 5 log10(r Delta)). ``sigma``: standard deviations, 0: unknown.
         ``group`` (n,): names of nights or observers. ``calibrated``: groups share a zero point
-        but for small errors. Raises ValueError for shapes that differ and values not finite.
+        but for small errors. Raises ValueError for shapes that differ, values not finite, and times
+        that are all the same.
         """
         t, magnitude = np.asarray(t, float), np.asarray(magnitude, float)
         if t.ndim != 1 or t.shape != magnitude.shape or t.size < 8:
@@ -54,6 +55,8 @@ class LightCurve(NamedTuple):
         bad = np.flatnonzero(~(np.isfinite(t) & np.isfinite(magnitude)))
         if bad.size:
             raise ValueError(f"times and magnitudes must be finite; point {bad[0]} is not.")
+        if np.ptp(t) == 0:
+            raise ValueError(f"all {t.size} times are {t[0]}: a light curve must span some time.")
         if (sun is None) != (observer is None):
             raise ValueError("give both the vectors to the Sun and to the observer, or neither.")
         if sun is not None:

@@ -9,14 +9,15 @@ from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._frequencies import Pairs, fourier_lattices
 from polhode.lightcurve._model import Bodies, Points
 from polhode.lightcurve._phase import HG1G2, AbstractPhase, SeeligerPhase
-from polhode.lightcurve._search import Hypotheses, Trials, hypotheses, tried
-from polhode.lightcurve._solutions import Fit, described, frequencies, momentum, notes_on
+from polhode.lightcurve._search import Hypotheses, hypotheses, tried
+from polhode.lightcurve._solutions import REACHED, Fit, described, frequencies, momentum, notes_on
 from polhode.lightcurve._steps import BATCH, Problem, State, picked, taken
 
-_FEW = 256  # points that a search looks at
-_AGAIN = 8  # pairs of periods searched again
+_FEW = 160  # points that a search looks at
+_DESCENT = ((1.0, 2), (0.5, 3), (0.25, 6))  # parts of the starts, and their steps
+_WIDE = 10.0  # limit of the first steps' residuals, in sigma
+_AGAIN, _MORE, _POLES = 8, 2000, 12  # pairs of periods searched again, by trials and starts of each
 _LIMIT = 3.0  # of residuals in a search, in sigma
-_REACHED = 1.3  # chi-square per degree of freedom at which a search ends
 
 
 def fit_light_curve(
@@ -25,8 +26,8 @@ def fit_light_curve(
     phase: AbstractPhase | None = None,
     pairs: Pairs | None = None,
     highest: float | None = None,
-    trials: int = 100_000,
-    starts: int = 288,
+    trials: int = 40_000,
+    starts: int = 2,
     searches: int = 3,
     floor: float = 0.03,
     offset_sigma: float | None = None,
@@ -38,7 +39,8 @@ def fit_light_curve(
 
     Pairs of frequencies from Fourier series, each with all it can mean; ``trials`` bodies of these
     periods, all else drawn at random; Levenberg-Marquardt, with exact derivatives, on the best
-    ``starts``; the mirror images of what is found; distinct solutions, the ``most`` best.
+    ``starts`` of each pair and meaning; the mirror images of what is found; distinct solutions, the
+    ``most`` best. Repeated until two searches agree, ``searches`` times at most.
 
     ``phase``: a phase function (default: ``HG1G2()`` where the phase angle changes by more than 5
     degrees, else ``SeeligerPhase()``). ``pairs``: instead of those from the series. ``highest``
@@ -64,29 +66,39 @@ def fit_light_curve(
         pairs = fourier_lattices(curve.t, curve.magnitude, columns=columns, highest=highest)
     meant = hypotheses(pairs)
     key = jax.random.key(seed)
-    few, problem = _thinned(points, _FEW), Problem(phase, points)
-    state = None
+    rough, problem = Problem(phase, _thinned(points, _FEW)), Problem(phase, points)
+    state, again = None, False
     for _ in range(searches):
         key, own = jax.random.split(key)
-        found = _searched(own, meant, trials, starts, few, problem, _blur(curve), pairs.resolution)
+        found = _searched(
+            own, meant, trials, starts, rough, problem, _blur(curve), pairs.resolution
+        )
+        again = state is not None and _found_twice(state, found, pairs.resolution)
         state = found if state is None else _joined(state, found)
-        # the errors assumed are reached: nothing is left to be found
+        # found again, and the errors assumed are reached: nothing is left to be found
         freedom = max(curve.t.size - state.matrix.shape[1], 1)
-        if state.cost.min() < _REACHED * freedom:
+        if again and state.cost.min() < REACHED * freedom:
             break
     assert state is not None
-    state = _better(problem, state, pairs.resolution, BATCH, limit, 40)
+    state = _with_poles(jax.random.fold_in(key, 1), state, rough, problem, pairs.resolution)
+    state = _better(problem, state, pairs.resolution, BATCH, limit, 60)
     normals = _mirrors(curve)
-    order = _distinct(state, pairs.resolution)[: BATCH // 2]
+    order = _distinct(state, pairs.resolution, BATCH // 2)
     images = [_mirrored(taken(state.bodies, order), normal) for normal in normals]
     images = jax.tree.map(lambda *x: np.concatenate([y[: len(order)] for y in x]), *images)
     images = taken(images, np.arange(len(images.wxyz)))
     width = np.full(len(images.wxyz), limit)
     mirrored = problem.improve(problem.start(images, width), width, 30)
     state = _joined(state, mirrored)
-    order = _distinct(state, pairs.resolution)[:most]
+    order = _distinct(state, pairs.resolution, most)
     solutions, scale = described(problem, state, order, curve, normals, limit)
-    return Fit(solutions, curve, pairs, meant, scale, notes_on(curve, solutions, scale))
+    notes = notes_on(curve, solutions, scale)
+    if not again:
+        notes += (
+            "No second search found the best motion again: better ones may have been missed. Ask"
+            " for more trials or searches.",
+        )
+    return Fit(solutions, curve, pairs, meant, scale, notes)
 
 
 def _blur(curve: LightCurve) -> float:
@@ -101,49 +113,48 @@ def _blur(curve: LightCurve) -> float:
 
 
 def _searched(
-    key,
-    meant: Hypotheses,
-    trials: int,
-    starts: int,
-    few: Points,
-    problem: Problem,
-    blur,
-    resolution,
-) -> State:
+    key, meant, trials: int, starts: int, rough: Problem, problem: Problem, blur, resolution
+) -> State:  # fmt: skip
     """Bodies of all hypotheses; then more with the periods found, whose pole may be wrong."""
-    phase, rough = problem.phase, Problem(problem.phase, few)
-    trial = tried(jax.random.fold_in(key, 0), meant, trials, phase, few, blur)
-    state = _started(trial, starts, rough, each=3)
-    state = _better(problem, state, resolution, 3 * BATCH, 10.0, 12)
-    near, known = _near(state, resolution)
-    trial = tried(
-        jax.random.fold_in(key, 1), near, trials // 3, phase, few, 0.5 * resolution, known
-    )
-    again = _started(trial, starts // 3, rough, each=starts)
-    state = _joined(state, problem.start(again.bodies, np.full(len(again.cost), 10.0)))
-    return _better(problem, state, resolution, 2 * BATCH, _LIMIT, 12)
+    own = jax.random.split(key)
+    state = _started(own[0], meant, trials, starts, rough, blur)
+    state = _better(problem, state, resolution, 3 * BATCH, _WIDE, 12)
+    return _with_poles(own[1], state, rough, problem, resolution)
 
 
-def _started(trial: Trials, count: int, problem: Problem, each: int) -> State:
-    """A few steps from the best trials, at most ``each`` of one hypothesis."""
-    chosen = _varied(trial.misfit, trial.source, count, each)
-    bodies = taken(trial.bodies, chosen)
+def _with_poles(key, state: State, rough: Problem, problem: Problem, resolution) -> State:
+    """The best, and more of their periods."""
+    near = _near(state, resolution)
+    trials = _MORE * len(near.f_phi)
+    more = _started(key, near, trials, _POLES, rough, 0.5 * resolution)
+    more = problem.start(more.bodies, np.full(len(more.cost), _WIDE))
+    return _better(problem, _joined(state, more), resolution, 2 * BATCH, _LIMIT, 12)
+
+
+def _started(key, meant, trials: int, keep: int, problem: Problem, blur) -> State:
+    """Steps from the ``keep`` best trials of every hypothesis, more from the best of these."""
+    found = tried(key, meant, trials, keep, problem.phase, problem.points, blur)
+    bodies = taken(found.bodies, np.arange(len(found.gain)))
     # the gain, as a first step of the shape
-    bodies.unknowns[: len(chosen), 2:4] *= trial.gain[chosen][:, None]
-    width = np.full(len(bodies.wxyz), 10.0)
-    return problem.improve(problem.start(bodies, width), width, 10)
+    bodies.unknowns[: len(found.gain), 2:4] *= found.gain[:, None]
+    state = problem.start(bodies, np.full(len(bodies.wxyz), _WIDE))
+    for part, steps in _DESCENT:
+        best = np.argsort(state.cost)[: int(part * len(bodies.wxyz))]
+        best = np.pad(best, (0, -len(best) % BATCH), mode="edge")
+        state = problem.improve(picked(state, best), np.full(len(best), _WIDE), steps)
+    return state
 
 
 def _better(problem: Problem, state: State, resolution, keep: int, limit: float, steps: int):
     """The ``keep`` best distinct ones, improved."""
-    best = _distinct(state, resolution)[:keep]
+    best = _distinct(state, resolution, keep)
     best = np.pad(best, (0, keep - len(best)), mode="edge")
     width = np.full(keep, limit)
     return problem.improve(problem.look(*picked(state[:2], best), width), width, steps)
 
 
-def _near(state: State, resolution: float) -> tuple[Hypotheses, Bodies]:
-    """Periods and modes of the best bodies, poles apart."""
+def _near(state: State, resolution: float) -> Hypotheses:
+    """Periods and modes of the best bodies."""
     f_phi, f_psi, mode = frequencies(state.bodies)
     kept: list[int] = []
     for k in np.argsort(state.cost):
@@ -152,8 +163,21 @@ def _near(state: State, resolution: float) -> tuple[Hypotheses, Bodies]:
                     for j in kept if mode[j] == mode[k]]  # fmt: skip
             if min(size, default=np.inf) > 0.3 * resolution:
                 kept.append(int(k))
-    meant = Hypotheses(f_phi[kept], f_psi[kept], mode[kept] == int(free.Mode.LAM))
-    return meant, picked(state.bodies, np.array(kept))
+    return Hypotheses(f_phi[kept], f_psi[kept], mode[kept] == int(free.Mode.LAM))
+
+
+def _found_twice(one: State, other: State, resolution: float) -> bool:
+    """Whether the best motion of both is in both, poles apart."""
+    f_phi, f_psi, mode = zip(*(frequencies(s.bodies) for s in (one, other)))
+    k = int(np.argmin([s.cost.min() for s in (one, other)]))
+    best = int(np.argmin((one, other)[k].cost))
+    alike = [
+        (mode[j] == mode[k][best])
+        & (abs(f_phi[j] - f_phi[k][best]) < 0.2 * resolution)
+        & (abs(f_psi[j] - f_psi[k][best]) < 0.2 * resolution)
+        for j in (0, 1)
+    ]
+    return all(x.any() for x in alike)
 
 
 def _joined(*states: State) -> State:
@@ -171,36 +195,25 @@ def _thinned(points: Points, count: int) -> Points:
     )
 
 
-def _varied(misfit, source, count: int, each: int) -> np.ndarray:
-    """Numbers of the best, at most ``each`` from one source, padded with the last."""
-    used: dict = {}
-    chosen = []
-    for k in np.argsort(misfit):
-        used[source[k]] = used.get(source[k], 0) + 1
-        if used[source[k]] <= each:
-            chosen.append(k)
-        if len(chosen) == count:
-            break
-    return np.pad(np.array(chosen), (0, count - len(chosen)), mode="edge")
-
-
-def _distinct(state: State, resolution: float) -> np.ndarray:
-    """Numbers of the solutions that differ in mode, frequencies or pole, the best first."""
+def _distinct(state: State, resolution: float, most: int) -> np.ndarray:
+    """Numbers of the ``most`` best solutions that differ in mode, frequencies or pole."""
     f_phi, f_psi, mode = frequencies(state.bodies)
     pole = momentum(state.bodies)
+    finite = np.isfinite(state.cost + f_phi + f_psi)
     kept: list[int] = []
     for k in np.argsort(state.cost):
-        if not np.isfinite(state.cost[k] + f_phi[k] + f_psi[k]):
+        if not finite[k]:
             continue
-        same = [
-            mode[k] == mode[j]
-            and abs(f_phi[k] - f_phi[j]) < 0.2 * resolution
-            and abs(f_psi[k] - f_psi[j]) < 0.2 * resolution
-            and pole[k] @ pole[j] > np.cos(np.radians(15))
-            for j in kept
-        ]
-        if not any(same):
+        same = (
+            (mode[kept] == mode[k])
+            & (abs(f_phi[kept] - f_phi[k]) < 0.2 * resolution)
+            & (abs(f_psi[kept] - f_psi[k]) < 0.2 * resolution)
+            & (pole[kept] @ pole[k] > np.cos(np.radians(15)))
+        )
+        if not same.any():
             kept.append(int(k))
+        if len(kept) == most:
+            break
     return np.array(kept)
 
 

@@ -105,7 +105,13 @@ class _Scan(NamedTuple):
         t = t - t[0]
         columns = np.ones((1, t.size)) if columns is None else np.asarray(columns, float)
         basis = _orthonormal(columns)
+        size = values @ values
         values = values - basis.T @ (basis @ values)
+        if values @ values <= 1e-24 * size:
+            raise ValueError(
+                "the brightness does not vary but for an offset of each group: there is nothing to"
+                " find."
+            )
         values = values / np.sqrt(values @ values)
         step = 1 / (oversampling * np.ptp(t))
         if highest is None:

@@ -83,7 +83,7 @@ def magnitudes(phase: AbstractPhase, bodies: Bodies, points: Points) -> Float[Ar
 
 
 def magnitudes_and_slopes(phase: AbstractPhase, bodies: Bodies, points: Points):
-    """Magnitudes (b, n) and their derivatives (b, n, 10 + c), the turn in space (3) last.
+    """Magnitudes (b, n) and their derivatives (b, 10 + c, n), the turn in space (3) last.
 
     The motion is differentiated by five numbers only, the light sample by sample in reverse.
     """
@@ -93,10 +93,7 @@ def magnitudes_and_slopes(phase: AbstractPhase, bodies: Bodies, points: Points):
     def moved(step):
         return attitudes(u.at[:, jnp.array([0, 1, 4, 5, 6])].add(step), wxyz, points.t)
 
-    still = jnp.zeros(5, u.dtype)
-    q, by_motion = jax.vmap(lambda e: jax.jvp(moved, (still,), (e,)), out_axes=(None, -1))(
-        jnp.eye(5, dtype=u.dtype)
-    )  # 4 x (b, n), 4 x (b, n, 5)
+    q, along = jax.linearize(moved, jnp.zeros(5, u.dtype))
     many = len(phase.typical)
     whole = (count, points.t.shape[1])
 
@@ -112,13 +109,50 @@ def magnitudes_and_slopes(phase: AbstractPhase, bodies: Bodies, points: Points):
 
     value, pull = jax.vjp(seen, q, turn, shape, coefficients)
     by_q, by_turn, by_shape, by_coefficients = pull(jnp.ones(whole, u.dtype))
-    motion = cast(Array, sum(a[..., None] * b for a, b in zip(by_q, by_motion, strict=True)))
-    slopes = [motion[..., :2], jnp.stack(by_shape, -1), motion[..., 2:], by_coefficients]
-    return value, jnp.concatenate([*slopes, jnp.stack(by_turn, -1)], axis=-1)
+    # one at a time: rows of samples stay contiguous, a mapped axis would come between them
+    motion = [
+        cast(Array, sum(a * b for a, b in zip(by_q, along(e), strict=True)))
+        for e in jnp.eye(5, dtype=u.dtype)
+    ]
+    known = [by_coefficients[..., k] for k in range(many)]
+    return value, jnp.stack([*motion[:2], *by_shape, *motion[2:], *known, *by_turn], axis=1)
+
+
+def _frequencies(unknowns):
+    """Logarithms of f_phi and f_psi, and the mode, of one body."""
+    found = free.periods(moments_of(unknowns), unknowns[RATES])
+    return -jnp.log(jnp.stack([found.P_phi, found.P_psi])), found.mode
+
+
+def _kept(old, step):
+    """``old + step`` of one body, its rates mended so that frequencies change as the step meant."""
+    (before, mode), (change, _) = jax.jvp(_frequencies, (old,), (step,))
+    plain = old + step
+    rates, near = plain[RATES], True
+    for _ in range(2):
+
+        def left(x):
+            now, mode = _frequencies(plain.at[RATES].set(x))
+            return now - before - change, (now - before - change, mode)
+
+        slopes, (rest, now) = jax.jacfwd(left, has_aux=True)(rates)
+        # the least change of the rates; the matrix is 2 x 2
+        a, b, c = (slopes[i] @ slopes[j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        weights = jnp.stack([c * rest[0] - b * rest[1], a * rest[1] - b * rest[0]]) / (
+            a * c - b * b
+        )
+        rates, near = rates - weights @ slopes, near & (now == mode)
+    change = rates - plain[RATES]
+    near = near & (jnp.sum(change**2) < 0.1 * jnp.sum(plain[RATES] ** 2))  # false if not finite
+    return plain.at[RATES].set(jnp.where(near, rates, plain[RATES]))
 
 
 def stepped(bodies: Bodies, step: Float[Array, "b u+3"]) -> Bodies:
-    """The bodies after a step of the unknowns and a turn in space."""
+    """The bodies after a step of the unknowns and a turn in space.
+
+    A step to first order: to second order its frequencies are kept to what they are to first,
+    because the valleys of long light curves are narrow in the frequencies and curved in the rates.
+    """
     turn = rotation.rotation_vector_to_wxyz(step[:, -3:])
     wxyz = rotation.normalise(rotation.multiply(turn, bodies.wxyz))
-    return Bodies(bodies.unknowns + step[:, :-3], wxyz)
+    return Bodies(jax.vmap(_kept)(bodies.unknowns, step[:, :-3]), wxyz)

@@ -147,11 +147,18 @@ def _damit(path, lines) -> LightCurve:
     """Blocks of ``points calibrated`` and rows of JD, intensity, vectors to Sun and Earth."""
     rows = [(k + 1, line.split()) for k, line in enumerate(lines) if line.strip()]
     count, place, table, group, kinds = int(rows[0][1][0]), 1, [], [], []
+    if count == 0:
+        raise ValueError(f"{path} announces no light curve.")
     for block in range(count):
         if place >= len(rows):
             raise ValueError(f"{path} announces {count} light curves and holds {block}.")
         line, head = rows[place]
-        points = int(_number(path, line, "number of points", head[0]))
+        if not head[0].isdigit() or int(head[0]) == 0:
+            raise ValueError(
+                f"{path}: line {line}, number of points must be a whole number above 0, got"
+                f" {head[0]!r}."
+            )
+        points = int(head[0])
         kinds.append(len(head) > 1 and head[1] == "1")
         body = rows[place + 1 : place + 1 + points]
         if len(body) < points:
@@ -163,11 +170,11 @@ def _damit(path, lines) -> LightCurve:
                     f" and to the Earth), got {len(cells)}."
                 )
             table.append([_number(path, number, "a cell", c) for c in cells[:8]])
+            if not table[-1][1] > 0:
+                raise ValueError(f"{path}: line {number}: an intensity must be positive.")
             group.append(f"{block + 1:04d}")
         place += 1 + points
     data = np.array(table)
-    if not np.all(data[:, 1] > 0):
-        raise ValueError(f"{path}: intensities must be positive.")
     # by its documentation: JD corrected for light time, intensity reduced to 1 au
     return LightCurve.of(
         data[:, 0], -2.5 * np.log10(data[:, 1]), data[:, 2:5], data[:, 5:8], group=group,

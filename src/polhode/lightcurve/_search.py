@@ -14,10 +14,6 @@ from polhode.lightcurve._phase import AbstractPhase
 
 CHUNK = 2048
 _BISECTIONS = 24
-# Part of all bodies in each round, and of all hypotheses that go on after it.
-_ROUNDS = ((0.3, 1.0), (0.25, 0.5), (0.15, 0.25), (0.15, 0.12), (0.15, 0.12))
-_ELITE = 6  # parents of each hypothesis
-_WIDTH = 0.4  # of the first bred
 _WORTH = (3.0, 0.03)  # what a series may leave, by that of the best, and of the whole
 _GAIN = (0.6, 1.7)  # of the variations, in a trial's score
 _SLOPE_SIGMA = 0.5  # of the phase function, in a trial's score [mag / rad]
@@ -113,21 +109,6 @@ def _fresh(key, f_phi, f_psi, long_axis, blur) -> Draws:
 
 
 @jax.jit
-def _bred(key, parents: Draws, blur, width) -> Draws:
-    """Bodies near their parents, by ``width`` of what is possible."""
-    keys = iter(jax.random.split(key, 6))
-
-    def near(x, size):
-        return x + width * size * jax.random.normal(next(keys), x.shape)
-
-    unit = parents.wxyz / jnp.linalg.norm(parents.wxyz, axis=-1, keepdims=True)
-    return Draws(
-        jnp.clip(near(parents.inertia, 0.5), 0.0, 1.0), near(parents.late, 0.3), near(unit, 1.0),
-        near(parents.shape, 1.0), near(parents.f_phi, blur), near(parents.f_psi, blur),
-    )  # fmt: skip
-
-
-@jax.jit
 def _built(draws: Draws, long_axis, spread):
     """Bodies (b,) with the periods asked, and whether there are any for the inertia drawn."""
     u, ratio = _axes(draws.inertia), draws.f_psi / draws.f_phi
@@ -182,22 +163,6 @@ def draw(key, hypotheses: Hypotheses, each: int, blur: float) -> tuple[Draws, np
     return made, long_axis
 
 
-def draws_of(key, bodies: Bodies, meant: Hypotheses, each: int) -> Draws:
-    """Bodies found, one of each hypothesis, as parents: all but the place on the polhode."""
-    axes = np.exp(bodies.unknowns[:, :2])
-    inertia = np.stack([(axes[:, 0] - 0.2) / 0.8, (axes[:, 1] / axes[:, 0] - 0.3) / 0.7], -1)
-    copies = (np.clip(inertia, 0, 1), bodies.wxyz, np.zeros_like(inertia), meant.f_phi, meant.f_psi)
-    inertia, wxyz, shape, f_phi, f_psi = (np.repeat(x, each, axis=0) for x in copies)
-    late = np.asarray(jax.random.uniform(key, (len(f_phi),)))
-    return Draws(inertia, late, wxyz, shape, f_phi, f_psi)
-
-
-def breed(key, parents: Draws, blur: float, width: float) -> Draws:
-    return _in_chunks(
-        lambda k, d: _bred(jax.random.fold_in(key, k), d, blur, width), len(parents.late), parents
-    )
-
-
 def _misfit(phase, bodies: Bodies, points: Points, solver):
     """Misfit (b,) and gain (b,): what the body's variations are multiplied by to fit best."""
 
@@ -243,61 +208,27 @@ def misfits(phase: AbstractPhase, bodies: Bodies, points: Points) -> tuple[np.nd
 
 
 class Trials(NamedTuple):
-    """Bodies tried, scored; arrays (b, ...)."""
+    """The best bodies tried of every hypothesis, those of one beside each other; (b, ...)."""
 
-    draws: Draws
     bodies: Bodies
-    misfit: np.ndarray
     gain: np.ndarray
     source: np.ndarray  # number of the hypothesis
 
 
 def tried(
-    key, meant: Hypotheses, count: int, phase: AbstractPhase, points: Points, blur: float,
-    known: Bodies | None = None,
-) -> Trials:  # fmt: skip
-    """About ``count`` bodies, in rounds for ever fewer hypotheses.
-
-    A hypothesis is as good as its best body. A body within reach of the right one is one in some
-    hundreds that have the right periods: those of the later rounds are bred from the best of
-    their hypothesis, ever closer. ``known``: a body of each hypothesis, half of the first round
-    are near which.
-    """
-    alive = np.arange(len(meant.f_phi))
-    whole = None
-    for k, (part_of_bodies, part_of_hypotheses) in enumerate(_ROUNDS):
-        each = max(1, int(count * part_of_bodies) // len(alive))
-        source = np.repeat(alive, each)
-        own = jax.random.fold_in(key, k)
-        if whole is None:
-            made, _ = draw(own, meant, each, blur)
-            if known is not None:
-                parents = draws_of(own, known, meant, each)
-                near = breed(jax.random.fold_in(own, 1), parents, 0.1 * blur, _WIDTH / 2)
-                made = jax.tree.map(lambda *x: np.concatenate(x), made, near)
-                source = np.r_[source, source]
-        else:
-            parents = _parents(whole, alive, each)
-            made = breed(own, jax.tree.map(lambda x, at=parents: x[at], whole.draws), blur,
-                         _WIDTH * 0.7 ** (k - 1))  # fmt: skip
-        bodies, good = build(made, meant.long_axis[source], phase)
-        misfit, gain = misfits(phase, bodies, points)
-        part = Trials(made, bodies, np.where(good, misfit, np.inf), gain, source)
-        whole = part if whole is None else jax.tree.map(
-            lambda *x: np.concatenate(x), whole, part
-        )  # fmt: skip
-        best = np.full(len(meant.f_phi), np.inf)
-        np.minimum.at(best, whole.source, whole.misfit)
-        most = max(4, int(part_of_hypotheses * len(best)))
-        alive = np.sort(alive[np.argsort(best[alive])[:most]])
-    assert whole is not None  # there is a round
-    return whole
-
-
-def _parents(trials: Trials, alive, each: int) -> np.ndarray:
-    """Numbers (alive each,) of the best ones of every hypothesis, in turn."""
-    order = np.lexsort((trials.misfit, trials.source))
-    first = np.searchsorted(trials.source[order], alive)
-    many = np.searchsorted(trials.source[order], alive, side="right") - first
-    turn = np.arange(each)[None] % np.minimum(_ELITE, many)[:, None]
-    return order[first[:, None] + turn].reshape(-1)
+    key, meant: Hypotheses, count: int, keep: int, phase: AbstractPhase, points: Points, blur: float
+) -> Trials:
+    """The ``keep`` best of each hypothesis among about ``count`` bodies drawn."""
+    many = len(meant.f_phi)
+    each = max(keep, count // many)
+    draws, long_axis = draw(key, meant, each, blur)
+    bodies, good = build(draws, long_axis, phase)
+    misfit, gain = misfits(phase, bodies, points)
+    misfit = np.where(good, misfit, np.inf).reshape(many, each)
+    best = np.argsort(misfit, axis=1)[:, :keep] + each * np.arange(many)[:, None]
+    best = best.reshape(-1)
+    return Trials(
+        Bodies(bodies.unknowns[best], bodies.wxyz[best]),
+        gain[best],
+        np.repeat(np.arange(many), keep),
+    )

@@ -13,6 +13,9 @@ from polhode.lightcurve._model import Bodies, moments_of
 from polhode.lightcurve._search import Hypotheses
 from polhode.lightcurve._steps import BATCH, Problem, State, normal_equations, picked
 
+# Chi-square per degree of freedom at which a body explains a light curve.
+REACHED = 1.3
+
 
 class Solution(NamedTuple):
     """A body that explains a light curve. Body axes: those of its shape and inertia."""
@@ -166,7 +169,7 @@ def notes_on(curve: LightCurve, solutions, scale: float) -> tuple[str, ...]:
             f"Ambiguous: {len(rivals)} other solution(s) than the best, mirrors apart, cannot be"
             " excluded at 1 in 1000."
         )
-    if scale > 1.5:
+    if scale**2 > REACHED:
         notes.append(
             f"Residuals are {scale:.1f} times the errors assumed: an ellipsoid is not the whole"
             " truth, errors follow from the residuals, and neighbouring ones are alike; trust"

@@ -6,7 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from polhode.lightcurve._model import Bodies, Points, magnitudes_and_slopes, stepped
+from polhode.lightcurve._model import (
+    Bodies,
+    Points,
+    magnitudes,
+    magnitudes_and_slopes,
+    stepped,
+)  # fmt: skip
 from polhode.lightcurve._phase import AbstractPhase
 
 BATCH = 32
@@ -48,15 +54,17 @@ def normal_equations(phase, bodies: Bodies, offsets, points: Points, limit):
     cost = 2 * limit**2 * jnp.sum(squared / (1 + jnp.sqrt(1 + squared)), axis=-1)
     robust = 1 / jnp.sqrt(1 + squared)
     weight = points.weight * robust
-    columns = jnp.broadcast_to(points.columns.T, (*rest.shape, points.columns.shape[0]))
-    whole = jnp.concatenate([slopes, columns], axis=-1)
-    weighted = whole * weight[..., None]
-    matrix = jnp.einsum("bni,bnj->bij", weighted, whole)
-    right = jnp.einsum("bni,bn->bi", weighted, rest)
+    columns = jnp.broadcast_to(points.columns, (rest.shape[0], *points.columns.shape))
+    whole = jnp.concatenate([slopes, columns], axis=1)
+    weighted = whole * weight[:, None]
+    matrix = jnp.einsum("bin,bjn->bij", weighted, whole)
+    right = jnp.einsum("bin,bn->bi", weighted, rest)
     return cost, matrix, right, jnp.sum(rest * rest * points.weight, -1), (value, robust)
 
 
 normal_equations = jax.jit(normal_equations, static_argnums=0)
+_light = jax.jit(magnitudes, static_argnums=0)
+_stepped = jax.jit(stepped)
 
 
 class State(NamedTuple):
@@ -101,10 +109,14 @@ class Problem:
 
     def start(self, bodies: Bodies, limit: np.ndarray) -> State:
         """With the offsets that fit best."""
-        state = self.look(bodies, np.zeros((bodies.wxyz.shape[0], self.columns)), limit)
-        tail = slice(-self.columns, None)
-        offsets = -_solved(state.matrix[:, tail, tail], state.right[:, tail], 1e-9)
-        return self.look(bodies, offsets, limit)
+        c, weight = np.asarray(self.points.columns), np.asarray(self.points.weight)
+        solver = np.linalg.inv((c * weight) @ c.T + np.diag(self.stiffness + 1e-9 * weight.sum()))
+        light = np.concatenate([
+            _light(self.phase, picked(bodies, slice(k, k + BATCH)), self.points)
+            for k in range(0, len(limit), BATCH)
+        ])  # fmt: skip
+        rest = np.nan_to_num((self.points.magnitude - light) * weight, posinf=0, neginf=0)
+        return self.look(bodies, rest @ c.T @ solver, limit)
 
     def improve(self, state: State, limit: np.ndarray, steps: int, ending: float = 1e-3):
         """Levenberg-Marquardt; ends when no cost fell by ``ending`` in three steps."""
@@ -122,14 +134,20 @@ class Problem:
             # no step of more than half a unit in the logarithms, half a radian in attitude
             size = np.abs(np.delete(step[:, :many], (4, 5, 6), axis=1)).max(1)
             step *= np.minimum(1, 0.5 / np.maximum(size, 1e-30))[:, None]
-            bodies = jax.tree.map(np.asarray, stepped(old.bodies, jnp.asarray(step[:, :many])))
+            parts = [
+                _stepped(picked(old.bodies, cut), step[cut, :many])
+                for cut in (slice(k, k + BATCH) for k in range(0, len(step), BATCH))
+            ]
+            bodies = jax.tree.map(lambda *x: np.concatenate(x), *parts)
             new = self.look(bodies, old.offsets + step[:, many:], limit[moving])
             better = new.cost < old.cost
             gain = np.where(better, old.cost - new.cost, 0)
             for held, found in zip(jax.tree.leaves(state), jax.tree.leaves(new)):
                 held[moving[better]] = found[better]
             damping[moving] = np.clip(damping[moving] * np.where(better, 0.2, 5.0), 1e-9, 1e9)
-            small = gain < ending * np.maximum(1, 1e-3 * old.cost)
+            # a step refused says nothing before the damping is great
+            small = np.where(better, gain < ending * np.maximum(1, 1e-3 * old.cost),
+                             damping[moving] > 10)  # fmt: skip
             quiet[moving] = np.where(small, quiet[moving] + 1, 0)
         return state
 
