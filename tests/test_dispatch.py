@@ -225,3 +225,25 @@ def test_the_first_sample_is_the_given_state():
         found = ph.simulate(scene, ph.State(wxyz, [0.1, 0.9, 0.2]), TS)
         np.testing.assert_allclose(found.wxyz[0], wxyz / np.linalg.norm(wxyz), rtol=1e-15)
         assert np.array_equal(found.omega_body[0], [0.1, 0.9, 0.2])
+
+
+def test_what_was_asked_before_compiles_nothing_again(caplog):
+    """Loops with functions of their own would be new programs in every call outside of ``jit``."""
+    tensor = np.diag([1.0, 2.0, 3.0]) + 0.1
+    orbit = ph.KeplerOrbit(1.0, 2.0, 0.1)
+    scene = ph.Scene(SCENE.inertia, ph.GravityGradient(1.0, orbit))
+    trajectory = ph.simulate(scene, _state(), jnp.array(TS))
+
+    def ask():
+        ph.Inertia.from_tensor(tensor).moments.block_until_ready()
+        trajectory.energy.block_until_ready()
+        ph.LVLH(orbit).attitude(1.5)
+        ph.propagate(SCENE, _state(), 0.1, free=lambda s: s.inertia.diagonal)
+
+    with jax.log_compiles():
+        ask()
+        assert any("XLA compilation" in line for line in caplog.messages)
+        ask()
+        caplog.clear()
+        ask()
+    assert not [line for line in caplog.messages if "XLA compilation" in line]
