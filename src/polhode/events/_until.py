@@ -103,6 +103,16 @@ class _Bracket(NamedTuple):
     samples: list[Array]
 
 
+class _Dip(NamedTuple):
+    """Where a function that keeps its sign at the looks crosses zero and turns back: after which
+    look (N,), ``_LOOKS`` for nowhere; when it turns, its value there and its sign before."""
+
+    place: Array
+    time: Array
+    value: Array
+    side: Array
+
+
 class _Window(NamedTuple):
     """The search under way: the next window begins at ``share`` of the whole, with ``samples``."""
 
@@ -186,40 +196,9 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
             fast = jnp.min(jnp.where(slow, _LOOKS, jnp.arange(_LOOKS + 1)))
             reach = jnp.minimum(reach, jnp.maximum(fast, 1))
         place, is_dip = place[:, :_DIPS], is_dip[:, :_DIPS] & (place[:, :_DIPS] < reach)
-
-        def look(x, k):
-            return jnp.take_along_axis(x, k, axis=-1)
-
-        low, high = look(grid, place), look(grid, place + 1)
-
-        def turning(_):
-            def fn(t):
-                value, slope = until.values(moved_to(begin if exact else seen, t))
-                return slope, value
-
-            return bracketed(fn, low, high, look(slopes, place), look(slopes, place + 1), is_dip)
-
-        none = low, jnp.zeros_like(values[:, :_DIPS])
-        lowest, there = jax.lax.cond(jnp.any(is_dip), turning, lambda _: none, 0)
-        side = look(sides, place)
-        across = is_dip & (jnp.where(there >= 0, 1, -1) != side)
-        pair, some = first_true(across, 1)
-        dip = jnp.where(some, look(place, pair), _LOOKS)[:, 0]
-        lowest, there, side = (look(x, pair)[:, 0] for x in (lowest, there, side))
-        dip_first = dip < change
-        event = jnp.minimum(dip, change)
-        new = busy & (event < reach)
-        here = jnp.where(new, event, 0)[:, None]
-        after = jnp.zeros(n, bool)  # of a pair the second, where the first has the other direction
-        if until.direction:
-            after = jnp.where(side < 0, 1, -1) * forward != until.direction
-        early, late = dip_first & ~after, dip_first & after
-        a, b, fa, fb = (look(x, here + k)[:, 0] for x in (grid, values) for k in (0, 1))
-        fresh = _Bracket(
-            jnp.where(late, lowest, a), jnp.where(early, lowest, b),
-            jnp.where(late, there, fa), jnp.where(early, there, fb),
-            a, [jnp.take_along_axis(x, here[..., None], axis=1)[:, 0] for x in _samples(seen)],
-        )  # fmt: skip
+        dip = _first_dip(until, begin if exact else seen, grid, slopes, sides, place, is_dip)
+        new = busy & (jnp.minimum(dip.place, change) < reach)
+        fresh = _bracket(seen, grid, values, change, dip, until.direction * forward, new)
         found = jax.tree.map(lambda x, y: jnp.where(_as(new, x), x, y), fresh, walk.found)
         alive = walk.alive & (seen.status == Status.SUCCESSFUL)
         samples, met = [x[:, reach] for x in _samples(seen)], walk.met | new
@@ -252,6 +231,47 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
     near, _ = bracketed(fn, *given)
     lost = ~walk.met & walk.alive & (walk.share < 1)
     return walk.met, lost, near[:, 0], jnp.abs(walk.width * span) / _LOOKS
+
+
+def _first_dip(until: Event, motion: Trajectory, grid, slopes, sides, place, is_dip) -> _Dip:
+    """Of the places (N, D) where the function may turn back, the first where it crosses zero."""
+    low, high = _look(grid, place), _look(grid, place + 1)
+
+    def turning(_):
+        def fn(t):
+            value, slope = until.values(moved_to(motion, t))
+            return slope, value
+
+        return bracketed(fn, low, high, _look(slopes, place), _look(slopes, place + 1), is_dip)
+
+    none = low, jnp.zeros_like(low)
+    time, value = jax.lax.cond(jnp.any(is_dip), turning, lambda _: none, 0)
+    side = _look(sides, place)
+    across = is_dip & (jnp.where(value >= 0, 1, -1) != side)
+    pair, some = first_true(across, 1)
+    found = jnp.where(some, _look(place, pair), _LOOKS)
+    return _Dip(*(x[:, 0] for x in (found, *(_look(x, pair) for x in (time, value, side)))))
+
+
+def _bracket(seen: Trajectory, grid, values, change, dip: _Dip, wanted, new) -> _Bracket:
+    """Around the first event, a change of sign between two looks or a dip; ``wanted`` (N,) is the
+    direction in the order of the looks, 0 for any. Where no event is ``new``, any numbers."""
+    here = jnp.where(new, jnp.minimum(dip.place, change), 0)[:, None]
+    # of the pair of crossings at a dip the second, where the first has the other direction
+    second = (wanted != 0) & (jnp.where(dip.side < 0, 1, -1) != wanted)
+    is_dip = dip.place < change
+    early, late = is_dip & ~second, is_dip & second
+    a, b, fa, fb = (_look(x, here + k)[:, 0] for x in (grid, values) for k in (0, 1))
+    return _Bracket(
+        jnp.where(late, dip.time, a), jnp.where(early, dip.time, b),
+        jnp.where(late, dip.value, fa), jnp.where(early, dip.value, fb),
+        a, [jnp.take_along_axis(x, here[..., None], axis=1)[:, 0] for x in _samples(seen)],
+    )  # fmt: skip
+
+
+def _look(x: Array, k: Array) -> Array:
+    """Entries ``k`` (N, D) of the rows of ``x``."""
+    return jnp.take_along_axis(x, k, axis=-1)
 
 
 def _held(lanes: Trajectory, ts: Array, until: Event, met: Array, near: Array, step: Array):
