@@ -74,5 +74,8 @@ def test_steps_join_and_map():
     both = ph.State(jnp.stack([STATE.wxyz, STATE.wxyz]), rates)
     mapped = jax.vmap(lambda state: ph.propagate(scene, state, DT))(both)
     np.testing.assert_allclose(mapped.jacobian[0], half.jacobian, rtol=0, atol=1e-12)
+    for free in (lambda s: s.inertia.size, lambda s: 2 * s.inertia.diagonal):
+        with pytest.raises(ValueError, match="arrays that the scene holds"):
+            ph.propagate(scene, STATE, DT, free=free)
     with pytest.raises(ValueError, match="one body"):
         ph.propagate(scene, both, DT)

@@ -55,7 +55,7 @@ def propagate(
     their entries are the parameters, which stay as they are. ``method``, ``rtol``: as for
     ``ph.simulate``, which raises; under ``jit`` all is NaN where the body did not arrive.
 
-    Raises ValueError for a batch.
+    Raises ValueError for a batch, or a ``free`` that picks what is no array of the scene.
 
         state, jacobian, noise = ph.propagate(scene, state, 0.1)
         covariance = jacobian @ covariance @ jacobian.T + noise @ noise.T * density / 0.1
@@ -81,8 +81,15 @@ def _places(scene: Scene, free: Callable[[Scene], Any] | None) -> tuple[int, ...
     places tell a compiled program whether it is the one asked for."""
     if free is None:
         return ()
-    numbered = jax.tree.unflatten(jax.tree.structure(scene), range(len(jax.tree.leaves(scene))))
-    return tuple(jax.tree.leaves(free(numbered)))
+    leaves, tree = jax.tree.flatten(scene)
+    marks = [object() for _ in leaves]
+    try:
+        return tuple(marks.index(x) for x in jax.tree.leaves(free(tree.unflatten(marks))))
+    except (AttributeError, TypeError, ValueError) as error:
+        raise ValueError(
+            "free must pick arrays that the scene holds, such as lambda s: s.inertia.diagonal, and"
+            f" work nothing out of them: {error}."
+        ) from error
 
 
 @eqx.filter_jit
