@@ -81,6 +81,17 @@ def _rf_core(x: Array, y: Array, z: Array) -> Array:
     return _rf_series(x, y, z)
 
 
+def rd_series(x: Array, y: Array, z: Array) -> Array:
+    """RD of arguments within the spread: DLMF 19.36.2."""
+    mean = (x + y + 3 * z) / 5
+    x, y = 1 - x / mean, 1 - y / mean
+    z = -(x + y) / 3
+    xy, z2 = x * y, z * z
+    e2, e3 = xy - 6 * z2, (3 * xy - 8 * z2) * z
+    e4, e5 = 3 * (xy - z2) * z2, xy * z2 * z
+    return _series(e2, e3, e4, e5) / (mean * jnp.sqrt(mean))
+
+
 def _rd_core(x: Array, y: Array, z: Array) -> Array:
     def wide(state):
         steps, x, y, z, *_ = state
@@ -97,13 +108,7 @@ def _rd_core(x: Array, y: Array, z: Array) -> Array:
 
     start = (0, x, y, z, jnp.zeros_like(x), jnp.ones((), x.dtype))
     _, x, y, z, total, weight = jax.lax.while_loop(wide, duplicate, start)
-    mean = (x + y + 3 * z) / 5
-    x, y = 1 - x / mean, 1 - y / mean
-    z = -(x + y) / 3
-    xy, z2 = x * y, z * z
-    e2, e3 = xy - 6 * z2, (3 * xy - 8 * z2) * z
-    e4, e5 = 3 * (xy - z2) * z2, xy * z2 * z
-    return 3 * total + weight * _series(e2, e3, e4, e5) / (mean * jnp.sqrt(mean))
+    return 3 * total + weight * rd_series(x, y, z)
 
 
 def _rc_of_one(e: Array, one_plus_e: Array) -> Array:

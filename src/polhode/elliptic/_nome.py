@@ -40,6 +40,14 @@ def nome_per_lambda(lam: Array) -> Array:
     return 1 + z * (2 + z * (15 + z * (150 + z * (1707 + z * 20910))))
 
 
+def deficit_per_x(q: Array, per_x: Array, theta3_squared: Array, theta4: Array) -> Array:
+    """(1 - E/K) / x = D/K of the parameter x <= 0.8: theta4'' over theta4, DLMF 20.2.4, 19.25.1."""
+    q3 = q * q * q
+    q4 = q3 * q
+    bend = 1 - q3 * (4 - q4 * q * (9 - 16 * q4 * q3))
+    return 8 * per_x * bend / (theta4 * theta3_squared * theta3_squared)
+
+
 def nome(m: Array, m1: Array) -> Nome:
     """The nome and theta constants of min(m, m1), with m + m1 = 1, every number to a few ulps."""
     circular = m <= m1
@@ -57,8 +65,8 @@ def nome(m: Array, m1: Array) -> Nome:
     theta3, theta4 = 1 + above, 1 - 2 * (q - q4 + q9)
     theta2 = 1 + q2 * (1 + q4)
     excess = above * (2 + above)
-    deficit_per_x = 8 * per_x * (1 - q * q2 * (4 - 9 * q4 * q)) / (theta4 * (1 + excess) ** 2)
-    return Nome(circular, x, q, per_x, excess, theta2, theta3, theta4, deficit_per_x)
+    deficit = deficit_per_x(q, per_x, 1 + excess, theta4)
+    return Nome(circular, x, q, per_x, excess, theta2, theta3, theta4, deficit)
 
 
 _LN2_HEAD, _LN2_TAIL = 0.693145751953125, 1.4286068203094173e-06

@@ -87,10 +87,10 @@ def _limits(dtype) -> tuple[float, float]:
     return 2.0**-bits, 2.0 ** -(bits // 2)
 
 
-def _nome(square: Scalars, root: Scalars) -> Scalars:
-    """The nome of parameter ``square`` <= 0.8; ``root``: root of the complementary modulus."""
-    e = square / (2 * (1 + root * root) * (1 + root) ** 2)
-    return e * nome_per_lambda(e)
+def nome_per_square(square: Scalars, root: Scalars) -> Scalars:
+    """The nome over its parameter ``square`` <= 0.8; ``root``: of the complementary modulus."""
+    share = 1 / (2 * (1 + root * root) * (1 + root) ** 2)
+    return share * nome_per_lambda(share * square)
 
 
 def means(circular, endless, x: Scalars, m: Scalars, m1: Scalars, one: Scalars):
@@ -102,7 +102,7 @@ def means(circular, endless, x: Scalars, m: Scalars, m1: Scalars, one: Scalars):
     for _ in range(_STEPS - 1):
         a, b = (a + b) / 2, jnp.sqrt(a * b)
     mean = (a + b) / 2
-    nome = _nome(square, jnp.sqrt(other))
+    nome = square * nome_per_square(square, jnp.sqrt(other))
     mean, nome = settled((mean, nome), one)
     log_nome = jnp.where(circular | endless, 1, -jnp.log(jnp.where(circular | endless, 0.5, nome)))
     return mean, nome, log_nome, settled(omega * mean, one)

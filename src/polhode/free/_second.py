@@ -6,23 +6,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode.free._motion import Swing
+from polhode.elliptic._carlson import rd_series
+from polhode.elliptic._nome import deficit_per_x
+from polhode.free._motion import Swing, nome_per_square
 from polhode.free._roles import Triple
 
 Scalars = Float[Array, "*b"]
 
 _DUPLICATIONS = 14
-
-
-def _tail(x: Scalars, y: Scalars, z: Scalars) -> Scalars:
-    """R_D of three nearly equal arguments (Carlson, Numer. Algorithms 10 (1995), eq. 2.28)."""
-    mean = (x + y + 3 * z) / 5
-    a, b = 1 - x / mean, 1 - y / mean
-    c = -(a + b) / 3
-    e2, e3 = a * b - 6 * c * c, (3 * a * b - 8 * c * c) * c
-    e4, e5 = 3 * (a * b - c * c) * c * c, a * b * c * c * c
-    series = 1 - 3 / 14 * e2 + e3 / 6 + 9 / 88 * e2 * e2 - 3 / 22 * e4
-    return (series - 9 / 52 * e2 * e3 + 3 / 26 * e5) / (mean * jnp.sqrt(mean))
 
 
 def incomplete(S: Scalars, C: Scalars, N: Scalars, many: bool) -> tuple[Scalars, Scalars]:
@@ -53,7 +44,9 @@ def incomplete(S: Scalars, C: Scalars, N: Scalars, many: bool) -> tuple[Scalars,
             carry = duplicate(k, carry)
     first, second, x, y, z, share = carry
     cube = S * S * S
-    return cube * (first + share / 3 * _tail(x, y, z)), cube * (second + share / 3 * _tail(x, z, y))
+    return cube * (first + share / 3 * rd_series(x, y, z)), cube * (
+        second + share / 3 * rd_series(x, z, y)
+    )
 
 
 def complete(swing: Swing) -> tuple[Scalars, Scalars]:
@@ -66,16 +59,8 @@ def quarter_turn(circular, endless, m, m1, mean, log_nome, inverse_rate):
     """The same from the parameter, its complement and what comes of their mean."""
     square = jnp.where(circular, m, m1)
     other = jnp.sqrt(jnp.where(circular, m1, m))
-    a, b = (1 + other) / 2, jnp.sqrt(other)
-    part = 1 / (2 * (1 + other))
-    gap = square * part
-    total, weight = 1 + 2 * gap * part, 2
-    for _ in range(3):
-        a, b = (a + b) / 2, jnp.sqrt(a * b)
-        part, gap = gap * part / (4 * a), gap * gap / (4 * a)
-        weight *= 2
-        total = total + weight * gap * part
-    half = total / 2
+    per_square = nome_per_square(square, jnp.sqrt(other))
+    half = deficit_per_x(square * per_square, per_square, 1 / mean, jnp.sqrt(other / mean))
     quarter = jnp.where(circular, math.pi, log_nome) / (2 * mean)
     m = jnp.where(circular, 1, m)
     first = jnp.where(circular, quarter * half, (quarter * (1 - m1 * half) - mean) / m)
