@@ -7,7 +7,7 @@ from polhode.free._evaluate import (
     is_abreast as is_abreast,
     prepare as prepare,
 )
-from polhode.free._motion import FreeMotion as FreeMotion
+from polhode.free._motion import FreeConstants as FreeConstants
 from polhode.free._periods import Mode as Mode, Periods as Periods, periods as periods
 from polhode.free._symmetric import (
     spherical_motion as spherical_motion,

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from polhode.free._compensated import compensate
 from polhode.free._flow import Instant, advance, attitude, rates
 from polhode.free._frame import Quadruple
-from polhode.free._motion import FreeMotion, Swing, Turning, prepare_swing, prepare_turning
+from polhode.free._motion import FreeConstants, Swing, Turning, prepare_swing, prepare_turning
 from polhode.free._roles import Triple, assign_roles
 from polhode.free._rule import Found, answer_rule
 from polhode.xla import kernel, opaque_ones
@@ -33,7 +33,7 @@ def components(values, count: int) -> tuple[Scalars, ...]:
     return tuple(values[..., k] for k in range(count))
 
 
-def prepare(moments, wxyz, omega, products=None, *, compensated: bool = False) -> FreeMotion:
+def prepare(moments, wxyz, omega, products=None, *, compensated: bool = False) -> FreeConstants:
     """Constants of the exact motion of free bodies.
 
     **Arguments:** principal ``moments`` (..., 3), positive, in any order; initial attitude
@@ -51,11 +51,11 @@ def prepare(moments, wxyz, omega, products=None, *, compensated: bool = False) -
     turning = None if wxyz is None else prepare_turning(swing, wxyz)
     if compensated:
         swing, turning = compensate(swing, turning, roles)
-    return FreeMotion(moments, products, omega, wxyz, swing, turning)
+    return FreeConstants(moments, products, omega, wxyz, swing, turning)
 
 
 def evaluate(
-    motion: FreeMotion, t: Float[Array, "..."], *, attitude: bool = True, rates: bool = True
+    motion: FreeConstants, t: Float[Array, "..."], *, attitude: bool = True, rates: bool = True
 ) -> tuple[Triple | None, Quadruple | None]:
     """Body rates and attitude at times ``t`` from the start, as tuples of component arrays.
 
@@ -136,7 +136,7 @@ def _abreast(given, t, compensated: bool, wanted):
 
     def at(given, found, t):
         moments, wxyz, omega, products = given
-        return evaluate(FreeMotion(moments, products, omega, wxyz, *found), t, **wanted)
+        return evaluate(FreeConstants(moments, products, omega, wxyz, *found), t, **wanted)
 
     # Coefficients of the derivative are worked out again where they are used: kept for all times
     # they would go through the memory, which takes longer.

@@ -66,7 +66,7 @@ class Turning(NamedTuple):
     pace_low: Scalars | None = None
 
 
-class FreeMotion(NamedTuple):
+class FreeConstants(NamedTuple):
     """Per-body constants of the exact free motion; every field has the shape of the batch.
 
     ``moments``, ``products``, ``omega`` and ``wxyz`` are the input, through which alone
