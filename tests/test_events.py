@@ -191,6 +191,52 @@ def test_derivatives_of_a_motion_that_stops():
     np.testing.assert_allclose(many, [known(0.4, 0.6)[0], known(0.4, 1.3)[0]], rtol=1e-12)
 
 
+def test_second_derivatives_of_events():
+    """Of times, states and slopes, by the closed form of a ball; both orders of the modes."""
+
+    def known_of(given):
+        rate, level = given
+        phase = jnp.pi + jnp.arcsin(level)
+        half = jnp.cos(phase / 2), 0 * phase, jnp.sin(phase / 2), 0 * phase
+        return jnp.stack([phase / rate, *half, -rate * jnp.cos(phase)])
+
+    def found(given):
+        rate, level = given
+        state = ph.State(STATE.wxyz, jnp.stack([0 * rate, rate, 0 * rate]))
+        event, span = ph.Event(Height(level), 1, samples=64), jnp.array([0.0, 10.0])
+        held = ph.simulate(BALL, state, span, until=event)
+        crossed = ph.crossings(ph.simulate(BALL, state, span), event, most=2)
+        last = [held.event_time[None], held.last.wxyz, crossed.slope[:1]]
+        return jnp.concatenate(last), crossed.times[0]
+
+    given = jnp.array([RATE, 0.4])
+    want = jax.hessian(known_of)(given)
+    for second in (jax.jacfwd(jax.jacrev(found)), jax.jacrev(jax.jacfwd(found))):
+        of_held, of_crossed = jax.jit(second)(given)
+        np.testing.assert_allclose(of_held, want, atol=1e-13)
+        np.testing.assert_allclose(of_crossed, want[0], atol=1e-13)
+
+
+def test_second_derivatives_of_the_event_of_a_stepped_top():
+    """Of time and attitude, by central differences of first derivatives."""
+
+    def stop(rate):
+        state = ph.State([np.cos(0.5), np.sin(0.5), 0.0, 0.0], jnp.stack([0.1, rate, 0.3]))
+        across = ph.Event(lambda wxyz, omega_body, t: wxyz[1] - 0.4, -1)
+        held = ph.simulate(PENDULUM, state, [0.0, 10.0], rtol=1e-11, until=across)
+        return held.event_time + held.last.wxyz @ jnp.array([3.0, 0.0, 2.0, 1.0])
+
+    def slope(rate):
+        first = jax.grad(stop)(rate)
+        return first, first
+
+    both = jax.jit(jax.jacfwd(slope, has_aux=True))
+    (second, _), step = both(0.2), 1e-4
+    want = (both(0.2 + step)[1] - both(0.2 - step)[1]) / (2 * step)
+    assert abs(want) > 0.1
+    np.testing.assert_allclose(second, want, rtol=1e-6)
+
+
 def test_what_is_never_met_is_given_up(monkeypatch):
     monkeypatch.setattr("polhode.events._until._MOST", 10)
     never = ph.Event(lambda wxyz, omega_body, t: omega_body[1] - 3.5)
