@@ -171,7 +171,9 @@ def _from_nearest(motion: Motion, scene: Scene, samples, ts, times):
 def shortly_after(trajectory: Trajectory, late: Array) -> Trajectory:
     """Samples so little later, by ``late`` (..., T) [s], that three terms of their Taylor series
     lead there: of what is no later but for its derivatives, values and two derivatives."""
-    samples = [x for x in (trajectory.wxyz, trajectory.omega_body, trajectory.spins) if x is not None]
+    samples = [
+        x for x in (trajectory.wxyz, trajectory.omega_body, trajectory.spins) if x is not None
+    ]
     found = _along(trajectory._scene, samples, trajectory._t, late[..., None])
     wxyz, omega, *spins = found
     return Trajectory(
