@@ -65,9 +65,10 @@ def crossings(
     given.
 
     Times are as accurate as the motion: to rounding for exact laws, to ``rtol`` over the slope for
-    stepped ones. They have first and second derivatives, by the implicit function theorem, in all that
-    the motion depends on, and so has ``slope``; third ones are wrong. A crossing at the first time (within 1e-6 of the time between two looks) is where the motion comes
-    from, not one that it makes.
+    stepped ones. They have first and second derivatives, by the implicit function theorem, in all
+    that the motion depends on, and so has ``slope``; third ones are wrong. A crossing at the first
+    time (within 1e-6 of the time between two looks) is where the motion comes from, not one that it
+    makes.
 
     The guarantee: the function and its rate of change are looked at 32 times in a turn of the
     fastest natural rate, the largest of |L| over the smallest moment at the saved samples and of

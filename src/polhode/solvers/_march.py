@@ -250,9 +250,9 @@ def march(
         follows = CAUTION * sound**-power * walk.before ** (MEMORY * power)
         again = CAUTION * sound**-power
         factor = jnp.where(good, jnp.clip(follows, 0.2, 4), jnp.clip(again, 0.1, 0.9))
-        if limits.jumps:  # after one an error is rounding: how much longer a step may be is unseen
-            tiny = good & (error < eps) & (4 * angle < eps**power)
-            factor = jnp.where(tiny, 4, factor)
+        # of steps that a jump has cut to units in the last place of the time the error is rounding,
+        # which does not tell how much longer they may be
+        factor = jnp.where(good & (width < 64 * grain.astype(dtype)) & ~cut, 4, factor)
         wanted = jnp.where(good & cut, jnp.maximum(walk.width, width * factor), width * factor)
         wanted = jnp.where(good | (width > grain.astype(dtype)), wanted, 0)
         wanted = jnp.where(live(walk), wanted, walk.width)
