@@ -1,5 +1,10 @@
 """Events: times known in closed form, pairs between looks, derivatives, and motions that stop."""
 
+import json
+import subprocess
+import sys
+from pathlib import Path
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -189,6 +194,118 @@ def test_derivatives_of_a_motion_that_stops():
     np.testing.assert_allclose(q_level, change, rtol=1e-11, atol=1e-15)
     many = jax.vmap(stop, (0, None))(jnp.array([0.6, 1.3]), given[1])[0]
     np.testing.assert_allclose(many, [known(0.4, 0.6)[0], known(0.4, 1.3)[0]], rtol=1e-12)
+
+
+def test_second_derivatives_of_events():
+    """Of times, states and slopes, by the closed form of a ball."""
+
+    def known_of(given):
+        rate, level = given
+        phase = jnp.pi + jnp.arcsin(level)
+        half = jnp.cos(phase / 2), 0 * phase, jnp.sin(phase / 2), 0 * phase
+        return jnp.stack([phase / rate, *half, -rate * jnp.cos(phase)])
+
+    def found(given):
+        rate, level = given
+        state = ph.State(STATE.wxyz, jnp.stack([0 * rate, rate, 0 * rate]))
+        event, span = ph.Event(Height(level), 1, samples=64), jnp.array([0.0, 10.0])
+        held = ph.simulate(BALL, state, span, until=event)
+        crossed = ph.crossings(ph.simulate(BALL, state, span), event, most=2)
+        last = [held.event_time[None], held.last.wxyz, crossed.slope[:1]]
+        return jnp.concatenate(last), crossed.times[0]
+
+    given = jnp.array([RATE, 0.4])
+    want = jax.hessian(known_of)(given)
+    of_held, of_crossed = jax.jit(jax.hessian(found))(given)
+    np.testing.assert_allclose(of_held, want, atol=1e-13)
+    np.testing.assert_allclose(of_crossed, want[0], atol=1e-13)
+
+
+@pytest.mark.slow
+def test_second_derivatives_of_the_event_of_a_stepped_top():
+    """Of time and attitude, by central differences of first derivatives."""
+
+    def stop(rate):
+        state = ph.State([np.cos(0.5), np.sin(0.5), 0.0, 0.0], jnp.stack([0.1, rate, 0.3]))
+        across = ph.Event(lambda wxyz, omega_body, t: wxyz[1] - 0.4, -1)
+        held = ph.simulate(PENDULUM, state, [0.0, 10.0], rtol=1e-11, until=across)
+        return held.event_time + held.last.wxyz @ jnp.array([3.0, 0.0, 2.0, 1.0])
+
+    def slope(rate):
+        first = jax.grad(stop)(rate)
+        return first, first
+
+    both = jax.jit(jax.jacfwd(slope, has_aux=True))
+    (second, _), step = both(0.2), 1e-4
+    want = (both(0.2 + step)[1] - both(0.2 - step)[1]) / (2 * step)
+    assert abs(want) > 0.1
+    np.testing.assert_allclose(second, want, rtol=1e-6)
+
+
+class Edge(eqx.Module):
+    """Of a dead zone of yaw and rate; on which ``side`` is a leaf, which a scan may change."""
+
+    side: jax.Array
+
+    def __call__(self, wxyz, omega_body, t):
+        return self.side * (2 * jnp.arctan2(wxyz[3], wxyz[0]) + omega_body[2]) - 0.1
+
+
+def switching_times(leak, pushes, sides):
+    """Roots of a + b s + c s^2 of each leg, by NumPy."""
+    yaw, rate, t, times = 0.0, 0.0, 0.0, []
+    for push, side in zip(pushes, sides):
+        gain = (leak + push) / 2.5
+        roots = np.roots([gain / 2, rate + gain, yaw + rate - side * 0.1])
+        leg = min(x.real for x in roots if abs(x.imag) < 1e-12 and x.real > 1e-6)
+        yaw, rate, t = yaw + rate * leg + gain * leg**2 / 2, rate + gain * leg, t + leg
+        times.append(t)
+    return np.array(times)
+
+
+@pytest.mark.slow
+def test_switching_in_a_scan_has_derivatives():
+    """On, off, on, off under jit, lax.scan and reverse mode: by the leak."""
+    pushes, sides = jnp.array([0.0, -0.1] * 2), jnp.array([1.0, -1.0] * 2)
+
+    @jax.jit
+    def times(leak):
+        def leg(carry, given):
+            (state, t), (push, side) = carry, given
+            torque = ph.BodyTorque(jnp.stack([0 * push, 0 * push, leak + push]))
+            scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 2.5]), None, torque)
+            span, event = t + jnp.array([0.0, 1e4]), ph.Event(Edge(side), 1)
+            found = ph.simulate(scene, state, span, until=event)
+            return (found.last, found.event_time), found.event_time
+
+        start = ph.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3)), jnp.zeros(())
+        _, found = jax.lax.scan(leg, start, (pushes, sides))
+        return found, found
+
+    slopes, found = jax.jit(jax.jacrev(times, has_aux=True))(0.02)
+    np.testing.assert_allclose(found, switching_times(0.02, pushes, sides), rtol=1e-12)
+    ends = (switching_times(0.02 + x, pushes, sides) for x in (1e-6, -1e-6))
+    np.testing.assert_allclose(slopes, np.subtract(*ends) / 2e-6, rtol=1e-7)
+    many, _ = jax.jit(jax.vmap(times))(jnp.array([0.02, 0.03]))
+    for leak, row in zip((0.02, 0.03), many):
+        np.testing.assert_allclose(row, switching_times(leak, pushes, sides), rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_batch_on_two_devices_stops_as_on_one():
+    script = Path(__file__).with_name("sharded_until.py")
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, timeout=300, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found.pop("devices") == 2
+    assert set(found) == {"exact", "stepped"}
+    for name, case in found.items():
+        assert case["away"] < 1e-12, name
+        assert case["same"], name  # status, and which bodies meet their event
+        assert case["met"] == [True, True, False, True], name
+        assert case["kept"], name  # each body stays where it is
 
 
 def test_what_is_never_met_is_given_up(monkeypatch):

@@ -77,5 +77,8 @@ def test_steps_join_and_map():
     for free in (lambda s: s.inertia.size, lambda s: 2 * s.inertia.diagonal):
         with pytest.raises(ValueError, match="arrays that the scene holds"):
             ph.propagate(scene, STATE, DT, free=free)
+    for given in ((scene, STATE.wxyz), (STATE, STATE)):
+        with pytest.raises(TypeError, match=r"must be a ph\."):
+            ph.propagate(*given, DT)
     with pytest.raises(ValueError, match="one body"):
         ph.propagate(scene, both, DT)

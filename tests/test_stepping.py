@@ -151,6 +151,27 @@ def test_a_push_after_rest_or_on_a_turning_body_is_seen(kind):
     assert np.all(got.steps < 800)
 
 
+@pytest.mark.parametrize(
+    ("rates", "inclusive", "ts"),
+    [([0.0, 0.5, 0.1], True, [0.0, 50.0, 100.0]), ([0.0, 0, 0], False, [0.0, 50.0, 100.0])],
+    ids=["turning", "resting"],
+)
+def test_steps_go_on_from_a_jump_at_a_saved_time(rates, inclusive, ts):
+    """Steps of few units in the last place of the time grow again, or are cut until they pass."""
+
+    def push(t):
+        acts = t >= 50 if inclusive else t > 50
+        return jnp.where(acts, 1.0, 0.0) * jnp.array([0.0, 0.3, 0.1])
+
+    inertia, start = ph.Inertia.from_moments([1.0, 2.0, 2.5]), ph.State([1.0, 0, 0, 0], rates)
+    got = ph.simulate(ph.Scene(inertia, None, ph.BodyTorque(push)), start, ts)
+    assert got.steps < 1200
+    there = ph.simulate(ph.Scene(inertia), start, ts[:2]).last
+    pushed = ph.Scene(inertia, None, ph.BodyTorque([0.0, 0.3, 0.1]))
+    want = ph.simulate(pushed, there, ts[1:], rtol=1e-11)
+    assert rotation.angle_between(got.wxyz[-1], want.wxyz[-1]) < 1e-8
+
+
 def test_a_brake_that_lets_go_at_a_rate():
     """About one axis, with a constant torque down to a rate of 1/2: the angle is elementary."""
     rates = np.array([0.8, -1.5])

@@ -129,12 +129,12 @@ def _from_nearest(motion: Motion, scene: Scene, samples, ts, times):
         there = begin == end
         span = jnp.stack([begin, jnp.where(there, begin + unit, end)], axis=-1)
         found = motion.method.run(scene, State(wxyz, omega), span, rtol, final)
-        # where no time passes, the sample itself, which has its rates for derivatives
+        # where no time passes, the sample itself, with its derivatives by the time
         step = jnp.broadcast_to((end - begin)[..., None], (*wxyz.shape[:-1], 1))
         here = jnp.broadcast_to(there[..., None], step.shape)
-        rates = [rotation.wxyz_rate(wxyz, omega), *_rates(scene, wxyz, omega, spins, begin)]
         ends = [x[:, 0] for x in (found.wxyz, found.omega_body, found.spins) if x is not None]
-        kept = [jnp.where(here, x + step * rate, end) for x, rate, end in zip(start, rates, ends)]
+        near = _along(scene, start, begin, jnp.where(here, step, 0))
+        kept = [jnp.where(here, x, end) for x, end in zip(near, ends)]
         return (
             kept,
             jnp.where(here[:, 0], Status.SUCCESSFUL, found.status),
@@ -168,11 +168,34 @@ def _from_nearest(motion: Motion, scene: Scene, samples, ts, times):
     return found, jnp.max(status, axis=-1), jnp.sum(steps, axis=-1)
 
 
-def _rates(scene: Scene, wxyz: Array, omega: Array, spins: list[Array], t: Array) -> list[Array]:
-    """Acceleration of lanes, and what their coupled wheels gain."""
-    now = tuple(spins[0][..., i] for i in range(spins[0].shape[-1])) if spins else ()
-    acceleration, changes = scene.with_spins(now).changes(wxyz, omega, t)
-    return [acceleration, *([jnp.stack(changes, axis=-1)] if changes else [])]
+def shortly_after(trajectory: Trajectory, late: Array) -> Trajectory:
+    """Samples so little later, by ``late`` (..., T) [s], that three terms of their Taylor series
+    lead there: of what is no later but for its derivatives, values and two derivatives."""
+    samples = [
+        x for x in (trajectory.wxyz, trajectory.omega_body, trajectory.spins) if x is not None
+    ]
+    found = _along(trajectory._scene, samples, trajectory._t, late[..., None])
+    wxyz, omega, *spins = found
+    return Trajectory(
+        trajectory._t + late, wxyz, omega, trajectory.status, trajectory.steps, trajectory.scene,
+        spins=spins[0] if spins else None, motion=trajectory.motion,
+    )  # fmt: skip
+
+
+def _along(scene: Scene, samples: list[Array], t: Array, step: Array) -> list[Array]:
+    """Samples (..., 4), (..., 3) and momenta of coupled wheels, a ``step`` (..., 1) [s] later."""
+
+    def rates(samples, t):
+        wxyz, omega, *spins = samples
+        now = tuple(jnp.moveaxis(spins[0], -1, 0)) if spins else ()
+        acceleration, turned = scene.with_spins(now).changes(wxyz, omega, t)
+        more = [jnp.stack(jnp.broadcast_arrays(*turned), axis=-1)] if turned else []
+        return [rotation.wxyz_rate(wxyz, omega), acceleration, *more]
+
+    given = list(samples), jnp.asarray(t)
+    first = rates(*given)
+    _, second = jax.jvp(rates, given, (first, jnp.ones_like(given[1])))
+    return [x + step * (a + step / 2 * b) for x, a, b in zip(samples, first, second)]
 
 
 def _nearest(ts: Array, times: Array) -> Array:

@@ -14,7 +14,14 @@ from polhode import rotation
 from polhode._scene import Scene
 from polhode._simulate import simulate
 from polhode._state import State
-from polhode.methods import AbstractMethod, Status, check_inputs, check_rtol, raise_on_failure
+from polhode.methods import (
+    AbstractMethod,
+    Status,
+    check_inputs,
+    check_kinds,
+    check_rtol,
+    raise_on_failure,
+)
 
 _NODES = 8
 """Gauss points that the effect of a disturbance is summed over; their error falls with the 16th
@@ -55,11 +62,13 @@ def propagate(
     their entries are the parameters, which stay as they are. ``method``, ``rtol``: as for
     ``ph.simulate``, which raises; under ``jit`` all is NaN where the body did not arrive.
 
-    Raises ValueError for a batch, or a ``free`` that picks what is no array of the scene.
+    Raises ValueError for a batch, or a ``free`` that picks what is no array of the scene; TypeError
+    for what is no scene or no state.
 
         state, jacobian, noise = ph.propagate(scene, state, 0.1)
         covariance = jacobian @ covariance @ jacobian.T + noise @ noise.T * density / 0.1
     """
+    check_kinds(scene, state)
     if state.wxyz.ndim > 1 or state.omega_body.ndim > 1:
         raise ValueError(
             "propagate takes one body, got a state of shapes"

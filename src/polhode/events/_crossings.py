@@ -65,10 +65,10 @@ def crossings(
     given.
 
     Times are as accurate as the motion: to rounding for exact laws, to ``rtol`` over the slope for
-    stepped ones. They have first derivatives, by the implicit function theorem, in all that the
-    motion depends on; second ones are wrong, as they are of ``ph.simulate(..., until=)``. A
-    crossing at the first time (within 1e-6 of the time between two looks) is where the motion comes
-    from, not one that it makes.
+    stepped ones. They have first and second derivatives, by the implicit function theorem, in all
+    that the motion depends on, and so has ``slope``; third ones are wrong. A crossing at the first
+    time (within 1e-6 of the time between two looks) is where the motion comes from, not one that it
+    makes.
 
     The guarantee: the function and its rate of change are looked at 32 times in a turn of the
     fastest natural rate, the largest of |L| over the smallest moment at the saved samples and of
@@ -252,15 +252,13 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> tuple
 
 
 def _polished(trajectory: Trajectory, event: Event, times: Array, use: Array):
-    """Slopes, and times with their derivatives: one step of Newton's method."""
+    """Slopes and times with their derivatives."""
     safe = jnp.where(use, times, trajectory.ts[..., :1])
-    value, slope = event.values(moved_to(trajectory, safe))
-    divisor = jax.lax.stop_gradient(jnp.where(slope == 0, 1, slope))
-    change = jnp.where(slope == 0, 0, -value / divisor)
     # of the value no more than rounding is left to mend, or of a touch all digits are noise
     grain = 64 * jnp.finfo(safe.dtype).eps * jnp.abs(safe)
-    kept = jax.lax.stop_gradient(jnp.clip(change, -grain, grain))
-    return slope, safe + (change - jax.lax.stop_gradient(change)) + kept
+    late, there = event.polished(moved_to(trajectory, safe), grain)
+    _, slope = event.values(there)
+    return slope, safe + late
 
 
 def dips_of(grid, values, slopes, sides) -> Array:

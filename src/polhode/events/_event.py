@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polhode import rotation
+from polhode._motion import shortly_after
 from polhode._trajectory import Trajectory
 from polhode.parts import checked, mapped
 
@@ -57,6 +58,23 @@ class Event(eqx.Module):
             return mapped("Event", self.fn, _ARGUMENTS, _SHAPES, (), wxyz, omega, t)
 
         return jax.jvp(value, (wxyz, omega, t), slopes)
+
+    def polished(self, near: Trajectory, most: Array) -> tuple[Array, Trajectory]:
+        """At samples ``near`` events: how much later (..., T) [s] these are, at most by ``most``,
+        and the samples then.
+
+        Steps t - g(t)/s with one slope s for all: where g(t) is zero they move nothing, and after
+        two of them t has the first and second derivatives of the root.
+        """
+        still = jax.lax.stop_gradient
+        value, slope = self.values(near)
+        touch, chord = slope == 0, still(jnp.where(slope == 0, 1, slope))
+        late = jnp.where(touch, 0, -value / chord)
+        late = late - still(late) + still(jnp.clip(late, -most, most))
+        value, _ = self.values(shortly_after(near, late))
+        change = jnp.where(touch, 0, -value / chord)
+        late = late + (change - still(change))
+        return late, shortly_after(near, late)
 
 
 def at_least(name: str, value: Any, least: int) -> int | None:

@@ -8,7 +8,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode import rotation
 from polhode._batch import PARTS, flatten
 from polhode._motion import moved_through, moved_to
 from polhode._scene import Scene
@@ -283,39 +282,28 @@ def _held(lanes: Trajectory, ts: Array, until: Event, met: Array, near: Array, s
         end = sign * jnp.max(sign * end)
     far = (sign * end)[..., None] < sign[..., None] * ts
     moved = moved_through(lanes, jnp.where(far, end[..., None], ts))
-    near = jnp.where(met, near, ts[..., 0])[:, None]
-    there = moved_to(moved, near)
-    value, slope = until.values(there)
-    known = jax.lax.stop_gradient(jnp.where(slope == 0, 1, slope))
-    change = jnp.where(slope == 0, 0, -value / known)
+    if ts.ndim > 1 or met.size == 1:  # the last sample of each body is at its own event
+        there = moved[..., -1:]
+    else:
+        there = moved_to(moved, jnp.where(met, near, ts[..., 0])[:, None])
     # the motion in windows differed from this one by no more than the tolerance allows
-    most = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(near)
+    most = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(there._t)
     motion: Any = lanes.motion
     if not motion.method.exact:
         most = jnp.maximum(most, 1e-4 * step.reshape(-1, 1))
-    kept = jax.lax.stop_gradient(jnp.clip(change, -most, most))
-    event = near + (change - jax.lax.stop_gradient(change)) + kept
-    late = (event - jax.lax.stop_gradient(near))[..., None]
-    at_event = _shortly_after(there, late)
+    late, at_event = until.polished(there, most)
+    event = there._t + late
     rows = jnp.broadcast_to(ts, (event.shape[0], ts.shape[-1]))
     past = met[:, None] & (sign.reshape(-1, 1) * (rows - event) >= 0)
     held = [
-        jnp.where(past[..., None], x, y) for x, y in zip(at_event, _samples(moved), strict=True)
+        jnp.where(past[..., None], x, y)
+        for x, y in zip(_samples(at_event), _samples(moved), strict=True)
     ]
     wxyz, omega, *spins = held
     status = jnp.where(met, there.status, moved.status)
     times = jnp.where(past, event, rows)
     event = jnp.where(met, event[:, 0], jnp.inf)
     return wxyz, omega, spins[0] if spins else None, status, moved.steps, times, event
-
-
-def _shortly_after(there: Trajectory, late: Array) -> list[Array]:
-    """Samples so little later that a straight line leads there."""
-    wxyz, omega, *spins = _samples(there)
-    acceleration, turned = there._scene.changes(wxyz, omega, there._t)
-    rates = [rotation.wxyz_rate(wxyz, omega), acceleration]
-    rates += [jnp.stack(jnp.broadcast_arrays(*turned), axis=-1)] if turned else []
-    return [x + late * rate for x, rate in zip((wxyz, omega, *spins), rates, strict=True)]
 
 
 def _samples(trajectory: Trajectory) -> list[Array]:

@@ -69,6 +69,9 @@ class RotatingFrame(eqx.Module):
 
     ``turning`` tells attitude and rates; ``origin`` is None or a function of time giving the
     origin's position in space components [m], whose derivatives are found by differentiation.
+
+    As of every ``eqx.Module`` a method holds the frame's arrays, which ``jax.jit`` cannot take as
+    fixed: ``eqx.filter_jit(frame.omega)(t)``, or hand the frame in as an argument.
     """
 
     turning: AbstractTurning

@@ -12,6 +12,7 @@ from polhode.methods._charts import (
 )
 from polhode.methods._inputs import (
     check_inputs as check_inputs,
+    check_kinds as check_kinds,
     check_method as check_method,
     check_rtol as check_rtol,
     check_times as check_times,

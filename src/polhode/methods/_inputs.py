@@ -38,13 +38,18 @@ def _is_solver_class(x: Any) -> bool:
     return isinstance(x, type) and issubclass(x, diffrax.AbstractSolver)
 
 
+def check_kinds(scene: Any, state: Any) -> None:
+    """A scene and a state."""
+    for name, value, kind in (("scene", scene, Scene), ("state", state, State)):
+        if not isinstance(value, kind):
+            raise TypeError(f"{name} must be a ph.{kind.__name__}, got {type(value).__name__}.")
+
+
 def check_inputs(
     scene: Any, state: Any, ts: Any, record: Any
 ) -> tuple[Scene, State, Array, Record]:
     """Kinds, dtypes and times, with messages that tell the mend."""
-    for name, value, kind in (("scene", scene, Scene), ("state", state, State)):
-        if not isinstance(value, kind):
-            raise TypeError(f"{name} must be a ph.{kind.__name__}, got {type(value).__name__}.")
+    check_kinds(scene, state)
     record = Record() if record is None else record
     if not isinstance(record, Record):
         raise TypeError(f"record must be a ph.Record or None, got {type(record).__name__}.")

@@ -225,9 +225,15 @@ def march(
         left = (due - walk.gone).astype(dtype)
         # no step is much shorter than its neighbours for the sake of the end
         width = jnp.where(left <= walk.width, left, jnp.minimum(walk.width, left / 2))
-        # to a time that is a number: thousands of rounded sums would add up to another time
-        exact = ((walk.gone + width.astype(walk.gone.dtype)) - walk.gone).astype(dtype)
-        width = jnp.where(width == left, left, exact)
+        cut = width < 0.999 * walk.width  # for the sake of a time, not by rounding
+        # to a time that is a number: thousands of rounded sums would add up to another time; down
+        # after a step refused, or that would be tried again and again
+        near = walk.gone + width.astype(walk.gone.dtype)
+        grain = jnp.nextafter(near, jnp.inf) - near
+        exact = (near - walk.gone).astype(dtype)
+        down = (exact > width) & (walk.refused[1] > 0)
+        exact = jnp.where(down, (near - grain - walk.gone).astype(dtype), exact)
+        width = jnp.where(width == left, left, jnp.maximum(exact, grain.astype(dtype)))
         width = jnp.where(live(walk), width, 0)
         gone, h = (x if own else jnp.max(x) for x in (walk.gone, width))
         t, h = start + sign * gone, sign.astype(dtype) * h
@@ -244,8 +250,11 @@ def march(
         follows = CAUTION * sound**-power * walk.before ** (MEMORY * power)
         again = CAUTION * sound**-power
         factor = jnp.where(good, jnp.clip(follows, 0.2, 4), jnp.clip(again, 0.1, 0.9))
-        cut = good & (width < 0.999 * walk.width)  # for the sake of a time, not by rounding
-        wanted = jnp.where(cut, jnp.maximum(walk.width, width * factor), width * factor)
+        # of steps that a jump has cut to units in the last place of the time the error is rounding,
+        # which does not tell how much longer they may be
+        factor = jnp.where(good & (width < 64 * grain.astype(dtype)) & ~cut, 4, factor)
+        wanted = jnp.where(good & cut, jnp.maximum(walk.width, width * factor), width * factor)
+        wanted = jnp.where(good | (width > grain.astype(dtype)), wanted, 0)
         wanted = jnp.where(live(walk), wanted, walk.width)
         later_time = jnp.where(width == left, due, walk.gone + width.astype(walk.gone.dtype))
         gone = jnp.where(good, later_time, walk.gone)
