@@ -229,7 +229,7 @@ def march(
         # to a time that is a number: thousands of rounded sums would add up to another time; down
         # after a step refused, or that would be tried again and again
         near = walk.gone + width.astype(walk.gone.dtype)
-        grain = jnp.nextafter(near, jnp.inf) - near
+        grain = jnp.finfo(near.dtype).eps * near  # one or two units in its last place
         exact = (near - walk.gone).astype(dtype)
         down = (exact > width) & (walk.refused[1] > 0)
         exact = jnp.where(down, (near - grain - walk.gone).astype(dtype), exact)
