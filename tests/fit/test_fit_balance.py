@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 from benchmarks import throws as recipe, throws_synthetic as study
 from polhode.fit import (
     Drag,
+    Huber,
     Instrument,
     Recording,
     SteppedMotion,
@@ -19,6 +20,7 @@ from polhode.fit import (
     averaged,
     fit_balance,
     fit_inertia,
+    fit_recordings,
     lever_arm,
     stack,
 )
@@ -233,6 +235,12 @@ def test_what_a_balance_cannot_use_is_refused():
             bias=True,
         )
     whole = Recording.of(times, rates, wheel_speed=times)
+    with pytest.raises(ValueError, match=r"needs instrument=Instrument\(spin_inertia\)"):
+        fit_recordings([whole, whole])
+    with pytest.raises(ValueError, match="got also robust, noise_known"):
+        fit_recordings([whole], instrument=Instrument(SPIN), robust=Huber(3), noise_known=True)
+    with pytest.raises(ValueError, match="throws without a wheel: fit_balance"):
+        fit_recordings([whole], instrument=Instrument(None))
     with pytest.raises(ValueError, match=r"number the body of each of 2 recordings.*\[0, 2\]"):
         fit_balance([whole] * 2, Instrument(SPIN), bodies=[0, 2])
     with pytest.raises(ValueError, match="spin_inertia must be positive, got 0"):

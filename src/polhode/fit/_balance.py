@@ -1,8 +1,10 @@
 """Inertia, drag, instrument and noise that make the readings of throws likeliest.
 
-Fisher's method of scoring on the likelihood of ``polhode.fit._filter``, restricted for the noise
-(``polhode.fit._restricted``); tolerances of the instrument, and what is expected of drag and noise,
-are terms of it as well.
+Fisher's method of scoring on the likelihood of ``polhode.fit._filter``; tolerances of the
+instrument, and what is expected of drag and noise, are terms of it as well. A body that is found
+bends to the noise of the readings, and the scatter left tells too little of it: the noise is found
+by restricted likelihood, which counts what is used up by half the log-determinant of the
+information about all else (Patterson and Thompson, Biometrika 58 (1971) 545).
 """
 
 import equinox as eqx
@@ -16,7 +18,6 @@ from polhode.fit._instrument import Instrument, Tolerance
 from polhode.fit._linear import entries_of
 from polhode.fit._matrices import inverse, solve
 from polhode.fit._parameters import SCALE, FullTensor, base_of, free_columns, tensor_of
-from polhode.fit._restricted import Places, unsure, used_up
 from polhode.fit._start import regression
 
 # directions of symmetric traceless matrices, orthonormal
@@ -37,11 +38,13 @@ _PARTS = np.cumsum([_TENSOR, _DRAG, _LEVEL, _COMMON])
 _LOST, _WIDE, _NARROW = 0.15, 1.0, 0.7
 # steps at most, and the distance of the tensors from the best, in standard deviations, that ends
 # them (of all else: four times that)
-_STEPS, _NEAR = 120, 0.03
+_STEPS, _NEAR = 200, 0.03
 # how much a step may change logarithms of the noise
 _LOUDER = 1.5
 # by how much logarithms of the noise are shifted for differences
 _SHIFT = 1e-2
+# how often at most what the bodies use up is worked out anew
+_ROUNDS = 5
 
 
 def instrument_of(unknown: Float[Array, " 11"], given: Instrument, tolerance: Tolerance):
@@ -144,7 +147,6 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     noise[_PARTS[1] : _PARTS[3]] = True
     heard, others = np.flatnonzero(noise), np.flatnonzero(~noise)
     loud = np.concatenate([np.tile(noise[:own], count), noise[own:]])
-    places = Places(loud, place[:, others], place[:, heard])
     held = jnp.asarray(np.where(loud, 1, 1e-3), dtype)
     span = data.times[0, -1] - data.times[0, 0]
     typical = jnp.sqrt(jnp.mean(jnp.sum(data.omega**2, axis=2)))
@@ -173,25 +175,30 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         shown = jnp.diag(precision).at[place[:, :, None], place[:, None, :]].add(each.information)
         return Score(value, slope, shown, each.rest, each.spread)
 
-    def bent(unknown) -> Float[Array, "r p p m"]:
-        """Slopes, by the noise, of what recordings tell of all else: by differences, for the
-        program of second derivatives is several times as long."""
+    def used_up(unknown, information):
+        """Slopes, by the noise, of half the log-determinant of the information about all else."""
 
         def told(shift):
             each = jax.vmap(lambda data, own: score_by(data, own + shift, others))
             return each(data, unknown[place]).information
 
+        # by differences, for the program of second derivatives is several times as long
         shifts = np.zeros((1 + heard.size, used))
         shifts[1 + np.arange(heard.size), heard] = _SHIFT
         every = jax.lax.map(told, jnp.asarray(shifts, dtype))
-        return jnp.moveaxis((every[1:] - every[0]) / _SHIFT, 0, -1)
+        bends = (every[1:] - every[0]) / _SHIFT
+        # covariances, were the noise known
+        quiet = jnp.asarray(~loud, dtype)
+        sure = inverse(information * quiet * quiet[:, None] + jnp.diag(1 - quiet))
+        where = place[:, others]
+        sure = sure[where[:, :, None], where[:, None, :]]
+        found = jnp.einsum("rpq,mrpq->rm", sure, bends) / 2
+        return jnp.zeros_like(unknown).at[place[:, heard]].add(found)
 
-    def counted(unknown, information, lost, _, rounds):
-        """Slopes of what the restricted likelihood adds, once all is likeliest with the last."""
-        bends = bent(unknown)
-        now = used_up(information, bends, places)
+    def restricted(unknown, information, lost, rounds):
+        """What the restricted likelihood adds to the slopes, and how often it was worked out."""
         # the mean of all so far: by themselves they may go to and fro
-        return lost + (now - lost) / (rounds + 1), bends, rounds + 1
+        return lost + (used_up(unknown, information) - lost) / (rounds + 1), rounds + 1
 
     def far(score, lost):
         """How far from the likeliest all is, in standard deviations; bodies count in full."""
@@ -200,7 +207,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         return jnp.maximum(jnp.max(jnp.abs(left[inner])), jnp.max(jnp.abs(left)) / 4)
 
     def again(carry):
-        unknown, move, score, lost, bends, rounds, damping, _, steps = carry
+        unknown, move, score, lost, rounds, damping, _, steps = carry
         tried = scored(unknown + move)
         value = tried.surprise + lost @ move
         well = jnp.isfinite(value) & (value <= score.surprise)
@@ -209,16 +216,16 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         damping = jnp.where(well, damping / 3, jnp.maximum(damping * 10, 1e-3))
         distance = far(score, lost)
         if heard.size:
-            lost, bends, rounds = jax.lax.cond(
-                distance < _NEAR, counted, lambda *same: same[2:],
-                unknown, score.information, lost, bends, rounds,
+            lost, rounds = jax.lax.cond(
+                (distance < _NEAR) & (rounds < _ROUNDS), restricted, lambda *same: same[2:],
+                unknown, score.information, lost, rounds,
             )  # fmt: skip
             distance = far(score, lost)
         shown = score.information
         move = -solve(shown + damping * jnp.diag(held * jnp.diagonal(shown)), score.slope + lost)
         # from a start far off, noise so large that everything is likely would be a step away
         move = move / jnp.maximum(1, jnp.max(jnp.abs(loud * move)) / _LOUDER)
-        return unknown, move, score, lost, bends, rounds, damping, distance, steps + 1
+        return unknown, move, score, lost, rounds, damping, distance, steps + 1
 
     def unsettled(carry):
         *_, distance, steps = carry
@@ -228,9 +235,8 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     zero, large = jnp.zeros(loud.size, dtype), jnp.asarray(jnp.inf, dtype)
     blank = jnp.zeros((*data.known.shape, 3), dtype)
     nothing = Score(large, zero, jnp.eye(loud.size, dtype=dtype), blank, blank)
-    bends = jnp.zeros((recordings, others.size, others.size, heard.size), dtype)
-    state = (zero, zero, nothing, zero, bends, 0, jnp.asarray(3e-3, dtype), large, 0)
-    unknown, _, score, _, bends, *_, distance, steps = jax.lax.while_loop(unsettled, again, state)
+    state = (zero, zero, nothing, zero, 0, jnp.asarray(3e-3, dtype), large, 0)
+    unknown, _, score, *_, distance, steps = jax.lax.while_loop(unsettled, again, state)
     covariance = inverse(score.information)
     shared = jnp.broadcast_to(unknown[count * own :], (count, used - own))
     rest = jnp.zeros((count, _PARTS[3] + _DEVICE - used), dtype)
@@ -248,8 +254,6 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
 
     slopes = jax.vmap(jax.jacfwd(entries))(every[:, :_TENSOR], known.sigma)
     blocks = covariance[inner[:, :, None], inner[:, None, :]]
-    if heard.size:
-        blocks = blocks + unsure(score.information, bends, places, inner)
     blocks = slopes @ blocks @ jnp.swapaxes(slopes, 1, 2)
     return Fitted(
         tensors, slowed, instrument, noise, blocks, score.rest, score.spread, score.surprise, steps,
