@@ -158,13 +158,15 @@ def test_throws_without_a_wheel_show_ratios():
     tensor = TENSORS[0] / np.linalg.eigvalsh(TENSORS[0])[2]
     rng = np.random.default_rng(2)
     given = []
+
+    @jax.jit
+    def flown(begin):
+        none = {"drag": None, "delay": None}
+        return flight(jnp.asarray(tensor), begin, None, jnp.asarray(times), None, none)
+
     for _ in range(3):
         begin = rng.normal(size=3)
-        begin *= 10 / np.linalg.norm(begin)
-        moved = flight(
-            jnp.asarray(tensor), jnp.asarray(begin), None, jnp.asarray(times), None,
-            {"drag": None, "delay": None},
-        )  # fmt: skip
+        moved = flown(jnp.asarray(begin * 10 / np.linalg.norm(begin)))
         given.append(Recording.of(times, moved.omega + 0.01 * rng.normal(size=(100, 3))))
     fit = fit_balance(given, Instrument(None))
     true = np.linalg.eigvalsh(tensor)

@@ -82,8 +82,8 @@ def test_a_wheel_is_fitted_by_the_likelihood_of_the_readings(tmp_path, capsys):
     path, out = tmp_path / "throw.csv", tmp_path / "out"
     lines = [",".join("" if np.isnan(x) else repr(float(x)) for x in row) for row in table]
     path.write_text("\n".join(["t,wx,wy,wz,wheel", *lines]) + "\n")
-    wheel_options = ["--wheel-inertia", str(study.SPIN), "--wheel-axis", "0", "0", "2"]
-    assert main(["fit", str(path), *wheel_options, "--block", "4", "-o", str(out)]) == 0
+    options = f"--columns wheel=wheel --wheel-inertia {study.SPIN} --wheel-axis 0 0 2 --block 4"
+    assert main(["fit", str(path), *options.split(), "-o", str(out)]) == 0
     assert "moment [kg m^2]" in capsys.readouterr().out
     found = json.loads(out.with_suffix(".json").read_text())
     fit = fit_balance([one], Instrument(study.SPIN), block=4)

@@ -146,8 +146,8 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     noise = np.zeros(used, bool)
     noise[_PARTS[1] : _PARTS[3]] = True
     heard, others = np.flatnonzero(noise), np.flatnonzero(~noise)
-    loud = np.concatenate([np.tile(noise[:own], count), noise[own:]])
-    held = jnp.asarray(np.where(loud, 1, 1e-3), dtype)
+    loud = jnp.asarray(np.concatenate([np.tile(noise[:own], count), noise[own:]]), dtype)
+    held = jnp.where(loud > 0, 1, 1e-3).astype(dtype)
     span = data.times[0, -1] - data.times[0, 0]
     typical = jnp.sqrt(jnp.mean(jnp.sum(data.omega**2, axis=2)))
     drag = _LOST / span * jnp.stack([jnp.ones_like(typical), 1 / typical])
@@ -186,10 +186,10 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         shifts = np.zeros((1 + heard.size, used))
         shifts[1 + np.arange(heard.size), heard] = _SHIFT
         every = jax.lax.map(told, jnp.asarray(shifts, dtype))
-        bends = (every[1:] - every[0]) / _SHIFT
+        bends = (every[1:] - every[:1]) / _SHIFT
         # covariances, were the noise known
-        quiet = jnp.asarray(~loud, dtype)
-        sure = inverse(information * quiet * quiet[:, None] + jnp.diag(1 - quiet))
+        quiet = 1 - loud
+        sure = inverse(information * quiet[None] * quiet[:, None] + jnp.diag(loud))
         where = place[:, others]
         sure = sure[where[:, :, None], where[:, None, :]]
         found = jnp.einsum("rpq,mrpq->rm", sure, bends) / 2

@@ -34,10 +34,10 @@ def fit_wheel(recording: Recording, instrument: Instrument, block: int) -> Inert
 def fit_wheels(recordings: Sequence[Recording], instrument: Instrument, block: int) -> InertiaFit:
     """One body from its recordings of rates and wheel; ``fit_balance``."""
     fit = fit_balance(recordings, instrument, block=block, throw=False)
-    return _told(fit, stack(recordings))
+    return _told(fit, stack(recordings), instrument)
 
 
-def _told(fit: BalanceFit, recording: Recording) -> InertiaFit:
+def _told(fit: BalanceFit, recording: Recording, given: Instrument) -> InertiaFit:
     """One body's balance as the result that every motion gives."""
     tensor, moments = fit.inertia.tensor[0], fit.moments[0]
     covariance = fit.covariance[0]
@@ -67,7 +67,7 @@ def _told(fit: BalanceFit, recording: Recording) -> InertiaFit:
     )
     begin = device.rates(needed("omega", recording.omega)[:, 0])
     parameters = Parameters(
-        jnp.zeros(6, moments.dtype), begin, bias=device.bias,
+        jnp.zeros(6, moments.dtype), begin, bias=None if given.bias is None else device.bias,
         motion={"drag": Drag(*fit.drag[0]), "delay": None},
     )  # fmt: skip
     return InertiaFit(
