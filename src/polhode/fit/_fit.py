@@ -66,10 +66,9 @@ def fit_inertia(
 
     A wheel's motion that is taken at its word (``SteppedMotion``) misleads where the air pushes and
     the speed is noisy: of simulated throws of 0.5 s it misses the moments by 2 to 7 % and states
-    0.6 to 1.1 %, the likelihood of the readings by 0.04 to 1.7 % and states 0.03 to 1.4 %. A
-    recording alone shows its own noise poorly, and the 95 % intervals hold 88 %: give throws of
-    one body together to ``fit_balance``. Forces take part in fits of a ``motion`` only: 3 cm from
-    the centre of mass an accelerometer narrows the tensor of such a throw by 0.3 % at most.
+    0.6 to 1.1 %, the likelihood of the readings by 0.04 to 1.7 % and states 0.03 to 1.4 %. Forces
+    take part in fits of a ``motion`` only: 3 cm from the centre of mass an accelerometer narrows
+    the tensor of such a throw by 0.3 % at most.
 
     Torque-free rates show only the ratios of the moments: see ``InertiaFit.scale_known``. Every
     iterate is a physical body. Left-handed axes are not fitted away: with attitudes they are
@@ -127,7 +126,7 @@ def _only_a_wheel(instrument: Instrument | None, wheel_speed, others) -> None:
     )
     require(wheel_speed is not None, "an instrument needs the wheel's speed: give wheel_speed.")
     require(
-        instrument.spin_inertia is not None,
+        instrument is not None and instrument.spin_inertia is not None,
         "the instrument needs the wheel's spin_inertia; throws without a wheel: fit_balance.",
     )
     unused = [name for name, value in others.items() if value is not None and value is not False]
