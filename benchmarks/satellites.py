@@ -27,6 +27,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks._steps import runge_kutta
 from polhode import fit as room
 
 STEP, LENGTH, PARTS = 0.1, 60.0, 10
@@ -69,11 +70,7 @@ def flown(key, tensor, spin, fastest, push):
         momentum, slow = state
         t, push_now = inputs
         found = rates(momentum, t)
-        one = field(momentum, t, slow)
-        two = field(momentum + dt / 2 * one, t + dt / 2, slow)
-        three = field(momentum + dt / 2 * two, t + dt / 2, slow)
-        four = field(momentum + dt * three, t + dt, slow)
-        momentum = momentum + dt / 6 * (one + 2 * two + 2 * three + four)
+        momentum = runge_kutta(lambda m, t: field(m, t, slow), momentum, t, dt)
         return (momentum, stays * slow + push * (1 - stays**2) ** 0.5 * push_now), found
 
     times = dt * jnp.arange(count)

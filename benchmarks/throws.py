@@ -48,7 +48,6 @@ FAST, BLOCK = 4, 4
 # What a choice of the recipe might change: window of the flight, s; how much more is left out where
 # the motor was switched, s; samples to a residual
 VARIED = {
-    "as it is": {},
     "flight from 0.10 to 0.52 s": {"flight": (0.10, 0.52)},
     "10 ms more left out at each switch": {"margin": 0.01},
     "5 samples to a residual": {"block": 5},
@@ -93,41 +92,67 @@ def together(found, block=BLOCK):
     return everything, bodies, fit
 
 
-def varied(folder):
-    """Shifts of the joint fit's moments under other choices, over their standard deviation."""
-    table, usual = {}, None
+def varied(folder, usual, single):
+    """What other choices do to the joint fit ``usual`` and to its single throws, by configuration.
+
+    Moves of the joint moments over their standard deviation, and over the one that leaving readings
+    out makes of it (variances of nested estimates subtract, where they do); moves of the means of
+    single throws over the standard deviation of these means, and over that which the moves of the
+    throws themselves show.
+    """
+    table = {}
+    first, spread = np.asarray(usual.moments), np.asarray(usual.moments_std)
     for name, choice in VARIED.items():
         how = dict(choice)
         block = how.pop("block", BLOCK)
         _, found = load(folder, **how)
         _, _, fit = together(found, block)
-        moments, spread = np.asarray(fit.moments), np.asarray(fit.moments_std)
-        if usual is None:
-            usual = moments, spread
-            continue
-        shift = (moments - usual[0]) / usual[1]
+        moved = np.asarray(fit.moments) - first
+        more = np.asarray(fit.moments_std) ** 2 - spread**2
+        shift = moved / spread
+        wider = more > 0.01 * spread**2
+        by_chance = (moved / np.sqrt(np.where(wider, more, 1)))[wider]
+        means, pairs = [], []
+        for body, kind in enumerate(found):
+            if kind not in single:
+                continue
+            before = np.asarray(single[kind].moments)
+            apart = np.asarray(fit.each(found[kind], body).moments) - before
+            root = len(before) ** 0.5
+            means.append(root * apart.mean(axis=0) / before.std(axis=0, ddof=1))
+            pairs.append(root * apart.mean(axis=0) / apart.std(axis=0, ddof=1))
         table[name] = {
             "shift_over_std": dict(zip(found, shift.tolist(), strict=True)),
             "largest": float(np.abs(shift).max()),
-            "largest_percent": 100 * float(np.abs(moments / usual[0] - 1).max()),
+            "largest_percent": 100 * float(np.abs(moved / first).max()),
             "beyond_half": int((np.abs(shift) > 0.5).sum()),
+            "wider": int(wider.sum()),
+            "rms_over_expected": float(np.sqrt(np.mean(by_chance**2))) if wider.any() else None,
+            "means_shift_over_std": dict(zip(single, np.array(means).tolist(), strict=True)),
+            "means_largest": float(np.abs(means).max()),
+            "means_beyond_half": int((np.abs(means) > 0.5).sum()),
+            "means_over_own_scatter": dict(zip(single, np.array(pairs).tolist(), strict=True)),
+            "means_rms_over_own_scatter": float(np.sqrt(np.mean(np.square(pairs)))),
         }
-        print(
-            name,
-            {kind: table[name][kind] for kind in ("largest", "largest_percent", "beyond_half")},
-        )
+        plain = {kind: x for kind, x in table[name].items() if not isinstance(x, dict)}
+        print(name, plain, flush=True)
     return table
 
 
 def agreement(joint, single, body):
-    """Means of single throws less the joint fit, %, and over what the errors stated make of it."""
+    """Means of single throws less the joint fit, %, and over what the errors stated make of it;
+    plain means, and weighed by the errors stated."""
     moments, spread = np.asarray(joint.moments)[body], np.asarray(joint.moments_std)[body]
     each, own = np.asarray(single.moments), np.asarray(single.moments_std)
     apart = each.mean(axis=0) - moments
+    weight = own**-2.0
+    weighed = (weight * (each - moments)).sum(axis=0) / weight.sum(axis=0)
     expected = np.sqrt((own**2 - spread**2).mean(axis=0) / len(each))
     return {
         "apart_percent": (100 * apart / moments).tolist(),
         "apart_over_std": (apart / expected).tolist(),
+        "apart_weighed_percent": (100 * weighed / moments).tolist(),
+        "apart_weighed_over_std": (weighed * np.sqrt(weight.sum(axis=0))).tolist(),
         "std_of_one_percent": (100 * np.median(own, axis=0) / moments).tolist(),
         "scatter_of_one_percent": (100 * each.std(axis=0, ddof=1) / moments).tolist(),
     }
@@ -176,16 +201,26 @@ def objects(index, joint, tensors, arms):
     return scale, made
 
 
-def errors(tensor, reference):
-    """Relative error of the moments, %, and turn of the axes, degrees."""
-    found, true = ph.Inertia(full=tensor), ph.Inertia(full=reference)
-    (found, turn), (true, frame) = found.to_principal(), true.to_principal()
-    apart = np.linalg.norm(found.moments - true.moments) / np.linalg.norm(true.moments)
-    matrix = np.asarray(to_matrix(turn)).T @ np.asarray(to_matrix(frame))
+def turn_of(tensor, reference):
+    """Smallest turn (3,), degrees, sensor axes, from the reference to the principal axes found."""
+    frames = []
+    for given in (reference, tensor):
+        _, turn = ph.Inertia(full=given).to_principal()
+        frames.append(np.asarray(to_matrix(turn)))
     # half turns about principal axes change nothing
     signs = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
-    trace = np.max(signs @ np.diagonal(matrix))
-    return 100 * float(apart), float(np.degrees(np.arccos(np.clip((trace - 1) / 2, -1, 1))))
+    signs = signs[np.argmax(signs @ np.diagonal(frames[0].T @ frames[1]))]
+    matrix = frames[1] @ np.diag(signs) @ frames[0].T
+    axis = np.array([matrix[k - 1, k - 2] - matrix[k - 2, k - 1] for k in range(3)])
+    size = np.arccos(np.clip((np.trace(matrix) - 1) / 2, -1, 1))
+    return np.degrees(size) * axis / max(np.linalg.norm(axis), np.finfo(float).tiny)
+
+
+def errors(tensor, reference):
+    """Relative error of the moments, %, and turn of the axes, degrees."""
+    found, true = (np.linalg.eigvalsh(one) for one in (tensor, reference))
+    apart = np.linalg.norm(found - true) / np.linalg.norm(true)
+    return 100 * float(apart), float(np.linalg.norm(turn_of(tensor, reference)))
 
 
 def tables(index, made):
@@ -200,11 +235,16 @@ def tables(index, made):
         if reference is not None:
             off = np.array([errors(one, np.array(reference)) for one in tensors])
             row["moments_error_percent"], row["axes_error_deg"] = off.mean(axis=0).tolist()
+            turns = np.array([turn_of(one, np.array(reference)) for one in tensors])
+            row["turn_common_deg"] = turns.mean(axis=0).tolist()
+            row["axes_scatter_deg"] = float(
+                np.linalg.norm(turns - turns.mean(axis=0), axis=1).mean()
+            )
         found[name] = row
     return found
 
 
-def run(folder, configurations=None):
+def run(folder, configurations=None, vary=False):
     """The whole recipe."""
     index, found = load(folder, configurations)
     fit, each, arms = measure(found)
@@ -213,7 +253,7 @@ def run(folder, configurations=None):
     scale, alone = objects(index, joint, single, arms)
     _, together = objects(index, joint, {name: joint[name][None] for name in single}, arms)
     device = fit.instrument
-    return {
+    numbers = {
         "throws": sum(map(len, found.values())),
         "spin_inertia_kgm2": SPIN * scale,
         "wheel_axis": np.asarray(device.axis).tolist(),
@@ -227,15 +267,16 @@ def run(folder, configurations=None):
         "every_throw_alone": tables(index, alone),
         "throws_of_a_configuration_together": tables(index, together),
     }
+    if vary:
+        numbers["varied"] = varied(folder, fit, each)
+    return numbers
 
 
 def main() -> int:
     """Run, print and write."""
     options = recordings(__doc__, DATA, {"varied": "other choices of the recipe as well"})
     jax.config.update("jax_enable_x64", True)
-    numbers = run(options.data)
-    if options.varied:
-        numbers["varied"] = varied(options.data)
+    numbers = run(options.data, vary=options.varied)
     for name, row in numbers["single_throws_and_joint_fit"].items():
         print(name, {kind: np.round(value, 2).tolist() for kind, value in row.items()})
     for kind in ("every_throw_alone", "throws_of_a_configuration_together"):

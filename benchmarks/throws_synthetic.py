@@ -2,12 +2,13 @@
 
 Bodies of 1 to 30 times the inertia of the TU Delft device (``benchmarks.throws``), thrown with the
 same wheel, window, noise of the gyroscope and of the wheel, and torques of the air. The noise is
-found from 40 throws of a body together (``fit_balance``), then every throw is fitted alone. Printed
+found from 40 throws of a body together (``fit_balance``), then every throw is fitted alone; then
+some more, each of which has to tell its noise as well. Printed
 for each size and principal moment: mean error over its standard deviation, root mean square of the
 errors over the Cramer-Rao bound (the standard deviation that the fit states), and how often the
 interval of 95 % holds the truth.
 
-    python -m benchmarks.throws_synthetic [--throws 960] [--sizes 1,3,10,30]
+    python -m benchmarks.throws_synthetic [--throws 960] [--own 240] [--sizes 1,3,10,30]
 """
 
 import argparse
@@ -22,6 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks._steps import runge_kutta
 from polhode import fit as room
 
 SPIN = 1.7e-6
@@ -67,11 +69,7 @@ def simulated(key, tensor, parts=4):
         momentum, slow = state
         t, push, fresh = inputs
         found = rates(momentum, t)
-        one = field(momentum, t, slow)
-        two = field(momentum + dt / 2 * one, t + dt / 2, slow)
-        three = field(momentum + dt / 2 * two, t + dt / 2, slow)
-        four = field(momentum + dt * three, t + dt, slow)
-        momentum = momentum + dt / 6 * (one + 2 * two + 2 * three + four)
+        momentum = runge_kutta(lambda m, t: field(m, t, slow), momentum, t, dt)
         momentum = momentum + size * WHITE * dt**0.5 * push
         return (momentum, stays * slow + SLOW * (1 - stays**2) ** 0.5 * fresh), found
 
@@ -116,19 +114,43 @@ def study(size, number, together=40, group=120):
         moments.append(np.asarray(alone.moments))
         spread.append(np.asarray(alone.moments_std))
         done += int(np.sum(np.asarray(alone.converged)))
-    error, spread = np.concatenate(moments) - true, np.concatenate(spread)
+    return {
+        "size": size,
+        **told(np.concatenate(moments) - true, np.concatenate(spread), true),
+        "joint_rms_error_over_std": np.sqrt(np.square(joints).mean(axis=0)).tolist(),
+        "converged": done,
+    }
+
+
+def study_own(size, number):
+    """Errors of single throws that tell their noise as well, as of ``fit_inertia`` with a wheel."""
+    tensor = size * DEVICE
+    true = np.linalg.eigvalsh(tensor)
+    fits = [
+        room.fit_balance([one], room.Instrument(SPIN), block=BLOCK, throw=False)
+        for one in throws(round(100 * size) + 11, tensor, number)
+    ]
+    moments, spread = (
+        np.array([getattr(one, kind)[0] for one in fits]) for kind in ("moments", "moments_std")
+    )
+    return {
+        "size": size,
+        **told(moments - true, spread, true),
+        "converged": sum(bool(one.converged) for one in fits),
+    }
+
+
+def told(error, spread, true):
+    """What errors (n, 3) and the deviations stated say together."""
     off = error / spread
     held = np.abs(off) < 1.959964
     return {
-        "size": size,
-        "throws": number,
+        "throws": len(error),
         "std_percent": (100 * np.median(spread / true, axis=0)).tolist(),
         "mean_error_over_std": (error.mean(axis=0) / error.std(axis=0)).tolist(),
         "rms_error_over_bound": np.sqrt((off**2).mean(axis=0)).tolist(),
         "covered_percent": (100 * held.mean(axis=0)).tolist(),
         "covered_percent_all": 100 * float(held.mean()),
-        "joint_rms_error_over_std": np.sqrt(np.square(joints).mean(axis=0)).tolist(),
-        "converged": done,
     }
 
 
@@ -136,16 +158,19 @@ def main() -> int:
     """Run, print and write."""
     parser = argparse.ArgumentParser(description=str(__doc__).splitlines()[0])
     parser.add_argument("--throws", type=int, default=960)
+    parser.add_argument("--own", type=int, default=240)
     parser.add_argument("--sizes", default="1,3,10,30")
     parser.add_argument("--output", default=None)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
-    rows = []
+    numbers = {"sizes": [], "own_noise": []}
     for size in map(float, options.sizes.split(",")):
-        rows.append(study(size, options.throws))
-        for name, value in rows[-1].items():
-            print(f"  {name:24s} {np.round(value, 3)}", flush=True)
-    numbers = {"sizes": rows}
+        numbers["own_noise"].append(study_own(size, options.own))
+        numbers["sizes"].append(study(size, options.throws))
+        for kind, rows in numbers.items():
+            print(kind)
+            for name, value in rows[-1].items():
+                print(f"  {name:24s} {np.round(value, 3)}", flush=True)
     print(f"written: {write('throws_synthetic', numbers, path=options.output)}")
     return 0
 

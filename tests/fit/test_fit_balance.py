@@ -12,6 +12,7 @@ from scipy.integrate import solve_ivp
 from benchmarks import throws as recipe, throws_synthetic as study
 from polhode.fit import (
     Drag,
+    Huber,
     Instrument,
     Recording,
     SteppedMotion,
@@ -19,6 +20,7 @@ from polhode.fit import (
     averaged,
     fit_balance,
     fit_inertia,
+    fit_recordings,
     lever_arm,
     stack,
 )
@@ -156,13 +158,15 @@ def test_throws_without_a_wheel_show_ratios():
     tensor = TENSORS[0] / np.linalg.eigvalsh(TENSORS[0])[2]
     rng = np.random.default_rng(2)
     given = []
+
+    @jax.jit
+    def flown(begin):
+        none = {"drag": None, "delay": None}
+        return flight(jnp.asarray(tensor), begin, None, jnp.asarray(times), None, none)
+
     for _ in range(3):
         begin = rng.normal(size=3)
-        begin *= 10 / np.linalg.norm(begin)
-        moved = flight(
-            jnp.asarray(tensor), jnp.asarray(begin), None, jnp.asarray(times), None,
-            {"drag": None, "delay": None},
-        )  # fmt: skip
+        moved = flown(jnp.asarray(begin * 10 / np.linalg.norm(begin)))
         given.append(Recording.of(times, moved.omega + 0.01 * rng.normal(size=(100, 3))))
     fit = fit_balance(given, Instrument(None))
     true = np.linalg.eigvalsh(tensor)
@@ -233,6 +237,12 @@ def test_what_a_balance_cannot_use_is_refused():
             bias=True,
         )
     whole = Recording.of(times, rates, wheel_speed=times)
+    with pytest.raises(ValueError, match=r"needs instrument=Instrument\(spin_inertia\)"):
+        fit_recordings([whole, whole])
+    with pytest.raises(ValueError, match="got also robust, noise_known"):
+        fit_recordings([whole], instrument=Instrument(SPIN), robust=Huber(3), noise_known=True)
+    with pytest.raises(ValueError, match="throws without a wheel: fit_balance"):
+        fit_recordings([whole], instrument=Instrument(None))
     with pytest.raises(ValueError, match=r"number the body of each of 2 recordings.*\[0, 2\]"):
         fit_balance([whole] * 2, Instrument(SPIN), bodies=[0, 2])
     with pytest.raises(ValueError, match="spin_inertia must be positive, got 0"):

@@ -68,13 +68,21 @@ def fit(
         float | None,
         typer.Option(
             parser=positive, metavar="J",
-            help="spin inertia of the wheel, kg m^2: fixes the absolute scale",
+            help="spin inertia of the wheel, kg m^2: fixes the absolute scale. Drag and noise are"
+            " then found too",
         ),
     ] = None,
     wheel_axis: Annotated[
         tuple[float, float, float],
         typer.Option(metavar="X Y Z", help="axis of the wheel"),
     ] = (0.0, 0.0, 1.0),
+    block: Annotated[
+        int,
+        typer.Option(
+            min=1, metavar="N",
+            help="with --wheel-inertia: samples to a residual, so many that their noise is white",
+        ),
+    ] = 1,
     allow_undetermined: Annotated[
         bool,
         typer.Option(
@@ -96,9 +104,14 @@ def fit(
         *_columns(recording, columns), degrees=degrees, milliseconds=milliseconds, noise=noise,
         moments_only=moments_only, bias=bias, drag=drag, robust=robust,
         wheel_inertia=wheel_inertia, wheel_axis=wheel_axis,
+        block=block,
     )  # fmt: skip
     if wheel_inertia and "wheel" not in asked.columns:
         raise UsageError("--wheel-inertia needs the wheel's speed: add wheel=COLUMN to --columns.")
+    if wheel_inertia:
+        _only_a_wheel(asked)
+    elif block != 1:
+        raise UsageError("--block belongs to --wheel-inertia.")
     if robust and not noise:
         raise UsageError("--robust counts in noises: give --noise SIGMA too.")
     if not math.hypot(*wheel_axis) > 0 or not math.isfinite(math.hypot(*wheel_axis)):
@@ -126,6 +139,24 @@ class _Asked:
     robust: float | None
     wheel_inertia: float | None
     wheel_axis: tuple[float, float, float]
+    block: int
+
+
+def _only_a_wheel(asked: _Asked) -> None:
+    """Refuse what the likelihood of the readings does not use, and name the way to it."""
+    cures = {
+        "--drag": (asked.drag, "a drag is fitted anyway; leave it out"),
+        "--noise": (asked.noise, "the noise is found from the readings; leave it out"),
+        "--bias": (
+            asked.bias,
+            "fit_balance(..., tolerance=Tolerance()) in Python fits it",
+        ),
+        "--moments-only": (asked.moments_only, "the whole tensor is found; leave it out"),
+        "--robust": (asked.robust, "leave the outliers blank in the file"),
+    }
+    for option, (given, cure) in cures.items():
+        if given:
+            raise UsageError(f"{option} does not go with --wheel-inertia: {cure}.")
 
 
 def _columns(words: list[str], given: list[str]) -> tuple[Path, dict[str, str]]:
@@ -224,15 +255,12 @@ def _said(loaded: Any) -> str:
 
 def _options(asked: _Asked, room: Any) -> dict[str, Any]:
     """Keywords of ``fit_recordings``."""
+    if asked.wheel_inertia:
+        axis = tuple(x / math.hypot(*asked.wheel_axis) for x in asked.wheel_axis)
+        return {"instrument": room.Instrument(asked.wheel_inertia, axis), "block": asked.block}
     motion = room.FreeMotion()
-    if asked.drag or asked.wheel_inertia:
-        length = math.hypot(*asked.wheel_axis)
-        motion = room.SteppedMotion(
-            spin_inertia=asked.wheel_inertia,
-            axis=tuple(x / length for x in asked.wheel_axis),
-            drag=room.Drag() if asked.drag else None,
-            fit_drag=asked.drag,
-        )
+    if asked.drag:
+        motion = room.SteppedMotion(drag=room.Drag(), fit_drag=True)
     return {
         "motion": motion,
         "unknown": room.MomentsOnly() if asked.moments_only else room.FullTensor(),

@@ -1,7 +1,10 @@
 """Inertia, drag, instrument and noise that make the readings of throws likeliest.
 
 Fisher's method of scoring on the likelihood of ``polhode.fit._filter``; tolerances of the
-instrument, and what is expected of drag and noise, are terms of it as well.
+instrument, and what is expected of drag and noise, are terms of it as well. A body that is found
+bends to the noise of the readings, and the scatter left tells too little of it: the noise is found
+by restricted likelihood, which counts what is used up by half the log-determinant of the
+information about all else (Patterson and Thompson, Biometrika 58 (1971) 545).
 """
 
 import equinox as eqx
@@ -35,9 +38,13 @@ _PARTS = np.cumsum([_TENSOR, _DRAG, _LEVEL, _COMMON])
 _LOST, _WIDE, _NARROW = 0.15, 1.0, 0.7
 # steps at most, and the distance of the tensors from the best, in standard deviations, that ends
 # them (of all else: four times that)
-_STEPS, _NEAR = 120, 0.03
+_STEPS, _NEAR = 200, 0.03
 # how much a step may change logarithms of the noise
 _LOUDER = 1.5
+# by how much logarithms of the noise are shifted for differences
+_SHIFT = 1e-2
+# how often at most what the bodies use up is worked out anew
+_ROUNDS = 5
 
 
 def instrument_of(unknown: Float[Array, " 11"], given: Instrument, tolerance: Tolerance):
@@ -136,58 +143,100 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         np.concatenate([np.tile(expected[:own], count), expected[own:used]]), dtype
     )
     # steps of the noise overshoot where it hardly shows, and are held back more than the others
-    soft = np.full(_PARTS[3] + _DEVICE, 1e-3)
-    soft[_PARTS[1] : _PARTS[3]] = 1
-    held = jnp.asarray(np.concatenate([np.tile(soft[:own], count), soft[own:used]]), dtype)
-    loud = jnp.where(held == 1, 1, 0).astype(dtype)
+    noise = np.zeros(used, bool)
+    noise[_PARTS[1] : _PARTS[3]] = True
+    heard, others = np.flatnonzero(noise), np.flatnonzero(~noise)
+    loud = jnp.asarray(np.concatenate([np.tile(noise[:own], count), noise[own:]]), dtype)
+    held = jnp.where(loud > 0, 1, 1e-3).astype(dtype)
     span = data.times[0, -1] - data.times[0, 0]
     typical = jnp.sqrt(jnp.mean(jnp.sum(data.omega**2, axis=2)))
     drag = _LOST / span * jnp.stack([jnp.ones_like(typical), 1 / typical])
-
     first = jnp.asarray(own * np.arange(count)[:, None] + np.arange(own)[None])
+    inner = first[:, :_TENSOR]
 
-    def one(data: Readings, unknown):
-        def found(unknown):
-            full = jnp.concatenate([unknown, jnp.zeros(_PARTS[3] + _DEVICE - used, dtype)])
+    def score_by(data: Readings, unknown, which) -> Score:
+        """Of one recording, by some of its unknowns."""
+
+        def found(part):
+            missing = jnp.zeros(_PARTS[3] + _DEVICE - used, dtype)
+            full = jnp.concatenate([unknown.at[which].set(part), missing])
             got = innovations(data, *known.parts(full, data.body, drag))
             return got, got
 
-        by, found = jax.jacfwd(found, has_aux=True)(unknown)
+        by, found = jax.jacfwd(found, has_aux=True)(unknown[which])
         return score_of(found, by)
 
     def scored(unknown) -> Score:
-        each = jax.vmap(one)(data, unknown[place])
+        each = jax.vmap(lambda data, own: score_by(data, own, np.arange(used)))(
+            data, unknown[place]
+        )
         value = jnp.sum(each.surprise) + jnp.sum(precision * unknown**2) / 2
         slope = (precision * unknown).at[place].add(each.slope)
         shown = jnp.diag(precision).at[place[:, :, None], place[:, None, :]].add(each.information)
         return Score(value, slope, shown, each.rest, each.spread)
 
-    def again(carry):
-        unknown, score, damping, _, steps = carry
-        shown = score.information
-        move = -solve(shown + damping * jnp.diag(held * jnp.diagonal(shown)), score.slope)
-        # from a start far off, noise so large that everything is likely would be a step away
-        move = move / jnp.maximum(1, jnp.max(jnp.abs(loud * move)) / _LOUDER)
-        tried = scored(unknown + move)
-        well = jnp.isfinite(tried.surprise) & (tried.surprise <= score.surprise)
-        kept = jax.tree.map(lambda a, b: jnp.where(well, a, b), tried, score)
-        unknown = jnp.where(well, unknown + move, unknown)
-        damping = jnp.where(well, damping / 3, jnp.maximum(damping * 10, 1e-3))
-        return unknown, kept, damping, far(kept), steps + 1
+    def used_up(unknown, information):
+        """Slopes, by the noise, of half the log-determinant of the information about all else."""
 
-    def far(score):
+        def told(shift):
+            each = jax.vmap(lambda data, own: score_by(data, own + shift, others))
+            return each(data, unknown[place]).information
+
+        # by differences, for the program of second derivatives is several times as long
+        shifts = np.zeros((1 + heard.size, used))
+        shifts[1 + np.arange(heard.size), heard] = _SHIFT
+        every = jax.lax.map(told, jnp.asarray(shifts, dtype))
+        bends = (every[1:] - every[:1]) / _SHIFT
+        # covariances, were the noise known
+        quiet = 1 - loud
+        sure = inverse(information * quiet[None] * quiet[:, None] + jnp.diag(loud))
+        where = place[:, others]
+        sure = sure[where[:, :, None], where[:, None, :]]
+        found = jnp.einsum("rpq,mrpq->rm", sure, bends) / 2
+        return jnp.zeros_like(unknown).at[place[:, heard]].add(found)
+
+    def restricted(unknown, information, lost, rounds):
+        """What the restricted likelihood adds to the slopes, and how often it was worked out."""
+        # the mean of all so far: by themselves they may go to and fro
+        return lost + (used_up(unknown, information) - lost) / (rounds + 1), rounds + 1
+
+    def far(score, lost):
         """How far from the likeliest all is, in standard deviations; bodies count in full."""
         covariance = inverse(score.information)
-        left = (covariance @ score.slope) / jnp.sqrt(jnp.diagonal(covariance))
-        return jnp.maximum(jnp.max(jnp.abs(left[first[:, :_TENSOR]])), jnp.max(jnp.abs(left)) / 4)
+        left = covariance @ (score.slope + lost) / jnp.sqrt(jnp.diagonal(covariance))
+        return jnp.maximum(jnp.max(jnp.abs(left[inner])), jnp.max(jnp.abs(left)) / 4)
+
+    def again(carry):
+        unknown, move, score, lost, rounds, damping, _, steps = carry
+        tried = scored(unknown + move)
+        value = tried.surprise + lost @ move
+        well = jnp.isfinite(value) & (value <= score.surprise)
+        score = jax.tree.map(lambda a, b: jnp.where(well, a, b), tried, score)
+        unknown = jnp.where(well, unknown + move, unknown)
+        damping = jnp.where(well, damping / 3, jnp.maximum(damping * 10, 1e-3))
+        distance = far(score, lost)
+        if heard.size:
+            lost, rounds = jax.lax.cond(
+                (distance < _NEAR) & (rounds < _ROUNDS), restricted, lambda *same: same[2:],
+                unknown, score.information, lost, rounds,
+            )  # fmt: skip
+            distance = far(score, lost)
+        shown = score.information
+        move = -solve(shown + damping * jnp.diag(held * jnp.diagonal(shown)), score.slope + lost)
+        # from a start far off, noise so large that everything is likely would be a step away
+        move = move / jnp.maximum(1, jnp.max(jnp.abs(loud * move)) / _LOUDER)
+        return unknown, move, score, lost, rounds, damping, distance, steps + 1
 
     def unsettled(carry):
         *_, distance, steps = carry
         return ~(distance < _NEAR) & (steps < _STEPS)
 
-    begin = jnp.zeros(count * own + used - own, dtype)
-    state = (begin, scored(begin), jnp.asarray(1e-3, dtype), jnp.asarray(jnp.inf, dtype), 0)
-    unknown, score, _, distance, steps = jax.lax.while_loop(unsettled, again, state)
+    # the first round takes the place where it begins, whatever it is worth
+    zero, large = jnp.zeros(loud.size, dtype), jnp.asarray(jnp.inf, dtype)
+    blank = jnp.zeros((*data.known.shape, 3), dtype)
+    nothing = Score(large, zero, jnp.eye(loud.size, dtype=dtype), blank, blank)
+    state = (zero, zero, nothing, zero, 0, jnp.asarray(3e-3, dtype), large, 0)
+    unknown, _, score, *_, distance, steps = jax.lax.while_loop(unsettled, again, state)
     covariance = inverse(score.information)
     shared = jnp.broadcast_to(unknown[count * own :], (count, used - own))
     rest = jnp.zeros((count, _PARTS[3] + _DEVICE - used), dtype)
@@ -204,7 +253,6 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         return entries_of(known.tensor(shape, sigma), 6)
 
     slopes = jax.vmap(jax.jacfwd(entries))(every[:, :_TENSOR], known.sigma)
-    inner = first[:, :_TENSOR]
     blocks = covariance[inner[:, :, None], inner[:, None, :]]
     blocks = slopes @ blocks @ jnp.swapaxes(slopes, 1, 2)
     return Fitted(

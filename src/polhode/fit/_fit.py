@@ -10,7 +10,7 @@ from jaxtyping import ArrayLike
 
 from polhode._checks import require
 from polhode.fit._compiled import compiled
-from polhode.fit._fit_wheel import fit_wheel
+from polhode.fit._fit_wheel import fit_wheel, fit_wheels
 from polhode.fit._instrument import Instrument
 from polhode.fit._motion import AbstractMotion, FreeMotion
 from polhode.fit._parameters import AbstractInertiaUnknown, FullTensor
@@ -66,10 +66,9 @@ def fit_inertia(
 
     A wheel's motion that is taken at its word (``SteppedMotion``) misleads where the air pushes and
     the speed is noisy: of simulated throws of 0.5 s it misses the moments by 2 to 7 % and states
-    0.6 to 1.1 %, the likelihood of the readings by 0.04 to 1.7 % and states 0.03 to 1.4 %. A
-    recording alone shows its own noise poorly, and the 95 % intervals hold 88 %: give throws of
-    one body together to ``fit_balance``. Forces take part in fits of a ``motion`` only: 3 cm from
-    the centre of mass an accelerometer narrows the tensor of such a throw by 0.3 % at most.
+    0.6 to 1.1 %, the likelihood of the readings by 0.04 to 1.7 % and states 0.03 to 1.4 %. Forces
+    take part in fits of a ``motion`` only: 3 cm from the centre of mass an accelerometer narrows
+    the tensor of such a throw by 0.3 % at most.
 
     Torque-free rates show only the ratios of the moments: see ``InertiaFit.scale_known``. Every
     iterate is a physical body. Left-handed axes are not fitted away: with attitudes they are
@@ -118,7 +117,7 @@ def fit_inertia(
     return _finished(each(recording, problem), throw)
 
 
-def _only_a_wheel(instrument, wheel_speed, others) -> None:
+def _only_a_wheel(instrument: Instrument | None, wheel_speed, others) -> None:
     """Refuse what the likelihood of the readings would not use."""
     require(
         instrument is not None,
@@ -126,6 +125,10 @@ def _only_a_wheel(instrument, wheel_speed, others) -> None:
         "motion: SteppedMotion(spin_inertia), or FreeMotion() to leave the wheel out.",
     )
     require(wheel_speed is not None, "an instrument needs the wheel's speed: give wheel_speed.")
+    require(
+        instrument is not None and instrument.spin_inertia is not None,
+        "the instrument needs the wheel's spin_inertia; throws without a wheel: fit_balance.",
+    )
     unused = [name for name, value in others.items() if value is not None and value is not False]
     require(
         not unused,
@@ -138,6 +141,8 @@ def _only_a_wheel(instrument, wheel_speed, others) -> None:
 def fit_recordings(
     recordings: Sequence[Recording],
     *,
+    instrument: Instrument | None = None,
+    block: int = 1,
     motion: AbstractMotion | None = None,
     unknown: AbstractInertiaUnknown | None = None,
     known: Inertia | None = None,
@@ -152,9 +157,24 @@ def fit_recordings(
 ) -> InertiaFit:
     """One inertia from several recordings of the same body (``Recording.of``); see ``fit_inertia``.
 
-    Windows of one long recording are recordings too: their initial rates are then fitted
-    separately (multiple shooting), which keeps a long or chaotic motion tractable.
+    Recordings with a wheel need its ``instrument``, as there (the noise is found, too, and what
+    belongs to a motion is refused), or the ``motion``. Windows of one long recording are recordings
+    too: their initial rates are then fitted separately (multiple shooting), which keeps a long or
+    chaotic motion tractable.
     """
+    wheel = [one.wheel is not None for one in recordings]
+    if instrument is not None or (any(wheel) and motion is None):
+        _only_a_wheel(
+            instrument,
+            any(wheel) or None,
+            {
+                "motion": motion, "unknown": unknown, "known": known, "bias": bias,
+                "mounting": mounting, "robust": robust, "noise_known": noise_known,
+                "solver": solver, "attitudes": any(one.wxyz is not None for one in recordings),
+                "forces": any(one.force is not None for one in recordings),
+            },
+        )  # fmt: skip
+        return _finished(fit_wheels(recordings, instrument, block), throw)
     problem = Problem(
         FreeMotion() if motion is None else motion,
         FullTensor() if unknown is None else unknown,

@@ -1,4 +1,6 @@
-"""``fit_inertia`` where a wheel is aboard: the likelihood of the readings, body by body."""
+"""A wheel aboard in ``fit_inertia`` and ``fit_recordings``: the likelihood of the readings."""
+
+from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +13,7 @@ from polhode.fit._linear import entries_of, whole_of
 from polhode.fit._matrices import inverse
 from polhode.fit._motion import Drag, SteppedMotion
 from polhode.fit._parameters import Parameters, base_of
-from polhode.fit._recording import Recording, needed
+from polhode.fit._recording import Recording, needed, stack
 from polhode.fit._residuals import Model
 from polhode.fit._result import Finding, InertiaFit, whiteness_of
 from polhode.inertia import Inertia, principal, second_moments
@@ -24,12 +26,18 @@ def fit_wheel(recording: Recording, instrument: Instrument, block: int) -> Inert
     found = []
     for k in range(flat.times.shape[0]):
         one = jax.tree.map(lambda leaf, k=k: leaf[k], flat)
-        found.append(_told(fit_balance([one], instrument, block=block, throw=False), one))
+        found.append(fit_wheels([one], instrument, block))
     joined = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
     return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), joined)
 
 
-def _told(fit: BalanceFit, recording: Recording) -> InertiaFit:
+def fit_wheels(recordings: Sequence[Recording], instrument: Instrument, block: int) -> InertiaFit:
+    """One body from its recordings of rates and wheel; ``fit_balance``."""
+    fit = fit_balance(recordings, instrument, block=block, throw=False)
+    return _told(fit, stack(recordings), instrument)
+
+
+def _told(fit: BalanceFit, recording: Recording, given: Instrument) -> InertiaFit:
     """One body's balance as the result that every motion gives."""
     tensor, moments = fit.inertia.tensor[0], fit.moments[0]
     covariance = fit.covariance[0]
@@ -57,9 +65,9 @@ def _told(fit: BalanceFit, recording: Recording) -> InertiaFit:
         columns=tuple(map(tuple, np.eye(6).tolist())),
         scale_known=True,
     )
-    begin = device.rates(needed("omega", recording.omega)[:1])
+    begin = device.rates(needed("omega", recording.omega)[:, 0])
     parameters = Parameters(
-        jnp.zeros(6, moments.dtype), begin, bias=device.bias,
+        jnp.zeros(6, moments.dtype), begin, bias=None if given.bias is None else device.bias,
         motion={"drag": Drag(*fit.drag[0]), "delay": None},
     )  # fmt: skip
     return InertiaFit(
@@ -68,7 +76,7 @@ def _told(fit: BalanceFit, recording: Recording) -> InertiaFit:
         covariance, jnp.asarray(0), jnp.sqrt(jnp.sum(rest**2) / read), whiteness,
         jnp.sqrt(jnp.sum((rest * fit.residuals_std) ** 2) / read),
         sum(jnp.where(seen, int(flag), 0) for flag, seen in flags), fit.steps, jnp.asarray(1),
-        parameters, model, {"omega": rest}, True, True,
+        parameters, model, {"omega": rest, "omega_std": fit.residuals_std}, True, True,
     )  # fmt: skip
 
 

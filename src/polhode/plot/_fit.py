@@ -15,10 +15,11 @@ _LEVELS = {"68 %": 2.2957, "95 %": 5.9915}
 def fit(result: Any, recording: Any, *, body: int = 0, title: str = ""):
     """Figure of a ``fit.InertiaFit`` and the ``fit.Recording`` it was made from; returns it.
 
-    Left: rates of the first recording (dots) over the fitted motion (lines), and the residuals in
-    units of their noise. Right: the region of the two smaller ratios (or moments) that the data
-    allow, the limit of what a body can be, and a table of the results. ``body`` picks one of a
-    batch. Raises ValueError for a recording without rates.
+    Left: rates of the first recording (dots) over the fitted motion, or over what the readings
+    before let expect where a wheel is aboard (lines), and the residuals in units of their noise.
+    Right: the region of the two smaller ratios (or moments) that the data allow, the limit of what
+    a body can be, and a table of the results. ``body`` picks one of a batch. Raises ValueError for
+    a recording without rates.
     """
     if recording.omega is None:
         raise ValueError("the figure of a fit needs a recording of rates, got attitudes alone.")
@@ -70,6 +71,17 @@ def _single(result, recording, body) -> dict[str, Any]:
     times = np.asarray(recording.times).reshape(-1, samples)[place]
     residual = np.asarray(result.residuals["omega"])
     residual = residual.reshape(-1, *residual.shape[-3:])[body][0]
+    if "omega_std" in result.residuals:
+        # of the likelihood of the readings: expected from those before, some samples to a residual
+        noise = np.asarray(result.residuals["omega_std"])
+        noise = noise.reshape(-1, *noise.shape[-3:])[body][0]
+        block, count = (samples - 1) // len(residual), len(residual)
+
+        def blocks(values):
+            return values[: count * block].reshape(count, block, -1).mean(axis=1)
+
+        times, omega = blocks(times)[:, 0], blocks(omega)
+        present = np.any(residual != 0, axis=1)
     # a loss that bounds outliers has shortened their residuals: shown as they were fitted
     model = omega - residual * noise
     hole = np.where(present, 1.0, np.nan)[:, None]
