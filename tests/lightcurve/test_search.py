@@ -8,10 +8,10 @@ import pytest
 import polhode as ph
 from benchmarks import light_curves
 from polhode import lightcurve
-from polhode.lightcurve import _fit, _search, _solutions, _steps
+from polhode.lightcurve import _fit, _hypotheses, _search, _solutions, _steps
 
 PHASE = lightcurve.HG1G2()
-MEANT = _search.Hypotheses(np.array([1.2, 1.9]), np.array([0.7, 0.5]), np.array([True, False]))
+MEANT = _hypotheses.Hypotheses(np.array([1.2, 1.9]), np.array([0.7, 0.5]), np.array([True, False]))
 
 
 def test_bodies_have_the_periods_of_their_hypothesis():
@@ -32,7 +32,9 @@ def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
     right = 1 / truth["P_phi"], 1 / truth["P_psi"]
     # the right one among eight that are off by one to eight steps of the resolution
     off = np.arange(9) * 1.5 / np.ptp(curve.t)
-    meant = _search.Hypotheses(right[0] + off, right[1] + 0 * off, np.full(9, truth["mode"] == 0))
+    meant = _hypotheses.Hypotheses(
+        right[0] + off, right[1] + 0 * off, np.full(9, truth["mode"] == 0)
+    )
     key = jax.random.key(0)
     trials = _search.tried(key, meant, 1800, 3, PHASE, points, 0.0)
     np.testing.assert_array_equal(trials.source, np.repeat(np.arange(9), 3))

@@ -9,8 +9,8 @@ import numpy as np
 from polhode import free, rotation
 from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._frequencies import Pairs
+from polhode.lightcurve._hypotheses import Hypotheses
 from polhode.lightcurve._model import Bodies, moments_of
-from polhode.lightcurve._search import Hypotheses
 from polhode.lightcurve._steps import BATCH, Problem, State, normal_equations, picked
 
 # Chi-square per degree of freedom at which a body explains a light curve.
@@ -59,17 +59,34 @@ class Fit(NamedTuple):
 
 def frequencies(bodies: Bodies):
     """f_phi, f_psi, and mode of bodies."""
-    unknowns = jnp.asarray(bodies.unknowns)
-    found = free.periods(moments_of(unknowns), unknowns[:, 4:7])
-    return 1 / np.asarray(found.P_phi), 1 / np.asarray(found.P_psi), np.asarray(found.mode)
+    return _in_parts(_periods, bodies)
 
 
 def momentum(bodies: Bodies) -> np.ndarray:
     """Unit vectors of the angular momentum in space (b, 3)."""
-    unknowns = jnp.asarray(bodies.unknowns)
-    body = jnp.stack(moments_of(unknowns), -1) * unknowns[:, 4:7]
-    space = np.asarray(rotation.rotate(jnp.asarray(bodies.wxyz), body))
-    return space / np.linalg.norm(space, axis=1, keepdims=True)
+    return _in_parts(_momentum, bodies)
+
+
+@jax.jit
+def _periods(bodies: Bodies):
+    found = free.periods(moments_of(bodies.unknowns), bodies.unknowns[:, 4:7])
+    return 1 / found.P_phi, 1 / found.P_psi, found.mode
+
+
+@jax.jit
+def _momentum(bodies: Bodies):
+    body = jnp.stack(moments_of(bodies.unknowns), -1) * bodies.unknowns[:, 4:7]
+    space = rotation.rotate(bodies.wxyz, body)
+    return space / jnp.sqrt(jnp.sum(space**2, axis=-1, keepdims=True))
+
+
+def _in_parts(function, bodies: Bodies):
+    """``function`` of bodies (b,) by 256, so that one program serves every number of them."""
+    total = len(bodies.wxyz)
+    index = np.minimum(np.arange(total + -total % 256), total - 1).reshape(-1, 256)
+    bodies = jax.tree.map(np.asarray, bodies)
+    parts = [function(picked(bodies, part)) for part in index]
+    return jax.tree.map(lambda *x: np.concatenate(x)[:total], *parts)
 
 
 def _derived(x, wxyz):
