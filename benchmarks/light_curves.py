@@ -203,7 +203,7 @@ def best_possible(curve, body, floor=0.01) -> dict:
     width = np.full(_steps.BATCH, 3.0)
     state = problem.improve(problem.start(start, width), width, 20)
     normals = _fit._mirrors(curve)
-    (found,), _ = _solutions.described(problem, state, np.array([0]), curve, normals, 3.0)
+    (found,), *_ = _solutions.described(problem, state, np.array([0]), curve, normals, 3.0)
     return {
         "P_phi_std": found.P_phi_std / found.P_phi, "P_psi_std": found.P_psi_std / found.P_psi,
         "cost": found.cost,

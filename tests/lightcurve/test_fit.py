@@ -173,8 +173,12 @@ def test_tc4_in_the_night_of_2012(shared, tmp_path):
         pytest.skip("the folder of light curves is absent")
     pytest.importorskip("matplotlib")
     said = []
+    # every third point: as many as a search looks at, so that search and fit are one program
+    header, *rows = (folder / "tc4_2012.csv").read_text().splitlines()
+    few = tmp_path / "few.csv"
+    few.write_text("\n".join([header, *rows[::3]]) + "\n")
     fit = lightcurve.run(
-        folder / "tc4_2012.csv", vectors=folder / "tc4_2012_vectors.csv", trials=20_000,
+        few, vectors=folder / "tc4_2012_vectors.csv", trials=8_000,
         output=tmp_path / "tc4", say=said.append,
     )  # fmt: skip
     assert fit.best.mode == ph.Mode.LAM

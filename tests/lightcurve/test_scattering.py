@@ -116,12 +116,8 @@ def test_derivatives_of_facets_through_motion_and_shape():
             lightcurve.Convex.from_mesh(vertices * jnp.exp(stretch)[None], faces),
             lightcurve.Convex.from_harmonics(coefficients, 500),
         )
-        return jnp.stack([
-            body.brightness(
-                ph.rotation.rotate(back, sun[None]), ph.rotation.rotate(back, observer[None]), lambert=0.2
-            )
-            for body in bodies
-        ])  # fmt: skip
+        lit, seen = (ph.rotation.rotate(back, v[None]) for v in (sun, observer))
+        return jnp.stack([body.brightness(lit, seen, lambert=0.2) for body in bodies])
 
     x = jnp.asarray(np.r_[np.zeros(6), 0.4, 1.1, -0.5, 0.3, -0.2, 0.9, 0.5, 0.2, -0.3, 0.1])
     light = jax.jit(light)

@@ -64,6 +64,23 @@ def test_misfit_is_that_of_the_light_times_the_gain():
     assert _search.misfits(PHASE, flat, points)[1][0] > 1.1
 
 
+def test_likeness_is_the_variance_of_sums_over_that_of_independent_ones():
+    """Nights of 20 points with a correlation of 0.7 from one to the next; the sums of 400 draws."""
+    rng = np.random.default_rng(2)
+    night = np.repeat(np.arange(20), 20)
+    t = night + 0.01 * np.tile(np.arange(20), 20)
+    sun = np.tile([1.0, 0, 0], (400, 1))
+    curve = lightcurve.LightCurve.of(t, 0 * t, sun, sun, group=night)
+    alone = rng.normal(size=(400, 400))
+    alike = alone.copy()
+    for k in np.flatnonzero(np.diff(night, prepend=-1) == 0):
+        alike[:, k] = 0.7 * alike[:, k - 1] + np.sqrt(1 - 0.7**2) * alone[:, k]
+    measured = np.var(alike.sum(1)) / 400
+    found = [_solutions.likeness(curve, row) for row in alike[:20]]
+    assert np.mean(found) == pytest.approx(measured, rel=0.15)
+    assert np.mean([_solutions.likeness(curve, row) for row in alone[:20]]) < 1.05
+
+
 def test_normal_points_are_means_of_one_group():
     t = np.array([0.0, 0.001, 0.002, 0.5, 0.501, 1.0, 1.001, 1.002, 1.003])
     group = np.array(["a", "b", "a", "a", "a", "a", "a", "a", "a"])

@@ -92,14 +92,14 @@ def fit_light_curve(
     mirrored = problem.improve(problem.start(images, width), width, 30)
     state = _joined(state, mirrored)
     order = _distinct(state, pairs.resolution, most)
-    solutions, scale = described(problem, state, order, curve, normals, limit)
-    notes = notes_on(curve, solutions, scale)
+    solutions, scale, alike = described(problem, state, order, curve, normals, limit)
+    notes = notes_on(curve, solutions, scale, alike)
     if not again:
         notes += (
             "No second search found the best motion again: better ones may have been missed. Ask"
             " for more trials or searches.",
         )
-    return Fit(solutions, curve, pairs, meant, scale, notes)
+    return Fit(solutions, curve, pairs, meant, scale, alike, notes)
 
 
 def _blur(curve: LightCurve) -> float:
