@@ -3,6 +3,7 @@
 import math
 from typing import Any
 
+from benchmarks._light_curve_section import light_curves
 from benchmarks._markdown import machine, number, rows
 from benchmarks._throw_sections import satellites, throw_design, throws, throws_synthetic
 
@@ -378,6 +379,7 @@ SECTIONS = {
     "gradients": gradients, "scene_cost": scene_cost, "scaling": scaling,
     "identification": identification, "throws": throws,
     "throws_synthetic": throws_synthetic, "throw_design": throw_design, "satellites": satellites,
+    "light_curves": light_curves,
     "racquet": racquet,
     "stress": stress,
     "free_body": free_body, "elliptic_accuracy": elliptic_accuracy,

@@ -33,7 +33,7 @@ from scipy.spatial import ConvexHull
 
 import polhode as ph
 from polhode import lightcurve
-from polhode.lightcurve import _fit, _model, _search, _solutions, _steps
+from polhode.lightcurve import _fit, _hypotheses, _model, _search, _solutions, _steps
 
 VERDICTS = ("right", "within its errors", "listed", "told", "silent")
 HIGHEST = 7.0  # frequency sought of synthetic tumblers [1/d]
@@ -203,7 +203,7 @@ def best_possible(curve, body, floor=0.01) -> dict:
     width = np.full(_steps.BATCH, 3.0)
     state = problem.improve(problem.start(start, width), width, 20)
     normals = _fit._mirrors(curve)
-    (found,), _ = _solutions.described(problem, state, np.array([0]), curve, normals, 3.0)
+    (found,), *_ = _solutions.described(problem, state, np.array([0]), curve, normals, 3.0)
     return {
         "P_phi_std": found.P_phi_std / found.P_phi, "P_psi_std": found.P_psi_std / found.P_psi,
         "cost": found.cost,
@@ -237,7 +237,7 @@ def speed(states: int = 100_000, samples: int = 400) -> dict:
     t = np.linspace(0, 25.0, samples)
     sun, observer = directions(t)
     points = lightcurve.LightCurve.of(t, 0 * t, sun, observer).points(0.02)
-    one = _search.Hypotheses(np.array([1.0]), np.array([1.3]), np.array([True]))
+    one = _hypotheses.Hypotheses(np.array([1.0]), np.array([1.3]), np.array([True]))
     phase = lightcurve.HG1G2()
     bodies, _ = _search.build(*_search.draw(jax.random.key(0), one, states, 0.1), phase)
     _search.misfits(phase, jax.tree.map(lambda x: x[: _search.CHUNK], bodies), points)

@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import polhode as ph
+from benchmarks import light_curves
 from polhode import lightcurve
 
 RNG = np.random.default_rng(19)
@@ -96,6 +98,40 @@ def test_facets_of_ellipsoid_and_of_harmonics():
     again = lightcurve.Convex.from_harmonics(coefficients, 4000)
     other = again.brightness(jnp.asarray(sun), jnp.asarray(observer), lambert=0.3)
     assert other == pytest.approx(float(found), rel=0.02)
+
+
+def test_derivatives_of_facets_through_motion_and_shape():
+    """By moments, rates, attitude, vertices of a mesh, and harmonics of the curvature."""
+    moments, vertices, faces = light_curves.blunt(np.array([1.0, 0.7, 0.5]))
+    ts = jnp.linspace(0.0, 5.0, 7)
+    sun, observer = jnp.array([1.0, 0.0, 0.0]), jnp.array([0.8, 0.0, 0.6])
+
+    def light(x):
+        stretch, inertia, omega, turn, coefficients = jnp.split(x, [3, 6, 9, 12])
+        wxyz = ph.rotation.rotation_vector_to_wxyz(turn)
+        scene = ph.Scene(ph.Inertia(moments * jnp.exp(inertia)))
+        path = ph.simulate(scene, ph.State(wxyz, omega), ts)
+        back = ph.rotation.conjugate(path.wxyz)
+        bodies = (
+            lightcurve.Convex.from_mesh(vertices * jnp.exp(stretch)[None], faces),
+            lightcurve.Convex.from_harmonics(coefficients, 500),
+        )
+        lit, seen = (ph.rotation.rotate(back, v[None]) for v in (sun, observer))
+        return jnp.stack([body.brightness(lit, seen, lambert=0.2) for body in bodies])
+
+    x = jnp.asarray(np.r_[np.zeros(6), 0.4, 1.1, -0.5, 0.3, -0.2, 0.9, 0.5, 0.2, -0.3, 0.1])
+    light = jax.jit(light)
+    slopes = jax.jacrev(light)(x)
+    step = 1e-6
+    measured = np.stack(
+        [(light(x + step * e) - light(x - step * e)) / (2 * step) for e in np.eye(16)], -1
+    )
+    # facets turn dark with a corner of theirs, which a difference may straddle
+    np.testing.assert_allclose(slopes, measured, atol=1e-5 * np.abs(measured).max())
+    # every one of them matters, and a body does not depend on the other's shape
+    seen = np.abs(measured).max(1) > 1e-3
+    np.testing.assert_array_equal(seen[0], np.arange(16) < 12)
+    np.testing.assert_array_equal(seen[1], np.arange(16) >= 3)
 
 
 def test_lambert_sphere_and_cube():

@@ -8,10 +8,10 @@ import pytest
 import polhode as ph
 from benchmarks import light_curves
 from polhode import lightcurve
-from polhode.lightcurve import _fit, _search, _solutions, _steps
+from polhode.lightcurve import _fit, _hypotheses, _search, _solutions, _steps
 
 PHASE = lightcurve.HG1G2()
-MEANT = _search.Hypotheses(np.array([1.2, 1.9]), np.array([0.7, 0.5]), np.array([True, False]))
+MEANT = _hypotheses.Hypotheses(np.array([1.2, 1.9]), np.array([0.7, 0.5]), np.array([True, False]))
 
 
 def test_bodies_have_the_periods_of_their_hypothesis():
@@ -32,7 +32,9 @@ def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
     right = 1 / truth["P_phi"], 1 / truth["P_psi"]
     # the right one among eight that are off by one to eight steps of the resolution
     off = np.arange(9) * 1.5 / np.ptp(curve.t)
-    meant = _search.Hypotheses(right[0] + off, right[1] + 0 * off, np.full(9, truth["mode"] == 0))
+    meant = _hypotheses.Hypotheses(
+        right[0] + off, right[1] + 0 * off, np.full(9, truth["mode"] == 0)
+    )
     key = jax.random.key(0)
     trials = _search.tried(key, meant, 1800, 3, PHASE, points, 0.0)
     np.testing.assert_array_equal(trials.source, np.repeat(np.arange(9), 3))
@@ -60,6 +62,23 @@ def test_misfit_is_that_of_the_light_times_the_gain():
     assert gain[0] == pytest.approx(1.0, abs=0.05)
     flat = body._replace(unknowns=jnp.asarray(body.unknowns).at[:, 2:4].multiply(0.8))
     assert _search.misfits(PHASE, flat, points)[1][0] > 1.1
+
+
+def test_likeness_is_the_variance_of_sums_over_that_of_independent_ones():
+    """Nights of 20 points with a correlation of 0.7 from one to the next; the sums of 400 draws."""
+    rng = np.random.default_rng(2)
+    night = np.repeat(np.arange(20), 20)
+    t = night + 0.01 * np.tile(np.arange(20), 20)
+    sun = np.tile([1.0, 0, 0], (400, 1))
+    curve = lightcurve.LightCurve.of(t, 0 * t, sun, sun, group=night)
+    alone = rng.normal(size=(400, 400))
+    alike = alone.copy()
+    for k in np.flatnonzero(np.diff(night, prepend=-1) == 0):
+        alike[:, k] = 0.7 * alike[:, k - 1] + np.sqrt(1 - 0.7**2) * alone[:, k]
+    measured = np.var(alike.sum(1)) / 400
+    found = [_solutions.likeness(curve, row) for row in alike[:20]]
+    assert np.mean(found) == pytest.approx(measured, rel=0.15)
+    assert np.mean([_solutions.likeness(curve, row) for row in alone[:20]]) < 1.05
 
 
 def test_normal_points_are_means_of_one_group():

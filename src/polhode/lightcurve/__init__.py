@@ -7,8 +7,8 @@ from polhode.lightcurve._frequencies import (
     Pairs as Pairs,
     fourier_lattices as fourier_lattices,
     fourier_pairs as fourier_pairs,
-    meaning as meaning,
 )
+from polhode.lightcurve._hypotheses import meaning as meaning
 from polhode.lightcurve._phase import (
     HG as HG,
     HG1G2 as HG1G2,

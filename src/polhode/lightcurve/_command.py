@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from polhode.lightcurve._fit import fit_light_curve
-from polhode.lightcurve._frequencies import fourier_pairs, meaning
+from polhode.lightcurve._frequencies import fourier_pairs
+from polhode.lightcurve._hypotheses import meaning
 from polhode.lightcurve._read import read_light_curve
 from polhode.lightcurve._solutions import Fit
 

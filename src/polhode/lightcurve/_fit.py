@@ -7,9 +7,10 @@ import numpy as np
 from polhode import free, rotation
 from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._frequencies import Pairs, fourier_lattices
+from polhode.lightcurve._hypotheses import Hypotheses, hypotheses
 from polhode.lightcurve._model import Bodies, Points
 from polhode.lightcurve._phase import HG1G2, AbstractPhase, SeeligerPhase
-from polhode.lightcurve._search import Hypotheses, hypotheses, tried
+from polhode.lightcurve._search import tried
 from polhode.lightcurve._solutions import REACHED, Fit, described, frequencies, momentum, notes_on
 from polhode.lightcurve._steps import BATCH, Problem, State, picked, taken
 
@@ -59,12 +60,12 @@ def fit_light_curve(
     points = curve.points(floor, offset_sigma)
     if phase is None:
         phase = HG1G2() if np.ptp(curve.alpha) > np.radians(5) else SeeligerPhase()
+    columns = curve.columns(np.inf)[0]
+    if np.ptp(curve.alpha) > np.radians(1):
+        columns = np.vstack([columns, curve.alpha, curve.alpha**2])
     if pairs is None:
-        columns = curve.columns(np.inf)[0]
-        if np.ptp(curve.alpha) > np.radians(1):
-            columns = np.vstack([columns, curve.alpha, curve.alpha**2])
         pairs = fourier_lattices(curve.t, curve.magnitude, columns=columns, highest=highest)
-    meant = hypotheses(pairs)
+    meant = hypotheses(pairs, curve.t, curve.magnitude, columns=columns)
     key = jax.random.key(seed)
     rough, problem = Problem(phase, _thinned(points, _FEW)), Problem(phase, points)
     state, again = None, False
@@ -91,14 +92,14 @@ def fit_light_curve(
     mirrored = problem.improve(problem.start(images, width), width, 30)
     state = _joined(state, mirrored)
     order = _distinct(state, pairs.resolution, most)
-    solutions, scale = described(problem, state, order, curve, normals, limit)
-    notes = notes_on(curve, solutions, scale)
+    solutions, scale, alike = described(problem, state, order, curve, normals, limit)
+    notes = notes_on(curve, solutions, scale, alike)
     if not again:
         notes += (
             "No second search found the best motion again: better ones may have been missed. Ask"
             " for more trials or searches.",
         )
-    return Fit(solutions, curve, pairs, meant, scale, notes)
+    return Fit(solutions, curve, pairs, meant, scale, alike, notes)
 
 
 def _blur(curve: LightCurve) -> float:

@@ -15,6 +15,9 @@ from jaxtyping import Array, Float
 
 _CHUNK = 4096
 _MOST = 600  # nodes of the grid that are sought unless more are asked for
+# Sums of a line g and another h, in halves: g and what it may be a harmonic of, or have as one, so
+# that h is not chosen for what g alone explains; h, and its sidebands.
+LINES = np.array([(1, 0), (2, 0), (3, 0), (4, 0), (0, 2), (2, 2), (2, -2)]) / 2
 
 
 class Pairs(NamedTuple):
@@ -29,8 +32,8 @@ class Pairs(NamedTuple):
 def terms(order: int, even: bool = True) -> np.ndarray:
     """Multiples (i, j) of f_phi and f_psi, one of each pair of opposites.
 
-    ``even``: only even j. A body that half a turn about its long axis does not change, such as an
-    ellipsoid, has no others.
+    ``even``: only even j. A body in long-axis mode that half a turn about its long axis does not
+    change, such as an ellipsoid, has no others.
     """
     j = np.arange(-order, order + 1) * (2 if even else 1)
     grid = np.array([(a, b) for a in range(order + 1) for b in j])
@@ -85,11 +88,11 @@ def _equations(tables, data, nodes):
 
 
 @jax.jit
-def _scan(tables, data, pairs, multiples):
-    return jax.vmap(lambda pair: _equations(tables, data, multiples @ pair))(pairs)
+def _scan(tables, data, nodes):
+    return jax.vmap(lambda each: _equations(tables, data, each))(nodes)
 
 
-class _Scan(NamedTuple):
+class Scan(NamedTuple):
     """Tables from which the normal equations of any pair of nodes are looked up."""
 
     tables: tuple  # transforms of the window and of the columns projected out
@@ -100,7 +103,8 @@ class _Scan(NamedTuple):
     resolution: float
 
     @classmethod
-    def of(cls, t, values, columns, highest, oversampling: int, multiples) -> "_Scan":
+    def of(cls, t, values, columns, highest, oversampling: int, most: int) -> "Scan":
+        """``most``: the highest sum looked at is that many times the highest frequency."""
         t, values = np.asarray(t, float), np.asarray(values, float)
         t = t - t[0]
         columns = np.ones((1, t.size)) if columns is None else np.asarray(columns, float)
@@ -117,27 +121,33 @@ class _Scan(NamedTuple):
         if highest is None:
             highest = min(_highest(t, values, step), _MOST * step)
         count = int(np.ceil(highest / step)) + 1
-        most = 2 * (int(np.abs(multiples).sum(1).max()) * count + 1)
         window, data, *rest = _transforms(
-            jnp.asarray(t), jnp.asarray(np.vstack([np.ones_like(t), values, basis])), step, most
-        )
+            jnp.asarray(t), jnp.asarray(np.vstack([np.ones_like(t), values, basis])), step,
+            2 * (most * count + 1),
+        )  # fmt: skip
         return cls((window, jnp.stack(rest)), data, step, count, t.size, step * oversampling)
 
-    def explained(self, pairs: np.ndarray, multiples: np.ndarray) -> np.ndarray:
-        """Part of the variance (k,) that the series of pairs of nodes (k, 2) explain."""
-        chunk = min(_CHUNK, 256 * -(-len(pairs) // 256))
-        whole = np.concatenate([pairs, np.repeat(pairs[-1:], -len(pairs) % chunk, 0)])
-        power = np.empty(len(whole))
+    def fitted(self, nodes: np.ndarray, soft=1e-3) -> tuple[np.ndarray, np.ndarray]:
+        """Part of the variance (k,) explained by waves at nodes (k, m), and ln det of the matrix.
+
+        ``soft`` (..., m): added to the diagonal of the normal equations, over the number of points.
+        """
+        chunk = min(_CHUNK, 256 * -(-len(nodes) // 256))
+        whole = np.concatenate([nodes, np.repeat(nodes[-1:], -len(nodes) % chunk, 0)])
+        power, size = np.empty((2, len(whole)))
+        # columns that coincide, or vanish, would leave a singular matrix
+        ridge = self.size * np.diag(np.tile(np.broadcast_to(soft, nodes.shape[1:]), 2))
         for start in range(0, len(whole), chunk):
             part = slice(start, start + chunk)
-            gram, right = _scan(
-                self.tables, self.data, jnp.asarray(whole[part]), jnp.asarray(multiples)
-            )
-            # columns that coincide, or vanish, leave a singular matrix
-            gram = np.asarray(gram) + 1e-3 * self.size * np.eye(right.shape[-1])
-            right = np.asarray(right)
+            gram, right = _scan(self.tables, self.data, jnp.asarray(whole[part]))
+            gram, right = np.asarray(gram) + ridge, np.asarray(right)
             power[part] = np.sum(right * np.linalg.solve(gram, right[..., None])[..., 0], axis=-1)
-        return np.nan_to_num(power[: len(pairs)])
+            size[part] = np.linalg.slogdet(gram)[1]
+        return np.nan_to_num(power[: len(nodes)]), size[: len(nodes)]
+
+    def explained(self, pairs: np.ndarray, multiples: np.ndarray) -> np.ndarray:
+        """Part of the variance (k,) that the sums (m, 2) of pairs of nodes (k, 2) explain."""
+        return self.fitted(np.rint(pairs @ multiples.T).astype(int))[0]
 
 
 def fourier_pairs(
@@ -160,7 +170,8 @@ def fourier_pairs(
     best ``keep``. Without ``even`` the two may be swapped, and ``f_phi`` is the higher one.
     """
     multiples = terms(order, even)
-    scan = _Scan.of(t, values, columns, highest, oversampling, multiples)
+    most = int(np.abs(multiples).sum(1).max())
+    scan = Scan.of(t, values, columns, highest, oversampling, most)
     # a tenth of a cycle at least; neither frequency may be that of the other
     nodes = np.arange(max(oversampling // 2, 1), scan.count)
     pairs = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), -1).reshape(-1, 2)
@@ -187,42 +198,37 @@ def fourier_lattices(
     *,
     columns: Float[Array | np.ndarray, "c n"] | None = None,
     highest: float | None = None,
-    order: int = 2,
     lines: int = 16,
     oversampling: int = 5,
     keep: int = 60,
 ) -> Pairs:
-    """Pairs (g, h) whose sums of multiples up to ``order`` explain ``values`` best.
+    """Pairs of lines (g, h) that explain ``values`` best, given as ``f_phi`` and ``f_psi``.
 
-    As `fourier_pairs` without ``even``, but g is only one of the ``lines`` highest peaks of the
-    spectrum of one frequency, of which aliases are some, and h is sought over the whole grid: the
-    strongest line of a body is always one of its sums, so that a long light curve, with thousands
-    of nodes, is searched by lines of the grid instead of all of it: with order 1, and the best of
-    every line again with ``order``. Which sums of multiples of the body's own frequencies g and h
-    are is left open.
+    For long light curves, whose grid has millions of pairs: g is only one of the ``lines`` highest
+    peaks of the spectrum of one frequency, of which aliases are some, and h is sought over the
+    whole grid, beside the multiples of g and half of it. What explains a body's light are a few
+    sums of multiples of its frequencies; which of them g and h are is left open.
     """
-    multiples = terms(order, even=False)
-    scan = _Scan.of(t, values, columns, highest, oversampling, multiples)
+    scan = Scan.of(t, values, columns, highest, oversampling, 2)
     nodes = np.arange(max(oversampling // 2, 1), scan.count)
-    alone = np.stack([nodes, np.zeros_like(nodes)], -1)
-    peaks = _maxima(scan.explained(alone, np.array([[1, 0]])))[:lines]
-    found = []
+    peaks = _maxima(scan.fitted(nodes[:, None])[0])[:lines]
+    found, power = [], []
     for node in nodes[peaks]:
         line = np.stack([np.full_like(nodes, node), nodes], -1)
-        found.append(line[_maxima(scan.explained(line, terms(1, even=False)))[:keep]])
-    found = np.concatenate(found)
-    power = scan.explained(found, multiples)
-    first = np.argsort(-power)
-    kept: list[tuple[float, int, int]] = []
-    for part, (one, other) in zip(power[first], found[first]):
-        g, h = int(max(one, other)), int(min(one, other))
-        same = [max(abs(g - a), abs(h - b)) <= oversampling // 2 for _, a, b in kept]
-        if not any(same) and g - h > oversampling // 2:
-            kept.append((float(part), g, h))
+        part = scan.explained(line, LINES)
+        best = _maxima(part)[:keep]
+        found.append(line[best])
+        power.append(part[best])
+    found, power = np.concatenate(found), np.concatenate(power)
+    kept: list[int] = []
+    for k in np.argsort(-power):
+        near = np.abs(found[kept] - found[k]).max(1) if kept else np.array([np.inf])
+        if near.min() > oversampling // 4:
+            kept.append(int(k))
         if len(kept) == keep:
             break
-    power, high, low = np.array(kept).T
-    return Pairs(high * scan.step, low * scan.step, power, scan.resolution)
+    g, h = scan.step * found[kept].T
+    return Pairs(g, h, power[kept], scan.resolution)
 
 
 def _maxima(values: np.ndarray) -> np.ndarray:
@@ -245,25 +251,3 @@ def _highest(t, values, step) -> float:
     (table,) = _transforms(jnp.asarray(t), jnp.asarray(values)[None], step, count)
     power = np.abs(np.asarray(table)) ** 2
     return 1.3 * step * np.flatnonzero(power > 0.1 * power.max())[-1]
-
-
-def meaning(f_phi: float, f_psi: float, order: int = 2) -> str:
-    """What a pair would mean, in words: modes that it allows, and its strongest sums."""
-    sums = sorted(
-        (abs(i) + abs(j), abs(i * f_phi + j * f_psi), i, j) for i, j in terms(order, even=True)
-    )
-    listed = ", ".join(
-        f"{_name(i, 'f_phi')}{_name(j, 'f_psi', first=i == 0)} = {f:.5g}" for _, f, i, j in sums[:4]
-    )
-    # A body slower about L than about its long axis can only turn fully about the latter:
-    # (I_s/I_i - 1)(I_s/I_l - 1) <= 1 for moments that mass can have.
-    modes = "LAM or SAM" if f_psi < f_phi else "LAM only"
-    return f"{modes}; {listed}"
-
-
-def _name(count: int, symbol: str, first: bool = True) -> str:
-    if count == 0:
-        return ""
-    sign = "-" if count < 0 else "" if first else "+"
-    size = "" if abs(count) == 1 else f"{abs(count)} "
-    return f"{sign}{size}{symbol}" if first else f" {sign} {size}{symbol}"

@@ -8,56 +8,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode import free
-from polhode.lightcurve._frequencies import Pairs
+from polhode.lightcurve._hypotheses import Hypotheses
 from polhode.lightcurve._model import Bodies, Points, magnitudes, moments_of
 from polhode.lightcurve._phase import AbstractPhase
 
 CHUNK = 2048
 _BISECTIONS = 24
-_WORTH = (3.0, 0.03)  # what a series may leave, by that of the best, and of the whole
 _GAIN = (0.6, 1.7)  # of the variations, in a trial's score
 _SLOPE_SIGMA = 0.5  # of the phase function, in a trial's score [mag / rad]
-
-
-class Hypotheses(NamedTuple):
-    """Periods that a light curve may stand for; arrays (h,)."""
-
-    f_phi: np.ndarray
-    f_psi: np.ndarray
-    long_axis: np.ndarray  # bool: LAM
-
-
-def hypotheses(pairs: Pairs, lattices: int = 30, most: int = 800) -> Hypotheses:
-    """What the first ``lattices`` pairs of a Fourier series can mean, ``most`` at most.
-
-    A series tells the set of sums of multiples of two frequencies, g and h, not which of them is
-    what. A body has ``i f_phi + 2 j f_psi``, of which those with odd i may be faint: f_phi is one
-    of g, h, g + h, g - h or half of it, and 2 f_psi another one; in both modes, but that SAM has
-    ``f_psi <= f_phi``, because no moment exceeds the sum of the other two.
-    """
-    sums = np.array([(1, 0), (0, 1), (1, 1), (1, -1)], float)
-    found = []
-    left = 1 - pairs.explained
-    worth = left <= _WORTH[0] * left.min() + _WORTH[1]
-    for g in np.stack([pairs.f_phi, pairs.f_psi], -1)[worth][:lattices]:
-        size = np.abs(sums @ g)
-        for i in range(4):
-            for f_phi in (size[i], size[i] / 2):
-                for f_psi in np.delete(size, i) / 2:
-                    # half a turn within the light curve at least
-                    if min(f_phi, f_psi) >= 0.5 * pairs.resolution:
-                        found += [(f_phi, f_psi, mode) for mode in (True, False)]
-    table = np.array([row for row in found if row[2] or row[1] < row[0]], float)
-    # the same within four tenths of the resolution is the same
-    scaled = table / np.array([0.4 * pairs.resolution, 0.4 * pairs.resolution, 1e-3])
-    kept: list[np.ndarray] = []
-    for row in scaled:
-        if not kept or np.abs(np.array(kept) - row).max(1).min() > 1:
-            kept.append(row)
-        if len(kept) == most:
-            break
-    table = np.array(kept) * np.array([0.4 * pairs.resolution, 0.4 * pairs.resolution, 1e-3])
-    return Hypotheses(table[:, 0], table[:, 1], table[:, 2] > 0.5)
 
 
 class Draws(NamedTuple):

@@ -9,8 +9,8 @@ import numpy as np
 from polhode import free, rotation
 from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._frequencies import Pairs
+from polhode.lightcurve._hypotheses import Hypotheses
 from polhode.lightcurve._model import Bodies, moments_of
-from polhode.lightcurve._search import Hypotheses
 from polhode.lightcurve._steps import BATCH, Problem, State, normal_equations, picked
 
 # Chi-square per degree of freedom at which a body explains a light curve.
@@ -27,7 +27,7 @@ class Solution(NamedTuple):
     mode: free.Mode
     rms: float  # weighted, of the residuals [mag]
     cost: float  # robust chi-square, priors included
-    probability: float  # exp(-(cost - best) / 2 / scale^2): 1 for the best
+    probability: float  # exp(-(cost - best) / 2 / scale^2 / alike): 1 for the best
     moments: np.ndarray  # (3,), of the greatest
     moments_std: np.ndarray  # (3,)
     axes: np.ndarray  # (3,) semi-axes over the longest
@@ -50,6 +50,7 @@ class Fit(NamedTuple):
     pairs: Pairs
     hypotheses: Hypotheses
     scale: float  # residuals of the best over the errors assumed
+    alike: float  # so many residuals count as one, because neighbours are alike; 1: independent
     notes: tuple[str, ...]  # what this light curve cannot show
 
     @property
@@ -59,17 +60,34 @@ class Fit(NamedTuple):
 
 def frequencies(bodies: Bodies):
     """f_phi, f_psi, and mode of bodies."""
-    unknowns = jnp.asarray(bodies.unknowns)
-    found = free.periods(moments_of(unknowns), unknowns[:, 4:7])
-    return 1 / np.asarray(found.P_phi), 1 / np.asarray(found.P_psi), np.asarray(found.mode)
+    return _in_parts(_periods, bodies)
 
 
 def momentum(bodies: Bodies) -> np.ndarray:
     """Unit vectors of the angular momentum in space (b, 3)."""
-    unknowns = jnp.asarray(bodies.unknowns)
-    body = jnp.stack(moments_of(unknowns), -1) * unknowns[:, 4:7]
-    space = np.asarray(rotation.rotate(jnp.asarray(bodies.wxyz), body))
-    return space / np.linalg.norm(space, axis=1, keepdims=True)
+    return _in_parts(_momentum, bodies)
+
+
+@jax.jit
+def _periods(bodies: Bodies):
+    found = free.periods(moments_of(bodies.unknowns), bodies.unknowns[:, 4:7])
+    return 1 / found.P_phi, 1 / found.P_psi, found.mode
+
+
+@jax.jit
+def _momentum(bodies: Bodies):
+    body = jnp.stack(moments_of(bodies.unknowns), -1) * bodies.unknowns[:, 4:7]
+    space = rotation.rotate(bodies.wxyz, body)
+    return space / jnp.sqrt(jnp.sum(space**2, axis=-1, keepdims=True))
+
+
+def _in_parts(function, bodies: Bodies):
+    """``function`` of bodies (b,) by 256, so that one program serves every number of them."""
+    total = len(bodies.wxyz)
+    index = np.minimum(np.arange(total + -total % 256), total - 1).reshape(-1, 256)
+    bodies = jax.tree.map(np.asarray, bodies)
+    parts = [function(picked(bodies, part)) for part in index]
+    return jax.tree.map(lambda *x: np.concatenate(x)[:total], *parts)
 
 
 def _derived(x, wxyz):
@@ -92,7 +110,7 @@ _derived_slopes = jax.jit(jax.vmap(jax.jacfwd(_derived)))
 
 
 def described(problem: Problem, state: State, order, curve: LightCurve, normals, limit):
-    """Solutions, and the residuals of the best over the errors assumed."""
+    """Solutions, the residuals of the best over the errors assumed, and how alike they are."""
     n = curve.t.size
     index = np.pad(order, (0, -len(order) % BATCH), mode="edge")
     chosen = picked(state, index)
@@ -105,6 +123,7 @@ def described(problem: Problem, state: State, order, curve: LightCurve, normals,
     rest = model - curve.magnitude
     freedom = max(n - chosen.matrix.shape[1] + int((problem.stiffness > 0).sum()), 1)
     scale = float(np.sqrt((robust[0] * weight[0] * rest[0] ** 2).sum() / freedom))
+    alike = likeness(curve, np.sqrt(robust[0] * weight[0]) * rest[0])
     f_phi, f_psi, mode = frequencies(chosen.bodies)
     pole = momentum(chosen.bodies)
     unknowns, wxyz = chosen.bodies
@@ -114,7 +133,7 @@ def described(problem: Problem, state: State, order, curve: LightCurve, normals,
     out = []
     for k in range(len(order)):
         covariance = np.linalg.pinv(chosen.matrix[k], hermitian=True)[:count, :count]
-        spread = scale**2 * slopes[k] @ covariance @ slopes[k].T
+        spread = scale**2 * alike * slopes[k] @ covariance @ slopes[k].T
         std = np.sqrt(np.maximum(np.diag(spread), 0))
         images = 2 * normals * (normals @ pole[k])[:, None] - pole[k]
         mirror = [
@@ -128,16 +147,36 @@ def described(problem: Problem, state: State, order, curve: LightCurve, normals,
         out.append(Solution(
             1 / f_phi[k], 1 / f_psi[k], std[0] / f_phi[k], std[1] / f_psi[k],
             free.Mode(int(mode[k])), float(np.sqrt(np.average(rest[k] ** 2, weights=weight[0]))),
-            float(chosen.cost[k]), float(np.exp((chosen.cost[0] - chosen.cost[k]) / 2 / scale**2)),
+            float(chosen.cost[k]),
+            float(np.exp((chosen.cost[0] - chosen.cost[k]) / 2 / scale**2 / alike)),
             moments / moments.max(), std[2:5], axes / axes.max(),
             np.degrees([np.arctan2(pole[k, 1], pole[k, 0]) % (2 * np.pi), np.arcsin(pole[k, 2])]),
             float(np.degrees(np.linalg.norm(std[5:]))), wxyz[k], unknowns[k, 4:7],
             unknowns[k, 7:], chosen.offsets[k], model[k], robust[k], mirror[0] if mirror else None,
         ))  # fmt: skip
-    return tuple(out), scale
+    return tuple(out), scale, alike
 
 
-def notes_on(curve: LightCurve, solutions, scale: float) -> tuple[str, ...]:
+def likeness(curve: LightCurve, residuals: np.ndarray) -> float:
+    """How many residuals (n,), over their errors, count as one.
+
+    The variance of their sum over that of independent ones, if those of one run (one group, no gap
+    over half a day) are alike by rho^k, k points apart; rho: measured between neighbours.
+    """
+    together = (np.diff(curve.group) == 0) & (np.diff(curve.t) < 0.5)
+    a, b = residuals[:-1][together], residuals[1:][together]
+    rho = (a @ b) / max(np.sqrt((a @ a) * (b @ b)), 1e-300)
+    # rho within its error of 0 says nothing
+    if rho < 2 / np.sqrt(max(a.size, 1)):
+        return 1.0
+    run = np.cumsum(np.r_[0, ~together])
+    sizes = np.bincount(run)
+    lags = np.arange(1, sizes.max())
+    pairs = np.maximum(sizes[:, None] - lags, 0).sum(0)
+    return float(1 + 2 * (pairs * rho**lags).sum() / residuals.size)
+
+
+def notes_on(curve: LightCurve, solutions, scale: float, alike: float) -> tuple[str, ...]:
     """What this light curve cannot show, in sentences."""
     notes = list(curve.notes)
     sun, observer = curve._known_directions()
@@ -172,7 +211,11 @@ def notes_on(curve: LightCurve, solutions, scale: float) -> tuple[str, ...]:
     if scale**2 > REACHED:
         notes.append(
             f"Residuals are {scale:.1f} times the errors assumed: an ellipsoid is not the whole"
-            " truth, errors follow from the residuals, and neighbouring ones are alike; trust"
-            " none to better than a factor of two."
+            " truth, and errors follow from the residuals; trust none to better than a factor of"
+            " two."
+        )
+    if alike > 1:
+        notes.append(
+            f"Neighbouring residuals are alike: {alike:.1f} count as one in errors and odds."
         )
     return tuple(notes)
