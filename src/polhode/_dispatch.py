@@ -22,8 +22,8 @@ from jax.core import Tracer
 
 from polhode._scene import Scene
 from polhode._state import State
-from polhode._trajectory import Trajectory
 from polhode.methods import AbstractMethod, Record, Ways
+from polhode.trajectory import Trajectory
 
 _KEPT = 128
 """Programs that are kept, those used last."""

@@ -5,7 +5,6 @@ from polhode._propagate import Propagation as Propagation, propagate as propagat
 from polhode._scene import Scene as Scene
 from polhode._simulate import explain as explain, simulate as simulate
 from polhode._state import State as State
-from polhode._trajectory import Trajectory as Trajectory
 from polhode.events import Crossings as Crossings, Event as Event, crossings as crossings
 from polhode.fit import (
     fit_inertia as fit_inertia,
@@ -71,3 +70,4 @@ from polhode.torques import (
     UniformGravity as UniformGravity,
     ViscousCoupling as ViscousCoupling,
 )
+from polhode.trajectory import Trajectory as Trajectory

@@ -12,10 +12,8 @@ from polhode import rotation
 from polhode._batch import PARTS, Split, common_batch, flatten, on_devices, place, split_of
 from polhode._checks import is_concrete
 from polhode._dispatch import again, learn
-from polhode._motion import Motion
 from polhode._scene import Scene
 from polhode._state import State
-from polhode._trajectory import Trajectory
 from polhode.events import Event, check_until, stopped
 from polhode.methods import (
     AbstractMethod,
@@ -32,6 +30,7 @@ from polhode.methods import (
     raise_on_failure,
     ways_of,
 )
+from polhode.trajectory import Propagator, Trajectory
 
 
 def simulate(
@@ -147,7 +146,7 @@ def _begin(method, scene, state, ts, rtol) -> Trajectory:
     return Trajectory(
         ts[..., :1], wxyz[..., None, :], omega[..., None, :], status, jnp.zeros_like(status), scene,
         spins=jnp.stack(spins, axis=-1)[..., None, :] if spins else None,
-        motion=Motion.of(method, rtol),
+        propagator=Propagator.of(method, rtol),
     )  # fmt: skip
 
 
@@ -161,9 +160,9 @@ def _trajectory(method, scene, state, ts, rtol, record, split=None, in_order=Fal
         found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
     wxyz, omega, status, steps, work, error, motors, spins = found
     kept = ts[..., -1:] if record.final_only else ts
-    motion = Motion.of(method, rtol)
+    propagator = Propagator.of(method, rtol)
     trajectory = Trajectory(
-        kept, wxyz, omega, status, steps, scene, work, error, motors, spins, motion
+        kept, wxyz, omega, status, steps, scene, work, error, motors, spins, propagator
     )
     if record.work and method.exact:
         work = _work_of_exact(trajectory, state, ts[..., :1])

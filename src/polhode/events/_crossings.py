@@ -11,12 +11,11 @@ from jaxtyping import Array, Float, Int
 
 from polhode._batch import PARTS, flatten
 from polhode._checks import is_concrete
-from polhode._motion import moved_through, moved_to
 from polhode._scene import Scene
-from polhode._trajectory import Trajectory
 from polhode.events._bracketed import bracketed
 from polhode.events._event import Event, at_least
 from polhode.methods import Status, natural_rates
+from polhode.trajectory import Trajectory, moved_through, moved_to
 
 A_TURN = 32
 """Looks in a turn of the fastest natural rate."""
@@ -90,7 +89,7 @@ def crossings(
     looks = event.samples if samples is None else at_least("samples", samples, 2)
     for name in ("wxyz", "omega_body"):
         trajectory._need(name)
-    if trajectory.motion is None:
+    if trajectory.propagator is None:
         raise ValueError("this trajectory was made by hand: use one that ph.simulate returns.")
     if looks is None:
         looks = _looks(trajectory)
@@ -178,8 +177,9 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> tuple
     share = share.reshape((1,) * (ts.ndim - 1) + share.shape)
     grid = ts[..., :1] + share * (ts[..., -1:] - ts[..., :1])
     seen = moved_through(fixed, grid)
-    motion: Any = trajectory.motion
-    whence = fixed if motion.method.exact else seen  # what is stepped goes on from the nearest look
+    propagator: Any = trajectory.propagator
+    # what is stepped goes on from the nearest look
+    whence = fixed if propagator.method.exact else seen
     values, slopes = event.values(seen)
     values, slopes = (x.reshape(-1, looks) for x in (values, slopes))
     grid = jnp.broadcast_to(grid, (*batch, looks)).reshape(-1, looks)

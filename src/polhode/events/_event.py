@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Array
 
 from polhode import rotation
-from polhode._motion import shortly_after
-from polhode._trajectory import Trajectory
 from polhode.parts import checked, mapped
+from polhode.trajectory import Trajectory, shortly_after
 
 _ARGUMENTS = ("wxyz", "omega_body", "t")
 _SHAPES = ((4,), (3,), ())

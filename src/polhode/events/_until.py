@@ -9,14 +9,13 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode._batch import PARTS, flatten
-from polhode._motion import moved_through, moved_to
 from polhode._scene import Scene
 from polhode._state import State
-from polhode._trajectory import Trajectory
 from polhode.events._bracketed import bracketed
 from polhode.events._crossings import A_TURN, AT_START, dips_of, first_true, turning_rates
 from polhode.events._event import Event
 from polhode.methods import Record, Status, natural_rates
+from polhode.trajectory import Trajectory, moved_through, moved_to
 
 _LOOKS = 64
 """Steps between looks in a window: two turns of the fastest body."""
@@ -66,7 +65,7 @@ def stopped(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
         None if x is None else x.reshape(*batch, *x.shape[1:]) for x in held
     )
     return Trajectory(
-        times, wxyz, omega, status, steps, begin.scene, spins=spins, motion=begin.motion,
+        times, wxyz, omega, status, steps, begin.scene, spins=spins, propagator=begin.propagator,
         event_time=event,
     )  # fmt: skip
 
@@ -86,7 +85,7 @@ def _of_lanes(begin: Trajectory) -> Trajectory:
     wxyz, omega, spins = samples
     return Trajectory(
         ts, wxyz, omega, begin.status.reshape(n), begin.steps.reshape(n), Scene(**parts),
-        spins=spins, motion=begin.motion,
+        spins=spins, propagator=begin.propagator,
     )  # fmt: skip
 
 
@@ -127,8 +126,8 @@ class _Window(NamedTuple):
 def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...]:
     """Which bodies (N,) meet their event, and which were given up; when it is, and the time
     between two looks there [s]."""
-    motion: Any = lanes.motion
-    exact = motion.method.exact
+    propagator: Any = lanes.propagator
+    exact = propagator.method.exact
     first, last = ts[..., 0], ts[..., -1]
     span, dtype = last - first, ts.dtype
     n = lanes.status.size
@@ -144,14 +143,16 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
     def at(time, samples, share_of_error=None):
         """The bodies at a time () or (N,), one sample each."""
         wxyz, omega, *spins = (x[:, None] for x in samples)
-        now = motion
-        if share_of_error is not None and motion.rtol is not None:
-            eps = jnp.finfo(motion.rtol.dtype).eps
-            rtol = jnp.maximum(motion.rtol * share_of_error.astype(motion.rtol.dtype), 8 * eps)
-            now = eqx.tree_at(lambda m: m.rtol, motion, rtol)
+        now = propagator
+        if share_of_error is not None and propagator.rtol is not None:
+            eps = jnp.finfo(propagator.rtol.dtype).eps
+            rtol = jnp.maximum(
+                propagator.rtol * share_of_error.astype(propagator.rtol.dtype), 8 * eps
+            )
+            now = eqx.tree_at(lambda p: p.rtol, propagator, rtol)
         return Trajectory(
             time[..., None], wxyz, omega, lanes.status, lanes.steps, lanes.scene,
-            spins=spins[0] if spins else None, motion=now,
+            spins=spins[0] if spins else None, propagator=now,
         )  # fmt: skip
 
     def width_by_rate(share, samples, busy):
@@ -288,8 +289,8 @@ def _held(lanes: Trajectory, ts: Array, until: Event, met: Array, near: Array, s
         there = moved_to(moved, jnp.where(met, near, ts[..., 0])[:, None])
     # the motion in windows differed from this one by no more than the tolerance allows
     most = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(there._t)
-    motion: Any = lanes.motion
-    if not motion.method.exact:
+    propagator: Any = lanes.propagator
+    if not propagator.method.exact:
         most = jnp.maximum(most, 1e-4 * step.reshape(-1, 1))
     late, at_event = until.polished(there, most)
     event = there._t + late

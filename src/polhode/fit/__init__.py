@@ -22,7 +22,7 @@ from polhode.fit._motion import (
     AbstractMotion as AbstractMotion,
     Drag as Drag,
     FreeMotion as FreeMotion,
-    Motion as Motion,
+    Predicted as Predicted,
     SteppedMotion as SteppedMotion,
 )
 from polhode.fit._parameters import (

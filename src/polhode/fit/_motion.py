@@ -25,7 +25,7 @@ from polhode.solvers._classical import ClassicalRungeKutta
 from polhode.torques import AbstractTorque, LinearDamping, QuadraticDamping
 
 
-class Motion(NamedTuple):
+class Predicted(NamedTuple):
     """Rates, their derivatives (None: unknown) and, if asked for, attitudes at given times."""
 
     omega: Float[Array, "t 3"]
@@ -53,7 +53,7 @@ class AbstractMotion(eqx.Module):
         times: Float[Array, " t"],
         wheel: Float[Array, " t"] | None,
         unknown: Any,
-    ) -> Motion:
+    ) -> Predicted:
         """Motion with the inertia ``tensor`` from ``omega`` and ``wxyz`` at ``times[0]``."""
 
 
@@ -133,7 +133,7 @@ class SteppedMotion(AbstractMotion):
             push = push - gained / step[:, None]
         if attitude is not None:
             attitude = normalise(jnp.stack(attitude, axis=-1))
-        return Motion(rates, inertia.rates(push), attitude)
+        return Predicted(rates, inertia.rates(push), attitude)
 
     def _wheel(self, times, wheel, delay) -> Callable[[Array], Array] | None:
         """The wheel's momentum along its axis as a function of time; None without a wheel."""
@@ -195,7 +195,7 @@ class FreeMotion(AbstractMotion):
         path = _combined(to_matrix(axes), rates)
         if turned is not None:
             turned = _combined(_right_product(conjugate(axes)), turned)
-        return Motion(path, free_acceleration(Inertia(full=tensor), path), turned)
+        return Predicted(path, free_acceleration(Inertia(full=tensor), path), turned)
 
 
 def _combined(matrix: Float[Array, "n n"], components: tuple[Array, ...]) -> Float[Array, "t n"]:

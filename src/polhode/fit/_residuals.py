@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode.fit._motion import AbstractMotion, Motion
+from polhode.fit._motion import AbstractMotion, Predicted
 from polhode.fit._parameters import Base, Parameters, tensor_of
 from polhode.fit._recording import Recording, needed
 from polhode.rotation import conjugate, multiply, rotate, rotation_vector_to_wxyz
@@ -65,7 +65,7 @@ class Model(eqx.Module):
 
 def predict(
     parameters: Parameters, recording: Recording, model: Model, tensor: Array | None = None
-) -> Motion:
+) -> Predicted:
     """Motion of every recording (leading axis r) for these parameters, body axes.
 
     ``tensor`` (3, 3) stands in for that of ``parameters.shape`` when it is given.

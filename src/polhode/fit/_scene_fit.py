@@ -15,7 +15,7 @@ from polhode._scene import Scene
 from polhode._simulate import simulate
 from polhode._state import State
 from polhode.fit._fit import each, together
-from polhode.fit._motion import AbstractMotion, Motion
+from polhode.fit._motion import AbstractMotion, Predicted
 from polhode.fit._parameters import NoInertia
 from polhode.fit._recording import Recording, stack
 from polhode.fit._residuals import Huber
@@ -63,7 +63,7 @@ class LeafMotion(AbstractMotion):
         state = State(start.astype(omega.dtype), omega)
         scene = self.with_values(unknown)
         found = simulate(scene, state, times, self.method, rtol=self.rtol, throw=False)
-        return Motion(found.omega_body, None, None if wxyz is None else found.wxyz)
+        return Predicted(found.omega_body, None, None if wxyz is None else found.wxyz)
 
 
 class SceneFit(eqx.Module):

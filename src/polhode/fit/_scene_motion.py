@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from polhode._scene import Scene
 from polhode._simulate import simulate
 from polhode._state import State
-from polhode.fit._motion import AbstractMotion, Motion
+from polhode.fit._motion import AbstractMotion, Predicted
 from polhode.inertia import Inertia
 from polhode.methods import AbstractMethod, LiePoisson
 
@@ -45,4 +45,4 @@ class SceneMotion(AbstractMotion):
         found = simulate(
             scene, State(wxyz=start, omega_body=omega), times, self.method, rtol=self.rtol
         )
-        return Motion(found.omega_body, None, None if wxyz is None else found.wxyz)
+        return Predicted(found.omega_body, None, None if wxyz is None else found.wxyz)

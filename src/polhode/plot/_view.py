@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from polhode._trajectory import Trajectory
 from polhode.io import whole_file
 from polhode.plot._motion import Motion
 from polhode.plot._scale import Scale
@@ -27,6 +26,7 @@ from polhode.plot._view_data import (
     per_body,
 )
 from polhode.plot._view_file import read
+from polhode.trajectory import Trajectory
 
 _SHOWN_TURNS = 0.4  # turns that the fastest body makes in a second of the page
 

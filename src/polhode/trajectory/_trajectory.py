@@ -13,19 +13,19 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from polhode import rotation
 from polhode._batch import PARTS, along_time, map_arrays
 from polhode._checks import is_concrete
-from polhode._exports import dataset, write_aem
-from polhode._indexing import check_key, is_integer, split_key
 from polhode._scene import Scene
 from polhode._state import State
 from polhode.hamiltonian import components, from_quaternion
 from polhode.methods import Status
 from polhode.torques import Wheels
+from polhode.trajectory._exports import dataset, write_aem
+from polhode.trajectory._indexing import check_key, is_integer, split_key
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
 
-class AbstractMotion(eqx.Module):
+class AbstractPropagator(eqx.Module):
     """What moves the bodies of a trajectory to other times."""
 
     @abc.abstractmethod
@@ -46,7 +46,7 @@ class Trajectory(eqx.Module):
     without attitude that of the rates, relative); ``motor_work`` (..., T, m) [J]: the part of
     ``work`` that motor and friction of each wheel have done, or None without ``work`` or such;
     ``spins`` (..., T, k) [kg m^2/s]: momenta of the wheels with a coupling, or None;
-    ``motion``: method and tolerance, for ``at``;
+    ``propagator``: method and tolerance, for ``at``;
     ``event_time`` (...) [s]: of the event that ``ph.simulate(..., until=)`` stopped at, inf for a
     body that did not meet it, or None.
 
@@ -64,7 +64,7 @@ class Trajectory(eqx.Module):
     error: Float[Array, "*b"] | None = None
     motor_work: Float[Array, "*b t m"] | None = None
     spins: Float[Array, "*b t k"] | None = None
-    motion: AbstractMotion | None = None
+    propagator: AbstractPropagator | None = None
     event_time: Float[Array, "*b"] | None = None
 
     def at(self, t: Float[ArrayLike, "*#b k"]) -> "Trajectory":
@@ -85,12 +85,12 @@ class Trajectory(eqx.Module):
         """
         for name in ("wxyz", "omega_body"):
             self._need(name)
-        if self.motion is None:
+        if self.propagator is None:
             raise ValueError(
                 "this trajectory was made by hand, without a method to move it by: use one that"
                 " ph.simulate returns."
             )
-        return self.motion.at(self, t)
+        return self.propagator.at(self, t)
 
     def state_at(self, t: Float[ArrayLike, "*#b"]) -> State:
         """Attitude and rates (...) at one time ``t`` [s], () or one for each body; see ``at``."""
@@ -140,7 +140,7 @@ class Trajectory(eqx.Module):
             of_both(self.ts, 1), of_both(self.wxyz, 2), of_both(self.omega_body, 2),
             of_bodies(self.status, 0), of_bodies(self.steps, 0), Scene(**parts),
             of_both(self.work, 1), of_bodies(self.error, 0), of_both(self.motor_work, 2),
-            of_both(self.spins, 2), self.motion,
+            of_both(self.spins, 2), self.propagator,
             of_bodies(self.event_time, 0),
         )  # fmt: skip
 

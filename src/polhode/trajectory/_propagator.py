@@ -13,12 +13,12 @@ from polhode._batch import PARTS, flatten, map_arrays
 from polhode._checks import as_float_array
 from polhode._scene import Scene
 from polhode._state import State
-from polhode._trajectory import AbstractMotion, Trajectory
 from polhode.methods import AbstractMethod, Record, Status, raise_on_failure
 from polhode.torques import Wheels
+from polhode.trajectory._trajectory import AbstractPropagator, Trajectory
 
 
-class Motion(AbstractMotion):
+class Propagator(AbstractPropagator):
     """The method that moved a trajectory, and its tolerance (None for exact methods).
 
     Arrays of the method are leaves, all else of it is static: trajectories pass through ``jax.jit``
@@ -30,7 +30,7 @@ class Motion(AbstractMotion):
     rtol: Array | None
 
     @classmethod
-    def of(cls, method: AbstractMethod, rtol: Any) -> "Motion":
+    def of(cls, method: AbstractMethod, rtol: Any) -> "Propagator":
         """Of what a trajectory was made with."""
         return cls(*eqx.partition(method, eqx.is_array), None if method.exact else rtol)
 
@@ -70,7 +70,7 @@ def moved_through(trajectory: Trajectory, t: Array) -> Trajectory:
 
 @eqx.filter_jit
 def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
-    motion: Any = trajectory.motion
+    propagator: Any = trajectory.propagator
     batch, ts = trajectory.batch_shape, trajectory.ts
     parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
     samples = [
@@ -84,8 +84,8 @@ def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
             jnp.broadcast_to(x, (*batch, x.shape[-1])).reshape(-1, x.shape[-1]) for x in (ts, times)
         )
     times = jnp.where(jnp.isfinite(times), times, ts[..., :1])
-    move = _from_first if in_order or motion.method.exact else _from_nearest
-    found, status, steps = move(motion, Scene(**parts), samples, ts, times)
+    move = _from_first if in_order or propagator.method.exact else _from_nearest
+    found, status, steps = move(propagator, Scene(**parts), samples, ts, times)
     wxyz, omega, *spins = (x.reshape(*batch, *x.shape[1:]) for x in found)
     asked = jnp.broadcast_to(finite, wxyz.shape[:-1])[..., None]
     status, steps = status.reshape(batch), steps.reshape(batch)
@@ -93,7 +93,7 @@ def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
     wxyz, omega, *spins = (jnp.where(asked, x, jnp.nan) for x in (wxyz, omega, *spins))
     return Trajectory(
         t, wxyz, omega, jnp.where(good, status, trajectory.status), steps, trajectory.scene,
-        spins=spins[0] if spins else None, motion=motion,
+        spins=spins[0] if spins else None, propagator=propagator,
     )  # fmt: skip
 
 
@@ -104,20 +104,20 @@ def _begun(scene: Scene, spins: list[Array]) -> Scene:
     return Scene(scene.inertia, scene.potential, scene.torque, scene.rotors.begun(*spins))
 
 
-def _from_first(motion: Motion, scene: Scene, samples, ts, times):
+def _from_first(propagator: Propagator, scene: Scene, samples, ts, times):
     """From the first sample: an exact law holds at every time."""
     wxyz, omega, *spins = (x[:, 0] for x in samples)
     times = jnp.concatenate([ts[..., :1], times], axis=-1)
-    rtol = None if motion.rtol is None else jnp.min(motion.rtol)
-    found = motion.method.run(_begun(scene, spins), State(wxyz, omega), times, rtol, Record())
+    rtol = None if propagator.rtol is None else jnp.min(propagator.rtol)
+    found = propagator.method.run(_begun(scene, spins), State(wxyz, omega), times, rtol, Record())
     kept = [x[:, 1:] for x in (found.wxyz, found.omega_body, found.spins) if x is not None]
     return kept, found.status, found.steps
 
 
-def _from_nearest(motion: Motion, scene: Scene, samples, ts, times):
+def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
     """From the sample nearest to each time, of which a body may have many."""
     rtol = jnp.min(
-        motion.rtol
+        propagator.rtol
     )  # of a trajectory that came out of vmap one for each body, all equal
     final = Record(final_only=True)
     unit = _gap(ts, times)
@@ -128,7 +128,7 @@ def _from_nearest(motion: Motion, scene: Scene, samples, ts, times):
         scene = _begun(scene, spins)
         there = begin == end
         span = jnp.stack([begin, jnp.where(there, begin + unit, end)], axis=-1)
-        found = motion.method.run(scene, State(wxyz, omega), span, rtol, final)
+        found = propagator.method.run(scene, State(wxyz, omega), span, rtol, final)
         # where no time passes, the sample itself, with its derivatives by the time
         step = jnp.broadcast_to((end - begin)[..., None], (*wxyz.shape[:-1], 1))
         here = jnp.broadcast_to(there[..., None], step.shape)
@@ -178,7 +178,7 @@ def shortly_after(trajectory: Trajectory, late: Array) -> Trajectory:
     wxyz, omega, *spins = found
     return Trajectory(
         trajectory._t + late, wxyz, omega, trajectory.status, trajectory.steps, trajectory.scene,
-        spins=spins[0] if spins else None, motion=trajectory.motion,
+        spins=spins[0] if spins else None, propagator=trajectory.propagator,
     )  # fmt: skip
 
 
