@@ -61,10 +61,15 @@ def test_the_estimate_bounds_the_error(rtol):
     record = ph.Record(final_only=True, error=True)
     # With compensated sums: what rounding adds to plain ones is as large as the estimate.
     solver = ph.solvers.Extrapolation(16, compensated=True)
-    best = ph.simulate(scene, state, ts, ph.LiePoisson(solver), rtol=5e-14)
+    best, near = (
+        ph.simulate(scene, state, ts, ph.LiePoisson(solver), rtol=x).wxyz[:, -1]
+        for x in (5e-14, 1e-12)
+    )
+    # The chaotic ones, whose errors grow a hundredfold, are not what the estimate is good for.
+    calm = np.asarray(rotation.angle_between(best, near)) < 1e-10
+    assert np.sum(calm) > 30
     traj = ph.simulate(scene, state, ts, rtol=rtol, record=record, throw=False)
-    error = np.asarray(rotation.angle_between(best.wxyz[:, -1], traj.wxyz[:, -1]))
-    calm = error < 1e-3  # of the others no digit is left to estimate
+    error = np.asarray(rotation.angle_between(best, traj.wxyz[:, -1]))
     assert np.mean(error[calm] <= 10 * np.asarray(traj.error)[calm]) > 0.95
     assert np.median(np.asarray(traj.error)[calm] / error[calm]) < 30
     marked = np.asarray(traj.status) == ph.Status.INACCURATE
