@@ -44,9 +44,8 @@ def incomplete(S: Scalars, C: Scalars, N: Scalars, many: bool) -> tuple[Scalars,
             carry = duplicate(k, carry)
     first, second, x, y, z, share = carry
     cube = S * S * S
-    return cube * (first + share / 3 * rd_series(x, y, z)), cube * (
-        second + share / 3 * rd_series(x, z, y)
-    )
+    first, second = first + share / 3 * rd_series(x, y, z), second + share / 3 * rd_series(x, z, y)
+    return cube * first, cube * second
 
 
 def complete(swing: Swing) -> tuple[Scalars, Scalars]:

@@ -233,7 +233,8 @@ def march(
         exact = (near - walk.gone).astype(dtype)
         down = (exact > width) & (walk.refused[1] > 0)
         exact = jnp.where(down, (near - grain - walk.gone).astype(dtype), exact)
-        width = jnp.where(width == left, left, jnp.maximum(exact, grain.astype(dtype)))
+        exact = jnp.minimum(jnp.maximum(exact, grain.astype(dtype)), left)
+        width = jnp.where(width == left, left, exact)
         width = jnp.where(live(walk), width, 0)
         gone, h = (x if own else jnp.max(x) for x in (walk.gone, width))
         t, h = start + sign * gone, sign.astype(dtype) * h
