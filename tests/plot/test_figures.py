@@ -53,7 +53,7 @@ def test_separatrix_passes_through_the_intermediate_axis():
 
 @pytest.mark.parametrize("turned", [False, True])
 def test_polhode_curve_lies_on_the_ellipsoid(trajectory, turned):
-    made = plot.motion(
+    made = plot.samples(
         trajectory.ts,
         trajectory.omega_body,
         inertia=ph.Inertia.from_tensor(_tensor()) if turned else trajectory.scene.inertia,
@@ -98,7 +98,7 @@ def test_history_shows_rates_attitude_and_drift(trajectory):
     energy = np.asarray(trajectory.energy[1])
     want = np.abs(energy / energy[0] - 1)
     np.testing.assert_allclose(np.nan_to_num(drift.lines[0].get_ydata()), want, rtol=1e-12)
-    bare = plot.history(plot.motion(trajectory.ts, trajectory.omega_body))
+    bare = plot.history(plot.samples(trajectory.ts, trajectory.omega_body))
     assert len(bare.axes) == 1
 
 
@@ -117,10 +117,10 @@ def test_work_precision_sorts_and_names_failures():
 
 def test_overview_draws_bands_and_observations(trajectory):
     first = slice(0, 3)
-    seen = plot.motion(
+    seen = plot.samples(
         trajectory.ts[first], trajectory.omega_body[0, first], trajectory.wxyz[0, first]
     )
-    three = plot.motion(
+    three = plot.samples(
         trajectory.ts,
         trajectory.omega_body[np.array([0, 1, 1])],
         trajectory.wxyz[np.array([0, 1, 1])],
@@ -179,7 +179,7 @@ def test_animation_refuses_what_it_cannot_write(trajectory, tmp_path):
 
 
 def test_missing_data_and_wrong_bodies_are_named(trajectory):
-    bare = plot.motion(trajectory.ts, trajectory.omega_body)
+    bare = plot.samples(trajectory.ts, trajectory.omega_body)
     with pytest.raises(ValueError, match="needs inertia"):
         plot.polhode(bare)
     with pytest.raises(ValueError, match="needs wxyz"):
@@ -189,10 +189,10 @@ def test_missing_data_and_wrong_bodies_are_named(trajectory):
     with pytest.raises(TypeError, match=r"ph\.Trajectory"):
         plot.polhode(np.zeros((3, 3)))
     with pytest.raises(ValueError, match="omega_body must have shape"):
-        plot.motion([0.0, 1.0], [1.0, 2.0])
+        plot.samples([0.0, 1.0], [1.0, 2.0])
     with pytest.raises(ValueError, match="ts must have shape"):
-        plot.motion([0.0, 1.0, 2.0], np.zeros((2, 3)))
-    rest = plot.motion(
+        plot.samples([0.0, 1.0, 2.0], np.zeros((2, 3)))
+    rest = plot.samples(
         [0.0, 1.0], np.zeros((2, 3)), inertia=ph.Inertia.from_moments([1.0, 2.0, 2.5])
     )
     with pytest.raises(ValueError, match="at rest"):

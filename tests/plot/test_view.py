@@ -34,13 +34,13 @@ def decoded(text: str, dtype: str = "<f4") -> np.ndarray:
     return np.frombuffer(base64.b64decode(text), dtype)
 
 
-def spinning(samples: int, end: float, tensor=None, start: float = 0.0) -> plot.Motion:
+def spinning(samples: int, end: float, tensor=None, start: float = 0.0) -> plot.Samples:
     """A body that turns about its own and space's z axis, 1 rad/s."""
     ts = np.linspace(start, end, samples)
     half = (ts - start) / 2
     wxyz = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
     inertia = ph.Inertia.from_tensor(np.diag(MOMENTS) if tensor is None else tensor)
-    return plot.motion(ts, np.broadcast_to([0.0, 0.0, 1.0], (samples, 3)), wxyz, inertia)
+    return plot.samples(ts, np.broadcast_to([0.0, 0.0, 1.0], (samples, 3)), wxyz, inertia)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +77,7 @@ def test_momentum_of_wheels_is_shown():
 
 def test_time_may_run_backwards(trajectory):
     ts = np.asarray(trajectory.ts)[::-1]
-    made = plot.motion(
+    made = plot.samples(
         ts, trajectory.omega_body[:, ::-1], trajectory.wxyz[:, ::-1], trajectory.scene.inertia
     )
     forward, backward = known(plot.view(trajectory)), known(plot.view(made))

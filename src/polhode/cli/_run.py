@@ -222,7 +222,7 @@ def _draw(job, outcome, path: Path) -> Path:
     file, seen = job.file, job.file.observations
     observed = None
     if seen is not None:
-        observed = plot.motion(
+        observed = plot.samples(
             seen.seconds, seen.omega_body, build_attitudes(seen.attitudes, "float64")
         )
     figure = plot.overview(

@@ -118,7 +118,7 @@ def _chunk(store: Store, block: Block, number: int, writer, ahead: int) -> None:
     waiting: collections.deque = collections.deque()
     checksum = 0
 
-    def settle(most: int) -> None:
+    def wait(most: int) -> None:
         while len(waiting) > most:
             waiting.popleft().result()
 
@@ -127,7 +127,7 @@ def _chunk(store: Store, block: Block, number: int, writer, ahead: int) -> None:
         checksum = store.write(name, rows, values, checksum)
 
     def send(name: str, rows: slice, values: np.ndarray) -> None:
-        settle(_WAITING - 1)
+        wait(_WAITING - 1)
         waiting.append(writer.submit(write, name, rows, values))
 
     files = store.pieces(number)
@@ -146,7 +146,7 @@ def _chunk(store: Store, block: Block, number: int, writer, ahead: int) -> None:
         name, at = wanted
         send(name, at, gathered[name][at.start - rows[name].start : at.stop - rows[name].start])
         wanted = next(files, None)
-    settle(0)
+    wait(0)
     store.finish(number, checksum)
 
 

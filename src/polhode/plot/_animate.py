@@ -7,7 +7,7 @@ import numpy as np
 
 from polhode.io import whole_file
 from polhode.plot._matplotlib import AXES, INK, new_figure, styled
-from polhode.plot._motion import Motion, as_motion, matrices
+from polhode.plot._samples import Samples, as_samples, matrices
 from polhode.plot._scale import Scale
 from polhode.trajectory import Trajectory
 
@@ -19,7 +19,7 @@ _MOST_BODIES = 64
 
 @styled
 def animate(
-    what: Trajectory | Motion,
+    what: Trajectory | Samples,
     path: str | os.PathLike | None = None,
     *,
     bodies: list[int] | None = None,
@@ -39,7 +39,7 @@ def animate(
     from matplotlib.animation import FuncAnimation
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    made = as_motion(what)
+    made = as_samples(what)
     chosen = list(range(min(made.count, _MOST_BODIES))) if bodies is None else list(bodies)
     if not 1 <= len(chosen) <= _MOST_BODIES:
         raise ValueError(f"animate shows 1 to {_MOST_BODIES} bodies, got {len(chosen)}.")

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from polhode.plot._matplotlib import ACCENT, AXES, GREY, INK, new_figure, plain, styled
-from polhode.plot._motion import matrices
+from polhode.plot._samples import matrices
 
 # chi-square of two degrees of freedom: 68 % and 95 % of a plane
 _LEVELS = {"68 %": 2.2957, "95 %": 5.9915}

@@ -3,14 +3,14 @@
 import numpy as np
 
 from polhode.plot._matplotlib import ACCENT, GREY, INK, new_figure, styled
-from polhode.plot._motion import Motion, pick
+from polhode.plot._samples import Samples, pick
 from polhode.plot._scale import Scale
 from polhode.trajectory import Trajectory
 
 
 @styled
 def herpolhode(
-    what: Trajectory | Motion, *, body: int | None = None, ax=None, scale: Scale | None = None
+    what: Trajectory | Samples, *, body: int | None = None, ax=None, scale: Scale | None = None
 ):
     """Draw the angular velocity's trace in the plane normal to the angular momentum; Axes.
 

@@ -3,14 +3,14 @@
 import numpy as np
 
 from polhode.plot._matplotlib import AXES, GREY, INK, new_figure, styled
-from polhode.plot._motion import Motion, pick
+from polhode.plot._samples import Samples, pick
 from polhode.plot._scale import Scale
 from polhode.trajectory import Trajectory
 
 
 @styled
 def history(
-    what: Trajectory | Motion,
+    what: Trajectory | Samples,
     *,
     body: int | None = None,
     scale: Scale | None = None,

@@ -3,8 +3,8 @@
 import numpy as np
 
 from polhode.plot._matplotlib import AXES, INK, new_figure, plain, styled
-from polhode.plot._motion import Motion, as_motion
 from polhode.plot._polhode import polhode
+from polhode.plot._samples import Samples, as_samples
 from polhode.plot._scale import Scale
 from polhode.trajectory import Trajectory
 
@@ -13,9 +13,9 @@ _BAND = (5, 95)
 
 @styled
 def overview(
-    what: Trajectory | Motion,
+    what: Trajectory | Samples,
     *,
-    observed: Motion | None = None,
+    observed: Samples | None = None,
     scale: Scale | None = None,
     axis_names: tuple[str, str, str] = ("x", "y", "z"),
     title: str = "",
@@ -24,9 +24,9 @@ def overview(
 
     Left: the three body axes as directions in space (components along space x, y, z) and the body
     rates, lines for body 0 and bands from the 5th to the 95th percentile of the others; dots are
-    `observed` (`plot.motion` of one body; NaN where nothing was observed). Right: the polhode.
+    `observed` (`plot.samples` of one body; NaN where nothing was observed). Right: the polhode.
     """
-    made = as_motion(what)
+    made = as_samples(what)
     names = tuple(plain(name, 30) for name in axis_names)
     scale = Scale.of(np.ptp(made.ts[0])) if scale is None else scale
     figure = new_figure(11.0, 7.6)

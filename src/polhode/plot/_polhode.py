@@ -3,7 +3,7 @@
 import numpy as np
 
 from polhode.plot._matplotlib import ACCENT, AXES, GREY, INK, new_figure, styled
-from polhode.plot._motion import Motion, pick
+from polhode.plot._samples import Samples, pick
 from polhode.trajectory import Trajectory
 
 _LIGHT = np.array([0.25, -0.35, 0.9]) / np.linalg.norm([0.25, -0.35, 0.9])
@@ -11,7 +11,7 @@ _LIGHT = np.array([0.25, -0.35, 0.9]) / np.linalg.norm([0.25, -0.35, 0.9])
 
 @styled
 def polhode(
-    what: Trajectory | Motion,
+    what: Trajectory | Samples,
     *,
     body: int | None = None,
     ax=None,

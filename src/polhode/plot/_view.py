@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from polhode.io import whole_file
-from polhode.plot._motion import Motion
+from polhode.plot._samples import Samples
 from polhode.plot._scale import Scale
 from polhode.plot._view_data import (
     MOST_SAMPLES,
@@ -55,7 +55,7 @@ class View:
 
 
 def view(
-    what: Trajectory | Motion | list[Trajectory | Motion],
+    what: Trajectory | Samples | list[Trajectory | Samples],
     path: str | os.PathLike | None = None,
     *,
     mesh: Any = None,
@@ -76,7 +76,7 @@ def view(
 
     **Arguments:**
 
-    - ``what``: a trajectory, a ``plot.motion``, or a list of them, whose bodies (batch axes
+    - ``what``: a trajectory, a ``plot.samples``, or a list of them, whose bodies (batch axes
       flattened) stand side by side, 12 at most; ``bodies`` picks some by number.
     - ``path``: the file to write, or None. The page needs nothing but the file: no network.
     - ``mesh``: the body's surface in body axes, its origin the point that the body turns about: a

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from polhode.inertia._mesh import load_mesh
-from polhode.plot._motion import Motion, as_motion, matrices
+from polhode.plot._samples import Samples, as_samples, matrices
 from polhode.rotation import matrix_to_wxyz
 from polhode.trajectory import Trajectory
 
@@ -76,9 +76,9 @@ def chosen(what: Any, bodies: Sequence[int] | None) -> list[Body]:
     return picked
 
 
-def bodies_of(what: Trajectory | Motion) -> list[Body]:
+def bodies_of(what: Trajectory | Samples) -> list[Body]:
     """The bodies of a motion, batch axes flattened."""
-    made = as_motion(what)
+    made = as_samples(what)
     wxyz, tensor = made.need("wxyz", "a page"), made.need("tensor", "a page")
     if isinstance(what, Trajectory):  # that of rotors included
         momentum = np.asarray(what.momentum_space, np.float64).reshape(made.omega_body.shape)

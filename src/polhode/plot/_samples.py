@@ -11,7 +11,7 @@ from polhode.trajectory import Trajectory
 
 
 @dataclasses.dataclass(frozen=True)
-class Motion:
+class Samples:
     """Samples of N bodies: ts (N, T), wxyz (N, T, 4), omega_body (N, T, 3), tensor (N, 3, 3).
 
     `wxyz`, `tensor` and `energy` (N, T) may be None: the plots that need them say so.
@@ -28,7 +28,7 @@ class Motion:
         if value is None:
             mend = "inertia" if name in ("tensor", "energy") else name
             raise ValueError(
-                f"plotting {what} needs {mend}, which was not given: pass it to plot.motion, or "
+                f"plotting {what} needs {mend}, which was not given: pass it to plot.samples, or "
                 "plot a Trajectory that recorded attitude and rates."
             )
         return value
@@ -53,12 +53,12 @@ class Motion:
         return np.einsum("ntij,ntj->nti", self.matrices, self.momentum_body)
 
 
-def motion(
+def samples(
     ts: Float[ArrayLike, "*#b t"],
     omega_body: Float[ArrayLike, "*#b t 3"],
     wxyz: Float[ArrayLike, "*#b t 4"] | None = None,
     inertia: Inertia | None = None,
-) -> Motion:
+) -> Samples:
     """Arrays to plot: times (..., T) s, body rates (..., T, 3) rad/s, attitudes (..., T, 4).
 
     Leading axes are flattened to one axis of bodies. Raises ValueError for shapes that do not fit
@@ -80,7 +80,7 @@ def motion(
         tensor = flat("inertia", inertia.tensor, (3, 3))
         energy = np.einsum("nti,nij,ntj->nt", omega.reshape(-1, samples, 3), tensor,
                            omega.reshape(-1, samples, 3)) / 2  # fmt: skip
-    return Motion(
+    return Samples(
         flat("ts", ts, (samples,)),
         omega.reshape(-1, samples, 3),
         None if wxyz is None else flat("wxyz", wxyz, (samples, 4)),
@@ -89,27 +89,27 @@ def motion(
     )
 
 
-def as_motion(what: Trajectory | Motion) -> Motion:
-    """The motion of a trajectory, or the motion itself."""
-    if isinstance(what, Motion):
+def as_samples(what: Trajectory | Samples) -> Samples:
+    """The samples of a trajectory, or those given."""
+    if isinstance(what, Samples):
         return what
     if not isinstance(what, Trajectory):
         raise TypeError(
-            f"expected a ph.Trajectory or a plot.motion(...), got {type(what).__name__}."
+            f"expected a ph.Trajectory or a plot.samples(...), got {type(what).__name__}."
         )
     if what.omega_body is None:
         raise ValueError(
             "this trajectory holds no omega_body: simulate with record=ph.Record(rates=True)."
         )
-    made = motion(what.ts, what.omega_body, what.wxyz, what.scene.inertia)
+    made = samples(what.ts, what.omega_body, what.wxyz, what.scene.inertia)
     has_energy = what.scene.potential is None or what.wxyz is not None
     energy = np.asarray(what.energy, np.float64).reshape(made.ts.shape) if has_energy else None
     return dataclasses.replace(made, energy=energy)
 
 
-def pick(what: Trajectory | Motion, body: int | None) -> tuple[Motion, int]:
-    """The motion and the index of the body to plot (counted over flattened batch axes)."""
-    made = as_motion(what)
+def pick(what: Trajectory | Samples, body: int | None) -> tuple[Samples, int]:
+    """The samples, and the index of the body to plot (counted over flattened batch axes)."""
+    made = as_samples(what)
     body = 0 if body is None else body
     if not -made.count <= body < made.count:
         raise ValueError(f"body must be below the number of bodies, {made.count}, got {body}.")
