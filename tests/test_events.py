@@ -194,6 +194,7 @@ def test_derivatives_of_a_motion_that_stops():
     np.testing.assert_allclose(many, [known(0.4, 0.6)[0], known(0.4, 1.3)[0]], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_events():
     """Of times, states and slopes, by the closed form of a ball."""
 

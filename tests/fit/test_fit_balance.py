@@ -92,6 +92,7 @@ def throws():
 BODIES = [0] * 4 + [1] * 4
 
 
+@pytest.mark.slow
 def test_throws_in_air_show_the_tensor_and_the_instrument(throws):
     given = [Recording.of(t, w, wheel_speed=h) for t, w, h, _ in throws]
     fit = fit_balance(given, Instrument(SPIN), bodies=BODIES, tolerance=Tolerance(bias=0), block=4)

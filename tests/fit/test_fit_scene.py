@@ -37,6 +37,7 @@ def test_intervals_of_a_drag_hold_the_truth():
     assert np.mean(np.asarray(found.finding) == 0) > 0.98
 
 
+@pytest.mark.slow
 def test_whatever_a_scene_holds():
     """Offset of the centre of mass, orbit, drag and wheel together, from two recordings."""
 

@@ -166,6 +166,7 @@ def test_without_directions_only_frequencies(tmp_path):
         lightcurve.fit_light_curve(lightcurve.read_light_curve(path))
 
 
+@pytest.mark.slow
 def test_tc4_in_the_night_of_2012(shared, tmp_path):
     """Published: 12.25 and 8.5 = 1 / (1/12.23 + 1/27.8) min, long-axis mode (Lee et al. 2021)."""
     folder = shared / "data" / "light_curves"

@@ -1,6 +1,10 @@
-"""Run by the tests with 2 host devices: gradients of a sharded batch beside one device, as JSON."""
+"""Run by the tests with 2 host devices: gradients of a sharded batch beside one device, as JSON.
+
+Words after the name of the script: which scenes.
+"""
 
 import json
+import sys
 
 import jax
 
@@ -32,7 +36,8 @@ def main():
     draws = np.random.default_rng(0).standard_normal((8, 7))
     wxyz = jnp.asarray(draws[:, :4] / np.linalg.norm(draws[:, :4], axis=1, keepdims=True))
     omega, found = jnp.asarray(draws[:, 4:]), {"devices": len(jax.devices())}
-    for name, scene in SCENES.items():
+    for name in sys.argv[1:]:
+        scene = SCENES[name]
 
         def loss(omega, strength, wxyz, scene=scene, method=METHODS[name]):
             record = ph.Record(final_only=True)

@@ -164,10 +164,10 @@ def rows(*heavy: str):
     return [pytest.param(name, marks=slow) if name in heavy else name for name in METHODS]
 
 
-QUICK = ("planner", "Dopri8", "ClosedForm")
+QUICK = ("planner", "ClosedForm")
 
 
-@pytest.mark.parametrize("name", rows("Extrapolation", "Splitting"))
+@pytest.mark.parametrize("name", rows("Extrapolation", "Extrapolation compensated", "Splitting"))
 def test_state_and_gradient(name):
     check(METHODS[name], jnp.float64)
 
