@@ -41,9 +41,9 @@ FIRST = 0.05
 the angle turned. An early error has the longest time to grow, and at a high order a step of a
 twentieth of the error is shorter by a fifth only."""
 
-DRIFT, LONG = 0.75, 100
-"""Over more than ``LONG`` radians an error of the rates turns the body on: the tolerance falls with
-this power of the angle (``_drift``). It does so in proportion where the errors of the steps all
+LONG = 100
+"""Over more than so many radians an error of the rates turns the body on: the tolerance falls with
+the power 3/4 of the angle (``_drift``). It does so in proportion where the errors of the steps all
 have one sign, which is rare (1 body in 300)."""
 
 CAUTION, MEMORY = 0.9, 0.3
@@ -312,7 +312,7 @@ def march(
 
 
 def _drift(whole: Array) -> Array:
-    """What the tolerance falls by over an angle: a power of it, by roots, which are faster."""
+    """What the tolerance falls by: the power 3/4 of the angle, by roots, which are faster."""
     far = jnp.maximum(whole / LONG, 1)
     return jnp.sqrt(far * jnp.sqrt(far))
 
