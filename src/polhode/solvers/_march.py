@@ -114,10 +114,12 @@ class _Saved(NamedTuple):
 
     @classmethod
     def first(cls, rows: Array, elapsed: Array, y: list[Array]) -> "_Saved":
-        """Before the first step: what is saved at the start is the given state."""
+        """Before the first step: what is saved at the start is the given state, all else is NaN,
+        whatever ``rows`` hold: to look at them takes longer than to write anew."""
         now = elapsed <= 0
         here = jnp.concatenate([now, jnp.zeros((1,), bool)])
-        rows = jnp.where(here[:, None], jnp.stack(y, axis=-1)[:, None], rows)
+        empty = jnp.full_like(rows, jnp.nan)
+        rows = jnp.where(here[:, None], jnp.stack(y, axis=-1)[:, None], empty)
         place = jnp.broadcast_to(jnp.sum(jnp.where(now, 1, 0)).astype(jnp.int32), y[0].shape)
         return cls(rows, place, elapsed.at[place].get(mode="clip"))
 
