@@ -133,8 +133,10 @@ def _turned(turn: Array, wxyz: Array) -> Array:
     which takes half as long as ``rotation.multiply`` where there are many times."""
     a, b, c, d = (turn[..., i] for i in range(4))
     columns = ((a, b, c, d), (-b, a, d, -c), (-c, -d, a, b), (-d, c, -b, a))
-    parts = (wxyz[..., i, None] for i in range(4))
-    return sum(jnp.stack(column, axis=-1) * x for column, x in zip(columns, parts))
+    w, x, y, z = (
+        jnp.stack(column, axis=-1) * wxyz[..., i, None] for i, column in enumerate(columns)
+    )
+    return w + x + y + z
 
 
 def _spins(scene: Scene, state: State) -> tuple[tuple[Array, ...], ...]:
