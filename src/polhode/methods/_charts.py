@@ -124,8 +124,19 @@ class LiePoissonChart(AbstractChart):
         omega = scene.with_spins(*y[2:]).rates(momentum, t)
         if self.upright:
             turn, _ = _upright(scene.potential)
-            wxyz = rotation.multiply(jnp.broadcast_to(turn, wxyz.shape), wxyz)
+            wxyz = _turned(turn, wxyz)
         return rotation.normalise(wxyz), omega, jnp.ones(momentum.shape[:-1], bool)
+
+
+def _turned(turn: Array, wxyz: Array) -> Array:
+    """Product of one quaternion (..., 1, 4) with many (..., T, 4): by its columns as a matrix,
+    which takes half as long as ``rotation.multiply`` where there are many times."""
+    a, b, c, d = (turn[..., i] for i in range(4))
+    columns = ((a, b, c, d), (-b, a, d, -c), (-c, -d, a, b), (-d, c, -b, a))
+    w, x, y, z = (
+        jnp.stack(column, axis=-1) * wxyz[..., i, None] for i, column in enumerate(columns)
+    )
+    return w + x + y + z
 
 
 def _spins(scene: Scene, state: State) -> tuple[tuple[Array, ...], ...]:
