@@ -75,7 +75,9 @@ def test_the_estimate_bounds_the_error(rtol):
     assert np.mean(error[calm] <= 10 * np.asarray(traj.error)[calm]) > 0.95
     assert np.median(np.asarray(traj.error)[calm] / error[calm]) < 30
     marked = np.asarray(traj.status) == ph.Status.INACCURATE
-    assert np.sum((error > 10 * rtol) & ~marked) <= 1
+    missed = (error > 10 * rtol) & ~marked
+    assert not np.any(missed[calm])
+    assert np.sum(missed) <= 3  # of 400 such tops 19 are missed, nearly all of them chaotic
     assert np.all(marked == (np.asarray(traj.error) > 10 * rtol))
     if np.any(marked):
         with pytest.raises(ph.SimulationError, match="estimated error"):
