@@ -32,6 +32,8 @@ _HOLDABLE = frozenset(
 _WIDE = 1024
 """Floats in a sum, from which on a unit does not hold it."""
 
+_FEW = 1024
+
 _ANALYSING = ContextVar("analysing", default=False)
 """Set while a unit is looked through: the units inside it then show what they are made of."""
 
@@ -64,13 +66,16 @@ def kernel(fn: Callable, *, linearised: bool = False) -> Callable:
             _ANALYSING.reset(analysing)
         if not _is_holdable(closed.jaxpr):
             return fn(*operands)
-        # What fn closes over becomes an operand: it may be differentiated.
+        # What fn closes over becomes an operand: it may be differentiated. Small tables do not.
         count = len(closed.consts)
+        given = [k for k, x in enumerate(closed.consts) if not _is_table(x)]
 
-        def flat(*given):
-            return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, given[:count]))(*given[count:])
+        def flat(*given_):
+            consts = list(closed.consts)
+            for k, x in zip(given, given_): consts[k] = x
+            return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, consts))(*given_[len(given):])
 
-        found = _unit(flat, linearised)(*closed.consts, *leaves)
+        found = _unit(flat, linearised)(*[closed.consts[k] for k in given], *leaves)
         return jax.tree.unflatten(jax.tree.structure(shape), found)
 
     return call
@@ -121,6 +126,11 @@ def _put_all(size, batched, *given):
     return put(
         *(x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(given, batched))
     ), True
+
+
+def _is_table(x: Any) -> bool:
+    """Whether it is numbers known now, few enough to stand in a program."""
+    return not isinstance(x, Tracer) and np.size(x) <= _FEW
 
 
 def _is_of_use() -> bool:
