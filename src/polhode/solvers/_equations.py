@@ -241,9 +241,9 @@ class Equations:
         ``own`` those of the solution's."""
         rtol, told = jax.tree.unflatten(self.told, self._parts(c)[3])
         own = own and not self.asks_time
-        given = table(order_for(rtol), y[0].dtype)
 
-        def run(held, told, given, rtol, horizon, span, y, integrals):
+        def run(held, told, rtol, horizon, span, y, integrals):
+            given = table(order_for(rtol), y[0].dtype)
             limits = Limits(rtol, horizon, _STEPS, False)
             progress = fresh(y, self.compensated, span[0])
             y, sums, _ = march(
@@ -252,7 +252,7 @@ class Equations:
             )  # fmt: skip
             return y, sums
 
-        return kernel(run)(held, told, given, rtol, horizon, span, list(y), list(integrals))
+        return kernel(run)(held, told, rtol, horizon, span, list(y), list(integrals))
 
 
 def _plainly(own, y, rates):

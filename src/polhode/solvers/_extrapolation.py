@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from polhode.solvers._bound_term import BoundTerm
-from polhode.solvers._columns import SEQUENCES, carried_on, evaluations, extrapolated, table
+from polhode.solvers._columns import CHOSEN, SEQUENCES, carried_on, evaluations, extrapolated, table
 from polhode.solvers._dense import CollocationInterpolation, collocate
 from polhode.solvers._equal_steps import GivenTimes
 from polhode.solvers._march import GroupUnits, Limits, Progress, fresh, march
@@ -221,7 +221,7 @@ def order_for(rtol: Array, angle: Array | float = jnp.inf) -> Array | int:
     if isinstance(angle, float):
         return best
     found, least = best, jnp.full((), jnp.inf, rtol.dtype)
-    for order in (p for p in SEQUENCES if 6 <= p <= 16):
+    for order in CHOSEN:
         step = 0.6 * (0.27 * order - 0.3) * rtol ** (1 / (order + 1))
         work = (evaluations(order) + _BESIDE) * jnp.maximum(1, angle / step)
         better = (order <= best) & (work < least) & (angle < step)
