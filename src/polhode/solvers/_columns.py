@@ -90,7 +90,7 @@ def table(order: int | Array, dtype: Any) -> Table:
     """The columns of an order; a traced one must be among ``CHOSEN``."""
     orders = (order,) if isinstance(order, int) else CHOSEN
     lengths = np.array([len(SEQUENCES[o]) for o in orders], np.int32)
-    index = 0 if isinstance(order, int) else (order - orders[0]) // 2
+    index = 0 if isinstance(order, int) else (order.astype(jnp.int32) - orders[0]) >> 1
     rows = zip(*(_row(o, int(max(lengths))) for o in orders))
     # Four small arrays, not one: a program with arrays above 512 bytes beside its units goes to
     # several threads, which takes longer than all the rest of one body.
@@ -164,7 +164,8 @@ def extrapolated(
     def add(j, found):
         base, (new, sums), last, before = found
         count, *shares = (
-            jax.lax.dynamic_index_in_dim(x, j, keepdims=False) for x in (given.counts, *given.weights)
+            jax.lax.dynamic_index_in_dim(x, j, keepdims=False)
+            for x in (given.counts, *given.weights)
         )
         this = column(count.astype(jnp.result_type(width)))
         base = jax.tree.map(lambda x, b: jnp.where(j == 0, x, b), this, base)
