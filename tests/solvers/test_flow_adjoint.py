@@ -239,7 +239,7 @@ def test_one_step_is_what_the_loop_of_diffrax_makes_of_it(end):
         return diffrax.diffeqsolve(
             diffrax.ODETerm(lambda t, y, args: (args * y[1], t - y[0])), diffrax.Dopri5(),
             ts[0], ts[-1], None, (jnp.ones(2), jnp.zeros(2)), jnp.array(2.0), max_steps=3,
-            saveat=diffrax.SaveAt(subs=subs, solver_state=True),
+            saveat=diffrax.SaveAt(subs=subs),
             stepsize_controller=diffrax.StepTo(ts), adjoint=adjoint, throw=False,
         )  # fmt: skip
 
