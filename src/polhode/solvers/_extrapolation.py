@@ -220,9 +220,9 @@ def order_for(rtol: Array, angle: Array | float = jnp.inf) -> Array:
         best = 8 + 2 * sum(jnp.where(rtol < bound, 1, 0) for bound in (1e-3, 1e-4, 1e-5, 1e-10))
     if isinstance(angle, float):
         return settled(jnp.asarray(best, rtol.dtype), opaque_ones(rtol))
-    found, least = best, jnp.full((), jnp.inf, rtol.dtype)
+    found, least, size = best, jnp.full((), jnp.inf, rtol.dtype), jnp.log(rtol)
     for order in CHOSEN:
-        step = 0.6 * (0.27 * order - 0.3) * rtol ** (1 / (order + 1))
+        step = 0.6 * (0.27 * order - 0.3) * jnp.exp(size / (order + 1))
         work = (evaluations(order) + _BESIDE) * jnp.maximum(1, angle / step)
         better = (order <= best) & (work < least) & (angle < step)
         found, least = jnp.where(better, order, found), jnp.where(better, work, least)

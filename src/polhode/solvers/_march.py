@@ -214,7 +214,8 @@ def march(
         whole = jnp.maximum(whole, 1)
         done = jnp.minimum(walk.turned / whole, 1)
         share = SHARE * (FIRST + 3 * (1 - FIRST) * done * done)
-        allowed = share * limits.rtol * angle / (whole * jnp.maximum(whole / LONG, 1) ** DRIFT)
+        fall = _power(jnp.maximum(whole / LONG, 1), DRIFT)
+        allowed = share * limits.rtol * angle / (whole * fall)
         allowed = jnp.maximum(allowed, (COMPENSATED if compensated else ROUNDING) * eps)
         sound = jnp.isfinite(error) & jnp.isfinite(angle)  # a step may well end beyond all numbers
         error, allowed = jnp.where(sound, error, jnp.inf), jnp.where(sound, allowed, 1)
@@ -248,8 +249,8 @@ def march(
         ratio = worst(error / allowed, given_up(walk))
         good = (ratio <= 1) & live(walk)
         sound = jnp.maximum(ratio, 1e-6)
-        follows = CAUTION * sound**-power * walk.before ** (MEMORY * power)
-        again = CAUTION * sound**-power
+        again = CAUTION * _power(sound, -power)
+        follows = again * _power(walk.before, MEMORY * power)
         factor = jnp.where(good, jnp.clip(follows, 0.2, 4), jnp.clip(again, 0.1, 0.9))
         # of steps that a jump has cut to units in the last place of the time the error is rounding,
         # which does not tell how much longer they may be
@@ -317,6 +318,11 @@ def _picked(good, new, old):
     return [
         jnp.where(good if x.shape == good.shape else jnp.any(good), x, y) for x, y in zip(new, old)
     ]
+
+
+def _power(x: Array, power: Array | float) -> Array:
+    """x^power for x > 0: XLA calls a library for each number that it raises to a power."""
+    return jnp.exp(power * jnp.log(x))
 
 
 def _size(weights: list[Array], error: list[Array]) -> Array:
