@@ -225,6 +225,30 @@ def test_outside_of_simulate_any_solver_has_the_slopes_of_the_flow(name):
     np.testing.assert_allclose(*both, rtol=1e-5 if name == "implicit" else 2e-10)
 
 
+@pytest.mark.parametrize("end", [0.5, -0.5])
+def test_one_step_is_what_the_loop_of_diffrax_makes_of_it(end):
+    """Of two times nothing is looped; rooms for more steps stay as they are."""
+    ts = jnp.array([0.0, end])
+    subs = [
+        diffrax.SubSaveAt(t0=True, steps=1),
+        diffrax.SubSaveAt(t0=True, t1=True, fn=lambda t, y, args: (t, 2 * y[0])),
+        diffrax.SubSaveAt(steps=1, t1=True),
+    ]
+
+    def solved(adjoint):
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, y, args: (args * y[1], t - y[0])), diffrax.Dopri5(),
+            ts[0], ts[-1], None, (jnp.ones(2), jnp.zeros(2)), jnp.array(2.0), max_steps=3,
+            saveat=diffrax.SaveAt(subs=subs),
+            stepsize_controller=diffrax.StepTo(ts), adjoint=adjoint, throw=False,
+        )  # fmt: skip
+
+    ours, theirs = solved(FlowAdjoint()), solved(diffrax.ForwardMode())
+    assert ours.ts[0].tolist() == [0, end, np.inf, np.inf]
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-15, atol=1e-15)
+
+
 @pytest.mark.parametrize("name", ["marched", "stock"])
 def test_slopes_by_saved_times_are_the_field(name):
     """At each of them; a later start alone is an earlier end."""

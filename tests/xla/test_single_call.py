@@ -123,6 +123,50 @@ def test_no_traced_value_outlives_its_program(kind):
         assert jnp.all(jnp.isfinite(end(jnp.array([1.0, 1.5, 2.0]))))
 
 
+@pytest.mark.parametrize("times", [2, 20])
+def test_one_body_is_few_tasks_of_the_processor(times):
+    """XLA hands what is more than eight tasks with arrays above 512 bytes to several threads, which
+    takes 100 us, more than the motion."""
+    drag = ph.LinearDamping(0.1)
+    scene = ph.Scene(
+        ph.Inertia.from_moments([1.0, 1.5, 2.0]), ph.UniformGravity(1, [0, 0, 1]), drag
+    )
+
+    def end(state):
+        found = ph.simulate(scene, state, jnp.linspace(0, 1, times), rtol=1e-3)
+        return found.wxyz, found.omega_body, found.status
+
+    state = ph.State([1.0, 0.0, 0.0, 0.0], [0.1, 1.0, 0.1])
+    program = jax.jit(end).lower(state).compile().as_text()
+    main = program[program.index("\nENTRY") :]
+    kinds = ("fusion", "call", "while", "copy", "sort", "conditional", "custom-call", "reduce")
+    tasks = [line for line in main.splitlines() if any(f" {k}(" in line for k in kinds)]
+    assert any(" call(" in line for line in tasks)
+    assert len(tasks) <= 8, tasks
+
+
+def test_units_within_a_unit():
+    """They stay units, in its derivatives too; a known table stands inside."""
+    table, wide = jnp.arange(3.0), jnp.arange(2000.0)
+    inner = kernel(lambda x: jnp.sin(x) * table)
+    outer = kernel(lambda x: inner(x) + 2 * inner(x * x) + wide[7], of_units=True)
+
+    def plain(x):
+        return jnp.sin(x) * table + 2 * jnp.sin(x * x) * table + 7
+
+    x = jnp.array([0.3, 0.5, 0.7])
+    value, slope = jax.jit(outer), jax.jit(jax.grad(lambda x: jnp.sum(outer(x))))
+    assert value.lower(x).as_text().count('xla_cpu_small_call = "true"') >= 2
+    assert (
+        "xla_cpu_small_call"
+        not in jax.jit(jax.grad(lambda x: jnp.sum(plain(x)))).lower(x).as_text()
+    )
+    assert jnp.allclose(value(x), plain(x), rtol=1e-15, atol=0)
+    expected = jax.grad(lambda x: jnp.sum(plain(x)))(x)
+    assert jnp.allclose(slope(x), expected, rtol=1e-15, atol=0)
+    assert jnp.allclose(jax.vmap(value)(x[None])[0], plain(x), rtol=1e-15, atol=0)
+
+
 def test_a_seeded_slice_of_the_fuzz():
     """`fuzz.py` does thousands."""
     ran, refused, largest, ends = fuzz.hunt_units(15, seed=7, each=15)

@@ -34,7 +34,8 @@ sqrt(sum w_j^2 n_j). The harmonic sequence 2, 4, 6, ... amplifies it 3 (order 10
 times more.
 """
 
-LONGEST = max(len(sequence) for sequence in SEQUENCES.values())
+CHOSEN = (6, 8, 10, 12, 14, 16)
+"""Orders that a program may choose between."""
 
 
 def extrapolation_weights(sequence: tuple[int, ...]) -> tuple[Fraction, ...]:
@@ -56,18 +57,18 @@ def extrapolation_weights(sequence: tuple[int, ...]) -> tuple[Fraction, ...]:
 class Table(NamedTuple):
     """Columns of one order, that with most substeps first and the others filled up with zeros.
 
-    ``counts`` (K,): substeps; ``weights`` (3, K): of the result, and of the differences of the
-    last two pairs of results of descending order, p - (p-2) and (p-2) - (p-4); ``length``: columns
-    that there are; ``order``.
+    ``counts`` (K,): substeps; ``weights`` three of (K,): of the result, and of the differences of
+    the last two pairs of results of descending order, p - (p-2) and (p-2) - (p-4); ``length``:
+    columns that there are; ``order``.
     """
 
     counts: Array
-    weights: Array
+    weights: tuple[Array, ...]
     length: Array
     order: Array
 
 
-def _row(order: int) -> tuple[np.ndarray, np.ndarray]:
+def _row(order: int, length: int) -> list[np.ndarray]:
     sequence = SEQUENCES[order]
     place = [len(sequence) - 1, *range(len(sequence) - 1)]
     sums = [
@@ -76,24 +77,27 @@ def _row(order: int) -> tuple[np.ndarray, np.ndarray]:
     if len(sequence) == 2:
         sums[2] = [Fraction(0)] * 2
     whole, first, second = sums
-    given = np.zeros((3, LONGEST))
-    counts = np.zeros(LONGEST)
+    given = np.zeros((3, length))
+    counts = np.zeros(length, np.int32)
     for k, j in enumerate(place):
         counts[k] = sequence[j]
         if k:  # the others enter by their small differences to the base, which has weight one
             given[:, k] = [float(x) for x in (whole[j], whole[j] - first[j], first[j] - second[j])]
-    return counts, given
+    return [counts, *given]
 
 
 def table(order: int | Array, dtype: Any) -> Table:
-    """The columns of an order; a traced one must be a key of ``SEQUENCES``."""
-    orders = tuple(SEQUENCES)
-    counts, weights = (np.stack(x) for x in zip(*map(_row, orders)))
+    """The columns of an order; a traced one must be among ``CHOSEN``."""
+    orders = (order,) if isinstance(order, int) else CHOSEN
     lengths = np.array([len(SEQUENCES[o]) for o in orders], np.int32)
-    index = orders.index(order) if isinstance(order, int) else (order - orders[0]) // 2
+    index = 0 if isinstance(order, int) else (order.astype(jnp.int32) - orders[0]) >> 1
+    rows = zip(*(_row(o, int(max(lengths))) for o in orders))
+    # Four small arrays, not one: a program with arrays above 512 bytes beside its units goes to
+    # several threads, which takes longer than all the rest of one body.
+    counts, *weights = (np.stack(x) for x in rows)
     return Table(
-        jnp.asarray(counts, dtype)[index],
-        jnp.asarray(weights, dtype)[index],
+        jnp.asarray(counts)[index],
+        tuple(jnp.asarray(x, dtype)[index] for x in weights),
         jnp.asarray(lengths)[index],
         jnp.asarray(order, dtype),
     )
@@ -159,9 +163,10 @@ def extrapolated(
 
     def add(j, found):
         base, (new, sums), last, before = found
-        count = jax.lax.dynamic_index_in_dim(given.counts, j, keepdims=False)
-        shares = jax.lax.dynamic_index_in_dim(given.weights, j, axis=1, keepdims=False)
-        shares = [jax.lax.squeeze(jax.lax.slice(shares, (k,), (k + 1,)), (0,)) for k in range(3)]
+        count, *shares = (
+            jax.lax.dynamic_index_in_dim(x, j, keepdims=False)
+            for x in (given.counts, *given.weights)
+        )
         this = column(count.astype(jnp.result_type(width)))
         base = jax.tree.map(lambda x, b: jnp.where(j == 0, x, b), this, base)
         gap = jax.tree.map(jnp.subtract, this, base)

@@ -1,6 +1,7 @@
 """The equations that carry slopes back along a motion, on lists of arrays."""
 
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -19,7 +20,8 @@ class Costate(Protocol):
     args)``: dz/dt, and K (n,), whose slope by any of ``args`` is that of the result per unit time;
     ``finish(z, start, end, slopes)``: the slopes by the start, ``slopes`` those at the end.
     ``units(own, z, rates)``: weights of the components of z and the natural rate, ``own`` those of
-    the state.
+    the state. What these functions close over is traced only where the field closes over traced
+    values, too.
     """
 
     def begin(self, y: PyTree, slopes: PyTree) -> PyTree: ...
@@ -61,27 +63,41 @@ class AnyCostate(NamedTuple):
 
 
 class FlatCostate:
-    """A costate on lists of arrays; ``consts``: what its functions close over. ``opened(arrays)``:
-    the direction of time, 1 or -1, and the arguments."""
+    """A costate on lists of arrays. ``opened(arrays)``: the direction of time, 1 or -1, and the
+    arguments. ``closes`` (static): whether its functions may close over traced values; these are
+    ``consts``, and the rates are traced at once, not where a derivative asks for them."""
 
-    def __init__(self, costate: Costate, y0: PyTree, t: Array, arrays: list[Array], opened):
-        self.costate, self.tree = costate, jax.tree.structure(y0)
-        z = jax.eval_shape(costate.begin, y0, y0)
-        leaves, tree = jax.tree.flatten(z)
+    def __init__(self, costate: Costate, y0: PyTree, t: Array, arrays: list[Array], opened, closes):
+        self.costate, self.opened = costate, opened
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), y0)
+        self.shapes, self.tree = shapes, jax.tree.structure(y0)
+        self.jaxpr, self.consts = None, []
+        if closes:
+            z = jax.tree.leaves(jax.eval_shape(costate.begin, shapes, shapes))
 
-        def rates(t, *given):
-            z = jax.tree.unflatten(tree, given[: len(leaves)])
-            sign, args = opened(given[len(leaves) :])
-            found, k = costate.rates(sign * t, z, args)
-            return [sign.astype(x.dtype) * x for x in (*jax.tree.leaves(found), k)]
+            def rates(t, *given):
+                found, k = self._rates(given[len(z) :], t, given[: len(z)])
+                return [*found, k]
 
-        closed = jax.make_jaxpr(rates)(t, *leaves, *arrays)
-        self.jaxpr, self.consts, self.z_tree = closed.jaxpr, list(closed.consts), tree
+            closed = jax.make_jaxpr(rates)(t, *z, *arrays)
+            self.jaxpr, self.consts = closed.jaxpr, list(closed.consts)
+
+    @cached_property
+    def z_tree(self):
+        return jax.tree.structure(jax.eval_shape(self.costate.begin, self.shapes, self.shapes))
+
+    def _rates(self, arrays, t, z):
+        sign, args = self.opened(arrays)
+        found, k = self.costate.rates(sign * t, jax.tree.unflatten(self.z_tree, z), args)
+        *found, k = (sign.astype(x.dtype) * x for x in (*jax.tree.leaves(found), k))
+        return found, k
 
     def begin(self, end, slopes):
         return jax.tree.leaves(self.costate.begin(*map(self._y, (end, slopes))))
 
     def at(self, consts: Sequence[Any], arrays: Sequence[Any], t, z):
+        if self.jaxpr is None:
+            return self._rates(arrays, t, z)
         *rates, k = jaxpr_as_fun(ClosedJaxpr(self.jaxpr, list(consts)))(t, *z, *arrays)
         return rates, k
 

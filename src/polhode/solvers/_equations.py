@@ -11,6 +11,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
+from polhode._checks import is_concrete
 from polhode.hamiltonian import relative
 from polhode.solvers._bound_term import BoundTerm, uses
 from polhode.solvers._columns import table
@@ -34,15 +35,15 @@ def equations_of(
     leaves, tree = jax.tree.flatten(y0)
     problem = BoundTerm.of(terms, args)
     arrays, args_tree = jax.tree.flatten(problem.arrays)
-    dtype = jnp.result_type(*leaves)
+    dtype, time_dtype, static = jnp.result_type(*leaves), t.dtype, problem.static
 
     def opened(given):
-        return BoundTerm(jax.tree.unflatten(args_tree, given), problem.static)
+        return BoundTerm(jax.tree.unflatten(args_tree, given), static)
 
     def directed(given):
         problem = opened(given)
         _, args = eqx.combine(problem.arrays, problem.static)
-        return problem.forward(t.dtype), args
+        return problem.forward(time_dtype), args
 
     def plain(t, *given):
         y, now = jax.tree.unflatten(tree, given[: len(leaves)]), opened(given[len(leaves) :])
@@ -51,7 +52,8 @@ def equations_of(
     closed = jax.make_jaxpr(plain)(t, *leaves, *arrays)
     make = getattr(args, "costate", None)
     special = None if make is None else make(args, y0, t)
-    flat = None if special is None else FlatCostate(special, y0, t, arrays, directed)
+    closes = not is_concrete(closed.consts, special)
+    flat = None if special is None else FlatCostate(special, y0, t, arrays, directed, closes)
     how, told = jax.tree.flatten((rtol, units_of(args, y0, jnp.ones_like(t))))
     counts = len(closed.consts), 0 if flat is None else len(flat.consts), len(arrays)
     c = [*closed.consts, *([] if flat is None else flat.consts), *arrays, *how]
@@ -241,9 +243,9 @@ class Equations:
         ``own`` those of the solution's."""
         rtol, told = jax.tree.unflatten(self.told, self._parts(c)[3])
         own = own and not self.asks_time
-        given = table(order_for(rtol), y[0].dtype)
 
-        def run(held, told, given, rtol, horizon, span, y, integrals):
+        def run(held, told, rtol, horizon, span, y, integrals):
+            given = table(order_for(rtol), y[0].dtype)
             limits = Limits(rtol, horizon, _STEPS, False)
             progress = fresh(y, self.compensated, span[0])
             y, sums, _ = march(
@@ -252,7 +254,7 @@ class Equations:
             )  # fmt: skip
             return y, sums
 
-        return kernel(run)(held, told, given, rtol, horizon, span, list(y), list(integrals))
+        return kernel(run)(held, told, rtol, horizon, span, list(y), list(integrals))
 
 
 def _plainly(own, y, rates):

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Array, PyTree
 
 from polhode.solvers._bound_term import BoundTerm
-from polhode.solvers._columns import SEQUENCES, carried_on, evaluations, extrapolated, table
+from polhode.solvers._columns import CHOSEN, SEQUENCES, carried_on, evaluations, extrapolated, table
 from polhode.solvers._dense import CollocationInterpolation, collocate
 from polhode.solvers._equal_steps import GivenTimes
 from polhode.solvers._march import GroupUnits, Limits, Progress, fresh, march
-from polhode.xla import kernel
+from polhode.xla import kernel, opaque_ones, settled
 
 
 class Accuracy(eqx.Module):
@@ -203,7 +203,7 @@ _BESIDE = 30
 """What a step costs beside its evaluations, in these."""
 
 
-def order_for(rtol: Array, angle: Array | float = jnp.inf) -> Array | int:
+def order_for(rtol: Array, angle: Array | float = jnp.inf) -> Array:
     """The order of least work for a tolerance, as a number of the program.
 
     Measured on 1,000 tops (order 14 takes least time, or within a tenth of it, down to 1e-9), but
@@ -219,11 +219,11 @@ def order_for(rtol: Array, angle: Array | float = jnp.inf) -> Array | int:
     if jnp.finfo(rtol.dtype).eps < 1e-9:
         best = 8 + 2 * sum(jnp.where(rtol < bound, 1, 0) for bound in (1e-3, 1e-4, 1e-5, 1e-10))
     if isinstance(angle, float):
-        return best
-    found, least = best, jnp.full((), jnp.inf, rtol.dtype)
-    for order in (p for p in SEQUENCES if 6 <= p <= 16):
-        step = 0.9 * (0.27 * order - 0.3) * rtol ** (1 / (order + 1))
+        return settled(jnp.asarray(best, rtol.dtype), opaque_ones(rtol))
+    found, least, size = best, jnp.full((), jnp.inf, rtol.dtype), jnp.log(rtol)
+    for order in CHOSEN:
+        step = 0.9 * (0.27 * order - 0.3) * jnp.exp(size / (order + 1))
         work = (evaluations(order) + _BESIDE) * jnp.maximum(1, angle / step)
         better = (order <= best) & (work < least) & (angle < step)
         found, least = jnp.where(better, order, found), jnp.where(better, work, least)
-    return found
+    return settled(jnp.asarray(found, rtol.dtype), opaque_ones(rtol))

@@ -15,6 +15,7 @@ from jaxtyping import Array
 
 from polhode.solvers._equations import Equations, equations_of
 from polhode.solvers._linear import attached, is_slope
+from polhode.solvers._one_step import is_one_step, one_step
 
 
 class FlowAdjoint(diffrax.AbstractAdjoint):
@@ -66,10 +67,14 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
         steps = isinstance(controller, diffrax.StepTo) and _first(saveat.subs).steps == 1
         if spanning is not None and steps:
             solver, controller, state = spanning(controller, state)
-        state, *more = diffrax.ForwardMode().loop(
-            args=known, terms=diffrax.ODETerm(field), solver=solver, stepsize_controller=controller,
-            event=event, saveat=saveat, t0=begin, t1=end, init_state=state, **rest,
-        )  # fmt: skip
+        term, more = diffrax.ODETerm(field), [{}]
+        if is_one_step(controller, saveat, event, rest["progress_meter"]):
+            state = one_step(term, known, solver, saveat, state)
+        else:
+            state, *more = diffrax.ForwardMode().loop(
+                args=known, terms=term, solver=solver, stepsize_controller=controller,
+                event=event, saveat=saveat, t0=begin, t1=end, init_state=state, **rest,
+            )  # fmt: skip
         if times is None:  # whatever steps the controller took
             times = _first(state.save_state).ts
         saved = jax.tree.leaves(_first(state.save_state).ys)

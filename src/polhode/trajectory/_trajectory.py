@@ -2,10 +2,12 @@
 
 import abc
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
@@ -23,6 +25,12 @@ from polhode.trajectory._indexing import check_key, is_integer, split_key
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
+
+
+@partial(jax.jit, static_argnums=2)  # one program, not one for each operation
+def _sample(wxyz: Array, omega: Array, place: int) -> tuple[Array, Array]:
+    """Attitude and rates (...) of one sample."""
+    return wxyz[..., place, :], omega[..., place, :]
 
 
 class AbstractPropagator(eqx.Module):
@@ -99,7 +107,7 @@ class Trajectory(eqx.Module):
     @property
     def first(self) -> State:
         """The state (...) at the first sample."""
-        return State(self._need("wxyz")[..., 0, :], self._need("omega_body")[..., 0, :])
+        return State(*_sample(self._need("wxyz"), self._need("omega_body"), 0))
 
     @property
     def last(self) -> State:
@@ -107,7 +115,7 @@ class Trajectory(eqx.Module):
 
         It holds attitude and rates; the speeds of wheels are ``wheel_speed[..., -1, :]``.
         """
-        return State(self._need("wxyz")[..., -1, :], self._need("omega_body")[..., -1, :])
+        return State(*_sample(self._need("wxyz"), self._need("omega_body"), -1))
 
     def __getitem__(self, key: Any) -> "Trajectory":
         """Bodies and samples chosen as from an array of shape (..., T), body axes first.

@@ -19,24 +19,28 @@ from jax.sharding import AxisType
 from polhode.xla._switch import is_plain
 
 _HOLDABLE = frozenset(
-    """abs acos acosh add add_any and asin asinh atan atan2 atanh bitcast_convert_type
+    """abs acos acosh add add_any and asin asinh atan atan2 atanh attached bitcast_convert_type
      broadcast_in_dim cbrt ceil clamp concatenate cond convert_element_type copy cos cosh
      custom_jvp_call custom_vmap_call div dynamic_slice dynamic_update_slice eq erf erf_inv erfc
      exp exp2 expm1 floor gather ge gt integer_pow iota is_finite jit le log log1p logistic lt max
-     min mul ne neg not or pad pjit pow reduce_and reduce_max reduce_min reduce_or reduce_sum rem
-     reshape round rsqrt scan select_n shift_right_arithmetic sign sin sinh slice split sqrt square
-     squeeze stack stop_gradient sub tan tanh transpose unstack while xor""".split()  # noqa: SIM905
+     min mul ne neg not optimization_barrier or pad pjit pow reduce_and reduce_max reduce_min
+     reduce_or reduce_sum rem reshape round rsqrt scan select_n shift_right_arithmetic sign sin
+     sinh slice split sqrt square squeeze stack stop_gradient sub tan tanh transpose unstack while
+     xor""".split()  # noqa: SIM905
 )
 """Operations that a single compiled unit may hold; anything else keeps the usual way."""
 
 _WIDE = 1024
 """Floats in a sum, from which on a unit does not hold it."""
 
+_TABLE = 1024
+"""Known numbers of an array, up to which it stands in a unit."""
+
 _ANALYSING = ContextVar("analysing", default=False)
 """Set while a unit is looked through: the units inside it then show what they are made of."""
 
 
-def kernel(fn: Callable, *, linearised: bool = False) -> Callable:
+def kernel(fn: Callable, *, linearised: bool = False, of_units: bool = False) -> Callable:
     """``fn`` compiled by XLA's CPU backend as one function instead of one task per array.
 
     A step is made of many short loops over the bodies. As separate tasks each costs a dispatch,
@@ -46,7 +50,8 @@ def kernel(fn: Callable, *, linearised: bool = False) -> Callable:
 
     Derivatives are those of ``fn``, unmarked; with ``linearised`` the value and all coefficients of
     its derivative are a unit again, and only the linear map that is left is not. That suits
-    functions without loops of unknown length.
+    functions without loops of unknown length. With ``of_units`` what ``fn`` marks itself stays
+    marked, within the whole and in its derivatives.
     """
 
     def call(*operands):
@@ -55,7 +60,7 @@ def kernel(fn: Callable, *, linearised: bool = False) -> Callable:
         leaves, tree = jax.tree.flatten(operands)
         if not any(isinstance(leaf, Tracer) for leaf in leaves):
             return fn(*operands)  # run at once, the mark would reach every call inside as well
-        analysing = _ANALYSING.set(True)
+        analysing = _ANALYSING.set(not of_units)
         try:
             closed, shape = jax.make_jaxpr(
                 lambda *given: fn(*jax.tree.unflatten(tree, given)), return_shape=True
@@ -64,13 +69,8 @@ def kernel(fn: Callable, *, linearised: bool = False) -> Callable:
             _ANALYSING.reset(analysing)
         if not _is_holdable(closed.jaxpr):
             return fn(*operands)
-        # What fn closes over becomes an operand: it may be differentiated.
-        count = len(closed.consts)
-
-        def flat(*given):
-            return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, given[:count]))(*given[count:])
-
-        found = _unit(flat, linearised)(*closed.consts, *leaves)
+        whole, given = _opened(closed)
+        found = _unit(jaxpr_as_fun(whole), linearised, (whole, 0))(*given, *leaves)
         return jax.tree.unflatten(jax.tree.structure(shape), found)
 
     return call
@@ -121,6 +121,23 @@ def _put_all(size, batched, *given):
     return put(
         *(x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(given, batched))
     ), True
+
+
+def _opened(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
+    """The same program with what it closes over as its first operands, and these: they may be
+    differentiated. Few known numbers, such as the table of a rule, stay in it: as operands they
+    would be carried through every loop."""
+    jaxpr, own = closed.jaxpr, list(zip(closed.jaxpr.constvars, closed.consts, strict=True))
+    tables = [(v, x) for v, x in own if not isinstance(x, Tracer) and np.size(x) <= _TABLE]
+    others = [(v, x) for v, x in own if isinstance(x, Tracer) or np.size(x) > _TABLE]
+    names = jaxpr.debug_info.arg_names
+    names = None if names is None else ("",) * len(others) + (*names,)
+    opened = jaxpr.replace(
+        constvars=[v for v, _ in tables],
+        invars=[*(v for v, _ in others), *jaxpr.invars],
+        debug_info=jaxpr.debug_info._replace(arg_names=names),
+    )
+    return ClosedJaxpr(opened, [x for _, x in tables]), [x for _, x in others]
 
 
 def _is_of_use() -> bool:
@@ -239,6 +256,8 @@ def _marked(closed: ClosedJaxpr, given: Sequence[Any], bare: int) -> list[jax.Ar
             found = jaxpr_as_fun(ClosedJaxpr(jaxpr, closed.consts))(*every)
             firsts = (x[(0,) * x.ndim].astype(bool) for x in operands)
             sure = reduce(jnp.logical_or, firsts, zeros[0] == 0)
+            # through a division, or the compiler asks every operand again for each result
+            sure = jnp.where(sure, 1, 0) / (1 - zeros[1]) > 0
             chosen = {*range(len(found) - 1 - bare), len(found) - 1}
             other = {
                 k: jnp.broadcast_to(zeros[1].astype(found[k].dtype), found[k].shape) for k in chosen
