@@ -227,7 +227,7 @@ def test_what_ellipsoids_miss_of_other_bodies_grows_as_the_floor_does():
         ).x
         missed.append([np.std(rest(best, place)) for place in range(len(angles))])
     missed = np.sqrt(np.mean(np.square(missed), axis=0))
-    sun = np.zeros((len(angles), 3)) + [1.0, 0, 0]
+    sun = np.tile([1.0, 0.0, 0.0], (len(angles), 1))
     observer = np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1)
     repeated = (np.repeat(x, 2, axis=0) for x in (sun, observer))
     curve = lightcurve.LightCurve.of(np.arange(10.0), np.zeros(10), *repeated)
