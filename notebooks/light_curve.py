@@ -159,8 +159,8 @@ for k, solution in enumerate(fit.solutions[:4]):
 
 # %% [markdown]
 # Periods are right to two of their errors, moments to 8 %. The pole is off by several times its
-# error: that error takes the residuals for noise, if one that lasts for some points, but they are the
-# rock's corners, which come back every turn. Mirror images of the pole are in the list too.
+# error: that error takes the residuals for noise, if one that lasts for some points, but they are
+# the rock's corners, which come back every turn. Mirror images of the pole are in the list too.
 #
 # And the attitude, night for night? An ellipsoid looks the same after half a turn about each axis,
 # so the nearest of four attitudes counts.
