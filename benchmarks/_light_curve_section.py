@@ -14,28 +14,26 @@ def light_curves(report: dict) -> list[str]:
             f"{speed['states']:,} trial states against {speed['samples']} points:"
             f" {number(speed['seconds'])} s.", "",
         ]  # fmt: skip
-    for name, when in (("cases", ""), ("before", ", before the hypotheses were mended")):
-        cases = numbers.get(name, [])
-        if cases:
-            seeds = sorted({row["seed"] for row in cases})
-            lines += [
-                f"Synthetic tumblers, seeds {_ranges(seeds)}{when}: how the fit from the light"
-                " alone ends (see the top of `benchmarks/light_curves.py`); determined: those"
-                " whose points tell both periods to 0.1 %.", "",
-                *rows(
-                    ["noise [mag]", "", "bodies", *VERDICTS, "pole within 10 deg listed",
-                     "seconds"],
-                    [
-                        line
-                        for part in numbers["summary" if name == "cases" else "summary_before"]
-                        for line in (
-                            _counts(part, "all", part),
-                            _counts(part["determined"], "determined", part),
-                        )
-                    ],
-                ),
-            ]  # fmt: skip
-            lines += _bodies("Those not right", [r for r in cases if r["verdict"] != "right"])
+    cases = numbers.get("cases", [])
+    if cases:
+        seeds = sorted({row["seed"] for row in cases})
+        lines += [
+            f"Synthetic tumblers, seeds {_ranges(seeds)}: how the fit from the light alone ends"
+            " (see the top of `benchmarks/light_curves.py`); determined: those whose points tell"
+            " both periods to 0.1 %.", "",
+            *rows(
+                ["noise [mag]", "", "bodies", *VERDICTS, "pole within 10 deg listed", "seconds"],
+                [
+                    line
+                    for part in numbers["summary"]
+                    for line in (
+                        _counts(part, "all", part),
+                        _counts(part["determined"], "determined", part),
+                    )
+                ],
+            ),
+        ]  # fmt: skip
+        lines += _bodies("Those not right", [r for r in cases if r["verdict"] != "right"])
     if numbers.get("eggs"):
         lines += _bodies("Bodies that are no ellipsoids", numbers["eggs"])
     real = numbers.get("real")

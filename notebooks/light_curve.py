@@ -119,8 +119,8 @@ for g, h, part in list(zip(pairs.f_phi, pairs.f_psi, pairs.explained, strict=Tru
 print("as f_phi and f_psi, the first would mean:", lightcurve.meaning(*(x[0] for x in pairs[:2])))
 
 # %% [markdown]
-# Every pair allows many bodies: each of its sums may be f_phi or twice f_psi, in both modes. All of
-# these are tried.
+# Every pair allows many bodies: each of its lines may be any of the strong sums, in both modes. The
+# likeliest of these are tried.
 #
 # ## Every body that explains the points
 # Trial bodies with those periods, all else at random; least-squares steps from the two best
@@ -159,8 +159,8 @@ for k, solution in enumerate(fit.solutions[:4]):
 
 # %% [markdown]
 # Periods are right to two of their errors, moments to 8 %. The pole is off by several times its
-# error: that error takes the residuals for noise, but they are the rock's corners, and neighbouring
-# ones are alike. Mirror images of the pole are in the list too.
+# error: that error takes the residuals for noise, if one that lasts for some points, but they are
+# the rock's corners, which come back every turn. Mirror images of the pole are in the list too.
 #
 # And the attitude, night for night? An ellipsoid looks the same after half a turn about each axis,
 # so the nearest of four attitudes counts.

@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.optimize import least_squares
+from scipy.spatial import ConvexHull
 
 import polhode as ph
 from benchmarks import light_curves
@@ -164,3 +166,71 @@ def test_harmonics_are_those_of_scipy():
 def test_harmonics_need_a_square_number():
     with pytest.raises(ValueError, match=r"1, 4, 9, 16"):
         lightcurve.Convex.from_harmonics(jnp.zeros(5))
+
+
+def _stone(rng, axes):
+    """Hull of 60 points around an ellipsoid, in its principal axes: normals, areas, semi-axes."""
+    corners = rng.normal(size=(60, 3))
+    corners *= axes / np.linalg.norm(corners, axis=1, keepdims=True)
+    return _faceted(corners * np.exp(0.12 * rng.normal(size=(60, 1))))
+
+
+def _faceted(corners):
+    hull = ConvexHull(corners)
+    a, b, c = (corners[hull.simplices[:, k]] for k in range(3))
+    across = np.cross(b - a, c - a)
+    faces = np.where(
+        (np.sum(across * hull.equations[:, :3], axis=1) > 0)[:, None],
+        hull.simplices,
+        hull.simplices[:, ::-1],
+    )
+    whole = ph.MassProperties.from_mesh(corners, faces, density=1.0).central.full
+    moments, turn = np.linalg.eigh(np.asarray(whole))
+    areas = np.linalg.norm(across, axis=1) / 2
+    return hull.equations[:, :3] @ turn, areas, np.sqrt(moments.sum() / 2 - moments)
+
+
+def test_what_ellipsoids_miss_of_other_bodies_grows_as_the_floor_does():
+    """The best ellipsoid below 30 degrees, seen at greater phase angles: bodies at random."""
+    rng, many = np.random.default_rng(5), 150
+    angles = np.radians([3.0, 25.0, 60.0, 90.0, 120.0])
+    ellipsoid = jax.jit(
+        lambda axes, s, o: lightcurve.seeliger_ellipsoid(tuple(axes), tuple(s), tuple(o))
+    )
+    missed = []
+    for k in range(8):
+        b = rng.uniform(0.35, 0.9)
+        axes = np.array([1.0, b, b * rng.uniform(0.5, 0.95)])
+        if k % 2:
+            _, corners, _ = light_curves.blunt(axes, rng.uniform(2, 4), rng.uniform(0, 0.4))
+            normals, areas, axes = _faceted(corners)
+        else:
+            normals, areas, axes = _stone(rng, axes)
+        seen = []
+        for alpha in angles:
+            sun, across = rng.normal(size=(2, many, 3))
+            across = np.cross(sun, across)
+            sun, across = (x / np.linalg.norm(x, axis=1, keepdims=True) for x in (sun, across))
+            observer = np.cos(alpha) * sun + np.sin(alpha) * across
+            mu0, mu = np.maximum(sun @ normals.T, 0), np.maximum(observer @ normals.T, 0)
+            light = (mu0 * mu / np.maximum(mu0 + mu, 1e-9)) @ areas
+            seen.append((sun.T, observer.T, -2.5 * np.log10(light)))
+
+        def rest(x, place, axes=axes, seen=seen):
+            sun, observer, magnitude = seen[place]
+            light = ellipsoid(axes * np.exp(np.r_[0.0, x]), sun, observer)
+            rest = -2.5 * np.log10(light) - magnitude
+            return rest - np.mean(rest)  # what is common to all is the phase function's
+
+        best = least_squares(
+            lambda x: np.concatenate([rest(x, 0), rest(x, 1)]), np.zeros(2), diff_step=1e-3
+        ).x
+        missed.append([np.std(rest(best, place)) for place in range(len(angles))])
+    missed = np.sqrt(np.mean(np.square(missed), axis=0))
+    sun = np.tile([1.0, 0.0, 0.0], (len(angles), 1))
+    observer = np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1)
+    repeated = (np.repeat(x, 2, axis=0) for x in (sun, observer))
+    curve = lightcurve.LightCurve.of(np.arange(10.0), np.zeros(10), *repeated)
+    floors = np.asarray(curve.points(1.0).weight)[0, :10:2] ** -0.5
+    growth = missed / missed[0] / (floors / floors[0])
+    assert np.all((growth > 0.6) & (growth < 1.6))
