@@ -24,7 +24,7 @@ from polhode.free._exact import (
 )
 from polhode.free._motion import Swing, Turning
 from polhode.free._roles import Roles
-from polhode.xla import settled
+from polhode.xla import staged
 
 Scalars = Float[Array, "*b"]
 
@@ -107,7 +107,7 @@ def frequencies(roles: Roles) -> tuple[Pair, Pair, Scalars]:
 def compensate(swing: Swing, turning: Turning | None, roles: Roles) -> tuple[Swing, Turning | None]:
     """Both motions with low parts of their paces, where the means have converged."""
     # Settled: the two parts of a pair must come out of one and the same sum.
-    pace, angle, left = settled(frequencies(roles), roles.one)
+    pace, angle, left = staged(frequencies(roles), roles.one)
     # Convergence is quadratic: what is left is the square of the last step.
     sound = (left < jnp.finfo(left.dtype).eps / 64) & ~swing.endless
     high, low = _beside(swing.pace, pace, sound, roles.pulse)

@@ -12,7 +12,7 @@ from polhode.free._motion import Swing, Turning
 from polhode.free._phase import cosine_sine, horner, parity, sine_half, sinh
 from polhode.free._roles import Triple, restore
 from polhode.hamiltonian import triple
-from polhode.xla import settled
+from polhode.xla import staged
 
 Scalars = Float[Array, "*b"]
 
@@ -127,13 +127,13 @@ def half_angle(swing: Swing, turning: Turning, t: Scalars, rest, half, N, turned
 
 
 def advance(swing: Swing, turning: Turning | None, t: Scalars, one: Scalars | None, fine=False):
-    """The ``Instant`` of time t; with ``one``, of the shape of t, in stages (see ``settled``).
+    """The ``Instant`` of time t; with ``one``, of the shape of t, in stages (see ``staged``).
 
     ``fine``: in more stages, for results that many kernels need.
     """
     # One kernel per output repeats the arithmetic of all stages, which costs less than to write
     # and read them when every lane has many times, and more when it has one.
-    stage = (lambda x: x) if one is None else (lambda x: settled(x, one))
+    stage = (lambda x: x) if one is None else (lambda x: staged(x, one))
     more = stage if fine else (lambda x: x)
     whole, rest = more(sweep(swing, t))
     half, folded = jacobi(swing, rest, stage)

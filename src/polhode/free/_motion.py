@@ -9,7 +9,7 @@ from jaxtyping import Array, Bool, Float
 from polhode.elliptic._nome import nome_per_lambda
 from polhode.free._phase import arc
 from polhode.free._roles import Roles, Triple, restore
-from polhode.xla import settled
+from polhode.xla import staged
 
 Scalars = Float[Array, "*b"]
 
@@ -103,9 +103,9 @@ def means(circular, endless, x: Scalars, m: Scalars, m1: Scalars, one: Scalars):
         a, b = (a + b) / 2, jnp.sqrt(a * b)
     mean = (a + b) / 2
     nome = square * nome_per_square(square, jnp.sqrt(other))
-    mean, nome = settled((mean, nome), one)
+    mean, nome = staged((mean, nome), one)
     log_nome = jnp.where(circular | endless, 1, -jnp.log(jnp.where(circular | endless, 0.5, nome)))
-    return mean, nome, log_nome, settled(omega * mean, one)
+    return mean, nome, log_nome, staged(omega * mean, one)
 
 
 def prepare_swing(roles: Roles) -> Swing:
@@ -120,7 +120,7 @@ def prepare_swing(roles: Roles) -> Swing:
     p, r, s = d12 * d1 * d2, d23 * d2 * d3, d13 * d1 * d3
     A = (l1 * w1 * d13 + l2 * w2 * d23) * d3
     B = (l2 * w2 * d12 + l3 * w3 * d13) * d1
-    A, B = settled((A, B), one)
+    A, B = staged((A, B), one)
     x = B * r
     moving = x > 0
     divisor = jnp.where(moving, x, 1)
@@ -132,7 +132,7 @@ def prepare_swing(roles: Roles) -> Swing:
     mean, nome, log_nome, rate = means(circular, endless, x, m, m1, one)
     pace = rate / jnp.where(circular, math.pi, log_nome) * roles.pulse
     inverse_rate = jnp.where(moving, 1 / jnp.where(moving, rate, 1), 0)
-    pace = settled(pace, one)
+    pace = staged(pace, one)
     return Swing(
         (l1, l2, l3), (d1, d2, d3), roles.moments, p, r, s, A, B, m, m1, circular, endless, steady,
         jnp.where(endless, 0, nome), mean, log_nome, rate,
@@ -171,7 +171,7 @@ def _circular_series(swing: Swing, shift: Scalars):
     q2 = q * q
     even = q * (1 + 2 * shift * shift)  # q cosh 2b
     odd = 2 * (q * shift) * jnp.sqrt(1 + shift * shift)  # q sinh 2b
-    even, odd = settled((even, odd), swing.one)
+    even, odd = staged((even, odd), swing.one)
     c2, s2 = q2 * (2 * even * even - q2), 2 * q2 * even * odd
     c3 = q2 * q2 * q2 * even * (4 * even * even - 3 * q2)
     s3 = q2 * q2 * q2 * odd * (4 * odd * odd + 3 * q2)
@@ -250,13 +250,13 @@ def prepare_turning(swing: Swing, wxyz: tuple[Scalars, ...]) -> Turning:
     imaginary = tuple(
         swing.sense * jnp.where(pick, x, y) for x, y in zip(imaginary_c, imaginary_h, strict=True)
     )
-    real, imaginary = settled((real, imaginary), swing.one)
+    real, imaginary = staged((real, imaginary), swing.one)
     # (8) at the start of the reference motion, where the momentum is (sqrt(across), 0, peak).
     begin = (d3 * peak + d1 * across / (length + peak)) / 2
     slope = jnp.where(pick, slope_c, slope_h)
     still = pick | swing.endless
     sway = jnp.where(still, 0, swing.sense * 2 * beta)
-    sway, slope = settled((sway, slope), swing.one)
+    sway, slope = staged((sway, slope), swing.one)
     half_rate = begin + swing.rate * (swing.sense * slope - sway / swing.log_nome)
     # The minimal rotation carrying L to axis 3 is (|L| + |L3|, L x n3); the start undoes it.
     side = swing.parity * jnp.copysign(1, l3)
@@ -265,7 +265,7 @@ def prepare_turning(swing: Swing, wxyz: tuple[Scalars, ...]) -> Turning:
     q0, q1, q2, q3 = wxyz
     t1, t2, t3 = tilt
     scale = 1 / jnp.sqrt((q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3) * (w * w + l1 * l1 + l2 * l2))
-    tilt, w, scale = settled(((t1, t2, t3), w, scale), swing.one)
+    tilt, w, scale = staged(((t1, t2, t3), w, scale), swing.one)
     t1, t2, t3 = tilt
     start = (
         (q0 * w + q1 * t1 + q2 * t2 + q3 * t3) * scale,

@@ -15,7 +15,7 @@ from polhode.free._exact import (
     sum_of,
 )
 from polhode.hamiltonian import triple
-from polhode.xla import opaque_ones, settled
+from polhode.xla import opaque_ones, staged
 
 Scalars = Float[Array, "*b"]
 Triple = tuple[Scalars, Scalars, Scalars]
@@ -81,24 +81,24 @@ def assign_roles(moments: Triple, rates: Triple) -> Roles:
     low, mid, high = low / lift, mid / lift, high / lift
     # Exact next to the separatrix, where the two terms cancel and all depends on the difference.
     gap = subtract_pairs(_pull(high, w_high, high, mid), _pull(low, w_low, mid, low)).value
-    gap = settled(gap, one)
+    gap = staged(gap, one)
     # A tie is the separatrix, or a spin about an axis across that of a symmetric body: there the
     # circled axis must be one of the two equal ones.
     above = (gap > 0) | ((gap == 0) & (high - mid <= mid - low))
-    sense = settled(jnp.where(above, 1, -1).astype(low.dtype), one)
+    sense = staged(jnp.where(above, 1, -1).astype(low.dtype), one)
     above = sense > 0
     k1, k3 = jnp.where(above, k_low, k_high), jnp.where(above, k_high, k_low)
     right = (k_mid - k1 == 1) | (k_mid - k1 == -2)
     return Roles(
-        settled((jnp.where(above, low, high), mid, jnp.where(above, high, low)), one),
-        settled((jnp.where(above, w_low, w_high), w_mid, jnp.where(above, w_high, w_low)), one),
-        settled(jnp.where(resting, 0, pulse), one),
-        settled(heft, one),
+        staged((jnp.where(above, low, high), mid, jnp.where(above, high, low)), one),
+        staged((jnp.where(above, w_low, w_high), w_mid, jnp.where(above, w_high, w_low)), one),
+        staged(jnp.where(resting, 0, pulse), one),
+        staged(heft, one),
         jnp.abs(gap),
         sense,
-        settled(jnp.where(right, 1, -1).astype(low.dtype), one),
-        settled(k_mid.astype(low.dtype), one),
-        settled(k3.astype(low.dtype), one),
+        staged(jnp.where(right, 1, -1).astype(low.dtype), one),
+        staged(k_mid.astype(low.dtype), one),
+        staged(k3.astype(low.dtype), one),
         one,
     )
 

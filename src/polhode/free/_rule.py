@@ -30,7 +30,7 @@ from polhode.free._tangent import (
     squares_of_momenta,
 )
 from polhode.hamiltonian import triple
-from polhode.xla import opaque_ones, settled
+from polhode.xla import opaque_ones, staged
 
 Scalars = Float[Array, "*b"]
 
@@ -136,8 +136,8 @@ def _for_tangent(swing: Swing, at: Instant, t: Scalars) -> Instant:
     return at._replace(folded=mend(at.folded), functions=mend(at.functions))
 
 
-def _settled(ones, values):
-    return settled(values, *ones)
+def _staged(ones, values):
+    return staged(values, *ones)
 
 
 class _Tangent(NamedTuple):
@@ -157,7 +157,7 @@ def _tangent(many: bool, attitude: bool, found: Found, given, dm, dp, dw) -> _Ta
     scaled = t * found.swing.pulse
     ones = opaque_ones(scaled), found.swing.one
     # The transpose of a stage is a stage: it keeps cotangents from being summed again and again.
-    stage = functools.partial(_settled, ones)
+    stage = functools.partial(_staged, ones)
     swing = start_of(found.swing, moments, omega)
     frame = Frame(swing)
     change = stage(change_of_start(swing, frame, dm, dp, dw))

@@ -15,7 +15,7 @@ from polhode.solvers._columns import CHOSEN, SEQUENCES, carried_on, evaluations,
 from polhode.solvers._dense import CollocationInterpolation, collocate
 from polhode.solvers._equal_steps import GivenTimes
 from polhode.solvers._march import GroupUnits, Limits, Progress, fresh, march
-from polhode.xla import kernel, opaque_ones, settled
+from polhode.xla import kernel, opaque_ones, staged
 
 
 class Accuracy(eqx.Module):
@@ -219,11 +219,11 @@ def order_for(rtol: Array, angle: Array | float = jnp.inf) -> Array:
     if jnp.finfo(rtol.dtype).eps < 1e-9:
         best = 8 + 2 * sum(jnp.where(rtol < bound, 1, 0) for bound in (1e-3, 1e-4, 1e-5, 1e-10))
     if isinstance(angle, float):
-        return settled(jnp.asarray(best, rtol.dtype), opaque_ones(rtol))
+        return staged(jnp.asarray(best, rtol.dtype), opaque_ones(rtol))
     found, least, size = best, jnp.full((), jnp.inf, rtol.dtype), jnp.log(rtol)
     for order in CHOSEN:
         step = 0.9 * (0.27 * order - 0.3) * jnp.exp(size / (order + 1))
         work = (evaluations(order) + _BESIDE) * jnp.maximum(1, angle / step)
         better = (order <= best) & (work < least) & (angle < step)
         found, least = jnp.where(better, order, found), jnp.where(better, work, least)
-    return settled(jnp.asarray(found, rtol.dtype), opaque_ones(rtol))
+    return staged(jnp.asarray(found, rtol.dtype), opaque_ones(rtol))

@@ -28,7 +28,7 @@ from jaxtyping import Array
 from polhode.tops._complex import Complex, unit, where
 from polhode.tops._cubic import Cubic, cubic, positive, safe
 from polhode.tops._pochhammer import Curve, curve, pair, point, unpaired
-from polhode.xla import opaque_ones, settled
+from polhode.xla import opaque_ones, staged
 
 
 class Spinor(NamedTuple):
@@ -122,19 +122,19 @@ def _places(f: Cubic, c: Curve, one: Array):
     )
     f, c, one = _row((f, c, one))
     scale = 1 / safe(near, f.amount * span)
-    lift, fall = settled(((f.middle + depth) * scale, fall * (scale * jnp.sqrt(f.width))), one)
-    mean, step = settled((mean * f.reach, step * f.reach), one)
+    lift, fall = staged(((f.middle + depth) * scale, fall * (scale * jnp.sqrt(f.width))), one)
+    mean, step = staged((mean * f.reach, step * f.reach), one)
     e, partner = _reciprocal(step + mean, -step + mean, c.square)
-    half = settled(((1 + partner) * (1 + e).inverse).root, one)
+    half = staged(((1 + partner) * (1 + e).inverse).root, one)
     lead = where(near, -fall + lift, e * half)
     rest = where(near, fall + lift, partner * half.inverse)
-    lead, rest = settled((lead, rest), one)
+    lead, rest = staged((lead, rest), one)
     pull = jnp.where(near, c.square, 1) * c.steps[0]
     first, second = point(lead, rest, pull, c, one)
-    return settled((first * jnp.where(near, -1, c.per), second * jnp.where(near, -c.h, c.per)), one)
+    return staged((first * jnp.where(near, -1, c.per), second * jnp.where(near, -c.h, c.per)), one)
 
 
-def _settled_start(c: Curve, start: Complex, partner: Complex):
+def _staged_start(c: Curve, start: Complex, partner: Complex):
     """E and h/E so that their product is h although it may be rounding (near the separatrix).
 
     E and E/h are the same place; taken is the one far from 0, unless both are small.
@@ -170,13 +170,13 @@ def orbit(
     both = alpha * beta
     vertical = (-2 * both.re, 2 * both.im, 2 * alpha.square, 2 * beta.square)
     one = opaque_ones(alpha.re)
-    f = settled(cubic(2 * transverse * pull, vertical, momentum), one)
-    c = settled(curve(f.square), one)
+    f = staged(cubic(2 * transverse * pull, vertical, momentum), one)
+    c = staged(curve(f.square), one)
     places, partners = _places(f, c, one)
-    start, partner = settled(_settled_start(c, places.at(0), partners.at(0)), one)
-    nu = settled(jnp.sqrt(f.width) / (4 * c.stretch), one)
+    start, partner = staged(_staged_start(c, places.at(0), partners.at(0)), one)
+    nu = staged(jnp.sqrt(f.width) / (4 * c.stretch), one)
     origin, twist = pair(start.re + partner.re, c.h, jnp.ones_like(c.h), c.series)
-    base = settled((partner - start) * (twist / origin), one)
+    base = staged((partner - start) * (twist / origin), one)
     x, mirror = places.at(slice(1, 3)), partners.at(slice(1, 3))
     turning = _turning(x, mirror, c, one)
     # alpha vanishes where g = -1, before the turning over
@@ -186,9 +186,7 @@ def orbit(
         for v in (x, mirror, turning)
     )
     push = Complex(momentum[1], momentum[0]) * (1 / (2 * f.unit))
-    value, rate = settled(
-        (_stack(alpha, beta), _stack(-(beta.conj * push), alpha.conj * push)), one
-    )
+    value, rate = staged((_stack(alpha, beta), _stack(-(beta.conj * push), alpha.conj * push)), one)
     whole = Orbit(c, start, partner, f.circular, nu * f.unit / transverse, None)
     frequency = f.unit / transverse
 
@@ -197,17 +195,17 @@ def orbit(
     )
     zero = jnp.zeros_like(value.re)
     nu_complex = Complex(_only(f.circular, nu), _only(~f.circular, nu))
-    ahead, behind = settled((mirror * start, x * partner), one)
-    theta, slope = settled(unpaired(ahead, behind, c.series, one), one)
-    inverse = settled(theta.inverse, one)
-    inner = settled(base + slope * inverse, one)
+    ahead, behind = staged((mirror * start, x * partner), one)
+    theta, slope = staged(unpaired(ahead, behind, c.series, one), one)
+    inverse = staged(theta.inverse, one)
+    inner = staged(base + slope * inverse, one)
     # From the rate at the start. Where nothing nutates (nu = 0) the phase alone turns.
     steady = (rate * value.conj).im / safe(value.square > 0, value.square)
     k = -(nu_complex * (1 + 2 * turning)) - f.momentum / 2
-    k = settled(where(f.live, k, Complex(steady, zero)), one)
+    k = staged(where(f.live, k, Complex(steady, zero)), one)
     drift = (k * value).times_i - rate
     d = drift * (-nu_complex.conj.times_i) * (1 / (2 * nu * nu)) + inner * value
-    d = settled(where(f.live, d, Complex(zero, zero)), one)
+    d = staged(where(f.live, d, Complex(zero, zero)), one)
     # d : c = E : x. Where one of them is far below the other, the difference from the rate would
     # leave it rounding, which exp(2 i nu t) near the separatrix makes large.
     unsteady = f.live & ~f.circular
@@ -216,13 +214,13 @@ def orbit(
     nothing = Complex(zero, zero)
     large = where(first, x, where(second, start, nothing + 1))
     ratio = where(first, start, where(second, x, nothing)) * large.inverse
-    most = settled(value * (1 - ratio).inverse, one)
-    least = settled(most * ratio, one)
+    most = staged(value * (1 - ratio).inverse, one)
+    least = staged(most * ratio, one)
     whole_part, d = (
         where(first, most, where(second, -least, value + d)),
         where(first, least, where(second, -most, d)),
     )
-    scale = settled(inverse * origin, one)
+    scale = staged(inverse * origin, one)
     plain = f.circular | (x.square == 0)
     spinors = Spinor(
         scale * whole_part,
@@ -233,7 +231,7 @@ def orbit(
         jnp.arctan2(_only(~plain, x.im), jnp.where(plain, 1, x.re)),
         jnp.stack([upward, ~upward]) & ~f.circular,
     )
-    return whole._replace(spinors=settled(spinors, one))
+    return whole._replace(spinors=staged(spinors, one))
 
 
 def _turning(x: Complex, mirror: Complex, c: Curve, one: Array) -> Complex:
@@ -245,7 +243,7 @@ def _turning(x: Complex, mirror: Complex, c: Curve, one: Array) -> Complex:
     moved = x * jnp.stack([ones, c.h])
     times, rise = jnp.stack([c.h, c.h * c.h]), jnp.stack([ones, 2 * c.h])
     norm, twist = pair(moved.re + mirror.re, times, rise, _row(c.series))
-    turning = settled((mirror - moved) * (twist / norm), _row(one))
+    turning = staged((mirror - moved) * (twist / norm), _row(one))
     upper = x.at(1)
     return _stack(turning.at(0), turning.at(1) + upper * (1 - upper).inverse)
 
@@ -267,22 +265,22 @@ def at(o: Orbit, elapsed: Array) -> tuple[Complex, Complex, Complex]:
     f, inverse = turn * size, turn.conj * (1 / size)
     forward, backward = o.start * f, o.partner * inverse
     one = opaque_ones(angle)
-    f, forward, backward = settled((f, forward, backward), one)
+    f, forward, backward = staged((f, forward, backward), one)
     below = pair(forward.re + backward.re, o.curve.h, jnp.ones_like(o.curve.h), series)[0]
-    below = settled(1 / below, one)
+    below = staged(1 / below, one)
 
     def parameter(s: Spinor):
-        ahead, behind = settled((s.mirror * forward, s.place * backward), one)
-        theta, twist = settled(unpaired(ahead, behind, series, one), one)
+        ahead, behind = staged((s.mirror * forward, s.place * backward), one)
+        theta, twist = staged(unpaired(ahead, behind, series, one), one)
         fading = s.d * f
         left = s.c - fading
-        whole, slope = settled((left * theta, left * twist - fading * theta), one)
+        whole, slope = staged((left * theta, left * twist - fading * theta), one)
         phase = unit(s.rate.re * elapsed + count * s.turn)
         factor = phase * (below * jnp.where(s.growing, 1 / half, 1))
-        factor = settled(factor, one)
+        factor = staged(factor, one)
         nu = 2 * o.nu
         slope = where(circular, slope * nu, slope.times_i * nu)
-        return settled((factor * whole, factor * (s.rate * whole + slope)), one)
+        return staged((factor * whole, factor * (s.rate * whole + slope)), one)
 
     alpha, alpha_rate = parameter(jax.tree.map(lambda x: x[0], o.spinors))
     beta, beta_rate = parameter(jax.tree.map(lambda x: x[1], o.spinors))

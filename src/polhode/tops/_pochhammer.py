@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from polhode.elliptic._nome import nome
 from polhode.tops._complex import Complex
-from polhode.xla import settled
+from polhode.xla import staged
 
 _TERMS = 5
 
@@ -149,7 +149,7 @@ def unpaired(a: Complex, b: Complex, series: Series, one: Array) -> tuple[Comple
     first = _first(series.weights)
     x, y = _polynomial(a, series.weights), _polynomial(b, series.weights)
     dx, dy = a * _polynomial(a, first), b * _polynomial(b, first)
-    x, y, dx, dy = settled((x, y, dx, dy), one)
+    x, y, dx, dy = staged((x, y, dx, dy), one)
     return x * y, dx * y - x * dy
 
 
@@ -163,7 +163,7 @@ def _apart_rule(primals, tangents):
         value, rise = _polynomial(a, series.weights), _polynomial(a, first)
         bend = rise + a * _polynomial(a, _first(first))
         by_h = _polynomial(a, series.slopes), a * _polynomial(a, _first(series.slopes))
-        return settled((value, rise, a * rise, bend, *by_h), one)
+        return staged((value, rise, a * rise, bend, *by_h), one)
 
     x, x1, dx, dx1, xh, dxh = parts(a)
     y, y1, dy, dy1, yh, dyh = parts(b)
@@ -173,7 +173,7 @@ def _apart_rule(primals, tangents):
         dx * y1 - x * dy1,
         dxh * y + dx * yh - xh * dy - x * dyh,
     )
-    of_value, of_twist = settled((of_value, of_twist), one)
+    of_value, of_twist = staged((of_value, of_twist), one)
     return unpaired(*primals), tuple(p * da + q * db + r * dh for p, q, r in (of_value, of_twist))
 
 
@@ -186,8 +186,8 @@ def _descend(e: Complex, partner: Complex, c: Curve, one: Array) -> Complex:
     """
     *levels, (_, _, roots) = _levels(e, partner, c, one)
     total = (1 + roots[1]) * (1 + roots[0]).inverse
-    total = settled((levels[1][2] * (total * total)).root, one)
-    total = settled((levels[0][2] * total).root, one)
+    total = staged((levels[1][2] * (total * total)).root, one)
+    total = staged((levels[0][2] * total).root, one)
     return total.root
 
 
@@ -195,11 +195,11 @@ def _levels(e: Complex, partner: Complex, c: Curve, one: Array):
     """e, its partner and (1 + partner)/(1 + e) of each level; of the last the roots of 1 + both."""
     found = []
     for step in c.steps[1:]:
-        ratio = settled((1 + partner) * (1 + e).inverse, one)
+        ratio = staged((1 + partner) * (1 + e).inverse, one)
         found.append((e, partner, ratio))
         e, partner = e * e * ratio * step, partner * partner * ratio.inverse * step
-        e, partner = settled((e, partner), one)
-    return *found, (e, partner, settled(((1 + e).root, (1 + partner).root), one))
+        e, partner = staged((e, partner), one)
+    return *found, (e, partner, staged(((1 + e).root, (1 + partner).root), one))
 
 
 @_descend.defjvp
@@ -210,7 +210,7 @@ def _descend_rule(primals, tangents):
     # Partial derivatives of the logarithm, from the last level back to the first.
     by_e = (left * (1 + left)).inverse * (-1 / 8)
     by_partner = (right * (1 + right)).inverse * (1 / 8)
-    by_e, by_partner = settled((by_e, by_partner), one)
+    by_e, by_partner = staged((by_e, by_partner), one)
     by_square = Complex(jnp.zeros_like(one), jnp.zeros_like(one))
     for k in (1, 0):
         up, down = by_e * e, by_partner * partner
@@ -221,11 +221,9 @@ def _descend_rule(primals, tangents):
         by_e = by_e * (e * ratio) * (2 * step) - share * (1 + e).inverse
         by_partner = by_partner * (partner * ratio.inverse) * (2 * step)
         by_partner = by_partner + share * (1 + partner).inverse
-        by_e, by_partner = settled((by_e, by_partner), one)
+        by_e, by_partner = staged((by_e, by_partner), one)
     value = _descend(*primals)
-    by_e, by_partner, by_square = settled(
-        (by_e * value, by_partner * value, by_square * value), one
-    )
+    by_e, by_partner, by_square = staged((by_e * value, by_partner * value, by_square * value), one)
     return value, by_e * de + by_partner * dpartner + by_square * dc.square
 
 
@@ -235,5 +233,5 @@ def point(lead: Complex, rest: Complex, pull: Array, c: Curve, one: Array):
     From twice the amplitude as exponentials ``lead``, ``rest`` (times lambda, and one half of the
     first Landen step taken), whose squares times ``pull`` are those of the next level.
     """
-    turn = settled(_descend(lead * lead * pull, rest * rest * pull, c, one), one)
+    turn = staged(_descend(lead * lead * pull, rest * rest * pull, c, one), one)
     return lead * turn, rest * turn.inverse

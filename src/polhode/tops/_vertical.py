@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 from polhode.hamiltonian import components
 from polhode.tops._complex import Complex
 from polhode.tops._lagrange import at, orbit
-from polhode.xla import opaque_ones, settled
+from polhode.xla import opaque_ones, staged
 
 
 def upward(force: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array, Array], Array]:
@@ -55,10 +55,10 @@ def lagrange_motion(
     the axis included. Klein & Sommerfeld, Theorie des Kreisels, VI; see ``_lagrange``.
     """
     one = opaque_ones(transverse)
-    wxyz, omega = settled((tuple(wxyz[..., i] for i in range(4)), components(omega)), one)
-    turn, size = settled(upward(components(force_space)), one)
+    wxyz, omega = staged((tuple(wxyz[..., i] for i in range(4)), components(omega)), one)
+    turn, size = staged(upward(components(force_space)), one)
     back = (turn[0], -turn[1], -turn[2])
-    q, spin = settled(_turned(back, wxyz), one), omega[2]
+    q, spin = staged(_turned(back, wxyz), one), omega[2]
     momentum = (transverse * omega[0], transverse * omega[1], axial_momentum)
     spinor = Complex(q[0], q[3]), Complex(q[2], q[1])
     motion = orbit(transverse, spin, -size * distance, spinor, momentum)

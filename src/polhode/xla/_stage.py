@@ -13,7 +13,7 @@ def opaque_ones(x: Array) -> Array:
     return jnp.where(jnp.isnan(x), x, 1)
 
 
-def settled(values: Any, *ones: Array) -> Any:
+def staged(values: Any, *ones: Array) -> Any:
     """The same values, each divided by the ``ones`` of its own shape.
 
     The compiler repeats cheap arithmetic in every fused loop that needs its result, but never a
