@@ -31,7 +31,7 @@ from polhode.methods import (
     ways_of,
 )
 from polhode.trajectory import Propagator, Trajectory
-from polhode.xla import kernel
+from polhode.xla import FEW, kernel
 
 
 def simulate(
@@ -171,15 +171,11 @@ def _trajectory(method, scene, state, ts, rtol, record, split=None, in_order=Fal
     return trajectory
 
 
-_FEW = 8
-"""Bodies for which one task of the processor more costs as much as normalising them."""
-
-
 def _moved(record, method, scene, state, ts, rtol, in_order=False) -> Samples:
     parts = (getattr(scene, name) for name in PARTS)
     batch = common_batch(*parts, state, extra=(ts.shape[:-1],))
     parts = {name: flatten(getattr(scene, name), batch) for name in PARTS}
-    few = state.wxyz.size <= 4 * _FEW
+    few = state.wxyz.size <= 4 * FEW  # one task more costs as much as normalising them
     unit = (kernel(State.as_unit) if few else State.as_unit)(state)
     lanes = flatten(unit, batch, shared=False)
     times = ts

@@ -106,7 +106,7 @@ def frequencies(roles: Roles) -> tuple[Pair, Pair, Scalars]:
 
 def compensate(swing: Swing, turning: Turning | None, roles: Roles) -> tuple[Swing, Turning | None]:
     """Both motions with low parts of their paces, where the means have converged."""
-    # Settled: the two parts of a pair must come out of one and the same sum.
+    # Staged: the two parts of a pair must come out of one and the same sum.
     pace, angle, left = staged(frequencies(roles), roles.one)
     # Convergence is quadratic: what is left is the square of the last step.
     sound = (left < jnp.finfo(left.dtype).eps / 64) & ~swing.endless

@@ -19,7 +19,7 @@ from polhode.methods._options import check_options
 from polhode.methods._segments import Moved, in_segments
 from polhode.methods._status import Status
 from polhode.solvers import FlowAdjoint, GivenTimes
-from polhode.xla import kernel
+from polhode.xla import FEW, kernel
 
 
 class Stepped(AbstractMethod):
@@ -60,7 +60,7 @@ class Stepped(AbstractMethod):
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
         if n <= size:
-            whole = kernel(one, of_units=True) if n <= _FEW else one
+            whole = kernel(one, of_units=True) if n <= FEW else one
             return whole((lanes, times))
         order = jnp.argsort(natural_rates(scene, state, ts))  # who shares a chunk is of like rate
         found = map_chunks(one, jax.tree.map(lambda x: x[order], (lanes, times)), n, size)
@@ -158,10 +158,6 @@ class Stepped(AbstractMethod):
             spins,
         )
 
-
-_FEW = 8
-"""Bodies so few that what stands around their march costs more than the march: all of it is one
-unit. For many the march is 5 % slower as a unit within a unit."""
 
 _ON_ACCELERATOR = 2**18
 """Bodies that are moved together there: enough to fill it, few enough for its memory."""

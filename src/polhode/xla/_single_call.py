@@ -33,6 +33,10 @@ _HOLDABLE = frozenset(
 _WIDE = 1024
 """Floats in a sum, from which on a unit does not hold it."""
 
+FEW = 8
+"""Bodies so few that what stands around their motion costs more than it does: all of it is one
+unit. For many the march is 5 % slower as a unit within a unit."""
+
 _TABLE = 1024
 """Known numbers of an array, up to which it stands in a unit."""
 
