@@ -77,7 +77,7 @@ def test_the_estimate_bounds_the_error(rtol):
     marked = np.asarray(traj.status) == ph.Status.INACCURATE
     missed = (error > 10 * rtol) & ~marked
     assert not np.any(missed[calm])
-    assert np.sum(missed) <= 3  # of 400 such tops 19 are missed, nearly all of them chaotic
+    assert np.sum(missed) <= 2  # of 400 such tops 5 and 9 are, none of the 337 calm ones
     assert np.all(marked == (np.asarray(traj.error) > 10 * rtol))
     if np.any(marked):
         with pytest.raises(ph.SimulationError, match="estimated error"):
