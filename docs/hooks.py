@@ -26,12 +26,6 @@ NOTEBOOKS = (
     "quick_start", "intermediate_axis", "euler_hamiltonian", "work_and_precision",
     "tumbling_asteroid", "explorer", "detumbling", "rotating_frames", "inertia", "fitting",
 )  # fmt: skip
-PENDING = {
-    "light_curves.md",
-    "free_motion.md",
-    "architecture.md",
-}  # shown as soon as they are there
-
 SECTIONS = {
     "Simulate": "simulate explain Scene State Trajectory Record Status SimulationError Plan choose",
     "Events": "Event crossings Crossings",
@@ -67,19 +61,13 @@ def public_names(module: str) -> list[str]:
 
 
 def on_config(config):
-    """Fill the navigation: notebooks, reference; leave out what is not written yet."""
+    """Fill the navigation: notebooks, reference."""
     for part in config.nav:
-        (title, pages), *_ = part.items()
+        title = next(iter(part))
         if title == "Notebooks":
             part[title] = [f"notebooks/{name}.md" for name in _notebooks()]
         elif title == "Reference":
             part[title] = [{module: f"reference/{module}.md"} for module in public_modules()]
-        elif isinstance(pages, list):
-            docs = Path(config.docs_dir)
-            part[title] = [
-                page for page in pages
-                if not (PENDING & set(page.values())) or (docs / next(iter(page.values()))).exists()
-            ]  # fmt: skip
     return config
 
 
