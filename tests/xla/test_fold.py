@@ -112,3 +112,23 @@ def test_folds():
     for got, want in zip(run(held, x, y), fn(a, b, x, y), strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-15, atol=1e-16)
         assert got.shape == want.shape
+
+
+def test_what_results_share_is_worked_out_once():
+    def rates(known, *state):
+        shared = known
+        for x in state:
+            shared = shared * (x - shared * x)
+        return [shared * x for x in state]
+
+    given = jnp.full(N, 0.3), *Y[0], *Y[1]
+    closed = jax.make_jaxpr(rates)(*given)
+
+    def multiplications(stage):
+        held, run, _ = specialise(closed, given[:1], stage=stage)
+        program = jax.jit(lambda *state: run(held, *state)).lower(*given[1:]).compile()
+        np.testing.assert_allclose(program(*given[1:]), rates(*given), rtol=1e-12)
+        return program.as_text().count(" multiply(")
+
+    assert multiplications(True) < 4 * len(given)
+    assert multiplications(False) > 12 * len(given)

@@ -193,12 +193,12 @@ class Equations:
         closed = jax.make_jaxpr(paired)(*c, span[0], *z)
 
         def coefficients(fold, *some):
-            return list(specialise(closed, _put(c, at, some), fold=fold).held)
+            return list(specialise(closed, _put(c, at, some), fold=fold, stage=False).held)
 
         # components of what is differentiated are fewer than what folding makes of them
         some, lane = [c[i] for i in at], end[0].shape
         for fold in (False, True):
-            made, run, seen = specialise(closed, c, fold=fold)
+            made, run, seen = specialise(closed, c, fold=fold, stage=False)
             which = _moving(partial(coefficients, fold), some)
             if all(seen[i] == {lane} for i in which):
                 break

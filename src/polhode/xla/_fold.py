@@ -3,7 +3,8 @@
 What automatic differentiation writes down holds sums with zero, products with one and products of
 parameters, all of which would be worked out again in every evaluation and, as XLA gives every
 output array its own loop, for every component. Here they are folded into few coefficients before
-the loop. The result differs from the plain function by rounding (products are reassociated).
+the loop, and values that several results share are staged. The result differs from the plain
+function by rounding (products are reassociated).
 """
 
 from collections.abc import Callable, Sequence
@@ -16,6 +17,7 @@ from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
+from polhode.xla._stage import opaque_ones, staged
 from polhode.xla._switch import is_plain
 
 _FOLDS = {
@@ -31,6 +33,10 @@ _TAKING_APART = frozenset(
     "broadcast_in_dim convert_element_type copy gather reshape slice squeeze stop_gradient".split()  # noqa: SIM905
 )
 _CALLS = frozenset(("jit", "pjit", "closed_call"))
+
+_WORTH = 8
+"""Operations behind a value of several results, from which on it is staged (see ``staged``). From 5
+to 60 were tried: gradients of tops and of damped satellites take least time with 8 to 20."""
 
 
 class _Held(NamedTuple):
@@ -81,10 +87,13 @@ class _Step(NamedTuple):
     operands: list[tuple[Any, Any, tuple[int, ...]]]
 
 
-def specialise(closed: ClosedJaxpr, known: Sequence[Any], *, fold: bool = True) -> Specialised:
+def specialise(
+    closed: ClosedJaxpr, known: Sequence[Any], *, fold: bool = True, stage: bool = True
+) -> Specialised:
     """Takes the part of ``closed`` that needs only its first arguments, ``known``, out of it.
 
-    Without ``fold`` these arguments are only taken apart: no arithmetic is done beforehand.
+    Without ``fold`` these arguments are only taken apart: no arithmetic is done beforehand. Without
+    ``stage`` the rest is not divided into stages: for a program that is to be specialised again.
     """
     if is_plain():
         shapes = tuple(frozenset([jnp.shape(x)]) for x in known)
@@ -106,6 +115,7 @@ def specialise(closed: ClosedJaxpr, known: Sequence[Any], *, fold: bool = True) 
             held[x.key] = x.value
             seen.setdefault(x.key, set()).add(tuple(shape))
     places = {key: place for place, key in enumerate(held)}
+    shared = _shared(steps, out) if stage else frozenset()
 
     def run(held, *state):
         values = dict(enumerate(state))
@@ -120,7 +130,8 @@ def specialise(closed: ClosedJaxpr, known: Sequence[Any], *, fold: bool = True) 
 
         for step in steps:
             found = step.bind(*(read(o) for o in step.operands))
-            values.update(zip(step.made, found if isinstance(found, list | tuple) else [found]))
+            for i, x in zip(step.made, found if isinstance(found, list | tuple) else [found]):
+                values[i] = staged(x, opaque_ones(x)) if i in shared else x
         return [read(o) for o in out]
 
     return Specialised(tuple(held.values()), run, tuple(map(frozenset, seen.values())))
@@ -135,6 +146,34 @@ def _needed(steps: list[_Step], out) -> tuple[_Step, ...]:
             kept.append(step)
             wanted.update(x for x, *_ in step.operands if not isinstance(x, _Held))
     return tuple(reversed(kept))
+
+
+def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
+    """Values that several results rest on and that are long enough to be worked out once."""
+    makers = {i: k for k, step in enumerate(steps) for i in step.made}
+
+    def of(operands):
+        return {i for i, *_ in operands if not isinstance(i, _Held) and i in makers}
+
+    users: dict[int, list[int]] = {i: [] for i in makers}
+    ends: dict[int, set[int]] = {i: set() for i in makers}  # the results that rest on it
+    for k, operand in enumerate(out):
+        for i in of([operand]):
+            users[i].append(-k)
+            ends[i].add(k)
+    for k, step in reversed([*enumerate(steps)]):
+        for i in of(step.operands):
+            users[i].append(k)
+            ends[i].update(*(ends[made] for made in step.made))
+    shared: set[int] = set()
+    behind: dict[int, set[int]] = {}  # the operations that a fused loop repeats for it
+    for k, step in enumerate(steps):
+        work = {k}.union(*(behind[i] for i in of(step.operands) - shared))
+        for i in step.made:
+            behind[i] = work
+            if min(len(users[i]), len(ends[i])) > 1 and len(work) >= _WORTH:
+                shared.add(i)
+    return frozenset(shared)
 
 
 class _Work:

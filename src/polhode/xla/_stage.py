@@ -8,9 +8,13 @@ from jaxtyping import Array
 
 
 def opaque_ones(x: Array) -> Array:
-    """Ones of the shape of x that the compiler cannot know to be ones (NaN where x is)."""
-    x = jax.lax.stop_gradient(x)
-    return jnp.where(jnp.isnan(x), x, 1)
+    """Ones of the shape of x that XLA cannot know to be ones, but LLVM after it does.
+
+    Half of a truth value, rounded down, is zero: XLA does not look at the bits of a number. So it
+    stages what is divided by them, and LLVM drops the division.
+    """
+    half = (jax.lax.stop_gradient(x) > 0).astype(jnp.int32) >> 1
+    return 1 + half.astype(x.dtype)
 
 
 def staged(values: Any, *ones: Array) -> Any:
@@ -18,11 +22,11 @@ def staged(values: Any, *ones: Array) -> Any:
 
     The compiler repeats cheap arithmetic in every fused loop that needs its result, but never a
     division; it drops optimisation barriers before fusing on the CPU. A division by a broadcast
-    scalar would be a multiplication to it. Truth values stay as they are.
+    scalar would be a multiplication to it. What is no float stays as it is.
     """
 
     def divided(x):
-        if x.dtype == bool:
+        if not jnp.issubdtype(x.dtype, jnp.inexact):
             return x
         one = next((one for one in ones if one.shape == x.shape), ones[0])
         return x / (one if one.ndim >= x.ndim else jnp.broadcast_to(one, x.shape))
