@@ -11,7 +11,7 @@ from diffrax import AbstractTerm
 from jax.interpreters import partial_eval
 from jaxtyping import PyTree
 
-from polhode.xla import specialise
+from polhode.xla import formula, specialise
 
 
 class BoundTerm(eqx.Module):
@@ -54,7 +54,7 @@ class BoundTerm(eqx.Module):
             found = problem.increment(t, jax.tree.unflatten(state_tree, y), problem.forward(dtype))
             return jax.tree.leaves(found)
 
-        closed = jax.make_jaxpr(rates)(*arrays, t, *leaves)
+        closed = formula(rates, *arrays, t, *leaves)
         held, run, _ = specialise(closed, arrays)
         return Prepared(held, run, uses(closed.jaxpr, len(arrays)))
 

@@ -83,6 +83,13 @@ class Equations:
         consts, _, arrays, _ = self._parts(c)
         return jaxpr_as_fun(ClosedJaxpr(self.jaxpr, consts))(t, *y, *arrays)
 
+    def prepared(self, c: Sequence[Any], t, y: Sequence[Any], stage: bool = False):
+        """Arrays held, and ``run(held, t, *y)``, the rates: see ``xla.specialise``."""
+        size = len(c)
+        closed = jax.make_jaxpr(lambda *x: self.field(x[:size], x[size], x[size + 1 :]))(*c, t, *y)
+        held, run, _ = specialise(closed, c, stage=stage)
+        return held, run
+
     def back(self, c: Sequence[Any], t, z: Sequence[Any]) -> tuple[list[Any], Any]:
         """Rates of state and costate, and the scalar whose slope by ``c`` is integrated."""
         if isinstance(self.costate, AnyCostate):
@@ -114,18 +121,12 @@ class Equations:
 
     def _solution(self, c, y, span, horizon):
         """The solution itself."""
-        made = specialise(
-            jax.make_jaxpr(lambda *x: self.field(x[: len(c)], x[len(c)], x[len(c) + 1 :]))(
-                *c, span[0], *y
-            ),
-            c,
-        )
-        run = made.run
+        held, run = self.prepared(c, span[0], y, stage=True)
 
         def rates(held, t, y, along):
             return run(held, t, *y), []
 
-        return self._solve(c, rates, made.held, y, [], span, horizon, _plainly)[0]
+        return self._solve(c, rates, held, y, [], span, horizon, _plainly)[0]
 
     def _pinned(self, c, y, t0, t1, horizon, end):
         return attached(self._moved, [t0, t1, horizon, *y, *c], end)

@@ -16,6 +16,7 @@ from jaxtyping import Array
 from polhode.solvers._equations import Equations, equations_of
 from polhode.solvers._linear import attached, is_slope
 from polhode.solvers._one_step import is_one_step, one_step
+from polhode.xla import kernel
 
 
 class FlowAdjoint(diffrax.AbstractAdjoint):
@@ -55,12 +56,14 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
         compensated = getattr(solver, "compensated", False)
         equations, c = equations_of(terms, args, init_state.y, t0, rtol, compensated)
 
+        held, rates = equations.prepared(c, t0, leaves)
+        rates = kernel(rates)  # for solvers that are not units themselves
+
         def field(t, y, known):
-            rates = equations.field(known.arrays, t, jax.tree.leaves(y))
-            return jax.tree.unflatten(tree, rates)
+            return jax.tree.unflatten(tree, rates(known.arrays, t, *jax.tree.leaves(y)))
 
         # The steps themselves are not differentiated, nor what the user's functions close over.
-        known = _Known(c, getattr(args, "units", None))
+        known = _Known(held, getattr(args, "units", None))
         given = (known, solver, stepsize_controller, saveat, t0, t1, init_state, rest)
         known, solver, controller, saveat, begin, end, state, rest = _stopped(given)
         spanning = getattr(solver, "spanning", None)
@@ -105,7 +108,7 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
 class _Known(eqx.Module):
     """All arrays that a field rests on, in place of its arguments; their natural units."""
 
-    arrays: list[Array]
+    arrays: tuple[Array, ...]
     units: Any
 
 

@@ -5,6 +5,12 @@ all of it off. `README.md` beside this file says what each part buys.
 """
 
 from polhode.xla._fold import Specialised as Specialised, specialise as specialise
-from polhode.xla._single_call import FEW as FEW, any_of as any_of, kernel as kernel, put as put
+from polhode.xla._single_call import (
+    FEW as FEW,
+    any_of as any_of,
+    formula as formula,
+    kernel as kernel,
+    put as put,
+)
 from polhode.xla._stage import opaque_ones as opaque_ones, staged as staged
 from polhode.xla._switch import is_plain as is_plain

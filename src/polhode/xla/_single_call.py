@@ -80,6 +80,15 @@ def kernel(fn: Callable, *, linearised: bool = False, of_units: bool = False) ->
     return call
 
 
+def formula(fn: Callable, *operands: Any) -> ClosedJaxpr:
+    """``fn`` traced; units inside it show what they are made of."""
+    analysing = _ANALYSING.set(True)
+    try:
+        return jax.make_jaxpr(fn)(*operands)
+    finally:
+        _ANALYSING.reset(analysing)
+
+
 @custom_vmap
 def any_of(these: jax.Array) -> jax.Array:
     """Whether any of these is not zero, under ``vmap`` any of the whole batch.
