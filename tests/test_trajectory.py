@@ -58,7 +58,7 @@ def truth(name, times, rates=STATE.omega_body):
     return np.array(rows)
 
 
-@pytest.mark.parametrize("name", ["free", "pushed", "wheel"])
+@pytest.mark.parametrize("name", ["free", pytest.param("pushed", marks=pytest.mark.slow), "wheel"])
 def test_at_any_time(name):
     """Within rtol where steps are taken, within rounding where the law is exact."""
     traj = ph.simulate(SCENES[name], STATE, TS, rtol=1e-10)

@@ -133,8 +133,8 @@ def test_many_times_agree_with_single_ones_in_value_and_gradient():
 
     def one_by_one(moments):
         motion = free.prepare(moments, wxyz, omega)
-        columns = [free.evaluate(motion, t) for t in ts]
-        return jnp.stack([jnp.stack([*w, *q]) for w, q in columns], -1)
+        columns = jax.lax.map(lambda t: free.evaluate(motion, t), ts)
+        return jnp.moveaxis(jnp.stack([x for part in columns for x in part]), 1, -1)
 
     for fn in (together, one_by_one):
         assert jax.eval_shape(fn, moments).shape == (7, 7, 4)

@@ -100,13 +100,13 @@ def test_both_modes_are_the_slope(scene_of):
     p = point()
     direction = along(p, 3)
     fn = partial(loss, scene_of)
-    want = difference(jax.jit(fn), p, direction)
+    forward = jax.jit(lambda p: jax.jvp(fn, (p,), (direction,)))
+    want = difference(lambda p: forward(p)[0], p, direction)
     slopes = jax.jit(jax.grad(fn))(p)
     products = jax.tree.map(lambda s, d: jnp.sum(s * d), slopes, direction)
     np.testing.assert_allclose(sum(jax.tree.leaves(products)), want, rtol=1e-9)
     assert all(abs(float(x)) > 1e-6 for x in jax.tree.leaves(products))  # every one takes part
-    _, change = jax.jit(lambda p, d: jax.jvp(fn, (p,), (d,)))(p, direction)
-    np.testing.assert_allclose(change, want, rtol=1e-9)
+    np.testing.assert_allclose(forward(p)[1], want, rtol=1e-9)
     if scene_of is satellite:
         return
     single = jax.tree.map(lambda x: x.astype(jnp.float32), p)
@@ -207,7 +207,12 @@ def arguments(first, strength):
     return tuple(jnp.broadcast_to(i, 3) for i in inverse), jnp.broadcast_to(strength, 3)
 
 
-@pytest.mark.parametrize("name", SOLVES)
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in ("controlled", "implicit") else pytest.param(n, marks=SLOW) for n in SOLVES]
+)
 def test_outside_of_simulate_any_solver_has_the_slopes_of_the_flow(name):
     """Of the last state by a moment and the strength of the field, 40 digits; the steps of the
     implicit one are coarse, its derivatives are not."""
@@ -249,7 +254,7 @@ def test_one_step_is_what_the_loop_of_diffrax_makes_of_it(end):
         np.testing.assert_allclose(a, b, rtol=1e-15, atol=1e-15)
 
 
-@pytest.mark.parametrize("name", ["marched", "stock"])
+@pytest.mark.parametrize("name", [pytest.param("marched", marks=SLOW), "stock"])
 def test_slopes_by_saved_times_are_the_field(name):
     """At each of them; a later start alone is an earlier end."""
     args, ts = arguments(jnp.array(bodies.MOMENTS[0]), jnp.array(bodies.STRENGTH)), bodies.TIMES
@@ -342,7 +347,11 @@ def held(p, method):
     return jnp.sum(WEIGHTS[:4] * end.wxyz[0]) + jnp.sum(WEIGHTS[4:] * end.omega_body[0])
 
 
-@pytest.mark.parametrize("solver", [Extrapolation(12), diffrax.Dopri8()], ids=("own", "stock"))
+@pytest.mark.parametrize(
+    "solver",
+    [Extrapolation(12), pytest.param(diffrax.Dopri8(), marks=SLOW)],
+    ids=("own", "stock"),
+)
 def test_the_way_back_starts_anew_where_drag_draws_bodies_together(solver):
     """By itself, in ``simulate``."""
     method = ph.LiePoisson(solver)

@@ -164,15 +164,21 @@ def rows(*heavy: str):
     return [pytest.param(name, marks=slow) if name in heavy else name for name in METHODS]
 
 
-QUICK = ("planner", "ClosedForm")
+# Methods with tests of their own of values and gradients, in tops and in solvers; and what acts in
+# the row of Dopri8 as well, where the planner's method is that of the other rows.
+ELSEWHERE = (
+    *("LagrangeTop", "Extrapolation", "Extrapolation compensated", "Splitting", "Moser-Veselov"),
+    *("planner space", "planner fading", "planner sink"),
+)
+SINGLE = "planner free", "planner gravity", "planner body and damping", "ClosedForm"
 
 
-@pytest.mark.parametrize("name", rows("Extrapolation", "Extrapolation compensated", "Splitting"))
+@pytest.mark.parametrize("name", rows(*ELSEWHERE))
 def test_state_and_gradient(name):
     check(METHODS[name], jnp.float64)
 
 
-@pytest.mark.parametrize("name", rows(*(name for name in METHODS if not name.startswith(QUICK))))
+@pytest.mark.parametrize("name", rows(*(name for name in METHODS if name not in SINGLE)))
 def test_state_and_gradient_in_single_precision(name):
     check(METHODS[name], jnp.float32)
 
