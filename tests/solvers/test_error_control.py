@@ -67,7 +67,9 @@ def test_no_body_is_far_beyond_the_error_asked_for(kind):
         assert 0.01 * rtol < usual < 3 * rtol, (rtol, usual / rtol)
 
 
-@pytest.mark.parametrize("kind", MADE)
+@pytest.mark.parametrize(
+    "kind", [k if k == "gravity" else pytest.param(k, marks=pytest.mark.slow) for k in MADE]
+)
 def test_nor_in_single_precision(kind):
     """Up to what rounding takes, beside float64 on the same rounded numbers."""
     for rtol in (1e-3, 1e-4, 1e-5):
