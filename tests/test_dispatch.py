@@ -149,7 +149,7 @@ def test_twenty_numbers_of_saved_times_compile_three_programs_at_most(kind):
         found = ph.simulate(scene, _state(), ts, rtol=10.0 ** -(3 + count % 5))
         assert np.array_equal(found.ts, ts)
         assert found.wxyz.shape == (count, 4)
-        assert found.energy.shape == (count,)
+        assert jax.eval_shape(lambda one: one.energy, found).shape == (count,)
         assert np.all(np.isfinite(found.wxyz))
     assert 1 <= compiled() <= 3
     record = ph.Record(final_only=True)

@@ -39,7 +39,13 @@ def known(level, rate=RATE, last=10.0):
     return np.sort([t for t in times if 1e-3 < t < last])
 
 
-@pytest.mark.parametrize("method", [None, ph.LiePoisson()], ids=["exact", "stepped"])
+@pytest.mark.parametrize(
+    "method",
+    [  # of steps: the pendulum below
+        pytest.param(None, id="exact"),
+        pytest.param(ph.LiePoisson(), id="stepped", marks=pytest.mark.slow),
+    ],
+)
 def test_crossings_of_a_turning_ball(method):
     """To 1e-12 of the time for exact laws; within what rtol allows for steps."""
     tolerance = 1e-12 if method is None else 1e-9
@@ -327,9 +333,13 @@ def test_what_cannot_be_searched_is_told():
     for given, match in (({"most": 3}, "samples="), ({"samples": 30}, "most=")):
         with pytest.raises(ValueError, match=match):
             jax.jit(lambda traj, given=given: ph.crossings(traj, height(0.0), **given))(traj)
-    few = ph.simulate(BALL, STATE, [0.0, 20.0], ph.LiePoisson(max_steps=120))
-    with pytest.raises(ValueError, match="steps of a body ran out"):
-        ph.crossings(few, height(0.0))
     fast = ph.simulate(BALL, ph.State([1.0, 0, 0, 0], [0.0, 1e7, 0]), [0.0, 10.0])
     with pytest.raises(ValueError, match="looks at each body"):
         ph.crossings(fast, height(0.0))
+
+
+@pytest.mark.slow
+def test_a_search_that_runs_out_of_steps_is_told():
+    few = ph.simulate(BALL, STATE, [0.0, 20.0], ph.LiePoisson(max_steps=120))
+    with pytest.raises(ValueError, match="steps of a body ran out"):
+        ph.crossings(few, height(0.0))
