@@ -31,9 +31,10 @@ def _fits_single(case: dict) -> bool:
     scope="module",
     params=[
         pytest.param(("float64", jax.jacfwd), id="float64"),
-        pytest.param(("float32", jax.jacrev), id="float32"),
-        # of hundreds of bodies in tests/stress
+        pytest.param(("float32", jax.jacfwd), id="float32"),
+        # in tests/stress of hundreds of bodies, and in tests/systems
         pytest.param(("float64", jax.jacrev), id="float64-reverse", marks=pytest.mark.slow),
+        pytest.param(("float32", jax.jacrev), id="float32-reverse", marks=pytest.mark.slow),
     ],
 )
 def solved(request):

@@ -50,15 +50,19 @@ def test_model_is_that_of_simulate(seen, trial):
     x = np.asarray(trial.unknowns[0])
     inertia = ph.Inertia(np.stack(_model.moments_of(jnp.asarray(x))))
     path = ph.simulate(ph.Scene(inertia), ph.State(trial.wxyz[0], x[4:7]), curve.t - curve.t[0])
-    back = ph.rotation.conjugate(path.wxyz)
-    sun, observer = (ph.rotation.rotate(back, jnp.asarray(v)) for v in (curve.sun, curve.observer))
     axes = np.exp([0.0, *x[2:4]])
-    light = lightcurve.seeliger_ellipsoid(tuple(axes), tuple(sun.T), tuple(observer.T))
-    light = light / (np.pi / 2 * np.prod(axes) ** (2 / 3))
-    alpha = jnp.asarray(curve.alpha)
-    expected = -2.5 * jnp.log10(light / lightcurve.seeliger_sphere(alpha))
-    expected = expected + PHASE.magnitudes(alpha, jnp.asarray(x[7:9]))
-    np.testing.assert_allclose(values[0, : curve.t.size], expected, atol=1e-9)
+
+    @jax.jit
+    def expected(wxyz, *vectors):
+        back, alpha = ph.rotation.conjugate(wxyz), jnp.asarray(curve.alpha)
+        sun, observer = (ph.rotation.rotate(back, v) for v in vectors)
+        light = lightcurve.seeliger_ellipsoid(tuple(axes), tuple(sun.T), tuple(observer.T))
+        light = light / (np.pi / 2 * np.prod(axes) ** (2 / 3))
+        reduced = -2.5 * jnp.log10(light / lightcurve.seeliger_sphere(alpha))
+        return reduced + PHASE.magnitudes(alpha, jnp.asarray(x[7:9]))
+
+    want = expected(path.wxyz, curve.sun, curve.observer)
+    np.testing.assert_allclose(values[0, : curve.t.size], want, atol=1e-9)
 
 
 def test_light_has_the_sums_of_its_mode(trial):

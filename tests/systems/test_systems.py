@@ -172,7 +172,7 @@ ELSEWHERE = (
     *("LagrangeTop", "Extrapolation", "Extrapolation compensated", "Splitting", "Moser-Veselov"),
     *("planner space", "planner fading", "planner sink", "planner gradient", "EulerAngles"),
 )
-SINGLE = "planner free", "planner gravity", "ClosedForm"
+SINGLE = "planner free", "planner gravity", "planner axisymmetric", "ClosedForm"
 
 
 @pytest.mark.parametrize("name", rows(*ELSEWHERE))
