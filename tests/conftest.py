@@ -40,6 +40,10 @@ assert not [name for name in sys.modules if name.split(".")[0] == "polhode"]
 jaxtyping.install_import_hook([f"polhode.{room}" for room in CHECKED], "checked.checked")
 
 
+# Tracing makes millions of objects that live; looking them all over for cycles takes a tenth of it.
+gc.set_threshold(200_000, 50, 100)
+
+
 _MOST = 4 * 2**30
 """Bytes that a worker may hold before it drops its programs: the next test reads from the disk
 those that it needs again. Two workers that keep the programs of a whole run take 24 GB."""

@@ -39,7 +39,13 @@ def known(level, rate=RATE, last=10.0):
     return np.sort([t for t in times if 1e-3 < t < last])
 
 
-@pytest.mark.parametrize("method", [None, ph.LiePoisson()], ids=["exact", "stepped"])
+@pytest.mark.parametrize(
+    "method",
+    [  # of steps: the pendulum below
+        pytest.param(None, id="exact"),
+        pytest.param(ph.LiePoisson(), id="stepped", marks=pytest.mark.slow),
+    ],
+)
 def test_crossings_of_a_turning_ball(method):
     """To 1e-12 of the time for exact laws; within what rtol allows for steps."""
     tolerance = 1e-12 if method is None else 1e-9
@@ -121,16 +127,17 @@ def test_a_motion_stops_at_its_event_and_goes_on_with_another_scene():
     burning = ph.Scene(inertia, None, ph.BodyTorque([0.0, 0.5, 0.0]))  # 0.25 rad/s^2 about y
     rest = ph.State([1.0, 0, 0, 0], jnp.zeros((2, 3)).at[1, 1].set(0.75))
     reached = ph.Event(lambda wxyz, omega_body, t: omega_body[1] - 1.0, 1)
-    on = ph.simulate(burning, rest, jnp.linspace(0.0, 6.0, 4), until=reached)
+    ts = np.linspace(0.0, 6.0, 4) + np.zeros((2, 1))  # below times of as many: the same programs
+    on = ph.simulate(burning, rest, ts, until=reached)
     np.testing.assert_allclose(on.event_time, [4.0, 1.0], rtol=1e-12)
     np.testing.assert_allclose(on.ts, [[0, 2, 4, 4], [0, 1, 1, 1]], rtol=1e-12)
     np.testing.assert_allclose(on.last.omega_body[:, 1], 1.0, rtol=1e-12)
     np.testing.assert_allclose(on.omega_body[0, :2, 1], [0.0, 0.5], atol=1e-14)
-    ts = np.asarray(on.event_time)[:, None] + np.array([0.0, 5.0])
+    ts = np.asarray(on.event_time)[:, None] + np.array([0.0, 1.0, 2.0, 5.0])
     off = ph.simulate(ph.Scene(inertia), on.last, ts, until=ph.Event(height(0.0), -1))
     turned = np.array([0.25 * 4**2 / 2, 0.75 + 0.25 / 2])  # at the switch; body x falls at 2 pi k
     want = np.array([4.0, 1.0]) + (2 * np.pi - turned)
-    reached_again = want < np.asarray(ts[:, 1])
+    reached_again = want < np.asarray(ts[:, -1])
     assert reached_again.tolist() == [True, False]
     np.testing.assert_allclose(off.event_time, [want[0], np.inf], rtol=1e-11)
     # at the surface of the event itself the motion starts: that is no crossing
@@ -173,16 +180,17 @@ def test_derivatives_of_a_motion_that_stops():
     """At a fixed phase x = rate t: dt/drate = -t/rate; the attitude is the phase's, the same for
     every rate, and moves with the level."""
 
-    @jax.jit
     def stop(rate, level):
         state = ph.State(STATE.wxyz, jnp.stack([0 * rate, rate, 0 * rate]))
         span = jnp.array([0.0, 1000.0])
         found = ph.simulate(BALL, state, span, until=ph.Event(Height(level)))
-        return found.event_time, found.last.wxyz
+        return (found.event_time, found.last.wxyz), found.event_time
 
-    given = jnp.asarray(RATE), jnp.asarray(0.4)
-    time, _ = stop(*given)
-    (by_rate, by_level), (q_rate, q_level) = jax.jacrev(stop, (0, 1))(*given)
+    rates, level = jnp.array([RATE, 0.6, 1.3]), jnp.asarray(0.4)
+    slopes = jax.jit(jax.vmap(jax.jacrev(stop, (0, 1), has_aux=True), (0, None)))
+    slopes, times = slopes(rates, level)
+    (by_rate, by_level), (q_rate, q_level) = jax.tree.map(lambda x: x[0], slopes)
+    time = times[0]
     np.testing.assert_allclose(by_rate, -time / RATE, rtol=1e-12)
     slope = -RATE * np.cos(RATE * time)
     np.testing.assert_allclose(by_level, 1 / slope, rtol=1e-12)
@@ -190,8 +198,7 @@ def test_derivatives_of_a_motion_that_stops():
     half = RATE * time / 2
     change = np.array([-np.sin(half), 0, np.cos(half), 0]) * RATE / 2 / slope
     np.testing.assert_allclose(q_level, change, rtol=1e-11, atol=1e-15)
-    many = jax.vmap(stop, (0, None))(jnp.array([0.6, 1.3]), given[1])[0]
-    np.testing.assert_allclose(many, [known(0.4, 0.6)[0], known(0.4, 1.3)[0]], rtol=1e-12)
+    np.testing.assert_allclose(times[1:], [known(0.4, 0.6)[0], known(0.4, 1.3)[0]], rtol=1e-12)
 
 
 @pytest.mark.slow
@@ -326,9 +333,13 @@ def test_what_cannot_be_searched_is_told():
     for given, match in (({"most": 3}, "samples="), ({"samples": 30}, "most=")):
         with pytest.raises(ValueError, match=match):
             jax.jit(lambda traj, given=given: ph.crossings(traj, height(0.0), **given))(traj)
-    few = ph.simulate(BALL, STATE, [0.0, 20.0], ph.LiePoisson(max_steps=120))
-    with pytest.raises(ValueError, match="steps of a body ran out"):
-        ph.crossings(few, height(0.0))
     fast = ph.simulate(BALL, ph.State([1.0, 0, 0, 0], [0.0, 1e7, 0]), [0.0, 10.0])
     with pytest.raises(ValueError, match="looks at each body"):
         ph.crossings(fast, height(0.0))
+
+
+@pytest.mark.slow
+def test_a_search_that_runs_out_of_steps_is_told():
+    few = ph.simulate(BALL, STATE, [0.0, 20.0], ph.LiePoisson(max_steps=120))
+    with pytest.raises(ValueError, match="steps of a body ran out"):
+        ph.crossings(few, height(0.0))

@@ -189,7 +189,13 @@ def test_explain_says_why_no_exact_law_holds():
     assert ph.explain(ph.Scene(scene.inertia), states(1), [0.0, 1.0]).refused == ()
 
 
-@pytest.mark.parametrize("inertia", [ph.Inertia.axisymmetric(2.0, 0.5), ph.Inertia.spherical(2.0)])
+@pytest.mark.parametrize(
+    "inertia",
+    [  # axisymmetric bodies against truths: tests/systems
+        pytest.param(ph.Inertia.axisymmetric(2.0, 0.5), id="axial", marks=pytest.mark.slow),
+        pytest.param(ph.Inertia.spherical(2.0), id="sphere"),
+    ],
+)
 def test_static_symmetry_gives_the_same_motion_and_slope(inertia):
     """The programs for known symmetry agree with the general one (itself held to 50 digits)."""
     general = ph.Inertia.from_moments(inertia.moments)
@@ -209,6 +215,7 @@ def test_static_symmetry_gives_the_same_motion_and_slope(inertia):
     np.testing.assert_allclose(only.omega_body, one.omega_body, atol=1e-15)
 
 
+@pytest.mark.slow  # tensors in both modes against 50 digits: tests/stress and tests/free
 def test_general_tensor_equals_its_principal_frame():
     """A tensor turned out of its axes moves as the body it is; its gradient is the tensor's."""
     turn = rotation.normalise(jnp.array([0.7, -0.3, 0.5, 0.2]))
@@ -222,10 +229,9 @@ def test_general_tensor_equals_its_principal_frame():
         end = ph.simulate(scene, state, ts, method, rtol=1e-13)
         return jnp.sum(end.omega_body[-1] ** 3), end.wxyz[-1]
 
+    slope = jax.jit(jax.grad(loss, has_aux=True), static_argnums=1)
     for given in (tilted, matrix @ jnp.diag(jnp.array([1.0, 1.0, 1.75])) @ matrix.T):
-        slopes, ends = zip(
-            *(jax.grad(loss, has_aux=True)(given, method) for method in (None, ph.LiePoisson()))
-        )
+        slopes, ends = zip(*(slope(given, method) for method in (None, ph.LiePoisson())))
         assert float(rotation.angle_between(*ends)) < 1e-10
         np.testing.assert_allclose(slopes[0], slopes[1], rtol=0, atol=1e-9)
 

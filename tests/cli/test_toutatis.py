@@ -45,7 +45,7 @@ def _angle(left, right):
 
 def test_misfits_to_the_radar_observations_are_those_of_principia():
     file = read_scene(SCENE)
-    few = dataclasses.replace(file.monte_carlo, clones=40)
+    few = dataclasses.replace(file.monte_carlo, clones=60)  # as below: the same programs
     job = _job.prepare(dataclasses.replace(file, monte_carlo=few), "float64")
     seen = job.file.observations
     ts = np.concatenate([[0.0], seen.seconds])

@@ -173,5 +173,6 @@ def test_a_missing_row_in_five_does_not_hide_the_noise(cases):
     times, clean, noisy, *_ = cases
     holed = np.stack([noisy[2], noisy[4], np.broadcast_to(clean[0, :1], clean[0].shape)])
     holed[:2, ::5] = np.nan
-    fit = fit_inertia(times, holed, throw=False)
+    # as many as all bodies are, for the program of these
+    fit = fit_inertia(times, holed[np.arange(BODIES) % 3], throw=False)
     assert not (np.asarray(fit.finding) & int(Finding.POOR)).any()

@@ -14,6 +14,7 @@ RACQUET, PISA = DATA / "ubc_racquet_toss", DATA / "pisa_racket" / "data25.txt"
 
 
 @pytest.mark.skipif(not RACQUET.exists(), reason="needs ../shared/data/ubc_racquet_toss")
+@pytest.mark.slow
 def test_tosses_of_a_racquet_together():
     """Published: 0.066 : 0.935 : 1 from a joint fit, 0.32 rad/s rms; by pendulum 0.067(13) : 1."""
     with open(RACQUET / "index.csv", encoding="utf-8") as file:

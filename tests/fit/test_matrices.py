@@ -50,12 +50,15 @@ def recordings(count):
     return stack([Recording.of(times, k + rates, wheel_speed=100 * times) for k in range(count)])
 
 
-def test_the_fits_hand_over_no_batch(affected):
-    given = recordings(6)
+@pytest.mark.parametrize("fit", ["each", pytest.param("together", marks=pytest.mark.slow)])
+def test_the_fits_hand_over_no_batch(affected, fit):
     problem = Problem(FreeMotion(), FullTensor())
-    for fit in (_fit.each, _fit.together):
-        batch, calls = largest_batch(fit.__wrapped__, given, problem)
-        assert (batch, calls > 4) == (1, True)
+    batch, calls = largest_batch(getattr(_fit, fit).__wrapped__, recordings(6), problem)
+    assert (batch, calls > 4) == (1, True)
+
+
+def test_nor_does_the_balance(affected):
+    given = recordings(6)
 
     def balanced(given):
         numbers = jnp.asarray([0, 1, 0, 1, 0, 1])

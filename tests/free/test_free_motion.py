@@ -16,6 +16,9 @@ FAMILIES = sorted({case["family"] for case in CASES})
 BOUNDS = {"float64": (5e-15, 5e-15, 1e-13), "float32": (2e-6, 2e-6, 3e-5)}
 
 
+MOTION = jax.jit(free.free_motion)
+
+
 def _fits_single(case: dict) -> bool:
     numbers = np.array([*case["moments"], *case["omega"], *case["wxyz"], case["t"]])
     size = np.abs(numbers)
@@ -24,10 +27,19 @@ def _fits_single(case: dict) -> bool:
     return bool(np.all(numbers.astype(np.float32) == numbers))
 
 
-@pytest.fixture(scope="module", params=["float64", "float32"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param(("float64", jax.jacfwd), id="float64"),
+        pytest.param(("float32", jax.jacfwd), id="float32"),
+        # in tests/stress of hundreds of bodies, and in tests/systems
+        pytest.param(("float64", jax.jacrev), id="float64-reverse", marks=pytest.mark.slow),
+        pytest.param(("float32", jax.jacrev), id="float32-reverse", marks=pytest.mark.slow),
+    ],
+)
 def solved(request):
-    """States and derivatives (double: forward and reverse) of all cases the dtype can hold."""
-    dtype = request.param
+    """States and derivatives in one mode of all cases the dtype can hold."""
+    dtype, mode = request.param
     table = [c for c in CASES if dtype == "float64" or _fits_single(c)]
 
     def state(moments, products, omega, t, wxyz):
@@ -36,10 +48,8 @@ def solved(request):
 
     def everything(*given):
         parts = (0, 1, 2, 3)
-        modes = (jax.jacfwd, jax.jacrev) if dtype == "float64" else (jax.jacrev,)
-        jacobians = [mode(state, parts)(*given) for mode in modes]
-        flat = [jnp.concatenate([x.reshape(7, -1) for x in j], 1) for j in jacobians]
-        return state(*given), *flat
+        jacobian = [x.reshape(7, -1) for x in mode(state, parts)(*given)]
+        return state(*given), jnp.concatenate(jacobian, 1)
 
     def column(name):
         return jnp.asarray(np.array([c[name] for c in table]), dtype)
@@ -79,23 +89,22 @@ def test_states(solved, family):
 @pytest.mark.parametrize("family", FAMILIES)
 def test_derivatives(solved, family):
     (_, _, bound), rows = solved
-    for case, value, *found in rows:
+    for case, value, jacobian in rows:
         if case["family"] != family:
             continue
         exact = np.array(case["jacobian"]).T
         sign = np.sign(np.dot(value[:4], case["wxyz_t"]))
-        for jacobian in found:
-            scaled = jacobian * np.array(case["unit"])
-            for block, factor in ((slice(0, 4), sign), (slice(4, 7), 1)):
-                largest = np.abs(exact[block]).max()
-                off = np.abs(factor * scaled[block] - exact[block]).max()
-                assert off <= bound * largest, (case["name"], block)
+        scaled = jacobian * np.array(case["unit"])
+        for block, factor in ((slice(0, 4), sign), (slice(4, 7), 1)):
+            largest = np.abs(exact[block]).max()
+            off = np.abs(factor * scaled[block] - exact[block]).max()
+            assert off <= bound * largest, (case["name"], block)
 
 
 def test_initial_state_is_returned_at_time_zero():
     moments, wxyz = jnp.array([1.0, 2.0, 3.0]), jnp.array([0.5, -0.5, 0.5, 0.5])
     omega = jnp.array([0.3, -0.2, 0.9])
-    rates, attitude = free.free_motion(moments, wxyz, omega, jnp.array(0.0))
+    rates, attitude = MOTION(moments, wxyz, omega, jnp.array(0.0))
     np.testing.assert_allclose(np.stack(rates), omega, rtol=3e-16)
     np.testing.assert_allclose(np.stack(attitude), wxyz, atol=3e-16)
 
@@ -107,9 +116,10 @@ def test_initial_attitude_carries_its_derivative():
     def attitude(q):
         return jnp.stack(free.free_motion(moments, q, omega, t, rates=False)[1])
 
-    _, found = jax.jvp(attitude, (wxyz,), (jnp.asarray(change),))
+    slope = jax.jit(lambda q, dq: jax.jvp(attitude, (q,), (dq,)))
+    _, found = slope(wxyz, jnp.asarray(change))
     # The turn from the start is the same for every start: q(t) = q(0) p.
-    turn = np.asarray(attitude(jnp.array([1.0, 0.0, 0.0, 0.0])))
+    turn = np.asarray(slope(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.asarray(change))[0])
     unit = np.asarray(wxyz) / np.linalg.norm(wxyz)
     moved = (change - unit * (unit @ change)) / np.linalg.norm(wxyz)
     a, b, c, d = turn
@@ -133,8 +143,8 @@ def test_many_times_agree_with_single_ones_in_value_and_gradient():
 
     def one_by_one(moments):
         motion = free.prepare(moments, wxyz, omega)
-        columns = [free.evaluate(motion, t) for t in ts]
-        return jnp.stack([jnp.stack([*w, *q]) for w, q in columns], -1)
+        columns = jax.lax.map(lambda t: free.evaluate(motion, t), ts)
+        return jnp.moveaxis(jnp.stack([x for part in columns for x in part]), 1, -1)
 
     for fn in (together, one_by_one):
         assert jax.eval_shape(fn, moments).shape == (7, 7, 4)
@@ -150,7 +160,7 @@ def test_many_times_agree_with_single_ones_in_value_and_gradient():
 def test_long_batches_are_cut_without_a_trace():
     moments, wxyz, omega = _random_bodies(6, 16411)  # a prime: the last chunk is filled up
     t = jnp.linspace(-5.0, 5.0, 16411)
-    found = jax.jit(free.free_motion)(moments, wxyz, omega, t)
+    found = MOTION(moments, wxyz, omega, t)
     whole = jax.jit(lambda *a: free.evaluate(free.prepare(*a), t))(moments, wxyz, omega)
     for part, other in zip(found, whole, strict=True):
         for x, y in zip(part, other, strict=True):
@@ -166,7 +176,7 @@ def test_a_sphere_has_no_axis_that_the_momentum_may_not_be_across():
             jnp.full(omega.shape, 2, dtype),
             jnp.tile(jnp.eye(4, dtype=dtype)[0], (27, 1)),
         )
-        found, turned = free.free_motion(moments, wxyz, omega, t)
+        found, turned = MOTION(moments, wxyz, omega, t)
         np.testing.assert_array_equal(np.stack(found, -1), omega)
         size = np.linalg.norm(rates, axis=-1, keepdims=True)
         axis = rates / np.where(size > 0, size, 1)
@@ -180,7 +190,7 @@ def test_conserved_over_long_times():
     rng = np.random.default_rng(6)
     moments = jnp.asarray(rng.uniform(0.5, 1.0, (200, 3)))
     wxyz, omega = jnp.asarray(rng.normal(size=(200, 4))), jnp.asarray(rng.normal(size=(200, 3)))
-    rates, attitude = free.free_motion(moments, wxyz, omega, jnp.full(200, 1e7))
+    rates, attitude = MOTION(moments, wxyz, omega, jnp.full(200, 1e7))
     now, before = np.stack(rates, -1) * moments, np.asarray(omega * moments)
     np.testing.assert_allclose((now**2).sum(-1), (before**2).sum(-1), rtol=1e-14)
     energy = (now**2 / moments).sum(-1)
@@ -224,7 +234,7 @@ def test_published_states(shared):
         else:
             omega = np.array(case["momentum0_body"], float) / moments
         given = (moments, np.array(case["q0"], float), omega, np.array(t, float))
-        rates, attitude = free.free_motion(*map(jnp.asarray, given))
+        rates, attitude = MOTION(*map(jnp.asarray, given))
         return np.stack(rates), np.stack(attitude), moments
 
     def check(found, omega, wxyz, tolerance=2e-15):
@@ -261,7 +271,7 @@ def test_principal_spins_keep_their_rates_to_the_bit():
         omega = np.zeros(3)
         omega[axis] = size / moments[axis]
         given = moments, np.array([1.0, 0, 0, 0]), omega, np.array(10.0)
-        rates, attitude = free.free_motion(*map(jnp.asarray, given))
+        rates, attitude = MOTION(*map(jnp.asarray, given))
         exact = np.zeros(4)
         exact[0], exact[1 + axis] = np.cos(angle / 2), np.sin(angle / 2)
         np.testing.assert_allclose(np.stack(rates), omega, rtol=2.3e-16)

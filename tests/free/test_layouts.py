@@ -10,8 +10,12 @@ import polhode as ph
 SCENE = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]))
 
 
-@pytest.mark.parametrize(("bodies", "times"), [(1, 1001), (3, 5), (7, 2), (1031, 3)])
-@pytest.mark.parametrize("rates_only", [False, True])
+SHAPES = [(1, 1001), (3, 5), (7, 2), (1031, 3)]  # the slopes of two of them: the others are slow
+CASES = [(*shape, False) for shape in SHAPES] + [(1, 1001, True), (1031, 3, True)]
+CASES += [pytest.param(*shape, True, marks=pytest.mark.slow) for shape in SHAPES[1:3]]
+
+
+@pytest.mark.parametrize(("bodies", "times", "rates_only"), CASES)
 def test_chunks_change_nothing(bodies, times, rates_only):
     rng = np.random.default_rng(bodies)
     wxyz, omega = jnp.array(rng.normal(size=(bodies, 4))), jnp.array(rng.normal(size=(bodies, 3)))

@@ -11,6 +11,12 @@ from polhode import lightcurve
 from polhode.lightcurve import _fit, _hypotheses, _model, _search, _solutions
 
 PHASE = lightcurve.HG1G2()
+STEPPED = jax.jit(_model.stepped)
+
+
+@jax.jit
+def magnitudes(bodies, points):
+    return _model.magnitudes(PHASE, bodies, points)
 
 
 @pytest.fixture(scope="module")
@@ -40,19 +46,23 @@ def test_trial_bodies_have_the_periods_asked(trial):
 def test_model_is_that_of_simulate(seen, trial):
     """Light worked out by the public pieces, one body at a time."""
     curve, _, points = seen
-    values = _model.magnitudes(PHASE, trial, points)
+    values = magnitudes(trial, points)
     x = np.asarray(trial.unknowns[0])
     inertia = ph.Inertia(np.stack(_model.moments_of(jnp.asarray(x))))
     path = ph.simulate(ph.Scene(inertia), ph.State(trial.wxyz[0], x[4:7]), curve.t - curve.t[0])
-    back = ph.rotation.conjugate(path.wxyz)
-    sun, observer = (ph.rotation.rotate(back, jnp.asarray(v)) for v in (curve.sun, curve.observer))
     axes = np.exp([0.0, *x[2:4]])
-    light = lightcurve.seeliger_ellipsoid(tuple(axes), tuple(sun.T), tuple(observer.T))
-    light = light / (np.pi / 2 * np.prod(axes) ** (2 / 3))
-    alpha = jnp.asarray(curve.alpha)
-    expected = -2.5 * jnp.log10(light / lightcurve.seeliger_sphere(alpha))
-    expected = expected + PHASE.magnitudes(alpha, jnp.asarray(x[7:9]))
-    np.testing.assert_allclose(values[0, : curve.t.size], expected, atol=1e-9)
+
+    @jax.jit
+    def expected(wxyz, *vectors):
+        back, alpha = ph.rotation.conjugate(wxyz), jnp.asarray(curve.alpha)
+        sun, observer = (ph.rotation.rotate(back, v) for v in vectors)
+        light = lightcurve.seeliger_ellipsoid(tuple(axes), tuple(sun.T), tuple(observer.T))
+        light = light / (np.pi / 2 * np.prod(axes) ** (2 / 3))
+        reduced = -2.5 * jnp.log10(light / lightcurve.seeliger_sphere(alpha))
+        return reduced + PHASE.magnitudes(alpha, jnp.asarray(x[7:9]))
+
+    want = expected(path.wxyz, curve.sun, curve.observer)
+    np.testing.assert_allclose(values[0, : curve.t.size], want, atol=1e-9)
 
 
 def test_light_has_the_sums_of_its_mode(trial):
@@ -60,7 +70,7 @@ def test_light_has_the_sums_of_its_mode(trial):
     t = np.r_[0, np.sort(np.random.default_rng(4).uniform(0, 60, 127))]
     sun, observer = np.tile([1.0, 0, 0], (128, 1)), np.tile([0.8, 0.6, 0], (128, 1))
     curve = lightcurve.LightCurve.of(t, 0 * t, sun, observer)
-    light = np.asarray(_model.magnitudes(PHASE, trial, curve.points(0.01)))
+    light = np.asarray(magnitudes(trial, curve.points(0.01)))
     left = []
     for sums in (_hypotheses.LAM, _hypotheses.SAM):
         phases = 2 * np.pi * np.outer(t, np.array(list(sums)) @ [1.2, 0.7])
@@ -74,13 +84,13 @@ def test_light_has_the_sums_of_its_mode(trial):
 
 def test_derivatives_by_every_unknown(seen, trial):
     _, _, points = seen
-    value, slopes = _model.magnitudes_and_slopes(PHASE, trial, points)
-    np.testing.assert_allclose(value, _model.magnitudes(PHASE, trial, points), atol=1e-12)
-    look = jax.jit(lambda step: _model.magnitudes(PHASE, _model.stepped(trial, step), points))
+    value, slopes = jax.jit(lambda *x: _model.magnitudes_and_slopes(PHASE, *x))(trial, points)
+    np.testing.assert_allclose(value, magnitudes(trial, points), atol=1e-12)
     size, (count, many, _) = 1e-6, slopes.shape
     for k in range(many):
         e = jnp.zeros((count, many)).at[:, k].set(size)
-        measured = (look(e) - look(-e)) / (2 * size)
+        ends = [magnitudes(STEPPED(trial, x), points) for x in (e, -e)]
+        measured = (ends[0] - ends[1]) / (2 * size)
         scale = jnp.max(jnp.abs(slopes[:, k]))
         np.testing.assert_allclose(slopes[:, k] / scale, measured / scale, atol=1e-6)
 
@@ -88,15 +98,16 @@ def test_derivatives_by_every_unknown(seen, trial):
 def test_steps_keep_the_frequencies_that_they_mean(trial):
     """To first order as plain steps; to second only the frequencies are as the step says."""
 
+    @jax.jit
     def logs(unknowns):
         found = ph.free.periods(_model.moments_of(unknowns), unknowns[..., 4:7])
         return -jnp.log(jnp.stack([found.P_phi, found.P_psi], -1))
 
     unknowns, wxyz = trial
     step = jnp.zeros((len(wxyz), unknowns.shape[1] + 3)).at[:, 0].set(0.03).at[:, 5].set(0.02)
-    meant = jax.jvp(logs, (unknowns,), (step[:, :-3],))[1]
+    meant = jax.jit(lambda x, dx: jax.jvp(logs, (x,), (dx,))[1])(unknowns, step[:, :-3])
     plain = logs(unknowns + step[:, :-3]) - logs(unknowns) - meant
-    moved = _model.stepped(trial, step)
+    moved = STEPPED(trial, step)
     rest = logs(moved.unknowns) - logs(unknowns) - meant
     # near the separatrix a body keeps its plain step
     mended = np.abs(rest).max(1) < 1e-5
@@ -112,9 +123,7 @@ def test_mirror_gives_the_same_light(trial):
     normal = _fit._mirrors(curve)[0]
     points = curve.points(0.01)
     image = _fit._mirrored(jax.tree.map(np.asarray, trial), normal)
-    np.testing.assert_allclose(
-        _model.magnitudes(PHASE, image, points), _model.magnitudes(PHASE, trial, points), atol=1e-9
-    )
+    np.testing.assert_allclose(magnitudes(image, points), magnitudes(trial, points), atol=1e-9)
     turned = 2 * normal * (_solutions.momentum(trial) @ normal)[:, None] - _solutions.momentum(
         trial
     )

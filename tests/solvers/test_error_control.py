@@ -67,7 +67,9 @@ def test_no_body_is_far_beyond_the_error_asked_for(kind):
         assert 0.01 * rtol < usual < 3 * rtol, (rtol, usual / rtol)
 
 
-@pytest.mark.parametrize("kind", MADE)
+@pytest.mark.parametrize(
+    "kind", [k if k == "gravity" else pytest.param(k, marks=pytest.mark.slow) for k in MADE]
+)
 def test_nor_in_single_precision(kind):
     """Up to what rounding takes, beside float64 on the same rounded numbers."""
     for rtol in (1e-3, 1e-4, 1e-5):
@@ -83,8 +85,14 @@ def test_nor_in_single_precision(kind):
         assert np.sum(angle < 10) > 5
 
 
-@pytest.mark.parametrize("count", [3, 30, 600])
-@pytest.mark.parametrize("kind", ["top", "gradient"])
+@pytest.mark.parametrize(
+    ("kind", "count"),
+    [("top", 3), ("top", 600), ("gradient", 30)]
+    + [
+        pytest.param(*case, marks=pytest.mark.slow)
+        for case in (("top", 30), ("gradient", 3), ("gradient", 600))
+    ],
+)
 def test_saved_times_are_as_accurate_however_many_they_are(kind, count):
     """Bodies of a batch go on to their next saved times without waiting for others, in steps of an
     order for the way between these."""

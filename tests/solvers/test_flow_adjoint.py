@@ -136,7 +136,7 @@ def value(inverse):
 
 
 def test_batches_of_slopes_and_second_derivatives():
-    """vmap over gradients, Jacobians both ways, the Hessian, which is symmetric; float32."""
+    """vmap over gradients, Jacobians both ways, the Hessian, which is symmetric."""
     point = 1 / MOMENTS.T
     slopes = jax.jit(jax.vmap(jax.grad(value)))(jnp.stack([point, 1.1 * point]))
     forward = jax.jit(jax.jacfwd(value))
@@ -146,9 +146,14 @@ def test_batches_of_slopes_and_second_derivatives():
     step = jax.random.normal(KEYS[2], (3, 3)) / 3
     change = difference(forward, point, step)
     np.testing.assert_allclose(hessian @ step.ravel(), change.ravel(), rtol=0, atol=1e-9)
+
+
+@pytest.mark.slow  # in simulate: tests/systems
+def test_slopes_in_single_precision():
+    point = 1 / MOMENTS.T
     single = jax.jit(jax.grad(value))(point.astype(jnp.float32))
     assert single.dtype == jnp.float32
-    np.testing.assert_allclose(single, slopes[0], rtol=0, atol=1e-5)
+    np.testing.assert_allclose(single, jax.jit(jax.grad(value))(point), rtol=0, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -207,7 +212,12 @@ def arguments(first, strength):
     return tuple(jnp.broadcast_to(i, 3) for i in inverse), jnp.broadcast_to(strength, 3)
 
 
-@pytest.mark.parametrize("name", SOLVES)
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "name", [n if n in ("controlled", "implicit") else pytest.param(n, marks=SLOW) for n in SOLVES]
+)
 def test_outside_of_simulate_any_solver_has_the_slopes_of_the_flow(name):
     """Of the last state by a moment and the strength of the field, 40 digits; the steps of the
     implicit one are coarse, its derivatives are not."""
@@ -249,7 +259,7 @@ def test_one_step_is_what_the_loop_of_diffrax_makes_of_it(end):
         np.testing.assert_allclose(a, b, rtol=1e-15, atol=1e-15)
 
 
-@pytest.mark.parametrize("name", ["marched", "stock"])
+@pytest.mark.parametrize("name", [pytest.param("marched", marks=SLOW), "stock"])
 def test_slopes_by_saved_times_are_the_field(name):
     """At each of them; a later start alone is an earlier end."""
     args, ts = arguments(jnp.array(bodies.MOMENTS[0]), jnp.array(bodies.STRENGTH)), bodies.TIMES
@@ -342,7 +352,11 @@ def held(p, method):
     return jnp.sum(WEIGHTS[:4] * end.wxyz[0]) + jnp.sum(WEIGHTS[4:] * end.omega_body[0])
 
 
-@pytest.mark.parametrize("solver", [Extrapolation(12), diffrax.Dopri8()], ids=("own", "stock"))
+@pytest.mark.parametrize(
+    "solver",
+    [Extrapolation(12), pytest.param(diffrax.Dopri8(), marks=SLOW)],
+    ids=("own", "stock"),
+)
 def test_the_way_back_starts_anew_where_drag_draws_bodies_together(solver):
     """By itself, in ``simulate``."""
     method = ph.LiePoisson(solver)

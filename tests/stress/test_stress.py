@@ -20,11 +20,18 @@ BOUND = {"attitude": 7.0, "rates": 11.0, "forward": 25.0, "reverse": 15.0}
 ROOM = {"tensors": 3.0, "dwelling": 3.0}
 
 
-@pytest.fixture(scope="module", params=[np.float64, np.float32], ids=["float64", "float32"])
+@pytest.fixture(
+    scope="module",
+    params=[
+        pytest.param((np.float64, ("reverse",)), id="float64"),
+        pytest.param((np.float32, ()), id="float32"),
+        pytest.param((np.float32, ("forward",)), id="float32-forward", marks=pytest.mark.slow),
+    ],
+)
 def scores(request):
-    # One program per dtype: values with reverse derivatives in double precision, forward in single.
-    double = request.param == np.float64
-    return double, stress.measure(request.param, PAIRS, forward=not double, reverse=double)
+    """Modes and scores. One program each: values with one mode of derivatives at most."""
+    dtype, modes = request.param
+    return modes, stress.measure(dtype, PAIRS, "forward" in modes, "reverse" in modes)
 
 
 def _spread(name: str) -> float:
@@ -35,11 +42,11 @@ def _spread(name: str) -> float:
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_family(scores, family):
-    double, table = scores
+    modes, table = scores
     table = [score for score in table if score["family"] == family]
     assert len(table) >= 3
     for score in table:
-        for name in ("attitude", "rates", "reverse" if double else "forward"):
+        for name in ("attitude", "rates", *modes):
             bound = ROOM.get(family, 1) * BOUND[name]
             if family == "ratios" and name in ("forward", "reverse"):
                 # A fast needle: derivatives lose the ratio of its moments.

@@ -38,6 +38,8 @@ def moved(numbers, t):
 VALUE = jax.jit(moved)
 SLOPE = jax.jit(lambda x, d, t: jax.jvp(lambda y: moved(y, t), (x,), (d,))[1])
 SENSITIVITY = jax.jit(lambda x, d, t: jax.vjp(lambda y: moved(y, t), x)[1](d)[0])
+# Not jnp.full, whose weak type would be another program.
+TIMES = np.full(len(NAMES), top_cases.TIME)
 
 
 @pytest.fixture(scope="module")
@@ -58,11 +60,10 @@ def test_every_regime_is_exact(exact, dtype, bound):
 
 def test_every_gradient_is_exact(exact):
     x = jnp.asarray(NUMBERS)
-    t = jnp.full(len(NAMES), top_cases.TIME)
-    rows = np.stack([SENSITIVITY(x, jnp.zeros((7, len(NAMES))).at[k].set(1.0), t)
+    rows = np.stack([SENSITIVITY(x, jnp.zeros((7, len(NAMES))).at[k].set(1.0), TIMES)
                      for k in range(7)])  # (7, 10, cases), in reverse mode  # fmt: skip
     direction = np.random.default_rng(4).normal(size=10)
-    forward = np.array(SLOPE(x, jnp.asarray(direction[:, None] * np.ones_like(NUMBERS)), t))
+    forward = np.array(SLOPE(x, jnp.asarray(direction[:, None] * np.ones_like(NUMBERS)), TIMES))
     for j, (name, entry) in enumerate(zip(NAMES, exact)):
         # three equal roots: the value is exact, the gradient is not
         bound = 1e-2 if name == "marginal_sleeping" else 1e-11
@@ -82,7 +83,7 @@ def test_within_a_hair_of_the_marginal_sleeping_top(exact):
     for j, (k, h) in enumerate(itertools.product((2, 3, 5, 7), (1e-15, 1e-12, -1e-9, 1e-7, -1e-5))):
         near[k, j] += h
         hairs[j] = abs(h)
-    got = np.array(VALUE(tuple(near), jnp.full(len(NAMES), top_cases.TIME)))
+    got = np.array(VALUE(tuple(near), TIMES))
     error = np.abs(got - np.array(want["state"])[:, None]).max(axis=0)
     assert np.all(error < 20 * hairs + 1e-14), error
 
@@ -145,8 +146,8 @@ def test_gni_lagrange_top():
     momentum, q = np.array([0.2, 1.0, 0.4]), np.array([0.4, 0.2, 0.4, 0.8])
     moments = np.array([0.5, 0.5, 1.0])
     numbers = (0.5, 1.0, 1.0, *(momentum / moments), *q)
-    lanes = tuple(jnp.full(len(NAMES), x) for x in numbers)
-    got = np.array(VALUE(lanes, jnp.full(len(NAMES), 30.0)))[:, 0]
+    lanes = tuple(np.full(len(NAMES), x) for x in numbers)
+    got = np.array(VALUE(lanes, np.full(len(NAMES), 30.0)))[:, 0]
     want = [0.9599571778198639, -0.36416972569944916, 0.4]
     assert np.abs(got[:3] * moments - want).max() < 1e-13
     wxyz = np.array([

@@ -177,7 +177,11 @@ def truth():
 
 
 @pytest.mark.parametrize(
-    ("method", "bound"), [(None, 1e-9), (ph.EulerAngles(), 1e-7)], ids=["planned", "euler_angles"]
+    ("method", "bound"),
+    [
+        pytest.param(None, 1e-9, id="planned"),
+        pytest.param(ph.EulerAngles(), 1e-7, id="euler_angles", marks=pytest.mark.slow),
+    ],
 )
 def test_the_motion(method, bound):
     rtol = 1e-11 if method is None else 1e-9

@@ -130,6 +130,7 @@ def test_scenes_are_trees_of_arrays():
     assert not any(x.shape for x in jax.tree.leaves(ph.BodyTorque(Unhashable())))
 
 
+@pytest.mark.slow  # a closure is differentiated in tests/test_stepping.py, leaves everywhere
 def test_a_scene_goes_through_jit_and_grad_and_closures_are_differentiated():
     """The derivative by a closed-over number is that by the same number as a leaf."""
     method = ph.LiePoisson(max_steps=64)

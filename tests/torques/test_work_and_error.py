@@ -23,7 +23,13 @@ METHODS = {
 }
 
 
-@pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
+@pytest.mark.parametrize(
+    "method",
+    [  # the planner's, which extrapolates, in test_every_torque
+        pytest.param(method, id=name, marks=pytest.mark.slow if name == "Extrapolation" else ())
+        for name, method in METHODS.items()
+    ],
+)
 def test_energy_changes_by_the_work(method):
     scene = ph.Scene(INERTIA, GRAVITY, DRAG + DRIVE)
     traj = ph.simulate(scene, STATE, TS, method, rtol=1e-11, record=ph.Record(work=True))
