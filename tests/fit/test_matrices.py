@@ -18,7 +18,7 @@ from polhode.fit import (
     _fit_balance,
     stack,
 )
-from polhode.fit._solve import Problem
+from polhode.fit._solve import FitOptions
 
 BATCH = np.random.default_rng(3).normal(size=(2, 5, 4, 4))
 SPD = BATCH @ np.swapaxes(BATCH, -1, -2) + np.eye(4)
@@ -52,9 +52,9 @@ def recordings(count):
 
 def test_the_fits_hand_over_no_batch(affected):
     given = recordings(6)
-    problem = Problem(FreeMotion(), FullTensor())
+    options = FitOptions(FreeMotion(), FullTensor())
     for fit in (_fit.each, _fit.together):
-        batch, calls = largest_batch(fit.__wrapped__, given, problem)
+        batch, calls = largest_batch(fit.__wrapped__, given, options)
         assert (batch, calls > 4) == (1, True)
 
     def balanced(given):
