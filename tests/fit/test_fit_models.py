@@ -35,7 +35,7 @@ from polhode.fit import (
 )
 from polhode.fit._parameters import base_of, free_columns
 from polhode.fit._result import _axes_disagree
-from polhode.fit._solve import Problem
+from polhode.fit._solve import FitOptions
 from polhode.rotation import to_matrix
 
 TENSOR = np.array([[2.0, 0.1, 0.2], [0.1, 2.5, -0.3], [0.2, -0.3, 3.2]])
@@ -195,8 +195,8 @@ def test_bias_mounting_lever_and_outliers():
 def test_an_inverted_axis_contradicts_the_attitudes(mounting, flip, wrong):
     data, _ = sensed(TIMES, flip=flip)
     recording = stack([Recording.of(data["times"], data["omega_body"], wxyz=data["wxyz"])])
-    problem = Problem(FreeMotion(), FullTensor(), mounting=mounting)
-    assert bool(_axes_disagree(recording, problem)) == wrong
+    options = FitOptions(FreeMotion(), FullTensor(), mounting=mounting)
+    assert bool(_axes_disagree(recording, options)) == wrong
     assert (np.linalg.det(np.asarray(sensor_axes(recording))[0]) < 0) == wrong
 
 

@@ -18,7 +18,7 @@ from polhode.fit import (
     _fit_balance,
     stack,
 )
-from polhode.fit._solve import Problem
+from polhode.fit._solve import FitOptions
 
 BATCH = np.random.default_rng(3).normal(size=(2, 5, 4, 4))
 SPD = BATCH @ np.swapaxes(BATCH, -1, -2) + np.eye(4)
@@ -52,8 +52,8 @@ def recordings(count):
 
 @pytest.mark.parametrize("fit", ["each", pytest.param("together", marks=pytest.mark.slow)])
 def test_the_fits_hand_over_no_batch(affected, fit):
-    problem = Problem(FreeMotion(), FullTensor())
-    batch, calls = largest_batch(getattr(_fit, fit).__wrapped__, recordings(6), problem)
+    options = FitOptions(FreeMotion(), FullTensor())
+    batch, calls = largest_batch(getattr(_fit, fit).__wrapped__, recordings(6), options)
     assert (batch, calls > 4) == (1, True)
 
 

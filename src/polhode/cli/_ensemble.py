@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
+from polhode.cli import _show
 from polhode.cli._options import byte_count, device_count, positive, whole_number
 from polhode.cli._signals import heed
 from polhode.cli._targets import UsageError
@@ -14,50 +15,49 @@ from polhode.cli._targets import UsageError
 _PANEL = "for a scene with an [ensemble]: "
 
 
-def _option(name: str, parser: Any, metavar: str, words: str) -> Any:
+def _option(name: str, words: str, parser: Any = None, metavar: str | None = None) -> Any:
     return typer.Option(name, parser=parser, metavar=metavar, help=_PANEL + words)
 
 
 MemoryOption = Annotated[
-    int | None, _option("--memory", byte_count, "SIZE", "memory to stay within, such as 2GB")
+    int | None, _option("--memory", "memory to stay within, such as 2GB", byte_count, "SIZE")
 ]
 ChunkOption = Annotated[
     int | None,
-    _option("--chunk", whole_number(1), "N", "bodies per chunk, instead of the library's choice"),
+    _option("--chunk", "bodies per chunk, instead of the library's choice", whole_number(1), "N"),
 ]
 DevicesOption = Annotated[
-    str | None, _option("--devices", device_count, "N|all", "devices to use (default: 1)")
+    str | None, _option("--devices", "devices to use (default: 1)", device_count, "N|all")
 ]
 ProcessOption = Annotated[
-    int | None, _option("--process", whole_number(0), "I", "number of this process, from 0")
+    int | None, _option("--process", "number of this process, from 0", whole_number(0), "I")
 ]
 ProcessesOption = Annotated[
     int | None,
-    _option("--processes", whole_number(1), "N", "number of processes that share the store"),
+    _option("--processes", "number of processes that share the store", whole_number(1), "N"),
 ]
 CoordinatorOption = Annotated[
     str | None,
-    typer.Option(
-        "--coordinator", metavar="HOST:PORT",
-        help=_PANEL + "where process 0 waits for the others (jax.distributed); needs --processes"
-        " and --process",
+    _option(
+        "--coordinator",
+        "where process 0 waits for the others (jax.distributed); needs --processes and --process",
+        metavar="HOST:PORT",
     ),
-]  # fmt: skip
+]
 ClusterOption = Annotated[
     bool,
-    typer.Option(
+    _option(
         "--cluster",
-        help=_PANEL + "let JAX find coordinator and numbers: SLURM, Open MPI, Kubernetes, or"
+        "let JAX find coordinator and numbers: SLURM, Open MPI, Kubernetes, or"
         " JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES, JAX_PROCESS_ID",
     ),
 ]
 PatienceOption = Annotated[
     float | None,
-    _option("--patience", positive, "S", "seconds to wait for the others (default: 300)"),
+    _option("--patience", "seconds to wait for the others (default: 300)", positive, "S"),
 ]
 NoVerifyOption = Annotated[
-    bool,
-    typer.Option("--no-verify", help=_PANEL + "take finished chunks for good without reading them"),
+    bool, _option("--no-verify", "take finished chunks for good without reading them")
 ]
 
 
@@ -78,10 +78,7 @@ def run(
     no_cache: bool,
 ) -> int:  # fmt: skip
     """Stream the ensemble into its store; 0, or 1 when some bodies did not finish."""
-    from rich.console import Console
-
-    messages = Console(stderr=True)
-    messages.quiet = quiet or not messages.is_terminal
+    messages = _show.messages(quiet)
     path = _store_path(file, output)
     with messages.status("starting ..."):
         import jax
@@ -188,13 +185,10 @@ class _Meter:
     """Progress with rate and remaining time, for people who watch; remembers the last report."""
 
     def __init__(self, messages):
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+        from rich.progress import TextColumn
 
         self.last: Any = None
-        self.bar = Progress(
-            TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TextColumn("bodies"),
-            TextColumn("{task.fields[rest]}"), console=messages, transient=True,
-        )  # fmt: skip
+        self.bar = _show.bar(messages, TextColumn("{task.fields[rest]}"))
         self.task = self.bar.add_task("", total=None, rest="compiling ...")
 
     def __enter__(self):

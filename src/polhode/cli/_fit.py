@@ -1,13 +1,15 @@
 """`polhode fit RECORDING`: inertia from a CSV of times and rates, with a table and a figure."""
 
-import dataclasses
+import functools
 import math
 import sys
+import types
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from polhode.cli import _show
 from polhode.cli._options import (
     DebugOption,
     ForceOption,
@@ -21,6 +23,7 @@ from polhode.cli._signals import heed
 from polhode.cli._targets import UsageError, target
 
 _ROLES = ("t", "wx", "wy", "wz", "wheel")
+_Asked = types.SimpleNamespace  # the options of `fit` as they were given
 
 
 def fit(
@@ -100,13 +103,13 @@ def fit(
     numbers (JSON) and a figure (PNG) and prints a summary. Exit code 1 when the fit must not be
     used, or when the recording does not show all ratios of the moments.
     """
+    path, named = _columns(recording, columns)
     asked = _Asked(
-        *_columns(recording, columns), degrees=degrees, milliseconds=milliseconds, noise=noise,
+        path=path, columns=named, degrees=degrees, milliseconds=milliseconds, noise=noise,
         moments_only=moments_only, bias=bias, drag=drag, robust=robust,
-        wheel_inertia=wheel_inertia, wheel_axis=wheel_axis,
-        block=block,
+        wheel_inertia=wheel_inertia, wheel_axis=wheel_axis, block=block,
     )  # fmt: skip
-    if wheel_inertia and "wheel" not in asked.columns:
+    if wheel_inertia and "wheel" not in named:
         raise UsageError("--wheel-inertia needs the wheel's speed: add wheel=COLUMN to --columns.")
     if wheel_inertia:
         _only_a_wheel(asked)
@@ -124,33 +127,12 @@ def fit(
     return _fit(asked, goals, quiet=quiet, no_cache=no_cache, allowed=allow_undetermined)
 
 
-@dataclasses.dataclass(frozen=True)
-class _Asked:
-    """What the options say."""
-
-    path: Path
-    columns: dict[str, str]
-    degrees: bool
-    milliseconds: bool
-    noise: float | None
-    moments_only: bool
-    bias: bool
-    drag: bool
-    robust: float | None
-    wheel_inertia: float | None
-    wheel_axis: tuple[float, float, float]
-    block: int
-
-
 def _only_a_wheel(asked: _Asked) -> None:
     """Refuse what the likelihood of the readings does not use, and name the way to it."""
     cures = {
         "--drag": (asked.drag, "a drag is fitted anyway; leave it out"),
         "--noise": (asked.noise, "the noise is found from the readings; leave it out"),
-        "--bias": (
-            asked.bias,
-            "fit_balance(..., tolerance=Tolerance()) in Python fits it",
-        ),
+        "--bias": (asked.bias, "fit_balance(..., tolerance=Tolerance()) in Python fits it"),
         "--moments-only": (asked.moments_only, "the whole tensor is found; leave it out"),
         "--robust": (asked.robust, "leave the outliers blank in the file"),
     }
@@ -185,15 +167,12 @@ def _goal(asked: _Asked, output: str | None, suffix: str, force: bool) -> Path:
 def _fit(asked: _Asked, goals: list[Path], *, quiet: bool, no_cache: bool, allowed: bool) -> int:
     from rich.console import Console
 
-    messages = Console(stderr=True)
-    messages.quiet = quiet or not messages.is_terminal
-    with messages.status("reading ...") as status:
+    with _show.messages(quiet).status("reading ...") as status:
         import jax
 
         jax.config.update("jax_enable_x64", True)
-        from polhode import fit as room
+        from polhode import fit as room, plot
         from polhode.cli import _cache
-        from polhode.io import visible
 
         loaded = _read(asked, room)
         recording = loaded.recording
@@ -203,9 +182,10 @@ def _fit(asked: _Asked, goals: list[Path], *, quiet: bool, no_cache: bool, allow
             heed()
             status.update("writing ...")
             written = [_write(goals[0], asked, loaded, result)]
-            if len(goals) > 1 and recording.omega is not None:
+            for picture in goals[1:]:
                 heed()
-                written.append(_draw(goals[1], asked, recording, result))
+                figure = functools.partial(plot.fit, result, recording, title=asked.path.name)
+                written.append(_show.write_figure(picture, figure))
     undetermined = _undetermined(result)
     if not quiet:
         here = sys.stdout.isatty()
@@ -213,8 +193,7 @@ def _fit(asked: _Asked, goals: list[Path], *, quiet: bool, no_cache: bool, allow
         out.print(_table(asked, recording, result))
         for text in (_said(loaded), *room.remarks(result)):
             out.print(f"- {text}", highlight=False, markup=False)
-        out.print("written: " + ", ".join(visible(str(path)) for path in written),
-                  highlight=False, markup=False)  # fmt: skip
+        _show.tell_written(out, written)
     if room.is_unusable(result):
         print(f"polhode: the fit must not be used: {', '.join(result.findings())}",
               file=sys.stderr)  # fmt: skip
@@ -308,7 +287,7 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
     recording = loaded.recording
     low, high = result.interval(0.95)
     found = _bias(result)
-    options = {name: value for name, value in dataclasses.asdict(asked).items()
+    options = {name: value for name, value in vars(asked).items()
                if name not in ("path", "columns")}  # fmt: skip
     document = {
         "recording": str(asked.path),
@@ -342,26 +321,6 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
     text = json.dumps(document, indent=1, allow_nan=False)
     with whole_file(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
-    return path
-
-
-def _draw(path: Path, asked: _Asked, recording: Any, result: Any) -> Path:
-    import io
-
-    import matplotlib as mpl
-
-    mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    from polhode import __version__, plot
-    from polhode.io import whole_file
-
-    figure = plot.fit(result, recording, title=asked.path.name)
-    drawn = io.BytesIO()
-    figure.savefig(drawn, format="png", dpi=160, metadata={"Software": f"polhode {__version__}"})
-    plt.close(figure)
-    with whole_file(path) as temporary:
-        temporary.write_bytes(drawn.getvalue())
     return path
 
 

@@ -11,7 +11,6 @@ import numpy as np
 
 import polhode
 from polhode import rotation
-from polhode.inertia import Inertia
 from polhode.io import (
     SceneFile,
     blamed,
@@ -172,17 +171,15 @@ def _index(job: Job, ts: np.ndarray) -> np.ndarray:
 def _simulate(job: Job, part: slice | None) -> polhode.Trajectory:
     scene, state = job.scene, job.state
     if part is not None:
-        scene = dataclasses.replace(scene, inertia=_cut(scene.inertia, part))
+        if scene.inertia.batch_shape:
+            inertia = jax.tree.map(lambda x: x[part], scene.inertia)
+            scene = dataclasses.replace(scene, inertia=inertia)
         state = jax.tree.map(lambda x: x[part] if x.ndim > 1 else x, state)
     with blamed(job.file, ""):
         trajectory = polhode.simulate(
             scene, state, job.all_ts, job.method, rtol=job.rtol, throw=False
         )
     return jax.block_until_ready(trajectory)
-
-
-def _cut(inertia: Inertia, part: slice) -> Inertia:
-    return jax.tree.map(lambda x: x[part], inertia) if inertia.batch_shape else inertia
 
 
 def _require_nominal(status: np.ndarray) -> None:

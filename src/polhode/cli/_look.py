@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-_Debug = Annotated[bool, typer.Option("--debug", help="show the traceback of an error")]
+from polhode.cli._options import DebugOption
 
 
 def view(
@@ -13,10 +13,9 @@ def view(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="the page; FILE.html if left out")
     ] = None,
-    debug: _Debug = False,
+    debug: DebugOption = False,
 ) -> int:
     """Write one HTML page that shows the motion of a file: it needs no network."""
-    del debug
     from polhode import plot
 
     target = path.with_suffix(".html") if output is None else output
@@ -36,10 +35,9 @@ def lightcurve(
     trials: Annotated[int, typer.Option(help="motions tried before the best are fitted")] = 40_000,
     floor: Annotated[float, typer.Option(help="least error of a point [mag]")] = 0.03,
     seed: Annotated[int, typer.Option(help="of the trials")] = 0,
-    debug: _Debug = False,
+    debug: DebugOption = False,
 ) -> int:
     """Spin and inertia of a tumbling body from its brightness."""
-    del debug
     import jax
 
     jax.config.update("jax_enable_x64", True)

@@ -50,6 +50,12 @@ def device_count(text: str) -> str:
     return text if text == "all" else str(whole_number(1)(text))
 
 
+def _precision(text: str) -> str:
+    if text not in ("float64", "float32"):
+        raise typer.BadParameter(f"{text[:80]!r} is not float64 or float32")
+    return text
+
+
 SceneName = Annotated[
     str, typer.Argument(metavar="SCENE", help="scene file (TOML), - for standard input",
                         show_default=False)
@@ -69,8 +75,8 @@ SeedOption = Annotated[
     ),
 ]  # fmt: skip
 PrecisionOption = Annotated[
-    str, typer.Option("--precision", parser=lambda text: _precision(text),
-                      metavar="float64|float32", help="numbers to compute with")
+    str, typer.Option("--precision", parser=_precision, metavar="float64|float32",
+                      help="numbers to compute with")
 ]  # fmt: skip
 ForceOption = Annotated[
     bool, typer.Option("--force", help="replace a file that polhode did not write")
@@ -82,12 +88,6 @@ NoCacheOption = Annotated[
 ]
 QuietOption = Annotated[bool, typer.Option("-q", "--quiet", help="print errors only")]
 DebugOption = Annotated[bool, typer.Option("--debug", help="show the full traceback of an error")]
-
-
-def _precision(text: str) -> str:
-    if text not in ("float64", "float32"):
-        raise typer.BadParameter(f"{text[:80]!r} is not float64 or float32")
-    return text
 
 
 def read(scene: str, clones: int | None, seed: int | None):

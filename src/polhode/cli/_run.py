@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from polhode.cli import _ensemble
+from polhode.cli import _ensemble, _show
 from polhode.cli._options import (
     ClonesOption,
     DebugOption,
@@ -84,12 +84,10 @@ def _simulate(
 ) -> int:
     from rich.console import Console
 
-    messages = Console(stderr=True)
-    # progress is for people who watch: nothing of it goes into a log file
-    messages.quiet = quiet or not messages.is_terminal
+    messages = _show.messages(quiet)
     with messages.status("starting ..."):
         from polhode.cli import _cache, _job, _summary
-        from polhode.io import visible, write_netcdf
+        from polhode.io import write_netcdf
 
     with _cache.kept_programs(not no_cache):
         with messages.status("starting ..."):
@@ -106,21 +104,16 @@ def _simulate(
     if not quiet:
         out = Console(soft_wrap=not sys.stdout.isatty())
         out.print(_summary.table(job, outcome, figures))
-        out.print("written: " + ", ".join(visible(str(path)) for path in written),
-                  highlight=False, markup=False)  # fmt: skip
+        _show.tell_written(out, written)
     return _failures(outcome.trajectory.status)
 
 
 def _with_progress(messages, job):
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import TimeElapsedColumn
 
     from polhode.cli import _job
 
-    columns = (
-        TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TextColumn("bodies"),
-        TimeElapsedColumn(),
-    )  # fmt: skip
-    with Progress(*columns, console=messages, transient=True) as progress:
+    with _show.bar(messages, TimeElapsedColumn()) as progress:
         task = progress.add_task("", total=job.bodies)
 
         def advance(done: int) -> None:
@@ -176,6 +169,7 @@ def provenance(file, precision: str) -> dict[str, Any]:
     import numpy as np
 
     from polhode import __version__
+    from polhode.ensemble._stream import device_names
     from polhode.io import visible
 
     carlo = file.monte_carlo
@@ -193,7 +187,7 @@ def provenance(file, precision: str) -> dict[str, Any]:
         "polhode_version": __version__,
         "jax_version": jax.__version__,
         "jaxlib_version": jaxlib.__version__,
-        "devices": device_layout(jax.local_devices()[:1]),
+        "devices": device_names(jax.local_devices()[:1]),
     }
     if carlo is not None:
         found["seed"] = np.int64(carlo.seed)
@@ -202,22 +196,10 @@ def provenance(file, precision: str) -> dict[str, Any]:
     return found
 
 
-def device_layout(devices) -> str:
-    """Number and kind of the devices that computed."""
-    return f"{len(devices)} x {devices[0].platform} ({devices[0].device_kind})"
-
-
 def _draw(job, outcome, path: Path) -> Path:
-    """Write the overview figure, without a display."""
-    import io
-
-    import matplotlib
-
-    matplotlib.use("agg")
-    from matplotlib import pyplot
-
-    from polhode import __version__, plot
-    from polhode.io import build_attitudes, whole_file
+    """Write the overview figure."""
+    from polhode import plot
+    from polhode.io import build_attitudes
 
     file, seen = job.file, job.file.observations
     observed = None
@@ -225,18 +207,10 @@ def _draw(job, outcome, path: Path) -> Path:
         observed = plot.samples(
             seen.seconds, seen.omega_body, build_attitudes(seen.attitudes, "float64")
         )
-    figure = plot.overview(
-        outcome.trajectory,
-        observed=observed,
-        axis_names=file.axis_names,
-        title=file.title,
+    names = {"axis_names": file.axis_names, "title": file.title}
+    return _show.write_figure(
+        path, lambda: plot.overview(outcome.trajectory, observed=observed, **names)
     )
-    drawn = io.BytesIO()
-    figure.savefig(drawn, dpi=160, metadata={"Software": f"polhode {__version__}"})
-    pyplot.close(figure)
-    with whole_file(path) as temporary:
-        temporary.write_bytes(drawn.getvalue())
-    return path
 
 
 def _failures(status) -> int:

@@ -1,6 +1,6 @@
 """The table that `polhode run` prints."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,9 +35,10 @@ def measure(job: Job, outcome: Outcome) -> Figures:
     periods, modes = {}, []
     if scene.torque is None and scene.rotors is None:
         energies = np.asarray(trajectory.energy, np.float64)
-        energies = energies.reshape(-1, energies.shape[-1])
-        scale = np.abs(_kinetic(trajectory)).reshape(energies.shape).max(axis=-1, keepdims=True)
-        energy = _largest((energies - energies[:, :1]) / np.where(scale > 0, scale, 1))
+        rates, own = trajectory.omega_body, trajectory.momentum_body
+        kinetic = np.sum(np.asarray(rates, float) * np.asarray(own, float), axis=-1) / 2
+        scale = np.abs(kinetic).max(axis=-1, keepdims=True)
+        energy = _largest((energies - energies[..., :1]) / np.where(scale > 0, scale, 1))
     if scene.is_free:
         vector = np.asarray(trajectory.momentum_space, np.float64)
         size = np.linalg.norm(vector[..., :1, :], axis=-1)
@@ -45,21 +46,12 @@ def measure(job: Job, outcome: Outcome) -> Figures:
         momentum = _largest(change / np.where(size > 0, size, 1))
         found = polhode.periods(scene.inertia, job.state)
         periods = {name: np.atleast_1d(np.asarray(getattr(found, name))) for name in MEANINGS}
-        modes = _mode_names(found.mode)
+        modes = [Mode(int(code)).name for code in np.atleast_1d(np.asarray(found.mode))]
     return Figures(periods, modes, energy, momentum)
-
-
-def _kinetic(trajectory) -> np.ndarray:
-    omega, momentum = trajectory.omega_body, trajectory.momentum_body
-    return np.einsum("...i,...i->...", np.asarray(omega, float), np.asarray(momentum, float)) / 2
 
 
 def _largest(relative: np.ndarray) -> float:
     return float(np.nanmax(np.abs(relative))) if np.isfinite(relative).any() else float("nan")
-
-
-def _mode_names(mode: Any) -> list[str]:
-    return [Mode(int(code)).name for code in np.atleast_1d(np.asarray(mode))]
 
 
 def table(job: Job, outcome: Outcome, figures: Figures):
@@ -73,7 +65,7 @@ def table(job: Job, outcome: Outcome, figures: Figures):
     grid = Table(
         title=Text(visible(file.title), style="bold"),
         title_justify="left",
-        caption=_caption(job, outcome, clones),
+        caption=_caption(job),
         caption_justify="left",
         show_edge=False,
         pad_edge=False,
@@ -152,7 +144,7 @@ def _misfits(residuals: Residuals | None, scale: Scale):
         yield f"median misfit, {rates.size} rates [{scale.rate}]", f"{np.median(rates):.3g}"
 
 
-def _caption(job: Job, outcome: Outcome, clones: int):
+def _caption(job: Job):
     from rich.text import Text
 
     file = job.file

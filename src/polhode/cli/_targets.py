@@ -18,9 +18,7 @@ def forget() -> None:
     _chosen.clear()
 
 
-def target(
-    path: Path | str, suffix: str, *, force: bool, confined: bool = False, keep_folder: bool = False
-) -> Path:
+def target(path: Path | str, suffix: str, *, force: bool, confined: bool = False) -> Path:
     """The file to write, its folder made; OSError before the work rather than after it.
 
     An existing file that polhode did not write, and a link, are replaced only by `force`.

@@ -2,6 +2,7 @@
 
 import collections
 import concurrent.futures
+import itertools
 import time
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
@@ -105,13 +106,12 @@ def _chunk(store: Store, block: Block, number: int, writer, ahead: int) -> None:
     """Compute a chunk and have it written and marked; one file is written while the next ones are
     computed.
     """
+    # the trajectories go file by file as they come; what has one file in a chunk is gathered
     rows = {name: store.rows(name, number) for name in store.arrays}
-    # what has one file in a chunk is gathered; the trajectories go as they come
-    split = [n for n in store.arrays if n in ("wxyz", "omega_body")]
     gathered = {
         name: np.zeros((r.stop - r.start, *store.arrays[name].shape[1:]), store.arrays[name].dtype)
         for name, r in rows.items()
-        if name not in split
+        if name not in store.split
     }
     first = number * store.chunk
     last = min(first + store.chunk, block.ensemble.bodies)
@@ -131,21 +131,20 @@ def _chunk(store: Store, block: Block, number: int, writer, ahead: int) -> None:
         waiting.append(writer.submit(write, name, rows, values))
 
     files = store.pieces(number)
-    cut = _Cutter(split)
-    wanted = next(files)
+    blocks: list[dict] = []  # of the files at hand, which hold whole blocks
     for offset, found in _blocks(block, first, last, ahead):
         _gather(gathered, offset, found, block.size)
-        cut.add(found)
-        while wanted is not None and wanted[0] in split:
-            ready = cut.take(wanted[0], wanted[1].stop - wanted[1].start)
-            if ready is None:
-                break
-            send(*wanted, ready)
-            wanted = next(files, None)
-    while wanted is not None:
-        name, at = wanted
+        blocks.append({name: np.asarray(found[name]) for name in store.split})
+        done = min(offset + block.size, last - first)
+        if done % store.piece and done < last - first:
+            continue
+        for name, at in itertools.islice(files, len(store.split)):
+            parts = [one[name] for one in blocks]
+            values = parts[0] if len(parts) == 1 else np.concatenate(parts)
+            send(name, at, values[: at.stop - at.start])
+        blocks.clear()
+    for name, at in files:
         send(name, at, gathered[name][at.start - rows[name].start : at.stop - rows[name].start])
-        wanted = next(files, None)
     wait(0)
     store.finish(number, checksum)
 
@@ -158,31 +157,6 @@ def _blocks(block: Block, first: int, last: int, ahead: int):
         if len(flying) >= ahead:
             yield flying.popleft()
     yield from flying
-
-
-class _Cutter:
-    """Rows of some arrays in the order they come, cut into lengths."""
-
-    def __init__(self, names: list[str]):
-        self.parts: dict[str, collections.deque] = {name: collections.deque() for name in names}
-
-    def add(self, found: dict) -> None:
-        for name, parts in self.parts.items():
-            parts.append(np.asarray(found[name]))
-
-    def take(self, name: str, count: int) -> np.ndarray | None:
-        """The next ``count`` rows, without a copy where they lie together; None: not all there."""
-        parts = self.parts[name]
-        if sum(map(len, parts)) < count:
-            return None
-        taken = []
-        while count:
-            part = parts.popleft()
-            taken.append(part[:count])
-            if len(part) > count:
-                parts.appendleft(part[count:])
-            count -= len(taken[-1])
-        return taken[0] if len(taken) == 1 else np.concatenate(taken)
 
 
 def _gather(parts: dict, offset: int, found: dict, size: int) -> None:

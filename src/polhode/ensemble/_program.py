@@ -54,8 +54,7 @@ class Block:
         self.size = block_size(ts.shape[0])
         if method is None:
             # by structure alone: the values differ from body to body
-            method = eqx.filter_eval_shape(lambda s, x: _Chosen(choose(s, x, record)[0]), scene,
-                                           state).method  # fmt: skip
+            method = eqx.filter_eval_shape(lambda s, x: choose(s, x, record)[0], scene, state)
         self.method = method
         self.rtol = check_rtol(rtol, ts.dtype)
         self.settings = Settings(self.size, trajectories, statistics)
@@ -113,7 +112,3 @@ def program(first: Array, each: Any, shared: Any, settings: Settings) -> dict[st
         found = summarise(statistic, trajectory, real)
         kept |= {f"{statistic.name}_{name}": x[None] for name, x in found.items()}
     return kept
-
-
-class _Chosen(eqx.Module):
-    method: AbstractMethod

@@ -31,12 +31,9 @@ class Deviate(eqx.Module):
     uniform: bool = eqx.field(static=True, default=False)
 
     def __call__(self, key: Array) -> Array:
-        draw = _uniform if self.uniform else jax.random.normal
-        return self.scale * draw(key, (3,), self.scale.dtype)
-
-
-def _uniform(key: Array, shape: tuple[int, ...], dtype: Any) -> Array:
-    return jax.random.uniform(key, shape, dtype, -1, 1)
+        if self.uniform:
+            return self.scale * jax.random.uniform(key, (3,), self.scale.dtype, -1, 1)
+        return self.scale * jax.random.normal(key, (3,), self.scale.dtype)
 
 
 class SpreadMoments(eqx.Module):
@@ -97,9 +94,8 @@ class SpreadEuler(eqx.Module):
 
     def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
         a = self.angles + self.deviate(key)
-        return scene, State(
-            rotation.euler_to_wxyz(a[0], a[1], a[2], self.sequence), state.omega_body
-        )
+        wxyz = rotation.euler_to_wxyz(a[0], a[1], a[2], self.sequence)
+        return scene, State(wxyz, state.omega_body)
 
 
 class SpreadRates(eqx.Module):

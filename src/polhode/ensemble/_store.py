@@ -133,7 +133,8 @@ class Store:
             )
         self.chunk: int = found.get("chunk", 0)  # what is missing or no number is refused below
         self.piece: int = found.get("piece", 0)
-        for name, unit in (("chunk", identity["block"]), ("piece", identity["block"])):
+        unit = identity["block"]
+        for name in ("chunk", "piece"):
             value = found.get(name)
             if type(value) is not int or value < 1 or value % unit or self.chunk % value:
                 raise StoreError(
@@ -175,6 +176,8 @@ class Store:
             arrays = {name: self.group[name] for name in make}
         self.marks = arrays["checksum"]
         self.arrays = {name: arrays[name] for name in layout}
+        # arrays that may have several files in a chunk
+        self.split = sorted({"wxyz", "omega_body"} & layout.keys())
 
     def _devices(self) -> list[str]:
         found = self.group.attrs.get("devices")
@@ -186,10 +189,11 @@ class Store:
         """
         try:
             found = self.group[name]
-            same = json.dumps(found.metadata.to_dict(), sort_keys=True, default=str) == json.dumps(
-                expected.metadata.to_dict(), sort_keys=True, default=str
+            same, wanted = (
+                json.dumps(array.metadata.to_dict(), sort_keys=True, default=str)
+                for array in (found, expected)
             )
-            return same and (name != "time" or np.array_equal(found[...], expected[...]))
+            return same == wanted and (name != "time" or np.array_equal(found[...], expected[...]))
         except Exception:  # whatever cannot be read is not like it
             return False
 
@@ -200,16 +204,17 @@ class Store:
 
     def finished(self) -> np.ndarray:
         """(chunks,) whether a chunk was marked as finished; the data are not looked at."""
+
+        def marked(chunk: int) -> bool:
+            try:
+                return self.marks[chunk] != 0
+            except Exception:
+                return False
+
         try:
             return self.marks[:] != 0
         except Exception:  # one of them is damaged: as if it were not there
-            return np.array([self._mark(k) != 0 for k in range(self.marks.shape[0])])
-
-    def _mark(self, chunk: int) -> int:
-        try:
-            return int(self.marks[chunk])
-        except Exception:
-            return 0
+            return np.array([marked(chunk) for chunk in range(self.marks.shape[0])])
 
     def rows(self, name: str, chunk: int) -> slice:
         """The rows of an array that belong to a chunk."""
@@ -220,9 +225,8 @@ class Store:
         """Arrays and rows of the files of a chunk in the order of its checksum: first those of
         the trajectories, piece by piece, then the arrays that have one file in a chunk.
         """
-        split = [n for n, a in sorted(self.arrays.items()) if n in _SPLIT]
-        rest = [n for n in sorted(self.arrays) if n not in _SPLIT]
-        for names in (split, rest):
+        rest = [n for n in sorted(self.arrays) if n not in self.split]
+        for names in (self.split, rest):
             steps = {n: self.arrays[n].chunks[0] for n in names}
             begin = {n: self.rows(n, chunk).start for n in names}
             end = {n: self.rows(n, chunk).stop for n in names}
@@ -280,21 +284,12 @@ class Store:
                 os.close(handle)
 
 
-_SPLIT = ("wxyz", "omega_body")
-"""Arrays that may have several files in a chunk."""
-
-
 def _remove(path: Path) -> None:
     """What lies in the place of an array, whatever it is."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-def _absent(dtype: Any) -> Any:
-    """What readers see where a chunk is not finished: NaN, or -1 for whole numbers."""
-    return np.nan if np.issubdtype(dtype, np.floating) else -1
 
 
 def _short(value: Any) -> str:
@@ -337,7 +332,9 @@ def _arrays(
             name, shape=field.shape, chunks=(field.piece, *field.shape[1:]), dtype=field.dtype,
             dimension_names=field.dimensions,
             attributes=field.attributes | {"rows_per_chunk": field.rows},
-            compressors=checked, fill_value=_absent(field.dtype),
+            compressors=checked,
+            # what readers see where a chunk is not finished
+            fill_value=np.nan if np.issubdtype(field.dtype, np.floating) else -1,
         )  # fmt: skip
 
     def checksum(group: Any) -> None:

@@ -92,7 +92,7 @@ def stream(
         store = Store(path, identity)
         begun = _layout.Rows(store.chunk, store.piece)
         with in_turn(path):
-            store.mend(times, layout(begun), words, [_device_names(devices)], warn)
+            store.mend(times, layout(begun), words, [device_names(devices)], warn)
         if processes == 1:
             store.sweep()
         fill(store, block, range(process, store.marks.shape[0], processes), verify, ahead, progress)
@@ -105,7 +105,7 @@ def stream(
     return path
 
 
-def _device_names(devices: Sequence[Any]) -> str:
+def device_names(devices: Sequence[Any]) -> str:
     """Number and kind of the devices, as a store remembers them."""
     return f"{len(devices)} x {devices[0].platform} ({devices[0].device_kind})"
 

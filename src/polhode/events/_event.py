@@ -1,6 +1,7 @@
 """What an event is: a function of attitude, rates and time that crosses zero."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -10,11 +11,10 @@ import numpy as np
 from jaxtyping import Array
 
 from polhode import rotation
-from polhode.parts import checked, mapped
+from polhode.parts import Signature
 from polhode.trajectory import Trajectory, shortly_after
 
-_ARGUMENTS = ("wxyz", "omega_body", "t")
-_SHAPES = ((4,), (3,), ())
+_FUNCTION = Signature("Event", {"wxyz": (4,), "omega_body": (3,), "t": ()})
 
 
 class Event(eqx.Module):
@@ -37,7 +37,7 @@ class Event(eqx.Module):
     samples: int | None = eqx.field(static=True)
 
     def __init__(self, fn: Callable, direction: int = 0, samples: int | None = None):
-        self.fn = checked("Event", fn, _ARGUMENTS, _SHAPES, ())
+        self.fn = _FUNCTION.checked(fn)
         if isinstance(direction, bool) or direction not in (-1, 0, 1):
             raise ValueError(f"direction must be 1 (rising), -1 (falling) or 0, got {direction!r}.")
         self.direction = int(direction)
@@ -52,11 +52,7 @@ class Event(eqx.Module):
             trajectory._scene.acceleration(wxyz, omega, trajectory._t),
             jnp.ones_like(t),
         )
-
-        def value(wxyz, omega, t):
-            return mapped("Event", self.fn, _ARGUMENTS, _SHAPES, (), wxyz, omega, t)
-
-        return jax.jvp(value, (wxyz, omega, t), slopes)
+        return jax.jvp(partial(_FUNCTION.mapped, self.fn), (wxyz, omega, t), slopes)
 
     def polished(self, near: Trajectory, most: Array) -> tuple[Array, Trajectory]:
         """At samples ``near`` events: how much later (..., T) [s] these are, at most by ``most``,

@@ -15,9 +15,15 @@ from jaxtyping import Array, Float
 
 from polhode.fit._filter import Noise, Readings, Score, innovations, score_of
 from polhode.fit._instrument import Instrument, Tolerance
-from polhode.fit._linear import entries_of
 from polhode.fit._matrices import inverse, solve
-from polhode.fit._parameters import SCALE, FullTensor, base_of, free_columns, tensor_of
+from polhode.fit._parameters import (
+    SCALE,
+    FullTensor,
+    base_of,
+    entries_of,
+    free_columns,
+    tensor_of,
+)
 from polhode.fit._start import regression
 
 # directions of symmetric traceless matrices, orthonormal
@@ -250,7 +256,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     noise = Noise(*noise[:_LEVEL], *(x[0] for x in noise[_LEVEL:]))
 
     def entries(shape, sigma):
-        return entries_of(known.tensor(shape, sigma), 6)
+        return entries_of(known.tensor(shape, sigma))
 
     slopes = jax.vmap(jax.jacfwd(entries))(every[:, :_TENSOR], known.sigma)
     blocks = covariance[inner[:, :, None], inner[:, None, :]]

@@ -57,14 +57,15 @@ def load_recording(
     rates that look like deg/s.
     """
     lines = _lines(path)
-    first = next((k for k, line in enumerate(lines) if _is_content(line)), None)
+    first = next(
+        (k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")),
+        None,
+    )
     if first is None:
         raise ValueError(f"{path} is empty; expected a header line and rows of times and rates.")
-    separator = _separator(lines[first])
-    names = [
-        name.strip()
-        for name in next(csv.reader([lines[first]], delimiter=separator, skipinitialspace=True))
-    ]
+    separator = next((mark for mark in ",;\t" if mark in lines[first]), ",")
+    (header,) = csv.reader([lines[first]], delimiter=separator, skipinitialspace=True)
+    names = [name.strip() for name in header]
     needed = _needed(path, names, {} if columns is None else columns)
     units = {role: unit for role, name in needed.items() if (unit := unit_of(role, name))}
     if scale is None:
@@ -118,24 +119,16 @@ def _rows(path, lines, first, separator, names, needed) -> tuple[list, list[int]
     places = [names.index(name) for name in needed.values()]
     table, numbers = [], []
     reader = csv.reader(lines[first + 1 :], delimiter=separator, skipinitialspace=True)
-    while True:
-        try:
-            row = next(reader, None)
-        except csv.Error as error:
-            raise ValueError(f"{path}: line {first + 1 + reader.line_num}: {error}.") from None
-        if row is None:
-            break
-        if not any(cell.strip() for cell in row):
-            continue
-        line = first + 1 + reader.line_num
-        cells = [row[k] if k < len(row) else "" for k in places]
-        table.append(
-            [
-                _number(path, line, name, cell, separator != ",")
-                for name, cell in zip(needed.values(), cells, strict=True)
-            ]
-        )
-        numbers.append(line)
+    try:
+        for row in reader:
+            if not any(cell.strip() for cell in row):
+                continue
+            numbers.append(first + 1 + reader.line_num)
+            cells = [row[k] if k < len(row) else "" for k in places]
+            pairs = zip(needed.values(), cells, strict=True)
+            table.append([_number(path, numbers[-1], *pair, separator != ",") for pair in pairs])
+    except csv.Error as error:
+        raise ValueError(f"{path}: line {first + 1 + reader.line_num}: {error}.") from None
     if len(table) < 4:
         raise ValueError(f"{path} must hold at least 4 rows of data, got {len(table)}.")
     return table, numbers
@@ -225,15 +218,6 @@ def _lines(path) -> list[str]:
     if any("\0" in line for line in lines):
         raise ValueError(f"{path} is not text in UTF-8; save the recording as CSV, UTF-8.")
     return lines
-
-
-def _is_content(line: str) -> bool:
-    return bool(line.strip()) and not line.lstrip().startswith("#")
-
-
-def _separator(header: str) -> str:
-    """Comma, or what stands in its place."""
-    return next((mark for mark in ",;\t" if mark in header), ",")
 
 
 def _headless(names: list[str]) -> str:

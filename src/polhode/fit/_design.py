@@ -7,8 +7,8 @@ from jaxtyping import Array, Float
 
 from polhode.fit._filter import Noise, Readings, innovations, score_of
 from polhode.fit._instrument import Instrument
-from polhode.fit._linear import entries_of, whole_of
 from polhode.fit._motion import SteppedMotion
+from polhode.fit._parameters import entries_of, whole_of
 
 # spin that drag may take in a second, as a part of the whole, of which the throw tells the rest
 _LOST = 0.3
@@ -52,13 +52,13 @@ def throw_information(
 
     def found(unknown):
         drag = _LOST * size * jnp.stack([unknown[6], unknown[7] / typical])
-        body = whole_of(unknown[:6], 6)
+        body = whole_of(unknown[:6])
         # as in the fit: torques are as uncertain as the body is large
         shaken = noise.grown(jnp.trace(body) / 2)
         got = innovations(data, size * body, drag, instrument, shaken)
         return got, got
 
-    here = jnp.concatenate([entries_of(tensor / size, 6), jnp.zeros(2, tensor.dtype)])
+    here = jnp.concatenate([entries_of(tensor / size), jnp.zeros(2, tensor.dtype)])
     by, got = jax.jacfwd(found, has_aux=True)(here)
     every = score_of(got, by).information
     air = every[6:, 6:] + jnp.eye(2, dtype=tensor.dtype)

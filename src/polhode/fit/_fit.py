@@ -4,20 +4,20 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
+from polhode._batch import map_chunks
 from polhode._checks import require
 from polhode.fit._compiled import compiled
 from polhode.fit._fit_wheel import fit_wheel, fit_wheels
 from polhode.fit._instrument import Instrument
-from polhode.fit._motion import AbstractMotion, FreeMotion
-from polhode.fit._parameters import AbstractInertiaUnknown, FullTensor
+from polhode.fit._motion import AbstractMotion
+from polhode.fit._parameters import AbstractInertiaUnknown
 from polhode.fit._recording import Recording, stack
 from polhode.fit._residuals import Huber
-from polhode.fit._result import CURES, UNUSABLE, FitError, InertiaFit, conclude
-from polhode.fit._solve import Problem, solve
+from polhode.fit._result import CURES, UNUSABLE, FitError, InertiaFit, conclude, is_unusable
+from polhode.fit._solve import FitOptions, solve
 from polhode.inertia import Inertia
 
 # Samples that a processor core works on together.
@@ -102,19 +102,11 @@ def fit_inertia(
         wheel_speed=wheel_speed,
         **{name: 1.0 if value is None else value for name, value in noise.items()},
     )
-    problem = Problem(
-        FreeMotion() if motion is None else motion,
-        FullTensor() if unknown is None else unknown,
-        known,
-        robust,
-        bias,
-        mounting,
-        any(value is not None for value in noise.values()),
-        starts,
-        solver,
-        max_steps,
+    noise_known = any(value is not None for value in noise.values())
+    options = FitOptions(
+        motion, unknown, known, robust, bias, mounting, noise_known, starts, solver, max_steps
     )
-    return _finished(each(recording, problem), throw)
+    return _finished(each(recording, options), throw)
 
 
 def _only_a_wheel(instrument: Instrument | None, wheel_speed, others) -> None:
@@ -175,87 +167,61 @@ def fit_recordings(
             },
         )  # fmt: skip
         return _finished(fit_wheels(recordings, instrument, block), throw)
-    problem = Problem(
-        FreeMotion() if motion is None else motion,
-        FullTensor() if unknown is None else unknown,
-        known,
-        robust,
-        bias,
-        mounting,
-        noise_known,
-        starts,
-        solver,
-        max_steps,
+    options = FitOptions(
+        motion, unknown, known, robust, bias, mounting, noise_known, starts, solver, max_steps
     )
-    return _finished(together(stack(recordings), problem), throw)
+    return _finished(together(stack(recordings), options), throw)
 
 
 def windows(recording: Recording, length: int) -> list[Recording]:
     """A recording (without batch) cut into windows of ``length`` samples sharing their ends."""
     count = recording.times.shape[-1]
-    require(
-        4 <= length <= count,
-        f"a window needs 4 to {count} samples, got {length}.",
-    )
-    starts = range(0, count - 3, length - 1)
-    cuts = [(first, min(first + length, count)) for first in starts]
-    return [
-        jax.tree.map(lambda leaf, a=a, b=b: leaf[a:b], recording) for a, b in cuts if b - a >= 4
-    ]
+    require(4 <= length <= count, f"a window needs 4 to {count} samples, got {length}.")
+    # starts that leave at least four samples
+    cuts = [slice(first, first + length) for first in range(0, count - 3, length - 1)]
+    return [jax.tree.map(lambda leaf, cut=cut: leaf[cut], recording) for cut in cuts]
 
 
 @compiled
-def together(recording: Recording, problem: Problem, conclude: Callable = conclude) -> Any:
+def together(recording: Recording, options: FitOptions, conclude: Callable = conclude) -> Any:
     """One body from its recordings (leading axis); ``conclude`` makes the result."""
-    return conclude(solve(recording, problem), recording, problem)
+    return conclude(solve(recording, options), recording, options)
 
 
 @compiled
-def each(recording: Recording, problem: Problem, conclude: Callable = conclude) -> Any:
+def each(recording: Recording, options: FitOptions, conclude: Callable = conclude) -> Any:
     """Fits of all bodies (leading axes), one recording each, in one compiled call."""
     batch = recording.batch_shape
     if not batch:
-        return together(jax.tree.map(lambda leaf: leaf[None], recording), problem, conclude)
+        return together(jax.tree.map(lambda leaf: leaf[None], recording), options, conclude)
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, 1, *leaf.shape[len(batch) :]), recording)
-    found = _batch(flat, problem, conclude)
+    found = _batch(flat, options, conclude)
     return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), found)
 
 
-def _batch(recording: Recording, problem: Problem, conclude: Callable) -> Any:
+def _batch(recording: Recording, options: FitOptions, conclude: Callable) -> Any:
     """Fits of bodies on one leading axis."""
 
     def fit(one):
-        return conclude(solve(one, problem), one, problem)
+        return conclude(solve(one, options), one, options)
 
     # A processor core fills its vector units with the samples of a few bodies; more at a time would
     # only wait for the slowest of them.
     count = recording.times.shape[0]
     at_once = max(1, _LANES // max(recording.times.shape[1] * recording.times.shape[2], 1))
-    if jax.default_backend() != "cpu" or count <= at_once:
-        return jax.vmap(fit)(recording)
-    if at_once == 1:
+    rounds = -(-count // at_once) if jax.default_backend() == "cpu" else 1
+    if at_once == 1 < rounds:
         return jax.lax.map(fit, recording)
-    rounds = -(-count // at_once)
-    at_once = -(-count // rounds)
-    missing = rounds * at_once - count
-
-    def cut(leaf):
-        # the last body fills up the last round: one program for all rounds
-        last = jnp.broadcast_to(leaf[-1:], (missing, *leaf.shape[1:]))
-        return jnp.concatenate([leaf, last]).reshape(rounds, at_once, *leaf.shape[1:])
-
-    found = jax.lax.map(jax.vmap(fit), jax.tree.map(cut, recording))
-    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:count], found)
+    return map_chunks(jax.vmap(fit), recording, count, -(-count // rounds))
 
 
 def _finished(result: InertiaFit, throw: bool) -> InertiaFit:
-    fatal = UNUSABLE
-    codes = np.atleast_1d(np.asarray(result.finding))
-    if throw and (codes & int(fatal)).any():
+    if throw and is_unusable(result):
+        codes = np.asarray(result.finding).reshape(-1)
         said = [
             f"{int(((codes & int(flag)) != 0).sum())} of {codes.size}: {text}"
             for flag, text in CURES.items()
-            if flag & fatal and (codes & int(flag)).any()
+            if flag & UNUSABLE and (codes & int(flag)).any()
         ]
         raise FitError("; ".join(said) + ". Pass throw=False to get the result with its flags.")
     return result

@@ -13,9 +13,9 @@ from polhode.fit._balance import Known, solve_balance, start_of
 from polhode.fit._compiled import compiled
 from polhode.fit._filter import Noise, readings_of
 from polhode.fit._instrument import Instrument, Tolerance
-from polhode.fit._linear import entries_of, whole_of
+from polhode.fit._parameters import entries_of, whole_of
 from polhode.fit._recording import Recording, needed, stack
-from polhode.fit._result import FitError
+from polhode.fit._result import FitError, turn_std
 from polhode.inertia import Inertia, principal
 
 
@@ -121,9 +121,7 @@ def fit_balance(
         "each recording needs at least 8 samples with rates and wheel, got "
         f"{present.sum(axis=1).min()}.",
     )
-    found = _together(
-        given, jnp.asarray(numbers), instrument, tolerance, count, block,
-    )  # fmt: skip
+    found = _together(given, jnp.asarray(numbers), instrument, tolerance, count, block)
     if throw and not bool(found.converged & jnp.all(jnp.isfinite(found.covariance))):
         raise FitError(
             "the balance of momentum did not converge or is not finite: look for recordings with "
@@ -158,19 +156,16 @@ def _concluded(found, block) -> BalanceFit:
         moments, axes, _ = principal(tensor)
 
         def derived(entries):
-            values, _, products = principal(whole_of(entries, 6))
+            values, _, products = principal(whole_of(entries))
             every = jnp.concatenate([values, products, entries])
             return every if sized else every / values[2]
 
-        slope = jax.jacfwd(derived)(entries_of(tensor, 6))
+        slope = jax.jacfwd(derived)(entries_of(tensor))
         covariance = slope @ covariance @ slope.T
         spread = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance)[:6], 0))
         size = jnp.ones_like(moments[2]) if sized else moments[2]
         tensor, moments = tensor / size, moments / size
-        gaps = jnp.stack(
-            [moments[2] - moments[1], moments[2] - moments[0], moments[1] - moments[0]]
-        )
-        turn = jnp.where(gaps > 0, spread[3:] / jnp.where(gaps > 0, gaps, 1), jnp.inf)
+        turn = turn_std(moments, spread[3:])
         return tensor, moments, axes, spread[:3], turn, covariance[6:, 6:], size
 
     tensors, moments, axes, spread, turn, covariance, size = jax.vmap(one)(

@@ -9,13 +9,12 @@ from jaxtyping import Array
 
 from polhode.fit._fit_balance import BalanceFit, fit_balance
 from polhode.fit._instrument import Instrument
-from polhode.fit._linear import entries_of, whole_of
 from polhode.fit._matrices import inverse
 from polhode.fit._motion import Drag, SteppedMotion
-from polhode.fit._parameters import Parameters, base_of
+from polhode.fit._parameters import Parameters, base_of, entries_of, whole_of
 from polhode.fit._recording import Recording, needed, stack
 from polhode.fit._residuals import Model
-from polhode.fit._result import Finding, InertiaFit, whiteness_of
+from polhode.fit._result import Finding, InertiaFit, flagged, whiteness_of
 from polhode.inertia import Inertia, principal, second_moments
 
 
@@ -41,19 +40,19 @@ def _told(fit: BalanceFit, recording: Recording, given: Instrument) -> InertiaFi
     """One body's balance as the result that every motion gives."""
     tensor, moments = fit.inertia.tensor[0], fit.moments[0]
     covariance = fit.covariance[0]
-    spread = _ratios_std(entries_of(tensor, 6), covariance)
+    spread = _ratios_std(entries_of(tensor), covariance)
     rest, known = fit.residuals, jnp.any(fit.residuals != 0, axis=-1).astype(moments.dtype)
     read = 3 * jnp.maximum(jnp.sum(known), 1)
     whiteness = whiteness_of(rest, known)
     trace = jnp.trace(tensor)
     finite = jnp.all(jnp.isfinite(tensor)) & jnp.all(jnp.isfinite(covariance))
-    flags = (
-        (Finding.STEP_LIMIT, ~fit.converged),
-        (Finding.NOT_FINITE, ~finite),
-        (Finding.NEARLY_FLAT, trace / 2 - moments[2] < 1e-4 * trace),
-        (Finding.NOT_WHITE, whiteness < 1e-4),
-        (Finding.WEAK, jnp.any(spread[:2] > 0.05)),
-    )
+    finding = flagged({
+        Finding.STEP_LIMIT: ~fit.converged,
+        Finding.NOT_FINITE: ~finite,
+        Finding.NEARLY_FLAT: trace / 2 - moments[2] < 1e-4 * trace,
+        Finding.NOT_WHITE: whiteness < 1e-4,
+        Finding.WEAK: jnp.any(spread[:2] > 0.05),
+    })  # fmt: skip
     device = fit.instrument
     x, y, z = (float(part) for part in np.asarray(device.axis))
     flight = SteppedMotion(
@@ -75,7 +74,7 @@ def _told(fit: BalanceFit, recording: Recording, given: Instrument) -> InertiaFi
         moments / moments[2], fit.moments_std[0], spread, fit.axes_std[0], inverse(covariance),
         covariance, jnp.asarray(0), jnp.sqrt(jnp.sum(rest**2) / read), whiteness,
         jnp.sqrt(jnp.sum((rest * fit.residuals_std) ** 2) / read),
-        sum(jnp.where(seen, int(flag), 0) for flag, seen in flags), fit.steps, jnp.asarray(1),
+        finding, fit.steps, jnp.asarray(1),
         parameters, model, {"omega": rest, "omega_std": fit.residuals_std}, True, True,
     )  # fmt: skip
 
@@ -83,7 +82,7 @@ def _told(fit: BalanceFit, recording: Recording, given: Instrument) -> InertiaFi
 @jax.jit
 def _ratios_std(entries: Array, covariance: Array) -> Array:
     def ratios(entries):
-        values, *_ = principal(whole_of(entries, 6))
+        values, *_ = principal(whole_of(entries))
         return values / values[2]
 
     slope = jax.jacfwd(ratios)(entries)

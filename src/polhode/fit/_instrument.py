@@ -1,5 +1,6 @@
 """A gyroscope beside a wheel: what a data sheet leaves open, and readings made ready for a fit."""
 
+import dataclasses
 from typing import NamedTuple
 
 import equinox as eqx
@@ -75,26 +76,22 @@ def averaged(recording: Recording, count: int) -> Recording:
         f"blocks of {count} leave {length} of {recording.times.shape[-1]} samples, 4 are needed.",
     )
 
-    def mean(array, tail):
-        array = jnp.take(array, jnp.arange(length * count), axis=array.ndim - 1 - tail)
-        place = array.ndim - 1 - tail
-        shape = (*array.shape[:place], length, count, *array.shape[place + 1 :])
-        return jnp.mean(array.reshape(shape), axis=place + 1)
+    require(recording.wxyz is None, "attitudes cannot be averaged; leave them out.")
+    place = len(recording.batch_shape)
 
-    tails = {"omega": 1, "wxyz": 1, "force": 1, "omega_noise": 1, "force_noise": 1}
-    found = {
-        name: mean(getattr(recording, name), tails.get(name, 0))
-        for name in recording.__dataclass_fields__
-        if getattr(recording, name) is not None
-    }
-    require("wxyz" not in found, "attitudes cannot be averaged; leave them out.")
-    for name in ("omega_noise", "force_noise"):
-        if name in found:
-            found[name] = found[name] / count**0.5
-    for name in ("present", "wheel_known"):
-        if name in found:
-            found[name] = jnp.floor(found[name])
-    return Recording(**found)
+    def mean(array):
+        cut = jax.lax.slice_in_dim(array, 0, length * count, axis=place)
+        shape = (*array.shape[:place], length, count, *array.shape[place + 1 :])
+        return jnp.mean(cut.reshape(shape), axis=place + 1)
+
+    found, smaller = jax.tree.map(mean, recording), lambda noise: noise / count**0.5
+    return dataclasses.replace(
+        found,
+        present=jnp.floor(found.present),
+        wheel_known=jax.tree.map(jnp.floor, found.wheel_known),
+        omega_noise=jax.tree.map(smaller, found.omega_noise),
+        force_noise=jax.tree.map(smaller, found.force_noise),
+    )
 
 
 @jax.jit

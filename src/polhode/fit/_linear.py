@@ -4,6 +4,7 @@ What all recordings share (the tensor, a bias, a drag) fills one block per recor
 own (initial rates and attitude) another: the zeros between them are never computed.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -13,7 +14,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from polhode.fit._matrices import triangle
-from polhode.fit._parameters import Parameters
+from polhode.fit._parameters import Parameters, entries_of, whole_of
 from polhode.fit._recording import Recording
 from polhode.fit._residuals import Model, residuals
 
@@ -53,23 +54,6 @@ class Linear(NamedTuple):
         return jnp.block([[corner, side], [side.T, below]])
 
 
-def entries_of(tensor: Float[Array, "3 3"], count: int) -> Float[Array, " e"]:
-    """The ``count`` unknown entries: xx, yy, zz and, of 6, yz, zx, xy; none where it is known."""
-    a, b, c = tensor[0, 0], tensor[1, 1], tensor[2, 2]
-    return jnp.stack([a, b, c, tensor[1, 2], tensor[2, 0], tensor[0, 1]])[:count]
-
-
-def whole_of(entries: Float[Array, " e"], count: int) -> Float[Array, "3 3"]:
-    """The tensor of its ``count`` (3 or 6) entries, products zero where they are absent.
-
-    Of none: any, for a motion that does not ask for it.
-    """
-    if count == 0:
-        return jnp.eye(3, dtype=entries.dtype)
-    (a, b, c), (p, q, r) = entries[:3], entries[3:6] if count == 6 else jnp.zeros_like(entries[:3])
-    return jnp.stack([jnp.stack([a, r, q]), jnp.stack([r, b, p]), jnp.stack([q, p, c])])
-
-
 def unknowns(parameters: Parameters, model: Model) -> tuple[Array, Array, Callable]:
     """Shared (s,) and own (r, o) unknowns as numbers, and the way back for one recording.
 
@@ -104,7 +88,7 @@ def linearise(
         parameters, tensor = one(shared, own)
         lone = jax.tree.map(lambda leaf: leaf[None], single)
         start = None if attitude is None else attitude[None]
-        parts = residuals(parameters, lone, model.starting_at(start), tensor)
+        parts = residuals(parameters, lone, dataclasses.replace(model, attitude=start), tensor)
         rest = jnp.concatenate([part[0] for part in parts.values()], axis=-1)
         return rest, rest
 

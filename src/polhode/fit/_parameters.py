@@ -11,10 +11,27 @@ from jaxtyping import Array, Float
 
 from polhode.fit._matrices import inverse
 from polhode.inertia import inertia_of_second_moments, principal
+from polhode.inertia._cholesky import symmetric
 from polhode.rotation import to_matrix
 
 # Eigenvalues of the second moments, relative to their sum, around which a flat body is near.
 _SOFT = 5e-3
+
+
+def entries_of(tensor: Float[Array, "3 3"], count: int = 6) -> Float[Array, " e"]:
+    """The ``count`` unknown entries: xx, yy, zz and, of 6, yz, zx, xy; none where it is known."""
+    a, b, c = tensor[0, 0], tensor[1, 1], tensor[2, 2]
+    return jnp.stack([a, b, c, tensor[1, 2], tensor[2, 0], tensor[0, 1]])[:count]
+
+
+def whole_of(entries: Float[Array, " e"], count: int = 6) -> Float[Array, "3 3"]:
+    """The tensor of its ``count`` (3 or 6) entries, products zero where they are absent.
+
+    Of none: any, for a motion that does not ask for it.
+    """
+    if count == 0:
+        return jnp.eye(3, dtype=entries.dtype)
+    return symmetric(entries[:3], entries[3:6] if count == 6 else jnp.zeros_like(entries[:3]))
 
 
 class Parameters(eqx.Module):
@@ -97,9 +114,7 @@ def base_of(sigma: Float[Array, "3 3"], scale_known: bool) -> Base:
         sigma, total = sigma / total, jnp.ones_like(total)
     soft = _SOFT * total
     matrix = sigma - soft**2 / 4 * inverse(sigma)
-    diagonal = jnp.stack([matrix[0, 0], matrix[1, 1], matrix[2, 2]])
-    off = jnp.stack([matrix[1, 2], matrix[2, 0], matrix[0, 1]])
-    return Base(jnp.concatenate([diagonal, off]), soft)
+    return Base(entries_of(matrix), soft)
 
 
 def tensor_of(shape: Float[Array, " k"], base: Base, columns: np.ndarray) -> Array:
@@ -112,9 +127,7 @@ def tensor_of(shape: Float[Array, " k"], base: Base, columns: np.ndarray) -> Arr
     """
     scale = base.soft / _SOFT
     y = base.entries + scale * jnp.sum(jnp.asarray(columns, shape.dtype) * shape[None], axis=1)
-    a, b, c, p, q, r = y
-    matrix = jnp.stack([jnp.stack([a, r, q]), jnp.stack([r, b, p]), jnp.stack([q, p, c])])
-    values, axes, (yz, zx, xy) = principal(matrix)
+    values, axes, (yz, zx, xy) = principal(whole_of(y))
     root = jnp.sqrt(values**2 + base.soft**2)
     # without cancellation for negative eigenvalues
     bent = jnp.where(values > 0, (values + root) / 2, base.soft**2 / (2 * (root - values)))
@@ -124,14 +137,7 @@ def tensor_of(shape: Float[Array, " k"], base: Base, columns: np.ndarray) -> Arr
         # carry the tangent of turning axes
         return (1 + (values[i] + values[j]) / (root[i] + root[j])) / 2
 
-    yz, zx, xy = slope(1, 2) * yz, slope(2, 0) * zx, slope(0, 1) * xy
-    inner = jnp.stack(
-        [
-            jnp.stack([bent[0], xy, zx]),
-            jnp.stack([xy, bent[1], yz]),
-            jnp.stack([zx, yz, bent[2]]),
-        ]
-    )
+    inner = symmetric(bent, (slope(1, 2) * yz, slope(2, 0) * zx, slope(0, 1) * xy))
     turn = to_matrix(axes)
     exact = jax.lax.Precision.HIGHEST
     sigma = jnp.einsum("ij,jk,lk->il", turn, inner, turn, precision=exact)

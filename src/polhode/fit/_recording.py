@@ -1,5 +1,6 @@
 """What was measured: gyroscope rates, attitudes, accelerometer readings, and their noise."""
 
+import dataclasses
 from collections.abc import Sequence
 from typing import Self
 
@@ -10,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode._checks import as_float_array, is_concrete, require
-from polhode.rotation import normalise
+from polhode.rotation import conjugate, multiply, normalise
 
 # angles per sample above which a record under-samples its own rotation
 _TURN_PER_SAMPLE = np.pi
@@ -80,42 +81,33 @@ class Recording(eqx.Module):
             "force_body": (force_body, (count, 3)),
             "wheel_speed": (wheel_speed, (count,)),
         }
-        arrays = {
-            name: None if value is None else _with_gaps(name, value, suffix, dtype)
-            for name, (value, suffix) in given.items()
-        }
         require(
-            any(arrays[name] is not None for name in ("omega_body", "wxyz")),
+            omega_body is not None or wxyz is not None,
             "a recording needs rates (omega_body), attitudes (wxyz) or both, got neither.",
         )
-        tails = {"omega_body": 2, "wxyz": 2, "force_body": 2, "wheel_speed": 1}
+        arrays = {
+            name: _with_gaps(name, value, suffix, dtype)
+            for name, (value, suffix) in given.items()
+            if value is not None
+        }
+        tails = {name: given[name][1] for name in arrays}
         batch = jnp.broadcast_shapes(
-            times.shape[:-1],
-            *(a.shape[: a.ndim - tails[n]] for n, a in arrays.items() if a is not None),
+            times.shape[:-1], *(a.shape[: a.ndim - len(tails[n])] for n, a in arrays.items())
         )
         # what is known now is worked on by NumPy, which has a hundredth of JAX's overhead
         xp = jnp
-        if is_concrete(times, *(a for a in arrays.values() if a is not None)):
+        if is_concrete(times, arrays):
             xp, times, arrays = np, *jax.tree.map(np.asarray, (times, arrays))
-        arrays = {
-            name: None if a is None else xp.broadcast_to(a, (*batch, *a.shape[-tails[name] :]))
-            for name, a in arrays.items()
-        }
+        arrays = {name: xp.broadcast_to(a, (*batch, *tails[name])) for name, a in arrays.items()}
         times = xp.broadcast_to(times, (*batch, count))
+        whole = {name: xp.isfinite(a) for name, a in arrays.items()}
+        filled = {name: xp.where(whole[name], a, _blank(name, a)) for name, a in arrays.items()}
+        wheel, known = filled.pop("wheel_speed", None), None
         present = xp.ones_like(times)
-        for name, array in arrays.items():
-            if array is not None and name != "wheel_speed":
-                whole = xp.isfinite(array)
-                whole = xp.all(whole, axis=-1) if tails[name] == 2 else whole
-                present = present * whole.astype(dtype)
-        filled = {
-            name: None if a is None else xp.where(xp.isfinite(a), a, _blank(name, a))
-            for name, a in arrays.items()
-        }
-        omega, attitude = filled["omega_body"], filled["wxyz"]
-        wheel, known = filled["wheel_speed"], None
+        for name in filled:
+            present = present * xp.all(whole[name], axis=-1).astype(dtype)
         if wheel is not None:
-            known = xp.isfinite(arrays["wheel_speed"]).astype(dtype)
+            known = whole["wheel_speed"].astype(dtype)
             if is_concrete(known):
                 least = int(np.min(np.sum(known, axis=-1)))
                 require(least >= 2, f"wheel_speed needs at least 2 numbers, got {least}.")
@@ -123,23 +115,20 @@ class Recording(eqx.Module):
         if is_concrete(present):
             least = int(np.min(np.sum(present, axis=-1)))
             require(least >= 4, f"a recording needs at least 4 samples without NaN, got {least}.")
+        omega, attitude, force = (filled.get(n) for n in ("omega_body", "wxyz", "force_body"))
         if omega is not None and is_concrete(omega, times):
             _check_rates(omega, times)
-        noises = {
-            "omega_noise": (omega_noise, omega, 3),
-            "attitude_noise": (attitude_noise, attitude, 0),
-            "force_noise": (force_noise, filled["force_body"], 3),
-        }
-        spread = {
-            name: None if of is None else _noise(name, value, (*batch, count), tail, dtype)
-            for name, (value, of, tail) in noises.items()
-        }
-        force = filled["force_body"]
-        parts = jax.tree.map(jnp.asarray, (times, present, omega, attitude, force, wheel, known))
-        spread = jax.tree.map(jnp.asarray, spread)
-        times, present, omega, attitude, force, wheel, known = parts
-        attitude = None if attitude is None else normalise(attitude)
-        return cls(times, present, omega, attitude, force, wheel, **spread, wheel_known=known)
+        noises = (
+            None if of is None else _noise(name, value, (*batch, count, *tail), dtype)
+            for name, value, of, tail in (
+                ("omega_noise", omega_noise, omega, (3,)),
+                ("attitude_noise", attitude_noise, attitude, ()),
+                ("force_noise", force_noise, force, (3,)),
+            )
+        )
+        attitude = None if attitude is None else normalise(jnp.asarray(attitude))
+        parts = (times, present, omega, attitude, force, wheel, *noises, known)
+        return cls(*jax.tree.map(jnp.asarray, parts))
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -149,6 +138,13 @@ class Recording(eqx.Module):
     def mirrored(self) -> "Recording":
         """The rates with every sign reversed: what the other handedness of axes would read."""
         return eqx.tree_at(lambda r: r.omega, self, -needed("omega", self.omega))
+
+
+def turn_between(first: Float[Array, "*t 4"], second: Float[Array, "*t 4"]) -> Float[Array, "*t 3"]:
+    """Rotation vectors, body axes, from attitudes to near ones: twice the quaternion's vector."""
+    turn = multiply(conjugate(first), second)
+    sign = jnp.where(turn[..., :1] < 0, -1, 1).astype(turn.dtype)
+    return 2 * sign * turn[..., 1:]
 
 
 def needed(name: str, array: Array | None) -> Array:
@@ -202,17 +198,14 @@ def stack(recordings: Sequence[Recording]) -> Recording:
         short = longest - r.times.shape[-1]
         if short == 0:
             return r
-        later = r.times[-1] + (r.times[-1] - r.times[-2]) * jnp.arange(
-            1, short + 1, dtype=r.times.dtype
+        steps = jnp.maximum(jnp.arange(longest) - (longest - short - 1), 0).astype(r.times.dtype)
+        longer = jax.tree.map(
+            lambda array: jnp.concatenate([array, jnp.repeat(array[-1:], short, axis=0)]), r
         )
-
-        def pad(array):
-            return jnp.concatenate([array, jnp.repeat(array[-1:], short, axis=0)])
-
-        longer = jax.tree.map(pad, r)
-        gaps = jnp.concatenate([r.present, jnp.zeros(short, r.present.dtype)])
-        return eqx.tree_at(
-            lambda s: (s.times, s.present), longer, (jnp.concatenate([r.times, later]), gaps)
+        return dataclasses.replace(
+            longer,
+            times=longer.times + steps * (r.times[-1] - r.times[-2]),
+            present=jnp.where(steps > 0, 0, longer.present),
         )
 
     kinds = {jax.tree.structure(r) for r in recordings}
@@ -255,10 +248,9 @@ def _check_rates(omega, times):
     )
 
 
-def _noise(name, value, shape, tail, dtype):
+def _noise(name, value, shape, dtype):
     array = as_float_array(name, value).astype(dtype)
     if is_concrete(array):
         array = np.asarray(array)
         require(array > 0, f"{name} must be positive (a standard deviation), got {array}.")
-    full = (*shape, tail) if tail else shape
-    return (np if is_concrete(array) else jnp).broadcast_to(array, full)
+    return (np if is_concrete(array) else jnp).broadcast_to(array, shape)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from polhode.fit._motion import AbstractMotion, Predicted
 from polhode.fit._parameters import Base, Parameters, tensor_of
-from polhode.fit._recording import Recording, needed
+from polhode.fit._recording import Recording, needed, turn_between
 from polhode.rotation import conjugate, multiply, rotate, rotation_vector_to_wxyz
 
 
@@ -46,10 +46,6 @@ class Model(eqx.Module):
     robust: Huber | None = None
     columns: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=())
     scale_known: bool = eqx.field(static=True, default=False)
-
-    def starting_at(self, attitude: Float[Array, "r 4"] | None) -> "Model":
-        """The same model with other start attitudes."""
-        return Model(self.motion, self.base, attitude, self.robust, self.columns, self.scale_known)
 
     @property
     def entries(self) -> int:
@@ -103,10 +99,8 @@ def residuals(
         parts["omega"] = weight * (recording.omega - seen) / noise
     if recording.wxyz is not None:
         noise = needed("attitude_noise", recording.attitude_noise)
-        apart = multiply(conjugate(motion.wxyz), recording.wxyz)
-        sign = jnp.where(apart[..., :1] < 0, -1, 1).astype(apart.dtype)
-        vector = 2 * sign * apart[..., 1:]
-        parts["attitude"] = weight * vector / noise[..., None]
+        apart = turn_between(motion.wxyz, recording.wxyz)
+        parts["attitude"] = weight * apart / noise[..., None]
     if recording.force is not None:
         if motion.omega_dot is None:
             raise ValueError(

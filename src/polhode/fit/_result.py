@@ -1,6 +1,7 @@
 """What a fit found, how well it is known, and what the data cannot say."""
 
 import enum
+from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,14 +11,13 @@ import numpy as np
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
-from polhode.fit._linear import Linear, entries_of, whole_of
+from polhode.fit._linear import Linear
 from polhode.fit._matrices import eigh, inverse, svd
-from polhode.fit._parameters import Parameters
-from polhode.fit._recording import Recording, needed
+from polhode.fit._parameters import Parameters, entries_of, whole_of
+from polhode.fit._recording import Recording, needed, turn_between
 from polhode.fit._residuals import Model
-from polhode.fit._solve import Problem, Solution, misfit_of
+from polhode.fit._solve import FitOptions, Solution, misfit_of
 from polhode.inertia import Inertia, principal
-from polhode.rotation import conjugate, multiply, to_matrix
 
 
 class Finding(enum.IntFlag):
@@ -109,14 +109,7 @@ class InertiaFit(eqx.Module):
         ratios ``I_k (I_i + I_j - I_k)``. It is as physical as the first, so free rates alone cannot
         tell the handedness; attitudes, a wheel or knowledge of the body can.
         """
-        values = self.moments
-        other = values * (jnp.sum(values, axis=-1, keepdims=True) - 2 * values)
-        other = other / jnp.max(other, axis=-1, keepdims=True)
-        diagonal = other[..., None] * jnp.broadcast_to(
-            jnp.eye(3, dtype=values.dtype), (*other.shape, 3)
-        )
-        matrix = to_matrix(self.axes)
-        return Inertia(full=matrix @ diagonal @ jnp.swapaxes(matrix, -1, -2))
+        return Inertia(diagonal=_other_hand(self.moments)).turned(self.axes)
 
     def interval(self, level: float = 0.95) -> tuple[Array, Array]:
         """Ends (..., 3) of the intervals of ``ratios``, or of ``moments`` if the scale is known."""
@@ -128,9 +121,7 @@ class InertiaFit(eqx.Module):
 
     def findings(self, body: int = 0) -> list[str]:
         """Names of the remarks on one body, in plain words."""
-        code = int(np.asarray(self.finding).reshape(-1)[body])
-        named = Finding.__members__.items()
-        return [name.lower().replace("_", " ") for name, flag in named if code & flag]
+        return [plainly(flag) for flag in found_of(self, body, Finding)]
 
     def report(self) -> str:
         """A short text per body: moments, uncertainty, remarks with cause and cure."""
@@ -154,22 +145,41 @@ _SCALE = (
 )
 
 
+def found_of(fit: Any, body: int, among: Iterable[Finding]) -> list[Finding]:
+    """The flags of one body of a fit, in this order."""
+    code = int(np.asarray(fit.finding).reshape(-1)[body])
+    return [flag for flag in among if code & flag]
+
+
+def plainly(flag: Finding) -> str:
+    """The name of a flag in plain words."""
+    return str(flag.name).lower().replace("_", " ")
+
+
+def flagged(seen: Mapping[Finding, Array]) -> Array:
+    """The ``Finding`` of those that are seen (under jit and vmap)."""
+    return sum((jnp.where(x, int(flag), 0) for flag, x in seen.items()), start=jnp.asarray(0))
+
+
+def _other_hand(moments: Any) -> Any:
+    """Moments (..., 3) of ``InertiaFit.mirrored``."""
+    other = moments * (moments.sum(axis=-1, keepdims=True) - 2 * moments)
+    return other / other.max(axis=-1, keepdims=True)
+
+
 def remarks(fit: InertiaFit, body: int = 0) -> list[str]:
     """What to know before using a fit, with cause and cure, in sentences."""
-    code = int(np.asarray(fit.finding).reshape(-1)[body])
     found = []
     if not fit.scale_known:
         found.append(_SCALE)
         if fit.free_rates:
-            values = np.asarray(fit.moments).reshape(-1, 3)[body]
-            twin = np.sort(values * (values.sum() - 2 * values))
-            twin = twin / twin[2]
+            twin = np.sort(_other_hand(np.asarray(fit.moments).reshape(-1, 3)[body]))
             found.append(
                 "free rates do not show the handedness of the axes: with one axis inverted the "
                 f"same data mean {twin[0]:.4f} : {twin[1]:.4f} : 1; compare with what you know of "
                 "the body"
             )
-    return found + [text for flag, text in CURES.items() if code & flag]
+    return found + [CURES[flag] for flag in found_of(fit, body, CURES)]
 
 
 def is_unusable(fit: InertiaFit) -> bool:
@@ -209,7 +219,7 @@ def shown_by(linear: Linear, recording: Recording, noise_known: bool) -> Shown:
     return Shown(information, covariance, null, safe, jnp.sum(~known), noise)
 
 
-def conclude(solution: Solution, recording: Recording, problem: Problem) -> InertiaFit:
+def conclude(solution: Solution, recording: Recording, options: FitOptions) -> InertiaFit:
     """Uncertainty and diagnostics of one body (under jit and vmap)."""
     tensor, model, linear = solution.tensor, solution.model, solution.linear
     dtype = tensor.dtype
@@ -230,7 +240,7 @@ def conclude(solution: Solution, recording: Recording, problem: Problem) -> Iner
         slope = slope * jnp.where(jnp.arange(9) // 3 == 1, size, 1)[:, None]
         sizes = jnp.where(jnp.arange(linear.shared.shape[-1]) < count, size, 1)
         linear = linear._replace(shared=linear.shared * sizes[None, None])
-    shown = shown_by(linear, recording, problem.noise_known)
+    shown = shown_by(linear, recording, options.noise_known)
     information, covariance, null, safe = shown[:4]
 
     full = jnp.concatenate([slope, jnp.zeros((9, information.shape[0] - count), dtype)], axis=1)
@@ -240,8 +250,7 @@ def conclude(solution: Solution, recording: Recording, problem: Problem) -> Iner
     reach = jnp.sqrt(jnp.sum((full / safe[None]) ** 2, axis=1))
     reach = jnp.concatenate([reach[:3], reach[:3] / moments[2], reach[6:]])
     spread = jnp.where(leaning > 1e-3 * reach, jnp.inf, spread)
-    gaps = jnp.stack([moments[2] - moments[1], moments[2] - moments[0], moments[1] - moments[0]])
-    axes_std = jnp.where(gaps > 0, spread[6:] / jnp.where(gaps > 0, gaps, 1), jnp.inf)
+    axes_std = turn_std(moments, spread[6:])
 
     parts = by_kind(linear, recording)
     whiteness = whiteness_of(linear.rest, recording.present)
@@ -253,18 +262,17 @@ def conclude(solution: Solution, recording: Recording, problem: Problem) -> Iner
         rms = jnp.sqrt(mean)
     trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
     finite = jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(tensor))
-    flags = (
-        (Finding.STEP_LIMIT, ~solution.stopped),
-        (Finding.NOT_FINITE, ~finite),
+    finding = flagged({
+        Finding.STEP_LIMIT: ~solution.stopped,
+        Finding.NOT_FINITE: ~finite,
         # the least of the second moments
-        (Finding.NEARLY_FLAT, trace / 2 - moments[2] < 1e-4 * trace),
-        (Finding.UNDETERMINED, jnp.any(~jnp.isfinite(spread[3:6]))),
-        (Finding.NOT_WHITE, whiteness < 1e-4),
-        (Finding.WEAK, jnp.any(spread[3:6] > 0.05)),
-        (Finding.POOR, misfit_of(linear, problem.robust) > 4 * solution.expected),
-        (Finding.AXES_DISAGREE, _axes_disagree(recording, problem)),
-    )
-    finding = sum(jnp.where(seen, int(flag), 0) for flag, seen in flags)
+        Finding.NEARLY_FLAT: trace / 2 - moments[2] < 1e-4 * trace,
+        Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread[3:6])),
+        Finding.NOT_WHITE: whiteness < 1e-4,
+        Finding.WEAK: jnp.any(spread[3:6] > 0.05),
+        Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
+        Finding.AXES_DISAGREE: _axes_disagree(recording, options),
+    })  # fmt: skip
     return InertiaFit(
         Inertia(full=tensor), moments, axes, moments / moments[2],
         spread[:3], spread[3:6], axes_std, information, covariance, shown.null_count,
@@ -272,6 +280,12 @@ def conclude(solution: Solution, recording: Recording, problem: Problem) -> Iner
         solution.attempts, solution.parameters, model,
         parts, model.scale_known, recording.wxyz is None,
     )  # fmt: skip
+
+
+def turn_std(moments: Float[Array, "3"], products_std: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Standard deviations [rad] about the principal axes of those of the products of inertia."""
+    gaps = jnp.stack([moments[2] - moments[1], moments[2] - moments[0], moments[1] - moments[0]])
+    return jnp.where(gaps > 0, products_std / jnp.where(gaps > 0, gaps, 1), jnp.inf)
 
 
 def sensor_axes(recording: Recording) -> Float[Array, "*b 3 3"]:
@@ -286,16 +300,16 @@ def sensor_axes(recording: Recording) -> Float[Array, "*b 3 3"]:
     return mixed @ inverse(square)
 
 
-def _axes_disagree(recording: Recording, problem: Problem) -> Array:
+def _axes_disagree(recording: Recording, options: FitOptions) -> Array:
     """Whether gyroscope and attitudes contradict each other beyond any mounting rotation."""
     if recording.omega is None or recording.wxyz is None:
         return jnp.asarray(False)
-    measured, seen = _turns(recording, centred=problem.bias)
+    measured, seen = _turns(recording, centred=options.bias)
     # the proper rotation nearest to the correlation of both, and how much its mirror image gains
     left, sizes, right = svd(jnp.einsum("rti,rtj->ij", measured, seen))
     hand = jnp.sign(jnp.linalg.det(left) * jnp.linalg.det(right))
     inverted = (hand < 0) & (sizes[2] > 0.1 * sizes[1])
-    if problem.mounting:
+    if options.mounting:
         return inverted
     signs = jnp.stack([jnp.ones_like(hand), jnp.ones_like(hand), hand])
     turn = left @ (signs[:, None] * right)
@@ -309,12 +323,10 @@ def _turns(recording: Recording, centred: bool) -> tuple[Array, Array]:
     ``centred``: less their means, whose difference may be the gyroscope's bias.
     """
     wxyz, omega = needed("wxyz", recording.wxyz), needed("omega", recording.omega)
-    turn = multiply(conjugate(wxyz[..., :-1, :]), wxyz[..., 1:, :])
-    sign = jnp.where(turn[..., :1] < 0, -1, 1).astype(turn.dtype)
     weight = (recording.present[..., 1:] * recording.present[..., :-1])[..., None]
     step = jnp.diff(recording.times, axis=-1)[..., None]
     measured = step * (omega[..., 1:, :] + omega[..., :-1, :]) / 2
-    turned = 2 * sign * turn[..., 1:]
+    turned = turn_between(wxyz[..., :-1, :], wxyz[..., 1:, :])
     if centred:
         total = jnp.sum(weight, axis=-2, keepdims=True)
         measured, turned = (

@@ -12,15 +12,26 @@ from jaxtyping import Array, ArrayLike, Float
 from polhode._batch import PARTS, batch_shapes
 from polhode._checks import as_float_array
 from polhode._scene import Scene
-from polhode._simulate import simulate
 from polhode._state import State
 from polhode.fit._fit import each, together
-from polhode.fit._motion import AbstractMotion, Predicted
+from polhode.fit._motion import AbstractMotion
 from polhode.fit._parameters import NoInertia
 from polhode.fit._recording import Recording, stack
 from polhode.fit._residuals import Huber
-from polhode.fit._result import CURES, UNUSABLE, Finding, FitError, by_kind, shown_by, whiteness_of
-from polhode.fit._solve import Problem, Solution, misfit_of
+from polhode.fit._result import (
+    CURES,
+    UNUSABLE,
+    Finding,
+    FitError,
+    by_kind,
+    flagged,
+    found_of,
+    plainly,
+    shown_by,
+    whiteness_of,
+)
+from polhode.fit._scene_motion import simulated
+from polhode.fit._solve import FitOptions, Solution, misfit_of
 from polhode.methods import AbstractMethod
 from polhode.rotation import multiply, rotation_vector_to_wxyz
 
@@ -57,13 +68,8 @@ class LeafMotion(AbstractMotion):
         return jax.tree.unflatten(tree, leaves)
 
     def __call__(self, tensor, omega, wxyz, times, wheel, unknown):
-        start = wxyz if self.attitude is None or wxyz is not None else self.attitude
-        if start is None:
-            start = jnp.asarray([1, 0, 0, 0], omega.dtype)
-        state = State(start.astype(omega.dtype), omega)
         scene = self.with_values(unknown)
-        found = simulate(scene, state, times, self.method, rtol=self.rtol, throw=False)
-        return Predicted(found.omega_body, None, None if wxyz is None else found.wxyz)
+        return simulated(scene, omega, wxyz, times, self.method, self.rtol, self.attitude)
 
 
 class SceneFit(eqx.Module):
@@ -101,8 +107,7 @@ class SceneFit(eqx.Module):
 
     def findings(self, body: int = 0) -> list[str]:
         """Names of the remarks on one body, in plain words."""
-        code = int(np.asarray(self.finding).reshape(-1)[body])
-        return [str(flag.name).lower().replace("_", " ") for flag in _CURES if code & flag]
+        return [plainly(flag) for flag in found_of(self, body, _CURES)]
 
     def report(self, body: int = 0) -> str:
         """A short text on one body: values, uncertainty, remarks with cause and cure."""
@@ -114,8 +119,7 @@ class SceneFit(eqx.Module):
                 for x in (value, spread)
             )
             lines.append(", ".join(f"{v:.6g} +- {s:.2g}" for v, s in zip(value, spread)))
-        code = int(np.asarray(self.finding).reshape(-1)[body])
-        return "\n".join(lines + [f"- {text}" for flag, text in _CURES.items() if code & flag])
+        return "\n".join(lines + [f"- {_CURES[flag]}" for flag in found_of(self, body, _CURES)])
 
 
 _CURES = {
@@ -170,13 +174,13 @@ def fit_scene(
     unless ``throw=False`` FitError when the fit is not finite or stopped early.
     """
     motion = LeafMotion(scene, places_of(scene, free), _start(attitude, scene), method, rtol)
-    problem = Problem(
+    options = FitOptions(
         motion, NoInertia(), None, robust, bias, False, noise_known, starts, solver, max_steps
     )
     if isinstance(data, Recording):
-        found = each(data, problem, conclude_scene)
+        found = each(data, options, conclude_scene)
     elif isinstance(data, list | tuple) and data and all(isinstance(x, Recording) for x in data):
-        found = together(stack(data), problem, conclude_scene)
+        found = together(stack(data), options, conclude_scene)
     else:
         raise TypeError(
             "data must be a ph.fit.Recording (ph.fit.Recording.of(times, omega_body, ...)) or a"
@@ -235,10 +239,10 @@ class _Mark:
         self.place = place
 
 
-def conclude_scene(solution: Solution, recording: Recording, problem: Problem) -> SceneFit:
+def conclude_scene(solution: Solution, recording: Recording, options: FitOptions) -> SceneFit:
     """Values, uncertainty and diagnostics of one body (under jit and vmap)."""
     linear, parameters = solution.linear, solution.parameters
-    shown = shown_by(linear, recording, problem.noise_known)
+    shown = shown_by(linear, recording, options.noise_known)
     count = linear.shared.shape[-1]
     spread = jnp.sqrt(jnp.maximum(jnp.diagonal(shown.covariance), 0))
     leaning = jnp.sqrt(jnp.sum((shown.null * shown.safe[:, None]) ** 2, axis=1))
@@ -254,17 +258,15 @@ def conclude_scene(solution: Solution, recording: Recording, problem: Problem) -
         initial = State(turned, parameters.omega)
     whiteness = whiteness_of(linear.rest, recording.present)
     finite = jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(linear.at))
-    poor = misfit_of(linear, problem.robust) > 4 * solution.expected
-    flags = (
-        (Finding.STEP_LIMIT, ~solution.stopped),
-        (Finding.NOT_FINITE, ~finite),
-        (Finding.UNDETERMINED, jnp.any(~jnp.isfinite(spread))),
-        (Finding.NOT_WHITE, whiteness < 1e-4),
-        (Finding.POOR, poor),
-    )
-    finding = sum(jnp.where(seen, int(flag), 0) for flag, seen in flags)
+    finding = flagged({
+        Finding.STEP_LIMIT: ~solution.stopped,
+        Finding.NOT_FINITE: ~finite,
+        Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread)),
+        Finding.NOT_WHITE: whiteness < 1e-4,
+        Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
+    })  # fmt: skip
     return SceneFit(
         values, std, initial, parameters.omega, parameters.bias,
         shown.covariance[:count, :count], shown.null_count, shown.noise, whiteness, finding,
-        solution.steps, by_kind(linear, recording), problem.motion,
+        solution.steps, by_kind(linear, recording), options.motion,
     )  # fmt: skip

@@ -14,6 +14,14 @@ from polhode.inertia import Inertia
 from polhode.methods import AbstractMethod, LiePoisson
 
 
+def simulated(scene, omega, wxyz, times, method, rtol, attitude=None) -> Predicted:
+    """The motion by ``ph.simulate``; without ``wxyz`` from ``attitude``, or from the space axes."""
+    axes = jnp.asarray([1, 0, 0, 0])
+    start = next(x for x in (wxyz, attitude, axes) if x is not None).astype(omega.dtype)
+    found = simulate(scene, State(start, omega), times, method, rtol=rtol, throw=False)
+    return Predicted(found.omega_body, None, None if wxyz is None else found.wxyz)
+
+
 class SceneMotion(AbstractMotion):
     """Motion of the scene ``build(inertia, unknown)``, by ``ph.simulate``.
 
@@ -41,8 +49,4 @@ class SceneMotion(AbstractMotion):
 
     def __call__(self, tensor, omega, wxyz, times, wheel, unknown):
         scene = self.build(Inertia(full=tensor), unknown)
-        start = jnp.asarray([1, 0, 0, 0], omega.dtype) if wxyz is None else wxyz
-        found = simulate(
-            scene, State(wxyz=start, omega_body=omega), times, self.method, rtol=self.rtol
-        )
-        return Predicted(found.omega_body, None, None if wxyz is None else found.wxyz)
+        return simulated(scene, omega, wxyz, times, self.method, self.rtol)

@@ -9,21 +9,23 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from polhode.fit._linear import Linear, entries_of, linearise, unknowns, whole_of
-from polhode.fit._motion import AbstractMotion
+from polhode.fit._linear import Linear, linearise, unknowns
+from polhode.fit._motion import AbstractMotion, FreeMotion
 from polhode.fit._optimiser import LevenbergMarquardt
 from polhode.fit._parameters import (
     AbstractInertiaUnknown,
     Base,
+    FullTensor,
     Parameters,
     base_of,
+    entries_of,
     free_columns,
+    whole_of,
 )
-from polhode.fit._recording import Recording, bridged, needed
+from polhode.fit._recording import Recording, bridged, needed, turn_between
 from polhode.fit._residuals import Huber, Model
 from polhode.fit._start import alternatives, regression, scatter
 from polhode.inertia import Inertia, inertia_of_second_moments, second_moments
-from polhode.rotation import conjugate, multiply
 
 # Parts of the recording that are fitted one after the other where the whole misleads at first.
 _PARTS = (0.1, 0.2, 0.35, 0.6, 1.0)
@@ -38,11 +40,11 @@ _SAME = 1e-4
 _OFFSET = 1e-4
 
 
-class Problem(eqx.Module):
+class FitOptions(eqx.Module):
     """What is asked: motion, unknowns, loss, start and optimiser (see ``fit_inertia``)."""
 
-    motion: AbstractMotion
-    unknown: AbstractInertiaUnknown
+    motion: AbstractMotion = eqx.field(converter=lambda given: given or FreeMotion())
+    unknown: AbstractInertiaUnknown = eqx.field(converter=lambda given: given or FullTensor())
     known: Inertia | None = None
     robust: Huber | None = None
     bias: bool = eqx.field(static=True, default=False)
@@ -88,17 +90,17 @@ class _Search(eqx.Module):
     good: Array
 
 
-def solve(recording: Recording, problem: Problem) -> Solution:
+def solve(recording: Recording, options: FitOptions) -> Solution:
     """Fit one body to its recordings (leading axis r). Pure; works under jit and vmap."""
     rates = _rates(recording)
-    bases, first = _bases(recording, rates, problem)
-    scale_known = problem.motion.fixes_scale()
-    columns = free_columns(problem.unknown, scale_known)
+    bases, first = _bases(recording, rates, options)
+    scale_known = options.motion.fixes_scale()
+    columns = free_columns(options.unknown, scale_known)
     fixed = tuple(map(tuple, columns.tolist()))
     attitude = None if recording.wxyz is None else recording.wxyz[:, 0]
 
     def model_of(base):
-        return Model(problem.motion, base, attitude, problem.robust, fixed, scale_known)
+        return Model(options.motion, base, attitude, options.robust, fixed, scale_known)
 
     dtype = rates.dtype
     zero = jnp.zeros(3, dtype)
@@ -106,10 +108,10 @@ def solve(recording: Recording, problem: Problem) -> Solution:
         shape=jnp.zeros(columns.shape[1], dtype),
         omega=rates[:, 0],
         attitude=None if attitude is None else jnp.zeros((rates.shape[0], 3), dtype),
-        bias=zero if problem.bias else None,
-        mounting=zero if problem.mounting else None,
+        bias=zero if options.bias else None,
+        mounting=zero if options.mounting else None,
         lever=zero if recording.force is not None else None,
-        motion=jax.tree.map(lambda x: jnp.asarray(x, dtype), problem.motion.start()),
+        motion=jax.tree.map(lambda x: jnp.asarray(x, dtype), options.motion.start()),
     )
     scale = _scale(begin, recording, rates)
     # the optimiser counts in the default precision whatever that of the data
@@ -120,8 +122,8 @@ def solve(recording: Recording, problem: Problem) -> Solution:
         return jax.tree.map(lambda a, b: a.astype(dtype) * b, scaled, scale)
 
     weight = _weight(recording, rates)
-    solver = problem.solver or LevenbergMarquardt(_OFFSET, float(jnp.finfo(dtype).eps) ** 0.75)
-    expected = _expected(recording, problem)
+    solver = options.solver or LevenbergMarquardt(_OFFSET, float(jnp.finfo(dtype).eps) ** 0.75)
+    expected = _expected(recording, options)
     # of one residual: 1 where the noise is known
     noise = jnp.sqrt(expected / jnp.sum(recording.present) / (3 * _kinds(recording)))
     noise = jnp.where(jnp.isfinite(noise), noise, 0.1 / weight)
@@ -143,7 +145,7 @@ def solve(recording: Recording, problem: Problem) -> Solution:
         prior = belief * scaled.shape.astype(dtype)
         return (weight * jnp.concatenate([misfit.ravel(), prior])).astype(wide), linear
 
-    jobs = _jobs(bases.soft.shape[0], problem.starts)
+    jobs = _jobs(bases.soft.shape[0], options.starts)
     which, part = (jnp.asarray(column) for column in (jobs["base"], jobs["part"]))
     part = part.astype(dtype)
     span = recording.times[:, -1:] - recording.times[:, :1]
@@ -160,7 +162,7 @@ def solve(recording: Recording, problem: Problem) -> Solution:
         start = jax.tree.map(lambda a, b: jnp.where(anew, a, b), fresh, search.scaled)
         found = optx.least_squares(
             misfits, solver, start, (base, within, belief),
-            has_aux=True, max_steps=problem.max_steps, throw=False,
+            has_aux=True, max_steps=options.max_steps, throw=False,
         )  # fmt: skip
         # the auxiliary output of the last accepted step; ``found.aux`` is that of the one before
         linear = found.state.aux
@@ -177,7 +179,7 @@ def solve(recording: Recording, problem: Problem) -> Solution:
         return _Search(
             job + 1, found.value, best, base, linear, cost,
             search.steps + found.stats["num_steps"], search.attempts + jnp.where(whole, 1, 0),
-            stopped, stopped & (again | (misfit_of(linear, problem.robust) <= _GOOD**2 * expected)),
+            stopped, stopped & (again | (misfit_of(linear, options.robust) <= _GOOD**2 * expected)),
         )  # fmt: skip
 
     one = jax.tree.map(lambda leaf: leaf[0], bases)
@@ -192,21 +194,11 @@ def solve(recording: Recording, problem: Problem) -> Solution:
     )  # fmt: skip
     count = len(jobs["base"])
     ended = jax.lax.while_loop(lambda s: (s.job < count) & ~s.good, attempt, begun)
-    parameters = actual(ended.best)
     model = model_of(ended.base)
-    linear = ended.linear
-    tensor = whole_of(linear.at, model.entries)
     return Solution(
-        parameters,
-        model,
-        tensor,
-        linear,
-        ended.cost,
-        ended.steps,
-        ended.attempts,
-        ended.stopped,
-        expected,
-    )
+        actual(ended.best), model, whole_of(ended.linear.at, model.entries), ended.linear,
+        ended.cost, ended.steps, ended.attempts, ended.stopped, expected,
+    )  # fmt: skip
 
 
 def _jobs(bases: int, attempts: int) -> dict[str, np.ndarray]:
@@ -230,13 +222,13 @@ def _kinds(recording: Recording) -> int:
     return sum(part is not None for part in (recording.omega, recording.wxyz, recording.force))
 
 
-def _expected(recording: Recording, problem: Problem) -> Float[Array, ""]:
+def _expected(recording: Recording, options: FitOptions) -> Float[Array, ""]:
     """The sum of squares that noise alone would leave.
 
     An unknown noise is taken from neighbouring samples; without rates nothing is known of it.
     """
     expected = jnp.sum(recording.present) * 3 * _kinds(recording)
-    if problem.noise_known:
+    if options.noise_known:
         return expected
     if recording.omega is None:
         return jnp.full_like(expected, jnp.inf)
@@ -277,32 +269,30 @@ def _rates(recording: Recording) -> Float[Array, "r t 3"]:
     """Measured rates, or those between successive attitudes; gaps filled by interpolation."""
     if recording.omega is None:
         wxyz = needed("wxyz", recording.wxyz)
-        turn = multiply(conjugate(wxyz[:, :-1]), wxyz[:, 1:])
-        sign = jnp.where(turn[..., :1] < 0, -1, 1).astype(turn.dtype)
-        between = 2 * sign * turn[..., 1:] / jnp.diff(recording.times, axis=-1)[..., None]
+        step = jnp.diff(recording.times, axis=-1)[..., None]
+        between = turn_between(wxyz[:, :-1], wxyz[:, 1:]) / step
         inner = (between[:, 1:] + between[:, :-1]) / 2
         return jnp.concatenate([between[:, :1], inner, between[:, -1:]], axis=1)
-
     return bridged(recording.times, recording.present, recording.omega)
 
 
-def _bases(recording, rates, problem) -> tuple[Base, Array]:
+def _bases(recording, rates, options) -> tuple[Base, Array]:
     """Starting bodies (leading axis), the best first, and the second moments of that one."""
-    if problem.unknown.columns().shape[1] == 0:
+    if options.unknown.columns().shape[1] == 0:
         first = jnp.eye(3, dtype=rates.dtype)
         return jax.tree.map(lambda leaf: leaf[None], base_of(first, True)), first
     carried = None
-    spin = getattr(problem.motion, "spin_inertia", None)
+    spin = getattr(options.motion, "spin_inertia", None)
     if spin is not None:
-        axis = jnp.asarray(problem.motion.axis, rates.dtype)
+        axis = jnp.asarray(options.motion.axis, rates.dtype)
         carried = spin * recording.wheel[..., None] * axis[None, None]
     first, second, _ = regression(rates, recording.times, recording.present, carried)
-    if problem.known is not None:
-        first = second_moments(problem.known.tensor)
+    if options.known is not None:
+        first = second_moments(options.known.tensor)
     bodies = jnp.stack([first, second, *alternatives(rates, first)])
-    if problem.unknown.columns().shape[1] == 3:
+    if options.unknown.columns().shape[1] == 3:
         bodies = bodies * jnp.eye(3, dtype=bodies.dtype)[None]
-    known = problem.motion.fixes_scale()
+    known = options.motion.fixes_scale()
     return jax.vmap(lambda sigma: base_of(sigma, known))(bodies), bodies[0]
 
 

@@ -16,11 +16,8 @@ from jaxtyping import Array, Float
 
 from polhode.fit._matrices import eigh, solve
 from polhode.fit._motion import free_acceleration
-from polhode.inertia import (
-    Inertia,
-    inertia_of_second_moments,
-    second_moments,
-)
+from polhode.fit._parameters import whole_of
+from polhode.inertia import Inertia, inertia_of_second_moments, second_moments
 from polhode.rotation import multiply, rotation_vector_to_wxyz, to_matrix
 
 # second moments below this part of their sum are lifted to it before the logarithm is taken
@@ -90,9 +87,7 @@ def _design(omega: Float[Array, "t 3"]) -> Float[Array, "t 3 6"]:
 
 def _physical(entries: Float[Array, " 6"]) -> Float[Array, "3 3"]:
     """Second moments of the nearest body that is not too flat."""
-    a, b, c, p, q, r = entries
-    tensor = jnp.stack([jnp.stack([a, r, q]), jnp.stack([r, b, p]), jnp.stack([q, p, c])])
-    values, axes = eigh(second_moments(tensor))
+    values, axes = eigh(second_moments(whole_of(entries)))
     least = _FLATTEST * jnp.sum(jnp.abs(values))
     values = jnp.maximum(values, least)
     return jnp.einsum("ij,j,kj->ik", axes, values, axes)

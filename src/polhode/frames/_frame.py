@@ -18,7 +18,7 @@ from polhode.frames._turning import (
     VariableRate,
     rate_of_change,
 )
-from polhode.parts import checked, kept, takes
+from polhode.parts import Signature, kept, takes
 from polhode.rotation import conjugate, identity, normalise, rotate
 from polhode.trajectory import Trajectory
 
@@ -55,7 +55,7 @@ def _sum(terms: list[Array | None]) -> Array:
 def _origin(function):
     if function is None:
         return None
-    return checked("RotatingFrame origin", function, ("t",), ((),), (3,))
+    return Signature("RotatingFrame origin", {"t": ()}, (3,)).checked(function)
 
 
 class RotatingFrame(eqx.Module):
@@ -110,7 +110,7 @@ class RotatingFrame(eqx.Module):
             start = normalise(start)
         t0 = jnp.asarray(t0, start.dtype)
         if varies:
-            omega_body = checked("RotatingFrame.from_rate", omega_body, ("t",), ((),), (3,))
+            omega_body = Signature("RotatingFrame.from_rate", {"t": ()}, (3,)).checked(omega_body)
             return cls(VariableRate(omega_body, start, t0), origin)
         return cls(ConstantRate(omega, start, t0), origin)
 
@@ -141,7 +141,7 @@ class RotatingFrame(eqx.Module):
 
         jax.eval_shape(look, t)
         shape = (3, 3) if found == [(3, 3)] else (4,)
-        return cls(PrescribedAttitude(checked(name, attitude, ("t",), ((),), shape)), origin)
+        return cls(PrescribedAttitude(Signature(name, {"t": ()}, shape).checked(attitude)), origin)
 
     @classmethod
     def from_trajectory(

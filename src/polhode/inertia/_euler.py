@@ -1,4 +1,8 @@
-"""Euler's equation of the rigid body in body axes (docs/equations.md, 003: 29)."""
+"""Euler's equation of the rigid body in body axes (docs/equations.md, 003: 29).
+
+A formula for those who have rates at hand: no motion is computed by it, and a test derives it from
+the one Hamiltonian.
+"""
 
 import jax.numpy as jnp
 import numpy as np

@@ -6,7 +6,8 @@ accuracy; each is checked against its defining integral in the tests.
 
 import abc
 import enum
-from typing import Self
+from collections.abc import Mapping
+from typing import Any, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -55,16 +56,11 @@ class AbstractShaped(eqx.Module):
         ``inner_sides`` (..., 3): edge lengths of a concentric empty box inside it.
         """
         if inner_sides is None:
-            mass, a = as_floats(mass=(mass, ()), sides=(sides, (3,)))
-            _check_size(mass, sides=a)
+            mass, a = _sized(mass, {"sides": sides}, core=(3,))
             x, y, z = (a[..., i] ** 2 / 12 for i in range(3))
             return cls._of_shape(mass, _of_second_moments(mass, x, y, z), Symmetry.NONE)
-        mass, a, b = as_floats(
-            mass=(mass, ()), sides=(sides, (3,)), inner_sides=(inner_sides, (3,))
-        )
-        _check_size(mass, sides=a)
-        require_positive("inner_sides", b, zero=True)
-        require_below("inner_sides", b, "sides", a)
+        lengths = {"sides": sides, "inner_sides": inner_sides}
+        mass, a, b = _sized(mass, lengths, {"inner_sides": "sides"}, core=(3,))
         wall = a - b
         require_positive("the wall, max(sides - inner_sides),", jnp.max(wall, axis=-1))
         squares = []
@@ -82,20 +78,15 @@ class AbstractShaped(eqx.Module):
     @classmethod
     def from_ellipsoid(cls, mass: ArrayLike, semi_axes: ArrayLike) -> Self:
         """A solid ellipsoid of semi-axes (..., 3)."""
-        mass, a = as_floats(mass=(mass, ()), semi_axes=(semi_axes, (3,)))
-        _check_size(mass, semi_axes=a)
+        mass, a = _sized(mass, {"semi_axes": semi_axes}, core=(3,))
         moments = _of_second_moments(mass, *(a[..., i] ** 2 / 5 for i in range(3)))
         return cls._of_shape(mass, moments, Symmetry.NONE)
 
     @classmethod
     def from_sphere(cls, mass: ArrayLike, radius: ArrayLike, inner_radius: ArrayLike = 0.0) -> Self:
         """A solid ball, or a ball around a concentric cavity of ``inner_radius`` (...)."""
-        mass, outer, inner = as_floats(
-            mass=(mass, ()), radius=(radius, ()), inner_radius=(inner_radius, ())
-        )
-        _check_size(mass, radius=outer)
-        require_positive("inner_radius", inner, zero=True)
-        require_below("inner_radius", inner, "radius", outer)
+        lengths = {"radius": radius, "inner_radius": inner_radius}
+        mass, outer, inner = _sized(mass, lengths, _HOLLOW)
         q = inner / outer
         # (1 - q^5)/(1 - q^3), both divided by 1 - q
         ratio = (1 + q + q**2 + q**3 + q**4) / (1 + q + q**2)
@@ -114,15 +105,8 @@ class AbstractShaped(eqx.Module):
         cls, mass: ArrayLike, radius: ArrayLike, length: ArrayLike, inner_radius: ArrayLike = 0.0
     ) -> Self:
         """A cylinder along body z, solid or (``inner_radius``) a tube."""
-        mass, radius, length, inner = as_floats(
-            mass=(mass, ()),
-            radius=(radius, ()),
-            length=(length, ()),
-            inner_radius=(inner_radius, ()),
-        )
-        _check_size(mass, radius=radius, length=length)
-        require_positive("inner_radius", inner, zero=True)
-        require_below("inner_radius", inner, "radius", radius)
+        lengths = {"radius": radius, "length": length, "inner_radius": inner_radius}
+        mass, radius, length, inner = _sized(mass, lengths, _HOLLOW)
         axial = (radius**2 + inner**2) / 2
         return cls._of_shape(
             mass, _axial(mass, axial / 2 + length**2 / 12, axial), Symmetry.AXISYMMETRIC
@@ -131,21 +115,16 @@ class AbstractShaped(eqx.Module):
     @classmethod
     def from_disc(cls, mass: ArrayLike, radius: ArrayLike, inner_radius: ArrayLike = 0.0) -> Self:
         """A flat disc or ring normal to body z; the flattest body there is (Iz = Ix + Iy)."""
-        mass, radius, inner = as_floats(
-            mass=(mass, ()), radius=(radius, ()), inner_radius=(inner_radius, ())
-        )
-        _check_size(mass, radius=radius)
-        require_positive("inner_radius", inner, zero=True)
-        require_below("inner_radius", inner, "radius", radius)
+        lengths = {"radius": radius, "inner_radius": inner_radius}
+        mass, radius, inner = _sized(mass, lengths, _HOLLOW)
         axial = (radius**2 + inner**2) / 2
         return cls._of_shape(mass, _axial(mass, axial / 2, axial), Symmetry.AXISYMMETRIC)
 
     @classmethod
     def from_rod(cls, mass: ArrayLike, length: ArrayLike, radius: ArrayLike = 0.0) -> Self:
         """A round rod along body z. A thin one (radius 0) cannot turn by itself: as part only."""
-        mass, length, radius = as_floats(mass=(mass, ()), length=(length, ()), radius=(radius, ()))
-        _check_size(mass, length=length)
-        require_positive("radius", radius, zero=True)
+        lengths = {"length": length, "radius": radius}
+        mass, length, radius = _sized(mass, lengths, {"radius": None})
         axial = radius**2 / 2
         return cls._of_shape(
             mass, _axial(mass, axial / 2 + length**2 / 12, axial), Symmetry.AXISYMMETRIC
@@ -157,8 +136,7 @@ class AbstractShaped(eqx.Module):
 
         The centre of mass lies ``height / 4`` above the base.
         """
-        mass, radius, height = as_floats(mass=(mass, ()), radius=(radius, ()), height=(height, ()))
-        _check_size(mass, radius=radius, height=height)
+        mass, radius, height = _sized(mass, {"radius": radius, "height": height})
         axial = 3 * radius**2 / 10
         return cls._of_shape(
             mass, _axial(mass, axial / 2 + 3 * height**2 / 80, axial), Symmetry.AXISYMMETRIC
@@ -167,17 +145,32 @@ class AbstractShaped(eqx.Module):
     @classmethod
     def from_torus(cls, mass: ArrayLike, ring_radius: ArrayLike, tube_radius: ArrayLike) -> Self:
         """A solid torus around body z: tube centre at ``ring_radius``, tube of ``tube_radius``."""
-        mass, ring, tube = as_floats(
-            mass=(mass, ()), ring_radius=(ring_radius, ()), tube_radius=(tube_radius, ())
-        )
-        _check_size(mass, ring_radius=ring)
-        require_positive("tube_radius", tube, zero=True)
-        require_below("tube_radius", tube, "ring_radius", ring)
+        lengths = {"ring_radius": ring_radius, "tube_radius": tube_radius}
+        mass, ring, tube = _sized(mass, lengths, {"tube_radius": "ring_radius"})
         moments = _axial(mass, ring**2 / 2 + 5 * tube**2 / 8, ring**2 + 3 * tube**2 / 4)
         return cls._of_shape(mass, moments, Symmetry.AXISYMMETRIC)
 
 
-def _check_size(mass: Array, **lengths: Array) -> None:
-    require_positive("mass", mass)
-    for name, array in lengths.items():
-        require_positive(name, array)
+_HOLLOW = {"inner_radius": "radius"}
+
+
+def _sized(
+    mass: ArrayLike,
+    lengths: Mapping[str, Any],
+    inner: Mapping[str, str | None] | None = None,
+    core: tuple[int, ...] = (),
+) -> tuple[Array, ...]:
+    """Mass and lengths (..., *core) as floats with common batch axes; ValueError for wrong ones.
+
+    All must be positive, but for those of ``inner``: they may be zero and must not exceed the one
+    named (None: any).
+    """
+    inner = inner or {}
+    arrays = as_floats(mass=(mass, ()), **{name: (x, core) for name, x in lengths.items()})
+    named = dict(zip(("mass", *lengths), arrays, strict=True))
+    for name, array in named.items():
+        require_positive(name, array, zero=name in inner)
+    for name, outer in inner.items():
+        if outer is not None:
+            require_below(name, named[name], outer, named[outer])
+    return arrays

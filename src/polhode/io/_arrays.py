@@ -49,13 +49,18 @@ def _read(name: str, written: str, bodies: int, scene: Path) -> np.ndarray:
     return rows
 
 
+def possible_moments(moments: np.ndarray) -> np.ndarray:
+    """Which rows (..., 3) are positive and obey the triangle inequality."""
+    return (moments.min(axis=-1) > 0) & (2 * moments.max(axis=-1) <= moments.sum(axis=-1))
+
+
 def _first_bad(name: str, rows: np.ndarray, step: int = 2**20) -> int | None:
     """The first row that no body can have, read bit by bit."""
     for start in range(0, len(rows), step):
         part = np.asarray(rows[start : start + step], np.float64)
         good = np.isfinite(part).all(axis=1)
         if name == "moments":
-            good &= (part.min(axis=1) > 0) & (2 * part.max(axis=1) <= part.sum(axis=1))
+            good &= possible_moments(part)
         elif name == "wxyz":
             good &= part.any(axis=1)
         if not good.all():

@@ -9,6 +9,7 @@ from jaxtyping import DTypeLike
 import polhode
 from polhode import rotation
 from polhode.inertia import Inertia
+from polhode.io._arrays import possible_moments
 from polhode.io._build import build_attitudes, build_inertia, build_state
 from polhode.io._error import SceneFileError
 from polhode.io._specification import Attitudes, SceneFile
@@ -81,7 +82,7 @@ def _draw_moments(file: SceneFile, moments: np.ndarray, noise: _Noise, count: in
     for _ in range(_MOST_ROUNDS):
         fresh = moments * (1 + noise(count))
         drawn += count
-        possible = _possible(fresh)
+        possible = possible_moments(fresh)
         refused += int((~possible).sum())
         kept = np.concatenate([kept, fresh[possible]])
         if len(kept) >= count:
@@ -94,7 +95,3 @@ def _draw_moments(file: SceneFile, moments: np.ndarray, noise: _Noise, count: in
             "make relative_sigma smaller",
         )  # fmt: skip
     return kept[:count], refused
-
-
-def _possible(moments: np.ndarray) -> np.ndarray:
-    return (moments.min(axis=-1) > 0) & (2 * moments.max(axis=-1) <= moments.sum(axis=-1))

@@ -16,11 +16,8 @@ from polhode.io._specification import (
     Draw,
     EnsemblePlan,
     InitialState,
-    Kept,
-    Method,
     MonteCarlo,
     Observations,
-    Output,
     Part,
     PublishedValue,
     SceneFile,
@@ -33,8 +30,6 @@ _FACTORS = _unit.ANGLES | _unit.ANGULAR_RATES | {"kg m^2/s": 1.0, "N m": 1.0}
 
 def in_si(checked: SceneText, text: str, path: Path) -> SceneFile:
     """The scene in SI units, with the text it was read from; reads [ensemble.arrays]."""
-    state = _state(checked.state)
-    relative = checked.inertia.unit == "relative"
     plan = checked.ensemble
     return SceneFile(
         path=path,
@@ -45,17 +40,17 @@ def in_si(checked: SceneText, text: str, path: Path) -> SceneFile:
         frame=checked.frame,
         axis_names=checked.axis_names,
         inertia=_inertia(checked.inertia),
-        relative_moments=relative,
-        state=state,
+        relative_moments=checked.inertia.unit == "relative",
+        state=_state(checked.state),
         times=_times(checked.times, path),
         potentials=_parts(checked.potential, "potential"),
         torques=_parts(checked.torque, "torque"),
         rotors=_parts(checked.rotors, "rotors"),
-        method=Method(**dict(checked.method)),
+        method=checked.method,
         monte_carlo=None if checked.monte_carlo is None else _monte_carlo(checked.monte_carlo),
         published=tuple(_published(checked)),
         observations=_observations(checked, path),
-        output=Output(checked.output.file, checked.output.figure),
+        output=checked.output,
         ensemble=None if plan is None else _ensemble(plan, path),
     )
 
@@ -183,7 +178,8 @@ def _ensemble(table: Ensemble, path: Path) -> EnsemblePlan:
         sigma, half = getattr(draw, f"{lead}sigma"), getattr(draw, f"{lead}half_width")
         factor = _FACTORS[getattr(draw, "unit", "rad")]
         draws.append(Draw(name, np.array(half if sigma is None else sigma) * factor, sigma is None))
-    kept = tuple(Kept(s.quantity, s.low, s.high, s.bins) for s in table.statistics)
     rows = {} if table.arrays is None else dict(table.arrays.given())
-    return EnsemblePlan(table.bodies, table.seed, table.trajectories, tuple(draws), kept,
-                        read_arrays(rows, table.bodies, path))  # fmt: skip
+    return EnsemblePlan(
+        table.bodies, table.seed, table.trajectories, tuple(draws), tuple(table.statistics),
+        read_arrays(rows, table.bodies, path),
+    )  # fmt: skip

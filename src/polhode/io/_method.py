@@ -1,6 +1,7 @@
 """The [method] of a scene file as a method object."""
 
 import inspect
+import math
 
 import diffrax
 
@@ -28,14 +29,10 @@ def build_method(file: SceneFile) -> "polhode.AbstractMethod | None":
         if method.solver is not None:
             options["solver"] = _solver(file, method.solver)
         if method.step is not None:
-            options["dt0"] = method.step * _direction(file)
+            first, last = file.times.seconds[[0, -1]]
+            options["dt0"] = math.copysign(method.step, last - first)
             options["controller"] = diffrax.ConstantStepSize()
         return chart(**options)
-
-
-def _direction(file: SceneFile) -> float:
-    seconds = file.times.seconds
-    return 1.0 if seconds[-1] > seconds[0] else -1.0
 
 
 def _solver(file: SceneFile, name: str) -> diffrax.AbstractSolver:

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from polhode.io._batches import Statistic
+from polhode.io._models import Method, Output
+
 
 @dataclasses.dataclass(frozen=True)
 class Part:
@@ -48,16 +51,6 @@ class Times:
 
 
 @dataclasses.dataclass(frozen=True)
-class Method:
-    """Which method and solver, tolerance and fixed step, s; None: left to the planner."""
-
-    kind: str
-    solver: str | None
-    rtol: float | None
-    step: float | None
-
-
-@dataclasses.dataclass(frozen=True)
 class Spread:
     """Standard deviation of one quantity in the Monte Carlo batch, SI, and where it comes from."""
 
@@ -85,22 +78,12 @@ class Draw:
 
 
 @dataclasses.dataclass(frozen=True)
-class Kept:
-    """A quantity whose distribution over the bodies is kept; SI, histogram unless low is None."""
-
-    quantity: str
-    low: float | None
-    high: float | None
-    bins: int
-
-
-@dataclasses.dataclass(frozen=True)
 class EnsemblePlan:
     bodies: int
     seed: int
     trajectories: bool
     draws: tuple[Draw, ...]
-    statistics: tuple[Kept, ...]
+    statistics: tuple[Statistic, ...]
     rows: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
 
@@ -122,12 +105,6 @@ class Observations:
     attitudes: Attitudes
     omega_body: np.ndarray
     source: str
-
-
-@dataclasses.dataclass(frozen=True)
-class Output:
-    file: str | None
-    figure: bool
 
 
 @dataclasses.dataclass(frozen=True)

@@ -24,5 +24,3 @@ MOMENTS = {
     "slug ft^2": 4.4482216152605 * 0.3048,
     "relative": 1.0,
 }
-LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "km": 1e3}
-MASSES = {"kg": 1.0, "g": 1e-3}

@@ -58,16 +58,27 @@ def real(value: object) -> float | None:
     return result if math.isfinite(result) else None
 
 
+def simple(
+    problem: str, expected: str, schema: Mapping[str, Any], fits: Callable[[Any], bool],
+    made: Callable[[Any], Any] = lambda given: given,
+) -> Checked:  # fmt: skip
+    """What is `made` of a value that `fits`."""
+
+    def check(given: object) -> Any:
+        if not fits(given):
+            raise wrong(problem, given, expected)
+        return made(given)
+
+    return Checked(check, expected, schema)
+
+
 def number(problem: str, expected: str, fits: Callable[[float], bool], **schema: Any) -> Checked:
     """A finite number that `fits`."""
 
-    def check(value: object) -> float:
-        found = real(value)
-        if found is None or not fits(found):
-            raise wrong(problem, value, expected)
-        return found
+    def is_fitting(given: object) -> bool:
+        return (found := real(given)) is not None and fits(found)
 
-    return Checked(check, expected, {"type": "number"} | schema)
+    return simple(problem, expected, {"type": "number"} | schema, is_fitting, float)
 
 
 NUMBER = number("not a finite number", "a finite number", lambda x: True)
@@ -80,39 +91,29 @@ TOLERANCE = number(
 
 def whole(least: int, most: int) -> Checked:
     """A whole number within limits."""
-    expected = f"a whole number from {least} to {most}"
-
-    def check(value: object) -> int:
-        if isinstance(value, bool) or not isinstance(value, int) or not least <= value <= most:
-            raise wrong("not a fitting whole number", value, expected)
-        return value
-
-    return Checked(check, expected, {"type": "integer", "minimum": least, "maximum": most})
+    return simple(
+        "not a fitting whole number", f"a whole number from {least} to {most}",
+        {"type": "integer", "minimum": least, "maximum": most},
+        lambda x: isinstance(x, int) and not isinstance(x, bool) and least <= x <= most,
+    )  # fmt: skip
 
 
-def _text(value: object) -> str:
-    if not isinstance(value, str):
-        raise wrong("not a text", value, TEXT.expected)
-    return value
-
-
-def _flag(value: object) -> bool:
-    if not isinstance(value, bool):
-        raise wrong("not a yes or no", value, FLAG.expected)
-    return value
-
-
-def _date(value: object) -> datetime.datetime:
-    if not isinstance(value, datetime.datetime):
-        raise wrong("not a date with a time", value, DATE.expected)
-    return value.replace(tzinfo=datetime.UTC) if value.tzinfo is None else value
-
-
-TEXT = Checked(_text, "a text in quotation marks", {"type": "string"})
-FLAG = Checked(_flag, "true or false", {"type": "boolean"})
-DATE = Checked(
-    _date, "a date and time such as 1992-11-09T17:49:47Z, without quotation marks",
-    {"type": "string", "format": "date-time"},
+TEXT = simple(
+    "not a text", "a text in quotation marks", {"type": "string"}, lambda x: isinstance(x, str)
+)
+FLAG = simple(
+    "not a yes or no", "true or false", {"type": "boolean"}, lambda x: isinstance(x, bool)
+)
+DATE = simple(
+    "not a date with a time",
+    "a date and time such as 1992-11-09T17:49:47Z, without quotation marks",
+    {"type": "string", "format": "date-time"}, lambda x: isinstance(x, datetime.datetime),
+    lambda x: x.replace(tzinfo=datetime.UTC) if x.tzinfo is None else x,
+)  # fmt: skip
+NAMES = simple(
+    "not three texts", 'three texts, e.g. ["x", "y", "z"]',
+    {"type": "array", "items": {"type": "string"}, "minItems": 3, "maxItems": 3},
+    lambda x: isinstance(x, list) and len(x) == 3 and all(isinstance(n, str) for n in x), tuple,
 )  # fmt: skip
 
 
@@ -209,7 +210,7 @@ SEQUENCES = [a + b + c for a in "xyz" for b in "xyz" for c in "xyz" if a != b an
 
 
 def _sequence(value: object) -> str:
-    if _text(value).lower() not in SEQUENCES:
+    if TEXT.check(value).lower() not in SEQUENCES:
         raise wrong("unknown Euler sequence", value, SEQUENCE.expected)
     return str(value).lower()
 
@@ -217,20 +218,8 @@ def _sequence(value: object) -> str:
 SEQUENCE = Checked(_sequence, "three letters of x, y, z, neighbours different", {"enum": SEQUENCES})
 
 
-def _names(value: object) -> tuple[str, ...]:
-    if not isinstance(value, list) or len(value) != 3 or not all(isinstance(n, str) for n in value):
-        raise wrong("not three texts", value, NAMES.expected)
-    return tuple(value)
-
-
-NAMES = Checked(
-    _names, 'three texts, e.g. ["x", "y", "z"]',
-    {"type": "array", "items": {"type": "string"}, "minItems": 3, "maxItems": 3},
-)  # fmt: skip
-
-
 def _path(value: object) -> str:
-    text = _text(value)
+    text = TEXT.check(value)
     parts = text.replace("\\", "/").split("/")
     if not text.isprintable() or not text or parts[0] == "" or ".." in parts or ":" in parts[0]:
         raise wrong(

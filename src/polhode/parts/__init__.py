@@ -1,10 +1,13 @@
 """What scenes are made of: parts with batch axes, and the functions that users give them."""
 
 from polhode.parts._functions import (
-    checked as checked,
+    Signature as Signature,
     kept as kept,
-    mapped as mapped,
     result_of as result_of,
     takes as takes,
 )
-from polhode.parts._part import AbstractPart as AbstractPart, shaped as shaped
+from polhode.parts._part import (
+    AbstractPart as AbstractPart,
+    shaped as shaped,
+    terms_of as terms_of,
+)

@@ -5,9 +5,10 @@ It is therefore kept as static data, equal to itself only. What is a pytree alre
 ``eqx.Module``, ``jax.tree_util.Partial``) is kept as it is: its arrays are leaves of the scene.
 """
 
+import dataclasses
 import functools
 import inspect
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -120,40 +121,39 @@ def result_of(
     return array.astype(dtype)
 
 
-def checked(
-    name: str, fn: Any, arguments: Sequence[str], shapes: Sequence[tuple[int, ...]], shape
-) -> Callable:
-    """The function, kept (see ``kept``), after one look at what it takes and returns.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Signature:
+    """What the functions given to ``name`` take and return: shapes of one body at one time."""
 
-    Nothing is computed: the function is traced once with arguments of the ``shapes``.
-    """
-    takes(name, fn, arguments)
-    fn = kept(fn)
-    dtype = jnp.result_type(float)
-    weak = [jax.ShapeDtypeStruct(s, dtype, weak_type=True) for s in shapes]  # of any dtype
-    with jax.numpy_dtype_promotion("standard"):  # the precision of the scene is not yet known
-        jax.eval_shape(lambda *args: result_of(name, arguments, fn, shape, None, *args), *weak)
-    return fn
+    name: str
+    arguments: Mapping[str, tuple[int, ...]]
+    returns: tuple[int, ...] = ()
 
+    def checked(self, fn: Any) -> Callable:
+        """The function, kept (see ``kept``), after one look at what it takes and returns.
 
-def mapped(
-    name: str,
-    fn: Callable,
-    arguments: Sequence[str],
-    shapes: Sequence[tuple[int, ...]],
-    shape: tuple[int, ...],
-    *args: Array,
-) -> Array:
-    """``fn`` over the leading axes of its arguments: an array (..., *shape) of their dtype."""
-    known = [x for x in args if hasattr(x, "dtype")]
-    dtype = jnp.result_type(*known) if known else None
+        Nothing is computed: the function is traced once with arguments of these shapes.
+        """
+        takes(self.name, fn, tuple(self.arguments))
+        fn = kept(fn)
+        dtype = jnp.result_type(float)
+        shapes = self.arguments.values()
+        weak = [jax.ShapeDtypeStruct(s, dtype, weak_type=True) for s in shapes]  # of any dtype
+        with jax.numpy_dtype_promotion("standard"):  # the precision of the scene is not yet known
+            jax.eval_shape(lambda *args: self._result(fn, None, *args), *weak)
+        return fn
 
-    def one(*args):
-        return result_of(name, arguments, fn, shape, dtype, *args)
+    def mapped(self, fn: Callable, *args: Any) -> Array:
+        """``fn`` over the leading axes of its arguments: (..., *returns) of their dtype."""
+        known = [x for x in args if hasattr(x, "dtype")]
+        dtype = jnp.result_type(*known) if known else None
+        taken, given = (
+            ",".join(f"({','.join(map(str, shape))})" for shape in shapes)
+            for shapes in (self.arguments.values(), [self.returns])
+        )
+        return jnp.vectorize(
+            lambda *args: self._result(fn, dtype, *args), signature=f"{taken}->{given}"
+        )(*args)
 
-    def signature(sizes):
-        return "(" + ",".join(map(str, sizes)) + ")"
-
-    return jnp.vectorize(one, signature=",".join(map(signature, shapes)) + "->" + signature(shape))(
-        *args
-    )
+    def _result(self, fn: Callable, dtype: Any, *args: Any) -> Array:
+        return result_of(self.name, tuple(self.arguments), fn, self.returns, dtype, *args)

@@ -63,6 +63,17 @@ class AbstractPart(eqx.Module):
         return part
 
 
+def terms_of(name: str, kind: type, total: type, one: Any, other: Any) -> tuple[Any, ...]:
+    """The terms of ``one + other``, either of which may be a ``total`` of several already.
+
+    TypeError unless ``other`` is of the same ``kind``, called ``name``.
+    """
+    if not isinstance(other, kind):
+        raise TypeError(f"a {name} adds to another {name}, not to {type(other).__name__}")
+    several = (part.terms if isinstance(part, total) else (part,) for part in (one, other))
+    return tuple(term for terms in several for term in terms)
+
+
 def _fits(value: Any, core: tuple[int | None, ...]) -> bool:
     """Whether a value is an array of floats (..., *core)."""
     if not isinstance(value, jax.Array) or not jnp.issubdtype(value.dtype, jnp.floating):

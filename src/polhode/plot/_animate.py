@@ -7,7 +7,7 @@ import numpy as np
 
 from polhode.io import whole_file
 from polhode.plot._matplotlib import AXES, INK, new_figure, styled
-from polhode.plot._samples import Samples, as_samples, matrices
+from polhode.plot._samples import Samples, as_samples, box_sides, matrices
 from polhode.plot._scale import Scale
 from polhode.trajectory import Trajectory
 
@@ -15,6 +15,7 @@ _FACES = np.array(
     [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]
 )
 _MOST_BODIES = 64
+_WRITERS = {".gif": "pillow", ".mp4": "ffmpeg", ".html": None, ".htm": None}
 
 
 @styled
@@ -88,11 +89,8 @@ def animate(
 def _box(tensor: np.ndarray) -> np.ndarray:
     """Corners (8, 3) in body axes of the box with this inertia, its diagonal of length 1."""
     moments, axes = np.linalg.eigh(tensor)
-    second = np.clip(moments.sum() / 2 - moments, 0, None)
-    sides = np.sqrt(second / second.sum())
     signs = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)])
-    # a flat body is drawn as a thin plate
-    return (signs * np.maximum(sides, 0.02) / 2) @ axes.T
+    return (signs * box_sides(moments) / 2) @ axes.T
 
 
 def _shade(turn: np.ndarray, corners: np.ndarray) -> np.ndarray:
@@ -128,10 +126,9 @@ def _interpolate(times, ts, wxyz):
 def _check_writer(path: Path) -> None:
     from matplotlib.animation import writers
 
-    needed = {".gif": "pillow", ".mp4": "ffmpeg", ".html": None, ".htm": None}
-    if path.suffix.lower() not in needed:
+    if path.suffix.lower() not in _WRITERS:
         raise ValueError(f"animate writes .gif, .mp4 or .html, got {path.name!r}.")
-    writer = needed[path.suffix.lower()]
+    writer = _WRITERS[path.suffix.lower()]
     if writer is not None and not writers.is_available(writer):
         raise RuntimeError(
             f"writing {path.suffix} needs {writer}, which is not installed; write .html instead, "
@@ -141,11 +138,11 @@ def _check_writer(path: Path) -> None:
 
 def _save(animation, path: Path, fps: int, dpi: int) -> None:
     with whole_file(path) as temporary:
-        if path.suffix.lower() in (".html", ".htm"):
+        writer = _WRITERS[path.suffix.lower()]
+        if writer is None:
             from matplotlib import rc_context
 
             with rc_context({"animation.embed_limit": 200.0, "savefig.dpi": dpi}):
                 temporary.write_text(animation.to_jshtml(fps=fps), encoding="utf-8")
         else:
-            writer = {".gif": "pillow", ".mp4": "ffmpeg"}[path.suffix.lower()]
             animation.save(temporary, writer=writer, fps=fps, dpi=dpi)

@@ -59,23 +59,19 @@ def _single(result, recording, body) -> dict[str, Any]:
     if not 0 <= body < max(np.asarray(result.finding).size, 1):
         raise ValueError(f"body must be one of the fit's, got {body}.")
 
-    def pick(value, tail):
+    def pick(value, tail, place=body):
         value = np.asarray(value)
-        return value.reshape(-1, *value.shape[value.ndim - tail :])[body]
+        return value.reshape(-1, *value.shape[value.ndim - tail :])[place]
 
-    omega, noise = np.asarray(recording.omega), np.asarray(recording.omega_noise)
     place = body if lead else 0
-    samples = omega.shape[-2]
-    omega, noise = (x.reshape(-1, samples, 3)[place] for x in (omega, noise))
-    present = np.asarray(recording.present).reshape(-1, samples)[place] > 0
-    times = np.asarray(recording.times).reshape(-1, samples)[place]
-    residual = np.asarray(result.residuals["omega"])
-    residual = residual.reshape(-1, *residual.shape[-3:])[body][0]
+    omega, noise = (pick(x, 2, place) for x in (recording.omega, recording.omega_noise))
+    present, times = (pick(x, 1, place) for x in (recording.present, recording.times))
+    present = present > 0
+    residual = pick(result.residuals["omega"], 3)[0]
     if "omega_std" in result.residuals:
         # of the likelihood of the readings: expected from those before, some samples to a residual
-        noise = np.asarray(result.residuals["omega_std"])
-        noise = noise.reshape(-1, *noise.shape[-3:])[body][0]
-        block, count = (samples - 1) // len(residual), len(residual)
+        noise = pick(result.residuals["omega_std"], 3)[0]
+        block, count = (len(omega) - 1) // len(residual), len(residual)
 
         def blocks(values):
             return values[: count * block].reshape(count, block, -1).mean(axis=1)
@@ -100,11 +96,7 @@ def _single(result, recording, body) -> dict[str, Any]:
         "spread": pick(spread, 1),
         "axes_std": pick(result.axes_std, 1),
         "covariance": _of_values(
-            moments,
-            axes,
-            pick(result.covariance, 2),
-            result.scale_known,
-            result.model.entries,
+            moments, axes, pick(result.covariance, 2), result.scale_known, result.model.entries
         ),
         "scale_known": result.scale_known,
         "rms": float(pick(result.rms, 0)),

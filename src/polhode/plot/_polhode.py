@@ -41,7 +41,9 @@ def polhode(
         ax = new_figure(5.4, 5.2).add_subplot(projection="3d")
     ax.view_init(*(_towards(made.omega_body[body]) if view is None else view))
     ax.computed_zorder = False
-    eye = _eye(ax)
+    elevation, azimuth = np.deg2rad([ax.elev, ax.azim])
+    flat = np.cos(elevation)
+    eye = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
 
     def draw(points, **style):
         _line(ax, points @ turn.T / size, (points / semi**2) @ turn.T @ eye, **style)
@@ -58,12 +60,6 @@ def polhode(
     _body_axes(ax, tensor, twice_energy, size, axis_names)
     _tidy(ax)
     return ax
-
-
-def _eye(ax) -> np.ndarray:
-    elevation, azimuth = np.deg2rad([ax.elev, ax.azim])
-    flat = np.cos(elevation)
-    return np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
 
 
 def _towards(omega) -> tuple[float, float]:

@@ -116,6 +116,12 @@ def pick(what: Trajectory | Samples, body: int | None) -> tuple[Samples, int]:
     return made, body % made.count
 
 
+def box_sides(moments: np.ndarray) -> np.ndarray:
+    """Sides (3,) of the homogeneous box with these moments, drawn with a diagonal of length 1."""
+    second = np.clip(moments.sum() / 2 - moments, 0, None)
+    return np.maximum(np.sqrt(second / second.sum()), 0.02)  # a flat body is a thin plate
+
+
 def matrices(wxyz: np.ndarray) -> np.ndarray:
     """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
     q = tuple(np.moveaxis(wxyz, -1, 0))

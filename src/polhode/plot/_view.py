@@ -55,7 +55,7 @@ class View:
 
 
 def view(
-    what: Trajectory | Samples | list[Trajectory | Samples],
+    what: Trajectory | Samples | Sequence[Trajectory | Samples | Body],
     path: str | os.PathLike | None = None,
     *,
     mesh: Any = None,
@@ -96,56 +96,7 @@ def view(
     Raises ValueError for too many bodies or times, meshes and names that do not fit them, and for
     a motion that is not finite; TypeError for other kinds of input.
     """
-    made = _view(
-        chosen(what, bodies),
-        mesh=mesh,
-        names=names,
-        axis_names=axis_names,
-        title=title,
-        seconds=seconds,
-        scale=scale,
-    )
-    if path is not None:
-        made.write(path)
-    return made
-
-
-def view_file(
-    path: str | os.PathLike,
-    output: str | os.PathLike | None = None,
-    *,
-    bodies: Sequence[int] | None = None,
-    **options: Any,
-) -> View:
-    """The page of a NetCDF file that ``polhode run`` wrote.
-
-    ``output``: the HTML file to write, or None. ``bodies``: clones by number; None: the first
-    three. Other ``options`` are those of ``view``; the title is that of the file. Moments and axes
-    of the body are those of the scene file, whose text the NetCDF file holds. Raises ImportError
-    without xarray and h5netcdf, FileNotFoundError without the file, ValueError for a file that
-    lacks what is shown.
-    """
-    found, title = read(path)
-    numbers = range(min(3, len(found))) if bodies is None else list(bodies)
-    if len(found) > 1:
-        named = ["nominal body" if number == 0 else f"clone {number}" for number in numbers]
-        options = {"names": named, **options}
-    made = _view(chosen(found, numbers), **{"title": title, **options})
-    if output is not None:
-        made.write(output)
-    return made
-
-
-def _view(
-    shown: list[Body],
-    *,
-    mesh: Any = None,
-    names: Sequence[str] | None = None,
-    axis_names: tuple[str, str, str] = ("x", "y", "z"),
-    title: str = "",
-    seconds: float | None = None,
-    scale: Scale | None = None,
-) -> View:
+    shown = chosen(what, bodies)
     start = min(float(one.ts[0]) for one in shown)
     duration = max(float(one.ts[-1]) for one in shown) - start
     if not duration > 0:
@@ -182,7 +133,33 @@ def _view(
         "eye": eye,
         "bodies": several,
     }  # fmt: skip
-    return View(_page(title or "polhode", motion))
+    made = View(_page(title or "polhode", motion))
+    if path is not None:
+        made.write(path)
+    return made
+
+
+def view_file(
+    path: str | os.PathLike,
+    output: str | os.PathLike | None = None,
+    *,
+    bodies: Sequence[int] | None = None,
+    **options: Any,
+) -> View:
+    """The page of a NetCDF file that ``polhode run`` wrote.
+
+    ``output``: the HTML file to write, or None. ``bodies``: clones by number; None: the first
+    three. Other ``options`` are those of ``view``; the title is that of the file. Moments and axes
+    of the body are those of the scene file, whose text the NetCDF file holds. Raises ImportError
+    without xarray and h5netcdf, FileNotFoundError without the file, ValueError for a file that
+    lacks what is shown.
+    """
+    found, title = read(path)
+    numbers = range(min(3, len(found))) if bodies is None else list(bodies)
+    if len(found) > 1:
+        named = ["nominal body" if number == 0 else f"clone {number}" for number in numbers]
+        options = {"names": named, **options}
+    return view(found, output, bodies=numbers, **{"title": title, **options})
 
 
 def _page(title: str, motion: dict[str, Any]) -> str:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from polhode.inertia._mesh import load_mesh
-from polhode.plot._samples import Samples, as_samples, matrices
+from polhode.plot._samples import Samples, as_samples, box_sides, matrices
 from polhode.rotation import matrix_to_wxyz
 from polhode.trajectory import Trajectory
 
@@ -137,8 +137,7 @@ def _solid(vertices, faces, colors) -> dict[str, Any]:
 
 def _box(moments: np.ndarray, turn: np.ndarray) -> dict[str, Any]:
     """The homogeneous box with these moments; a hue for each body axis, paler on its far side."""
-    sides = np.sqrt(np.clip(moments.sum() / 2 - moments, 0, None))
-    half = np.maximum(sides / np.linalg.norm(sides), 0.02)  # a flat body is a thin plate
+    half = box_sides(moments)
     vertices, colors, faces = [], [], []
     for axis in range(3):
         for sign in (1.0, -1.0):

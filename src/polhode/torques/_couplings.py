@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 from polhode._checks import as_number, is_concrete, require
 from polhode.hamiltonian import Attitude
-from polhode.parts import AbstractPart, checked, mapped, shaped
+from polhode.parts import AbstractPart, Signature, shaped, terms_of
+from polhode.torques._torques import stacked
 
 
 class AbstractCoupling(AbstractPart):
@@ -29,13 +30,7 @@ class AbstractCoupling(AbstractPart):
         """Torque on the wheel about its axis [N m]."""
 
     def __add__(self, other: "AbstractCoupling") -> "CouplingSum":
-        if not isinstance(other, AbstractCoupling):
-            raise TypeError(f"a coupling adds to another coupling, not to {type(other).__name__}")
-        return CouplingSum((*_terms(self), *_terms(other)))
-
-
-def _terms(coupling: AbstractCoupling) -> tuple[AbstractCoupling, ...]:
-    return coupling.terms if isinstance(coupling, CouplingSum) else (coupling,)
+        return CouplingSum(terms_of("coupling", AbstractCoupling, CouplingSum, self, other))
 
 
 class CouplingSum(AbstractCoupling):
@@ -111,8 +106,7 @@ class CoulombFriction(AbstractCoupling):
         return -self.size * jnp.tanh(speed / self.speed)
 
 
-_COMMAND = ("t", "wxyz", "omega_body", "speed")
-_COMMAND_SHAPES = ((), (4,), (3,), ())
+_COMMAND = Signature("Motor", {"t": (), "wxyz": (4,), "omega_body": (3,), "speed": ()})
 
 
 class Motor(AbstractCoupling):
@@ -142,7 +136,7 @@ class Motor(AbstractCoupling):
 
     def __init__(self, command, most_torque=None, most_speed=None):
         if callable(command):
-            self.command = checked("Motor", command, _COMMAND, _COMMAND_SHAPES, ())
+            self.command = _COMMAND.checked(command)
         else:
             self.command = as_number("Motor command", command)
         for name, value in (("most_torque", most_torque), ("most_speed", most_speed)):
@@ -156,11 +150,8 @@ class Motor(AbstractCoupling):
     def torque(self, t, speed, attitude, omega):
         wanted = self.command
         if callable(wanted):
-            wxyz, rates = (
-                jnp.stack(jnp.broadcast_arrays(*x), axis=-1) for x in (attitude.wxyz, omega)
-            )
-            given = t, wxyz, rates, speed
-            wanted = mapped("Motor", wanted, _COMMAND, _COMMAND_SHAPES, (), *given)
+            given = t, stacked(attitude.wxyz), stacked(omega), speed
+            wanted = _COMMAND.mapped(wanted, *given)
         if self.most_torque is None:
             return wanted
         low, high = -self.most_torque, self.most_torque

@@ -25,11 +25,10 @@ from jaxtyping import Array, Float
 
 from polhode._checks import as_number, is_concrete, require
 from polhode.hamiltonian import Vector, cross, triple
-from polhode.parts import checked, mapped, shaped
-from polhode.torques._torques import AbstractTorque
+from polhode.parts import Signature, shaped
+from polhode.torques._torques import AbstractTorque, stacked
 
-_ARGUMENTS = ("momentum_body", "omega_body")
-_SHAPES = ((3,), (3,))
+_RATE_LAW = Signature("EnergySink", {"momentum_body": (3,), "omega_body": (3,)})
 
 
 class EnergySink(AbstractTorque):
@@ -60,7 +59,7 @@ class EnergySink(AbstractTorque):
 
     def __init__(self, k):
         if callable(k):
-            self.k = checked("EnergySink", k, _ARGUMENTS, _SHAPES, ())
+            self.k = _RATE_LAW.checked(k)
             return
         self.k = as_number("EnergySink k", k)
         if is_concrete(self.k):
@@ -75,6 +74,5 @@ class EnergySink(AbstractTorque):
     def slip(self, t, momentum: Sequence[Array], omega: Sequence[Array]) -> Vector:
         rate = self.k
         if callable(rate):
-            given = (jnp.stack(jnp.broadcast_arrays(*x), axis=-1) for x in (momentum, omega))
-            rate = mapped("EnergySink", rate, _ARGUMENTS, _SHAPES, (), *given)
+            rate = _RATE_LAW.mapped(rate, stacked(momentum), stacked(omega))
         return triple(rate * x for x in cross(momentum, omega))

@@ -13,7 +13,7 @@ from polhode._checks import as_float_array
 from polhode.hamiltonian import Attitude, components
 from polhode.parts import AbstractPart, shaped
 from polhode.torques._orbit import AbstractConic, AbstractOrbit
-from polhode.torques._torques import AbstractTorque, vector_of_time
+from polhode.torques._torques import AbstractTorque, stacked, vector_of_time
 
 
 class LVLH(AbstractPart):
@@ -157,7 +157,7 @@ class RelativeTorque(AbstractTorque):
 
         def quaternion():  # dear, and asked for by few
             frame = rotation.matrix_to_wxyz(jnp.stack(axes, axis=-1))
-            body = jnp.stack(jnp.broadcast_arrays(*attitude.wxyz), axis=-1)
+            body = stacked(attitude.wxyz)
             frame = jnp.broadcast_to(rotation.conjugate(frame), body.shape)
             relative = rotation.multiply(frame, body)
             return tuple(relative[..., i] for i in range(4))

@@ -10,8 +10,14 @@ from jaxtyping import Array, Float
 from polhode import rotation
 from polhode._checks import as_float_array, as_number, is_concrete, require
 from polhode.hamiltonian import components, cross
-from polhode.parts import AbstractPart, checked, mapped, shaped
-from polhode.torques._torques import AbstractTorque, coefficients, value_at, vector_of_time
+from polhode.parts import AbstractPart, Signature, shaped
+from polhode.torques._torques import (
+    AbstractTorque,
+    coefficients,
+    stacked,
+    value_at,
+    vector_of_time,
+)
 
 
 class Pointing(AbstractTorque):
@@ -71,8 +77,10 @@ class RateDamping(AbstractTorque):
         return tuple(-c * (rate - wanted) for c, rate, wanted in pairs)
 
 
-_PLACE, _PLACE_SHAPES = ("position", "t"), ((3,), ())
-_SEEN, _SEEN_SHAPES = ("t", "omega_body", "field_body"), ((), (3,), (3,))
+_FIELD = Signature("MagneticDipole field", {"position": (3,), "t": ()}, (3,))
+_MOMENT = Signature(
+    "MagneticDipole moment", {"t": (), "omega_body": (3,), "field_body": (3,)}, (3,)
+)
 
 
 class MagneticDipole(AbstractTorque):
@@ -95,30 +103,20 @@ class MagneticDipole(AbstractTorque):
     position: Float[Array, "*#b 3"] | Callable | AbstractPart = shaped(3)
 
     def __init__(self, moment, field, position=(0.0, 0.0, 0.0)):
-        if callable(moment):
-            self.moment = checked("MagneticDipole moment", moment, _SEEN, _SEEN_SHAPES, (3,))
-        else:
-            self.moment = as_float_array("MagneticDipole moment", moment, (3,))
-        if callable(field):
-            self.field = checked("MagneticDipole field", field, _PLACE, _PLACE_SHAPES, (3,))
-        else:
-            self.field = as_float_array("MagneticDipole field", field, (3,))
+        self.moment, self.field = (
+            law.checked(given) if callable(given) else as_float_array(law.name, given, (3,))
+            for law, given in ((_MOMENT, moment), (_FIELD, field))
+        )
         self.position = vector_of_time("MagneticDipole position", position)
 
     def body_components(self, t, attitude, omega):
-        if callable(self.field):
-            place = value_at("MagneticDipole position", self.position, t)
-            given = jnp.stack(jnp.broadcast_arrays(*place), axis=-1), jnp.asarray(t, place[0].dtype)
-            name = "MagneticDipole field"
-            field = components(mapped(name, self.field, _PLACE, _PLACE_SHAPES, (3,), *given))
-        else:
-            field = components(self.field)
-        field = attitude.to_body(field)
-        if not callable(self.moment):
-            return cross(components(self.moment), field)
-        seen = (jnp.stack(jnp.broadcast_arrays(*x), axis=-1) for x in (omega, field))
-        name, given = "MagneticDipole moment", (t, *seen)
-        moment = mapped(name, self.moment, _SEEN, _SEEN_SHAPES, (3,), *given)
+        field, moment = self.field, self.moment
+        if callable(field):
+            place = stacked(value_at("MagneticDipole position", self.position, t))
+            field = _FIELD.mapped(field, place, jnp.asarray(t, place.dtype))
+        field = attitude.to_body(components(field))
+        if callable(moment):
+            moment = _MOMENT.mapped(moment, t, stacked(omega), stacked(field))
         return cross(components(moment), field)
 
 

@@ -1,6 +1,7 @@
 """Position and velocity on a Kepler orbit: gravity gradients and orbit frames follow it."""
 
 import abc
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -14,22 +15,44 @@ from polhode.parts import AbstractPart, shaped
 
 @jax.jit
 def eccentric_anomaly(mean: Float[Array, "*b"], eccentricity: Float[Array, "*b"]) -> Array:
-    """E in [-pi, pi] with E - e sin E = M [rad] for 0 <= e < 1, M within [-pi, pi].
+    """E in [-pi, pi] with E - e sin E = M [rad] for 0 <= e < 1, M within [-pi, pi]."""
 
-    Newton's method from an upper bound of the root, whence it descends monotonically; the last two
-    steps carry the derivatives.
-    """
-    sign = jnp.where(mean < 0, -1, 1).astype(mean.dtype)
-    m, e = jax.lax.stop_gradient((jnp.abs(mean), eccentricity))
-    # sin E <= 1; sin E <= E; and E - sin E >= 0.506 E^3/6 up to pi, where e < 1 only lowers E
-    bounds = jnp.minimum(m + e, m / (1 - e))
-    root = jnp.minimum(bounds, jnp.cbrt(m * (6 / 0.506)))
+    def above(m, e):
+        # sin E <= 1; sin E <= E; and E - sin E >= 0.506 E^3/6 up to pi, where e < 1 only lowers E
+        bounds = jnp.minimum(m + e, m / (1 - e))
+        return jnp.minimum(bounds, jnp.cbrt(m * (6 / 0.506)))
 
     def step(x, m, e):
         half = jnp.sin(x / 2)
         return x - ((1 - e) * x + e * _lag(x) - m) / (1 - e + 2 * e * half * half)
 
-    root = jax.lax.fori_loop(0, 8, lambda _, x: step(x, m, e), root)
+    return _newton(step, above, mean, eccentricity)
+
+
+@jax.jit
+def hyperbolic_anomaly(mean: Float[Array, "*b"], eccentricity: Float[Array, "*b"]) -> Array:
+    """F with e sinh F - F = M [rad] for e > 1."""
+
+    def above(m, e):
+        # sinh F >= F, sinh F - F >= F^3/6, and e sinh F = M + F with what bounds F
+        most = jnp.minimum(m / (e - 1), jnp.cbrt(6 * m / e))
+        return jnp.minimum(most, jnp.arcsinh((m + most) / e))
+
+    def step(x, m, e):
+        half = jnp.sinh(x / 2)
+        return x - ((e - 1) * x + e * _lead(x) - m) / (e - 1 + 2 * e * half * half)
+
+    return _newton(step, above, mean, eccentricity)
+
+
+def _newton(step: Callable, above: Callable, mean: Array, eccentricity: Array) -> Array:
+    """The root, which has the sign of ``mean``: by Newton's method from ``above`` it.
+
+    From there it descends monotonically; the last two steps carry the derivatives.
+    """
+    sign = jnp.where(mean < 0, -1, 1).astype(mean.dtype)
+    m, e = jax.lax.stop_gradient((jnp.abs(mean), eccentricity))
+    root = jax.lax.fori_loop(0, 8, lambda _, x: step(x, m, e), above(m, e))
     root = jax.lax.stop_gradient(root)
     for _ in range(2):
         root = step(root, sign * mean, eccentricity)
@@ -39,39 +62,21 @@ def eccentric_anomaly(mean: Float[Array, "*b"], eccentricity: Float[Array, "*b"]
 def _lag(x: Array) -> Array:
     """x - sin x, without cancellation at small x."""
     square = x * x
-    total = jnp.ones_like(x)
-    for k in range(8, 0, -1):  # below 1/2 the last term is under 1e-20
-        total = 1 - square * total / ((2 * k + 2) * (2 * k + 3))
-    return jnp.where(square < 0.25, x * square / 6 * total, x - jnp.sin(x))
-
-
-@jax.jit
-def hyperbolic_anomaly(mean: Float[Array, "*b"], eccentricity: Float[Array, "*b"]) -> Array:
-    """F with e sinh F - F = M [rad] for e > 1; as ``eccentric_anomaly``."""
-    sign = jnp.where(mean < 0, -1, 1).astype(mean.dtype)
-    m, e = jax.lax.stop_gradient((jnp.abs(mean), eccentricity))
-    # sinh F >= F, sinh F - F >= F^3/6, and e sinh F = M + F with what bounds F
-    most = jnp.minimum(m / (e - 1), jnp.cbrt(6 * m / e))
-    root = jnp.minimum(most, jnp.arcsinh((m + most) / e))
-
-    def step(x, m, e):
-        half = jnp.sinh(x / 2)
-        return x - ((e - 1) * x + e * _lead(x) - m) / (e - 1 + 2 * e * half * half)
-
-    root = jax.lax.fori_loop(0, 8, lambda _, x: step(x, m, e), root)
-    root = jax.lax.stop_gradient(root)
-    for _ in range(2):
-        root = step(root, sign * mean, eccentricity)
-    return sign * root
+    return jnp.where(square < 0.25, x * square / 6 * _series(-square), x - jnp.sin(x))
 
 
 def _lead(x: Array) -> Array:
     """sinh x - x, without cancellation at small x."""
     square = x * x
-    total = jnp.ones_like(x)
+    return jnp.where(square < 1, x * square / 6 * _series(square), jnp.sinh(x) - x)
+
+
+def _series(square: Array) -> Array:
+    """6 (sinh x - x)/x^3 of x^2 up to 1: what is left out is under 1e-18."""
+    total = jnp.ones_like(square)
     for k in range(8, 0, -1):
         total = 1 + square * total / ((2 * k + 2) * (2 * k + 3))
-    return jnp.where(square < 1, x * square / 6 * total, jnp.sinh(x) - x)
+    return total
 
 
 class AbstractOrbit(AbstractPart):

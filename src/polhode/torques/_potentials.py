@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from polhode._checks import as_float_array, as_number, is_concrete, numbers, require, together
 from polhode.hamiltonian import Attitude, components, dot
 from polhode.inertia import Inertia
-from polhode.parts import AbstractPart, checked, mapped, shaped
+from polhode.parts import AbstractPart, Signature, shaped, terms_of
 from polhode.torques._torques import value_at, vector_of_time
 
 
@@ -38,13 +38,7 @@ class AbstractPotential(AbstractPart):
         return self
 
     def __add__(self, other: "AbstractPotential") -> "PotentialSum":
-        if not isinstance(other, AbstractPotential):
-            raise TypeError(f"a potential adds to another potential, not to {type(other).__name__}")
-        return PotentialSum((*_terms(self), *_terms(other)))
-
-
-def _terms(potential: AbstractPotential) -> tuple[AbstractPotential, ...]:
-    return potential.terms if isinstance(potential, PotentialSum) else (potential,)
+        return PotentialSum(terms_of("potential", AbstractPotential, PotentialSum, self, other))
 
 
 class PotentialSum(AbstractPotential):
@@ -218,8 +212,7 @@ class GravityGradient(AbstractPotential):
         return -self.mu / (2 * square * distance) * (trace - 3 * project)
 
 
-_ARGUMENTS = ("R", "t")
-_SHAPES = ((3, 3), ())
+_FUNCTION = Signature("Potential", {"R": (3, 3), "t": ()})
 
 
 class Potential(AbstractPotential):
@@ -235,7 +228,7 @@ class Potential(AbstractPotential):
     fn: Callable
 
     def __init__(self, fn: Callable):
-        self.fn = checked("Potential", fn, _ARGUMENTS, _SHAPES, ())
+        self.fn = _FUNCTION.checked(fn)
 
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array:
-        return mapped("Potential", self.fn, _ARGUMENTS, _SHAPES, (), attitude.matrix, t)
+        return _FUNCTION.mapped(self.fn, attitude.matrix, t)

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import as_float_array, as_number, is_concrete, require
-from polhode.parts import checked, shaped
+from polhode.parts import shaped
 from polhode.torques._couplings import AbstractCoupling
-from polhode.torques._rotors import AbstractRotor
+from polhode.torques._rotors import IMPULSE, AbstractRotor
 
 
 class Rotor(AbstractRotor):
@@ -85,7 +85,7 @@ class Rotor(AbstractRotor):
                 " exact."
             )
         if impulse is not None:
-            impulse = checked("Rotor impulse", impulse, ("t",), ((),), ())
+            impulse = IMPULSE.checked(impulse)
         given = {"inertia": inertia, "momentum": momentum, "speed": speed, "torque": torque}
         for name, value in given.items():
             setattr(self, name, None if value is None else as_number(name, value))
@@ -112,14 +112,9 @@ class Rotor(AbstractRotor):
 
     def declared_anew(self):
         return Rotor(
-            self.axis_body,
-            self.inertia,
-            self.momentum,
-            self.speed,
-            self.torque,
-            self.impulse,
+            self.axis_body, self.inertia, self.momentum, self.speed, self.torque, self.impulse,
             self.coupling,
-        )
+        )  # fmt: skip
 
     def column(self, omega_body: Array, start: Array) -> tuple[Array, Array, Array, Array]:
         """Axis, its momentum at the start (relative if held, else absolute), J, motor torque."""

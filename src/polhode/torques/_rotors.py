@@ -25,8 +25,10 @@ from jaxtyping import Array, Float
 from polhode._checks import numbers, require, together
 from polhode.hamiltonian import Attitude, Vector, dot, triple
 from polhode.inertia import Inertia, Symmetry
-from polhode.parts import AbstractPart, mapped, shaped
+from polhode.parts import AbstractPart, Signature, shaped
 from polhode.torques._couplings import Couplings
+
+IMPULSE = Signature("Rotor impulse", {"t": ()})
 
 
 class AbstractRotor(AbstractPart):
@@ -154,8 +156,7 @@ class Wheels(AbstractRotor):
     @property
     def is_possible(self) -> Array:
         """Whether (...) each wheel that is not held has a positive moment."""
-        loose = [i for i, held in enumerate(self.held) if not held]
-        return jnp.all(self.inertia[..., np.array(loose, int)] > 0, axis=-1)
+        return jnp.all(self.inertia[..., np.array(self.loose, int)] > 0, axis=-1)
 
     @property
     def is_constant(self) -> bool:
@@ -225,17 +226,14 @@ class Wheels(AbstractRotor):
         """Momentum of wheel i along its axis (see the class) at time t [kg m^2/s]."""
         if i in self.coupled and self.spins:
             return self.spins[self.coupled.index(i)]
-        momentum = self.momentum[..., i]
-        if self.held[i]:
-            return momentum
-        impulse = self.impulses[i]
-        if i in self.coupled:
+        momentum, impulse = self.momentum[..., i], self.impulses[i]
+        if self.held[i] or i in self.coupled:
             return momentum
         if impulse is None:
             return momentum + self.torque[..., i] * (t - self.start)
 
         def given(t):
-            return mapped("Rotor impulse", impulse, ("t",), ((),), (), t)
+            return IMPULSE.mapped(impulse, t)
 
         return momentum + (given(t) - given(self.start))
 
@@ -249,16 +247,12 @@ class Wheels(AbstractRotor):
 
     def energy(self, t: Array | float) -> Array | None:
         """c^2/(2J) of the wheels that are not held [J]; None without such."""
-        parts = [
-            self.axial_momentum(i, t) ** 2 / (2 * self.inertia[..., i])
-            for i, held in enumerate(self.held)
-            if not held
-        ]
+        parts = [self.axial_momentum(i, t) ** 2 / (2 * self.inertia[..., i]) for i in self.loose]
         return sum(parts[1:], start=parts[0]) if parts else None
 
     def carrier(self, inertia: Inertia) -> Inertia:
         """The inertia that turns with the body: less that of wheels free about their axes."""
-        loose = [i for i, held in enumerate(self.held) if not held]
+        loose = self.loose
         if not loose:
             return inertia
         along = [k for i in loose if (k := self.along[i]) is not None]

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from polhode._checks import as_float_array, is_concrete, require
 from polhode.hamiltonian import Attitude, Vector, components
-from polhode.parts import AbstractPart, checked, mapped, shaped
+from polhode.parts import AbstractPart, Signature, shaped, terms_of
 
 
 class AbstractTorque(AbstractPart):
@@ -45,13 +45,7 @@ class AbstractTorque(AbstractPart):
         return self
 
     def __add__(self, other: "AbstractTorque") -> "TorqueSum":
-        if not isinstance(other, AbstractTorque):
-            raise TypeError(f"a torque adds to another torque, not to {type(other).__name__}")
-        return TorqueSum((*_terms(self), *_terms(other)))
-
-
-def _terms(torque: AbstractTorque) -> tuple[AbstractTorque, ...]:
-    return torque.terms if isinstance(torque, TorqueSum) else (torque,)
+        return TorqueSum(terms_of("torque", AbstractTorque, TorqueSum, self, other))
 
 
 class TorqueSum(AbstractTorque):
@@ -77,13 +71,18 @@ class TorqueSum(AbstractTorque):
         return tuple(sum(rest, start=first) for first, *rest in parts) if parts else None
 
 
+def stacked(parts: Sequence[Array]) -> Array:
+    """An array (..., n) of its n components, broadcast together."""
+    return jnp.stack(jnp.broadcast_arrays(*parts), axis=-1)
+
+
 def vector_of_time(name: str, n: Any) -> Array | Callable:
     """A constant vector (..., 3), or a function fn(t) -> (3,) after a look at what it returns."""
     if not callable(n):
         return as_float_array(name, n, (3,))
     if isinstance(n, AbstractPart) and callable(n):
         return n
-    return checked(name, n, ("t",), ((),), (3,))
+    return Signature(name, {"t": ()}, (3,)).checked(n)
 
 
 def value_at(name: str, vector, t) -> tuple[Array, Array, Array]:
@@ -92,7 +91,7 @@ def value_at(name: str, vector, t) -> tuple[Array, Array, Array]:
         return components(vector)
     if isinstance(vector, AbstractPart) and callable(vector):
         return components(vector(t))  # carries the batch axes itself, such as KeplerOrbit
-    return components(mapped(name, vector, ("t",), ((),), (3,), t))
+    return components(Signature(name, {"t": ()}, (3,)).mapped(vector, t))
 
 
 class BodyTorque(AbstractTorque):
@@ -176,8 +175,7 @@ class QuadraticDamping(AbstractTorque):
         return tuple(-c * size * rate for c, rate in zip(components(self.c), omega))
 
 
-_STATE = ("t", "wxyz", "omega_body")
-_STATE_SHAPES = ((), (4,), (3,))
+_FEEDBACK = Signature("FeedbackTorque", {"t": (), "wxyz": (4,), "omega_body": (3,)}, (3,))
 
 
 class FeedbackTorque(AbstractTorque):
@@ -193,10 +191,8 @@ class FeedbackTorque(AbstractTorque):
     fn: Callable
 
     def __init__(self, fn: Callable):
-        self.fn = checked("FeedbackTorque", fn, _STATE, _STATE_SHAPES, (3,))
+        self.fn = _FEEDBACK.checked(fn)
 
     def body_components(self, t, attitude, omega):
-        wxyz = jnp.stack(jnp.broadcast_arrays(*attitude.wxyz), axis=-1)
-        rates = jnp.stack(jnp.broadcast_arrays(*omega), axis=-1)
-        given = t, wxyz, rates
-        return components(mapped("FeedbackTorque", self.fn, _STATE, _STATE_SHAPES, (3,), *given))
+        given = t, stacked(attitude.wxyz), stacked(omega)
+        return components(_FEEDBACK.mapped(self.fn, *given))
