@@ -158,7 +158,7 @@ for k, solution in enumerate(fit.solutions[:4]):
           f" {solution.probability:.1g}")  # fmt: skip
 
 # %% [markdown]
-# Periods are right to two of their errors, moments to 8 %. The pole is off by several times its
+# Periods are right to two of their errors, moments to 7 %. The pole is off by several times its
 # error: that error takes the residuals for noise, if one that lasts for some points, but they are
 # the rock's corners, which come back every turn. Mirror images of the pole are in the list too.
 #

@@ -162,6 +162,18 @@ def test_a_tumbler_is_found_again():
     assert all(note in text for note in fit.notes)
 
 
+@pytest.mark.slow
+def test_how_much_zero_points_differ_is_learnt():
+    curve, truth, _ = light_curves.synthetic(3, 0.02, nights=10, days=16.0, each=14, spread=0.06)
+    fit = lightcurve.fit_light_curve(curve, floor=0.01, highest=7.0, trials=12_000, searches=1)
+    assert int(fit.best.mode) == truth["mode"]
+    assert fit.best.P_phi == pytest.approx(truth["P_phi"], rel=5e-3)
+    assert fit.best.P_psi == pytest.approx(truth["P_psi"], rel=5e-3)
+    # ten nights: to a quarter, one sigma
+    assert fit.offset_sigma is not None
+    assert 0.03 < fit.offset_sigma < 0.1
+
+
 def test_without_directions_only_frequencies(tmp_path):
     t = np.linspace(0, 1, 60)
     path = tmp_path / "points.csv"

@@ -11,7 +11,8 @@ from polhode import lightcurve
 from polhode.lightcurve import _fit, _hypotheses, _search, _solutions, _steps
 
 PHASE = lightcurve.HG1G2()
-MEANT = _hypotheses.Hypotheses(np.array([1.2, 1.9]), np.array([0.7, 0.5]), np.array([True, False]))
+Hypotheses = _hypotheses.Hypotheses
+MEANT = Hypotheses(np.array([1.2, 1.9]), np.array([0.7, 0.5]), np.array([True, False]))
 
 
 def test_bodies_have_the_periods_of_their_hypothesis():
@@ -32,9 +33,7 @@ def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
     right = 1 / truth["P_phi"], 1 / truth["P_psi"]
     # the right one among eight that are off by one to eight steps of the resolution
     off = np.arange(9) * 1.5 / np.ptp(curve.t)
-    meant = _hypotheses.Hypotheses(
-        right[0] + off, right[1] + 0 * off, np.full(9, truth["mode"] == 0)
-    )
+    meant = Hypotheses(right[0] + off, right[1] + 0 * off, np.full(9, truth["mode"] == 0))
     key = jax.random.key(0)
     trials = _search.tried(key, meant, 1800, 3, PHASE, points, 0.0)
     np.testing.assert_array_equal(trials.source, np.repeat(np.arange(9), 3))
@@ -50,6 +49,44 @@ def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
     f_phi, f_psi, _ = _solutions.frequencies(state.bodies)
     best = np.argmin(state.cost)
     np.testing.assert_allclose([f_phi[best], f_psi[best]], right, rtol=3e-3)
+
+
+def test_the_leading_hypotheses_are_tried_more():
+    many = Hypotheses(np.arange(1.0, 101.0), np.ones(100), np.ones(100, bool))
+    index, times = np.unique(_fit._shared(many).f_phi, return_counts=True)
+    np.testing.assert_array_equal(index, many.f_phi)
+    assert times[:16].min() > 10 * times[16:].max()
+    # half of the trials, or less, go to them
+    assert times[16:].sum() < times[:16].sum() < 3 * times[16:].sum()
+    assert len(_fit._shared(MEANT).f_phi) == 13 * len(MEANT.f_phi)
+
+
+def test_spread_of_offsets_is_the_likeliest():
+    """Twelve groups of a linear model with three other unknowns; all of them integrated out."""
+    rng = np.random.default_rng(1)
+    group = np.repeat(np.arange(12), 6)
+    other = np.c_[rng.normal(size=(72, 2)), np.ones(72)]
+    own = (group[:, None] == np.arange(12)).astype(float)
+    whole, sigma = np.hstack([other, own]), 0.05
+    data = other @ [1.0, -2.0, 3.0] + 0.08 * rng.normal(size=12)[group]
+    data = data + sigma * rng.normal(size=72)
+    stiffness = np.r_[0.0, np.full(12, 0.2**-2)]
+    matrix = whole.T @ whole / sigma**2 + np.diag(np.r_[0, 0, stiffness])
+    x = rng.normal(size=15)  # not the best
+    right = matrix @ x - whole.T @ data / sigma**2
+    spreads = np.linspace(0.01, 0.2, 400)
+
+    def evidence(spread):
+        covariance = sigma**2 * np.eye(72) + spread**2 * own @ own.T
+        inverse = np.linalg.inv(covariance)
+        reduced = other.T @ inverse @ other
+        left = data - other @ np.linalg.solve(reduced, other.T @ inverse @ data)
+        sizes = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(reduced)[1]
+        return -(left @ inverse @ left + sizes) / 2
+
+    best = spreads[np.argmax([evidence(s) for s in spreads])]
+    found = _steps.spread_of_offsets(matrix, right, x[2:], stiffness, slice(1, 13))
+    assert found == pytest.approx(best, rel=0.01)
 
 
 def test_misfit_is_that_of_the_light_times_the_gain():

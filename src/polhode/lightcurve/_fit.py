@@ -12,13 +12,15 @@ from polhode.lightcurve._model import Bodies, Points
 from polhode.lightcurve._phase import HG1G2, AbstractPhase, SeeligerPhase
 from polhode.lightcurve._search import tried
 from polhode.lightcurve._solutions import REACHED, Fit, described, frequencies, momentum, notes_on
-from polhode.lightcurve._steps import BATCH, Problem, State, picked, taken
+from polhode.lightcurve._steps import BATCH, Problem, State, picked, spread_of_offsets, taken
 
 _FEW = 160  # points that a search looks at
 _DESCENT = ((1.0, 2), (0.5, 3), (0.25, 6))  # parts of the starts, and their steps
 _WIDE = 10.0  # limit of the first steps' residuals, in sigma
 _AGAIN, _MORE, _POLES = 8, 2000, 12  # pairs of periods searched again, by trials and starts of each
 _LIMIT = 3.0  # of residuals in a search, in sigma
+_LEADING, _OFTEN = 16, 12  # so many of the hypotheses are tried so many times again
+_GROUPS = 8  # of so many, or more, it is learnt how much their zero points differ
 
 
 def fit_light_curve(
@@ -27,7 +29,7 @@ def fit_light_curve(
     phase: AbstractPhase | None = None,
     pairs: Pairs | None = None,
     highest: float | None = None,
-    trials: int = 40_000,
+    trials: int = 60_000,
     starts: int = 2,
     searches: int = 3,
     floor: float = 0.03,
@@ -40,15 +42,17 @@ def fit_light_curve(
 
     Pairs of frequencies from Fourier series, each with all it can mean; ``trials`` bodies of these
     periods, all else drawn at random; Levenberg-Marquardt, with exact derivatives, on the best
-    ``starts`` of each pair and meaning; the mirror images of what is found; distinct solutions, the
-    ``most`` best. Repeated until two searches agree, ``searches`` times at most.
+    ``starts`` of each pair and meaning; of the likeliest, thirteen times as many of both; the
+    mirror images of what is found; distinct solutions, the ``most`` best. Repeated until two
+    searches agree, ``searches`` times at most.
 
     ``phase``: a phase function (default: ``HG1G2()`` where the phase angle changes by more than 5
     degrees, else ``SeeligerPhase()``). ``pairs``: instead of those from the series. ``highest``
     frequency sought, per day. ``floor`` [mag]: added to the errors in quadrature, growing with
     the phase angle, for what an ellipsoid cannot be. ``offset_sigma``: see
-    ``LightCurve.columns``. ``limit``: residuals beyond as many sigma count by their size, not
-    their square. Needs float64 (``jax_enable_x64``).
+    ``LightCurve.columns``; None: of a calibrated curve with eight groups or more it is learnt from
+    the best motion found, and all are fitted again with it. ``limit``: residuals beyond as many
+    sigma count by their size, not their square. Needs float64 (``jax_enable_x64``).
 
     Raises RuntimeError in float32, ValueError for a light curve without directions.
     """
@@ -68,11 +72,11 @@ def fit_light_curve(
     meant = hypotheses(pairs, curve.t, curve.magnitude, columns=columns)
     key = jax.random.key(seed)
     rough, problem = Problem(phase, _thinned(points, _FEW)), Problem(phase, points)
-    state, again = None, False
+    state, again, shared = None, False, _shared(meant)
     for _ in range(searches):
         key, own = jax.random.split(key)
         found = _searched(
-            own, meant, trials, starts, rough, problem, _blur(curve), pairs.resolution
+            own, shared, trials, starts, rough, problem, _blur(curve), pairs.resolution
         )
         again = state is not None and _found_twice(state, found, pairs.resolution)
         state = found if state is None else _joined(state, found)
@@ -83,6 +87,14 @@ def fit_light_curve(
     assert state is not None
     state = _with_poles(jax.random.fold_in(key, 1), state, rough, problem, pairs.resolution)
     state = _better(problem, state, pairs.resolution, BATCH, limit, 60)
+    if offset_sigma is None and curve.calibrated and len(curve.names) >= _GROUPS:
+        best = picked(state, int(np.argmin(state.cost)))
+        groups = slice(1, 1 + len(curve.names))  # the first column is a constant
+        offset_sigma = spread_of_offsets(
+            best.matrix, best.right, best.offsets, problem.stiffness, groups
+        )
+        problem = Problem(phase, curve.points(floor, offset_sigma))
+        state = _better(problem, state, pairs.resolution, BATCH, limit, 30)
     normals = _mirrors(curve)
     order = _distinct(state, pairs.resolution, BATCH // 2)
     images = [_mirrored(taken(state.bodies, order), normal) for normal in normals]
@@ -99,7 +111,7 @@ def fit_light_curve(
             "No second search found the best motion again: better ones may have been missed. Ask"
             " for more trials or searches.",
         )
-    return Fit(solutions, curve, pairs, meant, scale, alike, notes)
+    return Fit(solutions, curve, pairs, meant, scale, alike, offset_sigma, notes)
 
 
 def _blur(curve: LightCurve) -> float:
@@ -111,6 +123,13 @@ def _blur(curve: LightCurve) -> float:
         np.clip((bisector @ bisector[:: max(1, len(bisector) // 50)].T).min(), -1, 1)
     )
     return float((0.125 + turned / (2 * np.pi)) / np.ptp(curve.t))
+
+
+def _shared(meant: Hypotheses) -> Hypotheses:
+    """The leading ones several times over: each time has trials and starts of its own."""
+    many = len(meant.f_phi)
+    index = np.r_[:many, np.tile(np.arange(min(_LEADING, many)), _OFTEN)]
+    return Hypotheses(*(x[index] for x in meant))
 
 
 def _searched(

@@ -51,6 +51,7 @@ class Fit(NamedTuple):
     hypotheses: Hypotheses
     scale: float  # residuals of the best over the errors assumed
     alike: float  # so many residuals count as one, because neighbours are alike; 1: independent
+    offset_sigma: float | None  # spread of groups' offsets [mag]: given or learnt; None: default
     notes: tuple[str, ...]  # what this light curve cannot show
 
     @property

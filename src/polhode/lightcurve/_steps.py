@@ -19,6 +19,7 @@ BATCH = 32
 # What is held of a body before it is seen: logarithms of the axes' ratios 0 +- 0.8; those of the
 # homogeneous ellipsoid of its inertia within 0.25 of its shape's; phase coefficients +- 0.3.
 _SHAPE_SIGMA, _TIE_SIGMA, _PHASE_SIGMA = 0.8, 0.25, 0.3
+_EXPECTED = 40  # steps to the spread of offsets; twenty reach three digits
 
 
 def _priors(phase: AbstractPhase, columns: int):
@@ -150,6 +151,26 @@ class Problem:
                              damping[moving] > 10)  # fmt: skip
             quiet[moving] = np.where(small, quiet[moving] + 1, 0)
         return state
+
+
+def spread_of_offsets(matrix, right, offsets, stiffness, groups: slice) -> float:
+    """Standard deviation of the groups' offsets [mag] that makes the points most likely.
+
+    ``matrix`` (u, u), ``right`` (u,): normal equations at a body, whose last unknowns are
+    ``offsets`` (c,) held by ``stiffness`` (c,). All unknowns are integrated out of the linear
+    model, by expectation and maximisation: the mean square is that of estimates and variances.
+    """
+    index = np.arange(len(matrix) - len(offsets), len(matrix))
+    x = np.zeros(len(matrix))
+    x[index] = offsets
+    right, index, held = matrix @ x - right, index[groups], stiffness[groups]
+    variance = 1 / held[0]
+    for _ in range(_EXPECTED):
+        precision = matrix.copy()
+        precision[index, index] += 1 / variance - held
+        inverse = np.linalg.pinv(precision, hermitian=True)
+        variance = np.mean((inverse @ right)[index] ** 2 + np.diag(inverse)[index])
+    return float(np.sqrt(variance))
 
 
 def _solved(matrix, right, damping):
