@@ -40,7 +40,7 @@ assert not [name for name in sys.modules if name.split(".")[0] == "polhode"]
 jaxtyping.install_import_hook([f"polhode.{room}" for room in CHECKED], "checked.checked")
 
 
-# Tracing makes millions of objects that live; looking them all over for cycles takes a tenth of it.
+# Tracing makes millions of objects that live: they are looked over for cycles less often.
 gc.set_threshold(200_000, 50, 100)
 
 
