@@ -1,9 +1,10 @@
 """Scenes with generated functions of the user's, of which XLA may fold this or that away.
 
-``python tests/xla/fuzz.py COUNT [SEED]`` draws COUNT functions and runs each in four ways (value,
-gradient, jit, vmap) in child processes; it prints how many ended badly, and which. A child writes
-down what it is about to do, so that an end is laid to one function; the next child goes on behind
-it. What Python refuses with a ValueError or TypeError counts as answered.
+``python tests/xla/fuzz.py COUNT [SEED]`` draws COUNT functions and runs each in five ways (value,
+gradient, jit, vmap, and under jit with a solver of diffrax) in child processes; it prints how many
+ended badly, and which. A child writes down what it is about to do, so that an end is laid to one
+function; the next child goes on behind it. What Python refuses with a ValueError or TypeError
+counts as answered.
 
 ``python tests/xla/fuzz.py units COUNT [SEED]`` marks the functions alone, 25 to a program, without
 a scene around them: a hundred times as many for the same work, and folded even more.
@@ -26,6 +27,7 @@ import polhode as ph
 from polhode.xla import kernel
 
 WAYS = ("value", "gradient", "jit", "vmap")
+OF_SCENES = (*WAYS, "stock")
 
 
 def number(rng, x, depth):
@@ -230,7 +232,8 @@ def run(kind, functions, way):
     def end(scale, omega):
         state = ph.State(wxyz, omega)
         found = ph.simulate(
-            scene(kind, functions, scale), state, [0.0, 0.3], rtol=1e-3,
+            scene(kind, functions, scale), state, [0.0, 0.3],
+            ph.LiePoisson() if way == "stock" else None, rtol=1e-3,
             record=ph.Record(final_only=True),
         )  # fmt: skip
         return found.wxyz[..., 0, :], found.omega_body[..., 0, :]
@@ -241,7 +244,7 @@ def run(kind, functions, way):
     one, omega = jnp.array(0.7), jnp.array([0.3, 1.0, -0.4])
     if way == "value":
         return end(0.7, omega)
-    if way == "jit":
+    if way in ("jit", "stock"):
         return jax.jit(end)(one, omega)
     if way == "vmap":
         return jax.vmap(end)(jnp.array([0.0, 1.0]), jnp.stack([omega, 2 * omega]))
@@ -251,8 +254,8 @@ def run(kind, functions, way):
 def child(seed, start, stop, log):
     """Works through cases and writes each down before it begins."""
     for case in range(start, stop):
-        kind, functions, _ = draw(seed, case // len(WAYS))
-        way = WAYS[case % len(WAYS)]
+        kind, functions, _ = draw(seed, case // len(OF_SCENES))
+        way = OF_SCENES[case % len(OF_SCENES)]
         with Path(log).open("a") as file:
             file.write(f"{case} ")
             file.flush()
@@ -350,7 +353,7 @@ def hunt_units(count, seed, each=25):
 
 def hunt(count, seed, *, each=200, patience=120, plain=False):
     """Verdicts of all cases: ``{case: words}``; what ended a child is ``ENDED`` or ``STUCK``."""
-    total, start, found = count * len(WAYS), 0, {}
+    total, start, found = count * len(OF_SCENES), 0, {}
     environment = _quickly() | {"POLHODE_PLAIN": "1" if plain else "0"}
     with tempfile.TemporaryDirectory() as folder:
         while start < total:
@@ -393,8 +396,9 @@ def main():
     found = hunt(count, seed)
     for case, verdict in found.items():
         if not verdict.startswith(("ok", "refused")):
-            kind, _, words = draw(seed, case // len(WAYS))
-            print(f"case {case}, {kind}, {WAYS[case % len(WAYS)]}: {verdict}\n    {words}")
+            kind, _, words = draw(seed, case // len(OF_SCENES))
+            way = OF_SCENES[case % len(OF_SCENES)]
+            print(f"case {case}, {kind}, {way}: {verdict}\n    {words}")
     ended = sum(v.startswith(("ENDED", "STUCK")) for v in found.values())
     heads = [v.split()[0] for v in found.values()]
     print(f"{len(found)} combinations, {ended} ended the process;",

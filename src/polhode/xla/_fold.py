@@ -155,15 +155,15 @@ def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
     def of(operands):
         return {i for i, *_ in operands if not isinstance(i, _Held) and i in makers}
 
-    users: dict[int, list[int]] = {i: [] for i in makers}
+    users = dict.fromkeys(makers, 0)
     ends: dict[int, set[int]] = {i: set() for i in makers}  # the results that rest on it
     for k, operand in enumerate(out):
         for i in of([operand]):
-            users[i].append(-k)
+            users[i] += 1
             ends[i].add(k)
-    for k, step in reversed([*enumerate(steps)]):
+    for step in reversed(steps):
         for i in of(step.operands):
-            users[i].append(k)
+            users[i] += 1
             ends[i].update(*(ends[made] for made in step.made))
     shared: set[int] = set()
     behind: dict[int, set[int]] = {}  # the operations that a fused loop repeats for it
@@ -171,7 +171,7 @@ def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
         work = {k}.union(*(behind[i] for i in of(step.operands) - shared))
         for i in step.made:
             behind[i] = work
-            if min(len(users[i]), len(ends[i])) > 1 and len(work) >= _WORTH:
+            if min(users[i], len(ends[i])) > 1 and len(work) >= _WORTH:
                 shared.add(i)
     return frozenset(shared)
 
