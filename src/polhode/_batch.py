@@ -134,12 +134,13 @@ def along_time(part: Any, batch_rank: int) -> Any:
 def map_chunks(fn: Callable[[Any], Any], lanes: Any, n: int, size: int) -> Any:
     """``fn`` over chunks of at most ``size`` of the ``n`` lanes, one after the other.
 
-    Memory stays bounded by a chunk and its arrays stay in the cache. The last chunk is filled up
-    with copies of the last lane, which are dropped again.
+    Memory stays bounded by a chunk and its arrays stay in the cache. Chunks are of one size; the
+    last is filled up with copies of the last lane, which are dropped again.
     """
     if n <= size:
         return fn(lanes)
     count = -(-n // size)
+    size = -(-n // count)
 
     def split(x):
         fill = jnp.broadcast_to(x[-1:], (count * size - n, *x.shape[1:]))

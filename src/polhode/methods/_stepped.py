@@ -39,17 +39,29 @@ class Stepped(AbstractMethod):
         """Whether the steps follow from ``rtol``."""
         return self.controller is None and not hasattr(self.solver, "check")
 
-    @property
-    def _bodies_at_once(self) -> int:
+    def _bodies_at_once(self, scene: Scene, state: State, ts: Array, record: Record) -> int:
         """For a solver in which each body has its own steps."""
-        on_cpu = jax.default_backend() == "cpu"
-        return getattr(self.solver, "bodies_at_once", 1) if on_cpu else _ON_ACCELERATOR
+        asked, found = getattr(self.solver, "bodies_at_once", None), []
+        if jax.default_backend() != "cpu":
+            return _ON_ACCELERATOR
+        if asked is None or state.wxyz.shape[0] <= FEW:
+            return 1 if asked is None else FEW
+
+        def look(scene, state):
+            y0, _ = self._start(scene, state, ts, record)
+            term, dynamics = self._posed(scene, state, ts, record)
+            found.append(asked(term, ts[0], y0, dynamics))
+
+        eqx.filter_eval_shape(look, scene, state)
+        return found[0]
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         check = getattr(self.solver, "check", None)
         if check is not None:
             check(self, scene, record)
-        size = 1 if ts.ndim == 2 else self.chunk or self._bodies_at_once
+        size = 1
+        if ts.ndim == 1:
+            size = self.chunk or self._bodies_at_once(scene, state, ts, record)
         lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
 
         def one(chunk):
@@ -59,20 +71,34 @@ class Stepped(AbstractMethod):
             return self._solve(scene, state, times, rtol, record)
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
-        if n <= size:
+        if n <= min(size, _SORTED):
             whole = kernel(one, of_units=True) if n <= FEW else one
             return whole((lanes, times))
-        order = jnp.argsort(natural_rates(scene, state, ts))  # who shares a chunk is of like rate
+        # who shares a chunk is of like rate, and none that takes long is left to the end of it
+        order = jnp.argsort(-natural_rates(scene, state, ts))
         found = map_chunks(one, jax.tree.map(lambda x: x[order], (lanes, times)), n, size)
         return jax.tree.map(lambda x: x[jnp.argsort(order)], found)
 
-    def _solve(self, scene, state, ts, rtol, record: Record) -> Samples:
-        """One chunk of lanes."""
+    def _start(self, scene, state, ts, record: Record):
+        """The first state, with the work that is recorded, and what the chart can hold."""
         y0, sound = self.chart.start(scene, state, ts[0])
         if record.work:
             wheels = scene.dynamics.wheels
             loose = () if wheels is None else wheels.loose
             y0 = (*y0, (jnp.zeros_like(y0[0][0]),) * (1 + len(loose)))
+        return y0, sound
+
+    def _posed(self, scene, state, ts, record: Record):
+        """The term of the equations, and its arguments."""
+        dynamics = self.chart.dynamics(scene, state, ts)
+        if not record.work:
+            return diffrax.ODETerm(self.chart.field), dynamics
+        known = dynamics.hamiltonian, dynamics.torque, dynamics.units
+        return diffrax.ODETerm(self.chart.field_and_power), Dynamics(*known, wheels=dynamics.wheels)
+
+    def _solve(self, scene, state, ts, rtol, record: Record) -> Samples:
+        """One chunk of lanes."""
+        y0, sound = self._start(scene, state, ts, record)
         edges = None if scene.torque is None else scene.torque.edges
         if edges is None:
             found = self._moved(scene, state, y0, ts, rtol, record)
@@ -89,14 +115,7 @@ class Stepped(AbstractMethod):
 
     def _moved(self, scene, state, y0, ts, rtol, record) -> Moved:
         """States from ``y0`` on."""
-        dynamics = self.chart.dynamics(scene, state, ts)
-        field = self.chart.field
-        if record.work:
-            wheels, field = dynamics.wheels, self.chart.field_and_power
-            dynamics = Dynamics(
-                dynamics.hamiltonian, dynamics.torque, dynamics.units, wheels=wheels
-            )
-        term = diffrax.ODETerm(field)
+        term, dynamics = self._posed(scene, state, ts, record)
         asked = _Asked(ts, rtol, self.dt0, self.max_steps, record.final_only, _may_jump(scene))
         if self.controller is None:
             make = getattr(self.solver, "stepping", None)
@@ -158,6 +177,9 @@ class Stepped(AbstractMethod):
             spins,
         )
 
+
+_SORTED = 64
+"""Bodies, beyond which they are put in order of their rates."""
 
 _ON_ACCELERATOR = 2**18
 """Bodies that are moved together there: enough to fill it, few enough for its memory."""

@@ -6,5 +6,5 @@ from polhode.solvers._extrapolation import (
     Extrapolation as Extrapolation,
 )
 from polhode.solvers._flow_adjoint import FlowAdjoint as FlowAdjoint
-from polhode.solvers._march import GroupUnits as GroupUnits
 from polhode.solvers._splitting import Splitting as Splitting
+from polhode.solvers._units import GroupUnits as GroupUnits

@@ -55,8 +55,8 @@ class BoundTerm(eqx.Module):
             return jax.tree.leaves(found)
 
         closed = formula(rates, *arrays, t, *leaves)
-        held, run, _ = specialise(closed, arrays)
-        return Prepared(held, run, uses(closed.jaxpr, len(arrays)))
+        held, run, _, by_entry = specialise(closed, arrays)
+        return Prepared(held, run, uses(closed.jaxpr, len(arrays)), by_entry)
 
 
 def uses(jaxpr, place: int) -> bool:
@@ -67,11 +67,12 @@ def uses(jaxpr, place: int) -> bool:
 
 class Prepared(NamedTuple):
     """``held``: arrays that the rates rest on; ``run(held, t, *y)``: the rates; ``asks_time``:
-    whether these depend on the time. See ``BoundTerm.prepared``."""
+    whether these depend on the time; ``by_entry``: see ``xla.Specialised``."""
 
     held: tuple[Any, ...]
     run: Callable[..., list[Any]]
     asks_time: bool
+    by_entry: bool
 
     def rates(self, held, t, y) -> list[Any]:
         """The rates, on lists of arrays; ``held`` is handed in again so that a compiled unit may

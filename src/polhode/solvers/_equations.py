@@ -18,7 +18,7 @@ from polhode.solvers._columns import table
 from polhode.solvers._costates import AnyCostate, FlatCostate
 from polhode.solvers._extrapolation import order_for, units_of
 from polhode.solvers._linear import attached, is_slope, linear, zeros
-from polhode.solvers._march import Limits, fresh, march
+from polhode.solvers._march import Field, Limits, fresh, march
 from polhode.xla import kernel, specialise
 
 _STEPS = 2**20
@@ -84,11 +84,11 @@ class Equations:
         return jaxpr_as_fun(ClosedJaxpr(self.jaxpr, consts))(t, *y, *arrays)
 
     def prepared(self, c: Sequence[Any], t, y: Sequence[Any], stage: bool = False):
-        """Arrays held, and ``run(held, t, *y)``, the rates: see ``xla.specialise``."""
+        """Arrays held, rates ``run(held, t, *y)`` and ``by_entry``: see ``xla.Specialised``."""
         size = len(c)
         closed = jax.make_jaxpr(lambda *x: self.field(x[:size], x[size], x[size + 1 :]))(*c, t, *y)
-        held, run, _ = specialise(closed, c, stage=stage)
-        return held, run
+        held, run, _, by_entry = specialise(closed, c, stage=stage)
+        return held, run, by_entry
 
     def back(self, c: Sequence[Any], t, z: Sequence[Any]) -> tuple[list[Any], Any]:
         """Rates of state and costate, and the scalar whose slope by ``c`` is integrated."""
@@ -121,12 +121,12 @@ class Equations:
 
     def _solution(self, c, y, span, horizon):
         """The solution itself."""
-        held, run = self.prepared(c, span[0], y, stage=True)
+        held, run, by_entry = self.prepared(c, span[0], y, stage=True)
 
         def rates(held, t, y, along):
             return run(held, t, *y), []
 
-        return self._solve(c, rates, held, y, [], span, horizon, _plainly)[0]
+        return self._solve(c, rates, held, y, [], span, horizon, _plainly, by_entry)[0]
 
     def _pinned(self, c, y, t0, t1, horizon, end):
         return attached(self._moved, [t0, t1, horizon, *y, *c], end)
@@ -171,7 +171,7 @@ class Equations:
             return [*rate, *change]
 
         z = [*y, *dy]
-        held, run, _ = specialise(jax.make_jaxpr(both)(*known, span[0], *z), known)
+        held, run, _, by_entry = specialise(jax.make_jaxpr(both)(*known, span[0], *z), known)
 
         def rates(held, t, z, along):
             return run(held, t, *z), []
@@ -180,7 +180,7 @@ class Equations:
             weights, rate = own(z[:size], f[:size])
             return [*weights, *relative(weights, z[size:], f[size:], rate)], rate
 
-        return self._solve(c, rates, held, z, [], span, horizon, units)[0][size:]
+        return self._solve(c, rates, held, z, [], span, horizon, units, by_entry)[0][size:]
 
     def _cotangent(self, at, given, slopes):
         """The transpose: slopes with respect to the start and to ``c[i]``."""
@@ -199,7 +199,7 @@ class Equations:
         # components of what is differentiated are fewer than what folding makes of them
         some, lane = [c[i] for i in at], end[0].shape
         for fold in (False, True):
-            made, run, seen = specialise(closed, c, fold=fold, stage=False)
+            made, run, seen, _ = specialise(closed, c, fold=fold, stage=False)
             which = _moving(partial(coefficients, fold), some)
             if all(seen[i] == {lane} for i in which):
                 break
@@ -235,11 +235,12 @@ class Equations:
             return found[: len(z)], found[len(z) :]
 
         held, own = (full.held, bare.held), all(s == lane for s in shapes)
-        z, mu = self._solve(c, rates, held, z, mu, span[::-1], horizon, self.costate.units, own)
+        by_entry, units = full.by_entry and bare.by_entry, self.costate.units
+        z, mu = self._solve(c, rates, held, z, mu, span[::-1], horizon, units, by_entry, own)
         mu = [_summed(m, jnp.shape(made[i])) for m, i in zip(mu, which)]
         return [*self.costate.finish(z, start, end, slopes), *pull(mu)]
 
-    def _solve(self, c, rates, held, y, integrals, span, horizon, units, own=True):
+    def _solve(self, c, rates, held, y, integrals, span, horizon, units, by_entry, own=True):
         """States and integrals at the end. ``units(own, y, rates)``: natural units of the states,
         ``own`` those of the solution's."""
         rtol, told = jax.tree.unflatten(self.told, self._parts(c)[3])
@@ -249,10 +250,8 @@ class Equations:
             given = table(order_for(rtol), y[0].dtype)
             limits = Limits(rtol, horizon, _STEPS, False)
             progress = fresh(y, self.compensated, span[0])
-            y, sums, _ = march(
-                partial(rates, held), partial(units, told), given, limits, own, span, y, integrals,
-                progress,
-            )  # fmt: skip
+            field = Field(rates, units, (held, told), own, by_entry)
+            y, sums, _ = march(field, given, limits, span, y, integrals, progress)
             return y, sums
 
         return kernel(run)(held, told, rtol, horizon, span, list(y), list(integrals))

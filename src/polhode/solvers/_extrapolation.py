@@ -14,7 +14,9 @@ from polhode.solvers._bound_term import BoundTerm
 from polhode.solvers._columns import CHOSEN, SEQUENCES, carried_on, evaluations, extrapolated, table
 from polhode.solvers._dense import CollocationInterpolation, collocate
 from polhode.solvers._equal_steps import GivenTimes
-from polhode.solvers._march import GroupUnits, Limits, Progress, fresh, march
+from polhode.solvers._lanes import LANES, QUEUE
+from polhode.solvers._march import Field, Limits, Progress, fresh, march
+from polhode.solvers._units import GroupUnits
 from polhode.xla import kernel, opaque_ones, staged
 
 
@@ -68,7 +70,6 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
     max_steps: int = eqx.field(static=True, default=2**16)
     jumps: bool = eqx.field(static=True, default=False)
 
-    bodies_at_once: ClassVar = 64
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = CollocationInterpolation
 
@@ -96,6 +97,12 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
             self.formal_order, self.compensated, accuracy, asked.max_steps, asked.jumps
         )
         return asked.marched(solver)
+
+    def bodies_at_once(self, terms, t: Array, y: PyTree, args: PyTree) -> int:
+        """Bodies that one solve leads best: where each goes on without regard to others, as many
+        as wait for a lane; else as many as there are lanes."""
+        dtype = jnp.result_type(*jax.tree.leaves(y))
+        return QUEUE if BoundTerm.of(terms, args).prepared(t, y, dtype).by_entry else LANES
 
     def order(self, terms) -> int:
         return self._fixed_order
@@ -169,20 +176,21 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         units = units_of(args, y0, horizon)
 
         def run(held, units, rtol, horizon, span, y, progress, elapsed):
-            def rates(t, y, along):
+            def rates(held, t, y, along):
                 return problem.rates(held, t, y), []
 
             order = self.formal_order
             if order is None:  # for the way from time to time, at the rates of the start
-                _, rate = units(y, rates(span[0], y, False)[0])
+                _, rate = units(y, rates(held, span[0], y, False)[0])
                 gap = jnp.abs(span[1] - span[0])
                 if elapsed is not None:
                     gap = gap / jnp.sum(jnp.where(elapsed > 0, 1, 0)).astype(gap.dtype)
                 order = order_for(rtol, jnp.max(rate, initial=0) * gap.astype(dtype))
             given = table(order, dtype)
             limits = Limits(rtol, horizon, self.max_steps, self.jumps)
-            own = not problem.asks_time
-            y, _, new = march(rates, units, given, limits, own, span, y, [], progress, elapsed)
+            own, known = not problem.asks_time, (held, units)
+            field = Field(rates, _as_told, known, own, problem.by_entry)
+            y, _, new = march(field, given, limits, span, y, [], progress, elapsed)
             return y, new
 
         y1, progress = kernel(run)(
@@ -197,6 +205,10 @@ def units_of(args: Any, y0: PyTree, horizon: Array) -> Any:
     """Natural units that the arguments of a field tell, or those of any state."""
     told = getattr(args, "units", None)
     return GroupUnits.of(y0, horizon) if told is None else jax.lax.stop_gradient(told)
+
+
+def _as_told(units, y, rates):
+    return units(y, rates)
 
 
 _BESIDE = 30

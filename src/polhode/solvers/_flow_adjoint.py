@@ -56,7 +56,7 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
         compensated = getattr(solver, "compensated", False)
         equations, c = equations_of(terms, args, init_state.y, t0, rtol, compensated)
 
-        held, rates = equations.prepared(c, t0, leaves)
+        held, rates, _ = equations.prepared(c, t0, leaves)
         rates = kernel(rates)  # for solvers that are not units themselves
 
         def field(t, y, known):

@@ -7,27 +7,44 @@ tops and gravity gradients with six decades of every parameter, orders 8 to 16 a
 2.2 radians the true error was 2 to 20 times that, 4.5 times in the median, for errors from 1e-13 to
 1e-2 (``benchmarks/error_control.py``); e alone is too large by anything up to 1,000.
 
-Steps are each body's own where the rates do not ask for the time: bodies march side by side, and
-the loop ends when the last has arrived. Where the rates do ask for it (an orbit, a torque that is
-a function of time) the bodies share their times, so that what depends on the time alone is worked
-out once for all of them, and the body that needs the smallest step decides.
+Steps are each body's own where the rates do not ask for the time: bodies march side by side, a few
+at once, and those that have arrived make room for others (``_lanes.py``). Where the rates do ask
+for it (an orbit, a torque that is a function of time) the bodies share their times, so that what
+depends on the time alone is worked out once for all of them, and the body that needs the smallest
+step decides.
 """
 
 from collections.abc import Callable
+from functools import partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode.solvers._columns import Rates, Table, carried_on, extrapolated
+from polhode.solvers._columns import Table, carried_on, extrapolated
+from polhode.solvers._lanes import LANES, in_lanes
+from polhode.solvers._units import weighted_length
 from polhode.xla import any_of, put
 
-Units = Callable[[list[Array], list[Array]], tuple[list[Array], Array]]
-"""Weights of the components of an error, whose squares are summed, and the natural rate [rad/s],
-of a state and its rates."""
+
+class Field(NamedTuple):
+    """What moves bodies that are the entries of arrays, and the arrays ``known`` that it rests on:
+    ``held`` of the rates, ``told`` of the units.
+
+    ``rates(held, t, y, along)``: see ``extrapolated``. ``units(told, y, rates)``: weights of the
+    components of an error, whose squares are summed, and the natural rate [rad/s]. ``own``: each
+    body in steps of its own; the rates must then not depend on the time. ``by_entry``: whether
+    bodies can be exchanged for others by exchanging the entries of all these arrays.
+    """
+
+    rates: Callable[..., tuple[list[Array], list[Array]]]
+    units: Callable[..., tuple[list[Array], Array]]
+    known: tuple[Any, Any]
+    own: bool
+    by_entry: bool = False
+
 
 CALIBRATED = 5
 """The error of a step over e^2 / d (see above)."""
@@ -105,15 +122,14 @@ def fresh(y: list[Array], compensated: bool, t: Array) -> Progress:
 
 
 class _Saved(NamedTuple):
-    """States saved on the way: ``rows`` (n, T + 1, C), the last of them not used; ``place`` (n,):
-    the next one, which is ``due`` (n,) [s] after the start."""
+    """States saved on the way: ``place`` (n,): the next one among those of its body, which is
+    ``due`` (n,) [s] after the start."""
 
-    rows: Array
     place: Array
     due: Array
 
     @classmethod
-    def first(cls, rows: Array, elapsed: Array, y: list[Array]) -> "_Saved":
+    def first(cls, rows: Array, elapsed: Array, y: list[Array]) -> tuple["_Saved", Array]:
         """Before the first step: what is saved at the start is the given state, all else is NaN,
         whatever ``rows`` hold: to look at them takes longer than to write anew."""
         now = elapsed <= 0
@@ -121,25 +137,30 @@ class _Saved(NamedTuple):
         empty = jnp.full_like(rows, jnp.nan)
         rows = jnp.where(here[:, None], jnp.stack(y, axis=-1)[:, None], empty)
         place = jnp.broadcast_to(jnp.sum(jnp.where(now, 1, 0)).astype(jnp.int32), y[0].shape)
-        return cls(rows, place, elapsed.at[place].get(mode="clip"))
+        saved = cls(place, elapsed.at[place].get(mode="clip"))
+        return saved, rows.reshape(-1, len(y))
 
-    def after(self, reached: Array, elapsed: Array, y: list[Array]) -> "_Saved":
-        """With the states of the bodies that have ``reached`` what was due."""
+    def after(
+        self, reached: Array, body: Array, elapsed: Array, y: list[Array], rows: Array
+    ) -> tuple["_Saved", Array]:
+        """With the states of the bodies that have ``reached`` what was due among the ``rows``
+        (n (T + 1), C), the last of each body not used."""
+        unused = elapsed.shape[0]
 
         def once(carry):
-            saved, _ = carry
-            unused = saved.rows.shape[1] - 1
-            rows = put(saved.rows, jnp.where(reached, saved.place, unused), jnp.stack(y, axis=-1))
+            saved, rows, _ = carry
+            at = body * (unused + 1) + jnp.where(reached, saved.place, unused)
+            rows = put(rows, at, jnp.stack(y, axis=-1))
             place = saved.place + jnp.where(reached, 1, 0)
-            return _Saved(rows, place, elapsed.at[place].get(mode="clip")), False
+            return _Saved(place, elapsed.at[place].get(mode="clip")), rows, False
 
         some = any_of(reached.astype(self.due.dtype))
         # once or not at all: a branch would copy all that is saved
-        return jax.lax.while_loop(lambda carry: carry[1], once, (self, some))[0]
+        return jax.lax.while_loop(lambda carry: carry[2], once, (self, rows, some))[:2]
 
 
 class _Walk(NamedTuple):
-    """A march under way."""
+    """What changes in a march; every array has one entry a body."""
 
     tried: Array
     gone: Array  # time since the start of this march
@@ -156,12 +177,19 @@ class _Walk(NamedTuple):
     saved: _Saved | None
 
 
+class _Fixed(NamedTuple):
+    """What does not: ``known`` of the field; which of all bodies each is; why it was given up
+    before. As part of a loop's state what does not change may end the process in XLA."""
+
+    known: Any
+    body: Array
+    ended: Array
+
+
 def march(
-    rates: Rates,
-    units: Units,
+    field: Field,
     given: Table,
     limits: Limits,
-    own: bool,
     span: tuple[Array, Array],
     y: list[Array],
     integrals: list[Array],
@@ -170,12 +198,11 @@ def march(
 ) -> tuple[list[Array], list[Array], Progress]:
     """State and integrals at ``span[1]``, of bodies that are the entries of arrays of one shape.
 
-    A body that has used up ``limits.steps`` ends as NaN. ``own`` (static): each body in steps of
-    its own; the rates must then not depend on the time. ``elapsed`` (T,): times since the start [s]
-    in order, the last that of the end, at which the states are to be saved, as the ``rows`` of the
-    progress: a body that has reached one goes on to its next without waiting for others.
+    A body that has used up ``limits.steps`` ends as NaN. ``elapsed`` (T,): times since the start
+    [s] in order, the last that of the end, at which the states are to be saved, as the ``rows`` of
+    the progress: a body that has reached one goes on to its next without waiting for others.
     """
-    compensated = bool(progress.low)
+    compensated, own = bool(progress.low), field.own
     start, end = span
     length, sign = jnp.abs(end - start), jnp.where(end < start, -1, 1)
     dtype = y[0].dtype
@@ -189,22 +216,27 @@ def march(
         """Of the bodies that share their steps, but for those that are given up."""
         return x if own else jnp.broadcast_to(jnp.max(jnp.where(dead, 0, x)), x.shape)
 
-    def given_up(walk):
+    def given_up(fixed, walk):
         """Bodies whose steps ran out, or became so short that they lead nowhere."""
         able = (walk.steps < limits.steps) & (walk.width > 0.1 * eps * length)
-        return ~(able & (progress.ended == 0))
+        return ~(able & (fixed.ended == 0))
 
-    def live(walk):
-        return (walk.gone < whole_length) & ~given_up(walk)
+    def live(fixed, walk):
+        return (walk.gone < whole_length) & ~given_up(fixed, walk)
 
-    def judged(walk, t, h, width, new, found, later):
+    def bound(fixed):
+        """Rates and units of bodies."""
+        held, told = fixed.known
+        return partial(field.rates, held), partial(field.units, told)
+
+    def judged(rates, units, walk, t, h, width, new, found, later):
         """Error of a step, and what it may be."""
         (weights, rate), (weights_, rate_) = units(walk.y, walk.rates), units(new, later)
         # by the larger and faster of both ends: a body that a torque sets in motion is not held
         # to digits of what it had at rest
         weights = [jnp.minimum(a, b) for a, b in zip(weights, weights_)]
         rate = jnp.maximum(rate, rate_)
-        last, before = (_size(weights, e) for e in (found.last, found.before))
+        last, before = (weighted_length(weights, e) for e in (found.last, found.before))
         error = CALIBRATED * last * jnp.where(last < before, last / before, 1)
         if limits.jumps:
             error = error + _missed(rates, t, h, walk, new, later, weights)
@@ -222,7 +254,10 @@ def march(
         error, allowed = jnp.where(sound, error, jnp.inf), jnp.where(sound, allowed, 1)
         return jax.lax.stop_gradient((error, allowed, jnp.where(sound, angle, 0)))
 
-    def one(walk):
+    def one(fixed, walk, rows):
+        """One step of each body."""
+        rates, units = bound(fixed)
+        alive = live(fixed, walk)
         due = whole_length if walk.saved is None else walk.saved.due
         left = (due - walk.gone).astype(dtype)
         # no step is much shorter than its neighbours for the sake of the end
@@ -237,7 +272,7 @@ def march(
         exact = jnp.where(down, (near - grain - walk.gone).astype(dtype), exact)
         exact = jnp.minimum(jnp.maximum(exact, grain.astype(dtype)), left)
         width = jnp.where(width == left, left, exact)
-        width = jnp.where(live(walk), width, 0)
+        width = jnp.where(alive, width, 0)
         gone, h = (x if own else jnp.max(x) for x in (walk.gone, width))
         t, h = start + sign * gone, sign.astype(dtype) * h
         found = extrapolated(rates, given, t, h, walk.y, walk.rates, walk.integrals, compensated)
@@ -246,9 +281,9 @@ def march(
         if compensated:
             new, low = carried_on(walk.y, walk.low, found.change)
         later, _ = rates(t + h.astype(t.dtype), new, False)
-        error, allowed, angle = judged(walk, t, h, width, new, found, later)
-        ratio = worst(error / allowed, given_up(walk))
-        good = (ratio <= 1) & live(walk)
+        error, allowed, angle = judged(rates, units, walk, t, h, width, new, found, later)
+        ratio = worst(error / allowed, given_up(fixed, walk))
+        good = (ratio <= 1) & alive
         size = jnp.log(jnp.maximum(ratio, 1e-6))  # logarithms: a power takes as long as three
         factor = CAUTION * jnp.exp(power * (jnp.where(good, MEMORY * walk.before, 0) - size))
         factor = jnp.clip(factor, jnp.where(good, 0.2, 0.1), jnp.where(good, 4, 0.9))
@@ -257,25 +292,31 @@ def march(
         factor = jnp.where(good & (width < 64 * grain.astype(dtype)) & ~cut, 4, factor)
         wanted = jnp.where(good & cut, jnp.maximum(walk.width, width * factor), width * factor)
         wanted = jnp.where(good | (width > grain.astype(dtype)), wanted, 0)
-        wanted = jnp.where(live(walk), wanted, walk.width)
+        wanted = jnp.where(alive, wanted, walk.width)
         later_time = jnp.where(width == left, due, walk.gone + width.astype(walk.gone.dtype))
         gone = jnp.where(good, later_time, walk.gone)
         saved = walk.saved
         if saved is not None:
-            saved = saved.after(good & (width == left), elapsed, new)
+            reached = good & (width == left)
+            saved, rows = saved.after(reached, fixed.body, elapsed, new, rows)
 
         def pick(a, b):
             return [jnp.where(good, x, y) for x, y in zip(a, b)]
 
         refused = (good, 0, error), (good, 0, width)
-        return _Walk(
-            walk.tried + 1, gone, pick(new, walk.y), pick(later, walk.rates), pick(low, walk.low),
+        walk = _Walk(
+            walk.tried + jnp.where(alive, 1, 0).astype(dtype), gone,
+            pick(new, walk.y), pick(later, walk.rates), pick(low, walk.low),
             _picked(good, found.sums, walk.integrals), wanted, jnp.where(good, size, walk.before),
             tuple(jnp.where(*x) for x in refused),
             walk.turned + jnp.where(good, angle, 0), walk.error + jnp.where(good, error, 0),
             walk.steps + jnp.where(good, 1, 0), saved,
         )  # fmt: skip
+        return walk, rows
 
+    body = jnp.arange(zero.size, dtype=jnp.int32).reshape(zero.shape)
+    fixed = _Fixed(field.known, body, progress.ended)
+    rates, units = bound(fixed)
     first, _ = rates(start, y, False)
     _, rate = units(y, first)
     # at first half of what a smooth motion allows, at once the whole way if that is short
@@ -285,32 +326,43 @@ def march(
     if not own:
         sound = jnp.where(guess > 0, guess, jnp.inf)  # a body that is no number holds up no other
         guess = jnp.where(guess > 0, jnp.min(sound), guess)
+    saved, rows = None, None
+    if elapsed is not None:
+        saved, rows = _Saved.first(progress.rows, elapsed, y)
     walk = _Walk(
-        jnp.zeros((), start.dtype), jnp.zeros(zero.shape, start.dtype), y, first, progress.low,
-        integrals, guess, zero, (zero, zero), progress.turned, progress.error, progress.steps,
-        None if elapsed is None else _Saved.first(progress.rows, elapsed, y),
+        zero, jnp.zeros(zero.shape, start.dtype), y, first, progress.low, integrals, guess, zero,
+        (zero, zero), progress.turned, progress.error, progress.steps, saved,
     )  # fmt: skip
 
-    def on(walk):
-        able = live(walk) & (walk.tried < _TRIES * limits.steps)
-        return any_of(able.astype(dtype))
+    def able(fixed, walk):
+        return live(fixed, walk) & (walk.tried < _TRIES * limits.steps)
 
-    walk = jax.lax.while_loop(on, one, walk)
-    arrived = (walk.gone >= whole_length) & (progress.ended == 0)
-    y = [jnp.where(arrived, x, jnp.nan) for x in walk.y]
-    numbers = jnp.isfinite(walk.width) & jnp.isfinite(walk.refused[0])
-    left = (walk.steps < limits.steps) & (walk.tried < _TRIES * limits.steps)
-    why = jnp.where(left, jnp.where(numbers, 2, 3), 1)
-    ended = jnp.where(arrived, 0, jnp.where(progress.ended > 0, progress.ended, why))
-    gone, rows = (
-        progress.gone + whole_length,
-        None if walk.saved is None else walk.saved.rows,
-    )
-    new = Progress(
-        walk.width, walk.turned, walk.low, walk.steps, walk.error, gone, ended.astype(jnp.int32),
-        rows,
-    )  # fmt: skip
-    return y, walk.integrals, new
+    def finished(fixed, walk):
+        arrived = (walk.gone >= whole_length) & (fixed.ended == 0)
+        y = [jnp.where(arrived, x, jnp.nan) for x in walk.y]
+        numbers = jnp.isfinite(walk.width) & jnp.isfinite(walk.refused[0])
+        left = (walk.steps < limits.steps) & (walk.tried < _TRIES * limits.steps)
+        why = jnp.where(left, jnp.where(numbers, 2, 3), 1)
+        ended = jnp.where(arrived, 0, jnp.where(fixed.ended > 0, fixed.ended, why))
+        # as floats, like all the rest
+        numbers = walk.width, walk.turned, walk.steps, walk.error, ended.astype(dtype)
+        return y, walk.integrals, walk.low, numbers
+
+    if field.by_entry and own and zero.ndim == 1 and zero.size > LANES:
+        found, rows = in_lanes(one, able, finished, fixed, walk, rows)
+    else:
+        walk, rows = jax.lax.while_loop(
+            lambda carry: any_of(able(fixed, carry[0]).astype(dtype)),
+            lambda carry: one(fixed, *carry),
+            (walk, rows),
+        )
+        found = finished(fixed, walk)
+    y, integrals, low, (width, turned, steps, error, ended) = found
+    gone = progress.gone + whole_length
+    if rows is not None:
+        rows = rows.reshape(zero.size, -1, len(y))
+    ended = ended.astype(jnp.int32)
+    return y, integrals, Progress(width, turned, low, steps, error, gone, ended, rows)
 
 
 def _drift(whole: Array) -> Array:
@@ -324,11 +376,6 @@ def _picked(good, new, old):
     return [
         jnp.where(good if x.shape == good.shape else jnp.any(good), x, y) for x, y in zip(new, old)
     ]
-
-
-def _size(weights: list[Array], error: list[Array]) -> Array:
-    square = sum((w * e) ** 2 for w, e in zip(weights, error))
-    return jnp.sqrt(jax.lax.stop_gradient(square))
 
 
 def _missed(rates, t, width, walk, new, later, weights) -> Array:
@@ -355,37 +402,9 @@ def _missed(rates, t, width, walk, new, later, weights) -> Array:
         sizes = []
         for _ in range(3):
             rows = [[b - a for a, b in zip(p, q)] for p, q in pairwise(rows)]
-            sizes.append(_size(weights, rows[0]))
+            sizes.append(weighted_length(weights, rows[0]))
         first, second, third = sizes
-        noise = 64 * eps * _size(weights, there)
+        noise = 64 * eps * weighted_length(weights, there)
         jumps = third > jnp.maximum(0.5 * jnp.maximum(second, 0.5 * first), noise)
         total = total + jnp.where(jumps, third * jnp.abs(4 * gap), 0)
     return total
-
-
-class GroupUnits(eqx.Module):
-    """Natural units of any state: each subtree at its top is a vector, measured by its length.
-
-    What is zero is measured by what its rate makes of it in the time ``span`` [s].
-    """
-
-    groups: tuple[int, ...] = eqx.field(static=True)
-    span: Array
-
-    @classmethod
-    def of(cls, y: Any, span: Array) -> "GroupUnits":
-        """Of states like ``y``."""
-        parts = [y] if eqx.is_array(y) else jax.tree.leaves(y, is_leaf=lambda x: x is not y)
-        return cls(tuple(len(jax.tree.leaves(part)) for part in parts), span)
-
-    def __call__(self, y: list[Array], rates: list[Array]) -> tuple[list[Array], Array]:
-        weights, square, start = [], jnp.zeros_like(y[0]), 0
-        for count in self.groups:
-            these = slice(start, start + count)
-            size = sum(x * x for x in y[these])
-            size = size + 1e-6 * sum((self.span.astype(x.dtype) * x) ** 2 for x in rates[these])
-            weight = 1 / jnp.sqrt(jnp.where(size > 0, size, 1))
-            square = square + sum((weight * x) ** 2 for x in rates[these])
-            weights += [weight] * count
-            start += count
-        return weights, jnp.sqrt(square)

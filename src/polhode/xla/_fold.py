@@ -29,6 +29,13 @@ _FOLDS = {
 _ELEMENTWISE = frozenset(
     (*_FOLDS, *"integer_pow square sqrt rsqrt sin cos exp log abs sign max min copy".split())  # noqa: SIM905
 )
+_BY_ENTRY = _ELEMENTWISE | frozenset(
+    """acos acosh and asin asinh atan atan2 atanh cbrt ceil convert_element_type cosh eq erf erfc
+     exp2 expm1 floor ge gt is_finite le log1p logistic lt ne not or pow rem round select_n sinh
+     stop_gradient tan tanh""".split()  # noqa: SIM905
+)
+"""Operations that treat the entries of arrays of one shape separately."""
+
 _TAKING_APART = frozenset(
     "broadcast_in_dim convert_element_type copy gather reshape slice squeeze stop_gradient".split()  # noqa: SIM905
 )
@@ -71,19 +78,23 @@ class Specialised(NamedTuple):
     """``held``: arrays computed before the loop; ``run(held, *state_leaves)`` does the rest.
 
     ``seen``: the shapes to which the loop broadcasts each; where that is one only, an array of
-    this shape may stand in its place.
+    this shape may stand in its place. ``by_entry``: whether every operation treats the entries of
+    the state's arrays separately, so that ``run`` takes any number of them.
     """
 
     held: tuple[Any, ...]
     run: Callable[..., list[Any]]
     seen: tuple[frozenset[tuple[int, ...]], ...]
+    by_entry: bool
 
 
 class _Step(NamedTuple):
-    """An operation of the loop; ``operands``: where it finds each, its aval, to what shape."""
+    """An operation of the loop; ``operands``: where it finds each, its aval, to what shape;
+    ``by_entry``: whether entries of its arrays have nothing to do with one another."""
 
     made: list[int]
     bind: Any
+    by_entry: bool
     operands: list[tuple[Any, Any, tuple[int, ...]]]
 
 
@@ -98,7 +109,7 @@ def specialise(
     if is_plain():
         shapes = tuple(frozenset([jnp.shape(x)]) for x in known)
         return Specialised(
-            tuple(known), lambda held, *state: jaxpr_as_fun(closed)(*held, *state), shapes
+            tuple(known), lambda held, *state: jaxpr_as_fun(closed)(*held, *state), shapes, False
         )
     jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals), True)
     work = _Work(fold)
@@ -115,6 +126,11 @@ def specialise(
             held[x.key] = x.value
             seen.setdefault(x.key, set()).add(tuple(shape))
     places = {key: place for place, key in enumerate(held)}
+    lane = free[-1].aval.shape
+    by_entry = all(step.by_entry for step in steps)
+    for _, aval, _ in (*(o for step in steps for o in step.operands), *out):
+        by_entry = by_entry and aval.shape == lane
+    by_entry = by_entry and all(np.shape(x) in ((), lane) for x in held.values())
     shared = _shared(steps, out) if stage else frozenset()
 
     def run(held, *state):
@@ -125,7 +141,8 @@ def specialise(
             if not isinstance(x, _Held):
                 return values[x]
             value = held[places[x.key]] if x.number is None else x.number
-            shape = np.broadcast_shapes(np.shape(value), aval.shape)
+            shape = jnp.shape(state[-1]) if by_entry else aval.shape
+            shape = np.broadcast_shapes(np.shape(value), shape)
             return jnp.broadcast_to(jnp.asarray(value, aval.dtype), shape)
 
         for step in steps:
@@ -134,7 +151,7 @@ def specialise(
                 values[i] = staged(x, opaque_ones(x)) if i in shared else x
         return [read(o) for o in out]
 
-    return Specialised(tuple(held.values()), run, tuple(map(frozenset, seen.values())))
+    return Specialised(tuple(held.values()), run, tuple(map(frozenset, seen.values())), by_entry)
 
 
 def _needed(steps: list[_Step], out) -> tuple[_Step, ...]:
@@ -192,11 +209,11 @@ class _Work:
         self.count += 1
         return _Slot(self.count - 1, aval)
 
-    def emit(self, bind, inputs, avals, outs, elementwise=True) -> list[_Slot]:
+    def emit(self, bind, inputs, avals, outs, name="mul") -> list[_Slot]:
         made = [self.slot(aval) for aval in outs]
-        shapes = [(outs[0] if elementwise else aval).shape for aval in avals]
+        shapes = [(outs[0] if name in _ELEMENTWISE else aval).shape for aval in avals]
         operands = [(self.operand(x), aval, s) for x, aval, s in zip(inputs, avals, shapes)]
-        self.steps.append(_Step([s.index for s in made], bind, operands))
+        self.steps.append(_Step([s.index for s in made], bind, name in _BY_ENTRY, operands))
         return made
 
     def operand(self, x) -> Any:
@@ -254,7 +271,7 @@ class _Work:
             if simple is not None:
                 return [simple]
         avals, outs = ([v.aval for v in vs] for vs in (eqn.invars, eqn.outvars))
-        return self.emit(_binder(eqn), given, avals, outs, name in _ELEMENTWISE)
+        return self.emit(_binder(eqn), given, avals, outs, name)
 
     def known_once(self, eqn, given) -> list[_Held]:
         """The same array for the same equation, when it is met again."""

@@ -106,34 +106,34 @@ def _any_of_all(size, batched, these):
 
 
 @custom_vmap
-def put(rows: jax.Array, place: jax.Array, values: jax.Array) -> jax.Array:
-    """``rows`` (..., S, C) with ``values`` (..., C) of bodies (...) at ``place`` (...) in S.
+def put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
+    """``rows`` (S, C) with ``values`` (n, C) at ``places`` (n,) in S, the last of equal ones.
 
     One after another on the CPU, where a unit cannot hold a scatter. Not for reverse mode.
     """
-    bodies = place.shape
-    if place.size == 0 or jax.default_backend() != "cpu":
-        return rows.at[(*jnp.indices(bodies), place)].set(values)
+    if places.size == 0 or jax.default_backend() != "cpu":
+        return rows.at[places].set(values)
 
     def one(i, rows):
-        at, rest = (i,), i
-        if len(bodies) > 1:
-            at = ()
-            for size in bodies[::-1]:
-                at, rest = (rest % size, *at), rest // size
-        to = (*at, place[at].astype(i.dtype), jnp.zeros_like(i))
-        value = values[at].reshape(*(1,) * (len(at) + 1), values.shape[-1])
-        return jax.lax.dynamic_update_slice(rows, value, to)
+        place = places[i].astype(i.dtype)
+        return jax.lax.dynamic_update_slice(rows, values[i][None], (place, jnp.zeros_like(i)))
 
-    return jax.lax.fori_loop(0, place.size, one, rows)
+    return jax.lax.fori_loop(0, places.size, one, rows)
 
 
 @put.def_vmap
 def _put_all(size, batched, *given):
-    """A batch of bodies is more bodies."""
-    return put(
-        *(x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(given, batched))
-    ), True
+    """The rows of a batch, one after another."""
+    rows, places, values = (
+        x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(given, batched)
+    )
+    places = places + rows.shape[1] * jnp.arange(size, dtype=places.dtype)[:, None]
+    flat = put(_flat(rows), places.reshape(-1), _flat(values))
+    return flat.reshape(rows.shape), True
+
+
+def _flat(x: jax.Array) -> jax.Array:
+    return x.reshape(-1, x.shape[-1])
 
 
 def _opened(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
