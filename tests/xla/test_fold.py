@@ -108,7 +108,7 @@ def test_folds():
     a, b = jnp.array(1.5), jnp.array([0.5, -2.0, 1.0])
     x, y = jnp.array([0.3, -1.0, 2.0]), jnp.array([1.0, 4.0, -0.2])
     closed = jax.make_jaxpr(fn)(a, b, x, y)
-    held, run, _ = specialise(closed, [a, b])
+    held, run, *_ = specialise(closed, [a, b])
     for got, want in zip(run(held, x, y), fn(a, b, x, y), strict=True):
         np.testing.assert_allclose(got, want, rtol=1e-15, atol=1e-16)
         assert got.shape == want.shape
@@ -125,7 +125,7 @@ def test_what_results_share_is_worked_out_once():
     closed = jax.make_jaxpr(rates)(*given)
 
     def multiplications(stage):
-        held, run, _ = specialise(closed, given[:1], stage=stage)
+        held, run, *_ = specialise(closed, given[:1], stage=stage)
         program = jax.jit(lambda *state: run(held, *state)).lower(*given[1:]).compile()
         np.testing.assert_allclose(program(*given[1:]), rates(*given), rtol=1e-12)
         return program.as_text().count(" multiply(")

@@ -47,7 +47,7 @@ def test_one_variable_switches_all_off(monkeypatch):
     assert float(specialise(closed, [jnp.array(3.0)]).held[0]) == 6
     monkeypatch.setenv("POLHODE_PLAIN", "1")
     assert "xla_cpu_small_call" not in _lowered()
-    held, run, _ = specialise(closed, [jnp.array(3.0)])
+    held, run, *_ = specialise(closed, [jnp.array(3.0)])
     assert float(held[0]) == 3
     assert float(run(held, jnp.array(2.0))[0]) == 12
 

@@ -322,8 +322,9 @@ def LiePoisson(
       drag stops within the time simulated).
     - ``progress_meter``: as in diffrax.
     - ``chunk``: bodies that are moved together; chunks follow one another, so memory stays bounded.
-      None: 200 where the bodies of a chunk share their steps; for ``Extrapolation``, in which each
-      has its own, 64, whose arrays a processor's cache holds, and 2^18 on an accelerator.
+      None: 200 where the bodies of a chunk share their steps. For ``Extrapolation``, in which each
+      has its own, 1024, of which 64 are on their way at once, in a processor's cache; 64 where the
+      field is more than arithmetic on the numbers of one body; 2^18 on an accelerator.
     """
     return _stepped(LiePoissonChart(), 200, solver, controller, dt0, max_steps, adjoint,
                     progress_meter, chunk)  # fmt: skip
