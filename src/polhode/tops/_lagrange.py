@@ -76,6 +76,10 @@ def _row(tree):
     return jax.tree.map(lambda x: x[None], tree)
 
 
+def _rows_of_ones(rows: int, x: Array) -> Array:
+    return opaque_ones(x * jnp.arange(1, rows + 1, dtype=x.dtype)[:, None])
+
+
 def _reciprocal(a: Complex, b: Complex, times: Array) -> tuple[Complex, Complex]:
     """The pair so that its product is ``times`` where that is small and one is large, so that the
     other is rounding: near three equal roots all would be."""
@@ -85,7 +89,7 @@ def _reciprocal(a: Complex, b: Complex, times: Array) -> tuple[Complex, Complex]
     return where(second & ~first, other, a), where(first, other, b)
 
 
-def _places(f: Cubic, c: Curve, one: Array):
+def _places(f: Cubic, c: Curve, raw: Array):
     """Places of the state, of g = -1 and of g = 1 (before the turning over), and their partners."""
     circular = f.circular
     zero = jnp.zeros_like(f.across)
@@ -120,7 +124,8 @@ def _places(f: Cubic, c: Curve, one: Array):
         jnp.stack([-f.across / state_span, zero, _only(circular, root)]),
         jnp.stack([zero, zero, _only(~circular, -root)]),
     )
-    f, c, one = _row((f, c, one))
+    f, c, one = *_row((f, c)), _rows_of_ones(3, raw)
+    near = staged(near, one)
     scale = 1 / safe(near, f.amount * span)
     lift, fall = staged(((f.middle + depth) * scale, fall * (scale * jnp.sqrt(f.width))), one)
     mean, step = staged((mean * f.reach, step * f.reach), one)
@@ -169,16 +174,17 @@ def orbit(
     alpha, beta = spinor
     both = alpha * beta
     vertical = (-2 * both.re, 2 * both.im, 2 * alpha.square, 2 * beta.square)
-    one = opaque_ones(alpha.re)
+    one = opaque_ones(transverse)
     f = staged(cubic(2 * transverse * pull, vertical, momentum), one)
     c = staged(curve(f.square), one)
-    places, partners = _places(f, c, one)
+    places, partners = _places(f, c, transverse)
     start, partner = staged(_staged_start(c, places.at(0), partners.at(0)), one)
     nu = staged(jnp.sqrt(f.width) / (4 * c.stretch), one)
     origin, twist = pair(start.re + partner.re, c.h, jnp.ones_like(c.h), c.series)
     base = staged((partner - start) * (twist / origin), one)
     x, mirror = places.at(slice(1, 3)), partners.at(slice(1, 3))
-    turning = _turning(x, mirror, c, one)
+    both_ones = _rows_of_ones(2, transverse)
+    turning = _turning(x, mirror, c, both_ones)
     # alpha vanishes where g = -1, before the turning over
     upward = f.sign > 0
     x, mirror, turning = (
@@ -186,12 +192,13 @@ def orbit(
         for v in (x, mirror, turning)
     )
     push = Complex(momentum[1], momentum[0]) * (1 / (2 * f.unit))
+    one = both_ones
     value, rate = staged((_stack(alpha, beta), _stack(-(beta.conj * push), alpha.conj * push)), one)
     whole = Orbit(c, start, partner, f.circular, nu * f.unit / transverse, None)
     frequency = f.unit / transverse
 
-    f, c, one, start, partner, origin, base, nu, frequency, spin = _row(
-        (f, c, one, start, partner, origin, base, nu, frequency, spin)
+    f, c, start, partner, origin, base, nu, frequency, spin = _row(
+        (f, c, start, partner, origin, base, nu, frequency, spin)
     )
     zero = jnp.zeros_like(value.re)
     nu_complex = Complex(_only(f.circular, nu), _only(~f.circular, nu))
@@ -243,7 +250,7 @@ def _turning(x: Complex, mirror: Complex, c: Curve, one: Array) -> Complex:
     moved = x * jnp.stack([ones, c.h])
     times, rise = jnp.stack([c.h, c.h * c.h]), jnp.stack([ones, 2 * c.h])
     norm, twist = pair(moved.re + mirror.re, times, rise, _row(c.series))
-    turning = staged((mirror - moved) * (twist / norm), _row(one))
+    turning = staged((mirror - moved) * (twist / norm), one)
     upper = x.at(1)
     return _stack(turning.at(0), turning.at(1) + upper * (1 - upper).inverse)
 
@@ -264,7 +271,7 @@ def at(o: Orbit, elapsed: Array) -> tuple[Complex, Complex, Complex]:
     turn = unit(_only(circular, angle))
     f, inverse = turn * size, turn.conj * (1 / size)
     forward, backward = o.start * f, o.partner * inverse
-    one = opaque_ones(angle)
+    one = opaque_ones(elapsed)
     f, forward, backward = staged((f, forward, backward), one)
     below = pair(forward.re + backward.re, o.curve.h, jnp.ones_like(o.curve.h), series)[0]
     below = staged(1 / below, one)

@@ -26,6 +26,8 @@ def staged(values: Any, *ones: Array) -> Any:
     """
 
     def divided(x):
+        if x.dtype == bool:
+            return divided(x.astype(ones[0].dtype)) > 0
         if not jnp.issubdtype(x.dtype, jnp.inexact):
             return x
         one = next((one for one in ones if one.shape == x.shape), ones[0])
