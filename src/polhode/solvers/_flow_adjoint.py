@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode.solvers._equations import Equations, equations_of
-from polhode.solvers._linear import attached, is_slope
+from polhode.xla._linear import attached, is_slope
 from polhode.solvers._one_step import is_one_step, one_step
 from polhode.xla import kernel
 

@@ -27,8 +27,8 @@ from jaxtyping import Array
 
 from polhode.tops._complex import Complex, unit, where
 from polhode.tops._cubic import Cubic, cubic, positive, safe
-from polhode.tops._pochhammer import Curve, curve, pair, point, unpaired
-from polhode.xla import opaque_ones, staged
+from polhode.tops._pochhammer import Curve, Series, curve, pair, point, unpaired
+from polhode.xla import opaque_ones, spread, staged
 
 
 class Spinor(NamedTuple):
@@ -51,16 +51,12 @@ class Orbit(NamedTuple):
     alpha and beta, stacked in front.
     """
 
-    curve: Curve
+    series: Series
     start: Complex
     partner: Complex
     circular: Array
     nu: Array
     spinors: Spinor
-
-    def along_time(self, axis: int) -> "Orbit":
-        """With an axis of length 1 after (-1) or before (-2) the lanes, ready for samples."""
-        return jax.tree.map(lambda x: jnp.expand_dims(x, axis), self)
 
 
 def _only(condition: Array, value: Array, other=0) -> Array:
@@ -71,13 +67,14 @@ def _stack(*trees):
     return jax.tree.map(lambda *x: jnp.stack(x), *trees)
 
 
-def _row(tree):
+def _row(tree, rows):
     """Lanes (1, N), to go with several values per lane."""
-    return jax.tree.map(lambda x: x[None], tree)
+    return spread(tree, 0, rows)
 
 
 def _rows_of_ones(rows: int, x: Array) -> Array:
-    return opaque_ones(x * jnp.arange(1, rows + 1, dtype=x.dtype)[:, None])
+    scale = jnp.arange(1, rows + 1, dtype=x.dtype)
+    return opaque_ones(x * scale.reshape(-1, *(1,) * x.ndim))
 
 
 def _reciprocal(a: Complex, b: Complex, times: Array) -> tuple[Complex, Complex]:
@@ -124,7 +121,7 @@ def _places(f: Cubic, c: Curve, raw: Array):
         jnp.stack([-f.across / state_span, zero, _only(circular, root)]),
         jnp.stack([zero, zero, _only(~circular, -root)]),
     )
-    f, c, one = *_row((f, c)), _rows_of_ones(3, raw)
+    f, c, one = *_row((f, c), 3), _rows_of_ones(3, raw)
     near = staged(near, one)
     scale = 1 / safe(near, f.amount * span)
     lift, fall = staged(((f.middle + depth) * scale, fall * (scale * jnp.sqrt(f.width))), one)
@@ -194,11 +191,11 @@ def orbit(
     push = Complex(momentum[1], momentum[0]) * (1 / (2 * f.unit))
     one = both_ones
     value, rate = staged((_stack(alpha, beta), _stack(-(beta.conj * push), alpha.conj * push)), one)
-    whole = Orbit(c, start, partner, f.circular, nu * f.unit / transverse, None)
+    whole = Orbit(c.series, start, partner, f.circular, nu * f.unit / transverse, None)
     frequency = f.unit / transverse
 
     f, c, start, partner, origin, base, nu, frequency, spin = _row(
-        (f, c, start, partner, origin, base, nu, frequency, spin)
+        (f, c, start, partner, origin, base, nu, frequency, spin), 2
     )
     zero = jnp.zeros_like(value.re)
     nu_complex = Complex(_only(f.circular, nu), _only(~f.circular, nu))
@@ -249,7 +246,7 @@ def _turning(x: Complex, mirror: Complex, c: Curve, one: Array) -> Complex:
     ones = jnp.ones_like(c.h)
     moved = x * jnp.stack([ones, c.h])
     times, rise = jnp.stack([c.h, c.h * c.h]), jnp.stack([ones, 2 * c.h])
-    norm, twist = pair(moved.re + mirror.re, times, rise, _row(c.series))
+    norm, twist = pair(moved.re + mirror.re, times, rise, _row(c.series, 2))
     turning = staged((mirror - moved) * (twist / norm), one)
     upper = x.at(1)
     return _stack(turning.at(0), turning.at(1) + upper * (1 - upper).inverse)
@@ -257,11 +254,11 @@ def _turning(x: Complex, mirror: Complex, c: Curve, one: Array) -> Complex:
 
 def at(o: Orbit, elapsed: Array) -> tuple[Complex, Complex, Complex]:
     """alpha, beta and omega_y + i omega_x at times [s] that broadcast against the lanes."""
-    series, circular = o.curve.series, o.circular
+    series, circular = o.series, o.circular
     angle = 2 * o.nu * elapsed
     # Whole periods of real exponentials; on the separatrix itself there is none.
-    periodic = ~circular & (o.curve.h > 0)
-    period = -jnp.log(safe(periodic, o.curve.h))
+    periodic = ~circular & (series.h > 0)
+    period = -jnp.log(safe(periodic, series.h))
     count = jnp.round(angle / safe(periodic, period))
     count = _only(periodic, jax.lax.stop_gradient(count))
     limit = 0.4 * math.log(jnp.finfo(angle.dtype).max)
@@ -273,7 +270,7 @@ def at(o: Orbit, elapsed: Array) -> tuple[Complex, Complex, Complex]:
     forward, backward = o.start * f, o.partner * inverse
     one = opaque_ones(elapsed)
     f, forward, backward = staged((f, forward, backward), one)
-    below = pair(forward.re + backward.re, o.curve.h, jnp.ones_like(o.curve.h), series)[0]
+    below = pair(forward.re + backward.re, series.h, jnp.ones_like(series.h), series)[0]
     below = staged(1 / below, one)
 
     def parameter(s: Spinor):

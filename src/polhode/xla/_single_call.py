@@ -16,14 +16,15 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters import ad, partial_eval
 from jax.sharding import AxisType
 
+from polhode.xla._linear import linear
 from polhode.xla._switch import is_plain
 
 _HOLDABLE = frozenset(
     """abs acos acosh add add_any and asin asinh atan atan2 atanh attached bitcast_convert_type
      broadcast_in_dim cbrt ceil clamp concatenate cond convert_element_type copy cos cosh
      custom_jvp_call custom_vmap_call div dynamic_slice dynamic_update_slice eq erf erf_inv erfc
-     exp exp2 expm1 floor gather ge gt integer_pow iota is_finite jit le log log1p logistic lt max
-     min mul ne neg not optimization_barrier or pad pjit pow reduce_and reduce_max reduce_min
+     exp exp2 expm1 floor gather ge gt integer_pow iota is_finite jit le linear_map log log1p logistic lt max
+     min mul ne neg not optimization_barrier or pad pjit pow reduce reduce_and reduce_max reduce_min
      reduce_or reduce_sum rem reshape round rsqrt scan select_n shift_right_arithmetic sign sin
      sinh slice split sqrt square squeeze stack stop_gradient sub tan tanh transpose unstack while
      xor""".split()  # noqa: SIM905
@@ -44,7 +45,7 @@ _ANALYSING = ContextVar("analysing", default=False)
 """Set while a unit is looked through: the units inside it then show what they are made of."""
 
 
-def kernel(fn: Callable, *, linearised: bool = False, of_units: bool = False) -> Callable:
+def kernel(fn: Callable, *, linearised: bool = False, of_units: bool = False, repeated: bool = False) -> Callable:
     """``fn`` compiled by XLA's CPU backend as one function instead of one task per array.
 
     A step is made of many short loops over the bodies. As separate tasks each costs a dispatch,
@@ -74,7 +75,7 @@ def kernel(fn: Callable, *, linearised: bool = False, of_units: bool = False) ->
         if not _is_holdable(closed.jaxpr):
             return fn(*operands)
         whole, given = _opened(closed)
-        found = _unit(jaxpr_as_fun(whole), linearised, (whole, 0))(*given, *leaves)
+        found = _unit(jaxpr_as_fun(whole), linearised, (whole, 0), repeated)(*given, *leaves)
         return jax.tree.unflatten(jax.tree.structure(shape), found)
 
     return call
@@ -178,6 +179,8 @@ def _is_holdable(jaxpr) -> bool:
 def _is_wide(equation) -> bool:
     """Whether it sums or compares so many floats that XLA hands them to a library, which it cannot
     do within a unit: from 4096 on, measured with jaxlib 0.10."""
+    if equation.primitive.name == "reduce":
+        return len(equation.outvars) == 1
     if not equation.primitive.name.startswith("reduce_"):
         return False
     given = equation.invars[0].aval
@@ -189,7 +192,7 @@ def _is_packable(dtype) -> bool:
     return isinstance(dtype, np.dtype) and dtype != jax.dtypes.float0
 
 
-def _unit(flat: Callable, linearised: bool, traced: Any = None) -> Callable:
+def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool = False) -> Callable:
     """``flat``, a function of arrays with a list of results, as one unit, differentiable.
 
     ``traced``: the same where it is known already, and how many results are bare (``_marked``).
@@ -210,16 +213,37 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None) -> Callable:
 
         # A derivative of the coefficients takes twice as long to compile as one of the formulas.
         again = any(isinstance(x, ad.JVPTracer) for x in leaves)
+        if repeated and not again:
+            count = len(leaves)
+
+            def forward(given, changes):
+                def along(*both):
+                    full, changes = both[:count], both[count:]
+                    some = [full[k] for k in moving]
+                    return jax.jvp(lambda *x: of_moving(full, x), some, list(changes))[1]
+
+                return _unit(along, False)(*given, *changes)
+
+            def backward(given, slopes):
+                def against(*both):
+                    full, slopes = both[:count], both[count:]
+                    some = [full[k] for k in moving]
+                    return list(jax.vjp(lambda *x: of_moving(full, x), *some)[1](list(slopes)))
+
+                return _unit(against, False)(*given, *slopes)
+
+            value = marked(*leaves)
+            return value, linear(forward, backward, leaves, [tangents[k] for k in moving], value)
         if again or not linearised:
             given = [leaves[k] for k in moving], [tangents[k] for k in moving]
             return jax.jvp(lambda *x: of_moving(leaves, x), *given)
         shape = []
 
         def known(*leaves):
-            value, linear = jax.linearize(
+            value, rest = jax.linearize(
                 lambda *x: of_moving(leaves, x), *(leaves[k] for k in moving)
             )
-            kept, tree = jax.tree.flatten(linear)
+            kept, tree = jax.tree.flatten(rest)
             shape[:] = [tree, len(value)]
             return [*value, *kept, jnp.zeros((), jnp.float32)]
 
@@ -228,8 +252,8 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None) -> Callable:
         bare = len(first.out_avals) - 1 - count
         *found, zero = _unit(jaxpr_as_fun(first), False, (first, bare))(*leaves)
         # Not marked: transposed, it would carry operands that go unused.
-        linear = jax.tree.unflatten(tree, found[count:])
-        return found[:count], linear(*(_gated(zero, tangents[k]) for k in moving))
+        rest = jax.tree.unflatten(tree, found[count:])
+        return found[:count], rest(*(_gated(zero, tangents[k]) for k in moving))
 
     marked.defjvp(derivative, symbolic_zeros=True)
     return marked

@@ -6,6 +6,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
@@ -108,6 +109,49 @@ ad.primitive_jvps[_linear_p] = _jvp
 ad.primitive_transposes[_linear_p] = _transpose
 batching.primitive_batchers[_linear_p] = _batch
 mlir.register_lowering(_linear_p, mlir.lower_fun(_compute, multiple_results=True))
+
+
+def spread(values: Any, axis: int, count: int) -> Any:
+    """Every array of a tree ``count`` times along a new axis.
+
+    As a broadcast, but that all their cotangents are summed at once, in a way that a unit can hold.
+    """
+    leaves, tree = jax.tree.flatten(values)
+    moving = [k for k, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.inexact)]
+
+    def repeated(x):
+        x = jnp.expand_dims(x, axis)
+        shape = list(x.shape)
+        shape[axis] = count
+        return jnp.broadcast_to(x, shape)
+
+    def forward(_, some):
+        return [repeated(x) for x in some]
+
+    def backward(_, slopes):
+        if count <= _FEW_ROWS:
+            rows = [[jax.lax.index_in_dim(x, i, axis, False) for i in range(count)] for x in slopes]
+            return [sum(x[1:], x[0]) for x in rows]
+        found: dict[int, Any] = {}
+        for shape in {x.shape for x in slopes}:
+            at = [k for k, x in enumerate(slopes) if x.shape == shape]
+            sums = jax.lax.reduce(
+                tuple(slopes[k] for k in at),
+                tuple(np.zeros((), slopes[k].dtype) for k in at),
+                lambda a, b: tuple(x + y for x, y in zip(a, b)),
+                (axis % len(shape),),
+            )
+            found.update(zip(at, sums))
+        return [found[k] for k in range(len(slopes))]
+
+    some = [leaves[k] for k in moving]
+    like = jax.eval_shape(lambda *x: forward(None, x), *some)
+    found = dict(zip(moving, linear(forward, backward, [], some, like)))
+    every = [found[k] if k in found else repeated(x) for k, x in enumerate(leaves)]
+    return jax.tree.unflatten(tree, every)
+
+
+_FEW_ROWS = 4
 
 
 Rule = Callable[[Sequence[Any], Sequence[Any], Sequence[Any]], Sequence[Any]]
