@@ -74,7 +74,7 @@ def _row(tree, rows):
 
 def _rows_of_ones(rows: int, x: Array) -> Array:
     scale = jnp.arange(1, rows + 1, dtype=x.dtype)
-    return opaque_ones(x * scale.reshape(-1, *(1,) * x.ndim))
+    return opaque_ones(x[None] * scale.reshape(-1, *(1,) * x.ndim))
 
 
 def _reciprocal(a: Complex, b: Complex, times: Array) -> tuple[Complex, Complex]:
