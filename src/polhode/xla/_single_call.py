@@ -228,7 +228,11 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
                 def against(*both):
                     full, slopes = both[:count], both[count:]
                     some = [full[k] for k in moving]
-                    return list(jax.vjp(lambda *x: of_moving(full, x), *some)[1](list(slopes)))
+                    return list(
+                        jax.linear_transpose(
+                            lambda *d: jax.jvp(lambda *x: of_moving(full, x), some, list(d))[1], *some
+                        )(list(slopes))
+                    )
 
                 return _unit(against, False)(*given, *slopes)
 
