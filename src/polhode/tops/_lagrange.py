@@ -173,11 +173,11 @@ def orbit(
     vertical = (-2 * both.re, 2 * both.im, 2 * alpha.square, 2 * beta.square)
     one = opaque_ones(transverse)
     f = staged(cubic(2 * transverse * pull, vertical, momentum), one)
-    c = staged(curve(f.square), one)
+    c = curve(staged(f.square, one), one)
     places, partners = _places(f, c, transverse)
     start, partner = staged(_staged_start(c, places.at(0), partners.at(0)), one)
     nu = staged(jnp.sqrt(f.width) / (4 * c.stretch), one)
-    origin, twist = pair(start.re + partner.re, c.h, jnp.ones_like(c.h), c.series)
+    origin, twist = pair(start.re + partner.re, c.h, jnp.ones_like(c.h), c.series, one)
     base = staged((partner - start) * (twist / origin), one)
     x, mirror = places.at(slice(1, 3)), partners.at(slice(1, 3))
     both_ones = _rows_of_ones(2, transverse)
@@ -246,7 +246,7 @@ def _turning(x: Complex, mirror: Complex, c: Curve, one: Array) -> Complex:
     ones = jnp.ones_like(c.h)
     moved = x * jnp.stack([ones, c.h])
     times, rise = jnp.stack([c.h, c.h * c.h]), jnp.stack([ones, 2 * c.h])
-    norm, twist = pair(moved.re + mirror.re, times, rise, _row(c.series, 2))
+    norm, twist = pair(moved.re + mirror.re, times, rise, _row(c.series, 2), one)
     turning = staged((mirror - moved) * (twist / norm), one)
     upper = x.at(1)
     return _stack(turning.at(0), turning.at(1) + upper * (1 - upper).inverse)
@@ -270,7 +270,7 @@ def at(o: Orbit, elapsed: Array) -> tuple[Complex, Complex, Complex]:
     forward, backward = o.start * f, o.partner * inverse
     one = opaque_ones(elapsed)
     f, forward, backward = staged((f, forward, backward), one)
-    below = pair(forward.re + backward.re, series.h, jnp.ones_like(series.h), series)[0]
+    below = pair(forward.re + backward.re, series.h, jnp.ones_like(series.h), series, one)[0]
     below = staged(1 / below, one)
 
     def parameter(s: Spinor):
