@@ -121,11 +121,14 @@ def _places(f: Cubic, c: Curve, raw: Array):
         jnp.stack([-f.across / state_span, zero, _only(circular, root)]),
         jnp.stack([zero, zero, _only(~circular, -root)]),
     )
-    f, c, one = *_row((f, c), 3), _rows_of_ones(3, raw)
+    middle, amount, width, reach, c = _row(
+        (f.middle, f.amount, jnp.sqrt(f.width), f.reach, c._replace(series=None)), 3
+    )
+    one = _rows_of_ones(3, raw)
     near = staged(near, one)
-    scale = 1 / safe(near, f.amount * span)
-    lift, fall = staged(((f.middle + depth) * scale, fall * (scale * jnp.sqrt(f.width))), one)
-    mean, step = staged((mean * f.reach, step * f.reach), one)
+    scale = 1 / safe(near, amount * span)
+    lift, fall = staged(((middle + depth) * scale, fall * (scale * width)), one)
+    mean, step = staged((mean * reach, step * reach), one)
     e, partner = _reciprocal(step + mean, -step + mean, c.square)
     half = staged(((1 + partner) * (1 + e).inverse).root, one)
     lead = where(near, -fall + lift, e * half)
@@ -194,25 +197,27 @@ def orbit(
     whole = Orbit(c.series, start, partner, f.circular, nu * f.unit / transverse, None)
     frequency = f.unit / transverse
 
-    f, c, start, partner, origin, base, nu, frequency, spin = _row(
-        (f, c, start, partner, origin, base, nu, frequency, spin), 2
+    circular, live, axial, series, start, partner, origin, base, nu, frequency, spin = _row(
+        (f.circular, f.live, f.momentum, c.series)
+        + (start, partner, origin, base, nu, frequency, spin),
+        2,
     )
     zero = jnp.zeros_like(value.re)
-    nu_complex = Complex(_only(f.circular, nu), _only(~f.circular, nu))
+    nu_complex = Complex(_only(circular, nu), _only(~circular, nu))
     ahead, behind = staged((mirror * start, x * partner), one)
-    theta, slope = staged(unpaired(ahead, behind, c.series, one), one)
+    theta, slope = staged(unpaired(ahead, behind, series, one), one)
     inverse = staged(theta.inverse, one)
     inner = staged(base + slope * inverse, one)
     # From the rate at the start. Where nothing nutates (nu = 0) the phase alone turns.
     steady = (rate * value.conj).im / safe(value.square > 0, value.square)
-    k = -(nu_complex * (1 + 2 * turning)) - f.momentum / 2
-    k = staged(where(f.live, k, Complex(steady, zero)), one)
+    k = -(nu_complex * (1 + 2 * turning)) - axial / 2
+    k = staged(where(live, k, Complex(steady, zero)), one)
     drift = (k * value).times_i - rate
     d = drift * (-nu_complex.conj.times_i) * (1 / (2 * nu * nu)) + inner * value
-    d = staged(where(f.live, d, Complex(zero, zero)), one)
+    d = staged(where(live, d, Complex(zero, zero)), one)
     # d : c = E : x. Where one of them is far below the other, the difference from the rate would
     # leave it rounding, which exp(2 i nu t) near the separatrix makes large.
-    unsteady = f.live & ~f.circular
+    unsteady = live & ~circular
     first = unsteady & (4 * start.square < x.square)
     second = unsteady & (4 * x.square < start.square)
     nothing = Complex(zero, zero)
@@ -225,7 +230,7 @@ def orbit(
         where(first, least, where(second, -most, d)),
     )
     scale = staged(inverse * origin, one)
-    plain = f.circular | (x.square == 0)
+    plain = circular | (x.square == 0)
     spinors = Spinor(
         scale * whole_part,
         scale * d,
@@ -233,7 +238,7 @@ def orbit(
         mirror,
         k * frequency + spin / 2,
         jnp.arctan2(_only(~plain, x.im), jnp.where(plain, 1, x.re)),
-        jnp.stack([upward, ~upward]) & ~f.circular,
+        jnp.stack([upward, ~upward]) & ~circular,
     )
     return whole._replace(spinors=staged(spinors, one))
 
