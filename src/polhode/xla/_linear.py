@@ -1,5 +1,5 @@
-"""Two primitives: a linear map that is computed by one program and transposed by another, and
-values found by other means with the derivatives of what they are."""
+"""Two primitives: a linear map that is computed by one program and transposed by another, such as
+``spread``, and values found by other means with the derivatives of what they are."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -114,44 +114,44 @@ mlir.register_lowering(_linear_p, mlir.lower_fun(_compute, multiple_results=True
 def spread(values: Any, axis: int, count: int) -> Any:
     """Every array of a tree ``count`` times along a new axis.
 
-    As a broadcast, but that all their cotangents are summed at once, in a way that a unit can hold.
+    As a broadcast, but that cotangents are summed in a way that a unit can hold: XLA hands the sum
+    of a large array to a library, not that of several at once.
     """
     leaves, tree = jax.tree.flatten(values)
-    moving = [k for k, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.inexact)]
+    moving = {k: x for k, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.inexact)}
 
     def repeated(x):
         x = jnp.expand_dims(x, axis)
-        shape = list(x.shape)
-        shape[axis] = count
-        return jnp.broadcast_to(x, shape)
+        return jnp.broadcast_to(x, [count if k == axis % x.ndim else n for k, n in enumerate(x.shape)])
 
     def forward(_, some):
         return [repeated(x) for x in some]
 
     def backward(_, slopes):
-        if count <= _FEW_ROWS:
+        if count <= _FEW:
             rows = [[jax.lax.index_in_dim(x, i, axis, False) for i in range(count)] for x in slopes]
             return [sum(x[1:], x[0]) for x in rows]
         found: dict[int, Any] = {}
-        for shape in {x.shape for x in slopes}:
-            at = [k for k, x in enumerate(slopes) if x.shape == shape]
+        for shape, dtype in {(x.shape, x.dtype) for x in slopes}:
+            at = [k for k, x in enumerate(slopes) if (x.shape, x.dtype) == (shape, dtype)]
+            zero = np.zeros((), dtype)
             sums = jax.lax.reduce(
                 tuple(slopes[k] for k in at),
-                tuple(np.zeros((), slopes[k].dtype) for k in at),
+                (zero,) * len(at),
                 lambda a, b: tuple(x + y for x, y in zip(a, b)),
                 (axis % len(shape),),
             )
             found.update(zip(at, sums))
         return [found[k] for k in range(len(slopes))]
 
-    some = [leaves[k] for k in moving]
-    like = jax.eval_shape(lambda *x: forward(None, x), *some)
-    found = dict(zip(moving, linear(forward, backward, [], some, like)))
+    like = jax.eval_shape(lambda: forward(None, moving.values()))
+    found = dict(zip(moving, linear(forward, backward, [], list(moving.values()), like)))
     every = [found[k] if k in found else repeated(x) for k, x in enumerate(leaves)]
     return jax.tree.unflatten(tree, every)
 
 
-_FEW_ROWS = 4
+_FEW = 4
+"""Rows up to which they are added one by one."""
 
 
 Rule = Callable[[Sequence[Any], Sequence[Any], Sequence[Any]], Sequence[Any]]

@@ -45,7 +45,9 @@ _ANALYSING = ContextVar("analysing", default=False)
 """Set while a unit is looked through: the units inside it then show what they are made of."""
 
 
-def kernel(fn: Callable, *, linearised: bool = False, of_units: bool = False, repeated: bool = False) -> Callable:
+def kernel(
+    fn: Callable, *, linearised: bool = False, repeated: bool = False, of_units: bool = False
+) -> Callable:
     """``fn`` compiled by XLA's CPU backend as one function instead of one task per array.
 
     A step is made of many short loops over the bodies. As separate tasks each costs a dispatch,
@@ -55,8 +57,11 @@ def kernel(fn: Callable, *, linearised: bool = False, of_units: bool = False, re
 
     Derivatives are those of ``fn``, unmarked; with ``linearised`` the value and all coefficients of
     its derivative are a unit again, and only the linear map that is left is not. That suits
-    functions without loops of unknown length. With ``of_units`` what ``fn`` marks itself stays
-    marked, within the whole and in its derivatives.
+    functions without loops of unknown length. With ``repeated`` tangents are a unit and cotangents
+    another, each of which works everything out again: nothing is kept in between but the operands,
+    and where coefficients would be hundreds that is several times as fast, to compile too. Sums
+    over many bodies or times are to be written as ``spread``. With ``of_units`` what ``fn`` marks
+    itself stays marked, within the whole and in its derivatives.
     """
 
     def call(*operands):
@@ -179,7 +184,7 @@ def _is_holdable(jaxpr) -> bool:
 def _is_wide(equation) -> bool:
     """Whether it sums or compares so many floats that XLA hands them to a library, which it cannot
     do within a unit: from 4096 on, measured with jaxlib 0.10."""
-    if equation.primitive.name == "reduce":
+    if equation.primitive.name == "reduce":  # of several arrays at once, as ``spread`` makes it
         return len(equation.outvars) == 1
     if not equation.primitive.name.startswith("reduce_"):
         return False
@@ -201,6 +206,8 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
     @jax.custom_jvp
     def marked(*leaves):
         closed, bare = traced or (jax.make_jaxpr(flat)(*leaves), 0)
+        if traced is None and not _is_holdable(closed.jaxpr):
+            return jaxpr_as_fun(closed)(*leaves)
         return _marked(closed, leaves, bare)
 
     def derivative(leaves, tangents):
@@ -214,40 +221,18 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
         # A derivative of the coefficients takes twice as long to compile as one of the formulas.
         again = any(isinstance(x, ad.JVPTracer) for x in leaves)
         if repeated and not again:
-            count = len(leaves)
-
-            def forward(given, changes):
-                def along(*both):
-                    full, changes = both[:count], both[count:]
-                    some = [full[k] for k in moving]
-                    return jax.jvp(lambda *x: of_moving(full, x), some, list(changes))[1]
-
-                return _unit(along, False)(*given, *changes)
-
-            def backward(given, slopes):
-                def against(*both):
-                    full, slopes = both[:count], both[count:]
-                    some = [full[k] for k in moving]
-                    return list(
-                        jax.linear_transpose(
-                            lambda *d: jax.jvp(lambda *x: of_moving(full, x), some, list(d))[1], *some
-                        )(list(slopes))
-                    )
-
-                return _unit(against, False)(*given, *slopes)
-
             value = marked(*leaves)
-            return value, linear(forward, backward, leaves, [tangents[k] for k in moving], value)
+            return value, _of_units(of_moving, moving, leaves, tangents, value)
         if again or not linearised:
             given = [leaves[k] for k in moving], [tangents[k] for k in moving]
             return jax.jvp(lambda *x: of_moving(leaves, x), *given)
         shape = []
 
         def known(*leaves):
-            value, rest = jax.linearize(
+            value, linear_map = jax.linearize(
                 lambda *x: of_moving(leaves, x), *(leaves[k] for k in moving)
             )
-            kept, tree = jax.tree.flatten(rest)
+            kept, tree = jax.tree.flatten(linear_map)
             shape[:] = [tree, len(value)]
             return [*value, *kept, jnp.zeros((), jnp.float32)]
 
@@ -256,11 +241,42 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
         bare = len(first.out_avals) - 1 - count
         *found, zero = _unit(jaxpr_as_fun(first), False, (first, bare))(*leaves)
         # Not marked: transposed, it would carry operands that go unused.
-        rest = jax.tree.unflatten(tree, found[count:])
-        return found[:count], rest(*(_gated(zero, tangents[k]) for k in moving))
+        linear_map = jax.tree.unflatten(tree, found[count:])
+        return found[:count], linear_map(*(_gated(zero, tangents[k]) for k in moving))
 
     marked.defjvp(derivative, symbolic_zeros=True)
     return marked
+
+
+def _of_units(of_moving: Callable, moving: Sequence[int], leaves, tangents, like) -> list[Any]:
+    """The tangents of ``of_moving(leaves, those that move)``: a unit, and its transpose another."""
+    count = len(leaves)
+    floats = {k: x for k, x in enumerate(like) if jnp.issubdtype(x.dtype, jnp.inexact)}
+
+    def slope(leaves, changes):
+        some = [leaves[k] for k in moving]
+        found = jax.jvp(lambda *x: of_moving(leaves, x), some, list(changes))[1]
+        return [found[k] for k in floats]
+
+    def along(*both):
+        return slope(both[:count], both[count:])
+
+    def against(*both):
+        leaves, slopes = both[:count], list(both[count:])
+        # ``jax.vjp`` would take half as long again to trace.
+        back = jax.linear_transpose(lambda *d: slope(leaves, d), *(leaves[k] for k in moving))
+        return list(back(slopes))
+
+    def forward(given, changes):
+        return _unit(along, False)(*given, *changes)
+
+    def backward(given, slopes):
+        return _unit(against, False)(*given, *slopes)
+
+    changes = [tangents[k] for k in moving]
+    found = dict(zip(floats, linear(forward, backward, leaves, changes, list(floats.values()))))
+    none = {k: np.zeros(x.shape, jax.dtypes.float0) for k, x in enumerate(like) if k not in floats}
+    return [(found | none)[k] for k in range(len(like))]
 
 
 def _gated(zero: jax.Array, tangent: jax.Array) -> jax.Array:
