@@ -198,8 +198,10 @@ def orbit(
     frequency = f.unit / transverse
 
     circular, live, axial, series, start, partner, origin, base, nu, frequency, spin = _row(
-        (f.circular, f.live, f.momentum, c.series)
-        + (start, partner, origin, base, nu, frequency, spin),
+        (
+            *(f.circular, f.live, f.momentum, c.series),
+            *(start, partner, origin, base, nu, frequency, spin),
+        ),
         2,
     )
     zero = jnp.zeros_like(value.re)

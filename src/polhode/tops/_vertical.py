@@ -54,8 +54,8 @@ def lagrange_motion(
     ``omega`` [rad/s]: initial state; ``axial_momentum`` along body z [kg m^2/s], that of wheels on
     the axis included. Klein & Sommerfeld, Theorie des Kreisels, VI; see ``_lagrange``.
     """
-    # The compiler makes a loop of every axis, be it of length one, and vectors of the last axis only:
-    # axes of length one are left out, the longer one comes last.
+    # The compiler makes a loop of every axis, be it of length one, and vectors of the last axis
+    # only: axes of length one are left out, and the longer one comes last.
     lanes, count = elapsed.shape
     times, axis = elapsed, -1
     given = transverse, force_space, distance, wxyz, omega, axial_momentum

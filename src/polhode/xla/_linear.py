@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
+from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -37,6 +38,11 @@ _linear_p.multiple_results = True
 @_linear_p.def_impl
 def _compute(*arrays, forward, backward, count, shapes):
     return list(forward(arrays[:count], arrays[count:]))
+
+
+def _lowered(*arrays, **params):
+    with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):  # a unit's mark is its call's
+        return _compute(*arrays, **params)
 
 
 @_linear_p.def_abstract_eval
@@ -108,7 +114,7 @@ def _batch(arrays, dims, *, forward, backward, count, shapes):
 ad.primitive_jvps[_linear_p] = _jvp
 ad.primitive_transposes[_linear_p] = _transpose
 batching.primitive_batchers[_linear_p] = _batch
-mlir.register_lowering(_linear_p, mlir.lower_fun(_compute, multiple_results=True))
+mlir.register_lowering(_linear_p, mlir.lower_fun(_lowered, multiple_results=True))
 
 
 def spread(values: Any, axis: int, count: int) -> Any:
@@ -122,26 +128,18 @@ def spread(values: Any, axis: int, count: int) -> Any:
 
     def repeated(x):
         x = jnp.expand_dims(x, axis)
-        return jnp.broadcast_to(x, [count if k == axis % x.ndim else n for k, n in enumerate(x.shape)])
+        return jnp.broadcast_to(
+            x, [count if k == axis % x.ndim else n for k, n in enumerate(x.shape)]
+        )
 
     def forward(_, some):
         return [repeated(x) for x in some]
 
     def backward(_, slopes):
-        if count <= _FEW:
-            rows = [[jax.lax.index_in_dim(x, i, axis, False) for i in range(count)] for x in slopes]
-            return [sum(x[1:], x[0]) for x in rows]
         found: dict[int, Any] = {}
-        for shape, dtype in {(x.shape, x.dtype) for x in slopes}:
-            at = [k for k, x in enumerate(slopes) if (x.shape, x.dtype) == (shape, dtype)]
-            zero = np.zeros((), dtype)
-            sums = jax.lax.reduce(
-                tuple(slopes[k] for k in at),
-                (zero,) * len(at),
-                lambda a, b: tuple(x + y for x, y in zip(a, b)),
-                (axis % len(shape),),
-            )
-            found.update(zip(at, sums))
+        for kind in {(x.shape, x.dtype) for x in slopes}:
+            at = [k for k, x in enumerate(slopes) if (x.shape, x.dtype) == kind]
+            found.update(zip(at, _sums([slopes[k] for k in at], axis)))
         return [found[k] for k in range(len(slopes))]
 
     like = jax.eval_shape(lambda: forward(None, moving.values()))
@@ -152,6 +150,26 @@ def spread(values: Any, axis: int, count: int) -> Any:
 
 _FEW = 4
 """Rows up to which they are added one by one."""
+
+
+def _sums(arrays: list[Any], axis: int) -> list[Any]:
+    """Sums along an axis of arrays of one shape and dtype."""
+    count, axis = arrays[0].shape[axis], axis % arrays[0].ndim
+    if count <= _FEW:
+        rows = [[jax.lax.index_in_dim(x, i, axis, False) for i in range(count)] for x in arrays]
+        return [sum(x[1:], x[0]) for x in rows]
+    if len(arrays) == 1:  # as two
+        half = count // 2
+        halves = [jax.lax.slice_in_dim(arrays[0], k, k + half, axis=axis) for k in (0, half)]
+        total = sum(_sums(halves, axis))
+        return [total + jax.lax.index_in_dim(arrays[0], -1, axis, False) if count % 2 else total]
+    zero = np.zeros((), arrays[0].dtype)
+    return jax.lax.reduce(
+        tuple(arrays),
+        (zero,) * len(arrays),
+        lambda a, b: tuple(x + y for x, y in zip(a, b)),
+        (axis,),
+    )
 
 
 Rule = Callable[[Sequence[Any], Sequence[Any], Sequence[Any]], Sequence[Any]]
