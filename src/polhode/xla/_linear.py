@@ -1,12 +1,12 @@
 """Two primitives: a linear map that is computed by one program and transposed by another, such as
 ``spread``, and values found by other means with the derivatives of what they are."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.core import ShapedArray
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import Primitive
@@ -120,8 +120,8 @@ mlir.register_lowering(_linear_p, mlir.lower_fun(_lowered, multiple_results=True
 def spread(values: Any, axis: int, count: int) -> Any:
     """Every array of a tree ``count`` times along a new axis.
 
-    As a broadcast, but that cotangents are summed in a way that a unit can hold: XLA hands the sum
-    of a large array to a library, not that of several at once.
+    As a broadcast, but that cotangents are summed in a loop, which a unit can hold: XLA hands the
+    sum of a large array to a library.
     """
     leaves, tree = jax.tree.flatten(values)
     moving = {k: x for k, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.inexact)}
@@ -136,11 +136,15 @@ def spread(values: Any, axis: int, count: int) -> Any:
         return [repeated(x) for x in some]
 
     def backward(_, slopes):
-        found: dict[int, Any] = {}
-        for kind in {(x.shape, x.dtype) for x in slopes}:
-            at = [k for k, x in enumerate(slopes) if (x.shape, x.dtype) == kind]
-            found.update(zip(at, _sums([slopes[k] for k in at], axis)))
-        return [found[k] for k in range(len(slopes))]
+        def row(i):
+            return [jax.lax.dynamic_index_in_dim(x, i, axis % x.ndim, False) for x in slopes]
+
+        def add(i, total):
+            return [a + b for a, b in zip(total, row(i))]
+
+        if count <= _FEW:
+            return functools.reduce(lambda total, i: add(i, total), range(1, count), row(0))
+        return jax.lax.fori_loop(1, count, add, row(0))
 
     like = jax.eval_shape(lambda: forward(None, moving.values()))
     found = dict(zip(moving, linear(forward, backward, [], list(moving.values()), like)))
@@ -150,26 +154,6 @@ def spread(values: Any, axis: int, count: int) -> Any:
 
 _FEW = 4
 """Rows up to which they are added one by one."""
-
-
-def _sums(arrays: list[Any], axis: int) -> list[Any]:
-    """Sums along an axis of arrays of one shape and dtype."""
-    count, axis = arrays[0].shape[axis], axis % arrays[0].ndim
-    if count <= _FEW:
-        rows = [[jax.lax.index_in_dim(x, i, axis, False) for i in range(count)] for x in arrays]
-        return [sum(x[1:], x[0]) for x in rows]
-    if len(arrays) == 1:  # as two
-        half = count // 2
-        halves = [jax.lax.slice_in_dim(arrays[0], k, k + half, axis=axis) for k in (0, half)]
-        total = sum(_sums(halves, axis))
-        return [total + jax.lax.index_in_dim(arrays[0], -1, axis, False) if count % 2 else total]
-    zero = np.zeros((), arrays[0].dtype)
-    return jax.lax.reduce(
-        tuple(arrays),
-        (zero,) * len(arrays),
-        lambda a, b: tuple(x + y for x, y in zip(a, b)),
-        (axis,),
-    )
 
 
 Rule = Callable[[Sequence[Any], Sequence[Any], Sequence[Any]], Sequence[Any]]

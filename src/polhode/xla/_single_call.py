@@ -24,7 +24,7 @@ _HOLDABLE = frozenset(
      broadcast_in_dim cbrt ceil clamp concatenate cond convert_element_type copy cos cosh
      custom_jvp_call custom_vmap_call div dynamic_slice dynamic_update_slice eq erf erf_inv erfc
      exp exp2 expm1 floor gather ge gt integer_pow iota is_finite jit le linear_map log log1p
-     logistic lt max min mul ne neg not optimization_barrier or pad pjit pow reduce reduce_and
+     logistic lt max min mul ne neg not optimization_barrier or pad pjit pow reduce_and
      reduce_max reduce_min reduce_or reduce_sum rem reshape round rsqrt scan select_n
      shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stop_gradient sub
      tan tanh transpose unstack while xor""".split()  # noqa: SIM905
@@ -184,8 +184,6 @@ def _is_holdable(jaxpr) -> bool:
 def _is_wide(equation) -> bool:
     """Whether it sums or compares so many floats that XLA hands them to a library, which it cannot
     do within a unit: from 4096 on, measured with jaxlib 0.10."""
-    if equation.primitive.name == "reduce":  # of several arrays at once, as ``spread`` makes it
-        return len(equation.outvars) == 1
     if not equation.primitive.name.startswith("reduce_"):
         return False
     given = equation.invars[0].aval
@@ -220,7 +218,7 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
 
         # A derivative of the coefficients takes twice as long to compile as one of the formulas.
         again = any(isinstance(x, ad.JVPTracer) for x in leaves)
-        if repeated and not again:
+        if repeated:
             value = marked(*leaves)
             return value, _of_units(of_moving, moving, leaves, tangents, value)
         if again or not linearised:
@@ -268,10 +266,10 @@ def _of_units(of_moving: Callable, moving: Sequence[int], leaves, tangents, like
         return list(back(slopes))
 
     def forward(given, changes):
-        return _unit(along, False)(*given, *changes)
+        return _unit(along, False, repeated=True)(*given, *changes)
 
     def backward(given, slopes):
-        return _unit(against, False)(*given, *slopes)
+        return _unit(against, False, repeated=True)(*given, *slopes)
 
     changes = [tangents[k] for k in moving]
     found = dict(zip(floats, linear(forward, backward, leaves, changes, list(floats.values()))))
