@@ -67,12 +67,13 @@ def _stack(*trees):
     return jax.tree.map(lambda *x: jnp.stack(x), *trees)
 
 
-def _row(tree, rows):
-    """Lanes (1, N), to go with several values per lane."""
+def _row(tree, rows: int):
+    """Lanes (rows, N), to go with several values per lane."""
     return spread(tree, 0, rows)
 
 
 def _rows_of_ones(rows: int, x: Array) -> Array:
+    """Ones (rows, N) that are no broadcast to XLA, of one body neither."""
     scale = jnp.arange(1, rows + 1, dtype=x.dtype)
     return opaque_ones(x[None] * scale.reshape(-1, *(1,) * x.ndim))
 

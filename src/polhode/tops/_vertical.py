@@ -7,6 +7,7 @@ from jaxtyping import Array, Float
 from polhode.hamiltonian import components
 from polhode.tops._complex import Complex
 from polhode.tops._lagrange import at, orbit
+from polhode.tops._pochhammer import Series
 from polhode.xla import opaque_ones, spread, staged
 
 
@@ -75,7 +76,13 @@ def lagrange_motion(
     spinor = Complex(q[0], q[3]), Complex(q[2], q[1])
     motion = orbit(transverse, spin, -size * distance, spinor, momentum)
     if count > 1:
-        motion, turn, spin = spread((motion, turn, spin), axis, count)
+        series = motion.series
+        motion, h, turn, spin = spread(
+            (motion._replace(series=None), series.h, turn, spin), axis, count
+        )
+        # apart, for no cotangents but that of h need be summed
+        weights = spread((series.weights, series.slopes), axis, count)
+        motion = motion._replace(series=Series(h, *weights))
     alpha, beta, across = at(motion, times)
     square = 1 / (alpha.square + beta.square)
     scale = jnp.sqrt(square)
