@@ -24,7 +24,7 @@ from polhode.hamiltonian import (
     lie_poisson_field,
 )
 from polhode.solvers import Accuracy, Extrapolation, FlowAdjoint
-from polhode.solvers._linear import linear
+from polhode.xla import linear
 
 KEYS = jax.random.split(jax.random.key(7), 8)
 WXYZ = rotation.normalise(jax.random.normal(KEYS[0], (3, 4)))

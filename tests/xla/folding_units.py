@@ -150,23 +150,23 @@ def _runs(fn, given):
 def main(each: bool, few: bool):
     units = {name: (fn, [jnp.asarray(x) for x in given]) for name, (fn, *given) in UNITS.items()}
     for way in FEW if few else (*WAYS, *SLOPES):
-        for linearised in (False, True) if way == "gradient" else (False,):
+        for how in ("", "linearised", "repeated") if way == "gradient" else ("",):
             some = {name: u for name, u in units.items() if way in _runs(*u)}
             for names in [[name] for name in some] if each else [list(some)]:
-                _compare({name: some[name] for name in names}, way, linearised)
+                _compare({name: some[name] for name in names}, way, how)
 
 
-def _compare(units, way, linearised):
+def _compare(units, way, how):
     """One program for all of the units, as each would take its second to compile."""
     if len(units) == 1:
-        print(f"{next(iter(units))}, {way}{', linearised' if linearised else ''}: ...", flush=True)
+        print(f"{next(iter(units))}, {way}{how and f', {how}'}: ...", flush=True)
     of, refused = (WAYS | SLOPES)[way], {}
 
     def all_of(marked):
         found = {}
         for name, (fn, given) in units.items():
             try:
-                unit = kernel(fn, linearised=linearised) if marked else fn
+                unit = kernel(fn, **({how: True} if how else {})) if marked else fn
                 found[name] = of(unit)(*(x if x.dtype != float else x * one for x in given))
             except (TypeError, ValueError, NotImplementedError) as error:
                 refused[name] = type(error).__name__  # second derivatives of a reverse rule
@@ -181,7 +181,7 @@ def _compare(units, way, linearised):
 
     found, plain = jax.jit(both)(one)
     for name in units:
-        label = f"{name}, {way}{', linearised' if linearised else ''}"
+        label = f"{name}, {way}{how and f', {how}'}"
         if name in refused:
             print(f"{label}: {refused[name]}", flush=True)
             continue

@@ -273,14 +273,17 @@ def child(seed, start, stop, log):
             jax.clear_caches()
 
 
-def unit(f, ways, linearised):
+DERIVATIVES = ({}, {"linearised": True}, {"repeated": True})
+
+
+def unit(f, ways, how):
     """Values and slopes of one marked function of the time, two arrays and an integer."""
 
     def whole(t, a, b, n):
         first = jnp.asarray(f(t, [a[0], b[1]]), float)
         return first, jnp.asarray(f(t, []), float) * a, 0 * n, first * 0 + b[0]
 
-    marked = kernel(whole, linearised=linearised) if ways else whole
+    marked = kernel(whole, **how) if ways else whole
     t, a, b, n = jnp.array(0.3), jnp.array([0.2, 0.4]), jnp.array([0.5, 0.1]), jnp.arange(3)
 
     def total(t, a, b):
@@ -309,7 +312,8 @@ def units(seed, start, stop, log):
                 found = {}
                 for index, f in enumerate(functions):
                     try:
-                        of = [unit(f, marked, index % 2 == 1)[way] for marked in (True, False)]
+                        how = DERIVATIVES[index % 3]
+                        of = [unit(f, marked, how)[way] for marked in (True, False)]
                         found[index] = [one(u) for one in of]
                     except (TypeError, ValueError):
                         refused.add(index)

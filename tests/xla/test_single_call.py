@@ -6,11 +6,12 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from xla import fuzz
 
 import polhode as ph
-from polhode.xla import _switch, kernel, specialise
+from polhode.xla import _switch, kernel, specialise, spread
 
 HERE = Path(__file__).parent
 
@@ -181,6 +182,41 @@ def test_units_within_a_unit():
     expected = jax.grad(lambda x: jnp.sum(plain(x)))(x)
     assert jnp.allclose(slope(x), expected, rtol=1e-15, atol=0)
     assert jnp.allclose(jax.vmap(value)(x[None])[0], plain(x), rtol=1e-15, atol=0)
+
+
+@pytest.mark.parametrize(("bodies", "times"), [(3, 2), (100, 61)])
+def test_units_that_repeat_their_work_in_derivatives(bodies, times):
+    """Gradients of any size stay units: what is spread over times is summed inside of one."""
+
+    def motion(a, b, t):
+        a, b, c = *spread((a, (jnp.sin(a * b), b > 0)), -1, times), spread(b, -1, times)
+        return jnp.where(b[1], jnp.cos(a * t) * b[0], a) * c, jnp.arange(bodies)
+
+    unit = kernel(motion, repeated=True)
+    a, b = jnp.linspace(0.3, 0.9, bodies), jnp.linspace(-0.5, 1.0, bodies)
+    t = jnp.linspace(0, 1, bodies * times).reshape(bodies, times)
+
+    def plain(a, b, t):
+        a, b = a[:, None], b[:, None]
+        return jnp.where(b > 0, jnp.cos(a * t) * jnp.sin(a * b), a) * b
+
+    def slope(fn):
+        return jax.jit(jax.grad(lambda *x: jnp.sum(jnp.exp(fn(*x))), argnums=(0, 1, 2)))
+
+    def agree(got, want):
+        jax.tree.map(
+            lambda x, y: np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-14), got, want
+        )
+
+    own = slope(lambda *x: unit(*x)[0])
+    lines = own.lower(a, b, t).as_text().splitlines()
+    assert sum(" call @" in line and "xla_cpu_small_call" in line for line in lines) == 2
+    agree(own(a, b, t), slope(plain)(a, b, t))
+    along = a, b, t
+    for f, g in ((lambda *x: unit(*x)[0], plain), (own, slope(plain))):  # forward, over reverse too
+        agree(*(jax.jit(lambda x, h=h: jax.jvp(h, x, x)[1])(along) for h in (f, g)))
+    many = jnp.stack([a, 2 * a])
+    agree(*(jax.vmap(f, (0, None, None))(many, b, t) for f in (own, slope(plain))))
 
 
 def test_a_seeded_slice_of_the_fuzz():

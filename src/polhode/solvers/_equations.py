@@ -17,9 +17,8 @@ from polhode.solvers._bound_term import BoundTerm, uses
 from polhode.solvers._columns import table
 from polhode.solvers._costates import AnyCostate, FlatCostate
 from polhode.solvers._extrapolation import order_for, units_of
-from polhode.solvers._linear import attached, is_slope, linear, zeros
 from polhode.solvers._march import Field, Limits, fresh, march
-from polhode.xla import kernel, specialise
+from polhode.xla import attached, is_slope, kernel, linear, specialise, zeros
 
 _STEPS = 2**20
 """Most steps of a derivative between two saved times."""

@@ -14,9 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode.solvers._equations import Equations, equations_of
-from polhode.solvers._linear import attached, is_slope
 from polhode.solvers._one_step import is_one_step, one_step
-from polhode.xla import kernel
+from polhode.xla import attached, is_slope, kernel
 
 
 class FlowAdjoint(diffrax.AbstractAdjoint):

@@ -27,8 +27,8 @@ from jaxtyping import Array
 
 from polhode.tops._complex import Complex, unit, where
 from polhode.tops._cubic import Cubic, cubic, positive, safe
-from polhode.tops._pochhammer import Curve, curve, pair, point, unpaired
-from polhode.xla import opaque_ones, staged
+from polhode.tops._pochhammer import Curve, Series, curve, pair, point, unpaired
+from polhode.xla import opaque_ones, spread, staged
 
 
 class Spinor(NamedTuple):
@@ -51,16 +51,12 @@ class Orbit(NamedTuple):
     alpha and beta, stacked in front.
     """
 
-    curve: Curve
+    series: Series
     start: Complex
     partner: Complex
     circular: Array
     nu: Array
     spinors: Spinor
-
-    def along_time(self, axis: int) -> "Orbit":
-        """With an axis of length 1 after (-1) or before (-2) the lanes, ready for samples."""
-        return jax.tree.map(lambda x: jnp.expand_dims(x, axis), self)
 
 
 def _only(condition: Array, value: Array, other=0) -> Array:
@@ -71,9 +67,15 @@ def _stack(*trees):
     return jax.tree.map(lambda *x: jnp.stack(x), *trees)
 
 
-def _row(tree):
-    """Lanes (1, N), to go with several values per lane."""
-    return jax.tree.map(lambda x: x[None], tree)
+def _row(tree, rows: int):
+    """Lanes (rows, N), to go with several values per lane."""
+    return spread(tree, 0, rows)
+
+
+def _rows_of_ones(rows: int, x: Array) -> Array:
+    """Ones (rows, N) that are no broadcast to XLA, of one body neither."""
+    scale = jnp.arange(1, rows + 1, dtype=x.dtype)
+    return opaque_ones(x[None] * scale.reshape(-1, *(1,) * x.ndim))
 
 
 def _reciprocal(a: Complex, b: Complex, times: Array) -> tuple[Complex, Complex]:
@@ -85,7 +87,7 @@ def _reciprocal(a: Complex, b: Complex, times: Array) -> tuple[Complex, Complex]
     return where(second & ~first, other, a), where(first, other, b)
 
 
-def _places(f: Cubic, c: Curve, one: Array):
+def _places(f: Cubic, c: Curve, raw: Array):
     """Places of the state, of g = -1 and of g = 1 (before the turning over), and their partners."""
     circular = f.circular
     zero = jnp.zeros_like(f.across)
@@ -120,10 +122,14 @@ def _places(f: Cubic, c: Curve, one: Array):
         jnp.stack([-f.across / state_span, zero, _only(circular, root)]),
         jnp.stack([zero, zero, _only(~circular, -root)]),
     )
-    f, c, one = _row((f, c, one))
-    scale = 1 / safe(near, f.amount * span)
-    lift, fall = staged(((f.middle + depth) * scale, fall * (scale * jnp.sqrt(f.width))), one)
-    mean, step = staged((mean * f.reach, step * f.reach), one)
+    middle, amount, width, reach, c = _row(
+        (f.middle, f.amount, jnp.sqrt(f.width), f.reach, c._replace(series=None)), 3
+    )
+    one = _rows_of_ones(3, raw)
+    near = staged(near, one)
+    scale = 1 / safe(near, amount * span)
+    lift, fall = staged(((middle + depth) * scale, fall * (scale * width)), one)
+    mean, step = staged((mean * reach, step * reach), one)
     e, partner = _reciprocal(step + mean, -step + mean, c.square)
     half = staged(((1 + partner) * (1 + e).inverse).root, one)
     lead = where(near, -fall + lift, e * half)
@@ -169,16 +175,17 @@ def orbit(
     alpha, beta = spinor
     both = alpha * beta
     vertical = (-2 * both.re, 2 * both.im, 2 * alpha.square, 2 * beta.square)
-    one = opaque_ones(alpha.re)
+    one = opaque_ones(transverse)
     f = staged(cubic(2 * transverse * pull, vertical, momentum), one)
-    c = staged(curve(f.square), one)
-    places, partners = _places(f, c, one)
+    c = curve(staged(f.square, one), one)
+    places, partners = _places(f, c, transverse)
     start, partner = staged(_staged_start(c, places.at(0), partners.at(0)), one)
     nu = staged(jnp.sqrt(f.width) / (4 * c.stretch), one)
-    origin, twist = pair(start.re + partner.re, c.h, jnp.ones_like(c.h), c.series)
+    origin, twist = pair(start.re + partner.re, c.h, jnp.ones_like(c.h), c.series, one)
     base = staged((partner - start) * (twist / origin), one)
     x, mirror = places.at(slice(1, 3)), partners.at(slice(1, 3))
-    turning = _turning(x, mirror, c, one)
+    both_ones = _rows_of_ones(2, transverse)
+    turning = _turning(x, mirror, c, both_ones)
     # alpha vanishes where g = -1, before the turning over
     upward = f.sign > 0
     x, mirror, turning = (
@@ -186,29 +193,34 @@ def orbit(
         for v in (x, mirror, turning)
     )
     push = Complex(momentum[1], momentum[0]) * (1 / (2 * f.unit))
+    one = both_ones
     value, rate = staged((_stack(alpha, beta), _stack(-(beta.conj * push), alpha.conj * push)), one)
-    whole = Orbit(c, start, partner, f.circular, nu * f.unit / transverse, None)
+    whole = Orbit(c.series, start, partner, f.circular, nu * f.unit / transverse, None)
     frequency = f.unit / transverse
 
-    f, c, one, start, partner, origin, base, nu, frequency, spin = _row(
-        (f, c, one, start, partner, origin, base, nu, frequency, spin)
+    circular, live, axial, series, start, partner, origin, base, nu, frequency, spin = _row(
+        (
+            *(f.circular, f.live, f.momentum, c.series),
+            *(start, partner, origin, base, nu, frequency, spin),
+        ),
+        2,
     )
     zero = jnp.zeros_like(value.re)
-    nu_complex = Complex(_only(f.circular, nu), _only(~f.circular, nu))
+    nu_complex = Complex(_only(circular, nu), _only(~circular, nu))
     ahead, behind = staged((mirror * start, x * partner), one)
-    theta, slope = staged(unpaired(ahead, behind, c.series, one), one)
+    theta, slope = staged(unpaired(ahead, behind, series, one), one)
     inverse = staged(theta.inverse, one)
     inner = staged(base + slope * inverse, one)
     # From the rate at the start. Where nothing nutates (nu = 0) the phase alone turns.
     steady = (rate * value.conj).im / safe(value.square > 0, value.square)
-    k = -(nu_complex * (1 + 2 * turning)) - f.momentum / 2
-    k = staged(where(f.live, k, Complex(steady, zero)), one)
+    k = -(nu_complex * (1 + 2 * turning)) - axial / 2
+    k = staged(where(live, k, Complex(steady, zero)), one)
     drift = (k * value).times_i - rate
     d = drift * (-nu_complex.conj.times_i) * (1 / (2 * nu * nu)) + inner * value
-    d = staged(where(f.live, d, Complex(zero, zero)), one)
+    d = staged(where(live, d, Complex(zero, zero)), one)
     # d : c = E : x. Where one of them is far below the other, the difference from the rate would
     # leave it rounding, which exp(2 i nu t) near the separatrix makes large.
-    unsteady = f.live & ~f.circular
+    unsteady = live & ~circular
     first = unsteady & (4 * start.square < x.square)
     second = unsteady & (4 * x.square < start.square)
     nothing = Complex(zero, zero)
@@ -221,7 +233,7 @@ def orbit(
         where(first, least, where(second, -most, d)),
     )
     scale = staged(inverse * origin, one)
-    plain = f.circular | (x.square == 0)
+    plain = circular | (x.square == 0)
     spinors = Spinor(
         scale * whole_part,
         scale * d,
@@ -229,7 +241,7 @@ def orbit(
         mirror,
         k * frequency + spin / 2,
         jnp.arctan2(_only(~plain, x.im), jnp.where(plain, 1, x.re)),
-        jnp.stack([upward, ~upward]) & ~f.circular,
+        jnp.stack([upward, ~upward]) & ~circular,
     )
     return whole._replace(spinors=staged(spinors, one))
 
@@ -242,19 +254,19 @@ def _turning(x: Complex, mirror: Complex, c: Curve, one: Array) -> Complex:
     ones = jnp.ones_like(c.h)
     moved = x * jnp.stack([ones, c.h])
     times, rise = jnp.stack([c.h, c.h * c.h]), jnp.stack([ones, 2 * c.h])
-    norm, twist = pair(moved.re + mirror.re, times, rise, _row(c.series))
-    turning = staged((mirror - moved) * (twist / norm), _row(one))
+    norm, twist = pair(moved.re + mirror.re, times, rise, _row(c.series, 2), one)
+    turning = staged((mirror - moved) * (twist / norm), one)
     upper = x.at(1)
     return _stack(turning.at(0), turning.at(1) + upper * (1 - upper).inverse)
 
 
 def at(o: Orbit, elapsed: Array) -> tuple[Complex, Complex, Complex]:
     """alpha, beta and omega_y + i omega_x at times [s] that broadcast against the lanes."""
-    series, circular = o.curve.series, o.circular
+    series, circular = o.series, o.circular
     angle = 2 * o.nu * elapsed
     # Whole periods of real exponentials; on the separatrix itself there is none.
-    periodic = ~circular & (o.curve.h > 0)
-    period = -jnp.log(safe(periodic, o.curve.h))
+    periodic = ~circular & (series.h > 0)
+    period = -jnp.log(safe(periodic, series.h))
     count = jnp.round(angle / safe(periodic, period))
     count = _only(periodic, jax.lax.stop_gradient(count))
     limit = 0.4 * math.log(jnp.finfo(angle.dtype).max)
@@ -264,9 +276,9 @@ def at(o: Orbit, elapsed: Array) -> tuple[Complex, Complex, Complex]:
     turn = unit(_only(circular, angle))
     f, inverse = turn * size, turn.conj * (1 / size)
     forward, backward = o.start * f, o.partner * inverse
-    one = opaque_ones(angle)
+    one = opaque_ones(elapsed)
     f, forward, backward = staged((f, forward, backward), one)
-    below = pair(forward.re + backward.re, o.curve.h, jnp.ones_like(o.curve.h), series)[0]
+    below = pair(forward.re + backward.re, series.h, jnp.ones_like(series.h), series, one)[0]
     below = staged(1 / below, one)
 
     def parameter(s: Spinor):

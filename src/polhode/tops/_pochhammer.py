@@ -78,15 +78,16 @@ def _curve(square: Array) -> Curve:
 
 
 @jax.custom_jvp
-def curve(square: Array) -> Curve:
+def curve(square: Array, one: Array) -> Curve:
     """The curve of a squared Landen modulus in [0, 0.03]."""
-    return _curve(square)
+    return staged(_curve(square), one)
 
 
 @curve.defjvp
 def _curve_rule(primals, tangents):
-    _, slopes = jax.jvp(_curve, primals, (jnp.ones_like(primals[0]),))
-    return curve(*primals), jax.tree.map(lambda slope: slope * tangents[0], slopes)
+    square, one = primals
+    _, slopes = jax.jvp(_curve, (square,), (jnp.ones_like(square),))
+    return curve(*primals), jax.tree.map(lambda slope: slope * tangents[0], staged(slopes, one))
 
 
 def _polynomial(a: Complex, coefficients) -> Complex:
@@ -119,28 +120,30 @@ def _pair(total: Array, times: Array, weights) -> tuple[Array, Array]:
 
 
 @jax.custom_jvp
-def pair(total: Array, times: Array, rise: Array, series: Series) -> tuple[Array, Array]:
+def pair(
+    total: Array, times: Array, rise: Array, series: Series, one: Array
+) -> tuple[Array, Array]:
     """(a; h)(b; h), and T in a d/da log (a; h) - b d/db log (b; h) = T (a - b)/((a; h)(b; h)).
 
     Real functions of the sum and the product of a and b; the product is a function of h, of slope
     ``rise``.
     """
-    return _pair(total, times, series.weights)
+    return staged(_pair(total, times, series.weights), one)
 
 
 @pair.defjvp
 def _pair_rule(primals, tangents):
-    total, times, rise, series = primals
-    one, zero = jnp.ones_like(total), jnp.zeros_like(total)
-    value, by_total = jax.jvp(lambda s: _pair(s, times, series.weights), (total,), (one,))
-    still = jnp.zeros_like(times)
+    total, times, rise, series, one = primals
+    unit, still = jnp.ones_like(total), jnp.zeros_like(times)
+    _, by_total = jax.jvp(lambda s: _pair(s, times, series.weights), (total,), (unit,))
     _, by_h = jax.jvp(
         lambda s, p, w: _pair(s, p, w),
         (total, times, series.weights),
-        (zero, still + rise, series.slopes),
+        (jnp.zeros_like(total), still + rise, series.slopes),
     )
+    by_total, by_h = staged((by_total, by_h), one)
     ds, dh = tangents[0], tangents[3].h  # the coefficients depend on h alone
-    return value, tuple(x * ds + y * dh for x, y in zip(by_total, by_h))
+    return pair(*primals), tuple(x * ds + y * dh for x, y in zip(by_total, by_h))
 
 
 @jax.custom_jvp

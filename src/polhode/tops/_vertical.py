@@ -7,7 +7,8 @@ from jaxtyping import Array, Float
 from polhode.hamiltonian import components
 from polhode.tops._complex import Complex
 from polhode.tops._lagrange import at, orbit
-from polhode.xla import opaque_ones, staged
+from polhode.tops._pochhammer import Series
+from polhode.xla import opaque_ones, spread, staged
 
 
 def upward(force: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array, Array], Array]:
@@ -54,6 +55,18 @@ def lagrange_motion(
     ``omega`` [rad/s]: initial state; ``axial_momentum`` along body z [kg m^2/s], that of wheels on
     the axis included. Klein & Sommerfeld, Theorie des Kreisels, VI; see ``_lagrange``.
     """
+    # The compiler makes a loop of every axis, be it of length one, and vectors of the last axis
+    # only: axes of length one are left out, and the longer one comes last.
+    lanes, count = elapsed.shape
+    times, axis = elapsed, -1
+    given = transverse, force_space, distance, wxyz, omega, axial_momentum
+    if lanes == 1:
+        times, given = jax.tree.map(lambda x: x[0], (times, given))
+    elif count < lanes:
+        times, axis = times.T, -2
+    if count == 1:
+        times = jnp.squeeze(times, axis)
+    transverse, force_space, distance, wxyz, omega, axial_momentum = given
     one = opaque_ones(transverse)
     wxyz, omega = staged((tuple(wxyz[..., i] for i in range(4)), components(omega)), one)
     turn, size = staged(upward(components(force_space)), one)
@@ -62,17 +75,23 @@ def lagrange_motion(
     momentum = (transverse * omega[0], transverse * omega[1], axial_momentum)
     spinor = Complex(q[0], q[3]), Complex(q[2], q[1])
     motion = orbit(transverse, spin, -size * distance, spinor, momentum)
-    # The compiler makes vectors of the last axis only: let it be the longer one.
-    lanes_last = elapsed.shape[-1] < elapsed.shape[-2]
-    axis = -2 if lanes_last else -1
-    times = elapsed.swapaxes(-1, -2) if lanes_last else elapsed
-    alpha, beta, across = at(motion.along_time(axis), times)
+    if count > 1:
+        series = motion.series
+        motion, h, turn, spin = spread(
+            (motion._replace(series=None), series.h, turn, spin), axis, count
+        )
+        # apart, for no cotangents but that of h need be summed
+        weights = spread((series.weights, series.slopes), axis, count)
+        motion = motion._replace(series=Series(h, *weights))
+    alpha, beta, across = at(motion, times)
     square = 1 / (alpha.square + beta.square)
     scale = jnp.sqrt(square)
-    turn = tuple(jnp.expand_dims(x, axis) * scale for x in turn)
-    q = _turned(turn, (alpha.re, beta.im, beta.re, alpha.im))
-    axial = jnp.broadcast_to(jnp.expand_dims(spin, axis), scale.shape)
-    rates = (across.im * square, across.re * square, axial)
-    if lanes_last:
-        q, rates = jax.tree.map(lambda x: x.swapaxes(-1, -2), (q, rates))
-    return jnp.stack(q, axis=-1), jnp.stack(rates, axis=-1)
+    q = _turned(tuple(x * scale for x in turn), (alpha.re, beta.im, beta.re, alpha.im))
+    rates = (across.im * square, across.re * square, spin)
+
+    def together(parts):
+        return jnp.stack([x.T if count < lanes else x for x in parts], axis=-1).reshape(
+            lanes, count, -1
+        )
+
+    return together(q), together(rates)

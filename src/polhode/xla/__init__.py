@@ -5,6 +5,13 @@ all of it off. `README.md` beside this file says what each part buys.
 """
 
 from polhode.xla._fold import Specialised as Specialised, specialise as specialise
+from polhode.xla._linear import (
+    attached as attached,
+    is_slope as is_slope,
+    linear as linear,
+    spread as spread,
+    zeros as zeros,
+)
 from polhode.xla._single_call import (
     FEW as FEW,
     any_of as any_of,

@@ -37,8 +37,9 @@ def main() -> int:
         return kernel(_leap)(a, b, n, t), nothing(a), kernel(_leap)(jnp.ones_like(a), b, n, t)
 
     def slope(a, b, n, t):
-        leap = kernel(_leap, linearised=True)
-        return jax.vmap(jax.grad(lambda t: jnp.sum(leap(a, b, n, t)[0])))(t + jnp.zeros(2, a.dtype))
+        ways = kernel(_leap, linearised=True), kernel(_leap, repeated=True)
+        total = jax.grad(lambda t: sum(jnp.sum(leap(a, b, n, t)[0]) for leap in ways))
+        return jax.vmap(total)(t + jnp.zeros(2, a.dtype))
 
     marked = [jax.jit(fn)(a, b, n, t) for fn in (value, slope)]
     with jax.disable_jit():

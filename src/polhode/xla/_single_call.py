@@ -16,17 +16,18 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jax.interpreters import ad, partial_eval
 from jax.sharding import AxisType
 
+from polhode.xla._linear import linear
 from polhode.xla._switch import is_plain
 
 _HOLDABLE = frozenset(
     """abs acos acosh add add_any and asin asinh atan atan2 atanh attached bitcast_convert_type
      broadcast_in_dim cbrt ceil clamp concatenate cond convert_element_type copy cos cosh
      custom_jvp_call custom_vmap_call div dynamic_slice dynamic_update_slice eq erf erf_inv erfc
-     exp exp2 expm1 floor gather ge gt integer_pow iota is_finite jit le log log1p logistic lt max
-     min mul ne neg not optimization_barrier or pad pjit pow reduce_and reduce_max reduce_min
-     reduce_or reduce_sum rem reshape round rsqrt scan select_n shift_right_arithmetic sign sin
-     sinh slice split sqrt square squeeze stack stop_gradient sub tan tanh transpose unstack while
-     xor""".split()  # noqa: SIM905
+     exp exp2 expm1 floor gather ge gt integer_pow iota is_finite jit le linear_map log log1p
+     logistic lt max min mul ne neg not optimization_barrier or pad pjit pow reduce_and
+     reduce_max reduce_min reduce_or reduce_sum rem reshape round rsqrt scan select_n
+     shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stop_gradient sub
+     tan tanh transpose unstack while xor""".split()  # noqa: SIM905
 )
 """Operations that a single compiled unit may hold; anything else keeps the usual way."""
 
@@ -44,7 +45,9 @@ _ANALYSING = ContextVar("analysing", default=False)
 """Set while a unit is looked through: the units inside it then show what they are made of."""
 
 
-def kernel(fn: Callable, *, linearised: bool = False, of_units: bool = False) -> Callable:
+def kernel(
+    fn: Callable, *, linearised: bool = False, repeated: bool = False, of_units: bool = False
+) -> Callable:
     """``fn`` compiled by XLA's CPU backend as one function instead of one task per array.
 
     A step is made of many short loops over the bodies. As separate tasks each costs a dispatch,
@@ -54,8 +57,11 @@ def kernel(fn: Callable, *, linearised: bool = False, of_units: bool = False) ->
 
     Derivatives are those of ``fn``, unmarked; with ``linearised`` the value and all coefficients of
     its derivative are a unit again, and only the linear map that is left is not. That suits
-    functions without loops of unknown length. With ``of_units`` what ``fn`` marks itself stays
-    marked, within the whole and in its derivatives.
+    functions without loops of unknown length. With ``repeated`` tangents are a unit and cotangents
+    another, each of which works everything out again: nothing is kept in between but the operands,
+    and where coefficients would be hundreds that is several times as fast, to compile too. Sums
+    over many bodies or times are to be written as ``spread``. With ``of_units`` what ``fn`` marks
+    itself stays marked, within the whole and in its derivatives.
     """
 
     def call(*operands):
@@ -74,7 +80,7 @@ def kernel(fn: Callable, *, linearised: bool = False, of_units: bool = False) ->
         if not _is_holdable(closed.jaxpr):
             return fn(*operands)
         whole, given = _opened(closed)
-        found = _unit(jaxpr_as_fun(whole), linearised, (whole, 0))(*given, *leaves)
+        found = _unit(jaxpr_as_fun(whole), linearised, (whole, 0), repeated)(*given, *leaves)
         return jax.tree.unflatten(jax.tree.structure(shape), found)
 
     return call
@@ -189,7 +195,7 @@ def _is_packable(dtype) -> bool:
     return isinstance(dtype, np.dtype) and dtype != jax.dtypes.float0
 
 
-def _unit(flat: Callable, linearised: bool, traced: Any = None) -> Callable:
+def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool = False) -> Callable:
     """``flat``, a function of arrays with a list of results, as one unit, differentiable.
 
     ``traced``: the same where it is known already, and how many results are bare (``_marked``).
@@ -198,6 +204,8 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None) -> Callable:
     @jax.custom_jvp
     def marked(*leaves):
         closed, bare = traced or (jax.make_jaxpr(flat)(*leaves), 0)
+        if traced is None and not _is_holdable(closed.jaxpr):
+            return jaxpr_as_fun(closed)(*leaves)
         return _marked(closed, leaves, bare)
 
     def derivative(leaves, tangents):
@@ -210,16 +218,19 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None) -> Callable:
 
         # A derivative of the coefficients takes twice as long to compile as one of the formulas.
         again = any(isinstance(x, ad.JVPTracer) for x in leaves)
+        if repeated:
+            value = marked(*leaves)
+            return value, _of_units(of_moving, moving, leaves, tangents, value)
         if again or not linearised:
             given = [leaves[k] for k in moving], [tangents[k] for k in moving]
             return jax.jvp(lambda *x: of_moving(leaves, x), *given)
         shape = []
 
         def known(*leaves):
-            value, linear = jax.linearize(
+            value, linear_map = jax.linearize(
                 lambda *x: of_moving(leaves, x), *(leaves[k] for k in moving)
             )
-            kept, tree = jax.tree.flatten(linear)
+            kept, tree = jax.tree.flatten(linear_map)
             shape[:] = [tree, len(value)]
             return [*value, *kept, jnp.zeros((), jnp.float32)]
 
@@ -228,11 +239,42 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None) -> Callable:
         bare = len(first.out_avals) - 1 - count
         *found, zero = _unit(jaxpr_as_fun(first), False, (first, bare))(*leaves)
         # Not marked: transposed, it would carry operands that go unused.
-        linear = jax.tree.unflatten(tree, found[count:])
-        return found[:count], linear(*(_gated(zero, tangents[k]) for k in moving))
+        linear_map = jax.tree.unflatten(tree, found[count:])
+        return found[:count], linear_map(*(_gated(zero, tangents[k]) for k in moving))
 
     marked.defjvp(derivative, symbolic_zeros=True)
     return marked
+
+
+def _of_units(of_moving: Callable, moving: Sequence[int], leaves, tangents, like) -> list[Any]:
+    """The tangents of ``of_moving(leaves, those that move)``: a unit, and its transpose another."""
+    count = len(leaves)
+    floats = {k: x for k, x in enumerate(like) if jnp.issubdtype(x.dtype, jnp.inexact)}
+
+    def slope(leaves, changes):
+        some = [leaves[k] for k in moving]
+        found = jax.jvp(lambda *x: of_moving(leaves, x), some, list(changes))[1]
+        return [found[k] for k in floats]
+
+    def along(*both):
+        return slope(both[:count], both[count:])
+
+    def against(*both):
+        leaves, slopes = both[:count], list(both[count:])
+        # ``jax.vjp`` would take half as long again to trace.
+        back = jax.linear_transpose(lambda *d: slope(leaves, d), *(leaves[k] for k in moving))
+        return list(back(slopes))
+
+    def forward(given, changes):
+        return _unit(along, False, repeated=True)(*given, *changes)
+
+    def backward(given, slopes):
+        return _unit(against, False, repeated=True)(*given, *slopes)
+
+    changes = [tangents[k] for k in moving]
+    found = dict(zip(floats, linear(forward, backward, leaves, changes, list(floats.values()))))
+    none = {k: np.zeros(x.shape, jax.dtypes.float0) for k, x in enumerate(like) if k not in floats}
+    return [(found | none)[k] for k in range(len(like))]
 
 
 def _gated(zero: jax.Array, tangent: jax.Array) -> jax.Array:

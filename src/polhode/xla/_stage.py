@@ -22,10 +22,13 @@ def staged(values: Any, *ones: Array) -> Any:
 
     The compiler repeats cheap arithmetic in every fused loop that needs its result, but never a
     division; it drops optimisation barriers before fusing on the CPU. A division by a broadcast
-    scalar would be a multiplication to it. What is no float stays as it is.
+    scalar would be a multiplication to it: of arrays of one body too, the ones need every axis.
+    Conditions are staged as numbers. What else is no float stays as it is.
     """
 
     def divided(x):
+        if x.dtype == bool:
+            return divided(x.astype(ones[0].dtype)) > 0
         if not jnp.issubdtype(x.dtype, jnp.inexact):
             return x
         one = next((one for one in ones if one.shape == x.shape), ones[0])

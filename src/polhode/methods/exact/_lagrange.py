@@ -71,7 +71,7 @@ class LagrangeTop(AbstractTopMethod):
         gravity: Any = scene.potential
         centre = as_lanes(gravity.centre_body, n, 1)
         force = as_lanes(gravity.mass, n)[:, None] * as_lanes(gravity.gravity_space, n, 1)
-        wxyz, omega = kernel(tops.lagrange_motion, linearised=True)(
+        wxyz, omega = kernel(tops.lagrange_motion, repeated=True)(
             transverse, force, centre[:, 2], state.wxyz, state.omega_body, axial, elapsed
         )
         lawful = (moments[:, 0] == moments[:, 1]) & (centre[:, 0] == 0) & (centre[:, 1] == 0)

@@ -1,12 +1,14 @@
-"""Two primitives: a linear map that is computed by one program and transposed by another, and
-values found by other means with the derivatives of what they are."""
+"""Two primitives: a linear map that is computed by one program and transposed by another, such as
+``spread``, and values found by other means with the derivatives of what they are."""
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jax.core import ShapedArray
+from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
@@ -36,6 +38,11 @@ _linear_p.multiple_results = True
 @_linear_p.def_impl
 def _compute(*arrays, forward, backward, count, shapes):
     return list(forward(arrays[:count], arrays[count:]))
+
+
+def _lowered(*arrays, **params):
+    with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):  # a unit's mark is its call's
+        return _compute(*arrays, **params)
 
 
 @_linear_p.def_abstract_eval
@@ -107,7 +114,46 @@ def _batch(arrays, dims, *, forward, backward, count, shapes):
 ad.primitive_jvps[_linear_p] = _jvp
 ad.primitive_transposes[_linear_p] = _transpose
 batching.primitive_batchers[_linear_p] = _batch
-mlir.register_lowering(_linear_p, mlir.lower_fun(_compute, multiple_results=True))
+mlir.register_lowering(_linear_p, mlir.lower_fun(_lowered, multiple_results=True))
+
+
+def spread(values: Any, axis: int, count: int) -> Any:
+    """Every array of a tree ``count`` times along a new axis.
+
+    As a broadcast, but that cotangents are summed in a loop, which a unit can hold: XLA hands the
+    sum of a large array to a library.
+    """
+    leaves, tree = jax.tree.flatten(values)
+    moving = {k: x for k, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.inexact)}
+
+    def repeated(x):
+        x = jnp.expand_dims(x, axis)
+        return jnp.broadcast_to(
+            x, [count if k == axis % x.ndim else n for k, n in enumerate(x.shape)]
+        )
+
+    def forward(_, some):
+        return [repeated(x) for x in some]
+
+    def backward(_, slopes):
+        def row(i):
+            return [jax.lax.dynamic_index_in_dim(x, i, axis % x.ndim, False) for x in slopes]
+
+        def add(i, total):
+            return [a + b for a, b in zip(total, row(i))]
+
+        if count <= _FEW:
+            return functools.reduce(lambda total, i: add(i, total), range(1, count), row(0))
+        return jax.lax.fori_loop(1, count, add, row(0))
+
+    like = jax.eval_shape(lambda: forward(None, moving.values()))
+    found = dict(zip(moving, linear(forward, backward, [], list(moving.values()), like)))
+    every = [found[k] if k in found else repeated(x) for k, x in enumerate(leaves)]
+    return jax.tree.unflatten(tree, every)
+
+
+_FEW = 4
+"""Rows up to which they are added one by one."""
 
 
 Rule = Callable[[Sequence[Any], Sequence[Any], Sequence[Any]], Sequence[Any]]
