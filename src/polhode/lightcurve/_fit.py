@@ -27,7 +27,8 @@ _DESCENT = ((1.0, 2), (0.5, 3), (0.25, 6))  # parts of the starts, and their ste
 _WIDE = 10.0  # limit of the first steps' residuals, in sigma
 _AGAIN, _MORE, _POLES = 8, 2000, 12  # pairs of periods searched again, by trials and starts of each
 _LIMIT = 3.0  # of residuals in a search, in sigma
-_LEADING, _OFTEN = 64, 8  # hypotheses tried again, and how often the first; the 16th half as often
+_FIRST, _TIMES = 16, 12  # so many of the hypotheses are tried so many times again
+_LEADING, _OFTEN = 64, 8  # as many then once more, the first as often; the 16th half as often
 _ALIKE = 4  # poles kept of one pair of periods: a motion and its three mirror images
 _GROUPS = 8  # of so many, or more, it is learnt how much their zero points differ
 
@@ -51,10 +52,10 @@ def fit_light_curve(
 
     Pairs of frequencies from Fourier series, each with all it can mean; ``trials`` bodies of these
     periods, all else drawn at random; Levenberg-Marquardt, with exact derivatives, on the best
-    ``starts`` of each pair and meaning; half as many again of the likeliest and of those with the
-    best bodies so far; the mirror images of what is found; distinct solutions, the ``most`` best
-    and all others that cannot be excluded. Repeated until two searches agree, ``searches`` times
-    at most.
+    ``starts`` of each pair and meaning, of the likeliest thirteen times as many of both; half as
+    many again of those with the best bodies so far; the mirror images of what is found; distinct
+    solutions, the ``most`` best and all others that cannot be excluded. Repeated until two searches
+    agree, ``searches`` times at most.
 
     ``phase``: a phase function (default: ``HG1G2()`` where the phase angle changes by more than 5
     degrees, else ``SeeligerPhase()``). ``pairs``: instead of those from the series. ``highest``
@@ -154,7 +155,12 @@ def _searched(
 ) -> State:  # fmt: skip
     """Bodies of all hypotheses; then more with the periods found, whose pole may be wrong."""
     own = jax.random.split(key, 3)
-    state, reached = _started(own[0], meant, trials, starts, rough, blur)
+    index = np.arange(len(meant.f_phi))
+    index = np.r_[index, np.tile(index[:_FIRST], _TIMES)]
+    every = Hypotheses(*(x[index] for x in meant))
+    state, cost = _started(own[0], every, trials, starts, rough, blur)
+    reached = np.full(len(meant.f_phi), np.inf)
+    np.minimum.at(reached, index, cost)
     likely = _shared(meant, reached)
     more, _ = _started(own[2], likely, trials // 2, starts, rough, blur)
     state = _better(problem, _joined(state, more), resolution, 3 * BATCH, _WIDE, 12)
