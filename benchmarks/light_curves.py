@@ -9,7 +9,7 @@ note says that it may be); silent (wrong without a warning). The search was deve
 150: others count. ``--egg``: bodies that are no ellipsoids. ``--real FOLDER`` adds 2012 TC4 and
 Toutatis, the latter with ``--seeds`` of the search, from files described in docs/light_curves.md.
 
-    python -m benchmarks.light_curves [--first 151] [--count 50] [--noise 0.02 0.1] [--egg 5]
+    python -m benchmarks.light_curves [--first 201] [--count 50] [--noise 0.02 0.1] [--egg 5]
         [--real FOLDER] [--speed]
 """
 
@@ -340,7 +340,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=50)
-    parser.add_argument("--first", type=int, default=151)
+    parser.add_argument("--first", type=int, default=201)
     parser.add_argument("--noise", type=float, nargs="*", default=[0.02, 0.1])
     parser.add_argument("--trials", type=int, default=60_000)
     parser.add_argument("--egg", type=int, default=0)

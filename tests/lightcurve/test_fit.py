@@ -1,5 +1,7 @@
 """Tumblers found again from their light alone; derivatives, mirrors, messages."""
 
+import types
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -128,6 +130,20 @@ def test_mirror_gives_the_same_light(trial):
         trial
     )
     np.testing.assert_allclose(_solutions.momentum(image), turned, atol=1e-9)
+
+
+def test_a_list_that_ends_before_the_odds_do_says_so():
+    curve, *_ = light_curves.synthetic(3, 0.02, nights=8, days=12.0, each=16)
+
+    def said(*odds):
+        solutions = [
+            types.SimpleNamespace(P_phi=1.0, P_psi=1.0, probability=p, mirror_of=None) for p in odds
+        ]
+        return [n for n in _solutions.notes_on(curve, solutions, 1.0, 1.0) if "Ambiguous" in n]
+
+    assert not said(1.0, 1e-4)
+    assert said(1.0, 0.1, 1e-4)[0].startswith("Ambiguous: 1 other")
+    assert said(1.0, 0.1, 0.01)[0].startswith("Ambiguous: at least 2 other")
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import pytest
 import polhode as ph
 from benchmarks import light_curves
 from polhode import lightcurve
-from polhode.lightcurve import _fit, _hypotheses, _search, _solutions, _steps
+from polhode.lightcurve import _fit, _hypotheses, _model, _search, _solutions, _steps
 
 PHASE = lightcurve.HG1G2()
 Hypotheses = _hypotheses.Hypotheses
@@ -45,20 +45,45 @@ def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
     assert np.all(np.diff(misfit, axis=1) >= 0)
     few, _ = _search.build(*_search.draw(jax.random.key(1), meant, 3, 0.0), PHASE)
     assert misfit.mean() < 0.7 * _search.misfits(PHASE, few, points)[0].mean()
-    state = _fit._started(key, meant, 1800, 3, _steps.Problem(PHASE, points), 0.0)
+    state, reached = _fit._started(key, meant, 1800, 3, _steps.Problem(PHASE, points), 0.0)
+    assert np.argmin(reached) == 0
+    assert reached.min() == state.cost.min()
+    assert np.isfinite(reached).all()
     f_phi, f_psi, _ = _solutions.frequencies(state.bodies)
     best = np.argmin(state.cost)
     np.testing.assert_allclose([f_phi[best], f_psi[best]], right, rtol=3e-3)
 
 
-def test_the_leading_hypotheses_are_tried_more():
-    many = Hypotheses(np.arange(1.0, 101.0), np.ones(100), np.ones(100, bool))
-    index, times = np.unique(_fit._shared(many).f_phi, return_counts=True)
-    np.testing.assert_array_equal(index, many.f_phi)
-    assert times[:16].min() > 10 * times[16:].max()
-    # half of the trials, or less, go to them
-    assert times[16:].sum() < times[:16].sum() < 3 * times[16:].sum()
-    assert len(_fit._shared(MEANT).f_phi) == 13 * len(MEANT.f_phi)
+def test_the_likeliest_and_the_best_so_far_are_tried_again():
+    many = Hypotheses(np.arange(200.0), np.ones(200), np.ones(200, bool))
+    shared = _fit._shared(many, np.arange(200.0)[::-1])  # the least likely reached the least
+    times = np.bincount(shared.f_phi.astype(int), minlength=200)
+    assert times[0] == times[-1] == _fit._OFTEN
+    assert np.all(times[32:-32] == 0)
+    assert times[:32].min() > 0
+    assert times[-32:].min() > 0
+    assert np.all(np.diff(times[:32]) <= 0)
+    assert np.all(np.diff(times[-32:]) >= 0)
+    # half as often from the sixteenth of the 64 on
+    assert times[8] == _fit._OFTEN / 2
+    one = _fit._shared(Hypotheses(*(x[:1] for x in many)), np.array([np.inf]))
+    assert len(one.f_phi) == _fit._OFTEN
+
+
+def test_poles_of_one_pair_do_not_crowd_out_others():
+    bodies, good = _search.build(*_search.draw(jax.random.key(0), MEANT, 32, 0.0), PHASE)
+    lam, sam = np.flatnonzero(good[:32])[0], 32 + np.flatnonzero(good[32:])[0]
+    index = np.r_[np.full(20, lam), sam]
+    wxyz = np.random.default_rng(0).normal(size=(21, 4))
+    bodies = _model.Bodies(
+        bodies.unknowns[index], wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
+    )
+    nothing = np.zeros(21)
+    state = _steps.State(bodies, nothing, np.arange(21.0), nothing, nothing, nothing)
+    kept = _fit._distinct(state, 0.01, 12)
+    assert len(kept) == 1 + _fit._ALIKE
+    assert kept[0] == 0
+    assert kept[-1] == 20
 
 
 def test_spread_of_offsets_is_the_likeliest():

@@ -11,7 +11,15 @@ from polhode.lightcurve._hypotheses import Hypotheses, hypotheses
 from polhode.lightcurve._model import Bodies, Points
 from polhode.lightcurve._phase import HG1G2, AbstractPhase, SeeligerPhase
 from polhode.lightcurve._search import tried
-from polhode.lightcurve._solutions import REACHED, Fit, described, frequencies, momentum, notes_on
+from polhode.lightcurve._solutions import (
+    EXCLUDED,
+    REACHED,
+    Fit,
+    described,
+    frequencies,
+    momentum,
+    notes_on,
+)
 from polhode.lightcurve._steps import BATCH, Problem, State, picked, spread_of_offsets, taken
 
 _FEW = 160  # points that a search looks at
@@ -19,7 +27,9 @@ _DESCENT = ((1.0, 2), (0.5, 3), (0.25, 6))  # parts of the starts, and their ste
 _WIDE = 10.0  # limit of the first steps' residuals, in sigma
 _AGAIN, _MORE, _POLES = 8, 2000, 12  # pairs of periods searched again, by trials and starts of each
 _LIMIT = 3.0  # of residuals in a search, in sigma
-_LEADING, _OFTEN = 16, 12  # so many of the hypotheses are tried so many times again
+_FIRST, _TIMES = 16, 12  # so many of the hypotheses are tried so many times again
+_LEADING, _OFTEN = 64, 8  # as many then once more, the first as often; the 16th half as often
+_ALIKE = 4  # poles kept of one pair of periods: a motion and its three mirror images
 _GROUPS = 8  # of so many, or more, it is learnt how much their zero points differ
 
 
@@ -42,9 +52,10 @@ def fit_light_curve(
 
     Pairs of frequencies from Fourier series, each with all it can mean; ``trials`` bodies of these
     periods, all else drawn at random; Levenberg-Marquardt, with exact derivatives, on the best
-    ``starts`` of each pair and meaning; of the likeliest, thirteen times as many of both; the
-    mirror images of what is found; distinct solutions, the ``most`` best. Repeated until two
-    searches agree, ``searches`` times at most.
+    ``starts`` of each pair and meaning, of the likeliest thirteen times as many of both; half as
+    many again of those with the best bodies so far; the mirror images of what is found; distinct
+    solutions, the ``most`` best and all others that cannot be excluded. Repeated until two searches
+    agree, ``searches`` times at most.
 
     ``phase``: a phase function (default: ``HG1G2()`` where the phase angle changes by more than 5
     degrees, else ``SeeligerPhase()``). ``pairs``: instead of those from the series. ``highest``
@@ -72,11 +83,11 @@ def fit_light_curve(
     meant = hypotheses(pairs, curve.t, curve.magnitude, columns=columns)
     key = jax.random.key(seed)
     rough, problem = Problem(phase, _thinned(points, _FEW)), Problem(phase, points)
-    state, again, shared = None, False, _shared(meant)
+    state, again = None, False
     for _ in range(searches):
         key, own = jax.random.split(key)
         found = _searched(
-            own, shared, trials, starts, rough, problem, _blur(curve), pairs.resolution
+            own, meant, trials, starts, rough, problem, _blur(curve), pairs.resolution
         )
         again = state is not None and _found_twice(state, found, pairs.resolution)
         state = found if state is None else _joined(state, found)
@@ -103,8 +114,9 @@ def fit_light_curve(
     width = np.full(len(images.wxyz), limit)
     mirrored = problem.improve(problem.start(images, width), width, 30)
     state = _joined(state, mirrored)
-    order = _distinct(state, pairs.resolution, most)
+    order = _distinct(state, pairs.resolution, max(most, BATCH))
     solutions, scale, alike = described(problem, state, order, curve, normals, limit)
+    solutions = solutions[: max(most, sum(s.probability > EXCLUDED for s in solutions))]
     notes = notes_on(curve, solutions, scale, alike)
     if not again:
         notes += (
@@ -125,10 +137,16 @@ def _blur(curve: LightCurve) -> float:
     return float((0.125 + turned / (2 * np.pi)) / np.ptp(curve.t))
 
 
-def _shared(meant: Hypotheses) -> Hypotheses:
-    """The leading ones several times over: each time has trials and starts of its own."""
-    many = len(meant.f_phi)
-    index = np.r_[:many, np.tile(np.arange(min(_LEADING, many)), _OFTEN)]
+def _shared(meant: Hypotheses, reached: np.ndarray) -> Hypotheses:
+    """Those to try again, several times over: each time has trials and starts of its own.
+
+    The likeliest, and those whose best body ``reached`` (h,) the lowest costs, in turn.
+    """
+    many = len(reached)
+    place = np.minimum(np.arange(many), np.argsort(np.argsort(reached)) + 0.5)
+    leading = np.argsort(place)[:_LEADING]
+    often = np.rint(_OFTEN / (1 + np.arange(len(leading)) / (_LEADING / 4))).astype(int)
+    index = np.repeat(leading, often)
     return Hypotheses(*(x[index] for x in meant))
 
 
@@ -136,9 +154,16 @@ def _searched(
     key, meant, trials: int, starts: int, rough: Problem, problem: Problem, blur, resolution
 ) -> State:  # fmt: skip
     """Bodies of all hypotheses; then more with the periods found, whose pole may be wrong."""
-    own = jax.random.split(key)
-    state = _started(own[0], meant, trials, starts, rough, blur)
-    state = _better(problem, state, resolution, 3 * BATCH, _WIDE, 12)
+    own = jax.random.split(key, 3)
+    index = np.arange(len(meant.f_phi))
+    index = np.r_[index, np.tile(index[:_FIRST], _TIMES)]
+    every = Hypotheses(*(x[index] for x in meant))
+    state, cost = _started(own[0], every, trials, starts, rough, blur)
+    reached = np.full(len(meant.f_phi), np.inf)
+    np.minimum.at(reached, index, cost)
+    likely = _shared(meant, reached)
+    more, _ = _started(own[2], likely, trials // 2, starts, rough, blur)
+    state = _better(problem, _joined(state, more), resolution, 3 * BATCH, _WIDE, 12)
     return _with_poles(own[1], state, rough, problem, resolution)
 
 
@@ -146,23 +171,31 @@ def _with_poles(key, state: State, rough: Problem, problem: Problem, resolution)
     """The best, and more of their periods."""
     near = _near(state, resolution)
     trials = _MORE * len(near.f_phi)
-    more = _started(key, near, trials, _POLES, rough, 0.5 * resolution)
+    more, _ = _started(key, near, trials, _POLES, rough, 0.5 * resolution)
     more = problem.start(more.bodies, np.full(len(more.cost), _WIDE))
     return _better(problem, _joined(state, more), resolution, 2 * BATCH, _LIMIT, 12)
 
 
-def _started(key, meant, trials: int, keep: int, problem: Problem, blur) -> State:
-    """Steps from the ``keep`` best trials of every hypothesis, more from the best of these."""
+def _started(key, meant, trials: int, keep: int, problem: Problem, blur):
+    """Steps from the ``keep`` best trials of every hypothesis, more from the best of these.
+
+    The bodies that were stepped to the end, and the least cost of each hypothesis.
+    """
     found = tried(key, meant, trials, keep, problem.phase, problem.points, blur)
-    bodies = taken(found.bodies, np.arange(len(found.gain)))
+    many = len(found.gain)
+    bodies = taken(found.bodies, np.arange(many))
     # the gain, as a first step of the shape
-    bodies.unknowns[: len(found.gain), 2:4] *= found.gain[:, None]
+    bodies.unknowns[:many, 2:4] *= found.gain[:, None]
+    source = np.pad(found.source, (0, len(bodies.wxyz) - many), mode="edge")
     state = problem.start(bodies, np.full(len(bodies.wxyz), _WIDE))
+    reached = np.full(len(meant.f_phi), np.inf)
     for part, steps in _DESCENT:
         best = np.argsort(state.cost)[: int(part * len(bodies.wxyz))]
         best = np.pad(best, (0, -len(best) % BATCH), mode="edge")
+        source = source[best]
         state = problem.improve(picked(state, best), np.full(len(best), _WIDE), steps)
-    return state
+        np.minimum.at(reached, source, state.cost)
+    return state, reached
 
 
 def _better(problem: Problem, state: State, resolution, keep: int, limit: float, steps: int):
@@ -216,7 +249,10 @@ def _thinned(points: Points, count: int) -> Points:
 
 
 def _distinct(state: State, resolution: float, most: int) -> np.ndarray:
-    """Numbers of the ``most`` best solutions that differ in mode, frequencies or pole."""
+    """Numbers of the ``most`` best solutions that differ in mode, frequencies or pole.
+
+    Of one mode and frequencies no more than `_ALIKE`, so that others are not crowded out.
+    """
     f_phi, f_psi, mode = frequencies(state.bodies)
     pole = momentum(state.bodies)
     finite = np.isfinite(state.cost + f_phi + f_psi)
@@ -224,13 +260,13 @@ def _distinct(state: State, resolution: float, most: int) -> np.ndarray:
     for k in np.argsort(state.cost):
         if not finite[k]:
             continue
-        same = (
+        alike = (
             (mode[kept] == mode[k])
             & (abs(f_phi[kept] - f_phi[k]) < 0.2 * resolution)
             & (abs(f_psi[kept] - f_psi[k]) < 0.2 * resolution)
-            & (pole[kept] @ pole[k] > np.cos(np.radians(15)))
         )
-        if not same.any():
+        same = alike & (pole[kept] @ pole[k] > np.cos(np.radians(15)))
+        if alike.sum() < _ALIKE and not same.any():
             kept.append(int(k))
         if len(kept) == most:
             break

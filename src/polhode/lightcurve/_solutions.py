@@ -15,6 +15,7 @@ from polhode.lightcurve._steps import BATCH, Problem, State, normal_equations, p
 
 # Chi-square per degree of freedom at which a body explains a light curve.
 REACHED = 1.3
+EXCLUDED = 1e-3  # odds of a solution below which it is
 
 
 class Solution(NamedTuple):
@@ -203,11 +204,13 @@ def notes_on(curve: LightCurve, solutions, scale: float, alike: float) -> tuple[
     for name, period in (("P_phi", best.P_phi), ("P_psi", best.P_psi)):
         if span < 3 * period:
             notes.append(f"Fewer than three {name} were seen: it is uncertain beyond its error.")
-    rivals = [s for s in solutions[1:] if s.probability > 1e-3 and s.mirror_of is None]
+    rivals = [s for s in solutions[1:] if s.probability > EXCLUDED and s.mirror_of is None]
     if rivals:
+        # a list that ends before the odds do is not the whole of them
+        least = "at least " if solutions[-1].probability > EXCLUDED else ""
         notes.append(
-            f"Ambiguous: {len(rivals)} other solution(s) than the best, mirrors apart, cannot be"
-            " excluded at 1 in 1000."
+            f"Ambiguous: {least}{len(rivals)} other solution(s) than the best, mirrors apart,"
+            " cannot be excluded at 1 in 1000."
         )
     if scale**2 > REACHED:
         notes.append(
