@@ -348,7 +348,9 @@ def march(
         numbers = walk.width, walk.turned, walk.steps, walk.error, ended.astype(dtype)
         return y, walk.integrals, walk.low, numbers
 
-    if field.by_entry and own and zero.ndim == 1 and zero.size > LANES:
+    # an accelerator holds them all
+    several = zero.ndim == 1 and zero.size > LANES and jax.default_backend() == "cpu"
+    if several and field.by_entry and own:
         found, rows = in_lanes(one, able, finished, fixed, walk, rows)
     else:
         walk, rows = jax.lax.while_loop(
