@@ -361,8 +361,8 @@ def march(
         found = finished(fixed, walk)
     y, integrals, low, (width, turned, steps, error, ended) = found
     gone = progress.gone + whole_length
-    if rows is not None:
-        rows = rows.reshape(zero.size, -1, len(y))
+    if rows is not None and elapsed is not None:
+        rows = rows.reshape(zero.size, elapsed.shape[0] + 1, len(y))
     ended = ended.astype(jnp.int32)
     return y, integrals, Progress(width, turned, low, steps, error, gone, ended, rows)
 
