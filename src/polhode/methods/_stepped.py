@@ -44,8 +44,10 @@ class Stepped(AbstractMethod):
         asked, found = getattr(self.solver, "bodies_at_once", None), []
         if jax.default_backend() != "cpu":
             return _ON_ACCELERATOR
-        if asked is None or state.wxyz.shape[0] <= FEW:
-            return 1 if asked is None else FEW
+        if asked is None:
+            return 1
+        if state.wxyz.shape[0] <= FEW:
+            return FEW
 
         def look(scene, state):
             y0, _ = self._start(scene, state, ts, record)
