@@ -154,6 +154,7 @@ def needed(name: str, array: Array | None) -> Array:
     return array
 
 
+@jax.jit
 def bridged(times: Float[Array, "*b t"], known: Float[Array, "*b t"], values: Array) -> Array:
     """Values with those that are not ``known`` interpolated linearly between their neighbours.
 

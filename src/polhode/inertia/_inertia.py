@@ -270,8 +270,7 @@ class Inertia(AbstractShaped, AbstractPart):
         omega = as_vectors("omega", omega)
         if self.full is None:
             return jnp.multiply(*_aligned(self.moments, omega))
-        rows = [jnp.sum(jnp.multiply(*_aligned(self.full[..., i, :], omega)), -1) for i in range(3)]
-        return jnp.stack(rows, axis=-1)
+        return _product(self.full, omega)
 
     def rates(self, momentum: Float[Array | np.ndarray, "*#b 3"]) -> Float[Array, "*b 3"]:
         """Body rates ``I^-1 L``, rad/s, of body momenta (..., 3), kg m^2/s."""
@@ -289,6 +288,13 @@ def _aligned(left, right):
     return jnp.broadcast_to(left, shape), jnp.broadcast_to(right, shape)
 
 
+@jax.jit  # one program, not one for each operation; likewise below
+def _product(tensor, vector):
+    rows = [jnp.sum(jnp.multiply(*_aligned(tensor[..., i, :], vector)), -1) for i in range(3)]
+    return jnp.stack(rows, axis=-1)
+
+
+@jax.jit
 def _solve(tensor, vector):
     """Solution of a symmetric positive definite 3x3 system by its L D L^T factors, elementwise."""
     a, p, q, r = (tensor[..., 0, 0], tensor[..., 1, 0], tensor[..., 2, 0], tensor[..., 2, 1])

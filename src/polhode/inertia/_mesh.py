@@ -6,7 +6,7 @@ from os.path import isfile
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from polhode._checks import as_float_array, is_concrete, require
 
@@ -73,8 +73,9 @@ def _check_closed(faces: np.ndarray) -> None:
     )
 
 
+@jax.jit  # one program, not one for each operation
 def mesh_integrals(
-    vertices: Float[Array, "*b v 3"], faces: np.ndarray
+    vertices: Float[Array, "*b v 3"], faces: Int[Array | np.ndarray, "f 3"]
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Float[Array, "*b 3 3"]]:
     """Volume, centre and central second moments (kg m^2 per kg m^-3) inside a closed mesh.
 

@@ -6,6 +6,7 @@ that the transforms of data and window are tabulated once and the normal equatio
 looked up, not summed.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -40,6 +41,7 @@ def terms(order: int, even: bool = True) -> np.ndarray:
     return grid[(grid[:, 0] > 0) | (grid[:, 1] > 0)]
 
 
+@partial(jax.jit, static_argnums=3)  # one program, not one for each operation
 def _transforms(t, values, step: float, count: int):
     """Sums of ``values`` (c, n) times exp(-2 pi i k step t), k = 0 ... count - 1: (c, count)."""
 

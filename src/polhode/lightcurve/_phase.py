@@ -1,9 +1,11 @@
 """Phase functions: the brightness of a sphere over that at opposition, by phase angle."""
 
 import math
+from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -70,6 +72,7 @@ class HG1G2(AbstractPhase):
 _BOWELL = ((3.332, 0.631, 0.986), (1.862, 1.218, 0.238))
 
 
+@partial(jax.jit, static_argnums=(1, 2, 3))  # one program, not one for each operation
 def _bowell(alpha, a, b, c):
     sine, tangent = jnp.sin(alpha), jnp.tan(alpha / 2)
     far = jnp.exp(-a * jnp.where(tangent > 0, tangent, 1) ** b)
@@ -111,6 +114,7 @@ def _spline(knots, table, alpha):
     return values[k] + t * rise + t * (1 - t) * ((1 - t) * left + t * right)
 
 
+@jax.jit
 def hg1g2_basis(alpha: Scalars) -> tuple[Scalars, Scalars, Scalars]:
     """The three functions of the H, G1, G2 system at ``alpha`` [rad]."""
     out = []

@@ -7,6 +7,7 @@ incidence. Directions point from the body to the Sun and to the observer, in bod
 
 import math
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -60,6 +61,7 @@ def seeliger_ellipsoid(axes: Triple, sun: Triple, observer: Triple) -> Scalars:
     return jnp.where(dark, 0, math.pi / 2 * a * b * c * lit * seen / size * total)
 
 
+@jax.jit
 def seeliger_sphere(alpha: Scalars) -> Scalars:
     """Lommel-Seeliger brightness of a sphere over that at opposition; ``alpha`` in [0, pi]."""
     half = alpha / 2

@@ -4,6 +4,8 @@ ZYZ, ``R = Rz(phi) Ry(theta) Rz(psi)``, is the convention of docs/equations.md;
 the other sequences are reduced to the same formulas by a quarter turn (Bernardes and Viollet 2022).
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -43,7 +45,13 @@ def euler_to_wxyz(
     angles continuously; `canonical` picks the one with scalar part >= 0.
     """
     check_sequence(sequence)
-    first, second, third = as_floats(finite=False, phi=(phi, ()), theta=(theta, ()), psi=(psi, ()))
+    return _quaternion(
+        sequence, *as_floats(finite=False, phi=(phi, ()), theta=(theta, ()), psi=(psi, ()))
+    )
+
+
+@partial(jax.jit, static_argnums=0)  # one program, not one for each operation
+def _quaternion(sequence: Sequence, first: Array, second: Array, third: Array) -> Array:
     i, j, k = sequence.axes
     if sequence.is_extrinsic:
         (i, j, k), first, third = (k, j, i), third, first
@@ -96,7 +104,11 @@ def wxyz_to_euler(
     angles of a traced quaternion that is zero are NaN.
     """
     check_sequence(sequence)
-    wxyz = as_quaternions(wxyz)
+    return _angles(sequence, as_quaternions(wxyz))
+
+
+@partial(jax.jit, static_argnums=0)
+def _angles(sequence: Sequence, wxyz: Array) -> tuple[Array, Array, Array]:
     wxyz = jnp.where(jnp.any(wxyz != 0, axis=-1, keepdims=True), wxyz, jnp.nan)
     i, j, k = sequence.axes
     if sequence.is_extrinsic:

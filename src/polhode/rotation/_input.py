@@ -53,12 +53,7 @@ def as_matrices(value: Any) -> tuple[Array, Array]:
     matrix = value
     if not isinstance(value, jax.Array) or value.shape[-2:] != (3, 3):
         matrix = as_float_array("matrix", value, (3, 3), finite=False)
-    seen = jax.lax.stop_gradient(matrix)
-    a, b, c = (seen[..., i, :] for i in range(3))
-    # of orthonormal, right-handed rows each is the vector product of the two others
-    off = [jnp.cross(a, b) - c, jnp.cross(b, c) - a, jnp.cross(c, a) - b]
-    size = jnp.max(jnp.abs(jnp.stack(off)), axis=(0, -1))
-    good = (size <= _UNIT) & (jnp.max(jnp.abs(seen), axis=(-2, -1)) > 0.5)
+    good, size = _judged(jax.lax.stop_gradient(matrix))
     if is_concrete(matrix):
         require(
             np.asarray(good | jnp.isnan(size)),
@@ -67,6 +62,16 @@ def as_matrices(value: Any) -> tuple[Array, Array]:
             " quaternion.",
         )
     return matrix, good
+
+
+@jax.jit
+def _judged(matrix: Array) -> tuple[Array, Array]:
+    """Which are rotations, and how far they are from it."""
+    a, b, c = (matrix[..., i, :] for i in range(3))
+    # of orthonormal, right-handed rows each is the vector product of the two others
+    off = [jnp.cross(a, b) - c, jnp.cross(b, c) - a, jnp.cross(c, a) - b]
+    size = jnp.max(jnp.abs(jnp.stack(off)), axis=(0, -1))
+    return (size <= _UNIT) & (jnp.max(jnp.abs(matrix), axis=(-2, -1)) > 0.5), size
 
 
 def check_sequence(sequence: Any) -> None:

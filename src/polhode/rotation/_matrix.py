@@ -1,5 +1,6 @@
 """Rotation matrices R, ``x_space = R x_body`` (docs/equations.md, 003: 3)."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
@@ -13,7 +14,11 @@ def wxyz_to_matrix(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3 3"]:
 
     Raises ValueError for a quaternion that is known not to be of unit length.
     """
-    wxyz = as_quaternions(wxyz, unit=True)
+    return _matrix(as_quaternions(wxyz, unit=True))
+
+
+@jax.jit  # one program, not one for each operation
+def _matrix(wxyz: Array) -> Array:
     q = tuple(wxyz[..., i] for i in range(4))
     return jnp.stack([jnp.stack(matrix_row(q, i), axis=-1) for i in range(3)], axis=-2)
 
@@ -29,7 +34,11 @@ def matrix_to_wxyz(matrix: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b 4"]:
     Raises ValueError for a matrix that is no rotation (a reflection, a scaling, entries off by more
     than 1e-3); while it is traced the quaternion of such a one is NaN.
     """
-    matrix, good = as_matrices(matrix)
+    return _quaternion(*as_matrices(matrix))
+
+
+@jax.jit
+def _quaternion(matrix: Array, good: Array) -> Array:
     (a, b, c), (d, e, f), (g, h, i) = (
         (matrix[..., row, 0], matrix[..., row, 1], matrix[..., row, 2]) for row in range(3)
     )

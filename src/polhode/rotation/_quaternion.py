@@ -23,7 +23,11 @@ def multiply(
     left: Float[ArrayLike, "*#b 4"], right: Float[ArrayLike, "*#b 4"]
 ) -> Float[Array, "*b 4"]:
     """Hamilton product ``left right``: first turn by ``right``, then by ``left``."""
-    left, right = as_vectors("left", left, 4), as_vectors("right", right, 4)
+    return _product(as_vectors("left", left, 4), as_vectors("right", right, 4))
+
+
+@jax.jit  # one program, not one for each operation; likewise below
+def _product(left: Array, right: Array) -> Array:
     a, b, c, d = (left[..., i] for i in range(4))
     w, x, y, z = (right[..., i] for i in range(4))
     return jnp.stack(
@@ -50,7 +54,11 @@ def rotate(
 
     Raises ValueError for a quaternion that is known not to be of unit length.
     """
-    wxyz, vector = as_quaternions(wxyz, unit=True), as_vectors("vector", vector, 3)
+    return _rotated(as_quaternions(wxyz, unit=True), as_vectors("vector", vector, 3))
+
+
+@jax.jit
+def _rotated(wxyz: Array, vector: Array) -> Array:
     w, axis = wxyz[..., :1], wxyz[..., 1:]
     twice = 2 * jnp.cross(axis, vector)
     return vector + w * twice + jnp.cross(axis, twice)
@@ -61,7 +69,11 @@ def normalise(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
 
     Scaled by the largest component first, so that neither tiny nor huge input is lost.
     """
-    wxyz = as_quaternions(wxyz)
+    return _normalised(as_quaternions(wxyz))
+
+
+@jax.jit
+def _normalised(wxyz: Array) -> Array:
     # Written out: XLA's sums over a short axis take twice as long as all else here. The result
     # does not depend on the scale, so that its derivative may be left out.
     parts = [wxyz[..., i] for i in range(4)]
@@ -87,5 +99,10 @@ def angle_between(
     start: Float[ArrayLike, "*#b 4"], end: Float[ArrayLike, "*#b 4"]
 ) -> Float[Array, "*b"]:
     """Angle in [0, pi] (rad) of the rotation that leads from one attitude to the other."""
-    turn = between(as_quaternions(start, "start"), as_quaternions(end, "end"))
+    return _angle(as_quaternions(start, "start"), as_quaternions(end, "end"))
+
+
+@jax.jit
+def _angle(start: Array, end: Array) -> Array:
+    turn = between(start, end)
     return 2 * jnp.arctan2(length(turn[..., 1:]), jnp.abs(turn[..., 0]))

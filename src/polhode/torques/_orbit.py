@@ -92,8 +92,20 @@ class AbstractOrbit(AbstractPart):
         return jax.jvp(self, (t,), (jnp.ones_like(t),))[1]
 
 
+@jax.jit  # one program, not one for each operation
+def _place(conic: "AbstractConic", t: Array) -> Array:
+    return conic._position(t)
+
+
 class AbstractConic(AbstractOrbit):
     """Base of the orbits that keep their plane."""
+
+    def __call__(self, t: Array | float) -> Float[Array, "*b 3"]:
+        return _place(self, t)
+
+    @abc.abstractmethod
+    def _position(self, t: Array) -> Float[Array, "*b 3"]:
+        """Position, as of every orbit."""
 
     @property
     @abc.abstractmethod
@@ -178,7 +190,7 @@ class KeplerOrbit(AbstractConic):
         pole = jnp.broadcast_arrays(sn * si * size, -cn * si * size, ci * size)
         return jnp.stack(pole, axis=-1)
 
-    def __call__(self, t: Array | float) -> Float[Array, "*b 3"]:
+    def _position(self, t: Array) -> Float[Array, "*b 3"]:
         mean = self.mean_anomaly + self.mean_motion * (t - self.epoch)
         e = self.eccentricity
         if self.hyperbolic:
@@ -261,7 +273,7 @@ class StateOrbit(AbstractConic):
     def momentum(self) -> Float[Array, "*b 3"]:
         return jnp.cross(*jnp.broadcast_arrays(self.position, self.velocity))
 
-    def __call__(self, t: Array | float) -> Float[Array, "*b 3"]:
+    def _position(self, t: Array) -> Float[Array, "*b 3"]:
         r0 = jnp.linalg.norm(self.position, axis=-1)
         bound = 2 - r0 * jnp.sum(self.velocity * self.velocity, axis=-1) / self.mu
         axis = r0 / jnp.abs(bound)

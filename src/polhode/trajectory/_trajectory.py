@@ -1,7 +1,7 @@
 """The result of a simulation: sampled attitude and rates, everything else on demand."""
 
 import abc
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -31,6 +31,11 @@ if TYPE_CHECKING:
 def _sample(wxyz: Array, omega: Array, place: int) -> tuple[Array, Array]:
     """Attitude and rates (...) of one sample."""
     return wxyz[..., place, :], omega[..., place, :]
+
+
+@eqx.filter_jit  # likewise
+def _derived(of: Callable[["Trajectory"], Any], bare: "Trajectory") -> Any:
+    return of(bare)
 
 
 class AbstractPropagator(eqx.Module):
@@ -191,6 +196,14 @@ class Trajectory(eqx.Module):
             )
         return value
 
+    def _compiled(self, of: Callable[["Trajectory"], Any]) -> Any:
+        """What ``of`` makes of this trajectory, in one program that other records of it share."""
+        bare = Trajectory(
+            self.ts, self.wxyz, self.omega_body, self.status, self.steps, self.scene,
+            spins=self.spins,
+        )  # fmt: skip
+        return _derived(of, bare)
+
     @property
     def _scene(self) -> Scene:
         """The scene with arrays shaped to broadcast against (..., T) samples."""
@@ -206,7 +219,8 @@ class Trajectory(eqx.Module):
     @property
     def momentum_body(self) -> Float[Array, "*b t 3"]:
         """Angular momentum in body axes, that of rotors included [kg m^2/s]."""
-        return self._scene.momentum(self._need("omega_body"), self._t)
+        self._need("omega_body")
+        return self._compiled(_momentum_body)
 
     @property
     def momentum_space(self) -> Float[Array, "*b t 3"]:
@@ -235,12 +249,10 @@ class Trajectory(eqx.Module):
         their speed it is the energy of the body turning with them locked, which is what then stays
         constant. It changes by ``work`` and by nothing else (but a potential that jumps in time).
         """
-        scene = self._scene
-        attitude = None
-        if scene.potential is not None:
-            wxyz = self._need("wxyz")
-            attitude = from_quaternion(tuple(wxyz[..., i] for i in range(4)))
-        return scene.hamiltonian.total(components(self.momentum_body), attitude, self._t)
+        self._need("omega_body")
+        if self.scene.potential is not None:
+            self._need("wxyz")
+        return self._compiled(_energy)
 
     def euler(
         self, sequence: rotation.Sequence | str = rotation.Sequence.ZYZ
@@ -284,3 +296,14 @@ class Trajectory(eqx.Module):
         not know, FileNotFoundError for a folder that is not there.
         """
         write_aem(path, self, epoch, **fields)
+
+
+def _momentum_body(bare: Trajectory) -> Array:
+    return bare._scene.momentum(bare._need("omega_body"), bare._t)
+
+
+def _energy(bare: Trajectory) -> Array:
+    scene, attitude = bare._scene, None
+    if scene.potential is not None:
+        attitude = from_quaternion(tuple(bare._need("wxyz")[..., i] for i in range(4)))
+    return scene.hamiltonian.total(components(_momentum_body(bare)), attitude, bare._t)
