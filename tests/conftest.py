@@ -11,7 +11,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 # What one process of a run has compiled, the others read: workers, subprocesses, notebook kernels.
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".pytest_cache" / "jax"))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 # XLA names its own tuning flags as features that the machine lacks when it reads such a program.
 os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 if "PYTEST_XDIST_WORKER" in os.environ:  # one core a worker: XLA reads this when it wakes up

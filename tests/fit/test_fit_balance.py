@@ -146,9 +146,18 @@ def test_a_wheel_in_fit_inertia_is_the_likelihood_of_the_readings():
     assert np.all(np.asarray(fit.ratios_std)[:, 2] == 0)
     assert np.all(np.asarray(fit.ratios_std)[:, :2] < np.asarray(fit.moments_std)[:, :2] / true[0])
     np.testing.assert_allclose(fit.noise, 1, atol=0.4)
+    assert "kg m^2" in fit.report()
+
+
+@pytest.mark.slow
+def test_a_recording_of_a_batch_is_fitted_as_alone():
+    given = stack(study.throws(3, 10 * study.DEVICE, 2))
+    wheel = np.where(np.asarray(given.wheel_known) > 0, given.wheel, np.nan)
+    fit = fit_inertia(
+        given.times, given.omega, wheel_speed=wheel, instrument=Instrument(SPIN), block=4
+    )
     one = fit_balance([jax.tree.map(lambda x: x[1], given)], Instrument(SPIN), block=4)
     np.testing.assert_allclose(fit.moments[1], one.moments[0], rtol=1e-9)
-    assert "kg m^2" in fit.report()
 
 
 def test_throws_without_a_wheel_show_ratios():

@@ -2,6 +2,7 @@
 
 import importlib.util
 import warnings
+from itertools import pairwise
 from pathlib import Path
 
 import jax
@@ -200,6 +201,17 @@ def test_an_inverted_axis_contradicts_the_attitudes(mounting, flip, wrong):
     assert (np.linalg.det(np.asarray(sensor_axes(recording))[0]) < 0) == wrong
 
 
+def test_windows_are_of_one_length_and_share_their_ends():
+    times = np.linspace(0, 12, 241, dtype=np.float32)
+    whole = Recording.of(times, np.ones((241, 3), np.float32), omega_noise=np.float32(0.02))
+    parts = windows(whole, 61)
+    assert [part.times.shape for part in parts] == [(61,)] * 4
+    assert parts[0].times.dtype == jnp.float32
+    for before, after in pairwise(parts):
+        assert float(after.times[0]) == float(before.times[-1])
+
+
+@pytest.mark.slow
 def test_windows_of_a_long_recording_in_single_precision():
     rng = np.random.default_rng(4)
     times = np.linspace(0, 12, 241, dtype=np.float32)

@@ -74,6 +74,7 @@ def test_second_derivatives(dtype):
     assert rows[True] > 15
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_many_bodies_at_once():
     """Forward over a mapped reverse mode differentiates the compiled coefficients themselves."""
     rng = np.random.default_rng(4)

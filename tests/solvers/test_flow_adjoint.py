@@ -135,12 +135,18 @@ def value(inverse):
     return sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(end.ys))
 
 
-def test_batches_of_slopes_and_second_derivatives():
-    """vmap over gradients, Jacobians both ways, the Hessian, which is symmetric."""
+def test_batches_of_slopes():
+    """vmap over gradients, Jacobians both ways."""
     point = 1 / MOMENTS.T
     slopes = jax.jit(jax.vmap(jax.grad(value)))(jnp.stack([point, 1.1 * point]))
+    forward = jax.jit(jax.vmap(jax.jacfwd(value)))(jnp.stack([point, 1.1 * point]))
+    np.testing.assert_allclose(slopes, forward, rtol=0, atol=1e-11)
+
+
+@pytest.mark.slow  # of a free body: tests/free
+def test_the_hessian_is_symmetric_and_the_change_of_the_slopes():
+    point = 1 / MOMENTS.T
     forward = jax.jit(jax.jacfwd(value))
-    np.testing.assert_allclose(slopes[0], forward(point), rtol=0, atol=1e-11)
     hessian = jax.jit(jax.jacfwd(jax.grad(value)))(point).reshape(9, 9)
     np.testing.assert_allclose(hessian, hessian.T, rtol=0, atol=1e-10)
     step = jax.random.normal(KEYS[2], (3, 3)) / 3
@@ -216,7 +222,7 @@ SLOW = pytest.mark.slow
 
 
 @pytest.mark.parametrize(
-    "name", [n if n in ("controlled", "implicit") else pytest.param(n, marks=SLOW) for n in SOLVES]
+    "name", [n if n == "implicit" else pytest.param(n, marks=SLOW) for n in SOLVES]
 )
 def test_outside_of_simulate_any_solver_has_the_slopes_of_the_flow(name):
     """Of the last state by a moment and the strength of the field, 40 digits; the steps of the
