@@ -35,17 +35,20 @@ def as_axes(name: str, value: Any) -> Array:
 
 
 def _check_length(name: str, seen: np.ndarray, unit: bool, hint: str) -> None:
-    largest = np.max(np.abs(seen), axis=-1, initial=0)
-    require(~(largest == 0), f"{name} must not be zero, got {describe(seen)}: {hint}.")
+    square = np.einsum("...i,...i->...", seen, seen)  # ten times as fast as largest components
+    if np.any(square == 0):  # or so small that squares vanish
+        zero = np.all(seen == 0, axis=-1)
+        require(~zero, f"{name} must not be zero, got {describe(seen)}: {hint}.")
     if not unit:
         return
-    length = np.sqrt(np.sum(np.square(seen, dtype=np.float64), axis=-1))
-    off = np.abs(length - 1)  # NaN passes
-    require(
-        ~(off > _UNIT),
-        f"{name} must be of unit length, got length {np.nanmax(length):.6g} in {describe(seen)}:"
-        f" {'use ph.rotation.normalise' if seen.shape[-1] == 4 else hint}.",
-    )
+    off = (square < (1 - _UNIT) ** 2) | (square > (1 + _UNIT) ** 2)  # NaN passes
+    if np.any(off):
+        length = np.nanmax(np.linalg.norm(seen.astype(np.float64), axis=-1))
+        require(
+            ~off,
+            f"{name} must be of unit length, got length {length:.6g} in {describe(seen)}:"
+            f" {'use ph.rotation.normalise' if seen.shape[-1] == 4 else hint}.",
+        )
 
 
 def as_matrices(value: Any) -> tuple[Array, Array]:
