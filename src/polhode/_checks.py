@@ -100,6 +100,24 @@ def as_number(name: str, value: Any) -> Array:
     return as_float_array(name, value, ())
 
 
+def require_positive(
+    name: str, array: Array, *, zero: bool = False, hint: str = "check its sign and its units"
+) -> None:
+    """ValueError if a concrete array holds negative values (or zeros, unless ``zero``)."""
+    if not is_concrete(array) or array.size == 0:
+        return
+    least = float(np.min(np.asarray(array)))
+    wanted = "not be negative" if zero else "be positive"
+    require(least > 0 or (zero and least == 0), f"{name} must {wanted}, got {least:g}: {hint}.")
+
+
+def as_positive(name: str, value: Any, **options: Any) -> Array:
+    """A floating-point scalar or batch of scalars; see ``require_positive``."""
+    number = as_number(name, value)
+    require_positive(name, number, **options)
+    return number
+
+
 def as_floats(
     *, finite: bool = True, **given: tuple[Any, tuple[int | None, ...]]
 ) -> tuple[Array, ...]:

@@ -102,12 +102,7 @@ class RotatingFrame(eqx.Module):
         if wxyz is None:
             start = identity((), dtype)
         else:
-            start = as_float_array("wxyz", wxyz, (4,))
-            if is_concrete(start):
-                require(
-                    np.any(np.asarray(start) != 0), "wxyz must not be zero: it has no attitude."
-                )
-            start = normalise(start)
+            start = normalise(as_float_array("wxyz", wxyz, (4,)))
         t0 = jnp.asarray(t0, start.dtype)
         if varies:
             omega_body = Signature("RotatingFrame.from_rate", {"t": ()}, (3,)).checked(omega_body)

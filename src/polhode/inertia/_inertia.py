@@ -8,14 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from polhode._checks import as_float_array, as_vectors, is_concrete, require
+from polhode._checks import (
+    as_float_array,
+    as_floats,
+    as_vectors,
+    is_concrete,
+    require,
+    require_positive,
+)
 from polhode.inertia._cholesky import inertia_from_log_cholesky, inertia_to_log_cholesky
 from polhode.inertia._eigen import principal
 from polhode.inertia._input import (
-    as_floats,
     check_moments,
     check_tensor,
-    require_positive,
     tolerance,
 )
 from polhode.inertia._physical import is_symmetric, possible_moments, possible_tensor

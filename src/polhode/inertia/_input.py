@@ -4,24 +4,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polhode._checks import as_floats as as_floats, is_concrete, require
+from polhode._checks import is_concrete, require
 
 
 def tolerance(array: Array) -> float:
     """Relative tolerance of consistency checks: the square root of the dtype's rounding."""
     return float(np.sqrt(jnp.finfo(array.dtype).eps))
-
-
-def require_positive(name: str, array: Array, *, zero: bool = False) -> None:
-    """ValueError if a concrete array holds negative values (or zeros, unless ``zero``)."""
-    if not is_concrete(array) or array.size == 0:
-        return
-    least = float(np.min(np.asarray(array)))
-    wanted = "zero or positive" if zero else "positive"
-    require(
-        least > 0 or (zero and least == 0),
-        f"{name} must be {wanted}, got {least:g}; check its sign and its units.",
-    )
 
 
 def require_below(small_name: str, small: Array, large_name: str, large: Array) -> None:

@@ -3,9 +3,8 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._checks import require
+from polhode._checks import require, require_positive
 from polhode.inertia._cholesky import symmetric
-from polhode.inertia._input import require_positive
 
 
 def check_points(masses: Array, positions: Array) -> None:
