@@ -274,24 +274,22 @@ class Inertia(AbstractShaped, AbstractPart):
         """Body momentum ``I omega``, kg m^2/s, of body rates (..., 3), rad/s."""
         omega = as_vectors("omega", omega)
         if self.full is None:
-            return jnp.multiply(*_aligned(self.moments, omega))
-        rows = [jnp.sum(jnp.multiply(*_aligned(self.full[..., i, :], omega)), -1) for i in range(3)]
+            return jnp.multiply(*jnp.broadcast_arrays(self.moments, omega))
+        rows = [
+            jnp.sum(jnp.multiply(*jnp.broadcast_arrays(self.full[..., i, :], omega)), -1)
+            for i in range(3)
+        ]
         return jnp.stack(rows, axis=-1)
 
     def rates(self, momentum: Float[Array | np.ndarray, "*#b 3"]) -> Float[Array, "*b 3"]:
         """Body rates ``I^-1 L``, rad/s, of body momenta (..., 3), kg m^2/s."""
         momentum = as_vectors("momentum", momentum)
         if self.full is None:
-            moments, momentum = _aligned(self.moments, momentum)
+            moments, momentum = jnp.broadcast_arrays(self.moments, momentum)
             return momentum / moments
         batch = jnp.broadcast_shapes(self.batch_shape, momentum.shape[:-1])
         tensor = jnp.broadcast_to(self.full, (*batch, 3, 3))
         return _solve(tensor, jnp.broadcast_to(momentum, (*batch, 3)))
-
-
-def _aligned(left, right):
-    shape = jnp.broadcast_shapes(left.shape, right.shape)
-    return jnp.broadcast_to(left, shape), jnp.broadcast_to(right, shape)
 
 
 def _solve(tensor, vector):
