@@ -1,5 +1,6 @@
 """Input checks shared by every constructor: what was given, what is expected, how to mend it."""
 
+import importlib
 from collections.abc import Sequence
 from functools import reduce
 from typing import Any
@@ -38,6 +39,16 @@ def require(condition: Any, message: str) -> None:
     """Raise ``ValueError(message)`` unless ``condition`` holds everywhere."""
     if not bool(np.all(np.asarray(condition))):
         raise ValueError(message)
+
+
+def imported(what: str, *modules: str, extra: str = "cli") -> Any:
+    """The first of the modules, all of which must be there; ImportError says who needs them."""
+    try:
+        first, *_ = map(importlib.import_module, modules)
+        return first
+    except ImportError as error:
+        needed = " and ".join(modules)
+        raise ImportError(f"{what} needs {needed}: pip install 'polhode[{extra}]'") from error
 
 
 def describe(value: Any, limit: int = 8) -> str:
@@ -101,10 +112,10 @@ def as_number(name: str, value: Any) -> Array:
 
 
 def require_positive(
-    name: str, array: Array, *, zero: bool = False, hint: str = "check its sign and its units"
+    name: str, array: Any, *, zero: bool = False, hint: str = "check its sign and its units"
 ) -> None:
     """ValueError if a concrete array holds negative values (or zeros, unless ``zero``)."""
-    if not is_concrete(array) or array.size == 0:
+    if not is_concrete(array) or np.size(array) == 0:
         return
     least = float(np.min(np.asarray(array)))
     wanted = "not be negative" if zero else "be positive"
