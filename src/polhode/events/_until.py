@@ -198,7 +198,7 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
             lambda x, y: jnp.where(new.reshape(-1, *(1,) * (x.ndim - 1)), x, y), fresh, walk.found
         )
         alive = walk.alive & (seen.status == Status.SUCCESSFUL)
-        samples, met = [x[:, reach] for x in _samples(seen)], walk.met | new
+        samples, met = [x[:, reach] for x in seen._samples], walk.met | new
         wider = jnp.where(reach < _LOOKS, width, _GROWTH * width)
         wider = jnp.minimum(wider, width_by_rate(share[reach], samples, alive & ~met))
         return _Window(walk.tried + 1, share[reach], wider, samples, met, alive, found)
@@ -207,7 +207,7 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
         left = (walk.share < 1) & (walk.tried < _MOST)
         return left & jnp.any(~walk.met & walk.alive)
 
-    samples, zero = [x[:, 0] for x in _samples(lanes)], jnp.zeros(n, dtype)
+    samples, zero = [x[:, 0] for x in lanes._samples], jnp.zeros(n, dtype)
     alive = lanes.status == Status.SUCCESSFUL
     begin = jnp.broadcast_to(first, (n,))
     nowhere = _Bracket(begin, begin, zero, zero, begin, samples)
@@ -262,7 +262,7 @@ def _bracket(seen: Trajectory, grid, values, change, dip: _Dip, wanted, new) -> 
     return _Bracket(
         jnp.where(late, dip.time, a), jnp.where(early, dip.time, b),
         jnp.where(late, dip.value, fa), jnp.where(early, dip.value, fb),
-        a, [jnp.take_along_axis(x, here[..., None], axis=1)[:, 0] for x in _samples(seen)],
+        a, [jnp.take_along_axis(x, here[..., None], axis=1)[:, 0] for x in seen._samples],
     )  # fmt: skip
 
 
@@ -290,15 +290,10 @@ def _held(lanes: Trajectory, ts: Array, until: Event, met: Array, near: Array, s
     past = met[:, None] & (sign.reshape(-1, 1) * (rows - event) >= 0)
     held = [
         jnp.where(past[..., None], x, y)
-        for x, y in zip(_samples(at_event), _samples(moved), strict=True)
+        for x, y in zip(at_event._samples, moved._samples, strict=True)
     ]
     wxyz, omega, *spins = held
     status = jnp.where(met, there.status, moved.status)
     times = jnp.where(past, event, rows)
     event = jnp.where(met, event[:, 0], jnp.inf)
     return wxyz, omega, spins[0] if spins else None, status, moved.steps, times, event
-
-
-def _samples(trajectory: Trajectory) -> list[Array]:
-    found = trajectory.wxyz, trajectory.omega_body, trajectory.spins
-    return [x for x in found if x is not None]
