@@ -93,32 +93,25 @@ def flatten(part: Any, batch: tuple[int, ...], *, shared: bool = True) -> Any:
     return map_arrays(map_arrays(part, full_rank), to_lanes)
 
 
+def lane_times(ts: Array, batch: tuple[int, ...]) -> Array:
+    """Times (T,) as they are, those of each body (..., T) as (N, T)."""
+    if ts.ndim == 1:
+        return ts
+    return jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
+
+
 def is_lane_tree(parts: Any) -> Any:
     """Mask of the leaves that carry the lane axis, for ``eqx.partition`` of (scene, state)."""
-    mask = jax.tree.map(lambda _: False, parts)
+    lane = object()
 
-    def mark(target, source):
-        if source is None or not hasattr(source, "core_ranks"):
-            return target
-        terms = getattr(source, "terms", None)
-        if terms is not None:
-            new = tuple(mark(t, s) for t, s in zip(target.terms, terms))
-            return eqx.tree_at(lambda p: p.terms, target, new)
-        for name in _inner(source):
-            inner = mark(getattr(target, name), getattr(source, name))
-            target = eqx.tree_at(lambda p, name=name: getattr(p, name), target, inner)
-        names = [name for name, rank in _fields(source) if getattr(source, name).ndim > rank]
-        if not names:
-            return target
-        return eqx.tree_at(lambda p: [getattr(p, n) for n in names], target, [True] * len(names))
+    def marked(part):
+        return map_arrays(part, lambda x, rank: lane if x.ndim > rank else x)
 
-    scene, state = mask
-    whole, bodies = parts
+    scene, state = parts
     for name in PARTS:
-        if getattr(whole, name, None) is not None:
-            new = mark(getattr(scene, name), getattr(whole, name))
-            scene = eqx.tree_at(lambda s, name=name: getattr(s, name), scene, new)
-    return scene, mark(state, bodies)
+        if (part := getattr(scene, name, None)) is not None:
+            scene = eqx.tree_at(lambda s, name=name: getattr(s, name), scene, marked(part))
+    return jax.tree.map(lambda x: x is lane, (scene, marked(state)))
 
 
 def along_time(part: Any, batch_rank: int) -> Any:

@@ -1,6 +1,7 @@
 """Input checks shared by every constructor: what was given, what is expected, how to mend it."""
 
-from collections.abc import Sequence
+import importlib
+from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any
 
@@ -34,10 +35,23 @@ def _is_here(x: Any) -> bool:
     return getattr(x, "is_fully_addressable", True)
 
 
-def require(condition: Any, message: str) -> None:
-    """Raise ``ValueError(message)`` unless ``condition`` holds everywhere."""
+def require(condition: Any, message: str | Callable[[], str]) -> None:
+    """Raise ``ValueError(message)`` unless ``condition`` holds everywhere.
+
+    A function makes its message only then: to print numbers takes longer than most checks.
+    """
     if not bool(np.all(np.asarray(condition))):
-        raise ValueError(message)
+        raise ValueError(message if isinstance(message, str) else message())
+
+
+def imported(what: str, *modules: str, extra: str = "cli") -> Any:
+    """The first of the modules, all of which must be there; ImportError says who needs them."""
+    try:
+        first, *_ = map(importlib.import_module, modules)
+        return first
+    except ImportError as error:
+        needed = " and ".join(modules)
+        raise ImportError(f"{what} needs {needed}: pip install 'polhode[{extra}]'") from error
 
 
 def describe(value: Any, limit: int = 8) -> str:
@@ -98,6 +112,24 @@ def as_vectors(name: str, value: Any, size: int = 3) -> Array:
 def as_number(name: str, value: Any) -> Array:
     """A floating-point scalar or batch of scalars."""
     return as_float_array(name, value, ())
+
+
+def require_positive(
+    name: str, array: Any, *, zero: bool = False, hint: str = "check its sign and its units"
+) -> None:
+    """ValueError if a concrete array holds negative values (or zeros, unless ``zero``)."""
+    if not is_concrete(array) or np.size(array) == 0:
+        return
+    least = float(np.min(np.asarray(array)))
+    wanted = "not be negative" if zero else "be positive"
+    require(least > 0 or (zero and least == 0), f"{name} must {wanted}, got {least:g}: {hint}.")
+
+
+def as_positive(name: str, value: Any, **options: Any) -> Array:
+    """A floating-point scalar or batch of scalars; see ``require_positive``."""
+    number = as_number(name, value)
+    require_positive(name, number, **options)
+    return number
 
 
 def as_floats(

@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode import rotation
-from polhode._scene import Scene
+from polhode._scene import Scene, places_of
 from polhode._simulate import simulate
 from polhode._state import State
 from polhode.methods import (
@@ -62,8 +62,8 @@ def propagate(
     their entries are the parameters, which stay as they are. ``method``, ``rtol``: as for
     ``ph.simulate``, which raises; under ``jit`` all is NaN where the body did not arrive.
 
-    Raises ValueError for a batch, or a ``free`` that picks what is no array of the scene; TypeError
-    for what is no scene or no state.
+    Raises ValueError for a batch; TypeError for what is no scene or no state, or a ``free`` that
+    picks what is no array of the scene.
 
         state, jacobian, noise = ph.propagate(scene, state, 0.1)
         covariance = jacobian @ covariance @ jacobian.T + noise @ noise.T * density / 0.1
@@ -77,28 +77,13 @@ def propagate(
     dtype = state.omega_body.dtype
     dt, t = jnp.asarray(dt, dtype), jnp.asarray(t, dtype)
     scene, state, _, _ = check_inputs(scene, state, jnp.stack([t, t + dt]), None)
+    places = () if free is None else places_of(scene, free)
     wxyz, omega, jacobian, noise, status = _propagated(
-        scene, state, dt, t, _places(scene, free), method, check_rtol(rtol, dtype)
+        scene, state, dt, t, places, method, check_rtol(rtol, dtype)
     )
     if not isinstance(status, Tracer):
         raise_on_failure(status)
     return Propagation(State(wxyz, omega), jacobian, noise)
-
-
-def _places(scene: Scene, free: Callable[[Scene], Any] | None) -> tuple[int, ...]:
-    """Where in the scene's leaves those are that ``free`` picks, in its order: unlike a function,
-    places tell a compiled program whether it is the one asked for."""
-    if free is None:
-        return ()
-    leaves, tree = jax.tree.flatten(scene)
-    marks = [object() for _ in leaves]
-    try:
-        return tuple(marks.index(x) for x in jax.tree.leaves(free(tree.unflatten(marks))))
-    except (AttributeError, TypeError, ValueError) as error:
-        raise ValueError(
-            "free must pick arrays that the scene holds, such as lambda s: s.inertia.diagonal, and"
-            f" work nothing out of them: {error}."
-        ) from error
 
 
 @eqx.filter_jit

@@ -128,13 +128,13 @@ class Scene(eqx.Module):
         """Body momentum (..., 3) [kg m^2/s] of body rates (..., 3) [rad/s], wheels included."""
         momentum = self.carrier.momentum(omega)
         wheels = self.wheel_momentum(t)
-        return momentum if wheels is None else jnp.add(*_aligned(momentum, wheels))
+        return momentum if wheels is None else jnp.add(*jnp.broadcast_arrays(momentum, wheels))
 
     def rates(self, momentum: Array, t: Array | float) -> Array:
         """Body rates (..., 3) [rad/s] of body momenta (..., 3) [kg m^2/s], the inverse."""
         wheels = self.wheel_momentum(t)
         if wheels is not None:
-            momentum = jnp.subtract(*_aligned(momentum, wheels))
+            momentum = jnp.subtract(*jnp.broadcast_arrays(momentum, wheels))
         return self.carrier.rates(momentum)
 
     def acceleration(self, wxyz: Array | None, omega: Array, t: Array | float) -> Array:
@@ -193,6 +193,26 @@ class Scene(eqx.Module):
         return Hamiltonian(inverse, self.inertia, self.potential, carried, spinning)
 
 
-def _aligned(a: Array, b: Array) -> tuple[Array, Array]:
-    shape = jnp.broadcast_shapes(a.shape, b.shape)
-    return jnp.broadcast_to(a, shape), jnp.broadcast_to(b, shape)
+def places_of(scene: Scene, free: Any) -> tuple[int, ...]:
+    """Which leaves of the scene ``free`` points at, in its order: unlike a function, places tell a
+    compiled program whether it is the one asked for. TypeError or ValueError with the cure.
+    """
+    if not callable(free):
+        raise TypeError(
+            "free must be a function of the scene that returns arrays of it, such as"
+            f" lambda s: [s.torque.c], got {type(free).__name__}."
+        )
+    leaves, tree = jax.tree.flatten(scene)
+    marks = [object() for _ in leaves]
+    wanted = "free must point at arrays that the scene holds, such as s.torque.c"
+    try:
+        places = tuple(marks.index(x) for x in jax.tree.leaves(free(tree.unflatten(marks))))
+    except (AttributeError, TypeError, ValueError, IndexError) as error:
+        raise TypeError(f"{wanted}, neither a part of one nor made from it: {error}.") from error
+    if not places or not all(
+        jnp.issubdtype(jnp.result_type(leaves[i]), jnp.floating) for i in places
+    ):
+        raise TypeError(f"{wanted}: one or more of real numbers.")
+    if len(set(places)) < len(places):
+        raise ValueError("free points at the same array twice.")
+    return places

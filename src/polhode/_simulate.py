@@ -9,7 +9,16 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode import rotation
-from polhode._batch import PARTS, Split, common_batch, flatten, on_devices, place, split_of
+from polhode._batch import (
+    PARTS,
+    Split,
+    common_batch,
+    flatten,
+    lane_times,
+    on_devices,
+    place,
+    split_of,
+)
 from polhode._checks import is_concrete
 from polhode._dispatch import again, learn
 from polhode._scene import Scene
@@ -139,9 +148,7 @@ def _begin(method, scene, state, ts, rtol) -> Trajectory:
     )
     spins = scene.dynamics.wheels.initial_spins(omega[..., 0]) if scene.dynamics.coupled else ()
     lanes = {name: flatten(part, batch) for name, part in parts.items()}
-    times = ts
-    if ts.ndim > 1:
-        times = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
+    times = lane_times(ts, batch)
     good = jnp.full(omega[..., 0].size, Status.SUCCESSFUL)
     status = judged(good, Scene(**lanes), times, rtol, False).reshape(batch)
     return Trajectory(
@@ -178,9 +185,7 @@ def _moved(record, method, scene, state, ts, rtol, in_order=False) -> Samples:
     few = state.wxyz.size <= 4 * FEW  # one task more costs as much as normalising them
     unit = (kernel(State.as_unit) if few else State.as_unit)(state)
     lanes = flatten(unit, batch, shared=False)
-    times = ts
-    if ts.ndim > 1:
-        times = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
+    times = lane_times(ts, batch)
     if record.error:
         samples = _with_error(method, Scene(**parts), lanes, times, rtol, record)
     else:

@@ -41,8 +41,10 @@ class State(AbstractPart):
         if is_concrete(quaternion):
             require(
                 np.any(np.asarray(quaternion) != 0, axis=-1),
-                f"wxyz must not be zero, got {describe(wxyz)}: a rotation is a unit quaternion,"
-                " scalar first; (1, 0, 0, 0) is no rotation.",
+                lambda: (
+                    f"wxyz must not be zero, got {describe(wxyz)}: a rotation is a unit quaternion,"
+                    " scalar first; (1, 0, 0, 0) is no rotation."
+                ),
             )
         try:
             np.broadcast_shapes(quaternion.shape[:-1], rates.shape[:-1])

@@ -1,6 +1,6 @@
 """Triangle meshes: exact integrals, derivatives by vertices, holes and inverted faces, files."""
 
-import builtins
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -151,13 +151,6 @@ def test_files(tmp_path):
 
 
 def test_without_trimesh_the_message_says_what_to_install(monkeypatch, tmp_path):
-    real = builtins.__import__
-
-    def refuse(name, *args, **kwargs):
-        if name == "trimesh":
-            raise ImportError(name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", refuse)
+    monkeypatch.setitem(sys.modules, "trimesh", None)
     with pytest.raises(ImportError, match=r"pip install 'polhode\[mesh\]'"):
         MassProperties.from_mesh_file(tmp_path / "box.obj", mass=1.0)

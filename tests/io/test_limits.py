@@ -58,9 +58,9 @@ def test_the_schema_and_the_page_name_the_same_keys():
     import re
     from pathlib import Path
 
-    from polhode.io._models import SceneText
+    from polhode.io import SceneFile
 
-    schema = SceneText.model_json_schema()
+    schema = SceneFile.model_json_schema()
     tables = [schema, *schema["$defs"].values()]
     keys = {key for table in tables for key in table.get("properties", {})}
     page = (Path(__file__).parents[2] / "docs" / "scene_files.md").read_text()

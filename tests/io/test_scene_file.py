@@ -46,8 +46,8 @@ def test_values_are_read_in_si_units():
     np.testing.assert_allclose(wxyz, [half, 0, 0, half], atol=1e-16)
     np.testing.assert_allclose(scene.state.value, [0, math.pi, 0], rtol=1e-15)
     np.testing.assert_allclose(scene.times.seconds, [0, 30, 60, 90, 120])
-    np.testing.assert_array_equal(scene.inertia.values["moments"], [1, 2, 2.5])
-    moments, omega = scene.monte_carlo.spreads
+    np.testing.assert_array_equal(scene.inertia.moments, [1, 2, 2.5])
+    moments, omega = scene.monte_carlo.spreads.values()
     np.testing.assert_array_equal(moments.sigma, [0.01] * 3)
     np.testing.assert_allclose(omega.sigma, np.deg2rad([1, 0, 2]))
     assert scene.published[0].value == 7200

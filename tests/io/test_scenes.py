@@ -25,7 +25,7 @@ def test_scene_builds(path, dtype):
     np.testing.assert_allclose(np.linalg.norm(state.wxyz), 1, rtol=1e-6)
     assert file.source
     if file.monte_carlo is not None:
-        assert all(spread.source for spread in file.monte_carlo.spreads)
+        assert all(spread.source for spread in file.monte_carlo.spreads.values())
 
 
 def test_wing_nut_spins_about_its_intermediate_axis():

@@ -34,8 +34,8 @@ def explain(
     print(f"  {len(times.seconds)} samples from {first:g} to {last:g} {times.unit}, {precision}")
     if carlo is not None:
         print(f"  {carlo.clones} clones, seed {carlo.seed}, drawn from the spread of:")
-        for spread in carlo.spreads:
-            print(f"    {spread.quantity}: {visible(spread.source)}")
+        for quantity, spread in carlo.spreads.items():
+            print(f"    {quantity}: {visible(spread.source)}")
     print(f"\n{plan}")
     return 0
 
@@ -44,7 +44,7 @@ def schema(debug: DebugOption = False) -> int:
     """Print the JSON Schema of scene files, for editors."""
     import json
 
-    from polhode.io._models import SceneText
+    from polhode.io import SceneFile
 
-    print(json.dumps(SceneText.model_json_schema(), indent=1))
+    print(json.dumps(SceneFile.model_json_schema(), indent=1))
     return 0

@@ -343,7 +343,7 @@ def _table(asked: _Asked, recording: Any, result: Any) -> Any:
     known = result.scale_known
     for name in ("", "moment [kg m^2]" if known else "ratio", "95 %", "axis in sensor axes", "+-"):
         grid.add_column(Text(name), justify="left" if name == "" else "right")
-    values = np.asarray(result.moments if known else result.ratios)
+    values = np.asarray(result.determined[0])
     low, high = (np.asarray(end) for end in result.interval(0.95))
     axes = np.asarray(to_matrix(result.axes))
     turn = np.degrees(np.asarray(result.axes_std))

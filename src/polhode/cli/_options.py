@@ -92,8 +92,6 @@ DebugOption = Annotated[bool, typer.Option("--debug", help="show the full traceb
 
 def read(scene: str, clones: int | None, seed: int | None):
     """The scene file with the options put in place of its own entries."""
-    import dataclasses
-
     from polhode.io import SceneFileError, read_scene
 
     file = read_scene(scene)
@@ -110,13 +108,14 @@ def read(scene: str, clones: int | None, seed: int | None):
             f"write `{key} = {given[name]}` into [ensemble], and name another store",
         )  # fmt: skip
     if given.get("clones") == 0:
-        return dataclasses.replace(file, monte_carlo=None)
+        return file.model_copy(update={"monte_carlo": None})
     if file.monte_carlo is None:
         raise SceneFileError(
             file.path, "[monte_carlo]", "missing table", f"--{name} on the command line",
             "a scene that states its uncertainties", "add [monte_carlo], or drop the option",
         )  # fmt: skip
-    return dataclasses.replace(file, monte_carlo=dataclasses.replace(file.monte_carlo, **given))
+    drawn = file.monte_carlo.model_copy(update=given)
+    return file.model_copy(update={"monte_carlo": drawn})
 
 
 def require(command: str, *packages: str, extra: str = "cli") -> None:

@@ -148,11 +148,11 @@ def _dataset(job, outcome, figures, precision: str):
         (*(lead if job.scene.inertia.batch_shape else ()), "axis"),
         job.scene.inertia.moments,
         {
-            "units": "1" if file.relative_moments else "kg m2",
+            "units": "1" if file.inertia.unit == "relative" else "kg m2",
             "long_name": "principal moments of inertia",
         },
     )
-    if file.relative_moments:
+    if file.inertia.unit == "relative":
         for name in _RELATIVE.keys() & dataset.data_vars.keys():
             words = dataset[name].attrs["long_name"]
             dataset[name].attrs = {

@@ -155,7 +155,8 @@ def _caption(job: Job):
         lines.append(f"published: {'; '.join(sources)}")
     if file.monte_carlo is not None:
         lines.append("clones: mean ± standard deviation, drawn from the spread of")
-        lines += [f"  {spread.quantity}: {spread.source}" for spread in file.monte_carlo.spreads]
+        spreads = file.monte_carlo.spreads.items()
+        lines += [f"  {quantity}: {spread.source}" for quantity, spread in spreads]
     if job.redrawn:
         lines.append(f"  {job.redrawn:,} draws had moments that no body has, and were drawn again")
     return Text("\n".join(map(visible, lines)))

@@ -27,10 +27,8 @@ def build_ensemble(file: SceneFile, dtype: DTypeLike) -> tuple[Ensemble, tuple[S
     if plan is None:
         raise ValueError(f"{file.path} has no [ensemble]: add one, with `bodies` and `seed`.")
     inertia = build_inertia(file, dtype)
-    spreads = [_spread(draw, file, dtype) for draw in plan.draws]
-    drawn = {draw.quantity for draw in plan.draws}
-    drawn |= set(plan.rows)
-    if file.state.rate == "momentum_body" and "momentum_body" not in drawn:
+    spreads = [_spread(name, draw, file, dtype) for name, draw in plan.spreads.items()]
+    if file.state.rate == "momentum_body" and "momentum_body" not in {*plan.spreads, *file.rows}:
         spreads.append(SpreadMomentum(jnp.asarray(file.state.value, dtype)))
     ensemble = Ensemble(
         build_scene(file, dtype, inertia),
@@ -38,7 +36,7 @@ def build_ensemble(file: SceneFile, dtype: DTypeLike) -> tuple[Ensemble, tuple[S
         plan.bodies,
         tuple(spreads),
         plan.seed,
-        dict(plan.rows),
+        dict(file.rows),
     )
     kept = tuple(
         Statistic(k.quantity, *QUANTITIES[k.quantity], k.low, k.high, k.bins)
@@ -47,18 +45,19 @@ def build_ensemble(file: SceneFile, dtype: DTypeLike) -> tuple[Ensemble, tuple[S
     return ensemble, kept
 
 
-def _spread(draw, file: SceneFile, dtype: DTypeLike):
-    if draw.scale is None:
+def _spread(quantity: str, draw, file: SceneFile, dtype: DTypeLike):
+    if getattr(draw, "any", False):
         return AnyAttitude()
-    deviate = Deviate(jnp.asarray(draw.scale, dtype), draw.uniform)
+    uniform = draw.sigma is None
+    deviate = Deviate(jnp.asarray(draw.half_width if uniform else draw.sigma, dtype), uniform)
     state = file.state
-    if draw.quantity == "euler":
+    if quantity == "euler":
         angles, sequence = jnp.asarray(state.attitude.values, dtype), state.attitude.sequence
         if sequence is None:
             raise ValueError("Euler angles spread only about Euler angles: give [state] euler.")
         return SpreadEuler(angles, deviate, rotation.Sequence[sequence.upper()])
-    if draw.quantity == "momentum_body":
+    if quantity == "momentum_body":
         return SpreadMomentum(jnp.asarray(state.value, dtype), deviate)
     kinds = {"moments": SpreadMoments, "attitude": SpreadAttitude, "omega_body": SpreadRates,
              "torque": SpreadTorque}  # fmt: skip
-    return kinds[draw.quantity](deviate)
+    return kinds[quantity](deviate)

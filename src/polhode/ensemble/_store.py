@@ -19,7 +19,10 @@ from typing import Any
 
 import numpy as np
 
+from polhode._checks import imported
 from polhode.ensemble._layout import Field, Rows
+from polhode.io._atomic import sync
+from polhode.io._error import shorten
 
 _MARK = 1 << 32  # above every 32-bit checksum: an empty cell is 0
 
@@ -29,11 +32,7 @@ class StoreError(RuntimeError):
 
 
 def _zarr() -> Any:
-    try:
-        import zarr
-    except ImportError as error:
-        raise ImportError("ensembles on disk need zarr: pip install 'polhode[scale]'") from error
-    return zarr
+    return imported("an ensemble on disk", "zarr", extra="scale")
 
 
 @contextlib.contextmanager
@@ -122,7 +121,7 @@ class Store:
                 f" {str(error)[:200]}): it was left as it is; name another path."
             ) from error
         different = [
-            f"  {key}: the store has {_short(found.get(key))}, this run {_short(value)}"
+            f"  {key}: the store has {shorten(found.get(key))}, this run {shorten(value)}"
             for key, value in identity.items()
             if found.get(key) != value
         ]
@@ -138,7 +137,7 @@ class Store:
             value = found.get(name)
             if type(value) is not int or value < 1 or value % unit or self.chunk % value:
                 raise StoreError(
-                    f"{path}: its setting {name} is {_short(value)}, expected a multiple of {unit}"
+                    f"{path}: its setting {name} is {shorten(value)}, expected a multiple of {unit}"
                     " bodies that fits: the store is damaged and was left as it is; name another"
                     " path."
                 )
@@ -273,15 +272,11 @@ class Store:
             raise
 
     def _sync(self, name: str, array: Any, piece: int) -> None:
-        """Have a file and its name in the folder on the disk, also when the power goes."""
+        """Have a file and its name in the folder on the disk."""
         key = array.metadata.encode_chunk_key((piece,) + (0,) * (array.ndim - 1))
         file = self.path / name / key
-        for path in (file, file.parent):
-            handle = os.open(path, os.O_RDONLY)
-            try:
-                os.fsync(handle)
-            finally:
-                os.close(handle)
+        sync(file)
+        sync(file.parent)
 
 
 def _remove(path: Path) -> None:
@@ -290,11 +285,6 @@ def _remove(path: Path) -> None:
         shutil.rmtree(path)
     else:
         path.unlink(missing_ok=True)
-
-
-def _short(value: Any) -> str:
-    text = str(value)
-    return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def consolidate(path: Path) -> None:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from polhode._batch import PARTS, flatten
+from polhode._batch import PARTS, flatten, lane_times
 from polhode._checks import is_concrete
 from polhode._scene import Scene
 from polhode.events._bracketed import bracketed
@@ -108,15 +108,10 @@ def crossings(
     while most is None and int(np.max(found.count, initial=0)) > room:
         room = 2 ** int(np.ceil(np.log2(np.max(found.count))))
         found, _ = _found(trajectory, event, room, looks)
-    if most is None:
-        found = _trimmed(found)
+    if most is None:  # without room that no body uses
+        used = int(np.max(found.count, initial=0))
+        found = Crossings(found.times[..., :used], found.slope[..., :used], found.count)
     return found
-
-
-def _trimmed(found: Crossings) -> Crossings:
-    """Without room that no body uses."""
-    used = int(np.max(found.count, initial=0))
-    return Crossings(found.times[..., :used], found.slope[..., :used], found.count)
 
 
 def _looks(trajectory: Trajectory) -> int:
@@ -159,10 +154,8 @@ def _natural_rates(trajectory: Trajectory) -> Array:
     batch = trajectory.batch_shape
     parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
     lanes = flatten(trajectory.first, batch, shared=False)
-    ts = trajectory.ts[..., jnp.array([0, -1])]
-    if ts.ndim > 1:
-        ts = jnp.broadcast_to(ts, (*batch, 2)).reshape(-1, 2)
-    return natural_rates(Scene(**parts), lanes, ts).reshape(batch)
+    ends = lane_times(trajectory.ts[..., jnp.array([0, -1])], batch)
+    return natural_rates(Scene(**parts), lanes, ends).reshape(batch)
 
 
 @eqx.filter_jit
@@ -197,32 +190,29 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> tuple
     room = max(most, _ROOM)
     dips = dips_of(grid, values, slopes, sides)
 
-    def at(x, place):
-        return jnp.take_along_axis(x, place, axis=-1)
-
     # what turns back towards zero between two looks is looked at where it turns
     place, is_dip = first_true(dips, room)
     single, is_single = first_true(changes, room)
-    side = at(sides, place)
-    low, high = at(grid, place), at(grid, place + 1)
-    turns = low, high, at(slopes, place), at(slopes, place + 1), is_dip
+    side = entries(sides, place)
+    low, high = entries(grid, place), entries(grid, place + 1)
+    turns = low, high, entries(slopes, place), entries(slopes, place + 1), is_dip
 
     def brackets(turning, there):
         """Between looks, and on both sides of such a turning point; which are pairs of these."""
         pairs = is_dip & (jnp.where(there >= 0, 1, -1) != side)
         columns = (
-            (at(grid, single), low, turning),
-            (at(grid, single + 1), turning, high),
-            (at(values, single), at(values, place), there),
-            (at(values, single + 1), there, at(values, place + 1)),
+            (entries(grid, single), low, turning),
+            (entries(grid, single + 1), turning, high),
+            (entries(values, single), entries(values, place), there),
+            (entries(values, single + 1), there, entries(values, place + 1)),
             (is_single, pairs, pairs),
-            (at(sides, single + 1) > 0, side < 0, side > 0),  # whether it rises along the motion
+            (entries(sides, single + 1) > 0, side < 0, side > 0),  # rising along the motion
         )
         *columns, use, rising = (jnp.concatenate(x, axis=-1) for x in columns)
         if event.direction:
             use = use & (jnp.where(rising, 1, -1) * ahead == event.direction)
         order = jnp.argsort(jnp.where(use, ahead * columns[0], jnp.inf), axis=-1)[:, :room]
-        return tuple(at(x, order) for x in (*columns, use)), pairs
+        return tuple(entries(x, order) for x in (*columns, use)), pairs
 
     def search(found, second):
         """The turning points, then the roots: one copy of the motion in the program."""
@@ -278,6 +268,11 @@ def dips_of(grid, values, slopes, sides) -> Array:
     s = jnp.clip(s, 0, 1)
     lowest = a + s * (b + s * (c + s * d))
     return turns & (lowest <= jnp.minimum(a, end) / 2)
+
+
+def entries(x: Array, k: Array) -> Array:
+    """Entries ``k`` (N, D) of the rows of ``x``."""
+    return jnp.take_along_axis(x, k, axis=-1)
 
 
 def first_true(mask: Array, most: int) -> tuple[Array, Array]:

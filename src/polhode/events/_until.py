@@ -8,11 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode._batch import PARTS, flatten
+from polhode._batch import PARTS, flatten, lane_times
 from polhode._scene import Scene
 from polhode._state import State
 from polhode.events._bracketed import bracketed
-from polhode.events._crossings import A_TURN, AT_START, dips_of, first_true, turning_rates
+from polhode.events._crossings import A_TURN, AT_START, dips_of, entries, first_true, turning_rates
 from polhode.events._event import Event
 from polhode.methods import Record, Status, natural_rates
 from polhode.trajectory import Trajectory, moved_through, moved_to
@@ -52,9 +52,7 @@ def stopped(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
     """The motion from ``begin``, its state at the first of ``ts``, each body held from its first
     event on."""
     batch = begin.batch_shape
-    lanes = _of_lanes(begin)
-    if ts.ndim > 1:
-        ts = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
+    lanes, ts = _of_lanes(begin), lane_times(ts, batch)
     arrays, rest = eqx.partition((lanes, until), eqx.is_inexact_array)
     still = jax.lax.stop_gradient
     fixed, event = eqx.combine(still(arrays), rest)
@@ -75,17 +73,14 @@ def _of_lanes(begin: Trajectory) -> Trajectory:
     batch = begin.batch_shape
     n = begin.status.size
     parts = {name: flatten(getattr(begin.scene, name), batch) for name in PARTS}
-    ts = begin.ts
-    if ts.ndim > 1:
-        ts = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(n, -1)
     samples = (
         None if x is None else x.reshape(n, *x.shape[len(batch) :])
         for x in (begin.wxyz, begin.omega_body, begin.spins)
     )
     wxyz, omega, spins = samples
     return Trajectory(
-        ts, wxyz, omega, begin.status.reshape(n), begin.steps.reshape(n), Scene(**parts),
-        spins=spins, propagator=begin.propagator,
+        lane_times(begin.ts, batch), wxyz, omega, begin.status.reshape(n), begin.steps.reshape(n),
+        Scene(**parts), spins=spins, propagator=begin.propagator,
     )  # fmt: skip
 
 
@@ -199,9 +194,11 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
         dip = _first_dip(until, begin if exact else seen, grid, slopes, sides, place, is_dip)
         new = busy & (jnp.minimum(dip.place, change) < reach)
         fresh = _bracket(seen, grid, values, change, dip, until.direction * forward, new)
-        found = jax.tree.map(lambda x, y: jnp.where(_as(new, x), x, y), fresh, walk.found)
+        found = jax.tree.map(
+            lambda x, y: jnp.where(new.reshape(-1, *(1,) * (x.ndim - 1)), x, y), fresh, walk.found
+        )
         alive = walk.alive & (seen.status == Status.SUCCESSFUL)
-        samples, met = [x[:, reach] for x in _samples(seen)], walk.met | new
+        samples, met = [x[:, reach] for x in seen._samples], walk.met | new
         wider = jnp.where(reach < _LOOKS, width, _GROWTH * width)
         wider = jnp.minimum(wider, width_by_rate(share[reach], samples, alive & ~met))
         return _Window(walk.tried + 1, share[reach], wider, samples, met, alive, found)
@@ -210,7 +207,7 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
         left = (walk.share < 1) & (walk.tried < _MOST)
         return left & jnp.any(~walk.met & walk.alive)
 
-    samples, zero = [x[:, 0] for x in _samples(lanes)], jnp.zeros(n, dtype)
+    samples, zero = [x[:, 0] for x in lanes._samples], jnp.zeros(n, dtype)
     alive = lanes.status == Status.SUCCESSFUL
     begin = jnp.broadcast_to(first, (n,))
     nowhere = _Bracket(begin, begin, zero, zero, begin, samples)
@@ -235,22 +232,22 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
 
 def _first_dip(until: Event, motion: Trajectory, grid, slopes, sides, place, is_dip) -> _Dip:
     """Of the places (N, D) where the function may turn back, the first where it crosses zero."""
-    low, high = _look(grid, place), _look(grid, place + 1)
+    low, high = entries(grid, place), entries(grid, place + 1)
 
     def turning(_):
         def fn(t):
             value, slope = until.values(moved_to(motion, t))
             return slope, value
 
-        return bracketed(fn, low, high, _look(slopes, place), _look(slopes, place + 1), is_dip)
+        return bracketed(fn, low, high, entries(slopes, place), entries(slopes, place + 1), is_dip)
 
     none = low, jnp.zeros_like(low)
     time, value = jax.lax.cond(jnp.any(is_dip), turning, lambda _: none, 0)
-    side = _look(sides, place)
+    side = entries(sides, place)
     across = is_dip & (jnp.where(value >= 0, 1, -1) != side)
     pair, some = first_true(across, 1)
-    found = jnp.where(some, _look(place, pair), _LOOKS)
-    return _Dip(*(x[:, 0] for x in (found, *(_look(x, pair) for x in (time, value, side)))))
+    found = jnp.where(some, entries(place, pair), _LOOKS)
+    return _Dip(*(x[:, 0] for x in (found, *(entries(x, pair) for x in (time, value, side)))))
 
 
 def _bracket(seen: Trajectory, grid, values, change, dip: _Dip, wanted, new) -> _Bracket:
@@ -261,17 +258,12 @@ def _bracket(seen: Trajectory, grid, values, change, dip: _Dip, wanted, new) -> 
     second = (wanted != 0) & (jnp.where(dip.side < 0, 1, -1) != wanted)
     is_dip = dip.place < change
     early, late = is_dip & ~second, is_dip & second
-    a, b, fa, fb = (_look(x, here + k)[:, 0] for x in (grid, values) for k in (0, 1))
+    a, b, fa, fb = (entries(x, here + k)[:, 0] for x in (grid, values) for k in (0, 1))
     return _Bracket(
         jnp.where(late, dip.time, a), jnp.where(early, dip.time, b),
         jnp.where(late, dip.value, fa), jnp.where(early, dip.value, fb),
-        a, [jnp.take_along_axis(x, here[..., None], axis=1)[:, 0] for x in _samples(seen)],
+        a, [jnp.take_along_axis(x, here[..., None], axis=1)[:, 0] for x in seen._samples],
     )  # fmt: skip
-
-
-def _look(x: Array, k: Array) -> Array:
-    """Entries ``k`` (N, D) of the rows of ``x``."""
-    return jnp.take_along_axis(x, k, axis=-1)
 
 
 def _held(lanes: Trajectory, ts: Array, until: Event, met: Array, near: Array, step: Array):
@@ -298,19 +290,10 @@ def _held(lanes: Trajectory, ts: Array, until: Event, met: Array, near: Array, s
     past = met[:, None] & (sign.reshape(-1, 1) * (rows - event) >= 0)
     held = [
         jnp.where(past[..., None], x, y)
-        for x, y in zip(_samples(at_event), _samples(moved), strict=True)
+        for x, y in zip(at_event._samples, moved._samples, strict=True)
     ]
     wxyz, omega, *spins = held
     status = jnp.where(met, there.status, moved.status)
     times = jnp.where(past, event, rows)
     event = jnp.where(met, event[:, 0], jnp.inf)
     return wxyz, omega, spins[0] if spins else None, status, moved.steps, times, event
-
-
-def _samples(trajectory: Trajectory) -> list[Array]:
-    found = trajectory.wxyz, trajectory.omega_body, trajectory.spins
-    return [x for x in found if x is not None]
-
-
-def _as(mask: Array, x: Array) -> Array:
-    return mask.reshape(-1, *(1,) * (x.ndim - 1))

@@ -6,10 +6,9 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import is_concrete, require
+from polhode._checks import require, require_positive
 from polhode.fit._matrices import solve
 from polhode.fit._recording import Recording, needed
 from polhode.fit._start import central_slope, integrate
@@ -33,12 +32,8 @@ class Instrument(eqx.Module):
     bias: Float[Array, " 3"] | None = None
 
     def __check_init__(self):
-        if self.spin_inertia is not None and is_concrete(self.spin_inertia):
-            require(
-                np.asarray(self.spin_inertia) > 0,
-                f"spin_inertia must be positive, got {self.spin_inertia}; None stands for "
-                "no wheel.",
-            )
+        if self.spin_inertia is not None:
+            require_positive("spin_inertia", self.spin_inertia, hint="None stands for no wheel")
 
     def rates(self, reading: Float[Array, "*t 3"]) -> Float[Array, "*t 3"]:
         """True rates, rad/s, sensor axes."""

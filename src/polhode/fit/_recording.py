@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from polhode._checks import as_float_array, is_concrete, require
+from polhode._checks import as_float_array, is_concrete, numbers, require, require_positive
 from polhode.rotation import conjugate, multiply, normalise
 
 # angles per sample above which a record under-samples its own rotation
@@ -95,9 +95,7 @@ class Recording(eqx.Module):
             times.shape[:-1], *(a.shape[: a.ndim - len(tails[n])] for n, a in arrays.items())
         )
         # what is known now is worked on by NumPy, which has a hundredth of JAX's overhead
-        xp = jnp
-        if is_concrete(times, arrays):
-            xp, times, arrays = np, *jax.tree.map(np.asarray, (times, arrays))
+        xp = numbers(times, *arrays.values())
         arrays = {name: xp.broadcast_to(a, (*batch, *tails[name])) for name, a in arrays.items()}
         times = xp.broadcast_to(times, (*batch, count))
         whole = {name: xp.isfinite(a) for name, a in arrays.items()}
@@ -251,7 +249,5 @@ def _check_rates(omega, times):
 
 def _noise(name, value, shape, dtype):
     array = as_float_array(name, value).astype(dtype)
-    if is_concrete(array):
-        array = np.asarray(array)
-        require(array > 0, f"{name} must be positive (a standard deviation), got {array}.")
-    return (np if is_concrete(array) else jnp).broadcast_to(array, shape)
+    require_positive(name, array, hint="it is a standard deviation")
+    return numbers(array).broadcast_to(array, shape)

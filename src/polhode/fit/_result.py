@@ -111,11 +111,16 @@ class InertiaFit(eqx.Module):
         """
         return Inertia(diagonal=_other_hand(self.moments)).turned(self.axes)
 
+    @property
+    def determined(self) -> tuple[Array, Array]:
+        """The moments if the scale is known, else the ratios (..., 3), and their deviations."""
+        if self.scale_known:
+            return self.moments, self.moments_std
+        return self.ratios, self.ratios_std
+
     def interval(self, level: float = 0.95) -> tuple[Array, Array]:
         """Ends (..., 3) of the intervals of ``ratios``, or of ``moments`` if the scale is known."""
-        value, spread = (
-            (self.moments, self.moments_std) if self.scale_known else (self.ratios, self.ratios_std)
-        )
+        value, spread = self.determined
         reach = float(norm.ppf(0.5 + level / 2)) * spread
         return value - reach, value + reach
 

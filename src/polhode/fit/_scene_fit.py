@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from polhode._batch import PARTS, batch_shapes
 from polhode._checks import as_float_array
-from polhode._scene import Scene
+from polhode._scene import Scene, places_of
 from polhode._state import State
 from polhode.fit._fit import each, together
 from polhode.fit._motion import AbstractMotion
@@ -173,6 +173,7 @@ def fit_scene(
     ``ph.fit(scene, data, free)`` is the same. Raises TypeError or ValueError for bad input, and
     unless ``throw=False`` FitError when the fit is not finite or stopped early.
     """
+    _check_single(scene)
     motion = LeafMotion(scene, places_of(scene, free), _start(attitude, scene), method, rtol)
     options = FitOptions(
         motion, NoInertia(), None, robust, bias, False, noise_known, starts, solver, max_steps
@@ -200,43 +201,16 @@ def _start(attitude: ArrayLike | None, scene: Scene) -> Array | None:
     return as_float_array("attitude", attitude, (4,)).astype(scene.inertia.dtype)
 
 
-def places_of(scene: Any, free: Any) -> tuple[int, ...]:
-    """Which leaves of the scene ``free`` points at; TypeError or ValueError with the cure."""
+def _check_single(scene: Any) -> None:
+    """TypeError or ValueError for what is not the scene of one body."""
     if not isinstance(scene, Scene):
         raise TypeError(f"scene must be a ph.Scene, got {type(scene).__name__}.")
-    if not callable(free):
-        raise TypeError(
-            "free must be a function of the scene that returns the arrays to fit, such as"
-            f" lambda s: [s.torque.c], got {type(free).__name__}."
-        )
     shapes = [shape for name in PARTS for shape in batch_shapes(getattr(scene, name))]
     if any(shapes):
         raise ValueError(
             f"the scene of a fit is that of one body, got parts with the batch axes {max(shapes)}:"
             " give one body's numbers as the start; a batch is in the recording."
         )
-    leaves, tree = jax.tree.flatten(scene)
-    marks = jax.tree.unflatten(tree, [_Mark(i) for i in range(len(leaves))])
-    wanted = "free must point at arrays that the scene holds, such as s.torque.c"
-    try:
-        found = jax.tree.leaves(free(marks), is_leaf=lambda x: isinstance(x, _Mark))
-    except (AttributeError, TypeError, ValueError, IndexError) as error:
-        raise TypeError(f"{wanted}, neither a part of one nor made from it: {error}.") from error
-    if not found or not all(isinstance(x, _Mark) for x in found):
-        raise TypeError(f"{wanted}, got {[type(x).__name__ for x in found]}.")
-    places = tuple(mark.place for mark in found)
-    if len(set(places)) < len(places):
-        raise ValueError("free points at the same array twice.")
-    if not all(jnp.issubdtype(jnp.result_type(leaves[i]), jnp.floating) for i in places):
-        raise TypeError(f"{wanted}: real numbers.")
-    return places
-
-
-class _Mark:
-    """Stands for a leaf while ``free`` is asked."""
-
-    def __init__(self, place: int):
-        self.place = place
 
 
 def conclude_scene(solution: Solution, recording: Recording, options: FitOptions) -> SceneFit:

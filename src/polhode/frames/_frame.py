@@ -43,13 +43,8 @@ def _aligned(*arrays: Array) -> list[Array]:
     return [array.reshape((1,) * (rank - array.ndim) + array.shape) for array in arrays]
 
 
-def _sum(terms: list[Array | None]) -> Array:
-    present = [term for term in terms if term is not None]
-    total = present[0]
-    for term in present[1:]:
-        left, right = _aligned(total, term)
-        total = left + right
-    return total
+def _sum(left: Array, right: Array) -> Array:
+    return jnp.add(*_aligned(left, right))
 
 
 def _origin(function):
@@ -102,12 +97,7 @@ class RotatingFrame(eqx.Module):
         if wxyz is None:
             start = identity((), dtype)
         else:
-            start = as_float_array("wxyz", wxyz, (4,))
-            if is_concrete(start):
-                require(
-                    np.any(np.asarray(start) != 0), "wxyz must not be zero: it has no attitude."
-                )
-            start = normalise(start)
+            start = normalise(as_float_array("wxyz", wxyz, (4,)))
         t0 = jnp.asarray(t0, start.dtype)
         if varies:
             omega_body = Signature("RotatingFrame.from_rate", {"t": ()}, (3,)).checked(omega_body)
@@ -230,37 +220,37 @@ class RotatingFrame(eqx.Module):
     def position_to_space(self, t: Time, position: Vector, *, wxyz=None) -> Vector:
         """Space position [m] of a point at frame ``position``. ``wxyz``: the attitude, if known."""
         turned = self._turned(t, position, wxyz)
-        return turned if self.origin is None else _sum([turned, self._origin(t)[0]])
+        return turned if self.origin is None else _sum(turned, self._origin(t)[0])
 
     def position_to_frame(self, t: Time, position_space: Vector) -> Vector:
         """Frame position [m] of a point in space."""
         if self.origin is not None:
-            position_space = _sum([position_space, -self._origin(t)[0]])
+            position_space = _sum(position_space, -self._origin(t)[0])
         return self._turned_back(t, position_space)
 
     def velocity_to_space(
         self, t: Time, position: Vector, velocity: Vector, *, wxyz=None
     ) -> Vector:
         """Space velocity [m/s] of a point with frame position and velocity (003: 8)."""
-        carried = _sum([velocity, _cross(self.omega_body(t), position)])
+        carried = _sum(velocity, _cross(self.omega_body(t), position))
         turned = self._turned(t, carried, wxyz)
-        return turned if self.origin is None else _sum([turned, self._origin(t)[1]])
+        return turned if self.origin is None else _sum(turned, self._origin(t)[1])
 
     def velocity_to_frame(self, t: Time, position_space: Vector, velocity_space: Vector) -> Vector:
         """Frame velocity [m/s] of a point with space position and velocity."""
         position = self.position_to_frame(t, position_space)
         if self.origin is not None:
-            velocity_space = _sum([velocity_space, -self._origin(t)[1]])
+            velocity_space = _sum(velocity_space, -self._origin(t)[1])
         relative = self._turned_back(t, velocity_space)
-        return _sum([relative, -_cross(self.omega_body(t), position)])
+        return _sum(relative, -_cross(self.omega_body(t), position))
 
     def acceleration_to_space(
         self, t: Time, position: Vector, velocity: Vector, acceleration: Vector
     ) -> Vector:
         """Space acceleration [m/s^2] of a point with this motion in the frame (003: 19)."""
         apparent = self._without_origin(t, position, velocity)
-        turned = self._turned(t, _sum([acceleration, -apparent]))
-        return turned if self.origin is None else _sum([turned, self._origin(t)[2]])
+        turned = self._turned(t, _sum(acceleration, -apparent))
+        return turned if self.origin is None else _sum(turned, self._origin(t)[2])
 
     def acceleration_to_frame(
         self, t: Time, position_space: Vector, velocity_space: Vector, acceleration_space: Vector
@@ -269,9 +259,9 @@ class RotatingFrame(eqx.Module):
         position = self.position_to_frame(t, position_space)
         velocity = self.velocity_to_frame(t, position_space, velocity_space)
         if self.origin is not None:
-            acceleration_space = _sum([acceleration_space, -self._origin(t)[2]])
+            acceleration_space = _sum(acceleration_space, -self._origin(t)[2])
         relative = self._turned_back(t, acceleration_space)
-        return _sum([relative, self._without_origin(t, position, velocity)])
+        return _sum(relative, self._without_origin(t, position, velocity))
 
     # --- forces by name (docs/equations.md, 003: 20, 21) ---------------------------------
 
@@ -303,7 +293,7 @@ class RotatingFrame(eqx.Module):
         if velocity is not None:
             carried = carried + 2 * velocity
         turning = -_cross(omega, carried)
-        return turning if slope is None else _sum([turning, -_cross(slope, position)])
+        return turning if slope is None else _sum(turning, -_cross(slope, position))
 
     def apparent_acceleration(
         self, t: Time, position: Vector, velocity: Vector | None = None, *, wxyz=None
@@ -315,12 +305,8 @@ class RotatingFrame(eqx.Module):
         apparent = self._without_origin(t, position, velocity)
         if self.origin is None:
             return apparent
-        return _sum([apparent, -self._turned_back(t, self._origin(t)[2], wxyz)])
+        return _sum(apparent, -self._turned_back(t, self._origin(t)[2], wxyz))
 
 
 def _times(mass: ArrayLike, vector: Array) -> Array:
-    mass = jnp.asarray(mass, vector.dtype)
-    if mass.ndim == 0:
-        return mass * vector
-    left, right = _aligned(mass[..., None], vector)
-    return left * right
+    return jnp.multiply(*_aligned(jnp.asarray(mass, vector.dtype)[..., None], vector))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from polhode._checks import as_float_array, is_concrete, require
+from polhode._checks import as_float_array, is_concrete, require_positive
 from polhode.frames._frame import RotatingFrame
 from polhode.frames._turning import VariableRate
 from polhode.methods import check_options, check_rtol, check_times
@@ -205,8 +205,7 @@ def simulate_particles(
         raise ValueError(f"ts must have shape (T,), got {ts.shape}: particles share their times.")
     if is_concrete(ts):
         check_times(np.asarray(ts))
-    if is_concrete(mass):
-        require(np.asarray(mass) > 0, "mass must be positive.")
+    require_positive("mass", mass)
     batch = jnp.broadcast_shapes(position.shape, velocity.shape, (*mass.shape[:-1], 3))
     position, velocity = (jnp.broadcast_to(x, batch) for x in (position, velocity))
     mass = jnp.broadcast_to(mass, (*batch[:-1], 1))

@@ -8,14 +8,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from polhode._checks import as_float_array, as_vectors, is_concrete, require
+from polhode._checks import (
+    as_float_array,
+    as_floats,
+    as_vectors,
+    is_concrete,
+    require,
+    require_positive,
+)
 from polhode.inertia._cholesky import inertia_from_log_cholesky, inertia_to_log_cholesky
 from polhode.inertia._eigen import principal
 from polhode.inertia._input import (
-    as_floats,
     check_moments,
     check_tensor,
-    require_positive,
     tolerance,
 )
 from polhode.inertia._physical import is_symmetric, possible_moments, possible_tensor
@@ -269,29 +274,24 @@ class Inertia(AbstractShaped, AbstractPart):
         """Body momentum ``I omega``, kg m^2/s, of body rates (..., 3), rad/s."""
         omega = as_vectors("omega", omega)
         if self.full is None:
-            return jnp.multiply(*_aligned(self.moments, omega))
+            return jnp.multiply(*jnp.broadcast_arrays(self.moments, omega))
         return _product(self.full, omega)
 
     def rates(self, momentum: Float[Array | np.ndarray, "*#b 3"]) -> Float[Array, "*b 3"]:
         """Body rates ``I^-1 L``, rad/s, of body momenta (..., 3), kg m^2/s."""
         momentum = as_vectors("momentum", momentum)
         if self.full is None:
-            moments, momentum = _aligned(self.moments, momentum)
+            moments, momentum = jnp.broadcast_arrays(self.moments, momentum)
             return momentum / moments
         batch = jnp.broadcast_shapes(self.batch_shape, momentum.shape[:-1])
         tensor = jnp.broadcast_to(self.full, (*batch, 3, 3))
         return _solve(tensor, jnp.broadcast_to(momentum, (*batch, 3)))
 
 
-def _aligned(left, right):
-    shape = jnp.broadcast_shapes(left.shape, right.shape)
-    return jnp.broadcast_to(left, shape), jnp.broadcast_to(right, shape)
-
-
 @jax.jit  # one program, not one for each operation; likewise below
 def _product(tensor, vector):
-    rows = [jnp.sum(jnp.multiply(*_aligned(tensor[..., i, :], vector)), -1) for i in range(3)]
-    return jnp.stack(rows, axis=-1)
+    rows = (jnp.broadcast_arrays(tensor[..., i, :], vector) for i in range(3))
+    return jnp.stack([jnp.sum(a * b, axis=-1) for a, b in rows], axis=-1)
 
 
 @jax.jit

@@ -1,27 +1,17 @@
 """Checks of what users hand in: shapes always, values only when they are concrete."""
 
+from functools import reduce
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polhode._checks import as_floats as as_floats, is_concrete, require
+from polhode._checks import is_concrete, require
 
 
 def tolerance(array: Array) -> float:
     """Relative tolerance of consistency checks: the square root of the dtype's rounding."""
     return float(np.sqrt(jnp.finfo(array.dtype).eps))
-
-
-def require_positive(name: str, array: Array, *, zero: bool = False) -> None:
-    """ValueError if a concrete array holds negative values (or zeros, unless ``zero``)."""
-    if not is_concrete(array) or array.size == 0:
-        return
-    least = float(np.min(np.asarray(array)))
-    wanted = "zero or positive" if zero else "positive"
-    require(
-        least > 0 or (zero and least == 0),
-        f"{name} must be {wanted}, got {least:g}; check its sign and its units.",
-    )
 
 
 def require_below(small_name: str, small: Array, large_name: str, large: Array) -> None:
@@ -43,19 +33,24 @@ def check_moments(name: str, seen: np.ndarray, slack: float, least: float = 0.0)
     """
     if seen.size == 0:
         return
-    largest = seen.max(axis=-1)
+    columns = tuple(seen[..., i] for i in range(seen.shape[-1]))  # NumPy reduces long axes faster
+    largest, smallest = reduce(np.maximum, columns), reduce(np.minimum, columns)
     require(
-        seen.min(axis=-1) > least * largest,
-        f"{name} must be positive (kg m^2), got {_worst(seen, seen.min(axis=-1))}; a moment is "
-        "zero only for a point or a thin line, which cannot turn about itself: give it a width.",
+        smallest > least * largest,
+        lambda: (
+            f"{name} must be positive (kg m^2), got {_worst(seen, smallest)}; a moment is zero"
+            " only for a point or a thin line, which cannot turn about itself: give it a width."
+        ),
     )
-    excess = 2 - (seen / largest[..., None]).sum(axis=-1)  # of any size: nothing overflows
+    excess = 2 - sum(x / largest for x in columns)  # of any size: nothing overflows
     require(
         excess <= slack,
-        f"{name} must satisfy the triangle inequality (each at most the sum of the two others), "
-        f"got {_worst(seen, -excess)}; check the units, and that these are moments of inertia, "
-        "not second moments or a gyration tensor. Published numbers that no body has pass with "
-        "Inertia.from_moments(..., physical=False).",
+        lambda: (
+            f"{name} must satisfy the triangle inequality (each at most the sum of the two"
+            f" others), got {_worst(seen, -excess)}; check the units, and that these are moments of"
+            " inertia, not second moments or a gyration tensor. Published numbers that no body has"
+            " pass with Inertia.from_moments(..., physical=False)."
+        ),
     )
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from polhode._checks import as_float_array, is_concrete, require
+from polhode._checks import as_float_array, as_floats, is_concrete, require, require_positive
 from polhode.inertia._cholesky import (
     inertia_of_second_moments,
     pseudo_from_log_cholesky,
@@ -16,10 +16,8 @@ from polhode.inertia._cholesky import (
 )
 from polhode.inertia._inertia import Inertia
 from polhode.inertia._input import (
-    as_floats,
     check_moments,
     check_tensor,
-    require_positive,
     tolerance,
 )
 from polhode.inertia._mesh import check_mesh, load_mesh, mesh_integrals
@@ -161,13 +159,7 @@ class MassProperties(AbstractShaped):
         shift = as_float_array("offset", offset, (3,)).astype(dtype)
         centre, central = self.centre, self.central
         if wxyz is not None:
-            turn = as_float_array("wxyz", wxyz, (4,)).astype(dtype)
-            if is_concrete(turn):
-                require(
-                    np.any(np.asarray(turn) != 0, axis=-1),
-                    "wxyz must not be the zero quaternion; (1, 0, 0, 0) is no turn.",
-                )
-            turn = normalise(turn)
+            turn = normalise(as_float_array("wxyz", wxyz, (4,)).astype(dtype))
             batch = jnp.broadcast_shapes(turn.shape[:-1], self.mass.shape)
             turn = jnp.broadcast_to(turn, (*batch, 4))
             centre = rotate(turn, jnp.broadcast_to(centre, (*batch, 3)))

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from polhode._checks import as_float_array, is_concrete, require
+from polhode._checks import as_float_array, imported, is_concrete, require
 
 
 def check_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, np.ndarray]:
@@ -111,12 +111,7 @@ def load_mesh(path: str | PathLike[str]) -> tuple[np.ndarray, np.ndarray]:
     Raises ImportError without trimesh, FileNotFoundError without the file, ValueError when it
     cannot be read as one mesh.
     """
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError(
-            "reading mesh files needs trimesh: pip install 'polhode[mesh]'."
-        ) from error
+    trimesh = imported("reading mesh files", "trimesh", extra="mesh")
     if not isfile(path):
         raise FileNotFoundError(f"there is no mesh file {path}.")
     try:

@@ -13,7 +13,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from polhode.inertia._input import as_floats, require_below, require_positive
+from polhode._checks import as_floats, require_positive
+from polhode.inertia._input import require_below
 
 
 class Symmetry(enum.Enum):

@@ -1,11 +1,11 @@
 """Tensors of inertia: point masses, parallel axes, turned axes."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._checks import require
+from polhode._checks import require, require_positive
 from polhode.inertia._cholesky import symmetric
-from polhode.inertia._input import require_positive
 
 
 def check_points(masses: Array, positions: Array) -> None:
@@ -43,21 +43,6 @@ def turned(
     tensor: Float[Array, "*#b 3 3"], matrix: Float[Array, "*#b 3 3"]
 ) -> Float[Array, "*b 3 3"]:
     """``R I R^T``, exactly symmetric."""
-    batch = jnp.broadcast_shapes(tensor.shape[:-2], matrix.shape[:-2])
-    tensor = jnp.broadcast_to(tensor, (*batch, 3, 3))
-    # sums of products instead of a matrix product, which accelerators may round more coarsely
-    axes = [[matrix[..., i, k] for k in range(3)] for i in range(3)]
-    images = [
-        [
-            sum(jnp.broadcast_to(a, batch) * tensor[..., k, i] for k, a in enumerate(row))
-            for i in range(3)
-        ]
-        for row in axes
-    ]
-
-    def entry(i, j):
-        return sum(image * jnp.broadcast_to(a, batch) for image, a in zip(images[i], axes[j]))
-
-    return symmetric(
-        (entry(0, 0), entry(1, 1), entry(2, 2)), (entry(1, 2), entry(2, 0), entry(0, 1))
-    )
+    exact = jax.lax.Precision.HIGHEST  # accelerators may round matrix products more coarsely
+    found = jnp.einsum("...ij,...jk,...lk->...il", matrix, tensor, matrix, precision=exact)
+    return (found + jnp.swapaxes(found, -1, -2)) / 2

@@ -20,13 +20,13 @@ if TYPE_CHECKING:
     )
     from polhode.io._clones import Clones as Clones, draw_clones as draw_clones
     from polhode.io._method import build_method as build_method
-    from polhode.io._specification import SceneFile as SceneFile
+    from polhode.io._models import SceneFile as SceneFile
 
 _ROOMS = {
     "_build": ("blamed", "build_attitudes", "build_inertia", "build_scene", "build_state"),
     "_clones": ("Clones", "draw_clones"),
     "_method": ("build_method",),
-    "_specification": ("SceneFile",),
+    "_models": ("SceneFile",),
 }
 
 

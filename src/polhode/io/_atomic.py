@@ -37,13 +37,13 @@ def whole_file(target: str | os.PathLike) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
-    _sync_folder(target.parent)
+    if hasattr(os, "O_DIRECTORY"):  # Windows cannot open folders
+        sync(target.parent)
 
 
-def _sync_folder(folder: Path) -> None:
-    if not hasattr(os, "O_DIRECTORY"):  # Windows cannot open folders
-        return
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+def sync(path: Path) -> None:
+    """Have a file, or the names in a folder, on the disk, also when the power goes."""
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:
@@ -57,13 +57,9 @@ def write_netcdf(dataset: "xarray.Dataset", target: str | os.PathLike) -> Path:
     h5netcdf and h5py (`pip install polhode[cli]`). Returns the path. Raises OSError when the
     folder is missing, full or not writable; an existing file then stays as it was.
     """
-    try:
-        import h5netcdf  # noqa: F401 - the engine that xarray is asked for below
-        import h5py  # noqa: F401 - which h5netcdf needs to write, but does not install
-    except ImportError as error:
-        raise ImportError(
-            "writing NetCDF needs xarray, h5netcdf and h5py: pip install 'polhode[cli]'"
-        ) from error
+    from polhode._checks import imported  # imports JAX
+
+    imported("writing NetCDF", "h5netcdf", "h5py")  # the one does not install the other
     packed = {"zlib": True, "complevel": 4, "shuffle": True}
     large = {name: packed for name, array in dataset.variables.items()
              if array.ndim and array.dtype.kind in "fiu"}  # fmt: skip

@@ -1,37 +1,52 @@
 """Tables of a scene file for many bodies: [monte_carlo] and [ensemble]."""
 
-from typing import Annotated
+from typing import Annotated, Any
 
 from pydantic import Field, model_validator
 
-from polhode.io._table import Angle, MomentumUnit, Rate, Spread, Table, Text, Words
+from polhode.io._table import Angle, Measured, MomentumUnit, Rate, Spread, Table, Text, Words
 from polhode.io._values import FLAG, NUMBER, PATH, choice, whole, wrong
+
+QUANTITIES = ("moments", "euler", "attitude", "omega_body", "momentum_body", "torque")
+
+
+class Drawn(Table):
+    """Bodies around the nominal one."""
+
+    @property
+    def spreads(self) -> dict[str, Any]:
+        """The quantities that are drawn, with their tables."""
+        return {name: table for name, table in self.given() if name in QUANTITIES}
 
 
 class MomentsSigma(Table):
     relative_sigma: Spread
     source: Text
 
+    @property
+    def sigma(self) -> list[float]:
+        return self.relative_sigma
 
-class AngleSigma(Table):
+
+class Sigma(Measured):
+    measures = ("sigma",)
     sigma: Spread
+    source: Text
+
+
+class AngleSigma(Sigma):
     unit: Angle = "rad"
-    source: Text
 
 
-class RatesSigma(Table):
-    sigma: Spread
+class RatesSigma(Sigma):
     unit: Rate = "rad/s"
-    source: Text
 
 
-class MomentumSigma(Table):
-    sigma: Spread
+class MomentumSigma(Sigma):
     unit: MomentumUnit = "kg m^2/s"
-    source: Text
 
 
-class MonteCarlo(Table):
+class MonteCarlo(Drawn):
     """Clones around the nominal body, each quantity drawn from a normal distribution."""
 
     clones: Annotated[int, whole(1, 10_000_000)]
@@ -44,15 +59,11 @@ class MonteCarlo(Table):
 
     @model_validator(mode="after")
     def _some(self) -> "MonteCarlo":
-        names = [name for name in QUANTITIES if getattr(self, name) is not None]
-        if not names:
-            expected = f"one or more of {', '.join(QUANTITIES)}"
+        if not self.spreads:
+            expected = f"one or more of {', '.join(QUANTITIES[:-1])}"
             mend = "add for example `moments = { relative_sigma = ..., source = .. }`"
             raise wrong("missing key", Words("none of them"), expected, mend, "")
         return self
-
-
-QUANTITIES = ("moments", "euler", "attitude", "omega_body", "momentum_body")
 
 
 class MomentsDraw(Table):
@@ -61,10 +72,19 @@ class MomentsDraw(Table):
     relative_half_width: Spread | None = None
     source: Text = ""
 
+    @property
+    def sigma(self) -> list[float] | None:
+        return self.relative_sigma
 
-class Draw(Table):
+    @property
+    def half_width(self) -> list[float] | None:
+        return self.relative_half_width
+
+
+class Draw(Measured):
     """`sigma`: normal; `half_width`: uniform."""
 
+    measures = ("sigma", "half_width")
     one_of = (("sigma", "half_width"),)
     sigma: Spread | None = None
     half_width: Spread | None = None
@@ -123,7 +143,7 @@ class Statistic(Table):
         return self
 
 
-class Ensemble(Table):
+class Ensemble(Drawn):
     """Any number of bodies, streamed into a Zarr store."""
 
     bodies: Annotated[int, whole(1, 2**32 - 1)]

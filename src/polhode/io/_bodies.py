@@ -1,21 +1,37 @@
 """Tables of a scene file that say what the body is, how it starts and what acts on it."""
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 from pydantic import BeforeValidator, Field, model_validator
 
 from polhode.io import _unit
-from polhode.io._table import Angle, MomentumUnit, Rate, Table, Vector, Words
+from polhode.io._table import Angle, Measured, MomentumUnit, Rate, Table, Vector, Words
 from polhode.io._values import MATRIX, NUMBER, POSITIVE, SEQUENCE, WXYZ, array, choice, wrong
 
 
-class Euler(Table):
+class Attitudes(NamedTuple):
+    """Attitudes as a file gives them: quaternions (..., 4), or Euler angles (..., 3) in rad.
+
+    R = R_a(angle 1) R_b(angle 2) R_c(angle 3) for the letters abc of `sequence` (None: quaternions
+    `wxyz`, not yet normalised), body -> space.
+    """
+
+    values: Any
+    sequence: str | None = None
+
+
+class Euler(Measured):
     """Turns about the body's own axes, first letter first: R = R_a(1) R_b(2) R_c(3)."""
 
+    measures = ("angles",)
     sequence: Annotated[str, SEQUENCE] = "zyz"
     angles: Vector
     unit: Angle = "rad"
+
+    @property
+    def attitude(self) -> Attitudes:
+        return Attitudes(self.angles, self.sequence)
 
 
 class Axisymmetric(Table):
@@ -78,10 +94,11 @@ AnySolid = Annotated[
 ]
 
 
-class Inertia(Table):
+class Inertia(Measured):
     """Exactly one way to say it; about the centre of mass, or the fixed point under gravity."""
 
-    one_of = (("moments", "tensor", "axisymmetric", "spherical", "parts"),)
+    measures = ("moments", "tensor", "axisymmetric", "spherical")
+    one_of = ((*measures, "parts"),)
     moments: Vector | None = Field(None, description="principal moments along body x, y, z")
     tensor: Annotated[list[list[float]], MATRIX] | None = Field(
         None, description="symmetric tensor in body axes"
@@ -89,22 +106,22 @@ class Inertia(Table):
     axisymmetric: Axisymmetric | None = None
     spherical: Annotated[float, NUMBER] | None = Field(None, description="all moments equal")
     parts: list[AnySolid] | None = Field(None, min_length=1)
-    unit: Annotated[str, choice(tuple(_unit.MOMENTS))] | None = None
+    unit: Annotated[str, choice(tuple(_unit.MOMENTS))] = "kg m^2"
 
     @model_validator(mode="after")
     def _no_unit_of_parts(self) -> "Inertia":
-        if self.parts is not None and self.unit is not None:
+        if self.parts is not None and "unit" in self.model_fields_set:
             raise wrong("not used with parts", self.unit, "no unit: parts are in kg and m",
                         "remove the unit", "unit")  # fmt: skip
         return self
 
 
-class Rates(Table):
+class Rates(Measured):
     value: Vector
     unit: Rate = "rad/s"
 
 
-class Momentum(Table):
+class Momentum(Measured):
     value: Vector
     unit: MomentumUnit = "kg m^2/s"
 
@@ -133,6 +150,21 @@ class State(Table):
             raise wrong("too many choices", Words("wxyz and euler"), "exactly one of wxyz, euler",
                         "keep one of them", "")  # fmt: skip
         return self
+
+    @property
+    def attitude(self) -> Attitudes:
+        """The one attitude at the first time."""
+        return Attitudes(self.wxyz or [1, 0, 0, 0]) if self.euler is None else self.euler.attitude
+
+    @property
+    def rate(self) -> str:
+        """Which of rates and momentum is given."""
+        return "momentum_body" if self.omega_body is None else "omega_body"
+
+    @property
+    def value(self) -> list[float]:
+        """The rates, rad/s, or the momentum, kg m^2/s, in body axes."""
+        return getattr(self, self.rate).value
 
 
 class UniformGravity(Table):

@@ -4,7 +4,6 @@ import contextlib
 import functools
 import operator
 from collections.abc import Iterator
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +13,10 @@ from jaxtyping import Array, DTypeLike, Float
 import polhode
 from polhode import rotation
 from polhode.inertia import Inertia, MassProperties, compose
+from polhode.io._bodies import AnySolid, Attitudes
 from polhode.io._error import SceneFileError
-from polhode.io._specification import Attitudes, Part, SceneFile
+from polhode.io._models import SceneFile
+from polhode.io._table import Table
 
 _CLASSES = {
     "uniform-gravity": "UniformGravity",
@@ -23,7 +24,6 @@ _CLASSES = {
     "body": "BodyTorque",
     "space": "SpaceTorque",
     "linear-damping": "LinearDamping",
-    "rotor": "Rotor",
 }
 
 
@@ -49,32 +49,35 @@ def build_attitudes(attitudes: Attitudes, dtype: DTypeLike) -> Float[Array, "*b 
 
 def build_inertia(file: SceneFile, dtype: DTypeLike) -> Inertia:
     """The nominal inertia. Raises SceneFileError for moments that no body has."""
-    part = file.inertia
-    with blamed(file, part.where):
-        if part.kind == "parts":
-            parts: Any = part.values["parts"]
-            solids = [_solid(solid, place, dtype) for solid, place in parts]
-            return compose(solids).inertia
-        values = {name: np.asarray(value, dtype) for name, value in part.values.items()}
-        if part.kind == "axisymmetric":
-            return Inertia.axisymmetric(**values)
+    table = file.inertia
+    kind, value = next((name, value) for name, value in table.given() if name != "unit")
+    with blamed(file, f"[inertia] {kind}"):
+        if kind == "parts":
+            return compose([_solid(solid, dtype) for solid in value]).inertia
+        if kind == "axisymmetric":
+            return Inertia.axisymmetric(**_numbers(value, dtype))
         make = {"moments": Inertia.from_moments, "tensor": Inertia.from_tensor}
-        return make.get(part.kind, Inertia.spherical)(values[part.kind])
+        return make.get(kind, Inertia.spherical)(np.asarray(value, dtype))
 
 
-def _solid(part: Part, place: dict, dtype: DTypeLike) -> MassProperties:
-    values = {name: np.asarray(value, dtype) for name, value in part.values.items()}
-    solid = getattr(MassProperties, f"from_{part.kind}")(**values)
-    turn = None if place["euler"] is None else build_attitudes(place["euler"], dtype)
-    return solid.moved(np.asarray(place["centre"], dtype), turn)
+def _numbers(table: Table, dtype: DTypeLike, *others: str) -> dict[str, np.ndarray]:
+    """The keys that hold numbers: all but the `others`."""
+    return {k: np.asarray(value, dtype) for k, value in table.given() if k not in others}
 
 
-def _objects(file: SceneFile, parts: tuple[Part, ...], dtype: DTypeLike) -> list:
-    made = []
-    for part in parts:
-        kind = getattr(polhode, _CLASSES[part.kind])
-        with blamed(file, part.where):
-            thing = kind(**{k: np.asarray(v, dtype) for k, v in part.values.items()})
+def _solid(table: AnySolid, dtype: DTypeLike) -> MassProperties:
+    make = getattr(MassProperties, f"from_{table.shape}")
+    turn = None if table.euler is None else build_attitudes(table.euler.attitude, dtype)
+    solid = make(**_numbers(table, dtype, "shape", "centre", "euler"))
+    return solid.moved(np.asarray(table.centre, dtype), turn)
+
+
+def _objects(file: SceneFile, key: str, dtype: DTypeLike) -> list:
+    made, tables = [], getattr(file, key)
+    for index, table in enumerate(tables):
+        kind = getattr(polhode, "Rotor" if key == "rotors" else _CLASSES[table.kind])
+        with blamed(file, f"[{key}]" if len(tables) == 1 else f"[{key} {index + 1}]"):
+            thing = kind(**_numbers(table, dtype, "kind"))
         # defaults that the file leaves out take the dtype too
         made.append(jax.tree.map(lambda x: jnp.asarray(x, dtype), thing))
     return made
@@ -88,13 +91,8 @@ def build_scene(
     Raises SceneFileError, naming the place, for numbers that a constructor refuses.
     """
     inertia = build_inertia(file, dtype) if inertia is None else inertia
-    acting = {}
-    for key, parts in zip(
-        ("potential", "torque", "rotors"), (file.potentials, file.torques, file.rotors), strict=True
-    ):
-        objects = _objects(file, parts, dtype)
-        if objects:
-            acting[key] = functools.reduce(operator.add, objects)
+    acting = {key: _objects(file, key, dtype) for key in ("potential", "torque", "rotors")}
+    acting = {key: functools.reduce(operator.add, made) for key, made in acting.items() if made}
     with blamed(file, ""):
         return polhode.Scene(inertia, **acting)
 

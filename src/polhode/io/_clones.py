@@ -10,9 +10,10 @@ import polhode
 from polhode import rotation
 from polhode.inertia import Inertia
 from polhode.io._arrays import possible_moments
+from polhode.io._bodies import Attitudes
 from polhode.io._build import build_attitudes, build_inertia, build_state
 from polhode.io._error import SceneFileError
-from polhode.io._specification import Attitudes, SceneFile
+from polhode.io._models import SceneFile
 
 _MOST_ROUNDS = 100
 
@@ -37,23 +38,23 @@ def draw_clones(file: SceneFile, dtype: DTypeLike) -> Clones:
     if plan is None:
         return Clones(nominal, build_state(file, dtype, nominal), 0)
     noise = {
-        spread.quantity: _Noise(plan.seed, spread.quantity, spread.sigma)
-        for spread in plan.spreads
-    }  # fmt: skip
+        name: _Noise(plan.seed, name, np.array(table.sigma)) for name, table in plan.spreads.items()
+    }
     count, redrawn, inertia = plan.clones, 0, nominal
     if "moments" in noise:
-        moments = np.asarray(file.inertia.values["moments"], np.float64)
+        moments = np.asarray(file.inertia.moments, np.float64)
         drawn, redrawn = _draw_moments(file, moments, noise["moments"], count)
         inertia = Inertia.from_moments(np.concatenate([moments[None], drawn]).astype(dtype))
     attitude = file.state.attitude
     if "euler" in noise:
-        attitude = Attitudes(_around(attitude.values, noise["euler"], count), attitude.sequence)
+        angles = _around(np.array(attitude.values), noise["euler"], count)
+        attitude = Attitudes(angles, attitude.sequence)
     wxyz = build_attitudes(attitude, dtype)
     if "attitude" in noise:
         turns = jnp.asarray(_around(np.zeros(3), noise["attitude"], count), dtype)
         wxyz = rotation.multiply(jnp.broadcast_to(wxyz, (count + 1, 4)),
                                  rotation.rotation_vector_to_wxyz(turns))  # fmt: skip
-    rates = file.state.value
+    rates = np.array(file.state.value)
     if file.state.rate in noise:
         rates = _around(rates, noise[file.state.rate], count)
     rates = jnp.broadcast_to(rates.astype(dtype), (count + 1, 3))

@@ -9,7 +9,7 @@ import polhode
 from polhode import solvers
 from polhode.io._build import blamed
 from polhode.io._error import SceneFileError
-from polhode.io._specification import SceneFile
+from polhode.io._models import SceneFile
 from polhode.io._values import suggestion
 
 

@@ -1,17 +1,21 @@
 """What a scene file may say: one pydantic model a table. `polhode schema` prints their JSON Schema.
 
-Values are as in the file, units not yet applied; `_convert` makes SI numbers of them. Nothing here
-needs numpy or JAX, so that a mistake in a file is told at once.
+Numbers are in SI once a table is checked. Nothing here needs numpy or JAX, so that a mistake in a
+file is told at once; what gives arrays imports numpy when it is asked.
 """
 
 import datetime
+import math
 from collections.abc import Mapping
-from typing import Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
+from polhode.io import _unit
 from polhode.io._batches import Ensemble, MonteCarlo
 from polhode.io._bodies import (
+    Attitudes,
     ConstantTorque,
     Inertia,
     Potentials,
@@ -19,7 +23,17 @@ from polhode.io._bodies import (
     State,
     Torques,
 )
-from polhode.io._table import Angle, Rate, Seconds, Table, Text, Vector, Words
+from polhode.io._table import (
+    Angle,
+    Measured,
+    Rate,
+    Seconds,
+    Table,
+    Text,
+    Vector,
+    Words,
+    scaled,
+)
 from polhode.io._values import (
     DATE,
     FLAG,
@@ -35,6 +49,9 @@ from polhode.io._values import (
     whole,
     wrong,
 )
+
+if TYPE_CHECKING:
+    import numpy as np
 
 MOST_SAMPLES = 10_000_000
 PERIODS = ("P_psi", "P_phi")
@@ -71,7 +88,27 @@ class Times(Table):
             if step == 0 or self.start + step == self.start or self.stop - step == self.stop:
                 expected = f"a number other than start = {self.start}, far enough for the samples"
                 raise wrong("no time passes", self.stop, expected, key="stop")
+        ends = self.values or [self.start, self.stop or 0.0, (self.stop or 0.0) - self.start]
+        if not all(math.isfinite(end * self.unit_seconds) for end in ends):
+            raise wrong("times beyond what numbers hold", self.unit, "times of less than 1e308 s",
+                        key="unit")  # fmt: skip
         return self
+
+    @property
+    def unit_seconds(self) -> float:
+        """The unit of tables and figures, s."""
+        return _unit.SECONDS[self.unit]
+
+    @property
+    def seconds(self) -> "np.ndarray":
+        """Sample times, s."""
+        import numpy as np
+
+        if self.values is not None:
+            return np.array(self.values) * self.unit_seconds
+        assert self.stop is not None  # the model asks for both
+        assert self.number is not None
+        return np.linspace(self.start, self.stop, self.number) * self.unit_seconds
 
 
 class Method(Table):
@@ -92,7 +129,8 @@ class Method(Table):
         return self
 
 
-class Published(Table):
+class Published(Measured):
+    measures = ("value", "uncertainty")
     name: Annotated[str, choice(PERIODS)]
     value: Annotated[float, NUMBER]
     uncertainty: Annotated[float, POSITIVE] | None = None
@@ -117,6 +155,8 @@ class Observation(Table):
 
 
 class Observations(Table):
+    """Attitudes and body rates that were observed."""
+
     source: Text = ""
     sequence: Annotated[str, SEQUENCE] = "zyz"
     angle_unit: Angle = "rad"
@@ -133,16 +173,52 @@ class Observations(Table):
                     raise wrong("mixed kinds of attitude", row.wxyz, expected, key=place)
         return self
 
+    @model_validator(mode="after")
+    def _in_si(self) -> "Observations":
+        factors = {"time": _unit.SI[self.time_unit], "angles": _unit.SI[self.angle_unit],
+                   "omega_body": _unit.SI[self.rate_unit]}  # fmt: skip
+        rows = [
+            row.model_copy(update={name: scaled(value, factors[name])
+                                   for name, value in row.given() if name in factors})
+            for row in self.rows
+        ]  # fmt: skip
+        return self.model_copy(update={"rows": rows})
+
+    @property
+    def seconds(self) -> "np.ndarray":
+        """Times of the rows (n,), s."""
+        import numpy as np
+
+        return np.array([row.time for row in self.rows])
+
+    @property
+    def attitudes(self) -> Attitudes:
+        """Those of the rows, NaN where a row has none."""
+        if any(row.angles is not None for row in self.rows):
+            return Attitudes(_columns([row.angles for row in self.rows], 3), self.sequence)
+        return Attitudes(_columns([row.wxyz for row in self.rows], 4))
+
+    @property
+    def omega_body(self) -> "np.ndarray":
+        """Body rates of the rows (n, 3), rad/s, NaN where a row has none."""
+        return _columns([row.omega_body for row in self.rows], 3)
+
+
+def _columns(rows: list[list[float] | None], width: int) -> "np.ndarray":
+    import numpy as np
+
+    return np.array([[math.nan] * width if row is None else row for row in rows])
+
 
 class Output(Table):
     file: Annotated[str, PATH] | None = None
     figure: Annotated[bool, FLAG] = True
 
 
-class SceneText(Table):
+class SceneFile(Table):
     """A scene of a rotating rigid body."""
 
-    title: Text | None = None
+    title: Text = Field("", description="the name of the file if left out")
     source: Text = Field("", description="where the numbers come from")
     epoch: Annotated[datetime.datetime, DATE] | None = Field(None, description="of time 0")
     frame: Text = Field("an inertial frame", description="name of the inertial frame")
@@ -160,8 +236,26 @@ class SceneText(Table):
     output: Output = Output()
     ensemble: Ensemble | None = None
 
+    _path: Path = PrivateAttr(Path("<text>"))
+    _text: str = PrivateAttr("")
+    _rows: "Mapping[str, np.ndarray]" = PrivateAttr(default_factory=dict)
+
+    @property
+    def path(self) -> Path:
+        return self._path
+
+    @property
+    def text(self) -> str:
+        """What was read."""
+        return self._text
+
+    @property
+    def rows(self) -> "Mapping[str, np.ndarray]":
+        """Of [ensemble.arrays], left on the disk."""
+        return self._rows
+
     @model_validator(mode="after")
-    def _spreads_fit(self) -> "SceneText":
+    def _spreads_fit(self) -> "SceneFile":
         if self.monte_carlo is not None and self.ensemble is not None:
             raise wrong("two batches", Words("[monte_carlo] and [ensemble]"), "one of them",
                         "keep [monte_carlo] for a file with a figure, [ensemble] for a store of any"
@@ -184,11 +278,24 @@ class SceneText(Table):
         return self
 
     @model_validator(mode="after")
-    def _epoch_of_rows(self) -> "SceneText":
+    def _rows_since_epoch(self) -> "SceneFile":
         seen = self.observations
-        for row in [] if seen is None or self.epoch is not None else seen.rows:
+        if seen is None:
+            return self
+        rows, last = [], -math.inf
+        for index, row in enumerate(seen.rows):
+            time = row.time
             if row.utc is not None:
-                raise wrong("missing key", Words(f"utc = {row.utc.isoformat()} in a row"),
-                            "the epoch that utc is counted from",
-                            "add `epoch = 1992-11-09T17:49:47Z`", "epoch")  # fmt: skip
-        return self
+                if self.epoch is None:
+                    raise wrong("missing key", Words(f"utc = {row.utc.isoformat()} in a row"),
+                                "the epoch that utc is counted from",
+                                "add `epoch = 1992-11-09T17:49:47Z`", "epoch")  # fmt: skip
+                time = (row.utc - self.epoch).total_seconds()
+            assert time is not None  # a row has one of both
+            if not last < time < math.inf:
+                raise wrong(f"unsorted or repeated times (row {index + 1})",
+                            Words(f"{time} s after {last} s"), "rows in the order of time",
+                            "sort the rows", "observations.rows")  # fmt: skip
+            rows.append(row.model_copy(update={"time": time}))
+            last = time
+        return self.model_copy(update={"observations": seen.model_copy(update={"rows": rows})})

@@ -10,17 +10,17 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from polhode.io._error import SceneFileError, shorten
+from polhode.io._error import SceneFileError, shorten, visible
 
 if TYPE_CHECKING:
-    import polhode
+    from polhode.io._models import SceneFile
 
 MOST_BYTES = 16 * 2**20
 MOST_DEPTH = 16
 MOST_DIGITS = 4000
 
 
-def read_scene(path: str | os.PathLike) -> "polhode.io._specification.SceneFile":
+def read_scene(path: str | os.PathLike) -> "SceneFile":
     """Read and check a scene file (TOML, docs/scene_files.md); "-" reads standard input.
 
     Raises SceneFileError for a file that cannot be read, is larger than 16 MB, is not TOML, or
@@ -49,21 +49,23 @@ def read_scene(path: str | os.PathLike) -> "polhode.io._specification.SceneFile"
     return parse_scene(text, path)
 
 
-def parse_scene(
-    text: str, path: str | os.PathLike = "<text>"
-) -> "polhode.io._specification.SceneFile":
+def parse_scene(text: str, path: str | os.PathLike = "<text>") -> "SceneFile":
     """`read_scene` of a text; `path` is the name used in messages, and its folder that of the files
     of [ensemble.arrays].
     """
     path = Path(path)
-    checked = check_scene(text, path)
-    from polhode.io._convert import in_si  # numpy is imported for good files only
+    file = _checked(text, path)
+    file = file.model_copy(update={"title": file.title or visible(path.stem)})
+    file._path, file._text = path, text
+    plan = file.ensemble
+    if plan is not None and plan.arrays is not None:
+        from polhode.io._arrays import read_arrays  # needs numpy, which a mistake does not wait for
 
-    return in_si(checked, text, path)
+        file._rows = read_arrays(dict(plan.arrays.given()), plan.bodies, path)
+    return file
 
 
-def check_scene(text: str, path: Path) -> "polhode.io._models.SceneText":
-    """The text as a checked model. Raises SceneFileError."""
+def _checked(text: str, path: Path) -> "SceneFile":
     _limit(text, path)
     try:
         data = tomllib.loads(text)
@@ -75,10 +77,10 @@ def check_scene(text: str, path: Path) -> "polhode.io._models.SceneText":
         from pydantic import ValidationError
     except ImportError as error:
         raise ImportError("scene files need pydantic: pip install 'polhode[cli]'") from error
-    from polhode.io._models import SceneText
+    from polhode.io._models import SceneFile
 
     try:
-        return SceneText.model_validate(data)
+        return SceneFile.model_validate(data)
     except ValidationError as error:
         found = error.errors(include_url=False)
         # what is there and wrong comes before what is not there

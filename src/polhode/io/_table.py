@@ -1,7 +1,7 @@
 """A table of a scene file: known keys, needed keys, and choices among keys."""
 
 from collections.abc import Iterator, Mapping
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, model_validator
 
@@ -52,6 +52,27 @@ class Table(BaseModel):
     def given(self) -> Iterator[tuple[str, Any]]:
         """Names and values of the keys that hold something."""
         return ((name, value) for name, value in self if value is not None)
+
+
+class Measured(Table):
+    """A table with a `unit`: once it is checked, the numbers in `measures` are in SI."""
+
+    measures: ClassVar[tuple[str, ...]] = ("value",)
+
+    @model_validator(mode="after")
+    def _in_si(self) -> Self:
+        factor = _unit.SI[dict(self)["unit"]]
+        found = {name: scaled(x, factor) for name, x in self.given() if name in self.measures}
+        return self.model_copy(update=found)
+
+
+def scaled(value: Any, factor: float) -> Any:
+    """A number, a list of them or a table of them, times the factor."""
+    if isinstance(value, list):
+        return [scaled(x, factor) for x in value]
+    if isinstance(value, Table):
+        return value.model_copy(update={name: scaled(x, factor) for name, x in value.given()})
+    return value * factor
 
 
 class Words(str):

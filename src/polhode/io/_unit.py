@@ -24,3 +24,4 @@ MOMENTS = {
     "slug ft^2": 4.4482216152605 * 0.3048,
     "relative": 1.0,
 }
+SI = SECONDS | ANGLES | ANGULAR_RATES | MOMENTS | {"kg m^2/s": 1.0, "N m": 1.0}

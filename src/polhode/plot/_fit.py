@@ -82,11 +82,7 @@ def _single(result, recording, body) -> dict[str, Any]:
     model = omega - residual * noise
     hole = np.where(present, 1.0, np.nan)[:, None]
     moments, axes = pick(result.moments, 1), pick(result.axes, 1)
-    value, spread = (
-        (result.moments, result.moments_std)
-        if result.scale_known
-        else (result.ratios, result.ratios_std)
-    )
+    value, spread = result.determined
     return {
         "times": times,
         "omega": omega * hole,

@@ -1,7 +1,8 @@
 """matplotlib when it is there, a clear message when it is not, and the look of all figures."""
 
 import functools
-from types import ModuleType
+
+from polhode._checks import imported
 
 X, Y, Z = "#D55E00", "#009E73", "#0072B2"  # body or space axes; told apart by the colour-blind
 AXES = (X, Y, Z)
@@ -31,21 +32,12 @@ STYLE = {
 }
 
 
-def matplotlib() -> ModuleType:
-    """The matplotlib module; ImportError with the command that installs it."""
-    try:
-        import matplotlib
-    except ImportError as error:
-        raise ImportError("figures need matplotlib: pip install 'polhode[cli]'") from error
-    return matplotlib
-
-
 def styled(function):
     """Run a plotting function with the common look, leaving the user's settings as they are."""
 
     @functools.wraps(function)
     def wrapper(*args, **kwargs):
-        with matplotlib().rc_context(STYLE):
+        with imported("a figure", "matplotlib").rc_context(STYLE):
             return function(*args, **kwargs)
 
     return wrapper

@@ -5,6 +5,7 @@ from os.path import isfile
 
 import numpy as np
 
+from polhode._checks import imported
 from polhode.io import build_inertia, parse_scene
 from polhode.plot._view_data import Body
 
@@ -13,13 +14,7 @@ _NEEDED = ("wxyz", "omega_body", "momentum_space", "moments")
 
 def read(path: str | os.PathLike) -> tuple[list[Body], str]:
     """The bodies of a file that ``polhode run`` wrote, and its title."""
-    try:
-        import h5netcdf  # noqa: F401 - the engine that xarray is asked for below
-        import xarray
-    except ImportError as error:
-        raise ImportError(
-            "reading NetCDF needs xarray, h5netcdf and h5py: pip install 'polhode[cli]'"
-        ) from error
+    xarray = imported("reading NetCDF", "xarray", "h5netcdf")  # the engine asked for below
     if not isfile(path):
         raise FileNotFoundError(f"there is no file {path}.")
     with xarray.open_dataset(path, engine="h5netcdf", decode_times=False) as data:

@@ -7,10 +7,9 @@ import abc
 from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import as_number, is_concrete, require
+from polhode._checks import as_number, as_positive
 from polhode.hamiltonian import Attitude
 from polhode.parts import AbstractPart, Signature, shaped, terms_of
 from polhode.torques._torques import stacked
@@ -50,13 +49,7 @@ class Couplings(AbstractPart):
 
 
 def _not_negative(name: str, value) -> Array:
-    number = as_number(name, value)
-    if is_concrete(number):
-        require(
-            np.asarray(number) >= 0,
-            f"{name} must not be negative, got {value}: friction takes energy away.",
-        )
-    return number
+    return as_positive(name, value, zero=True, hint="friction takes energy away")
 
 
 class ViscousCoupling(AbstractCoupling):
@@ -95,12 +88,7 @@ class CoulombFriction(AbstractCoupling):
 
     def __init__(self, torque, speed):
         self.size = _not_negative("CoulombFriction torque", torque)
-        self.speed = as_number("CoulombFriction speed", speed)
-        if is_concrete(self.speed):
-            require(
-                np.asarray(self.speed) > 0,
-                f"CoulombFriction speed must be positive, got {speed}: it smooths the step.",
-            )
+        self.speed = as_positive("CoulombFriction speed", speed, hint="it smooths the step")
 
     def torque(self, t, speed, attitude, omega):
         return -self.size * jnp.tanh(speed / self.speed)
@@ -140,10 +128,7 @@ class Motor(AbstractCoupling):
         else:
             self.command = as_number("Motor command", command)
         for name, value in (("most_torque", most_torque), ("most_speed", most_speed)):
-            number = None if value is None else as_number(f"Motor {name}", value)
-            if number is not None and is_concrete(number):
-                require(np.asarray(number) > 0, f"Motor {name} must be positive, got {value}.")
-            setattr(self, name, number)
+            setattr(self, name, None if value is None else as_positive(f"Motor {name}", value))
         if most_speed is not None and most_torque is None:
             raise ValueError("Motor most_speed needs most_torque, the torque that falls with it.")
 

@@ -20,10 +20,9 @@ dissipation on the free body motions of spacecraft, JPL TR 32-860 (1966).
 from collections.abc import Callable, Sequence
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import as_number, is_concrete, require
+from polhode._checks import as_positive
 from polhode.hamiltonian import Vector, cross, triple
 from polhode.parts import Signature, shaped
 from polhode.torques._torques import AbstractTorque, stacked
@@ -61,12 +60,7 @@ class EnergySink(AbstractTorque):
         if callable(k):
             self.k = _RATE_LAW.checked(k)
             return
-        self.k = as_number("EnergySink k", k)
-        if is_concrete(self.k):
-            require(
-                np.asarray(self.k) >= 0,
-                f"EnergySink k must not be negative, got {k}: a positive k takes energy away.",
-            )
+        self.k = as_positive("EnergySink k", k, zero=True, hint="a positive k takes energy away")
 
     def body_components(self, t, attitude, omega):
         return (jnp.zeros_like(omega[0]),) * 3  # nothing acts from outside

@@ -9,7 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, as_number, describe, is_concrete, require
+from polhode._checks import (
+    as_float_array,
+    as_number,
+    describe,
+    is_concrete,
+    require,
+    require_positive,
+)
 from polhode.parts import AbstractPart, shaped
 
 
@@ -155,8 +162,7 @@ class KeplerOrbit(AbstractConic):
         dtype = jnp.result_type(*(x for x in numbers.values()))
         for name, value in numbers.items():
             setattr(self, name, value.astype(dtype))
-        if is_concrete(self.mu):
-            require(np.asarray(self.mu) > 0, f"mu must be positive, got {mu}.")
+        require_positive("mu", self.mu)
         if is_concrete(self.eccentricity):
             e = np.asarray(self.eccentricity)
             if hyperbolic is None:
@@ -245,8 +251,7 @@ class StateOrbit(AbstractConic):
         dtype = jnp.result_type(*given.values())
         for name, value in given.items():
             setattr(self, name, value.astype(dtype))
-        if is_concrete(self.mu):
-            require(np.asarray(self.mu) > 0, f"mu must be positive, got {mu}.")
+        require_positive("mu", self.mu)
         if is_concrete(self.mu, self.position, self.velocity):
             place, speed = np.asarray(self.position), np.asarray(self.velocity)
             distance = np.linalg.norm(place, axis=-1)

@@ -9,7 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, as_number, is_concrete, numbers, require, together
+from polhode._checks import (
+    as_float_array,
+    as_number,
+    as_positive,
+    is_concrete,
+    numbers,
+    require,
+    together,
+)
 from polhode.hamiltonian import Attitude, components, dot
 from polhode.inertia import Inertia
 from polhode.parts import AbstractPart, Signature, shaped, terms_of
@@ -86,13 +94,9 @@ class UniformGravity(AbstractPotential):
         on_axis=False,
         vertical=False,
     ):
-        self.mass = as_number("mass", mass)
+        self.mass = as_positive("mass", mass, zero=True, hint="give it in kg")
         self.centre_body = as_float_array("centre_body", centre_body, (3,))
         self.gravity_space = as_float_array("gravity_space", gravity_space, (3,))
-        if is_concrete(self.mass):
-            require(
-                np.asarray(self.mass) >= 0, f"mass must not be negative, got {mass}: give it in kg."
-            )
         self.on_axis, self.vertical = bool(on_axis), bool(vertical)
         if self.vertical and is_concrete(self.gravity_space):
             require(
@@ -161,12 +165,8 @@ class GravityGradient(AbstractPotential):
     vertical: bool = eqx.field(static=True, default=False)
 
     def __init__(self, mu, position_space, vertical=False):
-        self.mu = as_number("mu", mu)
+        self.mu = as_positive("mu", mu, zero=True, hint="give it in m^3/s^2")
         self.vertical = bool(vertical)
-        if is_concrete(self.mu):
-            require(
-                np.asarray(self.mu) >= 0, f"mu must not be negative, got {mu}: give it in m^3/s^2."
-            )
         if callable(position_space):
             require(not vertical, "vertical is for a constant position: leave it out.")
             self.position_space = vector_of_time("GravityGradient", position_space)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, as_number, is_concrete, require
+from polhode._checks import as_float_array, as_number, is_concrete, require, require_positive
 from polhode.parts import shaped
 from polhode.torques._couplings import AbstractCoupling
 from polhode.torques._rotors import IMPULSE, AbstractRotor
@@ -95,11 +95,8 @@ class Rotor(AbstractRotor):
                 "Rotor needs inertia, the wheel's moment about its axis in kg m^2, unless it is"
                 " held at a given momentum."
             )
-        if inertia is not None and is_concrete(self.inertia):
-            require(
-                np.asarray(self.inertia) > 0,
-                f"the rotor's inertia must be positive, got {inertia}: give it in kg m^2.",
-            )
+        if self.inertia is not None:
+            require_positive("the rotor's inertia", self.inertia, hint="give it in kg m^2")
 
     @property
     def is_held(self) -> bool:

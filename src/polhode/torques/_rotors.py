@@ -261,19 +261,15 @@ class Wheels(AbstractRotor):
             for i, k in zip(loose, along):
                 column = [jnp.zeros_like(self.inertia[..., i])] * 3
                 column[k] = self.inertia[..., i]
-                less = _plus(less, jnp.stack(column, axis=-1))
+                less = jnp.add(*jnp.broadcast_arrays(less, jnp.stack(column, axis=-1)))
             axial = all(k == 2 for k in along)
             symmetric = axial and inertia.symmetry is not Symmetry.NONE
             kind = Symmetry.AXISYMMETRIC if symmetric else Symmetry.NONE
-            return Inertia.of_symmetry(_plus(inertia.moments, -less), kind, physical=False)
+            left = jnp.subtract(*jnp.broadcast_arrays(inertia.moments, less))
+            return Inertia.of_symmetry(left, kind, physical=False)
         tensor = inertia.tensor
         for i in loose:
             axis = self.axes[..., i, :]
-            outer = axis[..., :, None] * axis[..., None, :]
-            tensor = _plus(tensor, -self.inertia[..., i, None, None] * outer)
+            wheel = self.inertia[..., i, None, None] * (axis[..., :, None] * axis[..., None, :])
+            tensor = jnp.subtract(*jnp.broadcast_arrays(tensor, wheel))
         return Inertia(full=tensor)
-
-
-def _plus(a: Array, b: Array) -> Array:
-    shape = np.broadcast_shapes(a.shape, b.shape)
-    return jnp.broadcast_to(a, shape) + jnp.broadcast_to(b, shape)

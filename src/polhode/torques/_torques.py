@@ -5,10 +5,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, is_concrete, require
+from polhode._checks import as_float_array, require_positive
 from polhode.hamiltonian import Attitude, Vector, components
 from polhode.parts import AbstractPart, Signature, shaped, terms_of
 
@@ -130,15 +129,11 @@ class SpaceTorque(AbstractTorque):
 
 def coefficients(name: str, c) -> Array:
     """Damping about three axes, from one number or three."""
-    given, c = c, as_float_array(f"{name} c", c)
+    c = as_float_array(f"{name} c", c)
     if c.ndim == 0:
         c = jnp.broadcast_to(c, (3,))
     c = as_float_array(f"{name} c", c, (3,))
-    if is_concrete(c):
-        require(
-            np.asarray(c) >= 0,
-            f"{name} c must not be negative, got {given}: a positive c takes energy away.",
-        )
+    require_positive(f"{name} c", c, zero=True, hint="a positive c takes energy away")
     return c
 
 

@@ -9,16 +9,13 @@ from typing import Any
 import numpy as np
 
 from polhode import __version__
+from polhode._checks import imported
 from polhode.methods import Status
 
 
 def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
     """See ``Trajectory.to_xarray``."""
-    try:
-        import xarray
-    except ImportError as error:
-        raise ImportError("to_xarray needs xarray: pip install 'polhode[cli]'") from error
-
+    xarray = imported("to_xarray", "xarray")
     rank, wxyz, omega = len(trajectory.batch_shape), trajectory.wxyz, trajectory.omega_body
     batch = ("body",) if rank == 1 else tuple(f"batch_{i}" for i in range(rank))
     shared = trajectory.ts.ndim == 1

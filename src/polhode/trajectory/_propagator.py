@@ -9,7 +9,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
 from polhode import rotation
-from polhode._batch import PARTS, flatten, map_arrays
+from polhode._batch import PARTS, flatten, lane_times, map_arrays
 from polhode._checks import as_float_array
 from polhode._scene import Scene
 from polhode._state import State
@@ -73,16 +73,10 @@ def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
     propagator: Any = trajectory.propagator
     batch, ts = trajectory.batch_shape, trajectory.ts
     parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
-    samples = [
-        x.reshape(-1, *x.shape[len(batch) :])
-        for x in (trajectory.wxyz, trajectory.omega_body, trajectory.spins)
-        if x is not None
-    ]
+    samples = [x.reshape(-1, *x.shape[len(batch) :]) for x in trajectory._samples]
     finite, times = jnp.isfinite(t), t
     if ts.ndim > 1 or times.ndim > 1:  # one row a body
-        ts, times = (
-            jnp.broadcast_to(x, (*batch, x.shape[-1])).reshape(-1, x.shape[-1]) for x in (ts, times)
-        )
+        ts, times = (lane_times(jnp.atleast_2d(x), batch) for x in (ts, times))
     times = jnp.where(jnp.isfinite(times), times, ts[..., :1])
     move = _from_first if in_order or propagator.method.exact else _from_nearest
     found, status, steps = move(propagator, Scene(**parts), samples, ts, times)
@@ -171,10 +165,7 @@ def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
 def shortly_after(trajectory: Trajectory, late: Array) -> Trajectory:
     """Samples so little later, by ``late`` (..., T) [s], that three terms of their Taylor series
     lead there: of what is no later but for its derivatives, values and two derivatives."""
-    samples = [
-        x for x in (trajectory.wxyz, trajectory.omega_body, trajectory.spins) if x is not None
-    ]
-    found = _along(trajectory._scene, samples, trajectory._t, late[..., None])
+    found = _along(trajectory._scene, trajectory._samples, trajectory._t, late[..., None])
     wxyz, omega, *spins = found
     return Trajectory(
         trajectory._t + late, wxyz, omega, trajectory.status, trajectory.steps, trajectory.scene,

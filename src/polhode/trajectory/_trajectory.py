@@ -205,6 +205,11 @@ class Trajectory(eqx.Module):
         return _derived(of, bare)
 
     @property
+    def _samples(self) -> list[Array]:
+        """Attitude, rates and momenta of coupled wheels (..., T, n), as far as there are such."""
+        return [x for x in (self.wxyz, self.omega_body, self.spins) if x is not None]
+
+    @property
     def _scene(self) -> Scene:
         """The scene with arrays shaped to broadcast against (..., T) samples."""
         rank = len(self.batch_shape)
