@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode import rotation
-from polhode._batch import map_arrays
+from polhode._batch import along_time
 from polhode._checks import as_float_array
 from polhode.hamiltonian import Attitude, components
 from polhode.parts import AbstractPart, shaped
@@ -45,17 +45,6 @@ class LVLH(AbstractPart):
             )
         found: Any = vector_of_time("LVLH", orbit)
         self.orbit = found
-
-    def _along(self, t: Array, times: int) -> "LVLH":
-        """With orbits shaped to broadcast against ``times`` axes of time."""
-        if not isinstance(self.orbit, AbstractOrbit):
-            return self
-
-        def lift(x, rank):
-            lead = x.shape[: x.ndim - rank]
-            return x if lead == () else x.reshape(*lead, *(1,) * times, *x.shape[x.ndim - rank :])
-
-        return LVLH(map_arrays(self.orbit, lift))
 
     def axes(self, t: Array) -> tuple[Float[Array, "*b 3"], ...]:
         """Unit vectors x, y, z of the frame in space, and its rates [rad/s] along them."""
@@ -116,8 +105,10 @@ class LVLH(AbstractPart):
 
     def yaw_pitch_roll(self, trajectory) -> tuple[Array, Array, Array]:
         """Angles ZYX [rad] of a trajectory's body axes in the frame, each (..., T)."""
-        ts = trajectory.ts
-        wxyz, _ = self._along(ts, 1).to_frame(
+        frame = self
+        if isinstance(self.orbit, AbstractOrbit):  # which may be one for each body
+            frame = LVLH(along_time(self.orbit, len(trajectory.batch_shape)))
+        wxyz, _ = frame.to_frame(
             trajectory._need("wxyz"), trajectory._need("omega_body"), trajectory._t
         )
         return rotation.wxyz_to_euler(wxyz, rotation.Sequence.ZYX)
