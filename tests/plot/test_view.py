@@ -142,7 +142,7 @@ def test_text_of_the_user_stays_text():
         ({"names": ["a", "b"]}, "names must name the 1 bodies"),
         ({"seconds": 0.0}, "seconds must be positive"),
         ({"mesh": (np.zeros((3, 2)), np.zeros((1, 3), int))}, "vertices"),
-        ({"mesh": (np.ones((3, 3)), np.array([[0, 1, 3]]))}, "from 0 to 2"),
+        ({"mesh": (np.ones((3, 3)), np.array([[0, 1, 3]]))}, "vertices 0 to 2, got 0 to 3"),
         ({"mesh": [None, None]}, "one for each of 1 bodies"),
     ],
 )

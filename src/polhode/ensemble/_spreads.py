@@ -17,6 +17,7 @@ from polhode import rotation
 from polhode._scene import Scene
 from polhode._state import State
 from polhode.inertia import Inertia
+from polhode.io._arrays import possible_moments
 from polhode.torques import BodyTorque, SpaceTorque
 
 _MOST_DRAWS = 100
@@ -47,15 +48,12 @@ class SpreadMoments(eqx.Module):
     def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
         nominal = scene.inertia.moments
 
-        def possible(moments):
-            return (jnp.min(moments) > 0) & (2 * jnp.max(moments) <= jnp.sum(moments))
-
         def draw(trial):
             return nominal * (1 + self.relative(jax.random.fold_in(key, trial)))
 
         def unfinished(carry):
             trial, moments = carry
-            return ~possible(moments) & (trial < _MOST_DRAWS)
+            return ~possible_moments(moments) & (trial < _MOST_DRAWS)
 
         def again(carry):
             trial, _ = carry
@@ -63,7 +61,7 @@ class SpreadMoments(eqx.Module):
 
         zero = jnp.zeros((), jnp.int32)
         _, moments = jax.lax.while_loop(unfinished, again, (zero + 1, draw(zero)))
-        moments = jnp.where(possible(moments), moments, jnp.nan)
+        moments = jnp.where(possible_moments(moments), moments, jnp.nan)
         return dataclasses.replace(scene, inertia=Inertia.from_moments(moments)), state
 
 

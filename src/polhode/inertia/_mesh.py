@@ -11,12 +11,8 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from polhode._checks import as_float_array, imported, is_concrete, require
 
 
-def check_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, np.ndarray]:
-    """Vertices (..., v, 3) as floats and faces (f, 3) as integers of a closed, oriented surface.
-
-    Raises ValueError when the surface has holes, faces wound against their neighbours, or
-    (vertices known) does not enclose a positive volume.
-    """
+def as_triangles(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, np.ndarray]:
+    """Vertices (..., v, 3) as floats and faces (f, 3) as integers; TypeError or ValueError."""
     vertices = as_float_array("vertices", vertices, (None, 3))
     if not is_concrete(faces):
         raise TypeError(
@@ -36,6 +32,16 @@ def check_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, np.ndarray
         f"faces must refer to vertices 0 to {count - 1}, got {faces.min()} to {faces.max()}; "
         "does the file count from 1?",
     )
+    return vertices, faces
+
+
+def check_mesh(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, np.ndarray]:
+    """``as_triangles`` of a closed, oriented surface.
+
+    Raises ValueError when the surface has holes, faces wound against their neighbours, or
+    (vertices known) does not enclose a positive volume.
+    """
+    vertices, faces = as_triangles(vertices, faces)
     _check_closed(faces)
     if is_concrete(vertices) and vertices.size:
         with jax.ensure_compile_time_eval():  # the numbers are known, also under jit

@@ -3,6 +3,7 @@
 import stat
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -49,8 +50,8 @@ def _read(name: str, written: str, bodies: int, scene: Path) -> np.ndarray:
     return rows
 
 
-def possible_moments(moments: np.ndarray) -> np.ndarray:
-    """Which rows (..., 3) are positive and obey the triangle inequality."""
+def possible_moments(moments: Any) -> Any:
+    """Which rows (..., 3) of NumPy or JAX are positive and obey the triangle inequality."""
     return (moments.min(axis=-1) > 0) & (2 * moments.max(axis=-1) <= moments.sum(axis=-1))
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from polhode.inertia._mesh import load_mesh
+from polhode.inertia._mesh import as_triangles, load_mesh
 from polhode.plot._samples import Samples, as_samples, box_sides, matrices
 from polhode.rotation import matrix_to_wxyz
 from polhode.trajectory import Trajectory
@@ -169,20 +169,10 @@ def _mesh(mesh: Any) -> dict[str, Any]:
             "mesh must be a pair (vertices, faces), a trimesh.Trimesh or the path of a mesh file,"
             f" got {type(mesh).__name__}."
         )
-    vertices, faces = np.asarray(mesh[0], np.float64), np.asarray(mesh[1])
-    good = vertices.ndim == 2 and vertices.shape[1] == 3 and np.isfinite(vertices).all()
-    if not (good and faces.ndim == 2 and faces.shape[1] == 3 and faces.size):
-        raise ValueError(
-            "a mesh needs finite vertices (v, 3) and faces (f, 3),"
-            f" got {vertices.shape} and {faces.shape}."
-        )
-    if (
-        not np.issubdtype(faces.dtype, np.integer)
-        or faces.min() < 0
-        or faces.max() >= len(vertices)
-    ):
-        raise ValueError(f"faces must be whole numbers from 0 to {len(vertices) - 1}.")
-    return _solid(vertices, faces, None)
+    vertices, faces = as_triangles(*mesh)
+    if vertices.ndim != 2:
+        raise ValueError(f"a mesh of one body needs vertices (v, 3), got {vertices.shape}.")
+    return _solid(np.asarray(vertices), faces, None)
 
 
 def camera(momenta: list[np.ndarray]) -> tuple[list[float], list[float]]:
