@@ -43,7 +43,8 @@ class Pointing(AbstractTorque):
         wanted = as_float_array("Pointing target", target, (4,))
         if is_concrete(wanted):
             require(
-                np.any(np.asarray(wanted) != 0, axis=-1), f"target must not be zero, got {target}."
+                np.any(np.asarray(wanted) != 0, axis=-1),
+                lambda: f"target must not be zero, got {target}.",
             )
         self.target = rotation.normalise(wanted)
 

@@ -169,16 +169,20 @@ class KeplerOrbit(AbstractConic):
                 hyperbolic = bool(np.all(e > 1))
             require(
                 e > 1 if hyperbolic else (e >= 0) & (e < 1),
-                f"eccentricity must lie in [0, 1), or for a batch of hyperbolas above 1, got"
-                f" {eccentricity}.",
+                lambda: (
+                    "eccentricity must lie in [0, 1), or for a batch of hyperbolas above 1, got"
+                    f" {eccentricity}."
+                ),
             )
         self.hyperbolic = bool(hyperbolic)
         if is_concrete(self.semi_major_axis):
             axis = np.asarray(self.semi_major_axis)
             require(
                 axis < 0 if self.hyperbolic else axis > 0,
-                "semi_major_axis must be positive, of a hyperbola (eccentricity above 1) negative,"
-                f" got {semi_major_axis}.",
+                lambda: (
+                    "semi_major_axis must be positive, of a hyperbola (eccentricity above 1)"
+                    f" negative, got {semi_major_axis}."
+                ),
             )
 
     @property

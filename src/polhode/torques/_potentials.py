@@ -101,12 +101,17 @@ class UniformGravity(AbstractPotential):
         if self.vertical and is_concrete(self.gravity_space):
             require(
                 np.asarray(self.gravity_space)[..., :2] == 0,
-                f"vertical says that gravity is along space z, got {gravity_space}: leave it out.",
+                lambda: (
+                    f"vertical says that gravity is along space z, got {gravity_space}: leave it"
+                    " out."
+                ),
             )
         if self.on_axis and is_concrete(self.centre_body):
             require(
                 np.asarray(self.centre_body)[..., :2] == 0,
-                f"on_axis says that the centre lies on body z, got {centre_body}: leave it out.",
+                lambda: (
+                    f"on_axis says that the centre lies on body z, got {centre_body}: leave it out."
+                ),
             )
 
     @classmethod
@@ -180,8 +185,10 @@ class GravityGradient(AbstractPotential):
                 )
                 require(
                     not vertical or np.all(np.asarray(self.position_space)[..., :2] == 0),
-                    f"vertical says that the position is along space z, got {position_space}:"
-                    " leave it out.",
+                    lambda: (
+                        f"vertical says that the position is along space z, got {position_space}:"
+                        " leave it out."
+                    ),
                 )
 
     @property

@@ -58,7 +58,10 @@ class Rotor(AbstractRotor):
         if is_concrete(axis):
             require(
                 np.any(np.asarray(axis) != 0, axis=-1),
-                f"axis_body must not be zero, got {axis_body}: give the wheel's axis in body axes.",
+                lambda: (
+                    f"axis_body must not be zero, got {axis_body}: give the wheel's axis in body"
+                    " axes."
+                ),
             )
             self.along = _body_axis(np.asarray(axis))
         self.axis_body = _unit(axis)
