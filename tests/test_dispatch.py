@@ -235,6 +235,19 @@ def test_the_first_sample_is_the_given_state():
         assert np.array_equal(found.omega_body[0], [0.1, 0.9, 0.2])
 
 
+def test_what_is_asked_of_a_trajectory_is_a_program_or_two(caplog):
+    """Not one for each operation: twenty of an energy are half a second."""
+    weight = ph.UniformGravity(1.0, [0.0, 0.1, 0.5])
+    trajectory = ph.simulate(ph.Scene(SCENE.inertia, weight), _state(), jnp.linspace(0, 1, 29))
+    asks = (lambda x: x.energy, lambda x: x.momentum_space, lambda x: x.euler())
+    for ask in asks:
+        caplog.clear()
+        with jax.log_compiles():
+            ask(trajectory)
+        made = [line for line in caplog.messages if "Finished XLA compilation" in line]
+        assert 1 <= len(made) <= 2, made
+
+
 def test_what_was_asked_before_compiles_nothing_again(caplog):
     """Loops with functions of their own would be new programs in every call outside of ``jit``."""
     tensor = np.diag([1.0, 2.0, 3.0]) + 0.1

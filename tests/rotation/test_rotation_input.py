@@ -76,6 +76,19 @@ def test_rounded_matrices_pass():
     assert jnp.isnan(rotation.matrix_to_wxyz(np.full((3, 3), np.nan))).all()
 
 
+def test_quaternions_whose_squares_are_no_numbers_are_seen():
+    """Squares of 1e-200 vanish, those of 1e200 are infinite."""
+    for size in (1e-200, 1e200):
+        np.testing.assert_allclose(
+            rotation.normalise([size, 0, 0, size]), [0.5**0.5, 0, 0, 0.5**0.5]
+        )
+        with pytest.raises(ValueError, match="must be of unit length"):
+            rotation.rotate([0, size, 0, 0], [1.0, 2, 3])
+    with pytest.raises(ValueError, match="must not be zero"):
+        rotation.normalise([[1e-200, 0, 0, 0], [0, 0, 0, 0]])
+    assert np.isnan(rotation.rotate([np.nan, 0, 0, 0], [1.0, 2, 3])).all()
+
+
 def test_a_traced_zero_has_no_angles():
     assert all(jnp.isnan(x) for x in jax.jit(rotation.wxyz_to_euler)(jnp.zeros(4)))
 
