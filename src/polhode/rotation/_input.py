@@ -34,6 +34,7 @@ def as_axes(name: str, value: Any) -> Array:
     return axes
 
 
+@np.errstate(over="ignore")
 def _check_length(name: str, seen: np.ndarray, unit: bool, hint: str) -> None:
     square = np.einsum("...i,...i->...", seen, seen)  # ten times as fast as largest components
     if np.any(square == 0):  # or so small that squares vanish
