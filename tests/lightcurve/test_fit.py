@@ -33,7 +33,7 @@ def trial(seen):
     meant = _hypotheses.Hypotheses(
         np.array([1.2, 1.2]), np.array([0.7, 0.7]), np.array([True, False])
     )
-    draws = _search.draw(jax.random.key(1), meant, 8, 0.0)
+    draws = _search.draw(jax.random.key(1), meant, 8)
     return jax.tree.map(jnp.asarray, _search.build(*draws, PHASE)[0])
 
 

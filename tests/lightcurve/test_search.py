@@ -16,7 +16,7 @@ MEANT = Hypotheses(np.array([1.2, 1.9]), np.array([0.7, 0.5]), np.array([True, F
 
 
 def test_bodies_have_the_periods_of_their_hypothesis():
-    bodies, good = _search.build(*_search.draw(jax.random.key(0), MEANT, 32, 0.0), PHASE)
+    bodies, good = _search.build(*_search.draw(jax.random.key(0), MEANT, 32), PHASE)
     mode = np.repeat(MEANT.long_axis, 32)
     assert good.mean() > 0.5
     f_phi, f_psi, found = _solutions.frequencies(bodies)
@@ -35,7 +35,7 @@ def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
     off = np.arange(9) * 1.5 / np.ptp(curve.t)
     meant = Hypotheses(right[0] + off, right[1] + 0 * off, np.full(9, truth["mode"] == 0))
     key = jax.random.key(0)
-    trials = _search.tried(key, meant, 1800, 3, PHASE, points, 0.0)
+    trials = _search.tried(key, meant, 1800, 3, PHASE, points, points, 0.0)
     np.testing.assert_array_equal(trials.source, np.repeat(np.arange(9), 3))
     f_phi, *_ = _solutions.frequencies(trials.bodies)
     np.testing.assert_allclose(f_phi, meant.f_phi[trials.source], rtol=1e-9)
@@ -43,9 +43,10 @@ def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
     misfit, _ = _search.misfits(PHASE, trials.bodies, points)
     misfit = misfit.reshape(9, 3)
     assert np.all(np.diff(misfit, axis=1) >= 0)
-    few, _ = _search.build(*_search.draw(jax.random.key(1), meant, 3, 0.0), PHASE)
+    few, _ = _search.build(*_search.draw(jax.random.key(1), meant, 3), PHASE)
     assert misfit.mean() < 0.7 * _search.misfits(PHASE, few, points)[0].mean()
-    state, reached = _fit._started(key, meant, 1800, 3, _steps.Problem(PHASE, points), 0.0)
+    problem = _steps.Problem(PHASE, points)
+    state, reached = _fit._started(key, meant, 1800, 3, problem, problem, 0.0)
     assert np.argmin(reached) == 0
     assert reached.min() == state.cost.min()
     assert np.isfinite(reached).all()
@@ -55,23 +56,24 @@ def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
 
 
 def test_the_likeliest_and_the_best_so_far_are_tried_again():
-    many = Hypotheses(np.arange(200.0), np.ones(200), np.ones(200, bool))
-    shared = _fit._shared(many, np.arange(200.0)[::-1])  # the least likely reached the least
-    times = np.bincount(shared.f_phi.astype(int), minlength=200)
+    count, half = 800, _fit._LEADING // 2
+    many = Hypotheses(np.arange(count), np.ones(count), np.ones(count, bool))
+    shared = _fit._shared(many, np.arange(count)[::-1])  # the least likely reached the least
+    times = np.bincount(shared.f_phi, minlength=count)
     assert times[0] == times[-1] == _fit._OFTEN
-    assert np.all(times[32:-32] == 0)
-    assert times[:32].min() > 0
-    assert times[-32:].min() > 0
-    assert np.all(np.diff(times[:32]) <= 0)
-    assert np.all(np.diff(times[-32:]) >= 0)
-    # half as often from the sixteenth of the 64 on
-    assert times[8] == _fit._OFTEN / 2
+    assert np.all(times[half:-half] == 0)
+    assert times[:half].min() > 0
+    assert times[-half:].min() > 0
+    assert np.all(np.diff(times[:half]) <= 0)
+    assert np.all(np.diff(times[-half:]) >= 0)
+    # half as often from a quarter of them on
+    assert times[half // 4] == _fit._OFTEN / 2
     one = _fit._shared(Hypotheses(*(x[:1] for x in many)), np.array([np.inf]))
     assert len(one.f_phi) == _fit._OFTEN
 
 
 def test_poles_of_one_pair_do_not_crowd_out_others():
-    bodies, good = _search.build(*_search.draw(jax.random.key(0), MEANT, 32, 0.0), PHASE)
+    bodies, good = _search.build(*_search.draw(jax.random.key(0), MEANT, 32), PHASE)
     lam, sam = np.flatnonzero(good[:32])[0], 32 + np.flatnonzero(good[32:])[0]
     index = np.r_[np.full(20, lam), sam]
     wxyz = np.random.default_rng(0).normal(size=(21, 4))

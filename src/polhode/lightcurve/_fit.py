@@ -24,11 +24,12 @@ from polhode.lightcurve._steps import BATCH, Problem, State, picked, spread_of_o
 
 _FEW = 160  # points that a search looks at
 _DESCENT = ((1.0, 2), (0.5, 3), (0.25, 6))  # parts of the starts, and their steps
+_LAST = 12  # steps of the better half of what is left
 _WIDE = 10.0  # limit of the first steps' residuals, in sigma
-_AGAIN, _MORE, _POLES = 8, 2000, 12  # pairs of periods searched again, by trials and starts of each
+# pairs of periods searched again: trials of each, in as many parts with frequencies of their own
+_AGAIN, _MORE, _PARTS = 8, 2000, 6
 _LIMIT = 3.0  # of residuals in a search, in sigma
-_FIRST, _TIMES = 16, 12  # so many of the hypotheses are tried so many times again
-_LEADING, _OFTEN = 64, 8  # as many then once more, the first as often; the 16th half as often
+_LEADING, _OFTEN = 512, 3  # as many are tried again, the first so often; the 128th half as often
 _ALIKE = 4  # poles kept of one pair of periods: a motion and its three mirror images
 _GROUPS = 8  # of so many, or more, it is learnt how much their zero points differ
 
@@ -39,7 +40,7 @@ def fit_light_curve(
     phase: AbstractPhase | None = None,
     pairs: Pairs | None = None,
     highest: float | None = None,
-    trials: int = 60_000,
+    trials: int = 40_000,
     starts: int = 2,
     searches: int = 3,
     floor: float = 0.03,
@@ -51,11 +52,11 @@ def fit_light_curve(
     """Every tumbling ellipsoid, of free inertia, that explains a light curve; without a guess.
 
     Pairs of frequencies from Fourier series, each with all it can mean; ``trials`` bodies of these
-    periods, all else drawn at random; Levenberg-Marquardt, with exact derivatives, on the best
-    ``starts`` of each pair and meaning, of the likeliest thirteen times as many of both; half as
-    many again of those with the best bodies so far; the mirror images of what is found; distinct
-    solutions, the ``most`` best and all others that cannot be excluded. Repeated until two searches
-    agree, ``searches`` times at most.
+    periods, their phases those that the series prefers, all else drawn at random;
+    Levenberg-Marquardt, with exact derivatives, on the best ``starts`` of each pair and meaning; as
+    many again of the likeliest and of those with the best bodies so far; the mirror images of what
+    is found; distinct solutions, the ``most`` best and all others that cannot be excluded. Repeated
+    until two searches agree, ``searches`` times at most.
 
     ``phase``: a phase function (default: ``HG1G2()`` where the phase angle changes by more than 5
     degrees, else ``SeeligerPhase()``). ``pairs``: instead of those from the series. ``highest``
@@ -155,14 +156,9 @@ def _searched(
 ) -> State:  # fmt: skip
     """Bodies of all hypotheses; then more with the periods found, whose pole may be wrong."""
     own = jax.random.split(key, 3)
-    index = np.arange(len(meant.f_phi))
-    index = np.r_[index, np.tile(index[:_FIRST], _TIMES)]
-    every = Hypotheses(*(x[index] for x in meant))
-    state, cost = _started(own[0], every, trials, starts, rough, blur)
-    reached = np.full(len(meant.f_phi), np.inf)
-    np.minimum.at(reached, index, cost)
+    state, reached = _started(own[0], meant, trials, starts, rough, problem, blur)
     likely = _shared(meant, reached)
-    more, _ = _started(own[2], likely, trials // 2, starts, rough, blur)
+    more, _ = _started(own[2], likely, trials, starts, rough, problem, blur)
     state = _better(problem, _joined(state, more), resolution, 3 * BATCH, _WIDE, 12)
     return _with_poles(own[1], state, rough, problem, resolution)
 
@@ -171,31 +167,36 @@ def _with_poles(key, state: State, rough: Problem, problem: Problem, resolution)
     """The best, and more of their periods."""
     near = _near(state, resolution)
     trials = _MORE * len(near.f_phi)
-    more, _ = _started(key, near, trials, _POLES, rough, 0.5 * resolution)
+    near = Hypotheses(*(np.repeat(x, _PARTS) for x in near))
+    more, _ = _started(key, near, trials, 2, rough, problem, 0.5 * resolution)
     more = problem.start(more.bodies, np.full(len(more.cost), _WIDE))
     return _better(problem, _joined(state, more), resolution, 2 * BATCH, _LIMIT, 12)
 
 
-def _started(key, meant, trials: int, keep: int, problem: Problem, blur):
+def _started(key, meant, trials: int, keep: int, rough: Problem, whole: Problem, blur):
     """Steps from the ``keep`` best trials of every hypothesis, more from the best of these.
 
     The bodies that were stepped to the end, and the least cost of each hypothesis.
     """
-    found = tried(key, meant, trials, keep, problem.phase, problem.points, blur)
+    found = tried(key, meant, trials, keep, rough.phase, whole.points, rough.points, blur)
     many = len(found.gain)
     bodies = taken(found.bodies, np.arange(many))
     # the gain, as a first step of the shape
     bodies.unknowns[:many, 2:4] *= found.gain[:, None]
     source = np.pad(found.source, (0, len(bodies.wxyz) - many), mode="edge")
-    state = problem.start(bodies, np.full(len(bodies.wxyz), _WIDE))
+    state = rough.start(bodies, np.full(len(bodies.wxyz), _WIDE))
     reached = np.full(len(meant.f_phi), np.inf)
     for part, steps in _DESCENT:
         best = np.argsort(state.cost)[: int(part * len(bodies.wxyz))]
         best = np.pad(best, (0, -len(best) % BATCH), mode="edge")
         source = source[best]
-        state = problem.improve(picked(state, best), np.full(len(best), _WIDE), steps)
+        state = rough.improve(picked(state, best), np.full(len(best), _WIDE), steps)
         np.minimum.at(reached, source, state.cost)
-    return state, reached
+    best = np.argsort(state.cost)[: len(state.cost) // 2]
+    best = np.pad(best, (0, -len(best) % BATCH), mode="edge")
+    last = rough.improve(picked(state, best), np.full(len(best), _WIDE), _LAST)
+    np.minimum.at(reached, source[best], last.cost)
+    return _joined(state, last), reached
 
 
 def _better(problem: Problem, state: State, resolution, keep: int, limit: float, steps: int):

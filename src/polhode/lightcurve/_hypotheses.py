@@ -31,7 +31,7 @@ class Hypotheses(NamedTuple):
     long_axis: np.ndarray  # bool: LAM
 
 
-def hypotheses(pairs: Pairs, t, values, *, columns=None, most: int = 400) -> Hypotheses:
+def hypotheses(pairs: Pairs, t, values, *, columns=None, most: int = 800) -> Hypotheses:
     """Bodies' frequencies that explain pairs of lines (g, h), the ``most`` most likely first.
 
     Each of g and h may be any of the main sums of either mode; or g of the best pairs is one, and

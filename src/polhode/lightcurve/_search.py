@@ -11,10 +11,12 @@ from polhode import free
 from polhode.lightcurve._hypotheses import Hypotheses
 from polhode.lightcurve._model import Bodies, Points, magnitudes, moments_of
 from polhode.lightcurve._phase import AbstractPhase
+from polhode.lightcurve._series import GAIN, directions, series, turned
+from polhode.lightcurve._steps import picked
 
 CHUNK = 2048
 _BISECTIONS = 24
-_GAIN = (0.6, 1.7)  # of the variations, in a trial's score
+_PART = 4  # of so many bodies the one whose light comes nearest to the series is looked at
 _SLOPE_SIGMA = 0.5  # of the phase function, in a trial's score [mag / rad]
 
 
@@ -51,18 +53,16 @@ def _allowed(u, long_axis, ratio):
 
 
 @jax.jit
-def _fresh(key, f_phi, f_psi, long_axis, blur) -> Draws:
+def _fresh(key, f_phi, f_psi, long_axis) -> Draws:
     """Anything possible; of six inertias the first that allows the periods."""
-    count, keys = f_phi.shape[0], jax.random.split(key, 5)
-    shake = blur * jax.random.uniform(keys[0], (2, count), minval=-1.0)
-    f_phi, f_psi = (jnp.maximum(f + d, f / 2) for f, d in zip((f_phi, f_psi), shake, strict=True))
-    inertia = jax.random.uniform(keys[1], (6, count, 2))
+    count, keys = f_phi.shape[0], jax.random.split(key, 4)
+    inertia = jax.random.uniform(keys[0], (6, count, 2))
     allowed = _allowed(_axes(inertia), long_axis, (f_psi / f_phi)[None])
     pick = jnp.argmax(allowed, axis=0)
     return Draws(
         jnp.take_along_axis(inertia, pick[None, :, None], axis=0)[0],
-        jax.random.uniform(keys[2], (count,)), jax.random.normal(keys[3], (count, 4)),
-        jax.random.normal(keys[4], (count, 2)), f_phi, f_psi,
+        jax.random.uniform(keys[1], (count,)), jax.random.normal(keys[2], (count, 4)),
+        jax.random.normal(keys[3], (count, 2)), f_phi, f_psi,
     )  # fmt: skip
 
 
@@ -111,11 +111,18 @@ def build(draws: Draws, long_axis, phase: AbstractPhase, spread: float = 0.15):
     return Bodies(np.concatenate([bodies.unknowns, typical], -1), bodies.wxyz), good
 
 
-def draw(key, hypotheses: Hypotheses, each: int, blur: float) -> tuple[Draws, np.ndarray]:
-    """``each`` of every hypothesis, and their modes; frequencies within ``blur`` of it."""
+def shaken(key, meant: Hypotheses, blur: float) -> Hypotheses:
+    """Frequencies within ``blur`` of those meant."""
+    shake = blur * np.asarray(jax.random.uniform(key, (2, len(meant.f_phi)), minval=-1.0))
+    f_phi, f_psi = (np.maximum(f + d, f / 2) for f, d in zip(meant[:2], shake, strict=True))
+    return Hypotheses(f_phi, f_psi, meant.long_axis)
+
+
+def draw(key, hypotheses: Hypotheses, each: int) -> tuple[Draws, np.ndarray]:
+    """``each`` of every hypothesis, and their modes."""
     f_phi, f_psi, long_axis = (np.repeat(x, each) for x in hypotheses)
     made = _in_chunks(
-        lambda k, *x: _fresh(jax.random.fold_in(key, k), *x, blur),
+        lambda k, *x: _fresh(jax.random.fold_in(key, k), *x),
         len(f_phi), f_phi, f_psi, long_axis,
     )  # fmt: skip
     return made, long_axis
@@ -130,7 +137,7 @@ def _misfit(phase, bodies: Bodies, points: Points, solver):
     model = free_of_offsets(magnitudes(phase, bodies, points))
     data = free_of_offsets(points.magnitude)
     both, own = ((model * x * points.weight).sum(-1, keepdims=True) for x in (data, model))
-    gain = jnp.clip(both / jnp.maximum(own, 1e-12), *_GAIN)
+    gain = jnp.clip(both / jnp.maximum(own, 1e-12), *GAIN)
     rest = (gain * model - data) ** 2
     # the mean of |r| where it is large: single points do not decide
     scale = jnp.sum(rest * points.weight, -1, keepdims=True) / jnp.sum(points.weight)
@@ -174,19 +181,38 @@ class Trials(NamedTuple):
 
 
 def tried(
-    key, meant: Hypotheses, count: int, keep: int, phase: AbstractPhase, points: Points, blur: float
-) -> Trials:
-    """The ``keep`` best of each hypothesis among about ``count`` bodies drawn."""
+    key, meant: Hypotheses, count: int, keep: int, phase: AbstractPhase,
+    points: Points, few: Points, blur: float,
+) -> Trials:  # fmt: skip
+    """The ``keep`` best of each hypothesis among about ``count`` bodies drawn.
+
+    Their phases are those that the series of all ``points`` prefers, their misfit that of ``few``:
+    directions that turn are left to the latter.
+    """
     many = len(meant.f_phi)
     each = max(keep, count // many)
-    draws, long_axis = draw(key, meant, each, blur)
+    keys = jax.random.split(key)
+    meant = shaken(keys[0], meant, blur)
+    draws, long_axis = draw(keys[1], meant, each)
     bodies, good = build(draws, long_axis, phase)
-    misfit, gain = misfits(phase, bodies, points)
-    misfit = np.where(good, misfit, np.inf).reshape(many, each)
-    best = np.argsort(misfit, axis=1)[:, :keep] + each * np.arange(many)[:, None]
-    best = best.reshape(-1)
-    return Trials(
-        Bodies(bodies.unknowns[best], bodies.wxyz[best]),
-        gain[best],
-        np.repeat(np.arange(many), keep),
-    )
+    source = np.repeat(np.arange(many), each)
+    right, matrix = series(points, *meant)
+    sun, observer = directions(points)
+    bodies, fall = _in_chunks(
+        lambda _, b, d, own: turned(
+            b, d.f_phi, d.f_psi, meant.long_axis[own], right[own], matrix[own], sun, observer
+        ),
+        len(source), bodies, draws, source,
+    )  # fmt: skip
+    index = _least(np.where(good, -fall, np.inf), many, max(keep, each // _PART))
+    bodies = picked(bodies, index)
+    misfit, gain = misfits(phase, bodies, few)
+    best = _least(np.where(good[index], misfit, np.inf), many, keep)
+    return Trials(picked(bodies, best), gain[best], np.repeat(np.arange(many), keep))
+
+
+def _least(values: np.ndarray, many: int, keep: int) -> np.ndarray:
+    """Numbers of the ``keep`` least of each of ``many`` equal parts."""
+    each = len(values) // many
+    best = np.argsort(values.reshape(many, each), axis=1)[:, :keep]
+    return (best + each * np.arange(many)[:, None]).reshape(-1)
