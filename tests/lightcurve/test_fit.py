@@ -29,12 +29,15 @@ def seen():
 
 @pytest.fixture(scope="module")
 def trial(seen):
-    """Two bodies of given periods, in both modes."""
+    """Eight bodies of given periods in each mode."""
     meant = _hypotheses.Hypotheses(
         np.array([1.2, 1.2]), np.array([0.7, 0.7]), np.array([True, False])
     )
-    draws = _search.draw(jax.random.key(1), meant, 8)
-    return jax.tree.map(jnp.asarray, _search.build(*draws, PHASE)[0])
+    bodies, good = _search.build(*_search.draw(jax.random.key(1), meant, 24), PHASE)
+    lam, sam = (np.flatnonzero(x)[:8] for x in good.reshape(2, 24))
+    index = np.r_[lam, 24 + sam]
+    assert len(index) == 16
+    return jax.tree.map(lambda x: jnp.asarray(x[index]), bodies)
 
 
 def test_trial_bodies_have_the_periods_asked(trial):

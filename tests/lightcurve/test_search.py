@@ -67,7 +67,7 @@ def test_the_likeliest_and_the_best_so_far_are_tried_again():
     assert np.all(np.diff(times[:half]) <= 0)
     assert np.all(np.diff(times[-half:]) >= 0)
     # half as often from a quarter of them on
-    assert times[half // 4] == _fit._OFTEN / 2
+    assert times[half // 4] == round(_fit._OFTEN / 2)
     one = _fit._shared(Hypotheses(*(x[:1] for x in many)), np.array([np.inf]))
     assert len(one.f_phi) == _fit._OFTEN
 

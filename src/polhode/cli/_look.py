@@ -32,7 +32,7 @@ def lightcurve(
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="figure and numbers: OUTPUT.png, .json")
     ] = None,
-    trials: Annotated[int, typer.Option(help="motions tried before the best are fitted")] = 60_000,
+    trials: Annotated[int, typer.Option(help="motions tried before the best are fitted")] = 40_000,
     floor: Annotated[float, typer.Option(help="least error of a point [mag]")] = 0.03,
     seed: Annotated[int, typer.Option(help="of the trials")] = 0,
     debug: DebugOption = False,

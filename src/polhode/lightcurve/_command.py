@@ -53,7 +53,7 @@ def run(
     *,
     vectors: str | PathLike[str] | None = None,
     output: str | PathLike[str] | None = None,
-    trials: int = 60_000,
+    trials: int = 40_000,
     highest: float | None = None,
     floor: float = 0.03,
     seed: int = 0,
