@@ -85,6 +85,15 @@ def test_mixed_dtypes_and_batches_that_do_not_fit():
         ph.simulate(scene, single, TS, rtol=1e-9)
 
 
+def test_lists_of_single_precision_stay_so():
+    """Python's own numbers take the default precision, those of NumPy keep theirs."""
+    for kind in (np.float32, np.float64):
+        row = list(np.array([1.0, 1.5, 2.0], kind))
+        assert ph.Inertia.from_moments(row).moments.dtype == kind
+        assert ph.State(np.array([1, 0, 0, 0], kind), row).omega_body.dtype == kind
+    assert ph.Inertia.from_moments([1, 1.5, 2]).moments.dtype == jnp.float64
+
+
 def test_non_unit_quaternions_are_normalised_at_every_scale():
     for scale in (1e-300, 1e-5, 1.0, 1e300):
         state = ph.State(np.array([3.0, 0, 4.0, 0]) * scale, [0.0, 0, 1])

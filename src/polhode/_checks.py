@@ -75,10 +75,8 @@ def as_float_array(
         leaves = jax.tree.leaves(value, is_leaf=lambda leaf: leaf is None)
         if any(leaf is None or isinstance(leaf, (str, bytes)) for leaf in leaves):
             raise TypeError("no number")  # jax would read some strings as the name of a dtype
-        if isinstance(value, list | tuple) and not any(isinstance(x, jax.Array) for x in leaves):
-            value = np.asarray(value)
-            if value.dtype.kind in "fiu":  # jnp.asarray compiles a program for each length
-                value = jax.device_put(value.astype(float, copy=False))
+        if isinstance(value, list | tuple) and all(type(x) in (float, int) for x in leaves):
+            value = jax.device_put(np.asarray(value, float))  # jnp.asarray compiles a program
         array = jnp.asarray(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise TypeError(

@@ -1,13 +1,12 @@
 """The state of a rotating body: attitude and body rates."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._checks import as_float_array, describe, is_concrete, require
+from polhode._checks import as_float_array, is_concrete, require
 from polhode.hamiltonian import (
     canonical_from_momentum,
     components,
@@ -16,8 +15,6 @@ from polhode.hamiltonian import (
 )
 from polhode.inertia import Inertia
 from polhode.parts import AbstractPart, shaped
-
-_normalise = jax.jit(rotation.normalise)  # one program, not one for each operation
 
 
 class State(AbstractPart):
@@ -38,14 +35,6 @@ class State(AbstractPart):
             wxyz = rotation.scipy_to_wxyz(wxyz, getattr(omega_body, "dtype", None))
         quaternion = as_float_array("wxyz", wxyz, (4,))
         rates = as_float_array("omega_body", omega_body, (3,))
-        if is_concrete(quaternion):
-            require(
-                np.any(np.asarray(quaternion) != 0, axis=-1),
-                lambda: (
-                    f"wxyz must not be zero, got {describe(wxyz)}: a rotation is a unit quaternion,"
-                    " scalar first; (1, 0, 0, 0) is no rotation."
-                ),
-            )
         try:
             np.broadcast_shapes(quaternion.shape[:-1], rates.shape[:-1])
         except ValueError as error:
@@ -53,7 +42,7 @@ class State(AbstractPart):
                 f"wxyz {quaternion.shape} and omega_body {rates.shape} must have leading axes"
                 " that broadcast together."
             ) from error
-        self.wxyz = _normalise(quaternion)
+        self.wxyz = rotation.normalise(quaternion)
         self.omega_body = rates
 
     @classmethod

@@ -32,6 +32,13 @@ def test_quaternions_that_are_none(take):
     take([1, 0, 0, 0])
 
 
+def test_half_precision_is_looked_at_as_any_other():
+    for dtype in (jnp.float16, jnp.bfloat16):
+        assert rotation.normalise(jnp.array([2, 0, 0, 0], dtype)).dtype == dtype
+        with pytest.raises(ValueError, match="must not be zero"):
+            rotation.normalise(jnp.zeros(4, dtype))
+
+
 @pytest.mark.parametrize(
     ("take", "word"),
     [

@@ -36,6 +36,8 @@ def as_axes(name: str, value: Any) -> Array:
 
 @np.errstate(over="ignore")
 def _check_length(name: str, seen: np.ndarray, unit: bool, hint: str) -> None:
+    if seen.dtype.kind != "f":
+        seen = seen.astype(np.float32)  # einsum knows no bfloat16
     square = np.einsum("...i,...i->...", seen, seen)  # ten times as fast as largest components
     if np.any(square == 0):  # or so small that squares vanish
         zero = np.all(seen == 0, axis=-1)
