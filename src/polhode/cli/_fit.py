@@ -277,6 +277,7 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
     import numpy as np
 
     import polhode
+    from polhode.fit._result import other_hand
     from polhode.io import whole_file
     from polhode.rotation import to_matrix
 
@@ -297,7 +298,7 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
         "polhode": polhode.__version__,
         "jax": jax.__version__,
         "jaxlib": jaxlib.__version__,
-        "samples": int(np.sum(recording.present)),
+        "samples": int(np.sum(np.asarray(recording.present))),
         "gaps": int(np.sum(np.asarray(recording.present) == 0)),
         "scale_known": result.scale_known,
         "moments": plain(result.moments),
@@ -310,7 +311,7 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
         "axes_std_rad": [0.0] * 3 if asked.moments_only else plain(result.axes_std),
         "bias_rad_per_s": None if found is None else plain(found[0]),
         "bias_std_rad_per_s": None if found is None else plain(found[1]),
-        "mirrored_ratios": plain(np.sort(np.asarray(result.mirrored.moments))),
+        "mirrored_ratios": plain(np.sort(other_hand(np.asarray(result.moments)))),
         "rms_rad_per_s": plain(result.rms),
         "residual_over_noise": plain(result.noise),
         "whiteness": plain(result.whiteness),
@@ -333,7 +334,7 @@ def _table(asked: _Asked, recording: Any, result: Any) -> Any:
     from polhode.io import visible
     from polhode.rotation import to_matrix
 
-    samples = int(np.sum(recording.present))
+    samples = int(np.sum(np.asarray(recording.present)))
     grid = Table(
         title=Text(f"{visible(asked.path.name)}: {samples} samples"),
         title_justify="left",

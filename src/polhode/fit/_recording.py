@@ -218,7 +218,7 @@ def _with_gaps(name, value, suffix, dtype):
     holes = np.isnan(raw) if is_concrete(raw) and raw.dtype.kind == "f" else None
     clean = raw if holes is None else np.where(holes, np.zeros((), raw.dtype), raw)
     array = as_float_array(name, clean, suffix).astype(dtype)
-    return array if holes is None else jnp.where(jnp.asarray(holes), jnp.nan, array)
+    return array if holes is None else np.where(holes, np.asarray(np.nan, dtype), array)
 
 
 def _blank(name, array):

@@ -2,6 +2,7 @@
 
 import enum
 from collections.abc import Iterable, Mapping
+from statistics import NormalDist
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,6 +12,7 @@ import numpy as np
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
+from polhode._checks import require
 from polhode.fit._linear import Linear
 from polhode.fit._matrices import eigh, inverse, svd
 from polhode.fit._parameters import Parameters, entries_of, whole_of
@@ -109,7 +111,7 @@ class InertiaFit(eqx.Module):
         ratios ``I_k (I_i + I_j - I_k)``. It is as physical as the first, so free rates alone cannot
         tell the handedness; attitudes, a wheel or knowledge of the body can.
         """
-        return Inertia(diagonal=_other_hand(self.moments)).turned(self.axes)
+        return Inertia(diagonal=other_hand(self.moments)).turned(self.axes)
 
     @property
     def determined(self) -> tuple[Array, Array]:
@@ -120,8 +122,9 @@ class InertiaFit(eqx.Module):
 
     def interval(self, level: float = 0.95) -> tuple[Array, Array]:
         """Ends (..., 3) of the intervals of ``ratios``, or of ``moments`` if the scale is known."""
+        require(0 < level < 1, f"level must lie between 0 and 1, got {level!r}: 0.95 for 95 %.")
         value, spread = self.determined
-        reach = float(norm.ppf(0.5 + level / 2)) * spread
+        reach = NormalDist().inv_cdf(0.5 + level / 2) * spread
         return value - reach, value + reach
 
     def findings(self, body: int = 0) -> list[str]:
@@ -166,8 +169,8 @@ def flagged(seen: Mapping[Finding, Array]) -> Array:
     return sum((jnp.where(x, int(flag), 0) for flag, x in seen.items()), start=jnp.asarray(0))
 
 
-def _other_hand(moments: Any) -> Any:
-    """Moments (..., 3) of ``InertiaFit.mirrored``."""
+def other_hand(moments: Any) -> Any:
+    """Moments (..., 3) of ``InertiaFit.mirrored``, in the order of those given."""
     other = moments * (moments.sum(axis=-1, keepdims=True) - 2 * moments)
     return other / other.max(axis=-1, keepdims=True)
 
@@ -178,7 +181,7 @@ def remarks(fit: InertiaFit, body: int = 0) -> list[str]:
     if not fit.scale_known:
         found.append(_SCALE)
         if fit.free_rates:
-            twin = np.sort(_other_hand(np.asarray(fit.moments).reshape(-1, 3)[body]))
+            twin = np.sort(other_hand(np.asarray(fit.moments).reshape(-1, 3)[body]))
             found.append(
                 "free rates do not show the handedness of the axes: with one axis inverted the "
                 f"same data mean {twin[0]:.4f} : {twin[1]:.4f} : 1; compare with what you know of "

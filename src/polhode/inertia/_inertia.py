@@ -246,10 +246,7 @@ class Inertia(AbstractShaped, AbstractPart):
         """The tensor in body axes, kg m^2."""
         if self.full is not None:
             return self.full
-        moments = self.moments
-        return moments[..., None] * jnp.broadcast_to(
-            jnp.eye(3, dtype=moments.dtype), (*moments.shape, 3)
-        )
+        return _diagonal(self.moments)
 
     def turned(self, wxyz: Float[Array, "*#b 4"]) -> Self:
         """The body turned by the unit quaternion (..., 4) in its axes: ``R I R^T``, a full tensor.
@@ -289,6 +286,12 @@ class Inertia(AbstractShaped, AbstractPart):
 
 
 @jax.jit  # one program, not one for each operation; likewise below
+def _diagonal(moments):
+    unit = jnp.eye(3, dtype=moments.dtype)
+    return moments[..., None] * jnp.broadcast_to(unit, (*moments.shape, 3))
+
+
+@jax.jit
 def _product(tensor, vector):
     rows = (jnp.broadcast_arrays(tensor[..., i, :], vector) for i in range(3))
     return jnp.stack([jnp.sum(a * b, axis=-1) for a, b in rows], axis=-1)

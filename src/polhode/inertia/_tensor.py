@@ -39,6 +39,7 @@ def offset(mass: Float[Array, "*b"], shift: Float[Array, "*b 3"]) -> Float[Array
     return of_points(mass[..., None], shift[..., None, :])
 
 
+@jax.jit
 def turned(
     tensor: Float[Array, "*#b 3 3"], matrix: Float[Array, "*#b 3 3"]
 ) -> Float[Array, "*b 3 3"]:
