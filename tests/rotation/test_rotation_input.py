@@ -83,6 +83,14 @@ def test_rounded_matrices_pass():
     assert jnp.isnan(rotation.matrix_to_wxyz(np.full((3, 3), np.nan))).all()
 
 
+def test_known_matrices_are_looked_at_inside_jit():
+    turn, mirror = jnp.eye(3)[jnp.array([1, 2, 0])], -jnp.eye(3)
+    inside = jax.jit(lambda: rotation.matrix_to_wxyz(turn))()
+    np.testing.assert_allclose(inside, [0.5, -0.5, -0.5, -0.5], rtol=1e-15)
+    with pytest.raises(ValueError, match=r"determinant \+1"):
+        jax.jit(lambda: rotation.matrix_to_wxyz(mirror))()
+
+
 def test_quaternions_whose_squares_are_no_numbers_are_seen():
     """Squares of 1e-200 vanish, those of 1e200 are infinite."""
     for size in (1e-200, 1e200):

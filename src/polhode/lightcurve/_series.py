@@ -14,7 +14,7 @@ from polhode import free, rotation
 from polhode.lightcurve._model import Bodies, Points, _to_body, moments_of
 from polhode.lightcurve._scattering import seeliger_ellipsoid
 
-# Sums i f_phi + j f_psi compared, of LAM and of SAM: nearly all of an ellipsoid's light.
+# Sums i f_phi + j f_psi compared, of SAM and of LAM: nearly all of an ellipsoid's light.
 _SUMS = np.array([
     [(1, 1), (2, 0), (2, 2), (1, -1), (0, 2), (1, 3), (3, 1), (4, 0), (2, -2), (3, 3), (4, 2)],
     [(1, 0), (2, 0), (2, 2), (1, 2), (0, 2), (1, -2), (3, 0), (4, 0), (4, 2), (3, 2), (4, 4)],

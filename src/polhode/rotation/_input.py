@@ -59,10 +59,12 @@ def as_matrices(value: Any) -> tuple[Array, Array]:
     matrix = value
     if not isinstance(value, jax.Array) or value.shape[-2:] != (3, 3):
         matrix = as_float_array("matrix", value, (3, 3), finite=False)
-    good, size = _judged(jax.lax.stop_gradient(matrix))
-    if is_concrete(matrix):
+    if not is_concrete(matrix):
+        return matrix, _judged(jax.lax.stop_gradient(matrix))[0]
+    with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
+        good, size = _judged(matrix)
         require(
-            np.asarray(good | jnp.isnan(size)),
+            np.asarray(good) | np.isnan(size),
             "matrix must be a rotation, orthogonal and of determinant +1, got"
             f" {describe(np.asarray(matrix), 9)}: a reflection (determinant -1) or a scaling has no"
             " quaternion.",
