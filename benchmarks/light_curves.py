@@ -35,6 +35,8 @@ import polhode as ph
 from polhode import lightcurve
 from polhode.lightcurve import _fit, _hypotheses, _model, _search, _solutions, _steps
 
+_magnitudes = jax.jit(_model.magnitudes, static_argnums=0)
+
 VERDICTS = ("right", "within its errors", "listed", "told", "silent")
 HIGHEST = 7.0  # frequency sought of synthetic tumblers [1/d]
 TOUTATIS = {"P_phi": (7.41, 0.1), "P_psi": (5.38, 0.05), "pole": (180.2, -54.75)}
@@ -99,7 +101,7 @@ def synthetic(seed: int, noise: float, *, nights=24, days=80.0, each=20, spread=
     )  # fmt: skip
     blank = lightcurve.LightCurve.of(t, 0 * t, sun, observer, group=group, calibrated=True)
     points = blank.points(1.0)
-    light = np.asarray(_model.magnitudes(lightcurve.HG1G2(), bodies, points))[0, : t.size]
+    light = np.asarray(_magnitudes(lightcurve.HG1G2(), bodies, points))[0, : t.size]
     if egg:
         body, q = lightcurve.Convex.from_mesh(vertices, faces), _model.attitudes(*bodies, points.t)
         sun, observer = (

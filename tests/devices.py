@@ -9,7 +9,7 @@ from pathlib import Path
 def told_by(script: Path, *words: str) -> dict:
     """The JSON of its last line, given some words, without the count of devices."""
     done = subprocess.run(
-        [sys.executable, str(script), *words], capture_output=True, timeout=300, text=True
+        [sys.executable, str(script), *words], capture_output=True, timeout=900, text=True
     )
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])

@@ -330,7 +330,9 @@ def test_interrupt_of_a_running_process_leaves_nothing_half_written(here):
         time.sleep(0.5)
         process.send_signal(signal.SIGINT)
         errors = process.communicate(timeout=120)[1]
-    assert process.returncode == 130
+    # Python ends by the signal itself where that met an import that makes code from text, as those
+    # of data classes do; a shell reads 130 from both
+    assert process.returncode in (130, -signal.SIGINT)
     assert "interrupted" in errors
     assert "Traceback" not in errors
     assert list(output.parent.iterdir()) == []

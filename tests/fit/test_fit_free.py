@@ -135,10 +135,8 @@ def test_regression_on_clean_data_finds_the_shape():
 
 def test_prediction_is_the_exact_motion_and_differentiable(cases):
     times, clean, _, _, tensors = cases
-    model = FreeMotion()
-    path = model(
-        jnp.asarray(tensors[3]), jnp.asarray(clean[3, 0]), None, jnp.asarray(times), None, None
-    )
+    model = jax.jit(FreeMotion())
+    path = model(tensors[3], clean[3, 0], None, times, None, None)
     np.testing.assert_allclose(path.omega, clean[3], atol=1e-8)
 
 
@@ -173,6 +171,6 @@ def test_a_missing_row_in_five_does_not_hide_the_noise(cases):
     times, clean, noisy, *_ = cases
     holed = np.stack([noisy[2], noisy[4], np.broadcast_to(clean[0, :1], clean[0].shape)])
     holed[:2, ::5] = np.nan
-    # as many as all bodies are, for the program of these
-    fit = fit_inertia(times, holed[np.arange(BODIES) % 3], throw=False)
-    assert not (np.asarray(fit.finding) & int(Finding.POOR)).any()
+    for rates in holed:
+        fit = fit_inertia(times, rates, throw=False)
+        assert not int(fit.finding) & int(Finding.POOR)

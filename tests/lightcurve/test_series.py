@@ -12,6 +12,17 @@ from polhode.lightcurve._hypotheses import Hypotheses
 PHASE = lightcurve.SeeligerPhase()
 MEANT = Hypotheses(np.array([1.2, 1.9]), np.array([0.7, 0.5]), np.array([True, False]))
 MANY = 24
+magnitudes = jax.jit(_model.magnitudes, static_argnums=0)
+
+
+@jax.jit
+def moved(bodies, later):
+    """Rates and attitudes of free bodies at one time each."""
+    found = _series.free.free_motion(
+        _model.moments_of(bodies.unknowns), tuple(bodies.wxyz.T),
+        tuple(bodies.unknowns[:, 4:7].T), later,
+    )  # fmt: skip
+    return tuple(jnp.stack([x[:, 0] for x in part], -1) for part in found)
 
 
 @pytest.fixture(scope="module")
@@ -32,17 +43,13 @@ def test_any_phases_are_turned_to_those_of_the_points(blank, mode):
     bodies, good = _search.build(draws, long_axis, PHASE)
     (first,) = np.flatnonzero(good)[:1]
     points = blank.points(0.0)
-    light = np.asarray(_model.magnitudes(PHASE, bodies, points))[first]
+    light = np.asarray(magnitudes(PHASE, bodies, points))[first]
     points = blank._replace(magnitude=light + 0.3 * (blank.t > 5)).points(0.0)
     right, matrix = _series.series(points, *meant)
     # the same body at other times and turned about its momentum: all that phases are
     later = jnp.asarray(np.random.default_rng(1).uniform(0, 10, (MANY, 1)))
     same = jax.tree.map(lambda x: jnp.tile(x[first], (MANY, 1)), bodies)
-    moved = _series.free.free_motion(
-        _model.moments_of(same.unknowns), tuple(same.wxyz.T),
-        tuple(same.unknowns[:, 4:7].T), later,
-    )  # fmt: skip
-    rates, wxyz = (jnp.stack([x[:, 0] for x in part], -1) for part in moved)
+    rates, wxyz = moved(same, later)
     pole = _solutions.momentum(same)
     angle = jnp.asarray(np.random.default_rng(2).uniform(0, 6, (MANY, 1)))
     wxyz = _series.rotation.multiply(_series.rotation.rotation_vector_to_wxyz(angle * pole), wxyz)

@@ -1,6 +1,7 @@
 """A wheel aboard in ``fit_inertia`` and ``fit_recordings``: the likelihood of the readings."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,19 +41,7 @@ def _told(fit: BalanceFit, recording: Recording, given: Instrument) -> InertiaFi
     """One body's balance as the result that every motion gives."""
     tensor, moments = fit.inertia.tensor[0], fit.moments[0]
     covariance = fit.covariance[0]
-    spread = _ratios_std(entries_of(tensor), covariance)
-    rest, known = fit.residuals, jnp.any(fit.residuals != 0, axis=-1).astype(moments.dtype)
-    read = 3 * jnp.maximum(jnp.sum(known), 1)
-    whiteness = whiteness_of(rest, known)
-    trace = jnp.trace(tensor)
-    finite = jnp.all(jnp.isfinite(tensor)) & jnp.all(jnp.isfinite(covariance))
-    finding = flagged({
-        Finding.STEP_LIMIT: ~fit.converged,
-        Finding.NOT_FINITE: ~finite,
-        Finding.NEARLY_FLAT: trace / 2 - moments[2] < 1e-4 * trace,
-        Finding.NOT_WHITE: whiteness < 1e-4,
-        Finding.WEAK: jnp.any(spread[:2] > 0.05),
-    })  # fmt: skip
+    told = _judged(tensor, moments, covariance, fit.residuals, fit.residuals_std, fit.converged)
     device = fit.instrument
     x, y, z = (float(part) for part in np.asarray(device.axis))
     flight = SteppedMotion(
@@ -71,19 +60,46 @@ def _told(fit: BalanceFit, recording: Recording, given: Instrument) -> InertiaFi
     )  # fmt: skip
     return InertiaFit(
         Inertia(full=tensor), moments, fit.axes[0],
-        moments / moments[2], fit.moments_std[0], spread, fit.axes_std[0], inverse(covariance),
-        covariance, jnp.asarray(0), jnp.sqrt(jnp.sum(rest**2) / read), whiteness,
-        jnp.sqrt(jnp.sum((rest * fit.residuals_std) ** 2) / read),
-        finding, fit.steps, jnp.asarray(1),
-        parameters, model, {"omega": rest, "omega_std": fit.residuals_std}, True, True,
+        told.ratios, fit.moments_std[0], told.spread, fit.axes_std[0], told.information,
+        covariance, jnp.asarray(0), told.noise, told.whiteness, told.rms,
+        told.finding, fit.steps, jnp.asarray(1), parameters, model,
+        {"omega": fit.residuals, "omega_std": fit.residuals_std}, True, True,
     )  # fmt: skip
 
 
-@jax.jit
-def _ratios_std(entries: Array, covariance: Array) -> Array:
+class _Judged(NamedTuple):
+    ratios: Array
+    spread: Array  # of the ratios
+    information: Array
+    noise: Array
+    whiteness: Array
+    rms: Array
+    finding: Array
+
+
+@jax.jit  # one program, not one for each operation
+def _judged(tensor, moments, covariance, rest, expected, converged) -> _Judged:
+    """What the residuals ``rest``, over those ``expected``, and the covariance say of one body."""
+
     def ratios(entries):
         values, *_ = principal(whole_of(entries))
         return values / values[2]
 
-    slope = jax.jacfwd(ratios)(entries)
-    return jnp.sqrt(jnp.maximum(jnp.diagonal(slope @ covariance @ slope.T), 0)).at[2].set(0)
+    slope = jax.jacfwd(ratios)(entries_of(tensor))
+    variance = jnp.diagonal(slope @ covariance @ slope.T)
+    spread = jnp.sqrt(jnp.maximum(variance, 0)).at[2].set(0)
+    known = jnp.any(rest != 0, axis=-1).astype(moments.dtype)
+    read = 3 * jnp.maximum(jnp.sum(known), 1)
+    whiteness, trace = whiteness_of(rest, known), jnp.trace(tensor)
+    finite = jnp.all(jnp.isfinite(tensor)) & jnp.all(jnp.isfinite(covariance))
+    finding = flagged({
+        Finding.STEP_LIMIT: ~converged,
+        Finding.NOT_FINITE: ~finite,
+        Finding.NEARLY_FLAT: trace / 2 - moments[2] < 1e-4 * trace,
+        Finding.NOT_WHITE: whiteness < 1e-4,
+        Finding.WEAK: jnp.any(spread[:2] > 0.05),
+    })  # fmt: skip
+    noise, rms = (jnp.sqrt(jnp.sum(x**2) / read) for x in (rest, rest * expected))
+    return _Judged(
+        moments / moments[2], spread, inverse(covariance), noise, whiteness, rms, finding
+    )

@@ -2,6 +2,7 @@
 
 import enum
 from collections.abc import Iterable, Mapping
+from functools import partial
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
@@ -354,6 +355,7 @@ def by_kind(linear: Linear, recording: Recording) -> dict[str, Array]:
     return parts
 
 
+@partial(jax.jit, static_argnames="lags")  # one program, not one for each operation
 def whiteness_of(rest: Array, present: Array, lags: int = 5) -> Array:
     """Ljung-Box probability of the first autocorrelations of all channels together."""
     total = jnp.sum(present, axis=-1)[:, None]

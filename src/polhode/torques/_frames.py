@@ -63,13 +63,7 @@ class LVLH(AbstractPart):
             (r, v), (_, force) = jax.jvp(moving, (t,), (jnp.ones_like(t),))
             momentum = jnp.cross(r, v)
             normal = jnp.sum(force * momentum, axis=-1, keepdims=True)
-        size = jnp.linalg.norm(momentum, axis=-1, keepdims=True)
-        distance = jnp.linalg.norm(r, axis=-1, keepdims=True)
-        z, y = -r / distance, -momentum / size
-        zero = jnp.zeros_like(distance)
-        yawing = zero if normal is None else -distance * normal / size**2
-        rates = jnp.concatenate([zero, -size / distance**2, yawing], axis=-1)
-        return jnp.cross(y, z), y, z, rates
+        return _axes(r, momentum, normal)
 
     def attitude(self, t: ArrayLike) -> Float[Array, "*b 4"]:
         """Unit quaternion, frame -> space."""
@@ -120,6 +114,18 @@ class LVLH(AbstractPart):
         frame, rates = self.attitude(t), self.omega(t)
         lead = jnp.broadcast_shapes(*(x.shape[:-1] for x in (wxyz, omega, frame, rates)))
         return tuple(jnp.broadcast_to(x, (*lead, x.shape[-1])) for x in (wxyz, omega, frame, rates))
+
+
+@jax.jit  # one program, not one for each operation
+def _axes(r: Array, momentum: Array, normal: Array | None) -> tuple[Array, ...]:
+    """``LVLH.axes`` by the place, the angular momentum, and the force along that, if any."""
+    size = jnp.linalg.norm(momentum, axis=-1, keepdims=True)
+    distance = jnp.linalg.norm(r, axis=-1, keepdims=True)
+    z, y = -r / distance, -momentum / size
+    zero = jnp.zeros_like(distance)
+    yawing = zero if normal is None else -distance * normal / size**2
+    rates = jnp.concatenate([zero, -size / distance**2, yawing], axis=-1)
+    return jnp.cross(y, z), y, z, rates
 
 
 class RelativeTorque(AbstractTorque):
