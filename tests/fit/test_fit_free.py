@@ -87,6 +87,16 @@ def entries(tensors):
     )
 
 
+def test_a_level_is_a_probability(fits):
+    low, high = (
+        np.asarray(fits.interval(level)[1] - fits.ratios)[:, :2] for level in (0.5, np.float32(0.9))
+    )
+    np.testing.assert_allclose(high / low, 1.6448536269514722 / 0.6744897501960817, rtol=1e-6)
+    for level in (0.0, 1.0, 95):
+        with pytest.raises(ValueError, match=r"level must lie between 0 and 1"):
+            fits.interval(level)
+
+
 def test_the_scale_is_reported_as_unknown(fits):
     assert not fits.scale_known
     assert np.all(np.asarray(fits.null_count) >= 1)

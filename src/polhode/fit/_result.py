@@ -125,7 +125,7 @@ class InertiaFit(eqx.Module):
         """Ends (..., 3) of the intervals of ``ratios``, or of ``moments`` if the scale is known."""
         require(0 < level < 1, f"level must lie between 0 and 1, got {level!r}: 0.95 for 95 %.")
         value, spread = self.determined
-        reach = NormalDist().inv_cdf(0.5 + level / 2) * spread
+        reach = NormalDist().inv_cdf(0.5 + float(level) / 2) * spread
         return value - reach, value + reach
 
     def findings(self, body: int = 0) -> list[str]:
