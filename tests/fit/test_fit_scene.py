@@ -29,13 +29,12 @@ def damped(rates):
     return np.broadcast_to(path, (240, 25, 3))
 
 
-def drag_of(rates):
+def drag_of(rates, throw=True):
     """The drag that such recordings show, all in one program."""
     data = Recording.of(TIMES, rates, omega_noise=NOISE)
     start = ph.Scene(BODY, torque=ph.LinearDamping(0.15))
-    return ph.fit(
-        start, data, free=lambda s: [s.torque.c], noise_known=True, rtol=1e-7, starts=1, throw=False
-    )
+    free = lambda s: [s.torque.c]  # noqa: E731
+    return ph.fit(start, data, free=free, noise_known=True, rtol=1e-7, starts=1, throw=throw)
 
 
 def test_intervals_of_a_drag_hold_the_truth():
@@ -101,11 +100,26 @@ def test_whatever_a_scene_holds():
 
 def test_what_the_data_cannot_show_is_said():
     """The drag about two axes that the body does not turn about."""
-    found = drag_of(damped([0.0, 0.0, 1.0]))
+    found = drag_of(damped([0.0, 0.0, 1.0]), throw=False)
     assert found.findings() == ["undetermined"]
     assert np.all(np.asarray(found.null_count) == 2)
     np.testing.assert_array_equal(np.isfinite(found.std[0]), [[False, False, True]] * 240)
     np.testing.assert_allclose(found.values[0][:, 2], 0.2, rtol=1e-6)
+    assert "standard deviations are infinite" in found.report()
+
+
+@pytest.mark.slow
+def test_a_common_size_is_anyones():
+    """Damping over inertia is all that a damped body shows: no unknown alone is to blame."""
+    scene = ph.Scene(BODY, torque=ph.LinearDamping(TRUE_DRAG))
+    rates = noisy(3, ph.simulate(scene, STATE, TIMES).omega_body)
+    data = Recording.of(TIMES, rates, omega_noise=NOISE)
+    found = ph.fit_scene(
+        scene, data, lambda s: (s.inertia.diagonal, s.torque.c), rtol=1e-7, starts=1, throw=False
+    )
+    assert found.findings() == ["undetermined"]
+    assert int(found.null_count) == 1
+    assert not np.any(np.isfinite(np.concatenate(found.std)))
     assert "standard deviations are infinite" in found.report()
 
 

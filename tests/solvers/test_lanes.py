@@ -88,27 +88,30 @@ GRAVITY = ph.UniformGravity(1.0, [0.1, 0.2, 0.5])
 DRAG = ph.LinearDamping(0.05)
 
 
-def _ends(chunk, moments, wxyz, omega):
+def _ends(chunk, moments, wxyz, omega, acts=(GRAVITY,)):
     method = ph.LiePoisson(Extrapolation(None), chunk=chunk, max_steps=300)
     state = ph.State(wxyz, omega)
-    return ph.simulate(_scene(moments, GRAVITY), state, [0.0, 1.0, 3.0], method, throw=False)
+    return ph.simulate(_scene(moments, *acts), state, [0.0, 1.0, 3.0], method, throw=False)
 
 
-def _moved(chunk):
+def _moved(chunk, acts):
     """Slopes of a number made of the last states, and all that was moved, in one program."""
 
     def total(*given):
-        found = _ends(chunk, *given)
+        found = _ends(chunk, *given, acts)
         end = found.last
         return jnp.sum(end.wxyz**3) + jnp.sum(end.omega_body**2), found
 
     return jax.jit(jax.grad(total, (0, 1, 2), has_aux=True))
 
 
-def test_a_queue_changes_neither_values_nor_slopes():
+@pytest.mark.parametrize(
+    "acts", [(GRAVITY,), pytest.param((GRAVITY, DRAG), marks=pytest.mark.slow)], ids=len
+)
+def test_a_queue_changes_neither_values_nor_slopes(acts):
     """Beside chunks of 30, none of which has more bodies than there are lanes; and a body that is
     no number keeps none from its lane."""
-    given, ways = _drawn(N), [_moved(chunk) for chunk in (None, 30)]
+    given, ways = _drawn(N), [_moved(chunk, acts) for chunk in (None, 30)]
     given[2][17] = 1e3
     (_, queued), (_, apart) = (way(*given) for way in ways)
     assert list(np.flatnonzero(queued.status)) == [17]

@@ -1,5 +1,7 @@
 """The command line: `polhode run`, `explain`, `fit`, `schema`."""
 
+import contextlib
+import os
 import sys
 from collections.abc import Sequence
 
@@ -19,3 +21,18 @@ def main(argv: Sequence[str] | None = None) -> int:
               file=sys.stderr)  # fmt: skip
         return 1
     return command_line(argv)
+
+
+def command() -> None:
+    """The `polhode` command: `main`, which ends the process.
+
+    After an interrupt at once: where that met code made from text, as imports of data classes do,
+    ``python -m`` would end by the signal and not with the exit code, though it was caught.
+    """
+    code = main()
+    if code == 130:
+        for stream in (sys.stdout, sys.stderr):
+            with contextlib.suppress(OSError, ValueError):
+                stream.flush()
+        os._exit(code)
+    sys.exit(code)

@@ -1,8 +1,6 @@
 """`python -m polhode.cli`: the same as the `polhode` command."""
 
-import sys
-
-from polhode.cli import main
+from polhode.cli import command
 
 if __name__ == "__main__":
-    sys.exit(main())
+    command()
