@@ -1,4 +1,4 @@
-"""Worst errors of polhode.elliptic against mpmath, per function, dtype and region.
+"""Worst errors of polhode._closed_forms.elliptic against mpmath, per function, dtype and region.
 
     python -m benchmarks.elliptic_accuracy [--quick] [--points N] [--only NAME ...] [--output FILE]
 

@@ -2,7 +2,7 @@
 
     python -m benchmarks.error_control [--bodies 150] [--quick] [--output FILE]
 
-Two tables. The first holds the estimate of a single step's error (see ``solvers/_march.py``) beside
+Two tables. The first holds the estimate of a single step's error (``_integrate/_march.py``) beside
 the step's true error, for orders and widths of step. The second holds the error of the attitude at
 the last time over the ``rtol`` asked for, on bodies whose moments, rates, fields and torques are
 drawn over six decades, ratios of torque to kinetic energy from 1e-6 to 1e3, 1 to 1,000 radians.
@@ -27,9 +27,9 @@ import jax.numpy as jnp
 import numpy as np
 
 import polhode as ph
-from polhode.methods import LiePoissonChart
-from polhode.solvers._bound_term import BoundTerm
-from polhode.solvers._columns import extrapolated, table
+from polhode._integrate import LiePoissonChart
+from polhode._integrate._bound_term import BoundTerm
+from polhode._integrate._columns import extrapolated, table
 
 LONG = np.longdouble
 SEQUENCE = (2, 4, 6, 8, 10, 12, 14, 16, 24, 36)

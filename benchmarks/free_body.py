@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from polhode import free
+from polhode._closed_forms import free
 
 jax.config.update("jax_enable_x64", True)
 HERE = Path(__file__).resolve().parent

@@ -29,7 +29,7 @@ import mpmath
 import numpy as np
 
 import polhode as ph
-from polhode.solvers import Accuracy, Extrapolation
+from polhode._integrate import Accuracy, Extrapolation
 
 HORIZON = 100.0
 TORQUE = 1.0  # mass * g * distance

@@ -20,7 +20,7 @@ import numpy as np
 jax.config.update("jax_enable_x64", True)
 
 import polhode as ph
-from polhode.methods.exact import LagrangeTop
+from polhode._closed_forms import LagrangeTop
 
 HORIZON = 100.0
 

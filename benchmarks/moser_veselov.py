@@ -24,7 +24,7 @@ import numpy as np
 import polhode as ph
 from benchmarks import problems, truth
 from benchmarks.problems import PROBLEMS
-from polhode.solvers import Splitting
+from polhode._integrate import Splitting
 
 TOP, GRADIENT = PROBLEMS["heavy_top"], PROBLEMS["gradient"]
 CASES = (

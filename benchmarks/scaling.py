@@ -23,8 +23,8 @@ import numpy as np
 import polhode as ph
 from benchmarks.peers.polhode_own import scene
 from benchmarks.problems import PROBLEMS
+from polhode._closed_forms._free import _CHUNK
 from polhode._simulate import run
-from polhode.methods.exact._free import _CHUNK
 
 FAMILIES = ("free", "lagrange", "heavy_top")
 BODIES = (1, 10, 100, 1_000, 10_000, 100_000, 1_000_000)

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.integrators import CASES, heavy_top, initial_states
-from polhode.solvers import Splitting
+from polhode._integrate import Splitting
 
 BODIES, WINDOW = 16, 400
 STEPS = {2: 2**-7, 4: 3 * 2**-6, 6: 3 * 2**-5, 8: 3 * 2**-4}  # sums of them are exact

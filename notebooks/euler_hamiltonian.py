@@ -35,7 +35,7 @@ import numpy as np
 from diffrax import Dopri8
 
 import polhode as ph
-from polhode.hamiltonian import document_000 as closed
+from polhode._hamiltonian import document_000 as closed
 
 jax.config.update("jax_enable_x64", True)
 plt.rcParams.update(

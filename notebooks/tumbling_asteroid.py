@@ -28,7 +28,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import polhode as ph
-from polhode import io, plot
+from polhode import files, plot
 
 jax.config.update("jax_enable_x64", True)
 plt.rcParams.update(
@@ -42,9 +42,9 @@ plt.rcParams.update(
 )
 DAY = 86400.0
 
-file = io.read_scene(Path("../scenes/toutatis.toml"))
-scene = io.build_scene(file, jnp.float64)
-state = io.build_state(file, jnp.float64, scene.inertia)
+file = files.read_scene(Path("../scenes/toutatis.toml"))
+scene = files.build_scene(file, jnp.float64)
+state = files.build_state(file, jnp.float64, scene.inertia)
 seen = file.observations
 print(file.title, "-", file.source)
 print("moments (relative):", scene.inertia.diagonal, "about", file.axis_names)
@@ -59,7 +59,7 @@ print("moments (relative):", scene.inertia.diagonal, "about", file.axis_names)
 ts = DAY * jnp.linspace(0.0, 45.0, 901)
 path = ph.simulate(scene, state, ts)
 at_sight = ph.simulate(scene, state, np.append(0.0, seen.seconds)).wxyz[1:]
-observed = io.build_attitudes(seen.attitudes, np.float64)
+observed = files.build_attitudes(seen.attitudes, np.float64)
 
 fig, panels = plt.subplots(3, 1, figsize=(9, 5.2), sharex=True)
 per_day = np.rad2deg(1.0) * DAY

@@ -28,13 +28,11 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 # Rooms whose annotations are checked at every call (see checked.py); imported after this line.
 CHECKED = (
     "rotation",
-    "elliptic",
     "inertia",
-    "hamiltonian",
-    "torques",
-    "frames",
+    "_hamiltonian",
     "_scene",
-    "_state",
+    "_closed_forms.elliptic",
+    "frames",
 )
 assert not [name for name in sys.modules if name.split(".")[0] == "polhode"]
 jaxtyping.install_import_hook([f"polhode.{room}" for room in CHECKED], "checked.checked")

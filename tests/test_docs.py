@@ -160,7 +160,7 @@ def public_names() -> set[str]:
     found = set()
     for path in [package / "__init__.py", *package.glob("[a-z]*/__init__.py")]:
         module = ".".join(("polhode", *path.parent.relative_to(package).parts))
-        if module in ("polhode.cli", "polhode.parts"):  # a command; what the parts are made of
+        if module in ("polhode.cli", "polhode._parts"):  # a command; what the parts are made of
             continue
         holder = importlib.import_module(module)
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings, strategies as st
 
 import polhode as ph
-from polhode.methods import check_options
+from polhode._method import check_options
 
 INERTIA = ph.Inertia.from_moments([1.0, 1.5, 2.0])
 SCENE = ph.Scene(INERTIA)

@@ -49,7 +49,7 @@ def test_principal_axes_are_found_only_for_general_tensors(costs):
 
 def field_operations(scene):
     """Floating-point operations of one evaluation of the field for one body."""
-    from polhode.hamiltonian import Dynamics, lie_poisson_field
+    from polhode._hamiltonian import Dynamics, lie_poisson_field
 
     y = (tuple(jnp.ones(N) for _ in range(3)), tuple(jnp.ones(N) for _ in range(4)))
     system = Dynamics(scene.hamiltonian, scene.torque)

@@ -11,7 +11,7 @@ import pytest
 
 import polhode as ph
 from polhode import choose, rotation
-from polhode.solvers import Extrapolation
+from polhode._integrate import Extrapolation
 
 INERTIA = ph.Inertia.from_moments([1.0, 1.5, 2.0])
 GRAVITY = ph.UniformGravity(1.0, [0.1, 0.2, 0.5], [0.0, 0, -1.0])

@@ -20,10 +20,10 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from polhode._scene import Scene
-from polhode._state import State
-from polhode.methods import AbstractMethod, Record, Ways
-from polhode.trajectory import Trajectory
+from polhode._method import AbstractMethod, Record
+from polhode._plan import Ways
+from polhode._scene import Scene, State
+from polhode._trajectory import Trajectory
 
 _KEPT = 128
 """Programs that are kept, those used last."""

@@ -11,10 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode import rotation
-from polhode._scene import Scene, places_of
-from polhode._simulate import simulate
-from polhode._state import State
-from polhode.methods import (
+from polhode._method import (
     AbstractMethod,
     Status,
     check_inputs,
@@ -22,6 +19,9 @@ from polhode.methods import (
     check_rtol,
     raise_on_failure,
 )
+from polhode._scene import Scene, State
+from polhode._scene._scene import places_of
+from polhode._simulate import simulate
 
 _NODES = 8
 """Gauss points that the effect of a disturbance is summed over; their error falls with the 16th

@@ -21,26 +21,22 @@ from polhode._batch import (
 )
 from polhode._checks import is_concrete
 from polhode._dispatch import again, learn
-from polhode._scene import Scene
-from polhode._state import State
-from polhode.events import Event, check_until, stopped
-from polhode.methods import (
+from polhode._events import Event, check_until, stopped
+from polhode._kernels import FEW, kernel
+from polhode._method import (
     AbstractMethod,
-    Plan,
     Record,
     Samples,
     Status,
     check_inputs,
     check_method,
     check_rtol,
-    choose,
     judged,
-    plan,
     raise_on_failure,
-    ways_of,
 )
-from polhode.trajectory import Propagator, Trajectory
-from polhode.xla import FEW, kernel
+from polhode._plan import Plan, choose, plan, ways_of
+from polhode._scene import Scene, State
+from polhode._trajectory import Propagator, Trajectory
 
 
 def simulate(

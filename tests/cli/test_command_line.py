@@ -14,7 +14,7 @@ import xarray
 
 import polhode as ph
 from polhode.cli import main
-from polhode.io import build_scene, build_state, read_scene
+from polhode.files import build_scene, build_state, read_scene
 
 SCENES = Path(__file__).parents[2] / "scenes"
 TOP = """

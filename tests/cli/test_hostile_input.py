@@ -16,7 +16,7 @@ import xarray
 
 import polhode as ph
 from polhode.cli import _cache, _signals, main
-from polhode.io import _atomic
+from polhode.files import _atomic
 
 FREE = """title = "free"
 [inertia]

@@ -8,7 +8,7 @@ import xarray
 
 import polhode as ph
 from polhode.cli import _job, main
-from polhode.io import build_attitudes, read_scene
+from polhode.files import build_attitudes, read_scene
 
 SCENE = Path(__file__).parents[2] / "scenes" / "toutatis.toml"
 DAY = 86400.0

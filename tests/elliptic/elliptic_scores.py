@@ -4,7 +4,7 @@ import elliptic_truth as truth
 import mpmath as mp
 import numpy as np
 
-from polhode import elliptic
+from polhode._closed_forms import elliptic
 
 
 def labels(name):

@@ -9,7 +9,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from polhode import elliptic
+from polhode._closed_forms import elliptic
 
 TABLE = json.loads((Path(__file__).parent / "slopes.json").read_text())
 # Relative to the largest entry of the row: (float64, float32).

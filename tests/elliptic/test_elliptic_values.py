@@ -9,7 +9,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from polhode import elliptic
+from polhode._closed_forms import elliptic
 
 ROWS = json.loads((Path(__file__).parent / "values.json").read_text())
 # Worst ulps of the full run of benchmarks/elliptic_accuracy.py are 1 to 4.7.

@@ -5,7 +5,7 @@ import pytest
 
 from polhode.cli import main
 from polhode.ensemble import build_ensemble
-from polhode.io import SceneFileError, parse_scene
+from polhode.files import SceneFileError, parse_scene
 
 xarray = pytest.importorskip("xarray")
 

@@ -6,8 +6,8 @@ import numpy as np
 
 import polhode as ph
 from polhode import rotation
+from polhode._hamiltonian import Dynamics, lie_poisson_field
 from polhode.frames import RotatingFrame
-from polhode.hamiltonian import Dynamics, lie_poisson_field
 from polhode.inertia import Inertia, MassProperties
 
 TIME = 0.83

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from polhode import free
+from polhode._closed_forms import free
 
 CASES = json.loads(Path(__file__).with_name("free_cases.json").read_text())
 FAMILIES = sorted({case["family"] for case in CASES})

@@ -6,8 +6,8 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from polhode import free
-from polhode.free import Mode
+from polhode._closed_forms import free
+from polhode._closed_forms.free import Mode
 
 # Compiled once: eager dispatch would cost far more than the numbers.
 _periods = jax.jit(free.periods)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from polhode import free
+from polhode._closed_forms import free
 
 START = (0.5, -0.125, 0.75, 0.5)
 CASES = json.loads(Path(__file__).with_name("second_cases.json").read_text())

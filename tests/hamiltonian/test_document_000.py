@@ -9,8 +9,7 @@ import pytest
 
 import polhode as ph
 from polhode import rotation
-from polhode.documents import document_000 as doc
-from polhode.hamiltonian import rates_from_angle_rates
+from polhode._hamiltonian import document_000 as doc, rates_from_angle_rates
 from polhode.inertia import Inertia
 
 # theory section 8.1: I, q, qd and 20-digit results, recomputed from rotation matrices
@@ -131,7 +130,7 @@ def test_twenty_digit_vectors():
 
 
 def generalised_force(q, torque):
-    from polhode.hamiltonian import canonical_from_momentum
+    from polhode._hamiltonian import canonical_from_momentum
 
     return canonical_from_momentum(tuple(q), tuple(jnp.array(n) for n in torque))
 

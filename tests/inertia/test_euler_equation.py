@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from polhode.hamiltonian import Hamiltonian, inverse_inertia
+from polhode._hamiltonian import Hamiltonian, inverse_inertia
 from polhode.inertia import Inertia, MassProperties, angular_acceleration, required_torque
 from polhode.rotation import normalise, rotate
 

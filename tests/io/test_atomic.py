@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray
 
-from polhode.io import whole_file, write_netcdf
+from polhode.files import whole_file, write_netcdf
 
 
 @pytest.mark.parametrize("failure", [OSError, KeyboardInterrupt, SystemExit])

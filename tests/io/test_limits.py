@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from polhode.io import SceneFileError, parse_scene, read_scene
+from polhode.files import SceneFileError, parse_scene, read_scene
 
 HEAD = "[inertia]\nmoments = [1.0, 2.0, 2.5]\n"
 
@@ -58,7 +58,7 @@ def test_the_schema_and_the_page_name_the_same_keys():
     import re
     from pathlib import Path
 
-    from polhode.io import SceneFile
+    from polhode.files import SceneFile
 
     schema = SceneFile.model_json_schema()
     tables = [schema, *schema["$defs"].values()]

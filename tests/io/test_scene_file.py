@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from polhode.io import SceneFileError, build_attitudes, parse_scene, read_scene
+from polhode.files import SceneFileError, build_attitudes, parse_scene, read_scene
 
 GOOD = """
 title = "box"

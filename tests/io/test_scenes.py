@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polhode.io import build_scene, build_state, draw_clones, read_scene
+from polhode.files import build_scene, build_state, draw_clones, read_scene
 
 FOLDER = Path(__file__).parents[2] / "scenes"
 SCENES = sorted(FOLDER.glob("*.toml"))
@@ -62,7 +62,7 @@ def test_clones_are_drawn_as_the_file_says():
 
 
 def test_impossible_moments_are_drawn_again_or_refused(tmp_path):
-    from polhode.io import SceneFileError, parse_scene
+    from polhode.files import SceneFileError, parse_scene
 
     text = """
     inertia = { moments = [1.0, 1.0, 1.99] }
@@ -83,7 +83,7 @@ def test_impossible_moments_are_drawn_again_or_refused(tmp_path):
 
 def test_everything_that_acts_is_built_and_adds_up():
     import polhode as ph
-    from polhode.io import parse_scene
+    from polhode.files import parse_scene
 
     text = """
     inertia = { moments = [1.0, 1.5, 2.0] }

@@ -163,7 +163,7 @@ def test_bodies_that_did_not_finish_are_named():
 
 def test_a_file_of_the_command_line_is_shown(tmp_path):
     pytest.importorskip("h5netcdf")
-    from polhode.io import write_netcdf
+    from polhode.files import write_netcdf
 
     text = """
     title = "three clones"

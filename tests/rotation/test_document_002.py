@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import polhode.rotation as rotation
-from polhode.documents import document_002 as document
+from polhode._hamiltonian import document_002 as document
 
 # theory section 8.2: angles, rotation angle, axis of K, quaternion of K
 TRUTH = [

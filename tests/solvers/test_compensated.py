@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import pytest
 
 import polhode as ph
-from polhode.hamiltonian import Dynamics, lie_poisson_field
+from polhode._hamiltonian import Dynamics, lie_poisson_field
 
 
 def _tops(dtype):

@@ -16,15 +16,15 @@ from solvers import make_integrators_truth as bodies
 import polhode as ph
 from benchmarks.integrators import heavy_top
 from polhode import rotation
-from polhode.hamiltonian import (
+from polhode._hamiltonian import (
     Dynamics,
     Hamiltonian,
     LiePoissonCostate,
     LiePoissonUnits,
     lie_poisson_field,
 )
-from polhode.solvers import Accuracy, Extrapolation, FlowAdjoint
-from polhode.xla import linear
+from polhode._integrate import Accuracy, Extrapolation, FlowAdjoint
+from polhode._kernels import linear
 
 KEYS = jax.random.split(jax.random.key(7), 8)
 WXYZ = rotation.normalise(jax.random.normal(KEYS[0], (3, 4)))

@@ -11,9 +11,9 @@ import pytest
 from solvers import make_integrators_truth as bodies
 
 from benchmarks.integrators import heavy_top
-from polhode.solvers import Accuracy, Extrapolation, Splitting
-from polhode.solvers._extrapolation import order_for
-from polhode.xla import kernel
+from polhode._integrate import Accuracy, Extrapolation, Splitting
+from polhode._integrate._extrapolation import order_for
+from polhode._kernels import kernel
 
 WXYZ, OMEGA = np.array(bodies.WXYZ), np.array(bodies.OMEGA)
 MOMENTS, STRENGTH, END = bodies.MOMENTS, bodies.STRENGTH, bodies.TIMES[-1]

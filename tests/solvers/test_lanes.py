@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode.methods._charts import LiePoissonChart
-from polhode.solvers import Extrapolation
-from polhode.solvers._lanes import LANES, QUEUE, in_lanes
+from polhode._integrate import Extrapolation
+from polhode._integrate._charts import LiePoissonChart
+from polhode._integrate._lanes import LANES, QUEUE, in_lanes
 
 N = 90
 

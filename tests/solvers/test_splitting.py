@@ -8,8 +8,8 @@ import pytest
 
 import polhode as ph
 from benchmarks.integrators import heavy_top
-from polhode.solvers import Splitting
-from polhode.solvers._moser_veselov import ORDERS, paced, prepare, tangents
+from polhode._integrate import Splitting
+from polhode._integrate._moser_veselov import ORDERS, paced, prepare, tangents
 
 TERM = diffrax.ODETerm(heavy_top)
 BODIES = np.array([[1.0, 2.0, 3.0], [1.0, 1.0, 0.5], [0.01, 1.0, 1.0005], [4.0, 4.0, 4.0]])

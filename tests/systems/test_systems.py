@@ -14,7 +14,7 @@ from diffrax import Dopri8
 from systems.table import BY_NAME, truth
 
 import polhode as ph
-from polhode.solvers import Extrapolation, Splitting
+from polhode._integrate import Extrapolation, Splitting
 
 ACTING: dict[frozenset, list[str]] = {}
 for _name, _system in BY_NAME.items():

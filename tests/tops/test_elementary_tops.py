@@ -5,9 +5,8 @@ import pytest
 from mpmath import mp, mpf
 
 import polhode as ph
-from polhode import tops
-from polhode.methods.exact import FixedAxis, SymmetricTop, lawful
-from polhode.torques import Rotor
+from polhode._closed_forms import FixedAxis, SymmetricTop, lawful, tops
+from polhode._scene import Rotor
 
 SYMMETRIC = ph.Inertia.axisymmetric(1.25, 0.5)
 STATE = ph.State([0.5, 0.5, 0.5, -0.5], [[0.3, 0.2, 0.7], [0.0, 0.0, -1.0]])

@@ -13,9 +13,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 import top_cases
 
 import polhode as ph
-from polhode import tops
-from polhode.methods.exact import LagrangeTop
-from polhode.torques import Rotor, UniformGravity
+from polhode._closed_forms import LagrangeTop, tops
+from polhode._scene import Rotor, UniformGravity
 
 NAMES = list(top_cases.CASES)
 NUMBERS = np.array(list(top_cases.CASES.values())).T  # (10, cases): cases are lanes

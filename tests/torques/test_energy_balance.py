@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode.hamiltonian import (
+from polhode._hamiltonian import (
     Dynamics,
     external_power,
     from_quaternion,

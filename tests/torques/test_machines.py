@@ -7,7 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import polhode as ph
-from polhode.hamiltonian import from_quaternion
+from polhode._hamiltonian import from_quaternion
 
 INERTIA = ph.Inertia.from_moments([1.0, 1.5, 2.0])
 REST = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 0.1])

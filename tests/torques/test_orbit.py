@@ -5,7 +5,7 @@ import pytest
 from mpmath import mp, mpf
 
 import polhode as ph
-from polhode.torques import KeplerOrbit, StateOrbit, eccentric_anomaly
+from polhode._scene import KeplerOrbit, StateOrbit, eccentric_anomaly
 
 ECCENTRICITIES = [0.0, 0.01, 0.3, 0.7, 0.95, 0.999]
 ANOMALIES = [-3.14, -1.5, -1e-3, 0.0, 1e-6, 0.02, 0.4, 2.0, 3.1]

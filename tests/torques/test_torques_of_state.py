@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode.torques import FeedbackTorque, QuadraticDamping
+from polhode._scene import FeedbackTorque, QuadraticDamping
 
 
 def test_quadratic_damping_about_one_axis():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode.torques import FeedbackTorque
+from polhode._scene import FeedbackTorque
 
 INERTIA = ph.Inertia.from_moments([1.0, 1.5, 2.0])
 STATE = ph.State([0.8, 0.0, 0.6, 0.0], [0.5, -0.25, 0.75])
@@ -151,7 +151,7 @@ def test_a_scene_goes_through_jit_and_grad_and_closures_are_differentiated():
 
 def test_times_may_be_many():
     """Functions of one time are mapped over the samples, also where there are three of them."""
-    from polhode.hamiltonian import from_quaternion
+    from polhode._hamiltonian import from_quaternion
 
     ts = jnp.array([0.0, 1.0, 2.0])
     attitude = from_quaternion(tuple(jnp.ones((4, 3)) / 2))

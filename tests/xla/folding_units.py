@@ -14,7 +14,7 @@ jax.config.update("jax_enable_x64", True)
 import jax.numpy as jnp
 import numpy as np
 
-from polhode.xla import kernel
+from polhode._kernels import kernel
 
 WIDE = np.linspace(0.0, 1.0, 5000)
 X, Y, N = np.linspace(0.5, 2.5, 5), np.linspace(-1.0, 1.0, 5), np.arange(5)

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import polhode as ph
-from polhode.xla import kernel
+from polhode._kernels import kernel
 
 WAYS = ("value", "gradient", "jit", "vmap")
 OF_SCENES = (*WAYS, "stock")

@@ -8,9 +8,9 @@ import pytest
 
 import polhode as ph
 from benchmarks.integrators import heavy_top
-from polhode.hamiltonian import Dynamics, lie_poisson_field
-from polhode.solvers._bound_term import BoundTerm
-from polhode.xla import specialise
+from polhode._hamiltonian import Dynamics, lie_poisson_field
+from polhode._integrate._bound_term import BoundTerm
+from polhode._kernels import specialise
 
 N = 5
 KEYS = jax.random.split(jax.random.key(1), 2)

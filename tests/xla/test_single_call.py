@@ -11,7 +11,7 @@ import pytest
 from xla import fuzz
 
 import polhode as ph
-from polhode.xla import _switch, kernel, specialise, spread
+from polhode._kernels import _switch, kernel, specialise, spread
 
 HERE = Path(__file__).parent
 

@@ -63,7 +63,7 @@ NoVerifyOption = Annotated[
 
 def refuse(options: dict[str, Any], file: Any) -> None:
     """SceneFileError for an option that needs an [ensemble] which the scene does not have."""
-    from polhode.io import SceneFileError
+    from polhode.files import SceneFileError
 
     for name in options:
         raise SceneFileError(
@@ -86,7 +86,7 @@ def run(
         jax.config.update("jax_enable_x64", True)
         from polhode.cli import _cache
         from polhode.ensemble import StoreError, build_ensemble
-        from polhode.io import visible
+        from polhode.files import visible
 
         _meet(path, options)
         ensemble, statistics = build_ensemble(file, precision)
@@ -111,7 +111,7 @@ def run(
 
 
 def _store_path(file: Any, output: str | None) -> Path:
-    from polhode.io import visible
+    from polhode.files import visible
 
     text = output or file.output.file or f"{file.path.stem}.zarr"
     path = Path(text)
@@ -130,7 +130,7 @@ def _store_path(file: Any, output: str | None) -> Path:
 def _stream(file, ensemble, statistics, path, precision, meter, options):
     from polhode.cli._run import provenance
     from polhode.ensemble import stream
-    from polhode.io import build_method
+    from polhode.files import build_method
 
     words = provenance(file, precision)
     kept = ("title", "scene", "scene_source", "frame", "precision")

@@ -18,12 +18,12 @@ def explain(
     debug: DebugOption = False,
 ) -> int:
     """Say how a scene would be computed, and why, without computing it."""
-    from polhode.io import visible
+    from polhode.files import visible
 
     file = read(scene, clones, seed)
     import polhode
     from polhode.cli._job import prepare
-    from polhode.io import blamed
+    from polhode.files import blamed
 
     job = prepare(file, precision)
     with blamed(file, ""):
@@ -44,7 +44,7 @@ def schema(debug: DebugOption = False) -> int:
     """Print the JSON Schema of scene files, for editors."""
     import json
 
-    from polhode.io import SceneFile
+    from polhode.files import SceneFile
 
     print(json.dumps(SceneFile.model_json_schema(), indent=1))
     return 0

@@ -225,7 +225,7 @@ def _read(asked: _Asked, room: Any) -> Any:
 
 def _said(loaded: Any) -> str:
     """Which columns were read, in which units."""
-    from polhode.io import visible
+    from polhode.files import visible
 
     names = ", ".join(f"{role} = {visible(name)}" for role, name in loaded.columns.items())
     units = ", ".join(f"{role} in {unit}" for role, unit in loaded.units.items())
@@ -277,8 +277,8 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
     import numpy as np
 
     import polhode
+    from polhode.files import whole_file
     from polhode.fit._result import other_hand
-    from polhode.io import whole_file
     from polhode.rotation import to_matrix
 
     def plain(value: Any) -> Any:
@@ -331,7 +331,7 @@ def _table(asked: _Asked, recording: Any, result: Any) -> Any:
     from rich.table import Table
     from rich.text import Text
 
-    from polhode.io import visible
+    from polhode.files import visible
     from polhode.rotation import to_matrix
 
     samples = int(np.sum(np.asarray(recording.present)))

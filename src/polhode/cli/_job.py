@@ -11,14 +11,7 @@ import numpy as np
 
 import polhode
 from polhode import rotation
-from polhode.io import (
-    SceneFile,
-    blamed,
-    build_attitudes,
-    build_method,
-    build_scene,
-    draw_clones,
-)
+from polhode.files import SceneFile, blamed, build_attitudes, build_method, build_scene, draw_clones
 
 _CHUNKS, _LEAST_CHUNK = 20, 50  # pieces of progress, and bodies below which a piece does not pay
 

@@ -16,7 +16,7 @@ import typer
 
 from polhode.cli import _explain, _fit, _look, _run, _targets
 from polhode.cli._signals import INTERRUPTED, TERMINATED, heeded
-from polhode.io import SceneFileError, visible
+from polhode.files import SceneFileError, visible
 
 SUCCESS, FAILURE, USAGE = 0, 1, 2
 _codes: list[int] = []

@@ -92,7 +92,7 @@ DebugOption = Annotated[bool, typer.Option("--debug", help="show the full traceb
 
 def read(scene: str, clones: int | None, seed: int | None):
     """The scene file with the options put in place of its own entries."""
-    from polhode.io import SceneFileError, read_scene
+    from polhode.files import SceneFileError, read_scene
 
     file = read_scene(scene)
     given = {"clones": clones, "seed": seed}

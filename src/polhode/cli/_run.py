@@ -87,7 +87,7 @@ def _simulate(
     messages = _show.messages(quiet)
     with messages.status("starting ..."):
         from polhode.cli import _cache, _job, _summary
-        from polhode.io import write_netcdf
+        from polhode.files import write_netcdf
 
     with _cache.kept_programs(not no_cache):
         with messages.status("starting ..."):
@@ -170,7 +170,7 @@ def provenance(file, precision: str) -> dict[str, Any]:
 
     from polhode import __version__
     from polhode.ensemble._stream import device_names
-    from polhode.io import visible
+    from polhode.files import visible
 
     carlo = file.monte_carlo
     used: dict[str, Any] = {"precision": precision, "method": file.method.kind,
@@ -199,7 +199,7 @@ def provenance(file, precision: str) -> dict[str, Any]:
 def _draw(job, outcome, path: Path) -> Path:
     """Write the overview figure."""
     from polhode import plot
-    from polhode.io import build_attitudes
+    from polhode.files import build_attitudes
 
     file, seen = job.file, job.file.observations
     observed = None

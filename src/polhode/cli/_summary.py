@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 import polhode
+from polhode._closed_forms.free import Mode
 from polhode.cli._job import Job, Outcome, Residuals
-from polhode.free import Mode
-from polhode.io import visible
+from polhode.files import visible
 from polhode.plot import Scale
 
 MEANINGS = {

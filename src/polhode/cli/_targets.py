@@ -4,7 +4,7 @@ import os
 import stat
 from pathlib import Path
 
-from polhode.io import visible
+from polhode.files import visible
 
 _chosen: dict[Path, tuple[int, int] | None] = {}
 

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Array, Int
 
 from polhode._batch import PARTS, batch_shapes, is_lane_tree
-from polhode._scene import Scene
-from polhode._state import State
+from polhode._scene import Scene, State
 from polhode.ensemble._spreads import constant_torque, stream_of, with_torque
 from polhode.inertia import Inertia
 

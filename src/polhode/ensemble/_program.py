@@ -16,10 +16,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from polhode._method import AbstractMethod, Record, check_inputs, check_method, check_rtol
+from polhode._plan import choose
 from polhode._simulate import run
 from polhode.ensemble._ensemble import Ensemble, draw
 from polhode.ensemble._statistics import Statistic, summarise
-from polhode.methods import AbstractMethod, Record, check_inputs, check_method, check_rtol, choose
 
 _SAMPLES, _LEAST, _MOST = 2**20, 2**4, 2**13
 

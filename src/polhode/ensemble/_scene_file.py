@@ -16,7 +16,7 @@ from polhode.ensemble._spreads import (
     SpreadTorque,
 )
 from polhode.ensemble._statistics import QUANTITIES, Statistic
-from polhode.io import SceneFile, build_inertia, build_scene, build_state
+from polhode.files import SceneFile, build_inertia, build_scene, build_state
 
 
 def build_ensemble(file: SceneFile, dtype: DTypeLike) -> tuple[Ensemble, tuple[Statistic, ...]]:

@@ -14,11 +14,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._scene import Scene
-from polhode._state import State
+from polhode._scene import BodyTorque, Scene, SpaceTorque, State
+from polhode.files._arrays import possible_moments
 from polhode.inertia import Inertia
-from polhode.io._arrays import possible_moments
-from polhode.torques import BodyTorque, SpaceTorque
 
 _MOST_DRAWS = 100
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from polhode import rotation
-from polhode.trajectory import Trajectory
+from polhode._trajectory import Trajectory
 
 
 @dataclasses.dataclass(frozen=True)

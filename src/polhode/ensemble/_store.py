@@ -21,8 +21,8 @@ import numpy as np
 
 from polhode._checks import imported
 from polhode.ensemble._layout import Field, Rows
-from polhode.io._atomic import sync
-from polhode.io._error import shorten
+from polhode.files._atomic import sync
+from polhode.files._error import shorten
 
 _MARK = 1 << 32  # above every 32-bit checksum: an empty cell is 0
 

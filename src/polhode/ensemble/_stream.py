@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
+from polhode._method import AbstractMethod
 from polhode.ensemble import _layout
 from polhode.ensemble._ensemble import Ensemble
 from polhode.ensemble._fill import Progress, fill
@@ -19,7 +20,6 @@ from polhode.ensemble._program import Block
 from polhode.ensemble._statistics import Statistic
 from polhode.ensemble._store import Store, create, in_turn, locked
 from polhode.ensemble._summary import write_summaries
-from polhode.methods import AbstractMethod
 
 
 def stream(

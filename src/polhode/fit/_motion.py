@@ -10,8 +10,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode.free import free_motion
-from polhode.hamiltonian import (
+from polhode._closed_forms.free import free_motion
+from polhode._hamiltonian import (
     Dynamics,
     Hamiltonian,
     components,
@@ -19,10 +19,10 @@ from polhode.hamiltonian import (
     lie_poisson_field,
     momentum_rate,
 )
+from polhode._integrate._classical import ClassicalRungeKutta
+from polhode._scene import AbstractTorque, LinearDamping, QuadraticDamping
 from polhode.inertia import Inertia, principal
 from polhode.rotation import conjugate, multiply, normalise, rotate, to_matrix
-from polhode.solvers._classical import ClassicalRungeKutta
-from polhode.torques import AbstractTorque, LinearDamping, QuadraticDamping
 
 
 class Predicted(NamedTuple):

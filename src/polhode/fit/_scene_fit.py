@@ -11,8 +11,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 from polhode._batch import PARTS, batch_shapes
 from polhode._checks import as_float_array
-from polhode._scene import Scene, places_of
-from polhode._state import State
+from polhode._method import AbstractMethod
+from polhode._scene import Scene, State
+from polhode._scene._scene import places_of
 from polhode.fit._fit import each, together
 from polhode.fit._motion import AbstractMotion
 from polhode.fit._parameters import NoInertia
@@ -32,7 +33,6 @@ from polhode.fit._result import (
 )
 from polhode.fit._scene_motion import simulated
 from polhode.fit._solve import FitOptions, Solution, misfit_of
-from polhode.methods import AbstractMethod
 from polhode.rotation import multiply, rotation_vector_to_wxyz
 
 _LEANS = 1e-3

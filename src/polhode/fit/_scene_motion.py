@@ -6,12 +6,12 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 
-from polhode._scene import Scene
+from polhode._integrate import LiePoisson
+from polhode._method import AbstractMethod
+from polhode._scene import Scene, State
 from polhode._simulate import simulate
-from polhode._state import State
 from polhode.fit._motion import AbstractMotion, Predicted
 from polhode.inertia import Inertia
-from polhode.methods import AbstractMethod, LiePoisson
 
 
 def simulated(scene, omega, wxyz, times, method, rtol, attitude=None) -> Predicted:

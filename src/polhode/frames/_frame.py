@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode._checks import as_float_array, as_vectors, is_concrete, require
+from polhode._parts import Signature, kept, takes
+from polhode._trajectory import Trajectory
 from polhode.frames._interpolation import SampledAttitude
 from polhode.frames._sensors import angular_acceleration
 from polhode.frames._turning import (
@@ -18,9 +20,7 @@ from polhode.frames._turning import (
     VariableRate,
     rate_of_change,
 )
-from polhode.parts import Signature, kept, takes
 from polhode.rotation import conjugate, identity, normalise, rotate
-from polhode.trajectory import Trajectory
 
 Time = Float[ArrayLike, "*#b"]
 Vector = Float[Array, "*#b 3"]

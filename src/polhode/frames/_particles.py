@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode._checks import as_float_array, is_concrete, require_positive
+from polhode._method import check_options, check_rtol, check_times
+from polhode._parts import kept, result_of, takes
 from polhode.frames._frame import RotatingFrame
 from polhode.frames._turning import VariableRate
-from polhode.methods import check_options, check_rtol, check_times
-from polhode.parts import kept, result_of, takes
 from polhode.rotation import conjugate, normalise, rotate, wxyz_rate
 
 _ARGUMENTS = ("t", "position", "velocity")

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from polhode._checks import as_float_array
+from polhode._trajectory import Trajectory
 from polhode.rotation import conjugate, rotate
-from polhode.trajectory import Trajectory
 
 
 def _recorded(trajectory: Trajectory, name: str) -> Array:

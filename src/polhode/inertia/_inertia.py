@@ -16,6 +16,7 @@ from polhode._checks import (
     require,
     require_positive,
 )
+from polhode._parts import AbstractPart, shaped
 from polhode.inertia._cholesky import inertia_from_log_cholesky, inertia_to_log_cholesky
 from polhode.inertia._eigen import principal
 from polhode.inertia._input import (
@@ -26,7 +27,6 @@ from polhode.inertia._input import (
 from polhode.inertia._physical import is_symmetric, possible_moments, possible_tensor
 from polhode.inertia._shapes import AbstractShaped, Symmetry
 from polhode.inertia._tensor import check_points, of_points, turned
-from polhode.parts import AbstractPart, shaped
 from polhode.rotation import to_matrix
 
 _ONE_FORM = (

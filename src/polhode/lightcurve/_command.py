@@ -90,7 +90,7 @@ def _write(fit: Fit, output: Path, name: str, say) -> None:
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    from polhode.io import whole_file
+    from polhode.files import whole_file
 
     page = figure(fit, title=name)
     picture = output.with_name(output.name + ".png")

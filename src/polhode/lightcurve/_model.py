@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode import free, rotation
-from polhode.free._roles import Triple
+from polhode import rotation
+from polhode._closed_forms import free
+from polhode._closed_forms.free._roles import Triple
 from polhode.lightcurve._phase import AbstractPhase
 from polhode.lightcurve._scattering import _cross, seeliger_ellipsoid
 

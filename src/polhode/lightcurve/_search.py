@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode import free
+from polhode._closed_forms import free
 from polhode.lightcurve._hypotheses import Hypotheses
 from polhode.lightcurve._model import Bodies, Points, magnitudes, moments_of
 from polhode.lightcurve._phase import AbstractPhase

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode import free, rotation
+from polhode import rotation
+from polhode._closed_forms import free
 from polhode.lightcurve._model import Bodies, Points, _to_body, moments_of
 from polhode.lightcurve._scattering import seeliger_ellipsoid
 

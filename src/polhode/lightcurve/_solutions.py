@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from polhode import free, rotation
+from polhode import rotation
+from polhode._closed_forms import free
 from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._frequencies import Pairs
 from polhode.lightcurve._hypotheses import Hypotheses

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
-from polhode.io import whole_file
+from polhode._trajectory import Trajectory
+from polhode.files import whole_file
 from polhode.plot._matplotlib import AXES, INK, new_figure, styled
 from polhode.plot._samples import Samples, as_samples, box_sides, matrices
 from polhode.plot._scale import Scale
-from polhode.trajectory import Trajectory
 
 _FACES = np.array(
     [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]

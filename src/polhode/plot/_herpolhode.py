@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from polhode._trajectory import Trajectory
 from polhode.plot._matplotlib import ACCENT, GREY, INK, new_figure, styled
 from polhode.plot._samples import Samples, pick
 from polhode.plot._scale import Scale
-from polhode.trajectory import Trajectory
 
 
 @styled

@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from polhode._trajectory import Trajectory
 from polhode.plot._matplotlib import AXES, INK, new_figure, plain, styled
 from polhode.plot._polhode import polhode
 from polhode.plot._samples import Samples, as_samples
 from polhode.plot._scale import Scale
-from polhode.trajectory import Trajectory
 
 _BAND = (5, 95)
 

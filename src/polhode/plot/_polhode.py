@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from polhode._trajectory import Trajectory
 from polhode.plot._matplotlib import ACCENT, AXES, GREY, INK, new_figure, styled
 from polhode.plot._samples import Samples, pick
-from polhode.trajectory import Trajectory
 
 _LIGHT = np.array([0.25, -0.35, 0.9]) / np.linalg.norm([0.25, -0.35, 0.9])
 

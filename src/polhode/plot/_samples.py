@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
+from polhode._trajectory import Trajectory
 from polhode.inertia import Inertia
 from polhode.rotation import matrix_row
-from polhode.trajectory import Trajectory
 
 
 @dataclasses.dataclass(frozen=True)

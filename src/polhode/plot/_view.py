@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from polhode.io import whole_file
+from polhode._trajectory import Trajectory
+from polhode.files import whole_file
 from polhode.plot._samples import Samples
 from polhode.plot._scale import Scale
 from polhode.plot._view_data import (
@@ -26,7 +27,6 @@ from polhode.plot._view_data import (
     per_body,
 )
 from polhode.plot._view_file import read
-from polhode.trajectory import Trajectory
 
 _SHOWN_TURNS = 0.4  # turns that the fastest body makes in a second of the page
 

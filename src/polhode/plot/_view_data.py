@@ -9,10 +9,10 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from polhode._trajectory import Trajectory
 from polhode.inertia._mesh import as_triangles, load_mesh
 from polhode.plot._samples import Samples, as_samples, box_sides, matrices
 from polhode.rotation import matrix_to_wxyz
-from polhode.trajectory import Trajectory
 
 MOST_SAMPLES = 20_000
 """Samples of all shown bodies together that a page holds; more are thinned."""

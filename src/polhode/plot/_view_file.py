@@ -6,7 +6,7 @@ from os.path import isfile
 import numpy as np
 
 from polhode._checks import imported
-from polhode.io import build_inertia, parse_scene
+from polhode.files import build_inertia, parse_scene
 from polhode.plot._view_data import Body
 
 _NEEDED = ("wxyz", "omega_body", "momentum_space", "moments")

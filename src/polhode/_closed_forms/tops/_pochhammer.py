@@ -1,0 +1,240 @@
+"""Theta functions in Tate's form: the infinite product (a; h) = prod over n >= 0 of (1 - h^n a).
+
+theta1(z) with nome q is, up to constants and a factor exp(-iz), the product (a; h)(h/a; h) with
+a = exp(2iz), h = q^2 (Jacobi's triple product, NIST DLMF 20.5.1). Written so it depends on a and
+h/a, both of which are regular where the amplitude of a motion vanishes.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from polhode._closed_forms.elliptic._nome import nome
+from polhode._closed_forms.tops._complex import Complex
+from polhode._kernels import staged
+
+_TERMS = 5
+
+
+class Series(NamedTuple):
+    """Euler's coefficients of (a; h), and their derivatives with respect to ``h``."""
+
+    h: Array
+    weights: tuple[Array, ...]
+    slopes: tuple[Array, ...]
+
+
+class Curve(NamedTuple):
+    """One elliptic curve: ``h`` = q^2 <= exp(-2 pi), and what the map of its points needs.
+
+    ``square`` is lambda^2, lambda the modulus after one descending Landen step; ``steps`` are
+    lambda'/lambda^2 of the next ones, ``step_slopes`` their derivatives with respect to ``square``;
+    ``per`` is q/lambda; ``stretch`` is theta3(h)^2.
+    """
+
+    h: Array
+    square: Array
+    steps: tuple[Array, Array, Array]
+    step_slopes: tuple[Array, Array, Array]
+    per: Array
+    stretch: Array
+    series: Series
+
+
+def _series(h: Array) -> Series:
+    weights, slopes = [jnp.ones_like(h)], [jnp.zeros_like(h)]
+    power, power_slope = jnp.ones_like(h), jnp.zeros_like(h)  # h^k and its derivative
+    for k in range(_TERMS):
+        above, below = weights[-1] * power, 1 / (1 - power * h)
+        rise = slopes[-1] * power + weights[-1] * power_slope
+        slopes.append(-(rise + above * ((k + 1) * power * below)) * below)
+        weights.append(-above * below)
+        power, power_slope = power * h, (k + 1) * power
+    return Series(h, tuple(weights), tuple(slopes))
+
+
+def _curve(square: Array) -> Curve:
+    constants = nome(square, 1 - square)
+    steps, slopes = [], []
+    modulus, rise = square, jnp.ones_like(square)
+    for _ in range(3):
+        root = jnp.sqrt(1 - modulus)
+        steps.append(1 / (1 + root) ** 2)
+        slopes.append(steps[-1] / ((1 + root) * root) * rise)
+        grown = steps[-1] * modulus
+        rise = 2 * grown * (slopes[-1] * modulus + steps[-1] * rise)
+        modulus = grown * grown
+    return Curve(
+        constants.q,
+        square,
+        tuple(steps),
+        tuple(slopes),
+        jnp.sqrt(constants.per_x),
+        1 + constants.excess,
+        _series(constants.q),
+    )
+
+
+@jax.custom_jvp
+def curve(square: Array, one: Array) -> Curve:
+    """The curve of a squared Landen modulus in [0, 0.03]."""
+    return staged(_curve(square), one)
+
+
+@curve.defjvp
+def _curve_rule(primals, tangents):
+    square, one = primals
+    _, slopes = jax.jvp(_curve, (square,), (jnp.ones_like(square),))
+    return curve(*primals), jax.tree.map(lambda slope: slope * tangents[0], staged(slopes, one))
+
+
+def _polynomial(a: Complex, coefficients) -> Complex:
+    """Polynomial with real coefficients, lowest first (Knuth, TAOCP 2, 4.6.4: all of it real)."""
+    twice, square = 2 * a.re, a.square
+    *rest, ahead, last = coefficients
+    ahead = ahead + twice * last
+    for weight in reversed(rest[1:]):
+        ahead, last = weight + twice * ahead - square * last, ahead
+    return Complex(rest[0] + a.re * ahead - square * last, a.im * ahead)
+
+
+def _first(coefficients):
+    """Coefficients of the derivative."""
+    return [k * w for k, w in enumerate(coefficients) if k > 0]
+
+
+def _pair(total: Array, times: Array, weights) -> tuple[Array, Array]:
+    # On a and b, roots of z^2 - total z + times, a polynomial is linear in z (Knuth's scheme).
+    def line(coefficients):
+        *rest, ahead, last = coefficients
+        ahead = ahead + total * last
+        for weight in reversed(rest[1:]):
+            ahead, last = weight + total * ahead - times * last, ahead
+        return rest[0] - times * last, ahead
+
+    (low, high), (slope, bend) = line(weights), line(_first(weights))
+    twist = slope * low + (bend * low) * total + times * (bend * high)
+    return low * low + (low * high) * total + times * (high * high), twist
+
+
+@jax.custom_jvp
+def pair(
+    total: Array, times: Array, rise: Array, series: Series, one: Array
+) -> tuple[Array, Array]:
+    """(a; h)(b; h), and T in a d/da log (a; h) - b d/db log (b; h) = T (a - b)/((a; h)(b; h)).
+
+    Real functions of the sum and the product of a and b; the product is a function of h, of slope
+    ``rise``.
+    """
+    return staged(_pair(total, times, series.weights), one)
+
+
+@pair.defjvp
+def _pair_rule(primals, tangents):
+    total, times, rise, series, one = primals
+    unit, still = jnp.ones_like(total), jnp.zeros_like(times)
+    _, by_total = jax.jvp(lambda s: _pair(s, times, series.weights), (total,), (unit,))
+    _, by_h = jax.jvp(
+        lambda s, p, w: _pair(s, p, w),
+        (total, times, series.weights),
+        (jnp.zeros_like(total), still + rise, series.slopes),
+    )
+    by_total, by_h = staged((by_total, by_h), one)
+    ds, dh = tangents[0], tangents[3].h  # the coefficients depend on h alone
+    return pair(*primals), tuple(x * ds + y * dh for x, y in zip(by_total, by_h))
+
+
+@jax.custom_jvp
+def unpaired(a: Complex, b: Complex, series: Series, one: Array) -> tuple[Complex, Complex]:
+    """(a; h)(b; h), and a d/da less b d/db of it (Euler's series, DLMF 17.2.37)."""
+    first = _first(series.weights)
+    x, y = _polynomial(a, series.weights), _polynomial(b, series.weights)
+    dx, dy = a * _polynomial(a, first), b * _polynomial(b, first)
+    x, y, dx, dy = staged((x, y, dx, dy), one)
+    return x * y, dx * y - x * dy
+
+
+@unpaired.defjvp
+def _apart_rule(primals, tangents):
+    a, b, series, one = primals
+    da, db, dh = *tangents[:2], tangents[2].h
+
+    def parts(a):
+        first = _first(series.weights)
+        value, rise = _polynomial(a, series.weights), _polynomial(a, first)
+        bend = rise + a * _polynomial(a, _first(first))
+        by_h = _polynomial(a, series.slopes), a * _polynomial(a, _first(series.slopes))
+        return staged((value, rise, a * rise, bend, *by_h), one)
+
+    x, x1, dx, dx1, xh, dxh = parts(a)
+    y, y1, dy, dy1, yh, dyh = parts(b)
+    of_value = x1 * y, x * y1, xh * y + x * yh
+    of_twist = (
+        dx1 * y - x1 * dy,
+        dx * y1 - x * dy1,
+        dxh * y + dx * yh - xh * dy - x * dyh,
+    )
+    of_value, of_twist = staged((of_value, of_twist), one)
+    return unpaired(*primals), tuple(p * da + q * db + r * dh for p, q, r in (of_value, of_twist))
+
+
+@jax.custom_jvp
+def _descend(e: Complex, partner: Complex, c: Curve, one: Array) -> Complex:
+    """Product over n >= 1 of ((1 + partner_n)/(1 + e_n))^(1/2^(n+1)) along Landen's descent.
+
+    ``e`` and ``partner`` are those of n = 1. The last level, where the square is below 1e-20, is
+    summed in closed form, so that e may be large.
+    """
+    *levels, (_, _, roots) = _levels(e, partner, c, one)
+    total = (1 + roots[1]) * (1 + roots[0]).inverse
+    total = staged((levels[1][2] * (total * total)).root, one)
+    total = staged((levels[0][2] * total).root, one)
+    return total.root
+
+
+def _levels(e: Complex, partner: Complex, c: Curve, one: Array):
+    """e, its partner and (1 + partner)/(1 + e) of each level; of the last the roots of 1 + both."""
+    found = []
+    for step in c.steps[1:]:
+        ratio = staged((1 + partner) * (1 + e).inverse, one)
+        found.append((e, partner, ratio))
+        e, partner = e * e * ratio * step, partner * partner * ratio.inverse * step
+        e, partner = staged((e, partner), one)
+    return *found, (e, partner, staged(((1 + e).root, (1 + partner).root), one))
+
+
+@_descend.defjvp
+def _descend_rule(primals, tangents):
+    e, partner, c, one = primals
+    de, dpartner, dc, _ = tangents
+    *levels, (e, partner, (left, right)) = _levels(e, partner, c, one)
+    # Partial derivatives of the logarithm, from the last level back to the first.
+    by_e = (left * (1 + left)).inverse * (-1 / 8)
+    by_partner = (right * (1 + right)).inverse * (1 / 8)
+    by_e, by_partner = staged((by_e, by_partner), one)
+    by_square = Complex(jnp.zeros_like(one), jnp.zeros_like(one))
+    for k in (1, 0):
+        up, down = by_e * e, by_partner * partner
+        by_square = by_square + (up + down) * (c.step_slopes[k + 1] / c.steps[k + 1])
+        share = up - down + 1 / 4 / 2**k
+        e, partner, ratio = levels[k]
+        step = c.steps[k + 1]
+        by_e = by_e * (e * ratio) * (2 * step) - share * (1 + e).inverse
+        by_partner = by_partner * (partner * ratio.inverse) * (2 * step)
+        by_partner = by_partner + share * (1 + partner).inverse
+        by_e, by_partner = staged((by_e, by_partner), one)
+    value = _descend(*primals)
+    by_e, by_partner, by_square = staged((by_e * value, by_partner * value, by_square * value), one)
+    return value, by_e * de + by_partner * dpartner + by_square * dc.square
+
+
+def point(lead: Complex, rest: Complex, pull: Array, c: Curve, one: Array):
+    """Coordinate E of a point on the curve and h/E, without constant factors.
+
+    From twice the amplitude as exponentials ``lead``, ``rest`` (times lambda, and one half of the
+    first Landen step taken), whose squares times ``pull`` are those of the next level.
+    """
+    turn = staged(_descend(lead * lead * pull, rest * rest * pull, c, one), one)
+    return lead * turn, rest * turn.inverse

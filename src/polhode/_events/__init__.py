@@ -1,0 +1,5 @@
+"""Events: when a function of attitude, rates and time crosses zero, and motions that stop there."""
+
+from polhode._events._crossings import Crossings as Crossings, crossings as crossings
+from polhode._events._event import Event as Event
+from polhode._events._until import check_until as check_until, stopped as stopped

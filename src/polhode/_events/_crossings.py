@@ -1,0 +1,286 @@
+"""When a function of attitude, rates and time crosses zero along a trajectory."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from polhode._batch import PARTS, flatten, lane_times
+from polhode._checks import is_concrete
+from polhode._events._bracketed import bracketed
+from polhode._events._event import Event, at_least
+from polhode._integrate import natural_rates
+from polhode._method import Status
+from polhode._scene import Scene
+from polhode._trajectory import Trajectory, moved_through, moved_to
+
+A_TURN = 32
+"""Looks in a turn of the fastest natural rate."""
+
+_TOO_MANY = 20_000_000
+"""Looks at all bodies together, which are held in memory."""
+
+_ROOM = 16
+"""Least number of places where the function turns back that are looked at."""
+
+AT_START = 1e-6
+"""Part of the time between two looks within which a crossing is the start itself."""
+
+
+class Crossings(eqx.Module):
+    """Crossings of zero of each body, in the order in which the motion meets them.
+
+    **Fields:** ``times`` (..., M) [s], inf where there is none; ``slope`` (..., M): rate of change
+    of the function there [1/s], 0 where there is none; ``count`` (...): how many were found, which
+    may be more than the M that there was room for (``complete`` tells).
+    """
+
+    times: Float[Array, "*b m"]
+    slope: Float[Array, "*b m"]
+    count: Int[Array, "*b"]
+
+    @property
+    def complete(self) -> Array:
+        """Whether (...) there was room for all that were found."""
+        return self.count <= self.times.shape[-1]
+
+
+def crossings(
+    trajectory: Trajectory,
+    fn: Callable | Event,
+    direction: int = 0,
+    *,
+    most: int | None = None,
+    samples: int | None = None,
+) -> Crossings:
+    """Times within those of ``trajectory`` at which ``fn(wxyz, omega_body, t)`` crosses zero.
+
+    **Arguments:** ``fn``: see ``ph.Event``, which may be given in its place; ``direction``: 1
+    rising, -1 falling (in time), 0 both; ``most``: room for the crossings of a body; None: as many
+    as there are; ``samples``: see ``ph.Event``. Under ``jit``, ``vmap`` and ``grad`` both must be
+    given.
+
+    Times are as accurate as the motion: to rounding for exact laws, to ``rtol`` over the slope for
+    stepped ones. They have first and second derivatives, by the implicit function theorem, in all
+    that the motion depends on, and so has ``slope``; third ones are wrong. A crossing at the first
+    time (within 1e-6 of the time between two looks) is where the motion comes from, not one that it
+    makes.
+
+    The guarantee: the function and its rate of change are looked at 32 times in a turn of the
+    fastest natural rate, the largest of |L| over the smallest moment at the saved samples and of
+    the rate that gravity gives; where the function turns back towards zero between two looks its
+    turning point is found, and a pair of crossings around it. So a pair is missed only where the
+    function turns three times or more within one look: no fixed direction in a body seen from
+    space does so. Functions that vary faster than the body turns (high powers, other frequencies
+    of the time) and rates that rise and fall again between two saved samples need ``samples``.
+
+    Raises ValueError where the looks would be too many to be held in memory, where the steps of a
+    body run out on their way (under ``jit`` it is not ``complete``), or where ``jit`` does not know
+    how many there are.
+
+        up = ph.crossings(traj, lambda wxyz, omega_body, t: omega_body[0], direction=1)
+        traj.at(up.times).euler()
+    """
+    event = fn if isinstance(fn, Event) else Event(fn, direction, samples)
+    room = at_least("most", most, 1)
+    looks = event.samples if samples is None else at_least("samples", samples, 2)
+    for name in ("wxyz", "omega_body"):
+        trajectory._need(name)
+    if trajectory.propagator is None:
+        raise ValueError("this trajectory was made by hand: use one that ph.simulate returns.")
+    if looks is None:
+        looks = _looks(trajectory)
+    if room is None:
+        if not is_concrete(trajectory):
+            raise ValueError(
+                "under jit, vmap or grad the room for crossings must be known: most=8."
+            )
+        room = _ROOM
+    found, lost = _found(trajectory, event, room, looks)
+    if is_concrete(lost) and np.any(np.asarray(lost)):
+        raise ValueError(
+            f"the steps of a body ran out on its way through {looks:,} looks: search a shorter time"
+            " (traj.between), or ask for more steps, ph.LiePoisson(..., max_steps=2**20)."
+        )
+    while most is None and int(np.max(found.count, initial=0)) > room:
+        room = 2 ** int(np.ceil(np.log2(np.max(found.count))))
+        found, _ = _found(trajectory, event, room, looks)
+    if most is None:  # without room that no body uses
+        used = int(np.max(found.count, initial=0))
+        found = Crossings(found.times[..., :used], found.slope[..., :used], found.count)
+    return found
+
+
+def _looks(trajectory: Trajectory) -> int:
+    """How many looks find every crossing, of a motion that is known."""
+    if not is_concrete(trajectory):
+        raise ValueError(
+            "under jit, vmap or grad the number of looks must be known: ph.Event(fn, samples=1000),"
+            " 32 or more in a turn of the fastest rate."
+        )
+    turned = np.max(np.asarray(_turned(trajectory)), initial=0)
+    looks = max(17, 1 + int(np.ceil(A_TURN * turned / (2 * np.pi))) if np.isfinite(turned) else 17)
+    grain = 2 ** max(0, int(np.log2(looks)) - 2)  # few numbers, for fewer compiled programs
+    looks = 1 + -(-(looks - 1) // grain) * grain
+    if looks * max(1, int(np.prod(trajectory.batch_shape))) > _TOO_MANY:
+        raise ValueError(
+            f"{looks:,} looks at each body are needed for the {turned:.3g} rad that it turns:"
+            " search a shorter time or fewer bodies at once, or give samples= for a slow function."
+        )
+    return looks
+
+
+@eqx.filter_jit
+def _turned(trajectory: Trajectory) -> Array:
+    """Most (...) that a body may turn from the first to the last time [rad]."""
+    ts = trajectory._t
+    span = jnp.max(ts, axis=-1) - jnp.min(ts, axis=-1)
+    rate = jnp.max(turning_rates(trajectory), axis=-1)
+    return jnp.maximum(rate, _natural_rates(trajectory)) * span
+
+
+def turning_rates(trajectory: Trajectory) -> Array:
+    """The most (..., T) that a body may turn at, by its momentum at each sample [rad/s]."""
+    carrier = trajectory._scene.carrier
+    size = jnp.linalg.norm(carrier.momentum(trajectory._need("omega_body")), axis=-1)
+    return size / jnp.min(carrier.moments, axis=-1)
+
+
+def _natural_rates(trajectory: Trajectory) -> Array:
+    """Natural rates (...) [rad/s] at the first sample, gravity's included."""
+    batch = trajectory.batch_shape
+    parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
+    lanes = flatten(trajectory.first, batch, shared=False)
+    ends = lane_times(trajectory.ts[..., jnp.array([0, -1])], batch)
+    return natural_rates(Scene(**parts), lanes, ends).reshape(batch)
+
+
+@eqx.filter_jit
+def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> tuple[Crossings, Array]:
+    """The first ``most`` crossings, and for which bodies (...) the looks could not be taken."""
+    still = jax.lax.stop_gradient
+    arrays, rest = eqx.partition(trajectory, eqx.is_inexact_array)
+    fixed: Trajectory = eqx.combine(still(arrays), rest)
+    batch = trajectory.batch_shape
+    ts = fixed.ts
+    share = jnp.linspace(0, 1, looks, dtype=ts.dtype).at[0].set(AT_START / (looks - 1))
+    share = share.reshape((1,) * (ts.ndim - 1) + share.shape)
+    grid = ts[..., :1] + share * (ts[..., -1:] - ts[..., :1])
+    seen = moved_through(fixed, grid)
+    propagator: Any = trajectory.propagator
+    # what is stepped goes on from the nearest look
+    whence = fixed if propagator.method.exact else seen
+    values, slopes = event.values(seen)
+    values, slopes = (x.reshape(-1, looks) for x in (values, slopes))
+    grid = jnp.broadcast_to(grid, (*batch, looks)).reshape(-1, looks)
+    values, slopes, grid = still((values, slopes, grid))
+    ahead = jnp.where(grid[:, -1:] < grid[:, :1], -1, 1).astype(grid.dtype)
+
+    def evaluate(t):
+        found = event.values(moved_to(whence, t.reshape(*batch, -1)))
+        return still(tuple(x.reshape(t.shape) for x in found))
+
+    sides = jnp.where(values >= 0, 1, -1)
+    changes = sides[:, 1:] != sides[:, :-1]
+    if event.direction:
+        changes = changes & (sides[:, 1:] * ahead == event.direction)
+    room = max(most, _ROOM)
+    dips = dips_of(grid, values, slopes, sides)
+
+    # what turns back towards zero between two looks is looked at where it turns
+    place, is_dip = first_true(dips, room)
+    single, is_single = first_true(changes, room)
+    side = entries(sides, place)
+    low, high = entries(grid, place), entries(grid, place + 1)
+    turns = low, high, entries(slopes, place), entries(slopes, place + 1), is_dip
+
+    def brackets(turning, there):
+        """Between looks, and on both sides of such a turning point; which are pairs of these."""
+        pairs = is_dip & (jnp.where(there >= 0, 1, -1) != side)
+        columns = (
+            (entries(grid, single), low, turning),
+            (entries(grid, single + 1), turning, high),
+            (entries(values, single), entries(values, place), there),
+            (entries(values, single + 1), there, entries(values, place + 1)),
+            (is_single, pairs, pairs),
+            (entries(sides, single + 1) > 0, side < 0, side > 0),  # rising along the motion
+        )
+        *columns, use, rising = (jnp.concatenate(x, axis=-1) for x in columns)
+        if event.direction:
+            use = use & (jnp.where(rising, 1, -1) * ahead == event.direction)
+        order = jnp.argsort(jnp.where(use, ahead * columns[0], jnp.inf), axis=-1)[:, :room]
+        return tuple(entries(x, order) for x in (*columns, use)), pairs
+
+    def search(found, second):
+        """The turning points, then the roots: one copy of the motion in the program."""
+        given = [jnp.where(second, b, a) for a, b in zip(turns, brackets(*found)[0])]
+
+        def fn(t):
+            value, slope = evaluate(t)
+            return jnp.where(second, value, slope), value
+
+        found = bracketed(fn, *given)
+        return found, found
+
+    none = jnp.zeros_like(low)
+    _, (points, there) = jax.lax.scan(search, (none, none), jnp.array([False, True]))
+    (*_, use), pairs = brackets(points[0], there[0])
+    times = points[1]
+    each = 1 if event.direction else 2
+    count = jnp.sum(changes, axis=-1) + each * jnp.sum(pairs, axis=-1)
+    # dips beyond the room were not looked at: there may be as many pairs of them
+    dipping = jnp.sum(dips, axis=-1)
+    count = jnp.where(dipping > room, jnp.maximum(count, each * dipping), count)
+    times, use = (x[:, :most].reshape(*batch, most) for x in (times, use))
+    slope, times = _polished(trajectory, event, times, use)
+    lost = (seen.status != Status.SUCCESSFUL) & (trajectory.status == Status.SUCCESSFUL)
+    count = jnp.where(lost, most + 1, count.reshape(batch)).astype(jnp.int32)
+    return Crossings(jnp.where(use, times, jnp.inf), jnp.where(use, slope, 0), count), lost
+
+
+def _polished(trajectory: Trajectory, event: Event, times: Array, use: Array):
+    """Slopes and times with their derivatives."""
+    safe = jnp.where(use, times, trajectory.ts[..., :1])
+    # of the value no more than rounding is left to mend, or of a touch all digits are noise
+    grain = 64 * jnp.finfo(safe.dtype).eps * jnp.abs(safe)
+    late, there = event.polished(moved_to(trajectory, safe), grain)
+    _, slope = event.values(there)
+    return slope, safe + late
+
+
+def dips_of(grid, values, slopes, sides) -> Array:
+    """Between which looks (N, looks - 1) the function turns back before zero, and comes near it.
+
+    Near by the cubic through values and slopes, whose error is a hundredth of what it changes by.
+    """
+    step = grid[:, 1:] - grid[:, :-1]
+    side = sides[:, :-1].astype(values.dtype)
+    a, end = side * values[:, :-1], side * values[:, 1:]
+    b, b_end = side * step * slopes[:, :-1], side * step * slopes[:, 1:]
+    turns = (sides[:, 1:] == sides[:, :-1]) & (b < 0) & (b_end > 0)
+    jump = end - a
+    c, d = 3 * jump - 2 * b - b_end, b + b_end - 2 * jump
+    root = jnp.sqrt(jnp.maximum(c * c - 3 * d * b, 0))
+    s = -b / jnp.where(c + root > 0, c + root, 1)
+    s = jnp.clip(s, 0, 1)
+    lowest = a + s * (b + s * (c + s * d))
+    return turns & (lowest <= jnp.minimum(a, end) / 2)
+
+
+def entries(x: Array, k: Array) -> Array:
+    """Entries ``k`` (N, D) of the rows of ``x``."""
+    return jnp.take_along_axis(x, k, axis=-1)
+
+
+def first_true(mask: Array, most: int) -> tuple[Array, Array]:
+    """Places (N, most) of the first that are true, and which of these there are."""
+    size = mask.shape[-1]
+    places = jnp.where(mask, jnp.arange(size), size)
+    if most > size:
+        places = jnp.pad(places, ((0, 0), (0, most - size)), constant_values=size)
+    places = jnp.sort(places, axis=-1)[:, :most]
+    return jnp.where(places < size, places, 0), places < size

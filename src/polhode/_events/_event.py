@@ -1,0 +1,81 @@
+"""What an event is: a function of attitude, rates and time that crosses zero."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from polhode import rotation
+from polhode._parts import Signature
+from polhode._trajectory import Trajectory, shortly_after
+
+_FUNCTION = Signature("Event", {"wxyz": (4,), "omega_body": (3,), "t": ()})
+
+
+class Event(eqx.Module):
+    """A zero crossing of ``fn(wxyz, omega_body, t)``, a number of one body at one time.
+
+    **Arguments:** ``fn``: of the unit quaternion (4,) body -> space (of either sign), the body
+    rates (3,) [rad/s] and the time () [s], smooth; batches are mapped over it. ``direction``: 1
+    where fn rises through zero in time, -1 where it falls, 0 for both. ``samples``: at how many
+    equally spaced times the motion is looked at; None: 32 in a turn of the fastest natural rate
+    (see ``ph.crossings``), which under ``jit`` must be given for ``crossings``.
+
+    Raises TypeError or ValueError for a function that takes or returns something else, another
+    direction, or fewer than two samples.
+
+        horizontal = ph.Event(lambda wxyz, omega_body, t: ph.rotation.rotate(wxyz, z)[2])
+    """
+
+    fn: Callable
+    direction: int = eqx.field(static=True)
+    samples: int | None = eqx.field(static=True)
+
+    def __init__(self, fn: Callable, direction: int = 0, samples: int | None = None):
+        self.fn = _FUNCTION.checked(fn)
+        if isinstance(direction, bool) or direction not in (-1, 0, 1):
+            raise ValueError(f"direction must be 1 (rising), -1 (falling) or 0, got {direction!r}.")
+        self.direction = int(direction)
+        self.samples = at_least("samples", samples, 2)
+
+    def values(self, trajectory: Trajectory) -> tuple[Array, Array]:
+        """The function and its rate of change [1/s] at every sample (..., T)."""
+        wxyz, omega = trajectory._need("wxyz"), trajectory._need("omega_body")
+        t = jnp.broadcast_to(trajectory._t, omega.shape[:-1])
+        slopes = (
+            rotation.wxyz_rate(wxyz, omega),
+            trajectory._scene.acceleration(wxyz, omega, trajectory._t),
+            jnp.ones_like(t),
+        )
+        return jax.jvp(partial(_FUNCTION.mapped, self.fn), (wxyz, omega, t), slopes)
+
+    def polished(self, near: Trajectory, most: Array) -> tuple[Array, Trajectory]:
+        """At samples ``near`` events: how much later (..., T) [s] these are, at most by ``most``,
+        and the samples then.
+
+        Steps t - g(t)/s with one slope s for all: where g(t) is zero they move nothing, and after
+        two of them t has the first and second derivatives of the root.
+        """
+        still = jax.lax.stop_gradient
+        value, slope = self.values(near)
+        touch, chord = slope == 0, still(jnp.where(slope == 0, 1, slope))
+        late = jnp.where(touch, 0, -value / chord)
+        late = late - still(late) + still(jnp.clip(late, -most, most))
+        value, _ = self.values(shortly_after(near, late))
+        change = jnp.where(touch, 0, -value / chord)
+        late = late + (change - still(change))
+        return late, shortly_after(near, late)
+
+
+def at_least(name: str, value: Any, least: int) -> int | None:
+    """A known integer not below ``least``, or None."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
+        raise ValueError(f"{name} must be an integer, at least {least}, got {value!r:.40}.")
+    return int(value)

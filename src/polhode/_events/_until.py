@@ -1,0 +1,299 @@
+"""Motions that stop at an event: windows of the motion one after the other, until each body has
+met its own, so that the work follows from where the events are and not from the last time."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from polhode._batch import PARTS, flatten, lane_times
+from polhode._events._bracketed import bracketed
+from polhode._events._crossings import A_TURN, AT_START, dips_of, entries, first_true, turning_rates
+from polhode._events._event import Event
+from polhode._integrate import natural_rates
+from polhode._method import Record, Status
+from polhode._scene import Scene, State
+from polhode._trajectory import Trajectory, moved_through, moved_to
+
+_LOOKS = 64
+"""Steps between looks in a window: two turns of the fastest body."""
+
+_FIRST, _GROWTH = 2**-10, 4.0
+"""Part of the whole that the first window is at most, and how much longer the next may be: a body
+that rests at first may be set in motion soon."""
+
+_FASTER = 1.5
+"""How much faster than at its start a body may turn within a window."""
+
+_MOST = 2**20
+"""Windows, of a thousandth of a second or less each: what has no event by then is given up."""
+
+_DIPS = 2
+"""Places in a window, of each body, where the function may turn back before zero."""
+
+
+def check_until(until: Any, record: Any) -> None:
+    """An event, with samples of both attitude and rates."""
+    if not isinstance(until, Event):
+        raise TypeError(
+            f"until must be a ph.Event, got {type(until).__name__}: ph.Event(fn, direction)."
+        )
+    if record is not None and record != Record():
+        raise ValueError(
+            "until= needs attitude and rates at all times and knows no work and error: leave"
+            " record= out."
+        )
+
+
+@eqx.filter_jit
+def stopped(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
+    """The motion from ``begin``, its state at the first of ``ts``, each body held from its first
+    event on."""
+    batch = begin.batch_shape
+    lanes, ts = _of_lanes(begin), lane_times(ts, batch)
+    arrays, rest = eqx.partition((lanes, until), eqx.is_inexact_array)
+    still = jax.lax.stop_gradient
+    fixed, event = eqx.combine(still(arrays), rest)
+    met, lost, near, step = still(_first_event(fixed, event, still(ts)))
+    held = _held(lanes, ts, until, met, near, step)
+    held = (*held[:3], jnp.where(lost, Status.MAX_STEPS, held[3]), *held[4:])
+    wxyz, omega, spins, status, steps, times, event = (
+        None if x is None else x.reshape(*batch, *x.shape[1:]) for x in held
+    )
+    return Trajectory(
+        times, wxyz, omega, status, steps, begin.scene, spins=spins, propagator=begin.propagator,
+        event_time=event,
+    )  # fmt: skip
+
+
+def _of_lanes(begin: Trajectory) -> Trajectory:
+    """The same with one batch axis."""
+    batch = begin.batch_shape
+    n = begin.status.size
+    parts = {name: flatten(getattr(begin.scene, name), batch) for name in PARTS}
+    samples = (
+        None if x is None else x.reshape(n, *x.shape[len(batch) :])
+        for x in (begin.wxyz, begin.omega_body, begin.spins)
+    )
+    wxyz, omega, spins = samples
+    return Trajectory(
+        lane_times(begin.ts, batch), wxyz, omega, begin.status.reshape(n), begin.steps.reshape(n),
+        Scene(**parts), spins=spins, propagator=begin.propagator,
+    )  # fmt: skip
+
+
+class _Bracket(NamedTuple):
+    """Where each of N bodies meets its event: between two times, the values there, and the look
+    before it."""
+
+    low: Array
+    high: Array
+    at_low: Array
+    at_high: Array
+    look: Array  # its time
+    samples: list[Array]
+
+
+class _Dip(NamedTuple):
+    """Where a function that keeps its sign at the looks crosses zero and turns back: after which
+    look (N,), ``_LOOKS`` for nowhere; when it turns, its value there and its sign before."""
+
+    place: Array
+    time: Array
+    value: Array
+    side: Array
+
+
+class _Window(NamedTuple):
+    """The search under way: the next window begins at ``share`` of the whole, with ``samples``."""
+
+    tried: Array
+    share: Array
+    width: Array
+    samples: list[Array]
+    met: Array
+    alive: Array
+    found: _Bracket
+
+
+def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...]:
+    """Which bodies (N,) meet their event, and which were given up; when it is, and the time
+    between two looks there [s]."""
+    propagator: Any = lanes.propagator
+    exact = propagator.method.exact
+    first, last = ts[..., 0], ts[..., -1]
+    span, dtype = last - first, ts.dtype
+    n = lanes.status.size
+    forward = jnp.broadcast_to(jnp.where(span < 0, -1, 1), (n,))
+    least = 4 * _LOOKS * float(jnp.finfo(dtype).eps)
+
+    def times(share):
+        """(K,) or (N, K) of parts (K,) of the whole."""
+        share = share.reshape((1,) * span.ndim + share.shape)
+        found = first[..., None] + share * span[..., None]
+        return jnp.where(share >= 1, last[..., None], found)
+
+    def at(time, samples, share_of_error=None):
+        """The bodies at a time () or (N,), one sample each."""
+        wxyz, omega, *spins = (x[:, None] for x in samples)
+        now = propagator
+        if share_of_error is not None and propagator.rtol is not None:
+            eps = jnp.finfo(propagator.rtol.dtype).eps
+            rtol = jnp.maximum(
+                propagator.rtol * share_of_error.astype(propagator.rtol.dtype), 8 * eps
+            )
+            now = eqx.tree_at(lambda p: p.rtol, propagator, rtol)
+        return Trajectory(
+            time[..., None], wxyz, omega, lanes.status, lanes.steps, lanes.scene,
+            spins=spins[0] if spins else None, propagator=now,
+        )  # fmt: skip
+
+    def width_by_rate(share, samples, busy):
+        if until.samples is not None:
+            return jnp.asarray(_LOOKS / (until.samples - 1), dtype)
+        ends = jnp.stack(jnp.broadcast_arrays(times(share[None])[..., 0], last), axis=-1)
+        rates = natural_rates(lanes.scene, State(*samples[:2]), ends)
+        turned = jnp.max(jnp.where(busy & jnp.isfinite(rates), rates * jnp.abs(span), 0), initial=0)
+        turned = jnp.maximum(turned, jnp.finfo(dtype).tiny)
+        return jnp.maximum(_LOOKS * 2 * jnp.pi / A_TURN / turned, least).astype(dtype)
+
+    def one(walk: _Window) -> _Window:
+        busy = ~walk.met & walk.alive
+        width = jnp.minimum(walk.width, 1 - walk.share)
+        part = jnp.linspace(0, 1, _LOOKS + 1, dtype=dtype)
+        offset = jnp.where(walk.share == 0, AT_START / _LOOKS, 0).astype(dtype)
+        share = walk.share + width * part.at[0].set(offset)
+        share = share.at[-1].set(jnp.where(width < walk.width, 1, share[-1]))
+        begin = lanes if exact else at(times(walk.share[None])[..., 0], walk.samples, width)
+        seen = moved_through(begin, times(share))
+        values, slopes = until.values(seen)
+        grid = jnp.broadcast_to(seen.ts, values.shape)
+        sides = jnp.where(values >= 0, 1, -1)
+        changes = sides[:, 1:] != sides[:, :-1]
+        if until.direction:
+            changes = changes & (sides[:, 1:] * forward[:, None] == until.direction)
+        looks = jnp.arange(_LOOKS)
+        change = jnp.min(jnp.where(changes, looks, _LOOKS), axis=-1)
+        dips = (
+            dips_of(grid, values, slopes, sides) & (looks[None] < change[:, None]) & busy[:, None]
+        )
+        place, is_dip = first_true(dips, _DIPS + 1)
+
+        # as far as the bodies turn about as fast as thought, and no dip is left out
+        reach = jnp.min(jnp.where(is_dip[:, _DIPS], place[:, _DIPS], _LOOKS), initial=_LOOKS)
+        if until.samples is None:
+            turned = turning_rates(seen) * jnp.abs(span).reshape(-1, 1)
+            turned = jnp.where(busy[:, None] & jnp.isfinite(turned), turned, 0)
+            angle = jnp.max(turned, axis=0, initial=0) * width / _LOOKS
+            slow = (angle <= _FASTER * 2 * jnp.pi / A_TURN) | (width <= least)
+            fast = jnp.min(jnp.where(slow, _LOOKS, jnp.arange(_LOOKS + 1)))
+            reach = jnp.minimum(reach, jnp.maximum(fast, 1))
+        place, is_dip = place[:, :_DIPS], is_dip[:, :_DIPS] & (place[:, :_DIPS] < reach)
+        dip = _first_dip(until, begin if exact else seen, grid, slopes, sides, place, is_dip)
+        new = busy & (jnp.minimum(dip.place, change) < reach)
+        fresh = _bracket(seen, grid, values, change, dip, until.direction * forward, new)
+        found = jax.tree.map(
+            lambda x, y: jnp.where(new.reshape(-1, *(1,) * (x.ndim - 1)), x, y), fresh, walk.found
+        )
+        alive = walk.alive & (seen.status == Status.SUCCESSFUL)
+        samples, met = [x[:, reach] for x in seen._samples], walk.met | new
+        wider = jnp.where(reach < _LOOKS, width, _GROWTH * width)
+        wider = jnp.minimum(wider, width_by_rate(share[reach], samples, alive & ~met))
+        return _Window(walk.tried + 1, share[reach], wider, samples, met, alive, found)
+
+    def on(walk: _Window):
+        left = (walk.share < 1) & (walk.tried < _MOST)
+        return left & jnp.any(~walk.met & walk.alive)
+
+    samples, zero = [x[:, 0] for x in lanes._samples], jnp.zeros(n, dtype)
+    alive = lanes.status == Status.SUCCESSFUL
+    begin = jnp.broadcast_to(first, (n,))
+    nowhere = _Bracket(begin, begin, zero, zero, begin, samples)
+    start = jnp.zeros((), dtype)
+    width = width_by_rate(start, samples, alive)
+    width = width if until.samples is not None else jnp.minimum(width, _FIRST)
+    walk = _Window(
+        jnp.zeros((), jnp.int32), start, width, samples, jnp.zeros(n, bool), alive, nowhere
+    )
+    walk = jax.lax.while_loop(on, one, walk)
+    low, high, at_low, at_high, look, samples = walk.found
+
+    def fn(t):
+        value, _ = until.values(moved_to(lanes if exact else at(look, samples), t))
+        return value, value
+
+    given = (x[:, None] for x in (low, high, at_low, at_high, walk.met))
+    near, _ = bracketed(fn, *given)
+    lost = ~walk.met & walk.alive & (walk.share < 1)
+    return walk.met, lost, near[:, 0], jnp.abs(walk.width * span) / _LOOKS
+
+
+def _first_dip(until: Event, motion: Trajectory, grid, slopes, sides, place, is_dip) -> _Dip:
+    """Of the places (N, D) where the function may turn back, the first where it crosses zero."""
+    low, high = entries(grid, place), entries(grid, place + 1)
+
+    def turning(_):
+        def fn(t):
+            value, slope = until.values(moved_to(motion, t))
+            return slope, value
+
+        return bracketed(fn, low, high, entries(slopes, place), entries(slopes, place + 1), is_dip)
+
+    none = low, jnp.zeros_like(low)
+    time, value = jax.lax.cond(jnp.any(is_dip), turning, lambda _: none, 0)
+    side = entries(sides, place)
+    across = is_dip & (jnp.where(value >= 0, 1, -1) != side)
+    pair, some = first_true(across, 1)
+    found = jnp.where(some, entries(place, pair), _LOOKS)
+    return _Dip(*(x[:, 0] for x in (found, *(entries(x, pair) for x in (time, value, side)))))
+
+
+def _bracket(seen: Trajectory, grid, values, change, dip: _Dip, wanted, new) -> _Bracket:
+    """Around the first event, a change of sign between two looks or a dip; ``wanted`` (N,) is the
+    direction in the order of the looks, 0 for any. Where no event is ``new``, any numbers."""
+    here = jnp.where(new, jnp.minimum(dip.place, change), 0)[:, None]
+    # of the pair of crossings at a dip the second, where the first has the other direction
+    second = (wanted != 0) & (jnp.where(dip.side < 0, 1, -1) != wanted)
+    is_dip = dip.place < change
+    early, late = is_dip & ~second, is_dip & second
+    a, b, fa, fb = (entries(x, here + k)[:, 0] for x in (grid, values) for k in (0, 1))
+    return _Bracket(
+        jnp.where(late, dip.time, a), jnp.where(early, dip.time, b),
+        jnp.where(late, dip.value, fa), jnp.where(early, dip.value, fb),
+        a, [jnp.take_along_axis(x, here[..., None], axis=1)[:, 0] for x in seen._samples],
+    )  # fmt: skip
+
+
+def _held(lanes: Trajectory, ts: Array, until: Event, met: Array, near: Array, step: Array):
+    """Samples, status, steps, times and event times, with the derivatives of the motion."""
+    back = ts[..., -1] < ts[..., 0]
+    sign = jnp.where(back, -1, 1).astype(ts.dtype)
+    end = jnp.where(met, near, ts[..., -1])
+    if ts.ndim == 1:  # as far as the last event of all bodies
+        end = sign * jnp.max(sign * end)
+    far = (sign * end)[..., None] < sign[..., None] * ts
+    moved = moved_through(lanes, jnp.where(far, end[..., None], ts))
+    if ts.ndim > 1 or met.size == 1:  # the last sample of each body is at its own event
+        there = moved[..., -1:]
+    else:
+        there = moved_to(moved, jnp.where(met, near, ts[..., 0])[:, None])
+    # the motion in windows differed from this one by no more than the tolerance allows
+    most = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(there._t)
+    propagator: Any = lanes.propagator
+    if not propagator.method.exact:
+        most = jnp.maximum(most, 1e-4 * step.reshape(-1, 1))
+    late, at_event = until.polished(there, most)
+    event = there._t + late
+    rows = jnp.broadcast_to(ts, (event.shape[0], ts.shape[-1]))
+    past = met[:, None] & (sign.reshape(-1, 1) * (rows - event) >= 0)
+    held = [
+        jnp.where(past[..., None], x, y)
+        for x, y in zip(at_event._samples, moved._samples, strict=True)
+    ]
+    wxyz, omega, *spins = held
+    status = jnp.where(met, there.status, moved.status)
+    times = jnp.where(past, event, rows)
+    event = jnp.where(met, event[:, 0], jnp.inf)
+    return wxyz, omega, spins[0] if spins else None, status, moved.steps, times, event

@@ -1,0 +1,123 @@
+"""The canonical chart (docs/equations.md, 000): ZYZ angles (phi, theta, psi) and their momenta.
+
+H(q, p) expresses the body momentum through (q, p) and hands it to the one Hamiltonian;
+Hamilton's equations are its derivatives by ``jax.grad``. The chart needs sin(theta) != 0.
+"""
+
+from collections.abc import Callable, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from polhode._hamiltonian._attitude import Vector, components, cross, from_euler_angles
+from polhode._hamiltonian._energy import EnergyOfAttitude, Hamiltonian, free_hamiltonian
+from polhode._hamiltonian._lie_poisson import Dynamics, spin_rates
+from polhode.inertia import Inertia
+
+
+def momentum_from_canonical(q: Sequence[Array], p: Sequence[Array]) -> Vector:
+    """Body components of the angular momentum [kg m^2/s] from angles and momenta."""
+    _, theta, psi = q
+    p_phi, p_theta, p_psi = p
+    s, c, st = jnp.sin(psi), jnp.cos(psi), jnp.sin(theta)
+    across = (p_phi - jnp.cos(theta) * p_psi) / st
+    return s * p_theta - c * across, c * p_theta + s * across, p_psi
+
+
+def canonical_from_momentum(q: Sequence[Array], momentum: Sequence[Array]) -> Vector:
+    """Canonical momenta (p_phi, p_theta, p_psi) = B^T L of body momentum components.
+
+    The same map takes a body torque to its generalised force.
+    """
+    _, theta, psi = q
+    x, y, z = momentum
+    s, c, st = jnp.sin(psi), jnp.cos(psi), jnp.sin(theta)
+    return st * (s * y - c * x) + jnp.cos(theta) * z, s * x + c * y, z
+
+
+class CanonicalHamiltonian(eqx.Module):
+    """H(q, p[, t]) in joules: q = (phi, theta, psi) [rad], p [kg m^2/s], arrays (..., 3)."""
+
+    energy: Hamiltonian
+
+    def __call__(
+        self, q: Float[Array, "*#b 3"], p: Float[Array, "*#b 3"], t: Array | float = 0.0
+    ) -> Float[Array, "*b"]:
+        return self.of_components(components(q), components(p), t)
+
+    def of_components(self, q: Sequence[Array], p: Sequence[Array], t: Array | float) -> Array:
+        """The same on triples of component arrays (structure of arrays)."""
+        return self.energy(momentum_from_canonical(q, p), from_euler_angles(*q), t)
+
+
+def hamiltonian(
+    inertia: Inertia, potential: EnergyOfAttitude | None = None
+) -> CanonicalHamiltonian:
+    """The one H in Euler angles (docs/equations.md), ``hamiltonian(inertia, potential)(q, p)``.
+
+    ``q`` (..., 3): phi, theta, psi in rad; ``p`` (..., 3) in kg m^2/s; the result (...) in J.
+    """
+    return CanonicalHamiltonian(free_hamiltonian(inertia, potential))
+
+
+def hamiltons_equations(
+    H: Callable[..., Array],
+) -> Callable[..., tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]]:
+    """Hamilton's equations of any ``H(q, p, ...)`` by ``jax.grad`` (docs/equations.md: 2, 3).
+
+    Returns ``equations(q, p, *args) -> (dq/dt, dp/dt)``; leading batch axes are allowed as long
+    as H treats them one by one.
+    """
+
+    def equations(q, p, *args):
+        slope_q, slope_p = jax.grad(lambda q, p: jnp.sum(H(q, p, *args)), argnums=(0, 1))(q, p)
+        return slope_p, jax.tree.map(jnp.negative, slope_q)
+
+    return equations
+
+
+def rates_from_angle_rates(q: Sequence[Array], rates: Sequence[Array]) -> Vector:
+    """Body rates omega = B dq/dt [rad/s] on component triples."""
+    _, theta, psi = q
+    phi_dot, theta_dot, psi_dot = rates
+    s, c, st = jnp.sin(psi), jnp.cos(psi), jnp.sin(theta)
+    return (
+        s * theta_dot - st * c * phi_dot,
+        st * s * phi_dot + c * theta_dot,
+        jnp.cos(theta) * phi_dot + psi_dot,
+    )
+
+
+def angle_rates_from_rates(q: Sequence[Array], omega: Sequence[Array]) -> Vector:
+    """Angle rates dq/dt = B^-1 omega [rad/s] on component triples."""
+    _, theta, psi = q
+    x, y, z = omega
+    s, c = jnp.sin(psi), jnp.cos(psi)
+    phi_dot = (s * y - c * x) / jnp.sin(theta)
+    return phi_dot, s * x + c * y, z - jnp.cos(theta) * phi_dot
+
+
+def euler_angle_field(t, y, dynamics: Dynamics):
+    """The canonical vector field on ``y = (q, p)``, two triples of component arrays.
+
+    With coupled wheels a third group, their momenta.
+    """
+    q, p, *spins = y
+    dynamics = dynamics.at(*spins)
+    chart = CanonicalHamiltonian(dynamics.hamiltonian)
+    rate_q, rate_p = hamiltons_equations(chart.of_components)(q, p, t)
+    attitude, omega = from_euler_angles(*q), rates_from_angle_rates(q, rate_q)
+    if dynamics.torque is not None:
+        push = dynamics.torque.body_components(t, attitude, omega)
+        rate_p = tuple(a + b for a, b in zip(rate_p, canonical_from_momentum(q, push)))
+        momentum = momentum_from_canonical(q, p)
+        slip = dynamics.torque.slip(t, momentum, omega)
+        if slip is not None:  # axes that slip past a momentum which rests in space
+            moved = angle_rates_from_rates(q, slip), cross(momentum, slip)
+            _, more = jax.jvp(canonical_from_momentum, (q, momentum), moved)
+            rate_q = tuple(a + b for a, b in zip(rate_q, moved[0]))
+            rate_p = tuple(a + b for a, b in zip(rate_p, more))
+    moved = rate_q, rate_p
+    return (*moved, spin_rates(t, attitude, omega, dynamics)) if spins else moved

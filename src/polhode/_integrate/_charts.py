@@ -1,0 +1,231 @@
+"""The two charts of the one H: what a state is made of, and its vector field.
+
+The field is that of one body, written on components; bodies are the entries of their arrays.
+"""
+
+import abc
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from polhode import rotation
+from polhode._closed_forms import tops
+from polhode._hamiltonian import (
+    Attitude,
+    Dynamics,
+    FixedUnits,
+    LiePoissonCostate,
+    LiePoissonUnits,
+    Vector,
+    canonical_from_momentum,
+    components,
+    euler_angle_field,
+    external_power,
+    from_euler_angles,
+    from_quaternion,
+    lie_poisson_field,
+    momentum_from_canonical,
+    motor_powers,
+)
+from polhode._scene import AbstractPotential, GravityGradient, Scene, State, UniformGravity
+from polhode.rotation import euler_to_wxyz, wxyz_to_euler
+
+
+class AbstractChart(eqx.Module):
+    """Base of the charts. A state is two groups of component arrays (N,).
+
+    With coupled wheels a third: their momenta.
+
+    ``canonical``: whether these are coordinates and their momenta.
+    """
+
+    canonical: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def field(self, t, y, dynamics: Dynamics) -> PyTree[Array]:
+        """Rates of the state."""
+
+    @abc.abstractmethod
+    def seen(self, y: PyTree[Array]) -> tuple[Vector, Attitude]:
+        """Body momentum [kg m^2/s] and attitude."""
+
+    @abc.abstractmethod
+    def dynamics(self, scene: Scene, state: State, ts: Array) -> Dynamics:
+        """What moves the lanes, with the natural units of their states."""
+
+    @abc.abstractmethod
+    def start(self, scene: Scene, state: State, t: Array) -> tuple[PyTree[Array], Array]:
+        """Initial state of lanes, and which of them the chart can hold.
+
+        A lane that it cannot hold starts from some sound state instead, so that it does not hold
+        up the others; its samples are NaN and its status says why.
+        """
+
+    @abc.abstractmethod
+    def finish(self, scene: Scene, y: PyTree[Array], t: Array) -> tuple[Array, Array, Array]:
+        """wxyz, omega_body and whether the chart is still sound, of sampled components (N, T)."""
+
+    def field_and_power(self, t, y, dynamics: Dynamics):
+        """The field, and the power [W] of what is not conservative as one more group: all of it,
+        then that of every wheel that is not held."""
+        *state, _ = y
+        now, seen = dynamics.at(*state[2:]), self.seen(state[:2])
+        powers = (external_power(t, *seen, now),)
+        if now.wheels is not None:
+            powers += tuple(motor_powers(t, *seen, now, now.wheels.loose))
+        return *self.field(t, tuple(state), dynamics), powers
+
+
+class LiePoissonChart(AbstractChart):
+    """Body momentum and unit quaternion: free of singularities.
+
+    ``upright``: in a space frame whose z axis is along the scene's ``UniformGravity`` or the
+    constant position of its ``GravityGradient``, which must not vanish: of the attitude only one
+    row of R then matters, a third of the work.
+    """
+
+    upright: bool = eqx.field(static=True, default=False)
+
+    def field(self, t, y, dynamics):
+        return lie_poisson_field(t, y, dynamics)
+
+    def seen(self, y):
+        return y[0], from_quaternion(y[1])
+
+    def dynamics(self, scene, state, ts):
+        lane = state.wxyz[..., 0]
+        size = jnp.trace(scene.inertia.tensor, axis1=-2, axis2=-1) / 3
+        least = slow_momentum(scene, ts)
+        size, least, _ = jax.lax.stop_gradient(jnp.broadcast_arrays(size, least, lane))
+        moved = scene.dynamics
+        units = LiePoissonUnits(size, least, len(moved.coupled))
+        if self.upright:
+            _, potential = _upright(scene.potential)
+            scene = Scene(scene.inertia, potential, scene.torque, scene.rotors)
+        costate = None if moved.coupled else LiePoissonCostate.of
+        return Dynamics(scene.hamiltonian, scene.torque, units, costate, moved.wheels)
+
+    def start(self, scene, state, t):
+        momentum = scene.momentum(state.omega_body, t)
+        wxyz = state.wxyz
+        if self.upright:
+            turn, _ = _upright(scene.potential)
+            turn = jnp.broadcast_to(rotation.conjugate(turn), wxyz.shape)
+            wxyz = rotation.multiply(turn, wxyz)
+        y = components(momentum), tuple(wxyz[..., i] for i in range(4)), *_spins(scene, state)
+        return y, jnp.ones(wxyz.shape[0], bool)
+
+    def finish(self, scene, y, t):
+        momentum, wxyz = (jnp.stack(group, axis=-1) for group in y[:2])
+        omega = scene.with_spins(*y[2:]).rates(momentum, t)
+        if self.upright:
+            turn, _ = _upright(scene.potential)
+            wxyz = _turned(turn, wxyz)
+        return rotation.normalise(wxyz), omega, jnp.ones(momentum.shape[:-1], bool)
+
+
+def _turned(turn: Array, wxyz: Array) -> Array:
+    """Product of one quaternion (..., 1, 4) with many (..., T, 4): by its columns as a matrix,
+    which takes half as long as ``rotation.multiply`` where there are many times."""
+    a, b, c, d = (turn[..., i] for i in range(4))
+    columns = ((a, b, c, d), (-b, a, d, -c), (-c, -d, a, b), (-d, c, -b, a))
+    w, x, y, z = (
+        jnp.stack(column, axis=-1) * wxyz[..., i, None] for i, column in enumerate(columns)
+    )
+    return w + x + y + z
+
+
+def _spins(scene: Scene, state: State) -> tuple[tuple[Array, ...], ...]:
+    """Momenta of the coupled wheels as one more group of the state, or no group."""
+    wheels = scene.dynamics.wheels
+    if wheels is None or not wheels.coupled:
+        return ()
+    return (wheels.initial_spins(state.wxyz[..., 0]),)
+
+
+def _upright(field: UniformGravity | GravityGradient) -> tuple[Array, AbstractPotential]:
+    """Turn (..., 4) from a frame with z along the field into space, and the field in that frame."""
+    if isinstance(field, GravityGradient):
+        force = field.position_space
+    else:
+        mass, gravity = jnp.asarray(field.mass), field.gravity_space
+        lead = jnp.broadcast_shapes(mass.shape, gravity.shape[:-1])
+        force = mass[..., None] * jnp.broadcast_to(gravity, (*lead, 3))
+    (w, x, y), size = tops.upward(components(force))
+    zero = jnp.zeros_like(size)
+    along = jnp.stack([zero, zero, size], axis=-1)
+    turn = jnp.stack([w, x, y, zero], axis=-1)
+    if isinstance(field, GravityGradient):
+        return turn, GravityGradient(field.mu, along, vertical=True)
+    one = jnp.ones((), size.dtype)
+    return turn, UniformGravity(one, field.centre_body, along, field.on_axis, vertical=True)
+
+
+class EulerChart(AbstractChart):
+    """ZYZ Euler angles and their momenta, canonical; singular where theta is 0 or pi."""
+
+    canonical: ClassVar[bool] = True
+
+    def field(self, t, y, dynamics):
+        return euler_angle_field(t, y, dynamics)
+
+    def seen(self, y):
+        return momentum_from_canonical(*y), from_euler_angles(*y[0])
+
+    def dynamics(self, scene, state, ts):
+        momenta = 1 / momentum_scale(scene, state, ts)
+        ones, moved = jnp.ones_like(momenta), scene.dynamics
+        units = FixedUnits((ones,) * 3 + (momenta,) * (3 + len(moved.coupled)))
+        return Dynamics(scene.hamiltonian, scene.torque, units, wheels=moved.wheels)
+
+    def start(self, scene, state, t):
+        phi, theta, psi = q = wxyz_to_euler(state.wxyz)
+        sound = _away_from_poles(q)
+        q = (phi, jnp.where(sound, theta, jnp.pi / 2), psi)
+        momentum = components(scene.momentum(state.omega_body, t))
+        p = canonical_from_momentum(q, momentum)
+        return (q, tuple(jnp.where(sound, x, 0) for x in p), *_spins(scene, state)), sound
+
+    def finish(self, scene, y, t):
+        q, p, *spins = y
+        momentum = jnp.stack(momentum_from_canonical(q, p), axis=-1)
+        omega = scene.with_spins(*spins).rates(momentum, t)
+        return euler_to_wxyz(*q), omega, _away_from_poles(q)
+
+
+def _away_from_poles(q) -> Array:
+    """Whether the chart keeps at least half of the digits (its error grows like 1/sin theta)."""
+    theta = q[1]
+    return jnp.abs(jnp.sin(theta)) > jnp.sqrt(jnp.finfo(theta.dtype).eps)
+
+
+def momentum_scale(scene: Scene, state: State, ts: Array) -> Array:
+    """Natural unit of momentum of each lane: |L|, what the torques can add to it, what is slow."""
+    t = ts[..., 0]
+    momentum, spins = scene.momentum(state.omega_body, t), _spins(scene, state)
+    y = (components(momentum), tuple(state.wxyz[..., i] for i in range(4)), *spins)
+    push, *_ = lie_poisson_field(t, y, scene.dynamics)
+    size = jnp.trace(scene.inertia.tensor, axis1=-2, axis2=-1)
+    square = jnp.sum(momentum**2, axis=-1) + sum((x * x for group in spins for x in group), start=0)
+    square = square + size * jnp.sqrt(sum(x * x for x in push))
+    square = square + slow_momentum(scene, ts) ** 2
+    resting = square == 0
+    return jax.lax.stop_gradient(jnp.where(resting, 1, jnp.sqrt(jnp.where(resting, 1, square))))
+
+
+def slow_momentum(scene: Scene, ts: Array) -> Array:
+    """Momentum of a body that turns through one radian in the time simulated: a unit for one at
+    rest, which a torque may move later. Zero if no time passes."""
+    span = jnp.abs(ts[..., -1] - ts[..., 0])
+    size = jnp.trace(scene.inertia.tensor, axis1=-2, axis2=-1) / 3
+    return jax.lax.stop_gradient(jnp.where(span > 0, size / jnp.where(span > 0, span, 1), 0))
+
+
+def natural_rates(scene: Scene, state: State, ts: Array) -> Array:
+    """Rates [rad/s] of lanes, for sorting them by the steps that they will need."""
+    slowest = jnp.min(jnp.broadcast_to(scene.carrier.moments, (state.wxyz.shape[0], 3)), -1)
+    size = jnp.linalg.norm(state.omega_body, axis=-1)
+    return jax.lax.stop_gradient(jnp.maximum(momentum_scale(scene, state, ts) / slowest, size))

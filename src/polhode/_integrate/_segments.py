@@ -1,0 +1,88 @@
+"""A solve in segments: between the edges of pulses, so that no step meets one."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from polhode._method._status import Status
+
+
+class Moved(NamedTuple):
+    """What a solve of N lanes found: states at the samples (T, N) and at the end (1, N), steps,
+    status and, where it is known, sum of the estimated errors (N,)."""
+
+    samples: PyTree[Array]
+    last: PyTree[Array]
+    steps: Array
+    status: Array
+    error: Array | None
+
+
+def in_segments(
+    move: Callable[..., Moved], y: PyTree[Array], ts: Array, edges: Array, final_only: bool
+) -> Moved:
+    """``move(middle, y, times, parts)`` from edge to edge: from ``times[0]`` to ``times[-1]``, by
+    what acts at the time ``middle``, with one of ``parts`` equal shares of the error.
+
+    ``times`` may repeat its first. Derivatives by the edges are those of the ends of segments.
+    """
+    start, end = ts[0], ts[-1]
+    sign = jnp.where(end < start, -1, 1).astype(ts.dtype)
+    cuts = sign * jnp.sort(sign * jnp.clip(edges, min_of(start, end), max_of(start, end)))
+    bounds = jnp.concatenate([start[None], cuts, end[None]])
+    parts = bounds.shape[0] - 1
+
+    def one(carry, segment):
+        y, out, steps, status, error = carry
+        a, b = segment
+        empty = a == b
+        # a solve of no length has no rows to differentiate: it goes somewhere, and is dropped
+        stop = jnp.where(empty, a + (end - start) / 16, b)
+        inside = (sign * (ts - a) >= 0) & (sign * (b - ts) > 0) & ~empty
+        if final_only:
+            times = jnp.stack([a, stop])
+        else:
+            times = sign * jnp.sort(sign * jnp.where(inside, ts, a))
+            times = jnp.concatenate([times, stop[None]])
+        found = move(jax.lax.stop_gradient((a + b) / 2), y, times, parts)
+        good = status == Status.SUCCESSFUL
+        status = jnp.where(empty | ~good, status, found.status)
+        steps = steps + jnp.where(empty, 0, found.steps)
+        if error is not None:
+            error = error + jnp.where(empty, 0, found.error)
+        if not final_only:
+            later = jnp.sum(jnp.where(sign * (ts - b) >= 0, 1, 0))
+            rows = jnp.minimum(jnp.arange(ts.shape[0]) + later, ts.shape[0])
+            out = jax.tree.map(
+                lambda old, new: jnp.where(inside[:, None], new[rows], old), out, found.samples
+            )
+        # the last row, for only samples have derivatives
+        y = jax.tree.map(lambda old, new: jnp.where(empty, old, new[-1]), y, found.samples)
+        return (y, out, steps, status, error), None
+
+    shape = jax.eval_shape(lambda y: move(start, y, jnp.stack([start, end]), parts), y)
+    lane = jax.tree.leaves(y)[0].shape
+    out = None
+    if not final_only:
+        out = jax.tree.map(lambda x: jnp.zeros((ts.shape[0], *x.shape), x.dtype), y)
+    none = None if shape.error is None else jnp.zeros(lane, shape.error.dtype)
+    begin = y, out, jnp.zeros(lane, shape.steps.dtype), jnp.zeros(lane, shape.status.dtype), none
+    (y, out, steps, status, error), _ = jax.lax.scan(one, begin, (bounds[:-1], bounds[1:]))
+    last = jax.tree.map(lambda x: x[None], y)
+    if final_only:
+        return Moved(last, last, steps, status, error)
+    out = jax.tree.map(lambda rows, x: rows.at[-1].set(x), out, y)
+    return Moved(out, last, steps, status, error)
+
+
+def min_of(a: Array, b: Array) -> Any:
+    """The lesser, without a derivative of its own."""
+    return jax.lax.stop_gradient(jnp.minimum(a, b))
+
+
+def max_of(a: Array, b: Array) -> Any:
+    """The larger, likewise."""
+    return jax.lax.stop_gradient(jnp.maximum(a, b))

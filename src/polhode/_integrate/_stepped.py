@@ -1,0 +1,368 @@
+"""Everything that is stepped: one chart, one solver, one controller, one adjoint, one solve."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, PyTree
+
+from polhode._batch import PARTS, along_time, is_lane_tree, map_chunks
+from polhode._hamiltonian import Dynamics
+from polhode._integrate._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
+from polhode._integrate._equal_steps import GivenTimes
+from polhode._integrate._flow_adjoint import FlowAdjoint
+from polhode._integrate._segments import Moved, in_segments
+from polhode._kernels import FEW, kernel
+from polhode._method._base import AbstractMethod, Record, Samples
+from polhode._method._options import check_options
+from polhode._method._status import Status
+from polhode._scene import Scene, State
+
+
+class Stepped(AbstractMethod):
+    """Bodies moved by a diffrax solver on one of the two charts; see ``LiePoisson``."""
+
+    chart: AbstractChart
+    solver: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController | None
+    dt0: float | Array | None
+    max_steps: int = eqx.field(static=True)
+    adjoint: diffrax.AbstractAdjoint
+    progress_meter: diffrax.AbstractProgressMeter
+    chunk: int | None = eqx.field(static=True)
+
+    @property
+    def keeps_rtol(self) -> bool:
+        """Whether the steps follow from ``rtol``."""
+        return self.controller is None and not hasattr(self.solver, "check")
+
+    def _bodies_at_once(self, scene: Scene, state: State, ts: Array, record: Record) -> int:
+        """For a solver in which each body has its own steps."""
+        asked, found = getattr(self.solver, "bodies_at_once", None), []
+        if jax.default_backend() != "cpu":
+            return _ON_ACCELERATOR
+        if asked is None:
+            return 1
+        if state.wxyz.shape[0] <= FEW:
+            return FEW
+
+        def look(scene, state):
+            y0, _ = self._start(scene, state, ts, record)
+            term, dynamics = self._posed(scene, state, ts, record)
+            found.append(asked(term, ts[0], y0, dynamics))
+
+        eqx.filter_eval_shape(look, scene, state)
+        return found[0]
+
+    def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
+        check = getattr(self.solver, "check", None)
+        if check is not None:
+            check(self, scene, record)
+        size = 1
+        if ts.ndim == 1:
+            size = self.chunk or self._bodies_at_once(scene, state, ts, record)
+        lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
+
+        def one(chunk):
+            lanes, times = chunk
+            scene, state = eqx.combine(lanes, shared)
+            times = ts if times is None else times[0]
+            return self._solve(scene, state, times, rtol, record)
+
+        n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
+        if n <= min(size, _SORTED):
+            whole = kernel(one, of_units=True) if n <= FEW else one
+            return whole((lanes, times))
+        # who shares a chunk is of like rate, and none that takes long is left to the end of it
+        order = jnp.argsort(-natural_rates(scene, state, ts))
+        found = map_chunks(one, jax.tree.map(lambda x: x[order], (lanes, times)), n, size)
+        return jax.tree.map(lambda x: x[jnp.argsort(order)], found)
+
+    def _start(self, scene, state, ts, record: Record):
+        """The first state, with the work that is recorded, and what the chart can hold."""
+        y0, sound = self.chart.start(scene, state, ts[0])
+        if record.work:
+            wheels = scene.dynamics.wheels
+            loose = () if wheels is None else wheels.loose
+            y0 = (*y0, (jnp.zeros_like(y0[0][0]),) * (1 + len(loose)))
+        return y0, sound
+
+    def _posed(self, scene, state, ts, record: Record):
+        """The term of the equations, and its arguments."""
+        dynamics = self.chart.dynamics(scene, state, ts)
+        if not record.work:
+            return diffrax.ODETerm(self.chart.field), dynamics
+        known = dynamics.hamiltonian, dynamics.torque, dynamics.units
+        return diffrax.ODETerm(self.chart.field_and_power), Dynamics(*known, wheels=dynamics.wheels)
+
+    def _solve(self, scene, state, ts, rtol, record: Record) -> Samples:
+        """One chunk of lanes."""
+        y0, sound = self._start(scene, state, ts, record)
+        edges = None if scene.torque is None else scene.torque.edges
+        if edges is None:
+            found = self._moved(scene, state, y0, ts, rtol, record)
+            return self._samples(scene, found, ts, sound, record)
+
+        def move(middle, y, times, parts):
+            torque = scene.torque.during(middle)
+            now = Scene(scene.inertia, scene.potential, torque, scene.rotors)
+            share = jnp.maximum(rtol / parts, 8 * jnp.finfo(rtol.dtype).eps)
+            return self._moved(now, state, y, times, share, record)
+
+        found = in_segments(move, y0, ts, edges, record.final_only)
+        return self._samples(scene, found, ts, sound, record)
+
+    def _moved(self, scene, state, y0, ts, rtol, record) -> Moved:
+        """States from ``y0`` on."""
+        term, dynamics = self._posed(scene, state, ts, record)
+        asked = _Asked(ts, rtol, self.dt0, self.max_steps, record.final_only, _may_jump(scene))
+        if self.controller is None:
+            make = getattr(self.solver, "stepping", None)
+            stepping = asked.stock(self.solver, y0, term, dynamics) if make is None else make(asked)
+        else:
+            stepping = asked.given(self.solver, self.controller)
+        solution = diffrax.diffeqsolve(
+            term,
+            stepping.solver,
+            t0=ts[0],
+            t1=ts[-1],
+            dt0=stepping.dt0,
+            y0=y0,
+            args=dynamics,
+            saveat=stepping.saveat,
+            stepsize_controller=stepping.controller,
+            adjoint=_in_parts(self.adjoint, scene),
+            max_steps=stepping.max_steps,
+            progress_meter=self.progress_meter,
+            throw=False,
+        )
+        error = getattr(solution.solver_state, "error", None)
+        ys: Any = solution.ys
+        samples, last = ys
+        steps, status = _outcome(solution, y0[0][0].shape)
+        return Moved(samples, last, steps, status, error)
+
+    def _samples(self, scene, found: Moved, ts, sound, record: Record) -> Samples:
+        samples, last = (_lanes_first(y) for y in (found.samples, found.last))
+        dynamics = scene.dynamics
+        work, motors, spins = None, None, None
+        if record.work:
+            *samples, (work, *powers) = samples
+            *last, _ = last
+            motors = _of_wheels(dynamics.wheels, powers) if powers else None
+        if dynamics.coupled:
+            spins = jnp.stack(samples[2], axis=-1)
+        later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
+        kept = ts[-1:] if record.final_only else ts
+        wxyz, omega, _ = self.chart.finish(later, tuple(samples), kept[None])
+        *_, sound_at_end = self.chart.finish(later, tuple(last), ts[None, -1:])
+        wxyz, omega = (jnp.where(sound[:, None, None], x, jnp.nan) for x in (wxyz, omega))
+        taken, unfinished = found.steps, found.status
+        finite = jnp.all(jnp.isfinite(wxyz), axis=(-1, -2))
+        finite = finite & jnp.all(jnp.isfinite(omega), axis=(-1, -2))
+        done = unfinished == Status.SUCCESSFUL
+        status = jnp.where(done & ~finite, Status.NOT_FINITE, unfinished)
+        lost = ~sound | (~sound_at_end[:, -1] & ~done)
+        if self.chart.canonical:  # where steps become too short is where the chart ends
+            lost = lost | (unfinished == Status.STEP_FAILED)
+        return Samples(
+            wxyz if record.attitude else None,
+            omega if record.rates else None,
+            jnp.where(lost, Status.CHART_SINGULAR, status),
+            taken,
+            work,
+            found.error,
+            motors,
+            spins,
+        )
+
+
+_SORTED = 64
+"""Bodies, beyond which they are put in order of their rates."""
+
+_ON_ACCELERATOR = 2**18
+"""Bodies that are moved together there: enough to fill it, few enough for its memory."""
+
+
+class Stepping(NamedTuple):
+    """What is handed to ``diffrax.diffeqsolve``."""
+
+    solver: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController
+    saveat: diffrax.SaveAt
+    max_steps: int
+    dt0: Any
+
+
+class _Asked(NamedTuple):
+    """What a solver is asked for: the times, the error at the last of them, the first or longest
+    step, how many at most; whether only the last state is kept, and whether the rates may jump."""
+
+    ts: Array
+    rtol: Array
+    dt0: Any
+    max_steps: int
+    final_only: bool
+    jumps: bool
+
+    def given(self, solver, controller) -> Stepping:
+        """Steps of a controller that the user chose."""
+        saved = self._saved(diffrax.SubSaveAt(ts=self.ts))
+        return Stepping(solver, controller, saved, self.max_steps, self.dt0)
+
+    def marched(self, solver) -> Stepping:
+        """One step from each time to the next, of a solver that divides it by itself."""
+        ends = self.ts[jnp.array([0, -1])] if self.final_only else self.ts
+        saved = self._saved(diffrax.SubSaveAt(t0=True, steps=1))
+        saved = eqx.tree_at(lambda s: s.solver_state, saved, True)
+        return Stepping(solver, GivenTimes(ends), saved, ends.shape[0] - 1, None)
+
+    def stock(self, solver, y0, term, dynamics) -> Stepping:
+        """Steps of any solver with an error estimate."""
+        leaves = jax.tree.leaves(y0)
+        weights, rate = dynamics.units(leaves, jax.tree.leaves(term.vf(self.ts[0], y0, dynamics)))
+        turned = jnp.maximum(1, jnp.max(rate) * jnp.abs(self.ts[-1] - self.ts[0]))
+        weights = [*weights, *[jnp.zeros_like(x) for x in leaves[len(weights) :]]]
+        weights, turned = jax.lax.stop_gradient((weights, turned))
+        atol = jnp.maximum(self.rtol / (2 * turned), 8 * jnp.finfo(self.rtol.dtype).eps)
+        controller = diffrax.PIDController(rtol=0.0, atol=atol, norm=LaneNorm(tuple(weights)))
+        if not self.final_only:  # samples as accurate as steps, not as the interpolant
+            controller = diffrax.ClipStepSizeController(controller, step_ts=self.ts)
+        return self.given(solver, controller)
+
+    def _saved(self, samples) -> diffrax.SaveAt:
+        last = diffrax.SubSaveAt(t1=True)
+        return diffrax.SaveAt(subs=[last if self.final_only else samples, last])
+
+
+class LaneNorm(eqx.Module):
+    """Error of the worst lane: root mean square over its components, each times its weight.
+
+    A batch that shares its steps so keeps every body's own tolerance.
+    """
+
+    weights: tuple[Array, ...]
+
+    def __call__(self, y: PyTree[Array]) -> Array:
+        leaves = jax.tree.leaves(y)
+        square = sum((w * x) ** 2 for w, x in zip(self.weights, leaves))
+        worst = jnp.max(square) / len(leaves)
+        positive = worst > 0  # the root's slope at zero is infinite: keep it out of gradients
+        return jnp.where(positive, jnp.sqrt(jnp.where(positive, worst, 1)), 0)
+
+
+def _in_parts(adjoint: diffrax.AbstractAdjoint, scene: Scene) -> diffrax.AbstractAdjoint:
+    """On the way back from states that a torque has drawn together an error grows no longer than
+    through one of eight parts."""
+    if isinstance(adjoint, FlowAdjoint) and (scene.torque is not None or scene.dynamics.coupled):
+        return FlowAdjoint(adjoint.rtol, max(adjoint.parts, 8))
+    return adjoint
+
+
+def _of_wheels(wheels, loose: Sequence[Array]) -> Array:
+    """What belongs to the wheels that are not held, as (..., m) of all; zero where held."""
+    found = iter(loose)
+    zero = jnp.zeros_like(loose[0])
+    return jnp.stack([zero if held else next(found) for held in wheels.held], axis=-1)
+
+
+def _lanes_first(y):
+    """Saved states (T, N) as samples (N, T)."""
+    return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), y)
+
+
+def _outcome(solution, shape) -> tuple[Array, Array]:
+    """Steps and status of every lane."""
+    told = getattr(solution.solver_state, "ended", None)
+    if told is not None:  # each lane has steps of its own
+        return solution.solver_state.steps.astype(jnp.int32), jnp.array(_ENDED)[told]
+    limit = solution.result == diffrax.RESULTS.max_steps_reached
+    status = jnp.where(limit, Status.MAX_STEPS, Status.STEP_FAILED)
+    good = solution.result == diffrax.RESULTS.successful
+    status = jnp.where(good, Status.SUCCESSFUL, status)
+    return (
+        jnp.broadcast_to(solution.stats["num_steps"], shape),
+        jnp.broadcast_to(status, shape),
+    )
+
+
+_ENDED = (Status.SUCCESSFUL, Status.MAX_STEPS, Status.STEP_FAILED, Status.NOT_FINITE)
+
+
+def _may_jump(scene: Scene) -> bool:
+    """Whether a function of the user's acts on the body: orbits of this package are smooth."""
+    parts = (scene.potential, scene.torque, scene.rotors)
+    found = (x for x in jax.tree.leaves(parts, is_leaf=callable) if callable(x))
+    return not all(hasattr(x, "core_ranks") for x in found)
+
+
+def LiePoisson(
+    solver: diffrax.AbstractSolver | None = None,
+    controller: diffrax.AbstractStepSizeController | None = None,
+    dt0: float | Array | None = None,
+    max_steps: int = 2**16,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+    chunk: int | None = None,
+) -> Stepped:
+    """Unit quaternion and body momentum, free of singularities, with any diffrax solver.
+
+    **Arguments:**
+
+    - ``solver``: a ``diffrax.AbstractSolver`` for ODEs, ours or diffrax's; None: ``Dopri8``.
+    - ``controller``: a diffrax step-size controller; None: the error at every saved time is held
+      to the ``rtol`` of ``simulate`` (attitude in radians, momentum relative to each body's own
+      scale) by the error that the steps find.
+    - ``dt0``: first (or constant) step [s], negative backwards; None: chosen. For ``Splitting``,
+      which has no error estimate, the longest step: equal ones lead from each time to the next.
+    - ``max_steps``: of each body, or of bodies that share their steps.
+    - ``adjoint``: None: ``ph.solvers.FlowAdjoint()``, the derivatives of the exact flow, in forward
+      and reverse mode; or an adjoint of diffrax, for the derivative of the steps (for bodies that
+      drag stops within the time simulated).
+    - ``progress_meter``: as in diffrax.
+    - ``chunk``: bodies that are moved together; chunks follow one another, so memory stays bounded.
+      None: 200 where the bodies of a chunk share their steps. For ``Extrapolation``, in which each
+      has its own, 1024, of which 64 are on their way at once, in a processor's cache; 64 where the
+      field is more than arithmetic on the numbers of one body; 2^18 on an accelerator.
+    """
+    return _stepped(LiePoissonChart(), 200, solver, controller, dt0, max_steps, adjoint,
+                    progress_meter, chunk)  # fmt: skip
+
+
+def EulerAngles(
+    solver: diffrax.AbstractSolver | None = None,
+    controller: diffrax.AbstractStepSizeController | None = None,
+    dt0: float | Array | None = None,
+    max_steps: int = 2**16,
+    adjoint: diffrax.AbstractAdjoint | None = None,
+    progress_meter: diffrax.AbstractProgressMeter | None = None,
+    chunk: int | None = None,
+) -> Stepped:
+    """Canonical ZYZ Euler angles by Hamilton's equations (docs/equations.md), any diffrax solver.
+
+    A reference path: the chart breaks down where theta is 0 or pi, which is reported as
+    ``Status.CHART_SINGULAR``; passing near costs many steps. Arguments as ``ph.LiePoisson``; with a
+    solver whose bodies share their steps one body at a time, for the worst would hold up the rest.
+    """
+    return _stepped(EulerChart(), 1, solver, controller, dt0, max_steps, adjoint,
+                    progress_meter, chunk)  # fmt: skip
+
+
+def _stepped(chart, alone, solver, controller, dt0, max_steps, adjoint, progress_meter, chunk):
+    solver = diffrax.Dopri8() if solver is None else solver
+    check_options(solver, controller, adjoint, dt0=dt0, max_steps=max_steps, chunk=chunk)
+    if chunk is None and not hasattr(solver, "bodies_at_once"):
+        chunk = alone
+    return Stepped(
+        chart,
+        solver,
+        controller,
+        dt0,
+        max_steps,
+        FlowAdjoint() if adjoint is None else adjoint,
+        diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
+        chunk,
+    )

@@ -1,0 +1,23 @@
+"""What makes XLA's CPU backend fast: one compiled unit, coefficients folded beforehand.
+
+Nothing here changes a result by more than rounding; ``POLHODE_PLAIN=1`` in the environment switches
+all of it off. `README.md` beside this file says what each part buys.
+"""
+
+from polhode._kernels._fold import Specialised as Specialised, specialise as specialise
+from polhode._kernels._linear import (
+    attached as attached,
+    is_slope as is_slope,
+    linear as linear,
+    spread as spread,
+    zeros as zeros,
+)
+from polhode._kernels._single_call import (
+    FEW as FEW,
+    any_of as any_of,
+    formula as formula,
+    kernel as kernel,
+    put as put,
+)
+from polhode._kernels._stage import opaque_ones as opaque_ones, staged as staged
+from polhode._kernels._switch import is_plain as is_plain

@@ -1,0 +1,398 @@
+"""A traced function with everything done beforehand that does not depend on the state.
+
+What automatic differentiation writes down holds sums with zero, products with one and products of
+parameters, all of which would be worked out again in every evaluation and, as XLA gives every
+output array its own loop, for every component. Here they are folded into few coefficients before
+the loop, and values that several results share are staged. The result differs from the plain
+function by rounding (products are reassociated).
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, cast
+
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.core import ShapedArray
+from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
+from jax.interpreters import partial_eval
+
+from polhode._kernels._stage import opaque_ones, staged
+from polhode._kernels._switch import is_plain
+
+_FOLDS = {
+    "add": np.add, "add_any": np.add, "sub": np.subtract, "mul": np.multiply,
+    "div": np.divide, "neg": np.negative,
+}  # fmt: skip
+"""Operations on numbers that are known while tracing."""
+
+_ELEMENTWISE = frozenset(
+    (*_FOLDS, *"integer_pow square sqrt rsqrt sin cos exp log abs sign max min copy".split())  # noqa: SIM905
+)
+_BY_ENTRY = _ELEMENTWISE | frozenset(
+    """acos acosh and asin asinh atan atan2 atanh cbrt ceil convert_element_type cosh eq erf erfc
+     exp2 expm1 floor ge gt is_finite le log1p logistic lt ne not or pow rem round select_n sinh
+     stop_gradient tan tanh""".split()  # noqa: SIM905
+)
+"""Operations that treat the entries of arrays of one shape separately."""
+
+_TAKING_APART = frozenset(
+    "broadcast_in_dim convert_element_type copy gather reshape slice squeeze stop_gradient".split()  # noqa: SIM905
+)
+_CALLS = frozenset(("jit", "pjit", "closed_call"))
+
+_WORTH = 8
+"""Operations behind a value of several results, from which on it is staged (see ``staged``). From 5
+to 60 were tried: gradients of tops and of damped satellites take least time with 8 to 20."""
+
+
+class _Held(NamedTuple):
+    """A value known before the loop: an array, or one number that stands for a whole array."""
+
+    value: Any
+
+    @property
+    def number(self) -> Any:
+        """The value if it is known while tracing, else None."""
+        return self.value if isinstance(self.value, np.generic) else None
+
+    @property
+    def key(self):
+        return id(self.value) if self.number is None else ("number", self.number)
+
+
+class _Slot(NamedTuple):
+    """A value of the loop: that of number ``index`` times ``sign``, and ``scale`` if there is one.
+
+    ``factors``: of a product with that scale, the plain factor and the one that brought it.
+    """
+
+    index: int
+    aval: Any
+    scale: _Held | None = None
+    sign: int = 1
+    factors: tuple[int, int] | None = None
+
+
+class Specialised(NamedTuple):
+    """``held``: arrays computed before the loop; ``run(held, *state_leaves)`` does the rest.
+
+    ``seen``: the shapes to which the loop broadcasts each; where that is one only, an array of
+    this shape may stand in its place. ``by_entry``: whether every operation treats the entries of
+    the state's arrays separately, so that ``run`` takes any number of them.
+    """
+
+    held: tuple[Any, ...]
+    run: Callable[..., list[Any]]
+    seen: tuple[frozenset[tuple[int, ...]], ...]
+    by_entry: bool
+
+
+class _Step(NamedTuple):
+    """An operation of the loop; ``operands``: where it finds each, its aval, to what shape;
+    ``by_entry``: whether entries of its arrays have nothing to do with one another."""
+
+    made: list[int]
+    bind: Any
+    by_entry: bool
+    operands: list[tuple[Any, Any, tuple[int, ...]]]
+
+
+def specialise(
+    closed: ClosedJaxpr, known: Sequence[Any], *, fold: bool = True, stage: bool = True
+) -> Specialised:
+    """Takes the part of ``closed`` that needs only its first arguments, ``known``, out of it.
+
+    Without ``fold`` these arguments are only taken apart: no arithmetic is done beforehand. Without
+    ``stage`` the rest is not divided into stages: for a program that is to be specialised again.
+    """
+    if is_plain():
+        shapes = tuple(frozenset([jnp.shape(x)]) for x in known)
+        return Specialised(
+            tuple(known), lambda held, *state: jaxpr_as_fun(closed)(*held, *state), shapes, False
+        )
+    jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals), True)
+    work = _Work(fold)
+    known = [_Held(x) for x in known]
+    free = [work.slot(v.aval) for v in jaxpr.invars[len(known) :]]
+    found = work.walk(jaxpr, closed.consts, [*known, *free])
+    avals: list[Any] = [v.aval for v in jaxpr.outvars]
+    out = [(work.operand(x), aval, aval.shape) for x, aval in zip(found, avals)]
+    steps = _needed(work.steps, out)
+    held: dict[int, Any] = {}
+    seen: dict[int, set[tuple[int, ...]]] = {}
+    for x, _, shape in (*(o for step in steps for o in step.operands), *out):
+        if isinstance(x, _Held) and x.number is None:
+            held[x.key] = x.value
+            seen.setdefault(x.key, set()).add(tuple(shape))
+    places = {key: place for place, key in enumerate(held)}
+    lane = free[-1].aval.shape
+    by_entry = all(step.by_entry for step in steps)
+    for _, aval, _ in (*(o for step in steps for o in step.operands), *out):
+        by_entry = by_entry and aval.shape == lane
+    by_entry = by_entry and all(np.shape(x) in ((), lane) for x in held.values())
+    shared = _shared(steps, out) if stage else frozenset()
+
+    def run(held, *state):
+        values = dict(enumerate(state))
+
+        def read(operand):
+            x, aval, _ = operand
+            if not isinstance(x, _Held):
+                return values[x]
+            value = held[places[x.key]] if x.number is None else x.number
+            shape = jnp.shape(state[-1]) if by_entry else aval.shape
+            shape = np.broadcast_shapes(np.shape(value), shape)
+            return jnp.broadcast_to(jnp.asarray(value, aval.dtype), shape)
+
+        for step in steps:
+            found = step.bind(*(read(o) for o in step.operands))
+            for i, x in zip(step.made, found if isinstance(found, list | tuple) else [found]):
+                values[i] = staged(x, opaque_ones(x)) if i in shared else x
+        return [read(o) for o in out]
+
+    return Specialised(tuple(held.values()), run, tuple(map(frozenset, seen.values())), by_entry)
+
+
+def _needed(steps: list[_Step], out) -> tuple[_Step, ...]:
+    """The steps that the results rest on."""
+    wanted = {x for x, *_ in out if not isinstance(x, _Held)}
+    kept = []
+    for step in reversed(steps):
+        if wanted.intersection(step.made):
+            kept.append(step)
+            wanted.update(x for x, *_ in step.operands if not isinstance(x, _Held))
+    return tuple(reversed(kept))
+
+
+def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
+    """Values that several results rest on and that are long enough to be worked out once."""
+    makers = {i: k for k, step in enumerate(steps) for i in step.made}
+
+    def of(operands):
+        return {i for i, *_ in operands if not isinstance(i, _Held) and i in makers}
+
+    users = dict.fromkeys(makers, 0)
+    ends: dict[int, set[int]] = {i: set() for i in makers}  # the results that rest on it
+    for k, operand in enumerate(out):
+        for i in of([operand]):
+            users[i] += 1
+            ends[i].add(k)
+    for step in reversed(steps):
+        for i in of(step.operands):
+            users[i] += 1
+            ends[i].update(*(ends[made] for made in step.made))
+    shared: set[int] = set()
+    behind: dict[int, set[int]] = {}  # the operations that a fused loop repeats for it
+    for k, step in enumerate(steps):
+        work = {k}.union(*(behind[i] for i in of(step.operands) - shared))
+        for i in step.made:
+            behind[i] = work
+            if min(users[i], len(ends[i])) > 1 and len(work) >= _WORTH:
+                shared.add(i)
+    return frozenset(shared)
+
+
+class _Work:
+    """Goes through a jaxpr once: computes what is known, notes down what is not."""
+
+    def __init__(self, fold: bool):
+        self.fold = fold
+        self.steps: list[_Step] = []
+        self.count = 0
+        self.scaled: dict[Any, int] = {}
+        self.products: dict[tuple[int, int], int] = {}
+        self.found: dict[Any, _Held] = {}
+        self.alive: list[Any] = []  # whose ids are keys above
+
+    def slot(self, aval) -> _Slot:
+        self.count += 1
+        return _Slot(self.count - 1, aval)
+
+    def emit(self, bind, inputs, avals, outs, name="mul") -> list[_Slot]:
+        made = [self.slot(aval) for aval in outs]
+        shapes = [(outs[0] if name in _ELEMENTWISE else aval).shape for aval in avals]
+        operands = [(self.operand(x), aval, s) for x, aval, s in zip(inputs, avals, shapes)]
+        self.steps.append(_Step([s.index for s in made], bind, name in _BY_ENTRY, operands))
+        return made
+
+    def operand(self, x) -> Any:
+        """A value known before the loop, or the number of one that the loop has made."""
+        if isinstance(x, _Held):
+            self.alive.append(x.value)
+            return x
+        index = self.unsigned(x)
+        if x.sign > 0:
+            return index
+        key = (index, "neg")
+        if key not in self.scaled:
+            self.scaled[key] = self.emit(lax.neg, [_Slot(index, x.aval)], [x.aval], [x.aval])[0][0]
+        return self.scaled[key]
+
+    def unsigned(self, x: _Slot) -> int:
+        """The number of a value with its scale, but without its sign."""
+        if x.scale is None:
+            return x.index
+        key = (x.index, x.scale.key)
+        if key not in self.scaled:
+            self.alive.append(x.scale.value)
+            a, b = _Slot(x.index, x.aval), x.scale
+            if x.factors is not None:  # the scaled factor is likely to be met again
+                a, other = (_Slot(index, x.aval) for index in x.factors)
+                b = _Slot(self.unsigned(other._replace(scale=x.scale)), x.aval)
+            self.scaled[key] = self.emit(lax.mul, [a, b], [x.aval] * 2, [x.aval])[0].index
+        return self.scaled[key]
+
+    def walk(self, jaxpr, consts, inputs) -> Sequence[_Held | _Slot]:
+        env: dict[Any, Any] = dict(zip(jaxpr.constvars, map(_Held, consts)))
+        env.update(zip(jaxpr.invars, inputs))
+
+        def read(v):
+            if not isinstance(v, Literal):
+                return env[v]
+            return _Held(np.asarray(v.val, cast(ShapedArray, v.aval).dtype)[()])
+
+        for eqn in jaxpr.eqns:
+            given = [read(v) for v in eqn.invars]
+            env.update(zip(eqn.outvars, self.equation(eqn, given)))
+        return [read(v) for v in jaxpr.outvars]
+
+    def equation(self, eqn, given) -> Sequence[_Held | _Slot]:
+        name = eqn.primitive.name
+        if name in _CALLS:
+            inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
+            return self.walk(inner.jaxpr, inner.consts, given)
+        if not eqn.effects and all(isinstance(x, _Held) for x in given):
+            numbers = all(x.number is not None for x in given)
+            if self.fold or numbers or name in _TAKING_APART:
+                return self.known_once(eqn, given)
+        elif self.fold and len(eqn.outvars) == 1:
+            simple = self.simplified(name, given, eqn.outvars[0].aval)
+            if simple is not None:
+                return [simple]
+        avals, outs = ([v.aval for v in vs] for vs in (eqn.invars, eqn.outvars))
+        return self.emit(_binder(eqn), given, avals, outs, name)
+
+    def known_once(self, eqn, given) -> list[_Held]:
+        """The same array for the same equation, when it is met again."""
+        name = eqn.primitive.name
+        if name not in _ELEMENTWISE and name not in _TAKING_APART:
+            return self.known(eqn, given)
+        key = (name, repr(eqn.params), eqn.outvars[0].aval, *(x.key for x in given))
+        if key not in self.found:
+            self.alive += [x.value for x in given]
+            (self.found[key],) = self.known(eqn, given)
+        return [self.found[key]]
+
+    def known(self, eqn, given) -> list[_Held]:
+        """An equation before the loop; numbers stay numbers as long as they can."""
+        name, out = eqn.primitive.name, eqn.outvars[0].aval
+        single = all(np.ndim(x.value) == 0 for x in given)
+        if given and single and name == "broadcast_in_dim":
+            return given
+        if single and name in _FOLDS and all(x.number is not None for x in given):
+            return [_Held(out.dtype.type(_FOLDS[name](*(x.number for x in given))))]
+        if single and name in _ELEMENTWISE and len(eqn.outvars) == 1:
+            return [_Held(_binder(eqn)(*(jnp.asarray(x.value) for x in given)))]
+        full = [jnp.broadcast_to(x.value, v.aval.shape) for x, v in zip(given, eqn.invars)]
+        found = _binder(eqn)(*full)
+        return [_Held(x) for x in (found if isinstance(found, list | tuple) else [found])]
+
+    def simplified(self, name, given, aval) -> _Held | _Slot | None:
+        """What becomes of an operation with a known zero or factor; None where nothing does."""
+        if not jnp.issubdtype(aval.dtype, jnp.inexact):
+            return None
+        if any(isinstance(x, _Slot) and x.aval.shape != aval.shape for x in given):
+            return None  # one number of the loop meets an array
+        if name == "neg":
+            return self.times(given[0], _Held(aval.dtype.type(-1)), aval)
+        if name in ("add", "add_any", "sub"):
+            a, b = given
+            if name == "sub":
+                b = self.times(b, _Held(aval.dtype.type(-1)), aval)
+            return self.sum(a, b, aval)
+        if name == "mul":
+            a, b = given
+            if isinstance(a, _Held):
+                a, b = b, a
+            return self.times(a, b, aval) if isinstance(b, _Held) else self.product(a, b, aval)
+        if name == "div" and isinstance(given[1], _Held) and given[1].number is not None:
+            mantissa, _ = np.frexp(given[1].number)
+            if abs(mantissa) == 0.5:  # a power of two: the reciprocal is exact
+                return self.times(given[0], _Held(aval.dtype.type(1 / given[1].number)), aval)
+        return None
+
+    def sum(self, a, b, aval) -> _Held | _Slot:
+        """The sum of two values, at least one of them of the loop."""
+        if isinstance(a, _Held):
+            a, b = b, a
+        if isinstance(b, _Held):
+            if b.number == 0:
+                return a
+            one = _Slot(self.unsigned(a), aval)
+            bind = lax.add if a.sign > 0 else lambda x, y: lax.sub(y, x)
+            return self.emit(bind, [one, b], [aval] * 2, [aval])[0]
+        if a.index == b.index:
+            p, q = (_Held(aval.dtype.type(1)) if x.scale is None else x.scale for x in (a, b))
+            scale = self.combined("add" if a.sign == b.sign else "sub", p, q, aval)
+            return self.times(_Slot(a.index, a.aval, None, a.sign), scale, aval)
+        key = [None if x.scale is None else x.scale.key for x in (a, b)]
+        if key[0] == key[1]:  # one multiplication for both
+            scale, parts = a.scale, [_Slot(x.index, aval) for x in (a, b)]
+        else:
+            scale, parts = None, [_Slot(self.unsigned(x), aval) for x in (a, b)]
+        bind = lax.add if a.sign == b.sign else lax.sub
+        (made,) = self.emit(bind, parts, [aval] * 2, [aval])
+        return made._replace(scale=scale, sign=a.sign)
+
+    def product(self, a: _Slot, b: _Slot, aval) -> _Held | _Slot:
+        """The product of two values of the loop; a scale of either becomes one of the product."""
+        key = (min(a.index, b.index), max(a.index, b.index))
+        if key not in self.products:
+            plain = [_Slot(x.index, aval) for x in (a, b)]
+            (made,) = self.emit(lax.mul, plain, [aval] * 2, [aval])
+            self.products[key] = made.index
+        product: Any = _Slot(self.products[key], aval, None, a.sign * b.sign)
+        for x in (a, b):
+            if x.scale is not None:
+                product = self.times(product, x.scale, aval)
+        if isinstance(product, _Slot) and (a.scale is None) != (b.scale is None):
+            factors = (a.index, b.index) if a.scale is None else (b.index, a.index)
+            product = product._replace(factors=factors)
+        return product
+
+    def combined(self, name: str, a: _Held, b: _Held, aval) -> _Held:
+        """Sum, difference or product of two known values; the same one when met again."""
+        if a.number is not None and b.number is not None:
+            return _Held(aval.dtype.type(_FOLDS[name](a.number, b.number)))
+        key = (name, a.key, b.key, aval.dtype)
+        if key not in self.found:
+            self.alive += [a.value, b.value]
+            first, second = (jnp.asarray(x.value, aval.dtype) for x in (a, b))
+            self.found[key] = _Held(getattr(jnp, _WORDS[name])(first, second))
+        return self.found[key]
+
+    def times(self, x, factor: _Held, aval) -> _Held | _Slot:
+        """``x`` times a known factor, kept as a scale and a sign as long as possible."""
+        if isinstance(x, _Held):
+            return self.combined("mul", x, factor, aval)
+        number = factor.number
+        if number is not None:
+            if number == 0:
+                return factor
+            if number < 0:
+                x, factor = x._replace(sign=-x.sign), _Held(aval.dtype.type(-number))
+            if abs(number) == 1:
+                return x
+        if x.scale is not None:
+            factor = self.combined("mul", x.scale, factor, aval)
+        return x._replace(scale=None if factor.number == 1 else factor)
+
+
+_WORDS = {"add": "add", "sub": "subtract", "mul": "multiply"}
+
+
+def _binder(eqn):
+    found = eqn.primitive.get_bind_params(eqn.params)
+    funs, params = found if isinstance(found, tuple) else ((), found)  # as older versions of JAX
+    return lambda *operands: eqn.primitive.bind(*funs, *operands, **params)

@@ -1,0 +1,325 @@
+"""One compiled unit for a piece of a program."""
+
+from collections.abc import Callable, Sequence
+from contextvars import ContextVar
+from functools import reduce
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.custom_batching import custom_vmap
+from jax.custom_derivatives import SymbolicZero
+from jax.experimental.xla_metadata import set_xla_metadata
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.interpreters import ad, partial_eval
+from jax.sharding import AxisType
+
+from polhode._kernels._linear import linear
+from polhode._kernels._switch import is_plain
+
+_HOLDABLE = frozenset(
+    """abs acos acosh add add_any and asin asinh atan atan2 atanh attached bitcast_convert_type
+     broadcast_in_dim cbrt ceil clamp concatenate cond convert_element_type copy cos cosh
+     custom_jvp_call custom_vmap_call div dynamic_slice dynamic_update_slice eq erf erf_inv erfc
+     exp exp2 expm1 floor gather ge gt integer_pow iota is_finite jit le linear_map log log1p
+     logistic lt max min mul ne neg not optimization_barrier or pad pjit pow reduce_and
+     reduce_max reduce_min reduce_or reduce_sum rem reshape round rsqrt scan select_n
+     shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stop_gradient sub
+     tan tanh transpose unstack while xor""".split()  # noqa: SIM905
+)
+"""Operations that a single compiled unit may hold; anything else keeps the usual way."""
+
+_WIDE = 1024
+"""Floats in a sum, from which on a unit does not hold it."""
+
+FEW = 8
+"""Bodies so few that what stands around their motion costs more than it does: all of it is one
+unit. For many the march is 5 % slower as a unit within a unit."""
+
+_TABLE = 1024
+"""Known numbers of an array, up to which it stands in a unit."""
+
+_ANALYSING = ContextVar("analysing", default=False)
+"""Set while a unit is looked through: the units inside it then show what they are made of."""
+
+
+def kernel(
+    fn: Callable, *, linearised: bool = False, repeated: bool = False, of_units: bool = False
+) -> Callable:
+    """``fn`` compiled by XLA's CPU backend as one function instead of one task per array.
+
+    A step is made of many short loops over the bodies. As separate tasks each costs a dispatch,
+    and fusion across them repeats the work of one in the next; and a function for each takes
+    longer to compile than one for all. The mark keeps the call and asks for a single function; it
+    is a hint that changes no value. It is given on the CPU only and to plain arithmetic only.
+
+    Derivatives are those of ``fn``, unmarked; with ``linearised`` the value and all coefficients of
+    its derivative are a unit again, and only the linear map that is left is not. That suits
+    functions without loops of unknown length. With ``repeated`` tangents are a unit and cotangents
+    another, each of which works everything out again: nothing is kept in between but the operands,
+    and where coefficients would be hundreds that is several times as fast, to compile too. Sums
+    over many bodies or times are to be written as ``spread``. With ``of_units`` what ``fn`` marks
+    itself stays marked, within the whole and in its derivatives.
+    """
+
+    def call(*operands):
+        if _ANALYSING.get() or not _is_of_use():
+            return fn(*operands)
+        leaves, tree = jax.tree.flatten(operands)
+        if not any(isinstance(leaf, Tracer) for leaf in leaves):
+            return fn(*operands)  # run at once, the mark would reach every call inside as well
+        analysing = _ANALYSING.set(not of_units)
+        try:
+            closed, shape = jax.make_jaxpr(
+                lambda *given: fn(*jax.tree.unflatten(tree, given)), return_shape=True
+            )(*leaves)
+        finally:
+            _ANALYSING.reset(analysing)
+        if not _is_holdable(closed.jaxpr):
+            return fn(*operands)
+        whole, given = _opened(closed)
+        found = _unit(jaxpr_as_fun(whole), linearised, (whole, 0), repeated)(*given, *leaves)
+        return jax.tree.unflatten(jax.tree.structure(shape), found)
+
+    return call
+
+
+def formula(fn: Callable, *operands: Any) -> ClosedJaxpr:
+    """``fn`` traced; units inside it show what they are made of."""
+    analysing = _ANALYSING.set(True)
+    try:
+        return jax.make_jaxpr(fn)(*operands)
+    finally:
+        _ANALYSING.reset(analysing)
+
+
+@custom_vmap
+def any_of(these: jax.Array) -> jax.Array:
+    """Whether any of these is not zero, under ``vmap`` any of the whole batch.
+
+    A loop with such a condition goes on for all. With one of each, JAX would keep what has ended by
+    copying everything that the loop carries, in every turn.
+    """
+    return jnp.sum(jnp.where(these != 0, 1, 0)) > 0
+
+
+@any_of.def_vmap
+def _any_of_all(size, batched, these):
+    del size, batched
+    return any_of(these), False
+
+
+@custom_vmap
+def put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
+    """``rows`` (S, C) with ``values`` (n, C) at ``places`` (n,) in S, the last of equal ones.
+
+    One after another on the CPU, where a unit cannot hold a scatter. Not for reverse mode.
+    """
+    if places.size == 0 or jax.default_backend() != "cpu":
+        return rows.at[places].set(values)
+
+    def one(i, rows):
+        place = places[i].astype(i.dtype)
+        return jax.lax.dynamic_update_slice(rows, values[i][None], (place, jnp.zeros_like(i)))
+
+    return jax.lax.fori_loop(0, places.size, one, rows)
+
+
+@put.def_vmap
+def _put_all(size, batched, *given):
+    """The rows of a batch, one after another."""
+    rows, places, values = (
+        x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(given, batched)
+    )
+    places = places + rows.shape[1] * jnp.arange(size, dtype=places.dtype)[:, None]
+    flat = put(_flat(rows), places.reshape(-1), _flat(values))
+    return flat.reshape(rows.shape), True
+
+
+def _flat(x: jax.Array) -> jax.Array:
+    return x.reshape(-1, x.shape[-1])
+
+
+def _opened(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
+    """The same program with what it closes over as its first operands, and these: they may be
+    differentiated. Few known numbers, such as the table of a rule, stay in it: as operands they
+    would be carried through every loop."""
+    jaxpr, own = closed.jaxpr, list(zip(closed.jaxpr.constvars, closed.consts, strict=True))
+    tables = [(v, x) for v, x in own if not isinstance(x, Tracer) and np.size(x) <= _TABLE]
+    others = [(v, x) for v, x in own if isinstance(x, Tracer) or np.size(x) > _TABLE]
+    names = jaxpr.debug_info.arg_names
+    names = None if names is None else ("",) * len(others) + (*names,)
+    opened = jaxpr.replace(
+        constvars=[v for v, _ in tables],
+        invars=[*(v for v, _ in others), *jaxpr.invars],
+        debug_info=jaxpr.debug_info._replace(arg_names=names),
+    )
+    return ClosedJaxpr(opened, [x for _, x in tables]), [x for _, x in others]
+
+
+def _is_of_use() -> bool:
+    """On the CPU, and not where XLA may divide arrays among devices: a unit cannot be divided."""
+    if jax.default_backend() != "cpu" or is_plain():
+        return False
+    kinds = jax.sharding.get_abstract_mesh().axis_types
+    by_hand = len(kinds) > 0 and all(kind is AxisType.Manual for kind in kinds)
+    return by_hand or jax.device_count() == 1
+
+
+def _is_holdable(jaxpr) -> bool:
+    for equation in jaxpr.eqns:
+        if equation.primitive.name not in _HOLDABLE or _is_wide(equation):
+            return False
+        for value in jax.tree.leaves(
+            list(equation.params.values()), is_leaf=lambda v: hasattr(v, "eqns")
+        ):
+            nested = getattr(value, "jaxpr", value)
+            if hasattr(nested, "eqns") and not _is_holdable(nested):
+                return False
+    return all(_is_packable(v.aval.dtype) for v in (*jaxpr.invars, *jaxpr.constvars))
+
+
+def _is_wide(equation) -> bool:
+    """Whether it sums or compares so many floats that XLA hands them to a library, which it cannot
+    do within a unit: from 4096 on, measured with jaxlib 0.10."""
+    if not equation.primitive.name.startswith("reduce_"):
+        return False
+    given = equation.invars[0].aval
+    return jnp.issubdtype(given.dtype, jnp.inexact) and given.size >= _WIDE
+
+
+def _is_packable(dtype) -> bool:
+    """Numbers and truth values; not random keys, nor tangents of integers."""
+    return isinstance(dtype, np.dtype) and dtype != jax.dtypes.float0
+
+
+def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool = False) -> Callable:
+    """``flat``, a function of arrays with a list of results, as one unit, differentiable.
+
+    ``traced``: the same where it is known already, and how many results are bare (``_marked``).
+    """
+
+    @jax.custom_jvp
+    def marked(*leaves):
+        closed, bare = traced or (jax.make_jaxpr(flat)(*leaves), 0)
+        if traced is None and not _is_holdable(closed.jaxpr):
+            return jaxpr_as_fun(closed)(*leaves)
+        return _marked(closed, leaves, bare)
+
+    def derivative(leaves, tangents):
+        # What has no tangent stays a constant: its derivative is not worked out at all.
+        moving = [k for k, d in enumerate(tangents) if not isinstance(d, SymbolicZero)]
+
+        def of_moving(whole, given):
+            whole = dict(enumerate(whole)) | dict(zip(moving, given, strict=True))
+            return flat(*whole.values())
+
+        # A derivative of the coefficients takes twice as long to compile as one of the formulas.
+        again = any(isinstance(x, ad.JVPTracer) for x in leaves)
+        if repeated:
+            value = marked(*leaves)
+            return value, _of_units(of_moving, moving, leaves, tangents, value)
+        if again or not linearised:
+            given = [leaves[k] for k in moving], [tangents[k] for k in moving]
+            return jax.jvp(lambda *x: of_moving(leaves, x), *given)
+        shape = []
+
+        def known(*leaves):
+            value, linear_map = jax.linearize(
+                lambda *x: of_moving(leaves, x), *(leaves[k] for k in moving)
+            )
+            kept, tree = jax.tree.flatten(linear_map)
+            shape[:] = [tree, len(value)]
+            return [*value, *kept, jnp.zeros((), jnp.float32)]
+
+        first = jax.make_jaxpr(known)(*leaves)
+        tree, count = shape
+        bare = len(first.out_avals) - 1 - count
+        *found, zero = _unit(jaxpr_as_fun(first), False, (first, bare))(*leaves)
+        # Not marked: transposed, it would carry operands that go unused.
+        linear_map = jax.tree.unflatten(tree, found[count:])
+        return found[:count], linear_map(*(_gated(zero, tangents[k]) for k in moving))
+
+    marked.defjvp(derivative, symbolic_zeros=True)
+    return marked
+
+
+def _of_units(of_moving: Callable, moving: Sequence[int], leaves, tangents, like) -> list[Any]:
+    """The tangents of ``of_moving(leaves, those that move)``: a unit, and its transpose another."""
+    count = len(leaves)
+    floats = {k: x for k, x in enumerate(like) if jnp.issubdtype(x.dtype, jnp.inexact)}
+
+    def slope(leaves, changes):
+        some = [leaves[k] for k in moving]
+        found = jax.jvp(lambda *x: of_moving(leaves, x), some, list(changes))[1]
+        return [found[k] for k in floats]
+
+    def along(*both):
+        return slope(both[:count], both[count:])
+
+    def against(*both):
+        leaves, slopes = both[:count], list(both[count:])
+        # ``jax.vjp`` would take half as long again to trace.
+        back = jax.linear_transpose(lambda *d: slope(leaves, d), *(leaves[k] for k in moving))
+        return list(back(slopes))
+
+    def forward(given, changes):
+        return _unit(along, False, repeated=True)(*given, *changes)
+
+    def backward(given, slopes):
+        return _unit(against, False, repeated=True)(*given, *slopes)
+
+    changes = [tangents[k] for k in moving]
+    found = dict(zip(floats, linear(forward, backward, leaves, changes, list(floats.values()))))
+    none = {k: np.zeros(x.shape, jax.dtypes.float0) for k, x in enumerate(like) if k not in floats}
+    return [(found | none)[k] for k in range(len(like))]
+
+
+def _gated(zero: jax.Array, tangent: jax.Array) -> jax.Array:
+    """The tangent, needing ``zero``, which is 0."""
+    if tangent.dtype == jax.dtypes.float0:
+        return tangent
+    sure = jnp.broadcast_to(zero == 0, tangent.shape)
+    return jax.lax.select(sure, tangent, jnp.zeros_like(tangent))
+
+
+def _marked(closed: ClosedJaxpr, given: Sequence[Any], bare: int) -> list[jax.Array]:
+    """The marked call of a traced function, all of whose operands are surely used.
+
+    XLA ends the process over an operand of such a call that goes unused, and it folds away what a
+    program merely seems to use. One operand more is therefore two zeros that XLA cannot know: every
+    result is taken on the condition that the first is zero or a number of any operand is not. The
+    ``bare`` ones before the last are not: the choice would be one more copy of each, in a loop of
+    its own. They are of use together with the last result only, which is.
+    """
+    jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals))
+    needed = [jnp.asarray(x) for x, keep in zip(given, used, strict=True) if keep]
+    operands = [x for x in needed if x.size]
+    if not operands:
+        return jaxpr_as_fun(closed)(*given)
+    empty = {k: (x.shape, x.dtype) for k, x in enumerate(needed) if not x.size}
+    # Behind a barrier, for XLA moves constants into what is called.
+    zeros, *operands = jax.lax.optimization_barrier([jnp.zeros(2, jnp.float32), *operands])
+
+    def whole(zeros, *operands):
+        with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):  # the call's own only
+            every = list(operands)
+            for k, (shape, dtype) in empty.items():
+                every.insert(k, jnp.zeros(shape, dtype))
+            found = jaxpr_as_fun(ClosedJaxpr(jaxpr, closed.consts))(*every)
+            firsts = (x[(0,) * x.ndim].astype(bool) for x in operands)
+            sure = reduce(jnp.logical_or, firsts, zeros[0] == 0)
+            # through a division, or the compiler asks every operand again for each result
+            sure = jnp.where(sure, 1, 0) / (1 - zeros[1]) > 0
+            chosen = {*range(len(found) - 1 - bare), len(found) - 1}
+            other = {
+                k: jnp.broadcast_to(zeros[1].astype(found[k].dtype), found[k].shape) for k in chosen
+            }
+            return [
+                jax.lax.select(sure, x, other[k]) if k in chosen else x for k, x in enumerate(found)
+            ]
+
+    with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+        return jax.jit(whole)(zeros, *operands)

@@ -1,0 +1,186 @@
+"""Trajectories for others: xarray, and attitude ephemeris messages of the CCSDS."""
+
+import re
+from collections.abc import Iterator, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from polhode import __version__
+from polhode._checks import imported
+from polhode._method import Status
+
+
+def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
+    """See ``Trajectory.to_xarray``."""
+    xarray = imported("to_xarray", "xarray")
+    rank, wxyz, omega = len(trajectory.batch_shape), trajectory.wxyz, trajectory.omega_body
+    batch = ("body",) if rank == 1 else tuple(f"batch_{i}" for i in range(rank))
+    shared = trajectory.ts.ndim == 1
+    time = ("time",) if shared else (*batch, "time")
+    every, vectors = (*batch, "time"), (*batch, "time", "axis")
+    data: dict[str, Any] = {}
+
+    def put(name, array, dims, units, long_name):
+        if array is not None:
+            data[name] = (dims, np.asarray(array), {"units": units, "long_name": long_name})
+
+    quaternion = "attitude quaternion, scalar first, body to space"
+    put("wxyz", wxyz, (*every, "quaternion"), "1", quaternion)
+    put("omega_body", omega, vectors, "rad s-1", "angular velocity in body axes")
+    if omega is not None and (trajectory.scene.potential is None or wxyz is not None):
+        put("energy", trajectory.energy, every, "J", "kinetic plus potential energy")
+    if omega is not None and wxyz is not None:
+        momentum = "angular momentum in space axes"
+        put("momentum_space", trajectory.momentum_space, vectors, "kg m2 s-1", momentum)
+    put("work", trajectory.work, every, "J", "work done by the external torques")
+    put("error", trajectory.error, batch, "rad", "estimated error at the last time")
+    put("event_time", trajectory.event_time, batch, "s", "time of the event that ended the motion")
+    data["status"] = (
+        batch,
+        np.asarray(trajectory.status, np.int8),
+        {
+            "long_name": "outcome of each body",
+            "flag_values": np.array([int(s) for s in Status], np.int8),
+            "flag_meanings": " ".join(s.name.lower() for s in Status),
+        },
+    )
+    coords: dict[str, Any] = {
+        "quaternion": ("quaternion", list("wxyz"), {"long_name": "part, the scalar first"}),
+        "axis": ("axis", list("xyz"), {"long_name": "axis of the frame that the name states"}),
+    }
+    if labels is not None:
+        names = [str(label) for label in labels]
+        if rank != 1 or len(names) != trajectory.batch_shape[0]:
+            raise ValueError(
+                f"labels name the bodies of one batch axis, got {len(names)} for bodies of shape"
+                f" {trajectory.batch_shape}."
+            )
+        coords["body"] = ("body", names, {"long_name": "body"})
+    times = (time, np.asarray(trajectory.ts), {"units": "s", "long_name": "time"})
+    (coords if shared else data)["time" if shared else "ts"] = times
+    attributes = {
+        "Conventions": "CF-1.11",
+        "title": "Rotating rigid bodies",
+        "source": f"polhode {__version__}",
+        "convention": "wxyz scalar first, body -> space; R = Rz(phi) Ry(theta) Rz(psi)",
+    }
+    return xarray.Dataset(data, coords=coords, attrs=attributes)
+
+
+_TIME_SYSTEMS = (
+    "GMST",
+    "GPS",
+    "MET",
+    "MRT",
+    "SCLK",
+    "TAI",
+    "TCB",
+    "TCG",
+    "TDB",
+    "TT",
+    "UT1",
+    "UTC",
+)
+"""CCSDS 504.0-B-2, annex B: values of TIME_SYSTEM."""
+
+
+def write_aem(
+    path: str | Path,
+    trajectory: Any,
+    epoch: str,
+    *,
+    object_name: str | Sequence[str],
+    object_id: str | Sequence[str],
+    frame: str = "EME2000",
+    body_frame: str = "SC_BODY_1",
+    time_system: str = "TAI",
+    originator: str = "POLHODE",
+    center_name: str | None = None,
+    rates: bool = True,
+    creation_date: str | None = None,
+) -> None:
+    """See ``Trajectory.to_aem``. Sections 4.2 to 4.4 and annex B of the standard."""
+    start = _instant("epoch", epoch)
+    now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S")
+    created = str(_instant("creation_date", now if creation_date is None else creation_date))
+    if time_system not in _TIME_SYSTEMS:
+        raise ValueError(f"time_system must be one of {', '.join(_TIME_SYSTEMS)}: {time_system!r}.")
+    wxyz = np.asarray(trajectory._need("wxyz"), np.float64)
+    count, samples = int(np.prod(wxyz.shape[:-2], dtype=int)), wxyz.shape[-2]
+    names = _each("object_name", object_name, count)
+    identities = _each("object_id", object_id, count)
+    fixed = {"originator": originator, "frame": frame, "body_frame": body_frame}
+    for name, value in (
+        fixed | ({} if center_name is None else {"center_name": center_name})
+    ).items():
+        _text(name, value)
+    omega = np.asarray(trajectory._need("omega_body"), np.float64) if rates else wxyz[..., :0]
+    ts = np.broadcast_to(np.asarray(trajectory.ts, np.float64), wxyz.shape[:-1])
+    lines = ["CCSDS_AEM_VERS = 2.0", f"CREATION_DATE = {created}", f"ORIGINATOR = {originator}"]
+    for k in range(count):
+        t = ts.reshape(count, samples)[k]
+        kept = np.unique(t, return_index=True)[1]  # in the order of time, each time once
+        moments = [str(start + np.timedelta64(round(x * 1e9), "ns")) for x in t[kept]]
+        if len(set(moments)) < len(moments):
+            raise ValueError(
+                "times closer than a nanosecond cannot be written: keep fewer samples."
+            )
+        lines += ["", "META_START", f"OBJECT_NAME = {names[k]}", f"OBJECT_ID = {identities[k]}"]
+        lines += [] if center_name is None else [f"CENTER_NAME = {center_name}"]
+        lines += [
+            f"REF_FRAME_A = {frame}",
+            f"REF_FRAME_B = {body_frame}",
+            f"TIME_SYSTEM = {time_system}",
+            f"START_TIME = {moments[0]}",
+            f"STOP_TIME = {moments[-1]}",
+            f"ATTITUDE_TYPE = {'QUATERNION/ANGVEL' if rates else 'QUATERNION'}",
+            *(["ANGVEL_FRAME = REF_FRAME_B"] if rates else []),
+            "META_STOP",
+            "",
+            "DATA_START",
+        ]
+        rows = wxyz.reshape(count, samples, 4)[k][kept], omega.reshape(count, samples, -1)[k][kept]
+        lines += [f"{m} {row}" for m, row in zip(moments, _rows(*rows))]
+        lines.append("DATA_STOP")
+    Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")
+
+
+def _rows(wxyz: np.ndarray, omega: np.ndarray) -> Iterator[str]:
+    """Q1 Q2 Q3 QC, of A2B: components in space to components in the body; rates in deg/s."""
+    if not (np.isfinite(wxyz).all() and np.isfinite(omega).all()):
+        raise ValueError(
+            "the samples hold NaN: write the bodies that arrived, traj[traj.successful]."
+        )
+    xyzw = wxyz[:, [1, 2, 3, 0]]
+    for row in np.concatenate([xyzw, np.rad2deg(omega)], axis=-1):
+        yield " ".join(f"{x:.16e}" for x in row)
+
+
+def _instant(name: str, value: Any) -> np.datetime64:
+    pattern = r"\d{4}-\d{2}-\d{2}T\d{2}:\d{2}:\d{2}(\.\d{1,9})?Z?"
+    if not isinstance(value, str) or not re.fullmatch(pattern, value):
+        raise ValueError(
+            f'{name} must be a calendar time such as "2029-04-13T21:46:00", got {value!r:.60}.'
+        )
+    fine = "." in value or name == "epoch"
+    try:
+        return np.datetime64(value.removesuffix("Z"), "ns" if fine else "s")
+    except ValueError as error:
+        raise ValueError(f"{name}: there is no time {value}: {error}.") from None
+
+
+def _each(name: str, value: Any, count: int) -> list[str]:
+    values = [value] if isinstance(value, str) else list(value)
+    if len(values) != count:
+        raise ValueError(f"{name} must name each of {count} bodies, got {len(values)}.")
+    return [_text(name, x) for x in values]
+
+
+def _text(name: str, value: Any) -> str:
+    """One line of printable ASCII, as the standard wants values."""
+    if not isinstance(value, str) or not re.fullmatch(r"[!-~]([ -~]*[!-~])?", value):
+        raise ValueError(f"{name} must be one line of printable ASCII, got {value!r:.60}.")
+    return value

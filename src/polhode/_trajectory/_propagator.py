@@ -1,0 +1,207 @@
+"""Trajectories between their samples: the method that made them, run once more."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike
+
+from polhode import rotation
+from polhode._batch import PARTS, flatten, lane_times, map_arrays
+from polhode._checks import as_float_array
+from polhode._method import AbstractMethod, Record, Status, raise_on_failure
+from polhode._scene import Scene, State, Wheels
+from polhode._trajectory._trajectory import AbstractPropagator, Trajectory
+
+
+class Propagator(AbstractPropagator):
+    """The method that moved a trajectory, and its tolerance (None for exact methods).
+
+    Arrays of the method are leaves, all else of it is static: trajectories pass through ``jax.jit``
+    and ``jax.vmap`` as results.
+    """
+
+    arrays: Any
+    rest: Any = eqx.field(static=True)
+    rtol: Array | None
+
+    @classmethod
+    def of(cls, method: AbstractMethod, rtol: Any) -> "Propagator":
+        """Of what a trajectory was made with."""
+        return cls(*eqx.partition(method, eqx.is_array), None if method.exact else rtol)
+
+    @property
+    def method(self) -> AbstractMethod:
+        """The method."""
+        return eqx.combine(self.arrays, self.rest)
+
+    def at(self, trajectory: Trajectory, t: ArrayLike) -> Trajectory:
+        times = as_float_array("t", t, finite=False).astype(trajectory.ts.dtype)
+        times = times[None] if times.ndim == 0 else times
+        batch = trajectory.batch_shape
+        try:
+            fits = jnp.broadcast_shapes(times.shape[:-1], batch) == batch
+        except ValueError:
+            fits = False
+        if not fits:
+            raise ValueError(
+                f"t must have shape (K,), or (..., K) with the batch axes {batch} of the bodies,"
+                f" got {times.shape}."
+            )
+        found = moved_to(trajectory, times)
+        if not isinstance(found.status, Tracer):
+            raise_on_failure(found.status)
+        return found
+
+
+def moved_to(trajectory: Trajectory, t: Array) -> Trajectory:
+    """The trajectory at times (K,) or (..., K) of its dtype, in any order; see ``at``."""
+    return _moved(trajectory, t, False)
+
+
+def moved_through(trajectory: Trajectory, t: Array) -> Trajectory:
+    """The same for times in order, from the first sample on: for many, all over the motion."""
+    return _moved(trajectory, t, True)
+
+
+@eqx.filter_jit
+def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
+    propagator: Any = trajectory.propagator
+    batch, ts = trajectory.batch_shape, trajectory.ts
+    parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
+    samples = [x.reshape(-1, *x.shape[len(batch) :]) for x in trajectory._samples]
+    finite, times = jnp.isfinite(t), t
+    if ts.ndim > 1 or times.ndim > 1:  # one row a body
+        ts, times = (lane_times(jnp.atleast_2d(x), batch) for x in (ts, times))
+    times = jnp.where(jnp.isfinite(times), times, ts[..., :1])
+    move = _from_first if in_order or propagator.method.exact else _from_nearest
+    found, status, steps = move(propagator, Scene(**parts), samples, ts, times)
+    wxyz, omega, *spins = (x.reshape(*batch, *x.shape[1:]) for x in found)
+    asked = jnp.broadcast_to(finite, wxyz.shape[:-1])[..., None]
+    status, steps = status.reshape(batch), steps.reshape(batch)
+    good = trajectory.status == Status.SUCCESSFUL
+    wxyz, omega, *spins = (jnp.where(asked, x, jnp.nan) for x in (wxyz, omega, *spins))
+    return Trajectory(
+        t, wxyz, omega, jnp.where(good, status, trajectory.status), steps, trajectory.scene,
+        spins=spins[0] if spins else None, propagator=propagator,
+    )  # fmt: skip
+
+
+def _begun(scene: Scene, spins: list[Array]) -> Scene:
+    """The scene with these momenta of its coupled wheels, if there are such."""
+    if not spins or not isinstance(scene.rotors, Wheels):
+        return scene
+    return Scene(scene.inertia, scene.potential, scene.torque, scene.rotors.begun(*spins))
+
+
+def _from_first(propagator: Propagator, scene: Scene, samples, ts, times):
+    """From the first sample: an exact law holds at every time."""
+    wxyz, omega, *spins = (x[:, 0] for x in samples)
+    times = jnp.concatenate([ts[..., :1], times], axis=-1)
+    rtol = None if propagator.rtol is None else jnp.min(propagator.rtol)
+    found = propagator.method.run(_begun(scene, spins), State(wxyz, omega), times, rtol, Record())
+    kept = [x[:, 1:] for x in (found.wxyz, found.omega_body, found.spins) if x is not None]
+    return kept, found.status, found.steps
+
+
+def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
+    """From the sample nearest to each time, of which a body may have many."""
+    rtol = jnp.min(
+        propagator.rtol
+    )  # of a trajectory that came out of vmap one for each body, all equal
+    final = Record(final_only=True)
+    unit = _gap(ts, times)
+
+    def moved(scene, start, begin, end, unit):
+        """Lanes at ``end`` () or (N,), their status and steps."""
+        wxyz, omega, *spins = start
+        scene = _begun(scene, spins)
+        there = begin == end
+        span = jnp.stack([begin, jnp.where(there, begin + unit, end)], axis=-1)
+        found = propagator.method.run(scene, State(wxyz, omega), span, rtol, final)
+        # where no time passes, the sample itself, with its derivatives by the time
+        step = jnp.broadcast_to((end - begin)[..., None], (*wxyz.shape[:-1], 1))
+        here = jnp.broadcast_to(there[..., None], step.shape)
+        ends = [x[:, 0] for x in (found.wxyz, found.omega_body, found.spins) if x is not None]
+        near = _along(scene, start, begin, jnp.where(here, step, 0))
+        kept = [jnp.where(here, x, end) for x, end in zip(near, ends)]
+        return (
+            kept,
+            jnp.where(here[:, 0], Status.SUCCESSFUL, found.status),
+            jnp.where(here[:, 0], 0, found.steps),
+        )
+
+    if ts.ndim == 1:
+        place = _nearest(ts, times)
+
+        def one(given):
+            k, t = given
+            return moved(scene, [x[:, k] for x in samples], ts[k], t, unit)
+
+        found, status, steps = jax.lax.map(one, (place, times))
+        found = [jnp.moveaxis(x, 0, 1) for x in found]
+        return found, jnp.max(status, axis=0), jnp.sum(steps, axis=0)
+    n, count = times.shape
+    place = jax.vmap(_nearest)(ts, times)
+    begin = jnp.take_along_axis(ts, place, axis=-1).reshape(-1)
+    start = [
+        jnp.take_along_axis(x, place[..., None], axis=1).reshape(n * count, -1) for x in samples
+    ]
+
+    def each_time(x, rank):
+        return x[:, None] if x.ndim > rank else x
+
+    parts = {name: map_arrays(getattr(scene, name), each_time) for name in PARTS}
+    parts = {name: flatten(part, (n, count)) for name, part in parts.items()}
+    found = moved(Scene(**parts), start, begin, times.reshape(-1), unit.reshape(-1))
+    found, status, steps = jax.tree.map(lambda x: x.reshape(n, count, *x.shape[1:]), found)
+    return found, jnp.max(status, axis=-1), jnp.sum(steps, axis=-1)
+
+
+def shortly_after(trajectory: Trajectory, late: Array) -> Trajectory:
+    """Samples so little later, by ``late`` (..., T) [s], that three terms of their Taylor series
+    lead there: of what is no later but for its derivatives, values and two derivatives."""
+    found = _along(trajectory._scene, trajectory._samples, trajectory._t, late[..., None])
+    wxyz, omega, *spins = found
+    return Trajectory(
+        trajectory._t + late, wxyz, omega, trajectory.status, trajectory.steps, trajectory.scene,
+        spins=spins[0] if spins else None, propagator=trajectory.propagator,
+    )  # fmt: skip
+
+
+def _along(scene: Scene, samples: list[Array], t: Array, step: Array) -> list[Array]:
+    """Samples (..., 4), (..., 3) and momenta of coupled wheels, a ``step`` (..., 1) [s] later."""
+
+    def rates(samples, t):
+        wxyz, omega, *spins = samples
+        now = tuple(jnp.moveaxis(spins[0], -1, 0)) if spins else ()
+        acceleration, turned = scene.with_spins(now).changes(wxyz, omega, t)
+        more = [jnp.stack(jnp.broadcast_arrays(*turned), axis=-1)] if turned else []
+        return [rotation.wxyz_rate(wxyz, omega), acceleration, *more]
+
+    given = list(samples), jnp.asarray(t)
+    first = rates(*given)
+    _, second = jax.jvp(rates, given, (first, jnp.ones_like(given[1])))
+    return [x + step * (a + step / 2 * b) for x, a, b in zip(samples, first, second)]
+
+
+def _nearest(ts: Array, times: Array) -> Array:
+    """Places (K,) in ``ts`` (T,), in any order, of what is nearest to each of ``times`` (K,)."""
+    ts, times = jax.lax.stop_gradient((ts, times))
+    order = jnp.argsort(ts)
+    later = jnp.clip(jnp.searchsorted(ts[order], times), 0, ts.shape[0] - 1)
+    sooner = jnp.maximum(later - 1, 0)
+    closer = jnp.abs(ts[order[sooner]] - times) < jnp.abs(ts[order[later]] - times)
+    return order[jnp.where(closer, sooner, later)]
+
+
+def _gap(ts: Array, times: Array) -> Array:
+    """A time that a step may take in place of none at all; () or (N, K)."""
+    ts, times = jax.lax.stop_gradient((ts, times))
+    span = jnp.max(ts, axis=-1) - jnp.min(ts, axis=-1)
+    size = jnp.max(jnp.abs(ts), axis=-1)
+    gap = jnp.where(span > 0, span, jnp.maximum(size, 1)) / 1024
+    gap = jnp.maximum(gap, 1024 * jnp.finfo(ts.dtype).eps * size)
+    return gap if ts.ndim == 1 else jnp.broadcast_to(gap[:, None], times.shape)

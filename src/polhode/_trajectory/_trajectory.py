@@ -1,0 +1,312 @@
+"""The result of a simulation: sampled attitude and rates, everything else on demand."""
+
+import abc
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from polhode import rotation
+from polhode._batch import PARTS, along_time, map_arrays
+from polhode._checks import is_concrete
+from polhode._hamiltonian import components, from_quaternion
+from polhode._method import Status
+from polhode._scene import Scene, State, Wheels
+from polhode._trajectory._exports import dataset, write_aem
+from polhode._trajectory._indexing import check_key, is_integer, split_key
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+
+@partial(jax.jit, static_argnums=2)  # one program, not one for each operation
+def _sample(wxyz: Array, omega: Array, place: int) -> tuple[Array, Array]:
+    """Attitude and rates (...) of one sample."""
+    return wxyz[..., place, :], omega[..., place, :]
+
+
+@eqx.filter_jit  # likewise
+def _derived(of: Callable[["Trajectory"], Any], bare: "Trajectory") -> Any:
+    return of(bare)
+
+
+class AbstractPropagator(eqx.Module):
+    """What moves the bodies of a trajectory to other times."""
+
+    @abc.abstractmethod
+    def at(self, trajectory: "Trajectory", t: ArrayLike) -> "Trajectory":
+        """The trajectory at times ``t`` (K,) or (..., K)."""
+
+
+class Trajectory(eqx.Module):
+    """Samples of the motion; leading axes (...) are the batch, then T times.
+
+    **Fields:** ``ts`` (T,) or (..., T) [s]; ``wxyz`` (..., T, 4) body -> space, or None when not
+    recorded; ``omega_body`` (..., T, 3) [rad/s], or None; ``status`` (...): ``ph.Status`` per
+    body; ``steps`` (...): solver steps (0 for an exact solution); ``scene``, the motion of its
+    rotors fixed by the initial state; ``work`` (..., T) [J]: done from outside since the first
+    time, by external torques, potentials that change with time (also orbits) and the motors of
+    wheels, so that ``energy - work`` is constant, or None (``Record(work=True)``); ``error`` (...)
+    [rad]: estimated error of the attitude at the last time, or None (``Record(error=True)``;
+    without attitude that of the rates, relative); ``motor_work`` (..., T, m) [J]: the part of
+    ``work`` that motor and friction of each wheel have done, or None without ``work`` or such;
+    ``spins`` (..., T, k) [kg m^2/s]: momenta of the wheels with a coupling, or None;
+    ``propagator``: method and tolerance, for ``at``;
+    ``event_time`` (...) [s]: of the event that ``ph.simulate(..., until=)`` stopped at, inf for a
+    body that did not meet it, or None.
+
+    Between the samples: ``traj.at(t)``. Indexed, a trajectory is an array of shape (..., T) of
+    samples: ``traj[i]`` is a body of a batch, ``traj[..., ::10]`` every tenth sample.
+    """
+
+    ts: Float[Array, "*t"]
+    wxyz: Float[Array, "*b t 4"] | None
+    omega_body: Float[Array, "*b t 3"] | None
+    status: Int[Array, "*b"]
+    steps: Int[Array, "*b"]
+    scene: Scene
+    work: Float[Array, "*b t"] | None = None
+    error: Float[Array, "*b"] | None = None
+    motor_work: Float[Array, "*b t m"] | None = None
+    spins: Float[Array, "*b t k"] | None = None
+    propagator: AbstractPropagator | None = None
+    event_time: Float[Array, "*b"] | None = None
+
+    def at(self, t: Float[ArrayLike, "*#b k"]) -> "Trajectory":
+        """The motion at other times ``t`` [s]: a trajectory of the same bodies at these.
+
+        ``t`` (K,) is shared by all bodies, (..., K) one row a body; a number is taken as (1,). In
+        any order, also outside the times simulated. Differentiable in ``t``, in the initial state
+        and in the numbers of the scene; under ``jit`` and ``vmap`` too. Exact laws are evaluated at
+        ``t``; a stepped body is moved there from its nearest sample, which keeps ``rtol`` and costs
+        a few steps for each time. A time that is not finite gives NaN. ``work``, ``motor_work`` and
+        ``error`` are None.
+
+        Raises ValueError where attitude or rates were not recorded, SimulationError as
+        ``ph.simulate`` does.
+
+            traj = ph.simulate(scene, state, [0.0, 10.0])
+            traj.at(jnp.linspace(0, 10, 501)).energy
+        """
+        for name in ("wxyz", "omega_body"):
+            self._need(name)
+        if self.propagator is None:
+            raise ValueError(
+                "this trajectory was made by hand, without a method to move it by: use one that"
+                " ph.simulate returns."
+            )
+        return self.propagator.at(self, t)
+
+    def state_at(self, t: Float[ArrayLike, "*#b"]) -> State:
+        """Attitude and rates (...) at one time ``t`` [s], () or one for each body; see ``at``."""
+        return self.at(jnp.asarray(t)[..., None]).last
+
+    @property
+    def first(self) -> State:
+        """The state (...) at the first sample."""
+        return State(*_sample(self._need("wxyz"), self._need("omega_body"), 0))
+
+    @property
+    def last(self) -> State:
+        """The state (...) at the last sample, from which another simulation may go on.
+
+        It holds attitude and rates; the speeds of wheels are ``wheel_speed[..., -1, :]``.
+        """
+        return State(*_sample(self._need("wxyz"), self._need("omega_body"), -1))
+
+    def __getitem__(self, key: Any) -> "Trajectory":
+        """Bodies and samples chosen as from an array of shape (..., T), body axes first.
+
+        Integers, slices, ``...``, arrays of integers or truth values. ``traj[3]`` is the fourth
+        body (of one body: the fourth sample); ``traj[3, ::10]``, ``traj[..., -1]``: bodies first,
+        then times. The axis of time stays: an integer there keeps one sample.
+        """
+        bodies, times = split_key(key, len(self.batch_shape))
+        shape = self.batch_shape
+        check_key(bodies, shape, "bodies")
+        check_key(times, self.ts.shape[-1:], "samples")
+        times = (jnp.asarray(times)[None],) if is_integer(times) else (times,)
+
+        def of_bodies(x, rank):
+            if x is None or (lead := x.shape[: x.ndim - rank]) == ():
+                return x
+            full = jnp.broadcast_to(x.reshape((1,) * (len(shape) - len(lead)) + x.shape),
+                                    (*shape, *x.shape[x.ndim - rank :]))  # fmt: skip
+            return full[bodies] if bodies else full
+
+        def of_both(x, rank):
+            kept = of_bodies(x, rank)
+            if kept is None:
+                return None
+            return kept[(..., *times, *(slice(None),) * (rank - 1))]
+
+        parts = {name: map_arrays(getattr(self.scene, name), of_bodies) for name in PARTS}
+        return Trajectory(
+            of_both(self.ts, 1), of_both(self.wxyz, 2), of_both(self.omega_body, 2),
+            of_bodies(self.status, 0), of_bodies(self.steps, 0), Scene(**parts),
+            of_both(self.work, 1), of_bodies(self.error, 0), of_both(self.motor_work, 2),
+            of_both(self.spins, 2), self.propagator,
+            of_bodies(self.event_time, 0),
+        )  # fmt: skip
+
+    def between(self, start: float, end: float) -> "Trajectory":
+        """The samples from ``start`` to ``end`` [s], both included; of one row of times.
+
+        Not under ``jit``, where the number of samples must be known: use ``at``, or a slice.
+        Raises ValueError where no sample lies there, or where bodies have times of their own.
+        """
+        if not is_concrete(self.ts) or self.ts.ndim != 1:
+            raise ValueError(
+                "between needs one row of known times: use traj.at(times), or a slice such as"
+                " traj[..., 10:20]."
+            )
+        ts = np.asarray(self.ts)
+        (kept,) = np.nonzero((ts >= min(start, end)) & (ts <= max(start, end)))
+        if not kept.size:
+            raise ValueError(
+                f"no sample lies between {start} and {end}; they run from {ts[0]} to {ts[-1]}:"
+                " for times between samples use traj.at(times)."
+            )
+        return self[..., kept[0] : kept[-1] + 1]
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading axes."""
+        return self.status.shape
+
+    @property
+    def successful(self) -> Array:
+        """Which bodies finished, (...) of bool."""
+        return self.status == Status.SUCCESSFUL
+
+    def _need(self, name: str) -> Array:
+        value = getattr(self, name)
+        if value is None:
+            raise ValueError(
+                f"this trajectory holds no {name}: ask for it with"
+                " record=ph.Record(attitude=True, rates=True) in ph.simulate."
+            )
+        return value
+
+    def _compiled(self, of: Callable[["Trajectory"], Any]) -> Any:
+        """What ``of`` makes of this trajectory, in one program that other records of it share."""
+        bare = Trajectory(
+            self.ts, self.wxyz, self.omega_body, self.status, self.steps, self.scene,
+            spins=self.spins,
+        )  # fmt: skip
+        return _derived(of, bare)
+
+    @property
+    def _samples(self) -> list[Array]:
+        """Attitude, rates and momenta of coupled wheels (..., T, n), as far as there are such."""
+        return [x for x in (self.wxyz, self.omega_body, self.spins) if x is not None]
+
+    @property
+    def _scene(self) -> Scene:
+        """The scene with arrays shaped to broadcast against (..., T) samples."""
+        rank = len(self.batch_shape)
+        parts = {name: along_time(getattr(self.scene, name), rank) for name in PARTS}
+        spins = () if self.spins is None else tuple(jnp.moveaxis(self.spins, -1, 0))
+        return Scene(**parts).with_spins(spins)
+
+    @property
+    def _t(self) -> Array:
+        return self.ts.reshape((1,) * (len(self.batch_shape) + 1 - self.ts.ndim) + self.ts.shape)
+
+    @property
+    def momentum_body(self) -> Float[Array, "*b t 3"]:
+        """Angular momentum in body axes, that of rotors included [kg m^2/s]."""
+        self._need("omega_body")
+        return self._compiled(_momentum_body)
+
+    @property
+    def momentum_space(self) -> Float[Array, "*b t 3"]:
+        """Angular momentum in space axes [kg m^2/s]."""
+        return rotation.rotate(self._need("wxyz"), self.momentum_body)
+
+    @property
+    def wheel_speed(self) -> Float[Array, "*b t m"] | None:
+        """Speed of each wheel relative to the body [rad/s]; None without wheels.
+
+        NaN for a wheel that is held at a momentum, its inertia not given.
+        """
+        wheels = self._scene.rotors
+        if not isinstance(wheels, Wheels):
+            return None
+        omega = components(self._need("omega_body"))
+        speeds = [wheels.speed(i, self._t, omega) for i in range(len(wheels.held))]
+        shape = omega[0].shape
+        return jnp.stack([jnp.broadcast_to(x, shape) for x in speeds], axis=-1)
+
+    @property
+    def energy(self) -> Float[Array, "*b t"]:
+        """Kinetic plus potential energy [J]: the one Hamiltonian at every sample.
+
+        Of wheels that spin freely or by a motor the spin energy is included; with wheels held at
+        their speed it is the energy of the body turning with them locked, which is what then stays
+        constant. It changes by ``work`` and by nothing else (but a potential that jumps in time).
+        """
+        self._need("omega_body")
+        if self.scene.potential is not None:
+            self._need("wxyz")
+        return self._compiled(_energy)
+
+    def euler(
+        self, sequence: rotation.Sequence | str = rotation.Sequence.ZYZ
+    ) -> tuple[Array, Array, Array]:
+        """Euler angles [rad], each (..., T): by default ZYZ (phi, theta, psi).
+
+        ``sequence``: a ``rotation.Sequence``, or its axes as SciPy writes them: ``"ZYX"`` turns
+        about the axes of the body one after the other (yaw, pitch, roll), ``"zyx"`` about those of
+        space. Angles are in the order of the axes. Raises ValueError for other letters.
+        """
+        if isinstance(sequence, str):
+            sequence = rotation.Sequence.of(sequence)
+        return rotation.wxyz_to_euler(self._need("wxyz"), sequence)
+
+    def to_scipy(self) -> "Rotation":
+        """The attitudes, body -> space, as one SciPy ``Rotation`` of all samples.
+
+        In the order of ``wxyz`` with its leading axes flattened. The other way: ``ph.State`` takes
+        a ``Rotation`` in place of a quaternion. Not under ``jit``.
+        """
+        return rotation.wxyz_to_scipy(self._need("wxyz"))
+
+    def to_xarray(self, labels: Sequence[str] | None = None) -> Any:
+        """An ``xarray.Dataset`` with named dimensions, units and attributes (needs xarray).
+
+        ``labels``: names of the bodies of a batch of one axis, the coordinate ``body``.
+        """
+        return dataset(self, labels)
+
+    def to_aem(self, path: str | Path, epoch: str, **fields: Any) -> None:
+        """Write the attitudes as a CCSDS attitude ephemeris message (504.0-B-2), a text file.
+
+        **Arguments:** ``path``; ``epoch``: calendar time at which ``ts`` is zero, such as
+        ``"2029-04-13T21:46:00"``; fields of the message: ``object_name`` and ``object_id``
+        (required; for a batch one for each body), ``frame`` ("EME2000": that of space),
+        ``body_frame`` ("SC_BODY_1"), ``time_system`` ("TAI"), ``originator`` ("POLHODE"),
+        ``center_name`` (None), ``rates`` (True: body rates too), ``creation_date`` (now).
+
+        One segment a body, in the order of time. Seconds are counted on from ``epoch``: over a leap
+        second leave UTC to others. Raises ValueError or TypeError for fields that the standard does
+        not know, FileNotFoundError for a folder that is not there.
+        """
+        write_aem(path, self, epoch, **fields)
+
+
+def _momentum_body(bare: Trajectory) -> Array:
+    return bare._scene.momentum(bare._need("omega_body"), bare._t)
+
+
+def _energy(bare: Trajectory) -> Array:
+    scene, attitude = bare._scene, None
+    if scene.potential is not None:
+        attitude = from_quaternion(tuple(bare._need("wxyz")[..., i] for i in range(4)))
+    return scene.hamiltonian.total(components(_momentum_body(bare)), attitude, bare._t)

@@ -1,0 +1,37 @@
+"""Scene files (TOML) and labelled output (NetCDF).
+
+Reading and checking a file needs no JAX; what builds polhode's objects is imported when asked for.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from polhode.files._atomic import whole_file as whole_file, write_netcdf as write_netcdf
+from polhode.files._error import SceneFileError as SceneFileError, visible as visible
+from polhode.files._read import parse_scene as parse_scene, read_scene as read_scene
+
+if TYPE_CHECKING:
+    from polhode.files._build import (
+        blamed as blamed,
+        build_attitudes as build_attitudes,
+        build_inertia as build_inertia,
+        build_scene as build_scene,
+        build_state as build_state,
+    )
+    from polhode.files._clones import Clones as Clones, draw_clones as draw_clones
+    from polhode.files._method import build_method as build_method
+    from polhode.files._models import SceneFile as SceneFile
+
+_ROOMS = {
+    "_build": ("blamed", "build_attitudes", "build_inertia", "build_scene", "build_state"),
+    "_clones": ("Clones", "draw_clones"),
+    "_method": ("build_method",),
+    "_models": ("SceneFile",),
+}
+
+
+def __getattr__(name: str) -> Any:
+    for room, names in _ROOMS.items():
+        if name in names:
+            return getattr(importlib.import_module(f"polhode.files.{room}"), name)
+    raise AttributeError(f"module 'polhode.files' has no attribute {name!r}")

@@ -1,9 +1,0 @@
-"""The result of a simulation: samples, what follows from them, and the way to other times."""
-
-from polhode.trajectory._propagator import (
-    Propagator as Propagator,
-    moved_through as moved_through,
-    moved_to as moved_to,
-    shortly_after as shortly_after,
-)
-from polhode.trajectory._trajectory import Trajectory as Trajectory
