@@ -23,10 +23,11 @@ test-all: $(call STAMP,test) $(call STAMP,docs) test-versions  ## run every test
 test-versions:  ## a smoke test on the lowest and on the newest versions of what polhode needs
 	$(PYTHON) tests/versions.py
 
-lint: $(call STAMP,lint)  ## ruff and pyright
+lint: $(call STAMP,lint)  ## ruff, pyright, and both type checkers on the documentation's examples
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/python tests/user_types.py
 
 bench: $(call STAMP,bench)  ## the quick benchmark tables and figures, beside the peers that are installed
 	$(BIN)/python -m benchmarks --quick

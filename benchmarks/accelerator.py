@@ -19,6 +19,7 @@ import numpy as np
 import polhode as ph
 from benchmarks import _report, problems, truth
 from benchmarks.peers.polhode_own import scene
+from polhode._plan import choose
 from polhode._simulate import run
 
 SIZES = {
@@ -62,7 +63,7 @@ def measure(family: str, n: int, dtype: str, peak: dict[str, float]) -> dict:
     repeat = (-(-n // count), 1)
     state = ph.State(*(jnp.asarray(np.tile(x, repeat)[:n], kind) for x in problem.states(count)))
     given, ts = scene(problem, kind), jnp.asarray(problem.times, kind)
-    method, _ = ph.choose(given, state, record, RTOL[dtype])
+    method, _ = choose(given, state, record, RTOL[dtype])
 
     @jax.jit
     def simulated(wxyz, omega):

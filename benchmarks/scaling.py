@@ -24,6 +24,7 @@ import polhode as ph
 from benchmarks.peers.polhode_own import scene
 from benchmarks.problems import PROBLEMS
 from polhode._closed_forms._free import _CHUNK
+from polhode._plan import choose
 from polhode._simulate import run
 
 FAMILIES = ("free", "lagrange", "heavy_top")
@@ -41,7 +42,7 @@ def measure(family: str, bodies: int, saves: int, horizons: tuple, budget: float
     repeat = (-(-bodies // len(wxyz)), 1)
     state = ph.State(*(jnp.asarray(np.tile(x, repeat)[:bodies]) for x in (wxyz, omega)))
     given, ts = scene(problem, np.float64), jnp.asarray(problem.times)
-    method, _ = ph.choose(given, state, record, RTOL)
+    method, _ = choose(given, state, record, RTOL)
 
     @jax.jit
     def simulated(wxyz, omega, ts):

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import polhode as ph
+from polhode._plan import choose
 from polhode._simulate import run
 
 FINAL = ph.Record(final_only=True)
@@ -59,7 +60,7 @@ def scenes() -> dict[str, tuple[ph.Scene, ph.Record, int]]:
 
 def program(scene, state, ts, record, rtol=1e-9):
     """The compiled program that ``simulate`` runs for a scene."""
-    method, _ = ph.choose(scene, state, record)
+    method, _ = choose(scene, state, record)
     arguments = (method, scene, state, ts, jnp.asarray(rtol, ts.dtype), record)
     return run.lower(*arguments).compile(), arguments
 

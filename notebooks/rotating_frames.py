@@ -16,7 +16,7 @@
 #
 # A particle seen from a frame that turns feels forces that nobody exerts: centrifugal, Coriolis
 # and, when the turning changes, Euler's. `ph.RotatingFrame` knows them by name,
-# `ph.simulate_particles` moves particles under them.
+# `ph.frames.simulate_particles` moves particles under them.
 #
 # 1. How fast does the swing plane of a Foucault pendulum turn?
 # 2. Where does a body dropped into a deep shaft land?
@@ -77,7 +77,7 @@ def swing(latitude, rate, length, start, ts):
         return weight - tension[..., None] * along
 
     below = -jnp.sqrt(length**2 - start**2)
-    return ph.simulate_particles(
+    return ph.frames.simulate_particles(
         frame, jnp.stack([start, 0.0 * start, below]), jnp.zeros(3), ts, FrameForce(weight_and_wire)
     )
 
@@ -156,7 +156,7 @@ freiberg, depth = jnp.deg2rad(50.92), 158.5
 weight = FrameForce(lambda t, position, velocity: jnp.array([0.0, 0.0, -GRAVITY]))
 fall_time = np.sqrt(2 * depth / GRAVITY)
 times = jnp.concatenate([jnp.zeros(1), jnp.geomspace(0.3, fall_time, 40)])
-fall = ph.simulate_particles(
+fall = ph.frames.simulate_particles(
     ground(freiberg, EARTH_RATE), jnp.zeros(3), jnp.zeros(3), times, weight, rtol=1e-13
 )
 south, east, up = np.asarray(fall.position[1:]).T
@@ -209,7 +209,7 @@ frame = ph.RotatingFrame.from_trajectory(tumble)
 drift = np.array([-0.010, 0.0015, 0.002])  # m/s in space
 at = jnp.array([0.125, 0.0, -0.03])  # m, in the box; the box is not turned yet
 moving = eqx.filter_jit(frame.velocity_to_frame)(ts[0], at, jnp.asarray(drift))
-bead = ph.simulate_particles(frame, at, moving, ts, rtol=1e-12)
+bead = ph.frames.simulate_particles(frame, at, moving, ts, rtol=1e-12)
 in_space = eqx.filter_jit(lambda paths: paths.position_space)(bead)
 
 line = np.asarray(at) + np.asarray(ts)[:, None] * drift
@@ -272,7 +272,9 @@ def spring(t, position, velocity):
 
 
 shown = ts[:481]
-held = ph.simulate_particles(frame, corner, jnp.zeros(3), shown, FrameForce(spring), rtol=1e-8)
+held = ph.frames.simulate_particles(
+    frame, corner, jnp.zeros(3), shown, FrameForce(spring), rtol=1e-8
+)
 stretch = -stiffness * (held.position - corner)
 reading = ph.accelerometer(tumble, corner)[:481]
 

@@ -9,6 +9,7 @@ import pytest
 
 import polhode as ph
 from polhode import _dispatch
+from polhode._plan import choose
 
 SCENE = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]))
 TS = [0.0, 1.0, 3.0]
@@ -206,7 +207,7 @@ def test_long_horizons_of_stepped_bodies_carry_their_rounding():
     short = ph.simulate(scene, _state(), TS, rtol=1e-9)
     for rtol in (1e-12, 3e-13):
         found = ph.simulate(scene, _state(), TS, rtol=rtol)
-        method, _ = ph.choose(scene, _state(), ph.Record(), rtol, jnp.array(TS))
+        method, _ = choose(scene, _state(), ph.Record(), rtol, jnp.array(TS))
         asked = ph.simulate(scene, _state(), TS, method, rtol=rtol)
         assert method.solver.compensated == (rtol < 2000 * np.finfo(float).eps)
         assert np.array_equal(found.wxyz, asked.wxyz)

@@ -145,6 +145,7 @@ def test_a_motion_stops_at_its_event_and_goes_on_with_another_scene():
     assert np.all(np.isinf(again.event_time))
 
 
+@pytest.mark.slow
 def test_the_work_follows_from_the_event_and_not_from_the_last_time():
     """Two pendulums from rest, in a span of 1e9 s: simulated to its end they would swing for
     months; a quarter of their periods by SciPy."""
@@ -163,6 +164,7 @@ def test_the_work_follows_from_the_event_and_not_from_the_last_time():
     np.testing.assert_allclose(energy, energy[:, :1] + 0 * energy, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_bodies_that_are_set_in_motion_are_looked_at_often_enough():
     """From rest w = a t, and from rest by a pulse amid a span a thousand times as long."""
     scene = ph.Scene(ph.Inertia.spherical(2.0), None, ph.BodyTorque([0.0, 1.0, 0.0]))

@@ -200,7 +200,7 @@ def test_options_of_stepped_methods(options, error, word):
 
 
 def test_options_that_are_right_pass():
-    for solver in (diffrax.Kvaerno5(), ph.solvers.Extrapolation(12), ph.solvers.Splitting()):
+    for solver in (diffrax.Kvaerno5(), ph.Extrapolation(12), ph.Splitting()):
         check_options(solver, diffrax.ConstantStepSize(), diffrax.ForwardMode(), dt0=-0.1)
     check_options(diffrax.Tsit5(), max_steps=np.int64(4), chunk=1)
 
@@ -245,7 +245,9 @@ BALL = ph.MassProperties.from_sphere(1.0, 1.0)
         (lambda: ph.hamiltonian(INERTIA, lambda R, t: 1.0), TypeError, "the potential must be"),
         (lambda: FRAME.coriolis(0.0, jnp.ones(2)), ValueError, "vector must have shape"),
         (
-            lambda: ph.simulate_particles(FRAME, [1, 0, 0], [0, 0, 0], TS, solver=diffrax.Tsit5),
+            lambda: ph.frames.simulate_particles(
+                FRAME, [1, 0, 0], [0, 0, 0], TS, solver=diffrax.Tsit5
+            ),
             TypeError,
             "the class Tsit5",
         ),

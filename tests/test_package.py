@@ -18,6 +18,7 @@ def test_the_wheel_says_that_it_is_typed_and_holds_every_module(tmp_path):
     held = {name for name in zipfile.ZipFile(wheel).namelist() if name.startswith("polhode/")}
     assert "polhode/py.typed" in held
     source = ROOT / "src"
+    assert "polhode/__init__.pyi" in held
     assert held >= {str(path.relative_to(source)) for path in (source / "polhode").rglob("*.py")}
 
 

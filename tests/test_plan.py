@@ -8,6 +8,7 @@ import pytest
 import polhode as ph
 from benchmarks.scene_cost import counts, program, scenes, states
 from polhode import rotation
+from polhode._plan import choose
 
 N = 64
 
@@ -82,9 +83,9 @@ def test_final_state_keeps_no_trajectory_buffer():
 def test_the_choice_follows_the_structure():
     inertia = ph.Inertia.from_moments([1.0, 2.0, 3.0])
     given = states(2), ph.Record()
-    assert isinstance(ph.choose(ph.Scene(inertia), *given)[0], ph.ClosedForm)
+    assert isinstance(choose(ph.Scene(inertia), *given)[0], ph.ClosedForm)
     pushed = ph.Scene(inertia, torque=ph.BodyTorque(lambda t: jnp.stack([t, 0 * t, 0 * t])))
-    assert not isinstance(ph.choose(pushed, *given)[0], ph.ClosedForm)
+    assert not isinstance(choose(pushed, *given)[0], ph.ClosedForm)
     with pytest.raises(ValueError, match="free bodies only"):
         ph.simulate(pushed, ph.State([1.0, 0, 0, 0], [0.0, 0, 1]), [0.0, 1.0], ph.ClosedForm())
 
@@ -93,9 +94,9 @@ def test_long_horizons_have_compensated_frequencies():
     """1e6 rad: the rounded phase is off by 2e-10 rad, far beyond 1e-12 and well within 1e-9."""
     scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]))
     state, ts = ph.State([1.0, 0, 0, 0], [0.0, 0.6, 0.8]), jnp.array([0.0, 1e6])
-    assert ph.choose(scene, state, ph.Record(), 1e-12, ts)[0].compensated
-    assert not ph.choose(scene, state, ph.Record(), 1e-9, ts)[0].compensated
-    assert not ph.choose(scene, state, ph.Record(), 1e-12)[0].compensated
+    assert choose(scene, state, ph.Record(), 1e-12, ts)[0].compensated
+    assert not choose(scene, state, ph.Record(), 1e-9, ts)[0].compensated
+    assert not choose(scene, state, ph.Record(), 1e-12)[0].compensated
     assert "sums of two floats" in str(ph.explain(scene, state, ts, rtol=1e-12))
     chosen, plain = (
         ph.simulate(scene, state, ts, rtol=rtol, record=ph.Record(final_only=True))
@@ -121,8 +122,8 @@ def test_many_bodies_under_a_potential_reach_the_error_asked_for():
     state = ph.State(jnp.tile(wxyz, (40, 1)), jnp.array(system.omega))
     ts = jnp.array([0.0, 2.5, 6.0])
     for rtol in (1e-6, 1e-10):
-        method, _ = ph.choose(scene, state, ph.Record(), rtol)
-        assert isinstance(method.solver, ph.solvers.Extrapolation)
+        method, _ = choose(scene, state, ph.Record(), rtol)
+        assert isinstance(method.solver, ph.Extrapolation)
         assert method.chart.upright
         traj = ph.simulate(scene, state, ts, rtol=rtol)
         back = rotation.multiply(rotation.conjugate(side), traj.wxyz[:, -1])

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode import choose, rotation
+from polhode import rotation
 from polhode._integrate import Extrapolation
+from polhode._plan import choose
 
 INERTIA = ph.Inertia.from_moments([1.0, 1.5, 2.0])
 GRAVITY = ph.UniformGravity(1.0, [0.1, 0.2, 0.5], [0.0, 0, -1.0])
@@ -116,6 +117,7 @@ def test_only_a_resting_centre_is_turned_upright():
         ph.GravityGradient(1.0, [1.0, 0.0, 1.0], vertical=True)
 
 
+@pytest.mark.slow
 def test_a_gravity_gradient_is_the_same_seen_from_a_frame_upright_to_it():
     """Slopes go through the turn."""
 

@@ -3,13 +3,27 @@
 import importlib
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
+
+if TYPE_CHECKING:
+    from jax.typing import ArrayLike as _ArrayLike
+
+    # What users write for numbers: arrays, numbers, and lists of them, nested up to matrices of a
+    # batch. JAX's own alias leaves lists out.
+    ArrayLike = (
+        _ArrayLike
+        | Sequence[_ArrayLike]
+        | Sequence[Sequence[_ArrayLike]]
+        | Sequence[Sequence[Sequence[_ArrayLike]]]
+    )
+else:  # jaxtyping attaches shapes to array types only
+    from jaxtyping import ArrayLike as ArrayLike
 
 
 def is_concrete(*values: Any) -> bool:

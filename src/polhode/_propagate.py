@@ -8,9 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from polhode import rotation
+from polhode._checks import ArrayLike
 from polhode._method import (
     AbstractMethod,
     Status,

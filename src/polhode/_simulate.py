@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from polhode import rotation
 from polhode._batch import (
@@ -19,7 +19,7 @@ from polhode._batch import (
     place,
     split_of,
 )
-from polhode._checks import is_concrete
+from polhode._checks import ArrayLike, is_concrete
 from polhode._dispatch import again, learn
 from polhode._events import Event, check_until, stopped
 from polhode._kernels import FEW, kernel

@@ -127,6 +127,7 @@ def test_throws_in_air_show_the_tensor_and_the_instrument(throws):
     assert worse > 1.5 * np.abs(np.asarray(alone.moments) - true[1]).mean()
 
 
+@pytest.mark.slow
 def test_a_wheel_in_fit_inertia_is_the_likelihood_of_the_readings():
     """Throws in moving air: the motion that takes the wheel at its word is far off."""
     tensor = 10 * study.DEVICE
@@ -160,6 +161,7 @@ def test_a_recording_of_a_batch_is_fitted_as_alone():
     np.testing.assert_allclose(fit.moments[1], one.moments[0], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_throws_without_a_wheel_show_ratios():
     times = np.arange(0, 1, 0.01)
     tensor = TENSORS[0] / np.linalg.eigvalsh(TENSORS[0])[2]

@@ -174,6 +174,7 @@ def sensed(times, *, flip=(1, 1, 1), outliers=0):
     }, lever
 
 
+@pytest.mark.slow
 def test_bias_mounting_lever_and_outliers():
     data, lever = sensed(TIMES, outliers=4)
     fit = fit_inertia(**data, bias=True, mounting=True, robust=Huber(3.0), throw=False)

@@ -51,6 +51,7 @@ def crossings(times, x):
 
 
 @pytest.mark.skipif(not PISA.exists(), reason="needs ../shared/data/pisa_racket")
+@pytest.mark.slow
 def test_a_toss_recorded_with_left_handed_axes():
     """The author's fit, made with the mended sign, is 18(5) : 19(5) : 1."""
     table = np.loadtxt(PISA)

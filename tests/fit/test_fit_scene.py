@@ -37,6 +37,7 @@ def drag_of(rates, throw=True):
     return ph.fit(start, data, free=free, noise_known=True, rtol=1e-7, starts=1, throw=throw)
 
 
+@pytest.mark.slow
 def test_intervals_of_a_drag_hold_the_truth():
     """240 draws of the noise: normal deviates, of the size said."""
     true = TRUE_DRAG

@@ -27,6 +27,7 @@ def test_bodies_have_the_periods_of_their_hypothesis():
     assert not np.any((found == other) & good)
 
 
+@pytest.mark.slow
 def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
     curve, truth, _ = light_curves.synthetic(9, 0.02, nights=10, days=12.0, each=12)
     points = curve.points(0.01)

@@ -25,8 +25,8 @@ SCENES = {
 }
 METHODS = {
     "free": None,
-    "top": ph.LiePoisson(ph.solvers.Extrapolation(8), chunk=1),
-    "damped": ph.LiePoisson(ph.solvers.Extrapolation(8), chunk=1),
+    "top": ph.LiePoisson(ph.Extrapolation(8), chunk=1),
+    "damped": ph.LiePoisson(ph.Extrapolation(8), chunk=1),
 }
 
 

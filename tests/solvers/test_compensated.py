@@ -9,6 +9,7 @@ import pytest
 
 import polhode as ph
 from polhode._hamiltonian import Dynamics, lie_poisson_field
+from polhode._integrate import Accuracy
 
 
 def _tops(dtype):
@@ -25,14 +26,12 @@ def _tops(dtype):
 def _marched(dynamics, y, compensated):
     """By the solver's own march from each of 401 times to the next."""
     ends = jnp.linspace(0.0, 40.0, 401, dtype=y[0][0].dtype)
-    solver = ph.solvers.Extrapolation(
-        10, compensated=compensated, accuracy=ph.solvers.Accuracy(1e-7, 40.0)
-    )
+    solver = ph.Extrapolation(10, compensated=compensated, accuracy=Accuracy(1e-7, 40.0))
     return _solved(dynamics, y, solver, None, diffrax.StepTo(ends))
 
 
 def _stepped(dynamics, y, compensated):
-    solver = ph.solvers.Extrapolation(10, compensated=compensated)
+    solver = ph.Extrapolation(10, compensated=compensated)
     return _solved(dynamics, y, solver, jnp.array(0.1, y[0][0].dtype), diffrax.ConstantStepSize())
 
 

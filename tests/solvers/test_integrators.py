@@ -252,7 +252,7 @@ def _loss(first, strength, solver, steps, adjoint):
     [
         (Extrapolation(8), 30, "forward"),
         (Splitting(4), 240, "forward"),
-        (Splitting(6, moser_veselov=10), 120, "reverse"),
+        pytest.param(Splitting(6, moser_veselov=10), 120, "reverse", marks=pytest.mark.slow),
     ],
     ids=["extrapolation", "rotations", "moser_veselov"],
 )

@@ -123,6 +123,7 @@ def test_a_queue_changes_neither_values_nor_slopes(acts):
         np.testing.assert_allclose(one, other, atol=1e-11)
 
 
+@pytest.mark.slow
 def test_batches_of_queues_are_queues():
     moments, wxyz, omega = _drawn(N)
     rates = jnp.stack([omega, 0.1 * omega])

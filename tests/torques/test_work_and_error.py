@@ -9,6 +9,7 @@ from systems.table import BY_NAME, truth
 
 import polhode as ph
 from polhode import rotation
+from polhode._plan import choose
 
 INERTIA = ph.Inertia.from_moments([1.0, 1.5, 2.0])
 GRAVITY = ph.UniformGravity(1.0, [0.1, 0.0, 0.5], [0.0, 0.0, -2.0])
@@ -19,7 +20,7 @@ TS = jnp.linspace(0.0, 6.0, 4)
 METHODS = {
     "Dopri8": ph.LiePoisson(),
     "EulerAngles": ph.EulerAngles(),
-    "Extrapolation": ph.LiePoisson(ph.solvers.Extrapolation(12)),
+    "Extrapolation": ph.LiePoisson(ph.Extrapolation(12)),
 }
 
 
@@ -49,7 +50,7 @@ def test_work_on_a_damped_and_driven_spin():
     lost = -2.25 * (1 - np.exp(-0.3 * np.asarray(TS)))
     gained = 0.4 * (1.5 * np.asarray(TS) + 0.1 * np.asarray(TS) ** 2)
     for scene, want in ((damped, lost), (driven, gained)):
-        assert ph.choose(scene, state, record)[0].exact
+        assert choose(scene, state, record)[0].exact
         for method, atol in ((None, 1e-14), (ph.LiePoisson(), 1e-9)):
             traj = ph.simulate(scene, state, TS, method, rtol=1e-11, record=record)
             np.testing.assert_allclose(traj.work, want, rtol=0, atol=atol)
@@ -66,7 +67,7 @@ def test_the_estimate_bounds_the_error(rtol):
     scene, ts = ph.Scene(INERTIA, GRAVITY), jnp.array([0.0, 60.0])
     record = ph.Record(final_only=True, error=True)
     # With compensated sums: what rounding adds to plain ones is as large as the estimate.
-    solver = ph.solvers.Extrapolation(16, compensated=True)
+    solver = ph.Extrapolation(16, compensated=True)
     pushed = ph.State(wxyz, state.omega_body + 1e-9)
     best, beside = (
         ph.simulate(scene, x, ts, ph.LiePoisson(solver), rtol=5e-14).wxyz[:, -1]

@@ -5,3 +5,4 @@ from polhode._closed_forms._free import ClosedForm as ClosedForm
 from polhode._closed_forms._lagrange import LagrangeTop as LagrangeTop
 from polhode._closed_forms._periods import periods as periods
 from polhode._closed_forms._table import LAWS as LAWS, Law as Law, lawful as lawful
+from polhode._closed_forms.free import Mode as Mode, Periods as Periods

@@ -20,7 +20,8 @@ from polhode._closed_forms._conditions import (
     steady_wheels,
 )
 from polhode._closed_forms._law import AbstractTopMethod
-from polhode._scene import Scene
+from polhode._method._base import Record
+from polhode._scene import Scene, State
 
 
 class SymmetricTop(AbstractTopMethod):
@@ -34,7 +35,7 @@ class SymmetricTop(AbstractTopMethod):
 
     chunk: int = eqx.field(static=True, default=2**14)
 
-    def why_not(self, scene, state, record):
+    def why_not(self, scene: Scene, state: State, record: Record) -> str | None:
         refusal = self.objection(scene) or not_symmetric(scene) or axial_wheels(scene)
         if refusal is not None:
             return refusal
@@ -54,7 +55,7 @@ class SymmetricTop(AbstractTopMethod):
                 return "the attitude is elementary only for damping proportional to the moments"
         return None
 
-    def objection(self, scene):
+    def objection(self, scene: Scene) -> str | None:
         return not_linear(scene) or (
             None if scene.inertia.is_principal else "the body axes are not known to be principal"
         )
@@ -113,7 +114,7 @@ class FixedAxis(AbstractTopMethod):
 
     chunk: int = eqx.field(static=True, default=2**14)
 
-    def why_not(self, scene, state, record):
+    def why_not(self, scene: Scene, state: State, record: Record) -> str | None:
         refusal = self.objection(scene)
         if refusal is not None:
             return refusal
@@ -127,7 +128,7 @@ class FixedAxis(AbstractTopMethod):
             return "rates or torques do not lie along one principal axis"
         return None
 
-    def objection(self, scene):
+    def objection(self, scene: Scene) -> str | None:
         if scene.rotors is not None:
             return "rotors turn in the body"
         if not scene.inertia.is_principal:

@@ -32,13 +32,13 @@ class ClosedForm(AbstractExact):
     chunk: int | None = eqx.field(static=True, default=None)
     compensated: bool = eqx.field(static=True, default=False)
 
-    def objection(self, scene):
+    def objection(self, scene: Scene) -> str | None:
         if scene.is_free:
             return None
         acting = (part for part in PARTS[1:] if getattr(scene, part) is not None)
         return f"it solves free bodies only, and the scene has a {' and '.join(acting)}"
 
-    def why_not(self, scene, state, record):
+    def why_not(self, scene: Scene, state: State, record: Record) -> str | None:
         return self.objection(scene)
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:

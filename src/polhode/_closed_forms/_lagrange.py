@@ -16,7 +16,8 @@ from polhode._closed_forms._conditions import (
 )
 from polhode._closed_forms._law import AbstractTopMethod
 from polhode._kernels import kernel
-from polhode._scene import UniformGravity, Wheels
+from polhode._method._base import Record
+from polhode._scene import Scene, State, UniformGravity, Wheels
 
 
 class LagrangeTop(AbstractTopMethod):
@@ -44,7 +45,7 @@ class LagrangeTop(AbstractTopMethod):
             return n
         return max(1, 2**12 // count) if count > 32 else 128
 
-    def why_not(self, scene, state, record):
+    def why_not(self, scene: Scene, state: State, record: Record) -> str | None:
         refusal = self.objection(scene) or not_symmetric(scene) or axial_wheels(scene)
         gravity: Any = scene.potential
         if refusal is not None or gravity.on_axis:
@@ -54,7 +55,7 @@ class LagrangeTop(AbstractTopMethod):
             return "the centre of mass is not known to lie on body z (ph.UniformGravity.axial)"
         return None
 
-    def objection(self, scene):
+    def objection(self, scene: Scene) -> str | None:
         if not isinstance(scene.potential, UniformGravity):
             return "the potential is not uniform gravity"
         if scene.torque is not None:

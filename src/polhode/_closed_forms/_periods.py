@@ -17,7 +17,7 @@ def periods(inertia: Inertia, state: State) -> Periods:
     """P_psi, P_phi [s], mode and nutation limits [rad] of free bodies; fields (...).
 
     ``P_psi``: rotation about (LAM) or oscillation about (SAM) the long axis; ``P_phi``: mean
-    precession of the long axis about the angular momentum; ``mode``: ``ph.free.Mode``; ``k2``: the
+    precession of the long axis about the angular momentum; ``mode``: ``ph.Mode``; ``k2``: the
     elliptic parameter; ``theta_min``, ``theta_max``: angle between long axis and momentum.
     Infinite where there is no such motion. Differentiable. Formulas: Landau & Lifshitz, Mechanics,
     section 37; Samarasinha & A'Hearn, Icarus 93 (1991).

@@ -39,3 +39,7 @@ from polhode._hamiltonian._units import (
     LiePoissonUnits as LiePoissonUnits,
     relative as relative,
 )
+from polhode._hamiltonian.document_000 import (
+    HamiltonianMatrices as HamiltonianMatrices,
+    hamiltonian_matrices as hamiltonian_matrices,
+)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from polhode._checks import ArrayLike, as_float_array, as_vectors
 from polhode._hamiltonian._attitude import Vector, components, cross, from_euler_angles
 from polhode._hamiltonian._energy import EnergyOfAttitude, Hamiltonian, free_hamiltonian
 from polhode._hamiltonian._lie_poisson import Dynamics, spin_rates
@@ -43,8 +44,9 @@ class CanonicalHamiltonian(eqx.Module):
     energy: Hamiltonian
 
     def __call__(
-        self, q: Float[Array, "*#b 3"], p: Float[Array, "*#b 3"], t: Array | float = 0.0
+        self, q: Float[ArrayLike, "*#b 3"], p: Float[ArrayLike, "*#b 3"], t: Array | float = 0.0
     ) -> Float[Array, "*b"]:
+        q, p = as_vectors("q", q), as_vectors("p", p)
         return self.of_components(components(q), components(p), t)
 
     def of_components(self, q: Sequence[Array], p: Sequence[Array], t: Array | float) -> Array:
@@ -68,10 +70,11 @@ def hamiltons_equations(
     """Hamilton's equations of any ``H(q, p, ...)`` by ``jax.grad`` (docs/equations.md: 2, 3).
 
     Returns ``equations(q, p, *args) -> (dq/dt, dp/dt)``; leading batch axes are allowed as long
-    as H treats them one by one.
+    as H treats them one by one. Lists of numbers are taken as arrays.
     """
 
     def equations(q, p, *args):
+        q, p = (as_float_array(n, x) if isinstance(x, list) else x for n, x in (("q", q), ("p", p)))
         slope_q, slope_p = jax.grad(lambda q, p: jnp.sum(H(q, p, *args)), argnums=(0, 1))(q, p)
         return slope_p, jax.tree.map(jnp.negative, slope_q)
 

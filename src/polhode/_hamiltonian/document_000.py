@@ -5,8 +5,13 @@ Nothing here is used to move a body. Arrays: ``moments`` (..., 3) principal mome
 all broadcast. Equation numbers are the document's (docs/equations.md); misprints are corrected.
 """
 
+from typing import NamedTuple
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+
+from polhode._checks import ArrayLike, as_float_array
+from polhode.inertia import Inertia
 
 Vector3 = Float[Array, "*#b 3"]
 Matrix3 = Float[Array, "*b 3 3"]
@@ -195,3 +200,45 @@ def accelerations(moments: Vector3, q: Vector3, qd: Vector3) -> Float[Array, "*b
         - ct / st * lift * h * g
     )
     return jnp.stack(jnp.broadcast_arrays(phi, theta, psi), axis=-1)
+
+
+class HamiltonianMatrices(NamedTuple):
+    """The matrices of the ZYZ Euler-angle Hamiltonian, each (..., 3, 3) and symmetric.
+
+    With momenta p = (p_phi, p_theta, p_psi): H = p . V p / 2, dq/dt = V p,
+    dp_theta/dt = p . Theta p, dp_psi/dt = p . Psi p, and p_phi is constant.
+    """
+
+    V: Float[Array, "*b 3 3"]
+    Theta: Float[Array, "*b 3 3"]
+    Psi: Float[Array, "*b 3 3"]
+
+
+def hamiltonian_matrices(inertia: Inertia, q: ArrayLike) -> HamiltonianMatrices:
+    """Closed forms of the matrices V, Theta and Psi of the free body in ZYZ Euler angles.
+
+    They are an independent reference: polhode integrates the derivatives of ``ph.hamiltonian`` by
+    ``jax.grad`` instead, and the tests compare the two.
+
+    **Arguments:** ``inertia`` (...): about principal axes; ``q`` (..., 3): phi, theta, psi [rad].
+    Entries are infinite or NaN where sin(theta) is 0. V and its derivatives are in 1/(kg m^2).
+
+    Raises TypeError for another kind of inertia, ValueError for one with products of inertia.
+    Reference: docs/equations.md, equations 11, 14 and 15 of the ZYZ Euler-angle Hamiltonian.
+
+        V, Theta, Psi = ph.hamiltonian_matrices(ph.Inertia.from_moments([1, 2, 3]), [0.1, 0.8, 0.3])
+    """
+    if not isinstance(inertia, Inertia):
+        raise TypeError(
+            f"inertia must be a ph.Inertia, got {type(inertia).__name__}: for principal moments,"
+            " ph.Inertia.from_moments([...])."
+        )
+    if not inertia.is_principal:
+        raise ValueError(
+            "the closed forms hold about principal axes, and this inertia has products of inertia:"
+            " use ph.Inertia.from_moments of its principal moments."
+        )
+    moments, q = inertia.diagonal, as_float_array("q", q, (3,)).astype(inertia.dtype)
+    return HamiltonianMatrices(
+        inverse_mass_matrix(moments, q), theta_form(moments, q), psi_form(moments, q)
+    )

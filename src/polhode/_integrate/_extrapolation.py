@@ -96,7 +96,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
     def _fixed_order(self) -> int:
         return 12 if self.formal_order is None else self.formal_order
 
-    def stepping(self, asked) -> Any:
+    def stepping(self, asked: Any) -> Any:
         """How ``ph.LiePoisson`` and ``ph.EulerAngles`` step with it: to each time at once."""
         horizon = jnp.abs(asked.ts[-1] - asked.ts[0])
         accuracy = Accuracy(*jax.lax.stop_gradient((asked.rtol, horizon)))
@@ -105,28 +105,37 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         )
         return asked.marched(solver)
 
-    def bodies_at_once(self, terms, t: Array, y: PyTree, args: PyTree) -> int:
+    def bodies_at_once(self, terms: PyTree, t: Array, y: PyTree, args: PyTree) -> int:
         """Bodies that one solve leads best: where each goes on without regard to others, as many
         as wait for a lane; else as many as there are lanes."""
         dtype = jnp.result_type(*jax.tree.leaves(y))
         return QUEUE if BoundTerm.of(terms, args).prepared(t, y, dtype).by_entry else LANES
 
-    def order(self, terms) -> int:
+    def order(self, terms: PyTree) -> int:
         return self._fixed_order
 
-    def error_order(self, terms) -> int:
+    def error_order(self, terms: PyTree) -> int:
         return self._fixed_order - 1
 
-    def init(self, terms, t0, t1, y0, args) -> PyTree:
+    def init(self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> PyTree:
         leaves = jax.tree.leaves(y0)
         if self.accuracy is not None:
             return fresh(leaves, self.compensated, jnp.zeros_like(t0))
         return [jnp.zeros_like(x) for x in leaves] if self.compensated else []
 
-    def func(self, terms, t0, y0, args) -> PyTree:
+    def func(self, terms: PyTree, t0: Any, y0: PyTree, args: PyTree) -> PyTree:
         return terms.vf(t0, y0, args)
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: PyTree,
+        t0: Any,
+        t1: Any,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: Any,
+    ) -> tuple:
         del made_jump
         if self.accuracy is None:
             return self._one(terms, t0, t1, y0, args, solver_state)

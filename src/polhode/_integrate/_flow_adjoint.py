@@ -11,7 +11,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from polhode._integrate._equations import Equations, equations_of
 from polhode._integrate._one_step import is_one_step, one_step
@@ -47,7 +47,18 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
     parts: int = eqx.field(static=True, default=1)
 
     def loop(
-        self, *, args, terms, solver, stepsize_controller, event, saveat, t0, t1, init_state, **rest
+        self,
+        *,
+        args: PyTree,
+        terms: PyTree,
+        solver: Any,
+        stepsize_controller: Any,
+        event: Any,
+        saveat: Any,
+        t0: Any,
+        t1: Any,
+        init_state: Any,
+        **rest: Any,
     ) -> Any:
         times = _saved_times(saveat, stepsize_controller, event, t0, t1)
         leaves, tree = jax.tree.flatten(init_state.y)

@@ -1,13 +1,13 @@
 """Structure-preserving compositions of the exact flows that a Lie-Poisson system is made of."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from polhode._hamiltonian import cross, dot, from_quaternion
 from polhode._integrate._bound_term import BoundTerm, uses
@@ -16,6 +16,8 @@ from polhode._integrate._equal_steps import EqualSteps
 from polhode._integrate._moser_veselov import ORDERS, paced, prepare, tangents
 from polhode._integrate._schemes import KICK_SCHEMES, SCHEMES, Scheme
 from polhode._kernels import kernel
+from polhode._method._base import Record
+from polhode._scene import Scene
 
 Vector = tuple[Array, Array, Array]
 Quaternion = tuple[Array, Array, Array, Array]
@@ -80,7 +82,7 @@ class Splitting(diffrax.AbstractSolver):
     def scheme(self) -> Scheme:
         return (SCHEMES if self.moser_veselov is None else KICK_SCHEMES)[self.formal_order]
 
-    def check(self, method, scene, record) -> None:
+    def check(self, method: Any, scene: Scene, record: Record) -> None:
         """Raises ValueError, saying what to do, unless it can move the scene as asked."""
         name = "ph.LiePoisson(Splitting(...))"
 
@@ -118,22 +120,31 @@ class Splitting(diffrax.AbstractSolver):
             "moves no wheels with a coupling: use Extrapolation, or leave the method open.",
         )
 
-    def stepping(self, asked):
+    def stepping(self, asked: Any) -> Any:
         """How ``ph.LiePoisson`` steps with it: equal steps from each time to the next."""
         steps = EqualSteps(asked.ts, jnp.abs(jnp.asarray(asked.dt0, asked.ts.dtype)))
         return asked.given(self, steps)
 
-    def order(self, terms) -> int:
+    def order(self, terms: PyTree) -> int:
         return min(self.formal_order, self.moser_veselov or self.formal_order)
 
-    def init(self, terms, t0, t1, y0, args) -> Vector:
+    def init(self, terms: PyTree, t0: Any, t1: Any, y0: PyTree, args: PyTree) -> Vector:
         """The momentum in space axes: from step to step it passes unrounded."""
         return _rotate(y0[1], y0[0])
 
-    def func(self, terms, t0, y0, args) -> tuple[Vector, Quaternion]:
+    def func(self, terms: PyTree, t0: Any, y0: PyTree, args: PyTree) -> tuple[Vector, Quaternion]:
         return terms.vf(t0, y0, args)
 
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+    def step(
+        self,
+        terms: PyTree,
+        t0: Any,
+        t1: Any,
+        y0: PyTree,
+        args: PyTree,
+        solver_state: PyTree,
+        made_jump: Any,
+    ) -> tuple:
         momentum_space = jax.tree.map(
             lambda kept, fresh: jnp.where(made_jump, fresh, kept),
             solver_state,

@@ -319,7 +319,7 @@ def LiePoisson(
     - ``dt0``: first (or constant) step [s], negative backwards; None: chosen. For ``Splitting``,
       which has no error estimate, the longest step: equal ones lead from each time to the next.
     - ``max_steps``: of each body, or of bodies that share their steps.
-    - ``adjoint``: None: ``ph.solvers.FlowAdjoint()``, the derivatives of the exact flow, in forward
+    - ``adjoint``: None: ``ph.FlowAdjoint()``, the derivatives of the exact flow, in forward
       and reverse mode; or an adjoint of diffrax, for the derivative of the steps (for bodies that
       drag stops within the time simulated).
     - ``progress_meter``: as in diffrax.

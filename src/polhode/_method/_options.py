@@ -43,13 +43,13 @@ def check_options(
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "adjoint=diffrax.BacksolveAdjoint() finds the way back by integrating it, which misses"
-            " rtol, and cannot reach the scene's numbers: use ph.solvers.FlowAdjoint() (the"
+            " rtol, and cannot reach the scene's numbers: use ph.FlowAdjoint() (the"
             " default), diffrax.RecursiveCheckpointAdjoint(), or diffrax.ForwardMode() for jax.jvp."
         )
     if isinstance(getattr(solver, "term_structure", None), tuple):
         raise ValueError(
             f"{type(solver).__name__} splits positions from momenta, whose rates here depend on"
-            " both: use another solver; ph.solvers.Splitting() keeps a structure too."
+            " both: use another solver; ph.Splitting() keeps a structure too."
         )
     if dt0 is not None:
         step = as_float_array("dt0", dt0)

@@ -2,6 +2,8 @@
 
 import enum
 
+from jaxtyping import Array
+
 
 class Status(enum.IntEnum):
     """Outcome per body, as stored in ``Trajectory.status``."""
@@ -59,6 +61,6 @@ _EXPLANATIONS = {
 class SimulationError(RuntimeError):
     """Some bodies did not finish; ``status`` (the batch's shape) tells which and why."""
 
-    def __init__(self, message: str, status):
+    def __init__(self, message: str, status: Array):
         super().__init__(message)
         self.status = status

@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._checks import as_number, as_positive
+from polhode._checks import ArrayLike, as_number, as_positive
 from polhode._hamiltonian import Attitude
 from polhode._parts import AbstractPart, Signature, shaped, terms_of
 from polhode._scene._torques import stacked
@@ -67,10 +67,12 @@ class ViscousCoupling(AbstractCoupling):
 
     c: Float[Array, "*#b"] = shaped()
 
-    def __init__(self, c):
+    def __init__(self, c: ArrayLike):
         self.c = _not_negative("ViscousCoupling c", c)
 
-    def torque(self, t, speed, attitude, omega):
+    def torque(
+        self, t: Array | float, speed: Array, attitude: Attitude, omega: Sequence[Array]
+    ) -> Array:
         return -self.c * speed
 
 
@@ -86,11 +88,13 @@ class CoulombFriction(AbstractCoupling):
     size: Float[Array, "*#b"] = shaped()
     speed: Float[Array, "*#b"] = shaped()
 
-    def __init__(self, torque, speed):
+    def __init__(self, torque: ArrayLike, speed: ArrayLike):
         self.size = _not_negative("CoulombFriction torque", torque)
         self.speed = as_positive("CoulombFriction speed", speed, hint="it smooths the step")
 
-    def torque(self, t, speed, attitude, omega):
+    def torque(
+        self, t: Array | float, speed: Array, attitude: Attitude, omega: Sequence[Array]
+    ) -> Array:
         return -self.size * jnp.tanh(speed / self.speed)
 
 
@@ -122,7 +126,12 @@ class Motor(AbstractCoupling):
     most_torque: Float[Array, "*#b"] | None = shaped()
     most_speed: Float[Array, "*#b"] | None = shaped()
 
-    def __init__(self, command, most_torque=None, most_speed=None):
+    def __init__(
+        self,
+        command: ArrayLike | Callable,
+        most_torque: ArrayLike | None = None,
+        most_speed: ArrayLike | None = None,
+    ):
         if callable(command):
             self.command = _COMMAND.checked(command)
         else:
@@ -132,7 +141,9 @@ class Motor(AbstractCoupling):
         if most_speed is not None and most_torque is None:
             raise ValueError("Motor most_speed needs most_torque, the torque that falls with it.")
 
-    def torque(self, t, speed, attitude, omega):
+    def torque(
+        self, t: Array | float, speed: Array, attitude: Attitude, omega: Sequence[Array]
+    ) -> Array:
         wanted = self.command
         if callable(wanted):
             given = t, stacked(attitude.wxyz), stacked(omega), speed

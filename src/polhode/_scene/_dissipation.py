@@ -22,8 +22,8 @@ from collections.abc import Callable, Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._checks import as_positive
-from polhode._hamiltonian import Vector, cross, triple
+from polhode._checks import ArrayLike, as_positive
+from polhode._hamiltonian import Attitude, Vector, cross, triple
 from polhode._parts import Signature, shaped
 from polhode._scene._torques import AbstractTorque, stacked
 
@@ -56,16 +56,18 @@ class EnergySink(AbstractTorque):
 
     k: Float[Array, "*#b"] | Callable = shaped()
 
-    def __init__(self, k):
+    def __init__(self, k: ArrayLike):
         if callable(k):
             self.k = _RATE_LAW.checked(k)
             return
         self.k = as_positive("EnergySink k", k, zero=True, hint="a positive k takes energy away")
 
-    def body_components(self, t, attitude, omega):
-        return (jnp.zeros_like(omega[0]),) * 3  # nothing acts from outside
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
+        return triple([jnp.zeros_like(omega[0])] * 3)  # nothing acts from outside
 
-    def slip(self, t, momentum: Sequence[Array], omega: Sequence[Array]) -> Vector:
+    def slip(self, t: Array | float, momentum: Sequence[Array], omega: Sequence[Array]) -> Vector:
         rate = self.k
         if callable(rate):
             rate = _RATE_LAW.mapped(rate, stacked(momentum), stacked(omega))

@@ -1,16 +1,16 @@
 """The frame that goes along with an orbit, and torques in it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from polhode import rotation
 from polhode._batch import along_time
-from polhode._checks import as_float_array
-from polhode._hamiltonian import Attitude, components
+from polhode._checks import ArrayLike, as_float_array
+from polhode._hamiltonian import Attitude, Vector, components
 from polhode._parts import AbstractPart, shaped
 from polhode._scene._orbit import AbstractConic, AbstractOrbit
 from polhode._scene._torques import AbstractTorque, stacked, vector_of_time
@@ -37,7 +37,7 @@ class LVLH(AbstractPart):
 
     orbit: AbstractOrbit | Callable = shaped(3)
 
-    def __init__(self, orbit):
+    def __init__(self, orbit: AbstractOrbit | Callable):
         if not callable(orbit):
             raise TypeError(
                 "LVLH takes an orbit (ph.KeplerOrbit, ph.StateOrbit) or a function of time, got"
@@ -97,7 +97,7 @@ class LVLH(AbstractPart):
         turned = omega + rotation.rotate(rotation.conjugate(wxyz), rates)
         return rotation.multiply(frame, wxyz), turned
 
-    def yaw_pitch_roll(self, trajectory) -> tuple[Array, Array, Array]:
+    def yaw_pitch_roll(self, trajectory: Any) -> tuple[Array, Array, Array]:
         """Angles ZYX [rad] of a trajectory's body axes in the frame, each (..., T)."""
         frame = self
         if isinstance(self.orbit, AbstractOrbit):  # which may be one for each body
@@ -149,7 +149,9 @@ class RelativeTorque(AbstractTorque):
             )
         self.torque, self.frame = torque, frame
 
-    def body_components(self, t, attitude: Attitude, omega):
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
         *axes, rates = self.frame.axes(jnp.asarray(t, omega[0].dtype))
 
         def quaternion():  # dear, and asked for by few
@@ -166,11 +168,13 @@ class RelativeTorque(AbstractTorque):
         )
 
     @property
-    def edges(self):
+    def edges(self) -> Array | None:
         return self.torque.edges
 
-    def during(self, t):
+    def during(self, t: Array | float) -> AbstractTorque:
         return RelativeTorque(self.torque.during(t), self.frame)
 
-    def slip(self, t, momentum, omega):
+    def slip(
+        self, t: Array | float, momentum: Sequence[Array], omega: Sequence[Array]
+    ) -> Vector | None:
         return self.torque.slip(t, momentum, omega)

@@ -1,6 +1,6 @@
 """Ready-made control: pointing and rate damping, a magnetic dipole in a field."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._checks import as_float_array, as_number, is_concrete, require
-from polhode._hamiltonian import components, cross
+from polhode._checks import ArrayLike, as_float_array, as_number, is_concrete, require
+from polhode._hamiltonian import Attitude, components, cross, triple
 from polhode._parts import AbstractPart, Signature, shaped
 from polhode._scene._torques import AbstractTorque, coefficients, stacked, value_at, vector_of_time
 
@@ -32,7 +32,7 @@ class Pointing(AbstractTorque):
     kd: Float[Array, "*#b 3"] = shaped(3)
     target: Float[Array, "*#b 4"] = shaped(4)
 
-    def __init__(self, kp, kd, target=(1.0, 0.0, 0.0, 0.0)):
+    def __init__(self, kp: ArrayLike, kd: ArrayLike, target: ArrayLike = (1.0, 0.0, 0.0, 0.0)):
         self.kp, self.kd = coefficients("Pointing kp", kp), coefficients("Pointing kd", kd)
         wanted = as_float_array("Pointing target", target, (4,))
         if is_concrete(wanted):
@@ -42,7 +42,9 @@ class Pointing(AbstractTorque):
             )
         self.target = rotation.normalise(wanted)
 
-    def body_components(self, t, attitude, omega):
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
         a, *b = (self.target[..., i] for i in range(4))
         w, *v = attitude.wxyz
         scalar = a * w + b[0] * v[0] + b[1] * v[1] + b[2] * v[2]
@@ -50,7 +52,7 @@ class Pointing(AbstractTorque):
         sign = 2 * jnp.where(scalar < 0, -1, 1).astype(w.dtype)
         error = (sign * (a * y - w * x - z) for x, y, z in zip(b, v, turned))
         kp, kd = components(self.kp), components(self.kd)
-        return tuple(-p * e - d * rate for p, d, e, rate in zip(kp, kd, error, omega))
+        return triple(-p * e - d * rate for p, d, e, rate in zip(kp, kd, error, omega))
 
 
 class RateDamping(AbstractTorque):
@@ -63,13 +65,15 @@ class RateDamping(AbstractTorque):
     c: Float[Array, "*#b 3"] = shaped(3)
     rates: Float[Array, "*#b 3"] = shaped(3)
 
-    def __init__(self, c, rates=(0.0, 0.0, 0.0)):
+    def __init__(self, c: ArrayLike, rates: ArrayLike = (0.0, 0.0, 0.0)):
         self.c = coefficients("RateDamping c", c)
         self.rates = as_float_array("RateDamping rates", rates, (3,))
 
-    def body_components(self, t, attitude, omega):
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
         pairs = zip(components(self.c), omega, components(self.rates))
-        return tuple(-c * (rate - wanted) for c, rate, wanted in pairs)
+        return triple(-c * (rate - wanted) for c, rate, wanted in pairs)
 
 
 _FIELD = Signature("MagneticDipole field", {"position": (3,), "t": ()}, (3,))
@@ -97,14 +101,21 @@ class MagneticDipole(AbstractTorque):
     field: Float[Array, "*#b 3"] | Callable = shaped(3)
     position: Float[Array, "*#b 3"] | Callable | AbstractPart = shaped(3)
 
-    def __init__(self, moment, field, position=(0.0, 0.0, 0.0)):
+    def __init__(
+        self,
+        moment: ArrayLike | Callable,
+        field: ArrayLike | Callable,
+        position: ArrayLike | Callable = (0.0, 0.0, 0.0),
+    ):
         self.moment, self.field = (
             law.checked(given) if callable(given) else as_float_array(law.name, given, (3,))
             for law, given in ((_MOMENT, moment), (_FIELD, field))
         )
         self.position = vector_of_time("MagneticDipole position", position)
 
-    def body_components(self, t, attitude, omega):
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
         field, moment = self.field, self.moment
         if callable(field):
             place = stacked(value_at("MagneticDipole position", self.position, t))
@@ -126,11 +137,11 @@ class BDot(eqx.Module):
     k: Array
     most: Array | None
 
-    def __init__(self, k, most=None):
+    def __init__(self, k: ArrayLike, most: ArrayLike | None = None):
         self.k = as_number("BDot k", k)
         self.most = None if most is None else as_number("BDot most", most)
 
-    def __call__(self, t, omega_body, field_body):
+    def __call__(self, t: Array | float, omega_body: Array, field_body: Array) -> Array:
         moment = self.k * jnp.cross(omega_body, field_body)
         return moment if self.most is None else jnp.clip(moment, -self.most, self.most)
 
@@ -144,10 +155,10 @@ class DipoleField(eqx.Module):
 
     moment: Array
 
-    def __init__(self, moment):
+    def __init__(self, moment: ArrayLike):
         self.moment = as_float_array("DipoleField moment", moment, (3,))
 
-    def __call__(self, position, t):
+    def __call__(self, position: Array, t: Array | float) -> Array:
         size = jnp.sqrt(jnp.sum(position * position))
         n = position / size
         return 1e-7 * (3 * n * jnp.sum(n * self.moment) - self.moment) / size**3

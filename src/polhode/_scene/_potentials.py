@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import (
+    ArrayLike,
     as_float_array,
     as_number,
     as_positive,
@@ -88,11 +89,11 @@ class UniformGravity(AbstractPotential):
 
     def __init__(
         self,
-        mass,
-        centre_body,
-        gravity_space=(0.0, 0.0, -9.80665),
-        on_axis=False,
-        vertical=False,
+        mass: ArrayLike,
+        centre_body: ArrayLike,
+        gravity_space: ArrayLike = (0.0, 0.0, -9.80665),
+        on_axis: bool = False,
+        vertical: bool = False,
     ):
         self.mass = as_positive("mass", mass, zero=True, hint="give it in kg")
         self.centre_body = as_float_array("centre_body", centre_body, (3,))
@@ -115,7 +116,9 @@ class UniformGravity(AbstractPotential):
             )
 
     @classmethod
-    def axial(cls, mass, distance, gravity_space=(0.0, 0.0, -9.80665)) -> "UniformGravity":
+    def axial(
+        cls, mass: ArrayLike, distance: ArrayLike, gravity_space: ArrayLike = (0.0, 0.0, -9.80665)
+    ) -> "UniformGravity":
         """A centre of mass on body z, ``distance`` (...) [m] from the fixed point.
 
         With ``Inertia.axisymmetric`` this is Lagrange's top by construction: the exact motion is
@@ -126,13 +129,13 @@ class UniformGravity(AbstractPotential):
         return cls(mass, jnp.stack([zero, zero, distance], axis=-1), gravity_space, True)
 
     @property
-    def is_as_declared(self):
+    def is_as_declared(self) -> Any:
         return _on_z(
             self.centre_body if self.on_axis else None,
             self.gravity_space if self.vertical else None,
         )
 
-    def declared_anew(self):
+    def declared_anew(self) -> "UniformGravity":
         return UniformGravity(self.mass, self.centre_body, self.gravity_space)
 
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array:
@@ -169,7 +172,7 @@ class GravityGradient(AbstractPotential):
     position_space: Float[Array, "*#b 3"] | Callable = shaped(3)
     vertical: bool = eqx.field(static=True, default=False)
 
-    def __init__(self, mu, position_space, vertical=False):
+    def __init__(self, mu: ArrayLike, position_space: ArrayLike | Callable, vertical: bool = False):
         self.mu = as_positive("mu", mu, zero=True, hint="give it in m^3/s^2")
         self.vertical = bool(vertical)
         if callable(position_space):
@@ -192,10 +195,10 @@ class GravityGradient(AbstractPotential):
                 )
 
     @property
-    def is_as_declared(self):
+    def is_as_declared(self) -> Any:
         return _on_z(self.position_space if self.vertical else None)
 
-    def declared_anew(self):
+    def declared_anew(self) -> "GravityGradient":
         return GravityGradient(self.mu, self.position_space)
 
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array:

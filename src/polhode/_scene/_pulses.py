@@ -1,11 +1,14 @@
 """Torques that act for a while: thrusters and their like, whose edges no step misses."""
 
+from collections.abc import Sequence
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, is_concrete, require
+from polhode._checks import ArrayLike, as_float_array, is_concrete, require
+from polhode._hamiltonian import Attitude, Vector, triple
 from polhode._parts import shaped
 from polhode._scene._torques import AbstractTorque
 
@@ -31,7 +34,7 @@ class Pulses(AbstractTorque):
     on: Array | None
     torque: AbstractTorque = shaped()
 
-    def __init__(self, torque, starts, ends):
+    def __init__(self, torque: AbstractTorque, starts: ArrayLike, ends: ArrayLike):
         if not isinstance(torque, AbstractTorque):
             raise TypeError(
                 "Pulses takes a torque such as ph.BodyTorque([0., 0., 1.]), got"
@@ -54,12 +57,12 @@ class Pulses(AbstractTorque):
             )
 
     @property
-    def edges(self):
+    def edges(self) -> Array | None:
         inner = self.torque.edges
         own = [self.starts, self.ends] + ([] if inner is None else [inner])
         return jnp.concatenate(own)
 
-    def during(self, t):
+    def during(self, t: Array | float) -> AbstractTorque:
         inner = eqx.tree_at(lambda p: p.torque, self, self.torque.during(t))
         return eqx.tree_at(lambda p: p.on, inner, self._acts(t), is_leaf=lambda x: x is None)
 
@@ -72,10 +75,14 @@ class Pulses(AbstractTorque):
         among = (starts <= t[..., None]) & (t[..., None] < ends)
         return jnp.where(jnp.any(among, axis=-1), 1, 0).astype(self.starts.dtype)
 
-    def body_components(self, t, attitude, omega):
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
         on = self._acts(t)
-        return tuple(on * x for x in self.torque.body_components(t, attitude, omega))
+        return triple(on * x for x in self.torque.body_components(t, attitude, omega))
 
-    def slip(self, t, momentum, omega):
+    def slip(
+        self, t: Array | float, momentum: Sequence[Array], omega: Sequence[Array]
+    ) -> Vector | None:
         found = self.torque.slip(t, momentum, omega)
-        return None if found is None else tuple(self._acts(t) * x for x in found)
+        return None if found is None else triple(self._acts(t) * x for x in found)

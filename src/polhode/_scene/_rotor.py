@@ -8,7 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, as_number, is_concrete, require, require_positive
+from polhode._checks import (
+    ArrayLike,
+    as_float_array,
+    as_number,
+    is_concrete,
+    require,
+    require_positive,
+)
 from polhode._parts import shaped
 from polhode._scene._couplings import AbstractCoupling
 from polhode._scene._rotors import IMPULSE, AbstractRotor
@@ -45,13 +52,13 @@ class Rotor(AbstractRotor):
 
     def __init__(
         self,
-        axis_body,
-        inertia=None,
-        momentum=None,
-        speed=None,
-        torque=None,
-        impulse=None,
-        coupling=None,
+        axis_body: ArrayLike,
+        inertia: ArrayLike | None = None,
+        momentum: ArrayLike | None = None,
+        speed: ArrayLike | None = None,
+        torque: ArrayLike | None = None,
+        impulse: Callable | None = None,
+        coupling: AbstractCoupling | None = None,
     ):
         axis = as_float_array("axis_body", axis_body, (3,))
         self.along = None
@@ -107,10 +114,10 @@ class Rotor(AbstractRotor):
         return self.torque is None and self.impulse is None and self.coupling is None
 
     @property
-    def wheels(self):
+    def wheels(self) -> tuple["Rotor", ...]:
         return (self,)
 
-    def declared_anew(self):
+    def declared_anew(self) -> "Rotor":
         return Rotor(
             self.axis_body, self.inertia, self.momentum, self.speed, self.torque, self.impulse,
             self.coupling,

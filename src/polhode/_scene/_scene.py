@@ -14,6 +14,7 @@ from polhode._checks import is_concrete, together
 from polhode._hamiltonian import Dynamics, Hamiltonian, inverse_inertia, lie_poisson_field
 from polhode._scene._potentials import AbstractPotential
 from polhode._scene._rotors import AbstractRotor, Wheels
+from polhode._scene._state import State
 from polhode._scene._torques import AbstractTorque
 from polhode.inertia import Inertia
 
@@ -57,7 +58,7 @@ class Scene(eqx.Module):
         """Whether nothing acts on the body and nothing turns in it (static)."""
         return self.potential is None and self.torque is None and self.rotors is None
 
-    def settled(self, state, start: Array | np.ndarray) -> "Scene":
+    def settled(self, state: State, start: Array | np.ndarray) -> "Scene":
         """The scene with the motion of its wheels fixed by the state at the time ``start``."""
         if self.rotors is None:
             return self

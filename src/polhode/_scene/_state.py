@@ -1,12 +1,14 @@
 """The state of a rotating body: attitude and body rates."""
 
+from typing import Protocol
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._checks import as_float_array, is_concrete, require
+from polhode._checks import ArrayLike, as_float_array, is_concrete, require
 from polhode._hamiltonian import (
     canonical_from_momentum,
     components,
@@ -15,6 +17,12 @@ from polhode._hamiltonian import (
 )
 from polhode._parts import AbstractPart, shaped
 from polhode.inertia import Inertia
+
+
+class SciPyRotation(Protocol):
+    """What ``State`` needs of a ``scipy.spatial.transform.Rotation``."""
+
+    def as_quat(self) -> np.ndarray: ...
 
 
 class State(AbstractPart):
@@ -30,7 +38,7 @@ class State(AbstractPart):
     wxyz: Float[Array, "*#b 4"] = shaped(4)
     omega_body: Float[Array, "*#b 3"] = shaped(3)
 
-    def __init__(self, wxyz, omega_body):
+    def __init__(self, wxyz: ArrayLike | SciPyRotation, omega_body: ArrayLike):
         if hasattr(wxyz, "as_quat"):
             wxyz = rotation.scipy_to_wxyz(wxyz, getattr(omega_body, "dtype", None))
         quaternion = as_float_array("wxyz", wxyz, (4,))
@@ -46,7 +54,15 @@ class State(AbstractPart):
         self.omega_body = rates
 
     @classmethod
-    def from_euler(cls, phi, theta, psi, rates=None, momenta=None, inertia=None) -> "State":
+    def from_euler(
+        cls,
+        phi: ArrayLike,
+        theta: ArrayLike,
+        psi: ArrayLike,
+        rates: ArrayLike | None = None,
+        momenta: ArrayLike | None = None,
+        inertia: Inertia | None = None,
+    ) -> "State":
         """State from ZYZ Euler angles [rad] and their rates or canonical momenta.
 
         ``phi, theta, psi`` (...); exactly one of ``rates`` (..., 3) = d(phi, theta, psi)/dt

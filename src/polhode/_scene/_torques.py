@@ -7,8 +7,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, require_positive
-from polhode._hamiltonian import Attitude, Vector, components
+from polhode._checks import ArrayLike, as_float_array, require_positive
+from polhode._hamiltonian import Attitude, Vector, components, triple
 from polhode._parts import AbstractPart, Signature, shaped, terms_of
 
 
@@ -105,10 +105,12 @@ class BodyTorque(AbstractTorque):
 
     n: Float[Array, "*#b 3"] | Callable = shaped(3)
 
-    def __init__(self, n):
+    def __init__(self, n: ArrayLike | Callable):
         self.n = vector_of_time("BodyTorque", n)
 
-    def body_components(self, t, attitude, omega):
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
         return value_at("BodyTorque", self.n, t)
 
 
@@ -120,10 +122,12 @@ class SpaceTorque(AbstractTorque):
 
     n: Float[Array, "*#b 3"] | Callable = shaped(3)
 
-    def __init__(self, n):
+    def __init__(self, n: ArrayLike | Callable):
         self.n = vector_of_time("SpaceTorque", n)
 
-    def body_components(self, t, attitude, omega):
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
         return attitude.to_body(value_at("SpaceTorque", self.n, t))
 
 
@@ -145,11 +149,13 @@ class LinearDamping(AbstractTorque):
 
     c: Float[Array, "*#b 3"] = shaped(3)
 
-    def __init__(self, c):
+    def __init__(self, c: ArrayLike):
         self.c = coefficients("LinearDamping", c)
 
-    def body_components(self, t, attitude, omega):
-        return tuple(-c * rate for c, rate in zip(components(self.c), omega))
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
+        return triple(-c * rate for c, rate in zip(components(self.c), omega))
 
 
 class QuadraticDamping(AbstractTorque):
@@ -160,14 +166,16 @@ class QuadraticDamping(AbstractTorque):
 
     c: Float[Array, "*#b 3"] = shaped(3)
 
-    def __init__(self, c):
+    def __init__(self, c: ArrayLike):
         self.c = coefficients("QuadraticDamping", c)
 
-    def body_components(self, t, attitude, omega):
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
         square = omega[0] ** 2 + omega[1] ** 2 + omega[2] ** 2
         turning = square > 0  # the slope of the root is infinite at rest, that of the torque is 0
         size = jnp.where(turning, jnp.sqrt(jnp.where(turning, square, 1)), 0)
-        return tuple(-c * size * rate for c, rate in zip(components(self.c), omega))
+        return triple(-c * size * rate for c, rate in zip(components(self.c), omega))
 
 
 _FEEDBACK = Signature("FeedbackTorque", {"t": (), "wxyz": (4,), "omega_body": (3,)}, (3,))
@@ -188,6 +196,8 @@ class FeedbackTorque(AbstractTorque):
     def __init__(self, fn: Callable):
         self.fn = _FEEDBACK.checked(fn)
 
-    def body_components(self, t, attitude, omega):
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
         given = t, stacked(attitude.wxyz), stacked(omega)
         return components(_FEEDBACK.mapped(self.fn, *given))

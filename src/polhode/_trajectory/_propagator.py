@@ -6,11 +6,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from polhode import rotation
 from polhode._batch import PARTS, flatten, lane_times, map_arrays
-from polhode._checks import as_float_array
+from polhode._checks import ArrayLike, as_float_array
 from polhode._method import AbstractMethod, Record, Status, raise_on_failure
 from polhode._scene import Scene, State, Wheels
 from polhode._trajectory._trajectory import AbstractPropagator, Trajectory

@@ -10,11 +10,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
 from polhode import rotation
 from polhode._batch import PARTS, along_time, map_arrays
-from polhode._checks import is_concrete
+from polhode._checks import ArrayLike, is_concrete
 from polhode._hamiltonian import components, from_quaternion
 from polhode._method import Status
 from polhode._scene import Scene, State, Wheels

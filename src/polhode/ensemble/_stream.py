@@ -8,8 +8,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
 
+from polhode._checks import ArrayLike
 from polhode._method import AbstractMethod
 from polhode.ensemble import _layout
 from polhode.ensemble._ensemble import Ensemble

@@ -47,7 +47,7 @@ def _solver(file: SceneFile, name: str) -> diffrax.AbstractSolver:
     if name not in known:
         raise SceneFileError(
             file.path, "[method] solver", "unknown solver", name,
-            "the name of a solver of diffrax or ph.solvers, such as Dopri8",
+            "the name of a solver of diffrax or polhode, such as Dopri8",
             suggestion(name, tuple(known)),
         )  # fmt: skip
     try:

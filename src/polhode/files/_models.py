@@ -103,9 +103,7 @@ class Times(Table):
 
 class Method(Table):
     kind: Annotated[str, choice(("auto", "closed-form", "lie-poisson", "euler-angles"))] = "auto"
-    solver: Text | None = Field(
-        default=None, description="a solver of diffrax or ph.solvers"
-    )
+    solver: Text | None = Field(default=None, description="a solver of diffrax or polhode")
     rtol: Annotated[float, TOLERANCE] | None = None
     step: Annotated[float, POSITIVE] | None = Field(default=None, description="constant step [s]")
 

@@ -6,9 +6,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, as_vectors, is_concrete, require
+from polhode._checks import ArrayLike, as_float_array, as_vectors, is_concrete, require
 from polhode._parts import Signature, kept, takes
 from polhode._trajectory import Trajectory
 from polhode.frames._interpolation import SampledAttitude
@@ -217,7 +217,7 @@ class RotatingFrame(eqx.Module):
 
     # --- transformations, both ways (docs/equations.md, 003: 4-19) -----------------------
 
-    def position_to_space(self, t: Time, position: Vector, *, wxyz=None) -> Vector:
+    def position_to_space(self, t: Time, position: Vector, *, wxyz: ArrayLike = None) -> Vector:
         """Space position [m] of a point at frame ``position``. ``wxyz``: the attitude, if known."""
         turned = self._turned(t, position, wxyz)
         return turned if self.origin is None else _sum(turned, self._origin(t)[0])
@@ -229,7 +229,7 @@ class RotatingFrame(eqx.Module):
         return self._turned_back(t, position_space)
 
     def velocity_to_space(
-        self, t: Time, position: Vector, velocity: Vector, *, wxyz=None
+        self, t: Time, position: Vector, velocity: Vector, *, wxyz: ArrayLike = None
     ) -> Vector:
         """Space velocity [m/s] of a point with frame position and velocity (003: 8)."""
         carried = _sum(velocity, _cross(self.omega_body(t), position))
@@ -296,7 +296,7 @@ class RotatingFrame(eqx.Module):
         return turning if slope is None else _sum(turning, -_cross(slope, position))
 
     def apparent_acceleration(
-        self, t: Time, position: Vector, velocity: Vector | None = None, *, wxyz=None
+        self, t: Time, position: Vector, velocity: Vector | None = None, *, wxyz: ArrayLike = None
     ) -> Vector:
         """All apparent forces per unit mass [m/s^2], of a particle at rest without ``velocity``.
 

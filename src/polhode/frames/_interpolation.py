@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from polhode._checks import ArrayLike, as_float_array
 from polhode.rotation import (
     conjugate,
     multiply,
@@ -51,10 +52,15 @@ class SampledAttitude(eqx.Module):
     start_slope: Float[Array, "t-1 3 3"]
     end_slope: Float[Array, "t-1 3 3"]
 
-    def __init__(self, ts, wxyz, omega_body, angular_acceleration):
+    def __init__(
+        self, ts: ArrayLike, wxyz: ArrayLike, omega_body: ArrayLike, angular_acceleration: ArrayLike
+    ):
         """Samples (T,), (T, 4), (T, 3), (T, 3); less than half a turn from one to the next."""
-        self.ts, self.wxyz = ts, wxyz
-        slopes = _slopes(ts, wxyz, omega_body, angular_acceleration)
+        self.ts = as_float_array("ts", ts, (None,))
+        self.wxyz = as_float_array("wxyz", wxyz, (None, 4))
+        rates = as_float_array("omega_body", omega_body, (None, 3))
+        acceleration = as_float_array("angular_acceleration", angular_acceleration, (None, 3))
+        slopes = _slopes(self.ts, self.wxyz, rates, acceleration)
         self.start_slope, self.end_slope = slopes
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, "4"]:

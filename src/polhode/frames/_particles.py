@@ -7,9 +7,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, is_concrete, require_positive
+from polhode._checks import ArrayLike, as_float_array, is_concrete, require_positive
 from polhode._method import check_options, check_rtol, check_times
 from polhode._parts import kept, result_of, takes
 from polhode.frames._frame import RotatingFrame

@@ -2,9 +2,9 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array
+from polhode._checks import ArrayLike, as_float_array
 from polhode._trajectory import Trajectory
 from polhode.rotation import conjugate, rotate
 

@@ -1,14 +1,15 @@
 """The inertia of a rigid body about a fixed point or its centre of mass, in body axes."""
 
-from typing import Self
+from typing import Any, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Bool, Float
 
 from polhode._checks import (
+    ArrayLike,
     as_float_array,
     as_floats,
     as_vectors,
@@ -203,7 +204,7 @@ class Inertia(AbstractShaped, AbstractPart):
         return self.moments.shape[:-1] if self.full is None else self.full.shape[:-2]
 
     @property
-    def dtype(self):
+    def dtype(self) -> Any:
         """Floating dtype of the numbers."""
         return jax.tree.leaves(self)[0].dtype
 

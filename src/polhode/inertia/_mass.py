@@ -6,9 +6,16 @@ from typing import Self
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, as_floats, is_concrete, require, require_positive
+from polhode._checks import (
+    ArrayLike,
+    as_float_array,
+    as_floats,
+    is_concrete,
+    require,
+    require_positive,
+)
 from polhode.inertia._cholesky import (
     inertia_of_second_moments,
     pseudo_from_log_cholesky,

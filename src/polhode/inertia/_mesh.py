@@ -6,9 +6,9 @@ from os.path import isfile
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
 
-from polhode._checks import as_float_array, imported, is_concrete, require
+from polhode._checks import ArrayLike, as_float_array, imported, is_concrete, require
 
 
 def as_triangles(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, np.ndarray]:

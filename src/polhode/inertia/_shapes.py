@@ -11,9 +11,9 @@ from typing import Any, Self
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
-from polhode._checks import as_floats, require_positive
+from polhode._checks import ArrayLike, as_floats, require_positive
 from polhode.inertia._input import require_below
 
 

@@ -1,8 +1,10 @@
 """What ``polhode lightcurve FILE`` does."""
 
 import json
+from collections.abc import Callable
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,7 +15,7 @@ from polhode.lightcurve._read import read_light_curve
 from polhode.lightcurve._solutions import Fit
 
 
-def figure(fit: Fit, *, number: int = 0, title: str = ""):
+def figure(fit: Fit, *, number: int = 0, title: str = "") -> Any:
     """Data over solution ``number``, residuals, map of poles: a matplotlib figure."""
     from polhode.lightcurve._figure import figure as draw
 
@@ -57,7 +59,7 @@ def run(
     highest: float | None = None,
     floor: float = 0.03,
     seed: int = 0,
-    say=print,
+    say: Callable = print,
 ) -> Fit | None:
     """Read, fit, say the table, and write the figure and a JSON file beside each other.
 

@@ -1,11 +1,13 @@
 """A light curve: times, magnitudes, who saw them, and where Sun and observer stood."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
+from polhode._checks import ArrayLike
 from polhode.lightcurve._model import Points
 from polhode.lightcurve._scattering import seeliger_sphere
 
@@ -34,9 +36,19 @@ class LightCurve(NamedTuple):
 
     @classmethod
     def of(
-        cls, t, magnitude, sun=None, observer=None, *, sigma=0.0, group=None, calibrated=False,
-        at_body=False, reduced=False, notes=(),
-    ) -> "LightCurve":  # fmt: skip
+        cls,
+        t: ArrayLike,
+        magnitude: ArrayLike,
+        sun: ArrayLike | None = None,
+        observer: ArrayLike | None = None,
+        *,
+        sigma: ArrayLike = 0.0,
+        group: ArrayLike | Sequence[str] | None = None,
+        calibrated: bool = False,
+        at_body: bool = False,
+        reduced: bool = False,
+        notes: Sequence[str] = (),
+    ) -> "LightCurve":
         """Check and reduce observations.
 
         ``t`` (n,) [day]; ``magnitude`` (n,); ``sun``, ``observer`` (n, 3): vectors from the body

@@ -30,7 +30,7 @@ class SeeligerPhase(AbstractPhase):
 
     typical: ClassVar[tuple[float, ...]] = ()
 
-    def magnitudes(self, alpha, coefficients):
+    def magnitudes(self, alpha: Array, coefficients: Array) -> Array:
         return -2.5 * jnp.log10(seeliger_sphere(alpha))
 
 
@@ -39,7 +39,7 @@ class LinearPhase(AbstractPhase):
 
     typical: ClassVar[tuple[float, ...]] = (0.033,)
 
-    def magnitudes(self, alpha, coefficients):
+    def magnitudes(self, alpha: Array, coefficients: Array) -> Array:
         return coefficients[..., 0] * alpha * (180 / math.pi)
 
 
@@ -48,7 +48,7 @@ class HG(AbstractPhase):
 
     typical: ClassVar[tuple[float, ...]] = (0.15,)
 
-    def magnitudes(self, alpha, coefficients):
+    def magnitudes(self, alpha: Array, coefficients: Array) -> Array:
         slope = coefficients[..., 0]
         first, second = (_bowell(alpha, *k) for k in _BOWELL)
         return -2.5 * jnp.log10((1 - slope) * first + slope * second)
@@ -63,7 +63,7 @@ class HG1G2(AbstractPhase):
 
     typical: ClassVar[tuple[float, ...]] = (0.26, 0.38)
 
-    def magnitudes(self, alpha, coefficients):
+    def magnitudes(self, alpha: Array, coefficients: Array) -> Array:
         first, second = coefficients[..., 0], coefficients[..., 1]
         a, b, c = hg1g2_basis(alpha)
         return -2.5 * jnp.log10(first * a + second * b + (1 - first - second) * c)

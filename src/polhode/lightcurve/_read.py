@@ -12,7 +12,9 @@ _TIME = ("jd", "time", "t", "mjd", "bjd")
 _VECTORS = tuple(f"{body}_{c}" for body in ("sun", "observer") for c in "xyz")
 
 
-def read_light_curve(path: str | PathLike[str], vectors: str | PathLike[str] | None = None):
+def read_light_curve(
+    path: str | PathLike[str], vectors: str | PathLike[str] | None = None
+) -> LightCurve:
     """A ``LightCurve`` from a file, whose kind is told by its contents.
 
     CSV: columns ``jd`` (or ``time``, ``t``; days), ``magnitude`` (``mag``) or ``flux``

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from polhode._checks import ArrayLike
 from polhode.inertia._mesh import check_mesh
 from polhode.lightcurve._scattering import facets
 
@@ -24,7 +25,7 @@ class Convex(NamedTuple):
     areas: Float[Array, "*b f"]
 
     @classmethod
-    def from_mesh(cls, vertices, faces) -> "Convex":
+    def from_mesh(cls, vertices: ArrayLike, faces: ArrayLike) -> "Convex":
         """A closed triangle mesh (v, 3), (f, 3); what it hides from itself is not accounted for."""
         vertices, faces = check_mesh(vertices, faces)
         a, b, c = (vertices[faces[:, k]] for k in range(3))
@@ -64,7 +65,14 @@ class Convex(NamedTuple):
         rest = self.areas @ self.normals
         return jnp.sqrt(jnp.sum(rest * rest, axis=-1)) / jnp.sum(self.areas, axis=-1)
 
-    def brightness(self, sun, observer, *, lambert=0.0, seeliger=1.0) -> Scalars:
+    def brightness(
+        self,
+        sun: Array,
+        observer: Array,
+        *,
+        lambert: Array | float = 0.0,
+        seeliger: Array | float = 1.0,
+    ) -> Scalars:
         """Of bodies lit and seen from directions (..., 3) in body axes: see `facets`."""
         return facets(self.normals, self.areas, sun, observer, lambert, seeliger)
 

@@ -2,6 +2,7 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +29,7 @@ def animate(
     seconds: float = 8.0,
     dpi: int = 100,
     scale: Scale | None = None,
-):
+) -> Any:
     """Animate bodies as the boxes of the same inertia; returns matplotlib's `FuncAnimation`.
 
     Every body is drawn as the homogeneous box with its moments, each in its own panel (up to 64

@@ -12,7 +12,7 @@ _LEVELS = {"68 %": 2.2957, "95 %": 5.9915}
 
 
 @styled
-def fit(result: Any, recording: Any, *, body: int = 0, title: str = ""):
+def fit(result: Any, recording: Any, *, body: int = 0, title: str = "") -> Any:
     """Figure of a ``fit.InertiaFit`` and the ``fit.Recording`` it was made from; returns it.
 
     Left: rates of the first recording (dots) over the fitted motion, or over what the readings

@@ -1,5 +1,7 @@
 """The herpolhode: the curve of the angular velocity in the invariable plane of space."""
 
+from typing import Any
+
 import numpy as np
 
 from polhode._trajectory import Trajectory
@@ -10,8 +12,12 @@ from polhode.plot._scale import Scale
 
 @styled
 def herpolhode(
-    what: Trajectory | Samples, *, body: int | None = None, ax=None, scale: Scale | None = None
-):
+    what: Trajectory | Samples,
+    *,
+    body: int | None = None,
+    ax: Any = None,
+    scale: Scale | None = None,
+) -> Any:
     """Draw the angular velocity's trace in the plane normal to the angular momentum; Axes.
 
     The plane is normal to the angular momentum at the first time, its first direction that of the

@@ -1,5 +1,7 @@
 """Rates, attitude and conserved quantities against time."""
 
+from typing import Any
+
 import numpy as np
 
 from polhode._trajectory import Trajectory
@@ -15,7 +17,7 @@ def history(
     body: int | None = None,
     scale: Scale | None = None,
     axis_names: tuple[str, str, str] = ("x", "y", "z"),
-):
+) -> Any:
     """Stacked panels of one body: rates, attitude, drift of energy and momentum; the Figure.
 
     The attitude is shown as the quaternion `wxyz`. The drift is |E/E0 - 1| and |L - L0|/|L0| with L

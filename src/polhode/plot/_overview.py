@@ -1,5 +1,7 @@
 """One figure of a whole scene: body axes and rates against time, observations, polhode."""
 
+from typing import Any
+
 import numpy as np
 
 from polhode._trajectory import Trajectory
@@ -19,7 +21,7 @@ def overview(
     scale: Scale | None = None,
     axis_names: tuple[str, str, str] = ("x", "y", "z"),
     title: str = "",
-):
+) -> Any:
     """Figure of the first body, with the spread of the others and observations; returns it.
 
     Left: the three body axes as directions in space (components along space x, y, z) and the body

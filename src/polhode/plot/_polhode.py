@@ -1,5 +1,7 @@
 """The polhode: the curve of the angular velocity on the inertia ellipsoid."""
 
+from typing import Any
+
 import numpy as np
 
 from polhode._trajectory import Trajectory
@@ -14,11 +16,11 @@ def polhode(
     what: Trajectory | Samples,
     *,
     body: int | None = None,
-    ax=None,
+    ax: Any = None,
     family: int = 7,
     axis_names: tuple[str, str, str] = ("x", "y", "z"),
     view: tuple[float, float] | None = None,
-):
+) -> Any:
     """Draw the polhode of one body on its inertia ellipsoid; returns the 3-D Axes.
 
     The ellipsoid is that of constant kinetic energy at the first time, in the space of body rates,

@@ -3,8 +3,9 @@
 import dataclasses
 
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
 
+from polhode._checks import ArrayLike
 from polhode._trajectory import Trajectory
 from polhode.inertia import Inertia
 from polhode.rotation import matrix_row

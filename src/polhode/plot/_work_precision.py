@@ -1,10 +1,11 @@
 """Error against run time of several methods."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
-from jaxtyping import ArrayLike
 
+from polhode._checks import ArrayLike
 from polhode.plot._matplotlib import GREY, INK, new_figure, styled
 
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#7A5195", "#5D4E37")
@@ -15,11 +16,11 @@ _MARKERS = "osD^vP*X"
 def work_precision(
     curves: Mapping[str, tuple[ArrayLike, ArrayLike]],
     *,
-    ax=None,
+    ax: Any = None,
     time_label: str = "run time [s]",
     error_label: str = "error",
     highlight: str | None = None,
-):
+) -> Any:
     """Draw error (down is better) against run time (left is better) per method; returns the Axes.
 
     `curves`: name -> (errors, times), one entry per tolerance or step size. `highlight`: the name
@@ -31,7 +32,7 @@ def work_precision(
     if ax is None:
         ax = new_figure(6.4, 4.6).add_subplot()
     for index, (name, (errors, times)) in enumerate(curves.items()):
-        errors, times = np.atleast_1d(errors).astype(float), np.atleast_1d(times).astype(float)
+        errors, times = (np.atleast_1d(np.asarray(x, float)) for x in (errors, times))
         if errors.shape != times.shape or errors.ndim != 1:
             raise ValueError(
                 f"curve {name!r}: errors and times must be lists of one length, got shapes "

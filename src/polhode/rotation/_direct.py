@@ -6,8 +6,9 @@ All angles are in rad; ``sequence`` defaults to ZYZ.
 """
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
+from polhode._checks import ArrayLike
 from polhode.rotation._euler import euler_to_wxyz, wxyz_to_euler
 from polhode.rotation._matrix import matrix_to_wxyz, wxyz_to_matrix
 from polhode.rotation._modified_rodrigues import (

@@ -8,9 +8,9 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from polhode._checks import as_floats
+from polhode._checks import ArrayLike, as_floats
 from polhode.rotation._input import as_quaternions, check_sequence
 from polhode.rotation._scalar import length
 from polhode.rotation._sequence import Sequence

@@ -6,8 +6,10 @@ import jax
 import jax.core
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float
 
+from polhode._checks import ArrayLike
 from polhode.rotation._input import as_quaternions, as_vectors
 
 if TYPE_CHECKING:
@@ -43,7 +45,7 @@ def wxyz_to_scipy(wxyz: Float[ArrayLike, "*b 4"]) -> "Rotation":
     return Rotation.from_quat(xyzw if xyzw.ndim == 1 else xyzw.reshape(-1, 4))
 
 
-def scipy_to_wxyz(rotation: "Rotation", dtype=None) -> Float[Array, "*b 4"]:
+def scipy_to_wxyz(rotation: "Rotation", dtype: DTypeLike | None = None) -> Float[Array, "*b 4"]:
     """Quaternions, scalar first, of SciPy's ``Rotation``; ``dtype`` defaults to JAX's float."""
     if not hasattr(rotation, "as_quat"):
         raise TypeError(

@@ -2,8 +2,9 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
+from polhode._checks import ArrayLike
 from polhode.rotation._components import matrix_row
 from polhode.rotation._input import as_matrices, as_quaternions
 from polhode.rotation._quaternion import canonical

@@ -6,8 +6,9 @@ Two sets describe each rotation, one for each sign of the quaternion: one of len
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
+from polhode._checks import ArrayLike
 from polhode.rotation._input import as_quaternions, as_vectors
 from polhode.rotation._quaternion import canonical
 from polhode.rotation._scalar import length

@@ -8,13 +8,15 @@ from functools import reduce
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jax.typing import DTypeLike
+from jaxtyping import Array, Float
 
+from polhode._checks import ArrayLike
 from polhode.rotation._input import as_quaternions, as_vectors
 from polhode.rotation._scalar import length
 
 
-def identity(shape: tuple[int, ...] = (), dtype=None) -> Float[Array, "*b 4"]:
+def identity(shape: tuple[int, ...] = (), dtype: DTypeLike | None = None) -> Float[Array, "*b 4"]:
     """Quaternions of no rotation, of leading shape ``shape``."""
     return jnp.zeros((*shape, 4), dtype or jnp.result_type(float)).at[..., 0].set(1)
 

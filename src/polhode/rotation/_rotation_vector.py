@@ -1,8 +1,9 @@
 """Rotation vectors (axis times angle) and axis-angle pairs (docs/equations.md, 002)."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
+from polhode._checks import ArrayLike
 from polhode.rotation._input import as_axes, as_quaternions, as_vectors
 from polhode.rotation._quaternion import canonical
 from polhode.rotation._scalar import arc_ratio, cosine, direction, length, sine_ratio

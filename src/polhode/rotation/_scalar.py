@@ -9,7 +9,9 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
+
+from polhode._checks import ArrayLike
 
 
 def _dot(left: Array, right: Array) -> Array:

@@ -3,7 +3,9 @@
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
+
+from polhode._checks import ArrayLike
 
 
 def as_floats(*values: ArrayLike) -> tuple[Array, ...]:

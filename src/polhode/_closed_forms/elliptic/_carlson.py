@@ -6,8 +6,9 @@ Source: Carlson (1995), Numer. Algorithms 10, 13; NIST DLMF 19.16, 19.20, 19.26,
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
 
+from polhode._checks import ArrayLike
 from polhode._closed_forms.elliptic._argument import as_floats, broadcast
 from polhode._closed_forms.elliptic._partials import with_forward_partials
 

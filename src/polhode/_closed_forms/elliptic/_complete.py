@@ -3,8 +3,9 @@
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
 
+from polhode._checks import ArrayLike
 from polhode._closed_forms.elliptic._argument import as_floats, parameter_pair
 from polhode._closed_forms.elliptic._nome import HALF_PI, Nome, nome, period_parts
 

@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
 
+from polhode._checks import ArrayLike
 from polhode._closed_forms.elliptic._argument import as_floats, parameter_pair
 from polhode._closed_forms.elliptic._complete import associate_b_of, associate_d_of, second_kind
 from polhode._closed_forms.elliptic._nome import Nome, nome, period_parts

@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Float
 
+from polhode._checks import ArrayLike
 from polhode._closed_forms.elliptic._argument import as_floats, broadcast, parameter_pair
 from polhode._closed_forms.elliptic._carlson import rc_core, rf_rj_core
 from polhode._closed_forms.elliptic._complete import first_kind

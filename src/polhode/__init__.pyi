@@ -1,31 +1,60 @@
-"""The public names of polhode, imported together when the first of them is asked for."""
+"""The public names of polhode: the lazy import, the reference and type checkers read this list.
 
-from polhode import _integrate, rotation as rotation
-from polhode._closed_forms import (
+Signatures and annotations stand at the definitions. The order is that of the reference.
+"""
+
+# Simulation
+# Namespaces
+from . import (
+    ensemble as ensemble,
+    files as files,
+    fit as fit,
+    frames as frames,
+    inertia as inertia,
+    lightcurve as lightcurve,
+    plot as plot,
+    rotation as rotation,
+)
+from ._closed_forms import (
     ClosedForm as ClosedForm,
     FixedAxis as FixedAxis,
     LagrangeTop as LagrangeTop,
+    Mode as Mode,
+    Periods as Periods,
     SymmetricTop as SymmetricTop,
-    elliptic as elliptic,
-    free as free,
     periods as periods,
 )
-from polhode._closed_forms.free import Mode as Mode, Periods as Periods
-from polhode._events import Crossings as Crossings, Event as Event, crossings as crossings
-from polhode._hamiltonian import (
+from ._events import Crossings as Crossings, Event as Event, crossings as crossings
+
+# The Hamiltonian
+from ._hamiltonian import (
+    HamiltonianMatrices as HamiltonianMatrices,
     hamiltonian as hamiltonian,
+    hamiltonian_matrices as hamiltonian_matrices,
     hamiltons_equations as hamiltons_equations,
 )
-from polhode._integrate import EulerAngles as EulerAngles, LiePoisson as LiePoisson
-from polhode._method import (
+from ._integrate import (
+    EulerAngles as EulerAngles,
+    Extrapolation as Extrapolation,
+    FlowAdjoint as FlowAdjoint,
+    LiePoisson as LiePoisson,
+    Splitting as Splitting,
+)
+
+# Methods
+from ._method import (
     AbstractMethod as AbstractMethod,
     Record as Record,
     SimulationError as SimulationError,
     Status as Status,
 )
-from polhode._plan import Plan as Plan, choose as choose
-from polhode._propagate import Propagation as Propagation, propagate as propagate
-from polhode._scene import (
+from ._plan import Plan as Plan
+from ._propagate import Propagation as Propagation, propagate as propagate
+
+# Potentials and orbits
+# Torques and control
+# Wheels
+from ._scene import (
     LVLH as LVLH,
     AbstractCoupling as AbstractCoupling,
     AbstractOrbit as AbstractOrbit,
@@ -57,19 +86,22 @@ from polhode._scene import (
     UniformGravity as UniformGravity,
     ViscousCoupling as ViscousCoupling,
 )
-from polhode._simulate import explain as explain, simulate as simulate
-from polhode._trajectory import Trajectory as Trajectory
-from polhode.fit import (
+from ._simulate import explain as explain, simulate as simulate
+from ._trajectory import Trajectory as Trajectory
+from .fit import (
     fit_inertia as fit_inertia,
     fit_recordings as fit_recordings,
     fit_scene as fit_scene,
 )
-from polhode.frames import (
+
+# Frames, sensors and fits
+from .frames import (
     RotatingFrame as RotatingFrame,
     accelerometer as accelerometer,
     gyroscope as gyroscope,
-    simulate_particles as simulate_particles,
 )
-from polhode.inertia import Inertia as Inertia, MassProperties as MassProperties
 
-solvers = _integrate
+# Bodies
+from .inertia import Inertia as Inertia, MassProperties as MassProperties
+
+__version__: str
