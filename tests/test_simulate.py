@@ -81,9 +81,9 @@ def test_samples_are_as_accurate_as_steps():
 
 def test_record_keeps_what_is_asked():
     rates = ph.simulate(free(), STATE, TS, METHOD, record=ph.Record(attitude=False))
-    assert rates.wxyz is None
+    assert rates._wxyz is None
     assert rates.energy.shape == (5,)
-    with pytest.raises(ValueError, match="holds no wxyz"):
+    with pytest.raises(ValueError, match="no wxyz"):
         rates.euler()
     last = ph.simulate(free(), STATE, TS, METHOD, record=ph.Record(final_only=True))
     assert last.wxyz.shape == (1, 4)

@@ -18,7 +18,9 @@ def pages() -> dict[str, str]:
     """Module name and code of every page with Python examples."""
     sources = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
     blocks = {
-        path.stem.lower(): re.findall(r"^```python\n(.*?)^```", path.read_text("utf-8"), re.S | re.M)
+        path.stem.lower(): re.findall(
+            r"^```python\n(.*?)^```", path.read_text("utf-8"), re.S | re.M
+        )
         for path in sources
     }
     return {name: "\n".join(code) for name, code in blocks.items() if code}

@@ -9,13 +9,13 @@ Compiled programs are kept apart from scenes, by what is static in their argumen
 that differ in numbers share them.
 """
 
-import dataclasses
 import math
 import weakref
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from jax.core import Tracer
@@ -40,8 +40,13 @@ program."""
 
 
 _TIMED = (
-    ("ts", -1), ("wxyz", -2), ("omega_body", -2), ("work", -1), ("motor_work", -2), ("spins", -2),
-)  # fmt: skip
+    ("ts", -1),
+    ("_wxyz", -2),
+    ("_omega_body", -2),
+    ("_work", -1),
+    ("_motor_work", -2),
+    ("_spins", -2),
+)
 """Fields of a trajectory with samples, the times first, and the axis of time."""
 
 
@@ -106,7 +111,7 @@ def _program(run: Callable, method: AbstractMethod, tree: Any, record: Record) -
         scene = jax.tree.unflatten(tree, leaves)
         found = run(method, scene, State(wxyz, omega), ts, rtol, record)
         if scene.rotors is None:  # whose motion the initial state decides
-            found = dataclasses.replace(found, scene=_HERE)
+            found = eqx.tree_at(lambda t: t.scene, found, _HERE)
         flat, structure = jax.tree.flatten(found)
         shape[:] = [structure]
         place[:] = [next((i for i, x in enumerate(flat) if x is _HERE), None)]

@@ -170,7 +170,7 @@ def _trajectory(method, scene, state, ts, rtol, record, split=None, in_order=Fal
     )
     if record.work and method.exact:
         work = _work_of_exact(trajectory, state, ts[..., :1])
-        return eqx.tree_at(lambda t: t.work, trajectory, work, is_leaf=lambda x: x is None)
+        return eqx.tree_at(lambda t: t._work, trajectory, work, is_leaf=lambda x: x is None)
     return trajectory
 
 

@@ -63,7 +63,7 @@ def loss(scene_of, p):
     record = ph.Record(work=scene_of is driven)
     rtol = 1e-12 if ts.dtype == jnp.float64 else 2e-6
     end = ph.simulate(scene, state, ts, METHODS[scene_of.__name__], rtol=rtol, record=record)
-    work = 0 if end.work is None else jnp.sum(end.work)
+    work = 0 if end._work is None else jnp.sum(end.work)
     return jnp.sum(end.wxyz[:, 1:, 1] ** 2) + jnp.sum(jnp.sin(end.omega_body)) + 0.1 * work
 
 

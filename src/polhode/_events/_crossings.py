@@ -89,7 +89,7 @@ def crossings(
     room = at_least("most", most, 1)
     looks = event.samples if samples is None else at_least("samples", samples, 2)
     for name in ("wxyz", "omega_body"):
-        trajectory._need(name)
+        getattr(trajectory, name)  # raises where it was not recorded
     if trajectory.propagator is None:
         raise ValueError("this trajectory was made by hand: use one that ph.simulate returns.")
     if looks is None:
@@ -146,7 +146,7 @@ def _turned(trajectory: Trajectory) -> Array:
 def turning_rates(trajectory: Trajectory) -> Array:
     """The most (..., T) that a body may turn at, by its momentum at each sample [rad/s]."""
     carrier = trajectory._scene.carrier
-    size = jnp.linalg.norm(carrier.momentum(trajectory._need("omega_body")), axis=-1)
+    size = jnp.linalg.norm(carrier.momentum(trajectory.omega_body), axis=-1)
     return size / jnp.min(carrier.moments, axis=-1)
 
 

@@ -45,7 +45,7 @@ class Event(eqx.Module):
 
     def values(self, trajectory: Trajectory) -> tuple[Array, Array]:
         """The function and its rate of change [1/s] at every sample (..., T)."""
-        wxyz, omega = trajectory._need("wxyz"), trajectory._need("omega_body")
+        wxyz, omega = trajectory.wxyz, trajectory.omega_body
         t = jnp.broadcast_to(trajectory._t, omega.shape[:-1])
         slopes = (
             rotation.wxyz_rate(wxyz, omega),

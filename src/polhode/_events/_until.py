@@ -75,7 +75,7 @@ def _of_lanes(begin: Trajectory) -> Trajectory:
     parts = {name: flatten(getattr(begin.scene, name), batch) for name in PARTS}
     samples = (
         None if x is None else x.reshape(n, *x.shape[len(batch) :])
-        for x in (begin.wxyz, begin.omega_body, begin.spins)
+        for x in (begin._wxyz, begin._omega_body, begin._spins)
     )
     wxyz, omega, spins = samples
     return Trajectory(

@@ -56,7 +56,7 @@ class EnergySink(AbstractTorque):
 
     k: Float[Array, "*#b"] | Callable = shaped()
 
-    def __init__(self, k: ArrayLike):
+    def __init__(self, k: ArrayLike | Callable):
         if callable(k):
             self.k = _RATE_LAW.checked(k)
             return

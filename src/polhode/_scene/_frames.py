@@ -102,9 +102,7 @@ class LVLH(AbstractPart):
         frame = self
         if isinstance(self.orbit, AbstractOrbit):  # which may be one for each body
             frame = LVLH(along_time(self.orbit, len(trajectory.batch_shape)))
-        wxyz, _ = frame.to_frame(
-            trajectory._need("wxyz"), trajectory._need("omega_body"), trajectory._t
-        )
+        wxyz, _ = frame.to_frame(trajectory.wxyz, trajectory.omega_body, trajectory._t)
         return rotation.wxyz_to_euler(wxyz, rotation.Sequence.ZYX)
 
     def _given(self, wxyz, omega_body, t):

@@ -16,7 +16,7 @@ from polhode._method import Status
 def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
     """See ``Trajectory.to_xarray``."""
     xarray = imported("to_xarray", "xarray")
-    rank, wxyz, omega = len(trajectory.batch_shape), trajectory.wxyz, trajectory.omega_body
+    rank, wxyz, omega = len(trajectory.batch_shape), trajectory._wxyz, trajectory._omega_body
     batch = ("body",) if rank == 1 else tuple(f"batch_{i}" for i in range(rank))
     shared = trajectory.ts.ndim == 1
     time = ("time",) if shared else (*batch, "time")
@@ -35,9 +35,9 @@ def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
     if omega is not None and wxyz is not None:
         momentum = "angular momentum in space axes"
         put("momentum_space", trajectory.momentum_space, vectors, "kg m2 s-1", momentum)
-    put("work", trajectory.work, every, "J", "work done by the external torques")
-    put("error", trajectory.error, batch, "rad", "estimated error at the last time")
-    put("event_time", trajectory.event_time, batch, "s", "time of the event that ended the motion")
+    put("work", trajectory._work, every, "J", "work done by the external torques")
+    put("error", trajectory._error, batch, "rad", "estimated error at the last time")
+    put("event_time", trajectory._event_time, batch, "s", "time of the event that ended the motion")
     data["status"] = (
         batch,
         np.asarray(trajectory.status, np.int8),
@@ -108,7 +108,7 @@ def write_aem(
     created = str(_instant("creation_date", now if creation_date is None else creation_date))
     if time_system not in _TIME_SYSTEMS:
         raise ValueError(f"time_system must be one of {', '.join(_TIME_SYSTEMS)}: {time_system!r}.")
-    wxyz = np.asarray(trajectory._need("wxyz"), np.float64)
+    wxyz = np.asarray(trajectory.wxyz, np.float64)
     count, samples = int(np.prod(wxyz.shape[:-2], dtype=int)), wxyz.shape[-2]
     names = _each("object_name", object_name, count)
     identities = _each("object_id", object_id, count)
@@ -117,7 +117,7 @@ def write_aem(
         fixed | ({} if center_name is None else {"center_name": center_name})
     ).items():
         _text(name, value)
-    omega = np.asarray(trajectory._need("omega_body"), np.float64) if rates else wxyz[..., :0]
+    omega = np.asarray(trajectory.omega_body, np.float64) if rates else wxyz[..., :0]
     ts = np.broadcast_to(np.asarray(trajectory.ts, np.float64), wxyz.shape[:-1])
     lines = ["CCSDS_AEM_VERS = 2.0", f"CREATION_DATE = {created}", f"ORIGINATOR = {originator}"]
     for k in range(count):

@@ -47,36 +47,99 @@ class AbstractPropagator(eqx.Module):
 class Trajectory(eqx.Module):
     """Samples of the motion; leading axes (...) are the batch, then T times.
 
-    **Fields:** ``ts`` (T,) or (..., T) [s]; ``wxyz`` (..., T, 4) body -> space, or None when not
-    recorded; ``omega_body`` (..., T, 3) [rad/s], or None; ``status`` (...): ``ph.Status`` per
-    body; ``steps`` (...): solver steps (0 for an exact solution); ``scene``, the motion of its
-    rotors fixed by the initial state; ``work`` (..., T) [J]: done from outside since the first
-    time, by external torques, potentials that change with time (also orbits) and the motors of
-    wheels, so that ``energy - work`` is constant, or None (``Record(work=True)``); ``error`` (...)
-    [rad]: estimated error of the attitude at the last time, or None (``Record(error=True)``;
-    without attitude that of the rates, relative); ``motor_work`` (..., T, m) [J]: the part of
-    ``work`` that motor and friction of each wheel have done, or None without ``work`` or such;
-    ``spins`` (..., T, k) [kg m^2/s]: momenta of the wheels with a coupling, or None;
-    ``propagator``: method and tolerance, for ``at``;
-    ``event_time`` (...) [s]: of the event that ``ph.simulate(..., until=)`` stopped at, inf for a
-    body that did not meet it, or None.
+    **Attributes:** ``ts`` (T,) or (..., T) [s]; ``wxyz`` (..., T, 4) body -> space; ``omega_body``
+    (..., T, 3) [rad/s]; ``status`` (...): ``ph.Status`` of each body; ``steps`` (...): steps of the
+    solver (0 for a closed form); ``scene``, with the motion of its wheels fixed by the initial
+    state; ``propagator``: method and tolerance, for ``at``. On request: ``work``, ``motor_work``,
+    ``error`` (see ``ph.Record``) and ``event_time`` (``until=``). With coupled wheels: ``spins``.
+    What was not recorded raises ValueError, which says how to record it.
 
     Between the samples: ``traj.at(t)``. Indexed, a trajectory is an array of shape (..., T) of
     samples: ``traj[i]`` is a body of a batch, ``traj[..., ::10]`` every tenth sample.
     """
 
     ts: Float[Array, "*t"]
-    wxyz: Float[Array, "*b t 4"] | None
-    omega_body: Float[Array, "*b t 3"] | None
+    _wxyz: Float[Array, "*b t 4"] | None
+    _omega_body: Float[Array, "*b t 3"] | None
     status: Int[Array, "*b"]
     steps: Int[Array, "*b"]
     scene: Scene
-    work: Float[Array, "*b t"] | None = None
-    error: Float[Array, "*b"] | None = None
-    motor_work: Float[Array, "*b t m"] | None = None
-    spins: Float[Array, "*b t k"] | None = None
-    propagator: AbstractPropagator | None = None
-    event_time: Float[Array, "*b"] | None = None
+    _work: Float[Array, "*b t"] | None
+    _error: Float[Array, "*b"] | None
+    _motor_work: Float[Array, "*b t m"] | None
+    _spins: Float[Array, "*b t k"] | None
+    propagator: AbstractPropagator | None
+    _event_time: Float[Array, "*b"] | None
+
+    def __init__(
+        self,
+        ts: Array,
+        wxyz: Array | None,
+        omega_body: Array | None,
+        status: Array,
+        steps: Array,
+        scene: Scene,
+        work: Array | None = None,
+        error: Array | None = None,
+        motor_work: Array | None = None,
+        spins: Array | None = None,
+        propagator: AbstractPropagator | None = None,
+        event_time: Array | None = None,
+    ):
+        self.ts, self.status, self.steps, self.scene = ts, status, steps, scene
+        self._wxyz, self._omega_body = wxyz, omega_body
+        self._work, self._error, self._motor_work = work, error, motor_work
+        self._spins, self.propagator, self._event_time = spins, propagator, event_time
+
+    @property
+    def wxyz(self) -> Float[Array, "*b t 4"]:
+        """Attitudes (..., T, 4), body -> space, scalar first."""
+        return self._recorded("wxyz", "record=ph.Record(attitude=True), the default")
+
+    @property
+    def omega_body(self) -> Float[Array, "*b t 3"]:
+        """Body rates (..., T, 3) [rad/s]."""
+        return self._recorded("omega_body", "record=ph.Record(rates=True), the default")
+
+    @property
+    def work(self) -> Float[Array, "*b t"]:
+        """Work (..., T) [J] done from outside since the first time.
+
+        It includes external torques, potentials that change with time (also orbits) and the motors
+        of wheels, so that ``energy - work`` is constant.
+        """
+        return self._recorded("work", "record=ph.Record(work=True)")
+
+    @property
+    def error(self) -> Float[Array, "*b"]:
+        """Estimated error (...) [rad] of the attitude at the last time.
+
+        Without attitude it is the error of the rates, relative to their size.
+        """
+        return self._recorded("error", "record=ph.Record(error=True)")
+
+    @property
+    def motor_work(self) -> Float[Array, "*b t m"]:
+        """The part (..., T, m) [J] of ``work`` that motor and friction of each wheel have done."""
+        return self._recorded("motor_work", "record=ph.Record(work=True) and wheels that turn")
+
+    @property
+    def spins(self) -> Float[Array, "*b t k"]:
+        """Momenta (..., T, k) [kg m^2/s] of the wheels with a coupling."""
+        return self._recorded("spins", "a scene with wheels that have a coupling")
+
+    @property
+    def event_time(self) -> Float[Array, "*b"]:
+        """Time (...) [s] of the event that ended the motion; inf for a body without one."""
+        return self._recorded("event_time", "until=ph.Event(...)")
+
+    def _recorded(self, name: str, request: str) -> Array:
+        value = getattr(self, f"_{name}")
+        if value is None:
+            raise ValueError(
+                f"this trajectory has no {name}: ph.simulate records it with {request}."
+            )
+        return value
 
     def at(self, t: Float[ArrayLike, "*#b k"]) -> "Trajectory":
         """The motion at other times ``t`` [s]: a trajectory of the same bodies at these.
@@ -94,8 +157,7 @@ class Trajectory(eqx.Module):
             traj = ph.simulate(scene, state, [0.0, 10.0])
             traj.at(jnp.linspace(0, 10, 501)).energy
         """
-        for name in ("wxyz", "omega_body"):
-            self._need(name)
+        _ = self.wxyz, self.omega_body  # both must have been recorded
         if self.propagator is None:
             raise ValueError(
                 "this trajectory was made by hand, without a method to move it by: use one that"
@@ -110,7 +172,7 @@ class Trajectory(eqx.Module):
     @property
     def first(self) -> State:
         """The state (...) at the first sample."""
-        return State(*_sample(self._need("wxyz"), self._need("omega_body"), 0))
+        return State(*_sample(self.wxyz, self.omega_body, 0))
 
     @property
     def last(self) -> State:
@@ -118,7 +180,7 @@ class Trajectory(eqx.Module):
 
         It holds attitude and rates; the speeds of wheels are ``wheel_speed[..., -1, :]``.
         """
-        return State(*_sample(self._need("wxyz"), self._need("omega_body"), -1))
+        return State(*_sample(self.wxyz, self.omega_body, -1))
 
     def __getitem__(self, key: Any) -> "Trajectory":
         """Bodies and samples chosen as from an array of shape (..., T), body axes first.
@@ -148,11 +210,11 @@ class Trajectory(eqx.Module):
 
         parts = {name: map_arrays(getattr(self.scene, name), of_bodies) for name in PARTS}
         return Trajectory(
-            of_both(self.ts, 1), of_both(self.wxyz, 2), of_both(self.omega_body, 2),
+            of_both(self.ts, 1), of_both(self._wxyz, 2), of_both(self._omega_body, 2),
             of_bodies(self.status, 0), of_bodies(self.steps, 0), Scene(**parts),
-            of_both(self.work, 1), of_bodies(self.error, 0), of_both(self.motor_work, 2),
-            of_both(self.spins, 2), self.propagator,
-            of_bodies(self.event_time, 0),
+            of_both(self._work, 1), of_bodies(self._error, 0), of_both(self._motor_work, 2),
+            of_both(self._spins, 2), self.propagator,
+            of_bodies(self._event_time, 0),
         )  # fmt: skip
 
     def between(self, start: float, end: float) -> "Trajectory":
@@ -185,34 +247,25 @@ class Trajectory(eqx.Module):
         """Which bodies finished, (...) of bool."""
         return self.status == Status.SUCCESSFUL
 
-    def _need(self, name: str) -> Array:
-        value = getattr(self, name)
-        if value is None:
-            raise ValueError(
-                f"this trajectory holds no {name}: ask for it with"
-                " record=ph.Record(attitude=True, rates=True) in ph.simulate."
-            )
-        return value
-
     def _compiled(self, of: Callable[["Trajectory"], Any]) -> Any:
         """What ``of`` makes of this trajectory, in one program that other records of it share."""
         bare = Trajectory(
-            self.ts, self.wxyz, self.omega_body, self.status, self.steps, self.scene,
-            spins=self.spins,
+            self.ts, self._wxyz, self._omega_body, self.status, self.steps, self.scene,
+            spins=self._spins,
         )  # fmt: skip
         return _derived(of, bare)
 
     @property
     def _samples(self) -> list[Array]:
         """Attitude, rates and momenta of coupled wheels (..., T, n), as far as there are such."""
-        return [x for x in (self.wxyz, self.omega_body, self.spins) if x is not None]
+        return [x for x in (self._wxyz, self._omega_body, self._spins) if x is not None]
 
     @property
     def _scene(self) -> Scene:
         """The scene with arrays shaped to broadcast against (..., T) samples."""
         rank = len(self.batch_shape)
         parts = {name: along_time(getattr(self.scene, name), rank) for name in PARTS}
-        spins = () if self.spins is None else tuple(jnp.moveaxis(self.spins, -1, 0))
+        spins = () if self._spins is None else tuple(jnp.moveaxis(self._spins, -1, 0))
         return Scene(**parts).with_spins(spins)
 
     @property
@@ -222,24 +275,25 @@ class Trajectory(eqx.Module):
     @property
     def momentum_body(self) -> Float[Array, "*b t 3"]:
         """Angular momentum in body axes, that of rotors included [kg m^2/s]."""
-        self._need("omega_body")
+        _ = self.omega_body  # must have been recorded
         return self._compiled(_momentum_body)
 
     @property
     def momentum_space(self) -> Float[Array, "*b t 3"]:
         """Angular momentum in space axes [kg m^2/s]."""
-        return rotation.rotate(self._need("wxyz"), self.momentum_body)
+        return rotation.rotate(self.wxyz, self.momentum_body)
 
     @property
-    def wheel_speed(self) -> Float[Array, "*b t m"] | None:
-        """Speed of each wheel relative to the body [rad/s]; None without wheels.
+    def wheel_speed(self) -> Float[Array, "*b t m"]:
+        """Speed of each wheel relative to the body (..., T, m) [rad/s].
 
-        NaN for a wheel that is held at a momentum, its inertia not given.
+        NaN for a wheel that is held at a momentum, its inertia not given. Raises ValueError for a
+        scene without wheels.
         """
         wheels = self._scene.rotors
         if not isinstance(wheels, Wheels):
-            return None
-        omega = components(self._need("omega_body"))
+            raise ValueError("this trajectory has no wheel_speed: its scene has no wheels.")
+        omega = components(self.omega_body)
         speeds = [wheels.speed(i, self._t, omega) for i in range(len(wheels.held))]
         shape = omega[0].shape
         return jnp.stack([jnp.broadcast_to(x, shape) for x in speeds], axis=-1)
@@ -252,9 +306,9 @@ class Trajectory(eqx.Module):
         their speed it is the energy of the body turning with them locked, which is what then stays
         constant. It changes by ``work`` and by nothing else (but a potential that jumps in time).
         """
-        self._need("omega_body")
+        _ = self.omega_body  # must have been recorded
         if self.scene.potential is not None:
-            self._need("wxyz")
+            _ = self.wxyz
         return self._compiled(_energy)
 
     def euler(
@@ -268,7 +322,7 @@ class Trajectory(eqx.Module):
         """
         if isinstance(sequence, str):
             sequence = rotation.Sequence.of(sequence)
-        return rotation.wxyz_to_euler(self._need("wxyz"), sequence)
+        return rotation.wxyz_to_euler(self.wxyz, sequence)
 
     def to_scipy(self) -> "Rotation":
         """The attitudes, body -> space, as one SciPy ``Rotation`` of all samples.
@@ -276,7 +330,7 @@ class Trajectory(eqx.Module):
         In the order of ``wxyz`` with its leading axes flattened. The other way: ``ph.State`` takes
         a ``Rotation`` in place of a quaternion. Not under ``jit``.
         """
-        return rotation.wxyz_to_scipy(self._need("wxyz"))
+        return rotation.wxyz_to_scipy(self.wxyz)
 
     def to_xarray(self, labels: Sequence[str] | None = None) -> Any:
         """An ``xarray.Dataset`` with named dimensions, units and attributes (needs xarray).
@@ -302,11 +356,11 @@ class Trajectory(eqx.Module):
 
 
 def _momentum_body(bare: Trajectory) -> Array:
-    return bare._scene.momentum(bare._need("omega_body"), bare._t)
+    return bare._scene.momentum(bare.omega_body, bare._t)
 
 
 def _energy(bare: Trajectory) -> Array:
     scene, attitude = bare._scene, None
     if scene.potential is not None:
-        attitude = from_quaternion(tuple(bare._need("wxyz")[..., i] for i in range(4)))
+        attitude = from_quaternion(tuple(bare.wxyz[..., i] for i in range(4)))
     return scene.hamiltonian.total(components(_momentum_body(bare)), attitude, bare._t)

@@ -98,12 +98,8 @@ def as_samples(what: Trajectory | Samples) -> Samples:
         raise TypeError(
             f"expected a ph.Trajectory or a plot.samples(...), got {type(what).__name__}."
         )
-    if what.omega_body is None:
-        raise ValueError(
-            "this trajectory holds no omega_body: simulate with record=ph.Record(rates=True)."
-        )
-    made = samples(what.ts, what.omega_body, what.wxyz, what.scene.inertia)
-    has_energy = what.scene.potential is None or what.wxyz is not None
+    made = samples(what.ts, what.omega_body, what._wxyz, what.scene.inertia)
+    has_energy = what.scene.potential is None or what._wxyz is not None
     energy = np.asarray(what.energy, np.float64).reshape(made.ts.shape) if has_energy else None
     return dataclasses.replace(made, energy=energy)
 
