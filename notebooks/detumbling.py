@@ -115,7 +115,7 @@ def wheel(i):
         return 2e-3 * jnp.sign(wxyz[0]) * wxyz[1 + i] + 8e-3 * omega_body[i]
 
     axis = np.eye(3)[i]
-    drive = ph.Motor(law, most_torque=1e-3, most_speed=600.0) + ph.ViscousCoupling(1e-8)
+    drive = ph.Motor(law, max_torque=1e-3, max_speed=600.0) + ph.ViscousCoupling(1e-8)
     return ph.Rotor(axis, inertia=1e-5, speed=0.0, coupling=drive)
 
 

@@ -113,7 +113,7 @@ plt.show()
 
 # %%
 columns = np.vstack([curve.columns(np.inf)[0], curve.alpha])
-pairs = lightcurve.fourier_lattices(curve.t, curve.magnitude, columns=columns, highest=6.0)
+pairs = lightcurve.fourier_lattices(curve.t, curve.magnitude, columns=columns, max_frequency=6.0)
 for g, h, part in list(zip(pairs.f_phi, pairs.f_psi, pairs.explained, strict=True))[:6]:
     print(f"{part:6.1%} of the variance by sums of multiples of {g:.3f} and {h:.3f} a day")
 print("as f_phi and f_psi, the first would mean:", lightcurve.meaning(*(x[0] for x in pairs[:2])))

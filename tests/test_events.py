@@ -88,7 +88,7 @@ def test_each_body_of_a_batch_has_times_of_its_own():
         assert found.count[k] == want.size
         np.testing.assert_allclose(found.times[k, : want.size], want, rtol=1e-12)
         assert np.all(np.isinf(found.times[k, want.size :]))
-    one = ph.crossings(traj, height(0.4), most=1)  # no room for all: told
+    one = ph.crossings(traj, height(0.4), capacity=1)  # no room for all: told
     np.testing.assert_array_equal(one.complete, found.count <= 1)
     np.testing.assert_allclose(one.times[2, 0], known(0.4, 1.3)[0], rtol=1e-12)
 
@@ -103,7 +103,7 @@ def test_event_times_have_derivatives(method):
         rate, level = given
         state = ph.State(STATE.wxyz, jnp.stack([0 * rate, rate, 0 * rate]))
         traj = ph.simulate(BALL, state, TS, method, rtol=1e-10)
-        return ph.crossings(traj, Height(level), most=3, samples=64).times[1]
+        return ph.crossings(traj, Height(level), capacity=3, samples=64).times[1]
 
     time, (in_rate, in_level) = second((jnp.asarray(RATE), jnp.asarray(0.4)))
     np.testing.assert_allclose(time, known(0.4)[1], rtol=1e-8)
@@ -218,7 +218,7 @@ def test_second_derivatives_of_events():
         state = ph.State(STATE.wxyz, jnp.stack([0 * rate, rate, 0 * rate]))
         event, span = ph.Event(Height(level), 1, samples=64), jnp.array([0.0, 10.0])
         held = ph.simulate(BALL, state, span, until=event)
-        crossed = ph.crossings(ph.simulate(BALL, state, span), event, most=2)
+        crossed = ph.crossings(ph.simulate(BALL, state, span), event, capacity=2)
         last = [held.event_time[None], held.last.wxyz, crossed.slope[:1]]
         return jnp.concatenate(last), crossed.times[0]
 
@@ -332,7 +332,7 @@ def test_what_cannot_be_searched_is_told():
         ph.simulate(BALL, STATE, TS, until=height(0.0))
     with pytest.raises(ValueError, match="leave record"):
         ph.simulate(BALL, STATE, TS, until=ph.Event(height(0.0)), record=ph.Record(rates=False))
-    for given, match in (({"most": 3}, "samples="), ({"samples": 30}, "most=")):
+    for given, match in (({"capacity": 3}, "samples="), ({"samples": 30}, "capacity=")):
         with pytest.raises(ValueError, match=match):
             jax.jit(lambda traj, given=given: ph.crossings(traj, height(0.0), **given))(traj)
     fast = ph.simulate(BALL, ph.State([1.0, 0, 0, 0], [0.0, 1e7, 0]), [0.0, 10.0])

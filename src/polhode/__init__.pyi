@@ -1,107 +1,112 @@
 """The public names of polhode: the lazy import, the reference and type checkers read this list.
 
-Signatures and annotations stand at the definitions. The order is that of the reference.
+Signatures and annotations stand at the definitions. The order and the headings are those of the
+reference.
 """
 
 # Simulation
-# Namespaces
-from . import (
-    ensemble as ensemble,
-    files as files,
-    fit as fit,
-    frames as frames,
-    inertia as inertia,
-    lightcurve as lightcurve,
-    plot as plot,
-    rotation as rotation,
-)
-from ._closed_forms import (
-    ClosedForm as ClosedForm,
-    FixedAxis as FixedAxis,
-    LagrangeTop as LagrangeTop,
-    Mode as Mode,
-    Periods as Periods,
-    SymmetricTop as SymmetricTop,
-    periods as periods,
-)
-from ._events import Crossings as Crossings, Event as Event, crossings as crossings
+from ._simulate import simulate as simulate, explain as explain
+from ._scene import Scene as Scene, State as State
+from ._trajectory import Trajectory as Trajectory
+from ._method import Record as Record, Status as Status, SimulationError as SimulationError
+from ._plan import Plan as Plan
+from ._propagate import propagate as propagate, Propagation as Propagation
 
-# The Hamiltonian
-from ._hamiltonian import (
-    HamiltonianMatrices as HamiltonianMatrices,
-    hamiltonian as hamiltonian,
-    hamiltonian_matrices as hamiltonian_matrices,
-    hamiltons_equations as hamiltons_equations,
+# Events
+from ._events import Event as Event, crossings as crossings, Crossings as Crossings
+
+# Bodies
+from .inertia import Inertia as Inertia, MassProperties as MassProperties
+from ._closed_forms import periods as periods, Periods as Periods, Mode as Mode
+
+# Potentials and orbits
+from ._scene import (
+    UniformGravity as UniformGravity,
+    GravityGradient as GravityGradient,
+    Potential as Potential,
+    AbstractPotential as AbstractPotential,
+    KeplerOrbit as KeplerOrbit,
+    StateOrbit as StateOrbit,
+    AbstractOrbit as AbstractOrbit,
+    LVLH as LVLH,
 )
-from ._integrate import (
-    EulerAngles as EulerAngles,
-    Extrapolation as Extrapolation,
-    FlowAdjoint as FlowAdjoint,
-    LiePoisson as LiePoisson,
-    Splitting as Splitting,
+
+# Torques and control
+from ._scene import (
+    BodyTorque as BodyTorque,
+    SpaceTorque as SpaceTorque,
+    FeedbackTorque as FeedbackTorque,
+    RelativeTorque as RelativeTorque,
+    Pulses as Pulses,
+    LinearDamping as LinearDamping,
+    QuadraticDamping as QuadraticDamping,
+    EnergySink as EnergySink,
+    RateDamping as RateDamping,
+    Pointing as Pointing,
+    MagneticDipole as MagneticDipole,
+    BDot as BDot,
+    DipoleField as DipoleField,
+    AbstractTorque as AbstractTorque,
+)
+
+# Wheels
+from ._scene import (
+    Rotor as Rotor,
+    Motor as Motor,
+    ViscousCoupling as ViscousCoupling,
+    CoulombFriction as CoulombFriction,
+    AbstractRotor as AbstractRotor,
+    AbstractCoupling as AbstractCoupling,
 )
 
 # Methods
-from ._method import (
-    AbstractMethod as AbstractMethod,
-    Record as Record,
-    SimulationError as SimulationError,
-    Status as Status,
+from ._closed_forms import (
+    ClosedForm as ClosedForm,
+    SymmetricTop as SymmetricTop,
+    FixedAxis as FixedAxis,
+    LagrangeTop as LagrangeTop,
 )
-from ._plan import Plan as Plan
-from ._propagate import Propagation as Propagation, propagate as propagate
+from ._integrate import (
+    LiePoisson as LiePoisson,
+    EulerAngles as EulerAngles,
+    Extrapolation as Extrapolation,
+    Splitting as Splitting,
+    FlowAdjoint as FlowAdjoint,
+)
+from ._method import AbstractMethod as AbstractMethod
 
-# Potentials and orbits
-# Torques and control
-# Wheels
-from ._scene import (
-    LVLH as LVLH,
-    AbstractCoupling as AbstractCoupling,
-    AbstractOrbit as AbstractOrbit,
-    AbstractPotential as AbstractPotential,
-    AbstractRotor as AbstractRotor,
-    AbstractTorque as AbstractTorque,
-    BDot as BDot,
-    BodyTorque as BodyTorque,
-    CoulombFriction as CoulombFriction,
-    DipoleField as DipoleField,
-    EnergySink as EnergySink,
-    FeedbackTorque as FeedbackTorque,
-    GravityGradient as GravityGradient,
-    KeplerOrbit as KeplerOrbit,
-    LinearDamping as LinearDamping,
-    MagneticDipole as MagneticDipole,
-    Motor as Motor,
-    Pointing as Pointing,
-    Potential as Potential,
-    Pulses as Pulses,
-    QuadraticDamping as QuadraticDamping,
-    RateDamping as RateDamping,
-    RelativeTorque as RelativeTorque,
-    Rotor as Rotor,
-    Scene as Scene,
-    SpaceTorque as SpaceTorque,
-    State as State,
-    StateOrbit as StateOrbit,
-    UniformGravity as UniformGravity,
-    ViscousCoupling as ViscousCoupling,
-)
-from ._simulate import explain as explain, simulate as simulate
-from ._trajectory import Trajectory as Trajectory
-from .fit import (
-    fit_inertia as fit_inertia,
-    fit_recordings as fit_recordings,
-    fit_scene as fit_scene,
+# The Hamiltonian
+from ._hamiltonian import (
+    hamiltonian as hamiltonian,
+    hamiltons_equations as hamiltons_equations,
+    hamiltonian_matrices as hamiltonian_matrices,
+    HamiltonianMatrices as HamiltonianMatrices,
 )
 
-# Frames, sensors and fits
+# Frames and sensors
 from .frames import (
     RotatingFrame as RotatingFrame,
     accelerometer as accelerometer,
     gyroscope as gyroscope,
 )
 
-# Bodies
-from .inertia import Inertia as Inertia, MassProperties as MassProperties
+# Fits
+from .fit import (
+    fit_inertia as fit_inertia,
+    fit_recordings as fit_recordings,
+    fit_scene as fit_scene,
+)
+
+# Namespaces
+from . import (
+    rotation as rotation,
+    inertia as inertia,
+    frames as frames,
+    fit as fit,
+    lightcurve as lightcurve,
+    plot as plot,
+    files as files,
+    ensemble as ensemble,
+)
 
 __version__: str

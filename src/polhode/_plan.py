@@ -14,33 +14,23 @@ from jaxtyping import Array
 from polhode._batch import PARTS, common_batch
 from polhode._checks import is_concrete
 from polhode._closed_forms import LAWS, ClosedForm, lawful
-from polhode._integrate import Extrapolation
-from polhode._integrate._charts import LiePoissonChart
-from polhode._integrate._stepped import LiePoisson, Stepped
 from polhode._method._base import AbstractMethod, Record
 from polhode._scene import GravityGradient, Scene, State, UniformGravity
 from polhode.inertia import Symmetry
-
-
-def _named(method: AbstractMethod) -> str:
-    if not isinstance(method, Stepped):
-        return type(method).__name__
-    chart = type(method.chart).__name__.removesuffix("Chart")
-    return f"{chart}({type(method.solver).__name__})"
 
 
 @dataclass(frozen=True)
 class Plan:
     """What will run, what is skipped and why; ``print`` it.
 
-    **Fields:** ``method``; ``law``: why this one; ``skipped``: what is absent from the compiled
+    **Fields:** ``method``; ``reason``: why this one; ``skipped``: what is absent from the compiled
     program, with the reason; ``bodies``, ``samples``, ``dtype``: the size of the work;
     ``error``: the attitude error to be expected, in words; ``refused``: the exact laws that do not
     hold, with the reason, where the library chose to step.
     """
 
     method: AbstractMethod
-    law: str
+    reason: str
     skipped: tuple[str, ...]
     bodies: int
     samples: int
@@ -48,11 +38,16 @@ class Plan:
     error: str
     refused: tuple[str, ...] = ()
 
+    @property
+    def closed_form(self) -> str | None:
+        """The name of the closed-form solution; None where the motion is integrated."""
+        return self.method.name if self.method.exact else None
+
     def __str__(self) -> str:
         lines = [
             f"{self.bodies:,} {'body' if self.bodies == 1 else 'bodies'} x {self.samples:,}"
             f" {'sample' if self.samples == 1 else 'samples'}, {self.dtype}",
-            f"runs    {_named(self.method)}: {self.law}",
+            f"runs    {self.method.name}: {self.reason}",
             *_listed("skips", self.skipped),
             *_listed("not", self.refused),
             f"error   {self.error}",
@@ -127,8 +122,10 @@ def ways_of(scene: Scene, state: State, record: Record) -> Ways:
 
 @functools.cache
 def _stepped(upright: bool, compensated: bool) -> AbstractMethod:
-    method = LiePoisson(Extrapolation(None, compensated))
-    return dataclasses.replace(method, chart=LiePoissonChart(upright))
+    # here, so that diffrax loads with the first scene that is integrated
+    from polhode._integrate import Extrapolation, LiePoisson, LiePoissonChart
+
+    return LiePoisson(Extrapolation(None, compensated), chart=LiePoissonChart(upright))
 
 
 def _misses(ways: Ways, state: State, rtol, ts) -> bool:
@@ -183,16 +180,16 @@ def plan(
     record: Record,
 ) -> Plan:
     """The plan of checked input (see ``ph.explain``)."""
-    law, refused = "as asked for", ()
+    reason, refused = "as asked for", ()
     if method is None:
-        method, law = choose(scene, state, record, rtol, ts)
+        method, reason = choose(scene, state, record, rtol, ts)
         if not method.exact:
             _, refused = lawful(scene, state, record)
     parts = (getattr(scene, name) for name in PARTS)
     bodies = int(np.prod(common_batch(*parts, state, extra=(ts.shape[:-1],)), dtype=int))
     samples = 1 if record.final_only else ts.shape[-1]
     return Plan(
-        method, law, _skipped(scene, method, record), bodies, samples,
+        method, reason, _skipped(scene, method, record), bodies, samples,
         str(state.wxyz.dtype), _error(method, scene, state, ts, rtol), refused,
     )  # fmt: skip
 

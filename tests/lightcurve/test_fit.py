@@ -185,7 +185,9 @@ def test_a_tumbler_is_found_again():
 @pytest.mark.slow
 def test_how_much_zero_points_differ_is_learnt():
     curve, truth, _ = light_curves.synthetic(3, 0.02, nights=10, days=16.0, each=14, spread=0.06)
-    fit = lightcurve.fit_light_curve(curve, floor=0.01, highest=7.0, trials=12_000, searches=1)
+    fit = lightcurve.fit_light_curve(
+        curve, floor=0.01, max_frequency=7.0, trials=12_000, searches=1
+    )
     assert int(fit.best.mode) == truth["mode"]
     assert fit.best.P_phi == pytest.approx(truth["P_phi"], rel=5e-3)
     assert fit.best.P_psi == pytest.approx(truth["P_psi"], rel=5e-3)

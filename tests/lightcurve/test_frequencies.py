@@ -27,7 +27,7 @@ def series():
 def test_pairs_explain_what_least_squares_say(series, even):
     t, value, columns = series
     found = lightcurve.fourier_pairs(
-        t, value, columns=columns, highest=4.0, even=even, order=2 if even else 1, keep=200
+        t, value, columns=columns, max_frequency=4.0, even=even, order=2 if even else 1, keep=200
     )
     basis = [columns.T]
     multiples = _frequencies.terms(2 if even else 1, even)
@@ -67,7 +67,7 @@ SHORT_AXIS = ((1, 1, 0.2, 1.0), (2, 0, 0.15, 2.0), (2, 2, 0.05, 0.5))
 def test_hypotheses_hold_the_body(waves, long_axis):
     """Also where the harmonics of one line are nearly all: no multiple of it is taken for two."""
     t, value = _long(waves)
-    found = lightcurve.fourier_lattices(t, value, highest=7.0)
+    found = lightcurve.fourier_lattices(t, value, max_frequency=7.0)
     meant = _hypotheses.hypotheses(found, t, value)
     near = np.hypot(meant.f_phi - F_PHI, meant.f_psi - F_PSI) < 0.5 * found.resolution
     assert np.any(near[:20] & (meant.long_axis[:20] == long_axis))
@@ -95,7 +95,7 @@ def test_meaning_names_mode_and_sums():
 def test_lattices_find_the_sums_of_a_long_curve():
     """Two lines of the body come first, and explain what least squares say."""
     t, value = _long(MIXED)
-    found = lightcurve.fourier_lattices(t, value, highest=5.0, keep=20)
+    found = lightcurve.fourier_lattices(t, value, max_frequency=5.0, keep=20)
     assert np.all(np.diff(found.explained) <= 0)
     assert found.explained[0] > 0.9
     sums = _frequencies.LINES @ [found.f_phi[0], found.f_psi[0]]

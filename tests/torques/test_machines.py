@@ -147,7 +147,7 @@ def test_a_dipole_in_a_field_of_place_and_time():
         (lambda: ph.Pulses(ph.BodyTorque([0.0, 0, 1]), [1.0], [1.0]), ValueError, "end after"),
         (lambda: ph.Pulses(ph.BodyTorque([0.0, 0, 1]), [1.0, 2], [3.0]), ValueError, "one length"),
         (lambda: ph.Pulses(lambda t: t, [1.0], [2.0]), TypeError, "takes a torque"),
-        (lambda: ph.Motor(0.1, most_speed=3.0), ValueError, "needs most_torque"),
+        (lambda: ph.Motor(0.1, max_speed=3.0), ValueError, "needs max_torque"),
         (lambda: ph.Motor(0.1, -1.0), ValueError, "must be positive"),
         (lambda: ph.Motor(lambda t: t), TypeError, "t, wxyz, omega_body, speed"),
         (lambda: ph.CoulombFriction(0.1, 0.0), ValueError, "must be positive"),

@@ -54,15 +54,15 @@ def crossings(
     fn: Callable | Event,
     direction: int = 0,
     *,
-    most: int | None = None,
+    capacity: int | None = None,
     samples: int | None = None,
 ) -> Crossings:
     """Times within those of ``trajectory`` at which ``fn(wxyz, omega_body, t)`` crosses zero.
 
     **Arguments:** ``fn``: see ``ph.Event``, which may be given in its place; ``direction``: 1
-    rising, -1 falling (in time), 0 both; ``most``: room for the crossings of a body; None: as many
-    as there are; ``samples``: see ``ph.Event``. Under ``jit``, ``vmap`` and ``grad`` both must be
-    given.
+    rising, -1 falling (in time), 0 both; ``capacity``: how many crossings of a body are
+    stored; None: all of them; ``samples``: see ``ph.Event``. Under ``jit``, ``vmap`` and ``grad``
+    both must be given.
 
     Times are as accurate as the motion: to rounding for exact laws, to ``rtol`` over the slope for
     stepped ones. They have first and second derivatives, by the implicit function theorem, in all
@@ -86,7 +86,7 @@ def crossings(
         traj.at(up.times).euler()
     """
     event = fn if isinstance(fn, Event) else Event(fn, direction, samples)
-    room = at_least("most", most, 1)
+    room = at_least("capacity", capacity, 1)
     looks = event.samples if samples is None else at_least("samples", samples, 2)
     for name in ("wxyz", "omega_body"):
         getattr(trajectory, name)  # raises where it was not recorded
@@ -97,7 +97,7 @@ def crossings(
     if room is None:
         if not is_concrete(trajectory):
             raise ValueError(
-                "under jit, vmap or grad the room for crossings must be known: most=8."
+                "under jit, vmap or grad the number of stored crossings must be given: capacity=8."
             )
         room = _ROOM
     found, lost = _found(trajectory, event, room, looks)
@@ -106,10 +106,10 @@ def crossings(
             f"the steps of a body ran out on its way through {looks:,} looks: search a shorter time"
             " (traj.between), or ask for more steps, ph.LiePoisson(..., max_steps=2**20)."
         )
-    while most is None and int(np.max(found.count, initial=0)) > room:
+    while capacity is None and int(np.max(found.count, initial=0)) > room:
         room = 2 ** int(np.ceil(np.log2(np.max(found.count))))
         found, _ = _found(trajectory, event, room, looks)
-    if most is None:  # without room that no body uses
+    if capacity is None:  # without room that no body uses
         used = int(np.max(found.count, initial=0))
         found = Crossings(found.times[..., :used], found.slope[..., :used], found.count)
     return found

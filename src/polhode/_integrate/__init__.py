@@ -1,17 +1,8 @@
-"""Integrators made for rotating bodies, as solvers, controllers and adjoints of diffrax."""
+"""Numerical integration: coordinates, solvers, step control and adjoints on diffrax.
 
-from polhode._integrate._charts import (
-    EulerChart as EulerChart,
-    LiePoissonChart as LiePoissonChart,
-    natural_rates as natural_rates,
-)
-from polhode._integrate._equal_steps import EqualSteps as EqualSteps, GivenTimes as GivenTimes
-from polhode._integrate._extrapolation import Accuracy as Accuracy, Extrapolation as Extrapolation
-from polhode._integrate._flow_adjoint import FlowAdjoint as FlowAdjoint
-from polhode._integrate._splitting import Splitting as Splitting
-from polhode._integrate._stepped import (
-    EulerAngles as EulerAngles,
-    LiePoisson as LiePoisson,
-    Stepped as Stepped,
-)
-from polhode._integrate._units import GroupUnits as GroupUnits
+The names are imported at first use, so that diffrax loads with the first integrated scene.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

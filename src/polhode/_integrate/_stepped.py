@@ -22,8 +22,8 @@ from polhode._method._status import Status
 from polhode._scene import Scene, State
 
 
-class Stepped(AbstractMethod):
-    """Bodies moved by a diffrax solver on one of the two charts; see ``LiePoisson``."""
+class AbstractIntegration(AbstractMethod):
+    """Base of the methods that integrate with a diffrax solver; see ``LiePoisson``."""
 
     chart: AbstractChart
     solver: diffrax.AbstractSolver
@@ -33,6 +33,35 @@ class Stepped(AbstractMethod):
     adjoint: diffrax.AbstractAdjoint
     progress_meter: diffrax.AbstractProgressMeter
     chunk: int | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        chart: AbstractChart,
+        shared_chunk: int,
+        solver: diffrax.AbstractSolver | None,
+        controller: diffrax.AbstractStepSizeController | None,
+        dt0: float | Array | None,
+        max_steps: int,
+        adjoint: diffrax.AbstractAdjoint | None,
+        progress_meter: diffrax.AbstractProgressMeter | None,
+        chunk: int | None,
+    ):
+        """``shared_chunk``: the default ``chunk`` where bodies share their steps."""
+        solver = diffrax.Dopri8() if solver is None else solver
+        check_options(solver, controller, adjoint, dt0=dt0, max_steps=max_steps, chunk=chunk)
+        if chunk is None and not hasattr(solver, "bodies_at_once"):
+            chunk = shared_chunk
+        self.chart, self.solver, self.controller = chart, solver, controller
+        self.dt0, self.max_steps, self.chunk = dt0, max_steps, chunk
+        self.adjoint = FlowAdjoint() if adjoint is None else adjoint
+        no_meter = diffrax.NoProgressMeter()
+        self.progress_meter = no_meter if progress_meter is None else progress_meter
+
+    @property
+    def name(self) -> str:
+        """Coordinates and solver."""
+        coordinates = type(self.chart).__name__.removesuffix("Chart")
+        return f"{coordinates}({type(self.solver).__name__})"
 
     @property
     def keeps_rtol(self) -> bool:
@@ -299,15 +328,7 @@ def _may_jump(scene: Scene) -> bool:
     return not all(hasattr(x, "core_ranks") for x in found)
 
 
-def LiePoisson(
-    solver: diffrax.AbstractSolver | None = None,
-    controller: diffrax.AbstractStepSizeController | None = None,
-    dt0: float | Array | None = None,
-    max_steps: int = 2**16,
-    adjoint: diffrax.AbstractAdjoint | None = None,
-    progress_meter: diffrax.AbstractProgressMeter | None = None,
-    chunk: int | None = None,
-) -> Stepped:
+class LiePoisson(AbstractIntegration):
     """Unit quaternion and body momentum, free of singularities, with any diffrax solver.
 
     **Arguments:**
@@ -323,46 +344,49 @@ def LiePoisson(
       and reverse mode; or an adjoint of diffrax, for the derivative of the steps (for bodies that
       drag stops within the time simulated).
     - ``progress_meter``: as in diffrax.
+    - ``chart``: set by the planner (None: no preferred direction in space).
     - ``chunk``: bodies that are moved together; chunks follow one another, so memory stays bounded.
       None: 200 where the bodies of a chunk share their steps. For ``Extrapolation``, in which each
       has its own, 1024, of which 64 are on their way at once, in a processor's cache; 64 where the
       field is more than arithmetic on the numbers of one body; 2^18 on an accelerator.
     """
-    return _stepped(LiePoissonChart(), 200, solver, controller, dt0, max_steps, adjoint,
-                    progress_meter, chunk)  # fmt: skip
+
+    def __init__(
+        self,
+        solver: diffrax.AbstractSolver | None = None,
+        controller: diffrax.AbstractStepSizeController | None = None,
+        dt0: float | Array | None = None,
+        max_steps: int = 2**16,
+        adjoint: diffrax.AbstractAdjoint | None = None,
+        progress_meter: diffrax.AbstractProgressMeter | None = None,
+        chunk: int | None = None,
+        *,
+        chart: LiePoissonChart | None = None,
+    ):
+        chart = LiePoissonChart() if chart is None else chart
+        super().__init__(
+            chart, 200, solver, controller, dt0, max_steps, adjoint, progress_meter, chunk
+        )
 
 
-def EulerAngles(
-    solver: diffrax.AbstractSolver | None = None,
-    controller: diffrax.AbstractStepSizeController | None = None,
-    dt0: float | Array | None = None,
-    max_steps: int = 2**16,
-    adjoint: diffrax.AbstractAdjoint | None = None,
-    progress_meter: diffrax.AbstractProgressMeter | None = None,
-    chunk: int | None = None,
-) -> Stepped:
+class EulerAngles(AbstractIntegration):
     """Canonical ZYZ Euler angles by Hamilton's equations (docs/equations.md), any diffrax solver.
 
     A reference path: the chart breaks down where theta is 0 or pi, which is reported as
     ``Status.CHART_SINGULAR``; passing near costs many steps. Arguments as ``ph.LiePoisson``; with a
     solver whose bodies share their steps one body at a time, for the worst would hold up the rest.
     """
-    return _stepped(EulerChart(), 1, solver, controller, dt0, max_steps, adjoint,
-                    progress_meter, chunk)  # fmt: skip
 
-
-def _stepped(chart, alone, solver, controller, dt0, max_steps, adjoint, progress_meter, chunk):
-    solver = diffrax.Dopri8() if solver is None else solver
-    check_options(solver, controller, adjoint, dt0=dt0, max_steps=max_steps, chunk=chunk)
-    if chunk is None and not hasattr(solver, "bodies_at_once"):
-        chunk = alone
-    return Stepped(
-        chart,
-        solver,
-        controller,
-        dt0,
-        max_steps,
-        FlowAdjoint() if adjoint is None else adjoint,
-        diffrax.NoProgressMeter() if progress_meter is None else progress_meter,
-        chunk,
-    )
+    def __init__(
+        self,
+        solver: diffrax.AbstractSolver | None = None,
+        controller: diffrax.AbstractStepSizeController | None = None,
+        dt0: float | Array | None = None,
+        max_steps: int = 2**16,
+        adjoint: diffrax.AbstractAdjoint | None = None,
+        progress_meter: diffrax.AbstractProgressMeter | None = None,
+        chunk: int | None = None,
+    ):
+        super().__init__(
+            EulerChart(), 1, solver, controller, dt0, max_steps, adjoint, progress_meter, chunk
+        )

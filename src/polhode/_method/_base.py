@@ -59,6 +59,11 @@ class AbstractMethod(eqx.Module):
         """Whether ``rtol`` decides how accurate the motion is."""
         return False
 
+    @property
+    def name(self) -> str:
+        """The name that ``ph.explain`` prints."""
+        return type(self).__name__
+
     @abc.abstractmethod
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         """Samples at ``ts`` (T,) or (N, T) of lanes whose state holds at the first time."""

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,20 +20,21 @@ def check_method(method: Any) -> None:
     """Methods are objects, never strings."""
     if method is None or isinstance(method, AbstractMethod):
         return
+    import diffrax  # here, so that closed forms do not wait for it
+
+    kind = method if isinstance(method, type) else type(method)
     if isinstance(method, type) and issubclass(method, AbstractMethod):
         given, mend = f"the class {method.__name__}", f": make an object of it, {made(method)}"
-    elif isinstance(method, diffrax.AbstractSolver) or _is_solver_class(method):
-        name = method.__name__ if isinstance(method, type) else type(method).__name__
-        given, mend = f"the solver {name}", f": hand it to a chart, ph.LiePoisson({made(method)})"
+    elif issubclass(kind, diffrax.AbstractSolver):
+        given, mend = (
+            f"the solver {kind.__name__}",
+            f": hand it to a chart, ph.LiePoisson({made(method)})",
+        )
     else:
         given, mend = type(method).__name__, ""
         if callable(method) and getattr(method, "__module__", "").startswith("polhode."):
             given, mend = f"the function {method.__name__}", f": call it, ph.{method.__name__}()"
     raise TypeError(f"method must be None or an object such as ph.LiePoisson(), got {given}{mend}.")
-
-
-def _is_solver_class(x: Any) -> bool:
-    return isinstance(x, type) and issubclass(x, diffrax.AbstractSolver)
 
 
 def check_kinds(scene: Any, state: Any) -> None:

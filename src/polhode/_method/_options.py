@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import diffrax
 import numpy as np
 
 from polhode._checks import as_float_array, is_concrete
@@ -21,6 +20,8 @@ def check_options(
 
     Raises TypeError for another kind, ValueError for an option that cannot work here.
     """
+    import diffrax  # here, so that closed forms do not wait for it
+
     for name, value, kind, example in (
         ("solver", solver, diffrax.AbstractSolver, "diffrax.Dopri8()"),
         (

@@ -106,7 +106,7 @@ class Motor(AbstractCoupling):
 
     **Arguments:** ``command``: torque on the wheel about its axis [N m], a number (...) or a
     function ``fn(t, wxyz, omega_body, speed)`` of one body, the wheel's speed [rad/s] relative to
-    it; ``most_torque`` (...) [N m], positive: it gives no more than that; ``most_speed`` (...)
+    it; ``max_torque`` (...) [N m], positive: it gives no more than that; ``max_speed`` (...)
     [rad/s], positive: what it gives in the direction of the speed falls linearly to nothing there
     (the line of a DC motor), braking keeps the full torque. The speed needs the torque.
 
@@ -115,7 +115,7 @@ class Motor(AbstractCoupling):
         def hold(t, wxyz, omega_body, speed):       # the body takes the reaction
             return 0.4 * wxyz[1] * jnp.sign(wxyz[0]) + 0.5 * omega_body[0]
 
-        motor = ph.Motor(hold, most_torque=0.1, most_speed=600.0) + ph.ViscousCoupling(1e-5)
+        motor = ph.Motor(hold, max_torque=0.1, max_speed=600.0) + ph.ViscousCoupling(1e-5)
         wheel = ph.Rotor([1.0, 0.0, 0.0], inertia=1e-3, speed=0.0, coupling=motor)
 
     Raises TypeError or ValueError for other numbers, or a function that takes or returns something
@@ -123,23 +123,23 @@ class Motor(AbstractCoupling):
     """
 
     command: Float[Array, "*#b"] | Callable = shaped()
-    most_torque: Float[Array, "*#b"] | None = shaped()
-    most_speed: Float[Array, "*#b"] | None = shaped()
+    max_torque: Float[Array, "*#b"] | None = shaped()
+    max_speed: Float[Array, "*#b"] | None = shaped()
 
     def __init__(
         self,
         command: ArrayLike | Callable,
-        most_torque: ArrayLike | None = None,
-        most_speed: ArrayLike | None = None,
+        max_torque: ArrayLike | None = None,
+        max_speed: ArrayLike | None = None,
     ):
         if callable(command):
             self.command = _COMMAND.checked(command)
         else:
             self.command = as_number("Motor command", command)
-        for name, value in (("most_torque", most_torque), ("most_speed", most_speed)):
+        for name, value in (("max_torque", max_torque), ("max_speed", max_speed)):
             setattr(self, name, None if value is None else as_positive(f"Motor {name}", value))
-        if most_speed is not None and most_torque is None:
-            raise ValueError("Motor most_speed needs most_torque, the torque that falls with it.")
+        if max_speed is not None and max_torque is None:
+            raise ValueError("Motor max_speed needs max_torque, the torque that falls with it.")
 
     def torque(
         self, t: Array | float, speed: Array, attitude: Attitude, omega: Sequence[Array]
@@ -148,11 +148,11 @@ class Motor(AbstractCoupling):
         if callable(wanted):
             given = t, stacked(attitude.wxyz), stacked(omega), speed
             wanted = _COMMAND.mapped(wanted, *given)
-        if self.most_torque is None:
+        if self.max_torque is None:
             return wanted
-        low, high = -self.most_torque, self.most_torque
-        if self.most_speed is not None:
-            share = speed / self.most_speed
-            high = self.most_torque * jnp.clip(1 - share, 0, 1)
-            low = -self.most_torque * jnp.clip(1 + share, 0, 1)
+        low, high = -self.max_torque, self.max_torque
+        if self.max_speed is not None:
+            share = speed / self.max_speed
+            high = self.max_torque * jnp.clip(1 - share, 0, 1)
+            low = -self.max_torque * jnp.clip(1 + share, 0, 1)
         return jnp.clip(wanted, low, high)

@@ -92,7 +92,8 @@ class MagneticDipole(AbstractTorque):
     orbit such as ``ph.KeplerOrbit``, for a field that is a function.
 
         orbit = ph.KeplerOrbit(3.986e14, 6.9e6, inclination=1.7)
-        rods = ph.MagneticDipole(ph.BDot(4e4, most=0.2), ph.DipoleField([0, 0, -7.8e22]), orbit)
+        field = ph.DipoleField([0, 0, -7.8e22])
+        rods = ph.MagneticDipole(ph.BDot(4e4, max_moment=0.2), field, orbit)
 
     Raises TypeError or ValueError for functions that take or return something else.
     """
@@ -130,20 +131,23 @@ class BDot(eqx.Module):
     """Magnetic moment that brakes a tumble: m = k omega x B [A m^2], -k times the field's rate.
 
     In body axes a field that hardly changes in space changes by B x omega. ``k`` [A m^2 s/T] (a
-    number, a leaf that gradients tune); ``most`` [A m^2]: limit of each of three rods, or None.
+    number, a leaf that gradients tune); ``max_moment`` [A m^2]: limit of each of
+    three rods, or None.
     For ``ph.MagneticDipole``: the torque is -k |B|^2 times the part of omega normal to B.
     """
 
     k: Array
-    most: Array | None
+    max_moment: Array | None
 
-    def __init__(self, k: ArrayLike, most: ArrayLike | None = None):
+    def __init__(self, k: ArrayLike, max_moment: ArrayLike | None = None):
         self.k = as_number("BDot k", k)
-        self.most = None if most is None else as_number("BDot most", most)
+        self.max_moment = None if max_moment is None else as_number("BDot max_moment", max_moment)
 
     def __call__(self, t: Array | float, omega_body: Array, field_body: Array) -> Array:
         moment = self.k * jnp.cross(omega_body, field_body)
-        return moment if self.most is None else jnp.clip(moment, -self.most, self.most)
+        if self.max_moment is None:
+            return moment
+        return jnp.clip(moment, -self.max_moment, self.max_moment)
 
 
 class DipoleField(eqx.Module):

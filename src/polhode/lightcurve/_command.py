@@ -56,7 +56,7 @@ def run(
     vectors: str | PathLike[str] | None = None,
     output: str | PathLike[str] | None = None,
     trials: int = 40_000,
-    highest: float | None = None,
+    max_frequency: float | None = None,
     floor: float = 0.03,
     seed: int = 0,
     say: Callable = print,
@@ -72,13 +72,13 @@ def run(
     say(f"{path.name}: {curve.t.size} points, {len(curve.names)} groups, {np.ptp(curve.t):.4g} d")
     if curve.sun is None:
         pairs = fourier_pairs(
-            curve.t, curve.magnitude, columns=curve.columns(np.inf)[0], highest=highest
+            curve.t, curve.magnitude, columns=curve.columns(np.inf)[0], max_frequency=max_frequency
         )
         say(frequency_table(pairs))
         for note in (*curve.notes, "without vectors to Sun and observer no body can be fitted."):
             say(f"note: {note}")
         return None
-    fit = fit_light_curve(curve, trials=trials, highest=highest, floor=floor, seed=seed)
+    fit = fit_light_curve(curve, trials=trials, max_frequency=max_frequency, floor=floor, seed=seed)
     say(frequency_table(fit.pairs))
     say(table(fit))
     output = Path(path.stem if output is None else output)

@@ -40,7 +40,7 @@ def fit_light_curve(
     *,
     phase: AbstractPhase | None = None,
     pairs: Pairs | None = None,
-    highest: float | None = None,
+    max_frequency: float | None = None,
     trials: int = 40_000,
     starts: int = 2,
     searches: int = 3,
@@ -48,7 +48,7 @@ def fit_light_curve(
     offset_sigma: float | None = None,
     limit: float = 3.0,
     seed: int = 0,
-    most: int = 12,
+    max_solutions: int = 12,
 ) -> Fit:
     """Every tumbling ellipsoid, of free inertia, that explains a light curve; without a guess.
 
@@ -56,14 +56,14 @@ def fit_light_curve(
     periods, their phases those that the series prefers, all else drawn at random;
     Levenberg-Marquardt, with exact derivatives, on the best ``starts`` of each pair and meaning; as
     many again of the likeliest and of those with the best bodies so far; the mirror images of what
-    is found; distinct solutions, the ``most`` best and all others that cannot be excluded. Repeated
-    until two searches agree, ``searches`` times at most.
+    is found; distinct solutions, the ``max_solutions`` best and all others that cannot be excluded.
+    Repeated until two searches agree, ``searches`` times at most.
 
     ``phase``: a phase function (default: ``HG1G2()`` where the phase angle changes by more than 5
-    degrees, else ``SeeligerPhase()``). ``pairs``: instead of those from the series. ``highest``
-    frequency sought, per day. ``floor`` [mag]: added to the errors in quadrature, growing with
-    the phase angle, for what an ellipsoid cannot be. ``offset_sigma``: see
-    ``LightCurve.columns``; None: of a calibrated curve with eight groups or more it is learnt from
+    degrees, else ``SeeligerPhase()``). ``pairs``: instead of those from the series.
+    ``max_frequency``: the highest frequency of the search, per day. ``floor`` [mag]: added
+    to the errors in quadrature, growing with the phase angle, for what an ellipsoid cannot be.
+    ``offset_sigma``: see ``LightCurve.columns``; None: of a calibrated curve with eight groups or more it is learnt from
     the best motion found, and all are fitted again with it. ``limit``: residuals beyond as many
     sigma count by their size, not their square. Needs float64 (``jax_enable_x64``).
 
@@ -81,7 +81,9 @@ def fit_light_curve(
     if np.ptp(curve.alpha) > np.radians(1):
         columns = np.vstack([columns, curve.alpha, curve.alpha**2])
     if pairs is None:
-        pairs = fourier_lattices(curve.t, curve.magnitude, columns=columns, highest=highest)
+        pairs = fourier_lattices(
+            curve.t, curve.magnitude, columns=columns, max_frequency=max_frequency
+        )
     meant = hypotheses(pairs, curve.t, curve.magnitude, columns=columns)
     key = jax.random.key(seed)
     rough, problem = Problem(phase, _thinned(points, _FEW)), Problem(phase, points)
@@ -116,9 +118,9 @@ def fit_light_curve(
     width = np.full(len(images.wxyz), limit)
     mirrored = problem.improve(problem.start(images, width), width, 30)
     state = _joined(state, mirrored)
-    order = _distinct(state, pairs.resolution, max(most, BATCH))
+    order = _distinct(state, pairs.resolution, max(max_solutions, BATCH))
     solutions, scale, alike = described(problem, state, order, curve, normals, limit)
-    solutions = solutions[: max(most, sum(s.probability > EXCLUDED for s in solutions))]
+    solutions = solutions[: max(max_solutions, sum(s.probability > EXCLUDED for s in solutions))]
     notes = notes_on(curve, solutions, scale, alike)
     if not again:
         notes += (
@@ -251,7 +253,7 @@ def _thinned(points: Points, count: int) -> Points:
 
 
 def _distinct(state: State, resolution: float, most: int) -> np.ndarray:
-    """Numbers of the ``most`` best solutions that differ in mode, frequencies or pole.
+    """Numbers of the ``max_solutions`` best solutions that differ in mode, frequencies or pole.
 
     Of one mode and frequencies no more than `_ALIKE`, so that others are not crowded out.
     """

@@ -157,7 +157,7 @@ def fourier_pairs(
     values: Float[Array | np.ndarray, " n"],
     *,
     columns: Float[Array | np.ndarray, "c n"] | None = None,
-    highest: float | None = None,
+    max_frequency: float | None = None,
     order: int = 2,
     even: bool = True,
     oversampling: int = 4,
@@ -166,14 +166,14 @@ def fourier_pairs(
     """Pairs (f_phi, f_psi) whose Fourier series explain ``values`` best, over a whole grid.
 
     ``columns``: what is fitted besides, such as a constant for each night (default: one
-    constant). ``highest`` frequency of either, per unit of ``t``; default: 1.3 times that of the
+    constant). ``max_frequency`` of either, per unit of ``t``; default: 1.3 times that of the
     highest peak of the power spectrum with a tenth of the greatest power, but at most 600 steps of
     the grid, ``600 / oversampling`` turns within the light curve. Local maxima of the grid, the
     best ``keep``. Without ``even`` the two may be swapped, and ``f_phi`` is the higher one.
     """
     multiples = terms(order, even)
     most = int(np.abs(multiples).sum(1).max())
-    scan = Scan.of(t, values, columns, highest, oversampling, most)
+    scan = Scan.of(t, values, columns, max_frequency, oversampling, most)
     # a tenth of a cycle at least; neither frequency may be that of the other
     nodes = np.arange(max(oversampling // 2, 1), scan.count)
     pairs = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), -1).reshape(-1, 2)
@@ -199,7 +199,7 @@ def fourier_lattices(
     values: Float[Array | np.ndarray, " n"],
     *,
     columns: Float[Array | np.ndarray, "c n"] | None = None,
-    highest: float | None = None,
+    max_frequency: float | None = None,
     lines: int = 16,
     oversampling: int = 5,
     keep: int = 60,
@@ -211,7 +211,7 @@ def fourier_lattices(
     whole grid, beside the multiples of g and half of it. What explains a body's light are a few
     sums of multiples of its frequencies; which of them g and h are is left open.
     """
-    scan = Scan.of(t, values, columns, highest, oversampling, 2)
+    scan = Scan.of(t, values, columns, max_frequency, oversampling, 2)
     nodes = np.arange(max(oversampling // 2, 1), scan.count)
     peaks = _maxima(scan.fitted(nodes[:, None])[0])[:lines]
     found, power = [], []
