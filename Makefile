@@ -32,14 +32,14 @@ lint: $(call STAMP,lint)  ## ruff, pyright, and both type checkers on the docume
 bench: $(call STAMP,bench)  ## the quick benchmark tables and figures, beside the peers that are installed
 	$(BIN)/python -m benchmarks --quick
 
-docs: $(call STAMP,docs)  ## build the documentation into site/, without a network; a broken link is an error
-	$(BIN)/python -m mkdocs build
+docs: $(call STAMP,docs)  ## build the documentation into site/, without a network; a warning is an error
+	$(BIN)/python -m sphinx -W --keep-going -q -d build/doctrees docs site
 
 notebooks: $(call STAMP,test)  ## execute the notebooks from their text forms, outputs kept
 	cd notebooks && for script in *.py; do ../$(BIN)/jupytext --to ipynb --execute $$script || exit 1; done
 
 clean:  ## remove what the commands made
-	rm -rf $(VENV) .venv-lowest .venv-newest out site
+	rm -rf $(VENV) .venv-lowest .venv-newest out site build jupyter_execute docs/notebooks docs/reference
 
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -1,10 +1,11 @@
-"""Documents say what is: examples run, names and equations exist, the site holds every name.
-
-Notebooks do not drift from their text forms.
+"""Documentation agrees with the code: examples run, cited names and equations exist, the reference
+lists every public name, and notebooks agree with their text forms.
 """
 
 import ast
+import enum
 import importlib
+import inspect
 import re
 import subprocess
 import sys
@@ -15,13 +16,20 @@ from pathlib import Path
 import jupytext
 import pytest
 
+import polhode as ph
+
 ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT / "docs" / "_ext"))
+
+from polhode_docs import public_names, reference_pages, signatures
+
 NOTEBOOKS = ROOT / "notebooks"
 PAIRS = sorted({path.stem for path in NOTEBOOKS.glob("*.*") if path.suffix in (".py", ".ipynb")})
 NUMBERED = {"000": 39, "002": 12, "003": 29}
 LIMIT = 600_000  # bytes of an executed notebook
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
-SKETCHES = {"identifiability.md": 2, "light_curves.md": 1}  # need what polhode does not bring
+SKETCHES = {"identifiability.md": 2, "light_curves.md": 1}  # `py`: need more than polhode
+WIDTH = 100  # columns of a code box
 BADGE = re.compile(
     r"\[!\[Open in Colab\]\(https://colab\.research\.google\.com/assets/colab-badge\.svg\)\]"
     r"\(https://colab\.research\.google\.com/github/([\w-]+/[\w-]+)/blob/main/notebooks/(\w+)\.ipynb\)"
@@ -139,9 +147,15 @@ def examples(path: Path) -> str:
 def test_examples_are_marked_so_that_they_are_run():
     for path in PAGES:
         text = path.read_text(encoding="utf-8")
-        marks = re.findall(r"^```(?!sh|toml|text)(.+)$", text, re.M)
+        marks = re.findall(r"^```(?!sh|toml|text|\{)(.+)$", text, re.M)  # {include} is a directive
         others = [mark for mark in marks if mark.strip() != "python"]
         assert len(others) == SKETCHES.get(path.name, 0), (path.name, others)
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda p: p.stem)
+def test_examples_fit_into_the_box(path):
+    boxes = re.findall(r"^```\w*\n(.*?)^```", path.read_text(encoding="utf-8"), re.S | re.M)
+    assert not [line for box in boxes for line in box.split("\n") if len(line) > WIDTH]
 
 
 @pytest.mark.slow
@@ -154,26 +168,113 @@ def test_examples_run(path, tmp_path):
     assert done.returncode == 0, done.stderr[-3000:]
 
 
-def public_names() -> set[str]:
-    """What the packages' ``__init__.py`` files export (``from a import b as b``), dotted."""
-    package = ROOT / "src" / "polhode"
-    found = set()
-    for path in [package / "__init__.py", *package.glob("[a-z]*/__init__.py")]:
-        module = ".".join(("polhode", *path.parent.relative_to(package).parts))
-        if module in ("polhode.cli", "polhode._parts"):  # a command; what the parts are made of
-            continue
-        holder = importlib.import_module(module)
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            for alias in node.names if isinstance(node, ast.ImportFrom) else ():
-                if alias.asname == alias.name and not alias.name.startswith("_"):
-                    found.add(f"{module}.{alias.name}")
-        found -= {name for name in found if isinstance(resolve(name), type(holder))}
-    return found
+NAMES = public_names.public_names()
+
+
+def public_callables(kind: type | tuple[type, ...]) -> list:
+    """Public classes or functions, each once."""
+    return list({id(x): x for x in map(resolve, NAMES) if isinstance(x, kind)}.values())
+
+
+def test_the_stub_lists_what_the_package_exports():
+    assert len(NAMES) > 50
+    assert len(NAMES) == len(set(NAMES))
+    top = {name for name in NAMES if name.count(".") == 1}
+    assert top == {f"polhode.{name}" for name in ph.__all__}
+    for name in NAMES:
+        resolve(name)
+    for namespace in public_names.namespaces():
+        assert public_names.names_in(namespace), namespace
 
 
 def test_every_public_name_has_a_docstring():
-    bare = sorted(name for name in public_names() if not (resolve(name).__doc__ or "").strip())
+    bare = sorted(name for name in NAMES if not (resolve(name).__doc__ or "").strip())
     assert not bare
+
+
+def directives(text: str, page: str) -> list[str]:
+    """The names that a page of the reference documents, in full."""
+    module = page
+    found = []
+    for directive, name in re.findall(r"^\.\. (py:\w+|auto\w+):: (\S+)$", text, re.M):
+        if directive == "py:currentmodule":
+            module = name
+        elif directive == "py:module":
+            module = name
+            found.append(name)
+        else:
+            found.append(name if name.startswith(f"{module}.") else f"{module}.{name}")
+    return found
+
+
+def test_the_reference_documents_every_public_name_once():
+    pages = reference_pages.pages()
+    found = [name for page, text in pages.items() for name in directives(text, page)]
+    assert sorted(found) == sorted(NAMES)
+    listed = re.findall(r":py:obj:`\w+ <([\w.]+)>`", pages["index.rst"])
+    assert sorted(listed) == sorted(set(NAMES) - {n for n in NAMES if inspect.ismodule(resolve(n))})
+
+
+def test_the_groups_of_the_reference_hold_public_names_alone():
+    grouped = [name for _, _, row in public_names.GROUPS.values() for name in row.split()]
+    assert sorted(grouped) == sorted(public_names.names_in())
+
+
+def parameters(signature: str) -> list[str]:
+    arguments = ast.parse(f"def f{signature}: pass").body[0].args
+    each = [*arguments.posonlyargs, *arguments.args, arguments.vararg, *arguments.kwonlyargs]
+    return [argument.arg for argument in [*each, arguments.kwarg] if argument is not None]
+
+
+@pytest.mark.parametrize(
+    "thing",
+    [x for x in public_callables(type) if not issubclass(x, enum.Enum | Exception)],
+    ids=lambda x: x.__name__,
+)
+def test_classes_show_the_arguments_of_their_constructor(thing):
+    if getattr(thing, "__parameters__", ()) or not inspect.isclass(thing):
+        pytest.skip("a type alias")
+    assert parameters(signatures.of_class(thing)) == list(inspect.signature(thing).parameters)
+
+
+def test_functions_show_their_arguments():
+    functions = [x for x in public_callables(object) if inspect.isfunction(x)]
+    assert len(functions) > 50
+    for function in functions:
+        shown, _ = signatures.of_function(function)
+        assert parameters(shown) == list(inspect.signature(function).parameters), function
+
+
+def test_signatures_are_those_of_the_source():
+    shown, returned = signatures.of_function(ph.simulate)
+    assert "ts: Float[ArrayLike, '*#b t']" in shown
+    assert "method: AbstractMethod | None=None" in shown
+    assert returned == "Trajectory"
+    assert signatures.of_class(ph.Crossings).startswith("(times: Float[Array, '*b m'], ")
+    assert signatures.of_property(ph.Trajectory.energy) == "Float[Array, '*b t']"
+    assert signatures.of_class(ph.Status) is None
+
+
+def test_docstrings_become_markup():
+    text = "Of |L| and ``|L|``: 2 * 3, **bold**, see docs/fits.md.\n\n    x = 2 * y\n\n- one\n"
+    made = reference_pages.markup(text)
+    assert made == (
+        "Of \\|L\\| and ``|L|``: 2 \\* 3, **bold**, see :doc:`docs/fits.md </fits>`.\n\n"
+        ".. code-block:: python\n\n    x = 2 * y\n\n- one\n"
+    )
+
+
+def test_formulas_become_mathml():
+    pytest.importorskip("latex2mathml", reason="the group docs is not installed")
+    pytest.importorskip("sphinx", reason="the group docs is not installed")
+    mathml = importlib.import_module("polhode_docs.mathml")
+    assert mathml.TAG.search("a = b. \\tag{12}")[1] == "12"
+    assert mathml.TAG.search("a = b") is None
+    formula = mathml.mathml(r"\sin v / |L| = -1", "block")
+    assert formula.startswith("<math xmlns")
+    assert '<mi>sin</mi><mspace width="0.167em" /><mi>v</mi>' in formula
+    assert '<mo lspace="0" rspace="0">/</mo>' in formula
+    assert '<mo form="prefix">&#x02212;</mo>' in formula
 
 
 def test_the_source_cites_what_a_reader_can_open():
@@ -187,22 +288,39 @@ def test_the_source_cites_what_a_reader_can_open():
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory) -> Path:
-    """The built site; the build itself fails at a broken link."""
-    pytest.importorskip("mkdocstrings", reason="the group docs is not installed")
+    """The built site; a warning, such as a broken link, fails the build."""
+    for module in ("sphinx", "furo", "myst_nb", "latex2mathml"):
+        pytest.importorskip(module, reason="the group docs is not installed")
     folder = tmp_path_factory.mktemp("site")
-    command = [sys.executable, "-m", "mkdocs", "build", "--quiet", "--site-dir", folder]
+    command = [sys.executable, "-m", "sphinx", "-W", "--keep-going", "-q", "docs"]
+    command += ["-d", folder / "doctrees", folder / "site"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-3000:]
-    return folder
+    return folder / "site"
 
 
 @pytest.mark.slow
-def test_the_reference_holds_every_public_name(site):
+def test_the_inventory_lists_every_public_name(site):
     packed = (site / "objects.inv").read_bytes().split(b"\n", 4)[4]
-    listed = {line.split(" ", 1)[0] for line in zlib.decompress(packed).decode().splitlines()}
-    missing = sorted(name for name in public_names() if name not in listed)
-    assert not missing
-    assert "polhode.no_such_name" not in listed
+    rows = [line.split(" ") for line in zlib.decompress(packed).decode().splitlines()]
+    listed = {row[0] for row in rows if row[1].startswith("py:")}
+    assert sorted(set(NAMES) - listed) == []
+    public = {name for name in listed if not re.search(r"\._|^_", name)}
+    members = {name for name in public if name.rpartition(".")[0] in NAMES}
+    assert sorted(public - members - set(NAMES) - {"polhode"}) == []
+    assert {"polhode.Trajectory.energy", "polhode.Inertia.from_moments"} <= members
+
+
+@pytest.mark.slow
+def test_a_class_shows_its_constructor_and_links_its_types(site):
+    page = (site / "reference" / "simulation.html").read_text(encoding="utf-8")
+    entry = page[page.index('id="polhode.Scene"') :]
+    entry = entry[: entry.index("</dt>")]
+    assert re.findall(r'class="n"><span class="pre">(\w+)<', entry)[:4] == [
+        "inertia", "potential", "torque", "rotors",
+    ]  # fmt: skip
+    assert 'href="bodies.html#polhode.Inertia"' in entry
+    assert "jaxlib" not in page
 
 
 @pytest.mark.slow
@@ -221,6 +339,22 @@ def test_the_site_needs_no_network(site):
         if address
     }
     assert not asked
-    assert "<math xmlns" in (site / "equations.html").read_text(encoding="utf-8")
-    assert "arithmatex" not in (site / "equations.html").read_text(encoding="utf-8")
+    styles = "".join(path.read_text(encoding="utf-8") for path in site.rglob("*.css"))
+    assert not re.findall(r"(?:url\(|@import )[\"']?https?:[^)\"']*", styles)
+    assert '<script src="searchindex.js"' in (site / "search.html").read_text(encoding="utf-8")
+    assert "crossings" in (site / "searchindex.js").read_text(encoding="utf-8")
     assert (site / "motion" / "t_handle.html").stat().st_size > 500_000
+
+
+@pytest.mark.slow
+def test_pages_hold_formulas_figures_and_stored_outputs(site):
+    formulas = (site / "free_motion.html").read_text(encoding="utf-8")
+    assert len(re.findall(r'class="eqno" id="equation-\d+"', formulas)) == 16
+    assert "<math xmlns" in formulas
+    assert "\\frac" not in re.sub(r"<[^>]+>", "", formulas)
+    assert ".svg" in (site / "benchmarks.html").read_text(encoding="utf-8")
+    for name in PAIRS:
+        page = (site / "notebooks" / f"{name}.html").read_text(encoding="utf-8")
+        assert "cell_output" in page, name
+    answers = (site / "faq.html").read_text(encoding="utf-8")
+    assert answers.count("<dd>") > 10
