@@ -4,7 +4,7 @@ Signatures and annotations stand at the definitions. The order and the headings 
 reference.
 """
 
-# Simulation
+# Simulation: a scene, an initial state and times give a trajectory.
 from ._simulate import simulate as simulate, explain as explain
 from ._scene import Scene as Scene, State as State
 from ._trajectory import Trajectory as Trajectory
@@ -12,14 +12,14 @@ from ._method import Record as Record, Status as Status, SimulationError as Simu
 from ._plan import Plan as Plan
 from ._propagate import propagate as propagate, Propagation as Propagation
 
-# Events
+# Events: when a function of attitude, rates and time crosses zero.
 from ._events import Event as Event, crossings as crossings, Crossings as Crossings
 
-# Bodies
+# Bodies: inertia, mass properties, and the periods of the free motion.
 from .inertia import Inertia as Inertia, MassProperties as MassProperties
 from ._closed_forms import periods as periods, Periods as Periods, Mode as Mode
 
-# Potentials and orbits
+# Potentials and orbits: conservative parts of a scene; potentials add with `+`.
 from ._scene import (
     UniformGravity as UniformGravity,
     GravityGradient as GravityGradient,
@@ -31,7 +31,7 @@ from ._scene import (
     LVLH as LVLH,
 )
 
-# Torques and control
+# Torques and control: external torques, damping and control laws; they add with `+`.
 from ._scene import (
     BodyTorque as BodyTorque,
     SpaceTorque as SpaceTorque,
@@ -49,7 +49,7 @@ from ._scene import (
     AbstractTorque as AbstractTorque,
 )
 
-# Wheels
+# Wheels: reaction and momentum wheels, with motors and bearings; they add with `+`.
 from ._scene import (
     Rotor as Rotor,
     Motor as Motor,
@@ -59,7 +59,7 @@ from ._scene import (
     AbstractCoupling as AbstractCoupling,
 )
 
-# Methods
+# Methods: chosen by the library unless one of them is passed to `simulate`.
 from ._closed_forms import (
     ClosedForm as ClosedForm,
     SymmetricTop as SymmetricTop,
@@ -75,7 +75,7 @@ from ._integrate import (
 )
 from ._method import AbstractMethod as AbstractMethod
 
-# The Hamiltonian
+# The Hamiltonian: in ZYZ Euler angles, its equations of motion and their matrices.
 from ._hamiltonian import (
     hamiltonian as hamiltonian,
     hamiltons_equations as hamiltons_equations,
@@ -83,14 +83,14 @@ from ._hamiltonian import (
     HamiltonianMatrices as HamiltonianMatrices,
 )
 
-# Frames and sensors
+# Frames and sensors: rotating frames and sensor models; more in `polhode.frames`.
 from .frames import (
     RotatingFrame as RotatingFrame,
     accelerometer as accelerometer,
     gyroscope as gyroscope,
 )
 
-# Fits
+# Fits: inertia and other numbers from recordings; more in `polhode.fit`.
 from .fit import (
     fit_inertia as fit_inertia,
     fit_recordings as fit_recordings,

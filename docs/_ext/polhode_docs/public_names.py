@@ -4,58 +4,10 @@ Nothing of polhode is imported here: the tests compare this list with the packag
 """
 
 import ast
+import re
 from pathlib import Path
 
 PACKAGE = Path(__file__).resolve().parents[3] / "src" / "polhode"
-
-GROUPS = {
-    "simulation": (
-        "Simulation",
-        "A scene, an initial state and times give a trajectory; events; states for filters.",
-        """
-        simulate explain Scene State Trajectory Record Status SimulationError Plan
-        crossings Event Crossings propagate Propagation
-        """,
-    ),
-    "methods": (
-        "Methods",
-        "The solution method is chosen by the library unless one of these is passed to `simulate`.",
-        """
-        AbstractMethod ClosedForm LagrangeTop SymmetricTop FixedAxis LiePoisson EulerAngles
-        Extrapolation Splitting FlowAdjoint
-        """,
-    ),
-    "bodies": (
-        "Bodies",
-        "Inertia, mass properties, and the periods of the free motion.",
-        "Inertia MassProperties periods Periods Mode",
-    ),
-    "torques": (
-        "Potentials, torques and wheels",
-        "What a scene holds beside the body. Parts of one kind are added with `+`.",
-        """
-        AbstractPotential UniformGravity GravityGradient Potential
-        AbstractOrbit KeplerOrbit StateOrbit LVLH
-        AbstractTorque BodyTorque SpaceTorque FeedbackTorque RelativeTorque LinearDamping
-        QuadraticDamping EnergySink Pulses Pointing RateDamping MagneticDipole BDot DipoleField
-        AbstractRotor Rotor Motor AbstractCoupling ViscousCoupling CoulombFriction
-        """,
-    ),
-    "hamiltonian": (
-        "The Hamiltonian",
-        "The Hamiltonian in ZYZ Euler angles, its equations of motion, and their matrices.",
-        "hamiltonian hamiltons_equations HamiltonianMatrices hamiltonian_matrices",
-    ),
-    "sensors": (
-        "Sensors and fits",
-        "Sensor models, rotating frames and fits; more in `polhode.frames` and `polhode.fit`.",
-        """
-        RotatingFrame accelerometer gyroscope
-        fit_inertia fit_recordings fit_scene
-        """,
-    ),
-}
-"""Pages of the names of `polhode` itself: title, introduction, names."""
 
 
 def _statements(path: Path):
@@ -95,14 +47,25 @@ def public_names() -> list[str]:
 
 
 def grouped() -> dict[str, tuple[str, str, list[str]]]:
-    """The pages of `polhode`: title, introduction, names; those of no group come last."""
-    listed = names_in()
-    pages = {
-        page: (title, text, [name for name in row.split() if name in listed])
-        for page, (title, text, row) in GROUPS.items()
-    }
-    placed = {name for _, _, row in pages.values() for name in row}
-    others = [name for name in listed if name not in placed]
-    if others:
-        pages["others"] = ("Others", "", others)
+    """The pages of `polhode`: title, introduction, names, by the headings of the stub.
+
+    A heading is a comment `# Title: introduction` at the start of a line; the names of the imports
+    below it, up to the next heading, stand on its page. The namespaces have pages of their own.
+    """
+    text = (PACKAGE / "__init__.pyi").read_text(encoding="utf-8")
+    headings = [
+        (number, *match.groups())
+        for number, line in enumerate(text.splitlines(), 1)
+        if (match := re.fullmatch(r"# ([^:]+): (.+)", line))
+    ]
+    pages: dict[str, tuple[str, str, list[str]]] = {}
+    for node, name in _statements(PACKAGE / "__init__.pyi"):
+        if node.module is None:
+            continue
+        above = [heading for heading in headings if heading[0] < node.lineno]
+        if not above:
+            raise ValueError(f"{name} stands above the first heading of the stub")
+        _, title, text = above[-1]
+        page = re.sub(r"\W+", "_", title.lower())
+        pages.setdefault(page, (title, text[0].upper() + text[1:], []))[2].append(name)
     return pages

@@ -63,9 +63,10 @@ def fit_light_curve(
     degrees, else ``SeeligerPhase()``). ``pairs``: instead of those from the series.
     ``max_frequency``: the highest frequency of the search, per day. ``floor`` [mag]: added
     to the errors in quadrature, growing with the phase angle, for what an ellipsoid cannot be.
-    ``offset_sigma``: see ``LightCurve.columns``; None: of a calibrated curve with eight groups or more it is learnt from
-    the best motion found, and all are fitted again with it. ``limit``: residuals beyond as many
-    sigma count by their size, not their square. Needs float64 (``jax_enable_x64``).
+    ``offset_sigma``: see ``LightCurve.columns``;
+    None: of a calibrated curve with eight groups or more it is learnt from the best motion found,
+    and all are fitted again with it. ``limit``: residuals beyond as many sigma count by their size,
+    not their square. Needs float64 (``jax_enable_x64``).
 
     Raises RuntimeError in float32, ValueError for a light curve without directions.
     """
