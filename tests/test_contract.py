@@ -51,6 +51,25 @@ def test_a_fresh_process_finds_the_names(call):
     assert result.returncode == 0, result.stderr[-2000:]
 
 
+FREE = """
+import sys, polhode as ph
+scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]))
+ph.simulate(scene, ph.State([1, 0, 0, 0], [0.1, 1.0, 0.1]), [0.0, 1.0])
+ph.crossings, ph.propagate, ph.Trajectory
+heavy = ("diffrax", "optimistix", "lineax", "pydantic", "scipy", "matplotlib", "xarray", "typer")
+applications = [f"polhode.{x}" for x in ("fit", "lightcurve", "plot", "files", "ensemble", "cli")]
+print([name for name in (*heavy, *applications) if name in sys.modules])
+ph.LiePoisson()
+print("diffrax" in sys.modules)
+"""
+
+
+def test_a_free_body_loads_neither_diffrax_nor_applications():
+    result = subprocess.run([sys.executable, "-c", FREE], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert result.stdout.split("\n")[:2] == ["[]", "True"]
+
+
 def members(kind: type) -> Iterator[tuple[str, Callable, bool]]:
     """Public methods and properties of a class and its bases here: (name, function, bound)."""
     for base in kind.__mro__:

@@ -359,3 +359,15 @@ def test_pages_hold_formulas_figures_and_stored_outputs(site):
         assert "cell_output" in page, name
     answers = (site / "faq.html").read_text(encoding="utf-8")
     assert answers.count("<dd>") > 10
+
+
+def test_the_meaning_of_rtol_stands_in_one_place_that_all_cite():
+    page = (ROOT / "docs" / "methods.md").read_text(encoding="utf-8")
+    assert page.count("## What `rtol` means") == 1
+    assert "What `rtol` means" in ph.simulate.__doc__
+    scene = ph.Scene(ph.Inertia.from_moments([1, 2, 2.5]), torque=ph.LinearDamping([1, 2, 3]))
+    plan = ph.explain(scene, ph.State([1, 0, 0, 0], [0.1, 1.0, 0.1]), [0.0, 1.0])
+    assert "docs/methods.md: What rtol means" in str(plan)
+    for name in ("events", "float32", "integrators", "comparison", "scene_files"):
+        text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
+        assert "methods.md#what-rtol-means" in text, name

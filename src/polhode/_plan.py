@@ -218,6 +218,9 @@ def _skipped(scene: Scene, method: AbstractMethod, record: Record) -> tuple[str,
     return tuple(reasons)
 
 
+_MEANING = "as the steps estimate it (docs/methods.md: What rtol means)"
+
+
 def _error(method: AbstractMethod, scene: Scene, state: State, ts: Array, rtol: Array) -> str:
     """The error of the attitude that is to be expected, in words."""
     eps = float(jnp.finfo(state.wxyz.dtype).eps)
@@ -225,14 +228,14 @@ def _error(method: AbstractMethod, scene: Scene, state: State, ts: Array, rtol: 
         if not method.keeps_rtol:
             return "as the steps asked for make it"
         if not is_concrete(rtol):
-            return "about rtol rad at every saved time, by an estimate that the steps compute"
+            return f"about rtol rad at every saved time, {_MEANING}"
         if is_concrete(state.omega_body, ts) and 4 * eps * _turned(state, ts) > float(rtol):
             turned = _turned(state, ts)
             return (
                 f"about {4 * eps * turned:.0e} rad at the last time: rounding of {turned:.2g} rad"
                 f" turned takes more than the {rtol:.0e} asked for"
             )
-        return f"about {rtol:.0e} rad at every saved time, by an estimate that the steps compute"
+        return f"about {rtol:.0e} rad at every saved time, {_MEANING}"
     if getattr(method, "compensated", False) and scene.inertia.symmetry is Symmetry.NONE:
         return f"rounding only: about {4 * eps:.0e} rad at any time (compensated phases)"
     if not is_concrete(state.omega_body, ts):

@@ -60,9 +60,9 @@ def simulate(
       ``grad`` for meshes of explicit axes).
     - ``ts``: (T,) or (..., T) [s], strictly increasing or strictly decreasing.
     - ``method``: None lets the library choose; or ``ph.LiePoisson(...)``, ``ph.EulerAngles(...)``.
-    - ``rtol``: error asked for, attitude in radians and momenta relative to their size, at the
-      last time when the library chooses the method, of each step where the method says so;
-      None: 1e-9 in float64, 1e-5 in float32. Exact methods ignore it.
+    - ``rtol``: bound of the accumulated local error at the saved times, of the attitude in radians
+      and of the momentum relative to its size; None: 1e-9 in float64, 1e-5 in float32. Closed
+      forms ignore it. What it controls and what not: docs/methods.md, "What `rtol` means".
     - ``record``: what to keep; None: attitude and rates at all times.
     - ``until``: a ``ph.Event`` at which each body stops: its times and samples from there on are
       those of the event, so that ``Trajectory.last`` is the state to go on from; its time is

@@ -19,6 +19,7 @@ from polhode._kernels import FEW, kernel
 from polhode._method._base import AbstractMethod, Record, Samples
 from polhode._method._options import check_options
 from polhode._method._status import Status
+from polhode._parts import AbstractPart
 from polhode._scene import Scene, State
 
 
@@ -322,10 +323,13 @@ _ENDED = (Status.SUCCESSFUL, Status.MAX_STEPS, Status.STEP_FAILED, Status.NOT_FI
 
 
 def _may_jump(scene: Scene) -> bool:
-    """Whether a function of the user's acts on the body: orbits of this package are smooth."""
+    """Whether a function of the user's or a part that is not smooth acts on the body."""
+
+    def is_sharp(x) -> bool:
+        return not x.smooth if isinstance(x, AbstractPart) else callable(x)
+
     parts = (scene.potential, scene.torque, scene.rotors)
-    found = (x for x in jax.tree.leaves(parts, is_leaf=callable) if callable(x))
-    return not all(hasattr(x, "core_ranks") for x in found)
+    return any(is_sharp(x) for x in jax.tree.leaves(parts, is_leaf=is_sharp))
 
 
 class LiePoisson(AbstractIntegration):

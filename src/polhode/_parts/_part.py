@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -27,7 +27,12 @@ class AbstractPart(eqx.Module):
 
     Array fields that bodies may differ in are declared by ``shaped``; what stands in any other
     field is shared by all bodies.
+
+    ``smooth``: whether what the part contributes is a smooth function of state and time between
+    the edges that it declares. Steps are searched for jumps of parts that are not.
     """
+
+    smooth: ClassVar[bool] = True
 
     @property
     def core_ranks(self) -> dict[str, int]:

@@ -1,6 +1,7 @@
 """Ready-made control: pointing and rate damping, a magnetic dipole in a field."""
 
 from collections.abc import Callable, Sequence
+from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,6 +28,8 @@ class Pointing(AbstractTorque):
 
     Raises ValueError for negative gains or a zero quaternion.
     """
+
+    smooth: ClassVar[bool] = False  # the shorter way to the target changes at half a turn
 
     kp: Float[Array, "*#b 3"] = shaped(3)
     kd: Float[Array, "*#b 3"] = shaped(3)
