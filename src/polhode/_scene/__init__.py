@@ -19,7 +19,6 @@ from polhode._scene._orbit import (
     AbstractOrbit as AbstractOrbit,
     KeplerOrbit as KeplerOrbit,
     StateOrbit as StateOrbit,
-    eccentric_anomaly as eccentric_anomaly,
 )
 from polhode._scene._potentials import (
     AbstractPotential as AbstractPotential,

@@ -1,7 +1,7 @@
 """Position and velocity on a Kepler orbit: gravity gradients and orbit frames follow it."""
 
 import abc
-from collections.abc import Callable
+import math
 
 import equinox as eqx
 import jax
@@ -20,70 +20,111 @@ from polhode._checks import (
 from polhode._parts import AbstractPart, shaped
 
 
-@jax.jit
-def eccentric_anomaly(mean: Float[Array, "*b"], eccentricity: Float[Array, "*b"]) -> Array:
-    """E in [-pi, pi] with E - e sin E = M [rad] for 0 <= e < 1, M within [-pi, pi]."""
+def anomaly_at_periapsis(mean: Array, gap: Array, eccentricity: Array, hyperbolic: bool) -> Array:
+    """Eccentric (hyperbolic) anomaly for a mean anomaly, without loops and without derivatives.
 
-    def above(m, e):
-        # sin E <= 1; sin E <= E; and E - sin E >= 0.506 E^3/6 up to pi, where e < 1 only lowers E
-        bounds = jnp.minimum(m + e, m / (1 - e))
-        return jnp.minimum(bounds, jnp.cbrt(m * (6 / 0.506)))
-
-    def step(x, m, e):
-        half = jnp.sin(x / 2)
-        return x - ((1 - e) * x + e * _lag(x) - m) / (1 - e + 2 * e * half * half)
-
-    return _newton(step, above, mean, eccentricity)
-
-
-@jax.jit
-def hyperbolic_anomaly(mean: Float[Array, "*b"], eccentricity: Float[Array, "*b"]) -> Array:
-    """F with e sinh F - F = M [rad] for e > 1."""
-
-    def above(m, e):
-        # sinh F >= F, sinh F - F >= F^3/6, and e sinh F = M + F with what bounds F
-        most = jnp.minimum(m / (e - 1), jnp.cbrt(6 * m / e))
-        return jnp.minimum(most, jnp.arcsinh((m + most) / e))
-
-    def step(x, m, e):
-        half = jnp.sinh(x / 2)
-        return x - ((e - 1) * x + e * _lead(x) - m) / (e - 1 + 2 * e * half * half)
-
-    return _newton(step, above, mean, eccentricity)
-
-
-def _newton(step: Callable, above: Callable, mean: Array, eccentricity: Array) -> Array:
-    """The root, which has the sign of ``mean``: by Newton's method from ``above`` it.
-
-    From there it descends monotonically; the last two steps carry the derivatives.
+    ``mean`` [rad], of an ellipse within [-pi, pi]; ``gap``: |1 - e|, which the caller knows without
+    cancellation. The relative error is below 1e-13 (ellipses) and 1e-16 (hyperbolas) plus rounding.
+    F. L. Markley, Celest. Mech. Dyn. Astr. 63 (1995) 101, for the starting value of ellipses.
     """
     sign = jnp.where(mean < 0, -1, 1).astype(mean.dtype)
-    m, e = jax.lax.stop_gradient((jnp.abs(mean), eccentricity))
-    root = jax.lax.fori_loop(0, 8, lambda _, x: step(x, m, e), above(m, e))
-    root = jax.lax.stop_gradient(root)
-    for _ in range(2):
-        root = step(root, sign * mean, eccentricity)
-    return sign * root
+    m = jnp.abs(mean)
+    if hyperbolic:
+        # e sinh F - F exceeds (e - 1) F + e F^3/6, so that the root of this cubic exceeds F, and so
+        # does asinh((M + root)/e), by less than 2 per cent
+        p, h = 2 * gap / eccentricity, 3 * m / eccentricity
+        w = _power(h + jnp.sqrt(h * h + p * p * p), 1 / 3)
+        x = jnp.arcsinh((m + 2 * h / (w * w + p + p * p / (w * w))) / eccentricity)
+    else:
+        alpha = 3 * jnp.pi**2 + 1.6 * jnp.pi * (jnp.pi - m) / (1 + eccentricity)
+        alpha = alpha / (jnp.pi**2 - 6)
+        d = 3 * gap + alpha * eccentricity
+        q = 2 * alpha * d * gap - m * m
+        r = (3 * alpha * d * (d - gap) + m * m) * m
+        w = _power(r + jnp.sqrt(q * q * q + r * r), 2 / 3)
+        x = (2 * r * w / (w * w + w * q + q * q) + m) / d
+    zero = jnp.zeros_like(x)
+    for _ in range(2 if hyperbolic else 1):
+        x = x + _correction(_functions(x, hyperbolic), x, m, gap, eccentricity, zero, hyperbolic)
+    return sign * x
 
 
-def _lag(x: Array) -> Array:
-    """x - sin x, without cancellation at small x."""
+def passed_anomaly(
+    x: Array, mean: Array, gap: Array, a: Array, b: Array | float, hyperbolic: bool
+) -> tuple[Array, Array]:
+    """sin x and 1 - cos x, where x - a sin x + b (1 - cos x) = mean; ``x``: nearly the root.
+
+    Of hyperbolas sinh x and cosh x - 1, where a sinh x + b (cosh x - 1) - x = mean. ``gap``:
+    |1 - a|. The derivatives up to the third with respect to the other arguments are right: the
+    correction of a constant x is of fourth order. The rounding of x does not enter the results.
+    """
+    x = jax.lax.stop_gradient(x)
+    sine, turn, lag = _functions(x, hyperbolic)
+    change = _correction((sine, turn, lag), x, mean, gap, a, b, hyperbolic)
+    curved = 1 if hyperbolic else -1
+    cosine = 1 + curved * turn
+    return (
+        sine + change * (cosine + change * curved * (sine / 2 + change * cosine / 6)),
+        turn + change * (sine + change * (cosine / 2 + change * curved * sine / 6)),
+    )
+
+
+def _correction(functions, x, mean, gap, a, b, hyperbolic: bool) -> Array:
+    """Change of x to the root of the equations above, of fourth order in its error.
+
+    Newton's step u with the first terms of the inverse series, u - f2 u^2/(2 f1) + ...
+    """
+    sine, turn, lag = functions
+    curved = 1 if hyperbolic else -1
+    cosine = 1 + curved * turn
+    slope = gap + a * turn + b * sine
+    second = (a * sine + b * cosine) / (2 * slope)
+    third = (a * cosine + curved * b * sine) / (6 * slope)
+    u = (mean - (gap * x + a * lag + b * turn)) / slope
+    return u * (1 - u * (second - u * (2 * second * second - third)))
+
+
+def _functions(x: Array, hyperbolic: bool) -> tuple[Array, Array, Array]:
+    """sin x, 1 - cos x and x - sin x without cancellation; of hyperbolas sinh x, cosh x - 1 and
+    sinh x - x."""
     square = x * x
-    return jnp.where(square < 0.25, x * square / 6 * _series(-square), x - jnp.sin(x))
-
-
-def _lead(x: Array) -> Array:
-    """sinh x - x, without cancellation at small x."""
-    square = x * x
-    return jnp.where(square < 1, x * square / 6 * _series(square), jnp.sinh(x) - x)
+    if hyperbolic:
+        # of exponentials of |x|/2 itself: those of JAX add a logarithm of 2, which costs digits
+        grown = jnp.expm1(jnp.abs(x) / 2)
+        half = jnp.sign(x) * (grown + grown / (1 + grown)) / 2
+        sine, near = half * (1 + grown + 1 / (1 + grown)), 3
+    else:
+        half = jnp.sin(x / 2)
+        sine, near = 2 * half * jnp.cos(x / 2), 10
+    close = jnp.minimum(square, near)
+    series = x * square * _series(close if hyperbolic else -close)
+    lag = sine - x if hyperbolic else x - sine
+    return sine, 2 * half * half, jnp.where(square < near, series, lag)
 
 
 def _series(square: Array) -> Array:
-    """6 (sinh x - x)/x^3 of x^2 up to 1: what is left out is under 1e-18."""
-    total = jnp.ones_like(square)
-    for k in range(8, 0, -1):
-        total = 1 + square * total / ((2 * k + 2) * (2 * k + 3))
+    """(sinh x - x)/x^3 of x^2 within [-10, 3]; what is left out is below 1e-18."""
+    total = jnp.zeros_like(square)
+    for k in range(14, -1, -1):
+        total = 1 / math.factorial(2 * k + 3) + square * total
     return total
+
+
+def _power(x: Array, exponent: float) -> Array:
+    """Of a positive number, to a few digits fewer than ``jnp.power``, which takes longer."""
+    return jnp.exp(exponent * jnp.log(x))
+
+
+def _within_a_turn(angle: Array) -> Array:
+    """The angle [rad] plus whole turns, within [-pi, pi]."""
+    for _ in range(2):  # after a large angle's rounding error may be several turns
+        angle = angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
+    return angle
+
+
+def _from_one(eccentricity: Array, hyperbolic: bool) -> Array:
+    """|1 - e|, exact near one."""
+    return eccentricity - 1 if hyperbolic else 1 - eccentricity
 
 
 class AbstractOrbit(AbstractPart):
@@ -130,6 +171,10 @@ class KeplerOrbit(AbstractConic):
     inclination is counted from, x the direction that the node is counted from. All orbits of a
     batch are of one kind; ``hyperbolic`` (static) tells which where the numbers are traced.
 
+    Without an ``eccentricity`` (None) the orbit is a circle by construction: no equation is solved,
+    and there is no derivative with respect to the eccentricity, as there is with 0.0. The argument
+    of latitude is then ``periapsis`` plus the mean anomaly.
+
     Hand it to ``ph.GravityGradient(mu, orbit)``; ``ph.StateOrbit`` takes place and velocity instead
     of elements. Raises ValueError for mu that is not positive, an axis of the wrong sign, or an
     eccentricity that is negative or 1.
@@ -137,7 +182,7 @@ class KeplerOrbit(AbstractConic):
 
     mu: Float[Array, "*#b"] = shaped()
     semi_major_axis: Float[Array, "*#b"] = shaped()
-    eccentricity: Float[Array, "*#b"] = shaped()
+    eccentricity: Float[Array, "*#b"] | None = shaped()
     inclination: Float[Array, "*#b"] = shaped()
     node: Float[Array, "*#b"] = shaped()
     periapsis: Float[Array, "*#b"] = shaped()
@@ -149,7 +194,7 @@ class KeplerOrbit(AbstractConic):
         self,
         mu,
         semi_major_axis,
-        eccentricity=0.0,
+        eccentricity=None,
         inclination=0.0,
         node=0.0,
         periapsis=0.0,
@@ -158,12 +203,16 @@ class KeplerOrbit(AbstractConic):
         hyperbolic=None,
     ):
         given = locals()
-        numbers = {name: as_number(name, given[name]) for name in self.core_ranks}
+        if eccentricity is None:
+            self.eccentricity = given.pop("eccentricity")
+        numbers = {name: as_number(name, given[name]) for name in self.core_ranks if name in given}
         dtype = jnp.result_type(*(x for x in numbers.values()))
         for name, value in numbers.items():
             setattr(self, name, value.astype(dtype))
         require_positive("mu", self.mu)
-        if is_concrete(self.eccentricity):
+        if self.eccentricity is None:
+            require(not hyperbolic, "hyperbolic=True needs an eccentricity, which is above 1.")
+        elif is_concrete(self.eccentricity):
             e = np.asarray(self.eccentricity)
             if hyperbolic is None:
                 hyperbolic = bool(np.all(e > 1))
@@ -193,7 +242,9 @@ class KeplerOrbit(AbstractConic):
 
     @property
     def momentum(self) -> Float[Array, "*b 3"]:
-        parameter = self.semi_major_axis * (1 - self.eccentricity) * (1 + self.eccentricity)
+        parameter = jnp.abs(self.semi_major_axis)
+        if (e := self.eccentricity) is not None:
+            parameter = parameter * _from_one(e, self.hyperbolic) * (1 + e)
         cn, sn = jnp.cos(self.node), jnp.sin(self.node)
         ci, si = jnp.cos(self.inclination), jnp.sin(self.inclination)
         size = jnp.sqrt(self.mu * parameter)
@@ -202,18 +253,19 @@ class KeplerOrbit(AbstractConic):
 
     def _position(self, t: Array) -> Float[Array, "*b 3"]:
         mean = self.mean_anomaly + self.mean_motion * (t - self.epoch)
-        e = self.eccentricity
-        if self.hyperbolic:
-            anomaly = hyperbolic_anomaly(*jnp.broadcast_arrays(mean, e))
-            along = self.semi_major_axis * (jnp.cosh(anomaly) - e)
-            across = -self.semi_major_axis * jnp.sqrt(e * e - 1) * jnp.sinh(anomaly)
+        axis, e = jnp.abs(self.semi_major_axis), self.eccentricity
+        if not self.hyperbolic:
+            mean = _within_a_turn(mean)
+        if e is None:
+            angle = self.periapsis + mean
+            u, v = axis * jnp.cos(angle), axis * jnp.sin(angle)
         else:
-            mean = mean - 2 * jnp.pi * jnp.round(mean / (2 * jnp.pi))
-            anomaly = eccentric_anomaly(*jnp.broadcast_arrays(mean, e))
-            along = self.semi_major_axis * (jnp.cos(anomaly) - e)
-            across = self.semi_major_axis * jnp.sqrt(1 - e * e) * jnp.sin(anomaly)
-        cw, sw = jnp.cos(self.periapsis), jnp.sin(self.periapsis)
-        u, v = cw * along - sw * across, sw * along + cw * across
+            mean, gap, e = jnp.broadcast_arrays(mean, _from_one(e, self.hyperbolic), e)
+            x = anomaly_at_periapsis(*jax.lax.stop_gradient((mean, gap, e)), self.hyperbolic)
+            sine, turn = passed_anomaly(x, mean, gap, e, 0.0, self.hyperbolic)
+            along, across = axis * (gap - turn), axis * jnp.sqrt(gap * (1 + e)) * sine
+            cw, sw = jnp.cos(self.periapsis), jnp.sin(self.periapsis)
+            u, v = cw * along - sw * across, sw * along + cw * across
         cn, sn = jnp.cos(self.node), jnp.sin(self.node)
         ci, si = jnp.cos(self.inclination), jnp.sin(self.inclination)
         place = (cn * u - sn * ci * v, sn * u + cn * ci * v, si * v)
@@ -290,16 +342,13 @@ class StateOrbit(AbstractConic):
         # e cos E and e sin E at the epoch
         a = 1 - bound
         b = jnp.sum(self.position * self.velocity, axis=-1) / jnp.sqrt(self.mu * axis)
-        mean = n * (t - self.epoch)
-        if self.hyperbolic:
-            x = _hyperbolic_since(*jnp.broadcast_arrays(mean, a, b))
-            half, sine = jnp.sinh(x / 2), jnp.sinh(x)
-        else:
-            mean = mean - 2 * jnp.pi * jnp.round(mean / (2 * jnp.pi))
-            x = _anomaly_since(*jnp.broadcast_arrays(mean, a, b))
-            half, sine = jnp.sin(x / 2), jnp.sin(x)
-        turn = 2 * half * half  # 1 - cos x, or cosh x - 1
-        bound = jnp.abs(bound)
+        bound, mean = jnp.abs(bound), n * (t - self.epoch)
+        if not self.hyperbolic:
+            mean = _within_a_turn(mean)
+        mean, bound, a, b = jnp.broadcast_arrays(mean, bound, a, b)
+        shape = jnp.sum(self.momentum**2, axis=-1) / (self.mu * axis)  # |1 - e^2|
+        nearly = self._passed_anomaly(*jax.lax.stop_gradient((mean, a, b, shape)))
+        sine, turn = passed_anomaly(nearly, mean, bound, a, b, self.hyperbolic)
         f = 1 - turn / bound
         g = (bound * sine + b * turn) / n
         place, velocity = (
@@ -307,33 +356,15 @@ class StateOrbit(AbstractConic):
         )
         return f[..., None] * place + g[..., None] * velocity
 
-
-def _anomaly_since(mean: Array, a: Array, b: Array) -> Array:
-    """x with x - a sin x + b (1 - cos x) = mean, where a = e cos E0 and b = e sin E0."""
-
-    m, p, q = jax.lax.stop_gradient((mean, a, b))
-    at_epoch = jnp.arctan2(q, p)
-    total = at_epoch - q + m
-    total = total - 2 * jnp.pi * jnp.round(total / (2 * jnp.pi))
-    x = eccentric_anomaly(total, jnp.sqrt(p * p + q * q)) - at_epoch
-    x = jax.lax.stop_gradient(x - 2 * jnp.pi * jnp.round((x - m) / (2 * jnp.pi)))
-    for _ in range(2):  # these carry the derivatives
-        half, sine = jnp.sin(x / 2), jnp.sin(x)
-        turn = 2 * half * half
-        x = x - (x - a * sine + b * turn - mean) / (1 - a * (1 - turn) + b * sine)
-    return x
-
-
-def _hyperbolic_since(mean: Array, a: Array, b: Array) -> Array:
-    """x with a sinh x + b (cosh x - 1) - x = mean, where a = e cosh F0 and b = e sinh F0."""
-    m, p, q = jax.lax.stop_gradient((mean, a, b))
-    eccentricity = jnp.sqrt((p - q) * (p + q))
-    at_epoch = jnp.arcsinh(q / eccentricity)
-    x = hyperbolic_anomaly(q - at_epoch + m, eccentricity) - at_epoch
-    x = jax.lax.stop_gradient(x)
-    for _ in range(2):  # these carry the derivatives
-        half, sine = jnp.sinh(x / 2), jnp.sinh(x)
-        turn = 2 * half * half
-        gap = (a - 1) * x + a * _lead(x) + b * turn - mean
-        x = x - gap / (a - 1 + a * turn + b * sine)
-    return x
+    def _passed_anomaly(self, mean: Array, a: Array, b: Array, shape: Array) -> Array:
+        """Difference in anomaly since the epoch, nearly, without derivatives."""
+        if self.hyperbolic:
+            e = jnp.sqrt(1 + shape)
+            at_epoch = jnp.arcsinh(b / e)
+            total = mean + b - at_epoch
+        else:
+            e = jnp.sqrt(a * a + b * b)
+            at_epoch = jnp.arctan2(b, a)
+            total = _within_a_turn(mean + at_epoch - b)
+        x = anomaly_at_periapsis(total, shape / (1 + e), e, self.hyperbolic) - at_epoch
+        return x if self.hyperbolic else mean + _within_a_turn(x - mean)
