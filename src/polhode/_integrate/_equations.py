@@ -246,11 +246,13 @@ class Equations:
         own = own and not self.asks_time
 
         def run(held, told, rtol, horizon, span, y, integrals):
-            given = table(order_for(rtol), y[0].dtype)
+            def table_for(rate):
+                return table(order_for(rtol), y[0].dtype)
+
             limits = Limits(rtol, horizon, _STEPS, False)
             progress = fresh(y, self.compensated, span[0])
             field = Field(rates, units, (held, told), own, by_entry)
-            y, sums, _ = march(field, given, limits, span, y, integrals, progress)
+            y, sums, _ = march(field, table_for, limits, span, y, integrals, progress)
             return y, sums
 
         return kernel(run)(held, told, rtol, horizon, span, list(y), list(integrals))

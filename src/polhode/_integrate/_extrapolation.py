@@ -195,18 +195,18 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
             def rates(held, t, y, along):
                 return problem.rates(held, t, y), []
 
-            order = self.formal_order
-            if order is None:  # for the way from time to time, at the rates of the start
-                _, rate = units(y, rates(held, span[0], y, False)[0])
-                gap = jnp.abs(span[1] - span[0])
+            def table_for(rate):
+                if self.formal_order is not None:
+                    return table(self.formal_order, dtype)
+                gap = jnp.abs(span[1] - span[0])  # for the way from time to time
                 if elapsed is not None:
                     gap = gap / jnp.sum(jnp.where(elapsed > 0, 1, 0)).astype(gap.dtype)
-                order = order_for(rtol, jnp.max(rate, initial=0) * gap.astype(dtype))
-            given = table(order, dtype)
+                return table(order_for(rtol, jnp.max(rate, initial=0) * gap.astype(dtype)), dtype)
+
             limits = Limits(rtol, horizon, self.max_steps, self.jumps)
             own, known = not problem.asks_time, (held, units)
             field = Field(rates, _as_told, known, own, problem.by_entry)
-            y, _, new = march(field, given, limits, span, y, [], progress, elapsed)
+            y, _, new = march(field, table_for, limits, span, y, [], progress, elapsed)
             return y, new
 
         y1, progress = kernel(run)(

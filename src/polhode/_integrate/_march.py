@@ -16,7 +16,6 @@ step decides.
 
 from collections.abc import Callable
 from functools import partial
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax
@@ -188,7 +187,7 @@ class _Fixed(NamedTuple):
 
 def march(
     field: Field,
-    given: Table,
+    table_for: Callable[[Array], Table],
     limits: Limits,
     span: tuple[Array, Array],
     y: list[Array],
@@ -198,7 +197,8 @@ def march(
 ) -> tuple[list[Array], list[Array], Progress]:
     """State and integrals at ``span[1]``, of bodies that are the entries of arrays of one shape.
 
-    A body that has used up ``limits.steps`` ends as NaN. ``elapsed`` (T,): times since the start
+    ``table_for(rate)``: the columns of a step, by the natural rates [rad/s] at the start. A body
+    that has used up ``limits.steps`` ends as NaN. ``elapsed`` (T,): times since the start
     [s] in order, the last that of the end, at which the states are to be saved, as the ``rows`` of
     the progress: a body that has reached one goes on to its next without waiting for others.
     """
@@ -209,8 +209,11 @@ def march(
     eps = float(jnp.finfo(dtype).eps)
     rest = jnp.abs(limits.horizon - progress.gone - length).astype(dtype)
     whole_length, length = length, length.astype(dtype)
-    power = 1 / (given.order.astype(dtype) + 1)
     zero = jnp.zeros_like(y[0])
+    first, _ = field.rates(field.known[0], start, y, False)
+    _, rate = field.units(field.known[1], y, first)
+    given = table_for(rate)
+    power = 1 / (given.order.astype(dtype) + 1)
 
     def worst(x, dead):
         """Of the bodies that share their steps, but for those that are given up."""
@@ -316,9 +319,6 @@ def march(
 
     body = jnp.arange(zero.size, dtype=jnp.int32).reshape(zero.shape)
     fixed = _Fixed(field.known, body, progress.ended)
-    rates, units = bound(fixed)
-    first, _ = rates(start, y, False)
-    _, rate = units(y, first)
     # at first half of what a smooth motion allows, at once the whole way if that is short
     guess = 4 * limits.rtol.astype(dtype) ** power / jnp.maximum(rate, 1 / (length + rest))
     guess = jnp.where(progress.width > 0, progress.width, guess)  # NaN where the rates are
@@ -389,24 +389,42 @@ def _missed(rates, t, width, walk, new, later, weights) -> Array:
     differences of smooth rates fall with their order; those of rates that jump do not.
     """
     gap = GAP * width
-    chord = [GAP * (a - b) for a, b in zip(walk.y, new)]
-    tangent = [gap * f for f in walk.rates]
-    total = jnp.zeros_like(walk.width)
     eps = float(jnp.finfo(width.dtype).eps)
-    for base, there, part, sign, at in (
-        (walk.y, walk.rates, tangent, 1, t),
-        (new, later, chord, -1, t + width),
-    ):
-        rows = [there]
-        for k in (1, 2, 3):
-            now = (at + sign * k * gap).reshape(-1)[0]
-            rows.append(rates(now, [a + k * b for a, b in zip(base, part)], False)[0])
-        sizes = []
-        for _ in range(3):
-            rows = [[b - a for a, b in zip(p, q)] for p, q in pairwise(rows)]
-            sizes.append(weighted_length(weights, rows[0]))
+
+    def pick(at_end, a, b):
+        return [jnp.where(at_end, y, x) for x, y in zip(a, b)]
+
+    def beside(end, total):
+        """One end: 0, the start, or 1. In loops, so that the rates stand in the program once."""
+        at_end = end == 1
+        base, there = pick(at_end, walk.y, new), pick(at_end, walk.rates, later)
+        # along the tangent at the start, back along the chord at the end
+        chord = [a - b for a, b in zip(walk.y, new)]
+        part = [gap * f for f in walk.rates]
+        part = pick(at_end, part, [GAP * x for x in chord])
+        start, sign = jnp.where(at_end, t + width, t), jnp.where(at_end, -1, 1)
+
+        def further(k, found):
+            """Differences of order 0, 1, ... up to the rates ``k`` times so far; the sizes of
+            those from the end on, of which the one of order ``k`` is new."""
+            before, sizes = found
+            k = k.astype(width.dtype)
+            now = (start + sign * k * gap).reshape(-1)[0]
+            row = rates(now, [a + k * b for a, b in zip(base, part)], False)[0]
+            rows = [row]
+            for older in before:
+                row = [a - b for a, b in zip(row, older)]
+                rows.append(row)
+            lengths = [weighted_length(weights, x) for x in rows[1:]]
+            sizes = [jnp.where(k == n, x, y) for n, x, y in zip((1, 2, 3), lengths, sizes)]
+            return rows[:3], sizes
+
+        zero = [jnp.zeros_like(x) for x in there]
+        sizes = [jnp.zeros_like(total)] * 3
+        _, sizes = jax.lax.fori_loop(1, 4, further, ([there, zero, zero], sizes))
         first, second, third = sizes
         noise = 64 * eps * weighted_length(weights, there)
         jumps = third > jnp.maximum(0.5 * jnp.maximum(second, 0.5 * first), noise)
-        total = total + jnp.where(jumps, third * jnp.abs(4 * gap), 0)
-    return total
+        return total + jnp.where(jumps, third * jnp.abs(4 * gap), 0)
+
+    return jax.lax.fori_loop(0, 2, beside, jnp.zeros_like(walk.width))
