@@ -83,14 +83,10 @@ def flatten(part: Any, batch: tuple[int, ...], *, shared: bool = True) -> Any:
     def to_lanes(x, rank):
         core = x.shape[x.ndim - rank :]
         if shared and x.size == int(np.prod(core, dtype=int)):
-            return x.reshape(core)
-        return jnp.broadcast_to(x.reshape(_lead(x, rank) + core), batch + core).reshape(-1, *core)
+            return x if x.shape == core else x.reshape(core)
+        return jnp.broadcast_to(x, batch + core).reshape(-1, *core)
 
-    def full_rank(x, rank):
-        missing = len(batch) - (x.ndim - rank)
-        return x.reshape((1,) * missing + x.shape)
-
-    return map_arrays(map_arrays(part, full_rank), to_lanes)
+    return map_arrays(part, to_lanes)
 
 
 def lane_times(ts: Array, batch: tuple[int, ...]) -> Array:

@@ -20,6 +20,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from polhode._kernels import Distinct
 from polhode._method import AbstractMethod, Record
 from polhode._plan import Ways
 from polhode._scene import Scene, State
@@ -77,7 +78,7 @@ _PROGRAMS: OrderedDict[Any, _Program] = OrderedDict()
 def learn(run: Callable, scene: Scene, given: Any, record: Record, ways: Ways) -> None:
     """Keep what ``ways`` there are to move this scene by ``run(method, scene, state, ts, rtol,
     record)``. ``given``: the record as the caller gave it. All has passed the checks."""
-    leaves, tree = jax.tree.flatten(scene)
+    leaves, tree = jax.tree.flatten(Distinct(scene))
     if not leaves or not all(map(_is_local, leaves)):
         return
     if ways.of_state and ways.methods[0].exact:  # the law of this state, not of the scene
@@ -108,7 +109,7 @@ def _program(run: Callable, method: AbstractMethod, tree: Any, record: Record) -
 
     @jax.jit
     def call(ts, rtol, wxyz, omega, *leaves):
-        scene = jax.tree.unflatten(tree, leaves)
+        scene = jax.tree.unflatten(tree, leaves).value()
         found = run(method, scene, State(wxyz, omega), ts, rtol, record)
         if scene.rotors is None:  # whose motion the initial state decides
             found = eqx.tree_at(lambda t: t.scene, found, _HERE)

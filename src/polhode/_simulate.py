@@ -22,7 +22,7 @@ from polhode._batch import (
 from polhode._checks import ArrayLike, is_concrete
 from polhode._dispatch import again, learn
 from polhode._events import Event, check_until, stopped
-from polhode._kernels import FEW, kernel
+from polhode._kernels import FEW, jit_distinct, kernel
 from polhode._method import (
     AbstractMethod,
     Record,
@@ -126,13 +126,13 @@ def explain(
     return plan(scene, state, ts, method, check_rtol(rtol, state.wxyz.dtype), record)
 
 
-@eqx.filter_jit
+@jit_distinct
 def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> Trajectory:
     """The compiled part: lanes out of batches, the method, and back."""
     return _trajectory(method, scene, state, ts, rtol, record, split)
 
 
-@eqx.filter_jit
+@jit_distinct
 def _begin(method, scene, state, ts, rtol) -> Trajectory:
     """The state at the first time, as the only sample of a trajectory."""
     scene, state = scene.mended(), state.mended("state").as_unit()

@@ -132,3 +132,25 @@ def test_what_results_share_is_worked_out_once():
 
     assert multiplications(True) < 4 * len(given)
     assert multiplications(False) > 12 * len(given)
+
+
+def test_what_rests_on_the_same_arrays_is_worked_out_once():
+    """Calls of compiled functions too; numbers that differ in sign only are not the same."""
+
+    @jax.jit
+    def wave(a, t):
+        return jnp.sinh(jnp.sin(a * t) / (2 + jnp.cos(a * t)))
+
+    def field(a, b, t, y):
+        signs = jnp.arctan2(0.0, -jnp.abs(y)) + jnp.arctan2(-0.0, -jnp.abs(y))
+        return wave(a, t) * y + wave(b, t) + signs
+
+    t, y = jnp.array(0.3), jnp.arange(1.0, 4.0)
+    for a, b, waves in ((2 * t, None, 1), (2 * t, 3 * t, 2)):
+        b = a if b is None else b
+        ready = specialise(jax.make_jaxpr(field)(a, b, t, y), [a, b])
+        program = jax.make_jaxpr(ready.run)(ready.held, t, y)
+        names = [eqn.primitive.name for eqn in program.jaxpr.eqns]
+        assert [names.count(name) for name in ("sin", "cos", "sinh")] == [waves] * 3
+        assert names.count("atan2") == 2
+        np.testing.assert_allclose(ready.run(ready.held, t, y)[0], field(a, b, t, y), rtol=1e-14)

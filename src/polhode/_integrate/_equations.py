@@ -18,7 +18,7 @@ from polhode._integrate._columns import table
 from polhode._integrate._costates import AnyCostate, FlatCostate
 from polhode._integrate._extrapolation import order_for, units_of
 from polhode._integrate._march import Field, Limits, fresh, march
-from polhode._kernels import attached, is_slope, kernel, linear, specialise, zeros
+from polhode._kernels import Distinct, attached, is_slope, kernel, linear, specialise, zeros
 
 _STEPS = 2**20
 """Most steps of a derivative between two saved times."""
@@ -33,11 +33,11 @@ def equations_of(
     """
     leaves, tree = jax.tree.flatten(y0)
     problem = BoundTerm.of(terms, args)
-    arrays, args_tree = jax.tree.flatten(problem.arrays)
+    arrays, args_tree = jax.tree.flatten(Distinct(problem.arrays))
     dtype, time_dtype, static = jnp.result_type(*leaves), t.dtype, problem.static
 
     def opened(given):
-        return BoundTerm(jax.tree.unflatten(args_tree, given), static)
+        return BoundTerm(jax.tree.unflatten(args_tree, given).value(), static)
 
     def directed(given):
         problem = opened(given)

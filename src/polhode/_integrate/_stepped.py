@@ -1,5 +1,6 @@
 """Everything that is stepped: one chart, one solver, one controller, one adjoint, one solve."""
 
+import inspect
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -15,12 +16,16 @@ from polhode._integrate._charts import AbstractChart, EulerChart, LiePoissonChar
 from polhode._integrate._equal_steps import GivenTimes
 from polhode._integrate._flow_adjoint import FlowAdjoint
 from polhode._integrate._segments import Moved, in_segments
-from polhode._kernels import FEW, kernel
+from polhode._kernels import FEW, Distinct, kernel
 from polhode._method._base import AbstractMethod, Record, Samples
 from polhode._method._options import check_options
 from polhode._method._status import Status
 from polhode._parts import AbstractPart
 from polhode._scene import Scene, State
+
+# Without its own ``jit``, which would make one array that stands in several parts of the scene
+# several: all this is part of a compiled program anyway.
+_diffeqsolve = inspect.unwrap(diffrax.diffeqsolve)
 
 
 class AbstractIntegration(AbstractMethod):
@@ -97,7 +102,7 @@ class AbstractIntegration(AbstractMethod):
         lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
 
         def one(chunk):
-            lanes, times = chunk
+            lanes, times = chunk.value()
             scene, state = eqx.combine(lanes, shared)
             times = ts if times is None else times[0]
             return self._solve(scene, state, times, rtol, record)
@@ -105,10 +110,11 @@ class AbstractIntegration(AbstractMethod):
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
         if n <= min(size, _SORTED):
             whole = kernel(one, of_units=True) if n <= FEW else one
-            return whole((lanes, times))
+            return whole(Distinct((lanes, times)))
         # who shares a chunk is of like rate, and none that takes long is left to the end of it
         order = jnp.argsort(-natural_rates(scene, state, ts))
-        found = map_chunks(one, jax.tree.map(lambda x: x[order], (lanes, times)), n, size)
+        sorted_lanes = jax.tree.map(lambda x: x[order], Distinct((lanes, times)))
+        found = map_chunks(one, sorted_lanes, n, size)
         return jax.tree.map(lambda x: x[jnp.argsort(order)], found)
 
     def _start(self, scene, state, ts, record: Record):
@@ -154,7 +160,7 @@ class AbstractIntegration(AbstractMethod):
             stepping = asked.stock(self.solver, y0, term, dynamics) if make is None else make(asked)
         else:
             stepping = asked.given(self.solver, self.controller)
-        solution = diffrax.diffeqsolve(
+        solution = _diffeqsolve(
             term,
             stepping.solver,
             t0=ts[0],

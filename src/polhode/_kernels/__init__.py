@@ -4,6 +4,7 @@ Nothing here changes a result by more than rounding; ``POLHODE_PLAIN=1`` in the 
 all of it off. `README.md` beside this file says what each part buys.
 """
 
+from polhode._kernels._distinct import Distinct as Distinct, jit_distinct as jit_distinct
 from polhode._kernels._fold import Specialised as Specialised, specialise as specialise
 from polhode._kernels._linear import (
     attached as attached,

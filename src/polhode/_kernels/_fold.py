@@ -201,20 +201,38 @@ class _Work:
         self.steps: list[_Step] = []
         self.count = 0
         self.scaled: dict[Any, int] = {}
-        self.products: dict[tuple[int, int], int] = {}
-        self.found: dict[Any, _Held] = {}
+        self.met: dict[Any, list[Any]] = {}  # results of operations, by what they are made of
         self.alive: list[Any] = []  # whose ids are keys above
 
     def slot(self, aval) -> _Slot:
         self.count += 1
         return _Slot(self.count - 1, aval)
 
-    def emit(self, bind, inputs, avals, outs, name="mul") -> list[_Slot]:
-        made = [self.slot(aval) for aval in outs]
+    def once(self, key, inputs, outs, make: Callable[[], list[Any]]) -> list[Any]:
+        """What ``make`` returns; the same again for the same operation on the same inputs.
+
+        ``key``: of the operation; None where it is not known to be the same as another. Parts of a
+        scene that rest on the same arrays, such as one orbit, are so worked out once.
+        """
+        if key is None:
+            return make()
+        names = (_key_of(x) if isinstance(x, _Held) else x for x in inputs)
+        key = key, *names, *((aval.shape, aval.dtype) for aval in outs)
+        if key not in self.met:
+            self.alive += [x.value for x in inputs if isinstance(x, _Held)]
+            self.met[key] = make()
+        return self.met[key]
+
+    def emit(self, bind, inputs, avals, outs, key, name="mul") -> list[_Slot]:
         shapes = [(outs[0] if name in _ELEMENTWISE else aval).shape for aval in avals]
         operands = [(self.operand(x), aval, s) for x, aval, s in zip(inputs, avals, shapes)]
-        self.steps.append(_Step([s.index for s in made], bind, name in _BY_ENTRY, operands))
-        return made
+
+        def make():
+            made = [self.slot(aval) for aval in outs]
+            self.steps.append(_Step([s.index for s in made], bind, name in _BY_ENTRY, operands))
+            return made
+
+        return self.once(key, [x for x, *_ in operands], outs, make)
 
     def operand(self, x) -> Any:
         """A value known before the loop, or the number of one that the loop has made."""
@@ -224,10 +242,7 @@ class _Work:
         index = self.unsigned(x)
         if x.sign > 0:
             return index
-        key = (index, "neg")
-        if key not in self.scaled:
-            self.scaled[key] = self.emit(lax.neg, [_Slot(index, x.aval)], [x.aval], [x.aval])[0][0]
-        return self.scaled[key]
+        return self.emit(lax.neg, [_Slot(index, x.aval)], [x.aval], [x.aval], "neg")[0].index
 
     def unsigned(self, x: _Slot) -> int:
         """The number of a value with its scale, but without its sign."""
@@ -240,7 +255,7 @@ class _Work:
             if x.factors is not None:  # the scaled factor is likely to be met again
                 a, other = (_Slot(index, x.aval) for index in x.factors)
                 b = _Slot(self.unsigned(other._replace(scale=x.scale)), x.aval)
-            self.scaled[key] = self.emit(lax.mul, [a, b], [x.aval] * 2, [x.aval])[0].index
+            self.scaled[key] = self.emit(lax.mul, [a, b], [x.aval] * 2, [x.aval], "mul")[0].index
         return self.scaled[key]
 
     def walk(self, jaxpr, consts, inputs) -> Sequence[_Held | _Slot]:
@@ -265,24 +280,14 @@ class _Work:
         if not eqn.effects and all(isinstance(x, _Held) for x in given):
             numbers = all(x.number is not None for x in given)
             if self.fold or numbers or name in _TAKING_APART:
-                return self.known_once(eqn, given)
+                outs = [v.aval for v in eqn.outvars]
+                return self.once(_operation(eqn), given, outs, lambda: self.known(eqn, given))
         elif self.fold and len(eqn.outvars) == 1:
             simple = self.simplified(name, given, eqn.outvars[0].aval)
             if simple is not None:
                 return [simple]
         avals, outs = ([v.aval for v in vs] for vs in (eqn.invars, eqn.outvars))
-        return self.emit(_binder(eqn), given, avals, outs, name)
-
-    def known_once(self, eqn, given) -> list[_Held]:
-        """The same array for the same equation, when it is met again."""
-        name = eqn.primitive.name
-        if name not in _ELEMENTWISE and name not in _TAKING_APART:
-            return self.known(eqn, given)
-        key = (name, repr(eqn.params), eqn.outvars[0].aval, *(x.key for x in given))
-        if key not in self.found:
-            self.alive += [x.value for x in given]
-            (self.found[key],) = self.known(eqn, given)
-        return [self.found[key]]
+        return self.emit(_binder(eqn), given, avals, outs, _operation(eqn), name)
 
     def known(self, eqn, given) -> list[_Held]:
         """An equation before the loop; numbers stay numbers as long as they can."""
@@ -330,8 +335,9 @@ class _Work:
             if b.number == 0:
                 return a
             one = _Slot(self.unsigned(a), aval)
-            bind = lax.add if a.sign > 0 else lambda x, y: lax.sub(y, x)
-            return self.emit(bind, [one, b], [aval] * 2, [aval])[0]
+            if a.sign > 0:
+                return self.emit(lax.add, [one, b], [aval] * 2, [aval], "add")[0]
+            return self.emit(lax.sub, [b, one], [aval] * 2, [aval], "sub")[0]
         if a.index == b.index:
             p, q = (_Held(aval.dtype.type(1)) if x.scale is None else x.scale for x in (a, b))
             scale = self.combined("add" if a.sign == b.sign else "sub", p, q, aval)
@@ -341,18 +347,15 @@ class _Work:
             scale, parts = a.scale, [_Slot(x.index, aval) for x in (a, b)]
         else:
             scale, parts = None, [_Slot(self.unsigned(x), aval) for x in (a, b)]
-        bind = lax.add if a.sign == b.sign else lax.sub
-        (made,) = self.emit(bind, parts, [aval] * 2, [aval])
+        name, bind = ("add", lax.add) if a.sign == b.sign else ("sub", lax.sub)
+        (made,) = self.emit(bind, parts, [aval] * 2, [aval], name)
         return made._replace(scale=scale, sign=a.sign)
 
     def product(self, a: _Slot, b: _Slot, aval) -> _Held | _Slot:
         """The product of two values of the loop; a scale of either becomes one of the product."""
-        key = (min(a.index, b.index), max(a.index, b.index))
-        if key not in self.products:
-            plain = [_Slot(x.index, aval) for x in (a, b)]
-            (made,) = self.emit(lax.mul, plain, [aval] * 2, [aval])
-            self.products[key] = made.index
-        product: Any = _Slot(self.products[key], aval, None, a.sign * b.sign)
+        plain = [_Slot(index, aval) for index in sorted((a.index, b.index))]
+        (made,) = self.emit(lax.mul, plain, [aval] * 2, [aval], "mul")
+        product: Any = made._replace(sign=a.sign * b.sign)
         for x in (a, b):
             if x.scale is not None:
                 product = self.times(product, x.scale, aval)
@@ -365,12 +368,12 @@ class _Work:
         """Sum, difference or product of two known values; the same one when met again."""
         if a.number is not None and b.number is not None:
             return _Held(aval.dtype.type(_FOLDS[name](a.number, b.number)))
-        key = (name, a.key, b.key, aval.dtype)
-        if key not in self.found:
-            self.alive += [a.value, b.value]
+
+        def make():
             first, second = (jnp.asarray(x.value, aval.dtype) for x in (a, b))
-            self.found[key] = _Held(getattr(jnp, _WORDS[name])(first, second))
-        return self.found[key]
+            return [_Held(getattr(jnp, _WORDS[name])(first, second))]
+
+        return self.once(("combined", name), [a, b], [aval], make)[0]
 
     def times(self, x, factor: _Held, aval) -> _Held | _Slot:
         """``x`` times a known factor, kept as a scale and a sign as long as possible."""
@@ -390,6 +393,21 @@ class _Work:
 
 
 _WORDS = {"add": "add", "sub": "subtract", "mul": "multiply"}
+
+
+def _key_of(x: _Held) -> Any:
+    """Of a number its bits: zeros of either sign are not the same."""
+    return id(x.value) if x.number is None else (x.number.dtype, x.number.tobytes())
+
+
+def _operation(eqn) -> Any:
+    """What tells an operation from others, but for its operands; None where nothing does."""
+    key = (eqn.primitive.name, *sorted(eqn.params.items()))
+    try:
+        hash(key)
+    except TypeError:
+        return None
+    return None if eqn.effects else key
 
 
 def _binder(eqn):

@@ -11,6 +11,7 @@ from jaxtyping import Array
 from polhode import rotation
 from polhode._batch import PARTS, flatten, lane_times, map_arrays
 from polhode._checks import ArrayLike, as_float_array
+from polhode._kernels import jit_distinct
 from polhode._method import AbstractMethod, Record, Status, raise_on_failure
 from polhode._scene import Scene, State, Wheels
 from polhode._trajectory._trajectory import AbstractPropagator, Trajectory
@@ -66,7 +67,7 @@ def moved_through(trajectory: Trajectory, t: Array) -> Trajectory:
     return _moved(trajectory, t, True)
 
 
-@eqx.filter_jit
+@jit_distinct
 def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
     propagator: Any = trajectory.propagator
     batch, ts = trajectory.batch_shape, trajectory.ts
