@@ -1,10 +1,12 @@
 """The motion of any scene as the model of a fit: known torques, rotors, potentials, damping."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
 from polhode._integrate import LiePoisson
 from polhode._method import AbstractMethod
@@ -50,3 +52,36 @@ class SceneMotion(AbstractMotion):
     def __call__(self, tensor, omega, wxyz, times, wheel, unknown):
         scene = self.build(Inertia(full=tensor), unknown)
         return simulated(scene, omega, wxyz, times, self.method, self.rtol)
+
+
+class LeafMotion(AbstractMotion):
+    """Motion of a scene some of whose arrays are unknown, by ``ph.simulate``.
+
+    **Fields:** ``scene``, with the starting values; ``places`` (static): which of its leaves are
+    unknown; ``attitude`` (4,): initial one for recordings without attitudes; ``method`` and
+    ``rtol`` as in ``ph.simulate``.
+    """
+
+    scene: Scene
+    places: tuple[int, ...] = eqx.field(static=True)
+    attitude: Float[Array, " 4"] | None = None
+    method: AbstractMethod | None = None
+    rtol: float | None = eqx.field(static=True, default=None)
+
+    def start(self):
+        leaves = jax.tree.leaves(self.scene)
+        return [leaves[i] for i in self.places]
+
+    def fixes_scale(self):
+        return True
+
+    def with_values(self, values: Sequence[Array]) -> Scene:
+        """The scene with these numbers in place of the unknown ones."""
+        leaves, tree = jax.tree.flatten(self.scene)
+        for i, value in zip(self.places, values, strict=True):
+            leaves[i] = value.astype(leaves[i].dtype)
+        return jax.tree.unflatten(tree, leaves)
+
+    def __call__(self, tensor, omega, wxyz, times, wheel, unknown):
+        scene = self.with_values(unknown)
+        return simulated(scene, omega, wxyz, times, self.method, self.rtol, self.attitude)
