@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode.fit import Recording
-from polhode.fit._scene_fit import places_of
+from polhode._scene._scene import places_of
+from polhode.fit import FitOptions, Recording
 
 BODY = ph.Inertia.from_moments([1.0, 2.0, 2.5])
 STATE = ph.State([0.8, 0.0, 0.6, 0.0], [1.2, -0.8, 1.0])
@@ -34,7 +34,8 @@ def drag_of(rates, throw=True):
     data = Recording.of(TIMES, rates, omega_noise=NOISE)
     start = ph.Scene(BODY, torque=ph.LinearDamping(0.15))
     free = lambda s: [s.torque.c]  # noqa: E731
-    return ph.fit(start, data, free=free, noise_known=True, rtol=1e-7, starts=1, throw=throw)
+    options = FitOptions(trust_noise=True, max_starts=1)
+    return ph.fit_scene(start, data, free=free, rtol=1e-7, options=options, throw=throw)
 
 
 @pytest.mark.slow
@@ -50,7 +51,7 @@ def test_intervals_of_a_drag_hold_the_truth():
     assert 0.92 < inside < 0.98, inside
     np.testing.assert_allclose(np.mean(np.asarray(found.noise)), 1, atol=0.05)
     assert np.all(np.asarray(found.null_count) == 0)
-    assert np.mean(np.asarray(found.finding) == 0) > 0.98
+    assert np.mean(np.asarray(found.diagnostics) == 0) > 0.98
 
 
 @pytest.mark.slow
@@ -85,7 +86,7 @@ def test_whatever_a_scene_holds():
             s.potential.terms[0].centre_body, s.potential.terms[1].position_space.semi_major_axis,
             s.torque.c, s.rotors.momentum,
         ],
-        noise_known=True, rtol=1e-7,
+        rtol=1e-7, options=FitOptions(trust_noise=True),
     )  # fmt: skip
     assert found.findings() == []
     for value, std, exact in zip(found.values, found.std, true, strict=True):
@@ -94,7 +95,9 @@ def test_whatever_a_scene_holds():
         assert np.all(np.abs(off) < 4), off
     assert abs(float(found.noise) - 1) < 0.15
     assert found.initial.wxyz.shape == (2, 4)
-    np.testing.assert_allclose(found.omega, [[1.0, -0.8, 1.0], [-0.5, 1.5, 0.2]], atol=0.03)
+    np.testing.assert_allclose(
+        found.initial.omega_body, [[1.0, -0.8, 1.0], [-0.5, 1.5, 0.2]], atol=0.03
+    )
     np.testing.assert_array_equal(found.scene.rotors.momentum, found.values[3])
     assert "+-" in found.report()
 
@@ -115,9 +118,9 @@ def test_a_common_size_is_anyones():
     scene = ph.Scene(BODY, torque=ph.LinearDamping(TRUE_DRAG))
     rates = noisy(3, ph.simulate(scene, STATE, TIMES).omega_body)
     data = Recording.of(TIMES, rates, omega_noise=NOISE)
-    found = ph.fit_scene(
-        scene, data, lambda s: (s.inertia.diagonal, s.torque.c), rtol=1e-7, starts=1, throw=False
-    )
+    options = FitOptions(max_starts=1)
+    free = lambda s: (s.inertia.diagonal, s.torque.c)  # noqa: E731
+    found = ph.fit_scene(scene, data, free, rtol=1e-7, options=options, throw=False)
     assert found.findings() == ["undetermined"]
     assert int(found.null_count) == 1
     assert not np.any(np.isfinite(np.concatenate(found.std)))
