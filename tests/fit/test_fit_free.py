@@ -97,6 +97,28 @@ def test_a_level_is_a_probability(fits):
             fits.interval(level)
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("scene", "a fit of an inertia has no scene"),
+        ("instrument", "only the likelihood of readings has instrument"),
+        ("noise_levels", "only the likelihood of readings has noise_levels"),
+    ],
+)
+def test_what_a_fit_of_an_inertia_lacks_is_named(fits, name, message):
+    with pytest.raises(AttributeError, match=message):
+        getattr(fits, name)
+
+
+def test_values_are_the_tensor_and_start_at_the_initial_rates(fits, cases):
+    np.testing.assert_array_equal(fits.values[0], fits.inertia.tensor)
+    assert len(fits.values) == len(fits.std) == 1
+    assert np.all(np.isinf(fits.std[0]).any(axis=(1, 2)))  # the scale does not show
+    assert fits.sensor == fits.sensor_std == {}
+    np.testing.assert_allclose(fits.initial.omega_body[:, 0], cases[1][:, 0], atol=0.3)
+    assert fits.initial.wxyz.shape == (BODIES, 1, 4)
+
+
 def test_the_scale_is_reported_as_unknown(fits):
     assert not fits.scale_known
     assert np.all(np.asarray(fits.null_count) >= 1)

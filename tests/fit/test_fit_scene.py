@@ -38,11 +38,16 @@ def drag_of(rates, throw=True):
     return ph.fit_scene(start, data, free=free, rtol=1e-7, options=options, throw=throw)
 
 
+@pytest.fixture(scope="module")
+def found():
+    """240 draws of the noise."""
+    return drag_of(noisy(1, damped(STATE.omega_body)))
+
+
 @pytest.mark.slow
-def test_intervals_of_a_drag_hold_the_truth():
-    """240 draws of the noise: normal deviates, of the size said."""
+def test_intervals_of_a_drag_hold_the_truth(found):
+    """Normal deviates, of the stated size."""
     true = TRUE_DRAG
-    found = drag_of(noisy(1, damped(STATE.omega_body)))
     assert found.values[0].shape == found.std[0].shape == (240, 3)
     off = (np.asarray(found.values[0]) - true) / np.asarray(found.std[0])
     assert np.all(np.abs(off.mean(axis=0)) < 0.26)  # four standard deviations of the mean
@@ -155,3 +160,64 @@ def test_refused_scenes_and_data():
     several = ph.Scene(BODY, torque=ph.LinearDamping([[0.1, 0.1, 0.1]] * 2))
     with pytest.raises(ValueError, match="one body"):
         ph.fit_scene(several, data, lambda s: [s.torque.c])
+
+
+INERTIA = (
+    "inertia", "moments", "axes", "ratios", "moments_std", "ratios_std", "axes_std", "scale_known",
+    "principal_values", "mirror_inertia",
+)  # fmt: skip
+READINGS = ("instrument", "noise_levels", "negative_log_likelihood")
+
+
+def test_a_fit_of_a_scene_has_the_fields_of_every_fit(found):
+    # the drag, then the initial rates
+    spread = np.sqrt(np.diagonal(np.asarray(found.covariance), axis1=1, axis2=2))
+    np.testing.assert_allclose(spread[:, :3], found.std[0])
+    assert spread.shape == (240, 6)
+    assert found.sensor == found.sensor_std == {}
+    rates = np.asarray(found.initial.omega_body)
+    assert rates.shape == (240, 1, 3)
+    off = rates[:, 0] - np.asarray(STATE.omega_body)
+    assert np.all(np.abs(off) < 5 * spread[:, 3:])
+    np.testing.assert_array_equal(found.initial.wxyz, np.broadcast_to([1.0, 0, 0, 0], (240, 1, 4)))
+    np.testing.assert_allclose(found.rms, NOISE, rtol=0.3)
+    assert found.is_usable
+    assert found.scene.torque.c.shape == (240, 3)
+    assert found.report(3).startswith("body 3:\n")
+    assert found.report().count("+-") == 3 * 240
+
+
+@pytest.mark.parametrize("name", [*INERTIA, *READINGS])
+def test_what_a_fit_of_a_scene_lacks_is_named(found, name):
+    with pytest.raises(AttributeError, match=f"has no {name}:|has {name}: fit_balance"):
+        getattr(found, name)
+    assert not hasattr(found, name)
+
+
+def test_a_fit_of_a_scene_has_no_interval_of_moments(found):
+    with pytest.raises(AttributeError, match="a fit of a scene has no principal_values"):
+        found.interval()
+
+
+@pytest.mark.slow
+def test_the_bias_and_the_model_of_a_fitted_scene():
+    """``sensor`` has the bias; ``parameters`` and ``model`` predict the motion of ``scene``."""
+    scene = ph.Scene(BODY, torque=ph.LinearDamping(0.1))
+    rates = np.asarray(
+        ph.simulate(scene, ph.State([1.0, 0, 0, 0], STATE.omega_body), TIMES).omega_body
+    )
+    bias = np.array([0.05, 0.0, -0.02])
+    data = Recording.of(TIMES, rates + bias, omega_noise=1e-3)
+    start = ph.Scene(BODY, torque=ph.LinearDamping(0.2))
+    options = FitOptions(bias=True, max_starts=1)
+    fit = ph.fit_scene(start, data, lambda s: s.torque.c, options=options, rtol=1e-7)
+    np.testing.assert_allclose(fit.values[0], 0.1, atol=1e-5)
+    np.testing.assert_allclose(fit.sensor["bias"], bias, atol=1e-5)
+    # bias, drag, initial rates
+    spread = np.sqrt(np.diagonal(fit.covariance))
+    np.testing.assert_allclose(fit.sensor_std["bias"], spread[:3])
+    np.testing.assert_allclose(fit.std[0], spread[3:6])
+    predicted = ph.fit.predict(fit.parameters, ph.fit.stack([data]), fit.model).omega
+    state = ph.State(fit.initial.wxyz[0], fit.initial.omega_body[0])
+    again = ph.simulate(fit.scene, state, TIMES).omega_body
+    np.testing.assert_allclose(predicted[0], again, atol=1e-6)

@@ -105,6 +105,7 @@ def _with_noise(options: FitOptions, channels: dict[str, tuple]) -> FitOptions:
             noise is None or data is not None,
             f"{name} is the noise of {data_name}, which was not given.",
         )
+    for name, (noise, _, data) in channels.items():
         require(
             noise is not None or data is None or not given,
             f"{', '.join(given)} without {name}: the noise must be given of everything that was"
