@@ -16,6 +16,7 @@ from polhode.fit import (
     Instrument,
     Recording,
     Tolerance,
+    _fit_balance,
     averaged,
     fit_balance,
     fit_each,
@@ -24,6 +25,7 @@ from polhode.fit import (
     lever_arm,
     stack,
 )
+from polhode.fit._result import whiteness_of
 
 SPIN = 1.7e-6
 TENSORS = 1e-6 * np.array(
@@ -286,3 +288,15 @@ def test_throws_of_objects_whose_inertia_is_known():
     assert sum(counts) == 21
     assert moments <= 1.2
     assert axes <= 2.0
+
+
+def test_bodies_with_fewer_recordings_are_filled_up():
+    places, used = _fit_balance._by_body(np.array([1, 0, 1, 1]), 2)
+    np.testing.assert_array_equal(places, [[1, 0, 0], [0, 2, 3]])
+    np.testing.assert_array_equal(used, [[1, 0, 0], [1, 1, 1]])
+    rest = jax.random.normal(jax.random.key(0), (3, 40, 3))
+    present = jnp.ones((3, 40))
+    alone = whiteness_of(rest[:1], present[:1])
+    mask = jnp.asarray(used[0])
+    filled = whiteness_of(rest * mask[:, None, None], present * mask[:, None])
+    np.testing.assert_allclose(filled, alone, rtol=1e-12)

@@ -3,9 +3,9 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array
+from polhode._checks import ArrayLike, as_float_array
 from polhode.fit._filter import Noise, Readings, innovations, score_of
 from polhode.fit._instrument import Instrument
 from polhode.fit._motion import SteppedMotion

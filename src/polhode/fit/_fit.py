@@ -5,10 +5,9 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-from jaxtyping import ArrayLike
 
 from polhode._batch import map_chunks
-from polhode._checks import require
+from polhode._checks import ArrayLike, require
 from polhode.fit._compiled import compiled
 from polhode.fit._fit_wheel import fit_wheel, fit_wheels
 from polhode.fit._instrument import Instrument

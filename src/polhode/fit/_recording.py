@@ -8,9 +8,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, is_concrete, numbers, require, require_positive
+from polhode._checks import (
+    ArrayLike,
+    as_float_array,
+    is_concrete,
+    numbers,
+    require,
+    require_positive,
+)
 from polhode.rotation import conjugate, multiply, normalise
 
 # angles per sample above which a record under-samples its own rotation

@@ -390,7 +390,7 @@ class Shown(NamedTuple):
     noise: Array
 
 
-def shown_by(linear: Linear, recording: Recording, noise_known: bool) -> Shown:
+def shown_by(linear: Linear, recording: Recording, trust_noise: bool) -> Shown:
     """What the Jacobian of a fit says about its unknowns, in the order shared, then own."""
     information = linear.information()
     dtype = information.dtype
@@ -403,7 +403,7 @@ def shown_by(linear: Linear, recording: Recording, noise_known: bool) -> Shown:
     data = jnp.sum(recording.present) * linear.rest.shape[-1]
     freedom = jnp.maximum(data - jnp.sum(known).astype(dtype), 1)
     noise = jnp.sqrt(jnp.sum(linear.rest**2) / freedom)
-    variance = jnp.asarray(1, dtype) if noise_known else noise**2
+    variance = jnp.asarray(1, dtype) if trust_noise else noise**2
     covariance = (vectors * inverted[None]) @ vectors.T / safe[:, None] / safe[None] * variance
     null = jnp.where(known, 0, 1)[None] * vectors / safe[:, None]
     return Shown(information, covariance, null, safe, jnp.sum(~known), noise)

@@ -4,10 +4,10 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from jaxtyping import Array, ArrayLike
+from jaxtyping import Array
 
 from polhode._batch import PARTS, batch_shapes
-from polhode._checks import as_float_array, require
+from polhode._checks import ArrayLike, as_float_array, require
 from polhode._method import AbstractMethod
 from polhode._scene import Scene
 from polhode._scene._scene import places_of
