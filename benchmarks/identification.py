@@ -100,7 +100,7 @@ def design(seed, turns, samples, noise, least, count):
     sigma = noise * RATE
     rates = clean + sigma * rng.normal(size=clean.shape)
     fit = fit_inertia(times, rates, omega_noise=sigma, throw=False)
-    code = np.asarray(fit.finding)
+    code = np.asarray(fit.diagnostics)
     information = np.asarray(fit.information)
     inner = np.linalg.solve(information[:, 6:, 6:], information[:, 6:, :6])
     marginal = information[:, :6, :6] - information[:, :6, 6:] @ inner
@@ -225,7 +225,7 @@ def speed(count, quick):
         "batch_s": batch,
         "batch_compile_and_trace_s": batch_first - batch,
         "batch_per_body_over_best_single": batch / count / min(ours),
-        "batch_flagged_not_converged": int((np.asarray(fits.finding) & 1).sum()),
+        "batch_flagged_not_converged": int((np.asarray(fits.diagnostics) & 1).sum()),
         "residual_gradient_error": gradient(),
     }
 

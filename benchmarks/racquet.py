@@ -30,6 +30,7 @@ import numpy as np
 
 from polhode.fit import (
     Drag,
+    FitOptions,
     Instrument,
     Recording,
     SteppedMotion,
@@ -37,7 +38,7 @@ from polhode.fit import (
     fit_inertia,
     fit_recordings,
 )
-from polhode.fit._result import CURES, UNUSABLE
+from polhode.fit._result import UNUSABLE, WARNINGS
 from polhode.rotation import to_matrix
 
 FAST = 15.0
@@ -72,7 +73,7 @@ def alone(trials):
     """What became of every trial by itself."""
     times, rates = padded(trials)
     fit = fit_inertia(times, rates, throw=False)
-    codes, moments = np.asarray(fit.finding), np.asarray(fit.moments)
+    codes, moments = np.asarray(fit.diagnostics), np.asarray(fit.moments)
     tensors = np.asarray(fit.inertia.tensor)
     least = np.trace(tensors, axis1=1, axis2=2) / 2 - moments[:, 2]
     usable = codes & int(UNUSABLE) == 0
@@ -83,7 +84,7 @@ def alone(trials):
         "converged": int(usable.sum()),
         "neither_converged_nor_flagged": int(silent.sum()),
         "findings": {
-            flag.name.lower(): int((codes & int(flag) != 0).sum()) for flag in CURES
+            flag.name.lower(): int((codes & int(flag) != 0).sum()) for flag in WARNINGS
         },
         "rms_median_rad_s": float(np.median(np.asarray(fit.rms)[usable])),
         "ratios_median": np.median(np.asarray(fit.ratios)[usable], axis=0).tolist(),
@@ -99,7 +100,8 @@ def crossings(times, x):
 def together(trials, motion=None):
     """One body for the trials of a round."""
     given = [Recording.of(trial[:, 0], trial[:, 1:]) for trial in trials]
-    fit = fit_recordings(given, throw=False, starts=2, motion=motion)
+    options = FitOptions(motion=motion, max_starts=2)
+    fit = fit_recordings(given, options=options, throw=False)
     middle = np.asarray(to_matrix(fit.axes))[:, 1]
     rest = np.asarray(fit.residuals["omega"])
     errors, fewer = [], 0
@@ -132,15 +134,15 @@ def readings(trials, cut):
     trials = [one[cut : len(one) - cut] for one in trials if len(one) > 2 * cut + 20]
     given = [Recording.of(one[:, 0], one[:, 1:]) for one in trials]
     fit = fit_balance(given, Instrument(None), throw=False)
-    rest = np.asarray(fit.residuals) * np.asarray(fit.residuals_std)
+    rest = np.asarray(fit.residuals["omega"]) * np.asarray(fit.residuals["omega_std"])
     drag = together(trials, SteppedMotion(drag=Drag(), fit_drag=True, steps=2))
     return {
         "trials": len(trials),
-        "ratios": np.asarray(fit.moments[0]).tolist(),
-        "ratios_std": np.asarray(fit.moments_std[0]).tolist(),
+        "ratios": np.asarray(fit.ratios[0]).tolist(),
+        "ratios_std": np.asarray(fit.ratios_std[0]).tolist(),
         "rms_one_sample_ahead_rad_s": float(np.sqrt(np.mean(rest[rest != 0] ** 2))),
-        "slow_torque_rad_s2": float(fit.noise.slow[0] / np.trace(fit.inertia.tensor[0]) * 2),
-        "converged": bool(fit.converged),
+        "slow_torque_rad_s2": float(fit.noise_levels.slow[0] / np.trace(fit.inertia.tensor[0]) * 2),
+        "converged": "step limit" not in fit.findings(),
         "drag_fitted_ratios": drag["ratios"],
         "drag_fitted_ratios_std": drag["ratios_std"],
         "drag_fitted_rms_rad_s": drag["rms_rad_s"],

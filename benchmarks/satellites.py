@@ -156,7 +156,7 @@ def study(name, push, runs):
         },
         "moments_rms_error_over_std": float(np.sqrt(np.mean(off**2))),
         "covered_percent": 100 * float(np.mean(np.abs(off) < 1.959964)),
-        "converged": int(np.sum((np.asarray(fit.finding) & int(room.Finding.STEP_LIMIT)) == 0)),
+        "converged": int(np.sum((np.asarray(fit.diagnostics) & int(room.Finding.STEP_LIMIT)) == 0)),
     }
 
 

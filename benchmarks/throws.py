@@ -117,7 +117,7 @@ def varied(folder, usual, single):
             if kind not in single:
                 continue
             before = np.asarray(single[kind].moments)
-            apart = np.asarray(fit.each(found[kind], body).moments) - before
+            apart = np.asarray(room.fit_each(fit, found[kind], body).moments) - before
             root = len(before) ** 0.5
             means.append(root * apart.mean(axis=0) / before.std(axis=0, ddof=1))
             pairs.append(root * apart.mean(axis=0) / apart.std(axis=0, ddof=1))
@@ -163,7 +163,7 @@ def measure(found):
     names = list(found)
     everything, bodies, fit = together(found)
     each = {
-        name: fit.each(found[name], k)
+        name: room.fit_each(fit, found[name], k)
         for k, name in enumerate(names)
         if name not in (DEVICE, PROOF)
     }
@@ -252,7 +252,7 @@ def run(folder, configurations=None, vary=False):
     single = {name: np.asarray(one.inertia.tensor) for name, one in each.items()}
     scale, alone = objects(index, joint, single, arms)
     _, together = objects(index, joint, {name: joint[name][None] for name in single}, arms)
-    device = fit.instrument
+    device = jax.tree.map(lambda x: x[0], fit.instrument)
     numbers = {
         "throws": sum(map(len, found.values())),
         "spin_inertia_kgm2": SPIN * scale,

@@ -109,11 +109,11 @@ def study(size, number, together=40, group=120):
     for first in range(0, number, group):
         given = throws(round(100 * size) + first, tensor, min(group, number - first))
         joint = room.fit_balance(given[:together], room.Instrument(SPIN), block=BLOCK)
-        alone = joint.each(given)
+        alone = room.fit_each(joint, given)
         joints.append((np.asarray(joint.moments[0]) - true) / np.asarray(joint.moments_std[0]))
         moments.append(np.asarray(alone.moments))
         spread.append(np.asarray(alone.moments_std))
-        done += int(np.sum(np.asarray(alone.converged)))
+        done += converged(alone)
     return {
         "size": size,
         **told(np.concatenate(moments) - true, np.concatenate(spread), true),
@@ -136,8 +136,13 @@ def study_own(size, number):
     return {
         "size": size,
         **told(moments - true, spread, true),
-        "converged": sum(bool(one.converged) for one in fits),
+        "converged": sum(converged(one) for one in fits),
     }
+
+
+def converged(fit):
+    """How many bodies of a fit converged."""
+    return int(np.sum(np.asarray(fit.diagnostics) & int(room.Finding.STEP_LIMIT) == 0))
 
 
 def told(error, spread, true):

@@ -44,7 +44,7 @@ print(recording.times.shape[-1], "rows,", int(np.sum(recording.present == 0)), "
 # comes from the data, by linear regression on the conservation of angular momentum.
 
 # %%
-found = fit.fit_recordings([recording], noise_known=True)
+found = fit.fit_recordings([recording], options=fit.FitOptions(trust_noise=True))
 print(found.report())
 
 # %% [markdown]
@@ -173,10 +173,11 @@ true = np.linalg.eigvalsh(tensor)
 print("true moments [g cm^2]  ", 1e7 * true)
 print("fitted                 ", 1e7 * np.asarray(sized.moments[0]))
 print("standard deviations    ", 1e7 * np.asarray(sized.moments_std[0]))
-print(f"lag of the gyroscope    {1e3 * float(sized.instrument.delay):.2f} ms, set {1e3 * delay} ms")
+lag = float(sized.instrument.delay[0])
+print(f"lag of the gyroscope    {1e3 * lag:.2f} ms, set {1e3 * delay} ms")
 print("off by                 ", np.asarray((sized.moments[0] - true) / sized.moments_std[0]))
 
 # %% [markdown]
-# `sized.each(throws)` fits every throw by itself, with what all of them say of the instrument. What
-# a real instrument and real air leave of this accuracy stands in
+# `fit.fit_each(sized, throws)` fits every throw by itself, with the instrument that all of them
+# show. How much of this accuracy a real instrument and real air leave:
 # [what a motion tells about inertia](../docs/identifiability.md).

@@ -136,7 +136,8 @@ def map_chunks(fn: Callable[[Any], Any], lanes: Any, n: int, size: int) -> Any:
         return jnp.concatenate([x, fill]).reshape(count, size, *x.shape[1:])
 
     chunks = jax.lax.map(fn, jax.tree.map(split, lanes))
-    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:n], chunks)
+    # -1 would be ambiguous for arrays without elements
+    return jax.tree.map(lambda x: x.reshape(count * size, *x.shape[2:])[:n], chunks)
 
 
 # Several devices. Chunks of lanes are worked on one after the other, which a compiler that splits

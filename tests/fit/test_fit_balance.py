@@ -11,17 +11,21 @@ from scipy.integrate import solve_ivp
 
 from benchmarks import throws as recipe, throws_synthetic as study
 from polhode.fit import (
+    FitOptions,
     Huber,
     Instrument,
     Recording,
     Tolerance,
+    _fit_balance,
     averaged,
     fit_balance,
+    fit_each,
     fit_inertia,
     fit_recordings,
     lever_arm,
     stack,
 )
+from polhode.fit._result import whiteness_of
 
 SPIN = 1.7e-6
 TENSORS = 1e-6 * np.array(
@@ -98,21 +102,21 @@ def test_throws_in_air_show_the_tensor_and_the_instrument(throws):
     off = (np.asarray(fit.moments) - true) / np.asarray(fit.moments_std)
     assert np.abs(off).max() < 4
     assert np.max(np.asarray(fit.moments_std) / true) < 0.02
-    np.testing.assert_allclose(fit.instrument.delay, DELAY, atol=2e-4)
-    np.testing.assert_allclose(fit.instrument.axis, AXIS, atol=3e-3)
+    np.testing.assert_allclose(fit.instrument.delay[0], DELAY, atol=2e-4)
+    np.testing.assert_allclose(fit.instrument.axis[0], AXIS, atol=3e-3)
     assert fit.instrument.skew is not None
-    found = np.asarray(fit.instrument.skew)
+    found = np.asarray(fit.instrument.skew[0])
     np.testing.assert_allclose(found[[1, 2, 0], [2, 0, 1]], SKEW[[1, 2, 0], [2, 0, 1]], atol=2.5e-3)
     # four samples to a residual: half the noise of one
-    np.testing.assert_allclose(fit.noise.omega, 0.005, rtol=0.15)
+    np.testing.assert_allclose(fit.noise_levels.omega, 0.005, rtol=0.15)
     # expected from what was read before: as large as expected, and forgotten at once
-    rest = np.asarray(fit.residuals)
+    rest = np.asarray(fit.residuals["omega"]).reshape(8, -1, 3)
     np.testing.assert_allclose(np.mean(rest[rest != 0] ** 2), 1, atol=0.1)
     assert abs(np.mean(rest[:, 1:] * rest[:, :-1])) < 0.05
     # a throw alone, with what all of them say of the instrument
-    alone = fit.each(given[4:], body=1)
+    alone = fit_each(fit, given[4:], body=1)
     assert alone.moments.shape == (4, 3)
-    assert bool(np.all(alone.converged))
+    assert alone.is_usable
     off = (np.asarray(alone.moments) - true[1]) / np.asarray(alone.moments_std)
     assert np.abs(off).max() < 4
     # an ideal instrument, taken for granted, misleads by more than the noise does
@@ -120,9 +124,9 @@ def test_throws_in_air_show_the_tensor_and_the_instrument(throws):
     ideal = eqx.tree_at(
         lambda device: (device.spin_inertia, device.axis),
         ideal,
-        (fit.instrument.spin_inertia, jnp.asarray([0.0, 0.0, 1.0])),
+        (fit.instrument.spin_inertia, jnp.asarray([[0.0, 0.0, 1.0]] * 2)),
     )
-    plain = eqx.tree_at(lambda found: found.instrument, fit, ideal).each(given[4:], body=1)
+    plain = fit_each(eqx.tree_at(lambda found: found.instrument, fit, ideal), given[4:], body=1)
     worse = np.abs(np.asarray(plain.moments) - true[1]).mean()
     assert worse > 1.5 * np.abs(np.asarray(alone.moments) - true[1]).mean()
 
@@ -180,10 +184,14 @@ def test_throws_without_a_wheel_show_ratios():
     fit = fit_balance(given, Instrument(None))
     true = np.linalg.eigvalsh(tensor)
     assert float(fit.moments[0, 2]) == pytest.approx(1, abs=1e-12)
-    off = (np.asarray(fit.moments[0]) - true)[:2] / np.asarray(fit.moments_std[0])[:2]
+    off = (np.asarray(fit.ratios[0]) - true)[:2] / np.asarray(fit.ratios_std[0])[:2]
     assert np.abs(off).max() < 4
-    assert np.max(fit.moments_std) < 2e-3
-    np.testing.assert_allclose(fit.noise.omega, 0.01, rtol=0.15)
+    assert np.max(fit.ratios_std) < 2e-3
+    assert not fit.scale_known
+    assert np.all(np.isinf(fit.moments_std))
+    np.testing.assert_array_equal(fit.null_count, [1])
+    np.testing.assert_allclose(fit.noise_levels.omega, 0.01, rtol=0.15)
+    assert "Only ratios" in fit.report()
 
 
 @pytest.mark.slow
@@ -243,13 +251,14 @@ def test_what_a_balance_cannot_use_is_refused():
             wheel_speed=times,
             instrument=Instrument(SPIN),
             force_body=rates,
-            bias=True,
+            options=FitOptions(bias=True),
         )
     whole = Recording.of(times, rates, wheel_speed=times)
     with pytest.raises(ValueError, match=r"needs instrument=Instrument\(spin_inertia\)"):
         fit_recordings([whole, whole])
-    with pytest.raises(ValueError, match="got also robust, noise_known"):
-        fit_recordings([whole], instrument=Instrument(SPIN), robust=Huber(3), noise_known=True)
+    options = FitOptions(robust=Huber(3), trust_noise=True, max_starts=1)
+    with pytest.raises(ValueError, match="got also robust, trust_noise, max_starts"):
+        fit_recordings([whole], instrument=Instrument(SPIN), options=options)
     with pytest.raises(ValueError, match="throws without a wheel: fit_balance"):
         fit_recordings([whole], instrument=Instrument(None))
     with pytest.raises(ValueError, match=r"number the body of each of 2 recordings.*\[0, 2\]"):
@@ -279,3 +288,15 @@ def test_throws_of_objects_whose_inertia_is_known():
     assert sum(counts) == 21
     assert moments <= 1.2
     assert axes <= 2.0
+
+
+def test_bodies_with_fewer_recordings_are_filled_up():
+    places, used = _fit_balance._by_body(np.array([1, 0, 1, 1]), 2)
+    np.testing.assert_array_equal(places, [[1, 0, 0], [0, 2, 3]])
+    np.testing.assert_array_equal(used, [[1, 0, 0], [1, 1, 1]])
+    rest = jax.random.normal(jax.random.key(0), (3, 40, 3))
+    present = jnp.ones((3, 40))
+    alone = whiteness_of(rest[:1], present[:1])
+    mask = jnp.asarray(used[0])
+    filled = whiteness_of(rest * mask[:, None, None], present * mask[:, None])
+    np.testing.assert_allclose(filled, alone, rtol=1e-12)

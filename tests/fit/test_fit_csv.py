@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from polhode.fit import load_recording, read_recording
+from polhode.fit import read_recording
+from polhode.fit._csv import load_recording
 
 COLUMNS = {"t": "time", "wx": "x", "wy": "y", "wz": "z"}
 GOOD = """time, x, y, z, n

@@ -53,12 +53,12 @@ def fits(cases):
 
 
 def test_every_fit_is_a_physical_body(fits):
-    assert not (np.asarray(fits.finding) & int(Finding.NOT_FINITE)).any()
+    assert not (np.asarray(fits.diagnostics) & int(Finding.NOT_FINITE)).any()
     assert bool(jnp.all(is_physical(fits.inertia.tensor, slack=1e-12)))
 
 
 def test_every_fit_converges(fits):
-    assert not (np.asarray(fits.finding) & int(Finding.STEP_LIMIT)).any()
+    assert not (np.asarray(fits.diagnostics) & int(Finding.STEP_LIMIT)).any()
     assert np.asarray(fits.noise).max() < 1.25
 
 
@@ -71,7 +71,7 @@ def test_errors_are_as_large_as_the_bound_says(fits, cases):
     error = entries(np.asarray(fits.inertia.tensor)) - entries(truth)
     square = np.einsum("ni,nij,nj->n", error, marginal, error)
     # a body that its motion hardly shows has a valley longer than the linear theory of it holds
-    told = np.asarray(fits.finding) & int(Finding.WEAK | Finding.NEARLY_FLAT) == 0
+    told = np.asarray(fits.diagnostics) & int(Finding.WEAK | Finding.NEARLY_FLAT) == 0
     assert told.mean() > 0.95
     # five directions are determined, the sixth is the scale
     assert 0.9 < np.sqrt(square[told].mean() / 5) < 1.1
@@ -97,6 +97,28 @@ def test_a_level_is_a_probability(fits):
             fits.interval(level)
 
 
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("scene", "a fit of an inertia has no scene"),
+        ("instrument", "only the likelihood of readings has instrument"),
+        ("noise_levels", "only the likelihood of readings has noise_levels"),
+    ],
+)
+def test_what_a_fit_of_an_inertia_lacks_is_named(fits, name, message):
+    with pytest.raises(AttributeError, match=message):
+        getattr(fits, name)
+
+
+def test_values_are_the_tensor_and_start_at_the_initial_rates(fits, cases):
+    np.testing.assert_array_equal(fits.values[0], fits.inertia.tensor)
+    assert len(fits.values) == len(fits.std) == 1
+    assert np.all(np.isinf(fits.std[0]).any(axis=(1, 2)))  # the scale does not show
+    assert fits.sensor == fits.sensor_std == {}
+    np.testing.assert_allclose(fits.initial.omega_body[:, 0], cases[1][:, 0], atol=0.3)
+    assert fits.initial.wxyz.shape == (BODIES, 1, 4)
+
+
 def test_the_scale_is_reported_as_unknown(fits):
     assert not fits.scale_known
     assert np.all(np.asarray(fits.null_count) >= 1)
@@ -112,7 +134,7 @@ def test_the_scale_is_reported_as_unknown(fits):
 
 def test_an_inverted_axis_means_the_mirrored_body(cases, fits):
     wrong = fitted(cases[0], cases[2] * np.array([1, 1, -1.0]))
-    twins = np.sort(np.asarray(wrong.mirrored.moments), axis=-1)
+    twins = np.sort(np.asarray(wrong.mirror_inertia.moments), axis=-1)
     spread = np.asarray(fits.ratios_std)[:, :2]
     far = np.abs(twins - np.asarray(fits.ratios))[:, :2]
     known = np.max(spread, axis=1) < 0.02
@@ -183,4 +205,4 @@ def test_a_missing_row_in_five_does_not_hide_the_noise(cases):
     holed[:2, ::5] = np.nan
     for rates in holed:
         fit = fit_inertia(times, rates, throw=False)
-        assert not int(fit.finding) & int(Finding.POOR)
+        assert not int(fit.diagnostics) & int(Finding.POOR)

@@ -17,6 +17,7 @@ import polhode as ph
 from polhode.fit import (
     Drag,
     Finding,
+    FitOptions,
     FreeMotion,
     FullTensor,
     Huber,
@@ -36,7 +37,6 @@ from polhode.fit import (
 )
 from polhode.fit._parameters import base_of, free_columns
 from polhode.fit._result import _axes_disagree
-from polhode.fit._solve import FitOptions
 from polhode.rotation import to_matrix
 
 TENSOR = np.array([[2.0, 0.1, 0.2], [0.1, 2.5, -0.3], [0.2, -0.3, 3.2]])
@@ -88,7 +88,9 @@ def test_a_wheel_shows_the_scale_and_drag_and_delay_are_fitted():
         omega + 0.02 * rng.normal(size=omega.shape),
         wheel_speed=speed(times),
         omega_noise=0.02,
-        motion=SteppedMotion(spin_inertia, drag=Drag(), fit_drag=True, fit_delay=True),
+        options=FitOptions(
+            motion=SteppedMotion(spin_inertia, drag=Drag(), fit_drag=True, fit_delay=True)
+        ),
     )
     assert fit.scale_known
     assert int(fit.null_count) == 0
@@ -101,6 +103,11 @@ def test_a_wheel_shows_the_scale_and_drag_and_delay_are_fitted():
     found = fit.parameters.motion
     known = np.array([delay, 0.05, 0.02])
     got = np.array([found["delay"], found["drag"].linear, found["drag"].quadratic])
+    np.testing.assert_array_equal(got, fit.values[1:])
+    np.testing.assert_allclose(spread, fit.std[1:])
+    np.testing.assert_array_equal(fit.values[0], fit.inertia.tensor)
+    off = (np.asarray(fit.values[0]) - TENSOR) / np.asarray(fit.std[0])
+    assert np.abs(off).max() < 4
     assert np.all(np.abs(got - known) < 4 * spread)
     assert spread[0] < 0.001
     assert 0.9 < float(fit.noise) < 1.1
@@ -127,9 +134,11 @@ def test_any_scene_may_be_the_model():
         times,
         path + 0.01 * rng.normal(size=path.shape),
         omega_noise=0.01,
-        motion=SceneMotion(build, {"damping": 0.1}, rtol=1e-6),
-        known=ph.Inertia.from_moments([2.0, 2.4, 3.0]),
-        starts=1,
+        options=FitOptions(
+            motion=SceneMotion(build, {"damping": 0.1}, rtol=1e-6),
+            initial_inertia=ph.Inertia.from_moments([2.0, 2.4, 3.0]),
+            max_starts=1,
+        ),
     )
     assert fit.scale_known
     moments = np.linalg.eigvalsh(TENSOR)
@@ -143,7 +152,7 @@ def test_any_scene_may_be_the_model():
 def test_a_scene_has_no_accelerometer():
     rates, motion = np.ones((5, 3)), SceneMotion(lambda i, u: ph.Scene(i), {"damping": 0.1})
     with pytest.raises(ValueError, match="FreeMotion or SteppedMotion, got SceneMotion"):
-        fit_inertia(np.arange(5.0), rates, force_body=rates, motion=motion)
+        fit_inertia(np.arange(5.0), rates, force_body=rates, options=FitOptions(motion=motion))
 
 
 TIMES = np.linspace(0, 6, 121)
@@ -177,19 +186,21 @@ def sensed(times, *, flip=(1, 1, 1), outliers=0):
 @pytest.mark.slow
 def test_bias_mounting_lever_and_outliers():
     data, lever = sensed(TIMES, outliers=4)
-    fit = fit_inertia(**data, bias=True, mounting=True, robust=Huber(3.0), throw=False)
+    options = FitOptions(bias=True, mounting=True, robust=Huber(3.0))
+    fit = fit_inertia(**data, options=options, throw=False)
     spread = np.sqrt(np.diagonal(np.asarray(fit.covariance)))
-    found = fit.parameters
-    for got, known, place in (
-        (found.bias, SENSOR["bias"], 6),
-        (found.mounting, SENSOR["turn"], 9),
-        (found.lever, lever, 12),
+    for name, known, place in (
+        ("bias", SENSOR["bias"], 6),
+        ("mounting", SENSOR["turn"], 9),
+        ("lever", lever, 12),
     ):
-        assert np.all(np.abs(np.asarray(got) - known) < 4 * spread[place : place + 3])
+        std = np.asarray(fit.sensor_std[name])
+        np.testing.assert_allclose(std, spread[place : place + 3])
+        assert np.all(np.abs(np.asarray(fit.sensor[name]) - known) < 4 * std)
     true = np.linalg.eigvalsh(TENSOR)
     off = (np.asarray(fit.ratios) - true / true[2])[:2] / np.asarray(fit.ratios_std)[:2]
     assert np.abs(off).max() < 4
-    assert not int(fit.finding) & int(Finding.STEP_LIMIT | Finding.AXES_DISAGREE)
+    assert not int(fit.diagnostics) & int(Finding.STEP_LIMIT | Finding.AXES_DISAGREE)
 
 
 @pytest.mark.parametrize("mounting", [True, False])
@@ -225,7 +236,7 @@ def test_windows_of_a_long_recording_in_single_precision():
     parts = windows(whole, 61)
     assert len(parts) == 4
     assert float(parts[1].times[0]) == float(parts[0].times[-1])
-    fit = fit_recordings(parts, unknown=MomentsOnly(), noise_known=True)
+    fit = fit_recordings(parts, options=FitOptions(unknown=MomentsOnly(), trust_noise=True))
     assert fit.moments.dtype == jnp.float32
     assert fit.parameters.omega.shape == (4, 3)
     off = (np.asarray(fit.ratios) - moments / moments[2])[:2] / np.asarray(fit.ratios_std)[:2]

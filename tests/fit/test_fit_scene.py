@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode.fit import Recording
-from polhode.fit._scene_fit import places_of
+from polhode._scene._scene import places_of
+from polhode.fit import FitOptions, Recording
 
 BODY = ph.Inertia.from_moments([1.0, 2.0, 2.5])
 STATE = ph.State([0.8, 0.0, 0.6, 0.0], [1.2, -0.8, 1.0])
@@ -34,14 +34,20 @@ def drag_of(rates, throw=True):
     data = Recording.of(TIMES, rates, omega_noise=NOISE)
     start = ph.Scene(BODY, torque=ph.LinearDamping(0.15))
     free = lambda s: [s.torque.c]  # noqa: E731
-    return ph.fit(start, data, free=free, noise_known=True, rtol=1e-7, starts=1, throw=throw)
+    options = FitOptions(trust_noise=True, max_starts=1)
+    return ph.fit_scene(start, data, free=free, rtol=1e-7, options=options, throw=throw)
+
+
+@pytest.fixture(scope="module")
+def found():
+    """240 draws of the noise."""
+    return drag_of(noisy(1, damped(STATE.omega_body)))
 
 
 @pytest.mark.slow
-def test_intervals_of_a_drag_hold_the_truth():
-    """240 draws of the noise: normal deviates, of the size said."""
+def test_intervals_of_a_drag_hold_the_truth(found):
+    """Normal deviates, of the stated size."""
     true = TRUE_DRAG
-    found = drag_of(noisy(1, damped(STATE.omega_body)))
     assert found.values[0].shape == found.std[0].shape == (240, 3)
     off = (np.asarray(found.values[0]) - true) / np.asarray(found.std[0])
     assert np.all(np.abs(off.mean(axis=0)) < 0.26)  # four standard deviations of the mean
@@ -50,7 +56,7 @@ def test_intervals_of_a_drag_hold_the_truth():
     assert 0.92 < inside < 0.98, inside
     np.testing.assert_allclose(np.mean(np.asarray(found.noise)), 1, atol=0.05)
     assert np.all(np.asarray(found.null_count) == 0)
-    assert np.mean(np.asarray(found.finding) == 0) > 0.98
+    assert np.mean(np.asarray(found.diagnostics) == 0) > 0.98
 
 
 @pytest.mark.slow
@@ -85,7 +91,7 @@ def test_whatever_a_scene_holds():
             s.potential.terms[0].centre_body, s.potential.terms[1].position_space.semi_major_axis,
             s.torque.c, s.rotors.momentum,
         ],
-        noise_known=True, rtol=1e-7,
+        rtol=1e-7, options=FitOptions(trust_noise=True),
     )  # fmt: skip
     assert found.findings() == []
     for value, std, exact in zip(found.values, found.std, true, strict=True):
@@ -94,7 +100,9 @@ def test_whatever_a_scene_holds():
         assert np.all(np.abs(off) < 4), off
     assert abs(float(found.noise) - 1) < 0.15
     assert found.initial.wxyz.shape == (2, 4)
-    np.testing.assert_allclose(found.omega, [[1.0, -0.8, 1.0], [-0.5, 1.5, 0.2]], atol=0.03)
+    np.testing.assert_allclose(
+        found.initial.omega_body, [[1.0, -0.8, 1.0], [-0.5, 1.5, 0.2]], atol=0.03
+    )
     np.testing.assert_array_equal(found.scene.rotors.momentum, found.values[3])
     assert "+-" in found.report()
 
@@ -115,9 +123,9 @@ def test_a_common_size_is_anyones():
     scene = ph.Scene(BODY, torque=ph.LinearDamping(TRUE_DRAG))
     rates = noisy(3, ph.simulate(scene, STATE, TIMES).omega_body)
     data = Recording.of(TIMES, rates, omega_noise=NOISE)
-    found = ph.fit_scene(
-        scene, data, lambda s: (s.inertia.diagonal, s.torque.c), rtol=1e-7, starts=1, throw=False
-    )
+    options = FitOptions(max_starts=1)
+    free = lambda s: (s.inertia.diagonal, s.torque.c)  # noqa: E731
+    found = ph.fit_scene(scene, data, free, rtol=1e-7, options=options, throw=False)
     assert found.findings() == ["undetermined"]
     assert int(found.null_count) == 1
     assert not np.any(np.isfinite(np.concatenate(found.std)))
@@ -152,3 +160,64 @@ def test_refused_scenes_and_data():
     several = ph.Scene(BODY, torque=ph.LinearDamping([[0.1, 0.1, 0.1]] * 2))
     with pytest.raises(ValueError, match="one body"):
         ph.fit_scene(several, data, lambda s: [s.torque.c])
+
+
+INERTIA = (
+    "inertia", "moments", "axes", "ratios", "moments_std", "ratios_std", "axes_std", "scale_known",
+    "principal_values", "mirror_inertia",
+)  # fmt: skip
+READINGS = ("instrument", "noise_levels", "negative_log_likelihood")
+
+
+def test_a_fit_of_a_scene_has_the_fields_of_every_fit(found):
+    # the drag, then the initial rates
+    spread = np.sqrt(np.diagonal(np.asarray(found.covariance), axis1=1, axis2=2))
+    np.testing.assert_allclose(spread[:, :3], found.std[0])
+    assert spread.shape == (240, 6)
+    assert found.sensor == found.sensor_std == {}
+    rates = np.asarray(found.initial.omega_body)
+    assert rates.shape == (240, 1, 3)
+    off = rates[:, 0] - np.asarray(STATE.omega_body)
+    assert np.all(np.abs(off) < 5 * spread[:, 3:])
+    np.testing.assert_array_equal(found.initial.wxyz, np.broadcast_to([1.0, 0, 0, 0], (240, 1, 4)))
+    np.testing.assert_allclose(found.rms, NOISE, rtol=0.3)
+    assert found.is_usable
+    assert found.scene.torque.c.shape == (240, 3)
+    assert found.report(3).startswith("body 3:\n")
+    assert found.report().count("+-") == 3 * 240
+
+
+@pytest.mark.parametrize("name", [*INERTIA, *READINGS])
+def test_what_a_fit_of_a_scene_lacks_is_named(found, name):
+    with pytest.raises(AttributeError, match=f"has no {name}:|has {name}: fit_balance"):
+        getattr(found, name)
+    assert not hasattr(found, name)
+
+
+def test_a_fit_of_a_scene_has_no_interval_of_moments(found):
+    with pytest.raises(AttributeError, match="a fit of a scene has no principal_values"):
+        found.interval()
+
+
+@pytest.mark.slow
+def test_the_bias_and_the_model_of_a_fitted_scene():
+    """``sensor`` has the bias; ``parameters`` and ``model`` predict the motion of ``scene``."""
+    scene = ph.Scene(BODY, torque=ph.LinearDamping(0.1))
+    rates = np.asarray(
+        ph.simulate(scene, ph.State([1.0, 0, 0, 0], STATE.omega_body), TIMES).omega_body
+    )
+    bias = np.array([0.05, 0.0, -0.02])
+    data = Recording.of(TIMES, rates + bias, omega_noise=1e-3)
+    start = ph.Scene(BODY, torque=ph.LinearDamping(0.2))
+    options = FitOptions(bias=True, max_starts=1)
+    fit = ph.fit_scene(start, data, lambda s: s.torque.c, options=options, rtol=1e-7)
+    np.testing.assert_allclose(fit.values[0], 0.1, atol=1e-5)
+    np.testing.assert_allclose(fit.sensor["bias"], bias, atol=1e-5)
+    # bias, drag, initial rates
+    spread = np.sqrt(np.diagonal(fit.covariance))
+    np.testing.assert_allclose(fit.sensor_std["bias"], spread[:3])
+    np.testing.assert_allclose(fit.std[0], spread[3:6])
+    predicted = ph.fit.predict(fit.parameters, ph.fit.stack([data]), fit.model).omega
+    state = ph.State(fit.initial.wxyz[0], fit.initial.omega_body[0])
+    again = ph.simulate(fit.scene, state, TIMES).omega_body
+    np.testing.assert_allclose(predicted[0], again, atol=1e-6)

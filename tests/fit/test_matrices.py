@@ -9,6 +9,7 @@ import pytest
 
 import polhode.fit._matrices as matrices
 from polhode.fit import (
+    FitOptions,
     FreeMotion,
     FullTensor,
     Instrument,
@@ -18,7 +19,6 @@ from polhode.fit import (
     _fit_balance,
     stack,
 )
-from polhode.fit._solve import FitOptions
 
 BATCH = np.random.default_rng(3).normal(size=(2, 5, 4, 4))
 SPD = BATCH @ np.swapaxes(BATCH, -1, -2) + np.eye(4)
@@ -61,9 +61,10 @@ def test_nor_does_the_balance(affected):
     given = recordings(6)
 
     def balanced(given):
-        numbers = jnp.asarray([0, 1, 0, 1, 0, 1])
+        numbers = np.array([0, 1, 0, 1, 0, 1])
+        places, used = _fit_balance._by_body(numbers, 2)
         return _fit_balance._together.__wrapped__(
-            given, numbers, Instrument(1e-6), Tolerance(), 2, 2
+            given, jnp.asarray(numbers), places, used, Instrument(1e-6), Tolerance(), 2
         )
 
     batch, calls = largest_batch(balanced, given)

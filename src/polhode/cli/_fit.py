@@ -174,11 +174,11 @@ def _fit(asked: _Asked, goals: list[Path], *, quiet: bool, no_cache: bool, allow
         from polhode import fit as room, plot
         from polhode.cli import _cache
 
-        loaded = _read(asked, room)
+        loaded = _read(asked)
         recording = loaded.recording
         with _cache.kept_programs(not no_cache):
             status.update(f"fitting {recording.times.shape[-1]} samples (compiling first) ...")
-            result = room.fit_recordings([recording], throw=False, **_options(asked, room))
+            result = room.fit_recordings([recording], throw=False, **_keywords(asked, room))
             heed()
             status.update("writing ...")
             written = [_write(goals[0], asked, loaded, result)]
@@ -191,10 +191,10 @@ def _fit(asked: _Asked, goals: list[Path], *, quiet: bool, no_cache: bool, allow
         here = sys.stdout.isatty()
         out = Console(soft_wrap=not here, width=None if here else 110)
         out.print(_table(asked, recording, result))
-        for text in (_said(loaded), *room.remarks(result)):
+        for text in (_said(loaded), *result.warnings()):
             out.print(f"- {text}", highlight=False, markup=False)
         _show.tell_written(out, written)
-    if room.is_unusable(result):
+    if not result.is_usable:
         print(f"polhode: the fit must not be used: {', '.join(result.findings())}",
               file=sys.stderr)  # fmt: skip
         return 1
@@ -208,9 +208,11 @@ def _fit(asked: _Asked, goals: list[Path], *, quiet: bool, no_cache: bool, allow
     return 0
 
 
-def _read(asked: _Asked, room: Any) -> Any:
+def _read(asked: _Asked) -> Any:
+    from polhode.fit._csv import load_recording
+
     try:
-        return room.load_recording(
+        return load_recording(
             asked.path,
             asked.columns,
             scale=math.pi / 180 if asked.degrees else None,
@@ -232,7 +234,7 @@ def _said(loaded: Any) -> str:
     return f"columns: {names}" + (f"; by their names {units}" if units else "")
 
 
-def _options(asked: _Asked, room: Any) -> dict[str, Any]:
+def _keywords(asked: _Asked, room: Any) -> dict[str, Any]:
     """Keywords of ``fit_recordings``."""
     if asked.wheel_inertia:
         axis = tuple(x / math.hypot(*asked.wheel_axis) for x in asked.wheel_axis)
@@ -240,13 +242,14 @@ def _options(asked: _Asked, room: Any) -> dict[str, Any]:
     motion = room.FreeMotion()
     if asked.drag:
         motion = room.SteppedMotion(drag=room.Drag(), fit_drag=True)
-    return {
-        "motion": motion,
-        "unknown": room.MomentsOnly() if asked.moments_only else room.FullTensor(),
-        "bias": asked.bias,
-        "robust": room.Huber(asked.robust) if asked.robust else None,
-        "noise_known": asked.noise is not None,
-    }
+    options = room.FitOptions(
+        motion=motion,
+        unknown=room.MomentsOnly() if asked.moments_only else room.FullTensor(),
+        bias=asked.bias,
+        robust=room.Huber(asked.robust) if asked.robust else None,
+        trust_noise=asked.noise is not None,
+    )
+    return {"options": options}
 
 
 def _undetermined(result: Any) -> bool:
@@ -262,11 +265,9 @@ def _bias(result: Any) -> tuple[Any, Any] | None:
     """The gyroscope's bias, rad/s, and its standard deviation (3,); None where none was fitted."""
     import numpy as np
 
-    if result.parameters.bias is None:
+    if "bias" not in result.sensor:
         return None
-    first = result.model.entries  # the covariance begins with the tensor's entries
-    variance = np.diagonal(np.asarray(result.covariance))[first : first + 3]
-    return np.asarray(result.parameters.bias), np.sqrt(variance)
+    return np.asarray(result.sensor["bias"]), np.asarray(result.sensor_std["bias"])
 
 
 def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
@@ -344,7 +345,7 @@ def _table(asked: _Asked, recording: Any, result: Any) -> Any:
     known = result.scale_known
     for name in ("", "moment [kg m^2]" if known else "ratio", "95 %", "axis in sensor axes", "+-"):
         grid.add_column(Text(name), justify="left" if name == "" else "right")
-    values = np.asarray(result.determined[0])
+    values = np.asarray(result.principal_values[0])
     low, high = (np.asarray(end) for end in result.interval(0.95))
     axes = np.asarray(to_matrix(result.axes))
     turn = np.degrees(np.asarray(result.axes_std))

@@ -107,13 +107,13 @@ class Known(eqx.Module):
 
 
 class Fitted(eqx.Module):
-    """Unknowns of a balance and their information."""
+    """Unknowns of a balance; ``covariance``: of the tensor's entries and the two drags."""
 
     tensors: Float[Array, "n 3 3"]
     drag: Float[Array, "n 2"]
     instrument: Instrument
     noise: Noise
-    covariance: Float[Array, "n 6 6"]
+    covariance: Float[Array, "n 8 8"]
     rest: Float[Array, "r b 3"]
     spread: Float[Array, "r b 3"]
     surprise: Float[Array, ""]
@@ -255,11 +255,15 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     instrument = jax.tree.map(lambda x: x[0], instrument)
     noise = Noise(*noise[:_LEVEL], *(x[0] for x in noise[_LEVEL:]))
 
-    def entries(shape, sigma):
-        return entries_of(known.tensor(shape, sigma))
+    def outputs(part, sigma):
+        shape, slowed = part[:_TENSOR], part[_TENSOR:]
+        moved = slowed * drag * jnp.trace(sigma)
+        return jnp.concatenate([entries_of(known.tensor(shape, sigma)), moved])
 
-    slopes = jax.vmap(jax.jacfwd(entries))(every[:, :_TENSOR], known.sigma)
-    blocks = covariance[inner[:, :, None], inner[:, None, :]]
+    both = _TENSOR + _DRAG
+    slopes = jax.vmap(jax.jacfwd(outputs))(every[:, :both], known.sigma)
+    place = first[:, :both]
+    blocks = covariance[place[:, :, None], place[:, None, :]]
     blocks = slopes @ blocks @ jnp.swapaxes(slopes, 1, 2)
     return Fitted(
         tensors, slowed, instrument, noise, blocks, score.rest, score.spread, score.surprise, steps,

@@ -30,7 +30,21 @@ def read_recording(
     time_scale: float | None = None,
     noise: float = 1.0,
 ) -> Recording:
-    """A recording of rates from a CSV file with a header line; see ``load_recording``."""
+    """A recording of rates from a CSV file with a header line.
+
+    ``columns`` names the file's columns for ``t``, ``wx``, ``wy``, ``wz`` and optionally ``wheel``;
+    those it leaves out are recognised by their usual names (``t``, ``time_s``, ``wx``, ``gyro_x``,
+    ``omega_x``, ``angular_velocity.x``, ...). ``scale`` multiplies the rates (pi/180 for deg/s),
+    ``time_scale`` the times (1e-3 for ms); None: by the unit that the column's name states (in
+    brackets, or at its end), or 1. ``noise``, rad/s: standard deviation of the rates. An empty or
+    NaN cell makes its row a gap; one of ``wheel`` alone is interpolated linearly. Cells are
+    separated by commas, or, where the header has none, by semicolons or tabs, and may then have a
+    decimal comma. Lines before the header that are empty or start with # are skipped.
+
+    Raises FileNotFoundError, and ValueError for a file that is not text, missing, ambiguous or
+    repeated columns, cells that are no numbers, unsorted or repeated times (each with its line) and
+    rates that look like deg/s.
+    """
     return load_recording(path, columns, scale=scale, time_scale=time_scale, noise=noise).recording
 
 
@@ -42,20 +56,7 @@ def load_recording(
     time_scale: float | None = None,
     noise: float = 1.0,
 ) -> Loaded:
-    """A recording of rates from a CSV file with a header line, and how its columns were read.
-
-    ``columns`` names the file's columns for ``t``, ``wx``, ``wy``, ``wz`` and optionally ``wheel``;
-    those it leaves out are found by their usual names (``t``, ``time_s``, ``wx``, ``gyro_x``,
-    ``omega_x``, ``angular_velocity.x``, ...). ``scale`` multiplies the rates (pi/180 for deg/s),
-    ``time_scale`` the times (1e-3 for ms); None: by the unit that the column's name states (in
-    brackets, or at its end), or 1. ``noise``, rad/s: standard deviation of the rates. An empty or
-    NaN cell makes its row a gap (one of ``wheel`` alone is bridged linearly). Cells are separated
-    by commas, or, where the header has none, by semicolons or tabs, and may then have a decimal
-    comma; lines before the header that are empty or start with # are passed over.
-    Raises FileNotFoundError, and ValueError for a file that is not text, missing, ambiguous or
-    repeated columns, cells that are no numbers, unsorted or repeated times (each with its line) and
-    rates that look like deg/s.
-    """
+    """As ``read_recording``, with the columns and units that were recognised."""
     lines = _lines(path)
     first = next(
         (k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")),

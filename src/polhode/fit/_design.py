@@ -1,10 +1,11 @@
-"""Which throw tells most: the information about the tensor that a planned throw would bring."""
+"""Design of throws: Fisher information about the tensor that a planned throw provides."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from polhode._checks import ArrayLike, as_float_array
 from polhode.fit._filter import Noise, Readings, innovations, score_of
 from polhode.fit._instrument import Instrument
 from polhode.fit._motion import SteppedMotion
@@ -15,29 +16,39 @@ _LOST = 0.3
 
 
 def throw_information(
-    tensor: Float[Array, "3 3"],
-    omega: Float[Array, " 3"],
-    times: Float[Array, " t"],
-    wheel_speed: Float[Array, " t"],
+    tensor: ArrayLike,
+    omega: ArrayLike,
+    times: ArrayLike,
+    wheel_speed: ArrayLike,
     instrument: Instrument,
     noise: Noise,
     block: int = 1,
 ) -> Float[Array, "6 6"]:
-    """Fisher's information of one throw about the tensor, as ``fit_balance`` would find it.
+    """Fisher information about the tensor from one planned throw, as ``fit_balance`` uses it.
 
-    **Arguments:** ``tensor``, kg m^2, sensor axes, the wheel locked; ``omega``, rad/s: rates at
-    ``times[0]``; ``wheel_speed``, rad/s, at ``times``, s; ``instrument`` (known; its axis not
-    traced); ``noise`` of one body, of residuals of ``block`` samples, such as a fit's. The throw is
-    flown without drag; that drag is unknown is accounted for.
+    **Arguments:** ``tensor`` (3, 3), kg m^2, sensor axes, the wheel locked; ``omega`` (3,), rad/s:
+    rates at ``times[0]``; ``wheel_speed`` (T,), rad/s, at ``times`` (T,), s; ``instrument``
+    (its axis must not be traced); ``noise`` of one body, of residuals of ``block`` samples, such as
+    ``Fit.noise_levels``. The throw is simulated without drag, with drag among the unknowns.
 
-    Of xx, yy, zz, yz, zx, xy over half the trace of the tensor: the inverse is the Cramer-Rao bound
-    of their relative errors. Its log-determinant has derivatives by ``omega`` and ``wheel_speed``:
+    Returns the information (6, 6) about xx, yy, zz, yz, zx, xy over half the trace of the tensor:
+    its inverse is the Cramer-Rao bound of their relative errors. Its log-determinant is
+    differentiable with respect to ``omega`` and ``wheel_speed``:
 
         def worth(omega, wheel_speed):
             found = throw_information(tensor, omega, times, wheel_speed, instrument, noise)
             return jnp.linalg.slogdet(found)[1]
         slopes = jax.grad(worth, argnums=(0, 1))(omega, wheel_speed)
     """
+    tensor, omega, times, wheel_speed = (
+        as_float_array(name, value, shape)
+        for name, value, shape in (
+            ("tensor", tensor, (3, 3)),
+            ("omega", omega, (3,)),
+            ("times", times, (None,)),
+            ("wheel_speed", wheel_speed, (None,)),
+        )
+    )
     x, y, z = (float(component) for component in np.asarray(instrument.axis))
     flight = SteppedMotion(instrument.spin_inertia, (x, y, z), instrument.delay, steps=2)
     unknown = {"drag": None, "delay": None}

@@ -21,7 +21,7 @@ from polhode.rotation import to_matrix
 
 
 class Noise(NamedTuple):
-    """Standard deviations; those of a body have its number on the leading axis n.
+    """Standard deviations of readings and disturbing torques, by body on the leading axis n.
 
     ``omega``, rad/s: of a residual, and ``omega_wheel`` what the fastest wheel adds; ``torque``,
     N m s^(1/2), of white torques and ``torque_wheel`` what the fastest wheel adds (both grow with
@@ -38,7 +38,7 @@ class Noise(NamedTuple):
     wheel: Float[Array, ""]
 
     def grown(self, factor: Array) -> "Noise":
-        """That of a body ``factor`` times as large: torques grow with it."""
+        """The noise of a body of ``factor`` times the inertia: torques are proportional to it."""
         torque, wheel, slow = (x * factor for x in (self.torque, self.torque_wheel, self.slow))
         return self._replace(torque=torque, torque_wheel=wheel, slow=slow)
 

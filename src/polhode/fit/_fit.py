@@ -1,24 +1,20 @@
 """``fit_inertia``: the inertia of bodies from recordings of their motion."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import numpy as np
-from jaxtyping import ArrayLike
 
 from polhode._batch import map_chunks
-from polhode._checks import require
+from polhode._checks import ArrayLike, require
 from polhode.fit._compiled import compiled
 from polhode.fit._fit_wheel import fit_wheel, fit_wheels
 from polhode.fit._instrument import Instrument
-from polhode.fit._motion import AbstractMotion
-from polhode.fit._parameters import AbstractInertiaUnknown
+from polhode.fit._options import FitOptions, changed_options, check_usable, checked_options
 from polhode.fit._recording import Recording, stack
-from polhode.fit._residuals import Huber
-from polhode.fit._result import CURES, UNUSABLE, FitError, InertiaFit, conclude, is_unusable
-from polhode.fit._solve import FitOptions, solve
-from polhode.inertia import Inertia
+from polhode.fit._result import Fit, checked_fit, conclude
+from polhode.fit._solve import solve
 
 # Samples that a processor core works on together.
 _LANES = 1024
@@ -36,97 +32,118 @@ def fit_inertia(
     force_noise: ArrayLike | None = None,
     instrument: Instrument | None = None,
     block: int = 1,
-    motion: AbstractMotion | None = None,
-    unknown: AbstractInertiaUnknown | None = None,
-    known: Inertia | None = None,
-    bias: bool = False,
-    mounting: bool = False,
-    robust: Huber | None = None,
-    starts: int = 6,
-    solver: Any = None,
-    max_steps: int = 100,
+    options: FitOptions | None = None,
     throw: bool = True,
-) -> InertiaFit:
-    """Inertia of a body, or a batch of bodies, from one recording each.
+) -> Fit:
+    """Inertia of a body, or of each body of a batch, from one recording.
 
-    **Arguments:** ``times`` (..., T), s, increasing; ``omega_body`` (..., T, 3), rad/s, the
-    gyroscope in right-handed sensor axes; ``wxyz`` (..., T, 4) attitudes body -> space;
-    ``force_body`` (..., T, 3), m/s^2, accelerometer; rows with NaN are gaps. ``..._noise``:
-    standard deviations (None: one for all channels, taken from the residuals). ``wheel_speed``
-    (..., T), rad/s, of a wheel aboard, whose ``Instrument(spin_inertia)`` is to be given: then the
-    likelihood of the readings is fitted as by ``fit_balance``, drag and noise with it, ``block``
-    samples to a residual. ``motion``: what the body does instead: ``FreeMotion()`` (exact,
-    torque-free) or ``SteppedMotion`` (drag, a wheel that turns exactly as it says). ``unknown``:
-    ``FullTensor()`` or ``MomentsOnly()``. ``known``: an inertia to start from. ``bias``,
-    ``mounting``: whether to fit them. ``robust``: ``Huber(threshold)``, in standard deviations,
-    needs a known noise. ``starts``: how many attempts are made at most (1:
-    from a regression only; the next ones follow where its result misses the data: from another
-    regression, to growing parts of the recording, from other bodies). ``solver``: any
-    Gauss-Newton solver of optimistix.
+    **Arguments:**
 
-    A wheel's motion that is taken at its word (``SteppedMotion``) misleads where the air pushes and
-    the speed is noisy: of simulated throws of 0.5 s it misses the moments by 2 to 7 % and states
-    0.6 to 1.1 %, the likelihood of the readings by 0.04 to 1.7 % and states 0.03 to 1.4 %. Forces
-    take part in fits of a ``motion`` only: 3 cm from the centre of mass an accelerometer narrows
-    the tensor of such a throw by 0.3 % at most.
+    - ``times`` (..., T) [s], increasing; ``omega_body`` (..., T, 3) [rad/s], the gyroscope in
+      right-handed sensor axes; ``wxyz`` (..., T, 4), attitudes body -> space; ``force_body``
+      (..., T, 3) [m/s^2], the accelerometer; rows with NaN are gaps.
+    - ``omega_noise`` [rad/s], ``attitude_noise`` [rad], ``force_noise`` [m/s^2]: standard
+      deviations, broadcast against the data, of everything that was recorded or of nothing. None:
+      the noise is estimated from the residuals, all channels having the same in these units.
+    - ``wheel_speed`` (..., T) [rad/s]: speed of a reaction wheel relative to the body, with
+      ``instrument``: ``Instrument(spin_inertia)``. The likelihood of the readings is then maximised
+      as by ``fit_balance``: drag and noise are estimated too, ``block`` samples give one residual,
+      and ``options`` do not apply.
+    - ``options``: ``FitOptions``: motion, unknowns, loss, start and solver.
+    - ``throw``: whether a fit that must not be used raises FitError.
 
-    Torque-free rates show only the ratios of the moments: see ``InertiaFit.scale_known``. Every
-    iterate is a physical body. Left-handed axes are not fitted away: with attitudes they are
-    noticed; without, ``InertiaFit.mirrored`` tells what the rates would mean then.
+    Returns a ``Fit`` with the leading axes of the data. Torque-free rates show only the ratios of
+    the moments (``Fit.scale_known``). Every iterate is a physical body. Left-handed axes are
+    detected where attitudes are given; otherwise see ``Fit.mirror_inertia``.
 
-    Raises ValueError for bad input, and unless ``throw=False`` FitError when a fit is not finite,
-    stopped early, or rates and attitudes disagree about the axes; ``finding`` has the flags.
+    With ``SteppedMotion(spin_inertia)`` in place of the instrument the wheel speed counts as
+    noise-free: in simulated throws of 0.5 s with drag the moments are then wrong by 2 to 7 %
+    (stated: 0.6 to 1.1 %), by the likelihood of the readings 0.04 to 1.7 % (stated: 0.03 to 1.4 %).
+    ``FreeMotion()`` ignores the wheel.
+
+    Raises ValueError for bad input and for options that do not apply; FitError for a fit that is
+    not finite or stopped early, or where rates and attitudes contradict each other.
     """
-    noise = {
-        "omega_noise": omega_noise,
-        "attitude_noise": attitude_noise,
-        "force_noise": force_noise,
-    }
-    if instrument is not None or (wheel_speed is not None and motion is None):
-        _only_a_wheel(
-            instrument,
-            wheel_speed,
-            {
-                "omega_noise": omega_noise, "wxyz": wxyz, "force_body": force_body,
-                "motion": motion, "unknown": unknown, "known": known, "bias": bias,
-                "mounting": mounting, "robust": robust, "solver": solver,
-            },
-        )  # fmt: skip
+    options = checked_options(options)
+    require(
+        instrument is not None or block == 1,
+        f"block={block} belongs to an instrument: average the samples by averaged, or give"
+        " instrument=Instrument(spin_inertia).",
+    )
+    if instrument is not None or (wheel_speed is not None and options.motion is None):
+        others = {
+            "wxyz": wxyz,
+            "force_body": force_body,
+            "omega_noise": omega_noise,
+            "attitude_noise": attitude_noise,
+            "force_noise": force_noise,
+        }
+        names = [name for name, value in others.items() if value is not None]
+        _check_wheel(instrument, wheel_speed is not None, names, options)
         recording = Recording.of(times, omega_body, wheel_speed=wheel_speed)
-        return _finished(fit_wheel(recording, instrument, block), throw)
+        return checked_fit(fit_wheel(recording, instrument, block), throw)
+    channels = {
+        "omega_noise": (omega_noise, "omega_body", omega_body),
+        "attitude_noise": (attitude_noise, "wxyz", wxyz),
+        "force_noise": (force_noise, "force_body", force_body),
+    }
+    options = _with_noise(options, channels)
+    noise = {name: 1.0 if given is None else given for name, (given, _, _) in channels.items()}
     recording = Recording.of(
-        times,
-        omega_body,
-        wxyz=wxyz,
-        force_body=force_body,
-        wheel_speed=wheel_speed,
-        **{name: 1.0 if value is None else value for name, value in noise.items()},
+        times, omega_body, wxyz=wxyz, force_body=force_body, wheel_speed=wheel_speed, **noise
     )
-    noise_known = any(value is not None for value in noise.values())
-    options = FitOptions(
-        motion, unknown, known, robust, bias, mounting, noise_known, starts, solver, max_steps
-    )
-    return _finished(each(recording, options), throw)
+    check_usable(options, recording)
+    return checked_fit(each(recording, options), throw)
 
 
-def _only_a_wheel(instrument: Instrument | None, wheel_speed, others) -> None:
-    """Refuse what the likelihood of the readings would not use."""
+def _with_noise(options: FitOptions, channels: dict[str, tuple]) -> FitOptions:
+    """The options with ``trust_noise`` as the noise of ``fit_inertia`` implies it."""
+    given = [name for name, (noise, _, _) in channels.items() if noise is not None]
+    for name, (noise, data_name, data) in channels.items():
+        require(
+            noise is None or data is not None,
+            f"{name} is the noise of {data_name}, which was not given.",
+        )
+    for name, (noise, _, data) in channels.items():
+        require(
+            noise is not None or data is None or not given,
+            f"{', '.join(given)} without {name}: the noise must be given of everything that was"
+            " recorded, or of nothing.",
+        )
+    require(
+        given or not options.trust_noise,
+        "trust_noise=True needs the noise: give omega_noise (rad/s).",
+    )
+    require(
+        given or options.robust is None,
+        "robust counts residuals in standard deviations of the noise: give omega_noise (rad/s).",
+    )
+    if options.trust_noise is None:
+        return dataclasses.replace(options, trust_noise=bool(given))
+    return options
+
+
+def _check_wheel(
+    instrument: Instrument | None, wheel: bool, data: list[str], options: FitOptions
+) -> None:
+    """ValueError for what the likelihood of the readings does not use."""
     require(
         instrument is not None,
         "wheel_speed needs instrument=Instrument(spin_inertia) to mean a momentum; or give the "
-        "motion: SteppedMotion(spin_inertia), or FreeMotion() to leave the wheel out.",
+        "motion: FitOptions(motion=SteppedMotion(spin_inertia)), or FreeMotion() to leave the "
+        "wheel out.",
     )
-    require(wheel_speed is not None, "an instrument needs the wheel's speed: give wheel_speed.")
+    require(wheel, "an instrument needs the wheel's speed: give wheel_speed.")
     require(
         instrument is not None and instrument.spin_inertia is not None,
         "the instrument needs the wheel's spin_inertia; throws without a wheel: fit_balance.",
     )
-    unused = [name for name, value in others.items() if value is not None and value is not False]
+    unused = [*data, *changed_options(options)]
     require(
         not unused,
         f"with an instrument the readings of gyroscope and wheel alone are fitted, got also "
-        f"{', '.join(unused)}: leave it out, or give motion=SteppedMotion(spin_inertia) in place "
-        "of the instrument.",
+        f"{', '.join(unused)}: leave it out, or give FitOptions(motion=SteppedMotion("
+        "spin_inertia)) in place of the instrument.",
     )
 
 
@@ -135,42 +152,36 @@ def fit_recordings(
     *,
     instrument: Instrument | None = None,
     block: int = 1,
-    motion: AbstractMotion | None = None,
-    unknown: AbstractInertiaUnknown | None = None,
-    known: Inertia | None = None,
-    bias: bool = False,
-    mounting: bool = False,
-    robust: Huber | None = None,
-    noise_known: bool = False,
-    starts: int = 6,
-    solver: Any = None,
-    max_steps: int = 100,
+    options: FitOptions | None = None,
     throw: bool = True,
-) -> InertiaFit:
-    """One inertia from several recordings of the same body (``Recording.of``); see ``fit_inertia``.
+) -> Fit:
+    """One inertia from several recordings of the same body.
 
-    Recordings with a wheel need its ``instrument``, as there (the noise is found, too, and what
-    belongs to a motion is refused), or the ``motion``. Windows of one long recording are recordings
-    too: their initial rates are then fitted separately (multiple shooting), which keeps a long or
-    chaotic motion tractable.
+    **Arguments:** ``recordings``: made by ``Recording.of`` or ``read_recording``, with the same
+    kinds of data, of any lengths. ``instrument``, ``block``, ``options``, ``throw``: as in
+    ``fit_inertia``; ``FitOptions(trust_noise=True)`` where the noise of the recordings is absolute.
+    Recordings with a wheel need its ``instrument``, or a ``motion``.
+
+    Windows of one long recording (``windows``) are recordings too: their initial rates are fitted
+    separately (multiple shooting), which keeps a long or chaotic motion tractable.
+
+    Returns a ``Fit`` of one body. Raises ValueError and FitError as ``fit_inertia``.
     """
-    wheel = [one.wheel is not None for one in recordings]
-    if instrument is not None or (any(wheel) and motion is None):
-        _only_a_wheel(
-            instrument,
-            any(wheel) or None,
-            {
-                "motion": motion, "unknown": unknown, "known": known, "bias": bias,
-                "mounting": mounting, "robust": robust, "noise_known": noise_known,
-                "solver": solver, "attitudes": any(one.wxyz is not None for one in recordings),
-                "forces": any(one.force is not None for one in recordings),
-            },
-        )  # fmt: skip
-        return _finished(fit_wheels(recordings, instrument, block), throw)
-    options = FitOptions(
-        motion, unknown, known, robust, bias, mounting, noise_known, starts, solver, max_steps
+    options = checked_options(options)
+    stacked = stack(recordings)
+    wheel = stacked.wheel is not None
+    require(
+        instrument is not None or block == 1,
+        f"block={block} belongs to an instrument: average the samples by averaged, or give"
+        " instrument=Instrument(spin_inertia).",
     )
-    return _finished(together(stack(recordings), options), throw)
+    if instrument is not None or (wheel and options.motion is None):
+        kinds = {"attitudes": stacked.wxyz, "forces": stacked.force}
+        names = [name for name, value in kinds.items() if value is not None]
+        _check_wheel(instrument, wheel, names, options)
+        return checked_fit(fit_wheels(recordings, instrument, block), throw)
+    check_usable(options, stacked)
+    return checked_fit(together(stacked, options), throw)
 
 
 def windows(recording: Recording, length: int) -> list[Recording]:
@@ -213,15 +224,3 @@ def _batch(recording: Recording, options: FitOptions, conclude: Callable) -> Any
     if at_once == 1 < rounds:
         return jax.lax.map(fit, recording)
     return map_chunks(jax.vmap(fit), recording, count, -(-count // rounds))
-
-
-def _finished(result: InertiaFit, throw: bool) -> InertiaFit:
-    if throw and is_unusable(result):
-        codes = np.asarray(result.finding).reshape(-1)
-        said = [
-            f"{int(((codes & int(flag)) != 0).sum())} of {codes.size}: {text}"
-            for flag, text in CURES.items()
-            if flag & UNUSABLE and (codes & int(flag)).any()
-        ]
-        raise FitError("; ".join(said) + ". Pass throw=False to get the result with its flags.")
-    return result

@@ -1,22 +1,32 @@
-"""A gyroscope beside a wheel: what a data sheet leaves open, and readings made ready for a fit."""
+"""A gyroscope beside a reaction wheel: calibration parameters, and preparation of recordings."""
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._checks import require, require_positive
+from polhode._checks import as_float_array, require, require_positive
 from polhode.fit._matrices import solve
 from polhode.fit._recording import Recording, needed
 from polhode.fit._start import central_slope, integrate
 from polhode.rotation import to_matrix
 
 
+def _vector(name: str, *rows: int) -> Callable[[Any], Any]:
+    """Converter of a field to floats of shape (*rows, 3); None stays."""
+
+    def convert(value: Any) -> Any:
+        return None if value is None else as_float_array(name, value, (*rows, 3))
+
+    return convert
+
+
 class Instrument(eqx.Module):
-    """How readings mean rates and momentum: ``omega = (1 + skew) (reading - bias)``.
+    """Calibration of gyroscope and reaction wheel: ``omega = (1 + skew) (reading - bias)``.
 
     **Fields:** ``spin_inertia``, kg m^2, of the wheel (None: there is none); ``axis`` (3,) unit
     vector of its axis in sensor axes; ``delay``, s: to a gyroscope's reading belongs the speed of
@@ -26,12 +36,12 @@ class Instrument(eqx.Module):
     """
 
     spin_inertia: Array | float | None
-    axis: Float[Array, " 3"] = eqx.field(converter=jnp.asarray, default=(0.0, 0.0, 1.0))
+    axis: Float[Array, " 3"] = eqx.field(converter=_vector("axis"), default=(0.0, 0.0, 1.0))
     delay: Array | float = 0.0
-    skew: Float[Array, "3 3"] | None = None
-    bias: Float[Array, " 3"] | None = None
+    skew: Float[Array, "3 3"] | None = eqx.field(converter=_vector("skew", 3), default=None)
+    bias: Float[Array, " 3"] | None = eqx.field(converter=_vector("bias"), default=None)
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         if self.spin_inertia is not None:
             require_positive("spin_inertia", self.spin_inertia, hint="None stands for no wheel")
 
@@ -52,9 +62,9 @@ class Instrument(eqx.Module):
 
 
 class Tolerance(NamedTuple):
-    """Standard deviations of what is fitted of an ``Instrument``; zero: taken as given.
+    """Prior standard deviations of the fields of an ``Instrument``; zero: not fitted.
 
-    ``axis``, rad; ``delay``, s; ``skew``, relative; ``bias``, rad/s: as a data sheet states them.
+    **Fields:** ``axis`` [rad]; ``delay`` [s]; ``skew``, relative; ``bias`` [rad/s].
     """
 
     axis: float = 0.02
@@ -64,7 +74,11 @@ class Tolerance(NamedTuple):
 
 
 def averaged(recording: Recording, count: int) -> Recording:
-    """Means of blocks of ``count`` samples; a gap in a block makes it one. For fast recordings."""
+    """Recording of means over blocks of ``count`` samples; a block with a gap is a gap.
+
+    For readings that are much faster than the motion. Raises ValueError for fewer than four
+    blocks, and for recordings with attitudes.
+    """
     length = recording.times.shape[-1] // count
     require(
         length >= 4,

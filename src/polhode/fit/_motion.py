@@ -1,13 +1,14 @@
 """How the body moves between its first sample and the others: the model that a fit compares."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from polhode._closed_forms.free import free_motion
@@ -26,7 +27,7 @@ from polhode.rotation import conjugate, multiply, normalise, rotate, to_matrix
 
 
 class Predicted(NamedTuple):
-    """Rates, their derivatives (None: unknown) and, if asked for, attitudes at given times."""
+    """Body rates, their derivatives (None: unknown) and attitudes (None: not computed)."""
 
     omega: Float[Array, "t 3"]
     omega_dot: Float[Array, "t 3"] | None
@@ -58,44 +59,63 @@ class AbstractMotion(eqx.Module):
 
 
 class Drag(eqx.Module):
-    """Torque ``-(linear + quadratic |omega|) omega`` of the air, isotropic."""
+    """Isotropic torque of the air, ``-(linear + quadratic |omega|) omega``.
+
+    **Fields:** ``linear`` [N m s], ``quadratic`` [N m s^2].
+    """
 
     linear: Array | float = 0.0
     quadratic: Array | float = 0.0
 
-    def torque(self, dtype) -> AbstractTorque:
+    def torque(self, dtype: DTypeLike) -> AbstractTorque:
         """The torque in a scene; a fit may try negative coefficients, which a scene refuses."""
         parts = LinearDamping(1.0) + QuadraticDamping(1.0)
         tried = [jnp.full(3, c, dtype) for c in (self.linear, self.quadratic)]
         return eqx.tree_at(lambda s: [term.c for term in s.terms], parts, tried)
 
 
-class SteppedMotion(AbstractMotion):
-    """Flight with air drag and a wheel of known speed, by Runge-Kutta steps of order 4.
+def _three_floats(values: Sequence[float]) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
 
-    The motion is that of H with the wheel's momentum ``spin_inertia W(t - delay) axis`` and the
-    drag as its torque; I is the inertia with the wheel locked. ``steps`` steps are made between
-    samples. What is None is absent; ``fit_...`` says which of the values are unknown.
+
+class SteppedMotion(AbstractMotion):
+    """Flight with air drag and a reaction wheel of known speed, by Runge-Kutta steps of order 4.
+
+    **Fields:** ``spin_inertia`` [kg m^2] of the wheel about its ``axis`` (3,), a unit vector in
+    sensor axes (None: no wheel): its momentum is ``spin_inertia`` times the speed W(t - ``delay``)
+    of the recording, and the inertia is that with the wheel locked; ``drag``: a ``Drag`` or None;
+    ``fit_drag``, ``fit_delay``: whether these are unknown; ``steps`` between two samples.
     """
 
     spin_inertia: Array | float | None = None
-    axis: tuple[float, float, float] = eqx.field(static=True, default=(0.0, 0.0, 1.0))
+    axis: tuple[float, float, float] = eqx.field(
+        static=True, converter=_three_floats, default=(0.0, 0.0, 1.0)
+    )
     delay: Array | float = 0.0
     drag: Drag | None = None
     fit_drag: bool = eqx.field(static=True, default=False)
     fit_delay: bool = eqx.field(static=True, default=False)
     steps: int = eqx.field(static=True, default=1)
 
-    def start(self):
+    def start(self) -> dict[str, Any]:
         return {
             "drag": self.drag if self.fit_drag else None,
             "delay": self.delay if self.fit_delay else None,
         }
 
-    def fixes_scale(self):
+    def fixes_scale(self) -> bool:
         return self.spin_inertia is not None or (self.drag is not None and not self.fit_drag)
 
-    def __call__(self, tensor, omega, wxyz, times, wheel, unknown):
+    def __call__(
+        self,
+        tensor: Float[Array, "3 3"],
+        omega: Float[Array, " 3"],
+        wxyz: Float[Array, " 4"] | None,
+        times: Float[Array, " t"],
+        wheel: Float[Array, " t"] | None,
+        unknown: Any,
+    ) -> Predicted:
         inertia = Inertia(full=tensor)
         drag = unknown["drag"] if self.fit_drag else self.drag
         torque = None if drag is None else drag.torque(times.dtype)
@@ -172,15 +192,23 @@ def _field(t, y, dynamics):
 
 
 class FreeMotion(AbstractMotion):
-    """Torque-free flight, exact: Jacobi elliptic functions, nothing is stepped."""
+    """Torque-free motion in closed form (Jacobi elliptic functions)."""
 
-    def start(self):
+    def start(self) -> None:
         return None
 
-    def fixes_scale(self):
+    def fixes_scale(self) -> bool:
         return False
 
-    def __call__(self, tensor, omega, wxyz, times, wheel, unknown):
+    def __call__(
+        self,
+        tensor: Float[Array, "3 3"],
+        omega: Float[Array, " 3"],
+        wxyz: Float[Array, " 4"] | None,
+        times: Float[Array, " t"],
+        wheel: Float[Array, " t"] | None,
+        unknown: Any,
+    ) -> Predicted:
         moments, axes, (yz, zx, xy) = principal(tensor)
         start = rotate(conjugate(axes), omega)
         attitude = None if wxyz is None else tuple(multiply(wxyz, axes))

@@ -35,7 +35,7 @@ def whole_of(entries: Float[Array, " e"], count: int = 6) -> Float[Array, "3 3"]
 
 
 class Parameters(eqx.Module):
-    """Unconstrained unknowns of one body and its recordings (absent ones are None).
+    """Unconstrained unknowns of one body and its recordings (None: not fitted).
 
     **Fields:** ``shape`` (k,): free entries of the Cholesky factor, relative to the start;
     ``omega`` (r, 3), rad/s: rates at the first time of each recording; ``attitude`` (r, 3), rad:
@@ -64,21 +64,21 @@ class AbstractInertiaUnknown(eqx.Module):
 class FullTensor(AbstractInertiaUnknown):
     """Any tensor in sensor axes: six numbers, of which free motion shows five."""
 
-    def columns(self):
+    def columns(self) -> np.ndarray:
         return np.eye(6)
 
 
 class MomentsOnly(AbstractInertiaUnknown):
     """Sensor axes are principal axes: three numbers, of which free motion shows two."""
 
-    def columns(self):
+    def columns(self) -> np.ndarray:
         return np.eye(6)[:, :3]
 
 
 class NoInertia(AbstractInertiaUnknown):
-    """Of the inertia nothing is unknown but what the motion itself asks for."""
+    """The inertia is not unknown, or belongs to the unknowns of the motion."""
 
-    def columns(self):
+    def columns(self) -> np.ndarray:
         return np.zeros((6, 0))
 
 

@@ -1,4 +1,4 @@
-"""What was measured: gyroscope rates, attitudes, accelerometer readings, and their noise."""
+"""``Recording``: gyroscope rates, attitudes, accelerometer readings, and their noise."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -8,9 +8,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, is_concrete, numbers, require, require_positive
+from polhode._checks import (
+    ArrayLike,
+    as_float_array,
+    is_concrete,
+    numbers,
+    require,
+    require_positive,
+)
 from polhode.rotation import conjugate, multiply, normalise
 
 # angles per sample above which a record under-samples its own rotation
@@ -133,10 +140,6 @@ class Recording(eqx.Module):
         """Leading axes."""
         return self.times.shape[:-1]
 
-    def mirrored(self) -> "Recording":
-        """The rates with every sign reversed: what the other handedness of axes would read."""
-        return eqx.tree_at(lambda r: r.omega, self, -needed("omega", self.omega))
-
 
 def turn_between(first: Float[Array, "*t 4"], second: Float[Array, "*t 4"]) -> Float[Array, "*t 3"]:
     """Rotation vectors, body axes, from attitudes to near ones: twice the quaternion's vector."""
@@ -189,8 +192,16 @@ def bridged(times: Float[Array, "*b t"], known: Float[Array, "*b t"], values: Ar
 
 
 def stack(recordings: Sequence[Recording]) -> Recording:
-    """Recordings of one body as one batch; shorter ones are filled up with gaps."""
+    """One recording with a leading axis from several; shorter ones are filled up with gaps.
+
+    Raises ValueError for recordings that have batch axes or different kinds of data.
+    """
     require(len(recordings) > 0, "at least one recording is needed, got none.")
+    for one in recordings:
+        require(
+            not one.batch_shape,
+            f"recordings of one body have no batch axes, got {one.batch_shape}.",
+        )
     longest = max(r.times.shape[-1] for r in recordings)
 
     def filled(r):

@@ -21,7 +21,7 @@ class Huber(eqx.Module):
 
     threshold: float = 3.0
 
-    def __check_init__(self):
+    def __check_init__(self) -> None:
         if not self.threshold > 0:
             raise ValueError(f"the threshold of Huber must be positive, got {self.threshold}.")
 
@@ -34,10 +34,12 @@ class Huber(eqx.Module):
 
 
 class Model(eqx.Module):
-    """What is known of a fit: the motion, the free directions of the inertia, the start attitude.
+    """The model of a fit: how ``Parameters`` and a ``Recording`` give residuals.
 
-    ``base``: from where ``Parameters.shape`` counts, ``columns``
-    (static) its directions, ``attitude`` (r, 4) or None, ``robust`` loss or None.
+    **Fields:** ``motion``; ``base``, ``columns`` (static): origin and directions of
+    ``Parameters.shape``; ``attitude`` (r, 4): first recorded attitudes, to which
+    ``Parameters.attitude`` is relative, or None; ``robust``: a ``Huber`` or None; ``scale_known``
+    (static): whether ``shape`` includes the size of the inertia.
     """
 
     motion: AbstractMotion
@@ -64,7 +66,8 @@ def predict(
 ) -> Predicted:
     """Motion of every recording (leading axis r) for these parameters, body axes.
 
-    ``tensor`` (3, 3) stands in for that of ``parameters.shape`` when it is given.
+    ``tensor`` (3, 3): inertia in place of that of ``parameters.shape``. Returns ``omega``,
+    ``omega_dot`` (r, T, 3) and ``wxyz`` (r, T, 4), the last two None where they are not computed.
     """
     if tensor is None:
         tensor = model.tensor(parameters)
@@ -126,7 +129,7 @@ def log_density(
     ``recording`` as in ``residuals`` (one leading axis: ``stack([recording])``), ``model`` that of
     a fit, whose ``parameters`` are the place to start from; ``prior`` adds the logarithm of its
     density (None: flat in the parameters, that is in the second moments away from flat bodies).
-    BlackJAX takes the result as it is; in NumPyro hand its negative to ``potential_fn``.
+    The result is a density for BlackJAX; its negative is a ``potential_fn`` for NumPyro.
     """
 
     def density(parameters):

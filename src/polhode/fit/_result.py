@@ -1,7 +1,7 @@
-"""What a fit found, how well it is known, and what the data cannot say."""
+"""``Fit``: the result of a fit, its uncertainty, and what the data do not show."""
 
 import enum
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import partial
 from statistics import NormalDist
 from typing import Any, NamedTuple
@@ -11,20 +11,29 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.stats import norm
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from polhode._checks import require
+from polhode._scene import Scene, State
+from polhode.fit._filter import Noise
+from polhode.fit._instrument import Instrument
 from polhode.fit._linear import Linear
 from polhode.fit._matrices import eigh, inverse, svd
+from polhode.fit._options import FitOptions
 from polhode.fit._parameters import Parameters, entries_of, whole_of
 from polhode.fit._recording import Recording, needed, turn_between
 from polhode.fit._residuals import Model
-from polhode.fit._solve import FitOptions, Solution, misfit_of
+from polhode.fit._scene_motion import LeafMotion
+from polhode.fit._solve import Solution, misfit_of
 from polhode.inertia import Inertia, principal
+from polhode.rotation import multiply, rotation_vector_to_wxyz
+
+# Part of an unknown in directions that the data do not show, above which it is not known.
+_LEANS = 1e-3
 
 
 class Finding(enum.IntFlag):
-    """What to know about a fit before using it (per body; 0: nothing to remark)."""
+    """Diagnostics of a fit, as flags (per body; 0: none)."""
 
     NONE = 0
     STEP_LIMIT = 1
@@ -37,9 +46,9 @@ class Finding(enum.IntFlag):
     POOR = 128
 
 
-CURES = {
-    Finding.STEP_LIMIT: "the optimiser stopped at its step limit: raise max_steps, try more "
-    "starts, or shorten the recording into windows",
+WARNINGS = {
+    Finding.STEP_LIMIT: "the optimiser stopped at its step limit: raise max_steps or max_starts, "
+    "or shorten the recording into windows",
     Finding.NOT_FINITE: "the fit is not finite: look for outliers (robust=Huber()), wrong units or "
     "a recording with too little rotation",
     Finding.NEARLY_FLAT: "the best body is flat (one moment is the sum of the two others): the "
@@ -47,15 +56,28 @@ CURES = {
     "model may have pushed it there",
     Finding.UNDETERMINED: "some of the tensor does not show in this motion (an axis hardly "
     "excited, or a symmetric body): their intervals are infinite; add a recording of another spin",
-    Finding.AXES_DISAGREE: "the rates do not turn the attitudes as right-handed axes would: one "
-    "axis is inverted, or axes are exchanged; mend the columns (sensor_axes shows how)",
+    Finding.AXES_DISAGREE: "rates and attitudes contradict each other for right-handed axes: one "
+    "axis is inverted, or axes are exchanged; correct the columns (sensor_axes shows how)",
     Finding.NOT_WHITE: "the residuals are correlated in time: the model lacks something (drag, "
     "bias, a moving part) and the intervals are too narrow",
     Finding.WEAK: "a ratio is known to no better than 5 % (a nearly symmetric body, a spin near a "
-    "principal axis, a short record): the interval is a rough one, since the valley of good fits "
-    "is longer than the linear theory of it holds",
+    "principal axis, a short record): the interval is approximate, since the misfit is no longer "
+    "quadratic over such a range",
     Finding.POOR: "the residuals are more than twice as large as the noise: a wrong model, wrong "
-    "axes or units, outliers (robust=Huber()), or a valley that is not the best",
+    "axes or units, outliers (robust=Huber()), or a local minimum that is not the best",
+}
+_SCENE_WARNINGS = WARNINGS | {
+    Finding.UNDETERMINED: "some of the numbers do not show in this motion, alone or against each"
+    " other: their standard deviations are infinite; free fewer of them, or add a recording that"
+    " shows them",
+    Finding.POOR: "the residuals are more than twice as large as the noise: a wrong model, wrong"
+    " units, outliers (robust=Huber()), or a start too far away",
+}
+_READINGS_WARNINGS = WARNINGS | {
+    Finding.STEP_LIMIT: "the likelihood of the readings did not converge: look for samples outside"
+    " free flight, wrong units or signs of the wheel, or too little rotation",
+    Finding.NOT_FINITE: "the fit is not finite: look for samples outside free flight, wrong units"
+    " or signs of the wheel, or too little rotation",
 }
 
 UNUSABLE = Finding.STEP_LIMIT | Finding.NOT_FINITE | Finding.AXES_DISAGREE
@@ -63,23 +85,11 @@ UNUSABLE = Finding.STEP_LIMIT | Finding.NOT_FINITE | Finding.AXES_DISAGREE
 
 
 class FitError(RuntimeError):
-    """A fit that must not be used as it is; the message says why and what helps."""
+    """A fit that must not be used as it is; the message gives the cause and what helps."""
 
 
-class InertiaFit(eqx.Module):
-    """Result of ``fit_inertia``; leading axes are those of the bodies.
-
-    **Fields:** ``inertia``: full tensor in sensor axes; where ``scale_known`` (static) is false the
-    data show only its shape, and it is given with a largest moment of 1. ``moments`` (..., 3),
-    ascending; ``axes`` (..., 4), ``wxyz`` principal -> sensor axes; ``ratios`` (..., 3) to the
-    largest moment. ``moments_std``, ``ratios_std``: standard deviations (infinite for what the data
-    cannot say); ``axes_std`` (..., 3), rad, about each principal axis. ``covariance`` (..., p, p)
-    of the tensor's entries (xx, yy, zz, yz, zx, xy) followed by the other ``parameters``, by
-    the pseudo-inverse of ``information``; ``null_directions`` (..., p) how many directions of that
-    space are not determined (one for the unknown scale). ``noise``: standard deviation of the
-    residuals over that assumed (reduced chi); ``whiteness``: probability of correlations as large
-    as those seen, were the residuals independent. ``finding`` (...): ``Finding`` flags.
-    """
+class InertiaEstimate(eqx.Module):
+    """The inertia that a fit estimated; ``Fit`` documents the fields and passes them on."""
 
     inertia: Inertia
     moments: Float[Array, "*b 3"]
@@ -88,23 +98,146 @@ class InertiaFit(eqx.Module):
     moments_std: Float[Array, "*b 3"]
     ratios_std: Float[Array, "*b 3"]
     axes_std: Float[Array, "*b 3"]
+    scale_known: bool = eqx.field(static=True)
+    handedness_known: bool = eqx.field(static=True)
+
+
+class ReadingsEstimate(eqx.Module):
+    """What the likelihood of readings estimated of instrument and noise; ``Fit`` has the text."""
+
+    instrument: Instrument
+    noise_levels: Noise
+    negative_log_likelihood: Float[Array, "*b"]
+    block: int = eqx.field(static=True)
+
+
+class Fit(eqx.Module):
+    """Result of every fit. Leading axes (...) are those of the bodies, none for a single body.
+
+    **Fields** of every fit, r recordings of a body and p unknowns:
+
+    - ``values``: list of the fitted arrays, and ``std`` their standard deviations (infinite for
+      what the data do not show). Of ``fit_scene`` these are the arrays that ``free`` listed; of an
+      inertia the tensor (..., 3, 3) [kg m^2] in sensor axes and the unknowns of the motion (leaves
+      of ``parameters.motion``: drag, delay).
+    - ``sensor``, ``sensor_std``: those fitted of ``"bias"`` (..., 3) [rad/s] and ``"mounting"``
+      (..., 3) [rad] of the gyroscope and ``"lever"`` (..., 3) [m] of the accelerometer.
+    - ``initial``: ``ph.State`` (..., r) at the first time of each recording. Without recorded
+      attitudes the space axes are those of the body then, or the ``attitude`` of ``fit_scene``.
+    - ``covariance`` (..., p, p) of all unknowns: the tensor's entries xx, yy, zz, yz, zx, xy (three
+      for ``MomentsOnly``, none of a scene), bias, mounting, lever, the motion's unknowns or the
+      scene's values, then rates and attitude (rotation vector) at the start of each recording.
+      It is the pseudo-inverse of ``information`` (..., p, p). The likelihood of readings (a fit
+      with an ``instrument``) has no initial states among its unknowns.
+    - ``null_count`` (...): number of directions of the unknowns that the data do not show.
+    - ``noise`` (...): standard deviation of the residuals over the assumed one (reduced chi).
+    - ``whiteness`` (...): probability of autocorrelations as large as observed, for independent
+      residuals (Ljung-Box).
+    - ``rms`` (...): of the residual rates [rad/s]; NaN without rates.
+    - ``diagnostics`` (...): ``Finding`` flags as integers; ``findings``, ``warnings``, ``report``
+      and ``is_usable`` explain them.
+    - ``steps``, ``attempts`` (...): of the optimiser.
+    - ``residuals``: of ``"omega"``, ``"attitude"``, ``"force"`` (..., r, T, 3) over their noise;
+      with an ``instrument`` those of blocks of rates given all readings before, and
+      ``"omega_std"``, their standard deviations [rad/s].
+    - ``parameters``, ``model``: of ``predict``, ``residuals`` and ``log_density``.
+
+    **Of an inertia** (``fit_inertia``, ``fit_recordings``, ``fit_balance``): ``inertia``,
+    ``moments``, ``axes``, ``ratios``, their standard deviations, ``scale_known``,
+    ``principal_values``, ``interval``, ``mirror_inertia``. **Of a scene** (``fit_scene``):
+    ``scene``. **Of readings with an** ``instrument``: ``instrument``, ``noise_levels``,
+    ``negative_log_likelihood``. They raise AttributeError for fits of another kind.
+    """
+
+    values: list[Array]
+    std: list[Array]
+    sensor: dict[str, Array]
+    sensor_std: dict[str, Array]
+    initial: State
     information: Float[Array, "*b p p"]
     covariance: Float[Array, "*b p p"]
-    null_count: Array
+    null_count: Int[Array, "*b"]
     noise: Float[Array, "*b"]
     whiteness: Float[Array, "*b"]
     rms: Float[Array, "*b"]
-    finding: Array
-    steps: Array
-    attempts: Array
+    diagnostics: Int[Array, "*b"]
+    steps: Int[Array, "*b"]
+    attempts: Int[Array, "*b"]
+    residuals: dict[str, Array]
     parameters: Parameters
     model: Model
-    residuals: dict[str, Array]
-    scale_known: bool = eqx.field(static=True)
-    free_rates: bool = eqx.field(static=True)
+    _inertia: InertiaEstimate | None = None
+    _readings: ReadingsEstimate | None = None
+
+    def _of_inertia(self, name: str) -> InertiaEstimate:
+        if self._inertia is None:
+            raise AttributeError(
+                f"a fit of a scene has no {name}: see values, std and scene, or scene.inertia; an"
+                " inertia with its principal axes is fitted by fit_inertia or fit_recordings."
+            )
+        return self._inertia
+
+    def _of_readings(self, name: str) -> ReadingsEstimate:
+        if self._readings is None:
+            raise AttributeError(
+                f"only the likelihood of readings has {name}: fit_balance, or fit_inertia and"
+                " fit_recordings with instrument=Instrument(spin_inertia)."
+            )
+        return self._readings
 
     @property
-    def mirrored(self) -> Inertia:
+    def inertia(self) -> Inertia:
+        """Full tensor (...) in sensor axes about the centre of mass, reaction wheels locked.
+
+        Where ``scale_known`` is False the data show only its shape: the largest moment is 1.
+        """
+        return self._of_inertia("inertia").inertia
+
+    @property
+    def moments(self) -> Float[Array, "*b 3"]:
+        """Principal moments of inertia (..., 3) [kg m^2], ascending."""
+        return self._of_inertia("moments").moments
+
+    @property
+    def axes(self) -> Float[Array, "*b 4"]:
+        """Principal axes: quaternions ``wxyz`` (..., 4), principal -> sensor axes."""
+        return self._of_inertia("axes").axes
+
+    @property
+    def ratios(self) -> Float[Array, "*b 3"]:
+        """Ratios (..., 3) of the moments to the largest."""
+        return self._of_inertia("ratios").ratios
+
+    @property
+    def moments_std(self) -> Float[Array, "*b 3"]:
+        """Standard deviations of ``moments``; infinite where the scale is not known."""
+        return self._of_inertia("moments_std").moments_std
+
+    @property
+    def ratios_std(self) -> Float[Array, "*b 3"]:
+        """Standard deviations of ``ratios``; infinite for what the data do not show."""
+        return self._of_inertia("ratios_std").ratios_std
+
+    @property
+    def axes_std(self) -> Float[Array, "*b 3"]:
+        """Standard deviations (..., 3) [rad] of rotations about each principal axis."""
+        return self._of_inertia("axes_std").axes_std
+
+    @property
+    def scale_known(self) -> bool:
+        """Whether the data show the absolute size of the inertia, not only ratios (static)."""
+        return self._of_inertia("scale_known").scale_known
+
+    @property
+    def principal_values(self) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
+        """``moments`` if the scale is known, else ``ratios``, and their standard deviations."""
+        body = self._of_inertia("principal_values")
+        if body.scale_known:
+            return body.moments, body.moments_std
+        return body.ratios, body.ratios_std
+
+    @property
+    def mirror_inertia(self) -> Inertia:
         """The body that the same rates mean if the sensor axes are left-handed, largest moment 1.
 
         Reversing one rate (or exchanging two) changes the sign of ``omega x I omega`` and nothing
@@ -112,40 +245,106 @@ class InertiaFit(eqx.Module):
         ratios ``I_k (I_i + I_j - I_k)``. It is as physical as the first, so free rates alone cannot
         tell the handedness; attitudes, a wheel or knowledge of the body can.
         """
-        return Inertia(diagonal=other_hand(self.moments)).turned(self.axes)
+        body = self._of_inertia("mirror_inertia")
+        return Inertia(diagonal=other_hand(body.moments)).turned(body.axes)
 
     @property
-    def determined(self) -> tuple[Array, Array]:
-        """The moments if the scale is known, else the ratios (..., 3), and their deviations."""
-        if self.scale_known:
-            return self.moments, self.moments_std
-        return self.ratios, self.ratios_std
+    def scene(self) -> Scene:
+        """The scene with the fitted numbers; leading axes (...) as the fit has them."""
+        motion = self.model.motion
+        if self._inertia is not None or not isinstance(motion, LeafMotion):
+            raise AttributeError(
+                "a fit of an inertia has no scene: make one of it, ph.Scene(fit.inertia, ...), or"
+                " fit the numbers of a scene by fit_scene."
+            )
+        return motion.with_values(self.values)
 
-    def interval(self, level: float = 0.95) -> tuple[Array, Array]:
-        """Ends (..., 3) of the intervals of ``ratios``, or of ``moments`` if the scale is known."""
+    @property
+    def instrument(self) -> Instrument:
+        """The instrument, as estimated where ``fit_balance`` was given a ``tolerance``."""
+        return self._of_readings("instrument").instrument
+
+    @property
+    def noise_levels(self) -> Noise:
+        """Estimated standard deviations of readings and disturbing torques."""
+        return self._of_readings("noise_levels").noise_levels
+
+    @property
+    def negative_log_likelihood(self) -> Float[Array, "*b"]:
+        """Of all readings that were fitted together, up to a constant."""
+        return self._of_readings("negative_log_likelihood").negative_log_likelihood
+
+    @property
+    def is_usable(self) -> bool:
+        """Whether no fit stopped early, is not finite or contradicts the attitudes."""
+        return not bool((np.asarray(self.diagnostics) & int(UNUSABLE)).any())
+
+    def interval(self, level: float = 0.95) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
+        """Ends (..., 3) of confidence intervals of ``principal_values``; 0 < ``level`` < 1."""
+        value, spread = self.principal_values
         require(0 < level < 1, f"level must lie between 0 and 1, got {level!r}: 0.95 for 95 %.")
-        value, spread = self.determined
         reach = NormalDist().inv_cdf(0.5 + float(level) / 2) * spread
         return value - reach, value + reach
 
     def findings(self, body: int = 0) -> list[str]:
-        """Names of the remarks on one body, in plain words."""
-        return [plainly(flag) for flag in found_of(self, body, Finding)]
+        """Names of the diagnostics of one body, in plain words."""
+        return [str(flag.name).lower().replace("_", " ") for flag in self._flags(body)]
 
-    def report(self) -> str:
-        """A short text per body: moments, uncertainty, remarks with cause and cure."""
-        count = np.asarray(self.finding).size
-        lines = [_SCALE] if not self.scale_known else []
-        ratios, spread, moments = (
-            np.asarray(x).reshape(-1, 3) for x in (self.ratios, self.ratios_std, self.moments)
-        )
-        rms, noise = np.asarray(self.rms).reshape(-1), np.asarray(self.noise).reshape(-1)
-        for k in range(count):
-            shown = " : ".join(f"{r:.4f}({s:.1g})" for r, s in zip(ratios[k], spread[k]))
-            size = "" if not self.scale_known else f"; moments {moments[k]} kg m^2"
-            lines.append(f"body {k}: {shown}{size}; rms {rms[k]:.3g} rad/s, chi {noise[k]:.3g}")
-            lines += [f"  - {text}" for text in remarks(self, k) if text != _SCALE]
+    def warnings(self, body: int = 0) -> list[str]:
+        """What to know before using the fit of one body: sentences with cause and remedy."""
+        about = []
+        if self._inertia is not None and not self._inertia.scale_known:
+            about.append(_SCALE)
+            if not self._inertia.handedness_known:
+                twin = np.sort(other_hand(np.asarray(self.moments).reshape(-1, 3)[body]))
+                about.append(
+                    "free rates do not show the handedness of the axes: with one axis inverted the "
+                    f"same data mean {twin[0]:.4f} : {twin[1]:.4f} : 1; compare with what you know "
+                    "of the body"
+                )
+        texts = self._texts()
+        return about + [texts[flag] for flag in self._flags(body)]
+
+    def report(self, body: int | None = None) -> str:
+        """A short text on one body, or on all (None): values, uncertainty and warnings."""
+        count = np.asarray(self.diagnostics).size
+        bodies = range(count) if body is None else [body]
+        lines = []
+        if self._inertia is not None and not self._inertia.scale_known:
+            lines.append(_SCALE)
+        for k in bodies:
+            lines += self._value_lines(k) if self._inertia is None else [self._inertia_line(k)]
+            lines += [f"  - {text}" for text in self.warnings(k) if text != _SCALE]
         return "\n".join(lines)
+
+    def _inertia_line(self, body: int) -> str:
+        ratios, spread, moments = (
+            np.asarray(x).reshape(-1, 3)[body] for x in (self.ratios, self.ratios_std, self.moments)
+        )
+        rms, noise = (np.asarray(x).reshape(-1)[body] for x in (self.rms, self.noise))
+        shown = " : ".join(f"{r:.4f}({s:.1g})" for r, s in zip(ratios, spread))
+        size = f"; moments {moments} kg m^2" if self.scale_known else ""
+        return f"body {body}: {shown}{size}; rms {rms:.3g} rad/s, chi {noise:.3g}"
+
+    def _value_lines(self, body: int) -> list[str]:
+        lead = np.ndim(self.noise)
+        lines = [f"body {body}:"] if lead else []
+        for value, spread in zip(self.values, self.std):
+            value, spread = (
+                np.asarray(x).reshape(-1, *np.shape(x)[lead:])[body].reshape(-1)
+                for x in (value, spread)
+            )
+            lines.append(", ".join(f"{v:.6g} +- {s:.2g}" for v, s in zip(value, spread)))
+        return lines
+
+    def _flags(self, body: int) -> list[Finding]:
+        code = int(np.asarray(self.diagnostics).reshape(-1)[body])
+        return [flag for flag in WARNINGS if code & flag]
+
+    def _texts(self) -> dict[Finding, str]:
+        if self._inertia is None:
+            return _SCENE_WARNINGS
+        return WARNINGS if self._readings is None else _READINGS_WARNINGS
 
 
 _SCALE = (
@@ -154,15 +353,17 @@ _SCALE = (
 )
 
 
-def found_of(fit: Any, body: int, among: Iterable[Finding]) -> list[Finding]:
-    """The flags of one body of a fit, in this order."""
-    code = int(np.asarray(fit.finding).reshape(-1)[body])
-    return [flag for flag in among if code & flag]
-
-
-def plainly(flag: Finding) -> str:
-    """The name of a flag in plain words."""
-    return str(flag.name).lower().replace("_", " ")
+def checked_fit(fit: Fit, throw: bool) -> Fit:
+    """The fit; FitError where it must not be used, unless ``throw`` is False."""
+    if throw and not fit.is_usable:
+        codes = np.asarray(fit.diagnostics).reshape(-1)
+        texts = [
+            f"{int(((codes & int(flag)) != 0).sum())} of {codes.size}: {text}"
+            for flag, text in fit._texts().items()
+            if flag & UNUSABLE and (codes & int(flag)).any()
+        ]
+        raise FitError("; ".join(texts) + ". Pass throw=False to get the result with its flags.")
+    return fit
 
 
 def flagged(seen: Mapping[Finding, Array]) -> Array:
@@ -171,29 +372,9 @@ def flagged(seen: Mapping[Finding, Array]) -> Array:
 
 
 def other_hand(moments: Any) -> Any:
-    """Moments (..., 3) of ``InertiaFit.mirrored``, in the order of those given."""
+    """Moments (..., 3) of ``Fit.mirror_inertia``, in the order of those given."""
     other = moments * (moments.sum(axis=-1, keepdims=True) - 2 * moments)
     return other / other.max(axis=-1, keepdims=True)
-
-
-def remarks(fit: InertiaFit, body: int = 0) -> list[str]:
-    """What to know before using a fit, with cause and cure, in sentences."""
-    found = []
-    if not fit.scale_known:
-        found.append(_SCALE)
-        if fit.free_rates:
-            twin = np.sort(other_hand(np.asarray(fit.moments).reshape(-1, 3)[body]))
-            found.append(
-                "free rates do not show the handedness of the axes: with one axis inverted the "
-                f"same data mean {twin[0]:.4f} : {twin[1]:.4f} : 1; compare with what you know of "
-                "the body"
-            )
-    return found + [CURES[flag] for flag in found_of(fit, body, CURES)]
-
-
-def is_unusable(fit: InertiaFit) -> bool:
-    """Whether some body's result must not be used: stopped early, not finite, axes contradict."""
-    return bool((np.asarray(fit.finding) & int(UNUSABLE)).any())
 
 
 class Shown(NamedTuple):
@@ -209,7 +390,7 @@ class Shown(NamedTuple):
     noise: Array
 
 
-def shown_by(linear: Linear, recording: Recording, noise_known: bool) -> Shown:
+def shown_by(linear: Linear, recording: Recording, trust_noise: bool) -> Shown:
     """What the Jacobian of a fit says about its unknowns, in the order shared, then own."""
     information = linear.information()
     dtype = information.dtype
@@ -222,15 +403,68 @@ def shown_by(linear: Linear, recording: Recording, noise_known: bool) -> Shown:
     data = jnp.sum(recording.present) * linear.rest.shape[-1]
     freedom = jnp.maximum(data - jnp.sum(known).astype(dtype), 1)
     noise = jnp.sqrt(jnp.sum(linear.rest**2) / freedom)
-    variance = jnp.asarray(1, dtype) if noise_known else noise**2
+    variance = jnp.asarray(1, dtype) if trust_noise else noise**2
     covariance = (vectors * inverted[None]) @ vectors.T / safe[:, None] / safe[None] * variance
     null = jnp.where(known, 0, 1)[None] * vectors / safe[:, None]
     return Shown(information, covariance, null, safe, jnp.sum(~known), noise)
 
 
-def conclude(solution: Solution, recording: Recording, options: FitOptions) -> InertiaFit:
-    """Uncertainty and diagnostics of one body (under jit and vmap)."""
+class _Split(NamedTuple):
+    """Standard deviations of the unknowns that recordings share, sorted by what they are of."""
+
+    entries: Array
+    sensor: dict[str, Array]
+    motion: list[Array]
+
+
+def _split(shared: Array, count: int, parameters: Parameters) -> _Split:
+    """``shared`` (s,), in the order of ``unknowns``: the tensor's entries, sensor, motion."""
+    first = count
+    sensor, motion = {}, []
+    for name, part in _sensor(parameters).items():
+        sensor[name] = shared[first : first + part.size]
+        first += part.size
+    for leaf in jax.tree.leaves(parameters.motion):
+        motion.append(shared[first : first + leaf.size].reshape(leaf.shape))
+        first += leaf.size
+    return _Split(shared[:count], sensor, motion)
+
+
+def _sensor(parameters: Parameters) -> dict[str, Array]:
+    """The fitted unknowns of the sensors by name, in the order of ``unknowns``."""
+    parts = {name: getattr(parameters, name) for name in ("bias", "mounting", "lever")}
+    return {name: part for name, part in parts.items() if part is not None}
+
+
+def _deviations(shown: Shown, count: int) -> Array:
+    """Standard deviations of the first ``count`` unknowns; infinite for what is not shown."""
+    spread = jnp.sqrt(jnp.maximum(jnp.diagonal(shown.covariance), 0))
+    leaning = jnp.sqrt(jnp.sum((shown.null * shown.safe[:, None]) ** 2, axis=1))
+    return jnp.where(leaning > _LEANS, jnp.inf, spread)[:count]
+
+
+def _initial(parameters: Parameters, recording: Recording, attitude: Array | None) -> State:
+    """States at the first time of each recording; ``attitude``: of those without attitudes."""
+    if recording.wxyz is not None:
+        turn = rotation_vector_to_wxyz(needed("attitude", parameters.attitude))
+        return State(multiply(recording.wxyz[:, 0], turn), parameters.omega)
+    first = jnp.asarray([1, 0, 0, 0]) if attitude is None else attitude
+    first = first.astype(parameters.omega.dtype)
+    return State(jnp.broadcast_to(first, (*parameters.omega.shape[:-1], 4)), parameters.omega)
+
+
+def _rms(parts: dict[str, Array], recording: Recording) -> Array:
+    """Root mean square of the residual rates, rad/s; NaN without rates."""
+    if recording.omega is None:
+        return jnp.asarray(jnp.nan, recording.times.dtype)
+    square = (parts["omega"] * needed("omega_noise", recording.omega_noise)) ** 2
+    return jnp.sqrt(jnp.sum(square) / jnp.sum(recording.present) / 3)
+
+
+def conclude(solution: Solution, recording: Recording, options: FitOptions) -> Fit:
+    """Uncertainty and diagnostics of one body's inertia (under jit and vmap)."""
     tensor, model, linear = solution.tensor, solution.model, solution.linear
+    parameters = solution.parameters
     dtype = tensor.dtype
     count = model.entries
     entries = entries_of(tensor, count)
@@ -249,7 +483,7 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> I
         slope = slope * jnp.where(jnp.arange(9) // 3 == 1, size, 1)[:, None]
         sizes = jnp.where(jnp.arange(linear.shared.shape[-1]) < count, size, 1)
         linear = linear._replace(shared=linear.shared * sizes[None, None])
-    shown = shown_by(linear, recording, options.noise_known)
+    shown = shown_by(linear, recording, bool(options.trust_noise))
     information, covariance, null, safe = shown[:4]
 
     full = jnp.concatenate([slope, jnp.zeros((9, information.shape[0] - count), dtype)], axis=1)
@@ -261,34 +495,100 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> I
     spread = jnp.where(leaning > 1e-3 * reach, jnp.inf, spread)
     axes_std = turn_std(moments, spread[6:])
 
+    std = _split(_deviations(shown, linear.shared.shape[-1]), count, parameters)
     parts = by_kind(linear, recording)
     whiteness = whiteness_of(linear.rest, recording.present)
-    rates: Any = parts.get("omega")
-    if rates is None:
-        rms = jnp.asarray(jnp.nan, dtype)
-    else:
-        mean = jnp.sum((rates * recording.omega_noise) ** 2) / jnp.sum(recording.present) / 3
-        rms = jnp.sqrt(mean)
     trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
     finite = jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(tensor))
-    finding = flagged({
-        Finding.STEP_LIMIT: ~solution.stopped,
-        Finding.NOT_FINITE: ~finite,
-        # the least of the second moments
-        Finding.NEARLY_FLAT: trace / 2 - moments[2] < 1e-4 * trace,
-        Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread[3:6])),
-        Finding.NOT_WHITE: whiteness < 1e-4,
-        Finding.WEAK: jnp.any(spread[3:6] > 0.05),
-        Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
-        Finding.AXES_DISAGREE: _axes_disagree(recording, options),
-    })  # fmt: skip
-    return InertiaFit(
-        Inertia(full=tensor), moments, axes, moments / moments[2],
-        spread[:3], spread[3:6], axes_std, information, covariance, shown.null_count,
-        shown.noise, whiteness, rms, finding, solution.steps,
-        solution.attempts, solution.parameters, model,
-        parts, model.scale_known, recording.wxyz is None,
-    )  # fmt: skip
+    diagnostics = flagged(
+        {
+            Finding.STEP_LIMIT: ~solution.stopped,
+            Finding.NOT_FINITE: ~finite,
+            # the least of the second moments
+            Finding.NEARLY_FLAT: trace / 2 - moments[2] < 1e-4 * trace,
+            Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread[3:6])),
+            Finding.NOT_WHITE: whiteness < 1e-4,
+            Finding.WEAK: jnp.any(spread[3:6] > 0.05),
+            Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
+            Finding.AXES_DISAGREE: _axes_disagree(recording, options),
+        }
+    )
+    body = InertiaEstimate(
+        inertia=Inertia(full=tensor),
+        moments=moments,
+        axes=axes,
+        ratios=moments / moments[2],
+        moments_std=spread[:3],
+        ratios_std=spread[3:6],
+        axes_std=axes_std,
+        scale_known=model.scale_known,
+        handedness_known=recording.wxyz is not None,
+    )
+    return Fit(
+        values=[tensor, *jax.tree.leaves(parameters.motion)],
+        std=[symmetric_std(std.entries), *std.motion],
+        sensor=_sensor(parameters),
+        sensor_std=std.sensor,
+        initial=_initial(parameters, recording, None),
+        information=information,
+        covariance=covariance,
+        null_count=shown.null_count,
+        noise=shown.noise,
+        whiteness=whiteness,
+        rms=_rms(parts, recording),
+        diagnostics=diagnostics,
+        steps=solution.steps,
+        attempts=solution.attempts,
+        residuals=parts,
+        parameters=parameters,
+        model=model,
+        _inertia=body,
+    )
+
+
+def conclude_scene(solution: Solution, recording: Recording, options: FitOptions) -> Fit:
+    """Values, uncertainty and diagnostics of one body's scene (under jit and vmap)."""
+    linear, parameters = solution.linear, solution.parameters
+    shown = shown_by(linear, recording, bool(options.trust_noise))
+    spread = _deviations(shown, linear.shared.shape[-1])
+    std = _split(spread, 0, parameters)
+    parts = by_kind(linear, recording)
+    whiteness = whiteness_of(linear.rest, recording.present)
+    finite = jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(linear.at))
+    diagnostics = flagged(
+        {
+            Finding.STEP_LIMIT: ~solution.stopped,
+            Finding.NOT_FINITE: ~finite,
+            Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread)),
+            Finding.NOT_WHITE: whiteness < 1e-4,
+            Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
+        }
+    )
+    attitude = getattr(options.motion, "attitude", None)
+    return Fit(
+        values=list(parameters.motion),
+        std=std.motion,
+        sensor=_sensor(parameters),
+        sensor_std=std.sensor,
+        initial=_initial(parameters, recording, attitude),
+        information=shown.information,
+        covariance=shown.covariance,
+        null_count=shown.null_count,
+        noise=shown.noise,
+        whiteness=whiteness,
+        rms=_rms(parts, recording),
+        diagnostics=diagnostics,
+        steps=solution.steps,
+        attempts=solution.attempts,
+        residuals=parts,
+        parameters=parameters,
+        model=solution.model,
+    )
+
+
+def symmetric_std(entries: Float[Array, " e"]) -> Float[Array, "3 3"]:
+    """Standard deviations of a tensor from those of its entries; zero for products left out."""
+    return whole_of(entries, entries.shape[0])
 
 
 def turn_std(moments: Float[Array, "3"], products_std: Float[Array, "3"]) -> Float[Array, "3"]:
@@ -359,6 +659,9 @@ def by_kind(linear: Linear, recording: Recording) -> dict[str, Array]:
 def whiteness_of(rest: Array, present: Array, lags: int = 5) -> Array:
     """Ljung-Box probability of the first autocorrelations of all channels together."""
     total = jnp.sum(present, axis=-1)[:, None]
+    # recordings that only fill a batch up have no samples and count nothing
+    filled = total > 0
+    total = jnp.where(filled, total, lags + 1)
     rest = (rest - (jnp.sum(rest, axis=1) / total)[:, None]) * present[..., None]
     power = jnp.sum(rest**2, axis=1)
     safe = jnp.where(power > 0, power, 1)
@@ -372,6 +675,6 @@ def whiteness_of(rest: Array, present: Array, lags: int = 5) -> Array:
     statistic = jnp.sum(jax.lax.map(one, jnp.arange(1, lags + 1)))
     # Chi-square of many degrees by Wilson and Hilferty (PNAS 17 (1931) 684): the exact one would
     # take longer to compile than all else here.
-    degrees = lags * power.size
+    degrees = lags * rest.shape[-1] * jnp.sum(filled).astype(rest.dtype)
     spread = 2 / (9 * degrees)
     return norm.sf(((statistic / degrees) ** (1 / 3) - 1 + spread) / spread**0.5)

@@ -1,136 +1,22 @@
-"""``fit_scene``: whatever numbers of a scene the user points at, from recordings of its motion."""
+"""``fit_scene``: any arrays of a scene from recordings of its motion."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
-import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array
 
 from polhode._batch import PARTS, batch_shapes
-from polhode._checks import as_float_array
+from polhode._checks import ArrayLike, as_float_array, require
 from polhode._method import AbstractMethod
-from polhode._scene import Scene, State
+from polhode._scene import Scene
 from polhode._scene._scene import places_of
 from polhode.fit._fit import each, together
-from polhode.fit._motion import AbstractMotion
+from polhode.fit._options import FitOptions, check_usable, checked_options
 from polhode.fit._parameters import NoInertia
 from polhode.fit._recording import Recording, stack
-from polhode.fit._residuals import Huber
-from polhode.fit._result import (
-    CURES,
-    UNUSABLE,
-    Finding,
-    FitError,
-    by_kind,
-    flagged,
-    found_of,
-    plainly,
-    shown_by,
-    whiteness_of,
-)
-from polhode.fit._scene_motion import simulated
-from polhode.fit._solve import FitOptions, Solution, misfit_of
-from polhode.rotation import multiply, rotation_vector_to_wxyz
-
-_LEANS = 1e-3
-"""Part of an unknown in directions that the data do not show, above which it is not known."""
-
-
-class LeafMotion(AbstractMotion):
-    """Motion of a scene some of whose arrays are unknown, by ``ph.simulate``.
-
-    **Fields:** ``scene``, with the starting values; ``places`` (static): which of its leaves are
-    unknown; ``attitude`` (4,): initial one for recordings without attitudes; ``method`` and
-    ``rtol`` as in ``ph.simulate``.
-    """
-
-    scene: Scene
-    places: tuple[int, ...] = eqx.field(static=True)
-    attitude: Float[Array, " 4"] | None = None
-    method: AbstractMethod | None = None
-    rtol: float | None = eqx.field(static=True, default=None)
-
-    def start(self):
-        leaves = jax.tree.leaves(self.scene)
-        return [leaves[i] for i in self.places]
-
-    def fixes_scale(self):
-        return True
-
-    def with_values(self, values: Sequence[Array]) -> Scene:
-        """The scene with these numbers in place of the unknown ones."""
-        leaves, tree = jax.tree.flatten(self.scene)
-        for i, value in zip(self.places, values, strict=True):
-            leaves[i] = value.astype(leaves[i].dtype)
-        return jax.tree.unflatten(tree, leaves)
-
-    def __call__(self, tensor, omega, wxyz, times, wheel, unknown):
-        scene = self.with_values(unknown)
-        return simulated(scene, omega, wxyz, times, self.method, self.rtol, self.attitude)
-
-
-class SceneFit(eqx.Module):
-    """Result of ``fit_scene``; leading axes (...) are those of a batch of recordings.
-
-    **Fields:** ``values``: the fitted arrays, as ``free`` listed them, and ``std`` their standard
-    deviations (infinite for what the data do not show); ``initial``: ``ph.State`` (..., r) at the
-    first time of each recording (attitudes only where they were recorded); ``bias`` (..., 3)
-    [rad/s] or None; ``covariance`` (..., p, p) of bias and values one after another, by
-    the pseudo-inverse of what the data show; ``null_count``: directions of all unknowns, initial
-    states included, that they do not; ``noise``: standard deviation of the residuals over that
-    assumed (reduced chi); ``whiteness``: probability of correlations as large as those seen, were
-    the residuals independent; ``residuals`` over their noise; ``finding``: ``Finding`` flags;
-    ``steps`` of the optimiser; ``motion``: what was fitted.
-    """
-
-    values: list[Array]
-    std: list[Array]
-    initial: State | None
-    omega: Float[Array, "*b r 3"]
-    bias: Float[Array, "*b 3"] | None
-    covariance: Float[Array, "*b p p"]
-    null_count: Array
-    noise: Float[Array, "*b"]
-    whiteness: Float[Array, "*b"]
-    finding: Array
-    steps: Array
-    residuals: dict[str, Array]
-    motion: LeafMotion
-
-    @property
-    def scene(self) -> Scene:
-        """The scene with the fitted numbers (of a fit without a batch)."""
-        return self.motion.with_values(self.values)
-
-    def findings(self, body: int = 0) -> list[str]:
-        """Names of the remarks on one body, in plain words."""
-        return [plainly(flag) for flag in found_of(self, body, _CURES)]
-
-    def report(self, body: int = 0) -> str:
-        """A short text on one body: values, uncertainty, remarks with cause and cure."""
-        lead = np.ndim(self.noise)
-        lines = []
-        for value, spread in zip(self.values, self.std):
-            value, spread = (
-                np.asarray(x).reshape(-1, *np.shape(x)[lead:])[body].reshape(-1)
-                for x in (value, spread)
-            )
-            lines.append(", ".join(f"{v:.6g} +- {s:.2g}" for v, s in zip(value, spread)))
-        return "\n".join(lines + [f"- {_CURES[flag]}" for flag in found_of(self, body, _CURES)])
-
-
-_CURES = {
-    flag: CURES[flag] for flag in (Finding.STEP_LIMIT, Finding.NOT_FINITE, Finding.NOT_WHITE)
-} | {
-    Finding.UNDETERMINED: "some of the numbers do not show in this motion, alone or against each"
-    " other: their standard deviations are infinite; free fewer of them, or add a recording that"
-    " shows them",
-    Finding.POOR: "the residuals are more than twice as large as the noise: a wrong model, wrong"
-    " units, outliers (robust=Huber()), or a start too far away",
-}
+from polhode.fit._result import Fit, checked_fit, conclude_scene
+from polhode.fit._scene_motion import LeafMotion
 
 
 def fit_scene(
@@ -139,60 +25,85 @@ def fit_scene(
     free: Callable[[Scene], Any],
     *,
     attitude: ArrayLike | None = None,
-    bias: bool = False,
-    robust: Huber | None = None,
-    noise_known: bool = False,
     method: AbstractMethod | None = None,
     rtol: float | None = None,
-    starts: int = 2,
-    solver: Any = None,
-    max_steps: int = 60,
+    options: FitOptions | None = None,
     throw: bool = True,
-) -> SceneFit:
-    """Numbers of a scene, and how uncertain they are, from recordings of its motion.
+) -> Fit:
+    """Numbers of a scene, with standard deviations, from recordings of its motion.
 
-    **Arguments:** ``scene``: with starting values, one body; ``data``: a ``ph.fit.Recording`` (its
-    leading axes are bodies, fitted one by one), or a list of recordings of the same body; ``free``:
-    function of the scene that returns the array or the list of arrays to fit (of a part: all its
-    arrays). The initial rates of
-    each recording, and its initial attitude where attitudes were recorded, are always fitted too;
-    ``attitude`` (4,): the initial one where none were (None: the space axes). ``bias``: also that
-    of the gyroscope. ``noise_known``: whether the recording's noise is to be believed (else it is
-    taken from the residuals). ``robust``: ``Huber(threshold)``. ``method``, ``rtol``: as in
-    ``ph.simulate``. ``starts``: 2 also fits growing parts of the data where the whole misleads.
+    **Arguments:**
 
-    The numbers move freely: what must stay positive is only kept so by data that show it. For an
-    inertia of which nothing is known, ``fit_inertia`` finds the start and stays physical.
+    - ``scene``: with starting values, one body.
+    - ``data``: a ``ph.fit.Recording``, whose leading axes are bodies that are fitted one by one; or
+      a list of recordings of the same body.
+    - ``free``: function of the scene that returns the array or the list of arrays to fit (of a
+      part: all its arrays). The initial rates of each recording, and its initial attitude where
+      attitudes were recorded, are always fitted too.
+    - ``attitude`` (4,): initial attitude ``wxyz``, for recordings without attitudes; None: the
+      body axes are those of space at the first time.
+    - ``method``, ``rtol``: as in ``ph.simulate``.
+    - ``options``: ``FitOptions`` of which ``robust``, ``bias``, ``trust_noise``, ``max_starts``
+      (2 at most: all data, then growing parts of them), ``solver`` and ``max_steps`` apply.
+    - ``throw``: whether a fit that is not finite or stopped early raises FitError.
+
+    Returns a ``Fit``: ``values`` and ``std`` in the order of ``free``, ``scene`` with the values.
+    The numbers are not constrained: a coefficient may become negative. An inertia of which nothing
+    is known is fitted by ``fit_inertia``, which finds a start and keeps it physical.
 
         ts = jnp.linspace(0.0, 20.0, 200)
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 2.5]), torque=ph.LinearDamping(0.1))
         data = ph.fit.Recording.of(ts, rates, omega_noise=0.01)
-        found = ph.fit_scene(scene, data, free=lambda s: [s.torque.c], noise_known=True)
-        print(found.report())                            # found.values[0], found.std[0]: (3,)
+        options = ph.fit.FitOptions(trust_noise=True)
+        fit = ph.fit_scene(scene, data, free=lambda s: [s.torque.c], options=options)
+        print(fit.report())                              # fit.values[0], fit.std[0]: (3,)
 
-    ``ph.fit(scene, data, free)`` is the same. Raises TypeError or ValueError for bad input, and
-    unless ``throw=False`` FitError when the fit is not finite or stopped early.
+    Raises TypeError or ValueError for bad input and for options that do not apply, and FitError.
     """
     _check_single(scene)
-    motion = LeafMotion(scene, places_of(scene, free), _start(attitude, scene), method, rtol)
-    options = FitOptions(
-        motion, NoInertia(), None, robust, bias, False, noise_known, starts, solver, max_steps
+    options = checked_options(options)
+    for name in ("motion", "unknown", "initial_inertia"):
+        require(
+            getattr(options, name) is None,
+            f"fit_scene has no use for the option {name}: the scene is the model, and free selects"
+            " what is unknown.",
+        )
+    require(
+        not options.mounting,
+        "fit_scene does not fit a mounting: rotate the rates into the axes of the scene, or use"
+        " fit_inertia with motion=SceneMotion(...).",
     )
-    if isinstance(data, Recording):
-        found = each(data, options, conclude_scene)
-    elif isinstance(data, list | tuple) and data and all(isinstance(x, Recording) for x in data):
-        found = together(stack(data), options, conclude_scene)
-    else:
+    recordings = [data] if isinstance(data, Recording) else data
+    if not (
+        isinstance(recordings, list | tuple)
+        and recordings
+        and all(isinstance(one, Recording) for one in recordings)
+    ):
         raise TypeError(
             "data must be a ph.fit.Recording (ph.fit.Recording.of(times, omega_body, ...)) or a"
             f" list of them, got {type(data).__name__}."
         )
-    codes = np.atleast_1d(np.asarray(found.finding))
-    fatal = [flag for flag in _CURES if flag & UNUSABLE and (codes & int(flag)).any()]
-    if throw and fatal:
-        said = "; ".join(CURES[flag] for flag in fatal)
-        raise FitError(f"{said}. Pass throw=False to get the result with its flags.")
-    return found
+    for one in recordings:
+        require(
+            one.wheel is None,
+            "fit_scene does not read wheel_speed: describe the wheel by rotors of the scene"
+            " (ph.Rotor), and leave wheel_speed out of the recording.",
+        )
+        require(
+            one.force is None,
+            "fit_scene does not model accelerometer readings: leave force_body out.",
+        )
+        require(
+            attitude is None or one.wxyz is None,
+            "attitude is for recordings without attitudes; these have wxyz, whose first one is"
+            " fitted.",
+        )
+    check_usable(options, recordings[0])
+    motion = LeafMotion(scene, places_of(scene, free), _start(attitude, scene), method, rtol)
+    options = dataclasses.replace(options, motion=motion, unknown=NoInertia())
+    if isinstance(data, Recording):
+        return checked_fit(each(data, options, conclude_scene), throw)
+    return checked_fit(together(stack(recordings), options, conclude_scene), throw)
 
 
 def _start(attitude: ArrayLike | None, scene: Scene) -> Array | None:
@@ -211,36 +122,3 @@ def _check_single(scene: Any) -> None:
             f"the scene of a fit is that of one body, got parts with the batch axes {max(shapes)}:"
             " give one body's numbers as the start; a batch is in the recording."
         )
-
-
-def conclude_scene(solution: Solution, recording: Recording, options: FitOptions) -> SceneFit:
-    """Values, uncertainty and diagnostics of one body (under jit and vmap)."""
-    linear, parameters = solution.linear, solution.parameters
-    shown = shown_by(linear, recording, options.noise_known)
-    count = linear.shared.shape[-1]
-    spread = jnp.sqrt(jnp.maximum(jnp.diagonal(shown.covariance), 0))
-    leaning = jnp.sqrt(jnp.sum((shown.null * shown.safe[:, None]) ** 2, axis=1))
-    spread = jnp.where(leaning > _LEANS, jnp.inf, spread)[:count]
-    values = list(parameters.motion)
-    std, first = [], count - sum(x.size for x in values)
-    for value in values:
-        std.append(spread[first : first + value.size].reshape(value.shape))
-        first += value.size
-    initial = None
-    if recording.wxyz is not None:
-        turned = multiply(recording.wxyz[:, 0], rotation_vector_to_wxyz(parameters.attitude))
-        initial = State(turned, parameters.omega)
-    whiteness = whiteness_of(linear.rest, recording.present)
-    finite = jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(linear.at))
-    finding = flagged({
-        Finding.STEP_LIMIT: ~solution.stopped,
-        Finding.NOT_FINITE: ~finite,
-        Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread)),
-        Finding.NOT_WHITE: whiteness < 1e-4,
-        Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
-    })  # fmt: skip
-    return SceneFit(
-        values, std, initial, parameters.omega, parameters.bias,
-        shown.covariance[:count, :count], shown.null_count, shown.noise, whiteness, finding,
-        solution.steps, by_kind(linear, recording), options.motion,
-    )  # fmt: skip

@@ -1,7 +1,5 @@
 """From recordings of one body to its best parameters: start, Levenberg-Marquardt, information."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,8 +8,9 @@ import optimistix as optx
 from jaxtyping import Array, Float
 
 from polhode.fit._linear import Linear, linearise, unknowns
-from polhode.fit._motion import AbstractMotion, FreeMotion
+from polhode.fit._motion import AbstractMotion, FreeMotion, SteppedMotion
 from polhode.fit._optimiser import LevenbergMarquardt
+from polhode.fit._options import FitOptions
 from polhode.fit._parameters import (
     AbstractInertiaUnknown,
     Base,
@@ -38,21 +37,6 @@ _GOOD = 1.5
 _SAME = 1e-4
 # Distance from the optimum, in standard deviations, at which the optimiser stops.
 _OFFSET = 1e-4
-
-
-class FitOptions(eqx.Module):
-    """What is asked: motion, unknowns, loss, start and optimiser (see ``fit_inertia``)."""
-
-    motion: AbstractMotion = eqx.field(converter=lambda given: given or FreeMotion())
-    unknown: AbstractInertiaUnknown = eqx.field(converter=lambda given: given or FullTensor())
-    known: Inertia | None = None
-    robust: Huber | None = None
-    bias: bool = eqx.field(static=True, default=False)
-    mounting: bool = eqx.field(static=True, default=False)
-    noise_known: bool = eqx.field(static=True, default=False)
-    starts: int = eqx.field(static=True, default=6)
-    solver: Any = None
-    max_steps: int = eqx.field(static=True, default=60)
 
 
 class Solution(eqx.Module):
@@ -93,14 +77,16 @@ class _Search(eqx.Module):
 def solve(recording: Recording, options: FitOptions) -> Solution:
     """Fit one body to its recordings (leading axis r). Pure; works under jit and vmap."""
     rates = _rates(recording)
-    bases, first = _bases(recording, rates, options)
-    scale_known = options.motion.fixes_scale()
-    columns = free_columns(options.unknown, scale_known)
+    motion = FreeMotion() if options.motion is None else options.motion
+    unknown = FullTensor() if options.unknown is None else options.unknown
+    bases, first = _bases(recording, rates, motion, unknown, options.initial_inertia)
+    scale_known = motion.fixes_scale()
+    columns = free_columns(unknown, scale_known)
     fixed = tuple(map(tuple, columns.tolist()))
     attitude = None if recording.wxyz is None else recording.wxyz[:, 0]
 
     def model_of(base):
-        return Model(options.motion, base, attitude, options.robust, fixed, scale_known)
+        return Model(motion, base, attitude, options.robust, fixed, scale_known)
 
     dtype = rates.dtype
     zero = jnp.zeros(3, dtype)
@@ -111,7 +97,7 @@ def solve(recording: Recording, options: FitOptions) -> Solution:
         bias=zero if options.bias else None,
         mounting=zero if options.mounting else None,
         lever=zero if recording.force is not None else None,
-        motion=jax.tree.map(lambda x: jnp.asarray(x, dtype), options.motion.start()),
+        motion=jax.tree.map(lambda x: jnp.asarray(x, dtype), motion.start()),
     )
     scale = _scale(begin, recording, rates)
     # the optimiser counts in the default precision whatever that of the data
@@ -145,7 +131,7 @@ def solve(recording: Recording, options: FitOptions) -> Solution:
         prior = belief * scaled.shape.astype(dtype)
         return (weight * jnp.concatenate([misfit.ravel(), prior])).astype(wide), linear
 
-    jobs = _jobs(bases.soft.shape[0], options.starts)
+    jobs = _jobs(bases.soft.shape[0], options.max_starts)
     which, part = (jnp.asarray(column) for column in (jobs["base"], jobs["part"]))
     part = part.astype(dtype)
     span = recording.times[:, -1:] - recording.times[:, :1]
@@ -228,7 +214,7 @@ def _expected(recording: Recording, options: FitOptions) -> Float[Array, ""]:
     An unknown noise is taken from neighbouring samples; without rates nothing is known of it.
     """
     expected = jnp.sum(recording.present) * 3 * _kinds(recording)
-    if options.noise_known:
+    if options.trust_noise:
         return expected
     if recording.omega is None:
         return jnp.full_like(expected, jnp.inf)
@@ -276,23 +262,29 @@ def _rates(recording: Recording) -> Float[Array, "r t 3"]:
     return bridged(recording.times, recording.present, recording.omega)
 
 
-def _bases(recording, rates, options) -> tuple[Base, Array]:
+def _bases(
+    recording: Recording,
+    rates: Array,
+    motion: AbstractMotion,
+    unknown: AbstractInertiaUnknown,
+    initial: Inertia | None,
+) -> tuple[Base, Array]:
     """Starting bodies (leading axis), the best first, and the second moments of that one."""
-    if options.unknown.columns().shape[1] == 0:
+    if unknown.columns().shape[1] == 0:
         first = jnp.eye(3, dtype=rates.dtype)
         return jax.tree.map(lambda leaf: leaf[None], base_of(first, True)), first
     carried = None
-    spin = getattr(options.motion, "spin_inertia", None)
-    if spin is not None:
-        axis = jnp.asarray(options.motion.axis, rates.dtype)
-        carried = spin * recording.wheel[..., None] * axis[None, None]
+    if isinstance(motion, SteppedMotion) and motion.spin_inertia is not None:
+        axis = jnp.asarray(motion.axis, rates.dtype)
+        wheel = needed("wheel", recording.wheel)
+        carried = motion.spin_inertia * wheel[..., None] * axis[None, None]
     first, second, _ = regression(rates, recording.times, recording.present, carried)
-    if options.known is not None:
-        first = second_moments(options.known.tensor)
+    if initial is not None:
+        first = second_moments(initial.tensor)
     bodies = jnp.stack([first, second, *alternatives(rates, first)])
-    if options.unknown.columns().shape[1] == 3:
+    if unknown.columns().shape[1] == 3:
         bodies = bodies * jnp.eye(3, dtype=bodies.dtype)[None]
-    known = options.motion.fixes_scale()
+    known = motion.fixes_scale()
     return jax.vmap(lambda sigma: base_of(sigma, known))(bodies), bodies[0]
 
 

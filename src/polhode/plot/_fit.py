@@ -13,7 +13,7 @@ _LEVELS = {"68 %": 2.2957, "95 %": 5.9915}
 
 @styled
 def fit(result: Any, recording: Any, *, body: int = 0, title: str = "") -> Any:
-    """Figure of a ``fit.InertiaFit`` and the ``fit.Recording`` it was made from; returns it.
+    """Figure of a ``fit.Fit`` of an inertia and its ``fit.Recording``; returns it.
 
     Left: rates of the first recording (dots) over the fitted motion, or over what the readings
     before let expect where a wheel is aboard (lines), and the residuals in units of their noise.
@@ -55,8 +55,8 @@ def fit(result: Any, recording: Any, *, body: int = 0, title: str = "") -> Any:
 
 def _single(result, recording, body) -> dict[str, Any]:
     """The numbers of one body and its first recording, as NumPy arrays."""
-    lead = np.asarray(result.finding).ndim
-    if not 0 <= body < max(np.asarray(result.finding).size, 1):
+    lead = np.asarray(result.diagnostics).ndim
+    if not 0 <= body < max(np.asarray(result.diagnostics).size, 1):
         raise ValueError(f"body must be one of the fit's, got {body}.")
 
     def pick(value, tail, place=body):
@@ -82,7 +82,7 @@ def _single(result, recording, body) -> dict[str, Any]:
     model = omega - residual * noise
     hole = np.where(present, 1.0, np.nan)[:, None]
     moments, axes = pick(result.moments, 1), pick(result.axes, 1)
-    value, spread = result.determined
+    value, spread = result.principal_values
     return {
         "times": times,
         "omega": omega * hole,
