@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import (
+    ArrayLike,
     as_float_array,
     as_number,
     describe,
@@ -192,15 +193,15 @@ class KeplerOrbit(AbstractConic):
 
     def __init__(
         self,
-        mu,
-        semi_major_axis,
-        eccentricity=None,
-        inclination=0.0,
-        node=0.0,
-        periapsis=0.0,
-        mean_anomaly=0.0,
-        epoch=0.0,
-        hyperbolic=None,
+        mu: ArrayLike,
+        semi_major_axis: ArrayLike,
+        eccentricity: ArrayLike | None = None,
+        inclination: ArrayLike = 0.0,
+        node: ArrayLike = 0.0,
+        periapsis: ArrayLike = 0.0,
+        mean_anomaly: ArrayLike = 0.0,
+        epoch: ArrayLike = 0.0,
+        hyperbolic: bool | None = None,
     ):
         given = locals()
         if eccentricity is None:
@@ -297,7 +298,14 @@ class StateOrbit(AbstractConic):
     epoch: Float[Array, "*#b"] = shaped()
     hyperbolic: bool = eqx.field(static=True, default=False)
 
-    def __init__(self, mu, position, velocity, epoch=0.0, hyperbolic=None):
+    def __init__(
+        self,
+        mu: ArrayLike,
+        position: ArrayLike,
+        velocity: ArrayLike,
+        epoch: ArrayLike = 0.0,
+        hyperbolic: bool | None = None,
+    ):
         given = {
             "mu": as_number("mu", mu),
             "position": as_float_array("position", position, (3,)),
