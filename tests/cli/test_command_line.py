@@ -279,12 +279,13 @@ def test_missing_packages_are_named_before_the_work(here, capsys, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec",
-        lambda name: None if name in ("h5py", "optimistix") else find(name),
+        lambda name: None if name in ("h5py", "matplotlib") else find(name),
     )  # fmt: skip
     assert run("top.toml") == 1
-    assert "`polhode run` needs h5py: pip install 'polhode[cli]'" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "`polhode run` needs h5py, matplotlib: pip install 'polhode[cli]'" in told
     assert main(["fit", "toss.csv"]) == 1
-    assert "`polhode fit` needs optimistix: pip install" in capsys.readouterr().err
+    assert "`polhode fit` needs matplotlib: pip install 'polhode[cli]'" in capsys.readouterr().err
     assert [path.name for path in here.iterdir()] == ["top.toml"]
 
 

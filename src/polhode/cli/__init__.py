@@ -5,6 +5,8 @@ import os
 import sys
 from collections.abc import Sequence
 
+from polhode._extras import how_to_install
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code.
@@ -17,8 +19,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ModuleNotFoundError as error:
         words = sys.argv[1:] if argv is None else argv
         command = " ".join(["polhode", *map(str, words[:1])])
-        print(f"polhode: `{command}` needs {error.name}: pip install 'polhode[cli]'",
-              file=sys.stderr)  # fmt: skip
+        print(f"polhode: `{command}` needs {error.name}: {how_to_install('cli')}", file=sys.stderr)
         return 1
     return command_line(argv)
 

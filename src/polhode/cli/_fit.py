@@ -120,7 +120,6 @@ def fit(
     if not math.hypot(*wheel_axis) > 0 or not math.isfinite(math.hypot(*wheel_axis)):
         raise UsageError(f"--wheel-axis must have a direction, got {wheel_axis}.")
     require("fit", "rich", *(() if no_figure else ("matplotlib",)))
-    require("fit", "optimistix", extra="cli,fit")
     goals = [_goal(asked, output, ".json", force)]
     if not no_figure:
         goals.append(_goal(asked, output, ".png", force))

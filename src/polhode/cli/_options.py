@@ -122,8 +122,10 @@ def require(command: str, *packages: str, extra: str = "cli") -> None:
     """ImportError now, rather than after the work, when a package is missing."""
     import importlib.util
 
+    from polhode._extras import how_to_install
+
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:
         raise ImportError(
-            f"`polhode {command}` needs {', '.join(missing)}: pip install 'polhode[{extra}]'"
+            f"`polhode {command}` needs {', '.join(missing)}: {how_to_install(extra)}"
         )

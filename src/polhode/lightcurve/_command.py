@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from polhode._extras import imported
 from polhode.lightcurve._fit import fit_light_curve
 from polhode.lightcurve._frequencies import fourier_pairs
 from polhode.lightcurve._hypotheses import meaning
@@ -78,6 +79,7 @@ def run(
         for note in (*curve.notes, "without vectors to Sun and observer no body can be fitted."):
             say(f"note: {note}")
         return None
+    imported("the figure of a light curve", "matplotlib", extra="plot")  # before the search
     fit = fit_light_curve(curve, trials=trials, max_frequency=max_frequency, floor=floor, seed=seed)
     say(frequency_table(fit.pairs))
     say(table(fit))
