@@ -1,4 +1,4 @@
-"""The command line: `polhode run`, `explain`, `fit`, `schema`."""
+"""The command line: `polhode run`, `explain`, `fit`, `view`, `lightcurve`, `scenes`, `schema`."""
 
 import contextlib
 import os
@@ -11,8 +11,10 @@ from polhode._extras import how_to_install
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code.
 
-    0: done; 1: the simulation or the writing failed; 2: wrong options or a bad input file; 130:
-    interrupted (Ctrl-C). Raises SystemExit for --help, wrong options and termination (143).
+    0: done; 1: the computation or the writing failed; 2: wrong usage or wrong input, such as a file
+    that is missing, malformed or of another kind; 130: interrupted (Ctrl-C).
+
+    Raises SystemExit for --help, wrong options and termination (143).
     """
     try:
         from polhode.cli._main import main as command_line

@@ -21,15 +21,8 @@ def read(path: str | os.PathLike) -> tuple[list[Body], str]:
     from polhode.files import build_inertia, parse_scene
 
     _require_hdf5(Path(path))
-    try:
-        opened = xarray.open_dataset(path, engine="h5netcdf", decode_times=False)
-    except (OSError, ValueError, KeyError) as error:
-        raise ValueError(f"{path} is damaged or no NetCDF file ({error}): {_EXPECTED}.") from error
-    with opened as data:
-        missing = [name for name in _NEEDED if name not in data]
-        if missing or "scene" not in data.attrs:
-            what = ", ".join(missing) or "the text of its scene"
-            raise ValueError(f"{path} lacks {what}: {_EXPECTED}.")
+    _require_content(path)
+    with xarray.open_dataset(path, engine="h5netcdf", decode_times=False) as data:
         many = data["wxyz"].ndim > 2
         parts = [np.asarray(data[name], np.float64) for name in _NEEDED]
         wxyz, omega, momentum, moments = parts
@@ -62,3 +55,17 @@ def _require_hdf5(path: Path) -> None:
     with open(path, "rb") as file:
         if file.read(len(_SIGNATURE)) != _SIGNATURE:
             raise ValueError(f"{path} is not NetCDF-4: {_EXPECTED}.")
+
+
+def _require_content(path: str | os.PathLike) -> None:
+    """Check that the variables are there, before xarray guesses what another file means."""
+    h5py = imported("reading NetCDF", "h5py")
+    try:
+        with h5py.File(path, "r") as file:
+            missing = [name for name in _NEEDED if name not in file]
+            if "scene" not in file.attrs:
+                missing.append("the text of its scene")
+    except OSError as error:
+        raise ValueError(f"{path} is damaged ({error}): {_EXPECTED}.") from error
+    if missing:
+        raise ValueError(f"{path} lacks {', '.join(missing)}: {_EXPECTED}.")
