@@ -34,9 +34,11 @@ def scene_file(text: str) -> Any:
     if not hint and (close := _close(path.name.removesuffix(".toml"), shipped)):
         hint = f"`polhode run {close}` runs the scene {close} that comes with polhode"
     raise SceneFileError(
-        path, "", "cannot be read: No such file or directory",
+        path,
+        "",
+        "cannot be read: No such file or directory",
         mend=hint or "check the path; `polhode scenes` lists the scenes that come with polhode",
-    )  # fmt: skip
+    )
 
 
 def read_scene(text: str) -> Any:

@@ -18,13 +18,16 @@ def scenes(
     output: Annotated[
         str | None,
         typer.Option(
-            "-o", "--output", metavar="FILE", show_default=False,
+            "-o",
+            "--output",
+            metavar="FILE",
+            show_default=False,
             help="where to copy it (default: NAME.toml here)",
         ),
     ] = None,
     force: ForceOption = False,
     debug: DebugOption = False,
-) -> int:  # fmt: skip
+) -> int:
     """List the scenes that come with polhode, which `polhode run NAME` runs; or copy one."""
     import tomllib
 

@@ -74,9 +74,16 @@ def run(
     picture, document = (name.with_name(name.name + suffix) for suffix in (".png", ".json"))
     curve = read(path, vectors, floor)
     return fitted(
-        curve, path.name, picture, document,
-        trials=trials, highest=highest, floor=floor, seed=seed, say=say,
-    )  # fmt: skip
+        curve,
+        path.name,
+        picture,
+        document,
+        trials=trials,
+        max_frequency=max_frequency,
+        floor=floor,
+        seed=seed,
+        say=say,
+    )
 
 
 def read(
@@ -93,9 +100,17 @@ def read(
 
 
 def fitted(
-    curve: LightCurve, title: str, picture: Path, document: Path, *, say=print,
-    highest: float | None = None, trials: int, floor: float, seed: int,
-) -> Fit | None:  # fmt: skip
+    curve: LightCurve,
+    title: str,
+    picture: Path,
+    document: Path,
+    *,
+    say=print,
+    max_frequency: float | None = None,
+    trials: int,
+    floor: float,
+    seed: int,
+) -> Fit | None:
     """Fit, say the table, and write the figure and the numbers; see `run`."""
     say(f"{title}: {curve.t.size} points, {len(curve.names)} groups, {np.ptp(curve.t):.4g} d")
     if curve.sun is None:
