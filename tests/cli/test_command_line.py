@@ -16,9 +16,9 @@ import xarray
 import polhode as ph
 from polhode.cli import main
 from polhode.cli._inputs import scene_file
-from polhode.files import build_scene, build_state, read_scene
+from polhode.files import build_scene, build_state, read_scene, shipped_scenes
 
-SCENES = Path(__file__).parents[2] / "scenes"
+SCENES = shipped_scenes()["toutatis"].parent
 TOP = """
 title = "small top"
 source = "test"
