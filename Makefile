@@ -12,7 +12,7 @@ help:  ## show the commands
 
 demo: $(call STAMP,test)  ## simulate asteroid Toutatis with 1,000 clones; writes out/toutatis.nc and .png
 	@mkdir -p out
-	$(BIN)/polhode run scenes/toutatis.toml --output out/toutatis.nc
+	$(BIN)/polhode run toutatis --output out/toutatis.nc
 
 test: $(call STAMP,test)  ## run the tests but the slow ones, and one notebook
 	$(PYTEST) -m 'not slow' tests notebooks/quick_start.ipynb

@@ -1,11 +1,13 @@
 """What any supported set of versions must do: ``python tests/smoke.py [name ...]``.
 
-The README's ten lines, one scene of each kind with value and gradient, in both modes, and a fit;
-names take some of these. versions.py runs it.
+The README's ten lines, one scene of each kind with value and gradient, in both modes, a fit, and
+the commands with their files; names select some of these. versions.py runs it.
 """
 
+import contextlib
 import re
 import sys
+import tempfile
 import warnings
 from importlib.metadata import version
 from pathlib import Path
@@ -15,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import polhode as ph
+from polhode import plot
 
 jax.config.update("jax_enable_x64", True)
 
@@ -86,19 +89,68 @@ def check_fit():
     np.testing.assert_allclose(fitted / fitted.sum(), moments / moments.sum(), rtol=2e-3)
 
 
+def check_commands():
+    """Scene file to NetCDF, figure and page; ensemble to Zarr; recording to numbers and figure."""
+    from polhode.cli import main as polhode
+
+    def run(words):
+        assert polhode(words.split()) == 0, words
+
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        run("run wing_nut --clones 3 -o nut.nc -q")
+        run("view nut.nc")
+        run("explain toutatis --clones 0")
+        batch = "[ensemble]\nbodies = 8\nseed = 1\n[ensemble.attitude]\nany = true\n"
+        scene = Path(ph.files.shipped_scenes()["nasa_brick"]).read_text(encoding="utf-8")
+        Path("many.toml").write_text(scene.partition("[observations]")[0] + batch)
+        run("run many.toml -q")
+        times = np.linspace(0, 6, 150)
+        scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.6, 2.1]))
+        motion = ph.simulate(scene, ph.State([1.0, 0, 0, 0], [0.4, 2.0, 0.5]), times)
+        motion.to_xarray()
+        noise = np.random.default_rng(1).normal(scale=1e-4, size=(150, 3))
+        table = np.column_stack([times, np.asarray(motion.omega_body) + noise])
+        np.savetxt("imu.csv", table, delimiter=",", header="t,wx,wy,wz", comments="")
+        run("fit imu.csv -q -o fit")
+        plot.overview(motion).savefig("overview.png")
+        written = {path.name for path in Path().iterdir()}
+        needed = {"nut.nc", "nut.png", "nut.html", "many.zarr", "fit.json", "fit.png"}
+        assert needed <= written, needed - written
+
+
+OTHERS = {"fit": check_fit, "commands": check_commands}
+
+
 def main():
     warnings.simplefilter("error")
-    packages = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "jaxtyping", "numpy")
+    packages = (
+        "jax",
+        "jaxlib",
+        "equinox",
+        "diffrax",
+        "optimistix",
+        "lineax",
+        "jaxtyping",
+        "numpy",
+        "typer",
+        "pydantic",
+        "rich",
+        "xarray",
+        "h5netcdf",
+        "h5py",
+        "zarr",
+        "matplotlib",
+    )
     print(*(f"{name} {version(name)}" for name in packages), sep=", ")
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     (lines,) = re.findall(r"## Ten lines\n\n```python\n(.*?)```", readme, re.S)
     exec(lines, {})
-    failed, checks = [], {**SCENES, "fit": None}
+    failed, checks = [], {**SCENES, **OTHERS}
     for name, run in checks.items():
         if sys.argv[1:] and name not in sys.argv[1:]:
             continue
         try:
-            check_scene(*run) if run else check_fit()
+            run() if callable(run) else check_scene(*run)
         except Exception as error:
             failed.append(name)
             print(f"{name}: {type(error).__name__}: {error}", file=sys.stderr)

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from polhode.files import shipped_scenes
+
 ROOT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.slow
 
@@ -29,9 +31,18 @@ def built(tmp_path_factory) -> dict[str, Path]:
 def test_they_hold_what_is_needed(built):
     needed = {"polhode/py.typed", "polhode/plot/viewer/viewer.js", "polhode/plot/viewer/page.html"}
     needed |= {f"polhode/plot/viewer/three.{kind}" for kind in ("min.js", "LICENSE.txt")}
+    needed |= {f"polhode/files/scenes/{name}.toml" for name in shipped_scenes()}
     names = set(zipfile.ZipFile(built["wheel"]).namelist())
     assert needed <= names
     assert all(name.startswith("polhode") for name in names)
+    licences = {Path(name).name for name in names if ".dist-info/licenses/" in name}
+    assert licences == {"LICENSE", "three.LICENSE.txt"}
+    with zipfile.ZipFile(built["wheel"]) as wheel:
+        (name,) = [name for name in names if name.endswith(".dist-info/METADATA")]
+        metadata = wheel.read(name).decode()
+    assert "\nLicense-Expression: Apache-2.0 AND MIT\n" in metadata
+    assert "\nClassifier: Typing :: Typed\n" in metadata
+    assert not re.search(r"\]\((?!https?:|#)", metadata), "a relative link in the readme"
     with tarfile.open(built["archive"]) as archive:
         names = {name.split("/", 1)[-1] for name in archive.getnames()}
     assert {f"src/{name}" for name in needed} <= names
@@ -57,10 +68,3 @@ def test_installed_it_runs_the_lines_of_the_readme(built, kind, tmp_path):
     )
     assert done.returncode == 0, done.stderr[-3000:]
     assert Path(done.stdout.splitlines()[0]).is_relative_to(target.resolve())
-
-
-def test_the_citation_names_the_version():
-    from polhode import __version__
-
-    text = (ROOT / "CITATION.cff").read_text(encoding="utf-8")
-    assert f"\nversion: {__version__}\n" in text

@@ -1,8 +1,8 @@
 """``make test-versions``: smoke.py on the lowest and the newest versions of what polhode needs.
 
 Each set has an environment of its own beside the checkout, ``.venv-lowest`` and ``.venv-newest``,
-made with the interpreter that runs this file (JAX from 0.11 on needs Python 3.12); name one set to
-run it alone. The lowest set is read from pyproject.toml.
+made with the interpreter that runs this file (JAX from 0.11 on needs Python 3.12) and holding every
+extra; name one set to run it alone. The lowest set is read from pyproject.toml.
 """
 
 import re
@@ -16,12 +16,14 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 def floors() -> list[str]:
-    """``name==version`` of everything that polhode and its fits need, at the floors."""
+    """``name==version`` of the dependencies and of those of every extra, at the floors."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    needs = [*project["dependencies"], *project["optional-dependencies"]["fit"]]
+    needs = {*project["dependencies"]}.union(*project["optional-dependencies"].values())
+    needs = sorted(need for need in needs if not need.startswith("polhode["))
     found = [re.fullmatch(r"([\w-]+)>=([\d.]+)(,<[\d.]+)?", need) for need in needs]
     assert all(found), needs
     exact = dict(match.group(1, 2) for match in found if match)
+    assert len(exact) == len(needs), f"two floors of one package: {needs}"
     exact["jaxlib"] = exact["jax"]
     return [f"{name}=={number}" for name, number in exact.items()]
 
@@ -33,7 +35,7 @@ def run(name: str) -> int:
         venv.create(folder, with_pip=True)
     pins = floors() if name == "lowest" else ["--upgrade", "--upgrade-strategy", "eager"]
     install = [str(python), "-m", "pip", "install", "--quiet"]
-    subprocess.run([*install, f"{ROOT}[fit]", *pins], check=True)
+    subprocess.run([*install, f"{ROOT}[all]", *pins], check=True)
     print(f"{name}: ", end="", flush=True)
     return subprocess.run([str(python), str(ROOT / "tests" / "smoke.py")]).returncode
 

@@ -1,6 +1,5 @@
 """Input checks shared by every constructor: what was given, what is expected, how to mend it."""
 
-import importlib
 from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import TYPE_CHECKING, Any
@@ -56,16 +55,6 @@ def require(condition: Any, message: str | Callable[[], str]) -> None:
     """
     if not bool(np.all(np.asarray(condition))):
         raise ValueError(message if isinstance(message, str) else message())
-
-
-def imported(what: str, *modules: str, extra: str = "cli") -> Any:
-    """The first of the modules, all of which must be there; ImportError says who needs them."""
-    try:
-        first, *_ = map(importlib.import_module, modules)
-        return first
-    except ImportError as error:
-        needed = " and ".join(modules)
-        raise ImportError(f"{what} needs {needed}: pip install 'polhode[{extra}]'") from error
 
 
 def describe(value: Any, limit: int = 8) -> str:

@@ -2,6 +2,7 @@
 
 import importlib.util
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,9 +15,10 @@ import xarray
 
 import polhode as ph
 from polhode.cli import main
-from polhode.files import build_scene, build_state, read_scene
+from polhode.cli._inputs import scene_file
+from polhode.files import build_scene, build_state, read_scene, shipped_scenes
 
-SCENES = Path(__file__).parents[2] / "scenes"
+SCENES = shipped_scenes()["toutatis"].parent
 TOP = """
 title = "small top"
 source = "test"
@@ -245,6 +247,29 @@ def test_wrong_options_are_usage_errors(here, capsys, arguments, hint):
     assert hint in capsys.readouterr().err
 
 
+def test_the_scenes_that_come_with_polhode(here, capsys):
+    """Listed, copied, and run by name from any folder; a file of that name comes first."""
+    assert main(["scenes"]) == 0
+    told = capsys.readouterr().out
+    assert all(path.stem in told for path in SCENES.glob("*.toml"))
+    assert main(["explain", "lagrange_top"]) == 0
+    assert "Lagrange top" in capsys.readouterr().out
+    assert main(["scenes", "toutatis", "-o", "copies/mine"]) == 0
+    assert (here / "copies" / "mine.toml").read_bytes() == (SCENES / "toutatis.toml").read_bytes()
+    (here / "toutatis").write_text("no scene")
+    assert main(["explain", "toutatis"]) == 2
+    assert "not valid TOML" in capsys.readouterr().err
+
+
+def test_the_example_of_the_help_runs_where_only_polhode_is(here, capsys):
+    with pytest.raises(SystemExit):
+        main(["run", "--help"])
+    (words,) = re.findall(r"^ *example: polhode (.*)$", capsys.readouterr().out, re.M)
+    command, scene, *_ = words.split()
+    assert command == "run"
+    assert scene_file(scene).samefile(SCENES / f"{scene}.toml")
+
+
 def test_help_and_version(capsys):
     for arguments, text in ((["--help"], "explain"), (["run", "--help"], "--precision"),
                             (["--version"], ph.__version__)):  # fmt: skip
@@ -279,13 +304,15 @@ def test_missing_packages_are_named_before_the_work(here, capsys, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(
         importlib.util, "find_spec",
-        lambda name: None if name in ("h5py", "optimistix") else find(name),
+        lambda name: None if name in ("h5py", "matplotlib") else find(name),
     )  # fmt: skip
     assert run("top.toml") == 1
-    assert "`polhode run` needs h5py: pip install 'polhode[cli]'" in capsys.readouterr().err
+    told = capsys.readouterr().err
+    assert "`polhode run` needs h5py, matplotlib: pip install 'polhode[cli]'" in told
+    (here / "toss.csv").touch()
     assert main(["fit", "toss.csv"]) == 1
-    assert "`polhode fit` needs optimistix: pip install" in capsys.readouterr().err
-    assert [path.name for path in here.iterdir()] == ["top.toml"]
+    assert "`polhode fit` needs matplotlib: pip install 'polhode[cli]'" in capsys.readouterr().err
+    assert sorted(path.name for path in here.iterdir()) == ["top.toml", "toss.csv"]
 
 
 def test_termination_unwinds(here, monkeypatch):

@@ -1,16 +1,14 @@
 """The main job on asteroid 4179 Toutatis, against published numbers."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import xarray
 
 import polhode as ph
 from polhode.cli import _job, main
-from polhode.files import build_attitudes, read_scene
+from polhode.files import build_attitudes, read_scene, shipped_scenes
 
-SCENE = Path(__file__).parents[2] / "scenes" / "toutatis.toml"
+SCENE = shipped_scenes()["toutatis"]
 DAY = 86400.0
 
 # mockingbirdnest/Principia, physics/euler_solver_test.cpp: per radar observation of December 1992,

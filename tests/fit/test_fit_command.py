@@ -125,5 +125,5 @@ def test_repeated_times_are_named(toss, capsys):
 
 
 def test_a_missing_file_is_an_error(tmp_path, capsys):
-    assert main(["fit", str(tmp_path / "none.csv")]) == 1
+    assert main(["fit", str(tmp_path / "none.csv")]) == 2
     assert "none.csv" in capsys.readouterr().err

@@ -5,17 +5,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polhode.files import build_scene, build_state, draw_clones, read_scene
+from polhode.files import build_scene, build_state, draw_clones, read_scene, shipped_scenes
 
-FOLDER = Path(__file__).parents[2] / "scenes"
-SCENES = sorted(FOLDER.glob("*.toml"))
+SCENES = shipped_scenes()
+CHECKOUT = Path(__file__).parents[2] / "scenes"
 
 
 def test_there_are_scenes():
     assert len(SCENES) >= 5
 
 
-@pytest.mark.parametrize("path", SCENES, ids=lambda path: path.stem)
+@pytest.mark.skipif(not CHECKOUT.exists(), reason="source archives hold the files in src only")
+def test_a_checkout_has_them_in_a_folder_of_its_own():
+    assert {path.stem: path.resolve() for path in CHECKOUT.glob("*.toml")} == SCENES
+
+
+@pytest.mark.parametrize("path", SCENES.values(), ids=SCENES)
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_scene_builds(path, dtype):
     file = read_scene(path)
@@ -29,7 +34,7 @@ def test_scene_builds(path, dtype):
 
 
 def test_wing_nut_spins_about_its_intermediate_axis():
-    file = read_scene(FOLDER / "wing_nut.toml")
+    file = read_scene(SCENES["wing_nut"])
     inertia = build_scene(file, np.float64).inertia
     along_spin = np.asarray(inertia.tensor)[0, 0]
     smallest, middle, largest = np.sort(inertia.moments)
@@ -38,7 +43,7 @@ def test_wing_nut_spins_about_its_intermediate_axis():
 
 
 def test_clones_are_drawn_as_the_file_says():
-    file = read_scene(FOLDER / "toutatis.toml")
+    file = read_scene(SCENES["toutatis"])
     clones = draw_clones(file, np.float64)
     again = draw_clones(file, np.float64)
     assert clones.redrawn == 0

@@ -207,5 +207,5 @@ def test_settings_of_the_user_are_left_alone(trajectory):
 
 def test_message_without_matplotlib(trajectory, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
-    with pytest.raises(ImportError, match=r"pip install 'polhode\[cli\]'"):
+    with pytest.raises(ImportError, match=r"pip install 'polhode\[plot\]'"):
         plot.history(trajectory)

@@ -3,6 +3,7 @@
 import base64
 import json
 import re
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -261,3 +262,9 @@ def test_a_browser_plays_and_hides(browser, trajectory, tmp_path):
         browser.run(f"{click}.click()")
         assert changed(shown, browser.look()) == 0, name
     assert not browser.faults
+
+
+def test_a_page_carries_the_licence_of_what_it_carries(trajectory):
+    """three.js may be passed on with its copyright notice and the text of its licence."""
+    licence = Path(plot.__file__).parent / "viewer" / "three.LICENSE.txt"
+    assert licence.read_text(encoding="utf-8").strip() in plot.view(trajectory).html

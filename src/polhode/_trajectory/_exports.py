@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from polhode import __version__
-from polhode._checks import imported
+from polhode._extras import imported
 from polhode._method import Status
 
 

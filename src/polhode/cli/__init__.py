@@ -1,24 +1,27 @@
-"""The command line: `polhode run`, `explain`, `fit`, `schema`."""
+"""The command line: `polhode run`, `explain`, `fit`, `view`, `lightcurve`, `scenes`, `schema`."""
 
 import contextlib
 import os
 import sys
 from collections.abc import Sequence
 
+from polhode._extras import how_to_install
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; returns the exit code.
 
-    0: done; 1: the simulation or the writing failed; 2: wrong options or a bad input file; 130:
-    interrupted (Ctrl-C). Raises SystemExit for --help, wrong options and termination (143).
+    0: done; 1: the computation or the writing failed; 2: wrong usage or wrong input, such as a file
+    that is missing, malformed or of another kind; 130: interrupted (Ctrl-C).
+
+    Raises SystemExit for --help, wrong options and termination (143).
     """
     try:
         from polhode.cli._main import main as command_line
     except ModuleNotFoundError as error:
         words = sys.argv[1:] if argv is None else argv
         command = " ".join(["polhode", *map(str, words[:1])])
-        print(f"polhode: `{command}` needs {error.name}: pip install 'polhode[cli]'",
-              file=sys.stderr)  # fmt: skip
+        print(f"polhode: `{command}` needs {error.name}: {how_to_install('cli')}", file=sys.stderr)
         return 1
     return command_line(argv)
 

@@ -8,9 +8,9 @@ from typing import Annotated, Any
 import typer
 
 from polhode.cli import _show
-from polhode.cli._options import byte_count, device_count, positive, whole_number
+from polhode.cli._options import address, byte_count, device_count, positive, whole_number
 from polhode.cli._signals import heed
-from polhode.cli._targets import UsageError
+from polhode.cli._targets import UsageError, check_suffix
 
 _PANEL = "for a scene with an [ensemble]: "
 
@@ -41,7 +41,8 @@ CoordinatorOption = Annotated[
     _option(
         "--coordinator",
         "where process 0 waits for the others (jax.distributed); needs --processes and --process",
-        metavar="HOST:PORT",
+        address,
+        "HOST:PORT",
     ),
 ]
 ClusterOption = Annotated[
@@ -117,6 +118,7 @@ def _store_path(file: Any, output: str | None) -> Path:
     path = Path(text)
     if "\0" in text or path.name in ("", ".."):
         raise UsageError(f"the output {visible(text)} names no store: give a name such as big.zarr")
+    check_suffix(text, ".zarr", what="a Zarr store")
     if path.suffix != ".zarr":
         path = path.with_name(path.name + ".zarr")
     here = Path.cwd().resolve()
@@ -152,6 +154,9 @@ def _meet(path: Path, options: dict[str, Any]) -> None:
     cluster, coordinator = options.pop("cluster", False), options.pop("coordinator", None)
     patience = {"patience": options.pop("patience")} if "patience" in options else {}
     known = options.get("processes"), options.get("process")
+    processes, process = known
+    if processes is not None and process is not None and process >= processes:
+        raise UsageError(f"--process {process} of --processes {processes}: they count from 0.")
     if coordinator is None and not cluster:
         if known[0] is None and known[1] is not None:
             raise UsageError("--process needs --processes, the number of all of them.")

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from polhode.cli import _show
+from polhode.cli._inputs import refused
 from polhode.cli._options import (
     DebugOption,
     ForceOption,
@@ -20,9 +21,10 @@ from polhode.cli._options import (
     require,
 )
 from polhode.cli._signals import heed
-from polhode.cli._targets import UsageError, target
+from polhode.cli._targets import UsageError, stem, target
 
 _ROLES = ("t", "wx", "wy", "wz", "wheel")
+_EXPECTED = "a recording: CSV with a header line"
 _Asked = types.SimpleNamespace  # the options of `fit` as they were given
 
 
@@ -104,6 +106,8 @@ def fit(
     used, or when the recording does not show all ratios of the moments.
     """
     path, named = _columns(recording, columns)
+    with refused(path, ".csv", _EXPECTED):
+        pass
     asked = _Asked(
         path=path, columns=named, degrees=degrees, milliseconds=milliseconds, noise=noise,
         moments_only=moments_only, bias=bias, drag=drag, robust=robust,
@@ -119,8 +123,8 @@ def fit(
         raise UsageError("--robust counts in noises: give --noise SIGMA too.")
     if not math.hypot(*wheel_axis) > 0 or not math.isfinite(math.hypot(*wheel_axis)):
         raise UsageError(f"--wheel-axis must have a direction, got {wheel_axis}.")
+    output = output and stem(output, ".json", ".png", what="the numbers and the figure")
     require("fit", "rich", *(() if no_figure else ("matplotlib",)))
-    require("fit", "optimistix", extra="cli,fit")
     goals = [_goal(asked, output, ".json", force)]
     if not no_figure:
         goals.append(_goal(asked, output, ".png", force))
@@ -212,17 +216,23 @@ def _read(asked: _Asked) -> Any:
     from polhode.fit._csv import load_recording
 
     try:
-        return load_recording(
-            asked.path,
-            asked.columns,
-            scale=math.pi / 180 if asked.degrees else None,
-            time_scale=1e-3 if asked.milliseconds else None,
-            noise=asked.noise or 1.0,
-        )
-    except ValueError as error:
-        units = "deg/s" in str(error) and not (asked.degrees and asked.milliseconds)
-        hint = " See --degrees and --milliseconds." if units else ""
-        raise UsageError(f"{error}{hint}") from error
+        with refused(asked.path, ".csv", _EXPECTED):
+            return load_recording(
+                asked.path,
+                asked.columns,
+                scale=math.pi / 180 if asked.degrees else None,
+                time_scale=1e-3 if asked.milliseconds else None,
+                noise=asked.noise or 1.0,
+            )
+    except UsageError as error:
+        hint = ""
+        if "deg/s" in str(error) and not (asked.degrees and asked.milliseconds):
+            hint = " See --degrees and --milliseconds."
+        elif "must have the columns" in str(error):
+            missing = [role for role in _ROLES if f"{role} -> " in str(error)]
+            hint = " Name them: --columns " + " ".join(f"{role}=COLUMN" for role in missing)
+        first, end, rest = str(error).partition("\n")
+        raise UsageError(f"{first}{hint}{end}{rest}") from error
 
 
 def _said(loaded: Any) -> str:

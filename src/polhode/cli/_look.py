@@ -5,22 +5,43 @@ from typing import Annotated
 
 import typer
 
-from polhode.cli._options import DebugOption
+from polhode.cli._inputs import refused
+from polhode.cli._options import (
+    DebugOption,
+    ForceOption,
+    not_negative,
+    require,
+    whole_number,
+)
+from polhode.cli._targets import check_suffix, stem, target
 
 
 def view(
     path: Annotated[Path, typer.Argument(metavar="FILE.nc", help="made by `polhode run`")],
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="the page; FILE.html if left out")
+        str | None, typer.Option("-o", "--output", help="the page; FILE.html if left out")
     ] = None,
+    force: ForceOption = False,
     debug: DebugOption = False,
 ) -> int:
     """Write one HTML page that shows the motion of a file: it needs no network."""
+    from polhode.files import visible
+
+    if output is not None:
+        check_suffix(output, ".html", ".htm", what="a page")
+    expected = "a NetCDF file (.nc) that `polhode run` wrote"
+    with refused(path, ".nc", expected):
+        pass  # before JAX is imported
+    require("view", "xarray", "h5netcdf", "h5py")
     from polhode import plot
 
-    target = path.with_suffix(".html") if output is None else output
-    plot.view_file(path, target)
-    print(f"written: {target}")
+    with refused(path, ".nc", expected):
+        page = plot.view_file(path)
+    name = str(path.with_suffix(".html")) if output is None else output
+    suffix = ".htm" if name.endswith(".htm") else ".html"
+    goal = target(name, suffix, force=force)
+    page.write(goal)
+    print(f"written: {visible(str(goal))}")
     return 0
 
 
@@ -30,18 +51,41 @@ def lightcurve(
         Path | None, typer.Option(help="CSV of Sun and observer directions, if not in FILE")
     ] = None,
     output: Annotated[
-        Path | None, typer.Option("-o", "--output", help="figure and numbers: OUTPUT.png, .json")
+        str | None, typer.Option("-o", "--output", help="figure and numbers: OUTPUT.png, .json")
     ] = None,
-    trials: Annotated[int, typer.Option(help="motions tried before the best are fitted")] = 40_000,
-    floor: Annotated[float, typer.Option(help="least error of a point [mag]")] = 0.03,
-    seed: Annotated[int, typer.Option(help="of the trials")] = 0,
+    trials: Annotated[
+        int,
+        typer.Option(
+            parser=whole_number(1), metavar="N", help="motions tried before the best are fitted"
+        ),
+    ] = 40_000,
+    floor: Annotated[
+        float, typer.Option(parser=not_negative, metavar="MAG", help="least error of a point [mag]")
+    ] = 0.03,
+    seed: Annotated[
+        int, typer.Option(parser=whole_number(0), metavar="N", help="of the trials")
+    ] = 0,
+    force: ForceOption = False,
     debug: DebugOption = False,
 ) -> int:
     """Spin and inertia of a tumbling body from its brightness."""
+    expected = "a light curve: CSV with a header line, ALCDEF or DAMIT's lc.txt"
+    if output is not None:
+        output = stem(output, ".png", ".json", what="the figure and the numbers")
+    directions = "a CSV of directions: jd, sun_x ... observer_z"
+    for file, what in ((path, expected), (vectors, directions)):
+        if file is not None:
+            with refused(file, ".csv", what):
+                pass
+    require("lightcurve", "matplotlib")
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from polhode.lightcurve import run
+    from polhode.lightcurve._command import fitted, read
 
-    run(path, vectors=vectors, output=output, trials=trials, floor=floor, seed=seed)
+    with refused(path, ".csv", expected):
+        curve = read(path, vectors, floor)
+    name = output or path.stem
+    goals = [target(name + end, end, force=force) for end in (".png", ".json")]
+    fitted(curve, path.name, *goals, trials=trials, floor=floor, seed=seed)
     return 0

@@ -3,6 +3,7 @@
 Nothing heavy is imported before a command runs, so that `--help` and mistakes answer at once.
 """
 
+import difflib
 import functools
 import gc
 import os
@@ -10,19 +11,57 @@ import sys
 import traceback
 import warnings
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+import typer.core
 
-from polhode.cli import _explain, _fit, _look, _run, _targets
+from polhode.cli import _explain, _fit, _look, _run, _scenes, _targets
+from polhode.cli._inputs import READERS
 from polhode.cli._signals import INTERRUPTED, TERMINATED, heeded
 from polhode.files import SceneFileError, visible
 
 SUCCESS, FAILURE, USAGE = 0, 1, 2
 _codes: list[int] = []
 
+_OTHER_WORDS = {
+    "run": ("simulate", "sim", "solve", "integrate", "propagate", "start", "exec", "execute"),
+    "explain": ("plan", "describe", "check", "validate", "info", "inspect"),
+    "fit": ("identify", "inertia", "estimate", "calibrate"),
+    "lightcurve": ("light-curve", "light_curve", "lc", "photometry"),
+    "view": ("plot", "show", "page", "html", "animate", "viewer", "display", "draw", "open"),
+    "schema": ("json-schema", "jsonschema", "json_schema"),
+    "scenes": ("scene", "examples", "example", "list", "ls", "demo"),
+    "--help": ("help",),
+    "--version": ("version",),
+}
+
+
+class _Commands(typer.core.TyperGroup):
+    """The commands; an unknown one is answered with the command that was probably meant."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        name = args[0]
+        if self.get_command(ctx, name) is None and not name.startswith("-"):
+            ctx.fail(f"No such command {visible(name)!r}.{_meant(name)}")
+        return super().resolve_command(ctx, args)
+
+
+def _meant(name: str) -> str:
+    """A hint for an unknown command: one of the same meaning, or of a similar name."""
+    if reader := READERS.get(Path(name).suffix):
+        return f" It is the name of a file: {reader}."
+    for command, others in _OTHER_WORDS.items():
+        if name.lower() in (command, *others):
+            return f" Did you mean {command!r}?"
+    close = difflib.get_close_matches(name.lower(), _OTHER_WORDS, 1)
+    return f" Did you mean {close[0]!r}?" if close else f" There are {', '.join(_NAMES)}."
+
+
 app = typer.Typer(
     name="polhode",
+    cls=_Commands,
     help="Rotating rigid bodies: simulate scenes written as TOML files, fit inertia, look at them.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong options or input file, 130 interrupted.",
     add_completion=False,
@@ -125,6 +164,8 @@ def _report(error: Exception, debug: bool) -> int:
     known = bad_input or isinstance(error, OSError | ImportError | RuntimeError | MemoryError)
     lead = "" if known else f"{type(error).__name__}: "
     hint = "" if known or debug else "\n  (run again with --debug to see where)"
+    if isinstance(error, OSError) and error.strerror:  # str() begins with the number of the error
+        text = ": ".join(str(part) for part in (error.filename, error.strerror) if part)
     block = "\n".join(map(visible, f"{lead}{text}{hint}".split("\n")))
     print(f"polhode: {block}", file=sys.stderr)
     try:
@@ -138,13 +179,16 @@ def _silence(stream: Any) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
+_NAMES: list[str] = []
 _EXAMPLES = {
-    "run": "example: polhode run scenes/toutatis.toml -o toutatis.nc",
+    "run": "example: polhode run toutatis -o toutatis.nc",
     "fit": "example: polhode fit toss.csv --columns t=time wx=gx wy=gy wz=gz -o toss",
 }
 for _name, _command in (("run", _run.run), ("explain", _explain.explain), ("fit", _fit.fit),
                         ("schema", _explain.schema), ("view", _look.view),
-                        ("lightcurve", _look.lightcurve)):  # fmt: skip
+                        ("lightcurve", _look.lightcurve),
+                        ("scenes", _scenes.scenes)):  # fmt: skip
+    _NAMES.append(_name)
     app.command(_name, epilog=_EXAMPLES.get(_name))(_guarded(_command))
 
 

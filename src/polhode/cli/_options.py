@@ -25,6 +25,25 @@ def whole_number(least: int) -> Callable[[str], int]:
     return convert
 
 
+def not_negative(text: str | float) -> float:
+    """A finite number, 0 or above."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value < math.inf:
+        raise typer.BadParameter(f"{str(text)[:80]!r} is not a number from 0 up")
+    return value
+
+
+def address(text: str) -> str:
+    """HOST:PORT."""
+    host, _, port = text.rpartition(":")
+    if not host or not (port.isascii() and port.isdigit() and 0 < int(port[:6]) < 65536):
+        raise typer.BadParameter(f"{text[:80]!r} is not HOST:PORT, such as node1:1234")
+    return text
+
+
 def positive(text: str | float) -> float:
     """A finite number above 0."""
     try:
@@ -37,10 +56,13 @@ def positive(text: str | float) -> float:
 
 
 def byte_count(text: str | int) -> int:
-    """4GB, 500MB, 2e9."""
+    """4GB, 500MB, 2e9: a byte or more."""
     match = re.fullmatch(r"([0-9.]+(?:e[0-9]+)?)\s*([kmgt]?)b?", str(text).strip().lower())
     try:
-        return int(float(match[1]) * _SIZES[match[2]])  # type: ignore[index]
+        count = int(float(match[1]) * _SIZES[match[2]])  # type: ignore[index]
+        if count < 1:
+            raise ValueError
+        return count
     except (TypeError, ValueError, OverflowError):
         raise typer.BadParameter(f"{str(text)[:80]!r} is not a size such as 4GB") from None
 
@@ -57,8 +79,9 @@ def _precision(text: str) -> str:
 
 
 SceneName = Annotated[
-    str, typer.Argument(metavar="SCENE", help="scene file (TOML), - for standard input",
-                        show_default=False)
+    str, typer.Argument(metavar="SCENE", show_default=False,
+                        help="scene file (TOML), - for standard input, or the name of one that"
+                             " comes with polhode (polhode scenes)")
 ]  # fmt: skip
 ClonesOption = Annotated[
     int | None,
@@ -92,7 +115,8 @@ DebugOption = Annotated[bool, typer.Option("--debug", help="show the full traceb
 
 def read(scene: str, clones: int | None, seed: int | None):
     """The scene file with the options put in place of its own entries."""
-    from polhode.files import SceneFileError, read_scene
+    from polhode.cli._inputs import read_scene
+    from polhode.files import SceneFileError
 
     file = read_scene(scene)
     given = {"clones": clones, "seed": seed}
@@ -122,8 +146,10 @@ def require(command: str, *packages: str, extra: str = "cli") -> None:
     """ImportError now, rather than after the work, when a package is missing."""
     import importlib.util
 
+    from polhode._extras import how_to_install
+
     missing = [name for name in packages if importlib.util.find_spec(name) is None]
     if missing:
         raise ImportError(
-            f"`polhode {command}` needs {', '.join(missing)}: pip install 'polhode[{extra}]'"
+            f"`polhode {command}` needs {', '.join(missing)}: {how_to_install(extra)}"
         )

@@ -22,7 +22,7 @@ from polhode.cli._options import (
     require,
 )
 from polhode.cli._signals import heed
-from polhode.cli._targets import target
+from polhode.cli._targets import check_suffix, target
 
 
 def run(
@@ -72,6 +72,7 @@ def run(
     require("run", "rich", "xarray", "h5netcdf", "h5py", *(("matplotlib",) if with_figure else ()))
     named = output or file.output.file
     name = named or ("stdin" if scene == "-" else file.path.stem) + ".nc"
+    check_suffix(name, ".nc", what="a NetCDF file (the figure .png is written beside it)")
     goal = target(name, ".nc", force=force, confined=output is None and named is not None)
     picture = None
     if with_figure:

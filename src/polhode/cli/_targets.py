@@ -1,6 +1,7 @@
 """Files that a command is to write: what may be replaced, and what was."""
 
 import os
+import re
 import stat
 from pathlib import Path
 
@@ -16,6 +17,25 @@ class UsageError(Exception):
 def forget() -> None:
     """Begin anew: no file was chosen."""
     _chosen.clear()
+
+
+def check_suffix(text: str, *suffixes: str, what: str) -> None:
+    """UsageError for a name with the suffix of a format that the command does not write.
+
+    What follows a dot and does not begin with a letter (``run_0.5``) is part of the name.
+    """
+    suffix = Path(text).suffix
+    if re.fullmatch(r"\.[A-Za-z]\w*", suffix) and suffix not in suffixes:
+        raise UsageError(
+            f"cannot write {visible(text)}: {what} has the suffix {' or '.join(suffixes)}, not"
+            f" {visible(suffix)}; name such a file, or leave the suffix out"
+        )
+
+
+def stem(text: str, *suffixes: str, what: str) -> str:
+    """The name without one of the suffixes, of files that differ in them. Raises as above."""
+    check_suffix(text, *suffixes, what=what)
+    return text.removesuffix(Path(text).suffix) if Path(text).suffix in suffixes else text
 
 
 def target(path: Path | str, suffix: str, *, force: bool, confined: bool = False) -> Path:

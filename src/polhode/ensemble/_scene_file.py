@@ -1,5 +1,7 @@
 """From the [ensemble] of a scene file to an `Ensemble` and its statistics."""
 
+from typing import TYPE_CHECKING
+
 import jax.numpy as jnp
 from jaxtyping import DTypeLike
 
@@ -16,13 +18,17 @@ from polhode.ensemble._spreads import (
     SpreadTorque,
 )
 from polhode.ensemble._statistics import QUANTITIES, Statistic
-from polhode.files import SceneFile, build_inertia, build_scene, build_state
+
+if TYPE_CHECKING:
+    from polhode.files import SceneFile
 
 
-def build_ensemble(file: SceneFile, dtype: DTypeLike) -> tuple[Ensemble, tuple[Statistic, ...]]:
+def build_ensemble(file: "SceneFile", dtype: DTypeLike) -> tuple[Ensemble, tuple[Statistic, ...]]:
     """The ensemble and the statistics to keep. Raises SceneFileError for impossible numbers and
     ValueError for a file without [ensemble].
     """
+    from polhode.files import build_inertia, build_scene, build_state
+
     plan = file.ensemble
     if plan is None:
         raise ValueError(f"{file.path} has no [ensemble]: add one, with `bodies` and `seed`.")
@@ -45,7 +51,7 @@ def build_ensemble(file: SceneFile, dtype: DTypeLike) -> tuple[Ensemble, tuple[S
     return ensemble, kept
 
 
-def _spread(quantity: str, draw, file: SceneFile, dtype: DTypeLike):
+def _spread(quantity: str, draw, file: "SceneFile", dtype: DTypeLike):
     if getattr(draw, "any", False):
         return AnyAttitude()
     uniform = draw.sigma is None

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from polhode._checks import imported
+from polhode._extras import imported
 from polhode.ensemble._layout import Field, Rows
 from polhode.files._atomic import sync
 from polhode.files._error import shorten
@@ -297,11 +297,10 @@ def consolidate(path: Path) -> None:
 
 def _extended(checksum: int, values: np.ndarray) -> int:
     """CRC-32C of what came before and of the bytes of an array."""
-    import google_crc32c
-
+    crc32c = imported("an ensemble on disk", "google_crc32c", extra="scale")
     view = np.ascontiguousarray(values).view()
     view.setflags(write=False)  # google_crc32c takes nothing that could change meanwhile
-    return google_crc32c.extend(checksum, view)
+    return crc32c.extend(checksum, view)
 
 
 def _arrays(

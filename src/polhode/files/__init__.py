@@ -6,9 +6,11 @@ Reading and checking a file needs no JAX; what builds polhode's objects is impor
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from polhode._extras import imported
 from polhode.files._atomic import whole_file as whole_file, write_netcdf as write_netcdf
 from polhode.files._error import SceneFileError as SceneFileError, visible as visible
 from polhode.files._read import parse_scene as parse_scene, read_scene as read_scene
+from polhode.files._shipped import shipped_scenes as shipped_scenes
 
 if TYPE_CHECKING:
     from polhode.files._build import (
@@ -33,5 +35,6 @@ _ROOMS = {
 def __getattr__(name: str) -> Any:
     for room, names in _ROOMS.items():
         if name in names:
+            imported("a scene file", "pydantic")
             return getattr(importlib.import_module(f"polhode.files.{room}"), name)
     raise AttributeError(f"module 'polhode.files' has no attribute {name!r}")

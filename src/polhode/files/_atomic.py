@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from polhode._extras import imported
+
 if TYPE_CHECKING:
     import xarray
 
@@ -54,11 +56,9 @@ def write_netcdf(dataset: "xarray.Dataset", target: str | os.PathLike) -> Path:
     """Write a dataset (`Trajectory.to_xarray()`) as compressed NetCDF-4, whole or not at all.
 
     The file is made in memory first: HDF5 ends the process when the disk is full. Needs xarray,
-    h5netcdf and h5py (`pip install polhode[cli]`). Returns the path. Raises OSError when the
+    h5netcdf and h5py (the extra `cli`). Returns the path. Raises OSError when the
     folder is missing, full or not writable; an existing file then stays as it was.
     """
-    from polhode._checks import imported  # imports JAX
-
     imported("writing NetCDF", "h5netcdf", "h5py")  # the one does not install the other
     packed = {"zlib": True, "complevel": 4, "shuffle": True}
     large = {name: packed for name, array in dataset.variables.items()

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from polhode._extras import imported
 from polhode.files._error import SceneFileError, shorten, visible
 
 if TYPE_CHECKING:
@@ -73,15 +74,12 @@ def _checked(text: str, path: Path) -> "SceneFile":
         raise SceneFileError(
             path, "", f"not valid TOML: {error}", mend="see https://toml.io for the syntax"
         ) from None
-    try:
-        from pydantic import ValidationError
-    except ImportError as error:
-        raise ImportError("scene files need pydantic: pip install 'polhode[cli]'") from error
+    pydantic = imported("a scene file", "pydantic")
     from polhode.files._models import SceneFile
 
     try:
         return SceneFile.model_validate(data)
-    except ValidationError as error:
+    except pydantic.ValidationError as error:
         found = error.errors(include_url=False)
         # what is there and wrong comes before what is not there
         first = min(found, key=lambda e: e["type"] == "missing")

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from polhode._checks import ArrayLike, as_float_array, imported, is_concrete, require
+from polhode._checks import ArrayLike, as_float_array, is_concrete, require
+from polhode._extras import imported
 
 
 def as_triangles(vertices: ArrayLike, faces: ArrayLike) -> tuple[Array, np.ndarray]:

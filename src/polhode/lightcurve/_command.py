@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from polhode._extras import imported
+from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._fit import fit_light_curve
 from polhode.lightcurve._frequencies import fourier_pairs
 from polhode.lightcurve._hypotheses import meaning
@@ -65,11 +67,52 @@ def run(
 
     ``output``: path of the files without suffix (default: that of ``path``, in the current folder).
     Without directions to Sun and observer only the frequencies are listed, and None is returned.
-    Raises what `read_light_curve` raises.
+    Raises what `read_light_curve` raises, and ValueError for a floor of 0 where errors are missing.
     """
     path = Path(path)
+    name = Path(path.stem if output is None else output)
+    picture, document = (name.with_name(name.name + suffix) for suffix in (".png", ".json"))
+    curve = read(path, vectors, floor)
+    return fitted(
+        curve,
+        path.name,
+        picture,
+        document,
+        trials=trials,
+        max_frequency=max_frequency,
+        floor=floor,
+        seed=seed,
+        say=say,
+    )
+
+
+def read(
+    path: str | PathLike[str], vectors: str | PathLike[str] | None, floor: float
+) -> LightCurve:
+    """The light curve of a file; ValueError where neither it nor the floor gives an error."""
     curve = read_light_curve(path, vectors)
-    say(f"{path.name}: {curve.t.size} points, {len(curve.names)} groups, {np.ptp(curve.t):.4g} d")
+    if not floor > 0 and curve.sun is not None and not np.all(curve.sigma > 0):
+        raise ValueError(
+            f"{path}: a floor of {floor:g} needs a positive error of every point (sigma), which the"
+            " file does not give."
+        )
+    return curve
+
+
+def fitted(
+    curve: LightCurve,
+    title: str,
+    picture: Path,
+    document: Path,
+    *,
+    say=print,
+    max_frequency: float | None = None,
+    trials: int,
+    floor: float,
+    seed: int,
+) -> Fit | None:
+    """Fit, say the table, and write the figure and the numbers; see `run`."""
+    say(f"{title}: {curve.t.size} points, {len(curve.names)} groups, {np.ptp(curve.t):.4g} d")
     if curve.sun is None:
         pairs = fourier_pairs(
             curve.t, curve.magnitude, columns=curve.columns(np.inf)[0], max_frequency=max_frequency
@@ -78,26 +121,26 @@ def run(
         for note in (*curve.notes, "without vectors to Sun and observer no body can be fitted."):
             say(f"note: {note}")
         return None
+    imported("the figure of a light curve", "matplotlib", extra="plot")  # before the search
     fit = fit_light_curve(curve, trials=trials, max_frequency=max_frequency, floor=floor, seed=seed)
     say(frequency_table(fit.pairs))
     say(table(fit))
-    output = Path(path.stem if output is None else output)
-    _write(fit, output, path.name, say)
+    _write(fit, title, picture, document, say)
     return fit
 
 
-def _write(fit: Fit, output: Path, name: str, say) -> None:
+def _write(fit: Fit, name: str, picture: Path, document: Path, say) -> None:
     import matplotlib as mpl
 
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
+    from polhode import __version__
     from polhode.files import whole_file
 
     page = figure(fit, title=name)
-    picture = output.with_name(output.name + ".png")
     with whole_file(picture) as temporary:
-        page.savefig(temporary, dpi=160)
+        page.savefig(temporary, dpi=160, metadata={"Software": f"polhode {__version__}"})
     plt.close(page)
 
     def plain(value):
@@ -107,8 +150,7 @@ def _write(fit: Fit, output: Path, name: str, say) -> None:
     for solution in fit.solutions:
         kept = {k: plain(v) for k, v in solution._asdict().items() if k not in ("model", "weights")}
         listed.append(kept | {"mode": solution.mode.name})
-    document = output.with_name(output.name + ".json")
+    contents = {"file": name, "polhode": __version__, "solutions": listed, "notes": fit.notes}
     with whole_file(document) as temporary:
-        text = json.dumps({"file": name, "solutions": listed, "notes": fit.notes}, indent=1)
-        temporary.write_text(text + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(contents, indent=1) + "\n", encoding="utf-8")
     say(f"wrote {picture} and {document}")

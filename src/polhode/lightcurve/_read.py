@@ -52,6 +52,8 @@ def _number(path, line: int, name: str, text: str) -> float:
 def _rows(path, lines) -> tuple[dict[str, list[str]], list[int]]:
     """Columns of cells by lower-case name, and the number of each row's line."""
     kept = [(k + 1, s) for k, s in enumerate(lines) if s.strip() and not s.lstrip().startswith("#")]
+    if not kept:
+        raise ValueError(f"{path} is empty; expected a header line and rows.")
     mark = next((m for m in ",;\t" if m in kept[0][1]), None)
 
     def cells(text):
@@ -68,6 +70,8 @@ def _rows(path, lines) -> tuple[dict[str, list[str]], list[int]]:
             )
         table.append(row)
         numbers.append(number)
+    if not table:
+        raise ValueError(f"{path} has a header line and no rows after it.")
     return {name: [row[k] for row in table] for k, name in enumerate(names)}, numbers
 
 

@@ -1,4 +1,7 @@
-"""Figures in one call, of a Trajectory or of arrays (needs matplotlib)."""
+"""Figures in one call, of a Trajectory or of arrays (the extra ``plot``: matplotlib).
+
+``view``, the page of a moving body, needs no extra.
+"""
 
 from polhode.plot._animate import animate as animate
 from polhode.plot._fit import fit as fit

@@ -2,7 +2,7 @@
 
 import functools
 
-from polhode._checks import imported
+from polhode._extras import imported
 
 X, Y, Z = "#D55E00", "#009E73", "#0072B2"  # body or space axes; told apart by the colour-blind
 AXES = (X, Y, Z)
@@ -37,7 +37,7 @@ def styled(function):
 
     @functools.wraps(function)
     def wrapper(*args, **kwargs):
-        with imported("a figure", "matplotlib").rc_context(STYLE):
+        with imported("a figure", "matplotlib", extra="plot").rc_context(STYLE):
             return function(*args, **kwargs)
 
     return wrapper

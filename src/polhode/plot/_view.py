@@ -164,13 +164,14 @@ def view_file(
 
 def _page(title: str, motion: dict[str, Any]) -> str:
     folder = files("polhode.plot") / "viewer"
-    text = {name: (folder / name).read_text(encoding="utf-8")
-            for name in ("page.html", "viewer.js", "three.min.js")}  # fmt: skip
+    names = ("page.html", "viewer.js", "three.min.js", "three.LICENSE.txt")
+    text = {name: (folder / name).read_text(encoding="utf-8") for name in names}
     # "</" would end the script that holds the numbers
     packed = json.dumps(motion, allow_nan=False).replace("<", "\\u003c")
     return Template(text["page.html"]).substitute(
         title=html.escape(title),
         motion=packed,
         library=text["three.min.js"],
+        licence=text["three.LICENSE.txt"],
         viewer=text["viewer.js"],
     )

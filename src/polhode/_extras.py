@@ -1,0 +1,26 @@
+"""Optional dependencies, and the error of one that is missing. Imports neither NumPy nor JAX."""
+
+import importlib
+import importlib.util
+from typing import Any
+
+
+def how_to_install(extra: str) -> str:
+    """How to install an extra (or several, separated by commas), for error messages."""
+    return f"pip install 'polhode[{extra}]' (from a checkout: pip install '.[{extra}]')"
+
+
+def imported(what: str, *modules: str, extra: str = "cli") -> Any:
+    """The first of the modules, all of which must be installed.
+
+    Raises ImportError that names ``what`` needs them, and the extra that installs them.
+    """
+    try:
+        first, *_ = map(importlib.import_module, modules)
+        return first
+    except ImportError as error:
+        missing = [name for name in modules if importlib.util.find_spec(name) is None]
+        if not missing:  # installed and broken: its own message is the better one
+            raise
+        needed = " and ".join(missing)
+        raise ImportError(f"{what} needs {needed}: {how_to_install(extra)}") from error
