@@ -86,7 +86,7 @@ def save(figure, path: Path) -> Path:
     """Write a figure, whole or not at all, without anything that changes from run to run."""
     import matplotlib.pyplot as plt
 
-    from polhode.files import whole_file
+    from polhode.files._atomic import whole_file
 
     path.parent.mkdir(parents=True, exist_ok=True)
     quiet = {"svg.hashsalt": "polhode", "svg.fonttype": "path"}

@@ -39,7 +39,7 @@ from polhode.fit import (
     fit_recordings,
 )
 from polhode.fit._result import UNUSABLE, WARNINGS
-from polhode.rotation import to_matrix
+from polhode.rotation import wxyz_to_matrix
 
 FAST = 15.0
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "ubc_racquet_toss"
@@ -102,7 +102,7 @@ def together(trials, motion=None):
     given = [Recording.of(trial[:, 0], trial[:, 1:]) for trial in trials]
     options = FitOptions(motion=motion, max_starts=2)
     fit = fit_recordings(given, options=options, throw=False)
-    middle = np.asarray(to_matrix(fit.axes))[:, 1]
+    middle = np.asarray(wxyz_to_matrix(fit.axes))[:, 1]
     rest = np.asarray(fit.residuals["omega"])
     errors, fewer = [], 0
     for k, trial in enumerate(trials):

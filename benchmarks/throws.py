@@ -35,7 +35,7 @@ import numpy as np
 import polhode as ph
 from polhode import fit as room
 from polhode.inertia import MassProperties
-from polhode.rotation import to_matrix
+from polhode.rotation import wxyz_to_matrix
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "tudelft_throws"
 DEVICE, PROOF = "device_only", "proof_body"
@@ -206,7 +206,7 @@ def turn_of(tensor, reference):
     frames = []
     for given in (reference, tensor):
         _, turn = ph.Inertia(full=given).to_principal()
-        frames.append(np.asarray(to_matrix(turn)))
+        frames.append(np.asarray(wxyz_to_matrix(turn)))
     # half turns about principal axes change nothing
     signs = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]])
     signs = signs[np.argmax(signs @ np.diagonal(frames[0].T @ frames[1]))]

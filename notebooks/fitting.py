@@ -76,7 +76,7 @@ print("off by       ", off, "standard deviations")
 # Their uncertainty is given as angles about each axis.
 
 # %%
-print(np.asarray(rotation.to_matrix(found.axes)))
+print(np.asarray(rotation.wxyz_to_matrix(found.axes)))
 print("known to", np.degrees(np.asarray(found.axes_std)), "degrees")
 
 # %% [markdown]

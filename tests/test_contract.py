@@ -98,7 +98,6 @@ def unannotated(name: str, function: Callable, bound: bool) -> Iterator[str]:
         yield f"{name} -> ?"
 
 
-@pytest.mark.xfail(strict=True, reason="orbits and fits are being rewritten")
 def test_annotations_of_public_names_are_complete():
     missing: dict[str, None] = {}
     for name, value in public_objects():

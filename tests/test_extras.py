@@ -51,7 +51,7 @@ samples = plot.samples(times, motion.omega_body, motion.wxyz, scene.inertia)
 
 uses = {
     "works": [
-        lambda: rotation.to_matrix(motion.wxyz),
+        lambda: rotation.wxyz_to_matrix(motion.wxyz),
         lambda: inertia.principal(scene.inertia.tensor),
         lambda: frames.gyroscope,
         lambda: fit.Recording.of(times, motion.omega_body),

@@ -49,8 +49,8 @@ def test_misfits_to_the_radar_observations_are_those_of_principia():
     inertia = ph.Inertia.from_moments(job.file.inertia.moments)
     state = ph.State(wxyz=job.state.wxyz[0], omega_body=job.state.omega_body[0])
     made = ph.simulate(ph.Scene(inertia), state, ts)
-    axes = np.asarray(ph.rotation.to_matrix(made.wxyz[1:]))
-    observed = np.asarray(ph.rotation.to_matrix(build_attitudes(seen.attitudes, np.float64)))
+    axes = np.asarray(ph.rotation.wxyz_to_matrix(made.wxyz[1:]))
+    observed = np.asarray(ph.rotation.wxyz_to_matrix(build_attitudes(seen.attitudes, np.float64)))
     omega, omega_seen = np.asarray(made.omega_body[1:]), seen.omega_body
     sizes = np.linalg.norm(omega, axis=-1), np.linalg.norm(omega_seen, axis=-1)
     columns = [np.abs(sizes[0] - sizes[1]) / sizes[1], _angle(omega, omega_seen)]

@@ -37,7 +37,7 @@ from polhode.fit import (
 )
 from polhode.fit._parameters import base_of, free_columns
 from polhode.fit._result import _axes_disagree
-from polhode.rotation import to_matrix
+from polhode.rotation import wxyz_to_matrix
 
 TENSOR = np.array([[2.0, 0.1, 0.2], [0.1, 2.5, -0.3], [0.2, -0.3, 3.2]])
 
@@ -242,7 +242,7 @@ def test_windows_of_a_long_recording_in_single_precision():
     off = (np.asarray(fit.ratios) - moments / moments[2])[:2] / np.asarray(fit.ratios_std)[:2]
     assert np.abs(off).max() < 4
     assert np.asarray(fit.ratios_std).max() < 0.01
-    angle = np.abs(np.asarray(to_matrix(fit.axes)))
+    angle = np.abs(np.asarray(wxyz_to_matrix(fit.axes)))
     np.testing.assert_allclose(angle, np.eye(3), atol=1e-6)
     assert 0.9 < float(fit.noise) < 1.1
 

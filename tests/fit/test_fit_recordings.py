@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from polhode.fit import FitOptions, Recording, fit_inertia, fit_recordings
-from polhode.rotation import to_matrix
+from polhode.rotation import wxyz_to_matrix
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
 RACQUET, PISA = DATA / "ubc_racquet_toss", DATA / "pisa_racket" / "data25.txt"
@@ -31,7 +31,7 @@ def test_tosses_of_a_racquet_together():
     np.testing.assert_allclose(ratios, [0.066, 0.935, 1], atol=0.006)
     assert float(fit.rms) <= 0.31
     # half a turn of the racquet about its long axis: the time between changes of sign
-    middle = np.asarray(to_matrix(fit.axes))[:, 1]
+    middle = np.asarray(wxyz_to_matrix(fit.axes))[:, 1]
     residuals = np.asarray(fit.residuals["omega"])
     apart = []
     for k, one in enumerate(given):

@@ -64,7 +64,7 @@ def test_sensors_read_what_a_differentiated_path_tells(tumble):
 def test_gravity_is_read_when_the_body_does_not_fall(tumble):
     gravity = np.array([0.0, 0.0, -9.81])
     reading = accelerometer(tumble, np.zeros(3), gravity)
-    expected = [-np.asarray(rotation.to_matrix(q)).T @ gravity for q in tumble.wxyz]
+    expected = [-np.asarray(rotation.wxyz_to_matrix(q)).T @ gravity for q in tumble.wxyz]
     np.testing.assert_allclose(reading, np.stack(expected), rtol=0, atol=1e-14)
 
 

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 import xarray
 
-from polhode.files import whole_file, write_netcdf
+from polhode.files import write_netcdf
+from polhode.files._atomic import whole_file
 
 
 @pytest.mark.parametrize("failure", [OSError, KeyboardInterrupt, SystemExit])

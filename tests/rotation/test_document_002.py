@@ -7,6 +7,7 @@ import pytest
 
 import polhode.rotation as rotation
 from polhode._hamiltonian import document_002 as document
+from polhode.rotation._direct import euler_to_matrix_k
 
 # theory section 8.2: angles, rotation angle, axis of K, quaternion of K
 TRUTH = [
@@ -94,7 +95,7 @@ def test_relations_of_k_to_r(random_angles):
     r = rotation.euler_to_matrix
     swapped = jnp.swapaxes(r(psi, theta, phi), -1, -2)
     for same in (
-        rotation.euler_to_matrix_k(phi, theta, psi),
+        euler_to_matrix_k(phi, theta, psi),
         r(-phi, -theta, -psi),
         r(jnp.pi - phi, theta, jnp.pi - psi),
         swapped,

@@ -43,7 +43,7 @@ def test_half_precision_is_looked_at_as_any_other():
     ("take", "word"),
     [
         (lambda: rotation.rotate([2.0, 0, 0, 0], [1.0, 2, 3]), "unit length.*normalise"),
-        (lambda: rotation.to_matrix([0.0, 0.5, 0, 0]), "unit length, got length 0.5"),
+        (lambda: rotation.wxyz_to_matrix([0.0, 0.5, 0, 0]), "unit length, got length 0.5"),
         (lambda: rotation.axis_angle_to_wxyz([0.0, 0, 2], 1.0), "divide the axis by its length"),
         (lambda: rotation.axis_angle_to_wxyz([0.0, 0, 0], 1.0), "must not be zero"),
         (
@@ -77,7 +77,7 @@ def test_matrices_that_are_no_rotations(matrix):
 
 def test_rounded_matrices_pass():
     wxyz = rotation.normalise(np.random.default_rng(1).normal(size=(200, 4)))
-    matrix = np.round(np.asarray(rotation.to_matrix(wxyz)), 4)
+    matrix = np.round(np.asarray(rotation.wxyz_to_matrix(wxyz)), 4)
     back = rotation.matrix_to_wxyz(matrix)
     assert float(jnp.max(rotation.angle_between(wxyz, back))) < 3e-4
     assert jnp.isnan(rotation.matrix_to_wxyz(np.full((3, 3), np.nan))).all()

@@ -132,5 +132,5 @@ def test_one_time_is_shared_by_many_bodies():
     lanes = tuple(wxyz.T)
     dynamics = Dynamics(scene.hamiltonian)
     power = external_power(TIME, (jnp.ones(3),) * 3, from_quaternion(lanes), dynamics)
-    want = ph.rotation.to_matrix(wxyz)[:, 0, 1] * jnp.cos(TIME)
+    want = ph.rotation.wxyz_to_matrix(wxyz)[:, 0, 1] * jnp.cos(TIME)
     np.testing.assert_allclose(power, want, rtol=1e-14, atol=1e-16)

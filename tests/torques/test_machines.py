@@ -125,7 +125,7 @@ def test_a_dipole_in_a_field_of_place_and_time():
     field = ph.DipoleField(earth)
     np.testing.assert_allclose(field(jnp.asarray(place), 0.0), b, rtol=1e-14)
     wxyz = np.array([0.5, 0.5, -0.5, 0.5])
-    seen = np.asarray(ph.rotation.to_matrix(jnp.asarray(wxyz))).T @ b
+    seen = np.asarray(ph.rotation.wxyz_to_matrix(jnp.asarray(wxyz))).T @ b
     rods = ph.MagneticDipole([0.1, 0.2, 0.3], field, lambda t: t * jnp.asarray(place) / 0.5)
     got = components_of(rods, wxyz, [0.1, 0.2, 0.3])
     np.testing.assert_allclose(got, np.cross([0.1, 0.2, 0.3], seen), rtol=1e-13)

@@ -49,7 +49,7 @@ def test_kovalevskaya_top():
     scene = ph.Scene(inertia, ph.UniformGravity(1.0, (mu, 0.0, 0.0), (0.0, 0.0, -1.0)))
     state = ph.State([0.8, 0.3, 0.4, 0.2], [[0.1, 0.2, 0.3], [0.4, -0.5, 1.5]])
     got = ph.simulate(scene, state, jnp.linspace(0, 8, 9), ph.LiePoisson(), rtol=1e-12)
-    w, u = np.array(got.omega_body), np.array(ph.rotation.to_matrix(got.wxyz))[..., 2, :]
+    w, u = np.array(got.omega_body), np.array(ph.rotation.wxyz_to_matrix(got.wxyz))[..., 2, :]
     xi = (w[..., 0] + 1j * w[..., 1]) ** 2 + mu / c * (u[..., 0] + 1j * u[..., 1])
     minus = (w[..., 0] + 1j * w[..., 1]) ** 2 - mu / c * (u[..., 0] + 1j * u[..., 1])
     spread = min(np.ptp(np.abs(x), axis=-1).max() for x in (xi, minus))

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polhode import rotation
 from polhode._parts import Signature
 from polhode._trajectory import Trajectory, shortly_after
+from polhode.rotation._components import wxyz_rate
 
 _FUNCTION = Signature("Event", {"wxyz": (4,), "omega_body": (3,), "t": ()})
 
@@ -48,7 +48,7 @@ class Event(eqx.Module):
         wxyz, omega = trajectory.wxyz, trajectory.omega_body
         t = jnp.broadcast_to(trajectory._t, omega.shape[:-1])
         slopes = (
-            rotation.wxyz_rate(wxyz, omega),
+            wxyz_rate(wxyz, omega),
             trajectory._scene.acceleration(wxyz, omega, trajectory._t),
             jnp.ones_like(t),
         )

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Sequence
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode.rotation import matrix_row
+from polhode.rotation._components import matrix_row
 
 Vector = tuple[Array, Array, Array]
 """Three component arrays of one common shape (structure of arrays)."""

@@ -26,7 +26,7 @@ from polhode._hamiltonian._attitude import (
     triple,
 )
 from polhode._hamiltonian._energy import Hamiltonian
-from polhode.rotation import quaternion_rate as quaternion_rate
+from polhode.rotation._components import quaternion_rate as quaternion_rate
 
 
 def rates_and_torque(

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array
 
-from polhode import rotation
 from polhode._batch import PARTS, flatten, lane_times, map_arrays
 from polhode._checks import ArrayLike, as_float_array
 from polhode._kernels import jit_distinct
 from polhode._method import AbstractMethod, Record, Status, raise_on_failure
 from polhode._scene import Scene, State, Wheels
 from polhode._trajectory._trajectory import AbstractPropagator, Trajectory
+from polhode.rotation._components import wxyz_rate
 
 
 class Propagator(AbstractPropagator):
@@ -180,7 +180,7 @@ def _along(scene: Scene, samples: list[Array], t: Array, step: Array) -> list[Ar
         now = tuple(jnp.moveaxis(spins[0], -1, 0)) if spins else ()
         acceleration, turned = scene.with_spins(now).changes(wxyz, omega, t)
         more = [jnp.stack(jnp.broadcast_arrays(*turned), axis=-1)] if turned else []
-        return [rotation.wxyz_rate(wxyz, omega), acceleration, *more]
+        return [wxyz_rate(wxyz, omega), acceleration, *more]
 
     given = list(samples), jnp.asarray(t)
     first = rates(*given)

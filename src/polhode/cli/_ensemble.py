@@ -87,7 +87,7 @@ def run(
         jax.config.update("jax_enable_x64", True)
         from polhode.cli import _cache
         from polhode.ensemble import StoreError, build_ensemble
-        from polhode.files import visible
+        from polhode.files._error import visible
 
         _meet(path, options)
         ensemble, statistics = build_ensemble(file, precision)
@@ -112,7 +112,7 @@ def run(
 
 
 def _store_path(file: Any, output: str | None) -> Path:
-    from polhode.files import visible
+    from polhode.files._error import visible
 
     text = output or file.output.file or f"{file.path.stem}.zarr"
     path = Path(text)
@@ -149,7 +149,8 @@ def _meet(path: Path, options: dict[str, Any]) -> None:
     """Find the number of this process and of all, with the others where they are to meet; before
     anything is computed. The options of that go out of ``options``.
     """
-    from polhode.ensemble import claimed, join
+    from polhode.ensemble import join
+    from polhode.ensemble._processes import claimed
 
     cluster, coordinator = options.pop("cluster", False), options.pop("coordinator", None)
     patience = {"patience": options.pop("patience")} if "patience" in options else {}

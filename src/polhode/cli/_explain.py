@@ -18,12 +18,12 @@ def explain(
     debug: DebugOption = False,
 ) -> int:
     """Say how a scene would be computed, and why, without computing it."""
-    from polhode.files import visible
+    from polhode.files._error import visible
 
     file = read(scene, clones, seed)
     import polhode
     from polhode.cli._job import prepare
-    from polhode.files import blamed
+    from polhode.files._build import blamed
 
     job = prepare(file, precision)
     with blamed(file, ""):

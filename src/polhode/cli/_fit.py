@@ -237,7 +237,7 @@ def _read(asked: _Asked) -> Any:
 
 def _said(loaded: Any) -> str:
     """Which columns were read, in which units."""
-    from polhode.files import visible
+    from polhode.files._error import visible
 
     names = ", ".join(f"{role} = {visible(name)}" for role, name in loaded.columns.items())
     units = ", ".join(f"{role} in {unit}" for role, unit in loaded.units.items())
@@ -288,9 +288,9 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
     import numpy as np
 
     import polhode
-    from polhode.files import whole_file
+    from polhode.files._atomic import whole_file
     from polhode.fit._result import other_hand
-    from polhode.rotation import to_matrix
+    from polhode.rotation import wxyz_to_matrix
 
     def plain(value: Any) -> Any:
         value = np.asarray(value)
@@ -318,7 +318,7 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
         "ratios_std": plain(result.ratios_std),
         "interval_95": [plain(low), plain(high)],
         "tensor": plain(result.inertia.tensor),
-        "principal_axes_as_columns": plain(to_matrix(result.axes)),
+        "principal_axes_as_columns": plain(wxyz_to_matrix(result.axes)),
         "axes_std_rad": [0.0] * 3 if asked.moments_only else plain(result.axes_std),
         "bias_rad_per_s": None if found is None else plain(found[0]),
         "bias_std_rad_per_s": None if found is None else plain(found[1]),
@@ -342,8 +342,8 @@ def _table(asked: _Asked, recording: Any, result: Any) -> Any:
     from rich.table import Table
     from rich.text import Text
 
-    from polhode.files import visible
-    from polhode.rotation import to_matrix
+    from polhode.files._error import visible
+    from polhode.rotation import wxyz_to_matrix
 
     samples = int(np.sum(np.asarray(recording.present)))
     grid = Table(
@@ -357,7 +357,7 @@ def _table(asked: _Asked, recording: Any, result: Any) -> Any:
         grid.add_column(Text(name), justify="left" if name == "" else "right")
     values = np.asarray(result.principal_values[0])
     low, high = (np.asarray(end) for end in result.interval(0.95))
-    axes = np.asarray(to_matrix(result.axes))
+    axes = np.asarray(wxyz_to_matrix(result.axes))
     turn = np.degrees(np.asarray(result.axes_std))
     for k, name in enumerate(("smallest", "middle", "largest")):
         reach = "" if k == 2 and not known else f"{low[k]:.5g} to {high[k]:.5g}"

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from polhode.cli._targets import UsageError
-from polhode.files import SceneFileError, shipped_scenes, visible
+from polhode.files import SceneFileError, shipped_scenes
+from polhode.files._error import visible
 
 READERS = {
     ".toml": "`polhode run` and `polhode explain` read scene files (TOML)",

@@ -11,7 +11,8 @@ import numpy as np
 
 import polhode
 from polhode import rotation
-from polhode.files import SceneFile, blamed, build_attitudes, build_method, build_scene, draw_clones
+from polhode.files import SceneFile, build_attitudes, build_method, build_scene, draw_clones
+from polhode.files._build import blamed
 
 _CHUNKS, _LEAST_CHUNK = 20, 50  # pieces of progress, and bodies below which a piece does not pay
 

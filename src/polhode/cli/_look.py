@@ -25,7 +25,7 @@ def view(
     debug: DebugOption = False,
 ) -> int:
     """Write one HTML page that shows the motion of a file: it needs no network."""
-    from polhode.files import visible
+    from polhode.files._error import visible
 
     if output is not None:
         check_suffix(output, ".html", ".htm", what="a page")

@@ -20,7 +20,8 @@ import typer.core
 from polhode.cli import _explain, _fit, _look, _run, _scenes, _targets
 from polhode.cli._inputs import READERS
 from polhode.cli._signals import INTERRUPTED, TERMINATED, heeded
-from polhode.files import SceneFileError, visible
+from polhode.files import SceneFileError
+from polhode.files._error import visible
 
 SUCCESS, FAILURE, USAGE = 0, 1, 2
 _codes: list[int] = []

@@ -171,7 +171,7 @@ def provenance(file, precision: str) -> dict[str, Any]:
 
     from polhode import __version__
     from polhode.ensemble._stream import device_names
-    from polhode.files import visible
+    from polhode.files._error import visible
 
     carlo = file.monte_carlo
     used: dict[str, Any] = {"precision": precision, "method": file.method.kind,

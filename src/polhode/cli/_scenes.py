@@ -31,7 +31,9 @@ def scenes(
     """List the scenes that come with polhode, which `polhode run NAME` runs; or copy one."""
     import tomllib
 
-    from polhode.files import shipped_scenes, visible, whole_file
+    from polhode.files import shipped_scenes
+    from polhode.files._atomic import whole_file
+    from polhode.files._error import visible
 
     shipped = shipped_scenes()
     if name is None:

@@ -25,7 +25,7 @@ def bar(console: Any, last: Any) -> Any:
 
 def tell_written(console: Any, paths: Iterable[Path]) -> None:
     """Print the names of the files written."""
-    from polhode.files import visible
+    from polhode.files._error import visible
 
     names = ", ".join(visible(str(path)) for path in paths)
     console.print(f"written: {names}", highlight=False, markup=False)
@@ -39,7 +39,7 @@ def write_figure(path: Path, draw: Callable[[], Any]) -> Path:
     from matplotlib import pyplot
 
     from polhode import __version__
-    from polhode.files import whole_file
+    from polhode.files._atomic import whole_file
 
     figure, drawn = draw(), io.BytesIO()
     figure.savefig(drawn, format="png", dpi=160, metadata={"Software": f"polhode {__version__}"})

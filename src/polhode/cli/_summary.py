@@ -7,8 +7,8 @@ import numpy as np
 import polhode
 from polhode._closed_forms.free import Mode
 from polhode.cli._job import Job, Outcome, Residuals
-from polhode.files import visible
-from polhode.plot import Scale
+from polhode.files._error import visible
+from polhode.plot._scale import Scale
 
 MEANINGS = {
     "P_psi": "turn about long axis",

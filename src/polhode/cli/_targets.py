@@ -5,7 +5,7 @@ import re
 import stat
 from pathlib import Path
 
-from polhode.files import visible
+from polhode.files._error import visible
 
 _chosen: dict[Path, tuple[int, int] | None] = {}
 

@@ -2,7 +2,7 @@
 
 from polhode.ensemble._ensemble import Ensemble as Ensemble
 from polhode.ensemble._fill import Progress as Progress
-from polhode.ensemble._processes import claimed as claimed, join as join
+from polhode.ensemble._processes import join as join
 from polhode.ensemble._scene_file import build_ensemble as build_ensemble
 from polhode.ensemble._spreads import (
     AnyAttitude as AnyAttitude,

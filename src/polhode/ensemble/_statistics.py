@@ -53,7 +53,7 @@ def rate(trajectory: Trajectory) -> Array:
 
 def tilt(trajectory: Trajectory) -> Array:
     """Angle [rad] between the body's z axis and that of space."""
-    matrix = rotation.to_matrix(trajectory.wxyz)
+    matrix = rotation.wxyz_to_matrix(trajectory.wxyz)
     return jnp.arctan2(jnp.hypot(matrix[..., 0, 2], matrix[..., 1, 2]), matrix[..., 2, 2])
 
 

@@ -7,14 +7,13 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from polhode._extras import imported
-from polhode.files._atomic import whole_file as whole_file, write_netcdf as write_netcdf
-from polhode.files._error import SceneFileError as SceneFileError, visible as visible
+from polhode.files._atomic import write_netcdf as write_netcdf
+from polhode.files._error import SceneFileError as SceneFileError
 from polhode.files._read import parse_scene as parse_scene, read_scene as read_scene
 from polhode.files._shipped import shipped_scenes as shipped_scenes
 
 if TYPE_CHECKING:
     from polhode.files._build import (
-        blamed as blamed,
         build_attitudes as build_attitudes,
         build_inertia as build_inertia,
         build_scene as build_scene,

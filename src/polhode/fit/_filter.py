@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from polhode.fit._instrument import Instrument
 from polhode.fit._recording import Recording, bridged, needed
 from polhode.fit._start import central_slope, integrate
-from polhode.rotation import to_matrix
+from polhode.rotation import wxyz_to_matrix
 
 
 class Noise(NamedTuple):
@@ -124,7 +124,7 @@ def innovations(
         return values[: count * block].reshape(count, block, *values.shape[1:])
 
     rates = instrument.rates(data.omega)
-    turn = to_matrix(integrate(rates, central_slope(rates, data.times), data.times))
+    turn = wxyz_to_matrix(integrate(rates, central_slope(rates, data.times), data.times))
     carried = instrument.carried(data.times, data.wheel) / size
     speed = jnp.sqrt(jnp.sum(rates**2, axis=1, keepdims=True) + jnp.finfo(rates.dtype).tiny)
     push = -(drag[0] + drag[1] * speed) / size * rates

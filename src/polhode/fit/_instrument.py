@@ -13,7 +13,7 @@ from polhode._checks import as_float_array, require, require_positive
 from polhode.fit._matrices import solve
 from polhode.fit._recording import Recording, needed
 from polhode.fit._start import central_slope, integrate
-from polhode.rotation import to_matrix
+from polhode.rotation import wxyz_to_matrix
 
 
 def _vector(name: str, *rows: int) -> Callable[[Any], Any]:
@@ -120,7 +120,7 @@ def lever_arm(recording: Recording) -> Float[Array, "*b 3"]:
         def felt(arm):
             return jnp.cross(slope, arm) + jnp.cross(omega, jnp.cross(omega, arm))
 
-        turn = jnp.swapaxes(to_matrix(integrate(omega, slope, times)), -1, -2)
+        turn = jnp.swapaxes(wxyz_to_matrix(integrate(omega, slope, times)), -1, -2)
         late = (times - times[0])[:, None, None]
         design = jnp.concatenate([jax.vmap(felt, out_axes=-1)(unit), turn, late * turn], axis=-1)
         # a difference reaches to both neighbours

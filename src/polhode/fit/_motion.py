@@ -23,7 +23,7 @@ from polhode._hamiltonian import (
 from polhode._integrate._classical import ClassicalRungeKutta
 from polhode._scene import AbstractTorque, LinearDamping, QuadraticDamping
 from polhode.inertia import Inertia, principal
-from polhode.rotation import conjugate, multiply, normalise, rotate, to_matrix
+from polhode.rotation import conjugate, multiply, normalise, rotate, wxyz_to_matrix
 
 
 class Predicted(NamedTuple):
@@ -220,7 +220,7 @@ class FreeMotion(AbstractMotion):
             (xy, zx, yz),
             attitude=wxyz is not None,
         )
-        path = _combined(to_matrix(axes), rates)
+        path = _combined(wxyz_to_matrix(axes), rates)
         if turned is not None:
             turned = _combined(_right_product(conjugate(axes)), turned)
         return Predicted(path, free_acceleration(Inertia(full=tensor), path), turned)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from polhode.fit._matrices import inverse
 from polhode.inertia import inertia_of_second_moments, principal
 from polhode.inertia._cholesky import symmetric
-from polhode.rotation import to_matrix
+from polhode.rotation import wxyz_to_matrix
 
 # Eigenvalues of the second moments, relative to their sum, around which a flat body is near.
 _SOFT = 5e-3
@@ -138,7 +138,7 @@ def tensor_of(shape: Float[Array, " k"], base: Base, columns: np.ndarray) -> Arr
         return (1 + (values[i] + values[j]) / (root[i] + root[j])) / 2
 
     inner = symmetric(bent, (slope(1, 2) * yz, slope(2, 0) * zx, slope(0, 1) * xy))
-    turn = to_matrix(axes)
+    turn = wxyz_to_matrix(axes)
     exact = jax.lax.Precision.HIGHEST
     sigma = jnp.einsum("ij,jk,lk->il", turn, inner, turn, precision=exact)
     return inertia_of_second_moments(sigma)

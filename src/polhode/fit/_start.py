@@ -18,7 +18,7 @@ from polhode.fit._matrices import eigh, solve
 from polhode.fit._motion import free_acceleration
 from polhode.fit._parameters import whole_of
 from polhode.inertia import Inertia, inertia_of_second_moments, second_moments
-from polhode.rotation import multiply, rotation_vector_to_wxyz, to_matrix
+from polhode.rotation import multiply, rotation_vector_to_wxyz, wxyz_to_matrix
 
 # second moments below this part of their sum are lifted to it before the logarithm is taken
 _FLATTEST = 3e-3
@@ -128,7 +128,7 @@ def regression(
 
     def rows_of(slope):
         attitude = jax.vmap(integrate)(omega, slope, times)
-        turn = to_matrix(attitude) * present[..., None, None]
+        turn = wxyz_to_matrix(attitude) * present[..., None, None]
         return turn, jnp.einsum("rtij,rtjk->rtik", turn, _design(omega))
 
     def square(rows):

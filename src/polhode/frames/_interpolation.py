@@ -6,13 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike, as_float_array
-from polhode.rotation import (
-    conjugate,
-    multiply,
-    rotation_vector_to_wxyz,
-    wxyz_rate,
-    wxyz_to_rotation_vector,
-)
+from polhode.rotation import conjugate, multiply, rotation_vector_to_wxyz, wxyz_to_rotation_vector
+from polhode.rotation._components import wxyz_rate
 
 
 @jax.jit

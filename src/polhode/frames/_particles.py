@@ -14,7 +14,8 @@ from polhode._method import check_options, check_rtol, check_times
 from polhode._parts import kept, result_of, takes
 from polhode.frames._frame import RotatingFrame
 from polhode.frames._turning import VariableRate
-from polhode.rotation import conjugate, normalise, rotate, wxyz_rate
+from polhode.rotation import conjugate, normalise, rotate
+from polhode.rotation._components import wxyz_rate
 
 _ARGUMENTS = ("t", "position", "velocity")
 

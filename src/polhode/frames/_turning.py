@@ -12,14 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode.rotation import (
-    conjugate,
-    matrix_to_wxyz,
-    multiply,
-    normalise,
-    rotation_vector_to_wxyz,
-    wxyz_rate,
-)
+from polhode.rotation import conjugate, matrix_to_wxyz, multiply, normalise, rotation_vector_to_wxyz
+from polhode.rotation._components import wxyz_rate
 
 Rates = tuple[Float[Array, "3"], Float[Array, "3"] | None]
 

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode.rotation import matrix_row
+from polhode.rotation._components import matrix_row
 
 # Cyclic Jacobi converges quadratically once the off-diagonal part is small against the gaps, and
 # linearly fast before that. Sweeps beyond the last needed one do nothing (t = 0 exactly or below

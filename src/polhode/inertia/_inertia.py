@@ -28,7 +28,7 @@ from polhode.inertia._input import (
 from polhode.inertia._physical import is_symmetric, possible_moments, possible_tensor
 from polhode.inertia._shapes import AbstractShaped, Symmetry
 from polhode.inertia._tensor import check_points, of_points, turned
-from polhode.rotation import to_matrix
+from polhode.rotation import wxyz_to_matrix
 
 _ONE_FORM = (
     "Inertia holds either principal moments or a full tensor, not both and not neither; use"
@@ -254,7 +254,7 @@ class Inertia(AbstractShaped, AbstractPart):
 
         ``axes`` of the result is such a turn: ``Inertia(moments).turned(axes)`` is the body again.
         """
-        return type(self)(full=turned(self.tensor, to_matrix(wxyz)), physical=self.physical)
+        return type(self)(full=turned(self.tensor, wxyz_to_matrix(wxyz)), physical=self.physical)
 
     def to_principal(self) -> tuple[Self, Float[Array, "*b 4"]]:
         """The same body in principal axes, and the turn ``wxyz`` from those to the present axes.

@@ -12,7 +12,6 @@ from polhode.lightcurve._hypotheses import meaning as meaning
 from polhode.lightcurve._phase import (
     HG as HG,
     HG1G2 as HG1G2,
-    AbstractPhase as AbstractPhase,
     LinearPhase as LinearPhase,
     SeeligerPhase as SeeligerPhase,
 )

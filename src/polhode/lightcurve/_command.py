@@ -136,7 +136,7 @@ def _write(fit: Fit, name: str, picture: Path, document: Path, say) -> None:
     import matplotlib.pyplot as plt
 
     from polhode import __version__
-    from polhode.files import whole_file
+    from polhode.files._atomic import whole_file
 
     page = figure(fit, title=name)
     with whole_file(picture) as temporary:

@@ -10,6 +10,5 @@ from polhode.plot._history import history as history
 from polhode.plot._overview import overview as overview
 from polhode.plot._polhode import polhode as polhode
 from polhode.plot._samples import Samples as Samples, samples as samples
-from polhode.plot._scale import Scale as Scale
 from polhode.plot._view import View as View, view as view, view_file as view_file
 from polhode.plot._work_precision import work_precision as work_precision

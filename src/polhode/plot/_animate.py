@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from polhode._trajectory import Trajectory
-from polhode.files import whole_file
+from polhode.files._atomic import whole_file
 from polhode.plot._matplotlib import AXES, INK, new_figure, styled
 from polhode.plot._samples import Samples, as_samples, box_sides, matrices
 from polhode.plot._scale import Scale

@@ -45,7 +45,7 @@ def styled(function):
 
 def plain(text: str, length: int = 120) -> str:
     """A user's text as it stands: `$` begins no formula, control characters are written out."""
-    from polhode.files import visible
+    from polhode.files._error import visible
 
     text = visible(text)
     text = text if len(text) <= length else text[: length - 4] + " ..."

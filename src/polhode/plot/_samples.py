@@ -8,7 +8,7 @@ from jaxtyping import Float
 from polhode._checks import ArrayLike
 from polhode._trajectory import Trajectory
 from polhode.inertia import Inertia
-from polhode.rotation import matrix_row
+from polhode.rotation._components import matrix_row
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from polhode._trajectory import Trajectory
-from polhode.files import whole_file
+from polhode.files._atomic import whole_file
 from polhode.plot._samples import Samples
 from polhode.plot._scale import Scale
 from polhode.plot._view_data import (

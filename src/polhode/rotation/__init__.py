@@ -3,16 +3,10 @@
 Conversions are named ``source_to_target``.
 """
 
-from polhode.rotation._components import (
-    matrix_row as matrix_row,
-    quaternion_rate as quaternion_rate,
-    wxyz_rate as wxyz_rate,
-)
 from polhode.rotation._direct import (
     axis_angle_to_euler as axis_angle_to_euler,
     euler_to_axis_angle as euler_to_axis_angle,
     euler_to_matrix as euler_to_matrix,
-    euler_to_matrix_k as euler_to_matrix_k,
     euler_to_modified_rodrigues as euler_to_modified_rodrigues,
     euler_to_rotation_vector as euler_to_rotation_vector,
     matrix_to_euler as matrix_to_euler,
@@ -28,12 +22,10 @@ from polhode.rotation._interchange import (
 )
 from polhode.rotation._matrix import (
     matrix_to_wxyz as matrix_to_wxyz,
-    wxyz_to_matrix as to_matrix,  # noqa: F401
     wxyz_to_matrix as wxyz_to_matrix,
 )
 from polhode.rotation._modified_rodrigues import (
     modified_rodrigues_to_wxyz as modified_rodrigues_to_wxyz,
-    shadow as shadow,
     wxyz_to_modified_rodrigues as wxyz_to_modified_rodrigues,
     wxyz_to_shadow as wxyz_to_shadow,
 )
