@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from polhode._closed_forms.free import free_motion
 from polhode._hamiltonian import (
+    Attitude,
     Dynamics,
     Hamiltonian,
     components,
@@ -20,6 +21,7 @@ from polhode._hamiltonian import (
     lie_poisson_field,
     momentum_rate,
 )
+from polhode._hamiltonian._attitude import from_rows
 from polhode._integrate._classical import ClassicalRungeKutta
 from polhode._scene import AbstractTorque, LinearDamping, QuadraticDamping
 from polhode.inertia import Inertia, principal
@@ -145,7 +147,7 @@ class SteppedMotion(AbstractMotion):
         y = components(momentum), None if wxyz is None else tuple(wxyz)
         _, path = jax.lax.scan(interval, y, (nodes, wheel_at and wheel_at(nodes)))
         momentum, attitude = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), y, path)
-        push, rates = momentum_rate(times, momentum, None, dynamics(wheel_at))
+        push, rates = momentum_rate(times, momentum, _attitude(), dynamics(wheel_at))
         push, rates = jnp.stack(push, axis=-1), jnp.stack(rates, axis=-1)
         if wheel_at is not None:  # what the wheel takes up does not turn the body
             carried = jnp.stack(self._along(wheel_at(times)), axis=-1)
@@ -184,11 +186,16 @@ def free_acceleration(inertia: Inertia, omega: Float[Array, "t 3"]) -> Float[Arr
     return inertia.rates(jnp.stack(push, axis=-1))
 
 
+def _attitude() -> Attitude:
+    """An attitude without rows, for a drag and a wheel do not depend on it."""
+    return from_rows({})
+
+
 def _field(t, y, dynamics):
     """Rates of the body momentum and, where there is one, of the attitude."""
     if y[1] is not None:
         return lie_poisson_field(t, y, dynamics)
-    return momentum_rate(t, y[0], None, dynamics)[0], None
+    return momentum_rate(t, y[0], _attitude(), dynamics)[0], None
 
 
 class FreeMotion(AbstractMotion):
