@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import equinox as eqx
 import numpy as np
 import pytest
 import xarray
@@ -330,9 +331,8 @@ def test_clones_that_do_not_finish_are_reported(here, capsys, monkeypatch):
 
     def failing(*arguments, **options):
         made = simulate(*arguments, **options)
-        import dataclasses
-
-        return dataclasses.replace(made, status=made.status.at[-1].set(ph.Status.NOT_FINITE))
+        status = made.status.at[-1].set(ph.Status.NOT_FINITE)
+        return eqx.tree_at(lambda t: t.status, made, status)
 
     monkeypatch.setattr(ph, "simulate", failing)
     assert run("top.toml", "--clones", 2, "--no-figure") == 1

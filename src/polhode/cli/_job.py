@@ -151,7 +151,7 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
     seconds = time.perf_counter() - began
     compiling = _CLOCK.since(began)
     scene = job.scene.settled(job.state, job.ts[0])
-    trajectory = dataclasses.replace(piece, ts=job.ts, scene=scene, **kept)
+    trajectory = polhode.Trajectory(ts=job.ts, scene=scene, propagator=piece.propagator, **kept)
     return Outcome(trajectory, residuals, compiling, seconds - compiling)
 
 
