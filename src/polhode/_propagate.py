@@ -45,7 +45,7 @@ def propagate(
     dt: Float[ArrayLike, ""],
     *,
     t: Float[ArrayLike, ""] = 0.0,
-    free: Callable[[Scene], Any] | None = None,
+    free: Callable[[Any], Any] | None = None,
     method: AbstractMethod | None = None,
     rtol: float | None = None,
 ) -> Propagation:

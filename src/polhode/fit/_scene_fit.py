@@ -22,7 +22,7 @@ from polhode.fit._scene_motion import LeafMotion
 def fit_scene(
     scene: Scene,
     data: Recording | Sequence[Recording],
-    free: Callable[[Scene], Any],
+    free: Callable[[Any], Any],
     *,
     attitude: ArrayLike | None = None,
     method: AbstractMethod | None = None,
