@@ -1,5 +1,7 @@
 """Functions of users: looked at when a part is made, kept so that trees hold arrays only."""
 
+import math
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -163,3 +165,47 @@ def test_times_may_be_many():
     for torque in torques:
         push = torque.body_components(ts, attitude, rates)
         np.testing.assert_array_equal(jnp.stack(push), np.outer([1, 2, 3], ts))
+
+
+TRACED = {
+    "numpy": (lambda x: np.sin(x), r"np\.sin\(x\).*Use jax\.numpy, such as jnp\.sin"),
+    "if": (lambda x: 1.0 if x > 0 else -1.0, r"`if`.*jnp\.where\(condition, a, b\)"),
+    "math": (lambda x: math.sin(x), r"float\(\).*jnp\.sin\(x\) for math\.sin\(x\)"),
+    "index": (lambda x: [1.0, 2.0][jnp.asarray(x, int)], r"index.*Index a jnp\.array"),
+}
+PARTS = {
+    "BodyTorque": lambda use: ph.BodyTorque(lambda t: use(t) * jnp.ones(3)),
+    "SpaceTorque": lambda use: ph.SpaceTorque(lambda t: use(t) * jnp.ones(3)),
+    "FeedbackTorque": lambda use: FeedbackTorque(lambda t, q, w: use(w[0]) * w),
+    "Potential": lambda use: ph.Potential(lambda R, t: use(R[2, 2])),
+    "GravityGradient": lambda use: ph.GravityGradient(1.0, lambda t: use(t) * jnp.ones(3)),
+    "Motor": lambda use: ph.Motor(lambda t, q, w, speed: use(speed)),
+    "Rotor impulse": lambda use: wheel(lambda t: use(t)),
+    "EnergySink": lambda use: ph.EnergySink(lambda momentum, omega: use(omega[0])),
+    "MagneticDipole field": lambda use: ph.MagneticDipole(
+        [1.0, 0.0, 0.0], lambda x, t: use(t) * x, [1.0, 0.0, 0.0]
+    ),
+    "Event": lambda use: ph.Event(lambda q, w, t: use(w[0])),
+    "RotatingFrame": lambda use: ph.RotatingFrame.from_rate(lambda t: use(t) * jnp.ones(3)),
+}
+
+
+@pytest.mark.parametrize("mistake", list(TRACED))
+@pytest.mark.parametrize("part", list(PARTS))
+def test_what_tracing_forbids_is_named_with_its_jax_form(part, mistake):
+    use, words = TRACED[mistake]
+    with pytest.raises(TypeError, match=rf"given to {part}.*called as fn\(.*{words}") as raised:
+        PARTS[part](use)
+    assert isinstance(raised.value.__cause__, jax.errors.JAXTypeError | TypeError)
+    assert "test_user_functions.py" in str(raised.value)  # the user's own line
+
+
+def test_what_tracing_forbids_is_named_inside_the_simulation():
+    """A branch that the first look does not reach: of the precision of the scene alone."""
+
+    def push(t):
+        return jnp.ones(3) if t.weak_type else np.sin(t) * jnp.ones(3)
+
+    torque = ph.BodyTorque(push)
+    with pytest.raises(TypeError, match=r"given to BodyTorque.*Use jax\.numpy"):
+        ph.simulate(ph.Scene(INERTIA, torque=torque), STATE, [0.0, 1.0])

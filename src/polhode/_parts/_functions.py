@@ -8,12 +8,15 @@ It is therefore kept as static data, equal to itself only. What is a pytree alre
 import dataclasses
 import functools
 import inspect
+import traceback
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 _NAMES = {
@@ -75,17 +78,57 @@ def takes(name: str, fn: Any, arguments: Sequence[str]) -> None:
             )
 
 
+_TRACED = (
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+    jax.errors.ConcretizationTypeError,  # of bool(), float() and complex() too
+)
+
+
+def _remedy_for(error: Exception) -> str:
+    """The jax.numpy form of what raised one of ``_TRACED``."""
+    if isinstance(error, jax.errors.TracerArrayConversionError):
+        return "NumPy cannot compute with it. Use jax.numpy, such as jnp.sin(x) for np.sin(x)"
+    if isinstance(error, jax.errors.TracerBoolConversionError):
+        return (
+            "a Python `if`, `while`, `and`, `or` or `not` depends on it. Choose by"
+            " jnp.where(condition, a, b), and combine conditions by & and |"
+        )
+    if isinstance(error, jax.errors.TracerIntegerConversionError):
+        return "a Python index or range depends on it. Index a jnp.array, or use jnp.where"
+    return (
+        "float(), int(), math functions and .item() cannot convert it. Leave it an array, and use"
+        " jax.numpy, such as jnp.sin(x) for math.sin(x)"
+    )
+
+
+def _place_of(error: Exception) -> str:
+    """File, line and text of the user's own line that raised; empty where it is not known."""
+    libraries = tuple(str(Path(m.__file__).parent) for m in (jax, np, eqx) if m.__file__)
+    own = str(Path(__file__).parents[1])
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if not frame.filename.startswith((*libraries, own)) and frame.line:
+            return f" in line {frame.lineno} of {Path(frame.filename).name}, `{frame.line}`"
+    return ""
+
+
 def result_of(
     name: str, arguments: Sequence[str], fn: Callable, shape: tuple[int, ...], dtype: Any, *args
 ) -> Array:
     """What ``fn(*args)`` returns as an array of ``shape`` and ``dtype`` (None: its own).
 
-    TypeError or ValueError for anything else, naming what was returned and what is expected; what
-    the function raises itself passes, with a note on how it was called.
+    TypeError or ValueError for anything else, naming what was returned and what is expected;
+    TypeError for NumPy, ``if`` or ``float`` on a traced array, with the line and its jax.numpy
+    form; what the function raises otherwise passes, with a note on how it was called.
     """
     called = f"{name}, called as fn({', '.join(arguments)})"
     try:
         value = fn(*args)
+    except _TRACED as error:
+        raise TypeError(
+            f"the function given to {called}, needs the value of a traced array{_place_of(error)}:"
+            f" {_remedy_for(error)}."
+        ) from error
     except Exception as error:
         shapes = ", ".join(f"{k}: {jnp.shape(x)}" for k, x in zip(arguments, args))
         error.add_note(
