@@ -178,6 +178,30 @@ def test_bodies_that_are_set_in_motion_are_looked_at_often_enough():
     np.testing.assert_allclose(found.event_time, 50.05 + 7 * np.pi / 6 / 2.5, rtol=1e-9)
 
 
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_beyond_its_event_a_body_holds_the_state_of_the_event(way):
+    """A ball that turns at rates of both signs: two of three bodies meet the event."""
+    rates = jnp.array([0.6, 1.3, 0.0])
+    state = ph.State(STATE.wxyz, jnp.stack([0 * rates, way * rates, 0 * rates], axis=-1))
+    traj = ph.simulate(BALL, state, [0.0, way * 20.0], until=ph.Event(Height(jnp.asarray(0.4))))
+    inside, outside = way * jnp.array([0.5, 1.0]), way * jnp.array([30.0, 1e4])
+    at = traj.at(jnp.concatenate([inside, outside]))
+    met = np.isfinite(np.asarray(traj.event_time))
+    assert met.tolist() == [True, True, False]
+    for name in ("wxyz", "omega_body"):
+        held = np.broadcast_to(getattr(traj.last, name)[:2, None], getattr(at, name)[:2, 2:].shape)
+        np.testing.assert_allclose(getattr(at, name)[:2, 2:], held, atol=1e-13)
+    np.testing.assert_allclose(at.ts[:2, 2:], np.asarray(traj.event_time)[:2, None] + np.zeros(2))
+    np.testing.assert_array_equal(at.ts[2], np.concatenate([inside, outside]))
+    free = ph.simulate(BALL, state, [0.0, way * 20.0]).at(inside)
+    np.testing.assert_allclose(at.wxyz[:, :2], free.wxyz, atol=1e-13)
+    np.testing.assert_allclose(at.at(outside).wxyz[:2], at.wxyz[:2, 2:], atol=1e-13)
+    one = jax.jit(lambda t: traj[0].at(t).wxyz)(outside)
+    np.testing.assert_allclose(one, at.wxyz[0, 2:], atol=1e-13)
+    wait = jax.grad(lambda t: traj[0].at(t[None]).wxyz.sum())(outside[0])
+    assert float(wait) == 0
+
+
 def test_derivatives_of_a_motion_that_stops():
     """At a fixed phase x = rate t: dt/drate = -t/rate; the attitude is the phase's, the same for
     every rate, and moves with the level."""

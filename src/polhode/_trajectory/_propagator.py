@@ -51,6 +51,8 @@ class Propagator(AbstractPropagator):
                 f"t must have shape (K,), or (..., K) with the batch axes {batch} of the bodies,"
                 f" got {times.shape}."
             )
+        if trajectory._event_time is not None:
+            times = _until_event(trajectory, times)
         found = moved_to(trajectory, times)
         if not isinstance(found.status, Tracer):
             raise_on_failure(found.status)
@@ -86,8 +88,20 @@ def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
     wxyz, omega, *spins = (jnp.where(asked, x, jnp.nan) for x in (wxyz, omega, *spins))
     return Trajectory(
         t, wxyz, omega, jnp.where(good, status, trajectory.status), steps, trajectory.scene,
-        spins=spins[0] if spins else None, propagator=propagator,
+        spins=spins[0] if spins else None, propagator=propagator, event_time=trajectory._event_time,
     )  # fmt: skip
+
+
+def _until_event(trajectory: Trajectory, times: Array) -> Array:
+    """Times (..., K), those beyond the event of a body replaced by the time of its event."""
+    batch, ts = trajectory.batch_shape, trajectory.ts
+    times = jnp.broadcast_to(times, (*batch, times.shape[-1]))
+    event = jnp.broadcast_to(trajectory.event_time[..., None], times.shape)
+    # all bodies go one way; one that starts at its event does not show which
+    backwards = jnp.any(ts[..., -1] < ts[..., 0])
+    sign = jnp.where(backwards, -1, 1).astype(times.dtype)
+    beyond = jnp.isfinite(event) & jnp.isfinite(times) & (sign * times > sign * event)
+    return jnp.where(beyond, event, times)
 
 
 def _begun(scene: Scene, spins: list[Array]) -> Scene:

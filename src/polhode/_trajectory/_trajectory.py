@@ -145,7 +145,8 @@ class Trajectory(eqx.Module):
         """The motion at other times ``t`` [s]: a trajectory of the same bodies at these.
 
         ``t`` (K,) is shared by all bodies, (..., K) one row a body; a number is taken as (1,). In
-        any order, also outside the times simulated. Differentiable in ``t``, in the initial state
+        any order, also outside the times simulated; beyond the ``event_time`` of a body its times
+        and samples are those of the event. Differentiable in ``t``, in the initial state
         and in the numbers of the scene; under ``jit`` and ``vmap`` too. Exact laws are evaluated at
         ``t``; a stepped body is moved there from its nearest sample, which keeps ``rtol`` and costs
         a few steps for each time. A time that is not finite gives NaN. ``work``, ``motor_work`` and
