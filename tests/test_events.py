@@ -227,6 +227,33 @@ def test_derivatives_of_a_motion_that_stops():
     np.testing.assert_allclose(times[1:], [known(0.4, 0.6)[0], known(0.4, 1.3)[0]], rtol=1e-12)
 
 
+@pytest.mark.parametrize(
+    ("call", "modes"),
+    [("crossings", "fff")]
+    + [
+        pytest.param(call, modes, marks=pytest.mark.slow)
+        for call, modes in (("crossings", "rrr"), ("until", "rrr"), ("until", "ffr"))
+    ],
+)
+def test_third_derivatives_of_events_are_refused(call, modes):
+    def time_of(rate):
+        state = ph.State(STATE.wxyz, jnp.stack([0 * rate, rate, 0 * rate]))
+        event = ph.Event(Height(jnp.asarray(0.4)))
+        if call == "until":
+            return ph.simulate(BALL, state, jnp.array([0.0, 20.0]), until=event).event_time
+        traj = ph.simulate(BALL, state, jnp.array([0.0, 20.0]))
+        return ph.crossings(traj, event, capacity=2, samples=64).times[0]
+
+    derivative = time_of
+    for mode in modes[1:]:
+        derivative = {"f": jax.jacfwd, "r": jax.jacrev}[mode](derivative)
+    rate = jnp.asarray(0.6)
+    np.testing.assert_allclose(derivative(rate), 2 * time_of(rate) / rate**2, rtol=1e-9)
+    third = {"f": jax.jacfwd, "r": jax.jacrev}[modes[0]](derivative)
+    with pytest.raises(NotImplementedError, match="first and second derivatives"):
+        third(rate)
+
+
 @pytest.mark.slow
 def test_second_derivatives_of_events():
     """Of times, states and slopes, by the closed form of a ball."""

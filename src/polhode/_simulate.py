@@ -68,7 +68,7 @@ def simulate(
       those of the event, so that ``Trajectory.last`` is the state to go on from; its time is
       ``Trajectory.event_time`` (inf for a body that does not meet it). The work follows from where
       the last event of all bodies is, not from the last of ``ts``. Times and states have first and
-      second derivatives; third ones are wrong.
+      second derivatives; a third one raises NotImplementedError.
     - ``throw``: raise ``ph.SimulationError`` when a body did not finish. Under ``jit``, ``vmap``
       or ``grad`` nothing is raised: look at ``Trajectory.status``.
 

@@ -66,7 +66,7 @@ def crossings(
 
     Times are as accurate as the motion: to rounding for exact laws, to ``rtol`` over the slope for
     stepped ones. They have first and second derivatives, by the implicit function theorem, in all
-    that the motion depends on, and so has ``slope``; third ones are wrong. A crossing at the first
+    that the motion depends on, and so has ``slope``; third ones raise. A crossing at the first
     time (within 1e-6 of the time between two looks) is where the motion comes from, not one that it
     makes.
 

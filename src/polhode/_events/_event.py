@@ -68,8 +68,32 @@ class Event(eqx.Module):
         late = late - still(late) + still(jnp.clip(late, -most, most))
         value, _ = self.values(shortly_after(near, late))
         change = jnp.where(touch, 0, -value / chord)
-        late = late + (change - still(change))
+        late = _differentiable(late + (change - still(change)), 2)
         return late, shortly_after(near, late)
+
+
+def _differentiable(x: Array, order: int) -> Array:
+    """``x``, whose derivatives beyond ``order`` are refused while they are traced.
+
+    Each differentiation around another passes the rule below once, in whatever mode: reverse mode
+    transposes what this rule returns.
+    """
+
+    @jax.custom_jvp
+    def identity(x):
+        return x
+
+    @identity.defjvp
+    def derivative(primals, tangents):
+        if order == 0:
+            raise NotImplementedError(
+                "event times and states at events have first and second derivatives, and a third"
+                " one was asked for: differentiate twice at most, or take differences of second"
+                " derivatives."
+            )
+        return _differentiable(primals[0], order - 1), tangents[0]
+
+    return identity(x)
 
 
 def at_least(name: str, value: Any, least: int) -> int | None:
