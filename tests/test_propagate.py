@@ -82,3 +82,160 @@ def test_steps_join_and_map():
             ph.propagate(*given, DT)
     with pytest.raises(ValueError, match="one body"):
         ph.propagate(scene, both, DT)
+
+
+# Wheels. The coordinates of those that are not held at their speed follow attitude and rates.
+
+WHEEL_STATE = ([1.0, 0.2, -0.1, 0.3], [1.0, -0.8, 0.6])
+VISCOUS = ph.Rotor([1.0, 1.0, 0.0], 0.2, speed=3.0, coupling=ph.ViscousCoupling(0.4))
+HELD = ph.Rotor([1.0, 0.0, 0.0], momentum=0.3)
+FREE = ph.Rotor([0.0, 1.0, 1.0], 0.1, speed=1.0, torque=0.0)
+
+
+def hold(t, wxyz, omega_body, speed):
+    return 0.3 * wxyz[1] - 0.2 * omega_body[0] + 0.01 * speed + 0.1 * jnp.sin(t)
+
+
+def wheel_scene(rotors, potential=None, torque=None):
+    return ph.Scene(ph.Inertia(jnp.array([1.0, 1.5, 2.0])), potential, torque, rotors)
+
+
+WHEELS = {
+    "free": lambda: wheel_scene(FREE),
+    "gravity, damping, viscous": lambda: wheel_scene(
+        VISCOUS, ph.UniformGravity(2.0, [0.1, 0.2, 0.3]), ph.LinearDamping([0.1, 0.2, 0.3])
+    ),
+    "motor by the state": lambda: wheel_scene(
+        ph.Rotor([0.0, 1.0, 1.0], 0.1, momentum=0.2, coupling=ph.Motor(hold))
+    ),
+    "driven, held, viscous": lambda: wheel_scene(
+        ph.Rotor([0.0, 1.0, 1.0], 0.1, speed=1.0, torque=0.3) + HELD + VISCOUS
+    ),
+    "dry friction, impulse": lambda: wheel_scene(
+        ph.Rotor([0.0, 1.0, 1.0], 0.1, speed=1.0, coupling=ph.CoulombFriction(0.1, 0.5))
+        + ph.Rotor([1.0, 0.0, 0.0], 0.2, momentum=0.3, impulse=lambda t: 0.1 * jnp.sin(t))
+    ),
+    "stiff": lambda: wheel_scene(  # fades by exp(-60) in a second
+        ph.Rotor([1.0, 1.0, 0.0], 0.02, speed=3.0, coupling=ph.ViscousCoupling(1.2))
+    ),
+}
+
+
+def check_wheels(scene, dt, t):
+    """Jacobian and noise against differences of ``simulate``, steps in a row against one."""
+    state = ph.State(*WHEEL_STATE)
+    wheels = scene.settled(state, jnp.asarray(t)).rotors
+    loose = np.array(wheels.loose)
+    speeds = [wheels.speed(i, t, tuple(state.omega_body)) for i in range(len(wheels.held))]
+    n = 6 + len(loose)
+
+    @jax.jit
+    def end(error, push):
+        wxyz = rotation.multiply(state.wxyz, rotation.rotation_vector_to_wxyz(error[:3]))
+        begun = jnp.stack(speeds).at[loose].add(error[6:])
+        torque = ph.BodyTorque(push) if scene.torque is None else scene.torque + ph.BodyTorque(push)
+        pushed = ph.Scene(scene.inertia, scene.potential, torque, scene.rotors)
+        begin = ph.State(wxyz, state.omega_body + error[3:6], begun)
+        traj = ph.simulate(pushed, begin, [t, t + dt], rtol=1e-13)
+        return traj.wxyz[-1], traj.omega_body[-1], traj.wheel_speed[-1]
+
+    step = ph.propagate(scene, state, dt, t=t, rtol=1e-12)
+    assert step.jacobian.shape == (n, n)
+    assert step.noise.shape == (n, 3)
+
+    def slope(error, push, size=1e-3):
+        def change(k):
+            (q, w, s), (q0, w0, s0) = end(k * error, k * push), end(-k * error, -k * push)
+            turn = rotation.multiply(rotation.conjugate(q0), q)
+            turn = rotation.wxyz_to_rotation_vector(turn)
+            return np.concatenate([turn, w - w0, (s - s0)[loose]]) / (2 * k)
+
+        return (4 * change(size) - change(2 * size)) / 3
+
+    none = jnp.zeros(n), jnp.zeros(3)
+    flow = np.stack([slope(jnp.asarray(x), none[1]) for x in np.eye(n)], axis=1)
+    noise = np.stack([slope(none[0], jnp.asarray(x)) for x in np.eye(3)], axis=1)
+    np.testing.assert_allclose(step.jacobian, flow, rtol=0, atol=1e-8 * abs(flow).max())
+    np.testing.assert_allclose(step.noise, noise, rtol=0, atol=1e-8 * abs(noise).max())
+
+    first = ph.propagate(scene, state, dt / 3, t=t, rtol=1e-12)
+    then = ph.propagate(scene, first.state, 2 * dt / 3, t=t + dt / 3, rtol=1e-12)
+    scale = max(1, abs(step.jacobian).max())
+    wxyz, omega, speed = end(*none)
+    for last in (step.state, then.state):
+        np.testing.assert_allclose(last.wxyz, wxyz, rtol=0, atol=1e-11 * scale)
+        np.testing.assert_allclose(last.omega_body, omega, rtol=0, atol=1e-11 * scale)
+        np.testing.assert_allclose(
+            last.wheel_speed[loose], speed[loose], rtol=0, atol=1e-11 * scale
+        )
+    joined = then.jacobian @ first.jacobian
+    np.testing.assert_allclose(joined, step.jacobian, rtol=0, atol=1e-11 * scale)
+    joined = then.noise + then.jacobian @ first.noise
+    np.testing.assert_allclose(joined, step.noise, rtol=0, atol=1e-11 * scale)
+
+
+def test_a_free_wheel_keeps_its_momentum_under_a_disturbance():
+    """Noise of its speed and of the rates against differences; the next step continues with it."""
+    scene, dt = wheel_scene(FREE, torque=ph.BodyTorque(jnp.zeros(3))), 0.3
+    state = *WHEEL_STATE, [1.0]  # the same structure as what a step returns: one program
+    step = ph.propagate(scene, ph.State(*state), dt, rtol=1e-12)
+
+    def end(push):
+        pushed = wheel_scene(FREE, torque=ph.BodyTorque(push))
+        return ph.simulate(pushed, ph.State(*state), [0.0, dt], rtol=1e-12)
+
+    up, down = (end(k * jnp.array([0.0, 1e-3, 0.0])) for k in (1, -1))
+    omega = (up.omega_body[-1] - down.omega_body[-1]) / 2e-3
+    speed = (up.wheel_speed[-1] - down.wheel_speed[-1]) / 2e-3
+    np.testing.assert_allclose(step.noise[3:6, 1], omega, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(step.noise[6:, 1], speed, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(step.state.wheel_speed, up.wheel_speed[-1], rtol=0, atol=1e-3)
+    then = ph.propagate(scene, step.state, dt, t=dt, rtol=1e-12)
+    whole = ph.simulate(scene, ph.State(*state), [0.0, 2 * dt], rtol=1e-12).last
+    for got, want in zip(then.state.__dict__.values(), whole.__dict__.values(), strict=True):
+        np.testing.assert_allclose(got, want, rtol=0, atol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dt", [0.3, 1.0, -0.1])
+@pytest.mark.parametrize("name", WHEELS)
+def test_wheels_of_every_kind(name, dt):
+    check_wheels(WHEELS[name](), dt, 1.0)
+
+
+@pytest.mark.slow
+def test_noise_in_closed_form_with_a_free_wheel():
+    """Integrated over the step; a torque that changes nothing makes the same scene stepped."""
+    scene = ph.Scene(
+        ph.Inertia.axisymmetric(1.0, 1.5),
+        ph.UniformGravity.axial(1.0, 0.5),
+        rotors=ph.Rotor([0.0, 0.0, 1.0], 0.1, speed=5.0, torque=0.0),
+    )
+    state = ph.State(*WHEEL_STATE)
+    closed = ph.propagate(scene, state, 0.5, method=ph.LagrangeTop())
+    stepped = ph.propagate(scene, state, 0.5, method=ph.LiePoisson(), rtol=1e-12)
+    assert closed.jacobian.shape == (7, 7)
+    np.testing.assert_allclose(closed.jacobian, stepped.jacobian, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(closed.noise, stepped.noise, rtol=0, atol=1e-9)
+
+
+def test_held_wheels_have_no_coordinate_and_parameters_follow():
+    """Shapes: nothing is compiled."""
+    state = ph.State(*WHEEL_STATE)
+
+    def shapes(scene, free=None, state=state):
+        return jax.eval_shape(lambda s: ph.propagate(scene, s, 0.1, free=free), state)
+
+    step = shapes(wheel_scene(HELD))
+    assert step.jacobian.shape == (6, 6)
+    assert step.state.wheel_speed is None
+    scene = wheel_scene(HELD + FREE)
+    step = shapes(scene, lambda s: s.inertia.diagonal)
+    assert step.jacobian.shape == (10, 10)
+    assert step.noise.shape == (10, 3)
+    assert step.state.wheel_speed.shape == (2,)
+    assert shapes(scene, lambda s: s.rotors.terms[0].momentum).jacobian.shape == (8, 8)
+    with pytest.raises(ValueError, match="tangent coordinates already"):
+        shapes(scene, lambda s: s.rotors.terms[1].speed)
+    with pytest.raises(ValueError, match="speeds of 3 wheels, the scene 2"):
+        shapes(scene, state=ph.State(*WHEEL_STATE, [0.0, 0.0, 0.0]))

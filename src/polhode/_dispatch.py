@@ -108,9 +108,9 @@ def _program(run: Callable, method: AbstractMethod, tree: Any, record: Record) -
     timed: list[tuple[int, int]] = []
 
     @jax.jit
-    def call(ts, rtol, wxyz, omega, *leaves):
+    def call(ts, rtol, wxyz, omega, speeds, *leaves):
         scene = jax.tree.unflatten(tree, leaves).value()
-        found = run(method, scene, State(wxyz, omega), ts, rtol, record)
+        found = run(method, scene, State(wxyz, omega, speeds), ts, rtol, record)
         if scene.rotors is None:  # whose motion the initial state decides
             found = eqx.tree_at(lambda t: t.scene, found, _HERE)
         flat, structure = jax.tree.flatten(found)
@@ -141,10 +141,12 @@ def again(scene: Any, state: Any, ts: Any, rtol: Any, record: Any) -> Trajectory
     known = found[1].get(_key(record))
     if known is None:
         return None
-    wxyz, omega = state.wxyz, state.omega_body
+    wxyz, omega, speeds = state.wxyz, state.omega_body, state.wheel_speed
     for x, size in ((wxyz, 4), (omega, 3)):
         if not _is_local(x) or x.dtype != known.dtype or x.ndim == 0 or x.shape[-1] != size:
             return None
+    if speeds is not None and not (_is_local(speeds) and speeds.dtype == known.dtype):
+        return None
     times = _times(ts, known.dtype)
     if times is None:
         return None
@@ -172,7 +174,7 @@ def again(scene: Any, state: Any, ts: Any, rtol: Any, record: Any) -> Trajectory
         if size != ts.size:
             ts = np.asarray(ts)
             ts = np.concatenate([np.full(size - ts.size, ts[0]), ts])
-    leaves = program.call(ts, np.asarray(rtol, known.dtype), wxyz, omega, *known.leaves)
+    leaves = program.call(ts, np.asarray(rtol, known.dtype), wxyz, omega, speeds, *known.leaves)
     if size != whole.size:
         _shortened(leaves, program.timed, whole, size)
     if program.place[0] is not None:

@@ -14,25 +14,32 @@ from polhode import rotation
 from polhode._checks import ArrayLike
 from polhode._method import (
     AbstractMethod,
+    Record,
     Status,
     check_inputs,
     check_kinds,
     check_rtol,
     raise_on_failure,
 )
-from polhode._scene import Scene, State
+from polhode._plan import choose
+from polhode._scene import BodyTorque, Scene, State, Wheels
 from polhode._scene._scene import places_of
 from polhode._simulate import simulate
 
 _NODES = 8
-"""Gauss points that the effect of a disturbance is summed over; their error falls with the 16th
-power of the angle turned in a step: 1e-12 of it for a third of a turn."""
+"""Gauss points that the effect of a disturbance is integrated over where the motion has a closed
+form; their error falls with the 16th power of the angle turned in a step: 1e-12 of it for a third
+of a turn."""
 
 
 class Propagation(NamedTuple):
-    """A step: ``state`` at its end; ``jacobian`` (6 + p, 6 + p) of the tangent coordinates at the
-    end by those at the start; ``noise`` (6 + p, 3): what a constant disturbance torque [N m] in
-    body axes adds to them. See ``ph.propagate``."""
+    """One step of ``ph.propagate``, with n = 6 + w + p tangent coordinates.
+
+    ``state``: at the end of the step, the speeds of all wheels in its ``wheel_speed`` where w > 0,
+    so that the next step continues from it; ``jacobian`` (n, n): derivatives of the tangent
+    coordinates at the end by those at the start; ``noise`` (n, 3): change of the coordinates at the
+    end by a constant disturbance torque [N m] in body axes.
+    """
 
     state: State
     jacobian: Float[Array, "n n"]
@@ -49,22 +56,36 @@ def propagate(
     method: AbstractMethod | None = None,
     rtol: float | None = None,
 ) -> Propagation:
-    """The state ``dt`` [s] after ``t``, the Jacobian of the flow, and the map of its noise.
+    """The state ``dt`` [s] after ``t``, the Jacobian of the flow, and the effect of disturbances.
 
-    Tangent coordinates are (error rotation vector (3,) [rad] in body axes, error of the body rates
-    (3,) [rad/s], p parameters): the true attitude is ``q * exp(error)``, with ``rotation.multiply``
-    and ``rotation.rotation_vector_to_wxyz``. The Jacobian is that of the exact flow, by forward
-    differentiation through ``ph.simulate``; ``noise`` is its integral over the step against the
-    inverse inertia, so that a torque of spectral density s [N^2 m^2 s] held at random over each
-    step adds ``noise @ noise.T * s / dt`` to the covariance.
+    The n = 6 + w + p tangent coordinates are, in this order,
+
+    - the error rotation vector (3,) [rad] in body axes: the true attitude is ``q * exp(error)``,
+      with ``rotation.multiply`` and ``rotation.rotation_vector_to_wxyz``;
+    - the errors of the body rates (3,) [rad/s];
+    - the errors of the speeds relative to the body (w,) [rad/s] of the wheels that are not held at
+      their speed (``ph.Rotor`` with ``torque``, ``impulse`` or ``coupling``), in the order of the
+      rotors. Held wheels have no coordinate;
+    - the errors of the p parameters, which do not change.
+
+    The speeds are those of ``state.wheel_speed``, or of the rotors where that is None; the state
+    returned has a ``wheel_speed`` (m,) [rad/s] of all m wheels where w > 0 (NaN for a wheel held at
+    a momentum without an inertia), so that ``propagate(scene, step.state, dt, t=t + dt)`` continues
+    the motion.
+
+    The Jacobian is that of the exact flow, by forward differentiation through ``ph.simulate``.
+    ``noise`` is the derivative by a disturbance torque on the body [N m] that is constant over the
+    step, in body axes: a torque of spectral density s [N^2 m^2 s] adds ``noise @ noise.T * s / dt``
+    to the covariance.
 
     **Arguments:** ``scene``, ``state``: of one body; for several ``jax.vmap``. ``dt``: not zero.
     ``free``: None, or a function that picks leaves of the scene, ``lambda s: s.inertia.diagonal``:
-    their entries are the parameters, which stay as they are. ``method``, ``rtol``: as for
-    ``ph.simulate``, which raises; under ``jit`` all is NaN where the body did not arrive.
+    their entries are the parameters. ``method``, ``rtol``: as for ``ph.simulate``, which raises;
+    under ``jit`` all is NaN where the body did not finish.
 
-    Raises ValueError for a batch; TypeError for what is no scene or no state, or a ``free`` that
-    picks what is no array of the scene.
+    Raises ValueError for a batch, or a ``free`` that picks the speed or momentum of a wheel that is
+    a coordinate already; TypeError for what is no scene or no state, or a ``free`` that picks what
+    is no array of the scene.
 
         state, jacobian, noise = ph.propagate(scene, state, 0.1)
         covariance = jacobian @ covariance @ jacobian.T + noise @ noise.T * density / 0.1
@@ -79,52 +100,106 @@ def propagate(
     dt, t = jnp.asarray(dt, dtype), jnp.asarray(t, dtype)
     scene, state, _, _ = check_inputs(scene, state, jnp.stack([t, t + dt]), None)
     places = () if free is None else places_of(scene, free)
-    wxyz, omega, jacobian, noise, status = _propagated(
+    if not set(places).isdisjoint(_starts_of_loose(scene)):
+        raise ValueError(
+            "free picks the speed or momentum of a rotor that is not held at its speed: it is part"
+            " of the state, and its error one of the tangent coordinates already. Leave it out."
+        )
+    state, jacobian, noise, status = _propagated(
         scene, state, dt, t, places, method, check_rtol(rtol, dtype)
     )
     if not isinstance(status, Tracer):
         raise_on_failure(status)
-    return Propagation(State(wxyz, omega), jacobian, noise)
+    return Propagation(state, jacobian, noise)
+
+
+def _starts_of_loose(scene: Scene) -> tuple[int, ...]:
+    """The leaves of the scene that give initial speeds of wheels that are not held."""
+
+    def starts(scene):
+        if isinstance(scene.rotors, Wheels):
+            return [] if scene.rotors.is_constant else [scene.rotors.momentum]
+        loose = [w for w in scene.rotors.wheels if not w.is_held]
+        return [w.momentum if w.speed is None else w.speed for w in loose]
+
+    if scene.rotors is None or not starts(scene):
+        return ()
+    return places_of(scene, starts)
 
 
 @eqx.filter_jit
 def _propagated(scene, state, dt, t, places, method, rtol):
     dtype = dt.dtype
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    nodes, weights = (jnp.asarray(x, dtype) for x in ((1 + nodes) / 2, weights / 2))
-    ts = t + dt * jnp.concatenate([jnp.zeros(1, dtype), nodes, jnp.ones(1, dtype)])
     leaves, tree = jax.tree.flatten(scene)
     sizes = [leaves[k].size for k in places]
+    settled = scene.settled(state, t)
+    wheels: Any = settled.rotors
+    loose = getattr(wheels, "loose", ())
+    start_speeds: Any = _speeds(wheels, t, state.omega_body) if loose else None
+    begin = 6 + len(loose)
+    n = begin + sum(sizes)
 
-    def moved(error):
+    ends = jnp.stack([t, t + dt])
+    if method is None:
+        method, _ = choose(scene, state, Record(), rtol, ends)
+    # In closed form there is no motion under a torque: its effect is integrated over the step.
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    nodes, weights = (jnp.asarray(x, dtype) for x in ((1 + nodes) / 2, weights / 2))
+    inner = t + dt * nodes if method.exact else ends[:0]
+    ts = jnp.concatenate([ends[:1], inner, ends[1:]])
+
+    def moved(error, push):
         turn = jnp.concatenate([jnp.ones(1, dtype), error[:3] / 2])
-        start = State(rotation.multiply(state.wxyz, turn), state.omega_body + error[3:6])
-        changed, begin = list(leaves), 6
+        speeds = None
+        if loose:
+            speeds = start_speeds.at[np.array(loose)].add(error[6:begin])
+        start = State(rotation.multiply(state.wxyz, turn), state.omega_body + error[3:6], speeds)
+        changed, first = list(leaves), begin
         for k, size in zip(places, sizes):
-            change = error[begin : begin + size].reshape(leaves[k].shape)
-            changed[k], begin = leaves[k] + change.astype(leaves[k].dtype), begin + size
+            change = error[first : first + size].reshape(leaves[k].shape)
+            changed[k], first = leaves[k] + change.astype(leaves[k].dtype), first + size
         body = jax.tree.unflatten(tree, changed)
-        traj = simulate(body, start, ts, method, rtol=rtol)
+        if not method.exact:
+            push = BodyTorque(push)
+            torque = push if body.torque is None else body.torque + push
+            body = Scene(body.inertia, body.potential, torque, body.rotors)
+        traj = simulate(body, start, ts, method, rtol=rtol, throw=False)
         good = traj.status == Status.SUCCESSFUL
-        wxyz, omega = (jnp.where(good, x, jnp.nan) for x in (traj.wxyz, traj.omega_body))
-        return (wxyz, omega), (wxyz, omega, traj.status)
+        speeds = traj.wheel_speed if loose else jnp.zeros((ts.size, 0), dtype)
+        given = traj.wxyz, traj.omega_body, speeds
+        wxyz, omega, speeds = (jnp.where(good, x, jnp.nan) for x in given)
+        moving = speeds[:, np.array(loose, int)]
+        return (wxyz, omega, moving), (wxyz[-1], omega[-1], speeds[-1], wxyz, traj.status)
 
-    none = jnp.zeros(6 + sum(sizes), dtype)
-    (turns, rates), (wxyz, omega, status) = jax.jacfwd(moved, has_aux=True)(none)
-    back = rotation.conjugate(wxyz)
-    turns = jnp.moveaxis(turns, -1, -2)  # (T, n, 4)
-    along = jnp.broadcast_to(back[:, None], turns.shape)
-    angles = 2 * rotation.multiply(along, turns)[..., 1:]
-    flow = jnp.concatenate([jnp.moveaxis(angles, -1, -2), rates], axis=-2)  # (T, 6, n)
-    still = jnp.eye(none.size, dtype=dtype)[6:]
+    none = jnp.zeros(n, dtype), jnp.zeros(3, dtype)
+    derivatives, (*last, wxyz, status) = jax.jacfwd(
+        lambda both: moved(both[:n], both[n:]), has_aux=True
+    )(jnp.concatenate(none))
+    turns, *rates = derivatives  # (T, 4, n + 3), (T, 3, n + 3), (T, w, n + 3)
+    turns = jnp.moveaxis(turns, -1, -2)
+    back = jnp.broadcast_to(rotation.conjugate(wxyz)[:, None], turns.shape)
+    angles = 2 * rotation.multiply(back, turns)[..., 1:]
+    flow = jnp.concatenate([jnp.moveaxis(angles, -1, -2), *rates], axis=-2)
+    still = jnp.eye(n, n + 3, dtype=dtype)[begin:]
     flow = jnp.concatenate([flow, jnp.broadcast_to(still, (ts.size, *still.shape))], axis=-2)
-    end = flow[-1]
-    inverse = scene.settled(state, t).carrier.rates(jnp.eye(3, dtype=dtype))  # symmetric
-    push = jnp.zeros((none.size, 3), dtype).at[3:6].set(inverse)
+    end, noise = flow[-1, :, :n], flow[-1, :, n:]
+    if method.exact:
+        inverse = settled.carrier.rates(jnp.eye(3, dtype=dtype))  # symmetric
+        push = jnp.zeros((n, 3), dtype).at[3:6].set(inverse)
+        if loose:  # a torque on the body leaves the absolute momenta of its wheels as they are
+            axes = wheels.axes[np.array(loose)]
+            push = push.at[6:begin].set(-axes @ inverse)
 
-    def carried(flow):
-        """To the end, of what acts at a node."""
-        return end @ jnp.linalg.solve(flow, push)
+        def carried(flow):
+            """Effect at the end of a unit impulse at a node."""
+            return end @ jnp.linalg.solve(flow, push)
 
-    noise = dt * jnp.tensordot(weights, jax.vmap(carried)(flow[1:-1]), 1)
-    return wxyz[-1], omega[-1], end, noise, status
+        noise = dt * jnp.tensordot(weights, jax.vmap(carried)(flow[1:-1, :, :n]), 1)
+    wxyz, omega, speeds = last
+    return State(wxyz, omega, speeds if loose else None), end, noise, status
+
+
+def _speeds(wheels: Wheels, t: Array, omega: Array) -> Array:
+    """Speeds (m,) [rad/s] of the wheels of one body relative to it."""
+    rates = tuple(omega[i] for i in range(3))
+    return jnp.stack([wheels.speed(i, t, rates) for i in range(len(wheels.held))])

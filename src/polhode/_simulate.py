@@ -136,7 +136,7 @@ def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> T
 def _begin(method, scene, state, ts, rtol) -> Trajectory:
     """The state at the first time, as the only sample of a trajectory."""
     scene, state = scene.mended(), state.mended("state").as_unit()
-    scene = scene.settled(state, ts[..., 0])
+    scene, state = scene.settled(state, ts[..., 0]), state.without_wheels
     parts = {name: getattr(scene, name) for name in PARTS}
     batch = common_batch(*parts.values(), state, extra=(ts.shape[:-1],))
     wxyz, omega = (
@@ -157,7 +157,7 @@ def _begin(method, scene, state, ts, rtol) -> Trajectory:
 def _trajectory(method, scene, state, ts, rtol, record, split=None, in_order=False) -> Trajectory:
     """``in_order`` (static): times known to be in order, whose first may be repeated."""
     scene, state = scene.mended(), state.mended("state")  # shapes, whichever way led here
-    scene = scene.settled(state, ts[..., 0])
+    scene, state = scene.settled(state, ts[..., 0]), state.without_wheels
     if split is None:
         found = _moved(record, method, scene, state, ts, rtol, in_order)
     else:

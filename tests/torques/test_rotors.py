@@ -1,3 +1,4 @@
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -74,3 +75,50 @@ def test_refused_rotors(arguments, word):
         Rotor([0.0, 0.0, 1.0], **arguments)
     with pytest.raises(ValueError, match="must not be zero"):
         Rotor([0.0, 0.0, 0.0], momentum=1.0)
+
+
+FREE = ph.Rotor([0.0, 0.0, 1.0], inertia=0.2, speed=2.0, torque=0.0)
+DRAGGED = ph.Rotor([0.0, 1.0, 0.0], 0.1, speed=3.0, coupling=ph.ViscousCoupling(0.05))
+HELD = ph.Rotor([1.0, 0.0, 0.0], momentum=0.4)
+BODY = ph.Inertia.from_moments([2.0, 1.4, 1.5])
+
+
+def test_the_last_state_continues_with_its_wheels():
+    """Two simulations in a row are one; also through the settled scene of a trajectory."""
+    scene = ph.Scene(BODY, rotors=FREE + HELD + DRAGGED)
+    whole = ph.simulate(scene, STATE, [1.0, 2.0, 3.0], rtol=1e-12)
+    first = ph.simulate(scene, STATE, [1.0, 2.0], rtol=1e-12)
+    assert first.last.wheel_speed.shape == (2, 3)
+    np.testing.assert_allclose(first.last.wheel_speed, first.wheel_speed[:, -1], rtol=1e-14)
+    for again in (scene, first.scene):
+        then = ph.simulate(again, first.last, [2.0, 3.0], rtol=1e-12)
+        np.testing.assert_allclose(then.wxyz[:, -1], whole.wxyz[:, -1], rtol=0, atol=1e-11)
+        np.testing.assert_allclose(then.omega_body[:, -1], whole.omega_body[:, -1], atol=1e-11)
+        np.testing.assert_allclose(then.wheel_speed[:, -1], whole.wheel_speed[:, -1], atol=1e-10)
+    assert ph.simulate(ph.Scene(BODY, rotors=HELD), STATE, [0.0, 1.0]).last.wheel_speed is None
+
+
+def test_the_speeds_of_a_state_replace_those_of_the_rotors():
+    scene = ph.Scene(BODY, rotors=FREE + HELD)
+    other = eqx.tree_at(lambda s: s.rotors.terms[0].speed, scene, jnp.array(-1.5))
+    given = ph.State(STATE.wxyz, STATE.omega_body, [-1.5, jnp.nan])
+    want = ph.simulate(other, STATE, [0.0, 1.0]).omega_body
+    np.testing.assert_array_equal(ph.simulate(scene, given, [0.0, 1.0]).omega_body, want)
+    np.testing.assert_array_equal(ph.simulate(scene, given, [0.0, 1.0]).omega_body, want)  # cached
+    with pytest.raises(ValueError, match="speeds of 1 wheels, the scene 2"):
+        ph.simulate(scene, ph.State(STATE.wxyz, STATE.omega_body, [1.0]), [0.0, 1.0])
+    with pytest.raises(ValueError, match="broadcast together"):
+        ph.State(STATE.wxyz, STATE.omega_body, jnp.zeros((3, 2)))
+
+
+@pytest.mark.slow
+def test_the_speeds_of_a_state_with_an_event_and_without_rotors():
+    given = ph.State(STATE.wxyz, STATE.omega_body, [-1.5])
+    scene = ph.Scene(BODY, rotors=FREE)
+    want = ph.simulate(scene, given, [0.0, 1.0]).omega_body[:, -1]
+    until = ph.Event(lambda wxyz, omega_body, t: t - 1.0)
+    stopped = ph.simulate(scene, given, [0.0, 4.0], until=until).omega_body[:, -1]
+    np.testing.assert_allclose(stopped, want, rtol=0, atol=1e-8)
+    alone = ph.simulate(ph.Scene(BODY), given, [0.0, 1.0])  # the speeds are not used
+    want = ph.simulate(ph.Scene(BODY), STATE, [0.0, 1.0]).omega_body
+    np.testing.assert_array_equal(alone.omega_body, want)

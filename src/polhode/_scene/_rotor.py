@@ -30,7 +30,8 @@ class Rotor(AbstractRotor):
     - ``inertia`` (...): its moment J about that axis [kg m^2]; already part of the body's inertia.
       May be left out when ``momentum`` is given and no ``torque``, ``impulse`` or ``coupling``.
     - exactly one of ``momentum`` (...) = J Omega [kg m^2/s] and ``speed`` (...) = Omega [rad/s],
-      both relative to the body, at the first time.
+      both relative to the body, at the first time. A state with a ``wheel_speed`` replaces them,
+      except where the motor holds the speed.
     - ``torque`` (...) [N m]: what the motor exerts on the wheel about its axis, the body taking the
       reaction; 0: the wheel spins freely. None: the motor holds the speed.
     - ``impulse``: instead of ``torque``, an antiderivative of a motor torque that varies: a
@@ -123,12 +124,18 @@ class Rotor(AbstractRotor):
             self.coupling,
         )  # fmt: skip
 
-    def column(self, omega_body: Array, start: Array) -> tuple[Array, Array, Array, Array]:
-        """Axis, its momentum at the start (relative if held, else absolute), J, motor torque."""
+    def column(
+        self, omega_body: Array, start: Array, wheel_speed: Array | None = None
+    ) -> tuple[Array, Array, Array, Array]:
+        """Axis, its momentum at the start (relative if held, else absolute), J, motor torque.
+
+        ``wheel_speed`` (...) [rad/s]: at the start, of a wheel that is not held; None: its own.
+        """
         parts = (self.axis_body, self.inertia, self.momentum, self.speed, self.torque)
         shapes = [x.shape[:-1] if x is self.axis_body else x.shape for x in parts if x is not None]
         if not self.is_held:
             shapes += [omega_body.shape[:-1], start.shape]
+            shapes += [] if wheel_speed is None else [wheel_speed.shape]
         lead = np.broadcast_shapes(*shapes)
         zero = jnp.zeros(lead, self.axis_body.dtype)
         axis = jnp.broadcast_to(_unit(self.axis_body), (*lead, 3))
@@ -137,6 +144,8 @@ class Rotor(AbstractRotor):
             momentum = inertia * speed
         if self.is_held:
             return axis, momentum, inertia, zero
+        if wheel_speed is not None:
+            momentum = inertia * jnp.broadcast_to(wheel_speed, lead)
         turning = jnp.sum(axis * jnp.broadcast_to(omega_body, (*lead, 3)), axis=-1)
         return axis, momentum + inertia * turning, inertia, torque
 

@@ -71,9 +71,17 @@ class AbstractRotor(AbstractPart):
                 " locked and included. Add the wheels to it.",
             )
 
-    def settle(self, omega_body: Float[Array, "*#b 3"], start: Array) -> "Wheels":
-        """The wheels of bodies with rates ``omega_body`` at the time ``start`` (...)."""
-        columns = [wheel.column(omega_body, start) for wheel in self.wheels]
+    def settle(
+        self, omega_body: Float[Array, "*#b 3"], start: Array, wheel_speed: Array | None = None
+    ) -> "Wheels":
+        """The wheels of bodies with rates ``omega_body`` at the time ``start`` (...).
+
+        ``wheel_speed`` (..., m) [rad/s]: relative to the body; None: what the rotors were given.
+        """
+        speeds = _speeds_of(wheel_speed, len(self.wheels))
+        columns = [
+            wheel.column(omega_body, start, speed) for wheel, speed in zip(self.wheels, speeds)
+        ]
         lead = np.broadcast_shapes(*(x.shape for column in columns for x in column[1:]))
         lead = np.broadcast_shapes(lead, *(column[0].shape[:-1] for column in columns))
         axes = jnp.stack([jnp.broadcast_to(c[0], (*lead, 3)) for c in columns], axis=-2)
@@ -104,6 +112,18 @@ class RotorSum(AbstractRotor):
     @property
     def wheels(self):
         return self.terms
+
+
+def _speeds_of(wheel_speed: Array | None, count: int) -> Sequence[Array | None]:
+    """The speed (...) of each of ``count`` wheels, None where it is not given."""
+    if wheel_speed is None:
+        return [None] * count
+    if wheel_speed.shape[-1] != count:
+        raise ValueError(
+            f"the state has the speeds of {wheel_speed.shape[-1]} wheels, the scene {count}: give"
+            " wheel_speed one entry for each rotor, or leave it out."
+        )
+    return [wheel_speed[..., i] for i in range(count)]
 
 
 def _is_along(axes: Array, axis: int) -> Any:
@@ -168,8 +188,17 @@ class Wheels(AbstractRotor):
         """Which wheels are not held (static)."""
         return tuple(i for i, held in enumerate(self.held) if not held)
 
-    def settle(self, omega_body, start):
-        return self
+    def settle(self, omega_body, start, wheel_speed=None):
+        if wheel_speed is None:
+            return self
+        _speeds_of(wheel_speed, len(self.held))
+        loose = ~np.array(self.held)
+        axes, omega = jnp.broadcast_arrays(self.axes, omega_body[..., None, :])
+        speeds, turning, inertia, momentum, loose = jnp.broadcast_arrays(
+            wheel_speed, jnp.sum(axes * omega, axis=-1), self.inertia, self.momentum, loose
+        )
+        momentum = jnp.where(loose, inertia * (jnp.where(loose, speeds, 0) + turning), momentum)
+        return dataclasses.replace(self, momentum=momentum, start=start)
 
     def at(self, spins: Sequence[Array]) -> "Wheels":
         """The wheels at a moment when those that are coupled have these momenta [kg m^2/s]."""

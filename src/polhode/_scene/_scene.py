@@ -62,7 +62,7 @@ class Scene(eqx.Module):
         """The scene with the motion of its wheels fixed by the state at the time ``start``."""
         if self.rotors is None:
             return self
-        wheels = self.rotors.settle(state.omega_body, start)
+        wheels = self.rotors.settle(state.omega_body, start, state.wheel_speed)
         return Scene(self.inertia, self.potential, self.torque, wheels)
 
     @property

@@ -26,32 +26,45 @@ class SciPyRotation(Protocol):
 
 
 class State(AbstractPart):
-    """Attitude and body rates at one time.
+    """Attitude and body rates at one time, and the speeds of wheels where they are given.
 
     **Arguments:** ``wxyz`` (..., 4): unit quaternion, scalar first, body -> space; one that is not
     of unit length is normalised; or a SciPy ``Rotation``. ``omega_body`` (..., 3): angular velocity
-    in body axes [rad/s]. Leading axes are a batch and broadcast together.
+    in body axes [rad/s]. ``wheel_speed`` (..., m): speeds of the m wheels of the scene relative to
+    the body [rad/s], in the order of its rotors; they replace the speeds and momenta that the
+    ``ph.Rotor`` objects were given. None: those of the rotors. Entries of wheels that a motor holds
+    at their speed are not used (they may be NaN), nor is any by a scene without rotors. Leading
+    axes are a batch and broadcast together.
 
     Raises ValueError for a zero quaternion, NaN, wrong shapes or axes that do not broadcast.
     """
 
     wxyz: Float[Array, "*#b 4"] = shaped(4)
     omega_body: Float[Array, "*#b 3"] = shaped(3)
+    wheel_speed: Float[Array, "*#b m"] | None = shaped(None)
 
-    def __init__(self, wxyz: ArrayLike | SciPyRotation, omega_body: ArrayLike):
+    def __init__(
+        self,
+        wxyz: ArrayLike | SciPyRotation,
+        omega_body: ArrayLike,
+        wheel_speed: ArrayLike | None = None,
+    ):
         if hasattr(wxyz, "as_quat"):
             wxyz = rotation.scipy_to_wxyz(wxyz, getattr(omega_body, "dtype", None))
         quaternion = as_float_array("wxyz", wxyz, (4,))
         rates = as_float_array("omega_body", omega_body, (3,))
+        arrays = {"wxyz": quaternion, "omega_body": rates}
+        if wheel_speed is not None:
+            wheel_speed = as_float_array("wheel_speed", wheel_speed, (None,), finite=False)
+            arrays["wheel_speed"] = wheel_speed
         try:
-            np.broadcast_shapes(quaternion.shape[:-1], rates.shape[:-1])
+            np.broadcast_shapes(*(x.shape[:-1] for x in arrays.values()))
         except ValueError as error:
-            raise ValueError(
-                f"wxyz {quaternion.shape} and omega_body {rates.shape} must have leading axes"
-                " that broadcast together."
-            ) from error
+            shapes = " and ".join(f"{name} {x.shape}" for name, x in arrays.items())
+            raise ValueError(f"{shapes} must have leading axes that broadcast together.") from error
         self.wxyz = rotation.normalise(quaternion)
         self.omega_body = rates
+        self.wheel_speed = wheel_speed
 
     @classmethod
     def from_euler(
@@ -99,6 +112,13 @@ class State(AbstractPart):
         momentum = momentum_from_canonical(angles, components(momenta))
         momentum = jnp.stack(jnp.broadcast_arrays(*momentum), axis=-1)
         return cls(wxyz, inertia.rates(momentum))
+
+    @property
+    def without_wheels(self) -> "State":
+        """Attitude and body rates alone, once the scene holds the momenta of its wheels."""
+        if self.wheel_speed is None:
+            return self
+        return eqx.tree_at(lambda s: s.wheel_speed, self, None)
 
     def as_unit(self) -> "State":
         """The state with quaternions of unit length, where an edit or a step left another."""

@@ -32,6 +32,13 @@ def _sample(wxyz: Array, omega: Array, place: int) -> tuple[Array, Array]:
 
 
 @eqx.filter_jit  # likewise
+def _speeds(bare: "Trajectory", place: int) -> Array | None:
+    """Wheel speeds (..., m) of one sample."""
+    speeds = bare[..., place].wheel_speed
+    return None if speeds is None else speeds[..., 0, :]
+
+
+@eqx.filter_jit  # likewise
 def _derived(of: Callable[["Trajectory"], Any], bare: "Trajectory") -> Any:
     return of(bare)
 
@@ -173,15 +180,23 @@ class Trajectory(eqx.Module):
     @property
     def first(self) -> State:
         """The state (...) at the first sample."""
-        return State(*_sample(self.wxyz, self.omega_body, 0))
+        return self._state(0)
 
     @property
     def last(self) -> State:
         """The state (...) at the last sample, from which another simulation may go on.
 
-        It holds attitude and rates; the speeds of wheels are ``wheel_speed[..., -1, :]``.
+        It holds attitude and rates and, where the scene has wheels that are not held at their
+        speed, the speeds of all wheels.
         """
-        return State(*_sample(self.wxyz, self.omega_body, -1))
+        return self._state(-1)
+
+    def _state(self, place: int) -> State:
+        wxyz, omega = _sample(self.wxyz, self.omega_body, place)
+        wheels = self.scene.rotors
+        if not isinstance(wheels, Wheels) or wheels.is_constant:
+            return State(wxyz, omega)
+        return State(wxyz, omega, _speeds(self._bare, place))
 
     def __getitem__(self, key: Any) -> "Trajectory":
         """Bodies and samples chosen as from an array of shape (..., T), body axes first.
@@ -250,11 +265,15 @@ class Trajectory(eqx.Module):
 
     def _compiled(self, of: Callable[["Trajectory"], Any]) -> Any:
         """What ``of`` makes of this trajectory, in one program that other records of it share."""
-        bare = Trajectory(
+        return _derived(of, self._bare)
+
+    @property
+    def _bare(self) -> "Trajectory":
+        """The samples and the scene, without other records."""
+        return Trajectory(
             self.ts, self._wxyz, self._omega_body, self.status, self.steps, self.scene,
             spins=self._spins,
         )  # fmt: skip
-        return _derived(of, bare)
 
     @property
     def _samples(self) -> list[Array]:

@@ -113,7 +113,8 @@ def draw(each: Any, shared: Any, indices: Array, spreads: Any, seed: Array) -> t
             streams.append(stream)
             scene, state = spread(own_key, scene, state)
         if "momentum_body" in rows:
-            state = State(state.wxyz, scene.inertia.rates(rows["momentum_body"]))
+            omega = scene.inertia.rates(rows["momentum_body"])
+            state = State(state.wxyz, omega, state.wheel_speed)
         return scene, state
 
     return eqx.filter_vmap(one, in_axes=(0, eqx.if_array(0)), out_axes=eqx.if_array(0))(
@@ -128,4 +129,6 @@ def _placed(scene: Scene, state: State, rows: Mapping[str, Array]) -> tuple[Scen
     if "torque" in rows:
         scene = with_torque(scene, rows["torque"])
     wxyz, omega = rows.get("wxyz", state.wxyz), rows.get("omega_body", state.omega_body)
-    return scene, State(wxyz, omega) if "wxyz" in rows or "omega_body" in rows else state
+    if "wxyz" in rows or "omega_body" in rows:
+        state = State(wxyz, omega, state.wheel_speed)
+    return scene, state

@@ -70,7 +70,9 @@ class SpreadAttitude(eqx.Module):
 
     def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
         turn = rotation.rotation_vector_to_wxyz(self.turn(key))
-        return scene, State(rotation.multiply(state.wxyz, turn), state.omega_body)
+        return scene, State(
+            rotation.multiply(state.wxyz, turn), state.omega_body, state.wheel_speed
+        )
 
 
 class AnyAttitude(eqx.Module):
@@ -78,7 +80,7 @@ class AnyAttitude(eqx.Module):
 
     def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
         wxyz = jax.random.normal(key, (4,), state.wxyz.dtype)
-        return scene, State(wxyz, state.omega_body)
+        return scene, State(wxyz, state.omega_body, state.wheel_speed)
 
 
 class SpreadEuler(eqx.Module):
@@ -91,7 +93,7 @@ class SpreadEuler(eqx.Module):
     def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
         a = self.angles + self.deviate(key)
         wxyz = rotation.euler_to_wxyz(a[0], a[1], a[2], self.sequence)
-        return scene, State(wxyz, state.omega_body)
+        return scene, State(wxyz, state.omega_body, state.wheel_speed)
 
 
 class SpreadRates(eqx.Module):
@@ -100,7 +102,7 @@ class SpreadRates(eqx.Module):
     deviate: Deviate
 
     def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
-        return scene, State(state.wxyz, state.omega_body + self.deviate(key))
+        return scene, State(state.wxyz, state.omega_body + self.deviate(key), state.wheel_speed)
 
 
 class SpreadMomentum(eqx.Module):
@@ -113,7 +115,7 @@ class SpreadMomentum(eqx.Module):
 
     def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
         momentum = self.momentum if self.deviate is None else self.momentum + self.deviate(key)
-        return scene, State(state.wxyz, scene.inertia.rates(momentum))
+        return scene, State(state.wxyz, scene.inertia.rates(momentum), state.wheel_speed)
 
 
 class SpreadTorque(eqx.Module):
