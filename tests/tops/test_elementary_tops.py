@@ -90,3 +90,92 @@ def test_what_the_laws_ask_for():
         ph.simulate(driven, STATE, [0.0, 1.0], SymmetricTop())
     with pytest.raises(ph.SimulationError, match="law"):
         ph.simulate(driven, STATE, [0.0, 1.0], FixedAxis())
+
+
+RESTING = {
+    "symmetric, damping": (
+        SymmetricTop(),
+        lambda x: ph.Scene(SYMMETRIC, torque=ph.LinearDamping(0.1 * SYMMETRIC.moments)),
+    ),
+    "symmetric, wheel": (
+        SymmetricTop(),
+        lambda x: ph.Scene(SYMMETRIC, rotors=Rotor([0.0, 0.0, 1.0], momentum=x)),
+    ),
+    "symmetric": (SymmetricTop(), lambda x: ph.Scene(SYMMETRIC, torque=ph.LinearDamping(0.0))),
+    "axis, damping": (
+        FixedAxis(),
+        lambda x: ph.Scene(SYMMETRIC, torque=ph.LinearDamping([0.1, 0.2, 0.3])),
+    ),
+    "axis, torque": (
+        FixedAxis(),
+        lambda x: ph.Scene(SYMMETRIC, torque=ph.BodyTorque(x * jnp.array([1.0, 2.0, 3.0]))),
+    ),
+    "free": (ph.ClosedForm(), lambda x: ph.Scene(SYMMETRIC)),
+    "free sphere": (ph.ClosedForm(), lambda x: ph.Scene(ph.Inertia.spherical(2.0))),
+    "free tensor": (
+        ph.ClosedForm(),
+        lambda x: ph.Scene(
+            ph.Inertia(full=jnp.array([[2.0, 0.1, 0.2], [0.1, 3.0, -0.1], [0.2, -0.1, 4.0]]))
+        ),
+    ),
+}
+
+
+@pytest.mark.parametrize("method", [SymmetricTop(), FixedAxis()])
+def test_derivatives_at_rest(method):
+    """Damped with the rate k: the rates by exp(-k t), the attitude by half of its integral."""
+    scene = ph.Scene(SYMMETRIC, torque=ph.LinearDamping(0.1 * SYMMETRIC.moments))
+    start = jnp.array([0.5, 0.5, 0.1, -0.7])
+
+    def last(rates):
+        traj = ph.simulate(scene, ph.State(start, rates), [0.0, 2.0], method)
+        return traj.wxyz[-1], traj.omega_body[-1]
+
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        wxyz, omega = jax.jit(jacobian(last))(jnp.zeros(3))
+        np.testing.assert_allclose(omega, np.exp(-0.2) * np.eye(3), rtol=0, atol=1e-14)
+        for k in range(3):
+            turn = ph.rotation.multiply(start, jnp.eye(4)[k + 1] * (1 - np.exp(-0.2)) / 0.1 / 2)
+            np.testing.assert_allclose(wxyz[:, k], turn, rtol=0, atol=1e-14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", RESTING)
+def test_derivatives_at_rest_of_every_closed_form(name):
+    check_at_rest(*RESTING[name])
+
+
+def check_at_rest(method, scene):
+    """By the rates and a number of the scene, against integration."""
+
+    def last(both, method):
+        state = ph.State([0.5, 0.5, 0.1, -0.5], both[:3])
+        traj = ph.simulate(scene(both[3]), state, [0.0, 2.0], method, throw=False)
+        return jnp.concatenate([traj.wxyz[-1], traj.omega_body[-1]])
+
+    rest = jnp.zeros(4)
+    want = jax.jacfwd(lambda x: last(x, ph.LiePoisson()))(rest)
+    assert jnp.max(jnp.abs(want)) > 0.5
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        got = jax.jit(jacobian(lambda x: last(x, method)))(rest)
+        np.testing.assert_allclose(got, want, rtol=0, atol=1e-9)
+
+
+def test_what_the_fixed_axis_cannot_tell_is_nan():
+    """Rates across the axis turn it: their derivatives are not zero, and not elementary."""
+
+    def last(rates):
+        scene = ph.Scene(ph.Inertia.from_moments([2.0, 3.0, 4.0]), torque=ph.LinearDamping(0.1))
+        traj = ph.simulate(scene, ph.State([1.0, 0, 0, 0], rates), [0.0, 2.0], FixedAxis())
+        return jnp.concatenate([traj.wxyz[-1], traj.omega_body[-1]])
+
+    spin, axis = jnp.array([0.0, 0.0, 1.5]), jnp.array([0.0, 0.0, 1.0])
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        got = jax.jit(jacobian(last))(spin)
+        assert jnp.all(jnp.isnan(got[4:6, :2]))
+        np.testing.assert_array_equal(got[6, :2], 0)
+        assert jnp.all(jnp.isfinite(got[:, 2]))
+    along = jax.jit(lambda x: jax.jvp(last, (x,), (axis,))[1])(spin)
+    assert jnp.all(jnp.isfinite(along))
+    second = jax.jit(jax.jacfwd(jax.jacrev(last)))(jnp.zeros(3))
+    assert jnp.all(jnp.isnan(second[6]))

@@ -20,6 +20,7 @@ from polhode._closed_forms._conditions import (
     steady_wheels,
 )
 from polhode._closed_forms._law import AbstractTopMethod
+from polhode._kernels import derivable_once, underivable
 from polhode._method._base import Record
 from polhode._scene import Scene, State
 
@@ -109,7 +110,9 @@ class FixedAxis(AbstractTopMethod):
 
     All rates but one are zero at the start, the constant body torques lie along that axis and the
     damping is linear: d omega/dt = (N - c omega)/I. The axis may differ from body to body.
-    Derivatives with respect to the rates that are zero are those of this motion only: zero.
+    Derivatives with respect to rates and torques across the axis are those of another motion, which
+    is not elementary: they are NaN, and of a body at rest second ones with respect to any rates and
+    torques. (Where these are traced, ``ph.simulate`` does not choose this method by itself.)
     """
 
     chunk: int = eqx.field(static=True, default=2**14)
@@ -141,15 +144,21 @@ class FixedAxis(AbstractTopMethod):
         moments = as_lanes(scene.inertia.moments, n, 1)
         used = (push != 0) | (state.omega_body != 0)
         later = elapsed[:, :, None] * jnp.ones_like(moments)[:, None]
+        axis = jnp.argmax(used, axis=-1)
+        along = jnp.arange(3)[None] == axis[:, None]
+        moving = jnp.any(used, axis=-1, keepdims=True)
+        # Across the axis the equations are coupled, along it and at rest in second order.
+        both = jnp.concatenate([state.omega_body, push], axis=-1)
+        other = jnp.tile(~(along & moving), 2)
+        once = jnp.sum(derivable_once(both, other) - both, axis=-1, keepdims=True)  # zero
+        none = jnp.sum(underivable(both, other & moving) - both, axis=-1, keepdims=True)
+        start = state.omega_body + once + jnp.where(along, 0, none)
         omega, angles = tops.spin(
-            state.omega_body[:, None],
+            start[:, None],
             (damping / moments)[:, None],
             (push / moments)[:, None],
             later,
         )
-        axis = jnp.argmax(used, axis=-1)
-        unit = jnp.where(jnp.arange(3)[None] == axis[:, None], 1, 0).astype(push.dtype)
-        angle = jnp.sum(unit[:, None] * angles, axis=-1)
-        turn = tops.turn(tuple(unit[:, i, None] for i in range(3)), angle)
+        turn = rotation.rotation_vector_to_wxyz(angles)  # regular at rest
         wxyz = rotation.multiply(jnp.broadcast_to(state.wxyz[:, None], turn.shape), turn)
         return wxyz, omega, jnp.sum(used, axis=-1) <= 1

@@ -15,7 +15,6 @@ from polhode._closed_forms._conditions import (
     steady_wheels,
 )
 from polhode._closed_forms._law import AbstractTopMethod
-from polhode._kernels import kernel
 from polhode._method._base import Record
 from polhode._scene import Scene, State, UniformGravity, Wheels
 
@@ -72,7 +71,7 @@ class LagrangeTop(AbstractTopMethod):
         gravity: Any = scene.potential
         centre = as_lanes(gravity.centre_body, n, 1)
         force = as_lanes(gravity.mass, n)[:, None] * as_lanes(gravity.gravity_space, n, 1)
-        wxyz, omega = kernel(tops.lagrange_motion, repeated=True)(
+        wxyz, omega = tops.lagrange_motion(
             transverse, force, centre[:, 2], state.wxyz, state.omega_body, axial, elapsed
         )
         lawful = (moments[:, 0] == moments[:, 1]) & (centre[:, 0] == 0) & (centre[:, 1] == 0)

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode.rotation import multiply
+from polhode.rotation import multiply, rotation_vector_to_wxyz
 
 
 def decay(rate: Array, t: Array) -> Array:
@@ -56,12 +56,8 @@ def precession(
     The axis turns about ``momentum_space`` at |L|/A while the body turns about its axis at ``own``
     = omega_z - L_z/A [rad/s]; ``elapsed``: time, or the integral of what both decay by.
     """
-    square = jnp.sum(momentum_space**2, axis=-1)
-    moving = square > 0
-    size = jnp.sqrt(jnp.where(moving, square, 1))
-    unit = tuple((momentum_space[..., i] / size)[..., None] for i in range(3))
-    rate = (jnp.where(moving, size, 0) / transverse)[..., None]
-    outer = turn(unit, rate * elapsed)
+    rate = momentum_space / transverse[..., None]
+    outer = rotation_vector_to_wxyz(rate[..., None, :] * elapsed[..., None])  # regular at rest
     zero = jnp.zeros_like(elapsed)
     inner = turn((zero, zero, zero + 1), own[..., None] * elapsed)
     middle = jnp.broadcast_to(wxyz[..., None, :], outer.shape)

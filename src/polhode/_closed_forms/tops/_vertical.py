@@ -1,5 +1,7 @@
 """Lagrange's top for any direction of gravity: the frame of the vertical, and back."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -7,16 +9,18 @@ from jaxtyping import Array, Float
 from polhode._closed_forms.tops._complex import Complex
 from polhode._closed_forms.tops._lagrange import at, orbit
 from polhode._closed_forms.tops._pochhammer import Series
+from polhode._closed_forms.tops._short import frequency, reach, short_motion
+from polhode._closed_forms.tops._weightless import with_weight
 from polhode._hamiltonian import components
-from polhode._kernels import opaque_ones, spread, staged
+from polhode._kernels import any_of, kernel, opaque_ones, spread, staged
 
 
 def upward(force: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array, Array], Array]:
     """Turn (w, x, y; z = 0) of space z to an axis along +-force (never downwards), and the signed
     size of the force along it.
 
-    Without force the axis is z: the motion does not depend on it. Its derivative with respect to
-    the horizontal force then does, and is left out.
+    Without force the axis is z: the motion does not depend on it. The derivatives by the force are
+    then those of ``_weightless``.
     """
     square = sum(x * x for x in force)
     acting = square > 0
@@ -53,8 +57,44 @@ def lagrange_motion(
     ``transverse``: moment about any axis through the point and across body z [kg m^2];
     ``force_space``: weight [N], space axes, acting at ``distance`` [m] along body z; ``wxyz``,
     ``omega`` [rad/s]: initial state; ``axial_momentum`` along body z [kg m^2/s], that of wheels on
-    the axis included. Klein & Sommerfeld, Theorie des Kreisels, VI; see ``_lagrange``.
+    the axis included. Klein & Sommerfeld, Theorie des Kreisels, VI; see ``_lagrange``, where
+    the body hardly moves in that time ``_short``, and without force ``_weightless``.
     """
+    given: tuple[Any, ...] = transverse, force_space, distance, wxyz, omega, axial_momentum
+    fixed = jax.lax.stop_gradient((transverse, force_space, distance, omega, axial_momentum))
+    angle = frequency(*fixed)[:, None] * jnp.abs(jax.lax.stop_gradient(elapsed))
+    short = angle < reach(elapsed.dtype)
+    # Derivatives of the closed form would be NaN there: it is evaluated for another motion.
+    still = jnp.all(short, axis=-1)[:, None]
+    weightless = jnp.all(force_space == 0, axis=-1, keepdims=True)
+    force = jnp.where(still | weightless, 0, force_space)
+    start = jnp.where(still, 1, omega)
+    other = transverse, force, distance, wxyz, start, axial_momentum, jnp.where(short, 0, elapsed)
+    closed_form: Any = kernel(_long_motion, repeated=True)
+    motion = closed_form(*other)
+
+    def special(motion, given, elapsed):
+        corrected: Any = kernel(_corrected, repeated=True)
+        return corrected(motion, given, elapsed, short, weightless, still)
+
+    def general(motion, given, elapsed):
+        return list(motion)
+
+    which = any_of(jnp.where(short | weightless, 1, 0))
+    wxyz, omega = jax.lax.cond(which, special, general, motion, given, elapsed)
+    return wxyz, omega
+
+
+def _corrected(motion, given: tuple[Any, ...], elapsed, short, weightless, still) -> Any:
+    """The motion with what the closed form does not have: see ``lagrange_motion``."""
+    small = short_motion(*given, jnp.where(short, elapsed, 0))
+    weighted = with_weight(*given, elapsed, motion, weightless & ~still)
+    motion = [jnp.where(weightless[..., None], x, y) for x, y in zip(weighted, motion)]
+    return [jnp.where(short[..., None], x, y) for x, y in zip(small, motion)]
+
+
+def _long_motion(transverse, force_space, distance, wxyz, omega, axial_momentum, elapsed):
+    """The closed form, arguments and results as of ``lagrange_motion``."""
     # The compiler makes a loop of every axis, be it of length one, and vectors of the last axis
     # only: axes of length one are left out, and the longer one comes last.
     lanes, count = elapsed.shape

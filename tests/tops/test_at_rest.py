@@ -1,0 +1,140 @@
+"""Symmetric bodies at rest, or without weight: values and derivatives against integration."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import polhode as ph
+
+TILTED = [0.8, 0.6, 0.0, 0.0]
+UP, DOWN = [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]
+SLANTED = [3.0, -4.0, -8.0]  # m/s^2
+TS = jnp.array([0.0, 1.0, 3.0])
+USUAL = {"mass": 1.0, "distance": 0.5, "gravity": [0.0, 0.0, -9.80665], "moments": [2.0, 3.0]}
+
+
+def top(numbers, wheel=None):
+    mass, distance, gravity, moments = numbers[0], numbers[1], numbers[2:5], numbers[5:7]
+    potential = ph.UniformGravity.axial(mass, distance, gravity)
+    return ph.Scene(ph.Inertia.axisymmetric(moments[0], moments[1]), potential, rotors=wheel)
+
+
+def numbers_of(rates, **changed):
+    given = USUAL | changed
+    return jnp.concatenate(
+        [jnp.atleast_1d(jnp.asarray(x, float)) for x in given.values()] + [jnp.asarray(rates)]
+    )
+
+
+def last(numbers, wxyz, method, wheel=None):
+    state = ph.State(wxyz, numbers[7:10])
+    traj = ph.simulate(top(numbers, wheel), state, TS, method, rtol=1e-12, throw=False)
+    return jnp.concatenate([traj.wxyz[-1], traj.omega_body[-1]])
+
+
+REST = [0.0, 0.0, 0.0]
+CASES = {
+    "no mass": (TILTED, numbers_of(REST, mass=0.0, gravity=SLANTED)),
+    "no distance": (TILTED, numbers_of(REST, distance=0.0)),
+    "no gravity": (TILTED, numbers_of(REST, gravity=[0.0, 0.0, 0.0])),
+    "hardly any mass": (TILTED, numbers_of(REST, mass=1e-25)),
+    "less than that": (TILTED, numbers_of(REST, mass=1e-300)),
+    "hanging": (DOWN, numbers_of(REST)),
+    "inverted": (UP, numbers_of(REST)),
+    "sleeping": (UP, numbers_of([0.0, 0.0, 9.0])),
+    "spinning without mass": (TILTED, numbers_of([0.0, 0.0, 2.0], mass=0.0, gravity=SLANTED)),
+    "tumbling without mass": (TILTED, numbers_of([0.5, -0.3, 2.0], mass=0.0, gravity=SLANTED)),
+    "tumbling without gravity": (TILTED, numbers_of([0.5, -0.3, 2.0], gravity=[0.0, 0.0, 0.0])),
+    "tumbling about its centre": (TILTED, numbers_of([0.5, -0.3, 2.0], distance=0.0)),
+    "slowly without mass": (TILTED, numbers_of([5e-3, -3e-3, 2e-3], mass=0.0, gravity=SLANTED)),
+}
+WHEELS = {  # the second takes up the momentum of the body, which has none in all
+    "with a wheel": (ph.Rotor([0.0, 0.0, 1.0], momentum=0.7), REST),
+    "balanced by a wheel": (ph.Rotor([0.0, 0.0, 1.0], momentum=-3.0), [0.0, 0.0, 1.0]),
+}
+
+
+def check(wxyz, numbers, wheel=None):
+    exact = jax.jit(lambda x: last(x, wxyz, ph.LagrangeTop(), wheel))
+    stepped = jax.jit(lambda x: last(x, wxyz, ph.LiePoisson(), wheel))
+    np.testing.assert_allclose(exact(numbers), stepped(numbers), rtol=0, atol=1e-12)
+    forward, reverse = jax.jacfwd(exact)(numbers), jax.jacrev(exact)(numbers)
+    np.testing.assert_allclose(forward, jax.jacfwd(stepped)(numbers), rtol=0, atol=1e-9)
+    np.testing.assert_allclose(forward, reverse, rtol=0, atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", CASES)
+def test_against_integration(name):
+    check(*CASES[name])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WHEELS)
+def test_wheels_against_integration(name):
+    wheel, rates = WHEELS[name]
+    check(TILTED, numbers_of(rates, mass=0.0, gravity=SLANTED), wheel)
+
+
+def test_bodies_at_rest_among_others():
+    """A batch over the distance, in which one body rests: nothing of it is NaN."""
+    check_batch(jnp.float64, 1e-14, reverse=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("dtype", "bound"), [(jnp.float64, 1e-14), (jnp.float32, 1e-5)])
+def test_bodies_at_rest_among_others_in_reverse_mode(dtype, bound):
+    check_batch(dtype, bound, reverse=True)
+
+
+def check_batch(dtype, bound, reverse):
+    axes = jax.random.normal(jax.random.key(1), (3, 4), dtype)
+    rates = jnp.array([[0, 0, 0], [0, 0, 0], [0.1, 0.2, 0.3]], dtype)
+    inertia = ph.Inertia.axisymmetric(*jnp.array([2.0, 3.0], dtype))
+    gravity = jnp.array(SLANTED, dtype)
+    ts = jnp.asarray([0.0, 3.0], dtype)
+
+    def moved(distance, rates):
+        potential = ph.UniformGravity.axial(jnp.ones((), dtype), distance, gravity)
+        traj = ph.simulate(ph.Scene(inertia, potential), ph.State(axes, rates), ts)
+        return traj.wxyz[:, -1], traj.omega_body[:, -1]
+
+    distance = jnp.array([0.0, 0.1, 0.5], dtype)
+    (wxyz, omega), by_distance = jax.jit(
+        lambda d: jax.jvp(lambda d: moved(d, rates), (d,), (jnp.ones_like(d),))
+    )(distance)
+    start = ph.State(axes, rates).wxyz[0]
+    np.testing.assert_allclose(wxyz[0], start, rtol=0, atol=bound)
+    np.testing.assert_array_equal(omega[0], 0)
+    # a body at rest: its rates grow by the torque, its attitude by half of that times the time
+    down = ph.rotation.rotate(ph.rotation.conjugate(start), gravity)
+    pull = jnp.cross(jnp.array([0, 0, 1], dtype), down) / jnp.array([2, 2, 3], dtype)
+    np.testing.assert_allclose(by_distance[1][0], 3 * pull, rtol=0, atol=30 * bound)
+    turn = jnp.concatenate([jnp.zeros(1, dtype), pull * 9 / 4])
+    want = ph.rotation.multiply(start, turn)
+    np.testing.assert_allclose(by_distance[0][0], want, rtol=0, atol=30 * bound)
+    assert all(bool(jnp.all(jnp.isfinite(x))) for x in by_distance)
+    if not reverse:
+        return
+    total = jax.grad(lambda d, w: jnp.sum(moved(d, w)[1]), argnums=(0, 1))
+    found = jax.jit(total)(distance, rates)
+    assert all(bool(jnp.all(jnp.isfinite(x))) for x in found)
+    np.testing.assert_allclose(found[0][0], 3 * jnp.sum(pull), rtol=0, atol=50 * bound)
+    np.testing.assert_allclose(found[1][0], 1, rtol=0, atol=bound)
+
+
+@pytest.mark.slow
+def test_second_derivatives_without_weight_are_no_wrong_numbers():
+    """By the weight of a body that turns they are NaN, of one at rest right."""
+
+    def height(mass, rates):
+        numbers = numbers_of(jnp.zeros(3), gravity=SLANTED).at[0].set(mass).at[7:].set(rates)
+        return last(numbers, TILTED, ph.LagrangeTop())[4]
+
+    bend = jax.jit(jax.grad(jax.grad(height)))
+    assert jnp.isnan(bend(0.0, jnp.array([0.5, -0.3, 2.0])))
+    near = (jax.grad(height)(1e-3, jnp.zeros(3)) - jax.grad(height)(-1e-3, jnp.zeros(3))) / 2e-3
+    np.testing.assert_allclose(bend(0.0, jnp.zeros(3)), near, rtol=1e-4)
+    mixed = jax.jit(jax.jacfwd(jax.grad(height), argnums=1))(0.0, jnp.array([0.5, -0.3, 2.0]))
+    assert jnp.all(jnp.isfinite(mixed))
