@@ -86,7 +86,7 @@ CASES = [
     ("run many.toml --processes 0", 2, ["whole number from 1"]),
     ("run many.toml --process 0", 2, ["--processes"]),
     ("run many.toml --processes 2", 2, ["--process"]),
-    ("run many.toml --processes 2 --process 2", 2, ["count from 0"]),
+    ("run many.toml --processes 2 --process 2", 2, ["from 0 to 1"]),
     ("run many.toml --coordinator here", 2, ["HOST:PORT"]),
     ("run many.toml --coordinator here:99999", 2, ["HOST:PORT"]),
     ("run many.toml --coordinator here:80", 2, ["--processes and --process"]),
