@@ -5,12 +5,16 @@ the commands with their files; names select some of these. versions.py runs it.
 """
 
 import contextlib
+import os
 import re
 import sys
 import tempfile
 import warnings
 from importlib.metadata import version
 from pathlib import Path
+
+# as the command line does, see polhode.cli
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
 
 import jax
 import jax.numpy as jnp
@@ -91,6 +95,8 @@ def check_fit():
 
 def check_commands():
     """Scene file to NetCDF, figure and page; ensemble to Zarr; recording to numbers and figure."""
+    import trimesh
+
     from polhode.cli import main as polhode
 
     def run(words):
@@ -100,6 +106,7 @@ def check_commands():
         run("run wing_nut --clones 3 -o nut.nc -q")
         run("view nut.nc")
         run("explain toutatis --clones 0")
+        run("schema")
         batch = "[ensemble]\nbodies = 8\nseed = 1\n[ensemble.attitude]\nany = true\n"
         scene = Path(ph.files.shipped_scenes()["nasa_brick"]).read_text(encoding="utf-8")
         Path("many.toml").write_text(scene.partition("[observations]")[0] + batch)
@@ -107,7 +114,7 @@ def check_commands():
         times = np.linspace(0, 6, 150)
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.6, 2.1]))
         motion = ph.simulate(scene, ph.State([1.0, 0, 0, 0], [0.4, 2.0, 0.5]), times)
-        motion.to_xarray()
+        plot.view(motion, mesh=trimesh.creation.box((1.0, 2.0, 3.0)))
         noise = np.random.default_rng(1).normal(scale=1e-4, size=(150, 3))
         table = np.column_stack([times, np.asarray(motion.omega_body) + noise])
         np.savetxt("imu.csv", table, delimiter=",", header="t,wx,wy,wz", comments="")

@@ -390,3 +390,12 @@ def test_explain_names_the_method(here, capsys):
     (here / "free.toml").write_text(TOP[: TOP.index("[potential]")] + TOP[TOP.index("[times]") :])
     assert main(["explain", "free.toml"]) == 0
     assert "ClosedForm" in capsys.readouterr().out
+
+
+def test_the_log_of_xla_is_off_unless_it_is_asked_for(monkeypatch, capsys):
+    for before, after in ((None, "3"), ("0", "0")):
+        monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
+        if before is not None:
+            monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", before)
+        assert main(["schema"]) == 0
+        assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == after

@@ -31,6 +31,7 @@ TEXTS = {
     "imu.csv": "stamp,a,b,c\n" + RATES,
     "wheel.csv": "t,wx,wy,wz\n" + RATES,
     "header.csv": "t,wx,wy,wz\n",
+    "short.csv": "t,wx,wy,wz,v\n" + "".join(f"{k},1,0,0,{k}\n" for k in range(5)),
     "words.csv": "t,wx,wy,wz\n0,fast,0,0\n1,0,0,0\n",
     "light.csv": "jd,mag\n" + LIGHT,
     "flux.csv": "jd,flux\n" + LIGHT.replace(",10", ",-1"),
@@ -86,7 +87,7 @@ CASES = [
     ("run many.toml --processes 0", 2, ["whole number from 1"]),
     ("run many.toml --process 0", 2, ["--processes"]),
     ("run many.toml --processes 2", 2, ["--process"]),
-    ("run many.toml --processes 2 --process 2", 2, ["count from 0"]),
+    ("run many.toml --processes 2 --process 2", 2, ["from 0 to 1"]),
     ("run many.toml --coordinator here", 2, ["HOST:PORT"]),
     ("run many.toml --coordinator here:99999", 2, ["HOST:PORT"]),
     ("run many.toml --coordinator here:80", 2, ["--processes and --process"]),
@@ -109,6 +110,7 @@ CASES = [
     ("fit wheel.csv --robust -1 --noise 1", 2, ["positive"]),
     ("fit wheel.csv --block 0", 2, ["--block"]),
     ("fit wheel.csv --wheel-inertia nan", 2, ["positive"]),
+    ("fit short.csv --wheel-inertia 1 --columns wheel=v --no-figure", 2, ["at least 8 samples"]),
     ("fit wheel.csv --wheel-axis 0 0 0", 2, ["direction"]),
     ("fit wheel.csv -o x.csv", 2, [".json or .png", ".csv"]),
     ("fit wheel.csv imu.csv", 2, ["one RECORDING"]),
@@ -195,3 +197,11 @@ def test_exit_code_and_message(here, capsys, command, code, words):
     for word in ANY:
         assert word not in told.err
     assert sorted(os.listdir(here)) == before
+
+
+def test_a_light_curve_that_does_not_vary_is_wrong_input(here, capsys):
+    (here / "flat.csv").write_text("jd,mag\n" + "".join(f"{k},10\n" for k in range(9)))
+    assert main(["lightcurve", "flat.csv"]) == 2
+    told = capsys.readouterr().err
+    assert told.startswith("polhode: flat.csv: the brightness does not vary")
+    assert "--debug" not in told

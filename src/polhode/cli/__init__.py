@@ -16,6 +16,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Raises SystemExit for --help, wrong options and termination (143).
     """
+    # Of programs in its cache, jaxlib 0.10.0 reports flags of its own as features that the machine
+    # lacks, as errors. To be set before JAX is imported; what fails is raised as an exception.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     try:
         from polhode.cli._main import main as command_line
     except ModuleNotFoundError as error:

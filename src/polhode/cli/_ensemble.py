@@ -157,7 +157,7 @@ def _meet(path: Path, options: dict[str, Any]) -> None:
     known = options.get("processes"), options.get("process")
     processes, process = known
     if processes is not None and process is not None and process >= processes:
-        raise UsageError(f"--process {process} of --processes {processes}: they count from 0.")
+        raise UsageError(f"--process must be from 0 to {processes - 1}, got {process}.")
     if coordinator is None and not cluster:
         if known[0] is None and known[1] is not None:
             raise UsageError("--process needs --processes, the number of all of them.")

@@ -182,7 +182,10 @@ def _fit(asked: _Asked, goals: list[Path], *, quiet: bool, no_cache: bool, allow
         recording = loaded.recording
         with _cache.kept_programs(not no_cache):
             status.update(f"fitting {recording.times.shape[-1]} samples (compiling first) ...")
-            result = room.fit_recordings([recording], throw=False, **_keywords(asked, room))
+            try:
+                result = room.fit_recordings([recording], throw=False, **_keywords(asked, room))
+            except ValueError as error:  # the recording does not suit the options
+                raise UsageError(f"{asked.path}: {error}") from error
             heed()
             status.update("writing ...")
             written = [_write(goals[0], asked, loaded, result)]

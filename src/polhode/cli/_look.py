@@ -13,7 +13,7 @@ from polhode.cli._options import (
     require,
     whole_number,
 )
-from polhode.cli._targets import check_suffix, stem, target
+from polhode.cli._targets import UsageError, check_suffix, stem, target
 
 
 def view(
@@ -87,5 +87,8 @@ def lightcurve(
         curve = read(path, vectors, floor)
     name = output or path.stem
     goals = [target(name + end, end, force=force) for end in (".png", ".json")]
-    fitted(curve, path.name, *goals, trials=trials, floor=floor, seed=seed)
+    try:
+        fitted(curve, path.name, *goals, trials=trials, floor=floor, seed=seed)
+    except ValueError as error:  # a brightness that does not vary
+        raise UsageError(f"{path}: {error}") from error
     return 0
