@@ -112,7 +112,7 @@ def _() -> str:
 
 @_fragment("exact-scipy")
 def _() -> str:
-    families = ("free", "near_symmetric", "extreme", "separatrix", "long")
+    families = ("free", "near_symmetric", "extreme", "separatrix")
     return _between(_over_ours(_tables(*families), "SciPy closed form"))
 
 
