@@ -1,9 +1,9 @@
-"""``python -m benchmarks``: run them all, draw figures, compare results, write the results page.
+"""``python -m benchmarks``: run them all, draw figures, compare results, write pages.
 
 python -m benchmarks [--quick] [--output FOLDER]   every benchmark, each in its own process
 python -m benchmarks figures FILE ... [--output FOLDER]
 python -m benchmarks compare OLD NEW
-python -m benchmarks page                          benchmarks/README.md and README.md
+python -m benchmarks page                          results page, numbers in pages
 """
 
 import argparse
@@ -16,14 +16,17 @@ from pathlib import Path
 from benchmarks import _compare, _figures, _page, _report
 
 QUICK: dict[str, list[str]] = {
+    "imports": ["--runs", "3"],
     "work_precision": ["--quick"],
     "gradients": ["--quick"],
     "scene_cost": ["--quick"],
 }
 FULL: dict[str, list[str]] = {
-    "work_precision": [], "gradients": [], "scene_cost": [], "scaling": [], "stress": [],
-    "identification": [], "accelerator": [], "free_body": [], "elliptic_accuracy": [],
-    "rotation_stress": [], "torqued": [], "first_calls": [],
+    "imports": [], "first_calls": [], "plain_calls": [], "work_precision": [], "gradients": [],
+    "scene_cost": [], "scaling": [], "free_body": [], "torqued": [],
+    "error_control": ["--bodies", "100"], "moser_veselov": [], "splitting": [],
+    "elliptic_accuracy": [], "rotation_stress": [], "stress": [], "identification": [],
+    "satellites": [], "throw_design": [], "throws_synthetic": [], "accelerator": [],
 }  # fmt: skip
 
 
@@ -58,7 +61,7 @@ def main() -> int:
     compare = actions.add_parser("compare", help="what changed beyond noise")
     compare.add_argument("old", type=Path)
     compare.add_argument("new", type=Path)
-    actions.add_parser("page", help="write benchmarks/README.md and the tables of README.md")
+    actions.add_parser("page", help="write benchmarks/README.md and the numbers in other pages")
     options = parser.parse_args()
     if options.action == "figures":
         for path in _figures.draw(options.files, options.output, f".{options.format}"):

@@ -1,14 +1,12 @@
-"""The results page and the tables of the README, written from the committed JSON only."""
+"""The results page and the block of the README, written from the committed JSON only."""
 
 from pathlib import Path
 
 from benchmarks import _levels
-from benchmarks._markdown import machine, number, rows
-from benchmarks._report import RESULTS, read
+from benchmarks._markdown import command, machine, number, rows, source
+from benchmarks._report import RESULTS, ROOT, read
 from benchmarks._sections import SECTIONS, generic
 
-ROOT = Path(__file__).resolve().parents[1]
-BEGIN, END = "<!-- benchmarks: begin -->", "<!-- benchmarks: end -->"
 PEERS = ("heyoka", "diffrax", "SciPy closed form", "SciPy solve_ivp", "Numba", "MuJoCo")
 
 INTRODUCTION = """\
@@ -19,7 +17,7 @@ number here stands in one of those files, with the command that made it.
 
 ```sh
 make bench                          # quick tables and figures into out/benchmarks
-python -m benchmarks                # the same in full: an hour on one core
+python -m benchmarks                # the same in full: hours on one core
 python -m benchmarks.NAME           # one benchmark; --quick, --output FILE, --help
 python -m benchmarks compare A B    # what changed between two results beyond noise
 python -m benchmarks figures FILES  # draw figures from results
@@ -31,6 +29,11 @@ installed is named as missing. The same bodies go to every program, drawn from a
 take turns, so that a machine whose speed changes shifts them all. Times are medians with compiling
 apart; errors are angles in radians against Taylor series of 40 digits (`benchmarks/truth.py`),
 which use nothing of the package.
+
+Every result names its commit: that of the code measured, with `-dirty` where it was changed, or, for
+older results, the commit that brought the file into the repository ("committed with"). Other pages
+quote results between markers (`benchmarks/_fragments.py`); the same command writes them, and a test
+compares them.
 """
 
 
@@ -138,13 +141,16 @@ def merged() -> dict | None:
     if not paths:
         return None
     reports = [read(path) for path in paths]
+    runs = {(r["date"], str(sorted(r["machine"].items())), r.get("commit")) for r in reports}
+    if len(runs) > 1:
+        raise ValueError("work_precision*.json are of several commits, machines or days: run again")
     from benchmarks.problems import PROBLEMS
 
     tables = [t for report in reports for t in report["numbers"]["tables"]]
     order = list(PROBLEMS)
     tables.sort(key=lambda t: (order.index(t["family"]), t["dtype"], t["bodies"]))
     whole = dict(reports[0])
-    whole["commands"] = [report["command"] for report in reports]
+    whole["reports"] = reports
     missing = {k: v for report in reports for k, v in report["numbers"]["missing"].items()}
     whole["numbers"] = {"tables": tables, "missing": missing}
     return whole
@@ -152,8 +158,7 @@ def merged() -> dict | None:
 
 def work_precision(report: dict) -> list[str]:
     lines = ["## Error against run time", ""]
-    for command in dict.fromkeys(report["commands"]):
-        lines.append(f"- {machine({**report, 'command': command})}")
+    lines += [f"- {machine(each)}" for each in report["reports"]]
     for name, why in report["numbers"]["missing"].items():
         lines.append(f"- Missing: {name} ({why}).")
     lines += [
@@ -201,35 +206,44 @@ def page(names: list[str] | None = None) -> str:
 
 
 def readme_block() -> str:
-    """The generated part of the README: a figure, a table, the command."""
+    """The generated part of the README: a figure, two tables, the commands."""
     report = merged()
     if report is None:
         return ""
     lines = []
     for table in report["numbers"]["tables"]:
-        if table["bodies"] != 1000 or table["dtype"] != "float64":
-            continue
         mine = [row for row in table["rows"] if _levels.ours(row)]
-        if any(row["setting"] != "exact" for row in mine):  # how it steps has changed since
+        stepped = any(row["setting"] != "exact" for row in mine)
+        if table["dtype"] != "float64" or table["bodies"] not in (
+            (1, 1000) if stepped else (1000,)
+        ):
             continue
-        cells = [table["title"]]
-        cells.append(number(_levels.time_at(mine, 1e-9), 1e3))
+        about = ", integrated" * stepped + ", one body" * (table["bodies"] == 1)
+        cells = [table["title"] + about, number(_levels.time_at(mine, 1e-9), 1e3)]
         cells += [number(best(table, p, 1e-9, "attitude_median"), 1e3) for p in PEERS]
         lines.append(cells)
     return "\n".join([
-        BEGIN,
         "![error against run time per body](benchmarks/results/work_precision.svg)", "",
-        "Exact laws: microseconds per body, on one core, for a median attitude error of 1e-9 rad at"
-        " t = 100 (1e5 in the last row), 1,000 bodies, float64, compiling apart; a dash: never"
-        " reached, or not offered:", "",
+        "Microseconds per body, on one core, for a median attitude error of 1e-9 rad at t = 100"
+        " (1e5 in the last row), 1,000 bodies where none are named, float64, compiling apart; a"
+        " dash: never reached, or not offered; rows that are not marked as integrated are closed"
+        " forms in polhode:", "",
         *rows(["", "polhode", *PEERS], lines),
-        "Made by `python -m benchmarks.work_precision`; quick tables by `make bench`; all results,"
-        " other precisions and sizes, and where others are better:"
-        " [benchmarks](benchmarks/README.md).",
+        f"Made by `python -m benchmarks.work_precision` ({runs(report)});"
+        " quick tables by `make bench`; all results, other precisions and sizes, and where others"
+        " are better: [benchmarks](benchmarks/README.md).",
         "",
         *plain_calls_block(),
-        END,
     ])  # fmt: skip
+
+
+def runs(report: dict) -> str:
+    """The sources of the merged results, each with its families."""
+    found: dict[str, list[str]] = {}
+    for each in report["reports"]:
+        families = dict.fromkeys(table["family"] for table in each["numbers"]["tables"])
+        found.setdefault(source(each), []).extend(families)
+    return "; ".join(f"{made}: {', '.join(families)}" for made, families in found.items())
 
 
 def plain_calls_block() -> list[str]:
@@ -246,19 +260,24 @@ def plain_calls_block() -> list[str]:
         if row["bodies"] == 1000 or (row["family"] == "heavy_top" and row["bodies"] == 1)
     ]  # fmt: skip
     return [
-        "What a call costs as it is typed, `ph.simulate(scene, state, [0, 100])`, beside its bare"
-        " program for the last state, microseconds per body (`python -m benchmarks.plain_calls`):",
+        "Cost of an ordinary call, `ph.simulate(scene, state, [0, 100])`, beside that of its"
+        " compiled program for the last state, at the default `rtol`, microseconds per body"
+        f" ({command(read('plain_calls'))}):",
         "",
-        *rows(["", "bare", "plain call", "each of 100 saved times", "median error"], lines),
+        *rows(["", "program", "call", "each of 100 saved times", "median error"], lines),
     ]
 
 
 def write() -> list[Path]:
-    """Write benchmarks/README.md and the generated part of README.md; the files."""
-    target, readme = ROOT / "benchmarks" / "README.md", ROOT / "README.md"
-    target.write_text(page())
-    text = readme.read_text()
-    if BEGIN in text:
-        before, _, rest = text.partition(BEGIN)
-        readme.write_text(before + readme_block() + rest.partition(END)[2])
-    return [target, readme]
+    """Write benchmarks/README.md and the fragments of all pages; the files."""
+    from benchmarks import _fragments
+
+    target = ROOT / "benchmarks" / "README.md"
+    target.write_text(page(), encoding="utf-8")
+    written = [target]
+    for path in _fragments.pages():
+        text = path.read_text(encoding="utf-8")
+        if _fragments.MARK.search(text):
+            path.write_text(_fragments.filled(text), encoding="utf-8")
+            written.append(path)
+    return written

@@ -1,17 +1,21 @@
 """What every benchmark shares: how it times, what it writes, where it reads.
 
-A result is one JSON file with the fields ``name``, ``command``, ``date``, ``versions``,
-``machine``, ``flags``, ``threads`` and ``numbers``; figures and tables are made from such files
-only. Call ``one_thread()`` before the first import of jax for single-threaded numbers.
+A result is one JSON file with the fields ``name``, ``command``, ``date``, ``commit``,
+``versions``, ``machine``, ``flags``, ``threads`` and ``numbers``; figures and tables are made from
+such files only. Results from before ``commit`` was recorded have ``committed_with`` instead: the
+commit that brought the file into the repository. Call ``one_thread()`` before the first import of
+jax for single-threaded numbers.
 """
 
 import argparse
 import importlib.metadata
+import importlib.util
 import json
 import math
 import os
 import platform
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
@@ -22,7 +26,8 @@ from typing import Any, NamedTuple
 RESULTS = Path(__file__).resolve().parent / "results"
 """The committed results of the last full runs."""
 
-OUT = Path(__file__).resolve().parents[1] / "out" / "benchmarks"
+ROOT = Path(__file__).resolve().parents[1]
+OUT = ROOT / "out" / "benchmarks"
 """Where runs write when nothing else is asked for."""
 
 PACKAGES = ("jax", "jaxlib", "diffrax", "equinox", "numpy")
@@ -38,15 +43,44 @@ def one_thread() -> None:
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
 
 
+def commit() -> str | None:
+    """The commit that is measured, with ``-dirty`` where its code was changed; None: unknown.
+
+    Unknown without git, and where polhode is imported from elsewhere than this checkout. Results
+    and generated pages do not count as changes.
+    """
+    spec = importlib.util.find_spec("polhode")
+    if spec is None or not Path(str(spec.origin)).resolve().is_relative_to(ROOT):
+        return None
+    code = ("src", "benchmarks", ":!benchmarks/results", ":!benchmarks/README.md")
+    try:
+        head = _git("rev-parse", "HEAD")
+        return head + ("-dirty" if _git("status", "--porcelain", "--", *code) else "")
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+def today() -> str:
+    """The date in UTC."""
+    return datetime.now(UTC).date().isoformat()
+
+
+def _git(*words: str) -> str:
+    done = subprocess.run(["git", *words], cwd=ROOT, capture_output=True, text=True, check=True)
+    return done.stdout.strip()
+
+
 def machine() -> dict[str, Any]:
-    """The machine in general terms: kind of processor, cores, memory, accelerator if any."""
-    processor = platform.machine()
+    """The machine without its name: processor, model, cores, memory, accelerator if any."""
+    processor, model = platform.machine(), platform.processor()
     about = Path("/proc/cpuinfo")
     if about.exists():
-        flags = set(next((x for x in about.read_text().split("\n") if "flags" in x), "").split())
+        fields = dict(_field(line) for line in reversed(about.read_text().splitlines()))
+        flags = set(fields.get("flags", "").split())
         wide = [name for name in ("avx512f", "avx2", "avx") if name in flags]
         processor += f" with {wide[0].upper().removesuffix('F')}" if wide else ""
-    found: dict[str, Any] = {"processor": processor, "cores": os.cpu_count()}
+        model = fields.get("model name", model)
+    found: dict[str, Any] = {"processor": processor, "model": model, "cores": os.cpu_count()}
     if hasattr(os, "sysconf") and "SC_PHYS_PAGES" in os.sysconf_names:
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         found["memory_GB"] = round(memory / 2**30)
@@ -55,6 +89,12 @@ def machine() -> dict[str, Any]:
         device = sys.modules["jax"].devices()[0]
         found["device"] = device.device_kind if device.platform != "cpu" else "cpu"
     return found
+
+
+def _field(line: str) -> tuple[str, str]:
+    """Name and value of a line of /proc/cpuinfo."""
+    name, _, value = line.partition(":")
+    return name.strip(), value.strip()
 
 
 def versions(*more: str) -> dict[str, str | None]:
@@ -104,7 +144,8 @@ def write(
     report = {
         "name": name,
         "command": command(name),
-        "date": datetime.now(UTC).date().isoformat(),
+        "date": today(),
+        "commit": commit(),
         "versions": versions(*packages),
         "machine": machine(),
         "flags": os.environ.get("XLA_FLAGS", ""),

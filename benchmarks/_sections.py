@@ -4,7 +4,7 @@ import math
 from typing import Any
 
 from benchmarks._light_curve_section import light_curves
-from benchmarks._markdown import machine, number, rows
+from benchmarks._markdown import machine, number, rows, source
 from benchmarks._throw_sections import satellites, throw_design, throws, throws_synthetic
 
 
@@ -37,7 +37,11 @@ def scene_cost(report: dict) -> list[str]:
     return [
         "## What each kind of scene costs", "", machine(report), "",
         "Operations and bytes as the compiler counts them (the body of a loop once): what a scene"
-        " does not need is not in its program.", "", *rows(header, lines),
+        " does not need is not in its program. Times compare the rows of this table alone: the"
+        " programs return whole trajectories, and the top, of moments (1, 2, 3) and with a centre"
+        " of mass given as a vector, takes more steps and more work in each than the top of the"
+        " other tables, of moments (1, 1.5, 2) and with a centre of mass on its third axis.", "",
+        *rows(header, lines),
     ]  # fmt: skip
 
 
@@ -132,14 +136,20 @@ def identification(report: dict) -> list[str]:
          number(case["faster"]), number(case["error_ours"]), number(case["error_scipy"])]
         for k, case in enumerate(speed["cases"])
     ]  # fmt: skip
+    parts = numbers.get("origin", {})
+
+    def origin(part):
+        return f" ({source(parts[part])})" if part in parts else ""
+
     others = ["case", "polhode [ms]", "SciPy [ms]", "ratio", "error", "error of SciPy"]
     return [
         "## Identification", "", machine(report), "",
         "![errors over the bound, cover, times](results/identification.svg)", "",
         "Errors of the tensor over the Cramér-Rao bound and cover of 95 % intervals, with standard"
-        " errors; flagged bodies left out:", "", *rows(header, lines),
+        f" errors; flagged bodies left out{origin('designs')}:", "", *rows(header, lines),
         "One recording of 1,000 samples, from raw rates to covariance, beside `least_squares` over"
-        f" `solve_ivp`; tracing and compiling {number(speed['compile_and_trace_s'])} s once:", "",
+        f" `solve_ivp`; tracing and compiling {number(speed['compile_and_trace_s'])} s once"
+        f"{origin('speed')}:", "",
         *rows(others, cases),
         f"{speed['batch_bodies']:,} bodies in one call cost"
         f" {number(speed['batch_per_body_over_best_single'])} of the best single fit each"
@@ -349,7 +359,9 @@ def plain_calls(report: dict) -> list[str]:
     return [
         "## Plain calls", "", machine(report), "",
         "`ph.simulate` as typed, with its checks and both times, beside the compiled program for"
-        " the last state alone.", "", *rows(header, lines),
+        " the last state alone, at the default `rtol`; the errors beside are those reached. Error"
+        " against run time, above, interpolates to a given error instead, and takes the time of"
+        " one body from three.", "", *rows(header, lines),
         "Free bodies by saved times, ns per body; how far the dearest lies above a straight line"
         " between its neighbours:", "",
         *rows(["bodies", "dearest over its neighbours", "saved times: ns per body"], sweeps),
@@ -374,8 +386,18 @@ def first_calls(report: dict) -> list[str]:
     ]  # fmt: skip
 
 
+def imports(report: dict) -> list[str]:
+    lines = [[row["program"], number(row["seconds"])] for row in report["numbers"]["rows"]]
+    return [
+        "## Imports", "", machine(report), "",
+        f"Least seconds of a new process over {report['numbers']['runs']} alternated runs, beside"
+        " the libraries that polhode builds on.", "",
+        *rows(["", "time [s]"], lines),
+    ]  # fmt: skip
+
+
 SECTIONS = {
-    "plain_calls": plain_calls, "first_calls": first_calls,
+    "imports": imports, "plain_calls": plain_calls, "first_calls": first_calls,
     "gradients": gradients, "scene_cost": scene_cost, "scaling": scaling,
     "identification": identification, "throws": throws,
     "throws_synthetic": throws_synthetic, "throw_design": throw_design, "satellites": satellites,

@@ -1,6 +1,6 @@
 """Sections of the results page about throws and wheels."""
 
-from benchmarks._markdown import machine, number, rows
+from benchmarks._markdown import machine, number, rows, source
 
 
 def throws(report: dict) -> list[str]:
@@ -37,13 +37,15 @@ def throws_synthetic(report: dict) -> list[str]:
             for row in report["numbers"][name]
         ]  # fmt: skip
 
+    part = report["numbers"].get("origin", {}).get("own_noise")
+    own = f" ({source(part)})" if part else ""
     return [
         "## Simulated throws", "", machine(report), "",
         "Bodies of 1 to 30 times the inertia of the TU Delft device, each throw alone, with the"
-        " noise that 40 of 120 show; three principal moments.", "",
+        " noise that 40 of every 120 show; three principal moments.", "",
         *rows([*header, "40 throws together: rms error over the one stated"],
               lines("sizes", kinds)), "",
-        "The same where each throw has to tell its noise as well.", "",
+        f"The same with the noise of each throw estimated from that throw alone{own}.", "",
         *rows(header, lines("own_noise", kinds)),
     ]  # fmt: skip
 

@@ -7,7 +7,6 @@ compile time apart, and the attitude error against truth that is independent of 
 """
 
 import argparse
-import json
 from pathlib import Path
 
 from benchmarks import _report
@@ -73,9 +72,8 @@ def main() -> None:
             f"{found['attitude_worst']:>10.1e}",
             flush=True,
         )
-    if options.output:
-        options.output.parent.mkdir(parents=True, exist_ok=True)
-        options.output.write_text(json.dumps({"horizon": HORIZON, "rows": rows}, indent=1))
+    path = _report.write("charts", {"horizon": HORIZON, "rows": rows}, path=options.output)
+    print(f"written: {path.name}")
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ import sys
 import time
 from pathlib import Path
 
-from benchmarks._report import OUT, one_thread, read, write
+from benchmarks._report import OUT, commit, one_thread, read, today, write
 
 if __name__ == "__main__":
     one_thread()
@@ -282,6 +282,7 @@ def main() -> int:
     parser.add_argument("--output", type=Path, default=OUT / "identification.json")
     options = parser.parse_args()
     numbers = read(options.output)["numbers"] if options.part and options.output.exists() else {}
+    origin = numbers.setdefault("origin", {})
     if options.part != "speed":
         squares, covers, rows = [], [], []
         for row in DESIGNS[: 2 if options.quick else None]:
@@ -292,9 +293,11 @@ def main() -> int:
             print(json.dumps(found), flush=True)
         numbers["designs"] = rows
         numbers["designs_pooled"] = summary(np.concatenate(squares), np.concatenate(covers))
+        origin["designs"] = {"date": today(), "commit": commit()}
         print(json.dumps(numbers["designs_pooled"], indent=1))
     if options.part != "designs":
         numbers["speed"] = speed(50 if options.quick else 1000, options.quick)
+        origin["speed"] = {"date": today(), "commit": commit()}
         print(json.dumps(numbers["speed"], indent=1))
     path = write(
         "identification", numbers, path=options.output, packages=("scipy", "optimistix", "lineax")

@@ -1,6 +1,6 @@
 """Time from a new process to the names of a scene, beside the libraries that polhode builds on.
 
-    python -m benchmarks.imports [--runs 7]
+    python -m benchmarks.imports [--runs 7] [--output out/imports.json]
 
 Least wall time of each import over the runs, alternated; compare within one run only.
 """
@@ -9,6 +9,9 @@ import argparse
 import subprocess
 import sys
 import time
+from pathlib import Path
+
+from benchmarks import _report
 
 PROGRAMS = {
     "import jax": "import jax",
@@ -23,18 +26,29 @@ PROGRAMS = {
 }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=7)
-    runs = parser.parse_args().runs
-    least = dict.fromkeys(PROGRAMS, float("inf"))
+def measure(programs: dict[str, str], runs: int) -> list[dict]:
+    """Least seconds of a new process for each program."""
+    least = dict.fromkeys(programs, float("inf"))
     for _ in range(runs):
-        for name, program in PROGRAMS.items():
+        for name, program in programs.items():
             start = time.perf_counter()
             subprocess.run([sys.executable, "-c", program], check=True)
             least[name] = min(least[name], time.perf_counter() - start)
-    for name, seconds in least.items():
-        print(f"{name:30} {seconds:6.2f} s")
+    return [{"program": name, "seconds": seconds} for name, seconds in least.items()]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--runs", type=int, default=7)
+    parser.add_argument("--output", type=Path)
+    options = parser.parse_args()
+    rows = measure(PROGRAMS, options.runs)
+    for row in rows:
+        print(f"{row['program']:30} {row['seconds']:6.2f} s")
+    path = _report.write("imports", {"runs": options.runs, "rows": rows}, path=options.output)
+    print(f"written: {path.name}")
 
 
 if __name__ == "__main__":

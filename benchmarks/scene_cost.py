@@ -16,6 +16,7 @@ from benchmarks import _report
 if __name__ == "__main__":
     _report.one_thread()
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -62,7 +63,7 @@ def program(scene, state, ts, record, rtol=1e-9):
     """The compiled program that ``simulate`` runs for a scene."""
     method, _ = choose(scene, state, record)
     arguments = (method, scene, state, ts, jnp.asarray(rtol, ts.dtype), record)
-    return run.lower(*arguments).compile(), arguments
+    return eqx.filter_jit(run).lower(*arguments).compile(), arguments
 
 
 def counts(compiled) -> dict[str, float]:

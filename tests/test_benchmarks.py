@@ -2,14 +2,32 @@
 
 import ast
 import dataclasses
+import importlib.util
 import json
 import math
+import pkgutil
+import platform
+import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from benchmarks import _compare, _figures, _levels, _page, _report, problems, truth
+import benchmarks
+from benchmarks import (
+    __main__ as command,
+    _compare,
+    _figures,
+    _fragments,
+    _levels,
+    _markdown,
+    _page,
+    _report,
+    problems,
+    truth,
+)
 from benchmarks.problems import PROBLEMS
 
 FREE = PROBLEMS["free"]
@@ -150,6 +168,42 @@ def test_every_installed_peer_is_in_the_table_and_the_others_are_named():
 
 
 # The benchmarks themselves
+
+
+PEERS = {"mujoco", "numba", "heyoka"}  # in the dependency group `bench`
+
+
+def test_every_benchmark_can_be_imported():
+    lost = set()
+    for module in pkgutil.walk_packages(benchmarks.__path__, "benchmarks."):
+        try:
+            importlib.import_module(module.name)
+        except ModuleNotFoundError as error:
+            lost.add(error.name)
+    assert lost <= PEERS
+
+
+def test_every_benchmark_that_runs_with_the_others_takes_an_output():
+    for name in {**command.QUICK, **command.FULL}:
+        source = Path(_report.__file__).with_name(f"{name}.py").read_text(encoding="utf-8")
+        assert '"--output"' in source, name
+
+
+def test_times_of_imports_are_written_and_shown(tmp_path):
+    from benchmarks import _sections, imports
+
+    rows = imports.measure({"nothing": "pass"}, 1)
+    assert rows[0]["seconds"] > 0
+    path = _report.write("imports", {"runs": 1, "rows": rows}, path=tmp_path / "imports.json")
+    assert any("| nothing |" in line for line in _sections.SECTIONS["imports"](_report.read(path)))
+
+
+def test_the_operations_of_a_scene_are_counted():
+    from benchmarks import scene_cost
+
+    row, call = scene_cost.build("free, spherical, final state", 4)
+    assert row["flops"] > 0
+    assert call() is not None
 
 
 @pytest.mark.slow
@@ -366,11 +420,160 @@ def test_figures_are_drawn_from_results(tmp_path):
     assert made.read_text() == (_figures.draw([path], tmp_path)[0]).read_text()
 
 
-def test_pages_hold_the_numbers_of_the_committed_results():
-    readme = (_page.ROOT / "README.md").read_text(encoding="utf-8")
-    page = _page.ROOT / "benchmarks" / "README.md"
-    mend = "run: python -m benchmarks page"
-    text = page.read_text(encoding="utf-8")
-    assert text == _page.page(_page.names_on(text)), mend
-    if _page.merged() is not None:
-        assert _page.readme_block() in readme, mend
+WRITE = "run: python -m benchmarks page"
+
+
+def test_the_results_page_holds_the_numbers_of_the_committed_results():
+    text = (_page.ROOT / "benchmarks" / "README.md").read_text(encoding="utf-8")
+    assert text == _page.page(_page.names_on(text)), WRITE
+
+
+QUOTING = [p for p in _fragments.pages() if "<!-- result: " in p.read_text(encoding="utf-8")]
+
+
+@pytest.mark.parametrize("path", QUOTING, ids=lambda path: path.stem)
+def test_pages_quote_the_committed_results(path):
+    text = path.read_text(encoding="utf-8")
+    assert _fragments.filled(text) == text, WRITE
+
+
+@pytest.mark.parametrize("path", QUOTING, ids=lambda path: path.stem)
+def test_a_changed_number_in_a_page_is_found(path):
+    text = path.read_text(encoding="utf-8")
+    for match in _fragments.MARK.finditer(text):
+        digit = max(k for k, letter in enumerate(match[2]) if letter.isdigit()) + match.start(2)
+        changed = text[:digit] + str(9 - int(text[digit])) + text[digit + 1 :]
+        assert _fragments.filled(changed) == text != changed, match[1]
+
+
+def test_markers_of_results_come_in_pairs_within_lines_or_around_blocks():
+    used = set()
+    for path in QUOTING:
+        text = path.read_text(encoding="utf-8")
+        matches = list(_fragments.MARK.finditer(text))
+        assert len(matches) == text.count("<!-- result: ") == text.count("<!-- end -->"), path.name
+        for match in matches:
+            used.add(match[1])
+            block = match[2].startswith("\n")
+            assert match[2].endswith("\n") == block, match[1]
+            before = text[: match.start()].rpartition("\n")[2].lstrip()
+            assert bool(before) != block, f"{path.name}: {match[1]} begins a line, or does not"
+    assert used == set(_fragments.FRAGMENTS)
+
+
+HASH = re.compile(r"[0-9a-f]{40}")
+
+
+def git(*words: str, folder: Path = _report.ROOT) -> str | None:
+    """What git prints; None where it fails or is not installed."""
+    try:
+        done = subprocess.run(["git", *words], cwd=folder, capture_output=True, text=True)
+    except FileNotFoundError:
+        return None
+    return done.stdout if done.returncode == 0 else None
+
+
+@pytest.mark.parametrize("path", sorted(_report.RESULTS.glob("*.json")), ids=lambda p: p.stem)
+def test_a_committed_result_names_its_commit(path):
+    report = _report.read(path)
+    assert ("commit" in report) != ("committed_with" in report)
+    assert HASH.fullmatch(report.get("commit") or report["committed_with"])
+    for part in report["numbers"].get("origin", {}).values():
+        assert HASH.fullmatch(part.get("commit") or part["committed_with"])
+
+
+@pytest.mark.parametrize("path", sorted(_report.RESULTS.glob("*.json")), ids=lambda p: p.stem)
+def test_the_commit_named_holds_the_same_numbers(path):
+    """As far as the clone has the history."""
+    report = _report.read(path)
+    parts = dict(report["numbers"].pop("origin", {}))
+    origins = {None: report, **parts}
+    for part, origin in origins.items():
+        if "committed_with" not in origin:
+            continue
+        text = git("show", f"{origin['committed_with']}:benchmarks/results/{path.name}")
+        if text is None:
+            pytest.skip("a clone without that commit")
+        then = json.loads(text)["numbers"]
+        then.pop("origin", None)
+        if part is None:
+            assert then == report["numbers"]
+        else:
+            assert then[part] == report["numbers"][part], part
+
+
+def test_a_result_names_the_commit_and_the_machine_that_made_it(tmp_path):
+    path = _report.write("thing", {"ns": 1.0}, path=tmp_path / "a.json")
+    report = _report.read(path)
+    head = git("rev-parse", "HEAD")
+    assert report["commit"] is None if head is None else report["commit"][:40] == head.strip()
+    assert {"model", "cores"} <= set(report["machine"])
+    assert {"python", "polhode", "jax", "jaxlib"} <= set(report["versions"])
+    text = path.read_text()
+    assert platform.node() not in report["machine"].values()
+    assert str(Path.home()) not in text
+    assert str(_report.ROOT) not in text
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """A repository with a package of the name polhode, in place of this one."""
+    package = tmp_path / "src" / "polhode" / "__init__.py"
+    result = tmp_path / "benchmarks" / "results" / "a.json"
+    for file in (package, result):
+        file.parent.mkdir(parents=True)
+        file.write_text("1\n")
+    if git("init", "-q", folder=tmp_path) is None:
+        pytest.skip("needs git")
+    git("add", ".", folder=tmp_path)
+    who = ("-c", "user.name=a", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false")
+    assert git(*who, "commit", "-q", "-m", "a", folder=tmp_path) is not None
+    spec = importlib.util.spec_from_file_location("polhode", package)
+    monkeypatch.setattr(_report.importlib.util, "find_spec", lambda name: spec)
+    monkeypatch.setattr(_report, "ROOT", tmp_path)
+    return tmp_path
+
+
+def test_changed_code_marks_the_commit_and_changed_results_do_not(checkout):
+    head = _report.commit()
+    assert HASH.fullmatch(head)
+    (checkout / "benchmarks" / "results" / "a.json").write_text("2\n")
+    assert _report.commit() == head
+    for name in ("src/polhode/new.py", "benchmarks/new.py", "src/polhode/__init__.py"):
+        file, before = checkout / name, None
+        before = file.read_text() if file.exists() else None
+        file.write_text("2\n")
+        assert _report.commit() == f"{head}-dirty", name
+        file.unlink() if before is None else file.write_text(before)
+        assert _report.commit() == head
+
+
+def test_no_commit_is_named_for_a_package_from_elsewhere(checkout, monkeypatch, tmp_path_factory):
+    elsewhere = tmp_path_factory.mktemp("site") / "__init__.py"
+    spec = importlib.util.spec_from_file_location("polhode", elsewhere)
+    monkeypatch.setattr(_report.importlib.util, "find_spec", lambda name: spec)
+    assert _report.commit() is None
+
+
+def test_pages_say_where_the_commit_is_from():
+    made = {"date": "2026-01-02", "commit": "0123456789" * 4}
+    assert _markdown.source(made) == "2026-01-02, commit `0123456`"
+    dirty = {**made, "commit": made["commit"] + "-dirty"}
+    assert _markdown.source(dirty) == "2026-01-02, commit `0123456` with uncommitted changes"
+    old = {"date": "2026-01-02", "committed_with": made["commit"]}
+    assert _markdown.source(old) == "2026-01-02, committed with `0123456`"
+    assert _markdown.source({**made, "commit": None}) == "2026-01-02, commit unknown"
+
+
+@pytest.mark.parametrize(
+    "change", [{"date": "2026-01-01"}, {"commit": "a" * 40}, {"machine": {"cores": 1}}], ids=str
+)
+def test_one_table_is_of_one_commit_machine_and_day(tmp_path, monkeypatch, change):
+    for path in _report.RESULTS.glob("work_precision*.json"):
+        shutil.copy(path, tmp_path)
+    monkeypatch.setattr(_page, "RESULTS", tmp_path)
+    assert _page.merged() is not None
+    path = tmp_path / "work_precision_free.json"
+    path.write_text(json.dumps({**_report.read(path), **change}))
+    with pytest.raises(ValueError, match="several commits, machines or days"):
+        _page.merged()
