@@ -30,7 +30,7 @@ take turns, so that a machine whose speed changes shifts them all. Times are med
 apart; errors are angles in radians against Taylor series of 40 digits (`benchmarks/truth.py`),
 which use nothing of the package.
 
-Every result names its commit: that of the code measured, with `-dirty` where it was changed, or, for
+Every result names its commit: that of the code measured, with `-dirty` where it was changed; or for
 older results, the commit that brought the file into the repository ("committed with"). Other pages
 quote results between markers (`benchmarks/_fragments.py`); the same command writes them, and a test
 compares them.
