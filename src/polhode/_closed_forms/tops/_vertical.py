@@ -85,7 +85,7 @@ def lagrange_motion(
     return wxyz, omega
 
 
-def _corrected(motion, given: tuple[Any, ...], elapsed, short, weightless, still) -> Any:
+def _corrected(motion, given: Any, elapsed, short, weightless, still) -> Any:
     """The motion with what the closed form does not have: see ``lagrange_motion``."""
     small = short_motion(*given, jnp.where(short, elapsed, 0))
     weighted = with_weight(*given, elapsed, motion, weightless & ~still)
