@@ -87,8 +87,13 @@ def lagrange_motion(
 
 def _corrected(motion, given: Any, elapsed, short, weightless, still) -> Any:
     """The motion with what the closed form does not have: see ``lagrange_motion``."""
-    small = short_motion(*given, jnp.where(short, elapsed, 0))
-    weighted = with_weight(*given, elapsed, motion, weightless & ~still)
+    transverse, force, distance, wxyz, omega, axial = given
+    small = short_motion(
+        transverse, force, distance, wxyz, omega, axial, jnp.where(short, elapsed, 0)
+    )
+    weighted = with_weight(
+        transverse, force, distance, wxyz, omega, axial, elapsed, motion, weightless & ~still
+    )
     motion = [jnp.where(weightless[..., None], x, y) for x, y in zip(weighted, motion)]
     return [jnp.where(short[..., None], x, y) for x, y in zip(small, motion)]
 
