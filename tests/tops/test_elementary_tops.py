@@ -161,21 +161,18 @@ def check_at_rest(method, scene):
         np.testing.assert_allclose(got, want, rtol=0, atol=1e-9)
 
 
-def test_what_the_fixed_axis_cannot_tell_is_nan():
-    """Rates across the axis turn it: their derivatives are not zero, and not elementary."""
+def test_derivatives_across_a_fixed_axis_are_those_of_this_motion():
+    """Of a body that turns they are zero; of one at rest the second ones are NaN."""
 
     def last(rates):
         scene = ph.Scene(ph.Inertia.from_moments([2.0, 3.0, 4.0]), torque=ph.LinearDamping(0.1))
         traj = ph.simulate(scene, ph.State([1.0, 0, 0, 0], rates), [0.0, 2.0], FixedAxis())
         return jnp.concatenate([traj.wxyz[-1], traj.omega_body[-1]])
 
-    spin, axis = jnp.array([0.0, 0.0, 1.5]), jnp.array([0.0, 0.0, 1.0])
+    spin = jnp.array([0.0, 0.0, 1.5])
     for jacobian in (jax.jacfwd, jax.jacrev):
         got = jax.jit(jacobian(last))(spin)
-        assert jnp.all(jnp.isnan(got[4:6, :2]))
-        np.testing.assert_array_equal(got[6, :2], 0)
+        np.testing.assert_array_equal(got[:, :2], 0)
         assert jnp.all(jnp.isfinite(got[:, 2]))
-    along = jax.jit(lambda x: jax.jvp(last, (x,), (axis,))[1])(spin)
-    assert jnp.all(jnp.isfinite(along))
     second = jax.jit(jax.jacfwd(jax.jacrev(last)))(jnp.zeros(3))
     assert jnp.all(jnp.isnan(second[6]))

@@ -20,7 +20,7 @@ from polhode._closed_forms._conditions import (
     steady_wheels,
 )
 from polhode._closed_forms._law import AbstractTopMethod
-from polhode._kernels import derivable_once, underivable
+from polhode._kernels import derivable_once
 from polhode._method._base import Record
 from polhode._scene import Scene, State
 
@@ -110,9 +110,9 @@ class FixedAxis(AbstractTopMethod):
 
     All rates but one are zero at the start, the constant body torques lie along that axis and the
     damping is linear: d omega/dt = (N - c omega)/I. The axis may differ from body to body.
-    Derivatives with respect to rates and torques across the axis are those of another motion, which
-    is not elementary: they are NaN, and of a body at rest second ones with respect to any rates and
-    torques. (Where these are traced, ``ph.simulate`` does not choose this method by itself.)
+    Derivatives with respect to rates and torques across the axis of a body that turns are those of
+    this motion only: zero. Second ones of a body at rest are NaN. (Where these are traced,
+    ``ph.simulate`` does not choose this method by itself.)
     """
 
     chunk: int = eqx.field(static=True, default=2**14)
@@ -147,14 +147,15 @@ class FixedAxis(AbstractTopMethod):
         axis = jnp.argmax(used, axis=-1)
         along = jnp.arange(3)[None] == axis[:, None]
         moving = jnp.any(used, axis=-1, keepdims=True)
-        # Across the axis the equations are coupled, along it and at rest in second order.
-        both = jnp.concatenate([state.omega_body, push], axis=-1)
-        other = jnp.tile(~(along & moving), 2)
-        once = jnp.sum(derivable_once(both, other) - both, axis=-1, keepdims=True)  # zero
-        none = jnp.sum(underivable(both, other & moving) - both, axis=-1, keepdims=True)
-        start = state.omega_body + once + jnp.where(along, 0, none)
+        # Across the axis of a body that turns nothing is differentiated; at rest the equations are
+        # coupled in second order only.
+        held = jax.lax.stop_gradient
+        rates, push = (jnp.where(along | ~moving, x, held(x)) for x in (state.omega_body, push))
+        both = jnp.concatenate([rates, push], axis=-1)
+        resting = jnp.broadcast_to(~moving, both.shape)
+        once = jnp.sum(derivable_once(both, resting) - both, axis=-1, keepdims=True)  # zero
         omega, angles = tops.spin(
-            start[:, None],
+            (rates + once)[:, None],
             (damping / moments)[:, None],
             (push / moments)[:, None],
             later,

@@ -24,5 +24,4 @@ from polhode._kernels._stage import opaque_ones as opaque_ones, staged as staged
 from polhode._kernels._switch import is_plain as is_plain
 from polhode._kernels._undefined import (
     derivable_once as derivable_once,
-    underivable as underivable,
 )
