@@ -163,7 +163,7 @@ def test_a_tolerance_is_small():
 @pytest.mark.parametrize(
     ("method", "word"),
     [
-        (ph.LiePoisson, r"the function LiePoisson: call it, ph\.LiePoisson\(\)"),
+        (ph.LiePoisson, r"the class LiePoisson: make an object of it, ph\.LiePoisson\(\)"),
         (ph.ClosedForm, r"the class ClosedForm: make an object of it, ph\.ClosedForm\(\)"),
         (diffrax.Tsit5, r"hand it to a chart, ph\.LiePoisson\(diffrax\.Tsit5\(\)\)"),
         (diffrax.Tsit5(), r"hand it to a chart, ph\.LiePoisson\(diffrax\.Tsit5\(\)\)"),
