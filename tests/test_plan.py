@@ -263,5 +263,5 @@ def test_exact_laws_in_one_chunk():
     """``chunk=None``: all bodies at once, the same motion."""
     scene, ts = ph.Scene(ph.Inertia.axisymmetric(1.0, 2.0)), [0.0, 0.5, 1.0]
     whole, parts = (ph.simulate(scene, states(3), ts, ph.SymmetricTop(chunk=n)) for n in (None, 2))
-    # The compiler vectorises three bodies and two in different ways: last bits differ on some processors.
+    # Last bits depend on how the compiler vectorises three bodies and two.
     np.testing.assert_allclose(whole.wxyz, parts.wxyz, rtol=0, atol=1e-15)
