@@ -12,10 +12,15 @@
 # # Quick start: one body, a batch, a gradient
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/quick_start.ipynb)
-# (there, run `%pip install 'polhode[all]'` first)
 #
 # A rigid body is an inertia; its state is an attitude and body rates. polhode moves it, batches
 # of it, and differentiates through the motion. Everything is JAX: arrays in, arrays out.
+
+# %%
+# Needs polhode with its figures, installed from a checkout or from an archive of a release (on
+# Colab: upload the archive first). Remove the # in front of one line:
+# # %pip install '..[all]'
+# # %pip install './polhode-<version>.tar.gz[all]'
 
 # %%
 import jax
