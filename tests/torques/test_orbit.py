@@ -5,7 +5,7 @@ import pytest
 from mpmath import mp, mpf
 
 import polhode as ph
-from polhode._scene import KeplerOrbit, StateOrbit
+from polhode._scene import KeplerOrbit
 
 
 def test_the_orbit_obeys_newton():
@@ -35,7 +35,7 @@ def test_an_orbit_by_place_and_velocity_is_the_same_one():
                                2.0 * number, 0.5 * number)  # fmt: skip
         t0 = 4.0 * number
         velocity = jax.jacfwd(elements)(t0)
-        by_state = StateOrbit(1.7 * number, elements(t0), velocity, t0)
+        by_state = KeplerOrbit.from_state(1.7 * number, elements(t0), velocity, t0)
         for t in (-30.0, 0.0, 4.0, 7.5, 55.0):
             got, want = by_state(t * number), elements(t * number)
             assert got.dtype == dtype
@@ -63,7 +63,7 @@ def test_slopes_of_an_orbit_by_state(e):
             return f * r + g * v
 
     def place_at(given):
-        return StateOrbit(mu, given[:3], given[3:])(t)
+        return KeplerOrbit.from_state(mu, given[:3], given[3:])(t)
 
     given = [*place, *velocity]
     got, slopes = place_at(jnp.array(given)), jax.jacfwd(place_at)(jnp.array(given))
@@ -85,11 +85,11 @@ def test_slopes_of_an_orbit_by_state(e):
 
 def test_refused_orbits():
     with pytest.raises(ValueError, match=r"hyperbolas above 2, got 2\.: check the units"):
-        StateOrbit(1.0, [2.0, 0, 0], [0, 1.0, 0])
+        KeplerOrbit.from_state(1.0, [2.0, 0, 0], [0, 1.0, 0])
     with pytest.raises(ValueError, match="straight to or from"):
-        StateOrbit(1.0, [1.0, 0, 0], [0.5, 0, 0])
+        KeplerOrbit.from_state(1.0, [1.0, 0, 0], [0.5, 0, 0])
     with pytest.raises(ValueError, match="must have shape"):
-        StateOrbit(1.0, [1.0, 0], [0.5, 0, 0])
+        KeplerOrbit.from_state(1.0, [1.0, 0], [0.5, 0, 0])
     with pytest.raises(ValueError, match="eccentricity"):
         KeplerOrbit(1.0, 1.0, 1.0)
     with pytest.raises(ValueError, match="semi_major_axis"):
