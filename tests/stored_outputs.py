@@ -11,6 +11,7 @@ import hashlib
 import importlib
 import inspect
 import json
+import os
 import re
 import sys
 from pathlib import Path
@@ -46,9 +47,10 @@ def executed(name: str) -> nbformat.NotebookNode:
         record_timing=False,
         resources={"metadata": {"path": str(FOLDER)}},
     )
-    client.execute()
+    source = str(Path(ph.__file__).resolve().parents[1])
+    client.execute(env=os.environ | {"PYTHONPATH": source})
     imported = "".join(output.text for output in book.cells.pop().outputs).strip()
-    if imported != ph.__file__:
+    if Path(imported).resolve() != Path(ph.__file__).resolve():
         raise RuntimeError(f"the kernel imports {imported}, not {ph.__file__}")
     for number, cell in enumerate(book.cells):
         cell.id = f"cell-{number}"  # reproducible
