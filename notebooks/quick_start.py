@@ -79,7 +79,8 @@ fig.tight_layout()
 
 # %% [markdown]
 # ## A gradient
-# How does the final attitude depend on the moments of inertia? Reverse mode through the closed form:
+# How does the final attitude depend on the moments of inertia? Reverse mode through the closed
+# form:
 
 
 # %%

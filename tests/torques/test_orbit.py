@@ -42,6 +42,28 @@ def test_an_orbit_by_place_and_velocity_is_the_same_one():
             assert np.abs(np.array(got - want)).max() < bound / (1 - 0.95)
 
 
+def test_an_orbit_through_a_state_is_a_kepler_orbit():
+    elements = KeplerOrbit(1.7, 1.3, 0.3, 0.7, 0.3, 1.1, 0.2, 0.5)
+    place, velocity = elements(2.0), elements.velocity_at(2.0)
+    orbit = KeplerOrbit.from_state(1.7, place, velocity, epoch=2.0)
+    assert isinstance(orbit, KeplerOrbit)
+    assert not hasattr(ph, "StateOrbit")
+    assert orbit.semi_major_axis is None
+    assert len(jax.tree.leaves(orbit)) == 4
+    np.testing.assert_allclose(orbit.mean_motion, elements.mean_motion, rtol=1e-14)
+    np.testing.assert_allclose(orbit.momentum, elements.momentum, rtol=1e-13)
+
+    def later(scale, hyperbolic):
+        return KeplerOrbit.from_state(1.7, place, scale * velocity, 2.0, hyperbolic)(9.0)
+
+    for scale, hyperbolic in ((1.0, False), (2.0, True)):
+        plain = KeplerOrbit.from_state(1.7, place, scale * velocity, 2.0)
+        assert plain.hyperbolic == hyperbolic
+        traced = jax.jit(jax.vmap(later, (0, None)), static_argnums=1)
+        found = traced(jnp.array([scale, scale]), hyperbolic)
+        np.testing.assert_allclose(found, jnp.stack([plain(9.0)] * 2), rtol=1e-13)
+
+
 @pytest.mark.parametrize("e", [0.0, 1e-8, 0.4, 0.9])
 def test_slopes_of_an_orbit_by_state(e):
     """Against 50 digits' differences; a circle and an orbit in the plane are no exceptions."""
