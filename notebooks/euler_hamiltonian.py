@@ -12,7 +12,6 @@
 # # The Hamiltonian in Euler angles, and why the chart fails at the poles
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/euler_hamiltonian.ipynb)
-# (there, run `%pip install 'polhode[all]'` first)
 #
 # With ZYZ Euler angles $q=(\varphi,\theta,\psi)$ and their momenta $p$, the kinetic energy of a
 # rigid body is a quadratic form, $H=\tfrac12\,p\cdot V(q)\,p$. Done by hand, Hamilton's equations
@@ -24,9 +23,15 @@
 # 2. What happens at $\theta=0$ and $\theta=\pi$?
 
 # %%
+# Needs polhode with its figures, installed from a checkout or from an archive of a release (on
+# Colab: upload the archive first). Remove the # in front of one line:
+# # %pip install '..[all]'
+# # %pip install './polhode-<version>.tar.gz[all]'
+
+# %%
 import os
 
-os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # the compiler talks about large programs
+os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")  # no warnings of the compiler
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +40,6 @@ import numpy as np
 from diffrax import Dopri8
 
 import polhode as ph
-from polhode._hamiltonian import document_000 as closed
 
 jax.config.update("jax_enable_x64", True)
 plt.rcParams.update(
@@ -53,6 +57,7 @@ body = ph.Inertia.from_moments(moments)
 # %% [markdown]
 # ## 1. Autodiff against the closed forms
 # `ph.hamiltonian` is the one function; `ph.hamiltons_equations` differentiates it.
+# `ph.hamiltonian_matrices` gives the closed forms for comparison; no simulation uses them.
 
 # %%
 hamiltonian = ph.hamiltonian(body)
@@ -61,9 +66,7 @@ equations = jax.jit(ph.hamiltons_equations(hamiltonian))
 q = jnp.array([0.3, 1.1, -0.4])  # phi, theta, psi (rad)
 p = jnp.array([0.5, -0.2, 1.5])  # their momenta (N m s)
 rate_q, rate_p = equations(q, p)
-V, Theta, Psi = (
-    form(moments, q) for form in (closed.inverse_mass_matrix, closed.theta_form, closed.psi_form)
-)
+V, Theta, Psi = ph.hamiltonian_matrices(body, q)
 print("V, from d2H/dp2:\n", jax.hessian(hamiltonian, argnums=1)(q, p))
 print("V, closed form:\n", V)
 print("dq/dt     ", rate_q, "\nV p       ", V @ p)
@@ -83,22 +86,24 @@ p = jnp.asarray(rng.normal(size=(count, 3)))
 rate_q, rate_p = equations(q, p)
 
 
+def quadratic(form, vector):
+    return jnp.einsum("ni,nij,nj->n", vector, form, vector)
+
+
 def size(form, vector):
-    return jnp.einsum("ni,nij,nj->n", jnp.abs(vector), jnp.abs(form), jnp.abs(vector))
+    return quadratic(jnp.abs(form), jnp.abs(vector))
 
 
-V, Theta, Psi = (
-    form(moments, q) for form in (closed.inverse_mass_matrix, closed.theta_form, closed.psi_form)
-)
+V, Theta, Psi = ph.hamiltonian_matrices(body, q)
 rows = {
     r"$\dot q$ and $Vp$": jnp.max(
         jnp.abs(rate_q - jnp.einsum("nij,nj->ni", V, p))
         / jnp.einsum("nij,nj->ni", jnp.abs(V), jnp.abs(p)),
         axis=-1,
     ),
-    r"$\dot p_\theta$ and $p\cdot\Theta p$": jnp.abs(rate_p[:, 1] - closed.quadratic(Theta, p))
+    r"$\dot p_\theta$ and $p\cdot\Theta p$": jnp.abs(rate_p[:, 1] - quadratic(Theta, p))
     / size(Theta, p),
-    r"$\dot p_\psi$ and $p\cdot\Psi p$": jnp.abs(rate_p[:, 2] - closed.quadratic(Psi, p))
+    r"$\dot p_\psi$ and $p\cdot\Psi p$": jnp.abs(rate_p[:, 2] - quadratic(Psi, p))
     / (size(Psi, p) + size(V, p)),
 }
 fig, ax = plt.subplots(figsize=(8, 3.2))

@@ -12,11 +12,16 @@
 # # Explorer 1: a body that loses energy
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/explorer.ipynb)
-# (there, run `%pip install 'polhode[all]'` first)
 #
 # On 1 February 1958 Explorer 1, a tube of 2 m, was left spinning at 750 turns a minute about its
 # long axis. Within an orbit it was turning end over end. Nothing had pushed it: four whip antennas
 # bent, and what they lost as heat the rotation paid, at constant angular momentum. How much was it?
+
+# %%
+# Needs polhode with its figures, installed from a checkout or from an archive of a release (on
+# Colab: upload the archive first). Remove the # in front of one line:
+# # %pip install '..[all]'
+# # %pip install './polhode-<version>.tar.gz[all]'
 
 # %%
 import jax

@@ -12,14 +12,22 @@
 # # Inertia from a toss
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/fitting.ipynb)
-# (there, run `%pip install 'polhode[all]'` first)
 #
-# A box with a gyroscope inside is thrown. It tumbles for a second, freely but for the air, and the
-# gyroscope writes down three rates two hundred times a second. What is its inertia? The file
-# `toss.csv` is such a recording, made by a simulation so that the answer can be checked: a box of
-# 0.9 kg, 18 x 11 x 4 cm, the sensor glued on askew, white noise of 0.03 rad/s, a few samples lost.
+# A box with a gyroscope inside is thrown. It tumbles freely for a second, and the gyroscope records
+# three rates two hundred times a second. What is its inertia? The recording is simulated, so that
+# the answer can be checked: a box of 0.9 kg, 18 x 11 x 4 cm, the sensor mounted askew, white noise
+# of 0.03 rad/s, and seven samples lost.
 
 # %%
+# Needs polhode with its figures, installed from a checkout or from an archive of a release (on
+# Colab: upload the archive first). Remove the # in front of one line:
+# # %pip install '..[all]'
+# # %pip install './polhode-<version>.tar.gz[all]'
+
+# %%
+import tempfile
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -31,8 +39,23 @@ from polhode import fit, plot, rotation
 jax.config.update("jax_enable_x64", True)
 np.set_printoptions(precision=4, suppress=True)
 
+box = ph.Inertia.from_box(0.9, (0.18, 0.11, 0.04))  # kg, m; about its own axes
+mounting = rotation.normalise([0.95, 0.12, -0.2, 0.15])  # from the sensor's axes to the box's
+ts = np.arange(201) * 0.005
+thrown = ph.State([1.0, 0.0, 0.0, 0.0], [2.0, 13.0, 4.0])
+toss = ph.simulate(ph.Scene(box), thrown, ts)
+to_sensor = jnp.broadcast_to(rotation.conjugate(mounting), (201, 4))
+rng = np.random.default_rng(5)
+readings = np.asarray(rotation.rotate(to_sensor, toss.omega_body))
+readings = readings + 0.03 * rng.normal(size=readings.shape)
+readings[rng.choice(np.arange(5, 195), 7, replace=False)] = np.nan
+
+file = Path(tempfile.mkdtemp()) / "toss.csv"
+rows = np.column_stack([ts, readings])
+np.savetxt(file, rows, "%.4f", ",", header="time_s,gyro_x,gyro_y,gyro_z", comments="")
+
 recording = fit.read_recording(
-    "toss.csv", {"t": "time_s", "wx": "gyro_x", "wy": "gyro_y", "wz": "gyro_z"}, noise=0.03
+    file, {"t": "time_s", "wx": "gyro_x", "wy": "gyro_y", "wz": "gyro_z"}, noise=0.03
 )
 print(recording.times.shape[-1], "rows,", int(np.sum(recording.present == 0)), "of them gaps")
 
@@ -54,7 +77,7 @@ print(found.report())
 # standard deviations, by the Fisher information: no unbiased estimate from these data does better.
 
 # %%
-figure = plot.fit(found, recording, title="toss.csv")
+figure = plot.fit(found, recording, title="toss")
 plt.show()
 
 # %% [markdown]
@@ -63,7 +86,6 @@ plt.show()
 # The simulated box, and how many standard deviations the fit is off.
 
 # %%
-box = ph.Inertia.from_box(0.9, (0.18, 0.11, 0.04))
 true = np.sort(np.asarray(box.tensor).diagonal())
 true = true / true[2]
 off = (np.asarray(found.ratios) - true)[:2] / np.asarray(found.ratios_std)[:2]

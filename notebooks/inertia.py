@@ -12,11 +12,16 @@
 # # Inertia: which axis does this body really spin about?
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/inertia.ipynb)
-# (there, run `%pip install 'polhode[all]'` first)
 #
 # A spacecraft is drawn in its designer's axes and told to spin about z. Bodies do not know the
 # drawing: they know their principal axes. From parts to tensor, from tensor to axes, and from
 # there to the motion.
+
+# %%
+# Needs polhode with its figures, installed from a checkout or from an archive of a release (on
+# Colab: upload the archive first). Remove the # in front of one line:
+# # %pip install '..[all]'
+# # %pip install './polhode-<version>.tar.gz[all]'
 
 # %%
 import jax
@@ -58,7 +63,9 @@ foot, tip = np.array([0.5, 0.1, 0.3]), np.array([1.5, 0.4, 1.3])  # ends of the 
 
 sunward = rotation.axis_angle_to_wxyz(jnp.array([0.0, 1.0, 0.0]), jnp.deg2rad(35.0))
 boom_length = np.linalg.norm(tip - foot)
-along_boom = rotation.between(jnp.array([0.0, 0.0, 1.0]), jnp.asarray(tip - foot))
+tilt_axis = np.cross([0.0, 0.0, 1.0], tip - foot)
+tilt = jnp.arccos((tip - foot)[2] / boom_length)
+along_boom = rotation.axis_angle_to_wxyz(tilt_axis / np.linalg.norm(tilt_axis), tilt)  # from z
 
 MP = ph.MassProperties
 parts = {

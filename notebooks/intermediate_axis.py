@@ -12,11 +12,16 @@
 # # Why does it turn over? The intermediate axis
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/intermediate_axis.ipynb)
-# (there, run `%pip install 'polhode[all]'` first)
 #
 # In 1985 Vladimir Dzhanibekov unscrewed a wing nut in orbit: it flew off spinning, turned over,
 # flew on, turned over again. Nothing acts on it. A body spins steadily about its axis of least
 # and of greatest inertia, and turns over, again and again, when spun about the one between.
+
+# %%
+# Needs polhode with its figures, installed from a checkout or from an archive of a release (on
+# Colab: upload the archive first). Remove the # in front of one line:
+# # %pip install '..[all]'
+# # %pip install './polhode-<version>.tar.gz[all]'
 
 # %%
 import tempfile

@@ -12,11 +12,16 @@
 # # From flickering points to a tumbling body
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/light_curve.ipynb)
-# (there, run `%pip install 'polhode[all]'` first)
 #
 # A telescope sees an asteroid as one point of light that grows brighter and fainter. Can the points
 # alone tell how the rock turns, what shape it has and how its mass is spread? Here we make a rock,
 # look at it as a telescope would, forget what we made, and find it again.
+
+# %%
+# Needs polhode with its figures, installed from a checkout or from an archive of a release (on
+# Colab: upload the archive first). Remove the # in front of one line:
+# # %pip install '..[all]'
+# # %pip install './polhode-<version>.tar.gz[all]'
 
 # %%
 import jax

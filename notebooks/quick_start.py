@@ -12,10 +12,16 @@
 # # Quick start: one body, a batch, a gradient
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/quick_start.ipynb)
-# (there, run `%pip install 'polhode[all]'` first)
 #
-# A rigid body is an inertia; its state is an attitude and body rates. polhode moves it, batches
-# of it, and differentiates through the motion. Everything is JAX: arrays in, arrays out.
+# A rigid body is described by its inertia, and its state by an attitude and body rates. polhode
+# simulates one body or a batch and differentiates through the motion. Everything is JAX: arrays in,
+# arrays out.
+
+# %%
+# Needs polhode with its figures, installed from a checkout or from an archive of a release (on
+# Colab: upload the archive first). Remove the # in front of one line:
+# # %pip install '..[all]'
+# # %pip install './polhode-<version>.tar.gz[all]'
 
 # %%
 import jax
@@ -29,8 +35,8 @@ jax.config.update("jax_enable_x64", True)  # your choice: polhode follows the dt
 
 # %% [markdown]
 # ## One body
-# A wing nut spun about its intermediate axis, with a slight push. `method=None` lets the library
-# choose; `explain` says what it chose and why.
+# A wing nut spins about its intermediate axis, with a slight push. polhode chooses the method;
+# `explain` says which one and why.
 
 # %%
 inertia = ph.Inertia.from_moments([1.0, 2.0, 2.5])  # kg m^2, about body x, y, z
@@ -49,7 +55,7 @@ ax.legend(loc="upper right", ncols=3)
 fig.tight_layout()
 
 # %% [markdown]
-# Energy and the momentum in space are constants of the motion, to rounding:
+# Energy and the momentum in space are constant to rounding error:
 
 # %%
 print("energy drift  ", float(jnp.ptp(traj.energy) / traj.energy[0]))
@@ -57,8 +63,8 @@ print("momentum drift", float(jnp.max(jnp.ptp(traj.momentum_space, axis=0)) / 2.
 
 # %% [markdown]
 # ## A batch
-# Any leaf may carry leading axes; they broadcast together. A thousand bodies that differ in their
-# push:
+# Any array of a scene or state may have leading axes, which are broadcast. A thousand bodies that
+# differ in their push:
 
 # %%
 rng = np.random.default_rng(0)
@@ -73,8 +79,8 @@ fig.tight_layout()
 
 # %% [markdown]
 # ## A gradient
-# How does the final attitude depend on the moments of inertia? Reverse mode through the exact
-# motion:
+# How does the final attitude depend on the moments of inertia? Reverse mode through the closed
+# form:
 
 
 # %%
@@ -100,9 +106,9 @@ print("gradient            ", slope)
 print("central difference  ", difference, "(second entry)")
 
 # %% [markdown]
-# ## Something acts on it
+# ## Gravity
 # The same call with a potential: a heavy top about a fixed point. The torque is a derivative of
-# the one Hamiltonian.
+# the Hamiltonian.
 
 # %%
 top = ph.Scene(

@@ -12,7 +12,6 @@
 # # Rotating frames: three questions
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/rotating_frames.ipynb)
-# (there, run `%pip install 'polhode[all]'` first)
 #
 # A particle seen from a frame that turns feels forces that nobody exerts: centrifugal, Coriolis
 # and, when the turning changes, Euler's. `ph.RotatingFrame` knows them by name,
@@ -21,6 +20,12 @@
 # 1. How fast does the swing plane of a Foucault pendulum turn?
 # 2. Where does a body dropped into a deep shaft land?
 # 3. What does a bead do inside a tumbling box, and what does an accelerometer in that box read?
+
+# %%
+# Needs polhode with its figures, installed from a checkout or from an archive of a release (on
+# Colab: upload the archive first). Remove the # in front of one line:
+# # %pip install '..[all]'
+# # %pip install './polhode-<version>.tar.gz[all]'
 
 # %%
 import equinox as eqx

@@ -12,16 +12,19 @@
 # # A tumbling asteroid against what was seen
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/tumbling_asteroid.ipynb)
-# (there, run `%pip install 'polhode[all]'` first)
 #
 # Toutatis, a rock of 4.6 km that passes the Earth every four years, does not spin: it tumbles.
-# Radar images of December 1992 gave its attitude on seventeen days. The scene file
-# `scenes/toutatis.toml` holds a published state and the published observations, with sources.
+# Radar images of December 1992 gave its attitude on seventeen days. The scene `toutatis`, which is
+# part of polhode, holds a published state and the published observations, with sources.
 # Does a free rigid body explain what was seen? How well are its two periods known?
 
 # %%
-from pathlib import Path
+# Needs polhode with its figures, installed from a checkout or from an archive of a release (on
+# Colab: upload the archive first). Remove the # in front of one line:
+# # %pip install '..[all]'
+# # %pip install './polhode-<version>.tar.gz[all]'
 
+# %%
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -42,7 +45,7 @@ plt.rcParams.update(
 )
 DAY = 86400.0
 
-file = files.read_scene(Path("../scenes/toutatis.toml"))
+file = files.read_scene(files.shipped_scenes()["toutatis"])
 scene = files.build_scene(file, jnp.float64)
 state = files.build_state(file, jnp.float64, scene.inertia)
 seen = file.observations

@@ -361,7 +361,8 @@ def test_nasa_cylinder_librates_in_orbit(name):
     """NESC orbital cases 10A and 10C (at rest to the orbit), 10B and 10D (with a rate)."""
     where, omega, end, rates = LIBRATIONS[name]
     scene = ph.Scene(
-        ph.Inertia.from_moments(CYLINDER), ph.GravityGradient(MU, ph.StateOrbit(MU, *ORBITS[where]))
+        ph.Inertia.from_moments(CYLINDER),
+        ph.GravityGradient(MU, ph.KeplerOrbit.from_state(MU, *ORBITS[where])),
     )
     got = ph.simulate(scene, ph.State(_wxyz(STARTS[where]), omega), [0.0, 28800.0], rtol=1e-10)
     assert rotation.angle_between(got.wxyz[-1], _wxyz(end)) < 1e-9

@@ -26,7 +26,6 @@ from ._scene import (
     Potential as Potential,
     AbstractPotential as AbstractPotential,
     KeplerOrbit as KeplerOrbit,
-    StateOrbit as StateOrbit,
     AbstractOrbit as AbstractOrbit,
     LVLH as LVLH,
 )

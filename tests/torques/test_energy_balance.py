@@ -30,7 +30,9 @@ PARTS = {
     "function of time": {"potential": ph.GravityGradient(2.0, turned_in_time)},
     "kepler orbit": {"potential": ph.GravityGradient(2.0, ph.KeplerOrbit(2.0, 1.5, 0.3, 0.4))},
     "state orbit": {
-        "potential": ph.GravityGradient(2.0, ph.StateOrbit(2.0, [1.0, 0.5, 0.2], [0.1, 1.0, 0.3]))
+        "potential": ph.GravityGradient(
+            2.0, ph.KeplerOrbit.from_state(2.0, [1.0, 0.5, 0.2], [0.1, 1.0, 0.3])
+        )
     },
     "potential": {"potential": ph.Potential(lambda R, t: R[0, 1] * R[2, 2])},
     "potential of time": {"potential": ph.Potential(lambda R, t: R[0, 1] * jnp.sin(3 * t))},

@@ -189,7 +189,7 @@ def test_orbits_by_a_state(e):
             place, velocity = exact(start, e)
             speed = mp.sqrt(mpf(mu) / 2)
             r, v = ([float(scale * x) for x in y] for scale, y in ((2, place), (speed, velocity)))
-            orbit = ph.StateOrbit(mu, [*r, 0.0], [*v, 0.0], hyperbolic=e > 1)
+            orbit = ph.KeplerOrbit.from_state(mu, [*r, 0.0], [*v, 0.0], hyperbolic=e > 1)
             for t, got in zip(times, jax.vmap(orbit)(jnp.array(times))):
                 given = [*r, *v, t, mu]
 
@@ -226,8 +226,8 @@ def loops(jaxpr):
     [
         ph.KeplerOrbit(1.0, 2.0, 0.1),
         ph.KeplerOrbit(1.0, -2.0, 1.1),
-        ph.StateOrbit(1.0, [1.0, 0, 0], [0, 1.1, 0]),
-        ph.StateOrbit(1.0, [1.0, 0, 0], [0, 1.6, 0]),
+        ph.KeplerOrbit.from_state(1.0, [1.0, 0, 0], [0, 1.1, 0]),
+        ph.KeplerOrbit.from_state(1.0, [1.0, 0, 0], [0, 1.6, 0]),
     ],
 )
 def test_no_loops(orbit):

@@ -5,7 +5,7 @@ import pytest
 from mpmath import mp, mpf
 
 import polhode as ph
-from polhode._scene import KeplerOrbit, StateOrbit
+from polhode._scene import KeplerOrbit
 
 
 def test_the_orbit_obeys_newton():
@@ -35,11 +35,33 @@ def test_an_orbit_by_place_and_velocity_is_the_same_one():
                                2.0 * number, 0.5 * number)  # fmt: skip
         t0 = 4.0 * number
         velocity = jax.jacfwd(elements)(t0)
-        by_state = StateOrbit(1.7 * number, elements(t0), velocity, t0)
+        by_state = KeplerOrbit.from_state(1.7 * number, elements(t0), velocity, t0)
         for t in (-30.0, 0.0, 4.0, 7.5, 55.0):
             got, want = by_state(t * number), elements(t * number)
             assert got.dtype == dtype
             assert np.abs(np.array(got - want)).max() < bound / (1 - 0.95)
+
+
+def test_an_orbit_through_a_state_is_a_kepler_orbit():
+    elements = KeplerOrbit(1.7, 1.3, 0.3, 0.7, 0.3, 1.1, 0.2, 0.5)
+    place, velocity = elements(2.0), elements.velocity_at(2.0)
+    orbit = KeplerOrbit.from_state(1.7, place, velocity, epoch=2.0)
+    assert isinstance(orbit, KeplerOrbit)
+    assert not hasattr(ph, "StateOrbit")
+    assert orbit.semi_major_axis is None
+    assert len(jax.tree.leaves(orbit)) == 4
+    np.testing.assert_allclose(orbit.mean_motion, elements.mean_motion, rtol=1e-14)
+    np.testing.assert_allclose(orbit.momentum, elements.momentum, rtol=1e-13)
+
+    def later(scale, hyperbolic):
+        return KeplerOrbit.from_state(1.7, place, scale * velocity, 2.0, hyperbolic)(9.0)
+
+    for scale, hyperbolic in ((1.0, False), (2.0, True)):
+        plain = KeplerOrbit.from_state(1.7, place, scale * velocity, 2.0)
+        assert plain.hyperbolic == hyperbolic
+        traced = jax.jit(jax.vmap(later, (0, None)), static_argnums=1)
+        found = traced(jnp.array([scale, scale]), hyperbolic)
+        np.testing.assert_allclose(found, jnp.stack([plain(9.0)] * 2), rtol=1e-13)
 
 
 @pytest.mark.parametrize("e", [0.0, 1e-8, 0.4, 0.9])
@@ -63,7 +85,7 @@ def test_slopes_of_an_orbit_by_state(e):
             return f * r + g * v
 
     def place_at(given):
-        return StateOrbit(mu, given[:3], given[3:])(t)
+        return KeplerOrbit.from_state(mu, given[:3], given[3:])(t)
 
     given = [*place, *velocity]
     got, slopes = place_at(jnp.array(given)), jax.jacfwd(place_at)(jnp.array(given))
@@ -85,11 +107,11 @@ def test_slopes_of_an_orbit_by_state(e):
 
 def test_refused_orbits():
     with pytest.raises(ValueError, match=r"hyperbolas above 2, got 2\.: check the units"):
-        StateOrbit(1.0, [2.0, 0, 0], [0, 1.0, 0])
+        KeplerOrbit.from_state(1.0, [2.0, 0, 0], [0, 1.0, 0])
     with pytest.raises(ValueError, match="straight to or from"):
-        StateOrbit(1.0, [1.0, 0, 0], [0.5, 0, 0])
+        KeplerOrbit.from_state(1.0, [1.0, 0, 0], [0.5, 0, 0])
     with pytest.raises(ValueError, match="must have shape"):
-        StateOrbit(1.0, [1.0, 0], [0.5, 0, 0])
+        KeplerOrbit.from_state(1.0, [1.0, 0], [0.5, 0, 0])
     with pytest.raises(ValueError, match="eccentricity"):
         KeplerOrbit(1.0, 1.0, 1.0)
     with pytest.raises(ValueError, match="semi_major_axis"):

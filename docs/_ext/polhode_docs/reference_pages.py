@@ -13,6 +13,28 @@ SPECIAL = re.compile(r"\||(?<!\*)\*(?!\*)")
 ITEM = re.compile(r"\s*(-|\d+\.) ")
 PAGE = re.compile(r"\bdocs/(\w+)\.md\b")
 
+INTERNAL = {
+    # of scenes and their parts, while a simulation is prepared
+    "settled", "mended", "is_as_declared", "declared_anew", "carrier", "changes", "dynamics",
+    "with_spins", "without_wheels", "as_unit", "check_form", "check_within", "of_symmetry",
+    "settle", "column", "core_ranks", "smooth",
+    # of methods and solvers, inside the integration
+    "objection", "why_not", "refuse", "exact", "keeps_rtol", "stepping", "spanning",
+    "bodies_at_once", "evaluations", "error_order", "term_structure", "interpolation_cls",
+    "init", "func", "step", "loop", "parts", "check",
+    # of events, fits and files
+    "polished", "lanes", "model_config", "model_post_init", "rows",
+}  # fmt: skip
+"""Members that other modules of polhode use and that users have no use for."""
+
+
+def left_out(thing: type) -> list[str]:
+    """Members of a class that its entry leaves out: internal ones, and those that its entry's link
+    to a public abstract base documents, such as ``body_components`` of a torque."""
+    bases = [base for base in thing.__mro__[1:] if base.__name__.startswith("Abstract")]
+    own = [name for name in vars(thing) if not name.startswith("_")]
+    return [x for x in own if x in INTERNAL or any(x in vars(base) for base in bases)]
+
 
 def pages() -> dict[str, str]:
     """The source of every page of the reference, by its file name."""
@@ -44,7 +66,9 @@ def _page(title: str, text: str, module: str, names: list[str], home: dict) -> s
             parts.append(f".. py:{kind}:: {name}\n\n   The same as :py:obj:`{home[id(thing)]}`.")
         elif isinstance(thing, type):
             values = "\n   :undoc-members:" if issubclass(thing, enum.Enum) else ""
-            parts.append(f".. autoclass:: {full}\n   :members:{values}")
+            hidden = ", ".join(left_out(thing))
+            hidden = f"\n   :exclude-members: {hidden}" if hidden else ""
+            parts.append(f".. autoclass:: {full}\n   :members:{values}{hidden}")
         else:
             parts.append(f".. autofunction:: {full}")
         home.setdefault(id(thing), full)

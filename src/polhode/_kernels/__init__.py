@@ -23,5 +23,8 @@ from polhode._kernels._single_call import (
 from polhode._kernels._stage import opaque_ones as opaque_ones, staged as staged
 from polhode._kernels._switch import is_plain as is_plain
 from polhode._kernels._undefined import (
+    are_close as are_close,
     derivable_once as derivable_once,
+    over_gap as over_gap,
+    underivable as underivable,
 )

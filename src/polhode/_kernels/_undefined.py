@@ -31,6 +31,22 @@ def _spoiled(given: Any, tangents: Any) -> list[Array]:
     return [jnp.where(where & (tangent != 0), np.nan, tangent)]
 
 
+def are_close(first: Array, second: Array) -> Array:
+    """Where two numbers agree to half of their digits."""
+    limit = jnp.finfo(first.dtype).eps ** 0.5
+    return jnp.abs(first - second) <= limit * jnp.maximum(jnp.abs(first), jnp.abs(second))
+
+
+def over_gap(entry: Array, first: Array, second: Array) -> Array:
+    """``entry / (first - second)`` of an entry whose value is zero; all of one shape.
+
+    It counts in derivatives alone. Where the two agree to half of their digits the derivative by
+    the entry is NaN: it loses digits in proportion to their relative difference.
+    """
+    close = are_close(first, second)
+    return underivable(entry, close) / jnp.where(close, 1, first - second)
+
+
 @jax.custom_jvp
 def derivable_once(x: Array, where: Array) -> Array:
     """``x`` (..., n) with its first derivatives, and NaN for the second ones by any two of its last

@@ -18,7 +18,6 @@ from polhode._scene._laws import (
 from polhode._scene._orbit import (
     AbstractOrbit as AbstractOrbit,
     KeplerOrbit as KeplerOrbit,
-    StateOrbit as StateOrbit,
 )
 from polhode._scene._potentials import (
     AbstractPotential as AbstractPotential,

@@ -12,7 +12,7 @@ from polhode._batch import along_time
 from polhode._checks import ArrayLike, as_float_array
 from polhode._hamiltonian import Attitude, Vector, components
 from polhode._parts import AbstractPart, shaped
-from polhode._scene._orbit import AbstractConic, AbstractOrbit
+from polhode._scene._orbit import AbstractOrbit, KeplerOrbit
 from polhode._scene._torques import AbstractTorque, stacked, vector_of_time
 
 
@@ -23,9 +23,9 @@ class LVLH(AbstractPart):
     completes them: on a circular orbit it is the direction of flight. As NASA's JEOD and the
     space shuttle used it; yaw, pitch and roll are the angles ZYX of the body in it.
 
-    ``orbit``: ``ph.KeplerOrbit``, ``ph.StateOrbit``, or a function of time [s] returning the
-    position (3,) from the attracting centre [m], twice differentiable. Times are () or (..., T),
-    with the axes of a batch of orbits first.
+    ``orbit``: ``ph.KeplerOrbit``, or a function of time [s] returning the position (3,) from the
+    attracting centre [m], twice differentiable. Times are () or (..., T), with the axes of a batch
+    of orbits first.
 
         frame = ph.LVLH(ph.KeplerOrbit(3.986004418e14, 6.8e6))
         state = ph.State(*frame.from_frame([1.0, 0, 0, 0], [0.0, 0, 0], 0.0))  # held in the frame
@@ -40,7 +40,7 @@ class LVLH(AbstractPart):
     def __init__(self, orbit: AbstractOrbit | Callable):
         if not callable(orbit):
             raise TypeError(
-                "LVLH takes an orbit (ph.KeplerOrbit, ph.StateOrbit) or a function of time, got"
+                "LVLH takes an orbit (ph.KeplerOrbit) or a function of time, got"
                 f" {type(orbit).__name__}: a frame at rest needs none."
             )
         found: Any = vector_of_time("LVLH", orbit)
@@ -49,7 +49,7 @@ class LVLH(AbstractPart):
     def axes(self, t: Array) -> tuple[Float[Array, "*b 3"], ...]:
         """Unit vectors x, y, z of the frame in space, and its rates [rad/s] along them."""
         t = jnp.asarray(t)
-        if isinstance(self.orbit, AbstractConic):
+        if isinstance(self.orbit, KeplerOrbit):
             r = self.orbit(t)
             momentum, normal = jnp.broadcast_to(self.orbit.momentum, r.shape), None
         else:  # what is no conic may leave its plane

@@ -2,6 +2,7 @@
 
 import abc
 import math
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -142,28 +143,16 @@ class AbstractOrbit(AbstractPart):
 
 
 @jax.jit  # one program, not one for each operation
-def _place(conic: "AbstractConic", t: Array) -> Array:
-    return conic._position(t)
+def _place(orbit: "KeplerOrbit", t: Array) -> Array:
+    return _by_elements(orbit, t) if orbit.position is None else _by_state(orbit, t)
 
 
-class AbstractConic(AbstractOrbit):
-    """Base of the orbits that keep their plane."""
-
-    def __call__(self, t: Array | float) -> Float[Array, "*b 3"]:
-        return _place(self, t)
-
-    @abc.abstractmethod
-    def _position(self, t: Array) -> Float[Array, "*b 3"]:
-        """Position, as of every orbit."""
-
-    @property
-    @abc.abstractmethod
-    def momentum(self) -> Float[Array, "*b 3"]:
-        """Angular momentum r x v (..., 3) for a unit of mass, space axes [m^2/s]; constant."""
-
-
-class KeplerOrbit(AbstractConic):
+class KeplerOrbit(AbstractOrbit):
     """Position of a body on a conic about an attracting centre: ``orbit(t)`` (..., 3) [m].
+
+    ``KeplerOrbit(...)`` takes orbital elements, ``KeplerOrbit.from_state(...)`` a position and a
+    velocity. Use it in ``ph.GravityGradient(mu, orbit)``, ``ph.LVLH(orbit)`` and
+    ``ph.MagneticDipole``; these take a function of time [s] too, for an orbit that is no conic.
 
     **Arguments** (each (...), a batch broadcasts): ``mu`` [m^3/s^2]; ``semi_major_axis`` [m], of a
     hyperbola negative; ``eccentricity``, in [0, 1) or of a hyperbola above 1; ``inclination``,
@@ -176,18 +165,22 @@ class KeplerOrbit(AbstractConic):
     and there is no derivative with respect to the eccentricity, as there is with 0.0. The argument
     of latitude is then ``periapsis`` plus the mean anomaly.
 
-    Hand it to ``ph.GravityGradient(mu, orbit)``; ``ph.StateOrbit`` takes place and velocity instead
-    of elements. Raises ValueError for mu that is not positive, an axis of the wrong sign, or an
-    eccentricity that is negative or 1.
+        orbit = ph.KeplerOrbit(3.986e14, 6.9e6, inclination=1.7)
+        flyby = ph.KeplerOrbit.from_state(3.986e14, [3.8e7, 0, 0], [0, 7.4e3, 0])
+
+    Raises ValueError for mu that is not positive, an axis of the wrong sign, or an eccentricity
+    that is negative or 1.
     """
 
     mu: Float[Array, "*#b"] = shaped()
-    semi_major_axis: Float[Array, "*#b"] = shaped()
+    semi_major_axis: Float[Array, "*#b"] | None = shaped()
     eccentricity: Float[Array, "*#b"] | None = shaped()
-    inclination: Float[Array, "*#b"] = shaped()
-    node: Float[Array, "*#b"] = shaped()
-    periapsis: Float[Array, "*#b"] = shaped()
-    mean_anomaly: Float[Array, "*#b"] = shaped()
+    inclination: Float[Array, "*#b"] | None = shaped()
+    node: Float[Array, "*#b"] | None = shaped()
+    periapsis: Float[Array, "*#b"] | None = shaped()
+    mean_anomaly: Float[Array, "*#b"] | None = shaped()
+    position: Float[Array, "*#b 3"] | None = shaped(3)
+    velocity: Float[Array, "*#b 3"] | None = shaped(3)
     epoch: Float[Array, "*#b"] = shaped()
     hyperbolic: bool = eqx.field(static=True, default=False)
 
@@ -204,6 +197,7 @@ class KeplerOrbit(AbstractConic):
         hyperbolic: bool | None = None,
     ):
         given = locals()
+        self.position = self.velocity = None
         if eccentricity is None:
             self.eccentricity = given.pop("eccentricity")
         numbers = {name: as_number(name, given[name]) for name in self.core_ranks if name in given}
@@ -235,14 +229,68 @@ class KeplerOrbit(AbstractConic):
                 ),
             )
 
+    @classmethod
+    def from_state(
+        cls,
+        mu: ArrayLike,
+        position: ArrayLike,
+        velocity: ArrayLike,
+        epoch: ArrayLike = 0.0,
+        hyperbolic: bool | None = None,
+    ) -> Self:
+        """The conic through a position (..., 3) [m] with a velocity (..., 3) [m/s].
+
+        ``mu`` (...) [m^3/s^2]; both from the attracting centre, in space axes, at the time
+        ``epoch`` (...) [s]. They are kept in place of elements, so that derivatives are regular
+        everywhere, also for circular and equatorial orbits, where elements are not. All orbits of a
+        batch are ellipses, or all are hyperbolas, for fly-bys; ``hyperbolic`` (static) tells which
+        where the numbers are traced.
+
+        Lagrange's f and g functions of the difference in eccentric or hyperbolic anomaly (R. H.
+        Battin, An Introduction to the Mathematics and Methods of Astrodynamics, 1999).
+
+        Raises ValueError for mu that is not positive, or a state on neither: a parabola, ellipses
+        among hyperbolas, or moving straight to or from the centre.
+        """
+        place = as_float_array("position", position, (3,))
+        speed = as_float_array("velocity", velocity, (3,))
+        number, start = as_number("mu", mu), as_number("epoch", epoch)
+        dtype = jnp.result_type(place, speed, number, start)
+        place, speed = place.astype(dtype), speed.astype(dtype)
+        require_positive("mu", number)
+        if is_concrete(number, place, speed):
+            is_hyperbolic = _check_state(
+                np.asarray(number), np.asarray(place), np.asarray(speed), hyperbolic
+            )
+        else:
+            is_hyperbolic = bool(hyperbolic)
+        one = jnp.ones((), dtype)
+        elements = (-one, 2 * one) if is_hyperbolic else (one,)
+        orbit = cls(number, *elements, epoch=start.astype(dtype), hyperbolic=is_hyperbolic)
+        return eqx.tree_at(
+            lambda orbit: [getattr(orbit, name) for name in (*_ELEMENTS, "position", "velocity")],
+            orbit,
+            [None] * len(_ELEMENTS) + [place, speed],
+            is_leaf=lambda x: x is None,
+        )
+
+    def __call__(self, t: Array | float) -> Float[Array, "*b 3"]:
+        return _place(self, t)
+
     @property
     def mean_motion(self) -> Array:
         """sqrt(mu/|a|^3) [rad/s]."""
-        axis = jnp.abs(self.semi_major_axis)
+        if self.position is None:
+            axis = jnp.abs(self.semi_major_axis)
+        else:
+            axis = _axis_of_state(self)[0]
         return jnp.sqrt(self.mu / axis) / axis
 
     @property
     def momentum(self) -> Float[Array, "*b 3"]:
+        """Angular momentum r x v (..., 3) per unit of mass, space axes [m^2/s]; constant."""
+        if self.position is not None:
+            return jnp.cross(*jnp.broadcast_arrays(self.position, self.velocity))
         parameter = jnp.abs(self.semi_major_axis)
         if (e := self.eccentricity) is not None:
             parameter = parameter * _from_one(e, self.hyperbolic) * (1 + e)
@@ -252,127 +300,96 @@ class KeplerOrbit(AbstractConic):
         pole = jnp.broadcast_arrays(sn * si * size, -cn * si * size, ci * size)
         return jnp.stack(pole, axis=-1)
 
-    def _position(self, t: Array) -> Float[Array, "*b 3"]:
-        mean = self.mean_anomaly + self.mean_motion * (t - self.epoch)
-        axis, e = jnp.abs(self.semi_major_axis), self.eccentricity
-        if not self.hyperbolic:
-            mean = _within_a_turn(mean)
-        if e is None:
-            angle = self.periapsis + mean
-            u, v = axis * jnp.cos(angle), axis * jnp.sin(angle)
-        else:
-            mean, gap, e = jnp.broadcast_arrays(mean, _from_one(e, self.hyperbolic), e)
-            x = anomaly_at_periapsis(*jax.lax.stop_gradient((mean, gap, e)), self.hyperbolic)
-            sine, turn = passed_anomaly(x, mean, gap, e, 0.0, self.hyperbolic)
-            along, across = axis * (gap - turn), axis * jnp.sqrt(gap * (1 + e)) * sine
-            cw, sw = jnp.cos(self.periapsis), jnp.sin(self.periapsis)
-            u, v = cw * along - sw * across, sw * along + cw * across
-        cn, sn = jnp.cos(self.node), jnp.sin(self.node)
-        ci, si = jnp.cos(self.inclination), jnp.sin(self.inclination)
-        place = (cn * u - sn * ci * v, sn * u + cn * ci * v, si * v)
-        return jnp.stack(jnp.broadcast_arrays(*place), axis=-1)
+
+_ELEMENTS = (
+    "semi_major_axis",
+    "eccentricity",
+    "inclination",
+    "node",
+    "periapsis",
+    "mean_anomaly",
+)
 
 
-class StateOrbit(AbstractConic):
-    """Position on the conic through a given place and velocity: ``orbit(t)`` (..., 3) [m].
+def _by_elements(orbit: Any, t: Array) -> Float[Array, "*b 3"]:
+    mean = orbit.mean_anomaly + orbit.mean_motion * (t - orbit.epoch)
+    axis, e = jnp.abs(orbit.semi_major_axis), orbit.eccentricity
+    if not orbit.hyperbolic:
+        mean = _within_a_turn(mean)
+    if e is None:
+        angle = orbit.periapsis + mean
+        u, v = axis * jnp.cos(angle), axis * jnp.sin(angle)
+    else:
+        mean, gap, e = jnp.broadcast_arrays(mean, _from_one(e, orbit.hyperbolic), e)
+        x = anomaly_at_periapsis(*jax.lax.stop_gradient((mean, gap, e)), orbit.hyperbolic)
+        sine, turn = passed_anomaly(x, mean, gap, e, 0.0, orbit.hyperbolic)
+        along, across = axis * (gap - turn), axis * jnp.sqrt(gap * (1 + e)) * sine
+        cw, sw = jnp.cos(orbit.periapsis), jnp.sin(orbit.periapsis)
+        u, v = cw * along - sw * across, sw * along + cw * across
+    cn, sn = jnp.cos(orbit.node), jnp.sin(orbit.node)
+    ci, si = jnp.cos(orbit.inclination), jnp.sin(orbit.inclination)
+    place = (cn * u - sn * ci * v, sn * u + cn * ci * v, si * v)
+    return jnp.stack(jnp.broadcast_arrays(*place), axis=-1)
 
-    **Arguments** (a batch broadcasts): ``mu`` (...) [m^3/s^2]; ``position`` (..., 3) [m] from the
-    attracting centre and ``velocity`` (..., 3) [m/s] at the time ``epoch`` (...) [s], both in
-    space axes. Derivatives are regular everywhere, also for circular and equatorial orbits, whose
-    elements (``KeplerOrbit``) are not. All orbits of a batch are ellipses, or all are hyperbolas,
-    for fly-bys; ``hyperbolic`` (static) tells which where the numbers are traced.
 
-    Lagrange's f and g functions of the difference in eccentric or hyperbolic anomaly (R. H. Battin,
-    An Introduction to the Mathematics and Methods of Astrodynamics, 1999).
+def _check_state(
+    mu: np.ndarray, place: np.ndarray, speed: np.ndarray, hyperbolic: bool | None
+) -> bool:
+    """ValueError for states on neither an ellipse nor a hyperbola; whether they are hyperbolas."""
+    distance = np.linalg.norm(place, axis=-1)
+    excess = distance * np.sum(speed * speed, axis=-1) / mu
+    if hyperbolic is None:
+        hyperbolic = bool(np.all(excess > 2))
+    require(
+        (distance > 0) & ((excess > 2 + 1e-9) if hyperbolic else (excess < 2)),
+        "position and velocity must lie on an ellipse, |v|^2 |r|/mu below 2, or for a"
+        f" batch of hyperbolas above 2, got {describe(excess)}: check the units, or hand"
+        " GravityGradient any function of time instead.",
+    )
+    moment = np.linalg.norm(np.cross(place, speed), axis=-1)
+    require(
+        moment > 1e-6 * distance * np.sqrt(mu / np.maximum(distance, 1e-300)),
+        "the velocity must not point straight to or from the attracting centre, got"
+        f" {describe(speed)} at {describe(place)}.",
+    )
+    return hyperbolic
 
-    Hand it to ``ph.GravityGradient(mu, orbit)`` or ``ph.LVLH(orbit)``. Raises ValueError for mu
-    that is not positive, or a state on neither: a parabola, ellipses among hyperbolas, or moving
-    straight to or from the centre.
 
-        flyby = ph.StateOrbit(3.986e14, position=[3.8e7, 0, 0], velocity=[0, 7.4e3, 0])
-    """
+def _axis_of_state(orbit: Any) -> tuple[Array, Array]:
+    """|a| [m], and 2 - |r| |v|^2 / mu, which is negative on a hyperbola."""
+    distance = jnp.linalg.norm(orbit.position, axis=-1)
+    bound = 2 - distance * jnp.sum(orbit.velocity * orbit.velocity, axis=-1) / orbit.mu
+    return distance / jnp.abs(bound), bound
 
-    mu: Float[Array, "*#b"] = shaped()
-    position: Float[Array, "*#b 3"] = shaped(3)
-    velocity: Float[Array, "*#b 3"] = shaped(3)
-    epoch: Float[Array, "*#b"] = shaped()
-    hyperbolic: bool = eqx.field(static=True, default=False)
 
-    def __init__(
-        self,
-        mu: ArrayLike,
-        position: ArrayLike,
-        velocity: ArrayLike,
-        epoch: ArrayLike = 0.0,
-        hyperbolic: bool | None = None,
-    ):
-        given = {
-            "mu": as_number("mu", mu),
-            "position": as_float_array("position", position, (3,)),
-            "velocity": as_float_array("velocity", velocity, (3,)),
-            "epoch": as_number("epoch", epoch),
-        }
-        dtype = jnp.result_type(*given.values())
-        for name, value in given.items():
-            setattr(self, name, value.astype(dtype))
-        require_positive("mu", self.mu)
-        if is_concrete(self.mu, self.position, self.velocity):
-            place, speed = np.asarray(self.position), np.asarray(self.velocity)
-            distance = np.linalg.norm(place, axis=-1)
-            excess = distance * np.sum(speed * speed, axis=-1) / np.asarray(self.mu)
-            if hyperbolic is None:
-                hyperbolic = bool(np.all(excess > 2))
-            require(
-                (distance > 0) & ((excess > 2 + 1e-9) if hyperbolic else (excess < 2)),
-                "position and velocity must lie on an ellipse, |v|^2 |r|/mu below 2, or for a"
-                f" batch of hyperbolas above 2, got {describe(excess)}: check the units, or hand"
-                " GravityGradient any function of time instead.",
-            )
-            moment = np.linalg.norm(np.cross(place, speed), axis=-1)
-            require(
-                moment
-                > 1e-6 * distance * np.sqrt(np.asarray(self.mu) / np.maximum(distance, 1e-300)),
-                "the velocity must not point straight to or from the attracting centre, got"
-                f" {describe(speed)} at {describe(place)}.",
-            )
+def _by_state(orbit: Any, t: Array) -> Float[Array, "*b 3"]:
+    axis, bound = _axis_of_state(orbit)
+    n = jnp.sqrt(orbit.mu / axis) / axis  # mean motion
+    # e cos E and e sin E at the epoch
+    a = 1 - bound
+    b = jnp.sum(orbit.position * orbit.velocity, axis=-1) / jnp.sqrt(orbit.mu * axis)
+    bound, mean = jnp.abs(bound), n * (t - orbit.epoch)
+    if not orbit.hyperbolic:
+        mean = _within_a_turn(mean)
+    mean, bound, a, b = jnp.broadcast_arrays(mean, bound, a, b)
+    shape = jnp.sum(orbit.momentum**2, axis=-1) / (orbit.mu * axis)  # |1 - e^2|
+    nearly = _nearly_passed(orbit.hyperbolic, *jax.lax.stop_gradient((mean, a, b, shape)))
+    sine, turn = passed_anomaly(nearly, mean, bound, a, b, orbit.hyperbolic)
+    f = 1 - turn / bound
+    g = (bound * sine + b * turn) / n
+    place, velocity = (jnp.broadcast_to(x, (*f.shape, 3)) for x in (orbit.position, orbit.velocity))
+    return f[..., None] * place + g[..., None] * velocity
 
-        self.hyperbolic = bool(hyperbolic)
 
-    @property
-    def momentum(self) -> Float[Array, "*b 3"]:
-        return jnp.cross(*jnp.broadcast_arrays(self.position, self.velocity))
-
-    def _position(self, t: Array) -> Float[Array, "*b 3"]:
-        r0 = jnp.linalg.norm(self.position, axis=-1)
-        bound = 2 - r0 * jnp.sum(self.velocity * self.velocity, axis=-1) / self.mu
-        axis = r0 / jnp.abs(bound)
-        n = jnp.sqrt(self.mu / axis) / axis  # mean motion
-        # e cos E and e sin E at the epoch
-        a = 1 - bound
-        b = jnp.sum(self.position * self.velocity, axis=-1) / jnp.sqrt(self.mu * axis)
-        bound, mean = jnp.abs(bound), n * (t - self.epoch)
-        if not self.hyperbolic:
-            mean = _within_a_turn(mean)
-        mean, bound, a, b = jnp.broadcast_arrays(mean, bound, a, b)
-        shape = jnp.sum(self.momentum**2, axis=-1) / (self.mu * axis)  # |1 - e^2|
-        nearly = self._passed_anomaly(*jax.lax.stop_gradient((mean, a, b, shape)))
-        sine, turn = passed_anomaly(nearly, mean, bound, a, b, self.hyperbolic)
-        f = 1 - turn / bound
-        g = (bound * sine + b * turn) / n
-        place, velocity = (
-            jnp.broadcast_to(x, (*f.shape, 3)) for x in (self.position, self.velocity)
-        )
-        return f[..., None] * place + g[..., None] * velocity
-
-    def _passed_anomaly(self, mean: Array, a: Array, b: Array, shape: Array) -> Array:
-        """Difference in anomaly since the epoch, nearly, without derivatives."""
-        if self.hyperbolic:
-            e = jnp.sqrt(1 + shape)
-            at_epoch = jnp.arcsinh(b / e)
-            total = mean + b - at_epoch
-        else:
-            e = jnp.sqrt(a * a + b * b)
-            at_epoch = jnp.arctan2(b, a)
-            total = _within_a_turn(mean + at_epoch - b)
-        x = anomaly_at_periapsis(total, shape / (1 + e), e, self.hyperbolic) - at_epoch
-        return x if self.hyperbolic else mean + _within_a_turn(x - mean)
+def _nearly_passed(hyperbolic: bool, mean: Array, a: Array, b: Array, shape: Array) -> Array:
+    """Difference in anomaly since the epoch, nearly, without derivatives."""
+    if hyperbolic:
+        e = jnp.sqrt(1 + shape)
+        at_epoch = jnp.arcsinh(b / e)
+        total = mean + b - at_epoch
+    else:
+        e = jnp.sqrt(a * a + b * b)
+        at_epoch = jnp.arctan2(b, a)
+        total = _within_a_turn(mean + at_epoch - b)
+    x = anomaly_at_periapsis(total, shape / (1 + e), e, hyperbolic) - at_epoch
+    return x if hyperbolic else mean + _within_a_turn(x - mean)

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from polhode._kernels import are_close, over_gap, underivable
 from polhode.rotation._components import matrix_row
 
 # Cyclic Jacobi converges quadratically once the off-diagonal part is small against the gaps, and
@@ -112,7 +113,7 @@ def principal(
     fixed R, which exist for equal moments too; for separate moments those of ``moments`` are the
     usual ones. What depends on the tensor alone has its right derivative when it is computed from
     moments, products and wxyz together. This holds to first order: the second derivative of an
-    eigenvalue needs the turning of the axes, which is left out.
+    eigenvalue needs the turning of the axes, which is left out (see ``principal_moments``).
     """
     entries = [[(tensor[..., i, j] + tensor[..., j, i]) / 2 for j in range(3)] for i in range(3)]
     fixed = jax.lax.stop_gradient(tensor)
@@ -130,3 +131,35 @@ def principal(
     moments = jnp.stack([entry(i, i) / sum(x * x for x in columns[i]) for i in range(3)], axis=-1)
     products = jnp.stack([entry(1, 2), entry(2, 0), entry(0, 1)], axis=-1)
     return moments, jnp.stack(q, axis=-1), products - jax.lax.stop_gradient(products)
+
+
+@jax.jit
+def principal_moments(tensor: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3"]:
+    """The moments of ``principal``, with their second derivatives too.
+
+    Those are NaN where two moments agree to half of their digits and the principal axes turn:
+    there eigenvalues have no second derivatives.
+    """
+    moments, _, products = principal(tensor)
+    return _curved(moments, products)
+
+
+@jax.custom_jvp
+def _curved(moments: Array, products: Array) -> Array:
+    """Moments, with the second derivatives by the products (..., 3), which are zero in value."""
+    return moments
+
+
+@_curved.defjvp
+def _curved_rule(primals, tangents):
+    moments, products = primals
+    change, turned = tangents
+    a, b, c = (moments[..., i] for i in range(3))
+    close = are_close(a, b) | are_close(b, c) | are_close(c, a)
+    yz, zx, xy = (underivable(products[..., i], close) for i in range(3))
+    by_yz, by_zx, by_xy = (
+        2 * turned[..., i] * x
+        for i, x in enumerate((over_gap(yz, b, c), over_gap(zx, c, a), over_gap(xy, a, b)))
+    )
+    curved = jnp.stack([by_xy - by_zx, by_yz - by_xy, by_zx - by_yz], axis=-1)
+    return _curved(moments, products), change + curved

@@ -19,7 +19,7 @@ from polhode._checks import (
 )
 from polhode._parts import AbstractPart, shaped
 from polhode.inertia._cholesky import inertia_from_log_cholesky, inertia_to_log_cholesky
-from polhode.inertia._eigen import principal
+from polhode.inertia._eigen import principal, principal_moments
 from polhode.inertia._input import (
     check_moments,
     check_tensor,
@@ -212,12 +212,12 @@ class Inertia(AbstractShaped, AbstractPart):
     def moments(self) -> Float[Array, "*b 3"]:
         """Principal moments, kg m^2: as given, or ascending for a full tensor.
 
-        Differentiable; for equal moments of a full tensor see ``principal``.
+        Differentiable twice; second derivatives of equal moments by the full tensor are NaN.
         """
         if self.diagonal is not None:
             return self.diagonal
         if self.full is not None:
-            return principal(self.full)[0]
+            return principal_moments(self.full)
         if self.moment is not None:
             return jnp.stack([self.moment] * 3, axis=-1)
         transverse, axial = jnp.broadcast_arrays(self.transverse, self.axial)
@@ -265,7 +265,7 @@ class Inertia(AbstractShaped, AbstractPart):
         if self.full is None:
             unit = jnp.asarray([1, 0, 0, 0], self.dtype)
             return self, jnp.broadcast_to(unit, (*self.batch_shape, 4))
-        moments, wxyz, _ = principal(self.full)
+        moments, wxyz = principal_moments(self.full), principal(self.full)[1]
         return type(self)(diagonal=moments, physical=self.physical), wxyz
 
     def momentum(self, omega: Float[Array | np.ndarray, "*#b 3"]) -> Float[Array, "*b 3"]:

@@ -20,6 +20,7 @@ from polhode._closed_forms.free._roles import Triple
 from polhode._closed_forms.free._second import incomplete, quarter_turn
 from polhode._closed_forms.free._tangent import partials
 from polhode._hamiltonian import triple
+from polhode._kernels import over_gap
 
 Scalars = Float[Array, "*b"]
 
@@ -127,18 +128,15 @@ def _functions_rule(many, primals, tangents):
 def _axes(_, given) -> Triple:
     """Turn of the principal axes that entries xy, xz, yz of the tensor make."""
     (a, b, c), (xy, xz, yz) = given
-
-    def quotient(entry, gap):
-        return jnp.where(gap == 0, 0, entry / jnp.where(gap == 0, 1, gap))
-
-    return quotient(yz, b - c), quotient(xz, c - a), quotient(xy, a - b)
+    return over_gap(yz, b, c), over_gap(xz, c, a), over_gap(xy, a, b)
 
 
 def turn_of_axes(given, dm, dp, dw):
     """Everything along principal axes that turn with the tensor, and the way back of a vector.
 
     The products of inertia are zero and only carry a tangent, so that the turn is zero as well: it
-    counts in second derivatives alone. Axes of equal moments are not turned.
+    counts in second derivatives alone. Axes of equal moments have no such turn, and second
+    derivatives by the product between them are NaN.
     """
     moments, products, omega, wxyz, t = given
     none = tuple(jnp.zeros_like(x) for x in products)

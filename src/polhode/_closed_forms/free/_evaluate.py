@@ -103,9 +103,8 @@ def free_motion(
 
     First and second derivatives, forward and reverse, are exact in every regime, with two limits
     on second ones: those by ``products`` lose digits in proportion to the inverse relative
-    difference of two moments, and where two are equal they lack the turning of those axes (finite,
-    but not right); those by the rates lose the ratio of a radian to the angle turned through,
-    except at rest.
+    difference of two moments, and are NaN where two agree to half of their digits; those by the
+    rates lose the ratio of a radian to the angle turned through, except at rest.
     """
     parts = (
         components(moments, 3),

@@ -1,6 +1,7 @@
 """Rotation periods of a tumbling free body, in the convention of the long axis."""
 
 import enum
+import functools
 import math
 from typing import NamedTuple
 
@@ -8,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from polhode._closed_forms.free._carry import turn_of_axes
 from polhode._closed_forms.free._evaluate import components
 from polhode._closed_forms.free._frame import Frame, dot, matrix
 from polhode._closed_forms.free._motion import Swing, descend, prepare_swing, prepare_turning
@@ -15,6 +17,7 @@ from polhode._closed_forms.free._roles import assign_roles
 from polhode._closed_forms.free._rule import change_of_start, zero_where_symbolic
 from polhode._closed_forms.free._second import complete
 from polhode._closed_forms.free._tangent import change_of_invariants
+from polhode._kernels import are_close, underivable
 
 Scalars = Float[Array, "*b"]
 
@@ -135,9 +138,17 @@ def _periods(given):
 
 def _periods_rule(primals, tangents):
     given = primals[0]
+    dm, dp, dw = (zero_where_symbolic(d, x) for d, x in zip(tangents[0], given, strict=True))
+    # Of symmetric bodies the constants below have no right derivatives.
+    a, b, c = given[0]
+    symmetric = are_close(a, b) | are_close(b, c) | are_close(c, a)
+    given = jax.tree.map(functools.partial(underivable, where=symmetric), given)
+    if given[1] is not None:
+        moments, products, omega = given
+        given = moments, products, omega, None, None
+        (*given, _, _), dm, dp, dw, _ = turn_of_axes(given, dm, dp, dw)
     (values, mode), (swing, turning, steady, about) = _work_out(given)
     P_psi, P_phi, k2, _, _ = values
-    dm, dp, dw = (zero_where_symbolic(d, x) for d, x in zip(tangents[0], given, strict=True))
     change = change_of_start(swing, Frame(swing), dm, dp, dw)
     dr, ds, dpp, dA, dB, dz = change_of_invariants(swing, change)
     start = swing.momentum
