@@ -28,7 +28,11 @@ PAIRS = sorted({path.stem for path in NOTEBOOKS.glob("*.*") if path.suffix in ("
 NUMBERED = {"000": 39, "002": 12, "003": 29}
 LIMIT = 600_000  # bytes of an executed notebook
 PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
-SKETCHES = {"identifiability.md": 2, "light_curves.md": 1}  # `py`: need more than polhode
+SKETCHES = {
+    "identifiability.md": 2,
+    "light_curves.md": 1,
+    "scale.md": 1,
+}  # `py`: need more than polhode
 WIDTH = 100  # columns of a code box
 BADGE = re.compile(
     r"\[!\[Open in Colab\]\(https://colab\.research\.google\.com/assets/colab-badge\.svg\)\]"

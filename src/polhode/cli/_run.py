@@ -46,12 +46,8 @@ def run(
     memory: _ensemble.MemoryOption = None,
     chunk: _ensemble.ChunkOption = None,
     devices: _ensemble.DevicesOption = None,
-    process: _ensemble.ProcessOption = None,
-    processes: _ensemble.ProcessesOption = None,
-    coordinator: _ensemble.CoordinatorOption = None,
-    cluster: _ensemble.ClusterOption = False,
-    patience: _ensemble.PatienceOption = None,
-    no_verify: _ensemble.NoVerifyOption = False,
+    part: _ensemble.PartOption = None,
+    scheduler: _ensemble.SchedulerOption = None,
 ) -> int:  # fmt: skip
     """Simulate a scene with its Monte Carlo clones. Writes a NetCDF file and a PNG figure beside
     it, each whole or not at all, and prints a summary table. A scene with an [ensemble] goes into a
@@ -59,13 +55,14 @@ def run(
     """
     file = read(scene, clones, seed)
     options = {
-        "memory": memory, "chunk": chunk, "devices": devices, "process": process,
-        "processes": processes, "coordinator": coordinator, "cluster": cluster or None,
-        "patience": patience, "no_verify": no_verify or None,
+        "memory": memory, "chunk": chunk, "devices": devices, "part": part,
+        "scheduler": scheduler,
     }  # fmt: skip
     options = {name: value for name, value in options.items() if value is not None}
     if file.ensemble is not None:
         require("run", "rich", "zarr", extra="cli,scale")
+        if scheduler is not None:
+            require("run", "distributed", extra="cli,scale,dask")
         return _ensemble.run(file, output, precision, options, quiet=quiet, no_cache=no_cache)
     _ensemble.refuse(options, file)
     with_figure = file.output.figure and not no_figure
