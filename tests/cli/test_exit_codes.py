@@ -61,7 +61,7 @@ CASES = [
     ("run toutatsi", 2, ["polhode run toutatis"]),
     ("run elsewhere/wing_nut.toml", 2, ["polhode run wing_nut"]),
     ("run .", 2, ["directory"]),
-    ("run empty.toml", 2, ["missing key"]),
+    ("run empty.toml", 2, ["inertia", "Field required"]),
     ("run bin.toml", 2, ["not a text file"]),
     ("run imu.csv", 2, ["not valid TOML", "polhode fit"]),
     ("explain foreign.nc", 2, ["foreign.nc", "polhode view"]),

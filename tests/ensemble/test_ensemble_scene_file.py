@@ -45,14 +45,14 @@ def test_draws_in_the_units_of_the_file():
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("bodies = 9000", "bodies = 0", "whole number from 1"),
-        ("bodies = 9000", "clones = 9", "unknown key"),
-        ("any = true", "any = true\nsigma = 1", "too many choices"),
-        ("half_width = [0.0, 2.0, 3.0]", "half_width = -1", "not a spread"),
+        ("bodies = 9000", "bodies = 0", "greater than or equal to 1"),
+        ("bodies = 9000", "clones = 9", "Extra inputs"),
+        ("any = true", "any = true\nsigma = 1", "exactly one of"),
+        ("half_width = [0.0, 2.0, 3.0]", "half_width = -1", "greater than or equal to 0"),
         ("[ensemble.attitude]\nany = true", "[ensemble.moments]\nrelative_sigma = 1", "not fit"),
         ('quantity = "rate"', 'quantity = "tlt"', "tilt"),
-        ("high = 2", "", "half a range"),
-        ("high = 2", "high = -2", "not above low"),
+        ("high = 2", "", "both low and high"),
+        ("high = 2", "high = -2", "high must be above low"),
     ],
 )
 def test_mistakes_are_named(old, new, words):

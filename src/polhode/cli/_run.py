@@ -142,6 +142,11 @@ def _dataset(job, outcome, figures, precision: str):
         values = values if lead else values[0]
         words = f"period {name}: {_summary.MEANINGS[name]}"
         dataset[name] = (lead, values, {"units": "s", "long_name": words})
+    for name, times in outcome.events.items():
+        words = f"times at which the event {name} occurs, NaN where there are no more"
+        dimensions = (*lead, f"{name}_crossing")
+        values = times if lead else times[0]
+        dataset[f"{name}_times"] = (dimensions, values, {"units": "s", "long_name": words})
     dataset["moments"] = (
         (*(lead if job.scene.inertia.batch_shape else ()), "axis"),
         job.scene.inertia.moments,
