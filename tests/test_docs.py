@@ -239,6 +239,8 @@ def parameters(signature: str) -> list[str]:
 def test_classes_show_the_arguments_of_their_constructor(thing):
     if getattr(thing, "__parameters__", ()) or not inspect.isclass(thing):
         pytest.skip("a type alias")
+    if hasattr(thing, "model_fields"):
+        pytest.skip("pydantic changes its signature when it is first used")
     assert parameters(signatures.of_class(thing)) == list(inspect.signature(thing).parameters)
 
 

@@ -64,7 +64,7 @@ def run(
     """Compute the ensemble into its store; 0, or 1 when some bodies did not finish."""
     messages = _show.messages(quiet)
     path = _store_path(file, output)
-    with messages.status("starting ..."):
+    with _show.working(messages, "starting"):
         import jax
 
         jax.config.update("jax_enable_x64", True)
@@ -119,17 +119,15 @@ def _store_path(file: Any, output: str | None) -> Path:
 
 
 def _stream(file, ensemble, statistics, path, precision, meter, options):
-    from polhode.cli._run import provenance
+    from polhode.cli._run import texts
     from polhode.ensemble import stream
     from polhode.files import build_method
 
-    words = provenance(file, precision)
-    kept = ("title", "scene", "scene_source", "frame", "precision")
     stream(
         ensemble, file.times.seconds, path,
         method=build_method(file), rtol=file.method.rtol,
         trajectories=file.ensemble.trajectories, statistics=statistics,
-        attributes={name: words[name] for name in kept}, progress=meter, **options,
+        attributes=texts(file) | {"precision": precision}, progress=meter, **options,
     )  # fmt: skip
     return meter.last
 

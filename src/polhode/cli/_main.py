@@ -25,6 +25,13 @@ from polhode.files._error import visible
 
 SUCCESS, FAILURE, USAGE = 0, 1, 2
 _codes: list[int] = []
+_words: list[str] = []
+
+
+def words() -> list[str]:
+    """The arguments of the command that runs."""
+    return list(_words)
+
 
 _OTHER_WORDS = {
     "run": ("simulate", "sim", "solve", "integrate", "propagate", "start", "exec", "execute"),
@@ -196,9 +203,9 @@ for _name, _command in (("run", _run.run), ("explain", _explain.explain), ("fit"
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; see `polhode.cli.main`."""
     _codes.clear()
-    words = None if argv is None else list(argv)
+    _words[:] = map(str, sys.argv[1:] if argv is None else argv)
     try:
-        typer.main.get_command(app).main(args=words, prog_name="polhode")
+        typer.main.get_command(app).main(args=list(_words), prog_name="polhode")
     except SystemExit:
         if not _codes:
             raise

@@ -276,9 +276,11 @@ def device_names(devices: Sequence[Any]) -> str:
 def _title() -> dict[str, str]:
     """The attributes of every store."""
     from polhode import __version__
+    from polhode.files._provenance import commit
 
     return {
         "title": "Ensemble of rotating rigid bodies",
         "source": f"polhode {__version__}",
+        "polhode_commit": commit(),
         "convention": "wxyz scalar first, body -> space; R = Rz(phi) Ry(theta) Rz(psi)",
     }
