@@ -117,7 +117,7 @@ def _run_guarded(command: Callable[[], int], debug: bool) -> int:
     before = gc.get_threshold()
     gc.set_threshold(*_COLLECTED)
     try:
-        with heeded(_leave), warnings.catch_warnings():
+        with heeded(), warnings.catch_warnings():
             # numbers that overflow are told by the status, and letters without a picture are drawn
             # as boxes; what else warns is told without its place in the source
             warnings.simplefilter("ignore", RuntimeWarning)
@@ -140,13 +140,6 @@ def _run_guarded(command: Callable[[], int], debug: bool) -> int:
         return _report(error, debug)
     finally:
         gc.set_threshold(*before)
-
-
-def _leave(code: int) -> None:
-    """End the process here and now."""
-    word = "terminated" if code == TERMINATED else "interrupted"
-    print(f"\npolhode: {word}; {_state_of_files()}", file=sys.stderr, flush=True)
-    os._exit(code)
 
 
 def _warned(message: Warning | str, *_: Any) -> None:
