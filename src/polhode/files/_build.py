@@ -93,7 +93,10 @@ def build_orbit(file: SceneFile, dtype: DTypeLike) -> "polhode.AbstractOrbit | N
 def _potential(file: SceneFile, table: Any, orbit: Any, dtype: DTypeLike) -> Any:
     numbers = _numbers(table, dtype, "kind")
     if table.kind == "uniform-gravity":
-        return polhode.UniformGravity(**numbers)
+        # known by structure, also to an ensemble, whose method is chosen without numbers
+        gravity = table.gravity_space or [0.0, 0.0, -9.80665]
+        known = {"on_axis": not any(table.centre_body[:2]), "vertical": not any(gravity[:2])}
+        return polhode.UniformGravity(**numbers, **known)
     if table.needs_orbit:
         return polhode.GravityGradient(orbit.mu, orbit)
     return polhode.GravityGradient(**numbers)
