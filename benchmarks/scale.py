@@ -241,7 +241,7 @@ mass = 1.0
 centre_body = [0.0, 0.0, 0.1]
 [times]
 stop = 1000.0
-number = 101
+number = 751
 [ensemble]
 bodies = BODIES
 seed = 1

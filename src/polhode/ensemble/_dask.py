@@ -23,6 +23,13 @@ if TYPE_CHECKING:
     from polhode.ensemble._stream import Job
 
 _RETRIES = 2
+# of the process that starts the run; a worker shares its cache of compiled programs
+_SETTINGS = (
+    "jax_enable_x64",
+    "jax_compilation_cache_dir",
+    "jax_persistent_cache_min_compile_time_secs",
+    "jax_persistent_cache_min_entry_size_bytes",
+)
 _building = threading.Lock()
 
 
@@ -56,13 +63,13 @@ def complete(client: Any, job: "Job", numbers: range) -> Iterator[tuple[int, boo
         imported("a run on a dask cluster", name, extra="dask")
         for name in ("cloudpickle", "distributed")
     )
-    x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+    settings = {name: getattr(jax.config, name) for name in _SETTINGS}
     ensemble, *rest = job.arguments
     rows = {name: _reference(x) for name, x in ensemble.rows.items()}
     bare = _with_rows(ensemble, {})
     message = cloudpickle.dumps((bare, rows, rest, job.chunk, versions()))
     futures = client.map(
-        _complete, list(numbers), x64=x64, message=message, pure=False, retries=_RETRIES
+        _complete, list(numbers), settings=settings, message=message, pure=False, retries=_RETRIES
     )
     try:
         for _, result in distributed.as_completed(futures, with_results=True, loop=client.loop):
@@ -71,10 +78,12 @@ def complete(client: Any, job: "Job", numbers: range) -> Iterator[tuple[int, boo
         client.cancel(futures)
 
 
-def _complete(k: int, x64: bool, message: bytes) -> tuple[int, bool]:
+def _complete(k: int, settings: dict[str, Any], message: bytes) -> tuple[int, bool]:
     """Complete chunk ``k``; runs on a worker."""
-    jax.config.update("jax_enable_x64", x64)  # before arrays of 64 bits are unpickled
     with _building:
+        for name, value in settings.items():  # before arrays of 64 bits are unpickled
+            if value is not None and getattr(jax.config, name) != value:
+                jax.config.update(name, value)
         job = _build(message)
     return k, job.complete(k)
 
