@@ -188,3 +188,17 @@ def test_run_writes_resumes_and_refuses(tmp_path, capsys):
     plain.write_text(SCENE[: SCENE.index("[ensemble]")])
     assert main(["run", str(plain), "--part", "1/2"]) == 2
     assert "--part on the command line" in capsys.readouterr().err
+
+
+def test_heavy_tops_on_their_axis_follow_the_closed_form():
+    """The method of an ensemble is chosen without numbers, so that the scene must say it."""
+    import jax
+
+    import polhode as ph
+    from polhode.ensemble._program import Block
+
+    gravity = '[potential]\nkind = "uniform-gravity"\nmass = 1.0\ncentre_body = [0, 0, 0.1]\n'
+    for text, kind in ((gravity, ph.LagrangeTop), (gravity.replace("[0,", "[0.1,"), ph.LiePoisson)):
+        ensemble, _ = build_ensemble(parse_scene(SCENE + text), np.float64)
+        block = Block(ensemble, [0.0, 1.0], None, None, True, (), jax.devices()[:1])
+        assert isinstance(block.method, kind)
