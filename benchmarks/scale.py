@@ -3,12 +3,12 @@
     python -m benchmarks.scale store        1e6 bodies x 100 times and 1e7 x 10 (free disk: 12 GB)
     python -m benchmarks.scale cost         ns per body and per saved state, on one core
     python -m benchmarks.scale devices      a sharded batch of 1e6 bodies beside one device
-    python -m benchmarks.scale kills        20 kills at random moments, and what each of them cost
-    python -m benchmarks.scale processes    1, 2 and 4 processes into one store
+    python -m benchmarks.scale kills        20 kills at random moments
+    python -m benchmarks.scale parts        one part, two, and a dask cluster of two, a core each
     python -m benchmarks.scale model        the tables of docs/scale.md, from the committed results
 
-Each but the last writes ``scale_NAME.json``. Kills and processes are real ones; their stores are
-compared with an undisturbed one bit by bit.
+Each but the last writes ``scale_NAME.json``. Stores of kills, parts and clusters are compared with
+an undisturbed one bit by bit.
 """
 
 import argparse
@@ -29,7 +29,7 @@ from benchmarks import _report
 
 ARRAYS = ("wxyz", "omega_body", "status")
 CASES = {"1e6 x 100": (1_000_000, 100), "1e7 x 10": (10_000_000, 10)}
-PARTS = ("store", "cost", "devices", "kills", "processes")
+PARTS = ("store", "cost", "devices", "kills", "parts")
 CHUNK = 16384
 
 
@@ -179,55 +179,38 @@ def devices(bodies: int, times: int) -> dict:
     }
 
 
-def child(path: str, begun: str, process: str = "0", processes: str = "1") -> None:
-    """One run of 300,000 bodies; the number of each chunk that is begun goes to a file."""
+def child(path: str) -> None:
+    """One run of 300,000 bodies."""
     import numpy as np
 
     from polhode import ensemble as ens
-    from polhode.ensemble import _fill
 
-    begin = _fill._chunk
-
-    def noted(store, block, number, *rest):
-        with open(begun, "a") as file:
-            file.write(f"{number}\n")
-        begin(store, block, number, *rest)
-
-    _fill._chunk = noted
-    ens.stream(
-        make(300_000), np.linspace(0.0, 10.0, 10), path, chunk=CHUNK,
-        process=int(process), processes=int(processes), warn=lambda _: None,
-    )  # fmt: skip
+    ens.stream(make(300_000), np.linspace(0.0, 10.0, 10), path, chunk=CHUNK)
 
 
-def _child(*words: object) -> subprocess.Popen:
-    command = [sys.executable, "-m", "benchmarks.scale", "child", *map(str, words)]
-    return subprocess.Popen(command)
+def _child(path: Path) -> subprocess.Popen:
+    return subprocess.Popen([sys.executable, "-m", "benchmarks.scale", "child", str(path)])
 
 
 def _equal(one: Path, other: Path) -> bool:
-    import numpy as np
-    import zarr
+    from polhode.ensemble import open_store
 
-    return all(
-        np.array_equal(*(zarr.open_array(p / name, mode="r")[:] for p in (one, other)))
-        for name in ARRAYS
-    )
+    with open_store(one) as ours, open_store(other) as theirs:
+        return ours.load().identical(theirs.load())
 
 
 def kills(count: int, folder: Path) -> dict:
     """Kill and restart one run after another."""
-    whole, begun = folder / "whole.zarr", folder / "begun"
+    whole = folder / "whole.zarr"
     began = time.perf_counter()
-    assert _child(whole, begun).wait() == 0
+    assert _child(whole).wait() == 0
     usual = time.perf_counter() - began
-    chunks = len(begun.read_text().split())
     seen = []
     while sum(row["kills"] for row in seen) < count:
-        path, begun = folder / f"killed{len(seen)}.zarr", folder / f"begun{len(seen)}"
+        path = folder / f"killed{len(seen)}.zarr"
         done = 0
         for _ in range(5):
-            running = _child(path, begun)
+            running = _child(path)
             try:
                 running.wait(random.uniform(0.3, 0.95) * usual)
                 break
@@ -235,33 +218,91 @@ def kills(count: int, folder: Path) -> dict:
                 running.send_signal(signal.SIGKILL)
                 running.wait()
                 done += 1
-        assert _child(path, begun).wait() == 0
-        lost = len(begun.read_text().split()) - chunks
-        seen.append({"kills": done, "computed_again": lost, "equal": _equal(path, whole)})
+        assert _child(path).wait() == 0
+        seen.append({"kills": done, "equal": _equal(path, whole)})
         print(seen[-1], flush=True)
         shutil.rmtree(path)
     return {
         "kills": sum(row["kills"] for row in seen),
-        "chunks": chunks,
-        "computed_again": sum(row["computed_again"] for row in seen),
-        "most_again_per_kill": max(row["computed_again"] / max(1, row["kills"]) for row in seen),
         "stores": len(seen),
         "stores_equal": sum(row["equal"] for row in seen),
     }
 
 
-def processes(folder: Path) -> dict:
-    """The same run by 1, 2 and 4 processes at a time."""
-    found = {}
-    for count in (1, 2, 4):
-        path = folder / f"{count}.zarr"
-        began = time.perf_counter()
-        running = [_child(path, folder / f"begun{count}{i}", i, count) for i in range(count)]
-        assert [p.wait() for p in running] == [0] * count
-        found[str(count)] = {
-            "seconds": time.perf_counter() - began,
-            "equal": _equal(path, folder / "1.zarr"),
-        }
+TOPS = """
+[inertia]
+axisymmetric = { transverse = 1.0, axial = 0.5 }
+[state]
+euler = { angles = [0.0, 60.0, 0.0], unit = "deg" }
+omega_body = [0.1, 0.2, 5.0]
+[potential]
+kind = "uniform-gravity"
+mass = 1.0
+centre_body = [0.0, 0.0, 0.1]
+[times]
+stop = 1000.0
+number = 751
+[ensemble]
+bodies = BODIES
+seed = 1
+trajectories = false
+[ensemble.omega_body]
+sigma = 0.3
+[[ensemble.statistics]]
+quantity = "tilt"
+low = 0
+high = 3.2
+"""
+
+
+def parts(folder: Path, bodies: int = 262_144) -> dict:
+    """Heavy tops over 1,000 s in 32 chunks, statistics only: by one process, by two parts and by a
+    dask cluster of two workers, every process of them on a core of its own.
+    """
+    scene = folder / "tops.toml"
+    scene.write_text(TOPS.replace("BODIES", str(bodies)))
+    cores = sorted(os.sched_getaffinity(0))[:2]
+    python = [sys.executable, "-m"]
+
+    def start(core: int, words: list, quiet: bool = False) -> subprocess.Popen:
+        command = ["taskset", "-c", str(core), *python, *map(str, words)]
+        return subprocess.Popen(command, stderr=subprocess.DEVNULL if quiet else None)
+
+    def run(name: str, *words: object) -> list:
+        store = folder / f"{name}.zarr"
+        return ["polhode.cli", "run", scene, "-o", store, "--chunk", 8192, "-q", *words]
+
+    def clock(name: str, commands: list) -> None:
+        """Wall time, and the processor time of the slowest process of each group."""
+        began, busy = time.perf_counter(), 0.0
+        for group in commands:
+            running = [start(core, words) for core, words in zip(cores, group)]
+            ended = [os.wait4(process.pid, 0)[1:] for process in running]
+            assert [code for code, _ in ended] == [0] * len(ended)
+            busy += max(used.ru_utime + used.ru_stime for _, used in ended)
+        found[f"{name}_s"] = time.perf_counter() - began
+        found[f"{name}_cpu_s"] = busy
+
+    found = {"bodies": bodies, "load": os.getloadavg()[0]}
+    clock("first", [[run("first", "--part", "1/32")]])  # compiled programs are kept
+    clock("one", [[run("one")]])
+    clock("parts", [[run("parts", "--part", f"{i}/2") for i in (1, 2)], [run("parts")]])
+    address = "127.0.0.1:8799"
+    scheduler = ["distributed.cli.dask_scheduler", "--port", "8799", "--dashboard-address", ":0"]
+    worker = ["distributed.cli.dask_worker", address, "--nthreads", "1", "--no-dashboard"]
+    cluster = [start(cores[0], scheduler, True)] + [start(core, worker, True) for core in cores]
+    try:
+        time.sleep(8.0)  # the cluster is there before the run, as on a machine that has one
+        clock("dask", [[run("dask", "--scheduler", address)]])
+    finally:
+        for process in reversed(cluster):
+            process.terminate()
+            process.wait()
+    for name in ("parts", "dask"):
+        found[f"{name}_over_one"] = found[f"{name}_s"] / found["one_s"]
+    found["equal"] = all(
+        _equal(folder / f"{name}.zarr", folder / "one.zarr") for name in ("parts", "dask")
+    )
     return found
 
 
@@ -326,9 +367,8 @@ def _others(kills: dict, devices: dict) -> str:
     away = max(devices["greatest_difference"].values())
     return (
         f"Kills: {kills['kills']} at random moments of {kills['stores']} runs;"
-        f" {kills['computed_again']} chunks were computed again, at most"
-        f" {kills['most_again_per_kill']:.0f} a kill, and {kills['stores_equal']} of the"
-        f" {kills['stores']} stores equal an undisturbed one bit by bit.\n\n"
+        f" {kills['stores_equal']} of the {kills['stores']} stores equal an undisturbed one bit by"
+        " bit.\n\n"
         f"Devices: `ph.simulate` of {devices['bodies']:,} bodies x {devices['times']} times sharded"
         f" over 2, 4 and 8 forced devices of two cores takes {over} against one device, and"
         f" its attitudes lie within {away:.0e} of those (more than a factor of two cannot be seen"
@@ -345,9 +385,7 @@ def _span(seconds: float) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument(
-        "what", choices=("store", "cost", "devices", "kills", "processes", "model", "child")
-    )
+    parser.add_argument("what", choices=(*PARTS, "model", "child"))
     parser.add_argument("words", nargs="*", help=argparse.SUPPRESS)
     parser.add_argument("--case", choices=CASES, help="one case of the store alone")
     parser.add_argument("--kills", type=int, default=20)
@@ -383,11 +421,11 @@ def main() -> None:
                 "cost": cost,
                 "devices": lambda: devices(options.bodies, 10),
                 "kills": lambda: kills(options.kills, Path(folder)),
-                "processes": lambda: processes(Path(folder)),
+                "parts": lambda: parts(Path(folder)),
             }[options.what]()
     print(json.dumps(found, indent=1))
     path = options.output or _report.OUT / f"scale_{options.what}.json"
-    _report.write("scale", found, path=path, packages=("zarr", "google-crc32c"))
+    _report.write("scale", found, path=path, packages=("zarr", "distributed"))
 
 
 if __name__ == "__main__":

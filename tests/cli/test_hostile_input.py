@@ -1,9 +1,11 @@
 """What a careless or hostile user gives: every case ends with one message and the right code."""
 
 import contextlib
+import datetime
 import errno
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -16,7 +18,7 @@ import xarray
 
 import polhode as ph
 from polhode.cli import _cache, _signals, main
-from polhode.files import _atomic
+from polhode.files import _atomic, _provenance
 
 FREE = """title = "free"
 [inertia]
@@ -222,8 +224,14 @@ def test_provenance_is_what_ran(here, capsys):
     assert json.loads(found["options"]).items() >= {"seed": 7, "clones": 3}.items()
     assert found["scene"] == text
     assert found["Conventions"].startswith("CF-1.")
-    versions = [found[f"{name}_version"] for name in ("polhode", "jaxlib")]
-    assert versions == [ph.__version__, jaxlib.__version__]
+    versions = [found[f"{name}_version"] for name in ("polhode", "jaxlib", "numpy")]
+    assert versions == [ph.__version__, jaxlib.__version__, np.__version__]
+    assert found["history"].endswith(f" polhode run top.toml -o out.nc {' '.join(command)}")
+    assert datetime.datetime.fromisoformat(found["history"].split()[0]).tzinfo is not None
+    assert found["method"].startswith("ClosedForm")
+    commit = _provenance.commit()
+    assert found.get("polhode_commit", "") == commit
+    assert re.fullmatch(r"([0-9a-f]{40}(\+changes)?)?", commit)
     assert kind == np.int8
     assert flags["flag_meanings"].split()[0] == "successful"
     assert flags["flag_values"].dtype == np.int8

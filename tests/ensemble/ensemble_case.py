@@ -1,8 +1,10 @@
 """A small ensemble for the tests, also run as a program that is killed while it works."""
 
+import itertools
 import os
 import signal
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +12,6 @@ import numpy as np
 
 import polhode as ph
 from polhode import ensemble as ens
-from polhode.ensemble import _fill
 
 TS = np.array([0.0, 1.0, 4.0])
 CHUNK = 8192
@@ -24,35 +25,28 @@ def make(bodies=40_000, seed=7, rate=0.3, dtype=jnp.float64):
     return ens.Ensemble(scene, state, bodies, spreads, seed)
 
 
-def main(path, kill_after, begun=None):
-    """Run the case; with JAX_COORDINATOR_ADDRESS set as one of several processes that meet there.
-    The number of each chunk that is begun goes to the file ``begun``.
+def main(path, kill_at, part="1/1"):
+    """Run the case. With ``kill_at`` k above 0 the process is killed when the k-th file of a chunk
+    is complete; below 0, just before that, when only its temporary file is there.
     """
     jax.config.update("jax_enable_x64", True)
-    process, processes = ens.join() if "JAX_COORDINATOR_ADDRESS" in os.environ else (0, 1)
+    count_files(int(kill_at))
+    i, n = map(int, part.split("/"))
+    ens.stream(make(), TS, path, chunk=CHUNK, part=(i, n) if n > 1 else None)
 
-    def progress(report):
-        if report.done - report.reused >= int(kill_after) > 0:
+
+def count_files(kill_at):
+    replace, count = Path.replace, itertools.count(1)
+
+    def counted(self, target):
+        k = next(count) if "c" in Path(target).parts else 0
+        if k and k == -kill_at:
+            os.kill(os.getpid(), signal.SIGKILL)
+        replace(self, target)
+        if k and k == kill_at:
             os.kill(os.getpid(), signal.SIGKILL)
 
-    if begun is not None:
-        count_chunks(begun)
-    ens.stream(
-        make(), TS, path, chunk=CHUNK, progress=progress, process=process, processes=processes,
-        warn=lambda words: print(words, flush=True),
-    )  # fmt: skip
-
-
-def count_chunks(path):
-    """Have each chunk that is begun leave its number in a file, whatever comes after."""
-    begin = _fill._chunk
-
-    def noted(store, block, number, *rest):
-        with open(path, "a") as file:
-            file.write(f"{number}\n")
-        begin(store, block, number, *rest)
-
-    _fill._chunk = noted
+    Path.replace = counted
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 """Ensembles: what a body is, what a store holds, and what is left after a kill."""
 
 import errno
-import os
-import socket
+import itertools
+import random
+import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import jax
@@ -15,7 +15,6 @@ import pytest
 
 import polhode as ph
 from polhode import ensemble as ens
-from polhode.ensemble import _store
 from polhode.ensemble._statistics import tilt
 
 xarray = pytest.importorskip("xarray")
@@ -115,80 +114,57 @@ def test_statistics_are_those_of_the_trajectories(whole):
         np.testing.assert_allclose(data.tilt_quantiles, exact, atol=3.2 / 64)
 
 
-@pytest.mark.slow
-def test_processes_meet_one_dies_and_the_rest_is_made_good(whole, tmp_path):
-    """Two processes under jax.distributed, one killed after its first chunk; then a damaged and a
-    lost file, and one process that does what is missing.
-    """
-    path, begun = tmp_path / "killed.zarr", tmp_path / "begun"
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        address = f"127.0.0.1:{free.getsockname()[1]}"
-    base = os.environ | {"JAX_COORDINATOR_ADDRESS": address, "JAX_NUM_PROCESSES": "2"}
-    both = [
-        subprocess.Popen(
-            [sys.executable, str(SCRIPT), str(path), kill, f"{begun}{process}"],
-            env=base | {"JAX_PROCESS_ID": str(process)},
-            stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        )
-        for process, kill in enumerate(("0", "8192"))
-    ]  # fmt: skip
-    (told, errors), (_, other) = (p.communicate(timeout=300) for p in both)
-    assert [p.returncode for p in both] == [0, -9], errors + other
-    # the dead one had one chunk of two; whether its fellow ended later is up to the system
-    assert told in ("", "process 1 of 2 is not running and 1 of its 2 chunks are missing: give its"
-                    " command again.\n")  # fmt: skip
-    chunks = [int(n) for k in (0, 1) for n in Path(f"{begun}{k}").read_text().split()]
-    assert sorted(chunks) == [0, 1, 2, 4]
-    with open(path / "wxyz" / "c" / "1" / "0" / "0", "r+b") as file:
-        file.seek(5000)
-        file.write(b"damage")
-    os.remove(path / "omega_body" / "c" / "4" / "0" / "0")
-    reports, words = [], []
-    ens.stream(
-        make(), TS, path, chunk=CHUNK, process=0, processes=2, progress=reports.append,
-        warn=words.append,
-    )  # fmt: skip
-    assert words == ["process 1 of 2 is not running and 1 of its 2 chunks are missing: give its"
-                     " command again."]  # fmt: skip
-    assert (reports[0].reused, reports[-1].reused) == (40_000 - 2 * 8192, 2 * 8192)
-    ens.stream(make(), TS, path, chunk=CHUNK, progress=reports.append)
-    assert reports[-1].reused == 40_000 - 2 * 8192  # chunk 3 was missing, chunk 1 damaged
-    assert reports[-1].done == 40_000
-    assert equal(path, whole)
-
-
-def test_chunks_and_processes_change_no_bit(whole, tmp_path):
-    wider = ens.stream(make(), TS, tmp_path / "wider.zarr", chunk=3 * CHUNK)
+def test_chunks_and_parts_change_no_bit(whole, tmp_path):
+    wider = ens.stream(make(), TS, tmp_path / "wider.zarr", chunk=3 * CHUNK, statistics=[TILT])
     assert equal(wider, whole)
-    shared = tmp_path / "shared.zarr"
-    for process in (2, 0, 3, 1):
-        ens.stream(
-            make(), TS, shared, chunk=CHUNK, statistics=[TILT], process=process, processes=4,
-            warn=lambda _: None,
-        )  # fmt: skip
-    assert equal(shared, whole)
-    with xarray.open_zarr(shared) as ours, xarray.open_zarr(whole) as theirs:
+    parts = tmp_path / "parts.zarr"
+    for i in (2, 3, 1):
+        ens.stream(make(), TS, parts, chunk=CHUNK, statistics=[TILT], part=(i, 4))
+    with pytest.raises(ens.StoreError, match=r"1 of 5 chunks is missing \(3\)"):
+        ens.open_store(parts)
+    ens.stream(make(), TS, parts, statistics=[TILT], part=(4, 4))
+    with pytest.raises(ens.StoreError, match="not reduced yet"):
+        ens.open_store(parts)
+    reports = []
+    ens.stream(make(), TS, parts, statistics=[TILT], progress=reports.append)
+    assert reports[0].reused == reports[-1].done == 40_000
+    with ens.open_store(parts) as ours, ens.open_store(whole) as theirs:
+        xarray.testing.assert_identical(ours.load(), theirs.load())
+    with xarray.open_zarr(wider) as ours, xarray.open_zarr(whole) as theirs:
         xarray.testing.assert_identical(ours.tilt_summary_std, theirs.tilt_summary_std)
 
 
-def test_kills_cost_one_chunk_each(whole, tmp_path):
-    """A process is killed twice, each time in a chunk that it has just begun."""
-    path, begun = tmp_path / "killed.zarr", tmp_path / "begun"
-    command = [sys.executable, str(SCRIPT), str(path), "0", str(begun)]
-    for k in (1, 2):
-        child = subprocess.Popen(command)
-        while not begun.exists() or len(begun.read_text().split()) < 2 * k - 1:
-            assert child.poll() is None
-            time.sleep(0.001)
-        child.kill()
-        child.wait()
-    reports = []
-    ens.stream(make(), TS, path, chunk=CHUNK, progress=reports.append)
-    finished = reports[0].reused // CHUNK
-    assert finished >= 1
-    assert len(begun.read_text().split()) <= finished + 2
+def test_parts_that_begin_together_share_a_store(whole, tmp_path):
+    path = tmp_path / "parts.zarr"
+    command = [sys.executable, str(SCRIPT), str(path), "0"]
+    both = [subprocess.Popen([*command, part]) for part in ("1/2", "2/2")]
+    assert [child.wait(timeout=300) for child in both] == [0, 0]
+    assert [file.name for file in tmp_path.iterdir()] == ["parts.zarr"]
     assert equal(path, whole)
+
+
+def killed(path, k):
+    child = subprocess.run([sys.executable, str(SCRIPT), str(path), str(k)], timeout=300)
+    assert child.returncode == -signal.SIGKILL
+
+
+def test_a_kill_costs_the_chunks_in_progress(whole, tmp_path):
+    path, k = tmp_path / "killed.zarr", random.randint(1, 15)
+    killed(path, -k)
+    assert list(path.rglob("*.partial"))
+    (tmp_path / ".killed.zarr.ab12.partial").mkdir()  # of one that was killed while it made it
+    ens.stream(make(), TS, path, chunk=CHUNK)
+    assert equal(path, whole), k
+    assert not list(tmp_path.rglob("*.partial"))
+
+
+@pytest.mark.slow
+def test_ten_kills_end_with_the_same_bits(whole, tmp_path):
+    for k in random.sample(range(1, 16), 10):
+        path = tmp_path / f"{k}.zarr"
+        killed(path, k)
+        ens.stream(make(), TS, path, chunk=CHUNK)
+        assert equal(path, whole), k
 
 
 def test_other_runs_are_refused(whole, tmp_path):
@@ -196,44 +172,93 @@ def test_other_runs_are_refused(whole, tmp_path):
     for change in (make(seed=8), make(rate=0.2), make(bodies=30_000)):
         with pytest.raises(ens.StoreError, match="another run"):
             ens.stream(change, TS, whole, chunk=CHUNK, statistics=[TILT])
-    with pytest.raises(ens.StoreError, match="scene"):
-        ens.stream(make(), TS * 2, whole, chunk=CHUNK, statistics=[TILT])
-    with (
-        _store.locked(whole, 0, 1),
-        pytest.raises(ens.StoreError, match="in use by another run"),
+    for changed, words in (
+        ({"ts": TS * 2}, "numbers"),
+        ({"rtol": 1e-6}, "rtol"),
+        ({"name": "x"}, "name"),
+        ({"statistics": []}, "statistics"),
+        ({"attributes": {"scene": "a"}}, "scene: line 1 of the store"),
     ):
-        ens.stream(make(), TS, whole, chunk=CHUNK, statistics=[TILT])
-    with (
-        _store.locked(whole, 1, 2),
-        pytest.raises(ens.StoreError, match="another process 1"),
-    ):
-        ens.stream(make(), TS, whole, statistics=[TILT], process=1, processes=2)
+        options = {"ts": TS, "path": whole, "statistics": [TILT]} | changed
+        with pytest.raises(ens.StoreError, match=words):
+            ens.stream(make(), **options)
     (tmp_path / "mine.zarr").mkdir()
     (tmp_path / "mine.zarr" / "letter").write_text("keep")
-    with pytest.raises(ens.StoreError, match="no store of an ensemble"):
+    with pytest.raises(ens.StoreError, match=r"no store of an ensemble.*zarr\.json"):
         ens.stream(make(), TS, tmp_path / "mine.zarr")
     assert (tmp_path / "mine.zarr" / "letter").read_text() == "keep"
     after = arrays(whole)
     assert all(np.array_equal(before[name], after[name]) for name in before)
 
 
+def test_own_functions_need_a_name(tmp_path):
+    def turned(key, scene, state):
+        return scene, ph.State(state.wxyz, 2 * state.omega_body)
+
+    ensemble = make(bodies=64)
+    mine = ens.Ensemble(ensemble.scene, ensemble.state, 64, (turned,), 1)
+    path = tmp_path / "mine.zarr"
+    with pytest.raises(ValueError, match="name="):
+        ens.stream(mine, TS, path)
+    assert not path.exists()
+    ens.stream(mine, TS, path, name="twice the rates")
+    with pytest.raises(ens.StoreError, match="name: the store has 'twice the rates'"):
+        ens.stream(mine, TS, path, name="thrice the rates")
+
+
 def test_full_disk_says_so_and_loses_nothing(whole, tmp_path, monkeypatch):
     path = tmp_path / "full.zarr"
-    synced = _store.Store._sync
-    calls = []
+    replace, count = Path.replace, itertools.count(1)
 
-    def sync(self, name, array, chunk):
-        calls.append(name)
-        if len(calls) > 5:
+    def full(self, target):
+        if "c" in Path(target).parts and next(count) > 5:
             raise OSError(errno.ENOSPC, "No space left on device")
-        synced(self, name, array, chunk)
+        return replace(self, target)
 
-    monkeypatch.setattr(_store.Store, "_sync", sync)
-    with pytest.raises(ens.StoreError, match="full: 1 of 5 chunks"):
+    monkeypatch.setattr(Path, "replace", full)
+    with pytest.raises(ens.StoreError, match=r"full: \d of 5 chunks are complete"):
         ens.stream(make(), TS, path, chunk=CHUNK)
     monkeypatch.undo()
     ens.stream(make(), TS, path, chunk=CHUNK)
     assert equal(path, whole)
+
+
+@pytest.fixture
+def disk(tmp_path):
+    """A folder on a small disk of its own; ``disk(options)`` mounts it again."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+
+    def mount(options):
+        command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)]
+        if subprocess.run(command, capture_output=True).returncode:
+            pytest.skip("only root can mount a disk")
+        return folder
+
+    yield mount
+    subprocess.run(["umount", str(folder)], capture_output=True)
+
+
+def test_a_disk_that_is_full(whole, disk, tmp_path):
+    folder = disk("size=1M")
+    with pytest.raises(ens.StoreError, match="full: 0 of 5 chunks"):
+        ens.stream(make(), TS, folder / "full.zarr", chunk=CHUNK)
+    subprocess.run(["mount", "-o", "remount,size=50M", str(folder)], check=True)
+    ens.stream(make(), TS, folder / "full.zarr", chunk=CHUNK)
+    assert equal(folder / "full.zarr", whole)
+
+
+def test_a_folder_that_is_read_only(disk):
+    folder = disk("size=50M")
+    ens.stream(make(), TS, folder / "half.zarr", chunk=CHUNK, part=(1, 2))
+    subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
+    with pytest.raises(ens.StoreError, match=r"cannot make the store .*Read-only"):
+        ens.stream(make(), TS, folder / "new.zarr")
+    with pytest.raises(ens.StoreError, match=r"cannot write to .*Read-only"):
+        ens.stream(make(), TS, folder / "half.zarr")
+    with xarray.open_zarr(folder / "half.zarr") as data:
+        assert (data.status[CHUNK : 2 * CHUNK] == 255).all()
+        assert np.isnan(data.wxyz[CHUNK]).all()
 
 
 def test_bad_sizes_are_refused(tmp_path):
@@ -242,9 +267,10 @@ def test_bad_sizes_are_refused(tmp_path):
         ens.stream(make(), TS, path, chunk=1000)
     with pytest.raises(ValueError, match="too small"):
         ens.stream(make(), TS, path, memory=10_000_000)
-    with pytest.raises(ValueError, match="process must be"):
-        ens.stream(make(), TS, path, process=2, processes=2)
-    with pytest.raises(ValueError, match="nothing to keep"):
+    for part in ((0, 2), (3, 2)):
+        with pytest.raises(ValueError, match="part must be"):
+            ens.stream(make(), TS, path, part=part)
+    with pytest.raises(ValueError, match="nothing to store"):
         ens.stream(make(), TS, path, trajectories=False)
     assert not path.exists()
 

@@ -32,11 +32,17 @@ def main(argv: Sequence[str] | None = None) -> int:
 def command() -> None:
     """The `polhode` command: `main`, which ends the process.
 
-    After an interrupt at once: where that met code made from text, as imports of data classes do,
+    After an interrupt or termination at once: the threads of an ensemble would first complete
+    their chunks, and where the interrupt met code made from text, as imports of data classes do,
     ``python -m`` would end by the signal and not with the exit code, though it was caught.
     """
-    code = main()
-    if code == 130:
+    try:
+        code = main()
+    except SystemExit as ended:
+        if ended.code != 143:
+            raise
+        code = 143
+    if code in (130, 143):
         for stream in (sys.stdout, sys.stderr):
             with contextlib.suppress(OSError, ValueError):
                 stream.flush()

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 import typer
 
 from polhode.cli import _show
-from polhode.cli._options import address, byte_count, device_count, positive, whole_number
+from polhode.cli._options import byte_count, device_count, part, whole_number
 from polhode.cli._signals import heed
 from polhode.cli._targets import UsageError, check_suffix
 
@@ -29,37 +29,20 @@ ChunkOption = Annotated[
 DevicesOption = Annotated[
     str | None, _option("--devices", "devices to use (default: 1)", device_count, "N|all")
 ]
-ProcessOption = Annotated[
-    int | None, _option("--process", "number of this process, from 0", whole_number(0), "I")
-]
-ProcessesOption = Annotated[
-    int | None,
-    _option("--processes", "number of processes that share the store", whole_number(1), "N"),
-]
-CoordinatorOption = Annotated[
+PartOption = Annotated[
     str | None,
     _option(
-        "--coordinator",
-        "where process 0 waits for the others (jax.distributed); needs --processes and --process",
-        address,
-        "HOST:PORT",
+        "--part", "compute part I of N, every N-th chunk; run once without it at the end",
+        part, "I/N",
     ),
-]
-ClusterOption = Annotated[
-    bool,
+]  # fmt: skip
+SchedulerOption = Annotated[
+    str | None,
     _option(
-        "--cluster",
-        "let JAX find coordinator and numbers: SLURM, Open MPI, Kubernetes, or"
-        " JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES, JAX_PROCESS_ID",
+        "--scheduler", "address of a dask scheduler whose workers compute the chunks",
+        metavar="ADDRESS",
     ),
-]
-PatienceOption = Annotated[
-    float | None,
-    _option("--patience", "seconds to wait for the others (default: 300)", positive, "S"),
-]
-NoVerifyOption = Annotated[
-    bool, _option("--no-verify", "take finished chunks for good without reading them")
-]
+]  # fmt: skip
 
 
 def refuse(options: dict[str, Any], file: Any) -> None:
@@ -78,20 +61,21 @@ def run(
     file: Any, output: str | None, precision: str, options: dict[str, Any], *, quiet: bool,
     no_cache: bool,
 ) -> int:  # fmt: skip
-    """Stream the ensemble into its store; 0, or 1 when some bodies did not finish."""
+    """Compute the ensemble into its store; 0, or 1 when some bodies did not finish."""
     messages = _show.messages(quiet)
     path = _store_path(file, output)
-    with messages.status("starting ..."):
+    with _show.working(messages, "starting"):
         import jax
 
         jax.config.update("jax_enable_x64", True)
         from polhode.cli import _cache
         from polhode.ensemble import StoreError, build_ensemble
+        from polhode.ensemble._store import missing_chunks
         from polhode.files._error import visible
 
-        _meet(path, options)
         ensemble, statistics = build_ensemble(file, precision)
-    options["verify"] = not options.pop("no_verify", False)
+    if "part" in options:
+        options["part"] = tuple(map(int, options["part"].split("/")))
     if "devices" in options:
         options["devices"] = _devices(options["devices"])
     try:
@@ -102,12 +86,17 @@ def run(
         return 130
     except StoreError:
         raise
-    except ValueError as error:  # of sizes and numbers of processes, which options gave
+    except ValueError as error:  # of sizes, which options gave
         raise UsageError(str(error)) from error
     if not quiet:
         rate = "nothing was missing" if last.rate is None else f"{last.rate:,.0f} bodies/s"
         print(f"{last.done:,} bodies ({last.reused:,} from before), {rate}")
         print(f"written: {visible(str(path))}")
+    if "part" in options:
+        missing = missing_chunks(path) or "no chunk is missing: run once without --part"
+        if not quiet:
+            print(f"part {options['part'][0]} of {options['part'][1]} is complete; {missing}")
+        return 0
     return _failures(path)
 
 
@@ -130,51 +119,17 @@ def _store_path(file: Any, output: str | None) -> Path:
 
 
 def _stream(file, ensemble, statistics, path, precision, meter, options):
-    from polhode.cli._run import provenance
+    from polhode.cli._run import texts
     from polhode.ensemble import stream
     from polhode.files import build_method
 
-    words = provenance(file, precision)
-    kept = ("title", "scene", "scene_source", "frame", "precision")
     stream(
         ensemble, file.times.seconds, path,
         method=build_method(file), rtol=file.method.rtol,
         trajectories=file.ensemble.trajectories, statistics=statistics,
-        attributes={name: words[name] for name in kept}, progress=meter, warn=_warn, **options,
+        attributes=texts(file) | {"precision": precision}, progress=meter, **options,
     )  # fmt: skip
     return meter.last
-
-
-def _meet(path: Path, options: dict[str, Any]) -> None:
-    """Find the number of this process and of all, with the others where they are to meet; before
-    anything is computed. The options of that go out of ``options``.
-    """
-    from polhode.ensemble import join
-    from polhode.ensemble._processes import claimed
-
-    cluster, coordinator = options.pop("cluster", False), options.pop("coordinator", None)
-    patience = {"patience": options.pop("patience")} if "patience" in options else {}
-    known = options.get("processes"), options.get("process")
-    processes, process = known
-    if processes is not None and process is not None and process >= processes:
-        raise UsageError(f"--process must be from 0 to {processes - 1}, got {process}.")
-    if coordinator is None and not cluster:
-        if known[0] is None and known[1] is not None:
-            raise UsageError("--process needs --processes, the number of all of them.")
-        if (known[0] or 1) > 1 and known[1] is None:
-            raise UsageError("--processes needs --process, the number of this one, from 0.")
-        if patience:
-            raise UsageError("--patience needs --coordinator or --cluster.")
-        return
-    if coordinator is not None and not cluster and None in known:
-        raise UsageError("--coordinator needs --processes and --process.")
-    # two processes of one number on this machine are told apart before they disturb the others
-    with claimed(path, *known):
-        options["process"], options["processes"] = join(coordinator, *known, **patience)[:2]
-
-
-def _warn(words: str) -> None:
-    print(f"polhode: {words}", file=sys.stderr)
 
 
 def _devices(count: str) -> list[Any]:

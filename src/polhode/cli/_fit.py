@@ -171,7 +171,7 @@ def _goal(asked: _Asked, output: str | None, suffix: str, force: bool) -> Path:
 def _fit(asked: _Asked, goals: list[Path], *, quiet: bool, no_cache: bool, allowed: bool) -> int:
     from rich.console import Console
 
-    with _show.messages(quiet).status("reading ...") as status:
+    with _show.working(_show.messages(quiet), "reading") as show:
         import jax
 
         jax.config.update("jax_enable_x64", True)
@@ -181,13 +181,13 @@ def _fit(asked: _Asked, goals: list[Path], *, quiet: bool, no_cache: bool, allow
         loaded = _read(asked)
         recording = loaded.recording
         with _cache.kept_programs(not no_cache):
-            status.update(f"fitting {recording.times.shape[-1]} samples (compiling first) ...")
+            show(f"fitting {recording.times.shape[-1]} samples (compiling first)")
             try:
                 result = room.fit_recordings([recording], throw=False, **_keywords(asked, room))
             except ValueError as error:  # the recording does not suit the options
                 raise UsageError(f"{asked.path}: {error}") from error
             heed()
-            status.update("writing ...")
+            show("writing")
             written = [_write(goals[0], asked, loaded, result)]
             for picture in goals[1:]:
                 heed()

@@ -11,7 +11,14 @@ import numpy as np
 
 import polhode
 from polhode import rotation
-from polhode.files import SceneFile, build_attitudes, build_method, build_scene, draw_clones
+from polhode.files import (
+    SceneFile,
+    build_attitudes,
+    build_events,
+    build_method,
+    build_scene,
+    draw_clones,
+)
 from polhode.files._build import blamed
 
 _CHUNKS, _LEAST_CHUNK = 20, 50  # pieces of progress, and bodies below which a piece does not pay
@@ -44,10 +51,13 @@ class Job(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """The trajectory of all bodies, the misfit of the nominal one, and what it took."""
+    """The trajectory of all bodies, the misfit of the nominal one, the times [s] of events by name
+    (bodies, M), NaN where there are fewer than M, and the seconds that it took.
+    """
 
     trajectory: polhode.Trajectory
     residuals: "Residuals | None"
+    events: dict[str, np.ndarray]
     compile_seconds: float
     run_seconds: float
 
@@ -132,6 +142,8 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
     kept: dict[str, np.ndarray] = {}
     residuals = None
     sampled = _index(job, job.ts)
+    events = build_events(job.file, job.ts.dtype)
+    times: dict[str, list[np.ndarray]] = {name: [] for name in events}
     for start in range(0, total, size):
         first = min(start, total - size)  # the last chunk overlaps: all have one shape
         piece = _simulate(job, slice(first, first + size) if job.batch_shape else None)
@@ -147,12 +159,27 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
                 continue
             whole = kept.setdefault(name, np.empty((total, *part.shape[1:]), part.dtype))
             whole[first : first + size] = part
+        with blamed(job.file, "[[events]]"):
+            for name, event in events.items():
+                rows = np.atleast_2d(polhode.crossings(piece, event).times)
+                times[name].extend(rows[start - first :])
         progress(min(start + size, total))
     seconds = time.perf_counter() - began
     compiling = _CLOCK.since(began)
     scene = job.scene.settled(job.state, job.ts[0])
     trajectory = polhode.Trajectory(ts=job.ts, scene=scene, propagator=piece.propagator, **kept)
-    return Outcome(trajectory, residuals, compiling, seconds - compiling)
+    crossings = {name: _padded(rows) for name, rows in times.items()}
+    return Outcome(trajectory, residuals, crossings, compiling, seconds - compiling)
+
+
+def _padded(rows: list[np.ndarray]) -> np.ndarray:
+    """Rows of times, infinite where there is none, as one array with NaN there."""
+    width = max(int(np.isfinite(row).sum()) for row in rows)
+    padded = np.full((len(rows), width), np.nan)
+    for place, row in zip(padded, rows):
+        row = row[np.isfinite(row)]
+        place[: len(row)] = row
+    return padded
 
 
 def _index(job: Job, ts: np.ndarray) -> np.ndarray:

@@ -5,10 +5,12 @@ from typing import Annotated
 
 import typer
 
+from polhode.cli import _show
 from polhode.cli._inputs import refused
 from polhode.cli._options import (
     DebugOption,
     ForceOption,
+    QuietOption,
     not_negative,
     require,
     whole_number,
@@ -19,7 +21,8 @@ from polhode.cli._targets import UsageError, check_suffix, stem, target
 def view(
     path: Annotated[Path, typer.Argument(metavar="FILE.nc", help="made by `polhode run`")],
     output: Annotated[
-        str | None, typer.Option("-o", "--output", help="the page; FILE.html if left out")
+        str | None,
+        typer.Option("-o", "--output", metavar="PAGE", help="the page; FILE.html if left out"),
     ] = None,
     force: ForceOption = False,
     debug: DebugOption = False,
@@ -48,10 +51,14 @@ def view(
 def lightcurve(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="CSV, ALCDEF or DAMIT's lc.txt")],
     vectors: Annotated[
-        Path | None, typer.Option(help="CSV of Sun and observer directions, if not in FILE")
+        Path | None,
+        typer.Option(metavar="FILE", help="CSV of Sun and observer directions, if not in FILE"),
     ] = None,
     output: Annotated[
-        str | None, typer.Option("-o", "--output", help="figure and numbers: OUTPUT.png, .json")
+        str | None,
+        typer.Option(
+            "-o", "--output", metavar="OUTPUT", help="figure and numbers: OUTPUT.png, .json"
+        ),
     ] = None,
     trials: Annotated[
         int,
@@ -66,6 +73,7 @@ def lightcurve(
         int, typer.Option(parser=whole_number(0), metavar="N", help="of the trials")
     ] = 0,
     force: ForceOption = False,
+    quiet: QuietOption = False,
     debug: DebugOption = False,
 ) -> int:
     """Spin and inertia of a tumbling body from its brightness."""
@@ -77,7 +85,7 @@ def lightcurve(
         if file is not None:
             with refused(file, ".csv", what):
                 pass
-    require("lightcurve", "matplotlib")
+    require("lightcurve", "rich", "matplotlib")
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -87,8 +95,14 @@ def lightcurve(
         curve = read(path, vectors, floor)
     name = output or path.stem
     goals = [target(name + end, end, force=force) for end in (".png", ".json")]
+    lines: list[str] = []
+    options = {"trials": trials, "floor": floor, "seed": seed, "say": lines.append}
+    words = f"searching {curve.t.size} points with {trials:,} trials (compiling first)"
     try:
-        fitted(curve, path.name, *goals, trials=trials, floor=floor, seed=seed)
+        with _show.working(_show.messages(quiet), words):
+            fitted(curve, path.name, *goals, **options)
     except ValueError as error:  # a brightness that does not vary
         raise UsageError(f"{path}: {error}") from error
+    if not quiet:
+        print("\n".join(lines))
     return 0

@@ -25,6 +25,13 @@ from polhode.files._error import visible
 
 SUCCESS, FAILURE, USAGE = 0, 1, 2
 _codes: list[int] = []
+_words: list[str] = []
+
+
+def words() -> list[str]:
+    """The arguments of the command that runs."""
+    return list(_words)
+
 
 _OTHER_WORDS = {
     "run": ("simulate", "sim", "solve", "integrate", "propagate", "start", "exec", "execute"),
@@ -110,7 +117,7 @@ def _run_guarded(command: Callable[[], int], debug: bool) -> int:
     before = gc.get_threshold()
     gc.set_threshold(*_COLLECTED)
     try:
-        with heeded(_leave), warnings.catch_warnings():
+        with heeded(), warnings.catch_warnings():
             # numbers that overflow are told by the status, and letters without a picture are drawn
             # as boxes; what else warns is told without its place in the source
             warnings.simplefilter("ignore", RuntimeWarning)
@@ -133,13 +140,6 @@ def _run_guarded(command: Callable[[], int], debug: bool) -> int:
         return _report(error, debug)
     finally:
         gc.set_threshold(*before)
-
-
-def _leave(code: int) -> None:
-    """End the process here and now."""
-    word = "terminated" if code == TERMINATED else "interrupted"
-    print(f"\npolhode: {word}; {_state_of_files()}", file=sys.stderr, flush=True)
-    os._exit(code)
 
 
 def _warned(message: Warning | str, *_: Any) -> None:
@@ -196,9 +196,9 @@ for _name, _command in (("run", _run.run), ("explain", _explain.explain), ("fit"
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; see `polhode.cli.main`."""
     _codes.clear()
-    words = None if argv is None else list(argv)
+    _words[:] = map(str, sys.argv[1:] if argv is None else argv)
     try:
-        typer.main.get_command(app).main(args=words, prog_name="polhode")
+        typer.main.get_command(app).main(args=list(_words), prog_name="polhode")
     except SystemExit:
         if not _codes:
             raise

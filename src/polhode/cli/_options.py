@@ -36,12 +36,12 @@ def not_negative(text: str | float) -> float:
     return value
 
 
-def address(text: str) -> str:
-    """HOST:PORT."""
-    host, _, port = text.rpartition(":")
-    if not host or not (port.isascii() and port.isdigit() and 0 < int(port[:6]) < 65536):
-        raise typer.BadParameter(f"{text[:80]!r} is not HOST:PORT, such as node1:1234")
-    return text
+def part(text: str) -> str:
+    """I/N with I from 1 to N."""
+    first, _, last = text.partition("/")
+    if not (first.isdecimal() and last.isdecimal() and 1 <= int(first[:9]) <= int(last[:9])):
+        raise typer.BadParameter(f"{text[:80]!r} is not I/N with I from 1 to N, such as 3/8")
+    return f"{int(first)}/{int(last)}"
 
 
 def positive(text: str | float) -> float:

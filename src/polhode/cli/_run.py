@@ -1,5 +1,6 @@
 """`polhode run SCENE`: simulate a scene file, write NetCDF and a figure, print a summary."""
 
+import datetime
 import json
 import sys
 from pathlib import Path
@@ -23,6 +24,7 @@ from polhode.cli._options import (
 )
 from polhode.cli._signals import heed
 from polhode.cli._targets import check_suffix, target
+from polhode.files._error import visible
 
 
 def run(
@@ -46,12 +48,8 @@ def run(
     memory: _ensemble.MemoryOption = None,
     chunk: _ensemble.ChunkOption = None,
     devices: _ensemble.DevicesOption = None,
-    process: _ensemble.ProcessOption = None,
-    processes: _ensemble.ProcessesOption = None,
-    coordinator: _ensemble.CoordinatorOption = None,
-    cluster: _ensemble.ClusterOption = False,
-    patience: _ensemble.PatienceOption = None,
-    no_verify: _ensemble.NoVerifyOption = False,
+    part: _ensemble.PartOption = None,
+    scheduler: _ensemble.SchedulerOption = None,
 ) -> int:  # fmt: skip
     """Simulate a scene with its Monte Carlo clones. Writes a NetCDF file and a PNG figure beside
     it, each whole or not at all, and prints a summary table. A scene with an [ensemble] goes into a
@@ -59,13 +57,14 @@ def run(
     """
     file = read(scene, clones, seed)
     options = {
-        "memory": memory, "chunk": chunk, "devices": devices, "process": process,
-        "processes": processes, "coordinator": coordinator, "cluster": cluster or None,
-        "patience": patience, "no_verify": no_verify or None,
+        "memory": memory, "chunk": chunk, "devices": devices, "part": part,
+        "scheduler": scheduler,
     }  # fmt: skip
     options = {name: value for name, value in options.items() if value is not None}
     if file.ensemble is not None:
         require("run", "rich", "zarr", extra="cli,scale")
+        if scheduler is not None:
+            require("run", "distributed", extra="cli,scale,dask")
         return _ensemble.run(file, output, precision, options, quiet=quiet, no_cache=no_cache)
     _ensemble.refuse(options, file)
     with_figure = file.output.figure and not no_figure
@@ -86,17 +85,17 @@ def _simulate(
     from rich.console import Console
 
     messages = _show.messages(quiet)
-    with messages.status("starting ..."):
+    with _show.working(messages, "starting"):
         from polhode.cli import _cache, _job, _summary
         from polhode.files import write_netcdf
 
     with _cache.kept_programs(not no_cache):
-        with messages.status("starting ..."):
+        with _show.working(messages, "drawing the bodies"):
             job = _job.prepare(file, precision)
         outcome = _with_progress(messages, job)
-        with messages.status("measuring and writing ..."):
+        with _show.working(messages, "measuring and writing"):
             figures = _summary.measure(job, outcome)
-            dataset = _dataset(job, outcome, figures, precision)
+            dataset = _dataset(job, outcome, figures, precision, picture is not None)
             heed()
             written = [write_netcdf(dataset, goal)]
             if picture is not None:
@@ -128,7 +127,7 @@ def _with_progress(messages, job):
 _RELATIVE = {"energy": "s-2", "momentum_space": "s-1", "work": "s-2"}
 
 
-def _dataset(job, outcome, figures, precision: str):
+def _dataset(job, outcome, figures, precision: str, figure: bool):
     """The trajectory's dataset with the clones numbered, their periods and what was run."""
     from polhode.cli import _summary
 
@@ -145,6 +144,11 @@ def _dataset(job, outcome, figures, precision: str):
         values = values if lead else values[0]
         words = f"period {name}: {_summary.MEANINGS[name]}"
         dataset[name] = (lead, values, {"units": "s", "long_name": words})
+    for name, times in outcome.events.items():
+        words = f"times at which the event {name} occurs, NaN where there are no more"
+        dimensions = (*lead, f"{name}_crossing")
+        values = times if lead else times[0]
+        dataset[f"{name}_times"] = (dimensions, values, {"units": "s", "long_name": words})
     dataset["moments"] = (
         (*(lead if job.scene.inertia.batch_shape else ()), "axis"),
         job.scene.inertia.moments,
@@ -159,42 +163,64 @@ def _dataset(job, outcome, figures, precision: str):
             dataset[name].attrs = {
                 "units": _RELATIVE[name], "long_name": f"{words}, per unit of the relative moments",
             }  # fmt: skip
-    dataset.attrs.update(provenance(file, precision))
+    dataset.attrs.update(provenance(job, precision, figure))
     return dataset
 
 
-def provenance(file, precision: str) -> dict[str, Any]:
-    """What was run, as attributes: the scene as parsed, the options, the versions."""
-    import jax
-    import jaxlib
+def provenance(job, precision: str, figure: bool) -> dict[str, Any]:
+    """What was run, as attributes: the scene as read, options in force, seed, versions, commit."""
     import numpy as np
 
-    from polhode import __version__
+    import polhode
+    from polhode.cli import _main
     from polhode.ensemble._stream import device_names
-    from polhode.files._error import visible
+    from polhode.files._build import blamed
+    from polhode.files._provenance import commit, versions
 
+    file = job.file
     carlo = file.monte_carlo
-    used: dict[str, Any] = {"precision": precision, "method": file.method.kind,
-                            "solver": file.method.solver, "rtol": file.method.rtol}  # fmt: skip
+    with blamed(file, ""):
+        plan = polhode.explain(job.scene, job.state, job.ts, job.method, rtol=job.rtol)
+    runs = next(line for line in str(plan).splitlines() if line.startswith("runs"))
+    used: dict[str, Any] = {
+        "precision": precision, "method": file.method.kind, "solver": file.method.solver,
+        "step": file.method.step, "rtol": file.method.rtol, "figure": figure,
+    }  # fmt: skip
     used |= {"clones": carlo.clones, "seed": carlo.seed} if carlo is not None else {"clones": 0}
-    found: dict[str, Any] = {
-        "title": visible(file.title),
-        "scene_source": visible(file.source),
-        "frame": visible(file.frame),
-        "scene": file.text.replace("\0", ""),
+    now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    command = visible(" ".join(["polhode", *_main.words()]))
+    found: dict[str, Any] = texts(file) | {
+        "history": f"{now} {command}",
         "options": json.dumps(used),
+        "method": runs.removeprefix("runs").strip(),
         "precision": precision,
         "clones": np.int64(used["clones"]),
-        "polhode_version": __version__,
-        "jax_version": jax.__version__,
-        "jaxlib_version": jaxlib.__version__,
-        "devices": device_names(jax.local_devices()[:1]),
+        "devices": device_names(_devices()),
+        **versions(),
     }
+    if commit():
+        found["polhode_commit"] = commit()
     if carlo is not None:
         found["seed"] = np.int64(carlo.seed)
     if file.epoch is not None:
         found["epoch"] = file.epoch.isoformat()
     return found
+
+
+def _devices() -> list[Any]:
+    import jax
+
+    return jax.local_devices()[:1]
+
+
+def texts(file) -> dict[str, str]:
+    """What the scene file says, as attributes."""
+    return {
+        "title": visible(file.title),
+        "scene_source": visible(file.source),
+        "frame": visible(file.frame),
+        "scene": file.text.replace("\0", ""),
+    }
 
 
 def _draw(job, outcome, path: Path) -> Path:

@@ -1,7 +1,8 @@
 """What every command shows and writes in the same way: progress, the files written, figures."""
 
+import contextlib
 import io
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,17 @@ def bar(console: Any, last: Any) -> Any:
 
     columns = TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TextColumn("bodies")
     return Progress(*columns, last, console=console, transient=True)
+
+
+@contextlib.contextmanager
+def working(console: Any, words: str) -> Iterator[Callable[[str], None]]:
+    """Show what is done and the time that it has taken; what is yielded changes the words."""
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = SpinnerColumn(), TextColumn("{task.description} ..."), TimeElapsedColumn()
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task(words, total=None)
+        yield lambda words: progress.update(task, description=words)
 
 
 def tell_written(console: Any, paths: Iterable[Path]) -> None:

@@ -89,6 +89,10 @@ def table(job: Job, outcome: Outcome, figures: Figures):
             row(f"{name}  {meaning} [{unit}]", f"{values[0]:#.5g}", _spread(values[1:]),
                 _published(file, name, size))  # fmt: skip
         row("mode", figures.modes[0], _count(figures.modes[1:]))
+    for name, times in outcome.events.items():
+        count, first = np.isfinite(times).sum(axis=1), times[:, 0] / size if times.size else times
+        nominal = f"{first[0]:#.5g} ({count[0]})" if count[0] else "none"
+        row(f"event {name}: first [{unit}] (number)", nominal, _reached(first[1:], count[1:]))
     if figures.energy is not None:
         row("largest relative change of energy", f"{figures.energy:.1e}")
     if figures.momentum is not None:
@@ -107,6 +111,15 @@ def _spread(values: np.ndarray) -> str:
     text = _plus_minus(float(finite.mean()), float(finite.std()))
     endless = len(values) - finite.size
     return f"{text}, {endless:,} infinite" if endless else text
+
+
+def _reached(first: np.ndarray, count: np.ndarray) -> str:
+    """Mean and spread of the first times of the clones that have one."""
+    if not count.any():
+        return "none"
+    first = first[count > 0]
+    text = _plus_minus(float(first.mean()), float(first.std()))
+    return text if count.all() else f"{text}, {int((count == 0).sum()):,} none"
 
 
 def _plus_minus(value: float, width: float | None) -> str:

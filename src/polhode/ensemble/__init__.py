@@ -1,8 +1,6 @@
-"""Ensembles of any size: drawn by index, streamed into a store, resumed after a kill."""
+"""Ensembles of any size: drawn by index, written chunk by chunk, resumed after a kill."""
 
 from polhode.ensemble._ensemble import Ensemble as Ensemble
-from polhode.ensemble._fill import Progress as Progress
-from polhode.ensemble._processes import join as join
 from polhode.ensemble._scene_file import build_ensemble as build_ensemble
 from polhode.ensemble._spreads import (
     AnyAttitude as AnyAttitude,
@@ -15,5 +13,5 @@ from polhode.ensemble._spreads import (
     SpreadTorque as SpreadTorque,
 )
 from polhode.ensemble._statistics import Statistic as Statistic, quantile as quantile
-from polhode.ensemble._store import StoreError as StoreError
-from polhode.ensemble._stream import stream as stream
+from polhode.ensemble._store import StoreError as StoreError, open_store as open_store
+from polhode.ensemble._stream import Progress as Progress, stream as stream

@@ -1,45 +1,58 @@
-"""The arrays of a store, and how many bodies go into a chunk and into a file."""
+"""The arrays of a store, and how many bodies form a chunk."""
 
 import math
 from typing import Any, NamedTuple
 
 import numpy as np
 
-_PIECE_BYTES = 2**25
-_PIECES, _BLOCKS = 16, 64  # of a chunk: files per array; blocks where only statistics are kept
-_OWN_MEMORY = 600_000_000  # Python, JAX and the compiled program
-_COPIES, _PER_DEVICE = 5, 5  # pieces on their way to the disk; blocks being computed or copied
-_AHEAD_BYTES = 2**29
-
-
-class Rows(NamedTuple):
-    """Bodies of a chunk, which is finished or not, and of the files that make it up."""
-
-    chunk: int
-    piece: int
+_CHUNK_BYTES = 2**26
+_STATISTICS_BLOCKS = 64  # blocks of a chunk where only statistics are stored
+_PROCESS_BYTES = 600_000_000  # Python, JAX and the compiled program
+_DEFAULT_MEMORY = 4_000_000_000
+_COPIES = 4  # of a chunk while it is computed, compressed and written
 
 
 class Field(NamedTuple):
-    """One array of a store: ``rows`` of it belong to a chunk and ``piece`` to a file."""
+    """One array of a store. ``rows`` rows form a chunk, which is one file."""
 
     shape: tuple[int, ...]
     rows: int
-    piece: int
     dtype: Any
     dimensions: tuple[str, ...]
-    attributes: dict[str, str]
+    attributes: dict[str, Any]
+
+    @property
+    def fill_value(self) -> Any:
+        """A value that no result has."""
+        if self.dtype == np.uint8:
+            return 255
+        return np.nan if np.issubdtype(self.dtype, np.floating) else -1
+
+    def region(self, k: int) -> slice:
+        """The rows of chunk ``k``."""
+        return slice(k * self.rows, min((k + 1) * self.rows, self.shape[0]))
 
 
-def rows(
+class Sizes(NamedTuple):
+    """Bodies of a chunk, and the number of chunks that one process computes at a time."""
+
+    chunk: int
+    concurrent: int
+
+
+def sizes(
     bodies: int,
     block: int,
     body_bytes: int,
-    whole: bool,
+    trajectories: bool,
     devices: int,
+    cores: int,
     memory: int | None,
     chunk: int | None,
-) -> Rows:
-    """Sizes in whole blocks. ``whole``: trajectories are kept. ValueError for what cannot be."""
+) -> Sizes:
+    """Sizes that stay within ``memory`` bytes. ``block``: bodies of a block; ``body_bytes``: bytes
+    of one trajectory. Raises ValueError for a memory or a chunk that is not possible.
+    """
     if chunk is not None and (chunk < 1 or chunk % block):
         raise ValueError(
             f"chunk must be a positive multiple of the block of {block} bodies, got {chunk}: leave"
@@ -47,50 +60,47 @@ def rows(
             f" {block} (chunk= in Python)."
         )
     block_bytes = block * body_bytes
-    budget = _PIECE_BYTES
-    if memory is not None:
-        least = _OWN_MEMORY + block_bytes * (_COPIES + _PER_DEVICE * devices)
-        if memory < least:
-            raise ValueError(
-                f"a memory of {memory:,} bytes is too small: raise --memory to"
-                f" {math.ceil(least / 1e7) / 100}GB or more (memory={least} in Python), the least"
-                " for these times and devices, or save fewer times."
-            )
-        left = memory - _OWN_MEMORY - block_bytes * _PER_DEVICE * devices
-        budget = min(budget, left // _COPIES)
-    most = max(1, budget // block_bytes)
+    available = (_DEFAULT_MEMORY if memory is None else memory) - _PROCESS_BYTES
+    unit = devices  # every device computes a block of its own at a time
+
+    def required(blocks: int) -> int:
+        """Bytes for one chunk of so many blocks."""
+        stored = blocks if trajectories else 0
+        return block_bytes * (_COPIES * (stored or 1) + 2 * devices)
+
+    if memory is not None and required(1) > available:
+        least = required(1) + _PROCESS_BYTES
+        raise ValueError(
+            f"a memory of {memory:,} bytes is too small: raise --memory to"
+            f" {math.ceil(least / 1e7) / 100}GB or more (memory={least} in Python), the minimum for"
+            " these times and devices, or save fewer times."
+        )
     if chunk is not None:
         blocks = chunk // block
-        piece = next(k for k in range(min(most, blocks), 0, -1) if blocks % k == 0)
-        return Rows(chunk, (piece if whole else blocks) * block)
-    total = -(-bodies // block)
-    # files are filled up: no larger than there are bodies
-    piece = min(1 << (most.bit_length() - 1), total) if whole else 1
-    # every device has a block of its own in each group, and a chunk holds whole groups
-    unit = math.lcm(piece, devices)
-    blocks = unit * -(-(_PIECES * piece if whole else _BLOCKS) // unit)
-    blocks = min(blocks, piece * -(-total // piece))
-    return Rows(blocks * block, (piece if whole else blocks) * block)
-
-
-def ahead(block_bytes: int, cores: int, devices: int, memory: int | None) -> int:
-    """Groups of blocks in flight at once. A block on a processor keeps about one core busy (its
-    chunks come one after the other): one for each core, and one that waits, as memory allows.
-    """
-    budget = _AHEAD_BYTES
-    if memory is not None:
-        budget = max(0, memory - _OWN_MEMORY - block_bytes * (_COPIES + _PER_DEVICE * devices))
-    extra = budget // (2 * block_bytes * devices)
-    return 2 + max(0, min(extra, -(-cores // devices) - 1))
+    else:
+        target = _CHUNK_BYTES // block_bytes if trajectories else _STATISTICS_BLOCKS
+        while target > 1 and required(target) > available:
+            target //= 2
+        blocks = unit * -(-target // unit) if target > 0 else 1
+        blocks = min(blocks, -(-bodies // block))
+    concurrent = max(1, min(cores, available // required(blocks)))
+    return Sizes(blocks * block, int(concurrent))
 
 
 def fields(
-    bodies: int, size: Rows, block: int, times, trajectories, statistics
+    bodies: int, chunk: int, block: int, times: np.ndarray, trajectories: bool, statistics: tuple
 ) -> dict[str, Field]:
     """Arrays of the store by name."""
-    t, chunk = times.size, size.chunk
-    status = {"units": "1", "long_name": "outcome per body (0: finished, -1: not computed)"}
-    found = {"status": Field((bodies,), chunk, chunk, "int8", ("body",), status)}
+    from polhode._method import Status
+
+    t = times.size
+    status = {
+        "units": "1",
+        "long_name": "outcome of each body; 255: not computed",
+        "flag_values": [int(code) for code in Status],
+        "flag_meanings": " ".join(code.name.lower() for code in Status),
+    }
+    arrays = {"status": Field((bodies,), chunk, np.dtype("uint8"), ("body",), status)}
     if trajectories:
         wxyz = {"units": "1", "long_name": "attitude quaternion, scalar first, body to space"}
         omega = {"units": "rad s-1", "long_name": "angular velocity in body axes"}
@@ -98,32 +108,21 @@ def fields(
             ("wxyz", 4, "quaternion", wxyz),
             ("omega_body", 3, "axis", omega),
         ):
-            found[name] = Field(
-                (bodies, t, width), chunk, size.piece, times.dtype, ("body", "time", axis), words
-            )
+            dimensions = ("body", "time", axis)
+            arrays[name] = Field((bodies, t, width), chunk, times.dtype, dimensions, words)
     blocks, chunks = -(-bodies // block), -(-bodies // chunk)
     for s in statistics:
         for name in ("count", "mean", "squares", "least", "greatest"):
             dtype = np.dtype("int32") if name == "count" else times.dtype
             words = {"long_name": f"{name} of {s.name} in each block of {block}"}
-            each = chunk // block
-            found[f"{s.name}_{name}"] = Field(
-                (blocks, t), each, each, dtype, ("block", "time"), words
+            dimensions = ("block", "time")
+            arrays[f"{s.name}_{name}"] = Field(
+                (blocks, t), chunk // block, dtype, dimensions, words
             )
         if s.low is not None:
             words = {"long_name": f"bodies per bin of {s.name}, those below and above included"}
-            found[f"{s.name}_histogram"] = Field(
-                (chunks, t, s.bins + 2), 1, 1, "int64", ("chunk", "time", f"{s.name}_bin"), words
+            dimensions = ("chunk", "time", f"{s.name}_bin")
+            arrays[f"{s.name}_histogram"] = Field(
+                (chunks, t, s.bins + 2), 1, np.dtype("int64"), dimensions, words
             )
-    return found
-
-
-def title(attributes: dict[str, str]) -> dict[str, str]:
-    """The attributes of the store."""
-    from polhode import __version__
-
-    return {
-        "title": "Ensemble of rotating rigid bodies",
-        "source": f"polhode {__version__}",
-        "convention": "wxyz scalar first, body -> space; R = Rz(phi) Ry(theta) Rz(psi)",
-    } | attributes
+    return arrays

@@ -73,20 +73,18 @@ class Block:
         return *eqx.combine(jax.device_put(arrays, device), rest), self.settings
 
     def __call__(self, first: int) -> dict[str, Array]:
-        if len(self.devices) == 1:
-            return program(*self.inputs(first))
         if not self.compiled:
-            self.compiled = self._compile()
+            self.compile()
         return self.compiled[first // self.size % len(self.devices)](*self.inputs(first))
 
-    def _compile(self) -> list[Any]:
-        """The program for each device, compiled at the same time; traced in this thread, since
-        settings such as ``jax.enable_x64`` may be those of a thread.
+    def compile(self) -> None:
+        """Compile the program for all devices at the same time. It is traced in the calling thread,
+        whose settings (such as those of ``jax.enable_x64``) apply.
         """
         count = min(len(self.devices), -(-self.ensemble.bodies // self.size))
         lowered = [program.lower(*self.inputs(k * self.size)) for k in range(count)]
         with concurrent.futures.ThreadPoolExecutor(count) as threads:
-            return list(threads.map(lambda one: one.compile(), lowered))
+            self.compiled = list(threads.map(lambda one: one.compile(), lowered))
 
 
 class Settings(NamedTuple):
@@ -105,7 +103,7 @@ def program(first: Array, each: Any, shared: Any, settings: Settings) -> dict[st
     drawn = draw(each, shared, indices, spreads, seed)
     trajectory = run(method, *drawn, ts, rtol, Record())
     real = indices < bodies
-    kept = {"status": trajectory.status.astype(jnp.int8)}
+    kept = {"status": trajectory.status.astype(jnp.uint8)}
     if settings.trajectories:
         recorded = {"wxyz": trajectory.wxyz, "omega_body": trajectory.omega_body}
         kept |= {name: x for name, x in recorded.items() if x is not None}

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -101,19 +102,29 @@ def summarise(statistic: Statistic, trajectory: Trajectory, real: Bool[Array, " 
     return found
 
 
-def merge(count: np.ndarray, mean: np.ndarray, squares: np.ndarray) -> tuple:
-    """Counts, means and sums of squares of blocks (blocks, T) as those of all, (T,) float64: block
-    after block, so that the result does not depend on who computed them (Chan et al. 1979).
-    """
-    total = np.zeros(count.shape[1])
-    average, spread = np.zeros_like(total), np.zeros_like(total)
-    for n, m, s in zip(count.astype(float), mean.astype(float), squares.astype(float)):
-        both = np.maximum(total + n, 1)
-        away = m - average
-        average = average + away * n / both
-        spread = spread + s + away**2 * total * n / both
-        total = total + n
-    return total, average, spread
+class Moments(NamedTuple):
+    """Counts, means and sums of squared deviations of the bodies so far, each (T,) of float64."""
+
+    count: np.ndarray
+    mean: np.ndarray
+    squares: np.ndarray
+
+    @classmethod
+    def zero(cls, times: int) -> "Moments":
+        return cls(np.zeros(times), np.zeros(times), np.zeros(times))
+
+    def add(self, count: np.ndarray, mean: np.ndarray, squares: np.ndarray) -> "Moments":
+        """With those of further blocks (blocks, T), block after block, so that the result does not
+        depend on how blocks form chunks (Chan et al. 1979).
+        """
+        total, average, spread = self
+        for n, m, s in zip(count.astype(float), mean.astype(float), squares.astype(float)):
+            both = np.maximum(total + n, 1)
+            difference = m - average
+            average = average + difference * n / both
+            spread = spread + s + difference**2 * total * n / both
+            total = total + n
+        return Moments(total, average, spread)
 
 
 def quantile(histogram: np.ndarray, edges: np.ndarray, q: float) -> np.ndarray:

@@ -1,367 +1,342 @@
-"""The Zarr store of an ensemble run: finished chunks stay valid whatever happens to the writer.
+"""The Zarr store of an ensemble: one file per chunk and array, written atomically by Zarr.
 
-A chunk of bodies is one file, or a few, of each array. They are written and synced first, then its
-cell of ``checksum``, a file of its own: a chunk counts as finished only when the checksum of what
-can be read equals that cell. Nothing else needs to be kept for resuming.
+A chunk is complete when the file of every array is there and can be decoded; crc32c finds files
+that were altered or cut. Nothing else is recorded, so that any number of processes can write to a
+store without locks: they write different files, or the same bytes.
 """
 
 import contextlib
 import errno
+import glob
+import itertools
 import json
 import os
 import secrets
 import shutil
-import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from polhode._extras import imported
-from polhode.ensemble._layout import Field, Rows
-from polhode.files._atomic import sync
+from polhode.ensemble._layout import Field
 from polhode.files._error import shorten
 
-_MARK = 1 << 32  # above every 32-bit checksum: an empty cell is 0
+if TYPE_CHECKING:
+    import xarray
 
 
 class StoreError(RuntimeError):
-    """A store that cannot be used as asked: of another run, in use, not ours, or a full disk."""
+    """A store that cannot be used: of another run, damaged, incomplete, or on a full disk."""
 
 
 def _zarr() -> Any:
     return imported("an ensemble on disk", "zarr", extra="scale")
 
 
-@contextlib.contextmanager
-def locked(path: Path, process: int, processes: int) -> Iterator[None]:
-    """Hold the store for this process; the system lets go when the process ends, however it ends.
-
-    One process holds it alone; of several, each holds its own number and all share the store.
+def create(
+    path: Path,
+    ts: np.ndarray,
+    layout: Mapping[str, Field],
+    attributes: Mapping[str, Any],
+    identity: Mapping[str, Any],
+) -> None:
+    """Make an empty store in a temporary folder and rename it. Where another process was faster,
+    its store stays.
     """
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.partial")
     try:
-        import fcntl
-    except ImportError as error:  # Windows
-        raise StoreError("stores of ensembles need the file locks of Unix") from error
-
-    with contextlib.ExitStack() as stack:
-
-        def hold(name: str, kind: int, who: str) -> None:
-            try:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                file = stack.enter_context(open(path.with_name(name), "a"))
-            except OSError as error:
-                raise StoreError(
-                    f"cannot write beside {path}: {error.strerror}; name a place that you can"
-                    " write to."
-                ) from error
-            failure = None
-            for trial in range(3):  # others look at a lock for an instant
-                try:
-                    fcntl.flock(file, kind | fcntl.LOCK_NB)
-                    return
-                except OSError as error:
-                    failure = error
-                    time.sleep(0.05 * trial)
-            raise StoreError(
-                f"{path} is in use by {who}: wait until it ends, or write to another store."
-            ) from failure
-
-        alone = processes == 1
-        hold(f".{path.name}.lock", fcntl.LOCK_EX if alone else fcntl.LOCK_SH, "another run")
-        if not alone:
-            hold(f".{path.name}.lock{process}", fcntl.LOCK_EX, f"another process {process}")
-        yield
+        path.parent.mkdir(parents=True, exist_ok=True)
+        metadata = dict(attributes) | {"polhode": json.dumps(dict(identity))}
+        _write_empty(temporary, ts, layout, metadata)
+        try:
+            os.rename(temporary, path)
+        except OSError as error:  # a rename does not replace a folder that is not empty
+            if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
+                raise
+    except OSError as error:
+        raise StoreError(
+            f"cannot make the store {path}: {error.strerror or error}; name a place that you can"
+            " write to."
+        ) from error
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
-@contextlib.contextmanager
-def in_turn(path: Path) -> Iterator[None]:
-    """One process after the other: wait for the turn."""
-    import fcntl
+def compare_identity(
+    path: Path, identity: Mapping[str, Any], attributes: Mapping[str, str]
+) -> dict[str, Any]:
+    """The identity of a store that belongs to this run. Raises StoreError, which names what
+    differs, for a store of another run, and for a folder that is no store.
+    """
+    found = _read_identity(path)
+    texts = _read_json(path, "zarr.json")["attributes"]
+    different = [
+        f"  {key}: the store has {shorten(found.get(key))}, this run {shorten(value)}"
+        for key, value in identity.items()
+        if found.get(key) != value
+    ]
+    for key, text in attributes.items():
+        if texts.get(key) != text:
+            different.append(f"  {key}: {_first_difference(str(texts.get(key)), text)}")
+    if different:
+        raise StoreError(
+            f"{path} belongs to another run and was left as it is:\n" + "\n".join(different) + "\n"
+            "  use the scene, options and versions of the store, or name another path."
+        )
+    return found
 
-    with open(path.with_name(f".{path.name}.turn"), "a") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield
 
-
-def running(path: Path, process: int) -> bool:
-    """Whether another process holds the store under this number now."""
-    import fcntl
-
-    try:
-        with open(path.with_name(f".{path.name}.lock{process}")) as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except FileNotFoundError:
-        return False
-    except OSError:
-        return True
-    return False
+def _first_difference(stored: str, text: str) -> str:
+    """The first line in which two texts differ."""
+    lines = itertools.zip_longest(stored.splitlines(), text.splitlines())
+    for number, (a, b) in enumerate(lines, 1):
+        if a != b:
+            return f"line {number} of the store is {shorten(a)}, of this run {shorten(b)}"
+    return "the line ends differ"
 
 
 class Store:
-    """An opened store; ``identity`` is what must agree for a run to go on with it.
-
-    Raises StoreError, and leaves the folder as it is, when it is no store of an ensemble run, its
-    settings are damaged, or they are those of another run.
+    """The store of a run, opened for writing. Raises StoreError, and leaves the folder as it is,
+    when its metadata are not those that the store was created with.
     """
 
-    def __init__(self, path: Path, identity: dict[str, Any]):
+    def __init__(self, path: Path, ts: np.ndarray, layout: Mapping[str, Field]):
+        self.path, self.layout = path, layout
+        self.chunks = -(-layout["status"].shape[0] // layout["status"].rows)
+        self._compare_metadata(ts)
         zarr = _zarr()
-        self.path = path
-        try:
-            self.group = zarr.open_group(path, mode="r+", zarr_format=3, use_consolidated=False)
-            found = json.loads(self.group.attrs["polhode"])
-            if not isinstance(found, dict):
-                raise ValueError(f"the attribute polhode is a {type(found).__name__}")
-        except Exception as error:  # damaged metadata fail in whichever part reads them first
-            raise StoreError(
-                f"{path} exists and is no store of an ensemble run ({type(error).__name__}:"
-                f" {str(error)[:200]}): it was left as it is; name another path."
-            ) from error
-        different = [
-            f"  {key}: the store has {shorten(found.get(key))}, this run {shorten(value)}"
-            for key, value in identity.items()
-            if found.get(key) != value
-        ]
-        if different:
-            raise StoreError(
-                f"{path} holds another run and was left as it is:\n" + "\n".join(different) + "\n"
-                "  to mend: use the scene and versions of the store, or name another path."
-            )
-        self.chunk: int = found.get("chunk", 0)  # what is missing or no number is refused below
-        self.piece: int = found.get("piece", 0)
-        unit = identity["block"]
-        for name in ("chunk", "piece"):
-            value = found.get(name)
-            if type(value) is not int or value < 1 or value % unit or self.chunk % value:
-                raise StoreError(
-                    f"{path}: its setting {name} is {shorten(value)}, expected a multiple of {unit}"
-                    " bodies that fits: the store is damaged and was left as it is; name another"
-                    " path."
-                )
-
-    def mend(
-        self, ts: np.ndarray, layout: Mapping[str, Field], attributes: dict[str, Any],
-        layouts: Sequence[str], warn: Callable[[str], None],
-    ) -> None:  # fmt: skip
-        """Compare the arrays with the layout; what is lost or altered is made anew, and where that
-        held results, all chunks count as missing. ``layouts``: devices of the runs so far.
-        """
-        zarr = _zarr()
-        self.group = zarr.open_group(self.path, mode="r+", zarr_format=3, use_consolidated=False)
-        expected = zarr.create_group(zarr.storage.MemoryStore(), zarr_format=3)
-        make = _arrays(expected, ts, layout, -(-layout["status"].shape[0] // self.chunk))
-        lost = [name for name in make if not self._is_like(name, expected[name])]
-        if lost:
-            for name in lost:
-                _remove(self.path / name)
-                make[name](self.group)
-            told = f"{', '.join(lost)} of {self.path} were lost or altered and are made anew"
-            if lost != ["time"]:
-                _remove(self.path / "checksum")
-                make["checksum"](self.group)
-                told += "; every chunk is computed again"
-            warn(told + ".")
-        wanted = attributes | {"devices": sorted({*layouts, *self._devices()})}
-        altered = any(self.group.attrs.get(key) != value for key, value in wanted.items())
-        if altered:
-            self.group.attrs.update(wanted)
-        if altered or lost:
-            consolidate(self.path)
-        # values that equal the fill value are written too: every finished chunk has its files
+        # chunks that equal the fill value are written too: a chunk without a file is missing
         with zarr.config.set({"array.write_empty_chunks": True}):
-            arrays = {name: self.group[name] for name in make}
-        self.marks = arrays["checksum"]
-        self.arrays = {name: arrays[name] for name in layout}
-        # arrays that may have several files in a chunk
-        self.split = sorted({"wxyz", "omega_body"} & layout.keys())
+            self.group = zarr.open_group(path, mode="r+", use_consolidated=False)
+            self.arrays = {name: self.group[name] for name in layout}
+        self._check_times(ts)
 
-    def _devices(self) -> list[str]:
-        found = self.group.attrs.get("devices")
-        return [x for x in found if isinstance(x, str)] if isinstance(found, list) else []
+    def _compare_metadata(self, ts: np.ndarray) -> None:
+        """Compare every zarr.json with the one that the store was created with."""
+        files: dict[str, Any] = {}
+        _write_empty(_zarr().storage.MemoryStore(files), ts, self.layout, {})
+        root = json.loads(files.pop("zarr.json").to_bytes())
+        documents = {
+            key: json.loads(buffer.to_bytes())
+            for key, buffer in sorted(files.items())
+            if key.endswith("zarr.json")
+        }
+        for key, document in documents.items():
+            _require_equal(self.path, key, _read_json(self.path, key), document)
+        # statistics are added later
+        found = _dictionary(_read_json(self.path, "zarr.json")).get("consolidated_metadata")
+        consolidated = _dictionary(_dictionary(found).get("metadata"))
+        for name, document in root["consolidated_metadata"]["metadata"].items():
+            key = f"zarr.json (consolidated metadata of {name})"
+            _require_equal(self.path, key, consolidated.get(name), document)
 
-    def _is_like(self, name: str, expected: Any) -> bool:
-        """Whether an array is there with the metadata, and for times with the values, it began
-        with.
-        """
+    def _check_times(self, ts: np.ndarray) -> None:
+        """Write the times again where they are missing or damaged."""
         try:
-            found = self.group[name]
-            same, wanted = (
-                json.dumps(array.metadata.to_dict(), sort_keys=True, default=str)
-                for array in (found, expected)
-            )
-            return same == wanted and (name != "time" or np.array_equal(found[...], expected[...]))
-        except Exception:  # whatever cannot be read is not like it
+            same = np.array_equal(self.group["time"][:], ts)
+        except Exception:  # a damaged file fails in whichever codec reads it first
+            same = False
+        if not same:
+            shutil.rmtree(self.path / "time" / "c", ignore_errors=True)
+            with self._explained():
+                self.group["time"][:] = ts
+
+    def file(self, name: str, k: int) -> Path:
+        """The file of an array that contains chunk ``k``."""
+        return _chunk_file(self.path, name, k, len(self.layout[name].shape))
+
+    def missing(self) -> list[int]:
+        """The chunks of which a file is missing; the files are not read."""
+        dimensions = {name: len(field.shape) for name, field in self.layout.items()}
+        return _missing(self.path, dimensions, self.chunks)
+
+    def is_complete(self, k: int) -> bool:
+        """Whether chunk ``k`` is there and can be decoded."""
+        try:
+            if not all(self.file(name, k).is_file() for name in self.layout):
+                return False
+            for name, field in self.layout.items():
+                self.arrays[name][field.region(k)]
+            return True
+        except Exception:  # a damaged file fails in whichever codec reads it first
             return False
 
-    def sweep(self) -> None:
-        """Remove half-written files of a writer that was killed."""
+    def write(self, k: int, arrays: Mapping[str, np.ndarray]) -> None:
+        """Write chunk ``k``: one file of each array, in place of what is there."""
+        with self._explained():
+            for name, field in self.layout.items():
+                # a damaged file of the last chunk would be decoded to fill it up
+                self.file(name, k).unlink(missing_ok=True)
+                self.arrays[name][field.region(k)] = arrays[name]
+
+    def remove_partial(self) -> None:
+        """Remove what killed processes left half-written."""
         for file in self.path.rglob("*.partial"):
             file.unlink(missing_ok=True)
-
-    def finished(self) -> np.ndarray:
-        """(chunks,) whether a chunk was marked as finished; the data are not looked at."""
-
-        def marked(chunk: int) -> bool:
-            try:
-                return self.marks[chunk] != 0
-            except Exception:
-                return False
-
-        try:
-            return self.marks[:] != 0
-        except Exception:  # one of them is damaged: as if it were not there
-            return np.array([marked(chunk) for chunk in range(self.marks.shape[0])])
-
-    def rows(self, name: str, chunk: int) -> slice:
-        """The rows of an array that belong to a chunk."""
-        step = int(self.arrays[name].attrs["rows_per_chunk"])
-        return slice(chunk * step, min((chunk + 1) * step, self.arrays[name].shape[0]))
-
-    def pieces(self, chunk: int) -> Iterator[tuple[str, slice]]:
-        """Arrays and rows of the files of a chunk in the order of its checksum: first those of
-        the trajectories, piece by piece, then the arrays that have one file in a chunk.
-        """
-        rest = [n for n in sorted(self.arrays) if n not in self.split]
-        for names in (self.split, rest):
-            steps = {n: self.arrays[n].chunks[0] for n in names}
-            begin = {n: self.rows(n, chunk).start for n in names}
-            end = {n: self.rows(n, chunk).stop for n in names}
-            while any(begin[n] < end[n] for n in names):
-                for n in names:
-                    stop = min(begin[n] + steps[n], end[n])
-                    yield n, slice(begin[n], stop)
-                    begin[n] = stop
-
-    def valid(self, chunk: int) -> bool:
-        """Whether the chunk can be read and has the checksum it was given."""
-        try:
-            found = 0
-            for name, rows in self.pieces(chunk):
-                found = _extended(found, self.arrays[name][rows])
-            return int(self.marks[chunk]) == _MARK | found
-        except Exception:  # a damaged file fails in whichever codec meets it first
-            return False
-
-    def write(self, name: str, rows: slice, values: np.ndarray, checksum: int) -> int:
-        """Write one file of a chunk, on the disk when this returns; the checksum with it."""
-        with self._blame():
-            self.arrays[name][rows] = values
-            self._sync(name, self.arrays[name], rows.start // self.arrays[name].chunks[0])
-        return _extended(checksum, values)
-
-    def finish(self, chunk: int, checksum: int) -> None:
-        """Mark a chunk, all of whose files are written, as finished."""
-        with self._blame():
-            self.marks[chunk] = np.uint64(_MARK | checksum)
-            self._sync("checksum", self.marks, chunk)
+        for folder in self.path.parent.glob(f".{glob.escape(self.path.name)}.*.partial"):
+            shutil.rmtree(folder, ignore_errors=True)
 
     @contextlib.contextmanager
-    def _blame(self) -> Iterator[None]:
+    def _explained(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
             if error.errno in (errno.ENOSPC, errno.EDQUOT):
                 raise StoreError(
-                    f"the disk of {self.path} is full: {int(self.finished().sum())} of"
-                    f" {self.marks.shape[0]} chunks are finished and kept; make room and give the"
+                    f"the disk of {self.path} is full: {self.chunks - len(self.missing())} of"
+                    f" {self.chunks} chunks are complete and remain; free some space and run the"
                     " same command again."
                 ) from error
-            raise
+            raise StoreError(f"cannot write to {self.path}: {error.strerror or error}.") from error
 
-    def _sync(self, name: str, array: Any, piece: int) -> None:
-        """Have a file and its name in the folder on the disk."""
-        key = array.metadata.encode_chunk_key((piece,) + (0,) * (array.ndim - 1))
-        file = self.path / name / key
-        sync(file)
-        sync(file.parent)
+    def put(self, name: str, values: np.ndarray, dimensions: tuple, units: str) -> None:
+        """Write a small array as a whole."""
+        with self._explained():
+            array = self.group.create_array(
+                name, shape=values.shape, chunks=values.shape, dtype=values.dtype,
+                dimension_names=dimensions, attributes={"units": units}, overwrite=True,
+                compressors=_codecs(),
+            )  # fmt: skip
+            array[...] = values
 
-
-def _remove(path: Path) -> None:
-    """What lies in the place of an array, whatever it is."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
-
-
-def consolidate(path: Path) -> None:
-    """Gather the metadata of all arrays in one file, which xarray looks for first."""
-    with warnings.catch_warnings():
-        # Zarr points out that version 3 of its specification does not have this yet
-        warnings.simplefilter("ignore", UserWarning)
-        _zarr().consolidate_metadata(path, zarr_format=3)
+    def consolidate(self) -> None:
+        """Gather the metadata of all arrays in one file, which xarray reads first."""
+        with self._explained():
+            _consolidate(self.path)
 
 
-def _extended(checksum: int, values: np.ndarray) -> int:
-    """CRC-32C of what came before and of the bytes of an array."""
-    crc32c = imported("an ensemble on disk", "google_crc32c", extra="scale")
-    view = np.ascontiguousarray(values).view()
-    view.setflags(write=False)  # google_crc32c takes nothing that could change meanwhile
-    return crc32c.extend(checksum, view)
+def open_store(path: str | os.PathLike) -> "xarray.Dataset":
+    """The stored ensemble at ``path`` as an xarray dataset, which is read lazily.
+
+    Raises StoreError for a store whose chunks or statistics are not complete, which names the
+    missing chunks; ``xarray.open_zarr`` reads such a store, with NaN and status 255 in their place.
+    """
+    path = Path(path)
+    if words := missing_chunks(path):
+        raise StoreError(f"{path} is not complete: {words}.")
+    for name, *_ in _read_identity(path)["statistics"]:
+        if not (path / f"{name}_summary_mean" / "zarr.json").is_file():
+            raise StoreError(
+                f"{path} is not complete: the statistics of its chunks are not reduced yet; run it"
+                " once without --part."
+            )
+    xarray = imported("an ensemble on disk", "xarray", "zarr", extra="scale")
+    return xarray.open_zarr(path)
 
 
-def _arrays(
-    group: Any, ts: np.ndarray, layout: Mapping[str, Field], chunks: int
-) -> dict[str, Callable[[Any], None]]:
-    """Make the empty arrays of a store in a group; how to make each of them in another one."""
-    checked = [_zarr().codecs.Crc32cCodec()]
-
-    def time(group: Any) -> None:
-        made = group.create_array(
-            "time", shape=ts.shape, chunks=ts.shape, dtype=ts.dtype, dimension_names=("time",),
-            attributes={"units": "s", "long_name": "time"},
-        )  # fmt: skip
-        made[:] = ts
-
-    def one(name: str, field: Field) -> Callable[[Any], None]:
-        return lambda group: group.create_array(
-            name, shape=field.shape, chunks=(field.piece, *field.shape[1:]), dtype=field.dtype,
-            dimension_names=field.dimensions,
-            attributes=field.attributes | {"rows_per_chunk": field.rows},
-            compressors=checked,
-            # what readers see where a chunk is not finished
-            fill_value=np.nan if np.issubdtype(field.dtype, np.floating) else -1,
-        )  # fmt: skip
-
-    def checksum(group: Any) -> None:
-        group.create_array(
-            "checksum", shape=(chunks,), chunks=(1,), dtype="uint64", dimension_names=("chunk",),
-            attributes={"long_name": "CRC-32C of each finished chunk plus 2^32; 0: not finished"},
-            compressors=checked,
-        )  # fmt: skip
-
-    make = {"time": time, **{n: one(n, field) for n, field in layout.items()}, "checksum": checksum}
-    for fill in make.values():
-        fill(group)
-    return make
+def missing_chunks(path: Path) -> str:
+    """Which chunks of a store are missing, in words; empty when none is."""
+    identity = _read_identity(path)
+    dimensions = {}
+    for name in identity["arrays"]:
+        shape = _dictionary(_read_json(path, f"{name}/zarr.json")).get("shape")
+        if not isinstance(shape, list):
+            raise _unreadable(path, f"{name}/zarr.json", "its shape is no list")
+        dimensions[name] = len(shape)
+    chunks = -(-identity["bodies"] // identity["chunk"])
+    missing = _missing(path, dimensions, chunks)
+    if not missing:
+        return ""
+    numbers = ", ".join(map(str, missing[:10])) + (", ..." if len(missing) > 10 else "")
+    verb = "is" if len(missing) == 1 else "are"
+    return (
+        f"{len(missing)} of {chunks} chunks {verb} missing ({numbers}): run the parts that are"
+        " missing, or once without --part"
+    )
 
 
-def create(
-    path: Path,
-    identity: dict[str, Any],
-    size: Rows,
-    ts: np.ndarray,
-    layout: Mapping[str, Field],
-    attributes: dict[str, Any],
+def _missing(path: Path, dimensions: Mapping[str, int], chunks: int) -> list[int]:
+    """The chunks of which the file of an array is missing."""
+    return [
+        k
+        for k in range(chunks)
+        if not all(_chunk_file(path, name, k, n).is_file() for name, n in dimensions.items())
+    ]
+
+
+def _chunk_file(path: Path, name: str, k: int, dimensions: int) -> Path:
+    return path.joinpath(name, "c", str(k), *["0"] * (dimensions - 1))
+
+
+def _codecs() -> list[Any]:
+    codecs = _zarr().codecs
+    return [codecs.ZstdCodec(level=1), codecs.Crc32cCodec()]
+
+
+def _write_empty(
+    store: Any, ts: np.ndarray, layout: Mapping[str, Field], metadata: Mapping[str, Any]
 ) -> None:
-    """Make an empty store, whole or not at all; nothing happens when another process was faster."""
-    zarr = _zarr()
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(6)}.part")
+    """Write the metadata of a store, and its times."""
+    group = _zarr().create_group(store, zarr_format=3, attributes=dict(metadata))
+    time = group.create_array(
+        "time", shape=ts.shape, chunks=ts.shape, dtype=ts.dtype, dimension_names=("time",),
+        attributes={"units": "s", "long_name": "time"}, compressors=_codecs(), fill_value=np.nan,
+    )  # fmt: skip
+    time[:] = ts
+    for name, field in layout.items():
+        group.create_array(
+            name, shape=field.shape, chunks=(field.rows, *field.shape[1:]), dtype=field.dtype,
+            dimension_names=field.dimensions, attributes=field.attributes, compressors=_codecs(),
+            fill_value=field.fill_value,
+        )  # fmt: skip
+    _consolidate(store)
+
+
+def _consolidate(store: Any) -> None:
+    with warnings.catch_warnings():
+        # Zarr warns that version 3 of its specification does not have this yet
+        warnings.simplefilter("ignore", UserWarning)
+        _zarr().consolidate_metadata(store, zarr_format=3)
+
+
+def _read_json(path: Path, key: str) -> Any:
     try:
-        settings = json.dumps(identity | {"chunk": size.chunk, "piece": size.piece})
-        group = zarr.create_group(
-            temporary, zarr_format=3, attributes=attributes | {"polhode": settings}
-        )
-        _arrays(group, ts, layout, -(-identity["bodies"] // size.chunk))
-        consolidate(temporary)
-        # a rename does not replace a folder that holds something
-        with contextlib.suppress(FileExistsError):
-            os.rename(temporary, path)
-    except OSError as error:
-        if error.errno not in (errno.ENOTEMPTY, errno.EEXIST):
-            raise StoreError(f"cannot make the store {path}: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+        return json.loads((path / key).read_bytes())
+    except (OSError, ValueError, RecursionError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise _unreadable(path, key, reason) from error
+
+
+def _unreadable(path: Path, key: str, reason: str) -> StoreError:
+    return StoreError(
+        f"{path} is no store of an ensemble, or damaged: {key} cannot be read ({reason[:200]}). It"
+        " was left as it is; name another path, or remove it."
+    )
+
+
+def _dictionary(x: Any) -> dict:
+    return x if isinstance(x, dict) else {}
+
+
+def _require_equal(path: Path, key: str, found: Any, expected: Any) -> None:
+    """Raise StoreError that names the first entry that differs."""
+    if found == expected:
+        return
+    found, name = _dictionary(found), "its content"
+    for name, value in expected.items():
+        if found.get(name) != value:
+            break
+    raise StoreError(
+        f"{path} is damaged: {key} was altered ({name} is {shorten(found.get(name))}, expected"
+        f" {shorten(expected.get(name))}). It was left as it is; name another path, or remove it."
+    )
+
+
+def _read_identity(path: Path) -> dict[str, Any]:
+    """The identity of the run that a store belongs to."""
+    text = _dictionary(_dictionary(_read_json(path, "zarr.json")).get("attributes")).get("polhode")
+    try:
+        identity = json.loads(text)
+        sizes = [identity["bodies"], identity["chunk"], identity["block"]]
+        names = [*identity["arrays"], *(name for name, *_ in identity["statistics"])]
+        if not all(type(size) is int and size > 0 for size in sizes) or sizes[1] % sizes[2]:
+            raise ValueError(f"bodies, chunk and block are {shorten(sizes)}")
+        if not all(isinstance(name, str) and name.isidentifier() for name in names):
+            raise ValueError(f"the names of its arrays are {shorten(names)}")
+        return identity
+    except (TypeError, ValueError, KeyError, RecursionError) as error:
+        reason = f"{type(error).__name__}: {error}"
+        raise _unreadable(path, "zarr.json (attribute polhode)", reason) from error

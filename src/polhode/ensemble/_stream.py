@@ -1,10 +1,12 @@
-"""Run an ensemble chunk by chunk into a store, and go on where an earlier run stopped."""
+"""Run an ensemble into a store, and go on where an earlier run stopped."""
 
+import contextlib
 import os
-import warnings
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, ThreadPoolExecutor, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -12,15 +14,26 @@ from jaxtyping import Float
 
 from polhode._checks import ArrayLike
 from polhode._method import AbstractMethod
-from polhode.ensemble import _layout
+from polhode.ensemble import _dask, _layout
+from polhode.ensemble._chunks import compute
 from polhode.ensemble._ensemble import Ensemble
-from polhode.ensemble._fill import Progress, fill
-from polhode.ensemble._identity import digest
-from polhode.ensemble._processes import absent
+from polhode.ensemble._identity import digest, has_user_code, versions
 from polhode.ensemble._program import Block
 from polhode.ensemble._statistics import Statistic
-from polhode.ensemble._store import Store, create, in_turn, locked
+from polhode.ensemble._store import Store, compare_identity, create
 from polhode.ensemble._summary import write_summaries
+
+
+class Progress(NamedTuple):
+    """Bodies finished out of those of this run, ``reused`` of them computed earlier; ``rate``
+    bodies/s and ``remaining`` seconds are None before the first chunk is computed.
+    """
+
+    done: int
+    total: int
+    reused: int
+    rate: float | None
+    remaining: float | None
 
 
 def stream(
@@ -28,6 +41,7 @@ def stream(
     ts: Float[ArrayLike, " t"],
     path: str | os.PathLike,
     *,
+    name: str | None = None,
     method: AbstractMethod | None = None,
     rtol: float | None = None,
     trajectories: bool = True,
@@ -35,103 +49,238 @@ def stream(
     memory: int | None = None,
     chunk: int | None = None,
     devices: Sequence[Any] | None = None,
-    process: int = 0,
-    processes: int = 1,
-    verify: bool = True,
-    attributes: dict[str, str] | None = None,
+    part: tuple[int, int] | None = None,
+    scheduler: Any = None,
+    attributes: Mapping[str, str] | None = None,
     progress: Callable[[Progress], None] = lambda _: None,
-    warn: Callable[[str], None] = warnings.warn,
 ) -> Path:
     """Simulate all bodies at the times ``ts`` (T,) [s] into the Zarr store ``path``; returns it.
 
-    The same call again finishes what an earlier one left: finished chunks are checked and kept,
-    damaged ones computed again, and the result equals that of an undisturbed run to the bit.
-    Whatever ends the process costs it one chunk at most.
+    The same call again decodes the chunks that are there, computes those that are missing or
+    damaged, and ends with the bits of an undisturbed run. Chunks are separate files, each written
+    atomically, so that any number of processes may write to one store.
 
+    - ``name``: what is computed, in words. Required where the ensemble, the method or a statistic
+      contains functions or classes of your own, whose code is not compared: a store belongs to the
+      run of its name. Numbers, structure, seed, tolerance and versions are always compared.
     - ``method``, ``rtol``: as in ``ph.simulate``.
-    - ``trajectories``, ``statistics``: what is kept; status and number of each body always are.
-    - ``memory``: limit [bytes] from which the chunk size follows; ``chunk``: bodies per chunk
-      instead, a multiple of the block (``block_size``). A store keeps the chunks it began with.
-    - ``devices``: local JAX devices to share the bodies among; None: the first one.
-    - ``process``, ``processes``: this process takes the chunks whose number is ``process`` modulo
-      ``processes``. The last to finish writes the summaries of the statistics; each one tells
-      ``warn`` which others have ended and left chunks.
-    - ``verify``: read finished chunks and check them while the missing ones are computed; False
-      trusts the marks, which are written after the data are on the disk.
-    - ``attributes``: text to keep in the store, such as the scene file; part of its identity.
+    - ``trajectories``, ``statistics``: what is stored beside the status of each body.
+    - ``memory``: limit [bytes] from which the size of a chunk follows; ``chunk``: bodies per chunk
+      instead, a multiple of the block (see ``polhode.ensemble`` in docs/scale.md). A store retains
+      the chunks it began with.
+    - ``devices``: local JAX devices that share the bodies; None: the first one.
+    - ``part``: (i, n) computes every n-th chunk from the i-th on, i from 1 to n. The statistics are
+      reduced by the first call without it that finds all chunks.
+    - ``scheduler``: the address or the ``dask.distributed.Client`` of a cluster that computes the
+      chunks; None: the active client of this process, and without one this process.
+    - ``attributes``: text to store, such as the scene file; compared as well.
+    - ``progress``: called after each chunk.
 
-    Raises ``polhode.ensemble.StoreError`` for a store of another scene or version, in use, or on
-    a full disk, and ValueError for a chunk or memory that does not fit.
+    Raises ``polhode.ensemble.StoreError`` for a store of another run, damaged metadata or a full
+    disk, and ValueError for options that do not fit.
     """
     path = Path(path).resolve()
-    statistics = tuple(statistics)
-    if not 0 <= process < processes:
-        raise ValueError(f"process must be from 0 to {processes - 1}, got {process}.")
-    if not trajectories and not statistics:
-        raise ValueError("nothing to keep: give statistics, or trajectories=True.")
-    if len({s.name for s in statistics}) < len(statistics):
-        raise ValueError("two statistics have the same name: give each its own.")
+    statistics, attributes = tuple(statistics), dict(attributes or {})
+    _check(ensemble, method, name, trajectories, statistics, part)
     devices = [jax.local_devices()[0]] if devices is None else list(devices)
-    block = Block(ensemble, ts, method, rtol, trajectories, statistics, devices)
-    times = np.asarray(block.ts)
-    body_bytes = 7 * times.size * times.itemsize + 1  # to compute, if not to keep
-    size = _layout.rows(
-        ensemble.bodies, block.size, body_bytes, trajectories, len(devices), memory, chunk
-    )
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    on_cores = cores if devices[0].platform == "cpu" else 1
-    ahead = len(devices) * _layout.ahead(block.size * body_bytes, on_cores, len(devices), memory)
-    identity = _identity(block, rtol, trajectories, statistics, attributes or {})
-
-    def layout(size: _layout.Rows) -> dict[str, _layout.Field]:
-        return _layout.fields(ensemble.bodies, size, block.size, times, trajectories, statistics)
-
-    with locked(path, process, processes):
-        words = _layout.title(attributes or {})
+    job = Job(ensemble, ts, path, method, rtol, trajectories, statistics, devices)
+    size = job.sizes(memory, chunk)
+    identity = job.identity(name)
+    with contextlib.ExitStack() as stack:
+        client = None
+        if part is None or scheduler is not None:
+            client = stack.enter_context(_dask.connected(scheduler))
         if not os.path.lexists(path):
-            create(path, identity, size, times, layout(size), words)
-        store = Store(path, identity)
-        begun = _layout.Rows(store.chunk, store.piece)
-        with in_turn(path):
-            store.mend(times, layout(begun), words, [device_names(devices)], warn)
-        if processes == 1:
-            store.sweep()
-        fill(store, block, range(process, store.marks.shape[0], processes), verify, ahead, progress)
-        if store.finished().all():
-            with in_turn(path):
-                write_summaries(store, statistics)
+            metadata = _title() | {"devices": device_names(devices)} | attributes
+            full = identity | {"chunk": size.chunk}
+            create(path, job.times, job.layout(size.chunk), metadata, full)
+        store = job.open(compare_identity(path, identity, attributes)["chunk"])
+        first, step = (0, 1) if part is None else (part[0] - 1, part[1])
+        numbers = range(first, store.chunks, step)
+        tally = _Tally(job, numbers, progress)
+        if client is None:
+            finished = _complete_here(job, numbers, size.concurrent)
         else:
-            for words in absent(store, process, processes):
-                warn(words)
+            finished = _dask.complete(client, job, numbers)
+        stack.enter_context(contextlib.closing(finished))
+        for k, computed in finished:
+            tally.add(k, computed)
+    if part is None:
+        write_summaries(store, statistics)
+        store.remove_partial()
     return path
 
 
+def _check(ensemble, method, name, trajectories, statistics, part) -> None:
+    if not trajectories and not statistics:
+        raise ValueError("nothing to store: give statistics, or trajectories=True.")
+    if len({s.name for s in statistics}) < len(statistics):
+        raise ValueError("two statistics have the same name: give each its own.")
+    if part is not None and not 1 <= part[0] <= part[1]:
+        raise ValueError(f"part must be (i, n) with i from 1 to n, got {part}.")
+    quantities = [s.quantity for s in statistics]
+    if name is None and has_user_code((ensemble, method, quantities)):
+        raise ValueError(
+            "this ensemble contains functions or classes of your own, whose code a store cannot"
+            ' compare: give name="...", and another one when you change them.'
+        )
+
+
+class Job:
+    """An ensemble, what is stored of it and where: chunk ``k`` is completed by ``complete(k)``."""
+
+    def __init__(
+        self,
+        ensemble: Ensemble,
+        ts: Any,
+        path: Path,
+        method: AbstractMethod | None,
+        rtol: float | None,
+        trajectories: bool,
+        statistics: tuple[Statistic, ...],
+        devices: Sequence[Any],
+    ):
+        self.arguments = (ensemble, np.asarray(ts), path, method, rtol, trajectories, statistics)
+        self.block = Block(ensemble, ts, method, rtol, trajectories, statistics, devices)
+        self.times = np.asarray(self.block.ts)
+        self.path, self.rtol = path, rtol
+        self.trajectories, self.statistics = trajectories, statistics
+        self.chunk = 0
+        self.store: Store | None = None
+
+    def layout(self, chunk: int) -> dict[str, _layout.Field]:
+        return _layout.fields(
+            self.block.ensemble.bodies, chunk, self.block.size, self.times, self.trajectories,
+            self.statistics,
+        )  # fmt: skip
+
+    def sizes(self, memory: int | None, chunk: int | None) -> _layout.Sizes:
+        devices = self.block.devices
+        affinity = getattr(os, "sched_getaffinity", None)
+        cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+        body_bytes = 7 * self.times.size * self.times.itemsize + 1
+        return _layout.sizes(
+            self.block.ensemble.bodies, self.block.size, body_bytes, self.trajectories,
+            len(devices), cores if devices[0].platform == "cpu" else 2, memory, chunk,
+        )  # fmt: skip
+
+    def identity(self, name: str | None) -> dict[str, Any]:
+        """What two runs must share to write to one store, as plain JSON; without the chunk."""
+        block, ensemble = self.block, self.block.ensemble
+        parts = (ensemble.scene, ensemble.state, ensemble.spreads, ensemble.rows)
+        return {
+            "name": name,
+            "bodies": ensemble.bodies,
+            "seed": ensemble.seed,
+            "times": self.times.size,
+            "dtype": str(self.times.dtype),
+            "rtol": self.rtol,
+            "block": block.size,
+            "trajectories": self.trajectories,
+            "statistics": [[s.name, s.low, s.high, s.bins] for s in self.statistics],
+            "arrays": sorted(self.layout(block.size)),
+            "numbers": digest(*parts, self.times, block.method, self.statistics),
+            "platform": block.devices[0].platform,
+        } | versions()
+
+    def open(self, chunk: int) -> Store:
+        """Open the store, whose chunks have so many bodies."""
+        self.chunk = chunk
+        self.store = Store(self.path, self.times, self.layout(chunk))
+        return self.store
+
+    def complete(self, k: int) -> bool:
+        """Compute and write chunk ``k`` unless it is there and can be decoded; whether it was
+        computed.
+        """
+        assert self.store is not None
+        if self.store.is_complete(k):
+            return False
+        self.store.write(k, compute(self.block, self.store.layout, self.chunk, k))
+        return True
+
+
+def _complete_here(job: Job, numbers: range, concurrent: int) -> Iterator[tuple[int, bool]]:
+    """Complete the chunks in this process, ``concurrent`` at a time: (number, whether it was
+    computed) of each. One is compressed and written while others are computed.
+    """
+    assert job.store is not None
+    if concurrent == 1:
+        yield from ((k, job.complete(k)) for k in numbers)
+        return
+    if set(numbers).intersection(job.store.missing()):
+        job.block.compile()  # in this thread, and once
+    x64 = bool(jax.config.jax_enable_x64)  # pyright: ignore[reportAttributeAccessIssue]
+
+    def complete(k: int) -> tuple[int, bool]:
+        with jax.enable_x64(x64):  # a setting that may be one of the calling thread
+            return k, job.complete(k)
+
+    remaining, running = iter(numbers), set()
+    pool = ThreadPoolExecutor(concurrent)
+    try:
+        while True:
+            for k in remaining:
+                running.add(pool.submit(complete, k))
+                if len(running) == concurrent:
+                    break
+            if not running:
+                return
+            finished, running = wait(running, return_when=FIRST_COMPLETED)
+            yield from (future.result() for future in finished)
+    except Exception:
+        pool.shutdown(cancel_futures=True)
+        raise
+    finally:  # an interrupt does not wait for the chunks that are being computed
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+class _Tally:
+    """Counts bodies and reports them. Chunks whose files are there count as reused until they turn
+    out to be damaged.
+    """
+
+    def __init__(self, job: Job, numbers: range, progress: Callable[[Progress], None]):
+        assert job.store is not None
+        self.chunk, self.bodies, self.progress = job.chunk, job.block.ensemble.bodies, progress
+        missing = set(job.store.missing())
+        self.present = {k for k in numbers if k not in missing}
+        self.total = sum(map(self.count, numbers))
+        self.reused = sum(map(self.count, self.present))
+        self.computed = 0
+        self.began = time.perf_counter()
+        self.report()
+
+    def count(self, k: int) -> int:
+        return min(self.chunk, self.bodies - k * self.chunk)
+
+    def add(self, k: int, computed: bool) -> None:
+        if computed:
+            self.computed += self.count(k)
+            self.reused -= self.count(k) if k in self.present else 0
+        self.report()
+
+    def report(self) -> None:
+        done, rate, remaining = self.reused + self.computed, None, None
+        if self.computed:
+            rate = self.computed / (time.perf_counter() - self.began)
+            remaining = (self.total - done) / rate
+        self.progress(Progress(done, self.total, self.reused, rate, remaining))
+
+
 def device_names(devices: Sequence[Any]) -> str:
-    """Number and kind of the devices, as a store remembers them."""
+    """Number and kind of the devices."""
     return f"{len(devices)} x {devices[0].platform} ({devices[0].device_kind})"
 
 
-def _identity(block: Block, rtol, trajectories, statistics, attributes) -> dict[str, Any]:
-    """What two runs must share for their chunks to belong together, as plain JSON."""
-    import diffrax
-
+def _title() -> dict[str, str]:
+    """The attributes of every store."""
     from polhode import __version__
+    from polhode.files._provenance import commit
 
-    ensemble = block.ensemble
-    kept = [[s.name, s.low, s.high, s.bins] for s in statistics]
-    parts = (ensemble.scene, ensemble.state, ensemble.spreads, ensemble.rows)
     return {
-        "bodies": ensemble.bodies,
-        "seed": ensemble.seed,
-        "times": int(block.ts.size),
-        "dtype": str(block.ts.dtype),
-        "rtol": rtol,
-        "block": block.size,
-        "trajectories": trajectories,
-        "statistics": kept,
-        "scene": digest(*parts, block.ts, block.method, statistics, attributes),
-        "polhode": __version__,
-        "jax": jax.__version__,
-        "diffrax": diffrax.__version__,
-        "platform": block.devices[0].platform,
+        "title": "Ensemble of rotating rigid bodies",
+        "source": f"polhode {__version__}",
+        "polhode_commit": commit(),
+        "convention": "wxyz scalar first, body -> space; R = Rz(phi) Ry(theta) Rz(psi)",
     }

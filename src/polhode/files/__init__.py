@@ -15,6 +15,7 @@ from polhode.files._shipped import shipped_scenes as shipped_scenes
 if TYPE_CHECKING:
     from polhode.files._build import (
         build_attitudes as build_attitudes,
+        build_events as build_events,
         build_inertia as build_inertia,
         build_scene as build_scene,
         build_state as build_state,
@@ -23,8 +24,15 @@ if TYPE_CHECKING:
     from polhode.files._method import build_method as build_method
     from polhode.files._models import SceneFile as SceneFile
 
-_ROOMS = {
-    "_build": ("blamed", "build_attitudes", "build_inertia", "build_scene", "build_state"),
+_MODULES = {
+    "_build": (
+        "blamed",
+        "build_attitudes",
+        "build_events",
+        "build_inertia",
+        "build_scene",
+        "build_state",
+    ),
     "_clones": ("Clones", "draw_clones"),
     "_method": ("build_method",),
     "_models": ("SceneFile",),
@@ -32,8 +40,8 @@ _ROOMS = {
 
 
 def __getattr__(name: str) -> Any:
-    for room, names in _ROOMS.items():
+    for module, names in _MODULES.items():
         if name in names:
             imported("a scene file", "pydantic")
-            return getattr(importlib.import_module(f"polhode.files.{room}"), name)
+            return getattr(importlib.import_module(f"polhode.files.{module}"), name)
     raise AttributeError(f"module 'polhode.files' has no attribute {name!r}")

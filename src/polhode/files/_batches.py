@@ -1,11 +1,12 @@
 """Tables of a scene file for many bodies: [monte_carlo] and [ensemble]."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
-from polhode.files._table import Angle, Measured, MomentumUnit, Rate, Spread, Table, Text, Words
-from polhode.files._values import FLAG, NUMBER, PATH, choice, whole, wrong
+from polhode.files import _values
+from polhode.files._table import Measured, Table
+from polhode.files._values import BelowFolder, Number, Spread
 
 QUANTITIES = ("moments", "euler", "attitude", "omega_body", "momentum_body", "torque")
 
@@ -21,7 +22,7 @@ class Drawn(Table):
 
 class MomentsSigma(Table):
     relative_sigma: Spread
-    source: Text
+    source: str
 
     @property
     def sigma(self) -> list[float]:
@@ -31,26 +32,26 @@ class MomentsSigma(Table):
 class Sigma(Measured):
     measures = ("sigma",)
     sigma: Spread
-    source: Text
+    source: str
 
 
 class AngleSigma(Sigma):
-    unit: Angle = "rad"
+    unit: _values.Angle = "rad"
 
 
 class RatesSigma(Sigma):
-    unit: Rate = "rad/s"
+    unit: _values.Rate = "rad/s"
 
 
 class MomentumSigma(Sigma):
-    unit: MomentumUnit = "kg m^2/s"
+    unit: _values.Momentum = "kg m^2/s"
 
 
 class MonteCarlo(Drawn):
     """Clones around the nominal body, each quantity drawn from a normal distribution."""
 
-    clones: Annotated[int, whole(1, 10_000_000)]
-    seed: Annotated[int, whole(0, 2**63 - 1)]
+    clones: Annotated[int, Field(ge=1, le=10_000_000)]
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)]
     moments: MomentsSigma | None = None
     euler: AngleSigma | None = None
     attitude: AngleSigma | None = None
@@ -60,9 +61,10 @@ class MonteCarlo(Drawn):
     @model_validator(mode="after")
     def _some(self) -> "MonteCarlo":
         if not self.spreads:
-            expected = f"one or more of {', '.join(QUANTITIES[:-1])}"
-            mend = "add for example `moments = { relative_sigma = ..., source = .. }`"
-            raise wrong("missing key", Words("none of them"), expected, mend, "")
+            raise ValueError(
+                f"one or more of {', '.join(QUANTITIES[:-1])} are needed: add for example"
+                " `moments = { relative_sigma = ..., source = .. }`"
+            )
         return self
 
 
@@ -70,7 +72,7 @@ class MomentsDraw(Table):
     one_of = (("relative_sigma", "relative_half_width"),)
     relative_sigma: Spread | None = None
     relative_half_width: Spread | None = None
-    source: Text = ""
+    source: str = ""
 
     @property
     def sigma(self) -> list[float] | None:
@@ -88,69 +90,63 @@ class Draw(Measured):
     one_of = (("sigma", "half_width"),)
     sigma: Spread | None = None
     half_width: Spread | None = None
-    source: Text = ""
+    source: str = ""
 
 
 class AngleDraw(Draw):
-    unit: Angle = "rad"
+    unit: _values.Angle = "rad"
 
 
 class AttitudeDraw(AngleDraw):
     one_of = (("sigma", "half_width", "any"),)
-    any: Annotated[bool, FLAG] | None = Field(None, description="true: every attitude alike")
-
-    @model_validator(mode="after")
-    def _used(self) -> "AttitudeDraw":
-        if self.any is False:
-            raise wrong("not used", False, "true, or sigma, or half_width", key="any")
-        return self
+    any: Literal[True] | None = Field(None, description="true: every attitude alike")
 
 
 class RatesDraw(Draw):
-    unit: Rate = "rad/s"
+    unit: _values.Rate = "rad/s"
 
 
 class MomentumDraw(Draw):
-    unit: MomentumUnit = "kg m^2/s"
+    unit: _values.Momentum = "kg m^2/s"
 
 
 class TorqueDraw(Draw):
-    unit: Annotated[str, choice(("N m",))] = "N m"
+    unit: Literal["N m"] = "N m"
 
 
 class Arrays(Table):
     """Files of NumPy (.npy) below the scene's folder with a row for each body, SI."""
 
-    moments: Annotated[str, PATH] | None = None
-    wxyz: Annotated[str, PATH] | None = None
-    omega_body: Annotated[str, PATH] | None = None
-    momentum_body: Annotated[str, PATH] | None = None
-    torque: Annotated[str, PATH] | None = None
+    moments: BelowFolder | None = None
+    wxyz: BelowFolder | None = None
+    omega_body: BelowFolder | None = None
+    momentum_body: BelowFolder | None = None
+    torque: BelowFolder | None = None
 
 
 class Statistic(Table):
-    quantity: Annotated[str, choice(("rate", "tilt", "energy", "momentum"))]
-    low: Annotated[float, NUMBER] | None = None
-    high: Annotated[float, NUMBER] | None = None
-    bins: Annotated[int, whole(1, 100_000)] = 100
+    quantity: Literal["rate", "tilt", "energy", "momentum"]
+    low: Number | None = None
+    high: Number | None = None
+    bins: Annotated[int, Field(ge=1, le=100_000)] = 100
 
     @model_validator(mode="after")
     def _range(self) -> "Statistic":
         if (self.low is None) != (self.high is None):
-            raise wrong("half a range", dict(self.given()), "both low and high, or neither", key="")
+            raise ValueError("a range has both low and high, or neither")
         if self.low is not None and self.high is not None and self.low >= self.high:
-            raise wrong("not above low", self.high, f"a number above {self.low}", key="high")
+            raise ValueError(f"high must be above low = {self.low}, got {self.high}")
         return self
 
 
 class Ensemble(Drawn):
-    """Any number of bodies, streamed into a Zarr store."""
+    """Any number of bodies, computed into a Zarr store."""
 
-    bodies: Annotated[int, whole(1, 2**32 - 1)]
-    seed: Annotated[int, whole(0, 2**32 - 1)]
-    trajectories: Annotated[bool, FLAG] = True
-    statistics: list[Statistic] = Field(default_factory=list)
-    source: Text = ""
+    bodies: Annotated[int, Field(ge=1, le=2**32 - 1)]
+    seed: Annotated[int, Field(ge=0, le=2**32 - 1)]
+    trajectories: bool = True
+    statistics: Annotated[list[Statistic], Field(max_length=100)] = Field(default_factory=list)
+    source: str = ""
     arrays: Arrays | None = None
     moments: MomentsDraw | None = None
     euler: AngleDraw | None = None
@@ -160,13 +156,14 @@ class Ensemble(Drawn):
     torque: TorqueDraw | None = None
 
     @model_validator(mode="after")
-    def _keeps(self) -> "Ensemble":
+    def _stores(self) -> "Ensemble":
         names = [s.quantity for s in self.statistics]
         if not self.trajectories and not names:
-            raise wrong("nothing would be kept", False, "true, or [[ensemble.statistics]]",
-                        key="trajectories")  # fmt: skip
+            raise ValueError(
+                "nothing would be stored: set trajectories = true, or add [[ensemble.statistics]]"
+            )
         if len(set(names)) < len(names):
-            raise wrong("a quantity named twice", names, "each quantity once", key="statistics")
+            raise ValueError(f"statistics name a quantity twice: {', '.join(names)}")
         rows = self.arrays
         if rows is None:
             return self
@@ -177,6 +174,7 @@ class Ensemble(Drawn):
         }
         for name, clash in clashes.items():
             if getattr(rows, name) is not None and clash:
-                given = Words(f"{name} in arrays, and a table or rows that replace it")
-                raise wrong("given twice", given, "one of them", key=f"arrays.{name}")
+                raise ValueError(
+                    f"{name} is given twice: in arrays, and by a table or rows that replace it"
+                )
         return self

@@ -3,8 +3,10 @@
 import contextlib
 import functools
 import operator
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,12 +20,13 @@ from polhode.files._models import SceneFile
 from polhode.files._table import Table
 from polhode.inertia import Inertia, MassProperties, compose
 
-_CLASSES = {
-    "uniform-gravity": "UniformGravity",
-    "gravity-gradient": "GravityGradient",
+_TORQUES = {
     "body": "BodyTorque",
     "space": "SpaceTorque",
     "linear-damping": "LinearDamping",
+    "quadratic-damping": "QuadraticDamping",
+    "energy-sink": "EnergySink",
+    "rate-damping": "RateDamping",
 }
 
 
@@ -72,15 +75,82 @@ def _solid(table: AnySolid, dtype: DTypeLike) -> MassProperties:
     return solid.moved(np.asarray(table.centre, dtype), turn)
 
 
-def _objects(file: SceneFile, key: str, dtype: DTypeLike) -> list:
-    made, tables = [], getattr(file, key)
+def _float_parts(part: Any, dtype: DTypeLike) -> Any:
+    """The part with all numbers, defaults too, in the dtype."""
+    return jax.tree.map(lambda x: jnp.asarray(x, dtype) if eqx.is_array_like(x) else x, part)
+
+
+def build_orbit(file: SceneFile, dtype: DTypeLike) -> "polhode.AbstractOrbit | None":
+    """The [orbit], or None."""
+    table = file.orbit
+    if table is None:
+        return None
+    orbit = polhode.KeplerOrbit
+    make = orbit if table.position is None else orbit.from_state
+    with blamed(file, "[orbit]"):
+        return _float_parts(make(**_numbers(table, dtype, "unit")), dtype)
+
+
+def _potential(file: SceneFile, table: Any, orbit: Any, dtype: DTypeLike) -> Any:
+    numbers = _numbers(table, dtype, "kind")
+    if table.kind == "uniform-gravity":
+        # known by structure, also to an ensemble, whose method is chosen without numbers
+        gravity = table.gravity_space or [0.0, 0.0, -9.80665]
+        known = {"on_axis": not any(table.centre_body[:2]), "vertical": not any(gravity[:2])}
+        return polhode.UniformGravity(**numbers, **known)
+    if table.needs_orbit:
+        return polhode.GravityGradient(orbit.mu, orbit)
+    return polhode.GravityGradient(**numbers)
+
+
+def _torque(file: SceneFile, table: Any, orbit: Any, dtype: DTypeLike) -> Any:
+    if table.kind == "pointing":
+        numbers = _numbers(table, dtype, "kind", "frame", "wxyz", "euler")
+        torque = polhode.Pointing(**numbers, target=build_attitudes(table.target, dtype))
+    elif table.kind == "magnetorquer":
+        moment = table.moment_body
+        if table.b_dot is not None:
+            moment = _float_parts(polhode.BDot(**_numbers(table.b_dot, dtype)), dtype)
+        else:
+            moment = np.asarray(moment, dtype)
+        if table.dipole_space is None:
+            torque = polhode.MagneticDipole(moment, np.asarray(table.field_space, dtype))
+        else:
+            field = polhode.DipoleField(np.asarray(table.dipole_space, dtype))
+            torque = polhode.MagneticDipole(moment, field, orbit)
+    elif table.kind == "pulses":
+        kind = polhode.BodyTorque if table.axes == "body" else polhode.SpaceTorque
+        numbers = _numbers(table, dtype, "kind", "frame", "axes")
+        torque = polhode.Pulses(kind(numbers["n"]), numbers["starts"], numbers["ends"])
+    else:
+        kind = getattr(polhode, _TORQUES[table.kind])
+        torque = kind(**_numbers(table, dtype, "kind", "frame"))
+    if table.frame == "lvlh":
+        torque = polhode.RelativeTorque(torque, polhode.LVLH(orbit))
+    return torque
+
+
+def _rotor(file: SceneFile, table: Any, orbit: Any, dtype: DTypeLike) -> Any:
+    couplings = []
+    if table.viscous is not None:
+        couplings.append(polhode.ViscousCoupling(np.asarray(table.viscous, dtype)))
+    if table.coulomb is not None:
+        couplings.append(polhode.CoulombFriction(**_numbers(table.coulomb, dtype)))
+    if table.motor is not None:
+        couplings.append(polhode.Motor(**_numbers(table.motor, dtype)))
+    numbers = _numbers(table, dtype, "viscous", "coulomb", "motor")
+    if couplings:
+        numbers["coupling"] = functools.reduce(operator.add, couplings)
+    return polhode.Rotor(**numbers)
+
+
+def _sum(file: SceneFile, key: str, build: Callable, orbit: Any, dtype: DTypeLike) -> Any:
+    """The parts of a list of tables, added; None where there is none."""
+    parts, tables = [], getattr(file, key)
     for index, table in enumerate(tables):
-        kind = getattr(polhode, "Rotor" if key == "rotors" else _CLASSES[table.kind])
         with blamed(file, f"[{key}]" if len(tables) == 1 else f"[{key} {index + 1}]"):
-            thing = kind(**_numbers(table, dtype, "kind"))
-        # defaults that the file leaves out take the dtype too
-        made.append(jax.tree.map(lambda x: jnp.asarray(x, dtype), thing))
-    return made
+            parts.append(_float_parts(build(file, table, orbit, dtype), dtype))
+    return functools.reduce(operator.add, parts) if parts else None
 
 
 def build_scene(
@@ -91,10 +161,51 @@ def build_scene(
     Raises SceneFileError, naming the place, for numbers that a constructor refuses.
     """
     inertia = build_inertia(file, dtype) if inertia is None else inertia
-    acting = {key: _objects(file, key, dtype) for key in ("potential", "torque", "rotors")}
-    acting = {key: functools.reduce(operator.add, made) for key, made in acting.items() if made}
+    orbit = build_orbit(file, dtype)
+    builders = {"potential": _potential, "torque": _torque, "rotors": _rotor}
+    parts = {key: _sum(file, key, build, orbit, dtype) for key, build in builders.items()}
     with blamed(file, ""):
-        return polhode.Scene(inertia, **acting)
+        return polhode.Scene(inertia, **parts)
+
+
+def build_events(file: SceneFile, dtype: DTypeLike) -> dict[str, "polhode.Event"]:
+    """The [[events]] by name."""
+    events = {}
+    directions = {"rising": 1, "falling": -1, "both": 0}
+    for table in file.events:
+        direction = directions[table.crossing]
+        if table.rate is not None:
+            function = _RateLimit(jnp.asarray(table.rate, dtype))
+        else:
+            axis, space = (
+                jnp.asarray(np.asarray(x) / np.linalg.norm(x), dtype)
+                for x in (table.axis_body, table.direction_space)
+            )
+            function = _Angle(axis, space, jnp.asarray(table.angle, dtype))
+            direction = -direction  # the cosine falls where the angle grows
+        events[table.name] = polhode.Event(function, direction)
+    return events
+
+
+class _RateLimit(eqx.Module):
+    """|omega|^2 less that of the limit."""
+
+    limit: Array
+
+    def __call__(self, wxyz: Array, omega_body: Array, t: Array) -> Array:
+        return jnp.sum(omega_body**2) - self.limit**2
+
+
+class _Angle(eqx.Module):
+    """Cosine of the angle from a body axis to a direction in space, less that of the limit."""
+
+    axis_body: Array
+    direction_space: Array
+    angle: Array
+
+    def __call__(self, wxyz: Array, omega_body: Array, t: Array) -> Array:
+        axis = rotation.rotate(wxyz, self.axis_body)
+        return jnp.sum(axis * self.direction_space) - jnp.cos(self.angle)
 
 
 def build_state(file: SceneFile, dtype: DTypeLike, inertia: Inertia) -> "polhode.State":
@@ -102,4 +213,9 @@ def build_state(file: SceneFile, dtype: DTypeLike, inertia: Inertia) -> "polhode
     with blamed(file, "[state]"):
         value = jnp.asarray(file.state.value, dtype)
         omega = inertia.rates(value) if file.state.rate == "momentum_body" else value
-        return polhode.State(wxyz=build_attitudes(file.state.attitude, dtype), omega_body=omega)
+        wxyz = build_attitudes(file.state.attitude, dtype)
+        if file.state.frame == "lvlh":
+            frame = polhode.LVLH(build_orbit(file, dtype))
+            first = jnp.asarray(file.times.seconds[0], dtype)
+            wxyz, omega = frame.from_frame(wxyz, omega, first)
+        return polhode.State(wxyz=wxyz, omega_body=omega)

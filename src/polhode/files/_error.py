@@ -1,5 +1,7 @@
 """The error of a scene file, and how text from files is shown on a terminal."""
 
+import difflib
+from collections.abc import Iterable
 from pathlib import Path
 
 
@@ -12,14 +14,21 @@ class SceneFileError(ValueError):
 
     def __init__(
         self, file: Path | str, key: str, problem: str, given: str = "", expected: str = "",
-        mend: str = "",
+        mend: str = "", also: str = "",
     ):  # fmt: skip
         self.file, self.key, self.problem = str(file), key, problem
         self.given, self.expected, self.mend = given, expected, mend
         place = f"{self.file}: {key}: " if key else f"{self.file}: "
-        rows = [("given", given), ("expected", expected), ("to mend", mend)]
+        rows = [("given", given), ("expected", expected), ("to mend", mend), ("also", also)]
         lines = [visible(f"  {name + ':':<10}{text}") for name, text in rows if text]
         super().__init__("\n".join([visible(place + problem), *lines]))
+
+
+class Verbatim(str):
+    """Text that is shown without quotation marks."""
+
+    def __repr__(self) -> str:
+        return str(self)
 
 
 def visible(text: str) -> str:
@@ -38,3 +47,10 @@ def shorten(value: object, length: int = 80) -> str:
     except ValueError:  # an integer of more digits than Python writes out
         return "a number of thousands of digits"
     return text if len(text) <= length else text[: length - 4] + " ..."
+
+
+def did_you_mean(word: object, known: Iterable[str]) -> str:
+    """A question with the known word that is close to another one, or nothing."""
+    names = {name.lower(): name for name in known}
+    close = difflib.get_close_matches(str(word)[:100].lower(), names, 1, 0.6)
+    return f'did you mean "{names[close[0]]}"?' if close else ""

@@ -8,9 +8,8 @@ import diffrax
 import polhode
 from polhode import _integrate as solvers
 from polhode.files._build import blamed
-from polhode.files._error import SceneFileError
+from polhode.files._error import SceneFileError, did_you_mean
 from polhode.files._models import SceneFile
-from polhode.files._values import suggestion
 
 
 def build_method(file: SceneFile) -> "polhode.AbstractMethod | None":
@@ -38,8 +37,8 @@ def build_method(file: SceneFile) -> "polhode.AbstractMethod | None":
 def _solver(file: SceneFile, name: str) -> diffrax.AbstractSolver:
     known = {
         key: value
-        for room in (diffrax, solvers)
-        for key, value in vars(room).items()
+        for module in (diffrax, solvers)
+        for key, value in vars(module).items()
         if inspect.isclass(value)
         and issubclass(value, diffrax.AbstractSolver)
         and not key.startswith("Abstract")
@@ -48,7 +47,7 @@ def _solver(file: SceneFile, name: str) -> diffrax.AbstractSolver:
         raise SceneFileError(
             file.path, "[method] solver", "unknown solver", name,
             "the name of a solver of diffrax or polhode, such as Dopri8",
-            suggestion(name, tuple(known)),
+            did_you_mean(name, known),
         )  # fmt: skip
     try:
         return known[name]()

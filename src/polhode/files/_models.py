@@ -1,88 +1,90 @@
 """What a scene file may say: one pydantic model a table. `polhode schema` prints their JSON Schema.
 
 Numbers are in SI once a table is checked. Nothing here needs numpy or JAX, so that a mistake in a
-file is told at once; what gives arrays imports numpy when it is asked.
+file is reported at once; what gives arrays imports numpy when it is called.
 """
 
-import datetime
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from polhode.files import _unit
+from polhode.files import _unit, _values
+from polhode.files._actions import ConstantTorque, Event, Orbit, Potentials, Rotors, Torques
 from polhode.files._batches import Ensemble, MonteCarlo
-from polhode.files._bodies import (
-    Attitudes,
-    ConstantTorque,
-    Inertia,
-    Potentials,
-    Rotors,
-    State,
-    Torques,
-)
-from polhode.files._table import Angle, Measured, Rate, Seconds, Table, Text, Vector, Words, scaled
+from polhode.files._bodies import Attitudes, Inertia, State
+from polhode.files._table import Measured, Table, scaled
 from polhode.files._values import (
-    DATE,
-    FLAG,
-    NAMES,
-    NUMBER,
-    PATH,
-    POSITIVE,
-    SEQUENCE,
-    TIMES,
-    TOLERANCE,
-    WXYZ,
-    choice,
-    whole,
-    wrong,
+    MAX_SAMPLES,
+    BelowFolder,
+    Date,
+    Number,
+    Positive,
+    Quaternion,
+    Sequence,
+    Vector,
 )
 
 if TYPE_CHECKING:
     import numpy as np
 
-MOST_SAMPLES = 10_000_000
-PERIODS = ("P_psi", "P_phi")
-
 
 class Times(Table):
-    """`stop` and `number` of equidistant samples from `start`, or `values`."""
+    """`stop` and `number` or `step` of equidistant samples from `start`, or `values`."""
 
-    start: Annotated[float, NUMBER] = 0.0
-    stop: Annotated[float, NUMBER] | None = None
-    number: Annotated[int, whole(2, MOST_SAMPLES)] | None = None
-    values: Annotated[list[float], TIMES] | None = None
-    unit: Seconds = "s"
-
-    @model_validator(mode="before")
-    @classmethod
-    def _one_way(cls, data: Any) -> Any:
-        if not isinstance(data, Mapping):
-            return data
-        both = [key for key in ("start", "stop", "number") if key in data]
-        if "values" in data and both:
-            raise wrong("too many choices", Words(f"values and {both[0]}"),
-                        f"exactly one of values, {both[0]}", "keep one of them", "")  # fmt: skip
-        for key, words in (("stop", NUMBER.expected), ("number", whole(2, MOST_SAMPLES).expected)):
-            if "values" not in data and key not in data:
-                have = Words(f"only {', '.join(map(str, data)) or 'nothing'}")
-                raise wrong("missing key", have, words, f"add `{key} = ...`", key)
-        return data
+    start: Number | None = Field(None, description="0 if left out")
+    stop: Number | None = None
+    number: Annotated[int, Field(ge=2, le=MAX_SAMPLES)] | None = None
+    step: Positive | None = Field(None, description="between samples, instead of their number")
+    values: _values.Times | None = None
+    unit: _values.Seconds = "s"
 
     @model_validator(mode="after")
-    def _passes(self) -> "Times":
-        if self.stop is not None and self.number is not None:
-            step = (self.stop - self.start) / (self.number - 1)
-            if step == 0 or self.start + step == self.start or self.stop - step == self.stop:
-                expected = f"a number other than start = {self.start}, far enough for the samples"
-                raise wrong("no time passes", self.stop, expected, key="stop")
-        ends = self.values or [self.start, self.stop or 0.0, (self.stop or 0.0) - self.start]
+    def _one_way(self) -> "Times":
+        others = [key for key in ("start", "stop", "number", "step") if key in dict(self.given())]
+        if self.values is not None:
+            if others:
+                raise ValueError(f"exactly one of values, {others[0]} is needed, got both")
+            ends = [self.values[0], self.values[-1]]
+        else:
+            if self.stop is None:
+                raise ValueError("stop is missing: add `stop = ...`, or values")
+            if (self.number is None) == (self.step is None):
+                found = "none of them" if self.step is None else "both"
+                raise ValueError(
+                    f"exactly one of number, step is needed, got {found}: add `number = ...`"
+                )
+            ends = [self.first, self.stop]
+            span = self.stop - self.first
+            if self.step is not None and not 1 <= abs(span / self.step) <= MAX_SAMPLES - 1:
+                raise ValueError(f"step must give 2 to {MAX_SAMPLES} samples, got {self.step}")
+            if not math.isfinite(span):
+                raise ValueError("the times are beyond what numbers hold")
+            step = span / (self.samples - 1)
+            if step == 0 or ends[0] + step == ends[0] or ends[1] - step == ends[1]:
+                raise ValueError(
+                    f"stop must be other than start = {self.first}, far enough for the samples"
+                )
         if not all(math.isfinite(end * self.unit_seconds) for end in ends):
-            raise wrong("times beyond what numbers hold", self.unit, "times of less than 1e308 s",
-                        key="unit")  # fmt: skip
+            raise ValueError("the times are beyond what numbers hold: less than 1e308 s")
         return self
+
+    @property
+    def first(self) -> float:
+        """`start`, or 0."""
+        return 0.0 if self.start is None else self.start
+
+    @property
+    def samples(self) -> int:
+        """The number of equidistant samples."""
+        if self.number is not None:
+            return self.number
+        assert self.stop is not None
+        assert self.step is not None
+        # a whole number of steps, but for rounding, has its last sample at stop
+        return math.floor(abs(self.stop - self.first) / self.step * (1 + 1e-12)) + 1
 
     @property
     def unit_seconds(self) -> float:
@@ -96,71 +98,76 @@ class Times(Table):
 
         if self.values is not None:
             return np.array(self.values) * self.unit_seconds
-        assert self.stop is not None  # the model asks for both
-        assert self.number is not None
-        return np.linspace(self.start, self.stop, self.number) * self.unit_seconds
+        assert self.stop is not None  # the model requires it
+        last = self.stop
+        if self.step is not None:
+            last = self.first + math.copysign(self.step, last - self.first) * (self.samples - 1)
+        return np.linspace(self.first, last, self.samples) * self.unit_seconds
 
 
 class Method(Table):
-    kind: Annotated[str, choice(("auto", "closed-form", "lie-poisson", "euler-angles"))] = "auto"
-    solver: Text | None = Field(default=None, description="a solver of diffrax or polhode")
-    rtol: Annotated[float, TOLERANCE] | None = None
-    step: Annotated[float, POSITIVE] | None = Field(default=None, description="constant step [s]")
+    kind: Literal["auto", "closed-form", "lie-poisson", "euler-angles"] = "auto"
+    solver: str | None = Field(default=None, description="a solver of diffrax or polhode")
+    rtol: Annotated[float, Field(gt=0, lt=1)] | None = None
+    step: Positive | None = Field(default=None, description="constant step [s]")
 
     @model_validator(mode="after")
     def _fits(self) -> "Method":
         if self.solver is not None and self.kind in ("auto", "closed-form"):
-            raise wrong(f"not used by kind = {self.kind!r}", self.solver, "a method that steps",
-                        'set kind = "lie-poisson" or "euler-angles", or remove the solver',
-                        "solver")  # fmt: skip
+            raise ValueError(
+                f"solver is not used by kind = {self.kind!r}: set kind = 'lie-poisson' or"
+                " 'euler-angles', or remove the solver"
+            )
         if self.step is not None and self.solver is None:
-            raise wrong("a step without a solver", self.step, "a solver that takes this step",
-                        "add `solver = ...`, or remove the step", "step")  # fmt: skip
+            raise ValueError("step needs a solver: add `solver = ...`, or remove the step")
         return self
 
 
 class Published(Measured):
     measures = ("value", "uncertainty")
-    name: Annotated[str, choice(PERIODS)]
-    value: Annotated[float, NUMBER]
-    uncertainty: Annotated[float, POSITIVE] | None = None
-    unit: Seconds = "s"
-    source: Text
+    name: Literal["P_psi", "P_phi"]
+    value: Number
+    uncertainty: Positive | None = None
+    unit: _values.Seconds = "s"
+    source: str
 
 
 class Observation(Table):
     one_of = (("utc", "time"),)
-    utc: Annotated[datetime.datetime, DATE] | None = None
-    time: Annotated[float, NUMBER] | None = None
+    utc: Date | None = None
+    time: Number | None = None
     angles: Vector | None = None
-    wxyz: Annotated[list[float], WXYZ] | None = None
+    wxyz: Quaternion | None = None
     omega_body: Vector | None = None
 
     @model_validator(mode="after")
     def _something(self) -> "Observation":
         if self.angles is None and self.wxyz is None and self.omega_body is None:
-            raise wrong("missing key", Words("none of them"),
-                        "angles or wxyz, omega_body, or both", key="")  # fmt: skip
+            raise ValueError("angles or wxyz, omega_body, or both are needed")
         return self
 
 
 class Observations(Table):
     """Attitudes and body rates that were observed."""
 
-    source: Text = ""
-    sequence: Annotated[str, SEQUENCE] = "zyz"
-    angle_unit: Angle = "rad"
-    rate_unit: Rate = "rad/s"
-    time_unit: Seconds = "s"
-    rows: list[Observation] = Field(min_length=1, description="one or more rows { time = .., .. }")
+    source: str = ""
+    sequence: Sequence = "zyz"
+    angle_unit: _values.Angle = "rad"
+    rate_unit: _values.Rate = "rad/s"
+    time_unit: _values.Seconds = "s"
+    rows: list[Observation] = Field(
+        min_length=1, max_length=1_000_000, description="one or more rows { time = .., .. }"
+    )
 
     @model_validator(mode="after")
     def _one_kind(self) -> "Observations":
         if any(row.angles is not None for row in self.rows):
             for index, row in enumerate(self.rows):
                 if row.wxyz is not None:
-                    place, expected = f"rows {index + 1}.wxyz", "angles in every row, or wxyz"
-                    raise wrong("mixed kinds of attitude", row.wxyz, expected, key=place)
+                    raise ValueError(
+                        f"mixed kinds of attitude: angles in every row, or wxyz in every row (row"
+                        f" {index + 1} has wxyz)"
+                    )
         return self
 
     @model_validator(mode="after")
@@ -201,27 +208,29 @@ def _columns(rows: list[list[float] | None], width: int) -> "np.ndarray":
 
 
 class Output(Table):
-    file: Annotated[str, PATH] | None = None
-    figure: Annotated[bool, FLAG] = True
+    file: BelowFolder | None = None
+    figure: bool = True
 
 
 class SceneFile(Table):
     """A scene of a rotating rigid body."""
 
-    title: Text = Field("", description="the name of the file if left out")
-    source: Text = Field("", description="where the numbers come from")
-    epoch: Annotated[datetime.datetime, DATE] | None = Field(None, description="of time 0")
-    frame: Text = Field("an inertial frame", description="name of the inertial frame")
-    axis_names: Annotated[tuple[str, str, str], NAMES] = ("x", "y", "z")
+    title: str = Field("", description="the name of the file if left out")
+    source: str = Field("", description="where the numbers come from")
+    epoch: Date | None = Field(None, description="of time 0")
+    frame: str = Field("an inertial frame", description="name of the inertial frame")
+    axis_names: Annotated[tuple[str, str, str], Field(strict=False)] = ("x", "y", "z")
     inertia: Inertia
     state: State
     times: Times
+    orbit: Orbit | None = None
     potential: Potentials = Field(default_factory=list)
     torque: Torques = Field(default_factory=list)
     rotors: Rotors = Field(default_factory=list)
+    events: Annotated[list[Event], Field(max_length=20)] = Field(default_factory=list)
     method: Method = Method()
     monte_carlo: MonteCarlo | None = None
-    published: list[Published] = Field(default_factory=list)
+    published: Annotated[list[Published], Field(max_length=1000)] = Field(default_factory=list)
     observations: Observations | None = None
     output: Output = Output()
     ensemble: Ensemble | None = None
@@ -247,24 +256,44 @@ class SceneFile(Table):
     @model_validator(mode="after")
     def _spreads_fit(self) -> "SceneFile":
         if self.monte_carlo is not None and self.ensemble is not None:
-            raise wrong("two batches", Words("[monte_carlo] and [ensemble]"), "one of them",
-                        "keep [monte_carlo] for a file with a figure, [ensemble] for a store of any"
-                        " size", "ensemble")  # fmt: skip
+            raise ValueError(
+                "[monte_carlo] and [ensemble] exclude each other: keep [monte_carlo] for a file"
+                " with a figure, [ensemble] for a store of any size"
+            )
         constant = len(self.torque) == 1 and isinstance(self.torque[0], ConstantTorque)
         needs = {
-            "moments": (self.inertia.moments, "only for an [inertia] given by its moments"),
-            "euler": (self.state.euler, "only for a [state] given by Euler angles"),
-            "omega_body": (self.state.omega_body, "only for a [state] with omega_body"),
-            "momentum_body": (self.state.momentum_body, "only for a [state] with momentum_body"),
-            "torque": (constant or None, "only for one [torque] of kind body or space"),
-        }  # fmt: skip
+            "moments": (self.inertia.moments, "an [inertia] given by its moments"),
+            "euler": (self.state.euler, "a [state] given by Euler angles"),
+            "omega_body": (self.state.omega_body, "a [state] with omega_body"),
+            "momentum_body": (self.state.momentum_body, "a [state] with momentum_body"),
+            "torque": (constant or None, "one [torque] of kind body or space"),
+        }
         rows = None if self.ensemble is None else self.ensemble.arrays
         for lead, table in (("monte_carlo", self.monte_carlo), ("ensemble", self.ensemble),
                             ("ensemble.arrays", rows)):  # fmt: skip
-            for name, (fits, expected) in needs.items():
+            for name, (fits, needed) in needs.items():
                 if fits is None and getattr(table, name, None) is not None:
-                    given = Words(f"[{lead}] {name}")
-                    raise wrong("does not fit this scene", given, expected, key=f"{lead}.{name}")
+                    raise ValueError(f"[{lead}] {name} does not fit this scene: it needs {needed}")
+        return self
+
+    @model_validator(mode="after")
+    def _orbit_is_there(self) -> "SceneFile":
+        for name, tables in (("potential", self.potential), ("torque", self.torque)):
+            for index, table in enumerate(tables):
+                if self.orbit is None and getattr(table, "needs_orbit", False):
+                    raise ValueError(f"[{name} {index + 1}] needs an [orbit]: add one")
+        if self.state.frame == "lvlh":
+            if self.orbit is None:
+                raise ValueError('[state] frame = "lvlh" needs an [orbit]: add one')
+            if self.monte_carlo is not None or self.ensemble is not None:
+                raise ValueError(
+                    '[state] frame = "lvlh" is that of one body: remove [monte_carlo] or [ensemble]'
+                )
+        if self.events and self.ensemble is not None:
+            raise ValueError("[[events]] are not computed for an [ensemble]: remove one of them")
+        names = [event.name for event in self.events]
+        if len(set(names)) < len(names):
+            raise ValueError(f"[[events]] have a name twice: {', '.join(names)}")
         return self
 
     @model_validator(mode="after")
@@ -277,15 +306,17 @@ class SceneFile(Table):
             time = row.time
             if row.utc is not None:
                 if self.epoch is None:
-                    raise wrong("missing key", Words(f"utc = {row.utc.isoformat()} in a row"),
-                                "the epoch that utc is counted from",
-                                "add `epoch = 1992-11-09T17:49:47Z`", "epoch")  # fmt: skip
+                    raise ValueError(
+                        "epoch is missing, which utc in the rows of [observations] is counted from:"
+                        " add `epoch = 1992-11-09T17:49:47Z`"
+                    )
                 time = (row.utc - self.epoch).total_seconds()
             assert time is not None  # a row has one of both
             if not last < time < math.inf:
-                raise wrong(f"unsorted or repeated times (row {index + 1})",
-                            Words(f"{time} s after {last} s"), "rows in the order of time",
-                            "sort the rows", "observations.rows")  # fmt: skip
+                raise ValueError(
+                    "[observations] rows must be in the order of time: sort the rows (row"
+                    f" {index + 1} is at {time} s after {last} s)"
+                )
             rows.append(row.model_copy(update={"time": time}))
             last = time
         return self.model_copy(update={"observations": seen.model_copy(update={"rows": rows})})

@@ -1,24 +1,22 @@
 """From the text of a scene file to its checked model; errors in one readable block.
 
-Needs neither numpy nor JAX: a mistake is told in a fraction of a second.
+Needs neither numpy nor JAX: a mistake is reported in a fraction of a second.
 """
 
 import os
 import re
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from polhode._extras import imported
-from polhode.files._error import SceneFileError, shorten, visible
+from polhode.files._error import SceneFileError, Verbatim, did_you_mean, shorten, visible
 
 if TYPE_CHECKING:
     from polhode.files._models import SceneFile
 
-MOST_BYTES = 16 * 2**20
-MOST_DEPTH = 16
-MOST_DIGITS = 4000
+MAX_BYTES = 16 * 2**20
+MAX_KEY_PARTS = 200
 
 
 def read_scene(path: str | os.PathLike) -> "SceneFile":
@@ -32,15 +30,15 @@ def read_scene(path: str | os.PathLike) -> "SceneFile":
     path = Path("/dev/stdin" if standard else path)
     try:
         with open(0 if standard else path, "rb", closefd=not standard) as file:
-            data = file.read(MOST_BYTES + 1)
+            data = file.read(MAX_BYTES + 1)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or str(error)
         raise SceneFileError(
             path, "", f"cannot be read: {reason}", mend="check the path and its permissions"
         ) from None
-    if len(data) > MOST_BYTES:
+    if len(data) > MAX_BYTES:
         raise SceneFileError(
-            path, "", "too large", f"more than {MOST_BYTES:,} bytes", "a scene file of a few pages",
+            path, "", "too large", f"more than {MAX_BYTES:,} bytes", "a scene file of a few pages",
             "keep rows of many bodies in .npy files: [ensemble.arrays]",
         )  # fmt: skip
     try:
@@ -67,12 +65,13 @@ def parse_scene(text: str, path: str | os.PathLike = "<text>") -> "SceneFile":
 
 
 def _checked(text: str, path: Path) -> "SceneFile":
-    _limit(text, path)
+    _limit_keys(text, path)
     try:
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
+        words = "brackets nested too deeply" if isinstance(error, RecursionError) else str(error)
         raise SceneFileError(
-            path, "", f"not valid TOML: {error}", mend="see https://toml.io for the syntax"
+            path, "", f"not valid TOML: {words[:200]}", mend="see https://toml.io for the syntax"
         ) from None
     pydantic = imported("a scene file", "pydantic")
     from polhode.files._models import SceneFile
@@ -80,140 +79,88 @@ def _checked(text: str, path: Path) -> "SceneFile":
     try:
         return SceneFile.model_validate(data)
     except pydantic.ValidationError as error:
-        found = error.errors(include_url=False)
-        # what is there and wrong comes before what is not there
-        first = min(found, key=lambda e: e["type"] == "missing")
-        raise _told(path, data, first) from None
+        raise _readable(path, data, error.errors(include_url=False)) from None
 
 
-# strings and comments of TOML, so that what is in them does not count
-_QUOTED = re.compile(
-    r'"""(?:\\.|[^\\])*?"{3,5}|'
-    + r"'''.*?'{3,5}|"
-    + r'"(?:\\.|[^"\\\n])*"|'
-    + r"'[^'\n]*'|#[^\n]*",
-    re.DOTALL,
-)
-_DOTTED = re.compile(rf"(?<![\w-])(?:[\w-]++[ \t]*+\.[ \t]*+){{{MOST_DEPTH},}}")
-_LONG = re.compile(rf"(?<!\w)\w{{{MOST_DIGITS},}}")
+_SPACE_BEFORE_DOT = re.compile(r"(?<![ \t])[ \t]++(?=\.)")
+_SPACE_AFTER_DOT = re.compile(r"(?<=\.)[ \t]++")
+_DOTTED = re.compile(rf"(?<![\w.\"'-])(?:[\w\"'-]++\.){{{MAX_KEY_PARTS},}}")
 
 
-def _limit(text: str, path: Path) -> None:
-    """Refuse what would take the parser seconds, or more calls than Python allows."""
-    bare = _QUOTED.sub(lambda found: "s" + "\n" * found[0].count("\n"), text)
-
-    def refuse(problem: str, at: int, expected: str) -> SceneFileError:
-        line = bare.count("\n", 0, at) + 1
-        return SceneFileError(path, _key_at(bare, at), f"{problem} (line {line})",
-                              expected=expected)  # fmt: skip
-
-    if found := _DOTTED.search(bare):
-        raise refuse("keys nested too deeply", found.start(), f"at most {MOST_DEPTH} levels")
-    if found := _LONG.search(bare):
-        raise refuse(f"a number or key of {len(found[0]):,} characters", found.start(),
-                     f"fewer than {MOST_DIGITS:,}")  # fmt: skip
-    depth = 0
-    for found in re.finditer(r"[\[\]{}]", bare):
-        depth += 1 if found[0] in "[{" else -1
-        if depth > MOST_DEPTH:
-            raise refuse("brackets nested too deeply", found.start(), f"at most {MOST_DEPTH}")
+def _limit_keys(text: str, path: Path) -> None:
+    """Refuse dotted keys of hundreds of parts: their time grows as the square of the number."""
+    dense = _SPACE_AFTER_DOT.sub("", _SPACE_BEFORE_DOT.sub("", text))
+    if found := _DOTTED.search(dense):
+        line = dense.count("\n", 0, found.start()) + 1
+        raise SceneFileError(
+            path, "", f"keys nested too deeply (line {line})",
+            expected=f"fewer than {MAX_KEY_PARTS} parts",
+        )  # fmt: skip
 
 
-def _key_at(text: str, at: int) -> str:
-    """The key and the table that a place in the text belongs to, as far as lines tell."""
-    before = text[max(0, at - 100_000) : at + 200]
-    keys = re.findall(r"^[ \t]*([\w-]{1,80})[ \t]*=", before, re.MULTILINE)
-    tables = re.findall(r"^[ \t]*\[{1,2}([\w. -]{1,80})\]", before, re.MULTILINE)
-    table = f"[{tables[-1]}] " if tables else ""
-    return table + (keys[-1] if keys else "")
+def _readable(path: Path, data: Any, errors: list[Any]) -> SceneFileError:
+    """What pydantic found wrong: the first error with its value, and the places of the others."""
+    # a key that is there and unknown explains one that is missing
+    errors = sorted(errors, key=lambda e: (e["type"] == "missing", e["type"] != "extra_forbidden"))
+    first, *others = errors
+    place = _place(first, data)
+    given = "" if first["type"] == "missing" or not place else shorten(first["input"])
+    others = dict.fromkeys(f"{_place(e, data)}: {_message(e)}" for e in others)
+    others.pop(f"{place}: {_message(first)}", None)
+    also = [shorten(Verbatim(words), 150) for words in list(others)[:2]]
+    if len(others) > 2:
+        also.append(f"{len(others) - 2} more")
+    return SceneFileError(
+        path, place, _message(first), given, mend=_suggestion(first), also="; ".join(also)
+    )
 
 
-def _told(path: Path, data: Any, error: Any) -> SceneFileError:
-    """pydantic's error in our words."""
-    names, value = list(_walk(error["loc"], data)), error["input"]
-    told = error.get("ctx", {})
-    if error["type"] == "scene":
-        key = told["key"]
-        names += [] if key is None else key.split(".")
-        name = _name(names if key is None or key else [*names, ""])
-        words = (told["problem"], told["given"], told["expected"], told["mend"])
-    elif error["type"] == "missing":
-        key, have = str(error["loc"][-1]), "only " + ", ".join(value) if value else "nothing"
-        name = _name([*names, key])
-        words = ("missing key", have, _expected(key, value), f"add `{key} = ...`")
-    elif error["type"].startswith("union_tag"):
-        key, tags = told["discriminator"].strip("'"), told.get("expected_tags", "")
-        words = _untagged(value, key, tags.replace("'", ""), names)
-        name = _name([*names, key])
+def _message(error: Any) -> str:
+    return error["msg"].removeprefix("Value error, ")
+
+
+def _suggestion(error: Any) -> str:
+    """The key or the choice that was probably meant, or nothing."""
+    if error["type"] == "extra_forbidden":
+        word, known = str(error["loc"][-1]), _keys()
+    elif error["type"] in ("literal_error", "union_tag_invalid"):
+        context = error["ctx"]
+        word = context.get("tag") or error["input"]
+        known = re.findall(r"'([^']*)'", context.get("expected") or context["expected_tags"])
     else:
-        told = _PLAIN.get(error["type"], (error["msg"].lower(), ""))
-        name, words = _name(names), (told[0], shorten(value), told[1], "")
-    return SceneFileError(path, name, *words)
+        return ""
+    return did_you_mean(word, (name for name in known if name != word))
 
 
-_PLAIN = {
-    "list_type": ("not a list of tables", "tables written as [[...]]"),
-    "model_attributes_type": ("not a table", "a table"),
-    "too_short": ("an empty list", "one row or more"),
-}
-
-
-def _expected(key: str, given: Any) -> str:
-    """What the table with these keys and this one needs there, in words."""
+def _keys() -> set[str]:
+    """The keys of all tables."""
     from polhode.files._table import Table
 
-    kinds, found = [Table], []
-    while kinds:
-        kind = kinds.pop()
-        kinds += kind.__subclasses__()
-        field = kind.model_fields.get(key)
-        if field is not None and field.is_required() and set(given) <= kind.model_fields.keys():
-            found.append(kind.needs(key))
-    return found[0] if found else "a value"
+    tables, keys = [Table], set()
+    while tables:
+        table = tables.pop()
+        tables += table.__subclasses__()
+        keys |= table.model_fields.keys()
+    return keys
 
 
-def _untagged(value: Any, key: str, tags: str, names: list[str]) -> tuple[str, str, str, str]:
-    """A table whose kind is missing or unknown."""
-    from polhode.files import _bodies
-    from polhode.files._values import suggestion
-
-    if not tags:
-        unions = {"potential": _bodies.Potential, "torque": _bodies.Torque}
-        tags = ", ".join(_tags(unions.get(names[0], _bodies.AnySolid), key))
-    given = value.get(key) if isinstance(value, dict) else value
-    if given is None:
-        return "missing key", f"only {', '.join(value)}", f"one of {tags}", f"add `{key} = ...`"
-    mend = suggestion(given, tags.split(", ")) if isinstance(given, str) else ""
-    return "unknown choice", shorten(given), f"one of {tags}", mend
-
-
-def _tags(union: Any, key: str) -> Iterator[str]:
-    for model in union.__origin__.__args__:
-        yield from model.model_fields[key].annotation.__args__
-
-
-def _walk(place: tuple, data: Any) -> Iterator[str]:
-    """The keys of a place in the file, rows counted from 1 (" 1"); without pydantic's own marks."""
-    for step in place:
-        if isinstance(step, int) and isinstance(data, list) and step < len(data):
-            yield f" {step + 1}"
-        elif isinstance(data, dict) and step in data:
-            yield str(step)
-        else:
-            continue
-        data = data[step]
-
-
-def _name(names: list[str]) -> str:
-    """ "[table.inner 2] key", as messages call a place; without a key for a table itself."""
+def _place(error: Any, data: Any) -> str:
+    """The place of an error as TOML calls it, such as "[state.omega_body] unit". Rows of a list
+    are counted from 1.
+    """
     path: list[str] = []
-    for name in names:
-        if name.startswith(" ") and path:
-            path[-1] += name
+    for step in error["loc"]:
+        if isinstance(step, int) and isinstance(data, list) and step < len(data):
+            if path and isinstance(data[step], dict | list):
+                path[-1] += f" {step + 1}"
+        elif isinstance(data, dict) and step in data:
+            path.append(shorten(Verbatim(step), 60))
         else:
-            path.append(name)
+            continue  # a mark of pydantic's own, such as the kind of a table
+        data = data[step]
+    if error["type"] == "missing":
+        path.append(str(error["loc"][-1]))
+    if isinstance(data, dict) and error["type"] != "extra_forbidden" and error["type"] != "missing":
+        return f"[{'.'.join(path)}]" if path else ""
     *tables, key = path or [""]
-    if not key or " " in key:
-        tables, key = [*tables, key], ""
-    where = ".".join(filter(None, tables)).replace("observations.rows ", "observations row ")
-    return " ".join(filter(None, [f"[{where}]" if where else "", key]))
+    return " ".join(filter(None, [f"[{'.'.join(tables)}]" if tables else "", key]))

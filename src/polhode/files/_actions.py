@@ -1,0 +1,261 @@
+"""Tables of a scene file that say what acts on the body: SI units."""
+
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from polhode.files import _values
+from polhode.files._bodies import Attitudes, Euler
+from polhode.files._table import Measured, Table
+from polhode.files._values import (
+    Direction,
+    Gains,
+    NotNegative,
+    Number,
+    Numbers,
+    Positive,
+    Quaternion,
+    Vector,
+)
+
+
+class Orbit(Measured):
+    """A Kepler orbit: its elements, or position and velocity at the epoch, space axes."""
+
+    measures = ("inclination", "node", "periapsis", "mean_anomaly")
+    one_of = (("semi_major_axis", "position"),)
+    mu: Positive = Field(description="m^3/s^2")
+    semi_major_axis: Number | None = Field(None, description="m; of a hyperbola negative")
+    eccentricity: NotNegative | None = Field(None, description="left out: a circle")
+    inclination: Number | None = None
+    node: Number | None = Field(None, description="longitude of the ascending node")
+    periapsis: Number | None = Field(None, description="argument of periapsis")
+    mean_anomaly: Number | None = Field(None, description="at the epoch")
+    position: Vector | None = Field(None, description="m")
+    velocity: Vector | None = Field(None, description="m/s")
+    epoch: Number = Field(0.0, description="s")
+    unit: _values.Angle = Field("rad", description="of the angles")
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> "Orbit":
+        if (self.position is None) != (self.velocity is None):
+            raise ValueError("position and velocity are given together")
+        elements = [n for n in ("eccentricity", *self.measures) if getattr(self, n) is not None]
+        if self.position is not None and elements:
+            raise ValueError(f"{elements[0]} is not used with position and velocity: remove it")
+        return self
+
+
+class UniformGravity(Table):
+    kind: Literal["uniform-gravity"]
+    mass: Number
+    centre_body: Vector
+    gravity_space: Vector | None = None
+
+
+class GravityGradient(Table):
+    """Of a centre at rest (`mu`, `position_space`), or on the [orbit] (neither of them)."""
+
+    kind: Literal["gravity-gradient"]
+    mu: Number | None = None
+    position_space: Vector | None = None
+
+    @model_validator(mode="after")
+    def _both(self) -> "GravityGradient":
+        if (self.mu is None) != (self.position_space is None):
+            raise ValueError("give both mu and position_space, or neither to follow the [orbit]")
+        return self
+
+    @property
+    def needs_orbit(self) -> bool:
+        return self.mu is None
+
+
+class Torque(Table):
+    frame: Literal["inertial", "lvlh"] = Field(
+        "inertial", description="lvlh: the torque sees attitude and rates against the [orbit]"
+    )
+
+    @property
+    def needs_orbit(self) -> bool:
+        return self.frame == "lvlh"
+
+
+class ConstantTorque(Torque):
+    kind: Literal["body", "space"]
+    n: Vector
+
+
+class LinearDamping(Torque):
+    kind: Literal["linear-damping"]
+    c: Gains
+
+
+class QuadraticDamping(Torque):
+    kind: Literal["quadratic-damping"]
+    c: Gains
+
+
+class EnergySink(Torque):
+    kind: Literal["energy-sink"]
+    k: NotNegative
+
+
+class RateDamping(Torque):
+    kind: Literal["rate-damping"]
+    c: Gains
+    rates: Vector | None = None
+
+
+class Pointing(Torque):
+    """N = -2 kp e - kd omega towards an attitude (default: not turned)."""
+
+    kind: Literal["pointing"]
+    kp: Gains
+    kd: Gains
+    wxyz: Quaternion | None = None
+    euler: Euler | None = None
+
+    @model_validator(mode="after")
+    def _one_target(self) -> "Pointing":
+        if self.wxyz is not None and self.euler is not None:
+            raise ValueError("at most one of wxyz, euler is possible: remove one of them")
+        return self
+
+    @property
+    def target(self) -> Attitudes:
+        return Attitudes(self.wxyz or [1, 0, 0, 0]) if self.euler is None else self.euler.attitude
+
+
+class BDot(Table):
+    """m = k omega x B, each component limited to `max_moment`."""
+
+    k: Number
+    max_moment: Positive | None = None
+
+
+class Magnetorquer(Torque):
+    """N = m x B, of a constant moment or the B-dot law, in a constant field or that of a dipole at
+    the centre of the [orbit].
+    """
+
+    kind: Literal["magnetorquer"]
+    one_of = (("moment_body", "b_dot"), ("field_space", "dipole_space"))
+    moment_body: Vector | None = Field(None, description="A m^2")
+    b_dot: BDot | None = None
+    field_space: Vector | None = Field(None, description="T")
+    dipole_space: Vector | None = Field(None, description="A m^2")
+
+    @property
+    def needs_orbit(self) -> bool:
+        return self.frame == "lvlh" or self.dipole_space is not None
+
+
+class Pulses(Torque):
+    """A constant torque that acts from each of `starts` to the one of `ends` in its place."""
+
+    kind: Literal["pulses"]
+    n: Vector
+    axes: Literal["body", "space"] = "body"
+    starts: Numbers
+    ends: Numbers
+
+    @model_validator(mode="after")
+    def _pairs(self) -> "Pulses":
+        if len(self.starts) != len(self.ends):
+            raise ValueError(f"{len(self.starts)} starts and {len(self.ends)} ends are no pairs")
+        for a, b in zip(self.starts, self.ends):
+            if not a < b:
+                raise ValueError(f"a pulse ends after its start, got {a} to {b}")
+        return self
+
+
+class Coulomb(Table):
+    """-torque tanh(Omega / speed) on the wheel."""
+
+    torque: NotNegative
+    speed: Positive
+
+
+class Motor(Table):
+    """A constant torque on the wheel within the limits of its motor."""
+
+    command: Number
+    max_torque: Positive | None = None
+    max_speed: Positive | None = None
+
+
+class Rotor(Table):
+    """A wheel: its momentum or speed is relative to the body."""
+
+    one_of = (("momentum", "speed"),)
+    axis_body: Direction
+    inertia: Number | None = None
+    momentum: Number | None = None
+    speed: Number | None = None
+    torque: Number | None = None
+    viscous: NotNegative | None = Field(None, description="friction of the bearing [N m s]")
+    coulomb: Coulomb | None = None
+    motor: Motor | None = None
+
+
+class Event(Measured):
+    """When a body axis crosses an angle from a direction in space, or the rate a limit."""
+
+    one_of = (("angle", "rate"),)
+    measures = ("angle", "rate")
+    name: Annotated[str, Field(pattern=r"^[A-Za-z]\w{0,30}$", max_length=31)]
+    axis_body: Direction | None = None
+    direction_space: Direction | None = None
+    angle: Positive | None = None
+    rate: Positive | None = None
+    unit: _values.Angle | _values.Rate | None = None
+    crossing: Literal["rising", "falling", "both"] = "both"
+
+    @model_validator(mode="before")
+    @classmethod
+    def _unit(cls, data: Any) -> Any:
+        if isinstance(data, Mapping) and "unit" not in data:
+            return {**data, "unit": "rad" if "angle" in data else "rad/s"}
+        return data
+
+    @model_validator(mode="after")
+    def _fits(self) -> "Event":
+        axes = [self.axis_body, self.direction_space]
+        if self.angle is not None and None in axes:
+            raise ValueError("angle needs axis_body and direction_space")
+        if self.rate is not None and axes != [None, None]:
+            raise ValueError("rate has neither axis_body nor direction_space: remove them")
+        if ("/" in str(self.unit) or self.unit == "rpm") != (self.rate is not None):
+            raise ValueError(f"the unit {self.unit!r} does not fit")
+        if self.angle is not None and not self.angle < 3.1415926535:
+            raise ValueError("angle must lie between 0 and 180 degrees, both excluded")
+        return self
+
+
+def _rows(value: Any) -> Any:
+    """One table counts as a list of one."""
+    return [value] if isinstance(value, Mapping) else value
+
+
+Potential = Annotated[UniformGravity | GravityGradient, Field(discriminator="kind")]
+AnyTorque = Annotated[
+    ConstantTorque
+    | LinearDamping
+    | QuadraticDamping
+    | EnergySink
+    | RateDamping
+    | Pointing
+    | Magnetorquer
+    | Pulses,
+    Field(discriminator="kind"),
+]
+_Potentials = Annotated[list[Potential], Field(max_length=100)]
+_Torques = Annotated[list[AnyTorque], Field(max_length=100)]
+_Rotors = Annotated[list[Rotor], Field(max_length=100)]
+Potentials = Annotated[
+    _Potentials, BeforeValidator(_rows, json_schema_input_type=Potential | _Potentials)
+]
+Torques = Annotated[_Torques, BeforeValidator(_rows, json_schema_input_type=AnyTorque | _Torques)]
+Rotors = Annotated[_Rotors, BeforeValidator(_rows, json_schema_input_type=Rotor | _Rotors)]
