@@ -123,9 +123,9 @@ def ways_of(scene: Scene, state: State, record: Record) -> Ways:
 @functools.cache
 def _stepped(upright: bool, compensated: bool) -> AbstractMethod:
     # here, so that diffrax loads with the first scene that is integrated
-    from polhode._integrate import Extrapolation, LiePoisson, LiePoissonChart
+    from polhode._integrate import Automatic, LiePoisson, LiePoissonChart
 
-    return LiePoisson(Extrapolation(None, compensated), chart=LiePoissonChart(upright))
+    return LiePoisson(Automatic(None, compensated), chart=LiePoissonChart(upright))
 
 
 def _misses(ways: Ways, state: State, rtol, ts) -> bool:

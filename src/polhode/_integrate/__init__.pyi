@@ -1,5 +1,6 @@
 """Names of the integrators, imported at first use: diffrax loads with the first of them."""
 
+from ._automatic import Automatic as Automatic
 from ._charts import (
     EulerChart as EulerChart,
     LiePoissonChart as LiePoissonChart,

@@ -12,10 +12,16 @@ from jaxtyping import Array, PyTree
 
 from polhode._batch import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._hamiltonian import Dynamics
+from polhode._integrate._automatic import Automatic
 from polhode._integrate._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
 from polhode._integrate._equal_steps import GivenTimes
-from polhode._integrate._flow_adjoint import FlowAdjoint
+from polhode._integrate._equations import equations_of
+from polhode._integrate._flow_adjoint import FlowAdjoint, path_of
+from polhode._integrate._lanes import LANES
+from polhode._integrate._loop import Wanted, solve
+from polhode._integrate._problem import Problem
 from polhode._integrate._segments import Moved, in_segments
+from polhode._integrate._step_derivative import samples
 from polhode._kernels import FEW, Distinct, kernel
 from polhode._method._base import AbstractMethod, Record, Samples
 from polhode._method._options import check_options
@@ -96,8 +102,11 @@ class AbstractIntegration(AbstractMethod):
         check = getattr(self.solver, "check", None)
         if check is not None:
             check(self, scene, record)
+        rule = self._rule(scene, state, ts, record)
         size = 1
-        if ts.ndim == 1:
+        if ts.ndim == 1 and rule is not None:
+            size = self.chunk or LANES
+        elif ts.ndim == 1:
             size = self.chunk or self._bodies_at_once(scene, state, ts, record)
         lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
 
@@ -105,6 +114,8 @@ class AbstractIntegration(AbstractMethod):
             lanes, times = chunk.value()
             scene, state = eqx.combine(lanes, shared)
             times = ts if times is None else times[0]
+            if rule is not None:
+                return self._solve_by_loop(scene, state, times, rtol, record)
             return self._solve(scene, state, times, rtol, record)
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
@@ -133,6 +144,59 @@ class AbstractIntegration(AbstractMethod):
             return diffrax.ODETerm(self.chart.field), dynamics
         known = dynamics.hamiltonian, dynamics.torque, dynamics.units
         return diffrax.ODETerm(self.chart.field_and_power), Dynamics(*known, wheels=dynamics.wheels)
+
+    def _rule(self, scene, state, ts, record: Record):
+        """Whether the loop of explicit steps moves the bodies."""
+        if not isinstance(self.solver, Automatic) or self.controller is not None:
+            return None
+        few = state.wxyz.shape[0] <= FEW_BODIES
+        if not few and not _may_jump(scene):
+            return None
+        problem = self._problem(scene, state, ts[..., :2].reshape(-1)[:2], record)
+        if problem.switches.hidden or not (few or problem.switches.count):
+            return None
+        return problem
+
+    def _problem(self, scene, state, ts, record: Record) -> Problem:
+        """The field of one body."""
+        y0, _ = self._start(scene, state, ts, record)
+
+        def pose(parts):
+            return self._posed(*parts, ts, record)
+
+        return Problem.of(pose, (scene, state), is_lane_tree((scene, state)), y0, ts[0])
+
+    def _solve_by_loop(self, scene, state, ts, rtol, record: Record) -> Samples:
+        """One chunk of lanes, by the loop of explicit steps."""
+        y0, sound = self._start(scene, state, ts, record)
+        term, dynamics = self._posed(scene, state, ts, record)
+        problem = self._problem(scene, state, ts, record)
+        leaves, tree = jax.tree.flatten(y0)
+        rtol, bodies = jax.lax.stop_gradient(rtol), leaves[0].shape[0]
+        times = ts[-1:] if record.final_only else ts
+
+        def make(arrays, told, linked):
+            units, rtol = told
+            motion = problem.motion(arrays, lambda units, y, rates: units(y, rates), units)
+            return motion, Wanted(rtol, self.max_steps, linked=linked)
+
+        told = dynamics.units, rtol
+        y = jnp.stack(leaves)
+        walk, found = solve(make, *jax.lax.stop_gradient((problem.arrays, told, ts[0], times, y)))
+        found = found.samples.reshape(bodies, times.size + 1, -1)[:, :-1]
+        if problem.switches.count:
+            found = samples(make, problem.arrays, told, y, ts[0], times, found)
+        else:
+            equations, c = equations_of(term, dynamics, y0, ts[0], rtol, False)
+            path = [jnp.moveaxis(found[..., i], 0, 1) for i in range(len(leaves))]
+            path = path_of(equations, 1, c, leaves, ts[0], times, path)
+            found = jnp.stack([jnp.moveaxis(x, 0, 1) for x in path], axis=-1)
+        seen = jax.tree.unflatten(tree, [found[..., i].T for i in range(len(leaves))])
+        last = jax.tree.map(lambda x: x[-1:], seen)
+        status = jnp.array(_OF_LOOP)[walk.ended]
+        return self._samples(
+            scene, Moved(seen, last, walk.steps, status, walk.error), ts, sound, record
+        )
 
     def _solve(self, scene, state, ts, rtol, record: Record) -> Samples:
         """One chunk of lanes."""
@@ -324,6 +388,19 @@ def _outcome(solution, shape) -> tuple[Array, Array]:
         jnp.broadcast_to(status, shape),
     )
 
+
+_OF_LOOP = (
+    Status.SUCCESSFUL,
+    Status.SUCCESSFUL,
+    Status.MAX_STEPS,
+    Status.STEP_FAILED,
+    Status.NOT_FINITE,
+    Status.SLIDING,
+    Status.SUCCESSFUL,
+)
+
+FEW_BODIES = 4
+"""Bodies up to which explicit steps take less time than extrapolation."""
 
 _ENDED = (Status.SUCCESSFUL, Status.MAX_STEPS, Status.STEP_FAILED, Status.NOT_FINITE)
 

@@ -111,12 +111,28 @@ def _any_of_all(size, batched, these):
     return any_of(these), False
 
 
-@custom_vmap
+@jax.custom_jvp
 def put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
     """``rows`` (S, C) with ``values`` (n, C) at ``places`` (n,) in S, the last of equal ones.
 
     One after another on the CPU, where a unit cannot hold a scatter. Not for reverse mode.
     """
+    return _put_each(rows, places, values)
+
+
+@put.defjvp
+def _put_jvp(primals, tangents):
+    """Of its own, for the one that JAX makes of the rule for batches mixes up what is batched."""
+    (rows, places, values), (rows_, _, values_) = primals, tangents
+    return put(rows, places, values), put(rows_, places, values_)
+
+
+@custom_vmap
+def _put_each(rows, places, values):
+    return _put(rows, places, values)
+
+
+def _put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
     if places.size == 0 or jax.default_backend() != "cpu":
         return rows.at[places].set(values)
 
@@ -127,14 +143,14 @@ def put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
     return jax.lax.fori_loop(0, places.size, one, rows)
 
 
-@put.def_vmap
+@_put_each.def_vmap
 def _put_all(size, batched, *given):
     """The rows of a batch, one after another."""
     rows, places, values = (
         x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(given, batched)
     )
     places = places + rows.shape[1] * jnp.arange(size, dtype=places.dtype)[:, None]
-    flat = put(_flat(rows), places.reshape(-1), _flat(values))
+    flat = _put(_flat(rows), places.reshape(-1), _flat(values))
     return flat.reshape(rows.shape), True
 
 
