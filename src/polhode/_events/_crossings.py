@@ -13,10 +13,10 @@ from polhode._batch import PARTS, flatten, lane_times
 from polhode._checks import is_concrete
 from polhode._events._bracketed import bracketed
 from polhode._events._event import Event, at_least
-from polhode._integrate import natural_rates
+from polhode._integrate import Search, natural_rates
 from polhode._method import Status
-from polhode._scene import Scene
-from polhode._trajectory import Trajectory, moved_through, moved_to
+from polhode._scene import Scene, State
+from polhode._trajectory import Trajectory, begun, moved_through, moved_to
 
 A_TURN = 32
 """Looks in a turn of the fastest natural rate."""
@@ -26,6 +26,9 @@ _TOO_MANY = 20_000_000
 
 _ROOM = 16
 """Least number of places where the function turns back that are looked at."""
+
+CAPACITY = 64
+"""Crossings of each body that are stored unless told otherwise."""
 
 AT_START = 1e-6
 """Part of the time between two looks within which a crossing is the start itself."""
@@ -92,6 +95,10 @@ def crossings(
         getattr(trajectory, name)  # raises where it was not recorded
     if trajectory.propagator is None:
         raise ValueError("this trajectory was made by hand: use one that ph.simulate returns.")
+    if not trajectory.propagator.method.exact:
+        found = _met(trajectory, event, room or CAPACITY)
+        if found is not None:
+            return found
     if looks is None:
         looks = _looks(trajectory)
     if room is None:
@@ -113,6 +120,37 @@ def crossings(
         used = int(np.max(found.count, initial=0))
         found = Crossings(found.times[..., :used], found.slope[..., :used], found.count)
     return found
+
+
+@eqx.filter_jit
+def _met(trajectory: Trajectory, event: Event, capacity: int) -> Crossings | None:
+    """Crossings that the steps find on their way; None where the method does not look for them."""
+    batch, propagator = trajectory.batch_shape, trajectory.propagator
+    parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
+    wxyz, omega, *spins = (x.reshape(-1, *x.shape[len(batch) :])[:, 0] for x in trajectory._samples)
+    ts = lane_times(trajectory.ts[..., jnp.array([0, -1])], batch)
+    scene = begun(Scene(**parts), spins)
+    search = Search((event.fn,), (event.direction,), (False,), capacity)
+    rtol = jnp.min(propagator.rtol)
+    found = propagator.method.search(scene, State(wxyz, omega), ts, rtol, search, True)
+    if found is None:
+        return None
+    samples, events = found
+    spins = None if samples.spins is None else samples.spins[:, 1:]
+    there = Trajectory(
+        events.rows[:, 1:], samples.wxyz[:, 1:], samples.omega_body[:, 1:], samples.status,
+        samples.steps, Scene(**parts), spins=spins, propagator=propagator,
+    )  # fmt: skip
+    times = events.rows[:, 1:]
+    use = jnp.isfinite(events.times)
+    grain = 64 * jnp.finfo(times.dtype).eps * jnp.abs(times)
+    late, there = event.polished(there, grain)
+    _, slope = event.values(there)
+    good = samples.status == Status.SUCCESSFUL
+    count = jnp.where(good, events.count, capacity + 1)
+    times = jnp.where(use, times + late, jnp.inf).reshape(*batch, capacity)
+    slope = jnp.where(use, slope, 0).reshape(*batch, capacity)
+    return Crossings(times, slope, count.reshape(batch))
 
 
 def _looks(trajectory: Trajectory) -> int:

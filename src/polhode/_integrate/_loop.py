@@ -75,7 +75,8 @@ class Wanted(NamedTuple):
 
     ``rtol``: sum of the errors of the steps [rad]; ``max_steps``: of each body; ``capacity``:
     events stored for each body; ``directions``: of each event 1, -1 or 0 for both;
-    ``terminal``: whether a body stops at each; ``linked``: whether the place of a switch is to have derivatives.
+    ``terminal``: whether a body stops at each; ``linked``: whether the place of a switch is to have
+    derivatives.
     """
 
     rtol: Array
@@ -94,7 +95,7 @@ class Walk(NamedTuple):
     worked out; ``width``: of the next step [s]; ``before``: logarithm of the last error over what
     was allowed; ``turned``: angle so far [rad]; ``error``: sum of estimated errors; ``steps``,
     ``tried``; ``margin``: at ``y``; ``turns``: switches turned; ``back``: switches in sequence that
-    turned back at once; ``place``: of the next sample; ``count``: of events; ``ended``: see ``Ended``.
+    turned back at once; ``place``: of the next sample; ``count``: of events; ``ended``: 0 or why.
     """
 
     gone: Array
@@ -160,17 +161,21 @@ and ``rtol``), and what is wanted."""
 
 
 def solve(make: Make, arrays: Any, told: Any, start: Array, ts: Array, y: Array):
-    """From ``y`` (D, B) at the time ``start`` () through ``ts`` (T,), as one compiled unit."""
+    """From ``y`` (D, B) at ``start`` () or (B,) through ``ts`` (T,) or (B, T), as one unit."""
     motion, wanted = make(arrays, told, False)
     bodies = y.shape[1]
 
     def moved(held, known, told, rtol, start, ts, y):
         now = motion._replace(held=held, known=known, told=told)
-        starts = jnp.broadcast_to(start, (bodies,))
-        rows = jnp.broadcast_to(ts[:, None], (ts.size, bodies))
-        return run(now, wanted._replace(rtol=rtol), starts, rows, y)
+        return run(now, wanted._replace(rtol=rtol), *each_body(start, ts, bodies), y)
 
     return kernel(moved)(motion.held, motion.known, motion.told, wanted.rtol, start, ts, y)
+
+
+def each_body(start: Array, ts: Array, bodies: int) -> tuple[Array, Array]:
+    """``start`` () or (B,) and ``ts`` (T,) or (B, T) as (B,) and (T, B)."""
+    rows = ts[:, None] if ts.ndim == 1 else ts.T
+    return jnp.broadcast_to(start, (bodies,)), jnp.broadcast_to(rows, (rows.shape[0], bodies))
 
 
 def begin(motion: Motion, wanted: Wanted, start: Array, ts: Array, y: Array) -> tuple[Walk, Rows]:
@@ -545,7 +550,7 @@ def _turned(motion, wanted, walk, now, rows, tried, turn: Turn, wrong, good, wid
     sign = jnp.where(tried.h < 0, -1, 1)
     base = (capacity + 1) * jnp.arange(bodies, dtype=now.count.dtype)
     count, stopped = now.count, jnp.zeros_like(hit)
-    first = now.gone <= 1e-9 * jnp.abs(width)
+    first = now.gone <= 1e-6 * jnp.abs(width)  # where the motion comes from
     for k in range(motion.watched):
         row = motion.switches - motion.watched + k
         rises = jnp.where(turn.levels[row] > 0, 1, -1) * sign

@@ -31,6 +31,7 @@ from polhode._integrate._loop import (
     column,
     dense_of,
     dense_state,
+    each_body,
     run,
     weighted,
 )
@@ -41,8 +42,8 @@ KEPT = 128
 
 
 def samples(make: Make, arrays, told, y, start, ts, found) -> Array:
-    """``found`` (B, T, D), samples at ``ts`` (T,) of the motion from ``y`` (D, B) at ``start``,
-    with their derivatives."""
+    """``found`` (B, T, D), samples at ``ts`` (T,) or (B, T) of the motion from ``y`` (D, B) at
+    ``start`` () or (B,), with their derivatives. Times of one body may stand in any order."""
     leaves, tree = jax.tree.flatten(told)
     size, extra = len(arrays), len(leaves)
 
@@ -54,10 +55,11 @@ def samples(make: Make, arrays, told, y, start, ts, found) -> Array:
         *fixed, y, start, ts = operands
         *more, dy, dstart, dts = tangents
         motion, _ = opened(fixed)
+        starts, rows = each_body(start, ts, y.shape[1])
         at = [i for i, x in enumerate(more[:size]) if is_slope(x)]
         dy = dy if is_slope(dy) else zeros(dy)
         if is_slope(dstart):
-            dy = dy - dstart * _rates(motion, start[None], y[None])[0]
+            dy = dy - dstart * _rates(motion, starts[None], y[None])[0]
         change = linear(
             lambda given, moved: _tangent(opened, at, given, moved),
             lambda given, slopes: _cotangent(opened, at, given, slopes[0]),
@@ -66,28 +68,31 @@ def samples(make: Make, arrays, told, y, start, ts, found) -> Array:
             values,
         )
         if is_slope(dts):
-            rate = _rates(motion, ts, jnp.moveaxis(values[0], 0, -1))
-            change = [change[0] + jnp.moveaxis(dts[:, None, None] * rate, -1, 0)]
+            rate = _rates(motion, rows, jnp.moveaxis(values[0], 0, -1))
+            late = each_body(start, dts, y.shape[1])[1]
+            change = [change[0] + jnp.moveaxis(late[:, None] * rate, -1, 0)]
         return change
 
+    order = None
+    if ts.ndim > 1:
+        sign = jnp.where(ts[:, -1:] < jnp.reshape(start, (-1, 1)), -1, 1).astype(ts.dtype)
+        order = jnp.argsort(jax.lax.stop_gradient(sign * ts), axis=1)
+        ts = jnp.take_along_axis(ts, order, axis=1)
+        found = jnp.take_along_axis(found, order[..., None], axis=1)
     (found,) = attached(rule, [*arrays, *leaves, y, start, ts], [found])
-    return found
+    if order is None:
+        return found
+    return jnp.take_along_axis(found, jnp.argsort(order, axis=1)[..., None], axis=1)
 
 
 def _rates(motion: Motion, ts: Array, states: Array) -> Array:
-    """Rates (T, D, B) at states (T, D, B)."""
+    """Rates (T, D, B) at times (T, B) and states (T, D, B)."""
 
     def one(given):
         t, y = given
-        t = jnp.broadcast_to(t, y.shape[1:])
         return motion.rates(motion.held, motion.levels(motion.known, t, y), t, y)[0]
 
     return jax.lax.map(one, (ts, states))
-
-
-def _times(start: Array, ts: Array, y: Array) -> tuple[Array, Array]:
-    bodies = y.shape[1]
-    return jnp.broadcast_to(start, (bodies,)), jnp.broadcast_to(ts[:, None], (ts.size, bodies))
 
 
 def _tangent(opened, at, given, moved):
@@ -100,8 +105,8 @@ def _tangent(opened, at, given, moved):
         for i, x in zip(at, some):
             full[i] = x
         motion, wanted = opened(full, True)
-        _, rows = run(motion, wanted, *_times(start, ts, y), y)
-        return rows.samples.reshape(y.shape[1], ts.size + 1, -1)[:, :-1]
+        _, rows = run(motion, wanted, *each_body(start, ts, y.shape[1]), y)
+        return rows.samples.reshape(y.shape[1], ts.shape[-1] + 1, -1)[:, :-1]
 
     return [jax.jvp(path, (y, *(arrays[i] for i in at)), (dy, *some))[1]]
 
@@ -121,7 +126,7 @@ class _Note(NamedTuple):
 def _cotangent(opened, at, given, slopes):
     """Slopes by the state at the start and by ``arrays[i]``, i in ``at``."""
     *arrays, y, start, ts = given
-    start, times = _times(start, ts, y)
+    start, times = each_body(start, ts, y.shape[1])
     slopes = jnp.moveaxis(slopes, 0, -1)  # (T, D, B)
     chosen = [arrays[i] for i in at]
 

@@ -20,6 +20,7 @@ from polhode._integrate._flow_adjoint import FlowAdjoint, path_of
 from polhode._integrate._lanes import LANES
 from polhode._integrate._loop import Wanted, solve
 from polhode._integrate._problem import Problem
+from polhode._integrate._search import Found, Search, with_events
 from polhode._integrate._segments import Moved, in_segments
 from polhode._integrate._step_derivative import samples
 from polhode._kernels import FEW, Distinct, kernel
@@ -102,11 +103,10 @@ class AbstractIntegration(AbstractMethod):
         check = getattr(self.solver, "check", None)
         if check is not None:
             check(self, scene, record)
-        rule = self._rule(scene, state, ts, record)
+        if self._by_loop(scene, state, ts, record):
+            return self._run_by_loop(scene, state, ts, rtol, record)[0]
         size = 1
-        if ts.ndim == 1 and rule is not None:
-            size = self.chunk or LANES
-        elif ts.ndim == 1:
+        if ts.ndim == 1:
             size = self.chunk or self._bodies_at_once(scene, state, ts, record)
         lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
 
@@ -114,8 +114,6 @@ class AbstractIntegration(AbstractMethod):
             lanes, times = chunk.value()
             scene, state = eqx.combine(lanes, shared)
             times = ts if times is None else times[0]
-            if rule is not None:
-                return self._solve_by_loop(scene, state, times, rtol, record)
             return self._solve(scene, state, times, rtol, record)
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
@@ -145,66 +143,118 @@ class AbstractIntegration(AbstractMethod):
         known = dynamics.hamiltonian, dynamics.torque, dynamics.units
         return diffrax.ODETerm(self.chart.field_and_power), Dynamics(*known, wheels=dynamics.wheels)
 
-    def _rule(self, scene, state, ts, record: Record):
-        """Whether the loop of explicit steps moves the bodies."""
-        if not isinstance(self.solver, Automatic) or self.controller is not None:
-            return None
-        few = state.wxyz.shape[0] <= FEW_BODIES
-        if not few and not _may_jump(scene):
-            return None
-        problem = self._problem(scene, state, ts[..., :2].reshape(-1)[:2], record)
-        if problem.switches.hidden or not (few or problem.switches.count):
-            return None
-        return problem
+    def _run_by_loop(
+        self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record,
+        search: Search | None = None,
+    ) -> tuple[Samples, Found | None]:  # fmt: skip
+        lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
 
-    def _problem(self, scene, state, ts, record: Record) -> Problem:
-        """The field of one body."""
+        def one(chunk):
+            lanes, times = chunk.value()
+            scene, state = eqx.combine(lanes, shared)
+            times = ts if times is None else times
+            return self._solve_by_loop(scene, state, times, rtol, record, search)
+
+        n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
+        whole = kernel(one, of_units=True) if n <= FEW else one
+        return map_chunks(whole, Distinct((lanes, times)), n, self.chunk or LANES)
+
+    def search(
+        self, scene: Scene, state: State, ts: Array, rtol: Array, search: Search, final_only: bool
+    ) -> tuple[Samples, Found] | None:
+        """Samples at ``ts`` and then at the events that are met, of which ``Found`` tells more;
+        None where this method cannot look for events on its way."""
+        record = Record(final_only=final_only)
+        if not self._is_automatic:
+            return None
+        if self._problem(scene, state, ts, record, search).switches.hidden:
+            return None
+        samples, found = self._run_by_loop(scene, state, ts, rtol, record, search)
+        assert found is not None
+        return samples, found
+
+    @property
+    def _is_automatic(self) -> bool:
+        return isinstance(self.solver, Automatic) and self.controller is None
+
+    def _by_loop(self, scene, state, ts, record: Record) -> bool:
+        """Whether the loop of explicit steps moves the bodies."""
+        few = state.wxyz.shape[0] <= FEW_BODIES
+        if not self._is_automatic or not (few or _may_jump(scene)):
+            return False
+        switches = self._problem(scene, state, ts, record).switches
+        return not switches.hidden and (few or switches.count > 0)
+
+    def _problem(self, scene, state, ts, record: Record, search: Search | None = None) -> Problem:
+        """The field of one body, and the events that are searched for."""
         y0, _ = self._start(scene, state, ts, record)
+
+        def watch(parts, t, y):
+            scene, _ = parts
+            later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
+            y = jax.tree.map(lambda x: x[:, None], tuple(y))
+            wxyz, omega, _ = self.chart.finish(later, y, jnp.reshape(t, (1, 1)))
+            return jnp.stack([fn(wxyz[0, 0], omega[0, 0], t) for fn in search.fns])
 
         def pose(parts):
             return self._posed(*parts, ts, record)
 
-        return Problem.of(pose, (scene, state), is_lane_tree((scene, state)), y0, ts[0])
+        masks = is_lane_tree((scene, state))
+        seen = None if search is None else watch
+        return Problem.of(pose, (scene, state), masks, y0, ts.reshape(-1)[0], seen)
 
-    def _solve_by_loop(self, scene, state, ts, rtol, record: Record) -> Samples:
-        """One chunk of lanes, by the loop of explicit steps."""
+    def _solve_by_loop(
+        self, scene, state, ts, rtol, record: Record, search: Search | None = None
+    ) -> tuple[Samples, Found | None]:
+        """One chunk of lanes, by the loop of explicit steps; ``ts`` (T,) or (N, T)."""
         y0, sound = self._start(scene, state, ts, record)
         term, dynamics = self._posed(scene, state, ts, record)
         problem = self._problem(scene, state, ts, record)
+        watched = problem if search is None else self._problem(scene, state, ts, record, search)
         leaves, tree = jax.tree.flatten(y0)
         rtol, bodies = jax.lax.stop_gradient(rtol), leaves[0].shape[0]
-        times = ts[-1:] if record.final_only else ts
+        times = ts[..., -1:] if record.final_only else ts
+        told, start, y = (dynamics.units, rtol), ts[..., 0], jnp.stack(leaves)
 
         def make(arrays, told, linked):
             units, rtol = told
-            motion = problem.motion(arrays, lambda units, y, rates: units(y, rates), units)
+            motion = problem.motion(arrays, _by_units, units)
             return motion, Wanted(rtol, self.max_steps, linked=linked)
 
-        told = dynamics.units, rtol
-        y = jnp.stack(leaves)
-        walk, found = solve(make, *jax.lax.stop_gradient((problem.arrays, told, ts[0], times, y)))
-        found = found.samples.reshape(bodies, times.size + 1, -1)[:, :-1]
-        if problem.switches.count:
-            found = samples(make, problem.arrays, told, y, ts[0], times, found)
+        def make_watched(arrays, told, linked):
+            units, rtol = told
+            motion, asked = watched.motion(arrays, _by_units, units), search or Search()
+            return motion, Wanted(
+                rtol, self.max_steps, asked.capacity, asked.directions, asked.terminal, linked
+            )
+
+        given = jax.lax.stop_gradient((watched.arrays, told, start, times, y))
+        walk, rows = solve(make_watched, *given)
+        states = rows.samples.reshape(bodies, -1, len(leaves))[:, :-1]
+        found = None
+        if search is not None:
+            found, times, states = with_events(search, walk, rows, times, states)
+        if problem.switches.count or times.ndim > 1:
+            states = samples(make, problem.arrays, told, y, start, times, states)
         else:
-            equations, c = equations_of(term, dynamics, y0, ts[0], rtol, False)
-            path = [jnp.moveaxis(found[..., i], 0, 1) for i in range(len(leaves))]
-            path = path_of(equations, 1, c, leaves, ts[0], times, path)
-            found = jnp.stack([jnp.moveaxis(x, 0, 1) for x in path], axis=-1)
-        seen = jax.tree.unflatten(tree, [found[..., i].T for i in range(len(leaves))])
+            equations, c = equations_of(term, dynamics, y0, start, rtol, False)
+            path = [jnp.moveaxis(states[..., i], 0, 1) for i in range(len(leaves))]
+            path = path_of(equations, 1, c, leaves, start, times, path)
+            states = jnp.stack([jnp.moveaxis(x, 0, 1) for x in path], axis=-1)
+        seen = jax.tree.unflatten(tree, [states[..., i].T for i in range(len(leaves))])
         last = jax.tree.map(lambda x: x[-1:], seen)
         status = jnp.array(_OF_LOOP)[walk.ended]
-        return self._samples(
-            scene, Moved(seen, last, walk.steps, status, walk.error), ts, sound, record
-        )
+        moved = Moved(seen, last, walk.steps, status, walk.error)
+        return self._samples(scene, moved, times, sound, record), found
 
     def _solve(self, scene, state, ts, rtol, record: Record) -> Samples:
         """One chunk of lanes."""
         y0, sound = self._start(scene, state, ts, record)
+        kept = ts[-1:] if record.final_only else ts
         edges = None if scene.torque is None else scene.torque.edges
         if edges is None:
             found = self._moved(scene, state, y0, ts, rtol, record)
-            return self._samples(scene, found, ts, sound, record)
+            return self._samples(scene, found, kept, sound, record)
 
         def move(middle, y, times, parts):
             torque = scene.torque.during(middle)
@@ -213,7 +263,7 @@ class AbstractIntegration(AbstractMethod):
             return self._moved(now, state, y, times, share, record)
 
         found = in_segments(move, y0, ts, edges, record.final_only)
-        return self._samples(scene, found, ts, sound, record)
+        return self._samples(scene, found, kept, sound, record)
 
     def _moved(self, scene, state, y0, ts, rtol, record) -> Moved:
         """States from ``y0`` on."""
@@ -245,7 +295,8 @@ class AbstractIntegration(AbstractMethod):
         steps, status = _outcome(solution, y0[0][0].shape)
         return Moved(samples, last, steps, status, error)
 
-    def _samples(self, scene, found: Moved, ts, sound, record: Record) -> Samples:
+    def _samples(self, scene, found: Moved, kept, sound, record: Record) -> Samples:
+        """``kept``: times of the samples (T,) or (N, T)."""
         samples, last = (_lanes_first(y) for y in (found.samples, found.last))
         dynamics = scene.dynamics
         work, motors, spins = None, None, None
@@ -256,9 +307,9 @@ class AbstractIntegration(AbstractMethod):
         if dynamics.coupled:
             spins = jnp.stack(samples[2], axis=-1)
         later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
-        kept = ts[-1:] if record.final_only else ts
-        wxyz, omega, _ = self.chart.finish(later, tuple(samples), kept[None])
-        *_, sound_at_end = self.chart.finish(later, tuple(last), ts[None, -1:])
+        kept = jnp.atleast_2d(kept)
+        wxyz, omega, _ = self.chart.finish(later, tuple(samples), kept)
+        *_, sound_at_end = self.chart.finish(later, tuple(last), kept[:, -1:])
         wxyz, omega = (jnp.where(sound[:, None, None], x, jnp.nan) for x in (wxyz, omega))
         taken, unfinished = found.steps, found.status
         finite = jnp.all(jnp.isfinite(wxyz), axis=(-1, -2))
@@ -336,6 +387,10 @@ class _Asked(NamedTuple):
     def _saved(self, samples) -> diffrax.SaveAt:
         last = diffrax.SubSaveAt(t1=True)
         return diffrax.SaveAt(subs=[last if self.final_only else samples, last])
+
+
+def _by_units(units, y, rates):
+    return units(y, rates)
 
 
 class LaneNorm(eqx.Module):
