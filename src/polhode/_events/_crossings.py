@@ -144,7 +144,7 @@ def _met(trajectory: Trajectory, event: Event, capacity: int) -> Crossings | Non
     times = events.rows[:, 1:]
     use = jnp.isfinite(events.times)
     grain = 64 * jnp.finfo(times.dtype).eps * jnp.abs(times)
-    late, there = event.polished(there, grain)
+    late, there = event.mended(there, grain)
     _, slope = event.values(there)
     good = samples.status == Status.SUCCESSFUL
     count = jnp.where(good, events.count, capacity + 1)

@@ -86,7 +86,7 @@ def _held_by_loop(lanes: Trajectory, ts: Array, until: Event):
         lanes.scene, spins=spins[0][:, -1:] if spins else None, propagator=propagator,
     )  # fmt: skip
     grain = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(near._t)
-    late, at_event = until.polished(near, grain)
+    late, at_event = until.mended(near, grain)
     event = near._t + late
     rows = jnp.broadcast_to(ts, (met.size, ts.shape[-1]))
     sign = jnp.where(rows[:, -1:] < rows[:, :1], -1, 1).astype(ts.dtype)

@@ -183,15 +183,12 @@ def begin(motion: Motion, wanted: Wanted, start: Array, ts: Array, y: Array) -> 
     zero = jnp.zeros_like(y[0])
     none = jnp.zeros(zero.shape, jnp.int32)
     levels = motion.levels(motion.known, start, y)
-    rate, margin, _ = motion.rates(motion.held, levels, start, y)
-    _, pace = motion.units(motion.told, list(y), list(rate))
-    length = jnp.abs(ts[-1] - start)
-    guess = 4 * wanted.rtol.astype(y.dtype) ** (1 / ORDER) / jnp.maximum(pace, 1 / length)
-    guess = jax.lax.stop_gradient(guess)
+    unknown = jnp.zeros_like(levels)
+    # the first turn, of no width, finds the rates
     walk = Walk(
-        gone=zero, y=y, rate=rate, levels=levels, margin=margin, lately=jnp.zeros_like(levels),
-        fresh=zero > 1, width=guess, before=zero, turned=zero, error=zero, steps=none, tried=none,
-        turns=none, back=none, place=none, count=none, ended=none,
+        gone=zero, y=y, rate=jnp.zeros_like(y), levels=levels, margin=unknown, lately=unknown,
+        fresh=jnp.ones_like(none, bool), width=zero, before=zero, turned=zero, error=zero,
+        steps=none, tried=none, turns=none, back=none, place=none, count=none, ended=none,
     )  # fmt: skip
     dtype, bodies = y.dtype, y.shape[1]
     samples = jnp.full((bodies * (ts.shape[0] + 1), y.shape[0]), jnp.nan, dtype)
@@ -217,11 +214,12 @@ def advance(motion: Motion, wanted: Wanted, start: Array, ts: Array, walk: Walk,
     tried = attempt(motion, walk, t, h, asked)
     error, allowed, angle = still(_judged(motion, wanted, walk, tried, width, length, eps))
     ratio = error / allowed
-    good = (ratio <= 1) & alive
+    begins = walk.tried == 0
+    good = (ratio <= 1) & alive & ~begins
     end = dense_state(walk.y, tried.dense, jnp.ones_like(width))
     turn = None
     if motion.switches:
-        wrong = walk.fresh[None] & (tried.margins[0] < 0) & (walk.lately == 0)
+        wrong = walk.fresh[None] & (tried.margins[0] < 0) & (walk.lately == 0) & ~begins[None]
         good = good & ~jnp.any(wrong, axis=0)
         turn = _search(motion, wanted, walk, tried, t, good, eps)
     hit = jnp.zeros_like(good) if turn is None else turn.hit
@@ -234,6 +232,8 @@ def advance(motion: Motion, wanted: Wanted, start: Array, ts: Array, walk: Walk,
     factor = jnp.clip(factor, jnp.where(good, 0.2, 0.1), jnp.where(good, 5, 0.9))
     cut = good & (width < 0.999 * walk.width)
     proposed = jnp.where(cut, jnp.maximum(walk.width, width * factor), width * factor)
+    guess = still(_first_width(motion, wanted, walk.y, tried.stages[0], length))
+    proposed = jnp.where(begins, guess, proposed)
     rows, place = _save(tried, walk, rows, ts, start, jnp.where(good, gone, -1), width)
 
     def pick(a, b):
@@ -259,6 +259,11 @@ def advance(motion: Motion, wanted: Wanted, start: Array, ts: Array, walk: Walk,
     if turn is not None:
         now, rows = _turned(motion, wanted, walk, now, rows, tried, turn, wrong, good, width, start)
     return now._replace(ended=_ended(wanted, now, alive, length, ratio, eps)), rows
+
+
+def _first_width(motion: Motion, wanted: Wanted, y: Array, rate: Array, length: Array) -> Array:
+    _, pace = motion.units(motion.told, list(y), list(rate))
+    return 4 * wanted.rtol.astype(y.dtype) ** (1 / ORDER) / jnp.maximum(pace, 1 / length)
 
 
 def _width(walk: Walk, length: Array, alive: Array, eps: float) -> tuple[Array, Array]:

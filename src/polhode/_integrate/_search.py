@@ -18,6 +18,11 @@ class Search(NamedTuple):
     terminal: tuple[bool, ...] = ()
     capacity: int = 0
 
+    @property
+    def passing(self) -> "Search":
+        """The same events, none of which is stored or ends the motion."""
+        return Search(self.fns, self.directions, (False,) * len(self.fns), 0)
+
 
 class Found(NamedTuple):
     """Events of N bodies in the order of the motion: ``times`` (N, E) [s], inf where there is none,

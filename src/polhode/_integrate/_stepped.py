@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -103,8 +104,10 @@ class AbstractIntegration(AbstractMethod):
         check = getattr(self.solver, "check", None)
         if check is not None:
             check(self, scene, record)
-        if self._by_loop(scene, state, ts, record):
-            return self._run_by_loop(scene, state, ts, rtol, record)[0]
+        if self._is_automatic and self._suits_loop(scene, state, ts, record):
+            found = self._run_by_loop(scene, state, ts, rtol, record)
+            if found is not None:
+                return found[0]
         size = 1
         if ts.ndim == 1:
             size = self.chunk or self._bodies_at_once(scene, state, ts, record)
@@ -146,7 +149,8 @@ class AbstractIntegration(AbstractMethod):
     def _run_by_loop(
         self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record,
         search: Search | None = None,
-    ) -> tuple[Samples, Found | None]:  # fmt: skip
+    ) -> Any:  # fmt: skip
+        """None where switches may be hidden from it."""
         lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
 
         def one(chunk):
@@ -164,26 +168,20 @@ class AbstractIntegration(AbstractMethod):
     ) -> tuple[Samples, Found] | None:
         """Samples at ``ts`` and then at the events that are met, of which ``Found`` tells more;
         None where this method cannot look for events on its way."""
-        record = Record(final_only=final_only)
         if not self._is_automatic:
             return None
-        if self._problem(scene, state, ts, record, search).switches.hidden:
-            return None
-        samples, found = self._run_by_loop(scene, state, ts, rtol, record, search)
-        assert found is not None
-        return samples, found
+        record = Record(final_only=final_only)
+        return self._run_by_loop(scene, state, ts, rtol, record, search)
 
     @property
     def _is_automatic(self) -> bool:
         return isinstance(self.solver, Automatic) and self.controller is None
 
-    def _by_loop(self, scene, state, ts, record: Record) -> bool:
-        """Whether the loop of explicit steps moves the bodies."""
-        few = state.wxyz.shape[0] <= FEW_BODIES
-        if not self._is_automatic or not (few or _may_jump(scene)):
-            return False
-        switches = self._problem(scene, state, ts, record).switches
-        return not switches.hidden and (few or switches.count > 0)
+    def _suits_loop(self, scene, state, ts, record: Record) -> bool:
+        """Whether explicit steps are the faster ones, or the only ones that end at switches."""
+        if state.wxyz.shape[0] <= FEW_BODIES:
+            return True
+        return _may_jump(scene) and self._problem(scene, state, ts, record).switches.count > 0
 
     def _problem(self, scene, state, ts, record: Record, search: Search | None = None) -> Problem:
         """The field of one body, and the events that are searched for."""
@@ -205,31 +203,29 @@ class AbstractIntegration(AbstractMethod):
 
     def _solve_by_loop(
         self, scene, state, ts, rtol, record: Record, search: Search | None = None
-    ) -> tuple[Samples, Found | None]:
+    ) -> tuple[Samples, Found | None] | None:
         """One chunk of lanes, by the loop of explicit steps; ``ts`` (T,) or (N, T)."""
         y0, sound = self._start(scene, state, ts, record)
         term, dynamics = self._posed(scene, state, ts, record)
-        problem = self._problem(scene, state, ts, record)
-        watched = problem if search is None else self._problem(scene, state, ts, record, search)
+        problem = self._problem(scene, state, ts, record, search)
+        if problem.switches.hidden:
+            return None
         leaves, tree = jax.tree.flatten(y0)
         rtol, bodies = jax.lax.stop_gradient(rtol), leaves[0].shape[0]
         times = ts[..., -1:] if record.final_only else ts
         told, start, y = (dynamics.units, rtol), ts[..., 0], jnp.stack(leaves)
+        asked = Search() if search is None else search
+        passing = asked.passing
 
-        def make(arrays, told, linked):
+        def make(arrays, told, linked, asked=passing):
             units, rtol = told
             motion = problem.motion(arrays, _by_units, units)
-            return motion, Wanted(rtol, self.max_steps, linked=linked)
-
-        def make_watched(arrays, told, linked):
-            units, rtol = told
-            motion, asked = watched.motion(arrays, _by_units, units), search or Search()
             return motion, Wanted(
                 rtol, self.max_steps, asked.capacity, asked.directions, asked.terminal, linked
             )
 
-        given = jax.lax.stop_gradient((watched.arrays, told, start, times, y))
-        walk, rows = solve(make_watched, *given)
+        given = jax.lax.stop_gradient((problem.arrays, told, start, times, y))
+        walk, rows = solve(partial(make, asked=asked), *given)
         states = rows.samples.reshape(bodies, -1, len(leaves))[:, :-1]
         found = None
         if search is not None:
