@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 from polhode._integrate._dop853 import DENSE, DENSE_STAGES, ERROR_3, ERROR_5, NODES, STAGES, WEIGHTS
 from polhode._integrate._units import weighted_length
-from polhode._kernels import any_of, kernel, put
+from polhode._kernels import FEW, any_of, kernel, put
 
 SHARE = 0.6
 """Part of the tolerance that the estimated errors of the steps may add up to."""
@@ -160,16 +160,34 @@ Make = Callable[..., tuple[Motion, Wanted]]
 and ``rtol``), and what is wanted."""
 
 
-def solve(make: Make, arrays: Any, told: Any, start: Array, ts: Array, y: Array):
-    """From ``y`` (D, B) at ``start`` () or (B,) through ``ts`` (T,) or (B, T), as one unit."""
+class Solved(NamedTuple):
+    """Outcome of B bodies: see ``Walk`` and ``Rows``; of events None where none is stored."""
+
+    steps: Array
+    ended: Array
+    error: Array
+    count: Array | None
+    samples: Array
+    times: Array | None
+    which: Array | None
+    states: Array | None
+
+
+def solve(make: Make, arrays: Any, told: Any, start: Array, ts: Array, y: Array) -> Solved:
+    """From ``y`` (D, B) at ``start`` () or (B,) through ``ts`` (T,) or (B, T)."""
     motion, wanted = make(arrays, told, False)
     bodies = y.shape[1]
 
     def moved(held, known, told, rtol, start, ts, y):
         now = motion._replace(held=held, known=known, told=told)
-        return run(now, wanted._replace(rtol=rtol), *each_body(start, ts, bodies), y)
+        walk, rows = run(now, wanted._replace(rtol=rtol), *each_body(start, ts, bodies), y)
+        none = (None,) * 4
+        count, *events = (walk.count, *rows[1:]) if wanted.capacity else none
+        return Solved(walk.steps, walk.ended, walk.error, count, rows.samples, *events)
 
-    return kernel(moved)(motion.held, motion.known, motion.told, wanted.rtol, start, ts, y)
+    # of many bodies a unit compiles four times as long, and is no faster
+    moved = kernel(moved) if bodies <= FEW else moved
+    return moved(motion.held, motion.known, motion.told, wanted.rtol, start, ts, y)
 
 
 def each_body(start: Array, ts: Array, bodies: int) -> tuple[Array, Array]:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode._integrate._loop import STOPPED, Rows, Walk
+from polhode._integrate._loop import STOPPED, Solved
 
 
 class Search(NamedTuple):
@@ -34,18 +34,18 @@ class Found(NamedTuple):
     rows: Array
 
 
-def with_events(search: Search, walk: Walk, rows: Rows, times: Array, states: Array):
+def with_events(search: Search, solved: Solved, times: Array, states: Array):
     """The events, and times (N, T + E) and states (N, T + E, D) of samples and events; samples
     beyond a terminal event are that event."""
-    bodies, capacity = walk.count.shape[0], search.capacity
-    at = rows.times.reshape(bodies, capacity + 1)[:, :-1]
-    there = rows.states.reshape(bodies, capacity + 1, -1)[:, :-1]
-    which = rows.which.reshape(bodies, capacity + 1)[:, :-1].astype(jnp.int32)
+    bodies, capacity = solved.count.shape[0], search.capacity
+    at = solved.times.reshape(bodies, capacity + 1)[:, :-1]
+    there = solved.states.reshape(bodies, capacity + 1, -1)[:, :-1]
+    which = solved.which.reshape(bodies, capacity + 1)[:, :-1].astype(jnp.int32)
     times = jnp.broadcast_to(jnp.atleast_2d(times), states.shape[:2])
     met = jnp.isfinite(at)
     if any(search.terminal):
         sign = jnp.where(times[:, -1:] < times[:, :1], -1, 1).astype(times.dtype)
-        end = jnp.where(walk.ended == STOPPED, walk.count, capacity + 1)
+        end = jnp.where(solved.ended == STOPPED, solved.count, capacity + 1)
         stop = jnp.arange(1, capacity + 1, dtype=end.dtype)[None] == end[:, None]
         final = jnp.sum(jnp.where(stop, at, 0), axis=1, keepdims=True)
         state = jnp.sum(jnp.where(stop[..., None], there, 0), axis=1, keepdims=True)
@@ -56,4 +56,4 @@ def with_events(search: Search, walk: Walk, rows: Rows, times: Array, states: Ar
     there = jnp.where(met[..., None], there, states[:, -1:])
     times = jnp.concatenate([times, at_events], axis=1)
     states = jnp.concatenate([states, there], axis=1)
-    return Found(at, which, walk.count, times), times, states
+    return Found(at, which, solved.count, times), times, states

@@ -77,6 +77,29 @@ class AbstractIntegration(AbstractMethod):
         coordinates = type(self.chart).__name__.removesuffix("Chart")
         return f"{coordinates}({type(self.solver).__name__})"
 
+    def steps_of(self, scene: Scene, state: State, ts: Array, record: Record) -> str:
+        """The steps that the bodies of a scene are moved by, in words."""
+        if not self._is_automatic:
+            return f"steps of {type(self.solver).__name__}"
+        few, switches, hidden = state.wxyz.shape[0] <= FEW_BODIES, 0, ()
+        if few or _may_jump(scene):
+            found: list[Any] = []
+
+            def look(scene, state, ts):
+                found.append(self._problem(scene, state, ts, record).switches)
+
+            eqx.filter_eval_shape(look, scene, state, ts)
+            switches, hidden = found[0].count, found[0].hidden
+        if hidden:
+            return (
+                "extrapolated midpoint rule, searched for jumps: the torque contains"
+                f" {', '.join(hidden)}, in which the places of kinks cannot be found"
+            )
+        if few or switches:
+            ends = f", each ending where one of {switches} switches (clip, where, ...) turns"
+            return "explicit Runge-Kutta steps of order 8" + (ends if switches else "")
+        return "extrapolated midpoint rule"
+
     @property
     def keeps_rtol(self) -> bool:
         """Whether the steps follow from ``rtol``."""
@@ -225,11 +248,11 @@ class AbstractIntegration(AbstractMethod):
             )
 
         given = jax.lax.stop_gradient((problem.arrays, told, start, times, y))
-        walk, rows = solve(partial(make, asked=asked), *given)
-        states = rows.samples.reshape(bodies, -1, len(leaves))[:, :-1]
+        solved = solve(partial(make, asked=asked), *given)
+        states = solved.samples.reshape(bodies, -1, len(leaves))[:, :-1]
         found = None
         if search is not None:
-            found, times, states = with_events(search, walk, rows, times, states)
+            found, times, states = with_events(search, solved, times, states)
         if problem.switches.count or times.ndim > 1:
             states = samples(make, problem.arrays, told, y, start, times, states)
         else:
@@ -239,8 +262,8 @@ class AbstractIntegration(AbstractMethod):
             states = jnp.stack([jnp.moveaxis(x, 0, 1) for x in path], axis=-1)
         seen = jax.tree.unflatten(tree, [states[..., i].T for i in range(len(leaves))])
         last = jax.tree.map(lambda x: x[-1:], seen)
-        status = jnp.array(_OF_LOOP)[walk.ended]
-        moved = Moved(seen, last, walk.steps, status, walk.error)
+        status = jnp.array(_OF_LOOP)[solved.ended]
+        moved = Moved(seen, last, solved.steps, status, solved.error)
         return self._samples(scene, moved, times, sound, record), found
 
     def _solve(self, scene, state, ts, rtol, record: Record) -> Samples:

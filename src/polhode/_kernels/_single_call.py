@@ -8,12 +8,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+from jax.core import ShapedArray, Tracer
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
-from jax.interpreters import ad, partial_eval
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.sharding import AxisType
 
 from polhode._kernels._linear import linear
@@ -27,7 +27,7 @@ _HOLDABLE = frozenset(
      logistic lt max min mul ne neg not optimization_barrier or pad pjit pow reduce_and
      reduce_max reduce_min reduce_or reduce_sum rem reshape round rsqrt scan select_n
      shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stop_gradient sub
-     tan tanh transpose unstack while xor""".split()  # noqa: SIM905
+     tan tanh transpose unit unstack while xor""".split()  # noqa: SIM905
 )
 """Operations that a single compiled unit may hold; anything else keeps the usual way."""
 
@@ -337,5 +337,35 @@ def _marked(closed: ClosedJaxpr, given: Sequence[Any], bare: int) -> list[jax.Ar
                 jax.lax.select(sure, x, other[k]) if k in chosen else x for k, x in enumerate(found)
             ]
 
+    shapes = tuple((x.shape, x.dtype) for x in closed.out_avals)
+    return _unit_p.bind(zeros, *operands, whole=whole, shapes=shapes)
+
+
+# A primitive, or the derivative of a loop around the call would take the constants in it for known
+# beforehand and hand them in as operands, which might go unused.
+_unit_p = Primitive("unit")
+_unit_p.multiple_results = True
+
+
+@_unit_p.def_impl
+def _unit_at_once(*arrays, whole, shapes):
+    return list(whole(*arrays))
+
+
+@_unit_p.def_abstract_eval
+def _unit_shapes(*_, whole, shapes):
+    return [ShapedArray(shape, dtype) for shape, dtype in shapes]
+
+
+def _unit_lowered(*arrays, whole, shapes):
     with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-        return jax.jit(whole)(zeros, *operands)
+        return jax.jit(whole)(*arrays)
+
+
+def _unit_batch(arrays, dims, *, whole, shapes):
+    out = jax.vmap(lambda *x: list(_unit_lowered(*x, whole=whole, shapes=shapes)), dims)(*arrays)
+    return out, [0] * len(out)
+
+
+mlir.register_lowering(_unit_p, mlir.lower_fun(_unit_lowered, multiple_results=True))
+batching.primitive_batchers[_unit_p] = _unit_batch
