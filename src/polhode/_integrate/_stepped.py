@@ -191,7 +191,7 @@ class AbstractIntegration(AbstractMethod):
     ) -> tuple[Samples, Found] | None:
         """Samples at ``ts`` and then at the events that are met, of which ``Found`` tells more;
         None where this method cannot look for events on its way."""
-        if not self._is_automatic:
+        if not self._is_automatic or not state.wxyz.shape[0]:
             return None
         record = Record(final_only=final_only)
         return self._run_by_loop(scene, state, ts, rtol, record, search)
@@ -202,8 +202,9 @@ class AbstractIntegration(AbstractMethod):
 
     def _suits_loop(self, scene, state, ts, record: Record) -> bool:
         """Whether explicit steps are the faster ones, or the only ones that end at switches."""
-        if state.wxyz.shape[0] <= FEW_BODIES:
-            return True
+        bodies = state.wxyz.shape[0]
+        if bodies <= FEW_BODIES:
+            return bodies > 0
         return _may_jump(scene) and self._problem(scene, state, ts, record).switches.count > 0
 
     def _problem(self, scene, state, ts, record: Record, search: Search | None = None) -> Problem:
