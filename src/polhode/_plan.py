@@ -6,12 +6,13 @@ import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polhode._batch import PARTS, common_batch
+from polhode._batch import PARTS, common_batch, flatten, lane_times
 from polhode._checks import is_concrete
 from polhode._closed_forms import LAWS, ClosedForm, lawful
 from polhode._method._base import AbstractMethod, Record
@@ -106,8 +107,8 @@ def ways_of(scene: Scene, state: State, record: Record) -> Ways:
     if law is None:
         upright = scene.torque is None and _is_upright(scene.potential)
         says = (
-            "something acts on the body: extrapolated midpoint rule, stepped with an error"
-            " estimate, held to rtol at every saved time"
+            "something acts on the body: integrated in steps with an error estimate, held to"
+            " rtol at every saved time"
         )
         both = tuple(_stepped(upright, compensated) for compensated in (False, True))
         also = says + ", its rounding carried along: it would miss rtol"
@@ -123,9 +124,9 @@ def ways_of(scene: Scene, state: State, record: Record) -> Ways:
 @functools.cache
 def _stepped(upright: bool, compensated: bool) -> AbstractMethod:
     # here, so that diffrax loads with the first scene that is integrated
-    from polhode._integrate import Extrapolation, LiePoisson, LiePoissonChart
+    from polhode._integrate import Automatic, LiePoisson, LiePoissonChart
 
-    return LiePoisson(Extrapolation(None, compensated), chart=LiePoissonChart(upright))
+    return LiePoisson(Automatic(None, compensated), chart=LiePoissonChart(upright))
 
 
 def _misses(ways: Ways, state: State, rtol, ts) -> bool:
@@ -185,6 +186,7 @@ def plan(
         method, reason = choose(scene, state, record, rtol, ts)
         if not method.exact:
             _, refused = lawful(scene, state, record)
+            reason = f"{reason}; {_steps(method, scene, state, ts, record)}"
     parts = (getattr(scene, name) for name in PARTS)
     bodies = int(np.prod(common_batch(*parts, state, extra=(ts.shape[:-1],)), dtype=int))
     samples = 1 if record.final_only else ts.shape[-1]
@@ -192,6 +194,22 @@ def plan(
         method, reason, _skipped(scene, method, record), bodies, samples,
         str(state.wxyz.dtype), _error(method, scene, state, ts, rtol), refused,
     )  # fmt: skip
+
+
+def _steps(method, scene: Scene, state: State, ts: Array, record: Record) -> str:
+    """The rule of the steps, found as ``simulate`` finds it."""
+    words: list[str] = []
+
+    def look(scene, state, ts):
+        scene, state = scene.settled(state, ts[..., 0]), state.without_wheels
+        parts = {name: getattr(scene, name) for name in PARTS}
+        batch = common_batch(*parts.values(), state, extra=(ts.shape[:-1],))
+        lanes = Scene(**{name: flatten(part, batch) for name, part in parts.items()})
+        times = lane_times(ts, batch)
+        words.append(method.steps_of(lanes, flatten(state, batch, shared=False), times, record))
+
+    eqx.filter_eval_shape(look, scene, state, ts)
+    return words[0]
 
 
 def _skipped(scene: Scene, method: AbstractMethod, record: Record) -> tuple[str, ...]:

@@ -13,10 +13,10 @@ from polhode._batch import PARTS, flatten, lane_times
 from polhode._checks import is_concrete
 from polhode._events._bracketed import bracketed
 from polhode._events._event import Event, at_least
-from polhode._integrate import natural_rates
+from polhode._integrate import Search, natural_rates
 from polhode._method import Status
-from polhode._scene import Scene
-from polhode._trajectory import Trajectory, moved_through, moved_to
+from polhode._scene import Scene, State
+from polhode._trajectory import Trajectory, begun, moved_through, moved_to
 
 A_TURN = 32
 """Looks in a turn of the fastest natural rate."""
@@ -26,6 +26,9 @@ _TOO_MANY = 20_000_000
 
 _ROOM = 16
 """Least number of places where the function turns back that are looked at."""
+
+CAPACITY = 256
+"""Crossings of each body that the steps store unless told otherwise."""
 
 AT_START = 1e-6
 """Part of the time between two looks within which a crossing is the start itself."""
@@ -92,6 +95,11 @@ def crossings(
         getattr(trajectory, name)  # raises where it was not recorded
     if trajectory.propagator is None:
         raise ValueError("this trajectory was made by hand: use one that ph.simulate returns.")
+    if not trajectory.propagator.method.exact:
+        met = _met(trajectory, event, room or CAPACITY)
+        if met is not None:
+            _raise_if_lost(met[1], "the steps to the last time")
+            return met[0] if capacity is not None else _all_of(met[0], trajectory, event)
     if looks is None:
         looks = _looks(trajectory)
     if room is None:
@@ -101,11 +109,7 @@ def crossings(
             )
         room = _ROOM
     found, lost = _found(trajectory, event, room, looks)
-    if is_concrete(lost) and np.any(np.asarray(lost)):
-        raise ValueError(
-            f"the steps of a body ran out on its way through {looks:,} looks: search a shorter time"
-            " (traj.between), or ask for more steps, ph.LiePoisson(..., max_steps=2**20)."
-        )
+    _raise_if_lost(lost, f"its way through {looks:,} looks")
     while capacity is None and int(np.max(found.count, initial=0)) > room:
         room = 2 ** int(np.ceil(np.log2(np.max(found.count))))
         found, _ = _found(trajectory, event, room, looks)
@@ -113,6 +117,57 @@ def crossings(
         used = int(np.max(found.count, initial=0))
         found = Crossings(found.times[..., :used], found.slope[..., :used], found.count)
     return found
+
+
+def _raise_if_lost(lost: Array, way: str) -> None:
+    if is_concrete(lost) and np.any(np.asarray(lost)):
+        raise ValueError(
+            f"the steps of a body ran out on {way}: search a shorter time (traj.between), or ask"
+            " for more steps, ph.LiePoisson(..., max_steps=2**20)."
+        )
+
+
+def _all_of(found: Crossings, trajectory: Trajectory, event: Event) -> Crossings:
+    """All crossings, in as many columns as there are, where their number is known."""
+    if not is_concrete(found):
+        return found
+    most = int(np.max(found.count, initial=0))
+    if most > CAPACITY:
+        found, _ = _met(trajectory, event, 2 ** int(np.ceil(np.log2(most))))
+    return Crossings(found.times[..., :most], found.slope[..., :most], found.count)
+
+
+@eqx.filter_jit
+def _met(trajectory: Trajectory, event: Event, capacity: int) -> Any:
+    """Crossings that the steps find on their way, and for which bodies (...) these did not come to
+    the last time; None where the method does not look for them."""
+    batch, propagator = trajectory.batch_shape, trajectory.propagator
+    parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
+    wxyz, omega, *spins = (x.reshape(-1, *x.shape[len(batch) :])[:, 0] for x in trajectory._samples)
+    ts = lane_times(trajectory.ts[..., jnp.array([0, -1])], batch)
+    scene = begun(Scene(**parts), spins)
+    search = Search((event.fn,), (event.direction,), (False,), capacity)
+    rtol = jnp.min(propagator.rtol)
+    found = propagator.method.search(scene, State(wxyz, omega), ts, rtol, search, True)
+    if found is None:
+        return None
+    samples, events = found
+    spins = None if samples.spins is None else samples.spins[:, 1:]
+    there = Trajectory(
+        events.rows[:, 1:], samples.wxyz[:, 1:], samples.omega_body[:, 1:], samples.status,
+        samples.steps, Scene(**parts), spins=spins, propagator=propagator,
+    )  # fmt: skip
+    times = events.rows[:, 1:]
+    use = jnp.isfinite(events.times)
+    grain = 64 * jnp.finfo(times.dtype).eps * jnp.abs(times)
+    late, there = event.mended(there, grain)
+    _, slope = event.values(there)
+    lost = samples.status != Status.SUCCESSFUL
+    lost = lost & (trajectory.status.reshape(-1) == Status.SUCCESSFUL)
+    count = jnp.where(lost, capacity + 1, events.count).astype(jnp.int32)
+    times = jnp.where(use, times + late, jnp.inf).reshape(*batch, capacity)
+    slope = jnp.where(use, slope, 0).reshape(*batch, capacity)
+    return Crossings(times, slope, count.reshape(batch)), lost.reshape(batch)
 
 
 def _looks(trajectory: Trajectory) -> int:

@@ -8,8 +8,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array
 
+from polhode._kernels import attached, is_slope
 from polhode._parts import Signature
 from polhode._trajectory import Trajectory, shortly_after
 from polhode.rotation._components import wxyz_rate
@@ -53,6 +55,40 @@ class Event(eqx.Module):
             jnp.ones_like(t),
         )
         return jax.jvp(partial(_FUNCTION.mapped, self.fn), (wxyz, omega, t), slopes)
+
+    def mended(self, near: Trajectory, most: Array) -> tuple[Array, Trajectory]:
+        """``polished`` for samples at which the function is zero to rounding: the same derivatives,
+        and nothing to be worked out where none is asked for."""
+        arrays, rest = eqx.partition(near, eqx.is_inexact_array)
+        leaves, tree = jax.tree.flatten((arrays, most))
+
+        def moved(*leaves):
+            arrays, most = jax.tree.unflatten(tree, leaves)
+            late, there = self.polished(eqx.combine(arrays, rest), most)
+            return [late, *there._samples]
+
+        closed = jax.make_jaxpr(moved)(*leaves)
+        size = len(closed.consts)
+
+        def rule(operands, tangents, values):
+            at = [i for i, x in enumerate(tangents) if is_slope(x)]
+
+            def some(*given):
+                full = list(operands)
+                for i, x in zip(at, given):
+                    full[i] = x
+                return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, full[:size]))(*full[size:])
+
+            return jax.jvp(some, [operands[i] for i in at], [tangents[i] for i in at])[1]
+
+        values = [jnp.zeros_like(near._t), *near._samples]
+        operands = [*map(jnp.asarray, closed.consts), *leaves]
+        late, wxyz, omega, *spins = attached(rule, operands, values)
+        there = Trajectory(
+            near._t + late, wxyz, omega, near.status, near.steps, near.scene,
+            spins=spins[0] if spins else None, propagator=near.propagator,
+        )  # fmt: skip
+        return late, there
 
     def polished(self, near: Trajectory, most: Array) -> tuple[Array, Trajectory]:
         """At samples ``near`` events: how much later (..., T) [s] these are, at most by ``most``,

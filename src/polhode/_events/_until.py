@@ -12,10 +12,10 @@ from polhode._batch import PARTS, flatten, lane_times
 from polhode._events._bracketed import bracketed
 from polhode._events._crossings import A_TURN, AT_START, dips_of, entries, first_true, turning_rates
 from polhode._events._event import Event
-from polhode._integrate import natural_rates
+from polhode._integrate import Search, natural_rates
 from polhode._method import Record, Status
 from polhode._scene import Scene, State
-from polhode._trajectory import Trajectory, moved_through, moved_to
+from polhode._trajectory import Trajectory, begun, moved_through, moved_to
 
 _LOOKS = 64
 """Steps between looks in a window: two turns of the fastest body."""
@@ -53,12 +53,9 @@ def stopped(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
     event on."""
     batch = begin.batch_shape
     lanes, ts = _of_lanes(begin), lane_times(ts, batch)
-    arrays, rest = eqx.partition((lanes, until), eqx.is_inexact_array)
-    still = jax.lax.stop_gradient
-    fixed, event = eqx.combine(still(arrays), rest)
-    met, lost, near, step = still(_first_event(fixed, event, still(ts)))
-    held = _held(lanes, ts, until, met, near, step)
-    held = (*held[:3], jnp.where(lost, Status.MAX_STEPS, held[3]), *held[4:])
+    held = _held_by_loop(lanes, ts, until)
+    if held is None:
+        held = _held_by_windows(lanes, ts, until)
     wxyz, omega, spins, status, steps, times, event = (
         None if x is None else x.reshape(*batch, *x.shape[1:]) for x in held
     )
@@ -66,6 +63,52 @@ def stopped(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
         times, wxyz, omega, status, steps, begin.scene, spins=spins, propagator=begin.propagator,
         event_time=event,
     )  # fmt: skip
+
+
+def _held_by_loop(lanes: Trajectory, ts: Array, until: Event):
+    """Where the steps themselves look for the event: samples, status, steps, times and event times,
+    with the derivatives of the motion; None where they cannot."""
+    propagator: Any = lanes.propagator
+    method = propagator.method
+    if method.exact:
+        return None
+    wxyz, omega, *spins = (x[:, 0] for x in lanes._samples)
+    scene, search = begun(lanes.scene, spins), Search((until.fn,), (until.direction,), (True,), 1)
+    found = method.search(scene, State(wxyz, omega), ts, propagator.rtol, search, False)
+    if found is None:
+        return None
+    samples, events = found
+    spins = [] if samples.spins is None else [samples.spins]
+    path = [samples.wxyz, samples.omega_body, *spins]
+    met = jnp.isfinite(events.times[:, 0])
+    near = Trajectory(
+        events.rows[:, -1:], *(x[:, -1:] for x in path[:2]), samples.status, samples.steps,
+        lanes.scene, spins=spins[0][:, -1:] if spins else None, propagator=propagator,
+    )  # fmt: skip
+    grain = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(near._t)
+    late, at_event = until.mended(near, grain)
+    event = near._t + late
+    rows = jnp.broadcast_to(ts, (met.size, ts.shape[-1]))
+    sign = jnp.where(rows[:, -1:] < rows[:, :1], -1, 1).astype(ts.dtype)
+    past = met[:, None] & (sign * (rows - jax.lax.stop_gradient(event)) >= 0)
+    wxyz, omega, *spins = (
+        jnp.where(past[..., None], x, y[:, :-1]) for x, y in zip(at_event._samples, path)
+    )
+    times = jnp.where(past, event, rows)
+    event = jnp.where(met, event[:, 0], jnp.inf)
+    return (
+        wxyz, omega, spins[0] if spins else None, samples.status, samples.steps, times, event,
+    )  # fmt: skip
+
+
+def _held_by_windows(lanes: Trajectory, ts: Array, until: Event):
+    """The same by looks at windows of the motion."""
+    arrays, rest = eqx.partition((lanes, until), eqx.is_inexact_array)
+    still = jax.lax.stop_gradient
+    fixed, event = eqx.combine(still(arrays), rest)
+    met, lost, near, step = still(_first_event(fixed, event, still(ts)))
+    held = _held(lanes, ts, until, met, near, step)
+    return (*held[:3], jnp.where(lost, Status.MAX_STEPS, held[3]), *held[4:])
 
 
 def _of_lanes(begin: Trajectory) -> Trajectory:

@@ -1,5 +1,6 @@
 """Names of the integrators, imported at first use: diffrax loads with the first of them."""
 
+from ._automatic import Automatic as Automatic
 from ._charts import (
     EulerChart as EulerChart,
     LiePoissonChart as LiePoissonChart,
@@ -8,6 +9,7 @@ from ._charts import (
 from ._equal_steps import EqualSteps as EqualSteps, GivenTimes as GivenTimes
 from ._extrapolation import Accuracy as Accuracy, Extrapolation as Extrapolation
 from ._flow_adjoint import FlowAdjoint as FlowAdjoint
+from ._search import Search as Search
 from ._splitting import Splitting as Splitting
 from ._stepped import (
     AbstractIntegration as AbstractIntegration,

@@ -100,7 +100,7 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
             state = eqx.tree_at(lambda s: _first(s.save_state).ts, state, ts)
         count = min(times.shape[0], saved[0].shape[0])  # rooms for more steps stay as they are
         kept = [x[:count] for x in saved]
-        path = _path(equations, self.parts, c, leaves, t0, times[:count], kept)
+        path = path_of(equations, self.parts, c, leaves, t0, times[:count], kept)
         path = [jnp.concatenate([x, s[count:]]) for x, s in zip(path, saved)]
         ys = jax.tree.unflatten(tree, path)
         state = eqx.tree_at(lambda s: _first(s.save_state).ys, state, ys)
@@ -151,7 +151,7 @@ def _saved_times(saveat, controller, event, t0, t1) -> Array | None:
     return jnp.concatenate(times)
 
 
-def _path(equations: Equations, parts: int, c, y0, t0, times, saved):
+def path_of(equations: Equations, parts: int, c, y0, t0, times, saved):
     """The states saved, with the derivatives of the flow."""
     size = len(y0)
 

@@ -2,6 +2,7 @@
 
 import inspect
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import diffrax
@@ -12,10 +13,17 @@ from jaxtyping import Array, PyTree
 
 from polhode._batch import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._hamiltonian import Dynamics
+from polhode._integrate._automatic import Automatic
 from polhode._integrate._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
 from polhode._integrate._equal_steps import GivenTimes
-from polhode._integrate._flow_adjoint import FlowAdjoint
+from polhode._integrate._equations import equations_of
+from polhode._integrate._flow_adjoint import FlowAdjoint, path_of
+from polhode._integrate._lanes import LANES
+from polhode._integrate._loop import Wanted, solve
+from polhode._integrate._problem import Problem
+from polhode._integrate._search import Found, Search, with_events
 from polhode._integrate._segments import Moved, in_segments
+from polhode._integrate._step_derivative import samples
 from polhode._kernels import FEW, Distinct, kernel
 from polhode._method._base import AbstractMethod, Record, Samples
 from polhode._method._options import check_options
@@ -69,6 +77,29 @@ class AbstractIntegration(AbstractMethod):
         coordinates = type(self.chart).__name__.removesuffix("Chart")
         return f"{coordinates}({type(self.solver).__name__})"
 
+    def steps_of(self, scene: Scene, state: State, ts: Array, record: Record) -> str:
+        """The steps that the bodies of a scene are moved by, in words."""
+        if not self._is_automatic:
+            return f"steps of {type(self.solver).__name__}"
+        few, switches, hidden = state.wxyz.shape[0] <= FEW_BODIES, 0, ()
+        if few or _may_jump(scene):
+            found: list[Any] = []
+
+            def look(scene, state, ts):
+                found.append(self._problem(scene, state, ts, record).switches)
+
+            eqx.filter_eval_shape(look, scene, state, ts)
+            switches, hidden = found[0].count, found[0].hidden
+        if hidden:
+            return (
+                "extrapolated midpoint rule, searched for jumps: the torque contains"
+                f" {', '.join(hidden)}, in which the places of kinks cannot be found"
+            )
+        if few or switches:
+            ends = f", each ending where one of {switches} switches (clip, where, ...) turns"
+            return "explicit Runge-Kutta steps of order 8" + (ends if switches else "")
+        return "extrapolated midpoint rule"
+
     @property
     def keeps_rtol(self) -> bool:
         """Whether the steps follow from ``rtol``."""
@@ -96,6 +127,10 @@ class AbstractIntegration(AbstractMethod):
         check = getattr(self.solver, "check", None)
         if check is not None:
             check(self, scene, record)
+        if self._is_automatic and self._suits_loop(scene, state, ts, record):
+            found = self._run_by_loop(scene, state, ts, rtol, record)
+            if found is not None:
+                return found[0]
         size = 1
         if ts.ndim == 1:
             size = self.chunk or self._bodies_at_once(scene, state, ts, record)
@@ -134,13 +169,112 @@ class AbstractIntegration(AbstractMethod):
         known = dynamics.hamiltonian, dynamics.torque, dynamics.units
         return diffrax.ODETerm(self.chart.field_and_power), Dynamics(*known, wheels=dynamics.wheels)
 
+    def _run_by_loop(
+        self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record,
+        search: Search | None = None,
+    ) -> Any:  # fmt: skip
+        """None where switches may be hidden from it."""
+        lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
+
+        def one(chunk):
+            lanes, times = chunk.value()
+            scene, state = eqx.combine(lanes, shared)
+            times = ts if times is None else times
+            return self._solve_by_loop(scene, state, times, rtol, record, search)
+
+        n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
+        whole = kernel(one, of_units=True) if n <= FEW else one
+        return map_chunks(whole, Distinct((lanes, times)), n, self.chunk or LANES)
+
+    def search(
+        self, scene: Scene, state: State, ts: Array, rtol: Array, search: Search, final_only: bool
+    ) -> tuple[Samples, Found] | None:
+        """Samples at ``ts`` and then at the events that are met, of which ``Found`` tells more;
+        None where this method cannot look for events on its way."""
+        if not self._is_automatic or not state.wxyz.shape[0]:
+            return None
+        record = Record(final_only=final_only)
+        return self._run_by_loop(scene, state, ts, rtol, record, search)
+
+    @property
+    def _is_automatic(self) -> bool:
+        return isinstance(self.solver, Automatic) and self.controller is None
+
+    def _suits_loop(self, scene, state, ts, record: Record) -> bool:
+        """Whether explicit steps are the faster ones, or the only ones that end at switches."""
+        bodies = state.wxyz.shape[0]
+        if bodies <= FEW_BODIES:
+            return bodies > 0
+        return _may_jump(scene) and self._problem(scene, state, ts, record).switches.count > 0
+
+    def _problem(self, scene, state, ts, record: Record, search: Search | None = None) -> Problem:
+        """The field of one body, and the events that are searched for."""
+        y0, _ = self._start(scene, state, ts, record)
+
+        def watch(parts, t, y):
+            scene, _ = parts
+            later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
+            y = jax.tree.map(lambda x: x[:, None], tuple(y))
+            wxyz, omega, _ = self.chart.finish(later, y, jnp.reshape(t, (1, 1)))
+            return jnp.stack([fn(wxyz[0, 0], omega[0, 0], t) for fn in search.fns])
+
+        def pose(parts):
+            return self._posed(*parts, ts, record)
+
+        masks = is_lane_tree((scene, state))
+        seen = None if search is None else watch
+        return Problem.of(pose, (scene, state), masks, y0, ts.reshape(-1)[0], seen)
+
+    def _solve_by_loop(
+        self, scene, state, ts, rtol, record: Record, search: Search | None = None
+    ) -> tuple[Samples, Found | None] | None:
+        """One chunk of lanes, by the loop of explicit steps; ``ts`` (T,) or (N, T)."""
+        y0, sound = self._start(scene, state, ts, record)
+        term, dynamics = self._posed(scene, state, ts, record)
+        problem = self._problem(scene, state, ts, record, search)
+        if problem.switches.hidden:
+            return None
+        leaves, tree = jax.tree.flatten(y0)
+        rtol, bodies = jax.lax.stop_gradient(rtol), leaves[0].shape[0]
+        times = ts[..., -1:] if record.final_only else ts
+        told, start, y = (dynamics.units, rtol), ts[..., 0], jnp.stack(leaves)
+        asked = Search() if search is None else search
+        passing = asked.passing
+
+        def make(arrays, told, linked, asked=passing):
+            units, rtol = told
+            motion = problem.motion(arrays, _by_units, units)
+            return motion, Wanted(
+                rtol, self.max_steps, asked.capacity, asked.directions, asked.terminal, linked
+            )
+
+        given = jax.lax.stop_gradient((problem.arrays, told, start, times, y))
+        solved = solve(partial(make, asked=asked), *given)
+        states = solved.samples.reshape(bodies, -1, len(leaves))[:, :-1]
+        found = None
+        if search is not None:
+            found, times, states = with_events(search, solved, times, states)
+        if problem.switches.count or times.ndim > 1:
+            states = samples(make, problem.arrays, told, y, start, times, states)
+        else:
+            equations, c = equations_of(term, dynamics, y0, start, rtol, False)
+            path = [jnp.moveaxis(states[..., i], 0, 1) for i in range(len(leaves))]
+            path = path_of(equations, 1, c, leaves, start, times, path)
+            states = jnp.stack([jnp.moveaxis(x, 0, 1) for x in path], axis=-1)
+        seen = jax.tree.unflatten(tree, [states[..., i].T for i in range(len(leaves))])
+        last = jax.tree.map(lambda x: x[-1:], seen)
+        status = jnp.array(_OF_LOOP)[solved.ended]
+        moved = Moved(seen, last, solved.steps, status, solved.error)
+        return self._samples(scene, moved, times, sound, record), found
+
     def _solve(self, scene, state, ts, rtol, record: Record) -> Samples:
         """One chunk of lanes."""
         y0, sound = self._start(scene, state, ts, record)
+        kept = ts[-1:] if record.final_only else ts
         edges = None if scene.torque is None else scene.torque.edges
         if edges is None:
             found = self._moved(scene, state, y0, ts, rtol, record)
-            return self._samples(scene, found, ts, sound, record)
+            return self._samples(scene, found, kept, sound, record)
 
         def move(middle, y, times, parts):
             torque = scene.torque.during(middle)
@@ -149,7 +283,7 @@ class AbstractIntegration(AbstractMethod):
             return self._moved(now, state, y, times, share, record)
 
         found = in_segments(move, y0, ts, edges, record.final_only)
-        return self._samples(scene, found, ts, sound, record)
+        return self._samples(scene, found, kept, sound, record)
 
     def _moved(self, scene, state, y0, ts, rtol, record) -> Moved:
         """States from ``y0`` on."""
@@ -181,7 +315,8 @@ class AbstractIntegration(AbstractMethod):
         steps, status = _outcome(solution, y0[0][0].shape)
         return Moved(samples, last, steps, status, error)
 
-    def _samples(self, scene, found: Moved, ts, sound, record: Record) -> Samples:
+    def _samples(self, scene, found: Moved, kept, sound, record: Record) -> Samples:
+        """``kept``: times of the samples (T,) or (N, T)."""
         samples, last = (_lanes_first(y) for y in (found.samples, found.last))
         dynamics = scene.dynamics
         work, motors, spins = None, None, None
@@ -192,9 +327,9 @@ class AbstractIntegration(AbstractMethod):
         if dynamics.coupled:
             spins = jnp.stack(samples[2], axis=-1)
         later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
-        kept = ts[-1:] if record.final_only else ts
-        wxyz, omega, _ = self.chart.finish(later, tuple(samples), kept[None])
-        *_, sound_at_end = self.chart.finish(later, tuple(last), ts[None, -1:])
+        kept = jnp.atleast_2d(kept)
+        wxyz, omega, _ = self.chart.finish(later, tuple(samples), kept)
+        *_, sound_at_end = self.chart.finish(later, tuple(last), kept[:, -1:])
         wxyz, omega = (jnp.where(sound[:, None, None], x, jnp.nan) for x in (wxyz, omega))
         taken, unfinished = found.steps, found.status
         finite = jnp.all(jnp.isfinite(wxyz), axis=(-1, -2))
@@ -274,6 +409,10 @@ class _Asked(NamedTuple):
         return diffrax.SaveAt(subs=[last if self.final_only else samples, last])
 
 
+def _by_units(units, y, rates):
+    return units(y, rates)
+
+
 class LaneNorm(eqx.Module):
     """Error of the worst lane: root mean square over its components, each times its weight.
 
@@ -324,6 +463,19 @@ def _outcome(solution, shape) -> tuple[Array, Array]:
         jnp.broadcast_to(status, shape),
     )
 
+
+_OF_LOOP = (
+    Status.SUCCESSFUL,
+    Status.SUCCESSFUL,
+    Status.MAX_STEPS,
+    Status.STEP_FAILED,
+    Status.NOT_FINITE,
+    Status.SLIDING,
+    Status.SUCCESSFUL,
+)
+
+FEW_BODIES = 4
+"""Bodies up to which explicit steps take less time than extrapolation."""
 
 _ENDED = (Status.SUCCESSFUL, Status.MAX_STEPS, Status.STEP_FAILED, Status.NOT_FINITE)
 

@@ -8,12 +8,12 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+from jax.core import ShapedArray, Tracer
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
-from jax.interpreters import ad, partial_eval
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.sharding import AxisType
 
 from polhode._kernels._linear import linear
@@ -27,7 +27,7 @@ _HOLDABLE = frozenset(
      logistic lt max min mul ne neg not optimization_barrier or pad pjit pow reduce_and
      reduce_max reduce_min reduce_or reduce_sum rem reshape round rsqrt scan select_n
      shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stop_gradient sub
-     tan tanh transpose unstack while xor""".split()  # noqa: SIM905
+     tan tanh transpose unit unstack while xor""".split()  # noqa: SIM905
 )
 """Operations that a single compiled unit may hold; anything else keeps the usual way."""
 
@@ -111,12 +111,28 @@ def _any_of_all(size, batched, these):
     return any_of(these), False
 
 
-@custom_vmap
+@jax.custom_jvp
 def put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
     """``rows`` (S, C) with ``values`` (n, C) at ``places`` (n,) in S, the last of equal ones.
 
     One after another on the CPU, where a unit cannot hold a scatter. Not for reverse mode.
     """
+    return _put_each(rows, places, values)
+
+
+@put.defjvp
+def _put_jvp(primals, tangents):
+    """Of its own, for the one that JAX makes of the rule for batches mixes up what is batched."""
+    (rows, places, values), (rows_, _, values_) = primals, tangents
+    return put(rows, places, values), put(rows_, places, values_)
+
+
+@custom_vmap
+def _put_each(rows, places, values):
+    return _put(rows, places, values)
+
+
+def _put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
     if places.size == 0 or jax.default_backend() != "cpu":
         return rows.at[places].set(values)
 
@@ -127,14 +143,14 @@ def put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
     return jax.lax.fori_loop(0, places.size, one, rows)
 
 
-@put.def_vmap
+@_put_each.def_vmap
 def _put_all(size, batched, *given):
     """The rows of a batch, one after another."""
     rows, places, values = (
         x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(given, batched)
     )
     places = places + rows.shape[1] * jnp.arange(size, dtype=places.dtype)[:, None]
-    flat = put(_flat(rows), places.reshape(-1), _flat(values))
+    flat = _put(_flat(rows), places.reshape(-1), _flat(values))
     return flat.reshape(rows.shape), True
 
 
@@ -321,5 +337,35 @@ def _marked(closed: ClosedJaxpr, given: Sequence[Any], bare: int) -> list[jax.Ar
                 jax.lax.select(sure, x, other[k]) if k in chosen else x for k, x in enumerate(found)
             ]
 
+    shapes = tuple((x.shape, x.dtype) for x in closed.out_avals)
+    return _unit_p.bind(zeros, *operands, whole=whole, shapes=shapes)
+
+
+# A primitive, or the derivative of a loop around the call would take the constants in it for known
+# beforehand and hand them in as operands, which might go unused.
+_unit_p = Primitive("unit")
+_unit_p.multiple_results = True
+
+
+@_unit_p.def_impl
+def _unit_at_once(*arrays, whole, shapes):
+    return list(whole(*arrays))
+
+
+@_unit_p.def_abstract_eval
+def _unit_shapes(*_, whole, shapes):
+    return [ShapedArray(shape, dtype) for shape, dtype in shapes]
+
+
+def _unit_lowered(*arrays, whole, shapes):
     with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-        return jax.jit(whole)(zeros, *operands)
+        return jax.jit(whole)(*arrays)
+
+
+def _unit_batch(arrays, dims, *, whole, shapes):
+    out = jax.vmap(lambda *x: list(_unit_lowered(*x, whole=whole, shapes=shapes)), dims)(*arrays)
+    return out, [0] * len(out)
+
+
+mlir.register_lowering(_unit_p, mlir.lower_fun(_unit_lowered, multiple_results=True))
+batching.primitive_batchers[_unit_p] = _unit_batch

@@ -67,3 +67,7 @@ class AbstractMethod(eqx.Module):
     @abc.abstractmethod
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         """Samples at ``ts`` (T,) or (N, T) of lanes whose state holds at the first time."""
+
+    def search(self, scene: Scene, state: State, ts: Array, rtol: Array, search, final_only: bool):
+        """Events on the way, where the method itself can look for them; None where it cannot."""
+        return None

@@ -17,6 +17,7 @@ class Status(enum.IntEnum):
     WRONG_LAW = 6
     NOT_PHYSICAL = 7
     BAD_TIMES = 8
+    SLIDING = 9
 
     @property
     def explanation(self) -> str:
@@ -53,6 +54,11 @@ _EXPLANATIONS = {
         " others, a tensor symmetric, and a wheel's moment less than the body's about its axis;"
         " published numbers that break the inequality pass with"
         " ph.Inertia.from_moments(..., physical=False)"
+    ),
+    Status.SLIDING: (
+        "the motion slides along a switch: a comparison in a torque (where, sign, a threshold)"
+        " drives the body back from both sides; make the torque continuous there, for instance"
+        " x / width clipped to -1 and 1 in place of sign(x)"
     ),
     Status.BAD_TIMES: "ts is not strictly increasing or strictly decreasing: sort it",
 }

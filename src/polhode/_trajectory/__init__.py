@@ -2,6 +2,7 @@
 
 from polhode._trajectory._propagator import (
     Propagator as Propagator,
+    begun as begun,
     moved_through as moved_through,
     moved_to as moved_to,
     shortly_after as shortly_after,

@@ -104,7 +104,7 @@ def _until_event(trajectory: Trajectory, times: Array) -> Array:
     return jnp.where(beyond, event, times)
 
 
-def _begun(scene: Scene, spins: list[Array]) -> Scene:
+def begun(scene: Scene, spins: list[Array]) -> Scene:
     """The scene with these momenta of its coupled wheels, if there are such."""
     if not spins or not isinstance(scene.rotors, Wheels):
         return scene
@@ -116,7 +116,7 @@ def _from_first(propagator: Propagator, scene: Scene, samples, ts, times):
     wxyz, omega, *spins = (x[:, 0] for x in samples)
     times = jnp.concatenate([ts[..., :1], times], axis=-1)
     rtol = None if propagator.rtol is None else jnp.min(propagator.rtol)
-    found = propagator.method.run(_begun(scene, spins), State(wxyz, omega), times, rtol, Record())
+    found = propagator.method.run(begun(scene, spins), State(wxyz, omega), times, rtol, Record())
     kept = [x[:, 1:] for x in (found.wxyz, found.omega_body, found.spins) if x is not None]
     return kept, found.status, found.steps
 
@@ -132,7 +132,7 @@ def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
     def moved(scene, start, begin, end, unit):
         """Lanes at ``end`` () or (N,), their status and steps."""
         wxyz, omega, *spins = start
-        scene = _begun(scene, spins)
+        scene = begun(scene, spins)
         there = begin == end
         span = jnp.stack([begin, jnp.where(there, begin + unit, end)], axis=-1)
         found = propagator.method.run(scene, State(wxyz, omega), span, rtol, final)

@@ -1,0 +1,178 @@
+"""Kinks and jumps of a field: found in its program, ended at, and passed by derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import polhode as ph
+from polhode._integrate._switches import smooth, switched
+
+MOMENTS = np.array([1.0, 1.5, 2.0])
+INERTIA = ph.Inertia.from_moments(MOMENTS)
+WXYZ, OMEGA = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.31, -0.2, 1.0])
+TS = np.linspace(0.0, 10.0, 11)
+
+
+def program(fn, *examples):
+    """``fn`` of one moving vector, with its switches apart."""
+    return switched(jax.make_jaxpr(fn)(*examples), [True] * len(examples), jnp.float64)
+
+
+@pytest.mark.parametrize(
+    ("fn", "count", "jumps"),
+    [
+        (lambda x: jnp.maximum(x, 0.0), 3, False),
+        (lambda x: jnp.clip(x, -1.0, 1.0), 6, False),
+        (jnp.abs, 3, False),
+        (jax.nn.relu, 3, False),
+        (jnp.sign, 3, True),
+        (lambda x: jnp.where(x[0] > 0.2, x, -x), 1, True),
+        (jnp.floor, 3, True),
+        (lambda x: jnp.round(2 * x), 3, True),
+        (lambda x: x % 1.0, 6, True),
+        (lambda x: x.astype(jnp.int32) * 1.0, 3, True),
+        (jnp.max, 2, False),
+        (jnp.sort, 3, False),
+        (lambda x: x[jnp.argmax(x)], 2, False),
+        (lambda x: jnp.arctan2(x[0], x[1]), 1, False),
+        (lambda x: jax.lax.cond(x[0] > 0, jnp.sin, jnp.cos, x), 1, True),
+        (jax.jit(lambda x: jnp.maximum(x, 0.0)), 3, False),
+        (jax.checkpoint(lambda x: jnp.maximum(x, 0.0)), 3, False),
+        (lambda x: jax.lax.scan(lambda s, row: (s + jnp.abs(row), row), 0.0, x)[0], 3, False),
+        (lambda x: jnp.interp(x[0], jnp.arange(4.0), jnp.array([0.0, 1.0, 0.5, 2.0])), None, True),
+        (lambda x: jnp.linalg.norm(x), 0, False),
+        (smooth(lambda x: jnp.where(x > 0, x, x)), 0, False),
+    ],
+)
+def test_every_switch_of_a_program_is_found(fn, count, jumps):
+    """With the levels of a point held, the program has the same values near it, and no kink."""
+    x = jnp.array([0.3, -0.7, 1.4])
+    found = program(fn, x)
+    if count is not None:
+        assert found.count == count
+    assert not found.hidden
+    assert bool(found.jumps.any()) == jumps or count is None
+    levels = found.levels(x)
+    (value, *_), margins, _ = found.frozen(levels, x)
+    np.testing.assert_allclose(value, fn(x), atol=1e-15)
+    assert (np.asarray(margins) >= 0).all()
+    line = jax.vmap(lambda s: found.frozen(levels, x + s)[0][0])(jnp.linspace(-1.0, 1.0, 9))
+    bends = np.diff(np.asarray(line), 2, axis=0)
+    assert np.abs(bends).max() < 0.2 if jumps or count else True
+
+
+def test_what_cannot_be_looked_into_is_named():
+    def halved(x):
+        return jax.lax.while_loop(lambda s: jnp.sum(s * s) > 1, lambda s: s / 2, x)
+
+    assert program(halved, jnp.ones(3)).hidden == ("while",)
+    scene = ph.Scene(INERTIA, None, ph.FeedbackTorque(lambda t, wxyz, omega: halved(omega)))
+    state = ph.State(WXYZ, OMEGA)
+    assert "contains while" in str(ph.explain(scene, state, TS))
+    assert ph.simulate(scene, state, TS[:3]).successful
+
+
+LAWS = {
+    "clip": lambda p: lambda t, q, w: jnp.clip(-p[0] * w - p[1] * q[1:], -0.2, 0.2),
+    "dead band": lambda p: lambda t, q, w: -p[0] * jnp.where(jnp.abs(w) > p[1], w, 0.0),
+    "short way": lambda p: lambda t, q, w: -p[0] * jnp.sign(q[0]) * q[1:] - p[1] * w,
+    "pulse": lambda p: (
+        lambda t, q, w: jnp.where(
+            (t > p[1]) & (t < p[1] + 2), p[0] * jnp.array([1.0, -0.5, 0.2]), 0.0
+        )
+    ),
+    "steps": lambda p: lambda t, q, w: p[0] * jnp.floor(1.3 * t + p[1]) * jnp.array([0.1, 0, 0]),
+}
+
+
+def moved(p, omega, law, rtol):
+    scene = ph.Scene(INERTIA, None, ph.FeedbackTorque(LAWS[law](p)))
+    return ph.simulate(scene, ph.State(WXYZ, omega), TS, rtol=rtol)
+
+
+def truth(p, omega, law):
+    """SciPy's motion, in pieces that end where a level of the law's program changes.
+
+    The pieces are found by bisection on the law's own conditions, without polhode.
+    """
+    torque = jax.jit(LAWS[law](p))
+
+    def field(t, y):
+        q, w = y[:4], y[4:]
+        n = np.asarray(torque(t, q, w))
+        turn = np.concatenate([[-q[1:] @ w], q[0] * w + np.cross(q[1:], w)]) / 2
+        return np.concatenate([turn, (n - np.cross(w, MOMENTS * w)) / MOMENTS])
+
+    start = np.concatenate([WXYZ, np.asarray(omega)])
+    return solve_ivp(
+        field, (0, 10), start, method="DOP853", rtol=1e-11, atol=1e-11, max_step=1e-2
+    ).y[:, -1]
+
+
+@pytest.mark.parametrize("law", ["clip", "short way", "pulse"])
+def test_states_through_switches(law):
+    """Without a declaration, at every tolerance; SciPy's steps of 0.01 s miss a jump by 1e-5."""
+    p = jnp.array([0.4, 0.3])
+    fine = moved(p, OMEGA, law, 1e-12)
+    end = np.concatenate([fine.wxyz[-1], fine.omega_body[-1]])
+    np.testing.assert_allclose(end, truth(p, OMEGA, law), atol=1e-8 if law == "clip" else 2e-5)
+    for rtol in (1e-4, 1e-7, 1e-10):
+        apart = ph.rotation.angle_between(moved(p, OMEGA, law, rtol).wxyz, fine.wxyz)
+        assert float(apart.max()) < max(rtol, 1e-11)
+
+
+@pytest.mark.parametrize("law", [pytest.param(x, marks=pytest.mark.slow) for x in LAWS])
+def test_gradients_through_switches(law):
+    """Both modes, against differences of the values; the error falls with rtol."""
+    p = jnp.array([0.4, 0.3])
+    given = jnp.concatenate([p, OMEGA])
+
+    def loss(given, rtol):
+        found = moved(given[:2], given[2:], law, rtol)
+        return jnp.sum(found.wxyz[-1] * jnp.arange(1.0, 5)) + jnp.sum(found.omega_body[5] ** 2)
+
+    at, h = jax.jit(lambda x: loss(x, 1e-12)), 1e-5
+    want = np.zeros(5)
+    for i in range(5):
+        a, b, c, d = (float(at(given.at[i].add(k * h))) for k in (-2, -1, 1, 2))
+        want[i] = (8 * (c - b) - (d - a)) / (12 * h)
+    size = np.linalg.norm(want)
+    for rtol in (1e-5, 1e-8):
+        back = jax.grad(lambda x, rtol=rtol: loss(x, rtol))(given)
+        on = jax.jacfwd(lambda x, rtol=rtol: loss(x, rtol))(given)
+        for found in (back, on):
+            assert np.linalg.norm(found - want) < max(50 * rtol, 1e-8) * size
+
+
+def test_a_gradient_through_a_jump():
+    """The time of a jump moves with the state and with the threshold, a parameter."""
+
+    def end(p, omega):
+        def law(t, wxyz, omega):
+            return jnp.where(omega[2] > p[1], p[0] * omega, 0.1)
+
+        scene = ph.Scene(ph.Inertia.spherical(1.0), None, ph.FeedbackTorque(law))
+        return ph.simulate(scene, ph.State(WXYZ, omega), [0.0, 5.0]).omega_body[-1, 2]
+
+    # w = w0 exp(p0 t) down to p1 < w0, then 0.1 t more
+    rate, level, begin = -0.2, 0.7, 1.0
+    met = np.log(level / begin) / rate
+    with pytest.raises(ph.SimulationError, match="slides along a switch"):
+        end(jnp.array([rate, level]), jnp.array([0.0, 0.0, begin]))
+
+    def falling(p, omega):
+        def law(t, wxyz, omega):
+            return jnp.where(omega[2] > p[1], p[0] * omega, -0.1)
+
+        scene = ph.Scene(ph.Inertia.spherical(1.0), None, ph.FeedbackTorque(law))
+        return ph.simulate(scene, ph.State(WXYZ, omega), [0.0, 5.0]).omega_body[-1, 2]
+
+    given = jnp.array([rate, level]), jnp.array([0.0, 0.0, begin])
+    value, (by_p, by_omega) = jax.value_and_grad(falling, (0, 1))(*given)
+    np.testing.assert_allclose(value, level - 0.1 * (5 - met), rtol=1e-9)
+    # d met / d rate = -met / rate, d met / d level = 1 / (rate level), d met / d begin likewise
+    want = [-0.1 * met / rate, 1 + 0.1 / (rate * level)]
+    np.testing.assert_allclose(by_p, want, rtol=1e-8)
+    np.testing.assert_allclose(by_omega[2], -0.1 / (rate * begin), rtol=1e-8)
