@@ -110,8 +110,8 @@ def test_orbits_wheels_and_states_are_those_of_python():
     np.testing.assert_allclose(state.omega_body, expected.omega_body, atol=1e-15)
     place = "[orbit]\nmu = 1.0\nposition = [1, 0, 0]\nvelocity = [0, 1, 0]\nepoch = 2.0\n"
     found = build_scene(parse_scene(BODY + text + place), np.float64).potential
-    orbit = ph.KeplerOrbit.from_state(1.0, [1.0, 0, 0], [0, 1.0, 0], 2.0)
-    assert same(found, ph.GravityGradient(1.0, orbit))
+    through = ph.KeplerOrbit.from_state(1.0, [1.0, 0, 0], [0, 1.0, 0], 2.0)
+    assert same(found, ph.GravityGradient(1.0, through))
 
 
 def test_steps_between_samples():

@@ -7,7 +7,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import polhode as ph
-from polhode._integrate._switches import smooth, switched
+from polhode._integrate._switches import switched
+from polhode._kernels import smooth
 
 MOMENTS = np.array([1.0, 1.5, 2.0])
 INERTIA = ph.Inertia.from_moments(MOMENTS)
@@ -32,7 +33,7 @@ def program(fn, *examples):
         (jnp.floor, 3, True),
         (lambda x: jnp.round(2 * x), 3, True),
         (lambda x: x % 1.0, 6, True),
-        (lambda x: x.astype(jnp.int32) * 1.0, 3, True),
+        (lambda x: x.astype(jnp.int32).astype(x.dtype), 3, True),
         (jnp.max, 2, False),
         (jnp.sort, 3, False),
         (lambda x: x[jnp.argmax(x)], 2, False),
@@ -60,7 +61,7 @@ def test_every_switch_of_a_program_is_found(fn, count, jumps):
     assert (np.asarray(margins) >= 0).all()
     line = jax.vmap(lambda s: found.frozen(levels, x + s)[0][0])(jnp.linspace(-1.0, 1.0, 9))
     bends = np.diff(np.asarray(line), 2, axis=0)
-    assert np.abs(bends).max() < 0.2 if jumps or count else True
+    assert np.abs(bends).max() < 0.5
 
 
 def test_what_cannot_be_looked_into_is_named():

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode._integrate import _bound_term, _equations
+from polhode._integrate import _bound_term, _equations, _problem
 from polhode._kernels import Distinct, jit_distinct
 
 BODY = ph.Inertia.from_moments([1.0, 1.5, 2.0])
@@ -48,7 +48,7 @@ def last_rates(scene, t=1.0, times=2):
 def copies(monkeypatch):
     """Of every field that is specialised the logarithms: one in each Kepler's equation."""
     found = []
-    for module in (_bound_term, _equations):
+    for module in (_bound_term, _equations, _problem):
         original = module.specialise
 
         def recorded(closed, known, original=original, **options):

@@ -59,7 +59,9 @@ def test_strong_damping_is_right_or_marked(dtype, rtol):
         assert apart(end, k, tuple(LINEAR[k]), QUADRATIC[k]) < 10 * rtol, k
     with pytest.raises(ph.SimulationError, match="Kvaerno5") as lost:
         ph.simulate(*damped(dtype, 1e4 * LINEAR, QUADRATIC), rtol=rtol, record=record)
-    assert list(lost.value.status) == [ph.Status.MAX_STEPS] * 3 + [ph.Status.SUCCESSFUL]
+    out_of_steps = (ph.Status.MAX_STEPS, ph.Status.STEP_FAILED)
+    assert all(status in out_of_steps for status in lost.value.status[:3])
+    assert lost.value.status[3] == ph.Status.SUCCESSFUL
 
 
 def test_an_implicit_solver_takes_any_damping():

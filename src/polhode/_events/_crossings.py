@@ -95,7 +95,8 @@ def crossings(
         getattr(trajectory, name)  # raises where it was not recorded
     if trajectory.propagator is None:
         raise ValueError("this trajectory was made by hand: use one that ph.simulate returns.")
-    if not trajectory.propagator.method.exact:
+    propagator: Any = trajectory.propagator
+    if not propagator.method.exact:
         met = _met(trajectory, event, room or CAPACITY)
         if met is not None:
             _raise_if_lost(met[1], "the steps to the last time")
@@ -141,7 +142,8 @@ def _all_of(found: Crossings, trajectory: Trajectory, event: Event) -> Crossings
 def _met(trajectory: Trajectory, event: Event, capacity: int) -> Any:
     """Crossings that the steps find on their way, and for which bodies (...) these did not come to
     the last time; None where the method does not look for them."""
-    batch, propagator = trajectory.batch_shape, trajectory.propagator
+    batch = trajectory.batch_shape
+    propagator: Any = trajectory.propagator
     parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
     wxyz, omega, *spins = (x.reshape(-1, *x.shape[len(batch) :])[:, 0] for x in trajectory._samples)
     ts = lane_times(trajectory.ts[..., jnp.array([0, -1])], batch)

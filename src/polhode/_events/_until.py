@@ -82,7 +82,7 @@ def _held_by_loop(lanes: Trajectory, ts: Array, until: Event):
     path = [samples.wxyz, samples.omega_body, *spins]
     met = jnp.isfinite(events.times[:, 0])
     near = Trajectory(
-        events.rows[:, -1:], *(x[:, -1:] for x in path[:2]), samples.status, samples.steps,
+        events.rows[:, -1:], path[0][:, -1:], path[1][:, -1:], samples.status, samples.steps,
         lanes.scene, spins=spins[0][:, -1:] if spins else None, propagator=propagator,
     )  # fmt: skip
     grain = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(near._t)

@@ -680,7 +680,7 @@ def _looks(margins: Array) -> Array:
     return jnp.concatenate([jnp.maximum(looks[:1], 0), looks[1:]])
 
 
-_PLACES = NODES[list(LOOKS)]
+_PLACES = tuple(float(NODES[k]) for k in LOOKS)
 
 
 def _dips(looks: Array) -> tuple[Array, Array]:

@@ -37,7 +37,11 @@ class Found(NamedTuple):
 def with_events(search: Search, solved: Solved, times: Array, states: Array):
     """The events, and times (N, T + E) and states (N, T + E, D) of samples and events; samples
     beyond a terminal event are that event."""
-    bodies, capacity = solved.count.shape[0], search.capacity
+    bodies, capacity = solved.steps.shape[0], search.capacity
+    assert solved.times is not None
+    assert solved.states is not None
+    assert solved.which is not None
+    assert solved.count is not None
     at = solved.times.reshape(bodies, capacity + 1)[:, :-1]
     there = solved.states.reshape(bodies, capacity + 1, -1)[:, :-1]
     which = solved.which.reshape(bodies, capacity + 1)[:, :-1].astype(jnp.int32)

@@ -211,15 +211,18 @@ class AbstractIntegration(AbstractMethod):
         """The field of one body, and the events that are searched for."""
         y0, _ = self._start(scene, state, ts, record)
 
+        fns = () if search is None else search.fns
+
         def watch(parts, t, y):
             scene, _ = parts
             later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
             y = jax.tree.map(lambda x: x[:, None], tuple(y))
             wxyz, omega, _ = self.chart.finish(later, y, jnp.reshape(t, (1, 1)))
-            return jnp.stack([fn(wxyz[0, 0], omega[0, 0], t) for fn in search.fns])
+            return jnp.stack([fn(wxyz[0, 0], omega[0, 0], t) for fn in fns])
 
         def pose(parts):
-            return self._posed(*parts, ts, record)
+            scene, state = parts
+            return self._posed(scene, state, ts, record)
 
         masks = is_lane_tree((scene, state))
         seen = None if search is None else watch

@@ -16,8 +16,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 from jaxtyping import Array
 
-SMOOTH = "smooth_function"
-"""Name of the calls whose inner comparisons do not make a kink (``smooth``)."""
+from polhode._kernels import SMOOTH
 
 _CALLS = frozenset(
     "jit pjit closed_call core_call custom_jvp_call custom_vjp_call remat2 checkpoint".split()  # noqa: SIM905
@@ -32,16 +31,6 @@ _OPAQUE = frozenset("while pure_callback io_callback cummax cummin".split())  # 
 
 _SORTED = 16
 """Most numbers that are sorted by comparisons of pairs."""
-
-
-def smooth(fn: Callable) -> Callable:
-    """``fn``, whose result is smooth although it compares (a choice between two formulas of the
-    same value): no switch is looked for inside."""
-
-    def smooth_function(*args):
-        return fn(*args)
-
-    return jax.jit(smooth_function)
 
 
 class Switched(NamedTuple):
@@ -111,6 +100,7 @@ _SIDE = _Rule(
     lambda u, level: jnp.where(level > 0, u, -u),
     lambda u, level: 1 - level,
 )
+_ABOVE = _SIDE._replace(level=lambda u: jnp.where(u > 0, 1, 0))
 _FLOOR = _Rule(
     jnp.floor,
     lambda u, level: jnp.minimum(u - level, level + 1 - u),
@@ -213,9 +203,9 @@ class _Walk:
             env.update(zip(eqn.outvars, self.equation(eqn, [read(v) for v in eqn.invars])))
         return [read(v) for v in jaxpr.outvars]
 
-    def side(self, u, jumps: bool = False):
+    def side(self, u, jumps: bool = False, rule: _Rule = _SIDE):
         """Whether ``u`` is not below zero, held within a step."""
-        return self.chooser.choose(u, _SIDE, jumps) > 0
+        return self.chooser.choose(u, rule, jumps) > 0
 
     def equation(self, eqn, given):
         name, x = eqn.primitive.name, [value for value, _ in given]
@@ -254,7 +244,8 @@ class _Walk:
             return [(self._larger(low, self._larger(middle, high, False), True), True)]
         if name in _ORDERED:
             a, b = jnp.asarray(x[0]), jnp.asarray(x[1])
-            above = self.side(a - b if name in ("gt", "ge") else b - a, True)
+            rule = _ABOVE if name in ("gt", "lt") else _SIDE
+            above = self.side(a - b if name in ("gt", "ge") else b - a, True, rule)
             return [(jnp.broadcast_to(above, out.shape), False)]
         if name == "floor":
             return [(self._whole(x[0], _FLOOR, out), False)]

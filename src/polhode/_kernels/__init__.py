@@ -20,6 +20,7 @@ from polhode._kernels._single_call import (
     kernel as kernel,
     put as put,
 )
+from polhode._kernels._smooth import SMOOTH as SMOOTH, smooth as smooth
 from polhode._kernels._stage import opaque_ones as opaque_ones, staged as staged
 from polhode._kernels._switch import is_plain as is_plain
 from polhode._kernels._undefined import (

@@ -39,7 +39,11 @@ _EXPLANATIONS = {
         "theta reached 0 or pi, where Euler angles break down: use ph.LiePoisson (or leave"
         " method=None) for this body"
     ),
-    Status.STEP_FAILED: "the step-size controller or an implicit solve gave up",
+    Status.STEP_FAILED: (
+        "the steps became too short to lead on, or an implicit solve gave up: a torque that jumps"
+        " again and again, or damping far faster than the motion, which wants an implicit solver"
+        " such as ph.LiePoisson(diffrax.Kvaerno5(), chunk=1)"
+    ),
     Status.INACCURATE: (
         "the estimated error exceeds the tolerance asked for tenfold: the body is chaotic, or its"
         " rounding alone is more; loosen rtol, shorten ts, or use float64"

@@ -19,6 +19,7 @@ from polhode._checks import (
     require,
     require_positive,
 )
+from polhode._kernels import smooth
 from polhode._parts import AbstractPart, shaped
 
 
@@ -142,7 +143,7 @@ class AbstractOrbit(AbstractPart):
         return jax.jvp(self, (t,), (jnp.ones_like(t),))[1]
 
 
-@jax.jit  # one program, not one for each operation
+@smooth
 def _place(orbit: "KeplerOrbit", t: Array) -> Array:
     return _by_elements(orbit, t) if orbit.position is None else _by_state(orbit, t)
 
