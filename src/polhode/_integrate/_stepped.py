@@ -127,7 +127,11 @@ class AbstractIntegration(AbstractMethod):
         check = getattr(self.solver, "check", None)
         if check is not None:
             check(self, scene, record)
-        if self._is_automatic and self._suits_loop(scene, state, ts, record):
+        jumps = _may_jump(scene)
+        by_loop = False
+        if self._is_automatic:
+            by_loop, jumps = self._suits_loop(scene, state, ts, record, jumps)
+        if by_loop:
             found = self._run_by_loop(scene, state, ts, rtol, record)
             if found is not None:
                 return found[0]
@@ -140,7 +144,7 @@ class AbstractIntegration(AbstractMethod):
             lanes, times = chunk.value()
             scene, state = eqx.combine(lanes, shared)
             times = ts if times is None else times[0]
-            return self._solve(scene, state, times, rtol, record)
+            return self._solve(scene, state, times, rtol, record, jumps)
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
         if n <= min(size, _SORTED):
@@ -154,7 +158,7 @@ class AbstractIntegration(AbstractMethod):
 
     def _start(self, scene, state, ts, record: Record):
         """The first state, with the work that is recorded, and what the chart can hold."""
-        y0, sound = self.chart.start(scene, state, ts[0])
+        y0, sound = self.chart.start(scene, state, ts[..., 0])
         if record.work:
             wheels = scene.dynamics.wheels
             loose = () if wheels is None else wheels.loose
@@ -200,12 +204,14 @@ class AbstractIntegration(AbstractMethod):
     def _is_automatic(self) -> bool:
         return isinstance(self.solver, Automatic) and self.controller is None
 
-    def _suits_loop(self, scene, state, ts, record: Record) -> bool:
-        """Whether explicit steps are the faster ones, or the only ones that end at switches."""
+    def _suits_loop(self, scene, state, ts, record: Record, jumps: bool) -> tuple[bool, bool]:
+        """Whether explicit steps are the faster ones, or the only ones that end at switches; and
+        whether other steps are to be searched for jumps."""
         bodies = state.wxyz.shape[0]
-        if bodies <= FEW_BODIES:
-            return bodies > 0
-        return _may_jump(scene) and self._problem(scene, state, ts, record).switches.count > 0
+        if bodies <= FEW_BODIES or not jumps:
+            return 0 < bodies <= FEW_BODIES, jumps
+        switches = self._problem(scene, state, ts, record).switches
+        return switches.count > 0, bool(switches.hidden)
 
     def _problem(self, scene, state, ts, record: Record, search: Search | None = None) -> Problem:
         """The field of one body, and the events that are searched for."""
@@ -270,28 +276,28 @@ class AbstractIntegration(AbstractMethod):
         moved = Moved(seen, last, solved.steps, status, solved.error)
         return self._samples(scene, moved, times, sound, record), found
 
-    def _solve(self, scene, state, ts, rtol, record: Record) -> Samples:
+    def _solve(self, scene, state, ts, rtol, record: Record, jumps: bool) -> Samples:
         """One chunk of lanes."""
         y0, sound = self._start(scene, state, ts, record)
         kept = ts[-1:] if record.final_only else ts
         edges = None if scene.torque is None else scene.torque.edges
         if edges is None:
-            found = self._moved(scene, state, y0, ts, rtol, record)
+            found = self._moved(scene, state, y0, ts, rtol, record, jumps)
             return self._samples(scene, found, kept, sound, record)
 
         def move(middle, y, times, parts):
             torque = scene.torque.during(middle)
             now = Scene(scene.inertia, scene.potential, torque, scene.rotors)
             share = jnp.maximum(rtol / parts, 8 * jnp.finfo(rtol.dtype).eps)
-            return self._moved(now, state, y, times, share, record)
+            return self._moved(now, state, y, times, share, record, jumps)
 
         found = in_segments(move, y0, ts, edges, record.final_only)
         return self._samples(scene, found, kept, sound, record)
 
-    def _moved(self, scene, state, y0, ts, rtol, record) -> Moved:
+    def _moved(self, scene, state, y0, ts, rtol, record, jumps: bool) -> Moved:
         """States from ``y0`` on."""
         term, dynamics = self._posed(scene, state, ts, record)
-        asked = _Asked(ts, rtol, self.dt0, self.max_steps, record.final_only, _may_jump(scene))
+        asked = _Asked(ts, rtol, self.dt0, self.max_steps, record.final_only, jumps)
         if self.controller is None:
             make = getattr(self.solver, "stepping", None)
             stepping = asked.stock(self.solver, y0, term, dynamics) if make is None else make(asked)
