@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array
 
 from polhode._integrate._loop import Motion
@@ -91,12 +91,16 @@ class Problem(NamedTuple):
 
         bare = [x[0] if lane else x for x, lane in zip(arrays, self.lanes)]
         t, y = jnp.zeros((), self.dtype), [jnp.zeros(1, self.dtype)] * size
-        closed = formula(frozen, *bare, jnp.zeros(count, self.dtype), t, *y)
+        free = [jnp.zeros(count, self.dtype), t, *y]
+        closed = formula(frozen, *bare, *free)
         program: list[Any] = []
 
         def prepare(*some):
             found = specialise(closed, some)
-            program[:] = [found.run]
+            shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in (*found.held, *free)]
+            held = len(found.held)
+            # as a program of its own, for the function knows the values that were held
+            program[:] = [jax.make_jaxpr(lambda *x: found.run(x[:held], *x[held:]))(*shapes)]
             return list(found.held)
 
         axes = [0 if lane else None for lane in self.lanes]
@@ -105,12 +109,10 @@ class Problem(NamedTuple):
         held = (
             jax.vmap(prepare, in_axes=tuple(axes), out_axes=out)(*arrays) if arrays else prepare()
         )
-        (run,) = program
+        run = jaxpr_as_fun(program[0])
 
         def of_one(held, levels, t, y):
-            *rates, margins, turned = run(
-                tuple(held), levels, t, *(y[i][None] for i in range(size))
-            )
+            *rates, margins, turned = run(*held, levels, t, *(y[i][None] for i in range(size)))
             return jnp.concatenate(rates), margins, turned
 
         def rates(held, levels, t, y):

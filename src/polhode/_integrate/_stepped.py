@@ -248,11 +248,12 @@ class AbstractIntegration(AbstractMethod):
         times = ts[..., -1:] if record.final_only else ts
         told, start, y = (dynamics.units, rtol), ts[..., 0], jnp.stack(leaves)
         asked = Search() if search is None else search
+        program = problem._replace(arrays=[])  # a rule of derivatives holds no traced values
         passing = asked.passing
 
         def make(arrays, told, linked, asked=passing):
             units, rtol = told
-            motion = problem.motion(arrays, _by_units, units)
+            motion = program.motion(arrays, _by_units, units)
             return motion, Wanted(
                 rtol, self.max_steps, asked.capacity, asked.directions, asked.terminal, linked
             )
