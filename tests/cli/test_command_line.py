@@ -386,7 +386,7 @@ def test_explain_names_the_method(here, capsys):
     out = capsys.readouterr().out
     assert "small top" in out
     assert "120 clones, seed 5" in out
-    assert "LagrangeTop" in out or "LiePoisson(Extrapolation)" in out
+    assert "LagrangeTop" in out or "LiePoisson(Automatic)" in out
     (here / "free.toml").write_text(TOP[: TOP.index("[potential]")] + TOP[TOP.index("[times]") :])
     assert main(["explain", "free.toml"]) == 0
     assert "ClosedForm" in capsys.readouterr().out

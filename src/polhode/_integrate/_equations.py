@@ -12,13 +12,16 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
 from polhode._checks import is_concrete
-from polhode._hamiltonian import relative
+from polhode._hamiltonian import LiePoissonUnits, relative
 from polhode._integrate._bound_term import BoundTerm, uses
 from polhode._integrate._columns import table
 from polhode._integrate._costates import AnyCostate, FlatCostate
 from polhode._integrate._extrapolation import order_for, units_of
 from polhode._integrate._march import Field, Limits, fresh, march
 from polhode._kernels import Distinct, attached, is_slope, kernel, linear, specialise, zeros
+
+_LOST = 1000
+"""By how many ``rtol`` the way back may miss the state at its start."""
 
 _STEPS = 2**20
 """Most steps of a derivative between two saved times."""
@@ -236,6 +239,15 @@ class Equations:
         held, own = (full.held, bare.held), all(s == lane for s in shapes)
         by_entry, units = full.by_entry and bare.by_entry, self.costate.units
         z, mu = self._solve(c, rates, held, z, mu, span[::-1], horizon, units, by_entry, own)
+        # Backwards, what damping has drawn together runs apart: where the state found on the way
+        # has missed the start, the slopes found beside it mean nothing.
+        rtol, told = jax.tree.unflatten(self.told, self._parts(c)[3])
+        rest = told.least**2 if isinstance(told, LiePoissonUnits) else 0
+        apart = sum((a - b) ** 2 for a, b in zip(z[:3], start[:3]))
+        unit = sum((a * a + b * b for a, b in zip(start[:3], end[:3])), start=rest)
+        lost = apart > (_LOST * rtol) ** 2 * unit
+        z = [jnp.where(lost, jnp.nan, x) for x in z]
+        mu = [jnp.where(lost if m.shape == lost.shape else jnp.any(lost), jnp.nan, m) for m in mu]
         mu = [_summed(m, jnp.shape(made[i])) for m, i in zip(mu, which)]
         return [*self.costate.finish(z, start, end, slopes), *pull(mu)]
 

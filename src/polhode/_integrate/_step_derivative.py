@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.interpreters import ad
 from jaxtyping import Array
 
 from polhode._integrate._dop853 import DENSE_STAGES, NODES, STAGES, WEIGHTS
@@ -136,7 +137,9 @@ def _cotangent(opened, at, given, slopes):
             full[i] = x
         return [x for x in opened(full)[0].held if jnp.issubdtype(x.dtype, jnp.inexact)]
 
-    motion, wanted = opened(arrays)
+    # derivatives of slopes ask for those of the places of switches
+    linked = any(isinstance(x, ad.JVPTracer) for x in given)
+    motion, wanted = opened(arrays, linked)
     floats = [k for k, x in enumerate(motion.held) if jnp.issubdtype(x.dtype, jnp.inexact)]
     _, pull = jax.vjp(held_of, *chosen)
     sums = [jnp.zeros_like(motion.held[k]) for k in floats]

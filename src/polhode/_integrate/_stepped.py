@@ -264,7 +264,9 @@ class AbstractIntegration(AbstractMethod):
         found = None
         if search is not None:
             found, times, states = with_events(search, solved, times, states)
-        if problem.switches.count or times.ndim > 1:
+        # back along the exact equations an error of a damped motion would grow; along its steps not
+        damped = scene.torque is not None or bool(scene.dynamics.coupled)
+        if problem.switches.count or times.ndim > 1 or damped:
             states = samples(make, problem.arrays, told, y, start, times, states)
         else:
             equations, c = equations_of(term, dynamics, y0, start, rtol, False)
