@@ -206,7 +206,7 @@ def test_rates_alone_compile_to_less():
             wxyz = jnp.ones((8, 4)) if wanted.get("attitude", True) else None
             return free.free_motion(moments, wxyz, omega, t, **wanted)
 
-        return str(jax.make_jaxpr(motion)(*shapes)).count("\n")
+        return jax.jit(motion).lower(*shapes).as_text().count("\n")
 
     assert operations(attitude=False) < 0.6 * operations()
 

@@ -1,7 +1,7 @@
 """What every way of moving the bodies of a scene has in common."""
 
 import abc
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Array
@@ -68,6 +68,8 @@ class AbstractMethod(eqx.Module):
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         """Samples at ``ts`` (T,) or (N, T) of lanes whose state holds at the first time."""
 
-    def search(self, scene: Scene, state: State, ts: Array, rtol: Array, search, final_only: bool):
+    def search(
+        self, scene: Scene, state: State, ts: Array, rtol: Array, search: Any, final_only: bool
+    ) -> Any:
         """Events on the way, where the method itself can look for them; None where it cannot."""
         return None
