@@ -77,7 +77,9 @@ def test_what_cannot_be_looked_into_is_named():
 
 LAWS = {
     "clip": lambda p: lambda t, q, w: jnp.clip(-p[0] * w - p[1] * q[1:], -0.2, 0.2),
-    "dead band": lambda p: lambda t, q, w: -p[0] * jnp.where(jnp.abs(w) > p[1], w, 0.0),
+    "dead band": lambda p: (
+        lambda t, q, w: -p[0] * jnp.where(jnp.abs(w) > p[1], w - jnp.sign(w) * p[1], 0.0)
+    ),
     "short way": lambda p: lambda t, q, w: -p[0] * jnp.sign(q[0]) * q[1:] - p[1] * w,
     "pulse": lambda p: (
         lambda t, q, w: jnp.where(
@@ -144,7 +146,7 @@ def test_gradients_through_switches(law):
         back = jax.grad(lambda x, rtol=rtol: loss(x, rtol))(given)
         on = jax.jacfwd(lambda x, rtol=rtol: loss(x, rtol))(given)
         for found in (back, on):
-            assert np.linalg.norm(found - want) < max(50 * rtol, 1e-8) * size
+            assert np.linalg.norm(found - want) < max(2 * rtol, 1e-8) * size
 
 
 def test_a_gradient_through_a_jump():
@@ -177,3 +179,16 @@ def test_a_gradient_through_a_jump():
     want = [-0.1 * met / rate, 1 + 0.1 / (rate * level)]
     np.testing.assert_allclose(by_p, want, rtol=1e-8)
     np.testing.assert_allclose(by_omega[2], -0.1 / (rate * begin), rtol=1e-8)
+
+
+def test_a_side_beyond_which_the_field_is_no_number():
+    """Steps hold the side of a root until the motion is there, and do not pass it."""
+
+    def law(t, wxyz, omega):
+        size = 1 + jnp.where(omega[2] > 0, jnp.sqrt(omega[2]), 0.0)
+        return -0.3 * size * jnp.array([0.0, 0, 1])
+
+    scene = ph.Scene(ph.Inertia.spherical(1.0), None, ph.FeedbackTorque(law))
+    found = ph.simulate(scene, ph.State(WXYZ, [0.0, 0.0, 1.0]), [0.0, 5.0])
+    met = 2 / 0.3 * (1 - np.log(2))  # dw/dt = -0.3 (1 + sqrt(w)), then -0.3
+    np.testing.assert_allclose(found.omega_body[1, 2], -0.3 * (5 - met), rtol=1e-8)

@@ -252,6 +252,13 @@ def advance(motion: Motion, wanted: Wanted, start: Array, ts: Array, walk: Walk,
     proposed = jnp.where(cut, jnp.maximum(walk.width, width * factor), width * factor)
     guess = still(_first_width(motion, wanted, walk.y, tried.stages[0], length))
     proposed = jnp.where(begins, guess, proposed)
+    broken = None
+    if motion.switches:
+        broken, share = _broken(tried, ratio, alive & ~begins)
+        proposed = jnp.where(broken.any, 0.98 * width * share, proposed)
+        near = width * share <= 64 * eps * jnp.maximum(walk.gone, 0.01 * length)
+        broken = broken._replace(snaps=broken.any & near)
+        proposed = jnp.where(broken.snaps, guess, proposed)
     rows, place = _save(tried, walk, rows, ts, start, jnp.where(good, gone, -1), width)
 
     def pick(a, b):
@@ -276,6 +283,12 @@ def advance(motion: Motion, wanted: Wanted, start: Array, ts: Array, walk: Walk,
     )
     if turn is not None:
         now, rows = _turned(motion, wanted, walk, now, rows, tried, turn, wrong, good, width, start)
+        snaps = broken.snaps[None] & broken.flips
+        now = now._replace(
+            levels=jnp.where(snaps, 1 - walk.levels, now.levels),
+            lately=jnp.where(snaps, 1, now.lately),
+            fresh=now.fresh | broken.snaps,
+        )
     return now._replace(ended=_ended(wanted, now, alive, length, ratio, eps)), rows
 
 
@@ -354,6 +367,32 @@ def _ended(wanted, now: Walk, alive, length, ratio, eps) -> Array:
     why = jnp.where(now.gone >= length, ARRIVED, why)
     why = jnp.where(now.ended == STOPPED, STOPPED, why)
     return jnp.where(alive, why, now.ended).astype(now.ended.dtype)
+
+
+class _Broken(NamedTuple):
+    """Steps that held a side beyond which the field is no number, as that of ``where(x > 0,
+    sqrt(x), 0)``: ``any`` (B,); ``flips`` (K, B), the switches that were passed; ``snaps`` (B,):
+    the start is so near that they turn there."""
+
+    any: Array
+    flips: Array
+    snaps: Array
+
+
+def _broken(tried: Tried, ratio: Array, alive: Array) -> tuple[_Broken, Array]:
+    """Such steps, and the part of each up to the first switch."""
+    margins = tried.margins[:STAGES]
+    below = margins < 0
+    order = jnp.arange(STAGES)[:, None]
+    stage = jnp.min(jnp.where(jnp.any(below, axis=1), order, STAGES), axis=0)
+    pick = order == stage[None]
+    there = jnp.sum(jnp.where(pick[:, None], jnp.where(below, margins, 0), 0), axis=0)
+    node = jnp.sum(jnp.where(pick, jnp.asarray(NODES[:STAGES], ratio.dtype)[:, None], 0), axis=0)
+    begin = jnp.maximum(margins[0], 0)
+    flips = there < 0
+    share = jnp.min(jnp.where(flips, begin / jnp.where(flips, begin - there, 1), 1), axis=0)
+    broken = alive & ~jnp.isfinite(ratio) & jnp.any(flips, axis=0)
+    return _Broken(broken, flips, broken), jax.lax.stop_gradient(node * share)
 
 
 class Turn(NamedTuple):

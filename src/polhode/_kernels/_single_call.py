@@ -363,7 +363,13 @@ def _unit_lowered(*arrays, whole, shapes):
 
 
 def _unit_batch(arrays, dims, *, whole, shapes):
-    out = jax.vmap(lambda *x: list(_unit_lowered(*x, whole=whole, shapes=shapes)), dims)(*arrays)
+    size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
+
+    def one(*x):
+        # XLA divides loops over large arrays among threads, which it cannot do within a unit
+        return list(_unit_lowered(*x, whole=whole, shapes=shapes) if size <= FEW else whole(*x))
+
+    out = jax.vmap(one, dims)(*arrays)
     return out, [0] * len(out)
 
 
