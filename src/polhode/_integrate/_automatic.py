@@ -6,7 +6,7 @@ from polhode._integrate._extrapolation import Extrapolation
 class Automatic(Extrapolation):
     """What ``ph.simulate`` integrates with by itself.
 
-    Few bodies, and fields with kinks or jumps, are moved by explicit Runge-Kutta steps of order 8
-    that end where the field kinks or jumps (``_loop.py``); batches of smooth fields by the
-    extrapolated midpoint rule, with the arguments of ``ph.Extrapolation``.
+    Few bodies on which torques act, and fields with kinks or jumps, are moved by explicit
+    Runge-Kutta steps of order 8 that end where the field kinks or jumps (``_loop.py``); others by
+    the extrapolated midpoint rule, with the arguments of ``ph.Extrapolation``.
     """
