@@ -11,7 +11,7 @@ import numpy as np
 from polhode._extras import imported
 from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._fit import fit_light_curve
-from polhode.lightcurve._frequencies import fourier_pairs
+from polhode.lightcurve._frequencies import Pairs, fourier_lattices, fourier_pairs
 from polhode.lightcurve._hypotheses import meaning
 from polhode.lightcurve._read import read_light_curve
 from polhode.lightcurve._solutions import Fit
@@ -44,12 +44,17 @@ def table(fit: Fit) -> str:
     return "\n".join([*lines, *(f"note: {note}" for note in fit.notes)])
 
 
-def frequency_table(pairs, count: int = 6) -> str:
-    """Candidate pairs of frequencies, and what each would mean."""
-    lines = ["  explained  f_phi [1/d]  f_psi [1/d]  meaning"]
+def frequency_table(pairs: Pairs, count: int = 6, *, lines: bool = False) -> str:
+    """Candidate pairs of frequencies, and what each would mean; ``lines``: of two of their sums."""
+    if lines:
+        text = ["  explained  line 1 [1/d]  line 2 [1/d]"]
+        for a, b, part in list(zip(pairs.f_phi, pairs.f_psi, pairs.explained))[:count]:
+            text.append(f"  {part:8.1%}  {a:12.5g}  {b:12.5g}")
+        return "\n".join(text)
+    text = ["  explained  f_phi [1/d]  f_psi [1/d]  meaning"]
     for a, b, part in list(zip(pairs.f_phi, pairs.f_psi, pairs.explained))[:count]:
-        lines.append(f"  {part:8.1%}  {a:11.5g}  {b:11.5g}  {meaning(a, b)}")
-    return "\n".join(lines)
+        text.append(f"  {part:8.1%}  {a:11.5g}  {b:11.5g}  {meaning(a, b)}")
+    return "\n".join(text)
 
 
 def run(
@@ -117,13 +122,20 @@ def fitted(
         pairs = fourier_pairs(
             curve.t, curve.magnitude, columns=curve.columns(np.inf)[0], max_frequency=max_frequency
         )
-        say(frequency_table(pairs))
-        for note in (*curve.notes, "without vectors to Sun and observer no body can be fitted."):
+        lines = pairs.is_cut
+        if lines:  # the square of the grid is too small: pairs of lines reach further
+            pairs = fourier_lattices(
+                curve.t, curve.magnitude, columns=curve.columns(np.inf)[0],
+                max_frequency=max_frequency,
+            )  # fmt: skip
+        say(frequency_table(pairs, lines=lines))
+        missing = "without vectors to Sun and observer no body can be fitted."
+        for note in (*curve.notes, *pairs.warnings(), missing):
             say(f"note: {note}")
         return None
     imported("the figure of a light curve", "matplotlib", extra="plot")  # before the search
     fit = fit_light_curve(curve, trials=trials, max_frequency=max_frequency, floor=floor, seed=seed)
-    say(frequency_table(fit.pairs))
+    say(frequency_table(fit.pairs, lines=True))
     say(table(fit))
     _write(fit, title, picture, document, say)
     return fit

@@ -122,7 +122,7 @@ def fit_light_curve(
     order = _distinct(state, pairs.resolution, max(max_solutions, BATCH))
     solutions, scale, alike = described(problem, state, order, curve, normals, limit)
     solutions = solutions[: max(max_solutions, sum(s.probability > EXCLUDED for s in solutions))]
-    notes = notes_on(curve, solutions, scale, alike)
+    notes = notes_on(curve, solutions, scale, alike) + pairs.warnings()
     if not again:
         notes += (
             "No second search found the best motion again: better ones may have been missed. Ask"
