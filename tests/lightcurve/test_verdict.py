@@ -6,7 +6,7 @@ import pytest
 import polhode as ph
 from benchmarks.light_curves import directions
 from polhode import lightcurve
-from polhode.lightcurve import _nulls, _solutions, _verdict
+from polhode.lightcurve import _model, _nulls, _refine, _solutions, _verdict
 
 Verdict = lightcurve.Verdict
 NOISE, P_PHI, P_PSI = 0.03, 0.42, 1.31
@@ -48,6 +48,7 @@ def solution(model, P_phi=P_PHI, P_psi=P_PSI, odds=1.0, **others):
     entries = dict.fromkeys(_solutions.Solution._fields)
     entries |= {
         "P_phi": P_phi, "P_psi": P_psi, "mode": ph.Mode.LAM, "probability": odds, "model": model,
+        "parameters": 10.0,
         **others,
     }  # fmt: skip
     return _solutions.Solution(**entries)  # pyright: ignore[reportArgumentType]
@@ -238,6 +239,101 @@ def test_precession_of_the_short_axis_is_counted_in_the_motion():
         rate = abs(turned[-1] - turned[0]) / 400 / (2 * np.pi)
         body = solution(None, float(found.P_phi), float(found.P_psi))
         assert 1 / body.P_phi_short_axis == pytest.approx(rate, rel=0.01)
+
+
+@pytest.fixture(scope="module")
+def convex_case():
+    """A convex body that is no ellipsoid, seen in 12 nights, and its true motion."""
+    rng = np.random.default_rng(7)
+    blank = curve_of(flat, nights=12, days=30, each=20)
+    rough = 0.12 * rng.normal(size=16) * np.r_[0, np.ones(15)]
+    square = np.array([1.0, 0.7, 0.5]) ** 2
+    moments = square.sum() - square
+    state = ph.State([0.8, 0.4, -0.3, 0.2], np.array([11.0, 3.0, 5.0]))
+    back = ph.rotation.conjugate(ph.simulate(ph.Scene(ph.Inertia(moments)), state, blank.t).wxyz)
+    assert blank.sun is not None
+    assert blank.observer is not None
+    seen = [ph.rotation.rotate(back, v) for v in (blank.sun, blank.observer)]
+    ellipsoid = lightcurve.Convex.from_ellipsoid(np.array([1.0, 0.7, 0.5]), 1500)
+    more = np.exp(rough @ np.asarray(lightcurve.harmonics(ellipsoid.normals, 3)))
+    body = lightcurve.Convex(ellipsoid.normals, ellipsoid.areas * more)
+    light = -2.5 * np.log10(np.asarray(body.brightness(*seen)))
+    value = light + 0.02 * rng.normal(size=light.size)
+    curve = blank._replace(magnitude=value, sigma=np.full(light.size, 0.02))
+    body = _model.Bodies(
+        np.r_[np.log(square[1:]) / 2, np.log(square[1:]) / 2, state.omega_body, 0.3][None],
+        np.asarray(ph.rotation.normalise(state.wxyz))[None],
+    )
+    return curve, body, ph.periods(ph.Inertia(moments), state)
+
+
+def test_derivatives_of_convex_bodies(convex_case):
+    curve, body, _ = convex_case
+    points = curve.points(0.0, 0.02)
+    normals = lightcurve.Convex.from_ellipsoid(np.ones(3), 200).normals
+    rows = lightcurve.harmonics(normals, _refine.DEGREE)[1:]
+    known = (normals, 1.0 + normals[:, 0] ** 2, rows)
+    coefficients = 0.05 * np.random.default_rng(0).normal(size=_refine.HARMONICS)
+    _, motion, shape, open_area, by_open = _refine._light(body, coefficients, points, known)
+    size = 1e-6
+
+    def value(step, more):
+        change = np.zeros((1, body.unknowns.shape[1] + 3))
+        change[0, _refine._MOTION], change[0, -3:] = step[:5], step[5:]
+        turned = ph.rotation.rotation_vector_to_wxyz(change[:, -3:])
+        moved = _model.Bodies(
+            body.unknowns + change[:, :-3], ph.rotation.multiply(turned, body.wxyz)
+        )
+        out = _refine._light(moved, coefficients + more, points, known)
+        return np.asarray(out[0]), np.asarray(out[3])
+
+    none = np.zeros(_refine.HARMONICS)
+    for k in range(8):
+        e = size * np.eye(8)[k]
+        measured = (value(e, none)[0] - value(-e, none)[0]) / (2 * size)
+        scale = np.abs(measured).max()
+        # facets appear and vanish: single points differ
+        off = np.abs(motion[:, k] - measured) / scale
+        assert np.median(off) < 1e-6
+        assert np.quantile(off, 0.95) < 1e-2
+    for k in (0, 5, 20):
+        e = size * np.eye(_refine.HARMONICS)[k]
+        ends = [value(np.zeros(8), x) for x in (e, -e)]
+        measured, opened = ((a - b) / (2 * size) for a, b in zip(*ends, strict=True))
+        np.testing.assert_allclose(shape[:, k], measured, atol=1e-6)
+        np.testing.assert_allclose(by_open[k], opened, atol=1e-6)
+    assert open_area.shape == (3,)
+
+
+def test_a_convex_shape_leaves_the_noise_and_periods_within_their_errors(convex_case):
+    curve, body, truth = convex_case
+    linear, phase = _nulls.Linear(curve, 0.02), lightcurve.SeeligerPhase()
+    body = body._replace(unknowns=body.unknowns[:, : 7 + len(phase.typical)])
+    start = solution(
+        curve.magnitude, moments=np.array(_model.moments_of(body.unknowns[0])),
+        axes=np.exp(np.r_[0, body.unknowns[0, 2:4]]), omega_body=body.unknowns[0, 4:7],
+        coefficients=body.unknowns[0, 7:], wxyz=body.wxyz[0], offsets=np.zeros(13),
+    )  # fmt: skip
+    # a second start whose pole is 2 degrees off ends as a copy of the first
+    near = start._replace(
+        wxyz=np.asarray(ph.rotation.multiply(np.array([1.0, 0.01, 0.01, 0]), start.wxyz))
+    )
+    found, scale, alike = _refine.refined_solutions(
+        (start, near), linear, curve.points(0.0, 0.02), phase, 3.0
+    )
+    assert len(found) == 1
+    best = found[0]
+    assert scale == pytest.approx(1.0, abs=0.12)
+    assert alike < 1.5
+    assert best.harmonics is not None
+    for name in ("P_phi", "P_psi"):
+        error = getattr(best, name) - float(getattr(truth, name))
+        assert abs(error) < 3.5 * getattr(best, name + "_std")
+        assert getattr(best, name + "_std") < 1e-3 * getattr(best, name)
+    # an ellipsoid with the true motion leaves more
+    ellipsoid = _model.magnitudes(phase, body, curve.points(0.0, 0.02))
+    left = linear.projected(np.asarray(ellipsoid)[0, : curve.t.size]) - linear.data
+    assert np.std(left) > 1.5 * scale
 
 
 @pytest.mark.slow

@@ -11,6 +11,7 @@ from polhode.lightcurve._frequencies import Pairs, fourier_lattices
 from polhode.lightcurve._hypotheses import Hypotheses, hypotheses
 from polhode.lightcurve._model import Bodies, Points
 from polhode.lightcurve._phase import HG1G2, AbstractPhase, SeeligerPhase
+from polhode.lightcurve._refine import refined_solutions
 from polhode.lightcurve._search import tried
 from polhode.lightcurve._solutions import (
     EXCLUDED,
@@ -50,6 +51,7 @@ def fit_light_curve(
     limit: float = 3.0,
     seed: int = 0,
     max_solutions: int = 12,
+    convex: bool = True,
 ) -> LightCurveFit:
     """Every tumbling ellipsoid, of free inertia, that explains a light curve; without a guess.
 
@@ -124,6 +126,11 @@ def fit_light_curve(
     state = _joined(state, mirrored)
     order = _distinct(state, pairs.resolution, max(max_solutions, BATCH))
     solutions, scale, alike = described(problem, state, order, curve, normals, limit)
+    linear, nulls = null_models(curve, pairs, offset_sigma)
+    ellipsoids = solutions[:1]
+    if convex:
+        exact = curve.points(0.0, offset_sigma)  # without the floor
+        solutions, scale, alike = refined_solutions(solutions, linear, exact, phase, limit)
     solutions = solutions[: max(max_solutions, sum(s.probability > EXCLUDED for s in solutions))]
     notes = notes_on(curve, solutions, scale, alike) + pairs.warnings()
     if not again:
@@ -131,8 +138,9 @@ def fit_light_curve(
             "No second search found the best motion again: better ones may have been missed. Ask"
             " for more trials or searches.",
         )
-    linear, nulls = null_models(curve, pairs, offset_sigma)
-    judgement = judged(linear, nulls, pairs, solutions, found_again=again, limit=limit)
+    judgement = judged(
+        linear, nulls, pairs, solutions, found_again=again, limit=limit, others=ellipsoids
+    )
     return LightCurveFit(
         solutions, curve, pairs, meant, scale, alike, offset_sigma, notes, judgement.verdict,
         judgement.reasons, judgement.par, judgement.models, judgement.misfit, judgement.agreement,

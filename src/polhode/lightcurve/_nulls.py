@@ -31,7 +31,7 @@ class Model(NamedTuple):
 
     name: str
     log_evidence: float  # natural logarithm, without a constant that all models share
-    parameters: int  # besides offsets and phase function
+    parameters: float  # besides offsets and phase function
     rms: float  # weighted, of the residuals [mag]
     misfit: float  # residuals over the errors of the light curve itself, without any floor
     periods: tuple[float, ...]  # time unit of the light curve [day]
@@ -42,7 +42,7 @@ class Residuals(NamedTuple):
 
     name: str
     values: np.ndarray
-    parameters: int
+    parameters: float
     log_trials: float
     periods: tuple[float, ...] = ()
 
@@ -85,6 +85,19 @@ class Linear:
             matrix = self.projected(waves)
             rest = rest - matrix @ np.linalg.lstsq(matrix, rest, rcond=1e-9)[0]
         return rest[: self.t.size] / self.root
+
+    def offsets(self, residuals: np.ndarray, model) -> np.ndarray:
+        """Offsets that, with the columns beyond, are part of a model with these ``residuals``.
+
+        ``model``: a solution with offsets near them, from which they differ by what fits best.
+        """
+        change = self.curve.magnitude + residuals - model.model
+        count = len(self.curve.columns()[0])
+        own = self.columns[:count].T
+        matrix, data = own * self.root[:, None], change * self.root
+        out = np.array(model.offsets, float)
+        out[:count] += np.linalg.lstsq(matrix, data, rcond=1e-9)[0]
+        return out
 
     def chi2(self, waves: np.ndarray) -> float:
         """Sum of squares of the residuals over their errors."""
@@ -194,10 +207,12 @@ def two_periods(linear: Linear, pairs: Pairs, solutions) -> list[Residuals]:
 
 
 def tumbler(linear: Linear, pairs: Pairs, best) -> Residuals:
-    """The best tumbling ellipsoid: two moments, two axes, attitude and rates."""
+    """A tumbling body: two moments, attitude, rates, and the shape, as far as it is determined."""
     log_trials = _log_pairs(pairs.max_frequency, linear.t[-1])
     rest = linear.curve.magnitude - best.model
-    return Residuals("tumbling body", rest, 10, log_trials, (float(best.P_phi), float(best.P_psi)))
+    return Residuals(
+        "tumbling body", rest, best.parameters, log_trials, (float(best.P_phi), float(best.P_psi))
+    )
 
 
 def _log_pairs(max_frequency: float, span: float) -> float:

@@ -46,6 +46,9 @@ class Solution(NamedTuple):
     model: np.ndarray  # (n,) magnitudes, offsets included
     weights: np.ndarray  # (n,) in [0, 1]: robust weight of each point
     mirror_of: int | None  # number of the solution whose mirror image this is
+    # (k,) of the logarithm of the surface density over that of the ellipsoid; None: an ellipsoid
+    harmonics: np.ndarray | None = None
+    parameters: float = 10.0  # that the points determine, besides offsets and phase function
 
     @property
     def P_phi_short_axis(self) -> float:
@@ -138,6 +141,13 @@ def _derived(x, wxyz):
 
 
 _derived_slopes = jax.jit(jax.vmap(jax.jacfwd(_derived)))
+
+
+def derived_slopes(bodies: Bodies) -> np.ndarray:
+    """Derivatives (b, 8, u + 3) of ln P_phi, ln P_psi, moments and momentum's direction."""
+    unknowns, wxyz = map(np.asarray, bodies)
+    x = jnp.asarray(np.c_[unknowns, np.zeros((len(unknowns), 3))])
+    return np.asarray(_derived_slopes(x, jnp.asarray(wxyz)))
 
 
 def described(problem: Problem, state: State, order, curve: LightCurve, normals, limit):
@@ -266,9 +276,8 @@ def notes_on(curve: LightCurve, solutions, scale: float, alike: float) -> tuple[
         )
     if scale**2 > REACHED:
         notes.append(
-            f"Residuals are {scale:.1f} times the errors assumed: an ellipsoid is not the whole"
-            " truth, and errors follow from the residuals; trust none to better than a factor of"
-            " two."
+            f"Residuals are {scale:.1f} times the errors assumed: the body is not the whole truth,"
+            " and errors follow from the residuals; trust none to better than a factor of two."
         )
     if alike > 1:
         notes.append(

@@ -75,11 +75,16 @@ def judged(
     *,
     found_again: bool,
     limit: float,
+    others: tuple[Solution, ...] = (),
 ) -> Judgement:
-    """Compare the null hypotheses with the best tumbling body, and say what may be claimed."""
+    """Compare the null hypotheses with the best tumbling body, and say what may be claimed.
+
+    ``others``: more bodies to compare, such as the best ellipsoid, which has fewer parameters.
+    """
     curve = linear.curve
     best = solutions[0]
-    everything = [*nulls, *two_periods(linear, pairs, solutions), tumbler(linear, pairs, best)]
+    everything = [*nulls, *two_periods(linear, pairs, solutions)]
+    everything += [tumbler(linear, pairs, body) for body in (best, *others)]
     models = compared(linear, everything, likeness)
     classes = same_periods(solutions, pairs.resolution)
     agreement = resampled(curve, linear.root, solutions, classes, limit)
@@ -89,13 +94,14 @@ def judged(
     listed = tuple(m for m in (silent, single, double, body) if m is not None)
     assert silent is not None  # both are always fitted
     assert body is not None
+    own = models[len(models) - 1 - len(others)]  # the best of the list, whatever its evidence
     null = max(m.log_evidence for m in (silent, single) if m is not None)
     two = max(m.log_evidence for m in (double, body) if m is not None)
     more = two - null  # of two periods over one or none
     reasons: list[str] = []
 
     def result(verdict: Verdict, par: int) -> Judgement:
-        return Judgement(verdict, tuple(reasons), par, listed, body.misfit, agreement)
+        return Judgement(verdict, tuple(reasons), par, listed, own.misfit, agreement)
 
     if linear.independent < _FEW_POINTS:
         reasons.append(
@@ -115,8 +121,8 @@ def judged(
             period = single.periods[0]
             cycles = float(linear.t[-1]) / period
             reasons.append(
-                f"One period, {period:.6g} d or a multiple or alias of it, explains the points:"
-                f" ln Z {-more:+.1f} over two periods."
+                f"One period, {period:.6g} d ({24 * period:.5g} h) or a multiple or alias of it,"
+                f" explains the points: ln Z {-more:+.1f} over two periods."
             )
             return result(Verdict.ONE_PERIOD, 1 if cycles < _CYCLES else 2)
         reasons.append(
@@ -133,9 +139,9 @@ def judged(
         reasons.append(
             "A series of two periods explains the points, but no tumbling body that was found does."
         )
-    if body.misfit >= _MISFIT:
+    if own.misfit >= _MISFIT:
         reasons.append(
-            f"The best body leaves {body.misfit:.1f} times the errors of the points; no solution"
+            f"The best body leaves {own.misfit:.1f} times the errors of the points; no solution"
             f" is certain from {_MISFIT:g} on."
         )
     rivals = len({c for c, s in zip(classes, solutions, strict=True) if s.probability > EXCLUDED})
