@@ -9,6 +9,7 @@ from polhode import lightcurve
 from polhode.lightcurve import _model, _nulls, _refine, _solutions, _verdict
 
 Verdict = lightcurve.Verdict
+PHASE = lightcurve.SeeligerPhase()
 NOISE, P_PHI, P_PSI = 0.03, 0.42, 1.31
 
 
@@ -67,7 +68,7 @@ def cases():
     for name, light in (("noise", flat), ("rotator", rotating), ("tumbler", tumbling)):
         curve = curve_of(light)
         pairs = pairs_of(curve)
-        out[name] = curve, pairs, *_verdict.null_models(curve, pairs, 0.02)
+        out[name] = curve, pairs, *_verdict.null_models(curve, pairs, 0.02, PHASE)
     return out
 
 
@@ -127,6 +128,25 @@ def test_the_list_of_models_begins_with_the_null_hypotheses(cases):
     assert words == ["noise only", "one period", "two periods", "tumbling body"]
 
 
+def test_table_prints_null_hypotheses_before_bodies_and_the_verdict_last(cases):
+    curve, pairs, *_ = cases["tumbler"]
+    body = solution(
+        offset_free(cases["tumbler"], tumbling), P_phi_std=1e-4, P_psi_std=1e-3, rms=NOISE,
+        moments=np.array([0.5, 0.8, 1.0]), pole=np.array([10.0, 20.0]), pole_std=3.0,
+        parameters=18.3,
+    )  # fmt: skip
+    found = verdict(cases["tumbler"], body)
+    fit = lightcurve.LightCurveFit(
+        (body,), curve, pairs, None, 1.0, 1.0, None, ("a note",), found.verdict, found.reasons,
+        found.par, found.models, found.misfit, found.agreement,
+    )  # fmt: skip
+    text = lightcurve.table(fit)
+    places = [text.index(x) for x in ("noise only", "one period", "tumbling body", "P_phi short")]
+    assert places == sorted(places)
+    assert text.endswith("verdict: TUMBLING (PAR -4)\nnote: a note")
+    assert f"main lines of the best: f_phi: {24 * P_PHI:.5g} h" in text
+
+
 def test_residuals_of_twice_the_errors_are_never_certain(cases):
     """The right periods, with light that misses by 2.3 times the errors in the mean."""
     case = cases["tumbler"]
@@ -184,7 +204,7 @@ def test_a_body_found_once_or_at_the_edge_of_the_search_is_ambiguous(cases):
 def test_fourteen_points_are_too_few():
     curve = curve_of(tumbling, nights=2, days=4, each=7)
     pairs = pairs_of(curve)
-    linear, nulls = _verdict.null_models(curve, pairs, 0.02)
+    linear, nulls = _verdict.null_models(curve, pairs, 0.02, PHASE)
     found = _verdict.judged(
         linear, nulls, pairs, (solution(curve.magnitude),), found_again=True, limit=3.0
     )
@@ -207,10 +227,18 @@ def test_the_rotating_ellipsoid_is_found_with_its_geometry():
     rng = np.random.default_rng(0)
     value = -2.5 * np.log10(np.asarray(light)) + 0.01 * rng.normal(size=blank.t.size)
     curve = blank._replace(magnitude=value, sigma=np.full(blank.t.size, 0.01))
-    found = _nulls.rotator(_nulls.Linear(curve, 0.02), [period / 2 * 1.0002], 10.0)
+    linear = _nulls.Linear(curve, 0.02)
+    found = _nulls.rotator(linear, [period / 2 * 1.0002], 10.0)
     assert found is not None
-    assert found.periods[0] == pytest.approx(period, rel=1e-4)
-    assert np.std(found.values) < 0.0105
+    rest, ellipsoid = found
+    assert rest.periods[0] == pytest.approx(period, rel=1e-4)
+    assert np.std(rest.values) < 0.0105
+    # and with harmonics it still rotates about one axis, with more parameters
+    body = _refine.rotating_body(linear, ellipsoid, curve.points(0.0, 0.02), PHASE, 3.0)
+    assert np.std(body.values) < 1.01 * np.std(rest.values)
+    np.testing.assert_array_equal(body.body.unknowns[0, 4:6], 0.0)
+    assert 2 * np.pi / body.body.unknowns[0, 6] == pytest.approx(period, rel=1e-4)
+    assert 6 < body.parameters < 30
 
 
 def test_points_without_errors_get_the_scatter_of_neighbours():

@@ -51,7 +51,7 @@ def model_table(fit: LightCurveFit) -> str:
     for model in fit.models:
         periods = ", ".join(f"{p * per:.6g}" for p in model.periods)
         lines.append(
-            f"  {model.log_evidence - fit.models[0].log_evidence:+8.1f}  {model.parameters:10d}"
+            f"  {model.log_evidence - fit.models[0].log_evidence:+8.1f}  {model.parameters:10.1f}"
             f"  {model.rms:9.4f}  {model.misfit:9.2f}  {model.name}"
             + (f": {periods}" if periods else "")
         )

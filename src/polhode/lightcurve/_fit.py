@@ -126,7 +126,7 @@ def fit_light_curve(
     state = _joined(state, mirrored)
     order = _distinct(state, pairs.resolution, max(max_solutions, BATCH))
     solutions, scale, alike = described(problem, state, order, curve, normals, limit)
-    linear, nulls = null_models(curve, pairs, offset_sigma)
+    linear, nulls = null_models(curve, pairs, offset_sigma, phase, limit)
     ellipsoids = solutions[:1]
     if convex:
         exact = curve.points(0.0, offset_sigma)  # without the floor

@@ -253,8 +253,12 @@ def _rotators(x, arrays, basis):
     return value, slopes
 
 
-def rotator(linear: Linear, periods, max_frequency: float) -> Residuals | None:
-    """The best ellipsoid that rotates about its shortest axis, near one of ``periods``."""
+def rotator(linear: Linear, periods, max_frequency: float) -> tuple[Residuals, np.ndarray] | None:
+    """The best ellipsoid that rotates about its third axis, near one of ``periods``.
+
+    Its residuals, and logarithms of the second and third axis over the first, longitude and
+    latitude of the pole, phase [rad] and frequency. None without directions.
+    """
     curve = linear.curve
     if curve.sun is None or curve.observer is None:
         return None
@@ -270,8 +274,7 @@ def rotator(linear: Linear, periods, max_frequency: float) -> Residuals | None:
         (np.log(0.65), np.log(0.5), a, b, c)
         for a, b in zip(longitude, latitude, strict=True) for c in turn
     ])  # fmt: skip
-    best, values = np.inf, None
-    frequency = 0.0
+    best, values, chosen = np.inf, None, np.zeros(6)
     for f in sorted({float(f) for p in periods for f in (1 / p, 0.5 / p, 2 / p)}):
         if f > max_frequency:
             continue
@@ -284,12 +287,13 @@ def rotator(linear: Linear, periods, max_frequency: float) -> Residuals | None:
         size = np.sum(found**2, axis=1)
         k = int(np.argmin(size))
         if size[k] < best:
-            best, values, frequency = size[k], found[k], float(x[k, 5])
+            best, values, chosen = size[k], found[k], x[k]
     if values is None:
         return None
     log_trials = float(np.log(max(max_frequency * linear.t[-1], 1.0)))
     rest = values[: linear.t.size] / np.asarray(linear.root)
-    return Residuals("one period, rotating ellipsoid", rest, 6, log_trials, (1 / frequency,))
+    period = (1 / float(chosen[5]),)
+    return Residuals("one period, rotating ellipsoid", rest, 6, log_trials, period), chosen
 
 
 def _improved(x, arrays, basis, steps: int = 25):

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from polhode import rotation
 from polhode._closed_forms import free
 from polhode.lightcurve._model import Bodies, Points, _to_body, attitudes, moments_of, stepped
 from polhode.lightcurve._nulls import Linear
@@ -92,13 +93,21 @@ _stepped = jax.jit(stepped)
 
 
 def refine(
-    body: Bodies, linear: Linear, points: Points, phase: AbstractPhase, limit: float
+    body: Bodies,
+    linear: Linear,
+    points: Points,
+    phase: AbstractPhase,
+    limit: float,
+    *,
+    rotating: bool = False,
 ) -> Refined:
     """Least squares of motion, inertia and a convex shape from an ellipsoid's solution.
 
     ``body``: one, (1, ...). Offsets, and a phase function quadratic in the phase angle besides the
     body's own, are projected out. Residuals beyond ``limit`` sigma count by their size.
+    ``rotating``: the body keeps rotating about its third axis, and its inertia is left alone.
     """
+    moving = np.isin(np.arange(8), (4, 5, 6, 7)) if rotating else np.full(8, True)
     n, many = linear.t.size, len(phase.typical)
     normals = np.asarray(Convex.from_ellipsoid(jnp.ones(3), _FACETS).normals)
     rows = np.asarray(harmonics(jnp.asarray(normals), DEGREE))[1:]
@@ -116,7 +125,7 @@ def refine(
     def evaluated(body, coefficients):
         out = _light(body, jnp.asarray(coefficients), points, known)
         value, motion, shape, open_area, by_open = map(np.asarray, out)
-        whole = np.hstack([motion, shape])[:n]
+        whole = np.hstack([np.where(moving, motion, 0.0), shape])[:n]
         rest = linear.projected(value[:n] + own) - linear.data
         return rest, whole, open_area, by_open
 
@@ -151,7 +160,14 @@ def refine(
         step *= min(1.0, 0.5 / max(np.abs(np.r_[step[:2], step[5:]]).max(), 1e-30))
         change = np.zeros((1, body.unknowns.shape[1] + 3))
         change[0, _MOTION], change[0, -3:] = step[:5], step[5:8]
-        tried = _stepped(body, jnp.asarray(change))
+        if rotating:  # periods have no derivatives there
+            turn = rotation.rotation_vector_to_wxyz(jnp.asarray(change[:, -3:]))
+            tried = Bodies(
+                body.unknowns + change[:, :-3],
+                rotation.normalise(rotation.multiply(turn, body.wxyz)),
+            )
+        else:
+            tried = _stepped(body, jnp.asarray(change))
         new = evaluated(tried, coefficients + step[8:])
         new_chi2, new_cost = costed(new[0], coefficients + step[8:], tried, new[2])
         better = np.isfinite(new_cost) and new_cost < cost
@@ -201,6 +217,22 @@ def refined_solutions(
         place = first.setdefault(roots[k], len(out))
         out.append(made[k]._replace(mirror_of=None if place == len(out) else place))
     return _with_spread(out, resolution), scale, alike
+
+
+def rotating_body(
+    linear: Linear, ellipsoid: np.ndarray, points: Points, phase: AbstractPhase, limit: float
+) -> Refined:
+    """A convex body that rotates about one axis, from an ``ellipsoid`` (6,) of `rotator`."""
+    second, third, longitude, latitude, turn, frequency = ellipsoid
+    c, s, cb, sb = (f(x) for x in (longitude, latitude) for f in (np.cos, np.sin))
+    frame = np.array([[sb * c, sb * s, -cb], [-s, c, 0], [cb * c, cb * s, sb]])
+    ca, sa = np.cos(turn), np.sin(turn)
+    matrix = np.array([[ca, sa, 0], [-sa, ca, 0], [0, 0, 1]]) @ frame
+    # any inertia for which the third axis is the short one: the rotation is the same
+    unknowns = np.r_[np.log([0.8, 0.6]), second, third, 0, 0, 2 * np.pi * frequency, phase.typical]
+    wxyz = np.asarray(rotation.matrix_to_wxyz(jnp.asarray(matrix.T)))
+    body = Bodies(unknowns[None], wxyz[None])
+    return refine(body, linear, points, phase, limit, rotating=True)
 
 
 def _body(solution: Solution) -> Bodies:

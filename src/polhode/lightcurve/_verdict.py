@@ -18,6 +18,8 @@ from polhode.lightcurve._nulls import (
     tumbler,
     two_periods,
 )
+from polhode.lightcurve._phase import AbstractPhase
+from polhode.lightcurve._refine import rotating_body
 from polhode.lightcurve._solutions import EXCLUDED, Solution, likeness, same_periods
 
 _DECISIVE = 5.0  # difference of ln Z: odds of 150 to 1
@@ -49,7 +51,9 @@ class Judgement(NamedTuple):
     agreement: float
 
 
-def null_models(curve: LightCurve, pairs: Pairs, offset_sigma) -> tuple[Linear, list[Residuals]]:
+def null_models(
+    curve: LightCurve, pairs: Pairs, offset_sigma, phase: AbstractPhase, limit: float = 3.0
+) -> tuple[Linear, list[Residuals]]:
     """The null hypotheses, fitted: noise alone, and one period."""
     linear = Linear(curve, offset_sigma)
     found = [noise(linear)]
@@ -63,7 +67,16 @@ def null_models(curve: LightCurve, pairs: Pairs, offset_sigma) -> tuple[Linear, 
         best = sorted(series, key=lambda r: float(np.sum((r.values * linear.root) ** 2)))
         periods = dict.fromkeys(round(r.periods[0], 12) for r in (*best[:2], *series[:4]))
         ellipsoid = rotator(linear, list(periods)[:4], end)
-        found += [] if ellipsoid is None else [ellipsoid]
+        if ellipsoid is not None:
+            rest, chosen = ellipsoid
+            points = curve.points(0.0, offset_sigma)
+            body = rotating_body(linear, chosen, points, phase, limit)
+            period = 2 * np.pi / float(body.body.unknowns[0, 6])
+            convex = rest._replace(
+                name="one period, rotating convex body", values=body.values,
+                parameters=body.parameters, periods=(period,),
+            )  # fmt: skip
+            found += [rest] + ([convex] if np.isfinite(body.cost) else [])
     return linear, found
 
 
