@@ -140,6 +140,8 @@ CASES = [
     ("lightcurve light.csv --vectors bin.csv", 2, ["not text"]),
     ("lightcurve light.csv --vectors sun.csv", 2, ["lacks the columns"]),
     ("lightcurve light.csv --trials 0", 2, ["whole number from 1"]),
+    ("lightcurve light.csv --max-frequency 0", 2, ["positive number"]),
+    ("lightcurve light.csv --max-frequency nan", 2, ["positive number"]),
     ("lightcurve light.csv --trials -3", 2, ["whole number from 1"]),
     ("lightcurve light.csv --trials 1e4", 2, ["whole number from 1"]),
     ("lightcurve light.csv --seed -1", 2, ["whole number from 0"]),

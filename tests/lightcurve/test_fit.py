@@ -139,15 +139,21 @@ def test_mirror_gives_the_same_light(trial):
 def test_a_list_that_ends_before_the_odds_do_says_so():
     curve, *_ = light_curves.synthetic(3, 0.02, nights=8, days=12.0, each=16)
 
-    def said(*odds):
+    def said(word, *odds, step=0.1):
         solutions = [
-            types.SimpleNamespace(P_phi=1.0, P_psi=1.0, probability=p, mirror_of=None) for p in odds
+            types.SimpleNamespace(
+                P_phi=1.0 + step * k, P_psi=1.0, probability=p, mirror_of=None, mode=0
+            )
+            for k, p in enumerate(odds)
         ]
-        return [n for n in _solutions.notes_on(curve, solutions, 1.0, 1.0) if "Ambiguous" in n]
+        return [n for n in _solutions.notes_on(curve, solutions, 1.0, 1.0) if word in n]
 
-    assert not said(1.0, 1e-4)
-    assert said(1.0, 0.1, 1e-4)[0].startswith("Ambiguous: 1 other")
-    assert said(1.0, 0.1, 0.01)[0].startswith("Ambiguous: at least 2 other")
+    assert not said("mbiguous", 1.0, 1e-4)
+    assert said("Ambiguous", 1.0, 0.1, 1e-4)[0].startswith("Ambiguous: 1 other pair")
+    assert said("Ambiguous", 1.0, 0.1, 0.01)[0].startswith("Ambiguous: at least 2 other")
+    # other poles of the same periods
+    assert not said("Ambiguous", 1.0, 0.1, 1e-4, step=0.0)
+    assert said("pole is ambiguous", 1.0, 0.1, 1e-4, step=0.0)
 
 
 @pytest.mark.slow

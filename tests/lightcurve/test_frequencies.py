@@ -105,3 +105,64 @@ def test_lattices_find_the_sums_of_a_long_curve():
     whole = np.hstack([np.ones((t.size, 1)), np.cos(phases), np.sin(phases)])
     left = value - whole @ np.linalg.lstsq(whole, value, rcond=None)[0]
     assert found.explained[0] == pytest.approx(1 - left.var() / value.var(), abs=0.01)
+
+
+def test_default_range_holds_the_lines_of_a_fast_tumbler():
+    """Short-axis mode of 12.0 and 29.2 h in 60 days: its strongest line is that of 4.0 per day."""
+    rng = np.random.default_rng(0)
+    start = np.sort(rng.choice(60, 16, replace=False))
+    t = np.sort(start[:, None] + rng.uniform(0, 0.3, (16, 25)), axis=1).ravel()
+    f_phi, f_psi = 1 / 0.501, 1 / 1.218
+    value = sum(
+        a * np.cos(2 * np.pi * (i * f_phi + j * f_psi) * t + p)
+        for i, j, a, p in ((1, 1, 0.15, 1.0), (2, 0, 0.2, 2.0), (2, 2, 0.05, 0.5))
+    )
+    value = value + 0.02 * rng.normal(size=t.size)
+    found = lightcurve.fourier_lattices(t, value)
+    assert found.max_frequency > 2 * f_phi + 2 * f_psi
+    assert found.strongest == pytest.approx(2 * f_phi, abs=0.5 * found.resolution)
+    assert not found.is_cut
+    assert found.warnings() == ()
+    meant = _hypotheses.hypotheses(found, t, value)
+    near = np.hypot(meant.f_phi - f_phi, meant.f_psi - f_psi) < 0.5 * found.resolution
+    assert np.any(near[:5] & ~meant.long_axis[:5])
+
+
+@pytest.mark.parametrize("period", [2 / 24, 3 / 1440])
+def test_default_range_reaches_fast_rotations(period):
+    """Two hours in ten nights of a month; three minutes in one night."""
+    rng = np.random.default_rng(1)
+    if period > 0.01:
+        start = np.sort(rng.choice(30, 10, replace=False))
+        t = np.sort(start[:, None] + rng.uniform(0, 0.3, (10, 40)), axis=1).ravel()
+    else:
+        t = np.sort(rng.uniform(0, 0.1, 300))
+    value = 0.2 * np.cos(4 * np.pi * t / period) + 0.1 * np.cos(2 * np.pi * t / period)
+    found = lightcurve.fourier_lattices(t, value + 0.01 * rng.normal(size=t.size))
+    assert found.max_frequency > 2 / period
+    assert not found.is_cut
+
+
+def test_a_grid_that_ends_below_strong_lines_says_so():
+    t, value = _long(MIXED)
+    found = lightcurve.fourier_lattices(t, value, max_frequency=2.0)
+    assert found.max_frequency == pytest.approx(2.0, abs=found.resolution)
+    assert found.strongest == pytest.approx(2 * F_PHI, abs=0.5 * found.resolution)
+    (text,) = found.warnings()
+    assert "ends at 2" in text
+    assert "max_frequency" in text
+
+
+def test_a_default_grid_that_must_be_cut_says_so(monkeypatch):
+    t, value = _long(MIXED)
+    monkeypatch.setattr(_frequencies, "_MAX_LINE_NODES", 600)
+    found = lightcurve.fourier_lattices(t, value)
+    assert found.is_cut
+    assert found.max_frequency < 2 * F_PHI
+    assert "faster rotations were not tried" in found.warnings()[0]
+
+
+def test_a_line_at_the_edge_of_the_grid_is_named():
+    t, value = _long(MIXED)
+    found = lightcurve.fourier_lattices(t, value, max_frequency=1.02 * 2 * F_PHI)
+    assert any("at the edge" in text for text in found.warnings())

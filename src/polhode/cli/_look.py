@@ -12,6 +12,7 @@ from polhode.cli._options import (
     ForceOption,
     QuietOption,
     not_negative,
+    positive,
     require,
     whole_number,
 )
@@ -66,6 +67,14 @@ def lightcurve(
             parser=whole_number(1), metavar="N", help="motions tried before the best are fitted"
         ),
     ] = 40_000,
+    max_frequency: Annotated[
+        float | None,
+        typer.Option(
+            parser=positive,
+            metavar="F",
+            help="end of the search [cycles/day]; beyond all strong lines if left out",
+        ),
+    ] = None,
     floor: Annotated[
         float, typer.Option(parser=not_negative, metavar="MAG", help="least error of a point [mag]")
     ] = 0.03,
@@ -96,7 +105,10 @@ def lightcurve(
     name = output or path.stem
     goals = [target(name + end, end, force=force) for end in (".png", ".json")]
     lines: list[str] = []
-    options = {"trials": trials, "floor": floor, "seed": seed, "say": lines.append}
+    options = {
+        "trials": trials, "floor": floor, "seed": seed, "say": lines.append,
+        "max_frequency": max_frequency,
+    }  # fmt: skip
     words = f"searching {curve.t.size} points with {trials:,} trials (compiling first)"
     try:
         with _show.working(_show.messages(quiet), words):

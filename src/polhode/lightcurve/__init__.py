@@ -9,6 +9,7 @@ from polhode.lightcurve._frequencies import (
     fourier_pairs as fourier_pairs,
 )
 from polhode.lightcurve._hypotheses import meaning as meaning
+from polhode.lightcurve._nulls import Model as Model
 from polhode.lightcurve._phase import (
     HG as HG,
     HG1G2 as HG1G2,
@@ -22,4 +23,5 @@ from polhode.lightcurve._scattering import (
     seeliger_sphere as seeliger_sphere,
 )
 from polhode.lightcurve._shape import Convex as Convex, harmonics as harmonics
-from polhode.lightcurve._solutions import Fit as Fit, Solution as Solution
+from polhode.lightcurve._solutions import LightCurveFit as LightCurveFit, Solution as Solution
+from polhode.lightcurve._verdict import Verdict as Verdict

@@ -11,25 +11,60 @@ import numpy as np
 from polhode._extras import imported
 from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._fit import fit_light_curve
-from polhode.lightcurve._frequencies import fourier_pairs
+from polhode.lightcurve._frequencies import Pairs, fourier_lattices, fourier_pairs
 from polhode.lightcurve._hypotheses import meaning
 from polhode.lightcurve._read import read_light_curve
-from polhode.lightcurve._solutions import Fit
+from polhode.lightcurve._solutions import LightCurveFit
+
+# of the JSON file; other numbers have none
+_UNITS = {
+    "P_phi": "day", "P_psi": "day", "P_phi_std": "day", "P_psi_std": "day", "lines": "day",
+    "P_phi_short_axis": "day", "periods": "day", "max_frequency": "1/day", "rms": "mag",
+    "offsets": "mag", "offset_sigma": "mag", "floor": "mag", "pole": "deg", "pole_std": "deg",
+    "omega_body": "rad/day",
+}  # fmt: skip
 
 
-def figure(fit: Fit, *, number: int = 0, title: str = "") -> Any:
+def figure(fit: LightCurveFit, *, number: int = 0, title: str = "") -> Any:
     """Data over solution ``number``, residuals, map of poles: a matplotlib figure."""
     from polhode.lightcurve._figure import figure as draw
 
     return draw(fit, number=number, title=title)
 
 
-def table(fit: Fit) -> str:
-    """The solutions, one a line, and what the light curve cannot show."""
-    unit, per = ("d", 1.0) if fit.best.P_phi > 0.3 else ("min", 1440.0)
+def table(fit: LightCurveFit) -> str:
+    """Verdict, null hypotheses and their evidence, the bodies one a line, and notes."""
+    return "\n".join([model_table(fit), "", solution_table(fit), "", *conclusions(fit)])
+
+
+def conclusions(fit: LightCurveFit) -> list[str]:
+    """Lines that say what may be claimed, why, and what the light curve cannot show."""
+    lines = [f"verdict: {fit.verdict.name} (PAR {fit.par:+d})"]
+    lines += [f"because: {reason}" for reason in fit.reasons]
+    return [*lines, *(f"note: {note}" for note in fit.notes)]
+
+
+def model_table(fit: LightCurveFit) -> str:
+    """Models of the light curve, null hypotheses first, and their evidence over noise alone."""
+    unit, per = _unit([p for model in fit.models for p in model.periods])
+    lines = [f"  ln Z      parameters  rms [mag]  rms/error  model: periods [{unit}]"]
+    for model in fit.models:
+        periods = ", ".join(f"{p * per:.6g}" for p in model.periods)
+        lines.append(
+            f"  {model.log_evidence - fit.models[0].log_evidence:+8.1f}  {model.parameters:10.1f}"
+            f"  {model.rms:9.4f}  {model.misfit:9.2f}  {model.name}"
+            + (f": {periods}" if periods else "")
+        )
+    return "\n".join(lines)
+
+
+def solution_table(fit: LightCurveFit) -> str:
+    """The tumbling bodies, one a line, and the main lines of the best."""
+    best = fit.best
+    unit, per = _unit([best.P_phi, best.P_psi])
     lines = [
-        f"  #  rms [mag]  odds     P_phi [{unit}]          P_psi [{unit}]          mode"
-        "        moments              pole (lon, lat) [deg]"
+        f"  #  rms [mag]  odds     P_phi [{unit}]          P_psi [{unit}]          P_phi short axis"
+        "  mode        moments              pole (lon, lat) [deg]"
     ]
     for k, s in enumerate(fit.solutions):
         moments = " : ".join(f"{m:.3f}" for m in s.moments)
@@ -38,18 +73,33 @@ def table(fit: Fit) -> str:
             f"{k:3d}  {s.rms:.4f}    {s.probability:7.1e}"
             f"  {s.P_phi * per:9.5g} +- {s.P_phi_std * per:7.2g}"
             f"  {s.P_psi * per:9.5g} +- {s.P_psi_std * per:7.2g}"
+            f"  {s.P_phi_short_axis * per:16.5g}"
             f"  {s.mode.name:<10s}  {moments}  {s.pole[0]:6.1f} {s.pole[1]:+6.1f}"
             f" +- {s.pole_std:.1f}{mirror}"
         )
-    return "\n".join([*lines, *(f"note: {note}" for note in fit.notes)])
+    main = ", ".join(f"{name}: {period * per:.5g} {unit}" for name, period in best.lines())
+    return "\n".join([*lines, f"main lines of the best: {main}"])
 
 
-def frequency_table(pairs, count: int = 6) -> str:
-    """Candidate pairs of frequencies, and what each would mean."""
-    lines = ["  explained  f_phi [1/d]  f_psi [1/d]  meaning"]
+def _unit(periods) -> tuple[str, float]:
+    """A unit in which the periods [day] are neither long nor short, and its number in a day."""
+    typical = float(np.exp(np.mean(np.log(periods)))) if len(periods) else 1.0
+    if typical > 2:
+        return "d", 1.0
+    return ("h", 24.0) if typical > 1 / 24 else ("min", 1440.0)
+
+
+def frequency_table(pairs: Pairs, count: int = 6, *, lines: bool = False) -> str:
+    """Candidate pairs of frequencies, and what each would mean; ``lines``: of two of their sums."""
+    if lines:
+        text = ["  explained  line 1 [1/d]  line 2 [1/d]"]
+        for a, b, part in list(zip(pairs.f_phi, pairs.f_psi, pairs.explained))[:count]:
+            text.append(f"  {part:8.1%}  {a:12.5g}  {b:12.5g}")
+        return "\n".join(text)
+    text = ["  explained  f_phi [1/d]  f_psi [1/d]  meaning"]
     for a, b, part in list(zip(pairs.f_phi, pairs.f_psi, pairs.explained))[:count]:
-        lines.append(f"  {part:8.1%}  {a:11.5g}  {b:11.5g}  {meaning(a, b)}")
-    return "\n".join(lines)
+        text.append(f"  {part:8.1%}  {a:11.5g}  {b:11.5g}  {meaning(a, b)}")
+    return "\n".join(text)
 
 
 def run(
@@ -62,7 +112,7 @@ def run(
     floor: float = 0.03,
     seed: int = 0,
     say: Callable = print,
-) -> Fit | None:
+) -> LightCurveFit | None:
     """Read, fit, say the table, and write the figure and a JSON file beside each other.
 
     ``output``: path of the files without suffix (default: that of ``path``, in the current folder).
@@ -110,26 +160,39 @@ def fitted(
     trials: int,
     floor: float,
     seed: int,
-) -> Fit | None:
-    """Fit, say the table, and write the figure and the numbers; see `run`."""
+) -> LightCurveFit | None:
+    """LightCurveFit, say the table, and write the figure and the numbers; see `run`."""
     say(f"{title}: {curve.t.size} points, {len(curve.names)} groups, {np.ptp(curve.t):.4g} d")
     if curve.sun is None:
         pairs = fourier_pairs(
             curve.t, curve.magnitude, columns=curve.columns(np.inf)[0], max_frequency=max_frequency
         )
-        say(frequency_table(pairs))
-        for note in (*curve.notes, "without vectors to Sun and observer no body can be fitted."):
+        lines = pairs.is_cut
+        if lines:  # the square of the grid is too small: pairs of lines reach further
+            pairs = fourier_lattices(
+                curve.t, curve.magnitude, columns=curve.columns(np.inf)[0],
+                max_frequency=max_frequency,
+            )  # fmt: skip
+        say(frequency_table(pairs, lines=lines))
+        missing = "without vectors to Sun and observer no body can be fitted."
+        for note in (*curve.notes, *pairs.warnings(), missing):
             say(f"note: {note}")
         return None
     imported("the figure of a light curve", "matplotlib", extra="plot")  # before the search
     fit = fit_light_curve(curve, trials=trials, max_frequency=max_frequency, floor=floor, seed=seed)
-    say(frequency_table(fit.pairs))
+    say(frequency_table(fit.pairs, lines=True))
     say(table(fit))
-    _write(fit, title, picture, document, say)
+    settings = {
+        "trials": trials, "max_frequency": max_frequency, "floor": floor, "seed": seed,
+    }  # fmt: skip
+    _write(fit, title, picture, document, settings, say)
     return fit
 
 
-def _write(fit: Fit, name: str, picture: Path, document: Path, say) -> None:
+def _write(
+    fit: LightCurveFit, name: str, picture: Path, document: Path, settings: dict, say
+) -> None:
+    import jax
     import matplotlib as mpl
 
     mpl.use("Agg")
@@ -149,8 +212,17 @@ def _write(fit: Fit, name: str, picture: Path, document: Path, say) -> None:
     listed = []
     for solution in fit.solutions:
         kept = {k: plain(v) for k, v in solution._asdict().items() if k not in ("model", "weights")}
-        listed.append(kept | {"mode": solution.mode.name})
-    contents = {"file": name, "polhode": __version__, "solutions": listed, "notes": fit.notes}
+        more = {"P_phi_short_axis": solution.P_phi_short_axis, "lines": dict(solution.lines())}
+        listed.append(kept | {"mode": solution.mode.name} | more)
+    contents = {
+        "file": name, "polhode": __version__, "jax": jax.__version__, "numpy": np.__version__,
+        "units": _UNITS, "settings": settings, "verdict": fit.verdict.name,
+        "reasons": fit.reasons, "par": fit.par, "misfit": fit.misfit, "agreement": fit.agreement,
+        "scale": fit.scale, "alike": fit.alike, "offset_sigma": fit.offset_sigma,
+        "max_frequency": fit.pairs.max_frequency,
+        "models": [model._asdict() for model in fit.models],
+        "solutions": listed, "notes": fit.notes,
+    }  # fmt: skip
     with whole_file(document) as temporary:
         temporary.write_text(json.dumps(contents, indent=1) + "\n", encoding="utf-8")
     say(f"wrote {picture} and {document}")

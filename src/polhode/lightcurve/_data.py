@@ -127,6 +127,38 @@ class LightCurve(NamedTuple):
             t=t, magnitude=magnitude, sigma=sigma, group=group, sun=sun, observer=observer
         )
 
+    def scatter(self) -> float:
+        """Noise of the points [mag], from their scatter about straight lines between neighbours.
+
+        Of points of one group, less than a twentieth of the light curve and half a day apart: an
+        upper bound where the brightness bends between them. NaN where there are fewer than four.
+        """
+        t, m = self.t, self.magnitude
+        together = (self.group[2:] == self.group[:-2]) & (self.group[1:-1] == self.group[:-2])
+        near = together & (t[2:] - t[:-2] < min(0.5, np.ptp(t) / 20)) & (t[2:] > t[:-2])
+        index = np.flatnonzero(near)
+        if index.size < 4:
+            return math.nan
+        part = (t[index + 1] - t[index]) / (t[index + 2] - t[index])
+        rest = m[index + 1] - (1 - part) * m[index] - part * m[index + 2]
+        rest = rest / np.sqrt(1 + part**2 + (1 - part) ** 2)
+        return float(1.4826 * np.median(np.abs(rest)))
+
+    def with_errors(self, default: float) -> "LightCurve":
+        """Points without an error get the scatter of neighbours, or ``default`` [mag]."""
+        missing = ~(self.sigma > 0)
+        if not missing.any():
+            return self
+        estimate = self.scatter()
+        known = math.isfinite(estimate) and estimate > 0
+        size = estimate if known else default
+        whose = "No point has an error" if missing.all() else "Not every point has an error"
+        text = f"{whose}: {size:.2g} mag is taken" + (
+            ", from the scatter of neighbours." if known else ", the floor."
+        )
+        sigma = np.where(missing, size, self.sigma)
+        return self._replace(sigma=sigma, notes=(*self.notes, text))
+
     @property
     def alpha(self) -> np.ndarray:
         """Phase angles (n,) [rad]. Raises ValueError where the directions are unknown."""

@@ -2,13 +2,13 @@
 
 import numpy as np
 
-from polhode.lightcurve._solutions import Fit
+from polhode.lightcurve._solutions import LightCurveFit
 from polhode.plot._matplotlib import ACCENT, GREY, INK, Y, Z, new_figure, styled
 
 
 @styled
-def figure(fit: Fit, *, number: int = 0, title: str = ""):
-    """Figure of a ``Fit``; solution ``number`` is drawn over the data. Returns it.
+def figure(fit: LightCurveFit, *, number: int = 0, title: str = ""):
+    """Figure of a ``LightCurveFit``; solution ``number`` is drawn over the data. Returns it.
 
     Magnitudes without the offsets fitted; gaps longer than a tenth of the light curve are cut out.
     """
@@ -69,7 +69,7 @@ def _without_gaps(t):
     return np.cumsum(np.where(step > longest, 0.02 * np.ptp(t), step))
 
 
-def _poles(ax, fit: Fit, number: int) -> None:
+def _poles(ax, fit: LightCurveFit, number: int) -> None:
     for k, solution in enumerate(fit.solutions):
         longitude, latitude = np.radians(solution.pole)
         longitude = (longitude + np.pi) % (2 * np.pi) - np.pi
@@ -81,7 +81,7 @@ def _poles(ax, fit: Fit, number: int) -> None:
     ax.set_xticklabels([])
 
 
-def _listed(ax, fit: Fit) -> None:
+def _listed(ax, fit: LightCurveFit) -> None:
     ax.axis("off")
     text = [" #   rms   P_phi     P_psi     mode  pole        mirror"]
     for k, s in enumerate(fit.solutions[:9]):

@@ -11,17 +11,19 @@ from polhode.lightcurve._frequencies import Pairs, fourier_lattices
 from polhode.lightcurve._hypotheses import Hypotheses, hypotheses
 from polhode.lightcurve._model import Bodies, Points
 from polhode.lightcurve._phase import HG1G2, AbstractPhase, SeeligerPhase
+from polhode.lightcurve._refine import refined_solutions
 from polhode.lightcurve._search import tried
 from polhode.lightcurve._solutions import (
     EXCLUDED,
     REACHED,
-    Fit,
+    LightCurveFit,
     described,
     frequencies,
     momentum,
     notes_on,
 )
 from polhode.lightcurve._steps import BATCH, Problem, State, picked, spread_of_offsets, taken
+from polhode.lightcurve._verdict import judged, null_models
 
 _FEW = 160  # points that a search looks at
 _DESCENT = ((1.0, 2), (0.5, 3), (0.25, 6))  # parts of the starts, and their steps
@@ -49,7 +51,8 @@ def fit_light_curve(
     limit: float = 3.0,
     seed: int = 0,
     max_solutions: int = 12,
-) -> Fit:
+    convex: bool = True,
+) -> LightCurveFit:
     """Every tumbling ellipsoid, of free inertia, that explains a light curve; without a guess.
 
     Pairs of frequencies from Fourier series, each with all it can mean; ``trials`` bodies of these
@@ -75,6 +78,8 @@ def fit_light_curve(
         raise RuntimeError(
             "fits of light curves need float64: jax.config.update('jax_enable_x64', True)."
         )
+    curve._known_directions()
+    curve = curve.with_errors(floor)
     points = curve.points(floor, offset_sigma)
     if phase is None:
         phase = HG1G2() if np.ptp(curve.alpha) > np.radians(5) else SeeligerPhase()
@@ -121,14 +126,25 @@ def fit_light_curve(
     state = _joined(state, mirrored)
     order = _distinct(state, pairs.resolution, max(max_solutions, BATCH))
     solutions, scale, alike = described(problem, state, order, curve, normals, limit)
+    linear, nulls = null_models(curve, pairs, offset_sigma, phase, limit)
+    ellipsoids = solutions[:1]
+    if convex:
+        exact = curve.points(0.0, offset_sigma)  # without the floor
+        solutions, scale, alike = refined_solutions(solutions, linear, exact, phase, limit)
     solutions = solutions[: max(max_solutions, sum(s.probability > EXCLUDED for s in solutions))]
-    notes = notes_on(curve, solutions, scale, alike)
+    notes = notes_on(curve, solutions, scale, alike) + pairs.warnings()
     if not again:
         notes += (
             "No second search found the best motion again: better ones may have been missed. Ask"
             " for more trials or searches.",
         )
-    return Fit(solutions, curve, pairs, meant, scale, alike, offset_sigma, notes)
+    judgement = judged(
+        linear, nulls, pairs, solutions, found_again=again, limit=limit, others=ellipsoids
+    )
+    return LightCurveFit(
+        solutions, curve, pairs, meant, scale, alike, offset_sigma, notes, judgement.verdict,
+        judgement.reasons, judgement.par, judgement.models, judgement.misfit, judgement.agreement,
+    )  # fmt: skip
 
 
 def _blur(curve: LightCurve) -> float:

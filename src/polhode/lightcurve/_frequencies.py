@@ -15,7 +15,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 _CHUNK = 4096
-_MOST = 600  # nodes of the grid that are sought unless more are asked for
+# Nodes of the grid of frequencies, for pairs over the whole square of it and for lines.
+_MAX_PAIR_NODES, _MAX_LINE_NODES = 600, 15_000
+_FASTEST = 24.0  # per day: the second harmonic of a rotation in two hours
+_EDGE = 0.95  # of the highest frequency: lines above are at the edge of the grid
 # Sums of a line g and another h, in halves: g and what it may be a harmonic of, or have as one, so
 # that h is not chosen for what g alone explains; h, and its sidebands.
 LINES = np.array([(1, 0), (2, 0), (3, 0), (4, 0), (0, 2), (2, 2), (2, -2)]) / 2
@@ -28,6 +31,28 @@ class Pairs(NamedTuple):
     f_psi: np.ndarray  # (k,)
     explained: np.ndarray  # (k,) part of the variance that the series explains
     resolution: float  # 1 / span
+    max_frequency: float = np.inf  # end of the grid
+    # strongest line of the whole spectrum, that of the sampling, which may exceed the grid
+    strongest: float = np.nan
+    is_cut: bool = False  # the spectrum has strong lines beyond the grid, which was cut
+
+    def warnings(self) -> tuple[str, ...]:
+        """Sentences on what the range of the search may have missed."""
+        at_edge = max(self.f_phi[:1].max(initial=0), self.f_psi[:1].max(initial=0))
+        out = []
+        if self.is_cut or self.strongest > self.max_frequency:
+            out.append(
+                f"The search ends at {self.max_frequency:.4g} cycles per day, below lines of the"
+                f" spectrum (the strongest is at {self.strongest:.4g}): faster rotations were not"
+                " tried. Set a higher max_frequency (--max-frequency)."
+            )
+        elif at_edge > _EDGE * self.max_frequency:
+            out.append(
+                f"The best pair has a line at {at_edge:.4g} cycles per day, at the edge of the"
+                f" search ({self.max_frequency:.4g}): faster lines may explain more. Set a higher"
+                " max_frequency (--max-frequency)."
+            )
+        return tuple(out)
 
 
 def terms(order: int, even: bool = True) -> np.ndarray:
@@ -103,10 +128,17 @@ class Scan(NamedTuple):
     count: int  # nodes up to the highest frequency
     size: int  # points
     resolution: float
+    strongest: float  # frequency of the strongest line
+    is_cut: bool
 
     @classmethod
-    def of(cls, t, values, columns, highest, oversampling: int, most: int) -> "Scan":
-        """``most``: the highest sum looked at is that many times the highest frequency."""
+    def of(
+        cls, t, values, columns, highest, oversampling: int, most: int, max_nodes: int | None = None
+    ) -> "Scan":
+        """``most``: the highest sum looked at is that many times the highest frequency.
+
+        ``highest``: the end of the grid; None: that of the strong lines, at ``max_nodes`` at most.
+        """
         t, values = np.asarray(t, float), np.asarray(values, float)
         t = t - t[0]
         columns = np.ones((1, t.size)) if columns is None else np.asarray(columns, float)
@@ -120,14 +152,32 @@ class Scan(NamedTuple):
             )
         values = values / np.sqrt(values @ values)
         step = 1 / (oversampling * np.ptp(t))
-        if highest is None:
-            highest = min(_highest(t, values, step), _MOST * step)
+        strongest, is_cut = np.nan, False
+        if max_nodes is not None:
+            strongest, end = _strong_lines(t, values, step)
+            if highest is None:
+                highest = min(end, max_nodes * step)
+                is_cut = end > highest
         count = int(np.ceil(highest / step)) + 1
         window, data, *rest = _transforms(
             jnp.asarray(t), jnp.asarray(np.vstack([np.ones_like(t), values, basis])), step,
             2 * (most * count + 1),
         )  # fmt: skip
-        return cls((window, jnp.stack(rest)), data, step, count, t.size, step * oversampling)
+        return cls(
+            (window, jnp.stack(rest)),
+            data,
+            step,
+            count,
+            t.size,
+            step * oversampling,
+            strongest,
+            is_cut,
+        )
+
+    def pairs(self, f_phi, f_psi, explained) -> Pairs:
+        """Candidates of this grid."""
+        end = (self.count - 1) * self.step
+        return Pairs(f_phi, f_psi, explained, self.resolution, end, self.strongest, self.is_cut)
 
     def fitted(self, nodes: np.ndarray, soft=1e-3) -> tuple[np.ndarray, np.ndarray]:
         """Part of the variance (k,) explained by waves at nodes (k, m), and ln det of the matrix.
@@ -167,13 +217,15 @@ def fourier_pairs(
 
     ``columns``: what is fitted besides, such as a constant for each night (default: one
     constant). ``max_frequency`` of either, per unit of ``t``; default: 1.3 times that of the
-    highest peak of the power spectrum with a tenth of the greatest power, but at most 600 steps of
-    the grid, ``600 / oversampling`` turns within the light curve. Local maxima of the grid, the
-    best ``keep``. Without ``even`` the two may be swapped, and ``f_phi`` is the higher one.
+    highest peak of the power spectrum with a tenth of the greatest power, and 2.2 times that of the
+    greatest, but at most 600 steps of the grid, ``600 / oversampling`` turns within the light
+    curve: ``Pairs.is_cut`` and ``Pairs.warnings`` say where that is not enough, and
+    `fourier_lattices` reaches further. Local maxima of the grid, the best ``keep``. Without
+    ``even`` the two may be swapped, and ``f_phi`` is the higher one.
     """
     multiples = terms(order, even)
     most = int(np.abs(multiples).sum(1).max())
-    scan = Scan.of(t, values, columns, max_frequency, oversampling, most)
+    scan = Scan.of(t, values, columns, max_frequency, oversampling, most, _MAX_PAIR_NODES)
     # a tenth of a cycle at least; neither frequency may be that of the other
     nodes = np.arange(max(oversampling // 2, 1), scan.count)
     pairs = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), -1).reshape(-1, 2)
@@ -191,7 +243,7 @@ def fourier_pairs(
     high = np.argwhere((power >= np.max(around, axis=0)) & (power > 0))
     best = high[np.argsort(-power[tuple(high.T)])][:keep]
     found = nodes[best] * scan.step
-    return Pairs(found[:, 0], found[:, 1], power[tuple(best.T)], scan.resolution)
+    return scan.pairs(found[:, 0], found[:, 1], power[tuple(best.T)])
 
 
 def fourier_lattices(
@@ -209,9 +261,11 @@ def fourier_lattices(
     For long light curves, whose grid has millions of pairs: g is only one of the ``lines`` highest
     peaks of the spectrum of one frequency, of which aliases are some, and h is sought over the
     whole grid, beside the multiples of g and half of it. What explains a body's light are a few
-    sums of multiples of its frequencies; which of them g and h are is left open.
+    sums of multiples of its frequencies; which of them g and h are is left open. ``max_frequency``
+    of either, per unit of ``t``; default: as for `fourier_pairs`, but at most 15,000 steps of the
+    grid, ``15_000 / oversampling`` cycles within the light curve.
     """
-    scan = Scan.of(t, values, columns, max_frequency, oversampling, 2)
+    scan = Scan.of(t, values, columns, max_frequency, oversampling, 2, _MAX_LINE_NODES)
     nodes = np.arange(max(oversampling // 2, 1), scan.count)
     peaks = _maxima(scan.fitted(nodes[:, None])[0])[:lines]
     found, power = [], []
@@ -230,7 +284,7 @@ def fourier_lattices(
         if len(kept) == keep:
             break
     g, h = scan.step * found[kept].T
-    return Pairs(g, h, power[kept], scan.resolution)
+    return scan.pairs(g, h, power[kept])
 
 
 def _maxima(values: np.ndarray) -> np.ndarray:
@@ -246,10 +300,19 @@ def _orthonormal(columns: np.ndarray) -> np.ndarray:
     return basis[size > 1e-10 * size[0]]
 
 
-def _highest(t, values, step) -> float:
-    """1.3 times the highest frequency of the spectrum with a tenth of the greatest power."""
-    gap = np.median(np.diff(np.sort(np.asarray(t, float))))
-    count = int(min(0.5 / gap / step, 20000))
+def _strong_lines(t, values, step) -> tuple[float, float]:
+    """Frequency of the strongest line of the spectrum, and the end of a grid for all strong ones.
+
+    The end: 1.3 times the highest frequency with a tenth of the greatest power, or 2.2 times that
+    of the greatest, whose second harmonic may be the next line. The spectrum reaches to what the
+    sampling resolves; where points are sparse but uneven, to a rotation in two hours.
+    """
+    gaps = np.diff(np.sort(np.asarray(t, float)))
+    gaps = gaps[gaps > 0]
+    limit = max(0.5 / np.median(gaps), min(0.5 / np.quantile(gaps, 0.05), _FASTEST))
+    count = max(int(min(limit / step, 4 * _MAX_LINE_NODES)), 8)
     (table,) = _transforms(jnp.asarray(t), jnp.asarray(values)[None], step, count)
     power = np.abs(np.asarray(table)) ** 2
-    return 1.3 * step * np.flatnonzero(power > 0.1 * power.max())[-1]
+    strong = step * np.flatnonzero(power > 0.1 * power.max())[-1]
+    strongest = step * int(np.argmax(power))
+    return strongest, min(max(1.3 * strong, 2.2 * strongest), max(count * step, 8 * step))

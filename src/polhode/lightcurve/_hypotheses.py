@@ -113,8 +113,7 @@ def meaning(f_phi: float, f_psi: float) -> str:
 
     def listed(sums):
         return ", ".join(
-            f"{_name(i, 'f_phi')}{_name(j, 'f_psi', first=i == 0)} = {i * f_phi + j * f_psi:.5g}"
-            for i, j in list(sums)[:3]
+            f"{sum_name(i, j)} = {i * f_phi + j * f_psi:.5g}" for i, j in list(sums)[:3]
         )
 
     # A body slower about L than about its long axis can only turn fully about the latter:
@@ -122,6 +121,11 @@ def meaning(f_phi: float, f_psi: float) -> str:
     if f_psi < f_phi:
         return f"LAM or SAM; LAM: {listed(LAM)}; SAM: {listed(SAM)}"
     return f"LAM only: {listed(LAM)}"
+
+
+def sum_name(i: int, j: int) -> str:
+    """The sum i f_phi + j f_psi in words."""
+    return f"{_name(i, 'f_phi')}{_name(j, 'f_psi', first=i == 0)}"
 
 
 def _name(count: int, symbol: str, first: bool = True) -> str:

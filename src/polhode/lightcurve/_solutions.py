@@ -1,6 +1,6 @@
 """What a light curve tells of each body that explains it, and what it cannot tell."""
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +10,13 @@ from polhode import rotation
 from polhode._closed_forms import free
 from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._frequencies import Pairs
-from polhode.lightcurve._hypotheses import Hypotheses
+from polhode.lightcurve._hypotheses import LAM, SAM, Hypotheses, sum_name
 from polhode.lightcurve._model import Bodies, moments_of
+from polhode.lightcurve._nulls import Model
 from polhode.lightcurve._steps import BATCH, Problem, State, normal_equations, picked
+
+if TYPE_CHECKING:
+    from polhode.lightcurve._verdict import Verdict
 
 # Chi-square per degree of freedom at which a body explains a light curve.
 REACHED = 1.3
@@ -42,10 +46,29 @@ class Solution(NamedTuple):
     model: np.ndarray  # (n,) magnitudes, offsets included
     weights: np.ndarray  # (n,) in [0, 1]: robust weight of each point
     mirror_of: int | None  # number of the solution whose mirror image this is
+    # (k,) of the logarithm of the surface density over that of the ellipsoid; None: an ellipsoid
+    harmonics: np.ndarray | None = None
+    parameters: float = 10.0  # that the points determine, besides offsets and phase function
+
+    @property
+    def P_phi_short_axis(self) -> float:
+        """Precession period of the short axis: ``P_phi`` in the short-axis convention.
+
+        1 / (1 / P_phi + 1 / P_psi), where P_phi and P_psi are those of the long-axis convention, as
+        everywhere else; P_psi is the same in both (Samarasinha & A'Hearn, Icarus 93 (1991) 194).
+        """
+        return 1 / (1 / self.P_phi + 1 / self.P_psi)
+
+    def lines(self, count: int = 3) -> tuple[tuple[str, float], ...]:
+        """Main lines of the light of this mode, with their periods: ``("2 f_phi", period)``."""
+        sums = LAM if self.mode == free.Mode.LAM else SAM
+        return tuple(
+            (sum_name(i, j), 1 / (i / self.P_phi + j / self.P_psi)) for i, j in list(sums)[:count]
+        )
 
 
-class Fit(NamedTuple):
-    """All distinct solutions, the best first."""
+class LightCurveFit(NamedTuple):
+    """All distinct solutions, the best first, and what may be claimed: ``verdict``."""
 
     solutions: tuple[Solution, ...]
     curve: LightCurve
@@ -55,6 +78,14 @@ class Fit(NamedTuple):
     alike: float  # so many residuals count as one, because neighbours are alike; 1: independent
     offset_sigma: float | None  # spread of groups' offsets [mag]: given or learnt; None: default
     notes: tuple[str, ...]  # what this light curve cannot show
+    verdict: "Verdict"  # what may be claimed
+    reasons: tuple[str, ...]  # of the verdict
+    # Principal-axis rotation rating in the manner of Pravec et al., Icarus 173 (2005) 108: from -4
+    # (tumbling, with one physical model) over 0 (nothing is known) to 2 (one period explains all)
+    par: int
+    models: tuple[Model, ...]  # null hypotheses first, and their evidence
+    misfit: float  # residuals of the best over the errors of the points, without the floor
+    agreement: float  # part of resampled light curves in which the best periods stay the best
 
     @property
     def best(self) -> Solution:
@@ -110,6 +141,13 @@ def _derived(x, wxyz):
 
 
 _derived_slopes = jax.jit(jax.vmap(jax.jacfwd(_derived)))
+
+
+def derived_slopes(bodies: Bodies) -> np.ndarray:
+    """Derivatives (b, 8, u + 3) of ln P_phi, ln P_psi, moments and momentum's direction."""
+    unknowns, wxyz = map(np.asarray, bodies)
+    x = jnp.asarray(np.c_[unknowns, np.zeros((len(unknowns), 3))])
+    return np.asarray(_derived_slopes(x, jnp.asarray(wxyz)))
 
 
 def described(problem: Problem, state: State, order, curve: LightCurve, normals, limit):
@@ -179,6 +217,21 @@ def likeness(curve: LightCurve, residuals: np.ndarray) -> float:
     return float(1 + 2 * (pairs * rho**lags).sum() / residuals.size)
 
 
+def same_periods(solutions, resolution: float) -> list[int]:
+    """For each solution the number of the first with its mode and, to half of 1/span, periods."""
+    out: list[int] = []
+    for k, s in enumerate(solutions):
+        first = k
+        for j in range(k):
+            other = solutions[j]
+            off = max(abs(1 / s.P_phi - 1 / other.P_phi), abs(1 / s.P_psi - 1 / other.P_psi))
+            if out[j] == j and s.mode == other.mode and off < 0.5 * resolution:
+                first = j
+                break
+        out.append(first)
+    return out
+
+
 def notes_on(curve: LightCurve, solutions, scale: float, alike: float) -> tuple[str, ...]:
     """What this light curve cannot show, in sentences."""
     notes = list(curve.notes)
@@ -205,19 +258,26 @@ def notes_on(curve: LightCurve, solutions, scale: float, alike: float) -> tuple[
     for name, period in (("P_phi", best.P_phi), ("P_psi", best.P_psi)):
         if span < 3 * period:
             notes.append(f"Fewer than three {name} were seen: it is uncertain beyond its error.")
-    rivals = [s for s in solutions[1:] if s.probability > EXCLUDED and s.mirror_of is None]
-    if rivals:
-        # a list that ends before the odds do is not the whole of them
-        least = "at least " if solutions[-1].probability > EXCLUDED else ""
+    # a list that ends before the odds do is not the whole of them
+    least = "at least " if solutions[-1].probability > EXCLUDED else ""
+    classes = same_periods(solutions, 1 / span)
+    possible = [k for k, s in enumerate(solutions) if s.probability > EXCLUDED]
+    others = len({classes[k] for k in possible} - {0})
+    if others:
         notes.append(
-            f"Ambiguous: {least}{len(rivals)} other solution(s) than the best, mirrors apart,"
-            " cannot be excluded at 1 in 1000."
+            f"Ambiguous: {least}{others} other pair(s) of periods than the best cannot be excluded"
+            " at 1 in 1000."
+        )
+    poles = sum(classes[k] == 0 and solutions[k].mirror_of is None for k in possible) - 1
+    if poles:
+        notes.append(
+            f"The pole is ambiguous: {least}{poles} other body(ies) of the best periods, mirrors"
+            " apart, cannot be excluded at 1 in 1000."
         )
     if scale**2 > REACHED:
         notes.append(
-            f"Residuals are {scale:.1f} times the errors assumed: an ellipsoid is not the whole"
-            " truth, and errors follow from the residuals; trust none to better than a factor of"
-            " two."
+            f"Residuals are {scale:.1f} times the errors assumed: the body is not the whole truth,"
+            " and errors follow from the residuals; trust none to better than a factor of two."
         )
     if alike > 1:
         notes.append(

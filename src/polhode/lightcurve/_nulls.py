@@ -1,0 +1,355 @@
+"""Null hypotheses of a light curve: noise alone, and one period (a principal-axis rotator).
+
+They are compared with tumbling bodies by an approximation of the logarithm of the evidence,
+
+    ln Z = -N/2 ln(RSS / N) - k/2 ln N - ln M,
+
+N the number of independent points (less the offsets), RSS the sum of squares of the weighted
+residuals, k the parameters, M the independent frequencies that were tried (Schwarz, Ann. Statist. 6
+(1978) 461, with the noise level unknown).
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from polhode.lightcurve._data import LightCurve
+from polhode.lightcurve._frequencies import LINES, Pairs, Scan, _maxima, terms
+from polhode.lightcurve._scattering import seeliger_ellipsoid
+
+_CLIP = 4.0  # residuals beyond as many times the scale of the best model count as that
+_CANDIDATES = 10  # peaks of the spectrum of one period that are refined
+_SCAN_ORDERS, _ORDERS = (2, 4), (1, 2, 3, 4, 6, 8)
+_MODULATED = 4  # harmonics whose amplitude may change linearly with time
+_BATCH = 32  # rotators improved together
+
+
+class Model(NamedTuple):
+    """One explanation of a light curve, and its evidence."""
+
+    name: str
+    log_evidence: float  # natural logarithm, without a constant that all models share
+    parameters: float  # besides offsets and phase function
+    rms: float  # weighted, of the residuals [mag]
+    misfit: float  # residuals over the errors of the light curve itself, without any floor
+    periods: tuple[float, ...]  # time unit of the light curve [day]
+
+
+class Residuals(NamedTuple):
+    """Residuals (n,) [mag] of a model of ``parameters`` parameters, from ``trials`` tried."""
+
+    name: str
+    values: np.ndarray
+    parameters: float
+    log_trials: float
+    periods: tuple[float, ...] = ()
+
+
+class Linear:
+    """Weighted least squares with offsets, a phase function, and any other columns."""
+
+    def __init__(self, curve: LightCurve, offset_sigma: float | None = None):
+        self.curve, self.t = curve, curve.t - curve.t[0]
+        columns, stiffness = curve.columns(offset_sigma)
+        if curve.sun is not None and np.ptp(curve.alpha) > np.radians(1):
+            columns = np.vstack([columns, curve.alpha, curve.alpha**2])
+            stiffness = np.r_[stiffness, 0.0, 0.0]
+        self.columns = columns
+        self.root = 1 / curve.sigma
+        # rows of the priors below those of the points
+        prior = np.diag(np.sqrt(stiffness))[stiffness > 0]
+        self.rows = np.vstack([columns.T * self.root[:, None], prior])
+        left, size, _ = np.linalg.svd(self.rows, full_matrices=False)
+        self.basis = left[:, size > 1e-10 * size[0]]
+        self.data = self.projected(curve.magnitude)
+
+    @property
+    def independent(self) -> int:
+        """Points less the offsets that are free."""
+        return max(self.t.size - (self.basis.shape[1] - (len(self.rows) - self.t.size)), 1)
+
+    def projected(self, values: np.ndarray) -> np.ndarray:
+        """Values (n, ...) over their errors, with what offsets explain removed."""
+        weighted = (values.T * self.root).T
+        whole = np.concatenate(
+            [weighted, np.zeros((len(self.rows) - self.t.size, *values.shape[1:]))]
+        )
+        return whole - self.basis @ (self.basis.T @ whole)
+
+    def residuals(self, waves: np.ndarray) -> np.ndarray:
+        """Residuals (n,) [mag] of the data after columns ``waves`` (n, c)."""
+        rest = self.data
+        if waves.shape[1]:
+            matrix = self.projected(waves)
+            rest = rest - matrix @ np.linalg.lstsq(matrix, rest, rcond=1e-9)[0]
+        return rest[: self.t.size] / self.root
+
+    def offsets(self, residuals: np.ndarray, model) -> np.ndarray:
+        """Offsets that, with the columns beyond, are part of a model with these ``residuals``.
+
+        ``model``: a solution with offsets near them, from which they differ by what fits best.
+        """
+        change = self.curve.magnitude + residuals - model.model
+        count = len(self.curve.columns()[0])
+        own = self.columns[:count].T
+        matrix, data = own * self.root[:, None], change * self.root
+        out = np.array(model.offsets, float)
+        out[:count] += np.linalg.lstsq(matrix, data, rcond=1e-9)[0]
+        return out
+
+    def chi2(self, waves: np.ndarray) -> float:
+        """Sum of squares of the residuals over their errors."""
+        return float(np.sum((self.residuals(waves) * self.root) ** 2))
+
+
+def waves(t: np.ndarray, frequencies: np.ndarray, modulated: int = 0) -> np.ndarray:
+    """Cosines and sines (n, 2 k); the first ``modulated`` ones also times the time."""
+    angle = 2 * np.pi * np.outer(t, frequencies)
+    both = np.hstack([np.cos(angle), np.sin(angle)])
+    if not modulated:
+        return both
+    slow = (2 * t / t[-1] - 1)[:, None]
+    angle = angle[:, :modulated]
+    return np.hstack([both, slow * np.cos(angle), slow * np.sin(angle)])
+
+
+def noise(linear: Linear) -> Residuals:
+    """Offsets and a phase function alone."""
+    return Residuals("noise only", linear.residuals(np.empty((linear.t.size, 0))), 0, 0.0)
+
+
+def one_period(linear: Linear, max_frequency: float) -> list[Residuals]:
+    """Fourier series of one period, without and with amplitudes that change linearly in time.
+
+    The latter for directions that turn. The best of each number of harmonics.
+    """
+    t, span = linear.t, float(linear.t[-1])
+    candidates = _peaks(linear, max_frequency)
+    refined = [_refined(linear, f, lambda f: waves(t, f * np.arange(1, 5))) for f in candidates]
+    chi2 = [linear.chi2(waves(t, f * np.arange(1, 5))) for f in refined]
+    best = [refined[k] for k in np.argsort(chi2)[:4]]
+    # a series of f / 2 and few harmonics may be that of f
+    best += [f * part for f in best[:2] for part in (0.5, 2.0) if f * part < max_frequency]
+    log_trials = float(np.log(max(max_frequency * span, 1.0)))
+    out = []
+    for order in _ORDERS:
+        if 2 * order + 1 > linear.independent / 3:
+            break
+        harmonics = np.arange(1, order + 1)
+        for modulated in (0, min(order, _MODULATED)):
+            count = 2 * (order + modulated) + 1
+            if count > linear.independent / 3:
+                continue
+
+            def columns(f, harmonics=harmonics, modulated=modulated):
+                return waves(t, f * harmonics, modulated)
+
+            found = [_refined(linear, f, columns, steps=7) for f in best]
+            f = found[int(np.argmin([linear.chi2(columns(f)) for f in found]))]
+            name = f"one period, {order} harmonics" + (", changing" if modulated else "")
+            rest = linear.residuals(columns(f))
+            out.append(Residuals(name, rest, count, log_trials, (1 / f,)))
+    return out
+
+
+def _peaks(linear: Linear, max_frequency: float) -> list[float]:
+    """Frequencies whose series of two or of four harmonics explain most."""
+    curve, over = linear.curve, 6
+    columns = curve.columns(np.inf)[0]
+    scan = Scan.of(curve.t, curve.magnitude, columns, max_frequency, over, max(_SCAN_ORDERS))
+    # a whole turn within the light curve at least: slower waves are trends
+    nodes = np.arange(over, scan.count)
+    if not nodes.size:
+        return [1 / float(linear.t[-1])]
+    kept: list[int] = []
+    for order in _SCAN_ORDERS:
+        found = scan.fitted(nodes[:, None] * np.arange(1, order + 1))[0]
+        kept += nodes[_maxima(found)[:_CANDIDATES]].tolist()
+    return [scan.step * k for k in sorted(set(kept))]
+
+
+def _refined(linear: Linear, frequency: float, columns, steps: int = 11) -> float:
+    """The frequency near ``frequency`` at which ``columns(f)`` explain most."""
+    width = 0.25 / linear.t[-1]
+    for _ in range(2):
+        near = frequency + width * np.linspace(-1, 1, steps)
+        frequency = float(near[int(np.argmin([linear.chi2(columns(f)) for f in near]))])
+        width *= 2.5 / steps
+    return frequency
+
+
+def two_periods(linear: Linear, pairs: Pairs, solutions) -> list[Residuals]:
+    """Fourier series of two frequencies: of the best pairs of lines, and of the best bodies."""
+    t = linear.t
+    log_trials = _log_pairs(pairs.max_frequency, t[-1])
+    choices = [(LINES, g, h) for g, h in zip(pairs.f_phi[:3], pairs.f_psi[:3], strict=True)]
+    choices += [(terms(2, even=False), 1 / s.P_phi, 1 / s.P_psi) for s in solutions[:2]]
+    out = []
+    for sums, g, h in choices:
+        count = 2 * len(sums) + 2
+        if count > linear.independent / 2:
+            continue
+        pair = np.array([g, h])
+        for _ in range(2):
+            for k in (0, 1):
+
+                def columns(f, k=k, pair=pair, sums=sums):
+                    return waves(t, sums @ np.where(np.arange(2) == k, f, pair))
+
+                pair[k] = _refined(linear, pair[k], columns, steps=7)
+        rest = linear.residuals(waves(t, sums @ pair))
+        out.append(
+            Residuals("two periods, series", rest, count, log_trials, tuple((1 / pair).tolist()))
+        )
+    return out
+
+
+def tumbler(linear: Linear, pairs: Pairs, best) -> Residuals:
+    """A tumbling body: two moments, attitude, rates, and the shape, as far as it is determined."""
+    log_trials = _log_pairs(pairs.max_frequency, linear.t[-1])
+    rest = linear.curve.magnitude - best.model
+    return Residuals(
+        "tumbling body", rest, best.parameters, log_trials, (float(best.P_phi), float(best.P_psi))
+    )
+
+
+def _log_pairs(max_frequency: float, span: float) -> float:
+    """Independent pairs of frequencies of a grid, as a logarithm."""
+    return float(2 * np.log(max(max_frequency * span, 1.0)) - np.log(2))
+
+
+@jax.jit
+def _rotators(x, arrays, basis):
+    """Residuals (b, n) of ellipsoids that rotate about their third axis, and derivatives."""
+    t, sun, observer, root, data = arrays
+
+    def residuals(x):
+        u, v, longitude, latitude, turn, frequency = x
+        c, s = jnp.cos(longitude), jnp.sin(longitude)
+        cb, sb = jnp.cos(latitude), jnp.sin(latitude)
+        frame = jnp.stack([
+            jnp.stack([sb * c, sb * s, -cb]),
+            jnp.stack([-s, c, jnp.zeros_like(s)]),
+            jnp.stack([cb * c, cb * s, sb]),
+        ])  # fmt: skip
+        angle = turn + 2 * jnp.pi * frequency * t
+        ca, sa = jnp.cos(angle), jnp.sin(angle)
+
+        def seen(vector):
+            a, b, z = frame @ vector
+            return ca * a + sa * b, ca * b - sa * a, z
+
+        axes = (jnp.ones_like(t), jnp.exp(u) + 0 * t, jnp.exp(v) + 0 * t)
+        light = seeliger_ellipsoid(axes, seen(sun), seen(observer))
+        value = -2.5 * jnp.log10(jnp.maximum(light, 1e-12)) * root
+        whole = jnp.concatenate([value, jnp.zeros(basis.shape[0] - t.shape[0])])
+        return data - whole + basis @ (basis.T @ whole)
+
+    # mag per (log of an axis) is held loosely, as in fits of tumbling bodies
+    value = jax.vmap(residuals)(x)
+    slopes = jax.vmap(jax.jacfwd(residuals))(x)
+    return value, slopes
+
+
+def rotator(linear: Linear, periods, max_frequency: float) -> tuple[Residuals, np.ndarray] | None:
+    """The best ellipsoid that rotates about its third axis, near one of ``periods``.
+
+    Its residuals, and logarithms of the second and third axis over the first, longitude and
+    latitude of the pole, phase [rad] and frequency. None without directions.
+    """
+    curve = linear.curve
+    if curve.sun is None or curve.observer is None:
+        return None
+    # what the law gives a sphere is a part of the phase function
+    arrays = (linear.t, curve.sun.T, curve.observer.T, linear.root, linear.data)
+    arrays = tuple(map(jnp.asarray, arrays))
+    basis = jnp.asarray(linear.basis)
+    k = np.arange(12) + 0.5
+    latitude = np.arcsin(1 - 2 * k / 12)
+    longitude = np.pi * (1 + 5**0.5) * k
+    turn = np.pi * np.arange(4) / 4
+    grid = np.array([
+        (np.log(0.65), np.log(0.5), a, b, c)
+        for a, b in zip(longitude, latitude, strict=True) for c in turn
+    ])  # fmt: skip
+    best, values, chosen = np.inf, None, np.zeros(6)
+    for f in sorted({float(f) for p in periods for f in (1 / p, 0.5 / p, 2 / p)}):
+        if f > max_frequency:
+            continue
+        x = np.c_[grid, np.full(len(grid), f)]
+        x = np.concatenate([x, x[: -len(x) % _BATCH]])
+        parts = [x[k : k + _BATCH] for k in range(0, len(x), _BATCH)]
+        chi2 = [np.sum(np.asarray(_rotators(p, arrays, basis)[0]) ** 2, axis=1) for p in parts]
+        x = x[np.argsort(np.concatenate(chi2))[:_BATCH]]
+        x, found = _improved(x, arrays, basis)
+        size = np.sum(found**2, axis=1)
+        k = int(np.argmin(size))
+        if size[k] < best:
+            best, values, chosen = size[k], found[k], x[k]
+    if values is None:
+        return None
+    log_trials = float(np.log(max(max_frequency * linear.t[-1], 1.0)))
+    rest = values[: linear.t.size] / np.asarray(linear.root)
+    period = (1 / float(chosen[5]),)
+    return Residuals("one period, rotating ellipsoid", rest, 6, log_trials, period), chosen
+
+
+def _improved(x, arrays, basis, steps: int = 25):
+    """Levenberg-Marquardt for rotators (b, 6); the parameters, and residuals (b, n)."""
+    damping = np.full(len(x), 1e-2)
+    value, slopes = map(np.asarray, _rotators(x, arrays, basis))
+    for _ in range(steps):
+        # axes' ratios 0 +- 0.8 in their logarithms
+        held = np.diag([0.8**-2, 0.8**-2, 0, 0, 0, 0])
+        matrix = np.einsum("bni,bnj->bij", slopes, slopes) + held
+        right = np.einsum("bni,bn->bi", slopes, value) + x @ held
+        size = np.sqrt(np.maximum(np.einsum("bii->bi", matrix), 1e-12))
+        scaled = matrix / size[:, :, None] / size[:, None]
+        scaled = np.nan_to_num(scaled) + damping[:, None, None] * np.eye(6)
+        step = np.linalg.solve(scaled, np.nan_to_num(right / size)[..., None])[..., 0] / size
+        step *= np.minimum(1, 0.5 / np.maximum(np.abs(step[:, :5]).max(1), 1e-30))[:, None]
+        tried = x - step
+        new, new_slopes = map(np.asarray, _rotators(tried, arrays, basis))
+        held = held[0, 0]
+
+        def cost(value, x, held=held):
+            return np.nan_to_num(np.sum(value**2, 1), nan=np.inf) + held * (x[:, :2] ** 2).sum(1)
+
+        better = cost(new, tried) < cost(value, x)
+        x = np.where(better[:, None], tried, x)
+        value = np.where(better[:, None], new, value)
+        slopes = np.where(better[:, None, None], new_slopes, slopes)
+        damping = np.clip(damping * np.where(better, 0.2, 5.0), 1e-9, 1e9)
+    return x, value
+
+
+def compared(linear: Linear, found: list[Residuals], likeness) -> tuple[Model, ...]:
+    """Evidence of the models ``found``, with points that are alike in the best one joined.
+
+    ``likeness(curve, residuals over errors)``: how many residuals count as one.
+    """
+    curve = linear.curve
+    n = linear.independent
+    sharpest = min(found, key=lambda r: np.median(np.abs(r.values * linear.root)))
+    scale = 1.4826 * max(float(np.median(np.abs(sharpest.values * linear.root))), 1e-12)
+    limit = _CLIP * scale
+    alike = likeness(curve, np.clip(sharpest.values * linear.root, -limit, limit))
+    alike *= max(n / max(n - sharpest.parameters, 1), 1.0)
+    independent = max(n / alike, 2.0)
+    out = []
+    for each in found:
+        weighted = each.values * linear.root
+        rss = float(np.sum(np.minimum(weighted**2, limit**2)))
+        evidence = (
+            -independent / 2 * np.log(max(rss, 1e-300) / n)
+            - each.parameters / 2 * np.log(independent)
+            - each.log_trials
+        )
+        rms = float(np.sqrt(np.average(each.values**2, weights=linear.root**2)))
+        own = float(
+            np.sqrt(np.sum(np.minimum(weighted**2, limit**2)) / max(n - each.parameters, 1))
+        )
+        out.append(Model(each.name, float(evidence), each.parameters, rms, own, each.periods))
+    return tuple(out)
