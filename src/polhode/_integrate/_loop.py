@@ -281,7 +281,7 @@ def advance(motion: Motion, wanted: Wanted, start: Array, ts: Array, walk: Walk,
         tried=count(walk.tried, alive),
         place=place,
     )
-    if turn is not None:
+    if turn is not None and broken is not None:
         now, rows = _turned(motion, wanted, walk, now, rows, tried, turn, wrong, good, width, start)
         snaps = broken.snaps[None] & broken.flips
         now = now._replace(
