@@ -163,9 +163,8 @@ for k, solution in enumerate(fit.solutions[:4]):
           f" {solution.probability:.1g}")  # fmt: skip
 
 # %% [markdown]
-# Periods are right to two of their errors, moments to 7 %. The pole is off by several times its
-# error: that error takes the residuals for noise, if one that lasts for some points, but they are
-# the rock's corners, which come back every turn. Mirror images of the pole are in the list too.
+# Periods are right within their errors, moments to 7 %. The shape that was fitted last is convex, no
+# ellipsoid, so that the residuals are those of the noise. Mirror images of the pole are in the list.
 #
 # And the attitude, night for night? An ellipsoid looks the same after half a turn about each axis,
 # so the nearest of four attitudes counts.

@@ -116,3 +116,28 @@ def test_shapes_are_checked():
         lightcurve.LightCurve.of(JD, MAGNITUDE, np.ones((8, 3)), np.ones((9, 3)))
     with pytest.raises(ValueError, match="neither"):
         lightcurve.LightCurve.of(JD, MAGNITUDE, np.ones((9, 3)))
+
+
+def test_calibrated_and_reduced_are_what_the_caller_says(tmp_path):
+    path = tmp_path / "curve.csv"
+    rows = [f"{k / 10},{10 + k / 7},0,0,2.5,1.5,0,0,{k % 2}" for k in range(10)]
+    header = "jd,mag,sun_x,sun_y,sun_z,observer_x,observer_y,observer_z,night"
+    path.write_text("\n".join([header, *rows]))
+    plain, known = (
+        lightcurve.read_light_curve(path, calibrated=x, reduced=x) for x in (False, True)
+    )
+    assert not plain.calibrated
+    assert known.calibrated
+    np.testing.assert_allclose(known.magnitude - plain.magnitude, 5 * np.log10(2.5 * 1.5))
+
+
+def test_vectors_in_kilometres_and_copies_of_points_are_named():
+    t = np.arange(10.0)
+    far = np.tile([3e8, 0, 0], (10, 1))
+    with pytest.raises(ValueError, match=r"in au.*as one in km"):
+        lightcurve.LightCurve.of(t, np.sin(t), far, far)
+    t[4] = t[3]
+    light = np.sin(t)
+    assert "1 point(s) are exact copies" in lightcurve.LightCurve.of(t, light).notes[-1]
+    light[4] += 0.1
+    assert lightcurve.LightCurve.of(t, light).notes == ()

@@ -201,6 +201,19 @@ def test_a_body_found_once_or_at_the_edge_of_the_search_is_ambiguous(cases):
     assert any("max_frequency" in reason for reason in found.reasons)
 
 
+def test_a_mode_that_the_shape_decides_is_ambiguous(cases):
+    """The best ellipsoid and the best convex body agree on the periods, not on the mode."""
+    _, pairs, linear, nulls = cases["tumbler"]
+    body = solution(offset_free(cases["tumbler"], tumbling))
+    other = body._replace(mode=ph.Mode.SAM, model=body.model + 1e-3)
+    for ellipsoid, expected in ((body, Verdict.TUMBLING), (other, Verdict.AMBIGUOUS)):
+        found = _verdict.judged(
+            linear, nulls, pairs, (body,), found_again=True, limit=3.0, others=(ellipsoid,)
+        )
+        assert found.verdict is expected
+    assert "assumption on the shape" in found.reasons[0]
+
+
 def test_fourteen_points_are_too_few():
     curve = curve_of(tumbling, nights=2, days=4, each=7)
     pairs = pairs_of(curve)

@@ -81,6 +81,20 @@ def lightcurve(
     seed: Annotated[
         int, typer.Option(parser=whole_number(0), metavar="N", help="of the trials")
     ] = 0,
+    searches: Annotated[
+        int,
+        typer.Option(parser=whole_number(1), metavar="N", help="searches at most, until two agree"),
+    ] = 3,
+    binned: Annotated[
+        float | None,
+        typer.Option(parser=positive, metavar="DAYS", help="width of normal points"),
+    ] = None,
+    calibrated: Annotated[
+        bool, typer.Option("--calibrated", help="nights share a zero point, but for small errors")
+    ] = False,
+    reduced: Annotated[
+        bool, typer.Option("--reduced", help="the brightness is reduced for distance already")
+    ] = False,
     force: ForceOption = False,
     quiet: QuietOption = False,
     debug: DebugOption = False,
@@ -101,13 +115,13 @@ def lightcurve(
     from polhode.lightcurve._command import fitted, read
 
     with refused(path, ".csv", expected):
-        curve = read(path, vectors, floor)
+        curve = read(path, vectors, floor, binned=binned, calibrated=calibrated, reduced=reduced)
     name = output or path.stem
     goals = [target(name + end, end, force=force) for end in (".png", ".json")]
     lines: list[str] = []
     options = {
         "trials": trials, "floor": floor, "seed": seed, "say": lines.append,
-        "max_frequency": max_frequency,
+        "max_frequency": max_frequency, "searches": searches,
     }  # fmt: skip
     words = f"searching {curve.t.size} points with {trials:,} trials (compiling first)"
     try:

@@ -44,6 +44,8 @@ class Finding(enum.IntFlag):
     NOT_WHITE = 32
     WEAK = 64
     POOR = 128
+    SATURATED = 256
+    OUTLIERS = 512
 
 
 WARNINGS = {
@@ -65,6 +67,11 @@ WARNINGS = {
     "quadratic over such a range",
     Finding.POOR: "the residuals are more than twice as large as the noise: a wrong model, wrong "
     "axes or units, outliers (robust=Huber()), or a local minimum that is not the best",
+    Finding.SATURATED: "a gyroscope axis stays at its greatest or least rate, as a saturated sensor"
+    " does: leave those samples out (present=0), or the moments are biased far beyond their"
+    " intervals",
+    Finding.OUTLIERS: "single samples are more than five times as far off as others: fit with"
+    " robust=Huber(); intervals are wider than they need to be",
 }
 _SCENE_WARNINGS = WARNINGS | {
     Finding.UNDETERMINED: "some of the numbers do not show in this motion, alone or against each"
@@ -511,6 +518,8 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
             Finding.WEAK: jnp.any(spread[3:6] > 0.05),
             Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
             Finding.AXES_DISAGREE: _axes_disagree(recording, options),
+            Finding.SATURATED: saturated(recording),
+            Finding.OUTLIERS: has_outliers(linear.rest, recording.present, options.robust),
         }
     )
     body = InertiaEstimate(
@@ -562,6 +571,8 @@ def conclude_scene(solution: Solution, recording: Recording, options: FitOptions
             Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread)),
             Finding.NOT_WHITE: whiteness < 1e-4,
             Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
+            Finding.SATURATED: saturated(recording),
+            Finding.OUTLIERS: has_outliers(linear.rest, recording.present, options.robust),
         }
     )
     attitude = getattr(options.motion, "attitude", None)
@@ -607,6 +618,56 @@ def sensor_axes(recording: Recording) -> Float[Array, "*b 3 3"]:
     mixed = jnp.einsum("...ti,...tj->...ij", measured, seen)
     square = jnp.einsum("...ti,...tj->...ij", seen, seen)
     return mixed @ inverse(square)
+
+
+def saturated(recording: Recording) -> Array:
+    """Whether an axis of the gyroscope stays at its greatest or least rate.
+
+    At least four samples and 1 % of all are equal to it, and five times as many as to the next
+    value: a coarse digitisation repeats both.
+    """
+    if recording.omega is None:
+        return jnp.asarray(False)
+    present = recording.present[..., None] > 0
+    omega, dtype = recording.omega, recording.omega.dtype
+    samples = jnp.sum(present.astype(dtype))
+
+    def clipped(values):
+        values = jnp.where(present, values, -jnp.inf)
+        greatest = jnp.max(values, axis=-2, keepdims=True)
+        equal = values == greatest
+        below = jnp.where(equal, -jnp.inf, values)
+        second = jnp.max(below, axis=-2, keepdims=True)
+        many = jnp.sum(equal.astype(dtype), axis=-2)
+        others = jnp.sum(((below == second) & jnp.isfinite(below)).astype(dtype), axis=-2)
+        enough = (many >= 4) & (many >= 0.01 * samples)
+        # of a constant rate there are no others, or rounding errors only
+        size = jnp.max(jnp.where(present, jnp.abs(omega), 0))
+        varies = jnp.isfinite(second[..., 0, :]) & (
+            greatest[..., 0, :] - jnp.min(jnp.where(present, values, jnp.inf), axis=-2)
+            > 1e-6 * size
+        )
+        return jnp.any(enough & (many >= 5 * others) & varies)
+
+    return clipped(omega) | clipped(-omega)
+
+
+def has_outliers(rest: Array, present: Array, robust: Any) -> Array:
+    """Whether single residuals (r, t, c) are far off where the fit counts them by their square.
+
+    Three at least and 0.3 % of all beyond five sigma, sigma from the median, their neighbours
+    within three: a model that lacks something leaves runs, not single samples.
+    """
+    if robust is not None:
+        return jnp.asarray(False)
+    known = (present > 0)[..., None] & jnp.ones(rest.shape, bool)
+    size = jnp.where(known, jnp.abs(rest), jnp.nan)
+    scale = 1.4826 * jnp.nanmedian(size, axis=1, keepdims=True)
+    far = jnp.nan_to_num(size / jnp.where(scale > 0, scale, jnp.inf))
+    ends = jnp.pad(far, ((0, 0), (1, 1), (0, 0)))
+    alone = (far > 5) & (ends[:, :-2] < 3) & (ends[:, 2:] < 3)
+    count, total = (jnp.sum(x.astype(rest.dtype)) for x in (alone, known))
+    return (count >= 3) & (count >= 0.003 * total)
 
 
 def _axes_disagree(recording: Recording, options: FitOptions) -> Array:

@@ -111,18 +111,24 @@ def run(
     max_frequency: float | None = None,
     floor: float = 0.03,
     seed: int = 0,
+    searches: int = 3,
+    binned: float | None = None,
+    calibrated: bool = False,
+    reduced: bool = False,
     say: Callable = print,
 ) -> LightCurveFit | None:
     """Read, fit, say the table, and write the figure and a JSON file beside each other.
 
     ``output``: path of the files without suffix (default: that of ``path``, in the current folder).
+    ``searches``, ``trials``, ``max_frequency``, ``floor``, ``seed``: of `fit_light_curve`;
+    ``calibrated``, ``reduced``: of `read_light_curve`; ``binned``: width [day] of normal points.
     Without directions to Sun and observer only the frequencies are listed, and None is returned.
     Raises what `read_light_curve` raises, and ValueError for a floor of 0 where errors are missing.
     """
     path = Path(path)
     name = Path(path.stem if output is None else output)
     picture, document = (name.with_name(name.name + suffix) for suffix in (".png", ".json"))
-    curve = read(path, vectors, floor)
+    curve = read(path, vectors, floor, binned=binned, calibrated=calibrated, reduced=reduced)
     return fitted(
         curve,
         path.name,
@@ -132,21 +138,28 @@ def run(
         max_frequency=max_frequency,
         floor=floor,
         seed=seed,
+        searches=searches,
         say=say,
     )
 
 
 def read(
-    path: str | PathLike[str], vectors: str | PathLike[str] | None, floor: float
+    path: str | PathLike[str],
+    vectors: str | PathLike[str] | None,
+    floor: float,
+    *,
+    binned: float | None = None,
+    calibrated: bool = False,
+    reduced: bool = False,
 ) -> LightCurve:
     """The light curve of a file; ValueError where neither it nor the floor gives an error."""
-    curve = read_light_curve(path, vectors)
+    curve = read_light_curve(path, vectors, calibrated=calibrated, reduced=reduced)
     if not floor > 0 and curve.sun is not None and not np.all(curve.sigma > 0):
         raise ValueError(
             f"{path}: a floor of {floor:g} needs a positive error of every point (sigma), which the"
             " file does not give."
         )
-    return curve
+    return curve if binned is None else curve.binned(binned)
 
 
 def fitted(
@@ -160,6 +173,7 @@ def fitted(
     trials: int,
     floor: float,
     seed: int,
+    searches: int = 3,
 ) -> LightCurveFit | None:
     """LightCurveFit, say the table, and write the figure and the numbers; see `run`."""
     say(f"{title}: {curve.t.size} points, {len(curve.names)} groups, {np.ptp(curve.t):.4g} d")
@@ -179,12 +193,13 @@ def fitted(
             say(f"note: {note}")
         return None
     imported("the figure of a light curve", "matplotlib", extra="plot")  # before the search
-    fit = fit_light_curve(curve, trials=trials, max_frequency=max_frequency, floor=floor, seed=seed)
-    say(frequency_table(fit.pairs, lines=True))
-    say(table(fit))
     settings = {
         "trials": trials, "max_frequency": max_frequency, "floor": floor, "seed": seed,
+        "searches": searches,
     }  # fmt: skip
+    fit = fit_light_curve(curve, **settings)
+    say(frequency_table(fit.pairs, lines=True))
+    say(table(fit))
     _write(fit, title, picture, document, settings, say)
     return fit
 

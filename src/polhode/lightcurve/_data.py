@@ -13,6 +13,7 @@ from polhode.lightcurve._scattering import seeliger_sphere
 
 LIGHT_TIME = 499.00478384 / 86400  # days per au
 _DOUBLED = math.radians(40)  # phase angle at which the floor has doubled
+_FAR = 1e4  # au, beyond which vectors are not in au
 _BLOCK = 128  # samples are padded to multiples, so that few programs are compiled
 
 
@@ -85,6 +86,10 @@ class LightCurve(NamedTuple):
         names, number = np.unique(group, return_inverse=True)
         sigma = np.broadcast_to(np.asarray(sigma, float), t.shape)
         order = np.argsort(t, kind="stable")
+        copies = t.size - len(np.unique(np.stack([t, magnitude, number]), axis=1).T)
+        if copies:
+            text = f"{copies} point(s) are exact copies of others: their errors count twice."
+            notes = (*notes, text)
 
         def sort(x):
             return None if x is None else np.ascontiguousarray(x[order])
@@ -225,4 +230,9 @@ def _directions(name: str, vectors, count: int) -> tuple[np.ndarray, np.ndarray]
     length = np.linalg.norm(vectors, axis=1)
     if not np.all(np.isfinite(length) & (length > 0)):
         raise ValueError(f"{name} must hold finite vectors that are not zero.")
+    if length.max() > _FAR:
+        raise ValueError(
+            f"{name} must hold vectors in au: the longest has length {length.max():.4g}, as one in"
+            " km."
+        )
     return vectors / length[:, None], length

@@ -15,12 +15,14 @@ from polhode.lightcurve._refine import refined_solutions
 from polhode.lightcurve._search import tried
 from polhode.lightcurve._solutions import (
     EXCLUDED,
+    FIXED,
     REACHED,
     LightCurveFit,
     described,
     frequencies,
     momentum,
     notes_on,
+    wander,
 )
 from polhode.lightcurve._steps import BATCH, Problem, State, picked, spread_of_offsets, taken
 from polhode.lightcurve._verdict import judged, null_models
@@ -51,7 +53,7 @@ def fit_light_curve(
     limit: float = 3.0,
     seed: int = 0,
     max_solutions: int = 12,
-    convex: bool = True,
+    convex: bool | None = None,
 ) -> LightCurveFit:
     """Every tumbling ellipsoid, of free inertia, that explains a light curve; without a guess.
 
@@ -128,6 +130,8 @@ def fit_light_curve(
     solutions, scale, alike = described(problem, state, order, curve, normals, limit)
     linear, nulls = null_models(curve, pairs, offset_sigma, phase, limit)
     ellipsoids = solutions[:1]
+    if convex is None:
+        convex = wander(curve) >= FIXED
     if convex:
         exact = curve.points(0.0, offset_sigma)  # without the floor
         solutions, scale, alike = refined_solutions(solutions, linear, exact, phase, limit)

@@ -13,7 +13,11 @@ _VECTORS = tuple(f"{body}_{c}" for body in ("sun", "observer") for c in "xyz")
 
 
 def read_light_curve(
-    path: str | PathLike[str], vectors: str | PathLike[str] | None = None
+    path: str | PathLike[str],
+    vectors: str | PathLike[str] | None = None,
+    *,
+    calibrated: bool = False,
+    reduced: bool = False,
 ) -> LightCurve:
     """A ``LightCurve`` from a file, whose kind is told by its contents.
 
@@ -23,7 +27,9 @@ def read_light_curve(
     ``block``). Times are those at the observer, not corrected for light time, and brightness is
     not reduced for distance, but for a flux of mean 1. ``vectors``: a second CSV of ``jd`` and the
     six components, interpolated linearly, for a file that has none. ALCDEF: magnitudes with their
-    geometry from PHASE, PABL and PABB. DAMIT: intensities with vectors.
+    geometry from PHASE, PABL and PABB. DAMIT: intensities with vectors. Of CSV and ALCDEF:
+    ``calibrated``: groups share a zero point but for small errors; ``reduced``: brightness is
+    reduced for distance already.
 
     Raises FileNotFoundError, and ValueError that names the line or column that is wrong.
     """
@@ -36,10 +42,10 @@ def read_light_curve(
     if not content:
         raise ValueError(f"{path} is empty; expected a light curve.")
     if any(line.strip().upper().startswith("STARTMETADATA") for line in content[:50]):
-        return _alcdef(path, lines)
+        return _alcdef(path, lines, calibrated)
     if len(content[0].split()) == 1 and content[0].strip().isdigit():
         return _damit(path, lines)
-    return _table(path, lines, vectors)
+    return _table(path, lines, vectors, calibrated, reduced)
 
 
 def _number(path, line: int, name: str, text: str) -> float:
@@ -75,7 +81,7 @@ def _rows(path, lines) -> tuple[dict[str, list[str]], list[int]]:
     return {name: [row[k] for row in table] for k, name in enumerate(names)}, numbers
 
 
-def _table(path, lines, vectors) -> LightCurve:
+def _table(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve:
     columns, numbers = _rows(path, lines)
 
     def values(names, needed=True):
@@ -93,7 +99,7 @@ def _table(path, lines, vectors) -> LightCurve:
     t = values(_TIME)
     sigma = values(("sigma", "mag_err", "magerr", "error"), needed=False)
     magnitude = values(("magnitude", "mag"), needed=False)
-    notes, reduced = [], False
+    notes = []
     if magnitude is None:
         flux = values(("magnitude", "mag", "flux", "brightness", "intensity"))
         assert flux is not None  # it is needed
@@ -101,8 +107,8 @@ def _table(path, lines, vectors) -> LightCurve:
             line = numbers[int(np.flatnonzero(~(flux > 0))[0])]
             raise ValueError(f"{path}: line {line}: a flux must be positive.")
         magnitude = -2.5 * np.log10(flux)
-        reduced = abs(flux.mean() - 1) < 0.1
-        if reduced:
+        if not reduced and abs(flux.mean() - 1) < 0.1:
+            reduced = True
             notes.append("The flux has mean 1: taken as reduced for distance.")
         if sigma is not None:
             sigma = 2.5 / np.log(10) * sigma / flux
@@ -116,7 +122,7 @@ def _table(path, lines, vectors) -> LightCurve:
     sun, observer = (None, None) if six is None else (six[:, :3], six[:, 3:])
     return LightCurve.of(
         t, magnitude, sun, observer, sigma=0.0 if sigma is None else sigma, group=group,
-        reduced=reduced, notes=notes,
+        calibrated=calibrated, reduced=reduced, notes=notes,
     )  # fmt: skip
 
 
@@ -188,7 +194,7 @@ def _damit(path, lines) -> LightCurve:
     )  # fmt: skip
 
 
-def _alcdef(path, lines) -> LightCurve:
+def _alcdef(path, lines, calibrated: bool) -> LightCurve:
     """Sessions of KEYWORD=value and DATA=JD|magnitude|error lines."""
     table, group, keys, session, rays = [], [], {}, 0, []
     for number, line in enumerate(lines, 1):
@@ -224,8 +230,9 @@ def _alcdef(path, lines) -> LightCurve:
     else:
         notes.append("Not every session has PHASE, PABL and PABB: no directions.")
     return LightCurve.of(
-        data[:, 0], data[:, 1], sun, observer, sigma=data[:, 2], group=group, notes=notes
-    )
+        data[:, 0], data[:, 1], sun, observer, sigma=data[:, 2], group=group, notes=notes,
+        calibrated=calibrated,
+    )  # fmt: skip
 
 
 def _is_number(text) -> bool:

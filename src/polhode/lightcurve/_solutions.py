@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
 # Chi-square per degree of freedom at which a body explains a light curve.
 REACHED = 1.3
+FIXED = 5.0  # deg: directions that change by less are one geometry
 EXCLUDED = 1e-3  # odds of a solution below which it is
 
 
@@ -232,18 +233,23 @@ def same_periods(solutions, resolution: float) -> list[int]:
     return out
 
 
+def wander(curve: LightCurve) -> float:
+    """Greatest angle [deg] of the directions to Sun or observer from their means."""
+    return max(
+        np.degrees(np.arccos(np.clip((v @ v.mean(0) / np.linalg.norm(v.mean(0))).min(), -1, 1)))
+        for v in curve._known_directions()
+    )
+
+
 def notes_on(curve: LightCurve, solutions, scale: float, alike: float) -> tuple[str, ...]:
     """What this light curve cannot show, in sentences."""
     notes = list(curve.notes)
     sun, observer = curve._known_directions()
     directions = np.vstack([sun, observer])
-    wander = max(
-        np.degrees(np.arccos(np.clip((v @ v.mean(0) / np.linalg.norm(v.mean(0))).min(), -1, 1)))
-        for v in (sun, observer)
-    )
-    if wander < 5:
+    turned = wander(curve)
+    if turned < FIXED:
         notes.append(
-            f"Sun and observer keep their directions within {wander:.1f} deg: every pole has a"
+            f"Sun and observer keep their directions within {turned:.1f} deg: every pole has a"
             " mirror image in their plane that fits as well, and the absolute size of the shape's"
             " axes along the momentum is hardly seen."
         )

@@ -163,6 +163,11 @@ def judged(
             f"{rivals - 1} other pair(s) of periods cannot be excluded at 1 in"
             f" {round(1 / EXCLUDED)}."
         )
+    if any(same_periods((best, other), pairs.resolution) != [0, 0] for other in others):
+        reasons.append(
+            "The best ellipsoid has other periods or another mode than the best convex body: the"
+            " assumption on the shape decides."
+        )
     if agreement < _AGREEMENT:
         reasons.append(
             f"The best periods stay the best in {agreement:.0%} of resampled light curves only;"

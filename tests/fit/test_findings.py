@@ -1,0 +1,90 @@
+"""Saturated sensors and outliers are named; clean and coarsely digitised records are not."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import polhode as ph
+from polhode.fit import Finding, Recording, fit_inertia
+from polhode.fit._result import has_outliers, saturated
+
+T = np.linspace(0, 20, 500)
+RATES = np.stack([3 * np.sin(T), 2 * np.cos(1.3 * T), 1 + 0.5 * np.sin(2 * T)], -1)
+
+
+def noisy(seed=0):
+    return RATES + 0.02 * np.random.default_rng(seed).normal(size=RATES.shape)
+
+
+def is_saturated(omega, present=None):
+    return bool(saturated(Recording.of(T, omega, **({} if present is None else present))))
+
+
+@pytest.mark.parametrize("side", [1, -1])
+@pytest.mark.parametrize("part", [0.5, 0.75, 0.95])
+def test_clipped_rates_are_named(side, part):
+    omega = side * noisy()
+    limit = part * 3.0
+    assert is_saturated(np.minimum(omega, limit))
+
+
+def test_clipped_and_digitised_rates_are_named():
+    omega = np.round(np.clip(noisy(), -2.2, 2.2) / 0.005) * 0.005
+    assert is_saturated(omega)
+
+
+@pytest.mark.parametrize("step", [0.001, 0.01, 0.03])
+def test_digitised_rates_are_not_saturated(step):
+    assert not is_saturated(noisy())
+    assert not is_saturated(np.round(noisy() / step) * step)
+    assert not is_saturated(np.round(RATES / step) * step)
+
+
+def test_constant_rates_are_not_saturated():
+    omega = RATES.copy()
+    omega[:, 2] = 1.0
+    assert not is_saturated(omega)
+    omega[:, 2] = 0.0
+    assert not is_saturated(omega)
+    omega[:, 2] = 1 + 1e-15 * (np.arange(T.size) % 7 == 0)
+    assert not is_saturated(omega)
+
+
+def test_single_samples_far_off_are_outliers_and_runs_are_not():
+    rng = np.random.default_rng(1)
+    rest = rng.normal(size=(1, 500, 3))
+    present = jnp.ones((1, 500))
+    assert not has_outliers(jnp.asarray(rest), present, None)
+    some = rest.copy()
+    some[0, rng.choice(500, 8, replace=False), 1] += 15
+    assert has_outliers(jnp.asarray(some), present, None)
+    # the fit is robust already
+    assert not has_outliers(jnp.asarray(some), present, object())
+    # a model that lacks something
+    wrong = rest + 10 * (np.sin(T) > 0.9)[None, :, None]
+    assert not has_outliers(jnp.asarray(wrong), present, None)
+    # samples that are not there
+    gaps = np.ones((1, 500))
+    gaps[0, np.abs(some[0, :, 1]) > 6] = 0
+    assert not has_outliers(jnp.asarray(some), jnp.asarray(gaps), None)
+
+
+@pytest.mark.slow
+def test_fits_name_clipped_records_and_outliers():
+    inertia = ph.Inertia.from_moments([1.0, 1.6, 2.2])
+    t = np.linspace(0, 4.0, 400)
+    path = ph.simulate(ph.Scene(inertia), ph.State([1.0, 0, 0, 0], [3.0, 4.0, 2.0]), t)
+    rng = np.random.default_rng(0)
+    clean = np.asarray(path.omega_body) + 0.02 * rng.normal(size=(400, 3))
+    wild = clean.copy()
+    wild[rng.choice(400, 6, replace=False), 0] += 1.0
+    clipped = np.clip(clean, -3.0, 3.0)
+    for omega, expected in (
+        (clean, Finding.NONE),
+        (wild, Finding.OUTLIERS),
+        (clipped, Finding.SATURATED),
+    ):
+        fit = fit_inertia(t, omega, omega_noise=0.02, throw=False)
+        seen = int(fit.diagnostics) & int(Finding.OUTLIERS | Finding.SATURATED)
+        assert seen == int(expected)
+        assert ("saturated" in fit.findings()) == (expected is Finding.SATURATED)
