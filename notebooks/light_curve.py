@@ -163,8 +163,9 @@ for k, solution in enumerate(fit.solutions[:4]):
           f" {solution.probability:.1g}")  # fmt: skip
 
 # %% [markdown]
-# Periods are right within their errors, moments to 7 %. The shape that was fitted last is convex, no
-# ellipsoid, so that the residuals are those of the noise. Mirror images of the pole are in the list.
+# Periods are right within their errors, moments to 7 %. The shape that was fitted last is convex,
+# no ellipsoid, so that the residuals are those of the noise. Mirror images of the pole are in the
+# list.
 #
 # And the attitude, night for night? An ellipsoid looks the same after half a turn about each axis,
 # so the nearest of four attitudes counts.
