@@ -321,7 +321,7 @@ def test_parts_keep_the_way_back_from_states_drawn_together(mode):
     found = [jax.jit(mode(partial(angle, parts=parts)))(p) for parts in (1, 8)]
     np.testing.assert_allclose(found[1], want, rtol=1e-9)
     if mode is jax.jacrev:
-        assert np.max(np.abs(found[0] - want)) > 1e-8  # what the parts are for
+        assert np.isnan(found[0]).all()  # what the parts are for
 
 
 def test_what_cannot_be_differentiated_is_refused():

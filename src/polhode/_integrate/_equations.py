@@ -23,16 +23,26 @@ from polhode._kernels import Distinct, attached, is_slope, kernel, linear, speci
 _LOST = 1000
 """By how many ``rtol`` the way back may miss the state at its start."""
 
+_LOST_BY_OTHERS = 1e-3
+"""The same of states found by other solvers, whose error is not known."""
+
 _STEPS = 2**20
 """Most steps of a derivative between two saved times."""
 
 
 def equations_of(
-    terms: Any, args: PyTree, y0: PyTree[Array], t: Array, rtol: Array, compensated: bool
+    terms: Any,
+    args: PyTree,
+    y0: PyTree[Array],
+    t: Array,
+    rtol: Array,
+    compensated: bool,
+    own: bool = True,
 ) -> tuple["Equations", list[Array]]:
     """The field on lists of arrays, and all arrays that it rests on.
 
-    What the functions in ``args`` close over is among them: it may be differentiated.
+    What the functions in ``args`` close over is among them: it may be differentiated. ``own``:
+    whether the states that are saved keep ``rtol``.
     """
     leaves, tree = jax.tree.flatten(y0)
     problem = BoundTerm.of(terms, args)
@@ -59,7 +69,7 @@ def equations_of(
     how, told = jax.tree.flatten((rtol, units_of(args, y0, jnp.ones_like(t))))
     counts = len(closed.consts), 0 if flat is None else len(flat.consts), len(arrays)
     c = [*closed.consts, *([] if flat is None else flat.consts), *arrays, *how]
-    return Equations(closed.jaxpr, counts, len(leaves), flat, told, compensated), c
+    return Equations(closed.jaxpr, counts, len(leaves), flat, told, compensated, own), c
 
 
 class Equations:
@@ -69,9 +79,9 @@ class Equations:
     means, with its derivatives; the whole way takes ``horizon``.
     """
 
-    def __init__(self, jaxpr, counts, size, costate, told, compensated):
+    def __init__(self, jaxpr, counts, size, costate, told, compensated, own):
         self.jaxpr, self.counts, self.size = jaxpr, counts, size
-        self.told, self.compensated = told, compensated
+        self.told, self.compensated, self.own = told, compensated, own
         self.costate = AnyCostate(self.field) if costate is None else costate
         self.asks_time = uses(jaxpr, 0)
 
@@ -245,7 +255,8 @@ class Equations:
         rest = told.least**2 if isinstance(told, LiePoissonUnits) else 0
         apart = sum((a - b) ** 2 for a, b in zip(z[:3], start[:3]))
         unit = sum((a * a + b * b for a, b in zip(start[:3], end[:3])), start=rest)
-        lost = apart > (_LOST * rtol) ** 2 * unit
+        most = _LOST * rtol if self.own else _LOST_BY_OTHERS
+        lost = apart > most**2 * unit
         z = [jnp.where(lost, jnp.nan, x) for x in z]
         mu = [jnp.where(lost if m.shape == lost.shape else jnp.any(lost), jnp.nan, m) for m in mu]
         mu = [_summed(m, jnp.shape(made[i])) for m, i in zip(mu, which)]

@@ -64,7 +64,8 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
         leaves, tree = jax.tree.flatten(init_state.y)
         rtol = self._accuracy(solver, leaves[0].dtype)
         compensated = getattr(solver, "compensated", False)
-        equations, c = equations_of(terms, args, init_state.y, t0, rtol, compensated)
+        own = getattr(solver, "accuracy", None) is not None
+        equations, c = equations_of(terms, args, init_state.y, t0, rtol, compensated, own)
 
         held, rates, _ = equations.prepared(c, t0, leaves)
         rates = kernel(rates)  # for solvers that are not units themselves
