@@ -256,7 +256,7 @@ class Equations:
         apart = sum((a - b) ** 2 for a, b in zip(z[:3], start[:3]))
         unit = sum((a * a + b * b for a, b in zip(start[:3], end[:3])), start=rest)
         most = _LOST * rtol if self.own else _LOST_BY_OTHERS
-        lost = apart > most**2 * unit
+        lost = jnp.asarray(apart > most**2 * unit)
         z = [jnp.where(lost, jnp.nan, x) for x in z]
         mu = [jnp.where(lost if m.shape == lost.shape else jnp.any(lost), jnp.nan, m) for m in mu]
         mu = [_summed(m, jnp.shape(made[i])) for m, i in zip(mu, which)]
