@@ -81,7 +81,7 @@ class AbstractIntegration(AbstractMethod):
         """The steps that the bodies of a scene are moved by, in words."""
         if not self._is_automatic:
             return f"steps of {type(self.solver).__name__}"
-        few, switches, hidden = _are_few(scene, state), 0, ()
+        few, switches, hidden = self._are_few(scene, state), 0, ()
         if few or _may_jump(scene):
             found: list[Any] = []
 
@@ -204,10 +204,18 @@ class AbstractIntegration(AbstractMethod):
     def _is_automatic(self) -> bool:
         return isinstance(self.solver, Automatic) and self.controller is None
 
+    def _are_few(self, scene: Scene, state: State) -> bool:
+        """Whether these are few bodies on which torques act, whose rounding need not be carried
+        along: explicit steps do not."""
+        acts = scene.torque is not None or bool(scene.dynamics.coupled)
+        few = 0 < state.wxyz.shape[0] <= FEW_BODIES
+        plain = isinstance(self.solver, Automatic) and not self.solver.compensated
+        return acts and few and plain
+
     def _suits_loop(self, scene, state, ts, record: Record, jumps: bool) -> tuple[bool, bool]:
         """Whether explicit steps are the faster ones, or the only ones that end at switches; and
         whether other steps are to be searched for jumps."""
-        if _are_few(scene, state):
+        if self._are_few(scene, state):
             return True, jumps
         if not jumps or not state.wxyz.shape[0]:
             return False, jumps
@@ -492,13 +500,6 @@ FEW_BODIES = 4
 satellite: 1.1 s against 1.9 s), samples do not end them, and their derivatives stand damping.
 Bodies in a potential alone take half as long by extrapolation (one top, 20 s: 0.54 against 0.99
 ms), which compiles as fast there."""
-
-
-def _are_few(scene: Scene, state: State) -> bool:
-    """Whether these are few bodies on which torques act."""
-    acts = scene.torque is not None or bool(scene.dynamics.coupled)
-    return acts and 0 < state.wxyz.shape[0] <= FEW_BODIES
-
 
 _ENDED = (Status.SUCCESSFUL, Status.MAX_STEPS, Status.STEP_FAILED, Status.NOT_FINITE)
 
