@@ -94,7 +94,7 @@ class Walk(NamedTuple):
     ``lately``: which switches turned where the step begins; ``fresh``: whether rates are to be
     worked out; ``width``: of the next step [s]; ``before``: logarithm of the last error over what
     was allowed; ``turned``: angle so far [rad]; ``error``: sum of estimated errors; ``steps``,
-    ``tried``; ``margin``: at ``y``; ``turns``: switches turned; ``back``: switches in sequence that
+    ``tried``; ``margin``: at ``y``; ``back``: switches in sequence that
     turned back at once; ``place``: of the next sample; ``count``: of events; ``ended``: 0 or why.
     """
 
@@ -111,7 +111,6 @@ class Walk(NamedTuple):
     error: Array
     steps: Array
     tried: Array
-    turns: Array
     back: Array
     place: Array
     count: Array
@@ -206,7 +205,7 @@ def begin(motion: Motion, wanted: Wanted, start: Array, ts: Array, y: Array) -> 
     walk = Walk(
         gone=zero, y=y, rate=jnp.zeros_like(y), levels=levels, margin=unknown, lately=unknown,
         fresh=jnp.ones_like(none, bool), width=zero, before=zero, turned=zero, error=zero,
-        steps=none, tried=none, turns=none, back=none, place=none, count=none, ended=none,
+        steps=none, tried=none, back=none, place=none, count=none, ended=none,
     )  # fmt: skip
     dtype, bodies = y.dtype, y.shape[1]
     samples = jnp.full((bodies * (ts.shape[0] + 1), y.shape[0]), jnp.nan, dtype)
@@ -446,7 +445,7 @@ def _search(motion, wanted, walk: Walk, tried: Tried, t, good, eps) -> Turn:
     low, high = entry(spots, first - 1), entry(spots, jnp.minimum(first, size - 1))
     at_low, at_high = entry(looks, first - 1), entry(looks, jnp.minimum(first, size - 1))
     # of the turning points the one that comes nearest to zero, before any look below it
-    _, depth = _dips(looks)
+    depth = _dips(looks)
     inner = jnp.arange(1, size - 1)[:, None, None]
     depth = jnp.where(inner < first[None, None], depth, 1)
     least = jnp.min(depth, axis=(0, 1))
@@ -603,7 +602,6 @@ def _turned(motion, wanted, walk, now, rows, tried, turn: Turn, wrong, good, wid
         lately=lately.astype(walk.lately.dtype),
         fresh=hit | repaired,
         width=jnp.where(repaired, walk.width, jnp.where(again, width / 4, now.width)),
-        turns=walk.turns + jnp.where(hit, 1, 0).astype(walk.turns.dtype),
         back=jnp.where(again, walk.back + 1, jnp.where(good & ~hit, 0, walk.back)),
     )
     if not motion.watched:
@@ -722,10 +720,10 @@ def _looks(margins: Array) -> Array:
 _PLACES = tuple(float(NODES[k]) for k in LOOKS)
 
 
-def _dips(looks: Array) -> tuple[Array, Array]:
-    """Where a parabola through three looks in sequence turns (L - 2, K, B), and how low it lies
-    there, over the least of the three; 1 for nowhere near zero."""
-    place, depth = [], []
+def _dips(looks: Array) -> Array:
+    """How low a parabola through three looks lies where it turns (L - 2, K, B), over the least of
+    the three; 1 where it does not turn between them."""
+    depth = []
     for k in range(1, len(_PLACES) - 1):
         x0, x1, x2 = _PLACES[k - 1 : k + 2]
         a, b, c = looks[k - 1], looks[k], looks[k + 1]
@@ -733,8 +731,7 @@ def _dips(looks: Array) -> tuple[Array, Array]:
         least = jnp.minimum(jnp.minimum(a, b), c)
         inside = (x > x0) & (x < x2) & (least >= 0)
         depth.append(jnp.where(inside, value / jnp.where(least > 0, least, 1), 1))
-        place.append(jnp.where(inside, x, x1))
-    return jnp.stack(place), jnp.stack(depth)
+    return jnp.stack(depth)
 
 
 def _vertex(x, f):
@@ -752,6 +749,6 @@ def _vertex(x, f):
 def _is_near(margins: Array) -> Array:
     """Whether (B,) a switch may turn within the step."""
     looks = _looks(margins)
-    _, depth = _dips(looks)
+    depth = _dips(looks)
     near = jnp.any(looks < 0, axis=(0, 1)) | jnp.any(depth <= 0.5, axis=(0, 1))
     return jnp.where(near, 1.0, 0.0)
