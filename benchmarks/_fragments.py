@@ -255,64 +255,6 @@ def _() -> str:
     return number(max(row["over_worst"] or 0.0 for row in rows_ if row["dtype"] == "float32"))
 
 
-@_fragment("moser-veselov")
-def _() -> str:
-    found: dict[str, dict[tuple[str, str], dict]] = {}
-    for row in _numbers("moser_veselov")["rows"]:
-        found.setdefault(row["acts"], {})[row["program"], row["setting"]] = row
-    columns = {
-        "planner, rtol 1e-3, 1e-6, 1e-9": ("planner", "rtol 1e-03", "rtol 1e-06", "rtol 1e-09"),
-        "order 2, 200 and 800 steps": ("Moser-Veselov 10, order 2", "200 steps", "800 steps"),
-        "order 4, 200 and 400": ("Moser-Veselov 10, order 4", "200 steps", "400 steps"),
-        "order 6, 100 and 200": ("Moser-Veselov 10, order 6", "100 steps", "200 steps"),
-        "rotations, order 4, 200": ("rotations, order 4", "200 steps"),
-        "rotations, order 6, 200": ("rotations, order 6", "200 steps"),
-    }
-    lines = []
-    for acts, programs in found.items():
-        line = [acts]
-        for program, *settings in columns.values():
-            each = (programs[program, setting] for setting in settings)
-            line.append(", ".join(f"{number(r['us_per_body'])} ({r['median']:.0e})" for r in each))
-        lines.append(line)
-    return _block(rows(["", *columns], lines), f"({command(read('moser_veselov'))})")
-
-
-@_fragment("moser-veselov-rotations")
-def _() -> str:
-    """Rotations over Moser and Veselov's step, same order and number of steps."""
-    times = {
-        (row["acts"], row["program"].split("order")[1], row["setting"], row["program"][0]): row
-        for row in _numbers("moser_veselov")["rows"]
-        if "order" in row["program"]
-    }
-    return _between(
-        (
-            row["us_per_body"] / times[acts, order, setting, "M"]["us_per_body"]
-            for (acts, order, setting, kind), row in times.items()
-            if kind == "r"
-        )
-    )
-
-
-@_fragment("moser-veselov-planner")
-def _() -> str:
-    """Moser and Veselov's step over the planner's integrator, at the errors that both reach."""
-    found = []
-    cases: dict[str, list[dict]] = {}
-    for row in _numbers("moser_veselov")["rows"]:
-        about = {"ns_per_body": row["us_per_body"], "error": row["median"], "failed": 0}
-        cases.setdefault(row["acts"], []).append({**about, "program": row["program"]})
-    for rows_ in cases.values():
-        planner = [row for row in rows_ if row["program"] == "planner"]
-        coarsest = max(row["error"] for row in planner)
-        for row in rows_:
-            if row["program"].startswith("Moser") and row["error"] <= coarsest:
-                time = _levels.time_at(planner, row["error"], "error")
-                found += [row["ns_per_body"] / time] if time else []
-    return _between(found)
-
-
 # Fits
 
 

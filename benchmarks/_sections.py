@@ -1,6 +1,5 @@
 """The sections of the results page: each from one result, as lines of Markdown."""
 
-import math
 from typing import Any
 
 from benchmarks._light_curve_section import light_curves
@@ -243,37 +242,6 @@ def free_body(report: dict) -> list[str]:
     return [*out, ""]
 
 
-def elliptic_accuracy(report: dict) -> list[str]:
-    numbers, worst = report["numbers"], {}
-    for row in numbers["rows"]:
-        kinds = worst.setdefault(row["function"], {})
-        if row["worst"] is None or row["worst"] > kinds.get(row["dtype"], (-1.0,))[0]:
-            kinds[row["dtype"]] = (math.inf if row["worst"] is None else row["worst"],
-                                   row["region"])  # fmt: skip
-    allowed = numbers["allowed_elsewhere"]
-    lines = []
-    for name, kinds in worst.items():
-        cells = [f"`{name}`"]
-        for dtype in ("float64", "float32"):
-            where = kinds[dtype][1].replace("->", "→").replace("all", "–")
-            cells += [f"{kinds[dtype][0]:.2f}", where]
-        cells += [f"{limits[name]:,}" if name in limits else "–" for limits in allowed.values()]
-        lines.append(cells)
-    header = ["worst [eps]", "float64", "where", "float32", "where", *allowed]
-    return [
-        "## Elliptic functions", "", machine(report), "",
-        f"Worst errors over {numbers['points_per_function_and_dtype']:,} random and awkward points"
-        " per function and dtype against mpmath, in eps (2.2e-16, 1.2e-7) of the result, of 1"
-        " for sn and cn; of functions of u or an angle, what exceeds one eps of that argument."
-        " m1 = 1 - m is passed beside m. On the right what others allow in double precision: the"
-        " tests of Principia, in ulps (`elliptic_functions_test.cpp`,"
-        " `elliptic_integrals_test.cpp`; the rounding of the arguments and of 1 - m"
-        " counts there too), and Fukushima, in his machine epsilons"
-        " (Numer. Math. 116, 687; Math. Comp. 80, 1725).", "",
-        *rows(header, lines),
-    ]  # fmt: skip
-
-
 def rotation_stress(report: dict) -> list[str]:
     found: dict[str, dict] = {}
     for row in report["numbers"]["rows"]:
@@ -404,7 +372,7 @@ SECTIONS = {
     "light_curves": light_curves,
     "racquet": racquet,
     "stress": stress,
-    "free_body": free_body, "elliptic_accuracy": elliptic_accuracy,
+    "free_body": free_body,
     "rotation_stress": rotation_stress, "torqued": torqued,
 }  # fmt: skip
 """By name of the benchmark, in the order of the page; the others go through ``generic``."""

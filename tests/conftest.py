@@ -31,7 +31,6 @@ CHECKED = (
     "inertia",
     "_hamiltonian",
     "_scene",
-    "_closed_forms.elliptic",
     "frames",
 )
 assert not [name for name in sys.modules if name.split(".")[0] == "polhode"]

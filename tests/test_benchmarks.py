@@ -255,28 +255,6 @@ def test_scaling_and_scene_cost_run():
     assert row["flops"] > 0
 
 
-@pytest.mark.slow
-def test_splittings_are_scored_beside_the_planner(monkeypatch):
-    from benchmarks import moser_veselov
-
-    monkeypatch.setattr(moser_veselov, "RTOLS", (1e-9,))
-    monkeypatch.setattr(moser_veselov, "WHOLE", {4: (100,)})
-    monkeypatch.setattr(moser_veselov, "ROTATIONS", {})
-    short = dataclasses.replace(PROBLEMS["gradient"], horizon=2.0)
-    planner, whole = moser_veselov.run(short, 4, 2)
-    assert planner["worst"] < 1e-8
-    assert 1e-15 < whole["worst"] < 1e-7
-    assert whole["us_per_body"] > 0
-
-
-def test_accuracy_of_elliptic_functions_is_measured_per_region():
-    from benchmarks import elliptic_accuracy
-
-    found = list(elliptic_accuracy.measure(["ellipk"], 4))
-    assert len(found) == 2 * 4
-    assert all(0 <= row["worst"] < 5 and row["points"] == 4 for row in found)
-
-
 @pytest.fixture
 def free_bodies(monkeypatch):
     """The benchmark of free bodies with the truth of eight of them after 2 s."""

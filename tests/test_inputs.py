@@ -200,7 +200,7 @@ def test_options_of_stepped_methods(options, error, word):
 
 
 def test_options_that_are_right_pass():
-    for solver in (diffrax.Kvaerno5(), ph.Extrapolation(12), ph.Splitting()):
+    for solver in (diffrax.Kvaerno5(), ph.Extrapolation(12)):
         check_options(solver, diffrax.ConstantStepSize(), diffrax.ForwardMode(), dt0=-0.1)
     check_options(diffrax.Tsit5(), max_steps=np.int64(4), chunk=1)
 

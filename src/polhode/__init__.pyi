@@ -69,7 +69,6 @@ from ._integrate import (
     LiePoisson as LiePoisson,
     EulerAngles as EulerAngles,
     Extrapolation as Extrapolation,
-    Splitting as Splitting,
     FlowAdjoint as FlowAdjoint,
 )
 from ._method import AbstractMethod as AbstractMethod

@@ -149,9 +149,3 @@ def test_what_is_refused():
         ph.Rotor([1.0, 0, 0], 0.1, speed=1.0, coupling=0.1)
     with pytest.raises(ValueError, match="needs inertia"):
         ph.Rotor([1.0, 0, 0], momentum=1.0, coupling=ph.ViscousCoupling(0.1))
-    splitting = ph.LiePoisson(ph.Splitting(), dt0=0.1)
-    ring = ph.Rotor([0.0, 1.0, 0.0], 0.1, speed=1.0, coupling=ph.ViscousCoupling(0.1))
-    flat = ph.Scene(INERTIA, rotors=ring)
-    for scene, words in ((INSIDE["sink"], "of the rates"), (flat, "coupling")):
-        with pytest.raises(ValueError, match=words):
-            ph.simulate(scene, STATE, [0.0, 1.0], splitting)

@@ -6,11 +6,9 @@ from ._charts import (
     LiePoissonChart as LiePoissonChart,
     natural_rates as natural_rates,
 )
-from ._equal_steps import EqualSteps as EqualSteps, GivenTimes as GivenTimes
 from ._extrapolation import Accuracy as Accuracy, Extrapolation as Extrapolation
 from ._flow_adjoint import FlowAdjoint as FlowAdjoint
 from ._search import Search as Search
-from ._splitting import Splitting as Splitting
 from ._stepped import (
     AbstractIntegration as AbstractIntegration,
     EulerAngles as EulerAngles,

@@ -33,11 +33,6 @@ class BoundTerm(eqx.Module):
         """The control of one second, for an ODE one: minus one where diffrax turns the time."""
         return self.control(np.zeros(()), np.ones(()), dtype)
 
-    def field(self, t, y):
-        """The vector field."""
-        terms, args = eqx.combine(self.arrays, self.static)
-        return terms.vf(t, y, args)
-
     def increment(self, t, y, control):
         """Vector field times control."""
         terms, args = eqx.combine(self.arrays, self.static)

@@ -20,9 +20,9 @@ from polhode._integrate._columns import (
     table,
 )
 from polhode._integrate._dense import CollocationInterpolation, collocate
-from polhode._integrate._equal_steps import GivenTimes
 from polhode._integrate._lanes import LANES, QUEUE
 from polhode._integrate._march import Field, Limits, Progress, fresh, march
+from polhode._integrate._one_step import GivenTimes
 from polhode._integrate._units import GroupUnits
 from polhode._kernels import kernel, opaque_ones, staged
 

@@ -15,11 +15,11 @@ from polhode._batch import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._hamiltonian import Dynamics
 from polhode._integrate._automatic import Automatic
 from polhode._integrate._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
-from polhode._integrate._equal_steps import GivenTimes
 from polhode._integrate._equations import equations_of
 from polhode._integrate._flow_adjoint import FlowAdjoint, path_of
 from polhode._integrate._lanes import LANES
 from polhode._integrate._loop import Wanted, solve
+from polhode._integrate._one_step import GivenTimes
 from polhode._integrate._problem import Problem
 from polhode._integrate._search import Found, Search, with_events
 from polhode._integrate._segments import Moved, in_segments
@@ -103,7 +103,7 @@ class AbstractIntegration(AbstractMethod):
     @property
     def keeps_rtol(self) -> bool:
         """Whether the steps follow from ``rtol``."""
-        return self.controller is None and not hasattr(self.solver, "check")
+        return self.controller is None
 
     def _bodies_at_once(self, scene: Scene, state: State, ts: Array, record: Record) -> int:
         """For a solver in which each body has its own steps."""
@@ -124,9 +124,6 @@ class AbstractIntegration(AbstractMethod):
         return found[0]
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
-        check = getattr(self.solver, "check", None)
-        if check is not None:
-            check(self, scene, record)
         jumps = _may_jump(scene)
         by_loop = False
         if self._is_automatic:
@@ -523,8 +520,7 @@ class LiePoisson(AbstractIntegration):
     - ``controller``: a diffrax step-size controller; None: the error at every saved time is held
       to the ``rtol`` of ``simulate`` (attitude in radians, momentum relative to each body's own
       scale) by the error that the steps find.
-    - ``dt0``: first (or constant) step [s], negative backwards; None: chosen. For ``Splitting``,
-      which has no error estimate, the longest step: equal ones lead from each time to the next.
+    - ``dt0``: first (or constant) step [s], negative backwards; None: chosen.
     - ``max_steps``: of each body, or of bodies that share their steps.
     - ``adjoint``: None: ``ph.FlowAdjoint()``, the derivatives of the exact flow, in forward
       and reverse mode; or an adjoint of diffrax, for the derivative of the steps (for bodies that

@@ -50,7 +50,7 @@ def check_options(
     if isinstance(getattr(solver, "term_structure", None), tuple):
         raise ValueError(
             f"{type(solver).__name__} splits positions from momenta, whose rates here depend on"
-            " both: use another solver; ph.Splitting() keeps a structure too."
+            " both: use another solver, such as diffrax.Dopri8()."
         )
     if dt0 is not None:
         step = as_float_array("dt0", dt0)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from polhode._closed_forms.elliptic._nome import nome_per_lambda
+from polhode._closed_forms._elliptic import nome_per_parameter
 from polhode._closed_forms.free._phase import arc
 from polhode._closed_forms.free._roles import Roles, Triple, restore
 from polhode._kernels import staged
@@ -87,12 +87,6 @@ def _limits(dtype) -> tuple[float, float]:
     return 2.0**-bits, 2.0 ** -(bits // 2)
 
 
-def nome_per_square(square: Scalars, root: Scalars) -> Scalars:
-    """The nome over its parameter ``square`` <= 0.8; ``root``: of the complementary modulus."""
-    share = 1 / (2 * (1 + root * root) * (1 + root) ** 2)
-    return share * nome_per_lambda(share * square)
-
-
 def means(circular, endless, x: Scalars, m: Scalars, m1: Scalars, one: Scalars):
     """Arithmetic-geometric mean, nome, minus its logarithm, and the rate of the argument v."""
     square = jnp.where(circular, m, m1)
@@ -102,7 +96,7 @@ def means(circular, endless, x: Scalars, m: Scalars, m1: Scalars, one: Scalars):
     for _ in range(_STEPS - 1):
         a, b = (a + b) / 2, jnp.sqrt(a * b)
     mean = (a + b) / 2
-    nome = square * nome_per_square(square, jnp.sqrt(other))
+    nome = square * nome_per_parameter(square, jnp.sqrt(other))
     mean, nome = staged((mean, nome), one)
     log_nome = jnp.where(circular | endless, 1, -jnp.log(jnp.where(circular | endless, 0.5, nome)))
     return mean, nome, log_nome, staged(omega * mean, one)

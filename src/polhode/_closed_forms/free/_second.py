@@ -6,9 +6,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._closed_forms.elliptic._carlson import rd_series
-from polhode._closed_forms.elliptic._nome import deficit_per_x
-from polhode._closed_forms.free._motion import Swing, nome_per_square
+from polhode._closed_forms._elliptic import (
+    deficit_per_parameter,
+    nome_per_parameter,
+    rd_series,
+)
+from polhode._closed_forms.free._motion import Swing
 from polhode._closed_forms.free._roles import Triple
 
 Scalars = Float[Array, "*b"]
@@ -58,8 +61,8 @@ def quarter_turn(circular, endless, m, m1, mean, log_nome, inverse_rate):
     """The same from the parameter, its complement and what comes of their mean."""
     square = jnp.where(circular, m, m1)
     other = jnp.sqrt(jnp.where(circular, m1, m))
-    per_square = nome_per_square(square, jnp.sqrt(other))
-    half = deficit_per_x(square * per_square, per_square, 1 / mean, jnp.sqrt(other / mean))
+    per_square = nome_per_parameter(square, jnp.sqrt(other))
+    half = deficit_per_parameter(square * per_square, per_square, 1 / mean, jnp.sqrt(other / mean))
     quarter = jnp.where(circular, math.pi, log_nome) / (2 * mean)
     m = jnp.where(circular, 1, m)
     first = jnp.where(circular, quarter * half, (quarter * (1 - m1 * half) - mean) / m)

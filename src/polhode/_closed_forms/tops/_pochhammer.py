@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode._closed_forms.elliptic._nome import nome
+from polhode._closed_forms._elliptic import nome_per_parameter, theta3_squared_less_one
 from polhode._closed_forms.tops._complex import Complex
 from polhode._kernels import staged
 
@@ -56,7 +56,8 @@ def _series(h: Array) -> Series:
 
 
 def _curve(square: Array) -> Curve:
-    constants = nome(square, 1 - square)
+    per_square = nome_per_parameter(square, jnp.sqrt(jnp.sqrt(1 - square)))
+    h = square * per_square
     steps, slopes = [], []
     modulus, rise = square, jnp.ones_like(square)
     for _ in range(3):
@@ -67,13 +68,13 @@ def _curve(square: Array) -> Curve:
         rise = 2 * grown * (slopes[-1] * modulus + steps[-1] * rise)
         modulus = grown * grown
     return Curve(
-        constants.q,
+        h,
         square,
         tuple(steps),
         tuple(slopes),
-        jnp.sqrt(constants.per_x),
-        1 + constants.excess,
-        _series(constants.q),
+        jnp.sqrt(per_square),
+        1 + theta3_squared_less_one(h),
+        _series(h),
     )
 
 
