@@ -1,5 +1,7 @@
 """Bad input gets a clear error: what was given, what is expected, how to mend it."""
 
+import re
+
 import diffrax
 import equinox as eqx
 import jax
@@ -268,20 +270,49 @@ def omega_of(scene, state=STATE):
     return ph.simulate(scene, state, TS, METHOD, rtol=1e-7).omega_body
 
 
-@pytest.mark.parametrize("made", [[1.0, 1.5, 2.0], (1, 1.5, 2), np.array([1.0, 1.5, 2.0])])
-def test_numbers_put_in_by_an_edit_become_arrays(made):
-    edited = eqx.tree_at(lambda s: s.inertia.diagonal, SCENE, made)
-    assert ph.simulate(edited, STATE, TS).successful
-    np.testing.assert_array_equal(
-        ph.simulate(edited, STATE, TS).wxyz, ph.simulate(SCENE, STATE, TS).wxyz
-    )
+TOP = ph.Scene(
+    ph.Inertia.axisymmetric(1.0, 1.5),
+    ph.UniformGravity(1.0, [0.0, 0.1, 0.5]) + ph.GravityGradient(1.0, ph.KeplerOrbit(1.0, 5.0)),
+    ph.LinearDamping(0.1),
+    ph.Rotor([0.0, 0.0, 1.0], 0.1, speed=1.0, coupling=ph.ViscousCoupling(0.1)),
+)
+FIELDS = {
+    "inertia.axial": lambda s: s.inertia.axial,
+    "potential.terms[0].mass": lambda s: s.potential.terms[0].mass,
+    "potential.terms[1].position_space.mu": lambda s: s.potential.terms[1].position_space.mu,
+    "torque.c": lambda s: s.torque.c,
+    "rotors.axis_body": lambda s: s.rotors.axis_body,
+    "rotors.coupling.c": lambda s: s.rotors.coupling.c,
+}
+
+
+@pytest.mark.parametrize("field", FIELDS)
+@pytest.mark.parametrize("value", [2.0, 1, [1.0, 1.5, 2.0], jnp.arange(3)], ids=type)
+@pytest.mark.parametrize("use", [ph.simulate, ph.explain, lambda *a: ph.propagate(*a[:2], 1.0)])
+def test_numbers_put_in_by_an_edit_raise_where_the_scene_is_used(field, value, use):
+    edited = eqx.tree_at(FIELDS[field], TOP, value)
+    with pytest.raises(TypeError, match=rf"scene\.{re.escape(field)} must be a floating-point"):
+        use(edited, STATE, TS)
+
+
+def test_scenes_hold_anything_while_they_are_not_used():
+    """Masks, axes and names stand where arrays are: for tree_map, in_axes and optax."""
+    mask = jax.tree.map(lambda x: x.ndim > 0, TOP)
+    assert mask.torque.c is True
+    axes = jax.tree.map(lambda _: None, TOP)
+    axes = eqx.tree_at(lambda s: s.torque.c, axes, 0, is_leaf=lambda x: x is None)
+    batch = eqx.tree_at(lambda s: s.torque.c, TOP, jnp.ones((2, 3)))
+    last = jax.vmap(lambda s: ph.simulate(s, STATE, TS).omega_body[-1], in_axes=(axes,))(batch)
+    assert last.shape == (2, 3)
+    known = eqx.tree_at(lambda s: s.torque.c, TOP, np.full(3, 0.1))
+    np.testing.assert_array_equal(omega_of(known), omega_of(TOP))
 
 
 @pytest.mark.parametrize(
     ("where", "made", "error", "word"),
     [
         (lambda s: s.inertia.diagonal, "abc", TypeError, r"scene\.inertia\.diagonal must be"),
-        (lambda s: s.inertia.diagonal, [1.0, 2], ValueError, r"diagonal must have shape"),
+        (lambda s: s.inertia.diagonal, [1.0, 2], TypeError, r"diagonal must be .*got list"),
         (lambda s: s.inertia.diagonal, jnp.ones(4), ValueError, r"diagonal must have shape"),
         (lambda s: s.inertia.diagonal, None, ValueError, "not both and not neither"),
         (lambda s: s.inertia, jnp.ones(3), TypeError, "Scene inertia must be ph.Inertia"),

@@ -21,10 +21,12 @@ PARTS = ("inertia", "potential", "torque", "rotors")
 """The parts of a scene that may carry batch axes."""
 
 
+_ARRAYS = (jax.Array, np.ndarray)
+
+
 def _fields(part: Any) -> list[tuple[str, int]]:
-    return [
-        (name, rank) for name, rank in part.core_ranks.items() if eqx.is_array(getattr(part, name))
-    ]
+    ranks = part.core_ranks.items()
+    return [(name, n) for name, n in ranks if isinstance(getattr(part, name), _ARRAYS)]
 
 
 def _inner(part: Any) -> list[str]:

@@ -1,6 +1,5 @@
 """The planner: the cheapest way that is exact enough, from the scene's structure alone."""
 
-import dataclasses
 import functools
 import math
 from dataclasses import dataclass
@@ -116,9 +115,11 @@ def ways_of(scene: Scene, state: State, record: Record) -> Ways:
         return Ways(both, (says, also), 1.5, 1.5, 2000, of_state)
     if not scene.is_free or scene.inertia.symmetry is not Symmetry.NONE:
         return Ways((law.method, law.method), (law.says, law.says), of_state=law.of_state)
-    long = dataclasses.replace(law.method, compensated=True)
     also = law.says + ", its frequencies in sums of two floats: a rounded phase would miss rtol"
-    return Ways((law.method, long), (law.says, also), 1.0, 10.0)
+    return Ways((law.method, _COMPENSATED), (law.says, also), 1.0, 10.0)
+
+
+_COMPENSATED = ClosedForm(compensated=True)
 
 
 @functools.cache

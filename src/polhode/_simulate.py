@@ -20,7 +20,6 @@ from polhode._batch import (
     split_of,
 )
 from polhode._checks import ArrayLike, is_concrete
-from polhode._dispatch import again, learn
 from polhode._events import Event, check_until, stopped
 from polhode._kernels import FEW, jit_distinct, kernel
 from polhode._method import (
@@ -34,7 +33,7 @@ from polhode._method import (
     judged,
     raise_on_failure,
 )
-from polhode._plan import Plan, choose, plan, ways_of
+from polhode._plan import Plan, choose, plan
 from polhode._scene import Scene, State
 from polhode._trajectory import Propagator, Trajectory
 
@@ -77,22 +76,11 @@ def simulate(
     """
     if until is not None:
         check_until(until, record)
-    if method is None and until is None:
-        trajectory = again(scene, state, ts, rtol, record)
-        if trajectory is not None:
-            return checked(trajectory, throw)
-    given, as_given = record, scene
     scene, state, ts, record = check_inputs(scene, state, ts, record)
     check_method(method)
     checked_rtol = check_rtol(rtol, state.wxyz.dtype)
     split = split_of(scene, state, ts)
     if method is None:
-        if until is None and split is None and scene is as_given and is_concrete(scene, state):
-            plain = partial(_trajectory, in_order=True)
-            learn(plain, scene, given, record, ways_of(scene, state, record))
-            trajectory = again(scene, state, ts, rtol, given)
-            if trajectory is not None:
-                return checked(trajectory, throw)
         method, _ = choose(scene, state, record, checked_rtol, ts)
     if split is not None and is_concrete(scene, state, ts):
         scene, state, ts = place(split, scene, state, ts)
@@ -135,7 +123,7 @@ def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> T
 @jit_distinct
 def _begin(method, scene, state, ts, rtol) -> Trajectory:
     """The state at the first time, as the only sample of a trajectory."""
-    scene, state = scene.mended(), state.mended("state").as_unit()
+    state = state.as_unit()
     scene, state = scene.settled(state, ts[..., 0]), state.without_wheels
     parts = {name: getattr(scene, name) for name in PARTS}
     batch = common_batch(*parts.values(), state, extra=(ts.shape[:-1],))
@@ -146,7 +134,7 @@ def _begin(method, scene, state, ts, rtol) -> Trajectory:
     lanes = {name: flatten(part, batch) for name, part in parts.items()}
     times = lane_times(ts, batch)
     good = jnp.full(omega[..., 0].size, Status.SUCCESSFUL)
-    status = judged(good, Scene(**lanes), times, rtol, False).reshape(batch)
+    status = judged(good, Scene(**lanes), times, rtol).reshape(batch)
     return Trajectory(
         ts[..., :1], wxyz[..., None, :], omega[..., None, :], status, jnp.zeros_like(status), scene,
         spins=jnp.stack(spins, axis=-1)[..., None, :] if spins else None,
@@ -154,12 +142,10 @@ def _begin(method, scene, state, ts, rtol) -> Trajectory:
     )  # fmt: skip
 
 
-def _trajectory(method, scene, state, ts, rtol, record, split=None, in_order=False) -> Trajectory:
-    """``in_order`` (static): times known to be in order, whose first may be repeated."""
-    scene, state = scene.mended(), state.mended("state")  # shapes, whichever way led here
+def _trajectory(method, scene, state, ts, rtol, record, split) -> Trajectory:
     scene, state = scene.settled(state, ts[..., 0]), state.without_wheels
     if split is None:
-        found = _moved(record, method, scene, state, ts, rtol, in_order)
+        found = _moved(record, method, scene, state, ts, rtol)
     else:
         found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
     wxyz, omega, status, steps, work, error, motors, spins = found
@@ -174,7 +160,7 @@ def _trajectory(method, scene, state, ts, rtol, record, split=None, in_order=Fal
     return trajectory
 
 
-def _moved(record, method, scene, state, ts, rtol, in_order=False) -> Samples:
+def _moved(record, method, scene, state, ts, rtol) -> Samples:
     parts = (getattr(scene, name) for name in PARTS)
     batch = common_batch(*parts, state, extra=(ts.shape[:-1],))
     parts = {name: flatten(getattr(scene, name), batch) for name in PARTS}
@@ -186,7 +172,7 @@ def _moved(record, method, scene, state, ts, rtol, in_order=False) -> Samples:
         samples = _with_error(method, Scene(**parts), lanes, times, rtol, record)
     else:
         samples = method.run(Scene(**parts), lanes, times, rtol, record)._replace(error=None)
-    status = judged(samples.status, Scene(**parts), times, rtol, in_order)
+    status = judged(samples.status, Scene(**parts), times, rtol)
     samples = samples._replace(status=status)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), samples)
 

@@ -1,15 +1,17 @@
-"""Arrays that stand in several places of a pytree, such as one orbit in several parts of a scene.
+"""Calls of compiled programs: arrays are operands, all else is a static argument.
 
-A compiled program takes every leaf of its arguments as an array of its own, and works out twice
-what rests on the same array twice. What is passed as ``Distinct`` keeps them one.
+Arrays that stand in several places of a pytree, such as one orbit in several parts of a scene,
+stay one array in the program: it would otherwise take every leaf as an operand of its own, and
+compute twice what depends on the same array twice.
 """
 
 import functools
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import numpy as np
 
 
 class Distinct(eqx.Module):
@@ -30,16 +32,70 @@ class Distinct(eqx.Module):
         return jax.tree.unflatten(self.tree, [self.leaves[i] for i in self.places])
 
 
-def jit_distinct(fn: Callable) -> Callable:
-    """``eqx.filter_jit``, but arrays that stand in several places stay one in the program."""
+class _Static(NamedTuple):
+    """All of a pytree but its arrays, hashable: ``sources`` holds for each leaf the number of its
+    array, or the leaf itself within a tuple."""
 
-    @eqx.filter_jit
-    def program(given: Distinct):
-        args, kwargs = given.value()
-        return fn(*args, **kwargs)
+    tree: Any
+    sources: tuple[int | tuple[Any], ...]
+
+    def filled(self, arrays: list[Any]) -> Any:
+        leaves = (arrays[s] if isinstance(s, int) else s[0] for s in self.sources)
+        return jax.tree.unflatten(self.tree, leaves)
+
+
+def _split(value: Any) -> tuple[_Static, list[Any]]:
+    """The static part of a pytree, and its arrays, each once."""
+    leaves, tree = jax.tree.flatten(value)
+    arrays: list[Any] = []
+    numbers: dict[int, int] = {}
+    sources: list[int | tuple[Any]] = []
+    for leaf in leaves:
+        if not isinstance(leaf, _ARRAYS):
+            sources.append((leaf,))
+            continue
+        number = numbers.setdefault(id(leaf), len(arrays))
+        if number == len(arrays):
+            arrays.append(leaf)
+        sources.append(number)
+    return _Static(tree, tuple(sources)), arrays
+
+
+_ARRAYS = (jax.Array, np.ndarray, np.generic)
+
+
+@jax.tree_util.register_static
+class _Constant:
+    """A static value among the results of a program."""
+
+    def __init__(self, value: Any):
+        self.value = value
+
+    def __eq__(self, other: Any) -> bool:
+        return isinstance(other, _Constant) and self.value == other.value
+
+    def __hash__(self) -> int:
+        return hash(self.value)
+
+
+def jit_distinct(fn: Callable) -> Callable:
+    """``jax.jit`` for functions of pytrees that hold more than arrays, such as scenes and methods.
+
+    One compiled program for each structure of the arguments, in the cache of ``jax.jit``: scenes
+    that differ in numbers share it. Unlike with ``eqx.filter_jit`` arrays that stand in several
+    places stay one in the program, and a call costs a third.
+    """
+
+    @functools.partial(jax.jit, static_argnums=0)
+    def program(static: _Static, arrays: list[Any]):
+        args, kwargs = static.filled(arrays)
+        static, results = _split(fn(*args, **kwargs))
+        return _Constant(static), results
 
     @functools.wraps(fn)
     def call(*args, **kwargs):
-        return program(Distinct((args, kwargs)))
+        static, results = program(*_split((args, kwargs)))
+        return static.value.filled(results)
 
+    call.program = program  # type: ignore[attr-defined]
     return call

@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,7 +12,8 @@ from polhode._checks import as_float_array, describe, is_concrete, require
 from polhode._method._base import AbstractMethod, Record
 from polhode._method._options import made
 from polhode._method._status import SimulationError, Status
-from polhode._scene import Scene, State
+from polhode._parts import check_fields
+from polhode._scene import Scene, State, check_scene
 
 
 def check_method(method: Any) -> None:
@@ -49,11 +49,13 @@ def check_inputs(
 ) -> tuple[Scene, State, Array, Record]:
     """Kinds, dtypes and times, with messages that tell the mend."""
     check_kinds(scene, state)
-    record = Record() if record is None else record
+    record = _DEFAULT if record is None else record
     if not isinstance(record, Record):
         raise TypeError(f"record must be a ph.Record or None, got {type(record).__name__}.")
-    scene, state = scene.mended(), state.mended("state")
-    dtypes = {x.dtype for x in jax.tree.leaves((scene, state)) if eqx.is_inexact_array(x)}
+    check_scene(scene)
+    check_fields(state, "state")
+    dtypes = {x.dtype for x in jax.tree.leaves((scene, state)) if isinstance(x, _ARRAYS)}
+    dtypes = {x for x in dtypes if jnp.issubdtype(x, jnp.inexact)}
     if len(dtypes) != 1:
         raise TypeError(
             f"scene and state mix the dtypes {sorted(map(str, dtypes))}: make all arrays of one"
@@ -66,10 +68,23 @@ def check_inputs(
             " arrays float32 or float64, for example with jnp.asarray(x, jnp.float32)."
         )
     scene = scene.declared_anew()
-    ts = as_float_array("ts", ts, (None,)).astype(dtype)
+    ts = _times(ts, dtype)
     if is_concrete(ts):
         check_times(np.asarray(ts))
     return scene, state, ts, record
+
+
+_DEFAULT = Record()
+_ARRAYS = (jax.Array, np.ndarray)
+
+
+def _times(ts: Any, dtype: Any) -> Array:
+    """Times (..., T) of the dtype; known ones in NumPy, which costs no dispatch."""
+    plain = isinstance(ts, np.ndarray) and ts.dtype.kind == "f" and ts.ndim > 0
+    if plain and np.isfinite(ts).all():
+        return jnp.asarray(ts, dtype)
+    ts = as_float_array("ts", ts, (None,))
+    return ts if ts.dtype == dtype else ts.astype(dtype)
 
 
 def check_times(ts: np.ndarray) -> None:
@@ -142,14 +157,11 @@ def raise_on_failure(status: Array) -> None:
     )
 
 
-def judged(
-    status: Array, scene: Scene, ts: Array, rtol: Array | float | None, in_order: bool = False
-) -> Array:
+def judged(status: Array, scene: Scene, ts: Array, rtol: Array | float | None) -> Array:
     """The status (N,) of lanes, or what is wrong with the input of those that were given nonsense.
 
     What ``check_inputs`` refuses where numbers are known, found in the compiled program where they
-    are traced; a few operations for each body. ``scene``: that of the lanes; ``ts`` (T,) or (N, T);
-    ``in_order``: that they are in order is known.
+    are traced; a few operations for each body. ``scene``: that of the lanes; ``ts`` (T,) or (N, T).
     """
     if rtol is not None:
         least = 8 * float(jnp.finfo(ts.dtype).eps)
@@ -159,8 +171,6 @@ def judged(
     if declared is not None:
         status = jnp.where(declared, status, Status.WRONG_LAW)
     status = jnp.where(scene.is_possible, status, Status.NOT_PHYSICAL)
-    if in_order:
-        return status
     steps = jax.lax.stop_gradient(ts[..., 1:] - ts[..., :-1])
     ordered = jnp.all(steps > 0, axis=-1) | jnp.all(steps < 0, axis=-1)
     return jnp.where(ordered, status, Status.BAD_TIMES)

@@ -8,6 +8,7 @@ from polhode._parts._functions import (
 )
 from polhode._parts._part import (
     AbstractPart as AbstractPart,
+    check_fields as check_fields,
     shaped as shaped,
     terms_of as terms_of,
 )

@@ -2,13 +2,12 @@
 
 import dataclasses
 import functools
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-
-from polhode._checks import as_float_array
+import numpy as np
 
 
 def shaped(*core: int | None, **options: Any) -> Any:
@@ -39,33 +38,39 @@ class AbstractPart(eqx.Module):
         """The array fields by name, each with its rank without batch axes."""
         return {name: len(core) for name, core in _cores(type(self)).items()}
 
-    def mended(self, place: str) -> Self:
-        """The part with arrays in its array fields, where an edit has left numbers or lists.
 
-        Raises TypeError or ValueError, naming the field, for what is no array of its shape.
-        ``place``: what the part is called.
-        """
-        part = self
-        terms = getattr(self, "terms", None)
-        if terms is not None:
-            named = [term.mended(f"{place}.terms[{i}]") for i, term in enumerate(terms)]
-            if any(a is not b for a, b in zip(named, terms)):
-                part = eqx.tree_at(lambda p: p.terms, part, tuple(named))
-        for name, core in _cores(type(self)).items():
-            value = getattr(self, name)
-            if value is None or _fits(value, core):
-                continue
-            if callable(value) and not isinstance(value, AbstractPart):
-                continue
-            if isinstance(value, AbstractPart):
-                new = value.mended(f"{place}.{name}")
-            else:
-                new = as_float_array(f"{place}.{name}", value, core, finite=False)
-            if new is not value:
-                part = eqx.tree_at(
-                    lambda p, n=name: getattr(p, n), part, new, is_leaf=lambda x, v=value: x is v
-                )
-        return part
+def check_fields(part: AbstractPart, name: str) -> None:
+    """TypeError unless the array fields of a part, and of what it is made of, hold arrays.
+
+    ``eqx.tree_at`` may put a number or a list there, or an array of another shape (ValueError).
+    Nothing is checked while a part is unflattened: ``jax.tree.map``, ``in_axes`` and the masks of
+    optax put other things than arrays into these places. ``name``: what the part is called in the
+    message.
+    """
+    # A function, and not a method: Equinox builds an object for every method that is looked up,
+    # which takes longer than the check.
+    for i, term in enumerate(getattr(part, "terms", ())):
+        check_fields(term, f"{name}.terms[{i}]")
+    for field, core in _cores(type(part)).items():
+        value = getattr(part, field)
+        if value is None:
+            continue
+        if isinstance(value, AbstractPart):
+            check_fields(value, f"{name}.{field}")
+        elif not (callable(value) or _fits(value, core)):
+            _refuse(value, f"{name}.{field}", core)
+
+
+def _refuse(value: Any, name: str, core: tuple[int | None, ...]) -> None:
+    """The error for what is no array of floats (..., *core)."""
+    shape = ", ".join(["...", *("n" if size is None else str(size) for size in core)])
+    if isinstance(value, _ARRAYS) and jnp.issubdtype(value.dtype, jnp.floating):
+        raise ValueError(f"{name} must have shape ({shape}), got {value.shape}.")
+    given = f"{value.dtype} array" if isinstance(value, _ARRAYS) else f"{type(value).__name__}"
+    raise TypeError(
+        f"{name} must be a floating-point array ({shape}), got {given}: {value!r:.60}. Put"
+        " jnp.asarray(...) there, or build the part anew."
+    )
 
 
 def terms_of(name: str, kind: type, total: type, one: Any, other: Any) -> tuple[Any, ...]:
@@ -81,7 +86,11 @@ def terms_of(name: str, kind: type, total: type, one: Any, other: Any) -> tuple[
 
 def _fits(value: Any, core: tuple[int | None, ...]) -> bool:
     """Whether a value is an array of floats (..., *core)."""
-    if not isinstance(value, jax.Array) or not jnp.issubdtype(value.dtype, jnp.floating):
+    if not isinstance(value, _ARRAYS) or value.dtype not in _FLOATS:
         return False
     tail = value.shape[max(0, value.ndim - len(core)) :]
     return len(tail) == len(core) and all(a in (None, b) for a, b in zip(core, tail))
+
+
+_ARRAYS = (jax.Array, np.ndarray, np.generic)
+_FLOATS = tuple(np.dtype(x) for x in (np.float64, np.float32, np.float16, jnp.bfloat16))

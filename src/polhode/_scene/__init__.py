@@ -33,7 +33,7 @@ from polhode._scene._rotors import (
     RotorSum as RotorSum,
     Wheels as Wheels,
 )
-from polhode._scene._scene import Scene as Scene
+from polhode._scene._scene import Scene as Scene, check_scene as check_scene
 from polhode._scene._state import State as State
 from polhode._scene._torques import (
     AbstractTorque as AbstractTorque,

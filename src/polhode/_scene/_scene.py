@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool
 
 from polhode._checks import is_concrete, together
 from polhode._hamiltonian import Dynamics, Hamiltonian, inverse_inertia, lie_poisson_field
+from polhode._parts import check_fields
 from polhode._scene._potentials import AbstractPotential
 from polhode._scene._rotors import AbstractRotor, Wheels
 from polhode._scene._state import State
@@ -36,22 +37,9 @@ class Scene(eqx.Module):
     rotors: AbstractRotor | None = None
 
     def __check_init__(self):
-        self._check_kinds()
+        _check_kinds(self)
         if self.rotors is not None and is_concrete(self.inertia, self.rotors):
             self.rotors.check_within(self.inertia)
-
-    def _check_kinds(self) -> None:
-        kinds = (
-            ("inertia", Inertia, "ph.Inertia, for example ph.Inertia.from_moments([1., 2., 3.])"),
-            ("potential", AbstractPotential | None, "a potential (ph.UniformGravity, ...) or None"),
-            ("torque", AbstractTorque | None, "a torque (ph.BodyTorque, ...) or None"),
-            ("rotors", AbstractRotor | None, "rotors (ph.Rotor, a sum of them) or None"),
-        )
-        for name, kind, wanted in kinds:
-            value = getattr(self, name)
-            if not isinstance(value, kind):
-                raise TypeError(f"Scene {name} must be {wanted}, got {type(value).__name__}.")
-        self.inertia.check_form()
 
     @property
     def is_free(self) -> bool:
@@ -80,17 +68,6 @@ class Scene(eqx.Module):
         found = [part.is_as_declared for part in (self.potential, self.rotors) if part is not None]
         found = [x for x in found if x is not None]
         return together(found)
-
-    def mended(self) -> "Scene":
-        """The scene with arrays where an edit left numbers or lists; see ``AbstractPart``."""
-        self._check_kinds()
-        scene = self
-        for name in ("inertia", "potential", "torque", "rotors"):
-            part = getattr(self, name)
-            new = None if part is None else part.mended(f"scene.{name}")
-            if new is not part:
-                scene = eqx.tree_at(lambda s, n=name: getattr(s, n), scene, new)
-        return scene
 
     def declared_anew(self) -> "Scene":
         """The scene with what its parts declare taken from their numbers, where these are known.
@@ -219,3 +196,28 @@ def places_of(scene: Scene, free: Any) -> tuple[int, ...]:
     if len(set(places)) < len(places):
         raise ValueError("free points at the same array twice.")
     return places
+
+
+_KINDS = {
+    "inertia": (Inertia, "ph.Inertia, for example ph.Inertia.from_moments([1., 2., 3.])"),
+    "potential": (AbstractPotential, "a potential (ph.UniformGravity, ...) or None"),
+    "torque": (AbstractTorque, "a torque (ph.BodyTorque, ...) or None"),
+    "rotors": (AbstractRotor, "rotors (ph.Rotor, a sum of them) or None"),
+}
+
+
+def _check_kinds(scene: Scene) -> None:
+    for name, (kind, expected) in _KINDS.items():
+        value = getattr(scene, name)
+        if not (isinstance(value, kind) or (value is None and name != "inertia")):
+            raise TypeError(f"Scene {name} must be {expected}, got {type(value).__name__}.")
+    scene.inertia.check_form()
+
+
+def check_scene(scene: Scene) -> None:
+    """TypeError or ValueError, naming the field, for a scene that an edit has left in disorder."""
+    _check_kinds(scene)
+    for name in _KINDS:
+        part = getattr(scene, name)
+        if part is not None:
+            check_fields(part, f"scene.{name}")

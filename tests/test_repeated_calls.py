@@ -1,6 +1,8 @@
-"""Repeated plain calls: the same answers, the same care."""
+"""Plain calls: one program for a structure, checked input, the results of a compiled call."""
 
 import gc
+import weakref
+from concurrent.futures import ThreadPoolExecutor
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +10,8 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode import _dispatch
 from polhode._plan import choose
+from polhode._simulate import run
 
 SCENE = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]))
 TS = [0.0, 1.0, 3.0]
@@ -19,14 +21,8 @@ def _state(size=1.0):
     return ph.State([1.0, 0.0, 0.0, 0.0], [0.3 * size, size, 0.2 * size])
 
 
-@pytest.fixture(autouse=True)
-def taken():
-    """Every test starts where the scene is known."""
-    return ph.simulate(SCENE, _state(), jnp.array(TS))
-
-
 @pytest.mark.parametrize("kind", [jnp.array, np.array, list])
-def test_repeated_calls_give_what_a_compiled_call_gives(taken, kind):
+def test_plain_calls_give_what_a_compiled_call_gives(kind):
     state = _state(1.5)
     fast = ph.simulate(SCENE, state, kind(TS))
     slow = jax.jit(ph.simulate)(SCENE, state, jnp.array(TS))
@@ -35,7 +31,6 @@ def test_repeated_calls_give_what_a_compiled_call_gives(taken, kind):
         assert one.dtype == other.dtype
         assert one.shape == other.shape
         np.testing.assert_allclose(one, other, rtol=1e-14, atol=1e-14)
-    assert not np.allclose(fast.wxyz, taken.wxyz)
 
 
 def test_the_method_follows_the_numbers():
@@ -109,88 +104,44 @@ KINDS = {
 }
 
 
-KINDS_TOO = "damped", "wheel"
-
-
 @pytest.mark.parametrize("kind", KINDS)
-def test_every_kind_of_scene_is_remembered(kind, monkeypatch):
-    """The second call does not check the scene again, and gives what the long way gives."""
+def test_scenes_that_differ_in_numbers_share_a_program(kind):
     scene, record = ph.Scene(*KINDS[kind]), ph.Record(work=kind == "damped")
     ph.simulate(scene, _state(), TS, record=record)
-
-    def again(*_):
-        raise AssertionError("looked at the scene again")
-
-    monkeypatch.setattr("polhode._simulate.check_inputs", again)
-    fast = ph.simulate(scene, _state(1.5), np.array(TS), rtol=1e-7, record=record)
-    monkeypatch.undo()
-    slow = jax.jit(lambda state: ph.simulate(scene, state, TS, rtol=1e-7, record=record))
-    slow = slow(_state(1.5))
-    for one, other in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
-    assert (fast._work is None) == (kind != "damped")
-    if kind == "wheel":  # whose momentum is that of its own initial state
-        assert fast.scene is not scene
-    np.testing.assert_allclose(fast.energy, slow.energy, rtol=1e-12)
+    count = run.program._cache_size()
+    other = jax.tree.map(lambda x: 1.0 * x, scene)
+    found = ph.simulate(other, _state(1.5), np.array(TS), rtol=1e-7, record=record)
+    assert run.program._cache_size() == count
+    compiled = jax.jit(lambda state: ph.simulate(scene, state, TS, rtol=1e-7, record=record))
+    pairs = zip(jax.tree.leaves(found), jax.tree.leaves(compiled(_state(1.5))), strict=True)
+    for one, two in pairs:
+        np.testing.assert_allclose(one, two, rtol=1e-11, atol=1e-11)
 
 
-@pytest.mark.parametrize(
-    "kind", ["top", "Lagrange", *(pytest.param(k, marks=pytest.mark.slow) for k in KINDS_TOO)]
-)
-def test_twenty_numbers_of_saved_times_compile_three_programs_at_most(kind):
-    scene = ph.Scene(*KINDS[kind])
-
-    def compiled():
-        return sum(made.call._cache_size() for made in _dispatch._PROGRAMS.values())
-
-    _dispatch._PROGRAMS.clear()
-    counts = [3, 4, 7, 8, 9, 12, 20, 33, 50, 64, 65, 80, 100, 101, 150, 200, 257, 300, 400, 500]
-    for count in counts:
-        ts = np.linspace(0.0, 2.0, count)
-        found = ph.simulate(scene, _state(), ts, rtol=10.0 ** -(3 + count % 5))
-        assert np.array_equal(found.ts, ts)
-        assert found.wxyz.shape == (count, 4)
-        assert jax.eval_shape(lambda one: one.energy, found).shape == (count,)
-        assert np.all(np.isfinite(found.wxyz))
-    assert 1 <= compiled() <= 3
-    record = ph.Record(final_only=True)
-    for count in (2, 3, 5, 90):
-        ph.simulate(scene, _state(), np.linspace(0.0, 2.0, count), record=record)
-    assert compiled() <= 4
+def test_a_scene_ends_with_its_last_reference():
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.5]), FALL)
+    end = weakref.ref(scene)
+    found = ph.simulate(scene, _state(), TS)
+    assert found.wxyz.shape == (3, 4)
+    del scene, found
+    gc.collect()
+    assert end() is None
 
 
-SPIN = ph.Rotor([0.0, 0.0, 1.0], 0.1, speed=0.3, coupling=ph.ViscousCoupling(0.05))
-PULSES = ph.Pulses(ph.BodyTorque([0.0, 0.3, 0.0]), [0.4, 1.1], [0.6, 1.3])
+def test_threads_share_programs_and_mix_nothing():
+    """Scenes of two structures and many numbers, from eight threads at once."""
+    scenes = [
+        ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0 + k / 20]), FALL if k % 2 else None)
+        for k in range(8)
+    ]
 
+    def last(scene):
+        return np.asarray(ph.simulate(scene, _state(), TS).omega_body[-1])
 
-PARTS = {
-    "free": (ph.Inertia.from_moments([1.0, 2.0, 3.0]),),
-    "top": (I, FALL),
-    "pulses": (I, None, PULSES),
-    "coupled wheel": (I, FALL, None, SPIN),
-    "Lagrange": (ph.Inertia.axisymmetric(1.0, 0.5), ph.UniformGravity(1.0, [0.0, 0.0, 0.3])),
-}
-WAYS = [(name, 1.0) for name in PARTS] + [("free", -1.0), ("pulses", -1.0)]
-BACK = [
-    pytest.param(name, -1.0, marks=pytest.mark.slow) for name in PARTS if (name, -1.0) not in WAYS
-]
-
-
-@pytest.mark.parametrize(("name", "turned"), [*WAYS, *BACK])
-def test_samples_do_not_depend_on_how_many_times_a_program_is_for(name, turned):
-    """Thirteen times, for which a program of more serves, beside one of thirteen."""
-    parts = PARTS[name]
-    scene, record = ph.Scene(*parts), ph.Record(work=len(parts) > 1)
-    ts = turned * np.linspace(0.0, 2.0, 13) + 0.5
-    for _ in range(2):
-        fast = ph.simulate(scene, _state(), ts, record=record)
-    slow = jax.jit(lambda state: ph.simulate(scene, state, ts, record=record))(_state())
-    assert jax.tree.structure(fast) == jax.tree.structure(slow)
-    for one, other in zip(jax.tree.leaves(fast), jax.tree.leaves(slow), strict=True):
-        assert one.shape == other.shape
-        np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(fast.first.wxyz, _state().wxyz, rtol=1e-15)
-    np.testing.assert_allclose(fast.first.omega_body, _state().omega_body, rtol=1e-15)
+    alone = [last(scene) for scene in scenes]
+    with ThreadPoolExecutor(8) as threads:
+        found = list(threads.map(last, 4 * scenes))
+    np.testing.assert_array_equal(found, 4 * alone)
 
 
 def test_a_state_that_another_law_holds_for_is_moved_by_it():
@@ -212,20 +163,6 @@ def test_long_horizons_of_stepped_bodies_carry_their_rounding():
         assert method.solver.compensated == (rtol < 2000 * np.finfo(float).eps)
         assert np.array_equal(found.wxyz, asked.wxyz)
         assert not np.array_equal(found.wxyz, short.wxyz)
-
-
-def test_what_is_kept_of_a_scene_ends_with_it_and_programs_are_shared_and_few():
-    gc.collect()
-    scenes, programs = len(_dispatch._SCENES), len(_dispatch._PROGRAMS)
-    made = [ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0 + k / 9])) for k in range(3)]
-    found = [ph.simulate(scene, _state(), TS) for scene in made]
-    assert len(_dispatch._SCENES) == scenes + 3
-    assert len(_dispatch._PROGRAMS) <= programs + 1  # they differ in numbers
-    assert len({float(f.omega_body[-1, 0]) for f in found}) == 3
-    del made, found
-    gc.collect()
-    assert len(_dispatch._SCENES) == scenes
-    assert len(_dispatch._PROGRAMS) <= _dispatch._KEPT
 
 
 def test_the_first_sample_is_the_given_state():
