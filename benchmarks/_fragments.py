@@ -160,16 +160,6 @@ def _() -> str:
     return _between(found)
 
 
-@_fragment("over-the-program")
-def _() -> str:
-    kept = (
-        row["us_over_program"]
-        for row in _numbers("plain_calls")["rows"]
-        if row["family"] in ("free", "lagrange") and row["bodies"] <= 1000
-    )
-    return _between(kept)
-
-
 @_fragment("first-call")
 def _() -> str:
     return _between(row["value"] for row in _numbers("first_calls")["rows"])
