@@ -25,7 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from polhode._closed_forms import free
+from polhode._closed_forms import free_motion
 
 jax.config.update("jax_enable_x64", True)
 HERE = Path(__file__).resolve().parent
@@ -125,7 +125,7 @@ def final_state(case: str, count: int, t: float, scored: int) -> dict:
     q, w = bodies(case, count)
     moments = components(np.broadcast_to(np.array(CASES[case]), (count, 3)))
     given = moments, components(q), components(w), jnp.full(count, t)
-    program, compile_s = compiled(free.free_motion, *given)
+    program, compile_s = compiled(free_motion, *given)
     least, median = timed(lambda: jax.block_until_ready(program(*given)))
     omega, wxyz = program(*given)
     exact = truth(case, scored, t)
@@ -149,7 +149,7 @@ def saved_times(count: int, times: int) -> dict:
     row = {"bodies": count, "times": times}
     for name, wanted in (("both", {}), ("rates", {"attitude": False})):
         program, _ = compiled(
-            lambda *a, wanted=wanted: free.free_motion(*a, **wanted),
+            lambda *a, wanted=wanted: free_motion(*a, **wanted),
             moments, components(q), components(w), t,
         )  # fmt: skip
         given = moments, components(q), components(w), t
@@ -161,7 +161,7 @@ def saved_times(count: int, times: int) -> dict:
 def latency() -> dict:
     q, w = bodies("A", 1)
     given = jnp.array([CASES["A"]]), jnp.asarray(q), jnp.asarray(w), jnp.array([100.0])
-    call = jax.jit(free.free_motion)
+    call = jax.jit(free_motion)
     least, median = timed(lambda: jax.block_until_ready(call(*given)), 500)
     return {"us_per_call": least * 1e6, "us_per_call_median": median * 1e6}
 
@@ -169,7 +169,7 @@ def latency() -> dict:
 def gradient(count: int, t: float = 100.0) -> dict:
     """Loss of each body against a target motion; its derivative by the body's own moments."""
     q, w = bodies("A", count)
-    target = free.free_motion(
+    target = free_motion(
         components(np.broadcast_to(np.array((1.001, 1.998, 3.002)), (count, 3))),
         components(q), components(w), jnp.full(count, t),
     )  # fmt: skip
@@ -177,7 +177,7 @@ def gradient(count: int, t: float = 100.0) -> dict:
     start, rates = components(q), components(w)
 
     def loss(moments):
-        omega, wxyz = free.free_motion(moments, start, rates, times)
+        omega, wxyz = free_motion(moments, start, rates, times)
         along = sum(a * b for a, b in zip(wxyz, target[1], strict=True))
         off = sum((a - b) ** 2 for a, b in zip(omega, target[0], strict=True))
         return jnp.sum(4 * (1 - along**2) + off)

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from polhode._closed_forms import free
+from polhode._closed_forms import free_motion
+from polhode._closed_forms._free import evaluate, prepare
 
 CASES = json.loads(Path(__file__).with_name("free_cases.json").read_text())
 FAMILIES = sorted({case["family"] for case in CASES})
@@ -16,7 +17,7 @@ FAMILIES = sorted({case["family"] for case in CASES})
 BOUNDS = {"float64": (5e-15, 5e-15, 1e-13), "float32": (2e-6, 2e-6, 3e-5)}
 
 
-MOTION = jax.jit(free.free_motion)
+MOTION = jax.jit(free_motion)
 
 
 def _fits_single(case: dict) -> bool:
@@ -43,7 +44,7 @@ def solved(request):
     table = [c for c in CASES if dtype == "float64" or _fits_single(c)]
 
     def state(moments, products, omega, t, wxyz):
-        rates, attitude = free.free_motion(moments, wxyz, omega, t, products)
+        rates, attitude = free_motion(moments, wxyz, omega, t, products)
         return jnp.stack([*attitude, *rates])
 
     def everything(*given):
@@ -114,7 +115,7 @@ def test_initial_attitude_carries_its_derivative():
     wxyz, change = jnp.array([0.6, -0.5, 0.7, 0.1]), np.array([0.3, 0.1, -0.2, 0.4])
 
     def attitude(q):
-        return jnp.stack(free.free_motion(moments, q, omega, t, rates=False)[1])
+        return jnp.stack(free_motion(moments, q, omega, t, rates=False)[1])
 
     slope = jax.jit(lambda q, dq: jax.jvp(attitude, (q,), (dq,)))
     _, found = slope(wxyz, jnp.asarray(change))
@@ -138,12 +139,12 @@ def test_many_times_agree_with_single_ones_in_value_and_gradient():
     ts = jnp.linspace(-3.0, 8.0, 4)
 
     def together(moments):
-        rates, attitude = free.free_motion(moments, wxyz, omega, ts[None, :])
+        rates, attitude = free_motion(moments, wxyz, omega, ts[None, :])
         return jnp.stack([*rates, *attitude])
 
     def one_by_one(moments):
-        motion = free.prepare(moments, wxyz, omega)
-        columns = jax.lax.map(lambda t: free.evaluate(motion, t), ts)
+        motion = prepare(moments, wxyz, omega)
+        columns = jax.lax.map(lambda t: evaluate(motion, t), ts)
         return jnp.moveaxis(jnp.stack([x for part in columns for x in part]), 1, -1)
 
     for fn in (together, one_by_one):
@@ -161,7 +162,7 @@ def test_long_batches_are_cut_without_a_trace():
     moments, wxyz, omega = _random_bodies(6, 16411)  # a prime: the last chunk is filled up
     t = jnp.linspace(-5.0, 5.0, 16411)
     found = MOTION(moments, wxyz, omega, t)
-    whole = jax.jit(lambda *a: free.evaluate(free.prepare(*a), t))(moments, wxyz, omega)
+    whole = jax.jit(lambda *a: evaluate(prepare(*a), t))(moments, wxyz, omega)
     for part, other in zip(found, whole, strict=True):
         for x, y in zip(part, other, strict=True):
             np.testing.assert_allclose(x, y, atol=1e-14)
@@ -204,7 +205,7 @@ def test_rates_alone_compile_to_less():
     def operations(**wanted):
         def motion(moments, omega, t):
             wxyz = jnp.ones((8, 4)) if wanted.get("attitude", True) else None
-            return free.free_motion(moments, wxyz, omega, t, **wanted)
+            return free_motion(moments, wxyz, omega, t, **wanted)
 
         return jax.jit(motion).lower(*shapes).as_text().count("\n")
 
@@ -212,11 +213,11 @@ def test_rates_alone_compile_to_less():
 
 
 def test_wrong_use_is_explained():
-    motion = free.prepare(jnp.ones((2, 3)), None, jnp.ones((2, 3)))
+    motion = prepare(jnp.ones((2, 3)), None, jnp.ones((2, 3)))
     with pytest.raises(ValueError, match="prepared without wxyz"):
-        free.evaluate(motion, jnp.zeros(2))
+        evaluate(motion, jnp.zeros(2))
     with pytest.raises(ValueError, match="one more"):
-        free.evaluate(motion, jnp.zeros((2, 3, 4)), attitude=False)
+        evaluate(motion, jnp.zeros((2, 3, 4)), attitude=False)
 
 
 def _published(shared):

@@ -6,11 +6,10 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from polhode._closed_forms import free
-from polhode._closed_forms.free import Mode
+from polhode._closed_forms import Mode, principal_periods
 
 # Compiled once: eager dispatch would cost far more than the numbers.
-_periods = jax.jit(free.periods)
+_periods = jax.jit(principal_periods)
 
 TOUTATIS = (3.0836, 3.235, 1.0), np.deg2rad([14.51, 33.529, -98.709])  # rad per day
 
@@ -102,7 +101,7 @@ def test_modes_without_a_period():
 
 
 def _numbers(i, w, products):
-    found = free.periods(i, w, products)
+    found = principal_periods(i, w, products)
     return jnp.stack([found.P_psi, found.P_phi, found.k2, found.theta_min, found.theta_max])
 
 
@@ -138,7 +137,7 @@ def test_derivatives(omega):
 def _second(a, point, direction):
     def numbers(a):
         x = point + a * direction
-        found = free.periods(x[:3], x[3:])
+        found = principal_periods(x[:3], x[3:])
         return jnp.stack([found.P_psi, found.P_phi, found.k2])
 
     return jax.jacfwd(jax.jacrev(numbers))(a)

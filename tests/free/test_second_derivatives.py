@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from polhode._closed_forms import free
+from polhode._closed_forms import free_motion
 
 START = (0.5, -0.125, 0.75, 0.5)
 CASES = json.loads(Path(__file__).with_name("second_cases.json").read_text())
@@ -34,7 +34,7 @@ def test_second_derivatives(dtype):
         products = tuple(x[3:6]) if whole else None
         wxyz = tuple(jnp.asarray(START, x.dtype))
         given = tuple(x[:3]), wxyz, tuple(x[6:9]), x[9], products
-        rates, attitude = free.free_motion(*given)
+        rates, attitude = free_motion(*given)
         return jnp.dot(weights, jnp.stack([*attitude, *rates]))
 
     @jax.jit
@@ -47,7 +47,7 @@ def test_second_derivatives(dtype):
 
     x = column([[*c["moments"], 0, 0, 0, *c["omega"], c["t"]] for c in table])
     given = tuple(x[:, :3].T), tuple(column(START)), tuple(x[:, 6:9].T), x[:, 9]
-    lanes = jax.jit(lambda *given: free.free_motion(*given, rates=False)[1])
+    lanes = jax.jit(lambda *given: free_motion(*given, rates=False)[1])
     attitudes = np.stack(lanes(*given), axis=-1)
     weights = np.random.default_rng(8).normal(size=(len(table), 7)).astype(dtype)
     for k in range(4):
@@ -82,7 +82,7 @@ def test_second_derivatives_of_many_bodies_at_once():
     omega, move = rng.normal(size=(2, 3, 3))
 
     def numbers(omega, moments):
-        rates, _ = free.free_motion(tuple(moments), START, tuple(omega), 2.0, attitude=False)
+        rates, _ = free_motion(tuple(moments), START, tuple(omega), 2.0, attitude=False)
         return rates[0] * rates[1] + rates[2]
 
     def many(omega):

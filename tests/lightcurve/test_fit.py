@@ -10,7 +10,7 @@ import pytest
 import polhode as ph
 from benchmarks import light_curves
 from polhode import lightcurve
-from polhode._closed_forms import free
+from polhode._closed_forms import principal_periods
 from polhode.lightcurve import _fit, _hypotheses, _model, _search, _solutions
 
 PHASE = lightcurve.HG1G2()
@@ -106,7 +106,7 @@ def test_steps_keep_the_frequencies_that_they_mean(trial):
 
     @jax.jit
     def logs(unknowns):
-        found = free.periods(_model.moments_of(unknowns), unknowns[..., 4:7])
+        found = principal_periods(_model.moments_of(unknowns), unknowns[..., 4:7])
         return -jnp.log(jnp.stack([found.P_phi, found.P_psi], -1))
 
     unknowns, wxyz = trial

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from polhode import lightcurve
+from polhode._closed_forms import free_motion
 from polhode.lightcurve import _model, _search, _series, _solutions
 from polhode.lightcurve._hypotheses import Hypotheses
 
@@ -18,7 +19,7 @@ magnitudes = jax.jit(_model.magnitudes, static_argnums=0)
 @jax.jit
 def moved(bodies, later):
     """Rates and attitudes of free bodies at one time each."""
-    found = _series.free.free_motion(
+    found = free_motion(
         _model.moments_of(bodies.unknowns), tuple(bodies.wxyz.T),
         tuple(bodies.unknowns[:, 4:7].T), later,
     )  # fmt: skip

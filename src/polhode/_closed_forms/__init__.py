@@ -1,8 +1,12 @@
-"""Exact laws as methods: nothing is stepped. The table of them stands in `_table.py`."""
+"""Closed-form solutions as methods; `_table.py` lists the scenes for which each holds."""
 
 from polhode._closed_forms._elementary import FixedAxis as FixedAxis, SymmetricTop as SymmetricTop
-from polhode._closed_forms._free import ClosedForm as ClosedForm
+from polhode._closed_forms._free import ClosedForm as ClosedForm, free_motion as free_motion
+from polhode._closed_forms._free_periods import (
+    Mode as Mode,
+    Periods as Periods,
+    periods as periods,
+    principal_periods as principal_periods,
+)
 from polhode._closed_forms._lagrange import LagrangeTop as LagrangeTop
-from polhode._closed_forms._periods import periods as periods
 from polhode._closed_forms._table import LAWS as LAWS, Law as Law, lawful as lawful
-from polhode._closed_forms.free import Mode as Mode, Periods as Periods

@@ -9,6 +9,7 @@ from jaxtyping import Array
 from polhode import rotation
 from polhode._checks import is_concrete
 from polhode._closed_forms import tops
+from polhode._closed_forms._closed_form import AbstractTopMethod
 from polhode._closed_forms._conditions import (
     as_lanes,
     axial_start,
@@ -19,7 +20,6 @@ from polhode._closed_forms._conditions import (
     push_and_damping,
     steady_wheels,
 )
-from polhode._closed_forms._law import AbstractTopMethod
 from polhode._kernels import derivable_once
 from polhode._method._base import Record
 from polhode._scene import Scene, State

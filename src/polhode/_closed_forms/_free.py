@@ -1,18 +1,50 @@
-"""The exact motion of the free body as a method: nothing is stepped."""
+"""The free body as a closed form: the method, its batches, and symmetric bodies."""
+
+import functools
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from polhode import rotation
 from polhode._batch import PARTS, map_chunks
-from polhode._closed_forms import free
-from polhode._closed_forms._law import AbstractExact, with_first
+from polhode._closed_forms._closed_form import AbstractExact, with_first
+from polhode._closed_forms._free_derivatives import EvaluatedMotion, results_rule
+from polhode._closed_forms._free_motion import (
+    FreeConstants,
+    Instant,
+    Polhode,
+    Precession,
+    Triple,
+    advance,
+    as_components,
+    assign_roles,
+    attitude_at,
+    body_rates,
+    polhode_constants,
+    precession_constants,
+)
+from polhode._closed_forms._free_periods import compensate
+from polhode._closed_forms._free_tangent import Quadruple
+from polhode._kernels import kernel, opaque_ones
 from polhode._method._base import Record, Samples
 from polhode._method._status import Status
 from polhode._scene import Scene, State
 from polhode.inertia import Symmetry, principal
+
+_CHUNK = 2**13
+"""Bodies times samples per chunk: by measurement the largest that stays in a core's cache."""
+
+_TWO_CHUNKS = 8
+"""Bodies times samples from which two chunks cost less than one without a loop."""
+
+_TIME_BY_TIME = 64
+"""Bodies from which loops over them are long enough to go time by time."""
+
+_LANES = 512
+"""Bodies whose constants stay in a core's cache while it moves them to many times."""
 
 
 class ClosedForm(AbstractExact):
@@ -44,46 +76,48 @@ class ClosedForm(AbstractExact):
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         del rtol
         self.refuse(scene)
-        kept = ts[..., -1:] if record.final_only else ts[..., 1:]  # at the first it is given
-        t = kept - ts[..., :1]
+        saved = ts[..., -1:] if record.final_only else ts[..., 1:]  # the first is the state itself
+        t = saved - ts[..., :1]
         inertia = scene.inertia
         axes = products = None
         moments, wxyz, omega = inertia.moments, state.wxyz, state.omega_body
         if not inertia.is_principal:
-            whole = jnp.broadcast_to(inertia.full, (wxyz.shape[0], 3, 3))
-            moments, axes, products = principal(whole)
+            tensor = jnp.broadcast_to(inertia.full, (wxyz.shape[0], 3, 3))
+            moments, axes, products = principal(tensor)
             products = products[..., ::-1]  # (yz, zx, xy) -> (xy, xz, yz)
             wxyz = rotation.multiply(wxyz, axes)
             omega = rotation.rotate(rotation.conjugate(axes), omega)
-        n, wanted = wxyz.shape[0], {"attitude": record.attitude, "rates": record.rates}
-        given = jax.tree.map(lambda x: jnp.broadcast_to(x, (n, x.shape[-1])), (moments, products))
+        n, requested = wxyz.shape[0], {"attitude": record.attitude, "rates": record.rates}
+        of_inertia = jax.tree.map(
+            lambda x: jnp.broadcast_to(x, (n, x.shape[-1])), (moments, products)
+        )
         times = t if t.ndim == 2 else None
         motion = _MOTION[inertia.symmetry]
         if inertia.symmetry is Symmetry.NONE:
-            wanted["compensated"] = self.compensated
+            requested["compensated"] = self.compensated
 
         chunk, samples = _CHUNK if self.chunk is None else self.chunk, t.shape[-1]
-        lone = n == 1 and samples >= _WORTH_TWO
+        single_body = n == 1 and samples >= _TWO_CHUNKS
         size, pieces = max(1, chunk // samples), n
-        lanes = (given, wxyz, omega)
-        abreast = self.chunk is None and motion is _triaxial and free.is_abreast(n, samples)
-        if lone:  # one body at many times: as several bodies, each at a part of them
+        lanes = (of_inertia, wxyz, omega)
+        time_by_time = self.chunk is None and motion is _triaxial and goes_time_by_time(n, samples)
+        if single_body:  # one body at many times: as several bodies, each at a part of them
             pieces = max(2, -(-samples // chunk))
             each = -(-samples // pieces)
             times = jnp.pad(t.reshape(-1), (0, pieces * each - samples), mode="edge")
             times = times.reshape(pieces, each)
             lanes = jax.tree.map(lambda x: jnp.repeat(x, pieces, axis=0), lanes)
-        elif abreast:
-            size = free.even_rows(n)
-        elif n * samples >= _WORTH_TWO:
+        elif time_by_time:
+            size = chunk_size(n)
+        elif n * samples >= _TWO_CHUNKS:
             size = min(size, -(-n // 2))
 
-        def one(chunk):
+        def move(chunk):
             (moments, products), wxyz, omega, times = chunk
             times = t[None] if times is None else times
-            return motion(moments, products, wxyz, omega, times, wanted)
+            return motion(moments, products, wxyz, omega, times, requested)
 
-        def finished(parts, axes, state):
+        def assemble(parts, axes, state):
             omega, wxyz = (None if x is None else jnp.stack(x, axis=-1) for x in parts)
             if axes is not None:
                 axes = axes[:, None]
@@ -97,45 +131,39 @@ class ClosedForm(AbstractExact):
                     finite = finite & jnp.all(jnp.isfinite(part), axis=(-1, -2))
             return wxyz, omega, finite
 
-        if abreast:
+        if time_by_time:
             wxyz, omega, finite = map_chunks(
-                lambda chunk: finished(one(chunk[0]), *chunk[1:]),
-                ((*lanes, times), axes, state), n, size,
-            )  # fmt: skip
+                lambda chunk: assemble(move(chunk[0]), *chunk[1:]),
+                ((*lanes, times), axes, state),
+                n,
+                size,
+            )
         else:
             # Components are put together only here: fused with the motion, the stacking would have
-            # all of them worked out anew for each entry. A loop of two chunks keeps them apart.
-            parts = map_chunks(one, (*lanes, times), pieces, size)
-            if lone:
+            # all of them computed again for each entry. A loop of two chunks prevents that.
+            parts = map_chunks(move, (*lanes, times), pieces, size)
+            if single_body:
                 parts = jax.tree.map(lambda x: x.reshape(1, -1)[:, :samples], parts)
-            wxyz, omega, finite = finished(parts, axes, state)
+            wxyz, omega, finite = assemble(parts, axes, state)
         status = jnp.where(finite, Status.SUCCESSFUL, Status.NOT_FINITE)
         return Samples(wxyz, omega, status, jnp.zeros(n, status.dtype))
 
 
-_CHUNK = 2**13
-"""Bodies times samples per chunk: by measurement the largest that stays in a core's cache."""
-
-
-_WORTH_TWO = 8
-"""Bodies times samples from which two chunks cost less than one without a loop."""
-
-
-def _triaxial(moments, products, wxyz, omega, t, wanted):
+def _triaxial(moments, products, wxyz, omega, t, requested):
     if t.shape[-1] > 1:
-        return free.free_motion(moments, wxyz, omega, t, products, **wanted)
+        return free_motion(moments, wxyz, omega, t, products, **requested)
     # One time per body has kernels of its own, nearly twice as fast.
-    motion = free.free_motion(moments, wxyz, omega, t[:, 0], products, **wanted)
+    motion = free_motion(moments, wxyz, omega, t[:, 0], products, **requested)
     return jax.tree.map(lambda x: x[:, None], motion)
 
 
-def _symmetric(moments, products, wxyz, omega, t, wanted):
+def _symmetric(moments, products, wxyz, omega, t, requested):
     moments, wxyz, omega = (x[:, None] for x in (moments, wxyz, omega))
-    return _components(free.symmetric_motion(moments, wxyz, omega, t, **wanted))
+    return _components(symmetric_motion(moments, wxyz, omega, t, **requested))
 
 
-def _spherical(moments, products, wxyz, omega, t, wanted):
-    return _components(free.spherical_motion(wxyz[:, None], omega[:, None], t, **wanted))
+def _spherical(moments, products, wxyz, omega, t, requested):
+    return _components(spherical_motion(wxyz[:, None], omega[:, None], t, **requested))
 
 
 def _components(motion):
@@ -150,3 +178,246 @@ _MOTION = {
     Symmetry.AXISYMMETRIC: _symmetric,
     Symmetry.SPHERICAL: _spherical,
 }
+
+
+def prepare(moments, wxyz, omega, products=None, *, compensated: bool = False) -> FreeConstants:
+    """Constants of the exact motion of free bodies.
+
+    **Arguments:** principal ``moments`` (..., 3), positive, in any order; initial attitude
+    ``wxyz`` (..., 4), or None where only rates are requested; initial body rates ``omega``
+    (..., 3) along the principal axes; ``products`` (..., 3), the entries xy, xz, yz of the inertia
+    tensor, of value zero: they only carry tangents. Each may be a tuple of component arrays; all
+    components share one shape, the batch. ``compensated``: the frequencies in sums of two floats,
+    for long horizons.
+    """
+    moments, omega = as_components(moments, 3), as_components(omega, 3)
+    products = None if products is None else as_components(products, 3)
+    wxyz = None if wxyz is None else as_components(wxyz, 4)
+    roles = assign_roles(moments, omega)
+    polhode = polhode_constants(roles)
+    precession = None if wxyz is None else precession_constants(polhode, wxyz)
+    if compensated:
+        polhode, precession = compensate(polhode, precession, roles)
+    return FreeConstants(moments, products, omega, wxyz, polhode, precession)
+
+
+def evaluate(
+    motion: FreeConstants, t: Float[Array, "..."], *, attitude: bool = True, rates: bool = True
+) -> tuple[Triple | None, Quadruple | None]:
+    """Body rates and attitude at times ``t`` from the start, as tuples of component arrays.
+
+    ``t`` has the rank of the batch and broadcasts with it, or one trailing axis more: the times
+    of each body. Times may be negative. What is not requested is None and costs nothing.
+    """
+    batch = motion.moments[0].ndim
+    t = jnp.asarray(t)
+    if t.ndim > batch + 1:
+        raise ValueError(f"t has {t.ndim} axes, the motion {batch}: expected as many or one more")
+    if attitude and motion.precession is None:
+        raise ValueError("the motion was prepared without wxyz: pass it, or attitude=False")
+    many = t.ndim == batch + 1
+    if many:
+        motion = jax.tree.map(lambda x: x[..., None], motion)
+    elif t.ndim < batch:
+        t = t.reshape((1,) * (batch - t.ndim) + t.shape)
+    precession = motion.precession if attitude else None
+    arguments = (
+        motion.moments,
+        motion.products,
+        motion.omega,
+        motion.wxyz if attitude else None,
+        t,
+    )
+    # Derivatives do not pass through the constants (see ``_free_derivatives``).
+    constants = jax.lax.stop_gradient((motion.polhode, precession))
+    return _evaluate((attitude, rates, many), constants, arguments)
+
+
+def free_motion(
+    moments,
+    wxyz,
+    omega,
+    t,
+    products=None,
+    *,
+    attitude: bool = True,
+    rates: bool = True,
+    compensated: bool = False,
+) -> tuple[Triple | None, Quadruple | None]:
+    """The exact free motion: `prepare` and `evaluate` in one call.
+
+    A long batch of one axis is worked off in chunks that fit the cache of a processor core.
+
+    First and second derivatives, forward and reverse, are exact in every regime, with two limits
+    on second ones: those by ``products`` lose digits in proportion to the inverse relative
+    difference of two moments, and are NaN where two agree to half of their digits; those by the
+    rates lose the ratio of a radian to the angle turned through, except at rest.
+    """
+    parts = (
+        as_components(moments, 3),
+        as_components(wxyz, 4) if attitude else None,
+        as_components(omega, 3),
+        None if products is None else as_components(products, 3),
+    )
+
+    t = jnp.asarray(t)
+    requested = {"attitude": attitude, "rates": rates}
+    if t.ndim == 2 and parts[0][0].ndim == 1 and goes_time_by_time(len(parts[0][0]), t.shape[1]):
+        return _chunked(
+            lambda arguments, t: _time_by_time(arguments, t, compensated, requested),
+            parts,
+            t,
+            _LANES,
+        )
+
+    def whole_motion(arguments, t):
+        return evaluate(prepare(*arguments, compensated=compensated), t, **requested)
+
+    rows = max(1, _CHUNK // max(t.shape[1] if t.ndim == 2 else 1, 1))
+    return _chunked(kernel(whole_motion, linearised=True), parts, t, rows)
+
+
+def goes_time_by_time(bodies: int, times: int) -> bool:
+    """Whether all bodies are moved to one time after the other: the loops are then over bodies."""
+    return jax.default_backend() == "cpu" and times > 1 and bodies >= _TIME_BY_TIME
+
+
+def _time_by_time(arguments, t, compensated: bool, requested):
+    """The motion of many bodies, one time after the other; the constants are computed once."""
+
+    def constants(arguments):
+        motion = prepare(*arguments, compensated=compensated)
+        return motion.polhode, motion.precession
+
+    prepared = kernel(constants)(jax.lax.stop_gradient(arguments))
+
+    def at(arguments, prepared, t):
+        moments, wxyz, omega, products = arguments
+        return evaluate(FreeConstants(moments, products, omega, wxyz, *prepared), t, **requested)
+
+    # Coefficients of the derivative are computed again where they are used: storing them for all
+    # times takes longer, because memory bandwidth limits it.
+    at_time = jax.checkpoint(kernel(at, linearised=True), prevent_cse=False)
+    samples = jax.lax.map(lambda t: at_time(arguments, prepared, t), t.T)
+    return jax.tree.map(jnp.transpose, samples)
+
+
+def chunk_size(count: int, largest: int = _LANES) -> int:
+    """Bodies of a chunk: if possible a divisor, which spares the copies that padding makes."""
+    if count < 2 * largest:
+        return count
+    return next(
+        (n for n in range(largest, largest // 4 - 1, -1) if n > 0 and count % n == 0), largest
+    )
+
+
+def _chunked(fn, parts, t, rows):
+    """``fn(parts, t)``, ``rows`` bodies at a time where a processor has many to do."""
+    lanes = parts[0][0]
+    if jax.default_backend() != "cpu" or lanes.ndim != 1 or lanes.shape[0] < 2 * rows:
+        return fn(parts, t)
+    count = lanes.shape[0]
+    rows = chunk_size(count, rows)
+    padding = -count % rows
+
+    def pieces_of(x):
+        if padding == 0:
+            return x.reshape(-1, rows, *x.shape[1:])
+        last = jnp.broadcast_to(x[-1:], (padding, *x.shape[1:]))
+        return jnp.concatenate([x, last]).reshape(-1, rows, *x.shape[1:])
+
+    own_times = t.ndim > 0 and t.shape[0] == count
+    pieces = jax.tree.map(pieces_of, (parts, t) if own_times else (parts, None))
+    out = jax.lax.map(lambda p: fn(p[0], p[1] if own_times else t), pieces)
+    return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], out)
+
+
+def _results(requested, polhode: Polhode, precession: Precession | None, at: Instant):
+    return (
+        body_rates(polhode, at) if requested[1] else None,
+        attitude_at(polhode, precession, at) if requested[0] else None,
+    )
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _evaluate(requested, constants, arguments):
+    polhode, precession = constants
+    one = None if requested[2] else polhode.one
+    return _results(
+        requested, polhode, precession, advance(polhode, precession, arguments[-1], one)
+    )
+
+
+def _evaluate_rule(requested, primals, tangents):
+    (polhode, precession), arguments = primals
+    t = jax.lax.stop_gradient(arguments[-1])
+    # The tangent has many kernels, and each would repeat the motion itself.
+    at = advance(polhode, precession, t, opaque_ones(t * polhode.one), fine=True)
+    motion = EvaluatedMotion(polhode, precession, at, _results(requested, polhode, precession, at))
+    return results_rule(requested, (motion, arguments), (None, tangents[1]))
+
+
+_evaluate.defjvp(_evaluate_rule, symbolic_zeros=True)
+
+
+class SymmetricMotion(NamedTuple):
+    """Attitude (..., 4) and rates (..., 3) of a symmetric free body; None where not requested."""
+
+    wxyz: Array | None
+    omega_body: Array | None
+
+
+def symmetric_motion(
+    moments: Float[Array, "*#b 3"],
+    wxyz: Float[Array, "*#b 4"],
+    omega_body: Float[Array, "*#b 3"],
+    t: Float[Array, "*#b"],
+    *,
+    attitude: bool = True,
+    rates: bool = True,
+) -> SymmetricMotion:
+    """Regular precession of a body with equal moments about body x and y.
+
+    ``moments`` (..., 3) [kg m^2], the first two taken as equal; ``t`` (...) [s] since the state
+    ``wxyz``, ``omega_body`` held. The body turns about its axis at ``lambda = (1 - I3/I1) w3`` and
+    with that about the constant momentum at ``|L|/I1``.
+    """
+    transverse, axial = moments[..., 0], moments[..., 2]
+    slip = (transverse - axial) / transverse * omega_body[..., 2]
+    later = later_rates = None
+    if rates:
+        # Here and below: once, and not anew for each component of what follows.
+        cos, sin = jax.lax.optimization_barrier((jnp.cos(slip * t), jnp.sin(slip * t)))
+        x, y = omega_body[..., 0], omega_body[..., 1]
+        spin = jnp.broadcast_to(omega_body[..., 2], cos.shape)
+        later_rates = jnp.stack([x * cos + y * sin, y * cos - x * sin, spin], axis=-1)
+    if attitude:
+        own_momentum = jax.lax.optimization_barrier(omega_body * moments)
+        momentum = rotation.rotate(wxyz, own_momentum) / transverse[..., None]
+        angle = jax.lax.optimization_barrier(momentum * t[..., None])
+        precession = rotation.rotation_vector_to_wxyz(angle)
+        half = slip * t / 2
+        zero = jnp.zeros_like(half)
+        own = jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=-1)
+        precession, own = jax.lax.optimization_barrier((precession, own))
+        before = jax.lax.optimization_barrier(rotation.multiply(precession, wxyz))
+        later = rotation.multiply(before, own)
+    return SymmetricMotion(later, later_rates)
+
+
+def spherical_motion(
+    wxyz: Float[Array, "*#b 4"],
+    omega_body: Float[Array, "*#b 3"],
+    t: Float[Array, "*#b"],
+    *,
+    attitude: bool = True,
+    rates: bool = True,
+) -> SymmetricMotion:
+    """Constant rates of a body with three equal moments: rotation about a fixed axis."""
+    shape = jnp.broadcast_shapes(omega_body.shape[:-1], t.shape)
+    later = None
+    if attitude:
+        turn = rotation.rotation_vector_to_wxyz(omega_body * t[..., None])
+        turn = jax.lax.optimization_barrier(turn)
+        later = rotation.multiply(wxyz, turn)
+    return SymmetricMotion(later, jnp.broadcast_to(omega_body, (*shape, 3)) if rates else None)

@@ -7,6 +7,7 @@ import numpy as np
 
 from polhode._checks import is_concrete
 from polhode._closed_forms import tops
+from polhode._closed_forms._closed_form import AbstractTopMethod
 from polhode._closed_forms._conditions import (
     as_lanes,
     axial_start,
@@ -14,7 +15,6 @@ from polhode._closed_forms._conditions import (
     not_symmetric,
     steady_wheels,
 )
-from polhode._closed_forms._law import AbstractTopMethod
 from polhode._method._base import Record
 from polhode._scene import Scene, State, UniformGravity, Wheels
 

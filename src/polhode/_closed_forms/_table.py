@@ -2,10 +2,10 @@
 
 from typing import NamedTuple
 
+from polhode._closed_forms._closed_form import AbstractExact
 from polhode._closed_forms._elementary import FixedAxis, SymmetricTop
 from polhode._closed_forms._free import ClosedForm
 from polhode._closed_forms._lagrange import LagrangeTop
-from polhode._closed_forms._law import AbstractExact
 from polhode._method._base import Record
 from polhode._scene import Scene, State
 from polhode.inertia import Symmetry

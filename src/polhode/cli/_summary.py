@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 import polhode
-from polhode._closed_forms.free import Mode
+from polhode._closed_forms import Mode
 from polhode.cli._job import Job, Outcome, Residuals
 from polhode.files._error import visible
 from polhode.plot._scale import Scale

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from polhode._closed_forms.free import free_motion
+from polhode._closed_forms._free import free_motion
 from polhode._hamiltonian import (
     Attitude,
     Dynamics,

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from polhode import rotation
-from polhode._closed_forms import free
+from polhode._closed_forms import Mode
 from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._frequencies import Pairs, fourier_lattices
 from polhode.lightcurve._hypotheses import Hypotheses, hypotheses
@@ -241,7 +241,7 @@ def _near(state: State, resolution: float) -> Hypotheses:
                     for j in kept if mode[j] == mode[k]]  # fmt: skip
             if min(size, default=np.inf) > 0.3 * resolution:
                 kept.append(int(k))
-    return Hypotheses(f_phi[kept], f_psi[kept], mode[kept] == int(free.Mode.LAM))
+    return Hypotheses(f_phi[kept], f_psi[kept], mode[kept] == int(Mode.LAM))
 
 
 def _found_twice(one: State, other: State, resolution: float) -> bool:

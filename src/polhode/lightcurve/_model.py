@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._closed_forms import free
-from polhode._closed_forms.free._roles import Triple
+from polhode._closed_forms import free_motion, principal_periods
+from polhode._closed_forms._free_motion import Triple
 from polhode.lightcurve._phase import AbstractPhase
 from polhode.lightcurve._scattering import _cross, seeliger_ellipsoid
 
@@ -51,7 +51,7 @@ def attitudes(unknowns: Float[Array, "b u"], wxyz: Float[Array, "b 4"], t: Float
     """Quaternion components (b, n) of the exact motion."""
     omega = tuple(unknowns[:, k] for k in (4, 5, 6))
     start = tuple(wxyz[:, k] for k in range(4))
-    return free.free_motion(moments_of(unknowns), start, omega, t, rates=False)[1]
+    return free_motion(moments_of(unknowns), start, omega, t, rates=False)[1]
 
 
 def _to_body(q, vector: Triple) -> Triple:
@@ -121,7 +121,7 @@ def magnitudes_and_slopes(phase: AbstractPhase, bodies: Bodies, points: Points):
 
 def _frequencies(unknowns):
     """Logarithms of f_phi and f_psi, and the mode, of one body."""
-    found = free.periods(moments_of(unknowns), unknowns[RATES])
+    found = principal_periods(moments_of(unknowns), unknowns[RATES])
     return -jnp.log(jnp.stack([found.P_phi, found.P_psi])), found.mode
 
 

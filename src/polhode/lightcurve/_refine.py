@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from polhode import rotation
-from polhode._closed_forms import free
+from polhode._closed_forms import Mode
 from polhode.lightcurve._model import Bodies, Points, _to_body, attitudes, moments_of, stepped
 from polhode.lightcurve._nulls import Linear
 from polhode.lightcurve._phase import AbstractPhase
@@ -262,7 +262,7 @@ def _solution(
     return old._replace(
         P_phi=float(1 / f_phi), P_psi=float(1 / f_psi),
         P_phi_std=float(std[0] / f_phi), P_psi_std=float(std[1] / f_psi),
-        mode=free.Mode(int(mode)),
+        mode=Mode(int(mode)),
         rms=float(np.sqrt(np.average(found.values**2, weights=linear.root**2))),
         cost=found.cost, probability=float(np.exp(-(found.cost - least) / 2 / root**2)),
         moments=moments / moments.max(), moments_std=std[2:5],

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._closed_forms.free._roles import Triple
+from polhode._closed_forms._free_motion import Triple
 
 Scalars = Float[Array, "*b"]
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._closed_forms import free
+from polhode._closed_forms import free_motion, principal_periods
 from polhode.lightcurve._hypotheses import Hypotheses
 from polhode.lightcurve._model import Bodies, Points, magnitudes, moments_of
 from polhode.lightcurve._phase import AbstractPhase
@@ -44,7 +44,7 @@ def _spins(u, part, long_axis):
     along = jnp.broadcast_to(long_axis, split.shape)
     angle = jnp.where(along, split * part, jnp.pi / 2 - (jnp.pi / 2 - split) * part)
     omega = (jnp.cos(angle) / a, jnp.zeros_like(a), jnp.sin(angle) / c)
-    return (a, b, c), omega, free.periods((a, b, c), omega)
+    return (a, b, c), omega, principal_periods((a, b, c), omega)
 
 
 def _allowed(u, long_axis, ratio):
@@ -83,7 +83,7 @@ def _built(draws: Draws, long_axis, spread):
     moments, omega, found = _spins(u, (low + high) / 2, long_axis)
     scale = found.P_phi * draws.f_phi
     omega = tuple(x * scale for x in omega)
-    omega, _ = free.free_motion(moments, None, omega, draws.late / draws.f_psi, attitude=False)
+    omega, _ = free_motion(moments, None, omega, draws.late / draws.f_psi, attitude=False)
     assert omega is not None  # the rates were not declined
     near = jnp.abs(found.P_phi / found.P_psi / ratio - 1) < 0.01
     good = _allowed(u, long_axis, ratio) & near & jnp.isfinite(sum(omega))

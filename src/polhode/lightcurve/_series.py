@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._closed_forms import free
+from polhode._closed_forms import free_motion
 from polhode.lightcurve._model import Bodies, Points, _to_body, moments_of
 from polhode.lightcurve._scattering import seeliger_ellipsoid
 
@@ -80,7 +80,7 @@ def turned(
     moments, omega = moments_of(u), tuple(u[:, k] for k in (4, 5, 6))
     # half a period of the nutation: what is left is the same, turned by half a turn in SAM
     times = jnp.arange(_HALF)[None] / (2 * _HALF) / f_psi[:, None]
-    rates, q = free.free_motion(moments, tuple(wxyz[:, k] for k in range(4)), omega, times)
+    rates, q = free_motion(moments, tuple(wxyz[:, k] for k in range(4)), omega, times)
     assert rates is not None  # neither was declined
     assert q is not None
     pole = rotation.rotate(

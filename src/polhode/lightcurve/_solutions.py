@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from polhode import rotation
-from polhode._closed_forms import free
+from polhode._closed_forms import Mode, principal_periods
 from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._frequencies import Pairs
 from polhode.lightcurve._hypotheses import LAM, SAM, Hypotheses, sum_name
@@ -31,7 +31,7 @@ class Solution(NamedTuple):
     P_psi: float
     P_phi_std: float
     P_psi_std: float
-    mode: free.Mode
+    mode: Mode
     rms: float  # weighted, of the residuals [mag]
     cost: float  # robust chi-square, priors included
     probability: float  # exp(-(cost - best) / 2 / scale^2 / alike): 1 for the best
@@ -62,7 +62,7 @@ class Solution(NamedTuple):
 
     def lines(self, count: int = 3) -> tuple[tuple[str, float], ...]:
         """Main lines of the light of this mode, with their periods: ``("2 f_phi", period)``."""
-        sums = LAM if self.mode == free.Mode.LAM else SAM
+        sums = LAM if self.mode == Mode.LAM else SAM
         return tuple(
             (sum_name(i, j), 1 / (i / self.P_phi + j / self.P_psi)) for i, j in list(sums)[:count]
         )
@@ -105,7 +105,7 @@ def momentum(bodies: Bodies) -> np.ndarray:
 
 @jax.jit
 def _periods(bodies: Bodies):
-    found = free.periods(moments_of(bodies.unknowns), bodies.unknowns[:, 4:7])
+    found = principal_periods(moments_of(bodies.unknowns), bodies.unknowns[:, 4:7])
     return 1 / found.P_phi, 1 / found.P_psi, found.mode
 
 
@@ -130,7 +130,7 @@ def _derived(x, wxyz):
     unknowns, turn = x[:-3], x[-3:]
     moments = moments_of(unknowns)
     omega = unknowns[4:7]
-    found = free.periods(moments, tuple(omega))
+    found = principal_periods(moments, tuple(omega))
     moments = jnp.stack(moments)
     attitude = rotation.multiply(rotation.rotation_vector_to_wxyz(turn), wxyz)
     momentum = rotation.rotate(attitude, moments * omega)
@@ -188,7 +188,7 @@ def described(problem: Problem, state: State, order, curve: LightCurve, normals,
         axes = np.exp(np.r_[0.0, unknowns[k, 2:4]])
         out.append(Solution(
             1 / f_phi[k], 1 / f_psi[k], std[0] / f_phi[k], std[1] / f_psi[k],
-            free.Mode(int(mode[k])), float(np.sqrt(np.average(rest[k] ** 2, weights=weight[0]))),
+            Mode(int(mode[k])), float(np.sqrt(np.average(rest[k] ** 2, weights=weight[0]))),
             float(chosen.cost[k]),
             float(np.exp((chosen.cost[0] - chosen.cost[k]) / 2 / scale**2 / alike)),
             moments / moments.max(), std[2:5], axes / axes.max(),

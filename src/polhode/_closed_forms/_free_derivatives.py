@@ -1,0 +1,519 @@
+"""The derivative of the exact free motion as a rule of JAX, which can itself be differentiated.
+
+The constants of the motion are computed by formulas made for rounding, with branches and quotients
+of differences, whose chain rule is 0/0 in a symmetric body and on the separatrix. The tangent
+(``_free_tangent``) uses their values alone. For second derivatives each value is given the
+derivative of a plain formula, which is regular everywhere; nothing of it is evaluated unless the
+tangent is differentiated again."""
+
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
+from jaxtyping import Array, Float
+
+from polhode._closed_forms._arithmetic import sign_of_parity
+from polhode._closed_forms._free_motion import (
+    Instant,
+    Polhode,
+    Precession,
+    Triple,
+    agm_and_nome,
+    momentum_of,
+)
+from polhode._closed_forms._free_tangent import (
+    Frame,
+    Invariants,
+    Quadruple,
+    Variation,
+    apply_variation,
+    cross,
+    dot,
+    incomplete,
+    momentum_tangent,
+    partials,
+    products_of_momenta,
+    quarter_turn,
+    quaternion_product,
+    second_kind,
+    squares_of_momenta,
+)
+from polhode._hamiltonian import triple
+from polhode._kernels import opaque_ones, over_gap, staged
+
+Scalars = Float[Array, "*b"]
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def with_formula_derivative(formula, value, constants, arguments):
+    """``value``, with the derivative of ``formula(fixed, given)`` with respect to ``given``."""
+    return value
+
+
+@with_formula_derivative.defjvp
+def _with_formula_derivative_rule(formula, primals, tangents):
+    value, constants, arguments = primals
+    _, variation = jax.jvp(lambda x: formula(constants, x), (arguments,), (tangents[2],))
+    return with_formula_derivative(formula, value, constants, arguments), variation
+
+
+def _start_formula(polhode: Polhode, arguments):
+    """Plain formulas of the constants in ``start_of``."""
+    frame = Frame(polhode)
+    moments, omega = arguments
+    rate_unit = jnp.where(polhode.rate_unit > 0, polhode.rate_unit, 1)
+    i = i1, i2, i3 = tuple(x / polhode.moment_unit for x in frame.to_roles(moments))
+    w = tuple(x / rate_unit for x in frame.to_roles(omega))
+    d = d1, d2, d3 = tuple(1 / x for x in i)
+    momentum = l1, l2, l3 = tuple(x * y for x, y in zip(i, w, strict=True))
+    p = polhode.sense * (i2 - i1) * d1 * d2
+    r = polhode.sense * (i3 - i2) * d2 * d3
+    s = polhode.sense * (i3 - i1) * d1 * d3
+    return momentum, d, i, p, r, s, s * l1 * l1 + r * l2 * l2, p * l2 * l2 + s * l3 * l3
+
+
+def with_start_derivative(polhode: Polhode, moments: Triple, omega: Triple) -> Polhode:
+    """The constants that stand in the tangent, with derivatives by moments and initial rates."""
+    value = polhode.momentum, polhode.inverse_moments, polhode.moments
+    value = (*value, polhode.p, polhode.r, polhode.s, polhode.A, polhode.B)
+    momentum, inverse_moments, moments, p, r, s, A, B = with_formula_derivative(
+        _start_formula, value, polhode, (moments, omega)
+    )
+    return polhode._replace(
+        momentum=momentum, inverse_moments=inverse_moments, moments=moments, p=p, r=r, s=s, A=A, B=B
+    )
+
+
+def _momentum_formula(polhode: Polhode, arguments):
+    start, p, r, s, functions = arguments
+    return momentum_of(polhode._replace(momentum=start, p=p, r=r, s=s), functions)
+
+
+def with_momentum_derivative(polhode: Polhode, functions: Triple, now: Triple) -> Triple:
+    """The momentum at time t, with its derivative by the start and by S, C, N."""
+    arguments = (polhode.momentum, polhode.p, polhode.r, polhode.s, functions)
+    return with_formula_derivative(_momentum_formula, now, polhode, arguments)
+
+
+def _difference_formula(_, arguments):
+    x, y = arguments
+    return x - y
+
+
+def with_difference_derivative(polhode: Polhode, x: Scalars, y: Scalars) -> Scalars:
+    """B r - A p, exact where it vanishes on the separatrix."""
+    return with_formula_derivative(_difference_formula, polhode.m1 * x, (), (x, y))
+
+
+def _quarter_formula(circular, on_separatrix, x: Scalars, z: Scalars):
+    is_moving = x > 0
+    x, z = jnp.where(is_moving, x, 1), jnp.where(is_moving, z, 1)
+    m1 = z / x
+    m, one = 1 - m1, jnp.ones_like(x)
+    agm, _, log_nome, rate = agm_and_nome(circular, on_separatrix, x, m, m1, one)
+    return quarter_turn(circular, on_separatrix, m, m1, agm, log_nome, 1 / rate)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def with_functions_derivative(many: bool, value, constants, x: Scalars, z: Scalars, t: Scalars):
+    """``value``: S, C, N and the integrals of S^2 and (S/N)^2; with their derivatives.
+
+    ``constants``: those of the polhode and its half turns so far; ``x`` = B r, ``z`` = B r - A p.
+    """
+    return value
+
+
+@with_functions_derivative.defjvp
+def _functions_rule(many, primals, tangents):
+    value, constants, x, z, t = primals
+    _, _, dx, dz, dt = tangents
+    value = with_functions_derivative(many, value, constants, x, z, t)
+    polhode, half_turns = constants
+    S, C, N, first, second = value
+    y = with_formula_derivative(_difference_formula, polhode.A * polhode.p, (), (x, z))
+    dS, dC, dN = partials(x, y, (S, C, N), first, second).along(dx, dz)
+    dS, dC, dN = dS + C * N * dt, dC - x * S * N * dt, dN - y * S * C * dt
+    sign = sign_of_parity(half_turns)
+    _, variation = jax.jvp(
+        lambda s, c, n: incomplete(s, c, n, many),
+        (sign * S, sign * C, N),
+        (sign * dS, sign * dC, dN),
+    )
+    _, turn = jax.jvp(
+        functools.partial(_quarter_formula, polhode.circular, polhode.on_separatrix),
+        (x, z),
+        (dx, dz),
+    )
+    parts = tuple(
+        a + jnp.where(half_turns == 0, 0, 2 * half_turns * b)
+        for a, b in zip(variation, turn, strict=True)
+    )
+    return value, (dS, dC, dN, *parts)
+
+
+def _axes_turn(_, arguments) -> Triple:
+    """Turn of the principal axes that entries xy, xz, yz of the tensor make."""
+    (a, b, c), (xy, xz, yz) = arguments
+    return over_gap(yz, b, c), over_gap(xz, c, a), over_gap(xy, a, b)
+
+
+def along_turning_axes(arguments, dm, dp, dw):
+    """Everything along principal axes that turn with the tensor, and the way back of a vector.
+
+    The products of inertia are zero and only carry a tangent, so that the turn is zero as well: it
+    counts in second derivatives alone. Axes of equal moments have no such turn, and second
+    derivatives by the product between them are NaN.
+    """
+    moments, products, omega, wxyz, t = arguments
+    none = tuple(jnp.zeros_like(x) for x in products)
+    turn = with_formula_derivative(_axes_turn, none, (), (moments, products))
+
+    def along(v):
+        return None if v is None else tuple(a - b for a, b in zip(v, cross(turn, v), strict=True))
+
+    def to_body(v):
+        return tuple(a + b for a, b in zip(v, cross(turn, v), strict=True))
+
+    if dm is not None or dp is not None:
+        a, b, c = none if dm is None else dm
+        xy, xz, yz = none if dp is None else dp
+        x, y, z = turn
+        # M K - K M for the turn's cross product K.
+        dm = (a + 2 * (xy * z - xz * y), b + 2 * (yz * x - xy * z), c + 2 * (xz * y - yz * x))
+        dp = (
+            xy + (b - a) * z + xz * x - yz * y,
+            xz + (a - c) * y - xy * x + yz * z,
+            yz + (c - b) * x + xy * y - xz * z,
+        )
+    arguments = moments, jax.lax.stop_gradient(products), along(omega), wxyz, t
+    return arguments, dm, dp, along(dw), to_body
+
+
+def variation_at_rest(at_rest, arguments, dw, dt) -> tuple[Triple, Triple]:
+    """Variations of rates and attitude of a body at rest, to second order in the rates."""
+    (i1, i2, i3), _, omega, _, t = arguments
+    w1, w2, w3 = w = triple(jnp.where(at_rest, x, 0) for x in omega)
+    zero = jnp.zeros_like(t * i1)
+    d_time = (zero, zero, zero) if dt is None else triple(x * dt for x in w)
+    if dw is None:
+        return (zero, zero, zero), d_time
+    h1, h2, h3 = dw
+    gain = (
+        (i2 - i3) / i1 * (h2 * w3 + h3 * w2) * t,
+        (i3 - i1) / i2 * (h3 * w1 + h1 * w3) * t,
+        (i1 - i2) / i3 * (h1 * w2 + h2 * w1) * t,
+    )
+    d_rates = triple(h + g for h, g in zip(dw, gain, strict=True))
+    d_attitude = triple(
+        t * (h + (g - t * c) / 2) + e
+        for h, g, c, e in zip(dw, gain, cross(w, dw), d_time, strict=True)
+    )
+    return d_rates, d_attitude
+
+
+class EvaluatedMotion(NamedTuple):
+    """The motion at time t and the constants it came from: values without derivatives."""
+
+    polhode: Polhode
+    precession: Precession | None
+    at: Instant
+    results: tuple[Triple | None, Quadruple | None]
+
+
+def dense_or_none(tangents, primals):
+    """None where every tangent is zero, arrays otherwise."""
+    if tangents is None or all(isinstance(x, SymbolicZero) for x in jax.tree.leaves(tangents)):
+        return None
+    return jax.tree.map(
+        lambda d, x: jnp.zeros_like(x) if isinstance(d, SymbolicZero) else d, tangents, primals
+    )
+
+
+def start_variation(polhode: Polhode, frame: Frame, dm, dp, dw) -> Variation:
+    """Variation of the initial momentum and of the inverse tensor, in roles and scaled units."""
+    zero = (jnp.zeros_like(polhode.moment_unit),) * 3
+    inverse_rate_unit = 1 / jnp.where(polhode.rate_unit > 0, polhode.rate_unit, 1)
+    di = tuple(x / polhode.moment_unit for x in frame.to_roles(dm)) if dm is not None else zero
+    dv = tuple(x * inverse_rate_unit for x in frame.to_roles(dw)) if dw is not None else zero
+    d1, d2, d3 = d = polhode.inverse_moments
+    w1, w2, w3 = w = tuple(x * y for x, y in zip(polhode.momentum, d, strict=True))
+    momentum_variation = tuple(
+        i * v + e * u for i, v, e, u in zip(polhode.moments, dv, di, w, strict=True)
+    )
+    inverse_moments = tuple(-k * k * e for k, e in zip(d, di, strict=True))
+    if dp is None:
+        return Variation(momentum_variation, inverse_moments, None)
+    p12, p13, p23 = (x / polhode.moment_unit for x in frame.to_pairs(dp))
+    momentum_variation = (
+        momentum_variation[0] + p12 * w2 + p13 * w3,
+        momentum_variation[1] + p12 * w1 + p23 * w3,
+        momentum_variation[2] + p13 * w1 + p23 * w2,
+    )
+    return Variation(
+        momentum_variation, inverse_moments, (-d1 * d2 * p12, -d1 * d3 * p13, -d2 * d3 * p23)
+    )
+
+
+def _relative_turn(
+    polhode: Polhode, precession: Precession, frame: Frame, at: Instant, momentum_step: Triple
+):
+    """Quaternion from the attitude at t to that at the start, its vector part exact when small."""
+    l1, l2, l3 = frame.reflected(polhode.momentum)
+    s1, s2, s3 = frame.reflected(momentum_step)
+    c, s = at.precession_half_angle
+    height = precession.length + l3
+    tilt = jnp.sqrt(height * height + l1 * l1 + l2 * l2)
+    c, s = c / tilt, s / tilt
+    along = s * (tilt * tilt / precession.length)
+    v0 = c * s3
+    v = (c * s2 + s * s1, s * s2 - c * s1, s * s3)
+    to_body = cross((l2, -l1, jnp.zeros_like(l1)), v)
+    vector = (
+        along * l1 + height * v[0] - v0 * l2 - to_body[0],
+        along * l2 + height * v[1] + v0 * l1 - to_body[1],
+        along * l3 + height * v[2] - to_body[2],
+    )
+    scalar = c * tilt * tilt + height * v0 + l2 * v[0] - l1 * v[1]
+    return scalar, vector
+
+
+def _turn_tangent(
+    polhode,
+    frame: Frame,
+    functions,
+    now,
+    relative,
+    variation: Variation,
+    variation_since_start,
+    first,
+    t,
+):
+    """Variation of the attitude: a rotation vector along axes 1, 2, 3 at time t."""
+    sigma_pi = polhode.sense * polhode.parity
+    invariants = Invariants(polhode.momentum, polhode.p, polhode.r, polhode.s, polhode.A, polhode.B)
+    scalar, vector = relative
+    momentum_variation = frame.reflected(variation.momentum)
+    once = cross(vector, momentum_variation)
+    twice = cross(vector, once)
+    momentum_lag = tuple(
+        2 * (b - scalar * a) - m
+        for a, b, m in zip(once, twice, frame.reflected(variation_since_start), strict=True)
+    )
+    squares = squares_of_momenta(polhode, functions, now, first, t)
+    start = polhode.momentum
+    spin = tuple(x * y for x, y in zip(start, polhode.inverse_moments, strict=True))
+    energy = dot(spin, variation.momentum) + dot(start, apply_variation(variation, start)) / 2
+    about_L = t * energy + dot(variation.inverse_moments, squares) / 2
+    if variation.off_diagonal is not None:
+        about_L = about_L + dot(
+            variation.off_diagonal, products_of_momenta(invariants, functions, sigma_pi)
+        )
+    L_now = frame.reflected(now)
+    inverse_square = 1 / dot(start, start)
+    turn = tuple(
+        (a + about_L * b) * inverse_square
+        for a, b in zip(cross(L_now, momentum_lag), L_now, strict=True)
+    )
+    return frame.reflected(turn)
+
+
+def _regularised(polhode: Polhode, at: Instant, t: Scalars) -> Instant:
+    """S, C, N as the tangent needs them; the momentum itself does not.
+
+    Where omega_p is zero S is the time. On the separatrix derivatives grow without bound: they are
+    held where their products would overflow.
+    """
+    is_still = polhode.inverse_rate == 0
+    smallest = 2.0 ** -{4: 17, 8: 140}[t.dtype.itemsize]
+
+    def regular_functions(functions: Triple) -> Triple:
+        S, C, N = functions
+        C, N = (jnp.where(polhode.on_separatrix, jnp.maximum(x, smallest), x) for x in (C, N))
+        return jnp.where(is_still, t, S), C, N
+
+    return at._replace(
+        reduced=regular_functions(at.reduced), functions=regular_functions(at.functions)
+    )
+
+
+def _staged(ones, values):
+    return staged(values, *ones)
+
+
+class _Tangent(NamedTuple):
+    """Variations at time t along axes 1, 2, 3, scaled: of L, of the attitude, but for the time."""
+
+    polhode: Polhode
+    frame: Frame
+    now: Triple
+    variation: Variation
+    momentum: Triple
+    turn: Triple | None
+
+
+def _tangent(
+    many: bool, attitude: bool, motion: EvaluatedMotion, arguments, dm, dp, dw
+) -> _Tangent:
+    """The formulas of _tangent.py, every value in them with a derivative of its own."""
+    moments, _, omega, _, t = arguments
+    scaled = t * motion.polhode.rate_unit
+    ones = opaque_ones(scaled), motion.polhode.one
+    # The transpose of a stage is a stage: it keeps cotangents from being summed again and again.
+    stage = functools.partial(_staged, ones)
+    polhode = with_start_derivative(motion.polhode, moments, omega)
+    frame = Frame(polhode)
+    variation = stage(start_variation(polhode, frame, dm, dp, dw))
+    at = _regularised(motion.polhode, motion.at, scaled)
+    integrals = stage(second_kind(motion.polhode, at.half_turns, at.reduced, many))
+    x, y = polhode.B * polhode.r, polhode.A * polhode.p
+    *functions, first, second = with_functions_derivative(
+        many,
+        (*at.functions, *integrals),
+        (polhode, at.half_turns),
+        x,
+        with_difference_derivative(polhode, x, y),
+        scaled,
+    )
+    functions = tuple(functions)
+    now = with_momentum_derivative(polhode, functions, at.momentum)
+    by = stage(partials(x, y, functions, first, second))
+    variation_since_start = stage(momentum_tangent(polhode, functions, now, by, variation, stage))
+    total = tuple(g + m for g, m in zip(variation.momentum, variation_since_start, strict=True))
+    turn = None
+    if attitude:
+        relative = _relative(many, motion._replace(results=None), arguments)
+        turn = _turn_tangent(
+            polhode,
+            frame,
+            functions,
+            now,
+            relative,
+            variation,
+            variation_since_start,
+            first,
+            scaled,
+        )
+    return _Tangent(polhode, frame, now, variation, total, turn)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _relative(many: bool, motion: EvaluatedMotion, arguments):
+    """Turn from the start to time t, of which the tangent of the attitude is made, as quaternion.
+
+    Right-handed axes 1, 2, 3; its derivative is the tangent of the attitude itself.
+    """
+    polhode, at = motion.polhode, motion.at
+    sigma_pi = polhode.sense * polhode.parity
+    invariants = Invariants(polhode.momentum, polhode.p, polhode.r, polhode.s, polhode.A, polhode.B)
+    functions = _regularised(polhode, at, arguments[-1] * polhode.rate_unit).functions
+    j12, j13, j23 = products_of_momenta(invariants, functions, sigma_pi)
+    momentum_step = (
+        -sigma_pi * polhode.r * j23,
+        sigma_pi * polhode.s * j13,
+        -sigma_pi * polhode.p * j12,
+    )
+    return _relative_turn(polhode, motion.precession, Frame(polhode), at, momentum_step)
+
+
+def _relative_rule(many, primals, tangents):
+    motion, arguments = primals
+    dm, dp, dw, _, dt = (dense_or_none(d, x) for d, x in zip(tangents[1], arguments, strict=True))
+    scalar, vector = value = _relative(many, motion, arguments)
+    tangent = _tangent(many, True, motion, arguments, dm, dp, dw)
+    turn = _turn_in_time(tangent, dt)
+    half = tuple(x / 2 for x in tangent.frame.reflected(turn))
+    vector_variation = tuple(scalar * a + b for a, b in zip(half, cross(vector, half), strict=True))
+    return value, (-dot(vector, half), vector_variation)
+
+
+_relative.defjvp(_relative_rule, symbolic_zeros=True)
+
+
+def _turn_in_time(tangent: _Tangent, dt) -> Triple:
+    turn, polhode = tangent.turn, tangent.polhode
+    if turn is None:
+        raise ValueError("the tangent was computed for the rates alone: request the attitude.")
+    if dt is None:
+        return turn
+    return triple(
+        e + n * d * (polhode.rate_unit * dt)
+        for e, n, d in zip(turn, tangent.now, polhode.inverse_moments, strict=True)
+    )
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def with_results_derivative(requested: tuple[bool, bool, bool], motion: EvaluatedMotion, arguments):
+    """The results of an evaluated motion, with their derivative by ``arguments``."""
+    return motion.results
+
+
+def results_rule(requested, primals, tangents):
+    motion, arguments = primals
+    results = with_results_derivative(requested, motion, arguments)
+    return results, results_tangent(requested, motion, arguments, tangents[1], results)
+
+
+with_results_derivative.defjvp(results_rule, symbolic_zeros=True)
+
+
+def results_tangent(requested, motion: EvaluatedMotion, arguments, tangents, results):
+    """Variations of rates and attitude."""
+    dm, dp, dw, dq, dt = (dense_or_none(d, x) for d, x in zip(tangents, arguments, strict=True))
+    start, to_body = arguments[3], tuple
+    if arguments[1] is not None:
+        arguments, dm, dp, dw, to_body = along_turning_axes(arguments, dm, dp, dw)
+    tangent = _tangent(requested[2], requested[0], motion, arguments, dm, dp, dw)
+    polhode, frame, (n1, n2, n3) = tangent.polhode, tangent.frame, tangent.now
+    at_rest = polhode.rate_unit == 0
+    d_rates_at_rest, d_attitude_at_rest = variation_at_rest(at_rest, arguments, dw, dt)
+    d_omega = d_wxyz = None
+    if requested[1]:
+        total = tangent.momentum
+        if dt is not None:
+            d_time = polhode.sense * polhode.parity * polhode.rate_unit * dt
+            total = (
+                total[0] - polhode.r * n2 * n3 * d_time,
+                total[1] + polhode.s * n1 * n3 * d_time,
+                total[2] - polhode.p * n1 * n2 * d_time,
+            )
+        d_rates = tuple(
+            polhode.rate_unit * (d * x + e)
+            for d, x, e in zip(
+                polhode.inverse_moments,
+                total,
+                apply_variation(tangent.variation, tangent.now),
+                strict=True,
+            )
+        )
+        d_omega = to_body(
+            tuple(
+                jnp.where(at_rest, h, x)
+                for h, x in zip(d_rates_at_rest, frame.to_body(d_rates), strict=True)
+            )
+        )
+    if requested[0]:
+        turn = _turn_in_time(tangent, dt)
+        turn = to_body(
+            tuple(
+                jnp.where(at_rest, h, e)
+                for h, e in zip(d_attitude_at_rest, frame.to_body(turn), strict=True)
+            )
+        )
+        d_wxyz = quaternion_product(results[1], (jnp.zeros_like(n1), *(x / 2 for x in turn)))
+        if dq is not None:
+            d_wxyz = _start_tangent(start, dq, results[1], d_wxyz)
+    return d_omega, d_wxyz
+
+
+def _start_tangent(start: Quadruple, variation: Quadruple, now: Quadruple, other: Quadruple):
+    """Adds the answer to the initial attitude, which is normalised before use."""
+    inverse_square = 1 / dot(start, start)
+    along = dot(start, variation)
+    unit = tuple(
+        (d - along * inverse_square * q) * inverse_square
+        for d, q in zip(variation, start, strict=True)
+    )
+    left = quaternion_product(unit, (start[0], -start[1], -start[2], -start[3]))
+    return tuple(a + b for a, b in zip(other, quaternion_product(left, now), strict=True))

@@ -1,0 +1,610 @@
+"""The exact free motion: its constants, and the state at a time; (n) are formulas of
+docs/free_motion.md.
+
+Three stages: ``assign_roles`` orders and scales the axes; ``polhode_constants`` and
+``precession_constants`` prepare what depends on the body and its initial state alone; ``advance``
+evaluates the motion at a time. ``staged`` keeps XLA from repeating earlier arithmetic in every
+kernel that uses it."""
+
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from polhode._closed_forms._arithmetic import (
+    Pair,
+    arctangent,
+    binade,
+    cosine_sine,
+    horner,
+    multiply_pairs,
+    product_of,
+    scale_pair,
+    sign_of_parity,
+    sine_half,
+    sinh,
+    subtract_pairs,
+    sum_of,
+    whole_and_fraction,
+)
+from polhode._closed_forms._elliptic import nome_per_parameter
+from polhode._hamiltonian import triple
+from polhode._kernels import opaque_ones, staged
+
+Scalars = Float[Array, "*b"]
+Triple = tuple[Scalars, Scalars, Scalars]
+
+
+def as_components(values, count: int) -> tuple[Scalars, ...]:
+    """A tuple of component arrays, from one or from an array with the components last."""
+    if isinstance(values, tuple | list):
+        return tuple(values)
+    return tuple(values[..., k] for k in range(count))
+
+
+class Roles(NamedTuple):
+    """One body, its axes renumbered: the momentum circles axis 3, axis 2 is the intermediate one.
+
+    Rates are divided by a power of two near the largest, moments by one that leaves the largest
+    momentum near one, so that no product of momenta leaves the range of the dtype; time is to be
+    multiplied by ``rate_unit``, which is zero for a body at rest (its direction is then a dummy).
+    """
+
+    moments: Triple
+    rates: Triple
+    rate_unit: Scalars  # the power of two that divides the rates
+    moment_unit: Scalars  # the power of two that divides the moments
+    gap: Scalars  # |I3 w3^2 (I3 - I2) - I1 w1^2 (I2 - I1)|, the distance from the separatrix
+    sense: Scalars  # +1 when axis 3 has the largest moment, -1 when the smallest
+    parity: Scalars  # +1 when axes 1, 2, 3 are a right-handed system
+    axis_2: Scalars  # where axis 2 stands among x, y, z: 0, 1 or 2
+    axis_3: Scalars  # where axis 3 stands
+    one: Scalars
+
+
+def component_at(values: Triple, index) -> Scalars:
+    """The value that stands at an index 0, 1 or 2."""
+    return jnp.where(index == 0, values[0], jnp.where(index == 1, values[1], values[2]))
+
+
+def _extremes(x: Scalars, y: Scalars, z: Scalars) -> tuple[Int[Array, "*b"], Int[Array, "*b"]]:
+    """Where the smallest and the largest of three values stand; never the same place."""
+    low = jnp.where(y < x, jnp.where(z < y, 2, 1), jnp.where(z < x, 2, 0))
+    high = jnp.where(y >= x, jnp.where(z >= y, 2, 1), jnp.where(z >= x, 2, 0))
+    return low, high
+
+
+def _energy_term(moment: Scalars, rate: Scalars, larger: Scalars, smaller: Scalars) -> Pair:
+    """moment * rate^2 * (larger - smaller), with its rounding error."""
+    return multiply_pairs(scale_pair(product_of(rate, rate), moment), sum_of(larger, -smaller))
+
+
+def assign_roles(moments: Triple, rates: Triple) -> Roles:
+    """Sort the axes, choose the one that the momentum circles, scale by powers of two."""
+    largest = jnp.maximum(jnp.maximum(jnp.abs(rates[0]), jnp.abs(rates[1])), jnp.abs(rates[2]))
+    rate_unit = binade(largest)
+    moment_unit = binade(jnp.maximum(jnp.maximum(moments[0], moments[1]), moments[2]))
+    one = opaque_ones(moments[0])
+    # The momentum of a sphere circles no axis: the one that it is nearest to, so that it is not
+    # across it.
+    sphere = (moments[0] == moments[1]) & (moments[1] == moments[2])
+    order = tuple(jnp.where(sphere, jnp.abs(w), i) for w, i in zip(rates, moments, strict=True))
+    k_low, k_high = _extremes(*order)
+    k_mid = 3 - k_low - k_high
+    low, mid, high = (component_at(moments, k) / moment_unit for k in (k_low, k_mid, k_high))
+    w_low, w_mid, w_high = (component_at(rates, k) / rate_unit for k in (k_low, k_mid, k_high))
+    at_rest = largest == 0
+    w_high = jnp.where(at_rest, 1, w_high)
+    momentum_unit = binade(
+        jnp.maximum(jnp.maximum(jnp.abs(low * w_low), jnp.abs(mid * w_mid)), jnp.abs(high * w_high))
+    )
+    moment_unit = moment_unit * momentum_unit
+    low, mid, high = low / momentum_unit, mid / momentum_unit, high / momentum_unit
+    # Exact next to the separatrix, where the two terms cancel and all depends on the difference.
+    gap = subtract_pairs(
+        _energy_term(high, w_high, high, mid), _energy_term(low, w_low, mid, low)
+    ).value
+    gap = staged(gap, one)
+    # A tie is the separatrix, or a spin about an axis across that of a symmetric body: there the
+    # circled axis must be one of the two equal ones.
+    larger = (gap > 0) | ((gap == 0) & (high - mid <= mid - low))
+    sense = staged(jnp.where(larger, 1, -1).astype(low.dtype), one)
+    larger = sense > 0
+    k1, k3 = jnp.where(larger, k_low, k_high), jnp.where(larger, k_high, k_low)
+    right_handed = (k_mid - k1 == 1) | (k_mid - k1 == -2)
+    return Roles(
+        staged((jnp.where(larger, low, high), mid, jnp.where(larger, high, low)), one),
+        staged((jnp.where(larger, w_low, w_high), w_mid, jnp.where(larger, w_high, w_low)), one),
+        staged(jnp.where(at_rest, 0, rate_unit), one),
+        staged(moment_unit, one),
+        jnp.abs(gap),
+        sense,
+        staged(jnp.where(right_handed, 1, -1).astype(low.dtype), one),
+        staged(k_mid.astype(low.dtype), one),
+        staged(k3.astype(low.dtype), one),
+        one,
+    )
+
+
+def restore(values: Triple, axis_2: Scalars, axis_3: Scalars) -> Triple:
+    """Values along axes 1, 2, 3 put back along x, y, z."""
+    first, second, third = values
+    return triple(
+        jnp.where(axis_3 == k, third, jnp.where(axis_2 == k, second, first)) for k in range(3)
+    )
+
+
+# Beyond this parameter m the series in the nome are replaced by those in the complementary nome;
+# on either side three terms (five in the half nome of the attitude) reach the last bit of a double.
+_CIRCULAR_BELOW = 0.8
+_STEPS = 5
+
+
+class Polhode(NamedTuple):
+    """Constants of the momentum's motion in the body (axes in their roles, scaled units)."""
+
+    momentum: Triple
+    inverse_moments: Triple
+    moments: Triple
+    p: Scalars  # |1/I1 - 1/I2|
+    r: Scalars  # |1/I2 - 1/I3|
+    s: Scalars  # |1/I1 - 1/I3|
+    A: Scalars  # |2E - L^2/I3|
+    B: Scalars  # |L^2/I1 - 2E|
+    m: Scalars
+    m1: Scalars
+    circular: Bool[Array, "*b"]  # series in sines (else hyperbolic, near the separatrix)
+    on_separatrix: Bool[Array, "*b"]  # infinite period
+    permanent: Bool[Array, "*b"]  # permanent rotation about a principal axis
+    nome: Scalars
+    agm: Scalars  # the arithmetic-geometric mean, for the second kind
+    log_nome: Scalars  # minus the logarithm of the nome
+    rate: Scalars  # of the argument of the series, scaled time
+    inverse_rate: Scalars
+    half_turn_rate: Scalars  # half turns of that argument per unit of time
+    half_log_nome: Scalars  # half of the hyperbolic argument per half turn
+    sense: Scalars
+    parity: Scalars
+    rate_unit: Scalars
+    moment_unit: Scalars
+    axis_2: Scalars
+    axis_3: Scalars
+    one: Scalars
+    half_turn_rate_low: Scalars | None = None  # rounding error of the rate, where compensated
+
+
+class Precession(NamedTuple):
+    """Constants of the angle about the momentum, and of the attitude."""
+
+    half_turn_rate: Scalars  # mean rate of half of the angle, in half turns per unit of time
+    beta: Scalars  # 2 sigma beta / pi of (11)
+    theta_real: tuple[Scalars, ...]  # the theta series of half of the angle, by powers
+    theta_imaginary: tuple[Scalars, ...]
+    length: Scalars  # |L|
+    L3_max: Scalars  # largest L3
+    addition_coefficient: Scalars  # sigma p a^2 / (|L| (|L| + c) c) of (12)
+    start: tuple[Scalars, Scalars, Scalars, Scalars]  # initial attitude, less its tilt
+    half_turn_rate_low: Scalars | None = None
+
+
+class FreeConstants(NamedTuple):
+    """Per-body constants of the exact free motion; every field has the shape of the batch.
+
+    ``moments``, ``products``, ``omega`` and ``wxyz`` are the input, through which alone
+    derivatives flow; ``polhode`` and ``precession`` are computed from them.
+    """
+
+    moments: Triple
+    products: Triple
+    omega: Triple
+    wxyz: tuple[Scalars, ...] | None
+    polhode: Polhode
+    precession: Precession | None
+
+
+def _limits(dtype) -> tuple[float, float]:
+    """Smallest complementary parameter and ratio of differences that count as non-zero."""
+    bits = {4: 110, 8: 900}[jnp.dtype(dtype).itemsize]
+    return 2.0**-bits, 2.0 ** -(bits // 2)
+
+
+def agm_and_nome(circular, on_separatrix, x: Scalars, m: Scalars, m1: Scalars, one: Scalars):
+    """Arithmetic-geometric mean, nome, minus its logarithm, and the rate of the argument v."""
+    square = jnp.where(circular, m, m1)
+    other = jnp.sqrt(jnp.where(circular, m1, m))
+    omega = jnp.sqrt(x)
+    a, b = 1.0, other
+    for _ in range(_STEPS - 1):
+        a, b = (a + b) / 2, jnp.sqrt(a * b)
+    agm = (a + b) / 2
+    nome = square * nome_per_parameter(square, jnp.sqrt(other))
+    agm, nome = staged((agm, nome), one)
+    log_nome = jnp.where(
+        circular | on_separatrix, 1, -jnp.log(jnp.where(circular | on_separatrix, 0.5, nome))
+    )
+    return agm, nome, log_nome, staged(omega * agm, one)
+
+
+def polhode_constants(roles: Roles) -> Polhode:
+    """(1), (3), (5): parameter, periods and amplitudes of the momentum in the body."""
+    i1, i2, i3 = roles.moments
+    one = roles.one
+    w1, w2, w3 = roles.rates
+    floor, _ = _limits(i1.dtype)
+    d1, d2, d3 = 1 / i1, 1 / i2, 1 / i3
+    l1, l2, l3 = i1 * w1, i2 * w2, i3 * w3
+    d12, d23, d13 = jnp.abs(i2 - i1), jnp.abs(i3 - i2), jnp.abs(i3 - i1)
+    p, r, s = d12 * d1 * d2, d23 * d2 * d3, d13 * d1 * d3
+    A = (l1 * w1 * d13 + l2 * w2 * d23) * d3
+    B = (l2 * w2 * d12 + l3 * w3 * d13) * d1
+    A, B = staged((A, B), one)
+    x = B * r
+    moving = x > 0
+    divisor = jnp.where(moving, x, 1)
+    m = jnp.where(moving, A * p / divisor, 0)
+    m1 = jnp.where(moving, s * roles.gap * d2 / divisor, 1)
+    circular = m1 > 1 - _CIRCULAR_BELOW
+    on_separatrix = moving & (m1 < floor)
+    permanent = (jnp.abs(l1) + jnp.minimum(jnp.abs(l2), jnp.abs(l3))) == 0
+    agm, nome, log_nome, rate = agm_and_nome(circular, on_separatrix, x, m, m1, one)
+    half_turn_rate = rate / jnp.where(circular, math.pi, log_nome) * roles.rate_unit
+    inverse_rate = jnp.where(moving, 1 / jnp.where(moving, rate, 1), 0)
+    half_turn_rate = staged(half_turn_rate, one)
+    return Polhode(
+        momentum=(l1, l2, l3),
+        inverse_moments=(d1, d2, d3),
+        moments=roles.moments,
+        p=p,
+        r=r,
+        s=s,
+        A=A,
+        B=B,
+        m=m,
+        m1=m1,
+        circular=circular,
+        on_separatrix=on_separatrix,
+        permanent=permanent,
+        nome=jnp.where(on_separatrix, 0, nome),
+        agm=agm,
+        log_nome=log_nome,
+        rate=rate,
+        inverse_rate=inverse_rate,
+        half_turn_rate=half_turn_rate,
+        half_log_nome=log_nome / 2,
+        sense=roles.sense,
+        parity=roles.parity,
+        rate_unit=roles.rate_unit,
+        moment_unit=roles.moment_unit,
+        axis_2=roles.axis_2,
+        axis_3=roles.axis_3,
+        one=one,
+    )
+
+
+def descend(polhode: Polhode, length: Scalars) -> Scalars:
+    """(9): sinh of the imaginary shift b (circular) or tan of twice the angle beta (hyperbolic).
+
+    Gauss's transformation, every step a sum of positive terms.
+    """
+    other = jnp.sqrt(jnp.where(polhode.circular, polhode.m1, polhode.m))
+    _, least = _limits(other.dtype)
+    aspherical = polhode.r > 0
+    p = jnp.maximum(polhode.p, polhode.r * least)
+    start = jnp.where(aspherical, jnp.sqrt(polhode.r / jnp.where(aspherical, p, 1)), 0)
+    has_B = polhode.B > 0
+    ratio = jnp.where(polhode.circular, polhode.s, polhode.p) / jnp.where(has_B, polhode.B, 1)
+    d = jnp.where(has_B, length * jnp.sqrt(ratio), 1)
+    a, b = jnp.ones_like(other), other
+    numerator, denominator = start, jnp.ones_like(other)
+    for _ in range(_STEPS):
+        mean = (a + b) / 2
+        next_d = jnp.sqrt(a * mean * ((b + d) / (a + d)))
+        numerator = numerator * jnp.where(polhode.circular, 2 * mean, next_d)
+        denominator = denominator * jnp.where(polhode.circular, a + d, a)
+        a, b, d = mean, jnp.sqrt(a * b), next_d
+    return numerator / denominator
+
+
+def _circular_series(polhode: Polhode, shift: Scalars):
+    """(10): theta_4(v + i b | q^2) in powers of sin(v)^2, and the slope of its argument at 0."""
+    q = polhode.nome * polhode.nome
+    q2 = q * q
+    even = q * (1 + 2 * shift * shift)  # q cosh 2b
+    odd = 2 * (q * shift) * jnp.sqrt(1 + shift * shift)  # q sinh 2b
+    even, odd = staged((even, odd), polhode.one)
+    c2, s2 = q2 * (2 * even * even - q2), 2 * q2 * even * odd
+    c3 = q2 * q2 * q2 * even * (4 * even * even - 3 * q2)
+    s3 = q2 * q2 * q2 * odd * (4 * odd * odd + 3 * q2)
+    theta_real = (
+        1 - 2 * even + 2 * c2 - 2 * c3,
+        4 * even - 16 * c2 + 36 * c3,
+        16 * c2 - 96 * c3,
+        64 * c3,
+        jnp.zeros_like(q),
+    )
+    theta_imaginary = (
+        2 * odd - 4 * s2 + 6 * s3,
+        8 * s2 - 32 * s3,
+        32 * s3,
+        jnp.zeros_like(q),
+        jnp.zeros_like(q),
+    )
+    return theta_real, theta_imaginary, 2 * theta_imaginary[0] / theta_real[0]
+
+
+def _hyperbolic_series(polhode: Polhode, tangent: Scalars):
+    """(11): theta_2(beta - i w/2 | sqrt q') in powers of sinh(w/2)^2, derivative, beta."""
+    half = jnp.sqrt(polhode.nome)
+    double_cosine = 1 / jnp.sqrt(1 + tangent * tangent)
+    double_sine = tangent * double_cosine
+    cosine = jnp.sqrt((1 + double_cosine) / 2)
+    sine = double_sine / (2 * cosine)
+    double_sine = 2 * sine * cosine
+    angle = arctangent(double_sine / (1 + double_cosine))
+    cosines, sines = (
+        [cosine, cosine * (2 * double_cosine - 1)],
+        [
+            sine,
+            sine * (2 * double_cosine + 1),
+        ],
+    )
+    for _ in range(3):
+        cosines.append(2 * double_cosine * cosines[-1] - cosines[-2])
+        sines.append(2 * double_cosine * sines[-1] - sines[-2])
+    h2 = half * half
+    h6 = h2 * h2 * h2
+    weights = (jnp.ones_like(half), h2, h6, h6 * h6, h6 * h6 * h6 * h2)
+    c = [x * y for x, y in zip(weights, cosines, strict=True)]
+    s = [x * y for x, y in zip(weights, sines, strict=True)]
+    theta_real = (
+        c[0] + c[1] + c[2] + c[3] + c[4],
+        4 * c[1] + 12 * c[2] + 24 * c[3] + 40 * c[4],
+        16 * c[2] + 80 * c[3] + 240 * c[4],
+        64 * c[3] + 448 * c[4],
+        256 * c[4],
+    )
+    theta_imaginary = (
+        s[0] + 3 * s[1] + 5 * s[2] + 7 * s[3] + 9 * s[4],
+        4 * s[1] + 20 * s[2] + 56 * s[3] + 120 * s[4],
+        16 * s[2] + 112 * s[3] + 432 * s[4],
+        64 * s[3] + 576 * s[4],
+        256 * s[4],
+    )
+    return theta_real, theta_imaginary, theta_imaginary[0] / (2 * theta_real[0]), angle
+
+
+def precession_constants(polhode: Polhode, wxyz: tuple[Scalars, ...]) -> Precession:
+    """(10)-(12): mean rate of the angle about L, its theta series, and the untilted start."""
+    l1, l2, l3 = polhode.momentum
+    d1, _, d3 = polhode.inverse_moments
+    length = jnp.sqrt(l1 * l1 + l2 * l2 + l3 * l3)
+    aspherical = polhode.s > 0
+    divisor = jnp.where(aspherical, polhode.s, 1)
+    L3_max = jnp.where(aspherical, jnp.sqrt(polhode.B / divisor), jnp.abs(l3))
+    L1_max_squared = jnp.where(aspherical, polhode.A / divisor, l1 * l1 + l2 * l2)  # largest L1^2
+    shift = descend(polhode, length)
+    circular = polhode.circular
+    real_c, imaginary_c, slope_circular = _circular_series(polhode, shift)
+    real_h, imaginary_h, slope_hyperbolic, shift_angle = _hyperbolic_series(polhode, shift)
+    theta_real = tuple(jnp.where(circular, x, y) for x, y in zip(real_c, real_h, strict=True))
+    theta_imaginary = tuple(
+        polhode.sense * jnp.where(circular, x, y)
+        for x, y in zip(imaginary_c, imaginary_h, strict=True)
+    )
+    theta_real, theta_imaginary = staged((theta_real, theta_imaginary), polhode.one)
+    # (8) at the start of the reference motion, where the momentum is (sqrt(A/s), 0, L3_max).
+    start_rate = (d3 * L3_max + d1 * L1_max_squared / (length + L3_max)) / 2
+    slope = jnp.where(circular, slope_circular, slope_hyperbolic)
+    no_shift = circular | polhode.on_separatrix
+    beta = jnp.where(no_shift, 0, polhode.sense * 2 * shift_angle)
+    beta, slope = staged((beta, slope), polhode.one)
+    half_rate = start_rate + polhode.rate * (polhode.sense * slope - beta / polhode.log_nome)
+    # The minimal rotation carrying L to axis 3 is (|L| + |L3|, L x n3); the start undoes it.
+    side = polhode.parity * jnp.copysign(1, l3)
+    tilt = restore((side * l2, -side * l1, jnp.zeros_like(l3)), polhode.axis_2, polhode.axis_3)
+    w = length + jnp.abs(l3)
+    q0, q1, q2, q3 = wxyz
+    t1, t2, t3 = tilt
+    scale = 1 / jnp.sqrt((q0 * q0 + q1 * q1 + q2 * q2 + q3 * q3) * (w * w + l1 * l1 + l2 * l2))
+    tilt, w, scale = staged(((t1, t2, t3), w, scale), polhode.one)
+    t1, t2, t3 = tilt
+    start = (
+        (q0 * w + q1 * t1 + q2 * t2 + q3 * t3) * scale,
+        (q1 * w - q0 * t1 - q2 * t3 + q3 * t2) * scale,
+        (q2 * w - q0 * t2 - q3 * t1 + q1 * t3) * scale,
+        (q3 * w - q0 * t3 - q1 * t2 + q2 * t1) * scale,
+    )
+    addition_coefficient = (
+        polhode.sense
+        * polhode.p
+        * (L1_max_squared / (length * (length + L3_max)))
+        / jnp.where(L3_max > 0, L3_max, 1)
+    )
+    return Precession(
+        half_rate * polhode.rate_unit / math.pi,
+        beta / math.pi,
+        theta_real,
+        theta_imaginary,
+        length,
+        L3_max,
+        addition_coefficient,
+        start,
+    )
+
+
+def _phase(motion: Polhode | Precession, t: Scalars) -> tuple[Scalars, Scalars]:
+    half_turns, fraction = whole_and_fraction(motion.half_turn_rate, t)
+    return (
+        half_turns,
+        fraction if motion.half_turn_rate_low is None else fraction + motion.half_turn_rate_low * t,
+    )
+
+
+def half_turns_at(polhode: Polhode, t: Scalars) -> tuple[Scalars, Scalars]:
+    """Half turns of the theta functions' argument: a whole number and the remainder."""
+    half_turns, fraction = _phase(polhode, t)
+    # Farther out the momentum has reached the middle axis and nothing but overflow would follow.
+    limit = math.log(2) * {4: 55, 8: 450}[fraction.dtype.itemsize]
+    fraction = jnp.where(
+        polhode.on_separatrix, jnp.clip(polhode.half_turn_rate * t, -limit, limit), fraction
+    )
+    half_turns = jnp.where(polhode.on_separatrix, 0, half_turns)
+    return half_turns, fraction
+
+
+def jacobi(polhode: Polhode, fraction: Scalars, stage):
+    """(7): sn / omega_p, cn, dn of the time since the last half turn, and the base sine."""
+    half = stage(
+        jnp.where(polhode.circular, sine_half(fraction), sinh(polhode.half_log_nome * fraction))
+    )
+    sign = jnp.where(polhode.circular, 1.0, -1.0).astype(half.dtype)
+    base = sign * half * half
+    cosine = 1 - 2 * base
+    other = jnp.sqrt(1 - base)
+    sine = 2 * half * other
+    z = sign * sine * sine
+    h = polhode.nome
+    h2 = h * h
+    h4 = h2 * h2
+    h6, h8 = h4 * h2, h4 * h4
+    h9, h12 = h8 * h, h6 * h6
+    n1 = 1 - 3 * h2 + 5 * h6 - 7 * h12
+    n2 = 1 + h2 + h6 + h12
+    n3 = 1 + 2 * h + 2 * h4 + 2 * h9
+    n4 = 1 - 2 * h + 2 * h4 - 2 * h9
+    p1 = horner((n1, 4 * h2 - 20 * h6 + 56 * h12, 16 * h6 - 112 * h12, 64 * h12), z) / n1
+    p2 = horner((n2, -4 * h2 - 12 * h6 - 24 * h12, 16 * h6 + 80 * h12, -64 * h12), z) / n2
+    p3 = horner((n3, -4 * h - 16 * h4 - 36 * h9, 16 * h4 + 96 * h9, -64 * h9), z) / n3
+    p4 = horner((n4, 4 * h - 16 * h4 + 36 * h9, 16 * h4 - 96 * h9, 64 * h9), z) / n4
+    cosine_p2 = cosine * p2
+    denominator = 1 / jnp.where(polhode.circular, p4, cosine_p2)
+    sn = sine * p1 * denominator * polhode.inverse_rate
+    cn = jnp.where(polhode.circular, cosine_p2, p4) * denominator
+    dn = p3 * denominator
+    return half, (sn, cn, dn)
+
+
+def momentum_of(polhode: Polhode, functions: Triple) -> Triple:
+    """(6): L along axes 1, 2, 3 from its initial value, by the addition theorems."""
+    S, C, N = functions
+    l1, l2, l3 = polhode.momentum
+    k = polhode.sense * polhode.parity
+    denominator = 1 / (C * C + polhode.r * polhode.s * (l3 * l3) * (S * S))
+    return (
+        (l1 * C - k * (polhode.r * l2 * l3) * S * N) * denominator,
+        (l2 * C * N + k * (polhode.s * l1 * l3) * S) * denominator,
+        (l3 * N - k * (polhode.p * l1 * l2) * S * C) * denominator,
+    )
+
+
+def momentum(polhode: Polhode, functions: Triple) -> Triple:
+    """The same; a permanent rotation about a principal axis keeps its rates to the last bit."""
+    now = momentum_of(polhode, functions)
+    return triple(
+        jnp.where(polhode.permanent, l, x) for l, x in zip(polhode.momentum, now, strict=True)
+    )
+
+
+class Instant(NamedTuple):
+    """The motion at one time, axes in their roles, scaled units."""
+
+    half_turns: Scalars  # half turns of the theta functions' argument
+    reduced: Triple  # S, C, N less their half turns
+    functions: Triple  # S = sn / omega_p, C = cn, N = dn
+    momentum: Triple
+    half: tuple[Scalars, Scalars] | None  # cosine and sine of half the angle about L, over |M|
+
+    @property
+    def precession_half_angle(self) -> tuple[Scalars, Scalars]:
+        """``half``; ValueError where ``advance`` had no ``Precession``."""
+        if self.half is None:
+            raise ValueError("the motion was evaluated for its rates alone: pass a Precession.")
+        return self.half
+
+
+def half_angle(
+    polhode: Polhode, precession: Precession, t: Scalars, fraction, half, N, factors: Triple, stage
+):
+    """(10)-(12): cosine and sine of half of the angle about L, over the length of the tilt."""
+    S, l2, l3 = factors
+    half_turns, angle = _phase(precession, t)
+    angle = angle + precession.beta * fraction
+    whole_turns = jnp.round(angle)
+    cosine, sine = cosine_sine(angle - whole_turns)
+    sign = sign_of_parity(half_turns + whole_turns)
+    cosine, sine = stage((sign * cosine, sign * sine))
+    square = half * half
+    other = jnp.sqrt(1 + jnp.where(polhode.circular, -square, square))
+    double = 2 * half * other
+    z = jnp.where(polhode.circular, double * double, square)
+    theta_real = horner(precession.theta_real, z) * jnp.where(polhode.circular, 1, other)
+    theta_imaginary = horner(precession.theta_imaginary, z) * jnp.where(
+        polhode.circular, 2 * double * (1 - 2 * square), half
+    )
+    theta_real, theta_imaginary = stage((theta_real, theta_imaginary))
+    mu = precession.L3_max / precession.length
+    y, w = jnp.abs(polhode.momentum[2]) / precession.L3_max, jnp.abs(l3) / precession.L3_max
+    # (12): the series hold for the motion that starts where L3 is largest.
+    a = mu * (1 + N) * (1 + y) * (1 + w) + (1 - mu) * (1 + N + y + w)
+    b = precession.addition_coefficient * S * polhode.momentum[1] * l2
+    # (cosine + i sine) (real - i imaginary) (a + i b)
+    f, g = theta_real * a + theta_imaginary * b, theta_real * b - theta_imaginary * a
+    return cosine * f - sine * g, cosine * g + sine * f
+
+
+def advance(
+    polhode: Polhode, precession: Precession | None, t: Scalars, one: Scalars | None, fine=False
+):
+    """The ``Instant`` of time t; with ``one``, of the shape of t, in stages (see ``staged``).
+
+    ``fine``: in more stages, for results that many kernels need.
+    """
+    # One kernel per output repeats the arithmetic of all stages, which costs less than to write
+    # and read them when every lane has many times, and more when it has one.
+    stage = (lambda x: x) if one is None else (lambda x: staged(x, one))
+    extra_stage = stage if fine else (lambda x: x)
+    half_turns, fraction = extra_stage(half_turns_at(polhode, t))
+    half, reduced = jacobi(polhode, fraction, stage)
+    reduced = extra_stage(reduced)
+    sign = sign_of_parity(half_turns)
+    S, C, N = stage((sign * reduced[0], sign * reduced[1], reduced[2]))
+    l1, l2, l3 = now = stage(momentum(polhode, (S, C, N)))
+    if precession is None:
+        return Instant(half_turns, reduced, (S, C, N), now, None)
+    c, s = half_angle(polhode, precession, t, fraction, half, N, (S, l2, l3), stage)
+    height = precession.length + jnp.abs(l3)
+    scale = jax.lax.rsqrt((c * c + s * s) * (height * height + l1 * l1 + l2 * l2))
+    return Instant(half_turns, reduced, (S, C, N), now, stage((c * scale, s * scale)))
+
+
+def body_rates(polhode: Polhode, at: Instant) -> Triple:
+    """Body rates along x, y, z."""
+    spin = tuple(
+        polhode.rate_unit * (l * d)
+        for l, d in zip(at.momentum, polhode.inverse_moments, strict=True)
+    )
+    return restore(spin, polhode.axis_2, polhode.axis_3)
+
+
+def attitude_at(polhode: Polhode, precession: Precession, at: Instant) -> tuple[Scalars, ...]:
+    """Attitude: the start, the turn about axis 3, and the minimal rotation carrying L to it."""
+    l1, l2, l3 = at.momentum
+    c, s = at.precession_half_angle
+    height = precession.length + jnp.abs(l3)
+    facing = jnp.copysign(1, polhode.momentum[2])
+    side = polhode.parity * facing
+    v0 = c * height
+    v1, v2, v3 = restore(
+        (s * l1 + side * c * l2, s * l2 - side * c * l1, facing * s * height),
+        polhode.axis_2,
+        polhode.axis_3,
+    )
+    q0, q1, q2, q3 = precession.start
+    return (
+        q0 * v0 - q1 * v1 - q2 * v2 - q3 * v3,
+        q0 * v1 + q1 * v0 + q2 * v3 - q3 * v2,
+        q0 * v2 + q2 * v0 + q3 * v1 - q1 * v3,
+        q0 * v3 + q3 * v0 + q1 * v2 - q2 * v1,
+    )

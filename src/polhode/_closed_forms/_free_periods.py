@@ -1,0 +1,406 @@
+"""Frequencies and periods of the free motion; (13) of docs/free_motion.md.
+
+``compensate`` computes the two frequencies in unevaluated sums of two floats: over a long horizon
+the error of the exact motion is that of its phases, one unit in the last place of the frequencies
+times the time. With axis 3 the one that the momentum circles, p = |1/I1 - 1/I2|,
+r = |1/I2 - 1/I3|, s = p + r, the momentum's half period is 2 K(m) / omega_p, and the mean rate of
+the Euler angle about L is |L| (1/I3 +- s Pi(-p/r, m) / K(m)). Pi/K by DLMF 19.8.6.
+
+``periods`` are those of the long axis, in the convention of Samarasinha and A'Hearn."""
+
+import enum
+import functools
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from polhode import rotation
+from polhode._batch import common_batch
+from polhode._checks import describe, is_concrete, require
+from polhode._closed_forms._arithmetic import (
+    Pair,
+    add_pairs,
+    divide_pairs,
+    multiply_pairs,
+    product_of,
+    root_of,
+    scale_pair,
+    subtract_pairs,
+    sum_of,
+)
+from polhode._closed_forms._free_derivatives import (
+    along_turning_axes,
+    dense_or_none,
+    start_variation,
+)
+from polhode._closed_forms._free_motion import (
+    Polhode,
+    Precession,
+    Roles,
+    as_components,
+    assign_roles,
+    descend,
+    polhode_constants,
+    precession_constants,
+)
+from polhode._closed_forms._free_tangent import (
+    Frame,
+    apply_variation,
+    complete,
+    dot,
+    invariants_variation,
+)
+from polhode._kernels import are_close, staged, underivable
+from polhode._scene import State
+from polhode.inertia import Inertia, principal
+
+Scalars = Float[Array, "*b"]
+
+# Enough for 1 - m down to 1e-20 and moments that differ by a millionth: then one more bit each.
+_AGM_STEPS = 8
+_INVERSE_PI = {
+    4: (0.31830987334251404, 1.2841276633452237e-08),
+    8: (0.3183098861837907, -1.9678676675182486e-17),
+}
+
+
+def _where(condition, x: Pair, y: Pair) -> Pair:
+    return Pair(*(jnp.where(condition, a, b) for a, b in zip(x, y, strict=True)))
+
+
+def _absolute(x: Pair) -> Pair:
+    sign = jnp.where(x.high < 0, -1, 1).astype(x.high.dtype)
+    return Pair(sign * x.high, sign * x.low)
+
+
+def _halved(x: Pair) -> Pair:
+    return Pair(x.high / 2, x.low / 2)
+
+
+def _means(complement: Pair, pole: Pair) -> tuple[Pair, Pair, Scalars]:
+    """agm(1, complement), the sum of Q (DLMF 19.8.6; ``pole``: root of 1 - n), the last step."""
+    one = Pair(jnp.ones_like(pole.high), jnp.zeros_like(pole.high))
+
+    def step(_, state):
+        a, b, p, weight, pi_sum = state
+        product, square = multiply_pairs(a, b), multiply_pairs(p, p)
+        both = add_pairs(square, product)
+        weight = _halved(
+            multiply_pairs(weight, divide_pairs(subtract_pairs(square, product), both))
+        )
+        p = _halved(divide_pairs(both, p))
+        return _halved(add_pairs(a, b)), root_of(product), p, weight, add_pairs(pi_sum, weight)
+
+    # A loop and not an unrolled formula: it compiles in a tenth of the time.
+    a, b, _, weight, pi_sum = jax.lax.fori_loop(
+        0, _AGM_STEPS, step, (one, complement, pole, one, one)
+    )
+    return a, pi_sum, jnp.abs(weight.high) + jnp.abs(subtract_pairs(a, b).high)
+
+
+def compensated_rates(roles: Roles) -> tuple[Pair, Pair, Scalars]:
+    """Half-turn rates of ``Polhode`` and ``Precession`` per scaled time, and size of the last step.
+
+    Of the two characteristics -p/r and that of DLMF 19.7.9 the one near zero is taken: with the
+    latter Pi stands for the angle counted with the momentum's own turns in the body.
+    """
+    i1, i2, i3 = roles.moments
+    d12, d23, d13 = (_absolute(sum_of(a, -b)) for a, b in ((i2, i1), (i3, i2), (i3, i1)))
+    x1, x2, x3 = (
+        scale_pair(product_of(w, w), i) for w, i in zip(roles.rates, roles.moments, strict=True)
+    )
+    A = add_pairs(multiply_pairs(x2, d12), multiply_pairs(x3, d13))
+    B = add_pairs(multiply_pairs(x1, d13), multiply_pairs(x2, d23))
+    gap = _absolute(subtract_pairs(multiply_pairs(x3, d23), multiply_pairs(x1, d12)))
+    square = multiply_pairs(A, d23)
+    length2 = add_pairs(add_pairs(scale_pair(x1, i1), scale_pair(x2, i2)), scale_pair(x3, i3))
+    length = root_of(length2)
+    complement = root_of(divide_pairs(multiply_pairs(d13, gap), square))
+    n_small = divide_pairs(scale_pair(d13, i2), scale_pair(d23, i1))
+    n_large = divide_pairs(multiply_pairs(length2, d13), scale_pair(A, i3))
+    near_zero = n_small.high < n_large.high
+    pole = root_of(_where(near_zero, n_small, n_large))
+    mean, pi_sum, last_step = _means(complement, pole)
+    inverse_pi = Pair(*(jnp.full_like(i1, x) for x in _INVERSE_PI[i1.dtype.itemsize]))
+    volume = scale_pair(product_of(i1, i2), i3)
+    half_turn_rate = multiply_pairs(
+        multiply_pairs(root_of(divide_pairs(square, volume)), mean), inverse_pi
+    )
+    # |L|/I1 (1 -+ (I2 - I1) total / (2 I2)) less a turn per period, or |L|/I3 +- A total / (2 |L|).
+    parts = _where(near_zero, multiply_pairs(length, d12), divide_pairs(B, length))
+    pi_part = multiply_pairs(_halved(parts), pi_sum)
+    span = scale_pair(
+        _where(near_zero, product_of(i1, i2), Pair(i3, jnp.zeros_like(i3))), roles.sense
+    )
+    pi_part = divide_pairs(pi_part, span)
+    plain_rate = divide_pairs(length, Pair(jnp.where(near_zero, i1, i3), jnp.zeros_like(i1)))
+    pi_part = Pair(
+        jnp.where(near_zero, -pi_part.high, pi_part.high),
+        jnp.where(near_zero, -pi_part.low, pi_part.low),
+    )
+    angle = _halved(multiply_pairs(add_pairs(plain_rate, pi_part), inverse_pi))
+    own_turn = scale_pair(_halved(half_turn_rate), jnp.where(near_zero, -roles.sense, 0))
+    return half_turn_rate, add_pairs(angle, own_turn), last_step
+
+
+def compensate(
+    polhode: Polhode, precession: Precession | None, roles: Roles
+) -> tuple[Polhode, Precession | None]:
+    """Both motions with low parts of their paces, where the means have converged."""
+    # Staged: the two parts of a pair must come out of one and the same sum.
+    half_turn_rate, angle, last_step = staged(compensated_rates(roles), roles.one)
+    # Convergence is quadratic: what is left is the square of the last step.
+    converged = (last_step < jnp.finfo(last_step.dtype).eps / 64) & ~polhode.on_separatrix
+    high, low = _replaced(polhode.half_turn_rate, half_turn_rate, converged, roles.rate_unit)
+    polhode = polhode._replace(half_turn_rate=high, half_turn_rate_low=low)
+    if precession is not None:
+        high, low = _replaced(precession.half_turn_rate, angle, converged, roles.rate_unit)
+        precession = precession._replace(half_turn_rate=high, half_turn_rate_low=low)
+    return polhode, precession
+
+
+def _replaced(
+    plain: Scalars, compensated: Pair, converged, rate_unit: Scalars
+) -> tuple[Scalars, Scalars]:
+    """The pair that replaces a plain rate, unless it is NaN or disagrees with it."""
+    high, low = compensated.high * rate_unit, compensated.low * rate_unit
+    tolerance = {4: 2.0**-13, 8: 2.0**-30}[plain.dtype.itemsize]
+    converged = converged & (jnp.abs(high - plain) <= tolerance * jnp.abs(plain))
+    return jnp.where(converged, high, plain), jnp.where(converged, low, 0)
+
+
+class Mode(enum.IntEnum):
+    """How a free body tumbles; ``Periods.mode`` holds these numbers."""
+
+    LAM = 0  # long-axis mode: L circles the axis of the least moment
+    SAM = 1  # short-axis mode: L circles the axis of the greatest moment
+    SEPARATRIX = 2
+    PROLATE = 3  # two equal greater moments; the numbers are those of LAM
+    OBLATE = 4  # two equal lesser moments; the numbers are those of SAM
+    SPHERICAL = 5
+    AT_REST = 6
+
+
+class Periods(NamedTuple):
+    """Periods and nutation limits; every field has the shape of the batch."""
+
+    P_psi: Scalars
+    """Of the rotation about the long axis (LAM) or the oscillation about it (SAM)."""
+    P_phi: Scalars
+    """Mean, of the precession of the long axis about the angular momentum."""
+    mode: Int[Array, "*b"]
+    k2: Scalars
+    """Elliptic parameter, 0 for a symmetric body and 1 on the separatrix."""
+    theta_min: Scalars
+    """Least angle between long axis and momentum [rad]; in LAM that to the nearer of its ends."""
+    theta_max: Scalars
+
+
+def principal_periods(moments, omega, products=None) -> Periods:
+    """Periods of bodies of principal ``moments`` (..., 3) and body rates ``omega`` (..., 3).
+
+    Infinite where there is no such motion: P_psi on the separatrix, for a sphere and for a
+    symmetric body that spins across its axis, both for a body at rest (nutation limits: 0, pi).
+    ``products`` as in `prepare`. Formulas: Landau & Lifshitz, Mechanics, section 37, in the L
+    convention of Samarasinha & A'Hearn, Icarus 93 (1991).
+    """
+    moments, omega = as_components(moments, 3), as_components(omega, 3)
+    products = None if products is None else as_components(products, 3)
+    values, mode = _periods((moments, products, omega))
+    P_psi, P_phi, k2, low, high = values
+    return Periods(P_psi, P_phi, mode, k2, low, high)
+
+
+def _mean_precession(polhode: Polhode, precession, rate_unit: Scalars) -> Scalars:
+    """Mean rate about L of the long axis, scaled time."""
+    half_turns = math.pi * polhode.half_turn_rate / rate_unit
+    about_L = 2 * math.pi * precession.half_turn_rate / rate_unit
+    # The long axis takes one turn less per period than the minimal rotation; for needles that
+    # difference cancels, and the theta series of the axis itself is used instead.
+    shift = descend(polhode, precession.length)
+    growth = jnp.where(polhode.circular, shift + jnp.sqrt(1 + shift * shift), 1)
+    decay = 1 / (growth * growth)
+    q = polhode.nome
+    first, second = (q * growth) ** 2, (q * q * (q * growth * growth)) ** 2
+    above = decay - first * (1 + 2 * decay**3) + second * (2 + 3 * decay**5)
+    below = (1 - decay) - first * (1 - decay**3) + second * (1 - decay**5)
+    level = precession.length * polhode.inverse_moments[0]
+    series = level + polhode.rate * 2 * above / jnp.where(below > 0, below, 1)
+    long = jnp.where(polhode.circular & (below > 0), series, about_L - half_turns)
+    return jnp.where(polhode.sense < 0, long, about_L)
+
+
+def _limits(A, B, r, s, m1):
+    """Amplitudes of L1, L2, L3 and the least L3."""
+
+    def root(value):
+        return jnp.where(value > 0, jnp.sqrt(jnp.where(value > 0, value, 1)), 0)
+
+    aspherical_s = jnp.where(s > 0, s, 1)
+    first, third = root(A / aspherical_s), root(B / aspherical_s)
+    second = root(jnp.where(r > 0, A / jnp.where(r > 0, r, 1), A / aspherical_s))
+    return first, second, third, third * root(m1)
+
+
+def _angles(sense, A, B, r, s, m1):
+    first, second, third, L3_min = _limits(A, B, r, s, m1)
+    limit = jnp.arctan2(third, first)
+    low = jnp.where(sense < 0, jnp.arctan2(first, third), limit)
+    high = jnp.where(sense < 0, jnp.arctan2(second, L3_min), math.pi - limit)
+    return low, high
+
+
+def _values_and_constants(arguments):
+    moments, _, omega = arguments
+    roles = assign_roles(moments, omega)
+    polhode = polhode_constants(roles)
+    one = jnp.ones_like(moments[0])
+    precession = precession_constants(polhode, (one, 0 * one, 0 * one, 0 * one))
+    at_rest, is_sphere = polhode.rate_unit == 0, polhode.s == 0
+    rate_unit = jnp.where(at_rest, 1, polhode.rate_unit)
+    on_separatrix = (roles.gap == 0) & (polhode.B * polhode.r > 0)
+    level = (
+        jnp.where(on_separatrix, polhode.inverse_moments[1], polhode.inverse_moments[2])
+        * precession.length
+    )
+    permanent = on_separatrix | is_sphere | (polhode.half_turn_rate == 0)
+    about = (
+        jnp.where(permanent, level, _mean_precession(polhode, precession, rate_unit))
+        * polhode.rate_unit
+    )
+    turns = jnp.where(on_separatrix, 0, polhode.half_turn_rate)
+    P_psi = jnp.where(turns > 0, 2 / jnp.where(turns > 0, turns, 1), jnp.inf)
+    P_phi = jnp.where(about > 0, 2 * math.pi / jnp.where(about > 0, about, 1), jnp.inf)
+    low, high = _angles(polhode.sense, polhode.A, polhode.B, polhode.r, polhode.s, polhode.m1)
+    low, high = jnp.where(at_rest, 0, low), jnp.where(at_rest, math.pi, high)
+    mode = jnp.where(polhode.sense < 0, Mode.LAM, Mode.SAM)
+    mode = jnp.where(on_separatrix, Mode.SEPARATRIX, mode)
+    i1, i2, i3 = polhode.moments
+    long_pair = jnp.where(polhode.sense < 0, i1 == i2, i2 == i3)
+    short_pair = jnp.where(polhode.sense < 0, i2 == i3, i1 == i2)
+    mode = jnp.where(long_pair, Mode.PROLATE, jnp.where(short_pair, Mode.OBLATE, mode))
+    mode = jnp.where(is_sphere, Mode.SPHERICAL, mode)
+    mode = jnp.where(at_rest, Mode.AT_REST, mode).astype(jnp.int32)
+    return ((P_psi, P_phi, polhode.m, low, high), mode), (polhode, precession, permanent, about)
+
+
+@jax.custom_jvp
+def _periods(arguments):
+    return _values_and_constants(arguments)[0]
+
+
+def _periods_rule(primals, tangents):
+    arguments = primals[0]
+    dm, dp, dw = (dense_or_none(d, x) for d, x in zip(tangents[0], arguments, strict=True))
+    # Of symmetric bodies the constants below have no right derivatives.
+    a, b, c = arguments[0]
+    symmetric = are_close(a, b) | are_close(b, c) | are_close(c, a)
+    arguments = jax.tree.map(functools.partial(underivable, where=symmetric), arguments)
+    if arguments[1] is not None:
+        moments, products, omega = arguments
+        arguments = moments, products, omega, None, None
+        (*arguments, _, _), dm, dp, dw, _ = along_turning_axes(arguments, dm, dp, dw)
+    (values, mode), (polhode, precession, permanent, about) = _values_and_constants(arguments)
+    P_psi, P_phi, k2, _, _ = values
+    variation = start_variation(polhode, Frame(polhode), dm, dp, dw)
+    dr, ds, dpp, dA, dB, dz = invariants_variation(polhode, variation)
+    start = polhode.momentum
+    spin = tuple(x * y for x, y in zip(start, polhode.inverse_moments, strict=True))
+    energy = dot(spin, variation.momentum) + dot(start, apply_variation(variation, start)) / 2
+    cross = 0.0
+    if variation.off_diagonal is not None:
+        l1, l2, l3 = start
+        h12, h13, h23 = variation.off_diagonal
+        cross = 2 * polhode.sense * (h12 * l1 * l2 + h13 * l1 * l3 + h23 * l2 * l3)
+    dA, dB, dz = dA + cross, dB - cross, dz - polhode.s * cross
+    x = polhode.B * polhode.r
+    dx, dy = dB * polhode.r + polhode.B * dr, dA * polhode.p + polhode.A * dpp
+    first, second = complete(polhode)
+    quarter = P_psi * polhode.rate_unit / 4
+    quarter = jnp.where(permanent, 1, quarter)
+    divisor = jnp.where(x > 0, x, 1)
+    # By dx and dz = dx - dy, which alone counts next to the separatrix.
+    relative = dx / divisor
+    dquarter = (second * (polhode.m1 * dx - dz) - quarter * relative) / 2
+    period = 4 * quarter
+    square_2 = polhode.A * polhode.B * 4 * first
+    difference = start[1] ** 2 * period - square_2
+    s_divisor = jnp.where(polhode.s > 0, polhode.s, 1)
+    squares = (
+        start[0] ** 2 * period + polhode.r / s_divisor * difference,
+        square_2,
+        start[2] ** 2 * period + polhode.p / s_divisor * difference,
+    )
+    length = precession.length
+    dangle = period * energy + dot(variation.inverse_moments, squares) / 2
+    dangle = (dangle + dot(spin, start) * 4 * dquarter) / length
+    rate_unit = jnp.where(polhode.rate_unit > 0, polhode.rate_unit, 1)
+    rate = about / rate_unit  # scaled
+    # A permanent rotation about L: the rate is twice the energy over |L|.
+    dlength = dot(start, variation.momentum) / length
+    drate = jnp.where(
+        permanent,
+        (2 * energy - rate * dlength) / length,
+        (dangle - rate * 4 * dquarter) / period,
+    )
+    is_moving = about > 0
+    dP_psi = jnp.where(permanent, 0, 4 * dquarter / rate_unit)
+    dP_phi = jnp.where(is_moving, -P_phi / jnp.where(is_moving, rate, 1) * drate, 0)
+    dP_phi = jnp.where(is_moving, dP_phi, 0)
+    dm1 = jnp.where(x > 0, (dz - polhode.m1 * dx) / divisor, 0)
+    dk2 = jnp.where(x > 0, (dy - k2 * dx) / divisor, 0)
+    dm1, dk2 = jnp.where(polhode.circular, -dk2, dm1), jnp.where(polhode.circular, dk2, -dm1)
+    angles = jax.jvp(
+        lambda *a: _angles(polhode.sense, *a),
+        (polhode.A, polhode.B, polhode.r, polhode.s, polhode.m1),
+        (dA, dB, dr, ds, dm1),
+    )[1]
+    at_rest = polhode.rate_unit == 0
+    angles = tuple(jnp.where(at_rest, 0, a) for a in angles)
+    none = jnp.zeros(mode.shape, jax.dtypes.float0)
+    return (values, mode), ((dP_psi, dP_phi, dk2, *angles), none)
+
+
+_periods.defjvp(_periods_rule, symbolic_zeros=True)
+
+
+def periods(inertia: Inertia, state: State) -> Periods:
+    """P_psi, P_phi [s], mode and nutation limits [rad] of free bodies; fields (...).
+
+    ``P_psi``: rotation about (LAM) or oscillation about (SAM) the long axis; ``P_phi``: mean
+    precession of the long axis about the angular momentum; ``mode``: ``ph.Mode``; ``k2``: the
+    elliptic parameter; ``theta_min``, ``theta_max``: angle between long axis and momentum.
+    Infinite where there is no such motion. Differentiable. Formulas: Landau & Lifshitz, Mechanics,
+    section 37; Samarasinha & A'Hearn, Icarus 93 (1991).
+
+    Raises TypeError when handed anything but a ``ph.Inertia`` and a ``ph.State``.
+    """
+    if not isinstance(inertia, Inertia) or not isinstance(state, State):
+        raise TypeError(
+            "periods takes a ph.Inertia and a ph.State, got"
+            f" {type(inertia).__name__} and {type(state).__name__}."
+        )
+    if is_concrete(inertia):
+        require(
+            np.asarray(inertia.is_possible),
+            f"periods needs moments that a body can have, got {describe(inertia.moments)}.",
+        )
+    batch = common_batch(inertia, state)
+    moments, products, omega = inertia.moments, None, _spread(state.omega_body, batch)
+    if not inertia.is_principal:
+        moments, axes, products = principal(inertia.full)
+        products = _spread(products[..., ::-1], batch)  # (yz, zx, xy) -> (xy, xz, yz)
+        omega = rotation.rotate(rotation.conjugate(_spread(axes, batch)), omega)
+    return _compiled(_spread(moments, batch), omega, products)
+
+
+def _spread(x, batch):
+    x = x.reshape((1,) * (len(batch) + 1 - x.ndim) + x.shape)
+    return jnp.broadcast_to(x, (*batch, x.shape[-1]))
+
+
+_compiled = jax.jit(principal_periods)
