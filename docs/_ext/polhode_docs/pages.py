@@ -1,5 +1,6 @@
 """Pages that are made from other files of the repository: notebooks, the animated T-handle."""
 
+import base64
 import json
 import re
 from pathlib import Path
@@ -34,7 +35,20 @@ def write_notebooks(app) -> None:
             if cell["cell_type"] == "markdown":
                 cell["source"] = page_links("".join(cell["source"]))
         write_if_changed(folder / path.name, json.dumps(book, indent=1, ensure_ascii=False))
-    remove_others(folder, {path.name for path in notebooks})
+        thumbnail = first_figure(book)
+        if thumbnail is not None:
+            folder.joinpath(f"{path.stem}.png").write_bytes(thumbnail)
+    remove_others(folder, {f"{path.stem}{kind}" for path in notebooks for kind in (".ipynb", ".png")})
+
+
+def first_figure(book: dict) -> bytes | None:
+    """The first PNG among the outputs of a notebook, its thumbnail in the gallery."""
+    for cell in book["cells"]:
+        for output in cell.get("outputs", []):
+            picture = output.get("data", {}).get("image/png")
+            if picture:
+                return base64.b64decode("".join(picture))
+    return None
 
 
 def page_links(text: str) -> str:
@@ -46,6 +60,9 @@ def page_links(text: str) -> str:
 
 def adapt_links(app, document, source) -> None:
     """Links of a page, which lead to files of the repository, lead to pages of the site."""
+    if "/" in document:  # a folder down
+        source[0] = source[0].replace("](../../notebooks/", "](../notebooks/")
+        return
     text = source[0].replace("](../notebooks/", "](notebooks/")
     source[0] = text.replace("](../benchmarks/README.md", "](benchmarks.md")
 
