@@ -5,7 +5,7 @@ BIN = $(VENV)/bin
 STAMP = $(VENV)/.installed-$(1)
 PYTEST = $(BIN)/python -m pytest -n 2 --dist worksteal --durations=25
 
-.PHONY: demo test test-all test-versions lint bench docs notebooks clean help
+.PHONY: demo test test-all test-versions lint bench docs examples notebooks clean help
 
 help:  ## show the commands
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/'
@@ -34,6 +34,9 @@ bench: $(call STAMP,bench)  ## the quick benchmark tables and figures, beside th
 
 docs: $(call STAMP,docs)  ## build the documentation into site/, without a network; a warning is an error
 	$(BIN)/python -m sphinx -W --keep-going -q -d build/doctrees docs site
+
+examples: $(call STAMP,test)  ## execute the examples of README and documentation; store outputs and figures
+	$(BIN)/python tests/page_outputs.py
 
 notebooks: $(call STAMP,test)  ## execute the notebooks from their text forms and store the outputs
 	$(BIN)/python tests/stored_outputs.py

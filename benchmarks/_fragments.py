@@ -23,7 +23,7 @@ FRAGMENTS: dict[str, Callable[[], str]] = {}
 
 def pages() -> list[Path]:
     """The pages that may hold fragments."""
-    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 
 
 def filled(text: str) -> str:

@@ -18,7 +18,9 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 DOCS, FIGURES = ROOT / "docs", ROOT / "docs" / "figures"
-BLOCK = re.compile(r"^```python\n(.*?)^```\n(?:\n```output\n(.*?)^```\n)?", re.DOTALL | re.MULTILINE)
+BLOCK = re.compile(
+    r"^```python\n(.*?)^```\n(?:\n```output\n(.*?)^```\n)?", re.DOTALL | re.MULTILINE
+)
 FIGURE = re.compile(r"!\[[^\]]*\]\(\S*?figures/([\w.-]+)\)")
 
 RUNNER = """

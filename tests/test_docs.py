@@ -20,15 +20,13 @@ import polhode as ph
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.append(str(ROOT / "docs" / "_ext"))
 
+import page_outputs
+import stored_outputs
 from polhode_docs import public_names, reference_pages, signatures
 
 NUMBERED = {"000": 39, "002": 12, "003": 29}
-PAGES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
-SKETCHES = {
-    "identifiability.md": 2,
-    "light_curves.md": 1,
-    "scale.md": 1,
-}  # `py`: need more than polhode
+PAGES = page_outputs.pages()
+SKETCHES = {"identifiability": 2, "light_curves": 1, "scale": 1}  # `py`: need more than polhode
 WIDTH = 100  # columns of a code box
 
 
@@ -105,33 +103,58 @@ def test_tests_on_the_map_exist():
             assert function in functions_of(ROOT / path), name
 
 
-def examples(path: Path) -> str:
-    """The Python examples of a page, one after another."""
-    return "\n".join(re.findall(r"^```python\n(.*?)^```", path.read_text("utf-8"), re.S | re.M))
+EXECUTED = [path for path in PAGES if page_outputs.blocks(path.read_text("utf-8"))]
+HOW_TO = [path for path in EXECUTED if path.parent.name == "how-to"]
+AGAIN = "run: python tests/page_outputs.py"
 
 
 def test_examples_are_marked_so_that_they_are_run():
     for path in PAGES:
         text = path.read_text(encoding="utf-8")
-        marks = re.findall(r"^```(?!sh|toml|text|\{)(.+)$", text, re.M)  # {include} is a directive
+        marks = re.findall(r"^```(?!sh|toml|text|output|\{)(.+)$", text, re.M)  # {include}
         others = [mark for mark in marks if mark.strip() != "python"]
-        assert len(others) == SKETCHES.get(path.name, 0), (path.name, others)
+        assert len(others) == SKETCHES.get(page_outputs.name_of(path), 0), (path.name, others)
 
 
-@pytest.mark.parametrize("path", PAGES, ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", PAGES, ids=page_outputs.name_of)
 def test_examples_fit_into_the_box(path):
-    boxes = re.findall(r"^```\w*\n(.*?)^```", path.read_text(encoding="utf-8"), re.S | re.M)
+    boxes = re.findall(r"^```python\n(.*?)^```", path.read_text(encoding="utf-8"), re.S | re.M)
     assert not [line for box in boxes for line in box.split("\n") if len(line) > WIDTH]
 
 
+@pytest.mark.parametrize("path", EXECUTED, ids=page_outputs.name_of)
+def test_examples_show_what_they_print_and_draw(path):
+    text = path.read_text(encoding="utf-8")
+    for code, output in page_outputs.blocks(text):
+        assert bool(output) == ("print(" in code), f"{AGAIN} {path.name}: {code}"
+    drawn = set(re.findall(r'"([\w.-]+\.(?:png|svg))"', text))
+    assert set(page_outputs.figures(text)) == drawn
+    assert all((page_outputs.FIGURES / name).exists() for name in drawn), AGAIN
+
+
+@pytest.mark.parametrize("path", HOW_TO, ids=page_outputs.name_of)
+def test_a_how_to_asks_a_question_and_answers_it_with_output_and_figure(path):
+    text = path.read_text(encoding="utf-8")
+    assert re.match(r"# .*\?\n", text)
+    assert any(output for _, output in page_outputs.blocks(text))
+    assert page_outputs.figures(text)
+
+
+def test_every_figure_is_shown():
+    shown = {name for path in PAGES for name in page_outputs.figures(path.read_text("utf-8"))}
+    assert {path.name for path in page_outputs.FIGURES.iterdir()} == shown
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("path", [p for p in PAGES if examples(p)], ids=lambda p: p.stem)
-def test_examples_run(path, tmp_path):
-    script = tmp_path / "example.py"
-    script.write_text(examples(path), encoding="utf-8")
-    # in a process of its own: an example chooses its precision before the first array
-    done = subprocess.run([sys.executable, script], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr[-3000:]
+@pytest.mark.parametrize("path", EXECUTED, ids=page_outputs.name_of)
+def test_examples_print_what_the_page_shows(path, tmp_path):
+    text = path.read_text(encoding="utf-8")
+    printed = page_outputs.executed(text, tmp_path)
+    for (code, stored), new in zip(page_outputs.blocks(text), printed, strict=True):
+        found = stored_outputs.difference(stored, new)
+        assert found is None, f"{found} in\n{code}{AGAIN} {path.name}"
+    for name in page_outputs.figures(text):
+        assert (tmp_path / name).stat().st_size > 5000
 
 
 NAMES = public_names.public_names()
@@ -241,10 +264,10 @@ def test_signatures_are_those_of_the_source():
 
 
 def test_docstrings_become_markup():
-    text = "Of |L| and ``|L|``: 2 * 3, **bold**, see docs/fits.md.\n\n    x = 2 * y\n\n- one\n"
+    text = "Of |L| and ``|L|``: 2 * 3, **bold**, see docs/a/b.md.\n\n    x = 2 * y\n\n- one\n"
     made = reference_pages.markup(text)
     assert made == (
-        "Of \\|L\\| and ``|L|``: 2 \\* 3, **bold**, see :doc:`docs/fits.md </fits>`.\n\n"
+        "Of \\|L\\| and ``|L|``: 2 \\* 3, **bold**, see :doc:`docs/a/b.md </a/b>`.\n\n"
         ".. code-block:: python\n\n    x = 2 * y\n\n- one\n"
     )
 
@@ -267,7 +290,7 @@ def test_the_source_cites_what_a_reader_can_open():
     for path in sorted((ROOT / "src" / "polhode").rglob("*.py")):
         text = path.read_text(encoding="utf-8")
         assert not re.search(r"\b(theory|errata|display)s? (section |sections )?\d", text), path
-        for page in re.findall(r"\bdocs/(\w+\.md)\b", text):
+        for page in re.findall(r"\bdocs/([\w/-]+\.md)\b", text):
             assert (ROOT / "docs" / page).exists(), (path, page)
 
 
@@ -352,6 +375,6 @@ def test_the_meaning_of_rtol_stands_in_one_place_that_all_cite():
     scene = ph.Scene(ph.Inertia.from_moments([1, 2, 2.5]), torque=ph.LinearDamping([1, 2, 3]))
     plan = ph.explain(scene, ph.State([1, 0, 0, 0], [0.1, 1.0, 0.1]), [0.0, 1.0])
     assert "docs/methods.md: What rtol means" in str(plan)
-    for name in ("events", "float32", "integrators", "comparison", "scene_files"):
+    for name in ("tutorial/first_torque", "glossary", "sharp_bits", "comparison", "scene_files"):
         text = (ROOT / "docs" / f"{name}.md").read_text(encoding="utf-8")
         assert "methods.md#what-rtol-means" in text, name

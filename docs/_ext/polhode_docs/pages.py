@@ -5,6 +5,8 @@ import json
 import re
 from pathlib import Path
 
+from pygments.lexers.special import TextLexer
+
 from polhode_docs.t_handle import t_handle
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -38,7 +40,9 @@ def write_notebooks(app) -> None:
         thumbnail = first_figure(book)
         if thumbnail is not None:
             folder.joinpath(f"{path.stem}.png").write_bytes(thumbnail)
-    remove_others(folder, {f"{path.stem}{kind}" for path in notebooks for kind in (".ipynb", ".png")})
+    remove_others(
+        folder, {f"{path.stem}{kind}" for path in notebooks for kind in (".ipynb", ".png")}
+    )
 
 
 def first_figure(book: dict) -> bytes | None:
@@ -76,5 +80,6 @@ def write_motion(app, error) -> None:
 def setup(app):
     app.connect("builder-inited", write_notebooks)
     app.connect("source-read", adapt_links)
+    app.add_lexer("output", TextLexer)
     app.connect("build-finished", write_motion)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

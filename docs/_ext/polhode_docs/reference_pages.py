@@ -11,7 +11,7 @@ from polhode_docs.public_names import grouped, names_in, namespaces
 LITERAL = re.compile(r"(``.+?``|`[^`]+`)")
 SPECIAL = re.compile(r"\||(?<!\*)\*(?!\*)")
 ITEM = re.compile(r"\s*(-|\d+\.) ")
-PAGE = re.compile(r"\bdocs/(\w+)\.md\b")
+PAGE = re.compile(r"\bdocs/([\w/-]+)\.md\b")
 
 INTERNAL = {
     # of scenes and their parts, while a simulation is prepared

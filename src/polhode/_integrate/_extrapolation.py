@@ -68,7 +68,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
     ??? cite "Reference"
         W. B. Gragg, SIAM J. Numer. Anal. 2 (1965) 384; R. Bulirsch, J. Stoer, Numer. Math. 8
         (1966) 1; E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I,
-        section II.9, without Gragg's smoothing step. The error control: ``docs/integrators.md``.
+        section II.9, without Gragg's smoothing step. The error control: ``docs/design_notes.md``.
     """
 
     formal_order: int | None = eqx.field(static=True, default=12)

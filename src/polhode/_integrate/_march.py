@@ -50,7 +50,7 @@ CALIBRATED = 5
 
 SHARE = 0.6
 """Part of the tolerance that the steps' errors may add up to. They add up to more where the motion
-itself spreads errors (see ``docs/integrators.md``)."""
+itself spreads errors (see ``docs/design_notes.md``)."""
 
 FIRST = 0.05
 """What a radian at the start may err, of the mean over all; the rest is allowed as the square of
