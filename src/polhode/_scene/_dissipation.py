@@ -41,9 +41,9 @@ class EnergySink(AbstractTorque):
 
         tan theta(t) = tan theta(0) exp(k |L|^2 (1/C - 1/A) t).
 
-    ``omega_body`` of a trajectory is I^-1 L. The body rotates in addition by ``slip``, which is small
-    where little energy is lost in a revolution; ``docs/how-to/dissipate_energy.md`` derives this and
-    gives rate laws. It adds to torques and potentials that are weak against L x omega.
+    ``omega_body`` of a trajectory is I^-1 L. The body rotates in addition by ``slip``, which is
+    small where little energy is lost in a revolution; ``docs/how-to/dissipate_energy.md`` derives
+    this and gives rate laws. It adds to torques and potentials that are weak against L x omega.
 
         sink = ph.EnergySink(0.01)
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]), torque=sink)
