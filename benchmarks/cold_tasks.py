@@ -303,7 +303,7 @@ def toss() -> Callable:
     )
     rng = np.random.default_rng(0)
     seen = omega + 1e-3 * rng.normal(size=omega.shape)
-    return lambda: jax.block_until_ready(ph.fit.fit_free(ts, omega=seen).inertia.tensor)
+    return lambda: jax.block_until_ready(ph.fit_inertia(ts, seen).inertia.tensor)
 
 
 def view() -> Callable:

@@ -7,6 +7,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import polhode as ph
+from polhode._integrate import Automatic
 from polhode._integrate._switches import switched
 from polhode._kernels import smooth
 
@@ -170,7 +171,9 @@ def test_a_gradient_through_a_jump():
             return jnp.where(omega[2] > p[1], p[0] * omega, -0.1)
 
         scene = ph.Scene(ph.Inertia.spherical(1.0), None, ph.FeedbackTorque(law))
-        return ph.simulate(scene, ph.State(WXYZ, omega), [0.0, 5.0]).omega_body[-1, 2]
+        # of 128 steps two are noted at once: the others are taken once more on the way back
+        method = ph.LiePoisson(Automatic(), max_steps=128)
+        return ph.simulate(scene, ph.State(WXYZ, omega), [0.0, 5.0], method).omega_body[-1, 2]
 
     given = jnp.array([rate, level]), jnp.array([0.0, 0.0, begin])
     value, (by_p, by_omega) = jax.value_and_grad(falling, (0, 1))(*given)
@@ -192,3 +195,23 @@ def test_a_side_beyond_which_the_field_is_no_number():
     found = ph.simulate(scene, ph.State(WXYZ, [0.0, 0.0, 1.0]), [0.0, 5.0])
     met = 2 / 0.3 * (1 - np.log(2))  # dw/dt = -0.3 (1 + sqrt(w)), then -0.3
     np.testing.assert_allclose(found.omega_body[1, 2], -0.3 * (5 - met), rtol=1e-8)
+
+
+@pytest.mark.slow
+def test_gradients_of_a_batch_through_switches():
+    """Wider than a fused kernel, and in segments of four steps, as of one body."""
+
+    def law(t, wxyz, omega):
+        return jnp.clip(-0.5 * omega, -0.1, 0.2) + 0.05 * jnp.sin(3 * t)
+
+    scene = ph.Scene(INERTIA, torque=ph.FeedbackTorque(law))
+    omega = jnp.stack([(1 + 0.1 * k) * jnp.asarray(OMEGA) for k in range(10)])
+
+    def end(omega, max_steps):
+        method = ph.LiePoisson(Automatic(), max_steps=max_steps)
+        return jnp.sum(ph.simulate(scene, ph.State(WXYZ, omega), TS, method).last.wxyz[..., 1])
+
+    few, many = (jax.grad(end)(omega, n) for n in (256, 2**16))
+    np.testing.assert_allclose(few, many, rtol=1e-12)
+    one = jax.grad(end)(omega[3], 2**16)
+    np.testing.assert_allclose(many[3], one, atol=1e-9)

@@ -8,9 +8,9 @@ Piecewise-smooth Dynamical Systems (2008), section 2.5). Without this term deriv
 jump are wrong at any step width.
 
 *Forward*, the loop itself is differentiated, with the place of each switch by two steps of Newton's
-rule. *Backward*, the loop is run again and its state kept at ``KEPT`` turns, each second one of
-which is dropped whenever there is no more room; from one to the next it is run once more, its steps
-noted, and these are passed in reverse order.
+rule. *Backward*, the loop is run again, every step noted, and the steps are passed in reverse
+order. There is room for the notes of one ``KEPT``th of the steps that may be taken; of more than
+these the state is kept where each such segment begins, and it is run once more from there.
 """
 
 from typing import NamedTuple
@@ -23,6 +23,7 @@ from jaxtyping import Array
 from polhode._integrate._dop853 import DENSE_STAGES, NODES, STAGES, WEIGHTS
 from polhode._integrate._loop import (
     ARRIVED,
+    TRIES,
     UNDER_WAY,
     Make,
     Motion,
@@ -38,8 +39,8 @@ from polhode._integrate._loop import (
 )
 from polhode._kernels import any_of, attached, is_slope, kernel, linear, zeros
 
-KEPT = 128
-"""Turns of the loop whose state is kept."""
+KEPT = 256
+"""Turns of the loop, equally spaced over as many as there may be, whose whole state is kept."""
 
 
 def samples(make: Make, arrays, told, y, start, ts, found) -> Array:
@@ -113,15 +114,12 @@ def _tangent(opened, at, given, moved):
 
 
 class _Note(NamedTuple):
-    """A turn of the loop: state and levels before it, the time since the start, the signed width of
-    the step, 0 where none was accepted; state and levels after it."""
+    """Before a turn of the loop: state, levels, and the time since the start. What a turn leads to
+    stands in the note of the next one."""
 
     y: Array
     levels: Array
     gone: Array
-    h: Array
-    end: Array
-    after: Array
 
 
 def _cotangent(opened, at, given, slopes):
@@ -153,89 +151,79 @@ def _cotangent(opened, at, given, slopes):
 
 def _backward(motion, wanted, floats, start, times, y, slopes, sums):
     """Slopes by the state at the start and by the floats among ``motion.held``."""
-    walk, rows = begin(motion, wanted, start, times[-1:], y)
+    first, rows = begin(motion, wanted, start, times[-1:], y)
     end = times[-1:]
-    kept = jax.tree.map(
-        lambda x: jnp.broadcast_to(x[None], (KEPT, *x.shape)) + jnp.zeros_like(x)[None], walk
-    )
-    length = -(-4 * wanted.max_steps // KEPT) + 1
+    length = -(-TRIES * wanted.max_steps // KEPT)
 
-    def on(walk):
-        return any_of(jnp.where(walk.ended == UNDER_WAY, 1.0, 0.0))
+    def rooms(size, tree):
+        return jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), tree)
+
+    def put_in(rows, k, tree):
+        return jax.tree.map(
+            lambda r, x: jax.lax.dynamic_update_index_in_dim(r, x, k, 0), rows, tree
+        )
+
+    def entry(rows, k):
+        return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, k, 0, False), rows)
 
     def turn(carry):
-        walk, kept, count, stride = carry
-        row = count // stride
-        full = row >= KEPT
-        thinned = jax.lax.cond(full, lambda k: jax.tree.map(_every_second, k), lambda k: k, kept)
-        stride = jnp.where(full, 2 * stride, stride)
-        row = count // stride
-        begins = count == row * stride
-
-        def keep(rows, x):
-            x = jnp.where(begins, x, jax.lax.dynamic_index_in_dim(rows, row, 0, False))
-            return jax.lax.dynamic_update_index_in_dim(rows, x, row, 0)
-
-        kept = jax.tree.map(keep, thinned, walk)
+        walk, kept, notes, count = carry
+        number, place = count // length, count % length
+        begins = place == 0
+        old = entry(kept, number)
+        kept = put_in(kept, number, jax.tree.map(lambda x, o: jnp.where(begins, x, o), walk, old))
+        notes = put_in(notes, place, _noted(walk))
         walk, _ = advance(motion, wanted, start, end, walk, rows)
-        return walk, kept, count + 1, stride
+        return walk, kept, notes, count + 1
 
-    one = jnp.ones((), jnp.int32)
-    last, kept, count, stride = jax.lax.while_loop(
-        lambda c: on(c[0]), turn, (walk, kept, 0 * one, one)
+    last, kept, notes, count = jax.lax.while_loop(
+        lambda c: any_of(jnp.where(c[0].ended == UNDER_WAY, 1.0, 0.0)),
+        turn,
+        (first, rooms(KEPT, first), rooms(length, _noted(first)), jnp.zeros((), jnp.int32)),
     )
     sound = last.ended == ARRIVED
-    sign = jnp.where(end[0] < start, -1, 1).astype(y.dtype)
-    note = _noted(walk, walk, sign)
-    notes = jax.tree.map(lambda x: jnp.zeros((length, *x.shape), x.dtype), note)
+    final = (count - 1) // length
 
     def segment(carry):
-        number, *some = carry
-        first = number * stride
-        turns = jnp.minimum(stride, count - first)
-        walk = jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, number, 0, False), kept)
+        number, notes, *some = carry
+        turns = jnp.minimum(length, count - number * length)
 
         def note_one(i, carry):
             walk, notes = carry
-            after, _ = advance(motion, wanted, start, end, walk, rows)
-            new = _noted(walk, after, sign)
-            notes = jax.tree.map(
-                lambda rows, x: jax.lax.dynamic_update_index_in_dim(rows, x, i, 0), notes, new
-            )
-            return after, notes
+            notes = put_in(notes, i, _noted(walk))
+            walk, _ = advance(motion, wanted, start, end, walk, rows)
+            return walk, notes
 
-        _, noted = jax.lax.fori_loop(0, turns, note_one, (walk, notes))
+        # the notes of the final one are there already
+        missing = jnp.where(number == final, 0, turns)
+        _, notes = jax.lax.fori_loop(0, missing, note_one, (entry(kept, number), notes))
 
         def back(i, some):
-            k = turns - 1 - i
-            note = jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, k, 0, False), noted)
+            note = entry(notes, turns - 1 - i)
             return _step_back(motion, floats, start, times, slopes, sound, note, *some)
 
-        return number - 1, *jax.lax.fori_loop(0, turns, back, tuple(some))
+        return number - 1, notes, *jax.lax.fori_loop(0, turns, back, tuple(some))
 
     place = jnp.full(start.shape, times.shape[0] - 1, jnp.int32)
-    begun = (count - 1) // stride, jnp.zeros_like(y), sums, place
-    _, slope, sums, _ = jax.lax.while_loop(lambda c: c[0] >= 0, segment, begun)
+    begun = final, notes, _noted(last), jnp.zeros_like(y), sums, place
+    *_, slope, sums, _ = jax.lax.while_loop(lambda c: c[0] >= 0, segment, begun)
     return slope, sums
 
 
-def _every_second(rows: Array) -> Array:
-    half = rows[::2]
-    return jnp.concatenate([half, half])
+def _noted(walk: Walk) -> _Note:
+    return _Note(walk.y, walk.levels, walk.gone)
 
 
-def _noted(before: Walk, after: Walk, sign: Array) -> _Note:
-    h = sign * (after.gone - before.gone)
-    return _Note(before.y, before.levels, before.gone, h, after.y, after.levels)
-
-
-def _step_back(motion, floats, start, times, slopes, sound, note: _Note, slope, sums, place):
+def _step_back(
+    motion, floats, start, times, slopes, sound, note: _Note, after: _Note, slope, sums, place
+):
     """From slopes after a turn of the loop to those before it. ``place`` (B,): of the last sample
     that has not been met yet."""
     sign = jnp.where(times[-1] < start, -1, 1).astype(slope.dtype)
     t = start + sign * note.gone
-    live = sound & ((note.h != 0) | jnp.any(note.levels != note.after, axis=0))
-    h = jnp.where(live, note.h, 0)
+    h = sign * (after.gone - note.gone)
+    live = sound & ((h != 0) | jnp.any(note.levels != after.levels, axis=0))
+    h = jnp.where(live, h, 0)
 
     def of(some, levels, t, y):
         held = list(motion.held)
@@ -245,7 +233,7 @@ def _step_back(motion, floats, start, times, slopes, sound, note: _Note, slope, 
 
     known = [motion.held[k] for k in floats]
     if motion.jumps:
-        pulled, more = _jump_back(of, known, motion, note, t + h, slope, live)
+        pulled, more = _jump_back(of, known, motion, note, after, t + h, slope, live)
         slope, sums = slope + pulled, [a + b for a, b in zip(sums, more)]
 
     def met(place):
@@ -291,26 +279,26 @@ def _step_back(motion, floats, start, times, slopes, sound, note: _Note, slope, 
         return bars, slope + change, [a + b for a, b in zip(sums, more)]
 
     _, slope, sums = jax.lax.fori_loop(0, top, back, (bars, slope, sums))
-    return slope, sums, place
+    return note, slope, sums, place
 
 
-def _jump_back(of, known, motion, note: _Note, t, slope, live):
+def _jump_back(of, known, motion, note: _Note, after: _Note, t, slope, live):
     """What the time of a switch that turned adds to the slopes by the state and by ``known``."""
-    flips = (note.levels != note.after) & live[None]
+    flips = (note.levels != after.levels) & live[None]
     # events move nothing
     field = jnp.arange(motion.switches) < motion.switches - motion.watched
     flips = flips & field[:, None]
     share = jnp.where(flips, 1, 0).astype(slope.dtype)
     share = share / jnp.maximum(jnp.sum(share, axis=0, keepdims=True), 1)
-    before, *_ = of(known, note.levels, t, note.end)
-    later, *_ = of(known, note.after, t, note.end)
+    before, *_ = of(known, note.levels, t, after.y)
+    later, *_ = of(known, after.levels, t, after.y)
 
     def margin(some, t, y):
         return jnp.sum(jnp.where(flips, share * of(some, note.levels, t, y)[1], 0), axis=0)
 
-    _, pace = jax.jvp(lambda t, y: margin(known, t, y), (t, note.end), (jnp.ones_like(t), before))
+    _, pace = jax.jvp(lambda t, y: margin(known, t, y), (t, after.y), (jnp.ones_like(t), before))
     some = jnp.any(flips, axis=0) & (pace != 0)
     weight = jnp.sum(slope * (later - before), axis=0) / jnp.where(some, pace, 1)
-    _, pull = jax.vjp(lambda some, y: margin(some, t, y), known, note.end)
+    _, pull = jax.vjp(lambda some, y: margin(some, t, y), known, after.y)
     more, change = pull(jnp.where(some, weight, 0))
     return change, more

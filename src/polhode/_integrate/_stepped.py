@@ -24,7 +24,7 @@ from polhode._integrate._problem import Problem
 from polhode._integrate._search import Found, Search, with_events
 from polhode._integrate._segments import Moved, in_segments
 from polhode._integrate._step_derivative import samples
-from polhode._kernels import FEW, Distinct, kernel
+from polhode._kernels import FEW, Distinct, is_holdable, kernel
 from polhode._method._base import AbstractMethod, Record, Samples
 from polhode._method._options import check_options
 from polhode._method._status import Status
@@ -184,8 +184,20 @@ class AbstractIntegration(AbstractMethod):
             return self._solve_by_loop(scene, state, times, rtol, record, search)
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
-        whole = kernel(one, of_units=True) if n <= FEW else one
-        return map_chunks(whole, Distinct((lanes, times)), n, self.chunk or LANES)
+        if n <= FEW:
+            return map_chunks(kernel(one, of_units=True), Distinct((lanes, times)), n, n)
+        size = self.chunk or self._lanes_of_loop(scene, state, ts, record, search)
+        # bodies that share a chunk wait for one another: put together those of similar rates
+        order = jnp.argsort(-natural_rates(scene, state, ts))
+        sorted_lanes = jax.tree.map(lambda x: x[order], Distinct((lanes, times)))
+        found = map_chunks(one, sorted_lanes, n, size)
+        return jax.tree.map(lambda x: x[jnp.argsort(order)], found)
+
+    def _lanes_of_loop(self, scene, state, ts, record: Record, search) -> int:
+        """Bodies that the loop moves side by side: as many as a fused kernel holds; where the field
+        does not fit into one (products of matrices), so many that a call pays."""
+        problem = self._problem(scene, state, ts, record, search)
+        return FEW if is_holdable(problem.closed.jaxpr) else LANES
 
     def search(
         self, scene: Scene, state: State, ts: Array, rtol: Array, search: Search, final_only: bool

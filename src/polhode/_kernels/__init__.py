@@ -17,6 +17,7 @@ from polhode._kernels._single_call import (
     FEW as FEW,
     any_of as any_of,
     formula as formula,
+    is_holdable as is_holdable,
     kernel as kernel,
     put as put,
 )

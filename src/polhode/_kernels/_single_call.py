@@ -77,7 +77,7 @@ def kernel(
             )(*leaves)
         finally:
             _ANALYSING.reset(analysing)
-        if not _is_holdable(closed.jaxpr):
+        if not is_holdable(closed.jaxpr):
             return fn(*operands)
         whole, given = _opened(closed)
         found = _unit(jaxpr_as_fun(whole), linearised, (whole, 0), repeated)(*given, *leaves)
@@ -184,7 +184,8 @@ def _is_of_use() -> bool:
     return by_hand or jax.device_count() == 1
 
 
-def _is_holdable(jaxpr) -> bool:
+def is_holdable(jaxpr: Any) -> bool:
+    """Whether a unit can hold this program."""
     for equation in jaxpr.eqns:
         if equation.primitive.name not in _HOLDABLE or _is_wide(equation):
             return False
@@ -192,7 +193,7 @@ def _is_holdable(jaxpr) -> bool:
             list(equation.params.values()), is_leaf=lambda v: hasattr(v, "eqns")
         ):
             nested = getattr(value, "jaxpr", value)
-            if hasattr(nested, "eqns") and not _is_holdable(nested):
+            if hasattr(nested, "eqns") and not is_holdable(nested):
                 return False
     return all(_is_packable(v.aval.dtype) for v in (*jaxpr.invars, *jaxpr.constvars))
 
@@ -220,7 +221,7 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
     @jax.custom_jvp
     def marked(*leaves):
         closed, bare = traced or (jax.make_jaxpr(flat)(*leaves), 0)
-        if traced is None and not _is_holdable(closed.jaxpr):
+        if traced is None and not is_holdable(closed.jaxpr):
             return jaxpr_as_fun(closed)(*leaves)
         return _marked(closed, leaves, bare)
 
