@@ -31,6 +31,7 @@ import numpy as np
 from polhode.fit import (
     Drag,
     FitOptions,
+    Gyroscope,
     Instrument,
     Recording,
     SteppedMotion,
@@ -72,7 +73,8 @@ def padded(trials):
 def alone(trials):
     """What became of every trial by itself."""
     times, rates = padded(trials)
-    fit = fit_inertia(times, rates, throw=False)
+    options = FitOptions(gyroscope=Gyroscope.ideal())
+    fit = fit_inertia(times, rates, throw=False, options=options)
     codes, moments = np.asarray(fit.diagnostics), np.asarray(fit.moments)
     tensors = np.asarray(fit.inertia.tensor)
     least = np.trace(tensors, axis1=1, axis2=2) / 2 - moments[:, 2]
@@ -100,7 +102,7 @@ def crossings(times, x):
 def together(trials, motion=None):
     """One body for the trials of a round."""
     given = [Recording.of(trial[:, 0], trial[:, 1:]) for trial in trials]
-    options = FitOptions(motion=motion, max_starts=2)
+    options = FitOptions(motion=motion, max_starts=2, gyroscope=Gyroscope.ideal())
     fit = fit_recordings(given, options=options, throw=False)
     middle = np.asarray(wxyz_to_matrix(fit.axes))[:, 1]
     rest = np.asarray(fit.residuals["omega"])

@@ -65,9 +65,13 @@ print(recording.times.shape[-1], "rows,", int(np.sum(recording.present == 0)), "
 # The model is the exact free motion: nothing is stepped. The unknowns are the shape of the inertia
 # tensor and the rates at the first sample; every iterate is a body that could exist. The start
 # comes from the data, by linear regression on the conservation of angular momentum.
+#
+# The simulated sensor has exact scale factors and axes, `Gyroscope.ideal()`. Those of a real one
+# are known to a per cent or so, which is the default, and the intervals are wider.
 
 # %%
-found = fit.fit_recordings([recording], options=fit.FitOptions(trust_noise=True))
+options = fit.FitOptions(trust_noise=True, gyroscope=fit.Gyroscope.ideal())
+found = fit.fit_recordings([recording], options=options)
 print(found.report())
 
 # %% [markdown]

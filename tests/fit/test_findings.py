@@ -1,12 +1,15 @@
 """Saturated sensors and outliers are named; clean and coarsely digitised records are not."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import polhode as ph
-from polhode.fit import Finding, Recording, fit_inertia
-from polhode.fit._result import has_outliers, saturated
+from polhode.fit import Finding, Recording, fit_inertia, stack
+from polhode.fit._gyroscope import saturation
+from polhode.fit._result import has_outliers
 
 T = np.linspace(0, 20, 500)
 RATES = np.stack([3 * np.sin(T), 2 * np.cos(1.3 * T), 1 + 0.5 * np.sin(2 * T)], -1)
@@ -16,8 +19,8 @@ def noisy(seed=0):
     return RATES + 0.02 * np.random.default_rng(seed).normal(size=RATES.shape)
 
 
-def is_saturated(omega, present=None):
-    return bool(saturated(Recording.of(T, omega, **({} if present is None else present))))
+def is_saturated(omega):
+    return bool(jnp.any(saturation(Recording.of(T, omega)) != 0))
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -53,20 +56,25 @@ def test_constant_rates_are_not_saturated():
 def test_single_samples_far_off_are_outliers_and_runs_are_not():
     rng = np.random.default_rng(1)
     rest = rng.normal(size=(1, 500, 3))
-    present = jnp.ones((1, 500))
-    assert not has_outliers(jnp.asarray(rest), present, None)
+    whole = stack([Recording.of(T, RATES)])
+    assert not has_outliers(jnp.asarray(rest), whole, None)
     some = rest.copy()
     some[0, rng.choice(500, 8, replace=False), 1] += 15
-    assert has_outliers(jnp.asarray(some), present, None)
+    assert has_outliers(jnp.asarray(some), whole, None)
     # the fit is robust already
-    assert not has_outliers(jnp.asarray(some), present, object())
+    assert not has_outliers(jnp.asarray(some), whole, object())
     # a model that lacks something
     wrong = rest + 10 * (np.sin(T) > 0.9)[None, :, None]
-    assert not has_outliers(jnp.asarray(wrong), present, None)
+    assert not has_outliers(jnp.asarray(wrong), whole, None)
     # samples that are not there
-    gaps = np.ones((1, 500))
-    gaps[0, np.abs(some[0, :, 1]) > 6] = 0
-    assert not has_outliers(jnp.asarray(some), jnp.asarray(gaps), None)
+    gaps = dataclasses.replace(whole, present=jnp.asarray(np.abs(some[..., 1]) < 6, float))
+    assert not has_outliers(jnp.asarray(some), gaps, None)
+    # readings at a limit, whose residuals are zero while the model is beyond it
+    limits = np.zeros((1, 500, 3))
+    limits[0, :400, 2] = 1
+    at_limit = rest * (limits == 0)
+    saturated = dataclasses.replace(whole, saturated=jnp.asarray(limits))
+    assert not has_outliers(jnp.asarray(at_limit), saturated, None)
 
 
 @pytest.mark.slow

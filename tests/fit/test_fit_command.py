@@ -58,6 +58,11 @@ def test_a_recording_becomes_numbers_and_a_figure(toss, tmp_path, capsys):
     bias, spread = np.array(found["bias_rad_per_s"]), np.array(found["bias_std_rad_per_s"])
     assert np.all(np.abs(bias) < 5 * spread)
     assert np.all(spread < 0.05)
+    assert "what this recording can show" in printed
+    assert found["options"]["calibration"] == 0.01
+    assert np.shape(found["gyroscope_gain"]) == (3, 3)
+    sources = {row["quantity"]: row["source"] for row in found["observability"]}
+    assert sources["rotation of the gyroscope (3)"] == "calibration"
     assert "NaN" not in output.with_suffix(".json").read_text()
 
 

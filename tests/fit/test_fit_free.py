@@ -6,7 +6,15 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from polhode.fit import Finding, FreeMotion, Recording, fit_inertia, stack
+from polhode.fit import (
+    Finding,
+    FitOptions,
+    FreeMotion,
+    Gyroscope,
+    Recording,
+    fit_inertia,
+    stack,
+)
 from polhode.fit._start import regression
 from polhode.inertia import inertia_of_second_moments, is_physical
 
@@ -44,7 +52,8 @@ def cases():
 
 
 def fitted(times, rates):
-    return fit_inertia(times, rates, omega_noise=SIGMA[:, None, None], throw=False)
+    options = FitOptions(gyroscope=Gyroscope.ideal())
+    return fit_inertia(times, rates, omega_noise=SIGMA[:, None, None], options=options, throw=False)
 
 
 @pytest.fixture(scope="module")

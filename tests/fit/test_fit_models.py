@@ -20,6 +20,7 @@ from polhode.fit import (
     FitOptions,
     FreeMotion,
     FullTensor,
+    Gyroscope,
     Huber,
     Model,
     MomentsOnly,
@@ -89,7 +90,8 @@ def test_a_wheel_shows_the_scale_and_drag_and_delay_are_fitted():
         wheel_speed=speed(times),
         omega_noise=0.02,
         options=FitOptions(
-            motion=SteppedMotion(spin_inertia, drag=Drag(), fit_drag=True, fit_delay=True)
+            motion=SteppedMotion(spin_inertia, drag=Drag(), fit_drag=True, fit_delay=True),
+            gyroscope=Gyroscope.ideal(),
         ),
     )
     assert fit.scale_known

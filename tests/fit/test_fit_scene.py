@@ -7,7 +7,7 @@ import pytest
 
 import polhode as ph
 from polhode._scene._scene import places_of
-from polhode.fit import FitOptions, Recording
+from polhode.fit import FitOptions, Gyroscope, Recording
 
 BODY = ph.Inertia.from_moments([1.0, 2.0, 2.5])
 STATE = ph.State([0.8, 0.0, 0.6, 0.0], [1.2, -0.8, 1.0])
@@ -34,7 +34,7 @@ def drag_of(rates, throw=True):
     data = Recording.of(TIMES, rates, omega_noise=NOISE)
     start = ph.Scene(BODY, torque=ph.LinearDamping(0.15))
     free = lambda s: [s.torque.c]  # noqa: E731
-    options = FitOptions(trust_noise=True, max_starts=1)
+    options = FitOptions(trust_noise=True, max_starts=1, gyroscope=Gyroscope.ideal())
     return ph.fit_scene(start, data, free=free, rtol=1e-7, options=options, throw=throw)
 
 
@@ -209,7 +209,7 @@ def test_the_bias_and_the_model_of_a_fitted_scene():
     bias = np.array([0.05, 0.0, -0.02])
     data = Recording.of(TIMES, rates + bias, omega_noise=1e-3)
     start = ph.Scene(BODY, torque=ph.LinearDamping(0.2))
-    options = FitOptions(bias=True, max_starts=1)
+    options = FitOptions(bias=True, max_starts=1, gyroscope=Gyroscope.ideal())
     fit = ph.fit_scene(start, data, lambda s: s.torque.c, options=options, rtol=1e-7)
     np.testing.assert_allclose(fit.values[0], 0.1, atol=1e-5)
     np.testing.assert_allclose(fit.sensor["bias"], bias, atol=1e-5)

@@ -60,6 +60,21 @@ def fit(
     moments_only: Annotated[
         bool, typer.Option("--moments-only", help="the sensor axes are principal axes")
     ] = False,
+    calibration: Annotated[
+        float,
+        typer.Option(
+            min=0.0, metavar="PART",
+            help="standard deviation of the gyroscope's scale factors and of its misalignment"
+            " [rad]; 0: exact",
+        ),
+    ] = 0.01,
+    max_rate: Annotated[
+        float | None,
+        typer.Option(
+            parser=positive, metavar="RATE",
+            help="rate at which the gyroscope saturates, rad/s (default: found in the readings)",
+        ),
+    ] = None,
     bias: Annotated[bool, typer.Option("--bias", help="fit a constant gyroscope bias")] = False,
     drag: Annotated[bool, typer.Option("--drag", help="fit a drag of the air")] = False,
     robust: Annotated[
@@ -110,7 +125,8 @@ def fit(
         pass
     asked = _Asked(
         path=path, columns=named, degrees=degrees, milliseconds=milliseconds, noise=noise,
-        moments_only=moments_only, bias=bias, drag=drag, robust=robust,
+        moments_only=moments_only, calibration=calibration, max_rate=max_rate,
+        bias=bias, drag=drag, robust=robust,
         wheel_inertia=wheel_inertia, wheel_axis=wheel_axis, block=block,
     )  # fmt: skip
     if wheel_inertia and "wheel" not in named:
@@ -198,6 +214,7 @@ def _fit(asked: _Asked, goals: list[Path], *, quiet: bool, no_cache: bool, allow
         here = sys.stdout.isatty()
         out = Console(soft_wrap=not here, width=None if here else 110)
         out.print(_table(asked, recording, result))
+        out.print(_observability(result))
         for text in (_said(loaded), *result.warnings()):
             out.print(f"- {text}", highlight=False, markup=False)
         _show.tell_written(out, written)
@@ -258,6 +275,11 @@ def _keywords(asked: _Asked, room: Any) -> dict[str, Any]:
     options = room.FitOptions(
         motion=motion,
         unknown=room.MomentsOnly() if asked.moments_only else room.FullTensor(),
+        gyroscope=room.Gyroscope(
+            scale_std=asked.calibration,
+            misalignment_std=asked.calibration,
+            max_rate=asked.max_rate,
+        ),
         bias=asked.bias,
         robust=room.Huber(asked.robust) if asked.robust else None,
         trust_noise=asked.noise is not None,
@@ -325,6 +347,11 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
         "axes_std_rad": [0.0] * 3 if asked.moments_only else plain(result.axes_std),
         "bias_rad_per_s": None if found is None else plain(found[0]),
         "bias_std_rad_per_s": None if found is None else plain(found[1]),
+        "gyroscope_gain": plain(result.sensor["gain"]) if "gain" in result.sensor else None,
+        "gyroscope_gain_std": (
+            plain(result.sensor_std["gain"]) if "gain" in result.sensor else None
+        ),
+        "observability": [row._asdict() for row in result.observability()],
         "mirrored_ratios": plain(np.sort(other_hand(np.asarray(result.moments)))),
         "rms_rad_per_s": plain(result.rms),
         "residual_over_noise": plain(result.noise),
@@ -337,6 +364,24 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
     with whole_file(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
     return path
+
+
+def _observability(result: Any) -> Any:
+    """What this recording can show, as a rich Table."""
+    from rich.table import Table
+    from rich.text import Text
+
+    grid = Table(
+        title=Text("what this recording can show"),
+        title_justify="left",
+        show_edge=False,
+        pad_edge=False,
+    )
+    for name in ("", "estimated from", "would be shown by"):
+        grid.add_column(Text(name))
+    for row in result.observability():
+        grid.add_row(row.quantity, row.source, row.remedy)
+    return grid
 
 
 def _table(asked: _Asked, recording: Any, result: Any) -> Any:

@@ -9,6 +9,7 @@ from polhode.fit._fit import (
     windows as windows,
 )
 from polhode.fit._fit_balance import fit_balance as fit_balance, fit_each as fit_each
+from polhode.fit._gyroscope import Gyroscope as Gyroscope
 from polhode.fit._instrument import (
     Instrument as Instrument,
     Tolerance as Tolerance,
@@ -38,6 +39,7 @@ from polhode.fit._result import (
     Finding as Finding,
     Fit as Fit,
     FitError as FitError,
+    Observability as Observability,
     sensor_axes as sensor_axes,
 )
 from polhode.fit._scene_fit import fit_scene as fit_scene

@@ -10,6 +10,7 @@ from polhode._batch import map_chunks
 from polhode._checks import ArrayLike, require
 from polhode.fit._compiled import compiled
 from polhode.fit._fit_wheel import fit_wheel, fit_wheels
+from polhode.fit._gyroscope import Gyroscope, calibrated
 from polhode.fit._instrument import Instrument
 from polhode.fit._options import FitOptions, changed_options, check_usable, checked_options
 from polhode.fit._recording import Recording, stack
@@ -99,6 +100,13 @@ def fit_inertia(
 def _with_noise(options: FitOptions, channels: dict[str, tuple]) -> FitOptions:
     """The options with ``trust_noise`` as the noise of ``fit_inertia`` implies it."""
     given = [name for name, (noise, _, _) in channels.items() if noise is not None]
+    if options.gyroscope is not None and options.gyroscope.noise_density > 0:
+        require(
+            "omega_noise" not in given,
+            "omega_noise and noise_density of the gyroscope state the same noise: give one.",
+        )
+        given.append("omega_noise")
+        channels = channels | {"omega_noise": (1.0, *channels["omega_noise"][1:])}
     for name, (noise, data_name, data) in channels.items():
         require(
             noise is None or data is not None,
@@ -196,7 +204,7 @@ def windows(recording: Recording, length: int) -> list[Recording]:
 @compiled
 def together(recording: Recording, options: FitOptions, conclude: Callable = conclude) -> Any:
     """One body from its recordings (leading axis); ``conclude`` makes the result."""
-    return conclude(solve(recording, options), recording, options)
+    return _fitted(recording, options, conclude)
 
 
 @compiled
@@ -210,11 +218,17 @@ def each(recording: Recording, options: FitOptions, conclude: Callable = conclud
     return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), found)
 
 
+def _fitted(recording: Recording, options: FitOptions, conclude: Callable) -> Any:
+    """One body, its readings turned into rates by the sensor model."""
+    recording = calibrated(recording, options.gyroscope or Gyroscope())
+    return conclude(solve(recording, options), recording, options)
+
+
 def _batch(recording: Recording, options: FitOptions, conclude: Callable) -> Any:
     """Fits of bodies on one leading axis."""
 
     def fit(one):
-        return conclude(solve(one, options), one, options)
+        return _fitted(one, options, conclude)
 
     # A processor core fills its vector units with the samples of a few bodies; more at a time would
     # only wait for the slowest of them.

@@ -6,6 +6,7 @@ import equinox as eqx
 import optimistix as optx
 
 from polhode._checks import require
+from polhode.fit._gyroscope import Gyroscope
 from polhode.fit._motion import AbstractMotion, SteppedMotion
 from polhode.fit._parameters import AbstractInertiaUnknown
 from polhode.fit._recording import Recording
@@ -26,7 +27,10 @@ class FitOptions(eqx.Module):
       regression on the data.
     - ``robust``: ``Huber(threshold)``, the loss of residuals beyond ``threshold`` standard
       deviations of the noise; None: least squares.
-    - ``bias``: whether a constant bias of the gyroscope is fitted.
+    - ``gyroscope``: ``Gyroscope``, the sensor model and how well it is calibrated; None:
+      ``Gyroscope()``, scale factors and misalignment to 1 %. ``Gyroscope.ideal()`` takes them as
+      exact, as simulated rates are; of a real sensor the intervals are then far too narrow.
+    - ``bias``: whether a constant bias of the gyroscope is fitted, with no prior.
     - ``mounting``: whether a rotation between the axes of the gyroscope and those of the attitudes
       is fitted.
     - ``trust_noise``: whether the standard deviations of the recording are absolute (True) or only
@@ -47,6 +51,7 @@ class FitOptions(eqx.Module):
     unknown: AbstractInertiaUnknown | None = None
     initial_inertia: Inertia | None = None
     robust: Huber | None = None
+    gyroscope: Gyroscope | None = None
     bias: bool = eqx.field(static=True, default=False)
     mounting: bool = eqx.field(static=True, default=False)
     trust_noise: bool | None = eqx.field(static=True, default=None)
@@ -59,6 +64,7 @@ class FitOptions(eqx.Module):
             "motion": (AbstractMotion, "a motion such as FreeMotion() or None"),
             "unknown": (AbstractInertiaUnknown, "FullTensor(), MomentsOnly() or None"),
             "initial_inertia": (Inertia, "a ph.Inertia or None"),
+            "gyroscope": (Gyroscope, "a Gyroscope or None"),
             "robust": (Huber, "Huber(threshold) or None"),
             "solver": (optx.AbstractGaussNewton, "a Gauss-Newton solver of optimistix or None"),
             "trust_noise": (bool, "True, False or None"),
@@ -80,6 +86,13 @@ class FitOptions(eqx.Module):
         for name in ("max_starts", "max_steps"):
             value = getattr(self, name)
             require(value >= 1, f"{name} of FitOptions must be at least 1, got {value}.")
+
+
+def noise_is_trusted(options: FitOptions) -> bool:
+    """Whether the noise of the recordings is absolute."""
+    if options.trust_noise is None:
+        return options.gyroscope is not None and options.gyroscope.noise_density > 0
+    return options.trust_noise
 
 
 def changed_options(options: FitOptions) -> list[str]:
@@ -110,6 +123,24 @@ def check_usable(options: FitOptions, recording: Recording) -> None:
         require(
             recording.omega is not None or not getattr(options, name),
             f"{name}=True needs rates of a gyroscope (omega_body), got attitudes alone.",
+        )
+    sensor = options.gyroscope
+    if sensor is not None:
+        require(
+            recording.omega is not None,
+            "the option gyroscope needs its rates (omega_body), got attitudes alone.",
+        )
+        require(
+            not (sensor.delay or sensor.delay_std)
+            or recording.wxyz is not None
+            or recording.wheel is not None,
+            "the delay of a gyroscope shows only beside attitudes (wxyz) or a wheel (wheel_speed):"
+            " rates alone are those of a motion that begins later.",
+        )
+        require(
+            not sensor.jitter or bool(options.trust_noise) or sensor.noise_density > 0,
+            "jitter of the gyroscope adds to a known noise: give omega_noise (rad/s), or"
+            " noise_density of the gyroscope.",
         )
     motion = options.motion
     require(

@@ -41,7 +41,10 @@ class Parameters(eqx.Module):
     ``omega`` (r, 3), rad/s: rates at the first time of each recording; ``attitude`` (r, 3), rad:
     rotation vector (body axes) from the start attitude to the initial one; ``bias`` (3,), rad/s, of
     the gyroscope; ``mounting`` (3,), rad: rotation vector of the sensor axes; ``lever`` (3,), m:
-    accelerometer position from the centre of mass; ``motion``: the motion's own unknowns.
+    accelerometer position from the centre of mass; ``motion``: the motion's own unknowns; ``gain``
+    (9,): errors of the gyroscope's gain matrix beside the calibrated one, row by row; ``delay``, s,
+    of its readings; ``walk`` (r, k, 3), rad/s: changes of its bias over each of k equal parts of a
+    recording.
     """
 
     shape: Float[Array, " k"]
@@ -51,6 +54,9 @@ class Parameters(eqx.Module):
     mounting: Float[Array, " 3"] | None = None
     lever: Float[Array, " 3"] | None = None
     motion: Any = None
+    gain: Float[Array, " 9"] | None = None
+    delay: Float[Array, ""] | None = None
+    walk: Float[Array, "r k 3"] | None = None
 
 
 class AbstractInertiaUnknown(eqx.Module):

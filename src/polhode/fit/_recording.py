@@ -33,7 +33,9 @@ class Recording(eqx.Module):
     ``attitude_noise`` (rad), ``force_noise``, broadcast against it (1 where unknown: then the
     scatter is taken from the residuals); ``present`` (..., T): 1 for a sample, 0 for a gap;
     ``wheel`` (..., T), rad/s: speed of a wheel relative to the body, if there is one, its gaps
-    bridged linearly; ``wheel_known`` (..., T): 1 where it was measured.
+    bridged linearly; ``wheel_known`` (..., T): 1 where it was measured; ``saturated`` (..., T, 3):
+    1 and -1 where an axis of the gyroscope is at its upper or lower limit, else 0; None: fits look
+    for limits by themselves.
     """
 
     times: Float[Array, "*b t"]
@@ -46,6 +48,7 @@ class Recording(eqx.Module):
     attitude_noise: Float[Array, "*b t"] | None = None
     force_noise: Float[Array, "*b t 3"] | None = None
     wheel_known: Float[Array, "*b t"] | None = None
+    saturated: Float[Array, "*b t 3"] | None = None
 
     @classmethod
     def of(
@@ -153,6 +156,14 @@ def needed(name: str, array: Array | None) -> Array:
     if array is None:
         raise ValueError(f"the recording has no {name}: make it by Recording.of, which sets it.")
     return array
+
+
+def size_of_data(recording: Recording, channels: int) -> Array:
+    """How many numbers were measured; a saturated reading is not one."""
+    count = jnp.sum(recording.present) * channels
+    if recording.saturated is None:
+        return count
+    return count - jnp.sum(jnp.abs(recording.saturated) * recording.present[..., None])
 
 
 @jax.jit

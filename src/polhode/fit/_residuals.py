@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from functools import reduce
 from operator import add
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -10,10 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from polhode.fit._gyroscope import Gyroscope
 from polhode.fit._motion import AbstractMotion, Predicted
 from polhode.fit._parameters import Base, Parameters, tensor_of
 from polhode.fit._recording import Recording, needed, turn_between
+from polhode.fit._start import central_slope
 from polhode.rotation import conjugate, multiply, rotate, rotation_vector_to_wxyz
+
+# Standard deviation of a gain that counts as exactly known.
+_EXACT = 1e-9
 
 
 class Huber(eqx.Module):
@@ -39,7 +45,8 @@ class Model(eqx.Module):
     **Fields:** ``motion``; ``base``, ``columns`` (static): origin and directions of
     ``Parameters.shape``; ``attitude`` (r, 4): first recorded attitudes, to which
     ``Parameters.attitude`` is relative, or None; ``robust``: a ``Huber`` or None; ``scale_known``
-    (static): whether ``shape`` includes the size of the inertia.
+    (static): whether ``shape`` includes the size of the inertia; ``gyroscope``: its delay and the
+    standard deviations of its calibration.
     """
 
     motion: AbstractMotion
@@ -48,6 +55,7 @@ class Model(eqx.Module):
     robust: Huber | None = None
     columns: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=())
     scale_known: bool = eqx.field(static=True, default=False)
+    gyroscope: Gyroscope = Gyroscope()
 
     @property
     def entries(self) -> int:
@@ -86,20 +94,28 @@ def residuals(
 ) -> dict[str, Float[Array, "r t 3"]]:
     """Residuals of rates, attitudes (rotation vectors) and accelerometer, over their noise.
 
-    ``recording`` carries one leading axis r: recordings of one body. Gaps count zero. Any
-    optimiser can minimise the sum of squares; ``jax.grad`` and ``jax.jacfwd`` go through it.
+    ``recording`` carries one leading axis r: recordings of one body. Gaps count zero, and so does a
+    saturated reading while the model is beyond the limit. Any optimiser can minimise the sum of
+    squares; ``jax.grad`` and ``jax.jacfwd`` go through it.
     """
-    motion = predict(parameters, recording, model, tensor)
+    return compared(predict(parameters, recording, model, tensor), parameters, recording, model)
+
+
+def compared(
+    motion: Predicted, parameters: Parameters, recording: Recording, model: Model
+) -> dict[str, Float[Array, "r t 3"]]:
+    """``residuals`` of a motion that was predicted; what the sensors do to it is simulated here."""
     weight = recording.present[..., None]
     parts = {}
     if recording.omega is not None:
-        seen, noise = motion.omega, needed("omega_noise", recording.omega_noise)
-        if parameters.mounting is not None:
-            turn = conjugate(rotation_vector_to_wxyz(parameters.mounting))
-            seen = rotate(jnp.broadcast_to(turn, (*seen.shape[:-1], 4)), seen)
-        if parameters.bias is not None:
-            seen = seen + parameters.bias[None, None]
-        parts["omega"] = weight * (recording.omega - seen) / noise
+        noise = needed("omega_noise", recording.omega_noise)
+        rest = weight * (recording.omega - _read(motion, parameters, recording, model)) / noise
+        if recording.saturated is not None:
+            # A reading at the upper limit says only that the rate is not smaller.
+            side = recording.saturated
+            rest = jnp.where(side > 0, jnp.maximum(rest, 0), rest)
+            rest = jnp.where(side < 0, jnp.minimum(rest, 0), rest)
+        parts["omega"] = rest
     if recording.wxyz is not None:
         noise = needed("attitude_noise", recording.attitude_noise)
         apart = turn_between(motion.wxyz, recording.wxyz)
@@ -121,6 +137,81 @@ def residuals(
     return parts
 
 
+def _read(
+    motion: Predicted, parameters: Parameters, recording: Recording, model: Model
+) -> Float[Array, "r t 3"]:
+    """Noise-free readings of the gyroscope, in the units of ``Recording.omega``."""
+    omega = motion.omega
+    if model.gyroscope.delay or parameters.delay is not None:
+        # Two terms of Taylor's series: delays are short beside the time in which rates change.
+        delay = model.gyroscope.delay
+        delay = delay if parameters.delay is None else delay + parameters.delay
+        slope = motion.omega_dot
+        if slope is None:
+            slope = jax.vmap(central_slope)(omega, recording.times)
+        bend = jax.vmap(central_slope)(slope, recording.times)
+        omega = omega - delay * slope + delay**2 / 2 * bend
+    if parameters.mounting is not None:
+        turn = conjugate(rotation_vector_to_wxyz(parameters.mounting))
+        omega = rotate(jnp.broadcast_to(turn, (*omega.shape[:-1], 4)), omega)
+    if parameters.gain is not None:
+        errors = parameters.gain.reshape(3, 3)
+        omega = omega + jnp.einsum("ij,rtj->rti", errors, omega)
+    if parameters.bias is not None:
+        omega = omega + parameters.bias[None, None]
+    if parameters.walk is not None:
+        omega = omega + jax.vmap(walk_of)(parameters.walk, recording.times)
+    return omega
+
+
+def walk_of(steps: Float[Array, "k 3"], times: Float[Array, " t"]) -> Float[Array, "t 3"]:
+    """The bias relative to its start; it changes by ``steps`` over k equal parts of ``times``."""
+    count = steps.shape[0]
+    part = (times - times[0]) / (times[-1] - times[0]) * count
+    elapsed = jnp.clip(part[:, None] - jnp.arange(count, dtype=times.dtype)[None], 0, 1)
+    return jnp.einsum("tk,ki->ti", elapsed, steps)
+
+
+class Prior(NamedTuple):
+    """Precisions of the unknowns of the sensors' calibration, by name as in ``Parameters``."""
+
+    gain: Float[Array, " 9"] | None
+    bias: Float[Array, " 3"] | None
+    delay: Float[Array, ""] | None
+    walk: Float[Array, "r k 3"] | None
+
+
+def prior_of(parameters: Parameters, recording: Recording, model: Model) -> Prior:
+    """Inverse variances of the calibration; None where an unknown is absent or has no prior."""
+    sensor, dtype = model.gyroscope, recording.times.dtype
+
+    def precision(std, like):
+        return None if like is None else jnp.broadcast_to(jnp.asarray(std, dtype) ** -2, like.shape)
+
+    # an entry that is exactly known is an unknown that cannot move
+    widths = np.maximum(sensor.gain_std.ravel(), _EXACT)
+    walk = None
+    if parameters.walk is not None:
+        span = recording.times[:, -1] - recording.times[:, 0]
+        walk = parameters.walk.shape[1] / (sensor.bias_walk**2 * span)
+        walk = jnp.broadcast_to(walk[:, None, None], parameters.walk.shape)
+    return Prior(
+        precision(widths, parameters.gain),
+        precision(sensor.bias_std, parameters.bias) if sensor.bias_std else None,
+        precision(sensor.delay_std, parameters.delay) if sensor.delay_std else None,
+        walk,
+    )
+
+
+def prior_cost(parameters: Parameters, recording: Recording, model: Model) -> Float[Array, ""]:
+    """Half the sum of squares of the calibration's unknowns over their standard deviations."""
+    total = jnp.zeros((), recording.times.dtype)
+    for name, precision in prior_of(parameters, recording, model)._asdict().items():
+        if precision is not None:
+            total = total + jnp.sum(precision * getattr(parameters, name) ** 2) / 2
+    return total
+
+
 def log_density(
     recording: Recording, model: Model, prior: Callable[[Parameters], Array] | None = None
 ) -> Callable[[Parameters], Float[Array, ""]]:
@@ -128,13 +219,15 @@ def log_density(
 
     ``recording`` as in ``residuals`` (one leading axis: ``stack([recording])``), ``model`` that of
     a fit, whose ``parameters`` are the place to start from; ``prior`` adds the logarithm of its
-    density (None: flat in the parameters, that is in the second moments away from flat bodies).
+    density (None: flat in the parameters, that is in the second moments away from flat bodies),
+    beside that of the gyroscope's calibration, which is always included.
     The result is a density for BlackJAX; its negative is a ``potential_fn`` for NumPyro.
     """
 
     def density(parameters):
         parts = residuals(parameters, recording, model)
         misfit = -reduce(add, (jnp.sum(part**2) for part in parts.values())) / 2
+        misfit = misfit - prior_cost(parameters, recording, model)
         return misfit if prior is None else misfit + prior(parameters)
 
     return density

@@ -1,5 +1,6 @@
 """``Fit``: the result of a fit, its uncertainty, and what the data do not show."""
 
+import dataclasses
 import enum
 from collections.abc import Mapping
 from functools import partial
@@ -16,13 +17,14 @@ from jaxtyping import Array, Float, Int
 from polhode._checks import require
 from polhode._scene import Scene, State
 from polhode.fit._filter import Noise
+from polhode.fit._gyroscope import Gyroscope
 from polhode.fit._instrument import Instrument
 from polhode.fit._linear import Linear
 from polhode.fit._matrices import eigh, inverse, svd
-from polhode.fit._options import FitOptions
+from polhode.fit._options import FitOptions, noise_is_trusted
 from polhode.fit._parameters import Parameters, entries_of, whole_of
-from polhode.fit._recording import Recording, needed, turn_between
-from polhode.fit._residuals import Model
+from polhode.fit._recording import Recording, needed, size_of_data, turn_between
+from polhode.fit._residuals import Model, prior_of
 from polhode.fit._scene_motion import LeafMotion
 from polhode.fit._solve import Solution, misfit_of
 from polhode.inertia import Inertia, principal
@@ -46,6 +48,7 @@ class Finding(enum.IntFlag):
     POOR = 128
     SATURATED = 256
     OUTLIERS = 512
+    CALIBRATION = 1024
 
 
 WARNINGS = {
@@ -67,11 +70,13 @@ WARNINGS = {
     "quadratic over such a range",
     Finding.POOR: "the residuals are more than twice as large as the noise: a wrong model, wrong "
     "axes or units, outliers (robust=Huber()), or a local minimum that is not the best",
-    Finding.SATURATED: "a gyroscope axis stays at its greatest or least rate, as a saturated sensor"
-    " does: leave those samples out (present=0), or the moments are biased far beyond their"
-    " intervals",
+    Finding.SATURATED: "a gyroscope axis is saturated: readings at its limit count as bounds only;"
+    " state the limit, Gyroscope(max_rate=...), where an axis is beyond it throughout",
     Finding.OUTLIERS: "single samples are more than five times as far off as others: fit with"
     " robust=Huber(); intervals are wider than they need to be",
+    Finding.CALIBRATION: "scale factors, misalignment or bias of the gyroscope are more than 3.5"
+    " standard deviations from its calibration: state a wider one, Gyroscope(scale_std=...,"
+    " misalignment_std=...), or the model lacks something that they make up for",
 }
 _SCENE_WARNINGS = WARNINGS | {
     Finding.UNDETERMINED: "some of the numbers do not show in this motion, alone or against each"
@@ -89,6 +94,21 @@ _READINGS_WARNINGS = WARNINGS | {
 
 UNUSABLE = Finding.STEP_LIMIT | Finding.NOT_FINITE | Finding.AXES_DISAGREE
 """Findings that raise an error unless ``throw=False``."""
+
+
+class Observability(NamedTuple):
+    """A row of ``Fit.observability``: a quantity and what its estimate rests on.
+
+    **Fields:** ``quantity``, with the number of its components in brackets; ``count`` of them, of
+    which the data show ``shown``; ``source``: ``"data"``, ``"data and calibration"``,
+    ``"calibration"`` or ``"nothing"``; ``remedy``: a recording that would show it, or empty.
+    """
+
+    quantity: str
+    count: int
+    shown: int
+    source: str
+    remedy: str
 
 
 class FitError(RuntimeError):
@@ -133,8 +153,9 @@ class Fit(eqx.Module):
       attitudes the space axes are those of the body then, or the ``attitude`` of ``fit_scene``.
     - ``covariance`` (..., p, p) of all unknowns: the tensor's entries xx, yy, zz, yz, zx, xy (three
       for ``MomentsOnly``, none of a scene), bias, mounting, lever, the motion's unknowns or the
-      scene's values, then rates and attitude (rotation vector) at the start of each recording.
-      It is the pseudo-inverse of ``information`` (..., p, p). The likelihood of readings (a fit
+      scene's values, gain (row by row) and delay, then of each recording rates and attitude
+      (rotation vector) at its start and the walk of the bias. It is the pseudo-inverse of
+      ``information`` (..., p, p), which includes the calibration. The likelihood of readings (a fit
       with an ``instrument``) has no initial states among its unknowns.
     - ``null_count`` (...): number of directions of the unknowns that the data do not show.
     - ``noise`` (...): standard deviation of the residuals over the assumed one (reduced chi).
@@ -312,6 +333,81 @@ class Fit(eqx.Module):
         texts = self._texts()
         return about + [texts[flag] for flag in self._flags(body)]
 
+    def observability(self, body: int = 0) -> list[Observability]:
+        """What the recordings of one body can show, and what would show the rest."""
+        rows = []
+        gained = self._calibration_shown(body)
+        rests = "data" if gained is None else "data and calibration"
+        if self._inertia is not None:
+            spread = np.asarray(self.ratios_std).reshape(-1, 3)[body, :2]
+            shown = int(np.isfinite(spread).sum())
+            source = rests if shown else "nothing"
+            remedy = "" if shown == 2 else "another spin, away from the principal axes"
+            rows.append(Observability("ratios of the moments (2)", 2, shown, source, remedy))
+            size = int(self.scale_known)
+            remedy = "" if size else "a wheel of known spin inertia, a known torque or moment"
+            source = rests if size else "nothing"
+            rows.append(Observability("size of the inertia", 1, size, source, remedy))
+            if not (self.scale_known or self._inertia.handedness_known):
+                remedy = "attitudes (wxyz), a wheel, or knowledge of the body"
+                rows.append(Observability("handedness of the axes", 1, 0, "nothing", remedy))
+        else:
+            for k, spread in enumerate(self.std):
+                flat = np.asarray(spread).reshape(max(np.size(self.diagnostics), 1), -1)[body]
+                shown = int(np.isfinite(flat).sum())
+                remedy = "" if shown == flat.size else "another motion, or fewer free numbers"
+                source = rests if shown else "nothing"
+                name = f"values[{k}] ({flat.size})"
+                rows.append(Observability(name, flat.size, shown, source, remedy))
+        for name, count, shown in gained or []:
+            source = ("calibration", "data and calibration", "data")[
+                int(shown > 0) + int(shown == count)
+            ]
+            remedy = "" if shown == count else "attitudes (wxyz), or rates of a rate table"
+            rows.append(Observability(f"{name} ({count})", count, shown, source, remedy))
+        return rows
+
+    def _calibration_shown(self, body: int) -> list[tuple[str, int, int]] | None:
+        """Of the gyroscope's gain: name, number and how many directions the data show.
+
+        A direction is shown where the data at least halve the variance of its calibration.
+        """
+        if self.parameters.gain is None:
+            return None
+        rows = []
+        lead = np.ndim(self.diagnostics)
+        count = self.model.entries
+        for name in ("bias", "mounting", "lever", "motion"):
+            leaves = jax.tree.leaves(getattr(self.parameters, name))
+            count += sum(int(np.prod(np.shape(leaf)[lead:])) for leaf in leaves)
+        covariance = np.asarray(self.covariance)
+        covariance = covariance.reshape(-1, *covariance.shape[-2:])[body]
+        block = covariance[count : count + 9, count : count + 9]
+        width = self.model.gyroscope.gain_std
+        # symmetric and antisymmetric combinations of opposite entries
+        stretch, turn = [], []
+        for i in range(3):
+            unit = np.zeros((3, 3))
+            unit[i, i] = 1
+            stretch.append(unit)
+            for j in range(i):
+                even, odd = np.zeros((3, 3)), np.zeros((3, 3))
+                even[i, j] = even[j, i] = odd[i, j] = 0.5
+                odd[j, i] = -0.5
+                stretch.append(even)
+                turn.append(odd)
+        for name, directions in (
+            ("scale factors and skewness of the gyroscope", stretch),
+            ("rotation of the gyroscope", turn),
+        ):
+            basis = np.array([part.ravel() for part in directions])
+            prior = np.sqrt(np.sum((basis * width.ravel()) ** 2, axis=1))
+            basis = basis[prior > 0] / prior[prior > 0, None]
+            if basis.shape[0]:
+                left = np.linalg.eigvalsh(basis @ block @ basis.T)
+                rows.append((name, basis.shape[0], int(np.sum(left < 0.5))))
+        return rows
+
     def report(self, body: int | None = None) -> str:
         """A short text on one body, or on all (None): values, uncertainty and warnings."""
         count = np.asarray(self.diagnostics).size
@@ -322,6 +418,11 @@ class Fit(eqx.Module):
         for k in bodies:
             lines += self._value_lines(k) if self._inertia is None else [self._inertia_line(k)]
             lines += [f"  - {text}" for text in self.warnings(k) if text != _SCALE]
+            if body is not None or count == 1:
+                lines.append("  what this recording can show:")
+                for row in self.observability(k):
+                    remedy = f"; would be shown by {row.remedy}" if row.remedy else ""
+                    lines.append(f"    {row.quantity}: {row.source}{remedy}")
         return "\n".join(lines)
 
     def _inertia_line(self, body: int) -> str:
@@ -387,7 +488,8 @@ def other_hand(moments: Any) -> Any:
 class Shown(NamedTuple):
     """What the data show of p unknowns: ``information`` and ``covariance`` (p, p), directions
     ``null`` (p, p) that they do not show (zero columns for the others), natural sizes ``safe`` (p,)
-    of 1 over an unknown, how many are not shown, ``noise`` of the residuals over that assumed."""
+    of 1 over an unknown, how many are not shown, ``noise`` of the residuals over that assumed,
+    ``prior_std`` (p,): of the calibration, infinite for unknowns without a prior."""
 
     information: Array
     covariance: Array
@@ -395,25 +497,87 @@ class Shown(NamedTuple):
     safe: Array
     null_count: Array
     noise: Array
+    prior_std: Array
 
 
-def shown_by(linear: Linear, recording: Recording, trust_noise: bool) -> Shown:
-    """What the Jacobian of a fit says about its unknowns, in the order shared, then own."""
+def shown_by(solution: Solution, recording: Recording, trust_noise: bool) -> Shown:
+    """What the Jacobian of a fit says about its unknowns, in the order shared, then own.
+
+    Unknowns with a prior (the sensor's calibration) are eliminated: conditional on them the
+    covariance of the others is the pseudo-inverse of their information, so a direction that the
+    data do not show is found by the data alone, whatever the prior, and in single precision too.
+    """
+    linear = solution.linear
     information = linear.information()
     dtype = information.dtype
+    held, precision = _priors(solution, recording)
+    free = np.flatnonzero(~held)
+    inner = information[np.ix_(free, free)]
     # equilibrated: a direction counts as null by its own information, whatever its unit
-    size = jnp.sqrt(jnp.diagonal(information))
+    size = jnp.sqrt(jnp.diagonal(inner))
     safe = jnp.where(size > 0, size, 1)
-    values, vectors = eigh(information / safe[:, None] / safe[None])
+    values, vectors = eigh(inner / safe[:, None] / safe[None])
     known = values > 1e3 * float(jnp.finfo(dtype).eps) * values[-1]
     inverted = jnp.where(known, 1 / jnp.where(known, values, 1), 0)
-    data = jnp.sum(recording.present) * linear.rest.shape[-1]
-    freedom = jnp.maximum(data - jnp.sum(known).astype(dtype), 1)
-    noise = jnp.sqrt(jnp.sum(linear.rest**2) / freedom)
-    variance = jnp.asarray(1, dtype) if trust_noise else noise**2
-    covariance = (vectors * inverted[None]) @ vectors.T / safe[:, None] / safe[None] * variance
+    covariance = (vectors * inverted[None]) @ vectors.T / safe[:, None] / safe[None]
     null = jnp.where(known, 0, 1)[None] * vectors / safe[:, None]
-    return Shown(information, covariance, null, safe, jnp.sum(~known), noise)
+    used = jnp.sum(known).astype(dtype)
+    square = jnp.sum(linear.rest**2)
+    total = size_of_data(recording, linear.rest.shape[-1])
+    prior_std = jnp.full(held.size, jnp.inf, dtype)
+    if not held.any():
+        noise = jnp.sqrt(square / jnp.maximum(total - used, 1))
+        variance = jnp.asarray(1, dtype) if trust_noise else noise**2
+        return Shown(
+            information, covariance * variance, null, safe, jnp.sum(~known), noise, prior_std
+        )
+    place = np.flatnonzero(held)
+    cross = information[np.ix_(free, place)]
+    width = precision**-0.5
+    gained = covariance @ cross
+    # information of the data about the calibration, its unit the standard deviation of the prior
+    block = information[np.ix_(place, place)]
+    data = (block - cross.T @ gained) * width[:, None] * width[None]
+    shown, axes = eigh((data + data.T) / 2)
+    # rounding of the difference is no information
+    rounding = 1e3 * float(jnp.finfo(dtype).eps) * jnp.max(jnp.diagonal(block) * width**2)
+    shown = jnp.where(shown > rounding, shown, 0)
+    # the calibration uses up data as far as these show it
+    noise = jnp.sqrt(square / jnp.maximum(total - used, 1))
+    noise = jnp.sqrt(square / jnp.maximum(total - used - jnp.sum(shown / (shown + noise**2)), 1))
+    variance = jnp.asarray(1, dtype) if trust_noise else noise**2
+    # the mean of 1 / (information / variance + 1) by directions
+    spread = (axes * (1 / (shown / jnp.where(variance > 0, variance, 1) + 1))[None]) @ axes.T
+    spread = jnp.where(variance > 0, spread, 0) if not trust_noise else spread
+    spread = spread * width[:, None] * width[None]
+    beside = -gained @ spread
+    full = jnp.zeros_like(information)
+    full = full.at[np.ix_(free, free)].set(covariance * variance - beside @ gained.T)
+    full = full.at[np.ix_(free, place)].set(beside).at[np.ix_(place, free)].set(beside.T)
+    full = full.at[np.ix_(place, place)].set(spread)
+    order = jnp.zeros((held.size, held.size), dtype).at[np.ix_(free, free)].set(null)
+    sizes = jnp.ones(held.size, dtype).at[free].set(safe).at[place].set(1 / width)
+    with_prior = information.at[place, place].add(precision * variance)
+    prior_std = prior_std.at[place].set(width)
+    return Shown(with_prior, full, order, sizes, jnp.sum(~known), noise, prior_std)
+
+
+def _priors(solution: Solution, recording: Recording) -> tuple[np.ndarray, Array]:
+    """Which unknowns, in the order shared, then own, have a prior (static), and its precisions."""
+    parameters, model = solution.parameters, solution.model
+    prior = prior_of(parameters, recording, model)
+    shared = [np.zeros(model.entries, bool)]
+    for name in ("bias", "mounting", "lever", "motion", "gain", "delay"):
+        size = sum(leaf.size for leaf in jax.tree.leaves(getattr(parameters, name)))
+        shared.append(np.full(size, getattr(prior, name, None) is not None))
+    own = [np.zeros(0 if x is None else 3, bool) for x in (parameters.omega, parameters.attitude)]
+    walk = np.ones(0 if parameters.walk is None else parameters.walk[0].size, bool)
+    recordings = parameters.omega.shape[0]
+    held = np.concatenate([*shared, *[np.concatenate([*own, walk])] * recordings])
+    each = [getattr(prior, name) for name in ("bias", "gain", "delay", "walk")]
+    flat = [jnp.ravel(x) for x in each if x is not None]
+    dtype = parameters.omega.dtype
+    return held, jnp.concatenate([jnp.zeros(0, dtype), *flat]).astype(dtype)
 
 
 class _Split(NamedTuple):
@@ -425,22 +589,45 @@ class _Split(NamedTuple):
 
 
 def _split(shared: Array, count: int, parameters: Parameters) -> _Split:
-    """``shared`` (s,), in the order of ``unknowns``: the tensor's entries, sensor, motion."""
+    """``shared`` (s,), in the order of ``Unknowns``, by what it is of."""
     first = count
     sensor, motion = {}, []
-    for name, part in _sensor(parameters).items():
-        sensor[name] = shared[first : first + part.size]
-        first += part.size
+
+    def part(like):
+        nonlocal first
+        first += like.size
+        return shared[first - like.size : first].reshape(like.shape)
+
+    for name in ("bias", "mounting", "lever"):
+        if (value := getattr(parameters, name)) is not None:
+            sensor[name] = part(value)
     for leaf in jax.tree.leaves(parameters.motion):
-        motion.append(shared[first : first + leaf.size].reshape(leaf.shape))
-        first += leaf.size
+        motion.append(part(leaf))
+    if parameters.gain is not None:
+        sensor["gain"] = part(parameters.gain).reshape(3, 3)
+    if parameters.delay is not None:
+        sensor["delay"] = part(parameters.delay)
     return _Split(shared[:count], sensor, motion)
 
 
-def _sensor(parameters: Parameters) -> dict[str, Array]:
-    """The fitted unknowns of the sensors by name, in the order of ``unknowns``."""
-    parts = {name: getattr(parameters, name) for name in ("bias", "mounting", "lever")}
-    return {name: part for name, part in parts.items() if part is not None}
+def _sensor(parameters: Parameters, gyroscope: Gyroscope) -> dict[str, Array]:
+    """The fitted unknowns of the sensors by name: gain, bias and delay with those calibrated."""
+    names = ("bias", "mounting", "lever", "gain", "delay")
+    parts = {name: getattr(parameters, name) for name in names}
+    parts = {name: part for name, part in parts.items() if part is not None}
+    gain = None if gyroscope.gain is None else gyroscope.gain.astype(parameters.omega.dtype)
+    if "gain" in parts:
+        parts["gain"] = jnp.eye(3, dtype=parts["gain"].dtype) + parts["gain"].reshape(3, 3)
+        if gain is not None:
+            parts["gain"] = gain @ parts["gain"]
+    if "bias" in parts:
+        if gain is not None:
+            parts["bias"] = gain @ parts["bias"]
+        if gyroscope.bias is not None:
+            parts["bias"] = parts["bias"] + gyroscope.bias.astype(parts["bias"].dtype)
+    if "delay" in parts:
+        parts["delay"] = parts["delay"] + gyroscope.delay
+    return parts
 
 
 def _deviations(shown: Shown, count: int) -> Array:
@@ -490,7 +677,8 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
         slope = slope * jnp.where(jnp.arange(9) // 3 == 1, size, 1)[:, None]
         sizes = jnp.where(jnp.arange(linear.shared.shape[-1]) < count, size, 1)
         linear = linear._replace(shared=linear.shared * sizes[None, None])
-    shown = shown_by(linear, recording, bool(options.trust_noise))
+        solution = dataclasses.replace(solution, linear=linear)
+    shown = shown_by(solution, recording, noise_is_trusted(options))
     information, covariance, null, safe = shown[:4]
 
     full = jnp.concatenate([slope, jnp.zeros((9, information.shape[0] - count), dtype)], axis=1)
@@ -518,8 +706,9 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
             Finding.WEAK: jnp.any(spread[3:6] > 0.05),
             Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
             Finding.AXES_DISAGREE: _axes_disagree(recording, options),
-            Finding.SATURATED: saturated(recording),
-            Finding.OUTLIERS: has_outliers(linear.rest, recording.present, options.robust),
+            Finding.SATURATED: is_saturated(recording),
+            Finding.CALIBRATION: _calibration_strained(solution, recording),
+            Finding.OUTLIERS: has_outliers(linear.rest, recording, options.robust),
         }
     )
     body = InertiaEstimate(
@@ -536,7 +725,7 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
     return Fit(
         values=[tensor, *jax.tree.leaves(parameters.motion)],
         std=[symmetric_std(std.entries), *std.motion],
-        sensor=_sensor(parameters),
+        sensor=_sensor(parameters, solution.model.gyroscope),
         sensor_std=std.sensor,
         initial=_initial(parameters, recording, None),
         information=information,
@@ -558,7 +747,7 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
 def conclude_scene(solution: Solution, recording: Recording, options: FitOptions) -> Fit:
     """Values, uncertainty and diagnostics of one body's scene (under jit and vmap)."""
     linear, parameters = solution.linear, solution.parameters
-    shown = shown_by(linear, recording, bool(options.trust_noise))
+    shown = shown_by(solution, recording, noise_is_trusted(options))
     spread = _deviations(shown, linear.shared.shape[-1])
     std = _split(spread, 0, parameters)
     parts = by_kind(linear, recording)
@@ -571,15 +760,16 @@ def conclude_scene(solution: Solution, recording: Recording, options: FitOptions
             Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread)),
             Finding.NOT_WHITE: whiteness < 1e-4,
             Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
-            Finding.SATURATED: saturated(recording),
-            Finding.OUTLIERS: has_outliers(linear.rest, recording.present, options.robust),
+            Finding.SATURATED: is_saturated(recording),
+            Finding.CALIBRATION: _calibration_strained(solution, recording),
+            Finding.OUTLIERS: has_outliers(linear.rest, recording, options.robust),
         }
     )
     attitude = getattr(options.motion, "attitude", None)
     return Fit(
         values=list(parameters.motion),
         std=std.motion,
-        sensor=_sensor(parameters),
+        sensor=_sensor(parameters, solution.model.gyroscope),
         sensor_std=std.sensor,
         initial=_initial(parameters, recording, attitude),
         information=shown.information,
@@ -620,39 +810,26 @@ def sensor_axes(recording: Recording) -> Float[Array, "*b 3 3"]:
     return mixed @ inverse(square)
 
 
-def saturated(recording: Recording) -> Array:
-    """Whether an axis of the gyroscope stays at its greatest or least rate.
-
-    At least four samples and 1 % of all are equal to it, and five times as many as to the next
-    value: a coarse digitisation repeats both.
-    """
-    if recording.omega is None:
+def is_saturated(recording: Recording) -> Array:
+    """Whether readings of the gyroscope are at its limits."""
+    if recording.saturated is None:
         return jnp.asarray(False)
-    present = recording.present[..., None] > 0
-    omega, dtype = recording.omega, recording.omega.dtype
-    samples = jnp.sum(present.astype(dtype))
-
-    def clipped(values):
-        values = jnp.where(present, values, -jnp.inf)
-        greatest = jnp.max(values, axis=-2, keepdims=True)
-        equal = values == greatest
-        below = jnp.where(equal, -jnp.inf, values)
-        second = jnp.max(below, axis=-2, keepdims=True)
-        many = jnp.sum(equal.astype(dtype), axis=-2)
-        others = jnp.sum(((below == second) & jnp.isfinite(below)).astype(dtype), axis=-2)
-        enough = (many >= 4) & (many >= 0.01 * samples)
-        # of a constant rate there are no others, or rounding errors only
-        size = jnp.max(jnp.where(present, jnp.abs(omega), 0))
-        varies = jnp.isfinite(second[..., 0, :]) & (
-            greatest[..., 0, :] - jnp.min(jnp.where(present, values, jnp.inf), axis=-2)
-            > 1e-6 * size
-        )
-        return jnp.any(enough & (many >= 5 * others) & varies)
-
-    return clipped(omega) | clipped(-omega)
+    return jnp.any((recording.saturated != 0) & (recording.present[..., None] > 0))
 
 
-def has_outliers(rest: Array, present: Array, robust: Any) -> Array:
+def _calibration_strained(solution: Solution, recording: Recording) -> Array:
+    """Whether an unknown of the calibration is more than 3.5 standard deviations off its prior."""
+    far = jnp.asarray(False)
+    for name, precision in (
+        prior_of(solution.parameters, recording, solution.model)._asdict().items()
+    ):
+        if precision is not None:
+            value = getattr(solution.parameters, name)
+            far = far | jnp.any(value**2 * precision > 3.5**2)
+    return far
+
+
+def has_outliers(rest: Array, recording: Recording, robust: Any) -> Array:
     """Whether single residuals (r, t, c) are far off where the fit counts them by their square.
 
     Three at least and 0.3 % of all beyond five sigma, sigma from the median, their neighbours
@@ -660,7 +837,10 @@ def has_outliers(rest: Array, present: Array, robust: Any) -> Array:
     """
     if robust is not None:
         return jnp.asarray(False)
-    known = (present > 0)[..., None] & jnp.ones(rest.shape, bool)
+    known = (recording.present > 0)[..., None] & jnp.ones(rest.shape, bool)
+    if recording.saturated is not None:
+        # rates are the first channels; at a limit a residual may be zero
+        known = known.at[..., :3].set(known[..., :3] & (recording.saturated == 0))
     size = jnp.where(known, jnp.abs(rest), jnp.nan)
     scale = 1.4826 * jnp.nanmedian(size, axis=1, keepdims=True)
     far = jnp.nan_to_num(size / jnp.where(scale > 0, scale, jnp.inf))

@@ -7,10 +7,11 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from polhode.fit._gyroscope import WALK_KNOTS, Gyroscope
 from polhode.fit._linear import Linear, linearise, unknowns
 from polhode.fit._motion import AbstractMotion, FreeMotion, SteppedMotion
 from polhode.fit._optimiser import LevenbergMarquardt
-from polhode.fit._options import FitOptions
+from polhode.fit._options import FitOptions, noise_is_trusted
 from polhode.fit._parameters import (
     AbstractInertiaUnknown,
     Base,
@@ -21,8 +22,8 @@ from polhode.fit._parameters import (
     free_columns,
     whole_of,
 )
-from polhode.fit._recording import Recording, bridged, needed, turn_between
-from polhode.fit._residuals import Huber, Model
+from polhode.fit._recording import Recording, bridged, needed, size_of_data, turn_between
+from polhode.fit._residuals import Huber, Model, prior_cost, prior_of
 from polhode.fit._start import alternatives, regression, scatter
 from polhode.inertia import Inertia, inertia_of_second_moments, second_moments
 
@@ -35,6 +36,9 @@ _SPREAD = 0.1
 _GOOD = 1.5
 # Relative difference of two costs that are those of one optimum.
 _SAME = 1e-4
+# Part of the readings that always counts as noise beside the calibration's prior: without it
+# noise-free readings would leave the calibration free.
+_LEAST_NOISE = 1e-6
 # Distance from the optimum, in standard deviations, at which the optimiser stops.
 _OFFSET = 1e-4
 
@@ -78,6 +82,7 @@ def solve(recording: Recording, options: FitOptions) -> Solution:
     """Fit one body to its recordings (leading axis r). Pure; works under jit and vmap."""
     rates = _rates(recording)
     motion = FreeMotion() if options.motion is None else options.motion
+    gyroscope = Gyroscope() if options.gyroscope is None else options.gyroscope
     unknown = FullTensor() if options.unknown is None else options.unknown
     bases, first = _bases(recording, rates, motion, unknown, options.initial_inertia)
     scale_known = motion.fixes_scale()
@@ -86,7 +91,7 @@ def solve(recording: Recording, options: FitOptions) -> Solution:
     attitude = None if recording.wxyz is None else recording.wxyz[:, 0]
 
     def model_of(base):
-        return Model(motion, base, attitude, options.robust, fixed, scale_known)
+        return Model(motion, base, attitude, options.robust, fixed, scale_known, gyroscope)
 
     dtype = rates.dtype
     zero = jnp.zeros(3, dtype)
@@ -94,10 +99,10 @@ def solve(recording: Recording, options: FitOptions) -> Solution:
         shape=jnp.zeros(columns.shape[1], dtype),
         omega=rates[:, 0],
         attitude=None if attitude is None else jnp.zeros((rates.shape[0], 3), dtype),
-        bias=zero if options.bias else None,
         mounting=zero if options.mounting else None,
         lever=zero if recording.force is not None else None,
         motion=jax.tree.map(lambda x: jnp.asarray(x, dtype), motion.start()),
+        **_sensor_start(recording, gyroscope, options.bias, dtype),
     )
     scale = _scale(begin, recording, rates)
     # the optimiser counts in the default precision whatever that of the data
@@ -111,25 +116,45 @@ def solve(recording: Recording, options: FitOptions) -> Solution:
     solver = options.solver or LevenbergMarquardt(_OFFSET, float(jnp.finfo(dtype).eps) ** 0.75)
     expected = _expected(recording, options)
     # of one residual: 1 where the noise is known
-    noise = jnp.sqrt(expected / jnp.sum(recording.present) / (3 * _kinds(recording)))
+    noise = jnp.sqrt(expected / _data(recording))
     noise = jnp.where(jnp.isfinite(noise), noise, 0.1 / weight)
 
-    _, _, one_of = unknowns(begin, model_of(jax.tree.map(lambda leaf: leaf[0], bases)))
+    layout = unknowns(begin, model_of(jax.tree.map(lambda leaf: leaf[0], bases)))
+    count = _data(recording)
+    trusted = noise_is_trusted(options)
 
     @jax.jit
     def linear_at(shared, own, within, base):
         # traced once, however often the optimiser asks
-        return linearise(shared, own, one_of, within, model_of(base))
+        return linearise(shared, own, layout, within, model_of(base))
+
+    def prior_unit(linear):
+        """Noise of the residuals, the unit in which the calibration's prior is weighed.
+
+        With a known noise it is one. Else it is that of the present residuals: the sum of squares
+        is then proportional, to first order in 1/T, to the logarithm of the likelihood of an
+        unknown noise.
+        """
+        unit = jnp.ones((), dtype) if trusted else jnp.sqrt(jnp.sum(linear.rest**2) / count)
+        typical = 10 / weight / jnp.sqrt(count / rates.shape[0])
+        return jnp.maximum(unit, _LEAST_NOISE * typical)
 
     def misfits(scaled, job):
         base, within, belief = job
-        shared, own, _ = unknowns(actual(scaled), model_of(base))
+        parameters = actual(scaled)
+        values = unknowns(parameters, model_of(base))
         # The Jacobian is made here, once and by blocks: what the optimiser differentiates is linear
-        at = jax.lax.stop_gradient((shared, own))
+        at = jax.lax.stop_gradient((values.shared, values.own))
         linear = linear_at(*at, within, base)
-        misfit = linear.shifted(shared - at[0], own - at[1])
-        prior = belief * scaled.shape.astype(dtype)
-        return (weight * jnp.concatenate([misfit.ravel(), prior])).astype(wide), linear
+        misfit = linear.shifted(values.shared - at[0], values.own - at[1])
+        prior = prior_of(parameters, recording, model_of(base))
+        unit = jax.lax.stop_gradient(prior_unit(linear))
+        rows = [misfit.ravel(), belief * scaled.shape.astype(dtype)]
+        for name, precision in prior._asdict().items():
+            if precision is not None:
+                value = getattr(parameters, name)
+                rows.append((unit * jnp.sqrt(precision) * value).ravel())
+        return (weight * jnp.concatenate(rows)).astype(wide), linear
 
     jobs = _jobs(bases.soft.shape[0], options.max_starts)
     which, part = (jnp.asarray(column) for column in (jobs["base"], jobs["part"]))
@@ -153,6 +178,9 @@ def solve(recording: Recording, options: FitOptions) -> Solution:
         # the auxiliary output of the last accepted step; ``found.aux`` is that of the one before
         linear = found.state.aux
         cost = jnp.sum(linear.rest**2) / 2
+        cost = cost + prior_unit(linear) ** 2 * prior_cost(
+            actual(found.value), recording, model_of(base)
+        )
         whole = part[job] == 1
         better = whole & (cost < search.cost)
         # two starts that lead to one place leave little hope for a third
@@ -178,13 +206,33 @@ def solve(recording: Recording, options: FitOptions) -> Solution:
         jnp.asarray(0), fresh, fresh, one, nothing, jnp.asarray(jnp.inf, dtype),
         jnp.asarray(0), jnp.asarray(0), jnp.asarray(False), jnp.asarray(False),
     )  # fmt: skip
-    count = len(jobs["base"])
-    ended = jax.lax.while_loop(lambda s: (s.job < count) & ~s.good, attempt, begun)
+    last = len(jobs["base"])
+    ended = jax.lax.while_loop(lambda s: (s.job < last) & ~s.good, attempt, begun)
     model = model_of(ended.base)
     return Solution(
         actual(ended.best), model, whole_of(ended.linear.at, model.entries), ended.linear,
         ended.cost, ended.steps, ended.attempts, ended.stopped, expected,
     )  # fmt: skip
+
+
+def _sensor_start(
+    recording: Recording, gyroscope: Gyroscope, bias: bool, dtype: jnp.dtype
+) -> dict[str, Array | None]:
+    """The unknowns of the gyroscope, at their calibrated values; none without its readings."""
+    if recording.omega is None:
+        return {}
+    walk = (recording.times.shape[0], WALK_KNOTS, 3)
+    return {
+        "bias": jnp.zeros(3, dtype) if bias or gyroscope.bias_std else None,
+        "gain": jnp.zeros(9, dtype) if gyroscope.gain_std.any() else None,
+        "delay": jnp.zeros((), dtype) if gyroscope.delay_std else None,
+        "walk": jnp.zeros(walk, dtype) if gyroscope.bias_walk else None,
+    }
+
+
+def _data(recording: Recording) -> Float[Array, ""]:
+    """How many numbers were measured."""
+    return size_of_data(recording, 3 * _kinds(recording))
 
 
 def _jobs(bases: int, attempts: int) -> dict[str, np.ndarray]:
@@ -213,8 +261,8 @@ def _expected(recording: Recording, options: FitOptions) -> Float[Array, ""]:
 
     An unknown noise is taken from neighbouring samples; without rates nothing is known of it.
     """
-    expected = jnp.sum(recording.present) * 3 * _kinds(recording)
-    if options.trust_noise:
+    expected = _data(recording)
+    if noise_is_trusted(options):
         return expected
     if recording.omega is None:
         return jnp.full_like(expected, jnp.inf)
@@ -307,6 +355,9 @@ def _scale(begin: Parameters, recording: Recording, rates: Array) -> Parameters:
         mounting=like(begin.mounting, one),
         lever=like(begin.lever, length),
         motion=jax.tree.map(_size, begin.motion),
+        gain=like(begin.gain, jnp.asarray(0.1, rates.dtype)),
+        delay=like(begin.delay, jnp.mean(jnp.diff(recording.times))),
+        walk=like(begin.walk, typical),
     )
 
 
