@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from polhode._batch import PARTS, common_batch, flatten, lane_times
 from polhode._checks import is_concrete
-from polhode._closed_forms import LAWS, ClosedForm, lawful
+from polhode._closed_forms import CLOSED_FORMS, ClosedForm, choose_closed_form
 from polhode._method._base import AbstractMethod, Record
 from polhode._scene import GravityGradient, Scene, State, UniformGravity
 from polhode.inertia import Symmetry
@@ -102,7 +102,7 @@ class Ways(NamedTuple):
 
 def ways_of(scene: Scene, state: State, record: Record) -> Ways:
     """The ways that the planner chooses from."""
-    law, _ = lawful(scene, state, record)
+    law, _ = choose_closed_form(scene, state, record)
     if law is None:
         upright = scene.torque is None and _is_upright(scene.potential)
         says = (
@@ -111,12 +111,16 @@ def ways_of(scene: Scene, state: State, record: Record) -> Ways:
         )
         both = tuple(_stepped(upright, compensated) for compensated in (False, True))
         also = says + ", its rounding carried along: it would miss rtol"
-        of_state = any(law.of_state and law.method.objection(scene) is None for law in LAWS)
+        of_state = any(law.of_state and law.method.objection(scene) is None for law in CLOSED_FORMS)
         return Ways(both, (says, also), 1.5, 1.5, 2000, of_state)
     if not scene.is_free or scene.inertia.symmetry is not Symmetry.NONE:
-        return Ways((law.method, law.method), (law.says, law.says), of_state=law.of_state)
-    also = law.says + ", its frequencies in sums of two floats: a rounded phase would miss rtol"
-    return Ways((law.method, _COMPENSATED), (law.says, also), 1.0, 10.0)
+        return Ways(
+            (law.method, law.method), (law.explanation, law.explanation), of_state=law.of_state
+        )
+    also = (
+        law.explanation + ", its frequencies in sums of two floats: a rounded phase would miss rtol"
+    )
+    return Ways((law.method, _COMPENSATED), (law.explanation, also), 1.0, 10.0)
 
 
 _COMPENSATED = ClosedForm(compensated=True)
@@ -186,7 +190,7 @@ def plan(
     if method is None:
         method, reason = choose(scene, state, record, rtol, ts)
         if not method.exact:
-            _, refused = lawful(scene, state, record)
+            _, refused = choose_closed_form(scene, state, record)
             reason = f"{reason}; {_steps(method, scene, state, ts, record)}"
     parts = (getattr(scene, name) for name in PARTS)
     bodies = int(np.prod(common_batch(*parts, state, extra=(ts.shape[:-1],)), dtype=int))

@@ -13,7 +13,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 import top_cases
 
 import polhode as ph
-from polhode._closed_forms import LagrangeTop, tops
+from polhode._closed_forms import LagrangeTop
+from polhode._closed_forms._lagrange_top import lagrange_motion
 from polhode._scene import Rotor, UniformGravity
 
 NAMES = list(top_cases.CASES)
@@ -28,7 +29,7 @@ def moved(numbers, t):
     q = q / jnp.sqrt(jnp.sum(q * q, axis=-1, keepdims=True))
     zero = jnp.zeros_like(pull)
     force = jnp.stack([zero, zero, -pull], axis=-1)
-    wxyz, rates = tops.lagrange_motion(
+    wxyz, rates = lagrange_motion(
         a, force, jnp.ones_like(pull), q, omega, c * omega[:, 2], t[:, None]
     )
     return jnp.concatenate([rates[:, 0], wxyz[:, 0]], axis=-1).T

@@ -8,5 +8,9 @@ from polhode._closed_forms._free_periods import (
     periods as periods,
     principal_periods as principal_periods,
 )
-from polhode._closed_forms._lagrange import LagrangeTop as LagrangeTop
-from polhode._closed_forms._table import LAWS as LAWS, Law as Law, lawful as lawful
+from polhode._closed_forms._lagrange_top import LagrangeTop as LagrangeTop
+from polhode._closed_forms._table import (
+    CLOSED_FORMS as CLOSED_FORMS,
+    Solution as Solution,
+    choose_closed_form as choose_closed_form,
+)

@@ -1,31 +1,33 @@
-"""Driven and damped spin in elementary functions as methods: symmetric tops, a fixed axis."""
+"""Symmetric tops and bodies on a fixed axis: driven and damped spin in elementary functions."""
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from polhode import rotation
 from polhode._checks import is_concrete
-from polhode._closed_forms import tops
-from polhode._closed_forms._closed_form import AbstractTopMethod
-from polhode._closed_forms._conditions import (
+from polhode._closed_forms._closed_form import (
+    AbstractClosedForm,
     as_lanes,
-    axial_start,
-    axial_wheels,
+    axial_state,
+    bodies_per_chunk,
     broadcast,
-    not_linear,
-    not_symmetric,
-    push_and_damping,
-    steady_wheels,
+    run_in_chunks,
+    symmetry_objection,
+    torque_and_damping,
+    torque_objection,
+    wheel_objection,
+    wheels_have_constant_momentum,
 )
 from polhode._kernels import derivable_once
-from polhode._method._base import Record
+from polhode._method._base import Record, Samples
 from polhode._scene import Scene, State
+from polhode.rotation import multiply, rotation_vector_to_wxyz
 
 
-class SymmetricTop(AbstractTopMethod):
+class SymmetricTop(AbstractClosedForm):
     """A symmetric body without potential, in elementary functions: exact.
 
     Constant torque about the axis of symmetry (body z), linear damping symmetric about it and
@@ -37,17 +39,17 @@ class SymmetricTop(AbstractTopMethod):
     chunk: int = eqx.field(static=True, default=2**14)
 
     def why_not(self, scene: Scene, state: State, record: Record) -> str | None:
-        refusal = self.objection(scene) or not_symmetric(scene) or axial_wheels(scene)
+        refusal = self.objection(scene) or symmetry_objection(scene) or wheel_objection(scene)
         if refusal is not None:
             return refusal
         if not is_concrete(scene.torque):
             return "the torques are not known to be symmetric about body z"
-        push, damping = (np.asarray(x) for x in push_and_damping(scene))
-        if np.any(push[..., :2] != 0) or np.any(damping[..., 0] != damping[..., 1]):
+        torque, damping = (np.asarray(x) for x in torque_and_damping(scene))
+        if np.any(torque[..., :2] != 0) or np.any(damping[..., 0] != damping[..., 1]):
             return "a torque is not symmetric about body z"
         if not record.attitude:
             return None
-        if np.any(push != 0):
+        if np.any(torque != 0):
             return "the attitude of a driven body is not elementary (ph.Record(attitude=False))"
         if np.any(damping != 0):
             if scene.rotors is not None:
@@ -57,41 +59,56 @@ class SymmetricTop(AbstractTopMethod):
         return None
 
     def objection(self, scene: Scene) -> str | None:
-        return not_linear(scene) or (
+        return torque_objection(scene) or (
             None if scene.inertia.is_principal else "the body axes are not known to be principal"
         )
 
+    def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
+        del rtol
+        self.refuse(scene)
+        return run_in_chunks(self._motion, self._size, scene, state, ts, record)
+
+    def _size(self, n: int, count: int) -> int:
+        return bodies_per_chunk(self.chunk, n, count)
+
     def _motion(self, scene, state, elapsed):
         n = state.wxyz.shape[0]
-        transverse, moments, axial = axial_start(scene, state)
-        push, damping = (as_lanes(x, n, 1) for x in push_and_damping(scene))
-        own = moments[:, 2]
-        carried = axial - own * state.omega_body[:, 2]
-        fading, slowing = damping[:, 0] / transverse, damping[:, 2] / own
-        spin, angle = tops.spin(
-            state.omega_body[:, 2, None], slowing[:, None], (push[:, 2] / own)[:, None], elapsed
+        transverse, moments, axial = axial_state(scene, state)
+        torque, damping = (as_lanes(x, n, 1) for x in torque_and_damping(scene))
+        axial_moment = moments[:, 2]
+        wheel_momentum = axial - axial_moment * state.omega_body[:, 2]
+        transverse_decay, axial_decay = damping[:, 0] / transverse, damping[:, 2] / axial_moment
+        spin, angle = driven_spin(
+            state.omega_body[:, 2, None],
+            axial_decay[:, None],
+            (torque[:, 2] / axial_moment)[:, None],
+            elapsed,
         )
         # W = omega_x + i omega_y obeys A dW/dt = i ((C - A) omega_z + h) W - c W
-        turned = ((own - transverse) / transverse)[:, None] * angle
-        turned = turned + (carried / transverse)[:, None] * elapsed
-        c, s = jnp.cos(turned), jnp.sin(turned)
-        shrink = jnp.exp(-fading[:, None] * elapsed)
+        phase = ((axial_moment - transverse) / transverse)[:, None] * angle
+        phase = phase + (wheel_momentum / transverse)[:, None] * elapsed
+        c, s = jnp.cos(phase), jnp.sin(phase)
+        shrinkage = jnp.exp(-transverse_decay[:, None] * elapsed)
         x, y = state.omega_body[:, 0, None], state.omega_body[:, 1, None]
-        omega = jnp.stack([shrink * (x * c - y * s), shrink * (x * s + y * c), spin], axis=-1)
-        flat = jnp.stack([transverse, transverse], axis=-1) * state.omega_body[:, :2]
-        momentum = jnp.concatenate([flat, axial[:, None]], axis=-1)
-        wxyz = tops.precession(
+        omega = jnp.stack([shrinkage * (x * c - y * s), shrinkage * (x * s + y * c), spin], axis=-1)
+        transverse_momentum = jnp.stack([transverse, transverse], axis=-1) * state.omega_body[:, :2]
+        momentum = jnp.concatenate([transverse_momentum, axial[:, None]], axis=-1)
+        wxyz = precession(
             state.wxyz,
             rotation.rotate(state.wxyz, momentum),
             transverse,
             state.omega_body[:, 2] - axial / transverse,
-            tops.decay(fading[:, None], elapsed),
+            decay(transverse_decay[:, None], elapsed),
         )
-        lawful = (moments[:, 0] == moments[:, 1]) & jnp.all(push[:, :2] == 0, axis=-1)
-        lawful = lawful & (damping[:, 0] == damping[:, 1]) & steady_wheels(scene, n)
-        keeps = (push[:, 2] == 0) & _equal(fading, slowing) & ((carried == 0) | (fading == 0))
-        wxyz = jnp.where(keeps[:, None, None], wxyz, jnp.nan)
-        return wxyz, omega, lawful
+        holds = (moments[:, 0] == moments[:, 1]) & jnp.all(torque[:, :2] == 0, axis=-1)
+        holds = holds & (damping[:, 0] == damping[:, 1]) & wheels_have_constant_momentum(scene, n)
+        direction_is_constant = (
+            (torque[:, 2] == 0)
+            & _equal(transverse_decay, axial_decay)
+            & ((wheel_momentum == 0) | (transverse_decay == 0))
+        )
+        wxyz = jnp.where(direction_is_constant[:, None, None], wxyz, jnp.nan)
+        return wxyz, omega, holds
 
 
 def _equal(a: Array, b: Array) -> Array:
@@ -105,7 +122,7 @@ def _proportional(scene: Scene, damping) -> bool:
     return bool(np.all(_equal(rates[..., 0], rates[..., 2])))
 
 
-class FixedAxis(AbstractTopMethod):
+class FixedAxis(AbstractClosedForm):
     """Spin about one principal axis that stays fixed, driven and damped: exact.
 
     All rates but one are zero at the start, the constant body torques lie along that axis and the
@@ -124,10 +141,10 @@ class FixedAxis(AbstractTopMethod):
         if not is_concrete(scene.torque, state.omega_body):
             return "the rates are not known to lie along one principal axis"
         with jax.ensure_compile_time_eval():  # known numbers, also inside of jit
-            push, _ = push_and_damping(scene)
-            acting = broadcast(np.asarray(push) != 0, np.asarray(state.omega_body) != 0)
-            used = np.logical_or(*map(np.asarray, acting))
-        if np.any(used.sum(axis=-1) > 1):
+            torque, _ = torque_and_damping(scene)
+            acting = broadcast(np.asarray(torque) != 0, np.asarray(state.omega_body) != 0)
+            is_axis = np.logical_or(*map(np.asarray, acting))
+        if np.any(is_axis.sum(axis=-1) > 1):
             return "rates or torques do not lie along one principal axis"
         return None
 
@@ -136,30 +153,103 @@ class FixedAxis(AbstractTopMethod):
             return "rotors turn in the body"
         if not scene.inertia.is_principal:
             return "the body axes are not known to be principal"
-        return not_linear(scene)
+        return torque_objection(scene)
+
+    def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
+        del rtol
+        self.refuse(scene)
+        return run_in_chunks(self._motion, self._size, scene, state, ts, record)
+
+    def _size(self, n: int, count: int) -> int:
+        return bodies_per_chunk(self.chunk, n, count)
 
     def _motion(self, scene, state, elapsed):
         n = state.wxyz.shape[0]
-        push, damping = (as_lanes(x, n, 1) for x in push_and_damping(scene))
+        torque, damping = (as_lanes(x, n, 1) for x in torque_and_damping(scene))
         moments = as_lanes(scene.inertia.moments, n, 1)
-        used = (push != 0) | (state.omega_body != 0)
-        later = elapsed[:, :, None] * jnp.ones_like(moments)[:, None]
-        axis = jnp.argmax(used, axis=-1)
+        is_axis = (torque != 0) | (state.omega_body != 0)
+        times = elapsed[:, :, None] * jnp.ones_like(moments)[:, None]
+        axis = jnp.argmax(is_axis, axis=-1)
         along = jnp.arange(3)[None] == axis[:, None]
-        moving = jnp.any(used, axis=-1, keepdims=True)
+        is_moving = jnp.any(is_axis, axis=-1, keepdims=True)
         # Across the axis of a body that turns nothing is differentiated; at rest the equations are
         # coupled in second order only.
-        held = jax.lax.stop_gradient
-        rates, push = (jnp.where(along | ~moving, x, held(x)) for x in (state.omega_body, push))
-        both = jnp.concatenate([rates, push], axis=-1)
-        resting = jnp.broadcast_to(~moving, both.shape)
-        once = jnp.sum(derivable_once(both, resting) - both, axis=-1, keepdims=True)  # zero
-        omega, angles = tops.spin(
-            (rates + once)[:, None],
-            (damping / moments)[:, None],
-            (push / moments)[:, None],
-            later,
+        constant = jax.lax.stop_gradient
+        rates, torque = (
+            jnp.where(along | ~is_moving, x, constant(x)) for x in (state.omega_body, torque)
         )
-        turn = rotation.rotation_vector_to_wxyz(angles)  # regular at rest
-        wxyz = rotation.multiply(jnp.broadcast_to(state.wxyz[:, None], turn.shape), turn)
-        return wxyz, omega, jnp.sum(used, axis=-1) <= 1
+        both = jnp.concatenate([rates, torque], axis=-1)
+        at_rest = jnp.broadcast_to(~is_moving, both.shape)
+        zero_with_derivative = jnp.sum(
+            derivable_once(both, at_rest) - both, axis=-1, keepdims=True
+        )  # zero
+        omega, angles = driven_spin(
+            (rates + zero_with_derivative)[:, None],
+            (damping / moments)[:, None],
+            (torque / moments)[:, None],
+            times,
+        )
+        rotations = rotation.rotation_vector_to_wxyz(angles)  # regular at rest
+        wxyz = rotation.multiply(jnp.broadcast_to(state.wxyz[:, None], rotations.shape), rotations)
+        return wxyz, omega, jnp.sum(is_axis, axis=-1) <= 1
+
+
+def decay(rate: Array, t: Array) -> Array:
+    """(1 - exp(-k t))/k, t at k = 0: the integral of exp(-k t) [s]."""
+    x = rate * t
+    near = jnp.abs(x) < 0.5
+    far = jnp.where(near, 1, x)
+    return t * jnp.where(near, _series(x, 1), -jnp.expm1(-far) / far)
+
+
+def decay_twice(rate: Array, t: Array) -> Array:
+    """(t - decay)/k, t^2/2 at k = 0: the integral of ``decay`` [s^2]."""
+    x = rate * t
+    near = jnp.abs(x) < 0.5
+    far = jnp.where(near, 1, x)
+    return t * t * jnp.where(near, _series(x, 2), (far + jnp.expm1(-far)) / (far * far))
+
+
+def _series(x: Array, first: int) -> Array:
+    """Sum of (-x)^n/(n + first)! for |x| < 1/2."""
+    total, n = jnp.ones_like(x), 14
+    for k in range(n + first, first, -1):
+        total = 1 - x * total / k
+    return total / first
+
+
+def driven_spin(
+    start: Array, rate: Array, gain: Array, t: Array
+) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
+    """Rate [rad/s] and angle [rad] of ds/dt = gain - rate s from s = ``start``."""
+    decayed = decay(rate, t)
+    return start * jnp.exp(-rate * t) + gain * decayed, start * decayed + gain * decay_twice(
+        rate, t
+    )
+
+
+def rotation_about(axis: tuple[Array, Array, Array], angle: Array) -> Float[Array, "*b 4"]:
+    """Unit quaternion of a turn by ``angle`` [rad] about the unit ``axis``."""
+    c, s = jnp.cos(angle / 2), jnp.sin(angle / 2)
+    return jnp.stack(jnp.broadcast_arrays(c, *(s * a for a in axis)), axis=-1)
+
+
+def precession(
+    wxyz: Float[Array, "*b 4"],
+    momentum_space: Float[Array, "*b 3"],
+    transverse: Array,
+    axial_rate: Array,
+    elapsed: Float[Array, "*b t"],
+) -> Float[Array, "*b t 4"]:
+    """Attitude of a symmetric body whose momentum keeps its direction (regular precession).
+
+    The axis turns about ``momentum_space`` at |L|/A while the body turns about its axis at
+    ``axial_rate`` = omega_z - L_z/A [rad/s]; ``elapsed``: time, or the integral of the factor by
+    which both decay.
+    """
+    rate = momentum_space / transverse[..., None]
+    outer = rotation_vector_to_wxyz(rate[..., None, :] * elapsed[..., None])  # regular at rest
+    zero = jnp.zeros_like(elapsed)
+    inner = rotation_about((zero, zero, zero + 1), axial_rate[..., None] * elapsed)
+    start = jnp.broadcast_to(wxyz[..., None, :], outer.shape)
+    return multiply(multiply(outer, start), inner)

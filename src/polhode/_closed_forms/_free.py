@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from polhode import rotation
 from polhode._batch import PARTS, map_chunks
-from polhode._closed_forms._closed_form import AbstractExact, with_first
+from polhode._closed_forms._closed_form import AbstractClosedForm, with_first
 from polhode._closed_forms._free_derivatives import EvaluatedMotion, results_rule
 from polhode._closed_forms._free_motion import (
     FreeConstants,
@@ -47,7 +47,7 @@ _LANES = 512
 """Bodies whose constants stay in a core's cache while it moves them to many times."""
 
 
-class ClosedForm(AbstractExact):
+class ClosedForm(AbstractClosedForm):
     """The exact free motion in Jacobi elliptic functions, O(1) in time, for every inertia.
 
     Bodies known to be axisymmetric or spherical (``ph.Inertia.axisymmetric``, ``spherical``) use

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from polhode import rotation
-from polhode._closed_forms import tops
+from polhode._closed_forms._lagrange_top import upward
 from polhode._hamiltonian import (
     Attitude,
     Dynamics,
@@ -154,7 +154,7 @@ def _upright(field: UniformGravity | GravityGradient) -> tuple[Array, AbstractPo
         mass, gravity = jnp.asarray(field.mass), field.gravity_space
         lead = jnp.broadcast_shapes(mass.shape, gravity.shape[:-1])
         force = mass[..., None] * jnp.broadcast_to(gravity, (*lead, 3))
-    (w, x, y), size = tops.upward(components(force))
+    (w, x, y), size = upward(components(force))
     zero = jnp.zeros_like(size)
     along = jnp.stack([zero, zero, size], axis=-1)
     turn = jnp.stack([w, x, y, zero], axis=-1)

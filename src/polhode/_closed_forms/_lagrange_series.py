@@ -3,7 +3,9 @@
 theta1(z) with nome q is, up to constants and a factor exp(-iz), the product (a; h)(h/a; h) with
 a = exp(2iz), h = q^2 (Jacobi's triple product, NIST DLMF 20.5.1). Written so it depends on a and
 h/a, both of which are regular where the amplitude of a motion vanishes.
-"""
+
+Complex numbers are pairs of real arrays: real and complex mix freely, nothing is promoted, and XLA
+makes vector code of them."""
 
 from typing import NamedTuple
 
@@ -12,8 +14,76 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode._closed_forms._elliptic import nome_per_parameter, theta3_squared_less_one
-from polhode._closed_forms.tops._complex import Complex
 from polhode._kernels import staged
+
+
+class Complex(NamedTuple):
+    """``re + i im``; the other operand of + - * may be a real array or a number."""
+
+    re: Array
+    im: Array
+
+    def __add__(self, other):
+        if isinstance(other, Complex):
+            return Complex(self.re + other.re, self.im + other.im)
+        return Complex(self.re + other, self.im)
+
+    def __mul__(self, other):
+        if isinstance(other, Complex):
+            return Complex(
+                self.re * other.re - self.im * other.im, self.re * other.im + self.im * other.re
+            )
+        return Complex(self.re * other, self.im * other)
+
+    __radd__, __rmul__ = __add__, __mul__
+
+    def __neg__(self):
+        return Complex(-self.re, -self.im)
+
+    def __sub__(self, other):
+        return self + (-other)
+
+    def __rsub__(self, other):
+        return -self + other
+
+    @property
+    def conj(self) -> "Complex":
+        return Complex(self.re, -self.im)
+
+    @property
+    def square(self) -> Array:
+        """|z|^2."""
+        return self.re * self.re + self.im * self.im
+
+    @property
+    def inverse(self) -> "Complex":
+        scale = 1 / self.square
+        return Complex(self.re * scale, -self.im * scale)
+
+    @property
+    def times_i(self) -> "Complex":
+        return Complex(-self.im, self.re)
+
+    @property
+    def root(self) -> "Complex":
+        """Principal square root of a number off the negative real axis, |arg| < 2 pi/3 or so."""
+        re = jnp.sqrt((jnp.sqrt(self.square) + self.re) / 2)
+        return Complex(re, self.im / (2 * re))
+
+    def at(self, lanes) -> "Complex":
+        """The parts indexed alike."""
+        return Complex(self.re[lanes], self.im[lanes])
+
+
+def unit(angle: Array) -> Complex:
+    """exp(i angle)."""
+    return Complex(jnp.cos(angle), jnp.sin(angle))
+
+
+def where(condition: Array, a: Complex, b: Complex) -> Complex:
+    """Elementwise choice."""
+    return Complex(jnp.where(condition, a.re, b.re), jnp.where(condition, a.im, b.im))
+
 
 _TERMS = 5
 
@@ -23,55 +93,57 @@ class Series(NamedTuple):
 
     h: Array
     weights: tuple[Array, ...]
-    slopes: tuple[Array, ...]
+    derivatives: tuple[Array, ...]
 
 
 class Curve(NamedTuple):
     """One elliptic curve: ``h`` = q^2 <= exp(-2 pi), and what the map of its points needs.
 
     ``square`` is lambda^2, lambda the modulus after one descending Landen step; ``steps`` are
-    lambda'/lambda^2 of the next ones, ``step_slopes`` their derivatives with respect to ``square``;
-    ``per`` is q/lambda; ``stretch`` is theta3(h)^2.
+    lambda'/lambda^2 of the next ones, ``step_derivatives`` their derivatives with respect to
+    ``square``; ``per`` is q/lambda; ``stretch`` is theta3(h)^2.
     """
 
     h: Array
     square: Array
     steps: tuple[Array, Array, Array]
-    step_slopes: tuple[Array, Array, Array]
+    step_derivatives: tuple[Array, Array, Array]
     per: Array
     stretch: Array
     series: Series
 
 
 def _series(h: Array) -> Series:
-    weights, slopes = [jnp.ones_like(h)], [jnp.zeros_like(h)]
-    power, power_slope = jnp.ones_like(h), jnp.zeros_like(h)  # h^k and its derivative
+    weights, derivatives = [jnp.ones_like(h)], [jnp.zeros_like(h)]
+    power, power_derivative = jnp.ones_like(h), jnp.zeros_like(h)  # h^k and its derivative
     for k in range(_TERMS):
         above, below = weights[-1] * power, 1 / (1 - power * h)
-        rise = slopes[-1] * power + weights[-1] * power_slope
-        slopes.append(-(rise + above * ((k + 1) * power * below)) * below)
+        h_derivative = derivatives[-1] * power + weights[-1] * power_derivative
+        derivatives.append(-(h_derivative + above * ((k + 1) * power * below)) * below)
         weights.append(-above * below)
-        power, power_slope = power * h, (k + 1) * power
-    return Series(h, tuple(weights), tuple(slopes))
+        power, power_derivative = power * h, (k + 1) * power
+    return Series(h, tuple(weights), tuple(derivatives))
 
 
 def _curve(square: Array) -> Curve:
     per_square = nome_per_parameter(square, jnp.sqrt(jnp.sqrt(1 - square)))
     h = square * per_square
-    steps, slopes = [], []
-    modulus, rise = square, jnp.ones_like(square)
+    steps, derivatives = [], []
+    modulus, modulus_derivative = square, jnp.ones_like(square)
     for _ in range(3):
         root = jnp.sqrt(1 - modulus)
         steps.append(1 / (1 + root) ** 2)
-        slopes.append(steps[-1] / ((1 + root) * root) * rise)
-        grown = steps[-1] * modulus
-        rise = 2 * grown * (slopes[-1] * modulus + steps[-1] * rise)
-        modulus = grown * grown
+        derivatives.append(steps[-1] / ((1 + root) * root) * modulus_derivative)
+        next_modulus = steps[-1] * modulus
+        modulus_derivative = (
+            2 * next_modulus * (derivatives[-1] * modulus + steps[-1] * modulus_derivative)
+        )
+        modulus = next_modulus * next_modulus
     return Curve(
         h,
         square,
         tuple(steps),
-        tuple(slopes),
+        tuple(derivatives),
         jnp.sqrt(per_square),
         1 + theta3_squared_less_one(h),
         _series(h),
@@ -87,21 +159,23 @@ def curve(square: Array, one: Array) -> Curve:
 @curve.defjvp
 def _curve_rule(primals, tangents):
     square, one = primals
-    _, slopes = jax.jvp(_curve, (square,), (jnp.ones_like(square),))
-    return curve(*primals), jax.tree.map(lambda slope: slope * tangents[0], staged(slopes, one))
+    _, derivatives = jax.jvp(_curve, (square,), (jnp.ones_like(square),))
+    return curve(*primals), jax.tree.map(
+        lambda derivative: derivative * tangents[0], staged(derivatives, one)
+    )
 
 
 def _polynomial(a: Complex, coefficients) -> Complex:
     """Polynomial with real coefficients, lowest first (Knuth, TAOCP 2, 4.6.4: all of it real)."""
     twice, square = 2 * a.re, a.square
-    *rest, ahead, last = coefficients
+    *lower, ahead, last = coefficients
     ahead = ahead + twice * last
-    for weight in reversed(rest[1:]):
+    for weight in reversed(lower[1:]):
         ahead, last = weight + twice * ahead - square * last, ahead
-    return Complex(rest[0] + a.re * ahead - square * last, a.im * ahead)
+    return Complex(lower[0] + a.re * ahead - square * last, a.im * ahead)
 
 
-def _first(coefficients):
+def _derivative_of(coefficients):
     """Coefficients of the derivative."""
     return [k * w for k, w in enumerate(coefficients) if k > 0]
 
@@ -109,38 +183,40 @@ def _first(coefficients):
 def _pair(total: Array, times: Array, weights) -> tuple[Array, Array]:
     # On a and b, roots of z^2 - total z + times, a polynomial is linear in z (Knuth's scheme).
     def line(coefficients):
-        *rest, ahead, last = coefficients
+        *lower, ahead, last = coefficients
         ahead = ahead + total * last
-        for weight in reversed(rest[1:]):
+        for weight in reversed(lower[1:]):
             ahead, last = weight + total * ahead - times * last, ahead
-        return rest[0] - times * last, ahead
+        return lower[0] - times * last, ahead
 
-    (low, high), (slope, bend) = line(weights), line(_first(weights))
-    twist = slope * low + (bend * low) * total + times * (bend * high)
+    (low, high), (derivative, second_derivative) = line(weights), line(_derivative_of(weights))
+    twist = (
+        derivative * low + (second_derivative * low) * total + times * (second_derivative * high)
+    )
     return low * low + (low * high) * total + times * (high * high), twist
 
 
 @jax.custom_jvp
 def pair(
-    total: Array, times: Array, rise: Array, series: Series, one: Array
+    total: Array, times: Array, h_derivative: Array, series: Series, one: Array
 ) -> tuple[Array, Array]:
     """(a; h)(b; h), and T in a d/da log (a; h) - b d/db log (b; h) = T (a - b)/((a; h)(b; h)).
 
-    Real functions of the sum and the product of a and b; the product is a function of h, of slope
-    ``rise``.
+    Real functions of the sum and the product of a and b; the product is a function of h, of
+    derivative ``h_derivative``.
     """
     return staged(_pair(total, times, series.weights), one)
 
 
 @pair.defjvp
 def _pair_rule(primals, tangents):
-    total, times, rise, series, one = primals
+    total, times, h_derivative, series, one = primals
     unit, still = jnp.ones_like(total), jnp.zeros_like(times)
     _, by_total = jax.jvp(lambda s: _pair(s, times, series.weights), (total,), (unit,))
     _, by_h = jax.jvp(
         lambda s, p, w: _pair(s, p, w),
         (total, times, series.weights),
-        (jnp.zeros_like(total), still + rise, series.slopes),
+        (jnp.zeros_like(total), still + h_derivative, series.derivatives),
     )
     by_total, by_h = staged((by_total, by_h), one)
     ds, dh = tangents[0], tangents[3].h  # the coefficients depend on h alone
@@ -150,7 +226,7 @@ def _pair_rule(primals, tangents):
 @jax.custom_jvp
 def unpaired(a: Complex, b: Complex, series: Series, one: Array) -> tuple[Complex, Complex]:
     """(a; h)(b; h), and a d/da less b d/db of it (Euler's series, DLMF 17.2.37)."""
-    first = _first(series.weights)
+    first = _derivative_of(series.weights)
     x, y = _polynomial(a, series.weights), _polynomial(b, series.weights)
     dx, dy = a * _polynomial(a, first), b * _polynomial(b, first)
     x, y, dx, dy = staged((x, y, dx, dy), one)
@@ -158,16 +234,19 @@ def unpaired(a: Complex, b: Complex, series: Series, one: Array) -> tuple[Comple
 
 
 @unpaired.defjvp
-def _apart_rule(primals, tangents):
+def _unpaired_rule(primals, tangents):
     a, b, series, one = primals
     da, db, dh = *tangents[:2], tangents[2].h
 
     def parts(a):
-        first = _first(series.weights)
-        value, rise = _polynomial(a, series.weights), _polynomial(a, first)
-        bend = rise + a * _polynomial(a, _first(first))
-        by_h = _polynomial(a, series.slopes), a * _polynomial(a, _first(series.slopes))
-        return staged((value, rise, a * rise, bend, *by_h), one)
+        first = _derivative_of(series.weights)
+        value, derivative = _polynomial(a, series.weights), _polynomial(a, first)
+        second_derivative = derivative + a * _polynomial(a, _derivative_of(first))
+        by_h = (
+            _polynomial(a, series.derivatives),
+            a * _polynomial(a, _derivative_of(series.derivatives)),
+        )
+        return staged((value, derivative, a * derivative, second_derivative, *by_h), one)
 
     x, x1, dx, dx1, xh, dxh = parts(a)
     y, y1, dy, dy1, yh, dyh = parts(b)
@@ -197,45 +276,58 @@ def _descend(e: Complex, partner: Complex, c: Curve, one: Array) -> Complex:
 
 def _levels(e: Complex, partner: Complex, c: Curve, one: Array):
     """e, its partner and (1 + partner)/(1 + e) of each level; of the last the roots of 1 + both."""
-    found = []
+    levels = []
     for step in c.steps[1:]:
         ratio = staged((1 + partner) * (1 + e).inverse, one)
-        found.append((e, partner, ratio))
+        levels.append((e, partner, ratio))
         e, partner = e * e * ratio * step, partner * partner * ratio.inverse * step
         e, partner = staged((e, partner), one)
-    return *found, (e, partner, staged(((1 + e).root, (1 + partner).root), one))
+    return *levels, (e, partner, staged(((1 + e).root, (1 + partner).root), one))
 
 
 @_descend.defjvp
 def _descend_rule(primals, tangents):
     e, partner, c, one = primals
     de, dpartner, dc, _ = tangents
-    *levels, (e, partner, (left, right)) = _levels(e, partner, c, one)
+    *levels, (e, partner, (root_e, root_partner)) = _levels(e, partner, c, one)
     # Partial derivatives of the logarithm, from the last level back to the first.
-    by_e = (left * (1 + left)).inverse * (-1 / 8)
-    by_partner = (right * (1 + right)).inverse * (1 / 8)
+    by_e = (root_e * (1 + root_e)).inverse * (-1 / 8)
+    by_partner = (root_partner * (1 + root_partner)).inverse * (1 / 8)
     by_e, by_partner = staged((by_e, by_partner), one)
     by_square = Complex(jnp.zeros_like(one), jnp.zeros_like(one))
     for k in (1, 0):
-        up, down = by_e * e, by_partner * partner
-        by_square = by_square + (up + down) * (c.step_slopes[k + 1] / c.steps[k + 1])
-        share = up - down + 1 / 4 / 2**k
+        by_log_e, by_log_partner = by_e * e, by_partner * partner
+        by_square = by_square + (by_log_e + by_log_partner) * (
+            c.step_derivatives[k + 1] / c.steps[k + 1]
+        )
+        log_share = by_log_e - by_log_partner + 1 / 4 / 2**k
         e, partner, ratio = levels[k]
         step = c.steps[k + 1]
-        by_e = by_e * (e * ratio) * (2 * step) - share * (1 + e).inverse
+        by_e = by_e * (e * ratio) * (2 * step) - log_share * (1 + e).inverse
         by_partner = by_partner * (partner * ratio.inverse) * (2 * step)
-        by_partner = by_partner + share * (1 + partner).inverse
+        by_partner = by_partner + log_share * (1 + partner).inverse
         by_e, by_partner = staged((by_e, by_partner), one)
     value = _descend(*primals)
     by_e, by_partner, by_square = staged((by_e * value, by_partner * value, by_square * value), one)
     return value, by_e * de + by_partner * dpartner + by_square * dc.square
 
 
-def point(lead: Complex, rest: Complex, pull: Array, c: Curve, one: Array):
+def point(
+    factor_e: Complex, partner_factor: Complex, scale_of_squares: Array, c: Curve, one: Array
+):
     """Coordinate E of a point on the curve and h/E, without constant factors.
 
-    From twice the amplitude as exponentials ``lead``, ``rest`` (times lambda, and one half of the
-    first Landen step taken), whose squares times ``pull`` are those of the next level.
+    From twice the amplitude as exponentials ``factor_e``, ``partner_factor`` (times lambda, and one
+    half of the first Landen step taken), whose squares times ``scale_of_squares`` are those of the
+    next level.
     """
-    turn = staged(_descend(lead * lead * pull, rest * rest * pull, c, one), one)
-    return lead * turn, rest * turn.inverse
+    factor = staged(
+        _descend(
+            factor_e * factor_e * scale_of_squares,
+            partner_factor * partner_factor * scale_of_squares,
+            c,
+            one,
+        ),
+        one,
+    )
+    return factor_e * factor, partner_factor * factor.inverse

@@ -1,0 +1,366 @@
+"""Lagrange's top as a closed form: the method, the frame of the vertical, and two limits.
+
+The closed form (``_lagrange_curve``) measures momenta in units of (L^2 + 2 A |M|)^(1/2), M the
+moment of the weight. Where that unit or the direction of the weight does not exist, two other
+formulas take over:
+
+``short_motion``: times so short that one step of Runge and Kutta is exact to rounding. At rest
+without weight there is no unit of momentum, and with little weight the derivatives by it are the
+difference of large numbers. The equations of motion are regular there: a body at rest stays at
+rest. A step of fourth order has all terms of first and second derivatives by state and weight.
+Less its turn about its own axis at omega_z - L_z/A, the body moves as a sphere of moment A does:
+with q its attitude, e = R z the axis and r e the place where the weight F acts, in space axes,
+
+    dL/dt = r e x F,    dq/dt = (0, L) q / (2 A).
+
+``with_weight``: derivatives of the motion without weight by the weight, whose direction the closed
+form needs; the motion is analytic in its three components all the same. The sphere above turns as
+R(t) = exp(t [w]x) R(0), at the constant rate w = L/A in space axes. A small weight F at r e changes
+its momentum and attitude by
+
+    dL(t) = r I(t) x F,    I(t) = integral of e from 0 to t,
+    dtheta(t) = r / A  integral from 0 to t of exp((t - s) [w]x) (I(s) x F) ds,
+
+dtheta a rotation vector in space axes. With n = w/|w| and x = |w| t both are sums of powers of [n]x
+times functions of x."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from polhode import rotation
+from polhode._checks import is_concrete
+from polhode._closed_forms._closed_form import (
+    AbstractClosedForm,
+    as_lanes,
+    axial_state,
+    bodies_per_chunk,
+    run_in_chunks,
+    symmetry_objection,
+    wheel_objection,
+    wheels_have_constant_momentum,
+)
+from polhode._closed_forms._elementary import rotation_about
+from polhode._closed_forms._lagrange_curve import cayley_klein, lagrange_constants
+from polhode._closed_forms._lagrange_series import Complex, Series
+from polhode._hamiltonian import components
+from polhode._kernels import any_of, derivable_once, kernel, opaque_ones, spread, staged
+from polhode._method._base import Record, Samples
+from polhode._scene import Scene, State, UniformGravity, Wheels
+
+
+class LagrangeTop(AbstractClosedForm):
+    """Lagrange's top in theta functions, O(1) in time: exact.
+
+    A body symmetric about body z (``ph.Inertia.axisymmetric``) turning about a point of that axis
+    under uniform gravity in any direction, its centre of mass on the axis
+    (``ph.UniformGravity.axial``), wheels of constant momentum on the axis allowed. All motions:
+    looping, cuspidal and regular precession, sleeping and hanging tops, the separatrix, the
+    pendulum, no gravity. The error is rounding: a few units in the last place of the phase.
+    Derivatives hold the body symmetric. Within a hair of the marginal sleeping top (L_z^2 = 4 A m g
+    l and axis and rates within 1e-9 of upright) they lose digits: 1e-8 there, 1e-2 on it; values do
+    not. ``chunk`` bounds bodies times samples worked on at once (None: chosen).
+
+    Source: Klein & Sommerfeld, Theorie des Kreisels, chapter VI.
+    """
+
+    chunk: int | None = eqx.field(static=True, default=None)
+
+    def why_not(self, scene: Scene, state: State, record: Record) -> str | None:
+        refusal = self.objection(scene) or symmetry_objection(scene) or wheel_objection(scene)
+        gravity: Any = scene.potential
+        if refusal is not None or gravity.on_axis:
+            return refusal
+        centre = gravity.centre_body
+        if not is_concrete(centre) or np.any(np.asarray(centre)[..., :2] != 0):
+            return "the centre of mass is not known to lie on body z (ph.UniformGravity.axial)"
+        return None
+
+    def objection(self, scene: Scene) -> str | None:
+        if not isinstance(scene.potential, UniformGravity):
+            return "the potential is not uniform gravity"
+        if scene.torque is not None:
+            return "a torque acts"
+        if not scene.inertia.is_principal:
+            return "the body axes are not known to be principal"
+        if isinstance(scene.rotors, Wheels) and any(axis != 2 for axis in scene.rotors.along):
+            return "a rotor is not known to lie on body z"
+        return None
+
+    def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
+        del rtol
+        self.refuse(scene)
+        return run_in_chunks(self._motion, self._size, scene, state, ts, record)
+
+    def _size(self, n: int, count: int) -> int:
+        if self.chunk is not None:
+            return bodies_per_chunk(self.chunk, n, count)
+        # By measurement: at once twice as fast as in a loop, in which few bodies do best.
+        if n * count <= 2**14:
+            return n
+        return max(1, 2**12 // count) if count > 32 else 128
+
+    def _motion(self, scene, state, elapsed):
+        n = state.wxyz.shape[0]
+        transverse, moments, axial = axial_state(scene, state)
+        gravity: Any = scene.potential
+        centre = as_lanes(gravity.centre_body, n, 1)
+        force = as_lanes(gravity.mass, n)[:, None] * as_lanes(gravity.gravity_space, n, 1)
+        wxyz, omega = lagrange_motion(
+            transverse, force, centre[:, 2], state.wxyz, state.omega_body, axial, elapsed
+        )
+        holds = (moments[:, 0] == moments[:, 1]) & (centre[:, 0] == 0) & (centre[:, 1] == 0)
+        return wxyz, omega, holds & wheels_have_constant_momentum(scene, n)
+
+
+def upward(force: tuple[Array, Array, Array]) -> tuple[tuple[Array, Array, Array], Array]:
+    """Quaternion (w, x, y; z = 0) from space z to an axis along +-force (never downwards), and the
+    signed size of the force along it.
+
+    Without force the axis is z: the motion does not depend on it. The derivatives by the force are
+    then those of ``with_weight``.
+    """
+    square = sum(x * x for x in force)
+    acting = square > 0
+    force_component = jnp.sqrt(jnp.where(acting, square, 1))
+    up = jnp.where(force[2] < 0, -1, 1).astype(force_component.dtype)
+    a, b, c = (jnp.where(acting, up * v / force_component, w) for v, w in zip(force, (0, 0, 1)))
+    half = jnp.sqrt((1 + c) / 2)
+    return (half, -b / (2 * half), a / (2 * half)), jnp.where(
+        acting, up * force_component, force[2]
+    )
+
+
+def _times_tilt(tilt: tuple[Array, Array, Array], q: tuple[Array, ...]) -> tuple[Array, ...]:
+    """Quaternion product (w, x, y, 0) q on components."""
+    a, b, c = tilt
+    w, x, y, z = q
+    return (
+        a * w - b * x - c * y,
+        a * x + b * w + c * z,
+        a * y - b * z + c * w,
+        a * z + b * y - c * x,
+    )
+
+
+def lagrange_motion(
+    transverse: Float[Array, " n"],
+    force_space: Float[Array, "n 3"],
+    distance: Float[Array, " n"],
+    wxyz: Float[Array, "n 4"],
+    omega: Float[Array, "n 3"],
+    axial_momentum: Float[Array, " n"],
+    elapsed: Float[Array, "n t"],
+) -> tuple[Float[Array, "n t 4"], Float[Array, "n t 3"]]:
+    """Attitude and body rates after ``elapsed`` [s] of a symmetric body about a fixed point.
+
+    ``transverse``: moment about any axis through the point and across body z [kg m^2];
+    ``force_space``: weight [N], space axes, acting at ``distance`` [m] along body z; ``wxyz``,
+    ``omega`` [rad/s]: initial state; ``axial_momentum`` along body z [kg m^2/s], that of wheels on
+    the axis included. Klein & Sommerfeld, Theorie des Kreisels, VI. The closed form is
+    ``_long_motion``; ``short_motion`` replaces it where the body hardly moves in that time, and
+    ``with_weight`` gives the derivatives by a force that is zero.
+    """
+    arguments: tuple[Any, ...] = transverse, force_space, distance, wxyz, omega, axial_momentum
+    constants = jax.lax.stop_gradient((transverse, force_space, distance, omega, axial_momentum))
+    angle = momentum_frequency(*constants)[:, None] * jnp.abs(jax.lax.stop_gradient(elapsed))
+    short = angle < short_angle(elapsed.dtype)
+    # Derivatives of the closed form would be NaN there: it is evaluated for another motion.
+    at_rest = jnp.all(short, axis=-1)[:, None]
+    weightless = jnp.all(force_space == 0, axis=-1, keepdims=True)
+    force = jnp.where(at_rest | weightless, 0, force_space)
+    start = jnp.where(at_rest, 1, omega)
+    other = transverse, force, distance, wxyz, start, axial_momentum, jnp.where(short, 0, elapsed)
+    closed_form: Any = kernel(_long_motion, repeated=True)
+    motion = closed_form(*other)
+
+    def with_corrections(motion, arguments, elapsed):
+        corrected: Any = kernel(_corrected, repeated=True)
+        return corrected(motion, arguments, elapsed, short, weightless, at_rest)
+
+    def unchanged(motion, arguments, elapsed):
+        return list(motion)
+
+    branch = any_of(jnp.where(short | weightless, 1, 0))
+    wxyz, omega = jax.lax.cond(branch, with_corrections, unchanged, motion, arguments, elapsed)
+    return wxyz, omega
+
+
+def _corrected(motion, arguments: Any, elapsed, short, weightless, at_rest) -> Any:
+    """The motion with what the closed form does not have: see ``lagrange_motion``."""
+    transverse, force, distance, wxyz, omega, axial = arguments
+    small = short_motion(
+        transverse, force, distance, wxyz, omega, axial, jnp.where(short, elapsed, 0)
+    )
+    weighted = with_weight(
+        transverse, force, distance, wxyz, omega, axial, elapsed, motion, weightless & ~at_rest
+    )
+    motion = [jnp.where(weightless[..., None], x, y) for x, y in zip(weighted, motion)]
+    return [jnp.where(short[..., None], x, y) for x, y in zip(small, motion)]
+
+
+def _long_motion(transverse, force_space, distance, wxyz, omega, axial_momentum, elapsed):
+    """The closed form, arguments and results as of ``lagrange_motion``."""
+    # The compiler makes a loop of every axis, be it of length one, and vectors of the last axis
+    # only: axes of length one are left out, and the longer one comes last.
+    lanes, count = elapsed.shape
+    times, axis = elapsed, -1
+    arguments = transverse, force_space, distance, wxyz, omega, axial_momentum
+    if lanes == 1:
+        times, arguments = jax.tree.map(lambda x: x[0], (times, arguments))
+    elif count < lanes:
+        times, axis = times.T, -2
+    if count == 1:
+        times = jnp.squeeze(times, axis)
+    transverse, force_space, distance, wxyz, omega, axial_momentum = arguments
+    one = opaque_ones(transverse)
+    wxyz, omega = staged((tuple(wxyz[..., i] for i in range(4)), components(omega)), one)
+    tilt, force_component = staged(upward(components(force_space)), one)
+    inverse_tilt = (tilt[0], -tilt[1], -tilt[2])
+    q, spin = staged(_times_tilt(inverse_tilt, wxyz), one), omega[2]
+    momentum = (transverse * omega[0], transverse * omega[1], axial_momentum)
+    spinor = Complex(q[0], q[3]), Complex(q[2], q[1])
+    motion = lagrange_constants(transverse, spin, -force_component * distance, spinor, momentum)
+    if count > 1:
+        series = motion.series
+        motion, h, tilt, spin = spread(
+            (motion._replace(series=None), series.h, tilt, spin), axis, count
+        )
+        # apart, for no cotangents but that of h need be summed
+        weights = spread((series.weights, series.derivatives), axis, count)
+        motion = motion._replace(series=Series(h, *weights))
+    alpha, beta, across = cayley_klein(motion, times)
+    square = 1 / (alpha.square + beta.square)
+    scale = jnp.sqrt(square)
+    q = _times_tilt(tuple(x * scale for x in tilt), (alpha.re, beta.im, beta.re, alpha.im))
+    rates = (across.im * square, across.re * square, spin)
+
+    def to_samples(parts):
+        return jnp.stack([x.T if count < lanes else x for x in parts], axis=-1).reshape(
+            lanes, count, -1
+        )
+
+    return to_samples(q), to_samples(rates)
+
+
+def momentum_frequency(
+    transverse: Array, force: Array, distance: Array, omega: Array, axial: Array
+):
+    """(L^2 + 2 A |M|)^(1/2) / A (N,) [rad/s]; 0 for a body that stays at rest."""
+    weight = jnp.sqrt(jnp.sum(force * force, axis=-1)) * jnp.abs(distance)
+    across = jnp.sum(omega[:, :2] ** 2, axis=-1)
+    return jnp.sqrt(across + (axial / transverse) ** 2 + 2 * weight / transverse)
+
+
+def short_angle(dtype) -> float:
+    """The angle ``frequency`` times the time [rad] up to which the step is exact to rounding."""
+    return (100 * float(jnp.finfo(dtype).eps)) ** (1 / 5)
+
+
+def short_motion(
+    transverse: Array,
+    force: Array,
+    distance: Array,
+    wxyz: Array,
+    omega: Array,
+    axial: Array,
+    elapsed: Array,
+) -> tuple[Array, Array]:
+    """Attitude (N, T, 4) and body rates (N, T, 3); arguments as for ``lagrange_motion``."""
+    momentum = transverse[:, None] * omega[:, :2]
+    momentum = jnp.concatenate([momentum, axial[:, None]], axis=-1)
+    arm_force = (distance / transverse)[:, None, None] * force[:, None]
+    zero, one = jnp.zeros_like(elapsed), jnp.ones_like(elapsed)
+    step = elapsed[..., None]
+    start = (
+        jnp.broadcast_to(wxyz[:, None], (*elapsed.shape, 4)),
+        jnp.broadcast_to(
+            (rotation.rotate(wxyz, momentum) / transverse[:, None])[:, None], (*elapsed.shape, 3)
+        ),
+    )
+
+    def field(q, rate):
+        w, x, y, z = (q[..., i] for i in range(4))
+        a, b, c = (rate[..., i] for i in range(3))
+        q_rate = [-a * x - b * y - c * z, a * w + b * z - c * y, b * w + c * x - a * z]
+        axis = [2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z]
+        q_rate = jnp.stack([*q_rate, c * w + a * y - b * x], axis=-1) / 2
+        return q_rate, jnp.cross(jnp.stack(axis, axis=-1), jnp.broadcast_to(arm_force, rate.shape))
+
+    def stage(carry, weights):
+        rates, total = carry
+        rates = field(*(x + weights[0] * step * k for x, k in zip(start, rates)))
+        return (rates, tuple(x + weights[1] * k for x, k in zip(total, rates))), None
+
+    weights = jnp.array([[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]], elapsed.dtype)
+    none = tuple(map(jnp.zeros_like, start))
+    (_, total), _ = jax.lax.scan(stage, (none, none), weights)
+    q, rate = (x + step * k for x, k in zip(start, total))
+    own_rotation = rotation_about(
+        (zero, zero, one), (omega[:, 2] - axial / transverse)[:, None] * elapsed
+    )
+    q = rotation.normalise(rotation.multiply(q, own_rotation))
+    rate = rotation.rotate(rotation.conjugate(q), rate)
+    spin = jnp.broadcast_to(omega[:, None, 2:], (*elapsed.shape, 1))
+    return q, jnp.concatenate([rate[..., :2], spin], axis=-1)
+
+
+def with_weight(
+    transverse: Array,
+    force: Array,
+    distance: Array,
+    wxyz: Array,
+    omega: Array,
+    axial: Array,
+    elapsed: Array,
+    motion: tuple[Array, Array],
+    applies: Array,
+) -> tuple[Array, Array]:
+    """The ``motion`` without weight, with the derivatives by ``force``, which is zero.
+
+    Second derivatives by it are NaN. ``where`` (N, 1): bodies that turn and have no weight; of
+    others the result is finite and of no use. Other arguments as for ``lagrange_motion``.
+    """
+    moment = transverse[:, None]
+    momentum = jnp.concatenate([moment * omega[:, :2], axial[:, None]], axis=-1)
+    rate = jnp.where(applies, rotation.rotate(wxyz, momentum) / moment, 1)
+    size = jnp.sqrt(jnp.sum(rate * rate, axis=-1, keepdims=True))
+    n = rate / size
+    axis = rotation.rotate(wxyz, jnp.broadcast_to(jnp.array([0, 0, 1], n.dtype), n.shape))
+    weight = derivable_once(force, jnp.ones_like(force, bool)) * distance[:, None]
+    n_cross_axis = jnp.cross(n, axis)
+    a, b, c = (
+        jnp.cross(v, weight)[:, None] for v in (axis, n_cross_axis, jnp.cross(n, n_cross_axis))
+    )
+
+    # functions of x whose derivative is the one before; p: convolutions of them with sin and x
+    x = (size * elapsed)[..., None]
+    sine, cosine = jnp.sin(x), jnp.cos(x)
+    one_less_cosine = 2 * jnp.sin(x / 2) ** 2
+    x_less_sine, x2_less_cosine = x - sine, x * x / 2 - one_less_cosine
+    p1, p2 = one_less_cosine - x * sine / 2, x_less_sine - (sine - x * cosine) / 2
+    p3 = x2_less_cosine - p1
+    n = jnp.broadcast_to(n[:, None], (*elapsed.shape, 3))
+    first_sum = a * x_less_sine + b * p1 + c * p2
+    second_sum = jnp.cross(n, a * x2_less_cosine + b * p2 + c * p3)
+    angle = (
+        a * (x * x / 2)
+        + b * x_less_sine
+        + c * x2_less_cosine
+        + jnp.cross(n, first_sum + second_sum)
+    )
+    angle = angle / (size * size * moment)[:, None]
+    rate_change = (a * x + b * one_less_cosine + c * x_less_sine) / size[:, None]
+
+    q, rates = motion
+    half_angle = jnp.concatenate([jnp.zeros_like(x), angle / 2], axis=-1)
+    rate_change = rate_change / moment[:, None] + jnp.cross(
+        jnp.broadcast_to(rate[:, None], n.shape), angle
+    )
+    rate_change = rotation.rotate(rotation.conjugate(q), rate_change)
+    rate_change = jnp.concatenate([rate_change[..., :2], jnp.zeros_like(x)], axis=-1)
+    return q + rotation.multiply(half_angle, q), rates + rate_change
