@@ -17,7 +17,7 @@ FACE = "__init__"
 def house() -> list[str]:
     """Rooms (folders, and files at the root of the package) in the order of the table."""
     text = CONTRIBUTING.read_text(encoding="utf-8")
-    section = text.partition("## The house")[2].partition("\n## ")[0]
+    section = text.partition("## Modules")[2].partition("\n## ")[0]
     rows = re.findall(r"^\| *\d+ *\|([^|]*)\|", section, re.M)
     return [room for row in rows for room in re.findall(r"`(\w+)`", row)]
 
