@@ -28,6 +28,36 @@ INTERNAL = {
 """Members that other modules of polhode use and that users have no use for."""
 
 
+INTRODUCTION = """Reference
+=========
+
+Every public name, in the order of ``polhode/__init__.pyi``; ``ph`` is ``polhode``.
+
+.. list-table::
+   :widths: 40 60
+
+   * - the motion of a body
+     - :py:obj:`ph.simulate <polhode.simulate>` of a :py:obj:`ph.Scene <polhode.Scene>`; for events
+       :py:obj:`ph.crossings <polhode.crossings>` or ``until=``
+   * - one step with its Jacobian
+     - :py:obj:`ph.propagate <polhode.propagate>`
+   * - the periods of a free motion
+     - :py:obj:`ph.periods <polhode.periods>`
+   * - an inertia
+     - three different moments: ``Inertia.from_moments``; equal by construction: ``axisymmetric``,
+       ``spherical``; in other axes: ``from_tensor``; from solids and meshes: ``MassProperties``
+   * - a force
+     - with an energy: a potential; given in time: ``BodyTorque``, ``SpaceTorque``, ``Pulses``; by
+       the state: ``FeedbackTorque`` (:doc:`more </how-to/write_a_torque>`)
+   * - a method
+     - none: polhode chooses (:doc:`how </methods>`); or ``LiePoisson``, ``EulerAngles`` with a
+       solver of diffrax
+   * - a fit
+     - ``fit_inertia`` for one recording, ``fit_recordings`` for several, ``fit_scene`` for other
+       parameters (:doc:`more </how-to/fit_a_recording>`)
+"""
+
+
 def left_out(thing: type) -> list[str]:
     """Members of a class that its entry leaves out: internal ones, and those that its entry's link
     to a public abstract base documents, such as ``body_components`` of a torque."""
@@ -86,10 +116,7 @@ def _index(files: list[str]) -> str:
             rows.append(f"     - {markup(' '.join(first.split()))}")
         rows.append("")
     tree = "\n".join(f"   {Path(name).stem}" for name in files)
-    return (
-        "Reference\n=========\n\nEvery public name; ``ph`` is ``polhode``.\n\n"
-        f".. toctree::\n   :hidden:\n\n{tree}\n\n" + "\n".join(rows) + "\n"
-    )
+    return f"{INTRODUCTION}\n.. toctree::\n   :hidden:\n\n{tree}\n\n" + "\n".join(rows) + "\n"
 
 
 def _contents():
