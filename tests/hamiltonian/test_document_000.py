@@ -9,7 +9,7 @@ import pytest
 
 import polhode as ph
 from polhode import rotation
-from polhode._hamiltonian import document_000 as doc, rates_from_angle_rates
+from polhode._hamiltonian import _reference as doc, rates_from_angle_rates
 from polhode.inertia import Inertia
 
 # theory section 8.1: I, q, qd and 20-digit results, recomputed from rotation matrices

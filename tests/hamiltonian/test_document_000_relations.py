@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode._hamiltonian import document_000 as doc
+from polhode._hamiltonian import _reference as doc
 from polhode.inertia import Inertia
 
 MOMENTS = jnp.array([1.0, 1.7, 2.1])

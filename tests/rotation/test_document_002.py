@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import polhode.rotation as rotation
-from polhode._hamiltonian import document_002 as document
+from polhode._hamiltonian import _reference as document
 from polhode.rotation._direct import euler_to_matrix_k
 
 # theory section 8.2: angles, rotation angle, axis of K, quaternion of K

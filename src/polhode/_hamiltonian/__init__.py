@@ -1,23 +1,19 @@
-"""The one Hamiltonian, its two charts, and closed forms to compare with (docs/equations.md)."""
+"""The one Hamiltonian, its two sets of coordinates, and closed forms to compare with."""
 
-from polhode._hamiltonian import document_000 as document_000, document_002 as document_002
-from polhode._hamiltonian._attitude import (
+from polhode._hamiltonian._energy import (
     Attitude as Attitude,
+    Hamiltonian as Hamiltonian,
     Vector as Vector,
     components as components,
     cross as cross,
     dot as dot,
     from_euler_angles as from_euler_angles,
     from_quaternion as from_quaternion,
-    triple as triple,
-)
-from polhode._hamiltonian._costate import LiePoissonCostate as LiePoissonCostate
-from polhode._hamiltonian._energy import (
-    Hamiltonian as Hamiltonian,
     inverse_components as inverse_components,
     inverse_inertia as inverse_inertia,
+    triple as triple,
 )
-from polhode._hamiltonian._euler_chart import (
+from polhode._hamiltonian._euler_angles import (
     CanonicalHamiltonian as CanonicalHamiltonian,
     canonical_from_momentum as canonical_from_momentum,
     euler_angle_field as euler_angle_field,
@@ -28,18 +24,17 @@ from polhode._hamiltonian._euler_chart import (
 )
 from polhode._hamiltonian._lie_poisson import (
     Dynamics as Dynamics,
+    FixedUnits as FixedUnits,
+    LiePoissonUnits as LiePoissonUnits,
     external_power as external_power,
     lie_poisson_field as lie_poisson_field,
     momentum_rate as momentum_rate,
     motor_powers as motor_powers,
     quaternion_rate as quaternion_rate,
-)
-from polhode._hamiltonian._units import (
-    FixedUnits as FixedUnits,
-    LiePoissonUnits as LiePoissonUnits,
     relative as relative,
 )
-from polhode._hamiltonian.document_000 import (
+from polhode._hamiltonian._reference import (
     HamiltonianMatrices as HamiltonianMatrices,
     hamiltonian_matrices as hamiltonian_matrices,
 )
+from polhode._hamiltonian._variational import LiePoissonCostate as LiePoissonCostate

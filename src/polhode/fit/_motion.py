@@ -21,7 +21,7 @@ from polhode._hamiltonian import (
     lie_poisson_field,
     momentum_rate,
 )
-from polhode._hamiltonian._attitude import from_rows
+from polhode._hamiltonian._energy import from_rows
 from polhode._integrate._classical import ClassicalRungeKutta
 from polhode._scene import AbstractTorque, LinearDamping, QuadraticDamping
 from polhode.inertia import Inertia, principal

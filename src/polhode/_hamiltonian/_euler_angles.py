@@ -12,8 +12,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike, as_float_array, as_vectors
-from polhode._hamiltonian._attitude import Vector, components, cross, from_euler_angles
-from polhode._hamiltonian._energy import EnergyOfAttitude, Hamiltonian, free_hamiltonian
+from polhode._hamiltonian._energy import (
+    EnergyOfAttitude,
+    Hamiltonian,
+    Vector,
+    components,
+    cross,
+    free_hamiltonian,
+    from_euler_angles,
+)
 from polhode._hamiltonian._lie_poisson import Dynamics, spin_rates
 from polhode.inertia import Inertia
 
