@@ -173,7 +173,7 @@ def spin_rates(
 
 
 class LiePoissonUnits(eqx.Module):
-    """Natural units of body momentum and quaternion; updated with the state, as torques change rates.
+    """Natural units of body momentum and quaternion, updated with the state.
 
     ``size`` (N,): of each inertia [kg m^2]; ``least`` (N,): momentum [kg m^2/s] by which a body at
     rest is measured, which a torque may move later; ``wheels`` (static): how many have momenta that

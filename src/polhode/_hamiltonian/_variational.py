@@ -7,9 +7,9 @@ K = a . (L x dH/dL + sum_j r_j x dH/dr_j + N) + m . dH/dL,
 da/dt = -dK/dL,   dm/dt = m x dH/dL - (derivative of K by a rotation eta),
 
 and the derivative of the result by a parameter p is the integral of dK/dp. Of the attitude only the
-rows that H and N depend on are integrated. L. S. Pontryagin et al., The Mathematical Theory of Optimal Processes
-(1962), chapter 1; on the group: A. A. Agrachev, Y. L. Sachkov, Control Theory from the Geometric
-Viewpoint (2004), section 18.2.
+rows that H and N depend on are integrated. L. S. Pontryagin et al., The Mathematical Theory of
+Optimal Processes (1962), chapter 1; on the group: A. A. Agrachev, Y. L. Sachkov, Control Theory
+from the Geometric Viewpoint (2004), section 18.2.
 """
 
 from collections.abc import Sequence
@@ -41,7 +41,7 @@ class LiePoissonCostate(NamedTuple):
         return cls(rows[0] if one_row else None)
 
     def begin(self, y, cotangents):
-        """State to integrate backwards, from the end and the cotangents there: (L, attitude, a, m)."""
+        """State to integrate backwards, (L, attitude, a, m), of the end and its cotangents."""
         momentum, wxyz = y
         turn = tuple(_inner(cotangents[1], quaternion_rate(wxyz, axis)) for axis in _AXES)
         place = wxyz if self.row is None else from_quaternion(wxyz).row(self.row)
