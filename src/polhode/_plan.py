@@ -21,12 +21,12 @@ from polhode.inertia import Symmetry
 
 @dataclass(frozen=True)
 class Plan:
-    """What will run, what is skipped and why; ``print`` it.
+    """The chosen method, what is skipped, and the reasons; ``print`` shows them.
 
     **Fields:** ``method``; ``reason``: why this one; ``skipped``: what is absent from the compiled
     program, with the reason; ``bodies``, ``samples``, ``dtype``: the size of the work;
-    ``error``: the attitude error to be expected, in words; ``refused``: the exact laws that do not
-    hold, with the reason, where the library chose to step.
+    ``error``: the attitude error to be expected, in words; ``refused``: the closed forms that do
+    not apply, with the reason, if the motion is integrated.
     """
 
     method: AbstractMethod

@@ -49,27 +49,28 @@ def simulate(
     until: Event | None = None,
     throw: bool = True,
 ) -> Trajectory:
-    """Move every body of the scene from ``state`` at ``ts[0]`` through the times ``ts``.
+    """Simulate the motion of a scene from ``state`` at ``ts[0]``, and save it at the times ``ts``.
 
     **Arguments:**
 
     - ``scene``, ``state``: see ``ph.Scene``, ``ph.State``; batch axes broadcast together. A batch
-      that is sharded over several devices (``NamedSharding``) stays so: each device moves its own
-      bodies and the compiled program exchanges nothing (see docs/scale.md; under ``jit`` and
+      that is sharded over several devices (``NamedSharding``) stays sharded: each device simulates
+      its own bodies and nothing is exchanged (see docs/scale.md; under ``jit`` and
       ``grad`` for meshes of explicit axes).
     - ``ts``: (T,) or (..., T) [s], strictly increasing or strictly decreasing.
-    - ``method``: None lets the library choose; or ``ph.LiePoisson(...)``, ``ph.EulerAngles(...)``.
+    - ``method``: None: chosen by polhode (docs/methods.md); or ``ph.LiePoisson(...)``,
+      ``ph.EulerAngles(...)``.
     - ``rtol``: bound of the accumulated local error at the saved times, of the attitude in radians
       and of the momentum relative to its size; None: 1e-9 in float64, 1e-5 in float32. Closed
       forms ignore it. What it controls and what not: docs/methods.md, "What `rtol` means".
-    - ``record``: what to keep; None: attitude and rates at all times.
-    - ``until``: a ``ph.Event`` at which each body stops: its times and samples from there on are
-      those of the event, so that ``Trajectory.last`` is the state to go on from; its time is
-      ``Trajectory.event_time`` (inf for a body that does not meet it). The work follows from where
-      the last event of all bodies is, not from the last of ``ts``. Times and states have first and
+    - ``record``: what is saved; None: attitude and rates at all times.
+    - ``until``: a ``ph.Event`` at which each body stops. Its times and samples from there on are
+      those of the event, so that ``Trajectory.last`` is the state from which to continue;
+      ``Trajectory.event_time`` is inf for a body without an event. The cost depends on the time
+      of the last event of the batch, not on the last of ``ts``. Times and states have first and
       second derivatives; a third one raises NotImplementedError.
     - ``throw``: raise ``ph.SimulationError`` when a body did not finish. Under ``jit``, ``vmap``
-      or ``grad`` nothing is raised: look at ``Trajectory.status``.
+      or ``grad`` nothing is raised: check ``Trajectory.status``.
 
     Raises ValueError or TypeError for bad input: wrong kinds or shapes, unsorted times, mixed
     dtypes, a tolerance that the dtype cannot reach.

@@ -174,7 +174,7 @@ def _replaced(
 
 
 class Mode(enum.IntEnum):
-    """How a free body tumbles; ``Periods.mode`` holds these numbers."""
+    """Mode of a free rotation; the values of ``Periods.mode``."""
 
     LAM = 0  # long-axis mode: L circles the axis of the least moment
     SAM = 1  # short-axis mode: L circles the axis of the greatest moment

@@ -35,11 +35,11 @@ AT_START = 1e-6
 
 
 class Crossings(eqx.Module):
-    """Crossings of zero of each body, in the order in which the motion meets them.
+    """Crossings of zero of each body, in the order of the motion.
 
-    **Fields:** ``times`` (..., M) [s], inf where there is none; ``slope`` (..., M): rate of change
-    of the function there [1/s], 0 where there is none; ``count`` (...): how many were found, which
-    may be more than the M that there was room for (``complete`` tells).
+    **Fields:** ``times`` (..., M) [s], inf where there is none; ``slope`` (..., M): derivative
+    of the function there [1/s], 0 where there is none; ``count`` (...): number of crossings, which
+    may exceed the capacity M (see ``complete``).
     """
 
     times: Float[Array, "*b m"]
@@ -48,7 +48,7 @@ class Crossings(eqx.Module):
 
     @property
     def complete(self) -> Array:
-        """Whether (...) there was room for all that were found."""
+        """Whether (...) all crossings of a body are stored."""
         return self.count <= self.times.shape[-1]
 
 
@@ -65,25 +65,23 @@ def crossings(
     **Arguments:** ``fn``: see ``ph.Event``, which may be given in its place; ``direction``: 1
     rising, -1 falling (in time), 0 both; ``capacity``: how many crossings of a body are
     stored; None: all of them; ``samples``: see ``ph.Event``. Under ``jit``, ``vmap`` and ``grad``
-    both must be given.
+    both are required.
 
-    Times are as accurate as the motion: to rounding for exact laws, to ``rtol`` over the slope for
-    stepped ones. They have first and second derivatives, by the implicit function theorem, in all
-    that the motion depends on, and so has ``slope``; third ones raise. A crossing at the first
-    time (within 1e-6 of the time between two looks) is where the motion comes from, not one that it
-    makes.
+    Times are as accurate as the motion: to rounding for closed forms, to ``rtol`` over the
+    derivative of the function for integrated motions. Times and ``slope`` have first and second
+    derivatives, by the implicit function theorem; third derivatives raise. A zero at the first time
+    (within 1e-6 of the time between two samples) does not count as a crossing.
 
-    The guarantee: the function and its rate of change are looked at 32 times in a turn of the
-    fastest natural rate, the largest of |L| over the smallest moment at the saved samples and of
-    the rate that gravity gives; where the function turns back towards zero between two looks its
-    turning point is found, and a pair of crossings around it. So a pair is missed only where the
-    function turns three times or more within one look: no fixed direction in a body seen from
-    space does so. Functions that vary faster than the body turns (high powers, other frequencies
-    of the time) and rates that rise and fall again between two saved samples need ``samples``.
+    The function and its derivative are sampled 32 times per revolution of the fastest natural rate,
+    the largest of |L| over the smallest moment at the saved samples and of the rate of gravity. If
+    the function turns back towards zero between two samples, its turning point is located, and a
+    pair of crossings around it. A pair is therefore missed only if the function has three or more
+    turning points between two samples, which a direction fixed in the body does not have. Functions
+    that vary faster than the body rotates (high powers, other frequencies of the time) and rates
+    that rise and fall again between two saved samples need ``samples``.
 
-    Raises ValueError where the looks would be too many to be held in memory, where the steps of a
-    body run out on their way (under ``jit`` it is not ``complete``), or where ``jit`` does not know
-    how many there are.
+    Raises ValueError if the samples do not fit into memory, if the steps of a body run out (under
+    ``jit`` it is not ``complete``), or if their number is not known under ``jit``.
 
         up = ph.crossings(traj, lambda wxyz, omega_body, t: omega_body[0], direction=1)
         traj.at(up.times).euler()

@@ -24,9 +24,9 @@ class Event(eqx.Module):
 
     **Arguments:** ``fn``: of the unit quaternion (4,) body -> space (of either sign), the body
     rates (3,) [rad/s] and the time () [s], smooth; batches are mapped over it. ``direction``: 1
-    where fn rises through zero in time, -1 where it falls, 0 for both. ``samples``: at how many
-    equally spaced times the motion is looked at; None: 32 in a turn of the fastest natural rate
-    (see ``ph.crossings``), which under ``jit`` must be given for ``crossings``.
+    where fn rises through zero in time, -1 where it falls, 0 for both. ``samples``: number of
+    equally spaced times at which a motion in closed form is sampled; None: 32 per revolution of
+    the fastest natural rate (see ``ph.crossings``). ``crossings`` needs it under ``jit``.
 
     Raises TypeError or ValueError for a function that takes or returns something else, another
     direction, or fewer than two samples.
@@ -58,7 +58,7 @@ class Event(eqx.Module):
 
     def mended(self, near: Trajectory, most: Array) -> tuple[Array, Trajectory]:
         """``polished`` for samples at which the function is zero to rounding: the same derivatives,
-        and nothing to be worked out where none is asked for."""
+        and no computation where none is needed."""
         arrays, rest = eqx.partition(near, eqx.is_inexact_array)
         leaves, tree = jax.tree.flatten((arrays, most))
 
@@ -94,8 +94,8 @@ class Event(eqx.Module):
         """At samples ``near`` events: how much later (..., T) [s] these are, at most by ``most``,
         and the samples then.
 
-        Steps t - g(t)/s with one slope s for all: where g(t) is zero they move nothing, and after
-        two of them t has the first and second derivatives of the root.
+        Steps t - g(t)/s with one derivative s for all: they change nothing where g(t) is zero, and
+        after two of them t has the first and second derivatives of the root.
         """
         still = jax.lax.stop_gradient
         value, slope = self.values(near)

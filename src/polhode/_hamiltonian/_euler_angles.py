@@ -64,7 +64,7 @@ class CanonicalHamiltonian(eqx.Module):
 def hamiltonian(
     inertia: Inertia, potential: EnergyOfAttitude | None = None
 ) -> CanonicalHamiltonian:
-    """The one H in Euler angles (docs/equations.md), ``hamiltonian(inertia, potential)(q, p)``.
+    """``hamiltonian(inertia, potential)(q, p)`` in ZYZ Euler angles (docs/equations.md).
 
     ``q`` (..., 3): phi, theta, psi in rad; ``p`` (..., 3) in kg m^2/s; the result (...) in J.
     """

@@ -51,16 +51,16 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
       float32).
     - Conserves nothing exactly; $|q|$, energy and momenta to the accuracy of the step.
     - ``evaluations`` of the field per step (order 8: 21, order 12: 43, order 16: 81).
-    - ``compensated``: sums the changes within a step, not the states, and adds what rounding took
-      from the state after a step to the next one: less rounding, by a third longer.
+    - ``compensated``: sums the changes within a step, not the states, and carries the rounding
+      error of the state to the next step: less rounding, at a third more time.
     - ``accuracy``: None for one step of the method a step of diffrax, with an error estimate (the
       difference to order $p - 2$) for any of its controllers. With an ``Accuracy`` one step of
-      diffrax is as many of the method as the error asked for needs, so that diffrax's own cost is
-      paid once for each time to be saved; with it goes ``diffrax.StepTo(ts)``. All arrays of the
-      state then have one shape, and their entries are bodies that the field treats separately.
-      ``max_steps``: most steps of a body; one that needs more ends as NaN. ``jumps``: look for
-      jumps of the field beside the ends of a step. ``args`` may tell the natural units of the
-      state: ``args.units(y, rates)``, see ``solvers.GroupUnits``, which serves otherwise.
+      diffrax consists of as many steps of the method as the tolerance requires, so that the
+      overhead of diffrax is paid once for each saved time; use ``diffrax.StepTo(ts)`` with it. All
+      arrays of the state then have one shape, and their entries are independent bodies.
+      ``max_steps``: maximum number of steps of a body; one that needs more ends as NaN. ``jumps``:
+      search for jumps of the field near the ends of a step. ``args.units(y, rates)``, if present,
+      returns the natural units of the state.
     - Reverse mode cannot pass through its steps, forward mode can: ``FlowAdjoint`` has both.
     - Dense output: without ``accuracy`` collocation polynomials as accurate as the step, which cost
       some times the step itself, and nothing unless interpolated. With it none (NaN).

@@ -23,17 +23,17 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
 
     Reverse mode solves $y' = f$, $\lambda' = -\lambda\,\partial f/\partial y$,
     $\mu' = -\lambda\,\partial f/\partial c$ backwards, $c$ the coefficients that the field is made
-    of, as far as they depend on what is differentiated. The derivatives are as accurate as
-    ``rtol`` asks, whatever steps the solver took, and memory does not grow with the steps.
+    of, as far as they depend on what is differentiated. The derivatives are accurate to
+    ``rtol``, whatever steps the solver took, and memory does not grow with the steps.
 
     - ``rtol``: error of the derivatives relative to their size; None: that of the solver's
       ``accuracy``, or else 1e-9 in float64 and 1e-5 in float32.
-    - ``parts``: a field that draws its bodies together, as drag does, loses digits on the way
-      back, exp(rate of contraction * time) of them. The way back starts anew at every time that is
-      saved, and at the starts of at least so many equal parts of the whole.
+    - ``parts``: a field that contracts, as drag does, amplifies errors of the backward integration
+      by exp(rate of contraction * time). The backward integration restarts at every saved time, and
+      at the beginnings of at least this many equal parts of the time span.
     - The state: arrays of one shape, whose entries are bodies that the field treats separately.
-      ``args`` may tell its natural units, and better equations of the slopes for states of special
-      form: ``args.units``, ``args.costate`` (see ``polhode._hamiltonian``).
+      ``args.units`` and ``args.costate``, if present, give natural units and special adjoint
+      equations (see ``polhode._hamiltonian``).
     - Saved: the state itself, at the start, at given times, at the steps of ``diffrax.StepTo``, or
       at the end. Of several ``SubSaveAt`` the first is differentiated. Not for events.
 

@@ -566,9 +566,9 @@ class LiePoisson(AbstractIntegration):
 class EulerAngles(AbstractIntegration):
     """Canonical ZYZ Euler angles by Hamilton's equations (docs/equations.md), any diffrax solver.
 
-    A reference path: the chart breaks down where theta is 0 or pi, which is reported as
-    ``Status.CHART_SINGULAR``; passing near costs many steps. Arguments as ``ph.LiePoisson``; with a
-    solver whose bodies share their steps one body at a time, for the worst would hold up the rest.
+    For comparison: the coordinates are singular where theta is 0 or pi, which is reported as
+    ``Status.CHART_SINGULAR``; passing near costs many steps. Arguments as ``ph.LiePoisson``. Bodies
+    are integrated one at a time if they would share steps, so that none waits for the worst.
     """
 
     def __init__(

@@ -10,12 +10,12 @@ from polhode._scene import Scene, State
 
 
 class Record(eqx.Module):
-    """What to keep: attitude, rates, and whether only the last time (all static).
+    """What a simulation saves: attitude, rates, all times or the last one (all static).
 
-    ``work``: also integrate the work [J] that the external torques do. ``error``: also estimate
-    the error of each body at the last time, by a second, coarser run that costs about as much
-    again, and mark bodies that miss the tolerance by more than ten times ``Status.INACCURATE``:
-    chaotic ones, and those whose rounding alone is more than was asked for.
+    ``work``: also integrate the work [J] of the external torques. ``error``: also estimate the
+    error of each body at the last time, by a second, coarser run of about the same cost, and mark
+    bodies whose estimate is above ten times the tolerance by ``Status.INACCURATE``: chaotic
+    bodies, and those whose rounding error exceeds the tolerance.
     """
 
     attitude: bool = eqx.field(static=True, default=True)
@@ -47,9 +47,9 @@ class Samples(NamedTuple):
 
 
 class AbstractMethod(eqx.Module):
-    """Base of all methods. ``run`` moves N lanes; ``simulate`` does the checks and the batching.
+    """Base of all methods. ``run`` simulates N bodies; ``simulate`` checks inputs and batches.
 
-    ``exact``: whether nothing is stepped; such a method is not asked for the work.
+    ``exact``: whether the method is a closed form, which does not compute the work.
     """
 
     exact: ClassVar[bool] = False
@@ -71,5 +71,5 @@ class AbstractMethod(eqx.Module):
     def search(
         self, scene: Scene, state: State, ts: Array, rtol: Array, search: Any, final_only: bool
     ) -> Any:
-        """Events on the way, where the method itself can look for them; None where it cannot."""
+        """Events during the motion, if the method can find them by itself; None otherwise."""
         return None

@@ -21,7 +21,7 @@ class Status(enum.IntEnum):
 
     @property
     def explanation(self) -> str:
-        """What happened and how to mend it."""
+        """What happened and how to correct it."""
         return _EXPLANATIONS[self]
 
 
@@ -69,7 +69,7 @@ _EXPLANATIONS = {
 
 
 class SimulationError(RuntimeError):
-    """Some bodies did not finish; ``status`` (the batch's shape) tells which and why."""
+    """Some bodies did not finish; ``status`` (of the shape of the batch) states which and why."""
 
     def __init__(self, message: str, status: Array):
         super().__init__(message)

@@ -53,7 +53,7 @@ def _not_negative(name: str, value) -> Array:
 
 
 class ViscousCoupling(AbstractCoupling):
-    """Friction -c Omega on a wheel: a bearing, or a ring or wheel in a fluid that damps nutation.
+    """Viscous friction -c Omega on a wheel: a bearing, or a ring in a fluid that damps nutation.
 
     ``c`` (...) [N m s], not negative. A wheel with nothing else damps the motion of its body at
     constant angular momentum:
@@ -102,7 +102,7 @@ _COMMAND = Signature("Motor", {"t": (), "wxyz": (4,), "omega_body": (3,), "speed
 
 
 class Motor(AbstractCoupling):
-    """A motor between body and wheel, with the limits of one.
+    """A motor between body and wheel, with limits of torque and speed.
 
     **Arguments:** ``command``: torque on the wheel about its axis [N m], a number (...) or a
     function ``fn(t, wxyz, omega_body, speed)`` of one body, the wheel's speed [rad/s] relative to

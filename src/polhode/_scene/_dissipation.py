@@ -36,7 +36,7 @@ class EnergySink(AbstractTorque):
     dT/dt = -k |L x omega|^2 [W], and no torque from outside: the body ends in a spin about its
     axis of largest moment. ``k`` (...) [s/(kg m^2)] is a rate law: a number, not negative, or a
     function ``fn(momentum_body, omega_body)`` of L (3,) [kg m^2/s] and omega (3,) [rad/s] of one
-    body that returns one; kept and looked at as those of ``BodyTorque``. A body of moments A, A, C
+    body that returns one, stored and checked as those of ``BodyTorque``. A body of moments A, A, C
     with its angular momentum at the angle theta from the axis of C obeys, while k is constant,
 
         tan theta(t) = tan theta(0) exp(k |L|^2 (1/C - 1/A) t).

@@ -127,11 +127,11 @@ def _axes(r: Array, momentum: Array, normal: Array | None) -> tuple[Array, ...]:
 
 
 class RelativeTorque(AbstractTorque):
-    """A torque that sees attitude and rates against an orbit frame: ``torque`` in ``frame``.
+    """A torque computed from attitude and rates relative to an orbit frame.
 
-    ``RelativeTorque(ph.LinearDamping(c), frame)`` damps towards the frame, not towards rest;
-    ``RelativeTorque(ph.FeedbackTorque(fn), frame)`` points within it: ``fn`` is given the attitude
-    body -> frame and the rates against the frame. A ``ph.SpaceTorque`` is then along its axes.
+    ``RelativeTorque(ph.LinearDamping(c), frame)`` damps the rates relative to the frame;
+    ``RelativeTorque(ph.FeedbackTorque(fn), frame)`` passes the attitude body -> frame and the rates
+    relative to the frame to ``fn``. A ``ph.SpaceTorque`` is then along the axes of the frame.
 
     Raises TypeError for another kind of torque or frame.
     """

@@ -16,12 +16,14 @@ from polhode._scene._torques import AbstractTorque, coefficients, stacked, value
 
 
 class Pointing(AbstractTorque):
-    """A PD law that turns a body to an attitude: N = -2 kp e - kd omega in body axes.
+    """A PD control law for the attitude: N = -2 kp e - kd omega in body axes.
 
     e is the vector part of the quaternion from the attitude ``target`` to that of the body, of the
-    sign that turns the shorter way: for small angles kp times the angle. **Arguments:** ``kp``
-    [N m/rad] and ``kd`` [N m s], (..., 3) or (...) for the same about every axis, not negative;
-    ``target`` (..., 4): ``wxyz`` body -> space. At exactly half a turn the way is not decided.
+    sign of the shorter rotation: for small angles the torque is kp times the angle.
+
+    **Arguments:** ``kp`` [N m/rad] and ``kd`` [N m s], (..., 3) or (...) for the same about every
+    axis, not negative; ``target`` (..., 4): ``wxyz`` body -> space. At exactly half a revolution
+    the direction is undefined.
 
         law = ph.Pointing(kp=0.3, kd=0.8)
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), torque=law)
@@ -59,7 +61,7 @@ class Pointing(AbstractTorque):
 
 
 class RateDamping(AbstractTorque):
-    """A law that brings the body rates to given ones: N = -c (omega - rates) in body axes.
+    """A control law for the body rates: N = -c (omega - rates) in body axes.
 
     ``c`` (..., 3), or (...) for the same about every axis [N m s], not negative; ``rates`` (..., 3)
     [rad/s]. Raises ValueError for a negative c.
@@ -131,7 +133,7 @@ class MagneticDipole(AbstractTorque):
 
 
 class BDot(eqx.Module):
-    """Magnetic moment that brakes a tumble: m = k omega x B [A m^2], -k times the field's rate.
+    """Magnetic moment that detumbles a body: m = k omega x B [A m^2], -k times the rate of B.
 
     In body axes a field that hardly changes in space changes by B x omega. ``k`` [A m^2 s/T] (a
     number, a leaf that gradients tune); ``max_moment`` [A m^2]: limit of each of

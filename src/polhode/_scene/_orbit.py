@@ -160,7 +160,7 @@ class KeplerOrbit(AbstractOrbit):
     ``node`` (longitude of the ascending node), ``periapsis`` (its argument), ``mean_anomaly`` at
     the time ``epoch`` [rad, s], counted from periapsis. Space axes: z is the pole that the
     inclination is counted from, x the direction that the node is counted from. All orbits of a
-    batch are of one kind; ``hyperbolic`` (static) tells which where the numbers are traced.
+    batch are of one kind; ``hyperbolic`` (static) states which if the numbers are traced.
 
     Without an ``eccentricity`` (None) the orbit is a circle by construction: no equation is solved,
     and there is no derivative with respect to the eccentricity, as there is with 0.0. The argument
@@ -242,10 +242,9 @@ class KeplerOrbit(AbstractOrbit):
         """The conic through a position (..., 3) [m] with a velocity (..., 3) [m/s].
 
         ``mu`` (...) [m^3/s^2]; both from the attracting centre, in space axes, at the time
-        ``epoch`` (...) [s]. They are kept in place of elements, so that derivatives are regular
-        everywhere, also for circular and equatorial orbits, where elements are not. All orbits of a
-        batch are ellipses, or all are hyperbolas, for fly-bys; ``hyperbolic`` (static) tells which
-        where the numbers are traced.
+        ``epoch`` (...) [s]. They are stored in place of elements, so that derivatives are regular
+        everywhere, also for circular and equatorial orbits. All orbits of a batch are ellipses, or
+        all are hyperbolas; ``hyperbolic`` (static) states which if the numbers are traced.
 
         Lagrange's f and g functions of the difference in eccentric or hyperbolic anomaly (R. H.
         Battin, An Introduction to the Mathematics and Methods of Astrodynamics, 1999).

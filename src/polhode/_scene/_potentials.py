@@ -29,7 +29,7 @@ class AbstractPotential(AbstractPart):
     """Base of all potentials; they add with ``+``.
 
     ``energy(attitude, t, inertia)`` returns joules from component arrays: use
-    ``attitude.row(i)``, ``to_body``, ``to_space`` (only the rows looked at are computed and
+    ``attitude.row(i)``, ``to_body``, ``to_space`` (only the rows that are used are computed and
     differentiated).
     """
 

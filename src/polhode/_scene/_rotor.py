@@ -111,7 +111,7 @@ class Rotor(AbstractRotor):
 
     @property
     def is_held(self) -> bool:
-        """Whether a motor holds the speed relative to the body (static)."""
+        """Whether the speed relative to the body is prescribed (static)."""
         return self.torque is None and self.impulse is None and self.coupling is None
 
     @property

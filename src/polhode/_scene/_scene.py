@@ -21,7 +21,7 @@ from polhode.inertia import Inertia
 
 
 class Scene(eqx.Module):
-    """A rigid body and what acts on it; absent parts are None and cost nothing.
+    """A rigid body and what acts on it; absent parts are None and add nothing to the program.
 
     **Arguments:** ``inertia``: ``ph.Inertia``; ``potential``: ``ph.AbstractPotential`` or None;
     ``torque``: ``ph.AbstractTorque`` or None; ``rotors``: ``ph.Rotor`` or a sum of such, or None
@@ -43,7 +43,7 @@ class Scene(eqx.Module):
 
     @property
     def is_free(self) -> bool:
-        """Whether nothing acts on the body and nothing turns in it (static)."""
+        """Whether there is no potential, torque or wheel (static)."""
         return self.potential is None and self.torque is None and self.rotors is None
 
     def settled(self, state: State, start: Array | np.ndarray) -> "Scene":
@@ -151,7 +151,7 @@ class Scene(eqx.Module):
 
     @property
     def dynamics(self) -> Dynamics:
-        """What moves the body."""
+        """The field of the equations of motion."""
         wheels = self._wheels
         loose = None if wheels is None or wheels.is_constant else wheels
         return Dynamics(self.hamiltonian, self.torque, wheels=loose)
@@ -165,7 +165,7 @@ class Scene(eqx.Module):
 
     @property
     def hamiltonian(self) -> Hamiltonian:
-        """The one Hamiltonian of this scene."""
+        """The Hamiltonian of this scene."""
         wheels = self._wheels
         carried = None if wheels is None else wheels.body_momentum
         spinning = None if wheels is None or wheels.is_constant else wheels.energy

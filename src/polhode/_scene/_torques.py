@@ -96,9 +96,9 @@ def value_at(name: str, vector, t) -> tuple[Array, Array, Array]:
 class BodyTorque(AbstractTorque):
     """Torque given in body axes [N m]: constant (..., 3) or a function of time [s] -> (3,).
 
-    The function may jump. A pulse far shorter than a step can be missed: ``ph.Pulses`` has edges
-    that steps end at. A plain function is static data of the scene, not a
-    leaf of it; an ``eqx.Module`` keeps its arrays as leaves.
+    The function may jump; for pulses at known times use ``ph.Pulses``, at whose edges steps end. A
+    plain function is static data of the scene, not a leaf; an ``eqx.Module`` has its arrays as
+    leaves.
 
     Raises TypeError or ValueError for a function that takes or returns something else.
     """
@@ -117,7 +117,7 @@ class BodyTorque(AbstractTorque):
 class SpaceTorque(AbstractTorque):
     """Torque given in space axes [N m]: constant (..., 3) or a function of time [s] -> (3,).
 
-    Functions are kept and looked at as those of ``BodyTorque``.
+    Functions are stored and checked as those of ``BodyTorque``.
     """
 
     n: Float[Array, "*#b 3"] | Callable = shaped(3)

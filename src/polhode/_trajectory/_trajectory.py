@@ -154,10 +154,10 @@ class Trajectory(eqx.Module):
         ``t`` (K,) is shared by all bodies, (..., K) one row a body; a number is taken as (1,). In
         any order, also outside the times simulated; beyond the ``event_time`` of a body its times
         and samples are those of the event. Differentiable in ``t``, in the initial state
-        and in the numbers of the scene; under ``jit`` and ``vmap`` too. Exact laws are evaluated at
-        ``t``; a stepped body is moved there from its nearest sample, which keeps ``rtol`` and costs
-        a few steps for each time. A time that is not finite gives NaN. ``work``, ``motor_work`` and
-        ``error`` are None.
+        and in the numbers of the scene; under ``jit`` and ``vmap`` too. Closed forms are evaluated
+        at ``t``; an integrated motion is continued from the nearest sample, to ``rtol``, at the
+        cost of a few steps for each time. A time that is not finite gives NaN. ``work``,
+        ``motor_work`` and ``error`` are not available.
 
         Raises ValueError where attitude or rates were not recorded, SimulationError as
         ``ph.simulate`` does.
@@ -184,7 +184,7 @@ class Trajectory(eqx.Module):
 
     @property
     def last(self) -> State:
-        """The state (...) at the last sample, from which another simulation may go on.
+        """The state (...) at the last sample, from which another simulation can continue.
 
         It holds attitude and rates and, where the scene has wheels that are not held at their
         speed, the speeds of all wheels.

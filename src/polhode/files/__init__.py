@@ -1,6 +1,6 @@
 """Scene files (TOML) and labelled output (NetCDF).
 
-Reading and checking a file needs no JAX; what builds polhode's objects is imported when asked for.
+Reading and checking a file needs no JAX; the builders of scenes are imported on first use.
 """
 
 import importlib

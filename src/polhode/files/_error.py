@@ -8,8 +8,8 @@ from pathlib import Path
 class SceneFileError(ValueError):
     """A scene file that cannot be used.
 
-    `str(error)` is a readable block of a few lines: the file and key, what was given, what is
-    expected, and how to mend it.
+    `str(error)` is a readable block of a few lines: the file and key, the value, what is expected,
+    and how to correct it.
     """
 
     def __init__(

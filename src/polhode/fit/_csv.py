@@ -43,7 +43,7 @@ def read_recording(
 
     Raises FileNotFoundError, and ValueError for a file that is not text, missing, ambiguous or
     repeated columns, cells that are no numbers, unsorted or repeated times (each with its line) and
-    rates that look like deg/s.
+    rates that appear to be in deg/s.
     """
     return load_recording(path, columns, scale=scale, time_scale=time_scale, noise=noise).recording
 

@@ -34,8 +34,8 @@ class Recording(eqx.Module):
     scatter is taken from the residuals); ``present`` (..., T): 1 for a sample, 0 for a gap;
     ``wheel`` (..., T), rad/s: speed of a wheel relative to the body, if there is one, its gaps
     bridged linearly; ``wheel_known`` (..., T): 1 where it was measured; ``saturated`` (..., T, 3):
-    1 and -1 where an axis of the gyroscope is at its upper or lower limit, else 0; None: fits look
-    for limits by themselves.
+    1 and -1 where an axis of the gyroscope is at its upper or lower limit, else 0; None: fits
+    search for limits by themselves.
     """
 
     times: Float[Array, "*b t"]

@@ -270,8 +270,8 @@ class Fit(eqx.Module):
 
         Reversing one rate (or exchanging two) changes the sign of ``omega x I omega`` and nothing
         else, which is the free motion of the body ``I Sigma`` with ``Sigma = tr(I)/2 - I``: the
-        ratios ``I_k (I_i + I_j - I_k)``. It is as physical as the first, so free rates alone cannot
-        tell the handedness; attitudes, a wheel or knowledge of the body can.
+        ratios ``I_k (I_i + I_j - I_k)``. It is as physical as the first, so free rates alone do not
+        determine the handedness; attitudes, a wheel or knowledge of the body do.
         """
         body = self._of_inertia("mirror_inertia")
         return Inertia(diagonal=other_hand(body.moments)).turned(body.axes)

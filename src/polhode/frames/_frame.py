@@ -62,8 +62,8 @@ class RotatingFrame(eqx.Module):
     frames use ``jax.vmap``. What a frame lacks is None and costs nothing: a constant angular
     velocity has no Euler force, an origin at rest no origin force.
 
-    ``turning`` tells attitude and rates; ``origin`` is None or a function of time giving the
-    origin's position in space components [m], whose derivatives are found by differentiation.
+    ``turning`` gives attitude and rates; ``origin`` is None or a function of time that returns the
+    position of the origin in space components [m], which is differentiated automatically.
 
     As of every ``eqx.Module`` a method holds the frame's arrays, which ``jax.jit`` cannot take as
     fixed: ``eqx.filter_jit(frame.omega)(t)``, or hand the frame in as an argument.
@@ -84,7 +84,7 @@ class RotatingFrame(eqx.Module):
         """From an angular velocity along the rotating axes [rad/s]: constant, or a function of t.
 
         ``wxyz`` is the attitude at ``t0``, axes aligned with space by default. With a function of
-        time the attitude is integrated from ``t0`` each time it is asked for.
+        time the attitude is integrated from ``t0`` at each evaluation.
         """
         varies = callable(omega_body)
         omega = None if varies else as_float_array("omega_body", omega_body, (3,))

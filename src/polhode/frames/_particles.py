@@ -166,18 +166,18 @@ def simulate_particles(
     max_steps: int = 2**16,
     throw: bool = True,
 ) -> ParticlePaths:
-    """Move particles in a rotating frame, all with shared steps, by any diffrax solver.
+    """Simulate particles in a rotating frame, with shared steps, by any diffrax solver.
 
     **Arguments:**
 
     - ``position`` [m], ``velocity`` [m/s]: at ``ts[0]``, frame components (..., 3).
-    - ``ts``: (T,) [s], strictly increasing or strictly decreasing; every one is stepped to exactly.
+    - ``ts``: (T,) [s], strictly increasing or strictly decreasing; each ends a step.
     - ``force``: None (a free particle), `FrameForce` or `SpaceForce` [N]; ``mass`` [kg], (...).
     - ``rtol``: error per step relative to each particle's own length and speed; None: 1e-9 in
       float64, 1e-5 in float32.
     - ``solver`` (Dopri8), ``controller``, ``adjoint``, ``max_steps``: as in diffrax.
     - ``throw``: raise RuntimeError when the last time was not reached. Nothing is raised under
-      ``jit``, ``vmap`` or ``grad``: look at ``ParticlePaths.successful``.
+      ``jit``, ``vmap`` or ``grad``: check ``ParticlePaths.successful``.
 
     Raises TypeError or ValueError for wrong kinds, shapes, dtypes, times or masses.
     """

@@ -39,8 +39,8 @@ _ONE_FORM = (
 class Inertia(AbstractShaped, AbstractPart):
     """Inertia tensor I of a rigid body in body axes, kg m^2 (docs/equations.md, 003).
 
-    ``ph.Inertia(moments)``, of shape (..., 3), is ``Inertia.from_moments(moments)``; three rows of
-    three may be a tensor as well and are refused. The ``from_...`` constructors say what is meant.
+    ``ph.Inertia(moments)``, of shape (..., 3), is ``Inertia.from_moments(moments)``. Three rows of
+    three are rejected, since they may be a tensor: use a ``from_...`` constructor.
 
     The numbers stand in one of four forms, leading axes being a batch of bodies: ``diagonal``
     (..., 3), moments about body x, y, z, which are principal axes; ``full`` (..., 3, 3), any axes;
@@ -49,7 +49,7 @@ class Inertia(AbstractShaped, AbstractPart):
     a body that leaves it is one of another form. Given by these names numbers are taken as they
     are, and judged when the body is moved (``ph.Status.NOT_PHYSICAL``).
 
-    ``physical`` (static): whether the triangle inequality is asked for; positive moments and a
+    ``physical`` (static): whether the triangle inequality is required; positive moments and a
     symmetric tensor always are. Only numbers that are given by name may do without.
     """
 
@@ -236,7 +236,7 @@ class Inertia(AbstractShaped, AbstractPart):
 
     @property
     def axes(self) -> Float[Array, "*b 4"] | None:
-        """Turn ``wxyz`` from principal to body axes, or None when they are the same.
+        """Rotation ``wxyz`` from principal to body axes, or None when they are the same.
 
         Carries no derivative (``principal`` says how to get derivatives right).
         """
@@ -250,14 +250,14 @@ class Inertia(AbstractShaped, AbstractPart):
         return _diagonal(self.moments)
 
     def turned(self, wxyz: Float[Array, "*#b 4"]) -> Self:
-        """The body turned by the unit quaternion (..., 4) in its axes: ``R I R^T``, a full tensor.
+        """The body rotated by the unit quaternion (..., 4) in its axes: ``R I R^T``, a full tensor.
 
         ``axes`` of the result is such a turn: ``Inertia(moments).turned(axes)`` is the body again.
         """
         return type(self)(full=turned(self.tensor, wxyz_to_matrix(wxyz)), physical=self.physical)
 
     def to_principal(self) -> tuple[Self, Float[Array, "*b 4"]]:
-        """The same body in principal axes, and the turn ``wxyz`` from those to the present axes.
+        """The body in principal axes, and the rotation ``wxyz`` from those to the present axes.
 
         ``wxyz`` is a constant for derivatives, and the products of inertia about it are dropped:
         for derivatives of a motion with respect to a full tensor use ``principal``.

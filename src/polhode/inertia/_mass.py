@@ -157,7 +157,7 @@ class MassProperties(AbstractShaped):
         )
 
     def moved(self, offset: ArrayLike = (0.0, 0.0, 0.0), wxyz: ArrayLike | None = None) -> Self:
-        """The body first turned about its origin by ``wxyz`` (..., 4), then shifted by ``offset``.
+        """The body rotated about its origin by ``wxyz`` (..., 4), then translated by ``offset``.
 
         ``offset`` (..., 3), m, and the turn are given in the axes of the assembly; a quaternion
         that is not of unit length is normalised. A zero one raises ValueError.

@@ -55,22 +55,22 @@ def fit_light_curve(
     max_solutions: int = 12,
     convex: bool | None = None,
 ) -> LightCurveFit:
-    """Every tumbling ellipsoid, of free inertia, that explains a light curve; without a guess.
+    """All tumbling ellipsoids, of free inertia, that explain a light curve; no starting guess.
 
-    Pairs of frequencies from Fourier series, each with all it can mean; ``trials`` bodies of these
-    periods, their phases those that the series prefers, all else drawn at random;
-    Levenberg-Marquardt, with exact derivatives, on the best ``starts`` of each pair and meaning; as
-    many again of the likeliest and of those with the best bodies so far; the mirror images of what
-    is found; distinct solutions, the ``max_solutions`` best and all others that cannot be excluded.
-    Repeated until two searches agree, ``searches`` times at most.
+    The search (docs/light_curves.md): pairs of frequencies from Fourier series, each with all its
+    interpretations; ``trials`` bodies with these periods, with phases from the series and other
+    parameters drawn at random; Levenberg-Marquardt, with exact derivatives, on the best ``starts``
+    of each interpretation, then again on the most probable; mirror images; the ``max_solutions``
+    best distinct solutions and all others that cannot be excluded. Repeated until two searches
+    agree, at most ``searches`` times.
 
     ``phase``: a phase function (default: ``HG1G2()`` where the phase angle changes by more than 5
     degrees, else ``SeeligerPhase()``). ``pairs``: instead of those from the series.
     ``max_frequency``: the highest frequency of the search, per day. ``floor`` [mag]: added
     to the errors in quadrature, growing with the phase angle, for what an ellipsoid cannot be.
     ``offset_sigma``: see ``LightCurve.columns``;
-    None: of a calibrated curve with eight groups or more it is learnt from the best motion found,
-    and all are fitted again with it. ``limit``: residuals beyond as many sigma count by their size,
+    None: of a calibrated curve with eight groups or more it is estimated from the best motion, and
+    all are fitted again with it. ``limit``: residuals beyond as many sigma count by their size,
     not their square. Needs float64 (``jax_enable_x64``).
 
     Raises RuntimeError in float32, ValueError for a light curve without directions.

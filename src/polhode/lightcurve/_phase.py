@@ -57,8 +57,8 @@ class HG(AbstractPhase):
 class HG1G2(AbstractPhase):
     """The H, G1, G2 system; coefficients G1, G2. Muinonen et al. 2010, Icarus 209, 542.
 
-    Beyond 150 degrees, where the system is not defined, its splines are continued by their last
-    slope over their last value, as a falling exponential.
+    Beyond 150 degrees, where the system is not defined, its splines are continued as a decreasing
+    exponential with their last value and derivative.
     """
 
     typical: ClassVar[tuple[float, ...]] = (0.26, 0.38)

@@ -19,13 +19,13 @@ def read_light_curve(
     calibrated: bool = False,
     reduced: bool = False,
 ) -> LightCurve:
-    """A ``LightCurve`` from a file, whose kind is told by its contents.
+    """A ``LightCurve`` from a file, whose format is recognised from its contents.
 
     CSV: columns ``jd`` (or ``time``, ``t``; days), ``magnitude`` (``mag``) or ``flux``
-    (``brightness``), ``sun_x`` ... ``observer_z`` (``earth_x``; from the body, au), and as wanted
+    (``brightness``), ``sun_x`` ... ``observer_z`` (``earth_x``; from the body, au), and optionally
     ``sigma`` (``mag_err``; in the unit of the brightness), ``group`` (``observer``, ``night``,
     ``block``). Times are those at the observer, not corrected for light time, and brightness is
-    not reduced for distance, but for a flux of mean 1. ``vectors``: a second CSV of ``jd`` and the
+    not reduced for distance, except a flux of mean 1. ``vectors``: a second CSV of ``jd`` and the
     six components, interpolated linearly, for a file that has none. ALCDEF: magnitudes with their
     geometry from PHASE, PABL and PABB. DAMIT: intensities with vectors. Of CSV and ALCDEF:
     ``calibrated``: groups share a zero point but for small errors; ``reduced``: brightness is

@@ -76,7 +76,7 @@ def euler_to_axis_angle(
 def axis_angle_to_euler(
     axis: Float[ArrayLike, "*b 3"], angle: Float[ArrayLike, "*b"], sequence: Sequence = Sequence.ZYZ
 ) -> _Angles:
-    """Euler angles of the turn by ``angle`` about the unit vector ``axis``."""
+    """Euler angles of the rotation by ``angle`` about the unit vector ``axis``."""
     return wxyz_to_euler(axis_angle_to_wxyz(axis, angle), sequence)
 
 

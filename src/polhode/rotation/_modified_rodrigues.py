@@ -37,7 +37,7 @@ def _project(wxyz: Array) -> Array:
 
 
 def wxyz_to_modified_rodrigues(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3"]:
-    """The set of length at most 1, smooth at the identity; it jumps to its shadow at a half turn.
+    """The set of length at most 1, smooth at the identity; its shadow follows at an angle of pi.
 
     The scale of the quaternion does not matter.
     """

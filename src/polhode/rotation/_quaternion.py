@@ -24,7 +24,7 @@ def identity(shape: tuple[int, ...] = (), dtype: DTypeLike | None = None) -> Flo
 def multiply(
     left: Float[ArrayLike, "*#b 4"], right: Float[ArrayLike, "*#b 4"]
 ) -> Float[Array, "*b 4"]:
-    """Hamilton product ``left right``: first turn by ``right``, then by ``left``."""
+    """Hamilton product ``left right``: the rotation ``right`` followed by ``left``."""
     return _product(as_vectors("left", left, 4), as_vectors("right", right, 4))
 
 
@@ -93,14 +93,14 @@ def canonical(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
 def between(
     start: Float[ArrayLike, "*#b 4"], end: Float[ArrayLike, "*#b 4"]
 ) -> Float[Array, "*b 4"]:
-    """Rotation that leads from ``start`` to ``end`` in body axes: ``end = start between``."""
+    """Rotation from ``start`` to ``end`` in body axes: ``end = start between``."""
     return multiply(conjugate(start), end)
 
 
 def angle_between(
     start: Float[ArrayLike, "*#b 4"], end: Float[ArrayLike, "*#b 4"]
 ) -> Float[Array, "*b"]:
-    """Angle in [0, pi] (rad) of the rotation that leads from one attitude to the other."""
+    """Angle in [0, pi] (rad) of the rotation from one attitude to the other."""
     return _angle(as_quaternions(start, "start"), as_quaternions(end, "end"))
 
 

@@ -4,7 +4,7 @@ import enum
 
 
 class Sequence(enum.Enum):
-    """Order of the three turns that Euler angles describe.
+    """Order of the three rotations of Euler angles.
 
     ``Sequence.ZYZ`` is the convention here, ``R = Rz(phi) Ry(theta) Rz(psi)``. A plain member
     is *intrinsic*: the second and third turn are about the axes that the body has by then, and
@@ -61,7 +61,7 @@ class Sequence(enum.Enum):
 
     @property
     def is_extrinsic(self) -> bool:
-        """Whether all three turns are about fixed space axes."""
+        """Whether all three rotations are about fixed space axes."""
         return self.value[1]
 
     @property
