@@ -33,8 +33,7 @@ RETIRED = {
 """Pattern of whole words -> what to write in its place."""
 
 BARE = set(
-    "turned moved mended settled polished given known found kept held made told asked wanted rest"
-    " whole left gone most least near slope slopes look looks march room".split()
+    ["turned", "moved", "mended", "settled", "polished", "given", "known", "found", "kept", "held", "made", "told", "asked", "wanted", "rest", "whole", "left", "gone", "most", "least", "near", "slope", "slopes", "look", "looks", "march", "room"]
 )
 """Names of functions, parameters and fields that say no noun and no verb of the field."""
 
