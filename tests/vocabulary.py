@@ -32,9 +32,35 @@ RETIRED = {
 }
 """Pattern of whole words -> what to write in its place."""
 
-BARE = set(
-    ["turned", "moved", "mended", "settled", "polished", "given", "known", "found", "kept", "held", "made", "told", "asked", "wanted", "rest", "whole", "left", "gone", "most", "least", "near", "slope", "slopes", "look", "looks", "march", "room"]
-)
+BARE = {
+    "turned",
+    "moved",
+    "mended",
+    "settled",
+    "polished",
+    "given",
+    "known",
+    "found",
+    "kept",
+    "held",
+    "made",
+    "told",
+    "asked",
+    "wanted",
+    "rest",
+    "whole",
+    "left",
+    "gone",
+    "most",
+    "least",
+    "near",
+    "slope",
+    "slopes",
+    "look",
+    "looks",
+    "march",
+    "room",
+}
 """Names of functions, parameters and fields that say no noun and no verb of the field."""
 
 PATTERN = re.compile(rf"\b({'|'.join(RETIRED)})\b", re.IGNORECASE)
