@@ -471,7 +471,7 @@ def _() -> str:
         for row in _numbers("satellites")["rows"]
     ]
     header = ["", "least squares", "instrumental variables",
-              "`fit_inertia` with the wheel's instrument", "95 % hold"]  # fmt: skip
+              "likelihood of the readings", "95 % hold"]  # fmt: skip
     return _block(rows(header, lines), f"({command(read('satellites'))})")
 
 

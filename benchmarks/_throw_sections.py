@@ -54,8 +54,8 @@ def throw_design(report: dict) -> list[str]:
     return [
         "## Which throw tells most", "", machine(report), "",
         "Geometric mean of the standard deviations that one throw leaves of the tensor, from the"
-        " log-determinant of `fit.throw_information`: by direction of a spin of 18 rad/s, and by"
-        " the program of the wheel.", "",
+        " log-determinant of `benchmarks.throws.throw_information`: by direction of a spin of 18"
+        " rad/s, and by the program of the wheel.", "",
         "![what a throw tells by spin and by program](results/throw_design.svg)", "",
     ]  # fmt: skip
 

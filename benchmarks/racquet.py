@@ -28,14 +28,13 @@ if __name__ == "__main__":
 import jax
 import numpy as np
 
+from benchmarks.throws import Instrument, fit_balance
 from polhode.fit import (
     Drag,
     FitOptions,
     Gyroscope,
-    Instrument,
     Recording,
     SteppedMotion,
-    fit_balance,
     fit_inertia,
     fit_recordings,
 )

@@ -8,9 +8,10 @@ would change the rates by 1e-5 rad/s^2.
 
 Three estimators of the six entries on the same readings: least squares on Euler's equations with
 central differences; instrumental variables, the same equations with regressors that the motion of
-the first estimate gives (they hold no noise of the readings); ``fit_inertia`` with the wheel's
-instrument. Printed: mean over runs of |tensor - true| / |true| (Frobenius), in per cent, and of the
-last the rms of errors of the moments over the standard deviations stated.
+the first estimate gives (they hold no noise of the readings); the estimator of
+``benchmarks.throws`` with the wheel's instrument. Printed: mean over runs of |tensor - true| /
+|true| (Frobenius), in per cent, and of the last the rms of errors of the moments over the standard
+deviations stated.
 
     python -m benchmarks.satellites [--runs 20]
 """
@@ -28,6 +29,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks._steps import runge_kutta
+from benchmarks.throws import Instrument, fit_balance
 from polhode import fit as room
 
 STEP, LENGTH, PARTS = 0.1, 60.0, 10
@@ -132,10 +134,13 @@ def study(name, push, runs):
     rng = np.random.default_rng(5)
     readings = paths + NOISE * rng.normal(size=paths.shape)
     wheel = fastest * np.asarray(program(times))
-    fit = room.fit_inertia(
-        times, readings, wheel_speed=np.broadcast_to(wheel, readings.shape[:2]),
-        instrument=room.Instrument(spin, AXIS), throw=False,
-    )  # fmt: skip
+    fits = [
+        fit_balance(
+            [room.Recording.of(times, one, wheel_speed=wheel)], Instrument(spin, AXIS), throw=False
+        ).fit
+        for one in readings
+    ]
+    fit = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *fits)
     both = [regressions(one, spin, fastest, times) for one in readings]
     found = {
         "least_squares": [a for a, _ in both],

@@ -1,4 +1,4 @@
-"""Which throw tells most: ``fit.throw_information`` over initial spins and wheel programs.
+"""Which throw tells most: ``throw_information`` over initial spins and wheel programs.
 
 A body of 10 times the inertia of the TU Delft device, its wheel, window and noise
 (``benchmarks.throws_synthetic``). The number shown is ``exp(-log det / 12)``: the geometric mean of
@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks import throws_synthetic as study
-from polhode.fit import Instrument, Noise, throw_information
+from benchmarks.throws import Instrument, Noise, throw_information
 
 jax.config.update("jax_enable_x64", True)
 TENSOR = jnp.asarray(10 * study.DEVICE)

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks._steps import runge_kutta
+from benchmarks.throws import Instrument, fit_balance, fit_each
 from polhode import fit as room
 
 SPIN = 1.7e-6
@@ -108,8 +109,8 @@ def study(size, number, together=40, group=120):
     joints, moments, spread, done = [], [], [], 0
     for first in range(0, number, group):
         given = throws(round(100 * size) + first, tensor, min(group, number - first))
-        joint = room.fit_balance(given[:together], room.Instrument(SPIN), block=BLOCK)
-        alone = room.fit_each(joint, given)
+        joint = fit_balance(given[:together], Instrument(SPIN), block=BLOCK)
+        alone = fit_each(joint, given)
         joints.append((np.asarray(joint.moments[0]) - true) / np.asarray(joint.moments_std[0]))
         moments.append(np.asarray(alone.moments))
         spread.append(np.asarray(alone.moments_std))
@@ -123,11 +124,11 @@ def study(size, number, together=40, group=120):
 
 
 def study_own(size, number):
-    """Errors of single throws that tell their noise as well, as of ``fit_inertia`` with a wheel."""
+    """Errors of single throws that tell their noise as well."""
     tensor = size * DEVICE
     true = np.linalg.eigvalsh(tensor)
     fits = [
-        room.fit_balance([one], room.Instrument(SPIN), block=BLOCK, throw=False)
+        fit_balance([one], Instrument(SPIN), block=BLOCK, throw=False)
         for one in throws(round(100 * size) + 11, tensor, number)
     ]
     moments, spread = (

@@ -110,8 +110,6 @@ def test_a_level_is_a_probability(fits):
     ("name", "message"),
     [
         ("scene", "a fit of an inertia has no scene"),
-        ("instrument", "only the likelihood of readings has instrument"),
-        ("noise_levels", "only the likelihood of readings has noise_levels"),
     ],
 )
 def test_what_a_fit_of_an_inertia_lacks_is_named(fits, name, message):

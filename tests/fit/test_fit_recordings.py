@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from polhode.fit import FitOptions, Recording, fit_inertia, fit_recordings
+from polhode.fit import FitOptions, Recording, averaged, fit_inertia, fit_recordings
 from polhode.rotation import wxyz_to_matrix
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -72,3 +72,21 @@ def test_a_recording_made_without_its_noise_is_told():
     bare = Recording(times, np.ones(20), np.stack([np.sin(times)] * 3, axis=-1))
     with pytest.raises(ValueError, match=r"no omega_noise: make it by Recording\.of"):
         fit_recordings([bare])
+
+
+def test_gaps_of_the_wheel_are_bridged_and_remembered():
+    times = np.linspace(0, 1, 11)
+    wheel = 100 * times
+    wheel[[0, 4, 5, 10]] = np.nan
+    one = Recording.of(times, np.ones((11, 3)), wheel_speed=wheel)
+    np.testing.assert_allclose(one.wheel[1:10], 100 * times[1:10])
+    np.testing.assert_allclose(np.asarray(one.wheel)[[0, 10]], [10, 90])
+    np.testing.assert_array_equal(one.wheel_known, np.isfinite(wheel))
+    np.testing.assert_array_equal(one.present, np.ones(11))
+    half = averaged(one, 2)
+    np.testing.assert_array_equal(half.wheel_known, [0, 1, 0, 1, 1])
+    np.testing.assert_allclose(half.times, [0.05, 0.25, 0.45, 0.65, 0.85])
+    with pytest.raises(ValueError, match="blocks of 6 leave 1 of 11 samples"):
+        averaged(one, 6)
+    with pytest.raises(ValueError, match="wheel_speed needs at least 2 numbers, got 0"):
+        Recording.of(times, np.ones((11, 3)), wheel_speed=np.full(11, np.nan))

@@ -166,7 +166,6 @@ INERTIA = (
     "inertia", "moments", "axes", "ratios", "moments_std", "ratios_std", "axes_std", "scale_known",
     "principal_values", "mirror_inertia",
 )  # fmt: skip
-READINGS = ("instrument", "noise_levels", "negative_log_likelihood")
 
 
 def test_a_fit_of_a_scene_has_the_fields_of_every_fit(found):
@@ -187,9 +186,9 @@ def test_a_fit_of_a_scene_has_the_fields_of_every_fit(found):
     assert found.report().count("+-") == 3 * 240
 
 
-@pytest.mark.parametrize("name", [*INERTIA, *READINGS])
+@pytest.mark.parametrize("name", INERTIA)
 def test_what_a_fit_of_a_scene_lacks_is_named(found, name):
-    with pytest.raises(AttributeError, match=f"has no {name}:|has {name}: fit_balance"):
+    with pytest.raises(AttributeError, match=f"has no {name}:"):
         getattr(found, name)
     assert not hasattr(found, name)
 

@@ -12,11 +12,8 @@ from polhode.fit import (
     FitOptions,
     FreeMotion,
     FullTensor,
-    Instrument,
     Recording,
-    Tolerance,
     _fit,
-    _fit_balance,
     stack,
 )
 
@@ -55,20 +52,6 @@ def test_the_fits_hand_over_no_batch(affected, fit):
     options = FitOptions(FreeMotion(), FullTensor())
     batch, calls = largest_batch(getattr(_fit, fit).__wrapped__, recordings(6), options)
     assert (batch, calls > 4) == (1, True)
-
-
-def test_nor_does_the_balance(affected):
-    given = recordings(6)
-
-    def balanced(given):
-        numbers = np.array([0, 1, 0, 1, 0, 1])
-        places, used = _fit_balance._by_body(numbers, 2)
-        return _fit_balance._together.__wrapped__(
-            given, jnp.asarray(numbers), places, used, Instrument(1e-6), Tolerance(), 2
-        )
-
-    batch, calls = largest_batch(balanced, given)
-    assert (batch, calls > 2) == (1, True)
 
 
 def test_plain_calls_would_be_found():

@@ -88,21 +88,13 @@ def fit(
         float | None,
         typer.Option(
             parser=positive, metavar="J",
-            help="spin inertia of the wheel, kg m^2: fixes the absolute scale. Drag and noise are"
-            " then found too",
+            help="spin inertia of the wheel, kg m^2: fixes the absolute scale",
         ),
     ] = None,
     wheel_axis: Annotated[
         tuple[float, float, float],
         typer.Option(metavar="X Y Z", help="axis of the wheel"),
     ] = (0.0, 0.0, 1.0),
-    block: Annotated[
-        int,
-        typer.Option(
-            min=1, metavar="N",
-            help="with --wheel-inertia: samples to a residual, so many that their noise is white",
-        ),
-    ] = 1,
     allow_undetermined: Annotated[
         bool,
         typer.Option(
@@ -127,14 +119,10 @@ def fit(
         path=path, columns=named, degrees=degrees, milliseconds=milliseconds, noise=noise,
         moments_only=moments_only, calibration=calibration, max_rate=max_rate,
         bias=bias, drag=drag, robust=robust,
-        wheel_inertia=wheel_inertia, wheel_axis=wheel_axis, block=block,
+        wheel_inertia=wheel_inertia, wheel_axis=wheel_axis,
     )  # fmt: skip
     if wheel_inertia and "wheel" not in named:
         raise UsageError("--wheel-inertia needs the wheel's speed: add wheel=COLUMN to --columns.")
-    if wheel_inertia:
-        _only_a_wheel(asked)
-    elif block != 1:
-        raise UsageError("--block belongs to --wheel-inertia.")
     if robust and not noise:
         raise UsageError("--robust counts in noises: give --noise SIGMA too.")
     if not math.hypot(*wheel_axis) > 0 or not math.isfinite(math.hypot(*wheel_axis)):
@@ -145,20 +133,6 @@ def fit(
     if not no_figure:
         goals.append(_goal(asked, output, ".png", force))
     return _fit(asked, goals, quiet=quiet, no_cache=no_cache, allowed=allow_undetermined)
-
-
-def _only_a_wheel(asked: _Asked) -> None:
-    """Refuse what the likelihood of the readings does not use, and name the way to it."""
-    cures = {
-        "--drag": (asked.drag, "a drag is fitted anyway; leave it out"),
-        "--noise": (asked.noise, "the noise is found from the readings; leave it out"),
-        "--bias": (asked.bias, "fit_balance(..., tolerance=Tolerance()) in Python fits it"),
-        "--moments-only": (asked.moments_only, "the whole tensor is found; leave it out"),
-        "--robust": (asked.robust, "leave the outliers blank in the file"),
-    }
-    for option, (given, cure) in cures.items():
-        if given:
-            raise UsageError(f"{option} does not go with --wheel-inertia: {cure}.")
 
 
 def _columns(words: list[str], given: list[str]) -> tuple[Path, dict[str, str]]:
@@ -266,12 +240,11 @@ def _said(loaded: Any) -> str:
 
 def _keywords(asked: _Asked, room: Any) -> dict[str, Any]:
     """Keywords of ``fit_recordings``."""
-    if asked.wheel_inertia:
-        axis = tuple(x / math.hypot(*asked.wheel_axis) for x in asked.wheel_axis)
-        return {"instrument": room.Instrument(asked.wheel_inertia, axis), "block": asked.block}
     motion = room.FreeMotion()
-    if asked.drag:
-        motion = room.SteppedMotion(drag=room.Drag(), fit_drag=True)
+    if asked.drag or asked.wheel_inertia:
+        drag = room.Drag() if asked.drag else None
+        axis = tuple(x / math.hypot(*asked.wheel_axis) for x in asked.wheel_axis)
+        motion = room.SteppedMotion(asked.wheel_inertia, axis, drag=drag, fit_drag=asked.drag)
     options = room.FitOptions(
         motion=motion,
         unknown=room.MomentsOnly() if asked.moments_only else room.FullTensor(),

@@ -1,21 +1,12 @@
 """Inertia and other numbers of a scene from recordings, with their uncertainty."""
 
 from polhode.fit._csv import read_recording as read_recording
-from polhode.fit._design import throw_information as throw_information
-from polhode.fit._filter import Noise as Noise
 from polhode.fit._fit import (
     fit_inertia as fit_inertia,
     fit_recordings as fit_recordings,
     windows as windows,
 )
-from polhode.fit._fit_balance import fit_balance as fit_balance, fit_each as fit_each
 from polhode.fit._gyroscope import Gyroscope as Gyroscope
-from polhode.fit._instrument import (
-    Instrument as Instrument,
-    Tolerance as Tolerance,
-    averaged as averaged,
-    lever_arm as lever_arm,
-)
 from polhode.fit._motion import (
     Drag as Drag,
     FreeMotion as FreeMotion,
@@ -27,7 +18,7 @@ from polhode.fit._parameters import (
     MomentsOnly as MomentsOnly,
     Parameters as Parameters,
 )
-from polhode.fit._recording import Recording as Recording, stack as stack
+from polhode.fit._recording import Recording as Recording, averaged as averaged, stack as stack
 from polhode.fit._residuals import (
     Huber as Huber,
     Model as Model,

@@ -9,10 +9,8 @@ import jax
 from polhode._batch import map_chunks
 from polhode._checks import ArrayLike, require
 from polhode.fit._compiled import compiled
-from polhode.fit._fit_wheel import fit_wheel, fit_wheels
 from polhode.fit._gyroscope import Gyroscope, calibrated
-from polhode.fit._instrument import Instrument
-from polhode.fit._options import FitOptions, changed_options, check_usable, checked_options
+from polhode.fit._options import FitOptions, check_usable, checked_options
 from polhode.fit._recording import Recording, stack
 from polhode.fit._result import Fit, checked_fit, conclude
 from polhode.fit._solve import solve
@@ -31,8 +29,6 @@ def fit_inertia(
     omega_noise: ArrayLike | None = None,
     attitude_noise: ArrayLike | None = None,
     force_noise: ArrayLike | None = None,
-    instrument: Instrument | None = None,
-    block: int = 1,
     options: FitOptions | None = None,
     throw: bool = True,
 ) -> Fit:
@@ -46,10 +42,9 @@ def fit_inertia(
     - ``omega_noise`` [rad/s], ``attitude_noise`` [rad], ``force_noise`` [m/s^2]: standard
       deviations, broadcast against the data, of everything that was recorded or of nothing. None:
       the noise is estimated from the residuals, all channels having the same in these units.
-    - ``wheel_speed`` (..., T) [rad/s]: speed of a reaction wheel relative to the body, with
-      ``instrument``: ``Instrument(spin_inertia)``. The likelihood of the readings is then maximised
-      as by ``fit_balance``: drag and noise are estimated too, ``block`` samples give one residual,
-      and ``options`` do not apply.
+    - ``wheel_speed`` (..., T) [rad/s]: speed of a reaction wheel relative to the body, for
+      ``FitOptions(motion=SteppedMotion(spin_inertia))``, which takes it as exact; NaN where it is
+      not known.
     - ``options``: ``FitOptions``: motion, unknowns, loss, start and solver.
     - ``throw``: whether a fit that must not be used raises FitError.
 
@@ -57,32 +52,11 @@ def fit_inertia(
     the moments (``Fit.scale_known``). Every iterate is a physical body. Left-handed axes are
     detected where attitudes are given; otherwise see ``Fit.mirror_inertia``.
 
-    With ``SteppedMotion(spin_inertia)`` in place of the instrument the wheel speed counts as
-    noise-free: in simulated throws of 0.5 s with drag the moments are then wrong by 2 to 7 %
-    (stated: 0.6 to 1.1 %), by the likelihood of the readings 0.04 to 1.7 % (stated: 0.03 to 1.4 %).
-    ``FreeMotion()`` ignores the wheel.
-
     Raises ValueError for bad input and for options that do not apply; FitError for a fit that is
     not finite or stopped early, or where rates and attitudes contradict each other.
     """
     options = checked_options(options)
-    require(
-        instrument is not None or block == 1,
-        f"block={block} belongs to an instrument: average the samples by averaged, or give"
-        " instrument=Instrument(spin_inertia).",
-    )
-    if instrument is not None or (wheel_speed is not None and options.motion is None):
-        others = {
-            "wxyz": wxyz,
-            "force_body": force_body,
-            "omega_noise": omega_noise,
-            "attitude_noise": attitude_noise,
-            "force_noise": force_noise,
-        }
-        names = [name for name, value in others.items() if value is not None]
-        _check_wheel(instrument, wheel_speed is not None, names, options)
-        recording = Recording.of(times, omega_body, wheel_speed=wheel_speed)
-        return checked_fit(fit_wheel(recording, instrument, block), throw)
+    _check_wheel(wheel_speed is not None, options)
     channels = {
         "omega_noise": (omega_noise, "omega_body", omega_body),
         "attitude_noise": (attitude_noise, "wxyz", wxyz),
@@ -131,44 +105,27 @@ def _with_noise(options: FitOptions, channels: dict[str, tuple]) -> FitOptions:
     return options
 
 
-def _check_wheel(
-    instrument: Instrument | None, wheel: bool, data: list[str], options: FitOptions
-) -> None:
-    """ValueError for what the likelihood of the readings does not use."""
+def _check_wheel(wheel: bool, options: FitOptions) -> None:
+    """ValueError for a wheel's speed without a motion, which gives it a meaning."""
     require(
-        instrument is not None,
-        "wheel_speed needs instrument=Instrument(spin_inertia) to mean a momentum; or give the "
-        "motion: FitOptions(motion=SteppedMotion(spin_inertia)), or FreeMotion() to leave the "
-        "wheel out.",
-    )
-    require(wheel, "an instrument needs the wheel's speed: give wheel_speed.")
-    require(
-        instrument is not None and instrument.spin_inertia is not None,
-        "the instrument needs the wheel's spin_inertia; throws without a wheel: fit_balance.",
-    )
-    unused = [*data, *changed_options(options)]
-    require(
-        not unused,
-        f"with an instrument the readings of gyroscope and wheel alone are fitted, got also "
-        f"{', '.join(unused)}: leave it out, or give FitOptions(motion=SteppedMotion("
-        "spin_inertia)) in place of the instrument.",
+        not wheel or options.motion is not None,
+        "wheel_speed needs the wheel's spin inertia to mean a momentum: give"
+        " FitOptions(motion=SteppedMotion(spin_inertia)), or FreeMotion() to leave the wheel out.",
     )
 
 
 def fit_recordings(
     recordings: Sequence[Recording],
     *,
-    instrument: Instrument | None = None,
-    block: int = 1,
     options: FitOptions | None = None,
     throw: bool = True,
 ) -> Fit:
     """One inertia from several recordings of the same body.
 
     **Arguments:** ``recordings``: made by ``Recording.of`` or ``read_recording``, with the same
-    kinds of data, of any lengths. ``instrument``, ``block``, ``options``, ``throw``: as in
-    ``fit_inertia``; ``FitOptions(trust_noise=True)`` where the noise of the recordings is absolute.
-    Recordings with a wheel need its ``instrument``, or a ``motion``.
+    kinds of data, of any lengths. ``options``, ``throw``: as in ``fit_inertia``;
+    ``FitOptions(trust_noise=True)`` where the noise of the recordings is absolute. Recordings with
+    a wheel need a ``motion``.
 
     Windows of one long recording (``windows``) are recordings too: their initial rates are fitted
     separately (multiple shooting), which keeps a long or chaotic motion tractable.
@@ -177,17 +134,7 @@ def fit_recordings(
     """
     options = checked_options(options)
     stacked = stack(recordings)
-    wheel = stacked.wheel is not None
-    require(
-        instrument is not None or block == 1,
-        f"block={block} belongs to an instrument: average the samples by averaged, or give"
-        " instrument=Instrument(spin_inertia).",
-    )
-    if instrument is not None or (wheel and options.motion is None):
-        kinds = {"attitudes": stacked.wxyz, "forces": stacked.force}
-        names = [name for name, value in kinds.items() if value is not None]
-        _check_wheel(instrument, wheel, names, options)
-        return checked_fit(fit_wheels(recordings, instrument, block), throw)
+    _check_wheel(stacked.wheel is not None, options)
     check_usable(options, stacked)
     return checked_fit(together(stacked, options), throw)
 

@@ -1,7 +1,5 @@
 """Options of a fit, and which of them a function can use."""
 
-import dataclasses
-
 import equinox as eqx
 import optimistix as optx
 
@@ -44,7 +42,7 @@ class FitOptions(eqx.Module):
     - ``max_steps``: maximum number of steps of the solver for each starting point.
 
     A function raises ValueError for an option that it cannot use: ``fit_scene`` for ``motion``,
-    ``unknown``, ``initial_inertia`` and ``mounting``; fits with an ``instrument`` for all.
+    ``unknown``, ``initial_inertia`` and ``mounting``.
     """
 
     motion: AbstractMotion | None = None
@@ -93,16 +91,6 @@ def noise_is_trusted(options: FitOptions) -> bool:
     if options.trust_noise is None:
         return options.gyroscope is not None and options.gyroscope.noise_density > 0
     return options.trust_noise
-
-
-def changed_options(options: FitOptions) -> list[str]:
-    """Names of the options that differ from their defaults."""
-    return [
-        field.name
-        for field in dataclasses.fields(options)
-        if getattr(options, field.name) is not field.default
-        and getattr(options, field.name) != field.default
-    ]
 
 
 def checked_options(options: FitOptions | None) -> FitOptions:

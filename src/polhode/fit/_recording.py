@@ -234,6 +234,36 @@ def stack(recordings: Sequence[Recording]) -> Recording:
     return jax.tree.map(lambda *parts: jnp.stack(parts), *map(filled, recordings))
 
 
+def averaged(recording: Recording, count: int) -> Recording:
+    """Recording of means over blocks of ``count`` samples; a block with a gap is a gap.
+
+    For readings that are much faster than the motion. Raises ValueError for fewer than four
+    blocks, and for recordings with attitudes.
+    """
+    length = recording.times.shape[-1] // count
+    require(
+        length >= 4,
+        f"blocks of {count} leave {length} of {recording.times.shape[-1]} samples, 4 are needed.",
+    )
+
+    require(recording.wxyz is None, "attitudes cannot be averaged; leave them out.")
+    place = len(recording.batch_shape)
+
+    def mean(array):
+        cut = jax.lax.slice_in_dim(array, 0, length * count, axis=place)
+        shape = (*array.shape[:place], length, count, *array.shape[place + 1 :])
+        return jnp.mean(cut.reshape(shape), axis=place + 1)
+
+    found, smaller = jax.tree.map(mean, recording), lambda noise: noise / count**0.5
+    return dataclasses.replace(
+        found,
+        present=jnp.floor(found.present),
+        wheel_known=jax.tree.map(jnp.floor, found.wheel_known),
+        omega_noise=jax.tree.map(smaller, found.omega_noise),
+        force_noise=jax.tree.map(smaller, found.force_noise),
+    )
+
+
 def _with_gaps(name, value, suffix, dtype):
     """Like ``as_float_array``, but NaN is allowed: it marks a gap."""
     raw = np.asarray(value) if is_concrete(value) else value

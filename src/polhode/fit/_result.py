@@ -16,9 +16,7 @@ from jaxtyping import Array, Float, Int
 
 from polhode._checks import require
 from polhode._scene import Scene, State
-from polhode.fit._filter import Noise
 from polhode.fit._gyroscope import Gyroscope
-from polhode.fit._instrument import Instrument
 from polhode.fit._linear import Linear
 from polhode.fit._matrices import eigh, inverse, svd
 from polhode.fit._options import FitOptions, noise_is_trusted
@@ -85,13 +83,6 @@ _SCENE_WARNINGS = WARNINGS | {
     Finding.POOR: "the residuals are more than twice as large as the noise: a wrong model, wrong"
     " units, outliers (robust=Huber()), or a start too far away",
 }
-_READINGS_WARNINGS = WARNINGS | {
-    Finding.STEP_LIMIT: "the likelihood of the readings did not converge: look for samples outside"
-    " free flight, wrong units or signs of the wheel, or too little rotation",
-    Finding.NOT_FINITE: "the fit is not finite: look for samples outside free flight, wrong units"
-    " or signs of the wheel, or too little rotation",
-}
-
 UNUSABLE = Finding.STEP_LIMIT | Finding.NOT_FINITE | Finding.AXES_DISAGREE
 """Findings that raise an error unless ``throw=False``."""
 
@@ -129,15 +120,6 @@ class InertiaEstimate(eqx.Module):
     handedness_known: bool = eqx.field(static=True)
 
 
-class ReadingsEstimate(eqx.Module):
-    """What the likelihood of readings estimated of instrument and noise; ``Fit`` has the text."""
-
-    instrument: Instrument
-    noise_levels: Noise
-    negative_log_likelihood: Float[Array, "*b"]
-    block: int = eqx.field(static=True)
-
-
 class Fit(eqx.Module):
     """Result of every fit. Leading axes (...) are those of the bodies, none for a single body.
 
@@ -155,8 +137,7 @@ class Fit(eqx.Module):
       for ``MomentsOnly``, none of a scene), bias, mounting, lever, the motion's unknowns or the
       scene's values, gain (row by row) and delay, then of each recording rates and attitude
       (rotation vector) at its start and the walk of the bias. It is the pseudo-inverse of
-      ``information`` (..., p, p), which includes the calibration. The likelihood of readings (a fit
-      with an ``instrument``) has no initial states among its unknowns.
+      ``information`` (..., p, p), which includes the calibration.
     - ``null_count`` (...): number of directions of the unknowns that the data do not show.
     - ``noise`` (...): standard deviation of the residuals over the assumed one (reduced chi).
     - ``whiteness`` (...): probability of autocorrelations as large as observed, for independent
@@ -165,16 +146,13 @@ class Fit(eqx.Module):
     - ``diagnostics`` (...): ``Finding`` flags as integers; ``findings``, ``warnings``, ``report``
       and ``is_usable`` explain them.
     - ``steps``, ``attempts`` (...): of the optimiser.
-    - ``residuals``: of ``"omega"``, ``"attitude"``, ``"force"`` (..., r, T, 3) over their noise;
-      with an ``instrument`` those of blocks of rates given all readings before, and
-      ``"omega_std"``, their standard deviations [rad/s].
+    - ``residuals``: of ``"omega"``, ``"attitude"``, ``"force"`` (..., r, T, 3) over their noise.
     - ``parameters``, ``model``: of ``predict``, ``residuals`` and ``log_density``.
 
-    **Of an inertia** (``fit_inertia``, ``fit_recordings``, ``fit_balance``): ``inertia``,
+    **Of an inertia** (``fit_inertia``, ``fit_recordings``): ``inertia``,
     ``moments``, ``axes``, ``ratios``, their standard deviations, ``scale_known``,
     ``principal_values``, ``interval``, ``mirror_inertia``. **Of a scene** (``fit_scene``):
-    ``scene``. **Of readings with an** ``instrument``: ``instrument``, ``noise_levels``,
-    ``negative_log_likelihood``. They raise AttributeError for fits of another kind.
+    ``scene``. They raise AttributeError for fits of another kind.
     """
 
     values: list[Array]
@@ -195,7 +173,6 @@ class Fit(eqx.Module):
     parameters: Parameters
     model: Model
     _inertia: InertiaEstimate | None = None
-    _readings: ReadingsEstimate | None = None
 
     def _of_inertia(self, name: str) -> InertiaEstimate:
         if self._inertia is None:
@@ -204,14 +181,6 @@ class Fit(eqx.Module):
                 " inertia with its principal axes is fitted by fit_inertia or fit_recordings."
             )
         return self._inertia
-
-    def _of_readings(self, name: str) -> ReadingsEstimate:
-        if self._readings is None:
-            raise AttributeError(
-                f"only the likelihood of readings has {name}: fit_balance, or fit_inertia and"
-                " fit_recordings with instrument=Instrument(spin_inertia)."
-            )
-        return self._readings
 
     @property
     def inertia(self) -> Inertia:
@@ -286,21 +255,6 @@ class Fit(eqx.Module):
                 " fit the numbers of a scene by fit_scene."
             )
         return motion.with_values(self.values)
-
-    @property
-    def instrument(self) -> Instrument:
-        """The instrument, as estimated where ``fit_balance`` was given a ``tolerance``."""
-        return self._of_readings("instrument").instrument
-
-    @property
-    def noise_levels(self) -> Noise:
-        """Estimated standard deviations of readings and disturbing torques."""
-        return self._of_readings("noise_levels").noise_levels
-
-    @property
-    def negative_log_likelihood(self) -> Float[Array, "*b"]:
-        """Of all readings that were fitted together, up to a constant."""
-        return self._of_readings("negative_log_likelihood").negative_log_likelihood
 
     @property
     def is_usable(self) -> bool:
@@ -450,9 +404,7 @@ class Fit(eqx.Module):
         return [flag for flag in WARNINGS if code & flag]
 
     def _texts(self) -> dict[Finding, str]:
-        if self._inertia is None:
-            return _SCENE_WARNINGS
-        return WARNINGS if self._readings is None else _READINGS_WARNINGS
+        return _SCENE_WARNINGS if self._inertia is None else WARNINGS
 
 
 _SCALE = (

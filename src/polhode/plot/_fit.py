@@ -15,8 +15,8 @@ _LEVELS = {"68 %": 2.2957, "95 %": 5.9915}
 def fit(result: Any, recording: Any, *, body: int = 0, title: str = "") -> Any:
     """Figure of a ``fit.Fit`` of an inertia and its ``fit.Recording``; returns it.
 
-    Left: rates of the first recording (dots) over the fitted motion, or over what the readings
-    before let expect where a wheel is aboard (lines), and the residuals in units of their noise.
+    Left: rates of the first recording (dots) over the fitted motion (lines), and the residuals in
+    units of their noise.
     Right: the region of the two smaller ratios (or moments) that the data allow, the limit of what
     a body can be, and a table of the results. ``body`` picks one of a batch. Raises ValueError for
     a recording without rates.
@@ -68,16 +68,6 @@ def _single(result, recording, body) -> dict[str, Any]:
     present, times = (pick(x, 1, place) for x in (recording.present, recording.times))
     present = present > 0
     residual = pick(result.residuals["omega"], 3)[0]
-    if "omega_std" in result.residuals:
-        # of the likelihood of the readings: expected from those before, some samples to a residual
-        noise = pick(result.residuals["omega_std"], 3)[0]
-        block, count = (len(omega) - 1) // len(residual), len(residual)
-
-        def blocks(values):
-            return values[: count * block].reshape(count, block, -1).mean(axis=1)
-
-        times, omega = blocks(times)[:, 0], blocks(omega)
-        present = np.any(residual != 0, axis=1)
     # a loss that bounds outliers has shortened their residuals: shown as they were fitted
     model = omega - residual * noise
     hole = np.where(present, 1.0, np.nan)[:, None]

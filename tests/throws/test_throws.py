@@ -1,4 +1,4 @@
-"""The balance of momentum: throws in air with a wheel, by a gyroscope that is not quite right."""
+"""``benchmarks.throws``: throws in air with a wheel, by a gyroscope that is not quite right."""
 
 import itertools
 
@@ -9,22 +9,17 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from benchmarks import throws as recipe, throws_synthetic as study
-from polhode.fit import (
-    FitOptions,
-    Huber,
+from benchmarks import throws_synthetic as study
+from benchmarks.throws import (
     Instrument,
-    Recording,
     Tolerance,
-    _fit_balance,
-    averaged,
+    __main__ as recipe,
+    estimator,
     fit_balance,
     fit_each,
-    fit_inertia,
-    fit_recordings,
     lever_arm,
-    stack,
 )
+from polhode.fit import Recording, averaged, stack
 from polhode.fit._result import whiteness_of
 
 SPIN = 1.7e-6
@@ -132,40 +127,6 @@ def test_throws_in_air_show_the_tensor_and_the_instrument(throws):
 
 
 @pytest.mark.slow
-def test_a_wheel_in_fit_inertia_is_the_likelihood_of_the_readings():
-    """Throws in moving air: the motion that takes the wheel at its word is far off."""
-    tensor = 10 * study.DEVICE
-    given = stack(study.throws(3, tensor, 2))
-    wheel = np.where(np.asarray(given.wheel_known) > 0, given.wheel, np.nan)
-    fit = fit_inertia(
-        given.times, given.omega, wheel_speed=wheel, instrument=Instrument(SPIN), block=4
-    )
-    true = np.linalg.eigvalsh(tensor)
-    assert fit.scale_known
-    assert fit.moments.shape == (2, 3)
-    assert fit.findings() == fit.findings(1) == []
-    np.testing.assert_allclose(fit.moments, np.broadcast_to(true, (2, 3)), rtol=0.03)
-    assert np.max(np.asarray(fit.moments_std) / true) < 0.01
-    np.testing.assert_allclose(fit.ratios, true / true[2] * np.ones((2, 1)), atol=0.02)
-    # a deviation of the ratio is at least the part of it that the moments do not share
-    assert np.all(np.asarray(fit.ratios_std)[:, 2] == 0)
-    assert np.all(np.asarray(fit.ratios_std)[:, :2] < np.asarray(fit.moments_std)[:, :2] / true[0])
-    np.testing.assert_allclose(fit.noise, 1, atol=0.4)
-    assert "kg m^2" in fit.report()
-
-
-@pytest.mark.slow
-def test_a_recording_of_a_batch_is_fitted_as_alone():
-    given = stack(study.throws(3, 10 * study.DEVICE, 2))
-    wheel = np.where(np.asarray(given.wheel_known) > 0, given.wheel, np.nan)
-    fit = fit_inertia(
-        given.times, given.omega, wheel_speed=wheel, instrument=Instrument(SPIN), block=4
-    )
-    one = fit_balance([jax.tree.map(lambda x: x[1], given)], Instrument(SPIN), block=4)
-    np.testing.assert_allclose(fit.moments[1], one.moments[0], rtol=1e-9)
-
-
-@pytest.mark.slow
 def test_throws_without_a_wheel_show_ratios():
     times = np.arange(0, 1, 0.01)
     tensor = TENSORS[0] / np.linalg.eigvalsh(TENSORS[0])[2]
@@ -216,20 +177,6 @@ def test_the_accelerometer_tells_its_distance_from_the_centre_of_mass(throws):
     np.testing.assert_allclose(lever_arm(averaged(given, 4)), np.tile(ARM, (8, 1)), atol=1e-3)
 
 
-def test_gaps_of_the_wheel_are_bridged_and_remembered():
-    times = np.linspace(0, 1, 11)
-    wheel = 100 * times
-    wheel[[0, 4, 5, 10]] = np.nan
-    one = Recording.of(times, np.ones((11, 3)), wheel_speed=wheel)
-    np.testing.assert_allclose(one.wheel[1:10], 100 * times[1:10])
-    np.testing.assert_allclose(np.asarray(one.wheel)[[0, 10]], [10, 90])
-    np.testing.assert_array_equal(one.wheel_known, np.isfinite(wheel))
-    np.testing.assert_array_equal(one.present, np.ones(11))
-    half = averaged(one, 2)
-    np.testing.assert_array_equal(half.wheel_known, [0, 1, 0, 1, 1])
-    np.testing.assert_allclose(half.times, [0.05, 0.25, 0.45, 0.65, 0.85])
-
-
 def test_what_a_balance_cannot_use_is_refused():
     times = np.linspace(0, 1, 20)
     rates = np.sin(np.outer(times, [3.0, 4, 5]))
@@ -238,29 +185,7 @@ def test_what_a_balance_cannot_use_is_refused():
         fit_balance([bare], Instrument(SPIN))
     with pytest.raises(ValueError, match="need the wheel's spin_inertia"):
         fit_balance([Recording.of(times, rates, wheel_speed=times)], Instrument(None))
-    with pytest.raises(
-        ValueError, match=r"wheel_speed needs instrument=Instrument\(spin_inertia\)"
-    ):
-        fit_inertia(times, rates, wheel_speed=times)
-    with pytest.raises(ValueError, match="needs the wheel's speed"):
-        fit_inertia(times, rates, instrument=Instrument(SPIN))
-    with pytest.raises(ValueError, match="got also force_body, bias"):
-        fit_inertia(
-            times,
-            rates,
-            wheel_speed=times,
-            instrument=Instrument(SPIN),
-            force_body=rates,
-            options=FitOptions(bias=True),
-        )
     whole = Recording.of(times, rates, wheel_speed=times)
-    with pytest.raises(ValueError, match=r"needs instrument=Instrument\(spin_inertia\)"):
-        fit_recordings([whole, whole])
-    options = FitOptions(robust=Huber(3), trust_noise=True, max_starts=1)
-    with pytest.raises(ValueError, match="got also robust, trust_noise, max_starts"):
-        fit_recordings([whole], instrument=Instrument(SPIN), options=options)
-    with pytest.raises(ValueError, match="throws without a wheel: fit_balance"):
-        fit_recordings([whole], instrument=Instrument(None))
     with pytest.raises(ValueError, match=r"number the body of each of 2 recordings.*\[0, 2\]"):
         fit_balance([whole] * 2, Instrument(SPIN), bodies=[0, 2])
     with pytest.raises(ValueError, match="spin_inertia must be positive, got 0"):
@@ -268,10 +193,6 @@ def test_what_a_balance_cannot_use_is_refused():
     few = Recording.of(times, rates, wheel_speed=np.where(times < 0.25, 1.0, np.nan))
     with pytest.raises(ValueError, match="at least 8 samples with rates and wheel, got 5"):
         fit_balance([few], Instrument(SPIN))
-    with pytest.raises(ValueError, match="blocks of 6 leave 3 of 20 samples"):
-        averaged(bare, 6)
-    with pytest.raises(ValueError, match="wheel_speed needs at least 2 numbers, got 0"):
-        Recording.of(times, rates, wheel_speed=np.full(20, np.nan))
 
 
 @pytest.mark.skipif(not recipe.DATA.exists(), reason="needs ../shared/data/tudelft_throws")
@@ -291,7 +212,7 @@ def test_throws_of_objects_whose_inertia_is_known():
 
 
 def test_bodies_with_fewer_recordings_are_filled_up():
-    places, used = _fit_balance._by_body(np.array([1, 0, 1, 1]), 2)
+    places, used = estimator._by_body(np.array([1, 0, 1, 1]), 2)
     np.testing.assert_array_equal(places, [[1, 0, 0], [0, 2, 3]])
     np.testing.assert_array_equal(used, [[1, 0, 0], [1, 1, 1]])
     rest = jax.random.normal(jax.random.key(0), (3, 40, 3))

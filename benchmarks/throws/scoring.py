@@ -1,6 +1,6 @@
 """Inertia, drag, instrument and noise that make the readings of throws likeliest.
 
-Fisher's method of scoring on the likelihood of ``polhode.fit._filter``; tolerances of the
+Fisher's method of scoring on the likelihood of ``benchmarks.throws.likelihood``; tolerances of the
 instrument, and what is expected of drag and noise, are terms of it as well. A body that is found
 bends to the noise of the readings, and the scatter left tells too little of it: the noise is found
 by restricted likelihood, which counts what is used up by half the log-determinant of the
@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode.fit._filter import Noise, Readings, Score, innovations, score_of
-from polhode.fit._instrument import Instrument, Tolerance
+from benchmarks.throws.instrument import Instrument, Tolerance
+from benchmarks.throws.likelihood import Noise, Readings, Score, innovations, score_of
 from polhode.fit._matrices import inverse, solve
 from polhode.fit._parameters import (
     SCALE,
@@ -116,7 +116,7 @@ class Fitted(eqx.Module):
     covariance: Float[Array, "n 8 8"]
     rest: Float[Array, "r b 3"]
     spread: Float[Array, "r b 3"]
-    surprise: Float[Array, ""]
+    negative_log_likelihood: Float[Array, ""]
     steps: Array
     converged: Array
 
@@ -176,7 +176,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         each = jax.vmap(lambda data, own: score_by(data, own, np.arange(used)))(
             data, unknown[place]
         )
-        value = jnp.sum(each.surprise) + jnp.sum(precision * unknown**2) / 2
+        value = jnp.sum(each.negative_log_likelihood) + jnp.sum(precision * unknown**2) / 2
         slope = (precision * unknown).at[place].add(each.slope)
         shown = jnp.diag(precision).at[place[:, :, None], place[:, None, :]].add(each.information)
         return Score(value, slope, shown, each.rest, each.spread)
@@ -215,8 +215,8 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     def again(carry):
         unknown, move, score, lost, rounds, damping, _, steps = carry
         tried = scored(unknown + move)
-        value = tried.surprise + lost @ move
-        well = jnp.isfinite(value) & (value <= score.surprise)
+        value = tried.negative_log_likelihood + lost @ move
+        well = jnp.isfinite(value) & (value <= score.negative_log_likelihood)
         score = jax.tree.map(lambda a, b: jnp.where(well, a, b), tried, score)
         unknown = jnp.where(well, unknown + move, unknown)
         damping = jnp.where(well, damping / 3, jnp.maximum(damping * 10, 1e-3))
@@ -266,9 +266,17 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     blocks = covariance[place[:, :, None], place[:, None, :]]
     blocks = slopes @ blocks @ jnp.swapaxes(slopes, 1, 2)
     return Fitted(
-        tensors, slowed, instrument, noise, blocks, score.rest, score.spread, score.surprise, steps,
+        tensors,
+        slowed,
+        instrument,
+        noise,
+        blocks,
+        score.rest,
+        score.spread,
+        score.negative_log_likelihood,
+        steps,
         distance < _NEAR,
-    )  # fmt: skip
+    )
 
 
 def start_of(data: Readings, instrument: Instrument, count: int) -> tuple[Array, Noise]:

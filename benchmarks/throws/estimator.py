@@ -1,19 +1,20 @@
-"""``fit_balance``: inertia from throws in real air, in absolute size with a wheel aboard."""
+"""``fit_balance``: inertia from throws in air, in absolute size with a reaction wheel aboard."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from benchmarks.throws.instrument import Instrument, Tolerance
+from benchmarks.throws.likelihood import Noise, readings_of
+from benchmarks.throws.scoring import Known, solve_balance, start_of
 from polhode._checks import is_concrete, require
 from polhode._scene import State
-from polhode.fit._balance import Known, solve_balance, start_of
 from polhode.fit._compiled import compiled
-from polhode.fit._filter import Noise, readings_of
-from polhode.fit._instrument import Instrument, Tolerance
 from polhode.fit._matrices import eigh
 from polhode.fit._motion import Drag, SteppedMotion
 from polhode.fit._parameters import (
@@ -31,7 +32,6 @@ from polhode.fit._result import (
     Finding,
     Fit,
     InertiaEstimate,
-    ReadingsEstimate,
     checked_fit,
     flagged,
     symmetric_std,
@@ -39,6 +39,26 @@ from polhode.fit._result import (
     whiteness_of,
 )
 from polhode.inertia import Inertia, principal, second_moments
+
+
+class ThrowFit(eqx.Module):
+    """A ``polhode.fit.Fit``, whose attributes this object has, and the instrument that was found.
+
+    **Fields:** ``fit``; ``instrument``, as estimated where a ``tolerance`` was given;
+    ``noise_levels``: standard deviations of readings and disturbing torques;
+    ``negative_log_likelihood`` (n,): of all readings together, up to a constant; ``block``.
+    """
+
+    fit: Fit
+    instrument: Instrument
+    noise_levels: Noise
+    negative_log_likelihood: Float[Array, " n"]
+    block: int = eqx.field(static=True)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__") or name == "fit":
+            raise AttributeError(name)
+        return getattr(self.fit, name)
 
 
 def fit_balance(
@@ -49,7 +69,7 @@ def fit_balance(
     tolerance: Tolerance | None = None,
     block: int = 1,
     throw: bool = True,
-) -> Fit:
+) -> ThrowFit:
     """Inertia tensors of thrown bodies by maximum likelihood of the readings of a gyroscope.
 
     For throws in air, with a reaction wheel of measured speed or without one (``Instrument(None)``:
@@ -70,8 +90,9 @@ def fit_balance(
       much faster than the motion are best ``averaged`` first.
     - ``throw``: whether a fit that is not finite or did not converge raises FitError.
 
-    Returns a ``Fit`` whose leading axis n are the bodies. A body with fewer recordings than another
-    has zeros as residuals and initial rates of those that it lacks. Every tensor is physical.
+    Returns a ``ThrowFit`` whose leading axis n are the bodies. A body with fewer recordings than
+    another has zeros as residuals and initial rates of those that it lacks. Every tensor is
+    physical.
 
     Raises ValueError for recordings without rates or the wheel's speed, and FitError.
     """
@@ -102,19 +123,21 @@ def fit_balance(
     )
     places, used = _by_body(numbers, count)
     estimate = _together(given, jnp.asarray(numbers), places, used, instrument, tolerance, block)
-    return checked_fit(_fit_of(estimate, block), throw)
+    found = _fit_of(estimate, block)
+    checked_fit(found.fit, throw)
+    return found
 
 
-def fit_each(fit: Fit, recordings: Sequence[Recording], body: int = 0) -> Fit:
+def fit_each(fit: ThrowFit, recordings: Sequence[Recording], body: int = 0) -> ThrowFit:
     """Every recording of a body by itself, with the instrument and the noise of a joint fit.
 
     **Arguments:** ``fit``: of ``fit_balance``; ``recordings`` of one of its bodies, ``body``.
-    Returns a ``Fit`` whose leading axis are the recordings.
+    Returns a ``ThrowFit`` whose leading axis are the recordings.
     """
     instrument, noise, tensor = jax.tree.map(
         lambda x: x[body], (fit.instrument, fit.noise_levels, fit.inertia.tensor)
     )
-    given, block = stack(recordings), fit._of_readings("instrument").block
+    given, block = stack(recordings), fit.block
     fits = [
         _fit_of(
             _alone(
@@ -249,7 +272,7 @@ def _concluded(found, recording: Recording, places: Array, used: Array) -> _Esti
             base=base_of(second_moments(tensor), sized),
             instrument=found.instrument,
             noise_levels=levels.grown(1 / size),
-            negative_log_likelihood=found.surprise,
+            negative_log_likelihood=found.negative_log_likelihood,
             steps=found.steps,
         )
 
@@ -279,8 +302,8 @@ def _pseudo_inverse(matrix: Float[Array, "p p"]) -> tuple[Float[Array, "p p"], I
     return (vectors * inverted[None]) @ vectors.T / safe[:, None] / safe[None], jnp.sum(~shown)
 
 
-def _fit_of(estimate: _Estimate, block: int) -> Fit:
-    """The arrays as a ``Fit``; outside of jit, for the wheel's axis is a static number."""
+def _fit_of(estimate: _Estimate, block: int) -> ThrowFit:
+    """The arrays as a ``ThrowFit``; outside of jit, for the wheel's axis is a static number."""
     device, rates = estimate.instrument, estimate.rates
     sized = estimate.body.scale_known
     _, linear, quadratic = estimate.values
@@ -297,7 +320,7 @@ def _fit_of(estimate: _Estimate, block: int) -> Fit:
         motion={"drag": Drag(linear, quadratic), "delay": None},
     )
     unit = jnp.asarray([1, 0, 0, 0], rates.dtype)
-    return Fit(
+    fit = Fit(
         values=estimate.values,
         std=estimate.std,
         sensor={},
@@ -318,10 +341,5 @@ def _fit_of(estimate: _Estimate, block: int) -> Fit:
             motion, estimate.base, columns=tuple(map(tuple, columns.tolist())), scale_known=sized
         ),
         _inertia=estimate.body,
-        _readings=ReadingsEstimate(
-            instrument=device,
-            noise_levels=estimate.noise_levels,
-            negative_log_likelihood=estimate.negative_log_likelihood,
-            block=block,
-        ),
     )
+    return ThrowFit(fit, device, estimate.noise_levels, estimate.negative_log_likelihood, block)

@@ -33,11 +33,12 @@ import jax
 import numpy as np
 
 import polhode as ph
+from benchmarks.throws import Instrument, Tolerance, fit_balance, fit_each, lever_arm
 from polhode import fit as room
 from polhode.inertia import MassProperties
 from polhode.rotation import wxyz_to_matrix
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "tudelft_throws"
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "tudelft_throws"
 DEVICE, PROOF = "device_only", "proof_body"
 # kg m^2, of the wheel: where the balance begins; the proof body corrects it
 SPIN = 1.7e-6
@@ -86,8 +87,8 @@ def together(found, block=BLOCK):
     """Recordings, numbers of their bodies, and the joint fit."""
     everything = [one for ones in found.values() for one in ones]
     bodies = [k for k, ones in enumerate(found.values()) for _ in ones]
-    fit = room.fit_balance(
-        everything, room.Instrument(SPIN), bodies=bodies, tolerance=room.Tolerance(), block=block
+    fit = fit_balance(
+        everything, Instrument(SPIN), bodies=bodies, tolerance=Tolerance(), block=block
     )
     return everything, bodies, fit
 
@@ -117,7 +118,7 @@ def varied(folder, usual, single):
             if kind not in single:
                 continue
             before = np.asarray(single[kind].moments)
-            apart = np.asarray(room.fit_each(fit, found[kind], body).moments) - before
+            apart = np.asarray(fit_each(fit, found[kind], body).moments) - before
             root = len(before) ** 0.5
             means.append(root * apart.mean(axis=0) / before.std(axis=0, ddof=1))
             pairs.append(root * apart.mean(axis=0) / apart.std(axis=0, ddof=1))
@@ -163,12 +164,12 @@ def measure(found):
     names = list(found)
     everything, bodies, fit = together(found)
     each = {
-        name: room.fit_each(fit, found[name], k)
+        name: fit_each(fit, found[name], k)
         for k, name in enumerate(names)
         if name not in (DEVICE, PROOF)
     }
     slow = room.stack([room.averaged(one, BLOCK) for one in everything])
-    arms = np.asarray(room.lever_arm(slow))
+    arms = np.asarray(lever_arm(slow))
     arms = {name: arms[np.array(bodies) == k].mean(axis=0) for k, name in enumerate(names)}
     return fit, each, arms
 

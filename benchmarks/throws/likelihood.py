@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode.fit._instrument import Instrument
+from benchmarks.throws.instrument import Instrument
 from polhode.fit._recording import Recording, bridged, needed
 from polhode.fit._start import central_slope, integrate
 from polhode.rotation import wxyz_to_matrix
@@ -203,17 +203,18 @@ def inverse_of(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
     return found / determinant[..., None, None]
 
 
-def surprise(found: Innovations) -> Float[Array, ""]:
+def negative_log_likelihood(found: Innovations) -> Float[Array, ""]:
     """Minus the logarithm of the likelihood, but for a constant."""
     weighed = jnp.einsum("bi,bij,bj->", found.rest, inverse_of(found.covariance), found.rest)
     return (weighed + jnp.sum(jnp.log(_cofactors(found.covariance)[0]))) / 2
 
 
 class Score(NamedTuple):
-    """``surprise``, its slopes by p unknowns, the information (expected second slopes), and what
-    was read less what was expected, over its standard deviation ``spread``, rad/s."""
+    """``negative_log_likelihood``, its slopes by p unknowns, the information (expected second
+    slopes), and what was read less what was expected, over its standard deviation ``spread``,
+    rad/s."""
 
-    surprise: Float[Array, "*r"]
+    negative_log_likelihood: Float[Array, "*r"]
     slope: Float[Array, "*r p"]
     information: Float[Array, "*r p p"]
     rest: Float[Array, "*r b 3"]
@@ -231,4 +232,4 @@ def score_of(found: Innovations, by: Innovations) -> Score:
     shown = jnp.einsum("bip,bij,bjq->pq", by.rest, inverse, by.rest)
     shown = shown + jnp.einsum("bikp,bkiq->pq", relative, relative) / 2
     spread = jnp.sqrt(jnp.diagonal(found.covariance, axis1=1, axis2=2))
-    return Score(surprise(found), slope, shown, found.rest / spread, spread)
+    return Score(negative_log_likelihood(found), slope, shown, found.rest / spread, spread)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks import throws_synthetic as study
-from polhode.fit import Instrument, Noise, throw_information
+from benchmarks.throws import Instrument, Noise, throw_information
 
 TENSOR = jnp.asarray(10 * study.DEVICE)
 SIZE = float(np.trace(TENSOR)) / 2

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from benchmarks.throws.instrument import Instrument
+from benchmarks.throws.likelihood import Noise, Readings, innovations, score_of
 from polhode._checks import ArrayLike, as_float_array
-from polhode.fit._filter import Noise, Readings, innovations, score_of
-from polhode.fit._instrument import Instrument
 from polhode.fit._motion import SteppedMotion
 from polhode.fit._parameters import entries_of, whole_of
 

@@ -1,6 +1,5 @@
 """A gyroscope beside a reaction wheel: calibration parameters, and preparation of recordings."""
 
-import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -9,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, require, require_positive
+from polhode._checks import as_float_array, require_positive
 from polhode.fit._matrices import solve
 from polhode.fit._recording import Recording, needed
 from polhode.fit._start import central_slope, integrate
@@ -71,36 +70,6 @@ class Tolerance(NamedTuple):
     delay: float = 1e-3
     skew: float = 0.01
     bias: float = 0.02
-
-
-def averaged(recording: Recording, count: int) -> Recording:
-    """Recording of means over blocks of ``count`` samples; a block with a gap is a gap.
-
-    For readings that are much faster than the motion. Raises ValueError for fewer than four
-    blocks, and for recordings with attitudes.
-    """
-    length = recording.times.shape[-1] // count
-    require(
-        length >= 4,
-        f"blocks of {count} leave {length} of {recording.times.shape[-1]} samples, 4 are needed.",
-    )
-
-    require(recording.wxyz is None, "attitudes cannot be averaged; leave them out.")
-    place = len(recording.batch_shape)
-
-    def mean(array):
-        cut = jax.lax.slice_in_dim(array, 0, length * count, axis=place)
-        shape = (*array.shape[:place], length, count, *array.shape[place + 1 :])
-        return jnp.mean(cut.reshape(shape), axis=place + 1)
-
-    found, smaller = jax.tree.map(mean, recording), lambda noise: noise / count**0.5
-    return dataclasses.replace(
-        found,
-        present=jnp.floor(found.present),
-        wheel_known=jax.tree.map(jnp.floor, found.wheel_known),
-        omega_noise=jax.tree.map(smaller, found.omega_noise),
-        force_noise=jax.tree.map(smaller, found.force_noise),
-    )
 
 
 @jax.jit
