@@ -1,5 +1,6 @@
 """Events: times known in closed form, pairs between looks, derivatives, and motions that stop."""
 
+from functools import partial
 from pathlib import Path
 
 import equinox as eqx
@@ -396,3 +397,99 @@ def test_a_search_that_runs_out_of_steps_is_told():
     few = ph.simulate(BALL, STATE, [0.0, 20.0], ph.LiePoisson(max_steps=120))
     with pytest.raises(ValueError, match="steps of a body ran out"):
         ph.crossings(few, height(0.0))
+
+
+def slowing(*, rate=0.1):
+    """A sphere that spins about z and slows down as exp(-rate t)."""
+    law = ph.FeedbackTorque(lambda t, wxyz, omega: -rate * omega)
+    return ph.Scene(ph.Inertia.spherical(1.0), None, law)
+
+
+def below(limit, **options):
+    return ph.Event(lambda wxyz, omega, t: omega[2] - limit, -1, **options)
+
+
+def test_events_of_a_simulation_in_order_of_time():
+    """The times are known; a terminal one ends the motion, the samples after it are its own."""
+    state = ph.State([1.0, 0, 0, 0], jnp.array([[0.0, 0, 1.0], [0.0, 0, 2.0]]))
+    events = [below(0.5), below(0.8), below(0.3, terminal=True), below(0.2)]
+    ts = jnp.linspace(0.0, 15.0, 16)
+
+    @jax.jit
+    @partial(jax.value_and_grad, has_aux=True)
+    def run(rate):
+        traj = ph.simulate(slowing(rate=rate), state, ts, events=events)
+        return traj.events.times[1, 1], traj
+
+    (value, traj), slope = run(0.1)
+    found = traj.events
+    want = 10 * np.log([1 / 0.8, 1 / 0.5, 1 / 0.3])
+    np.testing.assert_allclose(found.times[0, :3], want, rtol=1e-9)
+    np.testing.assert_array_equal(found.which[0, :4], [1, 0, 2, -1])
+    np.testing.assert_array_equal(found.which[1, :3], [1, 0, -1])
+    np.testing.assert_array_equal(found.count, [3, 2])
+    np.testing.assert_allclose(found.omega_body[1, :2, 2], [0.8, 0.5], rtol=1e-9)
+    assert np.all(np.isnan(found.wxyz[0, 3]))
+    assert np.isinf(found.times[1, 2])
+    np.testing.assert_allclose(traj.event_time, [want[2], np.inf], rtol=1e-9)
+    np.testing.assert_allclose(traj.ts[0, -2:], want[2], rtol=1e-9)
+    np.testing.assert_allclose(traj.omega_body[0, -1, 2], 0.3, rtol=1e-9)
+    np.testing.assert_allclose(value, 10 * np.log(4), rtol=1e-9)
+    np.testing.assert_allclose(slope, -100 * np.log(4), rtol=1e-7)
+    assert traj[1].events.count == 2
+
+
+def test_events_of_a_motion_in_closed_form():
+    """The same as those of each event alone, merged; the terminal one cuts the rest."""
+    state = ph.State([1.0, 0, 0, 0], [0.3, 0.2, 3.0])
+    rises = ph.Event(lambda wxyz, omega, t: omega[0], 1)
+    falls = ph.Event(lambda wxyz, omega, t: omega[1], -1)
+    last = ph.Event(lambda wxyz, omega, t: t - 7.0, 1, terminal=True)
+    ts = jnp.linspace(0.0, 10.0, 11)
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]))
+    traj = ph.simulate(scene, state, ts, events=[rises, falls, last])
+    whole = ph.simulate(scene, state, ts)
+    alone = [np.asarray(ph.crossings(whole, x).times) for x in (rises, falls)]
+    want = np.sort(np.concatenate([*(x[x < 7] for x in alone), [7.0]]))
+    found = traj.events
+    np.testing.assert_allclose(found.times[: want.size], want, atol=1e-12)
+    assert int(found.count) == want.size
+    assert float(traj.event_time) == pytest.approx(7.0)
+    np.testing.assert_allclose(traj.ts[-3:], 7.0)
+    np.testing.assert_allclose(found.omega_body[want.size - 1], traj.last.omega_body)
+
+
+def test_more_events_than_are_stored_are_reported():
+    """With the true count, and never silently."""
+    state = ph.State([1.0, 0, 0, 0], [0.3, 0.2, 3.0])
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), None, ph.LinearDamping(1e-3))
+    few = ph.Event(lambda wxyz, omega, t: omega[0], 0, capacity=2)
+    with pytest.raises(ph.SimulationError, match="capacity"):
+        ph.simulate(scene, state, [0.0, 20.0], events=few)
+    traj = ph.simulate(scene, state, [0.0, 20.0], events=few, throw=False)
+    assert int(traj.status) == ph.Status.TOO_MANY_EVENTS
+    many = ph.crossings(ph.simulate(scene, state, [0.0, 20.0]), few)
+    assert int(traj.events.count) == many.times.size > 2
+    np.testing.assert_allclose(traj.events.times, many.times[:2], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("events", "more", "message"),
+    [
+        ([lambda wxyz, omega, t: t], {}, "ph.Event objects"),
+        ([], {}, "empty"),
+        (below(1.0), {"until": below(1.0)}, "terminal=True"),
+        (below(1.0), {"record": ph.Record(final_only=True)}, "leave record"),
+    ],
+)
+def test_bad_events_are_refused(events, more, message):
+    state = ph.State([1.0, 0, 0, 0], [0.0, 0, 1.0])
+    with pytest.raises((TypeError, ValueError), match=message):
+        ph.simulate(slowing(), state, [0.0, 1.0], events=events, **more)
+
+
+def test_options_of_an_event_are_checked():
+    with pytest.raises(TypeError, match="terminal"):
+        below(1.0, terminal=1)
+    with pytest.raises(ValueError, match="capacity"):
+        below(1.0, capacity=0)

@@ -1,5 +1,6 @@
 """The one entry point: a scene, a state and times give a trajectory."""
 
+from collections.abc import Sequence
 from functools import partial
 
 import equinox as eqx
@@ -20,7 +21,14 @@ from polhode._batch import (
     split_of,
 )
 from polhode._checks import ArrayLike, is_concrete
-from polhode._events import Event, check_until, stopped
+from polhode._events import (
+    Event,
+    check_until,
+    checked_events,
+    found_by_search,
+    found_by_steps,
+    stopped,
+)
 from polhode._kernels import FEW, jit_distinct, kernel
 from polhode._method import (
     AbstractMethod,
@@ -47,6 +55,7 @@ def simulate(
     rtol: float | None = None,
     record: Record | None = None,
     until: Event | None = None,
+    events: Event | Sequence[Event] | None = None,
     throw: bool = True,
 ) -> Trajectory:
     """Simulate the motion of a scene from ``state`` at ``ts[0]``, and save it at the times ``ts``.
@@ -69,6 +78,11 @@ def simulate(
       ``Trajectory.event_time`` is inf for a body without an event. The cost depends on the time
       of the last event of the batch, not on the last of ``ts``. Times and states have first and
       second derivatives; a third one raises NotImplementedError.
+    - ``events``: one or several ``ph.Event``, searched for while the motion is integrated:
+      ``Trajectory.events`` holds times, states and which event it was, in the order of the motion.
+      A body stops at an event with ``terminal=True`` as with ``until``. One that meets more events
+      than the sum of their ``capacity`` has the status ``TOO_MANY_EVENTS``. A motion in closed form
+      is searched as by ``ph.crossings`` (under ``jit`` each event needs ``samples``).
     - ``throw``: raise ``ph.SimulationError`` when a body did not finish. Under ``jit``, ``vmap``
       or ``grad`` nothing is raised: check ``Trajectory.status``.
 
@@ -77,6 +91,8 @@ def simulate(
     """
     if until is not None:
         check_until(until, record)
+    if events is not None:
+        return _with_events(scene, state, ts, method, rtol, record, until, events, throw)
     scene, state, ts, record = check_inputs(scene, state, ts, record)
     check_method(method)
     checked_rtol = check_rtol(rtol, state.wxyz.dtype)
@@ -88,6 +104,21 @@ def simulate(
     if until is not None:
         return checked(stopped(_begin(method, scene, state, ts, checked_rtol), ts, until), throw)
     return checked(run(method, scene, state, ts, checked_rtol, record, split), throw)
+
+
+def _with_events(scene, state, ts, method, rtol, record, until, events, throw) -> Trajectory:
+    """``simulate`` with events."""
+    events = checked_events(events, until, record)
+    scene, state, ts, record = check_inputs(scene, state, ts, record)
+    check_method(method)
+    checked_rtol = check_rtol(rtol, state.wxyz.dtype)
+    if method is None:
+        method, _ = choose(scene, state, record, checked_rtol, ts)
+    found = found_by_steps(_begin(method, scene, state, ts, checked_rtol), ts, events)
+    if found is None:
+        trajectory = run(method, scene, state, ts, checked_rtol, record, None)
+        found = found_by_search(checked(trajectory, throw), events)
+    return checked(found, throw)
 
 
 def checked(trajectory: Trajectory, throw: bool) -> Trajectory:

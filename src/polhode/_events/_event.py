@@ -26,10 +26,12 @@ class Event(eqx.Module):
     rates (3,) [rad/s] and the time () [s], smooth; batches are mapped over it. ``direction``: 1
     where fn rises through zero in time, -1 where it falls, 0 for both. ``samples``: number of
     equally spaced times at which a motion in closed form is sampled; None: 32 per revolution of
-    the fastest natural rate (see ``ph.crossings``). ``crossings`` needs it under ``jit``.
+    the fastest natural rate (see ``ph.crossings``). ``crossings`` needs it under ``jit``. In a
+    simulation (``simulate(..., events=)``): ``terminal``: whether a body stops at the event;
+    ``capacity``: number of events of a body that are stored.
 
     Raises TypeError or ValueError for a function that takes or returns something else, another
-    direction, or fewer than two samples.
+    direction, fewer than two samples, or no capacity.
 
         horizontal = ph.Event(lambda wxyz, omega_body, t: ph.rotation.rotate(wxyz, z)[2])
     """
@@ -37,13 +39,27 @@ class Event(eqx.Module):
     fn: Callable
     direction: int = eqx.field(static=True)
     samples: int | None = eqx.field(static=True)
+    terminal: bool = eqx.field(static=True)
+    capacity: int = eqx.field(static=True)
 
-    def __init__(self, fn: Callable, direction: int = 0, samples: int | None = None):
+    def __init__(
+        self,
+        fn: Callable,
+        direction: int = 0,
+        samples: int | None = None,
+        *,
+        terminal: bool = False,
+        capacity: int = 64,
+    ):
         self.fn = _FUNCTION.checked(fn)
         if isinstance(direction, bool) or direction not in (-1, 0, 1):
             raise ValueError(f"direction must be 1 (rising), -1 (falling) or 0, got {direction!r}.")
         self.direction = int(direction)
         self.samples = at_least("samples", samples, 2)
+        if not isinstance(terminal, bool):
+            raise TypeError(f"terminal must be True or False, got {terminal!r}.")
+        self.terminal = terminal
+        self.capacity = at_least("capacity", capacity, 1) or 1
 
     def values(self, trajectory: Trajectory) -> tuple[Array, Array]:
         """The function and its rate of change [1/s] at every sample (..., T)."""

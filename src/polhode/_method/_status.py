@@ -18,6 +18,7 @@ class Status(enum.IntEnum):
     NOT_PHYSICAL = 7
     BAD_TIMES = 8
     SLIDING = 9
+    TOO_MANY_EVENTS = 10
 
     @property
     def explanation(self) -> str:
@@ -63,6 +64,10 @@ _EXPLANATIONS = {
         "the motion slides along a switch: a comparison in a torque (where, sign, a threshold)"
         " drives the body back from both sides; make the torque continuous there, for instance"
         " x / width clipped to -1 and 1 in place of sign(x)"
+    ),
+    Status.TOO_MANY_EVENTS: (
+        "the body met more events than are stored (trajectory.events.count tells how many): give"
+        " ph.Event(..., capacity=n)"
     ),
     Status.BAD_TIMES: "ts is not strictly increasing or strictly decreasing: sort it",
 }

@@ -7,4 +7,4 @@ from polhode._trajectory._propagator import (
     moved_to as moved_to,
     shortly_after as shortly_after,
 )
-from polhode._trajectory._trajectory import Trajectory as Trajectory
+from polhode._trajectory._trajectory import Events as Events, Trajectory as Trajectory

@@ -51,6 +51,22 @@ class AbstractPropagator(eqx.Module):
         """The trajectory at times ``t`` (K,) or (..., K)."""
 
 
+class Events(eqx.Module):
+    """Events of each body in the order in which the motion meets them; see ``simulate(events=)``.
+
+    **Fields:** ``times`` (..., M) [s], inf where there is none; ``which`` (..., M): the place of
+    the event in ``events``, -1 where there is none; ``wxyz`` (..., M, 4) and ``omega_body``
+    (..., M, 3) [rad/s]: the states there, NaN where there is none; ``count`` (...): how many were
+    met, which is more than M where the status is ``TOO_MANY_EVENTS``.
+    """
+
+    times: Float[Array, "*b m"]
+    which: Int[Array, "*b m"]
+    wxyz: Float[Array, "*b m 4"]
+    omega_body: Float[Array, "*b m 3"]
+    count: Int[Array, "*b"]
+
+
 class Trajectory(eqx.Module):
     """Samples of the motion; leading axes (...) are the batch, then T times.
 
@@ -77,6 +93,7 @@ class Trajectory(eqx.Module):
     _spins: Float[Array, "*b t k"] | None
     propagator: AbstractPropagator | None
     _event_time: Float[Array, "*b"] | None
+    _events: Events | None
 
     def __init__(
         self,
@@ -92,11 +109,13 @@ class Trajectory(eqx.Module):
         spins: Array | None = None,
         propagator: AbstractPropagator | None = None,
         event_time: Array | None = None,
+        events: Events | None = None,
     ):
         self.ts, self.status, self.steps, self.scene = ts, status, steps, scene
         self._wxyz, self._omega_body = wxyz, omega_body
         self._work, self._error, self._motor_work = work, error, motor_work
         self._spins, self.propagator, self._event_time = spins, propagator, event_time
+        self._events = events
 
     @property
     def wxyz(self) -> Float[Array, "*b t 4"]:
@@ -140,7 +159,12 @@ class Trajectory(eqx.Module):
         """Time (...) [s] of the event that ended the motion; inf for a body without one."""
         return self._recorded("event_time", "until=ph.Event(...)")
 
-    def _recorded(self, name: str, request: str) -> Array:
+    @property
+    def events(self) -> Events:
+        """The events that each body met; see ``Events``."""
+        return self._recorded("events", "events=[ph.Event(...)]")
+
+    def _recorded(self, name: str, request: str) -> Any:
         value = getattr(self, f"_{name}")
         if value is None:
             raise ValueError(
@@ -231,6 +255,9 @@ class Trajectory(eqx.Module):
             of_both(self._work, 1), of_bodies(self._error, 0), of_both(self._motor_work, 2),
             of_both(self._spins, 2), self.propagator,
             of_bodies(self._event_time, 0),
+            None if self._events is None else Events(
+                *(of_bodies(x, r) for x, r in zip(jax.tree.leaves(self._events), (1, 1, 2, 2, 0)))
+            ),
         )  # fmt: skip
 
     def between(self, start: float, end: float) -> "Trajectory":
