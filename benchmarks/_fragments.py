@@ -15,7 +15,8 @@ from pathlib import Path
 
 from benchmarks import _levels, _page
 from benchmarks._markdown import command, number, rows, source
-from benchmarks._report import ROOT, read
+from benchmarks._report import RESULTS, ROOT, read
+from benchmarks.cold_tasks import TASKS
 
 MARK = re.compile(r"<!-- result: ([\w-]+) -->(.*?)<!-- end -->", re.DOTALL)
 FRAGMENTS: dict[str, Callable[[], str]] = {}
@@ -142,6 +143,32 @@ def _() -> str:
             if time and other:
                 found.append(time / other)
     return _between(found)
+
+
+def cold_tasks() -> str:
+    """Ten tasks from a cold process; in bold where the other library has its answer sooner."""
+    lines = []
+    for row in _numbers("cold_tasks")["rows"]:
+        ours, peer = row["polhode"], row["peer"] or {}
+        other = f", {TASKS[row['task']][2]}" if peer else ""
+
+        def cells(key, ours=ours, peer=peer):
+            sooner = key in peer and peer[key] < ours[key]
+            mine, its = number(ours.get(key)), number(peer.get(key))
+            return f"{mine} / **{its}**" if sooner else f"{mine} / {its}"
+
+        errors = [f"{x['error']:.0e}" if "error" in x else "–" for x in (ours, peer)]
+        lines.append([
+            row["task"] + other, cells("first"), cells("second"), number(ours.get("cached")),
+            cells("memory"), " / ".join(errors),
+        ])  # fmt: skip
+    header = ["polhode / other", "first answer [s]", "second call [s]",
+              "first answer with stored programs [s]", "memory [MB]", "error"]  # fmt: skip
+    return _block(rows(header, lines), f"({command(read('cold_tasks'))})")
+
+
+if (RESULTS / "cold_tasks.json").exists():
+    FRAGMENTS["cold-tasks"] = cold_tasks
 
 
 # Calls

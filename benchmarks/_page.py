@@ -268,6 +268,14 @@ def plain_calls_block() -> list[str]:
     ]
 
 
+def with_marker(text: str, name: str, after: str) -> str:
+    """The page with a marker of a fragment, set after a heading if there is none."""
+    marker = f"<!-- result: {name} -->"
+    return (
+        text if marker in text else text.replace(after, f"{after}{marker}\n-\n<!-- end -->\n\n", 1)
+    )
+
+
 def write() -> list[Path]:
     """Write benchmarks/README.md and the fragments of all pages; the files."""
     from benchmarks import _fragments
@@ -277,6 +285,8 @@ def write() -> list[Path]:
     written = [target]
     for path in _fragments.pages():
         text = path.read_text(encoding="utf-8")
+        if path.name == "README.md" and "cold-tasks" in _fragments.FRAGMENTS:
+            text = with_marker(text, "cold-tasks", after="## Cost\n\n")
         if _fragments.MARK.search(text):
             path.write_text(_fragments.filled(text), encoding="utf-8")
             written.append(path)

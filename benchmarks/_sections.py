@@ -82,6 +82,20 @@ def stress(report: dict) -> list[str]:
     ]  # fmt: skip
 
 
+def cold_tasks(report: dict) -> list[str]:
+    from benchmarks import _fragments
+
+    return [
+        "## Tasks from a cold process", "", machine(report), "",
+        "Seconds from the start of a process to the first answer, imports and compilation included;"
+        " the second call in the same process; the first answer of a later process that finds"
+        " compiled programs in JAX's persistent cache; the largest resident size. polhode / the"
+        " other library; in bold where the other is sooner or smaller. The script of each task"
+        " is in `benchmarks/cold_tasks.py`.", "",
+        _fragments.cold_tasks(), "",
+    ]  # fmt: skip
+
+
 def generic(report: dict, name: str) -> list[str]:
     """Any other result: its lists of rows as tables, its other numbers as a list."""
     title = name.replace("_", " ")
@@ -365,9 +379,9 @@ def imports(report: dict) -> list[str]:
 
 
 SECTIONS = {
-    "imports": imports, "plain_calls": plain_calls, "first_calls": first_calls,
-    "gradients": gradients, "scene_cost": scene_cost, "scaling": scaling,
-    "identification": identification, "throws": throws,
+    "cold_tasks": cold_tasks, "imports": imports, "plain_calls": plain_calls,
+    "first_calls": first_calls, "gradients": gradients, "scene_cost": scene_cost,
+    "scaling": scaling, "identification": identification, "throws": throws,
     "throws_synthetic": throws_synthetic, "throw_design": throw_design, "satellites": satellites,
     "light_curves": light_curves,
     "racquet": racquet,

@@ -25,6 +25,7 @@ from benchmarks import (
     _markdown,
     _page,
     _report,
+    cold_tasks,
     problems,
     truth,
 )
@@ -554,3 +555,30 @@ def test_one_table_is_of_one_commit_machine_and_day(tmp_path, monkeypatch, chang
     path.write_text(json.dumps({**_report.read(path), **change}))
     with pytest.raises(ValueError, match="several commits, machines or days"):
         _page.merged()
+
+
+def test_the_table_of_cold_tasks_marks_what_others_do_sooner(monkeypatch):
+    name = next(iter(cold_tasks.TASKS))
+    ours = {"first": 2.0, "second": 0.001, "cached": 1.0, "memory": 300.0, "error": 1e-11}
+    peer = {"first": 0.7, "second": 0.3, "memory": 90.0, "error": 2e-8}
+    alone = {key: value for key, value in ours.items() if key != "error"}
+    report = {
+        "command": "python -m benchmarks.cold_tasks",
+        "numbers": {"rows": [
+            {"task": name, "peer": peer, "polhode": ours},
+            {"task": name, "peer": "", "polhode": alone},
+        ]},
+    }  # fmt: skip
+    monkeypatch.setattr(_fragments, "read", lambda _: report)
+    table = _fragments.cold_tasks()
+    assert f"| {name}, SciPy | 2 / **0.7** | 0.001 / 0.3 | 1 | 300 / **90** | 1e-11 / 2e-08 |" in (
+        table.replace("1.0e-03", "0.001")
+    )
+    assert f"| {name} | 2 / – |" in table
+
+
+def test_a_missing_marker_is_set_below_its_heading():
+    text = "# A\n\n## Cost\n\nold\n"
+    marked = _page.with_marker(text, "cold-tasks", "## Cost\n\n")
+    assert marked.index("<!-- result: cold-tasks -->") < marked.index("old")
+    assert _page.with_marker(marked, "cold-tasks", "## Cost\n\n") == marked
