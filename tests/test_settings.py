@@ -10,7 +10,7 @@ import jaxtyping
 import pytest
 
 import polhode as ph
-from polhode.inertia import _cholesky as inertia
+from polhode import inertia
 
 LEAST = "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"
 PROGRAM = """

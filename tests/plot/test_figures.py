@@ -12,7 +12,7 @@ from matplotlib import pyplot as plt
 
 import polhode as ph
 from polhode import plot
-from polhode.plot import _animate, _polhode
+from polhode.plot import _animate, _trajectory
 
 MOMENTS = np.array([1.0, 2.0, 2.5])
 
@@ -35,7 +35,7 @@ def _close_figures():
 @pytest.mark.parametrize("axis", [0, 2])
 def test_family_curves_have_the_energy_and_momentum_they_are_drawn_for(axis):
     for inertia in (1.2, 1.9) if axis == 0 else (2.1, 2.45):
-        curves = list(_polhode._level(MOMENTS, 3.0, inertia, axis))
+        curves = list(_trajectory._level(MOMENTS, 3.0, inertia, axis))
         assert len(curves) == 2
         for side, curve in zip((1, -1), curves, strict=True):
             np.testing.assert_allclose(curve**2 @ MOMENTS, 3.0, rtol=1e-13)
@@ -44,11 +44,11 @@ def test_family_curves_have_the_energy_and_momentum_they_are_drawn_for(axis):
 
 
 def test_separatrix_passes_through_the_intermediate_axis():
-    for curve in _polhode._separatrix(MOMENTS, 3.0):
+    for curve in _trajectory._separatrix(MOMENTS, 3.0):
         np.testing.assert_allclose(curve**2 @ MOMENTS**2, 3.0 * 2.0, rtol=1e-13)
         assert np.abs(curve[:, 1]).max() == pytest.approx(np.sqrt(3.0 / 2.0))
         assert np.abs(curve[:, 2]).min() < 1e-7
-    assert not list(_polhode._separatrix(np.array([1.0, 1.0, 2.0]), 3.0))
+    assert not list(_trajectory._separatrix(np.array([1.0, 1.0, 2.0]), 3.0))
 
 
 @pytest.mark.parametrize("turned", [False, True])

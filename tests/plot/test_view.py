@@ -12,7 +12,7 @@ from plot import chromium
 
 import polhode as ph
 from polhode import plot
-from polhode.plot import _view_data
+from polhode.plot import _view
 
 MOMENTS = np.array([1.0, 2.0, 3.0])
 TURN = 2 * np.pi  # s: one turn of the spinning body
@@ -91,9 +91,9 @@ def test_long_motions_are_thinned_to_every_kth_sample_and_the_last(samples):
     made = spinning(samples, 0.01 * (samples - 1))
     motion = known(plot.view(made))
     kept = motion["bodies"][0]["ts"]
-    assert len(kept) <= _view_data.MOST_SAMPLES
+    assert len(kept) <= _view.MOST_SAMPLES
     step = round(float(kept[1] - kept[0]) / 0.01)
-    assert len(range(0, samples, max(step - 1, 1))) + 1 > _view_data.MOST_SAMPLES or step == 1
+    assert len(range(0, samples, max(step - 1, 1))) + 1 > _view.MOST_SAMPLES or step == 1
     np.testing.assert_allclose(np.diff(kept)[:-1], 0.01 * step, rtol=1e-3)
     assert kept[-1] == pytest.approx(0.01 * (samples - 1))
     assert (f"One sample in {step}" in motion["note"]) == (step > 1)

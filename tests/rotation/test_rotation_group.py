@@ -7,7 +7,7 @@ import pytest
 
 import polhode.rotation as rotation
 from polhode.rotation import _scalar
-from polhode.rotation._modified_rodrigues import shadow
+from polhode.rotation._conversions import shadow
 
 SHAPE = (3, 1, 2, 1)
 

@@ -6,7 +6,8 @@ products are ever added, so that a compiler that contracts a product and a sum i
 changes nothing.
 
 The polynomials are Chebyshev fits to 40 digits, good to 1e-17 on their intervals. XLA turns them
-into vector code, which its own sine is not."""
+into vector code, which its own sine is not.
+"""
 
 from typing import NamedTuple
 

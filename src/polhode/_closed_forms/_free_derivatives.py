@@ -4,7 +4,8 @@ The constants of the motion are computed by formulas made for rounding, with bra
 of differences, whose chain rule is 0/0 in a symmetric body and on the separatrix. The tangent
 (``_free_tangent``) uses their values alone. For second derivatives each value is given the
 derivative of a plain formula, which is regular everywhere; nothing of it is evaluated unless the
-tangent is differentiated again."""
+tangent is differentiated again.
+"""
 
 import functools
 from typing import NamedTuple

@@ -4,7 +4,8 @@ docs/free_motion.md.
 Three stages: ``assign_roles`` orders and scales the axes; ``polhode_constants`` and
 ``precession_constants`` prepare what depends on the body and its initial state alone; ``advance``
 evaluates the motion at a time. ``staged`` keeps XLA from repeating earlier arithmetic in every
-kernel that uses it."""
+kernel that uses it.
+"""
 
 import math
 from typing import NamedTuple

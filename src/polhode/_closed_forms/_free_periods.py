@@ -6,7 +6,8 @@ times the time. With axis 3 the one that the momentum circles, p = |1/I1 - 1/I2|
 r = |1/I2 - 1/I3|, s = p + r, the momentum's half period is 2 K(m) / omega_p, and the mean rate of
 the Euler angle about L is |L| (1/I3 +- s Pi(-p/r, m) / K(m)). Pi/K by DLMF 19.8.6.
 
-``periods`` are those of the long axis, in the convention of Samarasinha and A'Hearn."""
+``periods`` are those of the long axis, in the convention of Samarasinha and A'Hearn.
+"""
 
 import enum
 import functools

@@ -10,7 +10,8 @@ The attitude follows from two conserved quantities. With e the variation of the 
 rotation vector in body axes), R e x L = delta(ell) - R delta L is known because ell = R L is
 constant, and e . L = t delta E + 1/2 delta D : integral of L L^T, because the rate of e . L is
 omega . delta L + L . delta D L, of which omega . delta L + 1/2 L . delta D L is the constant
-delta E (D: inverse inertia tensor, E: energy)."""
+delta E (D: inverse inertia tensor, E: energy).
+"""
 
 import math
 from typing import NamedTuple

@@ -5,7 +5,8 @@ a = exp(2iz), h = q^2 (Jacobi's triple product, NIST DLMF 20.5.1). Written so it
 h/a, both of which are regular where the amplitude of a motion vanishes.
 
 Complex numbers are pairs of real arrays: real and complex mix freely, nothing is promoted, and XLA
-makes vector code of them."""
+makes vector code of them.
+"""
 
 from typing import NamedTuple
 

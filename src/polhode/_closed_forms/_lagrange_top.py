@@ -22,7 +22,8 @@ its momentum and attitude by
     dtheta(t) = r / A  integral from 0 to t of exp((t - s) [w]x) (I(s) x F) ds,
 
 dtheta a rotation vector in space axes. With n = w/|w| and x = |w| t both are sums of powers of [n]x
-times functions of x."""
+times functions of x.
+"""
 
 from typing import Any
 

@@ -14,7 +14,7 @@ from jaxtyping import Array
 from polhode._kernels import attached, is_slope
 from polhode._parts import Signature
 from polhode._trajectory import Trajectory, shortly_after
-from polhode.rotation._components import wxyz_rate
+from polhode.rotation._quaternion import wxyz_rate
 
 _FUNCTION = Signature("Event", {"wxyz": (4,), "omega_body": (3,), "t": ()})
 

@@ -2,7 +2,8 @@
 
 Whatever is integrated is a derivative of H. Both coordinates (ZYZ Euler angles; quaternion and body
 momentum) and every energy that the library reports evaluate ``Hamiltonian.__call__``; nothing else
-in the package states the formula."""
+in the package states the formula.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from typing import Protocol, runtime_checkable
@@ -13,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode.inertia import Inertia
-from polhode.rotation._components import matrix_row
+from polhode.rotation._quaternion import matrix_row
 
 Vector = tuple[Array, Array, Array]
 """Three component arrays of one common shape (structure of arrays)."""

@@ -4,7 +4,8 @@ dL/dt = L x w + sum_j r_j x dH/dr_j + N,   dq/dt = q (0, w) / 2,   w = dH/dL + s
 
 r_j the rows of R (body components of the space axes). Both derivatives of H come from one
 ``jax.grad``; for V = 0 this is Euler's equation in body axes. The slip s is that of a body which
-loses energy inside (``ph.EnergySink``), else absent."""
+loses energy inside (``ph.EnergySink``), else absent.
+"""
 
 from collections.abc import Callable, Sequence
 from operator import add
@@ -25,7 +26,7 @@ from polhode._hamiltonian._energy import (
     from_rows,
     triple,
 )
-from polhode.rotation._components import quaternion_rate as quaternion_rate
+from polhode.rotation._quaternion import quaternion_rate as quaternion_rate
 
 
 def rates_and_torque(

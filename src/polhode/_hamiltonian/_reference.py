@@ -11,7 +11,8 @@ The matrix K and the axis-angle formulas (002), as printed: arccos and the quoti
 near the identity and near half turns; ``ph.rotation.euler_to_axis_angle`` is the robust form. K is
 the attitude R of the same angles seen in axes with y and z reversed, ``K = D R D`` with
 ``D = diag(1, -1, -1)``; so K turns by the same angle as R about ``(l, -m, -n)`` when R turns about
-``(l, m, n)``."""
+``(l, m, n)``.
+"""
 
 from typing import NamedTuple
 

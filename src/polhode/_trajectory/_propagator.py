@@ -14,7 +14,7 @@ from polhode._kernels import jit_distinct
 from polhode._method import AbstractMethod, Record, Status, raise_on_failure
 from polhode._scene import Scene, State, Wheels
 from polhode._trajectory._trajectory import AbstractPropagator, Trajectory
-from polhode.rotation._components import wxyz_rate
+from polhode.rotation._quaternion import wxyz_rate
 
 
 class Propagator(AbstractPropagator):

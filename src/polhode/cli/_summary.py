@@ -8,7 +8,7 @@ import polhode
 from polhode._closed_forms import Mode
 from polhode.cli._job import Job, Outcome, Residuals
 from polhode.files._error import visible
-from polhode.plot._scale import Scale
+from polhode.plot._samples import Scale
 
 MEANINGS = {
     "P_psi": "turn about long axis",

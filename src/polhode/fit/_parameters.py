@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from polhode.fit._matrices import inverse
 from polhode.inertia import inertia_of_second_moments, principal
-from polhode.inertia._cholesky import symmetric
+from polhode.inertia._physical import symmetric
 from polhode.rotation import wxyz_to_matrix
 
 # Eigenvalues of the second moments, relative to their sum, around which a flat body is near.

@@ -1,7 +1,6 @@
 """Rotating frames, the forces in them, and sensors in a body (docs/equations.md, 003)."""
 
-from polhode.frames._frame import RotatingFrame as RotatingFrame
-from polhode.frames._interpolation import SampledAttitude as SampledAttitude
+from polhode.frames._frame import RotatingFrame as RotatingFrame, SampledAttitude as SampledAttitude
 from polhode.frames._particles import (
     FrameForce as FrameForce,
     ParticlePaths as ParticlePaths,

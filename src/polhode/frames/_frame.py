@@ -1,7 +1,9 @@
-"""Rotating frames: transformations and the forces in them (docs/equations.md, 003)."""
+"""Rotating frames: attitude in time, transformations, apparent forces (docs/equations.md, 003)."""
 
+import abc
 from collections.abc import Callable
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -11,16 +13,169 @@ from jaxtyping import Array, Float
 from polhode._checks import ArrayLike, as_float_array, as_vectors, is_concrete, require
 from polhode._parts import Signature, kept, takes
 from polhode._trajectory import Trajectory
-from polhode.frames._interpolation import SampledAttitude
 from polhode.frames._sensors import angular_acceleration
-from polhode.frames._turning import (
-    AbstractTurning,
-    ConstantRate,
-    PrescribedAttitude,
-    VariableRate,
-    rate_of_change,
+from polhode.rotation import (
+    conjugate,
+    identity,
+    matrix_to_wxyz,
+    multiply,
+    normalise,
+    rotate,
+    rotation_vector_to_wxyz,
+    wxyz_to_rotation_vector,
 )
-from polhode.rotation import conjugate, identity, normalise, rotate
+from polhode.rotation._quaternion import wxyz_rate
+
+Rates = tuple[Float[Array, "3"], Float[Array, "3"] | None]
+
+
+def rate_of_change(function: Callable, t: Array) -> tuple[Array, Array]:
+    """A function of time and its time derivative, by forward-mode differentiation."""
+    return jax.jvp(function, (t,), (jnp.ones_like(t),))
+
+
+class AbstractTurning(eqx.Module):
+    """Attitude and angular velocity of a frame at one time ``t`` (a scalar)."""
+
+    @abc.abstractmethod
+    def rates(self, t: Array) -> Rates:
+        """Angular velocity and its derivative [rad/s, rad/s^2]; None where it is always zero."""
+
+    @abc.abstractmethod
+    def attitude(self, t: Array) -> Float[Array, "4"]:
+        """Unit quaternion, rotating axes -> space axes."""
+
+
+class ConstantRate(AbstractTurning):
+    """Constant angular velocity; attitude ``start`` at time ``t0``, in closed form."""
+
+    omega_body: Float[Array, "3"]
+    start: Float[Array, "4"]
+    t0: Float[Array, ""]
+
+    def rates(self, t):
+        return self.omega_body, None
+
+    def attitude(self, t):
+        return multiply(self.start, rotation_vector_to_wxyz(self.omega_body * (t - self.t0)))
+
+
+class VariableRate(AbstractTurning):
+    """Angular velocity as a function of time; attitude ``start`` at ``t0``, by integration."""
+
+    omega_body: Callable[[Array], Float[Array, "3"]]
+    start: Float[Array, "4"]
+    t0: Float[Array, ""]
+
+    def rates(self, t):
+        return rate_of_change(self.omega_body, t)
+
+    def attitude(self, t):
+        """One adaptive integration from ``t0``, at about 50 times the rounding error per step."""
+        accuracy = 50 * float(jnp.finfo(self.start.dtype).eps)
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda s, wxyz, _: wxyz_rate(wxyz, self.omega_body(s))),
+            diffrax.Dopri8(),
+            self.t0,
+            t,
+            None,
+            self.start,
+            stepsize_controller=diffrax.PIDController(rtol=0.0, atol=accuracy),
+            max_steps=2**14,
+            adjoint=diffrax.RecursiveCheckpointAdjoint(),
+        )
+        (path,) = jax.tree.leaves(solution.ys)
+        return normalise(path[-1])
+
+
+class PrescribedAttitude(AbstractTurning):
+    """Attitude as a function of time, a matrix (3, 3) or a quaternion (4,) of any scale."""
+
+    function: Callable[[Array], Array]
+
+    def rates(self, t):
+        return rate_of_change(self._omega, t)
+
+    def _omega(self, t):
+        value, slope = rate_of_change(self.function, t)
+        if value.ndim == 2:
+            turn = value.T @ slope
+            return (
+                jnp.stack(
+                    [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+                )
+                / 2
+            )
+        return 2 * multiply(conjugate(value), slope)[1:] / jnp.sum(value * value)
+
+    def attitude(self, t):
+        value = self.function(t)
+        return matrix_to_wxyz(value) if value.ndim == 2 else normalise(value)
+
+
+@jax.jit
+def _slopes(ts, wxyz, omega_body, angular_acceleration) -> tuple[Array, Array]:
+    """Rotation vector of each interval and its two derivatives by t/h, at start and end."""
+    start, end = slice(None, -1), slice(1, None)
+    origin = conjugate(wxyz[start])
+    rate = wxyz_rate(wxyz, omega_body)
+    bend = wxyz_rate(rate, omega_body) + wxyz_rate(wxyz, angular_acceleration)
+
+    def vector(h):
+        path = wxyz[end] + h * rate[end] + h * h / 2 * bend[end]
+        return wxyz_to_rotation_vector(multiply(origin, path))
+
+    def slope(h):
+        return jax.jvp(vector, (h,), (jnp.ones_like(h),))[1]
+
+    zero = jnp.zeros((), ts.dtype)
+    first, second = jax.jvp(slope, (zero,), (jnp.ones_like(zero),))
+    step = (ts[end] - ts[start])[:, None]
+    here = [jnp.zeros_like(first), step * omega_body[start], step**2 * angular_acceleration[start]]
+    there = [vector(zero), step * first, step**2 * second]
+    return jnp.stack(here, axis=1), jnp.stack(there, axis=1)
+
+
+class SampledAttitude(eqx.Module):
+    """Attitude through samples, with their angular velocities and angular accelerations.
+
+    Between two samples the rotation vector from the earlier one is the polynomial of degree five
+    that matches attitude, rate and acceleration at both. For samples h apart the attitude is in
+    error by O(h^6), the angular velocity by O(h^5), the angular acceleration by O(h^4); at the
+    samples all three are exact. Beyond the samples the nearest polynomial goes on.
+    """
+
+    ts: Float[Array, " t"]
+    wxyz: Float[Array, "t 4"]
+    start_slope: Float[Array, "t-1 3 3"]
+    end_slope: Float[Array, "t-1 3 3"]
+
+    def __init__(
+        self, ts: ArrayLike, wxyz: ArrayLike, omega_body: ArrayLike, angular_acceleration: ArrayLike
+    ):
+        """Samples (T,), (T, 4), (T, 3), (T, 3); less than half a turn from one to the next."""
+        self.ts = as_float_array("ts", ts, (None,))
+        self.wxyz = as_float_array("wxyz", wxyz, (None, 4))
+        rates = as_float_array("omega_body", omega_body, (None, 3))
+        acceleration = as_float_array("angular_acceleration", angular_acceleration, (None, 3))
+        slopes = _slopes(self.ts, self.wxyz, rates, acceleration)
+        self.start_slope, self.end_slope = slopes
+
+    def __call__(self, t: Float[Array, ""]) -> Float[Array, "4"]:
+        backwards = self.ts[-1] < self.ts[0]
+        times, wanted = jnp.where(backwards, -self.ts, self.ts), jnp.where(backwards, -t, t)
+        last = self.ts.shape[0] - 2
+        k = jnp.clip(jnp.searchsorted(times, wanted, side="right") - 1, 0, last)
+        s = (t - self.ts[k]) / (self.ts[k + 1] - self.ts[k])
+        (_, v0, a0), (p1, v1, a1) = self.start_slope[k], self.end_slope[k]
+        # Taylor at the start, and three terms that meet value, slope and bend at the end
+        value, slope, bend = p1 - v0 - a0 / 2, v1 - v0 - a0, a1 - a0
+        cubic = 10 * value - 4 * slope + bend / 2
+        quartic = -15 * value + 7 * slope - bend
+        quintic = 6 * value - 3 * slope + bend / 2
+        vector = s * (v0 + s * (a0 / 2 + s * (cubic + s * (quartic + s * quintic))))
+        return multiply(self.wxyz[k], rotation_vector_to_wxyz(vector))
+
 
 Time = Float[ArrayLike, "*#b"]
 Vector = Float[Array, "*#b 3"]

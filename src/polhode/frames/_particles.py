@@ -12,10 +12,9 @@ from jaxtyping import Array, Float
 from polhode._checks import ArrayLike, as_float_array, is_concrete, require_positive
 from polhode._method import check_options, check_rtol, check_times
 from polhode._parts import kept, result_of, takes
-from polhode.frames._frame import RotatingFrame
-from polhode.frames._turning import VariableRate
+from polhode.frames._frame import RotatingFrame, VariableRate
 from polhode.rotation import conjugate, normalise, rotate
-from polhode.rotation._components import wxyz_rate
+from polhode.rotation._quaternion import wxyz_rate
 
 _ARGUMENTS = ("t", "position", "velocity")
 

@@ -1,4 +1,4 @@
-"""The inertia of a rigid body about a fixed point or its centre of mass, in body axes."""
+"""The inertia of a rigid body in body axes, and Euler's equation (docs/equations.md, 003: 29)."""
 
 from typing import Any, Self
 
@@ -18,16 +18,21 @@ from polhode._checks import (
     require_positive,
 )
 from polhode._parts import AbstractPart, shaped
-from polhode.inertia._cholesky import inertia_from_log_cholesky, inertia_to_log_cholesky
-from polhode.inertia._eigen import principal, principal_moments
-from polhode.inertia._input import (
+from polhode.inertia._physical import (
     check_moments,
+    check_points,
     check_tensor,
+    inertia_from_log_cholesky,
+    inertia_to_log_cholesky,
+    is_symmetric,
+    of_points,
+    possible_moments,
+    possible_tensor,
     tolerance,
+    turned,
 )
-from polhode.inertia._physical import is_symmetric, possible_moments, possible_tensor
+from polhode.inertia._principal import principal, principal_moments
 from polhode.inertia._shapes import AbstractShaped, Symmetry
-from polhode.inertia._tensor import check_points, of_points, turned
 from polhode.rotation import wxyz_to_matrix
 
 _ONE_FORM = (
@@ -340,3 +345,34 @@ def _moments_meant(given) -> Array:
             " body with three equal ones."
         )
     return as_float_array("Inertia(moments): moments", given, (3,))
+
+
+def angular_acceleration(
+    inertia: Inertia,
+    omega_body: Float[Array | np.ndarray, "*#b 3"],
+    torque_body: Float[Array | np.ndarray, "*#b 3"] | None = None,
+) -> Float[Array, "*b 3"]:
+    """``domega/dt`` (..., 3), rad/s^2, of ``I domega/dt + omega x (I omega) = N``.
+
+    ``omega_body`` rad/s and ``torque_body`` N m (None: free) in body axes; constant inertia, any
+    axes. Without ``omega x (I omega)``, as often printed, it is right only when that vanishes,
+    i.e. when omega is along a principal axis.
+    """
+    drive = _cross(inertia.momentum(omega_body), omega_body)
+    if torque_body is not None:
+        drive = jnp.add(*jnp.broadcast_arrays(drive, torque_body))
+    return inertia.rates(drive)
+
+
+def required_torque(
+    inertia: Inertia,
+    omega_body: Float[Array | np.ndarray, "*#b 3"],
+    omega_dot_body: Float[Array | np.ndarray, "*#b 3"],
+) -> Float[Array, "*b 3"]:
+    """The torque ``I domega/dt + omega x (I omega)`` (..., 3), N m, that a given motion needs."""
+    gyroscopic = _cross(omega_body, inertia.momentum(omega_body))
+    return jnp.add(*jnp.broadcast_arrays(inertia.momentum(omega_dot_body), gyroscopic))
+
+
+def _cross(left: Array | np.ndarray, right: Array | np.ndarray) -> Array:
+    return jnp.cross(*jnp.broadcast_arrays(left, right))

@@ -1,12 +1,108 @@
-"""How far a tensor is from the boundary of what a body can have."""
+"""What a body can have: second moments, the triangle inequality, checks of tensors and points.
+
+A tensor is the inertia of some body exactly when its second moments ``Sigma = integral x x^T dm =
+tr(I)/2 - I`` are positive semidefinite (which is the triangle inequality of its moments). Writing
+``Sigma`` by a triangular factor with exponentials on its diagonal makes every real vector a
+physical body. With mass and centre of mass the same holds for the 4x4 pseudo-inertia
+``J = [[Sigma, m c], [m c^T, m]]`` (Rucker and Wensing, IEEE Robotics and Automation Letters 7(2),
+2022, eqs. 8-13).
+
+Checks look at shapes always, at values only when they are concrete.
+"""
+
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from polhode.inertia._cholesky import second_moments
-from polhode.inertia._eigen import principal
-from polhode.inertia._input import tolerance
+from polhode._checks import is_concrete, require, require_positive
+from polhode.inertia._principal import principal
+
+
+def symmetric(diagonal, off):
+    """Matrix (..., 3, 3) of its diagonal and the entries (y, z), (z, x), (x, y)."""
+    (a, b, c), (p, q, r) = diagonal, off
+    rows = [[a, r, q], [r, b, p], [q, p, c]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def second_moments(tensor: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
+    """Second moments ``Sigma = tr(I)/2 - I`` (..., 3, 3), kg m^2, of inertia tensors."""
+    a, b, c = (tensor[..., i, i] for i in range(3))
+    off = (-tensor[..., 1, 2], -tensor[..., 0, 2], -tensor[..., 0, 1])
+    return symmetric(((b + c - a) / 2, (c + a - b) / 2, (a + b - c) / 2), off)
+
+
+def inertia_of_second_moments(sigma: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
+    """Inertia tensors ``I = tr(Sigma) - Sigma`` (..., 3, 3), kg m^2, of second moments."""
+    a, b, c = (sigma[..., i, i] for i in range(3))
+    off = (-sigma[..., 1, 2], -sigma[..., 0, 2], -sigma[..., 0, 1])
+    return symmetric((b + c, c + a, a + b), off)
+
+
+def _upper_product(d1, d2, d3, s12, s13, s23):
+    """``S S^T`` of the upper triangle ``S = [[d1, s12, s13], [0, d2, s23], [0, 0, d3]]``."""
+    return symmetric(
+        (d1 * d1 + s12 * s12 + s13 * s13, d2 * d2 + s23 * s23, d3 * d3),
+        (s23 * d3, s13 * d3, s12 * d2 + s13 * s23),
+    )
+
+
+def _upper_factor(sigma):
+    """The upper triangle S with positive diagonal of ``sigma = S S^T``."""
+    d3 = jnp.sqrt(sigma[..., 2, 2])
+    s23, s13 = sigma[..., 1, 2] / d3, sigma[..., 0, 2] / d3
+    d2 = jnp.sqrt(sigma[..., 1, 1] - s23 * s23)
+    s12 = (sigma[..., 0, 1] - s13 * s23) / d2
+    d1 = jnp.sqrt(sigma[..., 0, 0] - s13 * s13 - s12 * s12)
+    return d1, d2, d3, s12, s13, s23
+
+
+def inertia_from_log_cholesky(parameters: Float[Array, "*b 6"]) -> Float[Array, "*b 3 3"]:
+    """Inertia tensor (..., 3, 3) of ``(d1, d2, d3, n12, n13, n23)``, any real numbers.
+
+    ``Sigma = S S^T`` with ``S = N diag(exp d)`` and N unit upper triangular: adding a constant
+    to the three d scales the body and changes nothing else. d in log of sqrt(kg) m, n without unit.
+    """
+    d1, d2, d3 = (jnp.exp(parameters[..., i]) for i in range(3))
+    n12, n13, n23 = (parameters[..., i] for i in range(3, 6))
+    sigma = _upper_product(d1, d2, d3, n12 * d2, n13 * d3, n23 * d3)
+    return inertia_of_second_moments(sigma)
+
+
+def inertia_to_log_cholesky(tensor: Float[Array, "*b 3 3"]) -> Float[Array, "*b 6"]:
+    """Inverse of ``inertia_from_log_cholesky``; a flat body (on the boundary) has infinite ones."""
+    d1, d2, d3, s12, s13, s23 = _upper_factor(second_moments(tensor))
+    logs = [jnp.log(d1), jnp.log(d2), jnp.log(d3)]
+    return jnp.stack([*logs, s12 / d2, s13 / d3, s23 / d3], axis=-1)
+
+
+def pseudo_from_log_cholesky(
+    parameters: Float[Array, "*b 10"],
+) -> tuple[Float[Array, "*b"], Float[Array, "*b 3"], Float[Array, "*b 3 3"]]:
+    """Mass, centre of mass and inertia about it of the ten parameters of Rucker and Wensing.
+
+    ``(alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3)``; ``J = U U^T`` with
+    ``U = exp(alpha) [[exp d1, s12, s13, t1], [0, exp d2, s23, t2], [0, 0, exp d3, t3],
+    [0, 0, 0, 1]]`` (their eqs. 11 and 12). Lengths in m, mass ``exp(2 alpha)`` in kg.
+    """
+    alpha, s12, s23, s13 = (parameters[..., i] for i in (0, 4, 5, 6))
+    d1, d2, d3 = (jnp.exp(parameters[..., i]) for i in (1, 2, 3))
+    mass = jnp.exp(2 * alpha)
+    sigma = mass[..., None, None] * _upper_product(d1, d2, d3, s12, s13, s23)
+    return mass, parameters[..., 7:], inertia_of_second_moments(sigma)
+
+
+def pseudo_to_log_cholesky(
+    mass: Float[Array, "*b"], centre: Float[Array, "*b 3"], tensor: Float[Array, "*b 3 3"]
+) -> Float[Array, "*b 10"]:
+    """Inverse of ``pseudo_from_log_cholesky``; ``tensor`` is about the centre of mass."""
+    sigma = second_moments(tensor) / mass[..., None, None]
+    d1, d2, d3, s12, s13, s23 = _upper_factor(sigma)
+    head = [jnp.log(mass) / 2, jnp.log(d1), jnp.log(d2), jnp.log(d3), s12, s23, s13]
+    return jnp.concatenate([jnp.stack(head, axis=-1), centre], axis=-1)
 
 
 def physical_margin(tensor: Float[Array, "*b 3 3"]) -> Float[Array, "*b"]:
@@ -79,3 +175,115 @@ def _is_positive(matrix: Array) -> Array:
     second = b - p / a * p
     last = c - q / a * q - (r - p / a * q) ** 2 / second
     return (a > 0) & (second > 0) & (last > 0)
+
+
+def tolerance(array: Array) -> float:
+    """Relative tolerance of consistency checks: the square root of the dtype's rounding."""
+    return float(np.sqrt(jnp.finfo(array.dtype).eps))
+
+
+def require_below(small_name: str, small: Array, large_name: str, large: Array) -> None:
+    """ValueError if a concrete ``small`` exceeds ``large`` anywhere."""
+    if is_concrete(small, large):
+        least, most = np.asarray(small), np.asarray(large)
+        require(
+            least <= most,
+            f"{small_name} must not exceed {large_name}, got {least.max():g} against "
+            f"{most.min():g}; exchange them?",
+        )
+
+
+def check_moments(name: str, seen: np.ndarray, slack: float, least: float = 0.0) -> None:
+    """ValueError unless rows of principal moments are positive and obey the triangle inequality.
+
+    ``slack`` is the relative tolerance of the inequality (flat bodies), ``least`` the fraction of
+    the largest moment that counts as zero.
+    """
+    if seen.size == 0:
+        return
+    columns = tuple(seen[..., i] for i in range(seen.shape[-1]))  # NumPy reduces long axes faster
+    largest, smallest = reduce(np.maximum, columns), reduce(np.minimum, columns)
+    require(
+        smallest > least * largest,
+        lambda: (
+            f"{name} must be positive (kg m^2), got {_worst(seen, smallest)}; a moment is zero"
+            " only for a point or a thin line, which cannot turn about itself: give it a width."
+        ),
+    )
+    excess = 2 - sum(x / largest for x in columns)  # of any size: nothing overflows
+    require(
+        excess <= slack,
+        lambda: (
+            f"{name} must satisfy the triangle inequality (each at most the sum of the two"
+            f" others), got {_worst(seen, -excess)}; check the units, and that these are moments of"
+            " inertia, not second moments or a gyration tensor. Published numbers that no body has"
+            " pass with Inertia.from_moments(..., physical=False)."
+        ),
+    )
+
+
+def check_tensor(name: str, array: Array, *, triangle: bool = True) -> None:
+    """ValueError unless a concrete tensor is symmetric with moments that a body can have.
+
+    ``triangle``: whether these must obey the triangle inequality.
+    """
+    if not is_concrete(array) or array.size == 0:
+        return
+    seen = np.asarray(array, np.float64)
+    mirrored = np.swapaxes(seen, -1, -2)
+    skew = np.abs(seen - mirrored)
+    require(
+        skew <= tolerance(array) * np.abs(seen).max(axis=(-2, -1), keepdims=True),
+        f"{name} must be symmetric, got entries that differ by up to {skew.max():g} from their "
+        "transposed ones; pass (A + A.T) / 2 if that is what is meant.",
+    )
+    # moments within the rounding of the largest cannot be told from zero
+    least = 64 * float(jnp.finfo(array.dtype).eps)
+    moments = np.linalg.eigvalsh((seen + mirrored) / 2)
+    slack = tolerance(array) if triangle else np.inf
+    check_moments(f"the principal moments of {name}", moments, slack, least)
+
+
+def _worst(seen: np.ndarray, badness: np.ndarray | np.floating) -> str:
+    return np.array2string(seen.reshape(-1, seen.shape[-1])[int(np.argmin(badness))])
+
+
+def check_points(masses: Array, positions: Array) -> None:
+    """ValueError for an empty set of points, differing lengths, or a mass below zero."""
+    count = positions.shape[-2]
+    require(count > 0, "positions must hold at least one point, got none; is the file empty?")
+    require(
+        masses.shape[-1] == count,
+        f"masses (..., n) and positions (..., n, 3) must have one n, got {masses.shape} and "
+        f"{positions.shape}.",
+    )
+    require_positive("masses", masses, zero=True)
+    require_positive("the sum of the masses", jnp.sum(masses, axis=-1))
+
+
+def of_points(
+    masses: Float[Array, "*b n"], positions: Float[Array, "*b n 3"]
+) -> Float[Array, "*b 3 3"]:
+    """``sum m (x.x 1 - x x^T)`` about the origin (docs/equations.md, 003: 24)."""
+    x, y, z = (positions[..., i] for i in range(3))
+
+    def second(u, v):
+        return jnp.sum(masses * u * v, axis=-1)
+
+    xx, yy, zz = second(x, x), second(y, y), second(z, z)
+    return symmetric((yy + zz, zz + xx, xx + yy), (-second(y, z), -second(z, x), -second(x, y)))
+
+
+def offset(mass: Float[Array, "*b"], shift: Float[Array, "*b 3"]) -> Float[Array, "*b 3 3"]:
+    """What a mass at distance ``shift`` (..., 3) adds: ``m (d.d 1 - d d^T)`` (Steiner)."""
+    return of_points(mass[..., None], shift[..., None, :])
+
+
+@jax.jit
+def turned(
+    tensor: Float[Array, "*#b 3 3"], matrix: Float[Array, "*#b 3 3"]
+) -> Float[Array, "*b 3 3"]:
+    """``R I R^T``, exactly symmetric."""
+    exact = jax.lax.Precision.HIGHEST  # accelerators may round matrix products more coarsely
+    found = jnp.einsum("...ij,...jk,...lk->...il", matrix, tensor, matrix, precision=exact)
+    return (found + jnp.swapaxes(found, -1, -2)) / 2

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode._checks import ArrayLike, as_floats, require_positive
-from polhode.inertia._input import require_below
+from polhode.inertia._physical import require_below
 
 
 class Symmetry(enum.Enum):

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike
-from polhode.inertia._mesh import check_mesh
+from polhode.inertia._mass import check_mesh
 from polhode.lightcurve._scattering import facets
 
 Scalars = Float[Array, "*b"]

@@ -9,8 +9,7 @@ import numpy as np
 from polhode._trajectory import Trajectory
 from polhode.files._atomic import whole_file
 from polhode.plot._matplotlib import AXES, INK, new_figure, styled
-from polhode.plot._samples import Samples, as_samples, box_sides, matrices
-from polhode.plot._scale import Scale
+from polhode.plot._samples import Samples, Scale, as_samples, box_sides, matrices
 
 _FACES = np.array(
     [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]]

@@ -1,19 +1,110 @@
-"""Euler angles of every sequence, to and from unit quaternions.
+"""Euler angles of all twenty-four sequences, to and from every other description of a rotation.
 
-ZYZ, ``R = Rz(phi) Ry(theta) Rz(psi)``, is the convention of docs/equations.md;
-the other sequences are reduced to the same formulas by a quarter turn (Bernardes and Viollet 2022).
+ZYZ, ``R = Rz(phi) Ry(theta) Rz(psi)``, is the convention of docs/equations.md; the other sequences
+are reduced to the same formulas by a quarter turn (Bernardes and Viollet 2022).
+
+Every conversion goes through the unit quaternion, the only description that is smooth and well
+scaled everywhere, so that it loses nothing: small rotations keep their relative accuracy, half
+turns their axis. All angles are in rad; ``sequence`` defaults to ZYZ.
 """
 
+import enum
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike, as_floats
-from polhode.rotation._input import as_quaternions, check_sequence
+from polhode.rotation._conversions import (
+    axis_angle_to_wxyz,
+    matrix_to_wxyz,
+    modified_rodrigues_to_wxyz,
+    rotation_vector_to_wxyz,
+    wxyz_to_axis_angle,
+    wxyz_to_matrix,
+    wxyz_to_modified_rodrigues,
+    wxyz_to_rotation_vector,
+)
+from polhode.rotation._input import as_quaternions
 from polhode.rotation._scalar import length
-from polhode.rotation._sequence import Sequence
+
+
+class Sequence(enum.Enum):
+    """Order of the three rotations of Euler angles.
+
+    ``Sequence.ZYZ`` is the convention here, ``R = Rz(phi) Ry(theta) Rz(psi)``. A plain member
+    is *intrinsic*: the second and third turn are about the axes that the body has by then, and
+    ``R = R_i(first) R_j(second) R_k(third)``. A member ending in ``_SPACE`` is *extrinsic*: all
+    turns are about fixed space axes, and ``R = R_k(third) R_j(second) R_i(first)``.
+
+    The second angle lies in [0, pi] when the first and last axis are the same (proper Euler angles)
+    and in [-pi/2, pi/2] when all three differ (Tait-Bryan angles).
+    """
+
+    XYX = ((0, 1, 0), False)
+    XZX = ((0, 2, 0), False)
+    YXY = ((1, 0, 1), False)
+    YZY = ((1, 2, 1), False)
+    ZXZ = ((2, 0, 2), False)
+    ZYZ = ((2, 1, 2), False)
+    XYZ = ((0, 1, 2), False)
+    XZY = ((0, 2, 1), False)
+    YXZ = ((1, 0, 2), False)
+    YZX = ((1, 2, 0), False)
+    ZXY = ((2, 0, 1), False)
+    ZYX = ((2, 1, 0), False)
+    XYX_SPACE = ((0, 1, 0), True)
+    XZX_SPACE = ((0, 2, 0), True)
+    YXY_SPACE = ((1, 0, 1), True)
+    YZY_SPACE = ((1, 2, 1), True)
+    ZXZ_SPACE = ((2, 0, 2), True)
+    ZYZ_SPACE = ((2, 1, 2), True)
+    XYZ_SPACE = ((0, 1, 2), True)
+    XZY_SPACE = ((0, 2, 1), True)
+    YXZ_SPACE = ((1, 0, 2), True)
+    YZX_SPACE = ((1, 2, 0), True)
+    ZXY_SPACE = ((2, 0, 1), True)
+    ZYX_SPACE = ((2, 1, 0), True)
+
+    @classmethod
+    def of(cls, axes: str) -> "Sequence":
+        """The sequence that SciPy writes so: ``"ZYX"`` intrinsic, ``"zyx"`` extrinsic.
+
+        Raises ValueError for anything but three letters of one case, neighbours different.
+        """
+        name = axes.upper() + ("_SPACE" if axes.islower() else "")
+        if name not in cls.__members__ or not (axes.islower() or axes.isupper()):
+            raise ValueError(
+                f"no sequence is called {axes!r}: give three of XYZ about body axes or three of xyz"
+                ' about space axes, neighbours different, such as "ZYX" (yaw, pitch, roll).'
+            )
+        return cls[name]
+
+    @property
+    def axes(self) -> tuple[int, int, int]:
+        """Axes in the order in which the angles are given; 0, 1, 2 are x, y, z."""
+        return self.value[0]
+
+    @property
+    def is_extrinsic(self) -> bool:
+        """Whether all three rotations are about fixed space axes."""
+        return self.value[1]
+
+    @property
+    def is_proper(self) -> bool:
+        """Whether the first and the last axis are the same."""
+        return self.axes[0] == self.axes[2]
+
+
+def check_sequence(sequence: Any) -> None:
+    """TypeError for anything but a ``Sequence``."""
+    if not isinstance(sequence, Sequence):
+        raise TypeError(
+            "sequence must be a ph.rotation.Sequence, such as Sequence.ZYX (about body axes) or"
+            f" Sequence.ZYX_SPACE, got {type(sequence).__name__}: {sequence!r:.40}."
+        )
 
 
 def _parity(i: int, j: int, k: int) -> int:
@@ -144,3 +235,89 @@ def _angles(sequence: Sequence, wxyz: Array) -> tuple[Array, Array, Array]:
     if sequence.is_extrinsic:
         first, third = third, first
     return first, second, third
+
+
+_Angles = tuple[Float[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]
+
+
+def euler_to_matrix(
+    phi: Float[ArrayLike, "*#b"],
+    theta: Float[ArrayLike, "*#b"],
+    psi: Float[ArrayLike, "*#b"],
+    sequence: Sequence = Sequence.ZYZ,
+) -> Float[Array, "*b 3 3"]:
+    """Rotation matrix R of Euler angles."""
+    return wxyz_to_matrix(euler_to_wxyz(phi, theta, psi, sequence))
+
+
+def matrix_to_euler(
+    matrix: Float[ArrayLike, "*b 3 3"], sequence: Sequence = Sequence.ZYZ
+) -> _Angles:
+    """Euler angles of a rotation matrix; ranges and ends as in `wxyz_to_euler`."""
+    return wxyz_to_euler(matrix_to_wxyz(matrix), sequence)
+
+
+def euler_to_rotation_vector(
+    phi: Float[ArrayLike, "*#b"],
+    theta: Float[ArrayLike, "*#b"],
+    psi: Float[ArrayLike, "*#b"],
+    sequence: Sequence = Sequence.ZYZ,
+) -> Float[Array, "*b 3"]:
+    """Rotation vector, of length at most pi, of Euler angles."""
+    return wxyz_to_rotation_vector(euler_to_wxyz(phi, theta, psi, sequence))
+
+
+def rotation_vector_to_euler(
+    rotation_vector: Float[ArrayLike, "*b 3"], sequence: Sequence = Sequence.ZYZ
+) -> _Angles:
+    """Euler angles of a rotation vector; ranges and ends as in `wxyz_to_euler`."""
+    return wxyz_to_euler(rotation_vector_to_wxyz(rotation_vector), sequence)
+
+
+def euler_to_axis_angle(
+    phi: Float[ArrayLike, "*#b"],
+    theta: Float[ArrayLike, "*#b"],
+    psi: Float[ArrayLike, "*#b"],
+    sequence: Sequence = Sequence.ZYZ,
+) -> tuple[Float[Array, "*b 3"], Float[Array, "*b"]]:
+    """Unit axis and angle in [0, pi] of Euler angles: robust (docs/equations.md, 002: 3-12).
+
+    For ZYZ the axis is that of R; the matrix K turns about ``(l, -m, -n)``.
+    """
+    return wxyz_to_axis_angle(euler_to_wxyz(phi, theta, psi, sequence))
+
+
+def axis_angle_to_euler(
+    axis: Float[ArrayLike, "*b 3"], angle: Float[ArrayLike, "*b"], sequence: Sequence = Sequence.ZYZ
+) -> _Angles:
+    """Euler angles of the rotation by ``angle`` about the unit vector ``axis``."""
+    return wxyz_to_euler(axis_angle_to_wxyz(axis, angle), sequence)
+
+
+def euler_to_modified_rodrigues(
+    phi: Float[ArrayLike, "*#b"],
+    theta: Float[ArrayLike, "*#b"],
+    psi: Float[ArrayLike, "*#b"],
+    sequence: Sequence = Sequence.ZYZ,
+) -> Float[Array, "*b 3"]:
+    """Modified Rodrigues parameters, of length at most 1, of Euler angles."""
+    return wxyz_to_modified_rodrigues(euler_to_wxyz(phi, theta, psi, sequence))
+
+
+def modified_rodrigues_to_euler(
+    parameters: Float[ArrayLike, "*b 3"], sequence: Sequence = Sequence.ZYZ
+) -> _Angles:
+    """Euler angles of modified Rodrigues parameters, either set."""
+    return wxyz_to_euler(modified_rodrigues_to_wxyz(parameters), sequence)
+
+
+def euler_to_matrix_k(
+    phi: Float[ArrayLike, "*#b"], theta: Float[ArrayLike, "*#b"], psi: Float[ArrayLike, "*#b"]
+) -> Float[Array, "*b 3 3"]:
+    """The matrix K (docs/equations.md, 002): R of the same ZYZ angles, y and z axes reversed.
+
+    ``K(phi, theta, psi) = D R D = R(-phi, -theta, -psi) = R(psi, theta, phi)^T``, with
+    ``D = diag(1, -1, -1)``. K is neither R nor its transpose.
+    """
+    w, x, y, z = jnp.moveaxis(euler_to_wxyz(phi, theta, psi), -1, 0)
+    return wxyz_to_matrix(jnp.stack([w, x, -y, -z], axis=-1))

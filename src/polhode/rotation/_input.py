@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array
 
 from polhode._checks import as_float_array, as_vectors as as_vectors, describe, is_concrete, require
-from polhode.rotation._sequence import Sequence
 
 _UNIT = 1e-3
 """How far from unit length or orthogonality numbers may be that were rounded for printing."""
@@ -80,12 +79,3 @@ def _judged(matrix: Array) -> tuple[Array, Array]:
     off = [jnp.cross(a, b) - c, jnp.cross(b, c) - a, jnp.cross(c, a) - b]
     size = jnp.max(jnp.abs(jnp.stack(off)), axis=(0, -1))
     return (size <= _UNIT) & (jnp.max(jnp.abs(matrix), axis=(-2, -1)) > 0.5), size
-
-
-def check_sequence(sequence: Any) -> None:
-    """TypeError for anything but a ``Sequence``."""
-    if not isinstance(sequence, Sequence):
-        raise TypeError(
-            "sequence must be a ph.rotation.Sequence, such as Sequence.ZYX (about body axes) or"
-            f" Sequence.ZYX_SPACE, got {type(sequence).__name__}: {sequence!r:.40}."
-        )

@@ -1,19 +1,55 @@
 """Unit quaternions, scalar first (``wxyz``), turning body components into space components.
 
 Every function takes arrays of shape (..., 4) (quaternions) and (..., 3) (vectors), broadcasts
-leading axes together, and keeps the dtype of its input.
+leading axes together, and keeps the dtype of its input. The matrix and the rate of a quaternion are
+written once, on component arrays. Scalar-last quaternions and SciPy's ``Rotation`` are converted
+here.
 """
 
+from collections.abc import Sequence
 from functools import reduce
+from typing import TYPE_CHECKING, Any
 
 import jax
+import jax.core
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike
 from polhode.rotation._input import as_quaternions, as_vectors
 from polhode.rotation._scalar import length
+
+
+def matrix_row(wxyz: Sequence[Any], i: int) -> tuple[Any, Any, Any]:
+    """Row ``i`` of the rotation matrix: body components of space axis ``i`` (JAX or NumPy)."""
+    w, x, y, z = wxyz
+    if i == 0:
+        return 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    if i == 1:
+        return 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    return 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+
+
+def quaternion_rate(wxyz: Sequence[Array], omega: Sequence[Array | float]) -> tuple[Array, ...]:
+    """dq/dt = q (0, omega) / 2 for body rates omega [rad/s], four and three component arrays."""
+    w, x, y, z = wxyz
+    a, b, c = (rate / 2 for rate in omega)
+    return (
+        -x * a - y * b - z * c,
+        w * a + y * c - z * b,
+        w * b + z * a - x * c,
+        w * c + x * b - y * a,
+    )
+
+
+def wxyz_rate(
+    wxyz: Float[Array, "*#b 4"], omega_body: Float[Array, "*#b 3"]
+) -> Float[Array, "*b 4"]:
+    """dq/dt [1/s] of an attitude (..., 4) with body rates (..., 3) [rad/s]."""
+    q, omega = (tuple(x[..., i] for i in range(x.shape[-1])) for x in (wxyz, omega_body))
+    return jnp.stack(quaternion_rate(q, omega), axis=-1)
 
 
 def identity(shape: tuple[int, ...] = (), dtype: DTypeLike | None = None) -> Float[Array, "*b 4"]:
@@ -108,3 +144,47 @@ def angle_between(
 def _angle(start: Array, end: Array) -> Array:
     turn = between(start, end)
     return 2 * jnp.arctan2(length(turn[..., 1:]), jnp.abs(turn[..., 0]))
+
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+
+def wxyz_to_xyzw(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
+    """Scalar-last order (SciPy, ROS, Eigen's storage) of a scalar-first quaternion."""
+    wxyz = as_vectors("wxyz", wxyz, 4)
+    return jnp.concatenate([wxyz[..., 1:], wxyz[..., :1]], axis=-1)
+
+
+def xyzw_to_wxyz(xyzw: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
+    """Scalar-first order of a scalar-last quaternion."""
+    xyzw = as_vectors("xyzw", xyzw, 4)
+    return jnp.concatenate([xyzw[..., 3:], xyzw[..., :3]], axis=-1)
+
+
+def wxyz_to_scipy(wxyz: Float[ArrayLike, "*b 4"]) -> "Rotation":
+    """SciPy's ``Rotation`` of quaternions, body -> space (its ``apply`` is our `rotate`).
+
+    Leading axes are flattened to the single one that every SciPy release knows; a lone quaternion
+    of shape (4,) gives a single rotation. Not for use under a JAX transformation.
+    """
+    if isinstance(wxyz, jax.core.Tracer):
+        raise TypeError(
+            "wxyz_to_scipy was given a traced array: SciPy works on concrete values only; "
+            "convert outside jit, vmap and grad"
+        )
+    from scipy.spatial.transform import Rotation
+
+    xyzw = np.asarray(wxyz_to_xyzw(as_quaternions(wxyz)), np.float64)
+    return Rotation.from_quat(xyzw if xyzw.ndim == 1 else xyzw.reshape(-1, 4))
+
+
+def scipy_to_wxyz(rotation: "Rotation", dtype: DTypeLike | None = None) -> Float[Array, "*b 4"]:
+    """Quaternions, scalar first, of SciPy's ``Rotation``; ``dtype`` defaults to JAX's float."""
+    if not hasattr(rotation, "as_quat"):
+        raise TypeError(
+            "scipy_to_wxyz takes a scipy.spatial.transform.Rotation, got"
+            f" {type(rotation).__name__}; for an array that is scalar last use xyzw_to_wxyz."
+        )
+    xyzw = jnp.asarray(rotation.as_quat(), dtype or jnp.result_type(float))
+    return xyzw_to_wxyz(xyzw)

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode._kernels import are_close, over_gap, underivable
-from polhode.rotation._components import matrix_row
+from polhode.rotation._quaternion import matrix_row
 
 # Cyclic Jacobi converges quadratically once the off-diagonal part is small against the gaps, and
 # linearly fast before that. Sweeps beyond the last needed one do nothing (t = 0 exactly or below

@@ -1,0 +1,353 @@
+"""Figures of trajectories: histories, polhode and herpolhode, and an overview of a scene."""
+
+from typing import Any
+
+import numpy as np
+
+from polhode._trajectory import Trajectory
+from polhode.plot._matplotlib import ACCENT, AXES, GREY, INK, new_figure, plain, styled
+from polhode.plot._samples import Samples, Scale, as_samples, pick
+
+
+@styled
+def history(
+    what: Trajectory | Samples,
+    *,
+    body: int | None = None,
+    scale: Scale | None = None,
+    axis_names: tuple[str, str, str] = ("x", "y", "z"),
+) -> Any:
+    """Stacked panels of one body: rates, attitude, drift of energy and momentum; the Figure.
+
+    The attitude is shown as the quaternion `wxyz`. The drift is |E/E0 - 1| and |L - L0|/|L0| with L
+    in space axes: rounding and truncation of a free body; where torques act, real change.
+    Panels whose data were not recorded are left out.
+    """
+    made, body = pick(what, body)
+    scale = Scale.of(np.ptp(made.ts[body])) if scale is None else scale
+    panels = [_rates]
+    if made.wxyz is not None:
+        panels.append(_attitude)
+    if made.tensor is not None and made.energy is not None:
+        panels.append(_drift)
+    figure = new_figure(7.2, 2.1 * len(panels) + 0.4)
+    axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
+    t = made.ts[body] / scale.seconds
+    for panel, ax in zip(panels, axes, strict=True):
+        panel(ax, t, made, body, scale, axis_names)
+        # beside the panel, where it can hide nothing
+        ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        ax.margins(x=0.01)
+    axes[-1].set_xlabel(f"time [{scale.time}]")
+    return figure
+
+
+def _rates(ax, t, made, body, scale, names):
+    for k in range(3):
+        rate = made.omega_body[body, :, k] / scale.radians_per_second
+        ax.plot(t, rate, color=AXES[k], label=names[k])
+    ax.set_ylabel(f"[{scale.rate}]")
+    ax.set_title("Body rates")
+
+
+def _attitude(ax, t, made, body, scale, names):
+    for k, (name, color) in enumerate(zip("wxyz", (INK, *AXES), strict=True)):
+        ax.plot(t, made.wxyz[body, :, k], color=color, label=name)
+    ax.set_ylim(-1.08, 1.08)
+    ax.set_title("Attitude quaternion, body to space")
+
+
+def _drift(ax, t, made, body, scale, names):
+    energy = made.energy[body]
+    momentum = made.momentum_space[body] if made.wxyz is not None else None
+    lines = {"energy": np.abs(energy / energy[0] - 1) if energy[0] else np.abs(energy)}
+    if momentum is not None:
+        size = np.linalg.norm(momentum[0])
+        lines["momentum"] = np.linalg.norm(momentum - momentum[0], axis=-1) / (size or 1)
+    for (name, line), color in zip(lines.items(), (INK, GREY), strict=False):
+        ax.plot(t, np.where(line > 0, line, np.nan), color=color, label=name)
+    ax.set_yscale("log")
+    ax.set_title("Relative change of energy and of angular momentum in space")
+
+
+_LIGHT = np.array([0.25, -0.35, 0.9]) / np.linalg.norm([0.25, -0.35, 0.9])
+
+
+@styled
+def polhode(
+    what: Trajectory | Samples,
+    *,
+    body: int | None = None,
+    ax: Any = None,
+    family: int = 7,
+    axis_names: tuple[str, str, str] = ("x", "y", "z"),
+    view: tuple[float, float] | None = None,
+) -> Any:
+    """Draw the polhode of one body on its inertia ellipsoid; returns the 3-D Axes.
+
+    The ellipsoid is that of constant kinetic energy at the first time, in the space of body rates,
+    scaled so that its largest semi-axis is 1. Thin lines are `family` other polhodes of the same
+    energy on either side of the separatrix (dashed), which passes through the intermediate axis.
+    Parts of a curve behind the ellipsoid are faint; a dot marks the first time. `view` is
+    (elevation, azimuth) in degrees; None: towards the curve.
+    """
+    made, body = pick(what, body)
+    tensor = made.need("tensor", "the polhode")[body]
+    moments, turn = np.linalg.eigh(tensor)
+    turn[:, 0] *= np.linalg.det(turn)  # right-handed
+    omega = made.omega_body[body] @ turn
+    twice_energy = omega[0] ** 2 @ moments
+    if not twice_energy > 0:
+        raise ValueError("the body is at rest at the first time: it has no inertia ellipsoid.")
+    semi = np.sqrt(twice_energy / moments)
+    size = semi.max()
+    if ax is None:
+        ax = new_figure(5.4, 5.2).add_subplot(projection="3d")
+    ax.view_init(*(_towards(made.omega_body[body]) if view is None else view))
+    ax.computed_zorder = False
+    elevation, azimuth = np.deg2rad([ax.elev, ax.azim])
+    flat = np.cos(elevation)
+    eye = np.array([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+
+    def draw(points, **style):
+        _line(ax, points @ turn.T / size, (points / semi**2) @ turn.T @ eye, **style)
+
+    _surface(ax, semi / size, turn, eye)
+    for curve in _family(moments, twice_energy, family):
+        draw(curve, color=GREY, linewidth=0.7)
+    for curve in _separatrix(moments, twice_energy):
+        draw(curve, color=INK, linewidth=1.0, linestyle=(0, (4, 2)))
+    draw(omega, color=ACCENT, linewidth=2.4)
+    start, visible = turn @ omega[0] / size, eye @ turn @ (omega[0] / semi**2) >= 0
+    ax.scatter(*start, color=ACCENT, s=42, edgecolor="white", linewidth=0.8,
+               alpha=1.0 if visible else 0.35, zorder=7)  # fmt: skip
+    _body_axes(ax, tensor, twice_energy, size, axis_names)
+    _tidy(ax)
+    return ax
+
+
+def _towards(omega) -> tuple[float, float]:
+    """Elevation and azimuth from which most of the curve is in front."""
+    mean = np.mean(omega, axis=0)
+    flat = np.hypot(mean[0], mean[1])
+    azimuth = 32.0
+    if flat > 0.3 * np.linalg.norm(omega, axis=-1).mean():
+        azimuth = np.degrees(np.arctan2(mean[1], mean[0])) + 25
+    return (-24.0 if mean[2] < -flat else 24.0), azimuth
+
+
+def _line(ax, points, facing, **style):
+    """A curve whose parts with `facing` < 0 are faint."""
+    for front in (False, True):
+        shown = points.copy()
+        hide = (facing >= 0) != front
+        # keep the neighbours of a change of side, so that the two parts meet
+        hide[1:-1] &= hide[:-2] & hide[2:]
+        shown[hide] = np.nan
+        alpha = 1.0 if front else 0.22
+        ax.plot(*shown.T, alpha=alpha, zorder=4 if front else 2, **style)
+
+
+def _surface(ax, semi, turn, eye):
+    longitude, latitude = np.meshgrid(np.linspace(0, 2 * np.pi, 121), np.linspace(0, np.pi, 61))
+    ball = np.stack([np.sin(latitude) * np.cos(longitude),
+                     np.sin(latitude) * np.sin(longitude), np.cos(latitude)])  # fmt: skip
+    points = np.einsum("ij,j...->i...", turn, ball * semi[:, None, None])
+    normal = np.einsum("ij,j...->i...", turn, ball / semi[:, None, None])
+    normal /= np.linalg.norm(normal, axis=0)
+    lit = np.clip(np.einsum("i,i...->...", _LIGHT, normal), 0, 1)
+    rim = np.clip(np.einsum("i,i...->...", eye, normal), 0, 1)
+    brightness = (0.80 + 0.14 * lit + 0.06 * rim)[..., None]
+    colors = np.clip(np.array([0.95, 0.98, 1.02]) * brightness, 0, 1)
+    ax.plot_surface(*points, facecolors=colors, linewidth=0, antialiased=False, shade=False,
+                    rcount=61, ccount=121, zorder=1)  # fmt: skip
+
+
+def _family(moments, twice_energy, count):
+    """Polhodes of the same energy: closed curves around the first and the last principal axis."""
+    low, middle, high = moments
+    for axis, (start, stop) in ((0, (low, middle)), (2, (middle, high))):
+        # at equal gaps of the height above the separatrix plane rather than of |L|^2
+        for fraction in (np.arange(count // 2 + 1) + 0.5) / (count // 2 + 1):
+            inertia = start + (stop - start) * (fraction**2 if axis == 0 else 1 - fraction**2)
+            yield from _level(moments, twice_energy, inertia, axis)
+
+
+def _separatrix(moments, twice_energy):
+    if moments[0] < moments[1] < moments[2]:
+        yield from _level(moments, twice_energy, moments[1], 2)
+
+
+def _level(moments, twice_energy, inertia, axis):
+    """The two curves |L|^2 = `inertia` 2T on the ellipsoid that enclose principal axis `axis`."""
+    others = [k for k in range(3) if k != axis]
+    # with w_k^2 = 2T s_k: sum I_k s_k = 1 and sum I_k^2 s_k = inertia; eliminate s_axis
+    weights = [
+        moments[k] * (moments[k] - moments[axis]) / (inertia - moments[axis])
+        if inertia != moments[axis]
+        else np.inf
+        for k in others
+    ]
+    if not all(0 < w < np.inf for w in weights):
+        return
+    angle = np.linspace(0, 2 * np.pi, 361)
+    curve = np.zeros((angle.size, 3))
+    for k, weight, wave in zip(others, weights, (np.cos(angle), np.sin(angle)), strict=True):
+        curve[:, k] = wave / np.sqrt(weight)
+    rest = 1 - sum(moments[k] * curve[:, k] ** 2 for k in others)
+    height = np.sqrt(np.clip(rest, 0, None) / moments[axis])
+    for side in (1, -1):
+        curve[:, axis] = side * height
+        yield curve * np.sqrt(twice_energy)
+
+
+def _body_axes(ax, tensor, twice_energy, size, names):
+    for k, (name, color) in enumerate(zip(names, AXES, strict=True)):
+        direction = np.eye(3)[k]
+        surface = np.sqrt(twice_energy / tensor[k, k]) / size
+        near, far = direction * surface, direction * (surface + 0.28)
+        ax.plot(*np.stack([near, far]).T, color=color, linewidth=1.6, zorder=5)
+        ax.text(*(direction * (surface + 0.36)), name, color=color, ha="center", va="center",
+                zorder=8)  # fmt: skip
+
+
+def _tidy(ax):
+    ax.set_axis_off()
+    ax.set_box_aspect((1, 1, 1), zoom=1.2)
+    ax.set_xlim(-1, 1)
+    ax.set_ylim(-1, 1)
+    ax.set_zlim(-1, 1)
+    ax.set_proj_type("ortho")
+
+
+@styled
+def herpolhode(
+    what: Trajectory | Samples,
+    *,
+    body: int | None = None,
+    ax: Any = None,
+    scale: Scale | None = None,
+) -> Any:
+    """Draw the angular velocity's trace in the plane normal to the angular momentum; Axes.
+
+    The plane is normal to the angular momentum at the first time, its first direction that of the
+    rates' part in the plane then. Dashed circles are the least and the greatest distance reached.
+    A dot marks the first time.
+    """
+    made, body = pick(what, body)
+    scale = Scale.of(np.ptp(made.ts[body])) if scale is None else scale
+    omega = np.einsum("tij,tj->ti", made.matrices[body], made.omega_body[body])
+    momentum = made.momentum_space[body, 0]
+    if not np.linalg.norm(momentum) > 0:
+        raise ValueError("the body is at rest at the first time: it has no invariable plane.")
+    normal = momentum / np.linalg.norm(momentum)
+    first = omega[0] - normal * (normal @ omega[0])
+    if np.linalg.norm(first) <= 1e-12 * np.linalg.norm(omega[0]):
+        first = np.eye(3)[np.argmin(np.abs(normal))]
+        first = first - normal * (normal @ first)
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    x, y = omega @ first / scale.radians_per_second, omega @ second / scale.radians_per_second
+    if ax is None:
+        ax = new_figure(5.0, 5.0).add_subplot()
+    radius = np.hypot(x, y)
+    angle = np.linspace(0, 2 * np.pi, 361)
+    for limit in (radius.min(), radius.max()):
+        ax.plot(limit * np.cos(angle), limit * np.sin(angle), color=GREY, linewidth=0.8,
+                linestyle=(0, (4, 3)))  # fmt: skip
+    ax.plot(x, y, color=ACCENT, linewidth=1.1)
+    ax.plot(x[0], y[0], "o", color=ACCENT, markeredgecolor="white", markersize=7)
+    ax.plot(0, 0, "+", color=INK, markersize=9)
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set_xlabel(f"rate in the invariable plane [{scale.rate}]")
+    ax.set_ylabel(f"[{scale.rate}]")
+    ax.set_title("Herpolhode")
+    return ax
+
+
+_BAND = (5, 95)
+
+
+@styled
+def overview(
+    what: Trajectory | Samples,
+    *,
+    observed: Samples | None = None,
+    scale: Scale | None = None,
+    axis_names: tuple[str, str, str] = ("x", "y", "z"),
+    title: str = "",
+) -> Any:
+    """Figure of the first body, with the spread of the others and observations; returns it.
+
+    Left: the three body axes as directions in space (components along space x, y, z) and the body
+    rates, lines for body 0 and bands from the 5th to the 95th percentile of the others; dots are
+    `observed` (`plot.samples` of one body; NaN where nothing was observed). Right: the polhode.
+    """
+    made = as_samples(what)
+    names = tuple(plain(name, 30) for name in axis_names)
+    scale = Scale.of(np.ptp(made.ts[0])) if scale is None else scale
+    figure = new_figure(11.0, 7.6)
+    grid = figure.add_gridspec(4, 2, width_ratios=(1.75, 1.0))
+    rows = [figure.add_subplot(grid[0, 0])]
+    rows += [figure.add_subplot(grid[k, 0], sharex=rows[0]) for k in (1, 2, 3)]
+    t = made.ts[0] / scale.seconds
+    direction, band = made.matrices, made.count > 2
+    seen = None if observed is None else observed.ts[0] / scale.seconds
+    for k, ax in enumerate(rows[:3]):
+        for i, color in enumerate(AXES):
+            _curve(ax, t, direction[:, :, i, k], color, f"space {'xyz'[i]}", band)
+            if observed is not None and observed.wxyz is not None:
+                _dots(ax, seen, observed.matrices[0, :, i, k], color)
+        ax.set_ylim(-1.1, 1.1)
+        letter = "xyz"[k]
+        name = "" if names[k] == letter else f" ({names[k]})"
+        ax.set_title(f"Body {letter} axis{name}: direction in space")
+    for k, color in enumerate(AXES):
+        unit = scale.radians_per_second
+        _curve(rows[3], t, made.omega_body[:, :, k] / unit, color, names[k], band)
+        if observed is not None:
+            _dots(rows[3], seen, observed.omega_body[0, :, k] / unit, color)
+    rows[3].set_title("Body rates")
+    rows[3].set_ylabel(f"[{scale.rate}]")
+    rows[3].set_xlabel(f"time [{scale.time}]")
+    for ax in rows:
+        ax.margins(x=0.01)
+        ax.label_outer()
+    for ax in (rows[0], rows[3]):
+        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=3, borderpad=0,
+                  handlelength=1.4, columnspacing=1.2)  # fmt: skip
+    ax = figure.add_subplot(grid[:3, 1], projection="3d")
+    polhode(made, ax=ax, axis_names=names)
+    ax.set_title("Polhode on the inertia ellipsoid", loc="center")
+    _key(figure.add_subplot(grid[3, 1]), observed is not None, made.count - 1)
+    if title:
+        figure.suptitle(plain(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
+    return figure
+
+
+def _curve(ax, t, values, color, label, band):
+    if band:
+        low, high = np.percentile(values[1:], _BAND, axis=0)
+        ax.fill_between(t, low, high, color=color, alpha=0.22, linewidth=0, zorder=2)
+    ax.plot(t, values[0], color=color, label=label, linewidth=1.3, zorder=3)
+
+
+def _dots(ax, t, values, color):
+    ax.plot(t, values, "o", color=color, markersize=4.2, markeredgecolor="white",
+            markeredgewidth=0.6, zorder=4)  # fmt: skip
+
+
+def _key(ax, observed, clones):
+    """What lines, bands and dots mean."""
+    from matplotlib.artist import Artist
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    entries: list[tuple[Artist, str]] = [(Line2D([], [], color=INK, linewidth=1.3), "nominal body")]
+    if clones > 1:
+        entries.append((Patch(color=INK, alpha=0.22), f"5 % to 95 % of {clones:,} clones"))
+    if observed:
+        dot = Line2D([], [], color=INK, marker="o", linestyle="", markersize=4.2)
+        entries.append((dot, "published values"))
+    ax.set_axis_off()
+    ax.legend(*zip(*entries, strict=True), loc="center")
