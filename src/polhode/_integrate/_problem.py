@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array
 
-from polhode._integrate._loop import Motion
+from polhode._integrate._explicit_step import Motion
 from polhode._integrate._switches import Switched, switched
 from polhode._kernels import Distinct, formula, specialise
 
@@ -22,14 +22,14 @@ class Problem(NamedTuple):
 
     ``closed``: rates (and sides of events) of ``arrays``, the time and the components of the state;
     ``arrays``: those of B bodies (B, ...) where ``lanes`` says so, else shared; ``switches``;
-    ``watched``: how many of the last switches are events.
+    ``events``: how many of the last switches are events.
     """
 
     closed: ClosedJaxpr
     arrays: list[Any]
     lanes: tuple[bool, ...]
     switches: Switched
-    watched: int
+    events: int
     components: int
     dtype: Any
 
@@ -79,13 +79,13 @@ class Problem(NamedTuple):
             len(components), dtype,
         )  # fmt: skip
 
-    def motion(self, arrays: Sequence[Any], units: Callable[..., Any], told: Any) -> Motion:
-        """As the loop wants it; ``units(told, y, rates)``."""
+    def motion(self, arrays: Sequence[Any], units: Callable[..., Any], unit_data: Any) -> Motion:
+        """Equations of motion for the loop; ``units(unit_data, y, rates)``: see ``Motion``."""
         size, count = self.components, self.switches.count
-        known = len(arrays)
+        fixed_count = len(arrays)
 
         def frozen(*given):
-            fixed, levels, t, y = given[:known], given[known], given[known + 1], given[known + 2 :]
+            fixed, (levels, t, *y) = given[:fixed_count], given[fixed_count:]
             out, margins, turned = self.switches.frozen(levels, *fixed, t, *y)
             return [*out[:size], margins, turned]
 
@@ -95,28 +95,34 @@ class Problem(NamedTuple):
         closed = formula(frozen, *bare, *free)
         program: list[Any] = []
 
-        def prepare(*some):
-            found = specialise(closed, some)
-            shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in (*found.held, *free)]
-            held = len(found.held)
-            # as a program of its own, for the function knows the values that were held
-            program[:] = [jax.make_jaxpr(lambda *x: found.run(x[:held], *x[held:]))(*shapes)]
-            return list(found.held)
+        def coefficients_of(*some):
+            folded = specialise(closed, some)
+            shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in (*folded.held, *free)]
+            size = len(folded.held)
+            # traced as a program of its own: ``run`` closes over the traced coefficients
+            program[:] = [jax.make_jaxpr(lambda *x: folded.run(x[:size], *x[size:]))(*shapes)]
+            return list(folded.held)
 
         axes = [0 if lane else None for lane in self.lanes]
-        depends = _depends(jax.make_jaxpr(prepare)(*bare).jaxpr, self.lanes)
+        depends = _depends(jax.make_jaxpr(coefficients_of)(*bare).jaxpr, self.lanes)
         out = [0 if moves else None for moves in depends]
-        held = (
-            jax.vmap(prepare, in_axes=tuple(axes), out_axes=out)(*arrays) if arrays else prepare()
+        coefficients = (
+            jax.vmap(coefficients_of, in_axes=tuple(axes), out_axes=out)(*arrays)
+            if arrays
+            else coefficients_of()
         )
         run = jaxpr_as_fun(program[0])
 
-        def of_one(held, levels, t, y):
-            *rates, margins, turned = run(*held, levels, t, *(y[i][None] for i in range(size)))
+        def of_one(coefficients, levels, t, y):
+            *rates, margins, turned = run(
+                *coefficients, levels, t, *(y[i][None] for i in range(size))
+            )
             return jnp.concatenate(rates), margins, turned
 
-        def rates(held, levels, t, y):
-            return jax.vmap(of_one, in_axes=(out, -1, 0, -1), out_axes=-1)(held, levels, t, y)
+        def rates(coefficients, levels, t, y):
+            return jax.vmap(of_one, in_axes=(out, -1, 0, -1), out_axes=-1)(
+                coefficients, levels, t, y
+            )
 
         def levels_of_one(fixed, t, y):
             return self.switches.levels(*fixed, t, *(y[i][None] for i in range(size)))
@@ -126,8 +132,10 @@ class Problem(NamedTuple):
                 return jnp.zeros((0, t.shape[0]), self.dtype)
             return jax.vmap(levels_of_one, in_axes=(axes, 0, -1), out_axes=-1)(list(fixed), t, y)
 
-        jumps = bool(self.switches.jumps[: count - self.watched].any())
-        return Motion(rates, levels, units, held, list(arrays), told, count, self.watched, jumps)
+        jumps = bool(self.switches.jumps[: count - self.events].any())
+        return Motion(
+            rates, levels, units, coefficients, list(arrays), unit_data, count, self.events, jumps
+        )
 
 
 class _Marked(NamedTuple):

@@ -1,4 +1,4 @@
-"""Events that the steps look for on their way."""
+"""Events for which the integration loop searches."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -6,12 +6,12 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode._integrate._loop import STOPPED, Solved
+from polhode._integrate._loop import AT_EVENT, Solved
 
 
 class Search(NamedTuple):
-    """Events to look for: functions ``(wxyz, omega_body, t)``, the direction of each and whether it
-    ends the motion; ``capacity``: how many of a body are stored. All static."""
+    """Events to search for: functions ``(wxyz, omega_body, t)``, the direction of each and whether
+    it ends the motion; ``capacity``: how many of a body are stored. All static."""
 
     fns: tuple[Callable[..., Array], ...] = ()
     directions: tuple[int, ...] = ()
@@ -49,7 +49,7 @@ def with_events(search: Search, solved: Solved, times: Array, states: Array):
     met = jnp.isfinite(at)
     if any(search.terminal):
         sign = jnp.where(times[:, -1:] < times[:, :1], -1, 1).astype(times.dtype)
-        end = jnp.where(solved.ended == STOPPED, solved.count, capacity + 1)
+        end = jnp.where(solved.outcome == AT_EVENT, solved.count, capacity + 1)
         stop = jnp.arange(1, capacity + 1, dtype=end.dtype)[None] == end[:, None]
         final = jnp.sum(jnp.where(stop, at, 0), axis=1, keepdims=True)
         state = jnp.sum(jnp.where(stop[..., None], there, 0), axis=1, keepdims=True)

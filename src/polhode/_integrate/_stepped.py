@@ -18,7 +18,7 @@ from polhode._integrate._charts import AbstractChart, EulerChart, LiePoissonChar
 from polhode._integrate._equations import equations_of
 from polhode._integrate._flow_adjoint import FlowAdjoint, path_of
 from polhode._integrate._lanes import LANES
-from polhode._integrate._loop import Wanted, solve
+from polhode._integrate._loop import LoopOptions, solve
 from polhode._integrate._one_step import GivenTimes
 from polhode._integrate._problem import Problem
 from polhode._integrate._search import Found, Search, with_events
@@ -272,7 +272,7 @@ class AbstractIntegration(AbstractMethod):
         def make(arrays, told, linked, asked=passing):
             units, rtol = told
             motion = program.motion(arrays, _by_units, units)
-            return motion, Wanted(
+            return motion, LoopOptions(
                 rtol, self.max_steps, asked.capacity, asked.directions, asked.terminal, linked
             )
 
@@ -293,7 +293,7 @@ class AbstractIntegration(AbstractMethod):
             states = jnp.stack([jnp.moveaxis(x, 0, 1) for x in path], axis=-1)
         seen = jax.tree.unflatten(tree, [states[..., i].T for i in range(len(leaves))])
         last = jax.tree.map(lambda x: x[-1:], seen)
-        status = jnp.array(_OF_LOOP)[solved.ended]
+        status = jnp.array(_OF_LOOP)[solved.outcome]
         moved = Moved(seen, last, solved.steps, status, solved.error)
         return self._samples(scene, moved, times, sound, record), found
 

@@ -1,0 +1,224 @@
+"""One step of the explicit Runge-Kutta method DOP853, of several bodies side by side.
+
+The stages are a loop, so that the field stands in the compiled program once. Coefficients:
+``_dop853.py``.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from polhode._integrate._dop853 import DENSE, DENSE_STAGES, NODES, STAGES, WEIGHTS
+from polhode._kernels import any_of
+
+MARGIN_STAGES = (0, 3, 6, 5, 9, 10, 12)
+"""Stages in order of time, the margins of which are inspected for switches."""
+
+MARGIN_NODES = tuple(float(NODES[k]) for k in MARGIN_STAGES)
+"""Where these lie in the step."""
+
+
+class Motion(NamedTuple):
+    """Equations of motion of B bodies.
+
+    ``rates(coefficients, levels, t, y)``: rates (D, B), margins (K, B) and the levels (K, B) to
+    which each switch would turn, for levels (K, B), times (B,) and states (D, B);
+    ``levels(arguments, t, y)``: the levels at a point; ``units(unit_data, y, rates)``: weights of
+    the components of an error, the squares of which are summed, and natural rates [rad/s] (B,). The
+    last ``events`` of the K ``switches`` are events; ``jumps``: whether the rates may jump at one
+    of the others."""
+
+    rates: Callable[..., tuple[Array, Array, Array]]
+    levels: Callable[..., Array]
+    units: Callable[..., tuple[list[Array], Array]]
+    coefficients: Any
+    arguments: Any
+    unit_data: Any
+    switches: int
+    events: int = 0
+    jumps: bool = True
+
+
+class Progress(NamedTuple):
+    """Carry of the loop; the last axis of every array is the bodies.
+
+    ``elapsed``: time since the start [s]; ``y``, ``rate``: state and its rates; ``levels``,
+    ``margin``: of the switches at ``y``; ``just_turned``: switches that turned at the start of the
+    step; ``needs_rates``: whether ``rate`` must be evaluated anew; ``width``: of the next step [s];
+    ``last_error``: logarithm of the last error over its tolerance; ``angle`` so far [rad];
+    ``error``: sum of estimated errors; ``steps`` accepted and ``attempts``; ``reversals``:
+    consecutive switches that turned back at once; ``place``: index of the next sample; ``count``:
+    of events; ``outcome``."""
+
+    elapsed: Array
+    y: Array
+    rate: Array
+    levels: Array
+    margin: Array
+    just_turned: Array
+    needs_rates: Array
+    width: Array
+    last_error: Array
+    angle: Array
+    error: Array
+    steps: Array
+    attempts: Array
+    reversals: Array
+    place: Array
+    count: Array
+    outcome: Array
+
+
+class Attempt(NamedTuple):
+    """A step that may be refused.
+
+    ``h`` (B,): signed width; ``stages`` (16, D, B): rates; ``margins`` (16, K, B); ``new_levels``
+    (K, B): to which switches would turn at the start; ``depths`` (5, K, B): of turning points of
+    the margins; ``dense`` (7, D, B): coefficients of dense output, valid where it was requested."""
+
+    h: Array
+    stages: Array
+    margins: Array
+    new_levels: Array
+    depths: Array
+    dense: Array
+
+
+def attempt_step(
+    motion: Motion, progress: Progress, t: Array, h: Array, needs_dense: Array
+) -> Attempt:
+    """A step of each body, of signed width ``h`` (B,) from ``t`` (B,). The stages of dense output
+    are skipped unless a body ``needs_dense`` (B,) or has a switch near.
+
+    Both phases, the stages of the step and those of dense output, are turns of one loop, so that
+    the field stands in the program once."""
+    dtype = progress.y.dtype
+    table, nodes = jnp.asarray(WEIGHTS, dtype), jnp.asarray(NODES, dtype)
+    stages = _padded(progress.rate)
+    margins = _padded(progress.margin)
+    events = motion.switches > 0
+
+    def stage(i, found):
+        stages, margins, new_levels = found
+        y = progress.y + h[None] * weighted(table[i], stages)
+        rate, margin, turn = motion.rates(motion.coefficients, progress.levels, t + nodes[i] * h, y)
+        stages = jax.lax.dynamic_update_index_in_dim(stages, rate, i, 0)
+        if events:
+            margins = jax.lax.dynamic_update_index_in_dim(margins, margin, i, 0)
+            new_levels = jnp.where(i == 0, turn, new_levels)
+        return stages, margins, new_levels
+
+    def phase(number, found):
+        *some, depths, inside = found
+        more = jnp.where(inside, DENSE_STAGES, STAGES)
+        first = jnp.where(any_of(jnp.where(progress.needs_rates, 1.0, 0.0)), 0, 1)
+        begin, end = jnp.where(number == 0, first, STAGES), jnp.where(number == 0, STAGES, more)
+        some = jax.lax.fori_loop(begin, end, stage, tuple(some))
+        if events:
+            depths = jnp.where(number == 0, _depths(margin_samples(some[1])), depths)
+            inside = inside | any_of(_is_near(some[1], depths))
+        return *some, depths, inside
+
+    inside = any_of(jnp.where(needs_dense, 1.0, 0.0)) if not motion.events else jnp.ones((), bool)
+    depths = (
+        jnp.ones((len(MARGIN_STAGES) - 2, *progress.levels.shape), dtype)
+        if events
+        else progress.levels
+    )
+    found = jax.lax.fori_loop(0, 2, phase, (stages, margins, progress.levels, depths, inside))
+    stages, margins, new_levels, depths, inside = found
+    return Attempt(h, stages, margins, new_levels, depths, dense_of(h, stages))
+
+
+def dense_of(h: Array, stages: Array) -> Array:
+    """Coefficients (7, D, B) of dense output."""
+    h_rates = h[None, None] * stages
+    change = weighted(WEIGHTS[STAGES - 1], h_rates)
+    first, last = h_rates[0], h_rates[STAGES - 1]
+    return jnp.stack(
+        [change, first - change, 2 * change - (first + last)]
+        + [weighted(row, h_rates) for row in DENSE]
+    )
+
+
+def dense_state(y: Array, dense: Array, x: Array) -> Array:
+    """States (D, B) at the fractions ``x`` (B,) of a step from ``y``."""
+    total, x = jnp.zeros_like(y), x[None]
+    rest = 1 - x
+    for k in range(dense.shape[0] - 1, -1, -1):
+        total = (total + dense[k]) * (x if k % 2 == 0 else rest)
+    return y + total
+
+
+def margin_samples(margins: Array) -> Array:
+    """Margins (7, K, B) in order of time; a switch that has just turned starts at zero."""
+    sampled = jnp.stack([margins[k] for k in MARGIN_STAGES])
+    return jnp.concatenate([jnp.maximum(sampled[:1], 0), sampled[1:]])
+
+
+def _depths(sampled: Array) -> Array:
+    """Minimum of the parabola through three neighbouring margins (5, K, B), relative to the least
+    of the three; 1 where it does not lie between them."""
+    x = np.array(MARGIN_NODES)
+    inverse = 1 / np.diff(x)
+
+    def column(values):
+        return jnp.asarray(values, sampled.dtype)[:, None, None]
+
+    chords = (sampled[1:] - sampled[:-1]) * column(inverse)
+    left, bend = chords[:-1], (chords[1:] - chords[:-1]) * column(1 / (x[2:] - x[:-2]))
+    # slopes at both ends tell whether it turns between them, without a division for most
+    falls = left - bend * column(x[1:-1] - x[:-2])
+    rises = left + bend * column(2 * x[2:] - x[:-2] - x[1:-1])
+    a = sampled[:-2]
+    least = jnp.minimum(jnp.minimum(a, sampled[1:-1]), sampled[2:])
+    turns = (falls < 0) & (rises > 0) & (bend > 0) & (least >= 0)
+    scale = jnp.where(turns & (least > 0), 4 * bend * least, 1)
+    return jnp.where(turns, (4 * bend * a - falls * falls) / scale, 1)
+
+
+def vertex_of(x, f):
+    """Minimum of the parabola through three points and its value; far away if there is none."""
+    (x0, x1, x2), (a, b, c) = x, f
+    left, right = (b - a) / (x1 - x0), (c - b) / (x2 - x1)
+    bend = (right - left) / (x2 - x0)
+    up = bend > 0
+    safe = jnp.where(up, bend, 1)
+    place = jnp.where(up, (x0 + x1) / 2 - left / (2 * safe), 2.0)
+    value = a + (place - x0) * (left + bend * (place - x1))
+    return place, value
+
+
+def _is_near(margins: Array, depths: Array) -> Array:
+    """Whether (B,) a switch may turn within the step."""
+    near = jnp.any(margin_samples(margins) < 0, axis=(0, 1)) | jnp.any(depths <= 0.5, axis=(0, 1))
+    return jnp.where(near, 1.0, 0.0)
+
+
+def column(storage: Array, k: Array) -> Array:
+    """Entry ``k`` (B,) of each body along the first axis."""
+    k = jnp.clip(k, 0, storage.shape[0] - 1)
+    k = jnp.broadcast_to(k.reshape(*[1] * (storage.ndim - 1), -1), (1, *storage.shape[1:]))
+    return jnp.take_along_axis(storage, k, axis=0)[0]
+
+
+def weighted(weights: np.ndarray | Array, stages: Array) -> Array:
+    """Sum (D, B) of ``stages`` (S, D, B) with ``weights`` (S,), without those known to be zero.
+    Summed term by term it is one fused loop; a matrix product would not fit into a fused kernel."""
+    total = None
+    for j in range(weights.shape[0]):
+        if isinstance(weights, np.ndarray) and weights[j] == 0:
+            continue
+        term = jnp.asarray(weights[j], stages.dtype) * stages[j]
+        total = term if total is None else total + term
+    return jnp.zeros_like(stages[0]) if total is None else total
+
+
+def _padded(first: Array) -> Array:
+    """Room for all stages, the first of them set."""
+    rest = jnp.zeros((DENSE_STAGES - 1, *first.shape), first.dtype)
+    return jnp.concatenate([first[None], rest])
