@@ -8,6 +8,7 @@ import pytest
 import polhode as ph
 from polhode._scene._scene import places_of
 from polhode.fit import FitOptions, Gyroscope, Recording
+from polhode.fit._scene_motion import LeafMotion
 
 BODY = ph.Inertia.from_moments([1.0, 2.0, 2.5])
 STATE = ph.State([0.8, 0.0, 0.6, 0.0], [1.2, -0.8, 1.0])
@@ -130,6 +131,12 @@ def test_a_common_size_is_anyones():
     assert int(found.null_count) == 1
     assert not np.any(np.isfinite(np.concatenate(found.std)))
     assert "standard deviations are infinite" in found.report()
+    # ratios are known: of the moments, and of drag over inertia
+    ratio, std = found.derived(lambda v: jnp.stack([v[0][:2] / v[0][2], v[1][:2] / v[0][:2]]))
+    exact = np.array([[0.4, 0.8], TRUE_DRAG[:2] / np.array([1.0, 2.0])])
+    assert np.all(std < 0.05)
+    assert np.all(np.abs(ratio - exact) < 4 * std)
+    assert np.all(np.isinf(found.derived(lambda v: v[0] + v[1])[1]))
 
 
 @pytest.mark.parametrize(
@@ -220,3 +227,67 @@ def test_the_bias_and_the_model_of_a_fitted_scene():
     state = ph.State(fit.initial.wxyz[0], fit.initial.omega_body[0])
     again = ph.simulate(fit.scene, state, TIMES).omega_body
     np.testing.assert_allclose(predicted[0], again, atol=1e-6)
+
+
+def test_bounds_and_priors_hold():
+    """A coefficient that is zero, bounded by zero; one with a prior narrower than the data."""
+    scene = ph.Scene(BODY, torque=ph.LinearDamping([0.1, 0.06, 0.0]))
+    rates = noisy(4, ph.simulate(scene, STATE, TIMES).omega_body)
+    data = Recording.of(TIMES, rates, omega_noise=NOISE)
+    start = ph.Scene(BODY, torque=ph.LinearDamping([0.12, 0.06, 0.02]))
+    options = FitOptions(trust_noise=True, max_starts=1, gyroscope=Gyroscope.ideal())
+    fit = ph.fit_scene(
+        start,
+        data,
+        lambda s: s.torque.c,
+        bounds=[(0.0, [np.inf, 0.07, np.inf])],
+        prior_std=[[1.0, 1e-4, 1.0]],
+        options=options,
+        rtol=1e-6,
+    )
+    value, std = np.asarray(fit.values[0]), np.asarray(fit.std[0])
+    assert np.all(value >= 0)
+    assert abs(value[0] - 0.1) < 4 * std[0]
+    assert std[0] < 0.02
+    # the prior decides
+    assert abs(value[1] - 0.06) < 2e-4
+    assert std[1] == pytest.approx(1e-4, rel=0.01)
+    assert value[2] < 3 * std[2]
+    derived, spread = fit.derived(lambda v: v[0])
+    np.testing.assert_allclose(derived, value)
+    np.testing.assert_allclose(spread, std, rtol=1e-6)
+
+
+def test_values_between_bounds_and_numbers_that_may_be_anything():
+    """Both ways, for two bounds, one and none; derivatives are finite far beyond a bound."""
+    scene = ph.Scene(BODY, torque=ph.LinearDamping([0.1, 0.2, 0.3]))
+    low, high = jnp.array([0.0, 0.0, -jnp.inf]), jnp.array([0.15, jnp.inf, 0.4])
+    motion = LeafMotion(scene, places_of(scene, lambda s: s.torque.c), bounds=((low, high),))
+    for values in ([0.1, 0.2, 0.3], [0.149, 1e-6, -5.0], [1e-9, 50.0, 0.399999]):
+        numbers = motion.unbounded([jnp.array(values)])
+        np.testing.assert_allclose(motion.bounded(numbers)[0], values, rtol=1e-6)
+    far = jnp.array([-30.0, -30.0, 30.0])
+    value, slope = jax.jvp(lambda x: motion.bounded([x])[0], (far,), (jnp.ones(3),))
+    assert np.all((value > low) & (value < high))
+    assert np.all(np.isfinite(slope) & (slope > 0))
+    assert bool(motion.at_bound([jnp.array([0.1, 1e-6, 0.3])]))
+    assert not bool(motion.at_bound([jnp.array([0.1, 0.01, 0.3])]))
+    free = LeafMotion(scene, places_of(scene, lambda s: s.torque.c), bounds=(None,))
+    np.testing.assert_array_equal(free.bounded([far])[0], far)
+
+
+@pytest.mark.parametrize(
+    ("more", "error", "message"),
+    [
+        ({"bounds": [(0.2, None)]}, ValueError, "must lie between their bounds"),
+        ({"bounds": (0.0, None)}, ValueError, "one entry for each of the 1 arrays"),
+        ({"bounds": [0.0]}, TypeError, r"bounds\[0\] must be a pair"),
+        ({"prior_std": [-1.0]}, ValueError, r"prior_std\[0\] must be positive"),
+        ({"prior_std": 0.1}, ValueError, "prior_std must be a list with one entry"),
+    ],
+)
+def test_wrong_bounds_and_priors_are_refused(more, error, message):
+    scene = ph.Scene(BODY, torque=ph.LinearDamping(0.1))
+    data = Recording.of(jnp.arange(5.0), jnp.ones((5, 3)) * 0.1)
+    with pytest.raises(error, match=message):
+        ph.fit_scene(scene, data, lambda s: s.torque.c, **more)

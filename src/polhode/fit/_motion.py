@@ -47,6 +47,22 @@ class AbstractMotion(eqx.Module):
     def fixes_scale(self) -> bool:
         """Whether rates alone depend on the absolute size of the inertia (static)."""
 
+    def bounded(self, unknown: Any) -> Any:
+        """Values of the motion's unknowns from numbers that may be anything."""
+        return unknown
+
+    def unbounded(self, values: Any) -> Any:
+        """The inverse of ``bounded``."""
+        return values
+
+    def at_bound(self, values: Any) -> Array:
+        """Whether an unknown is at its bound."""
+        return jnp.asarray(False)
+
+    def prior_std(self) -> list[Array | None]:
+        """Standard deviations of normal priors about the start, one for each unknown leaf."""
+        return [None for _ in jax.tree.leaves(self.start())]
+
     @abc.abstractmethod
     def __call__(
         self,

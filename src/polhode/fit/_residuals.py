@@ -179,6 +179,7 @@ class Prior(NamedTuple):
     bias: Float[Array, " 3"] | None
     delay: Float[Array, ""] | None
     walk: Float[Array, "r k 3"] | None
+    motion: list[Array | None]
 
 
 def prior_of(parameters: Parameters, recording: Recording, model: Model) -> Prior:
@@ -200,15 +201,35 @@ def prior_of(parameters: Parameters, recording: Recording, model: Model) -> Prio
         precision(sensor.bias_std, parameters.bias) if sensor.bias_std else None,
         precision(sensor.delay_std, parameters.delay) if sensor.delay_std else None,
         walk,
+        [
+            None if std is None else jnp.broadcast_to(std, leaf.shape).astype(dtype) ** -2
+            for std, leaf in zip(
+                model.motion.prior_std(), jax.tree.leaves(parameters.motion), strict=True
+            )
+        ],
     )
 
 
-def prior_cost(parameters: Parameters, recording: Recording, model: Model) -> Float[Array, ""]:
-    """Half the sum of squares of the calibration's unknowns over their standard deviations."""
-    total = jnp.zeros((), recording.times.dtype)
-    for name, precision in prior_of(parameters, recording, model)._asdict().items():
+def departures(parameters: Parameters, recording: Recording, model: Model) -> list[Array]:
+    """Unknowns that have a prior, less its mean, over its standard deviation."""
+    prior = prior_of(parameters, recording, model)
+    parts = [
+        (precision, getattr(parameters, name))
+        for name, precision in prior._asdict().items()
+        if name != "motion" and precision is not None
+    ]
+    leaves = jax.tree.leaves(parameters.motion), jax.tree.leaves(model.motion.start())
+    for precision, value, start in zip(prior.motion, *leaves, strict=True):
         if precision is not None:
-            total = total + jnp.sum(precision * getattr(parameters, name) ** 2) / 2
+            parts.append((precision, value - jnp.asarray(start, value.dtype)))
+    return [(jnp.sqrt(precision) * value).ravel() for precision, value in parts]
+
+
+def prior_cost(parameters: Parameters, recording: Recording, model: Model) -> Float[Array, ""]:
+    """Half the sum of squares of ``departures``."""
+    total = jnp.zeros((), recording.times.dtype)
+    for part in departures(parameters, recording, model):
+        total = total + jnp.sum(part**2) / 2
     return total
 
 

@@ -2,7 +2,7 @@
 
 import dataclasses
 import enum
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from statistics import NormalDist
 from typing import Any, NamedTuple
@@ -14,7 +14,7 @@ import numpy as np
 from jax.scipy.stats import norm
 from jaxtyping import Array, Float, Int
 
-from polhode._checks import require
+from polhode._checks import ArrayLike, require
 from polhode._scene import Scene, State
 from polhode.fit._gyroscope import Gyroscope
 from polhode.fit._linear import Linear
@@ -47,6 +47,7 @@ class Finding(enum.IntFlag):
     SATURATED = 256
     OUTLIERS = 512
     CALIBRATION = 1024
+    AT_BOUND = 2048
 
 
 WARNINGS = {
@@ -75,6 +76,8 @@ WARNINGS = {
     Finding.CALIBRATION: "scale factors, misalignment or bias of the gyroscope are more than 3.5"
     " standard deviations from its calibration: state a wider one, Gyroscope(scale_std=...,"
     " misalignment_std=...), or the model lacks something that they make up for",
+    Finding.AT_BOUND: "a value is at its bound: its interval is one-sided, and the data may ask for"
+    " a value beyond",
 }
 _SCENE_WARNINGS = WARNINGS | {
     Finding.UNDETERMINED: "some of the numbers do not show in this motion, alone or against each"
@@ -260,6 +263,56 @@ class Fit(eqx.Module):
     def is_usable(self) -> bool:
         """Whether no fit stopped early, is not finite or contradicts the attitudes."""
         return not bool((np.asarray(self.diagnostics) & int(UNUSABLE)).any())
+
+    def derived(
+        self, function: Callable[[list[Array]], ArrayLike], body: int = 0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """A function of the ``values`` of one body and its standard deviation.
+
+        **Arguments:** ``function`` of the list ``values``, differentiable by JAX, with an array of
+        any shape; ``body``: number in the flattened batch.
+
+        By linear propagation of ``covariance``. A function may be known although its arguments are
+        not: where the data do not show the common size of inertia and drag, their ratio has a
+        finite deviation, ``fit.derived(lambda v: v[1] / v[0])``. Infinite for what the data do not
+        show.
+        """
+        lead = np.ndim(self.diagnostics)
+        values = [jnp.reshape(x, (-1, *jnp.shape(x)[lead:]))[body] for x in self.values]
+        count = self.model.entries
+        if self._inertia is not None:
+            # the unknowns are entries of the tensor, not its nine components
+            values = [entries_of(values[0], count), *values[1:]]
+
+        def of_unknowns(parts):
+            if self._inertia is not None:
+                parts = [whole_of(parts[0], count), *parts[1:]]
+            return jnp.asarray(function(parts))
+
+        value, slopes = of_unknowns(values), jax.jacfwd(of_unknowns)(values)
+        slopes = [np.reshape(np.asarray(x), (value.size, -1)) for x in slopes]
+        sensors = (self.parameters.bias, self.parameters.mounting, self.parameters.lever)
+        skipped = sum(int(np.prod(np.shape(x)[lead:])) for x in sensors if x is not None)
+        covariance, information = (
+            np.asarray(x).reshape(-1, *np.shape(x)[-2:])[body]
+            for x in (self.covariance, self.information)
+        )
+        # in the order of the covariance: entries, sensors, then the motion's values
+        full = np.zeros((value.size, covariance.shape[0]))
+        first = 0
+        for k, slope in enumerate(slopes):
+            first += skipped if k == int(self._inertia is not None) else 0
+            full[:, first : first + slope.shape[1]] = slope
+            first += slope.shape[1]
+        std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", full, covariance, full), 0))
+        size = np.sqrt(np.diagonal(information))
+        safe = np.where(size > 0, size, 1)
+        found, axes = np.linalg.eigh(information / safe[:, None] / safe)
+        null = axes[:, found <= 1e3 * np.finfo(information.dtype).eps * found[-1]]
+        leaning = np.linalg.norm(full @ (null / safe[:, None]), axis=1)
+        reach = np.linalg.norm(full / safe, axis=1)
+        std = np.where(leaning > _LEANS * reach, np.inf, std)
+        return np.asarray(value), std.reshape(value.shape)
 
     def interval(self, level: float = 0.95) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
         """Ends (..., 3) of confidence intervals of ``principal_values``; 0 < ``level`` < 1."""
@@ -519,14 +572,19 @@ def _priors(solution: Solution, recording: Recording) -> tuple[np.ndarray, Array
     parameters, model = solution.parameters, solution.model
     prior = prior_of(parameters, recording, model)
     shared = [np.zeros(model.entries, bool)]
+    motion = jax.tree.leaves(parameters.motion)
     for name in ("bias", "mounting", "lever", "motion", "gain", "delay"):
+        if name == "motion":
+            for leaf, precision in zip(motion, prior.motion, strict=True):
+                shared.append(np.full(leaf.size, precision is not None))
+            continue
         size = sum(leaf.size for leaf in jax.tree.leaves(getattr(parameters, name)))
         shared.append(np.full(size, getattr(prior, name, None) is not None))
     own = [np.zeros(0 if x is None else 3, bool) for x in (parameters.omega, parameters.attitude)]
     walk = np.ones(0 if parameters.walk is None else parameters.walk[0].size, bool)
     recordings = parameters.omega.shape[0]
     held = np.concatenate([*shared, *[np.concatenate([*own, walk])] * recordings])
-    each = [getattr(prior, name) for name in ("bias", "gain", "delay", "walk")]
+    each = [prior.bias, *prior.motion, prior.gain, prior.delay, prior.walk]
     flat = [jnp.ravel(x) for x in each if x is not None]
     dtype = parameters.omega.dtype
     return held, jnp.concatenate([jnp.zeros(0, dtype), *flat]).astype(dtype)
@@ -710,6 +768,7 @@ def conclude_scene(solution: Solution, recording: Recording, options: FitOptions
             Finding.STEP_LIMIT: ~solution.stopped,
             Finding.NOT_FINITE: ~finite,
             Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread)),
+            Finding.AT_BOUND: solution.model.motion.at_bound(parameters.motion),
             Finding.NOT_WHITE: whiteness < 1e-4,
             Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
             Finding.SATURATED: is_saturated(recording),
@@ -775,7 +834,7 @@ def _calibration_strained(solution: Solution, recording: Recording) -> Array:
     for name, precision in (
         prior_of(solution.parameters, recording, solution.model)._asdict().items()
     ):
-        if precision is not None:
+        if name != "motion" and precision is not None:
             value = getattr(solution.parameters, name)
             far = far | jnp.any(value**2 * precision > 3.5**2)
     return far

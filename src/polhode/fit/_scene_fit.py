@@ -4,10 +4,13 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from polhode._batch import PARTS, batch_shapes
-from polhode._checks import ArrayLike, as_float_array, require
+from polhode._checks import ArrayLike, as_float_array, require, require_positive
 from polhode._method import AbstractMethod
 from polhode._scene import Scene
 from polhode._scene._scene import places_of
@@ -24,6 +27,8 @@ def fit_scene(
     data: Recording | Sequence[Recording],
     free: Callable[[Any], Any],
     *,
+    bounds: Sequence[tuple[ArrayLike | None, ArrayLike | None] | None] | None = None,
+    prior_std: Sequence[ArrayLike | None] | None = None,
     attitude: ArrayLike | None = None,
     method: AbstractMethod | None = None,
     rtol: float | None = None,
@@ -40,6 +45,11 @@ def fit_scene(
     - ``free``: function of the scene that returns the array or the list of arrays to fit (of a
       part: all its arrays). The initial rates of each recording, and its initial attitude where
       attitudes were recorded, are always fitted too.
+    - ``bounds``: for each array of ``free`` a pair of its lower and upper bound, numbers or arrays
+      of its shape, None where there is none; None in place of a pair: no bounds. The starting
+      values must lie between them. ``[(0.0, None)]`` keeps a coefficient positive.
+    - ``prior_std``: for each array of ``free`` the standard deviation of a normal prior about its
+      starting value, a number or an array of its shape, or None.
     - ``attitude`` (4,): initial attitude ``wxyz``, for recordings without attitudes; None: the
       body axes are those of space at the first time.
     - ``method``, ``rtol``: as in ``ph.simulate``.
@@ -48,8 +58,8 @@ def fit_scene(
     - ``throw``: whether a fit that is not finite or stopped early raises FitError.
 
     Returns a ``Fit``: ``values`` and ``std`` in the order of ``free``, ``scene`` with the values.
-    The numbers are not constrained: a coefficient may become negative. An inertia of which nothing
-    is known is fitted by ``fit_inertia``, which finds a start and keeps it physical.
+    Numbers without bounds are not constrained: a coefficient may become negative. An inertia of
+    which nothing is known is fitted by ``fit_inertia``, which finds a start and keeps it physical.
 
         ts = jnp.linspace(0.0, 20.0, 200)
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 2.5]), torque=ph.LinearDamping(0.1))
@@ -99,11 +109,65 @@ def fit_scene(
             " fitted.",
         )
     check_usable(options, recordings[0])
-    motion = LeafMotion(scene, places_of(scene, free), _start(attitude, scene), method, rtol)
+    places = places_of(scene, free)
+    starts = [jax.tree.leaves(scene)[i] for i in places]
+    motion = LeafMotion(
+        scene,
+        places,
+        _start(attitude, scene),
+        method,
+        rtol,
+        None if bounds is None else _bounds(bounds, starts),
+        None if prior_std is None else _widths(prior_std, starts),
+    )
     options = dataclasses.replace(options, motion=motion, unknown=NoInertia())
     if isinstance(data, Recording):
         return checked_fit(each(data, options, conclude_scene), throw)
     return checked_fit(together(stack(recordings), options, conclude_scene), throw)
+
+
+def _bounds(bounds: Sequence, starts: Sequence[Array]) -> tuple[tuple[Array, Array] | None, ...]:
+    _check_count("bounds", bounds, starts)
+    found = []
+    for k, (pair, start) in enumerate(zip(bounds, starts, strict=True)):
+        if pair is None:
+            found.append(None)
+            continue
+        if not (isinstance(pair, tuple | list) and len(pair) == 2):
+            raise TypeError(f"bounds[{k}] must be a pair (lower, upper) or None, got {pair!r}.")
+        ends = [
+            jnp.full(start.shape, sign * jnp.inf, start.dtype)
+            if end is None
+            else jnp.broadcast_to(jnp.asarray(end, start.dtype), start.shape)
+            for end, sign in zip(pair, (-1, 1), strict=True)
+        ]
+        inside = (ends[0] < start) & (start < ends[1])
+        require(
+            np.asarray(inside),
+            f"the starting values of array {k} must lie between their bounds, got"
+            f" {np.asarray(start)} for {pair}.",
+        )
+        found.append((ends[0], ends[1]))
+    return tuple(found)
+
+
+def _widths(prior_std: Sequence, starts: Sequence[Array]) -> tuple[Array | None, ...]:
+    _check_count("prior_std", prior_std, starts)
+    found = []
+    for k, (std, start) in enumerate(zip(prior_std, starts, strict=True)):
+        if std is None:
+            found.append(None)
+            continue
+        require_positive(f"prior_std[{k}]", std, hint="None stands for no prior")
+        found.append(jnp.broadcast_to(jnp.asarray(std, start.dtype), start.shape))
+    return tuple(found)
+
+
+def _check_count(name: str, given: Sequence, starts: Sequence[Array]) -> None:
+    require(
+        isinstance(given, list | tuple) and len(given) == len(starts),
+        f"{name} must be a list with one entry for each of the {len(starts)} arrays of free.",
+    )
 
 
 def _start(attitude: ArrayLike | None, scene: Scene) -> Array | None:

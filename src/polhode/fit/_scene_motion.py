@@ -70,11 +70,51 @@ class SceneMotion(AbstractMotion):
         return simulated(scene, omega, wxyz, times, self.method, self.rtol)
 
 
+def _inside(number: Array, start: Array, low: Array, high: Array) -> Array:
+    """A value between its bounds; any number may be given, and an inner one hardly changes.
+
+    At one bound the smooth maximum ``low + (d + sqrt(d^2 + s^2)) / 2``, at two a sigmoid.
+    """
+    half, middle = (high - low) / 2, (high + low) / 2
+    both = jnp.isfinite(half)
+    half, middle = jnp.where(both, half, 1), jnp.where(both, middle, 0)
+    y = (number - middle) / half
+    between = middle + half * y / jnp.sqrt(1 + y**2)
+    # one bound: the distance from it, mirrored for an upper one
+    some = jnp.isfinite(low) | jnp.isfinite(high)
+    side = jnp.where(jnp.isfinite(low), 1, -1)
+    end = jnp.where(jnp.isfinite(low), low, jnp.where(jnp.isfinite(high), high, 0))
+    # any positive number where there is no bound, for finite derivatives of what is not chosen
+    soft = jnp.where(some, jnp.abs(start - end), 1)
+    d = side * (number - end)
+    root = jnp.sqrt(d**2 + soft**2)
+    # without cancellation far beyond the bound
+    beyond = jnp.where(d > 0, (d + root) / 2, soft**2 / (2 * (root - jnp.where(d > 0, 0, d))))
+    return jnp.where(both, between, jnp.where(some, end + side * beyond, number))
+
+
+def _outside(value: Array, start: Array, low: Array, high: Array) -> Array:
+    """The inverse of ``_inside``."""
+    half, middle = (high - low) / 2, (high + low) / 2
+    both = jnp.isfinite(half)
+    half, middle = jnp.where(both, half, 1), jnp.where(both, middle, 0)
+    y = jnp.where(both, (value - middle) / half, 0)
+    between = middle + half * y / jnp.sqrt(1 - y**2)
+    side = jnp.where(jnp.isfinite(low), 1, -1)
+    some = jnp.isfinite(low) | jnp.isfinite(high)
+    end = jnp.where(jnp.isfinite(low), low, jnp.where(jnp.isfinite(high), high, 0))
+    d = jnp.where(some, side * (value - end), 1)
+    beyond = end + side * (d - (start - end) ** 2 / (4 * d))
+    return jnp.where(both, between, jnp.where(some, beyond, value))
+
+
 class LeafMotion(AbstractMotion):
     """Motion of a scene some of whose arrays are unknown, by ``ph.simulate``.
 
     **Fields:** ``scene``, with the starting values; ``places`` (static): which of its leaves are
-    unknown; ``attitude`` (4,): initial one for recordings without attitudes; ``method`` and
+    unknown; ``bounds``: lower and upper ends of each, infinite where there is none, or None;
+    ``widths``: standard deviations of normal priors about the start; ``attitude`` (4,): initial one
+    for recordings without attitudes; ``method`` and
     ``rtol`` as in ``ph.simulate``.
     """
 
@@ -83,6 +123,31 @@ class LeafMotion(AbstractMotion):
     attitude: Float[Array, " 4"] | None = None
     method: AbstractMethod | None = None
     rtol: float | None = eqx.field(static=True, default=None)
+    bounds: tuple[tuple[Array, Array] | None, ...] | None = None
+    widths: tuple[Array | None, ...] | None = None
+
+    def bounded(self, unknown: list[Array]) -> list[Array]:
+        if self.bounds is None:
+            return unknown
+        pairs = zip(unknown, self.start(), self.bounds, strict=True)
+        return [x if ends is None else _inside(x, at, *ends) for x, at, ends in pairs]
+
+    def unbounded(self, values: list[Array]) -> list[Array]:
+        if self.bounds is None:
+            return values
+        pairs = zip(values, self.start(), self.bounds, strict=True)
+        return [x if ends is None else _outside(x, at, *ends) for x, at, ends in pairs]
+
+    def prior_std(self) -> list[Array | None]:
+        return super().prior_std() if self.widths is None else list(self.widths)
+
+    def at_bound(self, values: list[Array]) -> Array:
+        """Whether a value has come within a thousandth of the start's distance to a bound."""
+        near = jnp.asarray(False)
+        for x, at, ends in zip(values, self.start(), self.bounds or (), strict=False):
+            for end in ends or ():
+                near = near | jnp.any(jnp.abs(x - end) < 1e-3 * jnp.abs(at - end))
+        return near
 
     def start(self) -> list[Array]:
         leaves = jax.tree.leaves(self.scene)

@@ -1,5 +1,7 @@
 """From recordings of one body to its best parameters: start, Levenberg-Marquardt, information."""
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,7 +25,7 @@ from polhode.fit._parameters import (
     whole_of,
 )
 from polhode.fit._recording import Recording, bridged, needed, size_of_data, turn_between
-from polhode.fit._residuals import Huber, Model, prior_cost, prior_of
+from polhode.fit._residuals import Huber, Model, departures, prior_cost
 from polhode.fit._start import alternatives, regression, scatter
 from polhode.inertia import Inertia, inertia_of_second_moments, second_moments
 
@@ -107,10 +109,12 @@ def solve(recording: Recording, options: FitOptions) -> Solution:
     scale = _scale(begin, recording, rates)
     # the optimiser counts in the default precision whatever that of the data
     wide = jnp.result_type(float)
-    fresh = jax.tree.map(lambda a, b: (a / b).astype(wide), begin, scale)
+    unbounded = dataclasses.replace(begin, motion=motion.unbounded(begin.motion))
+    fresh = jax.tree.map(lambda a, b: (a / b).astype(wide), unbounded, scale)
 
     def actual(scaled):
-        return jax.tree.map(lambda a, b: a.astype(dtype) * b, scaled, scale)
+        found = jax.tree.map(lambda a, b: a.astype(dtype) * b, scaled, scale)
+        return dataclasses.replace(found, motion=motion.bounded(found.motion))
 
     weight = _weight(recording, rates)
     solver = options.solver or LevenbergMarquardt(_OFFSET, float(jnp.finfo(dtype).eps) ** 0.75)
@@ -147,13 +151,9 @@ def solve(recording: Recording, options: FitOptions) -> Solution:
         at = jax.lax.stop_gradient((values.shared, values.own))
         linear = linear_at(*at, within, base)
         misfit = linear.shifted(values.shared - at[0], values.own - at[1])
-        prior = prior_of(parameters, recording, model_of(base))
         unit = jax.lax.stop_gradient(prior_unit(linear))
         rows = [misfit.ravel(), belief * scaled.shape.astype(dtype)]
-        for name, precision in prior._asdict().items():
-            if precision is not None:
-                value = getattr(parameters, name)
-                rows.append((unit * jnp.sqrt(precision) * value).ravel())
+        rows += [unit * part for part in departures(parameters, recording, model_of(base))]
         return (weight * jnp.concatenate(rows)).astype(wide), linear
 
     jobs = _jobs(bases.soft.shape[0], options.max_starts)
