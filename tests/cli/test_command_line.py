@@ -106,7 +106,6 @@ def test_chunks_cover_every_body_once(here):
     assert seen == [50, 100, 121]
     whole = ph.simulate(job.scene, job.state, job.ts, job.method)
     np.testing.assert_allclose(outcome.trajectory.wxyz, whole.wxyz, atol=2e-7)
-    assert outcome.compile_seconds >= 0
     assert outcome.run_seconds > 0
 
 

@@ -149,40 +149,6 @@ def test_times_broadcast_against_particles():
     np.testing.assert_allclose(forces[2], 3 * frame.coriolis(times, positions[2]), atol=1e-14)
 
 
-def _multiplications(frame, moving: bool) -> int:
-    """Products in the compiled-to-be program, nested calls included."""
-
-    def count(jaxpr) -> int:
-        total = 0
-        for equation in jaxpr.eqns:
-            total += equation.primitive.name in ("mul", "dot_general")
-            for value in equation.params.values():
-                for item in value if isinstance(value, tuple | list) else [value]:
-                    inner = getattr(item, "jaxpr", item)
-                    total += count(inner) if hasattr(inner, "eqns") else 0
-        return total
-
-    def program(t, position, velocity):
-        return frame.apparent_acceleration(t, position, velocity if moving else None)
-
-    args = jnp.asarray(TIME), jnp.asarray(POSITION), jnp.asarray(VELOCITY)
-    return count(jax.make_jaxpr(program)(*args).jaxpr)
-
-
-def test_absent_terms_are_not_computed():
-    """One cross product of two vectors counts six."""
-    steady = RotatingFrame.from_rate(OMEGA)
-    assert _multiplications(steady, moving=False) == 2 * 6
-    # Coriolis shares its cross product with the centrifugal force: only 2 v is new
-    assert _multiplications(steady, moving=True) == 2 * 6 + 1
-    slope = jnp.asarray(SLOPE)
-    varying = RotatingFrame.from_rate(lambda t: jnp.asarray(OMEGA) + slope * t)
-    # the given rate and its derivative cost two, the Euler term one cross product
-    assert _multiplications(varying, moving=True) == 2 * 6 + 1 + 2 + 6
-    moving = RotatingFrame.from_rate(OMEGA, wobbling_origin)
-    assert _multiplications(moving, moving=True) > 2 * 6 + 1 + 12
-
-
 @pytest.mark.parametrize(
     ("make", "error", "message"),
     [

@@ -199,19 +199,6 @@ def test_conserved_over_long_times():
     np.testing.assert_allclose(np.linalg.norm(np.stack(attitude, -1), axis=-1), 1, rtol=1e-15)
 
 
-def test_rates_alone_compile_to_less():
-    shapes = jnp.ones((8, 3)), jnp.ones((8, 3)), jnp.ones(8)
-
-    def operations(**wanted):
-        def motion(moments, omega, t):
-            wxyz = jnp.ones((8, 4)) if wanted.get("attitude", True) else None
-            return free_motion(moments, wxyz, omega, t, **wanted)
-
-        return jax.jit(motion).lower(*shapes).as_text().count("\n")
-
-    assert operations(attitude=False) < 0.6 * operations()
-
-
 def test_wrong_use_is_explained():
     motion = prepare(jnp.ones((2, 3)), None, jnp.ones((2, 3)))
     with pytest.raises(ValueError, match="prepared without wxyz"):

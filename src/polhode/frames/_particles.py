@@ -210,10 +210,18 @@ def simulate_particles(
     position, velocity = (jnp.broadcast_to(x, batch) for x in (position, velocity))
     mass = jnp.broadcast_to(mass, (*batch[:-1], 1))
     *paths, steps = _solve(
-        frame, force, mass, position, velocity, ts, check_rtol(rtol, dtype),
-        solver, controller,
-        diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint, max_steps,
-    )  # fmt: skip
+        frame,
+        force,
+        mass,
+        position,
+        velocity,
+        ts,
+        check_rtol(rtol, dtype),
+        solver,
+        controller,
+        diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
+        max_steps,
+    )
     made = ParticlePaths(ts, paths[0], paths[1], frame, paths[2], steps)
     if throw and is_concrete(made.successful) and not bool(made.successful):
         raise RuntimeError(

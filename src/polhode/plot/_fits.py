@@ -34,8 +34,14 @@ def fit(result: Any, recording: Any, *, body: int = 0, title: str = "") -> Any:
     dense = one["times"].size > 300
     for k, color in enumerate(AXES):
         ax = rows[k]
-        ax.plot(one["times"], one["omega"][:, k], ".", color=GREY, label="data",
-                markersize=2 if dense else 5)  # fmt: skip
+        ax.plot(
+            one["times"],
+            one["omega"][:, k],
+            ".",
+            color=GREY,
+            label="data",
+            markersize=2 if dense else 5,
+        )
         ax.plot(one["times"], one["model"][:, k], color=color, label="model")
         ax.set_title(f"Rate about {'xyz'[k]}")
         ax.set_ylabel("[rad/s]")
@@ -133,9 +139,14 @@ def _region(ax, one):
         line = np.linspace(0, 1, 201)
         reached = limits[0][0] + limits[1][0] < 1
         ax.fill_between(
-            line, 0, 1 - line, color=GREY, alpha=0.35, linewidth=0,
+            line,
+            0,
+            1 - line,
+            color=GREY,
+            alpha=0.35,
+            linewidth=0,
             label="no body" if reached else None,
-        )  # fmt: skip
+        )
         ax.set_xlim(*limits[0])
         ax.set_ylim(*limits[1])
     ax.legend(loc="best")
@@ -161,9 +172,16 @@ def _table(ax, one):
         "remarks        " + (", ".join(one["findings"]) or "none"),
     ]
     ax.text(
-        0.0, 0.95, "\n".join(lines), family="monospace", fontsize=8.5, va="top", linespacing=1.5,
-        transform=ax.transAxes, color=INK,
-    )  # fmt: skip
+        0.0,
+        0.95,
+        "\n".join(lines),
+        family="monospace",
+        fontsize=8.5,
+        va="top",
+        linespacing=1.5,
+        transform=ax.transAxes,
+        color=INK,
+    )
 
 
 def _rounded(value, spread) -> str:
@@ -229,6 +247,13 @@ def work_precision(
     ax.set_xlabel(time_label)
     ax.set_ylabel(error_label)
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
-    ax.annotate("better", xy=(0.02, 0.03), xytext=(0.13, 0.14), xycoords="axes fraction",
-                color=GREY, fontsize=8, arrowprops={"arrowstyle": "->", "color": GREY})  # fmt: skip
+    ax.annotate(
+        "better",
+        xy=(0.02, 0.03),
+        xytext=(0.13, 0.14),
+        xycoords="axes fraction",
+        color=GREY,
+        fontsize=8,
+        arrowprops={"arrowstyle": "->", "color": GREY},
+    )
     return ax

@@ -100,8 +100,15 @@ def samples(
     energy = tensor = None
     if inertia is not None:
         tensor = flat("inertia", inertia.tensor, (3, 3))
-        energy = np.einsum("nti,nij,ntj->nt", omega.reshape(-1, samples, 3), tensor,
-                           omega.reshape(-1, samples, 3)) / 2  # fmt: skip
+        energy = (
+            np.einsum(
+                "nti,nij,ntj->nt",
+                omega.reshape(-1, samples, 3),
+                tensor,
+                omega.reshape(-1, samples, 3),
+            )
+            / 2
+        )
     return Samples(
         flat("ts", ts, (samples,)),
         omega.reshape(-1, samples, 3),

@@ -119,8 +119,15 @@ def polhode(
         draw(curve, color=INK, linewidth=1.0, linestyle=(0, (4, 2)))
     draw(omega, color=ACCENT, linewidth=2.4)
     start, visible = turn @ omega[0] / size, eye @ turn @ (omega[0] / semi**2) >= 0
-    ax.scatter(*start, color=ACCENT, s=42, edgecolor="white", linewidth=0.8,
-               alpha=1.0 if visible else 0.35, zorder=7)  # fmt: skip
+    ax.scatter(
+        *start,
+        color=ACCENT,
+        s=42,
+        edgecolor="white",
+        linewidth=0.8,
+        alpha=1.0 if visible else 0.35,
+        zorder=7,
+    )
     _body_axes(ax, tensor, twice_energy, size, axis_names)
     _tidy(ax)
     return ax
@@ -150,8 +157,13 @@ def _line(ax, points, facing, **style):
 
 def _surface(ax, semi, turn, eye):
     longitude, latitude = np.meshgrid(np.linspace(0, 2 * np.pi, 121), np.linspace(0, np.pi, 61))
-    ball = np.stack([np.sin(latitude) * np.cos(longitude),
-                     np.sin(latitude) * np.sin(longitude), np.cos(latitude)])  # fmt: skip
+    ball = np.stack(
+        [
+            np.sin(latitude) * np.cos(longitude),
+            np.sin(latitude) * np.sin(longitude),
+            np.cos(latitude),
+        ]
+    )
     points = np.einsum("ij,j...->i...", turn, ball * semi[:, None, None])
     normal = np.einsum("ij,j...->i...", turn, ball / semi[:, None, None])
     normal /= np.linalg.norm(normal, axis=0)
@@ -159,8 +171,16 @@ def _surface(ax, semi, turn, eye):
     rim = np.clip(np.einsum("i,i...->...", eye, normal), 0, 1)
     brightness = (0.80 + 0.14 * lit + 0.06 * rim)[..., None]
     colors = np.clip(np.array([0.95, 0.98, 1.02]) * brightness, 0, 1)
-    ax.plot_surface(*points, facecolors=colors, linewidth=0, antialiased=False, shade=False,
-                    rcount=61, ccount=121, zorder=1)  # fmt: skip
+    ax.plot_surface(
+        *points,
+        facecolors=colors,
+        linewidth=0,
+        antialiased=False,
+        shade=False,
+        rcount=61,
+        ccount=121,
+        zorder=1,
+    )
 
 
 def _family(moments, twice_energy, count):
@@ -207,8 +227,9 @@ def _body_axes(ax, tensor, twice_energy, size, names):
         surface = np.sqrt(twice_energy / tensor[k, k]) / size
         near, far = direction * surface, direction * (surface + 0.28)
         ax.plot(*np.stack([near, far]).T, color=color, linewidth=1.6, zorder=5)
-        ax.text(*(direction * (surface + 0.36)), name, color=color, ha="center", va="center",
-                zorder=8)  # fmt: skip
+        ax.text(
+            *(direction * (surface + 0.36)), name, color=color, ha="center", va="center", zorder=8
+        )
 
 
 def _tidy(ax):
@@ -253,8 +274,13 @@ def herpolhode(
     radius = np.hypot(x, y)
     angle = np.linspace(0, 2 * np.pi, 361)
     for limit in (radius.min(), radius.max()):
-        ax.plot(limit * np.cos(angle), limit * np.sin(angle), color=GREY, linewidth=0.8,
-                linestyle=(0, (4, 3)))  # fmt: skip
+        ax.plot(
+            limit * np.cos(angle),
+            limit * np.sin(angle),
+            color=GREY,
+            linewidth=0.8,
+            linestyle=(0, (4, 3)),
+        )
     ax.plot(x, y, color=ACCENT, linewidth=1.1)
     ax.plot(x[0], y[0], "o", color=ACCENT, markeredgecolor="white", markersize=7)
     ax.plot(0, 0, "+", color=INK, markersize=9)
@@ -314,8 +340,14 @@ def overview(
         ax.margins(x=0.01)
         ax.label_outer()
     for ax in (rows[0], rows[3]):
-        ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=3, borderpad=0,
-                  handlelength=1.4, columnspacing=1.2)  # fmt: skip
+        ax.legend(
+            loc="lower right",
+            bbox_to_anchor=(1.0, 0.98),
+            ncols=3,
+            borderpad=0,
+            handlelength=1.4,
+            columnspacing=1.2,
+        )
     ax = figure.add_subplot(grid[:3, 1], projection="3d")
     polhode(made, ax=ax, axis_names=names)
     ax.set_title("Polhode on the inertia ellipsoid", loc="center")
@@ -333,8 +365,16 @@ def _curve(ax, t, values, color, label, band):
 
 
 def _dots(ax, t, values, color):
-    ax.plot(t, values, "o", color=color, markersize=4.2, markeredgecolor="white",
-            markeredgewidth=0.6, zorder=4)  # fmt: skip
+    ax.plot(
+        t,
+        values,
+        "o",
+        color=color,
+        markersize=4.2,
+        markeredgecolor="white",
+        markeredgewidth=0.6,
+        zorder=4,
+    )
 
 
 def _key(ax, observed, clones):

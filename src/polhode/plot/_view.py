@@ -363,20 +363,25 @@ def view(
     motion = {
         "title": title,
         "note": note(several),
-        "unit": {"time": scale.time, "seconds": scale.seconds, "rate": scale.rate,
-                 "rate_size": scale.radians_per_second},
+        "unit": {
+            "time": scale.time,
+            "seconds": scale.seconds,
+            "rate": scale.rate,
+            "rate_size": scale.radians_per_second,
+        },
         "start": start,
         "duration": duration,
         "pace": duration / seconds,
         "axis_names": list(axis_names),
         "plane": "invariable plane" if free else "tangent plane",
-        "rolling": "The inertia ellipsoid rolls on the invariable plane" if free
-                   else "The inertia ellipsoid and the plane that touches it",
+        "rolling": "The inertia ellipsoid rolls on the invariable plane"
+        if free
+        else "The inertia ellipsoid and the plane that touches it",
         "hidden": [f"path of body {axis_names[2]}"] if free else [],
         "up": up,
         "eye": eye,
         "bodies": several,
-    }  # fmt: skip
+    }
     made = View(_page(title or "polhode", motion))
     if path is not None:
         made.write(path)
