@@ -23,7 +23,7 @@ QUICK: dict[str, list[str]] = {
 }
 FULL: dict[str, list[str]] = {
     "imports": [], "first_calls": [], "plain_calls": [], "work_precision": [], "gradients": [],
-    "scene_cost": [], "scaling": [], "free_body": [], "torqued": [],
+    "controllers": [], "scene_cost": [], "scaling": [], "free_body": [], "torqued": [],
     "error_control": ["--bodies", "100"], "rotation_stress": [], "stress": [], "identification": [],
     "satellites": [], "throw_design": [], "throws_synthetic": [], "accelerator": [],
 }  # fmt: skip

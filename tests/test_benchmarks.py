@@ -244,6 +244,36 @@ def test_gradients_are_scored_against_high_precision(monkeypatch):
     assert row["ratio"] > 1
 
 
+def test_the_least_time_to_an_error_is_of_the_tolerances_that_reach_it():
+    from benchmarks import controllers
+
+    rows = [
+        {"program": name, "error": error, "seconds": seconds}
+        for name, error, seconds in [
+            ("a", 1e-3, 1.0), ("a", 1e-5, 3.0), ("a", 1e-7, 2.0), ("b", None, 0.1), ("b", 1e-2, 0.5)
+        ]
+    ]  # fmt: skip
+    assert controllers.level_times(rows, 1e-2) == {"a": 1.0, "b": 0.5}
+    assert controllers.level_times(rows, 1e-4) == {"a": 2.0, "b": None}
+
+
+@pytest.mark.slow
+def test_gradients_through_controllers_are_timed_and_scored(tmp_path, monkeypatch):
+    from benchmarks import controllers
+
+    path = tmp_path / "controllers.json"
+    monkeypatch.setattr("sys.argv", ["controllers", "--quick", "--output", str(path)])
+    controllers.main()
+    numbers = _report.read(path)["numbers"]
+    errors = {(row["program"], row["tolerance"]): row["error"] for row in numbers["rows"]}
+    assert errors["polhode", 1e-6] < 1e-4
+    assert errors["diffrax Dopri8", 1e-10] < 1e-3  # the same motion, so the same gradient
+    (check,) = numbers["checks"]
+    assert max(check["along"], check["across"]) < 1e-5
+    assert all(row["seconds"] > 0 and row["compile_s"] > 0 for row in numbers["rows"])
+    assert numbers["kinds"][0]["error"] < 1e-5
+
+
 @pytest.mark.slow
 def test_scaling_and_scene_cost_run():
     from benchmarks import scaling, scene_cost
