@@ -110,7 +110,8 @@ def diffrax_loss(state: ph.State, solver: Any) -> Callable:
     def loss(controller, tolerance):
         def one(y):
             y = diffrax.diffeqsolve(
-                diffrax.ODETerm(field), solver, 0 * end, end, end / 100, y, controller, max_steps=4096,
+                diffrax.ODETerm(field), solver, 0 * end, end, end / 100, y, controller,
+                max_steps=4096,
                 stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
                 adjoint=diffrax.RecursiveCheckpointAdjoint(),
             ).ys[-1]  # fmt: skip
