@@ -63,15 +63,15 @@ def propagate(
     - the error rotation vector (3,) [rad] in body axes: the true attitude is ``q * exp(error)``,
       with ``rotation.multiply`` and ``rotation.rotation_vector_to_wxyz``;
     - the errors of the body rates (3,) [rad/s];
-    - the errors of the speeds relative to the body (w,) [rad/s] of the wheels that are not held at
-      their speed (``ph.Rotor`` with ``torque``, ``impulse`` or ``coupling``), in the order of the
-      rotors. Held wheels have no coordinate;
+    - the errors of the speeds relative to the body (w,) [rad/s] of the wheels without a prescribed
+      speed (``ph.Rotor`` with ``torque``, ``impulse`` or ``coupling``), in the order of the rotors.
+      Held wheels have no coordinate;
     - the errors of the p parameters, which do not change.
 
     The speeds are those of ``state.wheel_speed``, or of the rotors where that is None; the state
-    returned has a ``wheel_speed`` (m,) [rad/s] of all m wheels where w > 0 (NaN for a wheel held at
-    a momentum without an inertia), so that ``propagate(scene, step.state, dt, t=t + dt)`` continues
-    the motion.
+    returned has a ``wheel_speed`` (m,) [rad/s] of all m wheels if w > 0 (NaN for a wheel of
+    prescribed momentum without an inertia), so that ``propagate(scene, step.state, dt, t=t + dt)``
+    continues the motion.
 
     The Jacobian is that of the exact flow, by forward differentiation through ``ph.simulate``.
     ``noise`` is the derivative by a disturbance torque on the body [N m] that is constant over the

@@ -123,13 +123,13 @@ def _proportional(scene: Scene, damping) -> bool:
 
 
 class FixedAxis(AbstractClosedForm):
-    """Spin about one principal axis that stays fixed, driven and damped: exact.
+    """Rotation about a fixed principal axis, driven and damped, in closed form.
 
     All rates but one are zero at the start, the constant body torques lie along that axis and the
     damping is linear: d omega/dt = (N - c omega)/I. The axis may differ from body to body.
-    Derivatives with respect to rates and torques across the axis of a body that turns are those of
-    this motion only: zero. Second ones of a body at rest are NaN. (Where these are traced,
-    ``ph.simulate`` does not choose this method by itself.)
+    Derivatives with respect to transverse rates and torques are zero, those of this motion only.
+    Second ones of a body at rest are NaN. (Where these are traced, ``ph.simulate`` does not choose
+    this method by itself.)
     """
 
     chunk: int = eqx.field(static=True, default=2**14)

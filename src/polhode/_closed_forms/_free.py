@@ -52,8 +52,8 @@ class ClosedForm(AbstractClosedForm):
 
     Bodies known to be axisymmetric or spherical (``ph.Inertia.axisymmetric``, ``spherical``) use
     circular functions only. Needs a scene without potential and torque. The error is rounding: a
-    few units in the last place of the phase turned through. ``chunk`` bounds the bodies times
-    samples worked on at once; None: chosen by the library. Steps are reported as 0.
+    few units in the last place of the phase. ``chunk`` bounds the bodies times samples worked on at
+    once; None: chosen by the library. Steps are reported as 0.
 
     ``compensated``: frequencies in sums of two floats (double-double in float64), so that over a
     long horizon the error no longer grows with the phase. It costs a few hundred nanoseconds per

@@ -378,7 +378,7 @@ def periods(inertia: Inertia, state: State) -> Periods:
     Infinite where there is no such motion. Differentiable. Formulas: Landau & Lifshitz, Mechanics,
     section 37; Samarasinha & A'Hearn, Icarus 93 (1991).
 
-    Raises TypeError when handed anything but a ``ph.Inertia`` and a ``ph.State``.
+    Raises TypeError for anything but a ``ph.Inertia`` and a ``ph.State``.
     """
     if not isinstance(inertia, Inertia) or not isinstance(state, State):
         raise TypeError(

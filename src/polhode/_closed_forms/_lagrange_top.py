@@ -62,9 +62,9 @@ class LagrangeTop(AbstractClosedForm):
     (``ph.UniformGravity.axial``), wheels of constant momentum on the axis allowed. All motions:
     looping, cuspidal and regular precession, sleeping and hanging tops, the separatrix, the
     pendulum, no gravity. The error is rounding: a few units in the last place of the phase.
-    Derivatives hold the body symmetric. Within a hair of the marginal sleeping top (L_z^2 = 4 A m g
-    l and axis and rates within 1e-9 of upright) they lose digits: 1e-8 there, 1e-2 on it; values do
-    not. ``chunk`` bounds bodies times samples worked on at once (None: chosen).
+    Derivatives are those of symmetric bodies. Within a hair of the marginal sleeping top (L_z^2 = 4
+    A m g l and axis and rates within 1e-9 of upright) they lose digits: 1e-8 there, 1e-2 on it;
+    values do not. ``chunk`` bounds bodies times samples worked on at once (None: chosen).
 
     Source: Klein & Sommerfeld, Theorie des Kreisels, chapter VI.
     """

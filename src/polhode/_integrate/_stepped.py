@@ -529,9 +529,9 @@ class LiePoisson(AbstractIntegration):
     **Arguments:**
 
     - ``solver``: a ``diffrax.AbstractSolver`` for ODEs, ours or diffrax's; None: ``Dopri8``.
-    - ``controller``: a diffrax step-size controller; None: the error at every saved time is held
-      to the ``rtol`` of ``simulate`` (attitude in radians, momentum relative to each body's own
-      scale) by the error that the steps find.
+    - ``controller``: a diffrax step-size controller; None: the estimated error at every saved time
+      is kept below the ``rtol`` of ``simulate`` (attitude in radians, momentum relative to the
+      scale of each body).
     - ``dt0``: first (or constant) step [s], negative backwards; None: chosen.
     - ``max_steps``: of each body, or of bodies that share their steps.
     - ``adjoint``: None: ``ph.FlowAdjoint()``, the derivatives of the exact flow, in forward
@@ -539,10 +539,11 @@ class LiePoisson(AbstractIntegration):
       drag stops within the time simulated).
     - ``progress_meter``: as in diffrax.
     - ``chart``: set by the planner (None: no preferred direction in space).
-    - ``chunk``: bodies that are moved together; chunks follow one another, so memory stays bounded.
-      None: 200 where the bodies of a chunk share their steps. For ``Extrapolation``, in which each
-      has its own, 1024, of which 64 are on their way at once, in a processor's cache; 64 where the
-      field is more than arithmetic on the numbers of one body; 2^18 on an accelerator.
+    - ``chunk``: number of bodies that are integrated together; chunks are processed one after the
+      other, which bounds the memory. None: 200 where the bodies of a chunk share their steps. For
+      ``Extrapolation``, in which each has its own, 1024, of which 64 are on their way at once, in a
+      processor's cache; 64 where the field is more than arithmetic on the numbers of one body; 2^18
+      on an accelerator.
     """
 
     def __init__(

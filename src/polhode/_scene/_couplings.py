@@ -107,10 +107,10 @@ class Motor(AbstractCoupling):
     **Arguments:** ``command``: torque on the wheel about its axis [N m], a number (...) or a
     function ``fn(t, wxyz, omega_body, speed)`` of one body, the wheel's speed [rad/s] relative to
     it; ``max_torque`` (...) [N m], positive: it gives no more than that; ``max_speed`` (...)
-    [rad/s], positive: what it gives in the direction of the speed falls linearly to nothing there
-    (the line of a DC motor), braking keeps the full torque. The speed needs the torque.
+    [rad/s], positive: the accelerating torque falls linearly to zero there (the line of a DC
+    motor); the braking torque does not. The speed needs the torque.
 
-    A wheel that holds a body's attitude, friction in its bearing:
+    A wheel that controls the attitude, with friction in its bearing:
 
         def hold(t, wxyz, omega_body, speed):       # the body takes the reaction
             return 0.4 * wxyz[1] * jnp.sign(wxyz[0]) + 0.5 * omega_body[0]

@@ -250,7 +250,7 @@ class KeplerOrbit(AbstractOrbit):
         Battin, An Introduction to the Mathematics and Methods of Astrodynamics, 1999).
 
         Raises ValueError for mu that is not positive, or a state on neither: a parabola, ellipses
-        among hyperbolas, or moving straight to or from the centre.
+        among hyperbolas, or radial motion.
         """
         place = as_float_array("position", position, (3,))
         speed = as_float_array("velocity", velocity, (3,))

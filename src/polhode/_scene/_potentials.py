@@ -69,7 +69,7 @@ class PotentialSum(AbstractPotential):
 
 
 class UniformGravity(AbstractPotential):
-    """Weight of a body turning about a fixed point: V = -mass g_space . (R centre_body).
+    """Weight of a body that rotates about a fixed point: V = -mass g_space . (R centre_body).
 
     **Arguments:** ``mass`` (...) [kg]; ``centre_body`` (..., 3) from the fixed point to the centre
     of mass [m], body axes; ``gravity_space`` (..., 3) [m/s^2], space axes. The inertia of the

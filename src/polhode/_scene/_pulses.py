@@ -14,19 +14,19 @@ from polhode._scene._torques import AbstractTorque
 
 
 class Pulses(AbstractTorque):
-    """A torque that acts only from each of ``starts`` to the one of ``ends`` in its place.
+    """A torque that acts from each of ``starts`` to the corresponding one of ``ends``.
 
-    **Arguments:** ``torque``: what acts then, such as ``ph.BodyTorque``; ``starts``, ``ends`` (k,)
-    [s]: shared by all bodies, each end after its start. Steps end at every edge, so that no pulse
-    is missed however short, and derivatives by starts and ends are exact. Pulses that overlap act
-    once. A motion with k pulses is solved in 2 k + 1 parts.
+    **Arguments:** ``torque``: the torque during the pulses, such as ``ph.BodyTorque``; ``starts``,
+    ``ends`` (k,) [s]: shared by all bodies, each end after its start. Steps end at every edge, so
+    that no pulse is missed however short, and derivatives by starts and ends are exact. Pulses that
+    overlap act once. A motion with k pulses is solved in 2 k + 1 parts.
 
         burn = ph.Pulses(ph.BodyTorque([0.0, 0.0, 2.0]), [1.0, 5.0], [1.05, 5.001])
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), torque=burn)
         state = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 0.0])
         ph.simulate(scene, state, [0.0, 9.0]).omega_body[-1]     # (0, 0, 0.051)
 
-    Raises TypeError for what is no torque, ValueError for ends before starts or other shapes.
+    Raises TypeError unless it is a torque, ValueError for ends before starts or other shapes.
     """
 
     starts: Float[Array, " k"]

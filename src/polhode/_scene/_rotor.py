@@ -31,9 +31,9 @@ class Rotor(AbstractRotor):
       May be left out when ``momentum`` is given and no ``torque``, ``impulse`` or ``coupling``.
     - exactly one of ``momentum`` (...) = J Omega [kg m^2/s] and ``speed`` (...) = Omega [rad/s],
       both relative to the body, at the first time. A state with a ``wheel_speed`` replaces them,
-      except where the motor holds the speed.
-    - ``torque`` (...) [N m]: what the motor exerts on the wheel about its axis, the body taking the
-      reaction; 0: the wheel spins freely. None: the motor holds the speed.
+      except for a prescribed speed.
+    - ``torque`` (...) [N m]: torque of the motor on the wheel about its axis, with the reaction on
+      the body; 0: the wheel spins freely. None: the speed is prescribed.
     - ``impulse``: instead of ``torque``, an antiderivative of a motor torque that varies: a
       function of time [s] returning N m s.
     - ``coupling``: instead of both, what acts between wheel and body by the wheel's speed, the time

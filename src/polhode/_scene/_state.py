@@ -32,9 +32,9 @@ class State(AbstractPart):
     of unit length is normalised; or a SciPy ``Rotation``. ``omega_body`` (..., 3): angular velocity
     in body axes [rad/s]. ``wheel_speed`` (..., m): speeds of the m wheels of the scene relative to
     the body [rad/s], in the order of its rotors; they replace the speeds and momenta that the
-    ``ph.Rotor`` objects were given. None: those of the rotors. Entries of wheels that a motor holds
-    at their speed are not used (they may be NaN), nor is any by a scene without rotors. Leading
-    axes are a batch and broadcast together.
+    ``ph.Rotor`` objects were given. None: those of the rotors. Entries of wheels with a prescribed
+    speed are not used (they may be NaN), nor is any entry in a scene without rotors. Leading axes
+    are a batch and broadcast together.
 
     Raises ValueError for a zero quaternion, NaN, wrong shapes or axes that do not broadcast.
     """

@@ -28,7 +28,7 @@ class AbstractTorque(AbstractPart):
     def slip(
         self, t: Array | float, momentum: Sequence[Array], omega: Sequence[Array]
     ) -> Vector | None:
-        """Rates [rad/s] by which the body turns beside I^-1 L while it loses energy inside.
+        """Rates [rad/s] of the rotation in addition to I^-1 L in a body that loses energy inside.
 
         None where there are none; see ``EnergySink``.
         """

@@ -52,12 +52,12 @@ class AbstractPropagator(eqx.Module):
 
 
 class Events(eqx.Module):
-    """Events of each body in the order in which the motion meets them; see ``simulate(events=)``.
+    """Events of each body in the order of the motion; see ``simulate(events=)``.
 
     **Fields:** ``times`` (..., M) [s], inf where there is none; ``which`` (..., M): the place of
     the event in ``events``, -1 where there is none; ``wxyz`` (..., M, 4) and ``omega_body``
-    (..., M, 3) [rad/s]: the states there, NaN where there is none; ``count`` (...): how many were
-    met, which is more than M where the status is ``TOO_MANY_EVENTS``.
+    (..., M, 3) [rad/s]: the states there, NaN where there is none; ``count`` (...): number of
+    events, which exceeds M if the status is ``TOO_MANY_EVENTS``.
     """
 
     times: Float[Array, "*b m"]
@@ -161,7 +161,7 @@ class Trajectory(eqx.Module):
 
     @property
     def events(self) -> Events:
-        """The events that each body met; see ``Events``."""
+        """The events of each body; see ``Events``."""
         return self._recorded("events", "events=[ph.Event(...)]")
 
     def _recorded(self, name: str, request: str) -> Any:
@@ -210,8 +210,8 @@ class Trajectory(eqx.Module):
     def last(self) -> State:
         """The state (...) at the last sample, from which another simulation can continue.
 
-        It holds attitude and rates and, where the scene has wheels that are not held at their
-        speed, the speeds of all wheels.
+        It contains attitude and rates and, if the scene has wheels without a prescribed speed, the
+        speeds of all wheels.
         """
         return self._state(-1)
 
@@ -334,8 +334,8 @@ class Trajectory(eqx.Module):
     def wheel_speed(self) -> Float[Array, "*b t m"]:
         """Speed of each wheel relative to the body (..., T, m) [rad/s].
 
-        NaN for a wheel that is held at a momentum, its inertia not given. Raises ValueError for a
-        scene without wheels.
+        NaN for a wheel of prescribed momentum without an inertia. Raises ValueError for a scene
+        without wheels.
         """
         wheels = self._scene.rotors
         if not isinstance(wheels, Wheels):
@@ -349,9 +349,9 @@ class Trajectory(eqx.Module):
     def energy(self) -> Float[Array, "*b t"]:
         """Kinetic plus potential energy [J]: the one Hamiltonian at every sample.
 
-        Of wheels that spin freely or by a motor the spin energy is included; with wheels held at
-        their speed it is the energy of the body turning with them locked, which is what then stays
-        constant. It changes by ``work`` and by nothing else (but a potential that jumps in time).
+        Of wheels that spin freely or by a motor the spin energy is included; with wheels of
+        prescribed speed it is the energy of the body with the wheels locked, which is constant
+        then. It changes by ``work`` and by nothing else (but a potential that jumps in time).
         """
         _ = self.omega_body  # must have been recorded
         if self.scene.potential is not None:
@@ -374,8 +374,8 @@ class Trajectory(eqx.Module):
     def to_scipy(self) -> "Rotation":
         """The attitudes, body -> space, as one SciPy ``Rotation`` of all samples.
 
-        In the order of ``wxyz`` with its leading axes flattened. The other way: ``ph.State`` takes
-        a ``Rotation`` in place of a quaternion. Not under ``jit``.
+        In the order of ``wxyz`` with its leading axes flattened. Conversely, ``ph.State`` accepts a
+        ``Rotation`` in place of a quaternion. Not under ``jit``.
         """
         return rotation.wxyz_to_scipy(self.wxyz)
 

@@ -64,7 +64,7 @@ class SpreadMoments(eqx.Module):
 
 
 class SpreadAttitude(eqx.Module):
-    """The attitude followed by a turn about body axes by the rotation vector ``turn`` [rad]."""
+    """The attitude followed by a rotation about body axes by the rotation vector ``turn`` [rad]."""
 
     turn: Deviate
 

@@ -14,12 +14,12 @@ from polhode._trajectory import Trajectory
 
 @dataclasses.dataclass(frozen=True)
 class Statistic:
-    """One quantity whose distribution over the bodies is kept at every time.
+    """One quantity whose distribution over the bodies is computed at every time.
 
-    ``quantity(trajectory)`` gives (bodies, T). Mean, standard deviation, least and greatest are
-    always kept; with ``low < high`` also a histogram of ``bins`` equal bins between them (and what
-    lies outside), from which quantiles follow to within a bin. Bodies that did not finish do not
-    count. Raises ValueError for a range or number of bins that makes no histogram.
+    ``quantity(trajectory)`` gives (bodies, T). Mean, standard deviation, minimum and maximum are
+    always computed; with ``low < high`` also a histogram of ``bins`` equal bins between them (and
+    what lies outside), from which quantiles follow to within a bin. Bodies that did not finish do
+    not count. Raises ValueError for a range or number of bins that makes no histogram.
     """
 
     name: str

@@ -57,7 +57,7 @@ def write_netcdf(dataset: "xarray.Dataset", target: str | os.PathLike) -> Path:
 
     The file is made in memory first: HDF5 ends the process when the disk is full. Needs xarray,
     h5netcdf and h5py (the extra `cli`). Returns the path. Raises OSError when the
-    folder is missing, full or not writable; an existing file then stays as it was.
+    folder is missing, full or not writable; an existing file is then unchanged.
     """
     imported("writing NetCDF", "h5netcdf", "h5py")  # the one does not install the other
     packed = {"zlib": True, "complevel": 4, "shuffle": True}

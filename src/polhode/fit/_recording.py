@@ -65,7 +65,7 @@ class Recording(eqx.Module):
     ) -> Self:
         """A checked recording. A sample whose row holds NaN is a gap and is left out.
 
-        A NaN of ``wheel_speed`` alone leaves the sample in, for the speed is interpolated there.
+        A sample with a NaN of ``wheel_speed`` alone is used, with the speed interpolated.
 
         Times must increase; they are shared or carry the same leading axes as the data. Raises
         ValueError for unsorted or repeated times, fewer than four samples, shapes that do not fit,

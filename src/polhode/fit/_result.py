@@ -91,7 +91,7 @@ UNUSABLE = Finding.STEP_LIMIT | Finding.NOT_FINITE | Finding.AXES_DISAGREE
 
 
 class Observability(NamedTuple):
-    """A row of ``Fit.observability``: a quantity and what its estimate rests on.
+    """A row of ``Fit.observability``: a quantity and the source of its estimate.
 
     **Fields:** ``quantity``, with the number of its components in brackets; ``count`` of them, of
     which the data show ``shown``; ``source``: ``"data"``, ``"data and calibration"``,
@@ -238,7 +238,7 @@ class Fit(eqx.Module):
 
     @property
     def mirror_inertia(self) -> Inertia:
-        """The body that the same rates mean if the sensor axes are left-handed, largest moment 1.
+        """The body with the same rates if the sensor axes are left-handed; largest moment 1.
 
         Reversing one rate (or exchanging two) changes the sign of ``omega x I omega`` and nothing
         else, which is the free motion of the body ``I Sigma`` with ``Sigma = tr(I)/2 - I``: the

@@ -220,8 +220,8 @@ class RotatingFrame(eqx.Module):
     ``turning`` gives attitude and rates; ``origin`` is None or a function of time that returns the
     position of the origin in space components [m], which is differentiated automatically.
 
-    As of every ``eqx.Module`` a method holds the frame's arrays, which ``jax.jit`` cannot take as
-    fixed: ``eqx.filter_jit(frame.omega)(t)``, or hand the frame in as an argument.
+    Methods of an ``eqx.Module`` contain its arrays, which ``jax.jit`` does not accept as constants:
+    use ``eqx.filter_jit(frame.omega_body)(t)``, or pass the frame as an argument.
     """
 
     turning: AbstractTurning
@@ -298,7 +298,8 @@ class RotatingFrame(eqx.Module):
 
         Attitude, rate and angular acceleration are exact at the samples and interpolated between
         them with errors O(h^6), O(h^5), O(h^4) for samples h apart (`SampledAttitude`).
-        Raises ValueError for a batch of bodies, missing records, or samples half a turn apart.
+        Raises ValueError for a batch of bodies, missing records, or samples half a revolution
+        apart.
         """
         wxyz, omega = trajectory.wxyz, trajectory.omega_body
         if wxyz is None or omega is None:

@@ -42,11 +42,11 @@ def accelerometer(
 
     The reading is acceleration minus gravity:
     ``omega x (omega x r) + d(omega)/dt x r - R^T gravity`` (docs/equations.md, 003: 17-21), with
-    the lever r from the point about which the body turns. ``gravity_space`` (3,) [m/s^2] is for a
-    body that turns about a point fixed in space; leave it None for a body in free fall, where
-    gravity and the acceleration of the mass centre cancel.
+    the lever arm r from the point about which the body rotates. ``gravity_space`` (3,) [m/s^2] is
+    for a body that rotates about a point fixed in space; leave it None for a body in free fall,
+    where gravity and the acceleration of the mass centre cancel.
 
-    Raises ValueError when the trajectory holds no rates (or no attitude where it is needed).
+    Raises ValueError if the trajectory has no rates (or no attitude where it is needed).
     """
     omega = _recorded(trajectory, "omega_body")
     lever = as_float_array("position_body", position_body, (3,)).astype(omega.dtype)

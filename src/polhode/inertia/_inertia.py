@@ -47,12 +47,12 @@ class Inertia(AbstractShaped, AbstractPart):
     ``ph.Inertia(moments)``, of shape (..., 3), is ``Inertia.from_moments(moments)``. Three rows of
     three are rejected, since they may be a tensor: use a ``from_...`` constructor.
 
-    The numbers stand in one of four forms, leading axes being a batch of bodies: ``diagonal``
-    (..., 3), moments about body x, y, z, which are principal axes; ``full`` (..., 3, 3), any axes;
+    The numbers have one of four forms, with leading axes for a batch of bodies: ``diagonal`` (...,
+    3), moments about body x, y, z, which are principal axes; ``full`` (..., 3, 3), any axes;
     ``transverse`` (...) and ``axial`` (...) of a body symmetric about body z; ``moment`` (...) of
-    one with three equal moments. So a symmetry cannot be lost: a step of an optimiser keeps it, and
-    a body that leaves it is one of another form. Given by these names numbers are taken as they
-    are, and judged when the body is moved (``ph.Status.NOT_PHYSICAL``).
+    one with three equal moments. A symmetry therefore cannot be lost, for example in a step of an
+    optimiser. Numbers passed by these names are not checked until the simulation
+    (``ph.Status.NOT_PHYSICAL``).
 
     ``physical`` (static): whether the triangle inequality is required; positive moments and a
     symmetric tensor always are. Only numbers that are given by name may do without.
@@ -104,8 +104,8 @@ class Inertia(AbstractShaped, AbstractPart):
     def from_moments(cls, moments: ArrayLike, *, physical: bool = True) -> Self:
         """Principal moments (..., 3), kg m^2, about body x, y, z, which are principal axes.
 
-        ``physical=False`` lets numbers pass that no body has but that are published and move by
-        the same equations, such as (2, 1, 2/3): one greater than the sum of the two others.
+        ``physical=False`` accepts published moments that violate the triangle inequality, such as
+        (2, 1, 2/3); the equations of motion are the same.
 
         Raises ValueError for a wrong shape, values that are not positive and finite, or moments
         that no body has (flat bodies, where one equals the sum of the two others, pass).
@@ -154,10 +154,10 @@ class Inertia(AbstractShaped, AbstractPart):
     def from_points(cls, masses: ArrayLike, positions: ArrayLike) -> Self:
         """Point masses (..., n), kg, at ``positions`` (..., n, 3), m, about the origin.
 
-        ``I = sum m (x.x 1 - x x^T)`` (docs/equations.md, 003: 24). The origin is the point that the
-        body turns about; for a free body use ``MassProperties.from_points``, whose ``inertia`` is
-        about the centre of mass. Raises ValueError for an empty set, a negative mass, points
-        that all lie on one line through the origin, NaN or infinity.
+        ``I = sum m (x.x 1 - x x^T)`` (docs/equations.md, 003: 24). The origin is the point about
+        which the body rotates; for a free body use ``MassProperties.from_points``, whose
+        ``inertia`` is about the centre of mass. Raises ValueError for an empty set, a negative
+        mass, points that all lie on one line through the origin, NaN or infinity.
         """
         masses, positions = as_floats(masses=(masses, (None,)), positions=(positions, (None, 3)))
         check_points(masses, positions)
@@ -257,7 +257,7 @@ class Inertia(AbstractShaped, AbstractPart):
     def turned(self, wxyz: Float[Array, "*#b 4"]) -> Self:
         """The body rotated by the unit quaternion (..., 4) in its axes: ``R I R^T``, a full tensor.
 
-        ``axes`` of the result is such a turn: ``Inertia(moments).turned(axes)`` is the body again.
+        ``axes`` is such a rotation: ``Inertia(moments).turned(axes)`` is the body.
         """
         return type(self)(full=turned(self.tensor, wxyz_to_matrix(wxyz)), physical=self.physical)
 

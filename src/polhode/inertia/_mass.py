@@ -39,7 +39,7 @@ class MassProperties(AbstractShaped):
     """Mass (...), kg; centre of mass (..., 3), m; inertia about it, all in the body's axes.
 
     ``a + b`` joins bodies given in the same axes, ``a - b`` cuts b out of a, ``moved`` places a
-    part. Parts may be thin rods or points, which alone have no inertia to turn with.
+    part. Parts may be thin rods or points, whose own inertia is singular.
     """
 
     mass: Float[Array, "*b"]
@@ -161,7 +161,7 @@ class MassProperties(AbstractShaped):
     def moved(self, offset: ArrayLike = (0.0, 0.0, 0.0), wxyz: ArrayLike | None = None) -> Self:
         """The body rotated about its origin by ``wxyz`` (..., 4), then translated by ``offset``.
 
-        ``offset`` (..., 3), m, and the turn are given in the axes of the assembly; a quaternion
+        ``offset`` (..., 3), m, and the rotation are given in the axes of the assembly; a quaternion
         that is not of unit length is normalised. A zero one raises ValueError.
         """
         dtype = self.mass.dtype

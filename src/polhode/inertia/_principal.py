@@ -105,15 +105,15 @@ def principal(
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 4"], Float[Array, "*b 3"]]:
     """Principal moments, axes and products of inertia of symmetric tensors.
 
-    Returns ``moments`` (..., 3), ascending; ``wxyz`` (..., 4), the right-handed turn from principal
-    to body axes, ``I = R diag(moments) R^T``; and ``products`` (..., 3), the entries (y, z),
-    (z, x), (x, y) of ``R^T I R``, which are zero in value.
+    Returns ``moments`` (..., 3), ascending; ``wxyz`` (..., 4), the right-handed rotation from
+    principal to body axes, ``I = R diag(moments) R^T``; and ``products`` (..., 3), the entries (y,
+    z), (z, x), (x, y) of ``R^T I R``, which are zero in value.
 
     Derivatives: ``wxyz`` carries none. ``moments`` and ``products`` carry those of ``R^T I R`` at
     fixed R, which exist for equal moments too; for separate moments those of ``moments`` are the
     usual ones. What depends on the tensor alone has its right derivative when it is computed from
     moments, products and wxyz together. This holds to first order: the second derivative of an
-    eigenvalue needs the turning of the axes, which is left out (see ``principal_moments``).
+    eigenvalue depends on the rotation of the axes, which is omitted (see ``principal_moments``).
     """
     entries = [[(tensor[..., i, j] + tensor[..., j, i]) / 2 for j in range(3)] for i in range(3)]
     fixed = jax.lax.stop_gradient(tensor)

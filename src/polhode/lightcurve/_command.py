@@ -117,7 +117,7 @@ def run(
     reduced: bool = False,
     say: Callable = print,
 ) -> LightCurveFit | None:
-    """Read, fit, say the table, and write the figure and a JSON file beside each other.
+    """Read and fit a light curve, print the table, and write the figure and a JSON file.
 
     ``output``: path of the files without suffix (default: that of ``path``, in the current folder).
     ``searches``, ``trials``, ``max_frequency``, ``floor``, ``seed``: of `fit_light_curve`;

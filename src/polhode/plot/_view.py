@@ -312,30 +312,30 @@ def view(
 ) -> View:
     """A page with the moving bodies side by side, a time slider and a play button.
 
-    Each body is shown twice. Left, the body turns with its axes, the space axes, the angular
+    Each body is shown twice. Left: the rotating body with its axes, the space axes, the angular
     momentum L and the angular velocity. Right, Poinsot's picture: the inertia ellipsoid rolls on
-    the plane normal to the angular momentum; the angular velocity traces the polhode on it and
-    the herpolhode in the plane. Where torques act, the ellipsoid is that of the energy at each
-    time, and the plane the one that touches it.
+    the plane normal to the angular momentum; the angular velocity traces the polhode on it and the
+    herpolhode in the plane. Where torques act, the ellipsoid is that of the energy at each time,
+    and the plane the one that touches it.
 
     **Arguments:**
 
     - ``what``: a trajectory, a ``plot.samples``, or a list of them, whose bodies (batch axes
       flattened) stand side by side, 12 at most; ``bodies`` picks some by number.
     - ``path``: the file to write, or None. The page needs nothing but the file: no network.
-    - ``mesh``: the body's surface in body axes, its origin the point that the body turns about: a
-      pair (vertices (v, 3), faces (f, 3)), a ``trimesh.Trimesh``, the path of a mesh file, or a
-      list of one for each body. None: the homogeneous box with the same inertia. It is drawn to
-      fit the picture, whatever its size.
+    - ``mesh``: the body's surface in body axes, its origin the point about which the body rotates:
+      a pair (vertices (v, 3), faces (f, 3)), a ``trimesh.Trimesh``, the path of a mesh file, or a
+      list of one for each body. None: the homogeneous box with the same inertia. It is drawn to fit
+      the picture, whatever its size.
     - ``names``, ``axis_names``, ``title``: of the bodies, of the body axes, of the page.
-    - ``seconds``: time of the page that the whole motion takes; None: the fastest body makes
-      0.4 turns in a second.
+    - ``seconds``: time of the page that the whole motion takes; None: the fastest body makes 0.4
+      revolutions per second.
     - ``scale``: units of time and rate that are shown; None: those that suit the duration.
 
     Numbers are kept in single precision. Of bodies with more than 20,000 samples together, every
     k-th and the last are kept, k the least that suffices. Between samples attitudes are
-    interpolated, unless a body turns more than a quarter turn from one sample to the next: then
-    the page steps from sample to sample, and says so. ``page.html#t=12.5`` opens at that time.
+    interpolated, unless a body rotates by more than a quarter revolution from one sample to the
+    next: then the page shows samples only, and says so. ``page.html#t=12.5`` opens at that time.
 
     Raises ValueError for too many bodies or times, meshes and names that do not fit them, and for
     a motion that is not finite; TypeError for other kinds of input.
