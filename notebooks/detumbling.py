@@ -9,15 +9,14 @@
 # ---
 
 # %% [markdown]
-# # Detumbling: a gain tuned by its derivative
+# # Detumbling a satellite: tuning a gain by its derivative
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/detumbling.ipynb)
 #
-# A small satellite leaves its launcher tumbling. Three magnetic rods brake it in the field of the
-# Earth by the B-dot law: the moment of the rods is `k` times $\omega\times B$. With a small gain
-# `k` this takes long. With a large one only the rate normal to the field is braked, and the rest
-# waits until the field has turned. The best gain lies between; the derivative through the
-# simulation finds it.
+# A small satellite tumbles after its release. Three magnetorquers detumble it in the field of the
+# Earth by the B-dot law: their moment is `k` times $\omega\times B$. With a small gain `k` this
+# takes long. With a large one only the rate normal to the field is damped, until the direction of
+# the field has changed. The best gain lies between; the derivative of the simulation finds it.
 
 # %%
 # Needs polhode with its figures, installed from a checkout or from an archive of a release (on
@@ -76,8 +75,8 @@ plt.show()
 # %% [markdown]
 # ## The loss and its derivative
 # Not every loss can be tuned by a derivative. Near the best gain the energy at the end of the orbit
-# beats up and down by orders of magnitude, and the energy of a single tumble jumps with the gain,
-# because the rate passes close to its separatrix on the way. The mean kinetic energy over the
+# varies by orders of magnitude, and the energy of a single satellite jumps with the gain, because
+# its motion passes close to the separatrix. The mean kinetic energy over the
 # orbit and over 32 directions of the first rate is smooth where the best gain lies. With one
 # parameter, forward mode (`jax.jvp`) costs least. The derivative with respect to `log k` passes
 # through orbit, field, control law and motion; here it is compared with central differences.
@@ -138,12 +137,12 @@ right.legend(title="A m² s/T")
 plt.show()
 
 # %% [markdown]
-# This gain is the best one for these rates and this orbit. Real rods saturate:
+# This gain is the best one for these rates and this orbit. Real magnetorquers saturate:
 # `ph.BDot(k, max_moment=...)` limits them, and derivatives pass through the limit.
 #
-# ## And then point
-# Once the rates are small, reaction wheels take over: three motors with limits hold the attitude by
-# a PD law. A thruster fires for 20 ms in between; steps end at its edges, so that none misses it.
+# ## Pointing
+# Once the rates are small, reaction wheels take over: three motors with limits control the attitude
+# by a PD law. A thruster fires for 20 ms; integration steps end at the edges of the pulse.
 
 
 # %%

@@ -9,17 +9,17 @@
 # ---
 
 # %% [markdown]
-# # The Hamiltonian in Euler angles, and why the chart fails at the poles
+# # The Hamiltonian in Euler angles and its singular attitudes
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/euler_hamiltonian.ipynb)
 #
 # With ZYZ Euler angles $q=(\varphi,\theta,\psi)$ and their momenta $p$, the kinetic energy of a
-# rigid body is a quadratic form, $H=\tfrac12\,p\cdot V(q)\,p$. Done by hand, Hamilton's equations
-# take pages: $\dot q = Vp$, $\dot p_\varphi=0$, $\dot p_\theta=p\cdot\Theta p$,
-# $\dot p_\psi=p\cdot\Psi p$, each matrix full of sines. In polhode the Hamiltonian is written once
-# and `jax.grad` does the rest. Two questions:
+# rigid body is a quadratic form, $H=\tfrac12\,p\cdot V(q)\,p$. Hamilton's equations are
+# $\dot q = Vp$, $\dot p_\varphi=0$, $\dot p_\theta=p\cdot\Theta p$, $\dot p_\psi=p\cdot\Psi p$,
+# with matrices that are long when written out. In polhode the Hamiltonian is written once, and
+# `jax.grad` derives the equations. Two questions:
 #
-# 1. Does automatic differentiation give what the pages give?
+# 1. Does automatic differentiation agree with the closed forms?
 # 2. What happens at $\theta=0$ and $\theta=\pi$?
 
 # %%
@@ -56,8 +56,8 @@ body = ph.Inertia.from_moments(moments)
 
 # %% [markdown]
 # ## 1. Autodiff against the closed forms
-# `ph.hamiltonian` is the one function; `ph.hamiltons_equations` differentiates it.
-# `ph.hamiltonian_matrices` gives the closed forms for comparison; no simulation uses them.
+# `ph.hamiltonian` is the Hamiltonian; `ph.hamiltons_equations` differentiates it.
+# `ph.hamiltonian_matrices` returns the closed forms for comparison; no simulation uses them.
 
 # %%
 hamiltonian = ph.hamiltonian(body)
@@ -74,7 +74,7 @@ print("dp/dt     ", rate_p, "\n0, pTp, pPp", jnp.array([0.0, p @ Theta @ p, p @ 
 
 # %% [markdown]
 # And on 20,000 random states, with the angle $\theta$ down to a thousandth of a radian from a pole.
-# Every deviation is divided by the size of the terms that the closed form adds up.
+# Every deviation is divided by the size of the terms of the closed form.
 
 # %%
 rng = np.random.default_rng(0)
@@ -117,15 +117,15 @@ ax.set_ylim(5e-18, 3e-13)
 plt.show()
 
 # %% [markdown]
-# The two agree to rounding, everywhere.
+# The two agree to rounding.
 #
 # ## 2. The poles
-# At $\theta=0$ the first and the third turn are about the same axis: only $\varphi+\psi$ means
-# anything. Nothing happens to the body there, but $V$ grows like $1/\sin^2\theta$. A body that
-# passes a pole at distance $\delta$ spins its angles by half a turn within a time proportional to
-# $\delta$, and an integrator in this chart must follow it. Bodies launched to pass the pole at
-# eight distances, by three ways: the exact motion, the chart without poles (quaternion and body
-# momentum), and the Euler angles, all with the same solver and tolerance.
+# At $\theta=0$ the first and the third rotation are about the same axis: only $\varphi+\psi$ is
+# defined. The motion is regular there, but $V$ grows like $1/\sin^2\theta$. When a body passes a
+# pole at distance $\delta$, its angles $\varphi$ and $\psi$ change by about $\pi$ within a time
+# proportional to $\delta$, which an integrator in these coordinates must resolve. Bodies pass the
+# pole at eight distances, computed by three methods: the closed form, quaternion and body momentum,
+# and Euler angles, the latter two with the same solver and tolerance.
 
 # %%
 closest = np.logspace(0, -7, 8)
@@ -169,7 +169,6 @@ for name, run in results.items():
           f" finished {int(run.successful.sum())} of {len(closest)}")  # fmt: skip
 
 # %% [markdown]
-# The quaternion chart does not know where the poles are. The Euler chart pays for every approach
-# with steps, and it is for this that polhode uses it for derivations and for tests, and not to move
-# bodies: `method=None` never chooses it, and its result says so (`Status`) when a body comes so
-# close that the angles lose their meaning.
+# Quaternion and body momentum are not affected by the poles. Euler angles need more steps at every
+# approach. polhode uses them for derivations and tests: `method=None` never chooses them, and the
+# status of the result reports a body that comes too close to a pole.

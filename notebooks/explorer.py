@@ -14,8 +14,8 @@
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/explorer.ipynb)
 #
 # On 1 February 1958 Explorer 1, a tube of 2 m, was left spinning at 750 turns a minute about its
-# long axis. Within an orbit it was turning end over end. Nothing had pushed it: four whip antennas
-# bent, and what they lost as heat the rotation paid, at constant angular momentum. How much was it?
+# long axis. Within an orbit it was rotating end over end. No torque acted on it: four whip antennas
+# bent and dissipated energy of the rotation as heat, at constant angular momentum. How much?
 
 # %%
 # Needs polhode with its figures, installed from a checkout or from an archive of a release (on
@@ -51,10 +51,10 @@ print(f"energy {L**2 / (2 * C):.0f} J spinning along, {L**2 / (2 * A):.1f} J end
 
 # %% [markdown]
 # ## A sink, and the angle in closed form
-# `ph.EnergySink(k)` takes $k\,|L\times\omega|^2$ watts and leaves $L$ in space where it is. With
+# `ph.EnergySink(k)` dissipates $k\,|L\times\omega|^2$ watts and keeps $L$ constant in space. With
 # $\theta$ between the axis and $L$, this body has
-# $\tan\theta=\tan\theta_0\,\exp(kL^2(1/C-1/A)\,t)$. Three losses, fast ones so that every turn can
-# be followed, from 0.1° off the axis:
+# $\tan\theta=\tan\theta_0\,\exp(kL^2(1/C-1/A)\,t)$. Three rates of dissipation, starting 0.1° off
+# the axis:
 
 # %%
 theta0 = np.deg2rad(0.1)
@@ -84,8 +84,9 @@ print(f"momentum in space: within {float(drift.max()):.0e} of where it was")
 print(f"the energy only fell: {bool(jnp.all(jnp.diff(path.energy) < 1e-9))}")
 
 # %% [markdown]
-# ## What one orbit says
-# Time and loss scale: half the `k`, twice the time. From 0.1° to 80° in an orbit of 115 minutes:
+# ## The loss within one orbit
+# Time scales with the loss: half the `k`, twice the time. From 0.1° to 80° in an orbit of 115
+# minutes:
 
 # %%
 orbit = 115 * 60.0
@@ -94,8 +95,8 @@ most = rate * L**2 * (1 / C - 1 / A) / 4  # at 45 degrees
 print(f"growth {rate:.1e} /s; the antennas need to turn at most {most:.3f} W into heat")
 
 # %% [markdown]
-# A few hundredths of a watt. The angle at any time has derivatives too; from an angle seen after a
-# minute, `k` follows by Newton's method on the simulation, the formula not needed:
+# A few hundredths of a watt. The angle at any time can be differentiated; from an angle observed
+# after a minute, Newton's method on the simulation determines `k`:
 
 
 # %%
@@ -114,10 +115,10 @@ exact = np.log(np.tan(seen) / np.tan(theta0)) / 60
 print(f"growth {float(jnp.exp(x)) * L**2 * (1 / C - 1 / A):.6f} /s, by the formula {exact:.6f} /s")
 
 # %% [markdown]
-# ## A ring does it on purpose
-# Satellites that should spin about their largest moment carry a ring of fluid: a wheel with
-# friction, `ph.Rotor(..., coupling=ph.ViscousCoupling(c))`. It takes the wobble of this disk away,
-# and its momentum is all that changes hands.
+# ## A nutation damper
+# Satellites that should rotate about the axis of their largest moment carry a ring of fluid: a
+# wheel with friction, `ph.Rotor(..., coupling=ph.ViscousCoupling(c))`. It damps the nutation of
+# this disk by exchanging angular momentum with the body.
 
 # %%
 disk = ph.Inertia.from_moments([1.0, 1.1, 1.6])

@@ -62,9 +62,9 @@ print(recording.times.shape[-1], "rows,", int(np.sum(recording.present == 0)), "
 # %% [markdown]
 # ## The fit
 #
-# The model is the exact free motion: nothing is stepped. The unknowns are the shape of the inertia
-# tensor and the rates at the first sample; every iterate is a body that could exist. The start
-# comes from the data, by linear regression on the conservation of angular momentum.
+# The model is the closed-form free motion. The unknowns are the shape of the inertia
+# tensor and the rates at the first sample; every iterate is a possible body. The starting
+# point comes from the data, by linear regression on the conservation of angular momentum.
 #
 # The simulated sensor has exact scale factors and axes, `Gyroscope.ideal()`. Those of a real one
 # are known to a per cent or so, which is the default, and the intervals are wider.
@@ -75,19 +75,20 @@ found = fit.fit_recordings([recording], options=options)
 print(found.report())
 
 # %% [markdown]
-# The report is honest about three things. Only *ratios* of moments show: a body of twice the
-# inertia moves the same. The handedness of the axes does not show either: if one axis of the sensor
-# were inverted, the same data would mean the other body named there. The numbers in brackets are
-# standard deviations, by the Fisher information: no unbiased estimate from these data does better.
+# The report states what the data cannot show. Only *ratios* of moments are determined: a body of
+# twice the inertia moves in the same way. The handedness of the axes is not determined either: with
+# one axis of the sensor inverted, the same data belong to the other body named there. The numbers
+# in brackets are standard deviations, by the Fisher information: no unbiased estimate from these
+# data does better.
 
 # %%
 figure = plot.fit(found, recording, title="toss")
 plt.show()
 
 # %% [markdown]
-# ## Was it right?
+# ## Comparison with the truth
 #
-# The simulated box, and how many standard deviations the fit is off.
+# The simulated box, and the errors of the fit in standard deviations.
 
 # %%
 true = np.sort(np.asarray(box.tensor).diagonal())
@@ -98,8 +99,8 @@ print("fitted ratios", np.asarray(found.ratios))
 print("off by       ", off, "standard deviations")
 
 # %% [markdown]
-# The directions of the principal axes in sensor axes came out as well: the columns of this matrix.
-# Their uncertainty is given as angles about each axis.
+# The fit also yields the directions of the principal axes in sensor axes, the columns of this
+# matrix. Their uncertainty is given as angles about each axis.
 
 # %%
 print(np.asarray(rotation.wxyz_to_matrix(found.axes)))
@@ -108,8 +109,8 @@ print("known to", np.degrees(np.asarray(found.axes_std)), "degrees")
 # %% [markdown]
 # ## How long must a recording be?
 #
-# The bound can be asked before anything is thrown. The residual function is public, so its Jacobian
-# at any body and rates is one call away; here, the same box with shorter and shorter records.
+# The bound can be computed before the throw. The residual function is public, and its Jacobian
+# gives the bound for any body and rates; here, the same box with shorter and shorter recordings.
 
 # %%
 parameters, model = found.parameters, found.model
@@ -152,10 +153,10 @@ plt.show()
 # %% [markdown]
 # At a constant effect per sample a bound falls with the square root of the number of samples. This
 # one falls much faster, because a small error of the inertia grows with time into a large error of
-# phase: in a tumble, length is worth more than sampling rate.
+# phase: a longer recording helps more than a higher sampling rate.
 
 # %% [markdown]
-# ## Absolute size: a wheel aboard
+# ## Absolute size: a reaction wheel
 #
 # Free motion shows ratios. A reaction wheel of known spin inertia, switched on and off in flight,
 # shows the size as well. `SteppedMotion` integrates the motion of body and wheel; the drag of the
@@ -199,5 +200,5 @@ lag = float(sized.parameters.motion["delay"])
 print(f"delay of the gyroscope  {1e3 * lag:.2f} ms, set {1e3 * delay} ms")
 
 # %% [markdown]
-# How much of this accuracy a real instrument and real air leave:
-# [what a motion tells about inertia](../docs/identifiability.md).
+# The accuracy with real instruments and real air:
+# [what a motion shows of the inertia](../docs/identifiability.md).

@@ -9,13 +9,13 @@
 # ---
 
 # %% [markdown]
-# # Inertia: which axis does this body really spin about?
+# # Inertia: from parts to principal axes
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/inertia.ipynb)
 #
-# A spacecraft is drawn in its designer's axes and told to spin about z. Bodies do not know the
-# drawing: they know their principal axes. From parts to tensor, from tensor to axes, and from
-# there to the motion.
+# A spacecraft, drawn in its designer's axes, shall rotate about z. Whether it can depends on its
+# principal axes. This notebook goes from the parts to the inertia tensor, to its principal axes,
+# and to the motion.
 
 # %%
 # Needs polhode with its figures, installed from a checkout or from an archive of a release (on
@@ -53,8 +53,8 @@ np.set_printoptions(precision=3, suppress=True)
 # %% [markdown]
 # ## From parts to a tensor
 #
-# A bus, two solar panels turned towards the Sun, and a boom with a ball at its tip. Each part is
-# a simple shape, `moved` to its place; `compose` adds masses, finds the common centre of mass and
+# A bus, two solar panels at an angle, and a boom with a ball at its tip. Each part is a simple
+# shape, `moved` to its position; `compose` adds masses, finds the common centre of mass and
 # shifts every tensor to it.
 
 # %%
@@ -84,8 +84,8 @@ print(np.asarray(craft.inertia.tensor))
 # %% [markdown]
 # ## From the tensor to principal axes
 #
-# The numbers beside the diagonal, the products of inertia, say that the designer's axes are not
-# principal. `to_principal` finds those that are, and the turn from them to the designer's.
+# The products of inertia show that the designer's axes are not principal axes. `to_principal`
+# returns the body in principal axes, and the rotation from them to the designer's axes.
 
 # %%
 principal, turn = craft.inertia.to_principal()
@@ -131,12 +131,12 @@ ax.set_axis_off()
 plt.show()
 
 # %% [markdown]
-# ## Ten numbers that are always a body
+# ## Unconstrained parameters
 #
-# Not every symmetric matrix is the inertia of something: the moments are positive and no one
-# exceeds the sum of the other two. The log-Cholesky parameters (Rucker and Wensing 2022) have no
-# such fences: there and back loses nothing, and *any* ten real numbers are a body. That is what
-# makes them fit for optimisation and for uncertainty.
+# Not every symmetric matrix is an inertia tensor: the moments are positive and none exceeds the sum
+# of the other two. The log-Cholesky parameters (Rucker and Wensing 2022) are unconstrained: *any*
+# ten real numbers are the mass properties of a possible body. They suit optimisation and the
+# propagation of uncertainty.
 
 # %%
 ten = craft.to_log_cholesky()
@@ -189,11 +189,11 @@ panels[0].text(0.93, 0.96, "sphere", color=GREY, ha="right", va="center")
 plt.show()
 
 # %% [markdown]
-# ## From there to the motion
+# ## The motion
 #
-# Spun about the designer's z at 6 rpm, the craft tumbles: its angular velocity runs around the
-# polhode on the inertia ellipsoid instead of standing still at a pole. The motion is exact and
-# `periods` knows its two periods beforehand.
+# Rotating about the designer's z at 6 rpm, the spacecraft tumbles: its angular velocity follows a
+# polhode on the inertia ellipsoid instead of remaining on a principal axis. `periods` returns the
+# two periods of the motion.
 
 # %%
 spin = 6 * 2 * np.pi / 60
@@ -223,11 +223,11 @@ right.set_title("Angle of the designer's z to the angular momentum\n(dashed: eve
 plt.show()
 
 # %% [markdown]
-# ## Making the drawing right
+# ## Balancing
 #
-# Everything above is differentiable, so the cure can be computed: two battery packs of 30 kg
-# slide on the deck and on the floor of the bus. Newton's method finds where they make z a
-# principal axis through the middle of the bus.
+# Everything above can be differentiated, so the spacecraft can be balanced: two battery packs of 30
+# kg are shifted on the deck and on the floor of the bus. Newton's method finds the positions that
+# make z a principal axis through the centre of the bus.
 
 
 # %%

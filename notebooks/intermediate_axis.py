@@ -9,13 +9,13 @@
 # ---
 
 # %% [markdown]
-# # Why does it turn over? The intermediate axis
+# # The intermediate axis: why a body turns over
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/intermediate_axis.ipynb)
 #
-# In 1985 Vladimir Dzhanibekov unscrewed a wing nut in orbit: it flew off spinning, turned over,
-# flew on, turned over again. Nothing acts on it. A body spins steadily about its axis of least
-# and of greatest inertia, and turns over, again and again, when spun about the one between.
+# In 1985 Vladimir Dzhanibekov unscrewed a wing nut in orbit: it flew off rotating, turned over,
+# and turned over again, without a torque. Rotation about the axes of the smallest and the largest
+# moment of inertia is stable; rotation about the intermediate axis is not.
 
 # %%
 # Needs polhode with its figures, installed from a checkout or from an archive of a release (on
@@ -43,9 +43,9 @@ nut = ph.Inertia.from_moments([1.0, 2.0, 2.5])  # kg m^2: least about x, greates
 scene = ph.Scene(nut)
 
 # %% [markdown]
-# ## Three axes, three fates
-# The same spin of 1 rad/s about each axis, with the same push of a hundredth sideways. One call
-# moves all three.
+# ## Rotation about each axis
+# The same rate of 1 rad/s about each axis, with the same perturbation of a hundredth. One call
+# simulates all three.
 
 # %%
 push = 0.01
@@ -62,12 +62,12 @@ panels[0].legend(loc="center right", frameon=False)
 plt.show()
 
 # %% [markdown]
-# ## The picture that explains it
-# Energy and the size of the angular momentum stay as they are. Each is an ellipsoid in the space of
-# body rates, and the tip of the rate moves along the curve where the two meet: the **polhode**.
-# Around the axes of least and greatest inertia these curves are small closed loops. Through the
-# intermediate axis run the two curves of the separatrix (dashed), and a body started there is
-# carried along them to the other side of the ellipsoid: it turns over.
+# ## The polhode
+# Energy and the magnitude of the angular momentum are constant. Each is an ellipsoid in the space
+# of body rates, and the angular velocity moves along their intersection, the **polhode**. Around
+# the axes of the smallest and the largest moment these curves are small closed loops. The two
+# curves of the separatrix (dashed) pass through the intermediate axis; a body that starts near it
+# follows them to the opposite side of the ellipsoid: it turns over.
 
 # %%
 fig = plt.figure(figsize=(8.6, 3.1), layout="constrained")
@@ -76,9 +76,9 @@ for k in range(3):
 plt.show()
 
 # %% [markdown]
-# Seen from space, the tip of the rate wanders in a plane normal to the angular momentum: the
-# **herpolhode**. About a stable axis it stays in a narrow ring around the momentum; about the
-# intermediate axis it comes from the middle and returns to it with every turn.
+# In space, the angular velocity moves in a plane normal to the angular momentum, along the
+# **herpolhode**. For a stable axis it is confined to a narrow ring around the momentum; for the
+# intermediate axis it spirals out from the centre and returns to it with every flip.
 
 # %%
 fig, panels = plt.subplots(1, 3, figsize=(8.6, 3.1), layout="constrained")
@@ -87,9 +87,9 @@ for k, ax in enumerate(panels):
 plt.show()
 
 # %% [markdown]
-# ## The flip itself
+# ## The flip
 # Faces on the negative side of a body axis are paler. The box turns over; its angular momentum
-# stays where it was.
+# is constant.
 
 # %%
 flip = ph.simulate(scene, ph.State([1.0, 0.0, 0.0, 0.0], omega[1]), jnp.linspace(0.0, 32.0, 801))
@@ -102,10 +102,10 @@ picture  # noqa: B018
 
 # %% [markdown]
 # ## How often?
-# Next to the axis a push grows like $e^{\lambda t}$ with
-# $\lambda = \omega\sqrt{(I_2-I_1)(I_3-I_2)/(I_1I_3)}$, so the wait depends on the logarithm of the
-# push: a push ten times smaller waits only $\ln 10/\lambda$ longer. The exact period is a complete
-# elliptic integral, `ph.periods`, and holds down to pushes that no stepping method would resolve.
+# Near the axis a perturbation grows like $e^{\lambda t}$ with $\lambda =
+# \omega\sqrt{(I_2-I_1)(I_3-I_2)/(I_1I_3)}$, so the time between flips depends on the logarithm of
+# the perturbation: a tenth of it adds only $\ln 10/\lambda$. The exact period is a complete
+# elliptic integral, `ph.periods`, valid also for perturbations that no integrator resolves.
 
 # %%
 small, middle, great = 1.0, 2.0, 2.5
@@ -137,12 +137,11 @@ for size, seen in zip((1e-2, 1e-6, 1e-10), measured, strict=True):
     print(f"push {size:.0e}: flips every {seen:.2f} s, ph.periods gives {exact:.4f} s")
 
 # %% [markdown]
-# ## And with friction inside?
-# Nothing above depends on how a nut is made. Real bodies bend and slosh a little: energy is lost,
-# angular momentum is not, and every body ends up spinning about its axis of *greatest* inertia.
-# That is what surprised the builders of Explorer 1 in 1958. `ph.FeedbackTorque` takes any torque
-# that depends on the state; one that acts along $L\times(L\times\omega)$ removes energy and leaves
-# the size of the momentum alone.
+# ## Internal friction
+# Real bodies bend and contain fluids: they lose energy, but no angular momentum, and end in a
+# rotation about the axis of the *largest* moment of inertia, as Explorer 1 did in 1958.
+# `ph.FeedbackTorque` takes any torque that depends on the state; one that acts along
+# $L\times(L\times\omega)$ removes energy and keeps the magnitude of the momentum.
 
 
 # %%

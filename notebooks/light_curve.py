@@ -9,13 +9,13 @@
 # ---
 
 # %% [markdown]
-# # From flickering points to a tumbling body
+# # Spin state and inertia from a light curve
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/light_curve.ipynb)
 #
-# A telescope sees an asteroid as one point of light that grows brighter and fainter. Can the points
-# alone tell how the rock turns, what shape it has and how its mass is spread? Here we make a rock,
-# look at it as a telescope would, forget what we made, and find it again.
+# A telescope sees an asteroid as a point whose brightness changes. Do these changes determine its
+# rotation, shape and inertia? This notebook simulates an asteroid and its observation, and
+# estimates all three from the light curve alone.
 
 # %%
 # Needs polhode with its figures, installed from a checkout or from an archive of a release (on
@@ -46,9 +46,9 @@ plt.rcParams.update(
 rng = np.random.default_rng(4)
 
 # %% [markdown]
-# ## A rock that nobody has seen
-# The hull of 60 random points around an egg: no ellipsoid, so that the fit below has the wrong
-# shape, as every fit of a real rock has. Its moments follow from its volume, at constant density.
+# ## The asteroid
+# The hull of 60 random points around an egg: not an ellipsoid, so the model of the search has the
+# wrong shape, as for every real asteroid. Its moments follow from its volume, at constant density.
 
 # %%
 corners = rng.normal(size=(60, 3))
@@ -70,11 +70,11 @@ print("moments", moments / moments.max())
 print(f"{mode}, P_phi {truth.P_phi:.4f} d, P_psi {truth.P_psi:.4f} d")
 
 # %% [markdown]
-# ## What the telescope sees
-# Two telescopes a third of a day apart share 18 nights of 90 days; a night is six hours, clouds
-# take some points. Sun and Earth move: the rock circles at 1.8 au, we at 1. The light of a convex
-# rock is the sum over the facets that are lit and seen, by the law of Lommel and Seeliger. Noise
-# 0.02 mag; the telescopes' zero points differ from night to night by 0.02 mag too.
+# ## The observations
+# Two telescopes a third of a day apart share 18 nights of 90 days; a night is six hours, some
+# points are missing. The asteroid orbits at 1.8 au, the Earth at 1 au. The light of a convex body
+# is the sum over the facets that are lit and visible, by the Lommel-Seeliger law. Noise 0.02 mag;
+# the telescopes' zero points differ from night to night by 0.02 mag too.
 
 # %%
 nights = np.sort(rng.choice(90, 18, replace=False)) + rng.choice([0, 1 / 3], 18)
@@ -111,10 +111,10 @@ plt.show()
 # %% [markdown]
 # From here on only `curve` is used: times, magnitudes, and where Sun and Earth stood.
 #
-# ## Frequencies, and what they can mean
-# A spinning body repeats itself; a tumbling one does not. Its light is a sum of waves of the
-# frequencies i f_phi + j f_psi. The spectrum of one frequency shows such sums and their aliases of
-# one a day, and no peak need be a period of the body. Pairs of frequencies do better:
+# ## Frequencies
+# The light of a tumbling body is not periodic. It is a sum of waves of the frequencies
+# i f_phi + j f_psi. The spectrum of one frequency shows such sums and their aliases of
+# one a day, and a peak is not necessarily a period of the body. Pairs of frequencies explain more:
 
 # %%
 columns = np.vstack([curve.columns(np.inf)[0], curve.alpha])
@@ -124,10 +124,10 @@ for g, h, part in list(zip(pairs.f_phi, pairs.f_psi, pairs.explained, strict=Tru
 print("as f_phi and f_psi, the first would mean:", lightcurve.meaning(*(x[0] for x in pairs[:2])))
 
 # %% [markdown]
-# Every pair allows many bodies: each of its lines may be any of the strong sums, in both modes. The
-# likeliest of these are tried.
+# Every pair has many interpretations: each line may be any of the strong sums, in both modes. The
+# most probable are tried.
 #
-# ## Every body that explains the points
+# ## The search
 # Trial bodies with those periods, all else at random; least-squares steps from the two best
 # of each meaning, more from what fits; once more with the periods found; the mirror images.
 
@@ -140,7 +140,7 @@ lightcurve.figure(fit, title="An unseen rock")
 plt.show()
 
 # %% [markdown]
-# ## Was it right?
+# ## Comparison with the truth
 
 # %%
 best = fit.best
@@ -184,9 +184,9 @@ off = min(off, key=np.median)
 print(f"attitude off by {np.median(off):.1f} deg in the median, {off.max():.1f} at most")
 
 # %% [markdown]
-# ## What one night would have shown
-# The same rock, six hours of it, from one place. Many bodies explain the points to their noise, and
-# the first of them may be far from the rock; the notes say what the night cannot tell.
+# ## One night
+# The same asteroid, six hours from one place. Many bodies explain the points to their noise, and
+# the first of them may be far from the truth; the notes say what one night cannot show.
 
 # %%
 one = curve.group == curve.group[0]

@@ -9,15 +9,15 @@
 # ---
 
 # %% [markdown]
-# # Rotating frames: three questions
+# # Rotating frames: three problems
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/rotating_frames.ipynb)
 #
-# A particle seen from a frame that turns feels forces that nobody exerts: centrifugal, Coriolis
-# and, when the turning changes, Euler's. `ph.RotatingFrame` knows them by name,
-# `ph.frames.simulate_particles` moves particles under them.
+# In a rotating frame apparent forces act on a particle: the centrifugal and the Coriolis force and,
+# if the angular velocity changes, the Euler force. `ph.RotatingFrame` computes them,
+# `ph.frames.simulate_particles` simulates particles under them.
 #
-# 1. How fast does the swing plane of a Foucault pendulum turn?
+# 1. How fast does the plane of a Foucault pendulum rotate?
 # 2. Where does a body dropped into a deep shaft land?
 # 3. What does a bead do inside a tumbling box, and what does an accelerometer in that box read?
 
@@ -143,8 +143,8 @@ print("measured / sin(latitude) law:", np.array2string(np.asarray(ratio), precis
 print("1 - 3/8 (start / length)^2  :", round(1 - 3 / 8 * float(start / length) ** 2, 4))
 
 # %% [markdown]
-# The plane turns clockwise in the north, as it must. It turns a little slower than the law says,
-# and that is real: a bob let go at rest on a turning Earth swings in a thin ellipse, and an
+# The plane rotates clockwise in the north, a little more slowly than the law of the sine predicts.
+# A bob released at rest on the rotating Earth moves on a thin ellipse, and an
 # ellipse of finite size precesses by itself, here against the Earth, by 3/8 of the square of
 # amplitude over length (Airy 1851).
 #
@@ -265,7 +265,7 @@ plt.show()
 # Fix the bead at a corner of the box with a stiff, critically damped spring. It gives way until
 # the spring carries centrifugal and Euler force, so that stretch times stiffness over mass is
 # minus the reading of an accelerometer there. `ph.accelerometer` computes that reading from the
-# equations of motion, without a bead.
+# equations of motion.
 
 # %%
 corner = jnp.asarray(0.45 * sides)

@@ -9,14 +9,14 @@
 # ---
 
 # %% [markdown]
-# # A tumbling asteroid against what was seen
+# # A tumbling asteroid, compared with radar observations
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/tumbling_asteroid.ipynb)
 #
-# Toutatis, a rock of 4.6 km that passes the Earth every four years, does not spin: it tumbles.
+# Toutatis, a rock of 4.6 km that passes the Earth every four years, tumbles.
 # Radar images of December 1992 gave its attitude on seventeen days. The scene `toutatis`, which is
 # part of polhode, holds a published state and the published observations, with sources.
-# Does a free rigid body explain what was seen? How well are its two periods known?
+# Does a free rigid body explain the observations? How accurately are its two periods known?
 
 # %%
 # Needs polhode with its figures, installed from a checkout or from an archive of a release (on
@@ -53,9 +53,9 @@ print(file.title, "-", file.source)
 print("moments (relative):", scene.inertia.diagonal, "about", file.axis_names)
 
 # %% [markdown]
-# ## The motion, exactly
-# Nothing acts on it that matters within two months, so nothing is stepped: `ph.simulate` evaluates
-# the motion at any set of times, here at those of the observations too. The state is that at the
+# ## The motion
+# Torques are negligible within two months, so the motion has a closed form: `ph.simulate` evaluates
+# it at any set of times, here at those of the observations too. The state is that at the
 # first of the times.
 
 # %%
@@ -95,9 +95,9 @@ for item in file.published:
           f" {item.source}")  # fmt: skip
 
 # %% [markdown]
-# ## How well are they known?
-# The derivative of a period is one `jax.grad`. Which of the six numbers that make a state and a
-# shape matters most?
+# ## Uncertainty of the periods
+# The derivative of a period is one `jax.grad`. Which of the six parameters of state
+# and shape matters most?
 
 
 # %%
@@ -117,7 +117,7 @@ for name, part in zip(names, parts, strict=True):
 print(f"together               {np.sqrt(np.sum(parts**2)):.4f} d (to first order)")
 
 # %% [markdown]
-# And without the first order, 20,000 clones drawn from the same errors, in one call:
+# Without linearisation: 20,000 clones drawn from the same errors, in one call:
 
 # %%
 rng = np.random.default_rng(4179)
@@ -143,10 +143,10 @@ for name in ("P_psi", "P_phi"):
     print(f"{name}: {values.mean():.3f} +- {values.std():.3f} d")
 
 # %% [markdown]
-# ## What a tumbler looks like
-# Left, the polhode: the tip of the rate runs around the long axis. Right, where the short axis
-# points, as seen along the angular momentum: two periods without a common multiple, so that it
-# never repeats.
+# ## Polhode and path of the short axis
+# Left, the polhode: the angular velocity circulates about the long axis. Right, the direction of
+# the short axis, seen along the angular momentum: the two periods are incommensurate, so the path
+# does not close.
 
 # %%
 fig = plt.figure(figsize=(9.6, 4.2))
@@ -165,7 +165,7 @@ low, high = np.rad2deg([float(periods.theta_min), float(periods.theta_max)])
 print(f"the long axis stays between {low:.1f}° and {high:.1f}° from the angular momentum")
 
 # %% [markdown]
-# ## The other way round: Halley's nucleus
+# ## The inverse problem: Halley's nucleus
 # From light curves and images of 1986, Belton et al. (1991) gave Halley's nucleus a long axis 66°
 # from the angular momentum, circling it in 3.69 d, and a turn about that axis in 7.1 d. For an
 # axisymmetric body the three numbers fix the shape, since with $\theta$ the angle and $n$ the rate

@@ -9,14 +9,14 @@
 # ---
 
 # %% [markdown]
-# # What does a digit cost?
+# # Run time against accuracy
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/work_and_precision.ipynb)
 #
-# A time means nothing without the error beside it, and a conserved energy does not prove that an
-# attitude is right. This notebook shows run times only beside errors, and measures errors against
-# reference solutions that share no code with the programs compared: Taylor series in 40-digit
-# arithmetic (`python -m benchmarks.truth` in the repository).
+# A run time is meaningful only together with an error, and a constant energy does not prove that an
+# attitude is accurate. This notebook shows run times together with errors, and measures errors
+# against reference solutions that share no code with the programs compared: Taylor series in
+# 40-digit arithmetic (`python -m benchmarks.truth` in the repository).
 
 # %%
 # Needs polhode with its figures, installed from a checkout or from an archive of a release (on
@@ -177,9 +177,9 @@ ax.set_title("Asymmetric heavy top, 12 bodies")
 plt.show()
 
 # %% [markdown]
-# ## Conserved is not correct
-# With a loose tolerance the energy is kept far better than the attitude: it shows only the error
-# across its level set, not the one along it. The worst bodies of this top are chaotic.
+# ## Conservation and accuracy
+# With a loose tolerance the energy is far more accurate than the attitude: it shows only the error
+# normal to its level set, not the one along it. The worst bodies of this top are chaotic.
 
 # %%
 print("rtol     energy drift   attitude error: median   worst body")
@@ -191,10 +191,10 @@ for rtol in (1e-4, 1e-6, 1e-8):
     print(f"{rtol:.0e}  {drift:12.0e} {np.median(off):23.0e} {off.max():12.0e} rad")
 
 # %% [markdown]
-# ## A free body takes no steps
-# A free body has a closed form. Its error is the rounding of the angle turned through, whatever the
-# horizon; the two reference tables are for moments (1, 2, 3) kg m²: after 10⁵ s, and after 100 s
-# beside the separatrix, where textbook formulas lose half of their digits because the modulus is
+# ## Closed forms
+# The free motion has a closed form. Its error is the rounding error of the angle, whatever the
+# time span; the two reference tables are for moments (1, 2, 3) kg m²: after 10⁵ s, and after 100 s
+# near the separatrix, where textbook formulas lose half of their digits because the modulus is
 # within rounding of one. polhode computes with the complement of the modulus instead.
 
 # %%
