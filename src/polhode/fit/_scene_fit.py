@@ -58,8 +58,8 @@ def fit_scene(
     - ``throw``: whether a fit that is not finite or stopped early raises FitError.
 
     Returns a ``Fit``: ``values`` and ``std`` in the order of ``free``, ``scene`` with the values.
-    Numbers without bounds are not constrained: a coefficient may become negative. An inertia of
-    which nothing is known is fitted by ``fit_inertia``, which finds a start and keeps it physical.
+    Numbers without bounds are not constrained: a coefficient may become negative. For an unknown
+    inertia use ``fit_inertia``, which needs no starting point and keeps it physical.
 
         ts = jnp.linspace(0.0, 20.0, 200)
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 2.5]), torque=ph.LinearDamping(0.1))

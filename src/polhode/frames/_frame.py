@@ -142,7 +142,7 @@ class SampledAttitude(eqx.Module):
     Between two samples the rotation vector from the earlier one is the polynomial of degree five
     that matches attitude, rate and acceleration at both. For samples h apart the attitude is in
     error by O(h^6), the angular velocity by O(h^5), the angular acceleration by O(h^4); at the
-    samples all three are exact. Beyond the samples the nearest polynomial goes on.
+    samples all three are exact. Beyond the samples the nearest polynomial is extrapolated.
     """
 
     ts: Float[Array, " t"]

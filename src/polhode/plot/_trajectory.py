@@ -252,7 +252,7 @@ def herpolhode(
     """Draw the angular velocity's trace in the plane normal to the angular momentum; Axes.
 
     The plane is normal to the angular momentum at the first time, its first direction that of the
-    rates' part in the plane then. Dashed circles are the least and the greatest distance reached.
+    rates' part in the plane then. Dashed circles are the smallest and the largest distance reached.
     A dot marks the first time.
     """
     made, body = pick(what, body)

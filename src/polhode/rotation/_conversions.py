@@ -35,8 +35,8 @@ def matrix_to_wxyz(matrix: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b 4"]:
 
     The symmetric matrix ``4 q q^T`` is linear in R. Its row with the largest diagonal entry (at
     least 1) is parallel to q and far from zero, so that one normalisation gives q without
-    cancellation for every rotation, half turns included (after Shepperd 1978).
-    The derivative is the one for changes that keep the matrix a rotation.
+    cancellation for every rotation, angles of pi included (after Shepperd 1978). The derivative is
+    the one for changes that keep the matrix a rotation.
 
     Raises ValueError for a matrix that is no rotation (a reflection, a scaling, entries off by more
     than 1e-3); while it is traced the quaternion of such a one is NaN.
@@ -74,8 +74,8 @@ def rotation_vector_to_wxyz(rotation_vector: Float[ArrayLike, "*b 3"]) -> Float[
 def wxyz_to_rotation_vector(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3"]:
     """Rotation vector (rad) of length at most pi of a quaternion (its scale does not matter).
 
-    Smooth at the identity, with right derivatives of every order; at a half turn, where it jumps
-    between two opposite vectors, its derivative is that of the side taken.
+    Smooth at the identity, with right derivatives of every order; at an angle of pi, where it jumps
+    between two opposite vectors, its derivative is one-sided.
     """
     upper = canonical(as_quaternions(wxyz))
     return 2 * arc_ratio(upper[..., 0], upper[..., 1:])[..., None] * upper[..., 1:]

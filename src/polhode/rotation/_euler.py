@@ -35,9 +35,9 @@ class Sequence(enum.Enum):
     """Order of the three rotations of Euler angles.
 
     ``Sequence.ZYZ`` is the convention here, ``R = Rz(phi) Ry(theta) Rz(psi)``. A plain member
-    is *intrinsic*: the second and third turn are about the axes that the body has by then, and
-    ``R = R_i(first) R_j(second) R_k(third)``. A member ending in ``_SPACE`` is *extrinsic*: all
-    turns are about fixed space axes, and ``R = R_k(third) R_j(second) R_i(first)``.
+    is *intrinsic*: the second and third rotation are about the rotated body axes, and ``R =
+    R_i(first) R_j(second) R_k(third)``. A member ending in ``_SPACE`` is *extrinsic*: all rotations
+    are about fixed space axes, and ``R = R_k(third) R_j(second) R_i(first)``.
 
     The second angle lies in [0, pi] when the first and last axis are the same (proper Euler angles)
     and in [-pi/2, pi/2] when all three differ (Tait-Bryan angles).
@@ -282,7 +282,7 @@ def euler_to_axis_angle(
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b"]]:
     """Unit axis and angle in [0, pi] of Euler angles: robust (docs/equations.md, 002: 3-12).
 
-    For ZYZ the axis is that of R; the matrix K turns about ``(l, -m, -n)``.
+    For ZYZ the axis is that of R; the matrix K rotates about ``(l, -m, -n)``.
     """
     return wxyz_to_axis_angle(euler_to_wxyz(phi, theta, psi, sequence))
 
