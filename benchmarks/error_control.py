@@ -1,16 +1,16 @@
 """Whether ``rtol`` is kept: random scenes over six decades, against long-double truth.
 
-    python -m benchmarks.error_control [--bodies 150] [--quick] [--output FILE]
+python -m benchmarks.error_control [--bodies 150] [--quick] [--output FILE]
 
-Two tables. The first holds the estimate of a single step's error (``_integrate/_march.py``) beside
-the step's true error, for orders and widths of step. The second holds the error of the attitude at
-the last time over the ``rtol`` asked for, on bodies whose moments, rates, fields and torques are
-drawn over six decades, ratios of torque to kinetic energy from 1e-6 to 1e3, 1 to 1,000 radians.
+Two tables. The first holds the estimate of a single step's error (``_integrate/_midpoint.py``)
+beside the step's true error, for orders and widths of step. The second holds the error of the
+attitude at the last time over the ``rtol`` asked for, on bodies whose moments, rates, fields and
+torques are drawn over six decades, ratios of torque to kinetic energy from 1e-6 to 1e3, 1 to 1,000
+radians.
 
 Truth: Gragg's extrapolation of order 20 in 80-bit arithmetic, written out in NumPy from Newton's
 law, with two widths of step that must agree. ``spread``: how much more than linearly with the angle
-turned a small change of the momentum grows; beyond 100 a body counts as chaotic and is left out.
-"""
+turned a small change of the momentum grows; beyond 100 a body counts as chaotic and is left out."""
 
 import argparse
 from fractions import Fraction
@@ -28,8 +28,8 @@ import numpy as np
 
 import polhode as ph
 from polhode._integrate import LiePoissonChart
-from polhode._integrate._bound_term import BoundTerm
 from polhode._integrate._columns import extrapolated, table
+from polhode._integrate._field import BoundTerm
 
 LONG = np.longdouble
 SEQUENCE = (2, 4, 6, 8, 10, 12, 14, 16, 24, 36)

@@ -134,7 +134,7 @@ def test_marching_keeps_the_accuracy_asked_for():
     for rtol in (1e-4, 1e-7, 1e-10, 1e-12):
         found = run(None, jnp.asarray(rtol))
         assert worst(found, exact((*TIMES, END))) < 10 * rtol
-        assert np.all(found.solver_state.ended == 0)
+        assert np.all(found.solver_state.reason == 0)
         order = int(order_for(jnp.asarray(rtol)))
         steps = np.asarray(found.solver_state.steps)
         work.append(float(np.sum(steps)) * Extrapolation(order).evaluations)
@@ -151,7 +151,7 @@ def test_a_march_out_of_steps_ends_as_no_number():
     saveat = diffrax.SaveAt(t1=True, solver_state=True)
     found = solve(solver, None, stepsize_controller=controller, saveat=saveat, max_steps=1)
     assert np.all(np.isnan(stacked(found.ys)))
-    assert np.all(found.solver_state.ended == 1)
+    assert np.all(found.solver_state.reason == 1)
     assert np.all(found.solver_state.steps == 2)
 
 

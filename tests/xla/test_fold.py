@@ -9,7 +9,7 @@ import pytest
 import polhode as ph
 from benchmarks.integrators import heavy_top
 from polhode._hamiltonian import Dynamics, lie_poisson_field
-from polhode._integrate._bound_term import BoundTerm
+from polhode._integrate._field import BoundTerm
 from polhode._kernels import specialise
 
 N = 5

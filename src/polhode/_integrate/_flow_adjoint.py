@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from polhode._integrate._equations import Equations, equations_of
+from polhode._integrate._flow_derivative import Equations, equations_of
 from polhode._integrate._one_step import is_one_step, one_step
 from polhode._kernels import attached, is_slope, kernel
 

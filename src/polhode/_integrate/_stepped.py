@@ -13,15 +13,14 @@ from jaxtyping import Array, PyTree
 
 from polhode._batch import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._hamiltonian import Dynamics
-from polhode._integrate._automatic import Automatic
 from polhode._integrate._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
-from polhode._integrate._equations import equations_of
+from polhode._integrate._extrapolation import Automatic
 from polhode._integrate._flow_adjoint import FlowAdjoint, path_of
-from polhode._integrate._lanes import LANES
-from polhode._integrate._loop import LoopOptions, solve
+from polhode._integrate._flow_derivative import equations_of
+from polhode._integrate._loop import Found, LoopOptions, Search, solve, with_events
+from polhode._integrate._midpoint import LANES
 from polhode._integrate._one_step import GivenTimes
 from polhode._integrate._problem import Problem
-from polhode._integrate._search import Found, Search, with_events
 from polhode._integrate._segments import Moved, in_segments
 from polhode._integrate._step_derivative import samples
 from polhode._kernels import FEW, Distinct, is_holdable, kernel
@@ -481,9 +480,9 @@ def _lanes_first(y):
 
 def _outcome(solution, shape) -> tuple[Array, Array]:
     """Steps and status of every lane."""
-    told = getattr(solution.solver_state, "ended", None)
-    if told is not None:  # each lane has steps of its own
-        return solution.solver_state.steps.astype(jnp.int32), jnp.array(_ENDED)[told]
+    reason = getattr(solution.solver_state, "reason", None)
+    if reason is not None:  # each body has steps of its own
+        return solution.solver_state.steps.astype(jnp.int32), jnp.array(_OF_MIDPOINT)[reason]
     limit = solution.result == diffrax.RESULTS.max_steps_reached
     status = jnp.where(limit, Status.MAX_STEPS, Status.STEP_FAILED)
     good = solution.result == diffrax.RESULTS.successful
@@ -510,7 +509,7 @@ satellite: 1.1 s against 1.9 s), samples do not end them, and their derivatives 
 Bodies in a potential alone take half as long by extrapolation (one top, 20 s: 0.54 against 0.99
 ms), which compiles as fast there."""
 
-_ENDED = (Status.SUCCESSFUL, Status.MAX_STEPS, Status.STEP_FAILED, Status.NOT_FINITE)
+_OF_MIDPOINT = (Status.SUCCESSFUL, Status.MAX_STEPS, Status.STEP_FAILED, Status.NOT_FINITE)
 
 
 def _may_jump(scene: Scene) -> bool:

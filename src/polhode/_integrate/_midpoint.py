@@ -1,0 +1,560 @@
+"""Steps of the extrapolated midpoint rule from one time to another, with error control.
+
+The error of a step is found from its own table. Let e be the difference of the results of orders p
+and p - 2, and d that of p - 2 and p - 4. In a converging table the results' errors fall by about
+the same factor from one to the next, so that the result itself is off by about e^2 / d. Over random
+tops and gravity gradients with six decades of every parameter, orders 8 to 16 and steps of 0.3 to
+2.2 radians the true error was 2 to 20 times that, 4.5 times in the median, for errors from 1e-13 to
+1e-2 (``benchmarks/error_control.py``); e alone is too large by anything up to 1,000.
+
+Where the rates do not depend explicitly on time each body has steps of its own, and finished bodies
+leave their SIMD lanes to the next (``in_lanes``). Otherwise the bodies share their times, so that
+what depends on time alone is evaluated once for all of them, and the body that needs the smallest
+step decides.
+
+Work queue: bodies that are integrated side by side as entries of arrays wait for the last of them.
+Of bodies with moments, weights and rates spread over decades, 64 side by side take 2.5 times the
+steps that they need, and tops of one shape 1.2 times. So the lanes hold the running bodies only;
+when a few have finished, their results are stored and the next bodies take their lanes.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from polhode._integrate._columns import Table, carried_on, extrapolated
+from polhode._integrate._field import weighted_length
+from polhode._kernels import any_of, put
+
+LANES = 64
+"""Bodies side by side: their arrays fit into the innermost cache. With 32 a top takes 1.4 times as
+long, with 128 1.15 times."""
+
+QUEUE = 1024
+"""Bodies in a queue, which bounds the memory."""
+
+TOGETHER = 8
+"""Lanes that are filled at once. With 4 or 16 tops and gravity gradients take as long to 4 %."""
+
+
+class Field(NamedTuple):
+    """Equations of motion of bodies that are entries of arrays; ``data``: the ``coefficients`` of
+    the rates and the ``unit_data`` of the units.
+
+    ``rates(coefficients, t, y, along)``: see ``extrapolated``. ``units(unit_data, y, rates)``:
+    weights of the components of an error, whose squares are summed, and the natural rate [rad/s].
+    ``own``: each body in steps of its own; the rates must then not depend on the time.
+    ``by_entry``: whether bodies can be exchanged for others by exchanging the entries of all these
+    arrays."""
+
+    rates: Callable[..., tuple[list[Array], list[Array]]]
+    units: Callable[..., tuple[list[Array], Array]]
+    data: tuple[Any, Any]
+    own: bool
+    by_entry: bool = False
+
+
+CALIBRATED = 5
+"""The error of a step over e^2 / d (see above)."""
+
+SHARE = 0.6
+"""Bound of the sum of the steps' errors over the tolerance. Where the motion itself amplifies
+errors the sum is larger (``docs/design_notes.md``)."""
+
+FIRST = 0.05
+"""Error allowed for a radian at the start, relative to the mean over the motion; the remainder is
+allowed in proportion to the square of the angle. An early error has the longest time to grow, and
+at a high order a step with a twentieth of the error is only a fifth shorter."""
+
+LONG = 100
+"""Angle [rad] beyond which the tolerance falls with the power 3/4 of the angle (``_drift``): an
+error of the rates goes on turning the body. The error grows in proportion to the angle if the
+errors of all steps have one sign, which is rare (1 body in 300)."""
+
+CAUTION, MEMORY = 0.9, 0.3
+"""Safety factor of the width, and exponent of the last error (a PI controller)."""
+
+ROUNDING, COMPENSATED = 8, 4
+"""Units in the last place below which the error of a step is rounding, of plain and of compensated
+steps."""
+
+ROUGH = 32
+"""Factor by which the estimate may be too small where a torque jumps within a step: the last two
+values of the table differ by less than their errors. Recognised by errors that do not fall with the
+order of the method when a refused step is shortened."""
+
+_TRIES = 4
+"""Attempts allowed for each step allowed."""
+
+GAP = 1 / 16
+"""Fraction of a step: the search for jumps samples one, two and three of these from either end."""
+
+
+class Limits(NamedTuple):
+    """Limits of an integration: ``rtol``, the sum of errors [rad] at ``horizon`` [s] after its
+    start; ``steps``: their maximum; ``jumps`` (static): whether the rates may jump."""
+
+    rtol: Array
+    horizon: Array
+    steps: int
+    jumps: bool
+
+
+class Progress(NamedTuple):
+    """State of the integration from one saved time to the next; arrays of one entry a body.
+
+    ``width``: of the next step [s], 0 if unknown; ``total_angle`` so far [rad]; ``low``: rounding
+    errors of the state (compensated steps); ``steps``; ``error``: sum of the estimated errors
+    [rad]; ``elapsed``: time since the first start [s]; ``reason``: 0, or why the body failed: 1 no
+    steps are left, 2 the steps became too short, 3 likewise because the rates are not finite;
+    ``rows``: states (n, T + 1, C) at the times to be saved, where one call passes all of them; the
+    last row is not used.
+    """
+
+    width: Array
+    total_angle: Array
+    low: list[Array]
+    steps: Array
+    error: Array
+    elapsed: Array
+    reason: Array
+    rows: Array | None = None
+
+
+def initial_progress(y: list[Array], compensated: bool, t: Array) -> Progress:
+    """Progress before the first step."""
+    zero = jnp.zeros_like(y[0])
+    low = [jnp.zeros_like(x) for x in y] if compensated else []
+    reason = jnp.zeros(zero.shape, jnp.int32)
+    return Progress(zero, zero, low, zero, zero, jnp.zeros_like(t), reason)
+
+
+class _Saved(NamedTuple):
+    """Saved states: ``place`` (n,): index of the next one of each body, ``due`` (n,) [s] after the
+    start."""
+
+    place: Array
+    due: Array
+
+    @classmethod
+    def first(cls, rows: Array, save_times: Array, y: list[Array]) -> tuple["_Saved", Array]:
+        """Before the first step: what is saved at the start is the columns state, all else is NaN,
+        whatever ``rows`` hold: to look at them takes longer than to write anew."""
+        now = save_times <= 0
+        here = jnp.concatenate([now, jnp.zeros((1,), bool)])
+        empty = jnp.full_like(rows, jnp.nan)
+        rows = jnp.where(here[:, None], jnp.stack(y, axis=-1)[:, None], empty)
+        place = jnp.broadcast_to(jnp.sum(jnp.where(now, 1, 0)).astype(jnp.int32), y[0].shape)
+        saved = cls(place, save_times.at[place].get(mode="clip"))
+        return saved, rows.reshape(-1, len(y))
+
+    def after(
+        self, reached: Array, body: Array, save_times: Array, y: list[Array], rows: Array
+    ) -> tuple["_Saved", Array]:
+        """With the states of the bodies that have ``reached`` what was due among the ``rows``
+        (n (T + 1), C), the last of each body not used."""
+        unused = save_times.shape[0]
+
+        def once(carry):
+            saved, rows, _ = carry
+            at = body * (unused + 1) + jnp.where(reached, saved.place, unused)
+            rows = put(rows, at, jnp.stack(y, axis=-1))
+            place = saved.place + jnp.where(reached, 1, 0)
+            return _Saved(place, save_times.at[place].get(mode="clip")), rows, False
+
+        some = any_of(reached.astype(self.due.dtype))
+        # once or not at all: a branch would copy all that is saved
+        return jax.lax.while_loop(lambda carry: carry[2], once, (self, rows, some))[:2]
+
+
+class _Carry(NamedTuple):
+    """Carry of the integration loop; every array has one entry a body."""
+
+    attempts: Array
+    elapsed: Array  # time since the start of this call
+    y: list[Array]
+    rates: list[Array]
+    low: list[Array]
+    integrals: list[Array]
+    width: Array
+    before: Array  # logarithm of error over tolerance of the step before
+    refused: tuple[Array, Array]  # error and width of a step refused
+    total_angle: Array
+    error: Array
+    steps: Array
+    saved: _Saved | None
+
+
+class _Fixed(NamedTuple):
+    """Constants of the loop: ``data`` of the field; index of each body; why it failed before. As
+    part of the carry, constants may crash XLA."""
+
+    data: Any
+    body: Array
+    reason: Array
+
+
+def integrate(
+    field: Field,
+    table_for: Callable[[Array], Table],
+    limits: Limits,
+    span: tuple[Array, Array],
+    y: list[Array],
+    integrals: list[Array],
+    progress: Progress,
+    save_times: Array | None = None,
+) -> tuple[list[Array], list[Array], Progress]:
+    """State and integrals at ``span[1]``, of bodies that are the entries of arrays of one shape.
+
+    ``table_for(rate)``: the columns of a step, by the natural rates [rad/s] at the start. A body
+    that has used up ``limits.steps`` ends as NaN. ``save_times`` (T,): times since the start
+    [s] in order, the last that of the end, at which the states are to be saved, as the ``rows`` of
+    the progress: a body that has reached one goes on to its next without waiting for others.
+    """
+    compensated, own = bool(progress.low), field.own
+    start, end = span
+    length, sign = jnp.abs(end - start), jnp.where(end < start, -1, 1)
+    dtype = y[0].dtype
+    eps = float(jnp.finfo(dtype).eps)
+    remaining = jnp.abs(limits.horizon - progress.elapsed - length).astype(dtype)
+    duration, length = length, length.astype(dtype)
+    zero = jnp.zeros_like(y[0])
+    first, _ = field.rates(field.data[0], start, y, False)
+    _, rate = field.units(field.data[1], y, first)
+    columns = table_for(rate)
+    power = 1 / (columns.order.astype(dtype) + 1)
+
+    def worst(x, dead):
+        """Of the bodies that share their steps, but for those that are columns up."""
+        return x if own else jnp.broadcast_to(jnp.max(jnp.where(dead, 0, x)), x.shape)
+
+    def failed(fixed, carry):
+        """Bodies whose steps ran out, or became so short that they lead nowhere."""
+        able = (carry.steps < limits.steps) & (carry.width > 0.1 * eps * length)
+        return ~(able & (fixed.reason == 0))
+
+    def live(fixed, carry):
+        return (carry.elapsed < duration) & ~failed(fixed, carry)
+
+    def bound(fixed):
+        """Rates and units of bodies."""
+        coefficients, unit_data = fixed.data
+        return partial(field.rates, coefficients), partial(field.units, unit_data)
+
+    def error_and_tolerance(rates, units, carry, t, h, width, new, result, later):
+        """Error of a step, and what it may be."""
+        (weights, rate), (weights_, rate_) = units(carry.y, carry.rates), units(new, later)
+        # by the larger and faster of both ends: errors of a body that a torque sets in motion are
+        # not measured by its state at rest
+        weights = [jnp.minimum(a, b) for a, b in zip(weights, weights_)]
+        rate = jnp.maximum(rate, rate_)
+        last, before = (weighted_length(weights, e) for e in (result.last, result.before))
+        error = CALIBRATED * last * jnp.where(last < before, last / before, 1)
+        if limits.jumps:
+            error = error + _jump_error(rates, t, h, carry, new, later, weights)
+            fall = (width / jnp.where(carry.refused[1] > 0, carry.refused[1], 1)) ** columns.order
+            rough = (carry.refused[1] > 0) & (error > 2 * fall * carry.refused[0])
+            error = jnp.where(rough & (error > 128 * eps), ROUGH * error, error)
+        angle = rate * width
+        expected = (
+            carry.total_angle
+            + angle
+            + rate * (length - carry.elapsed.astype(dtype) - width + remaining)
+        )
+        expected = jnp.maximum(expected, 1)
+        done = jnp.minimum(carry.total_angle / expected, 1)
+        share = SHARE * (FIRST + 3 * (1 - FIRST) * done * done)
+        allowed = share * limits.rtol * angle / (expected * _drift(expected))
+        allowed = jnp.maximum(allowed, (COMPENSATED if compensated else ROUNDING) * eps)
+        sound = jnp.isfinite(error) & jnp.isfinite(angle)  # a step may well end beyond all numbers
+        error, allowed = jnp.where(sound, error, jnp.inf), jnp.where(sound, allowed, 1)
+        return jax.lax.stop_gradient((error, allowed, jnp.where(sound, angle, 0)))
+
+    def one(fixed, carry, rows):
+        """One step of each body."""
+        rates, units = bound(fixed)
+        alive = live(fixed, carry)
+        due = duration if carry.saved is None else carry.saved.due
+        left = (due - carry.elapsed).astype(dtype)
+        # divide what remains evenly, so that no step is much shorter than its neighbours
+        width = jnp.where(left <= carry.width, left, jnp.minimum(carry.width, left / 2))
+        cut = width < 0.999 * carry.width  # shortened to end at a time, not by rounding
+        # the width is the difference of two representable times, or rounding would accumulate;
+        # rounded down after a refused step, which would otherwise be attempted again and again
+        near = carry.elapsed + width.astype(carry.elapsed.dtype)
+        grain = jnp.finfo(near.dtype).eps * near  # one or two units in its last place
+        exact = (near - carry.elapsed).astype(dtype)
+        down = (exact > width) & (carry.refused[1] > 0)
+        exact = jnp.where(down, (near - grain - carry.elapsed).astype(dtype), exact)
+        exact = jnp.minimum(jnp.maximum(exact, grain.astype(dtype)), left)
+        width = jnp.where(width == left, left, exact)
+        width = jnp.where(alive, width, 0)
+        elapsed, h = (x if own else jnp.max(x) for x in (carry.elapsed, width))
+        t, h = start + sign * elapsed, sign.astype(dtype) * h
+        result = extrapolated(
+            rates, columns, t, h, carry.y, carry.rates, carry.integrals, compensated
+        )
+        low = carry.low
+        new = result.change
+        if compensated:
+            new, low = carried_on(carry.y, carry.low, result.change)
+        later, _ = rates(t + h.astype(t.dtype), new, False)
+        error, allowed, angle = error_and_tolerance(
+            rates, units, carry, t, h, width, new, result, later
+        )
+        ratio = worst(error / allowed, failed(fixed, carry))
+        accepted = (ratio <= 1) & alive
+        size = jnp.log(jnp.maximum(ratio, 1e-6))  # logarithms: a power takes as long as three
+        factor = CAUTION * jnp.exp(power * (jnp.where(accepted, MEMORY * carry.before, 0) - size))
+        factor = jnp.clip(factor, jnp.where(accepted, 0.2, 0.1), jnp.where(accepted, 4, 0.9))
+        # the error of a step that a jump has shortened to units in the last place of the time is
+        # rounding and says nothing about the width that is possible
+        factor = jnp.where(accepted & (width < 64 * grain.astype(dtype)) & ~cut, 4, factor)
+        proposed = jnp.where(
+            accepted & cut, jnp.maximum(carry.width, width * factor), width * factor
+        )
+        proposed = jnp.where(accepted | (width > grain.astype(dtype)), proposed, 0)
+        proposed = jnp.where(alive, proposed, carry.width)
+        later_time = jnp.where(
+            width == left, due, carry.elapsed + width.astype(carry.elapsed.dtype)
+        )
+        elapsed = jnp.where(accepted, later_time, carry.elapsed)
+        saved = carry.saved
+        if saved is not None:
+            reached = accepted & (width == left)
+            saved, rows = saved.after(reached, fixed.body, save_times, new, rows)
+
+        def pick(a, b):
+            return [jnp.where(accepted, x, y) for x, y in zip(a, b)]
+
+        refused = (accepted, 0, error), (accepted, 0, width)
+        carry = _Carry(
+            carry.attempts + jnp.where(alive, 1, 0).astype(dtype),
+            elapsed,
+            pick(new, carry.y),
+            pick(later, carry.rates),
+            pick(low, carry.low),
+            _picked(accepted, result.sums, carry.integrals),
+            proposed,
+            jnp.where(accepted, size, carry.before),
+            tuple(jnp.where(*x) for x in refused),
+            carry.total_angle + jnp.where(accepted, angle, 0),
+            carry.error + jnp.where(accepted, error, 0),
+            carry.steps + jnp.where(accepted, 1, 0),
+            saved,
+        )
+        return carry, rows
+
+    body = jnp.arange(zero.size, dtype=jnp.int32).reshape(zero.shape)
+    fixed = _Fixed(field.data, body, progress.reason)
+    # half of what a smooth motion allows, or everything at once if that is short
+    guess = 4 * limits.rtol.astype(dtype) ** power / jnp.maximum(rate, 1 / (length + remaining))
+    guess = jnp.where(progress.width > 0, progress.width, guess)  # NaN where the rates are
+    guess = jax.lax.stop_gradient(guess)
+    if not own:
+        sound = jnp.where(
+            guess > 0, guess, jnp.inf
+        )  # a body that is not finite does not delay others
+        guess = jnp.where(guess > 0, jnp.min(sound), guess)
+    saved, rows = None, None
+    if save_times is not None:
+        saved, rows = _Saved.first(progress.rows, save_times, y)
+    carry = _Carry(
+        zero,
+        jnp.zeros(zero.shape, start.dtype),
+        y,
+        first,
+        progress.low,
+        integrals,
+        guess,
+        zero,
+        (zero, zero),
+        progress.total_angle,
+        progress.error,
+        progress.steps,
+        saved,
+    )
+
+    def able(fixed, carry):
+        return live(fixed, carry) & (carry.attempts < _TRIES * limits.steps)
+
+    def finished(fixed, carry):
+        arrived = (carry.elapsed >= duration) & (fixed.reason == 0)
+        y = [jnp.where(arrived, x, jnp.nan) for x in carry.y]
+        numbers = jnp.isfinite(carry.width) & jnp.isfinite(carry.refused[0])
+        left = (carry.steps < limits.steps) & (carry.attempts < _TRIES * limits.steps)
+        why = jnp.where(left, jnp.where(numbers, 2, 3), 1)
+        reason = jnp.where(arrived, 0, jnp.where(fixed.reason > 0, fixed.reason, why))
+        # as floats, like the other numbers
+        numbers = carry.width, carry.total_angle, carry.steps, carry.error, reason.astype(dtype)
+        return y, carry.integrals, carry.low, numbers
+
+    # an accelerator integrates all bodies side by side
+    several = zero.ndim == 1 and zero.size > LANES and jax.default_backend() == "cpu"
+    if several and field.by_entry and own:
+        result, rows = in_lanes(one, able, finished, fixed, carry, rows)
+    else:
+        carry, rows = jax.lax.while_loop(
+            lambda carry: any_of(able(fixed, carry[0]).astype(dtype)),
+            lambda carry: one(fixed, *carry),
+            (carry, rows),
+        )
+        result = finished(fixed, carry)
+    y, integrals, low, (width, total_angle, steps, error, reason) = result
+    elapsed = progress.elapsed + duration
+    if rows is not None and save_times is not None:
+        rows = rows.reshape(zero.size, save_times.shape[0] + 1, len(y))
+    reason = reason.astype(jnp.int32)
+    return y, integrals, Progress(width, total_angle, low, steps, error, elapsed, reason, rows)
+
+
+def _drift(angle: Array) -> Array:
+    """Reduction of the tolerance: the power 3/4 of the angle, by square roots, which are faster."""
+    far = jnp.maximum(angle / LONG, 1)
+    return jnp.sqrt(far * jnp.sqrt(far))
+
+
+def _picked(accepted, new, old):
+    """Integrals with a shape that all bodies share are accepted with the step that they share."""
+    return [
+        jnp.where(accepted if x.shape == accepted.shape else jnp.any(accepted), x, y)
+        for x, y in zip(new, old)
+    ]
+
+
+def _jump_error(rates, t, width, carry, new, later, weights) -> Array:
+    """Error by rates that jump beside an end of a step, unseen by its estimate.
+
+    No column of the midpoint rule looks between either end of a step and its first or last
+    substep but at the end itself, and steps that are refused again and again near a jump end up
+    with it there. Along a straight line, the tangent at the start or the chord at the end,
+    differences of smooth rates fall with their order; those of rates that jump do not.
+    """
+    gap = GAP * width
+    eps = float(jnp.finfo(width.dtype).eps)
+
+    def pick(at_end, a, b):
+        return [jnp.where(at_end, y, x) for x, y in zip(a, b)]
+
+    def beside(end, total):
+        """One end: 0, the start, or 1. In loops, so that the rates stand in the program once."""
+        at_end = end == 1
+        base, there = pick(at_end, carry.y, new), pick(at_end, carry.rates, later)
+        # along the tangent at the start, back along the chord at the end
+        chord = [a - b for a, b in zip(carry.y, new)]
+        part = [gap * f for f in carry.rates]
+        part = pick(at_end, part, [GAP * x for x in chord])
+        start, sign = jnp.where(at_end, t + width, t), jnp.where(at_end, -1, 1)
+
+        def further(k, result):
+            """Differences of order 0, 1, ... up to the rates ``k`` times so far; the sizes of
+            those from the end on, of which the one of order ``k`` is new."""
+            before, sizes = result
+            k = k.astype(width.dtype)
+            now = (start + sign * k * gap).reshape(-1)[0]
+            row = rates(now, [a + k * b for a, b in zip(base, part)], False)[0]
+            rows = [row]
+            for older in before:
+                row = [a - b for a, b in zip(row, older)]
+                rows.append(row)
+            lengths = [weighted_length(weights, x) for x in rows[1:]]
+            sizes = [jnp.where(k == n, x, y) for n, x, y in zip((1, 2, 3), lengths, sizes)]
+            return rows[:3], sizes
+
+        zero = [jnp.zeros_like(x) for x in there]
+        sizes = [jnp.zeros_like(total)] * 3
+        _, sizes = jax.lax.fori_loop(1, 4, further, ([there, zero, zero], sizes))
+        first, second, third = sizes
+        noise = 64 * eps * weighted_length(weights, there)
+        jumps = third > jnp.maximum(0.5 * jnp.maximum(second, 0.5 * first), noise)
+        return total + jnp.where(jumps, third * jnp.abs(4 * gap), 0)
+
+    return jax.lax.fori_loop(0, 2, beside, jnp.zeros_like(carry.width))
+
+
+def in_lanes(
+    step: Callable[..., Any],
+    able: Callable[..., Array],
+    finished: Callable[..., Any],
+    fixed: Any,
+    carry: Any,
+    rows: Any,
+) -> tuple[Any, Any]:
+    """``finished(fixed, carry)`` of every body after all the steps that it is able to take, and
+    the ``rows``.
+
+    ``step(fixed, carry, rows)``: the new ``carry`` and ``rows`` after one step of some bodies.
+    ``able(fixed, carry)`` (n,): whether a body goes on; one whose ``carry`` is all zero must not.
+    ``carry``: arrays (n,); ``fixed``: such arrays and numbers, which no step changes, among them
+    ``fixed.body`` (n,), the place of each body among all; ``rows``: anything that belongs to all.
+    """
+    n = fixed.body.size
+    wide = -(-n // -(-n // LANES))  # no wider than where each lane leads as many bodies
+    wide += -wide % 8
+    parts, tree = jax.tree.flatten(fixed)
+    constant = [x for x in parts if x.shape == (n,)]
+    changing, form = jax.tree.flatten(carry)
+    endings, shape = jax.tree.flatten(finished(fixed, carry))
+    queue = _stacked(constant), _stacked(changing)
+
+    def fixed_of(fixed_rows):
+        """What is fixed of the bodies in the lanes."""
+        some = iter(_as(constant, fixed_rows))
+        return jax.tree.unflatten(tree, [next(some) if x.shape == (n,) else x for x in parts])
+
+    def settle(loop):
+        """What became of the bodies that have arrived is stored, and others take their lanes."""
+        fixed_rows, carry, results, next_body, _ = loop
+        fixed = fixed_of(fixed_rows)
+        done = ~able(fixed, carry)
+        endings = _stacked(jax.tree.leaves(finished(fixed, carry)))
+        results = put(results, fixed.body, endings.T)
+        lane = jnp.arange(wide)
+        before = jnp.sum(jnp.where((lane[:, None] > lane[None]) & done[None], 1, 0), axis=1)
+        index = next_body + before
+        new = done & (index < n)
+        others, start = (x.at[:, index].get(mode="clip") for x in queue)
+        start = jax.tree.unflatten(form, _as(changing, start))
+        carry = jax.tree.map(lambda a, b: jnp.where(new, a, b), start, carry)
+        count = jnp.sum(jnp.where(done, 1, 0))
+        # n: none is waiting; n + 1: all have been stored, and stay so while others of a batch go on
+        last = (count == wide) & (next_body >= n)
+        next_body = jnp.where(last, n + 1, jnp.minimum(next_body + count, n))
+        return jnp.where(new, others, fixed_rows), carry, results, next_body, False
+
+    def turn(loop):
+        fixed_rows, carry, results, next_body, rows = loop
+        idle = jnp.sum(jnp.where(able(fixed_of(fixed_rows), carry), 0, 1))
+        due = (idle >= TOGETHER) & (next_body < n) | (idle == wide)
+        # once or not at all: a branch would copy all that it may change
+        start = fixed_rows, carry, results, next_body, any_of(jnp.where(due, 1.0, 0.0))
+        fixed_rows, carry, results, next_body, _ = jax.lax.while_loop(lambda c: c[4], settle, start)
+        carry, rows = step(fixed_of(fixed_rows), carry, rows)
+        return fixed_rows, carry, results, next_body, rows
+
+    # at first every lane is done with a body of zeros, whose end is overwritten
+    fixed_rows, start = (jnp.zeros((len(x), wide), x.dtype) for x in queue)
+    carry = jax.tree.unflatten(form, _as(changing, start))
+    results = jnp.zeros_like(_stacked(endings).T)
+    start = fixed_rows, carry, results, jnp.zeros((), int), rows
+    *_, results, _, rows = jax.lax.while_loop(
+        lambda loop: any_of(jnp.where(loop[3] <= n, 1.0, 0.0)), turn, start
+    )
+    return jax.tree.unflatten(shape, _as(endings, results.T)), rows
+
+
+def _stacked(arrays: list[Array]) -> Array:
+    """Arrays as the rows of a matrix: it is looked up in one loop, which compiles faster than one
+    for each. Integers, numbers of bodies and small ones, are exact as floats."""
+    floats = [x.dtype for x in arrays if jnp.issubdtype(x.dtype, jnp.floating)]
+    widest = max(floats, key=lambda dtype: dtype.itemsize)
+    return jnp.stack([x.astype(widest) for x in arrays])
+
+
+def _as(like: list[Array], rows: Array) -> list[Array]:
+    """The rows of a matrix as what was stacked, which may have been integers."""
+    return [row.astype(x.dtype) for x, row in zip(like, rows)]
