@@ -141,3 +141,54 @@ def test_vectors_in_kilometres_and_copies_of_points_are_named():
     assert "1 point(s) are exact copies" in lightcurve.LightCurve.of(t, light).notes[-1]
     light[4] += 0.1
     assert lightcurve.LightCurve.of(t, light).notes == ()
+
+
+def test_fluxes_given_as_magnitudes_are_named():
+    t = 10 + 0.01 * np.arange(20)
+    flux = 1 + 0.2 * np.sin(np.arange(20))
+    with pytest.raises(ValueError, match=r"these are fluxes or counts"):
+        lightcurve.LightCurve.of(t, 5000 * flux)
+    named = lightcurve.LightCurve.of(t, flux / flux.mean())
+    assert any("as a normalised flux" in note for note in named.notes)
+    assert lightcurve.LightCurve.of(t, -2.5 * np.log10(flux)).notes == ()
+    assert lightcurve.LightCurve.of(t, 15 + flux).notes == ()
+
+
+def test_a_saturated_night_is_named_and_rounded_magnitudes_are_not():
+    t = 10 + 0.01 * np.arange(60)
+    magnitude = 15 + 0.3 * np.sin(0.7 * np.arange(60))
+    night = np.repeat(["first", "second"], 30)
+    clipped = np.where(night == "second", np.maximum(magnitude, 14.85), magnitude)
+    (note,) = lightcurve.LightCurve.of(t, clipped, group=night).notes
+    assert "group(s) second many points have the brightest magnitude" in note
+    assert lightcurve.LightCurve.of(t, magnitude, group=night).notes == ()
+    rounded = lightcurve.LightCurve.of(t, np.round(magnitude, 1), group=night)
+    assert not any("brightest" in note for note in rounded.notes)
+
+
+def test_vectors_that_do_not_start_at_the_body_are_named():
+    """Sun and Earth are one au apart, seen from the body and in one frame."""
+    t = 10 + 0.01 * np.arange(12)
+    sun = np.array([2.0, 0.3, 0.1])
+    earth = sun - np.array([0.6, 0.8, 0.0])
+    magnitude, suns = 15 + np.sin(t), np.tile(sun, (12, 1))
+    right = lightcurve.LightCurve.of(t, magnitude, suns, np.tile(earth, (12, 1)))
+    assert right.notes == ()
+    obliquity = np.radians(23.44)
+    turn = np.array(
+        [
+            [1, 0, 0],
+            [0, np.cos(obliquity), -np.sin(obliquity)],
+            [0, np.sin(obliquity), np.cos(obliquity)],
+        ]
+    )
+    for wrong in (-earth, turn @ (3 * earth), earth - sun):
+        (note,) = lightcurve.LightCurve.of(t, magnitude, suns, np.tile(wrong, (12, 1))).notes
+        assert "au apart" in note
+
+
+def test_unsorted_times_are_sorted_with_their_points():
+    t = 10 + 0.01 * np.array([3, 0, 2, 1, 7, 5, 6, 4])
+    curve = lightcurve.LightCurve.of(t, 15 + t)
+    assert np.all(np.diff(curve.t) > 0)
+    np.testing.assert_allclose(curve.magnitude, 15 + curve.t)

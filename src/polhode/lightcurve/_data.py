@@ -14,6 +14,12 @@ from polhode.lightcurve._scattering import seeliger_sphere
 LIGHT_TIME = 499.00478384 / 86400  # days per au
 _DOUBLED = math.radians(40)  # phase angle at which the floor has doubled
 _FAR = 1e4  # au, beyond which vectors are not in au
+# Magnitudes beyond this are none: the Sun has -27, the faintest stars seen 32.
+_FAINTEST = 45.0
+# Deviation of the distance from Sun to observer from 1 au that an observer near the Earth has [au].
+_ORBIT = 0.03
+# Points of one night at its brightest magnitude that count as saturated, at least.
+_REPEATED = 4
 _BLOCK = 128  # samples are padded to multiples, so that few programs are compiled
 
 
@@ -68,6 +74,11 @@ class LightCurve(NamedTuple):
         bad = np.flatnonzero(~(np.isfinite(t) & np.isfinite(magnitude)))
         if bad.size:
             raise ValueError(f"times and magnitudes must be finite; point {bad[0]} is not.")
+        if np.abs(magnitude).max() > _FAINTEST:
+            raise ValueError(
+                f"magnitudes reach {magnitude[np.argmax(np.abs(magnitude))]:.5g}: these are fluxes"
+                " or counts. Give -2.5 log10(flux), or name the column flux."
+            )
         if np.ptp(t) == 0:
             raise ValueError(f"all {t.size} times are {t[0]}: a light curve must span some time.")
         if (sun is None) != (observer is None):
@@ -76,6 +87,8 @@ class LightCurve(NamedTuple):
             sun, r = _directions("sun", sun, t.size)
             observer, delta = _directions("observer", observer, t.size)
             far = np.abs(delta - 1).max() > 1e-6
+            if far or np.abs(r - 1).max() > 1e-6:
+                notes = (*notes, *_apart(sun * r[:, None], observer * delta[:, None]))
             if far and not at_body:
                 t = t - LIGHT_TIME * delta
             if far and not reduced:
@@ -86,6 +99,7 @@ class LightCurve(NamedTuple):
         names, number = np.unique(group, return_inverse=True)
         sigma = np.broadcast_to(np.asarray(sigma, float), t.shape)
         order = np.argsort(t, kind="stable")
+        notes = (*notes, *_doubts(magnitude, number, names))
         copies = t.size - len(np.unique(np.stack([t, magnitude, number]), axis=1).T)
         if copies:
             text = f"{copies} point(s) are exact copies of others: their errors count twice."
@@ -236,3 +250,38 @@ def _directions(name: str, vectors, count: int) -> tuple[np.ndarray, np.ndarray]
             " km."
         )
     return vectors / length[:, None], length
+
+
+def _apart(sun: np.ndarray, observer: np.ndarray) -> list[str]:
+    """A note where Sun and observer, (n, 3) [au] from the body, are not one au apart."""
+    apart = np.linalg.norm(sun - observer, axis=1)
+    if np.abs(apart - 1).max() < _ORBIT:
+        return []
+    return [
+        f"Sun and observer are {apart.min():.3g} to {apart.max():.3g} au apart, and the Earth and"
+        " the Sun 0.98 to 1.02: unless the observer is elsewhere, the vectors do not start at the"
+        " body, or are in different frames or units."
+    ]
+
+
+def _doubts(magnitude: np.ndarray, group: np.ndarray, names: np.ndarray) -> list[str]:
+    """Notes on magnitudes that look like fluxes, and on nights that look saturated."""
+    notes = []
+    if magnitude.min() > 0 and abs(magnitude.mean() - 1) < 1e-3:
+        notes.append(
+            "The magnitudes have a mean of 1, as a normalised flux: of a flux give -2.5"
+            " log10(flux), or name the column flux."
+        )
+    flat = []
+    for k, name in enumerate(names):
+        values, counts = np.unique(magnitude[group == k], return_counts=True)
+        # rounded magnitudes repeat all their values, a saturated star only the brightest
+        many = max(_REPEATED, 0.1 * counts.sum())
+        if len(values) > 1 and counts[0] >= max(many, 5 * counts[1]):
+            flat.append(str(name))
+    if flat:
+        notes.append(
+            f"Of group(s) {', '.join(flat[:5])} many points have the brightest magnitude exactly,"
+            " as of a saturated detector: leave these points out."
+        )
+    return notes
