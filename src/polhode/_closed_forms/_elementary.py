@@ -180,11 +180,10 @@ class FixedAxis(AbstractClosedForm):
         )
         both = jnp.concatenate([rates, torque], axis=-1)
         at_rest = jnp.broadcast_to(~is_moving, both.shape)
-        zero_with_derivative = jnp.sum(
-            derivable_once(both, at_rest) - both, axis=-1, keepdims=True
-        )  # zero
+        # Zero, and NaN in second derivatives of a body at rest, which are not those of this motion.
+        zero = jnp.sum(derivable_once(both, at_rest) - both, axis=-1, keepdims=True)
         omega, angles = driven_spin(
-            (rates + zero_with_derivative)[:, None],
+            (rates + zero)[:, None],
             (damping / moments)[:, None],
             (torque / moments)[:, None],
             times,

@@ -216,6 +216,8 @@ def agm_and_nome(circular, on_separatrix, x: Scalars, m: Scalars, m1: Scalars, o
     square = jnp.where(circular, m, m1)
     other = jnp.sqrt(jnp.where(circular, m1, m))
     omega = jnp.sqrt(x)
+    # Quadratic convergence: from b >= sqrt(0.2) the fifth mean is exact to rounding. A fixed number
+    # of steps keeps all lanes in one kernel.
     a, b = 1.0, other
     for _ in range(_STEPS - 1):
         a, b = (a + b) / 2, jnp.sqrt(a * b)
@@ -550,7 +552,8 @@ def half_angle(
     # (12): the series hold for the motion that starts where L3 is largest.
     a = mu * (1 + N) * (1 + y) * (1 + w) + (1 - mu) * (1 + N + y + w)
     b = precession.addition_coefficient * S * polhode.momentum[1] * l2
-    # (cosine + i sine) (real - i imaginary) (a + i b)
+    # (cosine + i sine) (real - i imaginary) (a + i b): angles are added as products of complex
+    # numbers, without an arctangent and its branch cuts.
     f, g = theta_real * a + theta_imaginary * b, theta_real * b - theta_imaginary * a
     return cosine * f - sine * g, cosine * g + sine * f
 

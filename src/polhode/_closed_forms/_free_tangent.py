@@ -146,6 +146,8 @@ def _quotients(invariants: Invariants, functions: Triple):
     square = S * S
     tail = r * s * (l3 * l3) * square
     delta = C * C + tail
+    # (1 - C)/r = B S^2/(1 + C) because 1 - C^2 = B r S^2: no divisor vanishes for C >= 0. Where C
+    # is negative r cannot be zero, and the plain quotient loses nothing.
     ahead = C >= 0
     one_minus_C = jnp.where(
         ahead, square * B / jnp.where(ahead, 1 + C, 1), (1 - C) / jnp.where(ahead, 1, r)

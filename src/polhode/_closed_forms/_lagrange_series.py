@@ -87,6 +87,7 @@ def where(condition: Array, a: Complex, b: Complex) -> Complex:
 
 
 _TERMS = 5
+"""Of Euler's series: the coefficient of a^k falls like h^(k (k - 1)/2), and h <= exp(-2 pi)."""
 
 
 class Series(NamedTuple):
