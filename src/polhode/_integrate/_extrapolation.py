@@ -188,18 +188,18 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
     def _fixed_order(self) -> int:
         return 12 if self.formal_order is None else self.formal_order
 
-    def stepping(self, asked: Any) -> Any:
-        """How ``ph.LiePoisson`` and ``ph.EulerAngles`` step with it: to each time at once."""
-        horizon = jnp.abs(asked.ts[-1] - asked.ts[0])
-        accuracy = Accuracy(*jax.lax.stop_gradient((asked.rtol, horizon)))
+    def stepping(self, request: Any) -> Any:
+        """Arguments of diffrax for ``ph.LiePoisson`` and ``ph.EulerAngles``: one call for all."""
+        horizon = jnp.abs(request.ts[-1] - request.ts[0])
+        accuracy = Accuracy(*jax.lax.stop_gradient((request.rtol, horizon)))
         solver = Extrapolation(
-            self.formal_order, self.compensated, accuracy, asked.max_steps, asked.jumps
+            self.formal_order, self.compensated, accuracy, request.max_steps, request.jumps
         )
-        return asked.marched(solver)
+        return request.in_one_call(solver)
 
     def bodies_at_once(self, terms: PyTree, t: Array, y: PyTree, args: PyTree) -> int:
-        """Bodies that one solve leads best: where each goes on without regard to others, as many
-        as wait for a lane; else as many as there are lanes."""
+        """Number of bodies of one solve: a whole work queue where bodies have steps of their own,
+        else as many as there are lanes."""
         dtype = jnp.result_type(*jax.tree.leaves(y))
         return QUEUE if BoundTerm.of(terms, args).prepared(t, y, dtype).by_entry else LANES
 

@@ -1,4 +1,4 @@
-"""A solve in segments: between the edges of pulses, so that no step meets one."""
+"""A solve in segments between the edges of pulses, so that no step contains an edge."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -10,9 +10,9 @@ from jaxtyping import Array, PyTree
 from polhode._method._status import Status
 
 
-class Moved(NamedTuple):
-    """What a solve of N lanes found: states at the samples (T, N) and at the end (1, N), steps,
-    status and, where it is known, sum of the estimated errors (N,)."""
+class Solution(NamedTuple):
+    """Solution of N bodies: states at the samples (T, N) and at the end (1, N), steps, status and,
+    where the method estimates it, the sum of the errors (N,)."""
 
     samples: PyTree[Array]
     last: PyTree[Array]
@@ -22,8 +22,8 @@ class Moved(NamedTuple):
 
 
 def in_segments(
-    move: Callable[..., Moved], y: PyTree[Array], ts: Array, edges: Array, final_only: bool
-) -> Moved:
+    move: Callable[..., Solution], y: PyTree[Array], ts: Array, edges: Array, final_only: bool
+) -> Solution:
     """``move(middle, y, times, parts)`` from edge to edge: from ``times[0]`` to ``times[-1]``, by
     what acts at the time ``middle``, with one of ``parts`` equal shares of the error.
 
@@ -39,7 +39,7 @@ def in_segments(
         y, out, steps, status, error = carry
         a, b = segment
         empty = a == b
-        # a solve of no length has no rows to differentiate: it goes somewhere, and is dropped
+        # an empty segment is solved over another length and discarded, for derivatives exist
         stop = jnp.where(empty, a + (end - start) / 16, b)
         inside = (sign * (ts - a) >= 0) & (sign * (b - ts) > 0) & ~empty
         if final_only:
@@ -47,20 +47,20 @@ def in_segments(
         else:
             times = sign * jnp.sort(sign * jnp.where(inside, ts, a))
             times = jnp.concatenate([times, stop[None]])
-        found = move(jax.lax.stop_gradient((a + b) / 2), y, times, parts)
-        good = status == Status.SUCCESSFUL
-        status = jnp.where(empty | ~good, status, found.status)
-        steps = steps + jnp.where(empty, 0, found.steps)
+        solution = move(jax.lax.stop_gradient((a + b) / 2), y, times, parts)
+        successful = status == Status.SUCCESSFUL
+        status = jnp.where(empty | ~successful, status, solution.status)
+        steps = steps + jnp.where(empty, 0, solution.steps)
         if error is not None:
-            error = error + jnp.where(empty, 0, found.error)
+            error = error + jnp.where(empty, 0, solution.error)
         if not final_only:
             later = jnp.sum(jnp.where(sign * (ts - b) >= 0, 1, 0))
             rows = jnp.minimum(jnp.arange(ts.shape[0]) + later, ts.shape[0])
             out = jax.tree.map(
-                lambda old, new: jnp.where(inside[:, None], new[rows], old), out, found.samples
+                lambda old, new: jnp.where(inside[:, None], new[rows], old), out, solution.samples
             )
-        # the last row, for only samples have derivatives
-        y = jax.tree.map(lambda old, new: jnp.where(empty, old, new[-1]), y, found.samples)
+        # the last row: only samples have derivatives
+        y = jax.tree.map(lambda old, new: jnp.where(empty, old, new[-1]), y, solution.samples)
         return (y, out, steps, status, error), None
 
     shape = jax.eval_shape(lambda y: move(start, y, jnp.stack([start, end]), parts), y)
@@ -73,9 +73,9 @@ def in_segments(
     (y, out, steps, status, error), _ = jax.lax.scan(one, begin, (bounds[:-1], bounds[1:]))
     last = jax.tree.map(lambda x: x[None], y)
     if final_only:
-        return Moved(last, last, steps, status, error)
+        return Solution(last, last, steps, status, error)
     out = jax.tree.map(lambda rows, x: rows.at[-1].set(x), out, y)
-    return Moved(out, last, steps, status, error)
+    return Solution(out, last, steps, status, error)
 
 
 def min_of(a: Array, b: Array) -> Any:

@@ -1,4 +1,9 @@
-"""Everything that is stepped: one chart, one solver, one controller, one adjoint, one solve."""
+"""Methods that integrate: coordinates, solver, step control and adjoint, and one call of diffrax.
+
+``AbstractIntegration.run`` has two paths: the loop of explicit steps (``_run_by_loop``: few bodies
+with torques, switches, events), and ``diffrax.diffeqsolve`` (``_solve``: the extrapolated midpoint
+rule for batches, and any solver that the user gives).
+"""
 
 import inspect
 from collections.abc import Sequence
@@ -14,14 +19,14 @@ from jaxtyping import Array, PyTree
 from polhode._batch import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._hamiltonian import Dynamics
 from polhode._integrate._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
-from polhode._integrate._extrapolation import Automatic
+from polhode._integrate._extrapolation import Automatic, Extrapolation
 from polhode._integrate._flow_adjoint import FlowAdjoint, path_of
 from polhode._integrate._flow_derivative import equations_of
 from polhode._integrate._loop import Found, LoopOptions, Search, solve, with_events
 from polhode._integrate._midpoint import LANES
 from polhode._integrate._one_step import GivenTimes
 from polhode._integrate._problem import Problem
-from polhode._integrate._segments import Moved, in_segments
+from polhode._integrate._segments import Solution, in_segments
 from polhode._integrate._step_derivative import samples
 from polhode._kernels import FEW, Distinct, is_holdable, kernel
 from polhode._method._base import AbstractMethod, Record, Samples
@@ -30,8 +35,8 @@ from polhode._method._status import Status
 from polhode._parts import AbstractPart
 from polhode._scene import Scene, State
 
-# Without its own ``jit``, which would make one array that stands in several parts of the scene
-# several: all this is part of a compiled program anyway.
+# Without its own ``jit``, which would duplicate an array that several parts of the scene share; the
+# call is part of a compiled program anyway.
 _diffeqsolve = inspect.unwrap(diffrax.diffeqsolve)
 
 
@@ -62,7 +67,7 @@ class AbstractIntegration(AbstractMethod):
         """``shared_chunk``: the default ``chunk`` where bodies share their steps."""
         solver = diffrax.Dopri8() if solver is None else solver
         check_options(solver, controller, adjoint, dt0=dt0, max_steps=max_steps, chunk=chunk)
-        if chunk is None and not hasattr(solver, "bodies_at_once"):
+        if chunk is None and not isinstance(solver, Extrapolation):
             chunk = shared_chunk
         self.chart, self.solver, self.controller = chart, solver, controller
         self.dt0, self.max_steps, self.chunk = dt0, max_steps, chunk
@@ -77,22 +82,22 @@ class AbstractIntegration(AbstractMethod):
         return f"{coordinates}({type(self.solver).__name__})"
 
     def steps_of(self, scene: Scene, state: State, ts: Array, record: Record) -> str:
-        """The steps that the bodies of a scene are moved by, in words."""
+        """Description of the steps for a scene, for ``ph.explain``."""
         if not self._is_automatic:
             return f"steps of {type(self.solver).__name__}"
         few, switches, hidden = self._are_few(scene, state), 0, ()
         if few or _may_jump(scene):
-            found: list[Any] = []
+            program: list[Any] = []
 
-            def look(scene, state, ts):
-                found.append(self._problem(scene, state, ts, record).switches)
+            def trace(scene, state, ts):
+                program.append(self._problem(scene, state, ts, record).switches)
 
-            eqx.filter_eval_shape(look, scene, state, ts)
-            switches, hidden = found[0].count, found[0].hidden
+            eqx.filter_eval_shape(trace, scene, state, ts)
+            switches, hidden = program[0].count, program[0].hidden
         if hidden:
             return (
                 "extrapolated midpoint rule, searched for jumps: the torque contains"
-                f" {', '.join(hidden)}, in which the places of kinks cannot be found"
+                f" {', '.join(hidden)}, in which kinks cannot be located"
             )
         if few or switches:
             ends = f", each ending where one of {switches} switches (clip, where, ...) turns"
@@ -105,22 +110,23 @@ class AbstractIntegration(AbstractMethod):
         return self.controller is None
 
     def _bodies_at_once(self, scene: Scene, state: State, ts: Array, record: Record) -> int:
-        """For a solver in which each body has its own steps."""
-        asked, found = getattr(self.solver, "bodies_at_once", None), []
+        """Default chunk of a solver in which each body has its own steps."""
         if jax.default_backend() != "cpu":
             return _ON_ACCELERATOR
-        if asked is None:
+        solver = self.solver
+        if not isinstance(solver, Extrapolation):
             return 1
         if state.wxyz.shape[0] <= FEW:
             return FEW
+        counts: list[int] = []
 
-        def look(scene, state):
-            y0, _ = self._start(scene, state, ts, record)
-            term, dynamics = self._posed(scene, state, ts, record)
-            found.append(asked(term, ts[0], y0, dynamics))
+        def trace(scene, state):
+            y0, _ = self._initial_state(scene, state, ts, record)
+            term, dynamics = self._equations(scene, state, ts, record)
+            counts.append(solver.bodies_at_once(term, ts[0], y0, dynamics))
 
-        eqx.filter_eval_shape(look, scene, state)
-        return found[0]
+        eqx.filter_eval_shape(trace, scene, state)
+        return counts[0]
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         jumps = _may_jump(scene)
@@ -128,9 +134,9 @@ class AbstractIntegration(AbstractMethod):
         if self._is_automatic:
             by_loop, jumps = self._suits_loop(scene, state, ts, record, jumps)
         if by_loop:
-            found = self._run_by_loop(scene, state, ts, rtol, record)
-            if found is not None:
-                return found[0]
+            result = self._run_by_loop(scene, state, ts, rtol, record)
+            if result is not None:
+                return result[0]
         size = 1
         if ts.ndim == 1:
             size = self.chunk or self._bodies_at_once(scene, state, ts, record)
@@ -146,14 +152,15 @@ class AbstractIntegration(AbstractMethod):
         if n <= min(size, _SORTED):
             whole = kernel(one, of_units=True) if n <= FEW else one
             return whole(Distinct((lanes, times)))
-        # who shares a chunk is of like rate, and none that takes long is left to the end of it
+        # chunks of bodies with similar rates, the fastest first: no slow body is left for the end
         order = jnp.argsort(-natural_rates(scene, state, ts))
         sorted_lanes = jax.tree.map(lambda x: x[order], Distinct((lanes, times)))
-        found = map_chunks(one, sorted_lanes, n, size)
-        return jax.tree.map(lambda x: x[jnp.argsort(order)], found)
+        results = map_chunks(one, sorted_lanes, n, size)
+        return jax.tree.map(lambda x: x[jnp.argsort(order)], results)
 
-    def _start(self, scene, state, ts, record: Record):
-        """The first state, with the work that is recorded, and what the chart can hold."""
+    def _initial_state(self, scene, state, ts, record: Record):
+        """The initial state, with the work where it is recorded, and whether the coordinates hold
+        it."""
         y0, sound = self.chart.start(scene, state, ts[..., 0])
         if record.work:
             wheels = scene.dynamics.wheels
@@ -161,19 +168,25 @@ class AbstractIntegration(AbstractMethod):
             y0 = (*y0, (jnp.zeros_like(y0[0][0]),) * (1 + len(loose)))
         return y0, sound
 
-    def _posed(self, scene, state, ts, record: Record):
-        """The term of the equations, and its arguments."""
+    def _equations(self, scene, state, ts, record: Record):
+        """The diffrax term of the equations of motion, and its arguments."""
         dynamics = self.chart.dynamics(scene, state, ts)
         if not record.work:
             return diffrax.ODETerm(self.chart.field), dynamics
-        known = dynamics.hamiltonian, dynamics.torque, dynamics.units
-        return diffrax.ODETerm(self.chart.field_and_power), Dynamics(*known, wheels=dynamics.wheels)
+        parts = dynamics.hamiltonian, dynamics.torque, dynamics.units
+        return diffrax.ODETerm(self.chart.field_and_power), Dynamics(*parts, wheels=dynamics.wheels)
 
     def _run_by_loop(
-        self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record,
+        self,
+        scene: Scene,
+        state: State,
+        ts: Array,
+        rtol: Array,
+        record: Record,
         search: Search | None = None,
-    ) -> Any:  # fmt: skip
-        """None where switches may be hidden from it."""
+    ) -> Any:
+        """Samples and events by the loop of explicit steps; None where switches may be hidden from
+        it."""
         lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
 
         def one(chunk):
@@ -186,23 +199,24 @@ class AbstractIntegration(AbstractMethod):
         if n <= FEW:
             return map_chunks(kernel(one, of_units=True), Distinct((lanes, times)), n, n)
         size = self.chunk or self._lanes_of_loop(scene, state, ts, record, search)
-        # bodies that share a chunk wait for one another: put together those of similar rates
+        # bodies of a chunk wait for one another: similar rates in each
         order = jnp.argsort(-natural_rates(scene, state, ts))
         sorted_lanes = jax.tree.map(lambda x: x[order], Distinct((lanes, times)))
-        found = map_chunks(one, sorted_lanes, n, size)
-        return jax.tree.map(lambda x: x[jnp.argsort(order)], found)
+        results = map_chunks(one, sorted_lanes, n, size)
+        return jax.tree.map(lambda x: x[jnp.argsort(order)], results)
 
     def _lanes_of_loop(self, scene, state, ts, record: Record, search) -> int:
-        """Bodies that the loop moves side by side: as many as a fused kernel holds; where the field
-        does not fit into one (products of matrices), so many that a call pays."""
+        """Bodies that the loop integrates side by side: as many as a fused kernel holds (of 50
+        satellites 64 at once take 3 times as long); where the field does not fit into one, as a
+        network with its matrix products, as many as pay for the calls."""
         problem = self._problem(scene, state, ts, record, search)
         return FEW if is_holdable(problem.closed.jaxpr) else LANES
 
     def search(
         self, scene: Scene, state: State, ts: Array, rtol: Array, search: Search, final_only: bool
     ) -> tuple[Samples, Found] | None:
-        """Samples at ``ts`` and then at the events that are met, of which ``Found`` tells more;
-        None where this method cannot look for events on its way."""
+        """Samples at ``ts`` followed by those at the events, and the events; None where this method
+        does not search for events while it integrates."""
         if not self._is_automatic or not state.wxyz.shape[0]:
             return None
         record = Record(final_only=final_only)
@@ -213,16 +227,16 @@ class AbstractIntegration(AbstractMethod):
         return isinstance(self.solver, Automatic) and self.controller is None
 
     def _are_few(self, scene: Scene, state: State) -> bool:
-        """Whether these are few bodies on which torques act, whose rounding need not be carried
-        along: explicit steps do not."""
+        """Whether torques act on few bodies and rounding errors need not be compensated, which the
+        explicit steps do not do."""
         acts = scene.torque is not None or bool(scene.dynamics.coupled)
         few = 0 < state.wxyz.shape[0] <= FEW_BODIES
         plain = isinstance(self.solver, Automatic) and not self.solver.compensated
         return acts and few and plain
 
     def _suits_loop(self, scene, state, ts, record: Record, jumps: bool) -> tuple[bool, bool]:
-        """Whether explicit steps are the faster ones, or the only ones that end at switches; and
-        whether other steps are to be searched for jumps."""
+        """Whether the loop of explicit steps is faster, or the only one that ends at switches; and
+        whether other steps must be searched for jumps."""
         if self._are_few(scene, state):
             return True, jumps
         if not jumps or not state.wxyz.shape[0]:
@@ -231,98 +245,105 @@ class AbstractIntegration(AbstractMethod):
         return switches.count > 0, bool(switches.hidden)
 
     def _problem(self, scene, state, ts, record: Record, search: Search | None = None) -> Problem:
-        """The field of one body, and the events that are searched for."""
-        y0, _ = self._start(scene, state, ts, record)
+        """The equations of one body as a program, with the functions of the events."""
+        y0, _ = self._initial_state(scene, state, ts, record)
 
         fns = () if search is None else search.fns
 
-        def watch(parts, t, y):
+        def event_values(parts, t, y):
             scene, _ = parts
             later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
             y = jax.tree.map(lambda x: x[:, None], tuple(y))
             wxyz, omega, _ = self.chart.finish(later, y, jnp.reshape(t, (1, 1)))
             return jnp.stack([fn(wxyz[0, 0], omega[0, 0], t) for fn in fns])
 
-        def pose(parts):
+        def equations(parts):
             scene, state = parts
-            return self._posed(scene, state, ts, record)
+            return self._equations(scene, state, ts, record)
 
         masks = is_lane_tree((scene, state))
-        seen = None if search is None else watch
-        return Problem.of(pose, (scene, state), masks, y0, ts.reshape(-1)[0], seen)
+        values = None if search is None else event_values
+        return Problem.of(equations, (scene, state), masks, y0, ts.reshape(-1)[0], values)
 
     def _solve_by_loop(
         self, scene, state, ts, rtol, record: Record, search: Search | None = None
     ) -> tuple[Samples, Found | None] | None:
-        """One chunk of lanes, by the loop of explicit steps; ``ts`` (T,) or (N, T)."""
-        y0, sound = self._start(scene, state, ts, record)
-        term, dynamics = self._posed(scene, state, ts, record)
+        """One chunk of bodies by the loop of explicit steps; ``ts`` (T,) or (N, T)."""
+        y0, sound = self._initial_state(scene, state, ts, record)
+        term, dynamics = self._equations(scene, state, ts, record)
         problem = self._problem(scene, state, ts, record, search)
         if problem.switches.hidden:
             return None
         leaves, tree = jax.tree.flatten(y0)
         rtol, bodies = jax.lax.stop_gradient(rtol), leaves[0].shape[0]
         times = ts[..., -1:] if record.final_only else ts
-        told, start, y = (dynamics.units, rtol), ts[..., 0], jnp.stack(leaves)
-        asked = Search() if search is None else search
-        program = problem._replace(arrays=[])  # a rule of derivatives holds no traced values
-        passing = asked.passing
+        unit_data, start, y = (dynamics.units, rtol), ts[..., 0], jnp.stack(leaves)
+        searched = Search() if search is None else search
+        program = problem._replace(arrays=[])  # a derivative rule must not close over traced values
+        passing = searched.passing
 
-        def make(arrays, told, linked, asked=passing):
-            units, rtol = told
+        def make(arrays, unit_data, differentiable, searched=passing):
+            units, rtol = unit_data
             motion = program.motion(arrays, _by_units, units)
             return motion, LoopOptions(
-                rtol, self.max_steps, asked.capacity, asked.directions, asked.terminal, linked
+                rtol,
+                self.max_steps,
+                searched.capacity,
+                searched.directions,
+                searched.terminal,
+                differentiable,
             )
 
-        given = jax.lax.stop_gradient((problem.arrays, told, start, times, y))
-        solved = solve(partial(make, asked=asked), *given)
+        constants = jax.lax.stop_gradient((problem.arrays, unit_data, start, times, y))
+        solved = solve(partial(make, searched=searched), *constants)
         states = solved.samples.reshape(bodies, -1, len(leaves))[:, :-1]
-        found = None
+        events = None
         if search is not None:
-            found, times, states = with_events(search, solved, times, states)
-        # back along the exact equations an error of a damped motion would grow; along its steps not
+            events, times, states = with_events(search, solved, times, states)
+        # backward along the exact equations errors of a damped motion grow; along its steps they
+        # do not
         damped = scene.torque is not None or bool(scene.dynamics.coupled)
         if problem.switches.count or times.ndim > 1 or damped:
-            states = samples(make, problem.arrays, told, y, start, times, states)
+            states = samples(make, problem.arrays, unit_data, y, start, times, states)
         else:
             equations, c = equations_of(term, dynamics, y0, start, rtol, False)
             path = [jnp.moveaxis(states[..., i], 0, 1) for i in range(len(leaves))]
             path = path_of(equations, 1, c, leaves, start, times, path)
             states = jnp.stack([jnp.moveaxis(x, 0, 1) for x in path], axis=-1)
-        seen = jax.tree.unflatten(tree, [states[..., i].T for i in range(len(leaves))])
-        last = jax.tree.map(lambda x: x[-1:], seen)
+        saved = jax.tree.unflatten(tree, [states[..., i].T for i in range(len(leaves))])
+        last = jax.tree.map(lambda x: x[-1:], saved)
         status = jnp.array(_OF_LOOP)[solved.outcome]
-        moved = Moved(seen, last, solved.steps, status, solved.error)
-        return self._samples(scene, moved, times, sound, record), found
+        solution = Solution(saved, last, solved.steps, status, solved.error)
+        return self._samples(scene, solution, times, sound, record), events
 
     def _solve(self, scene, state, ts, rtol, record: Record, jumps: bool) -> Samples:
-        """One chunk of lanes."""
-        y0, sound = self._start(scene, state, ts, record)
-        kept = ts[-1:] if record.final_only else ts
+        """One chunk of bodies by ``diffrax.diffeqsolve``, between the edges of pulses."""
+        y0, sound = self._initial_state(scene, state, ts, record)
+        saved = ts[-1:] if record.final_only else ts
         edges = None if scene.torque is None else scene.torque.edges
         if edges is None:
-            found = self._moved(scene, state, y0, ts, rtol, record, jumps)
-            return self._samples(scene, found, kept, sound, record)
+            solution = self._solve_smooth(scene, state, y0, ts, rtol, record, jumps)
+            return self._samples(scene, solution, saved, sound, record)
 
         def move(middle, y, times, parts):
             torque = scene.torque.during(middle)
             now = Scene(scene.inertia, scene.potential, torque, scene.rotors)
             share = jnp.maximum(rtol / parts, 8 * jnp.finfo(rtol.dtype).eps)
-            return self._moved(now, state, y, times, share, record, jumps)
+            return self._solve_smooth(now, state, y, times, share, record, jumps)
 
-        found = in_segments(move, y0, ts, edges, record.final_only)
-        return self._samples(scene, found, kept, sound, record)
+        solution = in_segments(move, y0, ts, edges, record.final_only)
+        return self._samples(scene, solution, saved, sound, record)
 
-    def _moved(self, scene, state, y0, ts, rtol, record, jumps: bool) -> Moved:
-        """States from ``y0`` on."""
-        term, dynamics = self._posed(scene, state, ts, record)
-        asked = _Asked(ts, rtol, self.dt0, self.max_steps, record.final_only, jumps)
-        if self.controller is None:
-            make = getattr(self.solver, "stepping", None)
-            stepping = asked.stock(self.solver, y0, term, dynamics) if make is None else make(asked)
+    def _solve_smooth(self, scene, state, y0, ts, rtol, record, jumps: bool) -> Solution:
+        """The solution from ``y0`` through ``ts``: the one call of diffrax."""
+        term, dynamics = self._equations(scene, state, ts, record)
+        request = Request(ts, rtol, self.dt0, self.max_steps, record.final_only, jumps)
+        if self.controller is not None:
+            stepping = request.by_controller(self.solver, self.controller)
+        elif isinstance(self.solver, Extrapolation):
+            stepping = self.solver.stepping(request)
         else:
-            stepping = asked.given(self.solver, self.controller)
+            stepping = request.by_error_estimate(self.solver, y0, term, dynamics)
         solution = _diffeqsolve(
             term,
             stepping.solver,
@@ -342,11 +363,11 @@ class AbstractIntegration(AbstractMethod):
         ys: Any = solution.ys
         samples, last = ys
         steps, status = _outcome(solution, y0[0][0].shape)
-        return Moved(samples, last, steps, status, error)
+        return Solution(samples, last, steps, status, error)
 
-    def _samples(self, scene, found: Moved, kept, sound, record: Record) -> Samples:
-        """``kept``: times of the samples (T,) or (N, T)."""
-        samples, last = (_lanes_first(y) for y in (found.samples, found.last))
+    def _samples(self, scene, solution: Solution, times, sound, record: Record) -> Samples:
+        """Attitudes, rates and status from a solution; ``times`` of the samples (T,) or (N, T)."""
+        samples, last = (_lanes_first(y) for y in (solution.samples, solution.last))
         dynamics = scene.dynamics
         work, motors, spins = None, None, None
         if record.work:
@@ -356,39 +377,39 @@ class AbstractIntegration(AbstractMethod):
         if dynamics.coupled:
             spins = jnp.stack(samples[2], axis=-1)
         later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
-        kept = jnp.atleast_2d(kept)
-        wxyz, omega, _ = self.chart.finish(later, tuple(samples), kept)
-        *_, sound_at_end = self.chart.finish(later, tuple(last), kept[:, -1:])
+        times = jnp.atleast_2d(times)
+        wxyz, omega, _ = self.chart.finish(later, tuple(samples), times)
+        *_, sound_at_end = self.chart.finish(later, tuple(last), times[:, -1:])
         wxyz, omega = (jnp.where(sound[:, None, None], x, jnp.nan) for x in (wxyz, omega))
-        taken, unfinished = found.steps, found.status
+        outcome = solution.status
         finite = jnp.all(jnp.isfinite(wxyz), axis=(-1, -2))
         finite = finite & jnp.all(jnp.isfinite(omega), axis=(-1, -2))
-        done = unfinished == Status.SUCCESSFUL
-        status = jnp.where(done & ~finite, Status.NOT_FINITE, unfinished)
+        done = outcome == Status.SUCCESSFUL
+        status = jnp.where(done & ~finite, Status.NOT_FINITE, outcome)
         lost = ~sound | (~sound_at_end[:, -1] & ~done)
-        if self.chart.canonical:  # where steps become too short is where the chart ends
-            lost = lost | (unfinished == Status.STEP_FAILED)
+        if self.chart.canonical:  # steps become too short where the Euler angles are singular
+            lost = lost | (outcome == Status.STEP_FAILED)
         return Samples(
             wxyz if record.attitude else None,
             omega if record.rates else None,
             jnp.where(lost, Status.CHART_SINGULAR, status),
-            taken,
+            solution.steps,
             work,
-            found.error,
+            solution.error,
             motors,
             spins,
         )
 
 
 _SORTED = 64
-"""Bodies, beyond which they are put in order of their rates."""
+"""Number of bodies beyond which they are sorted by their rates."""
 
 _ON_ACCELERATOR = 2**18
-"""Bodies that are moved together there: enough to fill it, few enough for its memory."""
+"""Bodies integrated together on an accelerator: enough to fill it, few enough for its memory."""
 
 
 class Stepping(NamedTuple):
-    """What is handed to ``diffrax.diffeqsolve``."""
+    """Arguments of ``diffrax.diffeqsolve``."""
 
     solver: diffrax.AbstractSolver
     controller: diffrax.AbstractStepSizeController
@@ -397,9 +418,9 @@ class Stepping(NamedTuple):
     dt0: Any
 
 
-class _Asked(NamedTuple):
-    """What a solver is asked for: the times, the error at the last of them, the first or longest
-    step, how many at most; whether only the last state is kept, and whether the rates may jump."""
+class Request(NamedTuple):
+    """Requirements of a solve: times, error at the last of them, first or longest step, maximum
+    number of steps; whether only the last state is saved, and whether the rates may jump."""
 
     ts: Array
     rtol: Array
@@ -408,30 +429,32 @@ class _Asked(NamedTuple):
     final_only: bool
     jumps: bool
 
-    def given(self, solver, controller) -> Stepping:
+    def by_controller(self, solver, controller) -> Stepping:
         """Steps of a controller that the user chose."""
         saved = self._saved(diffrax.SubSaveAt(ts=self.ts))
         return Stepping(solver, controller, saved, self.max_steps, self.dt0)
 
-    def marched(self, solver) -> Stepping:
-        """One step from each time to the next, of a solver that divides it by itself."""
+    def in_one_call(self, solver) -> Stepping:
+        """One step of diffrax from each time to the next, which the solver subdivides."""
         ends = self.ts[jnp.array([0, -1])] if self.final_only else self.ts
         saved = self._saved(diffrax.SubSaveAt(t0=True, steps=1))
         saved = eqx.tree_at(lambda s: s.solver_state, saved, True)
         return Stepping(solver, GivenTimes(ends), saved, ends.shape[0] - 1, None)
 
-    def stock(self, solver, y0, term, dynamics) -> Stepping:
-        """Steps of any solver with an error estimate."""
+    def by_error_estimate(self, solver, y0, term, dynamics) -> Stepping:
+        """Steps of any solver with an error estimate, by diffrax's PID controller."""
         leaves = jax.tree.leaves(y0)
         weights, rate = dynamics.units(leaves, jax.tree.leaves(term.vf(self.ts[0], y0, dynamics)))
-        turned = jnp.maximum(1, jnp.max(rate) * jnp.abs(self.ts[-1] - self.ts[0]))
+        angle = jnp.maximum(1, jnp.max(rate) * jnp.abs(self.ts[-1] - self.ts[0]))
         weights = [*weights, *[jnp.zeros_like(x) for x in leaves[len(weights) :]]]
-        weights, turned = jax.lax.stop_gradient((weights, turned))
-        atol = jnp.maximum(self.rtol / (2 * turned), 8 * jnp.finfo(self.rtol.dtype).eps)
+        weights, angle = jax.lax.stop_gradient((weights, angle))
+        atol = jnp.maximum(self.rtol / (2 * angle), 8 * jnp.finfo(self.rtol.dtype).eps)
         controller = diffrax.PIDController(rtol=0.0, atol=atol, norm=LaneNorm(tuple(weights)))
-        if not self.final_only:  # samples as accurate as steps, not as the interpolant
+        if (
+            not self.final_only
+        ):  # samples at the ends of steps are more accurate than the interpolant
             controller = diffrax.ClipStepSizeController(controller, step_ts=self.ts)
-        return self.given(solver, controller)
+        return self.by_controller(solver, controller)
 
     def _saved(self, samples) -> diffrax.SaveAt:
         last = diffrax.SubSaveAt(t1=True)
@@ -443,9 +466,9 @@ def _by_units(units, y, rates):
 
 
 class LaneNorm(eqx.Module):
-    """Error of the worst lane: root mean square over its components, each times its weight.
+    """Error of the worst body: root mean square over its components, each times its weight.
 
-    A batch that shares its steps so keeps every body's own tolerance.
+    A batch with shared steps thus satisfies the tolerance of every body.
     """
 
     weights: tuple[Array, ...]
@@ -454,23 +477,23 @@ class LaneNorm(eqx.Module):
         leaves = jax.tree.leaves(y)
         square = sum((w * x) ** 2 for w, x in zip(self.weights, leaves))
         worst = jnp.max(square) / len(leaves)
-        positive = worst > 0  # the root's slope at zero is infinite: keep it out of gradients
+        positive = worst > 0  # the derivative of the root at zero is infinite
         return jnp.where(positive, jnp.sqrt(jnp.where(positive, worst, 1)), 0)
 
 
 def _in_parts(adjoint: diffrax.AbstractAdjoint, scene: Scene) -> diffrax.AbstractAdjoint:
-    """On the way back from states that a torque has drawn together an error grows no longer than
-    through one of eight parts."""
+    """The adjoint in at least eight parts where a torque acts: backward through damping errors
+    grow, and each part starts anew from a saved state."""
     if isinstance(adjoint, FlowAdjoint) and (scene.torque is not None or scene.dynamics.coupled):
         return FlowAdjoint(adjoint.rtol, max(adjoint.parts, 8))
     return adjoint
 
 
 def _of_wheels(wheels, loose: Sequence[Array]) -> Array:
-    """What belongs to the wheels that are not held, as (..., m) of all; zero where held."""
-    found = iter(loose)
+    """Values of the wheels that turn freely or by a motor, as (..., m) of all; else zero."""
+    values = iter(loose)
     zero = jnp.zeros_like(loose[0])
-    return jnp.stack([zero if held else next(found) for held in wheels.held], axis=-1)
+    return jnp.stack([zero if held else next(values) for held in wheels.held], axis=-1)
 
 
 def _lanes_first(y):
@@ -479,7 +502,7 @@ def _lanes_first(y):
 
 
 def _outcome(solution, shape) -> tuple[Array, Array]:
-    """Steps and status of every lane."""
+    """Steps and status of every body."""
     reason = getattr(solution.solver_state, "reason", None)
     if reason is not None:  # each body has steps of its own
         return solution.solver_state.steps.astype(jnp.int32), jnp.array(_OF_MIDPOINT)[reason]
@@ -493,6 +516,7 @@ def _outcome(solution, shape) -> tuple[Array, Array]:
     )
 
 
+# in the order of the outcomes of ``_loop.py``
 _OF_LOOP = (
     Status.SUCCESSFUL,
     Status.SUCCESSFUL,
@@ -504,10 +528,10 @@ _OF_LOOP = (
 )
 
 FEW_BODIES = 4
-"""Bodies up to which explicit steps are taken where torques act: these compile in half the time (a
-satellite: 1.1 s against 1.9 s), samples do not end them, and their derivatives stand damping.
-Bodies in a potential alone take half as long by extrapolation (one top, 20 s: 0.54 against 0.99
-ms), which compiles as fast there."""
+"""Number of bodies up to which explicit steps are taken where torques act: these compile in half
+the time (a satellite: 1.1 s against 1.9 s), samples do not end them, and their derivatives tolerate
+damping. Bodies in a potential alone take half as long by extrapolation (one top, 20 s: 0.54 against
+0.99 ms), which compiles as fast there."""
 
 _OF_MIDPOINT = (Status.SUCCESSFUL, Status.MAX_STEPS, Status.STEP_FAILED, Status.NOT_FINITE)
 
