@@ -49,10 +49,12 @@ class Network(eqx.Module):
 
     layers: eqx.nn.MLP
 
-    def __init__(self, activation: str, hidden: int = 32, dtype: Any = None):
+    def __init__(self, activation: str, hidden: int = 32, dtype: Any = np.float64):
         function = {"relu": jax.nn.relu, "tanh": jnp.tanh}[activation]
-        self.layers = eqx.nn.MLP(
-            7, 3, hidden, 2, function, key=jax.random.key(2), dtype=dtype or jnp.float64
+        layers = eqx.nn.MLP(7, 3, hidden, 2, function, key=jax.random.key(2), dtype=jnp.float64)
+        # the same weights rounded: random numbers of another dtype are others
+        self.layers = jax.tree.map(
+            lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, layers
         )
 
     def __call__(self, t, wxyz, omega):
@@ -290,33 +292,31 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     sizes = BODIES[:1] if options.quick else BODIES + ((4096,) if options.many else ())
     few = options.quick
-    rows, checks = [], []
-    for activation in ("relu",) if few else ("tanh", "relu"):
-        for bodies in sizes:
+    numbers: dict[str, Any] = {"horizon": HORIZON, "rows": [], "checks": [], "kinds": []}
+    for bodies in sizes:
+        for activation in ("relu",) if few else ("tanh", "relu"):
             program = Program(polhode_loss(states(bodies), REFERENCE), Network(activation))
             _, exact = program()
             if bodies == sizes[0]:
                 along, across = differences(activation, exact, bodies)
                 check = {"activation": activation, "along": along, "across": across}
-                checks.append(check)
+                numbers["checks"].append(check)
                 print(check, flush=True)
             runs = [(np.float64, OURS[1:2] if few else OURS, PEERS[::3] if few else PEERS)]
             if not few and bodies == 32:
                 runs.append((np.float32, SINGLE, SINGLE))
             for run in runs:
                 for row in measure(activation, bodies, *run, exact):
-                    rows.append(row)
+                    numbers["rows"].append(row)
                     print(
                         f"{activation} {bodies:>5} {row['dtype']} {row['program']:<14}"
                         f"{row['tolerance']:>8.0e}{row['seconds']:>10.4f} s{row['error']:>9.1e}"
                         f"{row['compile_s']:>7.1f} s{row['memory_MB'] or 0:>9.2f} MB",
                         flush=True,
                     )
-    kinds = []
     for kind in list(KINDS)[:1] if few else KINDS:
-        kinds.append(measure_kind(kind, 4 if few else 32))
-        print(kinds[-1], flush=True)
-    numbers = {"horizon": HORIZON, "rows": rows, "checks": checks, "kinds": kinds}
+        numbers["kinds"].append(measure_kind(kind, 4 if few else 32))
+        print(numbers["kinds"][-1], flush=True)
     path = _report.write("controllers", numbers, path=options.output, packages=("scipy",))
     print(f"written: {path.name}")
 
