@@ -8,9 +8,6 @@ import vocabulary
 WORDS, BARE = vocabulary.violations()
 ALLOWED = {
     "polhode.Crossings: slope",
-    "polhode.Event.mended: mended",
-    "polhode.Event.mended: most",
-    "polhode.Event.mended: near",
     "polhode.Inertia.turned: turned",
     "polhode.MassProperties.moved: moved",
     "polhode.files.SceneFileError: given",

@@ -18,20 +18,20 @@ from polhode._method import Status
 from polhode._scene import Scene, State
 from polhode._trajectory import Trajectory, begun, moved_through, moved_to
 
-A_TURN = 32
-"""Looks in a turn of the fastest natural rate."""
+SAMPLES_PER_TURN = 32
+"""Samples per revolution at the fastest natural rate."""
 
-_TOO_MANY = 20_000_000
-"""Looks at all bodies together, which are held in memory."""
+_MAX_SAMPLES = 20_000_000
+"""Samples of all bodies together that fit in memory."""
 
-_ROOM = 16
-"""Least number of places where the function turns back that are looked at."""
+_MIN_CAPACITY = 16
+"""Minimum number of minima of the function that are examined."""
 
 CAPACITY = 256
 """Crossings of each body that the steps store unless told otherwise."""
 
 AT_START = 1e-6
-"""Part of the time between two looks within which a crossing is the start itself."""
+"""Part of the time between two samples within which a crossing is the start itself."""
 
 
 class Crossings(eqx.Module):
@@ -87,32 +87,32 @@ def crossings(
         traj.at(up.times).euler()
     """
     event = fn if isinstance(fn, Event) else Event(fn, direction, samples)
-    room = at_least("capacity", capacity, 1)
-    looks = event.samples if samples is None else at_least("samples", samples, 2)
+    stored = at_least("capacity", capacity, 1)
+    size = event.samples if samples is None else at_least("samples", samples, 2)
     for name in ("wxyz", "omega_body"):
         getattr(trajectory, name)  # raises where it was not recorded
     if trajectory.propagator is None:
         raise ValueError("this trajectory was made by hand: use one that ph.simulate returns.")
     propagator: Any = trajectory.propagator
     if not propagator.method.exact:
-        met = _met(trajectory, event, room or CAPACITY)
+        met = _by_steps(trajectory, event, stored or CAPACITY)
         if met is not None:
             _raise_if_lost(met[1], "the steps to the last time")
             return met[0] if capacity is not None else _all_of(met[0], trajectory, event)
-    if looks is None:
-        looks = _looks(trajectory)
-    if room is None:
+    if size is None:
+        size = _sample_count(trajectory)
+    if stored is None:
         if not is_concrete(trajectory):
             raise ValueError(
                 "under jit, vmap or grad the number of stored crossings must be given: capacity=8."
             )
-        room = _ROOM
-    found, lost = _found(trajectory, event, room, looks)
-    _raise_if_lost(lost, f"its way through {looks:,} looks")
-    while capacity is None and int(np.max(found.count, initial=0)) > room:
-        room = 2 ** int(np.ceil(np.log2(np.max(found.count))))
-        found, _ = _found(trajectory, event, room, looks)
-    if capacity is None:  # without room that no body uses
+        stored = _MIN_CAPACITY
+    found, lost = _by_sampling(trajectory, event, stored, size)
+    _raise_if_lost(lost, f"the way through {size:,} samples")
+    while capacity is None and int(np.max(found.count, initial=0)) > stored:
+        stored = 2 ** int(np.ceil(np.log2(np.max(found.count))))
+        found, _ = _by_sampling(trajectory, event, stored, size)
+    if capacity is None:  # drop columns that no body uses
         used = int(np.max(found.count, initial=0))
         found = Crossings(found.times[..., :used], found.slope[..., :used], found.count)
     return found
@@ -130,14 +130,14 @@ def _all_of(found: Crossings, trajectory: Trajectory, event: Event) -> Crossings
     """All crossings, in as many columns as there are, where their number is known."""
     if not is_concrete(found):
         return found
-    most = int(np.max(found.count, initial=0))
-    if most > CAPACITY:
-        found, _ = _met(trajectory, event, 2 ** int(np.ceil(np.log2(most))))
-    return Crossings(found.times[..., :most], found.slope[..., :most], found.count)
+    capacity = int(np.max(found.count, initial=0))
+    if capacity > CAPACITY:
+        found, _ = _by_steps(trajectory, event, 2 ** int(np.ceil(np.log2(capacity))))
+    return Crossings(found.times[..., :capacity], found.slope[..., :capacity], found.count)
 
 
 @eqx.filter_jit
-def _met(trajectory: Trajectory, event: Event, capacity: int) -> Any:
+def _by_steps(trajectory: Trajectory, event: Event, capacity: int) -> Any:
     """Crossings that the steps find on their way, and for which bodies (...) these did not come to
     the last time; None where the method does not look for them."""
     batch = trajectory.batch_shape
@@ -154,39 +154,47 @@ def _met(trajectory: Trajectory, event: Event, capacity: int) -> Any:
     samples, events = found
     spins = None if samples.spins is None else samples.spins[:, 1:]
     there = Trajectory(
-        events.rows[:, 1:], samples.wxyz[:, 1:], samples.omega_body[:, 1:], samples.status,
-        samples.steps, Scene(**parts), spins=spins, propagator=propagator,
-    )  # fmt: skip
+        events.rows[:, 1:],
+        samples.wxyz[:, 1:],
+        samples.omega_body[:, 1:],
+        samples.status,
+        samples.steps,
+        Scene(**parts),
+        spins=spins,
+        propagator=propagator,
+    )
     times = events.rows[:, 1:]
     use = jnp.isfinite(events.times)
-    grain = 64 * jnp.finfo(times.dtype).eps * jnp.abs(times)
-    late, there = event.mended(there, grain)
+    tolerance = 64 * jnp.finfo(times.dtype).eps * jnp.abs(times)
+    delay, there = event.differentiable_at(there, tolerance)
     _, slope = event.values(there)
     lost = samples.status != Status.SUCCESSFUL
     lost = lost & (trajectory.status.reshape(-1) == Status.SUCCESSFUL)
     count = jnp.where(lost, capacity + 1, events.count).astype(jnp.int32)
-    times = jnp.where(use, times + late, jnp.inf).reshape(*batch, capacity)
+    times = jnp.where(use, times + delay, jnp.inf).reshape(*batch, capacity)
     slope = jnp.where(use, slope, 0).reshape(*batch, capacity)
     return Crossings(times, slope, count.reshape(batch)), lost.reshape(batch)
 
 
-def _looks(trajectory: Trajectory) -> int:
-    """How many looks find every crossing, of a motion that is known."""
+def _sample_count(trajectory: Trajectory) -> int:
+    """How many samples find every crossing, of a motion that is known."""
     if not is_concrete(trajectory):
         raise ValueError(
-            "under jit, vmap or grad the number of looks must be known: ph.Event(fn, samples=1000),"
-            " 32 or more in a turn of the fastest rate."
+            "under jit, vmap or grad the number of samples must be known:"
+            " ph.Event(fn, samples=1000), 32 or more per revolution of the fastest rate."
         )
     turned = np.max(np.asarray(_turned(trajectory)), initial=0)
-    looks = max(17, 1 + int(np.ceil(A_TURN * turned / (2 * np.pi))) if np.isfinite(turned) else 17)
-    grain = 2 ** max(0, int(np.log2(looks)) - 2)  # few numbers, for fewer compiled programs
-    looks = 1 + -(-(looks - 1) // grain) * grain
-    if looks * max(1, int(np.prod(trajectory.batch_shape))) > _TOO_MANY:
+    size = max(
+        17, 1 + int(np.ceil(SAMPLES_PER_TURN * turned / (2 * np.pi))) if np.isfinite(turned) else 17
+    )
+    tolerance = 2 ** max(0, int(np.log2(size)) - 2)  # few numbers, for fewer compiled programs
+    size = 1 + -(-(size - 1) // tolerance) * tolerance
+    if size * max(1, int(np.prod(trajectory.batch_shape))) > _MAX_SAMPLES:
         raise ValueError(
-            f"{looks:,} looks at each body are needed for the {turned:.3g} rad that it turns:"
+            f"{size:,} samples of each body are needed for the {turned:.3g} rad that it turns:"
             " search a shorter time or fewer bodies at once, or give samples= for a slow function."
         )
-    return looks
+    return size
 
 
 @eqx.filter_jit
@@ -199,7 +207,7 @@ def _turned(trajectory: Trajectory) -> Array:
 
 
 def turning_rates(trajectory: Trajectory) -> Array:
-    """The most (..., T) that a body may turn at, by its momentum at each sample [rad/s]."""
+    """Upper bound (..., T) of the rate of a body, by its momentum at each sample [rad/s]."""
     carrier = trajectory._scene.carrier
     size = jnp.linalg.norm(carrier.momentum(trajectory.omega_body), axis=-1)
     return size / jnp.min(carrier.moments, axis=-1)
@@ -215,47 +223,49 @@ def _natural_rates(trajectory: Trajectory) -> Array:
 
 
 @eqx.filter_jit
-def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> tuple[Crossings, Array]:
-    """The first ``most`` crossings, and for which bodies (...) the looks could not be taken."""
+def _by_sampling(
+    trajectory: Trajectory, event: Event, capacity: int, size: int
+) -> tuple[Crossings, Array]:
+    """The first ``capacity`` crossings, and the bodies (...) that could not be sampled."""
     still = jax.lax.stop_gradient
     arrays, rest = eqx.partition(trajectory, eqx.is_inexact_array)
     fixed: Trajectory = eqx.combine(still(arrays), rest)
     batch = trajectory.batch_shape
     ts = fixed.ts
-    share = jnp.linspace(0, 1, looks, dtype=ts.dtype).at[0].set(AT_START / (looks - 1))
+    share = jnp.linspace(0, 1, size, dtype=ts.dtype).at[0].set(AT_START / (size - 1))
     share = share.reshape((1,) * (ts.ndim - 1) + share.shape)
     grid = ts[..., :1] + share * (ts[..., -1:] - ts[..., :1])
-    seen = moved_through(fixed, grid)
+    sampled = moved_through(fixed, grid)
     propagator: Any = trajectory.propagator
     # what is stepped goes on from the nearest look
-    whence = fixed if propagator.method.exact else seen
-    values, slopes = event.values(seen)
-    values, slopes = (x.reshape(-1, looks) for x in (values, slopes))
-    grid = jnp.broadcast_to(grid, (*batch, looks)).reshape(-1, looks)
+    origin = fixed if propagator.method.exact else sampled
+    values, slopes = event.values(sampled)
+    values, slopes = (x.reshape(-1, size) for x in (values, slopes))
+    grid = jnp.broadcast_to(grid, (*batch, size)).reshape(-1, size)
     values, slopes, grid = still((values, slopes, grid))
     ahead = jnp.where(grid[:, -1:] < grid[:, :1], -1, 1).astype(grid.dtype)
 
     def evaluate(t):
-        found = event.values(moved_to(whence, t.reshape(*batch, -1)))
+        found = event.values(moved_to(origin, t.reshape(*batch, -1)))
         return still(tuple(x.reshape(t.shape) for x in found))
 
     sides = jnp.where(values >= 0, 1, -1)
     changes = sides[:, 1:] != sides[:, :-1]
     if event.direction:
         changes = changes & (sides[:, 1:] * ahead == event.direction)
-    room = max(most, _ROOM)
-    dips = dips_of(grid, values, slopes, sides)
+    stored = max(capacity, _MIN_CAPACITY)
+    minima = minima_of(grid, values, slopes, sides)
 
-    # what turns back towards zero between two looks is looked at where it turns
-    place, is_dip = first_true(dips, room)
-    single, is_single = first_true(changes, room)
+    # a minimum between two samples is evaluated
+    place, is_minimum = first_true(minima, stored)
+    single, is_single = first_true(changes, stored)
     side = entries(sides, place)
     low, high = entries(grid, place), entries(grid, place + 1)
-    turns = low, high, entries(slopes, place), entries(slopes, place + 1), is_dip
+    turns = low, high, entries(slopes, place), entries(slopes, place + 1), is_minimum
 
     def brackets(turning, there):
-        """Between looks, and on both sides of such a turning point; which are pairs of these."""
-        pairs = is_dip & (jnp.where(there >= 0, 1, -1) != side)
+        """Between samples, and on both sides of such a turning point; which are pairs of these."""
+        pairs = is_minimum & (jnp.where(there >= 0, 1, -1) != side)
         columns = (
             (entries(grid, single), low, turning),
             (entries(grid, single + 1), turning, high),
@@ -267,7 +277,7 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> tuple
         *columns, use, rising = (jnp.concatenate(x, axis=-1) for x in columns)
         if event.direction:
             use = use & (jnp.where(rising, 1, -1) * ahead == event.direction)
-        order = jnp.argsort(jnp.where(use, ahead * columns[0], jnp.inf), axis=-1)[:, :room]
+        order = jnp.argsort(jnp.where(use, ahead * columns[0], jnp.inf), axis=-1)[:, :stored]
         return tuple(entries(x, order) for x in (*columns, use)), pairs
 
     def search(found, second):
@@ -287,28 +297,28 @@ def _found(trajectory: Trajectory, event: Event, most: int, looks: int) -> tuple
     times = points[1]
     each = 1 if event.direction else 2
     count = jnp.sum(changes, axis=-1) + each * jnp.sum(pairs, axis=-1)
-    # dips beyond the room were not looked at: there may be as many pairs of them
-    dipping = jnp.sum(dips, axis=-1)
-    count = jnp.where(dipping > room, jnp.maximum(count, each * dipping), count)
-    times, use = (x[:, :most].reshape(*batch, most) for x in (times, use))
-    slope, times = _polished(trajectory, event, times, use)
-    lost = (seen.status != Status.SUCCESSFUL) & (trajectory.status == Status.SUCCESSFUL)
-    count = jnp.where(lost, most + 1, count.reshape(batch)).astype(jnp.int32)
+    # minima beyond the stored were not looked at: there may be as many pairs of them
+    dipping = jnp.sum(minima, axis=-1)
+    count = jnp.where(dipping > stored, jnp.maximum(count, each * dipping), count)
+    times, use = (x[:, :capacity].reshape(*batch, capacity) for x in (times, use))
+    slope, times = _refined(trajectory, event, times, use)
+    lost = (sampled.status != Status.SUCCESSFUL) & (trajectory.status == Status.SUCCESSFUL)
+    count = jnp.where(lost, capacity + 1, count.reshape(batch)).astype(jnp.int32)
     return Crossings(jnp.where(use, times, jnp.inf), jnp.where(use, slope, 0), count), lost
 
 
-def _polished(trajectory: Trajectory, event: Event, times: Array, use: Array):
+def _refined(trajectory: Trajectory, event: Event, times: Array, use: Array):
     """Slopes and times with their derivatives."""
     safe = jnp.where(use, times, trajectory.ts[..., :1])
     # of the value no more than rounding is left to mend, or of a touch all digits are noise
-    grain = 64 * jnp.finfo(safe.dtype).eps * jnp.abs(safe)
-    late, there = event.polished(moved_to(trajectory, safe), grain)
+    tolerance = 64 * jnp.finfo(safe.dtype).eps * jnp.abs(safe)
+    delay, there = event.refined(moved_to(trajectory, safe), tolerance)
     _, slope = event.values(there)
-    return slope, safe + late
+    return slope, safe + delay
 
 
-def dips_of(grid, values, slopes, sides) -> Array:
-    """Between which looks (N, looks - 1) the function turns back before zero, and comes near it.
+def minima_of(grid, values, slopes, sides) -> Array:
+    """Between which samples (N, S - 1) the function turns back before zero, and comes near it.
 
     Near by the cubic through values and slopes, whose error is a hundredth of what it changes by.
     """
@@ -331,11 +341,11 @@ def entries(x: Array, k: Array) -> Array:
     return jnp.take_along_axis(x, k, axis=-1)
 
 
-def first_true(mask: Array, most: int) -> tuple[Array, Array]:
-    """Places (N, most) of the first that are true, and which of these there are."""
+def first_true(mask: Array, capacity: int) -> tuple[Array, Array]:
+    """Places (N, capacity) of the first that are true, and which of these there are."""
     size = mask.shape[-1]
     places = jnp.where(mask, jnp.arange(size), size)
-    if most > size:
-        places = jnp.pad(places, ((0, 0), (0, most - size)), constant_values=size)
-    places = jnp.sort(places, axis=-1)[:, :most]
+    if capacity > size:
+        places = jnp.pad(places, ((0, 0), (0, capacity - size)), constant_values=size)
+    places = jnp.sort(places, axis=-1)[:, :capacity]
     return jnp.where(places < size, places, 0), places < size

@@ -72,16 +72,16 @@ class Event(eqx.Module):
         )
         return jax.jvp(partial(_FUNCTION.mapped, self.fn), (wxyz, omega, t), slopes)
 
-    def mended(self, near: Trajectory, most: Array) -> tuple[Array, Trajectory]:
-        """``polished`` for samples at which the function is zero to rounding: the same derivatives,
+    def differentiable_at(self, near: Trajectory, limit: Array) -> tuple[Array, Trajectory]:
+        """``refined`` for samples at which the function is zero to rounding: the same derivatives,
         and no computation where none is needed."""
         arrays, rest = eqx.partition(near, eqx.is_inexact_array)
-        leaves, tree = jax.tree.flatten((arrays, most))
+        leaves, tree = jax.tree.flatten((arrays, limit))
 
         def moved(*leaves):
-            arrays, most = jax.tree.unflatten(tree, leaves)
-            late, there = self.polished(eqx.combine(arrays, rest), most)
-            return [late, *there._samples]
+            arrays, limit = jax.tree.unflatten(tree, leaves)
+            delay, there = self.refined(eqx.combine(arrays, rest), limit)
+            return [delay, *there._samples]
 
         closed = jax.make_jaxpr(moved)(*leaves)
         size = len(closed.consts)
@@ -99,15 +99,21 @@ class Event(eqx.Module):
 
         values = [jnp.zeros_like(near._t), *near._samples]
         operands = [*map(jnp.asarray, closed.consts), *leaves]
-        late, wxyz, omega, *spins = attached(rule, operands, values)
+        delay, wxyz, omega, *spins = attached(rule, operands, values)
         there = Trajectory(
-            near._t + late, wxyz, omega, near.status, near.steps, near.scene,
-            spins=spins[0] if spins else None, propagator=near.propagator,
-        )  # fmt: skip
-        return late, there
+            near._t + delay,
+            wxyz,
+            omega,
+            near.status,
+            near.steps,
+            near.scene,
+            spins=spins[0] if spins else None,
+            propagator=near.propagator,
+        )
+        return delay, there
 
-    def polished(self, near: Trajectory, most: Array) -> tuple[Array, Trajectory]:
-        """At samples ``near`` events: how much later (..., T) [s] these are, at most by ``most``,
+    def refined(self, near: Trajectory, limit: Array) -> tuple[Array, Trajectory]:
+        """At samples ``near`` events: how much later (..., T) [s] these are, at limit by ``limit``,
         and the samples then.
 
         Steps t - g(t)/s with one derivative s for all: they change nothing where g(t) is zero, and
@@ -116,12 +122,12 @@ class Event(eqx.Module):
         still = jax.lax.stop_gradient
         value, slope = self.values(near)
         touch, chord = slope == 0, still(jnp.where(slope == 0, 1, slope))
-        late = jnp.where(touch, 0, -value / chord)
-        late = late - still(late) + still(jnp.clip(late, -most, most))
-        value, _ = self.values(shortly_after(near, late))
+        delay = jnp.where(touch, 0, -value / chord)
+        delay = delay - still(delay) + still(jnp.clip(delay, -limit, limit))
+        value, _ = self.values(shortly_after(near, delay))
         change = jnp.where(touch, 0, -value / chord)
-        late = _differentiable(late + (change - still(change)), 2)
-        return late, shortly_after(near, late)
+        delay = _differentiable(delay + (change - still(change)), 2)
+        return delay, shortly_after(near, delay)
 
 
 def _differentiable(x: Array, order: int) -> Array:
@@ -140,7 +146,7 @@ def _differentiable(x: Array, order: int) -> Array:
         if order == 0:
             raise NotImplementedError(
                 "event times and states at events have first and second derivatives, and a third"
-                " one was asked for: differentiate twice at most, or take differences of second"
+                " one was asked for: differentiate twice at limit, or take differences of second"
                 " derivatives."
             )
         return _differentiable(primals[0], order - 1), tangents[0]

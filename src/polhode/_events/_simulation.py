@@ -75,12 +75,12 @@ def found_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tra
         spins=None if samples.spins is None else samples.spins[:, count:],
         propagator=propagator,
     )
-    grain = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(there._t)
-    late, states = jnp.zeros_like(there._t), there._samples
+    tolerance = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(there._t)
+    delay, states = jnp.zeros_like(there._t), there._samples
     for k, event in enumerate(events):
-        more, shifted = event.mended(there, grain)
+        more, shifted = event.differentiable_at(there, tolerance)
         is_this = found.which == k
-        late = jnp.where(is_this, more, late)
+        delay = jnp.where(is_this, more, delay)
         states = [
             jnp.where(is_this[..., None], x, y)
             for x, y in zip(shifted._samples, states, strict=True)
@@ -98,7 +98,7 @@ def found_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tra
         path,
         (status, samples.steps),
         events,
-        (jnp.where(jnp.isfinite(found.times), there._t + late, jnp.inf), found.which, found.count),
+        (jnp.where(jnp.isfinite(found.times), there._t + delay, jnp.inf), found.which, found.count),
         states,
     )
 

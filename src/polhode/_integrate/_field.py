@@ -7,7 +7,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from diffrax import AbstractTerm
 from jax.interpreters import partial_eval
 from jaxtyping import Array, PyTree
 
@@ -21,7 +20,7 @@ class BoundTerm(eqx.Module):
     static: Any = eqx.field(static=True)
 
     @classmethod
-    def of(cls, terms: AbstractTerm, args: PyTree) -> "BoundTerm":
+    def of(cls, terms: Any, args: PyTree) -> "BoundTerm":
         return cls(*eqx.partition((terms, args), eqx.is_array))
 
     def control(self, t0, t1, dtype):
