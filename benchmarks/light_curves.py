@@ -33,9 +33,9 @@ from scipy.spatial import ConvexHull
 
 import polhode as ph
 from polhode import lightcurve
-from polhode.lightcurve import _fit, _hypotheses, _model, _search, _solutions, _steps
+from polhode.lightcurve import _brightness, _fit, _frequencies, _search, _solutions
 
-_magnitudes = jax.jit(_model.magnitudes, static_argnums=0)
+_magnitudes = jax.jit(_brightness.magnitudes, static_argnums=0)
 
 VERDICTS = ("right", "within its errors", "listed", "told", "silent")
 HIGHEST = 7.0  # frequency sought of synthetic tumblers [1/d]
@@ -93,7 +93,7 @@ def synthetic(seed: int, noise: float, *, nights=24, days=80.0, each=20, spread=
         # twenty turns at least, and not within 0.1 % of a spin about one axis
         if wide and 2 / P_phi + 2 / P_psi < 7 and P_psi < days / 20:
             break
-    bodies = _model.Bodies(
+    bodies = _brightness.Bodies(
         jnp.asarray(np.r_[
             np.log(square[1:] / square[0]) / 2, np.log(axes[1:]), omega * scale, 0.3, 0.35
         ])[None],
@@ -103,9 +103,12 @@ def synthetic(seed: int, noise: float, *, nights=24, days=80.0, each=20, spread=
     points = blank.points(1.0)
     light = np.asarray(_magnitudes(lightcurve.HG1G2(), bodies, points))[0, : t.size]
     if egg:
-        body, q = lightcurve.Convex.from_mesh(vertices, faces), _model.attitudes(*bodies, points.t)
+        body, q = (
+            lightcurve.Convex.from_mesh(vertices, faces),
+            _brightness.attitudes(*bodies, points.t),
+        )
         sun, observer = (
-            jnp.stack(_model._to_body(q, v), -1)[0] for v in (points.sun, points.observer)
+            jnp.stack(_brightness._to_body(q, v), -1)[0] for v in (points.sun, points.observer)
         )
         light = -2.5 * jnp.log10(body.brightness(sun, observer)) - points.sphere[0]
         light = light + lightcurve.HG1G2().magnitudes(points.alpha[0], bodies.unknowns[0, 7:])
@@ -206,14 +209,14 @@ def best_possible(curve, body, learnt=None, floor=0.01, spread=0.02) -> dict:
 
     The errors with the nights' ``spread`` known, the cost with the one ``learnt``.
     """
-    phase, width = lightcurve.HG1G2(), np.full(_steps.BATCH, 3.0)
-    problem = _steps.Problem(phase, curve.points(floor, spread))
-    start = _steps.taken(jax.tree.map(np.asarray, body), np.zeros(1, int))
+    phase, width = lightcurve.HG1G2(), np.full(_search.BATCH, 3.0)
+    problem = _search.Problem(phase, curve.points(floor, spread))
+    start = _search.select_padded(jax.tree.map(np.asarray, body), np.zeros(1, int))
     state = problem.improve(problem.start(start, width), width, 20)
     normals, one = _fit._mirrors(curve), np.array([0])
-    (found,), *_ = _solutions.described(problem, state, one, curve, normals, 3.0)
-    problem = _steps.Problem(phase, curve.points(floor, learnt))
-    state = problem.improve(problem.look(*state[:2], width), width, 20)
+    (found,), *_ = _solutions.describe_solutions(problem, state, one, curve, normals, 3.0)
+    problem = _search.Problem(phase, curve.points(floor, learnt))
+    state = problem.improve(problem.evaluate(*state[:2], width), width, 20)
     return {
         "P_phi_std": found.P_phi_std / found.P_phi, "P_psi_std": found.P_psi_std / found.P_psi,
         "cost": float(state.cost[0]),
@@ -247,7 +250,7 @@ def speed(states: int = 100_000, samples: int = 400) -> dict:
     t = np.linspace(0, 25.0, samples)
     sun, observer = directions(t)
     points = lightcurve.LightCurve.of(t, 0 * t, sun, observer).points(0.02)
-    one = _hypotheses.Hypotheses(np.array([1.0]), np.array([1.3]), np.array([True]))
+    one = _frequencies.Hypotheses(np.array([1.0]), np.array([1.3]), np.array([True]))
     phase = lightcurve.HG1G2()
     bodies, _ = _search.build(*_search.draw(jax.random.key(0), one, states), phase)
     _search.misfits(phase, jax.tree.map(lambda x: x[: _search.CHUNK], bodies), points)

@@ -11,15 +11,15 @@ import polhode as ph
 from benchmarks import light_curves
 from polhode import lightcurve
 from polhode._closed_forms import principal_periods
-from polhode.lightcurve import _fit, _hypotheses, _model, _search, _solutions
+from polhode.lightcurve import _brightness, _fit, _frequencies, _search, _solutions
 
 PHASE = lightcurve.HG1G2()
-STEPPED = jax.jit(_model.stepped)
+STEPPED = jax.jit(_brightness.apply_step)
 
 
 @jax.jit
 def magnitudes(bodies, points):
-    return _model.magnitudes(PHASE, bodies, points)
+    return _brightness.magnitudes(PHASE, bodies, points)
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def seen():
 @pytest.fixture(scope="module")
 def trial(seen):
     """Eight bodies of given periods in each mode."""
-    meant = _hypotheses.Hypotheses(
+    meant = _frequencies.Hypotheses(
         np.array([1.2, 1.2]), np.array([0.7, 0.7]), np.array([True, False])
     )
     bodies, good = _search.build(*_search.draw(jax.random.key(1), meant, 24), PHASE)
@@ -54,7 +54,7 @@ def test_model_is_that_of_simulate(seen, trial):
     curve, _, points = seen
     values = magnitudes(trial, points)
     x = np.asarray(trial.unknowns[0])
-    inertia = ph.Inertia(np.stack(_model.moments_of(jnp.asarray(x))))
+    inertia = ph.Inertia(np.stack(_brightness.moments_of(jnp.asarray(x))))
     path = ph.simulate(ph.Scene(inertia), ph.State(trial.wxyz[0], x[4:7]), curve.t - curve.t[0])
     axes = np.exp([0.0, *x[2:4]])
 
@@ -78,7 +78,7 @@ def test_light_has_the_sums_of_its_mode(trial):
     curve = lightcurve.LightCurve.of(t, 0 * t, sun, observer)
     light = np.asarray(magnitudes(trial, curve.points(0.01)))
     left = []
-    for sums in (_hypotheses.LAM, _hypotheses.SAM):
+    for sums in (_frequencies.LAM, _frequencies.SAM):
         phases = 2 * np.pi * np.outer(t, np.array(list(sums)) @ [1.2, 0.7])
         whole = np.hstack([np.ones((128, 1)), np.cos(phases), np.sin(phases)])
         rest = light.T - whole @ np.linalg.lstsq(whole, light.T, rcond=None)[0]
@@ -90,7 +90,9 @@ def test_light_has_the_sums_of_its_mode(trial):
 
 def test_derivatives_by_every_unknown(seen, trial):
     _, _, points = seen
-    value, slopes = jax.jit(lambda *x: _model.magnitudes_and_slopes(PHASE, *x))(trial, points)
+    value, slopes = jax.jit(lambda *x: _brightness.magnitudes_and_derivatives(PHASE, *x))(
+        trial, points
+    )
     np.testing.assert_allclose(value, magnitudes(trial, points), atol=1e-12)
     size, (count, many, _) = 1e-6, slopes.shape
     for k in range(many):
@@ -106,7 +108,7 @@ def test_steps_keep_the_frequencies_that_they_mean(trial):
 
     @jax.jit
     def logs(unknowns):
-        found = principal_periods(_model.moments_of(unknowns), unknowns[..., 4:7])
+        found = principal_periods(_brightness.moments_of(unknowns), unknowns[..., 4:7])
         return -jnp.log(jnp.stack([found.P_phi, found.P_psi], -1))
 
     unknowns, wxyz = trial
@@ -128,7 +130,7 @@ def test_mirror_gives_the_same_light(trial):
     curve = lightcurve.LightCurve.of(t, 0 * t, sun, observer)
     normal = _fit._mirrors(curve)[0]
     points = curve.points(0.01)
-    image = _fit._mirrored(jax.tree.map(np.asarray, trial), normal)
+    image = _fit._reflect(jax.tree.map(np.asarray, trial), normal)
     np.testing.assert_allclose(magnitudes(image, points), magnitudes(trial, points), atol=1e-9)
     turned = 2 * normal * (_solutions.momentum(trial) @ normal)[:, None] - _solutions.momentum(
         trial
@@ -170,8 +172,10 @@ def test_a_tumbler_is_found_again():
     sun, observer = (np.tile(v, (t.size, 1)) for v in (sun, observer))
     blank = lightcurve.LightCurve.of(t, 0 * t, sun, observer, sigma=0.02)
     x = np.r_[np.log(square[1:]) / 2, np.log(square[1:]) / 2, start.omega_body]
-    body = _model.Bodies(jnp.asarray(x)[None], start.wxyz[None])
-    light = _model.magnitudes(lightcurve.SeeligerPhase(), body, blank.points(0.01))[0, : t.size]
+    body = _brightness.Bodies(jnp.asarray(x)[None], start.wxyz[None])
+    light = _brightness.magnitudes(lightcurve.SeeligerPhase(), body, blank.points(0.01))[
+        0, : t.size
+    ]
     curve = blank._replace(magnitude=np.asarray(light) + 0.02 * rng.normal(size=t.size))
     fit = lightcurve.fit_light_curve(curve, floor=0.005, trials=8_000)
     best, text = fit.best, lightcurve.table(fit)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from polhode import lightcurve
-from polhode.lightcurve import _frequencies, _hypotheses
+from polhode.lightcurve import _frequencies
 
 F_PHI, F_PSI = 1.7, 0.6
 
@@ -68,7 +68,7 @@ def test_hypotheses_hold_the_body(waves, long_axis):
     """Also where the harmonics of one line are nearly all: no multiple of it is taken for two."""
     t, value = _long(waves)
     found = lightcurve.fourier_lattices(t, value, max_frequency=7.0)
-    meant = _hypotheses.hypotheses(found, t, value)
+    meant = _frequencies.hypotheses(found, t, value)
     near = np.hypot(meant.f_phi - F_PHI, meant.f_psi - F_PSI) < 0.5 * found.resolution
     assert np.any(near[:20] & (meant.long_axis[:20] == long_axis))
     # no moment exceeds the sum of the other two: SAM turns no slower about L than its long axis
@@ -123,7 +123,7 @@ def test_default_range_holds_the_lines_of_a_fast_tumbler():
     assert found.strongest == pytest.approx(2 * f_phi, abs=0.5 * found.resolution)
     assert not found.is_cut
     assert found.warnings() == ()
-    meant = _hypotheses.hypotheses(found, t, value)
+    meant = _frequencies.hypotheses(found, t, value)
     near = np.hypot(meant.f_phi - f_phi, meant.f_psi - f_psi) < 0.5 * found.resolution
     assert np.any(near[:5] & ~meant.long_axis[:5])
 

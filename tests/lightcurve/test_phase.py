@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from polhode import lightcurve
-from polhode.lightcurve import _phase
+from polhode.lightcurve import _brightness
 
 # (1) Ceres and (24) Themis every 20 degrees, as sbpy 0.5 gives them (absolute magnitudes off).
 TWENTIES = jnp.radians(jnp.arange(0.0, 160.0, 20.0))
@@ -33,13 +33,13 @@ def test_published_values(phase, coefficients, published):
 def test_slopes_printed_are_those_of_the_cubic_spline(table):
     """The slopes inside follow from the values and the end slopes: two tables, one spline."""
     interpolate = pytest.importorskip("scipy.interpolate")
-    values, slopes = getattr(_phase, table)
-    knots = _phase._NEAR if table == "_THIRD" else _phase._KNOTS
+    values, slopes = getattr(_brightness, table)
+    knots = _brightness._NEAR if table == "_THIRD" else _brightness._KNOTS
     ends = ((1, slopes[0]), (1, slopes[-1]))
     spline = interpolate.CubicSpline(knots, values, bc_type=ends)
     np.testing.assert_allclose(spline(knots, 1), slopes, atol=1e-6)
     inside = np.linspace(knots[0], knots[-1], 50)
-    mine = _phase._spline(knots, (values, slopes), jnp.asarray(inside))
+    mine = _brightness._spline(knots, (values, slopes), jnp.asarray(inside))
     np.testing.assert_allclose(mine, spline(inside), atol=1e-7)
 
 

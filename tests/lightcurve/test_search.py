@@ -8,10 +8,10 @@ import pytest
 import polhode as ph
 from benchmarks import light_curves
 from polhode import lightcurve
-from polhode.lightcurve import _fit, _hypotheses, _model, _search, _solutions, _steps
+from polhode.lightcurve import _brightness, _fit, _frequencies, _search, _solutions
 
 PHASE = lightcurve.HG1G2()
-Hypotheses = _hypotheses.Hypotheses
+Hypotheses = _frequencies.Hypotheses
 MEANT = Hypotheses(np.array([1.2, 1.9]), np.array([0.7, 0.5]), np.array([True, False]))
 
 
@@ -36,7 +36,7 @@ def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
     off = np.arange(9) * 1.5 / np.ptp(curve.t)
     meant = Hypotheses(right[0] + off, right[1] + 0 * off, np.full(9, truth["mode"] == 0))
     key = jax.random.key(0)
-    trials = _search.tried(key, meant, 1800, 3, PHASE, points, points, 0.0)
+    trials = _search.best_trials(key, meant, 1800, 3, PHASE, points, points, 0.0)
     np.testing.assert_array_equal(trials.source, np.repeat(np.arange(9), 3))
     f_phi, *_ = _solutions.frequencies(trials.bodies)
     np.testing.assert_allclose(f_phi, meant.f_phi[trials.source], rtol=1e-9)
@@ -46,8 +46,8 @@ def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
     assert np.all(np.diff(misfit, axis=1) >= 0)
     few, _ = _search.build(*_search.draw(jax.random.key(1), meant, 3), PHASE)
     assert misfit.mean() < 0.7 * _search.misfits(PHASE, few, points)[0].mean()
-    problem = _steps.Problem(PHASE, points)
-    state, reached = _fit._started(key, meant, 1800, 3, problem, problem, 0.0)
+    problem = _search.Problem(PHASE, points)
+    state, reached = _fit._descend(key, meant, 1800, 3, problem, problem, 0.0)
     assert np.argmin(reached) == 0
     assert reached.min() == state.cost.min()
     assert np.isfinite(reached).all()
@@ -59,7 +59,7 @@ def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
 def test_the_likeliest_and_the_best_so_far_are_tried_again():
     count, half = 800, _fit._LEADING // 2
     many = Hypotheses(np.arange(count), np.ones(count), np.ones(count, bool))
-    shared = _fit._shared(many, np.arange(count)[::-1])  # the least likely reached the least
+    shared = _fit._second_round(many, np.arange(count)[::-1])  # the least likely reached the least
     times = np.bincount(shared.f_phi, minlength=count)
     assert times[0] == times[-1] == _fit._OFTEN
     assert np.all(times[half:-half] == 0)
@@ -69,7 +69,7 @@ def test_the_likeliest_and_the_best_so_far_are_tried_again():
     assert np.all(np.diff(times[-half:]) >= 0)
     # half as often from a quarter of them on
     assert times[half // 4] == round(_fit._OFTEN / 2)
-    one = _fit._shared(Hypotheses(*(x[:1] for x in many)), np.array([np.inf]))
+    one = _fit._second_round(Hypotheses(*(x[:1] for x in many)), np.array([np.inf]))
     assert len(one.f_phi) == _fit._OFTEN
 
 
@@ -78,12 +78,12 @@ def test_poles_of_one_pair_do_not_crowd_out_others():
     lam, sam = np.flatnonzero(good[:32])[0], 32 + np.flatnonzero(good[32:])[0]
     index = np.r_[np.full(20, lam), sam]
     wxyz = np.random.default_rng(0).normal(size=(21, 4))
-    bodies = _model.Bodies(
+    bodies = _brightness.Bodies(
         bodies.unknowns[index], wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
     )
     nothing = np.zeros(21)
-    state = _steps.State(bodies, nothing, np.arange(21.0), nothing, nothing, nothing)
-    kept = _fit._distinct(state, 0.01, 12)
+    state = _search.State(bodies, nothing, np.arange(21.0), nothing, nothing, nothing)
+    kept = _fit._distinct_solutions(state, 0.01, 12)
     assert len(kept) == 1 + _fit._ALIKE
     assert kept[0] == 0
     assert kept[-1] == 20
@@ -113,7 +113,7 @@ def test_spread_of_offsets_is_the_likeliest():
         return -(left @ inverse @ left + sizes) / 2
 
     best = spreads[np.argmax([evidence(s) for s in spreads])]
-    found = _steps.spread_of_offsets(matrix, right, x[2:], stiffness, slice(1, 13))
+    found = _search.spread_of_offsets(matrix, right, x[2:], stiffness, slice(1, 13))
     assert found == pytest.approx(best, rel=0.01)
 
 
@@ -141,9 +141,9 @@ def test_likeness_is_the_variance_of_sums_over_that_of_independent_ones():
     for k in np.flatnonzero(np.diff(night, prepend=-1) == 0):
         alike[:, k] = 0.7 * alike[:, k - 1] + np.sqrt(1 - 0.7**2) * alone[:, k]
     measured = np.var(alike.sum(1)) / 400
-    found = [_solutions.likeness(curve, row) for row in alike[:20]]
+    found = [_solutions.effective_correlation(curve, row) for row in alike[:20]]
     assert np.mean(found) == pytest.approx(measured, rel=0.15)
-    assert np.mean([_solutions.likeness(curve, row) for row in alone[:20]]) < 1.05
+    assert np.mean([_solutions.effective_correlation(curve, row) for row in alone[:20]]) < 1.05
 
 
 def test_normal_points_are_means_of_one_group():

@@ -7,20 +7,20 @@ import pytest
 
 from polhode import lightcurve
 from polhode._closed_forms import free_motion
-from polhode.lightcurve import _model, _search, _series, _solutions
-from polhode.lightcurve._hypotheses import Hypotheses
+from polhode.lightcurve import _brightness, _search, _solutions
+from polhode.lightcurve._frequencies import Hypotheses
 
 PHASE = lightcurve.SeeligerPhase()
 MEANT = Hypotheses(np.array([1.2, 1.9]), np.array([0.7, 0.5]), np.array([True, False]))
 MANY = 24
-magnitudes = jax.jit(_model.magnitudes, static_argnums=0)
+magnitudes = jax.jit(_brightness.magnitudes, static_argnums=0)
 
 
 @jax.jit
 def moved(bodies, later):
     """Rates and attitudes of free bodies at one time each."""
     found = free_motion(
-        _model.moments_of(bodies.unknowns), tuple(bodies.wxyz.T),
+        _brightness.moments_of(bodies.unknowns), tuple(bodies.wxyz.T),
         tuple(bodies.unknowns[:, 4:7].T), later,
     )  # fmt: skip
     return tuple(jnp.stack([x[:, 0] for x in part], -1) for part in found)
@@ -46,18 +46,18 @@ def test_any_phases_are_turned_to_those_of_the_points(blank, mode):
     points = blank.points(0.0)
     light = np.asarray(magnitudes(PHASE, bodies, points))[first]
     points = blank._replace(magnitude=light + 0.3 * (blank.t > 5)).points(0.0)
-    right, matrix = _series.series(points, *meant)
+    right, matrix = _search.series(points, *meant)
     # the same body at other times and turned about its momentum: all that phases are
     later = jnp.asarray(np.random.default_rng(1).uniform(0, 10, (MANY, 1)))
     same = jax.tree.map(lambda x: jnp.tile(x[first], (MANY, 1)), bodies)
     rates, wxyz = moved(same, later)
     pole = _solutions.momentum(same)
     angle = jnp.asarray(np.random.default_rng(2).uniform(0, 6, (MANY, 1)))
-    wxyz = _series.rotation.multiply(_series.rotation.rotation_vector_to_wxyz(angle * pole), wxyz)
-    away = _model.Bodies(same.unknowns.at[:, 4:7].set(rates), wxyz)
-    found, fall = _series.turned(
+    wxyz = _search.rotation.multiply(_search.rotation.rotation_vector_to_wxyz(angle * pole), wxyz)
+    away = _brightness.Bodies(same.unknowns.at[:, 4:7].set(rates), wxyz)
+    found, fall = _search.align_phases(
         away, *(np.repeat(x, MANY) for x in meant), np.repeat(right, MANY, 0),
-        np.repeat(matrix, MANY, 0), *_series.directions(points),
+        np.repeat(matrix, MANY, 0), *_search.directions(points),
     )  # fmt: skip
     np.testing.assert_allclose(_solutions.momentum(found), pole, atol=1e-9)
     f_phi, f_psi, _ = _solutions.frequencies(found)
@@ -78,7 +78,7 @@ def test_any_phases_are_turned_to_those_of_the_points(blank, mode):
 def test_a_series_explains_waves_and_no_offsets(blank):
     angle = 2 * np.pi * (1.2 + 2 * 0.7) * (blank.t - blank.t[0])
     data = 0.2 * np.cos(angle) - 0.1 * np.sin(angle) + 0.5 * (blank.t > 5)
-    right, matrix = _series.series(blank._replace(magnitude=data).points(0.0), *MEANT)
+    right, matrix = _search.series(blank._replace(magnitude=data).points(0.0), *MEANT)
     found = np.linalg.solve(matrix[0], right[0])
     expected = np.zeros(22)
     expected[[3, 14]] = 0.2, -0.1  # f_phi + 2 f_psi is the fourth of the sums of LAM

@@ -6,7 +6,7 @@ import pytest
 import polhode as ph
 from benchmarks.light_curves import directions
 from polhode import lightcurve
-from polhode.lightcurve import _model, _nulls, _refine, _solutions, _verdict
+from polhode.lightcurve import _brightness, _fit, _nulls, _solutions
 
 Verdict = lightcurve.Verdict
 PHASE = lightcurve.SeeligerPhase()
@@ -68,13 +68,13 @@ def cases():
     for name, light in (("noise", flat), ("rotator", rotating), ("tumbler", tumbling)):
         curve = curve_of(light)
         pairs = pairs_of(curve)
-        out[name] = curve, pairs, *_verdict.null_models(curve, pairs, 0.02, PHASE)
+        out[name] = curve, pairs, *_fit.null_models(curve, pairs, 0.02, PHASE)
     return out
 
 
-def verdict(case, *solutions, found_again=True):
+def verdict(case, *solutions, reproduced=True):
     _, pairs, linear, nulls = case
-    return _verdict.judged(linear, nulls, pairs, solutions, found_again=found_again, limit=3.0)
+    return _fit.judge(linear, nulls, pairs, solutions, reproduced=reproduced, limit=3.0)
 
 
 def offset_free(case, light):
@@ -182,7 +182,9 @@ def test_periods_that_a_few_nights_decide_are_ambiguous(cases):
     noise = NOISE * rng.normal(size=curve.t.size)
     other = np.where(curve.group == 3, model + 2 * noise, model + 0.05 * noise)
     rival = solution(other, P_psi=1.1 * P_PSI, odds=1e-4)
-    agreement = _verdict.resampled(curve, linear.root, (solution(model), rival), [0, 1], limit=3.0)
+    agreement = _fit.bootstrap_agreement(
+        curve, linear.root, (solution(model), rival), [0, 1], limit=3.0
+    )
     assert agreement < 0.9
     assert verdict(case, solution(model), rival).verdict is Verdict.AMBIGUOUS
     # one that is worse in all nights is excluded
@@ -193,7 +195,7 @@ def test_periods_that_a_few_nights_decide_are_ambiguous(cases):
 def test_a_body_found_once_or_at_the_edge_of_the_search_is_ambiguous(cases):
     case = cases["tumbler"]
     body = solution(offset_free(case, tumbling))
-    found = verdict(case, body, found_again=False)
+    found = verdict(case, body, reproduced=False)
     assert found.verdict is Verdict.AMBIGUOUS
     cut = (case[0], case[1]._replace(is_cut=True), *case[2:])
     found = verdict(cut, body)
@@ -207,8 +209,8 @@ def test_a_mode_that_the_shape_decides_is_ambiguous(cases):
     body = solution(offset_free(cases["tumbler"], tumbling))
     other = body._replace(mode=ph.Mode.SAM, model=body.model + 1e-3)
     for ellipsoid, expected in ((body, Verdict.TUMBLING), (other, Verdict.AMBIGUOUS)):
-        found = _verdict.judged(
-            linear, nulls, pairs, (body,), found_again=True, limit=3.0, others=(ellipsoid,)
+        found = _fit.judge(
+            linear, nulls, pairs, (body,), reproduced=True, limit=3.0, others=(ellipsoid,)
         )
         assert found.verdict is expected
     assert "assumption on the shape" in found.reasons[0]
@@ -217,9 +219,9 @@ def test_a_mode_that_the_shape_decides_is_ambiguous(cases):
 def test_fourteen_points_are_too_few():
     curve = curve_of(tumbling, nights=2, days=4, each=7)
     pairs = pairs_of(curve)
-    linear, nulls = _verdict.null_models(curve, pairs, 0.02, PHASE)
-    found = _verdict.judged(
-        linear, nulls, pairs, (solution(curve.magnitude),), found_again=True, limit=3.0
+    linear, nulls = _fit.null_models(curve, pairs, 0.02, PHASE)
+    found = _fit.judge(
+        linear, nulls, pairs, (solution(curve.magnitude),), reproduced=True, limit=3.0
     )
     assert found.verdict is Verdict.TOO_FEW_POINTS
     assert found.par == 0
@@ -247,7 +249,7 @@ def test_the_rotating_ellipsoid_is_found_with_its_geometry():
     assert rest.periods[0] == pytest.approx(period, rel=1e-4)
     assert np.std(rest.values) < 0.0105
     # and with harmonics it still rotates about one axis, with more parameters
-    body = _refine.rotating_body(linear, ellipsoid, curve.points(0.0, 0.02), PHASE, 3.0)
+    body = _solutions.rotating_body(linear, ellipsoid, curve.points(0.0, 0.02), PHASE, 3.0)
     assert np.std(body.values) < 1.01 * np.std(rest.values)
     np.testing.assert_array_equal(body.body.unknowns[0, 4:6], 0.0)
     assert 2 * np.pi / body.body.unknowns[0, 6] == pytest.approx(period, rel=1e-4)
@@ -301,7 +303,7 @@ def convex_case():
     light = -2.5 * np.log10(np.asarray(body.brightness(*seen)))
     value = light + 0.02 * rng.normal(size=light.size)
     curve = blank._replace(magnitude=value, sigma=np.full(light.size, 0.02))
-    body = _model.Bodies(
+    body = _brightness.Bodies(
         np.r_[np.log(square[1:]) / 2, np.log(square[1:]) / 2, state.omega_body, 0.3][None],
         np.asarray(ph.rotation.normalise(state.wxyz))[None],
     )
@@ -312,23 +314,23 @@ def test_derivatives_of_convex_bodies(convex_case):
     curve, body, _ = convex_case
     points = curve.points(0.0, 0.02)
     normals = lightcurve.Convex.from_ellipsoid(np.ones(3), 200).normals
-    rows = lightcurve.harmonics(normals, _refine.DEGREE)[1:]
+    rows = lightcurve.harmonics(normals, _solutions.DEGREE)[1:]
     known = (normals, 1.0 + normals[:, 0] ** 2, rows)
-    coefficients = 0.05 * np.random.default_rng(0).normal(size=_refine.HARMONICS)
-    _, motion, shape, open_area, by_open = _refine._light(body, coefficients, points, known)
+    coefficients = 0.05 * np.random.default_rng(0).normal(size=_solutions.HARMONICS)
+    _, motion, shape, open_area, by_open = _solutions._light(body, coefficients, points, known)
     size = 1e-6
 
     def value(step, more):
         change = np.zeros((1, body.unknowns.shape[1] + 3))
-        change[0, _refine._MOTION], change[0, -3:] = step[:5], step[5:]
+        change[0, _solutions._MOTION], change[0, -3:] = step[:5], step[5:]
         turned = ph.rotation.rotation_vector_to_wxyz(change[:, -3:])
-        moved = _model.Bodies(
+        moved = _brightness.Bodies(
             body.unknowns + change[:, :-3], ph.rotation.multiply(turned, body.wxyz)
         )
-        out = _refine._light(moved, coefficients + more, points, known)
+        out = _solutions._light(moved, coefficients + more, points, known)
         return np.asarray(out[0]), np.asarray(out[3])
 
-    none = np.zeros(_refine.HARMONICS)
+    none = np.zeros(_solutions.HARMONICS)
     for k in range(8):
         e = size * np.eye(8)[k]
         measured = (value(e, none)[0] - value(-e, none)[0]) / (2 * size)
@@ -338,7 +340,7 @@ def test_derivatives_of_convex_bodies(convex_case):
         assert np.median(off) < 1e-6
         assert np.quantile(off, 0.95) < 1e-2
     for k in (0, 5, 20):
-        e = size * np.eye(_refine.HARMONICS)[k]
+        e = size * np.eye(_solutions.HARMONICS)[k]
         ends = [value(np.zeros(8), x) for x in (e, -e)]
         measured, opened = ((a - b) / (2 * size) for a, b in zip(*ends, strict=True))
         np.testing.assert_allclose(shape[:, k], measured, atol=1e-6)
@@ -351,7 +353,7 @@ def test_a_convex_shape_leaves_the_noise_and_periods_within_their_errors(convex_
     linear, phase = _nulls.Linear(curve, 0.02), lightcurve.SeeligerPhase()
     body = body._replace(unknowns=body.unknowns[:, : 7 + len(phase.typical)])
     start = solution(
-        curve.magnitude, moments=np.array(_model.moments_of(body.unknowns[0])),
+        curve.magnitude, moments=np.array(_brightness.moments_of(body.unknowns[0])),
         axes=np.exp(np.r_[0, body.unknowns[0, 2:4]]), omega_body=body.unknowns[0, 4:7],
         coefficients=body.unknowns[0, 7:], wxyz=body.wxyz[0], offsets=np.zeros(13),
     )  # fmt: skip
@@ -359,7 +361,7 @@ def test_a_convex_shape_leaves_the_noise_and_periods_within_their_errors(convex_
     near = start._replace(
         wxyz=np.asarray(ph.rotation.multiply(np.array([1.0, 0.01, 0.01, 0]), start.wxyz))
     )
-    found, scale, alike = _refine.refined_solutions(
+    found, scale, alike = _solutions.refined_solutions(
         (start, near), linear, curve.points(0.0, 0.02), phase, 3.0
     )
     assert len(found) == 1
@@ -372,7 +374,7 @@ def test_a_convex_shape_leaves_the_noise_and_periods_within_their_errors(convex_
         assert abs(error) < 3.5 * getattr(best, name + "_std")
         assert getattr(best, name + "_std") < 1e-3 * getattr(best, name)
     # an ellipsoid with the true motion leaves more
-    ellipsoid = _model.magnitudes(phase, body, curve.points(0.0, 0.02))
+    ellipsoid = _brightness.magnitudes(phase, body, curve.points(0.0, 0.02))
     left = linear.projected(np.asarray(ellipsoid)[0, : curve.t.size]) - linear.data
     assert np.std(left) > 1.5 * scale
 

@@ -9,20 +9,29 @@ from typing import Any
 import numpy as np
 
 from polhode._extras import imported
-from polhode.lightcurve._data import LightCurve
+from polhode.lightcurve._data import LightCurve, read_light_curve
 from polhode.lightcurve._fit import fit_light_curve
-from polhode.lightcurve._frequencies import Pairs, fourier_lattices, fourier_pairs
-from polhode.lightcurve._hypotheses import meaning
-from polhode.lightcurve._read import read_light_curve
+from polhode.lightcurve._frequencies import Pairs, fourier_lattices, fourier_pairs, meaning
 from polhode.lightcurve._solutions import LightCurveFit
 
 # of the JSON file; other numbers have none
 _UNITS = {
-    "P_phi": "day", "P_psi": "day", "P_phi_std": "day", "P_psi_std": "day", "lines": "day",
-    "P_phi_short_axis": "day", "periods": "day", "max_frequency": "1/day", "rms": "mag",
-    "offsets": "mag", "offset_sigma": "mag", "floor": "mag", "pole": "deg", "pole_std": "deg",
+    "P_phi": "day",
+    "P_psi": "day",
+    "P_phi_std": "day",
+    "P_psi_std": "day",
+    "lines": "day",
+    "P_phi_short_axis": "day",
+    "periods": "day",
+    "max_frequency": "1/day",
+    "rms": "mag",
+    "offsets": "mag",
+    "offset_sigma": "mag",
+    "floor": "mag",
+    "pole": "deg",
+    "pole_std": "deg",
     "omega_body": "rad/day",
-}  # fmt: skip
+}
 
 
 def figure(fit: LightCurveFit, *, number: int = 0, title: str = "") -> Any:
@@ -184,9 +193,11 @@ def fitted(
         lines = pairs.is_cut
         if lines:  # the square of the grid is too small: pairs of lines reach further
             pairs = fourier_lattices(
-                curve.t, curve.magnitude, columns=curve.columns(np.inf)[0],
+                curve.t,
+                curve.magnitude,
+                columns=curve.columns(np.inf)[0],
                 max_frequency=max_frequency,
-            )  # fmt: skip
+            )
         say(frequency_table(pairs, lines=lines))
         missing = "without vectors to Sun and observer no body can be fitted."
         for note in (*curve.notes, *pairs.warnings(), missing):
@@ -194,9 +205,12 @@ def fitted(
         return None
     imported("the figure of a light curve", "matplotlib", extra="plot")  # before the search
     settings = {
-        "trials": trials, "max_frequency": max_frequency, "floor": floor, "seed": seed,
+        "trials": trials,
+        "max_frequency": max_frequency,
+        "floor": floor,
+        "seed": seed,
         "searches": searches,
-    }  # fmt: skip
+    }
     fit = fit_light_curve(curve, **settings)
     say(frequency_table(fit.pairs, lines=True))
     say(table(fit))
@@ -224,20 +238,33 @@ def _write(
     def plain(value):
         return value.tolist() if isinstance(value, np.ndarray) else value
 
-    listed = []
+    rows = []
     for solution in fit.solutions:
-        kept = {k: plain(v) for k, v in solution._asdict().items() if k not in ("model", "weights")}
-        more = {"P_phi_short_axis": solution.P_phi_short_axis, "lines": dict(solution.lines())}
-        listed.append(kept | {"mode": solution.mode.name} | more)
+        fields = {
+            k: plain(v) for k, v in solution._asdict().items() if k not in ("model", "weights")
+        }
+        derived = {"P_phi_short_axis": solution.P_phi_short_axis, "lines": dict(solution.lines())}
+        rows.append(fields | {"mode": solution.mode.name} | derived)
     contents = {
-        "file": name, "polhode": __version__, "jax": jax.__version__, "numpy": np.__version__,
-        "units": _UNITS, "settings": settings, "verdict": fit.verdict.name,
-        "reasons": fit.reasons, "par": fit.par, "misfit": fit.misfit, "agreement": fit.agreement,
-        "scale": fit.scale, "alike": fit.alike, "offset_sigma": fit.offset_sigma,
+        "file": name,
+        "polhode": __version__,
+        "jax": jax.__version__,
+        "numpy": np.__version__,
+        "units": _UNITS,
+        "settings": settings,
+        "verdict": fit.verdict.name,
+        "reasons": fit.reasons,
+        "par": fit.par,
+        "misfit": fit.misfit,
+        "agreement": fit.agreement,
+        "scale": fit.scale,
+        "alike": fit.alike,
+        "offset_sigma": fit.offset_sigma,
         "max_frequency": fit.pairs.max_frequency,
         "models": [model._asdict() for model in fit.models],
-        "solutions": listed, "notes": fit.notes,
-    }  # fmt: skip
+        "solutions": rows,
+        "notes": fit.notes,
+    }
     with whole_file(document) as temporary:
         temporary.write_text(json.dumps(contents, indent=1) + "\n", encoding="utf-8")
     say(f"wrote {picture} and {document}")

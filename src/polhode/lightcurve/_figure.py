@@ -50,7 +50,7 @@ def figure(fit: LightCurveFit, *, number: int = 0, title: str = ""):
     cut = " (gaps cut out)" if x[-1] < t[-1] else ""
     middle.set_xlabel(f"time [{unit}]{cut}")
     _poles(page.add_subplot(below[0], projection="mollweide"), fit, number)
-    _listed(page.add_subplot(below[1]), fit)
+    _draw_table(page.add_subplot(below[1]), fit)
     if title:
         page.suptitle(title, x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
     return page
@@ -81,7 +81,7 @@ def _poles(ax, fit: LightCurveFit, number: int) -> None:
     ax.set_xticklabels([])
 
 
-def _listed(ax, fit: LightCurveFit) -> None:
+def _draw_table(ax, fit: LightCurveFit) -> None:
     ax.axis("off")
     text = [" #   rms   P_phi     P_psi     mode  pole        mirror"]
     for k, s in enumerate(fit.solutions[:9]):

@@ -1,4 +1,7 @@
-"""From a light curve to every tumbling body that explains it."""
+"""``fit_light_curve``: all tumbling bodies that explain a light curve, and the verdict on them."""
+
+import enum
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -6,26 +9,250 @@ import numpy as np
 
 from polhode import rotation
 from polhode._closed_forms import Mode
+from polhode.lightcurve._brightness import HG1G2, AbstractPhase, Bodies, Points, SeeligerPhase
 from polhode.lightcurve._data import LightCurve
-from polhode.lightcurve._frequencies import Pairs, fourier_lattices
-from polhode.lightcurve._hypotheses import Hypotheses, hypotheses
-from polhode.lightcurve._model import Bodies, Points
-from polhode.lightcurve._phase import HG1G2, AbstractPhase, SeeligerPhase
-from polhode.lightcurve._refine import refined_solutions
-from polhode.lightcurve._search import tried
+from polhode.lightcurve._frequencies import Hypotheses, Pairs, fourier_lattices, hypotheses
+from polhode.lightcurve._nulls import (
+    Linear,
+    Model,
+    Residuals,
+    compare_models,
+    noise,
+    one_period,
+    rotator,
+    tumbler,
+    two_periods,
+)
+from polhode.lightcurve._search import (
+    BATCH,
+    Problem,
+    State,
+    best_trials,
+    select,
+    select_padded,
+    spread_of_offsets,
+)
 from polhode.lightcurve._solutions import (
     EXCLUDED,
     FIXED,
     REACHED,
     LightCurveFit,
-    described,
+    Solution,
+    change_of_directions,
+    describe_solutions,
+    effective_correlation,
     frequencies,
     momentum,
     notes_on,
-    wander,
+    refined_solutions,
+    rotating_body,
+    same_periods,
 )
-from polhode.lightcurve._steps import BATCH, Problem, State, picked, spread_of_offsets, taken
-from polhode.lightcurve._verdict import judged, null_models
+
+# What may be claimed of a light curve: a verdict, the PAR rating, and agreement by resampling.
+
+_DECISIVE = 5.0  # difference of ln Z: odds of 150 to 1
+_FEW_POINTS = 36  # independent points below which no body of ten parameters is claimed
+_MISFIT = 2.0  # residuals over the curve's own errors from which no solution is certain
+_AGREEMENT = 0.9  # part of the resampled curves in which the best periods must stay the best
+_RESAMPLED, _BLOCKS = 400, 5
+_CYCLES = 3.0  # of one period, below which its rating is the lowest
+
+
+class Verdict(enum.Enum):
+    """What a light curve shows. Only ``TUMBLING`` claims the periods of the best solution."""
+
+    TUMBLING = "tumbling"
+    AMBIGUOUS = "ambiguous"
+    ONE_PERIOD = "one period"
+    NO_SIGNAL = "no signal"
+    TOO_FEW_POINTS = "too few points"
+
+
+class Judgement(NamedTuple):
+    """The verdict, its reasons, and the numbers behind them."""
+
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    par: int
+    models: tuple[Model, ...]
+    misfit: float
+    agreement: float
+
+
+def null_models(
+    curve: LightCurve, pairs: Pairs, offset_sigma, phase: AbstractPhase, limit: float = 3.0
+) -> tuple[Linear, list[Residuals]]:
+    """The null hypotheses, fitted: noise alone, and one period."""
+    linear = Linear(curve, offset_sigma)
+    nulls = [noise(linear)]
+    end = pairs.max_frequency
+    if not np.isfinite(end):
+        end = 2 * max(pairs.f_phi.max(), pairs.f_psi.max())
+    series = one_period(linear, end)
+    nulls += series
+    if series:
+        # the periods of the best series of few and of many harmonics
+        best = sorted(series, key=lambda r: float(np.sum((r.values * linear.root) ** 2)))
+        periods = dict.fromkeys(round(r.periods[0], 12) for r in (*best[:2], *series[:4]))
+        ellipsoid = rotator(linear, list(periods)[:4], end)
+        if ellipsoid is not None:
+            rest, chosen = ellipsoid
+            points = curve.points(0.0, offset_sigma)
+            body = rotating_body(linear, chosen, points, phase, limit)
+            period = 2 * np.pi / float(body.body.unknowns[0, 6])
+            convex = rest._replace(
+                name="one period, rotating convex body",
+                values=body.values,
+                parameters=body.parameters,
+                periods=(period,),
+            )
+            nulls += [rest] + ([convex] if np.isfinite(body.cost) else [])
+    return linear, nulls
+
+
+def judge(
+    linear: Linear,
+    nulls: list[Residuals],
+    pairs: Pairs,
+    solutions: tuple[Solution, ...],
+    *,
+    reproduced: bool,
+    limit: float,
+    others: tuple[Solution, ...] = (),
+) -> Judgement:
+    """Compare the null hypotheses with the best tumbling body, and say what may be claimed.
+
+    ``others``: more bodies to compare, such as the best ellipsoid, which has fewer parameters.
+    """
+    curve = linear.curve
+    best = solutions[0]
+    everything = [*nulls, *two_periods(linear, pairs, solutions)]
+    everything += [tumbler(linear, pairs, body) for body in (best, *others)]
+    models = compare_models(linear, everything, effective_correlation)
+    classes = same_periods(solutions, pairs.resolution)
+    agreement = bootstrap_agreement(curve, linear.root, solutions, classes, limit)
+    silent, single, double, body = (
+        _best_of(models, word) for word in ("noise", "one period", "two periods", "tumbling")
+    )
+    listed = tuple(m for m in (silent, single, double, body) if m is not None)
+    assert silent is not None  # both are always fitted
+    assert body is not None
+    own = models[len(models) - 1 - len(others)]  # the best of the list, whatever its evidence
+    null = max(m.log_evidence for m in (silent, single) if m is not None)
+    two = max(m.log_evidence for m in (double, body) if m is not None)
+    more = two - null  # of two periods over one or none
+    reasons: list[str] = []
+
+    def result(verdict: Verdict, par: int) -> Judgement:
+        return Judgement(verdict, tuple(reasons), par, listed, own.misfit, agreement)
+
+    if linear.independent < _FEW_POINTS:
+        reasons.append(
+            f"{linear.independent} points besides the offsets are too few for a body of ten"
+            f" parameters; {_FEW_POINTS} are needed."
+        )
+        return result(Verdict.TOO_FEW_POINTS, 0)
+    other = max(m.log_evidence for m in (single, double, body) if m is not None)
+    if silent.log_evidence > other - _DECISIVE and silent.misfit < _MISFIT:
+        reasons.append(
+            "No model explains the points decisively better than noise: ln Z"
+            f" {other - silent.log_evidence:+.1f} over noise alone, {_DECISIVE:g} are needed."
+        )
+        return result(Verdict.NO_SIGNAL, 0)
+    if single is not None and more < -_DECISIVE:
+        if single.misfit < _MISFIT:
+            period = single.periods[0]
+            cycles = float(linear.t[-1]) / period
+            reasons.append(
+                f"One period, {period:.6g} d ({24 * period:.5g} h) or a multiple or alias of it,"
+                f" explains the points: ln Z {-more:+.1f} over two periods."
+            )
+            return result(Verdict.ONE_PERIOD, 1 if cycles < _CYCLES else 2)
+        reasons.append(
+            f"One period is the best model, but leaves {single.misfit:.1f} times the errors of the"
+            " points."
+        )
+    elif more < _DECISIVE:
+        reasons.append(
+            f"Two periods are not decisively better than one: ln Z {more:+.1f}, {_DECISIVE:g} are"
+            " needed."
+        )
+    single_rejected = more >= _DECISIVE
+    if single_rejected and body.log_evidence - null < _DECISIVE:
+        reasons.append(
+            "A series of two periods explains the points, but no tumbling body that was found does."
+        )
+    if own.misfit >= _MISFIT:
+        reasons.append(
+            f"The best body leaves {own.misfit:.1f} times the errors of the points; no solution"
+            f" is certain from {_MISFIT:g} on."
+        )
+    rivals = len({c for c, s in zip(classes, solutions, strict=True) if s.probability > EXCLUDED})
+    if rivals > 1:
+        reasons.append(
+            f"{rivals - 1} other pair(s) of periods cannot be excluded at 1 in"
+            f" {round(1 / EXCLUDED)}."
+        )
+    if any(same_periods((best, other), pairs.resolution) != [0, 0] for other in others):
+        reasons.append(
+            "The best ellipsoid has other periods or another mode than the best convex body: the"
+            " assumption on the shape decides."
+        )
+    if agreement < _AGREEMENT:
+        reasons.append(
+            f"The best periods stay the best in {agreement:.0%} of resampled light curves only;"
+            f" {_AGREEMENT:.0%} are needed."
+        )
+    if not reproduced:
+        reasons.append("No second search found the best body again.")
+    reasons += pairs.warnings()
+    if not reasons:
+        poles = {s.mirror_of for s in solutions if s.probability > EXCLUDED}
+        unique = len([s for s in solutions if s.probability > EXCLUDED]) == 1 and len(poles) == 1
+        return result(Verdict.TUMBLING, -4 if unique else -3)
+    return result(Verdict.AMBIGUOUS, -2 if single_rejected else -1)
+
+
+def _best_of(models: tuple[Model, ...], word: str) -> Model | None:
+    candidates = [m for m in models if m.name.startswith(word)]
+    return max(candidates, key=lambda m: m.log_evidence) if candidates else None
+
+
+def bootstrap_agreement(
+    curve: LightCurve,
+    root: np.ndarray,
+    solutions: tuple[Solution, ...],
+    classes: list[int],
+    limit: float,
+    count: int = _RESAMPLED,
+) -> float:
+    """Part of ``count`` resampled light curves in which the best periods stay the best.
+
+    Nights are drawn with replacement, or runs of points where there are few nights, and the
+    contributions of the points to the cost of every solution are added anew (RELL bootstrap:
+    Kishino, Miyata & Hasegawa, J. Mol. Evol. 31 (1990) 151); the bodies are not fitted again.
+    """
+    if len(set(classes)) < 2:
+        return 1.0
+    # residuals over the errors that make the best solution fit
+    rest = np.array([(s.model - curve.magnitude) * root for s in solutions])
+    rest = rest / max(1.4826 * float(np.median(np.abs(rest[0]))), 1e-12)
+    cost = 2 * limit**2 * (np.sqrt(1 + (rest / limit) ** 2) - 1)
+    names, block = np.unique(curve.group, return_inverse=True)
+    if len(names) < _BLOCKS:
+        block = np.arange(curve.t.size) * 20 // curve.t.size
+    blocks = np.stack([np.bincount(block, c) for c in cost])
+    rng = np.random.default_rng(0)
+    weight = rng.multinomial(blocks.shape[1], np.full(blocks.shape[1], 1 / blocks.shape[1]), count)
+    best = np.argmin(blocks @ weight.T, axis=0)
+    return float(np.mean(np.array(classes)[best] == classes[0]))
+
+
+# The search. Its cost is dominated by light curves of trial bodies, so that most bodies are
+# rejected on few points and by cheap scores: draws by the Fourier series, a part of them by their
+# misfit to `_FEW` points, the rest by a few steps of least squares on these points, with fewer
+# bodies and more steps in each round (`_DESCENT`). Only the best are fitted to all points.
 
 _FEW = 160  # points that a search looks at
 _DESCENT = ((1.0, 2), (0.5, 3), (0.25, 6))  # parts of the starts, and their steps
@@ -94,61 +321,73 @@ def fit_light_curve(
         )
     meant = hypotheses(pairs, curve.t, curve.magnitude, columns=columns)
     key = jax.random.key(seed)
-    rough, problem = Problem(phase, _thinned(points, _FEW)), Problem(phase, points)
-    state, again = None, False
+    rough, problem = Problem(phase, _subsample(points, _FEW)), Problem(phase, points)
+    state, reproduced = None, False
     for _ in range(searches):
-        key, own = jax.random.split(key)
-        found = _searched(
-            own, meant, trials, starts, rough, problem, _blur(curve), pairs.resolution
+        key, search_key = jax.random.split(key)
+        result = _search_once(
+            search_key, meant, trials, starts, rough, problem, _blur(curve), pairs.resolution
         )
-        again = state is not None and _found_twice(state, found, pairs.resolution)
-        state = found if state is None else _joined(state, found)
+        reproduced = state is not None and _searches_agree(state, result, pairs.resolution)
+        state = result if state is None else _concatenate(state, result)
         # found again, and the errors assumed are reached: nothing is left to be found
         freedom = max(curve.t.size - state.matrix.shape[1], 1)
-        if again and state.cost.min() < REACHED * freedom:
+        if reproduced and state.cost.min() < REACHED * freedom:
             break
     assert state is not None
     state = _with_poles(jax.random.fold_in(key, 1), state, rough, problem, pairs.resolution)
-    state = _better(problem, state, pairs.resolution, BATCH, limit, 60)
+    state = _improve_best(problem, state, pairs.resolution, BATCH, limit, 60)
     if offset_sigma is None and curve.calibrated and len(curve.names) >= _GROUPS:
-        best = picked(state, int(np.argmin(state.cost)))
+        best = select(state, int(np.argmin(state.cost)))
         groups = slice(1, 1 + len(curve.names))  # the first column is a constant
         offset_sigma = spread_of_offsets(
             best.matrix, best.right, best.offsets, problem.stiffness, groups
         )
         problem = Problem(phase, curve.points(floor, offset_sigma))
-        state = _better(problem, state, pairs.resolution, BATCH, limit, 30)
+        state = _improve_best(problem, state, pairs.resolution, BATCH, limit, 30)
     normals = _mirrors(curve)
-    order = _distinct(state, pairs.resolution, BATCH // 2)
-    images = [_mirrored(taken(state.bodies, order), normal) for normal in normals]
+    order = _distinct_solutions(state, pairs.resolution, BATCH // 2)
+    images = [_reflect(select_padded(state.bodies, order), normal) for normal in normals]
     images = jax.tree.map(lambda *x: np.concatenate([y[: len(order)] for y in x]), *images)
-    images = taken(images, np.arange(len(images.wxyz)))
+    images = select_padded(images, np.arange(len(images.wxyz)))
     width = np.full(len(images.wxyz), limit)
     mirrored = problem.improve(problem.start(images, width), width, 30)
-    state = _joined(state, mirrored)
-    order = _distinct(state, pairs.resolution, max(max_solutions, BATCH))
-    solutions, scale, alike = described(problem, state, order, curve, normals, limit)
+    state = _concatenate(state, mirrored)
+    order = _distinct_solutions(state, pairs.resolution, max(max_solutions, BATCH))
+    solutions, scale, alike = describe_solutions(problem, state, order, curve, normals, limit)
     linear, nulls = null_models(curve, pairs, offset_sigma, phase, limit)
     ellipsoids = solutions[:1]
     if convex is None:
-        convex = wander(curve) >= FIXED
+        convex = change_of_directions(curve) >= FIXED
     if convex:
         exact = curve.points(0.0, offset_sigma)  # without the floor
         solutions, scale, alike = refined_solutions(solutions, linear, exact, phase, limit)
     solutions = solutions[: max(max_solutions, sum(s.probability > EXCLUDED for s in solutions))]
     notes = notes_on(curve, solutions, scale, alike) + pairs.warnings()
-    if not again:
+    if not reproduced:
         notes += (
             "No second search found the best motion again: better ones may have been missed. Ask"
             " for more trials or searches.",
         )
-    judgement = judged(
-        linear, nulls, pairs, solutions, found_again=again, limit=limit, others=ellipsoids
+    judgement = judge(
+        linear, nulls, pairs, solutions, reproduced=reproduced, limit=limit, others=ellipsoids
     )
     return LightCurveFit(
-        solutions, curve, pairs, meant, scale, alike, offset_sigma, notes, judgement.verdict,
-        judgement.reasons, judgement.par, judgement.models, judgement.misfit, judgement.agreement,
-    )  # fmt: skip
+        solutions,
+        curve,
+        pairs,
+        meant,
+        scale,
+        alike,
+        offset_sigma,
+        notes,
+        judgement.verdict,
+        judgement.reasons,
+        judgement.par,
+        judgement.models,
+        judgement.misfit,
+        judgement.agreement,
+    )
 
 
 def _blur(curve: LightCurve) -> float:
@@ -162,107 +401,112 @@ def _blur(curve: LightCurve) -> float:
     return float((0.125 + turned / (2 * np.pi)) / np.ptp(curve.t))
 
 
-def _shared(meant: Hypotheses, reached: np.ndarray) -> Hypotheses:
+def _second_round(meant: Hypotheses, least_cost: np.ndarray) -> Hypotheses:
     """Those to try again, several times over: each time has trials and starts of its own.
 
     The likeliest, and those whose best body ``reached`` (h,) the lowest costs, in turn.
     """
-    many = len(reached)
-    place = np.minimum(np.arange(many), np.argsort(np.argsort(reached)) + 0.5)
+    many = len(least_cost)
+    place = np.minimum(np.arange(many), np.argsort(np.argsort(least_cost)) + 0.5)
     leading = np.argsort(place)[:_LEADING]
-    often = np.rint(_OFTEN / (1 + np.arange(len(leading)) / (_LEADING / 4))).astype(int)
-    index = np.repeat(leading, often)
+    repeats = np.rint(_OFTEN / (1 + np.arange(len(leading)) / (_LEADING / 4))).astype(int)
+    index = np.repeat(leading, repeats)
     return Hypotheses(*(x[index] for x in meant))
 
 
-def _searched(
+def _search_once(
     key, meant, trials: int, starts: int, rough: Problem, problem: Problem, blur, resolution
-) -> State:  # fmt: skip
+) -> State:
     """Bodies of all hypotheses; then more with the periods found, whose pole may be wrong."""
     own = jax.random.split(key, 3)
-    state, reached = _started(own[0], meant, trials, starts, rough, problem, blur)
-    likely = _shared(meant, reached)
-    more, _ = _started(own[2], likely, trials, starts, rough, problem, blur)
-    state = _better(problem, _joined(state, more), resolution, 3 * BATCH, _WIDE, 12)
+    state, reached = _descend(own[0], meant, trials, starts, rough, problem, blur)
+    likely = _second_round(meant, reached)
+    more, _ = _descend(own[2], likely, trials, starts, rough, problem, blur)
+    state = _improve_best(problem, _concatenate(state, more), resolution, 3 * BATCH, _WIDE, 12)
     return _with_poles(own[1], state, rough, problem, resolution)
 
 
 def _with_poles(key, state: State, rough: Problem, problem: Problem, resolution) -> State:
     """The best, and more of their periods."""
-    near = _near(state, resolution)
+    near = _hypotheses_of_best(state, resolution)
     trials = _MORE * len(near.f_phi)
     near = Hypotheses(*(np.repeat(x, _PARTS) for x in near))
-    more, _ = _started(key, near, trials, 2, rough, problem, 0.5 * resolution)
+    more, _ = _descend(key, near, trials, 2, rough, problem, 0.5 * resolution)
     more = problem.start(more.bodies, np.full(len(more.cost), _WIDE))
-    return _better(problem, _joined(state, more), resolution, 2 * BATCH, _LIMIT, 12)
+    return _improve_best(problem, _concatenate(state, more), resolution, 2 * BATCH, _LIMIT, 12)
 
 
-def _started(key, meant, trials: int, keep: int, rough: Problem, whole: Problem, blur):
+def _descend(key, meant, trials: int, keep: int, rough: Problem, whole: Problem, blur):
     """Steps from the ``keep`` best trials of every hypothesis, more from the best of these.
 
     The bodies that were stepped to the end, and the least cost of each hypothesis.
     """
-    found = tried(key, meant, trials, keep, rough.phase, whole.points, rough.points, blur)
-    many = len(found.gain)
-    bodies = taken(found.bodies, np.arange(many))
+    best_drawn = best_trials(
+        key, meant, trials, keep, rough.phase, whole.points, rough.points, blur
+    )
+    count = len(best_drawn.gain)
+    bodies = select_padded(best_drawn.bodies, np.arange(count))
     # the gain, as a first step of the shape
-    bodies.unknowns[:many, 2:4] *= found.gain[:, None]
-    source = np.pad(found.source, (0, len(bodies.wxyz) - many), mode="edge")
+    bodies.unknowns[:count, 2:4] *= best_drawn.gain[:, None]
+    source = np.pad(best_drawn.source, (0, len(bodies.wxyz) - count), mode="edge")
     state = rough.start(bodies, np.full(len(bodies.wxyz), _WIDE))
-    reached = np.full(len(meant.f_phi), np.inf)
+    least_cost = np.full(len(meant.f_phi), np.inf)
     for part, steps in _DESCENT:
         best = np.argsort(state.cost)[: int(part * len(bodies.wxyz))]
         best = np.pad(best, (0, -len(best) % BATCH), mode="edge")
         source = source[best]
-        state = rough.improve(picked(state, best), np.full(len(best), _WIDE), steps)
-        np.minimum.at(reached, source, state.cost)
+        state = rough.improve(select(state, best), np.full(len(best), _WIDE), steps)
+        np.minimum.at(least_cost, source, state.cost)
     best = np.argsort(state.cost)[: len(state.cost) // 2]
     best = np.pad(best, (0, -len(best) % BATCH), mode="edge")
-    last = rough.improve(picked(state, best), np.full(len(best), _WIDE), _LAST)
-    np.minimum.at(reached, source[best], last.cost)
-    return _joined(state, last), reached
+    last = rough.improve(select(state, best), np.full(len(best), _WIDE), _LAST)
+    np.minimum.at(least_cost, source[best], last.cost)
+    return _concatenate(state, last), least_cost
 
 
-def _better(problem: Problem, state: State, resolution, keep: int, limit: float, steps: int):
+def _improve_best(problem: Problem, state: State, resolution, keep: int, limit: float, steps: int):
     """The ``keep`` best distinct ones, improved."""
-    best = _distinct(state, resolution, keep)
+    best = _distinct_solutions(state, resolution, keep)
     best = np.pad(best, (0, keep - len(best)), mode="edge")
     width = np.full(keep, limit)
-    return problem.improve(problem.look(*picked(state[:2], best), width), width, steps)
+    return problem.improve(problem.evaluate(*select(state[:2], best), width), width, steps)
 
 
-def _near(state: State, resolution: float) -> Hypotheses:
+def _hypotheses_of_best(state: State, resolution: float) -> Hypotheses:
     """Periods and modes of the best bodies."""
     f_phi, f_psi, mode = frequencies(state.bodies)
-    kept: list[int] = []
+    index: list[int] = []
     for k in np.argsort(state.cost):
-        if len(kept) < _AGAIN and np.isfinite(state.cost[k] + f_phi[k] + f_psi[k]):
-            size = [max(abs(f_phi[k] - f_phi[j]), abs(f_psi[k] - f_psi[j]))
-                    for j in kept if mode[j] == mode[k]]  # fmt: skip
+        if len(index) < _AGAIN and np.isfinite(state.cost[k] + f_phi[k] + f_psi[k]):
+            size = [
+                max(abs(f_phi[k] - f_phi[j]), abs(f_psi[k] - f_psi[j]))
+                for j in index
+                if mode[j] == mode[k]
+            ]
             if min(size, default=np.inf) > 0.3 * resolution:
-                kept.append(int(k))
-    return Hypotheses(f_phi[kept], f_psi[kept], mode[kept] == int(Mode.LAM))
+                index.append(int(k))
+    return Hypotheses(f_phi[index], f_psi[index], mode[index] == int(Mode.LAM))
 
 
-def _found_twice(one: State, other: State, resolution: float) -> bool:
+def _searches_agree(one: State, other: State, resolution: float) -> bool:
     """Whether the best motion of both is in both, poles apart."""
     f_phi, f_psi, mode = zip(*(frequencies(s.bodies) for s in (one, other)))
     k = int(np.argmin([s.cost.min() for s in (one, other)]))
     best = int(np.argmin((one, other)[k].cost))
-    alike = [
+    same_motion = [
         (mode[j] == mode[k][best])
         & (abs(f_phi[j] - f_phi[k][best]) < 0.2 * resolution)
         & (abs(f_psi[j] - f_psi[k][best]) < 0.2 * resolution)
         for j in (0, 1)
     ]
-    return all(x.any() for x in alike)
+    return all(x.any() for x in same_motion)
 
 
-def _joined(*states: State) -> State:
+def _concatenate(*states: State) -> State:
     return jax.tree.map(lambda *x: np.concatenate(x), *states)
 
 
-def _thinned(points: Points, count: int) -> Points:
+def _subsample(points: Points, count: int) -> Points:
     """``count`` of the points at most, evenly chosen."""
     known = np.flatnonzero(np.asarray(points.weight[0]) > 0)
     if len(known) <= count:
@@ -273,7 +517,7 @@ def _thinned(points: Points, count: int) -> Points:
     )
 
 
-def _distinct(state: State, resolution: float, most: int) -> np.ndarray:
+def _distinct_solutions(state: State, resolution: float, max_count: int) -> np.ndarray:
     """Numbers of the ``max_solutions`` best solutions that differ in mode, frequencies or pole.
 
     Of one mode and frequencies no more than `_ALIKE`, so that others are not crowded out.
@@ -281,21 +525,21 @@ def _distinct(state: State, resolution: float, most: int) -> np.ndarray:
     f_phi, f_psi, mode = frequencies(state.bodies)
     pole = momentum(state.bodies)
     finite = np.isfinite(state.cost + f_phi + f_psi)
-    kept: list[int] = []
+    index: list[int] = []
     for k in np.argsort(state.cost):
         if not finite[k]:
             continue
-        alike = (
-            (mode[kept] == mode[k])
-            & (abs(f_phi[kept] - f_phi[k]) < 0.2 * resolution)
-            & (abs(f_psi[kept] - f_psi[k]) < 0.2 * resolution)
+        same_motion = (
+            (mode[index] == mode[k])
+            & (abs(f_phi[index] - f_phi[k]) < 0.2 * resolution)
+            & (abs(f_psi[index] - f_psi[k]) < 0.2 * resolution)
         )
-        same = alike & (pole[kept] @ pole[k] > np.cos(np.radians(15)))
-        if alike.sum() < _ALIKE and not same.any():
-            kept.append(int(k))
-        if len(kept) == most:
+        same_pole = same_motion & (pole[index] @ pole[k] > np.cos(np.radians(15)))
+        if same_motion.sum() < _ALIKE and not same_pole.any():
+            index.append(int(k))
+        if len(index) == max_count:
             break
-    return np.array(kept)
+    return np.array(index)
 
 
 def _mirrors(curve: LightCurve) -> np.ndarray:
@@ -312,7 +556,7 @@ def _mirrors(curve: LightCurve) -> np.ndarray:
     return np.stack([first, middle, np.cross(first, middle)])
 
 
-def _mirrored(bodies: Bodies, normal: np.ndarray) -> Bodies:
+def _reflect(bodies: Bodies, normal: np.ndarray) -> Bodies:
     """The motions seen in a mirror that holds Sun and observer, which gives the same light.
 
     With M the reflection in space and D that of body axis y, the attitude is M R D, the rates

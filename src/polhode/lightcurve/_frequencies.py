@@ -1,10 +1,4 @@
-"""Two-dimensional Fourier series: which pairs of frequencies a light curve allows.
-
-A free body's brightness, in constant directions, is a series in ``cos`` and ``sin`` of
-``2 pi (i f_phi + j f_psi) t``. Every such frequency is a node of one uniform grid when both are, so
-that the transforms of data and window are tabulated once and the normal equations of a pair are
-looked up, not summed.
-"""
+"""Fourier series of a light curve, and which frequencies of a body its lines may be."""
 
 from functools import partial
 from typing import NamedTuple
@@ -13,6 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+# Two-dimensional Fourier series: which pairs of frequencies a light curve allows.
+#
+# The brightness of a free body, seen from constant directions, is a series in ``cos`` and ``sin``
+# of ``2 pi (i f_phi + j f_psi) t``. If f_phi and f_psi are nodes of a uniform grid, so is every
+# such sum. The transforms of data and sampling window are therefore tabulated once, in O(points x
+# nodes), and the normal equations of any pair are read from the tables: their cost does not depend
+# on the number of points, only on the square of the number of terms.
 
 _CHUNK = 4096
 # Nodes of the grid of frequencies, for pairs over the whole square of it and for lines.
@@ -90,8 +92,10 @@ def _gram(tables, a, b):
         value = jnp.take(table, jnp.abs(k), axis=-1)
         return jnp.where(k < 0, jnp.conj(value), value)
 
+    # A product of two waves is a wave of the difference plus one of the sum of their frequencies,
+    # both nodes of the grid: two look-ups replace a sum over the points. Blocks cos cos, cos sin,
+    # sin cos, sin sin; of the transforms with exp(-i x), Re is cos and -Im is sin.
     less, more = at(window, a - b), at(window, a + b)
-    # cos cos, cos sin, sin cos, sin sin, with exp(-i x) transforms: Re = cos, -Im = sin
     cc, ss = (less.real + more.real) / 2, (less.real - more.real) / 2
     sc, cs = -(more.imag + less.imag) / 2, -(more.imag - less.imag) / 2
     left, right = at(columns, a), at(columns, b)
@@ -160,9 +164,11 @@ class Scan(NamedTuple):
                 is_cut = end > highest
         count = int(np.ceil(highest / step)) + 1
         window, data, *rest = _transforms(
-            jnp.asarray(t), jnp.asarray(np.vstack([np.ones_like(t), values, basis])), step,
+            jnp.asarray(t),
+            jnp.asarray(np.vstack([np.ones_like(t), values, basis])),
+            step,
             2 * (most * count + 1),
-        )  # fmt: skip
+        )
         return cls(
             (window, jnp.stack(rest)),
             data,
@@ -187,7 +193,8 @@ class Scan(NamedTuple):
         chunk = min(_CHUNK, 256 * -(-len(nodes) // 256))
         whole = np.concatenate([nodes, np.repeat(nodes[-1:], -len(nodes) % chunk, 0)])
         power, size = np.empty((2, len(whole)))
-        # columns that coincide, or vanish, would leave a singular matrix
+        # Two sums of a pair may share a node, or be zero: the ridge keeps the matrix regular. With
+        # ``soft`` from prior variances the determinant gives the evidence at no further cost.
         ridge = self.size * np.diag(np.tile(np.broadcast_to(soft, nodes.shape[1:]), 2))
         for start in range(0, len(whole), chunk):
             part = slice(start, start + chunk)
@@ -238,12 +245,14 @@ def fourier_pairs(
     peak = np.pad(power, 1, constant_values=-1.0)
     around = [
         peak[1 + i : peak.shape[0] - 1 + i, 1 + j : peak.shape[1] - 1 + j]
-        for i in (-1, 0, 1) for j in (-1, 0, 1) if (i, j) != (0, 0)
-    ]  # fmt: skip
+        for i in (-1, 0, 1)
+        for j in (-1, 0, 1)
+        if (i, j) != (0, 0)
+    ]
     high = np.argwhere((power >= np.max(around, axis=0)) & (power > 0))
     best = high[np.argsort(-power[tuple(high.T)])][:keep]
-    found = nodes[best] * scan.step
-    return scan.pairs(found[:, 0], found[:, 1], power[tuple(best.T)])
+    frequencies = nodes[best] * scan.step
+    return scan.pairs(frequencies[:, 0], frequencies[:, 1], power[tuple(best.T)])
 
 
 def fourier_lattices(
@@ -268,23 +277,23 @@ def fourier_lattices(
     scan = Scan.of(t, values, columns, max_frequency, oversampling, 2, _MAX_LINE_NODES)
     nodes = np.arange(max(oversampling // 2, 1), scan.count)
     peaks = _maxima(scan.fitted(nodes[:, None])[0])[:lines]
-    found, power = [], []
+    pairs, power = [], []
     for node in nodes[peaks]:
         line = np.stack([np.full_like(nodes, node), nodes], -1)
         part = scan.explained(line, LINES)
         best = _maxima(part)[:keep]
-        found.append(line[best])
+        pairs.append(line[best])
         power.append(part[best])
-    found, power = np.concatenate(found), np.concatenate(power)
-    kept: list[int] = []
+    pairs, power = np.concatenate(pairs), np.concatenate(power)
+    index: list[int] = []
     for k in np.argsort(-power):
-        near = np.abs(found[kept] - found[k]).max(1) if kept else np.array([np.inf])
+        near = np.abs(pairs[index] - pairs[k]).max(1) if index else np.array([np.inf])
         if near.min() > oversampling // 4:
-            kept.append(int(k))
-        if len(kept) == keep:
+            index.append(int(k))
+        if len(index) == keep:
             break
-    g, h = scan.step * found[kept].T
-    return scan.pairs(g, h, power[kept])
+    g, h = scan.step * pairs[index].T
+    return scan.pairs(g, h, power[index])
 
 
 def _maxima(values: np.ndarray) -> np.ndarray:
@@ -316,3 +325,157 @@ def _strong_lines(t, values, step) -> tuple[float, float]:
     strong = step * np.flatnonzero(power > 0.1 * power.max())[-1]
     strongest = step * int(np.argmax(power))
     return strongest, min(max(1.3 * strong, 2.2 * strongest), max(count * step, 8 * step))
+
+
+# Interpretations of pairs of lines of a light curve: periods and mode of a body.
+#
+# Two lines of the spectrum fix the two frequencies once the sums that they stand for are known,
+# which they are not. Every invertible assignment of main sums is solved (a 2 x 2 system each) and
+# ranked by the evidence of the whole series, so that a trial body is never drawn for a pair of
+# frequencies that the spectrum rejects.
+
+# Sums i f_phi + j f_psi in the light of ellipsoids, and the part of its variance that each has:
+# means over spins and directions at random, in round numbers. Half a turn about its long axis, or
+# half a period of the nutation about the short one, leave an ellipsoid's light as it was: in
+# long-axis mode j is even, in short-axis mode i + j is.
+LAM = {
+    (1, 0): 0.4,
+    (2, 0): 0.2,
+    (2, 2): 0.2,
+    (1, 2): 0.06,
+    (0, 2): 0.05,
+    (1, -2): 0.005,
+    (3, 0): 0.005,
+    (4, 0): 0.005,
+    (4, 2): 0.003,
+    (3, 2): 0.003,
+    (4, 4): 0.003,
+}
+SAM = {
+    (1, 1): 0.5,
+    (2, 0): 0.35,
+    (2, 2): 0.1,
+    (1, -1): 0.015,
+    (0, 2): 0.012,
+    (1, 3): 0.01,
+    (3, 1): 0.003,
+    (4, 0): 0.003,
+}
+_MAIN = 0.0101  # sums with more than this are taken for the lines seen
+_OVER = 5  # nodes by resolution
+_LINES = 6  # lines whose other frequency is sought over all of the grid
+
+
+class Hypotheses(NamedTuple):
+    """Periods that a light curve may stand for; arrays (h,)."""
+
+    f_phi: np.ndarray
+    f_psi: np.ndarray
+    long_axis: np.ndarray  # bool: LAM
+
+
+def hypotheses(pairs: Pairs, t, values, *, columns=None, max_count: int = 800) -> Hypotheses:
+    """Bodies' frequencies that explain pairs of lines (g, h), the ``most`` most likely first.
+
+    Each of g and h may be any of the main sums of either mode; or g of the best pairs is one, and
+    the other frequency anything, where g is all that is seen. How likely a meaning is: by the
+    evidence of Gaussian waves of all sums of the mode, with their usual variances. SAM has
+    ``f_psi <= f_phi``, because no moment exceeds the sum of the other two.
+    """
+    lines = np.stack([pairs.f_phi, pairs.f_psi], -1)
+    highest = 1.01 * lines.max()
+    scan = Scan.of(t, values, columns, highest, _OVER, 8)
+    # noise, waves that are not listed, and directions that turn: twice what the best pair leaves
+    noise = 2 * max(1 - float(np.max(pairs.explained)), 1e-3)
+    alone = lines[_separated(lines[:, :1], pairs.explained, 0.2 * pairs.resolution, _LINES), 0]
+    candidates, score = [], []
+    for long_axis, sums in ((True, LAM), (False, SAM)):
+        main = {s: part for s, part in sums.items() if part > _MAIN}
+        meant = [np.einsum("kij,lj->lki", _inverse_sums(main), lines).reshape(-1, 2)]
+        for i, j in main:
+            free = _with_line(i, j, alone, scan)
+            free = free[_physically_possible(free, long_axis, pairs.resolution, highest)]
+            if len(free):
+                best = np.argsort(-_evidence(scan, free, main, noise))
+                meant.append(free[best[:max_count]])
+        meant = np.concatenate(meant)
+        meant = meant[_physically_possible(meant, long_axis, pairs.resolution, highest)]
+        if len(meant):
+            evidence = _evidence(scan, meant, sums, noise)
+            index = _separated(meant, evidence, 0.4 * pairs.resolution, max_count)
+            candidates += [(*meant[k], long_axis) for k in index]
+            score += evidence[index].tolist()
+    best = np.argsort(-np.array(score))[:max_count]
+    f_phi, f_psi, mode = np.array(candidates, float).reshape(-1, 3)[best].T
+    return Hypotheses(f_phi, f_psi, mode > 0.5)
+
+
+def _physically_possible(
+    meant: np.ndarray, long_axis: bool, resolution: float, highest: float
+) -> np.ndarray:
+    # half a turn within the light curve at least
+    good = (meant.min(1) >= 0.5 * resolution) & (meant.max(1) <= highest)
+    return good if long_axis else good & (meant[:, 1] <= meant[:, 0])
+
+
+def _with_line(i: int, j: int, lines: np.ndarray, scan: Scan) -> np.ndarray:
+    """All (f_phi, f_psi) of the grid for which i f_phi + j f_psi is one of ``lines``."""
+    nodes = scan.step * np.arange(1, scan.count)
+    g, other = (x.reshape(-1) for x in np.meshgrid(lines, nodes, indexing="ij"))
+    if j == 0:
+        return np.stack([g / i, other / 2], -1)
+    return np.stack([other, (g - i * other) / j], -1)
+
+
+def _evidence(scan: Scan, meant: np.ndarray, sums, left: float) -> np.ndarray:
+    """Twice the logarithm of the evidence (k,) of waves of ``sums``, but for a constant."""
+    nodes = np.rint(meant @ np.array(list(sums)).T / scan.step).astype(int)
+    variance = np.array(list(sums.values()))
+    power, size = scan.fitted(nodes, left / variance / scan.size)
+    return power * scan.size / left - size + 2 * np.log(left / variance).sum()
+
+
+def _inverse_sums(sums) -> np.ndarray:
+    """Matrices (k, 2, 2) from (g, h) to (f_phi, f_psi): two of the sums solved for these."""
+    main = np.array(list(sums), float)
+    pairs = [np.stack([a, b]) for a in main for b in main if abs(np.linalg.det([a, b])) > 0.5]
+    return np.unique(np.round(np.linalg.inv(pairs), 9), axis=0)
+
+
+def _separated(points: np.ndarray, score: np.ndarray, size: float, max_count: int) -> list[int]:
+    """Numbers of the ``most`` best of (k, 2), no two within ``size`` of each other."""
+    index: list[int] = []
+    for k in np.argsort(-score):
+        if not index or np.abs(points[index] - points[k]).max(1).min() > size:
+            index.append(int(k))
+        if len(index) == max_count:
+            break
+    return index
+
+
+def meaning(f_phi: float, f_psi: float) -> str:
+    """What a pair would mean, in words: modes that it allows, and the strongest sums of each."""
+
+    def listed(sums):
+        return ", ".join(
+            f"{sum_name(i, j)} = {i * f_phi + j * f_psi:.5g}" for i, j in list(sums)[:3]
+        )
+
+    # A body slower about L than about its long axis can only turn fully about the latter:
+    # (I_s/I_i - 1)(I_s/I_l - 1) <= 1 for moments that mass can have.
+    if f_psi < f_phi:
+        return f"LAM or SAM; LAM: {listed(LAM)}; SAM: {listed(SAM)}"
+    return f"LAM only: {listed(LAM)}"
+
+
+def sum_name(i: int, j: int) -> str:
+    """The sum i f_phi + j f_psi in words."""
+    return f"{_name(i, 'f_phi')}{_name(j, 'f_psi', first=i == 0)}"
+
+
+def _name(count: int, symbol: str, first: bool = True) -> str:
+    if count == 0:
+        return ""
+    sign = "-" if count < 0 else "" if first else "+"
+    size = "" if abs(count) == 1 else f"{abs(count)} "
+    return f"{sign}{size}{symbol}" if first else f" {sign} {size}{symbol}"

@@ -15,9 +15,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from polhode.lightcurve._brightness import seeliger_ellipsoid
 from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._frequencies import LINES, Pairs, Scan, _maxima, terms
-from polhode.lightcurve._scattering import seeliger_ellipsoid
 
 _CLIP = 4.0  # residuals beyond as many times the scale of the best model count as that
 _CANDIDATES = 10  # peaks of the spectrum of one period that are refined
@@ -127,7 +127,9 @@ def one_period(linear: Linear, max_frequency: float) -> list[Residuals]:
     """
     t, span = linear.t, float(linear.t[-1])
     candidates = _peaks(linear, max_frequency)
-    refined = [_refined(linear, f, lambda f: waves(t, f * np.arange(1, 5))) for f in candidates]
+    refined = [
+        _refine_frequency(linear, f, lambda f: waves(t, f * np.arange(1, 5))) for f in candidates
+    ]
     chi2 = [linear.chi2(waves(t, f * np.arange(1, 5))) for f in refined]
     best = [refined[k] for k in np.argsort(chi2)[:4]]
     # a series of f / 2 and few harmonics may be that of f
@@ -146,8 +148,8 @@ def one_period(linear: Linear, max_frequency: float) -> list[Residuals]:
             def columns(f, harmonics=harmonics, modulated=modulated):
                 return waves(t, f * harmonics, modulated)
 
-            found = [_refined(linear, f, columns, steps=7) for f in best]
-            f = found[int(np.argmin([linear.chi2(columns(f)) for f in found]))]
+            refined_again = [_refine_frequency(linear, f, columns, steps=7) for f in best]
+            f = refined_again[int(np.argmin([linear.chi2(columns(f)) for f in refined_again]))]
             name = f"one period, {order} harmonics" + (", changing" if modulated else "")
             rest = linear.residuals(columns(f))
             out.append(Residuals(name, rest, count, log_trials, (1 / f,)))
@@ -163,14 +165,14 @@ def _peaks(linear: Linear, max_frequency: float) -> list[float]:
     nodes = np.arange(over, scan.count)
     if not nodes.size:
         return [1 / float(linear.t[-1])]
-    kept: list[int] = []
+    chosen: list[int] = []
     for order in _SCAN_ORDERS:
-        found = scan.fitted(nodes[:, None] * np.arange(1, order + 1))[0]
-        kept += nodes[_maxima(found)[:_CANDIDATES]].tolist()
-    return [scan.step * k for k in sorted(set(kept))]
+        power = scan.fitted(nodes[:, None] * np.arange(1, order + 1))[0]
+        chosen += nodes[_maxima(power)[:_CANDIDATES]].tolist()
+    return [scan.step * k for k in sorted(set(chosen))]
 
 
-def _refined(linear: Linear, frequency: float, columns, steps: int = 11) -> float:
+def _refine_frequency(linear: Linear, frequency: float, columns, steps: int = 11) -> float:
     """The frequency near ``frequency`` at which ``columns(f)`` explain most."""
     width = 0.25 / linear.t[-1]
     for _ in range(2):
@@ -198,7 +200,7 @@ def two_periods(linear: Linear, pairs: Pairs, solutions) -> list[Residuals]:
                 def columns(f, k=k, pair=pair, sums=sums):
                     return waves(t, sums @ np.where(np.arange(2) == k, f, pair))
 
-                pair[k] = _refined(linear, pair[k], columns, steps=7)
+                pair[k] = _refine_frequency(linear, pair[k], columns, steps=7)
         rest = linear.residuals(waves(t, sums @ pair))
         out.append(
             Residuals("two periods, series", rest, count, log_trials, tuple((1 / pair).tolist()))
@@ -229,11 +231,13 @@ def _rotators(x, arrays, basis):
         u, v, longitude, latitude, turn, frequency = x
         c, s = jnp.cos(longitude), jnp.sin(longitude)
         cb, sb = jnp.cos(latitude), jnp.sin(latitude)
-        frame = jnp.stack([
-            jnp.stack([sb * c, sb * s, -cb]),
-            jnp.stack([-s, c, jnp.zeros_like(s)]),
-            jnp.stack([cb * c, cb * s, sb]),
-        ])  # fmt: skip
+        frame = jnp.stack(
+            [
+                jnp.stack([sb * c, sb * s, -cb]),
+                jnp.stack([-s, c, jnp.zeros_like(s)]),
+                jnp.stack([cb * c, cb * s, sb]),
+            ]
+        )
         angle = turn + 2 * jnp.pi * frequency * t
         ca, sa = jnp.cos(angle), jnp.sin(angle)
 
@@ -270,10 +274,13 @@ def rotator(linear: Linear, periods, max_frequency: float) -> tuple[Residuals, n
     latitude = np.arcsin(1 - 2 * k / 12)
     longitude = np.pi * (1 + 5**0.5) * k
     turn = np.pi * np.arange(4) / 4
-    grid = np.array([
-        (np.log(0.65), np.log(0.5), a, b, c)
-        for a, b in zip(longitude, latitude, strict=True) for c in turn
-    ])  # fmt: skip
+    grid = np.array(
+        [
+            (np.log(0.65), np.log(0.5), a, b, c)
+            for a, b in zip(longitude, latitude, strict=True)
+            for c in turn
+        ]
+    )
     best, values, chosen = np.inf, None, np.zeros(6)
     for f in sorted({float(f) for p in periods for f in (1 / p, 0.5 / p, 2 / p)}):
         if f > max_frequency:
@@ -283,11 +290,11 @@ def rotator(linear: Linear, periods, max_frequency: float) -> tuple[Residuals, n
         parts = [x[k : k + _BATCH] for k in range(0, len(x), _BATCH)]
         chi2 = [np.sum(np.asarray(_rotators(p, arrays, basis)[0]) ** 2, axis=1) for p in parts]
         x = x[np.argsort(np.concatenate(chi2))[:_BATCH]]
-        x, found = _improved(x, arrays, basis)
-        size = np.sum(found**2, axis=1)
+        x, residuals = _improve_rotators(x, arrays, basis)
+        size = np.sum(residuals**2, axis=1)
         k = int(np.argmin(size))
         if size[k] < best:
-            best, values, chosen = size[k], found[k], x[k]
+            best, values, chosen = size[k], residuals[k], x[k]
     if values is None:
         return None
     log_trials = float(np.log(max(max_frequency * linear.t[-1], 1.0)))
@@ -296,50 +303,54 @@ def rotator(linear: Linear, periods, max_frequency: float) -> tuple[Residuals, n
     return Residuals("one period, rotating ellipsoid", rest, 6, log_trials, period), chosen
 
 
-def _improved(x, arrays, basis, steps: int = 25):
+def _improve_rotators(x, arrays, basis, steps: int = 25):
     """Levenberg-Marquardt for rotators (b, 6); the parameters, and residuals (b, n)."""
     damping = np.full(len(x), 1e-2)
     value, slopes = map(np.asarray, _rotators(x, arrays, basis))
     for _ in range(steps):
         # axes' ratios 0 +- 0.8 in their logarithms
-        held = np.diag([0.8**-2, 0.8**-2, 0, 0, 0, 0])
-        matrix = np.einsum("bni,bnj->bij", slopes, slopes) + held
-        right = np.einsum("bni,bn->bi", slopes, value) + x @ held
+        prior_precision = np.diag([0.8**-2, 0.8**-2, 0, 0, 0, 0])
+        matrix = np.einsum("bni,bnj->bij", slopes, slopes) + prior_precision
+        right = np.einsum("bni,bn->bi", slopes, value) + x @ prior_precision
         size = np.sqrt(np.maximum(np.einsum("bii->bi", matrix), 1e-12))
         scaled = matrix / size[:, :, None] / size[:, None]
         scaled = np.nan_to_num(scaled) + damping[:, None, None] * np.eye(6)
         step = np.linalg.solve(scaled, np.nan_to_num(right / size)[..., None])[..., 0] / size
         step *= np.minimum(1, 0.5 / np.maximum(np.abs(step[:, :5]).max(1), 1e-30))[:, None]
-        tried = x - step
-        new, new_slopes = map(np.asarray, _rotators(tried, arrays, basis))
-        held = held[0, 0]
+        trial = x - step
+        new, new_slopes = map(np.asarray, _rotators(trial, arrays, basis))
+        prior_precision = prior_precision[0, 0]
 
-        def cost(value, x, held=held):
-            return np.nan_to_num(np.sum(value**2, 1), nan=np.inf) + held * (x[:, :2] ** 2).sum(1)
+        def cost(value, x, prior_precision=prior_precision):
+            return np.nan_to_num(np.sum(value**2, 1), nan=np.inf) + prior_precision * (
+                x[:, :2] ** 2
+            ).sum(1)
 
-        better = cost(new, tried) < cost(value, x)
-        x = np.where(better[:, None], tried, x)
+        better = cost(new, trial) < cost(value, x)
+        x = np.where(better[:, None], trial, x)
         value = np.where(better[:, None], new, value)
         slopes = np.where(better[:, None, None], new_slopes, slopes)
         damping = np.clip(damping * np.where(better, 0.2, 5.0), 1e-9, 1e9)
     return x, value
 
 
-def compared(linear: Linear, found: list[Residuals], likeness) -> tuple[Model, ...]:
-    """Evidence of the models ``found``, with points that are alike in the best one joined.
+def compare_models(
+    linear: Linear, candidates: list[Residuals], effective_correlation
+) -> tuple[Model, ...]:
+    """Evidence of ``candidates``, with points correlated in the residuals of the best joined.
 
-    ``likeness(curve, residuals over errors)``: how many residuals count as one.
+    ``effective_correlation(curve, residuals over errors)``: how many residuals count as one.
     """
     curve = linear.curve
     n = linear.independent
-    sharpest = min(found, key=lambda r: np.median(np.abs(r.values * linear.root)))
+    sharpest = min(candidates, key=lambda r: np.median(np.abs(r.values * linear.root)))
     scale = 1.4826 * max(float(np.median(np.abs(sharpest.values * linear.root))), 1e-12)
     limit = _CLIP * scale
-    alike = likeness(curve, np.clip(sharpest.values * linear.root, -limit, limit))
+    alike = effective_correlation(curve, np.clip(sharpest.values * linear.root, -limit, limit))
     alike *= max(n / max(n - sharpest.parameters, 1), 1.0)
     independent = max(n / alike, 2.0)
     out = []
-    for each in found:
+    for each in candidates:
         weighted = each.values * linear.root
         rss = float(np.sum(np.minimum(weighted**2, limit**2)))
         evidence = (

@@ -1,4 +1,4 @@
-"""Trial bodies with given periods, many at a time, and their misfit."""
+"""Trial bodies with given periods: random draws, alignment in phase, and least squares."""
 
 from typing import NamedTuple
 
@@ -7,12 +7,346 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from polhode import rotation
 from polhode._closed_forms import free_motion, principal_periods
-from polhode.lightcurve._hypotheses import Hypotheses
-from polhode.lightcurve._model import Bodies, Points, magnitudes, moments_of
-from polhode.lightcurve._phase import AbstractPhase
-from polhode.lightcurve._series import GAIN, directions, series, turned
-from polhode.lightcurve._steps import picked
+from polhode.lightcurve._brightness import (
+    AbstractPhase,
+    Bodies,
+    Points,
+    _to_body,
+    apply_step,
+    magnitudes,
+    magnitudes_and_derivatives,
+    moments_of,
+    seeliger_ellipsoid,
+)
+from polhode.lightcurve._frequencies import Hypotheses
+
+# Damped least squares for batches of bodies, robust, with exact derivatives.
+
+BATCH = 32
+# What is held of a body before it is seen: logarithms of the axes' ratios 0 +- 0.8; those of the
+# homogeneous ellipsoid of its inertia within 0.25 of its shape's; phase coefficients +- 0.3.
+_SHAPE_SIGMA, _TIE_SIGMA, _PHASE_SIGMA = 0.8, 0.25, 0.3
+_EXPECTED = 40  # steps to the spread of offsets; twenty reach three digits
+
+
+def _priors(phase: AbstractPhase, columns: int):
+    """Rows a, targets b and 1/sigma^2 of (a x - b)^2 / sigma^2 of all unknowns."""
+    many = len(phase.typical)
+    size = 10 + many + columns
+    rows, targets, precision = [], [], []
+
+    def add(entries, target, sigma):
+        row = np.zeros(size)
+        for k, value in entries:
+            row[k] = value
+        rows.append(row)
+        targets.append(target)
+        precision.append(sigma**-2.0)
+
+    for k in range(2):
+        add([(2 + k, 1.0)], 0.0, _SHAPE_SIGMA)
+        add([(k, 1.0), (2 + k, -1.0)], 0.0, _TIE_SIGMA)
+    for k, typical in enumerate(phase.typical):
+        add([(7 + k, 1.0)], typical, _PHASE_SIGMA)
+    return np.array(rows), np.array(targets), np.array(precision)
+
+
+def normal_equations(phase, bodies: Bodies, offsets, points: Points, limit):
+    """Robust cost (b,), and matrix and right side of the normal equations of data, all unknowns.
+
+    The cost of a residual of r sigma is 2 limit^2 (sqrt(1 + (r / limit)^2) - 1).
+    """
+    value, slopes = magnitudes_and_derivatives(phase, bodies, points)
+    rest = value + offsets @ points.columns - points.magnitude
+    squared = rest * rest * points.weight / limit[:, None] ** 2
+    cost = 2 * limit**2 * jnp.sum(squared / (1 + jnp.sqrt(1 + squared)), axis=-1)
+    robust = 1 / jnp.sqrt(1 + squared)
+    weight = points.weight * robust
+    columns = jnp.broadcast_to(points.columns, (rest.shape[0], *points.columns.shape))
+    whole = jnp.concatenate([slopes, columns], axis=1)
+    weighted = whole * weight[:, None]
+    matrix = jnp.einsum("bin,bjn->bij", weighted, whole)
+    right = jnp.einsum("bin,bn->bi", weighted, rest)
+    return cost, matrix, right, jnp.sum(rest * rest * points.weight, -1), (value, robust)
+
+
+normal_equations = jax.jit(normal_equations, static_argnums=0)
+_light = jax.jit(magnitudes, static_argnums=0)
+_apply_step = jax.jit(apply_step)
+
+
+class State(NamedTuple):
+    bodies: Bodies
+    offsets: np.ndarray
+    cost: np.ndarray
+    matrix: np.ndarray
+    right: np.ndarray
+    square: np.ndarray
+
+
+class Problem:
+    """Damped steps for batches of bodies."""
+
+    def __init__(self, phase: AbstractPhase, points: Points):
+        self.phase, self.points = phase, points
+        self.columns = points.columns.shape[0]
+        self.priors = _priors(phase, self.columns)
+        self.stiffness = np.asarray(points.stiffness)
+
+    def evaluate(self, bodies: Bodies, offsets: np.ndarray, limit: np.ndarray) -> State:
+        """Cost and normal equations of bodies (b,), b a multiple of the batch."""
+        parts = []
+        for start in range(0, len(offsets), BATCH):
+            cut = slice(start, start + BATCH)
+            piece = jax.tree.map(jnp.asarray, select(bodies, cut))
+            out = normal_equations(
+                self.phase, piece, jnp.asarray(offsets[cut]), self.points, jnp.asarray(limit[cut])
+            )
+            parts.append([np.asarray(x) for x in out[:4]])
+        cost, matrix, right, square = (np.concatenate(x) for x in zip(*parts))
+        rows, targets, precision = self.priors
+        many = bodies.unknowns.shape[1]
+        x = np.concatenate([bodies.unknowns, np.zeros((len(offsets), 3)), offsets], axis=1)
+        rest = x @ rows.T - targets
+        # Offsets without points are fixed at zero by the stiffness of their padding; free offsets
+        # have stiffness 0, and the jitter of `_solve_damped` alone.
+        soft = np.zeros(x.shape[1])
+        soft[many + 3 :] = self.stiffness
+        cost = cost + (rest**2 * precision).sum(1) + (x**2 * soft).sum(1)
+        matrix = matrix + (rows.T * precision) @ rows + np.diag(soft)
+        right = right + (rest * precision) @ rows + x * soft
+        return State(bodies, offsets, np.nan_to_num(cost, nan=np.inf), matrix, right, square)
+
+    def start(self, bodies: Bodies, limit: np.ndarray) -> State:
+        """With the offsets that fit best."""
+        c, weight = np.asarray(self.points.columns), np.asarray(self.points.weight)
+        solver = np.linalg.inv((c * weight) @ c.T + np.diag(self.stiffness + 1e-9 * weight.sum()))
+        light = np.concatenate(
+            [
+                _light(self.phase, select(bodies, slice(k, k + BATCH)), self.points)
+                for k in range(0, len(limit), BATCH)
+            ]
+        )
+        rest = np.nan_to_num((self.points.magnitude - light) * weight, posinf=0, neginf=0)
+        return self.evaluate(bodies, rest @ c.T @ solver, limit)
+
+    def improve(self, state: State, limit: np.ndarray, steps: int, ending: float = 1e-3):
+        """Levenberg-Marquardt; ends when no cost fell by ``ending`` in three steps."""
+        damping = np.full(len(limit), 1e-2)
+        idle_steps = np.zeros(len(limit), int)
+        for _ in range(steps):
+            active = np.flatnonzero(idle_steps < 3)
+            if not active.size:
+                break
+            # Converged bodies leave the batch: the number of active ones falls to a fraction within
+            # a few steps. Padding to whole batches keeps the shapes, and so the compiled programs,
+            # the same.
+            active = np.pad(active, (0, -active.size % BATCH), mode="edge")
+            old = select(state, active)
+            step = -_solve_damped(old.matrix, old.right, damping[active])
+            many = step.shape[1] - self.columns
+            # no step of more than half a unit in the logarithms, half a radian in attitude
+            size = np.abs(np.delete(step[:, :many], (4, 5, 6), axis=1)).max(1)
+            step *= np.minimum(1, 0.5 / np.maximum(size, 1e-30))[:, None]
+            parts = [
+                _apply_step(select(old.bodies, cut), step[cut, :many])
+                for cut in (slice(k, k + BATCH) for k in range(0, len(step), BATCH))
+            ]
+            bodies = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+            new = self.evaluate(bodies, old.offsets + step[:, many:], limit[active])
+            better = new.cost < old.cost
+            gain = np.where(better, old.cost - new.cost, 0)
+            for old_array, new_array in zip(jax.tree.leaves(state), jax.tree.leaves(new)):
+                old_array[active[better]] = new_array[better]
+            damping[active] = np.clip(damping[active] * np.where(better, 0.2, 5.0), 1e-9, 1e9)
+            # A rejected step counts as idle only at high damping: at low damping the next, shorter
+            # step may still reduce the cost.
+            small = np.where(
+                better, gain < ending * np.maximum(1, 1e-3 * old.cost), damping[active] > 10
+            )
+            idle_steps[active] = np.where(small, idle_steps[active] + 1, 0)
+        return state
+
+
+def spread_of_offsets(matrix, right, offsets, stiffness, groups: slice) -> float:
+    """Standard deviation of the groups' offsets [mag] that makes the points most likely.
+
+    ``matrix`` (u, u), ``right`` (u,): normal equations at a body, whose last unknowns are
+    ``offsets`` (c,) held by ``stiffness`` (c,). All unknowns are integrated out of the linear
+    model, by expectation and maximisation: the mean square is that of estimates and variances.
+    """
+    index = np.arange(len(matrix) - len(offsets), len(matrix))
+    x = np.zeros(len(matrix))
+    x[index] = offsets
+    right, index, prior_precision = matrix @ x - right, index[groups], stiffness[groups]
+    variance = 1 / prior_precision[0]
+    for _ in range(_EXPECTED):
+        precision = matrix.copy()
+        precision[index, index] += 1 / variance - prior_precision
+        inverse = np.linalg.pinv(precision, hermitian=True)
+        variance = np.mean((inverse @ right)[index] ** 2 + np.diag(inverse)[index])
+    return float(np.sqrt(variance))
+
+
+def _solve_damped(matrix, right, damping):
+    """Solutions of symmetric systems, scaled to unit diagonal, with ``damping`` on it."""
+    diagonal = np.einsum("bii->bi", matrix)
+    size = np.sqrt(np.where(diagonal > 0, diagonal, 1))
+    scaled = matrix / size[:, :, None] / size[:, None]
+    scaled = np.nan_to_num(scaled, posinf=0, neginf=0)
+    eye = np.eye(matrix.shape[1])
+    scaled = scaled + eye * (np.reshape(damping, (-1, 1, 1)) + 1e-12 + (diagonal <= 0)[:, :, None])
+    right = np.nan_to_num(right / size, posinf=0, neginf=0)
+    return np.linalg.solve(scaled, right[..., None])[..., 0] / size
+
+
+def select(tree, index):
+    """The bodies of these numbers."""
+    return jax.tree.map(lambda x: x[index], tree)
+
+
+def select_padded(bodies: Bodies, index) -> Bodies:
+    """The same, copied, in whole batches: the last is repeated."""
+    index = np.pad(index, (0, -len(index) % BATCH), mode="edge")
+    return select(jax.tree.map(np.array, bodies), index)
+
+
+# Alignment of trial bodies with the phases of a light curve's Fourier series.
+#
+# While the directions to Sun and observer are constant, the light of a body is a function of its
+# two phase angles (a torus), and a shift of both angles multiplies the Fourier coefficients by
+# phase factors. The light is therefore computed once, at the 72 nodes of a grid on the torus, and
+# every node is compared with the data through the normal equations of the series: 72 starting
+# phases of a body cost about as much as its light at 72 times, whatever the number of points.
+
+# Sums i f_phi + j f_psi compared, of SAM and of LAM: nearly all of an ellipsoid's light.
+_SUMS = np.array(
+    [
+        [(1, 1), (2, 0), (2, 2), (1, -1), (0, 2), (1, 3), (3, 1), (4, 0), (2, -2), (3, 3), (4, 2)],
+        [(1, 0), (2, 0), (2, 2), (1, 2), (0, 2), (1, -2), (3, 0), (4, 0), (4, 2), (3, 2), (4, 4)],
+    ]
+)
+_TURN, _HALF = 12, 6  # nodes of a turn about the momentum, and of half a period of the nutation
+GAIN = (0.6, 1.7)  # of the variations, in a trial's score
+_NODES = np.stack(np.meshgrid(np.arange(_TURN), np.arange(_HALF), indexing="ij"), -1).reshape(-1, 2)
+_ANGLES = 2 * np.pi * np.einsum("nc,mkc->mnk", _NODES / (_TURN, 2 * _HALF), _SUMS)
+
+
+def series(points: Points, f_phi, f_psi, long_axis) -> tuple[np.ndarray, np.ndarray]:
+    """Right sides (h, 2 k) and matrices (h, 2 k, 2 k) of the least squares of the sums' waves.
+
+    Of frequencies (h,) and modes (h,), the points weighted by their errors. What offsets and the
+    phase angle explain is projected out.
+    """
+    is_point = _known(points)
+    t, alpha, data, weight = (
+        np.asarray(x[0])[is_point]
+        for x in (points.t, points.alpha, points.magnitude, points.weight)
+    )
+    root = np.sqrt(weight)
+    columns = np.vstack([np.asarray(points.columns)[:, is_point], alpha, alpha**2]) * root
+    _, size, basis = np.linalg.svd(columns, full_matrices=False)
+    basis = basis[size > 1e-10 * size[0]]
+    data = data * root
+    data = data - (data @ basis.T) @ basis
+    right, matrix = [], []
+    for f, g, sums in zip(f_phi, f_psi, _SUMS[long_axis.astype(int)], strict=True):
+        angle = 2 * np.pi * (sums @ [f, g])[:, None] * t
+        waves = np.concatenate([np.cos(angle), np.sin(angle)]) * root
+        waves = waves - (waves @ basis.T) @ basis
+        right.append(waves @ data)
+        matrix.append(waves @ waves.T)
+    return np.array(right), np.array(matrix)
+
+
+def directions(points: Points) -> tuple[np.ndarray, np.ndarray]:
+    """Unit vectors (3,) to Sun and observer in the mean."""
+    is_point = _known(points)
+    means = (
+        np.array([np.asarray(x[0])[is_point].mean() for x in v])
+        for v in (points.sun, points.observer)
+    )
+    sun, observer = (v / np.linalg.norm(v) for v in means)
+    return sun, observer
+
+
+def _known(points: Points) -> np.ndarray:
+    return np.asarray(points.weight[0]) > 0  # others pad
+
+
+@jax.jit
+def align_phases(
+    bodies: Bodies, f_phi, f_psi, long_axis, right, matrix, sun, observer
+) -> tuple[Bodies, Float[Array, " b"]]:
+    """The bodies (b,), of frequencies (b,), where their light comes nearest to the series.
+
+    ``right`` (b, 2 k), ``matrix`` (b, 2 k, 2 k): of `series`; ``sun``, ``observer`` (3,): of
+    `directions`. Only attitude and rates change; the momentum keeps its direction. And by how much
+    each lowers chi-square.
+    """
+    u, wxyz = bodies
+    moments, omega = moments_of(u), tuple(u[:, k] for k in (4, 5, 6))
+    # Half a period of the nutation is enough: by the symmetry of an ellipsoid the other half
+    # repeats the same light, in SAM after half a turn about the momentum.
+    times = jnp.arange(_HALF)[None] / (2 * _HALF) / f_psi[:, None]
+    rates, q = free_motion(moments, tuple(wxyz[:, k] for k in range(4)), omega, times)
+    assert rates is not None  # neither was declined
+    assert q is not None
+    pole = rotation.rotate(
+        wxyz, jnp.stack([a * b for a, b in zip(moments, omega, strict=True)], -1)
+    )
+    pole = pole / jnp.linalg.norm(pole, axis=-1, keepdims=True)
+    turn = 2 * jnp.pi * (_NODES[None, :, 0] / _TURN - f_phi[:, None] * times[:, _NODES[:, 1]])
+    # Single precision suffices here, because the result only selects a node; it halves the time.
+    c, s, axis = (x.astype(jnp.float32) for x in (jnp.cos(turn), jnp.sin(turn), pole))
+
+    def back(vector):
+        """A direction in space, turned about the pole by minus ``turn``: components (b, n)."""
+        along = (axis @ vector)[:, None] * axis
+        across, plain = jnp.cross(axis, vector[None]), vector[None] - along
+        return tuple(
+            along[:, k, None] + c * plain[:, k, None] - s * across[:, k, None] for k in range(3)
+        )
+
+    sun, observer, right, matrix, shape = (
+        x.astype(jnp.float32) for x in (sun, observer, right, matrix, jnp.exp(u[:, 2:4]))
+    )
+    axes = (jnp.ones_like(shape[:, :1]), shape[:, :1], shape[:, 1:])
+    facing = tuple(x.astype(jnp.float32)[:, _NODES[:, 1]] for x in q)
+    light = seeliger_ellipsoid(axes, *(_to_body(facing, back(v)) for v in (sun, observer)))
+    light = -2.5 * jnp.log10(jnp.maximum(light, 1e-12))
+
+    mode = long_axis.astype(int)
+    c, s = (jnp.asarray(wave(_ANGLES), jnp.float32)[mode] for wave in (np.cos, np.sin))
+    even, odd = (2 * jnp.einsum("bn,bnk->bk", light, x)[:, None] / len(_NODES) for x in (c, s))
+    # The shift theorem: the coefficients of the light that starts at a node are those at node 0,
+    # rotated by the node's angles. All nodes share one set of coefficients.
+    model = jnp.concatenate([even * c + odd * s, odd * c - even * s], -1)
+    both = jnp.einsum("bnk,bk->bn", model, right)
+    own = jnp.sum(jnp.einsum("bnk,bkl->bnl", model, matrix) * model, -1)
+    gain = jnp.clip(both / jnp.maximum(own, 1e-12), *GAIN)
+    fall = gain * (2 * both - gain * own)
+    best = jnp.argmax(fall, axis=-1)
+    fall = jnp.take_along_axis(fall, best[:, None], 1)[:, 0]
+    node = jnp.asarray(_NODES)[best]
+
+    def at(parts):
+        return jnp.stack([jnp.take_along_axis(x, node[:, 1:], 1)[:, 0] for x in parts], -1)
+
+    parts = node / np.array([[_TURN, 2 * _HALF]])  # of a turn, of a period
+    half = jnp.pi * (parts[:, :1] - (f_phi / f_psi)[:, None] * parts[:, 1:])
+    turn = jnp.concatenate([jnp.cos(half), jnp.sin(half) * pole], -1)
+    return Bodies(u.at[:, 4:7].set(at(rates)), rotation.multiply(turn, at(q))), fall
+
+
+# Trial bodies with given periods, many at a time, and their misfit.
+#
+# The inertia is drawn first and the rates are then solved for the required ratio of periods
+# (bisection between small nutation and the separatrix) and scaled to the required P_phi. Every
+# trial therefore has the right frequencies, and the random search has two dimensions fewer: rates
+# drawn at random would rarely hit both frequencies to the resolution of a long light curve.
 
 CHUNK = 2048
 _BISECTIONS = 24
@@ -47,46 +381,49 @@ def _spins(u, part, long_axis):
     return (a, b, c), omega, principal_periods((a, b, c), omega)
 
 
-def _allowed(u, long_axis, ratio):
-    found = _spins(u, 1e-3, long_axis)[2]
-    return found.P_phi / found.P_psi > ratio
+def _periods_possible(u, long_axis, ratio):
+    periods = _spins(u, 1e-3, long_axis)[2]
+    return periods.P_phi / periods.P_psi > ratio
 
 
 @jax.jit
-def _fresh(key, f_phi, f_psi, long_axis) -> Draws:
+def _draw_chunk(key, f_phi, f_psi, long_axis) -> Draws:
     """Anything possible; of six inertias the first that allows the periods."""
     count, keys = f_phi.shape[0], jax.random.split(key, 4)
     inertia = jax.random.uniform(keys[0], (6, count, 2))
-    allowed = _allowed(_axes(inertia), long_axis, (f_psi / f_phi)[None])
+    allowed = _periods_possible(_axes(inertia), long_axis, (f_psi / f_phi)[None])
     pick = jnp.argmax(allowed, axis=0)
     return Draws(
         jnp.take_along_axis(inertia, pick[None, :, None], axis=0)[0],
-        jax.random.uniform(keys[1], (count,)), jax.random.normal(keys[2], (count, 4)),
-        jax.random.normal(keys[3], (count, 2)), f_phi, f_psi,
-    )  # fmt: skip
+        jax.random.uniform(keys[1], (count,)),
+        jax.random.normal(keys[2], (count, 4)),
+        jax.random.normal(keys[3], (count, 2)),
+        f_phi,
+        f_psi,
+    )
 
 
 @jax.jit
-def _built(draws: Draws, long_axis, spread):
+def _build_chunk(draws: Draws, long_axis, spread):
     """Bodies (b,) with the periods asked, and whether there are any for the inertia drawn."""
     u, ratio = _axes(draws.inertia), draws.f_psi / draws.f_phi
 
     def halve(_, ends):
         low, high = ends
         middle = (low + high) / 2
-        found = _spins(u, middle, long_axis)[2]
-        fast = found.P_phi / found.P_psi > ratio
+        periods = _spins(u, middle, long_axis)[2]
+        fast = periods.P_phi / periods.P_psi > ratio
         return jnp.where(fast, middle, low), jnp.where(fast, high, middle)
 
     ends = (jnp.zeros_like(ratio), jnp.ones_like(ratio))
     low, high = jax.lax.fori_loop(0, _BISECTIONS, halve, ends)
-    moments, omega, found = _spins(u, (low + high) / 2, long_axis)
-    scale = found.P_phi * draws.f_phi
+    moments, omega, periods = _spins(u, (low + high) / 2, long_axis)
+    scale = periods.P_phi * draws.f_phi
     omega = tuple(x * scale for x in omega)
     omega, _ = free_motion(moments, None, omega, draws.late / draws.f_psi, attitude=False)
     assert omega is not None  # the rates were not declined
-    near = jnp.abs(found.P_phi / found.P_psi / ratio - 1) < 0.01
-    good = _allowed(u, long_axis, ratio) & near & jnp.isfinite(sum(omega))
+    near = jnp.abs(periods.P_phi / periods.P_psi / ratio - 1) < 0.01
+    good = _periods_possible(u, long_axis, ratio) & near & jnp.isfinite(sum(omega))
     shape = u + spread * draws.shape
     wxyz = draws.wxyz / jnp.linalg.norm(draws.wxyz, axis=-1, keepdims=True)
     return Bodies(jnp.concatenate([u, shape, jnp.stack(omega, -1)], -1), wxyz), good
@@ -105,13 +442,13 @@ def build(draws: Draws, long_axis, phase: AbstractPhase, spread: float = 0.15):
     """Bodies (b,), and which exist; ``spread``: of the shape's ratios by the inertia's, in ln."""
     total = len(long_axis)
     bodies, good = _in_chunks(
-        lambda _, d, mode: _built(d, mode, spread), total, draws, np.asarray(long_axis)
+        lambda _, d, mode: _build_chunk(d, mode, spread), total, draws, np.asarray(long_axis)
     )
     typical = np.broadcast_to(np.asarray(phase.typical, float), (total, len(phase.typical)))
     return Bodies(np.concatenate([bodies.unknowns, typical], -1), bodies.wxyz), good
 
 
-def shaken(key, meant: Hypotheses, blur: float) -> Hypotheses:
+def perturb(key, meant: Hypotheses, blur: float) -> Hypotheses:
     """Frequencies within ``blur`` of those meant."""
     shake = blur * np.asarray(jax.random.uniform(key, (2, len(meant.f_phi)), minval=-1.0))
     f_phi, f_psi = (np.maximum(f + d, f / 2) for f, d in zip(meant[:2], shake, strict=True))
@@ -121,11 +458,14 @@ def shaken(key, meant: Hypotheses, blur: float) -> Hypotheses:
 def draw(key, hypotheses: Hypotheses, each: int) -> tuple[Draws, np.ndarray]:
     """``each`` of every hypothesis, and their modes."""
     f_phi, f_psi, long_axis = (np.repeat(x, each) for x in hypotheses)
-    made = _in_chunks(
-        lambda k, *x: _fresh(jax.random.fold_in(key, k), *x),
-        len(f_phi), f_phi, f_psi, long_axis,
-    )  # fmt: skip
-    return made, long_axis
+    draws = _in_chunks(
+        lambda k, *x: _draw_chunk(jax.random.fold_in(key, k), *x),
+        len(f_phi),
+        f_phi,
+        f_psi,
+        long_axis,
+    )
+    return draws, long_axis
 
 
 def _misfit(phase, bodies: Bodies, points: Points, solver):
@@ -139,13 +479,13 @@ def _misfit(phase, bodies: Bodies, points: Points, solver):
     both, own = ((model * x * points.weight).sum(-1, keepdims=True) for x in (data, model))
     gain = jnp.clip(both / jnp.maximum(own, 1e-12), *GAIN)
     rest = (gain * model - data) ** 2
-    # the mean of |r| where it is large: single points do not decide
+    # The score grows with the logarithm of large residuals, so that single points do not decide.
     scale = jnp.sum(rest * points.weight, -1, keepdims=True) / jnp.sum(points.weight)
     size = jnp.sum(points.weight * scale * jnp.log1p(rest / scale), -1) / jnp.sum(points.weight)
     return size, gain[..., 0]
 
 
-_scored = jax.jit(_misfit, static_argnums=0)
+_misfit_jit = jax.jit(_misfit, static_argnums=0)
 
 
 def misfits(phase: AbstractPhase, bodies: Bodies, points: Points) -> tuple[np.ndarray, np.ndarray]:
@@ -154,7 +494,7 @@ def misfits(phase: AbstractPhase, bodies: Bodies, points: Points) -> tuple[np.nd
     Offsets are fitted, and the light's variations may be a little greater or smaller all over: by
     the gain, as other axes' ratios would make them.
     """
-    # a slope by the phase angle: the phase function is not known yet
+    # A column linear in the phase angle stands for the phase function, which is not fitted yet.
     slope = jnp.where(points.weight > 0, points.alpha, 0.0)
     points = points._replace(
         columns=jnp.concatenate([points.columns, slope]),
@@ -167,7 +507,7 @@ def misfits(phase: AbstractPhase, bodies: Bodies, points: Points) -> tuple[np.nd
     for start in range(0, total, CHUNK):
         index = np.minimum(np.arange(start, start + CHUNK), total - 1)
         part = Bodies(bodies.unknowns[index], bodies.wxyz[index])
-        out.append(np.asarray(_scored(phase, part, points, jnp.asarray(solver))))
+        out.append(np.asarray(_misfit_jit(phase, part, points, jnp.asarray(solver))))
     misfit, gain = np.concatenate(out, axis=-1)[:, :total]
     return np.nan_to_num(misfit, nan=np.inf), gain
 
@@ -180,10 +520,16 @@ class Trials(NamedTuple):
     source: np.ndarray  # number of the hypothesis
 
 
-def tried(
-    key, meant: Hypotheses, count: int, keep: int, phase: AbstractPhase,
-    points: Points, few: Points, blur: float,
-) -> Trials:  # fmt: skip
+def best_trials(
+    key,
+    meant: Hypotheses,
+    count: int,
+    keep: int,
+    phase: AbstractPhase,
+    points: Points,
+    few: Points,
+    blur: float,
+) -> Trials:
     """The ``keep`` best of each hypothesis among about ``count`` bodies drawn.
 
     Their phases are those that the series of all ``points`` prefers, their misfit that of ``few``:
@@ -192,26 +538,29 @@ def tried(
     many = len(meant.f_phi)
     each = max(keep, count // many)
     keys = jax.random.split(key)
-    meant = shaken(keys[0], meant, blur)
+    meant = perturb(keys[0], meant, blur)
     draws, long_axis = draw(keys[1], meant, each)
     bodies, good = build(draws, long_axis, phase)
     source = np.repeat(np.arange(many), each)
     right, matrix = series(points, *meant)
     sun, observer = directions(points)
     bodies, fall = _in_chunks(
-        lambda _, b, d, own: turned(
+        lambda _, b, d, own: align_phases(
             b, d.f_phi, d.f_psi, meant.long_axis[own], right[own], matrix[own], sun, observer
         ),
-        len(source), bodies, draws, source,
-    )  # fmt: skip
-    index = _least(np.where(good, -fall, np.inf), many, max(keep, each // _PART))
-    bodies = picked(bodies, index)
+        len(source),
+        bodies,
+        draws,
+        source,
+    )
+    index = _smallest(np.where(good, -fall, np.inf), many, max(keep, each // _PART))
+    bodies = select(bodies, index)
     misfit, gain = misfits(phase, bodies, few)
-    best = _least(np.where(good[index], misfit, np.inf), many, keep)
-    return Trials(picked(bodies, best), gain[best], np.repeat(np.arange(many), keep))
+    best = _smallest(np.where(good[index], misfit, np.inf), many, keep)
+    return Trials(select(bodies, best), gain[best], np.repeat(np.arange(many), keep))
 
 
-def _least(values: np.ndarray, many: int, keep: int) -> np.ndarray:
+def _smallest(values: np.ndarray, many: int, keep: int) -> np.ndarray:
     """Numbers of the ``keep`` least of each of ``many`` equal parts."""
     each = len(values) // many
     best = np.argsort(values.reshape(many, each), axis=1)[:, :keep]

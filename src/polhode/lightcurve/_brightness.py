@@ -1,0 +1,509 @@
+"""Magnitudes of bodies: laws of scattering, phase functions, shapes, and the model of a fit."""
+
+import math
+from functools import partial
+from typing import ClassVar, NamedTuple, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from polhode import rotation
+from polhode._checks import ArrayLike
+from polhode._closed_forms import free_motion, principal_periods
+from polhode._closed_forms._free_motion import Triple
+from polhode.inertia._mass import check_mesh
+
+# Light scattered by a convex body, integrated over what is both lit and seen.
+#
+# A surface element of area dA sends ``mu mu0 / (mu + mu0) dA`` to the observer by the law of
+# Lommel and Seeliger, ``mu mu0 dA`` by Lambert's; mu and mu0 are the cosines of emergence and
+# incidence. Directions point from the body to the Sun and to the observer, in body axes.
+
+Scalars = Float[Array, "*b"]
+
+
+def _dot(a: Triple, b: Triple) -> Scalars:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: Triple, b: Triple) -> Triple:
+    return (
+        a[1] * b[2] - a[2] * b[1],
+        a[2] * b[0] - a[0] * b[2],
+        a[0] * b[1] - a[1] * b[0],
+    )
+
+
+def seeliger_ellipsoid(axes: Triple, sun: Triple, observer: Triple) -> Scalars:
+    """Lommel-Seeliger brightness of triaxial ellipsoids, in closed form.
+
+    ``axes``: semi-axes along x, y, z; ``sun``, ``observer``: unit vectors in body axes; tuples of
+    component arrays that broadcast together. Scale: pi a^2 / 2 for a sphere at opposition.
+    Source: Muinonen & Lumme, Astron. Astrophys. 584 (2015) A23, here without angles: in the space
+    where the ellipsoid is a unit sphere only squares of sines occur, so that value and derivatives
+    are right at opposition too. Zero, with derivative zero, at a phase angle of exactly pi.
+    """
+    a, b, c = axes
+    toward = (sun[0] / a, sun[1] / b, sun[2] / c)
+    away = (observer[0] / a, observer[1] / b, observer[2] / c)
+    lit2, seen2, product = _dot(toward, toward), _dot(away, away), _dot(toward, away)
+    whole = tuple(x + y for x, y in zip(toward, away, strict=True))
+    size2 = _dot(whole, whole)
+    dark = size2 == 0
+    size2 = jnp.where(dark, 1, size2)
+    size = jnp.sqrt(size2)
+    lit, seen = jnp.sqrt(lit2), jnp.sqrt(seen2)
+    cosine_lit = (lit2 + product) / (lit * size)
+    cosine_seen = (seen2 + product) / (seen * size)
+    across = _cross(toward, away)
+    # sin p sin q of the two angles from the terminator and the limb to the bisecting plane
+    sines = _dot(across, across) / (lit * seen * size2)
+    open_ = sines > 0
+    inner = jnp.where(open_, sines, 1)
+    ratio = inner / ((1 + cosine_lit) * (1 + cosine_seen))
+    # x log x: at x = 0 its slope is infinite, but sines is of second order there
+    bend = jnp.where(open_, inner * jnp.log(jnp.where(dark, 1, ratio)), 0)
+    total = cosine_lit + cosine_seen + bend
+    return jnp.where(dark, 0, math.pi / 2 * a * b * c * lit * seen / size * total)
+
+
+@jax.jit
+def seeliger_sphere(alpha: Scalars) -> Scalars:
+    """Lommel-Seeliger brightness of a sphere over that at opposition; ``alpha`` in [0, pi]."""
+    half = alpha / 2
+    quarter = jnp.where(half > 0, jnp.tan(half / 2), 1)
+    below = jnp.where(half < math.pi / 2, half, 0)
+    value = 1 + jnp.sin(below) * jnp.tan(below) * jnp.log(quarter)
+    return jnp.where(half < math.pi / 2, value, 0)
+
+
+def facets(
+    normals: Float[Array, "f 3"],
+    areas: Float[Array, "*#b f"],
+    sun: Float[Array, "*#b 3"],
+    observer: Float[Array, "*#b 3"],
+    lambert: float | Scalars = 0.0,
+    seeliger: float | Scalars = 1.0,
+) -> Scalars:
+    """Brightness of convex bodies of plane facets: ``seeliger`` and ``lambert`` parts of the laws.
+
+    ``normals``: outward unit vectors; ``areas`` of the facets, in which their albedo may be
+    included. The sum over the facets both lit and seen of
+    ``mu mu0 (seeliger / (mu + mu0) + lambert) area``.
+    """
+    incidence = jnp.maximum(sun @ normals.T, 0)
+    emergence = jnp.maximum(observer @ normals.T, 0)
+    both = (incidence > 0) & (emergence > 0)
+    divisor = jnp.where(both, incidence + emergence, 1)
+    shape = jnp.broadcast_shapes(incidence.shape, emergence.shape, jnp.shape(areas))
+    seeliger, lambert = (
+        x if jnp.ndim(x) == 0 else jnp.asarray(x)[..., None] for x in (seeliger, lambert)
+    )
+    law = seeliger / divisor + lambert
+    return jnp.sum(jnp.broadcast_to(areas, shape) * incidence * emergence * law, axis=-1)
+
+
+# Phase functions: the brightness of a sphere over that at opposition, by phase angle.
+
+
+class AbstractPhase(eqx.Module):
+    """A phase function; ``typical``: its coefficients where nothing is known."""
+
+    typical: eqx.AbstractClassVar[tuple[float, ...]]
+
+    def magnitudes(self, alpha: Scalars, coefficients: Float[Array, "*#b c"]) -> Scalars:
+        """Magnitudes above opposition at phase angles ``alpha`` [rad]."""
+        raise NotImplementedError
+
+
+class SeeligerPhase(AbstractPhase):
+    """What the law of Lommel and Seeliger gives by itself; no coefficients."""
+
+    typical: ClassVar[tuple[float, ...]] = ()
+
+    def magnitudes(self, alpha: Array, coefficients: Array) -> Array:
+        return -2.5 * jnp.log10(seeliger_sphere(alpha))
+
+
+class LinearPhase(AbstractPhase):
+    """``beta alpha``, beta in magnitudes per degree; fair between about 5 and 70 degrees."""
+
+    typical: ClassVar[tuple[float, ...]] = (0.033,)
+
+    def magnitudes(self, alpha: Array, coefficients: Array) -> Array:
+        return coefficients[..., 0] * alpha * (180 / math.pi)
+
+
+class HG(AbstractPhase):
+    """The H, G system of 1985; coefficient G. Bowell et al. 1989, Asteroids II, p. 524, eq. A4."""
+
+    typical: ClassVar[tuple[float, ...]] = (0.15,)
+
+    def magnitudes(self, alpha: Array, coefficients: Array) -> Array:
+        slope = coefficients[..., 0]
+        first, second = (_bowell(alpha, *k) for k in _BOWELL)
+        return -2.5 * jnp.log10((1 - slope) * first + slope * second)
+
+
+class HG1G2(AbstractPhase):
+    """The H, G1, G2 system; coefficients G1, G2. Muinonen et al. 2010, Icarus 209, 542.
+
+    Beyond 150 degrees, where the system is not defined, its splines are continued as a decreasing
+    exponential with their last value and derivative.
+    """
+
+    typical: ClassVar[tuple[float, ...]] = (0.26, 0.38)
+
+    def magnitudes(self, alpha: Array, coefficients: Array) -> Array:
+        first, second = coefficients[..., 0], coefficients[..., 1]
+        a, b, c = hg1g2_basis(alpha)
+        return -2.5 * jnp.log10(first * a + second * b + (1 - first - second) * c)
+
+
+_BOWELL = ((3.332, 0.631, 0.986), (1.862, 1.218, 0.238))
+
+
+@partial(jax.jit, static_argnums=(1, 2, 3))  # one program, not one for each operation
+def _bowell(alpha, a, b, c):
+    sine, tangent = jnp.sin(alpha), jnp.tan(alpha / 2)
+    far = jnp.exp(-a * jnp.where(tangent > 0, tangent, 1) ** b)
+    far = jnp.where(tangent > 0, far, 1)
+    near = 1 - c * sine / (0.119 + 1.341 * sine - 0.754 * sine * sine)
+    weight = jnp.exp(-90.56 * tangent * tangent)
+    return weight * near + (1 - weight) * far
+
+
+# Values and slopes (per radian) at the knots: Muinonen et al. 2010, tables 3 and 4; the slopes are
+# those of the cubic splines with the printed end slopes (Penttila et al. 2016, PSS 123, 117).
+_KNOTS = np.radians([7.5, 30.0, 60.0, 90.0, 120.0, 150.0])
+_FIRST = (
+    (0.75, 0.33486016, 0.13410560, 0.051104756, 0.021465687, 0.0036396989),
+    (-1.9098593, -0.55463432, -0.24404599, -0.094980438, -0.021411424, -0.091328612),
+)
+_SECOND = (
+    (0.925, 0.62884169, 0.31755495, 0.12716367, 0.022373903, 0.00016505689),
+    (-0.57295780, -0.76705367, -0.45665789, -0.28071809, -0.11173257, -8.6573138e-8),
+)
+_NEAR = np.radians([0.0, 0.3, 1.0, 2.0, 4.0, 8.0, 12.0, 20.0, 30.0])
+_THIRD = (
+    (
+        1.0,
+        0.83381185,
+        0.57735424,
+        0.42144772,
+        0.23174230,
+        0.10348178,
+        0.061733473,
+        0.016107006,
+        0.0,
+    ),
+    (
+        -0.10630097,
+        -41.180439,
+        -10.366915,
+        -7.5784615,
+        -3.6960950,
+        -0.78605652,
+        -0.46527012,
+        -0.20459545,
+        0.0,
+    ),
+)
+
+
+def _spline(knots, table, alpha):
+    """The cubic of given values and slopes at its ends, between the knots."""
+    dtype = alpha.dtype
+    knots, values, slopes = (jnp.asarray(x, dtype) for x in (knots, *table))
+    k = jnp.clip(jnp.searchsorted(knots, alpha, side="right") - 1, 0, knots.size - 2)
+    width = knots[k + 1] - knots[k]
+    t = jnp.clip((alpha - knots[k]) / width, 0, 1)
+    rise = values[k + 1] - values[k]
+    left, right = slopes[k] * width - rise, rise - slopes[k + 1] * width
+    return values[k] + t * rise + t * (1 - t) * ((1 - t) * left + t * right)
+
+
+@jax.jit
+def hg1g2_basis(alpha: Scalars) -> tuple[Scalars, Scalars, Scalars]:
+    """The three functions of the H, G1, G2 system at ``alpha`` [rad]."""
+    out = []
+    for table, slope in ((_FIRST, -6 / math.pi), (_SECOND, -9 / (5 * math.pi))):
+        value = _spline(_KNOTS, table, alpha)
+        last = table[0][-1]
+        tail = last * jnp.exp(jnp.minimum(table[1][-1] / last * (alpha - _KNOTS[-1]), 0))
+        value = jnp.where(alpha > _KNOTS[-1], tail, value)
+        out.append(jnp.where(alpha < _KNOTS[0], 1 + slope * alpha, value))
+    third = jnp.where(alpha < _NEAR[-1], _spline(_NEAR, _THIRD, alpha), 0)
+    return out[0], out[1], third
+
+
+# Convex bodies by their facets: from a mesh, an ellipsoid, or harmonics of their curvature.
+
+
+class Convex(NamedTuple):
+    """Facets of a convex body: outward ``normals`` (f, 3) and ``areas`` (..., f).
+
+    A convex body's light depends on its area per solid angle of normal only (its Gaussian surface
+    density, one over the curvature), of which these are samples.
+    """
+
+    normals: Float[Array, "f 3"]
+    areas: Float[Array, "*b f"]
+
+    @classmethod
+    def from_mesh(cls, vertices: ArrayLike, faces: ArrayLike) -> "Convex":
+        """A closed triangle mesh (v, 3), (f, 3); what it hides from itself is not accounted for."""
+        vertices, faces = check_mesh(vertices, faces)
+        a, b, c = (vertices[faces[:, k]] for k in range(3))
+        across = jnp.cross(b - a, c - a)
+        size = jnp.sqrt(jnp.sum(across * across, axis=-1))
+        return cls(across / size[:, None], size / 2)
+
+    @classmethod
+    def from_ellipsoid(cls, axes: Float[Array, "*b 3"], count: int = 1000) -> "Convex":
+        """Ellipsoids of semi-axes (..., 3): density (abc)^2 / (n' diag(axes^2) n)^2."""
+        axes = jnp.asarray(axes)
+        normals, weight = _sphere(count)
+        square = (axes**2) @ (normals**2).T
+        return cls(normals, weight * jnp.prod(axes, axis=-1)[..., None] ** 2 / square**2)
+
+    @classmethod
+    def from_harmonics(cls, coefficients: Float[Array, "*b k"], count: int = 1000) -> "Convex":
+        """Density exp(sum of coefficients times real spherical harmonics).
+
+        ``coefficients`` (..., (l + 1)^2) in the order l = 0; 1, m = -1, 0, 1; ... of `harmonics`.
+        Always positive; the surface closes, and a body exists (Minkowski), where the sum of
+        ``areas`` times ``normals`` vanishes: `unclosed` measures that.
+        """
+        coefficients = jnp.asarray(coefficients)
+        degree = math.isqrt(coefficients.shape[-1]) - 1
+        if (degree + 1) ** 2 != coefficients.shape[-1]:
+            raise ValueError(
+                "coefficients must be (l + 1)^2 = 1, 4, 9, 16, ... numbers in the last axis, got"
+                f" {coefficients.shape[-1]}."
+            )
+        normals, weight = _sphere(count)
+        return cls(normals, weight * jnp.exp(coefficients @ harmonics(normals, degree)))
+
+    @property
+    def unclosed(self) -> Scalars:
+        """|sum of areas times normals| over the whole area; 0 for a closed surface."""
+        rest = self.areas @ self.normals
+        return jnp.sqrt(jnp.sum(rest * rest, axis=-1)) / jnp.sum(self.areas, axis=-1)
+
+    def brightness(
+        self,
+        sun: Array,
+        observer: Array,
+        *,
+        lambert: Array | float = 0.0,
+        seeliger: Array | float = 1.0,
+    ) -> Scalars:
+        """Of bodies lit and seen from directions (..., 3) in body axes: see `facets`."""
+        return facets(self.normals, self.areas, sun, observer, lambert, seeliger)
+
+
+def _sphere(count: int):
+    """``count`` directions (n, 3) spread evenly on a spiral, and the solid angle of each."""
+    k = np.arange(count) + 0.5
+    z = 1 - 2 * k / count
+    turn = np.pi * (1 + 5**0.5) * k
+    across = np.sqrt(1 - z * z)
+    normals = np.stack([across * np.cos(turn), across * np.sin(turn), z], -1)
+    return jnp.asarray(normals), 4 * math.pi / count
+
+
+def harmonics(directions: Float[Array, "n 3"], degree: int) -> Float[Array, "k n"]:
+    """Real spherical harmonics of unit vectors, orthonormal on the sphere: ((degree + 1)^2, n)."""
+    x, y, z = (directions[:, k] for k in range(3))
+    # (x + i y)^m, and Legendre functions over sin^m by the usual recurrence in the degree
+    real, imaginary = jnp.ones_like(z), jnp.zeros_like(z)
+    rows: dict[tuple[int, int], Array] = {}
+    start = jnp.ones_like(z) * math.sqrt(1 / (4 * math.pi))
+    for m in range(degree + 1):
+        if m > 0:
+            real, imaginary = real * x - imaginary * y, real * y + imaginary * x
+            start = start * math.sqrt((2 * m + 1) / (2 * m))
+        below, now = jnp.zeros_like(z), start
+        for l in range(m, degree + 1):
+            root = math.sqrt(2) if m else 1.0
+            rows[l, m] = root * now * real
+            if m:
+                rows[l, -m] = root * now * imaginary
+            n = l + 1
+            a = math.sqrt((4 * n * n - 1) / (n * n - m * m))
+            b = (
+                math.sqrt((2 * n + 1) * ((n - 1) ** 2 - m * m) / ((2 * n - 3) * (n * n - m * m)))
+                if n - 1 > m
+                else 0.0
+            )
+            below, now = now, a * z * now - b * below
+    return jnp.stack([rows[l, m] for l in range(degree + 1) for m in range(-l, l + 1)])
+
+
+# Magnitudes of a free ellipsoid from the unknowns of a fit, in batches, with exact derivatives.
+
+# Unknowns besides the attitude: logarithms of the second and third semi-axis over the first, of
+# the homogeneous ellipsoid of the same inertia (2) and of the visible shape (2); body rates (3);
+# coefficients of the phase function; offsets. A step turns the attitude by a rotation vector (3).
+INERTIA, SHAPE, RATES, PHASE = slice(0, 2), slice(2, 4), slice(4, 7), 7
+
+
+class Points(NamedTuple):
+    """A light curve as the model needs it; rows (1, n), directions as component tuples."""
+
+    t: Float[Array, "1 n"]
+    sun: Triple
+    observer: Triple
+    alpha: Float[Array, "1 n"]
+    sphere: Float[Array, "1 n"]  # magnitude that the law itself gives a sphere
+    magnitude: Float[Array, "1 n"]
+    weight: Float[Array, "1 n"]  # 1 / sigma^2; 0 pads
+    columns: Float[Array, "c n"]  # of the offsets
+    stiffness: Float[Array, " c"]  # 1 / sigma^2 of what is known of them
+
+
+class Bodies(NamedTuple):
+    """A batch of trial bodies: unknowns (b, u) and attitudes at t = 0 (b, 4)."""
+
+    unknowns: Float[Array, "b u"]
+    wxyz: Float[Array, "b 4"]
+
+
+def moments_of(unknowns: Float[Array, "*b u"]) -> Triple:
+    """Moments, up to scale: those of the homogeneous ellipsoid with axes 1, e^u0, e^u1."""
+    y, z = jnp.exp(2 * unknowns[..., 0]), jnp.exp(2 * unknowns[..., 1])
+    return y + z, 1 + z, 1 + y
+
+
+def attitudes(unknowns: Float[Array, "b u"], wxyz: Float[Array, "b 4"], t: Float[Array, "1 n"]):
+    """Quaternion components (b, n) of the exact motion."""
+    omega = tuple(unknowns[:, k] for k in (4, 5, 6))
+    start = tuple(wxyz[:, k] for k in range(4))
+    return free_motion(moments_of(unknowns), start, omega, t, rates=False)[1]
+
+
+def _to_body(q, vector: Triple) -> Triple:
+    axis = tuple(-x for x in q[1:])
+    twice = tuple(2 * x for x in _cross(axis, vector))
+    again = _cross(axis, twice)
+    return tuple(x + q[0] * y + z for x, y, z in zip(vector, twice, again, strict=True))
+
+
+def _sample_magnitudes(
+    phase: AbstractPhase, q, turn: Triple, shape, coefficients, points: Points
+) -> Scalars:
+    """Magnitudes but for offsets; all arguments by sample. ``turn``: small, of space."""
+    sun, observer = (
+        tuple(a - b for a, b in zip(v, _cross(turn, v), strict=True))
+        for v in (points.sun, points.observer)
+    )
+    b, c = jnp.exp(shape[0]), jnp.exp(shape[1])
+    light = seeliger_ellipsoid((jnp.ones_like(b), b, c), _to_body(q, sun), _to_body(q, observer))
+    # over the sphere of the same volume
+    light = jnp.maximum(light, 1e-12) / (jnp.pi / 2 * (b * c) ** (2 / 3))
+    return -2.5 * jnp.log10(light) - points.sphere + phase.magnitudes(points.alpha, coefficients)
+
+
+def magnitudes(phase: AbstractPhase, bodies: Bodies, points: Points) -> Float[Array, "b n"]:
+    """Reduced magnitudes, but for the offsets."""
+    q = attitudes(*bodies, points.t)
+    u, zero = bodies.unknowns[:, :, None], jnp.zeros(())
+    many = len(phase.typical)
+    coefficients = jnp.moveaxis(u[:, PHASE : PHASE + many], 1, -1)
+    return _sample_magnitudes(
+        phase, q, (zero, zero, zero), (u[:, 2], u[:, 3]), coefficients, points
+    )
+
+
+def magnitudes_and_derivatives(phase: AbstractPhase, bodies: Bodies, points: Points):
+    """Magnitudes (b, n) and their derivatives (b, 10 + c, n), the turn in space (3) last.
+
+    Forward derivatives of the motion by five unknowns, reverse derivatives of the light by sample.
+    """
+    u, wxyz = bodies
+    count = u.shape[0]
+
+    def moved(step):
+        return attitudes(u.at[:, jnp.array([0, 1, 4, 5, 6])].add(step), wxyz, points.t)
+
+    q, along = jax.linearize(moved, jnp.zeros(5, u.dtype))
+    many = len(phase.typical)
+    whole = (count, points.t.shape[1])
+
+    def spread(x):
+        return jnp.broadcast_to(x[:, None], whole)
+
+    turn = tuple(jnp.zeros(whole, u.dtype) for _ in range(3))
+    shape = tuple(spread(u[:, k]) for k in (2, 3))
+    coefficients = jnp.broadcast_to(u[:, None, PHASE : PHASE + many], (*whole, many))
+
+    def seen(q, turn, shape, coefficients):
+        return _sample_magnitudes(phase, q, turn, shape, coefficients, points)
+
+    # The light of a sample depends on the quaternion of that sample only. One reverse pass with
+    # unit cotangents therefore gives the derivatives by all arguments at every sample, and the
+    # unknowns of the motion follow by the chain rule: 5 tangents of the closed form, not 10 + c of
+    # the light.
+    value, pull = jax.vjp(seen, q, turn, shape, coefficients)
+    by_q, by_turn, by_shape, by_coefficients = pull(jnp.ones(whole, u.dtype))
+    # One tangent at a time: under vmap the mapped axis would separate the samples in memory.
+    motion = [
+        cast(Array, sum(a * b for a, b in zip(by_q, along(e), strict=True)))
+        for e in jnp.eye(5, dtype=u.dtype)
+    ]
+    by_phase_function = [by_coefficients[..., k] for k in range(many)]
+    return value, jnp.stack(
+        [*motion[:2], *by_shape, *motion[2:], *by_phase_function, *by_turn], axis=1
+    )
+
+
+def _frequencies(unknowns):
+    """Logarithms of f_phi and f_psi, and the mode, of one body."""
+    periods = principal_periods(moments_of(unknowns), unknowns[RATES])
+    return -jnp.log(jnp.stack([periods.P_phi, periods.P_psi])), periods.mode
+
+
+def _with_corrected_rates(old, step):
+    """``old + step`` of one body, with rates corrected so that its frequencies change linearly.
+
+    The frequencies of the result are those of ``old`` plus their derivative along ``step``.
+    """
+    # The data fix the frequencies to 1/span, and the frequencies are nonlinear in the rates: a
+    # plain step leaves the narrow, curved valley of good fits, and only very short steps would stay
+    # in it. Two Newton corrections of the rates, each the solution of smallest norm of two
+    # equations in three unknowns, return to the valley at the cost of a few evaluations of the
+    # periods, without the light curve.
+    (before, mode), (change, _) = jax.jvp(_frequencies, (old,), (step,))
+    plain = old + step
+    rates, near = plain[RATES], True
+    for _ in range(2):
+
+        def left(x):
+            now, mode = _frequencies(plain.at[RATES].set(x))
+            return now - before - change, (now - before - change, mode)
+
+        slopes, (rest, now) = jax.jacfwd(left, has_aux=True)(rates)
+        # minimum-norm solution, by the explicit inverse of the 2 x 2 matrix J J^T
+        a, b, c = (slopes[i] @ slopes[j] for i, j in ((0, 0), (0, 1), (1, 1)))
+        weights = jnp.stack([c * rest[0] - b * rest[1], a * rest[1] - b * rest[0]]) / (
+            a * c - b * b
+        )
+        rates, near = rates - weights @ slopes, near & (now == mode)
+    change = rates - plain[RATES]
+    near = near & (jnp.sum(change**2) < 0.1 * jnp.sum(plain[RATES] ** 2))  # false if not finite
+    return plain.at[RATES].set(jnp.where(near, rates, plain[RATES]))
+
+
+def apply_step(bodies: Bodies, step: Float[Array, "b u+3"]) -> Bodies:
+    """The bodies after a step of the unknowns and a turn in space.
+
+    Rates are corrected to second order, so that the frequencies change linearly with the step: the
+    valleys of long light curves are narrow in the frequencies and curved in the rates.
+    """
+    turn = rotation.rotation_vector_to_wxyz(step[:, -3:])
+    wxyz = rotation.normalise(rotation.multiply(turn, bodies.wxyz))
+    return Bodies(jax.vmap(_with_corrected_rates)(bodies.unknowns, step[:, :-3]), wxyz)
