@@ -63,7 +63,7 @@ def measure(family: str, n: int, dtype: str, peak: dict[str, float]) -> dict:
     repeat = (-(-n // count), 1)
     state = ph.State(*(jnp.asarray(np.tile(x, repeat)[:n], kind) for x in problem.states(count)))
     given, ts = scene(problem, kind), jnp.asarray(problem.times, kind)
-    method, _ = choose(given, state, record, RTOL[dtype])
+    method, _ = choose(given, RTOL[dtype])
 
     @jax.jit
     def simulated(wxyz, omega):

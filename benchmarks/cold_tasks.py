@@ -231,7 +231,7 @@ def flyby(bodies: int = 500) -> Callable:
 
     import polhode as ph
 
-    orbit = ph.KeplerOrbit.from_state(MU, [-3.8e8, 7.0e7, 0.0], [6.0e3, 0.0, 0.0])
+    orbit = ph.HyperbolicOrbit.from_state(MU, [-3.8e8, 7.0e7, 0.0], [6.0e3, 0.0, 0.0])
     scene = ph.Scene(ph.Inertia.from_moments([0.61, 0.95, 1.0]), ph.GravityGradient(MU, orbit))
     rng = np.random.default_rng(0)
     turn = 2 * np.pi / 1.1e5

@@ -78,7 +78,7 @@ def own(problem: Problem, n: int, rtol: float, by: str = "moments"):
 
     moments = np.array(problem.moments)[[0, 2]] if symmetric else np.array(problem.moments)
     moments = jnp.asarray(np.broadcast_to(moments, (n, len(moments))))
-    method, _ = choose(scene(moments), state, record, rtol)
+    method, _ = choose(scene(moments), rtol)
 
     def value(moments):
         end = ph.simulate(

@@ -42,7 +42,7 @@ def measure(family: str, bodies: int, saves: int, horizons: tuple, budget: float
     repeat = (-(-bodies // len(wxyz)), 1)
     state = ph.State(*(jnp.asarray(np.tile(x, repeat)[:bodies]) for x in (wxyz, omega)))
     given, ts = scene(problem, np.float64), jnp.asarray(problem.times)
-    method, _ = choose(given, state, record, RTOL)
+    method, _ = choose(given, RTOL)
 
     @jax.jit
     def simulated(wxyz, omega, ts):

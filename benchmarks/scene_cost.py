@@ -61,7 +61,7 @@ def scenes() -> dict[str, tuple[ph.Scene, ph.Record, int]]:
 
 def program(scene, state, ts, record, rtol=1e-9):
     """The compiled program that ``simulate`` runs for a scene."""
-    method, _ = choose(scene, state, record)
+    method, _ = choose(scene)
     arguments = (method, scene, state, ts, jnp.asarray(rtol, ts.dtype), record)
     return eqx.filter_jit(run).lower(*arguments).compile(), arguments
 

@@ -211,7 +211,7 @@ def test_the_reference_leaves_out_what_only_polhode_uses():
                    pages, re.M)
     )  # fmt: skip
     hidden = entries["Scene"].split(", ")
-    assert {"settled", "declared_anew"} & set(vars(ph.Scene)) <= set(hidden)
+    assert {"settled", "dynamics"} & set(vars(ph.Scene)) <= set(hidden)
     assert not {"is_free", "momentum", "rates", "hamiltonian"} & set(hidden)
     assert "body_components" in entries["LinearDamping"]
     assert "body_components" not in entries.get("AbstractTorque", "")

@@ -33,20 +33,6 @@ def test_plain_calls_give_what_a_compiled_call_gives(kind):
         np.testing.assert_allclose(one, other, rtol=1e-14, atol=1e-14)
 
 
-def test_the_method_follows_the_numbers():
-    """A horizon so long that a rounded phase would miss rtol: not the method of the first call."""
-    ts, scene = jnp.array([0.0, 2e9, 4e9]), SCENE
-    exact = ph.simulate(scene, _state(), ts, ph.ClosedForm(compensated=True))
-    chosen = ph.simulate(scene, _state(), ts)
-    assert np.array_equal(chosen.wxyz, exact.wxyz)
-    assert np.array_equal(ph.simulate(scene, _state(1e9), ts / 1e9).ts, ts / 1e9)
-    assert "sums of two floats" in str(ph.explain(scene, _state(1e9), jnp.array([0.0, 2.0, 4.0])))
-    plain = ph.simulate(scene, _state(1e9), jnp.array([0.0, 2.0, 4.0]))
-    wanted = ph.ClosedForm(compensated=True)
-    wanted = ph.simulate(scene, _state(1e9), jnp.array([0.0, 2.0, 4.0]), wanted)
-    assert np.array_equal(plain.wxyz, wanted.wxyz)
-
-
 @pytest.mark.parametrize(
     ("ts", "error", "said"),
     [
@@ -99,7 +85,7 @@ KINDS = {
     "top": (I, FALL),
     "damped": (I, FALL, ph.LinearDamping(jnp.array([0.1, 0.2, 0.3]))),
     "damped, nothing else": (I, None, ph.LinearDamping(jnp.array([0.1, 0.2, 0.3]))),
-    "Lagrange": (ph.Inertia.axisymmetric(1.0, 0.5), ph.UniformGravity(1.0, [0.0, 0.0, 0.3])),
+    "Lagrange": (ph.Inertia.axisymmetric(1.0, 0.5), ph.UniformGravity.axial(1.0, 0.3)),
     "wheel": (I, None, None, ph.Rotor([0.0, 0.0, 1.0], 0.1, momentum=0.3)),
 }
 
@@ -144,21 +130,12 @@ def test_threads_share_programs_and_mix_nothing():
     np.testing.assert_array_equal(found, 4 * alone)
 
 
-def test_a_state_that_another_law_holds_for_is_moved_by_it():
-    scene = ph.Scene(*KINDS["damped, nothing else"])
-    assert np.all(np.asarray(ph.simulate(scene, _state(), TS).steps) > 0)
-    about_one_axis = ph.State([1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.7])
-    assert ph.simulate(scene, about_one_axis, TS).steps == 0
-    assert "one fixed principal axis" in str(ph.explain(scene, about_one_axis, TS))
-    assert np.all(np.asarray(ph.simulate(scene, _state(), TS).steps) > 0)
-
-
 def test_long_horizons_of_stepped_bodies_carry_their_rounding():
     scene = ph.Scene(*KINDS["top"])
     short = ph.simulate(scene, _state(), TS, rtol=1e-9)
     for rtol in (1e-12, 3e-13):
         found = ph.simulate(scene, _state(), TS, rtol=rtol)
-        method, _ = choose(scene, _state(), ph.Record(), rtol, jnp.array(TS))
+        method, _ = choose(scene, rtol)
         asked = ph.simulate(scene, _state(), TS, method, rtol=rtol)
         assert method.solver.compensated == (rtol < 2000 * np.finfo(float).eps)
         assert np.array_equal(found.wxyz, asked.wxyz)

@@ -42,7 +42,7 @@ def programs(problem: Problem, n, dtype, tolerances, quick) -> list[Program]:
     ts = jnp.asarray(problem.times, dtype)
     floor = 4 * float(np.finfo(dtype).eps)
     tolerances = [t for t in tolerances if t >= floor]
-    asked = [(DEFAULT, t, choose(given, ph.State(*starts[0]), record, t)[0]) for t in tolerances]
+    asked = [(DEFAULT, t, choose(given, t)[0]) for t in tolerances]
     stepped = not isinstance(asked[0][2], ph.ClosedForm | ph.LagrangeTop)
     if not stepped:
         asked = asked[:1]

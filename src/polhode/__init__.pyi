@@ -6,7 +6,7 @@ reference.
 
 # Simulation: a scene, an initial state and times give a trajectory.
 from ._simulate import simulate as simulate, explain as explain
-from ._scene import Scene as Scene, State as State
+from ._scene import Scene as Scene, State as State, specialise as specialise
 from ._trajectory import Events as Events, Trajectory as Trajectory
 from ._method import Record as Record, Status as Status, SimulationError as SimulationError
 from ._plan import Plan as Plan
@@ -26,6 +26,7 @@ from ._scene import (
     Potential as Potential,
     AbstractPotential as AbstractPotential,
     KeplerOrbit as KeplerOrbit,
+    HyperbolicOrbit as HyperbolicOrbit,
     AbstractOrbit as AbstractOrbit,
     LVLH as LVLH,
 )

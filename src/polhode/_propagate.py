@@ -14,7 +14,6 @@ from polhode import rotation
 from polhode._checks import ArrayLike
 from polhode._method import (
     AbstractMethod,
-    Record,
     Status,
     check_inputs,
     check_kinds,
@@ -141,7 +140,7 @@ def _propagated(scene, state, dt, t, places, method, rtol):
 
     ends = jnp.stack([t, t + dt])
     if method is None:
-        method, _ = choose(scene, state, Record(), rtol, ends)
+        method, _ = choose(scene, rtol)
     # In closed form there is no motion under a torque: its effect is integrated over the step.
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     nodes, weights = (jnp.asarray(x, dtype) for x in ((1 + nodes) / 2, weights / 2))

@@ -98,7 +98,7 @@ def simulate(
     checked_rtol = check_rtol(rtol, state.wxyz.dtype)
     split = split_of(scene, state, ts)
     if method is None:
-        method, _ = choose(scene, state, record, checked_rtol, ts)
+        method, _ = choose(scene, checked_rtol)
     if split is not None and is_concrete(scene, state, ts):
         scene, state, ts = place(split, scene, state, ts)
     if until is not None:
@@ -113,7 +113,7 @@ def _with_events(scene, state, ts, method, rtol, record, until, events, throw) -
     check_method(method)
     checked_rtol = check_rtol(rtol, state.wxyz.dtype)
     if method is None:
-        method, _ = choose(scene, state, record, checked_rtol, ts)
+        method, _ = choose(scene, checked_rtol)
     found = found_by_steps(_begin(method, scene, state, ts, checked_rtol), ts, events)
     if found is None:
         trajectory = run(method, scene, state, ts, checked_rtol, record, None)

@@ -101,7 +101,7 @@ def test_orbits_wheels_and_states_are_those_of_python():
     scene = build_scene(file, np.float64)
     assert same(scene.potential, ph.GravityGradient(3.986e14, orbit()))
     coupling = ph.ViscousCoupling(1e-4) + ph.CoulombFriction(0.25, 0.5) + ph.Motor(0.125, 0.5, 100)
-    wheel = ph.Rotor([0.0, 0, 2], inertia=0.5, speed=3.0, coupling=coupling)
+    wheel = ph.Rotor.axial(inertia=0.5, speed=3.0, coupling=coupling)
     assert same(scene.rotors, wheel)
     state = build_state(file, np.float64, scene.inertia)
     wxyz = ph.rotation.normalise(jnp.array([1.0, 1, 0, 0]))

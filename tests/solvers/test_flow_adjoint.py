@@ -25,6 +25,7 @@ from polhode._hamiltonian import (
 )
 from polhode._integrate import Accuracy, Extrapolation, FlowAdjoint
 from polhode._kernels import linear
+from polhode._scene import AlongZ
 
 KEYS = jax.random.split(jax.random.key(7), 8)
 WXYZ = rotation.normalise(jax.random.normal(KEYS[0], (3, 4)))
@@ -120,7 +121,7 @@ def value(inverse):
     dtype = inverse.dtype
     numbers = (jnp.array(x, dtype) for x in (1.0, (0.1, 0.0, 0.5), (0.0, 0.0, -1.0)))
     unit = ph.Inertia.from_moments(jnp.ones(3, dtype))
-    weight = ph.UniformGravity(*numbers, vertical=True)
+    weight = AlongZ(ph.UniformGravity(*numbers), -jnp.ones((), dtype))
     energy = Hamiltonian(tuple(inverse), unit, weight)
     units = LiePoissonUnits(jnp.ones(3, dtype), jnp.ones(3, dtype))
     dynamics = Dynamics(energy, None, units, LiePoissonCostate.of)

@@ -50,8 +50,8 @@ CASES = {
     "slowly without mass": (TILTED, numbers_of([5e-3, -3e-3, 2e-3], mass=0.0, gravity=SLANTED)),
 }
 WHEELS = {  # the second takes up the momentum of the body, which has none in all
-    "with a wheel": (ph.Rotor([0.0, 0.0, 1.0], momentum=0.7), REST),
-    "balanced by a wheel": (ph.Rotor([0.0, 0.0, 1.0], momentum=-3.0), [0.0, 0.0, 1.0]),
+    "with a wheel": (ph.Rotor.axial(momentum=0.7), REST),
+    "balanced by a wheel": (ph.Rotor.axial(momentum=-3.0), [0.0, 0.0, 1.0]),
 }
 
 

@@ -15,7 +15,7 @@ SCENES = {
     "heavy top": (I, FALL),
     "damped": (I, FALL, ph.LinearDamping(jnp.array([0.1, 0.2, 0.3]))),
     "satellite": (I, ph.GravityGradient(1.0, ORBIT)),
-    "Lagrange": (ph.Inertia.axisymmetric(1.0, 0.5), ph.UniformGravity(1.0, [0.0, 0.0, 0.3])),
+    "Lagrange": (ph.Inertia.axisymmetric(1.0, 0.5), ph.UniformGravity.axial(1.0, 0.3)),
 }
 
 

@@ -11,6 +11,7 @@ from benchmarks.integrators import heavy_top
 from polhode._hamiltonian import Dynamics, lie_poisson_field
 from polhode._integrate._field import BoundTerm
 from polhode._kernels import specialise
+from polhode._scene import AlongZ
 
 N = 5
 KEYS = jax.random.split(jax.random.key(1), 2)
@@ -76,7 +77,7 @@ def _arithmetic(closed):
 
 
 def test_the_derived_field_costs_what_the_one_written_by_hand_does():
-    gravity = ph.UniformGravity(1.0, [0.0, 0.0, 0.5], [0.0, 0.0, -2.0], True, True)
+    gravity = AlongZ(ph.UniformGravity.axial(1.0, 0.5), jnp.array(-2.0))
     derived = dynamics(ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), gravity))
     by_hand = (tuple(jnp.array([1.0, 1 / 1.5, 0.5])), jnp.array(1.0))
     counts = []

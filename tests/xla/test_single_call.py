@@ -83,7 +83,10 @@ def test_a_version_that_ends_the_process_runs_plain(untested, monkeypatch):
 
 def test_no_operation_of_an_orbit_keeps_it_out_of_a_unit():
     """Kepler's equation takes cube roots and inverse hyperbolic functions."""
-    orbits = {"ellipse": ph.KeplerOrbit(1.0, 2.0, 0.1), "fly-by": ph.KeplerOrbit(1.0, -2.0, 1.4)}
+    orbits = {
+        "ellipse": ph.KeplerOrbit(1.0, 2.0, 0.1),
+        "fly-by": ph.HyperbolicOrbit(1.0, -2.0, 1.4),
+    }
     for orbit in orbits.values():
         drag = ph.RelativeTorque(ph.LinearDamping(0.1), ph.LVLH(orbit))
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), None, drag)

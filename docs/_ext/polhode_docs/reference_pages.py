@@ -15,7 +15,7 @@ PAGE = re.compile(r"\bdocs/([\w/-]+)\.md\b")
 
 INTERNAL = {
     # of scenes and their parts, while a simulation is prepared
-    "settled", "is_as_declared", "declared_anew", "carrier", "changes", "dynamics",
+    "settled", "carrier", "changes", "dynamics",
     "with_spins", "without_wheels", "as_unit", "check_form", "check_within", "of_symmetry",
     "settle", "column", "core_ranks", "smooth",
     # of methods and solvers, inside the integration

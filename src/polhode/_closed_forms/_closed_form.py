@@ -6,11 +6,9 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from polhode._batch import is_lane_tree, map_chunks
-from polhode._checks import is_concrete
 from polhode._method._base import AbstractMethod, Record, Samples
 from polhode._method._status import Status
 from polhode._scene import BodyTorque, LinearDamping, Scene, State, TorqueSum, Wheels
@@ -27,10 +25,10 @@ class AbstractClosedForm(AbstractMethod):
         """What is wrong with the parts of the scene, whatever their values; None: nothing."""
 
     @abc.abstractmethod
-    def why_not(self, scene: Scene, state: State, record: Record) -> str | None:
-        """Why the solution does not hold for the scene; None where it is known to hold.
+    def why_not(self, scene: Scene) -> str | None:
+        """Why the types of the parts do not make the solution valid; None: they do.
 
-        Values count where they are concrete; while they are traced only what is static counts.
+        Numbers are not read: plain calls, ``jit``, ``vmap`` and ``grad`` choose alike.
         """
 
     def refuse(self, scene: Scene) -> None:
@@ -92,8 +90,8 @@ def _samples(wxyz, omega, holds, record: Record) -> Samples:
     finite = jnp.all(jnp.isfinite(omega), axis=(-1, -2))
     if record.attitude:
         finite = finite & jnp.all(jnp.isfinite(wxyz), axis=(-1, -2))
-    status = jnp.where(finite, Status.SUCCESSFUL, Status.NOT_FINITE)
-    status = jnp.where(holds, status, Status.WRONG_LAW)
+    status = jnp.where(finite & holds, Status.SUCCESSFUL, Status.NOT_FINITE)
+    wxyz, omega = (jnp.where(holds[:, None, None], x, jnp.nan) for x in (wxyz, omega))
     return Samples(
         wxyz if record.attitude else None,
         omega if record.rates else None,
@@ -114,38 +112,30 @@ def broadcast(*arrays):
 
 
 def wheel_objection(scene: Scene) -> str | None:
-    """Objection to rotors other than wheels of constant momentum on body z."""
+    """Objection to rotors other than wheels on body z that are held at their speed, by type."""
     rotors = scene.rotors
     if rotors is None:
         return None
-    along = rotors.along if isinstance(rotors, Wheels) else tuple(w.along for w in rotors.wheels)
-    if any(axis != 2 for axis in along):
-        return "a rotor is not known to lie on body z"
     if isinstance(rotors, Wheels):
-        motor_acts = not all(held or f is None for held, f in zip(rotors.held, rotors.impulses))
-        motor_acts = motor_acts or bool(rotors.coupled)
-        torques = [rotors.torque]
+        axes, held = rotors.along, rotors.held
     else:
-        motor_acts = any(not (w.impulse is None and w.coupling is None) for w in rotors.wheels)
-        torques = [w.torque for w in rotors.wheels if w.torque is not None]
-    if motor_acts:
-        return "a motor turns a rotor by a function of time or state"
-    if not all(is_concrete(x) and np.all(np.asarray(x) == 0) for x in torques):
-        return "a motor turns a rotor"
-    return None
+        axes = tuple(wheel.axis for wheel in rotors.wheels)
+        held = tuple(wheel.is_held for wheel in rotors.wheels)
+    if any(axis != 2 for axis in axes):
+        return NOT_AXIAL
+    return None if all(held) else "a motor turns a rotor, or it spins freely"
+
+
+NOT_AXIAL = "a rotor is not one of ph.Rotor.axial"
+NOT_PRINCIPAL = "the body axes are not principal axes by the type of the inertia"
 
 
 def symmetry_objection(scene: Scene) -> str | None:
+    """Objection to an inertia that is not symmetric about body z by its type."""
     inertia = scene.inertia
-    if not inertia.is_principal:
-        return "the body axes are not known to be principal"
-    if inertia.symmetry is Symmetry.NONE:
-        if not is_concrete(inertia):
-            return "the moments about body x and y are not known to be equal"
-        moments = np.asarray(inertia.moments)
-        if np.any(moments[..., 0] != moments[..., 1]):
-            return "the moments about body x and y differ"
-    return None
+    if inertia.is_principal and inertia.symmetry is not Symmetry.NONE:
+        return None
+    return "the inertia is not one of ph.Inertia.axisymmetric"
 
 
 def axial_state(scene: Scene, state: State) -> tuple[Array, Array, Array]:

@@ -3,17 +3,16 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._checks import is_concrete
 from polhode._closed_forms._closed_form import (
+    NOT_AXIAL,
+    NOT_PRINCIPAL,
     AbstractClosedForm,
     as_lanes,
     axial_state,
     bodies_per_chunk,
-    broadcast,
     run_in_chunks,
     symmetry_objection,
     torque_and_damping,
@@ -23,7 +22,7 @@ from polhode._closed_forms._closed_form import (
 )
 from polhode._kernels import derivable_once
 from polhode._method._base import Record, Samples
-from polhode._scene import Scene, State
+from polhode._scene import Scene, State, Wheels
 from polhode.rotation import multiply, rotation_vector_to_wxyz
 
 
@@ -38,30 +37,16 @@ class SymmetricTop(AbstractClosedForm):
 
     chunk: int = eqx.field(static=True, default=2**14)
 
-    def why_not(self, scene: Scene, state: State, record: Record) -> str | None:
+    def why_not(self, scene: Scene) -> str | None:
         refusal = self.objection(scene) or symmetry_objection(scene) or wheel_objection(scene)
-        if refusal is not None:
-            return refusal
-        if not is_concrete(scene.torque):
-            return "the torques are not known to be symmetric about body z"
-        torque, damping = (np.asarray(x) for x in torque_and_damping(scene))
-        if np.any(torque[..., :2] != 0) or np.any(damping[..., 0] != damping[..., 1]):
-            return "a torque is not symmetric about body z"
-        if not record.attitude:
-            return None
-        if np.any(torque != 0):
-            return "the attitude of a driven body is not elementary (ph.Record(attitude=False))"
-        if np.any(damping != 0):
-            if scene.rotors is not None:
-                return "the attitude of a damped body with wheels is not elementary"
-            if not is_concrete(scene.inertia) or not _proportional(scene, damping):
-                return "the attitude is elementary only for damping proportional to the moments"
-        return None
+        if refusal is None and scene.torque is not None:
+            return "a torque acts, of which only numbers can be symmetric about body z"
+        return refusal
 
     def objection(self, scene: Scene) -> str | None:
-        return torque_objection(scene) or (
-            None if scene.inertia.is_principal else "the body axes are not known to be principal"
-        )
+        if isinstance(scene.rotors, Wheels) and any(axis != 2 for axis in scene.rotors.along):
+            return NOT_AXIAL
+        return torque_objection(scene) or (None if scene.inertia.is_principal else NOT_PRINCIPAL)
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         del rtol
@@ -116,43 +101,26 @@ def _equal(a: Array, b: Array) -> Array:
     return jnp.abs(a - b) <= 4 * jnp.finfo(a.dtype).eps * jnp.abs(a)
 
 
-def _proportional(scene: Scene, damping) -> bool:
-    rates, moments = broadcast(np.asarray(damping), np.asarray(scene.inertia.moments))
-    rates = rates / moments
-    return bool(np.all(_equal(rates[..., 0], rates[..., 2])))
-
-
 class FixedAxis(AbstractClosedForm):
     """Rotation about a fixed principal axis, driven and damped, in closed form.
 
     All rates but one are zero at the start, the constant body torques lie along that axis and the
     damping is linear: d omega/dt = (N - c omega)/I. The axis may differ from body to body.
     Derivatives with respect to transverse rates and torques are zero, those of this motion only.
-    Second ones of a body at rest are NaN. (Where these are traced, ``ph.simulate`` does not choose
-    this method by itself.)
+    Second ones of a body at rest are NaN. Bodies with other rates or torques have NaN and
+    ``ph.Status.NOT_FINITE``: ``ph.simulate`` never chooses this method itself.
     """
 
     chunk: int = eqx.field(static=True, default=2**14)
 
-    def why_not(self, scene: Scene, state: State, record: Record) -> str | None:
-        refusal = self.objection(scene)
-        if refusal is not None:
-            return refusal
-        if not is_concrete(scene.torque, state.omega_body):
-            return "the rates are not known to lie along one principal axis"
-        with jax.ensure_compile_time_eval():  # known numbers, also inside of jit
-            torque, _ = torque_and_damping(scene)
-            acting = broadcast(np.asarray(torque) != 0, np.asarray(state.omega_body) != 0)
-            is_axis = np.logical_or(*map(np.asarray, acting))
-        if np.any(is_axis.sum(axis=-1) > 1):
-            return "rates or torques do not lie along one principal axis"
-        return None
+    def why_not(self, scene: Scene) -> str | None:
+        return self.objection(scene) or "only numbers can lie along one principal axis"
 
     def objection(self, scene: Scene) -> str | None:
         if scene.rotors is not None:
             return "rotors turn in the body"
         if not scene.inertia.is_principal:
-            return "the body axes are not known to be principal"
+            return NOT_PRINCIPAL
         return torque_objection(scene)
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:

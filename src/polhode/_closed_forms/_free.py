@@ -70,7 +70,7 @@ class ClosedForm(AbstractClosedForm):
         acting = (part for part in PARTS[1:] if getattr(scene, part) is not None)
         return f"it solves free bodies only, and the scene has a {' and '.join(acting)}"
 
-    def why_not(self, scene: Scene, state: State, record: Record) -> str | None:
+    def why_not(self, scene: Scene) -> str | None:
         return self.objection(scene)
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:

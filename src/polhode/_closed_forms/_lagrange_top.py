@@ -30,12 +30,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._checks import is_concrete
 from polhode._closed_forms._closed_form import (
+    NOT_AXIAL,
+    NOT_PRINCIPAL,
     AbstractClosedForm,
     as_lanes,
     axial_state,
@@ -71,15 +71,12 @@ class LagrangeTop(AbstractClosedForm):
 
     chunk: int | None = eqx.field(static=True, default=None)
 
-    def why_not(self, scene: Scene, state: State, record: Record) -> str | None:
+    def why_not(self, scene: Scene) -> str | None:
         refusal = self.objection(scene) or symmetry_objection(scene) or wheel_objection(scene)
         gravity: Any = scene.potential
-        if refusal is not None or gravity.on_axis:
-            return refusal
-        centre = gravity.centre_body
-        if not is_concrete(centre) or np.any(np.asarray(centre)[..., :2] != 0):
-            return "the centre of mass is not known to lie on body z (ph.UniformGravity.axial)"
-        return None
+        if refusal is None and gravity.distance is None:
+            return "the potential is not one of ph.UniformGravity.axial"
+        return refusal
 
     def objection(self, scene: Scene) -> str | None:
         if not isinstance(scene.potential, UniformGravity):
@@ -87,9 +84,9 @@ class LagrangeTop(AbstractClosedForm):
         if scene.torque is not None:
             return "a torque acts"
         if not scene.inertia.is_principal:
-            return "the body axes are not known to be principal"
+            return NOT_PRINCIPAL
         if isinstance(scene.rotors, Wheels) and any(axis != 2 for axis in scene.rotors.along):
-            return "a rotor is not known to lie on body z"
+            return NOT_AXIAL
         return None
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
@@ -109,7 +106,7 @@ class LagrangeTop(AbstractClosedForm):
         n = state.wxyz.shape[0]
         transverse, moments, axial = axial_state(scene, state)
         gravity: Any = scene.potential
-        centre = as_lanes(gravity.centre_body, n, 1)
+        centre = as_lanes(gravity.centre, n, 1)
         force = as_lanes(gravity.mass, n)[:, None] * as_lanes(gravity.gravity_space, n, 1)
         wxyz, omega = lagrange_motion(
             transverse, force, centre[:, 2], state.wxyz, state.omega_body, axial, elapsed

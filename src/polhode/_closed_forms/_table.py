@@ -1,4 +1,4 @@
-"""The table of closed forms: the planner takes the first one that is known to hold."""
+"""The table of closed forms: the planner takes the first that the types make valid."""
 
 from typing import NamedTuple
 
@@ -6,42 +6,39 @@ from polhode._closed_forms._closed_form import AbstractClosedForm
 from polhode._closed_forms._elementary import FixedAxis, SymmetricTop
 from polhode._closed_forms._free import ClosedForm
 from polhode._closed_forms._lagrange_top import LagrangeTop
-from polhode._method._base import Record
-from polhode._scene import Scene, State
+from polhode._scene import Scene
 from polhode.inertia import Symmetry
 
 
 class Solution(NamedTuple):
     """One row: name, what ``explain`` prints where it runs, and the method that evaluates it.
 
-    ``symmetry``: the symmetry that the inertia must be known to have; None: decided by the method.
-    ``of_state``: whether it holds for some states of a scene only.
+    ``symmetry``: that of the type of the inertia; None: decided by the method.
     """
 
     name: str
     explanation: str
     method: AbstractClosedForm
     symmetry: Symmetry | None = None
-    of_state: bool = False
 
-    def why_not(self, scene: Scene, state: State, record: Record) -> str | None:
-        """Why it is not known to hold; None where it is."""
-        reason = self.method.why_not(scene, state, record)
+    def why_not(self, scene: Scene) -> str | None:
+        """Why the types of the parts do not make it valid; None: they do."""
+        reason = self.method.why_not(scene)
         if reason is None and self.symmetry not in (None, scene.inertia.symmetry):
-            return f"the inertia is not declared {self.symmetry.name.lower()}"
+            return f"the inertia is not one of ph.Inertia.{self.symmetry.name.lower()}"
         return reason
 
 
 CLOSED_FORMS = (
     Solution(
         "free body",
-        "free and known to be spherical: exact rotation about a fixed axis",
+        "free and spherical: exact rotation about a fixed axis",
         ClosedForm(),
         Symmetry.SPHERICAL,
     ),
     Solution(
         "free body",
-        "free and known to be axisymmetric: exact regular precession",
+        "free and axisymmetric: exact regular precession",
         ClosedForm(),
         Symmetry.AXISYMMETRIC,
     ),
@@ -66,18 +63,15 @@ CLOSED_FORMS = (
         "fixed axis",
         "spin about one fixed principal axis: exact motion in elementary functions",
         FixedAxis(),
-        of_state=True,
     ),
 )
 
 
-def choose_closed_form(
-    scene: Scene, state: State, record: Record
-) -> tuple[Solution | None, tuple[str, ...]]:
-    """The first closed form known to hold, or None; and why those before it do not."""
+def choose_closed_form(scene: Scene) -> tuple[Solution | None, tuple[str, ...]]:
+    """The first closed form that the types make valid, or None; and why those before it are not."""
     refused = []
     for solution in CLOSED_FORMS:
-        reason = solution.why_not(scene, state, record)
+        reason = solution.why_not(scene)
         if reason is None:
             return solution, tuple(refused)
         refused.append(f"{solution.name}: {reason}")

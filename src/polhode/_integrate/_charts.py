@@ -30,7 +30,15 @@ from polhode._hamiltonian import (
     momentum_from_canonical,
     motor_powers,
 )
-from polhode._scene import AbstractPotential, GravityGradient, Scene, State, UniformGravity
+from polhode._kernels import underivable
+from polhode._scene import (
+    AbstractPotential,
+    AlongZ,
+    GravityGradient,
+    Scene,
+    State,
+    UniformGravity,
+)
 from polhode.rotation import euler_to_wxyz, wxyz_to_euler
 
 
@@ -149,19 +157,17 @@ def _spins(scene: Scene, state: State) -> tuple[tuple[Array, ...], ...]:
 def _upright(field: UniformGravity | GravityGradient) -> tuple[Array, AbstractPotential]:
     """Turn (..., 4) from a frame with z along the field into space, and the field in that frame."""
     if isinstance(field, GravityGradient):
-        force = field.position_space
+        (w, x, y), size = upward(components(field.position_space))
     else:
-        mass, gravity = jnp.asarray(field.mass), field.gravity_space
-        lead = jnp.broadcast_shapes(mass.shape, gravity.shape[:-1])
-        force = mass[..., None] * jnp.broadcast_to(gravity, (*lead, 3))
-    (w, x, y), size = upward(components(force))
-    zero = jnp.zeros_like(size)
-    along = jnp.stack([zero, zero, size], axis=-1)
-    turn = jnp.stack([w, x, y, zero], axis=-1)
-    if isinstance(field, GravityGradient):
-        return turn, GravityGradient(field.mu, along, vertical=True)
-    one = jnp.ones((), size.dtype)
-    return turn, UniformGravity(one, field.centre_body, along, field.on_axis, vertical=True)
+        gravity = components(field.gravity_space)
+        (w, x, y), size = upward(gravity)
+        # Without gravity any axis will do, but derivatives across the one that is taken are lost:
+        # they are made NaN.
+        none = jnp.all(field.gravity_space == 0, axis=-1)
+        size = size + sum(underivable(g, none) - g for g in gravity[:2])
+        size = jnp.multiply(*jnp.broadcast_arrays(field.mass, size))
+    turn = jnp.stack([w, x, y, jnp.zeros_like(w)], axis=-1)
+    return turn, AlongZ(field, size)
 
 
 class EulerChart(AbstractChart):

@@ -11,6 +11,7 @@ from polhode._method._inputs import (
     check_method as check_method,
     check_rtol as check_rtol,
     check_times as check_times,
+    default_rtol as default_rtol,
     judged as judged,
     raise_on_failure as raise_on_failure,
 )

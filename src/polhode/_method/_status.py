@@ -14,11 +14,10 @@ class Status(enum.IntEnum):
     CHART_SINGULAR = 3
     STEP_FAILED = 4
     INACCURATE = 5
-    WRONG_LAW = 6
-    NOT_PHYSICAL = 7
-    BAD_TIMES = 8
-    SLIDING = 9
-    TOO_MANY_EVENTS = 10
+    NOT_PHYSICAL = 6
+    BAD_TIMES = 7
+    SLIDING = 8
+    TOO_MANY_EVENTS = 9
 
     @property
     def explanation(self) -> str:
@@ -34,7 +33,9 @@ _EXPLANATIONS = {
         " such as ph.LiePoisson(diffrax.Kvaerno5(), chunk=1)"
     ),
     Status.NOT_FINITE: (
-        "a NaN or infinity appeared: look at this body's inertia, state, potential and torque"
+        "a NaN or infinity appeared: look at this body's inertia, state, potential and torque; or"
+        " the closed-form solution passed as method is not valid for its numbers (symmetry, centre"
+        " of mass, initial state): leave method=None"
     ),
     Status.CHART_SINGULAR: (
         "theta reached 0 or pi, where Euler angles break down: use ph.LiePoisson (or leave"
@@ -48,11 +49,6 @@ _EXPLANATIONS = {
     Status.INACCURATE: (
         "the estimated error exceeds the tolerance asked for tenfold: the body is chaotic, or its"
         " rounding alone is more; loosen rtol, shorten ts, or use float64"
-    ),
-    Status.WRONG_LAW: (
-        "the law of the method asked for does not hold for this body (symmetry, centre of mass or"
-        " initial state): leave method=None; or a number was changed in a part that was made for"
-        " others (ph.UniformGravity.axial, a wheel on a body axis): make the part anew"
     ),
     Status.NOT_PHYSICAL: (
         "no body has this inertia: moments must be positive and each at most the sum of the two"

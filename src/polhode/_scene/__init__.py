@@ -17,10 +17,12 @@ from polhode._scene._laws import (
 )
 from polhode._scene._orbit import (
     AbstractOrbit as AbstractOrbit,
+    HyperbolicOrbit as HyperbolicOrbit,
     KeplerOrbit as KeplerOrbit,
 )
 from polhode._scene._potentials import (
     AbstractPotential as AbstractPotential,
+    AlongZ as AlongZ,
     GravityGradient as GravityGradient,
     Potential as Potential,
     PotentialSum as PotentialSum,
@@ -34,6 +36,11 @@ from polhode._scene._rotors import (
     Wheels as Wheels,
 )
 from polhode._scene._scene import Scene as Scene, check_scene as check_scene
+from polhode._scene._specialise import (
+    constructors as constructors,
+    narrower as narrower,
+    specialise as specialise,
+)
 from polhode._scene._state import State as State
 from polhode._scene._torques import (
     AbstractTorque as AbstractTorque,

@@ -2,7 +2,7 @@
 
 import abc
 import math
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
@@ -155,19 +155,18 @@ class KeplerOrbit(AbstractOrbit):
     velocity. Use it in ``ph.GravityGradient(mu, orbit)``, ``ph.LVLH(orbit)`` and
     ``ph.MagneticDipole``; these take a function of time [s] too, for an orbit that is no conic.
 
-    **Arguments** (each (...), a batch broadcasts): ``mu`` [m^3/s^2]; ``semi_major_axis`` [m], of a
-    hyperbola negative; ``eccentricity``, in [0, 1) or of a hyperbola above 1; ``inclination``,
+    **Arguments** (each (...), a batch broadcasts): ``mu`` [m^3/s^2]; ``semi_major_axis`` [m];
+    ``eccentricity`` in [0, 1) (hyperbolas: ``ph.HyperbolicOrbit``); ``inclination``,
     ``node`` (longitude of the ascending node), ``periapsis`` (its argument), ``mean_anomaly`` at
     the time ``epoch`` [rad, s], counted from periapsis. Space axes: z is the pole that the
-    inclination is counted from, x the direction that the node is counted from. All orbits of a
-    batch are of one kind; ``hyperbolic`` (static) states which if the numbers are traced.
+    inclination is counted from, x the direction that the node is counted from.
 
     Without an ``eccentricity`` (None) the orbit is a circle by construction: no equation is solved,
     and there is no derivative with respect to the eccentricity, as there is with 0.0. The argument
     of latitude is then ``periapsis`` plus the mean anomaly.
 
         orbit = ph.KeplerOrbit(3.986e14, 6.9e6, inclination=1.7)
-        flyby = ph.KeplerOrbit.from_state(3.986e14, [3.8e7, 0, 0], [0, 7.4e3, 0])
+        same = ph.KeplerOrbit.from_state(3.986e14, orbit(0.0), orbit.velocity_at(0.0))
 
     Raises ValueError for mu that is not positive, an axis of the wrong sign, or an eccentricity
     that is negative or 1.
@@ -183,7 +182,7 @@ class KeplerOrbit(AbstractOrbit):
     position: Float[Array, "*#b 3"] | None = shaped(3)
     velocity: Float[Array, "*#b 3"] | None = shaped(3)
     epoch: Float[Array, "*#b"] = shaped()
-    hyperbolic: bool = eqx.field(static=True, default=False)
+    hyperbolic: ClassVar[bool] = False
 
     def __init__(
         self,
@@ -195,7 +194,6 @@ class KeplerOrbit(AbstractOrbit):
         periapsis: ArrayLike = 0.0,
         mean_anomaly: ArrayLike = 0.0,
         epoch: ArrayLike = 0.0,
-        hyperbolic: bool | None = None,
     ):
         given = locals()
         self.position = self.velocity = None
@@ -207,25 +205,22 @@ class KeplerOrbit(AbstractOrbit):
             setattr(self, name, value.astype(dtype))
         require_positive("mu", self.mu)
         if self.eccentricity is None:
-            require(not hyperbolic, "hyperbolic=True needs an eccentricity, which is above 1.")
+            require(not self.hyperbolic, "HyperbolicOrbit needs an eccentricity, which is above 1.")
         elif is_concrete(self.eccentricity):
             e = np.asarray(self.eccentricity)
-            if hyperbolic is None:
-                hyperbolic = bool(np.all(e > 1))
+            fits = e > 1 if self.hyperbolic else (e >= 0) & (e < 1)
+            bounds = "be above 1" if self.hyperbolic else "lie in [0, 1)"
+            other = "KeplerOrbit" if self.hyperbolic else "HyperbolicOrbit"
             require(
-                e > 1 if hyperbolic else (e >= 0) & (e < 1),
-                lambda: (
-                    "eccentricity must lie in [0, 1), or for a batch of hyperbolas above 1, got"
-                    f" {eccentricity}."
-                ),
+                fits,
+                lambda: f"eccentricity must {bounds}, got {eccentricity}; see ph.{other}.",
             )
-        self.hyperbolic = bool(hyperbolic)
         if is_concrete(self.semi_major_axis):
             axis = np.asarray(self.semi_major_axis)
             require(
                 axis < 0 if self.hyperbolic else axis > 0,
                 lambda: (
-                    "semi_major_axis must be positive, of a hyperbola (eccentricity above 1)"
+                    "semi_major_axis must be positive, of a hyperbola (ph.HyperbolicOrbit)"
                     f" negative, got {semi_major_axis}."
                 ),
             )
@@ -237,20 +232,19 @@ class KeplerOrbit(AbstractOrbit):
         position: ArrayLike,
         velocity: ArrayLike,
         epoch: ArrayLike = 0.0,
-        hyperbolic: bool | None = None,
     ) -> Self:
         """The conic through a position (..., 3) [m] with a velocity (..., 3) [m/s].
 
         ``mu`` (...) [m^3/s^2]; both from the attracting centre, in space axes, at the time
-        ``epoch`` (...) [s]. They are stored in place of elements, so that derivatives are regular
-        everywhere, also for circular and equatorial orbits. All orbits of a batch are ellipses, or
-        all are hyperbolas; ``hyperbolic`` (static) states which if the numbers are traced.
+        ``epoch`` (...) [s]. They are kept in place of elements, so that derivatives are regular
+        everywhere, also for circular and equatorial orbits, where elements are not. The orbits are
+        ellipses; of ``ph.HyperbolicOrbit`` hyperbolas.
 
         Lagrange's f and g functions of the difference in eccentric or hyperbolic anomaly (R. H.
         Battin, An Introduction to the Mathematics and Methods of Astrodynamics, 1999).
 
-        Raises ValueError for mu that is not positive, or a state on neither: a parabola, ellipses
-        among hyperbolas, or radial motion.
+        Raises ValueError for mu that is not positive, a state on another kind of orbit, or radial
+        motion.
         """
         place = as_float_array("position", position, (3,))
         speed = as_float_array("velocity", velocity, (3,))
@@ -259,14 +253,11 @@ class KeplerOrbit(AbstractOrbit):
         place, speed = place.astype(dtype), speed.astype(dtype)
         require_positive("mu", number)
         if is_concrete(number, place, speed):
-            is_hyperbolic = _check_state(
-                np.asarray(number), np.asarray(place), np.asarray(speed), hyperbolic
-            )
-        else:
-            is_hyperbolic = bool(hyperbolic)
+            state = np.asarray(number), np.asarray(place), np.asarray(speed)
+            _check_state(*state, cls.hyperbolic)
         one = jnp.ones((), dtype)
-        elements = (-one, 2 * one) if is_hyperbolic else (one,)
-        orbit = cls(number, *elements, epoch=start.astype(dtype), hyperbolic=is_hyperbolic)
+        elements = (-one, 2 * one) if cls.hyperbolic else (one,)
+        orbit = cls(number, *elements, epoch=start.astype(dtype))
         return eqx.tree_at(
             lambda orbit: [getattr(orbit, name) for name in (*_ELEMENTS, "position", "velocity")],
             orbit,
@@ -301,6 +292,19 @@ class KeplerOrbit(AbstractOrbit):
         return jnp.stack(pole, axis=-1)
 
 
+class HyperbolicOrbit(KeplerOrbit):
+    """Position of a body on a hyperbola about an attracting centre, for fly-bys.
+
+    As ``ph.KeplerOrbit``, with an ``eccentricity`` above 1 and a negative ``semi_major_axis`` [m].
+
+        flyby = ph.HyperbolicOrbit.from_state(3.986e14, [3.8e7, 0, 0], [0, 7.4e3, 0])
+
+    Raises ValueError for other numbers.
+    """
+
+    hyperbolic: ClassVar[bool] = True
+
+
 _ELEMENTS = (
     "semi_major_axis",
     "eccentricity",
@@ -332,19 +336,15 @@ def _by_elements(orbit: Any, t: Array) -> Float[Array, "*b 3"]:
     return jnp.stack(jnp.broadcast_arrays(*place), axis=-1)
 
 
-def _check_state(
-    mu: np.ndarray, place: np.ndarray, speed: np.ndarray, hyperbolic: bool | None
-) -> bool:
-    """ValueError for states on neither an ellipse nor a hyperbola; whether they are hyperbolas."""
+def _check_state(mu: np.ndarray, place: np.ndarray, speed: np.ndarray, hyperbolic: bool) -> None:
+    """ValueError for states on another kind of orbit."""
     distance = np.linalg.norm(place, axis=-1)
     excess = distance * np.sum(speed * speed, axis=-1) / mu
-    if hyperbolic is None:
-        hyperbolic = bool(np.all(excess > 2))
     require(
         (distance > 0) & ((excess > 2 + 1e-9) if hyperbolic else (excess < 2)),
-        "position and velocity must lie on an ellipse, |v|^2 |r|/mu below 2, or for a"
-        f" batch of hyperbolas above 2, got {describe(excess)}: check the units, or hand"
-        " GravityGradient any function of time instead.",
+        f"position and velocity must lie on {'a hyperbola' if hyperbolic else 'an ellipse'},"
+        f" |v|^2 |r|/mu {'above' if hyperbolic else 'below'} 2, got {describe(excess)}: check the"
+        f" units, or use ph.{'KeplerOrbit' if hyperbolic else 'HyperbolicOrbit'}.",
     )
     moment = np.linalg.norm(np.cross(place, speed), axis=-1)
     require(
@@ -352,7 +352,6 @@ def _check_state(
         "the velocity must not point straight to or from the attracting centre, got"
         f" {describe(speed)} at {describe(place)}.",
     )
-    return hyperbolic
 
 
 def _axis_of_state(orbit: Any) -> tuple[Array, Array]:

@@ -26,7 +26,8 @@ class Rotor(AbstractRotor):
 
     **Arguments:**
 
-    - ``axis_body`` (..., 3): its axis in body axes (normalised).
+    - ``axis_body`` (..., 3): its axis in body axes (normalised). A wheel on body x, y or z:
+      ``Rotor.axial``.
     - ``inertia`` (...): its moment J about that axis [kg m^2]; already part of the body's inertia.
       May be left out when ``momentum`` is given and no ``torque``, ``impulse`` or ``coupling``.
     - exactly one of ``momentum`` (...) = J Omega [kg m^2/s] and ``speed`` (...) = Omega [rad/s],
@@ -43,8 +44,8 @@ class Rotor(AbstractRotor):
     """
 
     impulse: Callable | None
-    along: int | None = eqx.field(static=True)
-    axis_body: Float[Array, "*#b 3"] = shaped(3)
+    axis: int | None = eqx.field(static=True)
+    axis_body: Float[Array, "*#b 3"] | None = shaped(3)
     inertia: Float[Array, "*#b"] | None = shaped()
     momentum: Float[Array, "*#b"] | None = shaped()
     speed: Float[Array, "*#b"] | None = shaped()
@@ -53,26 +54,33 @@ class Rotor(AbstractRotor):
 
     def __init__(
         self,
-        axis_body: ArrayLike,
+        axis_body: ArrayLike | None = None,
         inertia: ArrayLike | None = None,
         momentum: ArrayLike | None = None,
         speed: ArrayLike | None = None,
         torque: ArrayLike | None = None,
         impulse: Callable | None = None,
         coupling: AbstractCoupling | None = None,
+        *,
+        axis: int | None = None,
     ):
-        axis = as_float_array("axis_body", axis_body, (3,))
-        self.along = None
-        if is_concrete(axis):
-            require(
-                np.any(np.asarray(axis) != 0, axis=-1),
-                lambda: (
-                    f"axis_body must not be zero, got {axis_body}: give the wheel's axis in body"
-                    " axes."
-                ),
-            )
-            self.along = _body_axis(np.asarray(axis))
-        self.axis_body = _unit(axis)
+        require(
+            axis in (None, 0, 1, 2) and (axis is None) != (axis_body is None),
+            "Rotor takes an axis_body (..., 3), or of a wheel on a body axis its number 0, 1 or 2"
+            " (Rotor.axial).",
+        )
+        self.axis, self.axis_body = axis, None
+        if axis_body is not None:
+            vector = as_float_array("axis_body", axis_body, (3,))
+            if is_concrete(vector):
+                require(
+                    np.any(np.asarray(vector) != 0, axis=-1),
+                    lambda: (
+                        f"axis_body must not be zero, got {axis_body}: give the wheel's axis in"
+                        " body axes."
+                    ),
+                )
+            self.axis_body = _unit(vector)
         if (momentum is None) == (speed is None):
             raise ValueError(
                 "Rotor takes exactly one of momentum (J Omega relative to the body, kg m^2/s) and"
@@ -109,6 +117,34 @@ class Rotor(AbstractRotor):
         if self.inertia is not None:
             require_positive("the rotor's inertia", self.inertia, hint="give it in kg m^2")
 
+    @classmethod
+    def axial(
+        cls,
+        inertia: ArrayLike | None = None,
+        momentum: ArrayLike | None = None,
+        speed: ArrayLike | None = None,
+        torque: ArrayLike | None = None,
+        impulse: Callable | None = None,
+        coupling: AbstractCoupling | None = None,
+        *,
+        axis: int = 2,
+    ) -> "Rotor":
+        """A wheel on a body axis: ``axis`` 0, 1 or 2 for body x, y or z.
+
+        The other arguments are those of ``Rotor``. A symmetric body with wheels on body z that are
+        held at their speed has closed-form solutions, and with wheels on its axes it keeps them as
+        principal axes.
+        """
+        return cls(None, inertia, momentum, speed, torque, impulse, coupling, axis=axis)
+
+    @property
+    def direction(self) -> Float[Array, "*b 3"]:
+        """Unit vector (..., 3) of the axis in the body."""
+        if self.axis_body is not None:
+            return _unit(self.axis_body)
+        number = self.speed if self.momentum is None else self.momentum
+        return jnp.eye(3, dtype=jnp.asarray(number).dtype)[self.axis]
+
     @property
     def is_held(self) -> bool:
         """Whether the speed relative to the body is prescribed (static)."""
@@ -118,12 +154,6 @@ class Rotor(AbstractRotor):
     def wheels(self) -> tuple["Rotor", ...]:
         return (self,)
 
-    def declared_anew(self) -> "Rotor":
-        return Rotor(
-            self.axis_body, self.inertia, self.momentum, self.speed, self.torque, self.impulse,
-            self.coupling,
-        )  # fmt: skip
-
     def column(
         self, omega_body: Array, start: Array, wheel_speed: Array | None = None
     ) -> tuple[Array, Array, Array, Array]:
@@ -131,15 +161,16 @@ class Rotor(AbstractRotor):
 
         ``wheel_speed`` (...) [rad/s]: at the start, of a wheel that is not held; None: its own.
         """
-        parts = (self.axis_body, self.inertia, self.momentum, self.speed, self.torque)
-        shapes = [x.shape[:-1] if x is self.axis_body else x.shape for x in parts if x is not None]
+        direction = self.direction
+        parts = (self.inertia, self.momentum, self.speed, self.torque)
+        shapes = [direction.shape[:-1], *(x.shape for x in parts if x is not None)]
         if not self.is_held:
             shapes += [omega_body.shape[:-1], start.shape]
             shapes += [] if wheel_speed is None else [wheel_speed.shape]
         lead = np.broadcast_shapes(*shapes)
-        zero = jnp.zeros(lead, self.axis_body.dtype)
-        axis = jnp.broadcast_to(_unit(self.axis_body), (*lead, 3))
-        inertia, momentum, speed, torque = (zero if x is None else x + zero for x in parts[1:])
+        zero = jnp.zeros(lead, direction.dtype)
+        axis = jnp.broadcast_to(direction, (*lead, 3))
+        inertia, momentum, speed, torque = (zero if x is None else x + zero for x in parts)
         if self.momentum is None:
             momentum = inertia * speed
         if self.is_held:
@@ -154,9 +185,3 @@ def _unit(axis: Array) -> Array:
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(axis), axis=-1, keepdims=True))
     axis = axis / largest  # of any size: nothing overflows
     return axis / jnp.sqrt(jnp.sum(axis**2, axis=-1, keepdims=True))
-
-
-def _body_axis(axis: np.ndarray) -> int | None:
-    """Which body axis all of the axes lie on, or None."""
-    used = [i for i in range(3) if np.any(axis[..., i] != 0)]
-    return used[0] if len(used) == 1 else None

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import numbers, require, together
+from polhode._checks import require
 from polhode._hamiltonian import Attitude, Vector, dot, triple
 from polhode._parts import AbstractPart, Signature, shaped
 from polhode._scene._couplings import Couplings
@@ -39,17 +39,6 @@ class AbstractRotor(AbstractPart):
     def wheels(self) -> tuple[Any, ...]:
         """One by one."""
 
-    @property
-    def is_as_declared(self) -> Any:
-        """Whether (...) each wheel is on the body axis that it was made on; None: on any."""
-        found = [_is_along(w.axis_body, w.along) for w in self.wheels if w.along is not None]
-        return together(found)
-
-    def declared_anew(self) -> "AbstractRotor":
-        """The same numbers with the body axes that they lie on."""
-        made = [w.declared_anew() for w in self.wheels]
-        return RotorSum(tuple(made))
-
     def __add__(self, other: "AbstractRotor") -> "RotorSum":
         if not isinstance(other, AbstractRotor):
             raise TypeError(f"a rotor adds to another rotor, not to {type(other).__name__}")
@@ -60,7 +49,7 @@ class AbstractRotor(AbstractPart):
         for wheel in self.wheels:
             if wheel.inertia is None:
                 continue
-            axis = wheel.axis_body
+            axis = wheel.direction
             with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
                 turned = inertia.momentum(axis)
                 about = jnp.sum(jnp.broadcast_to(axis, turned.shape) * turned, axis=-1)
@@ -93,7 +82,7 @@ class AbstractRotor(AbstractPart):
         return Wheels(
             impulses=tuple(wheel.impulse for wheel in self.wheels),
             held=tuple(wheel.is_held for wheel in self.wheels),
-            along=tuple(wheel.along for wheel in self.wheels),
+            along=tuple(wheel.axis for wheel in self.wheels),
             coupled=tuple(i for i, wheel in enumerate(self.wheels) if wheel.coupling is not None),
             axes=axes,
             momentum=momentum,
@@ -126,13 +115,6 @@ def _speeds_of(wheel_speed: Array | None, count: int) -> Sequence[Array | None]:
     return [wheel_speed[..., i] for i in range(count)]
 
 
-def _is_along(axes: Array, axis: int) -> Any:
-    """Whether (...) axes lie on this body axis."""
-    axes = numbers(axes).asarray(axes)
-    first, second = (axes[..., k] for k in range(3) if k != axis)
-    return (first == 0) & (second == 0)
-
-
 class Wheels(AbstractRotor):
     """Rotors whose motion is known: what ``Rotor`` becomes once the state of the body is.
 
@@ -163,15 +145,6 @@ class Wheels(AbstractRotor):
 
     def check_within(self, inertia):
         """Nothing: the rotors were checked before they were settled."""
-
-    @property
-    def is_as_declared(self):
-        pairs = [(self.axes[..., i, :], axis) for i, axis in enumerate(self.along)]
-        found = [_is_along(x, axis) for x, axis in pairs if axis is not None]
-        return together(found)
-
-    def declared_anew(self):
-        return self
 
     @property
     def is_possible(self) -> Array:

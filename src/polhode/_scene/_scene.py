@@ -7,10 +7,9 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool
 
-from polhode._checks import is_concrete, together
+from polhode._checks import is_concrete
 from polhode._hamiltonian import Dynamics, Hamiltonian, inverse_inertia, lie_poisson_field
 from polhode._parts import check_fields
 from polhode._scene._potentials import AbstractPotential
@@ -18,6 +17,7 @@ from polhode._scene._rotors import AbstractRotor, Wheels
 from polhode._scene._state import State
 from polhode._scene._torques import AbstractTorque
 from polhode.inertia import Inertia
+from polhode.inertia._inertia import check_form
 
 
 class Scene(eqx.Module):
@@ -46,7 +46,7 @@ class Scene(eqx.Module):
         """Whether there is no potential, torque or wheel (static)."""
         return self.potential is None and self.torque is None and self.rotors is None
 
-    def settled(self, state: State, start: Array | np.ndarray) -> "Scene":
+    def settled(self, state: State, start: Array) -> "Scene":
         """The scene with the motion of its wheels fixed by the state at the time ``start``."""
         if self.rotors is None:
             return self
@@ -61,29 +61,6 @@ class Scene(eqx.Module):
             return self.inertia.is_possible
         found = self.inertia.is_possible, self.carrier.is_possible, wheels.is_possible
         return reduce(jnp.logical_and, jnp.broadcast_arrays(*found))
-
-    @property
-    def is_as_declared(self) -> Any:
-        """Whether (...) the numbers are such as the parts were made for; None where any will do."""
-        found = [part.is_as_declared for part in (self.potential, self.rotors) if part is not None]
-        found = [x for x in found if x is not None]
-        return together(found)
-
-    def declared_anew(self) -> "Scene":
-        """The scene with what its parts declare taken from their numbers, where these are known.
-
-        A number changed by ``eqx.tree_at`` may have left what its part was made for: a centre of
-        mass its axis, a wheel the body axis that it was on. The numbers count.
-        """
-        if not is_concrete(self.potential, self.rotors):
-            return self
-        scene = self
-        for name in ("potential", "rotors"):
-            part = getattr(self, name)
-            if part is None or (kept := part.is_as_declared) is None or bool(np.all(kept)):
-                continue
-            scene = eqx.tree_at(lambda s, n=name: getattr(s, n), scene, part.declared_anew())
-        return scene
 
     @property
     def _wheels(self) -> Wheels | None:
@@ -211,7 +188,7 @@ def _check_kinds(scene: Scene) -> None:
         value = getattr(scene, name)
         if not (isinstance(value, kind) or (value is None and name != "inertia")):
             raise TypeError(f"Scene {name} must be {expected}, got {type(value).__name__}.")
-    scene.inertia.check_form()
+    check_form(scene.inertia)
 
 
 def check_scene(scene: Scene) -> None:

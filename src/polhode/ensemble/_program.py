@@ -48,14 +48,13 @@ class Block:
         devices: Sequence[Any],
     ):
         check_method(method)
-        scene, state, ts, record = check_inputs(ensemble.scene, ensemble.state, ts, Record())
+        scene, _, ts, _ = check_inputs(ensemble.scene, ensemble.state, ts, Record())
         if ts.ndim != 1:
             raise ValueError(f"the bodies of an ensemble share their times (T,), got {ts.shape}.")
         self.ensemble, self.ts, self.devices = ensemble, ts, tuple(devices)
         self.size = block_size(ts.shape[0])
         if method is None:
-            # by structure alone: the values differ from body to body
-            method = eqx.filter_eval_shape(lambda s, x: choose(s, x, record)[0], scene, state)
+            method, _ = choose(scene)
         self.method = method
         self.rtol = check_rtol(rtol, ts.dtype)
         self.settings = Settings(self.size, trajectories, statistics)

@@ -1,5 +1,6 @@
 """Tables of a scene file that say what acts on the body: SI units."""
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -45,6 +46,13 @@ class Orbit(Measured):
         if self.position is not None and elements:
             raise ValueError(f"{elements[0]} is not used with position and velocity: remove it")
         return self
+
+    @property
+    def is_hyperbolic(self) -> bool:
+        """Whether the numbers are those of a fly-by."""
+        if self.position is None or self.velocity is None:
+            return self.eccentricity is not None and self.eccentricity > 1
+        return math.hypot(*self.velocity) ** 2 * math.hypot(*self.position) > 2 * self.mu
 
 
 class UniformGravity(Table):

@@ -14,6 +14,7 @@ from jaxtyping import Array, DTypeLike, Float
 
 import polhode
 from polhode import rotation
+from polhode._scene import narrower
 from polhode.files._bodies import AnySolid, Attitudes
 from polhode.files._error import SceneFileError
 from polhode.files._models import SceneFile
@@ -85,7 +86,7 @@ def build_orbit(file: SceneFile, dtype: DTypeLike) -> "polhode.AbstractOrbit | N
     table = file.orbit
     if table is None:
         return None
-    orbit = polhode.KeplerOrbit
+    orbit = polhode.HyperbolicOrbit if table.is_hyperbolic else polhode.KeplerOrbit
     make = orbit if table.position is None else orbit.from_state
     with blamed(file, "[orbit]"):
         return _float_parts(make(**_numbers(table, dtype, "unit")), dtype)
@@ -94,10 +95,7 @@ def build_orbit(file: SceneFile, dtype: DTypeLike) -> "polhode.AbstractOrbit | N
 def _potential(file: SceneFile, table: Any, orbit: Any, dtype: DTypeLike) -> Any:
     numbers = _numbers(table, dtype, "kind")
     if table.kind == "uniform-gravity":
-        # known by structure, also to an ensemble, whose method is chosen without numbers
-        gravity = table.gravity_space or [0.0, 0.0, -9.80665]
-        known = {"on_axis": not any(table.centre_body[:2]), "vertical": not any(gravity[:2])}
-        return polhode.UniformGravity(**numbers, **known)
+        return narrower(polhode.UniformGravity(**numbers))
     if table.needs_orbit:
         return polhode.GravityGradient(orbit.mu, orbit)
     return polhode.GravityGradient(**numbers)
@@ -141,7 +139,7 @@ def _rotor(file: SceneFile, table: Any, orbit: Any, dtype: DTypeLike) -> Any:
     numbers = _numbers(table, dtype, "viscous", "coulomb", "motor")
     if couplings:
         numbers["coupling"] = functools.reduce(operator.add, couplings)
-    return polhode.Rotor(**numbers)
+    return narrower(polhode.Rotor(**numbers))
 
 
 def _sum(file: SceneFile, key: str, build: Callable, orbit: Any, dtype: DTypeLike) -> Any:

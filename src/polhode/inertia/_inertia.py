@@ -92,13 +92,7 @@ class Inertia(AbstractShaped, AbstractPart):
             whole = None if value is None else as_float_array(name, value, core, finite=False)
             setattr(self, name, whole)
         self.physical = bool(physical)
-        self.check_form()
-
-    def check_form(self) -> None:
-        """ValueError unless the numbers stand in one form, of which they are all there."""
-        forms = (self.diagonal, self.full, self.transverse, self.moment)
-        whole = (self.transverse is None) == (self.axial is None)
-        require(sum(x is not None for x in forms) == 1 and whole, _ONE_FORM)
+        check_form(self)
 
     @classmethod
     def from_moments(cls, moments: ArrayLike, *, physical: bool = True) -> Self:
@@ -289,6 +283,14 @@ class Inertia(AbstractShaped, AbstractPart):
         batch = jnp.broadcast_shapes(self.batch_shape, momentum.shape[:-1])
         tensor = jnp.broadcast_to(self.full, (*batch, 3, 3))
         return _solve(tensor, jnp.broadcast_to(momentum, (*batch, 3)))
+
+
+def check_form(inertia: Inertia) -> None:
+    """ValueError unless the numbers stand in one form, of which they are all there."""
+    forms = (inertia.diagonal, inertia.full, inertia.transverse, inertia.moment)
+    whole = (inertia.transverse is None) == (inertia.axial is None)
+    if sum(x is not None for x in forms) != 1 or not whole:
+        raise ValueError(_ONE_FORM)
 
 
 @jax.jit  # one program, not one for each operation; likewise below
