@@ -363,7 +363,7 @@ def test_a_batch_on_two_devices_stops_as_on_one():
 
 
 def test_what_is_never_met_is_given_up(monkeypatch):
-    monkeypatch.setattr("polhode._events._until._MOST", 10)
+    monkeypatch.setattr("polhode._events._until._MAX_WINDOWS", 10)
     never = ph.Event(lambda wxyz, omega_body, t: omega_body[1] - 3.5)
     with pytest.raises(ph.SimulationError, match="steps"):
         ph.simulate(BALL, STATE, [0.0, 1e6], until=never)
@@ -388,7 +388,7 @@ def test_what_cannot_be_searched_is_told():
         with pytest.raises(ValueError, match=match):
             jax.jit(lambda traj, given=given: ph.crossings(traj, height(0.0), **given))(traj)
     fast = ph.simulate(BALL, ph.State([1.0, 0, 0, 0], [0.0, 1e7, 0]), [0.0, 10.0])
-    with pytest.raises(ValueError, match="looks at each body"):
+    with pytest.raises(ValueError, match="samples of each body"):
         ph.crossings(fast, height(0.0))
 
 
