@@ -215,3 +215,17 @@ def test_gradients_of_a_batch_through_switches():
     np.testing.assert_allclose(few, many, rtol=1e-12)
     one = jax.grad(end)(omega[3], 2**16)
     np.testing.assert_allclose(many[3], one, atol=1e-9)
+
+
+def test_a_torque_that_points_along_an_orbit():
+    """The frame's quaternion changes its sign, and with it the shorter way of ``ph.Pointing``; the
+    checks of a rotation matrix compare rounding errors. The body ends at rest in the frame."""
+    orbit = ph.KeplerOrbit(3.986004418e14, 6.871e6, inclination=np.deg2rad(97.4))
+    frame = ph.LVLH(orbit)
+    torque = ph.RelativeTorque(ph.Pointing(2e-4, 5e-3), frame)
+    scene = ph.Scene(ph.Inertia.from_moments([0.15, 0.185, 0.063]), None, torque)
+    state = ph.State(frame.attitude(0.0), [0.0, 0.01, 0.0])
+    last = ph.simulate(scene, state, [0.0, 6000.0], rtol=1e-7).last  # an orbit takes 5,668 s
+    wxyz, omega = frame.to_frame(last.wxyz, last.omega_body, 6000.0)
+    np.testing.assert_allclose(abs(wxyz[0]), 1, atol=1e-12)
+    np.testing.assert_allclose(omega, 0, atol=1e-9)

@@ -28,7 +28,7 @@ from polhode.rotation._conversions import (
     wxyz_to_rotation_vector,
 )
 from polhode.rotation._input import as_quaternions
-from polhode.rotation._scalar import length
+from polhode.rotation._scalar import largest, length
 
 
 class Sequence(enum.Enum):
@@ -174,7 +174,7 @@ def _quaternion(sequence: Sequence, first: Array, second: Array, third: Array) -
 def _phase(real: Array, imaginary: Array) -> tuple[Array, Array, Array]:
     """Modulus of a complex number, and the number scaled to size about 1 (1 for zero)."""
     pair = jnp.stack([real, imaginary], axis=-1)
-    scale = jax.lax.stop_gradient(jnp.max(jnp.abs(pair), axis=-1))
+    scale = jax.lax.stop_gradient(largest(pair)[..., 0])
     is_zero = scale == 0
     safe = jnp.where(is_zero, jnp.ones_like(scale), scale)
     scaled = jnp.where(is_zero, jnp.ones_like(real), real / safe)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polhode._checks import as_float_array, as_vectors as as_vectors, describe, is_concrete, require
+from polhode._kernels import smooth
 
 _UNIT = 1e-3
 """How far from unit length or orthogonality numbers may be that were rounded for printing."""
@@ -71,7 +72,7 @@ def as_matrices(value: Any) -> tuple[Array, Array]:
     return matrix, good
 
 
-@jax.jit
+@smooth  # a check of rounding errors: its comparisons are no kinks
 def _judged(matrix: Array) -> tuple[Array, Array]:
     """Which are rotations, and how far they are from it."""
     a, b, c = (matrix[..., i, :] for i in range(3))

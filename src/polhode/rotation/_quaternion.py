@@ -18,6 +18,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike
+from polhode._kernels import smooth
 from polhode.rotation._input import as_quaternions, as_vectors
 from polhode.rotation._scalar import length
 
@@ -110,12 +111,18 @@ def normalise(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
     return _normalised(as_quaternions(wxyz))
 
 
+@smooth
+def _largest_of(*parts: Array) -> Array:
+    """Largest absolute value: a scale, which cancels."""
+    return reduce(jnp.maximum, map(jnp.abs, parts))
+
+
 @jax.jit
 def _normalised(wxyz: Array) -> Array:
     # Written out: XLA's sums over a short axis take twice as long as all else here. The result
     # does not depend on the scale, so that its derivative may be left out.
     parts = [wxyz[..., i] for i in range(4)]
-    scale = jax.lax.stop_gradient(reduce(jnp.maximum, map(jnp.abs, parts)))
+    scale = jax.lax.stop_gradient(_largest_of(*parts))
     size = jnp.sqrt(sum((x / scale) ** 2 for x in parts))
     return wxyz / scale[..., None] / size[..., None]
 

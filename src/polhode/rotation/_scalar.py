@@ -12,6 +12,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike
+from polhode._kernels import smooth
+
+
+@smooth
+def largest(vector: Array) -> Array:
+    """Largest absolute component (..., 1): a scale that cancels in what is computed with it, so
+    that its changes from one component to another are no kinks."""
+    return jnp.max(jnp.abs(vector), axis=-1, keepdims=True)
 
 
 def _dot(left: Array, right: Array) -> Array:
@@ -24,7 +32,7 @@ def length(vector: Float[Array, "*b n"]) -> Float[Array, "*b"]:
 
     Its derivative at the zero vector, where none exists, is taken as zero.
     """
-    scale = jnp.max(jnp.abs(vector), axis=-1)
+    scale = largest(vector)[..., 0]
     safe = jnp.where(scale > 0, scale, jnp.ones_like(scale))
     scaled = vector / safe[..., None]
     return scale * jnp.sqrt(_dot(scaled, scaled))
@@ -33,7 +41,7 @@ def length(vector: Float[Array, "*b n"]) -> Float[Array, "*b"]:
 @jax.custom_jvp
 def direction(vector: Float[Array, "*b n"]) -> Float[Array, "*b n"]:
     """Unit vector along ``vector``; the last axis (0, ..., 0, 1) for the zero vector."""
-    scale = jnp.max(jnp.abs(vector), axis=-1, keepdims=True)
+    scale = largest(vector)
     is_zero = scale == 0
     last = jnp.zeros_like(vector).at[..., -1].set(1)
     scaled = jnp.where(is_zero, last, vector / jnp.where(is_zero, jnp.ones_like(scale), scale))
