@@ -46,8 +46,8 @@ from polhode.fit import (
     residuals,
     stack,
 )
-from polhode.fit._parameters import base_of, free_columns
-from polhode.fit._start import regression
+from polhode.fit._model import base_of, free_columns
+from polhode.fit._solve import regression
 
 jax.config.update("jax_enable_x64", True)
 RATE = 6.0

@@ -8,8 +8,7 @@ from jaxtyping import Array, Float
 from benchmarks.throws.instrument import Instrument
 from benchmarks.throws.likelihood import Noise, Readings, innovations, score_of
 from polhode._checks import ArrayLike, as_float_array
-from polhode.fit._motion import SteppedMotion
-from polhode.fit._parameters import entries_of, whole_of
+from polhode.fit._model import SteppedMotion, entries_of, whole_of
 
 # spin that drag may take in a second, as a part of the whole, of which the throw tells the rest
 _LOST = 0.3

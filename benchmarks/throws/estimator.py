@@ -14,30 +14,22 @@ from benchmarks.throws.likelihood import Noise, readings_of
 from benchmarks.throws.scoring import Known, solve_balance, start_of
 from polhode._checks import is_concrete, require
 from polhode._scene import State
-from polhode.fit._compiled import compiled
-from polhode.fit._matrices import eigh
-from polhode.fit._motion import Drag, SteppedMotion
-from polhode.fit._parameters import (
+from polhode.fit._conclude import combine_flags, symmetric_std, turn_std, whiteness_of
+from polhode.fit._model import (
     Base,
+    Drag,
     FullTensor,
     Parameters,
+    SteppedMotion,
     base_of,
     entries_of,
     free_columns,
     whole_of,
 )
-from polhode.fit._recording import Recording, needed, stack
+from polhode.fit._numerics import compiled, eigh
+from polhode.fit._recording import Recording, require_channel, stack
 from polhode.fit._residuals import Model
-from polhode.fit._result import (
-    Finding,
-    Fit,
-    InertiaEstimate,
-    checked_fit,
-    flagged,
-    symmetric_std,
-    turn_std,
-    whiteness_of,
-)
+from polhode.fit._result import Finding, Fit, InertiaEstimate, checked_fit
 from polhode.inertia import Inertia, principal, second_moments
 
 
@@ -115,7 +107,7 @@ def fit_balance(
     require(is_concrete(given.times), "fit_balance takes arrays, not traced values.")
     present = np.asarray(given.present) > 0
     if wheel:
-        present = present & (np.asarray(needed("wheel_known", given.wheel_known)) > 0)
+        present = present & (np.asarray(require_channel("wheel_known", given.wheel_known)) > 0)
     require(
         present.sum(axis=1) >= 8,
         "each recording needs at least 8 samples with rates and wheel, got "
@@ -235,7 +227,7 @@ def _concluded(found, recording: Recording, places: Array, used: Array) -> _Esti
         noise, rms = (jnp.sqrt(jnp.sum(x**2) / samples) for x in (rest, rest * spread))
         whiteness, trace = whiteness_of(rest, read), jnp.trace(tensor)
         finite = jnp.all(jnp.isfinite(tensor)) & jnp.all(jnp.isfinite(covariance))
-        diagnostics = flagged(
+        diagnostics = combine_flags(
             {
                 Finding.STEP_LIMIT: ~found.converged,
                 Finding.NOT_FINITE: ~finite,
@@ -279,7 +271,7 @@ def _concluded(found, recording: Recording, places: Array, used: Array) -> _Esti
     # those that all bodies share as well
     shared = (jnp.broadcast_to(x, used.shape[:1]) for x in found.noise[5:])
     levels = Noise(*found.noise[:5], *shared)
-    first = found.instrument.rates(needed("omega", recording.omega)[:, 0])
+    first = found.instrument.rates(require_channel("omega", recording.omega)[:, 0])
     return jax.vmap(one)(
         found.tensors,
         found.drag,

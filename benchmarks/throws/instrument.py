@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode._checks import as_float_array, require_positive
-from polhode.fit._matrices import solve
-from polhode.fit._recording import Recording, needed
-from polhode.fit._start import central_slope, integrate
+from polhode.fit._numerics import solve
+from polhode.fit._recording import Recording, central_slope, require_channel
+from polhode.fit._solve import integrate
 from polhode.rotation import wxyz_to_matrix
 
 
@@ -100,7 +100,10 @@ def lever_arm(recording: Recording) -> Float[Array, "*b 3"]:
         return solve(square, jnp.einsum("tij,ti->j", design, force))[:3]
 
     batch = recording.batch_shape
-    omega, force = needed("omega", recording.omega), needed("force", recording.force)
+    omega, force = (
+        require_channel("omega", recording.omega),
+        require_channel("force", recording.force),
+    )
     parts = (recording.times, recording.present, omega, force)
     flat = [part.reshape(-1, *part.shape[len(batch) :]) for part in parts]
     return jax.vmap(one)(*flat).reshape(*batch, 3)

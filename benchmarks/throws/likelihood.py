@@ -15,8 +15,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from benchmarks.throws.instrument import Instrument
-from polhode.fit._recording import Recording, bridged, needed
-from polhode.fit._start import central_slope, integrate
+from polhode.fit._recording import Recording, central_slope, interpolate_gaps, require_channel
+from polhode.fit._solve import integrate
 from polhode.rotation import wxyz_to_matrix
 
 
@@ -61,12 +61,12 @@ class Readings(NamedTuple):
 def readings_of(recording: Recording, body: Array, block: int) -> Readings:
     """Prepare recordings (leading axis r) of the bodies with numbers ``body`` (r,)."""
     times = recording.times
-    omega = bridged(times, recording.present, recording.omega)
+    omega = interpolate_gaps(times, recording.present, recording.omega)
     still = recording.wheel is None
     wheel = jnp.zeros_like(times) if still else recording.wheel
     sample = recording.present
     if not still:
-        sample = sample * needed("wheel_known", recording.wheel_known)
+        sample = sample * require_channel("wheel_known", recording.wheel_known)
     count = (times.shape[1] - 1) // block
 
     def blocks(values):

@@ -15,16 +15,9 @@ from jaxtyping import Array, Float
 
 from benchmarks.throws.instrument import Instrument, Tolerance
 from benchmarks.throws.likelihood import Noise, Readings, Score, innovations, score_of
-from polhode.fit._matrices import inverse, solve
-from polhode.fit._parameters import (
-    SCALE,
-    FullTensor,
-    base_of,
-    entries_of,
-    free_columns,
-    tensor_of,
-)
-from polhode.fit._start import regression
+from polhode.fit._model import SCALE, FullTensor, base_of, entries_of, free_columns, tensor_of
+from polhode.fit._numerics import inverse, solve
+from polhode.fit._solve import regression
 
 # directions of symmetric traceless matrices, orthonormal
 _SKEW = np.zeros((5, 3, 3))
@@ -121,7 +114,7 @@ class Fitted(eqx.Module):
     converged: Array
 
 
-def _expected(sized: bool) -> np.ndarray:
+def _expected_square_sum(sized: bool) -> np.ndarray:
     """Precisions of the unknowns of a recording, those of the tensor not expected at all."""
     # a size that nothing depends on stays where it is
     shape = [np.inf] * (_TENSOR - 1) + [np.inf if sized else 1.0]
@@ -144,7 +137,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         ],
         axis=1,
     )
-    expected = _expected(known.instrument.spin_inertia is not None)
+    expected = _expected_square_sum(known.instrument.spin_inertia is not None)
     precision = jnp.asarray(
         np.concatenate([np.tile(expected[:own], count), expected[own:used]]), dtype
     )

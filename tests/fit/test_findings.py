@@ -8,8 +8,8 @@ import pytest
 
 import polhode as ph
 from polhode.fit import Finding, Recording, fit_inertia, stack
-from polhode.fit._gyroscope import saturation
-from polhode.fit._result import has_outliers
+from polhode.fit._conclude import has_outliers
+from polhode.fit._options import saturation
 
 T = np.linspace(0, 20, 500)
 RATES = np.stack([3 * np.sin(T), 2 * np.cos(1.3 * T), 1 + 0.5 * np.sin(2 * T)], -1)

@@ -36,8 +36,8 @@ from polhode.fit import (
     stack,
     windows,
 )
-from polhode.fit._parameters import base_of, free_columns
-from polhode.fit._result import _axes_disagree
+from polhode.fit._conclude import _axes_disagree
+from polhode.fit._model import base_of, free_columns
 from polhode.rotation import wxyz_to_matrix
 
 TENSOR = np.array([[2.0, 0.1, 0.2], [0.1, 2.5, -0.3], [0.2, -0.3, 3.2]])

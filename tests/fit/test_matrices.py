@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-import polhode.fit._matrices as matrices
+import polhode.fit._numerics as matrices
 from polhode.fit import (
     FitOptions,
     FreeMotion,
@@ -47,7 +47,7 @@ def recordings(count):
     return stack([Recording.of(times, k + rates, wheel_speed=100 * times) for k in range(count)])
 
 
-@pytest.mark.parametrize("fit", ["each", pytest.param("together", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("fit", ["fit_each", pytest.param("fit_together", marks=pytest.mark.slow)])
 def test_the_fits_hand_over_no_batch(affected, fit):
     options = FitOptions(FreeMotion(), FullTensor())
     batch, calls = largest_batch(getattr(_fit, fit).__wrapped__, recordings(6), options)

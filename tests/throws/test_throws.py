@@ -20,7 +20,7 @@ from benchmarks.throws import (
     lever_arm,
 )
 from polhode.fit import Recording, averaged, stack
-from polhode.fit._result import whiteness_of
+from polhode.fit._conclude import whiteness_of
 
 SPIN = 1.7e-6
 TENSORS = 1e-6 * np.array(

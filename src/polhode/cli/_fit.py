@@ -207,7 +207,7 @@ def _fit(asked: _Asked, goals: list[Path], *, quiet: bool, no_cache: bool, allow
 
 
 def _read(asked: _Asked) -> Any:
-    from polhode.fit._csv import load_recording
+    from polhode.fit._recording import load_recording
 
     try:
         with refused(asked.path, ".csv", _EXPECTED):
@@ -287,7 +287,7 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
 
     import polhode
     from polhode.files._atomic import whole_file
-    from polhode.fit._result import other_hand
+    from polhode.fit._result import mirror_moments
     from polhode.rotation import wxyz_to_matrix
 
     def plain(value: Any) -> Any:
@@ -325,7 +325,7 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
             plain(result.sensor_std["gain"]) if "gain" in result.sensor else None
         ),
         "observability": [row._asdict() for row in result.observability()],
-        "mirrored_ratios": plain(np.sort(other_hand(np.asarray(result.moments)))),
+        "mirrored_ratios": plain(np.sort(mirror_moments(np.asarray(result.moments)))),
         "rms_rad_per_s": plain(result.rms),
         "residual_over_noise": plain(result.noise),
         "whiteness": plain(result.whiteness),

@@ -1,19 +1,28 @@
-"""``fit_inertia``: the inertia of bodies from recordings of their motion."""
+"""``fit_inertia``, ``fit_recordings`` and ``fit_scene``: fits of bodies and scenes."""
 
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
 
-from polhode._batch import map_chunks
-from polhode._checks import ArrayLike, require
-from polhode.fit._compiled import compiled
-from polhode.fit._gyroscope import Gyroscope, calibrated
-from polhode.fit._options import FitOptions, check_usable, checked_options
+from polhode._batch import PARTS, batch_shapes, map_chunks
+from polhode._checks import ArrayLike, as_float_array, require, require_positive
+from polhode._method import AbstractMethod
+from polhode._scene import Scene
+from polhode._scene._scene import places_of
+from polhode.fit._conclude import conclude, conclude_scene
+from polhode.fit._model import LeafMotion, NoInertia
+from polhode.fit._numerics import compiled
+from polhode.fit._options import FitOptions, Gyroscope, calibrate, check_usable, checked_options
 from polhode.fit._recording import Recording, stack
-from polhode.fit._result import Fit, checked_fit, conclude
-from polhode.fit._solve import solve
+from polhode.fit._result import Fit, checked_fit
+from polhode.fit._solve import solve_fit
+
+# ``fit_inertia``: the inertia of bodies from recordings of their motion.
 
 # Samples that a processor core works on together.
 _LANES = 1024
@@ -68,18 +77,18 @@ def fit_inertia(
         times, omega_body, wxyz=wxyz, force_body=force_body, wheel_speed=wheel_speed, **noise
     )
     check_usable(options, recording)
-    return checked_fit(each(recording, options), throw)
+    return checked_fit(fit_each(recording, options), throw)
 
 
 def _with_noise(options: FitOptions, channels: dict[str, tuple]) -> FitOptions:
     """The options with ``trust_noise`` as the noise of ``fit_inertia`` implies it."""
-    given = [name for name, (noise, _, _) in channels.items() if noise is not None]
+    stated = [name for name, (noise, _, _) in channels.items() if noise is not None]
     if options.gyroscope is not None and options.gyroscope.noise_density > 0:
         require(
-            "omega_noise" not in given,
+            "omega_noise" not in stated,
             "omega_noise and noise_density of the gyroscope state the same noise: give one.",
         )
-        given.append("omega_noise")
+        stated.append("omega_noise")
         channels = channels | {"omega_noise": (1.0, *channels["omega_noise"][1:])}
     for name, (noise, data_name, data) in channels.items():
         require(
@@ -88,20 +97,20 @@ def _with_noise(options: FitOptions, channels: dict[str, tuple]) -> FitOptions:
         )
     for name, (noise, _, data) in channels.items():
         require(
-            noise is not None or data is None or not given,
-            f"{', '.join(given)} without {name}: the noise must be given of everything that was"
+            noise is not None or data is None or not stated,
+            f"{', '.join(stated)} without {name}: the noise must be given of everything that was"
             " recorded, or of nothing.",
         )
     require(
-        given or not options.trust_noise,
+        stated or not options.trust_noise,
         "trust_noise=True needs the noise: give omega_noise (rad/s).",
     )
     require(
-        given or options.robust is None,
+        stated or options.robust is None,
         "robust counts residuals in standard deviations of the noise: give omega_noise (rad/s).",
     )
     if options.trust_noise is None:
-        return dataclasses.replace(options, trust_noise=bool(given))
+        return dataclasses.replace(options, trust_noise=bool(stated))
     return options
 
 
@@ -136,7 +145,7 @@ def fit_recordings(
     stacked = stack(recordings)
     _check_wheel(stacked.wheel is not None, options)
     check_usable(options, stacked)
-    return checked_fit(together(stacked, options), throw)
+    return checked_fit(fit_together(stacked, options), throw)
 
 
 def windows(recording: Recording, length: int) -> list[Recording]:
@@ -149,33 +158,33 @@ def windows(recording: Recording, length: int) -> list[Recording]:
 
 
 @compiled
-def together(recording: Recording, options: FitOptions, conclude: Callable = conclude) -> Any:
+def fit_together(recording: Recording, options: FitOptions, conclude: Callable = conclude) -> Any:
     """One body from its recordings (leading axis); ``conclude`` makes the result."""
-    return _fitted(recording, options, conclude)
+    return _fit_one(recording, options, conclude)
 
 
 @compiled
-def each(recording: Recording, options: FitOptions, conclude: Callable = conclude) -> Any:
+def fit_each(recording: Recording, options: FitOptions, conclude: Callable = conclude) -> Any:
     """Fits of all bodies (leading axes), one recording each, in one compiled call."""
     batch = recording.batch_shape
     if not batch:
-        return together(jax.tree.map(lambda leaf: leaf[None], recording), options, conclude)
+        return fit_together(jax.tree.map(lambda leaf: leaf[None], recording), options, conclude)
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, 1, *leaf.shape[len(batch) :]), recording)
-    found = _batch(flat, options, conclude)
-    return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), found)
+    fits = _fit_batch(flat, options, conclude)
+    return jax.tree.map(lambda leaf: leaf.reshape(*batch, *leaf.shape[1:]), fits)
 
 
-def _fitted(recording: Recording, options: FitOptions, conclude: Callable) -> Any:
+def _fit_one(recording: Recording, options: FitOptions, conclude: Callable) -> Any:
     """One body, its readings turned into rates by the sensor model."""
-    recording = calibrated(recording, options.gyroscope or Gyroscope())
-    return conclude(solve(recording, options), recording, options)
+    recording = calibrate(recording, options.gyroscope or Gyroscope())
+    return conclude(solve_fit(recording, options), recording, options)
 
 
-def _batch(recording: Recording, options: FitOptions, conclude: Callable) -> Any:
+def _fit_batch(recording: Recording, options: FitOptions, conclude: Callable) -> Any:
     """Fits of bodies on one leading axis."""
 
     def fit(one):
-        return _fitted(one, options, conclude)
+        return _fit_one(one, options, conclude)
 
     # A processor core fills its vector units with the samples of a few bodies; more at a time would
     # only wait for the slowest of them.
@@ -185,3 +194,172 @@ def _batch(recording: Recording, options: FitOptions, conclude: Callable) -> Any
     if at_once == 1 < rounds:
         return jax.lax.map(fit, recording)
     return map_chunks(jax.vmap(fit), recording, count, -(-count // rounds))
+
+
+# ``fit_scene``: any arrays of a scene from recordings of its motion.
+
+
+def fit_scene(
+    scene: Scene,
+    data: Recording | Sequence[Recording],
+    free: Callable[[Any], Any],
+    *,
+    bounds: Sequence[tuple[ArrayLike | None, ArrayLike | None] | None] | None = None,
+    prior_std: Sequence[ArrayLike | None] | None = None,
+    attitude: ArrayLike | None = None,
+    method: AbstractMethod | None = None,
+    rtol: float | None = None,
+    options: FitOptions | None = None,
+    throw: bool = True,
+) -> Fit:
+    """Numbers of a scene, with standard deviations, from recordings of its motion.
+
+    **Arguments:**
+
+    - ``scene``: with starting values, one body.
+    - ``data``: a ``ph.fit.Recording``, whose leading axes are bodies that are fitted one by one; or
+      a list of recordings of the same body.
+    - ``free``: function of the scene that returns the array or the list of arrays to fit (of a
+      part: all its arrays). The initial rates of each recording, and its initial attitude where
+      attitudes were recorded, are always fitted too.
+    - ``bounds``: for each array of ``free`` a pair of its lower and upper bound, numbers or arrays
+      of its shape, None where there is none; None in place of a pair: no bounds. The starting
+      values must lie between them. ``[(0.0, None)]`` keeps a coefficient positive.
+    - ``prior_std``: for each array of ``free`` the standard deviation of a normal prior about its
+      starting value, a number or an array of its shape, or None.
+    - ``attitude`` (4,): initial attitude ``wxyz``, for recordings without attitudes; None: the
+      body axes are those of space at the first time.
+    - ``method``, ``rtol``: as in ``ph.simulate``.
+    - ``options``: ``FitOptions`` of which ``robust``, ``bias``, ``trust_noise``, ``max_starts``
+      (2 at most: all data, then growing parts of them), ``solver`` and ``max_steps`` apply.
+    - ``throw``: whether a fit that is not finite or stopped early raises FitError.
+
+    Returns a ``Fit``: ``values`` and ``std`` in the order of ``free``, ``scene`` with the values.
+    Numbers without bounds are not constrained: a coefficient may become negative. For an unknown
+    inertia use ``fit_inertia``, which needs no starting point and keeps it physical.
+
+        ts = jnp.linspace(0.0, 20.0, 200)
+        scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 2.5]), torque=ph.LinearDamping(0.1))
+        data = ph.fit.Recording.of(ts, rates, omega_noise=0.01)
+        options = ph.fit.FitOptions(trust_noise=True)
+        fit = ph.fit_scene(scene, data, free=lambda s: [s.torque.c], options=options)
+        print(fit.report())                              # fit.values[0], fit.std[0]: (3,)
+
+    Raises TypeError or ValueError for bad input and for options that do not apply, and FitError.
+    """
+    _check_single(scene)
+    options = checked_options(options)
+    for name in ("motion", "unknown", "initial_inertia"):
+        require(
+            getattr(options, name) is None,
+            f"fit_scene has no use for the option {name}: the scene is the model, and free selects"
+            " what is unknown.",
+        )
+    require(
+        not options.mounting,
+        "fit_scene does not fit a mounting: rotate the rates into the axes of the scene, or use"
+        " fit_inertia with motion=SceneMotion(...).",
+    )
+    recordings = [data] if isinstance(data, Recording) else data
+    if not (
+        isinstance(recordings, list | tuple)
+        and recordings
+        and all(isinstance(one, Recording) for one in recordings)
+    ):
+        raise TypeError(
+            "data must be a ph.fit.Recording (ph.fit.Recording.of(times, omega_body, ...)) or a"
+            f" list of them, got {type(data).__name__}."
+        )
+    for one in recordings:
+        require(
+            one.wheel is None,
+            "fit_scene does not read wheel_speed: describe the wheel by rotors of the scene"
+            " (ph.Rotor), and leave wheel_speed out of the recording.",
+        )
+        require(
+            one.force is None,
+            "fit_scene does not model accelerometer readings: leave force_body out.",
+        )
+        require(
+            attitude is None or one.wxyz is None,
+            "attitude is for recordings without attitudes; these have wxyz, whose first one is"
+            " fitted.",
+        )
+    check_usable(options, recordings[0])
+    places = places_of(scene, free)
+    starts = [jax.tree.leaves(scene)[i] for i in places]
+    motion = LeafMotion(
+        scene,
+        places,
+        _start(attitude, scene),
+        method,
+        rtol,
+        None if bounds is None else _bounds(bounds, starts),
+        None if prior_std is None else _widths(prior_std, starts),
+    )
+    options = dataclasses.replace(options, motion=motion, unknown=NoInertia())
+    if isinstance(data, Recording):
+        return checked_fit(fit_each(data, options, conclude_scene), throw)
+    return checked_fit(fit_together(stack(recordings), options, conclude_scene), throw)
+
+
+def _bounds(bounds: Sequence, starts: Sequence[Array]) -> tuple[tuple[Array, Array] | None, ...]:
+    _check_count("bounds", bounds, starts)
+    pairs = []
+    for k, (pair, start) in enumerate(zip(bounds, starts, strict=True)):
+        if pair is None:
+            pairs.append(None)
+            continue
+        if not (isinstance(pair, tuple | list) and len(pair) == 2):
+            raise TypeError(f"bounds[{k}] must be a pair (lower, upper) or None, got {pair!r}.")
+        ends = [
+            jnp.full(start.shape, sign * jnp.inf, start.dtype)
+            if end is None
+            else jnp.broadcast_to(jnp.asarray(end, start.dtype), start.shape)
+            for end, sign in zip(pair, (-1, 1), strict=True)
+        ]
+        inside = (ends[0] < start) & (start < ends[1])
+        require(
+            np.asarray(inside),
+            f"the starting values of array {k} must lie between their bounds, got"
+            f" {np.asarray(start)} for {pair}.",
+        )
+        pairs.append((ends[0], ends[1]))
+    return tuple(pairs)
+
+
+def _widths(prior_std: Sequence, starts: Sequence[Array]) -> tuple[Array | None, ...]:
+    _check_count("prior_std", prior_std, starts)
+    arrays = []
+    for k, (std, start) in enumerate(zip(prior_std, starts, strict=True)):
+        if std is None:
+            arrays.append(None)
+            continue
+        require_positive(f"prior_std[{k}]", std, hint="None stands for no prior")
+        arrays.append(jnp.broadcast_to(jnp.asarray(std, start.dtype), start.shape))
+    return tuple(arrays)
+
+
+def _check_count(name: str, values: Sequence, starts: Sequence[Array]) -> None:
+    require(
+        isinstance(values, list | tuple) and len(values) == len(starts),
+        f"{name} must be a list with one entry for each of the {len(starts)} arrays of free.",
+    )
+
+
+def _start(attitude: ArrayLike | None, scene: Scene) -> Array | None:
+    if attitude is None:
+        return None
+    return as_float_array("attitude", attitude, (4,)).astype(scene.inertia.dtype)
+
+
+def _check_single(scene: Any) -> None:
+    """TypeError or ValueError for what is not the scene of one body."""
+    if not isinstance(scene, Scene):
+        raise TypeError(f"scene must be a ph.Scene, got {type(scene).__name__}.")
+    shapes = [shape for name in PARTS for shape in batch_shapes(getattr(scene, name))]
+    if any(shapes):
+        raise ValueError(
+            f"the scene of a fit is that of one body, got parts with the batch axes {max(shapes)}:"
+            " give one body's numbers as the start; a batch is in the recording."
+        )

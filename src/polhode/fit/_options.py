@@ -1,15 +1,261 @@
-"""Options of a fit, and which of them a function can use."""
+"""``FitOptions``, and the sensor model and loss function that they contain."""
+
+import dataclasses
+import math
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
 import optimistix as optx
+from jaxtyping import Array, Float
 
-from polhode._checks import require
-from polhode.fit._gyroscope import Gyroscope
-from polhode.fit._motion import AbstractMotion, SteppedMotion
-from polhode.fit._parameters import AbstractInertiaUnknown
-from polhode.fit._recording import Recording
-from polhode.fit._residuals import Huber
+from polhode._checks import ArrayLike, as_float_array, require
+from polhode.fit._model import AbstractInertiaUnknown, AbstractMotion, SteppedMotion
+from polhode.fit._numerics import inverse
+from polhode.fit._recording import Recording, central_slope, interpolate_gaps
 from polhode.inertia import Inertia
+
+# ``Gyroscope``: one sensor model for simulated readings and for fits.
+
+# Number of pieces of a recording in which the walk of the bias is linear.
+WALK_KNOTS = 16
+# A bound that readings reach: relative tolerance.
+_AT_LIMIT = 1e-9
+
+
+class Gyroscope(eqx.Module):
+    """Sensor model of a gyroscope: ``reading(t) = gain omega(t - delay) + bias + walk + noise``.
+
+    **Fields:**
+
+    - ``gain`` (3, 3): identity plus scale-factor errors (diagonal) and misalignments [rad] (the
+      other entries), as calibrated; None: the identity.
+    - ``bias`` (3,) [rad/s], as calibrated; None: zero.
+    - ``noise_density`` [rad/s/sqrt(Hz)]: white noise (angle random walk): a sample has the standard
+      deviation ``noise_density / sqrt(step)``.
+    - ``bias_walk`` [rad/s/sqrt(s)]: random walk of the bias (rate random walk).
+    - ``max_rate`` [rad/s]: readings saturate at plus and minus this rate; None: no limit is known.
+    - ``delay`` [s] of the readings behind their time stamps, beside attitudes or a wheel.
+    - ``jitter`` [s]: standard deviation of independent errors of the time stamps.
+    - ``scale_std``, ``misalignment_std`` [rad], ``bias_std`` [rad/s], ``delay_std`` [s]: standard
+      deviations of the calibration. A fit estimates what is not zero with a normal prior of that
+      width. The defaults are 1 % for ``scale_std`` and ``misalignment_std``, as data sheets of MEMS
+      gyroscopes state, and zero for the others. Misalignments include rotations of the sensor.
+
+    The terms are those of IEEE Std 952-1997, annex C. ``read`` simulates readings;
+    ``FitOptions(gyroscope=...)`` uses the model in a fit.
+
+    Raises ValueError for numbers that are negative or not finite, and a singular ``gain``.
+    """
+
+    gain: Float[Array, "3 3"] | None = None
+    bias: Float[Array, " 3"] | None = None
+    noise_density: float = eqx.field(static=True, default=0.0)
+    bias_walk: float = eqx.field(static=True, default=0.0)
+    max_rate: float | None = eqx.field(static=True, default=None)
+    delay: float = eqx.field(static=True, default=0.0)
+    jitter: float = eqx.field(static=True, default=0.0)
+    scale_std: float = eqx.field(static=True, default=0.01)
+    misalignment_std: float = eqx.field(static=True, default=0.01)
+    bias_std: float = eqx.field(static=True, default=0.0)
+    delay_std: float = eqx.field(static=True, default=0.0)
+
+    def __init__(
+        self,
+        gain: ArrayLike | None = None,
+        bias: ArrayLike | None = None,
+        *,
+        noise_density: float = 0.0,
+        bias_walk: float = 0.0,
+        max_rate: float | None = None,
+        delay: float = 0.0,
+        jitter: float = 0.0,
+        scale_std: float = 0.01,
+        misalignment_std: float = 0.01,
+        bias_std: float = 0.0,
+        delay_std: float = 0.0,
+    ):
+        self.gain = None if gain is None else as_float_array("gain", gain, (3, 3))
+        self.bias = None if bias is None else as_float_array("bias", bias, (3,))
+        self.noise_density = _check_not_negative("noise_density", noise_density)
+        self.bias_walk = _check_not_negative("bias_walk", bias_walk)
+        self.max_rate = None if max_rate is None else _check_not_negative("max_rate", max_rate)
+        require(self.max_rate != 0, "max_rate of Gyroscope must be positive; None: no limit.")
+        require(
+            math.isfinite(delay), f"delay of Gyroscope must be a finite number of s, got {delay}."
+        )
+        self.delay = float(delay)
+        self.jitter = _check_not_negative("jitter", jitter)
+        self.scale_std = _check_not_negative("scale_std", scale_std)
+        self.misalignment_std = _check_not_negative("misalignment_std", misalignment_std)
+        self.bias_std = _check_not_negative("bias_std", bias_std)
+        self.delay_std = _check_not_negative("delay_std", delay_std)
+
+    @classmethod
+    def ideal(cls) -> "Gyroscope":
+        """A gyroscope whose scale factors and axes are exactly known."""
+        return cls(scale_std=0.0, misalignment_std=0.0)
+
+    def read(self, key: Array, times: ArrayLike, omega_body: ArrayLike) -> Float[Array, "*b t 3"]:
+        """Simulated readings (..., T, 3) [rad/s] of the rates ``omega_body`` (..., T, 3) [rad/s].
+
+        ``key``: of ``jax.random``; ``times`` (T,) [s], increasing. Between the samples the rates
+        are interpolated by cubics; with ``noise_density`` the noise of a sample is that of the
+        mean over the step before it.
+        """
+        times, omega = as_float_array("times", times, (None,)), jnp.asarray(omega_body)
+        require(times.ndim == 1, f"times must have one axis, got the shape {times.shape}.")
+        count = times.shape[0]
+        require(
+            omega.ndim >= 2 and omega.shape[-2:] == (count, 3),
+            f"omega_body must have the shape (..., {count}, 3), got {omega.shape}.",
+        )
+        omega = omega.astype(jnp.result_type(float))
+        times = jnp.asarray(times, omega.dtype)
+        step = jnp.diff(times)
+        step = jnp.broadcast_to(jnp.concatenate([step[:1], step])[:, None], omega.shape)
+        shaken, white, walking = jax.random.split(key, 3)
+        if self.delay or self.jitter:
+            errors = self.jitter * jax.random.normal(shaken, omega.shape[:-1], omega.dtype)
+            omega = _at(omega, times, jnp.broadcast_to(times, errors.shape) - self.delay + errors)
+        if self.gain is not None:
+            omega = jnp.einsum("ij,...j->...i", self.gain.astype(omega.dtype), omega)
+        if self.bias is not None:
+            omega = omega + jnp.broadcast_to(self.bias.astype(omega.dtype), omega.shape)
+        if self.bias_walk:
+            steps = jax.random.normal(walking, omega.shape, omega.dtype) * step**0.5
+            walk = jnp.cumsum(steps.at[..., 0, :].set(0), axis=-2)
+            omega = omega + self.bias_walk * walk
+        if self.noise_density:
+            noise = jax.random.normal(white, omega.shape, omega.dtype)
+            omega = omega + self.noise_density * noise / step**0.5
+        if self.max_rate is not None:
+            omega = jnp.clip(omega, -self.max_rate, self.max_rate)
+        return omega
+
+    @property
+    def gain_std(self) -> np.ndarray:
+        """Standard deviations (3, 3) of the entries of ``gain``."""
+        unit = np.eye(3)
+        return self.scale_std * unit + self.misalignment_std * (1 - unit)
+
+
+def _check_not_negative(name: str, value: float) -> float:
+    number = float(value)
+    require(
+        math.isfinite(number) and number >= 0,
+        f"{name} of Gyroscope must be a finite number that is not negative, got {value}.",
+    )
+    return number
+
+
+def _at(
+    omega: Float[Array, "*b t 3"], times: Float[Array, " t"], new: Float[Array, "*b t"]
+) -> Float[Array, "*b t 3"]:
+    """Rates at other times, by cubic Hermite interpolation; beyond the ends by the last cubic."""
+
+    def one(omega, new):
+        slope = central_slope(omega, times)
+        k = jnp.clip(jnp.searchsorted(times, new, side="right") - 1, 0, times.shape[0] - 2)
+        width = (times[k + 1] - times[k])[:, None]
+        s = (new - times[k])[:, None] / width
+        late = s * s * (3 - 2 * s)
+        first, last = s * (1 - s) ** 2, s * s * (s - 1)
+        return (
+            (1 - late) * omega[k]
+            + late * omega[k + 1]
+            + width * (first * slope[k] + last * slope[k + 1])
+        )
+
+    flat = [omega.reshape(-1, *omega.shape[-2:]), new.reshape(-1, new.shape[-1])]
+    return jax.vmap(one)(*flat).reshape(omega.shape)
+
+
+def calibrate(recording: Recording, gyroscope: Gyroscope) -> Recording:
+    """The recording in rates instead of readings, with the noise that the sensor model implies.
+
+    Readings at the limit are marked in ``Recording.saturated``: a fit takes them as bounds.
+    Works on recordings with any leading axes, under jit and vmap.
+    """
+    if recording.omega is None:
+        return recording
+    omega, noise, dtype = recording.omega, recording.omega_noise, recording.omega.dtype
+    limits = recording.saturated
+    if limits is None:
+        limits = saturation(recording, gyroscope.max_rate)
+    if gyroscope.bias is not None:
+        omega = omega - jnp.broadcast_to(gyroscope.bias.astype(dtype), omega.shape)
+    if gyroscope.gain is not None:
+        back = inverse(gyroscope.gain).astype(dtype)
+        omega = jnp.einsum("ij,...j->...i", back, omega)
+    if gyroscope.noise_density:
+        step = jnp.median(jnp.diff(recording.times, axis=-1), axis=-1)[..., None, None]
+        noise = jnp.broadcast_to(gyroscope.noise_density / step**0.5, omega.shape)
+    if gyroscope.jitter and noise is not None:
+        flat = [
+            x.reshape(-1, *x.shape[len(recording.batch_shape) :])
+            for x in (interpolate_gaps(recording.times, recording.present, omega), recording.times)
+        ]
+        slope = jax.vmap(central_slope)(*flat).reshape(omega.shape)
+        noise = jnp.sqrt(noise**2 + (gyroscope.jitter * slope) ** 2)
+    return dataclasses.replace(recording, omega=omega, omega_noise=noise, saturated=limits)
+
+
+def saturation(recording: Recording, max_rate: float | None = None) -> Float[Array, "*b t 3"]:
+    """1 for readings at an upper limit of their axis, -1 at a lower one, else 0.
+
+    With ``max_rate`` those are the readings of that size. Without it an axis counts as saturated
+    if at least four samples and 1 % of all are equal to its extreme value, and five times as many
+    as to the next value: a coarse digitisation repeats both.
+    """
+    omega = recording.omega
+    if omega is None:
+        return jnp.zeros((*recording.times.shape, 3), recording.times.dtype)
+    present = recording.present[..., None] > 0
+    dtype = omega.dtype
+    if max_rate is not None:
+        beyond = (jnp.abs(omega) >= max_rate * (1 - _AT_LIMIT)) & present
+        return jnp.sign(omega) * beyond.astype(dtype)
+    samples = jnp.sum(present.astype(dtype), axis=-2)
+    size = jnp.max(jnp.where(present, jnp.abs(omega), 0), axis=(-2, -1))[..., None]
+
+    def upper(values):
+        values = jnp.where(present, values, -jnp.inf)
+        greatest = jnp.max(values, axis=-2, keepdims=True)
+        equal = values == greatest
+        below = jnp.where(equal, -jnp.inf, values)
+        second = jnp.max(below, axis=-2, keepdims=True)
+        many = jnp.sum(equal.astype(dtype), axis=-2)
+        others = jnp.sum(((below == second) & jnp.isfinite(below)).astype(dtype), axis=-2)
+        enough = (many >= 4) & (many >= 0.01 * samples)
+        # of a constant rate there are no others, or rounding errors only
+        least = jnp.min(jnp.where(present, values, jnp.inf), axis=-2)
+        varies = jnp.isfinite(second[..., 0, :]) & (greatest[..., 0, :] - least > 1e-6 * size)
+        clipped = enough & (many >= 5 * others) & varies
+        return (equal & present & clipped[..., None, :]).astype(dtype)
+
+    return upper(omega) - upper(-omega)
+
+
+class Huber(eqx.Module):
+    """Robust loss: residuals beyond ``threshold`` standard deviations count linearly."""
+
+    threshold: float = 3.0
+
+    def __check_init__(self) -> None:
+        if not self.threshold > 0:
+            raise ValueError(f"the threshold of Huber must be positive, got {self.threshold}.")
+
+    def __call__(self, residual: Array) -> Array:
+        size = jnp.abs(residual)
+        inside = size <= self.threshold
+        far = jnp.where(inside, self.threshold, size)
+        outside = jnp.sqrt(2 * self.threshold * far - self.threshold**2)
+        return jnp.where(inside, residual, jnp.sign(residual) * outside)
+
+
+# Options of a fit, and checks of which of them a function supports.
 
 
 class FitOptions(eqx.Module):

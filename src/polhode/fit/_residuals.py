@@ -1,5 +1,6 @@
-"""Data minus model in units of the noise: the function that every optimiser needs."""
+"""Residuals of a fit in units of the noise, and their Jacobian by blocks."""
 
+import dataclasses
 from collections.abc import Callable
 from functools import reduce
 from operator import add
@@ -9,34 +10,32 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from polhode.fit._gyroscope import Gyroscope
-from polhode.fit._motion import AbstractMotion, Predicted
-from polhode.fit._parameters import Base, Parameters, tensor_of
-from polhode.fit._recording import Recording, needed, turn_between
-from polhode.fit._start import central_slope
+from polhode.fit._model import (
+    AbstractMotion,
+    Base,
+    Parameters,
+    Predicted,
+    entries_of,
+    tensor_of,
+    whole_of,
+)
+from polhode.fit._numerics import triangle
+from polhode.fit._options import Gyroscope, Huber
+from polhode.fit._recording import (
+    Recording,
+    central_slope,
+    require_channel,
+    rotation_vector_between,
+)
 from polhode.rotation import conjugate, multiply, rotate, rotation_vector_to_wxyz
+
+# Residuals: data minus model in units of the noise.
 
 # Standard deviation of a gain that counts as exactly known.
 _EXACT = 1e-9
-
-
-class Huber(eqx.Module):
-    """Robust loss: residuals beyond ``threshold`` standard deviations count linearly."""
-
-    threshold: float = 3.0
-
-    def __check_init__(self) -> None:
-        if not self.threshold > 0:
-            raise ValueError(f"the threshold of Huber must be positive, got {self.threshold}.")
-
-    def __call__(self, residual: Array) -> Array:
-        size = jnp.abs(residual)
-        inside = size <= self.threshold
-        far = jnp.where(inside, self.threshold, size)
-        outside = jnp.sqrt(2 * self.threshold * far - self.threshold**2)
-        return jnp.where(inside, residual, jnp.sign(residual) * outside)
 
 
 class Model(eqx.Module):
@@ -98,17 +97,19 @@ def residuals(
     saturated reading while the model is beyond the limit. Any optimiser can minimise the sum of
     squares; ``jax.grad`` and ``jax.jacfwd`` go through it.
     """
-    return compared(predict(parameters, recording, model, tensor), parameters, recording, model)
+    return residuals_of_motion(
+        predict(parameters, recording, model, tensor), parameters, recording, model
+    )
 
 
-def compared(
+def residuals_of_motion(
     motion: Predicted, parameters: Parameters, recording: Recording, model: Model
 ) -> dict[str, Float[Array, "r t 3"]]:
-    """``residuals`` of a motion that was predicted; what the sensors do to it is simulated here."""
+    """``residuals`` of a predicted motion, with the sensors simulated."""
     weight = recording.present[..., None]
     parts = {}
     if recording.omega is not None:
-        noise = needed("omega_noise", recording.omega_noise)
+        noise = require_channel("omega_noise", recording.omega_noise)
         rest = weight * (recording.omega - _read(motion, parameters, recording, model)) / noise
         if recording.saturated is not None:
             # A reading at the upper limit says only that the rate is not smaller.
@@ -117,8 +118,8 @@ def compared(
             rest = jnp.where(side < 0, jnp.minimum(rest, 0), rest)
         parts["omega"] = rest
     if recording.wxyz is not None:
-        noise = needed("attitude_noise", recording.attitude_noise)
-        apart = turn_between(motion.wxyz, recording.wxyz)
+        noise = require_channel("attitude_noise", recording.attitude_noise)
+        apart = rotation_vector_between(motion.wxyz, recording.wxyz)
         parts["attitude"] = weight * apart / noise[..., None]
     if recording.force is not None:
         if motion.omega_dot is None:
@@ -126,7 +127,7 @@ def compared(
                 "force_body needs a motion that gives angular accelerations: FreeMotion or "
                 f"SteppedMotion, got {type(model.motion).__name__}."
             )
-        noise = needed("force_noise", recording.force_noise)
+        noise = require_channel("force_noise", recording.force_noise)
         lever = jnp.broadcast_to(parameters.lever, motion.omega.shape)
         felt = jnp.cross(motion.omega_dot, lever) + jnp.cross(
             motion.omega, jnp.cross(motion.omega, lever)
@@ -210,7 +211,7 @@ def prior_of(parameters: Parameters, recording: Recording, model: Model) -> Prio
     )
 
 
-def departures(parameters: Parameters, recording: Recording, model: Model) -> list[Array]:
+def prior_residuals(parameters: Parameters, recording: Recording, model: Model) -> list[Array]:
     """Unknowns that have a prior, less its mean, over its standard deviation."""
     prior = prior_of(parameters, recording, model)
     parts = [
@@ -226,9 +227,9 @@ def departures(parameters: Parameters, recording: Recording, model: Model) -> li
 
 
 def prior_cost(parameters: Parameters, recording: Recording, model: Model) -> Float[Array, ""]:
-    """Half the sum of squares of ``departures``."""
+    """Half the sum of squares of ``prior_residuals``."""
     total = jnp.zeros((), recording.times.dtype)
-    for part in departures(parameters, recording, model):
+    for part in prior_residuals(parameters, recording, model):
         total = total + jnp.sum(part**2) / 2
     return total
 
@@ -252,3 +253,149 @@ def log_density(
         return misfit if prior is None else misfit + prior(parameters)
 
     return density
+
+
+# Residuals and their Jacobian in one pass, stored by blocks.
+#
+# Unknowns that recordings share (the tensor, a bias, a drag) fill one block per recording, unknowns
+# of a recording (initial rates and attitude) another. The zeros between the blocks are neither
+# computed nor stored: cost and memory grow linearly with the number of recordings.
+
+
+class Linear(NamedTuple):
+    """Residuals (c channels side by side) and what their derivatives amount to.
+
+    ``shared``, ``own``, ``left``: the triangular factor of a recording's derivatives by shared and
+    own unknowns and of its residuals, column block by column block. Sums of squares and products
+    are those of all samples, so that an optimiser works on a handful of rows. ``at``: the shared
+    unknowns of the place.
+    """
+
+    rest: Float[Array, "r t c"]
+    shared: Float[Array, "r q s"]
+    own: Float[Array, "r q o"]
+    left: Float[Array, "r q"]
+    at: Float[Array, " s"]
+
+    def shifted(self, shared: Float[Array, " s"], own: Float[Array, "r o"]) -> Float[Array, "r q"]:
+        """``left`` after small changes of the unknowns, to first order."""
+        return (
+            self.left
+            + jnp.einsum("rqs,s->rq", self.shared, shared)
+            + jnp.einsum("rqo,ro->rq", self.own, own)
+        )
+
+    def information(self) -> Float[Array, "p p"]:
+        """``J^T J`` in the order shared, then own unknowns recording by recording."""
+        recordings, size = self.own.shape[0], self.own.shape[-1]
+        corner = jnp.einsum("rqs,rqz->sz", self.shared, self.shared)
+        side = jnp.einsum("rqs,rqo->sro", self.shared, self.own)
+        side = side.reshape(corner.shape[0], recordings * size)
+        blocks = jnp.einsum("rqo,rqz->roz", self.own, self.own)
+        each = jnp.eye(recordings, dtype=corner.dtype)[:, None, :, None] * blocks[:, :, None, :]
+        below = each.reshape(recordings * size, recordings * size)
+        return jnp.block([[corner, side], [side.T, below]])
+
+
+class Unknowns(NamedTuple):
+    """The unknowns of a fit as numbers, and the way back.
+
+    ``shared`` (s,): the tensor's entries, bias, mounting, lever, the motion's own, gain and delay;
+    ``own`` (r, o): rates, attitude and the walk of the bias of each recording. ``of_motion``,
+    ``of_own`` (static): which of them the motion depends on; all others belong to the sensors.
+    ``parameters``: those of one recording, and the tensor, of its numbers.
+    """
+
+    shared: Float[Array, " s"]
+    own: Float[Array, "r o"]
+    of_motion: np.ndarray
+    of_own: np.ndarray
+    parameters: Callable[[Array, Array], tuple[Parameters, Array]]
+
+
+def unknowns(parameters: Parameters, model: Model) -> Unknowns:
+    """See ``Unknowns``. The tensor's entries are regular unknowns for flat bodies too."""
+    count = model.entries
+    entries = entries_of(model.tensor(parameters), count)
+    sensors = (parameters.bias, parameters.mounting, parameters.lever)
+    calibration = (parameters.gain, parameters.delay)
+    rest, back = ravel_pytree((sensors, parameters.motion, calibration))
+    shared = jnp.concatenate([entries, rest.astype(entries.dtype)])
+    own = [parameters.omega]
+    if parameters.attitude is not None:
+        own.append(parameters.attitude)
+    moving = sum(part.shape[1] for part in own)
+    if parameters.walk is not None:
+        own.append(parameters.walk.reshape(parameters.walk.shape[0], -1))
+    own = jnp.concatenate(own, axis=1)
+    none = jnp.zeros(0, entries.dtype)
+    sizes = [
+        sum(leaf.size for leaf in jax.tree.leaves(part))
+        for part in (sensors, parameters.motion, calibration)
+    ]
+    of_motion = np.repeat([True, False, True, False], [count, *sizes])
+    of_own = np.arange(own.shape[1]) < moving
+
+    def one(shared, own):
+        (bias, mounting, lever), motion, (gain, delay) = back(shared[count:])
+        attitude = None if parameters.attitude is None else own[None, 3:6]
+        walk = None if parameters.walk is None else own[moving:].reshape(1, -1, 3)
+        found = Parameters(
+            none, own[None, :3], attitude, bias, mounting, lever, motion, gain, delay, walk
+        )
+        return found, whole_of(shared[:count], count)
+
+    return Unknowns(shared, own, of_motion, of_own, one)
+
+
+def linearise(
+    shared: Array, own: Array, layout: Unknowns, recording: Recording, model: Model
+) -> Linear:
+    """Residuals and Jacobian of all recordings: the motion appears once in the program.
+
+    ``layout`` gives the order of ``shared`` and ``own``. The motion, which is the expensive part,
+    is differentiated by the unknowns that it depends on; those of the sensors act on the motion
+    that was predicted, which costs next to nothing for each of them.
+    """
+    place, own_place = np.flatnonzero(layout.of_motion), np.flatnonzero(layout.of_own)
+    other, own_other = np.flatnonzero(~layout.of_motion), np.flatnonzero(~layout.of_own)
+
+    def at(own, single, attitude):
+        lone = jax.tree.map(lambda leaf: leaf[None], single)
+        start = None if attitude is None else attitude[None]
+        here = dataclasses.replace(model, attitude=start)
+
+        def flat(motion, parameters):
+            parts = residuals_of_motion(motion, parameters, lone, here)
+            return jnp.concatenate([part[0] for part in parts.values()], axis=-1)
+
+        def moved(some, some_own):
+            parameters, tensor = layout.parameters(
+                shared.at[place].set(some), own.at[own_place].set(some_own)
+            )
+            motion = predict(parameters, lone, here, tensor)
+            rest = flat(motion, parameters)
+            return rest, (rest, motion)
+
+        def sensed(some, some_own):
+            parameters, _ = layout.parameters(
+                shared.at[other].set(some), own.at[own_other].set(some_own)
+            )
+            return flat(motion, parameters)
+
+        slopes = jax.jacfwd(moved, argnums=(0, 1), has_aux=True)
+        (by_shared, by_own), (rest, motion) = slopes(shared[place], own[own_place])
+        if other.size or own_other.size:
+            also, own_also = jax.jacfwd(sensed, argnums=(0, 1))(shared[other], own[own_other])
+            by_shared = jnp.concatenate([by_shared, also], axis=-1)
+            by_own = jnp.concatenate([by_own, own_also], axis=-1)
+            by_shared = by_shared[..., np.argsort(np.concatenate([place, other]))]
+            by_own = by_own[..., np.argsort(np.concatenate([own_place, own_other]))]
+        return by_shared, by_own, rest
+
+    by_shared, by_own, rest = jax.vmap(at)(own, recording, model.attitude)
+    columns = jnp.concatenate([by_shared, by_own, rest[..., None]], axis=-1)
+    columns = columns.reshape(rest.shape[0], -1, columns.shape[-1])
+    factor = triangle(columns)
+    count = shared.shape[0]
+    return Linear(rest, factor[..., :count], factor[..., count:-1], factor[..., -1], shared)

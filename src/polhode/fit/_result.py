@@ -1,9 +1,7 @@
 """``Fit``: the result of a fit, its uncertainty, and what the data do not show."""
 
-import dataclasses
 import enum
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Callable
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
@@ -11,25 +9,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.stats import norm
 from jaxtyping import Array, Float, Int
 
 from polhode._checks import ArrayLike, require
 from polhode._scene import Scene, State
-from polhode.fit._gyroscope import Gyroscope
-from polhode.fit._linear import Linear
-from polhode.fit._matrices import eigh, inverse, svd
-from polhode.fit._options import FitOptions, noise_is_trusted
-from polhode.fit._parameters import Parameters, entries_of, whole_of
-from polhode.fit._recording import Recording, needed, size_of_data, turn_between
-from polhode.fit._residuals import Model, prior_of
-from polhode.fit._scene_motion import LeafMotion
-from polhode.fit._solve import Solution, misfit_of
-from polhode.inertia import Inertia, principal
-from polhode.rotation import multiply, rotation_vector_to_wxyz
+from polhode.fit._model import LeafMotion, Parameters, entries_of, whole_of
+from polhode.fit._residuals import Model
+from polhode.inertia import Inertia
 
 # Part of an unknown in directions that the data do not show, above which it is not known.
-_LEANS = 1e-3
+MAX_NULL_PART = 1e-3
 
 
 class Finding(enum.IntFlag):
@@ -246,7 +235,7 @@ class Fit(eqx.Module):
         determine the handedness; attitudes, a wheel or knowledge of the body do.
         """
         body = self._of_inertia("mirror_inertia")
-        return Inertia(diagonal=other_hand(body.moments)).turned(body.axes)
+        return Inertia(diagonal=mirror_moments(body.moments)).turned(body.axes)
 
     @property
     def scene(self) -> Scene:
@@ -311,7 +300,7 @@ class Fit(eqx.Module):
         null = axes[:, found <= 1e3 * np.finfo(information.dtype).eps * found[-1]]
         leaning = np.linalg.norm(full @ (null / safe[:, None]), axis=1)
         reach = np.linalg.norm(full / safe, axis=1)
-        std = np.where(leaning > _LEANS * reach, np.inf, std)
+        std = np.where(leaning > MAX_NULL_PART * reach, np.inf, std)
         return np.asarray(value), std.reshape(value.shape)
 
     def interval(self, level: float = 0.95) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
@@ -331,7 +320,7 @@ class Fit(eqx.Module):
         if self._inertia is not None and not self._inertia.scale_known:
             about.append(_SCALE)
             if not self._inertia.handedness_known:
-                twin = np.sort(other_hand(np.asarray(self.moments).reshape(-1, 3)[body]))
+                twin = np.sort(mirror_moments(np.asarray(self.moments).reshape(-1, 3)[body]))
                 about.append(
                     "free rates do not show the handedness of the axes: with one axis inverted the "
                     f"same data mean {twin[0]:.4f} : {twin[1]:.4f} : 1; compare with what you know "
@@ -479,454 +468,7 @@ def checked_fit(fit: Fit, throw: bool) -> Fit:
     return fit
 
 
-def flagged(seen: Mapping[Finding, Array]) -> Array:
-    """The ``Finding`` of those that are seen (under jit and vmap)."""
-    return sum((jnp.where(x, int(flag), 0) for flag, x in seen.items()), start=jnp.asarray(0))
-
-
-def other_hand(moments: Any) -> Any:
+def mirror_moments(moments: Any) -> Any:
     """Moments (..., 3) of ``Fit.mirror_inertia``, in the order of those given."""
     other = moments * (moments.sum(axis=-1, keepdims=True) - 2 * moments)
     return other / other.max(axis=-1, keepdims=True)
-
-
-class Shown(NamedTuple):
-    """What the data show of p unknowns: ``information`` and ``covariance`` (p, p), directions
-    ``null`` (p, p) that they do not show (zero columns for the others), natural sizes ``safe`` (p,)
-    of 1 over an unknown, how many are not shown, ``noise`` of the residuals over that assumed,
-    ``prior_std`` (p,): of the calibration, infinite for unknowns without a prior."""
-
-    information: Array
-    covariance: Array
-    null: Array
-    safe: Array
-    null_count: Array
-    noise: Array
-    prior_std: Array
-
-
-def shown_by(solution: Solution, recording: Recording, trust_noise: bool) -> Shown:
-    """What the Jacobian of a fit says about its unknowns, in the order shared, then own.
-
-    Unknowns with a prior (the sensor's calibration) are eliminated: conditional on them the
-    covariance of the others is the pseudo-inverse of their information, so a direction that the
-    data do not show is found by the data alone, whatever the prior, and in single precision too.
-    """
-    linear = solution.linear
-    information = linear.information()
-    dtype = information.dtype
-    held, precision = _priors(solution, recording)
-    free = np.flatnonzero(~held)
-    inner = information[np.ix_(free, free)]
-    # equilibrated: a direction counts as null by its own information, whatever its unit
-    size = jnp.sqrt(jnp.diagonal(inner))
-    safe = jnp.where(size > 0, size, 1)
-    values, vectors = eigh(inner / safe[:, None] / safe[None])
-    known = values > 1e3 * float(jnp.finfo(dtype).eps) * values[-1]
-    inverted = jnp.where(known, 1 / jnp.where(known, values, 1), 0)
-    covariance = (vectors * inverted[None]) @ vectors.T / safe[:, None] / safe[None]
-    null = jnp.where(known, 0, 1)[None] * vectors / safe[:, None]
-    used = jnp.sum(known).astype(dtype)
-    square = jnp.sum(linear.rest**2)
-    total = size_of_data(recording, linear.rest.shape[-1])
-    prior_std = jnp.full(held.size, jnp.inf, dtype)
-    if not held.any():
-        noise = jnp.sqrt(square / jnp.maximum(total - used, 1))
-        variance = jnp.asarray(1, dtype) if trust_noise else noise**2
-        return Shown(
-            information, covariance * variance, null, safe, jnp.sum(~known), noise, prior_std
-        )
-    place = np.flatnonzero(held)
-    cross = information[np.ix_(free, place)]
-    width = precision**-0.5
-    gained = covariance @ cross
-    # information of the data about the calibration, its unit the standard deviation of the prior
-    block = information[np.ix_(place, place)]
-    data = (block - cross.T @ gained) * width[:, None] * width[None]
-    shown, axes = eigh((data + data.T) / 2)
-    # rounding of the difference is no information
-    rounding = 1e3 * float(jnp.finfo(dtype).eps) * jnp.max(jnp.diagonal(block) * width**2)
-    shown = jnp.where(shown > rounding, shown, 0)
-    # the calibration uses up data as far as these show it
-    noise = jnp.sqrt(square / jnp.maximum(total - used, 1))
-    noise = jnp.sqrt(square / jnp.maximum(total - used - jnp.sum(shown / (shown + noise**2)), 1))
-    variance = jnp.asarray(1, dtype) if trust_noise else noise**2
-    # the mean of 1 / (information / variance + 1) by directions
-    spread = (axes * (1 / (shown / jnp.where(variance > 0, variance, 1) + 1))[None]) @ axes.T
-    spread = jnp.where(variance > 0, spread, 0) if not trust_noise else spread
-    spread = spread * width[:, None] * width[None]
-    beside = -gained @ spread
-    full = jnp.zeros_like(information)
-    full = full.at[np.ix_(free, free)].set(covariance * variance - beside @ gained.T)
-    full = full.at[np.ix_(free, place)].set(beside).at[np.ix_(place, free)].set(beside.T)
-    full = full.at[np.ix_(place, place)].set(spread)
-    order = jnp.zeros((held.size, held.size), dtype).at[np.ix_(free, free)].set(null)
-    sizes = jnp.ones(held.size, dtype).at[free].set(safe).at[place].set(1 / width)
-    with_prior = information.at[place, place].add(precision * variance)
-    prior_std = prior_std.at[place].set(width)
-    return Shown(with_prior, full, order, sizes, jnp.sum(~known), noise, prior_std)
-
-
-def _priors(solution: Solution, recording: Recording) -> tuple[np.ndarray, Array]:
-    """Which unknowns, in the order shared, then own, have a prior (static), and its precisions."""
-    parameters, model = solution.parameters, solution.model
-    prior = prior_of(parameters, recording, model)
-    shared = [np.zeros(model.entries, bool)]
-    motion = jax.tree.leaves(parameters.motion)
-    for name in ("bias", "mounting", "lever", "motion", "gain", "delay"):
-        if name == "motion":
-            for leaf, precision in zip(motion, prior.motion, strict=True):
-                shared.append(np.full(leaf.size, precision is not None))
-            continue
-        size = sum(leaf.size for leaf in jax.tree.leaves(getattr(parameters, name)))
-        shared.append(np.full(size, getattr(prior, name, None) is not None))
-    own = [np.zeros(0 if x is None else 3, bool) for x in (parameters.omega, parameters.attitude)]
-    walk = np.ones(0 if parameters.walk is None else parameters.walk[0].size, bool)
-    recordings = parameters.omega.shape[0]
-    held = np.concatenate([*shared, *[np.concatenate([*own, walk])] * recordings])
-    each = [prior.bias, *prior.motion, prior.gain, prior.delay, prior.walk]
-    flat = [jnp.ravel(x) for x in each if x is not None]
-    dtype = parameters.omega.dtype
-    return held, jnp.concatenate([jnp.zeros(0, dtype), *flat]).astype(dtype)
-
-
-class _Split(NamedTuple):
-    """Standard deviations of the unknowns that recordings share, sorted by what they are of."""
-
-    entries: Array
-    sensor: dict[str, Array]
-    motion: list[Array]
-
-
-def _split(shared: Array, count: int, parameters: Parameters) -> _Split:
-    """``shared`` (s,), in the order of ``Unknowns``, by what it is of."""
-    first = count
-    sensor, motion = {}, []
-
-    def part(like):
-        nonlocal first
-        first += like.size
-        return shared[first - like.size : first].reshape(like.shape)
-
-    for name in ("bias", "mounting", "lever"):
-        if (value := getattr(parameters, name)) is not None:
-            sensor[name] = part(value)
-    for leaf in jax.tree.leaves(parameters.motion):
-        motion.append(part(leaf))
-    if parameters.gain is not None:
-        sensor["gain"] = part(parameters.gain).reshape(3, 3)
-    if parameters.delay is not None:
-        sensor["delay"] = part(parameters.delay)
-    return _Split(shared[:count], sensor, motion)
-
-
-def _sensor(parameters: Parameters, gyroscope: Gyroscope) -> dict[str, Array]:
-    """The fitted unknowns of the sensors by name: gain, bias and delay with those calibrated."""
-    names = ("bias", "mounting", "lever", "gain", "delay")
-    parts = {name: getattr(parameters, name) for name in names}
-    parts = {name: part for name, part in parts.items() if part is not None}
-    gain = None if gyroscope.gain is None else gyroscope.gain.astype(parameters.omega.dtype)
-    if "gain" in parts:
-        parts["gain"] = jnp.eye(3, dtype=parts["gain"].dtype) + parts["gain"].reshape(3, 3)
-        if gain is not None:
-            parts["gain"] = gain @ parts["gain"]
-    if "bias" in parts:
-        if gain is not None:
-            parts["bias"] = gain @ parts["bias"]
-        if gyroscope.bias is not None:
-            parts["bias"] = parts["bias"] + gyroscope.bias.astype(parts["bias"].dtype)
-    if "delay" in parts:
-        parts["delay"] = parts["delay"] + gyroscope.delay
-    return parts
-
-
-def _deviations(shown: Shown, count: int) -> Array:
-    """Standard deviations of the first ``count`` unknowns; infinite for what is not shown."""
-    spread = jnp.sqrt(jnp.maximum(jnp.diagonal(shown.covariance), 0))
-    leaning = jnp.sqrt(jnp.sum((shown.null * shown.safe[:, None]) ** 2, axis=1))
-    return jnp.where(leaning > _LEANS, jnp.inf, spread)[:count]
-
-
-def _initial(parameters: Parameters, recording: Recording, attitude: Array | None) -> State:
-    """States at the first time of each recording; ``attitude``: of those without attitudes."""
-    if recording.wxyz is not None:
-        turn = rotation_vector_to_wxyz(needed("attitude", parameters.attitude))
-        return State(multiply(recording.wxyz[:, 0], turn), parameters.omega)
-    first = jnp.asarray([1, 0, 0, 0]) if attitude is None else attitude
-    first = first.astype(parameters.omega.dtype)
-    return State(jnp.broadcast_to(first, (*parameters.omega.shape[:-1], 4)), parameters.omega)
-
-
-def _rms(parts: dict[str, Array], recording: Recording) -> Array:
-    """Root mean square of the residual rates, rad/s; NaN without rates."""
-    if recording.omega is None:
-        return jnp.asarray(jnp.nan, recording.times.dtype)
-    square = (parts["omega"] * needed("omega_noise", recording.omega_noise)) ** 2
-    return jnp.sqrt(jnp.sum(square) / jnp.sum(recording.present) / 3)
-
-
-def conclude(solution: Solution, recording: Recording, options: FitOptions) -> Fit:
-    """Uncertainty and diagnostics of one body's inertia (under jit and vmap)."""
-    tensor, model, linear = solution.tensor, solution.model, solution.linear
-    parameters = solution.parameters
-    dtype = tensor.dtype
-    count = model.entries
-    entries = entries_of(tensor, count)
-
-    def derived(vector):
-        values, axes, products = principal(whole_of(vector, count))
-        # the largest is one to itself, rounding aside
-        ratios = (values / values[2]).at[2].set(1)
-        return jnp.concatenate([values, ratios, products]), (values, axes)
-
-    slope, (moments, axes) = jax.jacfwd(derived, has_aux=True)(entries)
-    if not model.scale_known:
-        # size that the data do not show: a largest moment of one
-        size = moments[2]
-        tensor, moments = tensor / size, moments / size
-        slope = slope * jnp.where(jnp.arange(9) // 3 == 1, size, 1)[:, None]
-        sizes = jnp.where(jnp.arange(linear.shared.shape[-1]) < count, size, 1)
-        linear = linear._replace(shared=linear.shared * sizes[None, None])
-        solution = dataclasses.replace(solution, linear=linear)
-    shown = shown_by(solution, recording, noise_is_trusted(options))
-    information, covariance, null, safe = shown[:4]
-
-    full = jnp.concatenate([slope, jnp.zeros((9, information.shape[0] - count), dtype)], axis=1)
-    spread = jnp.sqrt(jnp.maximum(jnp.sum((full @ covariance) * full, axis=1), 0))
-    # what leans on a null direction is not known at all
-    leaning = jnp.sqrt(jnp.sum((full @ null) ** 2, axis=1))
-    reach = jnp.sqrt(jnp.sum((full / safe[None]) ** 2, axis=1))
-    reach = jnp.concatenate([reach[:3], reach[:3] / moments[2], reach[6:]])
-    spread = jnp.where(leaning > 1e-3 * reach, jnp.inf, spread)
-    axes_std = turn_std(moments, spread[6:])
-
-    std = _split(_deviations(shown, linear.shared.shape[-1]), count, parameters)
-    parts = by_kind(linear, recording)
-    whiteness = whiteness_of(linear.rest, recording.present)
-    trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
-    finite = jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(tensor))
-    diagnostics = flagged(
-        {
-            Finding.STEP_LIMIT: ~solution.stopped,
-            Finding.NOT_FINITE: ~finite,
-            # the least of the second moments
-            Finding.NEARLY_FLAT: trace / 2 - moments[2] < 1e-4 * trace,
-            Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread[3:6])),
-            Finding.NOT_WHITE: whiteness < 1e-4,
-            Finding.WEAK: jnp.any(spread[3:6] > 0.05),
-            Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
-            Finding.AXES_DISAGREE: _axes_disagree(recording, options),
-            Finding.SATURATED: is_saturated(recording),
-            Finding.CALIBRATION: _calibration_strained(solution, recording),
-            Finding.OUTLIERS: has_outliers(linear.rest, recording, options.robust),
-        }
-    )
-    body = InertiaEstimate(
-        inertia=Inertia(full=tensor),
-        moments=moments,
-        axes=axes,
-        ratios=moments / moments[2],
-        moments_std=spread[:3],
-        ratios_std=spread[3:6],
-        axes_std=axes_std,
-        scale_known=model.scale_known,
-        handedness_known=recording.wxyz is not None,
-    )
-    return Fit(
-        values=[tensor, *jax.tree.leaves(parameters.motion)],
-        std=[symmetric_std(std.entries), *std.motion],
-        sensor=_sensor(parameters, solution.model.gyroscope),
-        sensor_std=std.sensor,
-        initial=_initial(parameters, recording, None),
-        information=information,
-        covariance=covariance,
-        null_count=shown.null_count,
-        noise=shown.noise,
-        whiteness=whiteness,
-        rms=_rms(parts, recording),
-        diagnostics=diagnostics,
-        steps=solution.steps,
-        attempts=solution.attempts,
-        residuals=parts,
-        parameters=parameters,
-        model=model,
-        _inertia=body,
-    )
-
-
-def conclude_scene(solution: Solution, recording: Recording, options: FitOptions) -> Fit:
-    """Values, uncertainty and diagnostics of one body's scene (under jit and vmap)."""
-    linear, parameters = solution.linear, solution.parameters
-    shown = shown_by(solution, recording, noise_is_trusted(options))
-    spread = _deviations(shown, linear.shared.shape[-1])
-    std = _split(spread, 0, parameters)
-    parts = by_kind(linear, recording)
-    whiteness = whiteness_of(linear.rest, recording.present)
-    finite = jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(linear.at))
-    diagnostics = flagged(
-        {
-            Finding.STEP_LIMIT: ~solution.stopped,
-            Finding.NOT_FINITE: ~finite,
-            Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread)),
-            Finding.AT_BOUND: solution.model.motion.at_bound(parameters.motion),
-            Finding.NOT_WHITE: whiteness < 1e-4,
-            Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
-            Finding.SATURATED: is_saturated(recording),
-            Finding.CALIBRATION: _calibration_strained(solution, recording),
-            Finding.OUTLIERS: has_outliers(linear.rest, recording, options.robust),
-        }
-    )
-    attitude = getattr(options.motion, "attitude", None)
-    return Fit(
-        values=list(parameters.motion),
-        std=std.motion,
-        sensor=_sensor(parameters, solution.model.gyroscope),
-        sensor_std=std.sensor,
-        initial=_initial(parameters, recording, attitude),
-        information=shown.information,
-        covariance=shown.covariance,
-        null_count=shown.null_count,
-        noise=shown.noise,
-        whiteness=whiteness,
-        rms=_rms(parts, recording),
-        diagnostics=diagnostics,
-        steps=solution.steps,
-        attempts=solution.attempts,
-        residuals=parts,
-        parameters=parameters,
-        model=solution.model,
-    )
-
-
-def symmetric_std(entries: Float[Array, " e"]) -> Float[Array, "3 3"]:
-    """Standard deviations of a tensor from those of its entries; zero for products left out."""
-    return whole_of(entries, entries.shape[0])
-
-
-def turn_std(moments: Float[Array, "3"], products_std: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Standard deviations [rad] about the principal axes of those of the products of inertia."""
-    gaps = jnp.stack([moments[2] - moments[1], moments[2] - moments[0], moments[1] - moments[0]])
-    return jnp.where(gaps > 0, products_std / jnp.where(gaps > 0, gaps, 1), jnp.inf)
-
-
-def sensor_axes(recording: Recording) -> Float[Array, "*b 3 3"]:
-    """Matrix M (..., 3, 3) with ``rates = M (rates of the attitudes)``, by linear regression.
-
-    The identity for a gyroscope aligned with the attitudes' body axes; near -1 in place of 1 on the
-    diagonal for an inverted axis, a permutation for exchanged ones, a rotation for a mounting.
-    """
-    measured, seen = _turns(recording, centred=False)
-    mixed = jnp.einsum("...ti,...tj->...ij", measured, seen)
-    square = jnp.einsum("...ti,...tj->...ij", seen, seen)
-    return mixed @ inverse(square)
-
-
-def is_saturated(recording: Recording) -> Array:
-    """Whether readings of the gyroscope are at its limits."""
-    if recording.saturated is None:
-        return jnp.asarray(False)
-    return jnp.any((recording.saturated != 0) & (recording.present[..., None] > 0))
-
-
-def _calibration_strained(solution: Solution, recording: Recording) -> Array:
-    """Whether an unknown of the calibration is more than 3.5 standard deviations off its prior."""
-    far = jnp.asarray(False)
-    for name, precision in (
-        prior_of(solution.parameters, recording, solution.model)._asdict().items()
-    ):
-        if name != "motion" and precision is not None:
-            value = getattr(solution.parameters, name)
-            far = far | jnp.any(value**2 * precision > 3.5**2)
-    return far
-
-
-def has_outliers(rest: Array, recording: Recording, robust: Any) -> Array:
-    """Whether single residuals (r, t, c) are far off where the fit counts them by their square.
-
-    Three at least and 0.3 % of all beyond five sigma, sigma from the median, their neighbours
-    within three: a model that lacks something leaves runs, not single samples.
-    """
-    if robust is not None:
-        return jnp.asarray(False)
-    known = (recording.present > 0)[..., None] & jnp.ones(rest.shape, bool)
-    if recording.saturated is not None:
-        # rates are the first channels; at a limit a residual may be zero
-        known = known.at[..., :3].set(known[..., :3] & (recording.saturated == 0))
-    size = jnp.where(known, jnp.abs(rest), jnp.nan)
-    scale = 1.4826 * jnp.nanmedian(size, axis=1, keepdims=True)
-    far = jnp.nan_to_num(size / jnp.where(scale > 0, scale, jnp.inf))
-    ends = jnp.pad(far, ((0, 0), (1, 1), (0, 0)))
-    alone = (far > 5) & (ends[:, :-2] < 3) & (ends[:, 2:] < 3)
-    count, total = (jnp.sum(x.astype(rest.dtype)) for x in (alone, known))
-    return (count >= 3) & (count >= 0.003 * total)
-
-
-def _axes_disagree(recording: Recording, options: FitOptions) -> Array:
-    """Whether gyroscope and attitudes contradict each other beyond any mounting rotation."""
-    if recording.omega is None or recording.wxyz is None:
-        return jnp.asarray(False)
-    measured, seen = _turns(recording, centred=options.bias)
-    # the proper rotation nearest to the correlation of both, and how much its mirror image gains
-    left, sizes, right = svd(jnp.einsum("rti,rtj->ij", measured, seen))
-    hand = jnp.sign(jnp.linalg.det(left) * jnp.linalg.det(right))
-    inverted = (hand < 0) & (sizes[2] > 0.1 * sizes[1])
-    if options.mounting:
-        return inverted
-    signs = jnp.stack([jnp.ones_like(hand), jnp.ones_like(hand), hand])
-    turn = left @ (signs[:, None] * right)
-    # less than this is a turn of more than 60 degrees between the axes
-    return inverted | (turn[0, 0] + turn[1, 1] + turn[2, 2] < 2)
-
-
-def _turns(recording: Recording, centred: bool) -> tuple[Array, Array]:
-    """Turns between samples by the rates and by the attitudes (..., T-1, 3).
-
-    ``centred``: less their means, whose difference may be the gyroscope's bias.
-    """
-    wxyz, omega = needed("wxyz", recording.wxyz), needed("omega", recording.omega)
-    weight = (recording.present[..., 1:] * recording.present[..., :-1])[..., None]
-    step = jnp.diff(recording.times, axis=-1)[..., None]
-    measured = step * (omega[..., 1:, :] + omega[..., :-1, :]) / 2
-    turned = turn_between(wxyz[..., :-1, :], wxyz[..., 1:, :])
-    if centred:
-        total = jnp.sum(weight, axis=-2, keepdims=True)
-        measured, turned = (
-            x - jnp.sum(weight * x, axis=-2, keepdims=True) / total for x in (measured, turned)
-        )
-    return weight * measured, weight * turned
-
-
-def by_kind(linear: Linear, recording: Recording) -> dict[str, Array]:
-    """Residuals of rates, attitudes and forces, each (r, t, 3), over their noise."""
-    parts, channel = {}, 0
-    kinds = {"omega": recording.omega, "attitude": recording.wxyz, "force": recording.force}
-    for name, measured in kinds.items():
-        if measured is not None:
-            parts[name] = linear.rest[..., channel : channel + 3]
-            channel += 3
-    return parts
-
-
-@partial(jax.jit, static_argnames="lags")  # one program, not one for each operation
-def whiteness_of(rest: Array, present: Array, lags: int = 5) -> Array:
-    """Ljung-Box probability of the first autocorrelations of all channels together."""
-    total = jnp.sum(present, axis=-1)[:, None]
-    # recordings that only fill a batch up have no samples and count nothing
-    filled = total > 0
-    total = jnp.where(filled, total, lags + 1)
-    rest = (rest - (jnp.sum(rest, axis=1) / total)[:, None]) * present[..., None]
-    power = jnp.sum(rest**2, axis=1)
-    safe = jnp.where(power > 0, power, 1)
-    later = jnp.pad(rest, ((0, 0), (0, lags), (0, 0)))
-
-    def one(lag):
-        moved = jax.lax.dynamic_slice_in_dim(later, lag, rest.shape[1], axis=1)
-        correlation = jnp.sum(rest * moved, axis=1) / safe
-        return jnp.sum(correlation**2 / (total - lag.astype(total.dtype)) * total * (total + 2))
-
-    statistic = jnp.sum(jax.lax.map(one, jnp.arange(1, lags + 1)))
-    # Chi-square of many degrees by Wilson and Hilferty (PNAS 17 (1931) 684): the exact one would
-    # take longer to compile than all else here.
-    degrees = lags * rest.shape[-1] * jnp.sum(filled).astype(rest.dtype)
-    spread = 2 / (9 * degrees)
-    return norm.sf(((statistic / degrees) ** (1 / 3) - 1 + spread) / spread**0.5)

@@ -1,6 +1,9 @@
-"""From recordings of one body to its best parameters: start, Levenberg-Marquardt, information."""
+"""From recordings of one body to its best parameters: start, optimisation, information."""
 
 import dataclasses
+import math
+from functools import reduce
+from operator import mul
 
 import equinox as eqx
 import jax
@@ -9,25 +12,221 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from polhode.fit._gyroscope import WALK_KNOTS, Gyroscope
-from polhode.fit._linear import Linear, linearise, unknowns
-from polhode.fit._motion import AbstractMotion, FreeMotion, SteppedMotion
-from polhode.fit._optimiser import LevenbergMarquardt
-from polhode.fit._options import FitOptions, noise_is_trusted
-from polhode.fit._parameters import (
+from polhode.fit._model import (
     AbstractInertiaUnknown,
+    AbstractMotion,
     Base,
+    FreeMotion,
     FullTensor,
     Parameters,
+    SteppedMotion,
     base_of,
     entries_of,
+    free_acceleration,
     free_columns,
     whole_of,
 )
-from polhode.fit._recording import Recording, bridged, needed, size_of_data, turn_between
-from polhode.fit._residuals import Huber, Model, departures, prior_cost
-from polhode.fit._start import alternatives, regression, scatter
+from polhode.fit._numerics import LevenbergMarquardt, eigh, solve
+from polhode.fit._options import WALK_KNOTS, FitOptions, Gyroscope, Huber, noise_is_trusted
+from polhode.fit._recording import (
+    Recording,
+    central_slope,
+    interpolate_gaps,
+    require_channel,
+    rotation_vector_between,
+    size_of_data,
+)
+from polhode.fit._residuals import Linear, Model, linearise, prior_cost, prior_residuals, unknowns
 from polhode.inertia import Inertia, inertia_of_second_moments, second_moments
+from polhode.rotation import multiply, rotation_vector_to_wxyz, wxyz_to_matrix
+
+# Starting values from the data: linear regression on the conservation of angular momentum.
+#
+# The rates are integrated to the attitude R(t) relative to the first sample. The angular momentum
+# ``R (I omega + h) = L`` is constant, which is linear in the six entries of I and the three of L.
+# No noisy rates are differentiated.
+
+# second moments below this part of their sum are lifted to it before the logarithm is taken
+_FLATTEST = 3e-3
+# rounds of interpolation with the tensor of the round before
+_ROUNDS = 3
+_PIECES = 6
+
+
+def integrate(
+    omega: Float[Array, "t 3"], slope: Float[Array, "t 3"], times: Float[Array, " t"]
+) -> Float[Array, "t 4"]:
+    """Attitude quaternions relative to the first sample, from rates and their derivatives.
+
+    Cubic Hermite interpolation, two Magnus steps of order 4 (two Gauss points) per interval.
+    """
+    step = jnp.diff(times)[:, None]
+    offset = jnp.asarray(3, omega.dtype) ** 0.5 / 12
+
+    def rate_at(s):
+        # Hermite's basis on [0, 1]
+        late = s * s * (3 - 2 * s)
+        start, end = s * (1 - s) ** 2, -s * s * (1 - s)
+        return (
+            (1 - late) * omega[:-1]
+            + late * omega[1:]
+            + step * (start * slope[:-1] + end * slope[1:])
+        )
+
+    def half(middle):
+        first, second = rate_at(middle - offset), rate_at(middle + offset)
+        return step / 4 * (first + second) + step**2 / 4 * offset * jnp.cross(first, second)
+
+    turns = multiply(rotation_vector_to_wxyz(half(0.25)), rotation_vector_to_wxyz(half(0.75)))
+    unit = jnp.asarray([[1, 0, 0, 0]], omega.dtype)
+    return jnp.concatenate([unit, _products(turns, unit)])
+
+
+def _products(turns: Float[Array, "n 4"], unit: Float[Array, "1 4"]) -> Float[Array, "n 4"]:
+    """Running products of quaternions: within rows of a square, all at a time, then over its rows.
+
+    As short a way as any for the machine, and the shortest program: its derivatives compile in
+    half the time that ``associative_scan`` takes.
+    """
+    count = turns.shape[0]
+    side = math.isqrt(count - 1) + 1
+    filled = jnp.concatenate([turns, jnp.broadcast_to(unit, (side * side - count, 4))])
+
+    def on(before, turn):
+        now = multiply(before, turn)
+        return now, now
+
+    start = jnp.broadcast_to(unit, (side, 4))
+    _, within = jax.lax.scan(on, start, jnp.swapaxes(filled.reshape(side, side, 4), 0, 1))
+    _, rows = jax.lax.scan(on, unit[0], within[-1])
+    before = jnp.concatenate([unit, rows[:-1]])
+    return multiply(before[:, None], jnp.swapaxes(within, 0, 1)).reshape(-1, 4)[:count]
+
+
+def _design(omega: Float[Array, "t 3"]) -> Float[Array, "t 3 6"]:
+    """``I omega`` as a matrix times (xx, yy, zz, yz, zx, xy)."""
+    x, y, z = (omega[..., i] for i in range(3))
+    o = jnp.zeros_like(x)
+    rows = [[x, o, o, o, z, y], [o, y, o, z, o, x], [o, o, z, y, x, o]]
+    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _nearest_physical(entries: Float[Array, " 6"]) -> Float[Array, "3 3"]:
+    """Second moments of the nearest body that is not too flat."""
+    values, axes = eigh(second_moments(whole_of(entries)))
+    least = _FLATTEST * jnp.sum(jnp.abs(values))
+    values = jnp.maximum(values, least)
+    return jnp.einsum("ij,j,kj->ik", axes, values, axes)
+
+
+def regression(
+    omega: Float[Array, "r t 3"],
+    times: Float[Array, "r t"],
+    present: Float[Array, "r t"],
+    momentum: Float[Array, "r t 3"] | None = None,
+) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"], Float[Array, ""]]:
+    """Second moments (3, 3) to start from, in two ways, and the relative misfit of the first.
+
+    The first takes the momentum as constant over each recording, the second over pieces of it,
+    which forgives errors of the integrated attitude and a slow loss of momentum.
+
+    ``momentum``: body components of a wheel's momentum; without it the tensor is scaled to unit
+    Frobenius norm, since only its shape shows. Without it, too, the rates between the samples are
+    interpolated with the derivatives that Euler's equations give for the tensor found before:
+    records of few samples per turn need that.
+    """
+
+    count = times.shape[1]
+    whole = jnp.ones((1, count), omega.dtype)
+    # parts in which errors of the integrated attitude have no time to grow
+    place = np.arange(count) * _PIECES // count
+    pieces = jnp.asarray(place == np.arange(_PIECES)[:, None], omega.dtype)
+
+    def centred(values, parts):
+        # eliminate the constant momentum of each part: subtract its mean
+        shape = (*present.shape, *[1] * (values.ndim - 2))
+        weight = parts[None] * present[:, None]
+        total = jnp.sum(weight, axis=2)
+        safe = jnp.where(total > 0, total, 1)
+        mean = jnp.einsum("rpt,rt...->rp...", weight, values)
+        mean = mean / safe.reshape(*safe.shape, *shape[2:])
+        return (values - jnp.einsum("pt,rp...->rt...", parts, mean)) * present.reshape(shape)
+
+    def rows_of(slope):
+        attitude = jax.vmap(integrate)(omega, slope, times)
+        turn = wxyz_to_matrix(attitude) * present[..., None, None]
+        return turn, jnp.einsum("rtij,rtjk->rtik", turn, _design(omega))
+
+    def square(rows):
+        return jnp.einsum("rtij,rtik->jk", rows, rows)
+
+    first = jax.vmap(central_slope)(omega, times)
+    if momentum is None:
+        metric = jnp.asarray([1, 1, 1, 2, 2, 2], omega.dtype) ** 0.5
+
+        def null(gram):
+            values, vectors = eigh(gram / metric[:, None] / metric[None])
+            entries = vectors[:, 0] / metric
+            entries = entries * jnp.where(jnp.sum(entries[:3]) < 0, -1, 1).astype(entries.dtype)
+            return _nearest_physical(entries), values[0] / jnp.sum(values)
+
+        def again(_, carry):
+            _, rows = rows_of(carry[0])
+            grams = jnp.stack([square(centred(rows, parts)) for parts in (whole, pieces)])
+            sigma, misfit = jax.vmap(null)(grams)
+            body = Inertia(full=inertia_of_second_moments(sigma[1]))
+            return free_acceleration(body, omega), sigma, misfit
+
+        unit = jnp.eye(3, dtype=omega.dtype)
+        start = (first, jnp.stack([unit, unit]), jnp.zeros(2, omega.dtype))
+        _, sigma, misfit = jax.lax.fori_loop(0, _ROUNDS, again, start)
+        return sigma[0], sigma[1], misfit[0]
+    turn, rows = rows_of(first)
+    carried = jnp.einsum("rtij,rtj->rti", turn, momentum)
+    solutions = []
+    for parts in (whole, pieces):
+        body, push = centred(rows, parts), centred(carried, parts)
+        entries = solve(square(body), -jnp.einsum("rtij,rti->j", body, push))
+        rest = jnp.einsum("rtij,j->rti", body, entries) + push
+        solutions.append((_nearest_physical(entries), jnp.sum(rest**2) / jnp.sum(push**2)))
+    return solutions[0][0], solutions[1][0], solutions[0][1]
+
+
+def alternative_starts(omega: Float[Array, "r t 3"], first: Float[Array, "3 3"]) -> list[Array]:
+    """Other second moments: long, flat and middling bodies along the directions of the rates."""
+    spread = jnp.einsum("rti,rtj->ij", omega, omega)
+    _, axes = eigh(spread)
+    size = first[0, 0] + first[1, 1] + first[2, 2]
+    return [
+        size * jnp.einsum("ij,j,kj->ik", axes, jnp.asarray(widths, omega.dtype), axes)
+        for widths in ((0.6, 0.25, 0.15), (0.15, 0.25, 0.6), (0.25, 0.6, 0.15))
+    ]
+
+
+def neighbour_noise_variance(
+    times: Float[Array, " t"], omega: Float[Array, "t 3"], present: Float[Array, " t"]
+) -> Float[Array, ""]:
+    """Variance of the noise as neighbours show it: each sample against the cubic through four.
+
+    An upper bound in the mean: where the sampling is coarse the motion itself adds to it. Infinite
+    where no five samples follow each other.
+    """
+    offset = jnp.stack([times[k : times.shape[0] - 4 + k] for k in range(5)]) - times[None, 2:-2]
+    value = jnp.stack([omega[k : times.shape[0] - 4 + k] for k in range(5)])
+    sampled = jnp.stack([present[k : times.shape[0] - 4 + k] for k in range(5)])
+    others = (0, 1, 3, 4)
+    weights = [
+        reduce(mul, (offset[j] / (offset[j] - offset[k]) for j in others if j != k)) for k in others
+    ]
+    guess = sum(w[:, None] * value[k] for w, k in zip(weights, others, strict=True))
+    share = 1 + sum(w * w for w in weights)
+    complete = jnp.prod(sampled, axis=0)
+    total = jnp.sum(complete)
+    square = jnp.sum(complete * jnp.sum((value[2] - guess) ** 2, axis=1) / share) / 3
+    return jnp.where(total > 0, square / jnp.where(total > 0, total, 1), jnp.inf)
+
+
+# The search for the best parameters: starts, Levenberg-Marquardt, and the choice between optima.
 
 # Parts of the recording that are fitted one after the other where the whole misleads at first.
 _PARTS = (0.1, 0.2, 0.35, 0.6, 1.0)
@@ -80,7 +279,7 @@ class _Search(eqx.Module):
     good: Array
 
 
-def solve(recording: Recording, options: FitOptions) -> Solution:
+def solve_fit(recording: Recording, options: FitOptions) -> Solution:
     """Fit one body to its recordings (leading axis r). Pure; works under jit and vmap."""
     rates = _rates(recording)
     motion = FreeMotion() if options.motion is None else options.motion
@@ -97,7 +296,7 @@ def solve(recording: Recording, options: FitOptions) -> Solution:
 
     dtype = rates.dtype
     zero = jnp.zeros(3, dtype)
-    begin = Parameters(
+    first_parameters = Parameters(
         shape=jnp.zeros(columns.shape[1], dtype),
         omega=rates[:, 0],
         attitude=None if attitude is None else jnp.zeros((rates.shape[0], 3), dtype),
@@ -106,31 +305,33 @@ def solve(recording: Recording, options: FitOptions) -> Solution:
         motion=jax.tree.map(lambda x: jnp.asarray(x, dtype), motion.start()),
         **_sensor_start(recording, gyroscope, options.bias, dtype),
     )
-    scale = _scale(begin, recording, rates)
-    # the optimiser counts in the default precision whatever that of the data
-    wide = jnp.result_type(float)
-    unbounded = dataclasses.replace(begin, motion=motion.unbounded(begin.motion))
-    fresh = jax.tree.map(lambda a, b: (a / b).astype(wide), unbounded, scale)
+    scale = _scale(first_parameters, recording, rates)
+    # The optimiser computes in the default precision, whatever the precision of the data.
+    optimiser_dtype = jnp.result_type(float)
+    unbounded = dataclasses.replace(
+        first_parameters, motion=motion.unbounded(first_parameters.motion)
+    )
+    first_scaled = jax.tree.map(lambda a, b: (a / b).astype(optimiser_dtype), unbounded, scale)
 
-    def actual(scaled):
-        found = jax.tree.map(lambda a, b: a.astype(dtype) * b, scaled, scale)
-        return dataclasses.replace(found, motion=motion.bounded(found.motion))
+    def parameters_of(scaled):
+        solution = jax.tree.map(lambda a, b: a.astype(dtype) * b, scaled, scale)
+        return dataclasses.replace(solution, motion=motion.bounded(solution.motion))
 
     weight = _weight(recording, rates)
     solver = options.solver or LevenbergMarquardt(_OFFSET, float(jnp.finfo(dtype).eps) ** 0.75)
-    expected = _expected(recording, options)
+    expected = _expected_square_sum(recording, options)
     # of one residual: 1 where the noise is known
-    noise = jnp.sqrt(expected / _data(recording))
+    noise = jnp.sqrt(expected / _data_count(recording))
     noise = jnp.where(jnp.isfinite(noise), noise, 0.1 / weight)
 
-    layout = unknowns(begin, model_of(jax.tree.map(lambda leaf: leaf[0], bases)))
-    count = _data(recording)
+    layout = unknowns(first_parameters, model_of(jax.tree.map(lambda leaf: leaf[0], bases)))
+    count = _data_count(recording)
     trusted = noise_is_trusted(options)
 
     @jax.jit
-    def linear_at(shared, own, within, base):
-        # traced once, however often the optimiser asks
-        return linearise(shared, own, layout, within, model_of(base))
+    def linear_at(shared, own, data_part, base):
+        # jit: traced once, however often the optimiser evaluates it
+        return linearise(shared, own, layout, data_part, model_of(base))
 
     def prior_unit(linear):
         """Noise of the residuals, the unit in which the calibration's prior is weighed.
@@ -144,19 +345,20 @@ def solve(recording: Recording, options: FitOptions) -> Solution:
         return jnp.maximum(unit, _LEAST_NOISE * typical)
 
     def misfits(scaled, job):
-        base, within, belief = job
-        parameters = actual(scaled)
+        base, data_part, shape_weight = job
+        parameters = parameters_of(scaled)
         values = unknowns(parameters, model_of(base))
-        # The Jacobian is made here, once and by blocks: what the optimiser differentiates is linear
+        # Residuals and Jacobian are computed here together, by blocks. The optimiser then
+        # differentiates a linear function: its own Jacobian costs no further integration.
         at = jax.lax.stop_gradient((values.shared, values.own))
-        linear = linear_at(*at, within, base)
+        linear = linear_at(*at, data_part, base)
         misfit = linear.shifted(values.shared - at[0], values.own - at[1])
         unit = jax.lax.stop_gradient(prior_unit(linear))
-        rows = [misfit.ravel(), belief * scaled.shape.astype(dtype)]
-        rows += [unit * part for part in departures(parameters, recording, model_of(base))]
-        return (weight * jnp.concatenate(rows)).astype(wide), linear
+        rows = [misfit.ravel(), shape_weight * scaled.shape.astype(dtype)]
+        rows += [unit * part for part in prior_residuals(parameters, recording, model_of(base))]
+        return (weight * jnp.concatenate(rows)).astype(optimiser_dtype), linear
 
-    jobs = _jobs(bases.soft.shape[0], options.max_starts)
+    jobs = _sequence_of_fits(bases.soft.shape[0], options.max_starts)
     which, part = (jnp.asarray(column) for column in (jobs["base"], jobs["part"]))
     part = part.astype(dtype)
     span = recording.times[:, -1:] - recording.times[:, :1]
@@ -165,54 +367,81 @@ def solve(recording: Recording, options: FitOptions) -> Solution:
     def attempt(search):
         job = search.job
         early = (elapsed <= part[job] * span).astype(dtype)
-        within = recording.present * early
-        within = eqx.tree_at(lambda r: r.present, recording, within)
+        data_part = recording.present * early
+        data_part = eqx.tree_at(lambda r: r.present, recording, data_part)
         base = jax.tree.map(lambda leaf: leaf[which[job]], bases)
-        anew = jnp.asarray(jobs["anew"])[job]
-        belief = jnp.where(part[job] < 1, noise / _SPREAD, 0)
-        start = jax.tree.map(lambda a, b: jnp.where(anew, a, b), fresh, search.scaled)
-        found = optx.least_squares(
-            misfits, solver, start, (base, within, belief),
-            has_aux=True, max_steps=options.max_steps, throw=False,
-        )  # fmt: skip
-        # the auxiliary output of the last accepted step; ``found.aux`` is that of the one before
-        linear = found.state.aux
+        restarts = jnp.asarray(jobs["anew"])[job]
+        shape_weight = jnp.where(part[job] < 1, noise / _SPREAD, 0)
+        start = jax.tree.map(lambda a, b: jnp.where(restarts, a, b), first_scaled, search.scaled)
+        solution = optx.least_squares(
+            misfits,
+            solver,
+            start,
+            (base, data_part, shape_weight),
+            has_aux=True,
+            max_steps=options.max_steps,
+            throw=False,
+        )
+        # the auxiliary output of the last accepted step; ``solution.aux`` is that of the one before
+        linear = solution.state.aux
         cost = jnp.sum(linear.rest**2) / 2
         cost = cost + prior_unit(linear) ** 2 * prior_cost(
-            actual(found.value), recording, model_of(base)
+            parameters_of(solution.value), recording, model_of(base)
         )
-        whole = part[job] == 1
-        better = whole & (cost < search.cost)
-        # two starts that lead to one place leave little hope for a third
-        again = whole & (jnp.abs(cost - search.cost) < _SAME * cost)
-        new = (found.value, base, linear, cost, found.result == optx.RESULTS.successful)
-        old = (search.best, search.base, search.linear, search.cost, search.stopped)
+        uses_all_data = part[job] == 1
+        better = uses_all_data & (cost < search.cost)
+        # Two starts that reach the same optimum end the search: a third rarely finds a better one.
+        same_optimum = uses_all_data & (jnp.abs(cost - search.cost) < _SAME * cost)
+        candidate = (solution.value, base, linear, cost, solution.result == optx.RESULTS.successful)
+        previous = (search.best, search.base, search.linear, search.cost, search.stopped)
         best, base, linear, cost, stopped = jax.tree.map(
-            lambda a, b: jnp.where(better, a, b), new, old
+            lambda a, b: jnp.where(better, a, b), candidate, previous
         )
         return _Search(
-            job + 1, found.value, best, base, linear, cost,
-            search.steps + found.stats["num_steps"], search.attempts + jnp.where(whole, 1, 0),
-            stopped, stopped & (again | (misfit_of(linear, options.robust) <= _GOOD**2 * expected)),
-        )  # fmt: skip
+            job + 1,
+            solution.value,
+            best,
+            base,
+            linear,
+            cost,
+            search.steps + solution.stats["num_steps"],
+            search.attempts + jnp.where(uses_all_data, 1, 0),
+            stopped,
+            stopped & (same_optimum | (misfit_of(linear, options.robust) <= _GOOD**2 * expected)),
+        )
 
     one = jax.tree.map(lambda leaf: leaf[0], bases)
-    _, struct = jax.eval_shape(misfits, fresh, (one, recording, noise))
-    nothing = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), struct)
-    # the body to begin with, should no attempt come to an end
+    _, struct = jax.eval_shape(misfits, first_scaled, (one, recording, noise))
+    empty_linear = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), struct)
+    # the starting body, in case no attempt finishes
     body = entries_of(inertia_of_second_moments(first), model_of(one).entries)
-    nothing = nothing._replace(at=nothing.at.at[: body.shape[0]].set(body))
-    begun = _Search(
-        jnp.asarray(0), fresh, fresh, one, nothing, jnp.asarray(jnp.inf, dtype),
-        jnp.asarray(0), jnp.asarray(0), jnp.asarray(False), jnp.asarray(False),
-    )  # fmt: skip
+    empty_linear = empty_linear._replace(at=empty_linear.at.at[: body.shape[0]].set(body))
+    first_search = _Search(
+        jnp.asarray(0),
+        first_scaled,
+        first_scaled,
+        one,
+        empty_linear,
+        jnp.asarray(jnp.inf, dtype),
+        jnp.asarray(0),
+        jnp.asarray(0),
+        jnp.asarray(False),
+        jnp.asarray(False),
+    )
     last = len(jobs["base"])
-    ended = jax.lax.while_loop(lambda s: (s.job < last) & ~s.good, attempt, begun)
-    model = model_of(ended.base)
+    last_search = jax.lax.while_loop(lambda s: (s.job < last) & ~s.good, attempt, first_search)
+    model = model_of(last_search.base)
     return Solution(
-        actual(ended.best), model, whole_of(ended.linear.at, model.entries), ended.linear,
-        ended.cost, ended.steps, ended.attempts, ended.stopped, expected,
-    )  # fmt: skip
+        parameters_of(last_search.best),
+        model,
+        whole_of(last_search.linear.at, model.entries),
+        last_search.linear,
+        last_search.cost,
+        last_search.steps,
+        last_search.attempts,
+        last_search.stopped,
+        expected,
+    )
 
 
 def _sensor_start(
@@ -230,12 +459,12 @@ def _sensor_start(
     }
 
 
-def _data(recording: Recording) -> Float[Array, ""]:
+def _data_count(recording: Recording) -> Float[Array, ""]:
     """How many numbers were measured."""
-    return size_of_data(recording, 3 * _kinds(recording))
+    return size_of_data(recording, 3 * _channel_count(recording))
 
 
-def _jobs(bases: int, attempts: int) -> dict[str, np.ndarray]:
+def _sequence_of_fits(bases: int, attempts: int) -> dict[str, np.ndarray]:
     """What is fitted in turn: the first two to all data, then each start to growing parts."""
     tries = [[(base, 1.0, True)] for base in range(min(bases, 2))]
     for base in range(bases):
@@ -251,33 +480,35 @@ def misfit_of(linear: Linear, robust: Huber | None) -> Float[Array, ""]:
     return jnp.sum(square if robust is None else jnp.minimum(square, robust.threshold**2))
 
 
-def _kinds(recording: Recording) -> int:
+def _channel_count(recording: Recording) -> int:
     """How many of rates, attitudes and forces there are."""
     return sum(part is not None for part in (recording.omega, recording.wxyz, recording.force))
 
 
-def _expected(recording: Recording, options: FitOptions) -> Float[Array, ""]:
+def _expected_square_sum(recording: Recording, options: FitOptions) -> Float[Array, ""]:
     """The sum of squares that noise alone would leave.
 
     An unknown noise is taken from neighbouring samples; without rates nothing is known of it.
     """
-    expected = _data(recording)
+    expected = _data_count(recording)
     if noise_is_trusted(options):
         return expected
     if recording.omega is None:
         return jnp.full_like(expected, jnp.inf)
-    omega_noise = needed("omega_noise", recording.omega_noise)
-    seen = jax.vmap(scatter)(recording.times, recording.omega, recording.present)
-    seen = seen / jnp.mean(omega_noise, axis=(1, 2)) ** 2
-    # recordings without five samples in a row tell nothing
-    told = jnp.isfinite(seen)
-    count = jnp.maximum(jnp.sum(told), 1).astype(seen.dtype)
-    mean = jnp.sum(jnp.where(told, seen, 0)) / count
-    mean = jnp.where(jnp.any(told), mean, jnp.inf)
-    # readings without any noise are met to what the optimiser takes for rounding at best
+    omega_noise = require_channel("omega_noise", recording.omega_noise)
+    variance = jax.vmap(neighbour_noise_variance)(
+        recording.times, recording.omega, recording.present
+    )
+    variance = variance / jnp.mean(omega_noise, axis=(1, 2)) ** 2
+    # infinite for recordings without five samples in a row
+    is_finite = jnp.isfinite(variance)
+    count = jnp.maximum(jnp.sum(is_finite), 1).astype(variance.dtype)
+    mean = jnp.sum(jnp.where(is_finite, variance, 0)) / count
+    mean = jnp.where(jnp.any(is_finite), mean, jnp.inf)
+    # noise-free readings can be fitted only to the optimiser's tolerance
     rounding = float(jnp.finfo(mean.dtype).eps) ** 0.75
-    least = rounding**2 * jnp.mean((recording.omega / omega_noise) ** 2)
-    return expected * jnp.maximum(mean, least)
+    least_variance = rounding**2 * jnp.mean((recording.omega / omega_noise) ** 2)
+    return expected * jnp.maximum(mean, least_variance)
 
 
 def _weight(recording: Recording, rates: Array) -> Float[Array, ""]:
@@ -287,13 +518,13 @@ def _weight(recording: Recording, rates: Array) -> Float[Array, ""]:
     """
     total = jnp.zeros((), rates.dtype)
     if recording.omega is not None:
-        noise = needed("omega_noise", recording.omega_noise)
+        noise = require_channel("omega_noise", recording.omega_noise)
         total += jnp.sum(recording.present[..., None] * (rates / noise) ** 2)
     if recording.wxyz is not None:
-        noise = needed("attitude_noise", recording.attitude_noise)
+        noise = require_channel("attitude_noise", recording.attitude_noise)
         total += jnp.sum(recording.present / noise**2)
     if recording.force is not None:
-        noise = needed("force_noise", recording.force_noise)
+        noise = require_channel("force_noise", recording.force_noise)
         total += jnp.sum(recording.present[..., None] * (recording.force / noise) ** 2)
     mean = total / rates.shape[0]
     return 10 / jnp.sqrt(jnp.where(mean > 0, mean, 1))
@@ -302,12 +533,12 @@ def _weight(recording: Recording, rates: Array) -> Float[Array, ""]:
 def _rates(recording: Recording) -> Float[Array, "r t 3"]:
     """Measured rates, or those between successive attitudes; gaps filled by interpolation."""
     if recording.omega is None:
-        wxyz = needed("wxyz", recording.wxyz)
+        wxyz = require_channel("wxyz", recording.wxyz)
         step = jnp.diff(recording.times, axis=-1)[..., None]
-        between = turn_between(wxyz[:, :-1], wxyz[:, 1:]) / step
+        between = rotation_vector_between(wxyz[:, :-1], wxyz[:, 1:]) / step
         inner = (between[:, 1:] + between[:, :-1]) / 2
         return jnp.concatenate([between[:, :1], inner, between[:, -1:]], axis=1)
-    return bridged(recording.times, recording.present, recording.omega)
+    return interpolate_gaps(recording.times, recording.present, recording.omega)
 
 
 def _bases(
@@ -321,19 +552,19 @@ def _bases(
     if unknown.columns().shape[1] == 0:
         first = jnp.eye(3, dtype=rates.dtype)
         return jax.tree.map(lambda leaf: leaf[None], base_of(first, True)), first
-    carried = None
+    wheel_momentum = None
     if isinstance(motion, SteppedMotion) and motion.spin_inertia is not None:
         axis = jnp.asarray(motion.axis, rates.dtype)
-        wheel = needed("wheel", recording.wheel)
-        carried = motion.spin_inertia * wheel[..., None] * axis[None, None]
-    first, second, _ = regression(rates, recording.times, recording.present, carried)
+        wheel = require_channel("wheel", recording.wheel)
+        wheel_momentum = motion.spin_inertia * wheel[..., None] * axis[None, None]
+    first, second, _ = regression(rates, recording.times, recording.present, wheel_momentum)
     if initial is not None:
         first = second_moments(initial.tensor)
-    bodies = jnp.stack([first, second, *alternatives(rates, first)])
+    bodies = jnp.stack([first, second, *alternative_starts(rates, first)])
     if unknown.columns().shape[1] == 3:
         bodies = bodies * jnp.eye(3, dtype=bodies.dtype)[None]
-    known = motion.fixes_scale()
-    return jax.vmap(lambda sigma: base_of(sigma, known))(bodies), bodies[0]
+    scale_known = motion.fixes_scale()
+    return jax.vmap(lambda sigma: base_of(sigma, scale_known))(bodies), bodies[0]
 
 
 def _scale(begin: Parameters, recording: Recording, rates: Array) -> Parameters:

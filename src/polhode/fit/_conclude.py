@@ -1,0 +1,489 @@
+"""Conclusions from the solution of a fit: covariance, observability and diagnostics."""
+
+import dataclasses
+from collections.abc import Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.stats import norm
+from jaxtyping import Array, Float
+
+from polhode._scene import State
+from polhode.fit._model import Parameters, entries_of, whole_of
+from polhode.fit._numerics import eigh, inverse, svd
+from polhode.fit._options import FitOptions, Gyroscope, noise_is_trusted
+from polhode.fit._recording import Recording, require_channel, rotation_vector_between, size_of_data
+from polhode.fit._residuals import Linear, prior_of
+from polhode.fit._result import (
+    MAX_NULL_PART,
+    Finding,
+    Fit,
+    InertiaEstimate,
+)
+from polhode.fit._solve import Solution, misfit_of
+from polhode.inertia import Inertia, principal
+from polhode.rotation import multiply, rotation_vector_to_wxyz
+
+
+def combine_flags(conditions: Mapping[Finding, Array]) -> Array:
+    """Sum of the flags whose conditions are true (under jit and vmap)."""
+    return sum((jnp.where(x, int(flag), 0) for flag, x in conditions.items()), start=jnp.asarray(0))
+
+
+class Determination(NamedTuple):
+    """How far the data determine p unknowns: ``information`` and ``covariance`` (p, p), directions
+    ``null`` (p, p) that they do not show (zero columns for the others), natural sizes ``safe`` (p,)
+    of 1 over an unknown, how many are not shown, ``noise`` of the residuals over that assumed,
+    ``prior_std`` (p,): of the calibration, infinite for unknowns without a prior."""
+
+    information: Array
+    covariance: Array
+    null: Array
+    safe: Array
+    null_count: Array
+    noise: Array
+    prior_std: Array
+
+
+def determination_of(solution: Solution, recording: Recording, trust_noise: bool) -> Determination:
+    """What the Jacobian of a fit says about its unknowns, in the order shared, then own.
+
+    Unknowns with a prior (the sensor's calibration) are eliminated: conditional on them the
+    covariance of the others is the pseudo-inverse of their information, so a direction that the
+    data do not show is found by the data alone, whatever the prior, and in single precision too.
+    """
+    linear = solution.linear
+    information = linear.information()
+    dtype = information.dtype
+    has_prior, precision = _priors(solution, recording)
+    free = np.flatnonzero(~has_prior)
+    inner = information[np.ix_(free, free)]
+    # Scaled to unit diagonal: the threshold of a null direction must not depend on units.
+    size = jnp.sqrt(jnp.diagonal(inner))
+    safe = jnp.where(size > 0, size, 1)
+    values, vectors = eigh(inner / safe[:, None] / safe[None])
+    determined = values > 1e3 * float(jnp.finfo(dtype).eps) * values[-1]
+    inverted = jnp.where(determined, 1 / jnp.where(determined, values, 1), 0)
+    covariance = (vectors * inverted[None]) @ vectors.T / safe[:, None] / safe[None]
+    null = jnp.where(determined, 0, 1)[None] * vectors / safe[:, None]
+    used = jnp.sum(determined).astype(dtype)
+    square = jnp.sum(linear.rest**2)
+    total = size_of_data(recording, linear.rest.shape[-1])
+    prior_std = jnp.full(has_prior.size, jnp.inf, dtype)
+    if not has_prior.any():
+        noise = jnp.sqrt(square / jnp.maximum(total - used, 1))
+        variance = jnp.asarray(1, dtype) if trust_noise else noise**2
+        return Determination(
+            information, covariance * variance, null, safe, jnp.sum(~determined), noise, prior_std
+        )
+    with_prior_index = np.flatnonzero(has_prior)
+    cross = information[np.ix_(free, with_prior_index)]
+    width = precision**-0.5
+    correction = covariance @ cross
+    # information of the data about the calibration, its unit the standard deviation of the prior
+    block = information[np.ix_(with_prior_index, with_prior_index)]
+    data = (block - cross.T @ correction) * width[:, None] * width[None]
+    gained_information, axes = eigh((data + data.T) / 2)
+    # The difference of two large matrices: values below its rounding error are no information.
+    rounding = 1e3 * float(jnp.finfo(dtype).eps) * jnp.max(jnp.diagonal(block) * width**2)
+    gained_information = jnp.where(gained_information > rounding, gained_information, 0)
+    # Degrees of freedom: an unknown with a prior counts by the part that the data determine.
+    noise = jnp.sqrt(square / jnp.maximum(total - used, 1))
+    noise = jnp.sqrt(
+        square
+        / jnp.maximum(
+            total - used - jnp.sum(gained_information / (gained_information + noise**2)), 1
+        )
+    )
+    variance = jnp.asarray(1, dtype) if trust_noise else noise**2
+    # the mean of 1 / (information / variance + 1) by directions
+    spread = (
+        axes * (1 / (gained_information / jnp.where(variance > 0, variance, 1) + 1))[None]
+    ) @ axes.T
+    spread = jnp.where(variance > 0, spread, 0) if not trust_noise else spread
+    spread = spread * width[:, None] * width[None]
+    beside = -correction @ spread
+    full = jnp.zeros_like(information)
+    full = full.at[np.ix_(free, free)].set(covariance * variance - beside @ correction.T)
+    full = (
+        full.at[np.ix_(free, with_prior_index)]
+        .set(beside)
+        .at[np.ix_(with_prior_index, free)]
+        .set(beside.T)
+    )
+    full = full.at[np.ix_(with_prior_index, with_prior_index)].set(spread)
+    order = jnp.zeros((has_prior.size, has_prior.size), dtype).at[np.ix_(free, free)].set(null)
+    sizes = jnp.ones(has_prior.size, dtype).at[free].set(safe).at[with_prior_index].set(1 / width)
+    with_prior = information.at[with_prior_index, with_prior_index].add(precision * variance)
+    prior_std = prior_std.at[with_prior_index].set(width)
+    return Determination(with_prior, full, order, sizes, jnp.sum(~determined), noise, prior_std)
+
+
+def _priors(solution: Solution, recording: Recording) -> tuple[np.ndarray, Array]:
+    """Which unknowns, in the order shared, then own, have a prior (static), and its precisions."""
+    parameters, model = solution.parameters, solution.model
+    prior = prior_of(parameters, recording, model)
+    shared = [np.zeros(model.entries, bool)]
+    motion = jax.tree.leaves(parameters.motion)
+    for name in ("bias", "mounting", "lever", "motion", "gain", "delay"):
+        if name == "motion":
+            for leaf, precision in zip(motion, prior.motion, strict=True):
+                shared.append(np.full(leaf.size, precision is not None))
+            continue
+        size = sum(leaf.size for leaf in jax.tree.leaves(getattr(parameters, name)))
+        shared.append(np.full(size, getattr(prior, name, None) is not None))
+    of_recording = [
+        np.zeros(0 if x is None else 3, bool) for x in (parameters.omega, parameters.attitude)
+    ]
+    walk = np.ones(0 if parameters.walk is None else parameters.walk[0].size, bool)
+    recordings = parameters.omega.shape[0]
+    has_prior = np.concatenate([*shared, *[np.concatenate([*of_recording, walk])] * recordings])
+    each = [prior.bias, *prior.motion, prior.gain, prior.delay, prior.walk]
+    flat = [jnp.ravel(x) for x in each if x is not None]
+    dtype = parameters.omega.dtype
+    return has_prior, jnp.concatenate([jnp.zeros(0, dtype), *flat]).astype(dtype)
+
+
+class _Split(NamedTuple):
+    """Standard deviations of the unknowns that recordings share, sorted by what they are of."""
+
+    entries: Array
+    sensor: dict[str, Array]
+    motion: list[Array]
+
+
+def _split(shared: Array, count: int, parameters: Parameters) -> _Split:
+    """``shared`` (s,), in the order of ``Unknowns``, by what it is of."""
+    first = count
+    sensor, motion = {}, []
+
+    def part(like):
+        nonlocal first
+        first += like.size
+        return shared[first - like.size : first].reshape(like.shape)
+
+    for name in ("bias", "mounting", "lever"):
+        if (value := getattr(parameters, name)) is not None:
+            sensor[name] = part(value)
+    for leaf in jax.tree.leaves(parameters.motion):
+        motion.append(part(leaf))
+    if parameters.gain is not None:
+        sensor["gain"] = part(parameters.gain).reshape(3, 3)
+    if parameters.delay is not None:
+        sensor["delay"] = part(parameters.delay)
+    return _Split(shared[:count], sensor, motion)
+
+
+def _sensor(parameters: Parameters, gyroscope: Gyroscope) -> dict[str, Array]:
+    """The fitted unknowns of the sensors by name: gain, bias and delay with those calibrated."""
+    names = ("bias", "mounting", "lever", "gain", "delay")
+    parts = {name: getattr(parameters, name) for name in names}
+    parts = {name: part for name, part in parts.items() if part is not None}
+    gain = None if gyroscope.gain is None else gyroscope.gain.astype(parameters.omega.dtype)
+    if "gain" in parts:
+        parts["gain"] = jnp.eye(3, dtype=parts["gain"].dtype) + parts["gain"].reshape(3, 3)
+        if gain is not None:
+            parts["gain"] = gain @ parts["gain"]
+    if "bias" in parts:
+        if gain is not None:
+            parts["bias"] = gain @ parts["bias"]
+        if gyroscope.bias is not None:
+            parts["bias"] = parts["bias"] + gyroscope.bias.astype(parts["bias"].dtype)
+    if "delay" in parts:
+        parts["delay"] = parts["delay"] + gyroscope.delay
+    return parts
+
+
+def _deviations(determination: Determination, count: int) -> Array:
+    """Standard deviations of the first ``count`` unknowns; infinite for what is not shown."""
+    std = jnp.sqrt(jnp.maximum(jnp.diagonal(determination.covariance), 0))
+    null_part = jnp.sqrt(jnp.sum((determination.null * determination.safe[:, None]) ** 2, axis=1))
+    return jnp.where(null_part > MAX_NULL_PART, jnp.inf, std)[:count]
+
+
+def _initial(parameters: Parameters, recording: Recording, attitude: Array | None) -> State:
+    """States at the first time of each recording; ``attitude``: of those without attitudes."""
+    if recording.wxyz is not None:
+        turn = rotation_vector_to_wxyz(require_channel("attitude", parameters.attitude))
+        return State(multiply(recording.wxyz[:, 0], turn), parameters.omega)
+    first = jnp.asarray([1, 0, 0, 0]) if attitude is None else attitude
+    first = first.astype(parameters.omega.dtype)
+    return State(jnp.broadcast_to(first, (*parameters.omega.shape[:-1], 4)), parameters.omega)
+
+
+def _rms(parts: dict[str, Array], recording: Recording) -> Array:
+    """Root mean square of the residual rates, rad/s; NaN without rates."""
+    if recording.omega is None:
+        return jnp.asarray(jnp.nan, recording.times.dtype)
+    square = (parts["omega"] * require_channel("omega_noise", recording.omega_noise)) ** 2
+    return jnp.sqrt(jnp.sum(square) / jnp.sum(recording.present) / 3)
+
+
+def conclude(solution: Solution, recording: Recording, options: FitOptions) -> Fit:
+    """Uncertainty and diagnostics of one body's inertia (under jit and vmap)."""
+    tensor, model, linear = solution.tensor, solution.model, solution.linear
+    parameters = solution.parameters
+    dtype = tensor.dtype
+    count = model.entries
+    entries = entries_of(tensor, count)
+
+    def derived(vector):
+        values, axes, products = principal(whole_of(vector, count))
+        # the largest is one to itself, rounding aside
+        ratios = (values / values[2]).at[2].set(1)
+        return jnp.concatenate([values, ratios, products]), (values, axes)
+
+    slope, (moments, axes) = jax.jacfwd(derived, has_aux=True)(entries)
+    if not model.scale_known:
+        # size that the data do not show: a largest moment of one
+        size = moments[2]
+        tensor, moments = tensor / size, moments / size
+        slope = slope * jnp.where(jnp.arange(9) // 3 == 1, size, 1)[:, None]
+        sizes = jnp.where(jnp.arange(linear.shared.shape[-1]) < count, size, 1)
+        linear = linear._replace(shared=linear.shared * sizes[None, None])
+        solution = dataclasses.replace(solution, linear=linear)
+    determination = determination_of(solution, recording, noise_is_trusted(options))
+    information, covariance, null, safe = determination[:4]
+
+    full = jnp.concatenate([slope, jnp.zeros((9, information.shape[0] - count), dtype)], axis=1)
+    spread = jnp.sqrt(jnp.maximum(jnp.sum((full @ covariance) * full, axis=1), 0))
+    # what leans on a null direction is not known at all
+    leaning = jnp.sqrt(jnp.sum((full @ null) ** 2, axis=1))
+    reach = jnp.sqrt(jnp.sum((full / safe[None]) ** 2, axis=1))
+    reach = jnp.concatenate([reach[:3], reach[:3] / moments[2], reach[6:]])
+    spread = jnp.where(leaning > 1e-3 * reach, jnp.inf, spread)
+    axes_std = turn_std(moments, spread[6:])
+
+    std = _split(_deviations(determination, linear.shared.shape[-1]), count, parameters)
+    parts = residuals_by_channel(linear, recording)
+    whiteness = whiteness_of(linear.rest, recording.present)
+    trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
+    finite = jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(tensor))
+    diagnostics = combine_flags(
+        {
+            Finding.STEP_LIMIT: ~solution.stopped,
+            Finding.NOT_FINITE: ~finite,
+            # the least of the second moments
+            Finding.NEARLY_FLAT: trace / 2 - moments[2] < 1e-4 * trace,
+            Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread[3:6])),
+            Finding.NOT_WHITE: whiteness < 1e-4,
+            Finding.WEAK: jnp.any(spread[3:6] > 0.05),
+            Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
+            Finding.AXES_DISAGREE: _axes_disagree(recording, options),
+            Finding.SATURATED: is_saturated(recording),
+            Finding.CALIBRATION: _calibration_strained(solution, recording),
+            Finding.OUTLIERS: has_outliers(linear.rest, recording, options.robust),
+        }
+    )
+    body = InertiaEstimate(
+        inertia=Inertia(full=tensor),
+        moments=moments,
+        axes=axes,
+        ratios=moments / moments[2],
+        moments_std=spread[:3],
+        ratios_std=spread[3:6],
+        axes_std=axes_std,
+        scale_known=model.scale_known,
+        handedness_known=recording.wxyz is not None,
+    )
+    return Fit(
+        values=[tensor, *jax.tree.leaves(parameters.motion)],
+        std=[symmetric_std(std.entries), *std.motion],
+        sensor=_sensor(parameters, solution.model.gyroscope),
+        sensor_std=std.sensor,
+        initial=_initial(parameters, recording, None),
+        information=information,
+        covariance=covariance,
+        null_count=determination.null_count,
+        noise=determination.noise,
+        whiteness=whiteness,
+        rms=_rms(parts, recording),
+        diagnostics=diagnostics,
+        steps=solution.steps,
+        attempts=solution.attempts,
+        residuals=parts,
+        parameters=parameters,
+        model=model,
+        _inertia=body,
+    )
+
+
+def conclude_scene(solution: Solution, recording: Recording, options: FitOptions) -> Fit:
+    """Values, uncertainty and diagnostics of one body's scene (under jit and vmap)."""
+    linear, parameters = solution.linear, solution.parameters
+    determination = determination_of(solution, recording, noise_is_trusted(options))
+    spread = _deviations(determination, linear.shared.shape[-1])
+    std = _split(spread, 0, parameters)
+    parts = residuals_by_channel(linear, recording)
+    whiteness = whiteness_of(linear.rest, recording.present)
+    finite = jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(linear.at))
+    diagnostics = combine_flags(
+        {
+            Finding.STEP_LIMIT: ~solution.stopped,
+            Finding.NOT_FINITE: ~finite,
+            Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread)),
+            Finding.AT_BOUND: solution.model.motion.at_bound(parameters.motion),
+            Finding.NOT_WHITE: whiteness < 1e-4,
+            Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
+            Finding.SATURATED: is_saturated(recording),
+            Finding.CALIBRATION: _calibration_strained(solution, recording),
+            Finding.OUTLIERS: has_outliers(linear.rest, recording, options.robust),
+        }
+    )
+    attitude = getattr(options.motion, "attitude", None)
+    return Fit(
+        values=list(parameters.motion),
+        std=std.motion,
+        sensor=_sensor(parameters, solution.model.gyroscope),
+        sensor_std=std.sensor,
+        initial=_initial(parameters, recording, attitude),
+        information=determination.information,
+        covariance=determination.covariance,
+        null_count=determination.null_count,
+        noise=determination.noise,
+        whiteness=whiteness,
+        rms=_rms(parts, recording),
+        diagnostics=diagnostics,
+        steps=solution.steps,
+        attempts=solution.attempts,
+        residuals=parts,
+        parameters=parameters,
+        model=solution.model,
+    )
+
+
+def symmetric_std(entries: Float[Array, " e"]) -> Float[Array, "3 3"]:
+    """Standard deviations of a tensor from those of its entries; zero for products left out."""
+    return whole_of(entries, entries.shape[0])
+
+
+def turn_std(moments: Float[Array, "3"], products_std: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Standard deviations [rad] about the principal axes of those of the products of inertia."""
+    gaps = jnp.stack([moments[2] - moments[1], moments[2] - moments[0], moments[1] - moments[0]])
+    return jnp.where(gaps > 0, products_std / jnp.where(gaps > 0, gaps, 1), jnp.inf)
+
+
+def sensor_axes(recording: Recording) -> Float[Array, "*b 3 3"]:
+    """Matrix M (..., 3, 3) with ``rates = M (rates of the attitudes)``, by linear regression.
+
+    The identity for a gyroscope aligned with the attitudes' body axes; near -1 in place of 1 on the
+    diagonal for an inverted axis, a permutation for exchanged ones, a rotation for a mounting.
+    """
+    measured, from_attitudes = _turns(recording, centred=False)
+    mixed = jnp.einsum("...ti,...tj->...ij", measured, from_attitudes)
+    square = jnp.einsum("...ti,...tj->...ij", from_attitudes, from_attitudes)
+    return mixed @ inverse(square)
+
+
+def is_saturated(recording: Recording) -> Array:
+    """Whether readings of the gyroscope are at its limits."""
+    if recording.saturated is None:
+        return jnp.asarray(False)
+    return jnp.any((recording.saturated != 0) & (recording.present[..., None] > 0))
+
+
+def _calibration_strained(solution: Solution, recording: Recording) -> Array:
+    """Whether an unknown of the calibration is more than 3.5 standard deviations off its prior."""
+    far = jnp.asarray(False)
+    for name, precision in (
+        prior_of(solution.parameters, recording, solution.model)._asdict().items()
+    ):
+        if name != "motion" and precision is not None:
+            value = getattr(solution.parameters, name)
+            far = far | jnp.any(value**2 * precision > 3.5**2)
+    return far
+
+
+def has_outliers(rest: Array, recording: Recording, robust: Any) -> Array:
+    """Whether single residuals (r, t, c) are far off where the fit counts them by their square.
+
+    Three at least and 0.3 % of all beyond five sigma, sigma from the median, their neighbours
+    within three: a model that lacks something leaves runs, not single samples.
+    """
+    if robust is not None:
+        return jnp.asarray(False)
+    measured = (recording.present > 0)[..., None] & jnp.ones(rest.shape, bool)
+    if recording.saturated is not None:
+        # rates are the first channels; at a limit a residual may be zero
+        measured = measured.at[..., :3].set(measured[..., :3] & (recording.saturated == 0))
+    size = jnp.where(measured, jnp.abs(rest), jnp.nan)
+    scale = 1.4826 * jnp.nanmedian(size, axis=1, keepdims=True)
+    far = jnp.nan_to_num(size / jnp.where(scale > 0, scale, jnp.inf))
+    ends = jnp.pad(far, ((0, 0), (1, 1), (0, 0)))
+    alone = (far > 5) & (ends[:, :-2] < 3) & (ends[:, 2:] < 3)
+    count, total = (jnp.sum(x.astype(rest.dtype)) for x in (alone, measured))
+    return (count >= 3) & (count >= 0.003 * total)
+
+
+def _axes_disagree(recording: Recording, options: FitOptions) -> Array:
+    """Whether gyroscope and attitudes contradict each other beyond any mounting rotation."""
+    if recording.omega is None or recording.wxyz is None:
+        return jnp.asarray(False)
+    measured, from_attitudes = _turns(recording, centred=options.bias)
+    # the proper rotation nearest to the correlation of both, and how much its mirror image gains
+    left_vectors, sizes, right_vectors = svd(jnp.einsum("rti,rtj->ij", measured, from_attitudes))
+    hand = jnp.sign(jnp.linalg.det(left_vectors) * jnp.linalg.det(right_vectors))
+    inverted = (hand < 0) & (sizes[2] > 0.1 * sizes[1])
+    if options.mounting:
+        return inverted
+    signs = jnp.stack([jnp.ones_like(hand), jnp.ones_like(hand), hand])
+    turn = left_vectors @ (signs[:, None] * right_vectors)
+    # less than this is a turn of more than 60 degrees between the axes
+    return inverted | (turn[0, 0] + turn[1, 1] + turn[2, 2] < 2)
+
+
+def _turns(recording: Recording, centred: bool) -> tuple[Array, Array]:
+    """Turns between samples by the rates and by the attitudes (..., T-1, 3).
+
+    ``centred``: less their means, whose difference may be the gyroscope's bias.
+    """
+    wxyz, omega = require_channel("wxyz", recording.wxyz), require_channel("omega", recording.omega)
+    weight = (recording.present[..., 1:] * recording.present[..., :-1])[..., None]
+    step = jnp.diff(recording.times, axis=-1)[..., None]
+    measured = step * (omega[..., 1:, :] + omega[..., :-1, :]) / 2
+    turned = rotation_vector_between(wxyz[..., :-1, :], wxyz[..., 1:, :])
+    if centred:
+        total = jnp.sum(weight, axis=-2, keepdims=True)
+        measured, turned = (
+            x - jnp.sum(weight * x, axis=-2, keepdims=True) / total for x in (measured, turned)
+        )
+    return weight * measured, weight * turned
+
+
+def residuals_by_channel(linear: Linear, recording: Recording) -> dict[str, Array]:
+    """Residuals of rates, attitudes and forces, each (r, t, 3), over their noise."""
+    parts, channel = {}, 0
+    kinds = {"omega": recording.omega, "attitude": recording.wxyz, "force": recording.force}
+    for name, measured in kinds.items():
+        if measured is not None:
+            parts[name] = linear.rest[..., channel : channel + 3]
+            channel += 3
+    return parts
+
+
+@partial(jax.jit, static_argnames="lags")  # one program, not one for each operation
+def whiteness_of(rest: Array, present: Array, lags: int = 5) -> Array:
+    """Ljung-Box probability of the first autocorrelations of all channels together."""
+    total = jnp.sum(present, axis=-1)[:, None]
+    # recordings that only fill a batch up have no samples and count nothing
+    filled = total > 0
+    total = jnp.where(filled, total, lags + 1)
+    rest = (rest - (jnp.sum(rest, axis=1) / total)[:, None]) * present[..., None]
+    power = jnp.sum(rest**2, axis=1)
+    safe = jnp.where(power > 0, power, 1)
+    later = jnp.pad(rest, ((0, 0), (0, lags), (0, 0)))
+
+    def one(lag):
+        moved = jax.lax.dynamic_slice_in_dim(later, lag, rest.shape[1], axis=1)
+        correlation = jnp.sum(rest * moved, axis=1) / safe
+        return jnp.sum(correlation**2 / (total - lag.astype(total.dtype)) * total * (total + 2))
+
+    statistic = jnp.sum(jax.lax.map(one, jnp.arange(1, lags + 1)))
+    # Chi-square of many degrees by Wilson and Hilferty (PNAS 17 (1931) 684): the exact one would
+    # take longer to compile than all else here.
+    degrees = lags * rest.shape[-1] * jnp.sum(filled).astype(rest.dtype)
+    spread = 2 / (9 * degrees)
+    return norm.sf(((statistic / degrees) ** (1 / 3) - 1 + spread) / spread**0.5)

@@ -1,0 +1,195 @@
+"""Linear algebra, least-squares steps and compiler options of fits."""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+import optimistix as optx
+from jax.core import Tracer
+from jax.errors import JaxRuntimeError
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array
+
+# Faster compilation of fits, where the compiler has the option.
+
+# XLA's older way to emit loops: for what a fit does the program is as fast and compiles in half the
+# time. The jaxlib of jax 0.10 knows the option, that of 0.12 no longer.
+_OPTIONS: dict[str, Any] = {"compiler_options": {"xla_cpu_use_fusion_emitters": False}}
+
+
+def compiled(function: Callable) -> Callable:
+    """``eqx.filter_jit`` that compiles faster on processors, where this is the outermost jit."""
+    inner = eqx.filter_jit(function)
+    outermost = eqx.filter_jit(function, **_OPTIONS)
+
+    @functools.wraps(function)
+    def call(*args):
+        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(args))
+        return (inner if traced or not _option_is_supported() else outermost)(*args)
+
+    return call
+
+
+@functools.cache
+def _option_is_supported() -> bool:
+    """Whether this jaxlib knows the options."""
+    if jax.default_backend() != "cpu":
+        return False
+    try:
+        jax.jit(lambda x: -x, **_OPTIONS)(1.0)
+    except (JaxRuntimeError, ValueError):
+        return False
+    return True
+
+
+# LAPACK calls for one matrix at a time: batched calls can deadlock.
+#
+# The jaxlib of jax 0.10 hands the matrices of a batch to the threads that run the program and waits
+# for them on one of these threads. When as many calls run at a time as there are threads (two on a
+# machine of two cores), each waits for the others and none returns. Single matrices are not handed
+# to other threads.
+
+# The jaxlib of jax 0.12 works through a batch where it is.
+_AFFECTED = jax.__version_info__ < (0, 12)
+
+
+def _one_matrix_at_a_time(signature: str) -> Callable:
+    """``function`` of single matrices for batches of them too, one after the other."""
+
+    def decorate(function: Callable) -> Callable:
+        looped = jax.custom_batching.sequential_vmap(function)
+
+        def call(*operands):
+            affected = _AFFECTED and jax.default_backend() == "cpu"
+            chosen = looped if affected else function
+            return jnp.vectorize(chosen, signature=signature)(*operands)
+
+        return call
+
+    return decorate
+
+
+@_one_matrix_at_a_time("(n,n)->(n),(n,n)")
+def eigh(matrix: Array) -> tuple[Array, Array]:
+    """Eigenvalues in ascending order and eigenvectors of symmetric matrices (..., n, n)."""
+    return tuple(jnp.linalg.eigh(matrix))
+
+
+@_one_matrix_at_a_time("(n,n),(n)->(n)")
+def solve(matrix: Array, right: Array) -> Array:
+    """``matrix^-1 right`` for matrices (..., n, n)."""
+    return jnp.linalg.solve(matrix, right)
+
+
+@_one_matrix_at_a_time("(n,n)->(n,n)")
+def _inverse(matrix: Array) -> Array:
+    return jnp.linalg.inv(matrix)
+
+
+def inverse(matrix: Array) -> Array:
+    """Inverses of matrices (..., n, n), with derivatives in both modes."""
+    fixed = jax.lax.stop_gradient(matrix)
+    found = _inverse(fixed)
+    return found - found @ (matrix - fixed) @ found  # loops of single matrices have none
+
+
+@_one_matrix_at_a_time("(n,n)->(n,n),(n),(n,n)")
+def svd(matrix: Array) -> tuple[Array, Array, Array]:
+    """Singular value decomposition of square matrices (..., n, n)."""
+    return tuple(jnp.linalg.svd(matrix))
+
+
+@_one_matrix_at_a_time("(m,n)->(k,n)")
+def triangle(matrix: Array) -> Array:
+    """The triangular factors R (..., min(m, n), n) of ``matrix = Q R``."""
+    return jnp.linalg.qr(matrix, mode="r")
+
+
+@_one_matrix_at_a_time("(m,n),(m)->(n)")
+def least_squares(matrix: Array, right: Array) -> Array:
+    """The x (..., n) that makes ``matrix x - right`` smallest; columns independent, m > n."""
+    count = matrix.shape[1]
+    factor = jnp.linalg.qr(jnp.concatenate([matrix, right[:, None]], axis=1), mode="r")
+    return jax.scipy.linalg.solve_triangular(factor[:count, :count], factor[:count, count])
+
+
+class LeastSquares(lx.AbstractLinearSolver):
+    """``least_squares`` as a solver of lineax: what ``lineax.QR`` does, one matrix at a time."""
+
+    def init(self, operator: lx.AbstractLinearOperator, options: dict[str, Any]):
+        return operator
+
+    def compute(self, state: lx.AbstractLinearOperator, vector, options: dict[str, Any]):
+        right, _ = ravel_pytree(vector)
+        unknown = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state.in_structure())
+        _, unravel = ravel_pytree(unknown)
+        return unravel(least_squares(state.as_matrix(), right)), lx.RESULTS.successful, {}
+
+    def transpose(self, state: lx.AbstractLinearOperator, options: dict[str, Any]):
+        raise NotImplementedError("steps of the optimiser are not differentiated in reverse mode.")
+
+    def conj(self, state: lx.AbstractLinearOperator, options: dict[str, Any]):
+        return state, {}
+
+    def assume_full_rank(self):
+        return True
+
+
+# Levenberg-Marquardt steps of Optimistix with a termination criterion in units of the noise.
+
+# Squared derivatives (of a data vector of norm ten by unknowns of order one) that count as none.
+_FAINT = 1e-6
+
+
+class LevenbergMarquardt(optx.AbstractGaussNewton):
+    """Levenberg-Marquardt that stops when the optimum is near beside its own uncertainty.
+
+    A step is not worth making when the part of the residuals that the linear model can still
+    remove is ``offset`` of what it cannot, each per degree of freedom (the relative offset of Bates
+    and Watts, Technometrics 23 (1981) 179): the estimate is then within about ``offset`` standard
+    deviations of the optimum, in every direction, however long the valley. ``floor`` is the part of
+    the residuals, relative to a data vector of norm ten, that counts as rounding.
+    """
+
+    offset: float
+    floor: float
+    rtol: float
+    atol: float
+    norm: Callable
+    descent: optx.DampedNewtonDescent
+    search: optx.ClassicalTrustRegion
+    verbose: Callable[..., None]
+
+    def __init__(self, offset: float, floor: float):
+        self.offset = offset
+        self.floor = floor
+        # the usual criterion stays as the other way to end
+        self.rtol = self.atol = floor
+        self.norm = optx.max_norm
+        self.descent = optx.DampedNewtonDescent(linear_solver=LeastSquares())
+        # For long valleys: enlarged as soon as the linear model is a fair guide
+        self.search = optx.ClassicalTrustRegion(0.75, 0.1, 4.0, 0.25)
+        self.verbose = _silent
+
+    def terminate(self, fn, y, args, options, state, tags):
+        ended, result = super().terminate(fn, y, args, options, state, tags)
+        jacobian, rest = state.f_info.jac.as_matrix(), state.f_info.residual
+        square, slope = jacobian.T @ jacobian, jacobian.T @ rest
+        size = jnp.sqrt(jnp.diagonal(square))
+        size = jnp.where(size > 0, size, 1)
+        # A direction that the data hardly show, as towards a flat body, is not waited for.
+        ridge = 30 * jnp.finfo(rest.dtype).eps * size.shape[0] + _FAINT / size**2
+        square = square / size[:, None] / size[None] + jnp.diag(ridge)
+        slope = slope / size
+        gain = slope @ solve(square, slope)
+        freedom = max(rest.shape[0] - size.shape[0], 1)
+        bound = self.offset**2 * jnp.sum(rest**2) / freedom * size.shape[0] + self.floor**2
+        return ended | (~state.first_step & (gain < bound)), result
+
+
+def _silent(**_):
+    """No output while it runs."""
