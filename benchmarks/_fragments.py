@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable
 from functools import cache
 from pathlib import Path
 
-from benchmarks import _levels, _page
+from benchmarks import _controller_section, _levels, _page
 from benchmarks._markdown import command, number, rows, source
 from benchmarks._report import RESULTS, ROOT, read
 from benchmarks.cold_tasks import TASKS
@@ -201,6 +201,24 @@ def _() -> str:
 def _() -> str:
     mine = (row for row in _numbers("gradients")["rows"] if row["peer"] == "polhode")
     return _between(row["ratio"] for row in mine)
+
+
+def controller_times() -> str:
+    return _block(
+        _controller_section.least_times(_numbers("controllers")),
+        f"polhode / diffrax Tsit5 / diffrax Dopri8 ({command(read('controllers'))})",
+    )
+
+
+def controller_kinds() -> str:
+    return _block(
+        _controller_section.kinds(_numbers("controllers")), f"({command(read('controllers'))})"
+    )
+
+
+if (RESULTS / "controllers.json").exists():
+    FRAGMENTS["controller-times"] = controller_times
+    FRAGMENTS["controller-kinds"] = controller_kinds
 
 
 # Integrators

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from benchmarks._controller_section import controllers
 from benchmarks._light_curve_section import light_curves
 from benchmarks._markdown import machine, number, rows, source
 from benchmarks._throw_sections import satellites, throw_design, throws, throws_synthetic
@@ -380,7 +381,8 @@ def imports(report: dict) -> list[str]:
 
 SECTIONS = {
     "cold_tasks": cold_tasks, "imports": imports, "plain_calls": plain_calls,
-    "first_calls": first_calls, "gradients": gradients, "scene_cost": scene_cost,
+    "first_calls": first_calls, "gradients": gradients, "controllers": controllers,
+    "scene_cost": scene_cost,
     "scaling": scaling, "identification": identification, "throws": throws,
     "throws_synthetic": throws_synthetic, "throw_design": throw_design, "satellites": satellites,
     "light_curves": light_curves,

@@ -1,6 +1,7 @@
 """simulate: batches, times, records, outcomes per body, derivatives, labelled output."""
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -217,3 +218,92 @@ def test_no_bodies_give_an_empty_trajectory(potential):
     got = ph.simulate(scene, state, [0.0, 1.0, 2.0])
     assert got.wxyz.shape == (0, 3, 4)
     assert got.status.shape == (0,)
+
+
+# Bodies that fail, in a batch with others
+
+FAST = ph.LiePoisson(max_steps=40, chunk=1)
+
+
+class Brake(eqx.Module):
+    """A torque against the rates, and a domain that a fast body leaves at once."""
+
+    gains: jax.Array
+
+    def __call__(self, t, wxyz, omega):
+        return -self.gains * omega * jnp.sqrt(4.0 - jnp.sum(omega**2))
+
+
+GAINS = jnp.array([0.1, 0.2, 0.3])
+
+
+def braked(gains, sizes, **options):
+    sizes = jnp.asarray(sizes)
+    omega = jnp.stack([0.3 * sizes, 0.2 * sizes, sizes], axis=-1)
+    wxyz = jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0, 0.0]), (*sizes.shape, 4))
+    scene = ph.Scene(ph.Inertia.from_moments(MOMENTS), torque=ph.FeedbackTorque(Brake(gains)))
+    return ph.simulate(scene, ph.State(wxyz, omega), [0.0, 1.0], rtol=1e-7, **options)
+
+
+def energy_of(weight):
+    return lambda t: weight * jnp.linalg.norm(t.last.omega_body, axis=-1)
+
+
+def test_the_mean_over_the_bodies_that_finished_is_theirs_alone():
+    """With derivatives by shared parameters of the torque, and of the cost."""
+
+    def loss(gains, weight, sizes, **options):
+        return ph.successful_mean(braked(gains, sizes, **options), energy_of(weight))
+
+    slope = jax.jit(jax.value_and_grad(loss, (0, 1)))
+    mixed, alone = (slope(GAINS, 2.0, jnp.array(x)) for x in ([0.5, 9.0], [0.5, 0.5]))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), mixed, alone)
+    assert np.all(mixed[1][0] < 0)
+    mapped = jax.vmap(lambda size: braked(GAINS, size))(jnp.array([0.5, 9.0]))
+    np.testing.assert_allclose(ph.successful_mean(mapped, energy_of(2.0)), alone[0], rtol=1e-6)
+    np.testing.assert_allclose(ph.successful_mean(mapped[0], energy_of(2.0)), alone[0], rtol=1e-6)
+    value, (gains, _) = slope(GAINS, 2.0, jnp.array([9.0, 9.0]))
+    assert np.isnan(value)
+    assert np.isnan(gains).all()
+    with pytest.raises(ValueError, match="one row for each body"):
+        ph.successful_mean(mapped, lambda t: jnp.ones(3))
+
+
+@pytest.mark.parametrize("method", [None, FAST], ids=["default", "diffrax"])
+def test_states_are_nan_where_a_body_failed(method):
+    traj = braked(GAINS, [0.5, 9.0], method=method, throw=False)
+    assert traj.successful.tolist() == [True, False]
+    assert np.isfinite(traj.omega_body[0]).all()
+    assert np.isnan(traj.omega_body[1, -1]).all()
+    assert np.isnan(traj.wxyz[1, -1]).all()
+
+
+def braked_sum(size, throw):
+    return jnp.sum(braked(GAINS, size, throw=throw).omega_body)
+
+
+def mapped_sum(size, throw):
+    return jax.vmap(lambda x: braked_sum(x, throw))(size)
+
+
+slow = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    "function",
+    [jax.grad(braked_sum), pytest.param(braked_sum, marks=slow),
+     pytest.param(mapped_sum, marks=slow)],
+    ids=["grad", "value", "vmap"],
+)  # fmt: skip
+def test_throw_raises_in_a_compiled_program_where_it_is_written(function):
+    run = jax.jit(function, static_argnums=1)
+    assert np.isfinite(run(jnp.array([0.5]), True)).all()
+    # of jax.jit a ValueError or JaxRuntimeError, of equinox.filter_jit its own RuntimeError
+    with pytest.raises((RuntimeError, ValueError), match="a body did not finish: "):
+        jax.block_until_ready(run(jnp.array([9.0]), True))
+
+
+def test_nothing_is_raised_in_a_compiled_program_by_default():
+    assert np.isnan(jax.jit(lambda x: braked_sum(x, None))(jnp.array([9.0])))
+    with pytest.raises(ph.SimulationError):
+        braked(GAINS, [9.0])

@@ -7,7 +7,11 @@ reference.
 # Simulation: a scene, an initial state and times give a trajectory.
 from ._simulate import simulate as simulate, explain as explain
 from ._scene import Scene as Scene, State as State, specialise as specialise
-from ._trajectory import Events as Events, Trajectory as Trajectory
+from ._trajectory import (
+    Events as Events,
+    Trajectory as Trajectory,
+    successful_mean as successful_mean,
+)
 from ._method import Record as Record, Status as Status, SimulationError as SimulationError
 from ._plan import Plan as Plan
 from ._propagate import propagate as propagate, Propagation as Propagation

@@ -56,7 +56,7 @@ def simulate(
     record: Record | None = None,
     until: Event | None = None,
     events: Event | Sequence[Event] | None = None,
-    throw: bool = True,
+    throw: bool | None = None,
 ) -> Trajectory:
     """Simulate the motion of a scene from ``state`` at ``ts[0]``, and save it at the times ``ts``.
 
@@ -83,8 +83,12 @@ def simulate(
       A body stops at an event with ``terminal=True`` as with ``until``. One that meets more events
       than the sum of their ``capacity`` has the status ``TOO_MANY_EVENTS``. A motion in closed form
       is searched as by ``ph.crossings`` (under ``jit`` each event needs ``samples``).
-    - ``throw``: raise ``ph.SimulationError`` when a body did not finish. Under ``jit``, ``vmap``
-      or ``grad`` nothing is raised: check ``Trajectory.status``.
+    - ``throw``: whether a body that did not finish raises. None: ``ph.SimulationError`` where the
+      status is known; under ``jit``, ``vmap`` or ``grad`` nothing is raised, and
+      ``Trajectory.status`` tells. True: there too, when the compiled program runs
+      (by ``equinox.error_if``: a RuntimeError under ``equinox.filter_jit``, an error of JAX under
+      ``jax.jit``). False: never. The states of such a
+      body are NaN from its failure on; for a mean over the others see ``ph.successful_mean``.
 
     Raises ValueError or TypeError for bad input: wrong kinds or shapes, unsorted times, mixed
     dtypes, a tolerance that the dtype cannot reach.
@@ -121,11 +125,31 @@ def _with_events(scene, state, ts, method, rtol, record, until, events, throw) -
     return checked(found, throw)
 
 
-def checked(trajectory: Trajectory, throw: bool) -> Trajectory:
-    """The trajectory; raises for bodies that did not finish where that is known."""
-    if throw and not isinstance(trajectory.status, Tracer):
+def checked(trajectory: Trajectory, throw: bool | None) -> Trajectory:
+    """The trajectory; raises for bodies that did not finish, as ``throw`` of ``simulate`` says."""
+    if throw is False:
+        return trajectory
+    if not isinstance(trajectory.status, Tracer):
         raise_on_failure(trajectory.status)
-    return trajectory
+        return trajectory
+    # by default nothing: the check is a callback, which programs on accelerators wait for
+    return _checked_at_run_time(trajectory) if throw else trajectory
+
+
+def _checked_at_run_time(trajectory: Trajectory) -> Trajectory:
+    """The trajectory, its samples and status bound to a check that runs with the program."""
+    failed = trajectory.status != Status.SUCCESSFUL
+    worst = jnp.max(trajectory.status, initial=Status.SUCCESSFUL)
+    messages = [f"a body did not finish: {status.explanation}" for status in Status]
+
+    def samples(t):
+        return [x for x in (t.ts, *t._samples, t._work) if x is not None]
+
+    # a factor of one: derivatives too use it, of which a program may hold nothing else
+    one = eqx.branched_error_if(jnp.ones((), trajectory.ts.dtype), failed, worst, messages)
+    trajectory = eqx.tree_at(samples, trajectory, [x * one for x in samples(trajectory)])
+    status = trajectory.status * one.astype(trajectory.status.dtype)
+    return eqx.tree_at(lambda t: t.status, trajectory, status)
 
 
 def explain(

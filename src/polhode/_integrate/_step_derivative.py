@@ -183,6 +183,12 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
     )
     finished = last.outcome == FINISHED
     final = (count - 1) // length
+    other = jnp.argmax(finished)
+
+    def sound(note):
+        # Where a body failed the rates may be NaN, and zero cotangents times NaN would reach
+        # coefficients shared with bodies that finished: the state of one of these in its place.
+        return jax.tree.map(lambda x: jnp.where(finished, x, x[..., other][..., None]), note)
 
     def segment(carry):
         number, notes, *some = carry
@@ -199,15 +205,16 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
         _, notes = jax.lax.fori_loop(0, missing, note_one, (entry(checkpoints, number), notes))
 
         def back(i, some):
-            note = entry(notes, turns - 1 - i)
+            note = sound(entry(notes, turns - 1 - i))
             return _step_back(motion, floats, start, times, cotangents, finished, note, *some)
 
         return number - 1, notes, *jax.lax.fori_loop(0, turns, back, tuple(some))
 
     place = jnp.full(start.shape, times.shape[0] - 1, jnp.int32)
-    begun = final, notes, _noted(last), jnp.zeros_like(y), sums, place
+    begun = final, notes, sound(_noted(last)), jnp.zeros_like(y), sums, place
     *_, cotangent, sums, _ = jax.lax.while_loop(lambda c: c[0] >= 0, segment, begun)
-    return cotangent, sums
+    some = any_of(jnp.where(finished, 1.0, 0.0))
+    return jnp.where(finished[None], cotangent, 0), [jnp.where(some, x, 0) for x in sums]
 
 
 def _noted(progress: Progress) -> _Note:

@@ -380,7 +380,10 @@ class AbstractIntegration(AbstractMethod):
         times = jnp.atleast_2d(times)
         wxyz, omega, _ = self.chart.finish(later, tuple(samples), times)
         *_, sound_at_end = self.chart.finish(later, tuple(last), times[:, -1:])
-        wxyz, omega = (jnp.where(sound[:, None, None], x, jnp.nan) for x in (wxyz, omega))
+        # diffrax fills the times that were not reached with inf
+        wxyz, omega = (
+            jnp.where(sound[:, None, None] & jnp.isfinite(x), x, jnp.nan) for x in (wxyz, omega)
+        )
         outcome = solution.status
         finite = jnp.all(jnp.isfinite(wxyz), axis=(-1, -2))
         finite = finite & jnp.all(jnp.isfinite(omega), axis=(-1, -2))
