@@ -183,7 +183,8 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
     )
     finished = last.outcome == FINISHED
     final = (count - 1) // length
-    other = jnp.argmax(finished)
+    index = jnp.arange(finished.shape[0])  # not argmax, which a fused kernel cannot hold
+    other = jnp.min(jnp.where(finished, index, finished.shape[0] - 1))
 
     def sound(note):
         # Where a body failed the rates may be NaN, and zero cotangents times NaN would reach
