@@ -72,10 +72,10 @@ class Event(eqx.Module):
         )
         return jax.jvp(partial(_FUNCTION.mapped, self.fn), (wxyz, omega, t), slopes)
 
-    def differentiable_at(self, near: Trajectory, limit: Array) -> tuple[Array, Trajectory]:
+    def differentiable_at(self, approximate: Trajectory, limit: Array) -> tuple[Array, Trajectory]:
         """``refined`` for samples at which the function is zero to rounding: the same derivatives,
         and no computation where none is needed."""
-        arrays, rest = eqx.partition(near, eqx.is_inexact_array)
+        arrays, rest = eqx.partition(approximate, eqx.is_inexact_array)
         leaves, tree = jax.tree.flatten((arrays, limit))
 
         def moved(*leaves):
@@ -97,37 +97,37 @@ class Event(eqx.Module):
 
             return jax.jvp(some, [operands[i] for i in at], [tangents[i] for i in at])[1]
 
-        values = [jnp.zeros_like(near._t), *near._samples]
+        values = [jnp.zeros_like(approximate._t), *approximate._samples]
         operands = [*map(jnp.asarray, closed.consts), *leaves]
         delay, wxyz, omega, *spins = attached(rule, operands, values)
         there = Trajectory(
-            near._t + delay,
+            approximate._t + delay,
             wxyz,
             omega,
-            near.status,
-            near.steps,
-            near.scene,
+            approximate.status,
+            approximate.steps,
+            approximate.scene,
             spins=spins[0] if spins else None,
-            propagator=near.propagator,
+            propagator=approximate.propagator,
         )
         return delay, there
 
-    def refined(self, near: Trajectory, limit: Array) -> tuple[Array, Trajectory]:
-        """At samples ``near`` events: how much later (..., T) [s] these are, at limit by ``limit``,
-        and the samples then.
+    def refined(self, approximate: Trajectory, limit: Array) -> tuple[Array, Trajectory]:
+        """Time (..., T) [s] from the samples ``approximate`` to the events near them, at most
+        ``limit``, and the samples at the events.
 
-        Steps t - g(t)/s with one derivative s for all: they change nothing where g(t) is zero, and
-        after two of them t has the first and second derivatives of the root.
+        Steps t - g(t)/s with one slope s for all: where g(t) is zero they change nothing, and after
+        two of them t has the first and second derivatives of the root.
         """
         still = jax.lax.stop_gradient
-        value, slope = self.values(near)
+        value, slope = self.values(approximate)
         touch, chord = slope == 0, still(jnp.where(slope == 0, 1, slope))
         delay = jnp.where(touch, 0, -value / chord)
         delay = delay - still(delay) + still(jnp.clip(delay, -limit, limit))
-        value, _ = self.values(shortly_after(near, delay))
+        value, _ = self.values(shortly_after(approximate, delay))
         change = jnp.where(touch, 0, -value / chord)
         delay = _differentiable(delay + (change - still(change)), 2)
-        return delay, shortly_after(near, delay)
+        return delay, shortly_after(approximate, delay)
 
 
 def _differentiable(x: Array, order: int) -> Array:
