@@ -116,8 +116,8 @@ class Event(eqx.Module):
         """Time (..., T) [s] from the samples ``approximate`` to the events near them, at most
         ``limit``, and the samples at the events.
 
-        Steps t - g(t)/s with one slope s for all: where g(t) is zero they change nothing, and after
-        two of them t has the first and second derivatives of the root.
+        Steps t - g(t)/s with one constant s, the rate of change of g: where g(t) is zero they
+        change nothing, and after two of them t has the first and second derivatives of the root.
         """
         still = jax.lax.stop_gradient
         value, slope = self.values(approximate)
