@@ -97,9 +97,9 @@ def _closed_form_of(tree: Any) -> Solution | None:
     return choose_closed_form(jax.tree.unflatten(tree, [0.0] * tree.num_leaves))[0]
 
 
-_ROUNDED_STEPS = 2000
+_ROUNDED_STEPS = 20_000
 """Tolerance in units of rounding below which steps carry their rounding along. They lose about
-eps * angle**1.5, more than rtol from (rtol/eps)**(2/3) rad on: 160 rad there. It costs 1.2 times as
+eps * angle**1.5, more than rtol from (rtol/eps)**(2/3) rad on: 740 rad there. It costs 1.2 times as
 much for one body and 1.8 times for a thousand, so that default tolerances do without."""
 
 _ROUNDED_PHASES = 1e5

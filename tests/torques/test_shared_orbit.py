@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode._integrate import _bound_term, _equations, _problem
+from polhode._integrate import _field, _flow_derivative, _problem
 from polhode._kernels import Distinct, jit_distinct
 
 BODY = ph.Inertia.from_moments([1.0, 1.5, 2.0])
@@ -48,7 +48,7 @@ def last_rates(scene, t=1.0, times=2):
 def copies(monkeypatch):
     """Of every field that is specialised the logarithms: one in each Kepler's equation."""
     found = []
-    for module in (_bound_term, _equations, _problem):
+    for module in (_field, _flow_derivative, _problem):
         original = module.specialise
 
         def recorded(closed, known, original=original, **options):
@@ -95,7 +95,9 @@ def test_the_same_motion_and_derivative_as_with_orbits_of_their_own():
         atol=1e-15,
     )
     moved = eqx.tree_at(
-        lambda s: s.potential.position_space.semi_major_axis, scene_of(shared, shared), 2.3
+        lambda s: s.potential.position_space.semi_major_axis,
+        scene_of(shared, shared),
+        jnp.asarray(2.3),
     )
     np.testing.assert_allclose(
         last_rates(moved), last_rates(scene_of(orbit_of(0.1, 2.3), shared)), rtol=0, atol=1e-15

@@ -358,6 +358,11 @@ def check_usable(options: FitOptions, recording: Recording) -> None:
             recording.omega is not None or not getattr(options, name),
             f"{name}=True needs rates of a gyroscope (omega_body), got attitudes alone.",
         )
+    count = recording.times.shape[-1]
+    require(
+        recording.wheel is None or count >= 8,
+        f"a recording with wheel speeds needs at least 8 samples, got {count}.",
+    )
     sensor = options.gyroscope
     if sensor is not None:
         require(
