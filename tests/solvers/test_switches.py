@@ -229,3 +229,16 @@ def test_a_torque_that_points_along_an_orbit():
     wxyz, omega = frame.to_frame(last.wxyz, last.omega_body, 6000.0)
     np.testing.assert_allclose(abs(wxyz[0]), 1, atol=1e-12)
     np.testing.assert_allclose(omega, 0, atol=1e-9)
+
+
+def test_switches_that_change_the_sides_of_others():
+    """The first one flips the arguments of two more, which together leave the torque constant."""
+
+    def law(t, wxyz, omega):
+        flipped = jnp.where(omega[2] > 0.5, 1.0, -1.0) * (1 + omega[2] ** 2)
+        size = jnp.where(flipped < 0, -flipped, flipped)
+        return -0.1 * jnp.where(size > 0, 1.0, -1.0) * jnp.array([0.0, 0, 1])
+
+    scene = ph.Scene(ph.Inertia.spherical(1.0), None, ph.FeedbackTorque(law))
+    found = ph.simulate(scene, ph.State(WXYZ, [0.0, 0.0, 1.0]), [0.0, 4.0, 8.0])
+    np.testing.assert_allclose(found.omega_body[1:, 2], [0.6, 0.2], atol=1e-9)

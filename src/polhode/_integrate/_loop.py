@@ -207,10 +207,6 @@ def advance(
             & (progress.just_turned == 0)
             & ~is_first[None]
         )
-        # a switch may change the margins of those after it in the program: correct the first alone
-        index = jnp.arange(motion.switches)[:, None]
-        first_wrong = jnp.min(jnp.where(wrong, index, motion.switches), axis=0)
-        wrong = wrong & (index == first_wrong[None])
         accepted = accepted & ~jnp.any(wrong, axis=0)
         turn = first_switch(motion, options, progress, attempt, t, accepted, eps)
     hit = jnp.zeros_like(accepted) if turn is None else turn.hit
