@@ -142,6 +142,26 @@ def test_any_diffrax_solver_and_controller(solver):
     assert float(jnp.max(rotation.angle_between(traj.wxyz, want.wxyz))) < 1e-5
 
 
+def test_a_batch_by_a_solver_and_a_controller_of_diffrax():
+    """16 heavy tops with steps of the user's controller: as accurate as its tolerance."""
+    rng = np.random.default_rng(3)
+    state = ph.State(jnp.asarray(rng.normal(size=(16, 4))), jnp.asarray(rng.normal(size=(16, 3))))
+    gravity = ph.UniformGravity(1.0, [0.125, 0.0, 0.5], [0.0, 0.0, -9.81])
+    scene = ph.Scene(ph.Inertia.from_moments(MOMENTS), gravity)
+    want = ph.simulate(scene, state, TS)
+    errors, steps = [], []
+    for tolerance in jnp.array([1e-4, 1e-9]):
+        controller = diffrax.PIDController(rtol=tolerance, atol=tolerance)
+        found = ph.simulate(scene, state, TS, ph.LiePoisson(diffrax.Tsit5(), controller))
+        assert found.successful.all()
+        assert found.wxyz.shape == (16, 5, 4)
+        errors.append(float(jnp.max(rotation.angle_between(found.wxyz, want.wxyz))))
+        steps.append(int(found.steps.max()))
+    assert 1e-5 < errors[0] < 1e-2
+    assert errors[1] < 1e-7
+    assert steps[0] < steps[1] / 3
+
+
 def test_forward_mode_and_times():
     """d/dt of the samples is the field; jvp by diffrax.ForwardMode, grad by the default."""
     forward = ph.LiePoisson(adjoint=diffrax.ForwardMode())
