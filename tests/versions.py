@@ -3,8 +3,14 @@
 Each set has an environment of its own beside the checkout, ``.venv-lowest`` and ``.venv-newest``,
 made with the interpreter that runs this file (JAX from 0.11 on needs Python 3.12) and holding every
 extra; name one set to run it alone. The lowest set is read from pyproject.toml.
+
+``python tests/versions.py next`` installs the newest JAX that exists, beyond the upper bound, and
+runs smoke.py and the functions that XLA folds away with fused kernels requested. Where both pass,
+the version may be added to ``FUSED_JAXLIB`` in ``src/polhode/_policy.py``, which is the table of
+versions on which fused kernels are used, and the bound raised.
 """
 
+import os
 import re
 import subprocess
 import sys
@@ -36,8 +42,17 @@ def run(name: str) -> int:
     pins = floors() if name == "lowest" else ["--upgrade", "--upgrade-strategy", "eager"]
     install = [str(python), "-m", "pip", "install", "--quiet"]
     subprocess.run([*install, f"{ROOT}[all]", *pins], check=True)
-    print(f"{name}: ", end="", flush=True)
-    return subprocess.run([str(python), str(ROOT / "tests" / "smoke.py")]).returncode
+    environment, scripts = dict(os.environ), ["smoke.py"]
+    if name == "next":
+        subprocess.run([*install, "--upgrade", "--no-deps", "jax", "jaxlib"], check=True)
+        environment["POLHODE_PLAIN"] = "0"
+        scripts.append("xla/folding_units.py")
+    codes = []
+    for script in scripts:
+        print(f"{name}, {script}: ", end="", flush=True)
+        command = [str(python), str(ROOT / "tests" / script)]
+        codes.append(subprocess.run(command, env=environment).returncode)
+    return max(codes)
 
 
 if __name__ == "__main__":

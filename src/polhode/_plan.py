@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from polhode import _policy
 from polhode._batch import PARTS, common_batch, flatten, lane_times
 from polhode._checks import is_concrete
 from polhode._closed_forms import ClosedForm, Solution, choose_closed_form
@@ -33,7 +34,8 @@ class Plan:
     program, with the reason; ``bodies``, ``samples``, ``dtype``: the size of the work;
     ``error``: the attitude error to be expected, in words; ``refused``: the closed forms that do
     not apply, with the reason, if the motion is integrated; ``narrower``: the constructors that
-    allow a closed form for these numbers (``ph.specialise`` uses them).
+    allow a closed form for these numbers (``ph.specialise`` uses them); ``plain``: why the
+    optimisations for CPUs are off, or None.
     """
 
     method: AbstractMethod
@@ -45,6 +47,7 @@ class Plan:
     error: str
     refused: tuple[str, ...] = ()
     narrower: tuple[str, ...] = ()
+    plain: str | None = None
 
     @property
     def closed_form(self) -> str | None:
@@ -61,6 +64,8 @@ class Plan:
             *_listed("allow", self.narrower),
             f"error   {self.error}",
         ]
+        if self.plain is not None:
+            lines.append(f"plain   without optimisations for CPUs: {self.plain}")
         return "\n".join(lines)
 
 
@@ -81,11 +86,11 @@ def choose(scene: Scene, rtol: Array | float = 1e-9) -> tuple[AbstractMethod, st
             "something acts on the body: integrated in steps with an error estimate, held to"
             " rtol at every saved time"
         )
-        compensated = _is_below(rtol, _ROUNDED_STEPS * eps, scene)
+        compensated = _is_below(rtol, _policy.COMPENSATED_STEPS * eps, scene)
         also = ", its rounding carried along: it would miss rtol" if compensated else ""
         return _stepped(_has_axis(scene), compensated), reason + also
     general = scene.is_free and scene.inertia.symmetry is Symmetry.NONE
-    if general and _is_below(rtol, _ROUNDED_PHASES * eps, scene):
+    if general and _is_below(rtol, _policy.COMPENSATED_PHASES * eps, scene):
         also = ", its frequencies in sums of two floats: a rounded phase would miss rtol"
         return _COMPENSATED, law.explanation + also
     return law.method, law.explanation
@@ -96,14 +101,6 @@ def _closed_form_of(tree: Any) -> Solution | None:
     """The closed form of scenes of this structure, which has no numbers."""
     return choose_closed_form(jax.tree.unflatten(tree, [0.0] * tree.num_leaves))[0]
 
-
-_ROUNDED_STEPS = 20_000
-"""Tolerance in units of rounding below which steps carry their rounding along. They lose about
-eps * angle**1.5, more than rtol from (rtol/eps)**(2/3) rad on: 740 rad there. It costs 1.2 times as
-much for one body and 1.8 times for a thousand, so that default tolerances do without."""
-
-_ROUNDED_PHASES = 1e5
-"""The same of the closed form of a free body, whose phases lose eps times the angle: 1e5 rad."""
 
 _COMPENSATED = ClosedForm(compensated=True)
 
@@ -168,6 +165,7 @@ def plan(
     return Plan(
         method, reason, _skipped(scene, method, record), bodies, samples,
         str(state.wxyz.dtype), _error(method, scene, state, ts, rtol), refused, narrower,
+        _policy.plain_reason(),
     )  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from polhode import rotation
+from polhode import _policy, rotation
 from polhode._batch import (
     PARTS,
     Split,
@@ -29,7 +29,7 @@ from polhode._events import (
     found_by_steps,
     stopped,
 )
-from polhode._kernels import FEW, jit_distinct, kernel
+from polhode._kernels import jit_distinct, kernel
 from polhode._method import (
     AbstractMethod,
     Record,
@@ -220,7 +220,9 @@ def _moved(record, method, scene, state, ts, rtol) -> Samples:
     parts = (getattr(scene, name) for name in PARTS)
     batch = common_batch(*parts, state, extra=(ts.shape[:-1],))
     parts = {name: flatten(getattr(scene, name), batch) for name in PARTS}
-    few = state.wxyz.size <= 4 * FEW  # one task more costs as much as normalising them
+    few = (
+        state.wxyz.size <= 4 * _policy.KERNEL_BODIES
+    )  # one task more costs as much as normalising them
     unit = (kernel(State.as_unit) if few else State.as_unit)(state)
     lanes = flatten(unit, batch, shared=False)
     times = lane_times(ts, batch)

@@ -11,7 +11,8 @@ import pytest
 import polhode as ph
 from polhode._integrate import Extrapolation
 from polhode._integrate._charts import LiePoissonChart
-from polhode._integrate._midpoint import LANES, QUEUE, in_lanes
+from polhode._integrate._midpoint import in_lanes
+from polhode._policy import LANES, QUEUE
 
 N = 90
 

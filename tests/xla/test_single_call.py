@@ -11,7 +11,7 @@ import pytest
 from xla import fuzz
 
 import polhode as ph
-from polhode._kernels import _switch, kernel, specialise, spread
+from polhode._kernels import kernel, specialise, spread
 
 HERE = Path(__file__).parent
 
@@ -51,34 +51,6 @@ def test_one_variable_switches_all_off(monkeypatch):
     held, run, *_ = specialise(closed, [jnp.array(3.0)])
     assert float(held[0]) == 3
     assert float(run(held, jnp.array(2.0))[0]) == 12
-
-
-@pytest.fixture
-def untested(monkeypatch, tmp_path):
-    """A version of jaxlib that the marks were not tested on, and no memory of a trial."""
-    monkeypatch.delenv("POLHODE_PLAIN", raising=False)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(_switch, "TESTED", ((0, 0, 1), (0, 0, 2)))
-    _switch._marks_work.cache_clear()
-    yield tmp_path / "polhode"
-    _switch._marks_work.cache_clear()
-
-
-def test_another_version_is_tried_out_once(untested, monkeypatch):
-    assert not _switch.is_plain()
-    assert [path.read_text() for path in untested.iterdir()] == ["work"]
-    _switch._marks_work.cache_clear()
-    monkeypatch.setattr(_switch, "_PROBE", ("-c", "import os; os.abort()"))
-    assert not _switch.is_plain()  # remembered
-
-
-def test_a_version_that_ends_the_process_runs_plain(untested, monkeypatch):
-    monkeypatch.setattr(_switch, "_PROBE", ("-c", "import os; os.abort()"))
-    with pytest.warns(UserWarning, match="POLHODE_PLAIN=1"):
-        assert _switch.is_plain()
-    assert _switch.is_plain()  # no second warning, which would be an error here
-    assert "xla_cpu_small_call" not in _lowered()
-    assert len(list(untested.iterdir())) == 1
 
 
 def test_no_operation_of_an_orbit_keeps_it_out_of_a_unit():

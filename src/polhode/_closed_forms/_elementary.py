@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode import rotation
+from polhode import _policy, rotation
 from polhode._closed_forms._closed_form import (
     NOT_AXIAL,
     NOT_PRINCIPAL,
@@ -35,7 +35,7 @@ class SymmetricTop(AbstractClosedForm):
     (``c = k I``) and no wheel, so that otherwise ``ph.Record(attitude=False)`` is needed.
     """
 
-    chunk: int = eqx.field(static=True, default=2**14)
+    chunk: int = eqx.field(static=True, default=_policy.ELEMENTARY_CHUNK)
 
     def why_not(self, scene: Scene) -> str | None:
         refusal = self.objection(scene) or symmetry_objection(scene) or wheel_objection(scene)
@@ -111,7 +111,7 @@ class FixedAxis(AbstractClosedForm):
     ``ph.Status.NOT_FINITE``: ``ph.simulate`` never chooses this method itself.
     """
 
-    chunk: int = eqx.field(static=True, default=2**14)
+    chunk: int = eqx.field(static=True, default=_policy.ELEMENTARY_CHUNK)
 
     def why_not(self, scene: Scene) -> str | None:
         return self.objection(scene) or "only numbers can lie along one principal axis"

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode import rotation
+from polhode import _policy, rotation
 from polhode._batch import PARTS, map_chunks
 from polhode._closed_forms._closed_form import AbstractClosedForm, with_first
 from polhode._closed_forms._free_derivatives import EvaluatedMotion, results_rule
@@ -28,23 +28,11 @@ from polhode._closed_forms._free_motion import (
 )
 from polhode._closed_forms._free_periods import compensate
 from polhode._closed_forms._free_tangent import Quadruple
-from polhode._kernels import kernel, opaque_ones
+from polhode._kernels import computed_once, kernel, opaque_ones
 from polhode._method._base import Record, Samples
 from polhode._method._status import Status
 from polhode._scene import Scene, State
 from polhode.inertia import Symmetry, principal
-
-_CHUNK = 2**13
-"""Bodies times samples per chunk: by measurement the largest that stays in a core's cache."""
-
-_TWO_CHUNKS = 8
-"""Bodies times samples from which two chunks cost less than one without a loop."""
-
-_TIME_BY_TIME = 64
-"""Bodies from which loops over them are long enough to go time by time."""
-
-_LANES = 512
-"""Bodies whose constants stay in a core's cache while it moves them to many times."""
 
 
 class ClosedForm(AbstractClosedForm):
@@ -96,11 +84,13 @@ class ClosedForm(AbstractClosedForm):
         if inertia.symmetry is Symmetry.NONE:
             requested["compensated"] = self.compensated
 
-        chunk, samples = _CHUNK if self.chunk is None else self.chunk, t.shape[-1]
-        single_body = n == 1 and samples >= _TWO_CHUNKS
+        chunk, samples = _policy.FREE_CHUNK if self.chunk is None else self.chunk, t.shape[-1]
+        single_body = n == 1 and samples >= _policy.FREE_PAIR
         size, pieces = max(1, chunk // samples), n
         lanes = (of_inertia, wxyz, omega)
-        time_by_time = self.chunk is None and motion is _triaxial and goes_time_by_time(n, samples)
+        time_by_time = (
+            self.chunk is None and motion is _triaxial and _policy.is_time_loop(n, samples)
+        )
         if single_body:  # one body at many times: as several bodies, each at a part of them
             pieces = max(2, -(-samples // chunk))
             each = -(-samples // pieces)
@@ -109,7 +99,7 @@ class ClosedForm(AbstractClosedForm):
             lanes = jax.tree.map(lambda x: jnp.repeat(x, pieces, axis=0), lanes)
         elif time_by_time:
             size = chunk_size(n)
-        elif n * samples >= _TWO_CHUNKS:
+        elif n * samples >= _policy.FREE_PAIR:
             size = min(size, -(-n // 2))
 
         def move(chunk):
@@ -262,24 +252,19 @@ def free_motion(
 
     t = jnp.asarray(t)
     requested = {"attitude": attitude, "rates": rates}
-    if t.ndim == 2 and parts[0][0].ndim == 1 and goes_time_by_time(len(parts[0][0]), t.shape[1]):
+    if t.ndim == 2 and parts[0][0].ndim == 1 and _policy.is_time_loop(len(parts[0][0]), t.shape[1]):
         return _chunked(
             lambda arguments, t: _time_by_time(arguments, t, compensated, requested),
             parts,
             t,
-            _LANES,
+            _policy.FREE_LANES,
         )
 
     def whole_motion(arguments, t):
         return evaluate(prepare(*arguments, compensated=compensated), t, **requested)
 
-    rows = max(1, _CHUNK // max(t.shape[1] if t.ndim == 2 else 1, 1))
+    rows = max(1, _policy.FREE_CHUNK // max(t.shape[1] if t.ndim == 2 else 1, 1))
     return _chunked(kernel(whole_motion, linearised=True), parts, t, rows)
-
-
-def goes_time_by_time(bodies: int, times: int) -> bool:
-    """Whether all bodies are moved to one time after the other: the loops are then over bodies."""
-    return jax.default_backend() == "cpu" and times > 1 and bodies >= _TIME_BY_TIME
 
 
 def _time_by_time(arguments, t, compensated: bool, requested):
@@ -302,7 +287,7 @@ def _time_by_time(arguments, t, compensated: bool, requested):
     return jax.tree.map(jnp.transpose, samples)
 
 
-def chunk_size(count: int, largest: int = _LANES) -> int:
+def chunk_size(count: int, largest: int = _policy.FREE_LANES) -> int:
     """Bodies of a chunk: if possible a divisor, which spares the copies that padding makes."""
     if count < 2 * largest:
         return count
@@ -314,7 +299,7 @@ def chunk_size(count: int, largest: int = _LANES) -> int:
 def _chunked(fn, parts, t, rows):
     """``fn(parts, t)``, ``rows`` bodies at a time where a processor has many to do."""
     lanes = parts[0][0]
-    if jax.default_backend() != "cpu" or lanes.ndim != 1 or lanes.shape[0] < 2 * rows:
+    if not _policy.is_chunked() or lanes.ndim != 1 or lanes.shape[0] < 2 * rows:
         return fn(parts, t)
     count = lanes.shape[0]
     rows = chunk_size(count, rows)
@@ -387,20 +372,20 @@ def symmetric_motion(
     later = later_rates = None
     if rates:
         # Here and below: once, and not anew for each component of what follows.
-        cos, sin = jax.lax.optimization_barrier((jnp.cos(slip * t), jnp.sin(slip * t)))
+        cos, sin = computed_once((jnp.cos(slip * t), jnp.sin(slip * t)))
         x, y = omega_body[..., 0], omega_body[..., 1]
         spin = jnp.broadcast_to(omega_body[..., 2], cos.shape)
         later_rates = jnp.stack([x * cos + y * sin, y * cos - x * sin, spin], axis=-1)
     if attitude:
-        own_momentum = jax.lax.optimization_barrier(omega_body * moments)
+        own_momentum = computed_once(omega_body * moments)
         momentum = rotation.rotate(wxyz, own_momentum) / transverse[..., None]
-        angle = jax.lax.optimization_barrier(momentum * t[..., None])
+        angle = computed_once(momentum * t[..., None])
         precession = rotation.rotation_vector_to_wxyz(angle)
         half = slip * t / 2
         zero = jnp.zeros_like(half)
         own = jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=-1)
-        precession, own = jax.lax.optimization_barrier((precession, own))
-        before = jax.lax.optimization_barrier(rotation.multiply(precession, wxyz))
+        precession, own = computed_once((precession, own))
+        before = computed_once(rotation.multiply(precession, wxyz))
         later = rotation.multiply(before, own)
     return SymmetricMotion(later, later_rates)
 
@@ -418,6 +403,6 @@ def spherical_motion(
     later = None
     if attitude:
         turn = rotation.rotation_vector_to_wxyz(omega_body * t[..., None])
-        turn = jax.lax.optimization_barrier(turn)
+        turn = computed_once(turn)
         later = rotation.multiply(wxyz, turn)
     return SymmetricMotion(later, jnp.broadcast_to(omega_body, (*shape, 3)) if rates else None)

@@ -32,7 +32,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode import rotation
+from polhode import _policy, rotation
 from polhode._closed_forms._closed_form import (
     NOT_AXIAL,
     NOT_PRINCIPAL,
@@ -97,10 +97,9 @@ class LagrangeTop(AbstractClosedForm):
     def _size(self, n: int, count: int) -> int:
         if self.chunk is not None:
             return bodies_per_chunk(self.chunk, n, count)
-        # By measurement: at once twice as fast as in a loop, in which few bodies do best.
-        if n * count <= 2**14:
+        if n * count <= _policy.TOP_WHOLE:
             return n
-        return max(1, 2**12 // count) if count > 32 else 128
+        return max(1, min(_policy.TOP_BODIES, _policy.TOP_CHUNK // count))
 
     def _motion(self, scene, state, elapsed):
         n = state.wxyz.shape[0]

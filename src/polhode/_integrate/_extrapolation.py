@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, PyTree
 from numpy.polynomial import chebyshev
 
+from polhode import _policy
 from polhode._integrate._columns import (
     CHOSEN,
     SEQUENCES,
@@ -22,8 +23,6 @@ from polhode._integrate._columns import (
 )
 from polhode._integrate._field import BoundTerm, GroupUnits
 from polhode._integrate._midpoint import (
-    LANES,
-    QUEUE,
     Field,
     Limits,
     Progress,
@@ -201,7 +200,8 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         """Number of bodies of one solve: a whole work queue where bodies have steps of their own,
         else as many as there are lanes."""
         dtype = jnp.result_type(*jax.tree.leaves(y))
-        return QUEUE if BoundTerm.of(terms, args).prepared(t, y, dtype).by_entry else LANES
+        prepared = BoundTerm.of(terms, args).prepared(t, y, dtype)
+        return _policy.QUEUE if prepared.by_entry else _policy.LANES
 
     def order(self, terms: PyTree) -> int:
         return self._fixed_order
@@ -319,10 +319,6 @@ def _as_told(units, y, rates):
     return units(y, rates)
 
 
-_BESIDE = 30
-"""What a step costs beside its evaluations, in these."""
-
-
 def order_for(rtol: Array, angle: Array | float = jnp.inf) -> Array:
     """The order of least work for a tolerance, as a number of the program.
 
@@ -343,7 +339,7 @@ def order_for(rtol: Array, angle: Array | float = jnp.inf) -> Array:
     found, least, size = best, jnp.full((), jnp.inf, rtol.dtype), jnp.log(rtol)
     for order in CHOSEN:
         step = 0.9 * (0.27 * order - 0.3) * jnp.exp(size / (order + 1))
-        work = (evaluations(order) + _BESIDE) * jnp.maximum(1, angle / step)
+        work = (evaluations(order) + _policy.STEP_OVERHEAD) * jnp.maximum(1, angle / step)
         better = (order <= best) & (work < least) & (angle < step)
         found, least = jnp.where(better, order, found), jnp.where(better, work, least)
     return staged(jnp.asarray(found, rtol.dtype), opaque_ones(rtol))

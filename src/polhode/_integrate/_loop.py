@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from polhode import _policy
 from polhode._integrate._dop853 import ERROR_3, ERROR_5, STAGES, WEIGHTS
 from polhode._integrate._explicit_step import (
     Attempt,
@@ -25,7 +26,7 @@ from polhode._integrate._explicit_step import (
 )
 from polhode._integrate._field import weighted_length
 from polhode._integrate._switch_location import SwitchPoint, first_switch, pick, undefined_side
-from polhode._kernels import FEW, any_of, kernel, put
+from polhode._kernels import any_of, kernel, put
 
 SHARE = 2.0
 """Bound of the sum of estimated errors over ``rtol``. The estimate, of lower order, exceeds the
@@ -114,7 +115,7 @@ def solve(make: Make, arrays: Any, unit_data: Any, start: Array, ts: Array, y: A
         )
 
     # for more bodies a fused kernel takes four times as long to compile and is not faster
-    moved = kernel(moved) if bodies <= FEW else moved
+    moved = kernel(moved) if bodies <= _policy.KERNEL_BODIES else moved
     return moved(
         motion.coefficients, motion.arguments, motion.unit_data, options.rtol, start, ts, y
     )

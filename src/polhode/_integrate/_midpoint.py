@@ -26,19 +26,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from polhode import _policy
 from polhode._integrate._columns import Table, carried_on, extrapolated
 from polhode._integrate._field import weighted_length
 from polhode._kernels import any_of, put
-
-LANES = 64
-"""Bodies side by side: their arrays fit into the innermost cache. With 32 a top takes 1.4 times as
-long, with 128 1.15 times."""
-
-QUEUE = 1024
-"""Bodies in a queue, which bounds the memory."""
-
-TOGETHER = 8
-"""Lanes that are filled at once. With 4 or 16 tops and gravity gradients take as long to 4 %."""
 
 
 class Field(NamedTuple):
@@ -393,9 +384,8 @@ def integrate(
         numbers = carry.width, carry.total_angle, carry.steps, carry.error, reason.astype(dtype)
         return y, carry.integrals, carry.low, numbers
 
-    # an accelerator integrates all bodies side by side
-    several = zero.ndim == 1 and zero.size > LANES and jax.default_backend() == "cpu"
-    if several and field.by_entry and own:
+    queue = zero.ndim == 1 and field.by_entry and own and _policy.is_refilled(zero.size)
+    if queue:
         result, rows = in_lanes(one, able, finished, fixed, carry, rows)
     else:
         carry, rows = jax.lax.while_loop(
@@ -493,7 +483,7 @@ def in_lanes(
     ``fixed.body`` (n,), the place of each body among all; ``rows``: anything that belongs to all.
     """
     n = fixed.body.size
-    wide = -(-n // -(-n // LANES))  # no wider than where each lane leads as many bodies
+    wide = -(-n // -(-n // _policy.LANES))  # no wider than where each lane leads as many bodies
     wide += -wide % 8
     parts, tree = jax.tree.flatten(fixed)
     constant = [x for x in parts if x.shape == (n,)]
@@ -529,7 +519,7 @@ def in_lanes(
     def turn(loop):
         fixed_rows, carry, results, next_body, rows = loop
         idle = jnp.sum(jnp.where(able(fixed_of(fixed_rows), carry), 0, 1))
-        due = (idle >= TOGETHER) & (next_body < n) | (idle == wide)
+        due = (idle >= _policy.REFILL_LANES) & (next_body < n) | (idle == wide)
         # once or not at all: a branch would copy all that it may change
         start = fixed_rows, carry, results, next_body, any_of(jnp.where(due, 1.0, 0.0))
         fixed_rows, carry, results, next_body, _ = jax.lax.while_loop(lambda c: c[4], settle, start)

@@ -9,10 +9,11 @@ any step width, and those through a kink by about the square root of the toleran
 
 *Forward mode* differentiates the loop, with the place of each switch by two steps of Newton's rule.
 *Reverse mode* integrates once more and records every step (state, levels and time), then passes
-the steps in reverse order. There is room for the records of one ``SEGMENTS``-th of the steps that
-may be taken; if there are more, the carry of the loop is stored at the start of each such segment,
-and the segments before the last one are integrated a third time. Full records of all steps would
-take 100 times the memory; a checkpoint at every 16th step takes one more integration of all.
+the steps in reverse order. The attempts that are allowed are divided into ``RECORD_SEGMENTS`` equal
+segments, and there is room for the records of one. If there are more steps, the carry of the loop
+is stored at the start of each segment, and those before the last one are integrated a third time.
+Full records of all steps would take 100 times the memory; a checkpoint at every 16th step takes one
+more integration of all.
 """
 
 from typing import NamedTuple
@@ -22,6 +23,7 @@ import jax.numpy as jnp
 from jax.interpreters import ad
 from jaxtyping import Array
 
+from polhode import _policy
 from polhode._integrate._dop853 import DENSE_STAGES, NODES, STAGES, WEIGHTS
 from polhode._integrate._explicit_step import (
     Motion,
@@ -33,9 +35,6 @@ from polhode._integrate._explicit_step import (
 )
 from polhode._integrate._loop import FINISHED, RUNNING, TRIES, Make, advance, begin, each_body, run
 from polhode._kernels import any_of, attached, is_slope, kernel, linear, zeros
-
-SEGMENTS = 256
-"""Segments of equal length into which the attempts that are allowed are divided."""
 
 
 def samples(make: Make, arrays, unit_data, y, start, ts, found) -> Array:
@@ -151,7 +150,7 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
     """Cotangents of the state at the start and of the floats among ``motion.coefficients``."""
     first, rows = begin(motion, options, start, times[-1:], y)
     end = times[-1:]
-    length = -(-TRIES * options.max_steps // SEGMENTS)
+    length = -(-TRIES * options.max_steps // _policy.RECORD_SEGMENTS)
 
     def buffers(size, tree):
         return jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), tree)
@@ -179,7 +178,12 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
     last, checkpoints, notes, count = jax.lax.while_loop(
         lambda c: any_of(jnp.where(c[0].outcome == RUNNING, 1.0, 0.0)),
         turn,
-        (first, buffers(SEGMENTS, first), buffers(length, _noted(first)), jnp.zeros((), jnp.int32)),
+        (
+            first,
+            buffers(_policy.RECORD_SEGMENTS, first),
+            buffers(length, _noted(first)),
+            jnp.zeros((), jnp.int32),
+        ),
     )
     finished = last.outcome == FINISHED
     final = (count - 1) // length

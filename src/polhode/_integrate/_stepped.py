@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
+from polhode import _policy
 from polhode._batch import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._hamiltonian import Dynamics
 from polhode._integrate._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
@@ -23,12 +24,11 @@ from polhode._integrate._extrapolation import Automatic, Extrapolation
 from polhode._integrate._flow_adjoint import FlowAdjoint, path_of
 from polhode._integrate._flow_derivative import equations_of
 from polhode._integrate._loop import Found, LoopOptions, Search, solve, with_events
-from polhode._integrate._midpoint import LANES
 from polhode._integrate._one_step import GivenTimes
 from polhode._integrate._problem import Problem
 from polhode._integrate._segments import Solution, in_segments
 from polhode._integrate._step_derivative import samples
-from polhode._kernels import FEW, Distinct, is_holdable, kernel
+from polhode._kernels import Distinct, is_holdable, kernel
 from polhode._method._base import AbstractMethod, Record, Samples
 from polhode._method._options import check_options
 from polhode._method._status import Status
@@ -111,13 +111,13 @@ class AbstractIntegration(AbstractMethod):
 
     def _bodies_at_once(self, scene: Scene, state: State, ts: Array, record: Record) -> int:
         """Default chunk of a solver in which each body has its own steps."""
-        if jax.default_backend() != "cpu":
-            return _ON_ACCELERATOR
+        if not _policy.is_cpu():
+            return _policy.ACCELERATOR_BODIES
         solver = self.solver
         if not isinstance(solver, Extrapolation):
             return 1
-        if state.wxyz.shape[0] <= FEW:
-            return FEW
+        if state.wxyz.shape[0] <= _policy.KERNEL_BODIES:
+            return _policy.KERNEL_BODIES
         counts: list[int] = []
 
         def trace(scene, state):
@@ -149,8 +149,8 @@ class AbstractIntegration(AbstractMethod):
             return self._solve(scene, state, times, rtol, record, jumps)
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
-        if n <= min(size, _SORTED):
-            whole = kernel(one, of_units=True) if n <= FEW else one
+        if n <= min(size, _policy.SORTED_BODIES):
+            whole = kernel(one, of_units=True) if n <= _policy.KERNEL_BODIES else one
             return whole(Distinct((lanes, times)))
         # chunks of bodies with similar rates, the fastest first: no slow body is left for the end
         order = jnp.argsort(-natural_rates(scene, state, ts))
@@ -196,7 +196,7 @@ class AbstractIntegration(AbstractMethod):
             return self._solve_by_loop(scene, state, times, rtol, record, search)
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
-        if n <= FEW:
+        if n <= _policy.KERNEL_BODIES:
             return map_chunks(kernel(one, of_units=True), Distinct((lanes, times)), n, n)
         size = self.chunk or self._lanes_of_loop(scene, state, ts, record, search)
         # bodies of a chunk wait for one another: similar rates in each
@@ -210,7 +210,8 @@ class AbstractIntegration(AbstractMethod):
         satellites 64 at once take 3 times as long); where the field does not fit into one, as a
         network with its matrix products, as many as pay for the calls."""
         problem = self._problem(scene, state, ts, record, search)
-        return FEW if is_holdable(problem.closed.jaxpr) else LANES
+        fits = is_holdable(problem.closed.jaxpr)
+        return _policy.KERNEL_BODIES if fits else _policy.LANES
 
     def search(
         self, scene: Scene, state: State, ts: Array, rtol: Array, search: Search, final_only: bool
@@ -230,7 +231,7 @@ class AbstractIntegration(AbstractMethod):
         """Whether torques act on few bodies and rounding errors need not be compensated, which the
         explicit steps do not do."""
         acts = scene.torque is not None or bool(scene.dynamics.coupled)
-        few = 0 < state.wxyz.shape[0] <= FEW_BODIES
+        few = 0 < state.wxyz.shape[0] <= _policy.EXPLICIT_BODIES
         plain = isinstance(self.solver, Automatic) and not self.solver.compensated
         return acts and few and plain
 
@@ -404,13 +405,6 @@ class AbstractIntegration(AbstractMethod):
         )
 
 
-_SORTED = 64
-"""Number of bodies beyond which they are sorted by their rates."""
-
-_ON_ACCELERATOR = 2**18
-"""Bodies integrated together on an accelerator: enough to fill it, few enough for its memory."""
-
-
 class Stepping(NamedTuple):
     """Arguments of ``diffrax.diffeqsolve``."""
 
@@ -530,12 +524,6 @@ _OF_LOOP = (
     Status.SUCCESSFUL,
 )
 
-FEW_BODIES = 4
-"""Number of bodies up to which explicit steps are taken where torques act: these compile in half
-the time (a satellite: 1.1 s against 1.9 s), samples do not end them, and their derivatives tolerate
-damping. Bodies in a potential alone take half as long by extrapolation (one top, 20 s: 0.54 against
-0.99 ms), which compiles as fast there."""
-
 _OF_MIDPOINT = (Status.SUCCESSFUL, Status.MAX_STEPS, Status.STEP_FAILED, Status.NOT_FINITE)
 
 
@@ -586,7 +574,15 @@ class LiePoisson(AbstractIntegration):
     ):
         chart = LiePoissonChart() if chart is None else chart
         super().__init__(
-            chart, 200, solver, controller, dt0, max_steps, adjoint, progress_meter, chunk
+            chart,
+            _policy.SHARED_STEP_BODIES,
+            solver,
+            controller,
+            dt0,
+            max_steps,
+            adjoint,
+            progress_meter,
+            chunk,
         )
 
 

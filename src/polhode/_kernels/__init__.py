@@ -1,7 +1,7 @@
 """What makes XLA's CPU backend fast: one compiled unit, coefficients folded beforehand.
 
-Nothing here changes a result by more than rounding; ``POLHODE_PLAIN=1`` in the environment switches
-all of it off. `README.md` beside this file says what each part buys.
+Nothing here changes a result by more than rounding. `README.md` beside this file says what each
+part buys, ``polhode._policy`` where it is used and how all of it is switched off.
 """
 
 from polhode._kernels._distinct import Distinct as Distinct, jit_distinct as jit_distinct
@@ -14,7 +14,6 @@ from polhode._kernels._linear import (
     zeros as zeros,
 )
 from polhode._kernels._single_call import (
-    FEW as FEW,
     any_of as any_of,
     formula as formula,
     is_holdable as is_holdable,
@@ -22,8 +21,11 @@ from polhode._kernels._single_call import (
     put as put,
 )
 from polhode._kernels._smooth import SMOOTH as SMOOTH, smooth as smooth
-from polhode._kernels._stage import opaque_ones as opaque_ones, staged as staged
-from polhode._kernels._switch import is_plain as is_plain
+from polhode._kernels._stage import (
+    computed_once as computed_once,
+    opaque_ones as opaque_ones,
+    staged as staged,
+)
 from polhode._kernels._undefined import (
     are_close as are_close,
     derivable_once as derivable_once,

@@ -17,8 +17,8 @@ from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jax.interpreters import partial_eval
 
+from polhode import _policy
 from polhode._kernels._stage import opaque_ones, staged
-from polhode._kernels._switch import is_plain
 
 _FOLDS = {
     "add": np.add, "add_any": np.add, "sub": np.subtract, "mul": np.multiply,
@@ -40,10 +40,6 @@ _TAKING_APART = frozenset(
     "broadcast_in_dim convert_element_type copy gather reshape slice squeeze stop_gradient".split()  # noqa: SIM905
 )
 _CALLS = frozenset(("jit", "pjit", "closed_call"))
-
-_WORTH = 8
-"""Operations behind a value of several results, from which on it is staged (see ``staged``). From 5
-to 60 were tried: gradients of tops and of damped satellites take least time with 8 to 20."""
 
 
 class _Held(NamedTuple):
@@ -106,13 +102,13 @@ def specialise(
     Without ``fold`` these arguments are only taken apart: no arithmetic is done beforehand. Without
     ``stage`` the rest is not divided into stages: for a program that is to be specialised again.
     """
-    if is_plain():
+    if _policy.is_plain():
         shapes = tuple(frozenset([jnp.shape(x)]) for x in known)
         return Specialised(
             tuple(known), lambda held, *state: jaxpr_as_fun(closed)(*held, *state), shapes, False
         )
     jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals), True)
-    work = _Work(fold)
+    work = _Work(fold and _policy.is_folded())
     known = [_Held(x) for x in known]
     free = [work.slot(v.aval) for v in jaxpr.invars[len(known) :]]
     found = work.walk(jaxpr, closed.consts, [*known, *free])
@@ -131,7 +127,7 @@ def specialise(
     for _, aval, _ in (*(o for step in steps for o in step.operands), *out):
         by_entry = by_entry and aval.shape == lane
     by_entry = by_entry and all(np.shape(x) in ((), lane) for x in held.values())
-    shared = _shared(steps, out) if stage else frozenset()
+    shared = _shared(steps, out) if stage and _policy.is_staged() else frozenset()
 
     def run(held, *state):
         values = dict(enumerate(state))
@@ -188,7 +184,7 @@ def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
         work = {k}.union(*(behind[i] for i in of(step.operands) - shared))
         for i in step.made:
             behind[i] = work
-            if min(users[i], len(ends[i])) > 1 and len(work) >= _WORTH:
+            if min(users[i], len(ends[i])) > 1 and len(work) >= _policy.STAGE_WORK:
                 shared.add(i)
     return frozenset(shared)
 

@@ -12,6 +12,8 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
+from polhode import _policy
+
 Map = Callable[[Sequence[Any], Sequence[Any]], Sequence[Any]]
 
 
@@ -142,18 +144,16 @@ def spread(values: Any, axis: int, count: int) -> Any:
         def add(i, total):
             return [a + b for a, b in zip(total, row(i))]
 
-        if count <= _FEW:
+        if count <= _policy.SUM_ROWS:
             return functools.reduce(lambda total, i: add(i, total), range(1, count), row(0))
         return jax.lax.fori_loop(1, count, add, row(0))
 
+    if not _policy.is_fused():
+        return jax.tree.map(repeated, values)
     like = jax.eval_shape(lambda: forward(None, moving.values()))
     found = dict(zip(moving, linear(forward, backward, [], list(moving.values()), like)))
     every = [found[k] if k in found else repeated(x) for k, x in enumerate(leaves)]
     return jax.tree.unflatten(tree, every)
-
-
-_FEW = 4
-"""Rows up to which they are added one by one."""
 
 
 Rule = Callable[[Sequence[Any], Sequence[Any], Sequence[Any]], Sequence[Any]]

@@ -16,8 +16,8 @@ from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.sharding import AxisType
 
+from polhode import _policy
 from polhode._kernels._linear import linear
-from polhode._kernels._switch import is_plain
 
 _HOLDABLE = frozenset(
     """abs acos acosh add add_any and asin asinh atan atan2 atanh attached bitcast_convert_type
@@ -30,16 +30,6 @@ _HOLDABLE = frozenset(
      tan tanh transpose unit unstack while xor""".split()  # noqa: SIM905
 )
 """Operations that a single compiled unit may hold; anything else keeps the usual way."""
-
-_WIDE = 1024
-"""Floats in a sum, from which on a unit does not hold it."""
-
-FEW = 8
-"""Bodies so few that what stands around their motion costs more than it does: all of it is one
-unit. For many the march is 5 % slower as a unit within a unit."""
-
-_TABLE = 1024
-"""Known numbers of an array, up to which it stands in a unit."""
 
 _ANALYSING = ContextVar("analysing", default=False)
 """Set while a unit is looked through: the units inside it then show what they are made of."""
@@ -133,7 +123,7 @@ def _put_each(rows, places, values):
 
 
 def _put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
-    if places.size == 0 or jax.default_backend() != "cpu":
+    if places.size == 0 or not _policy.is_fused():
         return rows.at[places].set(values)
 
     def one(i, rows):
@@ -163,8 +153,10 @@ def _opened(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
     differentiated. Few known numbers, such as the table of a rule, stay in it: as operands they
     would be carried through every loop."""
     jaxpr, own = closed.jaxpr, list(zip(closed.jaxpr.constvars, closed.consts, strict=True))
-    tables = [(v, x) for v, x in own if not isinstance(x, Tracer) and np.size(x) <= _TABLE]
-    others = [(v, x) for v, x in own if isinstance(x, Tracer) or np.size(x) > _TABLE]
+    tables = [
+        (v, x) for v, x in own if not isinstance(x, Tracer) and np.size(x) <= _policy.KERNEL_TABLE
+    ]
+    others = [(v, x) for v, x in own if isinstance(x, Tracer) or np.size(x) > _policy.KERNEL_TABLE]
     names = jaxpr.debug_info.arg_names
     names = None if names is None else ("",) * len(others) + (*names,)
     opened = jaxpr.replace(
@@ -177,7 +169,7 @@ def _opened(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
 
 def _is_of_use() -> bool:
     """On the CPU, and not where XLA may divide arrays among devices: a unit cannot be divided."""
-    if jax.default_backend() != "cpu" or is_plain():
+    if not _policy.is_fused():
         return False
     kinds = jax.sharding.get_abstract_mesh().axis_types
     by_hand = len(kinds) > 0 and all(kind is AxisType.Manual for kind in kinds)
@@ -204,7 +196,7 @@ def _is_wide(equation) -> bool:
     if not equation.primitive.name.startswith("reduce_"):
         return False
     given = equation.invars[0].aval
-    return jnp.issubdtype(given.dtype, jnp.inexact) and given.size >= _WIDE
+    return jnp.issubdtype(given.dtype, jnp.inexact) and given.size >= _policy.KERNEL_SUM
 
 
 def _is_packable(dtype) -> bool:
@@ -368,7 +360,11 @@ def _unit_batch(arrays, dims, *, whole, shapes):
 
     def one(*x):
         # XLA divides loops over large arrays among threads, which it cannot do within a unit
-        return list(_unit_lowered(*x, whole=whole, shapes=shapes) if size <= FEW else whole(*x))
+        return list(
+            _unit_lowered(*x, whole=whole, shapes=shapes)
+            if size <= _policy.KERNEL_BODIES
+            else whole(*x)
+        )
 
     out = jax.vmap(one, dims)(*arrays)
     return out, [0] * len(out)

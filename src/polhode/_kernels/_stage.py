@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from polhode import _policy
+
 
 def opaque_ones(x: Array) -> Array:
     """Ones of the shape of x that XLA cannot know to be ones, but LLVM after it does.
@@ -13,6 +15,8 @@ def opaque_ones(x: Array) -> Array:
     Half of a truth value, rounded down, is zero: XLA does not look at the bits of a number. So it
     stages what is divided by them, and LLVM drops the division.
     """
+    if not _policy.is_staged():
+        return jnp.ones_like(x)
     half = (jax.lax.stop_gradient(x) > 0).astype(jnp.int32) >> 1
     return 1 + half.astype(x.dtype)
 
@@ -26,6 +30,9 @@ def staged(values: Any, *ones: Array) -> Any:
     Conditions are staged as numbers. What else is no float stays as it is.
     """
 
+    if not _policy.is_staged():
+        return values
+
     def divided(x):
         if x.dtype == bool:
             return divided(x.astype(ones[0].dtype)) > 0
@@ -35,3 +42,9 @@ def staged(values: Any, *ones: Array) -> Any:
         return x / (one if one.ndim >= x.ndim else jnp.broadcast_to(one, x.shape))
 
     return jax.tree.map(divided, values)
+
+
+def computed_once(values: Any) -> Any:
+    """The same values behind an optimisation barrier: they are computed once, and not anew for
+    each result that follows from them, where XLA has not yet fused the computation."""
+    return jax.lax.optimization_barrier(values) if _policy.is_staged() else values

@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from polhode._checks import ArrayLike
 from polhode._method import AbstractMethod
+from polhode._policy import kind_of, platform_of
 from polhode.ensemble import _dask, _layout
 from polhode.ensemble._chunks import compute
 from polhode.ensemble._ensemble import Ensemble
@@ -161,7 +162,7 @@ class Job:
         body_bytes = 7 * self.times.size * self.times.itemsize + 1
         return _layout.sizes(
             self.block.ensemble.bodies, self.block.size, body_bytes, self.trajectories,
-            len(devices), cores if devices[0].platform == "cpu" else 2, memory, chunk,
+            len(devices), cores if platform_of(devices[0]) == "cpu" else 2, memory, chunk,
         )  # fmt: skip
 
     def identity(self, name: str | None) -> dict[str, Any]:
@@ -180,7 +181,7 @@ class Job:
             "statistics": [[s.name, s.low, s.high, s.bins] for s in self.statistics],
             "arrays": sorted(self.layout(block.size)),
             "numbers": digest(*parts, self.times, block.method, self.statistics),
-            "platform": block.devices[0].platform,
+            "platform": platform_of(block.devices[0]),
         } | versions()
 
     def open(self, chunk: int) -> Store:
@@ -270,7 +271,7 @@ class _Tally:
 
 def device_names(devices: Sequence[Any]) -> str:
     """Number and kind of the devices."""
-    return f"{len(devices)} x {devices[0].platform} ({devices[0].device_kind})"
+    return f"{len(devices)} x {kind_of(devices[0])}"
 
 
 def _title() -> dict[str, str]:

@@ -11,13 +11,18 @@ LIBRARIES = ("polhode", "jax", "jaxlib", "diffrax", "equinox", "numpy")
 
 
 def versions() -> dict[str, str]:
-    """NAME_version of polhode, Python and the libraries that compute."""
+    """NAME_version of polhode, Python and the libraries that compute; a note where fused kernels
+    and the other optimisations for CPUs are off, since results differ by rounding."""
     import polhode
+    from polhode._policy import plain_reason
 
     found = {"python_version": platform.python_version()}
     for name in LIBRARIES:
         own = name == "polhode"
         found[f"{name}_version"] = polhode.__version__ if own else importlib.metadata.version(name)
+    reason = plain_reason()
+    if reason is not None:
+        found["cpu_optimisations"] = f"off: {reason}"
     return found
 
 

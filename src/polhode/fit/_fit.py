@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from polhode import _policy
 from polhode._batch import PARTS, batch_shapes, map_chunks
 from polhode._checks import ArrayLike, as_float_array, require, require_positive
 from polhode._method import AbstractMethod
@@ -23,9 +24,6 @@ from polhode.fit._result import Fit, checked_fit
 from polhode.fit._solve import solve_fit
 
 # ``fit_inertia``: the inertia of bodies from recordings of their motion.
-
-# Samples that a processor core works on together.
-_LANES = 1024
 
 
 def fit_inertia(
@@ -189,8 +187,10 @@ def _fit_batch(recording: Recording, options: FitOptions, conclude: Callable) ->
     # A processor core fills its vector units with the samples of a few bodies; more at a time would
     # only wait for the slowest of them.
     count = recording.times.shape[0]
-    at_once = max(1, _LANES // max(recording.times.shape[1] * recording.times.shape[2], 1))
-    rounds = -(-count // at_once) if jax.default_backend() == "cpu" else 1
+    at_once = max(
+        1, _policy.FIT_SAMPLES // max(recording.times.shape[1] * recording.times.shape[2], 1)
+    )
+    rounds = -(-count // at_once) if _policy.is_cpu() else 1
     if at_once == 1 < rounds:
         return jax.lax.map(fit, recording)
     return map_chunks(jax.vmap(fit), recording, count, -(-count // rounds))

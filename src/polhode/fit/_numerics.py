@@ -14,6 +14,8 @@ from jax.errors import JaxRuntimeError
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from polhode import _policy
+
 # Faster compilation of fits, where the compiler has the option.
 
 # XLA's older way to emit loops: for what a fit does the program is as fast and compiles in half the
@@ -37,7 +39,7 @@ def compiled(function: Callable) -> Callable:
 @functools.cache
 def _option_is_supported() -> bool:
     """Whether this jaxlib knows the options."""
-    if jax.default_backend() != "cpu":
+    if not _policy.is_cpu() or _policy.is_plain():
         return False
     try:
         jax.jit(lambda x: -x, **_OPTIONS)(1.0)
@@ -64,7 +66,7 @@ def _one_matrix_at_a_time(signature: str) -> Callable:
         looped = jax.custom_batching.sequential_vmap(function)
 
         def call(*operands):
-            affected = _AFFECTED and jax.default_backend() == "cpu"
+            affected = _AFFECTED and _policy.is_cpu()
             chosen = looped if affected else function
             return jnp.vectorize(chosen, signature=signature)(*operands)
 

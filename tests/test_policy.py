@@ -1,0 +1,180 @@
+"""Choices by platform and measurement: one module, with a reason and a benchmark for each."""
+
+import ast
+import os
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import jax
+import jaxlib.version
+import numpy as np
+import pytest
+
+import polhode as ph
+from polhode import _policy
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCE = ROOT / "src" / "polhode"
+POLICY = SOURCE / "_policy.py"
+INSPECTIONS = {"default_backend", "platform", "device_kind"}
+
+
+def inspections(text: str) -> list[str]:
+    """Attributes of the platform that a module reads, in whatever form it imports them."""
+    tree = ast.parse(text)
+    reads = [node.attr for node in ast.walk(tree) if isinstance(node, ast.Attribute)]
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom):
+            reads += [name.name for name in node.names if (node.module or "").startswith("jax")]
+    return [name for name in reads if name in INSPECTIONS]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import jax\nif jax.default_backend() == 'cpu': pass",
+        "from jax import default_backend as b",
+        "def f(device):\n    return device.platform",
+    ],
+)
+def test_inspections_of_the_platform_are_recognised(text):
+    assert inspections(text)
+
+
+def test_the_platform_is_inspected_in_one_module():
+    found = {
+        str(path.relative_to(SOURCE)): names
+        for path in SOURCE.rglob("*.py")
+        if path != POLICY and (names := inspections(path.read_text(encoding="utf-8")))
+    }
+    assert not found
+
+
+def rows() -> dict[str, str]:
+    """The constants of the module, each with the text below it."""
+    body = ast.parse(POLICY.read_text(encoding="utf-8")).body
+    texts = {}
+    for node, after in zip(body, [*body[1:], None]):
+        if isinstance(node, ast.Assign):
+            (name,) = node.targets
+            is_text = isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant)
+            texts[ast.unparse(name)] = after.value.value if is_text else ""
+    return texts
+
+
+def test_every_choice_has_a_unit_a_reason_and_a_benchmark():
+    from benchmarks.policy import CASES
+
+    texts = rows()
+    assert len(texts) > 20
+    unexplained = [name for name, text in texts.items() if not text.startswith("[")]
+    assert not unexplained
+    assert {*texts} == {"FUSED_JAXLIB", *CASES}
+
+
+def test_the_upper_bound_of_jax_is_the_newest_version_tested():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    (needed,) = [need for need in project["dependencies"] if need.startswith("jax>")]
+    lowest, below = needed.removeprefix("jax>=").split(",<")
+    tested = [tuple(map(int, version.split("."))) for version in _policy.FUSED_JAXLIB]
+    assert tuple(map(int, below.split("."))) == (max(tested)[0], max(tested)[1] + 1)
+    assert tuple(map(int, lowest.split("."))) == min(tested)[:2]
+    assert jaxlib.version.__version__ in _policy.FUSED_JAXLIB
+
+
+@pytest.mark.parametrize(
+    ("variable", "version", "reason"),
+    [
+        (None, "0.10.2", None),
+        (None, "99.0.0", "jaxlib 99.0.0 is not among the tested versions"),
+        ("0", "99.0.0", None),
+        ("1", "0.10.2", "POLHODE_PLAIN is set"),
+    ],
+)
+def test_optimisations_follow_the_table_and_the_variable(monkeypatch, variable, version, reason):
+    monkeypatch.setattr(jaxlib.version, "__version__", version)
+    if variable is None:
+        monkeypatch.delenv("POLHODE_PLAIN", raising=False)
+    else:
+        monkeypatch.setenv("POLHODE_PLAIN", variable)
+    plan = ph.explain(ph.Scene(ph.Inertia.spherical(1.0)), STATE, [0.0, 1.0])
+    switches = (
+        _policy.is_fused(), _policy.is_folded(), _policy.is_staged(),
+        _policy.is_refilled(10**6), _policy.is_time_loop(10**6, 10),
+    )  # fmt: skip
+    if reason is None:
+        assert all(switches)
+        assert plan.plain is None
+        assert "plain" not in str(plan)
+    else:
+        assert not any(switches)
+        assert reason in plan.plain
+        assert reason in str(plan)
+
+
+STATE = ph.State([0.5, 0.5, 0.5, -0.5], [0.5, -1.0, 0.75])
+
+
+def test_a_program_is_for_the_default_device(monkeypatch):
+    """On a machine with an accelerator arrays may be put on the CPU by the default device."""
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert not _policy.is_cpu()
+    assert not _policy.is_fused()
+    for device in (jax.devices("cpu")[0], "cpu"):
+        with jax.default_device(device):
+            assert _policy.is_cpu()
+
+
+def scene_values() -> list[np.ndarray]:
+    """Values and gradients of a few scenes: closed forms, steps of both rules, one body and more
+    than lanes."""
+    gravity = ph.UniformGravity(1.0, [0.0, 0.1, 0.5])
+    body = ph.Inertia.from_moments([1.0, 1.5, 2.0])
+    scenes = {
+        "free": ph.Scene(body),
+        "symmetric": ph.Scene(ph.Inertia.axisymmetric(1.0, 0.5)),
+        "Lagrange's top": ph.Scene(
+            ph.Inertia.axisymmetric(1.0, 0.5), ph.UniformGravity.axial(1.0, 0.5)
+        ),
+        "heavy top": ph.Scene(body, gravity),
+        "damped": ph.Scene(body, gravity, ph.LinearDamping(0.1)),
+    }
+    rng = np.random.default_rng(1)
+    many = np.concatenate([np.ones((70, 1)), rng.normal(size=(70, 2))], axis=1)
+    values = []
+    for scene in scenes.values():
+        for omega in (many[0], many):
+
+            def end(omega, scene=scene):
+                state = ph.State([0.5, 0.5, 0.5, -0.5], omega)
+                found = ph.simulate(scene, state, [0.0, 0.5, 1.0], rtol=1e-9)
+                return (found.wxyz[..., 1:, :] ** 3).sum(), found.omega_body
+
+            (_, rates), slope = jax.jit(jax.value_and_grad(end, has_aux=True))(omega)
+            values += [np.asarray(rates), np.asarray(slope)]
+    return values
+
+
+@pytest.mark.slow
+def test_plain_programs_agree_with_optimised_ones(tmp_path):
+    """In a process of its own each: the variable is read while programs are traced."""
+    results = []
+    for variable in ("0", "1"):
+        path = tmp_path / f"{variable}.npz"
+        ran = subprocess.run(
+            [sys.executable, __file__, path],
+            env={**os.environ, "POLHODE_PLAIN": variable}, capture_output=True, text=True,
+        )  # fmt: skip
+        assert ran.returncode == 0, ran.stderr[-2000:]
+        with np.load(path) as file:
+            results.append([file[name] for name in file.files])
+    assert len(results[0]) == len(results[1]) == 20
+    for optimised, plain in zip(*results):
+        np.testing.assert_allclose(plain, optimised, rtol=1e-7, atol=1e-7)
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    np.savez(sys.argv[1], *scene_values())
