@@ -1,6 +1,10 @@
-"""Imports go one way: a room uses only what stands before it in the table of CONTRIBUTING.md."""
+"""Imports go one way: a module uses only what stands before it in the table of CONTRIBUTING.md.
+
+And the structure of the tests: public names, and one folder for tests that read programs.
+"""
 
 import ast
+import importlib
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -89,3 +93,42 @@ def test_imports_go_one_way():
                 wrong.append(f"{path.relative_to(SOURCE)} imports {used}")
     assert seen > 100
     assert not wrong, wrong
+
+
+TESTS = Path(__file__).parent
+PROGRAM_TEXT = {"as_text", "cost_analysis", "memory_analysis", "primitive", "eqns"}
+"""Attributes by which the programs of XLA and JAX are read."""
+
+
+def parsed_tests() -> list[tuple[Path, ast.Module]]:
+    paths = sorted(TESTS.rglob("*.py"))
+    return [(path.relative_to(TESTS), ast.parse(path.read_text("utf-8"))) for path in paths]
+
+
+def test_tests_import_public_names_from_where_they_are_public():
+    """What is private is imported only where a formula or a kernel is tested by itself."""
+    wrong, seen = [], 0
+    for path, tree in parsed_tests():
+        for node in ast.walk(tree):
+            if not (isinstance(node, ast.ImportFrom) and str(node.module).startswith("polhode._")):
+                continue
+            module = importlib.import_module(str(node.module))
+            for name in (alias.name for alias in node.names):
+                seen += 1
+                same = name in dir(ph) and getattr(ph, name) is getattr(module, name, None)
+                wrong += [f"{path}: {node.module}.{name}"] if same else []
+    assert seen > 30
+    assert not wrong, wrong
+
+
+def test_programs_are_read_in_one_folder():
+    """What a program contains is asserted in ``tests/xla``; elsewhere tests check results."""
+    readers = {
+        path.as_posix()
+        for path, tree in parsed_tests()
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Attribute) and node.attr in PROGRAM_TEXT
+    }
+    assert len(readers) > 4
+    outside = {path for path in readers if not path.startswith("xla/")}
+    assert outside == {"ensemble/eight_devices.py"}  # collectives between devices

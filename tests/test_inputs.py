@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings, strategies as st
+from hypothesis import HealthCheck, example, given, settings, strategies as st
 
 import polhode as ph
 from polhode._method import check_options
@@ -349,6 +349,7 @@ garbage = st.one_of(
     max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(first=garbage, second=garbage)
+@example(first=[1.0, 1.5, 2.0], second=[0.1, 0.0, 0.3])  # what constructors accept
 def test_garbage_never_passes_silently(unchecked, first, second):
     """A constructor raises ValueError or TypeError, or holds finite arrays of the right rank."""
     makers = [

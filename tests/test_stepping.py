@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode import rotation
-from polhode._integrate import Extrapolation
+from polhode import Extrapolation, rotation
 from polhode._plan import choose
 
 INERTIA = ph.Inertia.from_moments([1.0, 1.5, 2.0])

@@ -251,7 +251,9 @@ def test_the_scenes_that_come_with_polhode(here, capsys):
     """Listed, copied, and run by name from any folder; a file of that name comes first."""
     assert main(["scenes"]) == 0
     told = capsys.readouterr().out
-    assert all(path.stem in told for path in SCENES.glob("*.toml"))
+    names = [path.stem for path in SCENES.glob("*.toml")]
+    assert len(names) > 3
+    assert all(name in told for name in names)
     assert main(["explain", "lagrange_top"]) == 0
     assert "Lagrange top" in capsys.readouterr().out
     assert main(["scenes", "toutatis", "-o", "copies/mine"]) == 0

@@ -311,14 +311,14 @@ def test_an_interrupt_after_the_first_file_names_it(here, capsys, monkeypatch):
 
 
 def _modules(*arguments):
-    """Exit code, heavy modules and seconds of work of a command in a process of its own."""
+    """Exit code and heavy modules of a command in a process of its own."""
     code = (
-        "import sys, time\n"
+        "import sys\n"
         "from polhode.cli import main\n"
         "try: code = main(sys.argv[1:])\n"
         "except SystemExit as ended: code = ended.code\n"
         "found = [m for m in ('jax', 'numpy', 'matplotlib', 'xarray') if m in sys.modules]\n"
-        "print(code, found, time.process_time(), sep='|', file=sys.stderr)"
+        "print(code, found, sep='|', file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
     return done.stderr.splitlines()[-1].split("|")
@@ -331,10 +331,7 @@ def _modules(*arguments):
 )  # fmt: skip
 def test_help_and_mistakes_come_without_jax(here, arguments, code):
     (here / "bad.toml").write_text(FREE.replace("axial", "axail"))
-    found = _modules(*arguments)
-    assert found[:2] == [code, "[]"]
-    # 0.4 s are promised on an idle machine; that of the tests is shared and slows down for it
-    assert float(found[2]) < 1.2
+    assert _modules(*arguments) == [code, "[]"]
 
 
 def test_programs_are_kept_between_runs_unless_told_otherwise(here, monkeypatch):

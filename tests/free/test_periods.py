@@ -6,7 +6,8 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from polhode._closed_forms import Mode, principal_periods
+from polhode import Mode
+from polhode._closed_forms import principal_periods
 
 # Compiled once: eager dispatch would cost far more than the numbers.
 _periods = jax.jit(principal_periods)

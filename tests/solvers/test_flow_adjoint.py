@@ -15,7 +15,7 @@ from solvers import make_integrators_truth as bodies
 
 import polhode as ph
 from benchmarks.integrators import heavy_top
-from polhode import rotation
+from polhode import Extrapolation, FlowAdjoint, rotation
 from polhode._hamiltonian import (
     Dynamics,
     Hamiltonian,
@@ -23,7 +23,7 @@ from polhode._hamiltonian import (
     LiePoissonUnits,
     lie_poisson_field,
 )
-from polhode._integrate import Accuracy, Extrapolation, FlowAdjoint
+from polhode._integrate import Accuracy
 from polhode._kernels import linear
 from polhode._scene import AlongZ
 

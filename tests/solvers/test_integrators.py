@@ -11,7 +11,8 @@ import pytest
 from solvers import make_integrators_truth as bodies
 
 from benchmarks.integrators import heavy_top
-from polhode._integrate import Accuracy, Extrapolation
+from polhode import Extrapolation
+from polhode._integrate import Accuracy
 from polhode._integrate._extrapolation import order_for
 from polhode._kernels import kernel
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode._integrate import Extrapolation
+from polhode import Extrapolation
 from polhode._integrate._charts import LiePoissonChart
 from polhode._integrate._midpoint import in_lanes
 from polhode._policy import LANES, QUEUE

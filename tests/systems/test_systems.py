@@ -14,7 +14,7 @@ from diffrax import Dopri8
 from systems.table import BY_NAME, truth
 
 import polhode as ph
-from polhode._integrate import Extrapolation
+from polhode import Extrapolation
 
 ACTING: dict[frozenset, list[str]] = {}
 for _name, _system in BY_NAME.items():

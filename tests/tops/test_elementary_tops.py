@@ -5,9 +5,8 @@ import pytest
 from mpmath import mp, mpf
 
 import polhode as ph
-from polhode._closed_forms import FixedAxis, SymmetricTop
+from polhode import FixedAxis, Rotor, SymmetricTop
 from polhode._closed_forms._elementary import decay, decay_twice
-from polhode._scene import Rotor
 
 SYMMETRIC = ph.Inertia.axisymmetric(1.25, 0.5)
 STATE = ph.State([0.5, 0.5, 0.5, -0.5], [[0.3, 0.2, 0.7], [0.0, 0.0, -1.0]])

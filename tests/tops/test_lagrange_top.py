@@ -13,9 +13,8 @@ sys.path.insert(0, str(Path(__file__).parent))
 import top_cases
 
 import polhode as ph
-from polhode._closed_forms import LagrangeTop
+from polhode import LagrangeTop, Rotor, UniformGravity
 from polhode._closed_forms._lagrange_top import lagrange_motion
-from polhode._scene import Rotor, UniformGravity
 
 NAMES = list(top_cases.CASES)
 NUMBERS = np.array(list(top_cases.CASES.values())).T  # (10, cases): cases are lanes

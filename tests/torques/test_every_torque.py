@@ -13,9 +13,9 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import polhode as ph
+from polhode import FeedbackTorque, KeplerOrbit, QuadraticDamping
 from polhode._batch import PARTS, flatten
 from polhode._hamiltonian import Dynamics, lie_poisson_field
-from polhode._scene import FeedbackTorque, KeplerOrbit, QuadraticDamping
 
 SPAN, BODIES = (0.5, 2.5), 2
 NUMBERS = {

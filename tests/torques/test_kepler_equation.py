@@ -211,32 +211,6 @@ def test_orbits_by_a_state(e):
                 assert error(got[:2], want) < 25 * bound, (start, t)
 
 
-def loops(jaxpr):
-    """Loops anywhere in a program."""
-    count = 0
-    for eqn in jaxpr.eqns:
-        count += eqn.primitive.name in ("while", "scan", "cond")
-        for value in eqn.params.values():
-            for inner in value if isinstance(value, tuple | list) else [value]:
-                inner = getattr(inner, "jaxpr", inner)
-                count += loops(inner) if hasattr(inner, "eqns") else 0
-    return count
-
-
-@pytest.mark.parametrize(
-    "orbit",
-    [
-        ph.KeplerOrbit(1.0, 2.0, 0.1),
-        ph.HyperbolicOrbit(1.0, -2.0, 1.1),
-        ph.KeplerOrbit.from_state(1.0, [1.0, 0, 0], [0, 1.1, 0]),
-        ph.HyperbolicOrbit.from_state(1.0, [1.0, 0, 0], [0, 1.6, 0]),
-    ],
-)
-def test_no_loops(orbit):
-    for f in (orbit, orbit.velocity_at, jax.jacfwd(orbit.velocity_at)):
-        assert loops(jax.make_jaxpr(f)(0.3).jaxpr) == 0
-
-
 def test_a_circle_by_construction():
     """Without an eccentricity: the same place as at eccentricity 0, and the same derivatives."""
     t = 7.3
@@ -267,29 +241,6 @@ def test_a_circle_by_construction():
         ph.HyperbolicOrbit(1.3, -2.1)
     with pytest.raises(ValueError, match="semi_major_axis must be positive"):
         ph.KeplerOrbit(1.3, -2.1)
-
-
-def test_a_circle_solves_no_equation():
-    """One sine and one cosine of the time."""
-    orbit = ph.KeplerOrbit(1.3, 2.1, inclination=0.7)
-    seen = {"sin": 0, "cos": 0}
-
-    def count(jaxpr, moving):
-        moving = set(moving)
-        for eqn in jaxpr.eqns:
-            at = [k for k, v in enumerate(eqn.invars) if not hasattr(v, "val") and v in moving]
-            if not at:
-                continue
-            moving.update(eqn.outvars)
-            if eqn.primitive.name in seen:
-                seen[eqn.primitive.name] += 1
-            if "jaxpr" in eqn.params:
-                inner = eqn.params["jaxpr"].jaxpr
-                count(inner, [inner.invars[k] for k in at])
-
-    jaxpr = jax.make_jaxpr(orbit)(0.3).jaxpr
-    count(jaxpr, jaxpr.invars)
-    assert seen == {"sin": 1, "cos": 1}
 
 
 def test_batches_and_edits_of_circles():

@@ -5,7 +5,7 @@ import pytest
 from mpmath import mp, mpf
 
 import polhode as ph
-from polhode._scene import HyperbolicOrbit, KeplerOrbit
+from polhode import HyperbolicOrbit, KeplerOrbit
 
 
 def test_the_orbit_obeys_newton():

@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import polhode as ph
-from polhode._scene import QuadraticDamping
+from polhode import QuadraticDamping
 
 MOMENTS, OMEGA, END = np.array([1.0, 1.5, 2.0]), np.array([0.25, 1.0, 0.5]), 10.0
 LINEAR = np.array([[1e3, 1e3, 1e3], [3e3, 0.125, 0.25], [0.125, 0.25, 1e3], [0, 0, 0]])

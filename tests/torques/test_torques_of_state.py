@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode._scene import FeedbackTorque, QuadraticDamping
+from polhode import FeedbackTorque, QuadraticDamping
 
 
 def test_quadratic_damping_about_one_axis():

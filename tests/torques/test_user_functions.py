@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode._scene import FeedbackTorque
+from polhode import FeedbackTorque
 
 INERTIA = ph.Inertia.from_moments([1.0, 1.5, 2.0])
 STATE = ph.State([0.8, 0.0, 0.6, 0.0], [0.5, -0.25, 0.75])

@@ -1,0 +1,476 @@
+"""Mutation testing of the formulas: ``python tests/mutations.py [--only WORD ...] [--jobs N]``.
+
+Each mutant is a copy of the package in which one formula is changed (a sign, a factor, an index).
+It is run against the tests named beside it, of which one must fail; if all pass, against ``WIDER``.
+Prints a table; exits with 1 if a mutant survives, and with 2 if one cannot be run. ``--unmutated``
+runs the same tests on an unchanged copy, where all must pass.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "src" / "polhode"
+WIDER = ("systems", "hamiltonian", "free", "tops", "torques", "solvers", "rotation", "inertia")
+WIDER += ("frames", "test_simulate.py", "test_events.py", "test_propagate.py", "test_published.py")
+
+
+class Mutant(NamedTuple):
+    """One changed formula: ``old`` stands once in ``file`` (of ``src/polhode``)."""
+
+    file: str
+    old: str
+    new: str
+    effect: str
+    tests: Sequence[str]
+    """Files, or files with a name of a test, below ``tests``: the fastest first."""
+
+
+H, FIELD = "_hamiltonian/_energy.py", "_hamiltonian/_lie_poisson.py"
+ANGLES, COSTATE = "_hamiltonian/_euler_angles.py", "_hamiltonian/_variational.py"
+FREE, TOP = "_closed_forms/_free_motion.py", "_closed_forms/_lagrange_top.py"
+ELEMENTARY, PERIODS = "_closed_forms/_elementary.py", "_closed_forms/_free_periods.py"
+TANGENT = "_closed_forms/_free_tangent.py"
+ORBIT, WHEELS, FRAME = "_scene/_orbit.py", "_scene/_rotors.py", "frames/_frame.py"
+LAWS, LVLH = "_scene/_laws.py", "_scene/_frames.py"
+STEPS, LOOP = "_integrate/_step_derivative.py", "_integrate/_loop.py"
+FLOW, FOUND = "_integrate/_flow_derivative.py", "_integrate/_switch_location.py"
+CROSSINGS, RESIDUALS = "_events/_crossings.py", "fit/_residuals.py"
+LIGHT, PROPAGATE = "lightcurve/_brightness.py", "_propagate.py"
+MOMENTS, QUATERNION = "inertia/_physical.py", "rotation/_quaternion.py"
+
+MUTANTS = (
+    # the Hamiltonian, its coordinates and the adjoint equations
+    Mutant(
+        H,
+        "(a - h for a, h in zip(momentum, self.rotor_momentum(t)))",
+        "(a + h for a, h in zip(momentum, self.rotor_momentum(t)))",
+        "the momentum of wheels acts with the wrong sign",
+        ("torques/test_rotors.py", "torques/test_energy_balance.py"),
+    ),
+    Mutant(
+        H,
+        "twice = twice + 2 * (xy * x * y",
+        "twice = twice + (xy * x * y",
+        "products of inertia count half",
+        ("hamiltonian/test_charts.py", "inertia/test_euler_equation.py"),
+    ),
+    Mutant(
+        H,
+        "xy, xz, yz = e * f - c * d, d * f - b * e",
+        "xy, xz, yz = c * d - e * f, d * f - b * e",
+        "one entry of the inverse inertia has the wrong sign",
+        ("hamiltonian/test_charts.py", "inertia/test_euler_equation.py"),
+    ),
+    Mutant(
+        H,
+        "return ct * sf * cp + cf * sp, -ct * sf * sp + cf * cp, st * sf",
+        "return ct * sf * cp + cf * sp, -ct * sf * sp - cf * cp, st * sf",
+        "one entry of the attitude matrix of the Euler angles has the wrong sign",
+        ("hamiltonian/test_charts.py",),
+    ),
+    Mutant(
+        FIELD,
+        "torques = [cross(rows[i], by_row[i]) for i in rows]",
+        "torques = [cross(by_row[i], rows[i]) for i in rows]",
+        "the torque of a potential has the wrong sign",
+        ("hamiltonian/test_charts.py",),
+    ),
+    Mutant(
+        FIELD,
+        "power = power if potential_torque is None else power - dot(potential_torque, slip)",
+        "power = power if potential_torque is None else power + dot(potential_torque, slip)",
+        "the power lost by slip against a potential has the wrong sign",
+        ("torques/test_dissipation.py", "torques/test_energy_balance.py"),
+    ),
+    Mutant(
+        ANGLES,
+        "return s * p_theta - c * across, c * p_theta + s * across, p_psi",
+        "return s * p_theta - c * across, c * p_theta - s * across, p_psi",
+        "the momentum of the canonical coordinates is wrong",
+        ("hamiltonian/test_document_000_relations.py", "hamiltonian/test_charts.py"),
+    ),
+    Mutant(
+        ANGLES,
+        "moved = angle_rates_from_rates(q, slip), cross(momentum, slip)",
+        "moved = angle_rates_from_rates(q, slip), cross(slip, momentum)",
+        "an energy sink does not keep the momentum in Euler angles",
+        ("torques/test_dissipation.py", "torques/test_every_torque.py"),
+    ),
+    Mutant(
+        COSTATE,
+        "turn_rate = tuple(a - b for a, b in zip(cross(turn, omega), energy_by_turn))",
+        "turn_rate = tuple(a + b for a, b in zip(cross(turn, omega), energy_by_turn))",
+        "the adjoint of the attitude ignores the curvature of the potential",
+        ("systems/test_systems.py", "solvers/test_flow_adjoint.py"),
+    ),
+    # rotations and inertia
+    Mutant(
+        QUATERNION,
+        "w * b + z * a - x * c,\n        w * c + x * b - y * a,\n    )",
+        "w * b + z * a + x * c,\n        w * c + x * b - y * a,\n    )",
+        "the rate of a quaternion is not that of a rotation",
+        ("rotation", "hamiltonian/test_charts.py"),
+    ),
+    Mutant(
+        MOMENTS,
+        "(-second(y, z), -second(z, x), -second(x, y)))",
+        "(-second(y, z), second(z, x), -second(x, y)))",
+        "a product of inertia of points has the wrong sign",
+        ("inertia/test_mass_properties.py",),
+    ),
+    # closed forms
+    Mutant(
+        FREE,
+        "(l1 * C - k * (polhode.r * l2 * l3) * S * N) * denominator",
+        "(l1 * C + k * (polhode.r * l2 * l3) * S * N) * denominator",
+        "the momentum of a free body circles the wrong way about one axis",
+        ("free/test_free_motion.py",),
+    ),
+    Mutant(
+        FREE,
+        "a = mu * (1 + N) * (1 + y) * (1 + w) + (1 - mu) * (1 + N + y + w)",
+        "a = mu * (1 + N) * (1 + y) * (1 + w) + (1 + mu) * (1 + N + y + w)",
+        "the addition theorem of the angle about the momentum is wrong",
+        ("free/test_free_motion.py",),
+    ),
+    Mutant(
+        FREE,
+        "half_rate = start_rate + polhode.rate * (polhode.sense * slope - beta / polhode.log_nome)",
+        "half_rate = start_rate + polhode.rate * (polhode.sense * slope + beta / polhode.log_nome)",
+        "the mean precession of free bodies near the separatrix is wrong",
+        ("free/test_free_motion.py",),
+    ),
+    Mutant(
+        TANGENT,
+        "(-S * (S * C + x * N * first) / 2, -x * S * N * second / 2)",
+        "(-S * (S * C - x * N * first) / 2, -x * S * N * second / 2)",
+        "the derivative of the free motion by its parameters is wrong",
+        ("free/test_free_motion.py", "free/test_second_derivatives.py", "systems/test_systems.py"),
+    ),
+    Mutant(
+        PERIODS,
+        "drate = jnp.where(\n        permanent,\n        (2 * energy - rate * dlength) / length",
+        "drate = jnp.where(\n        permanent,\n        (2 * energy + rate * dlength) / length",
+        "derivatives of the period of a permanent rotation are wrong",
+        ("free/test_periods.py",),
+    ),
+    Mutant(
+        PERIODS,
+        "dP_psi = jnp.where(permanent, 0, 4 * dquarter / rate_unit)",
+        "dP_psi = jnp.where(permanent, 0, 2 * dquarter / rate_unit)",
+        "derivatives of the period about the long axis are half",
+        ("free/test_periods.py",),
+    ),
+    Mutant(
+        ELEMENTARY,
+        "phase = phase + (wheel_momentum / transverse)[:, None] * elapsed",
+        "phase = phase - (wheel_momentum / transverse)[:, None] * elapsed",
+        "the wheel of a symmetric body acts with the wrong sign",
+        ("tops/test_elementary_tops.py",),
+    ),
+    Mutant(
+        ELEMENTARY,
+        "return t * t * jnp.where(near, _series(x, 2)",
+        "return t * t * jnp.where(near, _series(x, 1)",
+        "the angle of a weakly damped driven body is twice too large",
+        ("tops/test_elementary_tops.py",),
+    ),
+    Mutant(
+        TOP,
+        "inverse_tilt = (tilt[0], -tilt[1], -tilt[2])",
+        "inverse_tilt = (tilt[0], -tilt[1], tilt[2])",
+        "Lagrange's top under gravity in any direction is wrong",
+        ("tops/test_lagrange_top.py",),
+    ),
+    Mutant(
+        TOP,
+        "angle = angle / (size * size * moment)[:, None]",
+        "angle = angle / (size * moment)[:, None]",
+        "the derivative of Lagrange's top by a weight that is zero is wrong",
+        ("tops/test_lagrange_top.py", "tops/test_at_rest.py"),
+    ),
+    # orbits, gradients and orbit frames
+    Mutant(
+        ORBIT,
+        "return u * (1 - u * (second - u * (2 * second * second - third)))",
+        "return u * (1 - u * (second - u * (second * second - third)))",
+        "the last correction of Kepler's equation is of a lower order",
+        ("torques/test_kepler_equation.py",),
+    ),
+    Mutant(
+        ORBIT,
+        "u, v = cw * along - sw * across, sw * along + cw * across",
+        "u, v = cw * along + sw * across, sw * along + cw * across",
+        "the argument of periapsis does not rotate the orbit",
+        ("torques/test_orbit.py",),
+    ),
+    Mutant(
+        ORBIT,
+        "g = (bound * sine + b * turn) / n",
+        "g = (bound * sine - b * turn) / n",
+        "orbits from a state that is not at an apsis are wrong",
+        ("torques/test_orbit.py",),
+    ),
+    Mutant(
+        "_scene/_potentials.py",
+        "return -mu / (2 * square * distance) * (trace - 3 * project)",
+        "return -mu / (2 * square * distance) * (trace - 2 * project)",
+        "the gravity gradient is two thirds of what it is",
+        ("hamiltonian/test_charts.py",),
+    ),
+    Mutant(
+        LVLH,
+        "rates = jnp.concatenate([zero, -size / distance**2, yawing], axis=-1)",
+        "rates = jnp.concatenate([zero, size / distance**2, yawing], axis=-1)",
+        "the local vertical frame rotates the wrong way",
+        ("torques/test_orbit_frames.py",),
+    ),
+    # torques and wheels
+    Mutant(
+        LAWS,
+        "return 1e-7 * (3 * n * jnp.sum(n * self.moment) - self.moment) / size**3",
+        "return 1e-7 * (2 * n * jnp.sum(n * self.moment) - self.moment) / size**3",
+        "the magnetic field of a dipole is wrong away from its equator",
+        ("torques/test_machines.py", "torques/test_orbit_frames.py", "torques/test_orbit.py"),
+    ),
+    Mutant(
+        LAWS,
+        "error = (sign * (a * y - w * x - z) for x, y, z in zip(b, v, turned))",
+        "error = (sign * (a * y - w * x + z) for x, y, z in zip(b, v, turned))",
+        "pointing at a target is wrong for large angles about another axis",
+        ("torques/test_machines.py", "torques/test_torques_of_state.py"),
+    ),
+    Mutant(
+        WHEELS,
+        "return own - dot(tuple(self.axes[..., i, k] for k in range(3)), omega)",
+        "return own + dot(tuple(self.axes[..., i, k] for k in range(3)), omega)",
+        "the speed of a wheel relative to the body is wrong",
+        ("torques/test_rotors.py", "torques/test_machines.py"),
+    ),
+    Mutant(
+        WHEELS,
+        "parts = [self.axial_momentum(i, t) ** 2 / (2 * self.inertia[..., i]) for i in self.loose]",
+        "parts = [self.axial_momentum(i, t) ** 2 / self.inertia[..., i] for i in self.loose]",
+        "the energy of wheels counts twice",
+        ("torques/test_rotors.py", "torques/test_energy_balance.py"),
+    ),
+    Mutant(
+        WHEELS,
+        "return momentum + self.torque[..., i] * (t - self.start)",
+        "return momentum - self.torque[..., i] * (t - self.start)",
+        "a motor with a constant torque runs the wrong way",
+        ("torques/test_rotors.py",),
+    ),
+    Mutant(
+        "_scene/_couplings.py",
+        "low = -self.max_torque * jnp.clip(1 + share, 0, 1)",
+        "low = -self.max_torque * jnp.clip(1 - share, 0, 1)",
+        "the braking torque of a motor falls with its speed",
+        ("torques/test_machines.py",),
+    ),
+    # frames and sensors
+    Mutant(
+        FRAME,
+        "carried = carried + 2 * velocity",
+        "carried = carried + velocity",
+        "the Coriolis acceleration is half",
+        ("frames/test_document_003.py", "frames/test_rotating_frame.py"),
+    ),
+    Mutant(
+        FRAME,
+        "return 2 * multiply(conjugate(value), slope)[1:] / jnp.sum(value * value)",
+        "return 2 * multiply(slope, conjugate(value))[1:] / jnp.sum(value * value)",
+        "the angular velocity of a prescribed attitude is along space axes",
+        ("frames/test_rotating_frame.py",),
+    ),
+    Mutant(
+        "frames/_sensors.py",
+        "reading = reading + jnp.cross(angular_acceleration(trajectory), lever)",
+        "reading = reading - jnp.cross(angular_acceleration(trajectory), lever)",
+        "the tangential acceleration of an accelerometer has the wrong sign",
+        ("frames/test_sensors.py",),
+    ),
+    # integration: error control, switches, events and derivatives
+    Mutant(
+        LOOP,
+        "allowed = SHARE * options.rtol.astype(error.dtype) * angle / (whole * drift)",
+        "allowed = SHARE * options.rtol.astype(error.dtype)",
+        "each step may have the error of the whole motion",
+        ("solvers/test_error_control.py", "test_stepping.py", "solvers/test_switches.py"),
+    ),
+    Mutant(
+        LOOP,
+        "rises = jnp.where(turn.levels[row] > 0, 1, -1) * sign",
+        "rises = jnp.where(turn.levels[row] > 0, -1, 1) * sign",
+        "the direction of an event is the opposite",
+        ("test_events.py",),
+    ),
+    Mutant(
+        STEPS,
+        "weight = jnp.sum(cotangent * (later - before), axis=0)",
+        "weight = jnp.sum(cotangent * (before - later), axis=0)",
+        "the jump of the costate at a switch has the wrong sign",
+        ("solvers/test_switches.py",),
+    ),
+    Mutant(
+        STEPS,
+        "bars = bars + (h[None] * change)[None] * table[i][:, None, None]",
+        "bars = bars + (h[None] * change)[None] * table[i - 1][:, None, None]",
+        "the derivative of a Runge-Kutta step uses the wrong row of its table",
+        ("solvers/test_switches.py", "systems/test_systems.py"),
+    ),
+    Mutant(
+        FLOW,
+        "dy = [a - dt0 * f for a, f in zip(dy, self.field(c, t0, y))]",
+        "dy = [a + dt0 * f for a, f in zip(dy, self.field(c, t0, y))]",
+        "the derivative by the first time has the wrong sign",
+        ("test_simulate.py", "solvers/test_flow_adjoint.py"),
+    ),
+    Mutant(
+        FOUND,
+        "change = jnp.where(search.hit, -value(part) / slope, 0)",
+        "change = jnp.where(search.hit, value(part) / slope, 0)",
+        "second derivatives by the place of a switch have the wrong sign",
+        ("solvers/test_switches.py", "test_events.py"),
+    ),
+    Mutant(
+        CROSSINGS,
+        "c, d = 3 * jump - 2 * b - b_end, b + b_end - 2 * jump",
+        "c, d = 3 * jump + 2 * b - b_end, b + b_end - 2 * jump",
+        "tangencies of an event function between two samples are misjudged",
+        ("test_events.py",),
+    ),
+    Mutant(
+        PROPAGATE,
+        "angles = 2 * rotation.multiply(back, turns)[..., 1:]",
+        "angles = rotation.multiply(back, turns)[..., 1:]",
+        "the attitude error of a filter is half",
+        ("test_propagate.py",),
+    ),
+    # fits and light curves
+    Mutant(
+        RESIDUALS,
+        "omega = omega - delay * slope + delay**2 / 2 * bend",
+        "omega = omega - delay * slope - delay**2 / 2 * bend",
+        "the delay of a gyroscope is wrong to second order",
+        ("fit/test_gyroscope.py",),
+    ),
+    Mutant(
+        RESIDUALS,
+        "rest = jnp.where(side > 0, jnp.maximum(rest, 0), rest)",
+        "rest = jnp.where(side > 0, jnp.minimum(rest, 0), rest)",
+        "saturated readings pull the fit the wrong way",
+        ("fit/test_gyroscope.py", "fit/test_fit_models.py"),
+    ),
+    Mutant(
+        LIGHT,
+        "square = (axes**2) @ (normals**2).T",
+        "square = axes @ (normals**2).T",
+        "the facets of an ellipsoid are those of another body",
+        ("lightcurve/test_scattering.py",),
+    ),
+    Mutant(
+        LIGHT,
+        "light = jnp.maximum(light, 1e-12) / (jnp.pi / 2 * (b * c) ** (2 / 3))",
+        "light = jnp.maximum(light, 1e-12) / (jnp.pi / 2 * (b * c) ** (1 / 3))",
+        "magnitudes depend on the scale of a shape",
+        ("lightcurve/test_scattering.py", "lightcurve/test_fit.py"),
+    ),
+)  # fmt: skip
+
+
+def mutated_text(mutant: Mutant, package: Path = PACKAGE) -> str:
+    """The file with its formula changed; ValueError unless ``old`` stands in it exactly once."""
+    path = package / mutant.file
+    if not path.exists():
+        raise ValueError(f"{mutant.file} does not exist: name the file that holds {mutant.old!r}")
+    text = path.read_text(encoding="utf-8")
+    if (count := text.count(mutant.old)) != 1:
+        raise ValueError(f"{mutant.file} holds {mutant.old!r} {count} times, expected once")
+    return text.replace(mutant.old, mutant.new)
+
+
+class Outcome(NamedTuple):
+    """``state``: killed, survived or not run; ``detail``: the test that failed, or the reason."""
+
+    state: str
+    detail: str
+    seconds: float = 0.0
+
+
+def run_tests(source: Path, tests: Sequence[str]) -> tuple[int, str]:
+    """Exit status of pytest with the package in ``source``, and the first failed test."""
+    command = [sys.executable, "-m", "pytest", "-x", "-q", "-m", "not slow", "-p", "no:xdist"]
+    command += ["-p", "no:cacheprovider", *(str(ROOT / "tests" / test) for test in tests)]
+    environment = os.environ | {"PYTHONPATH": str(source)}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    lines = [x for x in done.stdout.splitlines() if x.startswith(("FAILED", "ERROR"))]
+    last = (done.stdout or done.stderr).strip().splitlines()[-1:]
+    return done.returncode, (lines or last or [""])[0]
+
+
+def copied(folder: Path) -> Path:
+    """A copy of the package in an empty folder."""
+    shutil.copytree(PACKAGE, folder / "polhode", ignore=shutil.ignore_patterns("__pycache__"))
+    return folder
+
+
+def outcome_of(mutant: Mutant) -> Outcome:
+    """Whether the tests of a mutant, or those of ``WIDER``, fail."""
+    begin = time.monotonic()
+    try:
+        text = mutated_text(mutant)
+    except ValueError as error:
+        return Outcome("not run", str(error))
+    with tempfile.TemporaryDirectory() as folder:
+        source = copied(Path(folder))
+        (source / "polhode" / mutant.file).write_text(text, encoding="utf-8")
+        code, detail = run_tests(source, mutant.tests)
+        if code == 0:
+            code, detail = run_tests(source, WIDER)
+            detail = f"only by the wider tests: {detail}"
+    seconds = time.monotonic() - begin
+    if code == 0:
+        return Outcome("survived", mutant.effect, seconds)
+    return Outcome("killed" if code == 1 else "not run", detail, seconds)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--only", nargs="+", default=[], help="words of file, formula or effect")
+    parser.add_argument("--jobs", type=int, default=1, help="mutants run at a time")
+    parser.add_argument("--unmutated", action="store_true", help="run the tests unchanged")
+    options = parser.parse_args()
+    if options.unmutated:
+        tests = dict.fromkeys(test for mutant in MUTANTS for test in mutant.tests)
+        with tempfile.TemporaryDirectory() as folder:
+            code, detail = run_tests(copied(Path(folder)), list(tests))
+        print(detail)
+        return code
+    chosen = [m for m in MUTANTS if all(word in " ".join(m[:4]) for word in options.only)]
+    if not chosen:
+        print("no mutant holds these words")
+        return 2
+    states = []
+    with ThreadPoolExecutor(options.jobs) as pool:
+        for mutant, found in zip(chosen, pool.map(outcome_of, chosen)):
+            states.append(found.state)
+            print(f"{found.state:8} {found.seconds:5.0f} s  {mutant.file:36} {mutant.effect}")
+            print(f"{'':18}{found.detail}", flush=True)
+    killed = states.count("killed")
+    print(f"{killed} of {len(states)} mutants killed, {states.count('survived')} survived")
+    return 1 if "survived" in states else 2 if "not run" in states else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
