@@ -26,6 +26,7 @@ FULL: dict[str, list[str]] = {
     "controllers": [], "scene_cost": [], "scaling": [], "free_body": [], "torqued": [],
     "error_control": ["--bodies", "100"], "rotation_stress": [], "stress": [], "identification": [],
     "satellites": [], "throw_design": [], "throws_synthetic": [], "accelerator": [],
+    "engines": [],
 }  # fmt: skip
 
 
@@ -77,7 +78,8 @@ def main() -> int:
                 drawn = _figures.work_precision(merged, families)
                 _figures.save(drawn, _report.RESULTS / f"{name}.svg")
         others = [
-            _report.RESULTS / f"{name}.json" for name in ("scaling", "gradients", "throw_design")
+            _report.RESULTS / f"{name}.json"
+            for name in ("scaling", "gradients", "throw_design", "engines")
         ]
         _figures.draw([path for path in others if path.exists()], _report.RESULTS)
         for path in _page.write():

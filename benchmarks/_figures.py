@@ -224,9 +224,42 @@ def throw_design(report: dict):
     return figure
 
 
+def engines(report: dict):
+    """Attitude error and change of the energy of physics engines against revolutions."""
+    import matplotlib.pyplot as plt
+
+    from polhode.plot._matplotlib import STYLE
+
+    with plt.rc_context(STYLE):
+        figure = plt.figure(figsize=(9.0, 3.1), layout="constrained")
+        left, right = figure.subplots(1, 2)
+        for row in report["numbers"]["rows"]:
+            if row["body"] != "t_handle":
+                continue
+            for ax, name in ((left, "attitude"), (right, "energy")):
+                values = [None if x is None else abs(x) for x in row[name]]
+                points = [(t, x) for t, x in zip(row["turns"], values) if x]
+                if points and max(x for _, x in points) > 1e-14:
+                    (line,) = ax.loglog(*zip(*points), label=row["engine"])
+                    line.set_color(ENGINE_COLOURS.get(row["engine"], "#888888"))
+        left.set_ylabel("attitude error [rad]")
+        right.set_ylabel("relative change of the energy")
+        right.set_ylim(1e-13, 1e2)
+        for ax in (left, right):
+            ax.set_xlabel("revolutions")
+        left.legend()
+    return figure
+
+
+ENGINE_COLOURS = {
+    "MuJoCo Euler": "#CC79A7", "MuJoCo implicitfast": "#009E73", "MuJoCo RK4": "#0072B2",
+    "Bullet": "#E69F00", "no gyroscopic term": "#888888",
+}  # fmt: skip
+
+
 DRAWN = {
     "work_precision": work_precision, "scaling": scaling, "gradients": gradients,
-    "identification": identification, "throw_design": throw_design,
+    "identification": identification, "throw_design": throw_design, "engines": engines,
 }  # fmt: skip
 
 

@@ -379,6 +379,29 @@ def imports(report: dict) -> list[str]:
     ]  # fmt: skip
 
 
+def engines(report: dict) -> list[str]:
+    from benchmarks.engines import at_turns
+
+    rows_of = report["numbers"]["rows"]
+    lines = []
+    for row in rows_of:
+        cells = []
+        for turns in (1, 10, 100, 1000):
+            angle, energy = at_turns(row, turns)
+            text = "–" if angle is None else f"{angle:.1e} / {energy:+.1e}"
+            cells.append(text)
+        lines.append([f"{row['body']}: {row['engine']}", *cells, number(row["us_per_step"])])
+    header = ["attitude error [rad] / change of the energy after",
+              *(f"{n:,} revolutions" for n in (1, 10, 100, 1000)), "µs a step"]  # fmt: skip
+    return [
+        "## Physics engines beside the exact motion", "", machine(report), "",
+        "Free bodies of `polhode reference` at about 10 rad/s, without damping, in steps of"
+        f" {1e3 * report['numbers']['step']:g} ms; a dash: the motion has diverged.", "",
+        "![attitude error and energy of physics engines](results/engines.svg)", "",
+        *rows(header, lines),
+    ]  # fmt: skip
+
+
 SECTIONS = {
     "cold_tasks": cold_tasks, "imports": imports, "plain_calls": plain_calls,
     "first_calls": first_calls, "gradients": gradients, "controllers": controllers,
@@ -389,6 +412,6 @@ SECTIONS = {
     "racquet": racquet,
     "stress": stress,
     "free_body": free_body,
-    "rotation_stress": rotation_stress, "torqued": torqued,
+    "rotation_stress": rotation_stress, "torqued": torqued, "engines": engines,
 }  # fmt: skip
 """By name of the benchmark, in the order of the page; the others go through ``generic``."""

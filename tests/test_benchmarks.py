@@ -429,6 +429,38 @@ def test_figures_are_drawn_from_results(tmp_path):
     assert made.read_text() == (_figures.draw([path], tmp_path)[0]).read_text()
 
 
+def test_engines_are_scored_by_attitude_energy_and_momentum():
+    from benchmarks import engines
+
+    body = engines.bodies()[0]
+    half = 0.5e-6
+    turn = np.array([math.cos(half), math.sin(half), 0, 0])  # in space, by 1e-6 rad
+    w, x, y, z = body["wxyz"]
+    turned = np.array([turn[0] * w - turn[1] * x, turn[0] * x + turn[1] * w,
+                       turn[0] * y - turn[1] * z, turn[0] * z + turn[1] * y])  # fmt: skip
+    exact = np.stack([body["wxyz"]] * 2)
+    found = engines.score(
+        body, [1, 2], exact, np.stack([-turned, exact[1]]), np.stack([1.5 * body["omega"]] * 2)
+    )
+    np.testing.assert_allclose(found["attitude"], [1e-6, 0], rtol=1e-9)
+    np.testing.assert_allclose(found["energy"], 1.25)
+    np.testing.assert_allclose(found["momentum"], 0.5, rtol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["MuJoCo RK4", "Bullet"])
+def test_engines_are_given_the_same_body(name):
+    from benchmarks import engines
+
+    runs = engines.engines()
+    if name not in runs:
+        pytest.skip("not installed")
+    for body in engines.bodies():
+        saves = [10, 20]
+        row = engines.score(body, saves, engines.exact(body, saves), *runs[name][1](body, saves))
+        assert max(row["attitude"]) < 1e-2  # steps of order 1, 0.02 rad each
+
+
 WRITE = "run: python -m benchmarks page"
 
 

@@ -1,6 +1,7 @@
 """The command line: what it writes and prints, its exit codes, and what is left after a failure."""
 
 import importlib.util
+import json
 import os
 import re
 import signal
@@ -400,3 +401,19 @@ def test_the_log_of_xla_is_off_unless_it_is_asked_for(monkeypatch, capsys):
             monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", before)
         assert main(["schema"]) == 0
         assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == after
+
+
+def test_the_reference_motions_are_written(here, capsys):
+    shipped = (SCENES.parent / "reference" / "tumbling.json").read_text("utf-8")
+    assert main(["reference"]) == 0
+    assert main(["reference"]) == 0
+    assert (here / "tumbling.json").read_text("utf-8") == shipped
+    assert main(["reference", "-o", "truth/mine.csv"]) == 0
+    assert "mine.json" in capsys.readouterr().out
+    lines = (here / "truth" / "mine.csv").read_text("utf-8").splitlines()
+    bodies = json.loads(shipped)["bodies"]
+    assert len(lines) == 1 + sum(len(body["samples"]) for body in bodies)
+    assert main(["reference", "-o", "mine.txt"]) == 2
+    (here / "tumbling.csv").write_text("not of this program")
+    assert main(["reference"]) == 1
+    assert main(["reference", "--force"]) == 0

@@ -17,7 +17,7 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
-from polhode.cli import _explain, _fit, _look, _run, _scenes, _targets
+from polhode.cli import _explain, _fit, _look, _reference, _run, _scenes, _targets
 from polhode.cli._inputs import READERS
 from polhode.cli._signals import INTERRUPTED, TERMINATED, heeded
 from polhode.files import SceneFileError
@@ -41,6 +41,7 @@ _OTHER_WORDS = {
     "view": ("plot", "show", "page", "html", "animate", "viewer", "display", "draw", "open"),
     "schema": ("json-schema", "jsonschema", "json_schema"),
     "scenes": ("scene", "examples", "example", "list", "ls", "demo"),
+    "reference": ("truth", "tumbling", "exact", "reference_motions"),
     "--help": ("help",),
     "--version": ("version",),
 }
@@ -188,7 +189,8 @@ _EXAMPLES = {
 for _name, _command in (("run", _run.run), ("explain", _explain.explain), ("fit", _fit.fit),
                         ("schema", _explain.schema), ("view", _look.view),
                         ("lightcurve", _look.lightcurve),
-                        ("scenes", _scenes.scenes)):  # fmt: skip
+                        ("scenes", _scenes.scenes),
+                        ("reference", _reference.reference)):  # fmt: skip
     _NAMES.append(_name)
     app.command(_name, epilog=_EXAMPLES.get(_name))(_guarded(_command))
 

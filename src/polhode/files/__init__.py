@@ -10,6 +10,7 @@ from polhode._extras import imported
 from polhode.files._atomic import write_netcdf as write_netcdf
 from polhode.files._error import SceneFileError as SceneFileError
 from polhode.files._read import parse_scene as parse_scene, read_scene as read_scene
+from polhode.files._reference import reference_motions as reference_motions
 from polhode.files._shipped import shipped_scenes as shipped_scenes
 
 if TYPE_CHECKING:
