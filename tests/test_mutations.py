@@ -12,7 +12,10 @@ def test_a_mutant_changes_one_formula_of_the_package(mutant):
     before = (mutations.PACKAGE / mutant.file).read_text(encoding="utf-8")
     assert ast.dump(ast.parse(text)) != ast.dump(ast.parse(before))
     for test in (*mutant.tests, *mutations.WIDER):
-        assert (mutations.ROOT / "tests" / test.partition("::")[0]).exists(), test
+        file, _, name = test.partition("::")
+        path = mutations.ROOT / "tests" / file
+        assert path.exists(), test
+        assert not name or f"def {name.partition('[')[0]}(" in path.read_text("utf-8"), test
 
 
 def test_a_formula_that_is_gone_is_an_error():

@@ -36,6 +36,25 @@ def test_momentum_and_energy(name):
         assert np.abs(energy - energy[:, :1]).max() < 1e-9
 
 
+def test_euler_equation_with_wheels():
+    """I' domega/dt = L x omega - u a: the sign of the wheels, on which no conserved quantity bears.
+
+    I' leaves out wheels that are free about their axes a, to which their motors give u.
+    """
+    omega, moments = np.array([0.4, -0.5, 0.1]), np.diag([1.0, 2.0, 2.5])
+    oblique, upright = np.array([0.6, 0.8, 0.0]), np.array([0.0, 0.0, 1.0])
+    wheels = Rotor(oblique, inertia=0.2, speed=3.0, torque=0.05)
+    wheels = wheels + Rotor(upright, inertia=0.1, speed=2.0)
+    state = ph.State([0.8, 0.3, 0.4, 0.2], omega)
+    scene = ph.Scene(INERTIA, rotors=wheels).settled(state, jnp.array(0.0))
+    carrier = moments - 0.2 * np.outer(oblique, oblique)
+    momentum = carrier @ omega + 0.2 * (3.0 + oblique @ omega) * oblique + 0.1 * 2.0 * upright
+    want = np.linalg.solve(carrier, np.cross(momentum, omega) - 0.05 * oblique)
+    got = scene.acceleration(state.wxyz, state.omega_body, 0.0)
+    np.testing.assert_allclose(got, want, rtol=1e-14, atol=1e-15)
+    np.testing.assert_allclose(scene.momentum(state.omega_body, 0.0), momentum, rtol=1e-14)
+
+
 def test_a_wheel_against_newton():
     """One axis: (C - J) domega/dt = -tau; held wheels do not change a spin about their axis."""
     wheel = Rotor([0.0, 0.0, 1.0], inertia=0.5, speed=2.0, torque=[0.0, 0.3])
