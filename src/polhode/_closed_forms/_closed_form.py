@@ -9,8 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode._batch import is_lane_tree, map_chunks
-from polhode._method._base import AbstractMethod, Record, Samples
-from polhode._method._status import Status
+from polhode._method import AbstractMethod, Record, Samples, Status
 from polhode._scene import BodyTorque, LinearDamping, Scene, State, TorqueSum, Wheels
 from polhode.inertia import Symmetry
 

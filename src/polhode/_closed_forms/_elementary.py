@@ -21,7 +21,7 @@ from polhode._closed_forms._closed_form import (
     wheels_have_constant_momentum,
 )
 from polhode._kernels import derivable_once
-from polhode._method._base import Record, Samples
+from polhode._method import Record, Samples
 from polhode._scene import Scene, State, Wheels
 from polhode.rotation import multiply, rotation_vector_to_wxyz
 

@@ -29,8 +29,7 @@ from polhode._closed_forms._free_motion import (
 from polhode._closed_forms._free_periods import compensate
 from polhode._closed_forms._free_tangent import Quadruple
 from polhode._kernels import computed_once, kernel, opaque_ones
-from polhode._method._base import Record, Samples
-from polhode._method._status import Status
+from polhode._method import Record, Samples, Status
 from polhode._scene import Scene, State
 from polhode.inertia import Symmetry, principal
 

@@ -50,7 +50,7 @@ from polhode._closed_forms._lagrange_curve import cayley_klein, lagrange_constan
 from polhode._closed_forms._lagrange_series import Complex, Series
 from polhode._hamiltonian import components
 from polhode._kernels import any_of, derivable_once, kernel, opaque_ones, spread, staged
-from polhode._method._base import Record, Samples
+from polhode._method import Record, Samples
 from polhode._scene import Scene, State, UniformGravity, Wheels
 
 

@@ -25,6 +25,7 @@ from polhode._hamiltonian._euler_angles import (
 from polhode._hamiltonian._lie_poisson import (
     Dynamics as Dynamics,
     FixedUnits as FixedUnits,
+    LiePoissonCostate as LiePoissonCostate,
     LiePoissonUnits as LiePoissonUnits,
     external_power as external_power,
     lie_poisson_field as lie_poisson_field,
@@ -37,4 +38,3 @@ from polhode._hamiltonian._reference import (
     HamiltonianMatrices as HamiltonianMatrices,
     hamiltonian_matrices as hamiltonian_matrices,
 )
-from polhode._hamiltonian._variational import LiePoissonCostate as LiePoissonCostate

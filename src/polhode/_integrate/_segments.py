@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from polhode._method._status import Status
+from polhode._method import Status
 
 
 class Solution(NamedTuple):

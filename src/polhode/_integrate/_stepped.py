@@ -29,9 +29,7 @@ from polhode._integrate._problem import Problem
 from polhode._integrate._segments import Solution, in_segments
 from polhode._integrate._step_derivative import samples
 from polhode._kernels import Distinct, is_holdable, kernel
-from polhode._method._base import AbstractMethod, Record, Samples
-from polhode._method._options import check_options
-from polhode._method._status import Status
+from polhode._method import AbstractMethod, Record, Samples, Status, check_options
 from polhode._parts import AbstractPart
 from polhode._scene import Scene, State
 

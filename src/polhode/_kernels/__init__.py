@@ -4,31 +4,31 @@ Nothing here changes a result by more than rounding. `README.md` beside this fil
 part buys, ``polhode._policy`` where it is used and how all of it is switched off.
 """
 
-from polhode._kernels._distinct import Distinct as Distinct, jit_distinct as jit_distinct
-from polhode._kernels._fold import Specialised as Specialised, specialise as specialise
-from polhode._kernels._linear import (
+from polhode._kernels._derivatives import (
+    SMOOTH as SMOOTH,
+    are_close as are_close,
     attached as attached,
+    derivable_once as derivable_once,
     is_slope as is_slope,
     linear as linear,
+    over_gap as over_gap,
+    smooth as smooth,
     spread as spread,
+    underivable as underivable,
     zeros as zeros,
 )
-from polhode._kernels._single_call import (
+from polhode._kernels._distinct import Distinct as Distinct, jit_distinct as jit_distinct
+from polhode._kernels._fold import (
+    Specialised as Specialised,
+    computed_once as computed_once,
+    opaque_ones as opaque_ones,
+    specialise as specialise,
+    staged as staged,
+)
+from polhode._kernels._fused import (
     any_of as any_of,
     formula as formula,
     is_holdable as is_holdable,
     kernel as kernel,
     put as put,
-)
-from polhode._kernels._smooth import SMOOTH as SMOOTH, smooth as smooth
-from polhode._kernels._stage import (
-    computed_once as computed_once,
-    opaque_ones as opaque_ones,
-    staged as staged,
-)
-from polhode._kernels._undefined import (
-    are_close as are_close,
-    derivable_once as derivable_once,
-    over_gap as over_gap,
-    underivable as underivable,
 )

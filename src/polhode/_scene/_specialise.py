@@ -7,11 +7,10 @@ import jax
 import numpy as np
 
 from polhode._checks import is_concrete
-from polhode._scene._orbit import KeplerOrbit
+from polhode._scene._orbits import KeplerOrbit
 from polhode._scene._potentials import GravityGradient, PotentialSum, UniformGravity
-from polhode._scene._rotor import Rotor
-from polhode._scene._rotors import RotorSum
 from polhode._scene._scene import Scene
+from polhode._scene._wheels import Rotor, RotorSum
 from polhode.inertia import Inertia
 
 

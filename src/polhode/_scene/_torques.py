@@ -1,14 +1,23 @@
-"""External torques in body or space axes, constant, of time or of the state; damping."""
+"""Torques: in body and space axes, of the state, damping, pulses, and an energy sink."""
 
 import abc
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import ArrayLike, as_float_array, require_positive
-from polhode._hamiltonian import Attitude, Vector, components, triple
+from polhode._checks import (
+    ArrayLike,
+    as_float_array,
+    as_positive,
+    is_concrete,
+    require,
+    require_positive,
+)
+from polhode._hamiltonian import Attitude, Vector, components, cross, triple
 from polhode._parts import AbstractPart, Signature, shaped, terms_of
 
 
@@ -201,3 +210,147 @@ class FeedbackTorque(AbstractTorque):
     ) -> tuple[Array, Array, Array]:
         given = t, stacked(attitude.wxyz), stacked(omega)
         return components(_FEEDBACK.mapped(self.fn, *given))
+
+
+# Dissipation inside a body that conserves its angular momentum: the energy sink.
+#
+# No torque acts from outside, so that R L does not change. The parts of the body that yield a
+# little turn its mean axes on by a slip s beside the rates omega = I^-1 L,
+#
+#     dR/dt = R [omega + s]x,   dL/dt = L x (omega + s),   s = k (L x omega),
+#
+# whatever s may be: d(R L)/dt = R ((omega + s) x L + L x (omega + s)) = 0. The kinetic energy
+# T = L . omega / 2 falls by
+#
+#     dT/dt = omega . (L x s) = -k |L x omega|^2,
+#
+# that is wherever the body does not turn about a principal axis, down to |L|^2 / (2 I_max), the
+# only stable end. This is the double bracket of A. M. Bloch, P. S. Krishnaprasad, J. E. Marsden, T.
+# S. Ratiu, The Euler-Poincare equations and double bracket dissipation, Commun. Math. Phys. 175
+# (1996) 1, with the attitude that belongs to it; as an energy sink: P. W. Likins, Effects of energy
+# dissipation on the free body motions of spacecraft, JPL TR 32-860 (1966).
+
+
+_RATE_LAW = Signature("EnergySink", {"momentum_body": (3,), "omega_body": (3,)})
+
+
+class EnergySink(AbstractTorque):
+    """Loss of kinetic energy inside the body at constant angular momentum in space.
+
+    dT/dt = -k |L x omega|^2 [W], and no torque from outside: the body ends in a spin about its
+    axis of largest moment. ``k`` (...) [s/(kg m^2)] is a rate law: a number, not negative, or a
+    function ``fn(momentum_body, omega_body)`` of L (3,) [kg m^2/s] and omega (3,) [rad/s] of one
+    body that returns one, stored and checked as those of ``BodyTorque``. A body of moments A, A, C
+    with its angular momentum at the angle theta from the axis of C obeys, while k is constant,
+
+        tan theta(t) = tan theta(0) exp(k |L|^2 (1/C - 1/A) t).
+
+    ``omega_body`` of a trajectory is I^-1 L. The body rotates in addition by ``slip``, which is
+    small where little energy is lost in a revolution; ``docs/how-to/dissipate_energy.md`` derives
+    this and gives rate laws. It adds to torques and potentials that are weak against L x omega.
+
+        sink = ph.EnergySink(0.01)
+        scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]), torque=sink)
+        state = ph.State([1.0, 0, 0, 0], [1.0, 0.1, 0.1])
+        end = ph.simulate(scene, state, [0.0, 4000.0])       # about body z, 1/3 rad/s
+
+    Raises ValueError for a negative k, TypeError or ValueError for a function that takes or returns
+    something else.
+    """
+
+    k: Float[Array, "*#b"] | Callable = shaped()
+
+    def __init__(self, k: ArrayLike | Callable):
+        if callable(k):
+            self.k = _RATE_LAW.checked(k)
+            return
+        self.k = as_positive("EnergySink k", k, zero=True, hint="a positive k takes energy away")
+
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
+        return triple([jnp.zeros_like(omega[0])] * 3)  # nothing acts from outside
+
+    def slip(self, t: Array | float, momentum: Sequence[Array], omega: Sequence[Array]) -> Vector:
+        rate = self.k
+        if callable(rate):
+            rate = _RATE_LAW.mapped(rate, stacked(momentum), stacked(omega))
+        return triple(rate * x for x in cross(momentum, omega))
+
+
+# Pulses: torques that act for a while, such as those of thrusters, whose edges no step misses.
+
+
+class Pulses(AbstractTorque):
+    """A torque that acts from each of ``starts`` to the corresponding one of ``ends``.
+
+    **Arguments:** ``torque``: the torque during the pulses, such as ``ph.BodyTorque``; ``starts``,
+    ``ends`` (k,) [s]: shared by all bodies, each end after its start. Steps end at every edge, so
+    that no pulse is missed however short, and derivatives by starts and ends are exact. Pulses that
+    overlap act once. A motion with k pulses is solved in 2 k + 1 parts.
+
+        burn = ph.Pulses(ph.BodyTorque([0.0, 0.0, 2.0]), [1.0, 5.0], [1.05, 5.001])
+        scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), torque=burn)
+        state = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 0.0])
+        ph.simulate(scene, state, [0.0, 9.0]).omega_body[-1]     # (0, 0, 0.051)
+
+    Raises TypeError unless it is a torque, ValueError for ends before starts or other shapes.
+    """
+
+    starts: Float[Array, " k"]
+    ends: Float[Array, " k"]
+    on: Array | None
+    torque: AbstractTorque = shaped()
+
+    def __init__(self, torque: AbstractTorque, starts: ArrayLike, ends: ArrayLike):
+        if not isinstance(torque, AbstractTorque):
+            raise TypeError(
+                "Pulses takes a torque such as ph.BodyTorque([0., 0., 1.]), got"
+                f" {type(torque).__name__}."
+            )
+        self.torque, self.on = torque, None
+        self.starts, self.ends = (
+            jnp.atleast_1d(as_float_array(f"Pulses {name}", x))
+            for name, x in (("starts", starts), ("ends", ends))
+        )
+        if self.starts.ndim != 1 or self.starts.shape != self.ends.shape:
+            raise ValueError(
+                "Pulses starts and ends must be two lists of times of one length, got shapes"
+                f" {self.starts.shape} and {self.ends.shape}; all bodies share them."
+            )
+        if is_concrete(self.starts, self.ends):
+            require(
+                np.asarray(self.ends) > np.asarray(self.starts),
+                f"each pulse must end after it starts, got {starts} and {ends}.",
+            )
+
+    @property
+    def edges(self) -> Array | None:
+        inner = self.torque.edges
+        own = [self.starts, self.ends] + ([] if inner is None else [inner])
+        return jnp.concatenate(own)
+
+    def during(self, t: Array | float) -> AbstractTorque:
+        inner = eqx.tree_at(lambda p: p.torque, self, self.torque.during(t))
+        return eqx.tree_at(lambda p: p.on, inner, self._acts(t), is_leaf=lambda x: x is None)
+
+    def _acts(self, t: Array | float) -> Array:
+        """Whether a pulse acts at the times ``t`` (...): 1 or 0."""
+        if self.on is not None:
+            return self.on
+        t = jnp.asarray(t, self.starts.dtype)
+        starts, ends = (x.reshape((1,) * t.ndim + x.shape) for x in (self.starts, self.ends))
+        among = (starts <= t[..., None]) & (t[..., None] < ends)
+        return jnp.where(jnp.any(among, axis=-1), 1, 0).astype(self.starts.dtype)
+
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
+        on = self._acts(t)
+        return triple(on * x for x in self.torque.body_components(t, attitude, omega))
+
+    def slip(
+        self, t: Array | float, momentum: Sequence[Array], omega: Sequence[Array]
+    ) -> Vector | None:
+        found = self.torque.slip(t, momentum, omega)
+        return None if found is None else triple(self._acts(t) * x for x in found)

@@ -17,7 +17,7 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.sharding import AxisType
 
 from polhode import _policy
-from polhode._kernels._linear import linear
+from polhode._kernels._derivatives import linear
 
 _HOLDABLE = frozenset(
     """abs acos acosh add add_any and asin asinh atan atan2 atanh attached bitcast_convert_type

@@ -1,5 +1,9 @@
-"""Two primitives: a linear map that is computed by one program and transposed by another, such as
-``spread``, and values found by other means with the derivatives of what they are."""
+"""Derivatives that JAX has no rule for.
+
+Two primitives: a linear map that is computed by one program and transposed by another, such as
+``spread``; and values computed by other means, with the derivatives of what they are. Values whose
+derivatives are not known. Functions that are smooth although they compare.
+"""
 
 import functools
 from collections.abc import Callable, Sequence
@@ -7,10 +11,12 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import ShapedArray
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
 
 from polhode import _policy
 
@@ -216,3 +222,74 @@ def _attached_batch(arrays, dims, *, rule, count):
 ad.primitive_jvps[_attached_p] = _attached_jvp
 batching.primitive_batchers[_attached_p] = _attached_batch
 mlir.register_lowering(_attached_p, mlir.lower_fun(_values, multiple_results=True))
+
+
+# Values whose derivatives are not known: they become NaN, never numbers that are wrong.
+
+
+@jax.custom_jvp
+def underivable(x: Array, where: Array) -> Array:
+    """``x``, with NaN for its derivatives ``where`` (of the shape of x) it has a tangent.
+
+    Tangents and cotangents that are zero stay zero: what does not depend on ``x`` is not affected.
+    """
+    del where
+    return x
+
+
+@underivable.defjvp
+def _underivable_rule(primals, tangents):
+    x, where = primals
+    return underivable(x, where), linear(_spoiled, _spoiled, [where], [tangents[0]], [x])[0]
+
+
+def _spoiled(given: Any, tangents: Any) -> list[Array]:
+    (where,), (tangent,) = given, tangents
+    return [jnp.where(where & (tangent != 0), np.nan, tangent)]
+
+
+def are_close(first: Array, second: Array) -> Array:
+    """Where two numbers agree to half of their digits."""
+    limit = jnp.finfo(first.dtype).eps ** 0.5
+    return jnp.abs(first - second) <= limit * jnp.maximum(jnp.abs(first), jnp.abs(second))
+
+
+def over_gap(entry: Array, first: Array, second: Array) -> Array:
+    """``entry / (first - second)`` of an entry whose value is zero; all of one shape.
+
+    It counts in derivatives alone. Where the two agree to half of their digits the derivative by
+    the entry is NaN: it loses digits in proportion to their relative difference.
+    """
+    close = are_close(first, second)
+    return underivable(entry, close) / jnp.where(close, 1, first - second)
+
+
+@jax.custom_jvp
+def derivable_once(x: Array, where: Array) -> Array:
+    """``x`` (..., n) with its first derivatives, and NaN for the second ones by any two of its last
+    axis ``where`` they are taken."""
+    del where
+    return x
+
+
+@derivable_once.defjvp
+def _once_rule(primals, tangents):
+    x, where = primals
+    one = 1 + jnp.sum(underivable(x, where) - x, axis=-1, keepdims=True)
+    return derivable_once(x, where), tangents[0] * one
+
+
+# Functions that are smooth although they compare.
+
+
+SMOOTH = "smooth_function"
+"""Name of the calls of such functions, in which no kink is looked for."""
+
+
+def smooth(fn: Callable) -> Callable:
+    """``fn``, which chooses between formulas of the same value: its comparisons make no kink."""
+
+    def smooth_function(*args):
+        return fn(*args)
+
+    return jax.jit(smooth_function)

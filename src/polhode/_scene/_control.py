@@ -1,4 +1,4 @@
-"""Ready-made control: pointing and rate damping, a magnetic dipole in a field."""
+"""Control laws: pointing and rate damping, and a magnetic dipole in a field."""
 
 from collections.abc import Callable, Sequence
 from typing import ClassVar

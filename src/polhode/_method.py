@@ -1,0 +1,395 @@
+"""The interface of methods: options, samples, status, and checks of the input of a simulation."""
+
+import abc
+import enum
+from typing import Any, ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array
+
+from polhode._checks import as_float_array, describe, is_concrete, require
+from polhode._parts import check_fields
+from polhode._scene import Scene, State, check_scene
+
+# How the simulation of each body ended.
+
+
+class Status(enum.IntEnum):
+    """Outcome per body, as stored in ``Trajectory.status``."""
+
+    SUCCESSFUL = 0
+    MAX_STEPS = 1
+    NOT_FINITE = 2
+    CHART_SINGULAR = 3
+    STEP_FAILED = 4
+    INACCURATE = 5
+    NOT_PHYSICAL = 6
+    BAD_TIMES = 7
+    SLIDING = 8
+    TOO_MANY_EVENTS = 9
+
+    @property
+    def explanation(self) -> str:
+        """What happened and how to correct it."""
+        return _EXPLANATIONS[self]
+
+
+_EXPLANATIONS = {
+    Status.SUCCESSFUL: "finished",
+    Status.MAX_STEPS: (
+        "the solver used up max_steps before the last time: raise max_steps on the method,"
+        " loosen rtol, or shorten ts; damping far faster than the motion wants an implicit solver,"
+        " such as ph.LiePoisson(diffrax.Kvaerno5(), chunk=1)"
+    ),
+    Status.NOT_FINITE: (
+        "a NaN or infinity appeared: look at this body's inertia, state, potential and torque; or"
+        " the closed-form solution passed as method is not valid for its numbers (symmetry, centre"
+        " of mass, initial state): leave method=None"
+    ),
+    Status.CHART_SINGULAR: (
+        "theta reached 0 or pi, where Euler angles break down: use ph.LiePoisson (or leave"
+        " method=None) for this body"
+    ),
+    Status.STEP_FAILED: (
+        "the steps became too short to lead on, or an implicit solve gave up: a torque that jumps"
+        " again and again, or damping far faster than the motion, which wants an implicit solver"
+        " such as ph.LiePoisson(diffrax.Kvaerno5(), chunk=1)"
+    ),
+    Status.INACCURATE: (
+        "the estimated error exceeds the tolerance asked for tenfold: the body is chaotic, or its"
+        " rounding alone is more; loosen rtol, shorten ts, or use float64"
+    ),
+    Status.NOT_PHYSICAL: (
+        "no body has this inertia: moments must be positive and each at most the sum of the two"
+        " others, a tensor symmetric, and a wheel's moment less than the body's about its axis;"
+        " published numbers that break the inequality pass with"
+        " ph.Inertia.from_moments(..., physical=False)"
+    ),
+    Status.SLIDING: (
+        "the motion slides along a switch: a comparison in a torque (where, sign, a threshold)"
+        " drives the body back from both sides; make the torque continuous there, for instance"
+        " x / width clipped to -1 and 1 in place of sign(x)"
+    ),
+    Status.TOO_MANY_EVENTS: (
+        "the body met more events than are stored (trajectory.events.count tells how many): give"
+        " ph.Event(..., capacity=n)"
+    ),
+    Status.BAD_TIMES: "ts is not strictly increasing or strictly decreasing: sort it",
+}
+
+
+class SimulationError(RuntimeError):
+    """Some bodies did not finish; ``status`` (of the shape of the batch) states which and why."""
+
+    def __init__(self, message: str, status: Array):
+        super().__init__(message)
+        self.status = status
+
+
+# What methods have in common.
+
+
+class Record(eqx.Module):
+    """What a simulation saves: attitude, rates, all times or the last one (all static).
+
+    ``work``: also integrate the work [J] of the external torques. ``error``: also estimate the
+    error of each body at the last time, by a second, coarser run of about the same cost, and mark
+    bodies whose estimate is above ten times the tolerance by ``Status.INACCURATE``: chaotic
+    bodies, and those whose rounding error exceeds the tolerance.
+    """
+
+    attitude: bool = eqx.field(static=True, default=True)
+    rates: bool = eqx.field(static=True, default=True)
+    final_only: bool = eqx.field(static=True, default=False)
+    work: bool = eqx.field(static=True, default=False)
+    error: bool = eqx.field(static=True, default=False)
+
+    def __check_init__(self):
+        if not (self.attitude or self.rates):
+            raise ValueError("Record keeps nothing: switch on attitude, rates or both.")
+
+
+class Samples(NamedTuple):
+    """What a method returns for N lanes: (N, T, 4), (N, T, 3), (N,), (N,), (N, T), (N,).
+
+    ``error``: sum of the estimated errors of the steps, if the method knows it. ``motor_work``,
+    ``spins`` (N, T, m): of every wheel, and momenta of the coupled ones, or None.
+    """
+
+    wxyz: Array | None
+    omega_body: Array | None
+    status: Array
+    steps: Array
+    work: Array | None = None
+    error: Array | None = None
+    motor_work: Array | None = None
+    spins: Array | None = None
+
+
+class AbstractMethod(eqx.Module):
+    """Base of all methods. ``run`` simulates N bodies; ``simulate`` checks inputs and batches.
+
+    ``exact``: whether the method is a closed form, which does not compute the work.
+    """
+
+    exact: ClassVar[bool] = False
+
+    @property
+    def keeps_rtol(self) -> bool:
+        """Whether ``rtol`` decides how accurate the motion is."""
+        return False
+
+    @property
+    def name(self) -> str:
+        """The name that ``ph.explain`` prints."""
+        return type(self).__name__
+
+    @abc.abstractmethod
+    def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
+        """Samples at ``ts`` (T,) or (N, T) of lanes whose state holds at the first time."""
+
+    def search(
+        self, scene: Scene, state: State, ts: Array, rtol: Array, search: Any, final_only: bool
+    ) -> Any:
+        """Events during the motion, if the method can find them by itself; None otherwise."""
+        return None
+
+
+# Checks of the options of integrations.
+
+
+def check_options(
+    solver: Any,
+    controller: Any = None,
+    adjoint: Any = None,
+    *,
+    dt0: Any = None,
+    max_steps: Any = None,
+    chunk: Any = None,
+) -> None:
+    """Options of a stepped method: diffrax's objects, not their classes, and numbers that count.
+
+    Raises TypeError for another kind, ValueError for an option that cannot work here.
+    """
+    import diffrax  # here, so that closed forms do not wait for it
+
+    for name, value, kind, example in (
+        ("solver", solver, diffrax.AbstractSolver, "diffrax.Dopri8()"),
+        (
+            "controller", controller, diffrax.AbstractStepSizeController,
+            "diffrax.PIDController(rtol=1e-9, atol=1e-9)",
+        ),
+        ("adjoint", adjoint, diffrax.AbstractAdjoint, "diffrax.RecursiveCheckpointAdjoint()"),
+    ):  # fmt: skip
+        if isinstance(value, kind) or (value is None and name != "solver"):
+            continue
+        if isinstance(value, type) and issubclass(value, kind):
+            raise TypeError(
+                f"{name} must be an object, got the class {value.__name__}: make one of it,"
+                f" {made(value)}."
+            )
+        raise TypeError(
+            f"{name} must be a diffrax object such as {example}, got {type(value).__name__}:"
+            f" {value!r:.60}."
+        )
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "adjoint=diffrax.BacksolveAdjoint() finds the way back by integrating it, which misses"
+            " rtol, and cannot reach the scene's numbers: use ph.FlowAdjoint() (the"
+            " default), diffrax.RecursiveCheckpointAdjoint(), or diffrax.ForwardMode() for jax.jvp."
+        )
+    if isinstance(getattr(solver, "term_structure", None), tuple):
+        raise ValueError(
+            f"{type(solver).__name__} splits positions from momenta, whose rates here depend on"
+            " both: use another solver, such as diffrax.Dopri8()."
+        )
+    if dt0 is not None:
+        step = as_float_array("dt0", dt0)
+        if step.ndim or (is_concrete(step) and float(step) == 0):
+            raise ValueError(f"dt0 must be one step in seconds, not zero, got {dt0!r:.60}.")
+    for name, value in (("max_steps", max_steps), ("chunk", chunk)):
+        if value is None:
+            continue
+        if isinstance(value, bool) or not isinstance(value, int | np.integer):
+            raise TypeError(
+                f"{name} must be an integer, got {type(value).__name__}: {value!r:.40}."
+            )
+        if value < 1:
+            raise ValueError(f"{name} must be at least 1, got {value}.")
+
+
+def made(x: Any) -> str:
+    """How an object of this class, or of the class of this object, is written."""
+    kind = x if isinstance(x, type) else type(x)
+    room = kind.__module__.split(".")[0]
+    return f"{'ph' if room == 'polhode' else room}.{kind.__name__}()"
+
+
+# Checks of what users pass to ``simulate``: types, dtypes, times and tolerances.
+
+
+def check_method(method: Any) -> None:
+    """Methods are objects, never strings."""
+    if method is None or isinstance(method, AbstractMethod):
+        return
+    import diffrax  # here, so that closed forms do not wait for it
+
+    kind = method if isinstance(method, type) else type(method)
+    if isinstance(method, type) and issubclass(method, AbstractMethod):
+        given, mend = f"the class {method.__name__}", f": make an object of it, {made(method)}"
+    elif issubclass(kind, diffrax.AbstractSolver):
+        given, mend = (
+            f"the solver {kind.__name__}",
+            f": hand it to a chart, ph.LiePoisson({made(method)})",
+        )
+    else:
+        given, mend = type(method).__name__, ""
+        if callable(method) and getattr(method, "__module__", "").startswith("polhode."):
+            given, mend = f"the function {method.__name__}", f": call it, ph.{method.__name__}()"
+    raise TypeError(f"method must be None or an object such as ph.LiePoisson(), got {given}{mend}.")
+
+
+def check_kinds(scene: Any, state: Any) -> None:
+    """A scene and a state."""
+    for name, value, kind in (("scene", scene, Scene), ("state", state, State)):
+        if not isinstance(value, kind):
+            raise TypeError(f"{name} must be a ph.{kind.__name__}, got {type(value).__name__}.")
+
+
+def check_inputs(
+    scene: Any, state: Any, ts: Any, record: Any
+) -> tuple[Scene, State, Array, Record]:
+    """Kinds, dtypes and times, with messages that tell the mend."""
+    check_kinds(scene, state)
+    record = _DEFAULT if record is None else record
+    if not isinstance(record, Record):
+        raise TypeError(f"record must be a ph.Record or None, got {type(record).__name__}.")
+    check_scene(scene)
+    check_fields(state, "state")
+    dtypes = {x.dtype for x in jax.tree.leaves((scene, state)) if isinstance(x, _ARRAYS)}
+    dtypes = {x for x in dtypes if jnp.issubdtype(x, jnp.inexact)}
+    if len(dtypes) != 1:
+        raise TypeError(
+            f"scene and state mix the dtypes {sorted(map(str, dtypes))}: make all arrays of one"
+            " dtype, for example with jnp.asarray(x, jnp.float64)."
+        )
+    dtype = dtypes.pop()
+    if dtype not in (jnp.float32, jnp.float64):
+        raise TypeError(
+            f"scene and state are of {dtype}, which is too coarse to move a body by: make all"
+            " arrays float32 or float64, for example with jnp.asarray(x, jnp.float32)."
+        )
+    ts = _times(ts, dtype)
+    if is_concrete(ts):
+        check_times(np.asarray(ts))
+    return scene, state, ts, record
+
+
+_DEFAULT = Record()
+_ARRAYS = (jax.Array, np.ndarray)
+
+
+def _times(ts: Any, dtype: Any) -> Any:
+    """Times (..., T) of the dtype; known ones in NumPy, which costs no dispatch."""
+    if type(ts) is list and all(type(x) in (float, int) for x in ts):
+        ts = np.asarray(ts, float)
+    plain = isinstance(ts, np.ndarray) and ts.dtype.kind == "f" and ts.ndim > 0
+    if plain and np.isfinite(ts).all():
+        return np.asarray(ts, dtype)
+    ts = as_float_array("ts", ts, (None,))
+    return ts if ts.dtype == dtype else ts.astype(dtype)
+
+
+def check_times(ts: np.ndarray) -> None:
+    """At least two times, strictly monotonic."""
+    if ts.shape[-1] < 2:  # the message costs more than a small simulation
+        raise ValueError(
+            f"ts must hold at least two times, got {describe(ts)}: the state holds at ts[0]."
+        )
+    steps = np.diff(ts, axis=-1)
+    good = np.all(steps > 0, axis=-1) | np.all(steps < 0, axis=-1)
+    if not np.all(good):
+        turn = int(np.argwhere((steps <= 0) if steps.flat[0] > 0 else (steps >= 0))[0][-1])
+        raise ValueError(
+            "ts must be strictly increasing or strictly decreasing (in the dtype of the state,"
+            f" {ts.dtype}); entries {turn} and {turn + 1} are {ts[..., turn].flat[0]!r} and"
+            f" {ts[..., turn + 1].flat[0]!r}: sort them and drop repeated ones."
+        )
+
+
+def default_rtol(dtype: Any) -> float:
+    """What ``rtol=None`` means: 1e-9 in float64, 1e-5 in float32."""
+    return 1e-9 if float(jnp.finfo(dtype).eps) < 1e-9 else 1e-5
+
+
+def check_rtol(rtol: float | None, dtype) -> Array | np.ndarray:
+    """The tolerance in the state's dtype; a number that is known stays known under ``jit``."""
+    eps = float(jnp.finfo(dtype).eps)
+    if rtol is None:
+        rtol = default_rtol(dtype)
+    if isinstance(rtol, Tracer) and rtol.ndim == 0:
+        return jnp.asarray(rtol, dtype)
+    number = _number("rtol", rtol)
+    require(np.isfinite(number) and number > 0, f"rtol must be positive, got {rtol}.")
+    require(
+        number >= 8 * eps,
+        f"rtol={number:g} is below what {jnp.dtype(dtype).name} can reach (about {8 * eps:.0e}):"
+        " raise rtol, or use float64 (jax.config.update('jax_enable_x64', True)).",
+    )
+    require(
+        number < 1,
+        f"rtol must be below 1, got {number:g}: it is the error of the attitude in radians, and"
+        " that of the momentum relative to its size.",
+    )
+    return np.asarray(number, dtype)
+
+
+def _number(name: str, value: Any) -> float:
+    """One known real number; TypeError for strings, truth values, arrays and the rest."""
+    try:
+        if isinstance(value, str | bytes | bool) or np.ndim(value) != 0:
+            raise TypeError("no number")
+        return float(value)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"{name} must be one number, such as 1e-9, got {type(value).__name__}: {value!r:.60}."
+        ) from error
+
+
+def raise_on_failure(status: Array) -> None:
+    """SimulationError naming what happened to how many bodies, and which came first."""
+    ended = np.asarray(status)
+    if not ended.any():  # all Status.SUCCESSFUL
+        return
+    lines = []
+    for code in np.unique(ended[ended != Status.SUCCESSFUL]):
+        found = np.argwhere(ended == code)
+        first = tuple(int(i) for i in found[0])
+        which = (
+            f"{len(found)} of {ended.size} bodies (first: index {first})" if first else "the body"
+        )
+        lines.append(f"{which}: {Status(int(code)).explanation}")
+    raise SimulationError(
+        "; ".join(lines) + ". Pass throw=False to get the trajectory with its status per body.",
+        ended,
+    )
+
+
+def judged(status: Array, scene: Scene, ts: Array, rtol: Array | float | None) -> Array:
+    """The status (N,) of lanes, or what is wrong with the input of those that were given nonsense.
+
+    What ``check_inputs`` refuses where numbers are known, found in the compiled program where they
+    are traced; a few operations for each body. ``scene``: that of the lanes; ``ts`` (T,) or (N, T).
+    """
+    if rtol is not None:
+        least = 8 * float(jnp.finfo(ts.dtype).eps)
+        missed = (status == Status.SUCCESSFUL) & ~(rtol >= least * 0.99)
+        status = jnp.where(missed, Status.INACCURATE, status)
+    status = jnp.where(scene.is_possible, status, Status.NOT_PHYSICAL)
+    steps = jax.lax.stop_gradient(ts[..., 1:] - ts[..., :-1])
+    ordered = jnp.all(steps > 0, axis=-1) | jnp.all(steps < 0, axis=-1)
+    return jnp.where(ordered, status, Status.BAD_TIMES)

@@ -1,0 +1,603 @@
+"""Rotors (wheels) whose axes are fixed in the body: gyrostats.
+
+The inertia of the scene is that of the whole body with its wheels locked, their moments about
+their own axes included (Basilisk's hub inertia has the same meaning there; some texts leave the
+wheels out). A wheel of moment J about the unit axis a, at the speed Omega relative to the body,
+adds J Omega a to L = I omega. Held at that speed: L = I omega + J Omega a. Turned by a motor of
+torque tau about its axis (0: it spins freely) its momentum c = J (a . omega + Omega) obeys
+dc/dt = tau, and L = (I - J a a^T) omega + c a: in both cases the one Hamiltonian with a momentum
+h(t) subtracted from L (Hughes, Spacecraft Attitude Dynamics, 1986, section 3.4, 6). Where tau
+depends on the state (a coupling: friction, a motor with its limits), c is part of the state.
+"""
+
+import abc
+import dataclasses
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from polhode._checks import (
+    ArrayLike,
+    as_float_array,
+    as_number,
+    as_positive,
+    is_concrete,
+    require,
+    require_positive,
+)
+from polhode._hamiltonian import Attitude, Vector, dot, triple
+from polhode._parts import AbstractPart, Signature, shaped, terms_of
+from polhode._scene._torques import stacked
+from polhode.inertia import Inertia, Symmetry
+
+# What acts between a wheel and the body about the wheel's axis: motors, friction, dampers. The
+# wheel takes the torque, the body its reaction; the wheel's momentum is then part of the state.
+
+
+class AbstractCoupling(AbstractPart):
+    """Base of what acts between a wheel and its body; couplings add with ``+``.
+
+    ``torque(t, speed, attitude, omega)`` returns the torque [N m] on the wheel about its axis;
+    ``speed``: that of the wheel relative to the body [rad/s].
+    """
+
+    @abc.abstractmethod
+    def torque(
+        self, t: Array | float, speed: Array, attitude: Attitude, omega: Sequence[Array]
+    ) -> Array:
+        """Torque on the wheel about its axis [N m]."""
+
+    def __add__(self, other: "AbstractCoupling") -> "CouplingSum":
+        return CouplingSum(terms_of("coupling", AbstractCoupling, CouplingSum, self, other))
+
+
+class CouplingSum(AbstractCoupling):
+    """Sum of couplings of one wheel."""
+
+    terms: tuple[AbstractCoupling, ...]
+
+    def torque(self, t, speed, attitude, omega):
+        first, *rest = (term.torque(t, speed, attitude, omega) for term in self.terms)
+        return sum(rest, start=first)
+
+
+class Couplings(AbstractPart):
+    """Those of several wheels, one each."""
+
+    terms: tuple[AbstractCoupling, ...]
+
+
+def _not_negative(name: str, value) -> Array:
+    return as_positive(name, value, zero=True, hint="friction takes energy away")
+
+
+class ViscousCoupling(AbstractCoupling):
+    """Viscous friction -c Omega on a wheel: a bearing, or a ring in a fluid that damps nutation.
+
+    ``c`` (...) [N m s], not negative. A wheel with nothing else damps the motion of its body at
+    constant angular momentum:
+
+        ring = ph.ViscousCoupling(0.01)
+        damper = ph.Rotor([0.0, 1.0, 0.0], inertia=0.02, speed=0.0, coupling=ring)
+        scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]), rotors=damper)
+
+    Raises ValueError for a negative c.
+    """
+
+    c: Float[Array, "*#b"] = shaped()
+
+    def __init__(self, c: ArrayLike):
+        self.c = _not_negative("ViscousCoupling c", c)
+
+    def torque(
+        self, t: Array | float, speed: Array, attitude: Attitude, omega: Sequence[Array]
+    ) -> Array:
+        return -self.c * speed
+
+
+class CoulombFriction(AbstractCoupling):
+    """Dry friction of a bearing, smoothed: -torque tanh(Omega / speed) on the wheel.
+
+    ``torque`` (...) [N m] and ``speed`` (...) [rad/s] below which it falls to zero, both not
+    negative, the speed positive. The step of dry friction itself has no solution that an explicit
+    integrator can follow at rest; here a wheel creeps to rest as if viscous, with torque / speed.
+    Raises ValueError for other numbers.
+    """
+
+    size: Float[Array, "*#b"] = shaped()
+    speed: Float[Array, "*#b"] = shaped()
+
+    def __init__(self, torque: ArrayLike, speed: ArrayLike):
+        self.size = _not_negative("CoulombFriction torque", torque)
+        self.speed = as_positive("CoulombFriction speed", speed, hint="it smooths the step")
+
+    def torque(
+        self, t: Array | float, speed: Array, attitude: Attitude, omega: Sequence[Array]
+    ) -> Array:
+        return -self.size * jnp.tanh(speed / self.speed)
+
+
+_COMMAND = Signature("Motor", {"t": (), "wxyz": (4,), "omega_body": (3,), "speed": ()})
+
+
+class Motor(AbstractCoupling):
+    """A motor between body and wheel, with limits of torque and speed.
+
+    **Arguments:** ``command``: torque on the wheel about its axis [N m], a number (...) or a
+    function ``fn(t, wxyz, omega_body, speed)`` of one body, the wheel's speed [rad/s] relative to
+    it; ``max_torque`` (...) [N m], positive: it gives no more than that; ``max_speed`` (...)
+    [rad/s], positive: the accelerating torque falls linearly to zero there (the line of a DC
+    motor); the braking torque does not. The speed needs the torque.
+
+    A wheel that controls the attitude, with friction in its bearing:
+
+        def hold(t, wxyz, omega_body, speed):       # the body takes the reaction
+            return 0.4 * wxyz[1] * jnp.sign(wxyz[0]) + 0.5 * omega_body[0]
+
+        motor = ph.Motor(hold, max_torque=0.1, max_speed=600.0) + ph.ViscousCoupling(1e-5)
+        wheel = ph.Rotor([1.0, 0.0, 0.0], inertia=1e-3, speed=0.0, coupling=motor)
+
+    Raises TypeError or ValueError for other numbers, or a function that takes or returns something
+    else.
+    """
+
+    command: Float[Array, "*#b"] | Callable = shaped()
+    max_torque: Float[Array, "*#b"] | None = shaped()
+    max_speed: Float[Array, "*#b"] | None = shaped()
+
+    def __init__(
+        self,
+        command: ArrayLike | Callable,
+        max_torque: ArrayLike | None = None,
+        max_speed: ArrayLike | None = None,
+    ):
+        if callable(command):
+            self.command = _COMMAND.checked(command)
+        else:
+            self.command = as_number("Motor command", command)
+        for name, value in (("max_torque", max_torque), ("max_speed", max_speed)):
+            setattr(self, name, None if value is None else as_positive(f"Motor {name}", value))
+        if max_speed is not None and max_torque is None:
+            raise ValueError("Motor max_speed needs max_torque, the torque that falls with it.")
+
+    def torque(
+        self, t: Array | float, speed: Array, attitude: Attitude, omega: Sequence[Array]
+    ) -> Array:
+        wanted = self.command
+        if callable(wanted):
+            given = t, stacked(attitude.wxyz), stacked(omega), speed
+            wanted = _COMMAND.mapped(wanted, *given)
+        if self.max_torque is None:
+            return wanted
+        low, high = -self.max_torque, self.max_torque
+        if self.max_speed is not None:
+            share = speed / self.max_speed
+            high = self.max_torque * jnp.clip(1 - share, 0, 1)
+            low = -self.max_torque * jnp.clip(1 + share, 0, 1)
+        return jnp.clip(wanted, low, high)
+
+
+# All wheels of a scene.
+
+IMPULSE = Signature("Rotor impulse", {"t": ()})
+
+
+class AbstractRotor(AbstractPart):
+    """Base of rotors; they add with ``+``."""
+
+    @property
+    @abc.abstractmethod
+    def wheels(self) -> tuple[Any, ...]:
+        """One by one."""
+
+    def __add__(self, other: "AbstractRotor") -> "RotorSum":
+        if not isinstance(other, AbstractRotor):
+            raise TypeError(f"a rotor adds to another rotor, not to {type(other).__name__}")
+        return RotorSum((*self.wheels, *other.wheels))
+
+    def check_within(self, inertia: Inertia) -> None:
+        """ValueError for a wheel whose moment is not part of the body's about its axis."""
+        for wheel in self.wheels:
+            if wheel.inertia is None:
+                continue
+            axis = wheel.direction
+            with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
+                turned = inertia.momentum(axis)
+                about = jnp.sum(jnp.broadcast_to(axis, turned.shape) * turned, axis=-1)
+            require(
+                np.asarray(wheel.inertia) < np.asarray(about),
+                f"a rotor's inertia ({wheel.inertia} kg m^2) must be less than the body's about the"
+                f" same axis ({about}): the scene's inertia is that of the whole body, its wheels"
+                " locked and included. Add the wheels to it.",
+            )
+
+    def settle(
+        self, omega_body: Float[Array, "*#b 3"], start: Array, wheel_speed: Array | None = None
+    ) -> "Wheels":
+        """The wheels of bodies with rates ``omega_body`` at the time ``start`` (...).
+
+        ``wheel_speed`` (..., m) [rad/s]: relative to the body; None: what the rotors were given.
+        """
+        speeds = _speeds_of(wheel_speed, len(self.wheels))
+        columns = [
+            wheel.column(omega_body, start, speed) for wheel, speed in zip(self.wheels, speeds)
+        ]
+        lead = np.broadcast_shapes(*(x.shape for column in columns for x in column[1:]))
+        lead = np.broadcast_shapes(lead, *(column[0].shape[:-1] for column in columns))
+        axes = jnp.stack([jnp.broadcast_to(c[0], (*lead, 3)) for c in columns], axis=-2)
+        momentum, inertia, torque = (
+            jnp.stack([jnp.broadcast_to(column[i], lead) for column in columns], axis=-1)
+            for i in (1, 2, 3)
+        )
+        couplings = tuple(w.coupling for w in self.wheels if w.coupling is not None)
+        return Wheels(
+            impulses=tuple(wheel.impulse for wheel in self.wheels),
+            held=tuple(wheel.is_held for wheel in self.wheels),
+            along=tuple(wheel.axis for wheel in self.wheels),
+            coupled=tuple(i for i, wheel in enumerate(self.wheels) if wheel.coupling is not None),
+            axes=axes,
+            momentum=momentum,
+            inertia=inertia,
+            torque=torque,
+            start=start,
+            couplings=Couplings(couplings) if couplings else None,
+        )
+
+
+class RotorSum(AbstractRotor):
+    """Several rotors."""
+
+    terms: tuple[AbstractRotor, ...]
+
+    @property
+    def wheels(self):
+        return self.terms
+
+
+def _speeds_of(wheel_speed: Array | None, count: int) -> Sequence[Array | None]:
+    """The speed (...) of each of ``count`` wheels, None where it is not given."""
+    if wheel_speed is None:
+        return [None] * count
+    if wheel_speed.shape[-1] != count:
+        raise ValueError(
+            f"the state has the speeds of {wheel_speed.shape[-1]} wheels, the scene {count}: give"
+            " wheel_speed one entry for each rotor, or leave it out."
+        )
+    return [wheel_speed[..., i] for i in range(count)]
+
+
+class Wheels(AbstractRotor):
+    """Rotors whose motion is known: what ``Rotor`` becomes once the state of the body is.
+
+    ``axes`` (..., m, 3); ``momentum`` (..., m) at the time ``start`` (...), relative to the body
+    where ``held``, else absolute; ``inertia`` (..., m), 0 where not known; ``torque`` (..., m).
+    ``coupled`` (static): the wheels whose momenta are part of the state, the initial ones standing
+    in ``momentum``; ``spins``: their momenta of the moment, see ``at``.
+    """
+
+    impulses: tuple[Callable | None, ...]
+    held: tuple[bool, ...] = eqx.field(static=True)
+    along: tuple[int | None, ...] = eqx.field(static=True)
+    coupled: tuple[int, ...] = eqx.field(static=True)
+    axes: Float[Array, "*#b m 3"] = shaped(None, 3)
+    momentum: Float[Array, "*#b m"] = shaped(None)
+    inertia: Float[Array, "*#b m"] = shaped(None)
+    torque: Float[Array, "*#b m"] = shaped(None)
+    start: Float[Array, "*#b"] = shaped()
+    couplings: Couplings | None = shaped()
+    spins: tuple[Array, ...] = ()
+
+    @property
+    def wheels(self):
+        raise ValueError(
+            "these rotors belong to a simulated scene and are settled already: build the new scene"
+            " from ph.Rotor objects."
+        )
+
+    def check_within(self, inertia):
+        """Nothing: the rotors were checked before they were settled."""
+
+    @property
+    def is_possible(self) -> Array:
+        """Whether (...) each wheel that is not held has a positive moment."""
+        return jnp.all(self.inertia[..., np.array(self.loose, int)] > 0, axis=-1)
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether every wheel is held (static); the momentum may be constant all the same."""
+        return all(self.held)
+
+    @property
+    def loose(self) -> tuple[int, ...]:
+        """Which wheels are not held (static)."""
+        return tuple(i for i, held in enumerate(self.held) if not held)
+
+    def settle(self, omega_body, start, wheel_speed=None):
+        if wheel_speed is None:
+            return self
+        _speeds_of(wheel_speed, len(self.held))
+        loose = ~np.array(self.held)
+        axes, omega = jnp.broadcast_arrays(self.axes, omega_body[..., None, :])
+        speeds, turning, inertia, momentum, loose = jnp.broadcast_arrays(
+            wheel_speed, jnp.sum(axes * omega, axis=-1), self.inertia, self.momentum, loose
+        )
+        momentum = jnp.where(loose, inertia * (jnp.where(loose, speeds, 0) + turning), momentum)
+        return dataclasses.replace(self, momentum=momentum, start=start)
+
+    def at(self, spins: Sequence[Array]) -> "Wheels":
+        """The wheels at a moment when those that are coupled have these momenta [kg m^2/s]."""
+        return dataclasses.replace(self, spins=tuple(spins))
+
+    def begun(self, spins: Array) -> "Wheels":
+        """The wheels with these initial momenta (..., k) of those that are coupled."""
+        shape = jnp.broadcast_shapes(spins.shape[:-1], self.momentum.shape[:-1])
+        momentum = jnp.broadcast_to(self.momentum, (*shape, self.momentum.shape[-1]))
+        places = np.array(self.coupled, int)
+        return dataclasses.replace(self, momentum=momentum.at[..., places].set(spins))
+
+    def initial_spins(self, like: Array) -> tuple[Array, ...]:
+        """Momenta of the coupled wheels at the start, of the shape of ``like``."""
+        return tuple(jnp.broadcast_to(self.momentum[..., i], like.shape) for i in self.coupled)
+
+    def speed(self, i: int, t: Array | float, omega: Sequence[Array]) -> Array:
+        """Speed of wheel i relative to the body [rad/s]; NaN where its inertia is not known."""
+        inertia, momentum = self.inertia[..., i], self.axial_momentum(i, t)
+        known = inertia > 0
+        own = jnp.where(known, momentum / jnp.where(known, inertia, 1), jnp.nan)
+        if self.held[i]:
+            return own
+        return own - dot(tuple(self.axes[..., i, k] for k in range(3)), omega)
+
+    def motor_torques(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> list[Array]:
+        """Torque [N m] on each wheel about its axis from the body; zero where it is held."""
+        found, couplings = [], iter(() if self.couplings is None else self.couplings.terms)
+        for i, held in enumerate(self.held):
+            if i in self.coupled:
+                speed = self.speed(i, t, omega)
+                found.append(next(couplings).torque(t, speed, attitude, omega))
+            elif held:
+                found.append(jnp.zeros_like(omega[0]))
+            else:
+                t = jnp.asarray(t, self.momentum.dtype)
+                change = partial(self.axial_momentum, i)
+                found.append(jax.jvp(change, (t,), (jnp.ones_like(t),))[1])
+        return found
+
+    def motor_power(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> list[Array]:
+        """Power [W] that motor and friction of each wheel give to the motion; zero where held."""
+        torques = self.motor_torques(t, attitude, omega)
+        return [
+            torque if held else torque * self.speed(i, t, omega)
+            for i, (held, torque) in enumerate(zip(self.held, torques))
+        ]
+
+    def axial_momentum(self, i: int, t: Array | float) -> Array:
+        """Momentum of wheel i along its axis (see the class) at time t [kg m^2/s]."""
+        if i in self.coupled and self.spins:
+            return self.spins[self.coupled.index(i)]
+        momentum, impulse = self.momentum[..., i], self.impulses[i]
+        if self.held[i] or i in self.coupled:
+            return momentum
+        if impulse is None:
+            return momentum + self.torque[..., i] * (t - self.start)
+
+        def given(t):
+            return IMPULSE.mapped(impulse, t)
+
+        return momentum + (given(t) - given(self.start))
+
+    def body_momentum(self, t: Array | float) -> Vector:
+        """h(t): what L is more than the momentum of the body [kg m^2/s], body components."""
+        parts = [
+            tuple(self.axial_momentum(i, t) * self.axes[..., i, k] for k in range(3))
+            for i in range(len(self.held))
+        ]
+        return triple(sum(column[1:], start=column[0]) for column in zip(*parts))
+
+    def energy(self, t: Array | float) -> Array | None:
+        """c^2/(2J) of the wheels that are not held [J]; None without such."""
+        parts = [self.axial_momentum(i, t) ** 2 / (2 * self.inertia[..., i]) for i in self.loose]
+        return sum(parts[1:], start=parts[0]) if parts else None
+
+    def carrier(self, inertia: Inertia) -> Inertia:
+        """The inertia that turns with the body: less that of wheels free about their axes."""
+        loose = self.loose
+        if not loose:
+            return inertia
+        along = [k for i in loose if (k := self.along[i]) is not None]
+        if inertia.is_principal and len(along) == len(loose):
+            less = jnp.zeros((3,), inertia.dtype)
+            for i, k in zip(loose, along):
+                column = [jnp.zeros_like(self.inertia[..., i])] * 3
+                column[k] = self.inertia[..., i]
+                less = jnp.add(*jnp.broadcast_arrays(less, jnp.stack(column, axis=-1)))
+            axial = all(k == 2 for k in along)
+            symmetric = axial and inertia.symmetry is not Symmetry.NONE
+            kind = Symmetry.AXISYMMETRIC if symmetric else Symmetry.NONE
+            left = jnp.subtract(*jnp.broadcast_arrays(inertia.moments, less))
+            return Inertia.of_symmetry(left, kind, physical=False)
+        tensor = inertia.tensor
+        for i in loose:
+            axis = self.axes[..., i, :]
+            wheel = self.inertia[..., i, None, None] * (axis[..., :, None] * axis[..., None, :])
+            tensor = jnp.subtract(*jnp.broadcast_arrays(tensor, wheel))
+        return Inertia(full=tensor)
+
+
+# One wheel, as the user describes it.
+
+
+class Rotor(AbstractRotor):
+    """A wheel on an axis fixed in the body.
+
+    **Arguments:**
+
+    - ``axis_body`` (..., 3): its axis in body axes (normalised). A wheel on body x, y or z:
+      ``Rotor.axial``.
+    - ``inertia`` (...): its moment J about that axis [kg m^2]; already part of the body's inertia.
+      May be left out when ``momentum`` is given and no ``torque``, ``impulse`` or ``coupling``.
+    - exactly one of ``momentum`` (...) = J Omega [kg m^2/s] and ``speed`` (...) = Omega [rad/s],
+      both relative to the body, at the first time. A state with a ``wheel_speed`` replaces them,
+      except for a prescribed speed.
+    - ``torque`` (...) [N m]: torque of the motor on the wheel about its axis, with the reaction on
+      the body; 0: the wheel spins freely. None: the speed is prescribed.
+    - ``impulse``: instead of ``torque``, an antiderivative of a motor torque that varies: a
+      function of time [s] returning N m s.
+    - ``coupling``: instead of both, what acts between wheel and body by the wheel's speed, the time
+      and the state: ``ph.ViscousCoupling`` or a sum of such. Exact methods have no such wheels.
+
+    Raises ValueError for a zero axis, J <= 0, or more or less than one of momentum and speed.
+    """
+
+    impulse: Callable | None
+    axis: int | None = eqx.field(static=True)
+    axis_body: Float[Array, "*#b 3"] | None = shaped(3)
+    inertia: Float[Array, "*#b"] | None = shaped()
+    momentum: Float[Array, "*#b"] | None = shaped()
+    speed: Float[Array, "*#b"] | None = shaped()
+    torque: Float[Array, "*#b"] | None = shaped()
+    coupling: AbstractCoupling | None = shaped()
+
+    def __init__(
+        self,
+        axis_body: ArrayLike | None = None,
+        inertia: ArrayLike | None = None,
+        momentum: ArrayLike | None = None,
+        speed: ArrayLike | None = None,
+        torque: ArrayLike | None = None,
+        impulse: Callable | None = None,
+        coupling: AbstractCoupling | None = None,
+        *,
+        axis: int | None = None,
+    ):
+        require(
+            axis in (None, 0, 1, 2) and (axis is None) != (axis_body is None),
+            "Rotor takes an axis_body (..., 3), or of a wheel on a body axis its number 0, 1 or 2"
+            " (Rotor.axial).",
+        )
+        self.axis, self.axis_body = axis, None
+        if axis_body is not None:
+            vector = as_float_array("axis_body", axis_body, (3,))
+            if is_concrete(vector):
+                require(
+                    np.any(np.asarray(vector) != 0, axis=-1),
+                    lambda: (
+                        f"axis_body must not be zero, got {axis_body}: give the wheel's axis in"
+                        " body axes."
+                    ),
+                )
+            self.axis_body = _unit(vector)
+        if (momentum is None) == (speed is None):
+            raise ValueError(
+                "Rotor takes exactly one of momentum (J Omega relative to the body, kg m^2/s) and"
+                " speed (Omega relative to the body, rad/s)."
+            )
+        if sum(x is not None for x in (torque, impulse, coupling)) > 1:
+            raise ValueError(
+                "Rotor takes torque (a constant motor torque, N m), impulse (a function of time,"
+                " N m s: the antiderivative of a varying one) or coupling, not both."
+            )
+        if not isinstance(coupling, AbstractCoupling | None):
+            raise TypeError(
+                "Rotor coupling must be a coupling such as ph.ViscousCoupling(0.01), got"
+                f" {type(coupling).__name__}."
+            )
+        self.coupling = coupling
+        if callable(torque):
+            raise TypeError(
+                "Rotor torque must be a number; for a motor torque that varies with time give its"
+                " antiderivative: impulse=lambda t: ... [N m s], so that the wheel's momentum is"
+                " exact."
+            )
+        if impulse is not None:
+            impulse = IMPULSE.checked(impulse)
+        given = {"inertia": inertia, "momentum": momentum, "speed": speed, "torque": torque}
+        for name, value in given.items():
+            setattr(self, name, None if value is None else as_number(name, value))
+        self.impulse = impulse
+        if inertia is None and (speed is not None or not self.is_held):
+            raise ValueError(
+                "Rotor needs inertia, the wheel's moment about its axis in kg m^2, unless it is"
+                " held at a given momentum."
+            )
+        if self.inertia is not None:
+            require_positive("the rotor's inertia", self.inertia, hint="give it in kg m^2")
+
+    @classmethod
+    def axial(
+        cls,
+        inertia: ArrayLike | None = None,
+        momentum: ArrayLike | None = None,
+        speed: ArrayLike | None = None,
+        torque: ArrayLike | None = None,
+        impulse: Callable | None = None,
+        coupling: AbstractCoupling | None = None,
+        *,
+        axis: int = 2,
+    ) -> "Rotor":
+        """A wheel on a body axis: ``axis`` 0, 1 or 2 for body x, y or z.
+
+        The other arguments are those of ``Rotor``. A symmetric body with wheels on body z that are
+        held at their speed has closed-form solutions, and with wheels on its axes it keeps them as
+        principal axes.
+        """
+        return cls(None, inertia, momentum, speed, torque, impulse, coupling, axis=axis)
+
+    @property
+    def direction(self) -> Float[Array, "*b 3"]:
+        """Unit vector (..., 3) of the axis in the body."""
+        if self.axis_body is not None:
+            return _unit(self.axis_body)
+        number = self.speed if self.momentum is None else self.momentum
+        return jnp.eye(3, dtype=jnp.asarray(number).dtype)[self.axis]
+
+    @property
+    def is_held(self) -> bool:
+        """Whether the speed relative to the body is prescribed (static)."""
+        return self.torque is None and self.impulse is None and self.coupling is None
+
+    @property
+    def wheels(self) -> tuple["Rotor", ...]:
+        return (self,)
+
+    def column(
+        self, omega_body: Array, start: Array, wheel_speed: Array | None = None
+    ) -> tuple[Array, Array, Array, Array]:
+        """Axis, its momentum at the start (relative if held, else absolute), J, motor torque.
+
+        ``wheel_speed`` (...) [rad/s]: at the start, of a wheel that is not held; None: its own.
+        """
+        direction = self.direction
+        parts = (self.inertia, self.momentum, self.speed, self.torque)
+        shapes = [direction.shape[:-1], *(x.shape for x in parts if x is not None)]
+        if not self.is_held:
+            shapes += [omega_body.shape[:-1], start.shape]
+            shapes += [] if wheel_speed is None else [wheel_speed.shape]
+        lead = np.broadcast_shapes(*shapes)
+        zero = jnp.zeros(lead, direction.dtype)
+        axis = jnp.broadcast_to(direction, (*lead, 3))
+        inertia, momentum, speed, torque = (zero if x is None else x + zero for x in parts)
+        if self.momentum is None:
+            momentum = inertia * speed
+        if self.is_held:
+            return axis, momentum, inertia, zero
+        if wheel_speed is not None:
+            momentum = inertia * jnp.broadcast_to(wheel_speed, lead)
+        turning = jnp.sum(axis * jnp.broadcast_to(omega_body, (*lead, 3)), axis=-1)
+        return axis, momentum + inertia * turning, inertia, torque
+
+
+def _unit(axis: Array) -> Array:
+    largest = jax.lax.stop_gradient(jnp.max(jnp.abs(axis), axis=-1, keepdims=True))
+    axis = axis / largest  # of any size: nothing overflows
+    return axis / jnp.sqrt(jnp.sum(axis**2, axis=-1, keepdims=True))
