@@ -36,12 +36,12 @@ class Mutant(NamedTuple):
 
 
 H, FIELD = "_hamiltonian/_energy.py", "_hamiltonian/_lie_poisson.py"
-ANGLES, COSTATE = "_hamiltonian/_euler_angles.py", "_hamiltonian/_variational.py"
+ANGLES, COSTATE = "_hamiltonian/_euler_angles.py", "_hamiltonian/_lie_poisson.py"
 FREE, TOP = "_closed_forms/_free_motion.py", "_closed_forms/_lagrange_top.py"
 ELEMENTARY, PERIODS = "_closed_forms/_elementary.py", "_closed_forms/_free_periods.py"
 TANGENT = "_closed_forms/_free_tangent.py"
-ORBIT, WHEELS, FRAME = "_scene/_orbit.py", "_scene/_rotors.py", "frames/_frame.py"
-LAWS, LVLH = "_scene/_laws.py", "_scene/_frames.py"
+ORBIT, WHEELS, FRAME = "_scene/_orbits.py", "_scene/_wheels.py", "frames/_frame.py"
+LAWS, LVLH = "_scene/_control.py", "_scene/_orbits.py"
 STEPS, LOOP = "_integrate/_step_derivative.py", "_integrate/_loop.py"
 FLOW, FOUND = "_integrate/_flow_derivative.py", "_integrate/_switch_location.py"
 CROSSINGS, RESIDUALS = "_events/_crossings.py", "fit/_residuals.py"
@@ -280,7 +280,7 @@ MUTANTS = (
         ("torques/test_rotors.py::test_a_wheel_against_newton",),
     ),
     Mutant(
-        "_scene/_couplings.py",
+        "_scene/_wheels.py",
         "low = -self.max_torque * jnp.clip(1 + share, 0, 1)",
         "low = -self.max_torque * jnp.clip(1 - share, 0, 1)",
         "the braking torque of a motor falls with its speed",
