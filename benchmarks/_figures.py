@@ -86,11 +86,11 @@ def save(figure, path: Path) -> Path:
     """Write a figure, whole or not at all, without anything that changes from run to run."""
     import matplotlib.pyplot as plt
 
-    from polhode.files._atomic import whole_file
+    from polhode.files._write import atomic_write
 
     path.parent.mkdir(parents=True, exist_ok=True)
     quiet = {"svg.hashsalt": "polhode", "svg.fonttype": "path"}
-    with plt.rc_context(quiet), whole_file(path) as partial:
+    with plt.rc_context(quiet), atomic_write(path) as partial:
         figure.savefig(partial, metadata={"Date": None} if path.suffix == ".svg" else None)
     plt.close(figure)
     return path

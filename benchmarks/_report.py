@@ -137,7 +137,7 @@ def write(
     ``path``: a file; None: ``out/benchmarks/<name>.json``. ``packages``: peers whose versions to
     record beside ours. Not-a-number and infinite values become null. Whole or not at all.
     """
-    from polhode.files._atomic import whole_file
+    from polhode.files._write import atomic_write
 
     path = OUT / f"{name}.json" if path is None else Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -152,7 +152,7 @@ def write(
         "threads": threads(),
         "numbers": _plain(numbers),
     }
-    with whole_file(path) as partial:
+    with atomic_write(path) as partial:
         Path(partial).write_text(json.dumps(report, indent=1, allow_nan=False) + "\n")
     return path
 

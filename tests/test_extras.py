@@ -74,7 +74,7 @@ uses = {
         lambda: files.parse_scene(""),
         lambda: plot.view_file("x.nc"),
         *(lambda name=name: getattr(files, name) for name in
-          ("SceneFile", "build_scene", "build_inertia", "build_method", "draw_clones", "blamed")),
+          ("SceneFile", "build_scene", "build_inertia", "build_method", "draw_clones")),
     ],
     "scale": [lambda: ensemble.stream(ensemble.Ensemble(scene, state, 3), times, "x.zarr")],
     "mesh": [lambda: ph.MassProperties.from_mesh_file("x.stl", mass=1.0)],

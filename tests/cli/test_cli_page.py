@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from polhode.cli import _show, main
-from polhode.cli._main import _NAMES
+from polhode.cli import _progress, main
+from polhode.cli._main import _COMMANDS
 
 ROOT = Path(__file__).parents[2]
 sys.path.append(str(ROOT / "docs" / "_ext"))
@@ -19,7 +19,7 @@ def test_the_page_is_that_of_the_commands():
     text = (ROOT / "docs" / "cli.md").read_text("utf-8")
     assert text == page(), "run: python docs/_ext/polhode_docs/commands.py > docs/cli.md"
     assert [line for line in text.split("\n") if line.startswith("## ")] == [
-        f"## `polhode {name}`" for name in _NAMES
+        f"## `polhode {name}`" for name in _COMMANDS
     ]
 
 
@@ -30,7 +30,7 @@ def terminal(monkeypatch):
 
     file = io.StringIO()
     console = Console(file=file, force_terminal=True, width=120)
-    monkeypatch.setattr(_show, "messages", lambda quiet: console)
+    monkeypatch.setattr(_progress, "progress_console", lambda quiet: console)
     return file
 
 

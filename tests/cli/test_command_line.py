@@ -17,7 +17,7 @@ import xarray
 
 import polhode as ph
 from polhode.cli import main
-from polhode.cli._inputs import scene_file
+from polhode.cli._files import scene_path
 from polhode.files import build_scene, build_state, read_scene, shipped_scenes
 
 SCENES = shipped_scenes()["toutatis"].parent
@@ -168,9 +168,9 @@ def test_scenes_meet_the_reference_values_they_carry(name):
      (1234.5, 12.3, "1234 ± 12"), (5.0, None, "5"), (3.0, 0.0, "3"), (2.0, 1e-9, "2 ± 1e-09")],
 )  # fmt: skip
 def test_values_are_printed_with_the_digits_of_their_spread(value, width, text):
-    from polhode.cli import _summary
+    from polhode.cli import _job
 
-    assert _summary._plus_minus(value, width) == text
+    assert _job._plus_minus(value, width) == text
 
 
 def test_compile_time_counts_nested_reports_once(monkeypatch):
@@ -270,7 +270,7 @@ def test_the_example_of_the_help_runs_where_only_polhode_is(here, capsys):
     (words,) = re.findall(r"^ *example: polhode (.*)$", capsys.readouterr().out, re.M)
     command, scene, *_ = words.split()
     assert command == "run"
-    assert scene_file(scene).samefile(SCENES / f"{scene}.toml")
+    assert scene_path(scene).samefile(SCENES / f"{scene}.toml")
 
 
 def test_help_and_version(capsys):

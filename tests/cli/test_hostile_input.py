@@ -17,8 +17,8 @@ import pytest
 import xarray
 
 import polhode as ph
-from polhode.cli import _cache, _signals, main
-from polhode.files import _atomic, _provenance
+from polhode.cli import _process, main
+from polhode.files import _write
 
 FREE = """title = "free"
 [inertia]
@@ -89,7 +89,7 @@ def test_a_disk_that_fills_up_meanwhile(here, capsys, monkeypatch):
     def full(handle):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(_atomic.os, "fsync", full)
+    monkeypatch.setattr(_write.os, "fsync", full)
     refused(capsys, ["run", "free.toml", "-o", "out.nc", "--no-figure"], 1, "No space", "out.nc",
             str(here))  # fmt: skip
     assert [path.name for path in here.iterdir()] == ["free.toml"]
@@ -229,7 +229,7 @@ def test_provenance_is_what_ran(here, capsys):
     assert found["history"].endswith(f" polhode run top.toml -o out.nc {' '.join(command)}")
     assert datetime.datetime.fromisoformat(found["history"].split()[0]).tzinfo is not None
     assert found["method"].startswith("ClosedForm")
-    commit = _provenance.commit()
+    commit = _write.commit()
     assert found.get("polhode_commit", "") == commit
     assert re.fullmatch(r"([0-9a-f]{40}(\+changes)?)?", commit)
     assert kind == np.int8
@@ -307,7 +307,7 @@ def test_an_interrupt_after_the_first_file_names_it(here, capsys, monkeypatch):
     monkeypatch.setattr(_run, "_draw", late)
     assert main(["run", "free.toml"]) == 130
     assert "written: free.nc; not written: free.png" in capsys.readouterr().err
-    assert _signals._seen == []
+    assert _process._received == []
 
 
 def _modules(*arguments):
@@ -337,22 +337,22 @@ def test_help_and_mistakes_come_without_jax(here, arguments, code):
 def test_programs_are_kept_between_runs_unless_told_otherwise(here, monkeypatch):
     import jax
 
-    monkeypatch.setenv(_cache.VARIABLE, str(here / "kept"))
+    monkeypatch.setenv("POLHODE_CACHE", str(here / "kept"))
     before = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", None)
     try:
-        with _cache.kept_programs(True):
+        with _process.program_cache(True):
             folder = Path(jax.config.jax_compilation_cache_dir)
             assert folder.parent == here / "kept"
         assert jax.config.jax_compilation_cache_dir is None
-        with _cache.kept_programs(False):
+        with _process.program_cache(False):
             assert jax.config.jax_compilation_cache_dir is None
-        monkeypatch.setenv(_cache.VARIABLE, "off")
-        with _cache.kept_programs(True):
+        monkeypatch.setenv("POLHODE_CACHE", "off")
+        with _process.program_cache(True):
             assert jax.config.jax_compilation_cache_dir is None
         (here / "file").write_text("no folder")
-        monkeypatch.setenv(_cache.VARIABLE, str(here / "file"))
-        with _cache.kept_programs(True):
+        monkeypatch.setenv("POLHODE_CACHE", str(here / "file"))
+        with _process.program_cache(True):
             assert jax.config.jax_compilation_cache_dir is None
     finally:
         jax.config.update("jax_compilation_cache_dir", before)
@@ -360,7 +360,7 @@ def test_programs_are_kept_between_runs_unless_told_otherwise(here, monkeypatch)
 
 def test_a_damaged_cache_is_no_error(here):
     """In processes of their own: what is compiled is shared within one."""
-    environment = os.environ | {_cache.VARIABLE: str(here / "kept")}
+    environment = os.environ | {"POLHODE_CACHE": str(here / "kept")}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
     command = [sys.executable, "-m", "polhode.cli", "run", "free.toml", "--no-figure", "-q"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)

@@ -11,7 +11,7 @@ import pytest
 
 import polhode as ph
 from polhode import ensemble as ens
-from polhode.ensemble._identity import digest, has_user_code
+from polhode.ensemble._store import digest, has_user_code
 
 
 def things():
@@ -44,7 +44,7 @@ def test_everything_counts():
 def test_another_process_computes_the_same():
     code = (
         "import jax; jax.config.update('jax_enable_x64', True);"
-        "import test_ensemble_identity as t; from polhode.ensemble._identity import digest;"
+        "import test_ensemble_identity as t; from polhode.ensemble._store import digest;"
         "print(digest(t.things()))"
     )
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
@@ -56,11 +56,11 @@ def test_another_process_computes_the_same():
 
 
 def test_rows_of_arrays_are_read_in_parts(monkeypatch):
-    from polhode.ensemble import _identity
+    from polhode.ensemble import _store
 
     rows = np.arange(3000.0).reshape(1000, 3)
     before = digest(rows)
-    monkeypatch.setattr(_identity, "_BYTES", 1000)
+    monkeypatch.setattr(_store, "_DIGEST_BYTES", 1000)
     assert digest(rows) == before
     rows[999, 2] += 1
     assert digest(rows) != before

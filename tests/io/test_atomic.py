@@ -5,7 +5,7 @@ import pytest
 import xarray
 
 from polhode.files import write_netcdf
-from polhode.files._atomic import whole_file
+from polhode.files._write import atomic_write
 
 
 @pytest.mark.parametrize("failure", [OSError, KeyboardInterrupt, SystemExit])
@@ -14,7 +14,7 @@ def test_failure_leaves_the_old_file_and_nothing_else(tmp_path, failure):
     target.write_text("old")
 
     def write_half():
-        with whole_file(target) as temporary:
+        with atomic_write(target) as temporary:
             temporary.write_text("half")
             assert temporary.parent == tmp_path
             raise failure
@@ -28,7 +28,7 @@ def test_failure_leaves_the_old_file_and_nothing_else(tmp_path, failure):
 def test_success_replaces_the_file(tmp_path):
     target = tmp_path / "result.txt"
     target.write_text("old")
-    with whole_file(target) as temporary:
+    with atomic_write(target) as temporary:
         temporary.write_text("new")
         assert target.read_text() == "old"
     assert target.read_text() == "new"
@@ -39,7 +39,7 @@ def test_link_is_followed_and_kept(tmp_path):
     (tmp_path / "real.txt").write_text("old")
     link = tmp_path / "link.txt"
     link.symlink_to("real.txt")
-    with whole_file(link) as temporary:
+    with atomic_write(link) as temporary:
         temporary.write_text("new")
     assert link.is_symlink()
     assert (tmp_path / "real.txt").read_text() == "new"

@@ -3,29 +3,48 @@
 import functools
 import math
 import sys
-import types
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from polhode.cli import _show
-from polhode.cli._inputs import refused
+from polhode.cli import _progress
+from polhode.cli._files import UsageError, output_path, output_stem, usage_errors, write_figure
 from polhode.cli._options import (
     DebugOption,
     ForceOption,
     NoCacheOption,
     NoFigureOption,
     QuietOption,
+    option,
     positive,
     require,
 )
-from polhode.cli._signals import heed
-from polhode.cli._targets import UsageError, stem, target
+from polhode.cli._process import check_signals, program_cache
 
 _ROLES = ("t", "wx", "wy", "wz", "wheel")
 _EXPECTED = "a recording: CSV with a header line"
-_Asked = types.SimpleNamespace  # the options of `fit` as they were given
+
+
+class _Options(NamedTuple):
+    """What is fitted and how, as the command line says it; stored with the result."""
+
+    degrees: bool
+    milliseconds: bool
+    noise: float | None
+    moments_only: bool
+    calibration: float
+    max_rate: float | None
+    bias: bool
+    drag: bool
+    robust: float | None
+    wheel_inertia: float | None
+    wheel_axis: tuple[float, float, float]
+
+
+def _flag(name: str, words: str) -> Any:
+    return typer.Option(name, help=words)
 
 
 def fit(
@@ -35,71 +54,82 @@ def fit(
     ],
     columns: Annotated[
         list[str],
-        typer.Option(
-            metavar="NAME=COLUMN ...", show_default=False,
-            help="columns of t [s], wx, wy, wz and, if there is a wheel, wheel [rad/s]; those left"
-            " out are found by their usual names (t, time_s, wx, gyro_x, omega_x, ...)",
+        option(
+            "--columns",
+            "NAME=COLUMN ...",
+            "columns of t [s], wx, wy, wz and, if there is a wheel, wheel [rad/s]; those left out"
+            " are found by their usual names (t, time_s, wx, gyro_x, omega_x, ...)",
+            show_default=False,
         ),
     ] = [],  # noqa: B006 - typer reads it
     output: Annotated[
         str | None,
         typer.Option(
-            "-o", "--output", metavar="RESULT", show_default=False,
+            "-o",
+            "--output",
+            metavar="RESULT",
+            show_default=False,
             help="write RESULT.json and RESULT.png (default: the name of the recording, here)",
         ),
     ] = None,
-    degrees: Annotated[bool, typer.Option("--degrees", help="rates are in deg/s")] = False,
-    milliseconds: Annotated[bool, typer.Option("--milliseconds", help="times are in ms")] = False,
+    degrees: Annotated[bool, _flag("--degrees", "rates are in deg/s")] = False,
+    milliseconds: Annotated[bool, _flag("--milliseconds", "times are in ms")] = False,
     noise: Annotated[
         float | None,
-        typer.Option(
-            parser=positive, metavar="SIGMA",
-            help="standard deviation of the rates, rad/s (default: from the residuals)",
+        option(
+            "--noise",
+            "SIGMA",
+            "standard deviation of the rates, rad/s (default: from the residuals)",
+            positive,
         ),
     ] = None,
     moments_only: Annotated[
-        bool, typer.Option("--moments-only", help="the sensor axes are principal axes")
+        bool, _flag("--moments-only", "the sensor axes are principal axes")
     ] = False,
     calibration: Annotated[
         float,
-        typer.Option(
-            min=0.0, metavar="PART",
-            help="standard deviation of the gyroscope's scale factors and of its misalignment"
-            " [rad]; 0: exact",
+        option(
+            "--calibration",
+            "PART",
+            "standard deviation of the gyroscope's scale factors and of its misalignment [rad]; 0:"
+            " exact",
+            min=0.0,
         ),
     ] = 0.01,
     max_rate: Annotated[
         float | None,
-        typer.Option(
-            parser=positive, metavar="RATE",
-            help="rate at which the gyroscope saturates, rad/s (default: found in the readings)",
+        option(
+            "--max-rate",
+            "RATE",
+            "rate at which the gyroscope saturates, rad/s (default: found in the readings)",
+            positive,
         ),
     ] = None,
-    bias: Annotated[bool, typer.Option("--bias", help="fit a constant gyroscope bias")] = False,
-    drag: Annotated[bool, typer.Option("--drag", help="fit a drag of the air")] = False,
+    bias: Annotated[bool, _flag("--bias", "fit a constant gyroscope bias")] = False,
+    drag: Annotated[bool, _flag("--drag", "fit a drag of the air")] = False,
     robust: Annotated[
         float | None,
-        typer.Option(
-            parser=positive, metavar="K",
-            help="count residuals beyond K noises linearly (needs --noise)",
+        option(
+            "--robust", "K", "count residuals beyond K noises linearly (needs --noise)", positive
         ),
     ] = None,
     wheel_inertia: Annotated[
         float | None,
-        typer.Option(
-            parser=positive, metavar="J",
-            help="spin inertia of the wheel, kg m^2: fixes the absolute scale",
+        option(
+            "--wheel-inertia",
+            "J",
+            "spin inertia of the wheel, kg m^2: fixes the absolute scale",
+            positive,
         ),
     ] = None,
     wheel_axis: Annotated[
-        tuple[float, float, float],
-        typer.Option(metavar="X Y Z", help="axis of the wheel"),
+        tuple[float, float, float], option("--wheel-axis", "X Y Z", "axis of the wheel")
     ] = (0.0, 0.0, 1.0),
     allow_undetermined: Annotated[
         bool,
-        typer.Option(
+        _flag(
             "--allow-undetermined",
-            help="exit with 0 although the recording does not show all ratios of moments",
+            "exit with 0 although the recording does not show all ratios of moments",
         ),
     ] = False,
     no_figure: NoFigureOption = False,
@@ -107,96 +137,104 @@ def fit(
     no_cache: NoCacheOption = False,
     quiet: QuietOption = False,
     debug: DebugOption = False,
-) -> int:  # fmt: skip
+) -> int:
     """Fit the inertia of a tumbling body to a CSV file of times and gyroscope rates. Writes the
     numbers (JSON) and a figure (PNG) and prints a summary. Exit code 1 when the fit must not be
     used, or when the recording does not show all ratios of the moments.
     """
-    path, named = _columns(recording, columns)
-    with refused(path, ".csv", _EXPECTED):
+    path, names = _columns(recording, columns)
+    with usage_errors(path, ".csv", _EXPECTED):
         pass
-    asked = _Asked(
-        path=path, columns=named, degrees=degrees, milliseconds=milliseconds, noise=noise,
-        moments_only=moments_only, calibration=calibration, max_rate=max_rate,
-        bias=bias, drag=drag, robust=robust,
-        wheel_inertia=wheel_inertia, wheel_axis=wheel_axis,
-    )  # fmt: skip
-    if wheel_inertia and "wheel" not in named:
+    options = _Options(
+        degrees,
+        milliseconds,
+        noise,
+        moments_only,
+        calibration,
+        max_rate,
+        bias,
+        drag,
+        robust,
+        wheel_inertia,
+        wheel_axis,
+    )
+    if wheel_inertia and "wheel" not in names:
         raise UsageError("--wheel-inertia needs the wheel's speed: add wheel=COLUMN to --columns.")
     if robust and not noise:
         raise UsageError("--robust counts in noises: give --noise SIGMA too.")
     if not math.hypot(*wheel_axis) > 0 or not math.isfinite(math.hypot(*wheel_axis)):
         raise UsageError(f"--wheel-axis must have a direction, got {wheel_axis}.")
-    output = output and stem(output, ".json", ".png", what="the numbers and the figure")
+    output = output and output_stem(output, ".json", ".png", what="the numbers and the figure")
     require("fit", "rich", *(() if no_figure else ("matplotlib",)))
-    goals = [_goal(asked, output, ".json", force)]
-    if not no_figure:
-        goals.append(_goal(asked, output, ".png", force))
-    return _fit(asked, goals, quiet=quiet, no_cache=no_cache, allowed=allow_undetermined)
+    document = _output(path, output, ".json", force)
+    picture = None if no_figure else _output(path, output, ".png", force)
+    console = _progress.progress_console(quiet)
+    with _progress.spinner(console, "reading") as show, program_cache(not no_cache):
+        loaded, result = _fit(path, names, options, show)
+        show("writing")
+        written = [_write(document, path, options, loaded, result)]
+        if picture is not None:
+            check_signals()
+            from polhode import plot
+
+            figure = functools.partial(plot.fit, result, loaded.recording, title=path.name)
+            written.append(write_figure(picture, figure))
+    if not quiet:
+        _print(path, options, loaded, result, written)
+    return _exit_code(result, allow_undetermined)
 
 
-def _columns(words: list[str], given: list[str]) -> tuple[Path, dict[str, str]]:
+def _columns(words: list[str], options: list[str]) -> tuple[Path, dict[str, str]]:
     """The recording and what --columns says, whose later items stand among the arguments."""
     items = [word for word in words if word.partition("=")[0] in _ROLES and "=" in word]
     files = [word for word in words if word not in items]
-    wrong = [x for x in given if x.partition("=")[0] not in _ROLES or not x.partition("=")[2]]
-    wrong += [word for word in files[1:] if "=" in word or given]
-    if wrong:
+    invalid = [x for x in options if x.partition("=")[0] not in _ROLES or not x.partition("=")[2]]
+    invalid += [word for word in files[1:] if "=" in word or options]
+    if invalid:
         raise UsageError(
-            f"--columns takes NAME=COLUMN with NAME one of {', '.join(_ROLES)}, got {wrong[0]!r}."
+            f"--columns takes NAME=COLUMN with NAME one of {', '.join(_ROLES)}, got {invalid[0]!r}."
         )
     if len(files) != 1:
         raise UsageError(f"expected one RECORDING, got {', '.join(files) or 'none'}.")
     if "\0" in files[0]:
         raise UsageError("the name of the recording holds a NUL character.")
-    pairs = (item.partition("=") for item in (*given, *items))
+    pairs = (item.partition("=") for item in (*options, *items))
     return Path(files[0]), {name: column for name, _, column in pairs}
 
 
-def _goal(asked: _Asked, output: str | None, suffix: str, force: bool) -> Path:
-    name = output or asked.path.stem
-    return target(name + ("" if not Path(name).name.strip(".") else suffix), suffix, force=force)
+def _output(recording: Path, output: str | None, suffix: str, force: bool) -> Path:
+    name = output or recording.stem
+    name += suffix if Path(name).name.strip(".") else ""
+    return output_path(name, suffix, force=force)
 
 
-def _fit(asked: _Asked, goals: list[Path], *, quiet: bool, no_cache: bool, allowed: bool) -> int:
-    from rich.console import Console
+def _fit(
+    path: Path, names: dict[str, str], options: _Options, show: Callable[[str], None]
+) -> tuple[Any, Any]:
+    """The recording as it was read, and the result of the fit."""
+    import jax
 
-    with _show.working(_show.messages(quiet), "reading") as show:
-        import jax
+    jax.config.update("jax_enable_x64", True)
+    from polhode import fit as fits
 
-        jax.config.update("jax_enable_x64", True)
-        from polhode import fit as room, plot
-        from polhode.cli import _cache
+    loaded = _read(path, names, options)
+    show(f"fitting {loaded.recording.times.shape[-1]} samples (compiling first)")
+    fit_options = _fit_options(options)
+    try:
+        result = fits.fit_recordings([loaded.recording], throw=False, options=fit_options)
+    except ValueError as error:  # the recording does not suit the options
+        raise UsageError(f"{path}: {error}") from error
+    check_signals()
+    return loaded, result
 
-        loaded = _read(asked)
-        recording = loaded.recording
-        with _cache.kept_programs(not no_cache):
-            show(f"fitting {recording.times.shape[-1]} samples (compiling first)")
-            try:
-                result = room.fit_recordings([recording], throw=False, **_keywords(asked, room))
-            except ValueError as error:  # the recording does not suit the options
-                raise UsageError(f"{asked.path}: {error}") from error
-            heed()
-            show("writing")
-            written = [_write(goals[0], asked, loaded, result)]
-            for picture in goals[1:]:
-                heed()
-                figure = functools.partial(plot.fit, result, recording, title=asked.path.name)
-                written.append(_show.write_figure(picture, figure))
-    undetermined = _undetermined(result)
-    if not quiet:
-        here = sys.stdout.isatty()
-        out = Console(soft_wrap=not here, width=None if here else 110)
-        out.print(_table(asked, recording, result))
-        out.print(_observability(result))
-        for text in (_said(loaded), *result.warnings()):
-            out.print(f"- {text}", highlight=False, markup=False)
-        _show.tell_written(out, written)
+
+def _exit_code(result: Any, allow_undetermined: bool) -> int:
+    """0 when the result can be used; otherwise 1, and a message."""
     if not result.is_usable:
-        print(f"polhode: the fit must not be used: {', '.join(result.findings())}",
-              file=sys.stderr)  # fmt: skip
+        findings = ", ".join(result.findings())
+        print(f"polhode: the fit must not be used: {findings}", file=sys.stderr)
         return 1
-    if undetermined and not allowed:
+    if _undetermined(result) and not allow_undetermined:
         print(
             "polhode: the recording does not show all ratios of the moments (too little motion, or"
             " about one axis only); --allow-undetermined takes what it shows",
@@ -206,21 +244,21 @@ def _fit(asked: _Asked, goals: list[Path], *, quiet: bool, no_cache: bool, allow
     return 0
 
 
-def _read(asked: _Asked) -> Any:
+def _read(path: Path, names: dict[str, str], options: _Options) -> Any:
     from polhode.fit._recording import load_recording
 
     try:
-        with refused(asked.path, ".csv", _EXPECTED):
+        with usage_errors(path, ".csv", _EXPECTED):
             return load_recording(
-                asked.path,
-                asked.columns,
-                scale=math.pi / 180 if asked.degrees else None,
-                time_scale=1e-3 if asked.milliseconds else None,
-                noise=asked.noise or 1.0,
+                path,
+                names,
+                scale=math.pi / 180 if options.degrees else None,
+                time_scale=1e-3 if options.milliseconds else None,
+                noise=options.noise or 1.0,
             )
     except UsageError as error:
         hint = ""
-        if "deg/s" in str(error) and not (asked.degrees and asked.milliseconds):
+        if "deg/s" in str(error) and not (options.degrees and options.milliseconds):
             hint = " See --degrees and --milliseconds."
         elif "must have the columns" in str(error):
             missing = [role for role in _ROLES if f"{role} -> " in str(error)]
@@ -229,35 +267,38 @@ def _read(asked: _Asked) -> Any:
         raise UsageError(f"{first}{hint}{end}{rest}") from error
 
 
-def _said(loaded: Any) -> str:
+def _columns_read(loaded: Any) -> str:
     """Which columns were read, in which units."""
-    from polhode.files._error import visible
+    from polhode.files._error import escape
 
-    names = ", ".join(f"{role} = {visible(name)}" for role, name in loaded.columns.items())
+    names = ", ".join(f"{role} = {escape(name)}" for role, name in loaded.columns.items())
     units = ", ".join(f"{role} in {unit}" for role, unit in loaded.units.items())
     return f"columns: {names}" + (f"; by their names {units}" if units else "")
 
 
-def _keywords(asked: _Asked, room: Any) -> dict[str, Any]:
-    """Keywords of ``fit_recordings``."""
-    motion = room.FreeMotion()
-    if asked.drag or asked.wheel_inertia:
-        drag = room.Drag() if asked.drag else None
-        axis = tuple(x / math.hypot(*asked.wheel_axis) for x in asked.wheel_axis)
-        motion = room.SteppedMotion(asked.wheel_inertia, axis, drag=drag, fit_drag=asked.drag)
-    options = room.FitOptions(
-        motion=motion,
-        unknown=room.MomentsOnly() if asked.moments_only else room.FullTensor(),
-        gyroscope=room.Gyroscope(
-            scale_std=asked.calibration,
-            misalignment_std=asked.calibration,
-            max_rate=asked.max_rate,
-        ),
-        bias=asked.bias,
-        robust=room.Huber(asked.robust) if asked.robust else None,
-        trust_noise=asked.noise is not None,
+def _fit_options(options: _Options) -> Any:
+    """The options as ``FitOptions``."""
+    from polhode import fit as fits
+
+    motion = fits.FreeMotion()
+    if options.drag or options.wheel_inertia:
+        drag = fits.Drag() if options.drag else None
+        length = math.hypot(*options.wheel_axis)
+        axis = tuple(x / length for x in options.wheel_axis)
+        motion = fits.SteppedMotion(options.wheel_inertia, axis, drag=drag, fit_drag=options.drag)
+    gyroscope = fits.Gyroscope(
+        scale_std=options.calibration,
+        misalignment_std=options.calibration,
+        max_rate=options.max_rate,
     )
-    return {"options": options}
+    return fits.FitOptions(
+        motion=motion,
+        unknown=fits.MomentsOnly() if options.moments_only else fits.FullTensor(),
+        gyroscope=gyroscope,
+        bias=options.bias,
+        robust=fits.Huber(options.robust) if options.robust else None,
+        trust_noise=options.noise is not None,
+    )
 
 
 def _undetermined(result: Any) -> bool:
@@ -278,7 +319,7 @@ def _bias(result: Any) -> tuple[Any, Any] | None:
     return np.asarray(result.sensor["bias"]), np.asarray(result.sensor_std["bias"])
 
 
-def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
+def _write(path: Path, recording_path: Path, options: _Options, loaded: Any, result: Any) -> Path:
     import json
 
     import jax
@@ -286,7 +327,7 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
     import numpy as np
 
     import polhode
-    from polhode.files._atomic import whole_file
+    from polhode.files._write import atomic_write
     from polhode.fit._result import mirror_moments
     from polhode.rotation import wxyz_to_matrix
 
@@ -296,14 +337,12 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
 
     recording = loaded.recording
     low, high = result.interval(0.95)
-    found = _bias(result)
-    options = {name: value for name, value in vars(asked).items()
-               if name not in ("path", "columns")}  # fmt: skip
+    bias = _bias(result)
     document = {
-        "recording": str(asked.path),
+        "recording": str(recording_path),
         "columns": loaded.columns,
         "units": loaded.units,
-        "options": options,
+        "options": options._asdict(),
         "polhode": polhode.__version__,
         "jax": jax.__version__,
         "jaxlib": jaxlib.__version__,
@@ -317,9 +356,9 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
         "interval_95": [plain(low), plain(high)],
         "tensor": plain(result.inertia.tensor),
         "principal_axes_as_columns": plain(wxyz_to_matrix(result.axes)),
-        "axes_std_rad": [0.0] * 3 if asked.moments_only else plain(result.axes_std),
-        "bias_rad_per_s": None if found is None else plain(found[0]),
-        "bias_std_rad_per_s": None if found is None else plain(found[1]),
+        "axes_std_rad": [0.0] * 3 if options.moments_only else plain(result.axes_std),
+        "bias_rad_per_s": None if bias is None else plain(bias[0]),
+        "bias_std_rad_per_s": None if bias is None else plain(bias[1]),
         "gyroscope_gain": plain(result.sensor["gain"]) if "gain" in result.sensor else None,
         "gyroscope_gain_std": (
             plain(result.sensor_std["gain"]) if "gain" in result.sensor else None
@@ -334,9 +373,21 @@ def _write(path: Path, asked: _Asked, loaded: Any, result: Any) -> Path:
         "findings": result.findings(),
     }
     text = json.dumps(document, indent=1, allow_nan=False)
-    with whole_file(path) as temporary:
+    with atomic_write(path) as temporary:
         temporary.write_text(text + "\n", encoding="utf-8")
     return path
+
+
+def _print(path: Path, options: _Options, loaded: Any, result: Any, written: list[Path]) -> None:
+    from rich.console import Console
+
+    is_terminal = sys.stdout.isatty()
+    out = Console(soft_wrap=not is_terminal, width=None if is_terminal else 110)
+    out.print(_table(path, options, loaded.recording, result))
+    out.print(_observability(result))
+    for text in (_columns_read(loaded), *result.warnings()):
+        out.print(f"- {text}", highlight=False, markup=False)
+    _progress.print_paths(out, written)
 
 
 def _observability(result: Any) -> Any:
@@ -357,45 +408,51 @@ def _observability(result: Any) -> Any:
     return grid
 
 
-def _table(asked: _Asked, recording: Any, result: Any) -> Any:
+def _table(path: Path, options: _Options, recording: Any, result: Any) -> Any:
     """The summary as a rich Table."""
     import numpy as np
     from rich.table import Table
     from rich.text import Text
 
-    from polhode.files._error import visible
+    from polhode.files._error import escape
     from polhode.rotation import wxyz_to_matrix
 
     samples = int(np.sum(np.asarray(recording.present)))
     grid = Table(
-        title=Text(f"{visible(asked.path.name)}: {samples} samples"),
+        title=Text(f"{escape(path.name)}: {samples} samples"),
         title_justify="left",
         show_edge=False,
         pad_edge=False,
     )
-    known = result.scale_known
-    for name in ("", "moment [kg m^2]" if known else "ratio", "95 %", "axis in sensor axes", "+-"):
+    is_absolute = result.scale_known
+    for name in (
+        "",
+        "moment [kg m^2]" if is_absolute else "ratio",
+        "95 %",
+        "axis in sensor axes",
+        "+-",
+    ):
         grid.add_column(Text(name), justify="left" if name == "" else "right")
     values = np.asarray(result.principal_values[0])
     low, high = (np.asarray(end) for end in result.interval(0.95))
     axes = np.asarray(wxyz_to_matrix(result.axes))
-    turn = np.degrees(np.asarray(result.axes_std))
+    spread = np.degrees(np.asarray(result.axes_std))
     for k, name in enumerate(("smallest", "middle", "largest")):
-        reach = "" if k == 2 and not known else f"{low[k]:.5g} to {high[k]:.5g}"
-        shown = f"{turn[k]:.2g} deg" if turn[k] < 90 else "not determined"
+        interval = "" if k == 2 and not is_absolute else f"{low[k]:.5g} to {high[k]:.5g}"
+        angle = f"{spread[k]:.2g} deg" if spread[k] < 90 else "not determined"
         grid.add_row(
             name,
             f"{values[k]:.6g}",
-            reach if high[k] - values[k] <= values[k] else "not determined",
+            interval if high[k] - values[k] <= values[k] else "not determined",
             # without negative zeros
             "({:.3f}, {:.3f}, {:.3f})".format(*(np.round(axes[:, k], 3) + 0.0)),
-            "given" if asked.moments_only else shown,
+            "given" if options.moments_only else angle,
         )
     lines = [f"residual rms {float(result.rms):.3g} rad/s"]
-    if asked.noise:
+    if options.noise:
         lines[0] += f", {float(result.noise):.3g} of the noise"
-    if (found := _bias(result)) is not None:
-        parts = (f"{b:.3g} +- {s:.2g}" for b, s in zip(*found, strict=True))
+    if (bias := _bias(result)) is not None:
+        parts = (f"{b:.3g} +- {s:.2g}" for b, s in zip(*bias, strict=True))
         lines.append(f"bias of the gyroscope, rad/s: {', '.join(parts)}")
     grid.caption = Text("\n".join(lines))
     grid.caption_justify = "left"

@@ -1,4 +1,4 @@
-"""What `polhode run` computes: the batch of a scene file, chunk by chunk."""
+"""What `polhode run` computes: the batch of a scene file, chunk by chunk; and its summary."""
 
 import dataclasses
 import os
@@ -11,6 +11,7 @@ import numpy as np
 
 import polhode
 from polhode import rotation
+from polhode._closed_forms import Mode
 from polhode.files import (
     SceneFile,
     build_attitudes,
@@ -19,9 +20,14 @@ from polhode.files import (
     build_scene,
     draw_clones,
 )
-from polhode.files._build import blamed
+from polhode.files._error import escape, scene_errors
+from polhode.plot._samples import Scale
 
-_CHUNKS, _LEAST_CHUNK = 20, 50  # pieces of progress, and bodies below which a piece does not pay
+MEANINGS = {
+    "P_psi": "turn about long axis",
+    "P_phi": "mean precession",
+}
+_CHUNKS, _MIN_CHUNK = 20, 50  # pieces of progress, and bodies below which a piece does not pay
 
 
 class Job(NamedTuple):
@@ -63,14 +69,16 @@ class Outcome(NamedTuple):
 
 
 def prepare(file: SceneFile, precision: str) -> Job:
-    """Build the scene in the precision asked for; switches 64-bit numbers on for this process."""
+    """Build the scene in this precision; switches 64-bit numbers on for this process."""
     jax.config.update("jax_enable_x64", True)
     dtype = np.dtype(precision)
     _require_memory(file, dtype.itemsize)
     clones = draw_clones(file, dtype)
     ts = file.times.seconds.astype(dtype)
-    seen = () if file.observations is None else _within(file.observations.seconds, ts)
-    all_ts = np.unique(np.concatenate([ts, np.asarray(seen, dtype)]))
+    observed = ()
+    if file.observations is not None:
+        observed = _within(file.observations.seconds, ts)
+    all_ts = np.unique(np.concatenate([ts, np.asarray(observed, dtype)]))
     return Job(
         file,
         build_scene(file, dtype, clones.inertia),
@@ -87,15 +95,15 @@ def _require_memory(file: SceneFile, itemsize: int) -> None:
     """MemoryError now, rather than a process that the system ends, for what cannot fit."""
     bodies = 1 if file.monte_carlo is None else file.monte_carlo.clones + 1
     # attitude, rates, energy and momentum of every sample, and as much again to write them
-    need = 2 * 11 * itemsize * bodies * len(file.times.seconds)
+    required = 2 * 11 * itemsize * bodies * len(file.times.seconds)
     try:
-        have = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (AttributeError, ValueError, OSError):
         return
-    if need > have:
+    if required > memory:
         raise MemoryError(
-            f"{bodies:,} bodies at {len(file.times.seconds):,} times take {need / 1e9:,.1f} GB,"
-            f" this machine has {have / 1e9:,.1f} GB"
+            f"{bodies:,} bodies at {len(file.times.seconds):,} times take {required / 1e9:,.1f} GB,"
+            f" this machine has {memory / 1e9:,.1f} GB"
         )
 
 
@@ -131,15 +139,15 @@ jax.monitoring.register_event_duration_secs_listener(_CLOCK.listen)
 
 
 def run(job: Job, progress: Callable[[int], None]) -> Outcome:
-    """Simulate all bodies in chunks, telling `progress` how many are done after each.
+    """Simulate all bodies in chunks, calling `progress` with how many are finished after each.
 
     Raises SimulationError when the nominal body does not finish; clones that do not are found in
     the trajectory's `status`.
     """
     began = time.perf_counter()
     total = job.bodies
-    size = min(total, max(_LEAST_CHUNK, -(-total // _CHUNKS)))
-    kept: dict[str, np.ndarray] = {}
+    size = min(total, max(_MIN_CHUNK, -(-total // _CHUNKS)))
+    arrays: dict[str, np.ndarray] = {}
     residuals = None
     sampled = _index(job, job.ts)
     events = build_events(job.file, job.ts.dtype)
@@ -155,11 +163,11 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
             if name in ("wxyz", "omega_body"):
                 part = part[..., sampled, :]
             if not job.batch_shape:
-                kept[name] = part
+                arrays[name] = part
                 continue
-            whole = kept.setdefault(name, np.empty((total, *part.shape[1:]), part.dtype))
-            whole[first : first + size] = part
-        with blamed(job.file, "[[events]]"):
+            rows = arrays.setdefault(name, np.empty((total, *part.shape[1:]), part.dtype))
+            rows[first : first + size] = part
+        with scene_errors(job.file, "[[events]]"):
             for name, event in events.items():
                 rows = np.atleast_2d(polhode.crossings(piece, event).times)
                 times[name].extend(rows[start - first :])
@@ -167,12 +175,12 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
     seconds = time.perf_counter() - began
     compiling = _CLOCK.since(began)
     scene = job.scene.settled(job.state, job.ts[0])
-    trajectory = polhode.Trajectory(ts=job.ts, scene=scene, propagator=piece.propagator, **kept)
-    crossings = {name: _padded(rows) for name, rows in times.items()}
+    trajectory = polhode.Trajectory(ts=job.ts, scene=scene, propagator=piece.propagator, **arrays)
+    crossings = {name: _pad(rows) for name, rows in times.items()}
     return Outcome(trajectory, residuals, crossings, compiling, seconds - compiling)
 
 
-def _padded(rows: list[np.ndarray]) -> np.ndarray:
+def _pad(rows: list[np.ndarray]) -> np.ndarray:
     """Rows of times, infinite where there is none, as one array with NaN there."""
     width = max(int(np.isfinite(row).sum()) for row in rows)
     padded = np.full((len(rows), width), np.nan)
@@ -196,7 +204,7 @@ def _simulate(job: Job, part: slice | None) -> polhode.Trajectory:
             inertia = jax.tree.map(lambda x: x[part], scene.inertia)
             scene = dataclasses.replace(scene, inertia=inertia)
         state = jax.tree.map(lambda x: x[part] if x.ndim > 1 else x, state)
-    with blamed(job.file, ""):
+    with scene_errors(job.file, ""):
         trajectory = polhode.simulate(
             scene, state, job.all_ts, job.method, rtol=job.rtol, throw=False
         )
@@ -221,15 +229,175 @@ class Residuals(NamedTuple):
 
 def _residuals(job: Job, piece: polhode.Trajectory) -> Residuals | None:
     """The nominal body against the file's observations within the times; None without any."""
-    seen = job.file.observations
-    if seen is None:
+    observations = job.file.observations
+    if observations is None:
         return None
-    seconds = _within(seen.seconds, job.ts)
-    rows = np.isin(seen.seconds.astype(seconds.dtype), seconds)
+    seconds = _within(observations.seconds, job.ts)
+    rows = np.isin(observations.seconds.astype(seconds.dtype), seconds)
     at = _index(job, seconds)
     wxyz, omega = np.asarray(piece.wxyz), np.asarray(piece.omega_body)
     if job.batch_shape:
         wxyz, omega = wxyz[0], omega[0]
-    observed = np.asarray(build_attitudes(seen.attitudes, job.ts.dtype))[rows]
+    observed = np.asarray(build_attitudes(observations.attitudes, job.ts.dtype))[rows]
     angle = np.asarray(rotation.angle_between(wxyz[at], observed))
-    return Residuals(seconds, angle, seen.omega_body[rows] - omega[at])
+    return Residuals(seconds, angle, observations.omega_body[rows] - omega[at])
+
+
+class Figures(NamedTuple):
+    """Figures of merit of a run; `periods` name -> (bodies,) s, empty unless the body is free."""
+
+    periods: dict[str, np.ndarray]
+    modes: list[str]
+    energy: float | None
+    momentum: float | None
+
+
+def measure(job: Job, outcome: Outcome) -> Figures:
+    """Periods of every body; the largest change of energy and of angular momentum in space.
+
+    Energy is given where no torque and no motor works on the body, momentum where nothing acts.
+    """
+    scene, trajectory = job.scene, outcome.trajectory
+    energy = momentum = None
+    periods, modes = {}, []
+    if scene.torque is None and scene.rotors is None:
+        energies = np.asarray(trajectory.energy, np.float64)
+        rates, momenta = trajectory.omega_body, trajectory.momentum_body
+        kinetic = np.sum(np.asarray(rates, float) * np.asarray(momenta, float), axis=-1) / 2
+        scale = np.abs(kinetic).max(axis=-1, keepdims=True)
+        energy = _largest((energies - energies[..., :1]) / np.where(scale > 0, scale, 1))
+    if scene.is_free:
+        vector = np.asarray(trajectory.momentum_space, np.float64)
+        size = np.linalg.norm(vector[..., :1, :], axis=-1)
+        change = np.linalg.norm(vector - vector[..., :1, :], axis=-1)
+        momentum = _largest(change / np.where(size > 0, size, 1))
+        values = polhode.periods(scene.inertia, job.state)
+        periods = {name: np.atleast_1d(np.asarray(getattr(values, name))) for name in MEANINGS}
+        modes = [Mode(int(code)).name for code in np.atleast_1d(np.asarray(values.mode))]
+    return Figures(periods, modes, energy, momentum)
+
+
+def _largest(relative: np.ndarray) -> float:
+    return float(np.nanmax(np.abs(relative))) if np.isfinite(relative).any() else float("nan")
+
+
+def summary_table(job: Job, outcome: Outcome, figures: Figures):
+    """The summary as a rich Table."""
+    from rich.table import Table
+    from rich.text import Text
+
+    file, bodies = job.file, job.bodies
+    unit, size = file.times.unit, file.times.unit_seconds
+    clones = bodies - 1
+    grid = Table(
+        title=Text(escape(file.title), style="bold"),
+        title_justify="left",
+        caption=_caption(job),
+        caption_justify="left",
+        show_edge=False,
+        pad_edge=False,
+    )
+    grid.add_column("")
+    grid.add_column("nominal", justify="right")
+    if clones:
+        grid.add_column(f"{clones:,} clones", justify="right")
+    if file.published:
+        grid.add_column("published", justify="right")
+
+    def row(name, nominal, spread="", published=""):
+        cells = [name, nominal]
+        cells += [spread] if clones else []
+        cells += [published] if file.published else []
+        grid.add_row(*map(Text, cells))  # Text: brackets are units here, not markup
+
+    if figures.periods:
+        for name, meaning in MEANINGS.items():
+            values = figures.periods[name] / size
+            published = _published(file, name, size)
+            nominal = f"{values[0]:#.5g}"
+            row(f"{name}  {meaning} [{unit}]", nominal, _spread(values[1:]), published)
+        row("mode", figures.modes[0], _count(figures.modes[1:]))
+    for name, times in outcome.events.items():
+        count, first = np.isfinite(times).sum(axis=1), times[:, 0] / size if times.size else times
+        nominal = f"{first[0]:#.5g} ({count[0]})" if count[0] else "none"
+        row(f"event {name}: first [{unit}] (number)", nominal, _first_times(first[1:], count[1:]))
+    if figures.energy is not None:
+        row("largest relative change of energy", f"{figures.energy:.1e}")
+    if figures.momentum is not None:
+        row("largest relative change of momentum", f"{figures.momentum:.1e}")
+    for name, value in _misfits(outcome.residuals, Scale.of(np.ptp(file.times.seconds))):
+        row(name, value)
+    row("compilation [s]", f"{outcome.compile_seconds:.2f}")
+    row("simulation [s]", f"{outcome.run_seconds:.2f}")
+    return grid
+
+
+def _spread(values: np.ndarray) -> str:
+    finite = values[np.isfinite(values)]
+    if not finite.size:
+        return "infinite" if len(values) else ""
+    text = _plus_minus(float(finite.mean()), float(finite.std()))
+    endless = len(values) - finite.size
+    return f"{text}, {endless:,} infinite" if endless else text
+
+
+def _first_times(first: np.ndarray, count: np.ndarray) -> str:
+    """Mean and spread of the first times of the clones that have one."""
+    if not count.any():
+        return "none"
+    first = first[count > 0]
+    text = _plus_minus(float(first.mean()), float(first.std()))
+    return text if count.all() else f"{text}, {int((count == 0).sum()):,} none"
+
+
+def _plus_minus(value: float, width: float | None) -> str:
+    """Value ± width, the width with two digits and the value with as many decimals."""
+    if not width:
+        return f"{value:.5g}"
+    text = f"{width:.2g}"
+    if "e" in text:
+        return f"{value:.8g} ± {text}"
+    decimals = len(text.partition(".")[2])
+    return f"{value:.{decimals}f} ± {text}"
+
+
+def _count(modes: list[str]) -> str:
+    return ", ".join(f"{modes.count(name):,} {name}" for name in sorted(set(modes)))
+
+
+def _published(file, name: str, size: float) -> str:
+    return "; ".join(
+        _plus_minus(value.value / size, value.uncertainty and value.uncertainty / size)
+        for value in file.published
+        if value.name == name
+    )
+
+
+def _misfits(residuals: Residuals | None, scale: Scale):
+    if residuals is None:
+        return
+    angle = np.degrees(residuals.angle[np.isfinite(residuals.angle)])
+    if angle.size:
+        yield f"median misfit, {angle.size} attitudes [deg]", f"{np.median(angle):.3g}"
+    rates = np.linalg.norm(residuals.rates, axis=-1) / scale.radians_per_second
+    rates = rates[np.isfinite(rates)]
+    if rates.size:
+        yield f"median misfit, {rates.size} rates [{scale.rate}]", f"{np.median(rates):.3g}"
+
+
+def _caption(job: Job):
+    from rich.text import Text
+
+    file = job.file
+    count = "1 body" if job.bodies == 1 else f"{job.bodies:,} bodies"
+    lines = [f"{count}, {len(job.ts):,} samples, {job.ts.dtype}"]
+    if file.published:
+        sources = dict.fromkeys(value.source for value in file.published)
+        lines.append(f"published: {'; '.join(sources)}")
+    if file.monte_carlo is not None:
+        lines.append("clones: mean ± standard deviation, drawn from the spread of")
+        spreads = file.monte_carlo.spreads.items()
+        lines += [f"  {quantity}: {spread.source}" for quantity, spread in spreads]
+    if job.redrawn:
+        lines.append(f"  {job.redrawn:,} draws had moments that no body has, and were drawn again")
+    return Text("\n".join(map(escape, lines)))

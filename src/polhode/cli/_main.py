@@ -17,23 +17,23 @@ from typing import Annotated, Any
 import typer
 import typer.core
 
-from polhode.cli import _explain, _fit, _look, _reference, _run, _scenes, _targets
-from polhode.cli._inputs import READERS
-from polhode.cli._signals import INTERRUPTED, TERMINATED, heeded
+from polhode.cli import _commands, _fit, _run
+from polhode.cli._files import READERS, UsageError, reset_outputs, written_outputs
+from polhode.cli._process import INTERRUPTED, TERMINATED, signal_handlers
 from polhode.files import SceneFileError
-from polhode.files._error import visible
+from polhode.files._error import escape
 
 SUCCESS, FAILURE, USAGE = 0, 1, 2
 _codes: list[int] = []
-_words: list[str] = []
+_arguments: list[str] = []
 
 
-def words() -> list[str]:
+def arguments() -> list[str]:
     """The arguments of the command that runs."""
-    return list(_words)
+    return list(_arguments)
 
 
-_OTHER_WORDS = {
+_SYNONYMS = {
     "run": ("simulate", "sim", "solve", "integrate", "propagate", "start", "exec", "execute"),
     "explain": ("plan", "describe", "check", "validate", "info", "inspect"),
     "fit": ("identify", "inertia", "estimate", "calibrate"),
@@ -53,19 +53,19 @@ class _Commands(typer.core.TyperGroup):
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         name = args[0]
         if self.get_command(ctx, name) is None and not name.startswith("-"):
-            ctx.fail(f"No such command {visible(name)!r}.{_meant(name)}")
+            ctx.fail(f"No such command {escape(name)!r}.{_hint(name)}")
         return super().resolve_command(ctx, args)
 
 
-def _meant(name: str) -> str:
+def _hint(name: str) -> str:
     """A hint for an unknown command: one of the same meaning, or of a similar name."""
     if reader := READERS.get(Path(name).suffix):
         return f" It is the name of a file: {reader}."
-    for command, others in _OTHER_WORDS.items():
+    for command, others in _SYNONYMS.items():
         if name.lower() in (command, *others):
             return f" Did you mean {command!r}?"
-    close = difflib.get_close_matches(name.lower(), _OTHER_WORDS, 1)
-    return f" Did you mean {close[0]!r}?" if close else f" There are {', '.join(_NAMES)}."
+    close = difflib.get_close_matches(name.lower(), _SYNONYMS, 1)
+    return f" Did you mean {close[0]!r}?" if close else f" There are {', '.join(_COMMANDS)}."
 
 
 app = typer.Typer(
@@ -79,13 +79,13 @@ app = typer.Typer(
 )
 
 
-def _version(wanted: bool) -> bool:
-    if wanted:
+def _version(show: bool) -> bool:
+    if show:
         from polhode import __version__
 
         print(f"polhode {__version__}")
         raise typer.Exit
-    return wanted
+    return show
 
 
 @app.callback()
@@ -98,32 +98,32 @@ def _top(
 
 
 def _guarded(command: Callable[..., int]) -> Callable[..., None]:
-    """The command with every error told in one block; its exit code is noted for `main`."""
+    """The command with every error printed in one block; its exit code is noted for `main`."""
 
     @functools.wraps(command)
-    def guarded(*given: Any, **options: Any) -> None:
-        _codes.append(_run_guarded(functools.partial(command, *given, **options),
-                                   options.get("debug", False)))  # fmt: skip
+    def guarded(*arguments: Any, **options: Any) -> None:
+        call = functools.partial(command, *arguments, **options)
+        _codes.append(_run_guarded(call, options.get("debug", False)))
 
     return guarded
 
 
-_COLLECTED = (200_000, 50, 100)
-"""Thresholds of garbage collection: to trace a fit makes millions of objects that live, and to look
-them over again and again takes a sixth of the time of a command whose programs are kept."""
+# Thresholds of garbage collection. Tracing a fit makes millions of objects that stay alive; at
+# Python's thresholds, scanning them takes a sixth of the time of a command with cached programs.
+_GC_THRESHOLDS = (200_000, 50, 100)
 
 
 def _run_guarded(command: Callable[[], int], debug: bool) -> int:
-    _targets.forget()
-    before = gc.get_threshold()
-    gc.set_threshold(*_COLLECTED)
+    reset_outputs()
+    thresholds = gc.get_threshold()
+    gc.set_threshold(*_GC_THRESHOLDS)
     try:
-        with heeded(), warnings.catch_warnings():
-            # numbers that overflow are told by the status, and letters without a picture are drawn
-            # as boxes; what else warns is told without its place in the source
+        with signal_handlers(), warnings.catch_warnings():
+            # the status shows numbers that overflow, and letters without a glyph are drawn as
+            # boxes; other warnings are printed without their place in the source
             warnings.simplefilter("ignore", RuntimeWarning)
             warnings.filterwarnings("ignore", "Glyph", UserWarning)
-            warnings.showwarning = _warned
+            warnings.showwarning = _print_warning
             code = command()
             sys.stdout.flush()
             return code
@@ -134,41 +134,41 @@ def _run_guarded(command: Callable[[], int], debug: bool) -> int:
         if ended.code == TERMINATED:
             print(f"\npolhode: terminated; {_state_of_files()}", file=sys.stderr)
         raise
-    except BrokenPipeError:  # the reader of our output went away: nobody to tell
+    except BrokenPipeError:  # the reader of our output went away: nobody reads it
         _silence(sys.stdout)
         return FAILURE
     except Exception as error:
         return _report(error, debug)
     finally:
-        gc.set_threshold(*before)
+        gc.set_threshold(*thresholds)
 
 
-def _warned(message: Warning | str, *_: Any) -> None:
-    print(f"polhode: {visible(str(message))}", file=sys.stderr)
+def _print_warning(message: Warning | str, *_: Any) -> None:
+    print(f"polhode: {escape(str(message))}", file=sys.stderr)
 
 
 def _state_of_files() -> str:
-    written, left = ([visible(str(path)) for path in paths] for paths in _targets.changed())
+    written, unchanged = ([escape(str(path)) for path in paths] for paths in written_outputs())
     if not written:
         return "no file was changed"
-    told = f"written: {', '.join(written)}"
-    return told + (f"; not written: {', '.join(left)}" if left else "")
+    text = f"written: {', '.join(written)}"
+    return text + (f"; not written: {', '.join(unchanged)}" if unchanged else "")
 
 
 def _report(error: Exception, debug: bool) -> int:
     """Print the error to stderr; the exit code that belongs to it."""
     if debug:
         traceback.print_exception(error)
-    bad_input = isinstance(error, SceneFileError | _targets.UsageError)
+    bad_input = isinstance(error, SceneFileError | UsageError)
     text = str(error) or type(error).__name__
     if isinstance(error, MemoryError):
         text = f"not enough memory ({text}): ask for fewer bodies or times, or use an [ensemble]"
-    known = bad_input or isinstance(error, OSError | ImportError | RuntimeError | MemoryError)
-    lead = "" if known else f"{type(error).__name__}: "
-    hint = "" if known or debug else "\n  (run again with --debug to see where)"
+    expected = bad_input or isinstance(error, OSError | ImportError | RuntimeError | MemoryError)
+    lead = "" if expected else f"{type(error).__name__}: "
+    hint = "" if expected or debug else "\n  (run again with --debug to see where)"
     if isinstance(error, OSError) and error.strerror:  # str() begins with the number of the error
         text = ": ".join(str(part) for part in (error.filename, error.strerror) if part)
-    block = "\n".join(map(visible, f"{lead}{text}{hint}".split("\n")))
+    block = "\n".join(map(escape, f"{lead}{text}{hint}".split("\n")))
     print(f"polhode: {block}", file=sys.stderr)
     try:
         sys.stdout.flush()
@@ -181,26 +181,30 @@ def _silence(stream: Any) -> None:
     os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-_NAMES: list[str] = []
+_COMMANDS = {
+    "run": _run.run,
+    "explain": _commands.explain,
+    "fit": _fit.fit,
+    "schema": _commands.schema,
+    "view": _commands.view,
+    "lightcurve": _commands.lightcurve,
+    "scenes": _commands.scenes,
+    "reference": _commands.reference,
+}
 _EXAMPLES = {
     "run": "example: polhode run toutatis -o toutatis.nc",
     "fit": "example: polhode fit toss.csv --columns t=time wx=gx wy=gy wz=gz -o toss",
 }
-for _name, _command in (("run", _run.run), ("explain", _explain.explain), ("fit", _fit.fit),
-                        ("schema", _explain.schema), ("view", _look.view),
-                        ("lightcurve", _look.lightcurve),
-                        ("scenes", _scenes.scenes),
-                        ("reference", _reference.reference)):  # fmt: skip
-    _NAMES.append(_name)
+for _name, _command in _COMMANDS.items():
     app.command(_name, epilog=_EXAMPLES.get(_name))(_guarded(_command))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line; see `polhode.cli.main`."""
     _codes.clear()
-    _words[:] = map(str, sys.argv[1:] if argv is None else argv)
+    _arguments[:] = map(str, sys.argv[1:] if argv is None else argv)
     try:
-        typer.main.get_command(app).main(args=list(_words), prog_name="polhode")
+        typer.main.get_command(app).main(args=list(_arguments), prog_name="polhode")
     except SystemExit:
         if not _codes:
             raise

@@ -1,42 +1,31 @@
-"""Kinds of options that several commands share."""
+"""Kinds of options, those that several commands share, and what follows from them."""
 
 import math
 import re
 from collections.abc import Callable
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 _SIZES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 
 
-def whole_number(least: int) -> Callable[[str], int]:
-    """A whole number not below `least`."""
+def whole_number(minimum: int) -> Callable[[str], int]:
+    """A whole number not below `minimum`."""
 
     def convert(text: str | int) -> int:
         try:
             value = int(str(text))
         except ValueError:
-            value = least - 1
-        if value < least:
-            raise typer.BadParameter(f"{str(text)[:80]!r} is not a whole number from {least} up")
+            value = minimum - 1
+        if value < minimum:
+            raise typer.BadParameter(f"{str(text)[:80]!r} is not a whole number from {minimum} up")
         return value
 
     return convert
 
 
-def not_negative(text: str | float) -> float:
-    """A finite number, 0 or above."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value < math.inf:
-        raise typer.BadParameter(f"{str(text)[:80]!r} is not a number from 0 up")
-    return value
-
-
-def part(text: str) -> str:
+def parse_part(text: str) -> str:
     """I/N with I from 1 to N."""
     first, _, last = text.partition("/")
     if not (first.isdecimal() and last.isdecimal() and 1 <= int(first[:9]) <= int(last[:9])):
@@ -46,13 +35,25 @@ def part(text: str) -> str:
 
 def positive(text: str | float) -> float:
     """A finite number above 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = _number(text)
     if not 0 < value < math.inf:
         raise typer.BadParameter(f"{str(text)[:80]!r} is not a positive number")
     return value
+
+
+def not_negative(text: str | float) -> float:
+    """A finite number, 0 or above."""
+    value = _number(text)
+    if not 0 <= value < math.inf:
+        raise typer.BadParameter(f"{str(text)[:80]!r} is not a number from 0 up")
+    return value
+
+
+def _number(text: str | float) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def byte_count(text: str | int) -> int:
@@ -78,29 +79,36 @@ def _precision(text: str) -> str:
     return text
 
 
+def option(name: str, metavar: str, words: str, parser: Any = None, **settings: Any) -> Any:
+    """An option with a value."""
+    return typer.Option(name, metavar=metavar, help=words, parser=parser, **settings)
+
+
 SceneName = Annotated[
-    str, typer.Argument(metavar="SCENE", show_default=False,
-                        help="scene file (TOML), - for standard input, or the name of one that"
-                             " comes with polhode (polhode scenes)")
-]  # fmt: skip
+    str,
+    typer.Argument(
+        metavar="SCENE",
+        show_default=False,
+        help="scene file (TOML), - for standard input, or the name of one that comes with polhode"
+        " (polhode scenes)",
+    ),
+]
 ClonesOption = Annotated[
     int | None,
-    typer.Option(
-        "--clones", parser=whole_number(0), metavar="N",
-        help="number of Monte Carlo clones, instead of the scene's; 0: the nominal body only",
+    option(
+        "--clones",
+        "N",
+        "number of Monte Carlo clones, instead of the scene's; 0: the nominal body only",
+        whole_number(0),
     ),
-]  # fmt: skip
+]
 SeedOption = Annotated[
     int | None,
-    typer.Option(
-        "--seed", parser=whole_number(0), metavar="N",
-        help="seed of the clones, instead of the scene's",
-    ),
-]  # fmt: skip
+    option("--seed", "N", "seed of the clones, instead of the scene's", whole_number(0)),
+]
 PrecisionOption = Annotated[
-    str, typer.Option("--precision", parser=_precision, metavar="float64|float32",
-                      help="numbers to compute with")
-]  # fmt: skip
+    str, option("--precision", "float64|float32", "numbers to compute with", _precision)
+]
 ForceOption = Annotated[
     bool, typer.Option("--force", help="replace a file that polhode did not write")
 ]
@@ -113,33 +121,40 @@ QuietOption = Annotated[bool, typer.Option("-q", "--quiet", help="print errors o
 DebugOption = Annotated[bool, typer.Option("--debug", help="show the full traceback of an error")]
 
 
-def read(scene: str, clones: int | None, seed: int | None):
+def read_scene(scene: str, clones: int | None, seed: int | None) -> Any:
     """The scene file with the options put in place of its own entries."""
-    from polhode.cli._inputs import read_scene
+    from polhode.cli import _files
     from polhode.files import SceneFileError
 
-    file = read_scene(scene)
-    given = {"clones": clones, "seed": seed}
-    given = {name: value for name, value in given.items() if value is not None}
-    if not given:
+    file = _files.read_scene(scene)
+    options = {"clones": clones, "seed": seed}
+    options = {name: value for name, value in options.items() if value is not None}
+    if not options:
         return file
-    name = next(iter(given))
+    name = next(iter(options))
     if file.ensemble is not None:
         key = {"seed": "seed", "clones": "bodies"}[name]
         raise SceneFileError(
-            file.path, f"[ensemble] {key}", "not replaced by an option",
-            f"--{name} on the command line", "an [ensemble] that says what its store holds",
-            f"write `{key} = {given[name]}` into [ensemble], and name another store",
-        )  # fmt: skip
-    if given.get("clones") == 0:
+            file.path,
+            f"[ensemble] {key}",
+            "not replaced by an option",
+            f"--{name} on the command line",
+            "an [ensemble] that says what its store holds",
+            f"write `{key} = {options[name]}` into [ensemble], and name another store",
+        )
+    if options.get("clones") == 0:
         return file.model_copy(update={"monte_carlo": None})
     if file.monte_carlo is None:
         raise SceneFileError(
-            file.path, "[monte_carlo]", "missing table", f"--{name} on the command line",
-            "a scene that states its uncertainties", "add [monte_carlo], or drop the option",
-        )  # fmt: skip
-    drawn = file.monte_carlo.model_copy(update=given)
-    return file.model_copy(update={"monte_carlo": drawn})
+            file.path,
+            "[monte_carlo]",
+            "missing table",
+            f"--{name} on the command line",
+            "a scene that states its uncertainties",
+            "add [monte_carlo], or drop the option",
+        )
+    clones_table = file.monte_carlo.model_copy(update=options)
+    return file.model_copy(update={"monte_carlo": clones_table})
 
 
 def require(command: str, *packages: str, extra: str = "cli") -> None:

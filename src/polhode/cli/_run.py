@@ -1,14 +1,19 @@
-"""`polhode run SCENE`: simulate a scene file, write NetCDF and a figure, print a summary."""
+"""`polhode run SCENE`: simulate a scene file, write NetCDF and a figure, print a summary.
+
+A scene with an [ensemble] goes into a Zarr store, chunk by chunk.
+"""
 
 import datetime
 import json
+import math
 import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from polhode.cli import _ensemble, _show
+from polhode.cli import _progress
+from polhode.cli._files import UsageError, check_suffix, output_path, write_figure
 from polhode.cli._options import (
     ClonesOption,
     DebugOption,
@@ -19,12 +24,54 @@ from polhode.cli._options import (
     QuietOption,
     SceneName,
     SeedOption,
-    read,
+    byte_count,
+    device_count,
+    option,
+    parse_part,
+    read_scene,
     require,
+    whole_number,
 )
-from polhode.cli._signals import heed
-from polhode.cli._targets import check_suffix, target
-from polhode.files._error import visible
+from polhode.cli._process import check_signals, program_cache
+from polhode.files import SceneFileError
+from polhode.files._error import escape
+
+
+def _ensemble_option(name: str, metavar: str, words: str, parser: Any = None) -> Any:
+    return option(name, metavar, f"for a scene with an [ensemble]: {words}", parser)
+
+
+MemoryOption = Annotated[
+    int | None,
+    _ensemble_option("--memory", "SIZE", "memory to stay within, such as 2GB", byte_count),
+]
+ChunkOption = Annotated[
+    int | None,
+    _ensemble_option(
+        "--chunk", "N", "bodies per chunk, instead of the library's choice", whole_number(1)
+    ),
+]
+DevicesOption = Annotated[
+    str | None,
+    _ensemble_option("--devices", "N|all", "devices to use (default: 1)", device_count),
+]
+PartOption = Annotated[
+    str | None,
+    _ensemble_option(
+        "--part",
+        "I/N",
+        "compute part I of N, every N-th chunk; run once without it at the end",
+        parse_part,
+    ),
+]
+SchedulerOption = Annotated[
+    str | None,
+    _ensemble_option(
+        "--scheduler",
+        "ADDRESS",
+        "address of a dask scheduler whose workers compute the chunks",
+    ),
+]
 
 
 def run(
@@ -32,7 +79,10 @@ def run(
     output: Annotated[
         str | None,
         typer.Option(
-            "-o", "--output", metavar="FILE", show_default=False,
+            "-o",
+            "--output",
+            metavar="FILE",
+            show_default=False,
             help="NetCDF file to write (default: that of the scene's [output], or SCENE.nc here);"
             " its folder is made if need be",
         ),
@@ -45,80 +95,77 @@ def run(
     no_cache: NoCacheOption = False,
     quiet: QuietOption = False,
     debug: DebugOption = False,
-    memory: _ensemble.MemoryOption = None,
-    chunk: _ensemble.ChunkOption = None,
-    devices: _ensemble.DevicesOption = None,
-    part: _ensemble.PartOption = None,
-    scheduler: _ensemble.SchedulerOption = None,
-) -> int:  # fmt: skip
+    memory: MemoryOption = None,
+    chunk: ChunkOption = None,
+    devices: DevicesOption = None,
+    part: PartOption = None,
+    scheduler: SchedulerOption = None,
+) -> int:
     """Simulate a scene with its Monte Carlo clones. Writes a NetCDF file and a PNG figure beside
     it, each whole or not at all, and prints a summary table. A scene with an [ensemble] goes into a
     Zarr store instead.
     """
-    file = read(scene, clones, seed)
-    options = {
-        "memory": memory, "chunk": chunk, "devices": devices, "part": part,
-        "scheduler": scheduler,
-    }  # fmt: skip
+    file = read_scene(scene, clones, seed)
+    options = dict(memory=memory, chunk=chunk, devices=devices, part=part, scheduler=scheduler)  # noqa: C408
     options = {name: value for name, value in options.items() if value is not None}
     if file.ensemble is not None:
         require("run", "rich", "zarr", extra="cli,scale")
         if scheduler is not None:
             require("run", "distributed", extra="cli,scale,dask")
-        return _ensemble.run(file, output, precision, options, quiet=quiet, no_cache=no_cache)
-    _ensemble.refuse(options, file)
+        return _run_ensemble(file, output, precision, options, quiet=quiet, no_cache=no_cache)
+    _refuse(options, file)
     with_figure = file.output.figure and not no_figure
     require("run", "rich", "xarray", "h5netcdf", "h5py", *(("matplotlib",) if with_figure else ()))
-    named = output or file.output.file
-    name = named or ("stdin" if scene == "-" else file.path.stem) + ".nc"
+    stated = output or file.output.file
+    name = stated or ("stdin" if scene == "-" else file.path.stem) + ".nc"
     check_suffix(name, ".nc", what="a NetCDF file (the figure .png is written beside it)")
-    goal = target(name, ".nc", force=force, confined=output is None and named is not None)
+    path = output_path(name, ".nc", force=force, confined=output is None and stated is not None)
     picture = None
     if with_figure:
-        picture = target(goal.with_suffix(".png"), ".png", force=force)
-    return _simulate(file, goal, picture, precision, quiet=quiet, no_cache=no_cache)
+        picture = output_path(path.with_suffix(".png"), ".png", force=force)
+    return _simulate(file, path, picture, precision, quiet=quiet, no_cache=no_cache)
 
 
 def _simulate(
-    file: Any, goal: Path, picture: Path | None, precision: str, *, quiet: bool, no_cache: bool
+    file: Any, path: Path, picture: Path | None, precision: str, *, quiet: bool, no_cache: bool
 ) -> int:
     from rich.console import Console
 
-    messages = _show.messages(quiet)
-    with _show.working(messages, "starting"):
-        from polhode.cli import _cache, _job, _summary
+    console = _progress.progress_console(quiet)
+    with _progress.spinner(console, "starting"):
+        from polhode.cli import _job
         from polhode.files import write_netcdf
 
-    with _cache.kept_programs(not no_cache):
-        with _show.working(messages, "drawing the bodies"):
+    with program_cache(not no_cache):
+        with _progress.spinner(console, "drawing the bodies"):
             job = _job.prepare(file, precision)
-        outcome = _with_progress(messages, job)
-        with _show.working(messages, "measuring and writing"):
-            figures = _summary.measure(job, outcome)
+        outcome = _with_progress(console, job)
+        with _progress.spinner(console, "measuring and writing"):
+            figures = _job.measure(job, outcome)
             dataset = _dataset(job, outcome, figures, precision, picture is not None)
-            heed()
-            written = [write_netcdf(dataset, goal)]
+            check_signals()
+            written = [write_netcdf(dataset, path)]
             if picture is not None:
-                heed()
+                check_signals()
                 written.append(_draw(job, outcome, picture))
     if not quiet:
         out = Console(soft_wrap=not sys.stdout.isatty())
-        out.print(_summary.table(job, outcome, figures))
-        _show.tell_written(out, written)
+        out.print(_job.summary_table(job, outcome, figures))
+        _progress.print_paths(out, written)
     return _failures(outcome.trajectory.status)
 
 
-def _with_progress(messages, job):
+def _with_progress(console, job):
     from rich.progress import TimeElapsedColumn
 
     from polhode.cli import _job
 
-    with _show.bar(messages, TimeElapsedColumn()) as progress:
+    with _progress.progress_bar(console, TimeElapsedColumn()) as progress:
         task = progress.add_task("", total=job.bodies)
 
         def advance(done: int) -> None:
             progress.update(task, completed=done)
-            heed()
+            check_signals()
 
         return _job.run(job, advance)
 
@@ -129,7 +176,7 @@ _RELATIVE = {"energy": "s-2", "momentum_space": "s-1", "work": "s-2"}
 
 def _dataset(job, outcome, figures, precision: str, figure: bool):
     """The trajectory's dataset with the clones numbered, their periods and what was run."""
-    from polhode.cli import _summary
+    from polhode.cli import _job
 
     dataset = outcome.trajectory.to_xarray()
     file = job.file
@@ -142,7 +189,7 @@ def _dataset(job, outcome, figures, precision: str, figure: bool):
         lead = ("clone",)
     for name, values in figures.periods.items():
         values = values if lead else values[0]
-        words = f"period {name}: {_summary.MEANINGS[name]}"
+        words = f"period {name}: {_job.MEANINGS[name]}"
         dataset[name] = (lead, values, {"units": "s", "long_name": words})
     for name, times in outcome.events.items():
         words = f"times at which the event {name} occurs, NaN where there are no more"
@@ -160,65 +207,59 @@ def _dataset(job, outcome, figures, precision: str, figure: bool):
     if file.inertia.unit == "relative":
         for name in _RELATIVE.keys() & dataset.data_vars.keys():
             words = dataset[name].attrs["long_name"]
-            dataset[name].attrs = {
-                "units": _RELATIVE[name], "long_name": f"{words}, per unit of the relative moments",
-            }  # fmt: skip
-    dataset.attrs.update(provenance(job, precision, figure))
+            words += ", per unit of the relative moments"
+            dataset[name].attrs = {"units": _RELATIVE[name], "long_name": words}
+    dataset.attrs.update(_provenance(job, precision, figure))
     return dataset
 
 
-def provenance(job, precision: str, figure: bool) -> dict[str, Any]:
+def _provenance(job, precision: str, figure: bool) -> dict[str, Any]:
     """What was run, as attributes: the scene as read, options in force, seed, versions, commit."""
+    import jax
     import numpy as np
 
     import polhode
     from polhode.cli import _main
     from polhode.ensemble._stream import device_names
-    from polhode.files._build import blamed
-    from polhode.files._provenance import commit, versions
+    from polhode.files._error import scene_errors
+    from polhode.files._write import commit, versions
 
     file = job.file
-    carlo = file.monte_carlo
-    with blamed(file, ""):
+    clones = file.monte_carlo
+    with scene_errors(file, ""):
         plan = polhode.explain(job.scene, job.state, job.ts, job.method, rtol=job.rtol)
-    runs = next(line for line in str(plan).splitlines() if line.startswith("runs"))
-    used: dict[str, Any] = {
-        "precision": precision, "method": file.method.kind, "solver": file.method.solver,
-        "step": file.method.step, "rtol": file.method.rtol, "figure": figure,
-    }  # fmt: skip
-    used |= {"clones": carlo.clones, "seed": carlo.seed} if carlo is not None else {"clones": 0}
+    method = next(line for line in str(plan).splitlines() if line.startswith("runs"))
+    options: dict[str, Any] = {"precision": precision, "method": file.method.kind}
+    options |= {name: getattr(file.method, name) for name in ("solver", "step", "rtol")}
+    options |= {"figure": figure, "clones": 0 if clones is None else clones.clones}
+    if clones is not None:
+        options["seed"] = clones.seed
     now = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    command = visible(" ".join(["polhode", *_main.words()]))
-    found: dict[str, Any] = texts(file) | {
+    command = escape(" ".join(["polhode", *_main.arguments()]))
+    attributes: dict[str, Any] = _texts(file) | {
         "history": f"{now} {command}",
-        "options": json.dumps(used),
-        "method": runs.removeprefix("runs").strip(),
+        "options": json.dumps(options),
+        "method": method.removeprefix("runs").strip(),
         "precision": precision,
-        "clones": np.int64(used["clones"]),
-        "devices": device_names(_devices()),
+        "clones": np.int64(options["clones"]),
+        "devices": device_names(jax.local_devices()[:1]),
         **versions(),
     }
     if commit():
-        found["polhode_commit"] = commit()
-    if carlo is not None:
-        found["seed"] = np.int64(carlo.seed)
+        attributes["polhode_commit"] = commit()
+    if clones is not None:
+        attributes["seed"] = np.int64(clones.seed)
     if file.epoch is not None:
-        found["epoch"] = file.epoch.isoformat()
-    return found
+        attributes["epoch"] = file.epoch.isoformat()
+    return attributes
 
 
-def _devices() -> list[Any]:
-    import jax
-
-    return jax.local_devices()[:1]
-
-
-def texts(file) -> dict[str, str]:
+def _texts(file) -> dict[str, str]:
     """What the scene file says, as attributes."""
     return {
-        "title": visible(file.title),
-        "scene_source": visible(file.source),
-        "frame": visible(file.frame),
+        "title": escape(file.title),
+        "scene_source": escape(file.source),
+        "frame": escape(file.frame),
         "scene": file.text.replace("\0", ""),
     }
 
@@ -228,16 +269,13 @@ def _draw(job, outcome, path: Path) -> Path:
     from polhode import plot
     from polhode.files import build_attitudes
 
-    file, seen = job.file, job.file.observations
+    file, observations = job.file, job.file.observations
     observed = None
-    if seen is not None:
-        observed = plot.samples(
-            seen.seconds, seen.omega_body, build_attitudes(seen.attitudes, "float64")
-        )
+    if observations is not None:
+        wxyz = build_attitudes(observations.attitudes, "float64")
+        observed = plot.samples(observations.seconds, observations.omega_body, wxyz)
     names = {"axis_names": file.axis_names, "title": file.title}
-    return _show.write_figure(
-        path, lambda: plot.overview(outcome.trajectory, observed=observed, **names)
-    )
+    return write_figure(path, lambda: plot.overview(outcome.trajectory, observed=observed, **names))
 
 
 def _failures(status) -> int:
@@ -256,3 +294,150 @@ def _failures(status) -> int:
         file=sys.stderr,
     )
     return 1
+
+
+def _refuse(options: dict[str, Any], file: Any) -> None:
+    """Raise SceneFileError for an option that needs an [ensemble], which the scene lacks."""
+    for name in options:
+        raise SceneFileError(
+            file.path,
+            "[ensemble]",
+            "missing table",
+            f"--{name.replace('_', '-')} on the command line",
+            "a scene with an [ensemble]",
+            "add [ensemble], or drop the option",
+        )
+
+
+def _run_ensemble(
+    file: Any,
+    output: str | None,
+    precision: str,
+    options: dict[str, Any],
+    *,
+    quiet: bool,
+    no_cache: bool,
+) -> int:
+    """Compute the ensemble into its store; 0, or 1 when some bodies did not finish."""
+    console = _progress.progress_console(quiet)
+    path = _store_path(file, output)
+    with _progress.spinner(console, "starting"):
+        import jax
+
+        jax.config.update("jax_enable_x64", True)
+        from polhode.ensemble import StoreError, build_ensemble
+        from polhode.ensemble._store import missing_chunks
+        from polhode.files._error import escape
+
+        ensemble, statistics = build_ensemble(file, precision)
+    if "part" in options:
+        options["part"] = tuple(map(int, options["part"].split("/")))
+    if "devices" in options:
+        options["devices"] = _devices(options["devices"])
+    try:
+        with program_cache(not no_cache), _Meter(console) as meter:
+            last = _stream(file, ensemble, statistics, path, precision, meter, options)
+    except KeyboardInterrupt:
+        print("\npolhode: interrupted; the same command finishes what is missing", file=sys.stderr)
+        return 130
+    except StoreError:
+        raise
+    except ValueError as error:  # of sizes, which options gave
+        raise UsageError(str(error)) from error
+    if not quiet:
+        rate = "nothing was missing" if last.rate is None else f"{last.rate:,.0f} bodies/s"
+        print(f"{last.done:,} bodies ({last.reused:,} from before), {rate}")
+        print(f"written: {escape(str(path))}")
+    if "part" in options:
+        missing = missing_chunks(path) or "no chunk is missing: run once without --part"
+        if not quiet:
+            print(f"part {options['part'][0]} of {options['part'][1]} is complete; {missing}")
+        return 0
+    return _ensemble_failures(path)
+
+
+def _store_path(file: Any, output: str | None) -> Path:
+    from polhode.files._error import escape
+
+    text = output or file.output.file or f"{file.path.stem}.zarr"
+    path = Path(text)
+    if "\0" in text or path.name in ("", ".."):
+        raise UsageError(f"the output {escape(text)} names no store: give a name such as big.zarr")
+    check_suffix(text, ".zarr", what="a Zarr store")
+    if path.suffix != ".zarr":
+        path = path.with_name(path.name + ".zarr")
+    here = Path.cwd().resolve()
+    if output is None and not path.resolve().is_relative_to(here):
+        raise UsageError(f"[output] file: {escape(text)} leads out of the folder {here} by a link")
+    if path.is_symlink() and output is None:
+        raise UsageError(f"[output] file: {escape(text)} is a link: name a store")
+    return path
+
+
+def _stream(file, ensemble, statistics, path, precision, meter, options):
+    from polhode.ensemble import stream
+    from polhode.files import build_method
+
+    stream(
+        ensemble,
+        file.times.seconds,
+        path,
+        method=build_method(file),
+        rtol=file.method.rtol,
+        trajectories=file.ensemble.trajectories,
+        statistics=statistics,
+        attributes=_texts(file) | {"precision": precision},
+        progress=meter,
+        **options,
+    )
+    return meter.last
+
+
+def _devices(count: str) -> list[Any]:
+    import jax
+
+    devices = jax.local_devices()
+    number = len(devices) if count == "all" else int(count)
+    if number > len(devices):
+        raise UsageError(f"--devices {count}: this machine has {len(devices)} (use fewer, or all)")
+    return devices[:number]
+
+
+class _Meter:
+    """Progress with rate and remaining time, for people who watch; remembers the last report."""
+
+    def __init__(self, console):
+        from rich.progress import TextColumn
+
+        self.last: Any = None
+        self.bar = _progress.progress_bar(console, TextColumn("{task.fields[remaining]}"))
+        self.task = self.bar.add_task("", total=None, remaining="compiling ...")
+
+    def __enter__(self):
+        self.bar.start()
+        return self
+
+    def __exit__(self, *_):
+        self.bar.stop()
+
+    def __call__(self, report: Any) -> None:
+        check_signals()
+        self.last = report
+        remaining = "compiling ..."
+        if report.rate is not None:
+            seconds = math.ceil(report.remaining)
+            remaining = f"{report.rate:,.0f} bodies/s, {seconds // 60}:{seconds % 60:02d} left"
+        self.bar.update(self.task, completed=report.done, total=report.total, remaining=remaining)
+
+
+def _ensemble_failures(path: Path) -> int:
+    import numpy as np
+    import zarr
+
+    status = zarr.open_array(path / "status", mode="r")
+    failed, step = 0, status.chunks[0]
+    for start in range(0, status.shape[0], step):
+        failed += int((np.asarray(status[start : start + step]) > 0).sum())
+    if failed:
+        print(f"polhode: {failed:,} bodies did not finish; see `status` in {path}", file=sys.stderr)
+    return 1 if failed else 0

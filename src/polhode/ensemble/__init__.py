@@ -1,16 +1,16 @@
 """Ensembles of any size: drawn by index, written chunk by chunk, resumed after a kill."""
 
-from polhode.ensemble._ensemble import Ensemble as Ensemble
-from polhode.ensemble._scene_file import build_ensemble as build_ensemble
-from polhode.ensemble._spreads import (
+from polhode.ensemble._ensemble import (
     AnyAttitude as AnyAttitude,
     Deviate as Deviate,
+    Ensemble as Ensemble,
     SpreadAttitude as SpreadAttitude,
     SpreadEuler as SpreadEuler,
     SpreadMoments as SpreadMoments,
     SpreadMomentum as SpreadMomentum,
     SpreadRates as SpreadRates,
     SpreadTorque as SpreadTorque,
+    build_ensemble as build_ensemble,
 )
 from polhode.ensemble._statistics import Statistic as Statistic, quantile as quantile
 from polhode.ensemble._store import StoreError as StoreError, open_store as open_store

@@ -5,6 +5,7 @@ the job once, and completes chunks by the same function as a run without dask.
 """
 
 import contextlib
+import dataclasses
 import functools
 import sys
 import threading
@@ -16,8 +17,7 @@ import jax
 import numpy as np
 
 from polhode._extras import imported
-from polhode.ensemble._identity import versions
-from polhode.ensemble._store import StoreError
+from polhode.ensemble._store import StoreError, versions
 
 if TYPE_CHECKING:
     from polhode.ensemble._stream import Job
@@ -30,11 +30,11 @@ _SETTINGS = (
     "jax_persistent_cache_min_compile_time_secs",
     "jax_persistent_cache_min_entry_size_bytes",
 )
-_building = threading.Lock()
+_BUILD_LOCK = threading.Lock()
 
 
 @contextlib.contextmanager
-def connected(scheduler: Any) -> Iterator[Any]:
+def connection(scheduler: Any) -> Iterator[Any]:
     """The client of an address; a client as it is; for None the active client, or None.
 
     Raises StoreError when no scheduler answers.
@@ -66,8 +66,8 @@ def complete(client: Any, job: "Job", numbers: range) -> Iterator[tuple[int, boo
     settings = {name: getattr(jax.config, name) for name in _SETTINGS}
     ensemble, *rest = job.arguments
     rows = {name: _reference(x) for name, x in ensemble.rows.items()}
-    bare = _with_rows(ensemble, {})
-    message = cloudpickle.dumps((bare, rows, rest, job.chunk, versions()))
+    ensemble = dataclasses.replace(ensemble, rows={})
+    message = cloudpickle.dumps((ensemble, rows, rest, job.chunk, versions()))
     futures = client.map(
         _complete, list(numbers), settings=settings, message=message, pure=False, retries=_RETRIES
     )
@@ -80,7 +80,7 @@ def complete(client: Any, job: "Job", numbers: range) -> Iterator[tuple[int, boo
 
 def _complete(k: int, settings: dict[str, Any], message: bytes) -> tuple[int, bool]:
     """Complete chunk ``k``; runs on a worker."""
-    with _building:
+    with _BUILD_LOCK:
         for name, value in settings.items():  # before arrays of 64 bits are unpickled
             if value is not None and getattr(jax.config, name) != value:
                 jax.config.update(name, value)
@@ -97,27 +97,22 @@ def _build(message: bytes) -> "Job":
     ensemble, rows, arguments, chunk, expected = cloudpickle.loads(message)
     if versions() != expected:
         raise StoreError(f"a worker has the versions {versions()}, this run {expected}.")
-    ensemble = _with_rows(ensemble, {name: _dereference(x) for name, x in rows.items()})
+    rows = {name: _dereference(x) for name, x in rows.items()}
+    ensemble = dataclasses.replace(ensemble, rows=rows)
     job = Job(ensemble, *arguments, devices=[jax.local_devices()[0]])
     job.open(chunk)
     job.block.compile()
     return job
 
 
-def _with_rows(ensemble: Any, rows: dict[str, np.ndarray]) -> Any:
-    kind = type(ensemble)
-    return kind(
-        ensemble.scene, ensemble.state, ensemble.bodies, ensemble.spreads, ensemble.seed, rows
-    )
-
-
 def _reference(array: np.ndarray) -> Any:
     """A file instead of an array that is mapped from it as a whole."""
-    filename = getattr(array, "filename", None)
-    if not isinstance(array, np.memmap) or filename is None or isinstance(array.base, np.ndarray):
+    if not isinstance(array, np.memmap) or isinstance(array.base, np.ndarray):
+        return np.asarray(array)
+    if array.filename is None:
         return np.asarray(array)
     order = "C" if array.flags.c_contiguous else "F"
-    return Path(filename).resolve(), array.dtype, array.offset, array.shape, order
+    return Path(array.filename).resolve(), array.dtype, array.offset, array.shape, order
 
 
 def _dereference(reference: Any) -> np.ndarray:

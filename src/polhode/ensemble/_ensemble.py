@@ -1,22 +1,33 @@
-"""Ensembles: any number of bodies, each drawn from its own index, never all in memory."""
+"""Ensembles: any number of bodies, each drawn from its own index, never all in memory.
+
+The bodies differ from a nominal one by spreads, each of which changes one thing. A spread is any
+callable ``(key, scene, state) -> (scene, state)`` of one body; those here cover what scene files
+can say.
+"""
 
 import dataclasses
+import zlib
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Array, DTypeLike, Float, Int
 
+from polhode import rotation
 from polhode._batch import PARTS, batch_shapes, is_lane_tree
-from polhode._scene import Scene, State
-from polhode.ensemble._spreads import constant_torque, stream_of, with_torque
+from polhode._scene import BodyTorque, Scene, SpaceTorque, State
+from polhode.ensemble._statistics import QUANTITIES, Statistic
+from polhode.files._read import possible_moments
 from polhode.inertia import Inertia
 
-MOST_BODIES = 2**32 - 1
-"""Body indices are folded into the random key as 32-bit numbers."""
+if TYPE_CHECKING:
+    from polhode.files import SceneFile
+
+MAX_BODIES = 2**32 - 1  # body indices are folded into the random key as 32-bit numbers
+_MAX_DRAWS = 100
 
 Spread = Callable[[Array, Scene, State], tuple[Scene, State]]
 
@@ -57,14 +68,14 @@ class Ensemble(eqx.Module):
             )
         if not 0 <= self.seed < 2**32:
             raise ValueError(f"seed must be from 0 to {2**32 - 1}, got {self.seed}.")
-        if not 1 <= self.bodies <= MOST_BODIES:
-            raise ValueError(f"bodies must be from 1 to {MOST_BODIES}, got {self.bodies}.")
+        if not 1 <= self.bodies <= MAX_BODIES:
+            raise ValueError(f"bodies must be from 1 to {MAX_BODIES}, got {self.bodies}.")
         parts = [getattr(self.scene, name) for name in PARTS]
-        found = {shape for part in (*parts, self.state) for shape in batch_shapes(part)}
-        if wrong := found - {(), (self.bodies,)}:
+        shapes = {shape for part in (*parts, self.state) for shape in batch_shapes(part)}
+        if other := shapes - {(), (self.bodies,)}:
             raise ValueError(
                 f"arrays of an ensemble of {self.bodies} bodies have no leading axis or one of that"
-                f" length, got the leading axes {sorted(wrong)}."
+                f" length, got the leading axes {sorted(other)}."
             )
         for name, array in self.rows.items():
             if name not in ROWS:
@@ -99,30 +110,30 @@ def draw(each: Any, shared: Any, indices: Array, spreads: Any, seed: Array) -> t
     """The bodies of the indices (n,) of uint32 and a seed of uint32; traceable."""
     root = jax.random.key(seed, impl="threefry2x32")
 
-    def one(index, own):
-        own, rows = own
-        scene, state = eqx.combine(own, shared)
-        scene, state = _placed(scene, state, rows)
+    def draw_one(index, leaves_and_rows):
+        leaves, rows = leaves_and_rows
+        scene, state = eqx.combine(leaves, shared)
+        scene, state = _replace_rows(scene, state, rows)
         key = jax.random.fold_in(root, index)
         streams: list[int] = []
         for spread in spreads:
             stream = stream_of(spread)
-            own_key = jax.random.fold_in(key, stream)
+            spread_key = jax.random.fold_in(key, stream)
             if stream in streams:  # spreads of one name draw independently
-                own_key = jax.random.fold_in(own_key, streams.count(stream))
+                spread_key = jax.random.fold_in(spread_key, streams.count(stream))
             streams.append(stream)
-            scene, state = spread(own_key, scene, state)
+            scene, state = spread(spread_key, scene, state)
         if "momentum_body" in rows:
             omega = scene.inertia.rates(rows["momentum_body"])
             state = State(state.wxyz, omega, state.wheel_speed)
         return scene, state
 
-    return eqx.filter_vmap(one, in_axes=(0, eqx.if_array(0)), out_axes=eqx.if_array(0))(
+    return eqx.filter_vmap(draw_one, in_axes=(0, eqx.if_array(0)), out_axes=eqx.if_array(0))(
         indices, each
     )
 
 
-def _placed(scene: Scene, state: State, rows: Mapping[str, Array]) -> tuple[Scene, State]:
+def _replace_rows(scene: Scene, state: State, rows: Mapping[str, Array]) -> tuple[Scene, State]:
     """One body with its rows in place of the nominal numbers."""
     if "moments" in rows:
         scene = dataclasses.replace(scene, inertia=Inertia.from_moments(rows["moments"]))
@@ -132,3 +143,186 @@ def _placed(scene: Scene, state: State, rows: Mapping[str, Array]) -> tuple[Scen
     if "wxyz" in rows or "omega_body" in rows:
         state = State(wxyz, omega, state.wheel_speed)
     return scene, state
+
+
+class Deviate(eqx.Module):
+    """Random numbers (3,) of mean zero: normal of standard deviation ``scale`` (3,), or uniform
+    in +-``scale`` with ``uniform=True``.
+    """
+
+    scale: Float[Array, " 3"]
+    uniform: bool = eqx.field(static=True, default=False)
+
+    def __call__(self, key: Array) -> Array:
+        if self.uniform:
+            return self.scale * jax.random.uniform(key, (3,), self.scale.dtype, -1, 1)
+        return self.scale * jax.random.normal(key, (3,), self.scale.dtype)
+
+
+class SpreadMoments(eqx.Module):
+    """Principal moments times (1 + deviate); draws that no body can have are drawn again.
+
+    After 100 impossible draws the moments become NaN, and the status of the body says so.
+    """
+
+    relative: Deviate
+
+    def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
+        nominal = scene.inertia.moments
+
+        def draw_moments(trial):
+            return nominal * (1 + self.relative(jax.random.fold_in(key, trial)))
+
+        def is_unfinished(carry):
+            trial, moments = carry
+            return ~possible_moments(moments) & (trial < _MAX_DRAWS)
+
+        def draw_again(carry):
+            trial, _ = carry
+            return trial + 1, draw_moments(trial)
+
+        zero = jnp.zeros((), jnp.int32)
+        first = (zero + 1, draw_moments(zero))
+        _, moments = jax.lax.while_loop(is_unfinished, draw_again, first)
+        moments = jnp.where(possible_moments(moments), moments, jnp.nan)
+        return dataclasses.replace(scene, inertia=Inertia.from_moments(moments)), state
+
+
+class SpreadAttitude(eqx.Module):
+    """The attitude followed by a rotation about body axes by the rotation vector ``turn`` [rad]."""
+
+    turn: Deviate
+
+    def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
+        turn = rotation.rotation_vector_to_wxyz(self.turn(key))
+        return scene, State(
+            rotation.multiply(state.wxyz, turn), state.omega_body, state.wheel_speed
+        )
+
+
+class AnyAttitude(eqx.Module):
+    """Attitudes spread evenly over all rotations."""
+
+    def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
+        wxyz = jax.random.normal(key, (4,), state.wxyz.dtype)
+        return scene, State(wxyz, state.omega_body, state.wheel_speed)
+
+
+class SpreadEuler(eqx.Module):
+    """Euler ``angles`` (3,) [rad] of a sequence, each with its deviate [rad]."""
+
+    angles: Float[Array, " 3"]
+    deviate: Deviate
+    sequence: rotation.Sequence = eqx.field(static=True)
+
+    def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
+        a = self.angles + self.deviate(key)
+        wxyz = rotation.euler_to_wxyz(a[0], a[1], a[2], self.sequence)
+        return scene, State(wxyz, state.omega_body, state.wheel_speed)
+
+
+class SpreadRates(eqx.Module):
+    """Body rates plus a deviate [rad/s]."""
+
+    deviate: Deviate
+
+    def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
+        return scene, State(state.wxyz, state.omega_body + self.deviate(key), state.wheel_speed)
+
+
+class SpreadMomentum(eqx.Module):
+    """Body momentum ``momentum`` (3,) [kg m^2/s] plus a deviate: rates follow from the inertia
+    that the spreads before this one left.
+    """
+
+    momentum: Float[Array, " 3"]
+    deviate: Deviate | None = None
+
+    def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
+        momentum = self.momentum if self.deviate is None else self.momentum + self.deviate(key)
+        return scene, State(state.wxyz, scene.inertia.rates(momentum), state.wheel_speed)
+
+
+class SpreadTorque(eqx.Module):
+    """The constant torque of a scene (``BodyTorque`` or ``SpaceTorque``) plus a deviate [N m]."""
+
+    deviate: Deviate
+
+    def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
+        return with_torque(scene, constant_torque(scene) + self.deviate(key)), state
+
+
+def constant_torque(scene: Scene) -> Array:
+    """The numbers of the one constant torque of a scene [N m]. Raises TypeError without one."""
+    torque = scene.torque
+    if not isinstance(torque, BodyTorque | SpaceTorque) or not isinstance(torque.n, Array):
+        raise TypeError(
+            "torques of an ensemble vary around one constant ph.BodyTorque or ph.SpaceTorque, got"
+            f" {type(torque).__name__}: give the scene such a torque, or write your own spread."
+        )
+    return torque.n
+
+
+def with_torque(scene: Scene, n: Array) -> Scene:
+    """The scene with its constant torque replaced."""
+    return eqx.tree_at(lambda s: s.torque.n, scene, n)
+
+
+def stream_of(spread: Any) -> int:
+    """The number of a spread's own stream of random numbers, from its name: adding one spread
+    leaves the draws of the others as they are.
+    """
+    name = getattr(spread, "__name__", type(spread).__name__)
+    return zlib.crc32(name.encode())
+
+
+def build_ensemble(file: "SceneFile", dtype: DTypeLike) -> tuple[Ensemble, tuple[Statistic, ...]]:
+    """The ensemble and the statistics to keep. Raises SceneFileError for impossible numbers and
+    ValueError for a file without [ensemble].
+    """
+    from polhode.files import build_inertia, build_scene, build_state
+
+    plan = file.ensemble
+    if plan is None:
+        raise ValueError(f"{file.path} has no [ensemble]: add one, with `bodies` and `seed`.")
+    inertia = build_inertia(file, dtype)
+    spreads = [_spread(name, draw, file, dtype) for name, draw in plan.spreads.items()]
+    if file.state.rate == "momentum_body" and "momentum_body" not in {*plan.spreads, *file.rows}:
+        spreads.append(SpreadMomentum(jnp.asarray(file.state.value, dtype)))
+    ensemble = Ensemble(
+        build_scene(file, dtype, inertia),
+        build_state(file, dtype, inertia),
+        plan.bodies,
+        tuple(spreads),
+        plan.seed,
+        dict(file.rows),
+    )
+    statistics = tuple(
+        Statistic(table.quantity, *QUANTITIES[table.quantity], table.low, table.high, table.bins)
+        for table in plan.statistics
+    )
+    return ensemble, statistics
+
+
+def _spread(quantity: str, draw, file: "SceneFile", dtype: DTypeLike):
+    if quantity == "attitude" and draw.any:
+        return AnyAttitude()
+    uniform = draw.sigma is None
+    deviate = Deviate(jnp.asarray(draw.half_width if uniform else draw.sigma, dtype), uniform)
+    state = file.state
+    if quantity == "euler":
+        angles, sequence = jnp.asarray(state.attitude.values, dtype), state.attitude.sequence
+        if sequence is None:
+            raise ValueError("Euler angles spread only about Euler angles: give [state] euler.")
+        return SpreadEuler(angles, deviate, rotation.Sequence[sequence.upper()])
+    if quantity == "momentum_body":
+        return SpreadMomentum(jnp.asarray(state.value, dtype), deviate)
+    return _SPREADS[quantity](deviate)
+
+
+_SPREADS = {
+    "moments": SpreadMoments,
+    "attitude": SpreadAttitude,
+    "omega_body": SpreadRates,
+    "torque": SpreadTorque,
+}

@@ -1,4 +1,4 @@
-"""The one compiled program of an ensemble run: a block of bodies, always of the same shape.
+"""The one compiled program of an ensemble run, a block of bodies, and the chunks made of blocks.
 
 Vectorised loops treat the last lanes of an array differently from the others, and adaptive
 solvers share steps within a group of lanes. A body's result therefore depends on its place in
@@ -6,8 +6,9 @@ the compiled block. Blocks have a size that only the number of samples decides, 
 stands at place i modulo that size: chunk size, device count and process count change nothing.
 """
 
+import collections
 import concurrent.futures
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,19 +22,20 @@ from polhode._plan import choose
 from polhode._simulate import run
 from polhode.ensemble._ensemble import Ensemble, draw
 from polhode.ensemble._statistics import Statistic, summarise
+from polhode.ensemble._store import Field
 
-_SAMPLES, _LEAST, _MOST = 2**20, 2**4, 2**13
+_SAMPLES, _MIN_BODIES, _MAX_BODIES = 2**20, 2**4, 2**13
 
 
 def block_size(samples: int) -> int:
     """Bodies of a block: a power of two from 16 to 8192 with about a million samples or fewer."""
-    wanted = max(_LEAST, min(_MOST, _SAMPLES // samples))
-    return 1 << (wanted.bit_length() - 1)
+    bodies = max(_MIN_BODIES, min(_MAX_BODIES, _SAMPLES // samples))
+    return 1 << (bodies.bit_length() - 1)
 
 
 class Block:
     """``Block(...)(first)`` computes the block that starts at the body ``first``, and returns
-    device arrays: the dictionary of what is kept. Blocks go to the devices in turn, each by the
+    device arrays by name. Blocks go to the devices in turn, each by the
     same program of one device: how many devices there are changes no bit.
     """
 
@@ -101,12 +103,43 @@ def program(first: Array, each: Any, shared: Any, settings: Settings) -> dict[st
     indices = first + jnp.arange(settings.size, dtype=jnp.uint32)
     drawn = draw(each, shared, indices, spreads, seed)
     trajectory = run(method, *drawn, ts, rtol, Record())
-    real = indices < bodies
-    kept = {"status": trajectory.status.astype(jnp.uint8)}
+    arrays = {"status": trajectory.status.astype(jnp.uint8)}
     if settings.trajectories:
-        recorded = {"wxyz": trajectory.wxyz, "omega_body": trajectory.omega_body}
-        kept |= {name: x for name, x in recorded.items() if x is not None}
+        arrays |= {"wxyz": trajectory.wxyz, "omega_body": trajectory.omega_body}
     for statistic in settings.statistics:
-        found = summarise(statistic, trajectory, real)
-        kept |= {f"{statistic.name}_{name}": x[None] for name, x in found.items()}
-    return kept
+        summary = summarise(statistic, trajectory, indices < bodies)
+        arrays |= {f"{statistic.name}_{name}": x[None] for name, x in summary.items()}
+    return arrays
+
+
+def compute(block: Block, layout: Mapping[str, Field], chunk: int, k: int) -> dict[str, np.ndarray]:
+    """The arrays of chunk ``k``, the bodies from ``k * chunk`` on, by name.
+
+    Every device computes one block at a time. The result depends on ``k``, the seed and the scene
+    alone: not on the size of the chunk, the number of devices or what was computed before.
+    """
+    first, last = k * chunk, min((k + 1) * chunk, block.ensemble.bodies)
+    arrays = {}
+    for name, field in layout.items():
+        rows = field.region(k)
+        arrays[name] = np.zeros((rows.stop - rows.start, *field.shape[1:]), field.dtype)
+    pending: collections.deque = collections.deque()
+
+    def collect() -> None:
+        start, values = pending.popleft()
+        for name, array in arrays.items():
+            part = np.asarray(values[name])
+            axis = layout[name].dimensions[0]
+            if axis == "chunk":
+                array[0] += part.sum(axis=0)
+                continue
+            row = (start - first) // (block.size if axis == "block" else 1)
+            array[row : row + len(part)] = part[: len(array) - row]
+
+    for start in range(first, last, block.size):
+        if len(pending) == len(block.devices):
+            collect()
+        pending.append((start, block(start)))
+    while pending:
+        collect()
+    return arrays

@@ -1,4 +1,4 @@
-"""Statistics over the bodies of an ensemble at each time, kept instead of trajectories."""
+"""Statistics over the bodies of an ensemble at each time, stored instead of trajectories."""
 
 import dataclasses
 from collections.abc import Callable
@@ -10,6 +10,9 @@ from jaxtyping import Array, Bool, Float
 
 from polhode import rotation
 from polhode._trajectory import Trajectory
+from polhode.ensemble._store import Store
+
+SUMMARY_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,29 +80,29 @@ QUANTITIES = {
 """What scene files can name: quantity and units."""
 
 
-def summarise(statistic: Statistic, trajectory: Trajectory, real: Bool[Array, " n"]) -> dict:
+def summarise(statistic: Statistic, trajectory: Trajectory, is_body: Bool[Array, " n"]) -> dict:
     """Count, mean, sum of squared deviations, extremes and histogram of the bodies of a block that
-    are ``real`` and finished; arrays (T,), the histogram (T, bins + 2) with both outsides.
+    exist (``is_body``) and finished; arrays (T,), the histogram (T, bins + 2) with both outsides.
     """
     values: Float[Array, "n t"] = statistic.quantity(trajectory)
-    good = (real & trajectory.successful)[:, None] & jnp.isfinite(values)
-    count = jnp.sum(good, axis=0, dtype=jnp.int32)
+    counted = (is_body & trajectory.successful)[:, None] & jnp.isfinite(values)
+    count = jnp.sum(counted, axis=0, dtype=jnp.int32)
     weight = jnp.maximum(count, 1).astype(values.dtype)
-    mean = jnp.sum(jnp.where(good, values, 0), axis=0) / weight
-    found = {
+    mean = jnp.sum(jnp.where(counted, values, 0), axis=0) / weight
+    summary = {
         "count": count,
         "mean": mean,
-        "squares": jnp.sum(jnp.where(good, (values - mean[None]) ** 2, 0), axis=0),
-        "least": jnp.min(jnp.where(good, values, jnp.inf), axis=0),
-        "greatest": jnp.max(jnp.where(good, values, -jnp.inf), axis=0),
+        "squares": jnp.sum(jnp.where(counted, (values - mean[None]) ** 2, 0), axis=0),
+        "least": jnp.min(jnp.where(counted, values, jnp.inf), axis=0),
+        "greatest": jnp.max(jnp.where(counted, values, -jnp.inf), axis=0),
     }
     if statistic.low is not None:
         edges = jnp.asarray(statistic.edges, values.dtype)
-        place = jnp.where(good, jnp.searchsorted(edges, values, side="right"), 0)
+        place = jnp.where(counted, jnp.searchsorted(edges, values, side="right"), 0)
         columns = jnp.broadcast_to(jnp.arange(values.shape[1])[None], values.shape)
         empty = jnp.zeros((values.shape[1], statistic.bins + 2), jnp.int32)
-        found["histogram"] = empty.at[columns, place].add(good.astype(jnp.int32))
-    return found
+        summary["histogram"] = empty.at[columns, place].add(counted.astype(jnp.int32))
+    return summary
 
 
 class Moments(NamedTuple):
@@ -140,3 +143,43 @@ def quantile(histogram: np.ndarray, edges: np.ndarray, q: float) -> np.ndarray:
             part = (target - row[j - 1]) / (row[j] - row[j - 1])
             out[k] = edges[j - 1] + part * (edges[j] - edges[j - 1])
     return out
+
+
+def write_summaries(store: Store, statistics: tuple[Statistic, ...]) -> None:
+    """Write NAME_summary_mean, _std, _min, _max (time) and, with a histogram, its sum over the
+    bodies, its edges and quantiles. Every call writes the same numbers.
+    """
+    for s in statistics:
+        name = s.name
+        moments = Moments.zero(store.layout[f"{name}_count"].shape[1])
+        minimum, maximum, histogram = np.inf, -np.inf, np.zeros((), np.int64)
+        for k in range(store.chunks):
+            count, mean, squares, least, greatest = (
+                store.read(f"{name}_{kind}", k)
+                for kind in ("count", "mean", "squares", "least", "greatest")
+            )
+            moments = moments.add(count, mean, squares)
+            minimum = np.minimum(minimum, least.min(axis=0))
+            maximum = np.maximum(maximum, greatest.max(axis=0))
+            if s.low is not None:
+                histogram = histogram + store.read(f"{name}_histogram", k)[0]
+        count = moments.count
+        with np.errstate(invalid="ignore", divide="ignore"):
+            summary = {
+                "count": (count.astype(np.int64), "1"),
+                "mean": (np.where(count > 0, moments.mean, np.nan), s.units),
+                "std": (np.sqrt(moments.squares / count), s.units),
+                "min": (np.asarray(minimum), s.units),
+                "max": (np.asarray(maximum), s.units),
+            }
+        for kind, (values, units) in summary.items():
+            store.put(f"{name}_summary_{kind}", values, ("time",), units)
+        if s.low is None:
+            continue
+        store.put(f"{name}_summary_histogram", histogram, ("time", f"{name}_bin"), "1")
+        store.put(f"{name}_edges", s.edges, (f"{name}_edge",), s.units)
+        rows = np.stack([quantile(histogram, s.edges, q) for q in SUMMARY_QUANTILES])
+        store.put(f"{name}_quantiles", rows, ("quantile", "time"), s.units)
+        store.put("quantile", np.array(SUMMARY_QUANTILES), ("quantile",), "1")
+    if statistics:
+        store.consolidate()

@@ -6,34 +6,119 @@ store without locks: they write different files, or the same bytes.
 """
 
 import contextlib
+import dataclasses
 import errno
 import glob
+import hashlib
 import itertools
 import json
 import os
+import re
 import secrets
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
+import equinox as eqx
+import jax
 import numpy as np
 
 from polhode._extras import imported
-from polhode.ensemble._layout import Field
-from polhode.files._error import shorten
+from polhode.files._error import reason, shorten
 
 if TYPE_CHECKING:
     import xarray
+
+
+_LIBRARIES = ("polhode", "jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "numpy")
+_DIGEST_BYTES = 2**24  # of an array that are read at a time
 
 
 class StoreError(RuntimeError):
     """A store that cannot be used: of another run, damaged, incomplete, or on a full disk."""
 
 
-def _zarr() -> Any:
-    return imported("an ensemble on disk", "zarr", extra="scale")
+def open_store(path: str | os.PathLike) -> "xarray.Dataset":
+    """The stored ensemble at ``path`` as an xarray dataset, which is read lazily.
+
+    Raises StoreError for a store whose chunks or statistics are not complete, which names the
+    missing chunks; ``xarray.open_zarr`` reads such a store, with NaN and status 255 in their place.
+    """
+    path = Path(path)
+    if words := missing_chunks(path):
+        raise StoreError(f"{path} is not complete: {words}.")
+    for name, *_ in _read_identity(path)["statistics"]:
+        if not (path / f"{name}_summary_mean" / "zarr.json").is_file():
+            raise StoreError(
+                f"{path} is not complete: the statistics of its chunks are not reduced yet; run it"
+                " once without --part."
+            )
+    xarray = imported("an ensemble on disk", "xarray", "zarr", extra="scale")
+    return xarray.open_zarr(path)
+
+
+class Field(NamedTuple):
+    """One array of a store. ``rows`` rows form a chunk, which is one file."""
+
+    shape: tuple[int, ...]
+    rows: int
+    dtype: Any
+    dimensions: tuple[str, ...]
+    attributes: dict[str, Any]
+
+    @property
+    def fill_value(self) -> Any:
+        """A value that no result has."""
+        if self.dtype == np.uint8:
+            return 255
+        return np.nan if np.issubdtype(self.dtype, np.floating) else -1
+
+    def region(self, k: int) -> slice:
+        """The rows of chunk ``k``."""
+        return slice(k * self.rows, min((k + 1) * self.rows, self.shape[0]))
+
+
+def make_layout(
+    bodies: int, chunk: int, block: int, times: np.ndarray, trajectories: bool, statistics: tuple
+) -> dict[str, Field]:
+    """Arrays of the store by name."""
+    from polhode._method import Status
+
+    t = times.size
+    status = {
+        "units": "1",
+        "long_name": "outcome of each body; 255: not computed",
+        "flag_values": [int(code) for code in Status],
+        "flag_meanings": " ".join(code.name.lower() for code in Status),
+    }
+    arrays = {"status": Field((bodies,), chunk, np.dtype("uint8"), ("body",), status)}
+    if trajectories:
+        wxyz = {"units": "1", "long_name": "attitude quaternion, scalar first, body to space"}
+        omega = {"units": "rad s-1", "long_name": "angular velocity in body axes"}
+        for name, width, axis, words in (
+            ("wxyz", 4, "quaternion", wxyz),
+            ("omega_body", 3, "axis", omega),
+        ):
+            dimensions = ("body", "time", axis)
+            arrays[name] = Field((bodies, t, width), chunk, times.dtype, dimensions, words)
+    blocks, chunks = -(-bodies // block), -(-bodies // chunk)
+    for s in statistics:
+        for name in ("count", "mean", "squares", "least", "greatest"):
+            dtype = np.dtype("int32") if name == "count" else times.dtype
+            words = {"long_name": f"{name} of {s.name} in each block of {block}"}
+            dimensions = ("block", "time")
+            arrays[f"{s.name}_{name}"] = Field(
+                (blocks, t), chunk // block, dtype, dimensions, words
+            )
+        if s.low is not None:
+            words = {"long_name": f"bodies per bin of {s.name}, those below and above included"}
+            dimensions = ("chunk", "time", f"{s.name}_bin")
+            arrays[f"{s.name}_histogram"] = Field(
+                (chunks, t, s.bins + 2), 1, np.dtype("int64"), dimensions, words
+            )
+    return arrays
 
 
 def create(
@@ -58,8 +143,7 @@ def create(
                 raise
     except OSError as error:
         raise StoreError(
-            f"cannot make the store {path}: {error.strerror or error}; name a place that you can"
-            " write to."
+            f"cannot make the store {path}: {reason(error)}; name a place that you can write to."
         ) from error
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -71,12 +155,12 @@ def compare_identity(
     """The identity of a store that belongs to this run. Raises StoreError, which names what
     differs, for a store of another run, and for a folder that is no store.
     """
-    found = _read_identity(path)
+    stored = _read_identity(path)
     texts = _read_json(path, "zarr.json")["attributes"]
     different = [
-        f"  {key}: the store has {shorten(found.get(key))}, this run {shorten(value)}"
+        f"  {key}: the store has {shorten(stored.get(key))}, this run {shorten(value)}"
         for key, value in identity.items()
-        if found.get(key) != value
+        if stored.get(key) != value
     ]
     for key, text in attributes.items():
         if texts.get(key) != text:
@@ -86,7 +170,7 @@ def compare_identity(
             f"{path} belongs to another run and was left as it is:\n" + "\n".join(different) + "\n"
             "  use the scene, options and versions of the store, or name another path."
         )
-    return found
+    return stored
 
 
 def _first_difference(stored: str, text: str) -> str:
@@ -127,8 +211,8 @@ class Store:
         for key, document in documents.items():
             _require_equal(self.path, key, _read_json(self.path, key), document)
         # statistics are added later
-        found = _dictionary(_read_json(self.path, "zarr.json")).get("consolidated_metadata")
-        consolidated = _dictionary(_dictionary(found).get("metadata"))
+        stored = _dictionary(_read_json(self.path, "zarr.json")).get("consolidated_metadata")
+        consolidated = _dictionary(_dictionary(stored).get("metadata"))
         for name, document in root["consolidated_metadata"]["metadata"].items():
             key = f"zarr.json (consolidated metadata of {name})"
             _require_equal(self.path, key, consolidated.get(name), document)
@@ -141,7 +225,7 @@ class Store:
             same = False
         if not same:
             shutil.rmtree(self.path / "time" / "c", ignore_errors=True)
-            with self._explained():
+            with self._write_errors():
                 self.group["time"][:] = ts
 
     def file(self, name: str, k: int) -> Path:
@@ -153,20 +237,24 @@ class Store:
         dimensions = {name: len(field.shape) for name, field in self.layout.items()}
         return _missing(self.path, dimensions, self.chunks)
 
+    def read(self, name: str, k: int) -> np.ndarray:
+        """The rows of an array in chunk ``k``."""
+        return self.arrays[name][self.layout[name].region(k)]
+
     def is_complete(self, k: int) -> bool:
         """Whether chunk ``k`` is there and can be decoded."""
         try:
             if not all(self.file(name, k).is_file() for name in self.layout):
                 return False
-            for name, field in self.layout.items():
-                self.arrays[name][field.region(k)]
+            for name in self.layout:
+                self.read(name, k)
             return True
         except Exception:  # a damaged file fails in whichever codec reads it first
             return False
 
     def write(self, k: int, arrays: Mapping[str, np.ndarray]) -> None:
         """Write chunk ``k``: one file of each array, in place of what is there."""
-        with self._explained():
+        with self._write_errors():
             for name, field in self.layout.items():
                 # a damaged file of the last chunk would be decoded to fill it up
                 self.file(name, k).unlink(missing_ok=True)
@@ -180,7 +268,7 @@ class Store:
             shutil.rmtree(folder, ignore_errors=True)
 
     @contextlib.contextmanager
-    def _explained(self) -> Iterator[None]:
+    def _write_errors(self) -> Iterator[None]:
         try:
             yield
         except OSError as error:
@@ -190,41 +278,89 @@ class Store:
                     f" {self.chunks} chunks are complete and remain; free some space and run the"
                     " same command again."
                 ) from error
-            raise StoreError(f"cannot write to {self.path}: {error.strerror or error}.") from error
+            raise StoreError(f"cannot write to {self.path}: {reason(error)}.") from error
 
     def put(self, name: str, values: np.ndarray, dimensions: tuple, units: str) -> None:
         """Write a small array as a whole."""
-        with self._explained():
+        with self._write_errors():
             array = self.group.create_array(
-                name, shape=values.shape, chunks=values.shape, dtype=values.dtype,
-                dimension_names=dimensions, attributes={"units": units}, overwrite=True,
+                name,
+                shape=values.shape,
+                chunks=values.shape,
+                dtype=values.dtype,
+                dimension_names=dimensions,
+                attributes={"units": units},
                 compressors=_codecs(),
-            )  # fmt: skip
+                overwrite=True,
+            )
             array[...] = values
 
     def consolidate(self) -> None:
         """Gather the metadata of all arrays in one file, which xarray reads first."""
-        with self._explained():
+        with self._write_errors():
             _consolidate(self.path)
 
 
-def open_store(path: str | os.PathLike) -> "xarray.Dataset":
-    """The stored ensemble at ``path`` as an xarray dataset, which is read lazily.
+def digest(*values: Any) -> str:
+    """A SHA-256 of the structure, the static fields and the numbers of the values.
 
-    Raises StoreError for a store whose chunks or statistics are not complete, which names the
-    missing chunks; ``xarray.open_zarr`` reads such a store, with NaN and status 255 in their place.
+    Functions count by their name: their code and what it refers to do not.
     """
-    path = Path(path)
-    if words := missing_chunks(path):
-        raise StoreError(f"{path} is not complete: {words}.")
-    for name, *_ in _read_identity(path)["statistics"]:
-        if not (path / f"{name}_summary_mean" / "zarr.json").is_file():
-            raise StoreError(
-                f"{path} is not complete: the statistics of its chunks are not reduced yet; run it"
-                " once without --part."
-            )
-    xarray = imported("an ensemble on disk", "xarray", "zarr", extra="scale")
-    return xarray.open_zarr(path)
+    structure = re.sub(" at 0x[0-9a-f]+", "", eqx.tree_pformat(values, short_arrays=True))
+    sha = hashlib.sha256(structure.encode())
+    for leaf in jax.tree.leaves(values):
+        if not isinstance(leaf, np.ndarray | np.generic | jax.Array):
+            continue
+        if jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf = jax.random.key_data(leaf)
+        array = leaf if isinstance(leaf, np.ndarray) else np.asarray(leaf)
+        sha.update(f"{array.dtype} {array.shape}".encode())
+        if array.ndim == 0:
+            sha.update(array.tobytes())
+            continue
+        rows = max(
+            1, _DIGEST_BYTES // max(1, array[:1].nbytes)
+        )  # an array on disk is read in parts
+        for start in range(0, len(array), rows):
+            sha.update(np.ascontiguousarray(array[start : start + rows]).data)
+    return sha.hexdigest()
+
+
+def has_user_code(x: Any) -> bool:
+    """Whether a value contains a function or a class that is neither of polhode nor of a library
+    it is built on, so that its structure and its numbers do not say what it computes.
+    """
+    if isinstance(x, tuple | list):
+        return any(map(has_user_code, x))
+    if isinstance(x, Mapping):
+        return any(map(has_user_code, x.values()))
+    if isinstance(x, np.ndarray | np.generic | jax.Array):
+        return False
+    if dataclasses.is_dataclass(x) and not isinstance(x, type):
+        fields = [getattr(x, field.name, None) for field in dataclasses.fields(x)]
+        return _is_foreign(type(x)) or has_user_code(fields)
+    return callable(x) and _is_foreign(x)
+
+
+def _is_foreign(x: Any) -> bool:
+    module = getattr(x, "__module__", None) or ""
+    # a lambda or an inner function of a library may contain anything
+    inner = "<locals>" in getattr(x, "__qualname__", "<locals>")
+    return module.partition(".")[0] not in _LIBRARIES or (inner and module.startswith("polhode"))
+
+
+def versions() -> dict[str, str]:
+    """The versions that decide the bits of a result."""
+    import diffrax
+
+    from polhode import __version__
+
+    return {
+        "polhode": __version__,
+        "jax": jax.__version__,
+        "jaxlib": jax.lib.__version__,
+        "diffrax": diffrax.__version__,
+    }
 
 
 def missing_chunks(path: Path) -> str:
@@ -271,17 +407,20 @@ def _write_empty(
 ) -> None:
     """Write the metadata of a store, and its times."""
     group = _zarr().create_group(store, zarr_format=3, attributes=dict(metadata))
-    time = group.create_array(
-        "time", shape=ts.shape, chunks=ts.shape, dtype=ts.dtype, dimension_names=("time",),
-        attributes={"units": "s", "long_name": "time"}, compressors=_codecs(), fill_value=np.nan,
-    )  # fmt: skip
-    time[:] = ts
-    for name, field in layout.items():
+    words = {"units": "s", "long_name": "time"}
+    time = Field(ts.shape, ts.size, ts.dtype, ("time",), words)
+    for name, field in {"time": time, **layout}.items():
         group.create_array(
-            name, shape=field.shape, chunks=(field.rows, *field.shape[1:]), dtype=field.dtype,
-            dimension_names=field.dimensions, attributes=field.attributes, compressors=_codecs(),
+            name,
+            shape=field.shape,
+            chunks=(field.rows, *field.shape[1:]),
+            dtype=field.dtype,
+            dimension_names=field.dimensions,
+            attributes=field.attributes,
+            compressors=_codecs(),
             fill_value=field.fill_value,
-        )  # fmt: skip
+        )
+    group["time"][:] = ts
     _consolidate(store)
 
 
@@ -296,13 +435,12 @@ def _read_json(path: Path, key: str) -> Any:
     try:
         return json.loads((path / key).read_bytes())
     except (OSError, ValueError, RecursionError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise _unreadable(path, key, reason) from error
+        raise _unreadable(path, key, reason(error)) from error
 
 
-def _unreadable(path: Path, key: str, reason: str) -> StoreError:
+def _unreadable(path: Path, key: str, problem: str) -> StoreError:
     return StoreError(
-        f"{path} is no store of an ensemble, or damaged: {key} cannot be read ({reason[:200]}). It"
+        f"{path} is no store of an ensemble, or damaged: {key} cannot be read ({problem[:200]}). It"
         " was left as it is; name another path, or remove it."
     )
 
@@ -311,16 +449,16 @@ def _dictionary(x: Any) -> dict:
     return x if isinstance(x, dict) else {}
 
 
-def _require_equal(path: Path, key: str, found: Any, expected: Any) -> None:
+def _require_equal(path: Path, key: str, stored: Any, expected: Any) -> None:
     """Raise StoreError that names the first entry that differs."""
-    if found == expected:
+    if stored == expected:
         return
-    found, name = _dictionary(found), "its content"
+    stored, name = _dictionary(stored), "its content"
     for name, value in expected.items():
-        if found.get(name) != value:
+        if stored.get(name) != value:
             break
     raise StoreError(
-        f"{path} is damaged: {key} was altered ({name} is {shorten(found.get(name))}, expected"
+        f"{path} is damaged: {key} was altered ({name} is {shorten(stored.get(name))}, expected"
         f" {shorten(expected.get(name))}). It was left as it is; name another path, or remove it."
     )
 
@@ -338,5 +476,9 @@ def _read_identity(path: Path) -> dict[str, Any]:
             raise ValueError(f"the names of its arrays are {shorten(names)}")
         return identity
     except (TypeError, ValueError, KeyError, RecursionError) as error:
-        reason = f"{type(error).__name__}: {error}"
-        raise _unreadable(path, "zarr.json (attribute polhode)", reason) from error
+        problem = f"{type(error).__name__}: {error}"
+        raise _unreadable(path, "zarr.json (attribute polhode)", problem) from error
+
+
+def _zarr() -> Any:
+    return imported("an ensemble on disk", "zarr", extra="scale")

@@ -1,6 +1,7 @@
 """Run an ensemble into a store, and go on where an earlier run stopped."""
 
 import contextlib
+import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,14 +16,26 @@ from jaxtyping import Float
 from polhode._checks import ArrayLike
 from polhode._method import AbstractMethod
 from polhode._policy import kind_of, platform_of
-from polhode.ensemble import _dask, _layout
-from polhode.ensemble._chunks import compute
+from polhode.ensemble import _dask
 from polhode.ensemble._ensemble import Ensemble
-from polhode.ensemble._identity import digest, has_user_code, versions
-from polhode.ensemble._program import Block
-from polhode.ensemble._statistics import Statistic
-from polhode.ensemble._store import Store, compare_identity, create
-from polhode.ensemble._summary import write_summaries
+from polhode.ensemble._program import Block, compute
+from polhode.ensemble._statistics import Statistic, write_summaries
+from polhode.ensemble._store import (
+    Field,
+    Store,
+    compare_identity,
+    create,
+    digest,
+    has_user_code,
+    make_layout,
+    versions,
+)
+
+_CHUNK_BYTES = 2**26
+_STATISTICS_BLOCKS = 64  # blocks of a chunk where only statistics are stored
+_PROCESS_BYTES = 600_000_000  # Python, JAX and the compiled program
+_DEFAULT_MEMORY = 4_000_000_000
+_COPIES = 4  # of a chunk while it is computed, compressed and written
 
 
 class Progress(NamedTuple):
@@ -85,12 +98,12 @@ def stream(
     _check(ensemble, method, name, trajectories, statistics, part)
     devices = [jax.local_devices()[0]] if devices is None else list(devices)
     job = Job(ensemble, ts, path, method, rtol, trajectories, statistics, devices)
-    size = job.sizes(memory, chunk)
+    size = chunk_sizes(job, memory, chunk)
     identity = job.identity(name)
     with contextlib.ExitStack() as stack:
         client = None
         if part is None or scheduler is not None:
-            client = stack.enter_context(_dask.connected(scheduler))
+            client = stack.enter_context(_dask.connection(scheduler))
         if not os.path.lexists(path):
             metadata = _title() | {"devices": device_names(devices)} | attributes
             full = identity | {"chunk": size.chunk}
@@ -149,21 +162,9 @@ class Job:
         self.chunk = 0
         self.store: Store | None = None
 
-    def layout(self, chunk: int) -> dict[str, _layout.Field]:
-        return _layout.fields(
-            self.block.ensemble.bodies, chunk, self.block.size, self.times, self.trajectories,
-            self.statistics,
-        )  # fmt: skip
-
-    def sizes(self, memory: int | None, chunk: int | None) -> _layout.Sizes:
-        devices = self.block.devices
-        affinity = getattr(os, "sched_getaffinity", None)
-        cores = len(affinity(0)) if affinity else os.cpu_count() or 1
-        body_bytes = 7 * self.times.size * self.times.itemsize + 1
-        return _layout.sizes(
-            self.block.ensemble.bodies, self.block.size, body_bytes, self.trajectories,
-            len(devices), cores if platform_of(devices[0]) == "cpu" else 2, memory, chunk,
-        )  # fmt: skip
+    def layout(self, chunk: int) -> dict[str, Field]:
+        bodies, block = self.block.ensemble.bodies, self.block.size
+        return make_layout(bodies, chunk, block, self.times, self.trajectories, self.statistics)
 
     def identity(self, name: str | None) -> dict[str, Any]:
         """What two runs must share to write to one store, as plain JSON; without the chunk."""
@@ -199,6 +200,59 @@ class Job:
             return False
         self.store.write(k, compute(self.block, self.store.layout, self.chunk, k))
         return True
+
+
+class Sizes(NamedTuple):
+    """Bodies of a chunk, and the number of chunks that one process computes at a time."""
+
+    chunk: int
+    concurrent: int
+
+
+def chunk_sizes(job: Job, memory: int | None, chunk: int | None) -> Sizes:
+    """Sizes that stay within ``memory`` bytes. Raises ValueError for a memory or a chunk that is
+    not possible.
+    """
+    block, devices = job.block.size, len(job.block.devices)
+    if chunk is not None and (chunk < 1 or chunk % block):
+        raise ValueError(
+            f"chunk must be a positive multiple of the block of {block} bodies, got {chunk}: leave"
+            f" it out, or give --chunk {max(1, round(chunk / block)) * block} or a multiple of"
+            f" {block} (chunk= in Python)."
+        )
+    block_bytes = block * (7 * job.times.size * job.times.itemsize + 1)
+    available = (_DEFAULT_MEMORY if memory is None else memory) - _PROCESS_BYTES
+
+    def required(blocks: int) -> int:
+        """Bytes for one chunk of so many blocks."""
+        return block_bytes * (_COPIES * (blocks if job.trajectories else 1) + 2 * devices)
+
+    if memory is not None and required(1) > available:
+        minimum = required(1) + _PROCESS_BYTES
+        raise ValueError(
+            f"a memory of {memory:,} bytes is too small: raise --memory to"
+            f" {math.ceil(minimum / 1e7) / 100}GB or more (memory={minimum} in Python), the minimum"
+            " for these times and devices, or save fewer times."
+        )
+    if chunk is not None:
+        blocks = chunk // block
+    else:
+        target = _CHUNK_BYTES // block_bytes if job.trajectories else _STATISTICS_BLOCKS
+        while target > 1 and required(target) > available:
+            target //= 2
+        # every device computes a block of its own at a time
+        blocks = devices * -(-target // devices) if target > 0 else 1
+        blocks = min(blocks, -(-job.block.ensemble.bodies // block))
+    threads = _cores() if platform_of(job.block.devices[0]) == "cpu" else 2
+    concurrent = max(1, min(threads, available // required(blocks)))
+    return Sizes(blocks * block, int(concurrent))
+
+
+def _cores() -> int:
+    """The processor cores that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _complete_here(job: Job, numbers: range, concurrent: int) -> Iterator[tuple[int, bool]]:
@@ -277,7 +331,7 @@ def device_names(devices: Sequence[Any]) -> str:
 def _title() -> dict[str, str]:
     """The attributes of every store."""
     from polhode import __version__
-    from polhode.files._provenance import commit
+    from polhode.files._write import commit
 
     return {
         "title": "Ensemble of rotating rigid bodies",

@@ -1,10 +1,11 @@
-"""From a checked scene file to polhode's objects, in the dtype asked for."""
+"""From a checked scene file to the objects of polhode, in a floating-point dtype."""
 
-import contextlib
 import functools
+import inspect
+import math
 import operator
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,12 +16,17 @@ from jaxtyping import Array, DTypeLike, Float
 import polhode
 from polhode import rotation
 from polhode._scene import narrower
-from polhode.files._bodies import AnySolid, Attitudes
-from polhode.files._error import SceneFileError
+from polhode.files._error import SceneFileError, did_you_mean, scene_errors
 from polhode.files._models import SceneFile
-from polhode.files._table import Table
+from polhode.files._read import possible_moments
+from polhode.files._tables import AnySolid, Attitudes
+from polhode.files._values import Table
 from polhode.inertia import Inertia, MassProperties, compose
 
+if TYPE_CHECKING:
+    import diffrax
+
+_MAX_ROUNDS = 100  # of drawing moments until they are those of a body
 _TORQUES = {
     "body": "BodyTorque",
     "space": "SpaceTorque",
@@ -29,17 +35,6 @@ _TORQUES = {
     "energy-sink": "EnergySink",
     "rate-damping": "RateDamping",
 }
-
-
-@contextlib.contextmanager
-def blamed(file: SceneFile, where: str) -> Iterator[None]:
-    """Turn the error of a constructor into one that names the place in the scene file."""
-    try:
-        yield
-    except SceneFileError:
-        raise
-    except (ValueError, TypeError) as error:
-        raise SceneFileError(file.path, where, str(error)[:500]) from error
 
 
 def build_attitudes(attitudes: Attitudes, dtype: DTypeLike) -> Float[Array, "*b 4"]:
@@ -54,8 +49,8 @@ def build_attitudes(attitudes: Attitudes, dtype: DTypeLike) -> Float[Array, "*b 
 def build_inertia(file: SceneFile, dtype: DTypeLike) -> Inertia:
     """The nominal inertia. Raises SceneFileError for moments that no body has."""
     table = file.inertia
-    kind, value = next((name, value) for name, value in table.given() if name != "unit")
-    with blamed(file, f"[inertia] {kind}"):
+    kind, value = next((name, value) for name, value in table.entries() if name != "unit")
+    with scene_errors(file, f"[inertia] {kind}"):
         if kind == "parts":
             return compose([_solid(solid, dtype) for solid in value]).inertia
         if kind == "axisymmetric":
@@ -66,7 +61,7 @@ def build_inertia(file: SceneFile, dtype: DTypeLike) -> Inertia:
 
 def _numbers(table: Table, dtype: DTypeLike, *others: str) -> dict[str, np.ndarray]:
     """The keys that hold numbers: all but the `others`."""
-    return {k: np.asarray(value, dtype) for k, value in table.given() if k not in others}
+    return {k: np.asarray(value, dtype) for k, value in table.entries() if k not in others}
 
 
 def _solid(table: AnySolid, dtype: DTypeLike) -> MassProperties:
@@ -88,7 +83,7 @@ def build_orbit(file: SceneFile, dtype: DTypeLike) -> "polhode.AbstractOrbit | N
         return None
     orbit = polhode.HyperbolicOrbit if table.is_hyperbolic else polhode.KeplerOrbit
     make = orbit if table.position is None else orbit.from_state
-    with blamed(file, "[orbit]"):
+    with scene_errors(file, "[orbit]"):
         return _float_parts(make(**_numbers(table, dtype, "unit")), dtype)
 
 
@@ -104,7 +99,7 @@ def _potential(file: SceneFile, table: Any, orbit: Any, dtype: DTypeLike) -> Any
 def _torque(file: SceneFile, table: Any, orbit: Any, dtype: DTypeLike) -> Any:
     if table.kind == "pointing":
         numbers = _numbers(table, dtype, "kind", "frame", "wxyz", "euler")
-        torque = polhode.Pointing(**numbers, target=build_attitudes(table.target, dtype))
+        torque = polhode.Pointing(**numbers, target=build_attitudes(table.attitude, dtype))
     elif table.kind == "magnetorquer":
         moment = table.moment_body
         if table.b_dot is not None:
@@ -146,7 +141,7 @@ def _sum(file: SceneFile, key: str, build: Callable, orbit: Any, dtype: DTypeLik
     """The parts of a list of tables, added; None where there is none."""
     parts, tables = [], getattr(file, key)
     for index, table in enumerate(tables):
-        with blamed(file, f"[{key}]" if len(tables) == 1 else f"[{key} {index + 1}]"):
+        with scene_errors(file, f"[{key}]" if len(tables) == 1 else f"[{key} {index + 1}]"):
             parts.append(_float_parts(build(file, table, orbit, dtype), dtype))
     return functools.reduce(operator.add, parts) if parts else None
 
@@ -162,7 +157,7 @@ def build_scene(
     orbit = build_orbit(file, dtype)
     builders = {"potential": _potential, "torque": _torque, "rotors": _rotor}
     parts = {key: _sum(file, key, build, orbit, dtype) for key, build in builders.items()}
-    with blamed(file, ""):
+    with scene_errors(file, ""):
         return polhode.Scene(inertia, **parts)
 
 
@@ -208,7 +203,7 @@ class _Angle(eqx.Module):
 
 def build_state(file: SceneFile, dtype: DTypeLike, inertia: Inertia) -> "polhode.State":
     """The nominal state at the first time."""
-    with blamed(file, "[state]"):
+    with scene_errors(file, "[state]"):
         value = jnp.asarray(file.state.value, dtype)
         omega = inertia.rates(value) if file.state.rate == "momentum_body" else value
         wxyz = build_attitudes(file.state.attitude, dtype)
@@ -217,3 +212,142 @@ def build_state(file: SceneFile, dtype: DTypeLike, inertia: Inertia) -> "polhode
             first = jnp.asarray(file.times.seconds[0], dtype)
             wxyz, omega = frame.from_frame(wxyz, omega, first)
         return polhode.State(wxyz=wxyz, omega_body=omega)
+
+
+def build_method(file: SceneFile) -> "polhode.AbstractMethod | None":
+    """The method object, or None when the planner is to choose.
+
+    Raises SceneFileError for a solver that neither polhode nor diffrax has.
+    """
+    method = file.method
+    if method.kind == "auto":
+        return None
+    if method.kind == "closed-form":
+        return polhode.ClosedForm()
+    coordinates = polhode.LiePoisson if method.kind == "lie-poisson" else polhode.EulerAngles
+    options = {}
+    with scene_errors(file, "[method]"):
+        if method.solver is not None:
+            options["solver"] = _solver(file, method.solver)
+        if method.step is not None:
+            import diffrax
+
+            first, last = file.times.seconds[[0, -1]]
+            options["dt0"] = math.copysign(method.step, last - first)
+            options["controller"] = diffrax.ConstantStepSize()
+        return coordinates(**options)
+
+
+def _solver(file: SceneFile, name: str) -> "diffrax.AbstractSolver":
+    import diffrax
+
+    from polhode import _integrate
+
+    solvers = {
+        key: value
+        for module in (diffrax, _integrate)
+        for key, value in vars(module).items()
+        if inspect.isclass(value)
+        and issubclass(value, diffrax.AbstractSolver)
+        and not key.startswith("Abstract")
+    }
+    if name not in solvers:
+        raise SceneFileError(
+            file.path,
+            "[method] solver",
+            "unknown solver",
+            name,
+            "the name of a solver of diffrax or polhode, such as Dopri8",
+            did_you_mean(name, solvers),
+        )
+    try:
+        return solvers[name]()
+    except TypeError:
+        raise SceneFileError(
+            file.path,
+            "[method] solver",
+            "a solver that needs arguments",
+            name,
+            "one that is made without, such as Dopri8",
+            "use it from Python instead",
+        ) from None
+
+
+class Clones(NamedTuple):
+    """A batch of bodies, the nominal one first; `redrawn` draws had moments that no body has."""
+
+    inertia: Inertia
+    state: "polhode.State"
+    redrawn: int
+
+
+def draw_clones(file: SceneFile, dtype: DTypeLike) -> Clones:
+    """The nominal body followed by the clones of [monte_carlo], drawn in float64 from its seed.
+
+    Every quantity has its own stream of random numbers, so that adding a spread for one does not
+    change the draws of the others. Moments that break the triangle inequality are drawn again.
+    Raises SceneFileError when nearly all draws are impossible.
+    """
+    plan = file.monte_carlo
+    nominal = build_inertia(file, dtype)
+    if plan is None:
+        return Clones(nominal, build_state(file, dtype, nominal), 0)
+    noise = {
+        name: _Noise(plan.seed, name, np.array(table.sigma)) for name, table in plan.spreads.items()
+    }
+    count, redrawn, inertia = plan.clones, 0, nominal
+    if "moments" in noise:
+        moments = np.asarray(file.inertia.moments, np.float64)
+        drawn, redrawn = _draw_moments(file, moments, noise["moments"], count)
+        inertia = Inertia.from_moments(np.concatenate([moments[None], drawn]).astype(dtype))
+    attitude = file.state.attitude
+    if "euler" in noise:
+        angles = _around(np.array(attitude.values), noise["euler"], count)
+        attitude = Attitudes(angles, attitude.sequence)
+    wxyz = build_attitudes(attitude, dtype)
+    if "attitude" in noise:
+        turns = jnp.asarray(_around(np.zeros(3), noise["attitude"], count), dtype)
+        wxyz = jnp.broadcast_to(wxyz, (count + 1, 4))
+        wxyz = rotation.multiply(wxyz, rotation.rotation_vector_to_wxyz(turns))
+    rates = np.array(file.state.value)
+    if file.state.rate in noise:
+        rates = _around(rates, noise[file.state.rate], count)
+    rates = jnp.broadcast_to(rates.astype(dtype), (count + 1, 3))
+    omega = inertia.rates(rates) if file.state.rate == "momentum_body" else rates
+    return Clones(inertia, polhode.State(wxyz=wxyz, omega_body=omega), redrawn)
+
+
+class _Noise:
+    """Normal deviates of one quantity."""
+
+    def __init__(self, seed: int, quantity: str, sigma: np.ndarray):
+        label = int.from_bytes(quantity.encode(), "big")
+        self.stream, self.sigma = np.random.default_rng([seed, label]), sigma
+
+    def __call__(self, count: int) -> np.ndarray:
+        return self.sigma * self.stream.standard_normal((count, 3))
+
+
+def _around(value: np.ndarray, noise: _Noise, count: int) -> np.ndarray:
+    """(count + 1, 3): the value itself, then draws around it."""
+    return np.concatenate([value[None], value + noise(count)])
+
+
+def _draw_moments(file: SceneFile, moments: np.ndarray, noise: _Noise, count: int):
+    accepted, drawn, redrawn = np.empty((0, 3)), 0, 0
+    for _ in range(_MAX_ROUNDS):
+        draws = moments * (1 + noise(count))
+        drawn += count
+        possible = possible_moments(draws)
+        redrawn += int((~possible).sum())
+        accepted = np.concatenate([accepted, draws[possible]])
+        if len(accepted) >= count:
+            return accepted[:count], redrawn
+    raise SceneFileError(
+        file.path,
+        "[monte_carlo.moments] relative_sigma",
+        "impossible moments",
+        f"{len(accepted)} of {drawn} draws around {moments} are moments of a body",
+        "a spread that keeps most draws positive and within the triangle inequality",
+        "make relative_sigma smaller",
+    )

@@ -1,27 +1,56 @@
 """The error of a scene file, and how text from files is shown on a terminal."""
 
+import contextlib
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from polhode.files._models import SceneFile
 
 
 class SceneFileError(ValueError):
     """A scene file that cannot be used.
 
     `str(error)` is a readable block of a few lines: the file and key, the value, what is expected,
-    and how to correct it.
+    and how to correct it. These are its attributes `file`, `key`, `problem`, `value`, `expected`,
+    `fix` and `also` (further errors), all texts.
     """
 
     def __init__(
-        self, file: Path | str, key: str, problem: str, given: str = "", expected: str = "",
-        mend: str = "", also: str = "",
-    ):  # fmt: skip
+        self,
+        file: Path | str,
+        key: str,
+        problem: str,
+        value: str = "",
+        expected: str = "",
+        fix: str = "",
+        also: str = "",
+    ):
         self.file, self.key, self.problem = str(file), key, problem
-        self.given, self.expected, self.mend = given, expected, mend
+        self.value, self.expected, self.fix = value, expected, fix
         place = f"{self.file}: {key}: " if key else f"{self.file}: "
-        rows = [("given", given), ("expected", expected), ("to mend", mend), ("also", also)]
-        lines = [visible(f"  {name + ':':<10}{text}") for name, text in rows if text]
-        super().__init__("\n".join([visible(place + problem), *lines]))
+        rows = [("given", value), ("expected", expected), ("to fix", fix), ("also", also)]
+        lines = [escape(f"  {name + ':':<10}{text}") for name, text in rows if text]
+        super().__init__("\n".join([escape(place + problem), *lines]))
+
+
+@contextlib.contextmanager
+def scene_errors(file: "SceneFile", where: str) -> Iterator[None]:
+    """Turn the error of a constructor into one that names the place in the scene file."""
+    try:
+        yield
+    except SceneFileError:
+        raise
+    except (ValueError, TypeError) as error:
+        raise SceneFileError(file.path, where, str(error)[:500]) from error
+
+
+def reason(error: Exception) -> str:
+    """What went wrong, without the number that a system error begins with."""
+    message = error.strerror if isinstance(error, OSError) else None
+    return message or str(error) or type(error).__name__
 
 
 class Verbatim(str):
@@ -31,7 +60,7 @@ class Verbatim(str):
         return str(self)
 
 
-def visible(text: str) -> str:
+def escape(text: str) -> str:
     """The text on one line, with every character that a terminal would obey (escapes, line ends,
     marks that reverse the direction) or cannot show written as \\x1b, \\u202e and the like.
     """

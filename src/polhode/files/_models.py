@@ -7,24 +7,35 @@ file is reported at once; what gives arrays imports numpy when it is called.
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, PrivateAttr, model_validator
 
-from polhode.files import _unit, _values
-from polhode.files._actions import ConstantTorque, Event, Orbit, Potentials, Rotors, Torques
-from polhode.files._batches import Ensemble, MonteCarlo
-from polhode.files._bodies import Attitudes, Inertia, State
-from polhode.files._table import Measured, Table, scaled
+from polhode.files import _values
+from polhode.files._tables import (
+    Attitudes,
+    ConstantTorque,
+    Event,
+    Inertia,
+    Orbit,
+    Potentials,
+    Rotors,
+    State,
+    Torques,
+)
 from polhode.files._values import (
     MAX_SAMPLES,
     BelowFolder,
     Date,
+    Measured,
     Number,
     Positive,
     Quaternion,
     Sequence,
+    Spread,
+    Table,
     Vector,
+    scale,
 )
 
 if TYPE_CHECKING:
@@ -42,8 +53,8 @@ class Times(Table):
     unit: _values.Seconds = "s"
 
     @model_validator(mode="after")
-    def _one_way(self) -> "Times":
-        others = [key for key in ("start", "stop", "number", "step") if key in dict(self.given())]
+    def _values_or_span(self) -> "Times":
+        others = [key for key in dict(self.entries()) if key in ("start", "stop", "number", "step")]
         if self.values is not None:
             if others:
                 raise ValueError(f"exactly one of values, {others[0]} is needed, got both")
@@ -52,9 +63,9 @@ class Times(Table):
             if self.stop is None:
                 raise ValueError("stop is missing: add `stop = ...`, or values")
             if (self.number is None) == (self.step is None):
-                found = "none of them" if self.step is None else "both"
+                keys = "none of them" if self.step is None else "both"
                 raise ValueError(
-                    f"exactly one of number, step is needed, got {found}: add `number = ...`"
+                    f"exactly one of number, step is needed, got {keys}: add `number = ...`"
                 )
             ends = [self.first, self.stop]
             span = self.stop - self.first
@@ -89,7 +100,7 @@ class Times(Table):
     @property
     def unit_seconds(self) -> float:
         """The unit of tables and figures, s."""
-        return _unit.SECONDS[self.unit]
+        return _values.SECONDS[self.unit]
 
     @property
     def seconds(self) -> "np.ndarray":
@@ -112,7 +123,7 @@ class Method(Table):
     step: Positive | None = Field(default=None, description="constant step [s]")
 
     @model_validator(mode="after")
-    def _fits(self) -> "Method":
+    def _options_of_kind(self) -> "Method":
         if self.solver is not None and self.kind in ("auto", "closed-form"):
             raise ValueError(
                 f"solver is not used by kind = {self.kind!r}: set kind = 'lie-poisson' or"
@@ -141,7 +152,7 @@ class Observation(Table):
     omega_body: Vector | None = None
 
     @model_validator(mode="after")
-    def _something(self) -> "Observation":
+    def _observed(self) -> "Observation":
         if self.angles is None and self.wxyz is None and self.omega_body is None:
             raise ValueError("angles or wxyz, omega_body, or both are needed")
         return self
@@ -172,13 +183,12 @@ class Observations(Table):
 
     @model_validator(mode="after")
     def _in_si(self) -> "Observations":
-        factors = {"time": _unit.SI[self.time_unit], "angles": _unit.SI[self.angle_unit],
-                   "omega_body": _unit.SI[self.rate_unit]}  # fmt: skip
-        rows = [
-            row.model_copy(update={name: scaled(value, factors[name])
-                                   for name, value in row.given() if name in factors})
-            for row in self.rows
-        ]  # fmt: skip
+        units = {"time": self.time_unit, "angles": self.angle_unit, "omega_body": self.rate_unit}
+        rows = []
+        for row in self.rows:
+            numbers = ((name, value) for name, value in row.entries() if name in units)
+            numbers = {name: scale(value, _values.SI[units[name]]) for name, value in numbers}
+            rows.append(row.model_copy(update=numbers))
         return self.model_copy(update={"rows": rows})
 
     @property
@@ -210,6 +220,178 @@ def _columns(rows: list[list[float] | None], width: int) -> "np.ndarray":
 class Output(Table):
     file: BelowFolder | None = None
     figure: bool = True
+
+
+QUANTITIES = ("moments", "euler", "attitude", "omega_body", "momentum_body", "torque")
+
+
+class Spreads(Table):
+    """Bodies drawn around the nominal one."""
+
+    @property
+    def spreads(self) -> dict[str, Any]:
+        """The quantities that are drawn, with their tables."""
+        return {name: table for name, table in self.entries() if name in QUANTITIES}
+
+
+class MomentsSigma(Table):
+    relative_sigma: Spread
+    source: str
+
+    @property
+    def sigma(self) -> list[float]:
+        return self.relative_sigma
+
+
+class Sigma(Measured):
+    measures = ("sigma",)
+    sigma: Spread
+    source: str
+
+
+class AngleSigma(Sigma):
+    unit: _values.Angle = "rad"
+
+
+class RatesSigma(Sigma):
+    unit: _values.Rate = "rad/s"
+
+
+class MomentumSigma(Sigma):
+    unit: _values.Momentum = "kg m^2/s"
+
+
+class MonteCarlo(Spreads):
+    """Clones around the nominal body, each quantity drawn from a normal distribution."""
+
+    clones: Annotated[int, Field(ge=1, le=10_000_000)]
+    seed: Annotated[int, Field(ge=0, le=2**63 - 1)]
+    moments: MomentsSigma | None = None
+    euler: AngleSigma | None = None
+    attitude: AngleSigma | None = None
+    omega_body: RatesSigma | None = None
+    momentum_body: MomentumSigma | None = None
+
+    @model_validator(mode="after")
+    def _one_or_more(self) -> "MonteCarlo":
+        if not self.spreads:
+            raise ValueError(
+                f"one or more of {', '.join(QUANTITIES[:-1])} are needed: add for example"
+                " `moments = { relative_sigma = ..., source = .. }`"
+            )
+        return self
+
+
+class MomentsDraw(Table):
+    one_of = (("relative_sigma", "relative_half_width"),)
+    relative_sigma: Spread | None = None
+    relative_half_width: Spread | None = None
+    source: str = ""
+
+    @property
+    def sigma(self) -> list[float] | None:
+        return self.relative_sigma
+
+    @property
+    def half_width(self) -> list[float] | None:
+        return self.relative_half_width
+
+
+class Draw(Measured):
+    """`sigma`: normal; `half_width`: uniform."""
+
+    measures = ("sigma", "half_width")
+    one_of = (("sigma", "half_width"),)
+    sigma: Spread | None = None
+    half_width: Spread | None = None
+    source: str = ""
+
+
+class AngleDraw(Draw):
+    unit: _values.Angle = "rad"
+
+
+class AttitudeDraw(AngleDraw):
+    one_of = (("sigma", "half_width", "any"),)
+    any: Literal[True] | None = Field(None, description="true: every attitude alike")
+
+
+class RatesDraw(Draw):
+    unit: _values.Rate = "rad/s"
+
+
+class MomentumDraw(Draw):
+    unit: _values.Momentum = "kg m^2/s"
+
+
+class TorqueDraw(Draw):
+    unit: Literal["N m"] = "N m"
+
+
+class Arrays(Table):
+    """Files of NumPy (.npy) below the scene's folder with a row for each body, SI."""
+
+    moments: BelowFolder | None = None
+    wxyz: BelowFolder | None = None
+    omega_body: BelowFolder | None = None
+    momentum_body: BelowFolder | None = None
+    torque: BelowFolder | None = None
+
+
+class Statistic(Table):
+    quantity: Literal["rate", "tilt", "energy", "momentum"]
+    low: Number | None = None
+    high: Number | None = None
+    bins: Annotated[int, Field(ge=1, le=100_000)] = 100
+
+    @model_validator(mode="after")
+    def _range(self) -> "Statistic":
+        if (self.low is None) != (self.high is None):
+            raise ValueError("a range has both low and high, or neither")
+        if self.low is not None and self.high is not None and self.low >= self.high:
+            raise ValueError(f"high must be above low = {self.low}, got {self.high}")
+        return self
+
+
+class Ensemble(Spreads):
+    """Any number of bodies, computed into a Zarr store."""
+
+    bodies: Annotated[int, Field(ge=1, le=2**32 - 1)]
+    seed: Annotated[int, Field(ge=0, le=2**32 - 1)]
+    trajectories: bool = True
+    statistics: Annotated[list[Statistic], Field(max_length=100)] = Field(default_factory=list)
+    source: str = ""
+    arrays: Arrays | None = None
+    moments: MomentsDraw | None = None
+    euler: AngleDraw | None = None
+    attitude: AttitudeDraw | None = None
+    omega_body: RatesDraw | None = None
+    momentum_body: MomentumDraw | None = None
+    torque: TorqueDraw | None = None
+
+    @model_validator(mode="after")
+    def _something_stored(self) -> "Ensemble":
+        names = [s.quantity for s in self.statistics]
+        if not self.trajectories and not names:
+            raise ValueError(
+                "nothing would be stored: set trajectories = true, or add [[ensemble.statistics]]"
+            )
+        if len(set(names)) < len(names):
+            raise ValueError(f"statistics name a quantity twice: {', '.join(names)}")
+        rows = self.arrays
+        if rows is None:
+            return self
+        clashes = {
+            "wxyz": self.euler is not None or (self.attitude is not None and self.attitude.any),
+            "momentum_body": self.momentum_body is not None,
+            "omega_body": rows.momentum_body is not None,
+        }
+        for name, clash in clashes.items():
+            if clash and name in dict(rows.entries()):
+                raise ValueError(
+                    f"{name} is given twice: in arrays, and by a table or rows that replace it"
+                )
+        return self
 
 
 class SceneFile(Table):
@@ -268,11 +450,16 @@ class SceneFile(Table):
             "momentum_body": (self.state.momentum_body, "a [state] with momentum_body"),
             "torque": (constant or None, "one [torque] of kind body or space"),
         }
-        rows = None if self.ensemble is None else self.ensemble.arrays
-        for lead, table in (("monte_carlo", self.monte_carlo), ("ensemble", self.ensemble),
-                            ("ensemble.arrays", rows)):  # fmt: skip
-            for name, (fits, needed) in needs.items():
-                if fits is None and getattr(table, name, None) is not None:
+        drawn = {}
+        if self.monte_carlo is not None:
+            drawn["monte_carlo"] = self.monte_carlo.spreads
+        if self.ensemble is not None:
+            drawn["ensemble"] = self.ensemble.spreads
+            if self.ensemble.arrays is not None:
+                drawn["ensemble.arrays"] = dict(self.ensemble.arrays.entries())
+        for lead, quantities in drawn.items():
+            for name, (nominal, needed) in needs.items():
+                if nominal is None and name in quantities:
                     raise ValueError(f"[{lead}] {name} does not fit this scene: it needs {needed}")
         return self
 
@@ -280,7 +467,7 @@ class SceneFile(Table):
     def _orbit_is_there(self) -> "SceneFile":
         for name, tables in (("potential", self.potential), ("torque", self.torque)):
             for index, table in enumerate(tables):
-                if self.orbit is None and getattr(table, "needs_orbit", False):
+                if self.orbit is None and table.needs_orbit:
                     raise ValueError(f"[{name} {index + 1}] needs an [orbit]: add one")
         if self.state.frame == "lvlh":
             if self.orbit is None:
@@ -298,11 +485,11 @@ class SceneFile(Table):
 
     @model_validator(mode="after")
     def _rows_since_epoch(self) -> "SceneFile":
-        seen = self.observations
-        if seen is None:
+        observations = self.observations
+        if observations is None:
             return self
         rows, last = [], -math.inf
-        for index, row in enumerate(seen.rows):
+        for index, row in enumerate(observations.rows):
             time = row.time
             if row.utc is not None:
                 if self.epoch is None:
@@ -319,4 +506,5 @@ class SceneFile(Table):
                 )
             rows.append(row.model_copy(update={"time": time}))
             last = time
-        return self.model_copy(update={"observations": seen.model_copy(update={"rows": rows})})
+        observations = observations.model_copy(update={"rows": rows})
+        return self.model_copy(update={"observations": observations})

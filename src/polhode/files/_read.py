@@ -1,18 +1,23 @@
 """From the text of a scene file to its checked model; errors in one readable block.
 
-Needs neither numpy nor JAX: a mistake is reported in a fraction of a second.
+Needs neither NumPy (but for [ensemble.arrays]) nor JAX: a mistake is reported in a fraction of a
+second.
 """
 
 import os
 import re
+import stat
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from polhode._extras import imported
-from polhode.files._error import SceneFileError, Verbatim, did_you_mean, shorten, visible
+from polhode.files._error import SceneFileError, Verbatim, did_you_mean, escape, reason, shorten
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from polhode.files._models import SceneFile
 
 MAX_BYTES = 16 * 2**20
@@ -32,15 +37,17 @@ def read_scene(path: str | os.PathLike) -> "SceneFile":
         with open(0 if standard else path, "rb", closefd=not standard) as file:
             data = file.read(MAX_BYTES + 1)
     except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise SceneFileError(
-            path, "", f"cannot be read: {reason}", mend="check the path and its permissions"
-        ) from None
+        problem = f"cannot be read: {reason(error)}"
+        raise SceneFileError(path, "", problem, fix="check the path and its permissions") from None
     if len(data) > MAX_BYTES:
         raise SceneFileError(
-            path, "", "too large", f"more than {MAX_BYTES:,} bytes", "a scene file of a few pages",
-            "keep rows of many bodies in .npy files: [ensemble.arrays]",
-        )  # fmt: skip
+            path,
+            "",
+            "too large",
+            value=f"more than {MAX_BYTES:,} bytes",
+            expected="a scene file of a few pages",
+            fix="keep rows of many bodies in .npy files: [ensemble.arrays]",
+        )
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -53,33 +60,36 @@ def parse_scene(text: str, path: str | os.PathLike = "<text>") -> "SceneFile":
     of [ensemble.arrays].
     """
     path = Path(path)
-    file = _checked(text, path)
-    file = file.model_copy(update={"title": file.title or visible(path.stem)})
+    file = _validate(text, path)
+    file = file.model_copy(update={"title": file.title or escape(path.stem)})
     file._path, file._text = path, text
     plan = file.ensemble
     if plan is not None and plan.arrays is not None:
-        from polhode.files._arrays import read_arrays
-
-        file._rows = read_arrays(dict(plan.arrays.given()), plan.bodies, path)
+        file._rows = _read_arrays(dict(plan.arrays.entries()), plan.bodies, path)
     return file
 
 
-def _checked(text: str, path: Path) -> "SceneFile":
+def shipped_scenes() -> dict[str, Path]:
+    """The scene files that come with polhode, by name (``polhode run NAME`` runs one)."""
+    folder = Path(__file__).with_name("scenes")
+    return {path.stem: path for path in sorted(folder.glob("*.toml"))}
+
+
+def _validate(text: str, path: Path) -> "SceneFile":
     _limit_keys(text, path)
     try:
         data = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
         words = "brackets nested too deeply" if isinstance(error, RecursionError) else str(error)
-        raise SceneFileError(
-            path, "", f"not valid TOML: {words[:200]}", mend="see https://toml.io for the syntax"
-        ) from None
+        problem = f"not valid TOML: {words[:200]}"
+        raise SceneFileError(path, "", problem, fix="see https://toml.io for the syntax") from None
     pydantic = imported("a scene file", "pydantic")
     from polhode.files._models import SceneFile
 
     try:
         return SceneFile.model_validate(data)
     except pydantic.ValidationError as error:
-        raise _readable(path, data, error.errors(include_url=False)) from None
+        raise _scene_error(path, data, error.errors(include_url=False)) from None
 
 
 _SPACE_BEFORE_DOT = re.compile(r"(?<![ \t])[ \t]++(?=\.)")
@@ -90,28 +100,26 @@ _DOTTED = re.compile(rf"(?<![\w.\"'-])(?:[\w\"'-]++\.){{{MAX_KEY_PARTS},}}")
 def _limit_keys(text: str, path: Path) -> None:
     """Refuse dotted keys of hundreds of parts: their time grows as the square of the number."""
     dense = _SPACE_AFTER_DOT.sub("", _SPACE_BEFORE_DOT.sub("", text))
-    if found := _DOTTED.search(dense):
-        line = dense.count("\n", 0, found.start()) + 1
-        raise SceneFileError(
-            path, "", f"keys nested too deeply (line {line})",
-            expected=f"fewer than {MAX_KEY_PARTS} parts",
-        )  # fmt: skip
+    if match := _DOTTED.search(dense):
+        line = dense.count("\n", 0, match.start()) + 1
+        problem = f"keys nested too deeply (line {line})"
+        raise SceneFileError(path, "", problem, expected=f"fewer than {MAX_KEY_PARTS} parts")
 
 
-def _readable(path: Path, data: Any, errors: list[Any]) -> SceneFileError:
+def _scene_error(path: Path, data: Any, errors: list[Any]) -> SceneFileError:
     """What pydantic found wrong: the first error with its value, and the places of the others."""
     # a key that is there and unknown explains one that is missing
     errors = sorted(errors, key=lambda e: (e["type"] == "missing", e["type"] != "extra_forbidden"))
     first, *others = errors
     place = _place(first, data)
-    given = "" if first["type"] == "missing" or not place else shorten(first["input"])
+    value = "" if first["type"] == "missing" or not place else shorten(first["input"])
     others = dict.fromkeys(f"{_place(e, data)}: {_message(e)}" for e in others)
     others.pop(f"{place}: {_message(first)}", None)
     also = [shorten(Verbatim(words), 150) for words in list(others)[:2]]
     if len(others) > 2:
         also.append(f"{len(others) - 2} more")
     return SceneFileError(
-        path, place, _message(first), given, mend=_suggestion(first), also="; ".join(also)
+        path, place, _message(first), value, fix=_suggestion(first), also="; ".join(also)
     )
 
 
@@ -122,19 +130,19 @@ def _message(error: Any) -> str:
 def _suggestion(error: Any) -> str:
     """The key or the choice that was probably meant, or nothing."""
     if error["type"] == "extra_forbidden":
-        word, known = str(error["loc"][-1]), _keys()
+        word, choices = str(error["loc"][-1]), _keys()
     elif error["type"] in ("literal_error", "union_tag_invalid"):
         context = error["ctx"]
         word = context.get("tag") or error["input"]
-        known = re.findall(r"'([^']*)'", context.get("expected") or context["expected_tags"])
+        choices = re.findall(r"'([^']*)'", context.get("expected") or context["expected_tags"])
     else:
         return ""
-    return did_you_mean(word, (name for name in known if name != word))
+    return did_you_mean(word, (name for name in choices if name != word))
 
 
 def _keys() -> set[str]:
     """The keys of all tables."""
-    from polhode.files._table import Table
+    from polhode.files._values import Table
 
     tables, keys = [Table], set()
     while tables:
@@ -164,3 +172,67 @@ def _place(error: Any, data: Any) -> str:
         return f"[{'.'.join(path)}]" if path else ""
     *tables, key = path or [""]
     return " ".join(filter(None, [f"[{'.'.join(tables)}]" if tables else "", key]))
+
+
+_WIDTHS = {"moments": 3, "wxyz": 4, "omega_body": 3, "momentum_body": 3, "torque": 3}
+_VALID_ROWS = dict.fromkeys(_WIDTHS, "finite numbers") | {
+    "moments": "positive moments of which none exceeds the sum of the others",
+    "wxyz": "finite numbers, not all 0",
+}
+
+
+def _read_arrays(names: Mapping[str, str], bodies: int, scene: Path) -> "dict[str, np.ndarray]":
+    """The arrays (bodies, width), left on the disk, every row checked. Raises SceneFileError."""
+    return {name: _read_array(name, text, bodies, scene) for name, text in names.items()}
+
+
+def _read_array(name: str, text: str, bodies: int, scene: Path) -> "np.ndarray":
+    import numpy as np
+
+    target = f"a file of NumPy (.npy) with {bodies} x {_WIDTHS[name]} numbers"
+
+    def error_of(problem: str, value: str = text, expected: str = target) -> SceneFileError:
+        return SceneFileError(scene, f"[ensemble.arrays] {name}", problem, value, expected)
+
+    folder = scene.parent.resolve()
+    path = (folder / text).resolve()
+    if not path.is_relative_to(folder):
+        raise error_of("a link that leaves the folder of the scene", text, f"a file in {folder}")
+    try:
+        if not stat.S_ISREG(path.stat().st_mode):  # a pipe would be waited for, for ever
+            raise error_of("cannot be read: not a regular file")
+        rows = np.load(path, mmap_mode="r", allow_pickle=False)
+    except SceneFileError:
+        raise
+    except Exception as error:  # a damaged header fails in whichever part of NumPy meets it first
+        raise error_of(f"cannot be read: {reason(error)[:200]}") from error
+    if not isinstance(rows, np.ndarray):
+        raise error_of("wrong shape or type", f"{text}: {type(rows).__name__}")
+    if rows.shape != (bodies, _WIDTHS[name]) or rows.dtype.kind not in "fiu":
+        raise error_of("wrong shape or type", f"{text}: {rows.shape} of {rows.dtype}")
+    row = _first_invalid(name, rows)
+    if row is not None:
+        values = f"row {row}: {rows[row].tolist()}"
+        raise error_of("impossible numbers", values, _VALID_ROWS[name])
+    return rows
+
+
+def possible_moments(moments: Any) -> Any:
+    """Which rows (..., 3) of NumPy or JAX are positive and obey the triangle inequality."""
+    return (moments.min(axis=-1) > 0) & (2 * moments.max(axis=-1) <= moments.sum(axis=-1))
+
+
+def _first_invalid(name: str, rows: "np.ndarray", step: int = 2**20) -> int | None:
+    """The first row that no body can have; a million rows are in memory at a time."""
+    import numpy as np
+
+    for start in range(0, len(rows), step):
+        part = np.asarray(rows[start : start + step], np.float64)
+        valid = np.isfinite(part).all(axis=1)
+        if name == "moments":
+            valid &= possible_moments(part)
+        elif name == "wxyz":
+            valid &= part.any(axis=1)
+        if not valid.all():
+            return start + int(np.argmin(valid))
+    return None

@@ -1,10 +1,15 @@
-"""Types of single values of a scene file, checked by pydantic. Nothing here needs numpy."""
+"""What every table of a scene file is made of: tables, single values, units.
+
+pydantic checks them. Nothing here needs NumPy or JAX.
+"""
 
 import datetime
 import itertools
-from typing import Annotated, Any, Literal
+import math
+from collections.abc import Iterator
+from typing import Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 MAX_SAMPLES = 10_000_000
 
@@ -84,8 +89,73 @@ def _below(text: str) -> str:
 
 BelowFolder = Annotated[str, AfterValidator(_below)]
 
+
+# Units that a scene file may name, with their factors to SI
 Seconds = Literal["s", "ms", "min", "h", "day", "year"]
 Angle = Literal["rad", "deg", "turn"]
 Rate = Literal["rad/s", "deg/s", "deg/h", "deg/day", "rpm", "rev/s", "rev/day"]
 Moment = Literal["kg m^2", "g cm^2", "g mm^2", "slug ft^2", "relative"]
 Momentum = Literal["kg m^2/s"]
+
+DEGREE = math.pi / 180
+SECONDS = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0, "day": 86400.0, "year": 31557600.0}
+ANGLES = {"rad": 1.0, "deg": DEGREE, "turn": 2 * math.pi}
+ANGULAR_RATES = {
+    "rad/s": 1.0,
+    "deg/s": DEGREE,
+    "deg/h": DEGREE / 3600,
+    "deg/day": DEGREE / 86400,
+    "rpm": 2 * math.pi / 60,
+    "rev/s": 2 * math.pi,
+    "rev/day": 2 * math.pi / 86400,
+}
+# 1 slug = 1 lbf s^2/ft exactly, 1 lbf = 4.4482216152605 N, 1 ft = 0.3048 m
+MOMENTS = {
+    "kg m^2": 1.0,
+    "g cm^2": 1e-7,
+    "g mm^2": 1e-9,
+    "slug ft^2": 4.4482216152605 * 0.3048,
+    "relative": 1.0,
+}
+SI = SECONDS | ANGLES | ANGULAR_RATES | MOMENTS | {"kg m^2/s": 1.0, "N m": 1.0}
+
+
+class Table(BaseModel):
+    """A table; of each group in `one_of` exactly one key must be there."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, defer_build=True)
+    one_of: ClassVar[tuple[tuple[str, ...], ...]] = ()
+
+    @model_validator(mode="after")
+    def _one_of_each(self) -> Self:
+        for group in self.one_of:
+            present = [key for key in group if getattr(self, key) is not None]
+            if len(present) != 1:
+                keys = " and ".join(present) or "none of them"
+                raise ValueError(f"exactly one of {', '.join(group)} is needed, got {keys}")
+        return self
+
+    def entries(self) -> Iterator[tuple[str, Any]]:
+        """Names and values of the keys that hold something."""
+        return ((name, value) for name, value in self if value is not None)
+
+
+class Measured(Table):
+    """A table with a `unit`: once it is checked, the numbers in `measures` are in SI."""
+
+    measures: ClassVar[tuple[str, ...]] = ("value",)
+
+    @model_validator(mode="after")
+    def _in_si(self) -> Self:
+        factor = SI[dict(self)["unit"]]
+        numbers = {n: scale(x, factor) for n, x in self.entries() if n in self.measures}
+        return self.model_copy(update=numbers)
+
+
+def scale(value: Any, factor: float) -> Any:
+    """A number, a list of them or a table of them, times the factor."""
+    if isinstance(value, list):
+        return [scale(x, factor) for x in value]
+    if isinstance(value, Table):
+        return value.model_copy(update={name: scale(x, factor) for name, x in value.entries()})
+    return value * factor

@@ -228,10 +228,10 @@ def _write(
     import matplotlib.pyplot as plt
 
     from polhode import __version__
-    from polhode.files._atomic import whole_file
+    from polhode.files._write import atomic_write
 
     page = figure(fit, title=name)
-    with whole_file(picture) as temporary:
+    with atomic_write(picture) as temporary:
         page.savefig(temporary, dpi=160, metadata={"Software": f"polhode {__version__}"})
     plt.close(page)
 
@@ -265,6 +265,6 @@ def _write(
         "solutions": rows,
         "notes": fit.notes,
     }
-    with whole_file(document) as temporary:
+    with atomic_write(document) as temporary:
         temporary.write_text(json.dumps(contents, indent=1) + "\n", encoding="utf-8")
     say(f"wrote {picture} and {document}")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from polhode._trajectory import Trajectory
-from polhode.files._atomic import whole_file
+from polhode.files._write import atomic_write
 from polhode.plot._matplotlib import AXES, INK, new_figure, styled
 from polhode.plot._samples import Samples, Scale, as_samples, box_sides, matrices
 
@@ -137,7 +137,7 @@ def _check_writer(path: Path) -> None:
 
 
 def _save(animation, path: Path, fps: int, dpi: int) -> None:
-    with whole_file(path) as temporary:
+    with atomic_write(path) as temporary:
         writer = _WRITERS[path.suffix.lower()]
         if writer is None:
             from matplotlib import rc_context

@@ -45,9 +45,9 @@ def styled(function):
 
 def plain(text: str, length: int = 120) -> str:
     """A user's text as it stands: `$` begins no formula, control characters are written out."""
-    from polhode.files._error import visible
+    from polhode.files._error import escape
 
-    text = visible(text)
+    text = escape(text)
     text = text if len(text) <= length else text[: length - 4] + " ..."
     return text.replace("$", r"\$")
 

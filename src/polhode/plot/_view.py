@@ -17,7 +17,7 @@ import numpy as np
 
 from polhode._extras import imported
 from polhode._trajectory import Trajectory
-from polhode.files._atomic import whole_file
+from polhode.files._write import atomic_write
 from polhode.inertia._mass import as_triangles, load_mesh
 from polhode.plot._samples import Samples, Scale, as_samples, box_sides, matrices
 from polhode.rotation import matrix_to_wxyz
@@ -285,7 +285,7 @@ class View:
     def write(self, path: str | os.PathLike) -> Path:
         """Write the page, whole or not at all; returns the path."""
         path = Path(path)
-        with whole_file(path) as temporary:
+        with atomic_write(path) as temporary:
             temporary.write_text(self.html, encoding="utf-8")
         return path
 

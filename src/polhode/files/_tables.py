@@ -1,24 +1,191 @@
-"""Tables of a scene file that say what acts on the body: SI units."""
+"""Tables of a scene file that say what the body is, how it starts and what acts on it: SI units."""
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
 from polhode.files import _values
-from polhode.files._bodies import Attitudes, Euler
-from polhode.files._table import Measured, Table
 from polhode.files._values import (
     Direction,
     Gains,
+    Lengths,
+    Matrix,
+    Measured,
     NotNegative,
     Number,
     Numbers,
     Positive,
     Quaternion,
+    Sequence,
+    Table,
     Vector,
 )
+
+
+class Attitudes(NamedTuple):
+    """Attitudes as a file gives them: quaternions (..., 4), or Euler angles (..., 3) in rad.
+
+    R = R_a(angle 1) R_b(angle 2) R_c(angle 3) for the letters abc of `sequence` (None: quaternions
+    `wxyz`, not yet normalised), body -> space.
+    """
+
+    values: Any
+    sequence: str | None = None
+
+
+class Euler(Measured):
+    """Turns about the body's own axes, first letter first: R = R_a(1) R_b(2) R_c(3)."""
+
+    measures = ("angles",)
+    sequence: Sequence = "zyz"
+    angles: Vector
+    unit: _values.Angle = "rad"
+
+    @property
+    def attitude(self) -> Attitudes:
+        return Attitudes(self.angles, self.sequence)
+
+
+class Axisymmetric(Table):
+    """A symmetric top, symmetry axis body z."""
+
+    transverse: Positive
+    axial: Positive
+
+
+class Solid(Table):
+    """A homogeneous solid: kg, m."""
+
+    mass: Positive
+    centre: Vector = Field(default_factory=lambda: [0.0, 0.0, 0.0])
+    euler: Euler | None = None
+
+
+class Box(Solid):
+    shape: Literal["box"]
+    sides: Lengths
+    inner_sides: Lengths | None = None
+
+
+class Ellipsoid(Solid):
+    shape: Literal["ellipsoid"]
+    semi_axes: Lengths
+
+
+class Sphere(Solid):
+    shape: Literal["sphere"]
+    radius: Positive
+    inner_radius: Positive | None = None
+
+
+class Cylinder(Solid):
+    shape: Literal["cylinder"]
+    radius: Positive
+    length: Positive
+    inner_radius: Positive | None = None
+
+
+class Cone(Solid):
+    shape: Literal["cone"]
+    radius: Positive
+    height: Positive
+
+
+class Torus(Solid):
+    shape: Literal["torus"]
+    ring_radius: Positive
+    tube_radius: Positive
+
+
+AnySolid = Annotated[
+    Box | Ellipsoid | Sphere | Cylinder | Cone | Torus, Field(discriminator="shape")
+]
+
+
+class Inertia(Measured):
+    """Exactly one way to say it; about the centre of mass, or the fixed point under gravity."""
+
+    measures = ("moments", "tensor", "axisymmetric", "spherical")
+    one_of = ((*measures, "parts"),)
+    moments: Vector | None = Field(None, description="principal moments along body x, y, z")
+    tensor: Matrix | None = Field(None, description="symmetric tensor in body axes")
+    axisymmetric: Axisymmetric | None = None
+    spherical: Number | None = Field(None, description="all moments equal")
+    parts: list[AnySolid] | None = Field(None, min_length=1, max_length=1000)
+    unit: _values.Moment = "kg m^2"
+
+    @model_validator(mode="after")
+    def _no_unit_of_parts(self) -> "Inertia":
+        if self.parts is not None and "unit" in self.model_fields_set:
+            raise ValueError("parts have no unit: they are in kg and m; remove the unit")
+        return self
+
+
+class Rates(Measured):
+    value: Vector
+    unit: _values.Rate = "rad/s"
+
+
+class Momentum(Measured):
+    value: Vector
+    unit: _values.Momentum = "kg m^2/s"
+
+
+def _as_table(value: Any) -> Any:
+    """Plain numbers are those in the SI unit."""
+    return value if isinstance(value, Mapping) else {"value": value}
+
+
+AnyRates = Annotated[Rates, BeforeValidator(_as_table, json_schema_input_type=Vector | Rates)]
+AnyMomentum = Annotated[
+    Momentum, BeforeValidator(_as_table, json_schema_input_type=Vector | Momentum)
+]
+
+
+class Oriented(Table):
+    """A table with an attitude, body -> space; that of space axes where it is left out."""
+
+    wxyz: Quaternion | None = Field(None, description="scalar first")
+    euler: Euler | None = None
+
+    @model_validator(mode="after")
+    def _one_attitude(self) -> Self:
+        if self.wxyz is not None and self.euler is not None:
+            raise ValueError("at most one of wxyz, euler is possible: remove one of them")
+        return self
+
+    @property
+    def attitude(self) -> Attitudes:
+        return Attitudes(self.wxyz or [1, 0, 0, 0]) if self.euler is None else self.euler.attitude
+
+
+class State(Oriented):
+    """Attitude and motion at the first time."""
+
+    one_of = (("omega_body", "momentum_body"),)
+    frame: Literal["inertial", "lvlh"] = Field(
+        "inertial", description="lvlh: attitude and rates against the frame of the [orbit]"
+    )
+    omega_body: AnyRates | None = None
+    momentum_body: AnyMomentum | None = None
+
+    @model_validator(mode="after")
+    def _rates_of_frame(self) -> "State":
+        if self.frame == "lvlh" and self.omega_body is None:
+            raise ValueError('frame = "lvlh" needs omega_body')
+        return self
+
+    @property
+    def rate(self) -> str:
+        """Which of rates and momentum is given."""
+        return "momentum_body" if self.omega_body is None else "omega_body"
+
+    @property
+    def value(self) -> list[float]:
+        """The rates, rad/s, or the momentum, kg m^2/s, in body axes."""
+        return getattr(self, self.rate).value
 
 
 class Orbit(Measured):
@@ -55,14 +222,22 @@ class Orbit(Measured):
         return math.hypot(*self.velocity) ** 2 * math.hypot(*self.position) > 2 * self.mu
 
 
-class UniformGravity(Table):
+class Action(Table):
+    """A potential or a torque."""
+
+    @property
+    def needs_orbit(self) -> bool:
+        return False
+
+
+class UniformGravity(Action):
     kind: Literal["uniform-gravity"]
     mass: Number
     centre_body: Vector
     gravity_space: Vector | None = None
 
 
-class GravityGradient(Table):
+class GravityGradient(Action):
     """Of a centre at rest (`mu`, `position_space`), or on the [orbit] (neither of them)."""
 
     kind: Literal["gravity-gradient"]
@@ -70,7 +245,7 @@ class GravityGradient(Table):
     position_space: Vector | None = None
 
     @model_validator(mode="after")
-    def _both(self) -> "GravityGradient":
+    def _centre_or_orbit(self) -> "GravityGradient":
         if (self.mu is None) != (self.position_space is None):
             raise ValueError("give both mu and position_space, or neither to follow the [orbit]")
         return self
@@ -80,7 +255,7 @@ class GravityGradient(Table):
         return self.mu is None
 
 
-class Torque(Table):
+class Torque(Action):
     frame: Literal["inertial", "lvlh"] = Field(
         "inertial", description="lvlh: the torque sees attitude and rates against the [orbit]"
     )
@@ -116,24 +291,12 @@ class RateDamping(Torque):
     rates: Vector | None = None
 
 
-class Pointing(Torque):
-    """N = -2 kp e - kd omega towards an attitude (default: not turned)."""
+class Pointing(Torque, Oriented):
+    """N = -2 kp e - kd omega towards an attitude."""
 
     kind: Literal["pointing"]
     kp: Gains
     kd: Gains
-    wxyz: Quaternion | None = None
-    euler: Euler | None = None
-
-    @model_validator(mode="after")
-    def _one_target(self) -> "Pointing":
-        if self.wxyz is not None and self.euler is not None:
-            raise ValueError("at most one of wxyz, euler is possible: remove one of them")
-        return self
-
-    @property
-    def target(self) -> Attitudes:
-        return Attitudes(self.wxyz or [1, 0, 0, 0]) if self.euler is None else self.euler.attitude
 
 
 class BDot(Table):
@@ -173,7 +336,7 @@ class Pulses(Torque):
     def _pairs(self) -> "Pulses":
         if len(self.starts) != len(self.ends):
             raise ValueError(f"{len(self.starts)} starts and {len(self.ends)} ends are no pairs")
-        for a, b in zip(self.starts, self.ends):
+        for a, b in zip(self.starts, self.ends, strict=True):
             if not a < b:
                 raise ValueError(f"a pulse ends after its start, got {a} to {b}")
         return self
@@ -229,7 +392,7 @@ class Event(Measured):
         return data
 
     @model_validator(mode="after")
-    def _fits(self) -> "Event":
+    def _limit(self) -> "Event":
         axes = [self.axis_body, self.direction_space]
         if self.angle is not None and None in axes:
             raise ValueError("angle needs axis_body and direction_space")
@@ -242,7 +405,7 @@ class Event(Measured):
         return self
 
 
-def _rows(value: Any) -> Any:
+def _as_list(value: Any) -> Any:
     """One table counts as a list of one."""
     return [value] if isinstance(value, Mapping) else value
 
@@ -263,7 +426,9 @@ _Potentials = Annotated[list[Potential], Field(max_length=100)]
 _Torques = Annotated[list[AnyTorque], Field(max_length=100)]
 _Rotors = Annotated[list[Rotor], Field(max_length=100)]
 Potentials = Annotated[
-    _Potentials, BeforeValidator(_rows, json_schema_input_type=Potential | _Potentials)
+    _Potentials, BeforeValidator(_as_list, json_schema_input_type=Potential | _Potentials)
 ]
-Torques = Annotated[_Torques, BeforeValidator(_rows, json_schema_input_type=AnyTorque | _Torques)]
-Rotors = Annotated[_Rotors, BeforeValidator(_rows, json_schema_input_type=Rotor | _Rotors)]
+Torques = Annotated[
+    _Torques, BeforeValidator(_as_list, json_schema_input_type=AnyTorque | _Torques)
+]
+Rotors = Annotated[_Rotors, BeforeValidator(_as_list, json_schema_input_type=Rotor | _Rotors)]

@@ -1,37 +1,78 @@
-"""Compiled programs kept between runs, in the user's cache folder."""
+"""What a command changes in its process while it runs: signals, and the cache of programs.
+
+Python delivers a signal as an exception in whatever runs at that moment. Where that is a callback
+of a library (JAX's after a garbage collection, for one), the exception is printed and forgotten.
+So every signal is noted, and `check_signals` raises it again between the pieces of the work.
+"""
 
 import contextlib
 import hashlib
 import importlib.util
 import os
 import platform
+import signal
+import threading
+import types
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-VARIABLE = "POLHODE_CACHE"
-_MOST_BYTES = 2**30
+INTERRUPTED, TERMINATED = 130, 143
+_received: list[int] = []
+_MAX_BYTES = 2**30
 _OFF = ("off", "0", "no", "false", "")
 
 
 @contextlib.contextmanager
-def kept_programs(wanted: bool) -> Iterator[None]:
-    """Have JAX keep the programs that it compiles in the block.
+def signal_handlers() -> Iterator[None]:
+    """Let both signals unwind like an exception, so that temporary files are removed."""
+    _received.clear()
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
 
-    Off when `wanted` is false or POLHODE_CACHE is "off"; that variable may also name the folder. A
+    def stop(number: int, frame: types.FrameType | None) -> None:
+        _received.append(number)
+        check_signals()
+
+    watched = [signal.SIGTERM]
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not of a background job
+        watched.append(signal.SIGINT)
+    previous = {number: signal.signal(number, stop) for number in watched}
+    try:
+        yield
+        check_signals()
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def check_signals() -> None:
+    """Raise what a signal that came before should have raised."""
+    if signal.SIGTERM in _received:
+        raise SystemExit(TERMINATED)
+    if _received:
+        raise KeyboardInterrupt
+
+
+@contextlib.contextmanager
+def program_cache(enabled: bool) -> Iterator[None]:
+    """Have JAX store the programs that it compiles in the block, in the user's cache folder.
+
+    Off when `enabled` is false or POLHODE_CACHE is "off"; that variable may also name the folder. A
     folder that JAX was given by its own settings stays. What cannot be read or written is compiled
     again without a word, and a damaged entry is removed.
     """
     import jax
 
-    named = os.environ.get(VARIABLE)
-    if not wanted or (named is not None and named.lower() in _OFF):
+    name = os.environ.get("POLHODE_CACHE")
+    if not enabled or (name is not None and name.lower() in _OFF):
         yield
         return
     # JAX adds its settings when it runs, which its types do not tell
-    given = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    folder = None if given else _folder(named)
+    own_folder = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    folder = None if own_folder else _folder(name)
     settings = {}
     if folder is not None:
         settings = {
@@ -40,8 +81,8 @@ def kept_programs(wanted: bool) -> Iterator[None]:
             "jax_persistent_cache_min_entry_size_bytes": -1,
         }
         if importlib.util.find_spec("filelock") is not None:
-            settings["jax_compilation_cache_max_size"] = _MOST_BYTES
-    before = {name: getattr(jax.config, name) for name in settings}
+            settings["jax_compilation_cache_max_size"] = _MAX_BYTES
+    previous = {key: getattr(jax.config, key) for key in settings}
     show, damaged = warnings.showwarning, []
 
     def listen(message, *rest, **more):
@@ -56,7 +97,7 @@ def kept_programs(wanted: bool) -> Iterator[None]:
         yield
     finally:
         warnings.showwarning = show
-        _set(before)
+        _set(previous)
         if damaged and folder is not None:
             for file in folder.glob("*-cache"):
                 file.unlink(missing_ok=True)
@@ -73,15 +114,15 @@ def _set(settings: dict[str, Any]) -> None:
         compilation_cache.reset_cache()
 
 
-def _folder(named: str | None) -> Path | None:
+def _folder(name: str | None) -> Path | None:
     """The folder of this kind of processor (programs hold its instructions), made; None: none."""
     try:
-        if named is None:
+        if name is None:
             import platformdirs
 
             base = platformdirs.user_cache_path("polhode")
         else:
-            base = Path(named)
+            base = Path(name)
         folder = base / f"programs-{_processor()}"
         folder.mkdir(parents=True, exist_ok=True)
         return folder if os.access(folder, os.W_OK) else None
