@@ -25,6 +25,7 @@ from polhode.cli._options import (
     SeedOption,
     not_negative,
     option,
+    output_option,
     positive,
     read_scene,
     require,
@@ -77,13 +78,7 @@ def scenes(
     ] = None,
     output: Annotated[
         str | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="FILE",
-            show_default=False,
-            help="where to copy it (default: NAME.toml here)",
-        ),
+        output_option("FILE", "where to copy it (default: NAME.toml here)"),
     ] = None,
     force: ForceOption = False,
     debug: DebugOption = False,
@@ -159,7 +154,7 @@ def view(
     path: Annotated[Path, typer.Argument(metavar="FILE.nc", help="made by `polhode run`")],
     output: Annotated[
         str | None,
-        typer.Option("-o", "--output", metavar="PAGE", help="the page; FILE.html if left out"),
+        output_option("PAGE", "the page; FILE.html if left out"),
     ] = None,
     force: ForceOption = False,
     debug: DebugOption = False,
@@ -191,9 +186,7 @@ def lightcurve(
     ] = None,
     output: Annotated[
         str | None,
-        typer.Option(
-            "-o", "--output", metavar="OUTPUT", help="figure and numbers: OUTPUT.png, .json"
-        ),
+        output_option("OUTPUT", "figure and numbers: OUTPUT.png, .json"),
     ] = None,
     trials: Annotated[
         int,

@@ -18,6 +18,7 @@ from polhode.cli._options import (
     NoFigureOption,
     QuietOption,
     option,
+    output_option,
     positive,
     require,
 )
@@ -64,12 +65,8 @@ def fit(
     ] = [],  # noqa: B006 - typer reads it
     output: Annotated[
         str | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="RESULT",
-            show_default=False,
-            help="write RESULT.json and RESULT.png (default: the name of the recording, here)",
+        output_option(
+            "RESULT", "write RESULT.json and RESULT.png (default: the name of the recording, here)"
         ),
     ] = None,
     degrees: Annotated[bool, _flag("--degrees", "rates are in deg/s")] = False,

@@ -84,6 +84,10 @@ def option(name: str, metavar: str, words: str, parser: Any = None, **settings: 
     return typer.Option(name, metavar=metavar, help=words, parser=parser, **settings)
 
 
+def output_option(metavar: str, words: str) -> Any:
+    return typer.Option("-o", "--output", metavar=metavar, show_default=False, help=words)
+
+
 SceneName = Annotated[
     str,
     typer.Argument(

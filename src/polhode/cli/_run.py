@@ -10,8 +10,6 @@ import sys
 from pathlib import Path
 from typing import Annotated, Any
 
-import typer
-
 from polhode.cli import _progress
 from polhode.cli._files import UsageError, check_suffix, output_path, write_figure
 from polhode.cli._options import (
@@ -27,6 +25,7 @@ from polhode.cli._options import (
     byte_count,
     device_count,
     option,
+    output_option,
     parse_part,
     read_scene,
     require,
@@ -78,13 +77,10 @@ def run(
     scene: SceneName,
     output: Annotated[
         str | None,
-        typer.Option(
-            "-o",
-            "--output",
-            metavar="FILE",
-            show_default=False,
-            help="NetCDF file to write (default: that of the scene's [output], or SCENE.nc here);"
-            " its folder is made if need be",
+        output_option(
+            "FILE",
+            "NetCDF file to write (default: that of the scene's [output], or SCENE.nc here); its"
+            " folder is made if need be",
         ),
     ] = None,
     clones: ClonesOption = None,
