@@ -58,6 +58,7 @@ def test_a_recording_becomes_numbers_and_a_figure(toss, tmp_path, capsys):
     assert np.all(np.abs(bias) < 5 * spread)
     assert np.all(spread < 0.05)
     assert "what this recording can show" in printed
+    assert f"- limited by {found['limit']}" in printed.replace("\n", " ")
     assert found["options"]["calibration"] == 0.01
     assert np.shape(found["gyroscope_gain"]) == (3, 3)
     sources = {row["quantity"]: row["source"] for row in found["observability"]}

@@ -192,6 +192,52 @@ def test_periods_that_a_few_nights_decide_are_ambiguous(cases):
     assert verdict(case, solution(model), worse).verdict is Verdict.TUMBLING
 
 
+def test_refits_of_resampled_curves_are_weighted_least_squares():
+    """One step of Gauss and Newton is exact for a linear model without outliers."""
+    rng = np.random.default_rng(0)
+    block, derivatives = np.repeat(np.arange(6), 10), rng.normal(size=(60, 3))
+    data, prior = rng.normal(size=60), np.diag([0.0, 0.5, 2.0])
+    best = -np.linalg.solve(derivatives.T @ derivatives + prior, derivatives.T @ data)
+    solution = _solutions.Linearised(data + derivatives @ best, derivatives, prior)
+    weight = rng.multinomial(6, np.full(6, 1 / 6), 20).astype(float)
+    cost = _fit._refitted_cost(solution, block, weight, 1.0, 1e6)
+    at_best = best @ prior @ best
+    for k in range(20):
+        rows = np.sqrt(weight[k][block])[:, None]
+        stacked = np.vstack([derivatives * rows, np.sqrt(prior)])
+        target = np.r_[-data * rows[:, 0], np.zeros(3)]
+        left = np.linalg.lstsq(stacked, target, rcond=None)[1][0]
+        assert cost[k] + at_best == pytest.approx(left, rel=1e-6)
+
+
+def test_periods_that_win_in_few_refits_are_ambiguous(cases):
+    """Two bodies that explain the points alike: which is the better depends on the nights."""
+    case = cases["tumbler"]
+    curve, _, linear, _ = case
+    model = offset_free(case, tumbling)
+    derivatives = np.random.default_rng(1).normal(size=(curve.t.size, 3))
+    best, residuals = solution(model), curve.magnitude - model
+    for worse, certain in ((0.25, False), (1.5, True)):
+        part = np.where(curve.group % 2 == 0, 0.3, -worse)
+        other = solution(model + part * residuals, P_psi=1.1 * P_PSI, odds=1e-4)
+        linearised = [
+            _solutions.Linearised(
+                (s.model - curve.magnitude) * linear.root, derivatives, np.zeros((3, 3))
+            )
+            for s in (best, other)
+        ]
+        agreement = _fit.bootstrap_agreement(
+            curve, linear.root, (best, other), [0, 1], 3.0, linearised
+        )
+        assert (agreement >= _fit._AGREEMENT) == certain
+        _, pairs, linear, nulls = case
+        found = _fit.judge(
+            linear, nulls, pairs, (best, other), reproduced=True, limit=3.0, linearised=linearised
+        )
+        assert (found.verdict is Verdict.TUMBLING) == certain
+        assert any("resampled" in reason for reason in found.reasons) == (not certain)
+
+
 def test_a_body_found_once_or_at_the_edge_of_the_search_is_ambiguous(cases):
     case = cases["tumbler"]
     body = solution(offset_free(case, tumbling))
@@ -254,6 +300,24 @@ def test_the_rotating_ellipsoid_is_found_with_its_geometry():
     np.testing.assert_array_equal(body.body.unknowns[0, 4:6], 0.0)
     assert 2 * np.pi / body.body.unknowns[0, 6] == pytest.approx(period, rel=1e-4)
     assert 6 < body.parameters < 30
+
+
+def test_nights_with_a_trend_or_too_small_errors_are_named():
+    curve = curve_of(flat)
+    rng = np.random.default_rng(5)
+    residuals = NOISE * rng.normal(size=curve.t.size)
+    assert _solutions.notes_on_groups(curve, residuals, 1.0) == ()
+    third = curve.group == 2
+    part = (curve.t - curve.t[third].min()) / np.ptp(curve.t[third])
+    drifting = np.where(third, residuals + 0.15 * part, residuals)
+    (note,) = _solutions.notes_on_groups(curve, drifting, 1.0)
+    assert "group(s) 2 (+0.1" in note
+    assert "comparison star" in note
+    # the same trend is not remarkable where neighbours are alike
+    assert _solutions.notes_on_groups(curve, drifting, 8.0) == ()
+    noisy = np.where(third, 4 * residuals, residuals)
+    (note,) = _solutions.notes_on_groups(curve, noisy, 1.0)
+    assert "group(s) 2 scatter" in note
 
 
 def test_points_without_errors_get_the_scatter_of_neighbours():
@@ -361,10 +425,10 @@ def test_a_convex_shape_leaves_the_noise_and_periods_within_their_errors(convex_
     near = start._replace(
         wxyz=np.asarray(ph.rotation.multiply(np.array([1.0, 0.01, 0.01, 0]), start.wxyz))
     )
-    found, scale, alike = _solutions.refined_solutions(
+    found, scale, alike, linearised = _solutions.refined_solutions(
         (start, near), linear, curve.points(0.0, 0.02), phase, 3.0
     )
-    assert len(found) == 1
+    assert len(found) == len(linearised) == 1
     best = found[0]
     assert scale == pytest.approx(1.0, abs=0.12)
     assert alike < 1.5

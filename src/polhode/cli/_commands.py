@@ -178,6 +178,16 @@ def view(
     return 0
 
 
+_PHASES = ("seeliger", "linear", "hg", "hg1g2")  # known before JAX is imported
+
+
+def _phase(text: str) -> str:
+    """A name of a phase function."""
+    if text.lower() not in _PHASES:
+        raise typer.BadParameter(f"{text[:80]!r} is not one of {', '.join(_PHASES)}")
+    return text.lower()
+
+
 def lightcurve(
     path: Annotated[Path, typer.Argument(metavar="FILE", help="CSV, ALCDEF or DAMIT's lc.txt")],
     vectors: Annotated[
@@ -206,10 +216,34 @@ def lightcurve(
     ] = 0.03,
     seed: Annotated[int, option("--seed", "N", "of the trials", whole_number(0))] = 0,
     searches: Annotated[
-        int, option("--searches", "N", "searches at most, until two agree", whole_number(1))
+        int,
+        option(
+            "--searches",
+            "N",
+            "searches at most, until two agree; 0: only those of --start",
+            whole_number(0),
+        ),
     ] = 3,
     binned: Annotated[
         float | None, option("--binned", "DAYS", "width of normal points", positive)
+    ] = None,
+    phase: Annotated[
+        str | None,
+        option(
+            "--phase",
+            "NAME",
+            "phase function: seeliger, linear, hg or hg1g2 (default: hg1g2 where the phase angle"
+            " changes by more than 5 deg, else seeliger)",
+            _phase,
+        ),
+    ] = None,
+    start: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="JSON",
+            help="result of an earlier fit, such as one of fewer nights: its solutions are tried"
+            " first",
+        ),
     ] = None,
     calibrated: Annotated[
         bool, typer.Option("--calibrated", help="nights share a zero point, but for small errors")
@@ -230,23 +264,44 @@ def lightcurve(
         if file is not None:
             with usage_errors(file, ".csv", what):
                 pass
+    earlier = "the JSON file of an earlier polhode lightcurve"
+    if start is not None:
+        with usage_errors(start, ".json", earlier):
+            pass
+    elif searches < 1:
+        raise UsageError("--searches 0 needs the solutions of an earlier fit: --start JSON.")
     require("lightcurve", "rich", "matplotlib")
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from polhode.lightcurve._command import fitted, read
+    from polhode.lightcurve._command import fitted, read, read_solutions
 
+    reading = {"binned": binned, "calibrated": calibrated, "reduced": reduced}
     with usage_errors(path, ".csv", expected):
-        curve = read(path, vectors, floor, binned=binned, calibrated=calibrated, reduced=reduced)
+        curve = read(path, vectors, floor, **reading)
+    solutions = None
+    if start is not None:
+        with usage_errors(start, ".json", earlier):
+            solutions = read_solutions(start)
+    reading["vectors"] = None if vectors is None else vectors.name
+    reading["start"] = None if start is None else start.name
     name = output or path.stem
     paths = [output_path(name + end, end, force=force) for end in (".png", ".json")]
     lines: list[str] = []
-    options = {"trials": trials, "searches": searches, "seed": seed}
+    options = {"trials": trials, "searches": searches, "seed": seed, "phase": phase}
     options |= {"floor": floor, "max_frequency": max_frequency, "say": lines.append}
     words = f"searching {curve.t.size} points with {trials:,} trials (compiling first)"
     try:
-        with _progress.spinner(_progress.progress_console(quiet), words):
-            fitted(curve, path.name, *paths, **options)
+        with _progress.spinner(_progress.progress_console(quiet), words) as show:
+            fitted(
+                curve,
+                path.name,
+                *paths,
+                **options,
+                start=solutions,
+                progress=show,
+                reading=reading,
+            )
     except ValueError as error:  # a brightness that does not vary
         raise UsageError(f"{path}: {error}") from error
     if not quiet:

@@ -368,6 +368,7 @@ def _write(path: Path, recording_path: Path, options: _Options, loaded: Any, res
         "steps": int(result.steps),
         "undetermined": _undetermined(result),
         "findings": result.findings(),
+        "limit": result.limit(),
     }
     text = json.dumps(document, indent=1, allow_nan=False)
     with atomic_write(path) as temporary:
@@ -382,7 +383,7 @@ def _print(path: Path, options: _Options, loaded: Any, result: Any, written: lis
     out = Console(soft_wrap=not is_terminal, width=None if is_terminal else 110)
     out.print(_table(path, options, loaded.recording, result))
     out.print(_observability(result))
-    for text in (_columns_read(loaded), *result.warnings()):
+    for text in (_columns_read(loaded), f"limited by {result.limit()}", *result.warnings()):
         out.print(f"- {text}", highlight=False, markup=False)
     _progress.print_paths(out, written)
 

@@ -1,7 +1,11 @@
 """``Fit``: the result of a fit, its uncertainty, and what the data do not show."""
 
+import csv
 import enum
+import json
 from collections.abc import Callable
+from os import PathLike
+from pathlib import Path
 from statistics import NormalDist
 from typing import Any, NamedTuple
 
@@ -303,6 +307,181 @@ class Fit(eqx.Module):
         std = np.where(leaning > MAX_NULL_PART * reach, np.inf, std)
         return np.asarray(value), std.reshape(value.shape)
 
+    @property
+    def value_names(self) -> list[str]:
+        """Names of ``values``: paths in the scene, or ``"inertia"`` and the motion's unknowns."""
+        motion = self.model.motion
+        if self._inertia is None and isinstance(motion, LeafMotion):
+            paths = [path for path, _ in jax.tree_util.tree_flatten_with_path(motion.scene)[0]]
+            paths = [paths[k] for k in motion.places]
+        else:
+            paths = [
+                path for path, _ in jax.tree_util.tree_flatten_with_path(self.parameters.motion)[0]
+            ]
+        names = [jax.tree_util.keystr(path, simple=True, separator=".") for path in paths]
+        return names if self._inertia is None else ["inertia", *names]
+
+    def common_scale(self, body: int = 0) -> list[tuple[str, np.ndarray, np.ndarray]]:
+        """What is known of ``values`` where the data show all of them but for a common factor.
+
+        Names, ratios to the largest of all and standard deviations of the ratios, of those values
+        that the factor multiplies; empty where the data show the values themselves, or less.
+        """
+        lead = np.ndim(self.diagnostics)
+        values = [np.asarray(x).reshape(-1, *np.shape(x)[lead:])[body] for x in self.values]
+        spread = [np.asarray(x).reshape(-1, *np.shape(x)[lead:])[body] for x in self.std]
+        unknown = [k for k, std in enumerate(spread) if std.size and not np.any(np.isfinite(std))]
+        if self._inertia is not None or not unknown:
+            return []
+        k = max(unknown, key=lambda k: np.abs(values[k]).max())
+        place = np.unravel_index(np.argmax(np.abs(values[k])), values[k].shape)
+        rows = []
+        for j in unknown:
+            ratio, std = self.derived(lambda v, j=j: v[j] / v[k][place], body)
+            if j == k:
+                std[place] = 0  # of the largest to itself, rounding aside
+            if not np.all(np.isfinite(std)):
+                return []
+            rows.append((self.value_names[j], ratio, std))
+        return rows if sum(ratio.size for _, ratio, _ in rows) > 1 else []
+
+    def limit(self, body: int = 0) -> str:
+        """What limits the result of one body, in one sentence."""
+        flags = set(self._flags(body))
+        model = flags & {Finding.NOT_FINITE, Finding.STEP_LIMIT, Finding.AXES_DISAGREE}
+        model |= flags & {Finding.POOR, Finding.OUTLIERS, Finding.NOT_WHITE, Finding.CALIBRATION}
+        if model:
+            words = ", ".join(str(flag.name).lower().replace("_", " ") for flag in self._flags(body)
+                              if flag in model)  # fmt: skip
+            return f"the model, which does not explain the readings ({words})"
+        if self._inertia is not None:
+            std = np.asarray(self.ratios_std).reshape(-1, 3)[body, :2]
+        else:
+            lead = np.ndim(self.diagnostics)
+            std = np.concatenate([
+                np.asarray(x).reshape(-1, *np.shape(x)[lead:])[body].reshape(-1) for x in self.std
+            ])  # fmt: skip
+        if not np.all(np.isfinite(std)):
+            return "the motion, which does not show all unknowns: record another spin"
+        part = self._calibration_part(body)
+        if part > 0.5:
+            return (
+                f"the calibration of the gyroscope ({part:.0%} of the variance): a better one"
+                " helps, more samples of this kind do not"
+            )
+        return "the noise of the readings: more samples, or faster rotation, help"
+
+    def _calibration_part(self, body: int) -> float:
+        """Part of the variance of the values that an exact calibration would remove, at most."""
+        first = self.model.entries
+        lead = np.ndim(self.diagnostics)
+        if self.parameters.gain is None:
+            return 0.0
+
+        def count(*names):
+            leaves = [x for name in names for x in jax.tree.leaves(getattr(self.parameters, name))]
+            return sum(int(np.prod(np.shape(leaf)[lead:])) for leaf in leaves)
+
+        start = first + count("bias", "mounting", "lever")
+        moving = start + count("motion")
+        matrix = np.asarray(self.covariance)
+        matrix = matrix.reshape(-1, *matrix.shape[-2:])[body]
+        own = np.arange(first) if self._inertia is not None else np.arange(start, moving)
+        gain = np.arange(moving, moving + 9)
+        gain = gain[np.diagonal(matrix)[gain] > 0]
+        if not gain.size or not own.size:
+            return 0.0
+        side = matrix[np.ix_(own, gain)]
+        removed = side @ np.linalg.pinv(matrix[np.ix_(gain, gain)], hermitian=True) @ side.T
+        total = np.diagonal(matrix)[own]
+        return float(np.max(np.diagonal(removed) / np.where(total > 0, total, np.inf)))
+
+    def to_dict(self, body: int = 0) -> dict[str, Any]:
+        """The result of one body as numbers, lists and texts, such as JSON holds.
+
+        ``values`` and ``std`` by their names (``value_names``), the sensor, the initial states, the
+        covariance, and what ``report`` shows; of an inertia its principal moments and axes as well.
+        Units are SI. None stands for what is not finite: a standard deviation of what the data do
+        not show.
+        """
+        lead = np.ndim(self.diagnostics)
+
+        def plain(value):
+            value = np.asarray(value)
+            value = value.reshape(-1, *value.shape[lead:])[body]
+            return np.asarray(np.where(np.isfinite(value), value, None)).tolist()
+
+        names = self.value_names
+        out = {
+            "kind": "scene" if self._inertia is None else "inertia",
+            "values": {k: plain(x) for k, x in zip(names, self.values, strict=True)},
+            "std": {k: plain(x) for k, x in zip(names, self.std, strict=True)},
+            "sensor": {k: plain(x) for k, x in self.sensor.items()},
+            "sensor_std": {k: plain(x) for k, x in self.sensor_std.items()},
+            "initial_wxyz": plain(self.initial.wxyz),
+            "initial_omega_body": plain(self.initial.omega_body),
+            "covariance": plain(self.covariance),
+            "null_count": plain(self.null_count),
+            "noise": plain(self.noise),
+            "whiteness": plain(self.whiteness),
+            "rms": plain(self.rms),
+            "steps": plain(self.steps),
+            "findings": self.findings(body),
+            "warnings": self.warnings(body),
+            "limit": self.limit(body),
+            "observability": [row._asdict() for row in self.observability(body)],
+            "common_scale": {
+                name: [ratio.tolist(), std.tolist()] for name, ratio, std in self.common_scale(body)
+            },
+        }
+        if self._inertia is not None:
+            low, high = self.interval()
+            out |= {
+                "scale_known": self.scale_known,
+                "moments": plain(self.moments),
+                "moments_std": plain(self.moments_std),
+                "ratios": plain(self.ratios),
+                "ratios_std": plain(self.ratios_std),
+                "interval_95": [plain(low), plain(high)],
+                "axes_wxyz": plain(self.axes),
+                "axes_std": plain(self.axes_std),
+            }
+        return out
+
+    def to_json(self, path: str | PathLike[str]) -> None:
+        """Write ``to_dict`` of every body: one object, or a list of them for a batch."""
+        bodies = [self.to_dict(k) for k in range(np.size(self.diagnostics))]
+        whole = bodies if np.ndim(self.diagnostics) else bodies[0]
+        Path(path).write_text(json.dumps(whole, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+
+    def to_csv(self, path: str | PathLike[str]) -> None:
+        """Write a row for every fitted number: body, name, component, value, standard deviation.
+
+        A standard deviation that is not finite is an empty cell.
+        """
+        lead = np.ndim(self.diagnostics)
+        pairs = [
+            *zip(self.value_names, self.values, self.std, strict=True),
+            *((name, x, self.sensor_std[name]) for name, x in self.sensor.items()),
+        ]
+        if self._inertia is not None:
+            pairs += [
+                ("moments", self.moments, self.moments_std),
+                ("ratios", self.ratios, self.ratios_std),
+            ]
+        with Path(path).open("w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(["body", "name", "component", "value", "std"])
+            for body in range(np.size(self.diagnostics)):
+                for name, value, std in pairs:
+                    value, std = (
+                        np.asarray(x).reshape(-1, *np.shape(x)[lead:])[body] for x in (value, std)
+                    )
+                    for place in np.ndindex(value.shape):
+                        spread = repr(float(std[place])) if np.isfinite(std[place]) else ""
+                        component = " ".join(map(str, place))
+                        writer.writerow([body, name, component, repr(float(value[place])), spread])
+
     def interval(self, level: float = 0.95) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]:
         """Ends (..., 3) of confidence intervals of ``principal_values``; 0 < ``level`` < 1."""
         value, spread = self.principal_values
@@ -353,7 +532,7 @@ class Fit(eqx.Module):
                 shown = int(np.isfinite(flat).sum())
                 remedy = "" if shown == flat.size else "another motion, or fewer free numbers"
                 source = rests if shown else "nothing"
-                name = f"values[{k}] ({flat.size})"
+                name = f"{self.value_names[k]} ({flat.size})"
                 rows.append(Observability(name, flat.size, shown, source, remedy))
         for name, count, shown in gained or []:
             source = ("calibration", "data and calibration", "data")[
@@ -433,12 +612,19 @@ class Fit(eqx.Module):
     def _value_lines(self, body: int) -> list[str]:
         lead = np.ndim(self.noise)
         lines = [f"body {body}:"] if lead else []
-        for value, spread in zip(self.values, self.std):
+        for name, value, spread in zip(self.value_names, self.values, self.std, strict=True):
             value, spread = (
                 np.asarray(x).reshape(-1, *np.shape(x)[lead:])[body].reshape(-1)
                 for x in (value, spread)
             )
-            lines.append(", ".join(f"{v:.6g} +- {s:.2g}" for v, s in zip(value, spread)))
+            numbers = ", ".join(f"{v:.6g} +- {s:.2g}" for v, s in zip(value, spread))
+            lines.append(f"{name}: {numbers}")
+        known = self.common_scale(body)
+        if known:
+            lines.append("only a common factor of these is not shown; ratios to the largest:")
+        for name, ratio, std in known:
+            numbers = ", ".join(f"{v:.6g} +- {s:.2g}" for v, s in zip(ratio.flat, std.flat))
+            lines.append(f"  {name}: {numbers}")
         return lines
 
     def _flags(self, body: int) -> list[Finding]:

@@ -11,7 +11,12 @@ from polhode.lightcurve._brightness import (
     seeliger_ellipsoid as seeliger_ellipsoid,
     seeliger_sphere as seeliger_sphere,
 )
-from polhode.lightcurve._command import figure as figure, run as run, table as table
+from polhode.lightcurve._command import (
+    figure as figure,
+    read_solutions as read_solutions,
+    run as run,
+    table as table,
+)
 from polhode.lightcurve._data import LightCurve as LightCurve, read_light_curve as read_light_curve
 from polhode.lightcurve._fit import Verdict as Verdict, fit_light_curve as fit_light_curve
 from polhode.lightcurve._frequencies import (

@@ -1,18 +1,26 @@
 """What ``polhode lightcurve FILE`` does."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from polhode._closed_forms import Mode
 from polhode._extras import imported
+from polhode.lightcurve._brightness import (
+    HG,
+    HG1G2,
+    AbstractPhase,
+    LinearPhase,
+    SeeligerPhase,
+)
 from polhode.lightcurve._data import LightCurve, read_light_curve
 from polhode.lightcurve._fit import fit_light_curve
 from polhode.lightcurve._frequencies import Pairs, fourier_lattices, fourier_pairs, meaning
-from polhode.lightcurve._solutions import LightCurveFit
+from polhode.lightcurve._solutions import COVARIANCE_OF, LightCurveFit, Solution
 
 # of the JSON file; other numbers have none
 _UNITS = {
@@ -31,6 +39,16 @@ _UNITS = {
     "pole": "deg",
     "pole_std": "deg",
     "omega_body": "rad/day",
+    "epoch": "day",
+    "covariance": "products of the units of covariance_of; moments and momentum have none",
+}
+
+# Phase functions by the name that the command line gives them.
+PHASES: dict[str, AbstractPhase] = {
+    "seeliger": SeeligerPhase(),
+    "linear": LinearPhase(),
+    "hg": HG(),
+    "hg1g2": HG1G2(),
 }
 
 
@@ -122,15 +140,19 @@ def run(
     seed: int = 0,
     searches: int = 3,
     binned: float | None = None,
+    phase: str | None = None,
     calibrated: bool = False,
     reduced: bool = False,
+    start: str | PathLike[str] | None = None,
     say: Callable = print,
 ) -> LightCurveFit | None:
     """Read and fit a light curve, print the table, and write the figure and a JSON file.
 
     ``output``: path of the files without suffix (default: that of ``path``, in the current folder).
     ``searches``, ``trials``, ``max_frequency``, ``floor``, ``seed``: of `fit_light_curve`;
-    ``calibrated``, ``reduced``: of `read_light_curve`; ``binned``: width [day] of normal points.
+    ``calibrated``, ``reduced``: of `read_light_curve`; ``binned``: width [day] of normal points;
+    ``phase``: ``"seeliger"``, ``"linear"``, ``"hg"`` or ``"hg1g2"``; ``start``: the JSON file of an
+    earlier fit, whose solutions are tried first.
     Without directions to Sun and observer only the frequencies are listed, and None is returned.
     Raises what `read_light_curve` raises, and ValueError for a floor of 0 where errors are missing.
     """
@@ -148,7 +170,16 @@ def run(
         floor=floor,
         seed=seed,
         searches=searches,
+        phase=phase,
+        start=None if start is None else read_solutions(start),
         say=say,
+        reading={
+            "vectors": None if vectors is None else Path(vectors).name,
+            "binned": binned,
+            "calibrated": calibrated,
+            "reduced": reduced,
+            "start": None if start is None else Path(start).name,
+        },
     )
 
 
@@ -183,8 +214,15 @@ def fitted(
     floor: float,
     seed: int,
     searches: int = 3,
+    phase: str | None = None,
+    start: Sequence[Solution] | None = None,
+    progress: Callable[[str], None] | None = None,
+    reading: dict[str, Any] | None = None,
 ) -> LightCurveFit | None:
-    """LightCurveFit, say the table, and write the figure and the numbers; see `run`."""
+    """Fit, say the table, and write the figure and the numbers; see `run`.
+
+    ``reading``: how the light curve was read, for the settings in the JSON file.
+    """
     say(f"{title}: {curve.t.size} points, {len(curve.names)} groups, {np.ptp(curve.t):.4g} d")
     if curve.sun is None:
         pairs = fourier_pairs(
@@ -211,11 +249,44 @@ def fitted(
         "seed": seed,
         "searches": searches,
     }
-    fit = fit_light_curve(curve, **settings)
+    if phase is not None and phase not in PHASES:
+        raise ValueError(f"phase must be one of {', '.join(PHASES)}, got {phase!r}.")
+    fit = fit_light_curve(
+        curve,
+        **settings,
+        phase=None if phase is None else PHASES[phase],
+        start=start,
+        progress=progress,
+    )
+    used = next(name for name, each in PHASES.items() if type(each) is type(fit.phase))
+    settings |= {"phase": used} | (reading or {})
     say(frequency_table(fit.pairs, lines=True))
     say(table(fit))
     _write(fit, title, picture, document, settings, say)
     return fit
+
+
+def read_solutions(path: str | PathLike[str]) -> tuple[Solution, ...]:
+    """Solutions of an earlier fit from its JSON file, to start another one from.
+
+    Raises FileNotFoundError, and ValueError for a file that is not one of `run`.
+    """
+    path = Path(path)
+    try:
+        document = json.loads(path.read_text(encoding="utf-8"))
+        rows = document["solutions"]
+        out = []
+        for row in rows:
+            fields = {name: row.get(name) for name in Solution._fields}
+            arrays = ("moments", "axes", "wxyz", "omega_body", "coefficients")
+            fields |= {name: np.asarray(row[name], float) for name in arrays}
+            fields |= {"mode": Mode[row["mode"]], "epoch": float(row["epoch"])}
+            out.append(Solution(**fields))
+    except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path} is not a result of polhode lightcurve: {error!r}.") from None
+    if not out:
+        raise ValueError(f"{path} holds no solutions.")
+    return tuple(out)
 
 
 def _write(
@@ -261,6 +332,7 @@ def _write(
         "alike": fit.alike,
         "offset_sigma": fit.offset_sigma,
         "max_frequency": fit.pairs.max_frequency,
+        "covariance_of": COVARIANCE_OF,
         "models": [model._asdict() for model in fit.models],
         "solutions": rows,
         "notes": fit.notes,

@@ -1,6 +1,7 @@
 """``fit_light_curve``: all tumbling bodies that explain a light curve, and the verdict on them."""
 
 import enum
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -37,13 +38,16 @@ from polhode.lightcurve._solutions import (
     FIXED,
     REACHED,
     LightCurveFit,
+    Linearised,
     Solution,
+    bodies_of,
     change_of_directions,
     describe_solutions,
     effective_correlation,
     frequencies,
     momentum,
     notes_on,
+    notes_on_groups,
     refined_solutions,
     rotating_body,
     same_periods,
@@ -120,10 +124,12 @@ def judge(
     reproduced: bool,
     limit: float,
     others: tuple[Solution, ...] = (),
+    linearised: Sequence[Linearised] | None = None,
 ) -> Judgement:
     """Compare the null hypotheses with the best tumbling body, and say what may be claimed.
 
-    ``others``: more bodies to compare, such as the best ellipsoid, which has fewer parameters.
+    ``others``: more bodies to compare, such as the best ellipsoid, which has fewer parameters;
+    ``linearised``: of each solution, for fits to resampled light curves.
     """
     curve = linear.curve
     best = solutions[0]
@@ -131,7 +137,7 @@ def judge(
     everything += [tumbler(linear, pairs, body) for body in (best, *others)]
     models = compare_models(linear, everything, effective_correlation)
     classes = same_periods(solutions, pairs.resolution)
-    agreement = bootstrap_agreement(curve, linear.root, solutions, classes, limit)
+    agreement = bootstrap_agreement(curve, linear.root, solutions, classes, limit, linearised)
     silent, single, double, body = (
         _best_of(models, word) for word in ("noise", "one period", "two periods", "tumbling")
     )
@@ -225,28 +231,74 @@ def bootstrap_agreement(
     solutions: tuple[Solution, ...],
     classes: list[int],
     limit: float,
+    linearised: Sequence[Linearised] | None = None,
     count: int = _RESAMPLED,
 ) -> float:
     """Part of ``count`` resampled light curves in which the best periods stay the best.
 
-    Nights are drawn with replacement, or runs of points where there are few nights, and the
-    contributions of the points to the cost of every solution are added anew (RELL bootstrap:
-    Kishino, Miyata & Hasegawa, J. Mol. Evol. 31 (1990) 151); the bodies are not fitted again.
+    Nights are drawn with replacement, or runs of points where there are few nights. With
+    ``linearised`` every solution is fitted again to every resampled light curve, by one step of
+    Gauss and Newton from where it is; else the contributions of the points to its cost are added
+    (RELL bootstrap: Kishino, Miyata & Hasegawa, J. Mol. Evol. 31 (1990) 151).
     """
     if len(set(classes)) < 2:
         return 1.0
-    # residuals over the errors that make the best solution fit
-    rest = np.array([(s.model - curve.magnitude) * root for s in solutions])
-    rest = rest / max(1.4826 * float(np.median(np.abs(rest[0]))), 1e-12)
-    cost = 2 * limit**2 * (np.sqrt(1 + (rest / limit) ** 2) - 1)
     names, block = np.unique(curve.group, return_inverse=True)
     if len(names) < _BLOCKS:
         block = np.arange(curve.t.size) * 20 // curve.t.size
-    blocks = np.stack([np.bincount(block, c) for c in cost])
+    many = int(block.max()) + 1
     rng = np.random.default_rng(0)
-    weight = rng.multinomial(blocks.shape[1], np.full(blocks.shape[1], 1 / blocks.shape[1]), count)
-    best = np.argmin(blocks @ weight.T, axis=0)
+    weight = rng.multinomial(many, np.full(many, 1 / many), count).astype(float)
+    # residuals over the errors that make the best solution fit
+    if linearised is None:
+        rest = np.array([(s.model - curve.magnitude) * root for s in solutions])
+        rest = rest / _scale_of(rest[0])
+        blocks = np.stack([np.bincount(block, c) for c in _robust_cost(rest, limit)])
+        cost = blocks @ weight.T
+    else:
+        scale = _scale_of(linearised[0].residuals)
+        cost = np.stack([_refitted_cost(x, block, weight, scale, limit) for x in linearised])
+    best = np.argmin(cost, axis=0)
     return float(np.mean(np.array(classes)[best] == classes[0]))
+
+
+def _scale_of(residuals: np.ndarray) -> float:
+    return max(1.4826 * float(np.median(np.abs(residuals))), 1e-12)
+
+
+def _robust_cost(residuals: np.ndarray, limit: float) -> np.ndarray:
+    squared = residuals**2
+    return 2 * squared / (1 + np.sqrt(1 + squared / limit**2))
+
+
+def _refitted_cost(
+    solution: Linearised, block: np.ndarray, weight: np.ndarray, scale: float, limit: float
+) -> np.ndarray:
+    """Costs (r,) of a solution fitted again to blocks of points with ``weight`` (r, blocks)."""
+    residuals, derivatives = solution.residuals / scale, solution.derivatives / scale
+    robust = 1 / np.sqrt(1 + (residuals / limit) ** 2)
+    many = weight.shape[1]
+    # The normal equations are sums over blocks: those of a resampled light curve cost a sum of
+    # ``many`` matrices, not another pass over the points.
+    weighted = derivatives * robust[:, None]
+    parts = [block == k for k in range(many)]
+    matrices = np.array([weighted[part].T @ derivatives[part] for part in parts])
+    rights = np.array([weighted[part].T @ residuals[part] for part in parts])
+    total = matrices.sum(0) + solution.prior
+    # offsets of nights that were not drawn are not determined
+    jitter = 1e-9 * np.diag(np.diag(total))
+    matrix = np.einsum("rb,bij->rij", weight, matrices) + solution.prior + jitter
+    # At the best fit of all points the priors pull as the data do, in the opposite direction.
+    pull = rights.sum(0)
+    step = -np.linalg.solve(matrix, (weight @ rights - pull)[..., None])[..., 0]
+    cost = np.array(
+        [
+            _robust_cost(residuals[part][:, None] + derivatives[part] @ step.T, limit).sum(0)
+            for part in parts
+        ]
+    )
+    cost = np.einsum("rb,br->r", weight, cost)
+    return cost + np.einsum("ri,ij,rj->r", step, solution.prior, step) - 2 * step @ pull
 
 
 # The search. Its cost is dominated by light curves of trial bodies, so that most bodies are
@@ -281,6 +333,8 @@ def fit_light_curve(
     seed: int = 0,
     max_solutions: int = 12,
     convex: bool | None = None,
+    start: Sequence[Solution] | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> LightCurveFit:
     """All tumbling ellipsoids, of free inertia, that explain a light curve; no starting guess.
 
@@ -299,8 +353,12 @@ def fit_light_curve(
     None: of a calibrated curve with eight groups or more it is estimated from the best motion, and
     all are fitted again with it. ``limit``: residuals beyond as many sigma count by their size,
     not their square. Needs float64 (``jax_enable_x64``).
+    ``start``: solutions of an earlier fit, such as one to fewer nights. They are fitted to this
+    light curve first and count as a search; ``searches=0`` adds no other. ``progress`` is called
+    with a few words on what is done next.
 
-    Raises RuntimeError in float32, ValueError for a light curve without directions.
+    Raises RuntimeError in float32, ValueError for a light curve without directions, and for
+    ``searches`` below 1, or 0 with ``start``.
     """
     # JAX adds its settings when it runs, which its types do not tell
     if not jax.config.jax_enable_x64:  # pyright: ignore[reportAttributeAccessIssue]
@@ -308,6 +366,10 @@ def fit_light_curve(
             "fits of light curves need float64: jax.config.update('jax_enable_x64', True)."
         )
     curve._known_directions()
+    if searches < (0 if start else 1):
+        raise ValueError(f"searches must be at least 1, or 0 with a start, got {searches}.")
+    say = progress or (lambda words: None)
+    say("searching pairs of frequencies")
     curve = curve.with_errors(floor)
     points = curve.points(floor, offset_sigma)
     if phase is None:
@@ -323,7 +385,16 @@ def fit_light_curve(
     key = jax.random.key(seed)
     rough, problem = Problem(phase, _subsample(points, _FEW)), Problem(phase, points)
     state, reproduced = None, False
-    for _ in range(searches):
+    if start:
+        say(f"fitting {len(start)} earlier solutions")
+        bodies = select_padded(bodies_of(start, float(curve.t[0]), phase), np.arange(len(start)))
+        state = problem.start(bodies, np.full(len(bodies.wxyz), _WIDE))
+        state = _improve_best(problem, state, pairs.resolution, BATCH, limit, 30)
+        state = _with_poles(jax.random.fold_in(key, 2), state, rough, problem, pairs.resolution)
+        # the best of the earlier solutions was found by searches of its own
+        reproduced = searches == 0 and _is_best(start[0], state, pairs.resolution)
+    for k in range(searches):
+        say(f"search {k + 1} of at most {searches}: {len(meant.f_phi)} pairs of periods")
         key, search_key = jax.random.split(key)
         result = _search_once(
             search_key, meant, trials, starts, rough, problem, _blur(curve), pairs.resolution
@@ -335,6 +406,7 @@ def fit_light_curve(
         if reproduced and state.cost.min() < REACHED * freedom:
             break
     assert state is not None
+    say("fitting the best motions to all points")
     state = _with_poles(jax.random.fold_in(key, 1), state, rough, problem, pairs.resolution)
     state = _improve_best(problem, state, pairs.resolution, BATCH, limit, 60)
     if offset_sigma is None and curve.calibrated and len(curve.names) >= _GROUPS:
@@ -354,23 +426,34 @@ def fit_light_curve(
     mirrored = problem.improve(problem.start(images, width), width, 30)
     state = _concatenate(state, mirrored)
     order = _distinct_solutions(state, pairs.resolution, max(max_solutions, BATCH))
-    solutions, scale, alike = describe_solutions(problem, state, order, curve, normals, limit)
+    described = describe_solutions(problem, state, order, curve, normals, limit)
+    say("fitting noise alone and one period")
     linear, nulls = null_models(curve, pairs, offset_sigma, phase, limit)
-    ellipsoids = solutions[:1]
+    ellipsoids = described.solutions[:1]
     if convex is None:
         convex = change_of_directions(curve) >= FIXED
     if convex:
+        say(f"fitting convex shapes to {len(described.solutions)} motions")
         exact = curve.points(0.0, offset_sigma)  # without the floor
-        solutions, scale, alike = refined_solutions(solutions, linear, exact, phase, limit)
+        described = refined_solutions(described.solutions, linear, exact, phase, limit)
+    solutions, scale, alike, linearised = described
     solutions = solutions[: max(max_solutions, sum(s.probability > EXCLUDED for s in solutions))]
     notes = notes_on(curve, solutions, scale, alike) + pairs.warnings()
+    notes += notes_on_groups(curve, solutions[0].model - curve.magnitude, alike)
     if not reproduced:
         notes += (
             "No second search found the best motion again: better ones may have been missed. Ask"
             " for more trials or searches.",
         )
     judgement = judge(
-        linear, nulls, pairs, solutions, reproduced=reproduced, limit=limit, others=ellipsoids
+        linear,
+        nulls,
+        pairs,
+        solutions,
+        reproduced=reproduced,
+        limit=limit,
+        others=ellipsoids,
+        linearised=linearised[: len(solutions)],
     )
     return LightCurveFit(
         solutions,
@@ -387,6 +470,7 @@ def fit_light_curve(
         judgement.models,
         judgement.misfit,
         judgement.agreement,
+        phase,
     )
 
 
@@ -500,6 +584,16 @@ def _searches_agree(one: State, other: State, resolution: float) -> bool:
         for j in (0, 1)
     ]
     return all(x.any() for x in same_motion)
+
+
+def _is_best(solution: Solution, state: State, resolution: float) -> bool:
+    """Whether the best body of a state has the periods and the mode of a solution."""
+    f_phi, f_psi, mode = frequencies(select(state.bodies, [int(np.argmin(state.cost))]))
+    return bool(
+        mode[0] == int(solution.mode)
+        and abs(f_phi[0] - 1 / solution.P_phi) < 0.5 * resolution
+        and abs(f_psi[0] - 1 / solution.P_psi) < 0.5 * resolution
+    )
 
 
 def _concatenate(*states: State) -> State:

@@ -56,7 +56,7 @@ class Linear:
         if curve.sun is not None and np.ptp(curve.alpha) > np.radians(1):
             columns = np.vstack([columns, curve.alpha, curve.alpha**2])
             stiffness = np.r_[stiffness, 0.0, 0.0]
-        self.columns = columns
+        self.columns, self.stiffness = columns, stiffness
         self.root = 1 / curve.sigma
         # rows of the priors below those of the points
         prior = np.diag(np.sqrt(stiffness))[stiffness > 0]

@@ -69,7 +69,7 @@ def normal_equations(phase, bodies: Bodies, offsets, points: Points, limit):
     weighted = whole * weight[:, None]
     matrix = jnp.einsum("bin,bjn->bij", weighted, whole)
     right = jnp.einsum("bin,bn->bi", weighted, rest)
-    return cost, matrix, right, jnp.sum(rest * rest * points.weight, -1), (value, robust)
+    return cost, matrix, right, jnp.sum(rest * rest * points.weight, -1), (value, robust, whole)
 
 
 normal_equations = jax.jit(normal_equations, static_argnums=0)
@@ -106,6 +106,12 @@ class Problem:
             )
             parts.append([np.asarray(x) for x in out[:4]])
         cost, matrix, right, square = (np.concatenate(x) for x in zip(*parts))
+        prior_cost, prior_matrix, prior_right = self.prior(bodies, offsets)
+        cost, matrix, right = cost + prior_cost, matrix + prior_matrix, right + prior_right
+        return State(bodies, offsets, np.nan_to_num(cost, nan=np.inf), matrix, right, square)
+
+    def prior(self, bodies: Bodies, offsets: np.ndarray):
+        """Cost (b,), and matrix (u, u) and right side (b, u), of what is known before."""
         rows, targets, precision = self.priors
         many = bodies.unknowns.shape[1]
         x = np.concatenate([bodies.unknowns, np.zeros((len(offsets), 3)), offsets], axis=1)
@@ -114,10 +120,12 @@ class Problem:
         # have stiffness 0, and the jitter of `_solve_damped` alone.
         soft = np.zeros(x.shape[1])
         soft[many + 3 :] = self.stiffness
-        cost = cost + (rest**2 * precision).sum(1) + (x**2 * soft).sum(1)
-        matrix = matrix + (rows.T * precision) @ rows + np.diag(soft)
-        right = right + (rest * precision) @ rows + x * soft
-        return State(bodies, offsets, np.nan_to_num(cost, nan=np.inf), matrix, right, square)
+        cost = (rest**2 * precision).sum(1) + (x**2 * soft).sum(1)
+        return (
+            cost,
+            (rows.T * precision) @ rows + np.diag(soft),
+            (rest * precision) @ rows + x * soft,
+        )
 
     def start(self, bodies: Bodies, limit: np.ndarray) -> State:
         """With the offsets that fit best."""

@@ -1,5 +1,6 @@
 """Solutions of a light curve, their uncertainties, and their refinement with a convex shape."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -7,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from polhode import rotation
-from polhode._closed_forms import Mode, principal_periods
+from polhode._closed_forms import Mode, free_motion, principal_periods
 from polhode.lightcurve._brightness import (
     AbstractPhase,
     Bodies,
@@ -36,6 +37,15 @@ FIXED = 5.0  # deg: directions that change by less are one geometry
 EXCLUDED = 1e-3  # odds of a solution below which it is
 
 
+# Quantities of ``Solution.covariance``, in its order.
+COVARIANCE_OF = (
+    "P_phi",
+    "P_psi",
+    *(f"moments[{k}]" for k in range(3)),
+    *(f"momentum_{x}" for x in "xyz"),
+)
+
+
 class Solution(NamedTuple):
     """A body that explains a light curve. Body axes: those of its shape and inertia."""
 
@@ -62,6 +72,9 @@ class Solution(NamedTuple):
     # (k,) of the logarithm of the surface density over that of the ellipsoid; None: an ellipsoid
     harmonics: np.ndarray | None = None
     parameters: float = 10.0  # that the points determine, besides offsets and phase function
+    epoch: float = 0.0  # time of ``wxyz`` and ``omega_body``, the first of the light curve
+    # (8, 8) of P_phi, P_psi, moments (3) and the direction of the momentum in space (3)
+    covariance: np.ndarray | None = None
 
     @property
     def P_phi_short_axis(self) -> float:
@@ -99,6 +112,7 @@ class LightCurveFit(NamedTuple):
     models: tuple[Model, ...]  # null hypotheses first, and their evidence
     misfit: float  # residuals of the best over the errors of the points, without the floor
     agreement: float  # part of resampled light curves in which the best periods stay the best
+    phase: AbstractPhase | None = None  # phase function of the ellipsoids
 
     @property
     def best(self) -> Solution:
@@ -165,12 +179,35 @@ def derivatives_of_derived(bodies: Bodies) -> np.ndarray:
     return np.asarray(_derivatives_of_derived(x, jnp.asarray(wxyz)))
 
 
-def describe_solutions(problem: Problem, state: State, order, curve: LightCurve, normals, limit):
-    """Solutions, the residuals of the best over the errors assumed, and how alike they are."""
+class Linearised(NamedTuple):
+    """Residuals of a solution over their errors, and their first-order model; offsets included.
+
+    The cost after a step x of the unknowns is that of ``residuals + derivatives @ x``, and of
+    what is known before ``x @ prior @ x`` plus a linear term that balances the data at x = 0.
+    """
+
+    residuals: np.ndarray  # (n,)
+    derivatives: np.ndarray  # (n, u)
+    prior: np.ndarray  # (u, u)
+
+
+class Described(NamedTuple):
+    """Solutions, the best first, and what their residuals say."""
+
+    solutions: tuple[Solution, ...]
+    scale: float  # residuals of the best over the errors assumed
+    alike: float  # so many neighbouring residuals count as one
+    linearised: tuple[Linearised, ...]  # of each solution
+
+
+def describe_solutions(
+    problem: Problem, state: State, order, curve: LightCurve, normals, limit: float
+) -> Described:
+    """The bodies ``order`` of a state as solutions with errors."""
     n = curve.t.size
     index = np.pad(order, (0, -len(order) % BATCH), mode="edge")
     chosen = select(state, index)
-    _, _, _, _, (value, robust) = normal_equations(
+    _, _, _, _, (value, robust, derivatives) = normal_equations(
         problem.phase,
         jax.tree.map(jnp.asarray, chosen.bodies),
         jnp.asarray(chosen.offsets),
@@ -180,6 +217,12 @@ def describe_solutions(problem: Problem, state: State, order, curve: LightCurve,
     model = np.asarray(value + chosen.offsets @ problem.points.columns)[:, :n]
     robust, weight = np.asarray(robust)[:, :n], np.asarray(problem.points.weight)[:, :n]
     rest = model - curve.magnitude
+    root = np.sqrt(weight[0])
+    _, prior, _ = problem.prior(chosen.bodies, chosen.offsets)
+    derivatives = np.asarray(derivatives)[: len(order), :, :n]
+    linearised = tuple(
+        Linearised(rest[k] * root, (derivatives[k] * root).T, prior) for k in range(len(order))
+    )
     freedom = max(n - chosen.matrix.shape[1] + int((problem.stiffness > 0).sum()), 1)
     scale = float(np.sqrt((robust[0] * weight[0] * rest[0] ** 2).sum() / freedom))
     alike = effective_correlation(curve, np.sqrt(robust[0] * weight[0]) * rest[0])
@@ -229,9 +272,17 @@ def describe_solutions(problem: Problem, state: State, order, curve: LightCurve,
                 model[k],
                 robust[k],
                 mirror[0] if mirror else None,
+                epoch=float(curve.t[0]),
+                covariance=_of_periods(spread, f_phi[k], f_psi[k]),
             )
         )
-    return tuple(out), scale, alike
+    return Described(tuple(out), scale, alike, linearised)
+
+
+def _of_periods(covariance: np.ndarray, f_phi: float, f_psi: float) -> np.ndarray:
+    """A covariance of ln P_phi, ln P_psi, ... as one of the periods themselves."""
+    size = np.r_[1 / f_phi, 1 / f_psi, np.ones(len(covariance) - 2)]
+    return covariance * size * size[:, None]
 
 
 def effective_correlation(curve: LightCurve, residuals: np.ndarray) -> float:
@@ -327,6 +378,51 @@ def notes_on(curve: LightCurve, solutions, scale: float, alike: float) -> tuple[
     return tuple(notes)
 
 
+# A night whose comparison star varies, or whose errors are too small, by its residuals.
+
+_TREND = 5.0  # standard deviations of the slope of a night's residuals from which it is named
+_NOISY = 2.0  # scatter of a night over that of the others from which it is named
+_NIGHT_POINTS = 8  # points of a night below which it is not judged
+
+
+def notes_on_groups(curve: LightCurve, residuals: np.ndarray, alike: float) -> tuple[str, ...]:
+    """Names of the groups whose residuals (n,) [mag] have a trend, or scatter too much.
+
+    The residuals are those of the best body. A slope counts in standard deviations that follow from
+    the scatter of all groups and from how many neighbours count as one, ``alike``.
+    """
+    weighted = residuals / curve.sigma
+    scale = 1.4826 * max(float(np.median(np.abs(weighted))), 1e-12)
+    trends, noisy = [], []
+    for k, name in enumerate(curve.names):
+        own = curve.group == k
+        if own.sum() < _NIGHT_POINTS or np.ptp(curve.t[own]) == 0:
+            continue
+        weight = curve.sigma[own] ** -2.0
+        t, value = curve.t[own], residuals[own]
+        t = t - np.average(t, weights=weight)
+        value = value - np.average(value, weights=weight)
+        slope = np.sum(weight * t * value) / np.sum(weight * t**2)
+        error = scale * np.sqrt(alike / np.sum(weight * t**2))
+        if abs(slope) > _TREND * error:
+            trends.append(f"{name} ({slope * np.ptp(t):+.2f} mag)")
+        left = (value - slope * t) / curve.sigma[own]
+        if 1.4826 * np.median(np.abs(left - np.median(left))) > _NOISY * scale:
+            noisy.append(name)
+    notes = []
+    if trends:
+        notes.append(
+            f"The residuals of group(s) {', '.join(trends[:5])} have a trend from the first point"
+            " to the last: a comparison star may vary, or the extinction is not corrected."
+        )
+    if noisy:
+        notes.append(
+            f"The residuals of group(s) {', '.join(noisy[:5])} scatter by more than"
+            f" {_NOISY:g} times those of the others: give these points larger errors."
+        )
+    return tuple(notes)
+
+
 # Bodies refined with a convex shape: an ellipsoid's surface density times spherical harmonics.
 #
 # An ellipsoid fitted to a body of another shape biases the periods by several of its own standard
@@ -352,6 +448,7 @@ class Refined(NamedTuple):
     covariance: np.ndarray  # (8, 8) of inertia, rates and turn, for unit errors
     values: np.ndarray  # residuals (n,) [mag], model less data
     parameters: float  # that the points determine
+    linearised: Linearised
 
 
 @jax.jit
@@ -501,7 +598,19 @@ def refine(
         inverse[:8, :8],
         rest[:n] / linear.root,
         float(np.trace(inverse @ data)),
+        _linearised(rest[:n], slopes * linear.root[:, None], matrix - data, linear),
     )
+
+
+def _linearised(
+    residuals: np.ndarray, derivatives: np.ndarray, prior: np.ndarray, linear: Linear
+) -> Linearised:
+    """With the offsets, and the other columns of ``linear``, as further unknowns."""
+    many, columns = derivatives.shape[1], (linear.columns * linear.root).T
+    full = np.zeros((many + columns.shape[1],) * 2)
+    full[:many, :many] = prior
+    full[many:, many:] = np.diag(linear.stiffness)
+    return Linearised(residuals, np.hstack([derivatives, columns]), full)
 
 
 def refined_solutions(
@@ -510,8 +619,8 @@ def refined_solutions(
     points: Points,
     phase: AbstractPhase,
     limit: float,
-) -> tuple[tuple[Solution, ...], float, float]:
-    """The solutions with convex shapes, the best first; scale and likeness of its residuals.
+) -> Described:
+    """The solutions with convex shapes, the best first.
 
     Errors of a period hold the spread of the other poles of the same periods, by their odds.
     """
@@ -534,7 +643,8 @@ def refined_solutions(
     for k in distinct:
         place = first.setdefault(roots[k], len(out))
         out.append(candidates[k]._replace(mirror_of=None if place == len(out) else place))
-    return _with_spread_of_poles(out, resolution), scale, alike
+    linearised = tuple(refined[order[k]].linearised for k in distinct)
+    return Described(_with_spread_of_poles(out, resolution), scale, alike, linearised)
 
 
 def rotating_body(
@@ -554,13 +664,32 @@ def rotating_body(
 
 
 def _body(solution: Solution) -> Bodies:
-    """As the model holds it."""
+    """The ellipsoid and the motion of a solution, as the model has them."""
     square = np.log(solution.moments.sum() / 2 - solution.moments) / 2
     axes = np.log(solution.axes)
     unknowns = np.r_[
         square[1:] - square[0], axes[1:] - axes[0], solution.omega_body, solution.coefficients
     ]
     return Bodies(unknowns[None], solution.wxyz[None])
+
+
+def bodies_of(solutions: Sequence[Solution], epoch: float, phase: AbstractPhase) -> Bodies:
+    """Bodies of earlier solutions, moved to ``epoch``, with the coefficients of ``phase``."""
+    many, parts = len(phase.typical), []
+    for each in solutions:
+        unknowns, wxyz = _body(each)
+        coefficients = each.coefficients if len(each.coefficients) == many else phase.typical
+        rates, attitude = free_motion(
+            moments_of(jnp.asarray(unknowns)),
+            tuple(jnp.asarray(wxyz[:, k]) for k in range(4)),
+            tuple(jnp.asarray(unknowns[:, k]) for k in (4, 5, 6)),
+            jnp.full((1, 1), epoch - each.epoch),
+        )
+        assert rates is not None  # neither was declined
+        assert attitude is not None
+        unknowns = np.r_[unknowns[0, :4], [float(x[0, 0]) for x in rates], coefficients]
+        parts.append(Bodies(unknowns[None], np.array([[float(x[0, 0]) for x in attitude]])))
+    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
 
 
 def _solution(
@@ -597,6 +726,8 @@ def _solution(
         weights=1 / np.sqrt(1 + (weighted / limit) ** 2),
         harmonics=refined.coefficients,
         parameters=refined.parameters,
+        epoch=float(linear.curve.t[0]),
+        covariance=_of_periods(spread, f_phi, f_psi),
     )
 
 
@@ -630,11 +761,14 @@ def _with_spread_of_poles(solutions: list[Solution], resolution: float) -> tuple
         same = classes == classes[k]
         weight = odds * same / max((odds * same).sum(), 1e-300)
         change = {}
-        for name in ("P_phi", "P_psi"):
+        covariance = None if s.covariance is None else s.covariance.copy()
+        for i, name in enumerate(("P_phi", "P_psi")):
             period = getattr(s, name)
             apart = np.array([getattr(x, name) for x in solutions]) - period
             change[name + "_std"] = float(
                 np.sqrt(getattr(s, name + "_std") ** 2 + weight @ apart**2)
             )
-        out.append(s._replace(**change))
+            if covariance is not None:
+                covariance[i, i] = change[name + "_std"] ** 2
+        out.append(s._replace(**change, covariance=covariance))
     return tuple(out)

@@ -11,17 +11,20 @@ from polhode.plot._samples import matrices
 
 # chi-square of two degrees of freedom: 68 % and 95 % of a plane
 _LEVELS = {"68 %": 2.2957, "95 %": 5.9915}
+# Characters of a name, and rows of a table, that fit into the figure.
+_LONGEST, _ROWS = 18, 10
 
 
 @styled
 def fit(result: Any, recording: Any, *, body: int = 0, title: str = "") -> Any:
-    """Figure of a ``fit.Fit`` of an inertia and its ``fit.Recording``; returns it.
+    """Figure of a ``fit.Fit`` and its ``fit.Recording``; returns it.
 
     Left: rates of the first recording (dots) over the fitted motion (lines), and the residuals in
     units of their noise.
-    Right: the region of the two smaller ratios (or moments) that the data allow, the limit of what
-    a body can be, and a table of the results. ``body`` picks one of a batch. Raises ValueError for
-    a recording without rates.
+    Right, of an inertia: the region of the two smaller ratios (or moments) that the data allow, and
+    the limit of what a body can be; of a scene: the correlations of the fitted numbers. Below, a
+    table of the results. ``body`` picks one of a batch. Raises ValueError for a recording without
+    rates.
     """
     if recording.omega is None:
         raise ValueError("the figure of a fit needs a recording of rates, got attitudes alone.")
@@ -54,8 +57,12 @@ def fit(result: Any, recording: Any, *, body: int = 0, title: str = "") -> Any:
     for ax in rows:
         ax.margins(x=0.01)
         ax.label_outer()
-    _region(figure.add_subplot(right[0]), one)
-    _table(figure.add_subplot(right[1]), one)
+    if "correlation" in one:
+        _correlations(figure, figure.add_subplot(right[0]), one)
+        _scene_table(figure.add_subplot(right[1]), one)
+    else:
+        _region(figure.add_subplot(right[0]), one)
+        _table(figure.add_subplot(right[1]), one)
     if title:
         figure.suptitle(plain(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
     return figure
@@ -79,13 +86,21 @@ def _single(result, recording, body) -> dict[str, Any]:
     # a loss that bounds outliers has shortened their residuals: shown as they were fitted
     model = omega - residual * noise
     hole = np.where(present, 1.0, np.nan)[:, None]
-    moments, axes = pick(result.moments, 1), pick(result.axes, 1)
-    value, spread = result.principal_values
-    return {
+    shared = {
         "times": times,
         "omega": omega * hole,
         "model": model * hole,
         "residual": residual * hole,
+        "rms": float(pick(result.rms, 0)),
+        "chi": float(pick(result.noise, 0)),
+        "white": float(pick(result.whiteness, 0)),
+        "findings": result.findings(body),
+    }
+    if not hasattr(result, "moments"):  # a fit of a scene
+        return shared | _of_scene(result, body)
+    moments, axes = pick(result.moments, 1), pick(result.axes, 1)
+    value, spread = result.principal_values
+    return shared | {
         "value": pick(value, 1),
         "spread": pick(spread, 1),
         "axes_std": pick(result.axes_std, 1),
@@ -93,11 +108,61 @@ def _single(result, recording, body) -> dict[str, Any]:
             moments, axes, pick(result.covariance, 2), result.scale_known, result.model.entries
         ),
         "scale_known": result.scale_known,
-        "rms": float(pick(result.rms, 0)),
-        "chi": float(pick(result.noise, 0)),
-        "white": float(pick(result.whiteness, 0)),
-        "findings": result.findings(body),
     }
+
+
+def _of_scene(result, body: int) -> dict[str, Any]:
+    """Names, values, standard deviations and correlations of the fitted numbers of a scene."""
+    names, values, spreads = [], [], []
+    lead = np.ndim(result.diagnostics)
+    for name, value, std in zip(result.value_names, result.values, result.std, strict=True):
+        value, std = (np.asarray(x).reshape(-1, *np.shape(x)[lead:])[body] for x in (value, std))
+        for place in np.ndindex(value.shape):
+            names.append(name + "".join(f"[{k}]" for k in place))
+            values.append(value[place])
+            spreads.append(std[place])
+    sensors = [result.parameters.bias, result.parameters.mounting, result.parameters.lever]
+    first = sum(int(np.prod(np.shape(x)[lead:])) for x in sensors if x is not None)
+    covariance = np.asarray(result.covariance)
+    covariance = covariance.reshape(-1, *covariance.shape[-2:])[body]
+    own = slice(first, first + len(names))
+    covariance = covariance[own, own]
+    size = np.sqrt(np.maximum(np.diagonal(covariance), 0))
+    size = np.where(size > 0, size, 1)
+    return {
+        "names": names,
+        "value": np.array(values),
+        "spread": np.array(spreads),
+        "correlation": covariance / size / size[:, None],
+    }
+
+
+def _correlations(figure, ax, one):
+    """Matrix of the correlations of the fitted numbers."""
+    names = [name if len(name) <= _LONGEST else "..." + name[-_LONGEST:] for name in one["names"]]
+    picture = ax.imshow(one["correlation"], vmin=-1, vmax=1, cmap="RdBu_r")
+    ax.set_title("Correlations of the fitted numbers")
+    ax.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
+    ax.set_yticks(range(len(names)), names, fontsize=7)
+    ax.grid(visible=False)
+    figure.colorbar(picture, ax=ax, shrink=0.8)
+
+
+def _scene_table(ax, one):
+    """The numbers of a scene, and the findings."""
+    ax.set_axis_off()
+    rows = list(zip(one["names"], one["value"], one["spread"], strict=True))
+    lines = [f"{name[-_LONGEST:]:<20}{_rounded(value, std)}" for name, value, std in rows[:_ROWS]]
+    if len(rows) > _ROWS:
+        lines.append(f"... and {len(rows) - _ROWS} more")
+    lines += [
+        "",
+        f"residual rms   {one['rms']:.3g} rad/s",
+        f"over the noise {one['chi']:.3g}",
+        f"whiteness      p = {one['white']:.2g}",
+        "findings       " + (", ".join(one["findings"]) or "none"),
+    ]
+    _write_lines(ax, lines)
 
 
 def _of_values(moments, axes, covariance, scale_known, count) -> np.ndarray:
@@ -171,6 +236,10 @@ def _table(ax, one):
         "scale          " + ("known" if one["scale_known"] else "not shown by free motion"),
         "remarks        " + (", ".join(one["findings"]) or "none"),
     ]
+    _write_lines(ax, lines)
+
+
+def _write_lines(ax, lines: list[str]) -> None:
     ax.text(
         0.0,
         0.95,

@@ -1,0 +1,117 @@
+"""Results of fits as dictionaries, JSON, CSV and figures; what limits them."""
+
+import csv
+import json
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import polhode as ph
+from polhode import plot
+from polhode.fit import FitOptions, Gyroscope, Recording
+
+BODY = ph.Inertia.from_moments([1.0, 2.0, 2.5])
+STATE = ph.State([0.8, 0.0, 0.6, 0.0], [1.2, -0.8, 1.0])
+DRAG, NOISE, TIMES = np.array([0.1, 0.05, 0.2]), 0.01, np.linspace(0.0, 8.0, 25)
+
+
+@pytest.fixture(scope="module")
+def of_scene():
+    """Moments and drag, whose common size the rates do not show."""
+    scene = ph.Scene(BODY, torque=ph.LinearDamping(DRAG))
+    path = ph.simulate(scene, STATE, TIMES).omega_body
+    rates = path + NOISE * jax.random.normal(jax.random.key(3), path.shape)
+    data = Recording.of(TIMES, rates, omega_noise=NOISE)
+    options = FitOptions(max_starts=1, gyroscope=Gyroscope.ideal(), trust_noise=True)
+    free = lambda s: (s.inertia.diagonal, s.torque.c)  # noqa: E731
+    return ph.fit_scene(scene, data, free, rtol=1e-6, options=options), data
+
+
+@pytest.fixture(scope="module")
+def of_inertia():
+    times = np.linspace(0.0, 20.0, 60)
+    rates = ph.simulate(ph.Scene(BODY), STATE, times).omega_body
+    rates = rates + NOISE * jax.random.normal(jax.random.key(1), rates.shape)
+    return ph.fit_inertia(times, rates, omega_noise=NOISE)
+
+
+def test_values_have_the_names_of_the_scene(of_scene, of_inertia):
+    fit, _ = of_scene
+    assert fit.value_names == ["inertia.diagonal", "torque.c"]
+    assert "torque.c: " in fit.report()
+    assert fit.observability()[0].quantity == "inertia.diagonal (3)"
+    assert of_inertia.value_names == ["inertia"]
+
+
+def test_ratios_are_known_where_only_a_common_factor_is_not(of_scene):
+    fit, _ = of_scene
+    assert not np.any(np.isfinite(np.concatenate(fit.std)))
+    (first, moments, moments_std), (second, drag, drag_std) = fit.common_scale()
+    assert (first, second) == ("inertia.diagonal", "torque.c")
+    assert np.all(np.abs(moments - [0.4, 0.8, 1.0]) < 4 * moments_std + 1e-9)
+    assert np.all(np.abs(drag - DRAG / 2.5) < 4 * drag_std)
+    assert moments_std[2] == 0
+    assert 0 < drag_std.max() < 0.05
+    assert "ratios to the largest" in fit.report()
+    expected = fit.derived(lambda v: v[1] / v[0][2])
+    np.testing.assert_allclose(drag_std, expected[1])
+
+
+def test_the_result_as_json_and_csv(of_scene, of_inertia, tmp_path):
+    for fit, kind in ((of_scene[0], "scene"), (of_inertia, "inertia")):
+        fit.to_json(tmp_path / "fit.json")
+        document = json.loads((tmp_path / "fit.json").read_text())
+        assert document == json.loads(json.dumps(fit.to_dict()))
+        assert document["kind"] == kind
+        for name, value in zip(fit.value_names, fit.values, strict=True):
+            np.testing.assert_allclose(document["values"][name], value)
+        np.testing.assert_allclose(np.array(document["covariance"]), fit.covariance)
+        fit.to_csv(tmp_path / "fit.csv")
+        with (tmp_path / "fit.csv").open() as file:
+            rows = list(csv.DictReader(file))
+        numbers = [float(r["value"]) for r in rows if r["name"] == fit.value_names[0]]
+        np.testing.assert_allclose(numbers, np.ravel(fit.values[0]))
+    assert document["scale_known"] is False
+    assert document["moments_std"] == [None] * 3
+    assert {"inertia", "moments", "ratios", "gain"} <= {r["name"] for r in rows}
+    # what the data do not show has no standard deviation
+    assert all(r["std"] == "" for r in rows if r["name"] == "moments")
+
+
+def test_what_limits_a_fit_is_said(of_scene, of_inertia):
+    fit, _ = of_scene
+    assert fit.limit().startswith("the motion, which does not show all unknowns")
+    assert fit.to_dict()["limit"] == fit.limit()
+    # scale factors known to 1 % limit this recording of 0.01 rad/s
+    part = of_inertia._calibration_part(0)
+    assert of_inertia.limit().startswith(f"the calibration of the gyroscope ({part:.0%}")
+    assert 0.5 < part <= 1
+    # with the covariance of an exact calibration the noise does
+    matrix = np.array(of_inertia.covariance)
+    own, gain = slice(0, 6), slice(6, 15)
+    side = matrix[own, gain]
+    matrix[own, own] -= side @ np.linalg.pinv(matrix[gain, gain], hermitian=True) @ side.T
+    matrix[own, gain], matrix[gain, own] = 0, 0
+    exact = eqx.tree_at(lambda f: f.covariance, of_inertia, jnp.asarray(matrix))
+    assert exact.limit().startswith("the noise of the readings")
+    wrong = eqx.tree_at(
+        lambda f: f.diagnostics, of_inertia, jnp.asarray(int(ph.fit.Finding.NOT_WHITE))
+    )
+    assert wrong.limit() == "the model, which does not explain the readings (not white)"
+
+
+def test_a_figure_of_a_fitted_scene(of_scene):
+    pytest.importorskip("matplotlib")
+    figure = plot.fit(*of_scene, title="damping")
+    titles = [ax.get_title(loc=where) for ax in figure.axes for where in ("left", "center")]
+    assert "Correlations of the fitted numbers" in titles
+    assert "Residuals over noise, lines at twice their spread" in titles
+    (picture,) = (ax.images[0] for ax in figure.axes if ax.images)
+    matrix = np.asarray(picture.get_array())
+    assert matrix.shape == (6, 6)
+    np.testing.assert_allclose(np.diagonal(matrix), 1)
+    text = [t.get_text() for ax in figure.axes for t in ax.texts]
+    assert any("torque.c[2]" in x and "not determined" in x for x in text)
