@@ -73,6 +73,7 @@ from ._closed_forms import (
 from ._integrate import (
     LiePoisson as LiePoisson,
     EulerAngles as EulerAngles,
+    CoarseSteps as CoarseSteps,
     Extrapolation as Extrapolation,
     FlowAdjoint as FlowAdjoint,
 )

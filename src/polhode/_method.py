@@ -152,6 +152,10 @@ class AbstractMethod(eqx.Module):
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         """Samples at ``ts`` (T,) or (N, T) of lanes whose state holds at the first time."""
 
+    def steps_of(self, scene: Scene, state: State, ts: Array, record: Record) -> str:
+        """Description of the steps for N lanes, for ``ph.explain``; empty for a closed form."""
+        return ""
+
     def search(
         self, scene: Scene, state: State, ts: Array, rtol: Array, search: Any, final_only: bool
     ) -> Any:

@@ -88,7 +88,8 @@ def choose(scene: Scene, rtol: Array | float = 1e-9) -> tuple[AbstractMethod, st
         )
         compensated = _is_below(rtol, _policy.COMPENSATED_STEPS * eps, scene)
         also = ", its rounding carried along: it would miss rtol" if compensated else ""
-        return _stepped(_has_axis(scene), compensated), reason + also
+        low_order = not _is_below(rtol, _policy.LOW_ORDER_RTOL, scene)
+        return _stepped(_has_axis(scene), compensated, low_order), reason + also
     general = scene.is_free and scene.inertia.symmetry is Symmetry.NONE
     if general and _is_below(rtol, _policy.COMPENSATED_PHASES * eps, scene):
         also = ", its frequencies in sums of two floats: a rounded phase would miss rtol"
@@ -106,11 +107,13 @@ _COMPENSATED = ClosedForm(compensated=True)
 
 
 @functools.cache
-def _stepped(upright: bool, compensated: bool) -> AbstractMethod:
+def _stepped(upright: bool, compensated: bool, low_order: bool) -> AbstractMethod:
     # here, so that diffrax loads with the first scene that is integrated
     from polhode._integrate import Automatic, LiePoisson, LiePoissonChart
 
-    return LiePoisson(Automatic(None, compensated), chart=LiePoissonChart(upright))
+    return LiePoisson(
+        Automatic(None, compensated, low_order=low_order), chart=LiePoissonChart(upright)
+    )
 
 
 def _is_below(rtol: Array | float, limit: float, scene: Scene) -> bool:
@@ -157,8 +160,9 @@ def plan(
         method, reason = choose(scene, rtol)
         if not method.exact:
             _, refused = choose_closed_form(scene)
-            reason = f"{reason}; {_steps(method, scene, state, ts, record)}"
         narrower = _narrower(scene)
+    steps = "" if method.exact else _steps(method, scene, state, ts, record)
+    reason = f"{reason}; {steps}" if steps else reason
     parts = (getattr(scene, name) for name in PARTS)
     bodies = int(np.prod(common_batch(*parts, state, extra=(ts.shape[:-1],)), dtype=int))
     samples = 1 if record.final_only else ts.shape[-1]

@@ -1,5 +1,6 @@
 """Kinks and jumps of a field: found in its program, ended at, and passed by derivatives."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,9 @@ from scipy.integrate import solve_ivp
 
 import polhode as ph
 from polhode._integrate import Automatic
+from polhode._integrate._explicit_step import dense_of, dense_state
 from polhode._integrate._switches import switched
+from polhode._integrate._tableau import TSIT5
 from polhode._kernels import smooth
 
 MOMENTS = np.array([1.0, 1.5, 2.0])
@@ -242,3 +245,80 @@ def test_switches_that_change_the_sides_of_others():
     scene = ph.Scene(ph.Inertia.spherical(1.0), None, ph.FeedbackTorque(law))
     found = ph.simulate(scene, ph.State(WXYZ, [0.0, 0.0, 1.0]), [0.0, 4.0, 8.0])
     np.testing.assert_allclose(found.omega_body[1:, 2], [0.6, 0.2], atol=1e-9)
+
+
+WEIGHTS = jax.random.normal(jax.random.key(0), (24, 3)), jax.random.normal(jax.random.key(1), (24,))
+
+
+def by_network(scale, rtol, method=None):
+    """The last state under a network of 24 relu, the weights of which have a common factor."""
+
+    def law(t, wxyz, omega):
+        hidden = jax.nn.relu(WEIGHTS[0] @ (3 * omega) + WEIGHTS[1])
+        return -0.02 * scale * WEIGHTS[0].T @ hidden
+
+    scene = ph.Scene(INERTIA, torque=ph.FeedbackTorque(law))
+    state = ph.State(WXYZ, OMEGA)
+    plan = ph.explain(scene, state, [0.0, 5.0], method, rtol=rtol)
+    return ph.simulate(scene, state, [0.0, 5.0], method, rtol=rtol).last.omega_body[2], plan
+
+
+@pytest.mark.slow
+def test_many_switches_are_passed_by_steps_of_lower_order():
+    """From 1e-7 on, where order 8 would take more evaluations for the same number of steps."""
+    want, gradient = (f(lambda s: by_network(s, 1e-11)[0])(1.0) for f in (lambda f: f, jax.grad))
+    for rtol, order in ((1e-5, 5), (1e-8, 8)):
+        value, plan = by_network(1.0, rtol)
+        assert f"steps of order {order}, each ending" in str(plan)
+        assert abs(value - want) < 2 * rtol
+        found = jax.grad(lambda s, rtol=rtol: by_network(s, rtol)[0])(1.0)
+        assert abs(found - gradient) < 5 * rtol * abs(gradient)
+
+
+@pytest.mark.slow
+def test_coarse_steps_pass_switches():
+    """The state keeps rtol, the gradient an error of about its square root."""
+    coarse = ph.CoarseSteps()
+
+    def loss(scale):
+        return by_network(scale, 1e-5, coarse)[0]
+
+    fine, low, high = (by_network(scale, 1e-9)[0] for scale in (1.0, 0.999, 1.001))
+    assert 1e-9 < abs(loss(1.0) - fine) < 1e-4
+    np.testing.assert_allclose(jax.grad(loss)(1.0), (high - low) / 0.002, rtol=0.05)
+
+
+def test_coarse_steps_say_what_they_are():
+    """What is not theirs is refused."""
+    coarse, state, ts = ph.CoarseSteps(), ph.State(WXYZ, OMEGA), [0.0, 1.0]
+
+    def scene(limit):
+        law = ph.FeedbackTorque(lambda t, wxyz, omega: jnp.clip(-omega, -limit, limit))
+        return ph.Scene(INERTIA, torque=law)
+
+    plan = str(ph.explain(scene(0.2), state, ts, coarse))
+    assert "6 switches" in plan
+    assert "sqrt(rtol)" in plan
+
+    def loss(limit):
+        return ph.simulate(scene(limit), state, ts, coarse).last.omega_body[2]
+
+    with pytest.raises(NotImplementedError, match=r"leave method=ph\.CoarseSteps"):
+        jax.hessian(loss)(0.2)
+    event = ph.Event(lambda wxyz, omega, t: omega[2] - 0.8)
+    with pytest.raises(ValueError, match="does not search for events"):
+        ph.simulate(scene(0.2), state, ts, coarse, events=event)
+
+
+def test_the_rule_of_lower_order():
+    """The coefficients of diffrax, and dense output that is exact for what the rule solves."""
+    tableau = diffrax.Tsit5.tableau
+    for i, row in enumerate(tableau.a_lower):
+        np.testing.assert_array_equal(TSIT5.weights[i + 1, : len(row)], row)
+    np.testing.assert_array_equal(TSIT5.nodes[1:], tableau.c)
+    np.testing.assert_array_equal(TSIT5.errors[0], tableau.b_error)
+    x, h = jnp.linspace(0.0, 1.0, 11), 0.7
+    rates = jnp.asarray((TSIT5.nodes * h) ** 3)[:, None, None]
+    dense = dense_of(jnp.array([h]), rates, TSIT5)
+    found = jnp.stack([dense_state(jnp.zeros((1, 1)), dense, x[None, i])[0, 0] for i in range(11)])
+    np.testing.assert_allclose(found, (x * h) ** 4 / 4, atol=1e-14)

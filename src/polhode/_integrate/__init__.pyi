@@ -15,6 +15,7 @@ from ._flow_adjoint import FlowAdjoint as FlowAdjoint
 from ._loop import Search as Search
 from ._stepped import (
     AbstractIntegration as AbstractIntegration,
+    CoarseSteps as CoarseSteps,
     EulerAngles as EulerAngles,
     LiePoisson as LiePoisson,
 )

@@ -1,7 +1,7 @@
-"""One step of the explicit Runge-Kutta method DOP853, of several bodies side by side.
+"""One step of an explicit Runge-Kutta rule, of several bodies side by side.
 
 The stages are a loop, so that the field stands in the compiled program once. Coefficients:
-``_dop853.py``.
+``_tableau.py``.
 """
 
 from collections.abc import Callable
@@ -12,14 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polhode._integrate._dop853 import DENSE, DENSE_STAGES, NODES, STAGES, WEIGHTS
+from polhode._integrate._tableau import Tableau
 from polhode._kernels import any_of
-
-MARGIN_STAGES = (0, 3, 6, 5, 9, 10, 12)
-"""Stages in order of time, the margins of which are inspected for switches."""
-
-MARGIN_NODES = tuple(float(NODES[k]) for k in MARGIN_STAGES)
-"""Where these lie in the step."""
 
 
 class Motion(NamedTuple):
@@ -30,7 +24,7 @@ class Motion(NamedTuple):
     ``levels(arguments, t, y)``: the levels at a point; ``units(unit_data, y, rates)``: weights of
     the components of an error, the squares of which are summed, and natural rates [rad/s] (B,). The
     last ``events`` of the K ``switches`` are events; ``jumps``: whether the rates may jump at one
-    of the others."""
+    of the others; ``rule``: of the steps."""
 
     rates: Callable[..., tuple[Array, Array, Array]]
     levels: Callable[..., Array]
@@ -38,6 +32,7 @@ class Motion(NamedTuple):
     coefficients: Any
     arguments: Any
     unit_data: Any
+    rule: Tableau
     switches: int
     events: int = 0
     jumps: bool = True
@@ -76,9 +71,9 @@ class Progress(NamedTuple):
 class Attempt(NamedTuple):
     """A step that may be refused.
 
-    ``h`` (B,): signed width; ``stages`` (16, D, B): rates; ``margins`` (16, K, B); ``new_levels``
-    (K, B): to which switches would turn at the start; ``depths`` (5, K, B): of turning points of
-    the margins; ``dense`` (7, D, B): coefficients of dense output, valid where it was requested."""
+    ``h`` (B,): signed width; ``stages`` (S, D, B): rates; ``margins`` (S, K, B); ``new_levels``
+    (K, B): to which switches would turn at the start; ``depths`` (M, K, B): of turning points of
+    the margins; ``dense`` (7 or 4, D, B): coefficients of dense output, valid where requested."""
 
     h: Array
     stages: Array
@@ -96,10 +91,10 @@ def attempt_step(
 
     Both phases, the stages of the step and those of dense output, are turns of one loop, so that
     the field stands in the program once."""
-    dtype = progress.y.dtype
-    table, nodes = jnp.asarray(WEIGHTS, dtype), jnp.asarray(NODES, dtype)
-    stages = _padded(progress.rate)
-    margins = _padded(progress.margin)
+    dtype, rule = progress.y.dtype, motion.rule
+    table, nodes = jnp.asarray(rule.weights, dtype), jnp.asarray(rule.nodes, dtype)
+    stages = _padded(progress.rate, rule)
+    margins = _padded(progress.margin, rule)
     events = motion.switches > 0
 
     def stage(i, found):
@@ -114,34 +109,36 @@ def attempt_step(
 
     def phase(number, found):
         *some, depths, inside = found
-        more = jnp.where(inside, DENSE_STAGES, STAGES)
+        more = jnp.where(inside, rule.dense_stages, rule.stages)
         first = jnp.where(any_of(jnp.where(progress.needs_rates, 1.0, 0.0)), 0, 1)
-        begin, end = jnp.where(number == 0, first, STAGES), jnp.where(number == 0, STAGES, more)
+        begin = jnp.where(number == 0, first, rule.stages)
+        end = jnp.where(number == 0, rule.stages, more)
         some = jax.lax.fori_loop(begin, end, stage, tuple(some))
         if events:
-            depths = jnp.where(number == 0, _depths(margin_samples(some[1])), depths)
-            inside = inside | any_of(_is_near(some[1], depths))
+            depths = jnp.where(number == 0, _depths(margin_samples(some[1], rule), rule), depths)
+            inside = inside | any_of(_is_near(some[1], depths, rule))
         return *some, depths, inside
 
     inside = any_of(jnp.where(needs_dense, 1.0, 0.0)) if not motion.events else jnp.ones((), bool)
     depths = (
-        jnp.ones((len(MARGIN_STAGES) - 2, *progress.levels.shape), dtype)
+        jnp.ones((len(rule.margin_stages) - 2, *progress.levels.shape), dtype)
         if events
         else progress.levels
     )
     found = jax.lax.fori_loop(0, 2, phase, (stages, margins, progress.levels, depths, inside))
     stages, margins, new_levels, depths, inside = found
-    return Attempt(h, stages, margins, new_levels, depths, dense_of(h, stages))
+    return Attempt(h, stages, margins, new_levels, depths, dense_of(h, stages, rule))
 
 
-def dense_of(h: Array, stages: Array) -> Array:
-    """Coefficients (7, D, B) of dense output."""
+def dense_of(h: Array, stages: Array, rule: Tableau) -> Array:
+    """Coefficients (K, D, B) of dense output."""
     h_rates = h[None, None] * stages
-    change = weighted(WEIGHTS[STAGES - 1], h_rates)
-    first, last = h_rates[0], h_rates[STAGES - 1]
+    end = rule.stages - 1
+    change = weighted(rule.weights[end], h_rates)
+    first, last = h_rates[0], h_rates[end]
     return jnp.stack(
         [change, first - change, 2 * change - (first + last)]
-        + [weighted(row, h_rates) for row in DENSE]
+        + [weighted(row, h_rates) for row in rule.dense]
     )
 
 
@@ -154,16 +151,16 @@ def dense_state(y: Array, dense: Array, x: Array) -> Array:
     return y + total
 
 
-def margin_samples(margins: Array) -> Array:
-    """Margins (7, K, B) in order of time; a switch that has just turned starts at zero."""
-    sampled = jnp.stack([margins[k] for k in MARGIN_STAGES])
+def margin_samples(margins: Array, rule: Tableau) -> Array:
+    """Margins (M, K, B) in order of time; a switch that has just turned starts at zero."""
+    sampled = jnp.stack([margins[k] for k in rule.margin_stages])
     return jnp.concatenate([jnp.maximum(sampled[:1], 0), sampled[1:]])
 
 
-def _depths(sampled: Array) -> Array:
-    """Minimum of the parabola through three neighbouring margins (5, K, B), relative to the least
-    of the three; 1 where it does not lie between them."""
-    x = np.array(MARGIN_NODES)
+def _depths(sampled: Array, rule: Tableau) -> Array:
+    """Minimum of the parabola through three neighbouring margins (M - 2, K, B), relative to the
+    least of the three; 1 where it does not lie between them."""
+    x = np.array(rule.margin_nodes)
     inverse = 1 / np.diff(x)
 
     def column(values):
@@ -193,9 +190,10 @@ def vertex_of(x, f):
     return place, value
 
 
-def _is_near(margins: Array, depths: Array) -> Array:
+def _is_near(margins: Array, depths: Array, rule: Tableau) -> Array:
     """Whether (B,) a switch may turn within the step."""
-    near = jnp.any(margin_samples(margins) < 0, axis=(0, 1)) | jnp.any(depths <= 0.5, axis=(0, 1))
+    near = jnp.any(margin_samples(margins, rule) < 0, axis=(0, 1))
+    near = near | jnp.any(depths <= 0.5, axis=(0, 1))
     return jnp.where(near, 1.0, 0.0)
 
 
@@ -218,7 +216,7 @@ def weighted(weights: np.ndarray | Array, stages: Array) -> Array:
     return jnp.zeros_like(stages[0]) if total is None else total
 
 
-def _padded(first: Array) -> Array:
+def _padded(first: Array, rule: Tableau) -> Array:
     """Room for all stages, the first of them set."""
-    rest = jnp.zeros((DENSE_STAGES - 1, *first.shape), first.dtype)
+    rest = jnp.zeros((rule.dense_stages - 1, *first.shape), first.dtype)
     return jnp.concatenate([first[None], rest])

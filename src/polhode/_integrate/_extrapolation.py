@@ -30,6 +30,7 @@ from polhode._integrate._midpoint import (
     integrate,
 )
 from polhode._integrate._one_step import GivenTimes
+from polhode._integrate._tableau import DOP853, TSIT5, Tableau
 from polhode._kernels import kernel, opaque_ones, staged
 
 
@@ -349,6 +350,17 @@ class Automatic(Extrapolation):
     """The solver that ``ph.simulate`` chooses.
 
     Few bodies on which torques act, and fields with kinks or jumps, are moved by explicit
-    Runge-Kutta steps of order 8 that end where the field kinks or jumps (``_loop.py``); others by
-    the extrapolated midpoint rule, with the arguments of ``ph.Extrapolation``.
+    Runge-Kutta steps that end where the field kinks or jumps (``_loop.py``); others by the
+    extrapolated midpoint rule, with the arguments of ``ph.Extrapolation``.
+
+    ``low_order``: take steps of order 5 where the field has many switches; ``located``: False:
+    explicit steps of order 5 for all fields, through their switches.
     """
+
+    low_order: bool = eqx.field(static=True, default=False)
+    located: bool = eqx.field(static=True, default=True)
+
+    def rule(self, switches: int) -> Tableau:
+        """The explicit rule for a field with so many switches."""
+        many = switches >= _policy.LOW_ORDER_SWITCHES
+        return TSIT5 if not self.located or (self.low_order and many) else DOP853

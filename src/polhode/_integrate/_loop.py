@@ -14,7 +14,6 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode import _policy
-from polhode._integrate._dop853 import ERROR_3, ERROR_5, STAGES, WEIGHTS
 from polhode._integrate._explicit_step import (
     Attempt,
     Motion,
@@ -42,8 +41,6 @@ CAUTION, MEMORY = 0.9, 0.3
 
 ROUNDING = 8
 """Units in the last place below which the error of a step is rounding."""
-
-ORDER = 8
 
 MAX_REVERSALS = 16
 """Consecutive switches that turn back at once, after which the motion slides along a switch."""
@@ -217,7 +214,7 @@ def advance(
     elapsed = jnp.where(hit, progress.elapsed + part * width, elapsed)
     size = jnp.log(jnp.clip(ratio, 1e-6, 1e12))
     factor = CAUTION * jnp.exp(
-        (jnp.where(accepted, MEMORY * progress.last_error, 0) - size) / (ORDER - 1)
+        (jnp.where(accepted, MEMORY * progress.last_error, 0) - size) / motion.rule.order
     )
     factor = jnp.clip(factor, jnp.where(accepted, 0.2, 0.1), jnp.where(accepted, 5, 0.9))
     cut = accepted & (width < 0.999 * progress.width)
@@ -226,7 +223,7 @@ def advance(
     proposed = jnp.where(is_first, guess, proposed)
     undefined = None
     if motion.switches:
-        undefined, share = undefined_side(attempt, ratio, alive & ~is_first)
+        undefined, share = undefined_side(attempt, ratio, alive & ~is_first, motion.rule)
         proposed = jnp.where(undefined.any, 0.98 * width * share, proposed)
         near = width * share <= 64 * eps * jnp.maximum(progress.elapsed, 0.01 * length)
         undefined = undefined._replace(snaps=undefined.any & near)
@@ -245,7 +242,7 @@ def advance(
     now = progress._replace(
         elapsed=choose(elapsed, progress.elapsed),
         y=choose(jnp.where(hit[None], turn.state, end) if turn is not None else end, progress.y),
-        rate=choose(attempt.stages[STAGES - 1], first),
+        rate=choose(attempt.stages[motion.rule.stages - 1], first),
         needs_rates=hit,
         width=still(jnp.where(alive, proposed, progress.width)),
         last_error=choose(still(size), progress.last_error),
@@ -272,7 +269,11 @@ def _first_width(
     motion: Motion, options: LoopOptions, y: Array, rate: Array, length: Array
 ) -> Array:
     _, pace = motion.units(motion.unit_data, list(y), list(rate))
-    return 4 * options.rtol.astype(y.dtype) ** (1 / ORDER) / jnp.maximum(pace, 1 / length)
+    return (
+        4
+        * options.rtol.astype(y.dtype) ** (1 / (motion.rule.order + 1))
+        / jnp.maximum(pace, 1 / length)
+    )
 
 
 def _width(progress: Progress, length: Array, alive: Array, eps: float) -> tuple[Array, Array]:
@@ -291,20 +292,22 @@ def _width(progress: Progress, length: Array, alive: Array, eps: float) -> tuple
 
 def _error_and_tolerance(motion, options, progress, attempt, width, length, eps):
     """Error of a step [rad], its tolerance, and the angle of the step [rad]."""
-    first, later = attempt.stages[0], attempt.stages[STAGES - 1]
-    change = weighted(WEIGHTS[STAGES - 1], attempt.h[None, None] * attempt.stages)
+    rule = motion.rule
+    first, later = attempt.stages[0], attempt.stages[rule.stages - 1]
+    change = weighted(rule.weights[rule.stages - 1], attempt.h[None, None] * attempt.stages)
     ends = (progress.y, first), (progress.y + change, later)
     (weights, rate), (other, rate_) = (
         motion.units(motion.unit_data, list(y), list(f)) for y, f in ends
     )
     weights = [jnp.minimum(a, b) for a, b in zip(weights, other)]
     rate = jnp.maximum(rate, rate_)
-    five, three = (
+    error, *lower = (
         weighted_length(weights, list(attempt.h[None] * weighted(e, attempt.stages)))
-        for e in (ERROR_5, ERROR_3)
+        for e in rule.errors
     )
-    both = jnp.sqrt(five * five + 0.01 * three * three)
-    error = five * jnp.where(both > 0, five / jnp.where(both > 0, both, 1), 0)
+    if lower:  # of two estimates as in DOP853, of higher order than either
+        both = jnp.sqrt(error * error + 0.01 * lower[0] * lower[0])
+        error = error * jnp.where(both > 0, error / jnp.where(both > 0, both, 1), 0)
     angle = rate * width
     whole = jnp.maximum(progress.angle + rate * (length - progress.elapsed), 1)
     far = jnp.maximum(whole / LONG, 1)
@@ -358,7 +361,7 @@ def _apply_switch(
     repaired = jnp.any(wrong, axis=0) & (progress.outcome == RUNNING)
     near = turn.part <= turn.near
     again = hit & jnp.any(flips & (progress.just_turned > 0), axis=0) & near
-    there = attempt.margins[STAGES - 1]
+    there = attempt.margins[motion.rule.stages - 1]
     levels = jnp.where(flips, turn.levels, progress.levels)
     levels = jnp.where(wrong & repaired[None], attempt.new_levels, levels)
     kept = jnp.where((hit & near)[None], progress.just_turned, 0)

@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from polhode._integrate._explicit_step import Motion
 from polhode._integrate._switches import Switched, switched
+from polhode._integrate._tableau import Tableau
 from polhode._kernels import Distinct, formula, specialise
 
 Pose = Callable[[Any], tuple[Any, Any]]
@@ -22,7 +23,8 @@ class Problem(NamedTuple):
 
     ``closed``: rates (and sides of events) of ``arrays``, the time and the components of the state;
     ``arrays``: those of B bodies (B, ...) where ``lanes`` says so, else shared; ``switches``;
-    ``events``: how many of the last switches are events.
+    ``events``: how many of the last switches are events; ``passed``: how many switches the steps
+    pass without an end.
     """
 
     closed: ClosedJaxpr
@@ -32,11 +34,22 @@ class Problem(NamedTuple):
     events: int
     components: int
     dtype: Any
+    passed: int = 0
 
     @classmethod
-    def of(cls, pose: Pose, parts: Any, is_lane: Any, y0: Any, t: Array, watch: Any = None):
+    def of(
+        cls,
+        pose: Pose,
+        parts: Any,
+        is_lane: Any,
+        y0: Any,
+        t: Array,
+        watch: Any = None,
+        located: bool = True,
+    ):
         """``parts``: arrays of all bodies, ``is_lane``: a tree of which have a lane axis; ``y0``: a
-        state, components (B,); ``watch(parts, t, y)``: values (E,) of events, of one body."""
+        state, components (B,); ``watch(parts, t, y)``: values (E,) of events, of one body;
+        ``located``: False: the switches are passed, and only counted."""
         marked = jax.tree.map(_Marked, parts, is_lane)
         leaves, tree = jax.tree.flatten(marked, is_leaf=lambda x: isinstance(x, _Marked))
         arrays = [x.value for x in leaves if eqx.is_array(x.value)]
@@ -74,12 +87,17 @@ class Problem(NamedTuple):
             *[True] * (1 + len(components)),
         ]
         found = switched(closed, moving, dtype)
+        passed = 0 if located else found.count
+        if not located:
+            found = switched(closed, [False] * len(moving), dtype)
         return cls(
             closed, [*consts, *once], (*[False] * len(consts), *flags), found, events,
-            len(components), dtype,
+            len(components), dtype, passed,
         )  # fmt: skip
 
-    def motion(self, arrays: Sequence[Any], units: Callable[..., Any], unit_data: Any) -> Motion:
+    def motion(
+        self, arrays: Sequence[Any], units: Callable[..., Any], unit_data: Any, rule: Tableau
+    ) -> Motion:
         """Equations of motion for the loop; ``units(unit_data, y, rates)``: see ``Motion``."""
         size, count = self.components, self.switches.count
         fixed_count = len(arrays)
@@ -134,7 +152,16 @@ class Problem(NamedTuple):
 
         jumps = bool(self.switches.jumps[: count - self.events].any())
         return Motion(
-            rates, levels, units, coefficients, list(arrays), unit_data, count, self.events, jumps
+            rates,
+            levels,
+            units,
+            coefficients,
+            list(arrays),
+            unit_data,
+            rule,
+            count,
+            self.events,
+            jumps,
         )
 
 

@@ -24,7 +24,6 @@ from jax.interpreters import ad
 from jaxtyping import Array
 
 from polhode import _policy
-from polhode._integrate._dop853 import DENSE_STAGES, NODES, STAGES, WEIGHTS
 from polhode._integrate._explicit_step import (
     Motion,
     Progress,
@@ -37,9 +36,10 @@ from polhode._integrate._loop import FINISHED, RUNNING, TRIES, Make, advance, be
 from polhode._kernels import any_of, attached, is_slope, kernel, linear, zeros
 
 
-def samples(make: Make, arrays, unit_data, y, start, ts, found) -> Array:
+def samples(make: Make, arrays, unit_data, y, start, ts, found, once: bool = False) -> Array:
     """``found`` (B, T, D), samples at ``ts`` (T,) or (B, T) of the motion from ``y`` (D, B) at
-    ``start`` () or (B,), with their derivatives. Times of one body may stand in any order."""
+    ``start`` () or (B,), with their derivatives. Times of one body may stand in any order.
+    ``once``: refuse second derivatives."""
     leaves, tree = jax.tree.flatten(unit_data)
     size, extra = len(arrays), len(leaves)
 
@@ -57,8 +57,10 @@ def samples(make: Make, arrays, unit_data, y, start, ts, found) -> Array:
         if is_slope(dstart):
             dy = dy - dstart * _rates(motion, starts[None], y[None])[0]
         change = linear(
-            lambda given, moved: _tangent(problem_of, at, given, moved),
-            lambda given, cotangents: _cotangent(problem_of, at, given, cotangents[0]),
+            lambda given, moved: _tangent(problem_of, at, _checked(given, once), moved),
+            lambda given, cotangents: _cotangent(
+                problem_of, at, _checked(given, once), cotangents[0]
+            ),
             list(operands),
             [dy, *(more[i] for i in at)],
             values,
@@ -79,6 +81,20 @@ def samples(make: Make, arrays, unit_data, y, start, ts, found) -> Array:
     if order is None:
         return found
     return jnp.take_along_axis(found, jnp.argsort(order, axis=1)[..., None], axis=1)
+
+
+def _is_differentiated(given) -> bool:
+    return any(isinstance(x, ad.JVPTracer) for x in given)
+
+
+def _checked(given, once: bool):
+    """The operands of a derivative; raises where ``once`` and they are differentiated again."""
+    if once and _is_differentiated(given):
+        raise NotImplementedError(
+            "second derivatives of steps that pass kinks or jumps are wrong: leave"
+            " method=ph.CoarseSteps() out, so that the steps end there."
+        )
+    return given
 
 
 def _rates(motion: Motion, ts: Array, states: Array) -> Array:
@@ -130,7 +146,7 @@ def _cotangent(problem_of, at, given, cotangents):
         return [x for x in problem_of(full)[0].coefficients if jnp.issubdtype(x.dtype, jnp.inexact)]
 
     # second derivatives need those of the places of switches
-    differentiable = any(isinstance(x, ad.JVPTracer) for x in given)
+    differentiable = _is_differentiated(given)
     motion, options = problem_of(arrays, differentiable)
     floats = [k for k, x in enumerate(motion.coefficients) if jnp.issubdtype(x.dtype, jnp.inexact)]
     _, pull = jax.vjp(coefficients_of, *chosen)
@@ -262,8 +278,9 @@ def _step_back(
         due = jnp.abs(column(times, place) - start)
         return live & (place >= 0) & (h != 0) & ((due > note.elapsed) | (note.elapsed == 0))
 
-    top = jnp.where(any_of(jnp.where(met(place), 1.0, 0.0)), DENSE_STAGES, STAGES - 1)
-    table, nodes = jnp.asarray(WEIGHTS, cotangent.dtype), jnp.asarray(NODES, cotangent.dtype)
+    rule, dtype = motion.rule, cotangent.dtype
+    table, nodes = jnp.asarray(rule.weights, dtype), jnp.asarray(rule.nodes, dtype)
+    top = jnp.where(any_of(jnp.where(met(place), 1.0, 0.0)), rule.dense_stages, rule.stages - 1)
 
     def stage(i, found):
         rates, states = found
@@ -272,7 +289,7 @@ def _step_back(
         put_in = jax.lax.dynamic_update_index_in_dim
         return put_in(rates, rate, i, 0), put_in(states, y, i, 0)
 
-    buffers = jnp.zeros((DENSE_STAGES, *cotangent.shape), cotangent.dtype)
+    buffers = jnp.zeros((rule.dense_stages, *cotangent.shape), cotangent.dtype)
     _, states = jax.lax.fori_loop(0, top, stage, (buffers, buffers))
 
     def sample(carry):
@@ -280,11 +297,11 @@ def _step_back(
         here = met(place)
         x = jnp.abs(column(times, place) - start) - note.elapsed
         x = jnp.minimum(x / jnp.where(h != 0, jnp.abs(h), 1), 1)
-        _, pull = jax.vjp(lambda y, k: dense_state(y, dense_of(h, k), x), note.y, buffers)
+        _, pull = jax.vjp(lambda y, k: dense_state(y, dense_of(h, k, rule), x), note.y, buffers)
         some, more = pull(jnp.where(here[None], column(cotangents, place), 0))
         return place - jnp.where(here, 1, 0).astype(place.dtype), cotangent + some, bars + more
 
-    bars = h[None, None] * cotangent[None] * table[STAGES - 1][:, None, None]
+    bars = h[None, None] * cotangent[None] * table[rule.stages - 1][:, None, None]
     passed = jnp.where(finished[None], cotangent, 0)
     place, cotangent, bars = jax.lax.while_loop(
         lambda c: any_of(jnp.where(met(c[0]), 1.0, 0.0)), sample, (place, passed, bars)
