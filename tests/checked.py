@@ -8,6 +8,9 @@ import jax
 import numpy as np
 from beartype import BeartypeConf, beartype
 
+CHECKED: set[str] = set()
+"""Functions whose annotations are checked: ``module.qualified_name``."""
+
 # An int is a float here, as for every other tool that reads annotations (PEP 484).
 _beartype = beartype(conf=BeartypeConf(is_pep484_tower=True))
 
@@ -19,6 +22,7 @@ def checked(function: Callable) -> Callable:
     NumPy arrays): lists and numbers of all kinds, which the package itself converts or refuses.
     An array of any kind is one of NumPy too, where trajectories are looked at.
     """
+    CHECKED.add(f"{function.__module__}.{function.__qualname__}")
     hints = getattr(function, "__annotations__", {})
     for name, hint in hints.items():
         hints[name] = Any if _mentions_self(hint) or _is_users(hint) else _of_any_kind(hint)

@@ -1,5 +1,6 @@
 """The guards of the suite are alive: annotations are checked, programs are compiled once a run."""
 
+import inspect
 import os
 import subprocess
 import sys
@@ -8,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import jaxtyping
 import pytest
+from checked import CHECKED
+from contract import public_objects
 
 import polhode as ph
 from polhode import inertia
@@ -40,6 +43,42 @@ print(met.count("cache_hits"), met.count("cache_misses"))
 def test_wrong_shapes_and_kinds_are_refused_by_the_annotations(call, said):
     with pytest.raises(jaxtyping.TypeCheckError, match=f"parameter '{said}'"):
         call()
+
+
+def functions_of(value):
+    """A function, or the functions and properties that a class of the package defines."""
+    if not inspect.isclass(value):
+        return [value]
+    found = [getattr(x, "fget", None) or getattr(x, "__func__", x) for x in vars(value).values()]
+    found = [inspect.unwrap(x) for x in found if callable(x)]
+    named = f"{value.__qualname__}."
+    return [x for x in found if getattr(x, "__qualname__", "").startswith(named)]
+
+
+UNCHECKED = {
+    *("_method", "_closed_forms", "_integrate", "_plan", "_trajectory", "_events", "_simulate"),
+    *("_propagate", "_extras", "fit", "lightcurve", "plot", "files", "ensemble"),
+}
+"""Modules whose annotations are not checked while the tests run."""
+
+
+def test_annotations_of_public_names_are_checked():
+    seen, missing, unchecked = 0, [], set()
+    for name, value in public_objects():
+        for function in functions_of(value) if callable(value) else []:
+            function = inspect.unwrap(function)
+            package, _, module = function.__module__.partition(".")
+            if package != "polhode" or not function.__annotations__:
+                continue  # as __new__ of a named tuple
+            if (module := module.partition(".")[0]) in UNCHECKED:
+                unchecked.add(module)
+                continue
+            seen += 1
+            if f"{function.__module__}.{function.__qualname__}" not in CHECKED:
+                missing.append(f"{name}: {function.__module__}.{function.__qualname__}")
+    assert seen > 150
+    assert not missing, missing
+    assert unchecked == UNCHECKED
 
 
 def test_the_check_can_be_set_aside(unchecked):
