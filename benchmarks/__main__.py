@@ -1,8 +1,7 @@
-"""``python -m benchmarks``: run them all, draw figures, compare results, write pages.
+"""``python -m benchmarks``: run them all, draw figures, write pages.
 
 python -m benchmarks [--quick] [--output FOLDER]   every benchmark, each in its own process
 python -m benchmarks figures FILE ... [--output FOLDER]
-python -m benchmarks compare OLD NEW
 python -m benchmarks page                          results page, numbers in pages
 """
 
@@ -13,21 +12,23 @@ import sys
 import time
 from pathlib import Path
 
-from benchmarks import _compare, _figures, _page, _report
+from benchmarks import _figures, _page, _report
 
 QUICK: dict[str, list[str]] = {
     "imports": ["--runs", "3"],
     "work_precision": ["--quick"],
     "gradients": ["--quick"],
     "scene_cost": ["--quick"],
+    "conservation": ["--quick"],
 }
-FULL: dict[str, list[str]] = {
-    "imports": [], "first_calls": [], "plain_calls": [], "work_precision": [], "gradients": [],
-    "controllers": [], "scene_cost": [], "scaling": [], "free_body": [], "torqued": [],
-    "error_control": ["--bodies", "100"], "rotation_stress": [], "stress": [], "identification": [],
-    "satellites": [], "throw_design": [], "throws_synthetic": [], "accelerator": [],
-    "engines": [],
-}  # fmt: skip
+_NAMES = (
+    *("imports", "first_calls", "plain_calls", "work_precision", "gradients", "controllers"),
+    *("conservation", "scene_cost", "scaling", "free_body", "torqued", "error_control"),
+    *("rotation_stress", "stress", "identification", "satellites", "throw_design"),
+    *("throws_synthetic", "accelerator", "engines"),
+)
+FULL: dict[str, list[str]] = {name: [] for name in _NAMES}
+FULL["error_control"] = ["--bodies", "100"]
 
 
 def run(quick: bool, folder: Path) -> int:
@@ -58,18 +59,11 @@ def main() -> int:
     figures.add_argument("files", nargs="+", type=Path)
     figures.add_argument("--output", type=Path, default=_report.OUT)
     figures.add_argument("--format", choices=("svg", "png"), default="svg")
-    compare = actions.add_parser("compare", help="what changed beyond noise")
-    compare.add_argument("old", type=Path)
-    compare.add_argument("new", type=Path)
     actions.add_parser("page", help="write benchmarks/README.md and the numbers in other pages")
     options = parser.parse_args()
     if options.action == "figures":
         for path in _figures.draw(options.files, options.output, f".{options.format}"):
             print(path)
-        return 0
-    if options.action == "compare":
-        old, new = _report.read(options.old), _report.read(options.new)
-        print(_compare.show(_compare.compare(old, new)))
         return 0
     if options.action == "page":
         merged = _page.merged()

@@ -23,8 +23,8 @@ import numpy as np
 import polhode as ph
 from benchmarks.peers.polhode_own import scene
 from benchmarks.problems import PROBLEMS
-from polhode._closed_forms._free import _CHUNK
 from polhode._plan import choose
+from polhode._policy import FREE_CHUNK
 from polhode._simulate import run
 
 FAMILIES = ("free", "lagrange", "heavy_top")
@@ -66,7 +66,7 @@ def measure(family: str, bodies: int, saves: int, horizons: tuple, budget: float
             "bodies": bodies, "horizon": horizon, "saves": saves,
             "ns_per_body": wall.median / bodies * 1e9, "spread": wall.spread,
             "memory_MB": whole, "temporary_MB": temporary, "method": type(method).__name__,
-            "chunk": _CHUNK if isinstance(method, ph.ClosedForm) else method.chunk,
+            "chunk": FREE_CHUNK if isinstance(method, ph.ClosedForm) else method.chunk,
         })  # fmt: skip
     return rows
 

@@ -18,12 +18,9 @@ import pytest
 import benchmarks
 from benchmarks import (
     __main__ as command,
-    _compare,
     _figures,
-    _fragments,
-    _levels,
-    _markdown,
     _page,
+    _quotes,
     _report,
     cold_tasks,
     problems,
@@ -191,12 +188,14 @@ def test_every_benchmark_that_runs_with_the_others_takes_an_output():
 
 
 def test_times_of_imports_are_written_and_shown(tmp_path):
-    from benchmarks import _sections, imports
+    from benchmarks import imports
 
     rows = imports.measure({"nothing": "pass"}, 1)
     assert rows[0]["seconds"] > 0
     path = _report.write("imports", {"runs": 1, "rows": rows}, path=tmp_path / "imports.json")
-    assert any("| nothing |" in line for line in _sections.SECTIONS["imports"](_report.read(path)))
+    assert any(
+        "| nothing |" in line for line in _page.SECTIONS["imports"].lines(_report.read(path))
+    )
 
 
 def test_the_operations_of_a_scene_are_counted():
@@ -365,22 +364,22 @@ def _table(times, errors=(1e-4, 1e-8, 1e-12)):
 
 def test_time_at_a_level_is_interpolated_and_never_extrapolated():
     rows = _table((100.0, 400.0, 1600.0))["rows"][1:]
-    assert _levels.time_at(rows, 1e-3) == 100  # cheaper settings were not run
-    assert _levels.time_at(rows, 1e-6) == pytest.approx(200)
-    assert _levels.time_at(rows, 1e-12) == 1600
-    assert _levels.time_at(rows, 1e-13) is None
-    assert _levels.time_at(rows, 1e-6, "attitude_worst") > 200
+    assert _page.time_at(rows, 1e-3) == 100  # cheaper settings were not run
+    assert _page.time_at(rows, 1e-6) == pytest.approx(200)
+    assert _page.time_at(rows, 1e-12) == 1600
+    assert _page.time_at(rows, 1e-13) is None
+    assert _page.time_at(rows, 1e-6, "attitude_worst") > 200
     rows[1]["failed"] = 1
-    assert _levels.time_at(rows, 1e-8) == pytest.approx(100 * 16**0.5)
+    assert _page.time_at(rows, 1e-8) == pytest.approx(100 * 16**0.5)
 
 
 def test_standing_names_the_peer_that_is_faster():
-    slow, fast = (_levels.standing(_table(t)) for t in ((100.0, 400.0, 1600.0), (10.0, 40.0, 60.0)))
+    slow, fast = (_page.standing(_table(t)) for t in ((100.0, 400.0, 1600.0), (10.0, 40.0, 60.0)))
     assert [at["ratio"] for at in slow] == pytest.approx([2, 4, 11.3137085, 32], rel=1e-6)
     assert fast[0]["ratio"] == pytest.approx(0.2)
     assert fast[0]["peer"] == "other"
-    report = {"numbers": {"tables": [_table((10.0, 40.0, 60.0))]}}
-    assert any("other (stepper) reaches 1e-03" in line for line in _page.behind(report))
+    lines = _page.faster_peers([_table((10.0, 40.0, 60.0))])
+    assert any("other (stepper) reaches 1e-03" in line for line in lines)
 
 
 def _result(times, **more):
@@ -388,32 +387,14 @@ def _result(times, **more):
     return {"name": "work_precision", "numbers": numbers}
 
 
-def test_compare_leaves_noise_and_a_slower_machine_alone():
-    old, new = _result((100.0, 400.0, 1600.0)), _result((150.0, 606.0, 2400.0))
-    new["numbers"]["tables"][0]["rows"][0]["ns_per_body"] *= 1.5
-    found = _compare.compare(old, new)
-    assert found["pace"] == pytest.approx(1.5)
-    assert not found["changed"]
-    assert "nothing changed" in _compare.show(found)
-
-
-def test_compare_names_what_is_slower_wrong_gone_and_new():
-    old = _result((100.0, 400.0, 1600.0), extra=1.0)
-    new = _result((100.0, 800.0, 1600.0), other=1.0)
-    new["numbers"]["tables"][0]["rows"][3]["attitude_median"] = 1e-9
-    found = _compare.compare(old, new)
-    kinds = sorted((path[-1], kind) for path, kind, *_ in found["changed"])
-    assert kinds == [("attitude_median", "error"), ("ns_per_body", "time")]
-    text = _compare.show(found)
-    assert "slower" in text
-    assert "stepper, 1e-08" in text
-    assert _compare.flatten([{"name": "a", "x": 1}, {"name": "a", "x": 2}]) == {
-        ("a", "x"): 1.0, ("a, 1", "x"): 2.0,
-    }  # fmt: skip
-    assert found["gone"] == [("extra",)]
-    assert found["fresh"] == [("other",)]
-    with pytest.raises(ValueError, match="different"):
-        _compare.compare(old, {"name": "stress", "numbers": {}})
+def test_numbers_are_shown_by_their_keys():
+    """Entries that are alike as rows of one table, a list of a few numbers in a cell."""
+    lines = _page.by_keys("", {"speed_of": {"a": {"ns": 1.5, "m": [1, 2]}, "b": {"ns": None}}})
+    assert lines == [
+        "**speed of**", "", "|  | ns | m |", "|---|---:|---:|", "| a | 1.5 | 1, 2 |",
+        "| b | – | – |", "",
+    ]  # fmt: skip
+    assert _page.by_keys("x", {"n": 1200, "rows": []}) == ["**x**", "", "- n: 1,200", ""]
 
 
 def test_figures_are_drawn_from_results(tmp_path):
@@ -469,29 +450,29 @@ def test_the_results_page_holds_the_numbers_of_the_committed_results():
     assert text == _page.page(_page.names_on(text)), WRITE
 
 
-QUOTING = [p for p in _fragments.pages() if "<!-- result: " in p.read_text(encoding="utf-8")]
+QUOTING = [p for p in _quotes.pages() if "<!-- result: " in p.read_text(encoding="utf-8")]
 
 
 @pytest.mark.parametrize("path", QUOTING, ids=lambda path: path.stem)
 def test_pages_quote_the_committed_results(path):
     text = path.read_text(encoding="utf-8")
-    assert _fragments.filled(text) == text, WRITE
+    assert _quotes.fill(text) == text, WRITE
 
 
 @pytest.mark.parametrize("path", QUOTING, ids=lambda path: path.stem)
 def test_a_changed_number_in_a_page_is_found(path):
     text = path.read_text(encoding="utf-8")
-    for match in _fragments.MARK.finditer(text):
+    for match in _quotes.MARK.finditer(text):
         digit = max(k for k, letter in enumerate(match[2]) if letter.isdigit()) + match.start(2)
         changed = text[:digit] + str(9 - int(text[digit])) + text[digit + 1 :]
-        assert _fragments.filled(changed) == text != changed, match[1]
+        assert _quotes.fill(changed) == text != changed, match[1]
 
 
 def test_markers_of_results_come_in_pairs_within_lines_or_around_blocks():
     used = set()
     for path in QUOTING:
         text = path.read_text(encoding="utf-8")
-        matches = list(_fragments.MARK.finditer(text))
+        matches = list(_quotes.MARK.finditer(text))
         assert len(matches) == text.count("<!-- result: ") == text.count("<!-- end -->"), path.name
         for match in matches:
             used.add(match[1])
@@ -499,7 +480,7 @@ def test_markers_of_results_come_in_pairs_within_lines_or_around_blocks():
             assert match[2].endswith("\n") == block, match[1]
             before = text[: match.start()].rpartition("\n")[2].lstrip()
             assert bool(before) != block, f"{path.name}: {match[1]} begins a line, or does not"
-    assert used == set(_fragments.FRAGMENTS)
+    assert used == set(_quotes.QUOTES)
 
 
 HASH = re.compile(r"[0-9a-f]{40}")
@@ -597,12 +578,12 @@ def test_no_commit_is_named_for_a_package_from_elsewhere(checkout, monkeypatch, 
 
 def test_pages_say_where_the_commit_is_from():
     made = {"date": "2026-01-02", "commit": "0123456789" * 4}
-    assert _markdown.source(made) == "2026-01-02, commit `0123456`"
+    assert _page.source(made) == "2026-01-02, commit `0123456`"
     dirty = {**made, "commit": made["commit"] + "-dirty"}
-    assert _markdown.source(dirty) == "2026-01-02, commit `0123456` with uncommitted changes"
+    assert _page.source(dirty) == "2026-01-02, commit `0123456` with uncommitted changes"
     old = {"date": "2026-01-02", "committed_with": made["commit"]}
-    assert _markdown.source(old) == "2026-01-02, committed with `0123456`"
-    assert _markdown.source({**made, "commit": None}) == "2026-01-02, commit unknown"
+    assert _page.source(old) == "2026-01-02, committed with `0123456`"
+    assert _page.source({**made, "commit": None}) == "2026-01-02, commit unknown"
 
 
 @pytest.mark.parametrize(
@@ -619,7 +600,7 @@ def test_one_table_is_of_one_commit_machine_and_day(tmp_path, monkeypatch, chang
         _page.merged()
 
 
-def test_the_table_of_cold_tasks_marks_what_others_do_sooner(monkeypatch):
+def test_the_table_of_cold_tasks_marks_what_others_do_sooner():
     name = next(iter(cold_tasks.TASKS))
     ours = {"first": 2.0, "second": 0.001, "cached": 1.0, "memory": 300.0, "error": 1e-11}
     peer = {"first": 0.7, "second": 0.3, "memory": 90.0, "error": 2e-8}
@@ -631,16 +612,8 @@ def test_the_table_of_cold_tasks_marks_what_others_do_sooner(monkeypatch):
             {"task": name, "peer": "", "polhode": alone},
         ]},
     }  # fmt: skip
-    monkeypatch.setattr(_fragments, "read", lambda _: report)
-    table = _fragments.cold_tasks()
+    table = "\n".join(_page.cold_tasks_table(report))
     assert f"| {name}, SciPy | 2 / **0.7** | 0.001 / 0.3 | 1 | 300 / **90** | 1e-11 / 2e-08 |" in (
         table.replace("1.0e-03", "0.001")
     )
     assert f"| {name} | 2 / – |" in table
-
-
-def test_a_missing_marker_is_set_below_its_heading():
-    text = "# A\n\n## Cost\n\nold\n"
-    marked = _page.with_marker(text, "cold-tasks", "## Cost\n\n")
-    assert marked.index("<!-- result: cold-tasks -->") < marked.index("old")
-    assert _page.with_marker(marked, "cold-tasks", "## Cost\n\n") == marked
