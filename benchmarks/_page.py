@@ -647,9 +647,10 @@ SECTIONS = {
     ),
     "conservation": Section(
         "Energy and angular momentum over {turns:,} revolutions",
-        "One body by `ph.simulate` with its defaults: relative change of the energy, and of the"
-        " components of the angular momentum that the scene conserves, the largest at times up to"
-        " the one named. Integrated motions accumulate the error that `rtol` allows.",
+        "One body by `ph.simulate` with its defaults (but for `max_steps`): relative change of the"
+        " energy, and of the components of the angular momentum that the scene conserves, the"
+        " largest up to each number of revolutions. Integrated motions accumulate the error that"
+        " `rtol` allows.",
     ),
     "scene_cost": Section(
         "Cost of each kind of scene",
