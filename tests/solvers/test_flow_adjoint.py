@@ -92,11 +92,8 @@ def along(p, seed):
     return jax.tree.unflatten(tree, moves)
 
 
-@pytest.mark.parametrize(
-    "scene_of",
-    [pytest.param(driven, marks=pytest.mark.slow), satellite],
-    ids=lambda f: f.__name__,
-)
+@pytest.mark.slow  # both modes of a heavy top below, gradients of every torque: tests/systems
+@pytest.mark.parametrize("scene_of", [driven, satellite], ids=lambda f: f.__name__)
 def test_both_modes_are_the_slope(scene_of):
     p = point()
     direction = along(p, 3)

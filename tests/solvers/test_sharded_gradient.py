@@ -6,9 +6,8 @@ import pytest
 from devices import told_by
 
 
-@pytest.mark.parametrize(
-    "names", [("top",), pytest.param(("free", "damped"), marks=pytest.mark.slow)], ids=" ".join
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("names", [("top",), ("free", "damped")], ids=" ".join)
 def test_two_devices_give_the_gradient_of_one(names):
     found = told_by(Path(__file__).with_name("sharded_gradient.py"), *names)
     assert set(found) == set(names)
