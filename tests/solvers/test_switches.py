@@ -185,6 +185,11 @@ def test_a_gradient_through_a_jump():
     want = [-0.1 * met / rate, 1 + 0.1 / (rate * level)]
     np.testing.assert_allclose(by_p, want, rtol=1e-8)
     np.testing.assert_allclose(by_omega[2], -0.1 / (rate * begin), rtol=1e-8)
+    along = jnp.array([0.3, -0.2]), jnp.array([0.0, 0.0, 0.5])
+    _, change = jax.jvp(falling, given, along)
+    np.testing.assert_allclose(
+        change, 0.3 * want[0] - 0.2 * want[1] - 0.5 * 0.1 / (rate * begin), rtol=1e-8
+    )
 
 
 def test_a_side_beyond_which_the_field_is_no_number():

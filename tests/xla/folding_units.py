@@ -2,7 +2,7 @@
 
 Prints a line for each: its name, and the largest difference to the plain function. XLA answers a
 wrong use of the mark by ending the process. ``each``: a program for each unit, which names the one
-that ends it; ``few``: half of the ways, in half of the time.
+that ends it; ``few``: three of the ways.
 """
 
 import sys
@@ -125,7 +125,7 @@ SLOPES = {
 }
 
 
-FEW = "value", "in a loop", "in a branch", "gradient", "second"
+FEW = "value", "in a loop", "gradient"
 
 
 def _away(a, b):

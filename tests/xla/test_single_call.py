@@ -17,7 +17,7 @@ HERE = Path(__file__).parent
 
 
 @pytest.mark.parametrize(
-    ("words", "least"), [(["few"], 150), pytest.param([], 250, marks=pytest.mark.slow)]
+    ("words", "least"), [(["few"], 120), pytest.param([], 250, marks=pytest.mark.slow)]
 )
 def test_units_that_fold_away(words, least):
     """In a process of its own; `folding_units.py each` names the unit that ends it."""

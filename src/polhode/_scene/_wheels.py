@@ -32,7 +32,7 @@ from polhode._checks import (
     require_positive,
 )
 from polhode._hamiltonian import Attitude, Vector, dot, triple
-from polhode._parts import AbstractPart, AbstractSum, Signature, shaped, terms_of
+from polhode._parts import AbstractPart, Signature, shaped, terms_of
 from polhode._scene._torques import stacked
 from polhode.inertia import Inertia, Symmetry
 
@@ -57,7 +57,7 @@ class AbstractCoupling(AbstractPart):
         return CouplingSum(terms_of("coupling", AbstractCoupling, CouplingSum, self, other))
 
 
-class CouplingSum(AbstractCoupling, AbstractSum):
+class CouplingSum(AbstractCoupling):
     """Sum of couplings of one wheel."""
 
     terms: tuple[AbstractCoupling, ...]
@@ -67,7 +67,7 @@ class CouplingSum(AbstractCoupling, AbstractSum):
         return sum(rest, start=first)
 
 
-class Couplings(AbstractSum):
+class Couplings(AbstractPart):
     """Those of several wheels, one each."""
 
     terms: tuple[AbstractCoupling, ...]
@@ -250,7 +250,7 @@ class AbstractRotor(AbstractPart):
         )
 
 
-class RotorSum(AbstractRotor, AbstractSum):
+class RotorSum(AbstractRotor):
     """Several rotors."""
 
     terms: tuple[AbstractRotor, ...]
