@@ -387,7 +387,8 @@ def by_keys(title: str, value: Any) -> list[str]:
     lines = [*head, *lines, ""] if lines else []
     for key in value:
         if key not in plain and key != "origin":
-            lines += by_keys(f"{title}, {key}".strip(", ").replace("_", " "), value[key])
+            names = [title, "" if key == "rows" else key.replace("_", " ")]
+            lines += by_keys(", ".join(filter(None, names)), value[key])
     return lines
 
 
@@ -646,7 +647,7 @@ SECTIONS = {
         more=_controllers,
     ),
     "conservation": Section(
-        "Energy and angular momentum over {turns:,} revolutions",
+        "Energy and angular momentum over many revolutions",
         "One body by `ph.simulate` with its defaults (but for `max_steps`): relative change of the"
         " energy, and of the components of the angular momentum that the scene conserves, the"
         " largest up to each number of revolutions. Integrated motions accumulate the error that"

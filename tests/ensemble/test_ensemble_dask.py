@@ -73,6 +73,24 @@ def test_no_scheduler_at_the_address(tmp_path):
     assert not (tmp_path / "a.zarr").exists()
 
 
+def test_the_command_names_the_scheduler_that_does_not_answer(tmp_path, capsys, monkeypatch):
+    import dask
+
+    from polhode.cli import main
+
+    monkeypatch.chdir(tmp_path)
+    Path("many.toml").write_text("""
+inertia = { axisymmetric = { transverse = 1.0, axial = 1.5 } }
+state = { omega_body = [0.5, 0.2, 3.0] }
+times = { stop = 2.0, number = 5 }
+ensemble = { bodies = 20, seed = 1, attitude = { any = true } }
+""")
+    with dask.config.set({"distributed.comm.timeouts.connect": "100ms"}):
+        assert main(["run", "many.toml", "--scheduler", "tcp://127.0.0.1:1"]) == 1
+    assert "no dask scheduler answers at tcp://127.0.0.1:1" in capsys.readouterr().err
+    assert not Path("many.zarr").exists()
+
+
 @pytest.mark.slow
 def test_a_worker_that_is_killed_changes_no_bit(whole, tmp_path):
     """Two worker processes, the address of the scheduler, and a function of this module; one

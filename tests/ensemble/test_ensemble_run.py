@@ -2,6 +2,7 @@
 
 import errno
 import itertools
+import os
 import random
 import signal
 import subprocess
@@ -16,6 +17,7 @@ import pytest
 import polhode as ph
 from polhode import ensemble as ens
 from polhode.ensemble._statistics import tilt
+from polhode.ensemble._stream import Job, chunk_sizes
 
 xarray = pytest.importorskip("xarray")
 zarr = pytest.importorskip("zarr")
@@ -134,6 +136,13 @@ def test_chunks_and_parts_change_no_bit(whole, tmp_path):
         xarray.testing.assert_identical(ours.tilt_summary_std, theirs.tilt_summary_std)
 
 
+@pytest.mark.parametrize(("parts", "chunks"), [(1, 1), (2, 3), (5, 5), (9, 5)])
+def test_there_is_a_chunk_for_each_part(parts, chunks, tmp_path):
+    """As far as there are blocks: 40,000 bodies are five blocks of 8,192."""
+    job = Job(make(), TS, tmp_path, None, None, True, (), jax.local_devices()[:1])
+    assert -(-40_000 // chunk_sizes(job, None, None, parts).chunk) == chunks
+
+
 def test_parts_that_begin_together_share_a_store(whole, tmp_path):
     path = tmp_path / "parts.zarr"
     command = [sys.executable, str(SCRIPT), str(path), "0"]
@@ -207,17 +216,20 @@ def test_own_functions_need_a_name(tmp_path):
 
 
 def test_full_disk_says_so_and_loses_nothing(whole, tmp_path, monkeypatch):
+    """Full, or beyond the quota of the user."""
     path = tmp_path / "full.zarr"
-    replace, count = Path.replace, itertools.count(1)
+    replace = Path.replace
+    for code in (errno.ENOSPC, errno.EDQUOT):
+        count = itertools.count(1)
 
-    def full(self, target):
-        if "c" in Path(target).parts and next(count) > 5:
-            raise OSError(errno.ENOSPC, "No space left on device")
-        return replace(self, target)
+        def full(self, target, code=code, count=count):
+            if "c" in Path(target).parts and next(count) > 5:
+                raise OSError(code, os.strerror(code))
+            return replace(self, target)
 
-    monkeypatch.setattr(Path, "replace", full)
-    with pytest.raises(ens.StoreError, match=r"full: \d of 5 chunks are complete"):
-        ens.stream(make(), TS, path, chunk=CHUNK)
+        monkeypatch.setattr(Path, "replace", full)
+        with pytest.raises(ens.StoreError, match=r"full: \d of 5 chunks are complete"):
+            ens.stream(make(), TS, path, chunk=CHUNK)
     monkeypatch.undo()
     ens.stream(make(), TS, path, chunk=CHUNK)
     assert equal(path, whole)

@@ -83,8 +83,9 @@ def stream(
       instead, a multiple of the block (see ``polhode.ensemble`` in docs/scale.md). A store retains
       the chunks it began with.
     - ``devices``: local JAX devices that share the bodies; None: the first one.
-    - ``part``: (i, n) computes every n-th chunk from the i-th on, i from 1 to n. The statistics are
-      reduced by the first call without it that finds all chunks.
+    - ``part``: (i, n) computes every n-th chunk from the i-th on, i from 1 to n; chunks are then
+      small enough for n parts. The statistics are reduced by the first call without it that finds
+      all chunks.
     - ``scheduler``: the address or the ``dask.distributed.Client`` of a cluster that computes the
       chunks; None: the active client of this process, and without one this process.
     - ``attributes``: text to store, such as the scene file; compared as well.
@@ -98,7 +99,7 @@ def stream(
     _check(ensemble, method, name, trajectories, statistics, part)
     devices = [jax.local_devices()[0]] if devices is None else list(devices)
     job = Job(ensemble, ts, path, method, rtol, trajectories, statistics, devices)
-    size = chunk_sizes(job, memory, chunk)
+    size = chunk_sizes(job, memory, chunk, 1 if part is None else part[1])
     identity = job.identity(name)
     with contextlib.ExitStack() as stack:
         client = None
@@ -209,9 +210,9 @@ class Sizes(NamedTuple):
     concurrent: int
 
 
-def chunk_sizes(job: Job, memory: int | None, chunk: int | None) -> Sizes:
-    """Sizes that stay within ``memory`` bytes. Raises ValueError for a memory or a chunk that is
-    not possible.
+def chunk_sizes(job: Job, memory: int | None, chunk: int | None, parts: int = 1) -> Sizes:
+    """Sizes that stay within ``memory`` bytes, with a chunk for each part where there are as many
+    blocks. Raises ValueError for a memory or a chunk that is not possible.
     """
     block, devices = job.block.size, len(job.block.devices)
     if chunk is not None and (chunk < 1 or chunk % block):
@@ -242,7 +243,8 @@ def chunk_sizes(job: Job, memory: int | None, chunk: int | None) -> Sizes:
             target //= 2
         # every device computes a block of its own at a time
         blocks = devices * -(-target // devices) if target > 0 else 1
-        blocks = min(blocks, -(-job.block.ensemble.bodies // block))
+        all_blocks = -(-job.block.ensemble.bodies // block)
+        blocks = min(blocks, all_blocks, max(1, all_blocks // parts))
     threads = _cores() if platform_of(job.block.devices[0]) == "cpu" else 2
     concurrent = max(1, min(threads, available // required(blocks)))
     return Sizes(blocks * block, int(concurrent))
