@@ -46,6 +46,8 @@ CASES: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "REFILL_LANES": ((1, 4, 16, 32), ("heavy tops",)),
     "QUEUE": ((128, 4096), ("heavy tops",)),
     "EXPLICIT_BODIES": ((0, 16), ("satellite", "ten satellites")),
+    "LOW_ORDER_SWITCHES": ((0, 10**6), ("network", "clipped satellites")),
+    "LOW_ORDER_RTOL": ((1e-12, 1.0), ("network",)),
     "SORTED_BODIES": ((10**9,), ("heavy tops", "satellites")),
     "SHARED_STEP_BODIES": ((20, 1000), ("heavy tops by diffrax",)),
     "ACCELERATOR_BODIES": ((2**14,), ("heavy tops",)),
@@ -88,6 +90,12 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
 
     def clipped(t, wxyz, omega):
         return jnp.clip(-0.2 * omega, -0.05, 0.05)
+
+    weights = [jnp.asarray(rng.normal(size=shape) / 3) for shape in ((16, 7), (3, 16))]
+
+    def network(t, wxyz, omega):
+        hidden = jnp.maximum(weights[0] @ jnp.concatenate([wxyz, omega]), 0)
+        return 0.1 * weights[1] @ hidden
 
     def triaxial(potential=None, torque=None):
         return lambda m: ph.Scene(ph.Inertia.from_moments(m), potential, torque)
@@ -152,6 +160,7 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
         "ten satellites": value(satellite, 10),
         "satellites": value(satellite, 200),
         "clipped satellites": value(triaxial(gradient, ph.FeedbackTorque(clipped)), 50),
+        "network": value(triaxial(None, ph.FeedbackTorque(network)), 10),
         "gradient of free bodies": slope(triaxial(), BODIES),
         "gradient of Lagrange's tops": slope(symmetric(axial), BODIES),
         "gradient of a heavy top": slope(triaxial(gravity), 1),

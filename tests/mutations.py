@@ -311,8 +311,8 @@ MUTANTS = (
     # integration: error control, switches, events and derivatives
     Mutant(
         LOOP,
-        "allowed = SHARE * options.rtol.astype(error.dtype) * angle / (whole * drift)",
-        "allowed = SHARE * options.rtol.astype(error.dtype)",
+        "* options.rtol.astype(error.dtype) * angle / (whole * drift)",
+        "* options.rtol.astype(error.dtype)",
         "each step may have the error of the whole motion",
         ("solvers/test_switches.py::test_states_through_switches",),
     ),

@@ -52,9 +52,9 @@ def test_the_platform_is_inspected_in_one_module():
     assert not found
 
 
-def rows() -> dict[str, str]:
-    """The constants of the module, each with the text below it."""
-    body = ast.parse(POLICY.read_text(encoding="utf-8")).body
+def rows(path: Path) -> dict[str, str]:
+    """The constants of a module, each with the text below it."""
+    body = ast.parse(path.read_text(encoding="utf-8")).body
     texts = {}
     for node, after in zip(body, [*body[1:], None]):
         if isinstance(node, ast.Assign):
@@ -67,11 +67,17 @@ def rows() -> dict[str, str]:
 def test_every_choice_has_a_unit_a_reason_and_a_benchmark():
     from benchmarks.policy import CASES
 
-    texts = rows()
+    texts = rows(POLICY)
     assert len(texts) > 20
     unexplained = [name for name, text in texts.items() if not text.startswith("[")]
     assert not unexplained
     assert {*texts} == {"FUSED_JAXLIB", *CASES}
+
+
+def test_constants_of_the_error_control_have_a_unit_and_a_meaning():
+    texts = rows(SOURCE / "_integrate" / "_error_control.py")
+    assert len(texts) > 20
+    assert not [name for name, text in texts.items() if not text.startswith("[")]
 
 
 def test_the_upper_bound_of_jax_is_the_newest_version_tested():

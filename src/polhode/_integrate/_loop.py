@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode import _policy
+from polhode._integrate import _error_control as control
 from polhode._integrate._explicit_step import (
     Attempt,
     Motion,
@@ -26,27 +27,6 @@ from polhode._integrate._explicit_step import (
 from polhode._integrate._field import weighted_length
 from polhode._integrate._switch_location import SwitchPoint, first_switch, pick, undefined_side
 from polhode._kernels import any_of, kernel, put
-
-SHARE = 2.0
-"""Bound of the sum of estimated errors over ``rtol``. The estimate, of lower order, exceeds the
-error ten times and more: with 0.6 satellites keep a hundredth of ``rtol`` and take 1.2 times the
-steps; with 4 the worst of 64 exceeds ``rtol`` four times."""
-
-LONG = 100
-"""Angle [rad] beyond which the tolerance falls with the power 3/4 of the angle: an error of the
-rates goes on turning the body."""
-
-CAUTION, MEMORY = 0.9, 0.3
-"""Safety factor of the width, and exponent of the last error (a PI controller)."""
-
-ROUNDING = 8
-"""Units in the last place below which the error of a step is rounding."""
-
-MAX_REVERSALS = 16
-"""Consecutive switches that turn back at once, after which the motion slides along a switch."""
-
-TRIES = 4
-"""Attempts allowed for each step allowed."""
 
 RUNNING, FINISHED, OUT_OF_STEPS, STEP_TOO_SHORT, NOT_FINITE, SLIDING, AT_EVENT = range(7)
 """Values of ``Progress.outcome``."""
@@ -212,20 +192,20 @@ def advance(
 
     elapsed = jnp.where(last, length, progress.elapsed + width)
     elapsed = jnp.where(hit, progress.elapsed + part * width, elapsed)
-    size = jnp.log(jnp.clip(ratio, 1e-6, 1e12))
-    factor = CAUTION * jnp.exp(
-        (jnp.where(accepted, MEMORY * progress.last_error, 0) - size) / motion.rule.order
-    )
-    factor = jnp.clip(factor, jnp.where(accepted, 0.2, 0.1), jnp.where(accepted, 5, 0.9))
-    cut = accepted & (width < 0.999 * progress.width)
+    size = jnp.log(jnp.clip(ratio, control.MIN_RATIO, 1e12))
+    memory = jnp.where(accepted, control.MEMORY * progress.last_error, 0)
+    factor = control.SAFETY * jnp.exp((memory - size) / motion.rule.order)
+    factor = jnp.clip(factor, *control.factor_bounds(accepted, control.MAX_EXPLICIT_FACTOR))
+    cut = accepted & (width < control.CUT * progress.width)
     proposed = jnp.where(cut, jnp.maximum(progress.width, width * factor), width * factor)
     guess = still(_first_width(motion, options, progress.y, attempt.stages[0], length))
     proposed = jnp.where(is_first, guess, proposed)
     undefined = None
     if motion.switches:
         undefined, share = undefined_side(attempt, ratio, alive & ~is_first, motion.rule)
-        proposed = jnp.where(undefined.any, 0.98 * width * share, proposed)
-        near = width * share <= 64 * eps * jnp.maximum(progress.elapsed, 0.01 * length)
+        proposed = jnp.where(undefined.any, control.UNDEFINED_SIDE * width * share, proposed)
+        time = jnp.maximum(progress.elapsed, 0.01 * length)
+        near = width * share <= control.GRAIN * eps * time
         undefined = undefined._replace(snaps=undefined.any & near)
         proposed = jnp.where(undefined.snaps, guess, proposed)
     storage, place = _save(
@@ -270,7 +250,7 @@ def _first_width(
 ) -> Array:
     _, pace = motion.units(motion.unit_data, list(y), list(rate))
     return (
-        4
+        control.FIRST_WIDTH
         * options.rtol.astype(y.dtype) ** (1 / (motion.rule.order + 1))
         / jnp.maximum(pace, 1 / length)
     )
@@ -310,10 +290,10 @@ def _error_and_tolerance(motion, options, progress, attempt, width, length, eps)
         error = error * jnp.where(both > 0, error / jnp.where(both > 0, both, 1), 0)
     angle = rate * width
     whole = jnp.maximum(progress.angle + rate * (length - progress.elapsed), 1)
-    far = jnp.maximum(whole / LONG, 1)
+    far = jnp.maximum(whole / control.DRIFT_ANGLE, 1)
     drift = jnp.sqrt(far * jnp.sqrt(far))
-    allowed = SHARE * options.rtol.astype(error.dtype) * angle / (whole * drift)
-    allowed = jnp.maximum(allowed, ROUNDING * eps)
+    allowed = control.EXPLICIT_SHARE * options.rtol.astype(error.dtype) * angle / (whole * drift)
+    allowed = jnp.maximum(allowed, control.ROUNDED_STEP * eps)
     sound = jnp.isfinite(error) & jnp.isfinite(angle)
     return tuple(jnp.where(sound, x, y) for x, y in ((error, jnp.inf), (allowed, 1), (angle, 0)))
 
@@ -409,11 +389,12 @@ def _apply_switch(
 
 def _outcome(options, now: Progress, alive, length, ratio, eps) -> Array:
     """Whether each body is still running, or why not."""
-    spent = (now.steps >= options.max_steps) | (now.attempts >= TRIES * options.max_steps)
-    short = ~(now.width > 0.1 * eps * length)
+    attempts = control.ATTEMPTS * options.max_steps
+    spent = (now.steps >= options.max_steps) | (now.attempts >= attempts)
+    short = ~(now.width > control.MIN_WIDTH * eps * length)
     number = jnp.isfinite(ratio) & jnp.isfinite(now.width)
     why = jnp.where(short, jnp.where(number, STEP_TOO_SHORT, NOT_FINITE), RUNNING)
-    why = jnp.where(now.reversals >= MAX_REVERSALS, SLIDING, why)
+    why = jnp.where(now.reversals >= control.MAX_REVERSALS, SLIDING, why)
     why = jnp.where(spent, OUT_OF_STEPS, why)
     why = jnp.where(now.elapsed >= length, FINISHED, why)
     why = jnp.where(now.outcome == AT_EVENT, AT_EVENT, why)

@@ -27,6 +27,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode import _policy
+from polhode._integrate import _error_control as control
 from polhode._integrate._columns import Table, carried_on, extrapolated
 from polhode._integrate._field import weighted_length
 from polhode._kernels import any_of, put
@@ -47,42 +48,6 @@ class Field(NamedTuple):
     data: tuple[Any, Any]
     own: bool
     by_entry: bool = False
-
-
-CALIBRATED = 5
-"""The error of a step over e^2 / d (see above)."""
-
-SHARE = 0.6
-"""Bound of the sum of the steps' errors over the tolerance. Where the motion itself amplifies
-errors the sum is larger (``docs/design_notes.md``)."""
-
-FIRST = 0.05
-"""Error allowed for a radian at the start, relative to the mean over the motion; the remainder is
-allowed in proportion to the square of the angle. An early error has the longest time to grow, and
-at a high order a step with a twentieth of the error is only a fifth shorter."""
-
-LONG = 100
-"""Angle [rad] beyond which the tolerance falls with the power 3/4 of the angle (``_drift``): an
-error of the rates goes on turning the body. The error grows in proportion to the angle if the
-errors of all steps have one sign, which is rare (1 body in 300)."""
-
-CAUTION, MEMORY = 0.9, 0.3
-"""Safety factor of the width, and exponent of the last error (a PI controller)."""
-
-ROUNDING, COMPENSATED = 8, 4
-"""Units in the last place below which the error of a step is rounding, of plain and of compensated
-steps."""
-
-ROUGH = 32
-"""Factor by which the estimate may be too small where a torque jumps within a step: the last two
-values of the table differ by less than their errors. Recognised by errors that do not fall with the
-order of the method when a refused step is shortened."""
-
-_TRIES = 4
-"""Attempts allowed for each step allowed."""
-
-GAP = 1 / 16
-"""Fraction of a step: the search for jumps samples one, two and three of these from either end."""
 
 
 class Limits(NamedTuple):
@@ -225,7 +190,7 @@ def integrate(
 
     def failed(fixed, carry):
         """Bodies whose steps ran out, or became so short that they lead nowhere."""
-        able = (carry.steps < limits.steps) & (carry.width > 0.1 * eps * length)
+        able = (carry.steps < limits.steps) & (carry.width > control.MIN_WIDTH * eps * length)
         return ~(able & (fixed.reason == 0))
 
     def live(fixed, carry):
@@ -244,12 +209,14 @@ def integrate(
         weights = [jnp.minimum(a, b) for a, b in zip(weights, weights_)]
         rate = jnp.maximum(rate, rate_)
         last, before = (weighted_length(weights, e) for e in (result.last, result.before))
-        error = CALIBRATED * last * jnp.where(last < before, last / before, 1)
+        error = control.CALIBRATION * last * jnp.where(last < before, last / before, 1)
         if limits.jumps:
             error = error + _jump_error(rates, t, h, carry, new, later, weights)
             fall = (width / jnp.where(carry.refused[1] > 0, carry.refused[1], 1)) ** columns.order
-            rough = (carry.refused[1] > 0) & (error > 2 * fall * carry.refused[0])
-            error = jnp.where(rough & (error > 128 * eps), ROUGH * error, error)
+            rough = (carry.refused[1] > 0) & (error > control.ROUGH_FALL * fall * carry.refused[0])
+            error = jnp.where(
+                rough & (error > control.ROUGH_ROUNDING * eps), control.ROUGH_ERROR * error, error
+            )
         angle = rate * width
         expected = (
             carry.total_angle
@@ -258,9 +225,11 @@ def integrate(
         )
         expected = jnp.maximum(expected, 1)
         done = jnp.minimum(carry.total_angle / expected, 1)
-        share = SHARE * (FIRST + 3 * (1 - FIRST) * done * done)
+        first = control.FIRST_SHARE
+        share = control.MIDPOINT_SHARE * (first + 3 * (1 - first) * done * done)
         allowed = share * limits.rtol * angle / (expected * _drift(expected))
-        allowed = jnp.maximum(allowed, (COMPENSATED if compensated else ROUNDING) * eps)
+        rounding = control.COMPENSATED_STEP if compensated else control.ROUNDED_STEP
+        allowed = jnp.maximum(allowed, rounding * eps)
         sound = jnp.isfinite(error) & jnp.isfinite(angle)  # a step may well end beyond all numbers
         error, allowed = jnp.where(sound, error, jnp.inf), jnp.where(sound, allowed, 1)
         return jax.lax.stop_gradient((error, allowed, jnp.where(sound, angle, 0)))
@@ -273,7 +242,7 @@ def integrate(
         left = (due - carry.elapsed).astype(dtype)
         # divide what remains evenly, so that no step is much shorter than its neighbours
         width = jnp.where(left <= carry.width, left, jnp.minimum(carry.width, left / 2))
-        cut = width < 0.999 * carry.width  # shortened to end at a time, not by rounding
+        cut = width < control.CUT * carry.width  # shortened to end at a time, not by rounding
         # the width is the difference of two representable times, or rounding would accumulate;
         # rounded down after a refused step, which would otherwise be attempted again and again
         near = carry.elapsed + width.astype(carry.elapsed.dtype)
@@ -299,12 +268,15 @@ def integrate(
         )
         ratio = worst(error / allowed, failed(fixed, carry))
         accepted = (ratio <= 1) & alive
-        size = jnp.log(jnp.maximum(ratio, 1e-6))  # logarithms: a power takes as long as three
-        factor = CAUTION * jnp.exp(power * (jnp.where(accepted, MEMORY * carry.before, 0) - size))
-        factor = jnp.clip(factor, jnp.where(accepted, 0.2, 0.1), jnp.where(accepted, 4, 0.9))
+        # logarithms: a power takes as long as three of them
+        size = jnp.log(jnp.maximum(ratio, control.MIN_RATIO))
+        memory = jnp.where(accepted, control.MEMORY * carry.before, 0)
+        factor = control.SAFETY * jnp.exp(power * (memory - size))
+        factor = jnp.clip(factor, *control.factor_bounds(accepted, control.MAX_MIDPOINT_FACTOR))
         # the error of a step that a jump has shortened to units in the last place of the time is
         # rounding and says nothing about the width that is possible
-        factor = jnp.where(accepted & (width < 64 * grain.astype(dtype)) & ~cut, 4, factor)
+        short = width < control.GRAIN * grain.astype(dtype)
+        factor = jnp.where(accepted & short & ~cut, control.MAX_MIDPOINT_FACTOR, factor)
         proposed = jnp.where(
             accepted & cut, jnp.maximum(carry.width, width * factor), width * factor
         )
@@ -343,7 +315,8 @@ def integrate(
     body = jnp.arange(zero.size, dtype=jnp.int32).reshape(zero.shape)
     fixed = _Fixed(field.data, body, progress.reason)
     # half of what a smooth motion allows, or everything at once if that is short
-    guess = 4 * limits.rtol.astype(dtype) ** power / jnp.maximum(rate, 1 / (length + remaining))
+    guess = control.FIRST_WIDTH * limits.rtol.astype(dtype) ** power
+    guess = guess / jnp.maximum(rate, 1 / (length + remaining))
     guess = jnp.where(progress.width > 0, progress.width, guess)  # NaN where the rates are
     guess = jax.lax.stop_gradient(guess)
     if not own:
@@ -371,13 +344,13 @@ def integrate(
     )
 
     def able(fixed, carry):
-        return live(fixed, carry) & (carry.attempts < _TRIES * limits.steps)
+        return live(fixed, carry) & (carry.attempts < control.ATTEMPTS * limits.steps)
 
     def finished(fixed, carry):
         arrived = (carry.elapsed >= duration) & (fixed.reason == 0)
         y = [jnp.where(arrived, x, jnp.nan) for x in carry.y]
         numbers = jnp.isfinite(carry.width) & jnp.isfinite(carry.refused[0])
-        left = (carry.steps < limits.steps) & (carry.attempts < _TRIES * limits.steps)
+        left = (carry.steps < limits.steps) & (carry.attempts < control.ATTEMPTS * limits.steps)
         why = jnp.where(left, jnp.where(numbers, 2, 3), 1)
         reason = jnp.where(arrived, 0, jnp.where(fixed.reason > 0, fixed.reason, why))
         # as floats, like the other numbers
@@ -404,7 +377,7 @@ def integrate(
 
 def _drift(angle: Array) -> Array:
     """Reduction of the tolerance: the power 3/4 of the angle, by square roots, which are faster."""
-    far = jnp.maximum(angle / LONG, 1)
+    far = jnp.maximum(angle / control.DRIFT_ANGLE, 1)
     return jnp.sqrt(far * jnp.sqrt(far))
 
 
@@ -424,7 +397,7 @@ def _jump_error(rates, t, width, carry, new, later, weights) -> Array:
     with it there. Along a straight line, the tangent at the start or the chord at the end,
     differences of smooth rates fall with their order; those of rates that jump do not.
     """
-    gap = GAP * width
+    gap = control.JUMP_GAP * width
     eps = float(jnp.finfo(width.dtype).eps)
 
     def pick(at_end, a, b):
@@ -437,7 +410,7 @@ def _jump_error(rates, t, width, carry, new, later, weights) -> Array:
         # along the tangent at the start, back along the chord at the end
         chord = [a - b for a, b in zip(carry.y, new)]
         part = [gap * f for f in carry.rates]
-        part = pick(at_end, part, [GAP * x for x in chord])
+        part = pick(at_end, part, [control.JUMP_GAP * x for x in chord])
         start, sign = jnp.where(at_end, t + width, t), jnp.where(at_end, -1, 1)
 
         def further(k, result):
@@ -459,7 +432,7 @@ def _jump_error(rates, t, width, carry, new, later, weights) -> Array:
         sizes = [jnp.zeros_like(total)] * 3
         _, sizes = jax.lax.fori_loop(1, 4, further, ([there, zero, zero], sizes))
         first, second, third = sizes
-        noise = 64 * eps * weighted_length(weights, there)
+        noise = control.JUMP_NOISE * eps * weighted_length(weights, there)
         jumps = third > jnp.maximum(0.5 * jnp.maximum(second, 0.5 * first), noise)
         return total + jnp.where(jumps, third * jnp.abs(4 * gap), 0)
 

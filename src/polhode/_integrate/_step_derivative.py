@@ -24,6 +24,7 @@ from jax.interpreters import ad
 from jaxtyping import Array
 
 from polhode import _policy
+from polhode._integrate import _error_control as control
 from polhode._integrate._explicit_step import (
     Motion,
     Progress,
@@ -32,7 +33,7 @@ from polhode._integrate._explicit_step import (
     dense_state,
     weighted,
 )
-from polhode._integrate._loop import FINISHED, RUNNING, TRIES, Make, advance, begin, each_body, run
+from polhode._integrate._loop import FINISHED, RUNNING, Make, advance, begin, each_body, run
 from polhode._kernels import any_of, attached, is_slope, kernel, linear, zeros
 
 
@@ -166,7 +167,7 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
     """Cotangents of the state at the start and of the floats among ``motion.coefficients``."""
     first, rows = begin(motion, options, start, times[-1:], y)
     end = times[-1:]
-    length = -(-TRIES * options.max_steps // _policy.RECORD_SEGMENTS)
+    length = -(-control.ATTEMPTS * options.max_steps // _policy.RECORD_SEGMENTS)
 
     def buffers(size, tree):
         return jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), tree)

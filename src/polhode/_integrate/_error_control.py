@@ -1,0 +1,121 @@
+"""Constants of the error control, of both rules of steps: unit in brackets, meaning, what fits it.
+
+``python -m benchmarks.error_control`` compares estimates, requested and reached errors of random
+bodies with long-double solutions (docs/design_notes.md); where no other command is named, it is
+the one that shows the effect of a constant. eps: one unit in the last place, relative.
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array
+
+# Both rules.
+
+SAFETY = 0.9
+"""[factor] Of the width that the error of the last step suggests."""
+
+MEMORY = 0.3
+"""[exponent] Of the error of the step before, in the width of the next one (a PI controller)."""
+
+DRIFT_ANGLE = 100
+"""[rad] Beyond it the tolerance falls with the power 3/4 of the angle, for an error of the rates
+goes on turning the body. The error would grow in proportion to the angle if the errors of all steps
+had one sign, which is rare (1 body in 300)."""
+
+ROUNDED_STEP = 8
+"""[eps] Below it the error of a step is rounding: no shorter step reduces it."""
+
+MIN_FACTOR = 0.2
+"""[factor] Smallest change of the width after an accepted step."""
+
+MIN_REFUSED_FACTOR = 0.1
+"""[factor] Smallest change of the width after a refused step."""
+
+MAX_REFUSED_FACTOR = 0.9
+"""[factor] Largest change of the width after a refused step."""
+
+MIN_RATIO = 1e-6
+"""[1] Errors over tolerance below this count as this, for the logarithm."""
+
+FIRST_WIDTH = 4
+"""[rad] Angle of the first step at a tolerance of 1; falls with the root of the order: half of what
+smooth motions allow."""
+
+CUT = 0.999
+"""[factor] A step shorter than this part of the proposed width was cut to end at a time: its error
+does not shorten the next one."""
+
+MIN_WIDTH = 0.1
+"""[eps] Of the time span: steps that are shorter lead nowhere, and the body has failed."""
+
+ATTEMPTS = 4
+"""[attempts] Allowed for each step that is allowed."""
+
+
+# Extrapolated midpoint rule.
+
+CALIBRATION = 5
+"""[factor] The estimated error of a step over e^2 / d (see ``_midpoint.py``): the true error was 2
+to 20 times e^2 / d, 4.5 times in the median."""
+
+MIDPOINT_SHARE = 0.6
+"""[rtol] Bound of the sum of the errors of the steps. Where the motion itself amplifies errors the
+error is larger (docs/design_notes.md)."""
+
+FIRST_SHARE = 0.05
+"""[factor] Error allowed for a radian at the start, over the mean of the motion; the remainder is
+allowed in proportion to the square of the angle. An early error has the longest time to grow, and
+at a high order a step with a twentieth of the error is only a fifth shorter."""
+
+COMPENSATED_STEP = 4
+"""[eps] The same as ``ROUNDED_STEP`` where steps carry their rounding errors along."""
+
+MAX_MIDPOINT_FACTOR = 4
+"""[factor] Largest growth of the width from step to step."""
+
+GRAIN = 64
+"""[units in the last place of the time] A step this short, which a jump has cut, has an error of
+rounding that says nothing about the width: the next one grows by the largest factor."""
+
+# Where a torque jumps within a step, the last two values of the table differ by less than their
+# errors. This shows in errors that do not fall with the order when a refused step is shortened.
+
+ROUGH_FALL = 2
+"""[factor] By so much more than the order predicts the error exceeds that of the refused step."""
+
+ROUGH_ROUNDING = 128
+"""[eps] Smaller errors are not examined: rounding does not fall with the order either."""
+
+ROUGH_ERROR = 32
+"""[factor] Of the estimate in such a step."""
+
+JUMP_GAP = 1 / 16
+"""[step] The search for jumps samples one, two and three of these from either end of a step."""
+
+JUMP_NOISE = 64
+"""[eps] Third differences of the rates below this are rounding and not jumps."""
+
+
+# Explicit Runge-Kutta steps.
+
+EXPLICIT_SHARE = 2.0
+"""[rtol] Bound of the sum of the estimated errors. The estimate, of lower order, exceeds the error
+ten times and more: with 0.6 satellites keep a hundredth of ``rtol`` and take 1.2 times the steps;
+with 4 the worst of 64 exceeds ``rtol`` four times (``python -m benchmarks.torqued``)."""
+
+MAX_EXPLICIT_FACTOR = 5
+"""[factor] Largest growth of the width from step to step."""
+
+MAX_REVERSALS = 16
+"""[switches] Consecutive ones that turn back at once, after which the motion slides along a
+switch."""
+
+UNDEFINED_SIDE = 0.98
+"""[factor] Of the part of a step up to a switch beyond which the field is not defined."""
+
+
+def factor_bounds(accepted: Array, largest: float) -> tuple[Array, Array]:
+    """Smallest and ``largest`` change of the width, by whether each step was accepted."""
+    return (
+        jnp.where(accepted, MIN_FACTOR, MIN_REFUSED_FACTOR),
+        jnp.where(accepted, largest, MAX_REFUSED_FACTOR),
+    )
