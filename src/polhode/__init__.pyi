@@ -40,6 +40,7 @@ from ._scene import (
     BodyTorque as BodyTorque,
     SpaceTorque as SpaceTorque,
     FeedbackTorque as FeedbackTorque,
+    SampledTorque as SampledTorque,
     RelativeTorque as RelativeTorque,
     Pulses as Pulses,
     LinearDamping as LinearDamping,

@@ -153,9 +153,10 @@ def plan(
     method: AbstractMethod | None,
     rtol: Array,
     record: Record,
+    reason: str = "as asked for",
 ) -> Plan:
-    """The plan of checked input (see ``ph.explain``)."""
-    reason, refused, narrower = "as asked for", (), ()
+    """The plan of checked input (see ``ph.explain``); ``reason``: why a given method runs."""
+    refused, narrower = (), ()
     if method is None:
         method, reason = choose(scene, rtol)
         if not method.exact:

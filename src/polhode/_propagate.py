@@ -21,6 +21,7 @@ from polhode._method import (
     raise_on_failure,
 )
 from polhode._plan import choose
+from polhode._sampled import is_sampled
 from polhode._scene import BodyTorque, Scene, State, Wheels
 from polhode._scene._scene import places_of
 from polhode._simulate import simulate
@@ -90,6 +91,11 @@ def propagate(
         covariance = jacobian @ covariance @ jacobian.T + noise @ noise.T * density / 0.1
     """
     check_kinds(scene, state)
+    if is_sampled(scene):
+        raise ValueError(
+            "a SampledTorque holds a command that the state does not contain: propagate each period"
+            " with its command as a ph.BodyTorque."
+        )
     if state.wxyz.ndim > 1 or state.omega_body.ndim > 1:
         raise ValueError(
             "propagate takes one body, got a state of shapes"

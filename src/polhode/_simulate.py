@@ -42,6 +42,7 @@ from polhode._method import (
     raise_on_failure,
 )
 from polhode._plan import Plan, choose, plan
+from polhode._sampled import HeldPropagator, held, is_sampled
 from polhode._scene import Scene, State
 from polhode._trajectory import Propagator, Trajectory
 
@@ -95,19 +96,31 @@ def simulate(
     """
     if until is not None:
         check_until(until, record)
+    _refuse_events_of_commands(scene, until, events)
     if events is not None:
         return _with_events(scene, state, ts, method, rtol, record, until, events, throw)
     scene, state, ts, record = check_inputs(scene, state, ts, record)
     check_method(method)
     checked_rtol = check_rtol(rtol, state.wxyz.dtype)
     split = split_of(scene, state, ts)
-    if method is None:
+    if is_sampled(scene):
+        method = held(method, scene, ts, checked_rtol, record)
+    elif method is None:
         method, _ = choose(scene, checked_rtol)
     if split is not None and is_concrete(scene, state, ts):
         scene, state, ts = place(split, scene, state, ts)
     if until is not None:
         return checked(stopped(_begin(method, scene, state, ts, checked_rtol), ts, until), throw)
     return checked(run(method, scene, state, ts, checked_rtol, record, split), throw)
+
+
+def _refuse_events_of_commands(scene: Scene, until, events) -> None:
+    if (until is None and events is None) or not isinstance(scene, Scene) or not is_sampled(scene):
+        return
+    raise ValueError(
+        "events are not searched for in a scene with a SampledTorque: save the motion at the ends"
+        " of its periods and look there, or use ph.FeedbackTorque."
+    )
 
 
 def _with_events(scene, state, ts, method, rtol, record, until, events, throw) -> Trajectory:
@@ -167,7 +180,11 @@ def explain(
     """
     scene, state, ts, record = check_inputs(scene, state, ts, record)
     check_method(method)
-    return plan(scene, state, ts, method, check_rtol(rtol, state.wxyz.dtype), record)
+    checked_rtol = check_rtol(rtol, state.wxyz.dtype)
+    if is_sampled(scene):
+        method = held(method, scene, ts, checked_rtol, record)
+        return plan(scene, state, ts, method, checked_rtol, record, "the torque is sampled")
+    return plan(scene, state, ts, method, checked_rtol, record)
 
 
 @jit_distinct
@@ -206,7 +223,7 @@ def _trajectory(method, scene, state, ts, rtol, record, split) -> Trajectory:
         found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
     wxyz, omega, status, steps, work, error, motors, spins = found
     kept = ts[..., -1:] if record.final_only else ts
-    propagator = Propagator.of(method, rtol)
+    propagator = HeldPropagator() if is_sampled(scene) else Propagator.of(method, rtol)
     trajectory = Trajectory(
         kept, wxyz, omega, status, steps, scene, work, error, motors, spins, propagator
     )

@@ -16,7 +16,7 @@ from polhode._events._event import Event, at_least
 from polhode._integrate import Search, natural_rates
 from polhode._method import Status
 from polhode._scene import Scene, State
-from polhode._trajectory import Trajectory, begun, moved_through, moved_to
+from polhode._trajectory import Propagator, Trajectory, begun, moved_through, moved_to
 
 SAMPLES_PER_TURN = 32
 """Samples per revolution at the fastest natural rate."""
@@ -93,6 +93,11 @@ def crossings(
         getattr(trajectory, name)  # raises where it was not recorded
     if trajectory.propagator is None:
         raise ValueError("this trajectory was made by hand: use one that ph.simulate returns.")
+    if not isinstance(trajectory.propagator, Propagator):
+        raise ValueError(
+            "a SampledTorque holds a command that the samples do not contain: events between them"
+            " are not searched for."
+        )
     propagator: Any = trajectory.propagator
     if not propagator.method.exact:
         met = _by_steps(trajectory, event, stored or CAPACITY)

@@ -36,6 +36,7 @@ from polhode._scene._torques import (
     LinearDamping as LinearDamping,
     Pulses as Pulses,
     QuadraticDamping as QuadraticDamping,
+    SampledTorque as SampledTorque,
     SpaceTorque as SpaceTorque,
     TorqueSum as TorqueSum,
 )

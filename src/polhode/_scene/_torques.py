@@ -278,6 +278,53 @@ class EnergySink(AbstractTorque):
         return triple(rate * x for x in cross(momentum, omega))
 
 
+class SampledTorque(AbstractTorque):
+    """A controller that runs once in every period; its torque is held in between.
+
+    The zero-order hold of flight software. **Arguments:** ``fn(t, wxyz, omega_body)`` -> (3,):
+    torque in body axes [N m], as of ``ph.FeedbackTorque``; ``period`` [s]: a number, not a leaf.
+    ``fn`` is called at the first time of a simulation and in every ``period`` after it, so that a
+    simulation that continues another one should start where a period ends. It need not be smooth.
+
+    Only ``ph.simulate`` integrates it, alone or as a term of a sum, without events and work; the
+    times must be known (under ``jax.jit`` a list or a NumPy array), and ``Trajectory.at`` is not
+    available. A motion takes one integration for every period and every time. Derivatives by the
+    state and by the arrays of ``fn`` are those of the sampled system.
+
+        law = ph.SampledTorque(lambda t, wxyz, omega: -0.5 * omega, period=0.1)
+        scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), torque=law)
+
+    Raises TypeError or ValueError for a function that takes or returns something else, ValueError
+    for a period that is not positive.
+    """
+
+    fn: Callable
+    period: float = eqx.field(static=True)
+
+    def __init__(self, fn: Callable, period: float):
+        self.fn = _FEEDBACK.checked(fn)
+        if isinstance(period, bool) or not isinstance(period, (int, float)):
+            raise TypeError(
+                "SampledTorque period must be a number in seconds such as 0.1, got"
+                f" {type(period).__name__}."
+            )
+        if not 0 < period < float("inf"):
+            raise ValueError(f"SampledTorque period must be positive and finite, got {period}.")
+        self.period = float(period)
+
+    def command(self, t: Array, wxyz: Array, omega: Array) -> Array:
+        """The torque (N, 3) [N m] that N bodies will hold from the time ``t`` on."""
+        return _FEEDBACK.mapped(self.fn, t, wxyz, omega)
+
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
+        raise ValueError(
+            "SampledTorque holds a command that the state does not contain: simulate it with"
+            " ph.simulate without events, as the torque of the scene or a term of its sum."
+        )
+
+
 # Pulses: torques that act for a while, such as those of thrusters, whose edges no step misses.
 
 

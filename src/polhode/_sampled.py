@@ -1,0 +1,170 @@
+"""Motion under commands that are held: one integration from every edge or sample to the next."""
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from polhode._checks import ArrayLike, is_concrete
+from polhode._method import AbstractMethod, Record, Samples, Status
+from polhode._plan import choose
+from polhode._scene import BodyTorque, SampledTorque, Scene, State, TorqueSum
+from polhode._trajectory import Trajectory, begun
+from polhode._trajectory._trajectory import AbstractPropagator
+
+_COINCIDENT = 1e-9
+"""Part of a period below which a sample and the start of a period are one time."""
+
+
+def is_sampled(scene: Scene) -> bool:
+    """Whether a term of the torque is a ``SampledTorque``."""
+    return any(isinstance(term, SampledTorque) for term in _terms(scene.torque))
+
+
+def held(
+    method: AbstractMethod | None, scene: Scene, ts: Any, rtol: Array | float, record: Record
+) -> "HeldCommands":
+    """The method for a scene with a ``SampledTorque``; ``method``: that of each segment, or None.
+
+    Raises ValueError for what is not possible with it.
+    """
+    sampled = [term for term in _terms(scene.torque) if isinstance(term, SampledTorque)]
+    periods = {term.period for term in sampled}
+    if len(periods) > 1:
+        raise ValueError(
+            f"all SampledTorques of a scene must have one period, got {sorted(periods)}: join them"
+            " in one function."
+        )
+    if record.work:
+        raise ValueError("Record(work=True) is not available with SampledTorque: drop work=True.")
+    if not is_concrete(ts) or np.ndim(ts) != 1:
+        raise ValueError(
+            "the times of a scene with a SampledTorque must be one row of known numbers: under"
+            " jax.jit pass a list or a NumPy array, not a jax.numpy array."
+        )
+    if method is None:
+        method, _ = choose(_with_commands(scene, [jnp.zeros(3, scene.inertia.dtype)]), rtol)
+    return HeldCommands.of(method, np.asarray(ts, float), *periods)
+
+
+class HeldCommands(AbstractMethod):
+    """Commands held from edge to edge; ``method`` integrates each segment.
+
+    ``times`` (M + 1,): edges and samples in order; ``edges`` (M,): whether a segment starts at an
+    edge; ``places`` (T,): of the samples in ``times``.
+    """
+
+    method: AbstractMethod
+    times: Array
+    edges: Array
+    places: Array
+    period: float = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, method: AbstractMethod, ts: np.ndarray, period: float) -> "HeldCommands":
+        """For samples at ``ts`` (T,) and edges in every ``period`` from the first of them on."""
+        sign, start = np.sign(ts[-1] - ts[0]), ts[0]
+        phase = sign * (ts - start) / period
+        near = np.abs(phase - np.round(phase)) < _COINCIDENT
+        phase = np.where(near, np.round(phase), phase)
+        edges = np.arange(np.ceil(phase[-1]))
+        every = np.union1d(edges, phase)
+        # samples as they are given, edges between them
+        times = start + sign * period * every
+        places = np.searchsorted(every, phase)
+        times[places] = ts
+        return cls(method, times, np.isin(every[:-1], edges), places, period)
+
+    @property
+    def keeps_rtol(self) -> bool:
+        """Whether the segments do."""
+        return self.method.exact or self.method.keeps_rtol
+
+    @property
+    def name(self) -> str:
+        """That of the segments."""
+        return f"HeldCommands({self.method.name})"
+
+    def steps_of(self, scene: Scene, state: State, ts: Array, record: Record) -> str:
+        """Number and length of the segments."""
+        return f"{len(self.edges):,} segments, with a command held over every {self.period:g} s"
+
+    def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
+        bodies = state.wxyz.shape[0]
+        times = jnp.asarray(self.times, state.wxyz.dtype)
+        share = _share(state, times, rtol)
+        coupled = bool(scene.dynamics.coupled)
+        spins = ()
+        if coupled:
+            rates = tuple(jnp.moveaxis(state.omega_body, -1, 0))
+            spins = (jnp.stack(scene.dynamics.wheels.initial_spins(rates), axis=-1),)
+        laws = [x for x in _terms(scene.torque) if isinstance(x, SampledTorque)]
+        final = Record(final_only=True)
+
+        def segment(carry, given):
+            samples, commands, status, steps = carry
+            is_edge, span = given
+            wxyz, omega, *spins = samples
+            fresh = [law.command(span[0], wxyz, omega) for law in laws]
+            commands = [jnp.where(is_edge, a, b) for a, b in zip(fresh, commands)]
+            now = begun(_with_commands(scene, commands), spins)
+            found = self.method.run(now, State(wxyz, omega), span, share, final)
+            there = [x[:, 0] for x in (found.wxyz, found.omega_body, found.spins) if x is not None]
+            status = jnp.where(status == Status.SUCCESSFUL, found.status.astype(jnp.int32), status)
+            carry = there, commands, status, steps + found.steps.astype(jnp.int32)
+            return carry, there
+
+        begin = [state.wxyz, state.omega_body, *spins]
+        zero = jnp.zeros(bodies, jnp.int32)
+        commands = [jnp.zeros((bodies, 3), times.dtype) for _ in laws]
+        spans = jnp.stack([times[:-1], times[1:]], axis=-1)
+        (_, _, status, steps), passed = jax.lax.scan(
+            segment, (begin, commands, zero, zero), (jnp.asarray(self.edges), spans)
+        )
+        places = self.places[-1:] if record.final_only else self.places
+        wxyz, omega, *spins = (
+            jnp.moveaxis(jnp.concatenate([x[None], y])[places], 0, 1) for x, y in zip(begin, passed)
+        )
+        return Samples(
+            wxyz if record.attitude else None,
+            omega if record.rates else None,
+            status,
+            steps,
+            spins=spins[0] if spins else None,
+        )
+
+
+class HeldPropagator(AbstractPropagator):
+    """Of a trajectory with a command that its samples do not contain."""
+
+    def at(self, trajectory: Trajectory, t: ArrayLike) -> Trajectory:
+        raise ValueError(
+            "a SampledTorque holds a command that the samples do not contain: pass all times to"
+            " ph.simulate."
+        )
+
+
+def _share(state: State, times: Array, rtol: Array) -> Array:
+    """Tolerance of a segment: that of a radian, where errors add up over the whole angle."""
+    rates = jnp.linalg.norm(jax.lax.stop_gradient(state.omega_body), axis=-1)
+    angle = jnp.max(rates, initial=0) * jnp.abs(times[-1] - times[0])
+    share = rtol / jnp.maximum(jnp.maximum(angle, 1), len(times) ** 0.5)
+    return jnp.maximum(share, 8 * jnp.finfo(times.dtype).eps)
+
+
+def _terms(torque: Any) -> tuple[Any, ...]:
+    return torque.terms if isinstance(torque, TorqueSum) else (torque,)
+
+
+def _with_commands(scene: Scene, commands: list[Array]) -> Scene:
+    """The scene with a constant torque in place of each ``SampledTorque``."""
+    given = iter(commands if len(commands) > 1 else commands * len(_terms(scene.torque)))
+    terms = [
+        BodyTorque(next(given)) if isinstance(x, SampledTorque) else x for x in _terms(scene.torque)
+    ]
+    torque = terms[0] if len(terms) == 1 else TorqueSum(tuple(terms))
+    return dataclasses.replace(scene, torque=torque)

@@ -1,0 +1,105 @@
+"""Commands that are computed at fixed times and held in between."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import polhode as ph
+
+MOMENTS = np.array([1.0, 1.5, 2.0])
+INERTIA = ph.Inertia.from_moments(MOMENTS)
+WXYZ, OMEGA = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.3, -0.2, 0.5])
+PERIOD = 0.25
+TS = [0.0, 0.1, 0.25, 0.75, 1.6]
+"""Inside periods, at their ends, and in one that is cut."""
+
+
+def law(t, wxyz, omega):
+    """With a kink and a jump, which a held command does not pass on to the field."""
+    return jnp.clip(-0.8 * omega - 0.5 * wxyz[1:] * jnp.sign(wxyz[0]), -0.2, 0.2) + 0.1 * t
+
+
+def truth(ts, damping=0.0):
+    """SciPy's motion, period by period."""
+
+    def field(t, y, command):
+        q, w = y[:4], y[4:]
+        turn = np.concatenate([[-q[1:] @ w], q[0] * w + np.cross(q[1:], w)]) / 2
+        torque = command - damping * w
+        return np.concatenate([turn, (torque - np.cross(w, MOMENTS * w)) / MOMENTS])
+
+    y, rows = np.concatenate([WXYZ, OMEGA]), []
+    for k in range(int(np.ceil(ts[-1] / PERIOD))):
+        begin, end = k * PERIOD, min((k + 1) * PERIOD, ts[-1])
+        command = np.asarray(law(begin, y[:4], y[4:]))
+        options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13, "dense_output": True}
+        solved = solve_ivp(field, (begin, end), y, args=(command,), **options)
+        rows += [solved.sol(t) for t in ts if begin <= t < end]
+        y = solved.y[:, -1]
+    return np.array([*rows, y])
+
+
+def scene(fn=law):
+    return ph.Scene(INERTIA, torque=ph.SampledTorque(fn, PERIOD))
+
+
+def test_a_held_command_against_scipy():
+    found = ph.simulate(scene(), ph.State(WXYZ, OMEGA), TS)
+    both = np.concatenate([found.wxyz, found.omega_body], axis=-1)
+    np.testing.assert_allclose(both, truth(TS), atol=1e-11)
+    plan = str(ph.explain(scene(), ph.State(WXYZ, OMEGA), TS))
+    assert "8 segments, with a command held over every 0.25 s" in plan
+
+
+@pytest.mark.slow
+def test_a_held_command_beside_damping_of_a_batch():
+    """Bodies enough for the midpoint rule, a sum of torques, and times of which one is kept."""
+    torque = ph.LinearDamping(0.3) + ph.SampledTorque(law, PERIOD)
+    rates = OMEGA * np.linspace(1, 2, 6)[:, None]
+    states = ph.State(np.tile(WXYZ, (6, 1)), rates)
+    record = ph.Record(final_only=True)
+    found = ph.simulate(ph.Scene(INERTIA, torque=torque), states, TS, record=record)
+    assert found.wxyz.shape == (6, 1, 4)
+    last = np.concatenate([found.wxyz[0, 0], found.omega_body[0, 0]])
+    np.testing.assert_allclose(last, truth(TS, 0.3)[-1], atol=1e-9)
+
+
+@pytest.mark.slow
+def test_derivatives_of_a_held_command():
+    """By the initial rates and by a gain, in reverse mode under ``jit``, against differences."""
+
+    def loss(omega, gain):
+        fn = jax.tree_util.Partial(lambda g, t, wxyz, w: -g * w - 0.5 * wxyz[1:], gain)
+        last = ph.simulate(scene(fn), ph.State(WXYZ, omega), [0.0, 1.1], rtol=1e-11).last
+        return last.omega_body[0] + last.wxyz[1]
+
+    at = jax.jit(loss)
+    by_omega, by_gain = jax.jit(jax.grad(loss, (0, 1)))(jnp.array(OMEGA), 0.8)
+    h, up = 1e-4, np.array([1e-4, 0, 0])
+    np.testing.assert_allclose(by_gain, (at(OMEGA, 0.8 + h) - at(OMEGA, 0.8 - h)) / (2 * h), 1e-6)
+    slope = (at(OMEGA + up, 0.8) - at(OMEGA - up, 0.8)) / (2 * h)
+    np.testing.assert_allclose(by_omega[0], slope, rtol=1e-6)
+
+
+def test_a_sampled_torque_says_what_it_cannot():
+    state = ph.State(WXYZ, OMEGA)
+    event = ph.Event(lambda wxyz, omega, t: omega[0])
+    with pytest.raises(ValueError, match="must be positive"):
+        ph.SampledTorque(law, -0.1)
+    with pytest.raises(TypeError, match="a number in seconds"):
+        ph.SampledTorque(law, "fast")
+    with pytest.raises(ValueError, match="events are not searched"):
+        ph.simulate(scene(), state, TS, until=event)
+    with pytest.raises(ValueError, match="list or a NumPy array"):
+        jax.jit(lambda: ph.simulate(scene(), state, jnp.linspace(0, 1, 3)).wxyz)()
+    with pytest.raises(ValueError, match="drop work"):
+        ph.simulate(scene(), state, TS, record=ph.Record(work=True))
+    with pytest.raises(ValueError, match="does not contain"):
+        ph.propagate(scene(), state, 0.1)
+    found = ph.simulate(scene(), state, TS[:2])
+    with pytest.raises(ValueError, match="pass all times"):
+        found.at(0.05)
+    with pytest.raises(ValueError, match="events between"):
+        ph.crossings(found, event)
