@@ -260,6 +260,13 @@ def test_a_mode_that_the_shape_decides_is_ambiguous(cases):
         )
         assert found.verdict is expected
     assert "assumption on the shape" in found.reasons[0]
+    # unless convex bodies with the motion of the ellipsoid are excluded by far
+    for odds, expected in ((1e-5, Verdict.AMBIGUOUS), (1e-8, Verdict.TUMBLING)):
+        rival = other._replace(probability=odds, model=body.model + 0.1)
+        found = _fit.judge(
+            linear, nulls, pairs, (body, rival), reproduced=True, limit=3.0, others=(other,)
+        )
+        assert found.verdict is expected
 
 
 def test_fourteen_points_are_too_few():

@@ -200,11 +200,16 @@ def judge(
             f"{rivals - 1} other pair(s) of periods cannot be excluded at 1 in"
             f" {round(1 / EXCLUDED)}."
         )
-    if any(same_periods((best, other), pairs.resolution) != [0, 0] for other in others):
-        reasons.append(
-            "The best ellipsoid has other periods or another mode than the best convex body: the"
-            " assumption on the shape decides."
-        )
+    # An ellipsoid has too few parameters to follow another body and a convex shape has many, which
+    # can make up for a wrong motion. Where they disagree the shape must be decisive by far.
+    for other in others:
+        matches = [same_periods((s, other), pairs.resolution) == [0, 0] for s in solutions]
+        odds = [s.probability for s, same in zip(solutions, matches, strict=True) if same]
+        if not matches[0] and max(odds, default=1.0) > EXCLUDED**2:
+            reasons.append(
+                "The best ellipsoid has other periods or another mode than the best convex body:"
+                " the assumption on the shape decides."
+            )
     if agreement < _AGREEMENT:
         reasons.append(
             f"The best periods stay the best in {agreement:.0%} of resampled light curves only;"
