@@ -697,6 +697,13 @@ SECTIONS = {
         " `benchmarks/light_curves.py`), and bodies that are no ellipsoids (`eggs`).",
         more=_light_curves,
     ),
+    "light_curves_unseen": Section(
+        "Light curves of other bodies",
+        "{curves} light curves of convex polyhedra, whose shapes, motions and light do not come"
+        " from the package (see the top of `benchmarks/light_curves_unseen.py`), fitted with the"
+        " default settings; periods in hours.",
+        keys=("tumblers", "others", "period_errors_over_stated", "processor_seconds", "not_right"),
+    ),
     "racquet": Section(
         "Tosses of a racquet",
         "Real recordings of a phone's gyroscope (University of British Columbia,"

@@ -32,7 +32,14 @@ from benchmarks._report import OUT, one_thread, write
 
 KINDS = ("tumbler",) * 5 + ("rotator", "noise") + ("tumbler",) * 5 + ("rotator", "few")
 RIGHT = {"rotator": "ONE_PERIOD", "noise": "NO_SIGNAL", "few": "TOO_FEW_POINTS"}
-TUMBLERS = ("right", "right, ambiguous", "listed", "told", "denied", "silent")
+TUMBLERS = {
+    "right": "true periods and mode in first place, TUMBLING",
+    "right, ambiguous": "true periods and mode in first place, AMBIGUOUS",
+    "listed": "in the list, AMBIGUOUS",
+    "told": "not in the list, AMBIGUOUS",
+    "denied": "not called tumbling",
+    "silent": "other periods, TUMBLING",
+}
 LIGHT_TIME = 499.00478384 / 86400  # days per au
 OFFSET = 0.03  # standard deviation of the zero points of nights [mag]
 
@@ -330,21 +337,47 @@ def summary(rows: list[dict]) -> dict:
     """Counts, and the root of the mean square of the period errors over those stated."""
     tumblers = [r for r in rows if r["truth"]["kind"] == "tumbler"]
     z = np.array([z for r in tumblers if r["place"] == 0 for z in r["z"]])
+    seconds = [r["seconds"] for r in rows]
+
+    def count(name: str, kind: str) -> int:
+        return sum(r["score"] == name and r["truth"]["kind"] == kind for r in rows)
+
     return {
         "curves": len(rows),
-        "tumblers": {name: sum(r["score"] == name for r in tumblers) for name in TUMBLERS},
-        "others": {
-            kind: {
-                name: sum(r["score"] == name for r in rows if r["truth"]["kind"] == kind)
-                for name in ("right", "wrong", "silent")
-            }
+        "tumblers": [
+            {"score": name, "meaning": meaning, "curves": count(name, "tumbler")}
+            for name, meaning in TUMBLERS.items()
+        ],
+        "others": [
+            {"kind": kind, "expected": RIGHT[kind]}
+            | {name: count(name, kind) for name in ("right", "wrong", "silent")}
             for kind in RIGHT
+        ],
+        "period_errors_over_stated": {
+            "periods": z.size,
+            "rms": float(np.sqrt(np.mean(z**2))) if z.size else None,
+            "within_2": float(np.mean(np.abs(z) < 2)) if z.size else None,
         },
-        "z_rms": float(np.sqrt(np.mean(z**2))) if z.size else None,
-        "z_within_2": float(np.mean(np.abs(z) < 2)) if z.size else None,
-        "seconds_median": float(np.median([r["seconds"] for r in rows])) if rows else None,
-        "seconds_most": max((r["seconds"] for r in rows), default=None),
+        "processor_seconds": {
+            "median": float(np.median(seconds)) if rows else None,
+            "most": max(seconds, default=None),
+        },
+        "not_right": [_not_right(r) for r in rows if r["score"] != "right"],
     }
+
+
+def _not_right(row: dict) -> dict:
+    """A curve whose verdict does not claim the truth, with the periods in hours."""
+    truth, first = row["truth"], row["solutions"][0]
+    true = [f"{24 * truth[k]:.3f}" for k in ("P_phi", "P_psi", "period") if k in truth]
+    return {
+        "seed": row["seed"], "kind": truth["kind"], "verdict": row["verdict"],
+        "score": row["score"], "place": None if row["place"] is None else row["place"] + 1,
+        "true": f"{', '.join(true)} {truth.get('mode', '')}".strip(),
+        "first": f"{24 * first[0]:.3f}, {24 * first[2]:.3f} {first[4]}",
+        "calibrated": row["calibrated"],
+        "reasons": " ".join(row["reasons"]),
+    }  # fmt: skip
 
 
 def main() -> None:

@@ -31,7 +31,7 @@ class Instrument(eqx.Module):
     vector of its axis in sensor axes; ``delay``, s: to a gyroscope's reading belongs the speed of
     ``delay`` before; ``skew`` (3, 3): symmetric, traceless departure of the gyroscope's sensitivity
     from one (a common factor is that of ``spin_inertia``, an antisymmetric part a turn of the
-    axes); ``bias`` (3,), rad/s; ``offset``, rad/s: what the wheel's speed exceeds its reading by.
+    axes); ``bias`` (3,), rad/s.
     """
 
     spin_inertia: Array | float | None
@@ -39,7 +39,6 @@ class Instrument(eqx.Module):
     delay: Array | float = 0.0
     skew: Float[Array, "3 3"] | None = eqx.field(converter=_vector("skew", 3), default=None)
     bias: Float[Array, " 3"] | None = eqx.field(converter=_vector("bias"), default=None)
-    offset: Array | float = 0.0
 
     def __check_init__(self) -> None:
         if self.spin_inertia is not None:
@@ -57,21 +56,20 @@ class Instrument(eqx.Module):
         """Momentum of the wheel relative to the body, sensor axes; linear between the samples."""
         if self.spin_inertia is None:
             return jnp.zeros((*times.shape, 3), times.dtype)
-        speed = jnp.interp(times - self.delay, times, wheel) + self.offset
+        speed = jnp.interp(times - self.delay, times, wheel)
         return self.spin_inertia * speed[:, None] * self.axis[None]
 
 
 class Tolerance(NamedTuple):
     """Prior standard deviations of the fields of an ``Instrument``; zero: not fitted.
 
-    **Fields:** ``axis`` [rad]; ``delay`` [s]; ``skew``, relative; ``bias``, ``offset`` [rad/s].
+    **Fields:** ``axis`` [rad]; ``delay`` [s]; ``skew``, relative; ``bias`` [rad/s].
     """
 
     axis: float = 0.02
     delay: float = 1e-3
     skew: float = 0.01
     bias: float = 0.02
-    offset: float = 0.0
 
 
 @jax.jit

@@ -30,7 +30,7 @@ _SIZED = np.eye(6)
 _SIZELESS = np.concatenate([free_columns(FullTensor(), False), SCALE[:, None]], axis=1)
 # Unknowns of a recording: of its body's tensor, drag and noise, of the noise that all share, of the
 # instrument.
-_TENSOR, _DRAG, _LEVEL, _COMMON, _DEVICE = 6, 2, 5, 2, 12
+_TENSOR, _DRAG, _LEVEL, _COMMON, _DEVICE = 6, 2, 5, 2, 11
 _PARTS = np.cumsum([_TENSOR, _DRAG, _LEVEL, _COMMON])
 # Standard deviations expected: of the part of the spin that drag takes, of logarithms of the noise,
 # of its memory and of the wheel's noise
@@ -46,7 +46,7 @@ _SHIFT = 1e-2
 _ROUNDS = 5
 
 
-def instrument_of(unknown: Float[Array, " 12"], given: Instrument, tolerance: Tolerance):
+def instrument_of(unknown: Float[Array, " 11"], given: Instrument, tolerance: Tolerance):
     """The instrument that lies ``unknown`` tolerances from the one given."""
     size = tolerance.skew * unknown[:5]
     skew = jnp.einsum("k,kij->ij", size, jnp.asarray(_SKEW, unknown.dtype))
@@ -62,8 +62,7 @@ def instrument_of(unknown: Float[Array, " 12"], given: Instrument, tolerance: To
         axis / jnp.sqrt(jnp.sum(axis**2)),
         given.delay + tolerance.delay * unknown[7],
         skew if given.skew is None else given.skew + skew,
-        tolerance.bias * unknown[8:11] + (0 if given.bias is None else given.bias),
-        given.offset + tolerance.offset * unknown[11],
+        tolerance.bias * unknown[8:] + (0 if given.bias is None else given.bias),
     )
 
 
@@ -81,7 +80,7 @@ class Known(eqx.Module):
             return tensor_of(shape, base_of(sigma, True), _SIZED)
         return tensor_of(shape.at[5].set(0), base_of(sigma, True), _SIZELESS)
 
-    def parts(self, unknown: Float[Array, " 27"], body: Array, drag: Array):
+    def parts(self, unknown: Float[Array, " 26"], body: Array, drag: Array):
         """Tensor, drag, instrument and noise of one recording; ``drag``: its unit, over size."""
         shape, slowed, level, common, device = jnp.split(unknown, _PARTS)
         sigma = self.sigma[body]

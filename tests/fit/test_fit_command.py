@@ -2,11 +2,13 @@
 
 import json
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from polhode.cli import main
 from polhode.fit import SteppedMotion
+from polhode.fit._numerics import _is_single_use, compiled, single_use_programs
 
 
 @pytest.fixture
@@ -131,3 +133,17 @@ def test_repeated_times_are_named(toss, capsys):
 def test_a_missing_file_is_an_error(tmp_path, capsys):
     assert main(["fit", str(tmp_path / "none.csv")]) == 2
     assert "none.csv" in capsys.readouterr().err
+
+
+def test_programs_for_a_single_run_give_the_same():
+    @compiled
+    def function(x):
+        return jnp.sin(x) @ jnp.linspace(0.0, 1.0, 5)
+
+    x = jnp.arange(5.0)
+    with single_use_programs():
+        once = function(x)
+        assert _is_single_use.get()
+    assert not _is_single_use.get()
+    np.testing.assert_allclose(once, function(x), rtol=1e-14)
+    np.testing.assert_allclose(once, np.sin(np.arange(5.0)) @ np.linspace(0, 1, 5), rtol=1e-14)

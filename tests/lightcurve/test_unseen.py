@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from benchmarks import light_curves_unseen as unseen
+from benchmarks import _page, _report, light_curves_unseen as unseen
 from polhode import lightcurve
 
 
@@ -102,6 +102,12 @@ def test_a_run_continues_where_it_was_stopped(tmp_path, monkeypatch, capsys):
     assert seeds == [0, 1, 2, 5, 6]
     numbers = json.loads(output.read_text())["numbers"]
     assert numbers["curves"] == 5
-    assert numbers["tumblers"]["told"] == 3
-    assert numbers["others"]["rotator"] == {"right": 0, "wrong": 1, "silent": 0}
+    ends = {row["score"]: row["curves"] for row in numbers["tumblers"]}
+    assert ends["told"] == sum(ends.values()) == 3
+    assert numbers["others"][0] == {
+        "kind": "rotator", "expected": "ONE_PERIOD", "right": 0, "wrong": 1, "silent": 0
+    }  # fmt: skip
     assert "5 rotator  wrong" in capsys.readouterr().out
+    page = "\n".join(_page.SECTIONS["light_curves_unseen"].lines(_report.read(output)))
+    assert "| told | not in the list, AMBIGUOUS | 3 |" in page
+    assert "| rotator | ONE_PERIOD | 0 | 1 | 0 |" in page
