@@ -198,7 +198,7 @@ def test_refits_of_resampled_curves_are_weighted_least_squares():
     block, derivatives = np.repeat(np.arange(6), 10), rng.normal(size=(60, 3))
     data, prior = rng.normal(size=60), np.diag([0.0, 0.5, 2.0])
     best = -np.linalg.solve(derivatives.T @ derivatives + prior, derivatives.T @ data)
-    solution = _solutions.Linearised(data + derivatives @ best, derivatives, prior)
+    solution = _solutions.Linearised(data + derivatives @ best, derivatives, prior, prior @ best)
     weight = rng.multinomial(6, np.full(6, 1 / 6), 20).astype(float)
     cost = _fit._refitted_cost(solution, block, weight, 1.0, 1e6)
     at_best = best @ prior @ best
@@ -208,6 +208,22 @@ def test_refits_of_resampled_curves_are_weighted_least_squares():
         target = np.r_[-data * rows[:, 0], np.zeros(3)]
         left = np.linalg.lstsq(stacked, target, rcond=None)[1][0]
         assert cost[k] + at_best == pytest.approx(left, rel=1e-6)
+
+
+def test_a_refit_gains_nothing_by_offsets_without_points_or_by_ending_early():
+    """A free offset of a block that is not drawn; a solution beside the least cost."""
+    rng = np.random.default_rng(1)
+    block = np.repeat(np.arange(6), 10)
+    offsets = (block[:, None] == np.arange(6)).astype(float)
+    derivatives = np.hstack([rng.normal(size=(60, 2)), offsets])
+    residuals = 0.3 + rng.normal(size=60)  # the offsets are not those of the least cost
+    none = np.zeros((8, 8)), np.zeros(8)
+    weight = np.vstack([np.ones(6), [0, 2, 1, 1, 1, 1]]).astype(float)
+    solution = _solutions.Linearised(residuals, derivatives, *none)
+    cost = _fit._refitted_cost(solution, block, weight, 1.0, 3.0)
+    everything = _fit._robust_cost(residuals, 3.0).sum()
+    assert cost[0] == pytest.approx(everything)
+    assert abs(cost[1] / everything - 1) < 0.3
 
 
 def test_periods_that_win_in_few_refits_are_ambiguous(cases):
@@ -222,7 +238,10 @@ def test_periods_that_win_in_few_refits_are_ambiguous(cases):
         other = solution(model + part * residuals, P_psi=1.1 * P_PSI, odds=1e-4)
         linearised = [
             _solutions.Linearised(
-                (s.model - curve.magnitude) * linear.root, derivatives, np.zeros((3, 3))
+                (s.model - curve.magnitude) * linear.root,
+                derivatives,
+                np.zeros((3, 3)),
+                np.zeros(3),
             )
             for s in (best, other)
         ]

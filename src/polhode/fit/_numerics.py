@@ -22,10 +22,12 @@ from polhode import _policy
 
 # XLA's older way to emit loops: for what a fit does the program is as fast and compiles in half the
 # time. The jaxlib of jax 0.10 knows the option, that of 0.12 no longer.
-_OPTIONS: dict[str, Any] = {"xla_cpu_use_fusion_emitters": False}
+_OPTIONS: dict[str, Any] = {"compiler_options": {"xla_cpu_use_fusion_emitters": False}}
 # Without LLVM's optimisations the program of one recording compiles in 6 s of processor time
 # instead of 11, and runs 3.6 times as long: worthwhile for a fit of milliseconds that runs once.
-_SINGLE_USE = _OPTIONS | {"xla_backend_optimization_level": 0}
+_SINGLE_USE: dict[str, Any] = {
+    "compiler_options": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
+}
 _is_single_use: contextvars.ContextVar[bool] = contextvars.ContextVar("single_use", default=False)
 
 
@@ -42,8 +44,8 @@ def single_use_programs() -> Iterator[None]:
 def compiled(function: Callable) -> Callable:
     """``eqx.filter_jit`` that compiles faster on processors, where this is the outermost jit."""
     inner = eqx.filter_jit(function)
-    outermost = eqx.filter_jit(function, compiler_options=_OPTIONS)
-    single_use = eqx.filter_jit(function, compiler_options=_SINGLE_USE)
+    outermost = eqx.filter_jit(function, **_OPTIONS)
+    single_use = eqx.filter_jit(function, **_SINGLE_USE)
 
     @functools.wraps(function)
     def call(*args):
@@ -61,7 +63,7 @@ def _options_are_supported() -> bool:
     if not _policy.is_cpu() or _policy.is_plain():
         return False
     try:
-        jax.jit(lambda x: -x, compiler_options=_SINGLE_USE)(1.0)
+        jax.jit(lambda x: -x, **_SINGLE_USE)(1.0)
     except (JaxRuntimeError, ValueError):
         return False
     return True

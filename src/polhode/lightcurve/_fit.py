@@ -281,6 +281,7 @@ def _refitted_cost(
 ) -> np.ndarray:
     """Costs (r,) of a solution fitted again to blocks of points with ``weight`` (r, blocks)."""
     residuals, derivatives = solution.residuals / scale, solution.derivatives / scale
+    prior, gradient = solution.prior / scale**2, solution.gradient / scale**2
     robust = 1 / np.sqrt(1 + (residuals / limit) ** 2)
     many = weight.shape[1]
     # The normal equations are sums over blocks: those of a resampled light curve cost a sum of
@@ -289,13 +290,11 @@ def _refitted_cost(
     parts = [block == k for k in range(many)]
     matrices = np.array([weighted[part].T @ derivatives[part] for part in parts])
     rights = np.array([weighted[part].T @ residuals[part] for part in parts])
-    total = matrices.sum(0) + solution.prior
     # offsets of nights that were not drawn are not determined
-    jitter = 1e-9 * np.diag(np.diag(total))
-    matrix = np.einsum("rb,bij->rij", weight, matrices) + solution.prior + jitter
-    # At the best fit of all points the priors pull as the data do, in the opposite direction.
-    pull = rights.sum(0)
-    step = -np.linalg.solve(matrix, (weight @ rights - pull)[..., None])[..., 0]
+    jitter = 1e-9 * np.diag(np.diag(matrices.sum(0) + prior))
+    weight = np.vstack([np.ones(many), weight])
+    matrix = np.einsum("rb,bij->rij", weight, matrices) + prior + jitter
+    step = -np.linalg.solve(matrix, (weight @ rights + gradient)[..., None])[..., 0]
     cost = np.array(
         [
             _robust_cost(residuals[part][:, None] + derivatives[part] @ step.T, limit).sum(0)
@@ -303,7 +302,10 @@ def _refitted_cost(
         ]
     )
     cost = np.einsum("rb,br->r", weight, cost)
-    return cost + np.einsum("ri,ij,rj->r", step, solution.prior, step) - 2 * step @ pull
+    cost += np.einsum("ri,ij,rj->r", step, prior, step) + 2 * step @ gradient
+    # A solution that has not converged would gain by the step with all points as well, as far as
+    # the linear model holds, which was not tried: this gain does not count.
+    return cost[1:] - cost[0] + _robust_cost(residuals, limit).sum()
 
 
 # The search. Its cost is dominated by light curves of trial bodies, so that most bodies are

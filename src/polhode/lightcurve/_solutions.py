@@ -183,12 +183,13 @@ class Linearised(NamedTuple):
     """Residuals of a solution over their errors, and their first-order model; offsets included.
 
     The cost after a step x of the unknowns is that of ``residuals + derivatives @ x``, and of
-    what is known before ``x @ prior @ x`` plus a linear term that balances the data at x = 0.
+    what is known before ``x @ prior @ x + 2 gradient @ x``, but for a constant.
     """
 
     residuals: np.ndarray  # (n,)
     derivatives: np.ndarray  # (n, u)
     prior: np.ndarray  # (u, u)
+    gradient: np.ndarray  # (u,)
 
 
 class Described(NamedTuple):
@@ -218,10 +219,11 @@ def describe_solutions(
     robust, weight = np.asarray(robust)[:, :n], np.asarray(problem.points.weight)[:, :n]
     rest = model - curve.magnitude
     root = np.sqrt(weight[0])
-    _, prior, _ = problem.prior(chosen.bodies, chosen.offsets)
+    _, prior, gradient = problem.prior(chosen.bodies, chosen.offsets)
     derivatives = np.asarray(derivatives)[: len(order), :, :n]
     linearised = tuple(
-        Linearised(rest[k] * root, (derivatives[k] * root).T, prior) for k in range(len(order))
+        Linearised(rest[k] * root, (derivatives[k] * root).T, prior, gradient[k])
+        for k in range(len(order))
     )
     freedom = max(n - chosen.matrix.shape[1] + int((problem.stiffness > 0).sum()), 1)
     scale = float(np.sqrt((robust[0] * weight[0] * rest[0] ** 2).sum() / freedom))
@@ -588,7 +590,8 @@ def refine(
         damping = float(np.clip(damping * (0.2 if better else 5.0), 1e-9, 1e9))
         if quiet == 3:
             break
-    data, matrix, _ = normal(rest, slopes, open_area, by_open, body, coefficients)
+    data, matrix, right = normal(rest, slopes, open_area, by_open, body, coefficients)
+    pull = linear.projected(slopes).T @ (rest / np.sqrt(1 + (rest / limit) ** 2))
     inverse = np.linalg.pinv(matrix, hermitian=True)
     return Refined(
         jax.tree.map(np.asarray, body),
@@ -598,19 +601,25 @@ def refine(
         inverse[:8, :8],
         rest[:n] / linear.root,
         float(np.trace(inverse @ data)),
-        _linearised(rest[:n], slopes * linear.root[:, None], matrix - data, linear),
+        _linearised(rest[:n], slopes * linear.root[:, None], matrix - data, right - pull, linear),
     )
 
 
 def _linearised(
-    residuals: np.ndarray, derivatives: np.ndarray, prior: np.ndarray, linear: Linear
+    residuals: np.ndarray,
+    derivatives: np.ndarray,
+    prior: np.ndarray,
+    gradient: np.ndarray,
+    linear: Linear,
 ) -> Linearised:
     """With the offsets, and the other columns of ``linear``, as further unknowns."""
     many, columns = derivatives.shape[1], (linear.columns * linear.root).T
     full = np.zeros((many + columns.shape[1],) * 2)
     full[:many, :many] = prior
     full[many:, many:] = np.diag(linear.stiffness)
-    return Linearised(residuals, np.hstack([derivatives, columns]), full)
+    # The offsets are those of least squares: their priors pull as the residuals do.
+    pull = np.where(linear.stiffness > 0, -residuals @ columns, 0.0)
+    return Linearised(residuals, np.hstack([derivatives, columns]), full, np.r_[gradient, pull])
 
 
 def refined_solutions(
