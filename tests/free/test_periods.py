@@ -200,3 +200,17 @@ def test_derivatives_are_finite_in_the_limits():
 
     for part in jax.jit(jax.grad(finite, (0, 1)))(moments, omega):
         assert np.all(np.isfinite(part))
+
+
+@pytest.mark.parametrize(
+    ("moments", "omega"),
+    [((1.5, 1.5, 1.5), (0.3, -0.4, 1.2)), ((1.0, 1.5, 2.0), (0.0, 1.3, 0.0))],
+    ids=["sphere", "intermediate axis"],
+)
+def test_derivative_of_the_period_of_a_permanent_rotation(moments, omega):
+    """P = 2 pi/|omega|, of which the derivative along the axis is -2 pi omega/|omega|^3."""
+    omega = jnp.array(omega)
+    gradient = jax.jit(jax.grad(lambda w: principal_periods(jnp.array(moments), w).P_phi))(omega)
+    size = float(jnp.linalg.norm(omega))
+    found = float(gradient @ omega) / size
+    np.testing.assert_allclose(found, -2 * np.pi / size**2, rtol=1e-13)
