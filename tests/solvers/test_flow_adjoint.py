@@ -356,11 +356,8 @@ def held(p, method):
     return jnp.sum(WEIGHTS[:4] * end.wxyz[0]) + jnp.sum(WEIGHTS[4:] * end.omega_body[0])
 
 
-@pytest.mark.parametrize(
-    "solver",
-    [Extrapolation(12), pytest.param(diffrax.Dopri8(), marks=SLOW)],
-    ids=("own", "stock"),
-)
+@pytest.mark.slow  # the parts themselves: test_parts_keep_the_way_back_from_states_drawn_together
+@pytest.mark.parametrize("solver", [Extrapolation(12), diffrax.Dopri8()], ids=("own", "stock"))
 def test_the_way_back_starts_anew_where_drag_draws_bodies_together(solver):
     """By itself, in ``simulate``."""
     method = ph.LiePoisson(solver)

@@ -118,6 +118,7 @@ def test_a_ring_against_newton_in_every_chart():
             np.testing.assert_allclose(got.spins[k, -1, 0], end[7], rtol=0, atol=atol)
 
 
+@pytest.mark.slow  # of the field: test_every_torque.py
 def test_slopes_of_a_damped_motion():
     """By every number of the body and of what damps it, against differences of the motion."""
 
