@@ -262,8 +262,8 @@ def _read(path: Path, names: dict[str, str], options: _Options) -> Any:
         elif "must have the columns" in str(error):
             missing = [role for role in _ROLES if f"{role} -> " in str(error)]
             hint = " Name them: --columns " + " ".join(f"{role}=COLUMN" for role in missing)
-        first, end, rest = str(error).partition("\n")
-        raise UsageError(f"{first}{hint}{end}{rest}") from error
+        first, end, lines = str(error).partition("\n")
+        raise UsageError(f"{first}{hint}{end}{lines}") from error
 
 
 def _columns_read(loaded: Any) -> str:

@@ -144,7 +144,7 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
     Raises SimulationError when the nominal body does not finish; clones that do not are found in
     the trajectory's `status`.
     """
-    began = time.perf_counter()
+    start_time = time.perf_counter()
     total = job.bodies
     size = min(total, max(_MIN_CHUNK, -(-total // _CHUNKS)))
     arrays: dict[str, np.ndarray] = {}
@@ -172,8 +172,8 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
                 rows = np.atleast_2d(polhode.crossings(piece, event).times)
                 times[name].extend(rows[start - first :])
         progress(min(start + size, total))
-    seconds = time.perf_counter() - began
-    compiling = _CLOCK.since(began)
+    seconds = time.perf_counter() - start_time
+    compiling = _CLOCK.since(start_time)
     scene = job.scene.settled(job.state, job.ts[0])
     trajectory = polhode.Trajectory(ts=job.ts, scene=scene, propagator=piece.propagator, **arrays)
     crossings = {name: _pad(rows) for name, rows in times.items()}

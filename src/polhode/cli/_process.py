@@ -85,11 +85,11 @@ def program_cache(enabled: bool) -> Iterator[None]:
     previous = {key: getattr(jax.config, key) for key in settings}
     show, damaged = warnings.showwarning, []
 
-    def listen(message, *rest, **more):
+    def listen(message, *args, **kwargs):
         if "persistent compilation cache" in str(message):
             damaged.append(message)
         else:
-            show(message, *rest, **more)
+            show(message, *args, **kwargs)
 
     _set(settings)
     warnings.showwarning = listen

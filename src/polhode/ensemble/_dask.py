@@ -64,10 +64,10 @@ def complete(client: Any, job: "Job", numbers: range) -> Iterator[tuple[int, boo
         for name in ("cloudpickle", "distributed")
     )
     settings = {name: getattr(jax.config, name) for name in _SETTINGS}
-    ensemble, *rest = job.arguments
+    ensemble, *arguments = job.arguments
     rows = {name: _reference(x) for name, x in ensemble.rows.items()}
     ensemble = dataclasses.replace(ensemble, rows={})
-    message = cloudpickle.dumps((ensemble, rows, rest, job.chunk, versions()))
+    message = cloudpickle.dumps((ensemble, rows, arguments, job.chunk, versions()))
     futures = client.map(
         _complete, list(numbers), settings=settings, message=message, pure=False, retries=_RETRIES
     )

@@ -70,8 +70,8 @@ class Block:
         each, shared = self.ensemble.lanes(np.minimum(indices, self.ensemble.bodies - 1))
         start = np.asarray(first, np.uint32)
         shared = (shared, self.ensemble.spreads, self.method, self.ts, self.rtol, self.counts)
-        arrays, rest = eqx.partition((start, each, shared), eqx.is_array_like)
-        return *eqx.combine(jax.device_put(arrays, device), rest), self.settings
+        arrays, static = eqx.partition((start, each, shared), eqx.is_array_like)
+        return *eqx.combine(jax.device_put(arrays, device), static), self.settings
 
     def __call__(self, first: int) -> dict[str, Array]:
         if not self.compiled:
@@ -101,8 +101,8 @@ def program(first: Array, each: Any, shared: Any, settings: Settings) -> dict[st
     """One block on one device. Compiled once per kind of run and device."""
     shared, spreads, method, ts, rtol, (seed, bodies) = shared
     indices = first + jnp.arange(settings.size, dtype=jnp.uint32)
-    drawn = draw(each, shared, indices, spreads, seed)
-    trajectory = run(method, *drawn, ts, rtol, Record())
+    scene, state = draw(each, shared, indices, spreads, seed)
+    trajectory = run(method, scene, state, ts, rtol, Record())
     arrays = {"status": trajectory.status.astype(jnp.uint8)}
     if settings.trajectories:
         arrays |= {"wxyz": trajectory.wxyz, "omega_body": trajectory.omega_body}

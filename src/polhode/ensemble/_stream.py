@@ -305,7 +305,7 @@ class _Tally:
         self.total = sum(map(self.count, numbers))
         self.reused = sum(map(self.count, self.present))
         self.computed = 0
-        self.began = time.perf_counter()
+        self.start_time = time.perf_counter()
         self.report()
 
     def count(self, k: int) -> int:
@@ -320,7 +320,7 @@ class _Tally:
     def report(self) -> None:
         done, rate, remaining = self.reused + self.computed, None, None
         if self.computed:
-            rate = self.computed / (time.perf_counter() - self.began)
+            rate = self.computed / (time.perf_counter() - self.start_time)
             remaining = (self.total - done) / rate
         self.progress(Progress(done, self.total, self.reused, rate, remaining))
 

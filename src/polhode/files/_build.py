@@ -298,8 +298,8 @@ def draw_clones(file: SceneFile, dtype: DTypeLike) -> Clones:
     count, redrawn, inertia = plan.clones, 0, nominal
     if "moments" in noise:
         moments = np.asarray(file.inertia.moments, np.float64)
-        drawn, redrawn = _draw_moments(file, moments, noise["moments"], count)
-        inertia = Inertia.from_moments(np.concatenate([moments[None], drawn]).astype(dtype))
+        rows, redrawn = _draw_moments(file, moments, noise["moments"], count)
+        inertia = Inertia.from_moments(np.concatenate([moments[None], rows]).astype(dtype))
     attitude = file.state.attitude
     if "euler" in noise:
         angles = _around(np.array(attitude.values), noise["euler"], count)
@@ -334,10 +334,10 @@ def _around(value: np.ndarray, noise: _Noise, count: int) -> np.ndarray:
 
 
 def _draw_moments(file: SceneFile, moments: np.ndarray, noise: _Noise, count: int):
-    accepted, drawn, redrawn = np.empty((0, 3)), 0, 0
+    accepted, total, redrawn = np.empty((0, 3)), 0, 0
     for _ in range(_MAX_ROUNDS):
         draws = moments * (1 + noise(count))
-        drawn += count
+        total += count
         possible = possible_moments(draws)
         redrawn += int((~possible).sum())
         accepted = np.concatenate([accepted, draws[possible]])
@@ -347,7 +347,7 @@ def _draw_moments(file: SceneFile, moments: np.ndarray, noise: _Noise, count: in
         file.path,
         "[monte_carlo.moments] relative_sigma",
         "impossible moments",
-        f"{len(accepted)} of {drawn} draws around {moments} are moments of a body",
+        f"{len(accepted)} of {total} draws around {moments} are moments of a body",
         "a spread that keeps most draws positive and within the triangle inequality",
         "make relative_sigma smaller",
     )

@@ -78,8 +78,8 @@ def shorten(value: object, length: int = 80) -> str:
     return text if len(text) <= length else text[: length - 4] + " ..."
 
 
-def did_you_mean(word: object, known: Iterable[str]) -> str:
-    """A question with the known word that is close to another one, or nothing."""
-    names = {name.lower(): name for name in known}
+def did_you_mean(word: object, choices: Iterable[str]) -> str:
+    """A question with the choice that is close to another one, or nothing."""
+    names = {name.lower(): name for name in choices}
     close = difflib.get_close_matches(str(word)[:100].lower(), names, 1, 0.6)
     return f'did you mean "{names[close[0]]}"?' if close else ""

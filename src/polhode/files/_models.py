@@ -450,14 +450,14 @@ class SceneFile(Table):
             "momentum_body": (self.state.momentum_body, "a [state] with momentum_body"),
             "torque": (constant or None, "one [torque] of kind body or space"),
         }
-        drawn = {}
+        tables = {}
         if self.monte_carlo is not None:
-            drawn["monte_carlo"] = self.monte_carlo.spreads
+            tables["monte_carlo"] = self.monte_carlo.spreads
         if self.ensemble is not None:
-            drawn["ensemble"] = self.ensemble.spreads
+            tables["ensemble"] = self.ensemble.spreads
             if self.ensemble.arrays is not None:
-                drawn["ensemble.arrays"] = dict(self.ensemble.arrays.entries())
-        for lead, quantities in drawn.items():
+                tables["ensemble.arrays"] = dict(self.ensemble.arrays.entries())
+        for lead, quantities in tables.items():
             for name, (nominal, needed) in needs.items():
                 if nominal is None and name in quantities:
                     raise ValueError(f"[{lead}] {name} does not fit this scene: it needs {needed}")
