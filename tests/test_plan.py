@@ -333,3 +333,21 @@ def test_weights_of_a_batch_share_one_direction_of_gravity():
         one = ph.simulate(alone, state, ts, rtol=1e-10)
         np.testing.assert_allclose(both.wxyz[k], one.wxyz, atol=1e-9)
     np.testing.assert_allclose(both.energy[:, 1], both.energy[:, 0], rtol=1e-9)
+
+
+def test_explain_names_what_decays_too_fast():
+    """Narrow friction relaxes at torque / speed (1 / J + 1 / (I - J)), which explicit steps follow;
+    a batch has the number of its worst body."""
+    friction = ph.CoulombFriction(1e-3, 1e-4)
+    wheel = ph.Rotor([0.0, 0.0, 1.0], inertia=1e-3, speed=50.0, coupling=friction)
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), rotors=wheel)
+    state = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 0.1])
+    plan = ph.explain(scene, state, [0.0, 10.0])
+    assert "Kvaerno5" in str(plan)
+    rate = 1e-3 / 1e-4 * (1 / 1e-3 + 1 / (2 - 1e-3))
+    assert f"{rate:.1e}/s" in plan.stiff
+    assert ph.explain(scene, state, [0.0, 0.1]).stiff is None
+    assert ph.explain(scene, state, [0.0, 10.0], ph.LiePoisson()).stiff is None
+    drag = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), torque=ph.LinearDamping([1.0, 1, 80]))
+    batch = ph.State([[1.0, 0, 0, 0]] * 2, [[0.0, 0.0, 0.1]] * 2)
+    assert "4.0e+01/s" in ph.explain(drag, batch, [0.0, 1000.0]).stiff

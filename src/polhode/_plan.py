@@ -35,7 +35,7 @@ class Plan:
     ``error``: the attitude error to be expected, in words; ``refused``: the closed forms that do
     not apply, with the reason, if the motion is integrated; ``narrower``: the constructors that
     allow a closed form for these numbers (``ph.specialise`` uses them); ``plain``: why the
-    optimisations for CPUs are off, or None.
+    optimisations for CPUs are off, or None; ``stiff``: a decay that limits explicit steps, or None.
     """
 
     method: AbstractMethod
@@ -48,6 +48,7 @@ class Plan:
     refused: tuple[str, ...] = ()
     narrower: tuple[str, ...] = ()
     plain: str | None = None
+    stiff: str | None = None
 
     @property
     def closed_form(self) -> str | None:
@@ -66,6 +67,8 @@ class Plan:
         ]
         if self.plain is not None:
             lines.append(f"plain   without optimisations for CPUs: {self.plain}")
+        if self.stiff is not None:
+            lines.append(f"stiff   {self.stiff}")
         return "\n".join(lines)
 
 
@@ -156,11 +159,12 @@ def plan(
     reason: str = "as asked for",
 ) -> Plan:
     """The plan of checked input (see ``ph.explain``); ``reason``: why a given method runs."""
-    refused, narrower = (), ()
+    refused, narrower, stiff = (), (), None
     if method is None:
         method, reason = choose(scene, rtol)
         if not method.exact:
             _, refused = choose_closed_form(scene)
+            stiff = _stiff(scene, state, ts)
         narrower = _narrower(scene)
     steps = "" if method.exact else _steps(method, scene, state, ts, record)
     reason = f"{reason}; {steps}" if steps else reason
@@ -170,8 +174,73 @@ def plan(
     return Plan(
         method, reason, _skipped(scene, method, record), bodies, samples,
         str(state.wxyz.dtype), _error(method, scene, state, ts, rtol), refused, narrower,
-        _policy.plain_reason(),
+        _policy.plain_reason(), stiff,
     )  # fmt: skip
+
+
+_STIFF = 1e4
+"""[spans] Number of relaxation times in the time simulated from which ``explain`` warns. Explicit
+steps of order 8 are stable up to about six relaxation times each."""
+
+
+def _stiff(scene: Scene, state: State, ts: Array) -> str | None:
+    """A warning where explicit steps are limited by stability; None where they are not."""
+    if (scene.torque is None and scene.rotors is None) or not is_concrete(scene, state, ts):
+        return None
+    rate = float(np.max(_decay(scene, state.as_unit(), ts), initial=0))
+    number = rate * float(np.max(np.abs(ts[..., -1] - ts[..., 0])))
+    if not number >= _STIFF:
+        return None
+    return (
+        f"the fastest decay, {rate:.1e}/s, is {number:.0e} times shorter than the motion: explicit"
+        " steps are not much longer than it; ph.LiePoisson(diffrax.Kvaerno5(), chunk=1) is implicit"
+    )
+
+
+def _decay(scene: Scene, state: State, ts: Array) -> np.ndarray:
+    """Rate [1/s] (...) of the fastest decay of body rates and wheel speeds, linearised at the start
+    and, as friction changes most there, where the wheels are at rest in the body."""
+    scene, t = scene.settled(state, ts[..., 0]), ts[..., 0]
+    parts = (getattr(scene, name) for name in PARTS)
+    batch = common_batch(*parts, state.without_wheels, extra=(ts.shape[:-1],))
+    omega = jnp.broadcast_to(state.omega_body, (*batch, 3))
+    wxyz = jnp.broadcast_to(state.wxyz, (*batch, 4))
+    components = tuple(jnp.moveaxis(omega, -1, 0))
+    wheels = scene.dynamics.wheels if scene.dynamics.coupled else None
+    points = [()] if wheels is None else [wheels.initial_spins(components[0])]
+    if wheels is not None:
+
+        def speeds(spins):
+            return [wheels.at(spins).speed(i, t, components) for i in wheels.coupled]
+
+        zero, one = (
+            speeds([jnp.full(batch, value, omega.dtype) for _ in points[0]]) for value in (0, 1)
+        )
+        points.append(tuple(-a / (b - a) for a, b in zip(zero, one)))
+
+    def rates(y, spins):
+        omega = omega_of(y)
+        now = tuple(x + y[..., 3 + k] for k, x in enumerate(spins))
+        acceleration, turned = scene.with_spins(now).changes(wxyz, omega, t)
+        return jnp.concatenate(
+            [acceleration, *(jnp.broadcast_to(x, batch)[..., None] for x in turned)], axis=-1
+        )
+
+    def omega_of(y):
+        return omega + y[..., :3]
+
+    found = []
+    for spins in points:
+        size = 3 + len(spins)
+        zero = jnp.zeros((*batch, size), omega.dtype)
+        columns = [
+            jax.jvp(lambda y, s=spins: rates(y, s), (zero,), (zero.at[..., k].set(1),))[1]
+            for k in range(size)
+        ]
+        jacobian = np.asarray(jnp.stack(columns, axis=-1), float)
+        sound = np.where(np.isfinite(jacobian), jacobian, 0)
+        found.append(np.max(-np.linalg.eigvals(sound).real, axis=-1))
+    return np.max(np.stack(found), axis=0)
 
 
 def _narrower(scene: Scene) -> tuple[str, ...]:
