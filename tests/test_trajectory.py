@@ -2,6 +2,7 @@
 
 import pickle
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -182,3 +183,24 @@ def test_euler_angles_of_any_sequence_are_those_of_scipy():
     for wrong in ("ZZX", "ZyX", "abc", ""):
         with pytest.raises(ValueError, match="no sequence is called"):
             traj.euler(wrong)
+
+
+def test_a_printed_trajectory_shows_size_status_and_steps():
+    """Of a batch how many bodies have each status, and the range of their steps."""
+    body = ph.Inertia.from_moments([1.0, 1.5, 2.0])
+    free = ph.simulate(ph.Scene(body), ph.State([1.0, 0, 0, 0], [0.3, 0.2, 1.0]), [0.0, 2.5])
+    assert str(free).split("\n") == [
+        "1 body x 2 samples, float64",
+        "times   0 to 2.5 s",
+        "status  1 SUCCESSFUL",
+        "steps   none: a closed form",
+    ]
+    scene = ph.Scene(body, torque=ph.LinearDamping(0.1))
+    states = ph.State([1.0, 0, 0, 0], [[0.3, 0.2, 1.0], [3.0, 20.0, 10.0]])
+    few = ph.LiePoisson(diffrax.Dopri8(), max_steps=16, chunk=1)
+    text = str(ph.simulate(scene, states, [0.0, 5.0], few, throw=False))
+    assert "2 bodies x 2 samples" in text
+    assert "1 SUCCESSFUL, 1 MAX_STEPS" in text
+    assert "at most 16" in text
+    shown = jax.jit(lambda s: [str(ph.simulate(scene, s, [0.0, 5.0])), 0][1])(states)
+    assert shown == 0

@@ -116,6 +116,28 @@ class Trajectory(eqx.Module):
         self._spins, self.propagator, self._event_time = spins, propagator, event_time
         self._events = events
 
+    def __str__(self) -> str:
+        """Size, status and steps, for ``print``; under ``jit`` the shapes of all arrays."""
+        if not is_concrete(self.ts, self.status, self.steps):
+            return repr(self)
+        shape, times = self.batch_shape, np.asarray(self.ts)
+        bodies = "1 body" if shape == () else f"{' x '.join(f'{n:,}' for n in shape)} bodies"
+        count = times.shape[-1]
+        lines = [f"{bodies} x {count:,} {'sample' if count == 1 else 'samples'}, {times.dtype}"]
+        if times.size:
+            lines.append(f"times   {times[..., 0].min():g} to {times[..., -1].max():g} s")
+        values, numbers = np.unique(np.asarray(self.status), return_counts=True)
+        met = (f"{n:,} {Status(int(v)).name}" for v, n in zip(values, numbers))
+        lines.append(f"status  {', '.join(met)}")
+        steps = np.asarray(self.steps)
+        if steps.size and steps.max() > 0:
+            few, middle, many = steps.min(), np.median(steps), steps.max()
+            spread = "" if few == many else f", at least {few:,}, at most {many:,}"
+            lines.append(f"steps   {middle:,.0f}{spread}")
+        elif steps.size:
+            lines.append("steps   none: a closed form")
+        return "\n".join(lines)
+
     @property
     def wxyz(self) -> Float[Array, "*b t 4"]:
         """Attitudes (..., T, 4), body -> space, scalar first."""
