@@ -257,6 +257,26 @@ def test_periods_that_win_in_few_refits_are_ambiguous(cases):
         assert any("resampled" in reason for reason in found.reasons) == (not certain)
 
 
+def test_solutions_that_are_excluded_are_not_fitted_again(cases):
+    """One that the linear model would improve beyond the best, with odds of 1e-10 and of 1e-4."""
+    case = cases["tumbler"]
+    curve, _, linear, _ = case
+    model = offset_free(case, tumbling)
+    best, residuals = solution(model), (model - curve.magnitude) * linear.root
+    derivatives = np.random.default_rng(2).normal(size=(curve.t.size, 100))
+    none = np.zeros((100, 100)), np.zeros(100)
+    for odds, certain in ((1e-4, False), (1e-10, True)):
+        far = solution(model + 2 * (model - curve.magnitude), P_psi=1.1 * P_PSI, odds=odds)
+        linearised = [
+            _solutions.Linearised(residuals, 0 * derivatives, *none),
+            _solutions.Linearised(residuals, derivatives, *none),
+        ]
+        agreement = _fit.bootstrap_agreement(
+            curve, linear.root, (best, far), [0, 1], 3.0, linearised
+        )
+        assert (agreement > 0.9) == certain
+
+
 def test_a_body_found_once_or_at_the_edge_of_the_search_is_ambiguous(cases):
     case = cases["tumbler"]
     body = solution(offset_free(case, tumbling))
