@@ -270,7 +270,7 @@ MUTANTS = (
         "parts = [self.axial_momentum(i, t) ** 2 / (2 * self.inertia[..., i]) for i in self.loose]",
         "parts = [self.axial_momentum(i, t) ** 2 / self.inertia[..., i] for i in self.loose]",
         "the energy of wheels counts twice",
-        ("torques/test_rotors.py::test_momentum_and_energy",),
+        ("torques/test_rotors.py::test_euler_equation_with_wheels",),
     ),
     Mutant(
         WHEELS,

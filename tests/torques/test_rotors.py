@@ -37,9 +37,10 @@ def test_momentum_and_energy(name):
 
 
 def test_euler_equation_with_wheels():
-    """I' domega/dt = L x omega - u a: the sign of the wheels, on which no conserved quantity bears.
+    """I' domega/dt = L x omega - u a, and the energy of the body and of wheels that are not held.
 
-    I' leaves out wheels that are free about their axes a, to which their motors give u.
+    I' leaves out wheels that are free about their axes a, to which their motors give u. Conserved
+    quantities do not show the sign of the wheels, nor constant parts of the energy.
     """
     omega, moments = np.array([0.4, -0.5, 0.1]), np.diag([1.0, 2.0, 2.5])
     oblique, upright = np.array([0.6, 0.8, 0.0]), np.array([0.0, 0.0, 1.0])
@@ -53,6 +54,9 @@ def test_euler_equation_with_wheels():
     got = scene.acceleration(state.wxyz, state.omega_body, 0.0)
     np.testing.assert_allclose(got, want, rtol=1e-14, atol=1e-15)
     np.testing.assert_allclose(scene.momentum(state.omega_body, 0.0), momentum, rtol=1e-14)
+    energy = omega @ carrier @ omega / 2 + 0.2 * (3.0 + oblique @ omega) ** 2 / 2
+    total = scene.hamiltonian.total(tuple(jnp.array(momentum)), None, 0.0)
+    np.testing.assert_allclose(total, energy, rtol=1e-14)
 
 
 def test_a_wheel_against_newton():
