@@ -26,7 +26,11 @@ from polhode_docs import public_names, reference_pages, signatures
 
 NUMBERED = {"000": 39, "002": 12, "003": 29}
 PAGES = page_outputs.pages()
-SKETCHES = {"identifiability": 2, "scale": 1}  # `py`: need more than polhode
+SKETCHES = {
+    "identifiability": 2,
+    "scale": 1,
+    "how-to/use_tables": 2,
+}  # `py`: need more than polhode
 WIDTH = 100  # columns of a code box
 
 

@@ -20,7 +20,11 @@ from ._propagate import propagate as propagate, Propagation as Propagation
 from ._events import Event as Event, crossings as crossings, Crossings as Crossings
 
 # Bodies: inertia, mass properties, and the periods of the free motion.
-from .inertia import Inertia as Inertia, MassProperties as MassProperties
+from .inertia import (
+    Inertia as Inertia,
+    MassProperties as MassProperties,
+    VariableInertia as VariableInertia,
+)
 from ._closed_forms import periods as periods, Periods as Periods, Mode as Mode
 
 # Potentials and orbits: conservative parts of a scene; potentials add with `+`.
@@ -51,6 +55,11 @@ from ._scene import (
     MagneticDipole as MagneticDipole,
     BDot as BDot,
     DipoleField as DipoleField,
+    Plates as Plates,
+    Drag as Drag,
+    SolarPressure as SolarPressure,
+    Eclipse as Eclipse,
+    Table as Table,
     AbstractTorque as AbstractTorque,
 )
 

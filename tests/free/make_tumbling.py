@@ -9,6 +9,7 @@ import argparse
 import json
 import sys
 import time
+from functools import lru_cache
 from pathlib import Path
 
 import mpmath as mp
@@ -147,16 +148,21 @@ def by_period(moments, omega, t, digits: int = 50) -> list:
     p, m = motion.data[3:5]
     period = 4 * mp.ellipk(m) / p  # checked: the rates must return
     whole = mp.floor(mp.mpf(t) / period)
-    start, rates = free_reference(moments, START, omega, 0, digits=digits)
-    after, returned = free_reference(moments, START, omega, period, digits=digits)
-    assert max(abs(x - y) for x, y in zip(rates, returned)) < mp.mpf(10) ** (8 - digits)
     # one period rotates space by `turn`, about the angular momentum
-    turn = quaternion_product(after, conjugate(start))
+    turn = _turn(tuple(moments), tuple(omega), period, digits)
     half = mp.atan2(mp.sqrt(mp.fdot(turn[1:], turn[1:])), turn[0])
     axis = [x / mp.sin(half) for x in turn[1:]]
     many = [mp.cos(whole * half)] + [mp.sin(whole * half) * x for x in axis]
     q, w = free_reference(moments, START, omega, mp.mpf(t) - whole * period, digits=digits)
     return quaternion_product(many, q) + list(w)
+
+
+@lru_cache(maxsize=64)
+def _turn(moments, omega, period, digits: int) -> list:
+    start, rates = free_reference(moments, START, omega, 0, digits=digits)
+    after, returned = free_reference(moments, START, omega, period, digits=digits)
+    assert max(abs(x - y) for x, y in zip(rates, returned)) < mp.mpf(10) ** (8 - digits)
+    return quaternion_product(after, conjugate(start))
 
 
 def stored() -> list[dict]:
@@ -198,7 +204,7 @@ def difference(row: dict, sample: dict, derivative: bool, digits: int = 50) -> f
 def check() -> None:
     worst = 0.0
     for row in stored():
-        errors = [difference(row, sample, True, digits=100) for sample in row["samples"]]
+        errors = [difference(row, sample, True, digits=70) for sample in row["samples"]]
         worst = max(worst, *errors)
         print(f"{row['name']:20}", *(f"{x:.4f}" for x in errors), flush=True)
     print(f"largest error {worst:.4f} units of the 17th digit")

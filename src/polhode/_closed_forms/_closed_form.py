@@ -11,7 +11,7 @@ from jaxtyping import Array
 from polhode._batch import is_lane_tree, map_chunks
 from polhode._method import AbstractMethod, Record, Samples, Status
 from polhode._scene import BodyTorque, LinearDamping, Scene, State, TorqueSum, Wheels
-from polhode.inertia import Symmetry
+from polhode.inertia import Symmetry, VariableInertia
 
 
 class AbstractClosedForm(AbstractMethod):
@@ -32,7 +32,8 @@ class AbstractClosedForm(AbstractMethod):
 
     def refuse(self, scene: Scene) -> None:
         """ValueError where the solution does not hold for the parts of the scene."""
-        objection = self.objection(scene)
+        variable = isinstance(scene.inertia, VariableInertia)
+        objection = VARIABLE if variable else self.objection(scene)
         if objection is not None:
             raise ValueError(f"ph.{type(self).__name__}: {objection}; leave method=None.")
 
@@ -125,6 +126,7 @@ def wheel_objection(scene: Scene) -> str | None:
     return None if all(held) else "a motor turns a rotor, or it spins freely"
 
 
+VARIABLE = "the inertia changes with time"
 NOT_AXIAL = "a rotor is not one of ph.Rotor.axial"
 NOT_PRINCIPAL = "the body axes are not principal axes by the type of the inertia"
 

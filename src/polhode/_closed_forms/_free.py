@@ -65,7 +65,7 @@ class ClosedForm(AbstractClosedForm):
         self.refuse(scene)
         saved = ts[..., -1:] if record.final_only else ts[..., 1:]  # the first is the state itself
         t = saved - ts[..., :1]
-        inertia = scene.inertia
+        inertia = scene.constant_inertia
         axes = products = None
         moments, wxyz, omega = inertia.moments, state.wxyz, state.omega_body
         if not inertia.is_principal:

@@ -2,12 +2,12 @@
 
 from typing import NamedTuple
 
-from polhode._closed_forms._closed_form import AbstractClosedForm
+from polhode._closed_forms._closed_form import VARIABLE, AbstractClosedForm
 from polhode._closed_forms._elementary import FixedAxis, SymmetricTop
 from polhode._closed_forms._free import ClosedForm
 from polhode._closed_forms._lagrange_top import LagrangeTop
 from polhode._scene import Scene
-from polhode.inertia import Symmetry
+from polhode.inertia import Symmetry, VariableInertia
 
 
 class Solution(NamedTuple):
@@ -23,6 +23,8 @@ class Solution(NamedTuple):
 
     def why_not(self, scene: Scene) -> str | None:
         """Why the types of the parts do not make it valid; None: they do."""
+        if isinstance(scene.inertia, VariableInertia):
+            return VARIABLE
         reason = self.method.why_not(scene)
         if reason is None and self.symmetry not in (None, scene.inertia.symmetry):
             return f"the inertia is not one of ph.Inertia.{self.symmetry.name.lower()}"

@@ -213,7 +213,7 @@ def _turned(trajectory: Trajectory) -> Array:
 
 def turning_rates(trajectory: Trajectory) -> Array:
     """Upper bound (..., T) of the rate of a body, by its momentum at each sample [rad/s]."""
-    carrier = trajectory._scene.carrier
+    carrier = trajectory._scene.carrier_at(trajectory._t)
     size = jnp.linalg.norm(carrier.momentum(trajectory.omega_body), axis=-1)
     return size / jnp.min(carrier.moments, axis=-1)
 

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode.inertia import Inertia
+from polhode.inertia._variable import VariableInertia, inertia_at
 from polhode.rotation._quaternion import matrix_row
 
 Vector = tuple[Array, Array, Array]
@@ -156,14 +157,15 @@ def inverse_inertia(inertia: Inertia) -> tuple[Array, ...]:
 class Hamiltonian(eqx.Module):
     """H = (L - h) . I^-1 (L - h) / 2 + V(R, t), in joules (docs/equations.md, 000: 1).
 
-    **Fields:** ``inverse`` entries of I^-1 (three or six component arrays), ``inertia`` handed on
+    **Fields:** ``inverse`` entries of I^-1 (three or six component arrays), or a function of the
+    time that returns them, where the inertia changes; ``inertia`` handed on
     to the potential, ``potential`` or None, ``rotor_momentum`` or None: h(t) [kg m^2/s], body
     components of the momentum that wheels carry relative to the body, ``wheel_energy`` or None:
     energy [J] of their turning about their axes, a function of time alone that moves nothing.
     """
 
-    inverse: tuple[Array, ...]
-    inertia: Inertia
+    inverse: tuple[Array, ...] | Callable[[Array | float], tuple[Array, ...]]
+    inertia: Inertia | VariableInertia
     potential: EnergyOfAttitude | None = None
     rotor_momentum: Callable[[Array | float], Vector] | None = None
     wheel_energy: Callable[[Array | float], Array] | None = None
@@ -176,14 +178,15 @@ class Hamiltonian(eqx.Module):
             x, y, z = momentum
         else:
             x, y, z = (a - h for a, h in zip(momentum, self.rotor_momentum(t)))
-        twice = self.inverse[0] * x * x + self.inverse[1] * y * y + self.inverse[2] * z * z
-        if len(self.inverse) == 6:
-            xy, xz, yz = self.inverse[3:]
+        inverse = self.inverse(t) if callable(self.inverse) else self.inverse
+        twice = inverse[0] * x * x + inverse[1] * y * y + inverse[2] * z * z
+        if len(inverse) == 6:
+            xy, xz, yz = inverse[3:]
             twice = twice + 2 * (xy * x * y + xz * x * z + yz * y * z)
         kinetic = twice / 2
         if self.potential is None:
             return kinetic
-        return kinetic + self.potential.energy(attitude, t, self.inertia)
+        return kinetic + self.potential.energy(attitude, t, inertia_at(self.inertia, t))
 
     def total(
         self, momentum: Sequence[Array], attitude: Attitude | None, t: Array | float
@@ -203,7 +206,7 @@ class Hamiltonian(eqx.Module):
         def traced_energy(rows):
             nonlocal used
             attitude_seen = Attitude(lambda i: rows[i])
-            energy = potential.energy(attitude_seen, t, self.inertia)
+            energy = potential.energy(attitude_seen, t, inertia_at(self.inertia, t))
             used = attitude_seen.used
             return energy
 

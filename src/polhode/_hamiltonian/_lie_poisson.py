@@ -70,7 +70,8 @@ def external_power(
             power = power if potential_torque is None else power - dot(potential_torque, slip)
     if dynamics.coupled:
         power = power + sum(motor_powers(t, momentum, attitude, dynamics, dynamics.coupled))
-    if hamiltonian.potential is None and hamiltonian.wheel_energy is None:
+    constant = not callable(hamiltonian.inverse)
+    if constant and hamiltonian.potential is None and hamiltonian.wheel_energy is None:
         return power
     rows = {i: attitude.row(i) for i in hamiltonian.rows_used(attitude, t)}
     t = jnp.asarray(t, power.dtype)

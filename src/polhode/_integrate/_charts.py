@@ -39,6 +39,8 @@ from polhode._scene import (
     State,
     UniformGravity,
 )
+from polhode.inertia import Inertia
+from polhode.inertia._variable import inertia_at
 from polhode.rotation import euler_to_wxyz, wxyz_to_euler
 
 
@@ -105,7 +107,7 @@ class LiePoissonChart(AbstractChart):
 
     def dynamics(self, scene, state, ts):
         lane = state.wxyz[..., 0]
-        size = jnp.trace(scene.inertia.tensor, axis1=-2, axis2=-1) / 3
+        size = jnp.trace(_first_inertia(scene, ts).tensor, axis1=-2, axis2=-1) / 3
         least = slow_momentum(scene, ts)
         size, least, _ = jax.lax.stop_gradient(jnp.broadcast_arrays(size, least, lane))
         moved = scene.dynamics
@@ -214,7 +216,7 @@ def momentum_scale(scene: Scene, state: State, ts: Array) -> Array:
     momentum, spins = scene.momentum(state.omega_body, t), _spins(scene, state)
     y = (components(momentum), tuple(state.wxyz[..., i] for i in range(4)), *spins)
     push, *_ = lie_poisson_field(t, y, scene.dynamics)
-    size = jnp.trace(scene.inertia.tensor, axis1=-2, axis2=-1)
+    size = jnp.trace(_first_inertia(scene, ts).tensor, axis1=-2, axis2=-1)
     square = jnp.sum(momentum**2, axis=-1) + sum((x * x for group in spins for x in group), start=0)
     square = square + size * jnp.sqrt(sum(x * x for x in push))
     square = square + slow_momentum(scene, ts) ** 2
@@ -222,16 +224,22 @@ def momentum_scale(scene: Scene, state: State, ts: Array) -> Array:
     return jax.lax.stop_gradient(jnp.where(resting, 1, jnp.sqrt(jnp.where(resting, 1, square))))
 
 
+def _first_inertia(scene: Scene, ts: Array) -> Inertia:
+    """The inertia of lanes at their first time."""
+    return inertia_at(scene.inertia, ts[..., 0])
+
+
 def slow_momentum(scene: Scene, ts: Array) -> Array:
     """Momentum of a body that turns through one radian in the time simulated: a unit for one at
     rest, which a torque may move later. Zero if no time passes."""
     span = jnp.abs(ts[..., -1] - ts[..., 0])
-    size = jnp.trace(scene.inertia.tensor, axis1=-2, axis2=-1) / 3
+    size = jnp.trace(_first_inertia(scene, ts).tensor, axis1=-2, axis2=-1) / 3
     return jax.lax.stop_gradient(jnp.where(span > 0, size / jnp.where(span > 0, span, 1), 0))
 
 
 def natural_rates(scene: Scene, state: State, ts: Array) -> Array:
     """Rates [rad/s] of lanes, for sorting them by the steps that they will need."""
-    slowest = jnp.min(jnp.broadcast_to(scene.carrier.moments, (state.wxyz.shape[0], 3)), -1)
+    carrier = scene.carrier_at(ts[..., 0])
+    slowest = jnp.min(jnp.broadcast_to(carrier.moments, (state.wxyz.shape[0], 3)), -1)
     size = jnp.linalg.norm(state.omega_body, axis=-1)
     return jax.lax.stop_gradient(jnp.maximum(momentum_scale(scene, state, ts) / slowest, size))

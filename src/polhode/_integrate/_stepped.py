@@ -552,7 +552,7 @@ def _may_jump(scene: Scene) -> bool:
     def is_sharp(x) -> bool:
         return not x.smooth if isinstance(x, AbstractPart) else callable(x)
 
-    parts = (scene.potential, scene.torque, scene.rotors)
+    parts = (scene.inertia, scene.potential, scene.torque, scene.rotors)
     return any(is_sharp(x) for x in jax.tree.leaves(parts, is_leaf=is_sharp))
 
 

@@ -14,6 +14,12 @@ from polhode._scene._orbits import (
     KeplerOrbit as KeplerOrbit,
     RelativeTorque as RelativeTorque,
 )
+from polhode._scene._plates import (
+    Drag as Drag,
+    Eclipse as Eclipse,
+    Plates as Plates,
+    SolarPressure as SolarPressure,
+)
 from polhode._scene._potentials import (
     AbstractPotential as AbstractPotential,
     AlongZ as AlongZ,
@@ -28,6 +34,7 @@ from polhode._scene._specialise import (
     narrower as narrower,
     specialise as specialise,
 )
+from polhode._scene._tables import Table as Table
 from polhode._scene._torques import (
     AbstractTorque as AbstractTorque,
     BodyTorque as BodyTorque,

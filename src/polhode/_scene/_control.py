@@ -12,6 +12,7 @@ from polhode import rotation
 from polhode._checks import ArrayLike, as_float_array, as_number, is_concrete, require
 from polhode._hamiltonian import Attitude, components, cross, triple
 from polhode._parts import AbstractPart, Signature, shaped
+from polhode._scene._tables import Table
 from polhode._scene._torques import AbstractTorque, coefficients, stacked, value_at, vector_of_time
 
 
@@ -92,7 +93,8 @@ class MagneticDipole(AbstractTorque):
 
     **Arguments:** ``moment``: in body axes [A m^2], constant (..., 3) or a function ``fn(t,
     omega_body, field_body)`` -> (3,) of one body, such as ``ph.BDot``; ``field``: in space axes,
-    [T], constant (..., 3) or a function ``fn(position, t)`` -> (3,), such as ``ph.DipoleField``;
+    [T], constant (..., 3), a function ``fn(position, t)`` -> (3,), such as ``ph.DipoleField``, or a
+    ``ph.Table`` over time;
     ``position``: where the body is [m], space axes, constant (..., 3), a function of time or an
     orbit such as ``ph.KeplerOrbit``, for a field that is a function.
 
@@ -113,17 +115,26 @@ class MagneticDipole(AbstractTorque):
         field: ArrayLike | Callable,
         position: ArrayLike | Callable = (0.0, 0.0, 0.0),
     ):
-        self.moment, self.field = (
-            law.checked(given) if callable(given) else as_float_array(law.name, given, (3,))
-            for law, given in ((_MOMENT, moment), (_FIELD, field))
+        self.moment = (
+            _MOMENT.checked(moment)
+            if callable(moment)
+            else as_float_array(_MOMENT.name, moment, (3,))
         )
+        if isinstance(field, Table):
+            self.field = field
+        elif callable(field):
+            self.field = _FIELD.checked(field)
+        else:
+            self.field = as_float_array(_FIELD.name, field, (3,))
         self.position = vector_of_time("MagneticDipole position", position)
 
     def body_components(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> tuple[Array, Array, Array]:
         field, moment = self.field, self.moment
-        if callable(field):
+        if isinstance(field, Table):
+            field = field(t)
+        elif callable(field):
             place = stacked(value_at("MagneticDipole position", self.position, t))
             field = _FIELD.mapped(field, place, jnp.asarray(t, place.dtype))
         field = attitude.to_body(components(field))

@@ -28,6 +28,7 @@ from polhode._scene._torques import AbstractTorque
 from polhode._scene._wheels import AbstractRotor, Wheels
 from polhode.inertia import Inertia
 from polhode.inertia._inertia import check_form
+from polhode.inertia._variable import VariableInertia, inertia_at
 
 
 class SciPyRotation(Protocol):
@@ -148,28 +149,39 @@ class State(AbstractPart):
 class Scene(eqx.Module):
     """A rigid body and what acts on it; absent parts are None and add nothing to the program.
 
-    **Arguments:** ``inertia``: ``ph.Inertia``; ``potential``: ``ph.AbstractPotential`` or None;
-    ``torque``: ``ph.AbstractTorque`` or None; ``rotors``: ``ph.Rotor`` or a sum of such, or None
-    (the inertia includes the wheels). Any leaf may carry leading batch axes; they broadcast
-    together and with those of the state.
+    **Arguments:** ``inertia``: ``ph.Inertia`` or ``ph.VariableInertia``; ``potential``:
+    ``ph.AbstractPotential`` or None; ``torque``: ``ph.AbstractTorque`` or None; ``rotors``:
+    ``ph.Rotor`` or a sum of such, or None (the inertia includes the wheels). Any leaf may carry
+    leading batch axes; they broadcast together and with those of the state.
 
     Raises TypeError for a part of the wrong kind.
     """
 
-    inertia: Inertia
+    inertia: Inertia | VariableInertia
     potential: AbstractPotential | None = None
     torque: AbstractTorque | None = None
     rotors: AbstractRotor | None = None
 
     def __check_init__(self):
         _check_kinds(self)
-        if self.rotors is not None and is_concrete(self.inertia, self.rotors):
+        constant = isinstance(self.inertia, Inertia)
+        if constant and self.rotors is not None and is_concrete(self.inertia, self.rotors):
             self.rotors.check_within(self.inertia)
 
     @property
     def is_free(self) -> bool:
-        """Whether there is no potential, torque or wheel (static)."""
-        return self.potential is None and self.torque is None and self.rotors is None
+        """Whether the inertia is constant, without a potential, torque or wheel (static)."""
+        acting = (self.potential, self.torque, self.rotors)
+        return isinstance(self.inertia, Inertia) and all(part is None for part in acting)
+
+    @property
+    def constant_inertia(self) -> Inertia:
+        """The inertia; ValueError where it changes with time."""
+        if isinstance(self.inertia, Inertia):
+            return self.inertia
+        raise ValueError(
+            "this takes scenes whose inertia is constant: use ph.Inertia, not ph.VariableInertia."
+        )
 
     def settled(self, state: State, start: Array) -> "Scene":
         """The scene with the motion of its wheels fixed by the state at the time ``start``."""
@@ -180,7 +192,12 @@ class Scene(eqx.Module):
 
     @property
     def is_possible(self) -> Bool[Array, "*#b"]:
-        """Whether (...) a body can have this inertia and these wheels, also while traced."""
+        """Whether (...) a body can have this inertia and these wheels, also while traced.
+
+        An inertia that changes with time is not checked.
+        """
+        if not isinstance(self.inertia, Inertia):
+            return jnp.ones((), bool)
         wheels = self.rotors
         if not isinstance(wheels, Wheels) or wheels.is_constant:
             return self.inertia.is_possible
@@ -197,8 +214,16 @@ class Scene(eqx.Module):
 
     @property
     def carrier(self) -> Inertia:
-        """The inertia that turns with the body: without wheels that are not held at their speed."""
-        return self.inertia if self._wheels is None else self._wheels.carrier(self.inertia)
+        """The inertia that turns with the body: without wheels that are not held at their speed.
+
+        Of an inertia that changes with time at t = 0; see ``carrier_at``.
+        """
+        return self.carrier_at(0.0)
+
+    def carrier_at(self, t: Array | float) -> Inertia:
+        """The inertia that turns with the body at the time ``t`` [s]."""
+        inertia = inertia_at(self.inertia, t)
+        return inertia if self._wheels is None else self._wheels.carrier(inertia)
 
     def wheel_momentum(self, t: Array | float) -> Array | None:
         """h(t) (..., 3) [kg m^2/s]: momentum L - (carrier) omega of the wheels; None without."""
@@ -208,7 +233,7 @@ class Scene(eqx.Module):
 
     def momentum(self, omega: Array, t: Array | float) -> Array:
         """Body momentum (..., 3) [kg m^2/s] of body rates (..., 3) [rad/s], wheels included."""
-        momentum = self.carrier.momentum(omega)
+        momentum = self.carrier_at(t).momentum(omega)
         wheels = self.wheel_momentum(t)
         return momentum if wheels is None else jnp.add(*jnp.broadcast_arrays(momentum, wheels))
 
@@ -217,7 +242,7 @@ class Scene(eqx.Module):
         wheels = self.wheel_momentum(t)
         if wheels is not None:
             momentum = jnp.subtract(*jnp.broadcast_arrays(momentum, wheels))
-        return self.carrier.rates(momentum)
+        return self.carrier_at(t).rates(momentum)
 
     def acceleration(self, wxyz: Array | None, omega: Array, t: Array | float) -> Array:
         """Derivative (..., 3) of the body rates [rad/s^2] by the equations of motion.
@@ -249,7 +274,14 @@ class Scene(eqx.Module):
         if self.rotors is not None:  # what the wheels take up does not turn the body
             _, taken = jax.jvp(carried, (t, spins), (jnp.ones_like(t), turned))
             rate = rate - jnp.broadcast_to(taken, rate.shape)
-        return self.carrier.rates(rate), turned
+        if isinstance(self.inertia, VariableInertia):  # I domega/dt = dL/dt - (dI/dt) omega
+
+            def carried_momentum(t):
+                return self.carrier_at(t).momentum(omega)
+
+            _, change = jax.jvp(carried_momentum, (t,), (jnp.ones_like(t),))
+            rate = rate - change
+        return self.carrier_at(t).rates(rate), turned
 
     @property
     def dynamics(self) -> Dynamics:
@@ -271,8 +303,22 @@ class Scene(eqx.Module):
         wheels = self._wheels
         carried = None if wheels is None else wheels.body_momentum
         spinning = None if wheels is None or wheels.is_constant else wheels.energy
-        inverse = inverse_inertia(self.carrier)
+        if isinstance(self.inertia, VariableInertia):
+            inverse: Any = InverseOverTime(self.inertia, wheels)
+        else:
+            inverse = inverse_inertia(self.carrier)
         return Hamiltonian(inverse, self.inertia, self.potential, carried, spinning)
+
+
+class InverseOverTime(eqx.Module):
+    """Entries of the inverse of an inertia that changes, as a function of time."""
+
+    inertia: VariableInertia
+    wheels: Wheels | None
+
+    def __call__(self, t: Array | float) -> tuple[Array, ...]:
+        inertia = self.inertia.at(t)
+        return inverse_inertia(inertia if self.wheels is None else self.wheels.carrier(inertia))
 
 
 def places_of(scene: Scene, free: Any) -> tuple[int, ...]:
@@ -301,7 +347,10 @@ def places_of(scene: Scene, free: Any) -> tuple[int, ...]:
 
 
 _KINDS = {
-    "inertia": (Inertia, "ph.Inertia, for example ph.Inertia.from_moments([1., 2., 3.])"),
+    "inertia": (
+        Inertia | VariableInertia,
+        "ph.Inertia, for example ph.Inertia.from_moments([1., 2., 3.])",
+    ),
     "potential": (AbstractPotential, "a potential (ph.UniformGravity, ...) or None"),
     "torque": (AbstractTorque, "a torque (ph.BodyTorque, ...) or None"),
     "rotors": (AbstractRotor, "rotors (ph.Rotor, a sum of them) or None"),
@@ -313,7 +362,8 @@ def _check_kinds(scene: Scene) -> None:
         value = getattr(scene, name)
         if not (isinstance(value, kind) or (value is None and name != "inertia")):
             raise TypeError(f"Scene {name} must be {expected}, got {type(value).__name__}.")
-    check_form(scene.inertia)
+    if isinstance(scene.inertia, Inertia):
+        check_form(scene.inertia)
 
 
 def check_scene(scene: Scene) -> None:

@@ -53,7 +53,7 @@ class Job(NamedTuple):
     @property
     def batch_shape(self) -> tuple[int, ...]:
         lead = self.state.omega_body.shape[:-1]
-        return np.broadcast_shapes(lead, self.scene.inertia.batch_shape)
+        return np.broadcast_shapes(lead, self.scene.constant_inertia.batch_shape)
 
 
 class Outcome(NamedTuple):
@@ -200,7 +200,7 @@ def _index(job: Job, ts: np.ndarray) -> np.ndarray:
 def _simulate(job: Job, part: slice | None) -> polhode.Trajectory:
     scene, state = job.scene, job.state
     if part is not None:
-        if scene.inertia.batch_shape:
+        if scene.constant_inertia.batch_shape:
             inertia = jax.tree.map(lambda x: x[part], scene.inertia)
             scene = dataclasses.replace(scene, inertia=inertia)
         state = jax.tree.map(lambda x: x[part] if x.ndim > 1 else x, state)

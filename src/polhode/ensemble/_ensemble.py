@@ -124,7 +124,7 @@ def draw(each: Any, shared: Any, indices: Array, spreads: Any, seed: Array) -> t
             streams.append(stream)
             scene, state = spread(spread_key, scene, state)
         if "momentum_body" in rows:
-            omega = scene.inertia.rates(rows["momentum_body"])
+            omega = scene.constant_inertia.rates(rows["momentum_body"])
             state = State(state.wxyz, omega, state.wheel_speed)
         return scene, state
 
@@ -168,7 +168,7 @@ class SpreadMoments(eqx.Module):
     relative: Deviate
 
     def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
-        nominal = scene.inertia.moments
+        nominal = scene.constant_inertia.moments
 
         def draw_moments(trial):
             return nominal * (1 + self.relative(jax.random.fold_in(key, trial)))
@@ -240,7 +240,7 @@ class SpreadMomentum(eqx.Module):
 
     def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
         momentum = self.momentum if self.deviate is None else self.momentum + self.deviate(key)
-        return scene, State(state.wxyz, scene.inertia.rates(momentum), state.wheel_speed)
+        return scene, State(state.wxyz, scene.constant_inertia.rates(momentum), state.wheel_speed)
 
 
 class SpreadTorque(eqx.Module):

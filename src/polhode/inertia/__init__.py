@@ -16,3 +16,4 @@ from polhode.inertia._physical import (
 )
 from polhode.inertia._principal import principal as principal
 from polhode.inertia._shapes import Symmetry as Symmetry
+from polhode.inertia._variable import VariableInertia as VariableInertia

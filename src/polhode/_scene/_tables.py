@@ -1,0 +1,187 @@
+"""Tables over time: what ephemerides, field models and atmospheres return, for any part."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from polhode._checks import ArrayLike, as_float_array, is_concrete, require
+from polhode._kernels import smooth
+from polhode._parts import AbstractPart, shaped
+
+_NEIGHBOURS = 5
+"""Knots through which the polynomial runs whose derivative is taken: cubic interpolation is of
+fourth order, so the derivatives need no more than fourth order."""
+
+
+class Table(AbstractPart):
+    """A function of time from values at given times, for any part that takes one.
+
+    **Arguments:** ``times`` (n,) [s], ascending, shared by all bodies; ``values``: (..., n) of a
+    number, (..., n, k) of a vector of k components, with leading axes for a batch; ``order``
+    (static): 3 for cubic interpolation, whose error falls with the fourth power of the spacing, or
+    1 for linear interpolation, whose kinks at the times are known to the integrator: its steps end
+    there, so that ``rtol`` holds. ``derivatives``: of the values [1/s], of their shape, for cubic
+    interpolation where they are known, such as the velocities of an ephemeris; None: those of the
+    polynomials through five neighbouring values. ``kind``: "number" or "vector", where the shape
+    of the values leaves both open.
+
+    ``table(t)`` is a number or a vector (k,) for each of the times ``t`` (...). Before the first
+    time and after the last one the outermost polynomials continue: cover the simulated span.
+
+        sun = ph.Table([0.0, 3600.0, 7200.0], [[1.0, 0, 0], [0.9, 0.4, 0], [0.7, 0.7, 0]])
+        sun(1800.0)
+
+    Cubic Hermite interpolation: F. N. Fritsch and R. E. Carlson, SIAM J. Numer. Anal. 17 (1980)
+    238, equation 2, without their limits on the derivatives.
+
+    Raises ValueError for times that do not ascend, fewer than two, other shapes, or another order.
+    """
+
+    order: int = eqx.field(static=True)
+    is_number: bool = eqx.field(static=True)
+    times: Float[Array, " n"]
+    values: Float[Array, "*#b n k"] = shaped(None, None)
+    derivatives: Float[Array, "*#b n k"] | None = shaped(None, None)
+
+    def __init__(
+        self,
+        times: ArrayLike,
+        values: ArrayLike,
+        order: int = 3,
+        derivatives: ArrayLike | None = None,
+        kind: str | None = None,
+    ):
+        require(order in (1, 3), f"Table order must be 1 or 3, got {order!r}.")
+        require(
+            kind in (None, "number", "vector"),
+            f'Table kind must be "number", "vector" or None, got {kind!r}.',
+        )
+        require(
+            derivatives is None or order == 3,
+            "Table derivatives belong to order=3: a linear table does not use them.",
+        )
+        self.times = as_float_array("Table times", times, (None,))
+        if self.times.ndim != 1 or self.times.size < 2:
+            raise ValueError(
+                f"Table times must be two or more, of shape (n,), got {self.times.shape}."
+            )
+        if is_concrete(self.times):
+            require(np.diff(np.asarray(self.times)) > 0, "Table times must ascend.")
+        array = as_float_array("Table values", values)
+        self.order, self.is_number = order, _is_number(array.shape, self.times.size, kind)
+        self.values = array[..., None] if self.is_number else array
+        if derivatives is None:
+            self.derivatives = None
+            if order == 3:
+                self.derivatives = _derivatives(self.values, self.times.astype(array.dtype))
+            return
+        known = as_float_array("Table derivatives", derivatives)
+        core = 1 if self.is_number else 2
+        if known.shape[-core:] != array.shape[-core:]:
+            raise ValueError(
+                f"Table derivatives must have the shape of the values, {array.shape}, got"
+                f" {known.shape}."
+            )
+        self.derivatives = known[..., None] if self.is_number else known
+
+    @property
+    def smooth(self) -> bool:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Whether the derivative is continuous (static)."""
+        return self.order > 1
+
+    def __call__(self, t: Array | float) -> Array:
+        """Value at the times ``t`` (...): (...) of a number, (..., k) of a vector."""
+        t = jnp.asarray(t, self.values.dtype)
+        if self.values.ndim > 2:
+            t = jnp.broadcast_to(t, jnp.broadcast_shapes(t.shape, self.values.shape[:-2]))
+        times = self.times.astype(self.values.dtype)
+        interpolate = _linear if self.order == 1 else _cubic
+        found = interpolate(self, times, t)
+        return found[..., 0] if self.is_number else found
+
+
+def _is_number(shape: tuple[int, ...], n: int, kind: str | None) -> bool:
+    number, vector = shape[-1:] == (n,), len(shape) > 1 and shape[-2] == n
+    fits = {None: number or vector, "number": number, "vector": vector}
+    if not fits[kind]:
+        raise ValueError(
+            f"Table values must have shape (..., {n}) or (..., {n}, k) for {n} times, got {shape}."
+        )
+    if number and vector and kind is None:
+        raise ValueError(
+            f"Table values of shape {shape} may be numbers or vectors at {n} times: give"
+            ' kind="number" or kind="vector".'
+        )
+    return number if kind is None else kind == "number"
+
+
+def _linear(table: Table, times: Array, t: Array) -> Array:
+    # The place is continuous and rises through whole numbers at the times, and ``floor`` of it is
+    # the one switch that the integrator sees: held within a step, whatever the number of times.
+    place = _place(times, t)
+    i = jnp.clip(jnp.floor(place), 0, times.size - 2).astype(int)
+    first, last = times[i], times[i + 1]
+    share = ((t - first) / (last - first))[..., None]
+    low, high = _rows(table.values, i), _rows(table.values, i + 1)
+    return low + share * (high - low)
+
+
+@smooth
+def _place(times: Array, t: Array) -> Array:
+    i = _interval(times, t)
+    return i.astype(t.dtype) + (t - times[i]) / (times[i + 1] - times[i])
+
+
+@smooth
+def _cubic(table: Table, times: Array, t: Array) -> Array:
+    i = _interval(times, t)
+    width = (times[i + 1] - times[i])[..., None]
+    x = (t - times[i])[..., None] / width
+    low, high = _rows(table.values, i), _rows(table.values, i + 1)
+    rise = high - low
+    a = width * _rows(table.derivatives, i) - rise
+    b = rise - width * _rows(table.derivatives, i + 1)
+    return low + x * (rise + (1 - x) * (a * (1 - x) + b * x))
+
+
+def _interval(times: Array, t: Array) -> Array:
+    """Place of the last time that is not after ``t``, within [0, n - 2]."""
+    i = jnp.searchsorted(times, t, side="right", method="scan_unrolled") - 1
+    return jnp.clip(i, 0, times.size - 2)
+
+
+def _rows(values: Array, i: Array) -> Array:
+    """Rows ``i`` (...) of values (n, k), or (..., n, k) with leading axes that ``i`` has too."""
+    if values.ndim == 2:
+        return values[i]
+    values = values.reshape((1,) * (i.ndim + 2 - values.ndim) + values.shape)
+    return jnp.take_along_axis(values, i[..., None, None], axis=-2)[..., 0, :]
+
+
+@jax.jit  # one program, not one for each operation
+def _derivatives(values: Array, times: Array) -> Array:
+    """At each time, the derivative of the polynomial through the values around it."""
+    n = times.size
+    count = min(_NEIGHBOURS, n)
+    place = np.arange(n)
+    first = np.clip(place - count // 2, 0, n - count)
+    total = jnp.zeros_like(values)
+    for j in range(count):
+        # Lagrange's polynomial l_j, which is 1 at its own time: there its derivative is a sum, and
+        # at the other times a product without the factor that is zero
+        own = first + j == place
+        at = times[first + j]
+        weight, product = jnp.zeros_like(times), jnp.ones_like(times)
+        for k in range(count):
+            if k == j:
+                continue
+            other = times[first + k]
+            weight = weight + 1 / jnp.where(own, times - other, 1)
+            here = first + k == place
+            product = product * jnp.where(here, 1, times - other) / (at - other)
+        weight = jnp.where(own, weight, product)[:, None]
+        rows = values[..., first + j, :]
+        total = total + weight.reshape((1,) * (values.ndim - 2) + weight.shape) * rows
+    return total
