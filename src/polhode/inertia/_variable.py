@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polhode._checks import as_float_array, is_concrete, require
-from polhode._parts import AbstractPart, Signature, kept, shaped
-from polhode._parts._functions import takes
+from polhode._parts import AbstractPart, Signature, kept, shaped, takes
 from polhode.inertia._inertia import Inertia
 from polhode.inertia._shapes import Symmetry
 
