@@ -60,12 +60,15 @@ from ._scene import (
     SolarPressure as SolarPressure,
     Eclipse as Eclipse,
     Table as Table,
+    MomentumDumping as MomentumDumping,
+    ControlMomentGyro as ControlMomentGyro,
     AbstractTorque as AbstractTorque,
 )
 
 # Wheels: reaction and momentum wheels, with motors and bearings; they add with `+`.
 from ._scene import (
     Rotor as Rotor,
+    wheel_cluster as wheel_cluster,
     Motor as Motor,
     ViscousCoupling as ViscousCoupling,
     CoulombFriction as CoulombFriction,

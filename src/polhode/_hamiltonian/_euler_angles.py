@@ -120,7 +120,7 @@ def euler_angle_field(t, y, dynamics: Dynamics):
     rate_q, rate_p = hamiltons_equations(chart.of_components)(q, p, t)
     attitude, omega = from_euler_angles(*q), rates_from_angle_rates(q, rate_q)
     if dynamics.torque is not None:
-        push = dynamics.torque.body_components(t, attitude, omega)
+        push = dynamics.torque_at(t).body_components(t, attitude, omega)
         rate_p = tuple(a + b for a, b in zip(rate_p, canonical_from_momentum(q, push)))
         momentum = momentum_from_canonical(q, p)
         slip = dynamics.torque.slip(t, momentum, omega)

@@ -63,7 +63,8 @@ def external_power(
     power = jnp.zeros_like(momentum[0])
     if dynamics.torque is not None:
         omega, potential_torque = rates_and_torque(hamiltonian, momentum, attitude, t)
-        power = power + dot(dynamics.torque.body_components(t, attitude, omega), omega)
+        torque = dynamics.torque_at(t).body_components(t, attitude, omega)
+        power = power + dot(torque, omega)
         slip = dynamics.torque.slip(t, momentum, omega)
         if slip is not None:
             power = power + dot(omega, cross(momentum, slip))
@@ -102,6 +103,11 @@ class Dynamics(eqx.Module):
     def coupled(self) -> tuple[int, ...]:
         """Which wheels have momenta that are part of the state (static)."""
         return () if self.wheels is None else self.wheels.coupled
+
+    def torque_at(self, t: Array | float) -> Any:
+        """The torque, which may depend on the momentum of the wheels."""
+        carried = self.hamiltonian.rotor_momentum
+        return self.torque if carried is None else self.torque.with_wheels(carried(t))
 
     def at(self, spins: Sequence[Array] = ()) -> "Dynamics":
         """The dynamics at a moment when the coupled wheels have these momenta [kg m^2/s]."""
@@ -147,7 +153,7 @@ def _motion(t, momentum, attitude, dynamics) -> tuple[Vector, Vector, Vector]:
     if potential_torque is not None:
         rate = triple(map(add, rate, potential_torque))
     if dynamics.torque is not None:
-        torque = dynamics.torque.body_components(t, attitude, omega)
+        torque = dynamics.torque_at(t).body_components(t, attitude, omega)
         rate = triple(map(add, rate, torque))
     return rate, axes_rate, omega
 

@@ -1,5 +1,10 @@
 """Scenes and states, and what they are made of: potentials, torques, damping, rotors."""
 
+from polhode._scene._clusters import (
+    ControlMomentGyro as ControlMomentGyro,
+    MomentumDumping as MomentumDumping,
+    wheel_cluster as wheel_cluster,
+)
 from polhode._scene._control import (
     BDot as BDot,
     DipoleField as DipoleField,

@@ -131,16 +131,20 @@ class MagneticDipole(AbstractTorque):
     def body_components(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> tuple[Array, Array, Array]:
-        field, moment = self.field, self.moment
+        field, moment = self.field_body(t, attitude), self.moment
+        if callable(moment):
+            moment = _MOMENT.mapped(moment, t, stacked(omega), stacked(field))
+        return cross(components(moment), field)
+
+    def field_body(self, t: Array | float, attitude: Attitude) -> tuple[Array, Array, Array]:
+        """The field in body axes [T]."""
+        field = self.field
         if isinstance(field, Table):
             field = field(t)
         elif callable(field):
             place = stacked(value_at("MagneticDipole position", self.position, t))
             field = _FIELD.mapped(field, place, jnp.asarray(t, place.dtype))
-        field = attitude.to_body(components(field))
-        if callable(moment):
-            moment = _MOMENT.mapped(moment, t, stacked(omega), stacked(field))
-        return cross(components(moment), field)
+        return attitude.to_body(components(field))
 
 
 class BDot(eqx.Module):

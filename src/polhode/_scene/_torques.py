@@ -43,6 +43,10 @@ class AbstractTorque(AbstractPart):
         """
         return None
 
+    def with_wheels(self, momentum: Sequence[Array]) -> "AbstractTorque":
+        """The torque at a moment when the wheels of the scene carry this momentum [kg m^2/s]."""
+        return self
+
     @property
     def edges(self) -> Array | None:
         """Times (k,) [s] at which the torque jumps and steps have to end; None without such."""
@@ -72,6 +76,9 @@ class TorqueSum(AbstractTorque):
 
     def during(self, t):
         return TorqueSum(tuple(term.during(t) for term in self.terms))
+
+    def with_wheels(self, momentum):
+        return TorqueSum(tuple(term.with_wheels(momentum) for term in self.terms))
 
     def slip(self, t, momentum, omega):
         found = (term.slip(t, momentum, omega) for term in self.terms)

@@ -53,6 +53,17 @@ class AbstractCoupling(AbstractPart):
     ) -> Array:
         """Torque on the wheel about its axis [N m]."""
 
+    def torque_among(
+        self,
+        t: Array | float,
+        i: int,
+        speed_of: Callable[[int], Array],
+        attitude: Attitude,
+        omega: Sequence[Array],
+    ) -> Array:
+        """The same on wheel ``i``, where the speeds of all wheels are at hand."""
+        return self.torque(t, speed_of(i), attitude, omega)
+
     def __add__(self, other: "AbstractCoupling") -> "CouplingSum":
         return CouplingSum(terms_of("coupling", AbstractCoupling, CouplingSum, self, other))
 
@@ -64,6 +75,11 @@ class CouplingSum(AbstractCoupling):
 
     def torque(self, t, speed, attitude, omega):
         first, *rest = (term.torque(t, speed, attitude, omega) for term in self.terms)
+        return sum(rest, start=first)
+
+    def torque_among(self, t, i, speed_of, attitude, omega):
+        given = t, i, speed_of, attitude, omega
+        first, *rest = (term.torque_among(*given) for term in self.terms)
         return sum(rest, start=first)
 
 
@@ -361,8 +377,8 @@ class Wheels(AbstractRotor):
         found, couplings = [], iter(() if self.couplings is None else self.couplings.terms)
         for i, held in enumerate(self.held):
             if i in self.coupled:
-                speed = self.speed(i, t, omega)
-                found.append(next(couplings).torque(t, speed, attitude, omega))
+                speed_of = partial(self.speed, t=t, omega=omega)
+                found.append(next(couplings).torque_among(t, i, speed_of, attitude, omega))
             elif held:
                 found.append(jnp.zeros_like(omega[0]))
             else:
