@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from polhode._checks import as_float_array, is_concrete, require
+from polhode._checks import as_float_array, require
 from polhode._parts import AbstractPart, Signature, kept, shaped, takes
 from polhode.inertia._inertia import Inertia
 from polhode.inertia._shapes import Symmetry
@@ -45,17 +45,12 @@ class VariableInertia(AbstractPart):
 
     def __init__(self, fn: Callable):
         if isinstance(fn, AbstractPart) and callable(fn):
-            values: Any = getattr(fn, "values", None)
-            width = None if values is None else values.shape[-1]
+            width = (np.shape(jax.eval_shape(fn, 0.0)) or (1,))[-1]
             require(
                 width in (3, 9),
                 "VariableInertia takes a table of moments (..., n, 3) or of tensors (..., n, 9),"
                 f" got vectors of {width} numbers.",
             )
-            if width == 3 and is_concrete(values):
-                require(
-                    np.asarray(values) > 0, "the moments of a VariableInertia must be positive."
-                )
             self.fn, self.is_principal = fn, width == 3
             return
         takes("VariableInertia", fn, ("t",))
