@@ -6,10 +6,8 @@ So every signal is noted, and `check_signals` raises it again between the pieces
 """
 
 import contextlib
-import hashlib
 import importlib.util
 import os
-import platform
 import signal
 import threading
 import types
@@ -131,6 +129,9 @@ def _folder(name: str | None) -> Path | None:
 
 
 def _processor() -> str:
+    import hashlib
+    import platform
+
     words = platform.machine()
     with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as file:
         words += next((line for line in file if line.startswith(("flags", "Features"))), "")

@@ -13,8 +13,6 @@ from polhode.files._read import (
     read_scene as read_scene,
     shipped_scenes as shipped_scenes,
 )
-from polhode.files._reference import reference_motions as reference_motions
-from polhode.files._write import write_netcdf as write_netcdf
 
 if TYPE_CHECKING:
     from polhode.files._build import (
@@ -28,6 +26,8 @@ if TYPE_CHECKING:
         draw_clones as draw_clones,
     )
     from polhode.files._models import SceneFile as SceneFile
+    from polhode.files._reference import reference_motions as reference_motions
+    from polhode.files._write import write_netcdf as write_netcdf
 
 _BUILDERS = (
     "Clones",
@@ -39,11 +39,18 @@ _BUILDERS = (
     "build_state",
     "draw_clones",
 )
+# imported on first use: the command line answers before
+_MODULES = dict.fromkeys(_BUILDERS, "_build") | {
+    "SceneFile": "_models",
+    "reference_motions": "_reference",
+    "write_netcdf": "_write",
+}
 
 
 def __getattr__(name: str) -> Any:
-    if name not in (*_BUILDERS, "SceneFile"):
+    module = _MODULES.get(name)
+    if module is None:
         raise AttributeError(f"module 'polhode.files' has no attribute {name!r}")
-    imported("a scene file", "pydantic")
-    module = "_models" if name == "SceneFile" else "_build"
+    if module in ("_models", "_build"):
+        imported("a scene file", "pydantic")
     return getattr(importlib.import_module(f"polhode.files.{module}"), name)
