@@ -32,6 +32,7 @@ def test_they_hold_what_is_needed(built):
     needed = {"polhode/py.typed", "polhode/plot/viewer/viewer.js", "polhode/plot/viewer/page.html"}
     needed |= {f"polhode/plot/viewer/three.{kind}" for kind in ("min.js", "LICENSE.txt")}
     needed |= {f"polhode/files/scenes/{name}.toml" for name in shipped_scenes()}
+    needed.add("polhode/files/reference/tumbling.json")
     names = set(zipfile.ZipFile(built["wheel"]).namelist())
     assert needed <= names
     assert all(name.startswith("polhode") for name in names)
