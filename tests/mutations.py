@@ -224,7 +224,7 @@ MUTANTS = (
         "g = (bound * sine + b * turn) / n",
         "g = (bound * sine - b * turn) / n",
         "orbits from a state that is not at an apsis are wrong",
-        ("torques/test_orbit.py::test_an_orbit_through_a_state_is_a_kepler_orbit",),
+        ("torques/test_kepler_equation.py::test_orbits_by_a_state",),
     ),
     Mutant(
         "_scene/_potentials.py",
