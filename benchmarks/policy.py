@@ -40,7 +40,7 @@ CASES: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "KERNEL_BODIES": ((0, 64), ("heavy top", "ten heavy tops", "satellite", "clipped satellites")),
     "KERNEL_SUM": ((64,), ("gradient of heavy tops", "gradient of Lagrange's tops")),
     "KERNEL_TABLE": ((0,), ("heavy top", "heavy tops", "Lagrange's tops")),
-    "STAGE_WORK": ((2, 30, 10**6), ("satellites", "gradient of heavy tops")),
+    "STAGE_WORK": ((2, 10**6), ("satellites", "gradient of heavy tops", "gradient of satellites")),
     "SUM_ROWS": ((1, 16), ("gradient of Lagrange's tops",)),
     "LANES": ((16, 32, 128, 256), ("heavy tops", "satellites")),
     "REFILL_LANES": ((1, 4, 16, 32), ("heavy tops",)),
@@ -166,6 +166,7 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
         "gradient of a heavy top": slope(triaxial(gravity), 1),
         "gradient of heavy tops": slope(triaxial(gravity), BODIES),
         "gradient of a satellite": slope(satellite, 1),
+        "gradient of satellites": slope(satellite, 200),
         "fits": fits,
     }  # fmt: skip
 
