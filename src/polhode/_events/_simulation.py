@@ -173,7 +173,7 @@ def _ended(begin: Trajectory, rows, path, outcome, events, met, states):
             for x, y in zip(path, states, strict=True)
         ]
         event_time = jnp.where(stops, stop, jnp.inf)[:, 0].reshape(batch)
-    wxyz, omega, *spins = (x.reshape(*batch, *x.shape[1:]) for x in path)
+    path = [x.reshape(*batch, *x.shape[1:]) for x in path]
     status, steps = (x.reshape(batch) for x in outcome)
     nothing = ~happens[..., None]
     attitudes, rates, *_ = (
@@ -188,15 +188,4 @@ def _ended(begin: Trajectory, rows, path, outcome, events, met, states):
     )
     one_row = event_time is None and begin.ts.ndim == 1
     times = rows[0] if one_row else rows.reshape(*batch, -1)
-    return Trajectory(
-        times,
-        wxyz,
-        omega,
-        status,
-        steps,
-        begin.scene,
-        spins=spins[0] if spins else None,
-        propagator=begin.propagator,
-        event_time=event_time,
-        events=found,
-    )
+    return begin._with_samples(times, path, status, steps, event_time, found)

@@ -66,17 +66,8 @@ def stopped(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
     wxyz, omega, spins, status, steps, times, event = (
         None if x is None else x.reshape(*batch, *x.shape[1:]) for x in path
     )
-    return Trajectory(
-        times,
-        wxyz,
-        omega,
-        status,
-        steps,
-        begin.scene,
-        spins=spins,
-        propagator=begin.propagator,
-        event_time=event,
-    )
+    samples = [wxyz, omega] if spins is None else [wxyz, omega, spins]
+    return begin._with_samples(times, samples, status, steps, event)
 
 
 def _stopped_by_loop(lanes: Trajectory, ts: Array, until: Event):

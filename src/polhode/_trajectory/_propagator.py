@@ -85,11 +85,9 @@ def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
     asked = jnp.broadcast_to(finite, wxyz.shape[:-1])[..., None]
     status, steps = status.reshape(batch), steps.reshape(batch)
     good = trajectory.status == Status.SUCCESSFUL
-    wxyz, omega, *spins = (jnp.where(asked, x, jnp.nan) for x in (wxyz, omega, *spins))
-    return Trajectory(
-        t, wxyz, omega, jnp.where(good, status, trajectory.status), steps, trajectory.scene,
-        spins=spins[0] if spins else None, propagator=propagator, event_time=trajectory._event_time,
-    )  # fmt: skip
+    samples = [jnp.where(asked, x, jnp.nan) for x in (wxyz, omega, *spins)]
+    status = jnp.where(good, status, trajectory.status)
+    return trajectory._with_samples(t, samples, status, steps, trajectory._event_time)
 
 
 def _until_event(trajectory: Trajectory, times: Array) -> Array:

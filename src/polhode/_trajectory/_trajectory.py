@@ -138,6 +138,31 @@ class Trajectory(eqx.Module):
             lines.append("steps   none: a closed form")
         return "\n".join(lines)
 
+    def _with_samples(
+        self,
+        ts: Array,
+        samples: Sequence[Array],
+        status: Array,
+        steps: Array,
+        event_time: Array | None,
+        events: Events | None = None,
+    ) -> "Trajectory":
+        """The same motion with other samples: attitude, rates and, if there are coupled wheels,
+        their momenta."""
+        wxyz, omega, *spins = samples
+        return Trajectory(
+            ts,
+            wxyz,
+            omega,
+            status,
+            steps,
+            self.scene,
+            spins=spins[0] if spins else None,
+            propagator=self.propagator,
+            event_time=event_time,
+            events=events,
+        )
+
     @property
     def wxyz(self) -> Float[Array, "*b t 4"]:
         """Attitudes (..., T, 4), body -> space, scalar first."""
