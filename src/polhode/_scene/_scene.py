@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from functools import reduce
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import equinox as eqx
 import jax
@@ -157,10 +157,24 @@ class Scene(eqx.Module):
     Raises TypeError for a part of the wrong kind.
     """
 
-    inertia: Inertia | VariableInertia
+    if TYPE_CHECKING:  # of nearly all scenes, whose users should not have to ask
+        inertia: Inertia
+    else:
+        inertia: Inertia | VariableInertia
     potential: AbstractPotential | None = None
     torque: AbstractTorque | None = None
     rotors: AbstractRotor | None = None
+
+    def __init__(
+        self,
+        inertia: Inertia | VariableInertia,
+        potential: AbstractPotential | None = None,
+        torque: AbstractTorque | None = None,
+        rotors: AbstractRotor | None = None,
+    ):
+        given: Any = inertia
+        self.inertia, self.potential = given, potential
+        self.torque, self.rotors = torque, rotors
 
     def __check_init__(self):
         _check_kinds(self)
