@@ -119,6 +119,32 @@ class MassProperties(AbstractShaped):
         return cls.from_mesh(vertices * unit, faces, density=density, mass=mass)
 
     @classmethod
+    def from_urdf(cls, path: str | PathLike[str], link: str) -> Self:
+        """Of a link of a robot's URDF file, in the axes and about the origin of the link.
+
+        SI units, as the format has them. Raises FileNotFoundError, and ValueError for a file that
+        is no URDF, a link that is not in it or has no inertia, and moments that no body has.
+        """
+        from polhode.inertia._robots import read_urdf  # here: SciPy loads with it
+
+        return cls._of_file(*read_urdf(path, link))
+
+    @classmethod
+    def from_mjcf(cls, path: str | PathLike[str], body: str) -> Self:
+        """Of a body of an MJCF file, read by MuJoCo, in the axes and about the origin of the body.
+
+        Where the file has no ``inertial`` element, MuJoCo computes one from the geoms. Raises as
+        ``from_urdf``, and ImportError without mujoco (extra ``robots``).
+        """
+        from polhode.inertia._robots import read_mjcf  # here: SciPy loads with it
+
+        return cls._of_file(*read_mjcf(path, body))
+
+    @classmethod
+    def _of_file(cls, mass: float, centre: np.ndarray, tensor: np.ndarray) -> Self:
+        return cls.of(mass, centre, Inertia.from_tensor(tensor))
+
+    @classmethod
     def from_log_cholesky(cls, parameters: ArrayLike) -> Self:
         """A physical body from any real 10-vector (..., 10).
 

@@ -1,0 +1,84 @@
+"""Mass properties of one body of a robot's model file: URDF and MJCF."""
+
+from os import PathLike
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from polhode._extras import imported
+
+
+def read_urdf(path: str | PathLike[str], link: str) -> tuple[float, np.ndarray, np.ndarray]:
+    """Mass, centre of mass (3,) and tensor (3, 3) about it, in the axes of a link."""
+    name = Path(path).name
+    try:
+        root = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError as error:
+        raise ValueError(f"{name} is not XML ({error}): expected a URDF file.") from error
+    links = {found.get("name"): found for found in root.iter("link")}
+    if link not in links:
+        raise ValueError(f"{name} has no link {link!r}, it has: {_listed(links)}.")
+    inertial = links[link].find("inertial")
+    if inertial is None:
+        raise ValueError(f"the link {link!r} of {name} has no <inertial> element.")
+    where = f"the <inertial> of {link!r} in {name}"
+    mass = _number(inertial.find("mass"), "value", where)
+    entries = {
+        key: _number(inertial.find("inertia"), key, where)
+        for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    }
+    origin = inertial.find("origin")
+    centre, angles = (_three(origin, key, where) for key in ("xyz", "rpy"))
+    own = np.array(
+        [
+            [entries["ixx"], entries["ixy"], entries["ixz"]],
+            [entries["ixy"], entries["iyy"], entries["iyz"]],
+            [entries["ixz"], entries["iyz"], entries["izz"]],
+        ]
+    )
+    turned = Rotation.from_euler("xyz", angles).as_matrix()  # about fixed axes, roll first
+    return mass, centre, turned @ own @ turned.T
+
+
+def read_mjcf(path: str | PathLike[str], body: str) -> tuple[float, np.ndarray, np.ndarray]:
+    """The same of a body of an MJCF file, as MuJoCo compiles it (inertia from geoms included)."""
+    mujoco = imported("from_mjcf", "mujoco", extra="robots")
+    if not Path(path).is_file():
+        raise FileNotFoundError(f"no such file: {path}")
+    name = Path(path).name
+    try:
+        model: Any = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise ValueError(f"MuJoCo does not read {name}: {error}") from error
+    names = [model.body(i).name for i in range(model.nbody)]
+    if body not in names:
+        raise ValueError(f"{name} has no body {body!r}, it has: {_listed(names)}.")
+    found = model.body(body)
+    turned = Rotation.from_quat(found.iquat, scalar_first=True).as_matrix()
+    tensor = turned @ np.diag(found.inertia) @ turned.T
+    return float(found.mass[0]), np.array(found.ipos), tensor
+
+
+def _listed(names: Any) -> str:
+    return ", ".join(str(name) for name in names) or "none"
+
+
+def _number(element: Any, key: str, where: str) -> float:
+    text = None if element is None else element.get(key)
+    try:
+        return float(text)
+    except (TypeError, ValueError):
+        given = "nothing" if text is None else repr(text)
+        raise ValueError(f"{where} needs a number {key}, got {given}.") from None
+
+
+def _three(element: Any, key: str, where: str) -> np.ndarray:
+    text = "0 0 0" if element is None else element.get(key, "0 0 0")
+    try:
+        first, second, third = (float(word) for word in text.split())
+    except ValueError:
+        raise ValueError(f"{where} needs three numbers {key}, got {text!r}.") from None
+    return np.array([first, second, third])

@@ -1,0 +1,88 @@
+"""Mass properties from the model files of robots."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import polhode as ph
+from polhode.inertia import MassProperties
+
+URDF = """<robot name="arm">
+  <link name="base"/>
+  <link name="hand">
+    <inertial>
+      <origin xyz="0.1 -0.2 0.3" rpy="0.4 -0.5 0.6"/>
+      <mass value="2.5"/>
+      <inertia ixx="0.10" iyy="0.12" izz="0.07" ixy="0.01" ixz="-0.005" iyz="0.002"/>
+    </inertial>
+  </link>
+  <joint name="wrist" type="continuous"><parent link="base"/><child link="hand"/></joint>
+</robot>"""
+
+MJCF = """<mujoco><worldbody><body name="hand" pos="1 2 3">
+  <joint type="free"/>
+  <geom type="box" size="0.1 0.2 0.3" mass="2" pos="0.5 0 0" euler="0 0 90"/>
+</body></worldbody></mujoco>"""
+
+
+@pytest.fixture
+def arm(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text(URDF)
+    return path
+
+
+def test_a_link_of_a_urdf_file(arm):
+    """The tensor stands in the axes of the inertial frame: roll about x first, all axes fixed."""
+    hand = MassProperties.from_urdf(arm, "hand")
+    own = np.array([[0.10, 0.01, -0.005], [0.01, 0.12, 0.002], [-0.005, 0.002, 0.07]])
+    turned = (
+        Rotation.from_rotvec([0, 0, 0.6])
+        * Rotation.from_rotvec([0, -0.5, 0])
+        * Rotation.from_rotvec([0.4, 0, 0])
+    ).as_matrix()
+    np.testing.assert_allclose(hand.mass, 2.5)
+    np.testing.assert_allclose(hand.centre, [0.1, -0.2, 0.3])
+    np.testing.assert_allclose(hand.inertia.tensor, turned @ own @ turned.T, rtol=1e-12)
+
+
+def test_mujoco_reads_the_same_link(arm):
+    """MuJoCo's own reader of URDF is the independent truth."""
+    pytest.importorskip("mujoco", reason="needs mujoco, extra robots")
+    ours, theirs = MassProperties.from_urdf(arm, "hand"), MassProperties.from_mjcf(arm, "hand")
+    np.testing.assert_allclose(ours.centre, theirs.centre, atol=1e-12)
+    np.testing.assert_allclose(ours.inertia.tensor, theirs.inertia.tensor, rtol=1e-8, atol=1e-12)
+
+
+def test_a_body_of_an_mjcf_file(tmp_path):
+    """Without an inertial element it follows from the geoms: a box turned about z by 90 degrees."""
+    pytest.importorskip("mujoco", reason="needs mujoco, extra robots")
+    path = tmp_path / "box.xml"
+    path.write_text(MJCF)
+    hand = MassProperties.from_mjcf(path, "hand")
+    x, y, z = 0.2, 0.1, 0.3
+    want = 2 / 3 * np.diag([y * y + z * z, x * x + z * z, x * x + y * y])
+    np.testing.assert_allclose(hand.centre, [0.5, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(hand.inertia.tensor, want, rtol=1e-9, atol=1e-12)
+    scene = ph.Scene(hand.inertia)
+    assert ph.simulate(scene, ph.State([1.0, 0, 0, 0], [0.1, 1.0, 0.1]), [0.0, 1.0]).successful
+    with pytest.raises(ValueError, match="no body 'foot', it has: world, hand"):
+        MassProperties.from_mjcf(path, "foot")
+
+
+def test_robot_files_that_say_too_little(arm, tmp_path):
+    with pytest.raises(ValueError, match="no link 'foot', it has: base, hand"):
+        MassProperties.from_urdf(arm, "foot")
+    with pytest.raises(ValueError, match=r"'base' of arm\.urdf has no <inertial>"):
+        MassProperties.from_urdf(arm, "base")
+    with pytest.raises(FileNotFoundError):
+        MassProperties.from_urdf(tmp_path / "absent.urdf", "hand")
+    arm.write_text(URDF.replace('value="2.5"', 'value="heavy"'))
+    with pytest.raises(ValueError, match="needs a number value, got 'heavy'"):
+        MassProperties.from_urdf(arm, "hand")
+    arm.write_text(URDF.replace('ixx="0.10"', 'ixx="1.0"'))
+    with pytest.raises(ValueError, match="sum"):
+        MassProperties.from_urdf(arm, "hand")
+    arm.write_text("no XML")
+    with pytest.raises(ValueError, match="not XML"):
+        MassProperties.from_urdf(arm, "hand")
