@@ -132,3 +132,9 @@ def test_programs_are_read_in_one_folder():
     assert len(readers) > 4
     outside = {path for path in readers if not path.startswith("xla/")}
     assert outside == {"ensemble/eight_devices.py"}  # collectives between devices
+
+
+def test_the_formatter_sees_all_code():
+    files = list(SOURCE.rglob("*.py"))
+    assert len(files) > 100
+    assert not [path.name for path in files if re.search(r"# fmt: (skip|off)", path.read_text())]

@@ -238,9 +238,11 @@ def on_devices(
     in_specs = (method_specs, scene_specs, state_specs, split.spec(ts, 1), PartitionSpec())
     return jax.shard_map(
         lambda arrays: fn(*eqx.combine(arrays, rest)),
-        mesh=split.mesh, in_specs=(in_specs,), out_specs=PartitionSpec(*split.axes),
+        mesh=split.mesh,
+        in_specs=(in_specs,),
+        out_specs=PartitionSpec(*split.axes),
         check_vma=False,
-    )(arrays)  # fmt: skip
+    )(arrays)
 
 
 def _is_spec(x: Any) -> bool:

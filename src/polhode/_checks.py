@@ -1,4 +1,4 @@
-"""Input checks shared by every constructor: what was given, what is expected, how to mend it."""
+"""Input checks shared by every constructor: what was given, what is expected, how to fix it."""
 
 from collections.abc import Callable, Sequence
 from functools import reduce
@@ -100,7 +100,7 @@ def as_float_array(
         )
     if finite and is_concrete(array) and not bool(np.all(np.isfinite(np.asarray(array)))):
         raise ValueError(
-            f"{name} holds NaN or infinity ({describe(array)}): remove or mend these entries"
+            f"{name} holds NaN or infinity ({describe(array)}): remove or correct these entries"
             " before the call."
         )
     return array

@@ -184,11 +184,13 @@ def check_options(
     for name, value, kind, example in (
         ("solver", solver, diffrax.AbstractSolver, "diffrax.Dopri8()"),
         (
-            "controller", controller, diffrax.AbstractStepSizeController,
+            "controller",
+            controller,
+            diffrax.AbstractStepSizeController,
             "diffrax.PIDController(rtol=1e-9, atol=1e-9)",
         ),
         ("adjoint", adjoint, diffrax.AbstractAdjoint, "diffrax.RecursiveCheckpointAdjoint()"),
-    ):  # fmt: skip
+    ):
         if isinstance(value, kind) or (value is None and name != "solver"):
             continue
         if isinstance(value, type) and issubclass(value, kind):
@@ -244,17 +246,19 @@ def check_method(method: Any) -> None:
 
     kind = method if isinstance(method, type) else type(method)
     if isinstance(method, type) and issubclass(method, AbstractMethod):
-        given, mend = f"the class {method.__name__}", f": make an object of it, {made(method)}"
+        given, remedy = f"the class {method.__name__}", f": make an object of it, {made(method)}"
     elif issubclass(kind, diffrax.AbstractSolver):
-        given, mend = (
+        given, remedy = (
             f"the solver {kind.__name__}",
             f": hand it to a chart, ph.LiePoisson({made(method)})",
         )
     else:
-        given, mend = type(method).__name__, ""
+        given, remedy = type(method).__name__, ""
         if callable(method) and getattr(method, "__module__", "").startswith("polhode."):
-            given, mend = f"the function {method.__name__}", f": call it, ph.{method.__name__}()"
-    raise TypeError(f"method must be None or an object such as ph.LiePoisson(), got {given}{mend}.")
+            given, remedy = f"the function {method.__name__}", f": call it, ph.{method.__name__}()"
+    raise TypeError(
+        f"method must be None or an object such as ph.LiePoisson(), got {given}{remedy}."
+    )
 
 
 def check_kinds(scene: Any, state: Any) -> None:
@@ -267,7 +271,7 @@ def check_kinds(scene: Any, state: Any) -> None:
 def check_inputs(
     scene: Any, state: Any, ts: Any, record: Any
 ) -> tuple[Scene, State, Array, Record]:
-    """Kinds, dtypes and times, with messages that tell the mend."""
+    """Kinds, dtypes and times, with messages that say how to fix them."""
     check_kinds(scene, state)
     record = _DEFAULT if record is None else record
     if not isinstance(record, Record):

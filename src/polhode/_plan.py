@@ -172,10 +172,18 @@ def plan(
     bodies = int(np.prod(common_batch(*parts, state, extra=(ts.shape[:-1],)), dtype=int))
     samples = 1 if record.final_only else ts.shape[-1]
     return Plan(
-        method, reason, _skipped(scene, method, record), bodies, samples,
-        str(state.wxyz.dtype), _error(method, scene, state, ts, rtol), refused, narrower,
-        _policy.plain_reason(), stiff,
-    )  # fmt: skip
+        method,
+        reason,
+        _skipped(scene, method, record),
+        bodies,
+        samples,
+        str(state.wxyz.dtype),
+        _error(method, scene, state, ts, rtol),
+        refused,
+        narrower,
+        _policy.plain_reason(),
+        stiff,
+    )
 
 
 _STIFF = 1e4

@@ -209,10 +209,15 @@ def _begin(method, scene, state, ts, rtol) -> Trajectory:
     good = jnp.full(omega[..., 0].size, Status.SUCCESSFUL)
     status = judged(good, Scene(**lanes), times, rtol).reshape(batch)
     return Trajectory(
-        ts[..., :1], wxyz[..., None, :], omega[..., None, :], status, jnp.zeros_like(status), scene,
+        ts[..., :1],
+        wxyz[..., None, :],
+        omega[..., None, :],
+        status,
+        jnp.zeros_like(status),
+        scene,
         spins=jnp.stack(spins, axis=-1)[..., None, :] if spins else None,
         propagator=Propagator.of(method, rtol),
-    )  # fmt: skip
+    )
 
 
 def _trajectory(method, scene, state, ts, rtol, record, split) -> Trajectory:

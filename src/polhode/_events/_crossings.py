@@ -315,7 +315,7 @@ def _by_sampling(
 def _refined(trajectory: Trajectory, event: Event, times: Array, use: Array):
     """Slopes and times with their derivatives."""
     safe = jnp.where(use, times, trajectory.ts[..., :1])
-    # of the value no more than rounding is left to mend, or of a touch all digits are noise
+    # of the value no more than rounding is left to correct, or of a touch all digits are noise
     tolerance = 64 * jnp.finfo(safe.dtype).eps * jnp.abs(safe)
     delay, there = event.refined(moved_to(trajectory, safe), tolerance)
     _, slope = event.values(there)

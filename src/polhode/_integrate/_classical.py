@@ -38,6 +38,10 @@ class ClassicalRungeKutta(diffrax.AbstractSolver):
         last = terms.vf(t1, ahead(third, h), args)
         y1 = jax.tree.map(
             lambda y, a, b, c, d: y + h / 6 * (a + 2 * b + 2 * c + d),
-            y0, first, second, third, last,
-        )  # fmt: skip
+            y0,
+            first,
+            second,
+            third,
+            last,
+        )
         return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful

@@ -86,9 +86,17 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
             state = one_step(term, known, solver, saveat, state)
         else:
             state, *more = diffrax.ForwardMode().loop(
-                args=known, terms=term, solver=solver, stepsize_controller=controller,
-                event=event, saveat=saveat, t0=begin, t1=end, init_state=state, **rest,
-            )  # fmt: skip
+                args=known,
+                terms=term,
+                solver=solver,
+                stepsize_controller=controller,
+                event=event,
+                saveat=saveat,
+                t0=begin,
+                t1=end,
+                init_state=state,
+                **rest,
+            )
         if times is None:  # whatever steps the controller took
             times = _first(state.save_state).ts
         saved = jax.tree.leaves(_first(state.save_state).ys)

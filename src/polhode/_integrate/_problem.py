@@ -91,9 +91,15 @@ class Problem(NamedTuple):
         if not located:
             found = switched(closed, [False] * len(moving), dtype)
         return cls(
-            closed, [*consts, *once], (*[False] * len(consts), *flags), found, events,
-            len(components), dtype, passed,
-        )  # fmt: skip
+            closed,
+            [*consts, *once],
+            (*[False] * len(consts), *flags),
+            found,
+            events,
+            len(components),
+            dtype,
+            passed,
+        )
 
     def motion(
         self, arrays: Sequence[Any], units: Callable[..., Any], unit_data: Any, rule: Tableau

@@ -113,9 +113,13 @@ def _batch(arrays, dims, *, forward, backward, count, shapes):
         )(*given, *operands)
 
     out = _linear_p.bind(
-        *arrays[:count], *operands, forward=batched(forward), backward=batched(backward),
-        count=count, shapes=tuple(((size, *shape), dtype) for shape, dtype in shapes),
-    )  # fmt: skip
+        *arrays[:count],
+        *operands,
+        forward=batched(forward),
+        backward=batched(backward),
+        count=count,
+        shapes=tuple(((size, *shape), dtype) for shape, dtype in shapes),
+    )
     return out, [0] * len(out)
 
 

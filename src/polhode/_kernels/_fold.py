@@ -66,9 +66,13 @@ def computed_once(values: Any) -> Any:
 
 
 _FOLDS = {
-    "add": np.add, "add_any": np.add, "sub": np.subtract, "mul": np.multiply,
-    "div": np.divide, "neg": np.negative,
-}  # fmt: skip
+    "add": np.add,
+    "add_any": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "div": np.divide,
+    "neg": np.negative,
+}
 """Operations on numbers that are known while tracing."""
 
 _ELEMENTWISE = frozenset(

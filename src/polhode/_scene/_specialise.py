@@ -108,9 +108,14 @@ def _wheel(wheel: Rotor) -> Rotor:
     for axis in range(3):
         if np.all(np.delete(vector, axis, axis=-1) == 0) and np.all(vector[..., axis] > 0):
             return Rotor.axial(
-                wheel.inertia, wheel.momentum, wheel.speed, wheel.torque, wheel.impulse,
-                wheel.coupling, axis=axis,
-            )  # fmt: skip
+                wheel.inertia,
+                wheel.momentum,
+                wheel.speed,
+                wheel.torque,
+                wheel.impulse,
+                wheel.coupling,
+                axis=axis,
+            )
     return wheel
 
 

@@ -179,9 +179,15 @@ def shortly_after(trajectory: Trajectory, late: Array) -> Trajectory:
     found = _along(trajectory._scene, trajectory._samples, trajectory._t, late[..., None])
     wxyz, omega, *spins = found
     return Trajectory(
-        trajectory._t + late, wxyz, omega, trajectory.status, trajectory.steps, trajectory.scene,
-        spins=spins[0] if spins else None, propagator=trajectory.propagator,
-    )  # fmt: skip
+        trajectory._t + late,
+        wxyz,
+        omega,
+        trajectory.status,
+        trajectory.steps,
+        trajectory.scene,
+        spins=spins[0] if spins else None,
+        propagator=trajectory.propagator,
+    )
 
 
 def _along(scene: Scene, samples: list[Array], t: Array, step: Array) -> list[Array]:

@@ -284,8 +284,10 @@ class Trajectory(eqx.Module):
         def of_bodies(x, rank):
             if x is None or (lead := x.shape[: x.ndim - rank]) == ():
                 return x
-            full = jnp.broadcast_to(x.reshape((1,) * (len(shape) - len(lead)) + x.shape),
-                                    (*shape, *x.shape[x.ndim - rank :]))  # fmt: skip
+            full = jnp.broadcast_to(
+                x.reshape((1,) * (len(shape) - len(lead)) + x.shape),
+                (*shape, *x.shape[x.ndim - rank :]),
+            )
             return full[bodies] if bodies else full
 
         def of_both(x, rank):
@@ -296,15 +298,24 @@ class Trajectory(eqx.Module):
 
         parts = {name: map_arrays(getattr(self.scene, name), of_bodies) for name in PARTS}
         return Trajectory(
-            of_both(self.ts, 1), of_both(self._wxyz, 2), of_both(self._omega_body, 2),
-            of_bodies(self.status, 0), of_bodies(self.steps, 0), Scene(**parts),
-            of_both(self._work, 1), of_bodies(self._error, 0), of_both(self._motor_work, 2),
-            of_both(self._spins, 2), self.propagator,
+            of_both(self.ts, 1),
+            of_both(self._wxyz, 2),
+            of_both(self._omega_body, 2),
+            of_bodies(self.status, 0),
+            of_bodies(self.steps, 0),
+            Scene(**parts),
+            of_both(self._work, 1),
+            of_bodies(self._error, 0),
+            of_both(self._motor_work, 2),
+            of_both(self._spins, 2),
+            self.propagator,
             of_bodies(self._event_time, 0),
-            None if self._events is None else Events(
+            None
+            if self._events is None
+            else Events(
                 *(of_bodies(x, r) for x, r in zip(jax.tree.leaves(self._events), (1, 1, 2, 2, 0)))
             ),
-        )  # fmt: skip
+        )
 
     def between(self, start: float, end: float) -> "Trajectory":
         """The samples from ``start`` to ``end`` [s], both included; of one row of times.
@@ -344,9 +355,14 @@ class Trajectory(eqx.Module):
     def _bare(self) -> "Trajectory":
         """The samples and the scene, without other records."""
         return Trajectory(
-            self.ts, self._wxyz, self._omega_body, self.status, self.steps, self.scene,
+            self.ts,
+            self._wxyz,
+            self._omega_body,
+            self.status,
+            self.steps,
+            self.scene,
             spins=self._spins,
-        )  # fmt: skip
+        )
 
     @property
     def _samples(self) -> list[Array]:

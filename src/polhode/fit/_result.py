@@ -351,16 +351,19 @@ class Fit(eqx.Module):
         model = flags & {Finding.NOT_FINITE, Finding.STEP_LIMIT, Finding.AXES_DISAGREE}
         model |= flags & {Finding.POOR, Finding.OUTLIERS, Finding.NOT_WHITE, Finding.CALIBRATION}
         if model:
-            words = ", ".join(str(flag.name).lower().replace("_", " ") for flag in self._flags(body)
-                              if flag in model)  # fmt: skip
+            words = ", ".join(
+                str(flag.name).lower().replace("_", " ")
+                for flag in self._flags(body)
+                if flag in model
+            )
             return f"the model, which does not explain the readings ({words})"
         if self._inertia is not None:
             std = np.asarray(self.ratios_std).reshape(-1, 3)[body, :2]
         else:
             lead = np.ndim(self.diagnostics)
-            std = np.concatenate([
-                np.asarray(x).reshape(-1, *np.shape(x)[lead:])[body].reshape(-1) for x in self.std
-            ])  # fmt: skip
+            std = np.concatenate(
+                [np.asarray(x).reshape(-1, *np.shape(x)[lead:])[body].reshape(-1) for x in self.std]
+            )
         if not np.all(np.isfinite(std)):
             return "the motion, which does not show all unknowns: record another spin"
         part = self._calibration_part(body)

@@ -48,9 +48,9 @@ class Samples:
     def need(self, name: str, what: str) -> np.ndarray:
         value = getattr(self, name)
         if value is None:
-            mend = "inertia" if name in ("tensor", "energy") else name
+            remedy = "inertia" if name in ("tensor", "energy") else name
             raise ValueError(
-                f"plotting {what} needs {mend}, which was not given: pass it to plot.samples, or "
+                f"plotting {what} needs {remedy}, which was not given: pass it to plot.samples, or "
                 "plot a Trajectory that recorded attitude and rates."
             )
         return value
