@@ -31,8 +31,9 @@ def is_concrete(*values: Any) -> bool:
 
 
 def numbers(*arrays: Any) -> Any:
-    """NumPy where the arrays hold numbers now, else ``jax.numpy``: a look at a few numbers then
-    costs no dispatch, and they stay known while something else is traced."""
+    """NumPy for arrays with known values on the host, ``jax.numpy`` for others.
+
+    NumPy checks a few values without the dispatch of JAX, also while something else is traced."""
     return np if is_concrete(arrays) and all(_is_here(x) for x in arrays) else jnp
 
 

@@ -113,8 +113,10 @@ class Event(eqx.Module):
         return delay, there
 
     def refined(self, approximate: Trajectory, limit: Array) -> tuple[Array, Trajectory]:
-        """Time (..., T) [s] from the samples ``approximate`` to the events near them, at most
-        ``limit``, and the samples at the events.
+        """Samples moved to the events next to them.
+
+        ``approximate``: samples (..., T) near events; ``limit`` [s]: the longest move. Returns the
+        moves (..., T) [s], and the samples at the events.
 
         Steps t - g(t)/s with one constant s, the rate of change of g: where g(t) is zero they
         change nothing, and after two of them t has the first and second derivatives of the root.

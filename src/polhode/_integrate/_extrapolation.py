@@ -321,7 +321,7 @@ def _as_told(units, y, rates):
 
 
 def order_for(rtol: Array, angle: Array | float = jnp.inf) -> Array:
-    """The order of least work for a tolerance, as a number of the program.
+    """The order of least work for a tolerance, as a traced number.
 
     Measured on 1,000 tops (order 14 takes least time, or within a tenth of it, down to 1e-9), but
     lower where long steps of a high order make its error estimate a loose one

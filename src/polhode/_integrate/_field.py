@@ -83,7 +83,7 @@ def weighted_length(weights: list[Array], error: list[Array]) -> Array:
 class GroupUnits(eqx.Module):
     """Natural units of any state: each subtree at its top is a vector, measured by its length.
 
-    What is zero is measured by what its rate makes of it in the time ``span`` [s].
+    The unit of a vector that is zero is its rate times ``span`` [s].
     """
 
     groups: tuple[int, ...] = eqx.field(static=True)

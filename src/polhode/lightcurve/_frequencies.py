@@ -375,11 +375,12 @@ class Hypotheses(NamedTuple):
 
 
 def hypotheses(pairs: Pairs, t, values, *, columns=None, max_count: int = 800) -> Hypotheses:
-    """Bodies' frequencies that explain pairs of lines (g, h), the ``most`` most likely first.
+    """Frequencies of bodies that explain pairs of lines (g, h), at most ``max_count``, the most
+    likely first.
 
-    Each of g and h may be any of the main sums of either mode; or g of the best pairs is one, and
-    the other frequency anything, where g is all that is seen. How likely a meaning is: by the
-    evidence of Gaussian waves of all sums of the mode, with their usual variances. SAM has
+    Each of g and h may be any of the main sums of either mode. For the best pairs g alone may be
+    one, with the other frequency free. A hypothesis is rated by the evidence of Gaussian waves at
+    all sums of its mode, with their usual variances. SAM has
     ``f_psi <= f_phi``, because no moment exceeds the sum of the other two.
     """
     lines = np.stack([pairs.f_phi, pairs.f_psi], -1)

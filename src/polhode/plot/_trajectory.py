@@ -303,7 +303,7 @@ def overview(
     axis_names: tuple[str, str, str] = ("x", "y", "z"),
     title: str = "",
 ) -> Any:
-    """Figure of the first body, with the spread of the others and observations; returns it.
+    """A figure of the first body, with the spread of the others, and observations.
 
     Left: the three body axes as directions in space (components along space x, y, z) and the body
     rates, lines for body 0 and bands from the 5th to the 95th percentile of the others; dots are
