@@ -91,8 +91,7 @@ def choose(scene: Scene, rtol: Array | float = 1e-9) -> tuple[AbstractMethod, st
         )
         compensated = _is_below(rtol, _policy.COMPENSATED_STEPS * eps, scene)
         also = ", its rounding carried along: it would miss rtol" if compensated else ""
-        low_order = not _is_below(rtol, _policy.LOW_ORDER_RTOL, scene)
-        return _stepped(_has_axis(scene), compensated, low_order), reason + also
+        return _stepped(_has_axis(scene), compensated, _low_order(scene, rtol)), reason + also
     general = scene.is_free and scene.inertia.symmetry is Symmetry.NONE
     if general and _is_below(rtol, _policy.COMPENSATED_PHASES * eps, scene):
         also = ", its frequencies in sums of two floats: a rounded phase would miss rtol"
@@ -117,6 +116,14 @@ def _stepped(upright: bool, compensated: bool, low_order: bool) -> AbstractMetho
     return LiePoisson(
         Automatic(None, compensated, low_order=low_order), chart=LiePoissonChart(upright)
     )
+
+
+def _low_order(scene: Scene, rtol: Array | float) -> bool:
+    """Whether the tolerance allows steps of lower order; False for scenes that cannot have many
+    switches, so that their programs serve all tolerances."""
+    from polhode._integrate import may_jump
+
+    return may_jump(scene) and not _is_below(rtol, _policy.LOW_ORDER_RTOL, scene)
 
 
 def _is_below(rtol: Array | float, limit: float, scene: Scene) -> bool:

@@ -52,6 +52,7 @@ METHODS = {
     "Dopri8": Way(ph.LiePoisson(Dopri8()), ALL),
     "Extrapolation": Way(ph.LiePoisson(Extrapolation(8)), ALL),
     "Extrapolation compensated": Way(ph.LiePoisson(Extrapolation(8, compensated=True)), ALL),
+    "CoarseSteps": Way(ph.CoarseSteps(), FEW),
     "EulerAngles": Way(ph.EulerAngles(Dopri8()), ALL),
     "EulerAngles of few": Way(ph.EulerAngles(Dopri8()), FEW),
 }  # fmt: skip

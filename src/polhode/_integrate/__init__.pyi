@@ -18,4 +18,5 @@ from ._stepped import (
     CoarseSteps as CoarseSteps,
     EulerAngles as EulerAngles,
     LiePoisson as LiePoisson,
+    may_jump as may_jump,
 )

@@ -85,7 +85,7 @@ class AbstractIntegration(AbstractMethod):
         if not self._is_automatic:
             return f"steps of {type(self.solver).__name__}"
         few, switches, hidden = self._are_few(scene, state), 0, ()
-        if few or _may_jump(scene):
+        if few or may_jump(scene):
             program: list[Problem] = []
 
             def trace(scene, state, ts):
@@ -135,7 +135,7 @@ class AbstractIntegration(AbstractMethod):
         return counts[0]
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
-        jumps = _may_jump(scene)
+        jumps = may_jump(scene)
         by_loop = False
         if self._is_automatic:
             by_loop, jumps = self._suits_loop(scene, state, ts, record, jumps)
@@ -546,7 +546,7 @@ _OF_LOOP = (
 _OF_MIDPOINT = (Status.SUCCESSFUL, Status.MAX_STEPS, Status.STEP_FAILED, Status.NOT_FINITE)
 
 
-def _may_jump(scene: Scene) -> bool:
+def may_jump(scene: Scene) -> bool:
     """Whether a function of the user's or a part that is not smooth acts on the body."""
 
     def is_sharp(x) -> bool:
