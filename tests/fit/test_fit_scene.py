@@ -108,6 +108,7 @@ def test_whatever_a_scene_holds():
     assert "+-" in found.report()
 
 
+@pytest.mark.slow
 def test_what_the_data_cannot_show_is_said():
     """The drag about two axes that the body does not turn about."""
     found = drag_of(damped([0.0, 0.0, 1.0]), throw=False)

@@ -156,6 +156,7 @@ def test_errors_of_scale_and_misalignment_do_not_leave_residuals():
     assert np.any(np.asarray(far.diagnostics) & int(Finding.CALIBRATION))
 
 
+@pytest.mark.slow
 def test_two_of_three_scale_factors_of_a_free_body_leave_no_residuals():
     """Stretched along principal axes, free rates are those of another free body, to rounding."""
     moments = np.array([1.0, 1.6, 2.2])
@@ -208,6 +209,7 @@ def test_readings_at_a_limit_count_as_bounds():
     assert np.all(np.asarray(fit.ratios_std)[sound] < 0.01)
 
 
+@pytest.mark.slow
 def test_a_saturated_reading_is_a_bound_beside_errors_of_scale():
     """The limit is found by itself; a residual at it is zero while the model is beyond it."""
     ratios, omega, _ = bodies(1)

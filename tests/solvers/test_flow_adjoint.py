@@ -133,6 +133,7 @@ def value(inverse):
     return sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(end.ys))
 
 
+@pytest.mark.slow
 def test_batches_of_slopes():
     """vmap over gradients, Jacobians both ways."""
     point = 1 / MOMENTS.T
@@ -222,6 +223,7 @@ SLOW = pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [n if n == "implicit" else pytest.param(n, marks=SLOW) for n in SOLVES]
 )
+@pytest.mark.slow
 def test_outside_of_simulate_any_solver_has_the_slopes_of_the_flow(name):
     """Of the last state by a moment and the strength of the field, 40 digits; the steps of the
     implicit one are coarse, its derivatives are not."""

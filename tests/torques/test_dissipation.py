@@ -38,6 +38,7 @@ def test_the_flip_to_a_spin_about_the_largest_moment(name):
     assert np.abs(spin[:, :2]).max() < 1e-3
 
 
+@pytest.mark.slow
 def test_the_time_of_an_energy_sink():
     """tan theta = tan theta_0 exp(k L^2 (1/C - 1/A) t) about the axis of a symmetric body.
 

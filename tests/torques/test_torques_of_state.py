@@ -8,6 +8,7 @@ import polhode as ph
 from polhode import FeedbackTorque, QuadraticDamping
 
 
+@pytest.mark.slow
 def test_quadratic_damping_about_one_axis():
     """I domega/dt = -c omega^2: omega = w/(1 + c w t/I), with its derivative; at rest nothing."""
     state = ph.State([1.0, 0, 0, 0], [[0.0, 2.0, 0.0], [0.0, 0.0, 0.0]])
