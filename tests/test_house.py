@@ -138,3 +138,39 @@ def test_the_formatter_sees_all_code():
     files = list(SOURCE.rglob("*.py"))
     assert len(files) > 100
     assert not [path.name for path in files if re.search(r"# fmt: (skip|off)", path.read_text())]
+
+
+# fmt: off
+FOREIGN = {
+    "jaxpr", "eqns", "dtype", "shape", "sharding", "is_fully_addressable", "term_structure",
+    "faces", "as_quat", "_fields", "energy", "__module__",
+}
+# fmt: on
+"""Attributes of objects of JAX, NumPy, SciPy, diffrax, trimesh and of the user."""
+
+APPLICATIONS = ("cli", "ensemble", "files", "fit", "frames", "lightcurve", "plot")
+
+
+def absences(text: str) -> list[str]:
+    """Attributes of the package's own objects whose absence has a meaning."""
+    calls = [node for node in ast.walk(ast.parse(text)) if isinstance(node, ast.Call)]
+    calls = [call for call in calls if isinstance(call.func, ast.Name)]
+    names = [
+        call.args[1].value
+        for call in calls
+        if (call.func.id == "getattr" and len(call.args) == 3) or call.func.id == "hasattr"
+        if isinstance(call.args[1], ast.Constant)
+    ]
+    return [name for name in names if name not in FOREIGN]
+
+
+def test_protocols_are_classes():
+    """What an object can do is said by its class, not by attributes that others lack."""
+    assert absences("getattr(solver, 'spanning', None)") == ["spanning"]
+    found = {
+        str(path.relative_to(SOURCE)): names
+        for path in SOURCE.rglob("*.py")
+        if room_of(path) not in APPLICATIONS
+        and (names := absences(path.read_text(encoding="utf-8")))
+    }
+    assert not found

@@ -16,6 +16,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array
 
 from polhode._checks import is_concrete
+from polhode._parts import AbstractPart, AbstractSum
 
 PARTS = ("inertia", "potential", "torque", "rotors")
 """The parts of a scene that may carry batch axes."""
@@ -31,7 +32,7 @@ def _fields(part: Any) -> list[tuple[str, int]]:
 
 def _inner(part: Any) -> list[str]:
     """Fields that are parts themselves, such as an orbit."""
-    return [name for name in part.core_ranks if hasattr(getattr(part, name), "core_ranks")]
+    return [name for name in part.core_ranks if isinstance(getattr(part, name), AbstractPart)]
 
 
 def _lead(array, rank: int) -> tuple[int, ...]:
@@ -42,9 +43,8 @@ def map_arrays(part: Any, fn: Callable[[Any, int], Any]) -> Any:
     """The part with ``fn(array, core_rank)`` in place of each of its batched array fields."""
     if part is None:
         return None
-    terms = getattr(part, "terms", None)
-    if terms is not None:
-        return eqx.tree_at(lambda p: p.terms, part, tuple(map_arrays(t, fn) for t in terms))
+    if isinstance(part, AbstractSum):
+        return eqx.tree_at(lambda p: p.terms, part, tuple(map_arrays(t, fn) for t in part.terms))
     for name in _inner(part):
         inner = map_arrays(getattr(part, name), fn)
         part = eqx.tree_at(lambda p, name=name: getattr(p, name), part, inner)
@@ -107,7 +107,7 @@ def is_lane_tree(parts: Any) -> Any:
 
     scene, state = parts
     for name in PARTS:
-        if (part := getattr(scene, name, None)) is not None:
+        if (part := getattr(scene, name)) is not None:
             scene = eqx.tree_at(lambda s, name=name: getattr(s, name), scene, marked(part))
     return jax.tree.map(lambda x: x is lane, (scene, marked(state)))
 

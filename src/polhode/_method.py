@@ -139,6 +139,11 @@ class AbstractMethod(eqx.Module):
     exact: ClassVar[bool] = False
 
     @property
+    def is_compensated(self) -> bool:
+        """Whether rounding errors are carried along, so that they do not grow with the angle."""
+        return False
+
+    @property
     def keeps_rtol(self) -> bool:
         """Whether ``rtol`` decides how accurate the motion is."""
         return False

@@ -46,6 +46,12 @@ class AbstractPart(eqx.Module):
         return {name: len(core) for name, core in _cores(type(self)).items()}
 
 
+class AbstractSum(AbstractPart):
+    """Base of the sums of parts of one kind: ``terms`` carry the batch axes, each its own."""
+
+    terms: tuple[Any, ...]
+
+
 def check_fields(part: AbstractPart, name: str) -> None:
     """TypeError unless the array fields of a part, and of what it is made of, hold arrays.
 
@@ -56,7 +62,7 @@ def check_fields(part: AbstractPart, name: str) -> None:
     """
     # A function, and not a method: Equinox builds an object for every method that is looked up,
     # which takes longer than the check.
-    for i, term in enumerate(getattr(part, "terms", ())):
+    for i, term in enumerate(part.terms if isinstance(part, AbstractSum) else ()):
         check_fields(term, f"{name}.terms[{i}]")
     for field, core in _cores(type(part)).items():
         value = getattr(part, field)
@@ -80,7 +86,9 @@ def _refuse(value: Any, name: str, core: tuple[int | None, ...]) -> None:
     )
 
 
-def terms_of(name: str, kind: type, total: type, one: Any, other: Any) -> tuple[Any, ...]:
+def terms_of(
+    name: str, kind: type, total: type[AbstractSum], one: Any, other: Any
+) -> tuple[Any, ...]:
     """The terms of ``one + other``, either of which may be a ``total`` of several already.
 
     TypeError unless ``other`` is of the same ``kind``, called ``name``.

@@ -328,7 +328,7 @@ def _error(method: AbstractMethod, scene: Scene, state: State, ts: Array, rtol: 
                 f" turned takes more than the {rtol:.0e} asked for"
             )
         return f"about {rtol:.0e} rad at every saved time, {_MEANING}"
-    if getattr(method, "compensated", False) and scene.inertia.symmetry is Symmetry.NONE:
+    if method.is_compensated and scene.inertia.symmetry is Symmetry.NONE:
         return f"rounding only: about {4 * eps:.0e} rad at any time (compensated phases)"
     if not is_concrete(state.omega_body, ts):
         return f"rounding only: about {eps:.0e} per radian turned"

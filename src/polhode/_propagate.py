@@ -139,7 +139,7 @@ def _propagated(scene, state, dt, t, places, method, rtol):
     sizes = [leaves[k].size for k in places]
     settled = scene.settled(state, t)
     wheels: Any = settled.rotors
-    loose = getattr(wheels, "loose", ())
+    loose = wheels.loose if isinstance(settled.rotors, Wheels) else ()
     start_speeds: Any = _speeds(wheels, t, state.omega_body) if loose else None
     begin = 6 + len(loose)
     n = begin + sum(sizes)

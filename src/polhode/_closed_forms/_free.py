@@ -51,6 +51,10 @@ class ClosedForm(AbstractClosedForm):
     chunk: int | None = eqx.field(static=True, default=None)
     compensated: bool = eqx.field(static=True, default=False)
 
+    @property
+    def is_compensated(self) -> bool:
+        return self.compensated
+
     def objection(self, scene: Scene) -> str | None:
         if scene.is_free:
             return None

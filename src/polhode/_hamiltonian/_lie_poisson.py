@@ -84,13 +84,11 @@ def external_power(
 
 
 class Dynamics(eqx.Module):
-    """What moves a body: the Hamiltonian and the external torque (``AbstractTorque`` or None).
+    """The Hamiltonian of a body and the external torque on it (``AbstractTorque`` or None).
 
     ``wheels``: those that are not all held, or None; the momenta of the ``coupled`` ones are part
-    of the state.
-
-    For solvers that use them: ``units``, natural units of the states, and
-    ``costate(dynamics, y, t)`` (static), the adjoint equations; None: those of any field.
+    of the state. ``units(y, rates)``: natural units of the states; None: those of any state.
+    ``costate(dynamics, y, t)`` (static): the adjoint equations; None: those of any field.
     """
 
     hamiltonian: Hamiltonian

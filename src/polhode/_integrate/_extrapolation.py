@@ -13,6 +13,7 @@ from jaxtyping import Array, PyTree
 from numpy.polynomial import chebyshev
 
 from polhode import _policy
+from polhode._hamiltonian import Dynamics
 from polhode._integrate._columns import (
     CHOSEN,
     SEQUENCES,
@@ -21,7 +22,7 @@ from polhode._integrate._columns import (
     extrapolated,
     table,
 )
-from polhode._integrate._field import BoundTerm, GroupUnits
+from polhode._integrate._field import BoundTerm, FixedArguments, GroupUnits
 from polhode._integrate._midpoint import (
     Field,
     Limits,
@@ -151,8 +152,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
       overhead of diffrax is paid once for each saved time; use ``diffrax.StepTo(ts)`` with it. All
       arrays of the state then have one shape, and their entries are independent bodies.
       ``max_steps``: maximum number of steps of a body; one that needs more ends as NaN. ``jumps``:
-      search for jumps of the field near the ends of a step. ``args.units(y, rates)``, if present,
-      returns the natural units of the state.
+      search for jumps of the field near the ends of a step.
     - Reverse mode cannot pass through its steps, forward mode can: ``FlowAdjoint`` has both.
     - Dense output: without ``accuracy`` collocation polynomials as accurate as the step, which cost
       some times the step itself, and nothing unless interpolated. With it none (NaN).
@@ -257,14 +257,12 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         dense = collocate(terms, t0, t1, nodes, y1, args, self._fixed_order)
         return y1, error, dense, low, diffrax.RESULTS.successful
 
-    def spanning(self, controller: Any, state: Any) -> tuple["Extrapolation", Any, Any]:
+    def spanning(self, controller: diffrax.StepTo, state: Any) -> tuple["Extrapolation", Any, Any]:
         """Itself, the controller and the ``state`` of a solve by diffrax, with one step from the
         first of the controller's times to the last, that finds the states at all of them: the
         ``rows`` (n, T + 1, C) of its own state are C components of n bodies."""
-        leaves, times = jax.tree.leaves(state.y), getattr(controller, "ts", None)
-        if self.accuracy is None or times is None or jnp.ndim(leaves[0]) != 1:
-            return self, controller, state
-        if times.shape[0] == 2:
+        leaves, times = jax.tree.leaves(state.y), controller.ts
+        if self.accuracy is None or jnp.ndim(leaves[0]) != 1 or times.shape[0] == 2:
             return self, controller, state
         dtype = jnp.result_type(*leaves)
         rows = jnp.full((leaves[0].size, times.shape[0] + 1, len(leaves)), jnp.nan, dtype)
@@ -311,9 +309,10 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
 
 
 def units_of(args: Any, y0: PyTree, horizon: Array) -> Any:
-    """Natural units that the arguments of a field tell, or those of any state."""
-    told = getattr(args, "units", None)
-    return GroupUnits.of(y0, horizon) if told is None else jax.lax.stop_gradient(told)
+    """Natural units of the states: those that the arguments of the field state, or of any state."""
+    if not isinstance(args, Dynamics | FixedArguments) or args.units is None:
+        return GroupUnits.of(y0, horizon)
+    return jax.lax.stop_gradient(args.units)
 
 
 def _as_told(units, y, rates):

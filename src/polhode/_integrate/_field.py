@@ -53,6 +53,14 @@ class BoundTerm(eqx.Module):
         return Prepared(held, run, uses(closed.jaxpr, len(arrays)), by_entry)
 
 
+class FixedArguments(eqx.Module):
+    """All ``arrays`` that a field depends on, in place of its arguments; ``units``: the natural
+    units of its states, or None."""
+
+    arrays: tuple[Array, ...]
+    units: Any
+
+
 def uses(jaxpr, place: int) -> bool:
     """Whether the results of a program depend on its operand at ``place``."""
     _, used = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))

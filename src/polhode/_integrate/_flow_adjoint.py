@@ -13,7 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
+from polhode._hamiltonian import Dynamics
+from polhode._integrate._extrapolation import Extrapolation
+from polhode._integrate._field import FixedArguments
 from polhode._integrate._flow_derivative import Equations, equations_of
+from polhode._integrate._midpoint import Progress
 from polhode._integrate._one_step import is_one_step, one_step
 from polhode._kernels import attached, is_slope, kernel
 
@@ -32,8 +36,6 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
       by exp(rate of contraction * time). The backward integration restarts at every saved time, and
       at the beginnings of at least this many equal parts of the time span.
     - The state: arrays of one shape, whose entries are bodies that the field treats separately.
-      ``args.units`` and ``args.costate``, if present, give natural units and special adjoint
-      equations (see ``polhode._hamiltonian``).
     - Saved: the state itself, at the start, at given times, at the steps of ``diffrax.StepTo``, or
       at the end. Of several ``SubSaveAt`` the first is differentiated. Not for events.
 
@@ -63,8 +65,9 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
         times = _saved_times(saveat, stepsize_controller, event, t0, t1)
         leaves, tree = jax.tree.flatten(init_state.y)
         rtol = self._accuracy(solver, leaves[0].dtype)
-        compensated = getattr(solver, "compensated", False)
-        own = getattr(solver, "accuracy", None) is not None
+        midpoint = isinstance(solver, Extrapolation)
+        compensated = midpoint and solver.compensated
+        own = midpoint and solver.accuracy is not None
         equations, c = equations_of(terms, args, init_state.y, t0, rtol, compensated, own)
 
         held, rates, _ = equations.prepared(c, t0, leaves)
@@ -74,13 +77,12 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
             return jax.tree.unflatten(tree, rates(known.arrays, t, *jax.tree.leaves(y)))
 
         # The steps themselves are not differentiated, nor what the user's functions close over.
-        known = _Known(held, getattr(args, "units", None))
+        known = FixedArguments(held, args.units if isinstance(args, Dynamics) else None)
         given = (known, solver, stepsize_controller, saveat, t0, t1, init_state, rest)
         known, solver, controller, saveat, begin, end, state, rest = _stopped(given)
-        spanning = getattr(solver, "spanning", None)
         steps = isinstance(controller, diffrax.StepTo) and _first(saveat.subs).steps == 1
-        if spanning is not None and steps:
-            solver, controller, state = spanning(controller, state)
+        if midpoint and steps:
+            solver, controller, state = solver.spanning(controller, state)
         term, more = diffrax.ODETerm(field), [{}]
         if is_one_step(controller, saveat, event, rest["progress_meter"]):
             state = one_step(term, known, solver, saveat, state)
@@ -100,8 +102,9 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
         if times is None:  # whatever steps the controller took
             times = _first(state.save_state).ts
         saved = jax.tree.leaves(_first(state.save_state).ys)
-        rows = getattr(state.solver_state, "rows", None)
-        if rows is not None:  # found in one step
+        progress = state.solver_state
+        if isinstance(progress, Progress) and progress.rows is not None:  # found in one step
+            rows = progress.rows
             count, room = times.shape[0], _first(state.save_state).ts
             rows = jnp.transpose(rows[:, -1 - count : -1], (2, 1, 0))
             saved = [jnp.concatenate([x, y[count:]]) for x, y in zip(rows, saved)]
@@ -118,17 +121,9 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
     def _accuracy(self, solver, dtype) -> Array:
         if self.rtol is not None:
             return jax.lax.stop_gradient(jnp.asarray(self.rtol, dtype))
-        asked = getattr(solver, "accuracy", None)
-        if asked is not None:
-            return jax.lax.stop_gradient(jnp.asarray(asked.rtol, dtype))
+        if isinstance(solver, Extrapolation) and solver.accuracy is not None:
+            return jax.lax.stop_gradient(jnp.asarray(solver.accuracy.rtol, dtype))
         return jnp.asarray(1e-9 if jnp.finfo(dtype).eps < 1e-9 else 1e-5, dtype)
-
-
-class _Known(eqx.Module):
-    """All arrays that a field rests on, in place of its arguments; their natural units."""
-
-    arrays: tuple[Array, ...]
-    units: Any
 
 
 def _first(subs: Any) -> Any:

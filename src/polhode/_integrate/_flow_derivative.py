@@ -11,11 +11,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
 from polhode._checks import is_concrete
-from polhode._hamiltonian import LiePoissonUnits, relative
+from polhode._hamiltonian import Dynamics, LiePoissonUnits, relative
 from polhode._integrate._columns import table
 from polhode._integrate._extrapolation import order_for, units_of
 from polhode._integrate._field import BoundTerm, uses
@@ -165,7 +165,7 @@ def equations_of(
         return jax.tree.leaves(now.increment(t, y, now.forward(dtype)))
 
     closed = jax.make_jaxpr(plain)(t, *leaves, *arrays)
-    make = getattr(args, "costate", None)
+    make = args.costate if isinstance(args, Dynamics) else None
     special = None if make is None else make(args, y0, t)
     closes = not is_concrete(closed.consts, special)
     flat = None if special is None else FlatCostate(special, y0, t, arrays, directed, closes)
@@ -400,12 +400,12 @@ def _moving(fn: Callable[..., list[Any]], inputs: list[Any]) -> list[int]:
     jaxpr = jax.make_jaxpr(fn)(*inputs).jaxpr
     seen = set(jaxpr.invars)
     for eqn in jaxpr.eqns:
-        if any(not hasattr(v, "val") and v in seen for v in eqn.invars):
+        if any(not isinstance(v, Literal) and v in seen for v in eqn.invars):
             seen.update(eqn.outvars)
     return [
         i
         for i, v in enumerate(jaxpr.outvars)
-        if not hasattr(v, "val") and v in seen and jnp.issubdtype(v.aval.dtype, jnp.inexact)
+        if not isinstance(v, Literal) and v in seen and jnp.issubdtype(v.aval.dtype, jnp.inexact)
     ]
 
 

@@ -24,6 +24,7 @@ from polhode._integrate._extrapolation import Automatic, Extrapolation
 from polhode._integrate._flow_adjoint import FlowAdjoint, path_of
 from polhode._integrate._flow_derivative import equations_of
 from polhode._integrate._loop import Found, LoopOptions, Search, solve, with_events
+from polhode._integrate._midpoint import Progress
 from polhode._integrate._one_step import GivenTimes
 from polhode._integrate._problem import Problem
 from polhode._integrate._segments import Solution, in_segments
@@ -379,7 +380,8 @@ class AbstractIntegration(AbstractMethod):
             progress_meter=self.progress_meter,
             throw=False,
         )
-        error = getattr(solution.solver_state, "error", None)
+        progress = solution.solver_state
+        error = progress.error if isinstance(progress, Progress) else None
         ys: Any = solution.ys
         samples, last = ys
         steps, status = _outcome(solution, y0[0][0].shape)
@@ -519,9 +521,9 @@ def _lanes_first(y):
 
 def _outcome(solution, shape) -> tuple[Array, Array]:
     """Steps and status of every body."""
-    reason = getattr(solution.solver_state, "reason", None)
-    if reason is not None:  # each body has steps of its own
-        return solution.solver_state.steps.astype(jnp.int32), jnp.array(_OF_MIDPOINT)[reason]
+    progress = solution.solver_state
+    if isinstance(progress, Progress):  # each body has steps of its own
+        return progress.steps.astype(jnp.int32), jnp.array(_OF_MIDPOINT)[progress.reason]
     limit = solution.result == diffrax.RESULTS.max_steps_reached
     status = jnp.where(limit, Status.MAX_STEPS, Status.STEP_FAILED)
     good = solution.result == diffrax.RESULTS.successful

@@ -17,7 +17,7 @@ from polhode._checks import (
     require,
 )
 from polhode._hamiltonian import Attitude, components, dot
-from polhode._parts import AbstractPart, Signature, shaped, terms_of
+from polhode._parts import AbstractPart, AbstractSum, Signature, shaped, terms_of
 from polhode._scene._torques import value_at, vector_of_time
 from polhode.inertia import Inertia
 
@@ -38,7 +38,7 @@ class AbstractPotential(AbstractPart):
         return PotentialSum(terms_of("potential", AbstractPotential, PotentialSum, self, other))
 
 
-class PotentialSum(AbstractPotential):
+class PotentialSum(AbstractPotential, AbstractSum):
     """Sum of potentials."""
 
     terms: tuple[AbstractPotential, ...]

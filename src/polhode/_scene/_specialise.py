@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from polhode._checks import is_concrete
+from polhode._parts import AbstractSum
 from polhode._scene._orbits import KeplerOrbit
 from polhode._scene._potentials import GravityGradient, PotentialSum, UniformGravity
 from polhode._scene._scene import Scene
@@ -71,7 +72,7 @@ def _is_axial_wheel(part: Any) -> bool:
 
 
 def _count(part: Any, condition: Any) -> int:
-    return sum(map(condition, getattr(part, "terms", (part,))))
+    return sum(map(condition, part.terms if isinstance(part, AbstractSum) else (part,)))
 
 
 def _inertia(inertia: Inertia) -> Inertia:

@@ -18,7 +18,7 @@ from polhode._checks import (
     require_positive,
 )
 from polhode._hamiltonian import Attitude, Vector, components, cross, triple
-from polhode._parts import AbstractPart, Signature, shaped, terms_of
+from polhode._parts import AbstractPart, AbstractSum, Signature, shaped, terms_of
 
 
 class AbstractTorque(AbstractPart):
@@ -60,7 +60,7 @@ class AbstractTorque(AbstractPart):
         return TorqueSum(terms_of("torque", AbstractTorque, TorqueSum, self, other))
 
 
-class TorqueSum(AbstractTorque):
+class TorqueSum(AbstractTorque, AbstractSum):
     """Sum of torques."""
 
     terms: tuple[AbstractTorque, ...]

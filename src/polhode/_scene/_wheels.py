@@ -32,7 +32,7 @@ from polhode._checks import (
     require_positive,
 )
 from polhode._hamiltonian import Attitude, Vector, dot, triple
-from polhode._parts import AbstractPart, Signature, shaped, terms_of
+from polhode._parts import AbstractPart, AbstractSum, Signature, shaped, terms_of
 from polhode._scene._torques import stacked
 from polhode.inertia import Inertia, Symmetry
 
@@ -68,7 +68,7 @@ class AbstractCoupling(AbstractPart):
         return CouplingSum(terms_of("coupling", AbstractCoupling, CouplingSum, self, other))
 
 
-class CouplingSum(AbstractCoupling):
+class CouplingSum(AbstractCoupling, AbstractSum):
     """Sum of couplings of one wheel."""
 
     terms: tuple[AbstractCoupling, ...]
@@ -83,7 +83,7 @@ class CouplingSum(AbstractCoupling):
         return sum(rest, start=first)
 
 
-class Couplings(AbstractPart):
+class Couplings(AbstractSum):
     """Those of several wheels, one each."""
 
     terms: tuple[AbstractCoupling, ...]
@@ -266,7 +266,7 @@ class AbstractRotor(AbstractPart):
         )
 
 
-class RotorSum(AbstractRotor):
+class RotorSum(AbstractRotor, AbstractSum):
     """Several rotors."""
 
     terms: tuple[AbstractRotor, ...]
