@@ -17,7 +17,8 @@ from polhode._trajectory import Trajectory, begun
 from polhode._trajectory._trajectory import AbstractPropagator
 
 _COINCIDENT = 1e-9
-"""Part of a period below which a sample and the start of a period are one time."""
+"""Part of a period below which a sample and the start of a period are one time; in addition eight
+units in the last place of the times, which single precision rounds far more."""
 
 
 def is_sampled(scene: Scene) -> bool:
@@ -48,7 +49,7 @@ def held(
         )
     if method is None:
         method, _ = choose(_with_commands(scene, [jnp.zeros(3, scene.inertia.dtype)]), rtol)
-    return HeldCommands.of(method, np.asarray(ts, float), *periods)
+    return HeldCommands.of(method, np.asarray(ts), *periods)
 
 
 class HeldCommands(AbstractMethod):
@@ -67,9 +68,11 @@ class HeldCommands(AbstractMethod):
     @classmethod
     def of(cls, method: AbstractMethod, ts: np.ndarray, period: float) -> "HeldCommands":
         """For samples at ``ts`` (T,) and edges in every ``period`` from the first of them on."""
+        rounding = 8 * float(np.finfo(ts.dtype).eps) * float(np.max(np.abs(ts)))
+        ts = ts.astype(float)
         sign, start = np.sign(ts[-1] - ts[0]), ts[0]
         phase = sign * (ts - start) / period
-        near = np.abs(phase - np.round(phase)) < _COINCIDENT
+        near = np.abs(phase - np.round(phase)) < max(_COINCIDENT, rounding / period)
         phase = np.where(near, np.round(phase), phase)
         edges = np.arange(np.ceil(phase[-1]))
         every = np.union1d(edges, phase)

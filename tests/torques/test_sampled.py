@@ -103,3 +103,12 @@ def test_a_sampled_torque_says_what_it_cannot():
         found.at(0.05)
     with pytest.raises(ValueError, match="events between"):
         ph.crossings(found, event)
+
+
+def test_samples_at_the_ends_of_periods_are_edges_in_single_precision():
+    """There 100.1 is 1.5e-6 before it: no segment is shorter than the rounding of its ends."""
+    fn = ph.SampledTorque(law, 0.1)
+    body = ph.Inertia.from_moments(jnp.asarray(MOMENTS, jnp.float32))
+    state = ph.State(jnp.asarray(WXYZ, jnp.float32), jnp.asarray(OMEGA, jnp.float32))
+    plan = ph.explain(ph.Scene(body, torque=fn), state, [100.0, 100.1, 100.7, 101.0])
+    assert "; 10 segments" in plan.reason
