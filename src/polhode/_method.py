@@ -2,6 +2,7 @@
 
 import abc
 import enum
+from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
@@ -12,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from polhode._checks import as_float_array, describe, is_concrete, require
-from polhode._parts import check_fields
+from polhode._parts import check_fields, kept, takes
 from polhode._scene import Scene, State, check_scene
 
 # How the simulation of each body ended.
@@ -94,12 +95,29 @@ class SimulationError(RuntimeError):
 
 
 class Record(eqx.Module):
-    """What a simulation saves: attitude, rates, all times or the last one (all static).
+    """What a simulation saves: attitude, rates, all times or the last one, or a function of them.
+
+    ``attitude``, ``rates``, ``final_only`` (static): attitude (..., T, 4) and body rates
+    (..., T, 3) at all times, or at the last one.
 
     ``work``: also integrate the work [J] of the external torques. ``error``: also estimate the
     error of each body at the last time, by a second, coarser run of about the same cost, and mark
     bodies whose estimate is above ten times the tolerance by ``Status.INACCURATE``: chaotic
     bodies, and those whose rounding error exceeds the tolerance.
+
+    ``save``: a function of the motion that is stored in place of attitude and rates, as
+    ``Trajectory.saved``. It is called with the ``Trajectory`` of one body, without batch axes, and
+    returns an array (T, ...) or a pytree of such: one row for each sample. Batches are mapped over
+    it, a chunk of bodies at a time, so that the states of all bodies are never in memory together
+    (under ``vmap`` and in reverse mode they are). Rows are NaN from the failure of a body on. Of
+    the states themselves only the last is stored: see ``Trajectory.last``. An ``eqx.Module`` that
+    is called is differentiable in its arrays. Define the function once: another one is another
+    program to compile.
+
+    Raises ValueError if nothing is recorded, TypeError for a ``save`` that does not take one
+    argument; ``ph.simulate`` raises TypeError or ValueError for values that are not such arrays.
+
+        record = ph.Record(save=lambda trajectory: trajectory.momentum_space)
     """
 
     attitude: bool = eqx.field(static=True, default=True)
@@ -107,17 +125,39 @@ class Record(eqx.Module):
     final_only: bool = eqx.field(static=True, default=False)
     work: bool = eqx.field(static=True, default=False)
     error: bool = eqx.field(static=True, default=False)
+    save: Callable | None = None
 
-    def __check_init__(self):
+    def __init__(
+        self,
+        attitude: bool = True,
+        rates: bool = True,
+        final_only: bool = False,
+        work: bool = False,
+        error: bool = False,
+        save: Callable | None = None,
+    ):
+        self.attitude, self.rates, self.final_only = attitude, rates, final_only
+        self.work, self.error = work, error
+        if save is not None:
+            takes("Record(save=)", save, ("trajectory",))
+            save = kept(save)
+        self.save = save
         if not (self.attitude or self.rates):
             raise ValueError("Record keeps nothing: switch on attitude, rates or both.")
+
+    @property
+    def of_states(self) -> "Record":
+        """The same without ``save``."""
+        return Record(self.attitude, self.rates, self.final_only, self.work, self.error)
 
 
 class Samples(NamedTuple):
     """What a method returns for N lanes: (N, T, 4), (N, T, 3), (N,), (N,), (N, T), (N,).
 
     ``error``: sum of the estimated errors of the steps, if the method knows it. ``motor_work``,
-    ``spins`` (N, T, m): of every wheel, and momenta of the coupled ones, or None.
+    ``spins`` (N, T, m): of every wheel, and momenta of the coupled ones, or None. ``saved``,
+    ``final``: of ``Record(save=)``, its values and attitude, rates and momenta of coupled wheels
+    at the last time; methods leave them out.
     """
 
     wxyz: Array | None
@@ -128,6 +168,8 @@ class Samples(NamedTuple):
     error: Array | None = None
     motor_work: Array | None = None
     spins: Array | None = None
+    saved: Any = None
+    final: tuple[Array | None, Array | None, Array | None] | None = None
 
 
 class AbstractMethod(eqx.Module):

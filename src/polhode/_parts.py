@@ -210,6 +210,27 @@ def _place_of(error: Exception) -> str:
     return ""
 
 
+def call_traced(called: str, detail: str, fn: Callable, *args: Any) -> Any:
+    """What ``fn(*args)`` returns; ``called``, ``detail``: how messages describe the call.
+
+    TypeError for NumPy, ``if`` or ``float`` on a traced array, with the line and its jax.numpy
+    form; what the function raises otherwise passes, with a note on how it was called.
+    """
+    try:
+        return fn(*args)
+    except _TRACED as error:
+        raise TypeError(
+            f"the function given to {called}, needs the value of a traced array{_place_of(error)}:"
+            f" {_remedy_for(error)}."
+        ) from error
+    except Exception as error:
+        error.add_note(
+            f"This was raised in the function given to {called}{detail}. It is"
+            " traced by JAX: write it with jax.numpy, and choose by jnp.where."
+        )
+        raise
+
+
 def result_of(
     name: str, arguments: Sequence[str], fn: Callable, shape: tuple[int, ...], dtype: Any, *args
 ) -> Array:
@@ -220,20 +241,8 @@ def result_of(
     form; what the function raises otherwise passes, with a note on how it was called.
     """
     called = f"{name}, called as fn({', '.join(arguments)})"
-    try:
-        value = fn(*args)
-    except _TRACED as error:
-        raise TypeError(
-            f"the function given to {called}, needs the value of a traced array{_place_of(error)}:"
-            f" {_remedy_for(error)}."
-        ) from error
-    except Exception as error:
-        shapes = ", ".join(f"{k}: {jnp.shape(x)}" for k, x in zip(arguments, args))
-        error.add_note(
-            f"This was raised in the function given to {called} with the shapes {shapes}. It is"
-            " traced by JAX: write it with jax.numpy, and choose by jnp.where."
-        )
-        raise
+    shapes = ", ".join(f"{k}: {jnp.shape(x)}" for k, x in zip(arguments, args))
+    value = call_traced(called, f" with the shapes {shapes}", fn, *args)
     expected = f"an array of shape {shape}" if shape else "a single number"
     try:
         if value is None or any(

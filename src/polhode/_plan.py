@@ -303,6 +303,8 @@ def _skipped(scene: Scene, method: AbstractMethod, record: Record) -> tuple[str,
         reasons.append("attitude and the integral of the third kind: only rates are recorded")
     if not record.rates:
         reasons.append("rates at the samples: only the attitude is recorded")
+    if record.save is not None:
+        reasons.append("attitude and rates in memory: a function of the motion is saved instead")
     if record.final_only:
         reasons.append("the trajectory buffer: only the last time is recorded")
     if not method.exact:

@@ -100,6 +100,10 @@ SHARED_STEP_BODIES = 200
 ACCELERATOR_BODIES = 2**18
 """[bodies] Of one chunk on a GPU or TPU; bounds the memory."""
 
+SAVE_SAMPLES, ACCELERATOR_SAVE_SAMPLES = 2**18, 2**24
+"""[bodies times samples] Of one chunk where a function of the motion is saved in its place
+(``Record(save=)``), on a CPU and on an accelerator: 15 MB and 0.9 GB of states in float64."""
+
 STEP_OVERHEAD = 30
 """[evaluations of the field] That a step costs beside its own; decides the order of the midpoint
 rule."""
@@ -219,6 +223,13 @@ def is_time_loop(bodies: int, samples: int) -> bool:
     """Whether free bodies are moved to one time after the other."""
     usable = TIME_LOOP and is_cpu() and not is_plain()
     return usable and samples > 1 and bodies >= TIME_LOOP_BODIES
+
+
+def bodies_to_save(samples: int) -> int:
+    """Bodies in a chunk where a function of the motion is saved in its place; as many as there are
+    lanes at least."""
+    most = SAVE_SAMPLES if is_cpu() else ACCELERATOR_SAVE_SAMPLES
+    return max(LANES, most // samples)
 
 
 def is_chunked() -> bool:

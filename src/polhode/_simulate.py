@@ -15,7 +15,9 @@ from polhode._batch import (
     Split,
     common_batch,
     flatten,
+    is_lane_tree,
     lane_times,
+    map_chunks,
     on_devices,
     place,
     split_of,
@@ -29,7 +31,7 @@ from polhode._events import (
     found_by_steps,
     stopped,
 )
-from polhode._kernels import jit_distinct, kernel
+from polhode._kernels import Distinct, jit_distinct, kernel
 from polhode._method import (
     AbstractMethod,
     Record,
@@ -44,7 +46,7 @@ from polhode._method import (
 from polhode._plan import Plan, choose, plan
 from polhode._sampled import HeldPropagator, held, is_sampled
 from polhode._scene import Scene, State
-from polhode._trajectory import Propagator, Trajectory
+from polhode._trajectory import Propagator, Trajectory, final_of, values_of, with_saved
 
 
 def simulate(
@@ -73,7 +75,8 @@ def simulate(
     - ``rtol``: bound of the accumulated local error at the saved times, of the attitude in radians
       and of the momentum relative to its size; None: 1e-9 in float64, 1e-5 in float32. Closed
       forms ignore it. What it controls and what not: docs/methods.md, "What `rtol` means".
-    - ``record``: what is saved; None: attitude and rates at all times.
+    - ``record``: what is saved; None: attitude and rates at all times. A function of the motion
+      in their place: ``ph.Record(save=fn)``.
     - ``until``: a ``ph.Event`` at which each body stops. Its times and samples from there on are
       those of the event, so that ``Trajectory.last`` is the state from which to continue;
       ``Trajectory.event_time`` is inf for a body without an event. The cost depends on the time
@@ -110,7 +113,8 @@ def simulate(
     if split is not None and is_concrete(scene, state, ts):
         scene, state, ts = place(split, scene, state, ts)
     if until is not None:
-        return checked(stopped(_begin(method, scene, state, ts, checked_rtol), ts, until), throw)
+        found = stopped(_begin(method, scene, state, ts, checked_rtol), ts, until)
+        return checked(_reduced(found, record), throw)
     return checked(run(method, scene, state, ts, checked_rtol, record, split), throw)
 
 
@@ -133,9 +137,17 @@ def _with_events(scene, state, ts, method, rtol, record, until, events, throw) -
         method, _ = choose(scene, checked_rtol)
     found = found_by_steps(_begin(method, scene, state, ts, checked_rtol), ts, events)
     if found is None:
-        trajectory = run(method, scene, state, ts, checked_rtol, record, None)
+        trajectory = run(method, scene, state, ts, checked_rtol, record.of_states, None)
         found = found_by_search(checked(trajectory, throw), events)
-    return checked(found, throw)
+    return checked(_reduced(found, record), throw)
+
+
+def _reduced(trajectory: Trajectory, record: Record) -> Trajectory:
+    """The trajectory with the function that is saved in place of its states, if there is one."""
+    return trajectory if record.save is None else _with_saved(trajectory, record.save)
+
+
+_with_saved = jit_distinct(with_saved)
 
 
 def checked(trajectory: Trajectory, throw: bool | None) -> Trajectory:
@@ -156,11 +168,13 @@ def _checked_at_run_time(trajectory: Trajectory) -> Trajectory:
     messages = [f"a body did not finish: {status.explanation}" for status in Status]
 
     def samples(t):
-        return [x for x in (t.ts, *t._samples, t._work) if x is not None]
+        saved, final = jax.tree.leaves(t._saved), t._final or ()
+        return [x for x in (t.ts, *t._samples, t._work, *final, *saved) if x is not None]
 
     # a factor of one: derivatives too use it, of which a program may hold nothing else
     one = eqx.branched_error_if(jnp.ones((), trajectory.ts.dtype), failed, worst, messages)
-    trajectory = eqx.tree_at(samples, trajectory, [x * one for x in samples(trajectory)])
+    bound = [x * one.astype(x.dtype) for x in samples(trajectory)]
+    trajectory = eqx.tree_at(samples, trajectory, bound)
     status = trajectory.status * one.astype(trajectory.status.dtype)
     return eqx.tree_at(lambda t: t.status, trajectory, status)
 
@@ -226,16 +240,24 @@ def _trajectory(method, scene, state, ts, rtol, record, split) -> Trajectory:
         found = _moved(record, method, scene, state, ts, rtol)
     else:
         found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
-    wxyz, omega, status, steps, work, error, motors, spins = found
+    wxyz, omega, status, steps, work, error, motors, spins, saved, final = found
     kept = ts[..., -1:] if record.final_only else ts
     propagator = HeldPropagator() if is_sampled(scene) else Propagator.of(method, rtol)
-    trajectory = Trajectory(
-        kept, wxyz, omega, status, steps, scene, work, error, motors, spins, propagator
+    return Trajectory(
+        kept,
+        wxyz,
+        omega,
+        status,
+        steps,
+        scene,
+        work,
+        error,
+        motors,
+        spins,
+        propagator,
+        saved=saved,
+        final=final,
     )
-    if record.work and method.exact:
-        work = _work_of_exact(trajectory, state, ts[..., :1])
-        return eqx.tree_at(lambda t: t._work, trajectory, work, is_leaf=lambda x: x is None)
-    return trajectory
 
 
 def _moved(record, method, scene, state, ts, rtol) -> Samples:
@@ -248,26 +270,58 @@ def _moved(record, method, scene, state, ts, rtol) -> Samples:
     unit = (kernel(State.as_unit) if few else State.as_unit)(state)
     lanes = flatten(unit, batch, shared=False)
     times = lane_times(ts, batch)
-    if record.error:
-        samples = _with_error(method, Scene(**parts), lanes, times, rtol, record)
+    if record.save is None:
+        samples = _samples(record, method, Scene(**parts), lanes, times, rtol)
     else:
-        samples = method.run(Scene(**parts), lanes, times, rtol, record)._replace(error=None)
-    status = judged(samples.status, Scene(**parts), times, rtol)
-    samples = samples._replace(status=status)
+        samples = _saved(record, method, Scene(**parts), lanes, times, rtol)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), samples)
 
 
-def _work_of_exact(trajectory: Trajectory, state: State, start: Array) -> Array:
+def _samples(record: Record, method, scene: Scene, lanes: State, times, rtol) -> Samples:
+    """Samples of N lanes."""
+    if record.error:
+        samples = _with_error(method, scene, lanes, times, rtol, record)
+    else:
+        samples = method.run(scene, lanes, times, rtol, record)._replace(error=None)
+    samples = samples._replace(status=judged(samples.status, scene, times, rtol))
+    if record.work and method.exact:
+        samples = samples._replace(work=_work_of_exact(scene, lanes, times, samples, record))
+    return samples
+
+
+def _saved(record: Record, method, scene: Scene, lanes: State, times, rtol) -> Samples:
+    """Values of the function that is saved, of N lanes: a chunk of bodies at a time is integrated
+    and reduced, so that no more states than those of a chunk are in memory."""
+    each, shared = eqx.partition((scene, lanes), is_lane_tree((scene, lanes)))
+    n, own = lanes.wxyz.shape[0], times if times.ndim == 2 else None
+    assert record.save is not None
+    save = record.save
+
+    def reduced(chunk):
+        each, own = chunk.value()
+        scene, lanes = eqx.combine(each, shared)
+        rows = times if own is None else own
+        samples = _samples(record.of_states, method, scene, lanes, rows, rtol)
+        rows = rows[..., -1:] if record.final_only else rows
+        values = values_of(save, scene, rows, samples)
+        final = final_of(samples.wxyz, samples.omega_body, samples.spins)
+        return samples._replace(wxyz=None, omega_body=None, spins=None, saved=values, final=final)
+
+    size = _policy.bodies_to_save(1 if record.final_only else times.shape[-1])
+    return map_chunks(reduced, Distinct((each, own)), n, size)
+
+
+def _work_of_exact(scene: Scene, state: State, ts: Array, samples: Samples, record: Record):
     """Work of the torques in an exact motion: nothing, or what the rates gain (no potential)."""
-    if trajectory.scene.torque is None:
-        return jnp.zeros((*trajectory.batch_shape, trajectory.ts.shape[-1]), start.dtype)
-    batch = trajectory.batch_shape
-    wxyz, omega = (
-        jnp.broadcast_to(x[..., None, :], (*batch, 1, x.shape[-1]))
-        for x in (state.wxyz, state.omega_body)
-    )
-    first = Trajectory(start, wxyz, omega, trajectory.status, trajectory.steps, trajectory.scene)
-    return trajectory.energy - first.energy
+    rows = ts[..., -1:] if record.final_only else ts
+    if scene.torque is None:
+        return jnp.zeros((state.wxyz.shape[0], rows.shape[-1]), ts.dtype)
+
+    def energy(t, wxyz, omega):
+        return Trajectory(t, wxyz, omega, samples.status, samples.steps, scene).energy
+
+    first = energy(ts[..., :1], state.wxyz[:, None], state.omega_body[:, None])
+    return energy(rows, samples.wxyz, samples.omega_body) - first
 
 
 _COARSER = 30

@@ -32,7 +32,7 @@ def checked_events(events: Any, until: Any, record: Record | None) -> tuple[Even
             "until= is the short form of one terminal event: with events= give it as"
             " ph.Event(fn, direction, terminal=True)."
         )
-    if record is not None and record != Record():
+    if record is not None and record.of_states != Record():
         raise ValueError(
             "events= needs attitude and rates at all times and does not record work or error:"
             " leave record= out."

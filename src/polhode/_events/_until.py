@@ -47,7 +47,7 @@ def check_until(until: Any, record: Any) -> None:
         raise TypeError(
             f"until must be a ph.Event, got {type(until).__name__}: ph.Event(fn, direction)."
         )
-    if record is not None and record != Record():
+    if record is not None and record.of_states != Record():
         raise ValueError(
             "until= needs attitude and rates at all times and knows no work and error: leave"
             " record= out."

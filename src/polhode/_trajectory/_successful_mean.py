@@ -38,9 +38,12 @@ def successful_mean(trajectory: Trajectory, cost: Callable[[Trajectory], Array])
     batch, good = trajectory.batch_shape, trajectory.successful
 
     def samples(t):
-        return [x for x in (*t._samples, t._work) if x is not None]
+        saved, final = jax.tree.leaves(t._saved), t._final or ()
+        return [x for x in (*t._samples, t._work, *final, *saved) if x is not None]
 
     def finite(x):
+        if not jnp.issubdtype(x.dtype, jnp.inexact):  # a count that was saved
+            return x
         # components of 0.5 are a unit quaternion, and rates whose norm has a derivative
         mask = good.reshape(*batch, *(1,) * (x.ndim - len(batch)))
         return jnp.where(mask, x, jnp.asarray(0.5, x.dtype))

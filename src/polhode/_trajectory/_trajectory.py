@@ -10,7 +10,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 
 from polhode import rotation
 from polhode._batch import PARTS, along_time, map_arrays
@@ -73,7 +73,8 @@ class Trajectory(eqx.Module):
     (..., T, 3) [rad/s]; ``status`` (...): ``ph.Status`` of each body; ``steps`` (...): steps of the
     solver (0 for a closed form); ``scene``, with the motion of its wheels fixed by the initial
     state; ``propagator``: method and tolerance, for ``at``. On request: ``work``, ``motor_work``,
-    ``error`` (see ``ph.Record``) and ``event_time`` (``until=``). With coupled wheels: ``spins``.
+    ``error``, ``saved`` (see ``ph.Record``) and ``event_time`` (``until=``). With coupled wheels:
+    ``spins``.
     What was not recorded raises ValueError, which says how to record it.
 
     Between the samples: ``traj.at(t)``. Indexed, a trajectory is an array of shape (..., T) of
@@ -93,6 +94,8 @@ class Trajectory(eqx.Module):
     propagator: AbstractPropagator | None
     _event_time: Float[Array, "*b"] | None
     _events: Events | None
+    _saved: PyTree[Array]
+    _final: tuple[Array | None, ...] | None
 
     def __init__(
         self,
@@ -109,12 +112,15 @@ class Trajectory(eqx.Module):
         propagator: AbstractPropagator | None = None,
         event_time: Array | None = None,
         events: Events | None = None,
+        saved: PyTree[Array] = None,
+        final: tuple[Array | None, ...] | None = None,
     ):
         self.ts, self.status, self.steps, self.scene = ts, status, steps, scene
         self._wxyz, self._omega_body = wxyz, omega_body
         self._work, self._error, self._motor_work = work, error, motor_work
         self._spins, self.propagator, self._event_time = spins, propagator, event_time
         self._events = events
+        self._saved, self._final = saved, final
 
     def __str__(self) -> str:
         """Size, status and steps, for ``print``; under ``jit`` the shapes of all arrays."""
@@ -210,8 +216,19 @@ class Trajectory(eqx.Module):
         """The events of each body; see ``Events``."""
         return self._recorded("events", "events=[ph.Event(...)]")
 
+    @property
+    def saved(self) -> PyTree[Array]:
+        """The values of the function that was saved in place of the states; leaves (..., T, *k)."""
+        return self._recorded("saved", "record=ph.Record(save=fn)")
+
     def _recorded(self, name: str, request: str) -> Any:
         value = getattr(self, f"_{name}")
+        if value is None and self._saved is not None and name in ("wxyz", "omega_body", "spins"):
+            raise ValueError(
+                f"this trajectory has no {name}: it was not recorded, because"
+                " ph.Record(save=fn) stores the values of a function in its place, traj.saved."
+                f" Return trajectory.{name} from the function as well."
+            )
         if value is None:
             raise ValueError(
                 f"this trajectory has no {name}: ph.simulate records it with {request}."
@@ -262,11 +279,22 @@ class Trajectory(eqx.Module):
         return self._state(-1)
 
     def _state(self, place: int) -> State:
+        if self._final is not None and place == -1:
+            return self._last_sample._state(-1)
         wxyz, omega = _sample(self.wxyz, self.omega_body, place)
         wheels = self.scene.rotors
         if not isinstance(wheels, Wheels) or wheels.is_constant:
             return State(wxyz, omega)
         return State(wxyz, omega, _speeds(self._bare, place))
+
+    @property
+    def _last_sample(self) -> "Trajectory":
+        """The last sample of a trajectory that does not store states."""
+        assert self._final is not None
+        wxyz, omega, spins = (None if x is None else x[..., None, :] for x in self._final)
+        return Trajectory(
+            self.ts[..., -1:], wxyz, omega, self.status, self.steps, self.scene, spins=spins
+        )
 
     def __getitem__(self, key: Any) -> "Trajectory":
         """Bodies and samples chosen as from an array of shape (..., T), body axes first.
@@ -297,6 +325,9 @@ class Trajectory(eqx.Module):
             return kept[(..., *times, *(slice(None),) * (rank - 1))]
 
         parts = {name: map_arrays(getattr(self.scene, name), of_bodies) for name in PARTS}
+        final = None
+        if self._final is not None and ends_at_last(times):
+            final = tuple(of_bodies(x, 1) for x in self._final)
         return Trajectory(
             of_both(self.ts, 1),
             of_both(self._wxyz, 2),
@@ -315,6 +346,8 @@ class Trajectory(eqx.Module):
             else Events(
                 *(of_bodies(x, r) for x, r in zip(jax.tree.leaves(self._events), (1, 1, 2, 2, 0)))
             ),
+            jax.tree.map(lambda x: of_both(x, x.ndim - len(shape)), self._saved),
+            final,
         )
 
     def between(self, start: float, end: float) -> "Trajectory":
@@ -522,6 +555,12 @@ def split_key(key: Any, rank: int) -> tuple[tuple[Any, ...], Any]:
     if _taken(times) != 1:
         raise IndexError("truth values that choose samples must have one axis, that of the times.")
     return tuple(bodies), times
+
+
+def ends_at_last(times: tuple[Any, ...]) -> bool:
+    """Whether the entry of the times chooses the last sample as its last one, whatever T is."""
+    (key,) = times
+    return isinstance(key, slice) and key.stop is None and key.step in (None, 1)
 
 
 def check_key(key: Any, shape: tuple[int, ...], what: str) -> None:
