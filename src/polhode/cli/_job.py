@@ -21,6 +21,8 @@ from polhode.files import (
     draw_clones,
 )
 from polhode.files._error import escape, scene_errors
+from polhode.inertia import Inertia, VariableInertia
+from polhode.inertia._variable import inertia_at
 from polhode.plot._samples import Scale
 
 MEANINGS = {
@@ -53,7 +55,12 @@ class Job(NamedTuple):
     @property
     def batch_shape(self) -> tuple[int, ...]:
         lead = self.state.omega_body.shape[:-1]
-        return np.broadcast_shapes(lead, self.scene.constant_inertia.batch_shape)
+        return np.broadcast_shapes(lead, self.inertia.batch_shape)
+
+    @property
+    def inertia(self) -> Inertia:
+        """The inertia at the first time."""
+        return inertia_at(self.scene.inertia, self.ts[0])
 
 
 class Outcome(NamedTuple):
@@ -200,7 +207,7 @@ def _index(job: Job, ts: np.ndarray) -> np.ndarray:
 def _simulate(job: Job, part: slice | None) -> polhode.Trajectory:
     scene, state = job.scene, job.state
     if part is not None:
-        if scene.constant_inertia.batch_shape:
+        if job.inertia.batch_shape:
             inertia = jax.tree.map(lambda x: x[part], scene.inertia)
             scene = dataclasses.replace(scene, inertia=inertia)
         state = jax.tree.map(lambda x: x[part] if x.ndim > 1 else x, state)
@@ -260,7 +267,8 @@ def measure(job: Job, outcome: Outcome) -> Figures:
     scene, trajectory = job.scene, outcome.trajectory
     energy = momentum = None
     periods, modes = {}, []
-    if scene.torque is None and scene.rotors is None:
+    constant = not isinstance(scene.inertia, VariableInertia)
+    if scene.torque is None and scene.rotors is None and constant:
         energies = np.asarray(trajectory.energy, np.float64)
         rates, momenta = trajectory.omega_body, trajectory.momentum_body
         kinetic = np.sum(np.asarray(rates, float) * np.asarray(momenta, float), axis=-1) / 2

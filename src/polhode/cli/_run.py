@@ -193,11 +193,12 @@ def _dataset(job, outcome, figures, precision: str, figure: bool):
         values = times if lead else times[0]
         dataset[f"{name}_times"] = (dimensions, values, {"units": "s", "long_name": words})
     dataset["moments"] = (
-        (*(lead if job.scene.inertia.batch_shape else ()), "axis"),
-        job.scene.inertia.moments,
+        (*(lead if job.inertia.batch_shape else ()), "axis"),
+        job.inertia.moments,
         {
             "units": "1" if file.inertia.unit == "relative" else "kg m2",
-            "long_name": "principal moments of inertia",
+            "long_name": "principal moments of inertia"
+            + (" at the first time" if file.inertia.table is not None else ""),
         },
     )
     if file.inertia.unit == "relative":

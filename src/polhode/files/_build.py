@@ -15,13 +15,15 @@ from jaxtyping import Array, DTypeLike, Float
 
 import polhode
 from polhode import rotation
+from polhode._hamiltonian import from_quaternion
 from polhode._scene import narrower
 from polhode.files._error import SceneFileError, did_you_mean, scene_errors
 from polhode.files._models import SceneFile
 from polhode.files._read import possible_moments
-from polhode.files._tables import AnySolid, Attitudes
-from polhode.files._values import Table
-from polhode.inertia import Inertia, MassProperties, compose
+from polhode.files._tables import AnySolid, Attitudes, TimeTable
+from polhode.files._values import MOMENTS, Table
+from polhode.inertia import Inertia, MassProperties, VariableInertia, compose
+from polhode.inertia._variable import inertia_at
 
 if TYPE_CHECKING:
     import diffrax
@@ -46,17 +48,55 @@ def build_attitudes(attitudes: Attitudes, dtype: DTypeLike) -> Float[Array, "*b 
     return rotation.euler_to_wxyz(values[..., 0], values[..., 1], values[..., 2], sequence)
 
 
-def build_inertia(file: SceneFile, dtype: DTypeLike) -> Inertia:
+def build_table(file: SceneFile, table: TimeTable, dtype: DTypeLike) -> "polhode.Table":
+    """A table over time, from numbers in the scene or a CSV file beside it."""
+    times, values = (np.asarray(x, dtype) for x in file.columns(table))
+    return polhode.Table(
+        times, values, table.order, kind="number" if values.ndim == 1 else "vector"
+    )
+
+
+def _over_time(file: SceneFile, value: Any, dtype: DTypeLike) -> Any:
+    """A constant, or the table over time in its place."""
+    if isinstance(value, TimeTable):
+        return build_table(file, value, dtype)
+    return np.asarray(value, dtype)
+
+
+def build_inertia(file: SceneFile, dtype: DTypeLike) -> "Inertia | VariableInertia":
     """The nominal inertia. Raises SceneFileError for moments that no body has."""
     table = file.inertia
     kind, value = next((name, value) for name, value in table.entries() if name != "unit")
     with scene_errors(file, f"[inertia] {kind}"):
         if kind == "parts":
             return compose([_solid(solid, dtype) for solid in value]).inertia
+        if kind == "table":
+            found = build_table(file, value, dtype)
+            unit = np.asarray(MOMENTS[table.unit], dtype)
+            scaled = polhode.Table(found.times, unit * found.values, found.order, kind="vector")
+            _check_moments(file, np.asarray(scaled.values))
+            return VariableInertia(scaled)
         if kind == "axisymmetric":
             return Inertia.axisymmetric(**_numbers(value, dtype))
         make = {"moments": Inertia.from_moments, "tensor": Inertia.from_tensor}
         return make.get(kind, Inertia.spherical)(np.asarray(value, dtype))
+
+
+def _check_moments(file: SceneFile, rows: np.ndarray) -> None:
+    """SceneFileError for a row of moments (n, 3) or tensors (n, 9) that no body has."""
+    if rows.shape[-1] == 9:
+        tensors = rows.reshape(-1, 3, 3)
+        rows = np.linalg.eigvalsh((tensors + np.swapaxes(tensors, 1, 2)) / 2)
+    wrong = ~possible_moments(rows)
+    if wrong.any():
+        row = int(np.argmax(wrong))
+        raise SceneFileError(
+            file.path,
+            "[inertia.table]",
+            "impossible moments",
+            f"row {row + 1}: principal moments {rows[row].tolist()}",
+            "positive moments of which none exceeds the sum of the others",
+        )
 
 
 def _numbers(table: Table, dtype: DTypeLike, *others: str) -> dict[str, np.ndarray]:
@@ -96,8 +136,59 @@ def _potential(file: SceneFile, table: Any, orbit: Any, dtype: DTypeLike) -> Any
     return polhode.GravityGradient(**numbers)
 
 
+def _plates(table: Any, dtype: DTypeLike) -> "polhode.Plates":
+    def column(name):
+        return np.asarray([getattr(plate, name) for plate in table.plates], dtype)
+
+    return polhode.Plates(column("area"), column("normal"), column("centre"))
+
+
+class _Velocity(eqx.Module):
+    """Velocity on an orbit, in space axes, as a function of time."""
+
+    orbit: "polhode.AbstractOrbit"
+
+    def __call__(self, t: Array) -> Array:
+        return self.orbit.velocity_at(t)
+
+
+def _surface_torque(file: SceneFile, table: Any, orbit: Any, dtype: DTypeLike) -> Any:
+    """Drag and solar pressure."""
+    plates = _plates(table, dtype)
+    if table.kind == "drag":
+        density = _over_time(file, table.density, dtype)
+        along = table.velocity == "orbit"
+        velocity = _Velocity(orbit) if along else _over_time(file, table.velocity, dtype)
+        return polhode.Drag(plates, density, velocity, np.asarray(table.coefficient, dtype))
+    direction = _over_time(file, table.direction, dtype)
+    lit = _over_time(file, table.lit, dtype)
+    if table.eclipse is not None:
+        lit = polhode.Eclipse(orbit, direction, np.asarray(table.eclipse.radius, dtype))
+    others = _numbers(table, dtype, *_NO_NUMBERS)
+    return polhode.SolarPressure(plates, direction, lit, **others)
+
+
+_NO_NUMBERS = ("kind", "frame", "plates", "direction", "lit", "eclipse")
+
+
 def _torque(file: SceneFile, table: Any, orbit: Any, dtype: DTypeLike) -> Any:
-    if table.kind == "pointing":
+    if table.kind in ("drag", "solar-pressure"):
+        torque = _surface_torque(file, table, orbit, dtype)
+    elif table.kind in ("body", "space"):
+        torque = getattr(polhode, _TORQUES[table.kind])(_over_time(file, table.n, dtype))
+    elif table.kind == "momentum-dumping":
+        numbers = _numbers(table, dtype, "kind", "frame", "dipole_space", "field_space")
+        if table.dipole_space is None:
+            field = {"field": np.asarray(table.field_space, dtype)}
+        else:
+            dipole = polhode.DipoleField(np.asarray(table.dipole_space, dtype))
+            field = {"field": dipole, "position": orbit}
+        torque = polhode.MomentumDumping(**numbers, **field)
+    elif table.kind == "control-moment-gyro":
+        numbers = _numbers(table, dtype, "kind", "frame", "angle")
+        angle = build_table(file, table.angle, dtype)
+        torque = polhode.ControlMomentGyro(**numbers, angle=angle)
+    elif table.kind == "pointing":
         numbers = _numbers(table, dtype, "kind", "frame", "wxyz", "euler")
         torque = polhode.Pointing(**numbers, target=build_attitudes(table.attitude, dtype))
     elif table.kind == "magnetorquer":
@@ -137,6 +228,39 @@ def _rotor(file: SceneFile, table: Any, orbit: Any, dtype: DTypeLike) -> Any:
     return narrower(polhode.Rotor(**numbers))
 
 
+class _PointingLaw(eqx.Module):
+    """The torque that a cluster of wheels is to exert on the body."""
+
+    law: "polhode.Pointing"
+
+    def __call__(self, t: Array, wxyz: Array, omega_body: Array) -> Array:
+        attitude = from_quaternion(tuple(wxyz[i] for i in range(4)))
+        rates = tuple(omega_body[i] for i in range(3))
+        return jnp.stack(self.law.body_components(t, attitude, rates))
+
+
+def _cluster(file: SceneFile, table: Any, dtype: DTypeLike, first: int) -> Any:
+    kp, kd = np.asarray(table.kp, dtype), np.asarray(table.kd, dtype)
+    law = polhode.Pointing(kp, kd, build_attitudes(table.attitude, dtype))
+    numbers = _numbers(table, dtype, "wxyz", "euler", "kp", "kd", "viscous")
+    if table.viscous is not None:
+        numbers["friction"] = polhode.ViscousCoupling(np.asarray(table.viscous, dtype))
+    law = _float_parts(law, dtype)
+    return polhode.wheel_cluster(command=_PointingLaw(law), first=first, **numbers)
+
+
+def _wheels(file: SceneFile, dtype: DTypeLike) -> Any:
+    """Single wheels and clusters, in this order."""
+    wheels = _sum(file, "rotors", _rotor, None, dtype)
+    first = len(file.rotors)
+    for index, table in enumerate(file.clusters):
+        place = "[clusters]" if len(file.clusters) == 1 else f"[clusters {index + 1}]"
+        with scene_errors(file, place):
+            cluster = _float_parts(_cluster(file, table, dtype, first), dtype)
+        wheels, first = cluster if wheels is None else wheels + cluster, first + len(table.axes)
+    return wheels
+
+
 def _sum(file: SceneFile, key: str, build: Callable, orbit: Any, dtype: DTypeLike) -> Any:
     """The parts of a list of tables, added; None where there is none."""
     parts, tables = [], getattr(file, key)
@@ -147,7 +271,7 @@ def _sum(file: SceneFile, key: str, build: Callable, orbit: Any, dtype: DTypeLik
 
 
 def build_scene(
-    file: SceneFile, dtype: DTypeLike, inertia: Inertia | None = None
+    file: SceneFile, dtype: DTypeLike, inertia: "Inertia | VariableInertia | None" = None
 ) -> "polhode.Scene":
     """The scene with `inertia`, or with the nominal one of the file.
 
@@ -155,8 +279,9 @@ def build_scene(
     """
     inertia = build_inertia(file, dtype) if inertia is None else inertia
     orbit = build_orbit(file, dtype)
-    builders = {"potential": _potential, "torque": _torque, "rotors": _rotor}
+    builders = {"potential": _potential, "torque": _torque}
     parts = {key: _sum(file, key, build, orbit, dtype) for key, build in builders.items()}
+    parts["rotors"] = _wheels(file, dtype)
     with scene_errors(file, ""):
         return polhode.Scene(inertia, **parts)
 
@@ -201,15 +326,19 @@ class _Angle(eqx.Module):
         return jnp.sum(axis * self.direction_space) - jnp.cos(self.angle)
 
 
-def build_state(file: SceneFile, dtype: DTypeLike, inertia: Inertia) -> "polhode.State":
+def build_state(
+    file: SceneFile, dtype: DTypeLike, inertia: "Inertia | VariableInertia"
+) -> "polhode.State":
     """The nominal state at the first time."""
     with scene_errors(file, "[state]"):
         value = jnp.asarray(file.state.value, dtype)
-        omega = inertia.rates(value) if file.state.rate == "momentum_body" else value
+        first = jnp.asarray(file.times.seconds[0], dtype)
+        omega = (
+            inertia_at(inertia, first).rates(value) if file.state.rate == "momentum_body" else value
+        )
         wxyz = build_attitudes(file.state.attitude, dtype)
         if file.state.frame == "lvlh":
             frame = polhode.LVLH(build_orbit(file, dtype))
-            first = jnp.asarray(file.times.seconds[0], dtype)
             wxyz, omega = frame.from_frame(wxyz, omega, first)
         return polhode.State(wxyz=wxyz, omega_body=omega)
 
@@ -313,7 +442,10 @@ def draw_clones(file: SceneFile, dtype: DTypeLike) -> Clones:
     if file.state.rate in noise:
         rates = _around(rates, noise[file.state.rate], count)
     rates = jnp.broadcast_to(rates.astype(dtype), (count + 1, 3))
-    omega = inertia.rates(rates) if file.state.rate == "momentum_body" else rates
+    first = jnp.asarray(file.times.seconds[0], dtype)
+    omega = rates
+    if file.state.rate == "momentum_body":
+        omega = inertia_at(inertia, first).rates(rates)
     return Clones(inertia, polhode.State(wxyz=wxyz, omega_body=omega), redrawn)
 
 

@@ -5,7 +5,7 @@ file is reported at once; what gives arrays imports numpy when it is called.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -14,6 +14,7 @@ from pydantic import Field, PrivateAttr, model_validator
 from polhode.files import _values
 from polhode.files._tables import (
     Attitudes,
+    Clusters,
     ConstantTorque,
     Event,
     Inertia,
@@ -21,7 +22,9 @@ from polhode.files._tables import (
     Potentials,
     Rotors,
     State,
+    TimeTable,
     Torques,
+    check_columns,
 )
 from polhode.files._values import (
     MAX_SAMPLES,
@@ -222,6 +225,12 @@ class Output(Table):
     figure: bool = True
 
 
+def _tables_of(place: str, table: Table) -> Iterator[tuple[str, TimeTable]]:
+    for name, value in table.entries():
+        if isinstance(value, TimeTable):
+            yield f"[{place}.{name}]", value
+
+
 QUANTITIES = ("moments", "euler", "attitude", "omega_body", "momentum_body", "torque")
 
 
@@ -409,6 +418,7 @@ class SceneFile(Table):
     potential: Potentials = Field(default_factory=list)
     torque: Torques = Field(default_factory=list)
     rotors: Rotors = Field(default_factory=list)
+    clusters: Clusters = Field(default_factory=list)
     events: Annotated[list[Event], Field(max_length=20)] = Field(default_factory=list)
     method: Method = Method()
     monte_carlo: MonteCarlo | None = None
@@ -420,6 +430,7 @@ class SceneFile(Table):
     _path: Path = PrivateAttr(Path("<text>"))
     _text: str = PrivateAttr("")
     _rows: "Mapping[str, np.ndarray]" = PrivateAttr(default_factory=dict)
+    _columns: "Mapping[str, list[list[float]]]" = PrivateAttr(default_factory=dict)
 
     @property
     def path(self) -> Path:
@@ -434,6 +445,27 @@ class SceneFile(Table):
     def rows(self) -> "Mapping[str, np.ndarray]":
         """Of [ensemble.arrays], left on the disk."""
         return self._rows
+
+    @property
+    def tables(self) -> Iterator[tuple[str, TimeTable]]:
+        """The tables over time, each with its place in the file."""
+        yield from _tables_of("inertia", self.inertia)
+        for index, torque in enumerate(self.torque):
+            place = "torque" if len(self.torque) == 1 else f"torque {index + 1}"
+            yield from _tables_of(place, torque)
+
+    def columns(self, table: TimeTable) -> tuple[list[float], list[Any]]:
+        """Times [s] and values of a table; of a file those that were read with the scene."""
+        if table.file is None:
+            assert table.times is not None
+            assert table.values is not None
+            times, values = table.times, table.values
+        else:
+            rows = self._columns[table.file]
+            times = [row[0] for row in rows]
+            values = [row[1] if len(row) == 2 else row[1:] for row in rows]
+            check_columns(times, values, table.widths)
+        return [t * table.unit_seconds for t in times], values
 
     @model_validator(mode="after")
     def _spreads_fit(self) -> "SceneFile":
@@ -476,6 +508,10 @@ class SceneFile(Table):
                 raise ValueError(
                     '[state] frame = "lvlh" is that of one body: remove [monte_carlo] or [ensemble]'
                 )
+        if self.inertia.table is not None and self.ensemble is not None:
+            raise ValueError(
+                "[inertia] table is that of one body or of clones: remove the [ensemble]"
+            )
         if self.events and self.ensemble is not None:
             raise ValueError("[[events]] are not computed for an [ensemble]: remove one of them")
         names = [event.name for event in self.events]

@@ -4,6 +4,7 @@ Needs neither NumPy (but for [ensemble.arrays]) nor JAX: a mistake is reported i
 second.
 """
 
+import math
 import os
 import re
 import stat
@@ -57,7 +58,7 @@ def read_scene(path: str | os.PathLike) -> "SceneFile":
 
 def parse_scene(text: str, path: str | os.PathLike = "<text>") -> "SceneFile":
     """`read_scene` of a text; `path` is the name used in messages, and its folder that of the files
-    of [ensemble.arrays].
+    of [ensemble.arrays] and of tables over time.
     """
     path = Path(path)
     file = _validate(text, path)
@@ -66,6 +67,7 @@ def parse_scene(text: str, path: str | os.PathLike = "<text>") -> "SceneFile":
     plan = file.ensemble
     if plan is not None and plan.arrays is not None:
         file._rows = _read_arrays(dict(plan.arrays.entries()), plan.bodies, path)
+    file._columns = _read_tables(file, path)
     return file
 
 
@@ -214,6 +216,65 @@ def _read_array(name: str, text: str, bodies: int, scene: Path) -> "np.ndarray":
     if row is not None:
         values = f"row {row}: {rows[row].tolist()}"
         raise error_of("impossible numbers", values, _VALID_ROWS[name])
+    return rows
+
+
+_MAX_TABLE_BYTES = 2**28
+
+
+def _read_tables(file: "SceneFile", scene: Path) -> dict[str, list[list[float]]]:
+    """The rows of the CSV files of tables over time, by name. Raises SceneFileError."""
+    found: dict[str, list[list[float]]] = {}
+    for place, table in file.tables:
+        if table.file is None:
+            continue
+        if table.file not in found:
+            found[table.file] = _read_table(place, table.file, scene)
+        file._columns = found
+        try:
+            times, _ = file.columns(table)
+            if len(times) < 2:
+                raise ValueError("two or more rows are needed, got fewer")
+        except ValueError as error:
+            raise SceneFileError(scene, f"{place} file", str(error), table.file) from None
+    return found
+
+
+def _read_table(place: str, text: str, scene: Path) -> list[list[float]]:
+    """Rows of numbers separated by commas; a first row of names, empty lines and what follows a
+    ``#`` are skipped."""
+
+    def error_of(problem: str, value: str = text) -> SceneFileError:
+        expected = "a CSV file with the time and the values in its columns"
+        return SceneFileError(scene, f"{place} file", problem, value, expected)
+
+    folder = scene.parent.resolve()
+    path = (folder / text).resolve()
+    if not path.is_relative_to(folder):
+        raise error_of("a link that leaves the folder of the scene")
+    try:
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
+            raise error_of("cannot be read: not a regular file")
+        if status.st_size > _MAX_TABLE_BYTES:
+            raise error_of(f"too large: more than {_MAX_TABLE_BYTES:,} bytes")
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, ValueError) as error:
+        raise error_of(f"cannot be read: {reason(error)}") from None
+    rows: list[list[float]] = []
+    for number, line in enumerate(lines, 1):
+        cells = line.partition("#")[0].strip()
+        if not cells:
+            continue
+        try:
+            row = [float(cell) for cell in cells.split(",")]
+        except ValueError:
+            if not rows and number == next(i for i, x in enumerate(lines, 1) if x.strip()):
+                continue  # the names of the columns
+            raise error_of("not numbers separated by commas", f"line {number}: {line}") from None
+        if not all(map(math.isfinite, row)):
+            raise error_of("not finite", f"line {number}: {line}")
+        rows.append(row)
     return rows
 
 

@@ -1,13 +1,16 @@
 """Tables of a scene file that say what the body is, how it starts and what acts on it: SI units."""
 
+import itertools
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
 
 from polhode.files import _values
 from polhode.files._values import (
+    MAX_SAMPLES,
+    BelowFolder,
     Direction,
     Gains,
     Lengths,
@@ -46,6 +49,91 @@ class Euler(Measured):
     @property
     def attitude(self) -> Attitudes:
         return Attitudes(self.angles, self.sequence)
+
+
+class TimeTable(Table):
+    """Values over time: `times` and `values`, or the columns of a CSV `file` beside the scene.
+
+    The first column of the file is the time. In SI units but for the times.
+    """
+
+    widths: ClassVar[tuple[int, ...]]
+    one_of = (("values", "file"),)
+    times: list[Number] | None = Field(None, min_length=2, max_length=MAX_SAMPLES)
+    values: list[Any] | None = None
+    file: BelowFolder | None = Field(None, description="CSV: time and values in its columns")
+    order: Literal[1, 3] = Field(3, description="3: cubic interpolation, 1: linear")
+    unit: _values.Seconds = Field("s", description="of the times")
+
+    @model_validator(mode="after")
+    def _rows(self) -> Self:
+        if (self.times is None) != (self.values is None):
+            raise ValueError("times and values are given together, or the file in their place")
+        if self.times is None or self.values is None:
+            return self
+        if len(self.times) != len(self.values):
+            raise ValueError(f"{len(self.times)} times and {len(self.values)} values are no pairs")
+        check_columns(self.times, self.values, self.widths)
+        return self
+
+    @property
+    def unit_seconds(self) -> float:
+        """The unit of the times, s."""
+        return _values.SECONDS[self.unit]
+
+
+def check_columns(times: list[float], values: list[Any], widths: tuple[int, ...]) -> None:
+    """ValueError unless times ascend and all values have one and the same of these widths."""
+    for index, (a, b) in enumerate(itertools.pairwise(times)):
+        if not a < b:
+            raise ValueError(f"the times must ascend (entry {index + 2} is {b} after {a})")
+    found = {len(x) if isinstance(x, list) else 1 for x in values}
+    if len(found) != 1 or not found <= set(widths):
+        expected = " or ".join(map(str, widths))
+        raise ValueError(
+            f"each value must have {expected} number{'s' if expected != '1' else ''}, got"
+            f" {', '.join(map(str, sorted(found)))}"
+        )
+
+
+class NumberTable(TimeTable):
+    widths = (1,)
+    values: list[Number] | None = Field(None, max_length=MAX_SAMPLES)
+
+
+class VectorTable(TimeTable):
+    widths = (3,)
+    values: list[Vector] | None = Field(None, max_length=MAX_SAMPLES)
+
+
+class InertiaTable(TimeTable):
+    """Moments (3 numbers), or tensors (9 numbers, row by row), in the unit of the inertia."""
+
+    widths = (3, 9)
+    values: list[Annotated[list[Number], Field(min_length=3, max_length=9)]] | None = Field(
+        None, max_length=MAX_SAMPLES
+    )
+
+
+def _kind_of(value: Any) -> str:
+    """Whether a value is meant as a constant or as a table over time: errors are those of this."""
+    if isinstance(value, str):
+        return "word"
+    return "table" if isinstance(value, Mapping | TimeTable) else "constant"
+
+
+_Constant, _Series, _Word = Tag("constant"), Tag("table"), Tag("word")
+_BY_KIND = Discriminator(_kind_of)
+NumberOverTime = Annotated[
+    Annotated[NotNegative, _Constant] | Annotated[NumberTable, _Series], _BY_KIND
+]
+VectorOverTime = Annotated[Annotated[Vector, _Constant] | Annotated[VectorTable, _Series], _BY_KIND]
+Velocity = Annotated[
+    Annotated[Vector, _Constant]
+    | Annotated[VectorTable, _Series]
+    | Annotated[Literal["orbit"], _Word],
+    _BY_KIND,
+]
 
 
 class Axisymmetric(Table):
@@ -108,12 +196,13 @@ class Inertia(Measured):
     """Exactly one way to say it; about the centre of mass, or the fixed point under gravity."""
 
     measures = ("moments", "tensor", "axisymmetric", "spherical")
-    one_of = ((*measures, "parts"),)
+    one_of = ((*measures, "parts", "table"),)
     moments: Vector | None = Field(None, description="principal moments along body x, y, z")
     tensor: Matrix | None = Field(None, description="symmetric tensor in body axes")
     axisymmetric: Axisymmetric | None = None
     spherical: Number | None = Field(None, description="all moments equal")
     parts: list[AnySolid] | None = Field(None, min_length=1, max_length=1000)
+    table: InertiaTable | None = Field(None, description="inertia that changes with time")
     unit: _values.Moment = "kg m^2"
 
     @model_validator(mode="after")
@@ -267,7 +356,7 @@ class Torque(Action):
 
 class ConstantTorque(Torque):
     kind: Literal["body", "space"]
-    n: Vector
+    n: VectorOverTime
 
 
 class LinearDamping(Torque):
@@ -323,6 +412,104 @@ class Magnetorquer(Torque):
         return self.frame == "lvlh" or self.dipole_space is not None
 
 
+class MomentumDumping(Torque):
+    """Magnetorquers that unload the wheels: m = k h x B / |B|^2."""
+
+    kind: Literal["momentum-dumping"]
+    one_of = (("field_space", "dipole_space"),)
+    frame: Literal["inertial"] = "inertial"
+    k: NotNegative = Field(description="1/s")
+    field_space: Vector | None = Field(None, description="T")
+    dipole_space: Vector | None = Field(None, description="A m^2")
+    max_moment: Positive | None = Field(None, description="A m^2")
+
+    @property
+    def needs_orbit(self) -> bool:
+        return self.dipole_space is not None
+
+
+class Plate(Table):
+    """A flat plate, exposed on the side of its normal."""
+
+    area: NotNegative = Field(description="m^2")
+    normal: Direction
+    centre: Vector = Field(description="from the centre of mass, m")
+
+
+class Plated(Torque):
+    plates: Annotated[list[Plate], Field(min_length=1, max_length=1000)]
+
+    def coefficients_of_plates(self, *names: str) -> None:
+        """ValueError unless these are one number, or as many as there are plates."""
+        for name in names:
+            value = getattr(self, name)
+            if isinstance(value, list) and len(value) != len(self.plates):
+                raise ValueError(
+                    f"{name} has {len(value)} numbers for {len(self.plates)} plates: give one"
+                    " number, or one for each plate"
+                )
+
+
+class Drag(Plated):
+    """Air drag on plates: F = -rho Cd A max(n . v, 0) v / 2."""
+
+    kind: Literal["drag"]
+    density: NumberOverTime = Field(description="kg/m^3")
+    velocity: Velocity = Field(description="relative to the air, m/s; orbit: that of the [orbit]")
+    coefficient: NotNegative | list[NotNegative] = 2.2
+
+    @model_validator(mode="after")
+    def _one_for_each_plate(self) -> Self:
+        self.coefficients_of_plates("coefficient")
+        return self
+
+    @property
+    def needs_orbit(self) -> bool:
+        return self.frame == "lvlh" or self.velocity == "orbit"
+
+
+class Shadow(Table):
+    """The cylindrical shadow of the planet that the [orbit] is around."""
+
+    radius: Positive = Field(6.378137e6, description="m")
+
+
+class SolarPressure(Plated):
+    """Sunlight on plates that absorb, reflect and scatter."""
+
+    kind: Literal["solar-pressure"]
+    direction: VectorOverTime = Field(description="to the Sun")
+    lit: NumberOverTime = Field(1.0, description="visible part of the Sun")
+    eclipse: Shadow | None = None
+    specular: NotNegative | list[NotNegative] = 0.0
+    diffuse: NotNegative | list[NotNegative] = 0.0
+    pressure: NotNegative = Field(4.54e-6, description="N/m^2")
+
+    @model_validator(mode="after")
+    def _fractions(self) -> Self:
+        self.coefficients_of_plates("specular", "diffuse")
+        if self.eclipse is not None and "lit" in self.model_fields_set:
+            raise ValueError("at most one of lit, eclipse is possible: remove one of them")
+        if isinstance(self.direction, list) and not any(self.direction):
+            raise ValueError("direction must not be zero")
+        return self
+
+    @property
+    def needs_orbit(self) -> bool:
+        return self.frame == "lvlh" or self.eclipse is not None
+
+
+class ControlMomentGyro(Torque):
+    """A wheel of constant momentum on a gimbal that turns as `angle` says."""
+
+    kind: Literal["control-moment-gyro"]
+    frame: Literal["inertial"] = "inertial"
+    momentum: Number = Field(description="kg m^2/s")
+    gimbal: Direction
+    spin: Direction
+    angle: NumberTable = Field(description="of the gimbal over time, rad")
+
+
 class Pulses(Torque):
     """A constant torque that acts from each of `starts` to the one of `ends` in its place."""
 
@@ -369,6 +556,28 @@ class Rotor(Table):
     viscous: NotNegative | None = Field(None, description="friction of the bearing [N m s]")
     coulomb: Coulomb | None = None
     motor: Motor | None = None
+
+
+class Cluster(Oriented):
+    """Reaction wheels that together exert N = -2 kp e - kd omega towards an attitude."""
+
+    axes: Annotated[list[Direction], Field(min_length=3, max_length=100)]
+    inertia: Positive = Field(description="of each wheel about its axis, kg m^2")
+    kp: Gains
+    kd: Gains
+    speed: Number | list[Number] = Field(0.0, description="at the first time, rad/s")
+    max_torque: Positive | None = Field(None, description="of each motor, N m")
+    viscous: NotNegative | None = Field(None, description="friction of each bearing [N m s]")
+    null_gain: NotNegative = Field(0.0, description="1/s")
+    bias: Number | list[Number] = Field(0.0, description="speeds of null motion, rad/s")
+
+    @model_validator(mode="after")
+    def _one_for_each_wheel(self) -> Self:
+        for name in ("speed", "bias"):
+            value = getattr(self, name)
+            if isinstance(value, list) and len(value) != len(self.axes):
+                raise ValueError(f"{name} has {len(value)} numbers for {len(self.axes)} wheels")
+        return self
 
 
 class Event(Measured):
@@ -419,6 +628,10 @@ AnyTorque = Annotated[
     | RateDamping
     | Pointing
     | Magnetorquer
+    | MomentumDumping
+    | Drag
+    | SolarPressure
+    | ControlMomentGyro
     | Pulses,
     Field(discriminator="kind"),
 ]
@@ -432,3 +645,7 @@ Torques = Annotated[
     _Torques, BeforeValidator(_as_list, json_schema_input_type=AnyTorque | _Torques)
 ]
 Rotors = Annotated[_Rotors, BeforeValidator(_as_list, json_schema_input_type=Rotor | _Rotors)]
+_Clusters = Annotated[list[Cluster], Field(max_length=10)]
+Clusters = Annotated[
+    _Clusters, BeforeValidator(_as_list, json_schema_input_type=Cluster | _Clusters)
+]

@@ -126,7 +126,9 @@ def as_samples(what: Trajectory | Samples) -> Samples:
         raise TypeError(
             f"expected a ph.Trajectory or a plot.samples(...), got {type(what).__name__}."
         )
-    made = samples(what.ts, what.omega_body, what._wxyz, what.scene.inertia)
+    inertia = what.scene.inertia  # figures of one that changes with time have no ellipsoid
+    constant = inertia if isinstance(inertia, Inertia) else None
+    made = samples(what.ts, what.omega_body, what._wxyz, constant)
     has_energy = what.scene.potential is None or what._wxyz is not None
     energy = np.asarray(what.energy, np.float64).reshape(made.ts.shape) if has_energy else None
     return dataclasses.replace(made, energy=energy)

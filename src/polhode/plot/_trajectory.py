@@ -307,7 +307,8 @@ def overview(
 
     Left: the three body axes as directions in space (components along space x, y, z) and the body
     rates, lines for body 0 and bands from the 5th to the 95th percentile of the others; dots are
-    `observed` (`plot.samples` of one body; NaN where nothing was observed). Right: the polhode.
+    `observed` (`plot.samples` of one body; NaN where nothing was observed). Right: the polhode, or
+    the energy of a body whose inertia changes with time.
     """
     made = as_samples(what)
     names = tuple(plain(name, 30) for name in axis_names)
@@ -348,9 +349,15 @@ def overview(
             handlelength=1.4,
             columnspacing=1.2,
         )
-    ax = figure.add_subplot(grid[:3, 1], projection="3d")
-    polhode(made, ax=ax, axis_names=names)
-    ax.set_title("Polhode on the inertia ellipsoid", loc="center")
+    if made.tensor is None and made.energy is not None:
+        ax = figure.add_subplot(grid[:3, 1])
+        ax.plot(t, made.energy[0], color=INK, linewidth=1.3)
+        ax.set_title("Energy [J]")
+        ax.set_xlabel(f"time [{scale.time}]")
+    else:
+        ax = figure.add_subplot(grid[:3, 1], projection="3d")
+        polhode(made, ax=ax, axis_names=names)
+        ax.set_title("Polhode on the inertia ellipsoid", loc="center")
     _key(figure.add_subplot(grid[3, 1]), observed is not None, made.count - 1)
     if title:
         figure.suptitle(plain(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)

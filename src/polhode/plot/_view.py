@@ -19,6 +19,7 @@ from polhode._extras import imported
 from polhode._trajectory import Trajectory
 from polhode.files._write import atomic_write
 from polhode.inertia._mass import as_triangles, load_mesh
+from polhode.inertia._variable import inertia_at
 from polhode.plot._samples import Samples, Scale, as_samples, box_sides, matrices
 from polhode.rotation import matrix_to_wxyz
 
@@ -233,7 +234,8 @@ def read(path: str | os.PathLike) -> tuple[list[Body], str]:
         tensors = moments[:, :, None] * np.eye(3)  # clones differ in moments about the body axes
     else:
         inertia = build_inertia(parse_scene(text, path), jnp.result_type(float))
-        tensors = np.asarray(inertia.tensor, np.float64)
+        # one that changes with time is drawn as it is at the first time
+        tensors = np.asarray(inertia_at(inertia, ts.flat[0]).tensor, np.float64)
     count = wxyz.shape[0] if many else 1
     ts = np.broadcast_to(ts, (count, ts.shape[-1]))
     tensors = np.broadcast_to(tensors, (count, 3, 3))
