@@ -85,6 +85,42 @@ def test_dumping_is_normal_to_the_field_and_limited():
     np.testing.assert_allclose(found, np.cross(moment, FIELD), rtol=1e-12)
 
 
+# at t = 0 of this orbit x of the local frame is along space y, z along -x, hence y along -z
+FRAME = ph.LVLH(ph.KeplerOrbit(1.0, 1.0))
+IN_FRAME = np.array([[0, 0, -1.0], [1, 0, 0], [0, -1, 0]]) @ FIELD
+
+
+@pytest.mark.parametrize(
+    ("wrapped", "field"),
+    [
+        (lambda x: ph.Pulses(x, [-1.0], [1.0]), FIELD),
+        (lambda x: ph.RelativeTorque(x, FRAME), IN_FRAME),
+        (lambda x: ph.Pulses(ph.RelativeTorque(x, FRAME), [-1.0], [1.0]), IN_FRAME),
+        (lambda x: ph.RelativeTorque(ph.Pulses(x, [-1.0], [1.0]), FRAME), IN_FRAME),
+        (lambda x: ph.Pulses(x + ph.BodyTorque([0.0, 0, 0]), [-1.0], [1.0]), FIELD),
+    ],
+    ids=["pulses", "frame", "pulses in the frame", "frame of pulses", "sum in pulses"],
+)
+def test_dumping_within_another_torque_knows_the_wheels(wrapped, field):
+    h = np.array([0.3, -0.2, 0.1])
+    torque = wrapped(ph.MomentumDumping(K, FIELD)).with_wheels(components(jnp.asarray(h)))
+    found = np.stack(torque.body_components(jnp.array(0.0), STILL, components(jnp.zeros(3))))
+    expected = -K * (h - field * (field @ h) / (field @ field))
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.slow
+def test_dumping_in_pulses_is_that_between_two_parts_without_it():
+    body, wheel = ph.Inertia.from_moments(MOMENTS), ph.Rotor([0.0, 0, 1], momentum=0.3)
+    unload, state = ph.MomentumDumping(K, FIELD), ph.State([1.0, 0, 0, 0], [0.2, 0.1, -0.3])
+    scene = ph.Scene(body, torque=ph.Pulses(unload, [1.0], [2.5]), rotors=wheel)
+    found = ph.simulate(scene, state, [0.0, 4.0], rtol=1e-10).last
+    for torque, span in [(None, (0.0, 1.0)), (unload, (1.0, 2.5)), (None, (2.5, 4.0))]:
+        state = ph.simulate(ph.Scene(body, torque=torque, rotors=wheel), state, span, rtol=1e-10)
+        state = state.last
+    np.testing.assert_allclose(found.omega_body, state.omega_body, atol=1e-9)
+
+
 @pytest.mark.slow
 def test_a_controlled_satellite_is_that_of_scipy():
     """Cluster with null motion and limits, dumping and a gyroscope, integrated by hand."""

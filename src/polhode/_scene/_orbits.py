@@ -558,6 +558,9 @@ class RelativeTorque(AbstractTorque):
     def during(self, t: Array | float) -> AbstractTorque:
         return RelativeTorque(self.torque.during(t), self.frame)
 
+    def with_wheels(self, momentum: Sequence[Array]) -> AbstractTorque:
+        return RelativeTorque(self.torque.with_wheels(momentum), self.frame)
+
     def slip(
         self, t: Array | float, momentum: Sequence[Array], omega: Sequence[Array]
     ) -> Vector | None:

@@ -44,7 +44,10 @@ class AbstractTorque(AbstractPart):
         return None
 
     def with_wheels(self, momentum: Sequence[Array]) -> "AbstractTorque":
-        """The torque at a moment when the wheels of the scene carry this momentum [kg m^2/s]."""
+        """The torque at a moment when the wheels of the scene carry this momentum [kg m^2/s].
+
+        A torque that holds another one passes the momentum on to it.
+        """
         return self
 
     @property
@@ -387,6 +390,9 @@ class Pulses(AbstractTorque):
     def during(self, t: Array | float) -> AbstractTorque:
         inner = eqx.tree_at(lambda p: p.torque, self, self.torque.during(t))
         return eqx.tree_at(lambda p: p.on, inner, self._acts(t), is_leaf=lambda x: x is None)
+
+    def with_wheels(self, momentum: Sequence[Array]) -> AbstractTorque:
+        return eqx.tree_at(lambda p: p.torque, self, self.torque.with_wheels(momentum))
 
     def _acts(self, t: Array | float) -> Array:
         """Whether a pulse acts at the times ``t`` (...): 1 or 0."""
