@@ -1,6 +1,8 @@
 """Solutions of a light curve, their uncertainties, and their refinement with a convex shape."""
 
 from collections.abc import Sequence
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 import jax
@@ -84,6 +86,23 @@ class Solution(NamedTuple):
         everywhere else; P_psi is the same in both (Samarasinha & A'Hearn, Icarus 93 (1991) 194).
         """
         return 1 / (1 / self.P_phi + 1 / self.P_psi)
+
+    def to_damit(self, folder: str | PathLike[str], *, jd_of_zero: float = 0.0) -> Path:
+        """Write ``tumbler.csv`` and ``shape.txt`` into a folder, as DAMIT describes a tumbler.
+
+        The columns are those of the table of tumblers of DAMIT (astro.troja.mff.cuni.cz/projects/
+        damit): lambda, beta, P_psi, P_phi, I1, I2, phi0, psi0, JD0, in degrees, hours and days;
+        moments, angles and periods in the convention of Kaasalainen, Astron. Astrophys. 376 (2001)
+        302, which the file states. The times of the light curve are days from the Julian date
+        ``jd_of_zero`` on, its directions ecliptic (J2000). ``shape.txt``: vertices and triangles of
+        the ellipsoid. Returns the folder.
+
+        Raises ValueError for a solution with a convex shape, or one that does not tumble,
+        FileNotFoundError for a folder that is not there.
+        """
+        from polhode.lightcurve._damit import write_damit
+
+        return write_damit(self, folder, jd_of_zero=jd_of_zero)
 
     def lines(self, count: int = 3) -> tuple[tuple[str, float], ...]:
         """Main lines of the light of this mode, with their periods: ``("2 f_phi", period)``."""
