@@ -126,7 +126,7 @@ def _tangent(problem_of, at, given, moved):
 
 class _Note(NamedTuple):
     """Before a turn of the loop: state, levels, and the time since the start. What a turn leads to
-    stands in the note of the next one."""
+    stands in the note of the next one. Levels as ``_packed`` leaves them."""
 
     y: Array
     levels: Array
@@ -169,6 +169,21 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
     end = times[-1:]
     length = -(-control.ATTEMPTS * options.max_steps // _policy.RECORD_SEGMENTS)
 
+    def noted(progress):
+        return _Note(progress.y, _packed(motion, progress.levels), progress.elapsed)
+
+    def stored(progress):
+        """Checkpoint: rates and margins are evaluated again where a segment starts, on both
+        passes, so that both take the same steps."""
+        levels, turned = (_packed(motion, x) for x in (progress.levels, progress.just_turned))
+        return progress._replace(levels=levels, just_turned=turned, rate=None, margin=None)
+
+    def restored(progress):
+        levels, turned = (x.astype(y.dtype) for x in (progress.levels, progress.just_turned))
+        return progress._replace(
+            levels=levels, just_turned=turned, rate=jnp.zeros_like(y), margin=jnp.zeros_like(levels)
+        )
+
     def buffers(size, tree):
         return jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), tree)
 
@@ -184,11 +199,14 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
         progress, checkpoints, notes, count = carry
         number, place = count // length, count % length
         begins = place == 0
+        progress = progress._replace(needs_rates=progress.needs_rates | begins)
         old = entry(checkpoints, number)
         checkpoints = put_in(
-            checkpoints, number, jax.tree.map(lambda x, o: jnp.where(begins, x, o), progress, old)
+            checkpoints,
+            number,
+            jax.tree.map(lambda x, o: jnp.where(begins, x, o), stored(progress), old),
         )
-        notes = put_in(notes, place, _noted(progress))
+        notes = put_in(notes, place, noted(progress))
         progress, _ = advance(motion, options, start, end, progress, rows)
         return progress, checkpoints, notes, count + 1
 
@@ -197,8 +215,8 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
         turn,
         (
             first,
-            buffers(_policy.RECORD_SEGMENTS, first),
-            buffers(length, _noted(first)),
+            buffers(_policy.RECORD_SEGMENTS, stored(first)),
+            buffers(length, noted(first)),
             jnp.zeros((), jnp.int32),
         ),
     )
@@ -218,13 +236,14 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
 
         def note_one(i, carry):
             progress, notes = carry
-            notes = put_in(notes, i, _noted(progress))
+            notes = put_in(notes, i, noted(progress))
             progress, _ = advance(motion, options, start, end, progress, rows)
             return progress, notes
 
         # the final segment has just been recorded
         missing = jnp.where(number == final, 0, turns)
-        _, notes = jax.lax.fori_loop(0, missing, note_one, (entry(checkpoints, number), notes))
+        begin_at = restored(entry(checkpoints, number))
+        _, notes = jax.lax.fori_loop(0, missing, note_one, (begin_at, notes))
 
         def back(i, some):
             note = sound(entry(notes, turns - 1 - i))
@@ -233,14 +252,16 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
         return number - 1, notes, *jax.lax.fori_loop(0, turns, back, tuple(some))
 
     place = jnp.full(start.shape, times.shape[0] - 1, jnp.int32)
-    begun = final, notes, sound(_noted(last)), jnp.zeros_like(y), sums, place
+    begun = final, notes, sound(noted(last)), jnp.zeros_like(y), sums, place
     *_, cotangent, sums, _ = jax.lax.while_loop(lambda c: c[0] >= 0, segment, begun)
     some = any_of(jnp.where(finished, 1.0, 0.0))
     return jnp.where(finished[None], cotangent, 0), [jnp.where(some, x, 0) for x in sums]
 
 
-def _noted(progress: Progress) -> _Note:
-    return _Note(progress.y, progress.levels, progress.elapsed)
+def _packed(motion: Motion, levels: Array) -> Array:
+    """Levels (K, B) in an eighth of the memory: those of kinks are 0 or 1, those of jumps may be
+    any integer (``floor``). Records of a network of 64 relu would else be ten times the states."""
+    return levels if motion.jumps else levels.astype(jnp.int8)
 
 
 def _step_back(
@@ -258,6 +279,7 @@ def _step_back(
 ):
     """From cotangents after a turn of the loop to those before it. ``place`` (B,): index of the
     last sample that has not been passed yet."""
+    levels = note.levels.astype(cotangent.dtype)
     sign = jnp.where(times[-1] < start, -1, 1).astype(cotangent.dtype)
     t = start + sign * note.elapsed
     h = sign * (after.elapsed - note.elapsed)
@@ -286,7 +308,7 @@ def _step_back(
     def stage(i, found):
         rates, states = found
         y = note.y + h[None] * weighted(table[i], rates)
-        rate, *_ = of(values, note.levels, t + nodes[i] * h, y)
+        rate, *_ = of(values, levels, t + nodes[i] * h, y)
         put_in = jax.lax.dynamic_update_index_in_dim
         return put_in(rates, rate, i, 0), put_in(states, y, i, 0)
 
@@ -313,7 +335,7 @@ def _step_back(
         i = top - 1 - j
         y = jax.lax.dynamic_index_in_dim(states, i, 0, False)
         bar = jax.lax.dynamic_index_in_dim(bars, i, 0, False)
-        _, pull = jax.vjp(lambda some, y: of(some, note.levels, t + nodes[i] * h, y)[0], values, y)
+        _, pull = jax.vjp(lambda some, y: of(some, levels, t + nodes[i] * h, y)[0], values, y)
         more, change = pull(bar)
         bars = bars + (h[None] * change)[None] * table[i][:, None, None]
         return bars, cotangent + change, [a + b for a, b in zip(sums, more)]
