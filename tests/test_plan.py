@@ -351,3 +351,17 @@ def test_explain_names_what_decays_too_fast():
     drag = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), torque=ph.LinearDamping([1.0, 1, 80]))
     batch = ph.State([[1.0, 0, 0, 0]] * 2, [[0.0, 0.0, 0.1]] * 2)
     assert "4.0e+01/s" in ph.explain(drag, batch, [0.0, 1000.0]).stiff
+
+
+def test_explain_while_a_function_of_the_scene_closes_over_what_is_traced():
+    """How fast it decays is then unknown."""
+
+    def stiff(gain):
+        law = ph.FeedbackTorque(lambda t, wxyz, omega: -gain * omega)
+        scene = ph.Scene(TRIAXIAL, torque=law)
+        plan = ph.explain(scene, ph.State([1.0, 0, 0, 0], [0.1, 0.2, 0.3]), [0.0, 10.0])
+        assert (plan.stiff is None) == isinstance(gain, jax.core.Tracer)
+        return gain
+
+    stiff(1e5)
+    jax.eval_shape(stiff, 1e5)

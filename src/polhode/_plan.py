@@ -252,7 +252,10 @@ def _decay(scene: Scene, state: State, ts: Array) -> np.ndarray:
             jax.jvp(lambda y, s=spins: rates(y, s), (zero,), (zero.at[..., k].set(1),))[1]
             for k in range(size)
         ]
-        jacobian = np.asarray(jnp.stack(columns, axis=-1), float)
+        jacobian = jnp.stack(columns, axis=-1)
+        if isinstance(jacobian, jax.core.Tracer):  # a function of the scene closes over one
+            return np.zeros(batch)
+        jacobian = np.asarray(jacobian, float)
         sound = np.where(np.isfinite(jacobian), jacobian, 0)
         found.append(np.max(-np.linalg.eigvals(sound).real, axis=-1))
     return np.max(np.stack(found), axis=0)
