@@ -27,7 +27,6 @@ from polhode import _policy
 from polhode._integrate import _error_control as control
 from polhode._integrate._explicit_step import (
     Motion,
-    Progress,
     column,
     dense_of,
     dense_state,
