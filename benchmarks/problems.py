@@ -77,6 +77,11 @@ PROBLEMS = {
         Problem("long", "free body, to t = 1e5", (1.0, 2.0, 3.0), 11, horizon=1e5),
     )
 }  # fmt: skip
+SATELLITE = Problem(
+    "satellite", "satellite: gravity gradient, drag, thruster", (1.0, 1.5, 2.0), 25, horizon=50.0,
+    saves=10, gradient=0.75, damping=0.05, push=(0.02, -0.01, 0.03),
+)  # fmt: skip
+"""Of the benchmark on accelerators: torques in closed form there are none for."""
 
 
 def errors(

@@ -26,9 +26,10 @@ from benchmarks import (
     problems,
     truth,
 )
-from benchmarks.problems import PROBLEMS
+from benchmarks.problems import PROBLEMS, SATELLITE
 
 FREE = PROBLEMS["free"]
+KNOWN = PROBLEMS | {SATELLITE.name: SATELLITE}
 
 
 def test_only_a_benchmark_that_is_run_takes_one_core():
@@ -83,9 +84,9 @@ def test_long_motion_in_whole_periods_is_the_motion_step_by_step():
             assert max(abs(a - b) for a, b in zip(far, by_periods)) < mp.mpf(10) ** -28
 
 
-@pytest.mark.parametrize("name", PROBLEMS)
+@pytest.mark.parametrize("name", KNOWN)
 def test_saved_truth_is_scored_at_the_last_time_and_belongs_to_the_bodies(name):
-    problem, exact = PROBLEMS[name], truth.truth(PROBLEMS[name])
+    problem, exact = KNOWN[name], truth.truth(KNOWN[name])
     assert exact["index"][-1] == problem.saves - 1
     assert exact["wxyz"].shape == (truth.BODIES, len(exact["index"]), 4)
     np.testing.assert_allclose(np.linalg.norm(exact["wxyz"], axis=-1), 1, atol=1e-15)
@@ -117,13 +118,13 @@ def test_errors_are_angles_and_a_failure_counts_as_one():
 # Peers move the same bodies
 
 
-@pytest.mark.parametrize("name", [name for name in PROBLEMS if name != "long"])
+@pytest.mark.parametrize("name", [name for name in KNOWN if name != "long"])
 def test_peers_are_given_the_equations_of_the_truth(name):
     from mpmath import mp
 
     from benchmarks.peers import rigid_body
 
-    problem, short = PROBLEMS[name], 1e-12
+    problem, short = KNOWN[name], 1e-12
     wxyz, omega = (x[0] for x in problem.states(1))
     wxyz = wxyz / np.linalg.norm(wxyz)
     found = np.array(rigid_body(problem, wxyz, omega, 0.0))
@@ -216,6 +217,32 @@ def test_work_precision_times_and_scores_polhode():
         assert found["attitude_median"] < bound
         assert found["scored"] == (3 if n == 1 else n)
         assert program.compile_s > 0
+
+
+def test_without_an_accelerator_its_benchmark_says_so(monkeypatch, capsys):
+    from benchmarks import accelerator
+
+    monkeypatch.setattr("sys.argv", ["accelerator", "--quick"])
+    monkeypatch.setattr(
+        accelerator.jax, "devices", lambda: [accelerator.jax.local_devices(backend="cpu")[0]]
+    )
+    accelerator.main()
+    assert capsys.readouterr().out.startswith("not run")
+
+
+@pytest.mark.slow
+def test_satellites_of_the_accelerator_benchmark_beside_diffrax():
+    from benchmarks import accelerator
+
+    peak = {"bytes_per_s": 1e9, "flop_per_s": 1e9}
+    row = accelerator.measure("satellite", 20, "float64", peak)
+    assert row["attitude_worst"] < 1e-8
+    assert row["samples_per_s"] > 0
+    other = accelerator.measure_diffrax("satellite", 20, "float64", 1e-5)
+    assert other["equal_error"]
+    assert other["attitude_median"] < 1e-5
+    worse = accelerator.measure_diffrax("satellite", 20, "float32", 1e-12)
+    assert not worse["equal_error"]
 
 
 def test_tables_take_turns_and_keep_error_beside_time(monkeypatch):

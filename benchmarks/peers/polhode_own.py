@@ -24,14 +24,21 @@ def scene(problem: Problem, dtype) -> ph.Scene:
         inertia = ph.Inertia.axisymmetric(jnp.asarray(a, dtype), jnp.asarray(c, dtype))
     else:
         inertia = ph.Inertia.from_moments(jnp.asarray(problem.moments, dtype))
+    torque = None
+    if any(problem.push):
+        torque = ph.BodyTorque(jnp.asarray(problem.push, dtype))
+    if problem.damping:
+        drag = ph.LinearDamping(jnp.full(3, problem.damping, dtype))
+        torque = drag if torque is None else torque + drag
     if problem.weight:
         gravity = jnp.asarray([0.0, 0.0, -problem.weight], dtype)
         one = jnp.ones((), dtype)
-        return ph.Scene(inertia, ph.UniformGravity.axial(one, one, gravity))
+        return ph.Scene(inertia, ph.UniformGravity.axial(one, one, gravity), torque)
     if problem.gradient:
         mu = jnp.asarray(problem.gradient / 3, dtype)
-        return ph.Scene(inertia, ph.GravityGradient(mu, jnp.asarray(DIRECTION, dtype)))
-    return ph.Scene(inertia)
+        gradient = ph.GravityGradient(mu, jnp.asarray(DIRECTION, dtype))
+        return ph.Scene(inertia, gradient, torque)
+    return ph.Scene(inertia, torque=torque)
 
 
 def programs(problem: Problem, n, dtype, tolerances, quick) -> list[Program]:
