@@ -20,7 +20,7 @@ LOCATED_JUMP, LOCATED_KINK = 1e-4, 0.1
 """Width of the bracket of a switch of the field, relative to the step and to ``rtol``. A step
 beyond a jump adds an error of the change of the rates times this, far below the error of a step;
 one beyond a kink adds its square. The gradient of 32 bodies through a network of relu has the same
-error with 1 as with 1e-4, which takes a quarter more time."""
+error with 1 as with 1e-4, which takes a tenth more time."""
 
 _TRIES = 2
 """Evaluations below the root after which the upper end of the bracket is checked."""
