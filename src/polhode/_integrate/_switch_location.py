@@ -52,8 +52,8 @@ def first_switch(
     because a margin may dip below zero and return between two stages. Brackets are closed by the
     Illinois rule (secant, with the retained end halved), every switch with a secant of its own and
     the earliest root taken. The search aims half the tolerance beyond the root, and ends where the
-    secant says that the upper end is within the tolerance of it: 4 evaluations for a typical
-    switch (6 until both ends of the bracket are that near, 8 if its upper end is checked first)."""
+    secant says that the upper end is within the tolerance of it: 3 evaluations for a typical
+    switch; 5 if the upper end is checked first, and both ends must come that near."""
     nodes = motion.rule.margin_nodes
     sampled = margin_samples(attempt.margins, motion.rule)
     places = jnp.asarray(nodes, sampled.dtype)[:, None]
