@@ -1,8 +1,8 @@
-"""The planner: the cheapest way that is exact enough, from the types of the scene's parts alone."""
+"""The choice of a method: the first closed form that the types allow, otherwise integration."""
 
 import functools
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,17 +13,11 @@ from jaxtyping import Array
 from polhode import _policy
 from polhode._batch import PARTS, common_batch, flatten, lane_times
 from polhode._checks import is_concrete
-from polhode._closed_forms import ClosedForm, Solution, choose_closed_form
+from polhode._closed_forms import ClosedForm, FixedAxis, LagrangeTop, SymmetricTop
+from polhode._closed_forms._closed_form import VARIABLE, AbstractClosedForm
 from polhode._method import AbstractMethod, Record, default_rtol
-from polhode._scene import (
-    GravityGradient,
-    Scene,
-    State,
-    UniformGravity,
-    constructors,
-    specialise,
-)
-from polhode.inertia import Symmetry
+from polhode._scene import GravityGradient, Scene, State, UniformGravity, constructors, specialise
+from polhode.inertia import Symmetry, VariableInertia
 
 
 @dataclass(frozen=True)
@@ -76,15 +70,85 @@ def _listed(word: str, reasons: tuple[str, ...]) -> list[str]:
     return [f"{'' if i else word:8}{reason}" for i, reason in enumerate(reasons)]
 
 
+class Solution(NamedTuple):
+    """One row: name, what ``explain`` prints where it runs, and the method that evaluates it.
+
+    ``symmetry``: that of the type of the inertia; None: decided by the method.
+    """
+
+    name: str
+    explanation: str
+    method: AbstractClosedForm
+    symmetry: Symmetry | None = None
+
+    def why_not(self, scene: Scene) -> str | None:
+        """Why the types of the parts do not make it valid; None: they do."""
+        if isinstance(scene.inertia, VariableInertia):
+            return VARIABLE
+        reason = self.method.why_not(scene)
+        if reason is None and self.symmetry not in (None, scene.inertia.symmetry):
+            return f"the inertia is not one of ph.Inertia.{self.symmetry.name.lower()}"
+        return reason
+
+
+CLOSED_FORMS = (
+    Solution(
+        "free body",
+        "free and spherical: exact rotation about a fixed axis",
+        ClosedForm(),
+        Symmetry.SPHERICAL,
+    ),
+    Solution(
+        "free body",
+        "free and axisymmetric: exact regular precession",
+        ClosedForm(),
+        Symmetry.AXISYMMETRIC,
+    ),
+    Solution(
+        "free body",
+        "nothing acts on the body: exact motion in Jacobi elliptic functions",
+        ClosedForm(),
+    ),
+    Solution(
+        "Lagrange's top",
+        "symmetric body, centre of mass on its axis, uniform gravity (Lagrange's top): exact motion"
+        " in theta functions",
+        LagrangeTop(),
+    ),
+    Solution(
+        "symmetric top",
+        "symmetric body with torque, damping or wheels about its axis: exact motion in elementary"
+        " functions",
+        SymmetricTop(),
+    ),
+    Solution(
+        "fixed axis",
+        "spin about one fixed principal axis: exact motion in elementary functions",
+        FixedAxis(),
+    ),
+)
+
+
+def choose_closed_form(scene: Scene) -> tuple[Solution | None, tuple[str, ...]]:
+    """The first closed form that the types make valid, or None; and why those before it are not."""
+    refused = []
+    for solution in CLOSED_FORMS:
+        reason = solution.why_not(scene)
+        if reason is None:
+            return solution, tuple(refused)
+        refused.append(f"{solution.name}: {reason}")
+    return None, tuple(dict.fromkeys(refused))
+
+
 def choose(scene: Scene, rtol: Array | float = 1e-9) -> tuple[AbstractMethod, str]:
     """The method that ``simulate(..., method=None)`` uses, and why.
 
     The types of the parts decide, and ``rtol`` where it is a number; no number of the scene, of the
     state or of the times does. So plain calls, ``jit``, ``vmap`` and ``grad`` choose alike.
     """
-    law = _closed_form_of(jax.tree.structure(scene))
+    solution = _closed_form_of(jax.tree.structure(scene))
     eps = float(jnp.finfo(scene.inertia.dtype).eps)
-    if law is None:
+    if solution is None:
         reason = (
             "something acts on the body: integrated in steps with an error estimate, held to"
             " rtol at every saved time"
@@ -95,8 +159,8 @@ def choose(scene: Scene, rtol: Array | float = 1e-9) -> tuple[AbstractMethod, st
     general = scene.is_free and scene.inertia.symmetry is Symmetry.NONE
     if general and _is_below(rtol, _policy.COMPENSATED_PHASES * eps, scene):
         also = ", its frequencies in sums of two floats: a rounded phase would miss rtol"
-        return _COMPENSATED, law.explanation + also
-    return law.method, law.explanation
+        return _COMPENSATED, solution.explanation + also
+    return solution.method, solution.explanation
 
 
 @functools.lru_cache(maxsize=256)
@@ -266,11 +330,11 @@ def _narrower(scene: Scene) -> tuple[str, ...]:
     if not is_concrete(scene):
         return ()
     special = specialise(scene)
-    law, _ = choose_closed_form(special)
-    if law is None or law == choose_closed_form(scene)[0]:
+    solution, _ = choose_closed_form(special)
+    if solution is None or solution == choose_closed_form(scene)[0]:
         return ()
     names = ", ".join(constructors(scene, special))
-    return (f"{names} would say what these numbers are: {law.name} in closed form",)
+    return (f"{names} would say what these numbers are: {solution.name} in closed form",)
 
 
 def _steps(method, scene: Scene, state: State, ts: Array, record: Record) -> str:

@@ -21,6 +21,7 @@ from polhode._closed_forms._arithmetic import (
     cosine_sine,
     horner,
     multiply_pairs,
+    nome_per_parameter,
     product_of,
     scale_pair,
     sign_of_parity,
@@ -30,7 +31,6 @@ from polhode._closed_forms._arithmetic import (
     sum_of,
     whole_and_fraction,
 )
-from polhode._closed_forms._elliptic import nome_per_parameter
 from polhode._hamiltonian import triple
 from polhode._kernels import opaque_ones, staged
 

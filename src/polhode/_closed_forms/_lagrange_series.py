@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode._closed_forms._elliptic import nome_per_parameter, theta3_squared_less_one
+from polhode._closed_forms._arithmetic import nome_per_parameter, theta3_squared_less_one
 from polhode._kernels import staged
 
 
