@@ -42,7 +42,7 @@ def work_precision(report: dict, families: tuple[str, ...] = (), **shown):
     import matplotlib.pyplot as plt
 
     from polhode import plot
-    from polhode.plot._matplotlib import STYLE
+    from polhode.plot._samples import STYLE
 
     shown = SHOWN | shown
     tables = [
@@ -100,7 +100,7 @@ def scaling(report: dict):
     """Time and memory per body against the number of bodies, the horizon and saved times."""
     import matplotlib.pyplot as plt
 
-    from polhode.plot._matplotlib import STYLE
+    from polhode.plot._samples import STYLE
 
     sweeps = ("bodies", "horizon", "saves")
     labels = {"bodies": "bodies", "horizon": "horizon [s]", "saves": "saved times"}
@@ -128,7 +128,7 @@ def gradients(report: dict):
     """Cost of value and gradient over the forward run, and the error of the gradient."""
     import matplotlib.pyplot as plt
 
-    from polhode.plot._matplotlib import STYLE
+    from polhode.plot._samples import STYLE
 
     rows = report["numbers"]["rows"]
     with plt.rc_context(STYLE):
@@ -162,7 +162,7 @@ def identification(report: dict):
     """Errors over the bound and cover of intervals, two standard errors; times beside SciPy."""
     import matplotlib.pyplot as plt
 
-    from polhode.plot._matplotlib import STYLE
+    from polhode.plot._samples import STYLE
 
     numbers = report["numbers"]
     rows = [*numbers["designs"], numbers["designs_pooled"]]
@@ -203,7 +203,7 @@ def throw_design(report: dict):
     """What a throw tells of the tensor, by direction of its spin and by program of the wheel."""
     import matplotlib.pyplot as plt
 
-    from polhode.plot._matplotlib import STYLE
+    from polhode.plot._samples import STYLE
 
     numbers = report["numbers"]
     with plt.rc_context(STYLE):
@@ -228,7 +228,7 @@ def engines(report: dict):
     """Attitude error and change of the energy of physics engines against revolutions."""
     import matplotlib.pyplot as plt
 
-    from polhode.plot._matplotlib import STYLE
+    from polhode.plot._samples import STYLE
 
     with plt.rc_context(STYLE):
         figure = plt.figure(figsize=(9.0, 3.1), layout="constrained")

@@ -52,7 +52,7 @@ def store(bodies: int, times: int, folder: Path) -> dict:
     import numpy as np
 
     from polhode import ensemble as ens
-    from polhode.ensemble._program import Block
+    from polhode.ensemble._stream import Block
 
     ensemble, ts = make(bodies), np.linspace(0.0, 100.0, times)
     block = Block(ensemble, ts, None, None, True, (), jax.devices()[:1])
@@ -121,7 +121,7 @@ def cost(bodies: int = 65_536) -> dict:
     import jax
     import numpy as np
 
-    from polhode.ensemble._program import Block
+    from polhode.ensemble._stream import Block
 
     each, spread = {}, 0.0
     for times in (10, 100):

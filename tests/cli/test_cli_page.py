@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from polhode.cli import _progress, main
+from polhode.cli import _process, main
 from polhode.cli._main import _COMMANDS
 
 ROOT = Path(__file__).parents[2]
@@ -30,7 +30,7 @@ def terminal(monkeypatch):
 
     file = io.StringIO()
     console = Console(file=file, force_terminal=True, width=120)
-    monkeypatch.setattr(_progress, "progress_console", lambda quiet: console)
+    monkeypatch.setattr(_process, "progress_console", lambda quiet: console)
     return file
 
 

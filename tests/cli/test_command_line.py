@@ -17,7 +17,7 @@ import xarray
 
 import polhode as ph
 from polhode.cli import main
-from polhode.cli._files import scene_path
+from polhode.cli._options import scene_path
 from polhode.files import build_scene, build_state, read_scene, shipped_scenes
 
 SCENES = shipped_scenes()["toutatis"].parent

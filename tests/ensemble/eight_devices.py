@@ -19,7 +19,7 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 import polhode as ph
 from polhode import _simulate, ensemble as ens
-from polhode.ensemble._program import Block, program
+from polhode.ensemble._stream import Block, program
 
 COLLECTIVES = r"all-gather|all-reduce|all-to-all|collective-permute|reduce-scatter"
 

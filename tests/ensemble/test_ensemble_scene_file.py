@@ -195,7 +195,7 @@ def test_heavy_tops_on_their_axis_follow_the_closed_form():
     import jax
 
     import polhode as ph
-    from polhode.ensemble._program import Block
+    from polhode.ensemble._stream import Block
 
     gravity = '[potential]\nkind = "uniform-gravity"\nmass = 1.0\ncentre_body = [0, 0, 0.1]\n'
     for text, kind in ((gravity, ph.LagrangeTop), (gravity.replace("[0,", "[0.1,"), ph.LiePoisson)):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode.files._reference import REFERENCE, reference_csv
+from polhode.files._write import REFERENCE, reference_csv
 
 from .make_tumbling import BODIES, START, TURNS, difference, stored
 from .reference_free import free_reference

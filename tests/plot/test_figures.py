@@ -12,7 +12,7 @@ from matplotlib import pyplot as plt
 
 import polhode as ph
 from polhode import plot
-from polhode.plot import _animate, _trajectory
+from polhode.plot import _trajectory
 
 MOMENTS = np.array([1.0, 2.0, 2.5])
 
@@ -138,7 +138,7 @@ def test_overview_draws_bands_and_observations(trajectory):
 
 def test_boxes_have_the_inertia_of_their_body():
     tensor = _tensor()
-    corners = _animate._box(tensor)
+    corners = _trajectory._box(tensor)
     # a homogeneous box has one third of its corners' second moments
     second = corners.T @ corners / 8 / 3
     inertia = np.trace(second) * np.eye(3) - second
@@ -151,10 +151,10 @@ def test_interpolation_takes_the_short_way_and_meets_the_samples():
     half = np.array([0.0, 0.3, 0.6])
     wxyz = np.stack([np.cos(half), np.sin(half), 0 * half, 0 * half], axis=-1)
     wxyz[1] *= -1
-    at = _animate._interpolate(np.array([0.5, 1.0, 2.0]), ts, wxyz)
+    at = _trajectory._interpolate(np.array([0.5, 1.0, 2.0]), ts, wxyz)
     angle = np.arctan2(at[:, 2, 1], at[:, 1, 1])
     np.testing.assert_allclose(angle, [0.3, 0.6, 1.2], atol=1e-12)
-    back = _animate._interpolate(np.array([0.5, 1.0, 2.0]), ts[::-1], wxyz[::-1])
+    back = _trajectory._interpolate(np.array([0.5, 1.0, 2.0]), ts[::-1], wxyz[::-1])
     np.testing.assert_allclose(back, at, atol=1e-12)
 
 

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode._batch import PARTS, flatten, lane_times
-from polhode._events._bracketed import bracketed
 from polhode._events._crossings import (
     AT_START,
     SAMPLES_PER_TURN,
+    bracketed,
     entries,
     first_true,
     minima_of,

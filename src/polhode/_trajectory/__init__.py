@@ -9,8 +9,8 @@ from polhode._trajectory._propagator import (
 )
 from polhode._trajectory._saved import (
     final_of as final_of,
+    successful_mean as successful_mean,
     values_of as values_of,
     with_saved as with_saved,
 )
-from polhode._trajectory._successful_mean import successful_mean as successful_mean
 from polhode._trajectory._trajectory import Events as Events, Trajectory as Trajectory

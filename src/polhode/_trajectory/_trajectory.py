@@ -1,4 +1,4 @@
-"""The result of a simulation: sampled attitude and rates, everything else on demand."""
+"""The result of a simulation: sampled attitude and rates, everything else computed on demand."""
 
 import abc
 from collections.abc import Callable, Sequence

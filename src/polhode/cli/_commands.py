@@ -7,14 +7,7 @@ from typing import Annotated
 
 import typer
 
-from polhode.cli import _progress
-from polhode.cli._files import (
-    UsageError,
-    check_suffix,
-    output_path,
-    output_stem,
-    usage_errors,
-)
+from polhode.cli import _process
 from polhode.cli._options import (
     ClonesOption,
     DebugOption,
@@ -23,16 +16,21 @@ from polhode.cli._options import (
     QuietOption,
     SceneName,
     SeedOption,
+    UsageError,
+    check_suffix,
     not_negative,
     option,
     output_option,
+    output_path,
+    output_stem,
     positive,
     read_scene,
     require,
+    usage_errors,
     whole_number,
 )
 from polhode.files import shipped_scenes
-from polhode.files._error import escape, scene_errors
+from polhode.files._read import escape, scene_errors
 
 
 def explain(
@@ -125,8 +123,7 @@ def reference(
 
     Attitudes, rates, flip times and their derivatives of 14 bodies at times up to 1e5 revolutions.
     """
-    from polhode.files._reference import REFERENCE, reference_csv
-    from polhode.files._write import atomic_write
+    from polhode.files._write import REFERENCE, atomic_write, reference_csv
 
     stem = output_stem(output, ".json", ".csv", what="the reference data")
     texts = {".json": REFERENCE.read_text(encoding="utf-8"), ".csv": reference_csv()}
@@ -292,7 +289,7 @@ def lightcurve(
     options |= {"floor": floor, "max_frequency": max_frequency, "say": lines.append}
     words = f"searching {curve.t.size} points with {trials:,} trials (compiling first)"
     try:
-        with _progress.spinner(_progress.progress_console(quiet), words) as show:
+        with _process.spinner(_process.progress_console(quiet), words) as show:
             fitted(
                 curve,
                 path.name,

@@ -9,18 +9,22 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from polhode.cli import _progress
-from polhode.cli._files import UsageError, output_path, output_stem, usage_errors, write_figure
+from polhode.cli import _process
 from polhode.cli._options import (
     DebugOption,
     ForceOption,
     NoCacheOption,
     NoFigureOption,
     QuietOption,
+    UsageError,
     option,
     output_option,
+    output_path,
+    output_stem,
     positive,
     require,
+    usage_errors,
+    write_figure,
 )
 from polhode.cli._process import check_signals, program_cache
 
@@ -165,8 +169,8 @@ def fit(
     require("fit", "rich", *(() if no_figure else ("matplotlib",)))
     document = _output(path, output, ".json", force)
     picture = None if no_figure else _output(path, output, ".png", force)
-    console = _progress.progress_console(quiet)
-    with _progress.spinner(console, "reading") as show, program_cache(not no_cache):
+    console = _process.progress_console(quiet)
+    with _process.spinner(console, "reading") as show, program_cache(not no_cache):
         loaded, result = _fit(path, names, options, show)
         show("writing")
         written = [_write(document, path, options, loaded, result)]
@@ -268,7 +272,7 @@ def _read(path: Path, names: dict[str, str], options: _Options) -> Any:
 
 def _columns_read(loaded: Any) -> str:
     """Which columns were read, in which units."""
-    from polhode.files._error import escape
+    from polhode.files._read import escape
 
     names = ", ".join(f"{role} = {escape(name)}" for role, name in loaded.columns.items())
     units = ", ".join(f"{role} in {unit}" for role, unit in loaded.units.items())
@@ -387,7 +391,7 @@ def _print(path: Path, options: _Options, loaded: Any, result: Any, written: lis
     out.print(_observability(result))
     for text in (_columns_read(loaded), f"limited by {result.limit()}", *result.warnings()):
         out.print(f"- {text}", highlight=False, markup=False)
-    _progress.print_paths(out, written)
+    _process.print_paths(out, written)
 
 
 def _observability(result: Any) -> Any:
@@ -414,7 +418,7 @@ def _table(path: Path, options: _Options, recording: Any, result: Any) -> Any:
     from rich.table import Table
     from rich.text import Text
 
-    from polhode.files._error import escape
+    from polhode.files._read import escape
     from polhode.rotation import wxyz_to_matrix
 
     samples = int(np.sum(np.asarray(recording.present)))

@@ -20,7 +20,7 @@ from polhode.files import (
     build_scene,
     draw_clones,
 )
-from polhode.files._error import escape, scene_errors
+from polhode.files._read import escape, scene_errors
 from polhode.inertia import Inertia, VariableInertia
 from polhode.inertia._variable import inertia_at
 from polhode.plot._samples import Scale

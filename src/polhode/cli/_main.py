@@ -18,10 +18,10 @@ import typer
 import typer.core
 
 from polhode.cli import _commands, _fit, _run
-from polhode.cli._files import READERS, UsageError, reset_outputs, written_outputs
+from polhode.cli._options import READERS, UsageError, reset_outputs, written_outputs
 from polhode.cli._process import INTERRUPTED, TERMINATED, signal_handlers
 from polhode.files import SceneFileError
-from polhode.files._error import escape
+from polhode.files._read import escape
 
 SUCCESS, FAILURE, USAGE = 0, 1, 2
 _codes: list[int] = []

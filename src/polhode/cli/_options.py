@@ -1,11 +1,24 @@
-"""Kinds of options, those that several commands share, and what follows from them."""
+"""What commands share: options, scene files, and the files that they read and write.
 
+Names of files are checked before the work: where a file is, what is wrong, what may be replaced.
+"""
+
+import contextlib
+import csv
+import difflib
+import io
 import math
+import os
 import re
-from collections.abc import Callable
+import stat
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
+from polhode.files import SceneFileError, shipped_scenes
+from polhode.files._read import escape, reason
 
 _SIZES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 
@@ -127,10 +140,9 @@ DebugOption = Annotated[bool, typer.Option("--debug", help="show the full traceb
 
 def read_scene(scene: str, clones: int | None, seed: int | None) -> Any:
     """The scene file with the options put in place of its own entries."""
-    from polhode.cli import _files
     from polhode.files import SceneFileError
 
-    file = _files.read_scene(scene)
+    file = read_scene_file(scene)
     options = {"clones": clones, "seed": seed}
     options = {name: value for name, value in options.items() if value is not None}
     if not options:
@@ -172,3 +184,231 @@ def require(command: str, *packages: str, extra: str = "cli") -> None:
         raise ImportError(
             f"`polhode {command}` needs {', '.join(missing)}: {how_to_install(extra)}"
         )
+
+
+READERS = {
+    ".toml": "`polhode run` and `polhode explain` read scene files (TOML)",
+    ".csv": "`polhode fit` and `polhode lightcurve` read CSV files",
+    ".nc": "`polhode view` reads NetCDF files",
+    ".zarr": "xarray.open_zarr reads the stores of ensembles",
+}
+_outputs: dict[Path, tuple[int, int] | None] = {}  # with what was there before
+
+
+class UsageError(Exception):
+    """Options that do not fit each other or the file: exit code 2."""
+
+
+def scene_path(text: str) -> Any:
+    """The file of a scene: a path, or the name of a scene that comes with polhode.
+
+    Raises SceneFileError for a missing file, with the nearest name that exists.
+    """
+    path = Path(text)
+    if text == "-" or "\0" in text or os.path.lexists(path):
+        return text
+    shipped = shipped_scenes()
+    if text in shipped:
+        return shipped[text]
+    hint = _suggestion(path, ".toml")
+    if not hint and (close := _closest(path.name.removesuffix(".toml"), shipped)):
+        hint = f"`polhode run {close}` runs the scene {close} that comes with polhode"
+    raise SceneFileError(
+        path,
+        "",
+        "cannot be read: No such file or directory",
+        fix=hint or "check the path; `polhode scenes` lists the scenes that come with polhode",
+    )
+
+
+def read_scene_file(text: str) -> Any:
+    """The checked scene file; a file that another command reads is named as such."""
+    from polhode.files import read_scene
+
+    path = scene_path(text)
+    try:
+        return read_scene(path)
+    except SceneFileError as error:
+        hint = _other_command(Path(path), ".toml")
+        if not hint:
+            raise
+        raise UsageError(f"{error}\n  {hint}") from error
+
+
+@contextlib.contextmanager
+def usage_errors(path: Path, suffix: str, expected: str) -> Iterator[None]:
+    """Turn what reading a file raises into UsageError: its name, what is wrong, what is expected.
+
+    A file that is missing or no file at all is refused at once.
+    """
+    hint = _other_command(path, suffix)
+    end = f"\n  {hint}" if hint else ""
+    if "\0" in str(path):
+        raise UsageError(f"the name of {expected} holds a NUL character.")
+    try:
+        if path.is_dir():
+            raise UsageError(f"{path} is a folder: expected {expected}.{end}")
+        with open(path, "rb") if path.is_file() else contextlib.nullcontext():
+            path.stat()
+        yield
+    except FileNotFoundError as error:
+        missing = Path(error.filename or path)
+        question = _suggestion(missing, missing.suffix or suffix)
+        raise UsageError(
+            f"cannot read {missing}: no such file, expected {expected}"
+            + (f"; {question}" if question else ".")
+        ) from error
+    except OSError as error:
+        raise UsageError(
+            f"cannot read {path}: {reason(error)}; expected {expected}.{end}"
+        ) from error
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{path} is not text in UTF-8: expected {expected}.{end}") from error
+    except SceneFileError:
+        raise
+    except (ValueError, csv.Error) as error:
+        lead = "" if str(path) in str(error) else f"{path}: "
+        raise UsageError(f"{lead}{error}{end}") from error
+
+
+def _suggestion(path: Path, suffix: str) -> str:
+    """A question that names the file meant by a path without a file, or nothing."""
+    try:
+        names = {other.name for other in path.parent.iterdir() if other.suffix == suffix}
+    except OSError:
+        return ""
+    name = path.name + suffix if path.name + suffix in names else _closest(path.name, names)
+    return f"did you mean {escape(str(path.with_name(name)))}?" if name else ""
+
+
+def _closest(name: str, names: Any) -> str:
+    return next(iter(difflib.get_close_matches(name, names, 1, 0.75)), "")
+
+
+def _other_command(path: Path, suffix: str) -> str:
+    """Which command reads a file whose suffix is not the one expected, or nothing."""
+    return "" if path.suffix == suffix else READERS.get(path.suffix, "")
+
+
+def reset_outputs() -> None:
+    """Forget the output files of the command before."""
+    _outputs.clear()
+
+
+def check_suffix(text: str, *suffixes: str, what: str) -> None:
+    """UsageError for a name with the suffix of a format that the command does not write.
+
+    What follows a dot and does not begin with a letter (``run_0.5``) is part of the name.
+    """
+    suffix = Path(text).suffix
+    if re.fullmatch(r"\.[A-Za-z]\w*", suffix) and suffix not in suffixes:
+        raise UsageError(
+            f"cannot write {escape(text)}: {what} has the suffix {' or '.join(suffixes)}, not"
+            f" {escape(suffix)}; name such a file, or leave the suffix out"
+        )
+
+
+def output_stem(text: str, *suffixes: str, what: str) -> str:
+    """The name without one of the suffixes, of files that differ in them. Raises as above."""
+    check_suffix(text, *suffixes, what=what)
+    return text.removesuffix(Path(text).suffix) if Path(text).suffix in suffixes else text
+
+
+def output_path(path: Path | str, suffix: str, *, force: bool, confined: bool = False) -> Path:
+    """The file to write; its folder is made. Raises OSError before the work rather than after it.
+
+    An existing file that polhode did not write, and a link, are replaced only by `force`.
+    `confined`: a name from a scene file, which must not lead out of the current folder.
+    """
+    text = os.fspath(path)
+    if "\0" in text:
+        raise UsageError(f"the output {escape(text)} holds a NUL character: name a file")
+    path = Path(text)
+    if path.name in ("", "..") or path.is_dir():
+        raise IsADirectoryError(
+            f"{escape(text)} is a folder: name a file to write, such as"
+            f" {escape(str(path / 'out'))}{suffix}"
+        )
+    if path.suffix != suffix:
+        path = path.with_name(path.name + suffix)
+    here = Path.cwd().resolve()
+    if confined and not path.resolve().is_relative_to(here):
+        raise UsageError(
+            f"[output] file: {escape(text)} leads out of the folder {here} by a link; name a file"
+            " below it, or any place by -o on the command line"
+        )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        if path.is_dir():
+            raise IsADirectoryError(f"{path} is a folder: name a file to write")
+        if os.path.lexists(path) and not force and not _is_replaceable(path):
+            kind = "is a link" if path.is_symlink() else "was not written by polhode"
+            raise FileExistsError(
+                f"{escape(str(path))} exists and {kind}: name another file, or give --force to"
+                " replace it"
+            )
+        probe = path.parent / f".{path.stem}.probe"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        if error.strerror is None:
+            raise
+        raise OSError(
+            f"cannot write {escape(path.name)} in the folder {escape(str(path.parent))}:"
+            f" {error.strerror}"
+        ) from error
+    _outputs[path] = _identity(path)
+    return path
+
+
+def written_outputs() -> tuple[list[Path], list[Path]]:
+    """The output files that are new or replaced, and those that are as they were."""
+    new = [path for path, previous in _outputs.items() if _identity(path) != previous]
+    return new, [path for path in _outputs if path not in new]
+
+
+def write_figure(path: Path, draw: Callable[[], Any]) -> Path:
+    """Draw without a display and write a PNG, whole or not at all."""
+    import matplotlib
+
+    matplotlib.use("agg")
+    from matplotlib import pyplot
+
+    from polhode import __version__
+    from polhode.files._write import atomic_write
+
+    figure, data = draw(), io.BytesIO()
+    figure.savefig(data, format="png", dpi=160, metadata={"Software": f"polhode {__version__}"})
+    pyplot.close(figure)
+    with atomic_write(path) as temporary:
+        temporary.write_bytes(data.getvalue())
+    return path
+
+
+def _identity(path: Path) -> tuple[int, int] | None:
+    try:
+        status = path.stat()
+    except OSError:
+        return None
+    return status.st_ino, status.st_mtime_ns
+
+
+def _is_replaceable(path: Path) -> bool:
+    """Whether a file is empty or names polhode as its maker."""
+    status = path.lstat()
+    if not stat.S_ISREG(status.st_mode):
+        return False
+    if status.st_size == 0:
+        return True
+    if path.suffix == ".nc":
+        import h5py
+
+        try:
+            with h5py.File(path, "r") as file:
+                maker = file.attrs.get("source", "")
+        except OSError:
+            return False
+        maker = maker.decode(errors="replace") if isinstance(maker, bytes) else str(maker)
+        return maker.startswith("polhode")
+    with open(path, "rb") as file:
+        return b"polhode" in file.read(65536)

@@ -1,8 +1,9 @@
-"""What a command changes in its process while it runs: signals, and the cache of programs.
+"""What a command changes in its process while it runs: signals, the cache of programs, progress.
 
-Python delivers a signal as an exception in whatever runs at that moment. Where that is a callback
-of a library (JAX's after a garbage collection, for one), the exception is printed and forgotten.
-So every signal is noted, and `check_signals` raises it again between the pieces of the work.
+Python delivers a signal as an exception in whatever code runs at that moment. If that is a callback
+of a library (such as the one of JAX after a garbage collection), the exception is printed and
+dropped. Every signal is therefore recorded, and ``check_signals`` raises it again between pieces of
+the work.
 """
 
 import contextlib
@@ -12,7 +13,7 @@ import signal
 import threading
 import types
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -136,3 +137,39 @@ def _processor() -> str:
     with contextlib.suppress(OSError), open("/proc/cpuinfo", encoding="utf-8") as file:
         words += next((line for line in file if line.startswith(("flags", "Features"))), "")
     return hashlib.sha256(words.encode()).hexdigest()[:12]
+
+
+def progress_console(quiet: bool) -> Any:
+    """The console for progress, which is for people who watch: nothing goes into a log file."""
+    from rich.console import Console
+
+    console = Console(stderr=True)
+    console.quiet = quiet or not console.is_terminal
+    return console
+
+
+def progress_bar(console: Any, last: Any) -> Any:
+    """A bar of bodies done, with the column ``last`` at its end."""
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    columns = TextColumn("simulating"), BarColumn(), MofNCompleteColumn(), TextColumn("bodies")
+    return Progress(*columns, last, console=console, transient=True)
+
+
+@contextlib.contextmanager
+def spinner(console: Any, words: str) -> Iterator[Callable[[str], None]]:
+    """Show what is done and the time that it has taken; what is yielded changes the words."""
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    columns = SpinnerColumn(), TextColumn("{task.description} ..."), TimeElapsedColumn()
+    with Progress(*columns, console=console, transient=True) as progress:
+        task = progress.add_task(words, total=None)
+        yield lambda words: progress.update(task, description=words)
+
+
+def print_paths(console: Any, paths: Iterable[Path]) -> None:
+    """Print the names of the files written."""
+    from polhode.files._read import escape
+
+    names = ", ".join(escape(str(path)) for path in paths)
+    console.print(f"written: {names}", highlight=False, markup=False)

@@ -10,8 +10,7 @@ import sys
 from pathlib import Path
 from typing import Annotated, Any
 
-from polhode.cli import _progress
-from polhode.cli._files import UsageError, check_suffix, output_path, write_figure
+from polhode.cli import _process
 from polhode.cli._options import (
     ClonesOption,
     DebugOption,
@@ -22,18 +21,22 @@ from polhode.cli._options import (
     QuietOption,
     SceneName,
     SeedOption,
+    UsageError,
     byte_count,
+    check_suffix,
     device_count,
     option,
     output_option,
+    output_path,
     parse_part,
     read_scene,
     require,
     whole_number,
+    write_figure,
 )
 from polhode.cli._process import check_signals, program_cache
 from polhode.files import SceneFileError
-from polhode.files._error import escape
+from polhode.files._read import escape
 
 
 def _ensemble_option(name: str, metavar: str, words: str, parser: Any = None) -> Any:
@@ -127,16 +130,16 @@ def _simulate(
 ) -> int:
     from rich.console import Console
 
-    console = _progress.progress_console(quiet)
-    with _progress.spinner(console, "starting"):
+    console = _process.progress_console(quiet)
+    with _process.spinner(console, "starting"):
         from polhode.cli import _job
         from polhode.files import write_netcdf
 
     with program_cache(not no_cache):
-        with _progress.spinner(console, "drawing the bodies"):
+        with _process.spinner(console, "drawing the bodies"):
             job = _job.prepare(file, precision)
         outcome = _with_progress(console, job)
-        with _progress.spinner(console, "measuring and writing"):
+        with _process.spinner(console, "measuring and writing"):
             figures = _job.measure(job, outcome)
             dataset = _dataset(job, outcome, figures, precision, picture is not None)
             check_signals()
@@ -147,7 +150,7 @@ def _simulate(
     if not quiet:
         out = Console(soft_wrap=not sys.stdout.isatty())
         out.print(_job.summary_table(job, outcome, figures))
-        _progress.print_paths(out, written)
+        _process.print_paths(out, written)
     return _failures(outcome.trajectory.status)
 
 
@@ -156,7 +159,7 @@ def _with_progress(console, job):
 
     from polhode.cli import _job
 
-    with _progress.progress_bar(console, TimeElapsedColumn()) as progress:
+    with _process.progress_bar(console, TimeElapsedColumn()) as progress:
         task = progress.add_task("", total=job.bodies)
 
         def advance(done: int) -> None:
@@ -218,7 +221,7 @@ def _provenance(job, precision: str, figure: bool) -> dict[str, Any]:
     import polhode
     from polhode.cli import _main
     from polhode.ensemble._stream import device_names
-    from polhode.files._error import scene_errors
+    from polhode.files._read import scene_errors
     from polhode.files._write import commit, versions
 
     file = job.file
@@ -316,15 +319,15 @@ def _run_ensemble(
     no_cache: bool,
 ) -> int:
     """Compute the ensemble into its store; 0, or 1 when some bodies did not finish."""
-    console = _progress.progress_console(quiet)
+    console = _process.progress_console(quiet)
     path = _store_path(file, output)
-    with _progress.spinner(console, "starting"):
+    with _process.spinner(console, "starting"):
         import jax
 
         jax.config.update("jax_enable_x64", True)
         from polhode.ensemble import StoreError, build_ensemble
         from polhode.ensemble._store import missing_chunks
-        from polhode.files._error import escape
+        from polhode.files._read import escape
 
         ensemble, statistics = build_ensemble(file, precision)
     if "part" in options:
@@ -354,7 +357,7 @@ def _run_ensemble(
 
 
 def _store_path(file: Any, output: str | None) -> Path:
-    from polhode.files._error import escape
+    from polhode.files._read import escape
 
     text = output or file.output.file or f"{file.path.stem}.zarr"
     path = Path(text)
@@ -407,7 +410,7 @@ class _Meter:
         from rich.progress import TextColumn
 
         self.last: Any = None
-        self.bar = _progress.progress_bar(console, TextColumn("{task.fields[remaining]}"))
+        self.bar = _process.progress_bar(console, TextColumn("{task.fields[remaining]}"))
         self.task = self.bar.add_task("", total=None, remaining="compiling ...")
 
     def __enter__(self):

@@ -26,7 +26,7 @@ import jax
 import numpy as np
 
 from polhode._extras import imported
-from polhode.files._error import reason, shorten
+from polhode.files._read import reason, shorten
 
 if TYPE_CHECKING:
     import xarray

@@ -7,8 +7,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from polhode._extras import imported
-from polhode.files._error import SceneFileError as SceneFileError
 from polhode.files._read import (
+    SceneFileError as SceneFileError,
     parse_scene as parse_scene,
     read_scene as read_scene,
     shipped_scenes as shipped_scenes,
@@ -26,8 +26,10 @@ if TYPE_CHECKING:
         draw_clones as draw_clones,
     )
     from polhode.files._models import SceneFile as SceneFile
-    from polhode.files._reference import reference_motions as reference_motions
-    from polhode.files._write import write_netcdf as write_netcdf
+    from polhode.files._write import (
+        reference_motions as reference_motions,
+        write_netcdf as write_netcdf,
+    )
 
 _BUILDERS = (
     "Clones",
@@ -42,7 +44,7 @@ _BUILDERS = (
 # imported on first use: the command line answers before
 _MODULES = dict.fromkeys(_BUILDERS, "_build") | {
     "SceneFile": "_models",
-    "reference_motions": "_reference",
+    "reference_motions": "_write",
     "write_netcdf": "_write",
 }
 

@@ -17,9 +17,8 @@ import polhode
 from polhode import rotation
 from polhode._hamiltonian import from_quaternion
 from polhode._scene import narrower
-from polhode.files._error import SceneFileError, did_you_mean, scene_errors
 from polhode.files._models import SceneFile
-from polhode.files._read import possible_moments
+from polhode.files._read import SceneFileError, did_you_mean, possible_moments, scene_errors
 from polhode.files._tables import AnySolid, Attitudes, TimeTable
 from polhode.files._values import MOMENTS, Table
 from polhode.inertia import Inertia, MassProperties, VariableInertia, compose

@@ -24,11 +24,10 @@ from polhode._hamiltonian import (
 )
 from polhode._hamiltonian._energy import from_rows
 from polhode._integrate import LiePoisson
-from polhode._integrate._classical import ClassicalRungeKutta
 from polhode._method import AbstractMethod
 from polhode._scene import AbstractTorque, LinearDamping, QuadraticDamping, Scene, State
 from polhode._simulate import simulate
-from polhode.fit._numerics import inverse
+from polhode.fit._numerics import ClassicalRungeKutta, inverse
 from polhode.inertia import Inertia, inertia_of_second_moments, principal
 from polhode.inertia._physical import symmetric
 from polhode.rotation import conjugate, multiply, normalise, rotate, wxyz_to_matrix

@@ -3,7 +3,7 @@
 import numpy as np
 
 from polhode.lightcurve._solutions import LightCurveFit
-from polhode.plot._matplotlib import ACCENT, GREY, INK, Y, Z, new_figure, styled
+from polhode.plot._samples import ACCENT, GREY, INK, Y, Z, new_figure, styled
 
 
 @styled

@@ -3,10 +3,10 @@
 ``view``, the page of a moving body, needs no extra.
 """
 
-from polhode.plot._animate import animate as animate
 from polhode.plot._fits import fit as fit, work_precision as work_precision
 from polhode.plot._samples import Samples as Samples, samples as samples
 from polhode.plot._trajectory import (
+    animate as animate,
     herpolhode as herpolhode,
     history as history,
     overview as overview,

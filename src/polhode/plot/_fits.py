@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 
 from polhode._checks import ArrayLike
-from polhode.plot._matplotlib import ACCENT, AXES, GREY, INK, new_figure, plain, styled
-from polhode.plot._samples import matrices
+from polhode.plot._samples import ACCENT, AXES, GREY, INK, matrices, new_figure, plain, styled
 
 # chi-square of two degrees of freedom: 68 % and 95 % of a plane
 _LEVELS = {"68 %": 2.2957, "95 %": 5.9915}

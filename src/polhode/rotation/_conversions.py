@@ -10,9 +10,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._checks import ArrayLike
-from polhode.rotation._input import as_axes, as_matrices, as_quaternions, as_vectors
-from polhode.rotation._quaternion import canonical, matrix_row
+from polhode._checks import ArrayLike, as_vectors
+from polhode.rotation._quaternion import (
+    as_axes,
+    as_matrices,
+    as_quaternions,
+    canonical,
+    matrix_row,
+)
 from polhode.rotation._scalar import arc_ratio, cosine, direction, length, sine_ratio
 
 

@@ -27,7 +27,7 @@ from polhode.rotation._conversions import (
     wxyz_to_modified_rodrigues,
     wxyz_to_rotation_vector,
 )
-from polhode.rotation._input import as_quaternions
+from polhode.rotation._quaternion import as_quaternions
 from polhode.rotation._scalar import largest, length
 
 

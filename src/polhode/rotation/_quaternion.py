@@ -1,9 +1,13 @@
-"""Unit quaternions, scalar first (``wxyz``), turning body components into space components.
+"""Unit quaternions, scalar first (``wxyz``), that rotate body components into space components.
 
 Every function takes arrays of shape (..., 4) (quaternions) and (..., 3) (vectors), broadcasts
 leading axes together, and keeps the dtype of its input. The matrix and the rate of a quaternion are
 written once, on component arrays. Scalar-last quaternions and SciPy's ``Rotation`` are converted
 here.
+
+Shapes of arguments are always checked, values where they are concrete. Under ``jit``, ``vmap`` and
+``grad`` no error can be raised: a matrix that is no rotation becomes NaN, and a quaternion that is
+not of unit length is used as it is.
 """
 
 from collections.abc import Sequence
@@ -17,10 +21,85 @@ import numpy as np
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from polhode._checks import ArrayLike
+from polhode._checks import (
+    ArrayLike,
+    as_float_array,
+    as_vectors,
+    describe,
+    is_concrete,
+    require,
+)
 from polhode._kernels import smooth
-from polhode.rotation._input import as_quaternions, as_vectors
 from polhode.rotation._scalar import length
+
+_UNIT = 1e-3
+"""Tolerance on unit length and orthogonality, for numbers that were rounded for printing."""
+
+
+def as_quaternions(value: Any, name: str = "wxyz", *, unit: bool = False) -> Array:
+    """Quaternions (..., 4), none of them zero; ``unit``: of length one, where that is known."""
+    wxyz = as_vectors(name, value, 4)
+    if is_concrete(wxyz):
+        _check_length(name, np.asarray(wxyz), unit, "(1, 0, 0, 0) is no rotation, scalar first")
+    return wxyz
+
+
+def as_axes(name: str, value: Any) -> Array:
+    """Unit vectors (..., 3)."""
+    axes = as_vectors(name, value, 3)
+    if is_concrete(axes):
+        _check_length(name, np.asarray(axes), True, "divide the axis by its length")
+    return axes
+
+
+@np.errstate(over="ignore")
+def _check_length(name: str, values: np.ndarray, unit: bool, hint: str) -> None:
+    if values.dtype.kind != "f":
+        values = values.astype(np.float32)  # einsum does not support bfloat16
+    square = np.einsum(
+        "...i,...i->...", values, values
+    )  # ten times faster than the largest component
+    if np.any(square == 0):  # or so small that squares underflow
+        zero = np.all(values == 0, axis=-1)
+        require(~zero, f"{name} must not be zero, got {describe(values)}: {hint}.")
+    if not unit:
+        return
+    off = (square < (1 - _UNIT) ** 2) | (square > (1 + _UNIT) ** 2)  # NaN passes
+    if np.any(off):
+        size = np.nanmax(np.linalg.norm(values.astype(np.float64), axis=-1))
+        require(
+            ~off,
+            f"{name} must be of unit length, got length {size:.6g} in {describe(values)}:"
+            f" {'use ph.rotation.normalise' if values.shape[-1] == 4 else hint}.",
+        )
+
+
+def as_matrices(value: Any) -> tuple[Array, Array]:
+    """Matrices (..., 3, 3), and which of them (...) are rotations: orthogonal, of determinant 1."""
+    matrix = value
+    if not isinstance(value, jax.Array) or value.shape[-2:] != (3, 3):
+        matrix = as_float_array("matrix", value, (3, 3), finite=False)
+    if not is_concrete(matrix):
+        return matrix, _rotation_error(jax.lax.stop_gradient(matrix))[0]
+    with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
+        good, size = _rotation_error(matrix)
+        require(
+            np.asarray(good) | np.isnan(size),
+            "matrix must be a rotation, orthogonal and of determinant +1, got"
+            f" {describe(np.asarray(matrix), 9)}: a reflection (determinant -1) or a scaling has no"
+            " quaternion.",
+        )
+    return matrix, good
+
+
+@smooth  # a check of rounding errors: its comparisons are no kinks
+def _rotation_error(matrix: Array) -> tuple[Array, Array]:
+    """Which matrices are rotations, and the largest error of orthonormality."""
+    a, b, c = (matrix[..., i, :] for i in range(3))
+    # of orthonormal, right-handed rows each is the vector product of the two others
+    off = [jnp.cross(a, b) - c, jnp.cross(b, c) - a, jnp.cross(c, a) - b]
+    size = jnp.max(jnp.abs(jnp.stack(off)), axis=(0, -1))
+    return (size <= _UNIT) & (jnp.max(jnp.abs(matrix), axis=(-2, -1)) > 0.5), size
 
 
 def matrix_row(wxyz: Sequence[Any], i: int) -> tuple[Any, Any, Any]:
