@@ -12,6 +12,7 @@ from devices import told_by
 from scipy.special import ellipk
 
 import polhode as ph
+from polhode._events._crossings import minima_of
 
 RATE = 1.7
 BALL = ph.Scene(ph.Inertia.spherical(2.0))
@@ -144,6 +145,16 @@ def test_a_motion_stops_at_its_event_and_goes_on_with_another_scene():
     # at the surface of the event itself the motion starts: that is no crossing
     again = ph.simulate(burning, on.last, ts, until=reached)
     assert np.all(np.isinf(again.event_time))
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_intervals_with_a_minimum_near_zero_are_searched(side):
+    """Of (t - 0.3)^2 + lowest and of its negative, each on [0, 1], a cubic through their ends."""
+    lowest = np.array([-0.05, 0.0, 0.04, 0.05, 0.2])
+    ends, slopes = np.array([0.09, 0.49]) + lowest[:, None], np.array([[-0.6, 1.4]])
+    times, sides = np.array([[0.0, 1.0]]), np.full((5, 2), side)
+    searched = minima_of(*map(jnp.asarray, (times, side * ends, side * slopes, sides)))
+    np.testing.assert_array_equal(searched[:, 0], lowest <= ends[:, 0] / 2)
 
 
 @pytest.mark.slow

@@ -8,7 +8,19 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode.fit import Finding, FitOptions, Gyroscope, Recording, fit_inertia, fit_recordings
+from polhode.fit import (
+    Finding,
+    FitOptions,
+    FreeMotion,
+    Gyroscope,
+    Model,
+    Parameters,
+    Recording,
+    fit_inertia,
+    fit_recordings,
+)
+from polhode.fit._model import Predicted, base_of
+from polhode.fit._residuals import residuals_of_motion
 
 TIMES = np.arange(400) / 100
 KEY = jax.random.key(3)
@@ -63,6 +75,21 @@ def test_readings_are_those_of_the_fields():
     shift = jittered[:, :2] / slope[:, :2]
     clear = np.abs(slope[:, :2]).min(axis=1) > 0.5
     np.testing.assert_allclose(shift[clear, 0], shift[clear, 1], atol=2e-4)
+
+
+def test_a_delayed_gyroscope_fits_its_own_motion():
+    """Residuals vanish to the third order in the delay, as of ``Gyroscope.read``."""
+    delay = 0.013
+
+    def rates(t):
+        return np.stack([np.sin(3 * t), np.cos(2 * t), np.sin(t)], axis=-1)
+
+    data = ph.fit.stack([Recording.of(TIMES, rates(TIMES - delay))])
+    model = Model(FreeMotion(), base_of(jnp.eye(3), True), gyroscope=Gyroscope(delay=delay))
+    parameters = Parameters(jnp.zeros(6), jnp.zeros((1, 3)))
+    motion = Predicted(jnp.asarray(rates(TIMES))[None], None, None)
+    residuals = residuals_of_motion(motion, parameters, data, model)["omega"]
+    np.testing.assert_allclose(residuals[0, 3:-3], 0, atol=3e-5)
 
 
 @pytest.mark.parametrize(

@@ -192,6 +192,25 @@ def test_a_gradient_through_a_jump():
     )
 
 
+@pytest.mark.slow
+def test_second_derivatives_through_a_jump():
+    """By rate and level: of ``level - 0.1 (5 - log(level) / rate)``."""
+
+    def end(p):
+        def law(t, wxyz, omega):
+            return jnp.where(omega[2] > p[1], p[0] * omega, -0.1)
+
+        scene = ph.Scene(ph.Inertia.spherical(1.0), None, ph.FeedbackTorque(law))
+        return ph.simulate(scene, ph.State(WXYZ, [0.0, 0.0, 1.0]), [0.0, 5.0]).omega_body[-1, 2]
+
+    def exact(p):
+        return p[1] - 0.1 * (5 - jnp.log(p[1]) / p[0])
+
+    p, along = jnp.array([-0.2, 0.7]), jnp.array([0.3, 0.2])
+    found, want = (jax.jvp(jax.grad(f), (p,), (along,))[1] for f in (end, exact))
+    np.testing.assert_allclose(found, want, rtol=1e-7)
+
+
 def test_a_side_beyond_which_the_field_is_no_number():
     """Steps hold the side of a root until the motion is there, and do not pass it."""
 

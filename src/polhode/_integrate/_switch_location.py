@@ -1,5 +1,6 @@
 """Where within a step the first switch of the field turns, or the first event lies."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -54,6 +55,11 @@ def first_switch(
     the earliest root taken. The search aims half the tolerance beyond the root, and ends where the
     secant says that the upper end is within the tolerance of it: 3 evaluations for a typical
     switch; 5 if the upper end is checked first, and both ends must come that near."""
+    # The search has no derivatives: a loop whose body closed over tangents would carry them through
+    # every iteration. `_differentiable_part` gives the place its derivatives afterwards.
+    differentiated = motion.coefficients, progress, attempt, t
+    fixed = jax.lax.stop_gradient(differentiated)
+    _, progress, attempt, t = fixed
     nodes = motion.rule.margin_nodes
     sampled = margin_samples(attempt.margins, motion.rule)
     places = jnp.asarray(nodes, sampled.dtype)[:, None]
@@ -104,11 +110,10 @@ def first_switch(
         located = LOCATED_JUMP if motion.jumps else LOCATED_KINK
         tolerance = jnp.maximum(tolerance, located * options.rtol.astype(tolerance.dtype))
 
-    def margins_at(x):
+    def margins_at(x, constants=fixed):
+        coefficients, progress, attempt, t = constants
         y = dense_state(progress.y, attempt.dense, x)
-        _, margins, new_levels = motion.rates(
-            motion.coefficients, progress.levels, t + x * attempt.h, y
-        )
+        _, margins, new_levels = motion.rates(coefficients, progress.levels, t + x * attempt.h, y)
         return margins, new_levels
 
     def root_share(at_low, at_high):
@@ -205,14 +210,14 @@ def first_switch(
         none,
         jnp.zeros_like(accepted),
     )
-    search = jax.lax.while_loop(
-        lambda c: any_of(jnp.where(c.mode > 0, 1.0, 0.0)), one, jax.lax.stop_gradient(search)
-    )
+    search = jax.lax.while_loop(lambda c: any_of(jnp.where(c.mode > 0, 1.0, 0.0)), one, search)
     # halved margins keep their signs
     flips = search.at_high < 0
     part = search.high
+    _, progress, attempt, _ = differentiated
     if options.differentiable:
-        part = _differentiable_part(search.hit, flips, part, margins_at)
+        margins = partial(margins_at, constants=differentiated)
+        part = _differentiable_part(search.hit, flips, part, margins)
     state = dense_state(progress.y, attempt.dense, part)
     lost = search.hit & ~jnp.any(flips, axis=0)
     near = jnp.maximum(1e-3, 4 * tolerance)
