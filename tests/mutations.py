@@ -302,7 +302,7 @@ MUTANTS = (
         ("frames/test_rotating_frame.py::test_attitude_as_matrix_or_as_quaternion_of_any_scale",),
     ),
     Mutant(
-        "frames/_sensors.py",
+        "frames/_frame.py",
         "reading = reading + jnp.cross(angular_acceleration(trajectory), lever)",
         "reading = reading - jnp.cross(angular_acceleration(trajectory), lever)",
         "the tangential acceleration of an accelerometer has the wrong sign",

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode.inertia import Inertia
-from polhode.inertia._variable import VariableInertia, inertia_at
+from polhode.inertia._inertia import VariableInertia, inertia_at
 from polhode.rotation._quaternion import matrix_row
 
 Vector = tuple[Array, Array, Array]

@@ -40,7 +40,7 @@ from polhode._scene import (
     UniformGravity,
 )
 from polhode.inertia import Inertia
-from polhode.inertia._variable import inertia_at
+from polhode.inertia._inertia import inertia_at
 from polhode.rotation import euler_to_wxyz, wxyz_to_euler
 
 

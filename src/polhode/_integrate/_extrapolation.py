@@ -30,7 +30,7 @@ from polhode._integrate._midpoint import (
     initial_progress,
     integrate,
 )
-from polhode._integrate._one_step import GivenTimes
+from polhode._integrate._segments import GivenTimes
 from polhode._integrate._tableau import DOP853, TSIT5, Tableau
 from polhode._kernels import kernel, opaque_ones, staged
 

@@ -18,7 +18,7 @@ from polhode._integrate._extrapolation import Extrapolation
 from polhode._integrate._field import FixedArguments
 from polhode._integrate._flow_derivative import Equations, equations_of
 from polhode._integrate._midpoint import Progress
-from polhode._integrate._one_step import is_one_step, one_step
+from polhode._integrate._segments import is_one_step, one_step
 from polhode._kernels import attached, is_slope, kernel
 
 

@@ -25,9 +25,8 @@ from polhode._integrate._flow_adjoint import FlowAdjoint, path_of
 from polhode._integrate._flow_derivative import equations_of
 from polhode._integrate._loop import Found, LoopOptions, Search, solve, with_events
 from polhode._integrate._midpoint import Progress
-from polhode._integrate._one_step import GivenTimes
 from polhode._integrate._problem import Problem
-from polhode._integrate._segments import Solution, in_segments
+from polhode._integrate._segments import GivenTimes, Solution, in_segments
 from polhode._integrate._step_derivative import samples
 from polhode._integrate._tableau import TSIT5
 from polhode._kernels import Distinct, is_holdable, kernel

@@ -17,7 +17,6 @@ from polhode._kernels._derivatives import (
     underivable as underivable,
     zeros as zeros,
 )
-from polhode._kernels._distinct import Distinct as Distinct, jit_distinct as jit_distinct
 from polhode._kernels._fold import (
     Specialised as Specialised,
     computed_once as computed_once,
@@ -26,9 +25,11 @@ from polhode._kernels._fold import (
     staged as staged,
 )
 from polhode._kernels._fused import (
+    Distinct as Distinct,
     any_of as any_of,
     formula as formula,
     is_holdable as is_holdable,
+    jit_distinct as jit_distinct,
     kernel as kernel,
     put as put,
 )

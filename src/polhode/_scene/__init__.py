@@ -1,16 +1,14 @@
 """Scenes and states, and what they are made of: potentials, torques, damping, rotors."""
 
-from polhode._scene._clusters import (
-    ControlMomentGyro as ControlMomentGyro,
-    MomentumDumping as MomentumDumping,
-    wheel_cluster as wheel_cluster,
-)
 from polhode._scene._control import (
     BDot as BDot,
+    ControlMomentGyro as ControlMomentGyro,
     DipoleField as DipoleField,
     MagneticDipole as MagneticDipole,
+    MomentumDumping as MomentumDumping,
     Pointing as Pointing,
     RateDamping as RateDamping,
+    wheel_cluster as wheel_cluster,
 )
 from polhode._scene._orbits import (
     LVLH as LVLH,
@@ -33,8 +31,10 @@ from polhode._scene._potentials import (
     PotentialSum as PotentialSum,
     UniformGravity as UniformGravity,
 )
-from polhode._scene._scene import Scene as Scene, State as State, check_scene as check_scene
-from polhode._scene._specialise import (
+from polhode._scene._scene import (
+    Scene as Scene,
+    State as State,
+    check_scene as check_scene,
     constructors as constructors,
     narrower as narrower,
     specialise as specialise,

@@ -1,19 +1,21 @@
-"""Control laws: pointing and rate damping, and a magnetic dipole in a field."""
+"""Attitude control: pointing, rate damping, magnetic dipoles, gyros and clusters of wheels."""
 
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._checks import ArrayLike, as_float_array, as_number, is_concrete, require
-from polhode._hamiltonian import Attitude, components, cross, triple
+from polhode._checks import ArrayLike, as_float_array, as_number, as_positive, is_concrete, require
+from polhode._hamiltonian import Attitude, Vector, components, cross, dot, triple
 from polhode._parts import AbstractPart, Signature, shaped
 from polhode._scene._tables import Table
 from polhode._scene._torques import AbstractTorque, coefficients, stacked, value_at, vector_of_time
+from polhode._scene._wheels import AbstractCoupling, AbstractRotor, Rotor, RotorSum
 
 
 class Pointing(AbstractTorque):
@@ -186,3 +188,221 @@ class DipoleField(eqx.Module):
         size = jnp.sqrt(jnp.sum(position * position))
         n = position / size
         return 1e-7 * (3 * n * jnp.sum(n * self.moment) - self.moment) / size**3
+
+
+_COMMAND = Signature("wheel_cluster command", {"t": (), "wxyz": (4,), "omega_body": (3,)}, (3,))
+
+
+class _ClusterMotor(AbstractCoupling):
+    """Motor of wheel ``i`` of a cluster: its share of the commanded torque, and null motion."""
+
+    smooth: ClassVar[bool] = False  # the limits
+
+    command: Callable
+    share: Array
+    null: Array
+    bias: Array
+    first: int = eqx.field(static=True)
+    max_torque: Float[Array, "*#b"] | None = shaped()
+
+    def torque(
+        self, t: Array | float, speed: Array, attitude: Attitude, omega: Sequence[Array]
+    ) -> Array:
+        given = t, stacked(attitude.wxyz), stacked(omega)
+        wanted = components(_COMMAND.mapped(self.command, *given))
+        return self._limited(-dot(components(self.share), wanted))
+
+    def torque_among(
+        self,
+        t: Array | float,
+        i: int,
+        speed_of: Callable[[int], Array],
+        attitude: Attitude,
+        omega: Sequence[Array],
+    ) -> Array:
+        given = t, stacked(attitude.wxyz), stacked(omega)
+        total = -dot(components(self.share), components(_COMMAND.mapped(self.command, *given)))
+        for j in range(self.null.shape[-1]):
+            excess = speed_of(self.first + j) - self.bias[j]
+            total = total - self.null[j] * excess
+        return self._limited(total)
+
+    def _limited(self, torque: Array) -> Array:
+        if self.max_torque is None:
+            return torque
+        return jnp.clip(torque, -self.max_torque, self.max_torque)
+
+
+def wheel_cluster(
+    axes: ArrayLike,
+    inertia: ArrayLike,
+    command: Callable,
+    *,
+    speed: ArrayLike = 0.0,
+    max_torque: ArrayLike | None = None,
+    friction: AbstractCoupling | None = None,
+    null_gain: ArrayLike = 0.0,
+    bias: ArrayLike = 0.0,
+    first: int = 0,
+) -> AbstractRotor:
+    """A cluster of reaction wheels that exerts a commanded torque on the body.
+
+    **Arguments:** ``axes`` (n, 3): of n >= 3 wheels in body axes, which span space; ``inertia``:
+    of each wheel about its axis [kg m^2], (n,) or one number; ``command``: a function
+    ``fn(t, wxyz, omega_body)`` -> (3,), the torque on the body [N m]; ``speed``: initial speeds
+    [rad/s], (n,) or one number; ``max_torque`` of each motor [N m] or None; ``friction`` of each
+    bearing, such as ``ph.ViscousCoupling``; ``null_gain`` [1/s] and ``bias`` [rad/s], (n,) or one
+    number: null motion drives the speeds to the bias as far as that exerts no torque on the body;
+    ``first``: the number of other wheels that stand before these in the scene.
+
+    The wheels share the command by the pseudo-inverse of their axes, with the least sum of squares
+    of the motor torques. The result is a sum of ``ph.Rotor`` for ``ph.Scene(rotors=...)``.
+
+        corners = [[1, 1, 1], [-1, 1, 1], [-1, -1, 1], [1, -1, 1]]
+        law = lambda t, wxyz, omega_body: -0.1 * omega_body
+        wheels = ph.wheel_cluster(corners, 1e-3, law, max_torque=0.02)
+
+    F. L. Markley and J. L. Crassidis, Fundamentals of Spacecraft Attitude Determination and
+    Control, 2014, section 7.3.4. Raises ValueError for fewer than three wheels or axes in one
+    plane, TypeError or ValueError for a command that takes or returns something else.
+    """
+    directions = as_float_array("wheel_cluster axes", axes, (None, 3))
+    directions = directions / jnp.sqrt(jnp.sum(directions**2, axis=-1, keepdims=True))
+    n = directions.shape[0]
+    if is_concrete(directions):
+        require(
+            np.linalg.matrix_rank(np.asarray(directions), tol=1e-6) == 3,
+            f"wheel_cluster axes must be three or more that span space, got {axes}.",
+        )
+    moments, speeds, wanted = (
+        jnp.broadcast_to(as_float_array(f"wheel_cluster {name}", value), (n,))
+        for name, value in (("inertia", inertia), ("speed", speed), ("bias", bias))
+    )
+    gain = as_number("wheel_cluster null_gain", null_gain)
+    law = _COMMAND.checked(command)
+    # u = -A^+ N exerts N = -A u; rows of 1 - A^+ A are motions of the wheels without a torque.
+    # Momenta, not speeds, have to cancel: the projector acts on J times the speeds.
+    inverse = jnp.linalg.solve(directions.T @ directions, directions.T).T
+    projector = jnp.eye(n, dtype=directions.dtype) - inverse @ directions.T
+    limit = None if max_torque is None else as_positive("wheel_cluster max_torque", max_torque)
+    rotors = []
+    for i in range(n):
+        null = gain * projector[i] * moments
+        motor: Any = _ClusterMotor(law, inverse[i], null, wanted, first, limit)
+        coupling = motor if friction is None else motor + friction
+        rotors.append(Rotor(directions[i], inertia=moments[i], speed=speeds[i], coupling=coupling))
+    return RotorSum(tuple(rotors))
+
+
+class MomentumDumping(AbstractTorque):
+    """Magnetorquers that remove the momentum of the wheels: m = -k (B x h)/|B|^2, N = m x B.
+
+    h is the momentum of the wheels of the scene; the torque is -k times its part normal to the
+    field, and the wheels' control passes it on to them.
+
+    **Arguments:** ``k`` (...) [1/s], not negative; ``field`` and ``position``: as in
+    ``ph.MagneticDipole``; ``max_moment`` (...) [A m^2]: limit of each of three rods, or None.
+
+        unload = ph.MomentumDumping(1e-3, ph.DipoleField([0, 0, -7.8e22]), orbit, max_moment=0.5)
+
+    F. L. Markley and J. L. Crassidis, Fundamentals of Spacecraft Attitude Determination and
+    Control, 2014, section 7.5.2. Raises TypeError or ValueError for other arguments.
+    """
+
+    smooth: ClassVar[bool] = False  # the limit
+
+    dipole: MagneticDipole = shaped()
+    k: Float[Array, "*#b"] = shaped()
+    max_moment: Float[Array, "*#b"] | None = shaped()
+    momentum: Vector | None = None
+
+    def __init__(
+        self,
+        k: ArrayLike,
+        field: ArrayLike | Callable,
+        position: ArrayLike | Callable = (0.0, 0.0, 0.0),
+        max_moment: ArrayLike | None = None,
+    ):
+        self.k = as_positive("MomentumDumping k", k, zero=True)
+        self.dipole = MagneticDipole([0.0, 0.0, 0.0], field, position)
+        self.max_moment = None
+        if max_moment is not None:
+            self.max_moment = as_positive("MomentumDumping max_moment", max_moment)
+        self.momentum = None
+
+    def with_wheels(self, momentum: Sequence[Array]) -> AbstractTorque:
+        return eqx.tree_at(
+            lambda part: part.momentum, self, triple(momentum), is_leaf=lambda x: x is None
+        )
+
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
+        if self.momentum is None:
+            return triple([jnp.zeros_like(omega[0])] * 3)
+        field = self.dipole.field_body(t, attitude)
+        square = dot(field, field)
+        moment = triple(-self.k * x / square for x in cross(field, self.momentum))
+        if self.max_moment is not None:
+            moment = triple(jnp.clip(x, -self.max_moment, self.max_moment) for x in moment)
+        return cross(moment, field)
+
+
+class ControlMomentGyro(AbstractTorque):
+    """A single-gimbal control moment gyroscope: a wheel of constant momentum on a turning axis.
+
+    h(t) = momentum (cos(angle) spin + sin(angle) gimbal x spin) in body axes, and the torque on the
+    body is N = -dh/dt - omega x h. The momenta of a trajectory are those of the body without h.
+
+    **Arguments:** ``momentum`` (...) [kg m^2/s]: of the wheel; ``gimbal`` (..., 3): axis of the
+    gimbal, body axes; ``spin`` (..., 3): axis of the wheel at the angle zero, normal to the gimbal;
+    both are normalised; ``angle``: of the gimbal [rad], a function of time [s] that JAX can
+    differentiate, or a ``ph.Table``. The inertia of the gimbal is part of the body's and taken as
+    constant.
+
+        gyro = ph.ControlMomentGyro(2.0, [0, 0, 1.0], [1.0, 0, 0], lambda t: 0.3 * jnp.sin(t))
+
+    B. Wie, Space Vehicle Dynamics and Control, 2008, section 7.4. Raises ValueError for a spin axis
+    that is not normal to the gimbal, TypeError or ValueError for another function.
+    """
+
+    momentum: Float[Array, "*#b"] = shaped()
+    gimbal: Float[Array, "*#b 3"] = shaped(3)
+    spin: Float[Array, "*#b 3"] = shaped(3)
+    angle: Callable = shaped()
+
+    def __init__(self, momentum: ArrayLike, gimbal: ArrayLike, spin: ArrayLike, angle: Callable):
+        self.momentum = as_number("ControlMomentGyro momentum", momentum)
+        axes = []
+        for name, value in (("gimbal", gimbal), ("spin", spin)):
+            axis = as_float_array(f"ControlMomentGyro {name}", value, (3,))
+            axes.append(axis / jnp.sqrt(jnp.sum(axis**2, axis=-1, keepdims=True)))
+        self.gimbal, self.spin = axes
+        if is_concrete(self.gimbal, self.spin):
+            along = np.sum(np.asarray(self.gimbal) * np.asarray(self.spin), axis=-1)
+            require(
+                np.abs(along) < 1e-6,
+                f"the spin axis must be normal to the gimbal, got {spin} and {gimbal}.",
+            )
+        if isinstance(angle, AbstractPart) and callable(angle):
+            self.angle = angle
+        else:
+            self.angle = Signature("ControlMomentGyro angle", {"t": ()}).checked(angle)
+
+    def momentum_body(self, t: Array | float) -> Vector:
+        """h(t) as body components [kg m^2/s]."""
+        angle: Any = self.angle
+        if isinstance(angle, AbstractPart):
+            value = self.angle(t)
+        else:
+            value = Signature("ControlMomentGyro angle", {"t": ()}).mapped(angle, t)
+        spin, across = components(self.spin), cross(components(self.gimbal), components(self.spin))
+        c, s = self.momentum * jnp.cos(value), self.momentum * jnp.sin(value)
+        return triple(c * a + s * b for a, b in zip(spin, across))
+
+    def body_components(
+        self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
+    ) -> tuple[Array, Array, Array]:
+        t = jnp.asarray(t, omega[0].dtype)
+        h, change = jax.jvp(self.momentum_body, (t,), (jnp.ones_like(t),))
+        return triple(-a - b for a, b in zip(change, cross(omega, h)))

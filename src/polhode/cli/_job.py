@@ -22,7 +22,7 @@ from polhode.files import (
 )
 from polhode.files._read import escape, scene_errors
 from polhode.inertia import Inertia, VariableInertia
-from polhode.inertia._variable import inertia_at
+from polhode.inertia._inertia import inertia_at
 from polhode.plot._samples import Scale
 
 MEANINGS = {

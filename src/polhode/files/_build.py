@@ -22,7 +22,7 @@ from polhode.files._read import SceneFileError, did_you_mean, possible_moments, 
 from polhode.files._tables import AnySolid, Attitudes, TimeTable
 from polhode.files._values import MOMENTS, Table
 from polhode.inertia import Inertia, MassProperties, VariableInertia, compose
-from polhode.inertia._variable import inertia_at
+from polhode.inertia._inertia import inertia_at
 
 if TYPE_CHECKING:
     import diffrax

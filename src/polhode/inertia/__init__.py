@@ -2,6 +2,7 @@
 
 from polhode.inertia._inertia import (
     Inertia as Inertia,
+    VariableInertia as VariableInertia,
     angular_acceleration as angular_acceleration,
     required_torque as required_torque,
 )
@@ -12,8 +13,7 @@ from polhode.inertia._physical import (
     inertia_to_log_cholesky as inertia_to_log_cholesky,
     is_physical as is_physical,
     physical_margin as physical_margin,
+    principal as principal,
     second_moments as second_moments,
 )
-from polhode.inertia._principal import principal as principal
 from polhode.inertia._shapes import Symmetry as Symmetry
-from polhode.inertia._variable import VariableInertia as VariableInertia
