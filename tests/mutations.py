@@ -280,7 +280,7 @@ MUTANTS = (
         ("torques/test_rotors.py::test_a_wheel_against_newton",),
     ),
     Mutant(
-        "_scene/_wheels.py",
+        LAWS,
         "low = -self.max_torque * jnp.clip(1 + share, 0, 1)",
         "low = -self.max_torque * jnp.clip(1 - share, 0, 1)",
         "the braking torque of a motor falls with its speed",

@@ -1,7 +1,6 @@
 """What closed forms have in common: the abstract method, chunks of bodies, conditions on scenes."""
 
 import abc
-from collections.abc import Callable
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -38,36 +37,43 @@ class AbstractClosedForm(AbstractMethod):
             raise ValueError(f"ph.{type(self).__name__}: {objection}; leave method=None.")
 
 
-def run_in_chunks(
-    motion: Callable[[Scene, State, Array], tuple[Array | None, Array, Array]],
-    size: Callable[[int, int], int],
-    scene: Scene,
-    state: State,
-    ts: Array,
-    record: Record,
-) -> Samples:
-    """Samples of ``motion(scene, state, elapsed)``, ``size(bodies, samples)`` bodies at a time.
+class AbstractChunkedForm(AbstractClosedForm):
+    """A closed form that is evaluated for chunks of bodies, all samples of a body at once."""
 
-    ``motion`` returns wxyz (N, T, 4), omega (N, T, 3) and for which bodies (N,) it holds.
-    """
-    count = 1 if record.final_only else ts.shape[-1] - 1
-    lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
+    @abc.abstractmethod
+    def motion(
+        self, scene: Scene, state: State, elapsed: Array
+    ) -> tuple[Array | None, Array, Array]:
+        """wxyz (N, T, 4), omega_body (N, T, 3), and for which bodies (N,) the solution holds.
 
-    def of_chunk(chunk):
-        lanes, times = chunk
-        scene, state = eqx.combine(lanes, shared)
-        times = ts if times is None else times
-        saved = times[..., -1:] if record.final_only else times[..., 1:]  # the first is the state
-        elapsed = saved - times[..., :1]
-        n = state.wxyz.shape[0]
-        elapsed = jnp.broadcast_to(elapsed if elapsed.ndim == 2 else elapsed[None], (n, count))
-        wxyz, omega, holds = motion(scene, state, elapsed)
-        if not record.final_only:
-            wxyz, omega = with_first(state, wxyz, omega)
-        return _samples(wxyz, omega, holds, record)
+        ``elapsed`` (N, T) [s]: since ``state``.
+        """
 
-    n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
-    return map_chunks(of_chunk, (lanes, times), n, size(n, count))
+    @abc.abstractmethod
+    def chunk_size(self, n: int, count: int) -> int:
+        """Bodies of a chunk, for ``n`` bodies of ``count`` samples each."""
+
+    def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
+        del rtol
+        self.refuse(scene)
+        count = 1 if record.final_only else ts.shape[-1] - 1
+        lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
+
+        def of_chunk(chunk):
+            lanes, times = chunk
+            scene, state = eqx.combine(lanes, shared)
+            times = ts if times is None else times
+            saved = times[..., -1:] if record.final_only else times[..., 1:]  # the first: the state
+            elapsed = saved - times[..., :1]
+            n = state.wxyz.shape[0]
+            elapsed = jnp.broadcast_to(elapsed if elapsed.ndim == 2 else elapsed[None], (n, count))
+            wxyz, omega, holds = self.motion(scene, state, elapsed)
+            if not record.final_only:
+                wxyz, omega = with_first(state, wxyz, omega)
+            return _samples(wxyz, omega, holds, record)
+
+        n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
+        return map_chunks(of_chunk, (lanes, times), n, self.chunk_size(n, count))
 
 
 def bodies_per_chunk(chunk: int | None, n: int, count: int) -> int:

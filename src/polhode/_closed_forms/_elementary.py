@@ -9,11 +9,10 @@ from polhode import _policy, rotation
 from polhode._closed_forms._closed_form import (
     NOT_AXIAL,
     NOT_PRINCIPAL,
-    AbstractClosedForm,
+    AbstractChunkedForm,
     as_lanes,
     axial_state,
     bodies_per_chunk,
-    run_in_chunks,
     symmetry_objection,
     torque_and_damping,
     torque_objection,
@@ -21,12 +20,11 @@ from polhode._closed_forms._closed_form import (
     wheels_have_constant_momentum,
 )
 from polhode._kernels import derivable_once
-from polhode._method import Record, Samples
-from polhode._scene import Scene, State, Wheels
+from polhode._scene import Scene, Wheels
 from polhode.rotation import multiply, rotation_vector_to_wxyz
 
 
-class SymmetricTop(AbstractClosedForm):
+class SymmetricTop(AbstractChunkedForm):
     """A symmetric body without potential, in elementary functions: exact.
 
     Constant torque about the axis of symmetry (body z), linear damping symmetric about it and
@@ -48,15 +46,10 @@ class SymmetricTop(AbstractClosedForm):
             return NOT_AXIAL
         return torque_objection(scene) or (None if scene.inertia.is_principal else NOT_PRINCIPAL)
 
-    def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
-        del rtol
-        self.refuse(scene)
-        return run_in_chunks(self._motion, self._size, scene, state, ts, record)
-
-    def _size(self, n: int, count: int) -> int:
+    def chunk_size(self, n: int, count: int) -> int:
         return bodies_per_chunk(self.chunk, n, count)
 
-    def _motion(self, scene, state, elapsed):
+    def motion(self, scene, state, elapsed):
         n = state.wxyz.shape[0]
         transverse, moments, axial = axial_state(scene, state)
         torque, damping = (as_lanes(x, n, 1) for x in torque_and_damping(scene))
@@ -101,7 +94,7 @@ def _equal(a: Array, b: Array) -> Array:
     return jnp.abs(a - b) <= 4 * jnp.finfo(a.dtype).eps * jnp.abs(a)
 
 
-class FixedAxis(AbstractClosedForm):
+class FixedAxis(AbstractChunkedForm):
     """Rotation about a fixed principal axis, driven and damped, in closed form.
 
     All rates but one are zero at the start, the constant body torques lie along that axis and the
@@ -123,15 +116,10 @@ class FixedAxis(AbstractClosedForm):
             return NOT_PRINCIPAL
         return torque_objection(scene)
 
-    def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
-        del rtol
-        self.refuse(scene)
-        return run_in_chunks(self._motion, self._size, scene, state, ts, record)
-
-    def _size(self, n: int, count: int) -> int:
+    def chunk_size(self, n: int, count: int) -> int:
         return bodies_per_chunk(self.chunk, n, count)
 
-    def _motion(self, scene, state, elapsed):
+    def motion(self, scene, state, elapsed):
         n = state.wxyz.shape[0]
         torque, damping = (as_lanes(x, n, 1) for x in torque_and_damping(scene))
         moments = as_lanes(scene.inertia.moments, n, 1)

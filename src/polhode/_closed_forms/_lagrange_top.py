@@ -36,11 +36,10 @@ from polhode import _policy, rotation
 from polhode._closed_forms._closed_form import (
     NOT_AXIAL,
     NOT_PRINCIPAL,
-    AbstractClosedForm,
+    AbstractChunkedForm,
     as_lanes,
     axial_state,
     bodies_per_chunk,
-    run_in_chunks,
     symmetry_objection,
     wheel_objection,
     wheels_have_constant_momentum,
@@ -50,11 +49,10 @@ from polhode._closed_forms._lagrange_curve import cayley_klein, lagrange_constan
 from polhode._closed_forms._lagrange_series import Complex, Series
 from polhode._hamiltonian import components
 from polhode._kernels import any_of, derivable_once, kernel, opaque_ones, spread, staged
-from polhode._method import Record, Samples
-from polhode._scene import Scene, State, UniformGravity, Wheels
+from polhode._scene import Scene, UniformGravity, Wheels
 
 
-class LagrangeTop(AbstractClosedForm):
+class LagrangeTop(AbstractChunkedForm):
     """Lagrange's top in theta functions, O(1) in time: exact.
 
     A body symmetric about body z (``ph.Inertia.axisymmetric``) turning about a point of that axis
@@ -89,19 +87,14 @@ class LagrangeTop(AbstractClosedForm):
             return NOT_AXIAL
         return None
 
-    def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
-        del rtol
-        self.refuse(scene)
-        return run_in_chunks(self._motion, self._size, scene, state, ts, record)
-
-    def _size(self, n: int, count: int) -> int:
+    def chunk_size(self, n: int, count: int) -> int:
         if self.chunk is not None:
             return bodies_per_chunk(self.chunk, n, count)
         if n * count <= _policy.TOP_WHOLE:
             return n
         return max(1, min(_policy.TOP_BODIES, _policy.TOP_CHUNK // count))
 
-    def _motion(self, scene, state, elapsed):
+    def motion(self, scene, state, elapsed):
         n = state.wxyz.shape[0]
         transverse, moments, axial = axial_state(scene, state)
         gravity: Any = scene.potential

@@ -1,4 +1,4 @@
-"""Solves between given times: from edge to edge of pulses, and of one step without diffrax's loop."""
+"""Solves from edge to edge of pulses, and solves of one step without the loop of diffrax."""
 
 import dataclasses
 from collections.abc import Callable

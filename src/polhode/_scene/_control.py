@@ -190,7 +190,69 @@ class DipoleField(eqx.Module):
         return 1e-7 * (3 * n * jnp.sum(n * self.moment) - self.moment) / size**3
 
 
-_COMMAND = Signature("wheel_cluster command", {"t": (), "wxyz": (4,), "omega_body": (3,)}, (3,))
+_MOTOR_COMMAND = Signature("Motor", {"t": (), "wxyz": (4,), "omega_body": (3,), "speed": ()})
+
+
+class Motor(AbstractCoupling):
+    """A motor between body and wheel, with limits of torque and speed.
+
+    **Arguments:** ``command``: torque on the wheel about its axis [N m], a number (...) or a
+    function ``fn(t, wxyz, omega_body, speed)`` of one body, the wheel's speed [rad/s] relative to
+    it; ``max_torque`` (...) [N m], positive: it gives no more than that; ``max_speed`` (...)
+    [rad/s], positive: the accelerating torque falls linearly to zero there (the line of a DC
+    motor); the braking torque does not. The speed needs the torque.
+
+    A wheel that controls the attitude, with friction in its bearing:
+
+        def hold(t, wxyz, omega_body, speed):       # the body takes the reaction
+            return 0.4 * wxyz[1] * jnp.sign(wxyz[0]) + 0.5 * omega_body[0]
+
+        motor = ph.Motor(hold, max_torque=0.1, max_speed=600.0) + ph.ViscousCoupling(1e-5)
+        wheel = ph.Rotor([1.0, 0.0, 0.0], inertia=1e-3, speed=0.0, coupling=motor)
+
+    Raises TypeError or ValueError for other numbers, or a function that takes or returns something
+    else.
+    """
+
+    command: Float[Array, "*#b"] | Callable = shaped()
+    max_torque: Float[Array, "*#b"] | None = shaped()
+    max_speed: Float[Array, "*#b"] | None = shaped()
+
+    def __init__(
+        self,
+        command: ArrayLike | Callable,
+        max_torque: ArrayLike | None = None,
+        max_speed: ArrayLike | None = None,
+    ):
+        if callable(command):
+            self.command = _MOTOR_COMMAND.checked(command)
+        else:
+            self.command = as_number("Motor command", command)
+        for name, value in (("max_torque", max_torque), ("max_speed", max_speed)):
+            setattr(self, name, None if value is None else as_positive(f"Motor {name}", value))
+        if max_speed is not None and max_torque is None:
+            raise ValueError("Motor max_speed needs max_torque, the torque that falls with it.")
+
+    def torque(
+        self, t: Array | float, speed: Array, attitude: Attitude, omega: Sequence[Array]
+    ) -> Array:
+        torque = self.command
+        if callable(torque):
+            arguments = t, stacked(attitude.wxyz), stacked(omega), speed
+            torque = _MOTOR_COMMAND.mapped(torque, *arguments)
+        if self.max_torque is None:
+            return torque
+        low, high = -self.max_torque, self.max_torque
+        if self.max_speed is not None:
+            share = speed / self.max_speed
+            high = self.max_torque * jnp.clip(1 - share, 0, 1)
+            low = -self.max_torque * jnp.clip(1 + share, 0, 1)
+        return jnp.clip(torque, low, high)
+
+
+_CLUSTER_COMMAND = Signature(
+    "wheel_cluster command", {"t": (), "wxyz": (4,), "omega_body": (3,)}, (3,)
+)
 
 
 class _ClusterMotor(AbstractCoupling):
@@ -205,27 +267,19 @@ class _ClusterMotor(AbstractCoupling):
     first: int = eqx.field(static=True)
     max_torque: Float[Array, "*#b"] | None = shaped()
 
-    def torque(
-        self, t: Array | float, speed: Array, attitude: Attitude, omega: Sequence[Array]
-    ) -> Array:
-        given = t, stacked(attitude.wxyz), stacked(omega)
-        wanted = components(_COMMAND.mapped(self.command, *given))
-        return self._limited(-dot(components(self.share), wanted))
+    def torque(self, t, speed, attitude, omega):
+        return self._limited(self._commanded(t, attitude, omega))
 
-    def torque_among(
-        self,
-        t: Array | float,
-        i: int,
-        speed_of: Callable[[int], Array],
-        attitude: Attitude,
-        omega: Sequence[Array],
-    ) -> Array:
-        given = t, stacked(attitude.wxyz), stacked(omega)
-        total = -dot(components(self.share), components(_COMMAND.mapped(self.command, *given)))
+    def torque_among(self, t, i, speed_of, attitude, omega):
+        total = self._commanded(t, attitude, omega)
         for j in range(self.null.shape[-1]):
             excess = speed_of(self.first + j) - self.bias[j]
             total = total - self.null[j] * excess
         return self._limited(total)
+
+    def _commanded(self, t, attitude: Attitude, omega: Sequence[Array]) -> Array:
+        command = _CLUSTER_COMMAND.mapped(self.command, t, stacked(attitude.wxyz), stacked(omega))
+        return -dot(components(self.share), components(command))
 
     def _limited(self, torque: Array) -> Array:
         if self.max_torque is None:
@@ -279,7 +333,7 @@ def wheel_cluster(
         for name, value in (("inertia", inertia), ("speed", speed), ("bias", bias))
     )
     gain = as_number("wheel_cluster null_gain", null_gain)
-    law = _COMMAND.checked(command)
+    law = _CLUSTER_COMMAND.checked(command)
     # u = -A^+ N exerts N = -A u; rows of 1 - A^+ A are motions of the wheels without a torque.
     # Momenta, not speeds, have to cancel: the projector acts on J times the speeds.
     inverse = jnp.linalg.solve(directions.T @ directions, directions.T).T

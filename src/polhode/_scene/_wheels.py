@@ -33,7 +33,6 @@ from polhode._checks import (
 )
 from polhode._hamiltonian import Attitude, Vector, dot, triple
 from polhode._parts import AbstractPart, AbstractSum, Signature, shaped, terms_of
-from polhode._scene._torques import stacked
 from polhode.inertia import Inertia, Symmetry
 
 # What acts between a wheel and the body about the wheel's axis: motors, friction, dampers. The
@@ -137,66 +136,6 @@ class CoulombFriction(AbstractCoupling):
         self, t: Array | float, speed: Array, attitude: Attitude, omega: Sequence[Array]
     ) -> Array:
         return -self.size * jnp.tanh(speed / self.speed)
-
-
-_COMMAND = Signature("Motor", {"t": (), "wxyz": (4,), "omega_body": (3,), "speed": ()})
-
-
-class Motor(AbstractCoupling):
-    """A motor between body and wheel, with limits of torque and speed.
-
-    **Arguments:** ``command``: torque on the wheel about its axis [N m], a number (...) or a
-    function ``fn(t, wxyz, omega_body, speed)`` of one body, the wheel's speed [rad/s] relative to
-    it; ``max_torque`` (...) [N m], positive: it gives no more than that; ``max_speed`` (...)
-    [rad/s], positive: the accelerating torque falls linearly to zero there (the line of a DC
-    motor); the braking torque does not. The speed needs the torque.
-
-    A wheel that controls the attitude, with friction in its bearing:
-
-        def hold(t, wxyz, omega_body, speed):       # the body takes the reaction
-            return 0.4 * wxyz[1] * jnp.sign(wxyz[0]) + 0.5 * omega_body[0]
-
-        motor = ph.Motor(hold, max_torque=0.1, max_speed=600.0) + ph.ViscousCoupling(1e-5)
-        wheel = ph.Rotor([1.0, 0.0, 0.0], inertia=1e-3, speed=0.0, coupling=motor)
-
-    Raises TypeError or ValueError for other numbers, or a function that takes or returns something
-    else.
-    """
-
-    command: Float[Array, "*#b"] | Callable = shaped()
-    max_torque: Float[Array, "*#b"] | None = shaped()
-    max_speed: Float[Array, "*#b"] | None = shaped()
-
-    def __init__(
-        self,
-        command: ArrayLike | Callable,
-        max_torque: ArrayLike | None = None,
-        max_speed: ArrayLike | None = None,
-    ):
-        if callable(command):
-            self.command = _COMMAND.checked(command)
-        else:
-            self.command = as_number("Motor command", command)
-        for name, value in (("max_torque", max_torque), ("max_speed", max_speed)):
-            setattr(self, name, None if value is None else as_positive(f"Motor {name}", value))
-        if max_speed is not None and max_torque is None:
-            raise ValueError("Motor max_speed needs max_torque, the torque that falls with it.")
-
-    def torque(
-        self, t: Array | float, speed: Array, attitude: Attitude, omega: Sequence[Array]
-    ) -> Array:
-        wanted = self.command
-        if callable(wanted):
-            given = t, stacked(attitude.wxyz), stacked(omega), speed
-            wanted = _COMMAND.mapped(wanted, *given)
-        if self.max_torque is None:
-            return wanted
-        low, high = -self.max_torque, self.max_torque
-        if self.max_speed is not None:
-            share = speed / self.max_speed
-            high = self.max_torque * jnp.clip(1 - share, 0, 1)
-            low = -self.max_torque * jnp.clip(1 + share, 0, 1)
-        return jnp.clip(wanted, low, high)
 
 
 # All wheels of a scene.

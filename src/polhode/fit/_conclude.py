@@ -258,27 +258,16 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
     axes_std = turn_std(moments, spread[6:])
 
     std = _split(_deviations(determination, linear.shared.shape[-1]), count, parameters)
-    parts = residuals_by_channel(linear, recording)
-    whiteness = whiteness_of(linear.rest, recording.present)
     trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
-    finite = jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(tensor))
-    diagnostics = combine_flags(
-        {
-            Finding.STEP_LIMIT: ~solution.stopped,
-            Finding.NOT_FINITE: ~finite,
-            # the least of the second moments
-            Finding.NEARLY_FLAT: trace / 2 - moments[2] < 1e-4 * trace,
-            Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread[3:6])),
-            Finding.NOT_WHITE: whiteness < 1e-4,
-            Finding.WEAK: jnp.any(spread[3:6] > 0.05),
-            Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
-            Finding.AXES_DISAGREE: _axes_disagree(recording, options),
-            Finding.SATURATED: is_saturated(recording),
-            Finding.CALIBRATION: _calibration_strained(solution, recording),
-            Finding.OUTLIERS: has_outliers(linear.rest, recording, options.robust),
-        }
-    )
-    body = InertiaEstimate(
+    findings = {
+        Finding.NOT_FINITE: ~(jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(tensor))),
+        # the smallest of the second moments
+        Finding.NEARLY_FLAT: trace / 2 - moments[2] < 1e-4 * trace,
+        Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread[3:6])),
+        Finding.WEAK: jnp.any(spread[3:6] > 0.05),
+        Finding.AXES_DISAGREE: _axes_disagree(recording, options),
+    }
+    inertia = InertiaEstimate(
         inertia=Inertia(full=tensor),
         moments=moments,
         axes=axes,
@@ -289,25 +278,16 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
         scale_known=model.scale_known,
         handedness_known=recording.wxyz is not None,
     )
-    return Fit(
+    return _fit_of(
+        solution,
+        recording,
+        options,
+        determination,
+        findings,
         values=[tensor, *jax.tree.leaves(parameters.motion)],
-        std=[symmetric_std(std.entries), *std.motion],
-        sensor=_sensor(parameters, solution.model.gyroscope),
+        values_std=[symmetric_std(std.entries), *std.motion],
         sensor_std=std.sensor,
-        initial=_initial(parameters, recording, None),
-        information=information,
-        covariance=covariance,
-        null_count=determination.null_count,
-        noise=determination.noise,
-        whiteness=whiteness,
-        rms=_rms(parts, recording),
-        diagnostics=diagnostics,
-        steps=solution.steps,
-        attempts=solution.attempts,
-        residuals=parts,
-        parameters=parameters,
-        model=model,
-        _inertia=body,
+        inertia=inertia,
     )
 
 
@@ -317,28 +297,54 @@ def conclude_scene(solution: Solution, recording: Recording, options: FitOptions
     determination = determination_of(solution, recording, noise_is_trusted(options))
     spread = _deviations(determination, linear.shared.shape[-1])
     std = _split(spread, 0, parameters)
+    findings = {
+        Finding.NOT_FINITE: ~(jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(linear.at))),
+        Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread)),
+        Finding.AT_BOUND: solution.model.motion.at_bound(parameters.motion),
+    }
+    return _fit_of(
+        solution,
+        recording,
+        options,
+        determination,
+        findings,
+        values=list(parameters.motion),
+        values_std=std.motion,
+        sensor_std=std.sensor,
+        attitude=getattr(options.motion, "attitude", None),
+    )
+
+
+def _fit_of(
+    solution: Solution,
+    recording: Recording,
+    options: FitOptions,
+    determination: Determination,
+    findings: dict[Finding, Array],
+    *,
+    values: list[Array],
+    values_std: list[Array],
+    sensor_std: dict[str, Array],
+    attitude: Any = None,
+    inertia: InertiaEstimate | None = None,
+) -> Fit:
+    """The result, with the ``findings`` of its kind and those that all fits share."""
+    linear, parameters, model = solution.linear, solution.parameters, solution.model
     parts = residuals_by_channel(linear, recording)
     whiteness = whiteness_of(linear.rest, recording.present)
-    finite = jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(linear.at))
-    diagnostics = combine_flags(
-        {
-            Finding.STEP_LIMIT: ~solution.stopped,
-            Finding.NOT_FINITE: ~finite,
-            Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread)),
-            Finding.AT_BOUND: solution.model.motion.at_bound(parameters.motion),
-            Finding.NOT_WHITE: whiteness < 1e-4,
-            Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
-            Finding.SATURATED: is_saturated(recording),
-            Finding.CALIBRATION: _calibration_strained(solution, recording),
-            Finding.OUTLIERS: has_outliers(linear.rest, recording, options.robust),
-        }
-    )
-    attitude = getattr(options.motion, "attitude", None)
+    findings = findings | {
+        Finding.STEP_LIMIT: ~solution.stopped,
+        Finding.NOT_WHITE: whiteness < 1e-4,
+        Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
+        Finding.SATURATED: is_saturated(recording),
+        Finding.CALIBRATION: _calibration_strained(solution, recording),
+        Finding.OUTLIERS: has_outliers(linear.rest, recording, options.robust),
+    }
     return Fit(
-        values=list(parameters.motion),
-        std=std.motion,
-        sensor=_sensor(parameters, solution.model.gyroscope),
-        sensor_std=std.sensor,
+        values=values,
+        std=values_std,
+        sensor=_sensor(parameters, model.gyroscope),
+        sensor_std=sensor_std,
         initial=_initial(parameters, recording, attitude),
         information=determination.information,
         covariance=determination.covariance,
@@ -346,12 +352,13 @@ def conclude_scene(solution: Solution, recording: Recording, options: FitOptions
         noise=determination.noise,
         whiteness=whiteness,
         rms=_rms(parts, recording),
-        diagnostics=diagnostics,
+        diagnostics=combine_flags(findings),
         steps=solution.steps,
         attempts=solution.attempts,
         residuals=parts,
         parameters=parameters,
-        model=solution.model,
+        model=model,
+        _inertia=inertia,
     )
 
 
