@@ -6,7 +6,7 @@ import pytest
 import polhode as ph
 from benchmarks.light_curves import directions
 from polhode import lightcurve
-from polhode.lightcurve import _brightness, _fit, _nulls, _solutions
+from polhode.lightcurve import _brightness, _convex, _nulls, _solutions, _verdict
 
 Verdict = lightcurve.Verdict
 PHASE = lightcurve.SeeligerPhase()
@@ -68,13 +68,13 @@ def cases():
     for name, light in (("noise", flat), ("rotator", rotating), ("tumbler", tumbling)):
         curve = curve_of(light)
         pairs = pairs_of(curve)
-        out[name] = curve, pairs, *_fit.null_models(curve, pairs, 0.02, PHASE)
+        out[name] = curve, pairs, *_verdict.null_models(curve, pairs, 0.02, PHASE)
     return out
 
 
 def verdict(case, *solutions, reproduced=True):
     _, pairs, linear, nulls = case
-    return _fit.judge(linear, nulls, pairs, solutions, reproduced=reproduced, limit=3.0)
+    return _verdict.judge(linear, nulls, pairs, solutions, reproduced=reproduced, limit=3.0)
 
 
 def offset_free(case, light):
@@ -182,7 +182,7 @@ def test_periods_that_a_few_nights_decide_are_ambiguous(cases):
     noise = NOISE * rng.normal(size=curve.t.size)
     other = np.where(curve.group == 3, model + 2 * noise, model + 0.05 * noise)
     rival = solution(other, P_psi=1.1 * P_PSI, odds=1e-4)
-    agreement = _fit.bootstrap_agreement(
+    agreement = _verdict.bootstrap_agreement(
         curve, linear.root, (solution(model), rival), [0, 1], limit=3.0
     )
     assert agreement < 0.9
@@ -200,7 +200,7 @@ def test_refits_of_resampled_curves_are_weighted_least_squares():
     best = -np.linalg.solve(derivatives.T @ derivatives + prior, derivatives.T @ data)
     solution = _solutions.Linearised(data + derivatives @ best, derivatives, prior, prior @ best)
     weight = rng.multinomial(6, np.full(6, 1 / 6), 20).astype(float)
-    cost = _fit._refitted_cost(solution, block, weight, 1.0, 1e6)
+    cost = _verdict._refitted_cost(solution, block, weight, 1.0, 1e6)
     at_best = best @ prior @ best
     for k in range(20):
         rows = np.sqrt(weight[k][block])[:, None]
@@ -220,8 +220,8 @@ def test_a_refit_gains_nothing_by_offsets_without_points_or_by_ending_early():
     none = np.zeros((8, 8)), np.zeros(8)
     weight = np.vstack([np.ones(6), [0, 2, 1, 1, 1, 1]]).astype(float)
     solution = _solutions.Linearised(residuals, derivatives, *none)
-    cost = _fit._refitted_cost(solution, block, weight, 1.0, 3.0)
-    everything = _fit._robust_cost(residuals, 3.0).sum()
+    cost = _verdict._refitted_cost(solution, block, weight, 1.0, 3.0)
+    everything = _verdict._robust_cost(residuals, 3.0).sum()
     assert cost[0] == pytest.approx(everything)
     assert abs(cost[1] / everything - 1) < 0.3
 
@@ -245,12 +245,12 @@ def test_periods_that_win_in_few_refits_are_ambiguous(cases):
             )
             for s in (best, other)
         ]
-        agreement = _fit.bootstrap_agreement(
+        agreement = _verdict.bootstrap_agreement(
             curve, linear.root, (best, other), [0, 1], 3.0, linearised
         )
-        assert (agreement >= _fit._AGREEMENT) == certain
+        assert (agreement >= _verdict._AGREEMENT) == certain
         _, pairs, linear, nulls = case
-        found = _fit.judge(
+        found = _verdict.judge(
             linear, nulls, pairs, (best, other), reproduced=True, limit=3.0, linearised=linearised
         )
         assert (found.verdict is Verdict.TUMBLING) == certain
@@ -271,7 +271,7 @@ def test_solutions_that_are_excluded_are_not_fitted_again(cases):
             _solutions.Linearised(residuals, 0 * derivatives, *none),
             _solutions.Linearised(residuals, derivatives, *none),
         ]
-        agreement = _fit.bootstrap_agreement(
+        agreement = _verdict.bootstrap_agreement(
             curve, linear.root, (best, far), [0, 1], 3.0, linearised
         )
         assert (agreement > 0.9) == certain
@@ -294,7 +294,7 @@ def test_a_mode_that_the_shape_decides_is_ambiguous(cases):
     body = solution(offset_free(cases["tumbler"], tumbling))
     other = body._replace(mode=ph.Mode.SAM, model=body.model + 1e-3)
     for ellipsoid, expected in ((body, Verdict.TUMBLING), (other, Verdict.AMBIGUOUS)):
-        found = _fit.judge(
+        found = _verdict.judge(
             linear, nulls, pairs, (body,), reproduced=True, limit=3.0, others=(ellipsoid,)
         )
         assert found.verdict is expected
@@ -302,7 +302,7 @@ def test_a_mode_that_the_shape_decides_is_ambiguous(cases):
     # unless convex bodies with the motion of the ellipsoid are excluded by far
     for odds, expected in ((1e-5, Verdict.AMBIGUOUS), (1e-8, Verdict.TUMBLING)):
         rival = other._replace(probability=odds, model=body.model + 0.1)
-        found = _fit.judge(
+        found = _verdict.judge(
             linear, nulls, pairs, (body, rival), reproduced=True, limit=3.0, others=(other,)
         )
         assert found.verdict is expected
@@ -311,8 +311,8 @@ def test_a_mode_that_the_shape_decides_is_ambiguous(cases):
 def test_fourteen_points_are_too_few():
     curve = curve_of(tumbling, nights=2, days=4, each=7)
     pairs = pairs_of(curve)
-    linear, nulls = _fit.null_models(curve, pairs, 0.02, PHASE)
-    found = _fit.judge(
+    linear, nulls = _verdict.null_models(curve, pairs, 0.02, PHASE)
+    found = _verdict.judge(
         linear, nulls, pairs, (solution(curve.magnitude),), reproduced=True, limit=3.0
     )
     assert found.verdict is Verdict.TOO_FEW_POINTS
@@ -341,7 +341,7 @@ def test_the_rotating_ellipsoid_is_found_with_its_geometry():
     assert rest.periods[0] == pytest.approx(period, rel=1e-4)
     assert np.std(rest.values) < 0.0105
     # and with harmonics it still rotates about one axis, with more parameters
-    body = _solutions.rotating_body(linear, ellipsoid, curve.points(0.0, 0.02), PHASE, 3.0)
+    body = _convex.rotating_body(linear, ellipsoid, curve.points(0.0, 0.02), PHASE, 3.0)
     assert np.std(body.values) < 1.01 * np.std(rest.values)
     np.testing.assert_array_equal(body.body.unknowns[0, 4:6], 0.0)
     assert 2 * np.pi / body.body.unknowns[0, 6] == pytest.approx(period, rel=1e-4)
@@ -424,23 +424,23 @@ def test_derivatives_of_convex_bodies(convex_case):
     curve, body, _ = convex_case
     points = curve.points(0.0, 0.02)
     normals = lightcurve.Convex.from_ellipsoid(np.ones(3), 200).normals
-    rows = lightcurve.harmonics(normals, _solutions.DEGREE)[1:]
+    rows = lightcurve.harmonics(normals, _convex.DEGREE)[1:]
     known = (normals, 1.0 + normals[:, 0] ** 2, rows)
-    coefficients = 0.05 * np.random.default_rng(0).normal(size=_solutions.HARMONICS)
-    _, motion, shape, open_area, by_open = _solutions._light(body, coefficients, points, known)
+    coefficients = 0.05 * np.random.default_rng(0).normal(size=_convex.HARMONICS)
+    _, motion, shape, open_area, by_open = _convex._light(body, coefficients, points, known)
     size = 1e-6
 
     def value(step, more):
         change = np.zeros((1, body.unknowns.shape[1] + 3))
-        change[0, _solutions._MOTION], change[0, -3:] = step[:5], step[5:]
+        change[0, _convex._MOTION], change[0, -3:] = step[:5], step[5:]
         turned = ph.rotation.rotation_vector_to_wxyz(change[:, -3:])
         moved = _brightness.Bodies(
             body.unknowns + change[:, :-3], ph.rotation.multiply(turned, body.wxyz)
         )
-        out = _solutions._light(moved, coefficients + more, points, known)
+        out = _convex._light(moved, coefficients + more, points, known)
         return np.asarray(out[0]), np.asarray(out[3])
 
-    none = np.zeros(_solutions.HARMONICS)
+    none = np.zeros(_convex.HARMONICS)
     for k in range(8):
         e = size * np.eye(8)[k]
         measured = (value(e, none)[0] - value(-e, none)[0]) / (2 * size)
@@ -450,7 +450,7 @@ def test_derivatives_of_convex_bodies(convex_case):
         assert np.median(off) < 1e-6
         assert np.quantile(off, 0.95) < 1e-2
     for k in (0, 5, 20):
-        e = size * np.eye(_solutions.HARMONICS)[k]
+        e = size * np.eye(_convex.HARMONICS)[k]
         ends = [value(np.zeros(8), x) for x in (e, -e)]
         measured, opened = ((a - b) / (2 * size) for a, b in zip(*ends, strict=True))
         np.testing.assert_allclose(shape[:, k], measured, atol=1e-6)
@@ -471,7 +471,7 @@ def test_a_convex_shape_leaves_the_noise_and_periods_within_their_errors(convex_
     near = start._replace(
         wxyz=np.asarray(ph.rotation.multiply(np.array([1.0, 0.01, 0.01, 0]), start.wxyz))
     )
-    found, scale, alike, linearised = _solutions.refined_solutions(
+    found, scale, alike, linearised = _convex.refined_solutions(
         (start, near), linear, curve.points(0.0, 0.02), phase, 3.0
     )
     assert len(found) == len(linearised) == 1

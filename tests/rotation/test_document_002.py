@@ -7,7 +7,7 @@ import pytest
 
 import polhode.rotation as rotation
 from polhode._hamiltonian import _reference as document
-from polhode.rotation._euler import euler_to_matrix_k
+from polhode.rotation._conversions import euler_to_matrix_k
 
 # theory section 8.2: angles, rotation angle, axis of K, quaternion of K
 TRUTH = [

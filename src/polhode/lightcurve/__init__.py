@@ -18,7 +18,7 @@ from polhode.lightcurve._command import (
     table as table,
 )
 from polhode.lightcurve._data import LightCurve as LightCurve, read_light_curve as read_light_curve
-from polhode.lightcurve._fit import Verdict as Verdict, fit_light_curve as fit_light_curve
+from polhode.lightcurve._fit import fit_light_curve as fit_light_curve
 from polhode.lightcurve._frequencies import (
     Pairs as Pairs,
     fourier_lattices as fourier_lattices,
@@ -27,3 +27,4 @@ from polhode.lightcurve._frequencies import (
 )
 from polhode.lightcurve._nulls import Model as Model
 from polhode.lightcurve._solutions import LightCurveFit as LightCurveFit, Solution as Solution
+from polhode.lightcurve._verdict import Verdict as Verdict

@@ -1,4 +1,4 @@
-"""Solutions of a light curve, their uncertainties, and their refinement with a convex shape."""
+"""Solutions of a light curve, their uncertainties, and what it cannot show of them."""
 
 from collections.abc import Sequence
 from os import PathLike
@@ -14,22 +14,15 @@ from polhode._closed_forms import Mode, free_motion, principal_periods
 from polhode.lightcurve._brightness import (
     AbstractPhase,
     Bodies,
-    Convex,
-    Points,
-    _cross,
-    _to_body,
-    apply_step,
-    attitudes,
-    harmonics,
     moments_of,
 )
 from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._frequencies import LAM, SAM, Hypotheses, Pairs, sum_name
-from polhode.lightcurve._nulls import Linear, Model
+from polhode.lightcurve._nulls import Model
 from polhode.lightcurve._search import BATCH, Problem, State, normal_equations, select
 
 if TYPE_CHECKING:
-    from polhode.lightcurve._fit import Verdict
+    from polhode.lightcurve._verdict import Verdict
 
 # What a light curve tells of each body that explains it, and what it cannot tell.
 
@@ -294,13 +287,13 @@ def describe_solutions(
                 robust[k],
                 mirror[0] if mirror else None,
                 epoch=float(curve.t[0]),
-                covariance=_of_periods(spread, f_phi[k], f_psi[k]),
+                covariance=covariance_of_periods(spread, f_phi[k], f_psi[k]),
             )
         )
     return Described(tuple(out), scale, alike, linearised)
 
 
-def _of_periods(covariance: np.ndarray, f_phi: float, f_psi: float) -> np.ndarray:
+def covariance_of_periods(covariance: np.ndarray, f_phi: float, f_psi: float) -> np.ndarray:
     """A covariance of ln P_phi, ln P_psi, ... as one of the periods themselves."""
     size = np.r_[1 / f_phi, 1 / f_psi, np.ones(len(covariance) - 2)]
     return covariance * size * size[:, None]
@@ -444,254 +437,7 @@ def notes_on_groups(curve: LightCurve, residuals: np.ndarray, alike: float) -> t
     return tuple(notes)
 
 
-# Bodies refined with a convex shape: an ellipsoid's surface density times spherical harmonics.
-#
-# An ellipsoid fitted to a body of another shape biases the periods by several of its own standard
-# errors and leaves correlated residuals. With a free convex shape both are those of the noise.
-
-DEGREE = 6
-HARMONICS = (DEGREE + 1) ** 2 - 1  # a constant factor is an offset
-_FACETS = 800
-# Standard deviations known before: of each coefficient, of the sum of areas times normals over the
-# area, and of the logarithms of the axes of the inertia about those of the ellipsoid fitted.
-_HARMONIC_SIGMA, _CLOSED_SIGMA, _INERTIA_SIGMA = 0.3, 0.02, 0.25
-_STEPS, _ENDING = 25, 1e-3
-_MOTION = np.array([0, 1, 4, 5, 6])  # unknowns of a body that are no shape or phase function
-
-
-class Refined(NamedTuple):
-    """A body with a convex shape."""
-
-    body: Bodies  # one, (1, ...)
-    coefficients: np.ndarray  # (k,) of the harmonics, l from 1 on
-    chi2: float  # of the points, by their own errors, robust
-    cost: float  # with the priors
-    covariance: np.ndarray  # (8, 8) of inertia, rates and turn, for unit errors
-    values: np.ndarray  # residuals (n,) [mag], model less data
-    parameters: float  # that the points determine
-    linearised: Linearised
-
-
-@jax.jit
-def _light(body: Bodies, coefficients, points: Points, surface):
-    """Magnitudes (n,) of the law, derivatives (n, 8) and (n, k), and the open area (3,), (3, k)."""
-    normals, density, rows = surface
-    u, wxyz = body
-    areas = density * jnp.exp(coefficients @ rows)
-
-    def moved(step):
-        q = attitudes(u.at[:, jnp.asarray(_MOTION)].add(step), wxyz, points.t)
-        assert q is not None  # the attitude was not declined
-        return tuple(x[0] for x in q)
-
-    q, along = jax.linearize(moved, jnp.zeros(5, u.dtype))
-
-    def seen(q, turn):
-        def body_axes(vector):
-            space = tuple(
-                a[0] - b for a, b in zip(vector, _cross(turn, tuple(x[0] for x in vector)))
-            )
-            return jnp.stack(_to_body(q, space), -1)
-
-        mu0 = jnp.maximum(body_axes(points.sun) @ normals.T, 0)
-        mu = jnp.maximum(body_axes(points.observer) @ normals.T, 0)
-        both = mu * mu0
-        parts = both / jnp.where(both > 0, mu + mu0, 1) * areas[None]
-        total = jnp.maximum(jnp.sum(parts, axis=-1), 1e-12)
-        return -2.5 * jnp.log10(total), (parts, total)
-
-    zero = tuple(jnp.zeros(points.t.shape[1], u.dtype) for _ in range(3))
-    value, pull, (parts, total) = jax.vjp(seen, q, zero, has_aux=True)
-    by_q, by_turn = pull(jnp.ones_like(value))
-    motion = [
-        sum(a * b for a, b in zip(by_q, along(e), strict=True)) for e in jnp.eye(5, dtype=u.dtype)
-    ]
-    by_shape = -2.5 / jnp.log(10.0) * (parts @ rows.T) / total[:, None]
-    area = jnp.sum(areas)
-    open_area = areas @ normals / area
-    by_open = (rows * areas[None]) @ normals / area - jnp.outer(rows @ areas, open_area) / area
-    return value, jnp.stack([*motion, *by_turn], -1), by_shape, open_area, by_open
-
-
-_apply_step = jax.jit(apply_step)
-
-
-def refine(
-    body: Bodies,
-    linear: Linear,
-    points: Points,
-    phase: AbstractPhase,
-    limit: float,
-    *,
-    rotating: bool = False,
-) -> Refined:
-    """Least squares of motion, inertia and a convex shape from an ellipsoid's solution.
-
-    ``body``: one, (1, ...). Offsets, and a phase function quadratic in the phase angle besides the
-    body's own, are projected out. Residuals beyond ``limit`` sigma count by their size.
-    ``rotating``: the body keeps rotating about its third axis, and its inertia is left alone.
-    """
-    moving = np.isin(np.arange(8), (4, 5, 6, 7)) if rotating else np.full(8, True)
-    n, many = linear.t.size, len(phase.typical)
-    normals = np.asarray(Convex.from_ellipsoid(jnp.ones(3), _FACETS).normals)
-    rows = np.asarray(harmonics(jnp.asarray(normals), DEGREE))[1:]
-    square = np.exp(2 * np.r_[0.0, np.asarray(body.unknowns)[0, 2:4]])
-    density = np.prod(square) / (normals**2 @ square) ** 2
-    surface = tuple(map(jnp.asarray, (normals, density, rows)))
-    own = np.asarray(
-        phase.magnitudes(points.alpha[0], jnp.asarray(body.unknowns)[0, 7 : 7 + many])
-        - points.sphere[0]
-    )[:n]
-    start = np.asarray(body.unknowns)[0, :2].copy()
-    prior_precision = np.diag(
-        np.r_[
-            np.full(2, _INERTIA_SIGMA**-2.0), np.zeros(6), np.full(HARMONICS, _HARMONIC_SIGMA**-2.0)
-        ]
-    )
-
-    def evaluated(body, coefficients):
-        out = _light(body, jnp.asarray(coefficients), points, surface)
-        value, motion, shape, open_area, by_open = map(np.asarray, out)
-        whole = np.hstack([np.where(moving, motion, 0.0), shape])[:n]
-        rest = linear.projected(value[:n] + own) - linear.data
-        return rest, whole, open_area, by_open
-
-    def costed(rest, coefficients, body, open_area):
-        squared = (rest / limit) ** 2
-        chi2 = float(2 * limit**2 * np.sum(squared / (1 + np.sqrt(1 + squared))))
-        off = np.asarray(body.unknowns)[0, :2] - start
-        prior = (off**2).sum() * prior_precision[0, 0] + (coefficients**2).sum() * prior_precision[
-            -1, -1
-        ]
-        return chi2, chi2 + prior + float((open_area**2).sum()) / _CLOSED_SIGMA**2
-
-    coefficients, damping, quiet = np.zeros(HARMONICS), 1e-2, 0
-    body = Bodies(jnp.asarray(body.unknowns), jnp.asarray(body.wxyz))
-    rest, slopes, open_area, by_open = evaluated(body, coefficients)
-    chi2, cost = costed(rest, coefficients, body, open_area)
-
-    def normal(rest, slopes, open_area, by_open, body, coefficients):
-        weight = 1 / np.sqrt(1 + (rest / limit) ** 2)
-        whole = linear.projected(slopes)
-        data = (whole.T * weight) @ whole
-        matrix, right = data + prior_precision, (whole.T * weight) @ rest
-        off = np.asarray(body.unknowns)[0, :2] - start
-        right[:2] += off * prior_precision[0, 0]
-        right[8:] += coefficients * prior_precision[-1, -1] + by_open @ open_area / _CLOSED_SIGMA**2
-        matrix[8:, 8:] += by_open @ by_open.T / _CLOSED_SIGMA**2
-        return data, matrix, right
-
-    for _ in range(_STEPS):
-        _, matrix, right = normal(rest, slopes, open_area, by_open, body, coefficients)
-        size = np.sqrt(np.maximum(np.diag(matrix), 1e-30))
-        scaled = matrix / size / size[:, None] + damping * np.eye(len(matrix))
-        step = -np.linalg.solve(scaled, right / size) / size
-        step *= min(1.0, 0.5 / max(np.abs(np.r_[step[:2], step[5:]]).max(), 1e-30))
-        change = np.zeros((1, body.unknowns.shape[1] + 3))
-        change[0, _MOTION], change[0, -3:] = step[:5], step[5:8]
-        if rotating:  # the periods, and the correction by them, have no derivatives there
-            turn = rotation.rotation_vector_to_wxyz(jnp.asarray(change[:, -3:]))
-            trial = Bodies(
-                body.unknowns + change[:, :-3],
-                rotation.normalise(rotation.multiply(turn, body.wxyz)),
-            )
-        else:
-            trial = _apply_step(body, jnp.asarray(change))
-        new = evaluated(trial, coefficients + step[8:])
-        new_chi2, new_cost = costed(new[0], coefficients + step[8:], trial, new[2])
-        better = np.isfinite(new_cost) and new_cost < cost
-        gain = cost - new_cost if better else 0.0
-        small = gain < _ENDING * max(1.0, 1e-3 * cost) if better else damping > 10
-        quiet = quiet + 1 if small else 0
-        if better:
-            body, coefficients = trial, coefficients + step[8:]
-            (rest, slopes, open_area, by_open), chi2, cost = new, new_chi2, new_cost
-        damping = float(np.clip(damping * (0.2 if better else 5.0), 1e-9, 1e9))
-        if quiet == 3:
-            break
-    data, matrix, right = normal(rest, slopes, open_area, by_open, body, coefficients)
-    pull = linear.projected(slopes).T @ (rest / np.sqrt(1 + (rest / limit) ** 2))
-    inverse = np.linalg.pinv(matrix, hermitian=True)
-    return Refined(
-        jax.tree.map(np.asarray, body),
-        coefficients,
-        chi2,
-        cost,
-        inverse[:8, :8],
-        rest[:n] / linear.root,
-        float(np.trace(inverse @ data)),
-        _linearised(rest[:n], slopes * linear.root[:, None], matrix - data, right - pull, linear),
-    )
-
-
-def _linearised(
-    residuals: np.ndarray,
-    derivatives: np.ndarray,
-    prior: np.ndarray,
-    gradient: np.ndarray,
-    linear: Linear,
-) -> Linearised:
-    """With the offsets, and the other columns of ``linear``, as further unknowns."""
-    many, columns = derivatives.shape[1], (linear.columns * linear.root).T
-    full = np.zeros((many + columns.shape[1],) * 2)
-    full[:many, :many] = prior
-    full[many:, many:] = np.diag(linear.stiffness)
-    # The offsets are those of least squares: their priors pull as the residuals do.
-    pull = np.where(linear.stiffness > 0, -residuals @ columns, 0.0)
-    return Linearised(residuals, np.hstack([derivatives, columns]), full, np.r_[gradient, pull])
-
-
-def refined_solutions(
-    solutions: tuple[Solution, ...],
-    linear: Linear,
-    points: Points,
-    phase: AbstractPhase,
-    limit: float,
-) -> Described:
-    """The solutions with convex shapes, the best first.
-
-    Errors of a period hold the spread of the other poles of the same periods, by their odds.
-    """
-    curve = linear.curve
-    refined = [refine(_body(s), linear, points, phase, limit) for s in solutions]
-    order = sorted(range(len(refined)), key=lambda k: refined[k].cost)
-    best = refined[order[0]]
-    scale = float(np.sqrt(best.chi2 / max(linear.independent - best.parameters, 1.0)))
-    limited = np.clip(best.values * linear.root, -limit * scale, limit * scale)
-    alike = effective_correlation(curve, limited)
-    root = np.sqrt(alike) * scale
-    candidates = [
-        _solution(solutions[k], refined[k], linear, scale, root, limit, best.cost) for k in order
-    ]
-    roots = [k if solutions[k].mirror_of is None else solutions[k].mirror_of for k in order]
-    resolution = 1 / float(np.ptp(curve.t))
-    distinct = _without_copies(candidates, resolution)
-    out: list[Solution] = []
-    first: dict[int | None, int] = {}
-    for k in distinct:
-        place = first.setdefault(roots[k], len(out))
-        out.append(candidates[k]._replace(mirror_of=None if place == len(out) else place))
-    linearised = tuple(refined[order[k]].linearised for k in distinct)
-    return Described(_with_spread_of_poles(out, resolution), scale, alike, linearised)
-
-
-def rotating_body(
-    linear: Linear, ellipsoid: np.ndarray, points: Points, phase: AbstractPhase, limit: float
-) -> Refined:
-    """A convex body that rotates about one axis, from an ``ellipsoid`` (6,) of `rotator`."""
-    second, third, longitude, latitude, turn, frequency = ellipsoid
-    c, s, cb, sb = (f(x) for x in (longitude, latitude) for f in (np.cos, np.sin))
-    frame = np.array([[sb * c, sb * s, -cb], [-s, c, 0], [cb * c, cb * s, sb]])
-    ca, sa = np.cos(turn), np.sin(turn)
-    matrix = np.array([[ca, sa, 0], [-sa, ca, 0], [0, 0, 1]]) @ frame
-    # any inertia for which the third axis is the short one: the rotation is the same
-    unknowns = np.r_[np.log([0.8, 0.6]), second, third, 0, 0, 2 * np.pi * frequency, phase.typical]
-    wxyz = np.asarray(rotation.matrix_to_wxyz(jnp.asarray(matrix.T)))
-    body = Bodies(unknowns[None], wxyz[None])
-    return refine(body, linear, points, phase, limit, rotating=True)
-
-
-def _body(solution: Solution) -> Bodies:
+def ellipsoid_of(solution: Solution) -> Bodies:
     """The ellipsoid and the motion of a solution, as the model has them."""
     square = np.log(solution.moments.sum() / 2 - solution.moments) / 2
     axes = np.log(solution.axes)
@@ -705,7 +451,7 @@ def bodies_of(solutions: Sequence[Solution], epoch: float, phase: AbstractPhase)
     """Bodies of earlier solutions, moved to ``epoch``, with the coefficients of ``phase``."""
     many, parts = len(phase.typical), []
     for each in solutions:
-        unknowns, wxyz = _body(each)
+        unknowns, wxyz = ellipsoid_of(each)
         coefficients = each.coefficients if len(each.coefficients) == many else phase.typical
         rates, attitude = free_motion(
             moments_of(jnp.asarray(unknowns)),
@@ -718,85 +464,3 @@ def bodies_of(solutions: Sequence[Solution], epoch: float, phase: AbstractPhase)
         unknowns = np.r_[unknowns[0, :4], [float(x[0, 0]) for x in rates], coefficients]
         parts.append(Bodies(unknowns[None], np.array([[float(x[0, 0]) for x in attitude]])))
     return jax.tree.map(lambda *x: np.concatenate(x), *parts)
-
-
-def _solution(
-    old: Solution, refined: Refined, linear: Linear, scale: float, root: float, limit, least: float
-) -> Solution:
-    unknowns, wxyz = (x[0] for x in refined.body)
-    f_phi, f_psi, mode = (x[0] for x in frequencies(refined.body))
-    slopes = derivatives_of_derived(refined.body)[0]
-    moved = np.r_[_MOTION, len(unknowns) + np.arange(3)]
-    spread = root**2 * slopes[:, moved] @ refined.covariance @ slopes[:, moved].T
-    std = np.sqrt(np.maximum(np.diag(spread), 0))
-    if not np.isfinite(refined.cost + f_phi + f_psi + std.sum()):
-        return old._replace(cost=np.inf, probability=0.0)
-    moments = np.array(moments_of(unknowns))
-    pole = momentum(refined.body)[0]
-    weighted = refined.values * linear.root / scale
-    return old._replace(
-        P_phi=float(1 / f_phi),
-        P_psi=float(1 / f_psi),
-        P_phi_std=float(std[0] / f_phi),
-        P_psi_std=float(std[1] / f_psi),
-        mode=Mode(int(mode)),
-        rms=float(np.sqrt(np.average(refined.values**2, weights=linear.root**2))),
-        cost=refined.cost,
-        probability=float(np.exp(-(refined.cost - least) / 2 / root**2)),
-        moments=moments / moments.max(),
-        moments_std=std[2:5],
-        pole=np.degrees([np.arctan2(pole[1], pole[0]) % (2 * np.pi), np.arcsin(pole[2])]),
-        pole_std=float(np.degrees(np.linalg.norm(std[5:]))),
-        wxyz=wxyz,
-        omega_body=unknowns[4:7],
-        offsets=linear.offsets(refined.values, old),
-        model=linear.curve.magnitude + refined.values,
-        weights=1 / np.sqrt(1 + (weighted / limit) ** 2),
-        harmonics=refined.coefficients,
-        parameters=refined.parameters,
-        epoch=float(linear.curve.t[0]),
-        covariance=_of_periods(spread, f_phi, f_psi),
-    )
-
-
-def _without_copies(solutions: list[Solution], resolution: float) -> list[int]:
-    """Numbers of those that differ in periods, or by 10 degrees in the pole."""
-    classes = same_periods(solutions, resolution)
-    poles = np.radians([s.pole for s in solutions])
-    poles = np.stack(
-        [
-            np.cos(poles[:, 1]) * np.cos(poles[:, 0]),
-            np.cos(poles[:, 1]) * np.sin(poles[:, 0]),
-            np.sin(poles[:, 1]),
-        ],
-        -1,
-    )
-    distinct: list[int] = []
-    for k in range(len(solutions)):
-        same_periods_as = [j for j in distinct if classes[j] == classes[k]]
-        if not same_periods_as or (poles[same_periods_as] @ poles[k]).max() < np.cos(
-            np.radians(10)
-        ):
-            distinct.append(k)
-    return distinct
-
-
-def _with_spread_of_poles(solutions: list[Solution], resolution: float) -> tuple[Solution, ...]:
-    classes = np.array(same_periods(solutions, resolution))
-    odds = np.array([s.probability for s in solutions])
-    out = []
-    for k, s in enumerate(solutions):
-        same = classes == classes[k]
-        weight = odds * same / max((odds * same).sum(), 1e-300)
-        change = {}
-        covariance = None if s.covariance is None else s.covariance.copy()
-        for i, name in enumerate(("P_phi", "P_psi")):
-            period = getattr(s, name)
-            apart = np.array([getattr(x, name) for x in solutions]) - period
-            change[name + "_std"] = float(
-                np.sqrt(getattr(s, name + "_std") ** 2 + weight @ apart**2)
-            )
-            if covariance is not None:
-                covariance[i, i] = change[name + "_std"] ** 2
-        out.append(s._replace(**change, covariance=covariance))
-    return tuple(out)

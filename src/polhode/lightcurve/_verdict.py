@@ -1,0 +1,288 @@
+"""What may be claimed of a light curve: a verdict, its PAR rating, and agreement by resampling."""
+
+import enum
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from polhode.lightcurve._brightness import AbstractPhase
+from polhode.lightcurve._convex import rotating_body
+from polhode.lightcurve._data import LightCurve
+from polhode.lightcurve._frequencies import Pairs
+from polhode.lightcurve._nulls import (
+    Linear,
+    Model,
+    Residuals,
+    compare_models,
+    noise,
+    one_period,
+    rotator,
+    tumbler,
+    two_periods,
+)
+from polhode.lightcurve._solutions import (
+    EXCLUDED,
+    Linearised,
+    Solution,
+    effective_correlation,
+    same_periods,
+)
+
+_DECISIVE = 5.0  # difference of ln Z: odds of 150 to 1
+_FEW_POINTS = 36  # independent points below which no body of ten parameters is claimed
+_MISFIT = 2.0  # residuals over the curve's own errors from which no solution is certain
+_AGREEMENT = 0.9  # part of the resampled curves in which the best periods must stay the best
+_RESAMPLED, _BLOCKS = 400, 5
+_CYCLES = 3.0  # of one period, below which its rating is the lowest
+
+
+class Verdict(enum.Enum):
+    """What a light curve shows. Only ``TUMBLING`` claims the periods of the best solution."""
+
+    TUMBLING = "tumbling"
+    AMBIGUOUS = "ambiguous"
+    ONE_PERIOD = "one period"
+    NO_SIGNAL = "no signal"
+    TOO_FEW_POINTS = "too few points"
+
+
+class Judgement(NamedTuple):
+    """The verdict, its reasons, and the numbers behind them."""
+
+    verdict: Verdict
+    reasons: tuple[str, ...]
+    par: int
+    models: tuple[Model, ...]
+    misfit: float
+    agreement: float
+
+
+def null_models(
+    curve: LightCurve, pairs: Pairs, offset_sigma, phase: AbstractPhase, limit: float = 3.0
+) -> tuple[Linear, list[Residuals]]:
+    """The null hypotheses, fitted: noise alone, and one period."""
+    linear = Linear(curve, offset_sigma)
+    nulls = [noise(linear)]
+    end = pairs.max_frequency
+    if not np.isfinite(end):
+        end = 2 * max(pairs.f_phi.max(), pairs.f_psi.max())
+    series = one_period(linear, end)
+    nulls += series
+    if series:
+        # the periods of the best series of few and of many harmonics
+        best = sorted(series, key=lambda r: float(np.sum((r.values * linear.root) ** 2)))
+        periods = dict.fromkeys(round(r.periods[0], 12) for r in (*best[:2], *series[:4]))
+        ellipsoid = rotator(linear, list(periods)[:4], end)
+        if ellipsoid is not None:
+            rest, chosen = ellipsoid
+            points = curve.points(0.0, offset_sigma)
+            body = rotating_body(linear, chosen, points, phase, limit)
+            period = 2 * np.pi / float(body.body.unknowns[0, 6])
+            convex = rest._replace(
+                name="one period, rotating convex body",
+                values=body.values,
+                parameters=body.parameters,
+                periods=(period,),
+            )
+            nulls += [rest] + ([convex] if np.isfinite(body.cost) else [])
+    return linear, nulls
+
+
+def judge(
+    linear: Linear,
+    nulls: list[Residuals],
+    pairs: Pairs,
+    solutions: tuple[Solution, ...],
+    *,
+    reproduced: bool,
+    limit: float,
+    others: tuple[Solution, ...] = (),
+    linearised: Sequence[Linearised] | None = None,
+) -> Judgement:
+    """Compare the null hypotheses with the best tumbling body, and say what may be claimed.
+
+    ``others``: more bodies to compare, such as the best ellipsoid, which has fewer parameters;
+    ``linearised``: of each solution, for fits to resampled light curves.
+    """
+    curve = linear.curve
+    best = solutions[0]
+    everything = [*nulls, *two_periods(linear, pairs, solutions)]
+    everything += [tumbler(linear, pairs, body) for body in (best, *others)]
+    models = compare_models(linear, everything, effective_correlation)
+    classes = same_periods(solutions, pairs.resolution)
+    agreement = bootstrap_agreement(curve, linear.root, solutions, classes, limit, linearised)
+    silent, single, double, body = (
+        _best_of(models, word) for word in ("noise", "one period", "two periods", "tumbling")
+    )
+    listed = tuple(m for m in (silent, single, double, body) if m is not None)
+    assert silent is not None  # both are always fitted
+    assert body is not None
+    own = models[len(models) - 1 - len(others)]  # the best of the list, whatever its evidence
+    null = max(m.log_evidence for m in (silent, single) if m is not None)
+    two = max(m.log_evidence for m in (double, body) if m is not None)
+    more = two - null  # of two periods over one or none
+    reasons: list[str] = []
+
+    def result(verdict: Verdict, par: int) -> Judgement:
+        return Judgement(verdict, tuple(reasons), par, listed, own.misfit, agreement)
+
+    if linear.independent < _FEW_POINTS:
+        reasons.append(
+            f"{linear.independent} points besides the offsets are too few for a body of ten"
+            f" parameters; {_FEW_POINTS} are needed."
+        )
+        return result(Verdict.TOO_FEW_POINTS, 0)
+    other = max(m.log_evidence for m in (single, double, body) if m is not None)
+    if silent.log_evidence > other - _DECISIVE and silent.misfit < _MISFIT:
+        reasons.append(
+            "No model explains the points decisively better than noise: ln Z"
+            f" {other - silent.log_evidence:+.1f} over noise alone, {_DECISIVE:g} are needed."
+        )
+        return result(Verdict.NO_SIGNAL, 0)
+    if single is not None and more < -_DECISIVE:
+        if single.misfit < _MISFIT:
+            period = single.periods[0]
+            cycles = float(linear.t[-1]) / period
+            reasons.append(
+                f"One period, {period:.6g} d ({24 * period:.5g} h) or a multiple or alias of it,"
+                f" explains the points: ln Z {-more:+.1f} over two periods."
+            )
+            return result(Verdict.ONE_PERIOD, 1 if cycles < _CYCLES else 2)
+        reasons.append(
+            f"One period is the best model, but leaves {single.misfit:.1f} times the errors of the"
+            " points."
+        )
+    elif more < _DECISIVE:
+        reasons.append(
+            f"Two periods are not decisively better than one: ln Z {more:+.1f}, {_DECISIVE:g} are"
+            " needed."
+        )
+    single_rejected = more >= _DECISIVE
+    if single_rejected and body.log_evidence - null < _DECISIVE:
+        reasons.append(
+            "A series of two periods explains the points, but no tumbling body that was found does."
+        )
+    if own.misfit >= _MISFIT:
+        reasons.append(
+            f"The best body leaves {own.misfit:.1f} times the errors of the points; no solution"
+            f" is certain from {_MISFIT:g} on."
+        )
+    rivals = len({c for c, s in zip(classes, solutions, strict=True) if s.probability > EXCLUDED})
+    if rivals > 1:
+        reasons.append(
+            f"{rivals - 1} other pair(s) of periods cannot be excluded at 1 in"
+            f" {round(1 / EXCLUDED)}."
+        )
+    # An ellipsoid has too few parameters to follow another body and a convex shape has many, which
+    # can make up for a wrong motion. Where they disagree the shape must be decisive by far.
+    for other in others:
+        matches = [same_periods((s, other), pairs.resolution) == [0, 0] for s in solutions]
+        odds = [s.probability for s, same in zip(solutions, matches, strict=True) if same]
+        if not matches[0] and max(odds, default=1.0) > EXCLUDED**2:
+            reasons.append(
+                "The best ellipsoid has other periods or another mode than the best convex body:"
+                " the assumption on the shape decides."
+            )
+    if agreement < _AGREEMENT:
+        reasons.append(
+            f"The best periods stay the best in {agreement:.0%} of resampled light curves only;"
+            f" {_AGREEMENT:.0%} are needed."
+        )
+    if not reproduced:
+        reasons.append("No second search found the best body again.")
+    reasons += pairs.warnings()
+    if not reasons:
+        poles = {s.mirror_of for s in solutions if s.probability > EXCLUDED}
+        unique = len([s for s in solutions if s.probability > EXCLUDED]) == 1 and len(poles) == 1
+        return result(Verdict.TUMBLING, -4 if unique else -3)
+    return result(Verdict.AMBIGUOUS, -2 if single_rejected else -1)
+
+
+def _best_of(models: tuple[Model, ...], word: str) -> Model | None:
+    candidates = [m for m in models if m.name.startswith(word)]
+    return max(candidates, key=lambda m: m.log_evidence) if candidates else None
+
+
+def bootstrap_agreement(
+    curve: LightCurve,
+    root: np.ndarray,
+    solutions: tuple[Solution, ...],
+    classes: list[int],
+    limit: float,
+    linearised: Sequence[Linearised] | None = None,
+    count: int = _RESAMPLED,
+) -> float:
+    """Part of ``count`` resampled light curves in which the best periods stay the best.
+
+    Nights are drawn with replacement, or runs of points where there are few nights. First the
+    contributions of the points to the cost of every solution are added, without new fits (RELL
+    bootstrap: Kishino, Miyata & Hasegawa, J. Mol. Evol. 31 (1990) 151). With ``linearised`` the
+    solutions with odds above 1 in a million are also fitted again to every resampled light curve,
+    by one step of Gauss and Newton from where they are. The smaller part counts.
+    """
+    if len(set(classes)) < 2:
+        return 1.0
+    names, block = np.unique(curve.group, return_inverse=True)
+    if len(names) < _BLOCKS:
+        block = np.arange(curve.t.size) * 20 // curve.t.size
+    many = int(block.max()) + 1
+    rng = np.random.default_rng(0)
+    weight = rng.multinomial(many, np.full(many, 1 / many), count).astype(float)
+    number = np.array(classes)
+    # residuals over the errors that make the best solution fit
+    rest = np.array([(s.model - curve.magnitude) * root for s in solutions])
+    rest = rest / _scale_of(rest[0])
+    blocks = np.stack([np.bincount(block, c) for c in _robust_cost(rest, limit)])
+    agreement = float(np.mean(number[np.argmin(blocks @ weight.T, axis=0)] == number[0]))
+    # Others have often not converged, and the linear model then promises them more than the step
+    # would hold: one with odds of 1e-10 would win in most resampled light curves.
+    possible = [k for k, s in enumerate(solutions) if s.probability > EXCLUDED**2]
+    if linearised is None or len(set(number[possible])) < 2:
+        return agreement
+    scale = _scale_of(linearised[0].residuals)
+    cost = [_refitted_cost(linearised[k], block, weight, scale, limit) for k in possible]
+    best = number[possible][np.argmin(cost, axis=0)]
+    return min(agreement, float(np.mean(best == number[0])))
+
+
+def _scale_of(residuals: np.ndarray) -> float:
+    return max(1.4826 * float(np.median(np.abs(residuals))), 1e-12)
+
+
+def _robust_cost(residuals: np.ndarray, limit: float) -> np.ndarray:
+    squared = residuals**2
+    return 2 * squared / (1 + np.sqrt(1 + squared / limit**2))
+
+
+def _refitted_cost(
+    solution: Linearised, block: np.ndarray, weight: np.ndarray, scale: float, limit: float
+) -> np.ndarray:
+    """Costs (r,) of a solution fitted again to blocks of points with ``weight`` (r, blocks)."""
+    residuals, derivatives = solution.residuals / scale, solution.derivatives / scale
+    prior, gradient = solution.prior / scale**2, solution.gradient / scale**2
+    robust = 1 / np.sqrt(1 + (residuals / limit) ** 2)
+    many = weight.shape[1]
+    # The normal equations are sums over blocks: those of a resampled light curve cost a sum of
+    # ``many`` matrices, not another pass over the points.
+    weighted = derivatives * robust[:, None]
+    parts = [block == k for k in range(many)]
+    matrices = np.array([weighted[part].T @ derivatives[part] for part in parts])
+    rights = np.array([weighted[part].T @ residuals[part] for part in parts])
+    # offsets of nights that were not drawn are not determined
+    size = np.diag(matrices.sum(0) + prior)
+    jitter = np.diag(np.where(size > 0, 1e-9 * size, 1.0))
+    weight = np.vstack([np.ones(many), weight])
+    matrix = np.einsum("rb,bij->rij", weight, matrices) + prior + jitter
+    step = -np.linalg.solve(matrix, (weight @ rights + gradient)[..., None])[..., 0]
+    cost = np.array(
+        [
+            _robust_cost(residuals[part][:, None] + derivatives[part] @ step.T, limit).sum(0)
+            for part in parts
+        ]
+    )
+    cost = np.einsum("rb,br->r", weight, cost)
+    cost += np.einsum("ri,ij,rj->r", step, prior, step) + 2 * step @ gradient
+    # A solution that has not converged would gain by the step with all points as well, as far as
+    # the linear model holds, which was not tried: this gain does not count.
+    return cost[1:] - cost[0] + _robust_cost(residuals, limit).sum()
