@@ -3,8 +3,9 @@
 from polhode._events._crossings import Crossings as Crossings, crossings as crossings
 from polhode._events._event import Event as Event
 from polhode._events._simulation import (
+    check_until as check_until,
     checked_events as checked_events,
     found_by_search as found_by_search,
     found_by_steps as found_by_steps,
+    stopped as stopped,
 )
-from polhode._events._until import check_until as check_until, stopped as stopped

@@ -1,24 +1,28 @@
-"""Matrices, rotation vectors, axis-angle and modified Rodrigues parameters, and quaternions.
+"""Conversions between quaternions, matrices, axis and angle, Rodrigues parameters, Euler angles.
 
 Matrices R carry body to space components, ``x_space = R x_body`` (docs/equations.md, 003: 3);
 axis and angle are those of docs/equations.md, 002. Modified Rodrigues parameters are
 ``p = axis tan(angle/4)``: two sets describe each rotation, one for each sign of the quaternion, one
 of length at most 1 (angle up to pi) and its shadow ``-p/|p|**2`` (Schaub and Junkins 1996).
+
+Of Euler angles, ZYZ, ``R = Rz(phi) Ry(theta) Rz(psi)``, is the convention of docs/equations.md; the
+other 23 sequences are reduced to the same formulas by a quarter turn (Bernardes and Viollet 2022).
+All angles are in rad; ``sequence`` defaults to ZYZ. Every conversion passes through the unit
+quaternion, the only description that is smooth and well scaled everywhere: small rotations keep
+their relative accuracy, half turns their axis.
 """
+
+import enum
+from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._checks import ArrayLike, as_vectors
-from polhode.rotation._quaternion import (
-    as_axes,
-    as_matrices,
-    as_quaternions,
-    canonical,
-    matrix_row,
-)
-from polhode.rotation._scalar import arc_ratio, cosine, direction, length, sine_ratio
+from polhode._checks import ArrayLike, as_floats, as_vectors
+from polhode.rotation._quaternion import as_axes, as_matrices, as_quaternions, canonical, matrix_row
+from polhode.rotation._scalar import arc_ratio, cosine, direction, largest, length, sine_ratio
 
 
 def wxyz_to_matrix(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3 3"]:
@@ -46,11 +50,11 @@ def matrix_to_wxyz(matrix: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b 4"]:
     Raises ValueError for a matrix that is no rotation (a reflection, a scaling, entries off by more
     than 1e-3); while it is traced the quaternion of such a one is NaN.
     """
-    return _quaternion(*as_matrices(matrix))
+    return _quaternion_of_matrix(*as_matrices(matrix))
 
 
 @jax.jit
-def _quaternion(matrix: Array, good: Array) -> Array:
+def _quaternion_of_matrix(matrix: Array, good: Array) -> Array:
     (a, b, c), (d, e, f), (g, h, i) = (
         (matrix[..., row, 0], matrix[..., row, 1], matrix[..., row, 2]) for row in range(3)
     )
@@ -154,3 +158,295 @@ def shadow(parameters: Float[ArrayLike, "*b 3"]) -> Float[Array, "*b 3"]:
     parameters = as_vectors("parameters", parameters, 3)
     size = length(parameters)[..., None]
     return -(parameters / size) / size
+
+
+class Sequence(enum.Enum):
+    """Order of the three rotations of Euler angles.
+
+    ``Sequence.ZYZ`` is the convention here, ``R = Rz(phi) Ry(theta) Rz(psi)``. A plain member
+    is *intrinsic*: the second and third rotation are about the rotated body axes, and ``R =
+    R_i(first) R_j(second) R_k(third)``. A member ending in ``_SPACE`` is *extrinsic*: all rotations
+    are about fixed space axes, and ``R = R_k(third) R_j(second) R_i(first)``.
+
+    The second angle lies in [0, pi] when the first and last axis are the same (proper Euler angles)
+    and in [-pi/2, pi/2] when all three differ (Tait-Bryan angles).
+    """
+
+    XYX = ((0, 1, 0), False)
+    XZX = ((0, 2, 0), False)
+    YXY = ((1, 0, 1), False)
+    YZY = ((1, 2, 1), False)
+    ZXZ = ((2, 0, 2), False)
+    ZYZ = ((2, 1, 2), False)
+    XYZ = ((0, 1, 2), False)
+    XZY = ((0, 2, 1), False)
+    YXZ = ((1, 0, 2), False)
+    YZX = ((1, 2, 0), False)
+    ZXY = ((2, 0, 1), False)
+    ZYX = ((2, 1, 0), False)
+    XYX_SPACE = ((0, 1, 0), True)
+    XZX_SPACE = ((0, 2, 0), True)
+    YXY_SPACE = ((1, 0, 1), True)
+    YZY_SPACE = ((1, 2, 1), True)
+    ZXZ_SPACE = ((2, 0, 2), True)
+    ZYZ_SPACE = ((2, 1, 2), True)
+    XYZ_SPACE = ((0, 1, 2), True)
+    XZY_SPACE = ((0, 2, 1), True)
+    YXZ_SPACE = ((1, 0, 2), True)
+    YZX_SPACE = ((1, 2, 0), True)
+    ZXY_SPACE = ((2, 0, 1), True)
+    ZYX_SPACE = ((2, 1, 0), True)
+
+    @classmethod
+    def of(cls, axes: str) -> "Sequence":
+        """The sequence that SciPy writes so: ``"ZYX"`` intrinsic, ``"zyx"`` extrinsic.
+
+        Raises ValueError for anything but three letters of one case, neighbours different.
+        """
+        name = axes.upper() + ("_SPACE" if axes.islower() else "")
+        if name not in cls.__members__ or not (axes.islower() or axes.isupper()):
+            raise ValueError(
+                f"no sequence is called {axes!r}: give three of XYZ about body axes or three of xyz"
+                ' about space axes, neighbours different, such as "ZYX" (yaw, pitch, roll).'
+            )
+        return cls[name]
+
+    @property
+    def axes(self) -> tuple[int, int, int]:
+        """Axes in the order in which the angles are given; 0, 1, 2 are x, y, z."""
+        return self.value[0]
+
+    @property
+    def is_extrinsic(self) -> bool:
+        """Whether all three rotations are about fixed space axes."""
+        return self.value[1]
+
+    @property
+    def is_proper(self) -> bool:
+        """Whether the first and the last axis are the same."""
+        return self.axes[0] == self.axes[2]
+
+
+def check_sequence(sequence: Any) -> None:
+    """TypeError for anything but a ``Sequence``."""
+    if not isinstance(sequence, Sequence):
+        raise TypeError(
+            "sequence must be a ph.rotation.Sequence, such as Sequence.ZYX (about body axes) or"
+            f" Sequence.ZYX_SPACE, got {type(sequence).__name__}: {sequence!r:.40}."
+        )
+
+
+def _parity(i: int, j: int, k: int) -> int:
+    return (i - j) * (j - k) * (k - i) // 2
+
+
+def _half_sum(left: Array, right: Array) -> tuple[Array, Array]:
+    """Cosine and sine of (left + right)/2 for the exact sum, not only for the rounded one.
+
+    Near |left + right| = 2 pi the rounding of the sum alone would spoil a small rotation. The
+    rounding error is found exactly (Knuth 1969), and does not depend on the angles smoothly.
+    """
+    total = left + right
+    shifted = total - left
+    lost = jax.lax.stop_gradient((left - (total - shifted)) + (right - shifted)) / 2
+    cos, sin = jnp.cos(total / 2), jnp.sin(total / 2)
+    return cos - lost * sin, sin + lost * cos
+
+
+def euler_to_wxyz(
+    phi: Float[ArrayLike, "*#b"],
+    theta: Float[ArrayLike, "*#b"],
+    psi: Float[ArrayLike, "*#b"],
+    sequence: Sequence = Sequence.ZYZ,
+) -> Float[Array, "*b 4"]:
+    """Unit quaternion of Euler angles (rad), smooth for all angles.
+
+    The angles are given in the order of the sequence's axes. The sign of the quaternion follows the
+    angles continuously; `canonical` picks the one with scalar part >= 0.
+    """
+    check_sequence(sequence)
+    return _quaternion(
+        sequence, *as_floats(finite=False, phi=(phi, ()), theta=(theta, ()), psi=(psi, ()))
+    )
+
+
+@partial(jax.jit, static_argnums=0)  # one program, not one for each operation
+def _quaternion(sequence: Sequence, first: Array, second: Array, third: Array) -> Array:
+    i, j, k = sequence.axes
+    if sequence.is_extrinsic:
+        (i, j, k), first, third = (k, j, i), third, first
+    cos, sin = jnp.cos(second / 2), jnp.sin(second / 2)
+    if sequence.is_proper:
+        k = 3 - i - j
+        parity = _parity(i, j, k)
+        cos_sum, sin_sum = _half_sum(first, third)
+        cos_difference, sin_difference = _half_sum(first, -third)
+        parts = {
+            -1: cos * cos_sum,
+            i: cos * sin_sum,
+            j: sin * cos_difference,
+            k: parity * sin * sin_difference,
+        }
+    else:
+        parity = _parity(i, j, k)
+        cos_a, sin_a = jnp.cos(first / 2), jnp.sin(first / 2)
+        cos_c, sin_c = jnp.cos(third / 2), jnp.sin(third / 2)
+        parts = {
+            -1: cos_a * cos * cos_c - parity * (sin_a * sin * sin_c),
+            i: sin_a * cos * cos_c + parity * (cos_a * sin * sin_c),
+            j: cos_a * sin * cos_c - parity * (sin_a * cos * sin_c),
+            k: cos_a * cos * sin_c + parity * (sin_a * sin * cos_c),
+        }
+    return jnp.stack([parts[axis] for axis in (-1, 0, 1, 2)], axis=-1)
+
+
+def _phase(real: Array, imaginary: Array) -> tuple[Array, Array, Array]:
+    """Modulus of a complex number, and the number scaled to size about 1 (1 for zero)."""
+    pair = jnp.stack([real, imaginary], axis=-1)
+    scale = jax.lax.stop_gradient(largest(pair)[..., 0])
+    is_zero = scale == 0
+    safe = jnp.where(is_zero, jnp.ones_like(scale), scale)
+    scaled = jnp.where(is_zero, jnp.ones_like(real), real / safe)
+    return length(pair), scaled, jnp.where(is_zero, jnp.zeros_like(real), imaginary / safe)
+
+
+def wxyz_to_euler(
+    wxyz: Float[ArrayLike, "*b 4"], sequence: Sequence = Sequence.ZYZ
+) -> tuple[Float[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
+    """Euler angles (rad) of a quaternion (its scale and its sign do not matter).
+
+    First and third angle lie in [-pi, pi]; the second in [0, pi] (same first and last axis) or
+    [-pi/2, pi/2]. Where the second angle reaches an end of its range only the sum or the difference
+    of the other two is defined, and it is shared equally between them; derivatives of the angles
+    do not exist there, and the missing parts are returned as zero.
+
+    Raises ValueError for a quaternion that is zero, TypeError for what is no ``Sequence``; the
+    angles of a traced quaternion that is zero are NaN.
+    """
+    check_sequence(sequence)
+    return _angles(sequence, as_quaternions(wxyz))
+
+
+@partial(jax.jit, static_argnums=0)
+def _angles(sequence: Sequence, wxyz: Array) -> tuple[Array, Array, Array]:
+    wxyz = jnp.where(jnp.any(wxyz != 0, axis=-1, keepdims=True), wxyz, jnp.nan)
+    i, j, k = sequence.axes
+    if sequence.is_extrinsic:
+        i, j, k = k, j, i
+    k = 3 - i - j
+    parity = _parity(i, j, k)
+    w, along_i, along_j = wxyz[..., 0], wxyz[..., 1 + i], wxyz[..., 1 + j]
+    along_k = parity * wxyz[..., 1 + k]
+    if sequence.is_proper:
+        sums, differences = (w, along_i), (along_j, along_k)
+    else:
+        # R_i(a) R_j(b) R_k(c), turned on by a quarter about j, is
+        # R_i(a) R_j(b + pi/2) R_i(-parity c).
+        sums = (w - along_j, along_i - along_k)
+        differences = (w + along_j, along_i + along_k)
+    sum_size, sum_cos, sum_sin = _phase(*sums)
+    difference_size, difference_cos, difference_sin = _phase(*differences)
+    # arguments of the products U V and U conj(V): one arctangent each, already within (-pi, pi]
+    first = jnp.arctan2(
+        sum_cos * difference_sin + sum_sin * difference_cos,
+        sum_cos * difference_cos - sum_sin * difference_sin,
+    )
+    third = jnp.arctan2(
+        sum_sin * difference_cos - sum_cos * difference_sin,
+        sum_cos * difference_cos + sum_sin * difference_sin,
+    )
+    if sequence.is_proper:
+        second = 2 * jnp.arctan2(difference_size, sum_size)
+    else:
+        third = -parity * third
+        sine = 2 * (w * along_j + along_i * along_k)
+        second = jnp.arctan2(sine, sum_size * difference_size)
+    if sequence.is_extrinsic:
+        first, third = third, first
+    return first, second, third
+
+
+_Angles = tuple[Float[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]
+
+
+def euler_to_matrix(
+    phi: Float[ArrayLike, "*#b"],
+    theta: Float[ArrayLike, "*#b"],
+    psi: Float[ArrayLike, "*#b"],
+    sequence: Sequence = Sequence.ZYZ,
+) -> Float[Array, "*b 3 3"]:
+    """Rotation matrix R of Euler angles."""
+    return wxyz_to_matrix(euler_to_wxyz(phi, theta, psi, sequence))
+
+
+def matrix_to_euler(
+    matrix: Float[ArrayLike, "*b 3 3"], sequence: Sequence = Sequence.ZYZ
+) -> _Angles:
+    """Euler angles of a rotation matrix; ranges and ends as in `wxyz_to_euler`."""
+    return wxyz_to_euler(matrix_to_wxyz(matrix), sequence)
+
+
+def euler_to_rotation_vector(
+    phi: Float[ArrayLike, "*#b"],
+    theta: Float[ArrayLike, "*#b"],
+    psi: Float[ArrayLike, "*#b"],
+    sequence: Sequence = Sequence.ZYZ,
+) -> Float[Array, "*b 3"]:
+    """Rotation vector, of length at most pi, of Euler angles."""
+    return wxyz_to_rotation_vector(euler_to_wxyz(phi, theta, psi, sequence))
+
+
+def rotation_vector_to_euler(
+    rotation_vector: Float[ArrayLike, "*b 3"], sequence: Sequence = Sequence.ZYZ
+) -> _Angles:
+    """Euler angles of a rotation vector; ranges and ends as in `wxyz_to_euler`."""
+    return wxyz_to_euler(rotation_vector_to_wxyz(rotation_vector), sequence)
+
+
+def euler_to_axis_angle(
+    phi: Float[ArrayLike, "*#b"],
+    theta: Float[ArrayLike, "*#b"],
+    psi: Float[ArrayLike, "*#b"],
+    sequence: Sequence = Sequence.ZYZ,
+) -> tuple[Float[Array, "*b 3"], Float[Array, "*b"]]:
+    """Unit axis and angle in [0, pi] of Euler angles: robust (docs/equations.md, 002: 3-12).
+
+    For ZYZ the axis is that of R; the matrix K rotates about ``(l, -m, -n)``.
+    """
+    return wxyz_to_axis_angle(euler_to_wxyz(phi, theta, psi, sequence))
+
+
+def axis_angle_to_euler(
+    axis: Float[ArrayLike, "*b 3"], angle: Float[ArrayLike, "*b"], sequence: Sequence = Sequence.ZYZ
+) -> _Angles:
+    """Euler angles of the rotation by ``angle`` about the unit vector ``axis``."""
+    return wxyz_to_euler(axis_angle_to_wxyz(axis, angle), sequence)
+
+
+def euler_to_modified_rodrigues(
+    phi: Float[ArrayLike, "*#b"],
+    theta: Float[ArrayLike, "*#b"],
+    psi: Float[ArrayLike, "*#b"],
+    sequence: Sequence = Sequence.ZYZ,
+) -> Float[Array, "*b 3"]:
+    """Modified Rodrigues parameters, of length at most 1, of Euler angles."""
+    return wxyz_to_modified_rodrigues(euler_to_wxyz(phi, theta, psi, sequence))
+
+
+def modified_rodrigues_to_euler(
+    parameters: Float[ArrayLike, "*b 3"], sequence: Sequence = Sequence.ZYZ
+) -> _Angles:
+    """Euler angles of modified Rodrigues parameters, either set."""
+    return wxyz_to_euler(modified_rodrigues_to_wxyz(parameters), sequence)
+
+
+def euler_to_matrix_k(
+    phi: Float[ArrayLike, "*#b"], theta: Float[ArrayLike, "*#b"], psi: Float[ArrayLike, "*#b"]
+) -> Float[Array, "*b 3 3"]:
+    """The matrix K (docs/equations.md, 002): R of the same ZYZ angles, y and z axes reversed.
+
+    ``K(phi, theta, psi) = D R D = R(-phi, -theta, -psi) = R(psi, theta, phi)^T``, with
+    ``D = diag(1, -1, -1)``. K is neither R nor its transpose.
+    """
+    w, x, y, z = jnp.moveaxis(euler_to_wxyz(phi, theta, psi), -1, 0)
+    return wxyz_to_matrix(jnp.stack([w, x, -y, -z], axis=-1))
