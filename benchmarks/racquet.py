@@ -38,7 +38,7 @@ from polhode.fit import (
     fit_inertia,
     fit_recordings,
 )
-from polhode.fit._result import UNUSABLE, WARNINGS
+from polhode.fit._findings import UNUSABLE, WARNINGS
 from polhode.rotation import wxyz_to_matrix
 
 FAST = 15.0

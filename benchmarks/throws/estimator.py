@@ -15,6 +15,7 @@ from benchmarks.throws.scoring import Known, solve_balance, start_of
 from polhode._checks import is_concrete, require
 from polhode._scene import State
 from polhode.fit._conclude import combine_flags, symmetric_std, turn_std, whiteness_of
+from polhode.fit._findings import Finding
 from polhode.fit._model import (
     Base,
     Drag,
@@ -29,7 +30,7 @@ from polhode.fit._model import (
 from polhode.fit._numerics import compiled, eigh
 from polhode.fit._recording import Recording, require_channel, stack
 from polhode.fit._residuals import Model
-from polhode.fit._result import Finding, Fit, InertiaEstimate, checked_fit
+from polhode.fit._result import Fit, InertiaEstimate, checked_fit
 from polhode.inertia import Inertia, principal, second_moments
 
 

@@ -19,6 +19,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from polhode._kernels import staged
+
 Scalars = Float[Array, "*b"]
 
 _INTEGERS = {4: jnp.uint32, 8: jnp.uint64}
@@ -245,3 +247,26 @@ def rd_series(x: Array, y: Array, z: Array) -> Array:
         - 9 * (e3 * e4 + e2 * e5) / 68
     )
     return series / (mean * jnp.sqrt(mean))
+
+
+AGM_STEPS = 5
+"""Steps of the arithmetic-geometric mean, which reach rounding from a ratio of sqrt(0.2)."""
+
+
+def agm_and_nome(circular, on_separatrix, x: Scalars, m: Scalars, m1: Scalars, one: Scalars):
+    """Arithmetic-geometric mean, nome, minus its logarithm, and the rate of the argument v."""
+    square = jnp.where(circular, m, m1)
+    other = jnp.sqrt(jnp.where(circular, m1, m))
+    omega = jnp.sqrt(x)
+    # Quadratic convergence: from b >= sqrt(0.2) the fifth mean is exact to rounding. A fixed number
+    # of steps keeps all lanes in one kernel.
+    a, b = 1.0, other
+    for _ in range(AGM_STEPS - 1):
+        a, b = (a + b) / 2, jnp.sqrt(a * b)
+    agm = (a + b) / 2
+    nome = square * nome_per_parameter(square, jnp.sqrt(other))
+    agm, nome = staged((agm, nome), one)
+    log_nome = jnp.where(
+        circular | on_separatrix, 1, -jnp.log(jnp.where(circular | on_separatrix, 0.5, nome))
+    )
+    return agm, nome, log_nome, staged(omega * agm, one)

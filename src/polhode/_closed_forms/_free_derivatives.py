@@ -15,13 +15,12 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
-from polhode._closed_forms._arithmetic import sign_of_parity
+from polhode._closed_forms._arithmetic import agm_and_nome, sign_of_parity
 from polhode._closed_forms._free_motion import (
     Instant,
     Polhode,
     Precession,
     Triple,
-    agm_and_nome,
     momentum_of,
 )
 from polhode._closed_forms._free_tangent import (

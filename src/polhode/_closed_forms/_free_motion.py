@@ -15,13 +15,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from polhode._closed_forms._arithmetic import (
+    AGM_STEPS,
     Pair,
+    agm_and_nome,
     arctangent,
     binade,
     cosine_sine,
     horner,
     multiply_pairs,
-    nome_per_parameter,
     product_of,
     scale_pair,
     sign_of_parity,
@@ -140,7 +141,6 @@ def restore(values: Triple, axis_2: Scalars, axis_3: Scalars) -> Triple:
 # Beyond this parameter m the series in the nome are replaced by those in the complementary nome;
 # on either side three terms (five in the half nome of the attitude) reach the last bit of a double.
 _CIRCULAR_BELOW = 0.8
-_STEPS = 5
 
 
 class Polhode(NamedTuple):
@@ -209,25 +209,6 @@ def _limits(dtype) -> tuple[float, float]:
     """Smallest complementary parameter and ratio of differences that count as non-zero."""
     bits = {4: 110, 8: 900}[jnp.dtype(dtype).itemsize]
     return 2.0**-bits, 2.0 ** -(bits // 2)
-
-
-def agm_and_nome(circular, on_separatrix, x: Scalars, m: Scalars, m1: Scalars, one: Scalars):
-    """Arithmetic-geometric mean, nome, minus its logarithm, and the rate of the argument v."""
-    square = jnp.where(circular, m, m1)
-    other = jnp.sqrt(jnp.where(circular, m1, m))
-    omega = jnp.sqrt(x)
-    # Quadratic convergence: from b >= sqrt(0.2) the fifth mean is exact to rounding. A fixed number
-    # of steps keeps all lanes in one kernel.
-    a, b = 1.0, other
-    for _ in range(_STEPS - 1):
-        a, b = (a + b) / 2, jnp.sqrt(a * b)
-    agm = (a + b) / 2
-    nome = square * nome_per_parameter(square, jnp.sqrt(other))
-    agm, nome = staged((agm, nome), one)
-    log_nome = jnp.where(
-        circular | on_separatrix, 1, -jnp.log(jnp.where(circular | on_separatrix, 0.5, nome))
-    )
-    return agm, nome, log_nome, staged(omega * agm, one)
 
 
 def polhode_constants(roles: Roles) -> Polhode:
@@ -301,7 +282,7 @@ def descend(polhode: Polhode, length: Scalars) -> Scalars:
     d = jnp.where(has_B, length * jnp.sqrt(ratio), 1)
     a, b = jnp.ones_like(other), other
     numerator, denominator = start, jnp.ones_like(other)
-    for _ in range(_STEPS):
+    for _ in range(AGM_STEPS):
         mean = (a + b) / 2
         next_d = jnp.sqrt(a * mean * ((b + d) / (a + d)))
         numerator = numerator * jnp.where(polhode.circular, 2 * mean, next_d)

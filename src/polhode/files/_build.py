@@ -19,8 +19,8 @@ from polhode._hamiltonian import from_quaternion
 from polhode._scene import narrower
 from polhode.files._models import SceneFile
 from polhode.files._read import SceneFileError, did_you_mean, possible_moments, scene_errors
-from polhode.files._tables import AnySolid, Attitudes, TimeTable
-from polhode.files._values import MOMENTS, Table
+from polhode.files._tables import AnySolid, Attitudes
+from polhode.files._values import MOMENTS, Table, TimeTable
 from polhode.inertia import Inertia, MassProperties, VariableInertia, compose
 from polhode.inertia._inertia import inertia_at
 

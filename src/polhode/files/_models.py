@@ -22,9 +22,7 @@ from polhode.files._tables import (
     Potentials,
     Rotors,
     State,
-    TimeTable,
     Torques,
-    check_columns,
 )
 from polhode.files._values import (
     MAX_SAMPLES,
@@ -37,7 +35,9 @@ from polhode.files._values import (
     Sequence,
     Spread,
     Table,
+    TimeTable,
     Vector,
+    check_columns,
     scale,
 )
 

@@ -1,29 +1,31 @@
 """Tables of a scene file that say what the body is, how it starts and what acts on it: SI units."""
 
-import itertools
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
-from pydantic import BeforeValidator, Discriminator, Field, Tag, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from polhode.files import _values
 from polhode.files._values import (
-    MAX_SAMPLES,
-    BelowFolder,
     Direction,
     Gains,
+    InertiaTable,
     Lengths,
     Matrix,
     Measured,
     NotNegative,
     Number,
+    NumberOverTime,
     Numbers,
+    NumberTable,
     Positive,
     Quaternion,
     Sequence,
     Table,
     Vector,
+    VectorOverTime,
+    Velocity,
 )
 
 
@@ -49,91 +51,6 @@ class Euler(Measured):
     @property
     def attitude(self) -> Attitudes:
         return Attitudes(self.angles, self.sequence)
-
-
-class TimeTable(Table):
-    """Values over time: `times` and `values`, or the columns of a CSV `file` beside the scene.
-
-    The first column of the file is the time. In SI units but for the times.
-    """
-
-    widths: ClassVar[tuple[int, ...]]
-    one_of = (("values", "file"),)
-    times: list[Number] | None = Field(None, min_length=2, max_length=MAX_SAMPLES)
-    values: list[Any] | None = None
-    file: BelowFolder | None = Field(None, description="CSV: time and values in its columns")
-    order: Literal[1, 3] = Field(3, description="3: cubic interpolation, 1: linear")
-    unit: _values.Seconds = Field("s", description="of the times")
-
-    @model_validator(mode="after")
-    def _rows(self) -> Self:
-        if (self.times is None) != (self.values is None):
-            raise ValueError("times and values are given together, or the file in their place")
-        if self.times is None or self.values is None:
-            return self
-        if len(self.times) != len(self.values):
-            raise ValueError(f"{len(self.times)} times and {len(self.values)} values are no pairs")
-        check_columns(self.times, self.values, self.widths)
-        return self
-
-    @property
-    def unit_seconds(self) -> float:
-        """The unit of the times, s."""
-        return _values.SECONDS[self.unit]
-
-
-def check_columns(times: list[float], values: list[Any], widths: tuple[int, ...]) -> None:
-    """ValueError unless times ascend and all values have one and the same of these widths."""
-    for index, (a, b) in enumerate(itertools.pairwise(times)):
-        if not a < b:
-            raise ValueError(f"the times must ascend (entry {index + 2} is {b} after {a})")
-    found = {len(x) if isinstance(x, list) else 1 for x in values}
-    if len(found) != 1 or not found <= set(widths):
-        expected = " or ".join(map(str, widths))
-        raise ValueError(
-            f"each value must have {expected} number{'s' if expected != '1' else ''}, got"
-            f" {', '.join(map(str, sorted(found)))}"
-        )
-
-
-class NumberTable(TimeTable):
-    widths = (1,)
-    values: list[Number] | None = Field(None, max_length=MAX_SAMPLES)
-
-
-class VectorTable(TimeTable):
-    widths = (3,)
-    values: list[Vector] | None = Field(None, max_length=MAX_SAMPLES)
-
-
-class InertiaTable(TimeTable):
-    """Moments (3 numbers), or tensors (9 numbers, row by row), in the unit of the inertia."""
-
-    widths = (3, 9)
-    values: list[Annotated[list[Number], Field(min_length=3, max_length=9)]] | None = Field(
-        None, max_length=MAX_SAMPLES
-    )
-
-
-def _kind_of(value: Any) -> str:
-    """Whether a value is meant as a constant or as a table over time: errors are those of this."""
-    if isinstance(value, str):
-        return "word"
-    return "table" if isinstance(value, Mapping | TimeTable) else "constant"
-
-
-_Constant, _Series, _Word = Tag("constant"), Tag("table"), Tag("word")
-_BY_KIND = Discriminator(_kind_of)
-NumberOverTime = Annotated[
-    Annotated[NotNegative, _Constant] | Annotated[NumberTable, _Series], _BY_KIND
-]
-VectorOverTime = Annotated[Annotated[Vector, _Constant] | Annotated[VectorTable, _Series], _BY_KIND]
-Velocity = Annotated[
-    Annotated[Vector, _Constant]
-    | Annotated[VectorTable, _Series]
-    | Annotated[Literal["orbit"], _Word],
-    _BY_KIND,
-]
 
 
 class Axisymmetric(Table):

@@ -1,6 +1,11 @@
 """Inertia and other numbers of a scene from recordings, with their uncertainty."""
 
 from polhode.fit._conclude import sensor_axes as sensor_axes
+from polhode.fit._findings import (
+    Finding as Finding,
+    FitError as FitError,
+    Observability as Observability,
+)
 from polhode.fit._fit import (
     fit_inertia as fit_inertia,
     fit_recordings as fit_recordings,
@@ -29,9 +34,4 @@ from polhode.fit._residuals import (
     predict as predict,
     residuals as residuals,
 )
-from polhode.fit._result import (
-    Finding as Finding,
-    Fit as Fit,
-    FitError as FitError,
-    Observability as Observability,
-)
+from polhode.fit._result import Fit as Fit

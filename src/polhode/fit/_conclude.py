@@ -12,6 +12,7 @@ from jax.scipy.stats import norm
 from jaxtyping import Array, Float
 
 from polhode._scene import State
+from polhode.fit._findings import Finding
 from polhode.fit._model import Parameters, entries_of, whole_of
 from polhode.fit._numerics import eigh, inverse, svd
 from polhode.fit._options import FitOptions, Gyroscope, noise_is_trusted
@@ -19,7 +20,6 @@ from polhode.fit._recording import Recording, require_channel, rotation_vector_b
 from polhode.fit._residuals import Linear, prior_of
 from polhode.fit._result import (
     MAX_NULL_PART,
-    Finding,
     Fit,
     InertiaEstimate,
 )

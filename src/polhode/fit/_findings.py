@@ -1,0 +1,81 @@
+"""Findings of a fit: flags, their messages, and what a recording shows of each quantity."""
+
+import enum
+from typing import NamedTuple
+
+
+class Finding(enum.IntFlag):
+    """Diagnostics of a fit, as flags (per body; 0: none)."""
+
+    NONE = 0
+    STEP_LIMIT = 1
+    NOT_FINITE = 2
+    NEARLY_FLAT = 4
+    UNDETERMINED = 8
+    AXES_DISAGREE = 16
+    NOT_WHITE = 32
+    WEAK = 64
+    POOR = 128
+    SATURATED = 256
+    OUTLIERS = 512
+    CALIBRATION = 1024
+    AT_BOUND = 2048
+
+
+WARNINGS = {
+    Finding.STEP_LIMIT: "the optimiser stopped at its step limit: raise max_steps or max_starts, "
+    "or shorten the recording into windows",
+    Finding.NOT_FINITE: "the fit is not finite: look for outliers (robust=Huber()), wrong units or "
+    "a recording with too little rotation",
+    Finding.NEARLY_FLAT: "the best body is flat (one moment is the sum of the two others): the "
+    "limit of what is physical; intervals are one-sided there, and drag or bias left out of the "
+    "model may have pushed it there",
+    Finding.UNDETERMINED: "some of the tensor does not show in this motion (an axis hardly "
+    "excited, or a symmetric body): their intervals are infinite; add a recording of another spin",
+    Finding.AXES_DISAGREE: "rates and attitudes contradict each other for right-handed axes: one "
+    "axis is inverted, or axes are exchanged; correct the columns (sensor_axes shows how)",
+    Finding.NOT_WHITE: "the residuals are correlated in time: the model lacks something (drag, "
+    "bias, a moving part) and the intervals are too narrow",
+    Finding.WEAK: "a ratio is known to no better than 5 % (a nearly symmetric body, a spin near a "
+    "principal axis, a short record): the interval is approximate, since the misfit is no longer "
+    "quadratic over such a range",
+    Finding.POOR: "the residuals are more than twice as large as the noise: a wrong model, wrong "
+    "axes or units, outliers (robust=Huber()), or a local minimum that is not the best",
+    Finding.SATURATED: "a gyroscope axis is saturated: readings at its limit count as bounds only;"
+    " state the limit, Gyroscope(max_rate=...), where an axis is beyond it throughout",
+    Finding.OUTLIERS: "single samples are more than five times as far off as others: fit with"
+    " robust=Huber(); intervals are wider than they need to be",
+    Finding.CALIBRATION: "scale factors, misalignment or bias of the gyroscope are more than 3.5"
+    " standard deviations from its calibration: state a wider one, Gyroscope(scale_std=...,"
+    " misalignment_std=...), or the model lacks something that they make up for",
+    Finding.AT_BOUND: "a value is at its bound: its interval is one-sided, and the data may ask for"
+    " a value beyond",
+}
+SCENE_WARNINGS = WARNINGS | {
+    Finding.UNDETERMINED: "some of the numbers do not show in this motion, alone or against each"
+    " other: their standard deviations are infinite; free fewer of them, or add a recording that"
+    " shows them",
+    Finding.POOR: "the residuals are more than twice as large as the noise: a wrong model, wrong"
+    " units, outliers (robust=Huber()), or a start too far away",
+}
+UNUSABLE = Finding.STEP_LIMIT | Finding.NOT_FINITE | Finding.AXES_DISAGREE
+"""Findings that raise an error unless ``throw=False``."""
+
+
+class Observability(NamedTuple):
+    """A row of ``Fit.observability``: a quantity and the source of its estimate.
+
+    **Fields:** ``quantity``, with the number of its components in brackets; ``count`` of them, of
+    which the data show ``shown``; ``source``: ``"data"``, ``"data and calibration"``,
+    ``"calibration"`` or ``"nothing"``; ``remedy``: a recording that would show it, or empty.
+    """
+
+    quantity: str
+    count: int
+    shown: int
+    source: str
+    remedy: str
+
+
+class FitError(RuntimeError):
+    """A fit that must not be used as it is; the message gives the cause and what helps."""
