@@ -74,7 +74,7 @@ def test_unknown_phase_functions_are_refused(tmp_path):
     vectors = np.tile([1.0, 0, 0], (40, 1)), np.tile([0.8, 0.6, 0], (40, 1))
     curve = lightcurve.LightCurve.of(t, np.sin(20 * t), *vectors)
     with pytest.raises(ValueError, match="one of seeliger, linear, hg, hg1g2"):
-        _command.fitted(
+        _command.fit_file(
             curve, "x", tmp_path / "x.png", tmp_path / "x.json", trials=1, floor=0.1, seed=0,
             phase="lambert",
         )  # fmt: skip

@@ -63,8 +63,9 @@ class AbstractChunkedForm(AbstractClosedForm):
             lanes, times = chunk
             scene, state = eqx.combine(lanes, shared)
             times = ts if times is None else times
-            saved = times[..., -1:] if record.final_only else times[..., 1:]  # the first: the state
-            elapsed = saved - times[..., :1]
+            # the first sample is the state itself
+            sample_times = times[..., -1:] if record.final_only else times[..., 1:]
+            elapsed = sample_times - times[..., :1]
             n = state.wxyz.shape[0]
             elapsed = jnp.broadcast_to(elapsed if elapsed.ndim == 2 else elapsed[None], (n, count))
             wxyz, omega, holds = self.motion(scene, state, elapsed)
@@ -123,13 +124,13 @@ def wheel_objection(scene: Scene) -> str | None:
     if rotors is None:
         return None
     if isinstance(rotors, Wheels):
-        axes, held = rotors.along, rotors.held
+        axes, are_held = rotors.along, rotors.held
     else:
         axes = tuple(wheel.axis for wheel in rotors.wheels)
-        held = tuple(wheel.is_held for wheel in rotors.wheels)
+        are_held = tuple(wheel.is_held for wheel in rotors.wheels)
     if any(axis != 2 for axis in axes):
         return NOT_AXIAL
-    return None if all(held) else "a motor turns a rotor, or it spins freely"
+    return None if all(are_held) else "a motor turns a rotor, or it spins freely"
 
 
 VARIABLE = "the inertia changes with time"

@@ -67,8 +67,9 @@ class ClosedForm(AbstractClosedForm):
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
         del rtol
         self.refuse(scene)
-        saved = ts[..., -1:] if record.final_only else ts[..., 1:]  # the first is the state itself
-        t = saved - ts[..., :1]
+        # the first sample is the state itself
+        sample_times = ts[..., -1:] if record.final_only else ts[..., 1:]
+        t = sample_times - ts[..., :1]
         inertia = scene.constant_inertia
         axes = products = None
         moments, wxyz, omega = inertia.moments, state.wxyz, state.omega_body

@@ -358,14 +358,14 @@ def _tangent(
 ) -> _Tangent:
     """The formulas of _tangent.py, every value in them with a derivative of its own."""
     moments, _, omega, _, t = arguments
-    scaled = t * motion.polhode.rate_unit
-    ones = opaque_ones(scaled), motion.polhode.one
+    scaled_time = t * motion.polhode.rate_unit
+    ones = opaque_ones(scaled_time), motion.polhode.one
     # The transpose of a stage is a stage: it keeps cotangents from being summed again and again.
     stage = functools.partial(_staged, ones)
     polhode = with_start_derivative(motion.polhode, moments, omega)
     frame = Frame(polhode)
     variation = stage(start_variation(polhode, frame, dm, dp, dw))
-    at = _regularised(motion.polhode, motion.at, scaled)
+    at = _regularised(motion.polhode, motion.at, scaled_time)
     integrals = stage(second_kind(motion.polhode, at.half_turns, at.reduced, many))
     x, y = polhode.B * polhode.r, polhode.A * polhode.p
     *functions, first, second = with_functions_derivative(
@@ -374,7 +374,7 @@ def _tangent(
         (polhode, at.half_turns),
         x,
         with_difference_derivative(polhode, x, y),
-        scaled,
+        scaled_time,
     )
     functions = tuple(functions)
     now = with_momentum_derivative(polhode, functions, at.momentum)
@@ -393,7 +393,7 @@ def _tangent(
             variation,
             variation_since_start,
             first,
-            scaled,
+            scaled_time,
         )
     return _Tangent(polhode, frame, now, variation, total, turn)
 
@@ -515,5 +515,5 @@ def _start_tangent(start: Quadruple, variation: Quadruple, now: Quadruple, other
         (d - along * inverse_square * q) * inverse_square
         for d, q in zip(variation, start, strict=True)
     )
-    left = quaternion_product(unit, (start[0], -start[1], -start[2], -start[3]))
-    return tuple(a + b for a, b in zip(other, quaternion_product(left, now), strict=True))
+    relative = quaternion_product(unit, (start[0], -start[1], -start[2], -start[3]))
+    return tuple(a + b for a, b in zip(other, quaternion_product(relative, now), strict=True))

@@ -447,10 +447,10 @@ def _log_derivative(x: Complex, mirror: Complex, c: Curve, one: Array) -> Comple
     Of g = -1 it comes of the pair x, h/x, of g = 1 of h x, h/x: their sums are real.
     """
     ones = jnp.ones_like(c.h)
-    moved = x * jnp.stack([ones, c.h])
+    argument = x * jnp.stack([ones, c.h])
     times, rise = jnp.stack([c.h, c.h * c.h]), jnp.stack([ones, 2 * c.h])
-    norm, twist = pair(moved.re + mirror.re, times, rise, _row(c.series, 2), one)
-    log_derivative = staged((mirror - moved) * (twist / norm), one)
+    norm, twist = pair(argument.re + mirror.re, times, rise, _row(c.series, 2), one)
+    log_derivative = staged((mirror - argument) * (twist / norm), one)
     upper = x.at(1)
     return _stack(log_derivative.at(0), log_derivative.at(1) + upper * (1 - upper).inverse)
 
@@ -480,8 +480,8 @@ def cayley_klein(o: LagrangeConstants, elapsed: Array) -> tuple[Complex, Complex
         ahead, behind = staged((s.mirror * forward, s.place * backward), one)
         theta, twist = staged(unpaired(ahead, behind, series, one), one)
         fading = s.d * f
-        left = s.c - fading
-        value, derivative = staged((left * theta, left * twist - fading * theta), one)
+        difference = s.c - fading
+        value, derivative = staged((difference * theta, difference * twist - fading * theta), one)
         phase = unit(s.rate.re * elapsed + count * s.angle)
         factor = phase * (below * jnp.where(s.growing, 1 / half, 1))
         factor = staged(factor, one)

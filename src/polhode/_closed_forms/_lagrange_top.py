@@ -186,10 +186,10 @@ def _corrected(motion, arguments: Any, elapsed, short, weightless, at_rest) -> A
     small = short_motion(
         transverse, force, distance, wxyz, omega, axial, jnp.where(short, elapsed, 0)
     )
-    weighted = with_weight(
+    corrected_motion = with_weight(
         transverse, force, distance, wxyz, omega, axial, elapsed, motion, weightless & ~at_rest
     )
-    motion = [jnp.where(weightless[..., None], x, y) for x, y in zip(weighted, motion)]
+    motion = [jnp.where(weightless[..., None], x, y) for x, y in zip(corrected_motion, motion)]
     return [jnp.where(short[..., None], x, y) for x, y in zip(small, motion)]
 
 

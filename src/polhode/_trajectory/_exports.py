@@ -122,8 +122,8 @@ def write_aem(
     lines = ["CCSDS_AEM_VERS = 2.0", f"CREATION_DATE = {created}", f"ORIGINATOR = {originator}"]
     for k in range(count):
         t = ts.reshape(count, samples)[k]
-        kept = np.unique(t, return_index=True)[1]  # in the order of time, each time once
-        moments = [str(start + np.timedelta64(round(x * 1e9), "ns")) for x in t[kept]]
+        places = np.unique(t, return_index=True)[1]  # in the order of time, each time once
+        moments = [str(start + np.timedelta64(round(x * 1e9), "ns")) for x in t[places]]
         if len(set(moments)) < len(moments):
             raise ValueError(
                 "times closer than a nanosecond cannot be written: keep fewer samples."
@@ -142,7 +142,10 @@ def write_aem(
             "",
             "DATA_START",
         ]
-        rows = wxyz.reshape(count, samples, 4)[k][kept], omega.reshape(count, samples, -1)[k][kept]
+        rows = (
+            wxyz.reshape(count, samples, 4)[k][places],
+            omega.reshape(count, samples, -1)[k][places],
+        )
         lines += [f"{m} {row}" for m, row in zip(moments, _rows(*rows))]
         lines.append("DATA_STOP")
     Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")

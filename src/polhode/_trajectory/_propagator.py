@@ -53,24 +53,24 @@ class Propagator(AbstractPropagator):
             )
         if trajectory._event_time is not None:
             times = _until_event(trajectory, times)
-        found = moved_to(trajectory, times)
-        if not isinstance(found.status, Tracer):
-            raise_on_failure(found.status)
-        return found
+        result = moved_to(trajectory, times)
+        if not isinstance(result.status, Tracer):
+            raise_on_failure(result.status)
+        return result
 
 
 def moved_to(trajectory: Trajectory, t: Array) -> Trajectory:
     """The trajectory at times (K,) or (..., K) of its dtype, in any order; see ``at``."""
-    return _moved(trajectory, t, False)
+    return _at_times(trajectory, t, False)
 
 
 def moved_through(trajectory: Trajectory, t: Array) -> Trajectory:
     """The same for times in order, from the first sample on: for many, all over the motion."""
-    return _moved(trajectory, t, True)
+    return _at_times(trajectory, t, True)
 
 
 @jit_distinct
-def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
+def _at_times(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
     propagator: Any = trajectory.propagator
     batch, ts = trajectory.batch_shape, trajectory.ts
     parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
@@ -80,12 +80,12 @@ def _moved(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
         ts, times = (lane_times(jnp.atleast_2d(x), batch) for x in (ts, times))
     times = jnp.where(jnp.isfinite(times), times, ts[..., :1])
     move = _from_first if in_order or propagator.method.exact else _from_nearest
-    found, status, steps = move(propagator, Scene(**parts), samples, ts, times)
-    wxyz, omega, *spins = (x.reshape(*batch, *x.shape[1:]) for x in found)
-    asked = jnp.broadcast_to(finite, wxyz.shape[:-1])[..., None]
+    states, status, steps = move(propagator, Scene(**parts), samples, ts, times)
+    wxyz, omega, *spins = (x.reshape(*batch, *x.shape[1:]) for x in states)
+    is_finite = jnp.broadcast_to(finite, wxyz.shape[:-1])[..., None]
     status, steps = status.reshape(batch), steps.reshape(batch)
     good = trajectory.status == Status.SUCCESSFUL
-    samples = [jnp.where(asked, x, jnp.nan) for x in (wxyz, omega, *spins)]
+    samples = [jnp.where(is_finite, x, jnp.nan) for x in (wxyz, omega, *spins)]
     status = jnp.where(good, status, trajectory.status)
     return trajectory._with_samples(t, samples, status, steps, trajectory._event_time)
 
@@ -114,9 +114,9 @@ def _from_first(propagator: Propagator, scene: Scene, samples, ts, times):
     wxyz, omega, *spins = (x[:, 0] for x in samples)
     times = jnp.concatenate([ts[..., :1], times], axis=-1)
     rtol = None if propagator.rtol is None else jnp.min(propagator.rtol)
-    found = propagator.method.run(begun(scene, spins), State(wxyz, omega), times, rtol, Record())
-    kept = [x[:, 1:] for x in (found.wxyz, found.omega_body, found.spins) if x is not None]
-    return kept, found.status, found.steps
+    result = propagator.method.run(begun(scene, spins), State(wxyz, omega), times, rtol, Record())
+    states = [x[:, 1:] for x in (result.wxyz, result.omega_body, result.spins) if x is not None]
+    return states, result.status, result.steps
 
 
 def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
@@ -127,35 +127,35 @@ def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
     final = Record(final_only=True)
     unit = _gap(ts, times)
 
-    def moved(scene, start, begin, end, unit):
+    def from_sample(scene, start, begin, end, unit):
         """Lanes at ``end`` () or (N,), their status and steps."""
         wxyz, omega, *spins = start
         scene = begun(scene, spins)
         there = begin == end
         span = jnp.stack([begin, jnp.where(there, begin + unit, end)], axis=-1)
-        found = propagator.method.run(scene, State(wxyz, omega), span, rtol, final)
+        result = propagator.method.run(scene, State(wxyz, omega), span, rtol, final)
         # where no time passes, the sample itself, with its derivatives by the time
         step = jnp.broadcast_to((end - begin)[..., None], (*wxyz.shape[:-1], 1))
         here = jnp.broadcast_to(there[..., None], step.shape)
-        ends = [x[:, 0] for x in (found.wxyz, found.omega_body, found.spins) if x is not None]
+        ends = [x[:, 0] for x in (result.wxyz, result.omega_body, result.spins) if x is not None]
         near = _along(scene, start, begin, jnp.where(here, step, 0))
-        kept = [jnp.where(here, x, end) for x, end in zip(near, ends)]
+        states = [jnp.where(here, x, end) for x, end in zip(near, ends)]
         return (
-            kept,
-            jnp.where(here[:, 0], Status.SUCCESSFUL, found.status),
-            jnp.where(here[:, 0], 0, found.steps),
+            states,
+            jnp.where(here[:, 0], Status.SUCCESSFUL, result.status),
+            jnp.where(here[:, 0], 0, result.steps),
         )
 
     if ts.ndim == 1:
         place = _nearest(ts, times)
 
-        def one(given):
-            k, t = given
-            return moved(scene, [x[:, k] for x in samples], ts[k], t, unit)
+        def one(arguments):
+            k, t = arguments
+            return from_sample(scene, [x[:, k] for x in samples], ts[k], t, unit)
 
-        found, status, steps = jax.lax.map(one, (place, times))
-        found = [jnp.moveaxis(x, 0, 1) for x in found]
-        return found, jnp.max(status, axis=0), jnp.sum(steps, axis=0)
+        states, status, steps = jax.lax.map(one, (place, times))
+        states = [jnp.moveaxis(x, 0, 1) for x in states]
+        return states, jnp.max(status, axis=0), jnp.sum(steps, axis=0)
     n, count = times.shape
     place = jax.vmap(_nearest)(ts, times)
     begin = jnp.take_along_axis(ts, place, axis=-1).reshape(-1)
@@ -168,16 +168,16 @@ def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
 
     parts = {name: map_arrays(getattr(scene, name), each_time) for name in PARTS}
     parts = {name: flatten(part, (n, count)) for name, part in parts.items()}
-    found = moved(Scene(**parts), start, begin, times.reshape(-1), unit.reshape(-1))
-    found, status, steps = jax.tree.map(lambda x: x.reshape(n, count, *x.shape[1:]), found)
-    return found, jnp.max(status, axis=-1), jnp.sum(steps, axis=-1)
+    states = from_sample(Scene(**parts), start, begin, times.reshape(-1), unit.reshape(-1))
+    states, status, steps = jax.tree.map(lambda x: x.reshape(n, count, *x.shape[1:]), states)
+    return states, jnp.max(status, axis=-1), jnp.sum(steps, axis=-1)
 
 
 def shortly_after(trajectory: Trajectory, late: Array) -> Trajectory:
     """Samples so little later, by ``late`` (..., T) [s], that three terms of their Taylor series
     lead there: of what is no later but for its derivatives, values and two derivatives."""
-    found = _along(trajectory._scene, trajectory._samples, trajectory._t, late[..., None])
-    wxyz, omega, *spins = found
+    states = _along(trajectory._scene, trajectory._samples, trajectory._t, late[..., None])
+    wxyz, omega, *spins = states
     return Trajectory(
         trajectory._t + late,
         wxyz,
@@ -196,13 +196,13 @@ def _along(scene: Scene, samples: list[Array], t: Array, step: Array) -> list[Ar
     def rates(samples, t):
         wxyz, omega, *spins = samples
         now = tuple(jnp.moveaxis(spins[0], -1, 0)) if spins else ()
-        acceleration, turned = scene.with_spins(now).changes(wxyz, omega, t)
-        more = [jnp.stack(jnp.broadcast_arrays(*turned), axis=-1)] if turned else []
+        acceleration, wheel_torques = scene.with_spins(now).changes(wxyz, omega, t)
+        more = [jnp.stack(jnp.broadcast_arrays(*wheel_torques), axis=-1)] if wheel_torques else []
         return [wxyz_rate(wxyz, omega), acceleration, *more]
 
-    given = list(samples), jnp.asarray(t)
-    first = rates(*given)
-    _, second = jax.jvp(rates, given, (first, jnp.ones_like(given[1])))
+    begin = list(samples), jnp.asarray(t)
+    first = rates(*begin)
+    _, second = jax.jvp(rates, begin, (first, jnp.ones_like(begin[1])))
     return [x + step * (a + step / 2 * b) for x, a, b in zip(samples, first, second)]
 
 

@@ -151,8 +151,8 @@ def successful_mean(trajectory: Trajectory, cost: Callable[[Trajectory], Array])
     batch, good = trajectory.batch_shape, trajectory.successful
 
     def samples(t):
-        saved, final = jax.tree.leaves(t._saved), t._final or ()
-        return [x for x in (*t._samples, t._work, *final, *saved) if x is not None]
+        values, final = jax.tree.leaves(t._saved), t._final or ()
+        return [x for x in (*t._samples, t._work, *final, *values) if x is not None]
 
     def finite(x):
         if not jnp.issubdtype(x.dtype, jnp.inexact):  # a count that was saved

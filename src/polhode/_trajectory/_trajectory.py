@@ -133,8 +133,8 @@ class Trajectory(eqx.Module):
         if times.size:
             lines.append(f"times   {times[..., 0].min():g} to {times[..., -1].max():g} s")
         values, numbers = np.unique(np.asarray(self.status), return_counts=True)
-        met = (f"{n:,} {Status(int(v)).name}" for v, n in zip(values, numbers))
-        lines.append(f"status  {', '.join(met)}")
+        outcomes = (f"{n:,} {Status(int(v)).name}" for v, n in zip(values, numbers))
+        lines.append(f"status  {', '.join(outcomes)}")
         steps = np.asarray(self.steps)
         if steps.size and steps.max() > 0:
             few, middle, many = steps.min(), np.median(steps), steps.max()
@@ -319,10 +319,10 @@ class Trajectory(eqx.Module):
             return full[bodies] if bodies else full
 
         def of_both(x, rank):
-            kept = of_bodies(x, rank)
-            if kept is None:
+            entries = of_bodies(x, rank)
+            if entries is None:
                 return None
-            return kept[(..., *times, *(slice(None),) * (rank - 1))]
+            return entries[(..., *times, *(slice(None),) * (rank - 1))]
 
         parts = {name: map_arrays(getattr(self.scene, name), of_bodies) for name in PARTS}
         final = None
@@ -362,13 +362,13 @@ class Trajectory(eqx.Module):
                 " traj[..., 10:20]."
             )
         ts = np.asarray(self.ts)
-        (kept,) = np.nonzero((ts >= min(start, end)) & (ts <= max(start, end)))
-        if not kept.size:
+        (places,) = np.nonzero((ts >= min(start, end)) & (ts <= max(start, end)))
+        if not places.size:
             raise ValueError(
                 f"no sample lies between {start} and {end}; they run from {ts[0]} to {ts[-1]}:"
                 " for times between samples use traj.at(times)."
             )
-        return self[..., kept[0] : kept[-1] + 1]
+        return self[..., places[0] : places[-1] + 1]
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -534,7 +534,7 @@ def _entry(key: Any) -> Any:
     )
 
 
-def _taken(key: Any) -> int:
+def _axes_of(key: Any) -> int:
     """Axes that an entry stands for."""
     return key.ndim if getattr(key, "dtype", None) == np.bool_ else 1
 
@@ -543,16 +543,16 @@ def split_key(key: Any, rank: int) -> tuple[tuple[Any, ...], Any]:
     """Entries of the ``rank`` axes of bodies, and the entry of the times."""
     entries = [_entry(k) for k in (key if isinstance(key, tuple) else (key,))]
     dots = [i for i, k in enumerate(entries) if k is Ellipsis]
-    used = sum(_taken(k) for k in entries if k is not Ellipsis)
-    if len(dots) > 1 or used > rank + 1:
+    count = sum(_axes_of(k) for k in entries if k is not Ellipsis)
+    if len(dots) > 1 or count > rank + 1:
         raise IndexError(
             f"this trajectory has {rank + 1} axes to index, {rank} of bodies and one of times, got"
             f" {len(entries)} entries."
         )
     place = dots[0] if dots else len(entries)
-    filled = entries[:place] + [slice(None)] * (rank + 1 - used) + entries[place + 1 :]
-    *bodies, times = filled
-    if _taken(times) != 1:
+    full_key = entries[:place] + [slice(None)] * (rank + 1 - count) + entries[place + 1 :]
+    *bodies, times = full_key
+    if _axes_of(times) != 1:
         raise IndexError("truth values that choose samples must have one axis, that of the times.")
     return tuple(bodies), times
 
@@ -567,9 +567,9 @@ def check_key(key: Any, shape: tuple[int, ...], what: str) -> None:
     """IndexError for a known key outside the shape, where JAX would take the nearest entry."""
     if not is_concrete(key):
         return
-    known = key if isinstance(key, tuple) else (key,)
-    known = tuple(k if isinstance(k, slice) else np.asarray(k) for k in known)
+    concrete = key if isinstance(key, tuple) else (key,)
+    concrete = tuple(k if isinstance(k, slice) else np.asarray(k) for k in concrete)
     try:
-        np.broadcast_to(np.int8(0), shape)[known]
+        np.broadcast_to(np.int8(0), shape)[concrete]
     except IndexError as error:
         raise IndexError(f"there are {what} of shape {shape}, got {key!r:.60}: {error}.") from None

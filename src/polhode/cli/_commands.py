@@ -271,7 +271,7 @@ def lightcurve(
     import jax
 
     jax.config.update("jax_enable_x64", True)
-    from polhode.lightcurve._command import fitted, read, read_solutions
+    from polhode.lightcurve._command import fit_file, read, read_solutions
 
     reading = {"binned": binned, "calibrated": calibrated, "reduced": reduced}
     with usage_errors(path, ".csv", expected):
@@ -290,7 +290,7 @@ def lightcurve(
     words = f"searching {curve.t.size} points with {trials:,} trials (compiling first)"
     try:
         with _process.spinner(_process.progress_console(quiet), words) as show:
-            fitted(
+            fit_file(
                 curve,
                 path.name,
                 *paths,

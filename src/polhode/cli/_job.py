@@ -156,7 +156,7 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
     size = min(total, max(_MIN_CHUNK, -(-total // _CHUNKS)))
     arrays: dict[str, np.ndarray] = {}
     residuals = None
-    sampled = _index(job, job.ts)
+    sample_of_times = _index(job, job.ts)
     events = build_events(job.file, job.ts.dtype)
     times: dict[str, list[np.ndarray]] = {name: [] for name in events}
     for start in range(0, total, size):
@@ -168,7 +168,7 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
         for name in ("wxyz", "omega_body", "status", "steps"):
             part = np.asarray(getattr(piece, name))
             if name in ("wxyz", "omega_body"):
-                part = part[..., sampled, :]
+                part = part[..., sample_of_times, :]
             if not job.batch_shape:
                 arrays[name] = part
                 continue

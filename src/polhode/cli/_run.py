@@ -162,8 +162,8 @@ def _with_progress(console, job):
     with _process.progress_bar(console, TimeElapsedColumn()) as progress:
         task = progress.add_task("", total=job.bodies)
 
-        def advance(done: int) -> None:
-            progress.update(task, completed=done)
+        def advance(count: int) -> None:
+            progress.update(task, completed=count)
             check_signals()
 
         return _job.run(job, advance)

@@ -450,11 +450,11 @@ class _Tally:
         self.report()
 
     def report(self) -> None:
-        done, rate, remaining = self.reused + self.computed, None, None
+        count, rate, remaining = self.reused + self.computed, None, None
         if self.computed:
             rate = self.computed / (time.perf_counter() - self.start_time)
-            remaining = (self.total - done) / rate
-        self.progress(Progress(done, self.total, self.reused, rate, remaining))
+            remaining = (self.total - count) / rate
+        self.progress(Progress(count, self.total, self.reused, rate, remaining))
 
 
 def device_names(devices: Sequence[Any]) -> str:

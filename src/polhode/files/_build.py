@@ -70,11 +70,11 @@ def build_inertia(file: SceneFile, dtype: DTypeLike) -> "Inertia | VariableInert
         if kind == "parts":
             return compose([_solid(solid, dtype) for solid in value]).inertia
         if kind == "table":
-            found = build_table(file, value, dtype)
+            rows = build_table(file, value, dtype)
             unit = np.asarray(MOMENTS[table.unit], dtype)
-            scaled = polhode.Table(found.times, unit * found.values, found.order, kind="vector")
-            _check_moments(file, np.asarray(scaled.values))
-            return VariableInertia(scaled)
+            in_si = polhode.Table(rows.times, unit * rows.values, rows.order, kind="vector")
+            _check_moments(file, np.asarray(in_si.values))
+            return VariableInertia(in_si)
         if kind == "axisymmetric":
             return Inertia.axisymmetric(**_numbers(value, dtype))
         make = {"moments": Inertia.from_moments, "tensor": Inertia.from_tensor}
@@ -86,9 +86,9 @@ def _check_moments(file: SceneFile, rows: np.ndarray) -> None:
     if rows.shape[-1] == 9:
         tensors = rows.reshape(-1, 3, 3)
         rows = np.linalg.eigvalsh((tensors + np.swapaxes(tensors, 1, 2)) / 2)
-    wrong = ~possible_moments(rows)
-    if wrong.any():
-        row = int(np.argmax(wrong))
+    impossible = ~possible_moments(rows)
+    if impossible.any():
+        row = int(np.argmax(impossible))
         raise SceneFileError(
             file.path,
             "[inertia.table]",

@@ -490,9 +490,9 @@ class SceneFile(Table):
             if self.ensemble.arrays is not None:
                 tables["ensemble.arrays"] = dict(self.ensemble.arrays.entries())
         for lead, quantities in tables.items():
-            for name, (nominal, needed) in needs.items():
+            for name, (nominal, need) in needs.items():
                 if nominal is None and name in quantities:
-                    raise ValueError(f"[{lead}] {name} does not fit this scene: it needs {needed}")
+                    raise ValueError(f"[{lead}] {name} does not fit this scene: it needs {need}")
         return self
 
     @model_validator(mode="after")

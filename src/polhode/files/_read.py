@@ -301,20 +301,20 @@ _MAX_TABLE_BYTES = 2**28
 
 def _read_tables(file: "SceneFile", scene: Path) -> dict[str, list[list[float]]]:
     """The rows of the CSV files of tables over time, by name. Raises SceneFileError."""
-    found: dict[str, list[list[float]]] = {}
+    tables: dict[str, list[list[float]]] = {}
     for place, table in file.tables:
         if table.file is None:
             continue
-        if table.file not in found:
-            found[table.file] = _read_table(place, table.file, scene)
-        file._columns = found
+        if table.file not in tables:
+            tables[table.file] = _read_table(place, table.file, scene)
+        file._columns = tables
         try:
             times, _ = file.columns(table)
             if len(times) < 2:
                 raise ValueError("two or more rows are needed, got fewer")
         except ValueError as error:
             raise SceneFileError(scene, f"{place} file", str(error), table.file) from None
-    return found
+    return tables
 
 
 def _read_table(place: str, text: str, scene: Path) -> list[list[float]]:

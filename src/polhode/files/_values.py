@@ -209,12 +209,12 @@ def check_columns(times: list[float], values: list[Any], widths: tuple[int, ...]
     for index, (a, b) in enumerate(itertools.pairwise(times)):
         if not a < b:
             raise ValueError(f"the times must ascend (entry {index + 2} is {b} after {a})")
-    found = {len(x) if isinstance(x, list) else 1 for x in values}
-    if len(found) != 1 or not found <= set(widths):
+    widths_of_values = {len(x) if isinstance(x, list) else 1 for x in values}
+    if len(widths_of_values) != 1 or not widths_of_values <= set(widths):
         expected = " or ".join(map(str, widths))
         raise ValueError(
             f"each value must have {expected} number{'s' if expected != '1' else ''}, got"
-            f" {', '.join(map(str, sorted(found)))}"
+            f" {', '.join(map(str, sorted(widths_of_values)))}"
         )
 
 

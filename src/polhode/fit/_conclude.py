@@ -69,12 +69,12 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
     inverted = jnp.where(determined, 1 / jnp.where(determined, values, 1), 0)
     covariance = (vectors * inverted[None]) @ vectors.T / safe[:, None] / safe[None]
     null = jnp.where(determined, 0, 1)[None] * vectors / safe[:, None]
-    used = jnp.sum(determined).astype(dtype)
+    count = jnp.sum(determined).astype(dtype)
     square = jnp.sum(linear.rest**2)
     total = size_of_data(recording, linear.rest.shape[-1])
     prior_std = jnp.full(has_prior.size, jnp.inf, dtype)
     if not has_prior.any():
-        noise = jnp.sqrt(square / jnp.maximum(total - used, 1))
+        noise = jnp.sqrt(square / jnp.maximum(total - count, 1))
         variance = jnp.asarray(1, dtype) if trust_noise else noise**2
         return Determination(
             information, covariance * variance, null, safe, jnp.sum(~determined), noise, prior_std
@@ -91,11 +91,11 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
     rounding = 1e3 * float(jnp.finfo(dtype).eps) * jnp.max(jnp.diagonal(block) * width**2)
     gained_information = jnp.where(gained_information > rounding, gained_information, 0)
     # Degrees of freedom: an unknown with a prior counts by the part that the data determine.
-    noise = jnp.sqrt(square / jnp.maximum(total - used, 1))
+    noise = jnp.sqrt(square / jnp.maximum(total - count, 1))
     noise = jnp.sqrt(
         square
         / jnp.maximum(
-            total - used - jnp.sum(gained_information / (gained_information + noise**2)), 1
+            total - count - jnp.sum(gained_information / (gained_information + noise**2)), 1
         )
     )
     variance = jnp.asarray(1, dtype) if trust_noise else noise**2
@@ -380,9 +380,9 @@ def sensor_axes(recording: Recording) -> Float[Array, "*b 3 3"]:
     diagonal for an inverted axis, a permutation for exchanged ones, a rotation for a mounting.
     """
     measured, from_attitudes = _turns(recording, centred=False)
-    mixed = jnp.einsum("...ti,...tj->...ij", measured, from_attitudes)
+    product = jnp.einsum("...ti,...tj->...ij", measured, from_attitudes)
     square = jnp.einsum("...ti,...tj->...ij", from_attitudes, from_attitudes)
-    return mixed @ inverse(square)
+    return product @ inverse(square)
 
 
 def is_saturated(recording: Recording) -> Array:
@@ -451,13 +451,13 @@ def _turns(recording: Recording, centred: bool) -> tuple[Array, Array]:
     weight = (recording.present[..., 1:] * recording.present[..., :-1])[..., None]
     step = jnp.diff(recording.times, axis=-1)[..., None]
     measured = step * (omega[..., 1:, :] + omega[..., :-1, :]) / 2
-    turned = rotation_vector_between(wxyz[..., :-1, :], wxyz[..., 1:, :])
+    recorded = rotation_vector_between(wxyz[..., :-1, :], wxyz[..., 1:, :])
     if centred:
         total = jnp.sum(weight, axis=-2, keepdims=True)
-        measured, turned = (
-            x - jnp.sum(weight * x, axis=-2, keepdims=True) / total for x in (measured, turned)
+        measured, recorded = (
+            x - jnp.sum(weight * x, axis=-2, keepdims=True) / total for x in (measured, recorded)
         )
-    return weight * measured, weight * turned
+    return weight * measured, weight * recorded
 
 
 def residuals_by_channel(linear: Linear, recording: Recording) -> dict[str, Array]:
@@ -476,21 +476,21 @@ def whiteness_of(rest: Array, present: Array, lags: int = 5) -> Array:
     """Ljung-Box probability of the first autocorrelations of all channels together."""
     total = jnp.sum(present, axis=-1)[:, None]
     # recordings that only fill a batch up have no samples and count nothing
-    filled = total > 0
-    total = jnp.where(filled, total, lags + 1)
+    has_power = total > 0
+    total = jnp.where(has_power, total, lags + 1)
     rest = (rest - (jnp.sum(rest, axis=1) / total)[:, None]) * present[..., None]
     power = jnp.sum(rest**2, axis=1)
     safe = jnp.where(power > 0, power, 1)
     later = jnp.pad(rest, ((0, 0), (0, lags), (0, 0)))
 
     def one(lag):
-        moved = jax.lax.dynamic_slice_in_dim(later, lag, rest.shape[1], axis=1)
-        correlation = jnp.sum(rest * moved, axis=1) / safe
+        lagged = jax.lax.dynamic_slice_in_dim(later, lag, rest.shape[1], axis=1)
+        correlation = jnp.sum(rest * lagged, axis=1) / safe
         return jnp.sum(correlation**2 / (total - lag.astype(total.dtype)) * total * (total + 2))
 
     statistic = jnp.sum(jax.lax.map(one, jnp.arange(1, lags + 1)))
     # Chi-square of many degrees by Wilson and Hilferty (PNAS 17 (1931) 684): the exact one would
     # take longer to compile than all else here.
-    degrees = lags * rest.shape[-1] * jnp.sum(filled).astype(rest.dtype)
+    degrees = lags * rest.shape[-1] * jnp.sum(has_power).astype(rest.dtype)
     spread = 2 / (9 * degrees)
     return norm.sf(((statistic / degrees) ** (1 / 3) - 1 + spread) / spread**0.5)

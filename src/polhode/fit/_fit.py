@@ -70,7 +70,7 @@ def fit_inertia(
         "force_noise": (force_noise, "force_body", force_body),
     }
     options = _with_noise(options, channels)
-    noise = {name: 1.0 if given is None else given for name, (given, _, _) in channels.items()}
+    noise = {name: 1.0 if value is None else value for name, (value, _, _) in channels.items()}
     recording = Recording.of(
         times, omega_body, wxyz=wxyz, force_body=force_body, wheel_speed=wheel_speed, **noise
     )

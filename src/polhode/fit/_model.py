@@ -118,8 +118,8 @@ def free_columns(unknown: AbstractInertiaUnknown, scale_known: bool) -> np.ndarr
     if scale_known:
         return columns
     flat = columns - np.outer(SCALE, SCALE @ columns)
-    left, size, _ = np.linalg.svd(flat, full_matrices=False)
-    return left[:, size > 0.5]
+    basis, size, _ = np.linalg.svd(flat, full_matrices=False)
+    return basis[:, size > 0.5]
 
 
 class Base(NamedTuple):
@@ -156,14 +156,14 @@ def tensor_of(shape: Float[Array, " k"], base: Base, columns: np.ndarray) -> Arr
     values, axes, (yz, zx, xy) = principal(whole_of(y))
     root = jnp.sqrt(values**2 + base.soft**2)
     # without cancellation for negative eigenvalues
-    bent = jnp.where(values > 0, (values + root) / 2, base.soft**2 / (2 * (root - values)))
+    positive = jnp.where(values > 0, (values + root) / 2, base.soft**2 / (2 * (root - values)))
 
     def slope(i, j):
         # divided difference of the function above; the products that it multiplies are zero, and
         # carry the tangent of turning axes
         return (1 + (values[i] + values[j]) / (root[i] + root[j])) / 2
 
-    inner = symmetric(bent, (slope(1, 2) * yz, slope(2, 0) * zx, slope(0, 1) * xy))
+    inner = symmetric(positive, (slope(1, 2) * yz, slope(2, 0) * zx, slope(0, 1) * xy))
     turn = wxyz_to_matrix(axes)
     exact = jax.lax.Precision.HIGHEST
     sigma = jnp.einsum("ij,jk,lk->il", turn, inner, turn, precision=exact)
@@ -233,8 +233,8 @@ class Drag(eqx.Module):
     def torque(self, dtype: DTypeLike) -> AbstractTorque:
         """The torque in a scene; a fit may try negative coefficients, which a scene refuses."""
         parts = LinearDamping(1.0) + QuadraticDamping(1.0)
-        tried = [jnp.full(3, c, dtype) for c in (self.linear, self.quadratic)]
-        return eqx.tree_at(lambda s: [term.c for term in s.terms], parts, tried)
+        coefficients = [jnp.full(3, c, dtype) for c in (self.linear, self.quadratic)]
+        return eqx.tree_at(lambda s: [term.c for term in s.terms], parts, coefficients)
 
 
 def _three_floats(values: Sequence[float]) -> tuple[float, float, float]:
@@ -380,7 +380,7 @@ class FreeMotion(AbstractMotion):
         moments, axes, (yz, zx, xy) = principal(tensor)
         start = rotate(conjugate(axes), omega)
         attitude = None if wxyz is None else tuple(multiply(wxyz, axes))
-        rates, turned = free_motion(
+        rates, path_wxyz = free_motion(
             tuple(moments),
             attitude,
             tuple(start),
@@ -389,9 +389,9 @@ class FreeMotion(AbstractMotion):
             attitude=wxyz is not None,
         )
         path = _combined(wxyz_to_matrix(axes), rates)
-        if turned is not None:
-            turned = _combined(_right_product(conjugate(axes)), turned)
-        return Predicted(path, free_acceleration(Inertia(full=tensor), path), turned)
+        if path_wxyz is not None:
+            path_wxyz = _combined(_right_product(conjugate(axes)), path_wxyz)
+        return Predicted(path, free_acceleration(Inertia(full=tensor), path), path_wxyz)
 
 
 def _combined(matrix: Float[Array, "n n"], components: tuple[Array, ...]) -> Float[Array, "t n"]:

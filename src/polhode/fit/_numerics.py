@@ -89,8 +89,8 @@ def _one_matrix_at_a_time(signature: str) -> Callable:
 
         def call(*operands):
             affected = _AFFECTED and _policy.is_cpu()
-            chosen = looped if affected else function
-            return jnp.vectorize(chosen, signature=signature)(*operands)
+            implementation = looped if affected else function
+            return jnp.vectorize(implementation, signature=signature)(*operands)
 
         return call
 
@@ -117,8 +117,8 @@ def _inverse(matrix: Array) -> Array:
 def inverse(matrix: Array) -> Array:
     """Inverses of matrices (..., n, n), with derivatives in both modes."""
     fixed = jax.lax.stop_gradient(matrix)
-    found = _inverse(fixed)
-    return found - found @ (matrix - fixed) @ found  # loops of single matrices have none
+    result = _inverse(fixed)
+    return result - result @ (matrix - fixed) @ result  # loops of single matrices have none
 
 
 @_one_matrix_at_a_time("(n,n)->(n,n),(n),(n,n)")
@@ -200,7 +200,7 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         self.verbose = _silent
 
     def terminate(self, fn, y, args, options, state, tags):
-        ended, result = super().terminate(fn, y, args, options, state, tags)
+        stop, result = super().terminate(fn, y, args, options, state, tags)
         jacobian, rest = state.f_info.jac.as_matrix(), state.f_info.residual
         square, slope = jacobian.T @ jacobian, jacobian.T @ rest
         size = jnp.sqrt(jnp.diagonal(square))
@@ -212,7 +212,7 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
         gain = slope @ solve(square, slope)
         freedom = max(rest.shape[0] - size.shape[0], 1)
         bound = self.offset**2 * jnp.sum(rest**2) / freedom * size.shape[0] + self.floor**2
-        return ended | (~state.first_step & (gain < bound)), result
+        return stop | (~state.first_step & (gain < bound)), result
 
 
 def _silent(**_):

@@ -91,7 +91,7 @@ class Recording(eqx.Module):
                 f"{place}; sort the rows and drop repeated ones.",
             )
         count, dtype = times.shape[-1], times.dtype
-        given = {
+        channels = {
             "omega_body": (omega_body, (count, 3)),
             "wxyz": (wxyz, (count, 4)),
             "force_body": (force_body, (count, 3)),
@@ -103,10 +103,10 @@ class Recording(eqx.Module):
         )
         arrays = {
             name: _with_gaps(name, value, suffix, dtype)
-            for name, (value, suffix) in given.items()
+            for name, (value, suffix) in channels.items()
             if value is not None
         }
-        tails = {name: given[name][1] for name in arrays}
+        tails = {name: channels[name][1] for name in arrays}
         batch = jnp.broadcast_shapes(
             times.shape[:-1], *(a.shape[: a.ndim - len(tails[n])] for n, a in arrays.items())
         )
@@ -115,21 +115,21 @@ class Recording(eqx.Module):
         arrays = {name: xp.broadcast_to(a, (*batch, *tails[name])) for name, a in arrays.items()}
         times = xp.broadcast_to(times, (*batch, count))
         whole = {name: xp.isfinite(a) for name, a in arrays.items()}
-        filled = {name: xp.where(whole[name], a, _blank(name, a)) for name, a in arrays.items()}
-        wheel, known = filled.pop("wheel_speed", None), None
+        values = {name: xp.where(whole[name], a, _blank(name, a)) for name, a in arrays.items()}
+        wheel, wheel_present = values.pop("wheel_speed", None), None
         present = xp.ones_like(times)
-        for name in filled:
+        for name in values:
             present = present * xp.all(whole[name], axis=-1).astype(dtype)
         if wheel is not None:
-            known = whole["wheel_speed"].astype(dtype)
-            if is_concrete(known):
-                least = int(np.min(np.sum(known, axis=-1)))
+            wheel_present = whole["wheel_speed"].astype(dtype)
+            if is_concrete(wheel_present):
+                least = int(np.min(np.sum(wheel_present, axis=-1)))
                 require(least >= 2, f"wheel_speed needs at least 2 numbers, got {least}.")
-            wheel = interpolate_gaps(*map(jnp.asarray, (times, known, wheel)))
+            wheel = interpolate_gaps(*map(jnp.asarray, (times, wheel_present, wheel)))
         if is_concrete(present):
             least = int(np.min(np.sum(present, axis=-1)))
             require(least >= 4, f"a recording needs at least 4 samples without NaN, got {least}.")
-        omega, attitude, force = (filled.get(n) for n in ("omega_body", "wxyz", "force_body"))
+        omega, attitude, force = (values.get(n) for n in ("omega_body", "wxyz", "force_body"))
         if omega is not None and is_concrete(omega, times):
             _check_rates(omega, times)
         noises = (
@@ -141,7 +141,7 @@ class Recording(eqx.Module):
             )
         )
         attitude = None if attitude is None else normalise(jnp.asarray(attitude))
-        parts = (times, present, omega, attitude, force, wheel, *noises, known)
+        parts = (times, present, omega, attitude, force, wheel, *noises, wheel_present)
         return cls(*jax.tree.map(jnp.asarray, parts))
 
     @property
@@ -176,7 +176,7 @@ def size_of_data(recording: Recording, channels: int) -> Array:
 
 @jax.jit
 def interpolate_gaps(
-    times: Float[Array, "*b t"], known: Float[Array, "*b t"], values: Array
+    times: Float[Array, "*b t"], present: Float[Array, "*b t"], values: Array
 ) -> Array:
     """Values with those that are not ``known`` interpolated linearly between their neighbours.
 
@@ -185,9 +185,9 @@ def interpolate_gaps(
     """
     count = times.shape[-1]
 
-    def one(times, known, values):
+    def one(times, present, values):
         place = jnp.arange(count)
-        there = known > 0
+        there = present > 0
         before = jnp.where(there, place, jnp.maximum(place - 1, 0))
         after = jnp.where(there, place, jnp.minimum(place + 1, count - 1))
 
@@ -208,7 +208,7 @@ def interpolate_gaps(
         return values[before] + part * (values[after] - values[before])
 
     batch = times.shape[:-1]
-    flat = [x.reshape(-1, *x.shape[len(batch) :]) for x in (times, known, values)]
+    flat = [x.reshape(-1, *x.shape[len(batch) :]) for x in (times, present, values)]
     return jax.vmap(one)(*flat).reshape(values.shape)
 
 
@@ -225,7 +225,7 @@ def stack(recordings: Sequence[Recording]) -> Recording:
         )
     longest = max(r.times.shape[-1] for r in recordings)
 
-    def filled(r):
+    def padded(r):
         short = longest - r.times.shape[-1]
         if short == 0:
             return r
@@ -241,7 +241,7 @@ def stack(recordings: Sequence[Recording]) -> Recording:
 
     kinds = {jax.tree.structure(r) for r in recordings}
     require(len(kinds) == 1, "the recordings must hold the same kinds of data, got a mixture.")
-    return jax.tree.map(lambda *parts: jnp.stack(parts), *map(filled, recordings))
+    return jax.tree.map(lambda *parts: jnp.stack(parts), *map(padded, recordings))
 
 
 def averaged(recording: Recording, count: int) -> Recording:
@@ -381,7 +381,7 @@ def load_recording(
     separator = next((mark for mark in ",;\t" if mark in lines[first]), ",")
     (header,) = csv.reader([lines[first]], delimiter=separator, skipinitialspace=True)
     names = [name.strip() for name in header]
-    header_names = _needed(path, names, {} if columns is None else columns)
+    header_names = _required_columns(path, names, {} if columns is None else columns)
     units = {role: unit for role, name in header_names.items() if (unit := unit_of(role, name))}
     if scale is None:
         scale = _common(path, "rates", [units.get(role) for role in ("wx", "wy", "wz")], _RATES)
@@ -390,13 +390,13 @@ def load_recording(
     table, numbers = _rows(path, lines, first, separator, names, header_names)
     data = np.array(table)
     times = data[:, 0]
-    wrong = np.flatnonzero(~(np.diff(times) > 0))
-    if wrong.size:
-        k = int(wrong[0])
+    not_ascending = np.flatnonzero(~(np.diff(times) > 0))
+    if not_ascending.size:
+        k = int(not_ascending[0])
         raise ValueError(
             f"{path}: times must increase, but line {numbers[k + 1]} ({times[k + 1]:g}) does not "
             f"follow line {numbers[k]} ({times[k]:g}); sort the rows, drop repeated or empty "
-            f"ones ({wrong.size} such places)."
+            f"ones ({not_ascending.size} such places)."
         )
     wheel = data[:, 4] if "wheel" in header_names else None
     try:
@@ -408,7 +408,7 @@ def load_recording(
     return LoadedCsv(recording, header_names, units)
 
 
-def _needed(path, names: list[str], columns: Mapping[str, str]) -> dict[str, str]:
+def _required_columns(path, names: list[str], columns: Mapping[str, str]) -> dict[str, str]:
     """The column of each role: the one given, or the one whose name is usual for it."""
     header_names = {
         role: columns.get(role) or usual_column(path, role, names) or role

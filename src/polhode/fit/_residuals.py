@@ -340,10 +340,10 @@ def unknowns(parameters: Parameters, model: Model) -> Unknowns:
         (bias, mounting, lever), motion, (gain, delay) = back(shared[count:])
         attitude = None if parameters.attitude is None else own[None, 3:6]
         walk = None if parameters.walk is None else own[moving:].reshape(1, -1, 3)
-        found = Parameters(
+        values = Parameters(
             none, own[None, :3], attitude, bias, mounting, lever, motion, gain, delay, walk
         )
-        return found, whole_of(shared[:count], count)
+        return values, whole_of(shared[:count], count)
 
     return Unknowns(shared, own, of_motion, of_own, one)
 
@@ -369,7 +369,7 @@ def linearise(
             parts = residuals_of_motion(motion, parameters, lone, here)
             return jnp.concatenate([part[0] for part in parts.values()], axis=-1)
 
-        def moved(some, some_own):
+        def residuals_at(some, some_own):
             parameters, tensor = layout.parameters(
                 shared.at[place].set(some), own.at[own_place].set(some_own)
             )
@@ -383,7 +383,7 @@ def linearise(
             )
             return flat(motion, parameters)
 
-        slopes = jax.jacfwd(moved, argnums=(0, 1), has_aux=True)
+        slopes = jax.jacfwd(residuals_at, argnums=(0, 1), has_aux=True)
         (by_shared, by_own), (rest, motion) = slopes(shared[place], own[own_place])
         if other.size or own_other.size:
             also, own_also = jax.jacfwd(sensed, argnums=(0, 1))(shared[other], own[own_other])

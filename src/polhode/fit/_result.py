@@ -230,8 +230,8 @@ class Fit(eqx.Module):
         std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", full, covariance, full), 0))
         size = np.sqrt(np.diagonal(information))
         safe = np.where(size > 0, size, 1)
-        found, axes = np.linalg.eigh(information / safe[:, None] / safe)
-        null = axes[:, found <= 1e3 * np.finfo(information.dtype).eps * found[-1]]
+        eigenvalues, axes = np.linalg.eigh(information / safe[:, None] / safe)
+        null = axes[:, eigenvalues <= 1e3 * np.finfo(information.dtype).eps * eigenvalues[-1]]
         leaning = np.linalg.norm(full @ (null / safe[:, None]), axis=1)
         reach = np.linalg.norm(full / safe, axis=1)
         std = np.where(leaning > MAX_NULL_PART * reach, np.inf, std)
@@ -448,10 +448,10 @@ class Fit(eqx.Module):
         rests = "data" if gained is None else "data and calibration"
         if self._inertia is not None:
             spread = np.asarray(self.ratios_std).reshape(-1, 3)[body, :2]
-            shown = int(np.isfinite(spread).sum())
-            source = rests if shown else "nothing"
-            remedy = "" if shown == 2 else "another spin, away from the principal axes"
-            rows.append(Observability("ratios of the moments (2)", 2, shown, source, remedy))
+            shown_count = int(np.isfinite(spread).sum())
+            source = rests if shown_count else "nothing"
+            remedy = "" if shown_count == 2 else "another spin, away from the principal axes"
+            rows.append(Observability("ratios of the moments (2)", 2, shown_count, source, remedy))
             size = int(self.scale_known)
             remedy = "" if size else "a wheel of known spin inertia, a known torque or moment"
             source = rests if size else "nothing"
@@ -462,17 +462,17 @@ class Fit(eqx.Module):
         else:
             for k, spread in enumerate(self.std):
                 flat = np.asarray(spread).reshape(max(np.size(self.diagnostics), 1), -1)[body]
-                shown = int(np.isfinite(flat).sum())
-                remedy = "" if shown == flat.size else "another motion, or fewer free numbers"
-                source = rests if shown else "nothing"
+                shown_count = int(np.isfinite(flat).sum())
+                remedy = "" if shown_count == flat.size else "another motion, or fewer free numbers"
+                source = rests if shown_count else "nothing"
                 name = f"{self.value_names[k]} ({flat.size})"
-                rows.append(Observability(name, flat.size, shown, source, remedy))
-        for name, count, shown in gained or []:
+                rows.append(Observability(name, flat.size, shown_count, source, remedy))
+        for name, count, shown_count in gained or []:
             source = ("calibration", "data and calibration", "data")[
-                int(shown > 0) + int(shown == count)
+                int(shown_count > 0) + int(shown_count == count)
             ]
-            remedy = "" if shown == count else "attitudes (wxyz), or rates of a rate table"
-            rows.append(Observability(f"{name} ({count})", count, shown, source, remedy))
+            remedy = "" if shown_count == count else "attitudes (wxyz), or rates of a rate table"
+            rows.append(Observability(f"{name} ({count})", count, shown_count, source, remedy))
         return rows
 
     def _calibration_shown(self, body: int) -> list[tuple[str, int, int]] | None:
@@ -512,8 +512,8 @@ class Fit(eqx.Module):
             prior = np.sqrt(np.sum((basis * width.ravel()) ** 2, axis=1))
             basis = basis[prior > 0] / prior[prior > 0, None]
             if basis.shape[0]:
-                left = np.linalg.eigvalsh(basis @ block @ basis.T)
-                rows.append((name, basis.shape[0], int(np.sum(left < 0.5))))
+                remaining = np.linalg.eigvalsh(basis @ block @ basis.T)
+                rows.append((name, basis.shape[0], int(np.sum(remaining < 0.5))))
         return rows
 
     def report(self, body: int | None = None) -> str:
@@ -538,9 +538,9 @@ class Fit(eqx.Module):
             np.asarray(x).reshape(-1, 3)[body] for x in (self.ratios, self.ratios_std, self.moments)
         )
         rms, noise = (np.asarray(x).reshape(-1)[body] for x in (self.rms, self.noise))
-        shown = " : ".join(f"{r:.4f}({s:.1g})" for r, s in zip(ratios, spread))
+        ratio_text = " : ".join(f"{r:.4f}({s:.1g})" for r, s in zip(ratios, spread))
         size = f"; moments {moments} kg m^2" if self.scale_known else ""
-        return f"body {body}: {shown}{size}; rms {rms:.3g} rad/s, chi {noise:.3g}"
+        return f"body {body}: {ratio_text}{size}; rms {rms:.3g} rad/s, chi {noise:.3g}"
 
     def _value_lines(self, body: int) -> list[str]:
         lead = np.ndim(self.noise)
@@ -552,10 +552,10 @@ class Fit(eqx.Module):
             )
             numbers = ", ".join(f"{v:.6g} +- {s:.2g}" for v, s in zip(value, spread))
             lines.append(f"{name}: {numbers}")
-        known = self.common_scale(body)
-        if known:
+        scale = self.common_scale(body)
+        if scale:
             lines.append("only a common factor of these is not shown; ratios to the largest:")
-        for name, ratio, std in known:
+        for name, ratio, std in scale:
             numbers = ", ".join(f"{v:.6g} +- {s:.2g}" for v, s in zip(ratio.flat, std.flat))
             lines.append(f"  {name}: {numbers}")
         return lines

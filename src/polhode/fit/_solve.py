@@ -90,14 +90,14 @@ def _products(turns: Float[Array, "n 4"], unit: Float[Array, "1 4"]) -> Float[Ar
     """
     count = turns.shape[0]
     side = math.isqrt(count - 1) + 1
-    filled = jnp.concatenate([turns, jnp.broadcast_to(unit, (side * side - count, 4))])
+    padded = jnp.concatenate([turns, jnp.broadcast_to(unit, (side * side - count, 4))])
 
     def on(before, turn):
         now = multiply(before, turn)
         return now, now
 
     start = jnp.broadcast_to(unit, (side, 4))
-    _, within = jax.lax.scan(on, start, jnp.swapaxes(filled.reshape(side, side, 4), 0, 1))
+    _, within = jax.lax.scan(on, start, jnp.swapaxes(padded.reshape(side, side, 4), 0, 1))
     _, rows = jax.lax.scan(on, unit[0], within[-1])
     before = jnp.concatenate([unit, rows[:-1]])
     return multiply(before[:, None], jnp.swapaxes(within, 0, 1)).reshape(-1, 4)[:count]
@@ -213,14 +213,14 @@ def neighbour_noise_variance(
     """
     offset = jnp.stack([times[k : times.shape[0] - 4 + k] for k in range(5)]) - times[None, 2:-2]
     value = jnp.stack([omega[k : times.shape[0] - 4 + k] for k in range(5)])
-    sampled = jnp.stack([present[k : times.shape[0] - 4 + k] for k in range(5)])
+    windows = jnp.stack([present[k : times.shape[0] - 4 + k] for k in range(5)])
     others = (0, 1, 3, 4)
     weights = [
         reduce(mul, (offset[j] / (offset[j] - offset[k]) for j in others if j != k)) for k in others
     ]
     guess = sum(w[:, None] * value[k] for w, k in zip(weights, others, strict=True))
     share = 1 + sum(w * w for w in weights)
-    complete = jnp.prod(sampled, axis=0)
+    complete = jnp.prod(windows, axis=0)
     total = jnp.sum(complete)
     square = jnp.sum(complete * jnp.sum((value[2] - guess) ** 2, axis=1) / share) / 3
     return jnp.where(total > 0, square / jnp.where(total > 0, total, 1), jnp.inf)

@@ -55,19 +55,19 @@ def seeliger_ellipsoid(axes: Triple, sun: Triple, observer: Triple) -> Scalars:
     dark = size2 == 0
     size2 = jnp.where(dark, 1, size2)
     size = jnp.sqrt(size2)
-    lit, seen = jnp.sqrt(lit2), jnp.sqrt(seen2)
+    lit, visible = jnp.sqrt(lit2), jnp.sqrt(seen2)
     cosine_lit = (lit2 + product) / (lit * size)
-    cosine_seen = (seen2 + product) / (seen * size)
+    cosine_seen = (seen2 + product) / (visible * size)
     across = _cross(toward, away)
     # sin p sin q of the two angles from the terminator and the limb to the bisecting plane
-    sines = _dot(across, across) / (lit * seen * size2)
+    sines = _dot(across, across) / (lit * visible * size2)
     open_ = sines > 0
     inner = jnp.where(open_, sines, 1)
     ratio = inner / ((1 + cosine_lit) * (1 + cosine_seen))
     # x log x: at x = 0 its slope is infinite, but sines is of second order there
     bend = jnp.where(open_, inner * jnp.log(jnp.where(dark, 1, ratio)), 0)
     total = cosine_lit + cosine_seen + bend
-    return jnp.where(dark, 0, math.pi / 2 * a * b * c * lit * seen / size * total)
+    return jnp.where(dark, 0, math.pi / 2 * a * b * c * lit * visible / size * total)
 
 
 @jax.jit
@@ -427,10 +427,10 @@ def magnitudes_and_derivatives(phase: AbstractPhase, bodies: Bodies, points: Poi
     u, wxyz = bodies
     count = u.shape[0]
 
-    def moved(step):
+    def motion_after(step):
         return attitudes(u.at[:, jnp.array([0, 1, 4, 5, 6])].add(step), wxyz, points.t)
 
-    q, along = jax.linearize(moved, jnp.zeros(5, u.dtype))
+    q, along = jax.linearize(motion_after, jnp.zeros(5, u.dtype))
     many = len(phase.typical)
     whole = (count, points.t.shape[1])
 
@@ -441,14 +441,14 @@ def magnitudes_and_derivatives(phase: AbstractPhase, bodies: Bodies, points: Poi
     shape = tuple(spread(u[:, k]) for k in (2, 3))
     coefficients = jnp.broadcast_to(u[:, None, PHASE : PHASE + many], (*whole, many))
 
-    def seen(q, turn, shape, coefficients):
+    def brightness_of(q, turn, shape, coefficients):
         return _sample_magnitudes(phase, q, turn, shape, coefficients, points)
 
     # The light of a sample depends on the quaternion of that sample only. One reverse pass with
     # unit cotangents therefore gives the derivatives by all arguments at every sample, and the
     # unknowns of the motion follow by the chain rule: 5 tangents of the closed form, not 10 + c of
     # the light.
-    value, pull = jax.vjp(seen, q, turn, shape, coefficients)
+    value, pull = jax.vjp(brightness_of, q, turn, shape, coefficients)
     by_q, by_turn, by_shape, by_coefficients = pull(jnp.ones(whole, u.dtype))
     # One tangent at a time: under vmap the mapped axis would separate the samples in memory.
     motion = [
@@ -482,11 +482,11 @@ def _with_corrected_rates(old, step):
     rates, near = plain[RATES], True
     for _ in range(2):
 
-        def left(x):
+        def residual(x):
             now, mode = _frequencies(plain.at[RATES].set(x))
             return now - before - change, (now - before - change, mode)
 
-        slopes, (rest, now) = jax.jacfwd(left, has_aux=True)(rates)
+        slopes, (rest, now) = jax.jacfwd(residual, has_aux=True)(rates)
         # minimum-norm solution, by the explicit inverse of the 2 x 2 matrix J J^T
         a, b, c = (slopes[i] @ slopes[j] for i, j in ((0, 0), (0, 1), (1, 1)))
         weights = jnp.stack([c * rest[0] - b * rest[1], a * rest[1] - b * rest[0]]) / (

@@ -153,7 +153,7 @@ def run(
     name = Path(path.stem if output is None else output)
     picture, document = (name.with_name(name.name + suffix) for suffix in (".png", ".json"))
     curve = read(path, vectors, floor, binned=binned, calibrated=calibrated, reduced=reduced)
-    return fitted(
+    return fit_file(
         curve,
         path.name,
         picture,
@@ -195,7 +195,7 @@ def read(
     return curve if binned is None else curve.binned(binned)
 
 
-def fitted(
+def fit_file(
     curve: LightCurve,
     title: str,
     picture: Path,
@@ -251,8 +251,8 @@ def fitted(
         start=start,
         progress=progress,
     )
-    used = next(name for name, each in PHASES.items() if type(each) is type(fit.phase))
-    settings |= {"phase": used} | (reading or {})
+    phase_name = next(name for name, each in PHASES.items() if type(each) is type(fit.phase))
+    settings |= {"phase": phase_name} | (reading or {})
     say(frequency_table(fit.pairs, lines=True))
     say(table(fit))
     _write(fit, title, picture, document, settings, say)
@@ -353,22 +353,22 @@ def _figure(fit: LightCurveFit, number: int, title: str) -> Any:
 
     if not 0 <= number < len(fit.solutions):
         raise ValueError(f"number must be 0 to {len(fit.solutions) - 1}, got {number}.")
-    chosen, curve = fit.solutions[number], fit.curve
+    solution, curve = fit.solutions[number], fit.curve
     page = new_figure(11.0, 7.5)
     rows = page.add_gridspec(3, 1, height_ratios=(1.5, 0.8, 1.6))
     top, middle = page.add_subplot(rows[0]), page.add_subplot(rows[1])
     below = rows[2].subgridspec(1, 2, width_ratios=(1.15, 1.0))
     t, unit = _clock(curve.t - curve.t[0])
     x = _without_gaps(t)
-    offsets = chosen.offsets[: len(curve.columns()[0])] @ curve.columns()[0]
-    rest = curve.magnitude - chosen.model
-    used = chosen.weights > 0.5
+    offsets = solution.offsets[: len(curve.columns()[0])] @ curve.columns()[0]
+    rest = curve.magnitude - solution.model
+    inlier = solution.weights > 0.5
     for ax, value, model in (
-        (top, curve.magnitude - offsets, chosen.model - offsets),
+        (top, curve.magnitude - offsets, solution.model - offsets),
         (middle, rest, np.zeros_like(rest)),
     ):
-        ax.plot(x[used], value[used], ".", color=GREY, markersize=4, label="data")
-        ax.plot(x[~used], value[~used], "x", color=ACCENT, markersize=4, label="data, outlying")
+        ax.plot(x[inlier], value[inlier], ".", color=GREY, markersize=4, label="data")
+        ax.plot(x[~inlier], value[~inlier], "x", color=ACCENT, markersize=4, label="data, outlying")
         for part in np.split(np.arange(t.size), np.flatnonzero(np.diff(t) > 0.02 * np.ptp(t)) + 1):
             ax.plot(
                 x[part],
@@ -382,8 +382,8 @@ def _figure(fit: LightCurveFit, number: int, title: str) -> Any:
     top.legend(loc="upper right", ncols=3)
     top.set_ylabel("magnitude")
     top.set_title(
-        f"Solution {number}: P_phi {chosen.P_phi:.5g} d, P_psi {chosen.P_psi:.5g} d,"
-        f" {chosen.mode.name}, rms {chosen.rms:.3f} mag"
+        f"Solution {number}: P_phi {solution.P_phi:.5g} d, P_psi {solution.P_psi:.5g} d,"
+        f" {solution.mode.name}, rms {solution.rms:.3f} mag"
     )
     middle.set_ylabel("residual")
     cut = " (gaps cut out)" if x[-1] < t[-1] else ""

@@ -68,14 +68,14 @@ def _light(body: Bodies, coefficients, points: Points, surface):
     u, wxyz = body
     areas = density * jnp.exp(coefficients @ rows)
 
-    def moved(step):
+    def attitude_after(step):
         q = attitudes(u.at[:, jnp.asarray(_MOTION)].add(step), wxyz, points.t)
         assert q is not None  # the attitude was not declined
         return tuple(x[0] for x in q)
 
-    q, along = jax.linearize(moved, jnp.zeros(5, u.dtype))
+    q, along = jax.linearize(attitude_after, jnp.zeros(5, u.dtype))
 
-    def seen(q, turn):
+    def brightness_of(q, turn):
         def body_axes(vector):
             space = tuple(
                 a[0] - b for a, b in zip(vector, _cross(turn, tuple(x[0] for x in vector)))
@@ -90,7 +90,7 @@ def _light(body: Bodies, coefficients, points: Points, surface):
         return -2.5 * jnp.log10(total), (parts, total)
 
     zero = tuple(jnp.zeros(points.t.shape[1], u.dtype) for _ in range(3))
-    value, pull, (parts, total) = jax.vjp(seen, q, zero, has_aux=True)
+    value, pull, (parts, total) = jax.vjp(brightness_of, q, zero, has_aux=True)
     by_q, by_turn = pull(jnp.ones_like(value))
     motion = [
         sum(a * b for a, b in zip(by_q, along(e), strict=True)) for e in jnp.eye(5, dtype=u.dtype)
@@ -173,8 +173,8 @@ def refine(
     for _ in range(_STEPS):
         _, matrix, right = normal(rest, slopes, open_area, by_open, body, coefficients)
         size = np.sqrt(np.maximum(np.diag(matrix), 1e-30))
-        scaled = matrix / size / size[:, None] + damping * np.eye(len(matrix))
-        step = -np.linalg.solve(scaled, right / size) / size
+        damped = matrix / size / size[:, None] + damping * np.eye(len(matrix))
+        step = -np.linalg.solve(damped, right / size) / size
         step *= min(1.0, 0.5 / max(np.abs(np.r_[step[:2], step[5:]]).max(), 1e-30))
         change = np.zeros((1, body.unknowns.shape[1] + 3))
         change[0, _MOTION], change[0, -3:] = step[:5], step[5:8]
@@ -242,15 +242,15 @@ def refined_solutions(
     Errors of a period hold the spread of the other poles of the same periods, by their odds.
     """
     curve = linear.curve
-    refined = [refine(ellipsoid_of(s), linear, points, phase, limit) for s in solutions]
-    order = sorted(range(len(refined)), key=lambda k: refined[k].cost)
-    best = refined[order[0]]
+    bodies = [refine(ellipsoid_of(s), linear, points, phase, limit) for s in solutions]
+    order = sorted(range(len(bodies)), key=lambda k: bodies[k].cost)
+    best = bodies[order[0]]
     scale = float(np.sqrt(best.chi2 / max(linear.independent - best.parameters, 1.0)))
     limited = np.clip(best.values * linear.root, -limit * scale, limit * scale)
     alike = effective_correlation(curve, limited)
     root = np.sqrt(alike) * scale
     candidates = [
-        _solution(solutions[k], refined[k], linear, scale, root, limit, best.cost) for k in order
+        _solution(solutions[k], bodies[k], linear, scale, root, limit, best.cost) for k in order
     ]
     roots = [k if solutions[k].mirror_of is None else solutions[k].mirror_of for k in order]
     resolution = 1 / float(np.ptp(curve.t))
@@ -260,7 +260,7 @@ def refined_solutions(
     for k in distinct:
         place = first.setdefault(roots[k], len(out))
         out.append(candidates[k]._replace(mirror_of=None if place == len(out) else place))
-    linearised = tuple(refined[order[k]].linearised for k in distinct)
+    linearised = tuple(bodies[order[k]].linearised for k in distinct)
     return Described(_with_spread_of_poles(out, resolution), scale, alike, linearised)
 
 
@@ -281,39 +281,39 @@ def rotating_body(
 
 
 def _solution(
-    old: Solution, refined: Refined, linear: Linear, scale: float, root: float, limit, least: float
+    old: Solution, body: Refined, linear: Linear, scale: float, root: float, limit, least: float
 ) -> Solution:
-    unknowns, wxyz = (x[0] for x in refined.body)
-    f_phi, f_psi, mode = (x[0] for x in frequencies(refined.body))
-    slopes = derivatives_of_derived(refined.body)[0]
-    moved = np.r_[_MOTION, len(unknowns) + np.arange(3)]
-    spread = root**2 * slopes[:, moved] @ refined.covariance @ slopes[:, moved].T
+    unknowns, wxyz = (x[0] for x in body.body)
+    f_phi, f_psi, mode = (x[0] for x in frequencies(body.body))
+    slopes = derivatives_of_derived(body.body)[0]
+    places = np.r_[_MOTION, len(unknowns) + np.arange(3)]
+    spread = root**2 * slopes[:, places] @ body.covariance @ slopes[:, places].T
     std = np.sqrt(np.maximum(np.diag(spread), 0))
-    if not np.isfinite(refined.cost + f_phi + f_psi + std.sum()):
+    if not np.isfinite(body.cost + f_phi + f_psi + std.sum()):
         return old._replace(cost=np.inf, probability=0.0)
     moments = np.array(moments_of(unknowns))
-    pole = momentum(refined.body)[0]
-    weighted = refined.values * linear.root / scale
+    pole = momentum(body.body)[0]
+    residuals = body.values * linear.root / scale
     return old._replace(
         P_phi=float(1 / f_phi),
         P_psi=float(1 / f_psi),
         P_phi_std=float(std[0] / f_phi),
         P_psi_std=float(std[1] / f_psi),
         mode=Mode(int(mode)),
-        rms=float(np.sqrt(np.average(refined.values**2, weights=linear.root**2))),
-        cost=refined.cost,
-        probability=float(np.exp(-(refined.cost - least) / 2 / root**2)),
+        rms=float(np.sqrt(np.average(body.values**2, weights=linear.root**2))),
+        cost=body.cost,
+        probability=float(np.exp(-(body.cost - least) / 2 / root**2)),
         moments=moments / moments.max(),
         moments_std=std[2:5],
         pole=np.degrees([np.arctan2(pole[1], pole[0]) % (2 * np.pi), np.arcsin(pole[2])]),
         pole_std=float(np.degrees(np.linalg.norm(std[5:]))),
         wxyz=wxyz,
         omega_body=unknowns[4:7],
-        offsets=linear.offsets(refined.values, old),
-        model=linear.curve.magnitude + refined.values,
-        weights=1 / np.sqrt(1 + (weighted / limit) ** 2),
-        harmonics=refined.coefficients,
-        parameters=refined.parameters,
+        offsets=linear.offsets(body.values, old),
+        model=linear.curve.magnitude + body.values,
+        weights=1 / np.sqrt(1 + (residuals / limit) ** 2),
+        harmonics=body.coefficients,
+        parameters=body.parameters,
         epoch=float(linear.curve.t[0]),
         covariance=covariance_of_periods(spread, f_phi, f_psi),
     )

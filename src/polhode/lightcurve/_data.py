@@ -180,11 +180,11 @@ class LightCurve(NamedTuple):
         if not missing.any():
             return self
         estimate = self.scatter()
-        known = math.isfinite(estimate) and estimate > 0
-        size = estimate if known else default
+        is_known = math.isfinite(estimate) and estimate > 0
+        size = estimate if is_known else default
         whose = "No point has an error" if missing.all() else "Not every point has an error"
         text = f"{whose}: {size:.2g} mag is taken" + (
-            ", from the scatter of neighbours." if known else ", the floor."
+            ", from the scatter of neighbours." if is_known else ", the floor."
         )
         sigma = np.where(missing, size, self.sigma)
         return self._replace(sigma=sigma, notes=(*self.notes, text))
@@ -383,12 +383,12 @@ def _rows(path, lines) -> tuple[dict[str, list[str]], list[int]]:
 def _table(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve:
     columns, numbers = _rows(path, lines)
 
-    def values(names, needed=True):
+    def values(names, required=True):
         for name in names:
             if name in columns:
                 cells = zip(numbers, columns[name], strict=True)
                 return np.array([_number(path, k, name, c) for k, c in cells])
-        if needed:
+        if required:
             raise ValueError(
                 f"{path} must have a column {' or '.join(names)}; its columns are"
                 f" {', '.join(columns)}."
@@ -396,8 +396,8 @@ def _table(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve:
         return None
 
     t = values(_TIME)
-    sigma = values(("sigma", "mag_err", "magerr", "error"), needed=False)
-    magnitude = values(("magnitude", "mag"), needed=False)
+    sigma = values(("sigma", "mag_err", "magerr", "error"), required=False)
+    magnitude = values(("magnitude", "mag"), required=False)
     notes = []
     if magnitude is None:
         flux = values(("magnitude", "mag", "flux", "brightness", "intensity"))
@@ -528,10 +528,10 @@ def _alcdef(path, lines, calibrated: bool) -> LightCurve:
     if len(table) == 0:
         raise ValueError(f"{path} holds no DATA lines.")
     data = np.array(table)
-    known = all(all(_is_number(x) for x in ray) for ray in rays)
+    are_numbers = all(all(_is_number(x) for x in ray) for ray in rays)
     sun = observer = None
     notes = ["ALCDEF gives no distances: nights have free offsets, times keep their light time."]
-    if known:
+    if are_numbers:
         phase, longitude, latitude = np.radians(np.array(rays, float)).T
         sun = _ray(longitude - phase / 2, latitude)
         observer = _ray(longitude + phase / 2, latitude)

@@ -215,10 +215,8 @@ def _blur(curve: LightCurve) -> float:
     sun, observer = curve._known_directions()
     bisector = sun + observer
     bisector = bisector / np.linalg.norm(bisector, axis=1, keepdims=True)
-    turned = np.arccos(
-        np.clip((bisector @ bisector[:: max(1, len(bisector) // 50)].T).min(), -1, 1)
-    )
-    return float((0.125 + turned / (2 * np.pi)) / np.ptp(curve.t))
+    angle = np.arccos(np.clip((bisector @ bisector[:: max(1, len(bisector) // 50)].T).min(), -1, 1))
+    return float((0.125 + angle / (2 * np.pi)) / np.ptp(curve.t))
 
 
 def _second_round(meant: Hypotheses, least_cost: np.ndarray) -> Hypotheses:
@@ -338,10 +336,10 @@ def _concatenate(*states: State) -> State:
 
 def _subsample(points: Points, count: int) -> Points:
     """``count`` of the points at most, evenly chosen."""
-    known = np.flatnonzero(np.asarray(points.weight[0]) > 0)
-    if len(known) <= count:
+    places = np.flatnonzero(np.asarray(points.weight[0]) > 0)
+    if len(places) <= count:
         return points
-    index = known[np.arange(count) * len(known) // count]
+    index = places[np.arange(count) * len(places) // count]
     return jax.tree.map(lambda x: x[..., index], points._replace(stiffness=None))._replace(
         stiffness=points.stiffness
     )

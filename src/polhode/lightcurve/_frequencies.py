@@ -185,7 +185,7 @@ class Scan(NamedTuple):
         end = (self.count - 1) * self.step
         return Pairs(f_phi, f_psi, explained, self.resolution, end, self.strongest, self.is_cut)
 
-    def fitted(self, nodes: np.ndarray, soft=1e-3) -> tuple[np.ndarray, np.ndarray]:
+    def fit_nodes(self, nodes: np.ndarray, soft=1e-3) -> tuple[np.ndarray, np.ndarray]:
         """Part of the variance (k,) explained by waves at nodes (k, m), and ln det of the matrix.
 
         ``soft`` (..., m): added to the diagonal of the normal equations, over the number of points.
@@ -206,7 +206,7 @@ class Scan(NamedTuple):
 
     def explained(self, pairs: np.ndarray, multiples: np.ndarray) -> np.ndarray:
         """Part of the variance (k,) that the sums (m, 2) of pairs of nodes (k, 2) explain."""
-        return self.fitted(np.rint(pairs @ multiples.T).astype(int))[0]
+        return self.fit_nodes(np.rint(pairs @ multiples.T).astype(int))[0]
 
 
 def fourier_pairs(
@@ -276,7 +276,7 @@ def fourier_lattices(
     """
     scan = Scan.of(t, values, columns, max_frequency, oversampling, 2, _MAX_LINE_NODES)
     nodes = np.arange(max(oversampling // 2, 1), scan.count)
-    peaks = _maxima(scan.fitted(nodes[:, None])[0])[:lines]
+    peaks = _maxima(scan.fit_nodes(nodes[:, None])[0])[:lines]
     pairs, power = [], []
     for node in nodes[peaks]:
         line = np.stack([np.full_like(nodes, node), nodes], -1)
@@ -428,12 +428,12 @@ def _with_line(i: int, j: int, lines: np.ndarray, scan: Scan) -> np.ndarray:
     return np.stack([other, (g - i * other) / j], -1)
 
 
-def _evidence(scan: Scan, meant: np.ndarray, sums, left: float) -> np.ndarray:
+def _evidence(scan: Scan, meant: np.ndarray, sums, misfit: float) -> np.ndarray:
     """Twice the logarithm of the evidence (k,) of waves of ``sums``, but for a constant."""
     nodes = np.rint(meant @ np.array(list(sums)).T / scan.step).astype(int)
     variance = np.array(list(sums.values()))
-    power, size = scan.fitted(nodes, left / variance / scan.size)
-    return power * scan.size / left - size + 2 * np.log(left / variance).sum()
+    power, size = scan.fit_nodes(nodes, misfit / variance / scan.size)
+    return power * scan.size / misfit - size + 2 * np.log(misfit / variance).sum()
 
 
 def _inverse_sums(sums) -> np.ndarray:

@@ -61,8 +61,8 @@ class Linear:
         # rows of the priors below those of the points
         prior = np.diag(np.sqrt(stiffness))[stiffness > 0]
         self.rows = np.vstack([columns.T * self.root[:, None], prior])
-        left, size, _ = np.linalg.svd(self.rows, full_matrices=False)
-        self.basis = left[:, size > 1e-10 * size[0]]
+        basis, size, _ = np.linalg.svd(self.rows, full_matrices=False)
+        self.basis = basis[:, size > 1e-10 * size[0]]
         self.data = self.projected(curve.magnitude)
 
     @property
@@ -72,10 +72,8 @@ class Linear:
 
     def projected(self, values: np.ndarray) -> np.ndarray:
         """Values (n, ...) over their errors, with what offsets explain removed."""
-        weighted = (values.T * self.root).T
-        whole = np.concatenate(
-            [weighted, np.zeros((len(self.rows) - self.t.size, *values.shape[1:]))]
-        )
+        rows = (values.T * self.root).T
+        whole = np.concatenate([rows, np.zeros((len(self.rows) - self.t.size, *values.shape[1:]))])
         return whole - self.basis @ (self.basis.T @ whole)
 
     def residuals(self, waves: np.ndarray) -> np.ndarray:
@@ -127,11 +125,11 @@ def one_period(linear: Linear, max_frequency: float) -> list[Residuals]:
     """
     t, span = linear.t, float(linear.t[-1])
     candidates = _peaks(linear, max_frequency)
-    refined = [
+    frequencies = [
         _refine_frequency(linear, f, lambda f: waves(t, f * np.arange(1, 5))) for f in candidates
     ]
-    chi2 = [linear.chi2(waves(t, f * np.arange(1, 5))) for f in refined]
-    best = [refined[k] for k in np.argsort(chi2)[:4]]
+    chi2 = [linear.chi2(waves(t, f * np.arange(1, 5))) for f in frequencies]
+    best = [frequencies[k] for k in np.argsort(chi2)[:4]]
     # a series of f / 2 and few harmonics may be that of f
     best += [f * part for f in best[:2] for part in (0.5, 2.0) if f * part < max_frequency]
     log_trials = float(np.log(max(max_frequency * span, 1.0)))
@@ -165,11 +163,11 @@ def _peaks(linear: Linear, max_frequency: float) -> list[float]:
     nodes = np.arange(over, scan.count)
     if not nodes.size:
         return [1 / float(linear.t[-1])]
-    chosen: list[int] = []
+    peaks: list[int] = []
     for order in _SCAN_ORDERS:
-        power = scan.fitted(nodes[:, None] * np.arange(1, order + 1))[0]
-        chosen += nodes[_maxima(power)[:_CANDIDATES]].tolist()
-    return [scan.step * k for k in sorted(set(chosen))]
+        power = scan.fit_nodes(nodes[:, None] * np.arange(1, order + 1))[0]
+        peaks += nodes[_maxima(power)[:_CANDIDATES]].tolist()
+    return [scan.step * k for k in sorted(set(peaks))]
 
 
 def _refine_frequency(linear: Linear, frequency: float, columns, steps: int = 11) -> float:
@@ -241,12 +239,12 @@ def _rotators(x, arrays, basis):
         angle = turn + 2 * jnp.pi * frequency * t
         ca, sa = jnp.cos(angle), jnp.sin(angle)
 
-        def seen(vector):
+        def body_axes(vector):
             a, b, z = frame @ vector
             return ca * a + sa * b, ca * b - sa * a, z
 
         axes = (jnp.ones_like(t), jnp.exp(u) + 0 * t, jnp.exp(v) + 0 * t)
-        light = seeliger_ellipsoid(axes, seen(sun), seen(observer))
+        light = seeliger_ellipsoid(axes, body_axes(sun), body_axes(observer))
         value = -2.5 * jnp.log10(jnp.maximum(light, 1e-12)) * root
         whole = jnp.concatenate([value, jnp.zeros(basis.shape[0] - t.shape[0])])
         return data - whole + basis @ (basis.T @ whole)
@@ -281,7 +279,7 @@ def rotator(linear: Linear, periods, max_frequency: float) -> tuple[Residuals, n
             for c in turn
         ]
     )
-    best, values, chosen = np.inf, None, np.zeros(6)
+    best, values, parameters = np.inf, None, np.zeros(6)
     for f in sorted({float(f) for p in periods for f in (1 / p, 0.5 / p, 2 / p)}):
         if f > max_frequency:
             continue
@@ -294,13 +292,13 @@ def rotator(linear: Linear, periods, max_frequency: float) -> tuple[Residuals, n
         size = np.sum(residuals**2, axis=1)
         k = int(np.argmin(size))
         if size[k] < best:
-            best, values, chosen = size[k], residuals[k], x[k]
+            best, values, parameters = size[k], residuals[k], x[k]
     if values is None:
         return None
     log_trials = float(np.log(max(max_frequency * linear.t[-1], 1.0)))
     rest = values[: linear.t.size] / np.asarray(linear.root)
-    period = (1 / float(chosen[5]),)
-    return Residuals("one period, rotating ellipsoid", rest, 6, log_trials, period), chosen
+    period = (1 / float(parameters[5]),)
+    return Residuals("one period, rotating ellipsoid", rest, 6, log_trials, period), parameters
 
 
 def _improve_rotators(x, arrays, basis, steps: int = 25):
@@ -313,9 +311,9 @@ def _improve_rotators(x, arrays, basis, steps: int = 25):
         matrix = np.einsum("bni,bnj->bij", slopes, slopes) + prior_precision
         right = np.einsum("bni,bn->bi", slopes, value) + x @ prior_precision
         size = np.sqrt(np.maximum(np.einsum("bii->bi", matrix), 1e-12))
-        scaled = matrix / size[:, :, None] / size[:, None]
-        scaled = np.nan_to_num(scaled) + damping[:, None, None] * np.eye(6)
-        step = np.linalg.solve(scaled, np.nan_to_num(right / size)[..., None])[..., 0] / size
+        damped = matrix / size[:, :, None] / size[:, None]
+        damped = np.nan_to_num(damped) + damping[:, None, None] * np.eye(6)
+        step = np.linalg.solve(damped, np.nan_to_num(right / size)[..., None])[..., 0] / size
         step *= np.minimum(1, 0.5 / np.maximum(np.abs(step[:, :5]).max(1), 1e-30))[:, None]
         trial = x - step
         new, new_slopes = map(np.asarray, _rotators(trial, arrays, basis))
@@ -351,8 +349,8 @@ def compare_models(
     independent = max(n / alike, 2.0)
     out = []
     for each in candidates:
-        weighted = each.values * linear.root
-        rss = float(np.sum(np.minimum(weighted**2, limit**2)))
+        residuals = each.values * linear.root
+        rss = float(np.sum(np.minimum(residuals**2, limit**2)))
         evidence = (
             -independent / 2 * np.log(max(rss, 1e-300) / n)
             - each.parameters / 2 * np.log(independent)
@@ -360,7 +358,7 @@ def compare_models(
         )
         rms = float(np.sqrt(np.average(each.values**2, weights=linear.root**2)))
         own = float(
-            np.sqrt(np.sum(np.minimum(weighted**2, limit**2)) / max(n - each.parameters, 1))
+            np.sqrt(np.sum(np.minimum(residuals**2, limit**2)) / max(n - each.parameters, 1))
         )
         out.append(Model(each.name, float(evidence), each.parameters, rms, own, each.periods))
     return tuple(out)

@@ -66,9 +66,9 @@ def normal_equations(phase, bodies: Bodies, offsets, points: Points, limit):
     weight = points.weight * robust
     columns = jnp.broadcast_to(points.columns, (rest.shape[0], *points.columns.shape))
     whole = jnp.concatenate([slopes, columns], axis=1)
-    weighted = whole * weight[:, None]
-    matrix = jnp.einsum("bin,bjn->bij", weighted, whole)
-    right = jnp.einsum("bin,bn->bi", weighted, rest)
+    rows = whole * weight[:, None]
+    matrix = jnp.einsum("bin,bjn->bij", rows, whole)
+    right = jnp.einsum("bin,bn->bi", rows, rest)
     return cost, matrix, right, jnp.sum(rest * rest * points.weight, -1), (value, robust, whole)
 
 
@@ -202,12 +202,12 @@ def _solve_damped(matrix, right, damping):
     """Solutions of symmetric systems, scaled to unit diagonal, with ``damping`` on it."""
     diagonal = np.einsum("bii->bi", matrix)
     size = np.sqrt(np.where(diagonal > 0, diagonal, 1))
-    scaled = matrix / size[:, :, None] / size[:, None]
-    scaled = np.nan_to_num(scaled, posinf=0, neginf=0)
+    damped = matrix / size[:, :, None] / size[:, None]
+    damped = np.nan_to_num(damped, posinf=0, neginf=0)
     eye = np.eye(matrix.shape[1])
-    scaled = scaled + eye * (np.reshape(damping, (-1, 1, 1)) + 1e-12 + (diagonal <= 0)[:, :, None])
+    damped = damped + eye * (np.reshape(damping, (-1, 1, 1)) + 1e-12 + (diagonal <= 0)[:, :, None])
     right = np.nan_to_num(right / size, posinf=0, neginf=0)
-    return np.linalg.solve(scaled, right[..., None])[..., 0] / size
+    return np.linalg.solve(damped, right[..., None])[..., 0] / size
 
 
 def select(tree, index):
@@ -248,7 +248,7 @@ def series(points: Points, f_phi, f_psi, long_axis) -> tuple[np.ndarray, np.ndar
     Of frequencies (h,) and modes (h,), the points weighted by their errors. What offsets and the
     phase angle explain is projected out.
     """
-    is_point = _known(points)
+    is_point = _present_points(points)
     t, alpha, data, weight = (
         np.asarray(x[0])[is_point]
         for x in (points.t, points.alpha, points.magnitude, points.weight)
@@ -271,7 +271,7 @@ def series(points: Points, f_phi, f_psi, long_axis) -> tuple[np.ndarray, np.ndar
 
 def directions(points: Points) -> tuple[np.ndarray, np.ndarray]:
     """Unit vectors (3,) to Sun and observer in the mean."""
-    is_point = _known(points)
+    is_point = _present_points(points)
     means = (
         np.array([np.asarray(x[0])[is_point].mean() for x in v])
         for v in (points.sun, points.observer)
@@ -280,7 +280,7 @@ def directions(points: Points) -> tuple[np.ndarray, np.ndarray]:
     return sun, observer
 
 
-def _known(points: Points) -> np.ndarray:
+def _present_points(points: Points) -> np.ndarray:
     return np.asarray(points.weight[0]) > 0  # others pad
 
 

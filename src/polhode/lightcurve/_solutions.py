@@ -219,36 +219,36 @@ def describe_solutions(
     """The bodies ``order`` of a state as solutions with errors."""
     n = curve.t.size
     index = np.pad(order, (0, -len(order) % BATCH), mode="edge")
-    chosen = select(state, index)
+    best = select(state, index)
     _, _, _, _, (value, robust, derivatives) = normal_equations(
         problem.phase,
-        jax.tree.map(jnp.asarray, chosen.bodies),
-        jnp.asarray(chosen.offsets),
+        jax.tree.map(jnp.asarray, best.bodies),
+        jnp.asarray(best.offsets),
         problem.points,
         jnp.full(len(index), limit),
     )
-    model = np.asarray(value + chosen.offsets @ problem.points.columns)[:, :n]
+    model = np.asarray(value + best.offsets @ problem.points.columns)[:, :n]
     robust, weight = np.asarray(robust)[:, :n], np.asarray(problem.points.weight)[:, :n]
     rest = model - curve.magnitude
     root = np.sqrt(weight[0])
-    _, prior, gradient = problem.prior(chosen.bodies, chosen.offsets)
+    _, prior, gradient = problem.prior(best.bodies, best.offsets)
     derivatives = np.asarray(derivatives)[: len(order), :, :n]
     linearised = tuple(
         Linearised(rest[k] * root, (derivatives[k] * root).T, prior, gradient[k])
         for k in range(len(order))
     )
-    freedom = max(n - chosen.matrix.shape[1] + int((problem.stiffness > 0).sum()), 1)
+    freedom = max(n - best.matrix.shape[1] + int((problem.stiffness > 0).sum()), 1)
     scale = float(np.sqrt((robust[0] * weight[0] * rest[0] ** 2).sum() / freedom))
     alike = effective_correlation(curve, np.sqrt(robust[0] * weight[0]) * rest[0])
-    f_phi, f_psi, mode = frequencies(chosen.bodies)
-    pole = momentum(chosen.bodies)
-    unknowns, wxyz = chosen.bodies
+    f_phi, f_psi, mode = frequencies(best.bodies)
+    pole = momentum(best.bodies)
+    unknowns, wxyz = best.bodies
     x = jnp.asarray(np.c_[unknowns, np.zeros((len(index), 3))])
     slopes = np.asarray(_derivatives_of_derived(x, jnp.asarray(wxyz)))
     count = x.shape[1]
     out = []
     for k in range(len(order)):
-        covariance = np.linalg.pinv(chosen.matrix[k], hermitian=True)[:count, :count]
+        covariance = np.linalg.pinv(best.matrix[k], hermitian=True)[:count, :count]
         spread = scale**2 * alike * slopes[k] @ covariance @ slopes[k].T
         std = np.sqrt(np.maximum(np.diag(spread), 0))
         images = 2 * normals * (normals @ pole[k])[:, None] - pole[k]
@@ -270,8 +270,8 @@ def describe_solutions(
                 std[1] / f_psi[k],
                 Mode(int(mode[k])),
                 float(np.sqrt(np.average(rest[k] ** 2, weights=weight[0]))),
-                float(chosen.cost[k]),
-                float(np.exp((chosen.cost[0] - chosen.cost[k]) / 2 / scale**2 / alike)),
+                float(best.cost[k]),
+                float(np.exp((best.cost[0] - best.cost[k]) / 2 / scale**2 / alike)),
                 moments / moments.max(),
                 std[2:5],
                 axes / axes.max(),
@@ -282,7 +282,7 @@ def describe_solutions(
                 wxyz[k],
                 unknowns[k, 4:7],
                 unknowns[k, 7:],
-                chosen.offsets[k],
+                best.offsets[k],
                 model[k],
                 robust[k],
                 mirror[0] if mirror else None,
@@ -346,10 +346,10 @@ def notes_on(curve: LightCurve, solutions, scale: float, alike: float) -> tuple[
     notes = list(curve.notes)
     sun, observer = curve._known_directions()
     directions = np.vstack([sun, observer])
-    turned = change_of_directions(curve)
-    if turned < FIXED:
+    change = change_of_directions(curve)
+    if change < FIXED:
         notes.append(
-            f"Sun and observer keep their directions within {turned:.1f} deg: every pole has a"
+            f"Sun and observer keep their directions within {change:.1f} deg: every pole has a"
             " mirror image in their plane that fits as well, and the absolute size of the shape's"
             " axes along the momentum is hardly seen."
         )
@@ -420,8 +420,8 @@ def notes_on_groups(curve: LightCurve, residuals: np.ndarray, alike: float) -> t
         error = scale * np.sqrt(alike / np.sum(weight * t**2))
         if abs(slope) > _TREND * error:
             trends.append(f"{name} ({slope * np.ptp(t):+.2f} mag)")
-        left = (value - slope * t) / curve.sigma[own]
-        if 1.4826 * np.median(np.abs(left - np.median(left))) > _NOISY * scale:
+        trend_free = (value - slope * t) / curve.sigma[own]
+        if 1.4826 * np.median(np.abs(trend_free - np.median(trend_free))) > _NOISY * scale:
             noisy.append(name)
     notes = []
     if trends:

@@ -75,9 +75,9 @@ def null_models(
         periods = dict.fromkeys(round(r.periods[0], 12) for r in (*best[:2], *series[:4]))
         ellipsoid = rotator(linear, list(periods)[:4], end)
         if ellipsoid is not None:
-            rest, chosen = ellipsoid
+            rest, parameters = ellipsoid
             points = curve.points(0.0, offset_sigma)
-            body = rotating_body(linear, chosen, points, phase, limit)
+            body = rotating_body(linear, parameters, points, phase, limit)
             period = 2 * np.pi / float(body.body.unknowns[0, 6])
             convex = rest._replace(
                 name="one period, rotating convex body",
@@ -265,10 +265,10 @@ def _refitted_cost(
     many = weight.shape[1]
     # The normal equations are sums over blocks: those of a resampled light curve cost a sum of
     # ``many`` matrices, not another pass over the points.
-    weighted = derivatives * robust[:, None]
+    rows = derivatives * robust[:, None]
     parts = [block == k for k in range(many)]
-    matrices = np.array([weighted[part].T @ derivatives[part] for part in parts])
-    rights = np.array([weighted[part].T @ residuals[part] for part in parts])
+    matrices = np.array([rows[part].T @ derivatives[part] for part in parts])
+    rights = np.array([rows[part].T @ residuals[part] for part in parts])
     # offsets of nights that were not drawn are not determined
     size = np.diag(matrices.sum(0) + prior)
     jitter = np.diag(np.where(size > 0, 1e-9 * size, 1.0))

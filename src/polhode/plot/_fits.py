@@ -224,9 +224,9 @@ def _table(ax, one):
     head = "moments [kg m²]" if one["scale_known"] else "ratios"
     lines = [f"{'principal ' + head:<28}axis known to"]
     for value, spread, turn in zip(one["value"], one["spread"], one["axes_std"], strict=True):
-        known = _rounded(value, spread)
+        rounded = _rounded(value, spread)
         angle = f"{np.degrees(turn):.2g}°" if np.isfinite(turn) else "-"
-        lines.append(f"{known:<28}{angle}")
+        lines.append(f"{rounded:<28}{angle}")
     lines += [
         "",
         f"residual rms   {one['rms']:.3g} rad/s",

@@ -185,19 +185,19 @@ def as_samples(what: Trajectory | Samples) -> Samples:
         )
     inertia = what.scene.inertia  # figures of one that changes with time have no ellipsoid
     constant = inertia if isinstance(inertia, Inertia) else None
-    made = samples(what.ts, what.omega_body, what._wxyz, constant)
+    result = samples(what.ts, what.omega_body, what._wxyz, constant)
     has_energy = what.scene.potential is None or what._wxyz is not None
-    energy = np.asarray(what.energy, np.float64).reshape(made.ts.shape) if has_energy else None
-    return dataclasses.replace(made, energy=energy)
+    energy = np.asarray(what.energy, np.float64).reshape(result.ts.shape) if has_energy else None
+    return dataclasses.replace(result, energy=energy)
 
 
 def pick(what: Trajectory | Samples, body: int | None) -> tuple[Samples, int]:
     """The samples, and the index of the body to plot (counted over flattened batch axes)."""
-    made = as_samples(what)
+    result = as_samples(what)
     body = 0 if body is None else body
-    if not -made.count <= body < made.count:
-        raise ValueError(f"body must be below the number of bodies, {made.count}, got {body}.")
-    return made, body % made.count
+    if not -result.count <= body < result.count:
+        raise ValueError(f"body must be below the number of bodies, {result.count}, got {body}.")
+    return result, body % result.count
 
 
 def box_sides(moments: np.ndarray) -> np.ndarray:

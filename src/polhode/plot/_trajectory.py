@@ -39,18 +39,18 @@ def history(
     in space axes: rounding and truncation of a free body; where torques act, real change.
     Panels whose data were not recorded are left out.
     """
-    made, body = pick(what, body)
-    scale = Scale.of(np.ptp(made.ts[body])) if scale is None else scale
+    data, body = pick(what, body)
+    scale = Scale.of(np.ptp(data.ts[body])) if scale is None else scale
     panels = [_rates]
-    if made.wxyz is not None:
+    if data.wxyz is not None:
         panels.append(_attitude)
-    if made.tensor is not None and made.energy is not None:
+    if data.tensor is not None and data.energy is not None:
         panels.append(_drift)
     figure = new_figure(7.2, 2.1 * len(panels) + 0.4)
     axes = figure.subplots(len(panels), 1, sharex=True, squeeze=False)[:, 0]
-    t = made.ts[body] / scale.seconds
+    t = data.ts[body] / scale.seconds
     for panel, ax in zip(panels, axes, strict=True):
-        panel(ax, t, made, body, scale, axis_names)
+        panel(ax, t, data, body, scale, axis_names)
         # beside the panel, where it can hide nothing
         ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
         ax.margins(x=0.01)
@@ -58,24 +58,24 @@ def history(
     return figure
 
 
-def _rates(ax, t, made, body, scale, names):
+def _rates(ax, t, data, body, scale, names):
     for k in range(3):
-        rate = made.omega_body[body, :, k] / scale.radians_per_second
+        rate = data.omega_body[body, :, k] / scale.radians_per_second
         ax.plot(t, rate, color=AXES[k], label=names[k])
     ax.set_ylabel(f"[{scale.rate}]")
     ax.set_title("Body rates")
 
 
-def _attitude(ax, t, made, body, scale, names):
+def _attitude(ax, t, data, body, scale, names):
     for k, (name, color) in enumerate(zip("wxyz", (INK, *AXES), strict=True)):
-        ax.plot(t, made.wxyz[body, :, k], color=color, label=name)
+        ax.plot(t, data.wxyz[body, :, k], color=color, label=name)
     ax.set_ylim(-1.08, 1.08)
     ax.set_title("Attitude quaternion, body to space")
 
 
-def _drift(ax, t, made, body, scale, names):
-    energy = made.energy[body]
-    momentum = made.momentum_space[body] if made.wxyz is not None else None
+def _drift(ax, t, data, body, scale, names):
+    energy = data.energy[body]
+    momentum = data.momentum_space[body] if data.wxyz is not None else None
     lines = {"energy": np.abs(energy / energy[0] - 1) if energy[0] else np.abs(energy)}
     if momentum is not None:
         size = np.linalg.norm(momentum[0])
@@ -107,11 +107,11 @@ def polhode(
     Parts of a curve behind the ellipsoid are faint; a dot marks the first time. `view` is
     (elevation, azimuth) in degrees; None: towards the curve.
     """
-    made, body = pick(what, body)
-    tensor = made.need("tensor", "the polhode")[body]
+    data, body = pick(what, body)
+    tensor = data.need("tensor", "the polhode")[body]
     moments, turn = np.linalg.eigh(tensor)
     turn[:, 0] *= np.linalg.det(turn)  # right-handed
-    omega = made.omega_body[body] @ turn
+    omega = data.omega_body[body] @ turn
     twice_energy = omega[0] ** 2 @ moments
     if not twice_energy > 0:
         raise ValueError("the body is at rest at the first time: it has no inertia ellipsoid.")
@@ -119,7 +119,7 @@ def polhode(
     size = semi.max()
     if ax is None:
         ax = new_figure(5.4, 5.2).add_subplot(projection="3d")
-    ax.view_init(*(_towards(made.omega_body[body]) if view is None else view))
+    ax.view_init(*(_towards(data.omega_body[body]) if view is None else view))
     ax.computed_zorder = False
     elevation, azimuth = np.deg2rad([ax.elev, ax.azim])
     flat = np.cos(elevation)
@@ -162,13 +162,13 @@ def _towards(omega) -> tuple[float, float]:
 def _line(ax, points, facing, **style):
     """A curve whose parts with `facing` < 0 are faint."""
     for front in (False, True):
-        shown = points.copy()
+        visible = points.copy()
         hide = (facing >= 0) != front
         # keep the neighbours of a change of side, so that the two parts meet
         hide[1:-1] &= hide[:-2] & hide[2:]
-        shown[hide] = np.nan
+        visible[hide] = np.nan
         alpha = 1.0 if front else 0.22
-        ax.plot(*shown.T, alpha=alpha, zorder=4 if front else 2, **style)
+        ax.plot(*visible.T, alpha=alpha, zorder=4 if front else 2, **style)
 
 
 def _surface(ax, semi, turn, eye):
@@ -271,10 +271,10 @@ def herpolhode(
     rates' part in the plane then. Dashed circles are the smallest and the largest distance reached.
     A dot marks the first time.
     """
-    made, body = pick(what, body)
-    scale = Scale.of(np.ptp(made.ts[body])) if scale is None else scale
-    omega = np.einsum("tij,tj->ti", made.matrices[body], made.omega_body[body])
-    momentum = made.momentum_space[body, 0]
+    data, body = pick(what, body)
+    scale = Scale.of(np.ptp(data.ts[body])) if scale is None else scale
+    omega = np.einsum("tij,tj->ti", data.matrices[body], data.omega_body[body])
+    momentum = data.momentum_space[body, 0]
     if not np.linalg.norm(momentum) > 0:
         raise ValueError("the body is at rest at the first time: it has no invariable plane.")
     normal = momentum / np.linalg.norm(momentum)
@@ -326,30 +326,30 @@ def overview(
     `observed` (`plot.samples` of one body; NaN where nothing was observed). Right: the polhode, or
     the energy of a body whose inertia changes with time.
     """
-    made = as_samples(what)
+    data = as_samples(what)
     names = tuple(plain(name, 30) for name in axis_names)
-    scale = Scale.of(np.ptp(made.ts[0])) if scale is None else scale
+    scale = Scale.of(np.ptp(data.ts[0])) if scale is None else scale
     figure = new_figure(11.0, 7.6)
     grid = figure.add_gridspec(4, 2, width_ratios=(1.75, 1.0))
     rows = [figure.add_subplot(grid[0, 0])]
     rows += [figure.add_subplot(grid[k, 0], sharex=rows[0]) for k in (1, 2, 3)]
-    t = made.ts[0] / scale.seconds
-    direction, band = made.matrices, made.count > 2
-    seen = None if observed is None else observed.ts[0] / scale.seconds
+    t = data.ts[0] / scale.seconds
+    direction, band = data.matrices, data.count > 2
+    observed_times = None if observed is None else observed.ts[0] / scale.seconds
     for k, ax in enumerate(rows[:3]):
         for i, color in enumerate(AXES):
             _curve(ax, t, direction[:, :, i, k], color, f"space {'xyz'[i]}", band)
             if observed is not None and observed.wxyz is not None:
-                _dots(ax, seen, observed.matrices[0, :, i, k], color)
+                _dots(ax, observed_times, observed.matrices[0, :, i, k], color)
         ax.set_ylim(-1.1, 1.1)
         letter = "xyz"[k]
         name = "" if names[k] == letter else f" ({names[k]})"
         ax.set_title(f"Body {letter} axis{name}: direction in space")
     for k, color in enumerate(AXES):
         unit = scale.radians_per_second
-        _curve(rows[3], t, made.omega_body[:, :, k] / unit, color, names[k], band)
+        _curve(rows[3], t, data.omega_body[:, :, k] / unit, color, names[k], band)
         if observed is not None:
-            _dots(rows[3], seen, observed.omega_body[0, :, k] / unit, color)
+            _dots(rows[3], observed_times, observed.omega_body[0, :, k] / unit, color)
     rows[3].set_title("Body rates")
     rows[3].set_ylabel(f"[{scale.rate}]")
     rows[3].set_xlabel(f"time [{scale.time}]")
@@ -365,16 +365,16 @@ def overview(
             handlelength=1.4,
             columnspacing=1.2,
         )
-    if made.tensor is None and made.energy is not None:
+    if data.tensor is None and data.energy is not None:
         ax = figure.add_subplot(grid[:3, 1])
-        ax.plot(t, made.energy[0], color=INK, linewidth=1.3)
+        ax.plot(t, data.energy[0], color=INK, linewidth=1.3)
         ax.set_title("Energy [J]")
         ax.set_xlabel(f"time [{scale.time}]")
     else:
         ax = figure.add_subplot(grid[:3, 1], projection="3d")
-        polhode(made, ax=ax, axis_names=names)
+        polhode(data, ax=ax, axis_names=names)
         ax.set_title("Polhode on the inertia ellipsoid", loc="center")
-    _key(figure.add_subplot(grid[3, 1]), observed is not None, made.count - 1)
+    _key(figure.add_subplot(grid[3, 1]), observed is not None, data.count - 1)
     if title:
         figure.suptitle(plain(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
     return figure
@@ -445,26 +445,26 @@ def animate(
     from matplotlib.animation import FuncAnimation
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    made = as_samples(what)
-    chosen = list(range(min(made.count, _MOST_BODIES))) if bodies is None else list(bodies)
-    if not 1 <= len(chosen) <= _MOST_BODIES:
-        raise ValueError(f"animate shows 1 to {_MOST_BODIES} bodies, got {len(chosen)}.")
+    data = as_samples(what)
+    numbers = list(range(min(data.count, _MOST_BODIES))) if bodies is None else list(bodies)
+    if not 1 <= len(numbers) <= _MOST_BODIES:
+        raise ValueError(f"animate shows 1 to {_MOST_BODIES} bodies, got {len(numbers)}.")
     if path is not None:
         _check_writer(Path(path))
-    scale = Scale.of(np.ptp(made.ts)) if scale is None else scale
-    wxyz = made.need("wxyz", "an animation")
-    boxes = [_box(tensor) for tensor in made.need("tensor", "an animation")[chosen]]
+    scale = Scale.of(np.ptp(data.ts)) if scale is None else scale
+    wxyz = data.need("wxyz", "an animation")
+    boxes = [_box(tensor) for tensor in data.need("tensor", "an animation")[numbers]]
     frames = max(2, round(fps * seconds))
-    times = np.linspace(made.ts[chosen, 0], made.ts[chosen, -1], frames, axis=-1)
-    turns = [_interpolate(times[i], made.ts[b], wxyz[b]) for i, b in enumerate(chosen)]
+    times = np.linspace(data.ts[numbers, 0], data.ts[numbers, -1], frames, axis=-1)
+    turns = [_interpolate(times[i], data.ts[b], wxyz[b]) for i, b in enumerate(numbers)]
 
-    columns = int(np.ceil(np.sqrt(len(chosen))))
-    rows = -(-len(chosen) // columns)
-    side = 5.0 if len(chosen) == 1 else max(1.6, 7.0 / columns)
+    columns = int(np.ceil(np.sqrt(len(numbers))))
+    rows = -(-len(numbers) // columns)
+    side = 5.0 if len(numbers) == 1 else max(1.6, 7.0 / columns)
     figure = new_figure(columns * side, rows * side + 0.4)
     title = figure.suptitle("", fontsize=10, color=INK)
     solids = []
-    for index in range(len(chosen)):
+    for index in range(len(numbers)):
         ax = figure.add_subplot(rows, columns, index + 1, projection="3d")
         solid = Poly3DCollection(boxes[index][_FACES], edgecolor="white", linewidth=0.8)
         ax.add_collection3d(solid)
@@ -522,10 +522,10 @@ def _interpolate(times, ts, wxyz):
     # neighbouring quaternions on the same side, so that the short way is taken
     flips = np.sign(np.sum(wxyz[1:] * wxyz[:-1], axis=-1))
     flips = np.concatenate([[1.0], np.cumprod(np.where(flips == 0, 1.0, flips))])
-    signed = wxyz * flips[:, None]
+    continuous = wxyz * flips[:, None]
     order = np.argsort(ts)
-    mixed = np.stack([np.interp(times, ts[order], signed[order, k]) for k in range(4)], axis=-1)
-    return matrices(mixed / np.linalg.norm(mixed, axis=-1, keepdims=True))
+    mean = np.stack([np.interp(times, ts[order], continuous[order, k]) for k in range(4)], axis=-1)
+    return matrices(mean / np.linalg.norm(mean, axis=-1, keepdims=True))
 
 
 def _check_writer(path: Path) -> None:

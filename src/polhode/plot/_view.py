@@ -61,21 +61,23 @@ class Body:
         return bool(steady.all() and (np.abs(own - self.momentum) <= 1e-3 * size).all())
 
 
-def chosen(what: Any, bodies: Sequence[int] | None) -> list[Body]:
+def chosen_bodies(what: Any, bodies: Sequence[int] | None) -> list[Body]:
     """The bodies to show, by number, of one motion or of several."""
     several = what if isinstance(what, list) else [what]
-    found: list[Body] = []
+    candidates: list[Body] = []
     for one in several:
-        found += [one] if isinstance(one, Body) else bodies_of(one)
-    numbers = list(range(len(found)) if bodies is None else bodies)
+        candidates += [one] if isinstance(one, Body) else bodies_of(one)
+    numbers = list(range(len(candidates)) if bodies is None else bodies)
     if not 1 <= len(numbers) <= _MOST_BODIES:
         raise ValueError(
             f"a page shows 1 to {_MOST_BODIES} bodies, got {len(numbers)}: pick some with bodies=."
         )
-    wrong = [number for number in numbers if not -len(found) <= number < len(found)]
-    if wrong:
-        raise ValueError(f"bodies must be below the number of bodies, {len(found)}, got {wrong}.")
-    picked = [found[number] for number in numbers]
+    outside = [number for number in numbers if not -len(candidates) <= number < len(candidates)]
+    if outside:
+        raise ValueError(
+            f"bodies must be below the number of bodies, {len(candidates)}, got {outside}."
+        )
+    picked = [candidates[number] for number in numbers]
     for number, body in zip(numbers, picked, strict=True):
         if not all(np.isfinite(x).all() for x in (body.ts, body.wxyz, body.omega_body)):
             raise ValueError(
@@ -87,13 +89,13 @@ def chosen(what: Any, bodies: Sequence[int] | None) -> list[Body]:
 
 def bodies_of(what: Trajectory | Samples) -> list[Body]:
     """The bodies of a motion, batch axes flattened."""
-    made = as_samples(what)
-    wxyz, tensor = made.need("wxyz", "a page"), made.need("tensor", "a page")
+    data = as_samples(what)
+    wxyz, tensor = data.need("wxyz", "a page"), data.need("tensor", "a page")
     if isinstance(what, Trajectory):  # that of rotors included
-        momentum = np.asarray(what.momentum_space, np.float64).reshape(made.omega_body.shape)
+        momentum = np.asarray(what.momentum_space, np.float64).reshape(data.omega_body.shape)
     else:
-        momentum = made.momentum_space
-    samples = zip(made.ts, wxyz, made.omega_body, momentum, tensor, strict=True)
+        momentum = data.momentum_space
+    samples = zip(data.ts, wxyz, data.omega_body, momentum, tensor, strict=True)
     return [Body.sorted(*parts) for parts in samples]
 
 
@@ -105,20 +107,20 @@ def per_body(mesh: Any, count: int) -> list[Any]:
     return mesh
 
 
-def drawn(body: Body, start: float, most: int, mesh: Any) -> dict[str, Any]:
+def drawing_of(body: Body, start: float, most: int, mesh: Any) -> dict[str, Any]:
     """What the page knows of one body."""
     step = max(1, -(-(len(body.ts) - 1) // (most - 1)))
-    kept = np.unique(np.append(np.arange(0, len(body.ts), step), len(body.ts) - 1))
+    rows = np.unique(np.append(np.arange(0, len(body.ts), step), len(body.ts) - 1))
     moments, turn = np.linalg.eigh(body.tensor)
     turn[:, 0] *= np.linalg.det(turn)  # right-handed
     energy = np.einsum("ti,ij,tj->t", body.omega_body, body.tensor, body.omega_body).max()
     rates = np.linalg.norm(body.omega_body, axis=-1)
-    gaps = np.diff(body.ts[kept]) * np.maximum(rates[kept][1:], rates[kept][:-1])
+    gaps = np.diff(body.ts[rows]) * np.maximum(rates[rows][1:], rates[rows][:-1])
     return {
-        "ts": _packed(body.ts[kept] - start),
-        "wxyz": _packed(body.wxyz[kept]),
-        "omega_body": _packed(body.omega_body[kept]),
-        "momentum_space": _packed(body.momentum[kept]),
+        "ts": _packed(body.ts[rows] - start),
+        "wxyz": _packed(body.wxyz[rows]),
+        "omega_body": _packed(body.omega_body[rows]),
+        "momentum_space": _packed(body.momentum[rows]),
         "tensor": [float(x) for x in body.tensor.reshape(-1)],
         "principal": [float(x) for x in np.asarray(matrix_to_wxyz(jnp.asarray(turn)))],
         "semi": [float(x) for x in 1 / np.sqrt(moments)],
@@ -342,26 +344,26 @@ def view(
     Raises ValueError for too many bodies or times, meshes and names that do not fit them, and for
     a motion that is not finite; TypeError for other kinds of input.
     """
-    shown = chosen(what, bodies)
-    start = min(float(one.ts[0]) for one in shown)
-    duration = max(float(one.ts[-1]) for one in shown) - start
+    chosen = chosen_bodies(what, bodies)
+    start = min(float(one.ts[0]) for one in chosen)
+    duration = max(float(one.ts[-1]) for one in chosen) - start
     if not duration > 0:
         raise ValueError("a page needs at least two different times, got one.")
     scale = Scale.of(duration) if scale is None else scale
     if seconds is None:
-        fastest = max(np.linalg.norm(one.omega_body, axis=-1).max() for one in shown)
+        fastest = max(np.linalg.norm(one.omega_body, axis=-1).max() for one in chosen)
         seconds = max(8.0, float(fastest) * duration / (2 * np.pi) / _SHOWN_TURNS)
     if not seconds > 0:
         raise ValueError(f"seconds must be positive, got {seconds}.")
-    if names is not None and len(names) != len(shown):
-        raise ValueError(f"names must name the {len(shown)} bodies, got {len(names)}.")
-    most = max(2, MOST_SAMPLES // len(shown))
-    meshes = per_body(mesh, len(shown))
-    several = [drawn(one, start, most, m) for one, m in zip(shown, meshes, strict=True)]
+    if names is not None and len(names) != len(chosen):
+        raise ValueError(f"names must name the {len(chosen)} bodies, got {len(names)}.")
+    most = max(2, MOST_SAMPLES // len(chosen))
+    meshes = per_body(mesh, len(chosen))
+    several = [drawing_of(one, start, most, m) for one, m in zip(chosen, meshes, strict=True)]
     for body, name in zip(several, names or [""] * len(several), strict=True):
         body["name"] = str(name)
-    free = all(one.free for one in shown)
-    up, eye = camera([one.momentum for one in shown] if free else [])
+    free = all(one.free for one in chosen)
+    up, eye = camera([one.momentum for one in chosen] if free else [])
     motion = {
         "title": title,
         "note": note(several),
@@ -384,10 +386,10 @@ def view(
         "eye": eye,
         "bodies": several,
     }
-    made = View(_page(title or "polhode", motion))
+    page = View(_page(title or "polhode", motion))
     if path is not None:
-        made.write(path)
-    return made
+        page.write(path)
+    return page
 
 
 def view_file(
@@ -405,12 +407,12 @@ def view_file(
     without xarray and h5netcdf, FileNotFoundError without the file, ValueError for a file that
     lacks what is shown.
     """
-    found, title = read(path)
-    numbers = range(min(3, len(found))) if bodies is None else list(bodies)
-    if len(found) > 1:
+    body, title = read(path)
+    numbers = range(min(3, len(body))) if bodies is None else list(bodies)
+    if len(body) > 1:
         named = ["nominal body" if number == 0 else f"clone {number}" for number in numbers]
         options = {"names": named, **options}
-    return view(found, output, bodies=numbers, **{"title": title, **options})
+    return view(body, output, bodies=numbers, **{"title": title, **options})
 
 
 def _page(title: str, motion: dict[str, Any]) -> str:
