@@ -59,6 +59,8 @@ def _shapes(*_, forward, backward, count, shapes):
 
 
 def _jvp(arrays, tangents, *, count, **params):
+    # The map is linear in its operands and any function of what is given. Its tangent is the map of
+    # the tangents plus the derivative by what is given, which JAX takes through ``forward``.
     out = _linear_p.bind(*arrays, count=count, **params)
     given, operands = arrays[:count], arrays[count:]
     moved = tangents[count:]
@@ -95,11 +97,14 @@ def _transpose(slopes, *arrays, forward, backward, count, shapes):
     unknown = [ad.is_undefined_primal(x) for x in operands]
     avals = [x.aval if u else x for u, x in zip(unknown, operands)]
     slopes = [zeros(x) if isinstance(x, ad.Zero) else x for x in slopes]
+    # the same primitive with both programs exchanged: its transpose is the map itself again
     found = linear(backward, forward, given, slopes, avals)
     return [None] * count + [x if u else None for u, x in zip(unknown, found)]
 
 
 def _batch(arrays, dims, *, forward, backward, count, shapes):
+    # All operands get the axis, batched or not: the transpose has to return cotangents of the same
+    # shapes. What is given has no cotangent here, and keeps its axes.
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
     given_dims, operands = dims[:count], []
     for x, d in zip(arrays[count:], dims[count:]):
@@ -154,6 +159,7 @@ def spread(values: Any, axis: int, count: int) -> Any:
         def add(i, total):
             return [a + b for a, b in zip(total, row(i))]
 
+        # few rows are added one by one
         if count <= _policy.SUM_ROWS:
             return functools.reduce(lambda total, i: add(i, total), range(1, count), row(0))
         return jax.lax.fori_loop(1, count, add, row(0))
@@ -195,6 +201,9 @@ def _shapes_of_values(*avals, rule, count):
 
 
 def _attached_jvp(arrays, tangents, *, rule, count):
+    # The rule sees ``out``, values with their derivatives, so derivatives of the rule are second
+    # derivatives. Tangents of the values themselves are dropped: those are derivatives of how the
+    # values were computed.
     out = _attached_p.bind(*arrays, rule=rule, count=count)
     if not any(is_slope(x) for x in tangents[:count]):
         return out, [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in out]
@@ -248,6 +257,8 @@ def _underivable_rule(primals, tangents):
 
 
 def _spoiled(given: Any, tangents: Any) -> list[Array]:
+    # Zero tangents pass: under ``vmap`` over the columns of a Jacobian, and in batches, most
+    # directions do not move ``x`` at all.
     (where,), (tangent,) = given, tangents
     return [jnp.where(where & (tangent != 0), np.nan, tangent)]
 
@@ -279,6 +290,7 @@ def derivable_once(x: Array, where: Array) -> Array:
 @derivable_once.defjvp
 def _once_rule(primals, tangents):
     x, where = primals
+    # one in value; its own derivative by any entry of the axis is NaN, and reaches the tangents
     one = 1 + jnp.sum(underivable(x, where) - x, axis=-1, keepdims=True)
     return derivable_once(x, where), tangents[0] * one
 

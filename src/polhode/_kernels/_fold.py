@@ -156,6 +156,7 @@ def specialise(
         return Specialised(
             tuple(known), lambda held, *state: jaxpr_as_fun(closed)(*held, *state), shapes, False
         )
+    # ``instantiate=True`` keeps operands that go unused: the first ones are counted by place.
     jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals), True)
     work = _Work(fold and _policy.is_folded())
     known = [_Held(x) for x in known]
@@ -171,6 +172,8 @@ def specialise(
             held[x.key] = x.value
             seen.setdefault(x.key, set()).add(tuple(shape))
     places = {key: place for place, key in enumerate(held)}
+    # Where every operation treats entries separately, and every array is a number or of the shape
+    # of the state, the program is traced for one shape and run for any.
     lane = free[-1].aval.shape
     by_entry = all(step.by_entry for step in steps)
     for _, aval, _ in (*(o for step in steps for o in step.operands), *out):
@@ -212,6 +215,9 @@ def _needed(steps: list[_Step], out) -> tuple[_Step, ...]:
 
 def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
     """Values that several results rest on and that are long enough to be worked out once."""
+    # XLA fuses per result: a value is repeated for each result that it leads to, not for each of
+    # its users. So both are counted, and the work that staging would save is the number of
+    # operations between a value and the nearest staged ones before it (``behind``).
     makers = {i: k for k, step in enumerate(steps) for i in step.made}
 
     def of(operands):
@@ -261,6 +267,8 @@ class _Work:
         """
         if key is None:
             return make()
+        # Arrays are compared by identity, as their numbers may be traced. ``alive`` keeps them: the
+        # id of an object that was deleted may be used again.
         names = (_key_of(x) if isinstance(x, _Held) else x for x in inputs)
         key = key, *names, *((aval.shape, aval.dtype) for aval in outs)
         if key not in self.met:
@@ -291,6 +299,9 @@ class _Work:
 
     def unsigned(self, x: _Slot) -> int:
         """The number of a value with its scale, but without its sign."""
+        # Scales and signs are multiplied out only where an operation needs the value itself: until
+        # then products of parameters combine before the loop, and a sign turns a sum into a
+        # difference, which costs nothing.
         if x.scale is None:
             return x.index
         key = (x.index, x.scale.key)
@@ -322,6 +333,7 @@ class _Work:
         if name in _CALLS:
             inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
             return self.walk(inner.jaxpr, inner.consts, given)
+        # Operations with effects, such as checks, stay in the loop.
         if not eqn.effects and all(isinstance(x, _Held) for x in given):
             numbers = all(x.number is not None for x in given)
             if self.fold or numbers or name in _TAKING_APART:
@@ -337,6 +349,8 @@ class _Work:
     def known(self, eqn, given) -> list[_Held]:
         """An equation before the loop; numbers stay numbers as long as they can."""
         name, out = eqn.primitive.name, eqn.outvars[0].aval
+        # Only numbers can be compared with 0 and 1, and so remove an operation: they are computed
+        # by NumPy, never as arrays. A broadcast number stays one number, and not an array to read.
         single = all(np.ndim(x.value) == 0 for x in given)
         if given and single and name == "broadcast_in_dim":
             return given
@@ -367,8 +381,10 @@ class _Work:
                 a, b = b, a
             return self.times(a, b, aval) if isinstance(b, _Held) else self.product(a, b, aval)
         if name == "div" and isinstance(given[1], _Held) and given[1].number is not None:
+            # The reciprocal of a power of two is exact; with another the product would have one
+            # rounding error more than the quotient.
             mantissa, _ = np.frexp(given[1].number)
-            if abs(mantissa) == 0.5:  # a power of two: the reciprocal is exact
+            if abs(mantissa) == 0.5:
                 return self.times(given[0], _Held(aval.dtype.type(1 / given[1].number)), aval)
         return None
 
@@ -383,7 +399,7 @@ class _Work:
             if a.sign > 0:
                 return self.emit(lax.add, [one, b], [aval] * 2, [aval], "add")[0]
             return self.emit(lax.sub, [b, one], [aval] * 2, [aval], "sub")[0]
-        if a.index == b.index:
+        if a.index == b.index:  # p x + q x = (p + q) x, with the sum taken before the loop
             p, q = (_Held(aval.dtype.type(1)) if x.scale is None else x.scale for x in (a, b))
             scale = self.combined("add" if a.sign == b.sign else "sub", p, q, aval)
             return self.times(_Slot(a.index, a.aval, None, a.sign), scale, aval)
@@ -398,6 +414,7 @@ class _Work:
 
     def product(self, a: _Slot, b: _Slot, aval) -> _Held | _Slot:
         """The product of two values of the loop; a scale of either becomes one of the product."""
+        # sorted, so that x y and y x are one product
         plain = [_Slot(index, aval) for index in sorted((a.index, b.index))]
         (made,) = self.emit(lax.mul, plain, [aval] * 2, [aval], "mul")
         product: Any = made._replace(sign=a.sign * b.sign)
@@ -426,7 +443,7 @@ class _Work:
             return self.combined("mul", x, factor, aval)
         number = factor.number
         if number is not None:
-            if number == 0:
+            if number == 0:  # also of a value that is not finite: the term is absent
                 return factor
             if number < 0:
                 x, factor = x._replace(sign=-x.sign), _Held(aval.dtype.type(-number))

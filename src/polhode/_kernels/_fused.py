@@ -68,6 +68,8 @@ def kernel(
         leaves, tree = jax.tree.flatten(operands)
         if not any(isinstance(leaf, Tracer) for leaf in leaves):
             return fn(*operands)  # run at once, the mark would reach every call inside as well
+        # Units inside are traced plain, so that ``is_holdable`` sees their operations. With
+        # ``of_units`` they stay units: a derivative, which is not a unit as a whole, keeps them.
         analysing = _ANALYSING.set(not of_units)
         try:
             closed, shape = jax.make_jaxpr(
@@ -134,6 +136,8 @@ def _put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
     if places.size == 0 or not _policy.is_fused():
         return rows.at[places].set(values)
 
+    # A unit cannot hold a scatter. Rows are written one after another in it, so that bodies of a
+    # chunk need not wait for one another at their saved times.
     def one(i, rows):
         place = places[i].astype(i.dtype)
         return jax.lax.dynamic_update_slice(rows, values[i][None], (place, jnp.zeros_like(i)))
@@ -179,6 +183,7 @@ def _is_of_use() -> bool:
     """On the CPU, and not where XLA may divide arrays among devices: a unit cannot be divided."""
     if not _policy.is_fused():
         return False
+    # Within ``jax.shard_map`` each device has a program of its own, which XLA no longer divides.
     kinds = jax.sharding.get_abstract_mesh().axis_types
     by_hand = len(kinds) > 0 and all(kind is AxisType.Manual for kind in kinds)
     return by_hand or jax.device_count() == 1
@@ -241,6 +246,8 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
         if again or not linearised:
             given = [leaves[k] for k in moving], [tangents[k] for k in moving]
             return jax.jvp(lambda *x: of_moving(leaves, x), *given)
+        # ``jax.linearize`` within the unit: values and coefficients leave it as results, and the
+        # linear map alone is left outside, where JAX can transpose it.
         shape = []
 
         def known(*leaves):
@@ -288,6 +295,8 @@ def _of_units(of_moving: Callable, moving: Sequence[int], leaves, tangents, like
     def backward(given, slopes):
         return _unit(against, False, repeated=True)(*given, *slopes)
 
+    # Tangents and cotangents are a map and its transpose, each computed from the operands alone. It
+    # costs the motion once more, and saves hundreds of coefficients that would be stored and read.
     changes = [tangents[k] for k in moving]
     found = dict(zip(floats, linear(forward, backward, leaves, changes, list(floats.values()))))
     none = {k: np.zeros(x.shape, jax.dtypes.float0) for k, x in enumerate(like) if k not in floats}
@@ -317,7 +326,9 @@ def _marked(closed: ClosedJaxpr, given: Sequence[Any], bare: int) -> list[jax.Ar
     if not operands:
         return jaxpr_as_fun(closed)(*given)
     empty = {k: (x.shape, x.dtype) for k, x in enumerate(needed) if not x.size}
-    # Behind a barrier, for XLA moves constants into what is called.
+    # Behind a barrier, for XLA moves constants into what is called. Operands packed into one array
+    # for each dtype were tried: they need the same condition and are copied, and the gradient of a
+    # torqued body took 25 % longer to compile.
     zeros, *operands = jax.lax.optimization_barrier([jnp.zeros(2, jnp.float32), *operands])
 
     def whole(zeros, *operands):
@@ -326,9 +337,11 @@ def _marked(closed: ClosedJaxpr, given: Sequence[Any], bare: int) -> list[jax.Ar
             for k, (shape, dtype) in empty.items():
                 every.insert(k, jnp.zeros(shape, dtype))
             found = jaxpr_as_fun(ClosedJaxpr(jaxpr, closed.consts))(*every)
+            # one number of each operand is read, whatever XLA folds away of the program itself
             firsts = (x[(0,) * x.ndim].astype(bool) for x in operands)
             sure = reduce(jnp.logical_or, firsts, zeros[0] == 0)
-            # through a division, or the compiler asks every operand again for each result
+            # through a division, which XLA does not repeat: asked again for each result, the
+            # condition was a quarter of the program
             sure = jnp.where(sure, 1, 0) / (1 - zeros[1]) > 0
             chosen = {*range(len(found) - 1 - bare), len(found) - 1}
             other = {
@@ -414,6 +427,8 @@ class _Static(NamedTuple):
 
 def _split(value: Any) -> tuple[_Static, list[Any]]:
     """The static part of a pytree, and its arrays, each once."""
+    # One loop over the leaves. ``eqx.filter_jit`` partitions and combines trees instead, and a call
+    # takes three times as long.
     leaves, tree = jax.tree.flatten(value)
     arrays: list[Any] = []
     numbers: dict[int, int] = {}
