@@ -41,7 +41,7 @@ class AbstractChunkedForm(AbstractClosedForm):
     """A closed form that is evaluated for chunks of bodies, all samples of a body at once."""
 
     @abc.abstractmethod
-    def motion(
+    def _motion(
         self, scene: Scene, state: State, elapsed: Array
     ) -> tuple[Array | None, Array, Array]:
         """wxyz (N, T, 4), omega_body (N, T, 3), and for which bodies (N,) the solution holds.
@@ -50,7 +50,7 @@ class AbstractChunkedForm(AbstractClosedForm):
         """
 
     @abc.abstractmethod
-    def chunk_size(self, n: int, count: int) -> int:
+    def _chunk_size(self, n: int, count: int) -> int:
         """Bodies of a chunk, for ``n`` bodies of ``count`` samples each."""
 
     def run(self, scene: Scene, state: State, ts: Array, rtol: Array, record: Record) -> Samples:
@@ -68,13 +68,13 @@ class AbstractChunkedForm(AbstractClosedForm):
             elapsed = sample_times - times[..., :1]
             n = state.wxyz.shape[0]
             elapsed = jnp.broadcast_to(elapsed if elapsed.ndim == 2 else elapsed[None], (n, count))
-            wxyz, omega, holds = self.motion(scene, state, elapsed)
+            wxyz, omega, holds = self._motion(scene, state, elapsed)
             if not record.final_only:
                 wxyz, omega = with_first(state, wxyz, omega)
             return _samples(wxyz, omega, holds, record)
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
-        return map_chunks(of_chunk, (lanes, times), n, self.chunk_size(n, count))
+        return map_chunks(of_chunk, (lanes, times), n, self._chunk_size(n, count))
 
 
 def bodies_per_chunk(chunk: int | None, n: int, count: int) -> int:

@@ -46,10 +46,10 @@ class SymmetricTop(AbstractChunkedForm):
             return NOT_AXIAL
         return torque_objection(scene) or (None if scene.inertia.is_principal else NOT_PRINCIPAL)
 
-    def chunk_size(self, n: int, count: int) -> int:
+    def _chunk_size(self, n: int, count: int) -> int:
         return bodies_per_chunk(self.chunk, n, count)
 
-    def motion(self, scene, state, elapsed):
+    def _motion(self, scene, state, elapsed):
         n = state.wxyz.shape[0]
         transverse, moments, axial = axial_state(scene, state)
         torque, damping = (as_lanes(x, n, 1) for x in torque_and_damping(scene))
@@ -116,10 +116,10 @@ class FixedAxis(AbstractChunkedForm):
             return NOT_PRINCIPAL
         return torque_objection(scene)
 
-    def chunk_size(self, n: int, count: int) -> int:
+    def _chunk_size(self, n: int, count: int) -> int:
         return bodies_per_chunk(self.chunk, n, count)
 
-    def motion(self, scene, state, elapsed):
+    def _motion(self, scene, state, elapsed):
         n = state.wxyz.shape[0]
         torque, damping = (as_lanes(x, n, 1) for x in torque_and_damping(scene))
         moments = as_lanes(scene.inertia.moments, n, 1)

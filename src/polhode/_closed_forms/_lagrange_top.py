@@ -87,14 +87,14 @@ class LagrangeTop(AbstractChunkedForm):
             return NOT_AXIAL
         return None
 
-    def chunk_size(self, n: int, count: int) -> int:
+    def _chunk_size(self, n: int, count: int) -> int:
         if self.chunk is not None:
             return bodies_per_chunk(self.chunk, n, count)
         if n * count <= _policy.TOP_WHOLE:
             return n
         return max(1, min(_policy.TOP_BODIES, _policy.TOP_CHUNK // count))
 
-    def motion(self, scene, state, elapsed):
+    def _motion(self, scene, state, elapsed):
         n = state.wxyz.shape[0]
         transverse, moments, axial = axial_state(scene, state)
         gravity: Any = scene.potential
