@@ -250,8 +250,8 @@ MUTANTS = (
     ),
     Mutant(
         LAWS,
-        "error = (sign * (a * y - w * x - z) for x, y, z in zip(b, v, turned))",
-        "error = (sign * (a * y - w * x + z) for x, y, z in zip(b, v, turned))",
+        "error = (sign * (a * y - w * x - z) for x, y, z in zip(b, v, b_cross_v))",
+        "error = (sign * (a * y - w * x + z) for x, y, z in zip(b, v, b_cross_v))",
         "pointing at a target is wrong for large angles about another axis",
         (
             "torques/test_machines.py::test_pointing_and_rate_damping",

@@ -86,7 +86,7 @@ def crossings(
         traj.at(up.times).euler()
     """
     event = fn if isinstance(fn, Event) else Event(fn, direction, samples)
-    stored = at_least("capacity", capacity, 1)
+    slots = at_least("capacity", capacity, 1)
     size = event.samples if samples is None else at_least("samples", samples, 2)
     for name in ("wxyz", "omega_body"):
         getattr(trajectory, name)  # raises where it was not recorded
@@ -99,26 +99,26 @@ def crossings(
         )
     propagator: Any = trajectory.propagator
     if not propagator.method.exact:
-        met = _by_steps(trajectory, event, stored or CAPACITY)
+        met = _by_steps(trajectory, event, slots or CAPACITY)
         if met is not None:
             _raise_if_lost(met[1], "the steps to the last time")
             return met[0] if capacity is not None else _all_of(met[0], trajectory, event)
     if size is None:
         size = _sample_count(trajectory)
-    if stored is None:
+    if slots is None:
         if not is_concrete(trajectory):
             raise ValueError(
                 "under jit, vmap or grad the number of stored crossings must be given: capacity=8."
             )
-        stored = _MIN_CAPACITY
-    found, lost = _by_sampling(trajectory, event, stored, size)
+        slots = _MIN_CAPACITY
+    found, lost = _by_sampling(trajectory, event, slots, size)
     _raise_if_lost(lost, f"the way through {size:,} samples")
-    while capacity is None and int(np.max(found.count, initial=0)) > stored:
-        stored = 2 ** int(np.ceil(np.log2(np.max(found.count))))
-        found, _ = _by_sampling(trajectory, event, stored, size)
+    while capacity is None and int(np.max(found.count, initial=0)) > slots:
+        slots = 2 ** int(np.ceil(np.log2(np.max(found.count))))
+        found, _ = _by_sampling(trajectory, event, slots, size)
     if capacity is None:  # drop columns that no body uses
-        used = int(np.max(found.count, initial=0))
-        found = Crossings(found.times[..., :used], found.slope[..., :used], found.count)
+        count = int(np.max(found.count, initial=0))
+        found = Crossings(found.times[..., :count], found.slope[..., :count], found.count)
     return found
 
 
@@ -187,22 +187,22 @@ def _sample_count(trajectory: Trajectory) -> int:
             "under jit, vmap or grad the number of samples must be known:"
             " ph.Event(fn, samples=1000), 32 or more per revolution of the fastest rate."
         )
-    turned = np.max(np.asarray(_turned(trajectory)), initial=0)
+    angle = np.max(np.asarray(_turned_angle(trajectory)), initial=0)
     size = max(
-        17, 1 + int(np.ceil(SAMPLES_PER_TURN * turned / (2 * np.pi))) if np.isfinite(turned) else 17
+        17, 1 + int(np.ceil(SAMPLES_PER_TURN * angle / (2 * np.pi))) if np.isfinite(angle) else 17
     )
     tolerance = 2 ** max(0, int(np.log2(size)) - 2)  # few numbers, for fewer compiled programs
     size = 1 + -(-(size - 1) // tolerance) * tolerance
     if size * max(1, int(np.prod(trajectory.batch_shape))) > _MAX_SAMPLES:
         raise ValueError(
-            f"{size:,} samples of each body are needed for the {turned:.3g} rad that it turns:"
+            f"{size:,} samples of each body are needed for the {angle:.3g} rad that it turns:"
             " search a shorter time or fewer bodies at once, or give samples= for a slow function."
         )
     return size
 
 
 @eqx.filter_jit
-def _turned(trajectory: Trajectory) -> Array:
+def _turned_angle(trajectory: Trajectory) -> Array:
     """Most (...) that a body may turn from the first to the last time [rad]."""
     ts = trajectory._t
     span = jnp.max(ts, axis=-1) - jnp.min(ts, axis=-1)
@@ -239,19 +239,19 @@ def _by_sampling(
     share = jnp.linspace(0, 1, size, dtype=ts.dtype).at[0].set(AT_START / (size - 1))
     share = share.reshape((1,) * (ts.ndim - 1) + share.shape)
     grid = ts[..., :1] + share * (ts[..., -1:] - ts[..., :1])
-    sampled = moved_through(fixed, grid)
+    samples = moved_through(fixed, grid)
     propagator: Any = trajectory.propagator
     # what is stepped goes on from the nearest look
-    origin = fixed if propagator.method.exact else sampled
-    values, slopes = event.values(sampled)
+    origin = fixed if propagator.method.exact else samples
+    values, slopes = event.values(samples)
     values, slopes = (x.reshape(-1, size) for x in (values, slopes))
     grid = jnp.broadcast_to(grid, (*batch, size)).reshape(-1, size)
     values, slopes, grid = still((values, slopes, grid))
     ahead = jnp.where(grid[:, -1:] < grid[:, :1], -1, 1).astype(grid.dtype)
 
     def evaluate(t):
-        found = event.values(moved_to(origin, t.reshape(*batch, -1)))
-        return still(tuple(x.reshape(t.shape) for x in found))
+        pair = event.values(moved_to(origin, t.reshape(*batch, -1)))
+        return still(tuple(x.reshape(t.shape) for x in pair))
 
     sides = jnp.where(values >= 0, 1, -1)
     changes = sides[:, 1:] != sides[:, :-1]
@@ -284,16 +284,16 @@ def _by_sampling(
         order = jnp.argsort(jnp.where(use, ahead * columns[0], jnp.inf), axis=-1)[:, :stored]
         return tuple(entries(x, order) for x in (*columns, use)), pairs
 
-    def search(found, second):
+    def search(roots, second):
         """The turning points, then the roots: one copy of the motion in the program."""
-        given = [jnp.where(second, b, a) for a, b in zip(turns, brackets(*found)[0])]
+        arguments = [jnp.where(second, b, a) for a, b in zip(turns, brackets(*roots)[0])]
 
         def fn(t):
             value, slope = evaluate(t)
             return jnp.where(second, value, slope), value
 
-        found = bracketed(fn, *given)
-        return found, found
+        roots = bracketed(fn, *arguments)
+        return roots, roots
 
     none = jnp.zeros_like(low)
     _, (points, there) = jax.lax.scan(search, (none, none), jnp.array([False, True]))
@@ -305,13 +305,13 @@ def _by_sampling(
     dipping = jnp.sum(minima, axis=-1)
     count = jnp.where(dipping > stored, jnp.maximum(count, each * dipping), count)
     times, use = (x[:, :capacity].reshape(*batch, capacity) for x in (times, use))
-    slope, times = _refined(trajectory, event, times, use)
-    lost = (sampled.status != Status.SUCCESSFUL) & (trajectory.status == Status.SUCCESSFUL)
+    slope, times = _differentiable_times(trajectory, event, times, use)
+    lost = (samples.status != Status.SUCCESSFUL) & (trajectory.status == Status.SUCCESSFUL)
     count = jnp.where(lost, capacity + 1, count.reshape(batch)).astype(jnp.int32)
     return Crossings(jnp.where(use, times, jnp.inf), jnp.where(use, slope, 0), count), lost
 
 
-def _refined(trajectory: Trajectory, event: Event, times: Array, use: Array):
+def _differentiable_times(trajectory: Trajectory, event: Event, times: Array, use: Array):
     """Slopes and times with their derivatives."""
     safe = jnp.where(use, times, trajectory.ts[..., :1])
     # of the value no more than rounding is left to correct, or of a touch all digits are noise
@@ -399,12 +399,18 @@ def bracketed(
         inverse = -(f / ab) * (-f3 / bc) + (x3 - x) / span * (f / ac) * (g2 / bc)
         new = jnp.clip(jnp.where(safe, inverse, 0.5), limit, 1 - limit)
 
-        def kept(old, new):
+        def where_busy(old, new):
             return jnp.where(done, old, new)
 
-        found = kept(x1, x), kept(x2, new2), kept(f1, f), kept(f2, g2), kept(share, new)
-        found = (*found, kept(more, also))
-        return count + 1, done | stop, *found
+        values = (
+            where_busy(x1, x),
+            where_busy(x2, new2),
+            where_busy(f1, f),
+            where_busy(f2, g2),
+            where_busy(share, new),
+        )
+        values = (*values, where_busy(more, also))
+        return count + 1, done | stop, *values
 
     zero = at_low == 0
     start = jnp.where(zero, low, high), low, jnp.where(zero, at_low, at_high), at_low

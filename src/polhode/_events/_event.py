@@ -78,20 +78,20 @@ class Event(eqx.Module):
         arrays, rest = eqx.partition(approximate, eqx.is_inexact_array)
         leaves, tree = jax.tree.flatten((arrays, limit))
 
-        def moved(*leaves):
+        def values_of(*leaves):
             arrays, limit = jax.tree.unflatten(tree, leaves)
             delay, there = self.refined(eqx.combine(arrays, rest), limit)
             return [delay, *there._samples]
 
-        closed = jax.make_jaxpr(moved)(*leaves)
+        closed = jax.make_jaxpr(values_of)(*leaves)
         size = len(closed.consts)
 
         def rule(operands, tangents, values):
             at = [i for i, x in enumerate(tangents) if is_slope(x)]
 
-            def some(*given):
+            def some(*primals):
                 full = list(operands)
-                for i, x in zip(at, given):
+                for i, x in zip(at, primals):
                     full[i] = x
                 return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, full[:size]))(*full[size:])
 

@@ -107,7 +107,7 @@ def found_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tra
     )
     path = [x[:, :count] for x in (samples.wxyz, samples.omega_body)]
     path += [] if samples.spins is None else [samples.spins[:, :count]]
-    return _ended(
+    return _until_terminal(
         begin,
         jnp.broadcast_to(times, path[0].shape[:2]),
         path,
@@ -121,11 +121,11 @@ def found_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tra
 def found_by_search(trajectory: Trajectory, events: Sequence[Event]) -> Trajectory:
     """The same for a motion that is known at every time: its trajectory is searched."""
     each = [crossings(trajectory, event, capacity=event.capacity) for event in events]
-    return _merged(trajectory, [x.times for x in each], [x.count for x in each], events)
+    return _in_order_of_time(trajectory, [x.times for x in each], [x.count for x in each], events)
 
 
 @eqx.filter_jit
-def _merged(trajectory: Trajectory, times, counts, events) -> Trajectory:
+def _in_order_of_time(trajectory: Trajectory, times, counts, events) -> Trajectory:
     batch, ts = trajectory.batch_shape, trajectory.ts
     rows = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
     sign = jnp.where(rows[:, -1:] < rows[:, :1], -1, 1).astype(ts.dtype)
@@ -152,7 +152,7 @@ def _merged(trajectory: Trajectory, times, counts, events) -> Trajectory:
     def lanes(samples):
         return [x.reshape(-1, *x.shape[len(batch) :]) for x in samples]
 
-    return _ended(
+    return _until_terminal(
         trajectory,
         rows,
         lanes(trajectory._samples),
@@ -168,7 +168,7 @@ def _is_terminal(which: Array, events: Sequence[Event]) -> Array:
     return table[jnp.maximum(which, 0)] & (which >= 0)
 
 
-def _ended(begin: Trajectory, rows, path, outcome, events, met, states):
+def _until_terminal(begin: Trajectory, rows, path, outcome, events, met, states):
     """Samples beyond a terminal event are those of the event."""
     batch = begin.batch_shape
     at, which, count = met
@@ -194,7 +194,7 @@ def _ended(begin: Trajectory, rows, path, outcome, events, met, states):
     attitudes, rates, *_ = (
         jnp.where(nothing, jnp.nan, x).reshape(*batch, *x.shape[1:]) for x in states
     )
-    found = Events(
+    record = Events(
         times=at.reshape(*batch, -1),
         which=which.reshape(*batch, -1),
         wxyz=attitudes,
@@ -203,7 +203,7 @@ def _ended(begin: Trajectory, rows, path, outcome, events, met, states):
     )
     one_row = event_time is None and begin.ts.ndim == 1
     times = rows[0] if one_row else rows.reshape(*batch, -1)
-    return begin._with_samples(times, path, status, steps, event_time, found)
+    return begin._with_samples(times, path, status, steps, event_time, record)
 
 
 _SAMPLES = 64
@@ -261,10 +261,10 @@ def _stopped_by_loop(lanes: Trajectory, ts: Array, until: Event):
         return None
     wxyz, omega, *spins = (x[:, 0] for x in lanes._samples)
     scene, search = begun(lanes.scene, spins), Search((until.fn,), (until.direction,), (True,), 1)
-    found = method.search(scene, State(wxyz, omega), ts, propagator.rtol, search, False)
-    if found is None:
+    solution = method.search(scene, State(wxyz, omega), ts, propagator.rtol, search, False)
+    if solution is None:
         return None
-    samples, events = found
+    samples, events = solution
     spins = [] if samples.spins is None else [samples.spins]
     path = [samples.wxyz, samples.omega_body, *spins]
     met = jnp.isfinite(events.times[:, 0])
@@ -380,8 +380,8 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
     def times(share):
         """(K,) or (N, K) of parts (K,) of the whole."""
         share = share.reshape((1,) * span.ndim + share.shape)
-        found = first[..., None] + share * span[..., None]
-        return jnp.where(share >= 1, last[..., None], found)
+        grid = first[..., None] + share * span[..., None]
+        return jnp.where(share >= 1, last[..., None], grid)
 
     def at(time, samples, share_of_error=None):
         """The bodies at a time () or (N,), one sample each."""
@@ -409,9 +409,9 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
             return jnp.asarray(_SAMPLES / (until.samples - 1), dtype)
         ends = jnp.stack(jnp.broadcast_arrays(times(share[None])[..., 0], last), axis=-1)
         rates = natural_rates(lanes.scene, State(*samples[:2]), ends)
-        turned = jnp.max(jnp.where(busy & jnp.isfinite(rates), rates * jnp.abs(span), 0), initial=0)
-        turned = jnp.maximum(turned, jnp.finfo(dtype).tiny)
-        return jnp.maximum(_SAMPLES * 2 * jnp.pi / SAMPLES_PER_TURN / turned, least).astype(dtype)
+        angle = jnp.max(jnp.where(busy & jnp.isfinite(rates), rates * jnp.abs(span), 0), initial=0)
+        angle = jnp.maximum(angle, jnp.finfo(dtype).tiny)
+        return jnp.maximum(_SAMPLES * 2 * jnp.pi / SAMPLES_PER_TURN / angle, least).astype(dtype)
 
     def one(carry: _Window) -> _Window:
         busy = ~carry.met & carry.alive
@@ -442,9 +442,9 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
             jnp.where(is_minimum[:, _MINIMA], place[:, _MINIMA], _SAMPLES), initial=_SAMPLES
         )
         if until.samples is None:
-            turned = turning_rates(sampled) * jnp.abs(span).reshape(-1, 1)
-            turned = jnp.where(busy[:, None] & jnp.isfinite(turned), turned, 0)
-            angle = jnp.max(turned, axis=0, initial=0) * width / _SAMPLES
+            turned_angle = turning_rates(sampled) * jnp.abs(span).reshape(-1, 1)
+            turned_angle = jnp.where(busy[:, None] & jnp.isfinite(turned_angle), turned_angle, 0)
+            angle = jnp.max(turned_angle, axis=0, initial=0) * width / _SAMPLES
             slow = (angle <= _MAX_SPEED_UP * 2 * jnp.pi / SAMPLES_PER_TURN) | (width <= least)
             fast = jnp.min(jnp.where(slow, _SAMPLES, jnp.arange(_SAMPLES + 1)))
             reach = jnp.minimum(reach, jnp.maximum(fast, 1))
@@ -467,8 +467,8 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
         return _Window(carry.tried + 1, share[reach], wider, samples, met, alive, found)
 
     def on(carry: _Window):
-        left = (carry.share < 1) & (carry.tried < _MAX_WINDOWS)
-        return left & jnp.any(~carry.met & carry.alive)
+        unfinished = (carry.share < 1) & (carry.tried < _MAX_WINDOWS)
+        return unfinished & jnp.any(~carry.met & carry.alive)
 
     samples, zero = [x[:, 0] for x in lanes._samples], jnp.zeros(n, dtype)
     alive = lanes.status == Status.SUCCESSFUL
@@ -487,8 +487,8 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
         value, _ = until.values(moved_to(lanes if exact else at(look, samples), t))
         return value, value
 
-    given = (x[:, None] for x in (low, high, at_low, at_high, carry.met))
-    near, _ = bracketed(fn, *given)
+    arguments = (x[:, None] for x in (low, high, at_low, at_high, carry.met))
+    near, _ = bracketed(fn, *arguments)
     lost = ~carry.met & carry.alive & (carry.share < 1)
     return carry.met, lost, near[:, 0], jnp.abs(carry.width * span) / _SAMPLES
 
@@ -513,8 +513,10 @@ def _first_minimum(
     side = entries(sides, place)
     across = is_minimum & (jnp.where(value >= 0, 1, -1) != side)
     pair, some = first_true(across, 1)
-    found = jnp.where(some, entries(place, pair), _SAMPLES)
-    return _Minimum(*(x[:, 0] for x in (found, *(entries(x, pair) for x in (time, value, side)))))
+    interval = jnp.where(some, entries(place, pair), _SAMPLES)
+    return _Minimum(
+        *(x[:, 0] for x in (interval, *(entries(x, pair) for x in (time, value, side))))
+    )
 
 
 def _bracket(sampled: Trajectory, grid, values, change, minimum: _Minimum, wanted, new) -> _Bracket:
@@ -544,11 +546,11 @@ def _stopped_at(lanes: Trajectory, ts: Array, until: Event, met: Array, near: Ar
     if ts.ndim == 1:  # as far as the last event of all bodies
         end = sign * jnp.max(sign * end)
     far = (sign * end)[..., None] < sign[..., None] * ts
-    moved = moved_through(lanes, jnp.where(far, end[..., None], ts))
+    states = moved_through(lanes, jnp.where(far, end[..., None], ts))
     if ts.ndim > 1 or met.size == 1:  # the last sample of each body is at its own event
-        there = moved[..., -1:]
+        there = states[..., -1:]
     else:
-        there = moved_to(moved, jnp.where(met, near, ts[..., 0])[:, None])
+        there = moved_to(states, jnp.where(met, near, ts[..., 0])[:, None])
     # the motion in windows differed from this one by no more than the tolerance allows
     limit = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(there._t)
     propagator: Any = lanes.propagator
@@ -560,10 +562,10 @@ def _stopped_at(lanes: Trajectory, ts: Array, until: Event, met: Array, near: Ar
     past = met[:, None] & (sign.reshape(-1, 1) * (rows - event) >= 0)
     path = [
         jnp.where(past[..., None], x, y)
-        for x, y in zip(at_event._samples, moved._samples, strict=True)
+        for x, y in zip(at_event._samples, states._samples, strict=True)
     ]
     wxyz, omega, *spins = path
-    status = jnp.where(met, there.status, moved.status)
+    status = jnp.where(met, there.status, states.status)
     times = jnp.where(past, event, rows)
     event = jnp.where(met, event[:, 0], jnp.inf)
-    return wxyz, omega, spins[0] if spins else None, status, moved.steps, times, event
+    return wxyz, omega, spins[0] if spins else None, status, states.steps, times, event

@@ -24,18 +24,28 @@ Map = Callable[[Sequence[Any], Sequence[Any]], Sequence[Any]]
 
 
 def linear(
-    forward: Map, backward: Map, given: Sequence[Any], operands: Sequence[Any], like: Sequence[Any]
+    forward: Map,
+    backward: Map,
+    constants: Sequence[Any],
+    operands: Sequence[Any],
+    like: Sequence[Any],
 ) -> list[Any]:
-    """``forward(given, operands)``, linear in ``operands``; ``backward(given, out)`` transposes it.
+    """``forward(constants, operands)``, linear in ``operands``; ``backward(constants, out)`` is its
+    transpose.
 
     All are lists of arrays; ``like``: arrays of the shapes and dtypes of the result. Neither
     function may close over traced values. Unlike ``jax.custom_vjp`` this leaves forward mode as it
     is, and unlike ``jax.custom_derivatives.linear_call`` it takes ``vmap`` and derivatives with
-    respect to ``given``.
+    respect to ``constants``.
     """
     shapes = tuple((tuple(x.shape), x.dtype) for x in like)
     return _linear_p.bind(
-        *given, *operands, forward=forward, backward=backward, count=len(given), shapes=shapes
+        *constants,
+        *operands,
+        forward=forward,
+        backward=backward,
+        count=len(constants),
+        shapes=shapes,
     )
 
 
@@ -59,25 +69,25 @@ def _shapes(*_, forward, backward, count, shapes):
 
 
 def _jvp(arrays, tangents, *, count, **params):
-    # The map is linear in its operands and any function of what is given. Its tangent is the map of
-    # the tangents plus the derivative by what is given, which JAX takes through ``forward``.
+    # The map is linear in its operands and any function of the constants. Its tangent is the map of
+    # the tangents plus the derivative by the constants, which JAX takes through ``forward``.
     out = _linear_p.bind(*arrays, count=count, **params)
-    given, operands = arrays[:count], arrays[count:]
-    moved = tangents[count:]
+    constants, operands = arrays[:count], arrays[count:]
+    operand_tangents = tangents[count:]
     changes: list[Any] = []
-    if not all(isinstance(x, ad.Zero) for x in moved):
-        moved = [zeros(x) if isinstance(x, ad.Zero) else x for x in moved]
-        changes = _linear_p.bind(*given, *moved, count=count, **params)
+    if not all(isinstance(x, ad.Zero) for x in operand_tangents):
+        operand_tangents = [zeros(x) if isinstance(x, ad.Zero) else x for x in operand_tangents]
+        changes = _linear_p.bind(*constants, *operand_tangents, count=count, **params)
     at = [i for i, x in enumerate(tangents[:count]) if is_slope(x)]
     if at:
 
         def of_given(*some):
-            full = list(given)
+            full = list(constants)
             for i, x in zip(at, some):
                 full[i] = x
             return params["forward"](full, operands)
 
-        _, more = jax.jvp(of_given, [given[i] for i in at], [tangents[i] for i in at])
+        _, more = jax.jvp(of_given, [constants[i] for i in at], [tangents[i] for i in at])
         changes = [a + b for a, b in zip(changes, more)] if changes else more
     return out, changes
 
@@ -93,18 +103,18 @@ def zeros(x: Any) -> Any:
 
 
 def _transpose(slopes, *arrays, forward, backward, count, shapes):
-    given, operands = arrays[:count], arrays[count:]
+    constants, operands = arrays[:count], arrays[count:]
     unknown = [ad.is_undefined_primal(x) for x in operands]
     avals = [x.aval if u else x for u, x in zip(unknown, operands)]
     slopes = [zeros(x) if isinstance(x, ad.Zero) else x for x in slopes]
     # the same primitive with both programs exchanged: its transpose is the map itself again
-    found = linear(backward, forward, given, slopes, avals)
-    return [None] * count + [x if u else None for u, x in zip(unknown, found)]
+    cotangents = linear(backward, forward, constants, slopes, avals)
+    return [None] * count + [x if u else None for u, x in zip(unknown, cotangents)]
 
 
 def _batch(arrays, dims, *, forward, backward, count, shapes):
     # All operands get the axis, batched or not: the transpose has to return cotangents of the same
-    # shapes. What is given has no cotangent here, and keeps its axes.
+    # shapes. The constants have no cotangents here, and keep their axes.
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
     given_dims, operands = dims[:count], []
     for x, d in zip(arrays[count:], dims[count:]):
@@ -112,10 +122,10 @@ def _batch(arrays, dims, *, forward, backward, count, shapes):
         operands.append(full)
 
     def batched(fn):
-        return lambda given, operands: jax.vmap(
-            lambda *both: list(fn(both[: len(given)], both[len(given) :])),
+        return lambda constants, operands: jax.vmap(
+            lambda *both: list(fn(both[: len(constants)], both[len(constants) :])),
             in_axes=(*given_dims, *[0] * len(operands)),
-        )(*given, *operands)
+        )(*constants, *operands)
 
     out = _linear_p.bind(
         *arrays[:count],
@@ -167,8 +177,10 @@ def spread(values: Any, axis: int, count: int) -> Any:
     if not _policy.is_fused():
         return jax.tree.map(repeated, values)
     like = jax.eval_shape(lambda: forward(None, moving.values()))
-    found = dict(zip(moving, linear(forward, backward, [], list(moving.values()), like)))
-    every = [found[k] if k in found else repeated(x) for k, x in enumerate(leaves)]
+    repeated_floats = dict(zip(moving, linear(forward, backward, [], list(moving.values()), like)))
+    every = [
+        repeated_floats[k] if k in repeated_floats else repeated(x) for k, x in enumerate(leaves)
+    ]
     return jax.tree.unflatten(tree, every)
 
 
@@ -256,10 +268,10 @@ def _underivable_rule(primals, tangents):
     return underivable(x, where), linear(_spoiled, _spoiled, [where], [tangents[0]], [x])[0]
 
 
-def _spoiled(given: Any, tangents: Any) -> list[Array]:
+def _spoiled(constants: Any, tangents: Any) -> list[Array]:
     # Zero tangents pass: under ``vmap`` over the columns of a Jacobian, and in batches, most
     # directions do not move ``x`` at all.
-    (where,), (tangent,) = given, tangents
+    (where,), (tangent,) = constants, tangents
     return [jnp.where(where & (tangent != 0), np.nan, tangent)]
 
 

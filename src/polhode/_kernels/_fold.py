@@ -161,10 +161,10 @@ def specialise(
     work = _Work(fold and _policy.is_folded())
     known = [_Held(x) for x in known]
     free = [work.slot(v.aval) for v in jaxpr.invars[len(known) :]]
-    found = work.walk(jaxpr, closed.consts, [*known, *free])
+    results = work.walk(jaxpr, closed.consts, [*known, *free])
     avals: list[Any] = [v.aval for v in jaxpr.outvars]
-    out = [(work.operand(x), aval, aval.shape) for x, aval in zip(found, avals)]
-    steps = _needed(work.steps, out)
+    out = [(work.operand(x), aval, aval.shape) for x, aval in zip(results, avals)]
+    steps = _steps_of_results(work.steps, out)
     held: dict[int, Any] = {}
     seen: dict[int, set[tuple[int, ...]]] = {}
     for x, _, shape in (*(o for step in steps for o in step.operands), *out):
@@ -194,23 +194,23 @@ def specialise(
             return jnp.broadcast_to(jnp.asarray(value, aval.dtype), shape)
 
         for step in steps:
-            found = step.bind(*(read(o) for o in step.operands))
-            for i, x in zip(step.made, found if isinstance(found, list | tuple) else [found]):
+            results = step.bind(*(read(o) for o in step.operands))
+            for i, x in zip(step.made, results if isinstance(results, list | tuple) else [results]):
                 values[i] = staged(x, opaque_ones(x)) if i in shared else x
         return [read(o) for o in out]
 
     return Specialised(tuple(held.values()), run, tuple(map(frozenset, seen.values())), by_entry)
 
 
-def _needed(steps: list[_Step], out) -> tuple[_Step, ...]:
+def _steps_of_results(steps: list[_Step], out) -> tuple[_Step, ...]:
     """The steps that the results rest on."""
-    wanted = {x for x, *_ in out if not isinstance(x, _Held)}
-    kept = []
+    values = {x for x, *_ in out if not isinstance(x, _Held)}
+    needed_steps = []
     for step in reversed(steps):
-        if wanted.intersection(step.made):
-            kept.append(step)
-            wanted.update(x for x, *_ in step.operands if not isinstance(x, _Held))
-    return tuple(reversed(kept))
+        if values.intersection(step.made):
+            needed_steps.append(step)
+            values.update(x for x, *_ in step.operands if not isinstance(x, _Held))
+    return tuple(reversed(needed_steps))
 
 
 def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
@@ -281,9 +281,9 @@ class _Work:
         operands = [(self.operand(x), aval, s) for x, aval, s in zip(inputs, avals, shapes)]
 
         def make():
-            made = [self.slot(aval) for aval in outs]
-            self.steps.append(_Step([s.index for s in made], bind, name in _BY_ENTRY, operands))
-            return made
+            slots = [self.slot(aval) for aval in outs]
+            self.steps.append(_Step([s.index for s in slots], bind, name in _BY_ENTRY, operands))
+            return slots
 
         return self.once(key, [x for x, *_ in operands], outs, make)
 
@@ -324,68 +324,68 @@ class _Work:
             return _Held(np.asarray(v.val, cast(ShapedArray, v.aval).dtype)[()])
 
         for eqn in jaxpr.eqns:
-            given = [read(v) for v in eqn.invars]
-            env.update(zip(eqn.outvars, self.equation(eqn, given)))
+            operands = [read(v) for v in eqn.invars]
+            env.update(zip(eqn.outvars, self.equation(eqn, operands)))
         return [read(v) for v in jaxpr.outvars]
 
-    def equation(self, eqn, given) -> Sequence[_Held | _Slot]:
+    def equation(self, eqn, operands) -> Sequence[_Held | _Slot]:
         name = eqn.primitive.name
         if name in _CALLS:
             inner = eqn.params.get("jaxpr", eqn.params.get("call_jaxpr"))
-            return self.walk(inner.jaxpr, inner.consts, given)
+            return self.walk(inner.jaxpr, inner.consts, operands)
         # Operations with effects, such as checks, stay in the loop.
-        if not eqn.effects and all(isinstance(x, _Held) for x in given):
-            numbers = all(x.number is not None for x in given)
+        if not eqn.effects and all(isinstance(x, _Held) for x in operands):
+            numbers = all(x.number is not None for x in operands)
             if self.fold or numbers or name in _TAKING_APART:
                 outs = [v.aval for v in eqn.outvars]
-                return self.once(_operation(eqn), given, outs, lambda: self.known(eqn, given))
+                return self.once(_operation(eqn), operands, outs, lambda: self.known(eqn, operands))
         elif self.fold and len(eqn.outvars) == 1:
-            simple = self.simplified(name, given, eqn.outvars[0].aval)
+            simple = self.simplified(name, operands, eqn.outvars[0].aval)
             if simple is not None:
                 return [simple]
         avals, outs = ([v.aval for v in vs] for vs in (eqn.invars, eqn.outvars))
-        return self.emit(_binder(eqn), given, avals, outs, _operation(eqn), name)
+        return self.emit(_binder(eqn), operands, avals, outs, _operation(eqn), name)
 
-    def known(self, eqn, given) -> list[_Held]:
+    def known(self, eqn, operands) -> list[_Held]:
         """An equation before the loop; numbers stay numbers as long as they can."""
         name, out = eqn.primitive.name, eqn.outvars[0].aval
         # Only numbers can be compared with 0 and 1, and so remove an operation: they are computed
         # by NumPy, never as arrays. A broadcast number stays one number, and not an array to read.
-        single = all(np.ndim(x.value) == 0 for x in given)
-        if given and single and name == "broadcast_in_dim":
-            return given
-        if single and name in _FOLDS and all(x.number is not None for x in given):
-            return [_Held(out.dtype.type(_FOLDS[name](*(x.number for x in given))))]
+        single = all(np.ndim(x.value) == 0 for x in operands)
+        if operands and single and name == "broadcast_in_dim":
+            return operands
+        if single and name in _FOLDS and all(x.number is not None for x in operands):
+            return [_Held(out.dtype.type(_FOLDS[name](*(x.number for x in operands))))]
         if single and name in _ELEMENTWISE and len(eqn.outvars) == 1:
-            return [_Held(_binder(eqn)(*(jnp.asarray(x.value) for x in given)))]
-        full = [jnp.broadcast_to(x.value, v.aval.shape) for x, v in zip(given, eqn.invars)]
-        found = _binder(eqn)(*full)
-        return [_Held(x) for x in (found if isinstance(found, list | tuple) else [found])]
+            return [_Held(_binder(eqn)(*(jnp.asarray(x.value) for x in operands)))]
+        full = [jnp.broadcast_to(x.value, v.aval.shape) for x, v in zip(operands, eqn.invars)]
+        results = _binder(eqn)(*full)
+        return [_Held(x) for x in (results if isinstance(results, list | tuple) else [results])]
 
-    def simplified(self, name, given, aval) -> _Held | _Slot | None:
+    def simplified(self, name, operands, aval) -> _Held | _Slot | None:
         """What becomes of an operation with a known zero or factor; None where nothing does."""
         if not jnp.issubdtype(aval.dtype, jnp.inexact):
             return None
-        if any(isinstance(x, _Slot) and x.aval.shape != aval.shape for x in given):
+        if any(isinstance(x, _Slot) and x.aval.shape != aval.shape for x in operands):
             return None  # one number of the loop meets an array
         if name == "neg":
-            return self.times(given[0], _Held(aval.dtype.type(-1)), aval)
+            return self.times(operands[0], _Held(aval.dtype.type(-1)), aval)
         if name in ("add", "add_any", "sub"):
-            a, b = given
+            a, b = operands
             if name == "sub":
                 b = self.times(b, _Held(aval.dtype.type(-1)), aval)
             return self.sum(a, b, aval)
         if name == "mul":
-            a, b = given
+            a, b = operands
             if isinstance(a, _Held):
                 a, b = b, a
             return self.times(a, b, aval) if isinstance(b, _Held) else self.product(a, b, aval)
-        if name == "div" and isinstance(given[1], _Held) and given[1].number is not None:
+        if name == "div" and isinstance(operands[1], _Held) and operands[1].number is not None:
             # The reciprocal of a power of two is exact; with another the product would have one
             # rounding error more than the quotient.
-            mantissa, _ = np.frexp(given[1].number)
+            mantissa, _ = np.frexp(operands[1].number)
             if abs(mantissa) == 0.5:
-                return self.times(given[0], _Held(aval.dtype.type(1 / given[1].number)), aval)
+                return self.times(operands[0], _Held(aval.dtype.type(1 / operands[1].number)), aval)
         return None
 
     def sum(self, a, b, aval) -> _Held | _Slot:
@@ -409,15 +409,15 @@ class _Work:
         else:
             scale, parts = None, [_Slot(self.unsigned(x), aval) for x in (a, b)]
         name, bind = ("add", lax.add) if a.sign == b.sign else ("sub", lax.sub)
-        (made,) = self.emit(bind, parts, [aval] * 2, [aval], name)
-        return made._replace(scale=scale, sign=a.sign)
+        (total,) = self.emit(bind, parts, [aval] * 2, [aval], name)
+        return total._replace(scale=scale, sign=a.sign)
 
     def product(self, a: _Slot, b: _Slot, aval) -> _Held | _Slot:
         """The product of two values of the loop; a scale of either becomes one of the product."""
         # sorted, so that x y and y x are one product
         plain = [_Slot(index, aval) for index in sorted((a.index, b.index))]
-        (made,) = self.emit(lax.mul, plain, [aval] * 2, [aval], "mul")
-        product: Any = made._replace(sign=a.sign * b.sign)
+        (result,) = self.emit(lax.mul, plain, [aval] * 2, [aval], "mul")
+        product: Any = result._replace(sign=a.sign * b.sign)
         for x in (a, b):
             if x.scale is not None:
                 product = self.times(product, x.scale, aval)
@@ -473,6 +473,7 @@ def _operation(eqn) -> Any:
 
 
 def _binder(eqn):
-    found = eqn.primitive.get_bind_params(eqn.params)
-    funs, params = found if isinstance(found, tuple) else ((), found)  # as older versions of JAX
+    parameters = eqn.primitive.get_bind_params(eqn.params)
+    # older versions of JAX return functions too
+    funs, params = parameters if isinstance(parameters, tuple) else ((), parameters)
     return lambda *operands: eqn.primitive.bind(*funs, *operands, **params)

@@ -73,15 +73,15 @@ def kernel(
         analysing = _ANALYSING.set(not of_units)
         try:
             closed, shape = jax.make_jaxpr(
-                lambda *given: fn(*jax.tree.unflatten(tree, given)), return_shape=True
+                lambda *flat: fn(*jax.tree.unflatten(tree, flat)), return_shape=True
             )(*leaves)
         finally:
             _ANALYSING.reset(analysing)
         if not is_holdable(closed.jaxpr):
             return fn(*operands)
-        whole, given = _opened(closed)
-        found = _unit(jaxpr_as_fun(whole), linearised, (whole, 0), repeated)(*given, *leaves)
-        return jax.tree.unflatten(jax.tree.structure(shape), found)
+        whole, constants = _with_constants_as_operands(closed)
+        results = _unit(jaxpr_as_fun(whole), linearised, (whole, 0), repeated)(*constants, *leaves)
+        return jax.tree.unflatten(jax.tree.structure(shape), results)
 
     return call
 
@@ -146,10 +146,10 @@ def _put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
 
 
 @_put_each.def_vmap
-def _put_all(size, batched, *given):
+def _put_all(size, batched, *operands):
     """The rows of a batch, one after another."""
     rows, places, values = (
-        x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(given, batched)
+        x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(operands, batched)
     )
     places = places + rows.shape[1] * jnp.arange(size, dtype=places.dtype)[:, None]
     flat = _put(_flat(rows), places.reshape(-1), _flat(values))
@@ -160,7 +160,7 @@ def _flat(x: jax.Array) -> jax.Array:
     return x.reshape(-1, x.shape[-1])
 
 
-def _opened(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
+def _with_constants_as_operands(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
     """The same program with what it closes over as its first operands, and these: they may be
     differentiated. Few known numbers, such as the table of a rule, stay in it: as operands they
     would be carried through every loop."""
@@ -171,12 +171,12 @@ def _opened(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
     others = [(v, x) for v, x in own if isinstance(x, Tracer) or np.size(x) > _policy.KERNEL_TABLE]
     names = jaxpr.debug_info.arg_names
     names = None if names is None else ("",) * len(others) + (*names,)
-    opened = jaxpr.replace(
+    jaxpr_of_all = jaxpr.replace(
         constvars=[v for v, _ in tables],
         invars=[*(v for v, _ in others), *jaxpr.invars],
         debug_info=jaxpr.debug_info._replace(arg_names=names),
     )
-    return ClosedJaxpr(opened, [x for _, x in tables]), [x for _, x in others]
+    return ClosedJaxpr(jaxpr_of_all, [x for _, x in tables]), [x for _, x in others]
 
 
 def _is_of_use() -> bool:
@@ -208,8 +208,8 @@ def _is_wide(equation) -> bool:
     do within a unit: from 4096 on, measured with jaxlib 0.10."""
     if not equation.primitive.name.startswith("reduce_"):
         return False
-    given = equation.invars[0].aval
-    return jnp.issubdtype(given.dtype, jnp.inexact) and given.size >= _policy.KERNEL_SUM
+    operand = equation.invars[0].aval
+    return jnp.issubdtype(operand.dtype, jnp.inexact) and operand.size >= _policy.KERNEL_SUM
 
 
 def _is_packable(dtype) -> bool:
@@ -220,7 +220,7 @@ def _is_packable(dtype) -> bool:
 def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool = False) -> Callable:
     """``flat``, a function of arrays with a list of results, as one unit, differentiable.
 
-    ``traced``: the same where it is known already, and how many results are bare (``_marked``).
+    ``traced``: the same where it is known already, and how many results are bare (``_unit_call``).
     """
 
     @jax.custom_jvp
@@ -228,14 +228,14 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
         closed, bare = traced or (jax.make_jaxpr(flat)(*leaves), 0)
         if traced is None and not is_holdable(closed.jaxpr):
             return jaxpr_as_fun(closed)(*leaves)
-        return _marked(closed, leaves, bare)
+        return _unit_call(closed, leaves, bare)
 
     def derivative(leaves, tangents):
         # What has no tangent stays a constant: its derivative is not worked out at all.
         moving = [k for k, d in enumerate(tangents) if not isinstance(d, SymbolicZero)]
 
-        def of_moving(whole, given):
-            whole = dict(enumerate(whole)) | dict(zip(moving, given, strict=True))
+        def of_moving(whole, values):
+            whole = dict(enumerate(whole)) | dict(zip(moving, values, strict=True))
             return flat(*whole.values())
 
         # A derivative of the coefficients takes twice as long to compile as one of the formulas.
@@ -244,27 +244,27 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
             value = marked(*leaves)
             return value, _of_units(of_moving, moving, leaves, tangents, value)
         if again or not linearised:
-            given = [leaves[k] for k in moving], [tangents[k] for k in moving]
-            return jax.jvp(lambda *x: of_moving(leaves, x), *given)
+            arguments = [leaves[k] for k in moving], [tangents[k] for k in moving]
+            return jax.jvp(lambda *x: of_moving(leaves, x), *arguments)
         # ``jax.linearize`` within the unit: values and coefficients leave it as results, and the
         # linear map alone is left outside, where JAX can transpose it.
         shape = []
 
-        def known(*leaves):
+        def value_and_coefficients(*leaves):
             value, linear_map = jax.linearize(
                 lambda *x: of_moving(leaves, x), *(leaves[k] for k in moving)
             )
-            kept, tree = jax.tree.flatten(linear_map)
+            coefficients, tree = jax.tree.flatten(linear_map)
             shape[:] = [tree, len(value)]
-            return [*value, *kept, jnp.zeros((), jnp.float32)]
+            return [*value, *coefficients, jnp.zeros((), jnp.float32)]
 
-        first = jax.make_jaxpr(known)(*leaves)
+        first = jax.make_jaxpr(value_and_coefficients)(*leaves)
         tree, count = shape
         bare = len(first.out_avals) - 1 - count
-        *found, zero = _unit(jaxpr_as_fun(first), False, (first, bare))(*leaves)
+        *results, zero = _unit(jaxpr_as_fun(first), False, (first, bare))(*leaves)
         # Not marked: transposed, it would carry operands that go unused.
-        linear_map = jax.tree.unflatten(tree, found[count:])
-        return found[:count], linear_map(*(_gated(zero, tangents[k]) for k in moving))
+        linear_map = jax.tree.unflatten(tree, results[count:])
+        return results[:count], linear_map(*(_on_condition(zero, tangents[k]) for k in moving))
 
     marked.defjvp(derivative, symbolic_zeros=True)
     return marked
@@ -277,8 +277,8 @@ def _of_units(of_moving: Callable, moving: Sequence[int], leaves, tangents, like
 
     def slope(leaves, changes):
         some = [leaves[k] for k in moving]
-        found = jax.jvp(lambda *x: of_moving(leaves, x), some, list(changes))[1]
-        return [found[k] for k in floats]
+        results = jax.jvp(lambda *x: of_moving(leaves, x), some, list(changes))[1]
+        return [results[k] for k in floats]
 
     def along(*both):
         return slope(both[:count], both[count:])
@@ -289,21 +289,21 @@ def _of_units(of_moving: Callable, moving: Sequence[int], leaves, tangents, like
         back = jax.linear_transpose(lambda *d: slope(leaves, d), *(leaves[k] for k in moving))
         return list(back(slopes))
 
-    def forward(given, changes):
-        return _unit(along, False, repeated=True)(*given, *changes)
+    def forward(constants, changes):
+        return _unit(along, False, repeated=True)(*constants, *changes)
 
-    def backward(given, slopes):
-        return _unit(against, False, repeated=True)(*given, *slopes)
+    def backward(constants, slopes):
+        return _unit(against, False, repeated=True)(*constants, *slopes)
 
     # Tangents and cotangents are a map and its transpose, each computed from the operands alone. It
     # costs the motion once more, and saves hundreds of coefficients that would be stored and read.
     changes = [tangents[k] for k in moving]
-    found = dict(zip(floats, linear(forward, backward, leaves, changes, list(floats.values()))))
+    by_place = dict(zip(floats, linear(forward, backward, leaves, changes, list(floats.values()))))
     none = {k: np.zeros(x.shape, jax.dtypes.float0) for k, x in enumerate(like) if k not in floats}
-    return [(found | none)[k] for k in range(len(like))]
+    return [(by_place | none)[k] for k in range(len(like))]
 
 
-def _gated(zero: jax.Array, tangent: jax.Array) -> jax.Array:
+def _on_condition(zero: jax.Array, tangent: jax.Array) -> jax.Array:
     """The tangent, needing ``zero``, which is 0."""
     if tangent.dtype == jax.dtypes.float0:
         return tangent
@@ -311,7 +311,7 @@ def _gated(zero: jax.Array, tangent: jax.Array) -> jax.Array:
     return jax.lax.select(sure, tangent, jnp.zeros_like(tangent))
 
 
-def _marked(closed: ClosedJaxpr, given: Sequence[Any], bare: int) -> list[jax.Array]:
+def _unit_call(closed: ClosedJaxpr, arguments: Sequence[Any], bare: int) -> list[jax.Array]:
     """The marked call of a traced function, all of whose operands are surely used.
 
     XLA ends the process over an operand of such a call that goes unused, and it folds away what a
@@ -320,12 +320,12 @@ def _marked(closed: ClosedJaxpr, given: Sequence[Any], bare: int) -> list[jax.Ar
     ``bare`` ones before the last are not: the choice would be one more copy of each, in a loop of
     its own. They are of use together with the last result only, which is.
     """
-    jaxpr, used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals))
-    needed = [jnp.asarray(x) for x, keep in zip(given, used, strict=True) if keep]
-    operands = [x for x in needed if x.size]
+    jaxpr, is_used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals))
+    arrays = [jnp.asarray(x) for x, keep in zip(arguments, is_used, strict=True) if keep]
+    operands = [x for x in arrays if x.size]
     if not operands:
-        return jaxpr_as_fun(closed)(*given)
-    empty = {k: (x.shape, x.dtype) for k, x in enumerate(needed) if not x.size}
+        return jaxpr_as_fun(closed)(*arguments)
+    empty = {k: (x.shape, x.dtype) for k, x in enumerate(arrays) if not x.size}
     # Behind a barrier, for XLA moves constants into what is called. Operands packed into one array
     # for each dtype were tried: they need the same condition and are copied, and the gradient of a
     # torqued body took 25 % longer to compile.
@@ -336,19 +336,21 @@ def _marked(closed: ClosedJaxpr, given: Sequence[Any], bare: int) -> list[jax.Ar
             every = list(operands)
             for k, (shape, dtype) in empty.items():
                 every.insert(k, jnp.zeros(shape, dtype))
-            found = jaxpr_as_fun(ClosedJaxpr(jaxpr, closed.consts))(*every)
+            results = jaxpr_as_fun(ClosedJaxpr(jaxpr, closed.consts))(*every)
             # one number of each operand is read, whatever XLA folds away of the program itself
             firsts = (x[(0,) * x.ndim].astype(bool) for x in operands)
             sure = reduce(jnp.logical_or, firsts, zeros[0] == 0)
             # through a division, which XLA does not repeat: asked again for each result, the
             # condition was a quarter of the program
             sure = jnp.where(sure, 1, 0) / (1 - zeros[1]) > 0
-            chosen = {*range(len(found) - 1 - bare), len(found) - 1}
+            conditional = {*range(len(results) - 1 - bare), len(results) - 1}
             other = {
-                k: jnp.broadcast_to(zeros[1].astype(found[k].dtype), found[k].shape) for k in chosen
+                k: jnp.broadcast_to(zeros[1].astype(results[k].dtype), results[k].shape)
+                for k in conditional
             }
             return [
-                jax.lax.select(sure, x, other[k]) if k in chosen else x for k, x in enumerate(found)
+                jax.lax.select(sure, x, other[k]) if k in conditional else x
+                for k, x in enumerate(results)
             ]
 
     shapes = tuple((x.shape, x.dtype) for x in closed.out_avals)
@@ -420,7 +422,7 @@ class _Static(NamedTuple):
     tree: Any
     sources: tuple[int | tuple[Any], ...]
 
-    def filled(self, arrays: list[Any]) -> Any:
+    def with_arrays(self, arrays: list[Any]) -> Any:
         leaves = (arrays[s] if isinstance(s, int) else s[0] for s in self.sources)
         return jax.tree.unflatten(self.tree, leaves)
 
@@ -471,14 +473,14 @@ def jit_distinct(fn: Callable) -> Callable:
 
     @functools.partial(jax.jit, static_argnums=0)
     def program(static: _Static, arrays: list[Any]):
-        args, kwargs = static.filled(arrays)
+        args, kwargs = static.with_arrays(arrays)
         static, results = _split(fn(*args, **kwargs))
         return _Constant(static), results
 
     @functools.wraps(fn)
     def call(*args, **kwargs):
         static, results = program(*_split((args, kwargs)))
-        return static.value.filled(results)
+        return static.value.with_arrays(results)
 
     call.program = program  # type: ignore[attr-defined]
     return call

@@ -42,13 +42,13 @@ class Pointing(AbstractTorque):
 
     def __init__(self, kp: ArrayLike, kd: ArrayLike, target: ArrayLike = (1.0, 0.0, 0.0, 0.0)):
         self.kp, self.kd = coefficients("Pointing kp", kp), coefficients("Pointing kd", kd)
-        wanted = as_float_array("Pointing target", target, (4,))
-        if is_concrete(wanted):
+        quaternion = as_float_array("Pointing target", target, (4,))
+        if is_concrete(quaternion):
             require(
-                np.any(np.asarray(wanted) != 0, axis=-1),
+                np.any(np.asarray(quaternion) != 0, axis=-1),
                 lambda: f"target must not be zero, got {target}.",
             )
-        self.target = rotation.normalise(wanted)
+        self.target = rotation.normalise(quaternion)
 
     def body_components(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
@@ -56,9 +56,9 @@ class Pointing(AbstractTorque):
         a, *b = (self.target[..., i] for i in range(4))
         w, *v = attitude.wxyz
         scalar = a * w + b[0] * v[0] + b[1] * v[1] + b[2] * v[2]
-        turned = cross(b, v)
+        b_cross_v = cross(b, v)
         sign = 2 * jnp.where(scalar < 0, -1, 1).astype(w.dtype)
-        error = (sign * (a * y - w * x - z) for x, y, z in zip(b, v, turned))
+        error = (sign * (a * y - w * x - z) for x, y, z in zip(b, v, b_cross_v))
         kp, kd = components(self.kp), components(self.kd)
         return triple(-p * e - d * rate for p, d, e, rate in zip(kp, kd, error, omega))
 
@@ -81,7 +81,7 @@ class RateDamping(AbstractTorque):
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> tuple[Array, Array, Array]:
         pairs = zip(components(self.c), omega, components(self.rates))
-        return triple(-c * (rate - wanted) for c, rate, wanted in pairs)
+        return triple(-c * (rate - target) for c, rate, target in pairs)
 
 
 _FIELD = Signature("MagneticDipole field", {"position": (3,), "t": ()}, (3,))
@@ -328,7 +328,7 @@ def wheel_cluster(
             np.linalg.matrix_rank(np.asarray(directions), tol=1e-6) == 3,
             f"wheel_cluster axes must be three or more that span space, got {axes}.",
         )
-    moments, speeds, wanted = (
+    moments, speeds, bias_speeds = (
         jnp.broadcast_to(as_float_array(f"wheel_cluster {name}", value), (n,))
         for name, value in (("inertia", inertia), ("speed", speed), ("bias", bias))
     )
@@ -342,7 +342,7 @@ def wheel_cluster(
     rotors = []
     for i in range(n):
         null = gain * projector[i] * moments
-        motor: Any = _ClusterMotor(law, inverse[i], null, wanted, first, limit)
+        motor: Any = _ClusterMotor(law, inverse[i], null, bias_speeds, first, limit)
         coupling = motor if friction is None else motor + friction
         rotors.append(Rotor(directions[i], inertia=moments[i], speed=speeds[i], coupling=coupling))
     return RotorSum(tuple(rotors))

@@ -429,8 +429,8 @@ class LVLH(AbstractPart):
                 "LVLH takes an orbit (ph.KeplerOrbit) or a function of time, got"
                 f" {type(orbit).__name__}: a frame at rest needs none."
             )
-        found: Any = vector_of_time("LVLH", orbit)
-        self.orbit = found
+        function: Any = vector_of_time("LVLH", orbit)
+        self.orbit = function
 
     def axes(self, t: Array) -> tuple[Float[Array, "*b 3"], ...]:
         """Unit vectors x, y, z of the frame in space, and its rates [rad/s] along them."""

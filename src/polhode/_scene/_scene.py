@@ -283,16 +283,16 @@ class Scene(eqx.Module):
         state = (tuple(momentum[..., i] for i in range(3)), tuple(wxyz[..., i] for i in range(4)))
         dynamics = self.dynamics
         spins = dynamics.wheels.spins if dynamics.coupled else ()
-        push, _, *moved = lie_poisson_field(t, (*state, spins) if spins else state, dynamics)
+        push, _, *more = lie_poisson_field(t, (*state, spins) if spins else state, dynamics)
         rate = jnp.stack(jnp.broadcast_arrays(*push), axis=-1)
-        turned = tuple(moved[0]) if spins else ()
+        spin_rates = tuple(more[0]) if spins else ()
 
         def carried(t, spins):
             return self.with_spins(spins).wheel_momentum(t)
 
         if self.rotors is not None:  # what the wheels take up does not turn the body
-            _, taken = jax.jvp(carried, (t, spins), (jnp.ones_like(t), turned))
-            rate = rate - jnp.broadcast_to(taken, rate.shape)
+            _, gained = jax.jvp(carried, (t, spins), (jnp.ones_like(t), spin_rates))
+            rate = rate - jnp.broadcast_to(gained, rate.shape)
         if isinstance(self.inertia, VariableInertia):  # I domega/dt = dL/dt - (dI/dt) omega
 
             def carried_momentum(t):
@@ -300,7 +300,7 @@ class Scene(eqx.Module):
 
             _, change = jax.jvp(carried_momentum, (t,), (jnp.ones_like(t),))
             rate = rate - change
-        return self.carrier_at(t).rates(rate), turned
+        return self.carrier_at(t).rates(rate), spin_rates
 
     @property
     def dynamics(self) -> Dynamics:
@@ -430,16 +430,16 @@ def narrower(part: Any) -> Any:
 
 def constructors(scene: Scene, special: Scene) -> list[str]:
     """The names of the constructors by which ``special`` is narrower than ``scene``."""
-    found = []
+    names = []
     if scene.inertia.symmetry is not special.inertia.symmetry:
-        found.append(f"ph.Inertia.{special.inertia.symmetry.name.lower()}")
+        names.append(f"ph.Inertia.{special.inertia.symmetry.name.lower()}")
     elif scene.inertia.is_principal is not special.inertia.is_principal:
-        found.append("ph.Inertia.from_moments")
+        names.append("ph.Inertia.from_moments")
     if _count(scene.potential, _is_axial_weight) < _count(special.potential, _is_axial_weight):
-        found.append("ph.UniformGravity.axial")
+        names.append("ph.UniformGravity.axial")
     if _count(scene.rotors, _is_axial_wheel) < _count(special.rotors, _is_axial_wheel):
-        found.append("ph.Rotor.axial")
-    return found
+        names.append("ph.Rotor.axial")
+    return names
 
 
 def _is_axial_weight(part: Any) -> bool:

@@ -74,8 +74,8 @@ class TorqueSum(AbstractTorque, AbstractSum):
 
     @property
     def edges(self):
-        found = [x for term in self.terms if (x := term.edges) is not None]
-        return jnp.concatenate(found) if found else None
+        parts = [x for term in self.terms if (x := term.edges) is not None]
+        return jnp.concatenate(parts) if parts else None
 
     def during(self, t):
         return TorqueSum(tuple(term.during(t) for term in self.terms))
@@ -218,8 +218,8 @@ class FeedbackTorque(AbstractTorque):
     def body_components(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> tuple[Array, Array, Array]:
-        given = t, stacked(attitude.wxyz), stacked(omega)
-        return components(_FEEDBACK.mapped(self.fn, *given))
+        arguments = t, stacked(attitude.wxyz), stacked(omega)
+        return components(_FEEDBACK.mapped(self.fn, *arguments))
 
 
 # Dissipation inside a body that conserves its angular momentum: the energy sink.

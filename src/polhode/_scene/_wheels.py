@@ -77,8 +77,8 @@ class CouplingSum(AbstractCoupling, AbstractSum):
         return sum(rest, start=first)
 
     def torque_among(self, t, i, speed_of, attitude, omega):
-        given = t, i, speed_of, attitude, omega
-        first, *rest = (term.torque_among(*given) for term in self.terms)
+        arguments = t, i, speed_of, attitude, omega
+        first, *rest = (term.torque_among(*arguments) for term in self.terms)
         return sum(rest, start=first)
 
 
@@ -163,8 +163,8 @@ class AbstractRotor(AbstractPart):
                 continue
             axis = wheel.direction
             with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
-                turned = inertia.momentum(axis)
-                about = jnp.sum(jnp.broadcast_to(axis, turned.shape) * turned, axis=-1)
+                momentum = inertia.momentum(axis)
+                about = jnp.sum(jnp.broadcast_to(axis, momentum.shape) * momentum, axis=-1)
             require(
                 np.asarray(wheel.inertia) < np.asarray(about),
                 f"a rotor's inertia ({wheel.inertia} kg m^2) must be less than the body's about the"
@@ -303,8 +303,8 @@ class Wheels(AbstractRotor):
     def speed(self, i: int, t: Array | float, omega: Sequence[Array]) -> Array:
         """Speed of wheel i relative to the body [rad/s]; NaN where its inertia is not known."""
         inertia, momentum = self.inertia[..., i], self.axial_momentum(i, t)
-        known = inertia > 0
-        own = jnp.where(known, momentum / jnp.where(known, inertia, 1), jnp.nan)
+        is_known = inertia > 0
+        own = jnp.where(is_known, momentum / jnp.where(is_known, inertia, 1), jnp.nan)
         if self.held[i]:
             return own
         return own - dot(tuple(self.axes[..., i, k] for k in range(3)), omega)
@@ -313,18 +313,18 @@ class Wheels(AbstractRotor):
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> list[Array]:
         """Torque [N m] on each wheel about its axis from the body; zero where it is held."""
-        found, couplings = [], iter(() if self.couplings is None else self.couplings.terms)
+        torques, couplings = [], iter(() if self.couplings is None else self.couplings.terms)
         for i, held in enumerate(self.held):
             if i in self.coupled:
                 speed_of = partial(self.speed, t=t, omega=omega)
-                found.append(next(couplings).torque_among(t, i, speed_of, attitude, omega))
+                torques.append(next(couplings).torque_among(t, i, speed_of, attitude, omega))
             elif held:
-                found.append(jnp.zeros_like(omega[0]))
+                torques.append(jnp.zeros_like(omega[0]))
             else:
                 t = jnp.asarray(t, self.momentum.dtype)
                 change = partial(self.axial_momentum, i)
-                found.append(jax.jvp(change, (t,), (jnp.ones_like(t),))[1])
-        return found
+                torques.append(jax.jvp(change, (t,), (jnp.ones_like(t),))[1])
+        return torques
 
     def motor_power(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
@@ -379,8 +379,8 @@ class Wheels(AbstractRotor):
             axial = all(k == 2 for k in along)
             symmetric = axial and inertia.symmetry is not Symmetry.NONE
             kind = Symmetry.AXISYMMETRIC if symmetric else Symmetry.NONE
-            left = jnp.subtract(*jnp.broadcast_arrays(inertia.moments, less))
-            return Inertia.of_symmetry(left, kind, physical=False)
+            moments = jnp.subtract(*jnp.broadcast_arrays(inertia.moments, less))
+            return Inertia.of_symmetry(moments, kind, physical=False)
         tensor = inertia.tensor
         for i in loose:
             axis = self.axes[..., i, :]
@@ -476,8 +476,8 @@ class Rotor(AbstractRotor):
             )
         if impulse is not None:
             impulse = IMPULSE.checked(impulse)
-        given = {"inertia": inertia, "momentum": momentum, "speed": speed, "torque": torque}
-        for name, value in given.items():
+        numbers = {"inertia": inertia, "momentum": momentum, "speed": speed, "torque": torque}
+        for name, value in numbers.items():
             setattr(self, name, None if value is None else as_number(name, value))
         self.impulse = impulse
         if inertia is None and (speed is not None or not self.is_held):

@@ -79,8 +79,8 @@ def _ordered(diagonal, q):
         p, s = (r + 1) % 3, (r + 2) % 3
         first, second = min(p, s), max(p, s)
         exchange = diagonal[first] > diagonal[second]
-        turned = _turn(q, r, half, half)
-        q = tuple(jnp.where(exchange, new, old) for new, old in zip(turned, q, strict=True))
+        rotated = _turn(q, r, half, half)
+        q = tuple(jnp.where(exchange, new, old) for new, old in zip(rotated, q, strict=True))
         values = list(diagonal)
         values[first] = jnp.minimum(diagonal[first], diagonal[second])
         values[second] = jnp.maximum(diagonal[first], diagonal[second])
@@ -350,20 +350,22 @@ def require_below(small_name: str, small: Array, large_name: str, large: Array) 
         )
 
 
-def check_moments(name: str, seen: np.ndarray, slack: float, least: float = 0.0) -> None:
+def check_moments(name: str, moments: np.ndarray, slack: float, least: float = 0.0) -> None:
     """ValueError unless rows of principal moments are positive and obey the triangle inequality.
 
     ``slack`` is the relative tolerance of the inequality (flat bodies), ``least`` the fraction of
     the largest moment that counts as zero.
     """
-    if seen.size == 0:
+    if moments.size == 0:
         return
-    columns = tuple(seen[..., i] for i in range(seen.shape[-1]))  # NumPy reduces long axes faster
+    columns = tuple(
+        moments[..., i] for i in range(moments.shape[-1])
+    )  # NumPy reduces long axes faster
     largest, smallest = reduce(np.maximum, columns), reduce(np.minimum, columns)
     require(
         smallest > least * largest,
         lambda: (
-            f"{name} must be positive (kg m^2), got {_worst(seen, smallest)}; a moment is zero"
+            f"{name} must be positive (kg m^2), got {_worst(moments, smallest)}; a moment is zero"
             " only for a point or a thin line, which cannot turn about itself: give it a width."
         ),
     )
@@ -372,9 +374,9 @@ def check_moments(name: str, seen: np.ndarray, slack: float, least: float = 0.0)
         excess <= slack,
         lambda: (
             f"{name} must satisfy the triangle inequality (each at most the sum of the two"
-            f" others), got {_worst(seen, -excess)}; check the units, and that these are moments of"
-            " inertia, not second moments or a gyration tensor. Published numbers that no body has"
-            " pass with Inertia.from_moments(..., physical=False)."
+            f" others), got {_worst(moments, -excess)}; check the units, and that these are moments"
+            " of inertia, not second moments or a gyration tensor. Published numbers that no body"
+            " has pass with Inertia.from_moments(..., physical=False)."
         ),
     )
 
@@ -386,23 +388,23 @@ def check_tensor(name: str, array: Array, *, triangle: bool = True) -> None:
     """
     if not is_concrete(array) or array.size == 0:
         return
-    seen = np.asarray(array, np.float64)
-    mirrored = np.swapaxes(seen, -1, -2)
-    skew = np.abs(seen - mirrored)
+    entries = np.asarray(array, np.float64)
+    mirrored = np.swapaxes(entries, -1, -2)
+    skew = np.abs(entries - mirrored)
     require(
-        skew <= tolerance(array) * np.abs(seen).max(axis=(-2, -1), keepdims=True),
+        skew <= tolerance(array) * np.abs(entries).max(axis=(-2, -1), keepdims=True),
         f"{name} must be symmetric, got entries that differ by up to {skew.max():g} from their "
         "transposed ones; pass (A + A.T) / 2 if that is what is meant.",
     )
     # moments within the rounding of the largest cannot be told from zero
     least = 64 * float(jnp.finfo(array.dtype).eps)
-    moments = np.linalg.eigvalsh((seen + mirrored) / 2)
+    moments = np.linalg.eigvalsh((entries + mirrored) / 2)
     slack = tolerance(array) if triangle else np.inf
     check_moments(f"the principal moments of {name}", moments, slack, least)
 
 
-def _worst(seen: np.ndarray, badness: np.ndarray | np.floating) -> str:
-    return np.array2string(seen.reshape(-1, seen.shape[-1])[int(np.argmin(badness))])
+def _worst(values: np.ndarray, badness: np.ndarray | np.floating) -> str:
+    return np.array2string(values.reshape(-1, values.shape[-1])[int(np.argmin(badness))])
 
 
 def check_points(masses: Array, positions: Array) -> None:
