@@ -1,8 +1,8 @@
-"""Derivatives that JAX has no rule for.
+"""Derivative rules that JAX does not have.
 
-Two primitives: a linear map that is computed by one program and transposed by another, such as
-``spread``; and values computed by other means, with the derivatives of what they are. Values whose
-derivatives are not known. Functions that are smooth although they compare.
+Two primitives: a linear map that one program computes and another transposes, such as ``spread``;
+and values with a rule for their derivatives, whatever computed them. Also values without known
+derivatives, which become NaN, and functions that are smooth although they contain comparisons.
 """
 
 import functools
@@ -93,12 +93,12 @@ def _jvp(arrays, tangents, *, count, **params):
 
 
 def is_slope(x: Any) -> bool:
-    """Whether a tangent is there at all."""
+    """Whether a tangent is present: neither a symbolic zero nor that of an integer."""
     return not isinstance(x, ad.Zero) and x.dtype != jax.dtypes.float0
 
 
 def zeros(x: Any) -> Any:
-    """What a tangent that is not there stands for."""
+    """The zeros that a symbolic zero stands for."""
     return jnp.zeros(x.aval.shape, x.aval.dtype)
 
 
@@ -147,8 +147,8 @@ mlir.register_lowering(_linear_p, mlir.lower_fun(_lowered, multiple_results=True
 def spread(values: Any, axis: int, count: int) -> Any:
     """Every array of a tree ``count`` times along a new axis.
 
-    As a broadcast, but that cotangents are summed in a loop, which a unit can hold: XLA hands the
-    sum of a large array to a library.
+    Unlike in a broadcast, cotangents are summed in a loop, which a unit can contain; XLA computes
+    the sum of a large array by a library call, which it cannot.
     """
     leaves, tree = jax.tree.flatten(values)
     moving = {k: x for k, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.inexact)}
@@ -188,7 +188,7 @@ Rule = Callable[[Sequence[Any], Sequence[Any], Sequence[Any]], Sequence[Any]]
 
 
 def attached(rule: Rule, operands: Sequence[Any], values: Sequence[Any]) -> list[Any]:
-    """``values``, a function of ``operands`` found by other means, with its derivatives.
+    """``values``, a function of ``operands`` computed elsewhere, with its derivatives.
 
     ``rule(operands, tangents, values)``: the tangents of the values; those of operands may be
     absent (``is_slope``). It may not close over traced values. Derivatives of the rule see the

@@ -1,10 +1,10 @@
-"""A traced function with everything done beforehand that does not depend on the state.
+"""Partial evaluation of a traced function: what does not depend on the state is computed once.
 
-What automatic differentiation writes down holds sums with zero, products with one and products of
-parameters, all of which would be worked out again in every evaluation and, as XLA gives every
-output array its own loop, for every component. Here they are folded into few coefficients before
-the loop, and values that several results share are staged. The result differs from the plain
-function by rounding (products are reassociated).
+A program made by automatic differentiation contains sums with zero, products with one and products
+of parameters. They would be evaluated again in every call and, since XLA gives each output array a
+loop of its own, for every component. Here they are folded into few coefficients before the loop,
+and values that several results share are staged. The result differs from that of the original
+function by rounding, because products are reassociated.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,10 +25,10 @@ from polhode import _policy
 
 
 def opaque_ones(x: Array) -> Array:
-    """Ones of the shape of x that XLA cannot know to be ones, but LLVM after it does.
+    """Ones of the shape of x that XLA does not recognise as ones, but LLVM does.
 
-    Half of a truth value, rounded down, is zero: XLA does not look at the bits of a number. So it
-    stages what is divided by them, and LLVM drops the division.
+    A truth value shifted right by one bit is zero, which XLA does not simplify. It therefore keeps
+    divisions by these ones, and does not repeat them; LLVM, which runs later, removes the division.
     """
     if not _policy.is_staged():
         return jnp.ones_like(x)
@@ -39,10 +39,10 @@ def opaque_ones(x: Array) -> Array:
 def staged(values: Any, *ones: Array) -> Any:
     """The same values, each divided by the ``ones`` of its own shape.
 
-    The compiler repeats cheap arithmetic in every fused loop that needs its result, but never a
-    division; it drops optimisation barriers before fusing on the CPU. A division by a broadcast
-    scalar would be a multiplication to it: of arrays of one body too, the ones need every axis.
-    Conditions are staged as numbers. What else is no float stays as it is.
+    XLA repeats cheap arithmetic in every fused loop that needs its result, but never a division;
+    optimisation barriers do not help, since it removes them before it fuses on the CPU. The ones
+    must have every axis of the value, also for one body: a division by a broadcast scalar becomes
+    a multiplication. Conditions are staged as numbers; integers are returned unchanged.
     """
 
     if not _policy.is_staged():
@@ -60,8 +60,10 @@ def staged(values: Any, *ones: Array) -> Any:
 
 
 def computed_once(values: Any) -> Any:
-    """The same values behind an optimisation barrier: they are computed once, and not anew for
-    each result that follows from them, where XLA has not yet fused the computation."""
+    """The same values behind an optimisation barrier, before which XLA does not repeat arithmetic.
+
+    It works for passes that come before fusion; see ``staged`` for those that come after.
+    """
     return jax.lax.optimization_barrier(values) if _policy.is_staged() else values
 
 
@@ -146,10 +148,10 @@ class _Step(NamedTuple):
 def specialise(
     closed: ClosedJaxpr, known: Sequence[Any], *, fold: bool = True, stage: bool = True
 ) -> Specialised:
-    """Takes the part of ``closed`` that needs only its first arguments, ``known``, out of it.
+    """Compute the part of ``closed`` that depends on its first arguments, ``known``, alone.
 
-    Without ``fold`` these arguments are only taken apart: no arithmetic is done beforehand. Without
-    ``stage`` the rest is not divided into stages: for a program that is to be specialised again.
+    Without ``fold`` these arguments are only sliced and reshaped, without arithmetic. Without
+    ``stage`` no values are staged: for a program that will be specialised again.
     """
     if _policy.is_plain():
         shapes = tuple(frozenset([jnp.shape(x)]) for x in known)
@@ -203,7 +205,7 @@ def specialise(
 
 
 def _steps_of_results(steps: list[_Step], out) -> tuple[_Step, ...]:
-    """The steps that the results rest on."""
+    """The steps that the results depend on."""
     values = {x for x, *_ in out if not isinstance(x, _Held)}
     needed_steps = []
     for step in reversed(steps):
@@ -214,7 +216,7 @@ def _steps_of_results(steps: list[_Step], out) -> tuple[_Step, ...]:
 
 
 def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
-    """Values that several results rest on and that are long enough to be worked out once."""
+    """Values that several results depend on and that take enough operations to be staged."""
     # XLA fuses per result: a value is repeated for each result that it leads to, not for each of
     # its users. So both are counted, and the work that staging would save is the number of
     # operations between a value and the nearest staged ones before it (``behind``).
@@ -245,7 +247,7 @@ def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
 
 
 class _Work:
-    """Goes through a jaxpr once: computes what is known, notes down what is not."""
+    """One pass over a jaxpr: computes what is known, and records the other operations."""
 
     def __init__(self, fold: bool):
         self.fold = fold
@@ -260,10 +262,10 @@ class _Work:
         return _Slot(self.count - 1, aval)
 
     def once(self, key, inputs, outs, make: Callable[[], list[Any]]) -> list[Any]:
-        """What ``make`` returns; the same again for the same operation on the same inputs.
+        """The result of ``make``, cached by operation and inputs (common subexpressions).
 
-        ``key``: of the operation; None where it is not known to be the same as another. Parts of a
-        scene that rest on the same arrays, such as one orbit, are so worked out once.
+        ``key``: of the operation; None where it cannot be compared with others. Parts of a scene
+        that share arrays, such as one orbit, are therefore evaluated once.
         """
         if key is None:
             return make()
@@ -363,7 +365,7 @@ class _Work:
         return [_Held(x) for x in (results if isinstance(results, list | tuple) else [results])]
 
     def simplified(self, name, operands, aval) -> _Held | _Slot | None:
-        """What becomes of an operation with a known zero or factor; None where nothing does."""
+        """An operation with a known zero or factor, simplified; None where it is not."""
         if not jnp.issubdtype(aval.dtype, jnp.inexact):
             return None
         if any(isinstance(x, _Slot) and x.aval.shape != aval.shape for x in operands):
@@ -463,7 +465,7 @@ def _key_of(x: _Held) -> Any:
 
 
 def _operation(eqn) -> Any:
-    """What tells an operation from others, but for its operands; None where nothing does."""
+    """A key by which operations without effects compare equal, operands aside; else None."""
     key = (eqn.primitive.name, *sorted(eqn.params.items()))
     try:
         hash(key)

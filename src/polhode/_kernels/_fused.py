@@ -37,29 +37,29 @@ _HOLDABLE = frozenset(
      shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stop_gradient sub
      tan tanh transpose unit unstack while xor""".split()  # noqa: SIM905
 )
-"""Operations that a single compiled unit may hold; anything else keeps the usual way."""
+"""Operations that a unit may contain; functions with others are compiled as usual."""
 
 _ANALYSING = ContextVar("analysing", default=False)
-"""Set while a unit is looked through: the units inside it then show what they are made of."""
+"""Set while a function is traced for analysis: units inside it are then traced as plain code."""
 
 
 def kernel(
     fn: Callable, *, linearised: bool = False, repeated: bool = False, of_units: bool = False
 ) -> Callable:
-    """``fn`` compiled by XLA's CPU backend as one function instead of one task per array.
+    """``fn`` compiled by XLA's CPU backend as one function (a unit) instead of one task per array.
 
-    A step is made of many short loops over the bodies. As separate tasks each costs a dispatch,
-    and fusion across them repeats the work of one in the next; and a function for each takes
-    longer to compile than one for all. The mark keeps the call and asks for a single function; it
-    is a hint that changes no value. It is given on the CPU only and to plain arithmetic only.
+    A step consists of many short loops over the bodies. As separate tasks each costs a dispatch,
+    fusion repeats the work of one in the next, and many functions take longer to compile than one.
+    An attribute of the call requests a single function. It is a hint that changes no value, set on
+    the CPU only and for plain arithmetic only.
 
-    Derivatives are those of ``fn``, unmarked; with ``linearised`` the value and all coefficients of
-    its derivative are a unit again, and only the linear map that is left is not. That suits
-    functions without loops of unknown length. With ``repeated`` tangents are a unit and cotangents
-    another, each of which works everything out again: nothing is kept in between but the operands,
-    and where coefficients would be hundreds that is several times as fast, to compile too. Sums
-    over many bodies or times are to be written as ``spread``. With ``of_units`` what ``fn`` marks
-    itself stays marked, within the whole and in its derivatives.
+    Derivatives are those of ``fn``, without units. With ``linearised`` the value and the
+    coefficients of its derivative are a unit, and only the remaining linear map is not; this suits
+    functions without loops of unknown length. With ``repeated`` tangents are one unit and
+    cotangents another, each of which evaluates the function again: only the operands are stored,
+    which is several times as fast, also to compile, where there would be hundreds of coefficients.
+    Sums over many bodies or times are then written as ``spread``. With ``of_units`` the units
+    inside ``fn`` stay units, within the whole and in its derivatives.
     """
 
     def call(*operands):
@@ -87,7 +87,7 @@ def kernel(
 
 
 def formula(fn: Callable, *operands: Any) -> ClosedJaxpr:
-    """``fn`` traced; units inside it show what they are made of."""
+    """``fn`` traced, with the operations of units inside it in the open."""
     analysing = _ANALYSING.set(True)
     try:
         return jax.make_jaxpr(fn)(*operands)
@@ -99,8 +99,8 @@ def formula(fn: Callable, *operands: Any) -> ClosedJaxpr:
 def any_of(these: jax.Array) -> jax.Array:
     """Whether any of these is not zero, under ``vmap`` any of the whole batch.
 
-    A loop with such a condition goes on for all. With one of each, JAX would keep what has ended by
-    copying everything that the loop carries, in every turn.
+    A loop with this condition continues for the whole batch. With a condition for each body JAX
+    would select between old and new values of the whole carry in every iteration.
     """
     return jnp.sum(jnp.where(these != 0, 1, 0)) > 0
 
@@ -115,14 +115,15 @@ def _any_of_all(size, batched, these):
 def put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
     """``rows`` (S, C) with ``values`` (n, C) at ``places`` (n,) in S, the last of equal ones.
 
-    One after another on the CPU, where a unit cannot hold a scatter. Not for reverse mode.
+    On the CPU the rows are written one after another, as a unit cannot contain a scatter. It has
+    no reverse-mode derivative.
     """
     return _put_each(rows, places, values)
 
 
 @put.defjvp
 def _put_jvp(primals, tangents):
-    """Of its own, for the one that JAX makes of the rule for batches mixes up what is batched."""
+    """An explicit rule, as the one that JAX derives from the batching rule confuses batch axes."""
     (rows, places, values), (rows_, _, values_) = primals, tangents
     return put(rows, places, values), put(rows_, places, values_)
 
@@ -161,9 +162,10 @@ def _flat(x: jax.Array) -> jax.Array:
 
 
 def _with_constants_as_operands(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
-    """The same program with what it closes over as its first operands, and these: they may be
-    differentiated. Few known numbers, such as the table of a rule, stay in it: as operands they
-    would be carried through every loop."""
+    """The program with its closed-over values as first operands, which may be differentiated.
+
+    Small constant arrays, such as the table of a rule, stay inside: as operands they would be
+    carried through every loop. Returns the program and these operands."""
     jaxpr, own = closed.jaxpr, list(zip(closed.jaxpr.constvars, closed.consts, strict=True))
     tables = [
         (v, x) for v, x in own if not isinstance(x, Tracer) and np.size(x) <= _policy.KERNEL_TABLE
@@ -180,7 +182,7 @@ def _with_constants_as_operands(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[
 
 
 def _is_of_use() -> bool:
-    """On the CPU, and not where XLA may divide arrays among devices: a unit cannot be divided."""
+    """Whether on the CPU, and XLA does not partition arrays: a unit cannot be partitioned."""
     if not _policy.is_fused():
         return False
     # Within ``jax.shard_map`` each device has a program of its own, which XLA no longer divides.
@@ -204,8 +206,9 @@ def is_holdable(jaxpr: Any) -> bool:
 
 
 def _is_wide(equation) -> bool:
-    """Whether it sums or compares so many floats that XLA hands them to a library, which it cannot
-    do within a unit: from 4096 on, measured with jaxlib 0.10."""
+    """Whether it reduces so many floats that XLA calls a library, which a unit cannot contain.
+
+    From 4096 on, measured with jaxlib 0.10."""
     if not equation.primitive.name.startswith("reduce_"):
         return False
     operand = equation.invars[0].aval
@@ -271,7 +274,7 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
 
 
 def _of_units(of_moving: Callable, moving: Sequence[int], leaves, tangents, like) -> list[Any]:
-    """The tangents of ``of_moving(leaves, those that move)``: a unit, and its transpose another."""
+    """Tangents of ``of_moving``: one unit for the linear map and another for its transpose."""
     count = len(leaves)
     floats = {k: x for k, x in enumerate(like) if jnp.issubdtype(x.dtype, jnp.inexact)}
 
@@ -304,7 +307,7 @@ def _of_units(of_moving: Callable, moving: Sequence[int], leaves, tangents, like
 
 
 def _on_condition(zero: jax.Array, tangent: jax.Array) -> jax.Array:
-    """The tangent, needing ``zero``, which is 0."""
+    """The tangent, selected on the condition that ``zero`` is 0, which it always is."""
     if tangent.dtype == jax.dtypes.float0:
         return tangent
     sure = jnp.broadcast_to(zero == 0, tangent.shape)
@@ -312,13 +315,13 @@ def _on_condition(zero: jax.Array, tangent: jax.Array) -> jax.Array:
 
 
 def _unit_call(closed: ClosedJaxpr, arguments: Sequence[Any], bare: int) -> list[jax.Array]:
-    """The marked call of a traced function, all of whose operands are surely used.
+    """The call of a unit, in which every operand is certainly used.
 
-    XLA ends the process over an operand of such a call that goes unused, and it folds away what a
-    program merely seems to use. One operand more is therefore two zeros that XLA cannot know: every
-    result is taken on the condition that the first is zero or a number of any operand is not. The
-    ``bare`` ones before the last are not: the choice would be one more copy of each, in a loop of
-    its own. They are of use together with the last result only, which is.
+    XLA ends the process if an operand of such a call is unused, and it removes uses that it can
+    simplify. An additional operand therefore holds two zeros that XLA cannot know: every result is
+    selected on the condition that the first one is zero or any operand begins with another number.
+    The ``bare`` results before the last are exempt, since the selection would copy each of them in
+    a loop of its own; they are used only together with the last result, which is selected.
     """
     jaxpr, is_used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals))
     arrays = [jnp.asarray(x) for x, keep in zip(arguments, is_used, strict=True) if keep]
