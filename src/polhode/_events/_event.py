@@ -99,16 +99,9 @@ class Event(eqx.Module):
 
         values = [jnp.zeros_like(approximate._t), *approximate._samples]
         operands = [*map(jnp.asarray, closed.consts), *leaves]
-        delay, wxyz, omega, *spins = attached(rule, operands, values)
-        there = Trajectory(
-            approximate._t + delay,
-            wxyz,
-            omega,
-            approximate.status,
-            approximate.steps,
-            approximate.scene,
-            spins=spins[0] if spins else None,
-            propagator=approximate.propagator,
+        delay, *states = attached(rule, operands, values)
+        there = approximate._with_samples(
+            approximate._t + delay, states, approximate.status, approximate.steps, None
         )
         return delay, there
 

@@ -177,17 +177,8 @@ def shortly_after(trajectory: Trajectory, late: Array) -> Trajectory:
     """Samples so little later, by ``late`` (..., T) [s], that three terms of their Taylor series
     lead there: of what is no later but for its derivatives, values and two derivatives."""
     states = _along(trajectory._scene, trajectory._samples, trajectory._t, late[..., None])
-    wxyz, omega, *spins = states
-    return Trajectory(
-        trajectory._t + late,
-        wxyz,
-        omega,
-        trajectory.status,
-        trajectory.steps,
-        trajectory.scene,
-        spins=spins[0] if spins else None,
-        propagator=trajectory.propagator,
-    )
+    t = trajectory
+    return t._with_samples(t._t + late, states, t.status, t.steps, None)
 
 
 def _along(scene: Scene, samples: list[Array], t: Array, step: Array) -> list[Array]:
