@@ -346,8 +346,8 @@ MUTANTS = (
     ),
     Mutant(
         FOUND,
-        "change = jnp.where(search.hit, -value(part) / slope, 0)",
-        "change = jnp.where(search.hit, value(part) / slope, 0)",
+        "change = jnp.where(hit, -value(part) / slope, 0)",
+        "change = jnp.where(hit, value(part) / slope, 0)",
         "derivatives by the place of a switch have the wrong sign",
         ("solvers/test_switches.py::test_a_gradient_through_a_jump",),
     ),
