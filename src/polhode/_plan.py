@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 from polhode import _policy
@@ -317,7 +318,7 @@ def _decay(scene: Scene, state: State, ts: Array) -> np.ndarray:
             for k in range(size)
         ]
         jacobian = jnp.stack(columns, axis=-1)
-        if isinstance(jacobian, jax.core.Tracer):  # a function of the scene closes over one
+        if isinstance(jacobian, Tracer):  # a function of the scene closes over one
             return np.zeros(batch)
         jacobian = np.asarray(jacobian, float)
         sound = np.where(np.isfinite(jacobian), jacobian, 0)
