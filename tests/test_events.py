@@ -375,7 +375,7 @@ def test_a_batch_on_two_devices_stops_as_on_one():
 
 
 def test_what_is_never_met_is_given_up(monkeypatch):
-    monkeypatch.setattr("polhode._events._until._MAX_WINDOWS", 10)
+    monkeypatch.setattr("polhode._events._simulation._MAX_WINDOWS", 10)
     never = ph.Event(lambda wxyz, omega_body, t: omega_body[1] - 3.5)
     with pytest.raises(ph.SimulationError, match="steps"):
         ph.simulate(BALL, STATE, [0.0, 1e6], until=never)

@@ -40,7 +40,7 @@ def test_a_light_curve_search_shows_its_progress(tmp_path, monkeypatch, terminal
     monkeypatch.chdir(tmp_path)
     rows = "".join(f"{k / 10},{10 + k % 3}\n" for k in range(20))
     Path("light.csv").write_text("jd,mag\n" + rows)
-    monkeypatch.setattr(_command, "fitted", lambda *_, say, **__: say("a table"))
+    monkeypatch.setattr(_command, "fit_file", lambda *_, say, **__: say("a table"))
     assert main(["lightcurve", "light.csv", "--trials", "1000"]) == 0
     assert "searching 20 points with 1,000 trials" in terminal.getvalue()
     assert capsys.readouterr().out == "a table\n"
