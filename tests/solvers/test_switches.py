@@ -258,6 +258,16 @@ def test_a_torque_that_points_along_an_orbit():
     np.testing.assert_allclose(omega, 0, atol=1e-9)
 
 
+@pytest.mark.parametrize("start", [-690.2, 1e4])
+def test_switches_at_times_far_from_zero(start):
+    """Where a margin of the time is exactly zero between two representable times."""
+    torque = ph.Pulses(ph.BodyTorque([0.0, 0, 1]), [start + 0.3], [start + 100])
+    limited = ph.FeedbackTorque(lambda t, wxyz, omega: -1e-9 * jnp.maximum(omega, 0))
+    scene = ph.Scene(ph.Inertia.spherical(1.0), None, torque + limited)
+    found = ph.simulate(scene, ph.State(WXYZ, [0.0, 0, 1]), [start, start + 0.8], rtol=1e-10)
+    np.testing.assert_allclose(found.omega_body[-1, 2], 1.5, atol=2e-9)
+
+
 def test_switches_that_change_the_sides_of_others():
     """The first one flips the arguments of two more, which together leave the torque constant."""
 

@@ -26,8 +26,11 @@ error with 1 as with 1e-4, which takes a tenth more time."""
 _TRIES = 2
 """Evaluations below the root after which the upper end of the bracket is checked."""
 
-_EVALUATIONS = 60
+_EVALUATIONS = 80
 """Most evaluations of the margins in the search for one switch."""
+
+_SECANTS = 24
+"""Evaluations in the search from which brackets are halved: 56 times, to rounding."""
 
 
 class SwitchPoint(NamedTuple):
@@ -101,11 +104,9 @@ def first_switch(
     mode = jnp.where(dips, MINIMUM, bracket)
     end = sampled[-1]
     zero = jnp.zeros_like(attempt.h)
-    tolerance = (
-        4
-        * eps
-        * jnp.maximum(1, progress.elapsed / jnp.where(attempt.h != 0, jnp.abs(attempt.h), 1))
-    )
+    # of times far from zero the rounding: margins of the time are constant in between
+    moment = jnp.maximum(progress.elapsed, jnp.abs(t))
+    tolerance = 4 * eps * jnp.maximum(1, moment / jnp.where(zero != attempt.h, abs(attempt.h), 1))
     if not motion.events:  # an event is located to rounding, a change of the rates is not
         located = LOCATED_JUMP if motion.jumps else LOCATED_KINK
         tolerance = jnp.maximum(tolerance, located * options.rtol.astype(tolerance.dtype))
@@ -124,7 +125,9 @@ def first_switch(
 
     def secant(search):
         gap, room = search.high - search.low, tolerance / 2
-        share = jnp.where(search.count % 8 == 7, 0.5, root_share(search.at_low, search.at_high))
+        # margins that are zero over a part of the bracket defeat secants, not bisection
+        halve = (search.count % 8 == 7) | (search.count >= _SECANTS)
+        share = jnp.where(halve, 0.5, root_share(search.at_low, search.at_high))
         # nearer to an end than half the tolerance it could not move that end
         x = jnp.maximum(search.low + gap * share, search.low) + room
         return jnp.minimum(x, search.high - room)

@@ -41,7 +41,8 @@ class Pointing(AbstractTorque):
     target: Float[Array, "*#b 4"] = shaped(4)
 
     def __init__(self, kp: ArrayLike, kd: ArrayLike, target: ArrayLike = (1.0, 0.0, 0.0, 0.0)):
-        self.kp, self.kd = coefficients("Pointing kp", kp), coefficients("Pointing kd", kd)
+        self.kp = coefficients("Pointing kp", kp, "a positive kp turns towards the target")
+        self.kd = coefficients("Pointing kd", kd, "a positive kd takes energy away")
         quaternion = as_float_array("Pointing target", target, (4,))
         if is_concrete(quaternion):
             require(

@@ -150,13 +150,13 @@ class SpaceTorque(AbstractTorque):
         return attitude.to_body(value_at("SpaceTorque", self.n, t))
 
 
-def coefficients(name: str, c) -> Array:
-    """Damping about three axes, from one number or three."""
-    c = as_float_array(f"{name} c", c)
+def coefficients(name: str, c, hint: str = "a positive c takes energy away") -> Array:
+    """Damping about three axes, from one number or three; ``name``: of the argument."""
+    c = as_float_array(name, c)
     if c.ndim == 0:
         c = jnp.broadcast_to(c, (3,))
-    c = as_float_array(f"{name} c", c, (3,))
-    require_positive(f"{name} c", c, zero=True, hint="a positive c takes energy away")
+    c = as_float_array(name, c, (3,))
+    require_positive(name, c, zero=True, hint=hint)
     return c
 
 
@@ -169,7 +169,7 @@ class LinearDamping(AbstractTorque):
     c: Float[Array, "*#b 3"] = shaped(3)
 
     def __init__(self, c: ArrayLike):
-        self.c = coefficients("LinearDamping", c)
+        self.c = coefficients("LinearDamping c", c)
 
     def body_components(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
@@ -186,7 +186,7 @@ class QuadraticDamping(AbstractTorque):
     c: Float[Array, "*#b 3"] = shaped(3)
 
     def __init__(self, c: ArrayLike):
-        self.c = coefficients("QuadraticDamping", c)
+        self.c = coefficients("QuadraticDamping c", c)
 
     def body_components(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
