@@ -1,5 +1,6 @@
 """Input checks shared by every constructor: what was given, what is expected, how to fix it."""
 
+import functools
 from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import TYPE_CHECKING, Any
@@ -105,6 +106,19 @@ def as_float_array(
             " before the call."
         )
     return array
+
+
+@functools.cache
+def _weak_array(values: tuple[float, ...], wide: bool) -> Array:
+    del wide  # arrays of either default precision
+    with jax.ensure_compile_time_eval():
+        return jnp.stack([jnp.asarray(x) for x in values])
+
+
+def default_array(values: tuple[float, ...]) -> Array:
+    """The default of an argument, weakly typed like a Python number: its dtype is that of the other
+    numbers of the scene."""
+    return _weak_array(values, bool(jax.config.read("jax_enable_x64")))
 
 
 def as_vectors(name: str, value: Any, size: int = 3) -> Array:

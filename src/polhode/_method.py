@@ -325,8 +325,10 @@ def check_inputs(
         raise TypeError(f"record must be a ph.Record or None, got {type(record).__name__}.")
     check_scene(scene)
     check_fields(state, "state")
-    dtypes = {x.dtype for x in jax.tree.leaves((scene, state)) if isinstance(x, _ARRAYS)}
-    dtypes = {x for x in dtypes if jnp.issubdtype(x, jnp.inexact)}
+    dtypes = _dtypes(jax.tree.leaves((scene, state)))
+    if len(dtypes) > 1:
+        scene, state = _in_one_dtype((scene, state))
+        dtypes = _dtypes(jax.tree.leaves((scene, state)))
     if len(dtypes) != 1:
         raise TypeError(
             f"scene and state mix the dtypes {sorted(map(str, dtypes))}: make all arrays of one"
@@ -342,6 +344,27 @@ def check_inputs(
     if is_concrete(ts):
         check_times(np.asarray(ts))
     return scene, state, ts, record
+
+
+def _dtypes(leaves: list[Any]) -> set[Any]:
+    """Those of the arrays that hold inexact numbers."""
+    dtypes = {x.dtype for x in leaves if isinstance(x, _ARRAYS)}
+    return {x for x in dtypes if jnp.issubdtype(x, jnp.inexact)}
+
+
+def _in_one_dtype(tree: Any) -> Any:
+    """Arrays from Python numbers and defaults (weakly typed) in the dtype of the other arrays."""
+    leaves = jax.tree.leaves(tree)
+    strong = _dtypes([x for x in leaves if not (isinstance(x, jax.Array) and x.weak_type)])
+    if len(strong) != 1:
+        return tree
+    (dtype,) = strong
+
+    def cast(x):
+        weak = isinstance(x, jax.Array) and x.weak_type
+        return x.astype(dtype) if weak and jnp.issubdtype(x.dtype, jnp.inexact) else x
+
+    return jax.tree.map(cast, tree)
 
 
 _DEFAULT = Record()

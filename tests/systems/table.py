@@ -13,6 +13,8 @@ from typing import Any
 
 from mpmath import mpf
 
+SIMPLE = {"gravity", "gradient", "body", "damping", "fading", "space", "sink"}
+
 TRUTH = Path(__file__).with_name("truth.json")
 
 
@@ -27,10 +29,17 @@ class System:
     span: tuple[float, float]
     acts: dict[str, Any] = field(default_factory=dict)
     steps: int = 40
+    cuts: tuple[float, ...] = ()
+    """Times between the ends at which what acts jumps; the reference ends a step there."""
     unstable: float = 1.0
     """How much rounding at the start grows, for the bars in single precision: next to the separatrix
     the end has a derivative of 252 s by the initial rates, so that one rounding of 0.5 rad/s becomes
     7.5e-6; the bar of 4e-6 times this allows 16 of them."""
+
+    @property
+    def is_simple(self) -> bool:
+        """Whether ``torque`` has all that acts; the rest is in ``parts.py``."""
+        return SIMPLE.issuperset(self.acts)
 
     def torque(self, moments):
         """Torque in body axes for the reference integrator, written out from Newton's law."""
@@ -75,10 +84,25 @@ class System:
         return self.acts.get("sink", 0.0)
 
 
+MOMENTS, Q = (1.0, 1.5, 2.0), (0.75, 0.5, -0.25, 0.3535533905932738)
+CURVE = ((0.25, 0.0, -0.125), (0.0, 0.125, 0.25), (-0.0625, 0.0625, 0.0), (0.0, -0.03125, 0.015625))
+"""Torque in body axes as a polynomial of t: the cubic table through its ends is the polynomial."""
+PLATES = (
+    (1.0, (1.0, 0.0, 0.0), (-0.5, 0.125, -0.25)),
+    (0.5, (0.0, 0.0, 1.0), (0.25, 0.0, -0.125)),
+)
+"""Area, normal and centre; both are exposed all the time."""
+SUN = (0.75, 0.0, 0.6614378277661477)
+SHADOW = ((-1.5, 2.0, -1.3228756555322954), (-1.5, -2.0, -1.3228756555322954), 1.0)
+"""Places at both ends, in a straight line between, and the radius: dark from t = 1 to t = 3."""
+CORNERS = ((1, 1, 1), (-1, 1, 1), (-1, -1, 1), (1, -1, 1))
+DUMPING = (0.125, (0.25, -0.5, 1.0))
+"""k, and the field in space axes."""
+
 SYSTEMS = [
     System("free_long_axis_mode", (1.0, 2.0, 3.0), (1, 0, 0, 0), (1.0, 0.25, -0.5), (0, 10)),
     System("free_short_axis_mode", (1.0, 2.0, 3.0), (0.5, 0.5, -0.5, 0.5), (0.25, 0.25, 1.0), (0, 10)),
-    System("free_near_separatrix", (4.0, 5.0, 8.0), (1, 0, 0, 0), (0.0, 0.5, 0.001953125), (0, 40), {}, 80, 30),
+    System("free_near_separatrix", (4.0, 5.0, 8.0), (1, 0, 0, 0), (0.0, 0.5, 0.001953125), (0, 40), {}, 80, unstable=30),
     System("free_backwards", (2.0, 1.25, 1.5), (1, 0, 0, 0), (-0.5, 1.0, 0.75), (3, -5)),
     System("symmetric_prolate", (2.0, 2.0, 0.5), (0.5, -0.5, 0.5, 0.5), (0.5, 0.25, 2.0), (0, 8)),
     System("detest_b5", (0.5, 0.75, 1.0), (1, 0, 0, 0), (0.25, 1.5, -0.75), (0, 8)),
@@ -113,6 +137,39 @@ SYSTEMS = [
     System(
         "symmetric_fading", (1.5, 1.5, 2.0), (0.5, -0.5, 0.5, 0.5), (0.5, 0.25, -1.0), (0, 5),
         {"fading": 0.125},
+    ),
+    # what was added to the simple torques, one system each
+    System("torque_from_a_table", MOMENTS, Q, (0.5, -0.25, 1.0), (0, 4), {"table": CURVE}, 28),
+    System(
+        "air_drag", MOMENTS, (1, 0, 0, 0), (0.0625, -0.03125, 0.0625), (0, 4),
+        {"drag": (PLATES, 0.015625, (4.0, 0.5, 2.0), 2.0)}, 28,
+    ),
+    System(
+        "sunlight", MOMENTS, (1, 0, 0, 0), (0.0625, -0.03125, 0.0625), (0, 4),
+        {"light": (PLATES, SUN, 0.25, 0.375, 0.0625, None)}, 28,
+    ),
+    System(
+        "sunlight_and_shadow", MOMENTS, (1, 0, 0, 0), (0.0625, -0.03125, 0.0625), (0, 4),
+        {"light": (PLATES, SUN, 0.25, 0.375, 0.125, SHADOW)}, cuts=(1.0, 3.0), steps=28,
+    ),
+    System(
+        "booms_that_deploy", MOMENTS, Q, (0.5, -0.25, 1.0), (0, 4),
+        {"growth": (0.125, 0.25, 0.0625)}, 28,
+    ),
+    System(
+        "cluster_of_wheels", MOMENTS, Q, (0.5, -0.25, 1.0), (0, 4),
+        {"wheels": (CORNERS, 0.0625, (1.0, 2.0, -1.0, 0.5), (0.25, 0.125, 0.5), None)}, 28,
+    ),
+    System(
+        "momentum_dumping", MOMENTS, Q, (0.5, -0.25, 1.0), (0, 4),
+        {"wheels": (CORNERS, 0.0625, (1.0, 2.0, -1.0, 0.5), (0.25, 0.125, 0.5), DUMPING)}, 28,
+    ),
+    System(
+        "control_moment_gyro", MOMENTS, Q, (0.5, -0.25, 1.0), (0, 4), {"gyro": (0.5, 0.25)}, 28,
+    ),
+    System(
+        "commands_held", MOMENTS, Q, (0.5, -0.25, 1.0), (0, 4), {"sampled": (0.25, 0.5, 0.125)},
+        cuts=(0.5, 1.0, 1.5, 2.0, 2.5, 3.0, 3.5), steps=28,
     ),
 ]  # fmt: skip
 

@@ -50,6 +50,23 @@ def lift(value) -> Node:
     return Node(lambda k: mpf(value) if k == 0 else mpf(0))
 
 
+def reciprocal(a: Node) -> Node:
+    """1/a: the convolution of both is one."""
+
+    def rule(k):
+        if k == 0:
+            return 1 / a[0]
+        return -mp.fsum(a[j] * found[k - j] for j in range(1, k + 1)) / a[0]
+
+    found = Node(rule)
+    return found
+
+
+def dot(a, b):
+    first, *rest = (x * y for x, y in zip(a, b))
+    return sum(rest, start=first)
+
+
 class Unknown(Node):
     """A component of the state: coefficient k+1 is coefficient k of its rate over k+1."""
 
@@ -88,6 +105,55 @@ def rows(q):
     ]
 
 
+def quaternion_rate(q, rates):
+    """q (0, rates) / 2."""
+    w, x, y, z = q
+    a, b, c = (r * mpf("0.5") for r in rates)
+    return [-(x * a) - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c,
+            w * c + x * b - y * a]  # fmt: skip
+
+
+def growing_body(moments, growth):
+    """A body with moments that grow as moments + t growth: L is constant in space."""
+
+    def field(t, y):
+        omega, q = y[:3], y[3:]
+        now = [t * mpf(g) + mpf(m) for m, g in zip(moments, growth)]
+        momentum = [m * w for m, w in zip(now, omega)]
+        push = [p - w * mpf(g) for p, w, g in zip(cross(momentum, omega), omega, growth)]
+        return [p * reciprocal(m) for p, m in zip(push, now)] + quaternion_rate(q, omega)
+
+    return field
+
+
+def body_with_wheels(moments, axes, inertia, motor, torque):
+    """y = (omega, q, c): c are the momenta J (Omega + a . omega) of wheels about unit axes a.
+
+    ``moments``: of the body with its wheels locked. ``motor(omega)``: torque on each wheel;
+    ``torque(rows, h)``: on the body from outside, h the momentum of the wheels.
+    """
+    J = mpf(inertia)
+    carrier = mp.matrix(3, 3)
+    for i in range(3):
+        for k in range(3):
+            carrier[i, k] = (moments[i] if i == k else 0) - J * mp.fsum(a[i] * a[k] for a in axes)
+    inverse = carrier**-1
+
+    def field(t, y):
+        omega, q, spins = y[:3], y[3:7], y[7:]
+
+        def sums(values):
+            return [dot([lift(a[i]) for a in axes], values) for i in range(3)]
+
+        h, u = sums(spins), motor(omega)
+        momentum = [dot([lift(carrier[i, k]) for k in range(3)], omega) + h[i] for i in range(3)]
+        push = [a + b - c for a, b, c in zip(cross(momentum, omega), torque(rows(q), h), sums(u))]
+        change = [dot([lift(inverse[i, k]) for k in range(3)], push) for i in range(3)]
+        return [*change, *quaternion_rate(q, omega), *u]
+
+    return field
+
+
 def body(moments, torque=None, sink=0):
     """Rates and quaternion of a body: y = (omega, q); ``torque(t, omega, rows)`` in body axes.
 
@@ -104,13 +170,6 @@ def body(moments, torque=None, sink=0):
             push = cross(momentum, turning)
         if torque is not None:
             push = [a + b for a, b in zip(push, torque(t, omega, rows(q)))]
-        w, x, y_, z = q
-        a, b, c = (r * mpf("0.5") for r in turning)
-        return [p * (1 / m) for p, m in zip(push, moments)] + [
-            -(x * a) - y_ * b - z * c,
-            w * a + y_ * c - z * b,
-            w * b + z * a - x * c,
-            w * c + x * b - y_ * a,
-        ]
+        return [p * (1 / m) for p, m in zip(push, moments)] + quaternion_rate(q, turning)
 
     return field

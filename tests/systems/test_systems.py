@@ -20,7 +20,8 @@ ACTING: dict[frozenset, list[str]] = {}
 for _name, _system in BY_NAME.items():
     ACTING.setdefault(frozenset(_system.acts), []).append(_name)
 FREE = ACTING[frozenset()]
-ALL = list(BY_NAME)
+ALL = [name for name, system in BY_NAME.items() if system.is_simple]
+PARTS = [name for name in BY_NAME if name not in ALL]
 SYMMETRIC = ["symmetric_prolate", "symmetric_fading"]
 FEW = [name for name in ALL if {"gravity", "body", "damping"}.issuperset(BY_NAME[name].acts)]
 
@@ -43,7 +44,9 @@ METHODS = {
     **{
         f"planner {' and '.join(sorted(acts)) or 'free'}": Way(None, names)
         for acts, names in ACTING.items()
+        if names[0] in ALL
     },
+    **{f"planner of {name}": Way(None, [name]) for name in PARTS},
     "planner axisymmetric": Way(None, ["symmetric_prolate"], EXACT, axial=True),
     "ClosedForm": Way(ph.ClosedForm(), FREE, EXACT),
     "LagrangeTop": Way(ph.LagrangeTop(), ["lagrange_top"], EXACT, axial=True),
@@ -55,6 +58,8 @@ METHODS = {
     "CoarseSteps": Way(ph.CoarseSteps(), FEW),
     "EulerAngles": Way(ph.EulerAngles(Dopri8()), ALL),
     "EulerAngles of few": Way(ph.EulerAngles(Dopri8()), FEW),
+    "EulerAngles of momentum_dumping": Way(ph.EulerAngles(Dopri8()), ["momentum_dumping"]),
+    "Dopri8 of sunlight_and_shadow": Way(ph.LiePoisson(Dopri8()), ["sunlight_and_shadow"]),
 }  # fmt: skip
 
 # Space axes of the systems seen from the axes that they are moved in: no path of the table meets a
@@ -100,6 +105,61 @@ def acting(names: Sequence[str], moments):
     return potential, torque
 
 
+def with_parts(system, moments):
+    """Inertia, torque and rotors of a system that has more than simple torques; a batch of one."""
+    (kind, numbers), = system.acts.items()  # fmt: skip
+    dtype, ends = moments.dtype, jnp.array(system.span, moments.dtype)
+    inertia = ph.Inertia.from_moments(moments)
+
+    def array(x):
+        return jnp.array(x, dtype)
+
+    def space(x):
+        return ph.rotation.rotate(array(np.broadcast_to(TILT, (*np.shape(x)[:-1], 4))), array(x))
+
+    def plates(some):
+        return ph.Plates(*(array(np.array([plate[k] for plate in some])) for k in range(3)))
+
+    if kind == "table":
+        rows = np.array(numbers)
+        powers = [float(t) ** np.arange(4) for t in system.span]
+        slopes = [np.arange(4) * float(t) ** np.array([0, 0, 1, 2]) for t in system.span]
+        table = ph.Table(ends, array(powers @ rows), derivatives=array(slopes @ rows))
+        return inertia, ph.BodyTorque(table), None
+    if kind == "drag":
+        some, density, velocity, coefficient = numbers
+        torque = ph.Drag(plates(some), array(density), space(velocity), array(coefficient))
+        return inertia, torque, None
+    if kind == "light":
+        some, direction, *others, shadow = numbers
+        lit, sun = array(1.0), space(direction)
+        if shadow is not None:
+            places, radius = ph.Table(ends, space(shadow[:2]), order=1), shadow[2]
+            lit = ph.Eclipse(places, sun, array(radius))
+        return inertia, ph.SolarPressure(plates(some), sun, lit, *map(array, others)), None
+    if kind == "growth":
+        later = moments + array([numbers]) * (ends[1] - ends[0])
+        table = ph.Table(ends, jnp.stack([moments, later], axis=-2), order=1)
+        return ph.VariableInertia(table), None, None
+    if kind == "gyro":
+        momentum, rate = numbers
+        angle = ph.Table(ends, rate * ends, order=1)
+        x, z = array([1, 0, 0]), array([0, 0, 1])
+        return inertia, ph.ControlMomentGyro(array(momentum), z, x, angle), None
+    if kind == "sampled":
+        gains = array(numbers)
+        return inertia, ph.SampledTorque(lambda t, wxyz, omega: -gains * omega, 0.5), None
+    axes, wheel, speeds, gains, dumping = numbers
+    gains = array(gains)
+    wheels = ph.wheel_cluster(
+        array(axes), array(wheel), lambda t, wxyz, omega: -gains * omega, speed=array(speeds)
+    )
+    torque = None
+    if dumping is not None:
+        torque = ph.MomentumDumping(array(dumping[0]), space(dumping[1]))
+    return inertia, torque, wheels
+
+
 def final_states(way: Way, moments, rtol):
     """(omega, wxyz) (N, 7) at the last times, wxyz with the sign of the truth."""
     dtype, systems = moments.dtype, [BY_NAME[name] for name in way.names]
@@ -112,7 +172,12 @@ def final_states(way: Way, moments, rtol):
     wxyz = ph.rotation.multiply(tilt, jnp.array([system.wxyz for system in systems], dtype))
     state = ph.State(wxyz, jnp.array([system.omega for system in systems], dtype))
     times = jnp.array([system.span for system in systems], dtype)
-    scene = ph.Scene(inertia, *acting(way.names, moments))
+    if systems[0].is_simple:
+        scene = ph.Scene(inertia, *acting(way.names, moments))
+    else:
+        inertia, torque, rotors = with_parts(systems[0], moments)
+        scene = ph.Scene(inertia, torque=torque, rotors=rotors)
+        times = np.array(systems[0].span, dtype)
     record = ph.Record(final_only=True)
     end = ph.simulate(scene, state, times, way.method, rtol=rtol, record=record)
     exact = jnp.array([truth(name)["state"][3:] for name in way.names], dtype)
@@ -162,6 +227,7 @@ def rows(*heavy: str):
 # Methods with tests of their own of values and gradients, in tops and in solvers; and what acts in
 # the row of Dopri8 as well, where the planner's method is that of the other rows.
 ELSEWHERE = (
+    *(name for name, way in METHODS.items() if set(way.names) <= set(PARTS)),
     *("LagrangeTop", "Extrapolation", "Extrapolation compensated"),
     *("planner space", "planner fading", "planner sink", "planner gradient", "EulerAngles"),
 )

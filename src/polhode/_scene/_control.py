@@ -10,12 +10,23 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._checks import ArrayLike, as_float_array, as_number, as_positive, is_concrete, require
+from polhode._checks import (
+    ArrayLike,
+    as_float_array,
+    as_number,
+    as_positive,
+    default_array,
+    is_concrete,
+    require,
+)
 from polhode._hamiltonian import Attitude, Vector, components, cross, dot, triple
 from polhode._parts import AbstractPart, Signature, shaped
 from polhode._scene._tables import Table
 from polhode._scene._torques import AbstractTorque, coefficients, stacked, value_at, vector_of_time
 from polhode._scene._wheels import AbstractCoupling, AbstractRotor, Rotor, RotorSum
+
+_IDENTITY = (1.0, 0.0, 0.0, 0.0)
+_ORIGIN = (0.0, 0.0, 0.0)
 
 
 class Pointing(AbstractTorque):
@@ -40,9 +51,10 @@ class Pointing(AbstractTorque):
     kd: Float[Array, "*#b 3"] = shaped(3)
     target: Float[Array, "*#b 4"] = shaped(4)
 
-    def __init__(self, kp: ArrayLike, kd: ArrayLike, target: ArrayLike = (1.0, 0.0, 0.0, 0.0)):
+    def __init__(self, kp: ArrayLike, kd: ArrayLike, target: ArrayLike = _IDENTITY):
         self.kp = coefficients("Pointing kp", kp, "a positive kp turns towards the target")
         self.kd = coefficients("Pointing kd", kd, "a positive kd takes energy away")
+        target = default_array(_IDENTITY) if target is _IDENTITY else target
         quaternion = as_float_array("Pointing target", target, (4,))
         if is_concrete(quaternion):
             require(
@@ -74,8 +86,9 @@ class RateDamping(AbstractTorque):
     c: Float[Array, "*#b 3"] = shaped(3)
     rates: Float[Array, "*#b 3"] = shaped(3)
 
-    def __init__(self, c: ArrayLike, rates: ArrayLike = (0.0, 0.0, 0.0)):
+    def __init__(self, c: ArrayLike, rates: ArrayLike = _ORIGIN):
         self.c = coefficients("RateDamping c", c)
+        rates = default_array(_ORIGIN) if rates is _ORIGIN else rates
         self.rates = as_float_array("RateDamping rates", rates, (3,))
 
     def body_components(
@@ -116,7 +129,7 @@ class MagneticDipole(AbstractTorque):
         self,
         moment: ArrayLike | Callable,
         field: ArrayLike | Callable,
-        position: ArrayLike | Callable = (0.0, 0.0, 0.0),
+        position: ArrayLike | Callable = _ORIGIN,
     ):
         self.moment = (
             _MOMENT.checked(moment)
@@ -129,6 +142,7 @@ class MagneticDipole(AbstractTorque):
             self.field = _FIELD.checked(field)
         else:
             self.field = as_float_array(_FIELD.name, field, (3,))
+        position = default_array(_ORIGIN) if position is _ORIGIN else position
         self.position = vector_of_time("MagneticDipole position", position)
 
     def body_components(
@@ -375,11 +389,11 @@ class MomentumDumping(AbstractTorque):
         self,
         k: ArrayLike,
         field: ArrayLike | Callable,
-        position: ArrayLike | Callable = (0.0, 0.0, 0.0),
+        position: ArrayLike | Callable = _ORIGIN,
         max_moment: ArrayLike | None = None,
     ):
         self.k = as_positive("MomentumDumping k", k, zero=True)
-        self.dipole = MagneticDipole([0.0, 0.0, 0.0], field, position)
+        self.dipole = MagneticDipole(default_array(_ORIGIN), field, position)
         self.max_moment = None
         if max_moment is not None:
             self.max_moment = as_positive("MomentumDumping max_moment", max_moment)

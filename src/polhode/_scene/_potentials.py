@@ -13,6 +13,7 @@ from polhode._checks import (
     as_float_array,
     as_number,
     as_positive,
+    default_array,
     is_concrete,
     require,
 )
@@ -48,6 +49,9 @@ class PotentialSum(AbstractPotential, AbstractSum):
         return sum(rest, start=first)
 
 
+_STANDARD = (0.0, 0.0, -9.80665)
+
+
 class UniformGravity(AbstractPotential):
     """Weight of a body that rotates about a fixed point: V = -mass g_space . (R centre_body).
 
@@ -69,7 +73,7 @@ class UniformGravity(AbstractPotential):
         self,
         mass: ArrayLike,
         centre_body: ArrayLike | None = None,
-        gravity_space: ArrayLike = (0.0, 0.0, -9.80665),
+        gravity_space: ArrayLike = _STANDARD,
         *,
         distance: ArrayLike | None = None,
     ):
@@ -84,11 +88,12 @@ class UniformGravity(AbstractPotential):
             self.centre_body = as_float_array("centre_body", centre_body, (3,))
         else:
             self.distance = as_number("distance", distance)
-        self.gravity_space = as_float_array("gravity_space", gravity_space, (3,))
+        gravity = default_array(_STANDARD) if gravity_space is _STANDARD else gravity_space
+        self.gravity_space = as_float_array("gravity_space", gravity, (3,))
 
     @classmethod
     def axial(
-        cls, mass: ArrayLike, distance: ArrayLike, gravity_space: ArrayLike = (0.0, 0.0, -9.80665)
+        cls, mass: ArrayLike, distance: ArrayLike, gravity_space: ArrayLike = _STANDARD
     ) -> Self:
         """A centre of mass on body z, ``distance`` (...) [m] from the fixed point.
 

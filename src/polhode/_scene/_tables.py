@@ -79,6 +79,7 @@ class Table(AbstractPart):
         if is_concrete(self.times):
             require(np.diff(np.asarray(self.times)) > 0, "Table times must ascend.")
         array = as_float_array("Table values", values)
+        self.times = self.times.astype(array.dtype)  # a list is of the default precision
         self.order, self.is_number = order, _is_number(array.shape, self.times.size, kind)
         self.values = array[..., None] if self.is_number else array
         knots = self.times.astype(array.dtype)
