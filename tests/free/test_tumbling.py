@@ -14,7 +14,7 @@ import pytest
 import polhode as ph
 from polhode.files._write import REFERENCE, reference_csv
 
-from .make_tumbling import BODIES, START, TURNS, difference, stored
+from .make_tumbling import BODIES, START, TURNS, by_turns, difference, stored
 from .reference_free import free_reference
 
 pytestmark = pytest.mark.filterwarnings("ignore:Descending:DeprecationWarning")
@@ -37,6 +37,16 @@ def test_the_file_holds_every_body_as_its_script_has_it():
 def test_stored_states_agree_with_taylor_series(name, place):
     row = TEXTS[name]
     assert difference(row, row["samples"][place], False) < 0.5001
+
+
+@pytest.mark.parametrize("moments", [(1.0, 1.0, 1.5), (0.5, 2.0, 2.0)])
+def test_steps_of_a_symmetric_body_are_those_of_one_series(moments):
+    """By which the sphere with one moment changed is moved, whose rates do not return."""
+    omega = (0.5, -0.25, 1.0)
+    with mp.workdps(60):
+        found = by_turns([*map(mp.mpf, moments)], [*map(mp.mpf, omega)], 7.3, mp.mpf("1.1"), 40)
+        q, w = free_reference(moments, START, omega, 7.3, digits=40)
+        assert max(abs(a - b) for a, b in zip(found, [*q, *w])) < mp.mpf(10) ** -38
 
 
 @pytest.mark.slow
