@@ -347,7 +347,8 @@ def _apply_switch(
     kept = jnp.where((hit & near)[None], progress.just_turned, 0)
     just_turned = pick(accepted, jnp.zeros_like(progress.just_turned), progress.just_turned)
     just_turned = pick(hit, jnp.where(flips, 1, kept).astype(just_turned.dtype), just_turned)
-    just_turned = jnp.where(wrong & repaired[None], 1, just_turned)
+    # not at a root: its next one is a switch as any other, however soon
+    just_turned = jnp.where(wrong & repaired[None], 0, just_turned)
     now = now._replace(
         levels=levels,
         margin=pick(
