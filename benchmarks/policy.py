@@ -64,6 +64,8 @@ CASES: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "TOP_BODIES": ((32, 512), ("Lagrange's tops, 20 times",)),
     "ELEMENTARY_CHUNK": ((2**11, 2**17), ("damped symmetric bodies, 100 times",)),
     "FIT_SAMPLES": ((128, 8192), ("fits",)),
+    "SAVE_SAMPLES": ((2**15, 2**22), ("saved function of free bodies", "saved function of tops")),
+    "ACCELERATOR_SAVE_SAMPLES": ((2**18,), ("saved function of tops",)),
 }
 
 
@@ -121,6 +123,20 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
 
         return ready
 
+    def saved(build):
+        def ready():
+            m, q, w = (jnp.asarray(np.tile(x, (4, 1))) for x in (moments, wxyz, omega))
+            record = ph.Record(save=lambda motion: motion.omega_body[..., 2])
+
+            def values(m, q, w):
+                ts = jnp.linspace(0.0, 20.0, 401)
+                return ph.simulate(build(m), ph.State(q, w), ts, record=record).saved
+
+            program = jax.jit(values).lower(m, q, w).compile()
+            return lambda: jax.block_until_ready(program(m, q, w))
+
+        return ready
+
     def slope(*arguments, **options):
         def ready():
             samples, start = motion(*arguments, **options)
@@ -167,6 +183,8 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
         "gradient of heavy tops": slope(triaxial(gravity), BODIES),
         "gradient of a satellite": slope(satellite, 1),
         "gradient of satellites": slope(satellite, 200),
+        "saved function of free bodies": saved(triaxial()),
+        "saved function of tops": saved(triaxial(gravity)),
         "fits": fits,
     }  # fmt: skip
 

@@ -100,9 +100,12 @@ SHARED_STEP_BODIES = 200
 ACCELERATOR_BODIES = 2**18
 """[bodies] Of one chunk on a GPU or TPU; bounds the memory."""
 
-SAVE_SAMPLES, ACCELERATOR_SAVE_SAMPLES = 2**18, 2**24
-"""[bodies times samples] Of one chunk where a function of the motion is saved in its place
-(``Record(save=)``), on a CPU and on an accelerator: 15 MB and 0.9 GB of states in float64."""
+SAVE_SAMPLES = 2**18
+"""[bodies times samples] Of one chunk on a CPU where a function of the motion is saved in its
+place (``Record(save=)``): 15 MB of states in float64."""
+
+ACCELERATOR_SAVE_SAMPLES = 2**24
+"""[bodies times samples] The same on an accelerator: 0.9 GB."""
 
 STEP_OVERHEAD = 30
 """[evaluations of the field] That a step costs beside its own; decides the order of the midpoint

@@ -204,7 +204,29 @@ def explain(
 @jit_distinct
 def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> Trajectory:
     """The compiled part: lanes out of batches, the method, and back."""
-    return _trajectory(method, scene, state, ts, rtol, record, split)
+    scene, state = scene.settled(state, ts[..., 0]), state.without_wheels
+    if split is None:
+        found = _moved(record, method, scene, state, ts, rtol)
+    else:
+        found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
+    wxyz, omega, status, steps, work, error, motors, spins, saved, final = found
+    kept = ts[..., -1:] if record.final_only else ts
+    propagator = HeldPropagator() if is_sampled(scene) else Propagator.of(method, rtol)
+    return Trajectory(
+        kept,
+        wxyz,
+        omega,
+        status,
+        steps,
+        scene,
+        work,
+        error,
+        motors,
+        spins,
+        propagator,
+        saved=saved,
+        final=final,
+    )
 
 
 @jit_distinct
@@ -231,32 +253,6 @@ def _begin(method, scene, state, ts, rtol) -> Trajectory:
         scene,
         spins=jnp.stack(spins, axis=-1)[..., None, :] if spins else None,
         propagator=Propagator.of(method, rtol),
-    )
-
-
-def _trajectory(method, scene, state, ts, rtol, record, split) -> Trajectory:
-    scene, state = scene.settled(state, ts[..., 0]), state.without_wheels
-    if split is None:
-        found = _moved(record, method, scene, state, ts, rtol)
-    else:
-        found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
-    wxyz, omega, status, steps, work, error, motors, spins, saved, final = found
-    kept = ts[..., -1:] if record.final_only else ts
-    propagator = HeldPropagator() if is_sampled(scene) else Propagator.of(method, rtol)
-    return Trajectory(
-        kept,
-        wxyz,
-        omega,
-        status,
-        steps,
-        scene,
-        work,
-        error,
-        motors,
-        spins,
-        propagator,
-        saved=saved,
-        final=final,
     )
 
 
