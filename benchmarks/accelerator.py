@@ -25,8 +25,6 @@ import polhode as ph
 from benchmarks import _report, problems, truth
 from benchmarks.peers import stock_diffrax
 from benchmarks.peers.polhode_own import scene
-from polhode._plan import choose
-from polhode._simulate import run
 
 SIZES = {
     "free": (10**3, 10**4, 10**5, 10**6, 10**7),
@@ -74,11 +72,11 @@ def measure(family: str, n: int, dtype: str, peak: dict[str, float]) -> dict:
     repeat = (-(-n // count), 1)
     state = ph.State(*(jnp.asarray(np.tile(x, repeat)[:n], kind) for x in problem.states(count)))
     given, ts = scene(problem, kind), jnp.asarray(problem.times, kind)
-    method, _ = choose(given, RTOL[dtype])
+    method = ph.explain(given, state, ts, rtol=RTOL[dtype]).method
 
     @jax.jit
     def simulated(wxyz, omega):
-        made = run(method, given, ph.State(wxyz, omega), ts, jnp.asarray(RTOL[dtype], kind), record)
+        made = ph.simulate(given, ph.State(wxyz, omega), ts, rtol=RTOL[dtype], record=record)
         return made.wxyz, made.omega_body
 
     program = simulated.lower(state.wxyz, state.omega_body).compile()

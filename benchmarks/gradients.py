@@ -28,7 +28,6 @@ import polhode as ph
 from benchmarks import truth
 from benchmarks.peers import rigid_body
 from benchmarks.problems import DIRECTION, PROBLEMS, Problem
-from polhode._plan import choose
 
 WEIGHTS = (0.7, -0.4, 0.9, 0.3, -0.5, 0.8, 0.6)
 HORIZON = 20.0
@@ -78,7 +77,7 @@ def own(problem: Problem, n: int, rtol: float, by: str = "moments"):
 
     moments = np.array(problem.moments)[[0, 2]] if symmetric else np.array(problem.moments)
     moments = jnp.asarray(np.broadcast_to(moments, (n, len(moments))))
-    method, _ = choose(scene(moments), rtol)
+    method = ph.explain(scene(moments), state, ts, rtol=rtol).method
 
     def value(moments):
         end = ph.simulate(

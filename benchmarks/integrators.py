@@ -29,8 +29,7 @@ import mpmath
 import numpy as np
 
 import polhode as ph
-from polhode._integrate import Accuracy, Extrapolation
-from polhode._plan import choose
+from polhode._integrate import Accuracy
 
 HORIZON = 100.0
 TORQUE = 1.0  # mass * g * distance
@@ -198,7 +197,7 @@ class Simulated:
         scene = ph.Scene(ph.Inertia.from_moments(jnp.asarray(moments, dtype)), weight)
         self.given = scene, ph.State(wxyz, omega), jnp.array([0.0, HORIZON], dtype)
         self.record, self.rtol = ph.Record(final_only=True), rtol
-        self.method = stepped(self.given[0], rtol)
+        self.method = stepped(*self.given, rtol)
         start = time.perf_counter()
         self()
         self.compile_s = time.perf_counter() - start
@@ -216,10 +215,10 @@ def weight_of(strength):
     return 1.0, (0.0, 0.0, 0.5), (0.0, 0.0, -2.0 * strength)
 
 
-def stepped(scene, rtol):
+def stepped(scene, state, ts, rtol):
     """The planner's integrator, also where it would know the exact motion."""
     general = ph.Scene(ph.Inertia.from_moments(jnp.array([1.0, 1.5, 2.0])), scene.potential)
-    return choose(general, rtol)[0]
+    return ph.explain(general, state, ts, rtol=rtol).method
 
 
 class Heyoka:
@@ -304,7 +303,7 @@ def measure(programs, case, n, exact, repeats):
 
 def marched(case, n, rtol):
     """The planner's solver under the same error control, on the field written by hand."""
-    solver = Extrapolation(None, accuracy=Accuracy(rtol, HORIZON))
+    solver = ph.Extrapolation(None, accuracy=Accuracy(rtol, HORIZON))
     whole = diffrax.StepTo(jnp.array([0.0, HORIZON]))
     return Polhode(case, n, solver, None, whole, f"Extrapolation {rtol:.0e}")
 

@@ -31,6 +31,7 @@ import numpy as np
 from benchmarks.throws import Instrument, fit_balance
 from polhode.fit import (
     Drag,
+    Finding,
     FitOptions,
     Gyroscope,
     Recording,
@@ -38,10 +39,10 @@ from polhode.fit import (
     fit_inertia,
     fit_recordings,
 )
-from polhode.fit._findings import UNUSABLE, WARNINGS
 from polhode.rotation import wxyz_to_matrix
 
 FAST = 15.0
+UNUSABLE = Finding.STEP_LIMIT | Finding.NOT_FINITE | Finding.AXES_DISAGREE
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "ubc_racquet_toss"
 
 
@@ -85,7 +86,7 @@ def alone(trials):
         "converged": int(usable.sum()),
         "neither_converged_nor_flagged": int(silent.sum()),
         "findings": {
-            flag.name.lower(): int((codes & int(flag) != 0).sum()) for flag in WARNINGS
+            str(flag.name).lower(): int((codes & int(flag) != 0).sum()) for flag in Finding
         },
         "rms_median_rad_s": float(np.median(np.asarray(fit.rms)[usable])),
         "ratios_median": np.median(np.asarray(fit.ratios)[usable], axis=0).tolist(),
@@ -143,7 +144,7 @@ def readings(trials, cut):
         "ratios_std": np.asarray(fit.ratios_std[0]).tolist(),
         "rms_one_sample_ahead_rad_s": float(np.sqrt(np.mean(rest[rest != 0] ** 2))),
         "slow_torque_rad_s2": float(fit.noise_levels.slow[0] / np.trace(fit.inertia.tensor[0]) * 2),
-        "converged": "step limit" not in fit.findings(),
+        "converged": bool(np.all(fit.converged)),
         "drag_fitted_ratios": drag["ratios"],
         "drag_fitted_ratios_std": drag["ratios_std"],
         "drag_fitted_rms_rad_s": drag["rms_rad_s"],

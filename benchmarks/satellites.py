@@ -137,7 +137,7 @@ def study(name, push, runs):
     fits = [
         fit_balance(
             [room.Recording.of(times, one, wheel_speed=wheel)], Instrument(spin, AXIS), throw=False
-        ).fit
+        )
         for one in readings
     ]
     fit = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *fits)
@@ -161,7 +161,7 @@ def study(name, push, runs):
         },
         "moments_rms_error_over_std": float(np.sqrt(np.mean(off**2))),
         "covered_percent": 100 * float(np.mean(np.abs(off) < 1.959964)),
-        "converged": int(np.sum((np.asarray(fit.diagnostics) & int(room.Finding.STEP_LIMIT)) == 0)),
+        "converged": int(np.sum(fit.converged)),
     }
 
 

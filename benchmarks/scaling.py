@@ -3,8 +3,7 @@
     python -m benchmarks.scaling [--quick] [--output out/scaling.json]
 
 One core. Memory is that of the compiled program: arguments, results and temporaries. Bodies times
-samples beyond a chunk are worked on chunk after chunk, so that temporaries stop growing; the chunk
-of each method stands beside its numbers.
+samples beyond a chunk are worked on chunk after chunk, so that temporaries stop growing.
 """
 
 import argparse
@@ -23,9 +22,6 @@ import numpy as np
 import polhode as ph
 from benchmarks.peers.polhode_own import scene
 from benchmarks.problems import PROBLEMS
-from polhode._plan import choose
-from polhode._policy import FREE_CHUNK
-from polhode._simulate import run
 
 FAMILIES = ("free", "lagrange", "heavy_top")
 BODIES = (1, 10, 100, 1_000, 10_000, 100_000, 1_000_000)
@@ -42,11 +38,11 @@ def measure(family: str, bodies: int, saves: int, horizons: tuple, budget: float
     repeat = (-(-bodies // len(wxyz)), 1)
     state = ph.State(*(jnp.asarray(np.tile(x, repeat)[:bodies]) for x in (wxyz, omega)))
     given, ts = scene(problem, np.float64), jnp.asarray(problem.times)
-    method, _ = choose(given, RTOL)
+    method = ph.explain(given, state, ts, rtol=RTOL).method
 
     @jax.jit
     def simulated(wxyz, omega, ts):
-        made = run(method, given, ph.State(wxyz, omega), ts, jnp.asarray(RTOL), record)
+        made = ph.simulate(given, ph.State(wxyz, omega), ts, rtol=RTOL, record=record)
         return made.wxyz, made.omega_body
 
     program = simulated.lower(state.wxyz, state.omega_body, ts).compile()
@@ -66,7 +62,6 @@ def measure(family: str, bodies: int, saves: int, horizons: tuple, budget: float
             "bodies": bodies, "horizon": horizon, "saves": saves,
             "ns_per_body": wall.median / bodies * 1e9, "spread": wall.spread,
             "memory_MB": whole, "temporary_MB": temporary, "method": type(method).__name__,
-            "chunk": FREE_CHUNK if isinstance(method, ph.ClosedForm) else method.chunk,
         })  # fmt: skip
     return rows
 

@@ -22,8 +22,6 @@ import jax.numpy as jnp
 import numpy as np
 
 import polhode as ph
-from polhode._plan import choose
-from polhode._simulate import run
 
 FINAL = ph.Record(final_only=True)
 RATES = ph.Record(attitude=False, final_only=True)
@@ -59,11 +57,14 @@ def scenes() -> dict[str, tuple[ph.Scene, ph.Record, int]]:
     }  # fmt: skip
 
 
-def program(scene, state, ts, record, rtol=1e-9):
-    """The compiled program that ``simulate`` runs for a scene."""
-    method, _ = choose(scene)
-    arguments = (method, scene, state, ts, jnp.asarray(rtol, ts.dtype), record)
-    return eqx.filter_jit(run).lower(*arguments).compile(), arguments
+def program(scene, state, ts, record):
+    """The compiled program of a call of ``simulate``, and its arguments."""
+
+    def simulated(scene, state, ts):
+        return ph.simulate(scene, state, ts, record=record)
+
+    arguments = scene, state, ts
+    return eqx.filter_jit(simulated).lower(*arguments).compile(), arguments
 
 
 def counts(compiled) -> dict[str, float]:

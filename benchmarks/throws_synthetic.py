@@ -114,7 +114,7 @@ def study(size, number, together=40, group=120):
         joints.append((np.asarray(joint.moments[0]) - true) / np.asarray(joint.moments_std[0]))
         moments.append(np.asarray(alone.moments))
         spread.append(np.asarray(alone.moments_std))
-        done += converged(alone)
+        done += int(np.sum(alone.converged))
     return {
         "size": size,
         **told(np.concatenate(moments) - true, np.concatenate(spread), true),
@@ -137,13 +137,8 @@ def study_own(size, number):
     return {
         "size": size,
         **told(moments - true, spread, true),
-        "converged": sum(converged(one) for one in fits),
+        "converged": sum(int(np.sum(one.converged)) for one in fits),
     }
-
-
-def converged(fit):
-    """How many bodies of a fit converged."""
-    return int(np.sum(np.asarray(fit.diagnostics) & int(room.Finding.STEP_LIMIT) == 0))
 
 
 def told(error, spread, true):

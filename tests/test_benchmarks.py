@@ -182,6 +182,36 @@ def test_every_benchmark_can_be_imported():
     assert lost <= PEERS
 
 
+PRIVATE_IMPORTS = {
+    "_figures.py": "the style of figures, and whole files or none",
+    "_report.py": "whole files or none",
+    "error_control.py": "one step of the extrapolated midpoint rule",
+    "free_body.py": "the solution of the free body without lanes and planner",
+    "identification.py": "the start of a fit, which a peer is given as well",
+    "integrators.py": "the error control of a bare call of diffrax",
+    "light_curves.py": "parts of the search for spin states",
+    "policy.py": "the rows of the policy",
+    "scale.py": "one block of an ensemble",
+}
+"""Benchmarks that import private modules, and what they measure or use there."""
+
+
+def test_benchmarks_use_public_names():
+    root, found = Path(benchmarks.__file__).parent, set()
+    for path in root.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.Import):
+                names = [alias.name for alias in node.names]
+            elif isinstance(node, ast.ImportFrom):
+                names = [f"{node.module}.{alias.name}" for alias in node.names]
+            else:
+                continue
+            parts = [name.split(".") for name in names]
+            if any(p[0] == "polhode" and any(x.startswith("_") for x in p[1:]) for p in parts):
+                found.add(str(path.relative_to(root)))
+    assert found == set(PRIVATE_IMPORTS)
+
+
 def test_every_benchmark_that_runs_with_the_others_takes_an_output():
     for name in {**command.QUICK, **command.FULL}:
         source = Path(_report.__file__).with_name(f"{name}.py").read_text(encoding="utf-8")

@@ -9,8 +9,6 @@ import numpy as np
 import polhode as ph
 from benchmarks.peers import Program
 from benchmarks.problems import DIRECTION, Problem
-from polhode._plan import choose
-from polhode._simulate import run
 
 NAME = "polhode"
 DEFAULT = "default"
@@ -49,7 +47,8 @@ def programs(problem: Problem, n, dtype, tolerances, quick) -> list[Program]:
     ts = jnp.asarray(problem.times, dtype)
     floor = 4 * float(np.finfo(dtype).eps)
     tolerances = [t for t in tolerances if t >= floor]
-    asked = [(DEFAULT, t, choose(given, t)[0]) for t in tolerances]
+    state = ph.State(*starts[0])
+    asked = [(DEFAULT, t, ph.explain(given, state, ts, rtol=t).method) for t in tolerances]
     stepped = not isinstance(asked[0][2], ph.ClosedForm | ph.LagrangeTop)
     if not stepped:
         asked = asked[:1]
@@ -81,7 +80,7 @@ def _compiled(method, given, start, ts, record):
 
     @jax.jit
     def simulated(wxyz, omega, rtol):
-        made = run(method, given, ph.State(wxyz, omega), ts, rtol, record)
+        made = ph.simulate(given, ph.State(wxyz, omega), ts, method, rtol=rtol, record=record)
         return made.wxyz, made.omega_body
 
     return simulated.lower(*start, jnp.asarray(1e-3, ts.dtype)).compile()

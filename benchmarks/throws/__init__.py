@@ -1,7 +1,9 @@
 """Inertia from throws of bodies with a gyroscope and a reaction wheel (TU Delft, arXiv:2503.13137).
 
-An estimator for one laboratory's recordings, by maximum likelihood of the readings, on the public
-``polhode.fit``; ``python -m benchmarks.throws`` applies it to them.
+An estimator for one laboratory's recordings, by maximum likelihood of the readings. It takes
+``Recording``, ``stack``, ``averaged``, ``SteppedMotion`` and ``FitError`` of the public
+``polhode.fit``; the likelihood, its search and its result are its own.
+``python -m benchmarks.throws`` applies it to the recordings.
 """
 
 from benchmarks.throws.design import throw_information as throw_information

@@ -3,12 +3,12 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from benchmarks.throws.instrument import Instrument
 from benchmarks.throws.likelihood import Noise, Readings, innovations, score_of
-from polhode._checks import ArrayLike, as_float_array
-from polhode.fit._model import SteppedMotion, entries_of, whole_of
+from benchmarks.throws.numerics import entries_of, symmetric_matrix
+from polhode.fit import SteppedMotion
 
 # spin that drag may take in a second, as a part of the whole, of which the throw tells the rest
 _LOST = 0.3
@@ -40,13 +40,7 @@ def throw_information(
         slopes = jax.grad(worth, argnums=(0, 1))(omega, wheel_speed)
     """
     tensor, omega, times, wheel_speed = (
-        as_float_array(name, value, shape)
-        for name, value, shape in (
-            ("tensor", tensor, (3, 3)),
-            ("omega", omega, (3,)),
-            ("times", times, (None,)),
-            ("wheel_speed", wheel_speed, (None,)),
-        )
+        jnp.asarray(value, float) for value in (tensor, omega, times, wheel_speed)
     )
     x, y, z = (float(component) for component in np.asarray(instrument.axis))
     flight = SteppedMotion(instrument.spin_inertia, (x, y, z), instrument.delay, steps=2)
@@ -62,7 +56,7 @@ def throw_information(
 
     def found(unknown):
         drag = _LOST * size * jnp.stack([unknown[6], unknown[7] / typical])
-        body = whole_of(unknown[:6])
+        body = symmetric_matrix(unknown[:6])
         # as in the fit: torques are as uncertain as the body is large
         shaken = noise.grown(jnp.trace(body) / 2)
         got = innovations(data, size * body, drag, instrument, shaken)

@@ -1,57 +1,62 @@
 """``fit_balance``: inertia from throws in air, in absolute size with a reaction wheel aboard."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jax.core import Tracer
+from jaxtyping import Array, Bool, Float, Int
 
 from benchmarks.throws.instrument import Instrument, Tolerance
 from benchmarks.throws.likelihood import Noise, readings_of
+from benchmarks.throws.numerics import entries_of, symmetric_matrix, whiteness_of
 from benchmarks.throws.scoring import Known, solve_balance, start_of
-from polhode._checks import is_concrete, require
-from polhode._scene import State
-from polhode.fit._conclude import combine_flags, symmetric_std, turn_std, whiteness_of
-from polhode.fit._findings import Finding
-from polhode.fit._model import (
-    Base,
-    Drag,
-    FullTensor,
-    Parameters,
-    SteppedMotion,
-    base_of,
-    entries_of,
-    free_columns,
-    whole_of,
-)
-from polhode.fit._numerics import compiled, eigh
-from polhode.fit._recording import Recording, require_channel, stack
-from polhode.fit._residuals import Model
-from polhode.fit._result import Fit, InertiaEstimate, checked_fit
-from polhode.inertia import Inertia, principal, second_moments
+from polhode.fit import FitError, Recording, stack
+from polhode.inertia import Inertia, principal
+
+# a third less time to compile
+_OPTIONS: dict[str, Any] = {"compiler_options": {"xla_cpu_use_fusion_emitters": False}}
 
 
 class ThrowFit(eqx.Module):
-    """A ``polhode.fit.Fit``, whose attributes this object has, and the instrument that was found.
+    """Inertia, drag, instrument and noise by maximum likelihood; leading axis n: the bodies.
 
-    **Fields:** ``fit``; ``instrument``, as estimated where a ``tolerance`` was given;
-    ``noise_levels``: standard deviations of readings and disturbing torques;
-    ``negative_log_likelihood`` (n,): of all readings together, up to a constant; ``block``.
+    **Fields:** ``inertia`` (without a wheel its largest moment is 1), ``moments``, ``axes``,
+    ``ratios`` and their standard deviations as of ``polhode.fit.Fit``; ``drag`` (n, 2): linear and
+    quadratic; ``covariance`` (n, 8, 8) of the entries xx, yy, zz, yz, zx, xy and ``drag``;
+    ``residuals``: ``"omega"`` (n, m, b, 3) over their standard deviations ``"omega_std"``, rad/s;
+    ``whiteness`` (n,): probability of autocorrelations as large as theirs; ``instrument``, as
+    estimated where a ``tolerance`` was given; ``noise_levels``: standard deviations of readings and
+    disturbing torques; ``negative_log_likelihood`` (n,): of all readings together, up to a
+    constant; ``steps``, ``converged`` (n,): of the optimiser; ``scale_known``, ``block``.
     """
 
-    fit: Fit
+    inertia: Inertia
+    moments: Float[Array, "n 3"]
+    axes: Float[Array, "n 4"]
+    ratios: Float[Array, "n 3"]
+    moments_std: Float[Array, "n 3"]
+    ratios_std: Float[Array, "n 3"]
+    drag: Float[Array, "n 2"]
+    covariance: Float[Array, "n 8 8"]
+    residuals: dict[str, Array]
+    whiteness: Float[Array, " n"]
     instrument: Instrument
     noise_levels: Noise
     negative_log_likelihood: Float[Array, " n"]
+    steps: Int[Array, " n"]
+    converged: Bool[Array, " n"]
+    scale_known: bool = eqx.field(static=True)
     block: int = eqx.field(static=True)
 
-    def __getattr__(self, name: str) -> Any:
-        if name.startswith("__") or name == "fit":
-            raise AttributeError(name)
-        return getattr(self.fit, name)
+    @property
+    def is_usable(self) -> bool:
+        """Whether the search for every body converged to finite numbers."""
+        finite = np.isfinite(self.inertia.tensor).all() and np.isfinite(self.covariance).all()
+        return bool(np.all(self.converged) and finite)
 
 
 def fit_balance(
@@ -91,8 +96,8 @@ def fit_balance(
     """
     given = stack(recordings)
     wheel = instrument.spin_inertia is not None
-    require(given.omega is not None, "a balance needs omega_body in every recording.")
-    require(
+    _require(given.omega is not None, "a balance needs omega_body in every recording.")
+    _require(
         (given.wheel is not None) == wheel,
         "an instrument with a wheel needs wheel_speed in every recording."
         if wheel
@@ -100,25 +105,33 @@ def fit_balance(
     )
     numbers = np.zeros(len(recordings), int) if bodies is None else np.asarray(bodies)
     count = int(numbers.max()) + 1
-    require(
+    _require(
         numbers.shape == (len(recordings),) and set(numbers.tolist()) == set(range(count)),
         f"bodies must number the body of each of {len(recordings)} recordings from 0 on without "
         f"leaving one out, got {numbers.tolist()}.",
     )
-    require(is_concrete(given.times), "fit_balance takes arrays, not traced values.")
+    _require(not isinstance(given.times, Tracer), "fit_balance takes arrays, not traced values.")
     present = np.asarray(given.present) > 0
-    if wheel:
-        present = present & (np.asarray(require_channel("wheel_known", given.wheel_known)) > 0)
-    require(
-        present.sum(axis=1) >= 8,
+    if given.wheel_known is not None:
+        present = present & (np.asarray(given.wheel_known) > 0)
+    _require(
+        present.sum(axis=1).min() >= 8,
         "each recording needs at least 8 samples with rates and wheel, got "
         f"{present.sum(axis=1).min()}.",
     )
     places, used = _by_body(numbers, count)
-    estimate = _together(given, jnp.asarray(numbers), places, used, instrument, tolerance, block)
-    found = _fit_of(estimate, block)
-    checked_fit(found.fit, throw)
-    return found
+    fit = _together(given, jnp.asarray(numbers), places, used, instrument, tolerance, block)
+    if throw and not fit.is_usable:
+        raise FitError(
+            f"{int(np.sum(~np.asarray(fit.converged)))} of {count} bodies did not converge, or are"
+            " not finite. Pass throw=False to get the result all the same."
+        )
+    return fit
+
+
+def _require(condition: bool, message: str) -> None:
+    if not condition:
+        raise ValueError(message)
 
 
 def fit_each(fit: ThrowFit, recordings: Sequence[Recording], body: int = 0) -> ThrowFit:
@@ -132,12 +145,7 @@ def fit_each(fit: ThrowFit, recordings: Sequence[Recording], body: int = 0) -> T
     )
     given, block = stack(recordings), fit.block
     fits = [
-        _fit_of(
-            _alone(
-                jax.tree.map(lambda x, k=k: x[k : k + 1], given), instrument, noise, tensor, block
-            ),
-            block,
-        )
+        _alone(jax.tree.map(lambda x, k=k: x[k : k + 1], given), instrument, noise, tensor, block)
         for k in range(len(recordings))
     ]
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *fits)
@@ -153,186 +161,82 @@ def _by_body(numbers: np.ndarray, count: int) -> tuple[Array, Array]:
     return jnp.asarray(places), jnp.asarray(used)
 
 
-class _Estimate(NamedTuple):
-    """Arrays of the ``Fit`` of a balance; all have the leading axis n."""
-
-    body: InertiaEstimate
-    values: list[Array]  # tensor (n, 3, 3), linear and quadratic drag (n,)
-    std: list[Array]
-    information: Float[Array, "n 8 8"]
-    covariance: Float[Array, "n 8 8"]
-    null_count: Int[Array, " n"]
-    noise: Float[Array, " n"]
-    whiteness: Float[Array, " n"]
-    rms: Float[Array, " n"]
-    diagnostics: Int[Array, " n"]
-    residuals: dict[str, Array]
-    rates: Float[Array, "n m 3"]
-    base: Base
-    instrument: Instrument
-    noise_levels: Noise
-    negative_log_likelihood: Float[Array, " n"]
-    steps: Int[Array, " n"]
-
-
-@compiled
-def _together(recording, numbers, places, used, instrument, tolerance, block) -> _Estimate:
+@eqx.filter_jit(**_OPTIONS)
+def _together(recording, numbers, places, used, instrument, tolerance, block) -> ThrowFit:
     data = readings_of(recording, numbers, block)
     sigma, noise = start_of(data, instrument, places.shape[0])
     known = Known(sigma, instrument, tolerance or Tolerance(), noise)
     solution = solve_balance(data, known, "instrument" if tolerance else "noise")
-    return _concluded(solution, recording, places, used)
+    return _fit_of(solution, places, used, block)
 
 
-@compiled
-def _alone(recording, instrument, noise, tensor, block) -> _Estimate:
+@eqx.filter_jit(**_OPTIONS)
+def _alone(recording, instrument, noise, tensor, block) -> ThrowFit:
     sigma = (jnp.trace(tensor) / 2 * jnp.eye(3, dtype=tensor.dtype) - tensor)[None]
     data = readings_of(recording, jnp.zeros(1, int), block)
     noise = Noise(*(x[None] for x in noise[:5]), *noise[5:])
     known = Known(sigma, instrument, Tolerance(), noise)
     one = jnp.zeros((1, 1), int), jnp.ones((1, 1))
-    return _concluded(solve_balance(data, known, "tensor"), recording, *one)
+    return _fit_of(solve_balance(data, known, "tensor"), *one, block)
 
 
-def _concluded(found, recording: Recording, places: Array, used: Array) -> _Estimate:
-    """Uncertainty and diagnostics of every body, its recordings at ``places`` (n, m)."""
+def _fit_of(found, places: Array, used: Array, block: int) -> ThrowFit:
+    """Uncertainty of every body, its recordings at ``places`` (n, m)."""
     sized = found.instrument.spin_inertia is not None
     dtype = found.tensors.dtype
     used = used.astype(dtype)
 
-    def one(tensor, drag, covariance, rest, spread, first, used, levels):
+    def one(tensor, drag, covariance, rest, spread, used, levels, instrument):
         moments, axes, _ = principal(tensor)
 
         def derived(vector):
-            values, _, products = principal(whole_of(vector[:6]))
-            every = jnp.concatenate([values, products, vector])
-            every = every if sized else every / values[2]
-            return jnp.concatenate([every, (values / values[2]).at[2].set(1)])
+            values, _, _ = principal(symmetric_matrix(vector[:6]))
+            unit = jnp.ones_like(values[2]) if sized else values[2]
+            return jnp.concatenate([values / unit, vector / unit, values / values[2]])
 
-        # moments, products, entries, drag and ratios begin at 0, 3, 6, 12, 14
+        # moments, entries and drag, ratios begin at 0, 3, 11
         slope = jax.jacfwd(derived)(jnp.concatenate([entries_of(tensor), drag]))
         covariance = slope @ covariance @ slope.T
         std = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
-        covariance = covariance[6:14, 6:14]
         size = jnp.ones_like(moments[2]) if sized else moments[2]
         tensor, moments = tensor / size, moments / size
-        # without a wheel the data do not show the size
-        moments_std, entries_std = std[:3], std[6:12]
-        if not sized:
-            moments_std, entries_std = (
-                jnp.full_like(x, jnp.inf) for x in (moments_std, entries_std)
-            )
         rest, spread = (x * used[:, None, None] for x in (rest, spread))
         read = jnp.any(rest != 0, axis=-1).astype(dtype)
-        samples = 3 * jnp.maximum(jnp.sum(read), 1)
-        noise, rms = (jnp.sqrt(jnp.sum(x**2) / samples) for x in (rest, rest * spread))
-        whiteness, trace = whiteness_of(rest, read), jnp.trace(tensor)
-        finite = jnp.all(jnp.isfinite(tensor)) & jnp.all(jnp.isfinite(covariance))
-        diagnostics = combine_flags(
-            {
-                Finding.STEP_LIMIT: ~found.converged,
-                Finding.NOT_FINITE: ~finite,
-                Finding.NEARLY_FLAT: trace / 2 - moments[2] < 1e-4 * trace,
-                Finding.NOT_WHITE: whiteness < 1e-4,
-                Finding.WEAK: jnp.any(std[14:16] > 0.05),
-            }
-        )
-        information, null_count = _pseudo_inverse(covariance)
-        body = InertiaEstimate(
+        return ThrowFit(
             inertia=Inertia(full=tensor),
             moments=moments,
             axes=axes,
             ratios=moments / moments[2],
-            moments_std=moments_std,
-            ratios_std=std[14:],
-            axes_std=turn_std(moments, std[3:6]),
-            scale_known=sized,
-            handedness_known=False,
-        )
-        return _Estimate(
-            body=body,
-            values=[tensor, *(drag / size)],
-            std=[symmetric_std(entries_std), *std[12:14]],
-            information=information,
-            covariance=covariance,
-            null_count=null_count,
-            noise=noise,
-            whiteness=whiteness,
-            rms=rms,
-            diagnostics=diagnostics,
+            # without a wheel the data do not show the size
+            moments_std=std[:3] if sized else jnp.full_like(std[:3], jnp.inf),
+            ratios_std=std[11:].at[2].set(0),
+            drag=drag / size,
+            covariance=covariance[3:11, 3:11],
             residuals={"omega": rest, "omega_std": spread},
-            rates=first * used[:, None],
-            base=base_of(second_moments(tensor), sized),
-            instrument=found.instrument,
+            whiteness=whiteness_of(rest, read),
+            instrument=instrument,
             noise_levels=levels.grown(1 / size),
             negative_log_likelihood=found.negative_log_likelihood,
             steps=found.steps,
+            converged=found.converged,
+            scale_known=sized,
+            block=block,
         )
 
     # those that all bodies share as well
-    shared = (jnp.broadcast_to(x, used.shape[:1]) for x in found.noise[5:])
+    count = used.shape[0]
+    shared = (jnp.broadcast_to(x, (count,)) for x in found.noise[5:])
     levels = Noise(*found.noise[:5], *shared)
-    first = found.instrument.rates(require_channel("omega", recording.omega)[:, 0])
+    instrument = jax.tree.map(
+        lambda x: jnp.broadcast_to(x, (count, *jnp.shape(x))), found.instrument
+    )
     return jax.vmap(one)(
         found.tensors,
         found.drag,
         found.covariance,
         found.rest[places],
         found.spread[places],
-        first[places],
         used,
         levels,
+        instrument,
     )
-
-
-def _pseudo_inverse(matrix: Float[Array, "p p"]) -> tuple[Float[Array, "p p"], Int[Array, ""]]:
-    """Pseudo-inverse of a covariance in units of its own, and how many directions it lacks."""
-    size = jnp.sqrt(jnp.diagonal(matrix))
-    safe = jnp.where(size > 0, size, 1)
-    values, vectors = eigh(matrix / safe[:, None] / safe[None])
-    shown = values > 1e3 * float(jnp.finfo(matrix.dtype).eps) * values[-1]
-    inverted = jnp.where(shown, 1 / jnp.where(shown, values, 1), 0)
-    return (vectors * inverted[None]) @ vectors.T / safe[:, None] / safe[None], jnp.sum(~shown)
-
-
-def _fit_of(estimate: _Estimate, block: int) -> ThrowFit:
-    """The arrays as a ``ThrowFit``; outside of jit, for the wheel's axis is a static number."""
-    device, rates = estimate.instrument, estimate.rates
-    sized = estimate.body.scale_known
-    _, linear, quadratic = estimate.values
-    columns = free_columns(FullTensor(), sized)
-    x, y, z = (float(part) for part in np.asarray(device.axis)[0])
-    zero = jnp.zeros_like(linear)
-    motion = SteppedMotion(
-        device.spin_inertia, (x, y, z), device.delay, Drag(zero, zero), fit_drag=True
-    )
-    parameters = Parameters(
-        jnp.zeros((*linear.shape, columns.shape[1]), linear.dtype),
-        rates,
-        bias=device.bias,
-        motion={"drag": Drag(linear, quadratic), "delay": None},
-    )
-    unit = jnp.asarray([1, 0, 0, 0], rates.dtype)
-    fit = Fit(
-        values=estimate.values,
-        std=estimate.std,
-        sensor={},
-        sensor_std={},
-        initial=State(jnp.broadcast_to(unit, (*rates.shape[:-1], 4)), rates),
-        information=estimate.information,
-        covariance=estimate.covariance,
-        null_count=estimate.null_count,
-        noise=estimate.noise,
-        whiteness=estimate.whiteness,
-        rms=estimate.rms,
-        diagnostics=estimate.diagnostics,
-        steps=estimate.steps,
-        attempts=jnp.ones_like(estimate.steps),
-        residuals=estimate.residuals,
-        parameters=parameters,
-        model=Model(
-            motion, estimate.base, columns=tuple(map(tuple, columns.tolist())), scale_known=sized
-        ),
-        _inertia=estimate.body,
-    )
-    return ThrowFit(fit, device, estimate.noise_levels, estimate.negative_log_likelihood, block)

@@ -1,27 +1,19 @@
 """A gyroscope beside a reaction wheel: calibration parameters, and preparation of recordings."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import as_float_array, require_positive
-from polhode.fit._numerics import solve
-from polhode.fit._recording import Recording, central_slope, require_channel
-from polhode.fit._solve import integrate
-from polhode.rotation import wxyz_to_matrix
+from benchmarks.throws.numerics import attitudes, central_differences
+from polhode.fit import Recording
 
 
-def _vector(name: str, *rows: int) -> Callable[[Any], Any]:
-    """Converter of a field to floats of shape (*rows, 3); None stays."""
-
-    def convert(value: Any) -> Any:
-        return None if value is None else as_float_array(name, value, (*rows, 3))
-
-    return convert
+def _as_floats(value: Any) -> Any:
+    return None if value is None else jnp.asarray(value, float)
 
 
 class Instrument(eqx.Module):
@@ -35,14 +27,17 @@ class Instrument(eqx.Module):
     """
 
     spin_inertia: Array | float | None
-    axis: Float[Array, " 3"] = eqx.field(converter=_vector("axis"), default=(0.0, 0.0, 1.0))
+    axis: Float[Array, " 3"] = eqx.field(converter=_as_floats, default=(0.0, 0.0, 1.0))
     delay: Array | float = 0.0
-    skew: Float[Array, "3 3"] | None = eqx.field(converter=_vector("skew", 3), default=None)
-    bias: Float[Array, " 3"] | None = eqx.field(converter=_vector("bias"), default=None)
+    skew: Float[Array, "3 3"] | None = eqx.field(converter=_as_floats, default=None)
+    bias: Float[Array, " 3"] | None = eqx.field(converter=_as_floats, default=None)
 
     def __check_init__(self) -> None:
-        if self.spin_inertia is not None:
-            require_positive("spin_inertia", self.spin_inertia, hint="None stands for no wheel")
+        spin = self.spin_inertia
+        if isinstance(spin, float | int | np.ndarray) and not np.all(spin > 0):
+            raise ValueError(
+                f"spin_inertia must be positive, got {spin}; None stands for no wheel."
+            )
 
     def rates(self, reading: Float[Array, "*t 3"]) -> Float[Array, "*t 3"]:
         """True rates, rad/s, sensor axes."""
@@ -82,14 +77,14 @@ def lever_arm(recording: Recording) -> Float[Array, "*b 3"]:
     ``alpha``. Needs ``force`` and ``omega``.
     """
 
-    def one(times, present, omega, force):
-        slope = central_slope(omega, times)
+    def normal_equations(times, present, omega, force):
+        slope = central_differences(omega, times)
         unit = jnp.eye(3, dtype=omega.dtype)
 
         def felt(arm):
             return jnp.cross(slope, arm) + jnp.cross(omega, jnp.cross(omega, arm))
 
-        turn = jnp.swapaxes(wxyz_to_matrix(integrate(omega, slope, times)), -1, -2)
+        turn = jnp.swapaxes(attitudes(omega, slope, times), -1, -2)
         late = (times - times[0])[:, None, None]
         design = jnp.concatenate([jax.vmap(felt, out_axes=-1)(unit), turn, late * turn], axis=-1)
         # a difference reaches to both neighbours
@@ -97,13 +92,14 @@ def lever_arm(recording: Recording) -> Float[Array, "*b 3"]:
         whole = whole.at[0].set(0).at[-1].set(0)
         design = design * whole[:, None, None]
         square = jnp.einsum("tij,tik->jk", design, design)
-        return solve(square, jnp.einsum("tij,ti->j", design, force))[:3]
+        return square, jnp.einsum("tij,ti->j", design, force)
 
     batch = recording.batch_shape
-    omega, force = (
-        require_channel("omega", recording.omega),
-        require_channel("force", recording.force),
-    )
-    parts = (recording.times, recording.present, omega, force)
+    if recording.omega is None or recording.force is None:
+        raise ValueError("lever_arm needs omega_body and force_body in the recording.")
+    parts = (recording.times, recording.present, recording.omega, recording.force)
     flat = [part.reshape(-1, *part.shape[len(batch) :]) for part in parts]
-    return jax.vmap(one)(*flat).reshape(*batch, 3)
+    systems = jax.vmap(normal_equations)(*flat)
+    # one after the other: batched calls of LAPACK can deadlock (jax below 0.12)
+    solutions = jax.lax.map(lambda system: jnp.linalg.solve(*system), systems)
+    return solutions[:, :3].reshape(*batch, 3)

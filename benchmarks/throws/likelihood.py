@@ -15,9 +15,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from benchmarks.throws.instrument import Instrument
-from polhode.fit._recording import Recording, central_slope, interpolate_gaps, require_channel
-from polhode.fit._solve import integrate
-from polhode.rotation import wxyz_to_matrix
+from benchmarks.throws.numerics import (
+    attitudes,
+    central_differences,
+    cofactors_of,
+    interpolate_gaps,
+    inverse_of,
+)
+from polhode.fit import Recording
 
 
 class Noise(NamedTuple):
@@ -61,12 +66,10 @@ class Readings(NamedTuple):
 def readings_of(recording: Recording, body: Array, block: int) -> Readings:
     """Prepare recordings (leading axis r) of the bodies with numbers ``body`` (r,)."""
     times = recording.times
-    omega = interpolate_gaps(times, recording.present, recording.omega)
-    still = recording.wheel is None
-    wheel = jnp.zeros_like(times) if still else recording.wheel
-    sample = recording.present
-    if not still:
-        sample = sample * require_channel("wheel_known", recording.wheel_known)
+    omega = jax.vmap(interpolate_gaps)(times, recording.present, recording.omega)
+    wheel, sample = jnp.zeros_like(times), recording.present
+    if recording.wheel is not None and recording.wheel_known is not None:
+        wheel, sample = recording.wheel, sample * recording.wheel_known
     count = (times.shape[1] - 1) // block
 
     def blocks(values):
@@ -124,7 +127,7 @@ def innovations(
         return values[: count * block].reshape(count, block, *values.shape[1:])
 
     rates = instrument.rates(data.omega)
-    turn = wxyz_to_matrix(integrate(rates, central_slope(rates, data.times), data.times))
+    turn = attitudes(rates, central_differences(rates, data.times), data.times)
     carried = instrument.carried(data.times, data.wheel) / size
     speed = jnp.sqrt(jnp.sum(rates**2, axis=1, keepdims=True) + jnp.finfo(rates.dtype).tiny)
     push = -(drag[0] + drag[1] * speed) / size * rates
@@ -184,29 +187,10 @@ def _hat(vector: Float[Array, "b 3"]) -> Float[Array, "b 3 3"]:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _cofactors(matrix: Float[Array, "*b 3 3"]) -> tuple[Array, Array]:
-    """Determinants and cofactors of symmetric matrices."""
-    a, b, c = (matrix[..., k, k] for k in range(3))
-    p, q, r = matrix[..., 1, 2], matrix[..., 2, 0], matrix[..., 0, 1]
-    rows = [
-        [b * c - p * p, p * q - r * c, r * p - q * b],
-        [p * q - r * c, a * c - q * q, q * r - p * a],
-        [r * p - q * b, q * r - p * a, a * b - r * r],
-    ]
-    found = jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-    return jnp.sum(matrix[..., 0, :] * found[..., 0, :], axis=-1), found
-
-
-def inverse_of(matrix: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
-    """Inverses of symmetric matrices, written out."""
-    determinant, found = _cofactors(matrix)
-    return found / determinant[..., None, None]
-
-
 def negative_log_likelihood(found: Innovations) -> Float[Array, ""]:
     """Minus the logarithm of the likelihood, but for a constant."""
     weighed = jnp.einsum("bi,bij,bj->", found.rest, inverse_of(found.covariance), found.rest)
-    return (weighed + jnp.sum(jnp.log(_cofactors(found.covariance)[0]))) / 2
+    return (weighed + jnp.sum(jnp.log(cofactors_of(found.covariance)[0]))) / 2
 
 
 class Score(NamedTuple):

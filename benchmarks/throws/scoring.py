@@ -15,9 +15,13 @@ from jaxtyping import Array, Float
 
 from benchmarks.throws.instrument import Instrument, Tolerance
 from benchmarks.throws.likelihood import Noise, Readings, Score, innovations, score_of
-from polhode.fit._model import SCALE, FullTensor, base_of, entries_of, free_columns, tensor_of
-from polhode.fit._numerics import inverse, solve
-from polhode.fit._solve import regression
+from benchmarks.throws.numerics import (
+    SCALE,
+    entries_of,
+    origin_of,
+    start_by_regression,
+    tensor_of,
+)
 
 # directions of symmetric traceless matrices, orthonormal
 _SKEW = np.zeros((5, 3, 3))
@@ -27,7 +31,7 @@ for _k, (_i, _j) in enumerate(((1, 2), (2, 0), (0, 1))):
     _SKEW[2 + _k, _i, _j] = _SKEW[2 + _k, _j, _i] = np.sqrt(0.5)
 # directions of the tensor: all six, or five and the size, which throws without a wheel do not show
 _SIZED = np.eye(6)
-_SIZELESS = np.concatenate([free_columns(FullTensor(), False), SCALE[:, None]], axis=1)
+_SIZELESS = np.linalg.svd(SCALE[None])[2][::-1].T
 # Unknowns of a recording: of its body's tensor, drag and noise, of the noise that all share, of the
 # instrument.
 _TENSOR, _DRAG, _LEVEL, _COMMON, _DEVICE = 6, 2, 5, 2, 11
@@ -77,8 +81,8 @@ class Known(eqx.Module):
     def tensor(self, shape: Float[Array, " 6"], sigma: Float[Array, "3 3"]) -> Array:
         """The tensor (3, 3); without a wheel ``shape`` leaves its size alone."""
         if self.instrument.spin_inertia is not None:
-            return tensor_of(shape, base_of(sigma, True), _SIZED)
-        return tensor_of(shape.at[5].set(0), base_of(sigma, True), _SIZELESS)
+            return tensor_of(shape, origin_of(sigma), _SIZED)
+        return tensor_of(shape.at[5].set(0), origin_of(sigma), _SIZELESS)
 
     def parts(self, unknown: Float[Array, " 26"], body: Array, drag: Array):
         """Tensor, drag, instrument and noise of one recording; ``drag``: its unit, over size."""
@@ -188,7 +192,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         bends = (every[1:] - every[:1]) / _SHIFT
         # covariances, were the noise known
         quiet = 1 - loud
-        sure = inverse(information * quiet[None] * quiet[:, None] + jnp.diag(loud))
+        sure = jnp.linalg.inv(information * quiet[None] * quiet[:, None] + jnp.diag(loud))
         where = place[:, others]
         sure = sure[where[:, :, None], where[:, None, :]]
         found = jnp.einsum("rpq,mrpq->rm", sure, bends) / 2
@@ -201,7 +205,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
 
     def far(score, lost):
         """How far from the likeliest all is, in standard deviations; bodies count in full."""
-        covariance = inverse(score.information)
+        covariance = jnp.linalg.inv(score.information)
         left = covariance @ (score.slope + lost) / jnp.sqrt(jnp.diagonal(covariance))
         return jnp.maximum(jnp.max(jnp.abs(left[inner])), jnp.max(jnp.abs(left)) / 4)
 
@@ -221,7 +225,8 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
             )  # fmt: skip
             distance = far(score, lost)
         shown = score.information
-        move = -solve(shown + damping * jnp.diag(held * jnp.diagonal(shown)), score.slope + lost)
+        shown = shown + damping * jnp.diag(held * jnp.diagonal(shown))
+        move = -jnp.linalg.solve(shown, score.slope + lost)
         # from a start far off, noise so large that everything is likely would be a step away
         move = move / jnp.maximum(1, jnp.max(jnp.abs(loud * move)) / _LOUDER)
         return unknown, move, score, lost, rounds, damping, distance, steps + 1
@@ -236,7 +241,7 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
     nothing = Score(large, zero, jnp.eye(loud.size, dtype=dtype), blank, blank)
     state = (zero, zero, nothing, zero, 0, jnp.asarray(3e-3, dtype), large, 0)
     unknown, _, score, *_, distance, steps = jax.lax.while_loop(unsettled, again, state)
-    covariance = inverse(score.information)
+    covariance = jnp.linalg.inv(score.information)
     shared = jnp.broadcast_to(unknown[count * own :], (count, used - own))
     rest = jnp.zeros((count, _PARTS[3] + _DEVICE - used), dtype)
     every = jnp.concatenate([unknown[first], shared, rest], axis=1)
@@ -285,12 +290,13 @@ def start_of(data: Readings, instrument: Instrument, count: int) -> tuple[Array,
         weight = jnp.repeat(data.known, block, axis=1)
         weight = jnp.pad(weight, ((0, 0), (0, data.times.shape[1] - weight.shape[1])))
         weight = weight * (data.body == body).astype(data.times.dtype)[:, None]
-        _, sigma, _ = regression(rates, data.times, weight, carried)
+        sigma = start_by_regression(rates, data.times, weight, carried)
         return sigma, jnp.sqrt(
             jnp.sum(weight[..., None] * rates**2) / jnp.maximum(jnp.sum(weight), 1)
         )
 
-    sigma, typical = jax.vmap(one)(jnp.arange(count))
+    # one body after the other: batched calls of LAPACK can deadlock (jax below 0.12)
+    sigma, typical = jax.lax.map(one, jnp.arange(count))
     size = jnp.trace(sigma, axis1=1, axis2=2)
     span = data.times[0, -1] - data.times[0, 0]
     fast = jnp.max(jnp.abs(data.wheel))

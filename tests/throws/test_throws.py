@@ -19,8 +19,8 @@ from benchmarks.throws import (
     fit_each,
     lever_arm,
 )
+from benchmarks.throws.numerics import whiteness_of
 from polhode.fit import Recording, averaged, stack
-from polhode.fit._conclude import whiteness_of
 
 SPIN = 1.7e-6
 TENSORS = 1e-6 * np.array(
@@ -150,9 +150,7 @@ def test_throws_without_a_wheel_show_ratios():
     assert np.max(fit.ratios_std) < 2e-3
     assert not fit.scale_known
     assert np.all(np.isinf(fit.moments_std))
-    np.testing.assert_array_equal(fit.null_count, [1])
     np.testing.assert_allclose(fit.noise_levels.omega, 0.01, rtol=0.15)
-    assert "Only ratios" in fit.report()
 
 
 @pytest.mark.slow
