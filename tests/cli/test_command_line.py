@@ -361,6 +361,43 @@ cli.command()
     assert done.returncode == 130
 
 
+def test_an_interrupt_waits_for_the_end_of_an_import(tmp_path):
+    """An extension module of jaxlib that an exception leaves while it is initialised aborts the
+    process; and pydantic turns an interrupt into an error of its own."""
+    (tmp_path / "slow_module.py").write_text("""
+import os, signal
+os.kill(os.getpid(), signal.SIGINT)
+loaded = sum(range(100000)) > 0
+print("loaded", flush=True)
+""")
+    (tmp_path / "runs.py").write_text("""
+import time
+from polhode.cli import _process
+try:
+    with _process.signal_handlers():
+        import slow_module
+        time.sleep(20)
+except KeyboardInterrupt:
+    print("interrupted")
+try:
+    with _process.signal_handlers():
+        try:
+            import os, signal
+            os.kill(os.getpid(), signal.SIGINT)
+        except KeyboardInterrupt:
+            raise ValueError("of another library")
+except KeyboardInterrupt:
+    print("interrupted")
+""")
+    before = signal.getsignal(signal.SIGINT)
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    done = subprocess.run(
+        [sys.executable, "runs.py"], cwd=tmp_path, capture_output=True, text=True, timeout=60
+    )
+    signal.signal(signal.SIGINT, before)
+    assert done.stdout.split() == ["loaded", "interrupted", "interrupted"], done.stderr
+
+
 def test_interrupt_of_a_running_process_leaves_nothing_half_written(here):
     output = here / "new" / "top.nc"
     command = [sys.executable, "-m", "polhode.cli", "run", "top.toml", "-o", str(output),

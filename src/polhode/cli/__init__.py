@@ -38,6 +38,8 @@ def command() -> None:
     """
     try:
         code = main()
+    except KeyboardInterrupt:  # before the command line was read
+        code = 130
     except SystemExit as ended:
         if ended.code != 143:
             raise

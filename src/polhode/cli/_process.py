@@ -32,19 +32,46 @@ def signal_handlers() -> Iterator[None]:
         return
 
     def stop(number: int, frame: types.FrameType | None) -> None:
-        _received.append(number)
-        check_signals()
+        if number != alarm:
+            _received.append(number)
+        if alarm is not None and _is_importing(frame):
+            signal.signal(alarm, stop)
+            signal.setitimer(signal.ITIMER_REAL, _AGAIN)
+        else:
+            check_signals()
 
+    alarm = getattr(signal, "SIGALRM", None)  # not on Windows
     watched = [signal.SIGTERM]
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not of a background job
         watched.append(signal.SIGINT)
     previous = {number: signal.signal(number, stop) for number in watched}
+    if alarm is not None:
+        previous[alarm] = signal.getsignal(alarm)
     try:
         yield
         check_signals()
+    except Exception:
+        check_signals()  # a library may have turned the interrupt into an error of its own
+        raise
     finally:
+        if alarm is not None:
+            signal.setitimer(signal.ITIMER_REAL, 0)
         for number, handler in previous.items():
             signal.signal(number, handler)
+
+
+_AGAIN = 0.05
+"""[s] After which a signal that came during an import is looked at again."""
+
+
+def _is_importing(frame: types.FrameType | None) -> bool:
+    """Whether a module is being imported: an extension module of jaxlib, left by an exception while
+    it is initialised, aborts the process."""
+    while frame is not None:
+        if frame.f_code.co_filename.startswith("<frozen importlib"):
+            return True
+        frame = frame.f_back
+    return False
 
 
 def check_signals() -> None:
