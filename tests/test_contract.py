@@ -70,6 +70,31 @@ def test_a_free_body_loads_neither_diffrax_nor_applications():
     assert result.stdout.split("\n")[:2] == ["[]", "True"]
 
 
+CONSTRUCTED = """
+import jax, numpy as np, polhode as ph
+compiled = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda name, seconds, **_: compiled.append(name) if "backend_compile" in name else None
+)
+state = ph.State([1, 0, 0, 0.2], np.deg2rad(5.0) * np.ones(3))
+boxes = ph.Inertia.from_box(12.0, [0.2263, 0.1, 0.366]), ph.Inertia.from_cylinder(2.0, 0.1, 0.3)
+body = ph.Inertia.from_moments([1.0, 2.0, 3.0])
+gravity = ph.UniformGravity(1.0, [0, 0, 0.5], [0, 0, -9.8])
+scene = ph.Scene(body, gravity, ph.LinearDamping([0.1, 0.1, 0.2]))
+assert bool(body.is_possible)
+print(len(compiled))
+jax.numpy.ones(3) * 2
+print(len(compiled) > 0)
+"""
+
+
+def test_a_scene_is_described_without_compiling():
+    """Each operation on a single array that JAX compiles takes as long as a thousand of NumPy's."""
+    result = subprocess.run([sys.executable, "-c", CONSTRUCTED], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr[-2000:]
+    assert result.stdout.split() == ["0", "True"]
+
+
 def members(kind: type) -> Iterator[tuple[str, Callable, bool]]:
     """Public methods and properties of a class and its bases here: (name, function, bound)."""
     for base in kind.__mro__:

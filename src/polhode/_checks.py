@@ -38,6 +38,14 @@ def numbers(*arrays: Any) -> Any:
     return np if is_concrete(arrays) and all(_is_here(x) for x in arrays) else jnp
 
 
+def on_host(array: Any) -> Any:
+    """``array`` as a NumPy array where its values are known and it was not put on devices by hand.
+
+    A few operations on it then compile nothing."""
+    known = isinstance(array, jax.Array) and is_concrete(array) and not array.committed
+    return np.asarray(array) if known else array
+
+
 def together(found: Sequence[Any]) -> Any:
     """Where all of these truth values (...) hold, batch axes broadcast; None for none."""
     if not found:
@@ -67,6 +75,9 @@ def describe(value: Any, limit: int = 8) -> str:
     return f"array of shape {array.shape}"
 
 
+_NUMPY = (np.ndarray, np.float32, np.float64)
+
+
 def as_float_array(
     name: str, value: Any, suffix: Sequence[int | None] = (), *, finite: bool = True
 ) -> Array:
@@ -80,8 +91,13 @@ def as_float_array(
         leaves = jax.tree.leaves(value, is_leaf=lambda leaf: leaf is None)
         if any(leaf is None or isinstance(leaf, (str, bytes)) for leaf in leaves):
             raise TypeError("no number")  # jax would read some strings as the name of a dtype
+        # ``jnp.asarray`` compiles a program, and an array is copied: its owner may change it
         if isinstance(value, list | tuple) and all(type(x) in (float, int) for x in leaves):
-            value = jax.device_put(np.asarray(value, float))  # jnp.asarray compiles a program
+            value = jax.device_put(np.array(value, float))
+        elif type(value) is float:
+            value = jax.device_put(value)
+        elif isinstance(value, _NUMPY) and value.dtype in (np.float32, np.float64):
+            value = jax.device_put(np.array(value))
         array = jnp.asarray(value)
     except (TypeError, ValueError, OverflowError) as error:
         raise TypeError(

@@ -18,6 +18,7 @@ from polhode._checks import (
     as_floats,
     as_vectors,
     is_concrete,
+    on_host,
     require,
     require_positive,
 )
@@ -173,9 +174,11 @@ class Inertia(AbstractShaped, AbstractPart):
         """Moments (..., 3) in the form of a symmetry that they are known to have; unchecked."""
         if symmetry is Symmetry.NONE:
             return cls(diagonal=moments, physical=physical)
+        known = on_host(moments)
+        first, last = (as_float_array("a moment", known[..., i], finite=False) for i in (0, 2))
         if symmetry is Symmetry.AXISYMMETRIC:
-            return cls(transverse=moments[..., 0], axial=moments[..., 2], physical=physical)
-        return cls(moment=moments[..., 0], physical=physical)
+            return cls(transverse=first, axial=last, physical=physical)
+        return cls(moment=first, physical=physical)
 
     @classmethod
     def from_log_cholesky(cls, parameters: ArrayLike) -> Self:

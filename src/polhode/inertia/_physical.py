@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from polhode._checks import is_concrete, require, require_positive
+from polhode._checks import is_concrete, numbers, on_host, require, require_positive
 from polhode._kernels import are_close, over_gap, underivable
 from polhode.rotation._quaternion import matrix_row
 
@@ -291,12 +291,15 @@ def possible_moments(moments: Float[Array, "*b 3"], triangle: bool) -> Bool[Arra
     The tolerance is that of the constructors; nothing is looked for, so that it costs a few
     operations in a compiled program.
     """
-    moments = jax.lax.stop_gradient(moments)
-    good = jnp.all((moments > 0) & (moments < jnp.inf), axis=-1)
+    moments = on_host(moments)
+    xp = numbers(moments)
+    if xp is jnp:
+        moments = jax.lax.stop_gradient(moments)
+    good = xp.all((moments > 0) & (moments < jnp.inf), axis=-1)
     if triangle:
         quarter = moments / 4  # so that no sum overflows
-        largest = jnp.max(quarter, axis=-1)
-        good = good & (jnp.sum(quarter, axis=-1) >= (2 - tolerance(moments)) * largest)
+        largest = xp.max(quarter, axis=-1)
+        good = good & (xp.sum(quarter, axis=-1) >= (2 - tolerance(moments)) * largest)
     return good
 
 

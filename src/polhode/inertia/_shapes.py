@@ -10,10 +10,9 @@ from collections.abc import Mapping
 from typing import Any, Self
 
 import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode._checks import ArrayLike, as_floats, require_positive
+from polhode._checks import ArrayLike, as_float_array, as_floats, numbers, on_host, require_positive
 from polhode.inertia._physical import require_below
 
 
@@ -27,12 +26,17 @@ class Symmetry(enum.Enum):
 
 def _of_second_moments(mass: Array, x: Array, y: Array, z: Array) -> Array:
     """Principal moments of a body with mean squares x, y, z of its coordinates."""
-    return mass[..., None] * jnp.stack([y + z, z + x, x + y], axis=-1)
+    return _moments(mass, y + z, z + x, x + y)
 
 
 def _axial(mass: Array, transverse: Array, axial: Array) -> Array:
     """Principal moments (transverse, transverse, axial) times mass."""
-    return mass[..., None] * jnp.stack([transverse, transverse, axial], axis=-1)
+    return _moments(mass, transverse, transverse, axial)
+
+
+def _moments(mass: Array, *squares: Array) -> Array:
+    moments = mass[..., None] * numbers(mass, *squares).stack(squares, axis=-1)
+    return as_float_array("the principal moments", moments, finite=False)
 
 
 class AbstractShaped(eqx.Module):
@@ -63,7 +67,7 @@ class AbstractShaped(eqx.Module):
         lengths = {"sides": sides, "inner_sides": inner_sides}
         mass, a, b = _sized(mass, lengths, {"inner_sides": "sides"}, core=(3,))
         wall = a - b
-        require_positive("the wall, max(sides - inner_sides),", jnp.max(wall, axis=-1))
+        require_positive("the wall, max(sides - inner_sides),", numbers(wall).max(wall, axis=-1))
         squares = []
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
@@ -174,4 +178,5 @@ def _sized(
     for name, outer in inner.items():
         if outer is not None:
             require_below(name, named[name], outer, named[outer])
-    return arrays
+    # so that the formulas compile nothing where the numbers are known
+    return tuple(map(on_host, arrays))
