@@ -198,9 +198,54 @@ def test_a_printed_trajectory_shows_size_status_and_steps():
     scene = ph.Scene(body, torque=ph.LinearDamping(0.1))
     states = ph.State([1.0, 0, 0, 0], [[0.3, 0.2, 1.0], [3.0, 20.0, 10.0]])
     few = ph.LiePoisson(diffrax.Dopri8(), max_steps=16, chunk=1)
-    text = str(ph.simulate(scene, states, [0.0, 5.0], few, throw=False))
+    found = ph.simulate(scene, states, [0.0, 5.0], few, throw=False)
+    text, most = str(found), int(found.steps.max())
     assert "2 bodies x 2 samples" in text
     assert "1 SUCCESSFUL, 1 MAX_STEPS" in text
-    assert "at most 16" in text
+    assert f", at most {most}" in text
+    assert most + int(found.step_counts.refused.max()) == 16  # attempts are limited
     shown = jax.jit(lambda s: [str(ph.simulate(scene, s, [0.0, 5.0])), 0][1])(states)
     assert shown == 0
+
+
+def test_counts_of_steps_show_what_limited_them():
+    """Switches, events and saved times that end steps are counted, and printed where there are any.
+
+    The number of sign changes is known: a torque of constant size about one axis, directed against
+    the turn by the angle so far, swings the body to and fro."""
+    body = ph.Inertia.from_moments([2.0, 2.0, 2.0])
+
+    def against(t, wxyz, omega):
+        return jnp.array([0.0, 0.0, jnp.where(wxyz[0] * wxyz[3] > 0, -1.0, 1.0)])
+
+    swing = ph.Scene(body, torque=ph.FeedbackTorque(against))
+    # the angle 0.16 + t / 2 - t^2 / 4 is zero at t = 2.28, then every 2.561 s, at last at 17.65
+    start = ph.State([np.cos(0.08), 0, 0, np.sin(0.08)], [0, 0, 0.5])
+    found = ph.simulate(swing, start, [0.0, 18.5])
+    counts = found.step_counts
+    assert int(counts.at_switches) == 7
+    assert int(counts.accepted) == int(found.steps) > 7
+    assert int(counts.at_times) == 0
+    assert "ended at a switch or event: 7" in str(found)
+    event = ph.Event(lambda wxyz, omega, t: omega[2])  # at t = 1, 3.56, 6.12, ... 16.37
+    both = ph.simulate(swing, start, [0.0, 18.5], events=[event])
+    assert int(both.step_counts.at_switches) == 7 + 7
+
+    gravity = ph.UniformGravity(1.0, [0.1, 0.2, 0.3], [0.0, 0.0, -9.81])
+    top = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), gravity)
+    states = ph.State([1.0, 0, 0, 0], np.linspace(0.1, 2.0, 40)[:, None] * np.ones(3))
+    often = ph.simulate(top, states, np.linspace(0.0, 2.0, 401))
+    np.testing.assert_array_equal(often.step_counts.at_times, 400)
+    seldom = ph.simulate(top, states, [0.0, 20.0])
+    assert np.all(seldom.step_counts.at_times <= 3)  # the last one, and those halved before it
+    assert "ended at a saved time: 400" in str(often)
+    assert often[3].step_counts.at_times == 400
+    ends = often.at([1.001, 1.0])
+    assert ends.step_counts.accepted.shape == (40,)
+
+    def spun(t):
+        return jnp.array([0.0, 0.0, 5.0 / (1e-4 + (t - 3.0) ** 2)])
+
+    sudden = ph.simulate(ph.Scene(body, torque=ph.BodyTorque(spun)), states[0], [0.0, 6.0])
+    assert int(sudden.step_counts.refused) > 0
+    assert "refused" in str(sudden)

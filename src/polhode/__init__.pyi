@@ -12,7 +12,12 @@ from ._trajectory import (
     Trajectory as Trajectory,
     successful_mean as successful_mean,
 )
-from ._method import Record as Record, Status as Status, SimulationError as SimulationError
+from ._method import (
+    Record as Record,
+    Status as Status,
+    StepCounts as StepCounts,
+    SimulationError as SimulationError,
+)
 from ._plan import Plan as Plan
 from ._propagate import propagate as propagate, Propagation as Propagation
 

@@ -83,6 +83,35 @@ _EXPLANATIONS = {
 }
 
 
+class StepCounts(NamedTuple):
+    """Why the steps of each body were as short as they were; see ``Trajectory.step_counts``.
+
+    **Fields**, each (...) of integers: ``accepted``; ``refused``: attempts whose error was too
+    large, repeated with a shorter step; ``at_switches``: steps that ended where a switch of a
+    torque turned or an event occurred; ``at_times``: steps shortened to end at a saved time. All
+    others were limited by the error of the step. Methods that step by diffrax count the first two
+    only.
+    """
+
+    accepted: Array
+    refused: Array
+    at_switches: Array
+    at_times: Array
+
+    @classmethod
+    def of(
+        cls,
+        accepted: Array,
+        refused: Array | None = None,
+        at_switches: Array | None = None,
+        at_times: Array | None = None,
+    ) -> "StepCounts":
+        """These counts; what is not counted is zero."""
+        accepted = jnp.asarray(accepted)
+        others = (refused, at_switches, at_times)
+        return cls(accepted, *(jnp.zeros_like(accepted) if x is None else x for x in others))
+
+
 class SimulationError(RuntimeError):
     """Some bodies did not finish; ``status`` (of the shape of the batch) states which and why."""
 
@@ -163,7 +192,7 @@ class Samples(NamedTuple):
     wxyz: Array | None
     omega_body: Array | None
     status: Array
-    steps: Array
+    steps: StepCounts
     work: Array | None = None
     error: Array | None = None
     motor_work: Array | None = None

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polhode._checks import ArrayLike, is_concrete
-from polhode._method import AbstractMethod, Record, Samples, Status
+from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts
 from polhode._plan import choose
 from polhode._scene import BodyTorque, SampledTorque, Scene, State, TorqueSum
 from polhode._trajectory import Trajectory, begun
@@ -118,15 +118,15 @@ class HeldCommands(AbstractMethod):
             found = self.method.run(now, State(wxyz, omega), span, share, final)
             there = [x[:, 0] for x in (found.wxyz, found.omega_body, found.spins) if x is not None]
             status = jnp.where(status == Status.SUCCESSFUL, found.status.astype(jnp.int32), status)
-            carry = there, commands, status, steps + found.steps.astype(jnp.int32)
-            return carry, there
+            steps = jax.tree.map(lambda a, b: a + b.astype(a.dtype), steps, found.steps)
+            return (there, commands, status, steps), there
 
         begin = [state.wxyz, state.omega_body, *spins]
         zero = jnp.zeros(bodies, jnp.int32)
         commands = [jnp.zeros((bodies, 3), times.dtype) for _ in laws]
         spans = jnp.stack([times[:-1], times[1:]], axis=-1)
         (_, _, status, steps), passed = jax.lax.scan(
-            segment, (begin, commands, zero, zero), (jnp.asarray(self.edges), spans)
+            segment, (begin, commands, zero, StepCounts.of(zero)), (jnp.asarray(self.edges), spans)
         )
         places = self.places[-1:] if record.final_only else self.places
         wxyz, omega, *spins = (

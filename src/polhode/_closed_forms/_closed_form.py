@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode._batch import is_lane_tree, map_chunks
-from polhode._method import AbstractMethod, Record, Samples, Status
+from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts
 from polhode._scene import BodyTorque, LinearDamping, Scene, State, TorqueSum, Wheels
 from polhode.inertia import Symmetry, VariableInertia
 
@@ -103,7 +103,7 @@ def _samples(wxyz, omega, holds, record: Record) -> Samples:
         wxyz if record.attitude else None,
         omega if record.rates else None,
         status,
-        jnp.zeros(status.shape, status.dtype),
+        StepCounts.of(jnp.zeros_like(status)),
     )
 
 

@@ -29,7 +29,7 @@ from polhode._closed_forms._free_motion import (
 from polhode._closed_forms._free_periods import compensate
 from polhode._closed_forms._free_tangent import Quadruple
 from polhode._kernels import computed_once, kernel, opaque_ones
-from polhode._method import Record, Samples, Status
+from polhode._method import Record, Samples, Status, StepCounts
 from polhode._scene import Scene, State
 from polhode.inertia import Symmetry, principal
 
@@ -140,7 +140,7 @@ class ClosedForm(AbstractClosedForm):
                 parts = jax.tree.map(lambda x: x.reshape(1, -1)[:, :samples], parts)
             wxyz, omega, finite = assemble(parts, axes, state)
         status = jnp.where(finite, Status.SUCCESSFUL, Status.NOT_FINITE)
-        return Samples(wxyz, omega, status, jnp.zeros(n, status.dtype))
+        return Samples(wxyz, omega, status, StepCounts.of(jnp.zeros_like(status)))
 
 
 def _triaxial(moments, products, wxyz, omega, t, requested):

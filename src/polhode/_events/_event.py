@@ -101,7 +101,7 @@ class Event(eqx.Module):
         operands = [*map(jnp.asarray, closed.consts), *leaves]
         delay, *states = attached(rule, operands, values)
         there = approximate._with_samples(
-            approximate._t + delay, states, approximate.status, approximate.steps, None
+            approximate._t + delay, states, approximate.status, approximate._steps, None
         )
         return delay, there
 
@@ -116,13 +116,15 @@ class Event(eqx.Module):
         """
         still = jax.lax.stop_gradient
         value, slope = self.values(approximate)
+        later = shortly_after(approximate)
         touch, chord = slope == 0, still(jnp.where(slope == 0, 1, slope))
         delay = jnp.where(touch, 0, -value / chord)
         delay = delay - still(delay) + still(jnp.clip(delay, -limit, limit))
-        value, _ = self.values(shortly_after(approximate, delay))
+        there = later(delay)
+        value = _FUNCTION.mapped(self.fn, there.wxyz, there.omega_body, there._t)
         change = jnp.where(touch, 0, -value / chord)
         delay = _differentiable(delay + (change - still(change)), 2)
-        return delay, shortly_after(approximate, delay)
+        return delay, later(delay)
 
 
 def _differentiable(x: Array, order: int) -> Array:

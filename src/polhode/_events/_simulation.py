@@ -156,7 +156,7 @@ def _in_order_of_time(trajectory: Trajectory, times, counts, events) -> Trajecto
         trajectory,
         rows,
         lanes(trajectory._samples),
-        (status.reshape(-1), trajectory.steps.reshape(-1)),
+        jax.tree.map(jnp.ravel, (status, trajectory._steps)),
         events,
         (at, which, jnp.sum(met, axis=1)),
         lanes(there._samples),
@@ -189,7 +189,7 @@ def _until_terminal(begin: Trajectory, rows, path, outcome, events, met, states)
         ]
         event_time = jnp.where(stops, stop, jnp.inf)[:, 0].reshape(batch)
     path = [x.reshape(*batch, *x.shape[1:]) for x in path]
-    status, steps = (x.reshape(batch) for x in outcome)
+    status, steps = jax.tree.map(lambda x: x.reshape(batch), outcome)
     nothing = ~happens[..., None]
     attitudes, rates, *_ = (
         jnp.where(nothing, jnp.nan, x).reshape(*batch, *x.shape[1:]) for x in states
@@ -245,8 +245,8 @@ def stopped(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
     path = _stopped_by_loop(lanes, ts, until)
     if path is None:
         path = _stopped_by_windows(lanes, ts, until)
-    wxyz, omega, spins, status, steps, times, event = (
-        None if x is None else x.reshape(*batch, *x.shape[1:]) for x in path
+    wxyz, omega, spins, status, steps, times, event = jax.tree.map(
+        lambda x: x.reshape(*batch, *x.shape[1:]), path
     )
     samples = [wxyz, omega] if spins is None else [wxyz, omega, spins]
     return begin._with_samples(times, samples, status, steps, event)
@@ -325,7 +325,7 @@ def _of_lanes(begin: Trajectory) -> Trajectory:
         wxyz,
         omega,
         begin.status.reshape(n),
-        begin.steps.reshape(n),
+        jax.tree.map(jnp.ravel, begin._steps),
         Scene(**parts),
         spins=spins,
         propagator=begin.propagator,
@@ -398,7 +398,7 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
             wxyz,
             omega,
             lanes.status,
-            lanes.steps,
+            lanes._steps,
             lanes.scene,
             spins=spins[0] if spins else None,
             propagator=now,
@@ -568,4 +568,4 @@ def _stopped_at(lanes: Trajectory, ts: Array, until: Event, met: Array, near: Ar
     status = jnp.where(met, there.status, states.status)
     times = jnp.where(past, event, rows)
     event = jnp.where(met, event[:, 0], jnp.inf)
-    return wxyz, omega, spins[0] if spins else None, status, states.steps, times, event
+    return wxyz, omega, spins[0] if spins else None, status, states._steps, times, event

@@ -45,8 +45,9 @@ class Progress(NamedTuple):
     ``margin``: of the switches at ``y``; ``just_turned``: switches that turned at the start of the
     step; ``needs_rates``: whether ``rate`` must be evaluated anew; ``width``: of the next step [s];
     ``last_error``: logarithm of the last error over its tolerance; ``angle`` so far [rad];
-    ``error``: sum of estimated errors; ``steps`` accepted and ``attempts``; ``reversals``:
-    consecutive switches that turned back at once; ``place``: index of the next sample; ``count``:
+    ``error``: sum of estimated errors; ``steps`` accepted and ``attempts``;
+    ``at_switches``: steps that ended where a switch turned; ``reversals``: consecutive switches
+    that turned back at once; ``place``: index of the next sample; ``count``:
     of events; ``outcome``."""
 
     elapsed: Array
@@ -62,6 +63,7 @@ class Progress(NamedTuple):
     error: Array
     steps: Array
     attempts: Array
+    at_switches: Array
     reversals: Array
     place: Array
     count: Array
@@ -207,13 +209,8 @@ def column(storage: Array, k: Array) -> Array:
 def weighted(weights: np.ndarray | Array, stages: Array) -> Array:
     """Sum (D, B) of ``stages`` (S, D, B) with ``weights`` (S,), without those known to be zero.
     Summed term by term it is one fused loop; a matrix product would not fit into a fused kernel."""
-    total = None
-    for j in range(weights.shape[0]):
-        if isinstance(weights, np.ndarray) and weights[j] == 0:
-            continue
-        term = jnp.asarray(weights[j], stages.dtype) * stages[j]
-        total = term if total is None else total + term
-    return jnp.zeros_like(stages[0]) if total is None else total
+    weights = jnp.asarray(weights, stages.dtype)
+    return jnp.sum(weights[:, None, None] * stages[: weights.shape[0]], axis=0)
 
 
 def _padded(first: Array, rule: Tableau) -> Array:

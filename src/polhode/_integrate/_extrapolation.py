@@ -22,6 +22,7 @@ from polhode._integrate._columns import (
     extrapolated,
     table,
 )
+from polhode._integrate._diffrax_solve import GivenTimes
 from polhode._integrate._field import BoundTerm, FixedArguments, GroupUnits
 from polhode._integrate._midpoint import (
     Field,
@@ -30,7 +31,6 @@ from polhode._integrate._midpoint import (
     initial_progress,
     integrate,
 )
-from polhode._integrate._segments import GivenTimes
 from polhode._integrate._tableau import DOP853, TSIT5, Tableau
 from polhode._kernels import kernel, opaque_ones, staged
 

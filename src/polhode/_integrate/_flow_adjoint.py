@@ -14,11 +14,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
 from polhode._hamiltonian import Dynamics
+from polhode._integrate._diffrax_solve import is_one_step, one_step
 from polhode._integrate._extrapolation import Extrapolation
 from polhode._integrate._field import FixedArguments
 from polhode._integrate._flow_derivative import Equations, equations_of
 from polhode._integrate._midpoint import Progress
-from polhode._integrate._segments import is_one_step, one_step
 from polhode._kernels import attached, is_slope, kernel
 
 

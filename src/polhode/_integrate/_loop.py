@@ -27,6 +27,7 @@ from polhode._integrate._explicit_step import (
 from polhode._integrate._field import weighted_length
 from polhode._integrate._switch_location import SwitchPoint, first_switch, pick, undefined_side
 from polhode._kernels import any_of, kernel, put
+from polhode._method import StepCounts
 
 RUNNING, FINISHED, OUT_OF_STEPS, STEP_TOO_SHORT, NOT_FINITE, SLIDING, AT_EVENT = range(7)
 """Values of ``Progress.outcome``."""
@@ -62,7 +63,7 @@ class Storage(NamedTuple):
 class Solved(NamedTuple):
     """Result of B bodies: see ``Progress`` and ``Storage``; None where no event is stored."""
 
-    steps: Array
+    steps: StepCounts
     outcome: Array
     error: Array
     count: Array | None
@@ -87,9 +88,10 @@ def solve(make: Make, arrays: Any, unit_data: Any, start: Array, ts: Array, y: A
         progress, storage = run(now, options._replace(rtol=rtol), *each_body(start, ts, bodies), y)
         none = (None,) * 4
         count, *events = (progress.count, *storage[1:]) if options.capacity else none
-        return Solved(
-            progress.steps, progress.outcome, progress.error, count, storage.samples, *events
-        )
+        # the first attempt has no width
+        refused = jnp.maximum(progress.attempts - progress.steps - 1, 0)
+        steps = StepCounts.of(progress.steps, refused, progress.at_switches)
+        return Solved(steps, progress.outcome, progress.error, count, storage.samples, *events)
 
     # for more bodies a fused kernel takes four times as long to compile and is not faster
     moved = kernel(moved) if bodies <= _policy.KERNEL_BODIES else moved
@@ -132,6 +134,7 @@ def begin(
         error=zero,
         steps=none,
         attempts=none,
+        at_switches=none,
         reversals=none,
         place=none,
         count=none,
@@ -230,6 +233,7 @@ def advance(
         error=progress.error + choose(error, jnp.zeros_like(error)),
         steps=count(progress.steps, accepted),
         attempts=count(progress.attempts, alive),
+        at_switches=count(progress.at_switches, hit & accepted),
         place=place,
     )
     if turn is not None and undefined is not None:
@@ -436,7 +440,7 @@ class Found(NamedTuple):
 def with_events(search: Search, solved: Solved, times: Array, states: Array):
     """The events, and times (N, T + E) and states (N, T + E, D) of samples and events; samples
     beyond a terminal event are that event."""
-    bodies, capacity = solved.steps.shape[0], search.capacity
+    bodies, capacity = solved.outcome.shape[0], search.capacity
     assert solved.times is not None
     assert solved.states is not None
     assert solved.which is not None

@@ -64,17 +64,19 @@ class Progress(NamedTuple):
     """State of the integration from one saved time to the next; arrays of one entry a body.
 
     ``width``: of the next step [s], 0 if unknown; ``total_angle`` so far [rad]; ``low``: rounding
-    errors of the state (compensated steps); ``steps``; ``error``: sum of the estimated errors
-    [rad]; ``elapsed``: time since the first start [s]; ``reason``: 0, or why the body failed: 1 no
-    steps are left, 2 the steps became too short, 3 likewise because the rates are not finite;
-    ``rows``: states (n, T + 1, C) at the times to be saved, where one call passes all of them; the
-    last row is not used.
+    errors of the state (compensated steps); ``steps``; ``refused`` attempts; ``at_times``: steps
+    shortened to end at a saved time; ``error``: sum of the estimated errors [rad]; ``elapsed``:
+    time since the first start [s]; ``reason``: 0, or why the body failed: 1 no steps are left, 2
+    the steps became too short, 3 likewise because the rates are not finite; ``rows``: states (n, T
+    + 1, C) at the times to be saved, where one call passes all of them; the last row is not used.
     """
 
     width: Array
     total_angle: Array
     low: list[Array]
     steps: Array
+    refused: Array
+    at_times: Array
     error: Array
     elapsed: Array
     reason: Array
@@ -86,7 +88,7 @@ def initial_progress(y: list[Array], compensated: bool, t: Array) -> Progress:
     zero = jnp.zeros_like(y[0])
     low = [jnp.zeros_like(x) for x in y] if compensated else []
     reason = jnp.zeros(zero.shape, jnp.int32)
-    return Progress(zero, zero, low, zero, zero, jnp.zeros_like(t), reason)
+    return Progress(zero, zero, low, zero, zero, zero, zero, jnp.zeros_like(t), reason)
 
 
 class _Saved(NamedTuple):
@@ -142,6 +144,7 @@ class _Carry(NamedTuple):
     total_angle: Array
     error: Array
     steps: Array
+    at_times: Array
     saved: _Saved | None
 
 
@@ -308,6 +311,7 @@ def integrate(
             carry.total_angle + jnp.where(accepted, angle, 0),
             carry.error + jnp.where(accepted, error, 0),
             carry.steps + jnp.where(accepted, 1, 0),
+            carry.at_times + jnp.where(accepted & cut, 1, 0),
             saved,
         )
         return carry, rows
@@ -340,6 +344,7 @@ def integrate(
         progress.total_angle,
         progress.error,
         progress.steps,
+        progress.at_times,
         saved,
     )
 
@@ -354,7 +359,9 @@ def integrate(
         why = jnp.where(left, jnp.where(numbers, 2, 3), 1)
         reason = jnp.where(arrived, 0, jnp.where(fixed.reason > 0, fixed.reason, why))
         # as floats, like the other numbers
-        numbers = carry.width, carry.total_angle, carry.steps, carry.error, reason.astype(dtype)
+        reason = reason.astype(dtype)
+        steps = carry.steps, carry.attempts, carry.at_times
+        numbers = carry.width, carry.total_angle, *steps, carry.error, reason
         return y, carry.integrals, carry.low, numbers
 
     queue = zero.ndim == 1 and field.by_entry and own and _policy.is_refilled(zero.size)
@@ -367,12 +374,14 @@ def integrate(
             (carry, rows),
         )
         result = finished(fixed, carry)
-    y, integrals, low, (width, total_angle, steps, error, reason) = result
+    y, integrals, low, (width, total_angle, steps, attempts, at_times, error, reason) = result
+    refused = progress.refused + attempts - (steps - progress.steps)
     elapsed = progress.elapsed + duration
     if rows is not None and save_times is not None:
         rows = rows.reshape(zero.size, save_times.shape[0] + 1, len(y))
     reason = reason.astype(jnp.int32)
-    return y, integrals, Progress(width, total_angle, low, steps, error, elapsed, reason, rows)
+    counts = steps, refused, at_times
+    return y, integrals, Progress(width, total_angle, low, *counts, error, elapsed, reason, rows)
 
 
 def _drift(angle: Array) -> Array:

@@ -8,29 +8,29 @@ rule for batches, and any solver that the user gives).
 import inspect
 from collections.abc import Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PyTree
+from jaxtyping import Array
 
 from polhode import _policy
 from polhode._batch import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._hamiltonian import Dynamics
 from polhode._integrate._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
+from polhode._integrate._diffrax_solve import Request, Solution, in_segments
 from polhode._integrate._extrapolation import Automatic, Extrapolation
 from polhode._integrate._flow_adjoint import FlowAdjoint, path_of
 from polhode._integrate._flow_derivative import equations_of
 from polhode._integrate._loop import Found, LoopOptions, Search, solve, with_events
 from polhode._integrate._midpoint import Progress
 from polhode._integrate._problem import Problem
-from polhode._integrate._segments import GivenTimes, Solution, in_segments
 from polhode._integrate._step_derivative import samples
 from polhode._integrate._tableau import TSIT5
 from polhode._kernels import Distinct, is_holdable, kernel
-from polhode._method import AbstractMethod, Record, Samples, Status, check_options
+from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts, check_options
 from polhode._parts import AbstractPart
 from polhode._scene import Scene, State
 
@@ -425,77 +425,8 @@ class AbstractIntegration(AbstractMethod):
         )
 
 
-class Stepping(NamedTuple):
-    """Arguments of ``diffrax.diffeqsolve``."""
-
-    solver: diffrax.AbstractSolver
-    controller: diffrax.AbstractStepSizeController
-    saveat: diffrax.SaveAt
-    max_steps: int
-    dt0: Any
-
-
-class Request(NamedTuple):
-    """Requirements of a solve: times, error at the last of them, first or longest step, maximum
-    number of steps; whether only the last state is saved, and whether the rates may jump."""
-
-    ts: Array
-    rtol: Array
-    dt0: Any
-    max_steps: int
-    final_only: bool
-    jumps: bool
-
-    def by_controller(self, solver, controller) -> Stepping:
-        """Steps of a controller that the user chose."""
-        saved = self._saved(diffrax.SubSaveAt(ts=self.ts))
-        return Stepping(solver, controller, saved, self.max_steps, self.dt0)
-
-    def in_one_call(self, solver) -> Stepping:
-        """One step of diffrax from each time to the next, which the solver subdivides."""
-        ends = self.ts[jnp.array([0, -1])] if self.final_only else self.ts
-        saved = self._saved(diffrax.SubSaveAt(t0=True, steps=1))
-        saved = eqx.tree_at(lambda s: s.solver_state, saved, True)
-        return Stepping(solver, GivenTimes(ends), saved, ends.shape[0] - 1, None)
-
-    def by_error_estimate(self, solver, y0, term, dynamics) -> Stepping:
-        """Steps of any solver with an error estimate, by diffrax's PID controller."""
-        leaves = jax.tree.leaves(y0)
-        weights, rate = dynamics.units(leaves, jax.tree.leaves(term.vf(self.ts[0], y0, dynamics)))
-        angle = jnp.maximum(1, jnp.max(rate) * jnp.abs(self.ts[-1] - self.ts[0]))
-        weights = [*weights, *[jnp.zeros_like(x) for x in leaves[len(weights) :]]]
-        weights, angle = jax.lax.stop_gradient((weights, angle))
-        atol = jnp.maximum(self.rtol / (2 * angle), 8 * jnp.finfo(self.rtol.dtype).eps)
-        controller = diffrax.PIDController(rtol=0.0, atol=atol, norm=LaneNorm(tuple(weights)))
-        if (
-            not self.final_only
-        ):  # samples at the ends of steps are more accurate than the interpolant
-            controller = diffrax.ClipStepSizeController(controller, step_ts=self.ts)
-        return self.by_controller(solver, controller)
-
-    def _saved(self, samples) -> diffrax.SaveAt:
-        last = diffrax.SubSaveAt(t1=True)
-        return diffrax.SaveAt(subs=[last if self.final_only else samples, last])
-
-
 def _by_units(units, y, rates):
     return units(y, rates)
-
-
-class LaneNorm(eqx.Module):
-    """Error of the worst body: root mean square over its components, each times its weight.
-
-    A batch with shared steps thus satisfies the tolerance of every body.
-    """
-
-    weights: tuple[Array, ...]
-
-    def __call__(self, y: PyTree[Array]) -> Array:
-        leaves = jax.tree.leaves(y)
-        square = sum((w * x) ** 2 for w, x in zip(self.weights, leaves))
-        worst = jnp.max(square) / len(leaves)
-        positive = worst > 0  # the derivative of the root at zero is infinite
-        return jnp.where(positive, jnp.sqrt(jnp.where(positive, worst, 1)), 0)
 
 
 def _in_parts(adjoint: diffrax.AbstractAdjoint, scene: Scene) -> diffrax.AbstractAdjoint:
@@ -518,19 +449,22 @@ def _lanes_first(y):
     return jax.tree.map(lambda x: jnp.moveaxis(x, 0, -1), y)
 
 
-def _outcome(solution, shape) -> tuple[Array, Array]:
+def _outcome(solution, shape) -> tuple[StepCounts, Array]:
     """Steps and status of every body."""
     progress = solution.solver_state
     if isinstance(progress, Progress):  # each body has steps of its own
-        return progress.steps.astype(jnp.int32), jnp.array(_OF_MIDPOINT)[progress.reason]
+        counts = progress.steps, progress.refused, None, progress.at_times
+        counts = jax.tree.map(lambda x: x.astype(jnp.int32), counts)
+        return StepCounts.of(*counts), jnp.array(_OF_MIDPOINT)[progress.reason]
     limit = solution.result == diffrax.RESULTS.max_steps_reached
     status = jnp.where(limit, Status.MAX_STEPS, Status.STEP_FAILED)
     good = solution.result == diffrax.RESULTS.successful
     status = jnp.where(good, Status.SUCCESSFUL, status)
-    return (
-        jnp.broadcast_to(solution.stats["num_steps"], shape),
-        jnp.broadcast_to(status, shape),
+    accepted, refused = (
+        jnp.broadcast_to(solution.stats[f"num_{name}_steps"], shape)
+        for name in ("accepted", "rejected")
     )
+    return StepCounts.of(accepted, refused), jnp.broadcast_to(status, shape)
 
 
 # in the order of the outcomes of ``_loop.py``

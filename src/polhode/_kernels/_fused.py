@@ -78,6 +78,8 @@ def kernel(
         finally:
             _ANALYSING.reset(analysing)
         if not is_holdable(closed.jaxpr):
+            if of_units:  # the program is known, units inside it included
+                return jax.tree.unflatten(jax.tree.structure(shape), jaxpr_as_fun(closed)(*leaves))
             return fn(*operands)
         whole, constants = _with_constants_as_operands(closed)
         results = _unit(jaxpr_as_fun(whole), linearised, (whole, 0), repeated)(*constants, *leaves)

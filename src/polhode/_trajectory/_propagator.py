@@ -1,5 +1,6 @@
 """Trajectories between their samples: the method that made them, run once more."""
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -83,7 +84,8 @@ def _at_times(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
     states, status, steps = move(propagator, Scene(**parts), samples, ts, times)
     wxyz, omega, *spins = (x.reshape(*batch, *x.shape[1:]) for x in states)
     is_finite = jnp.broadcast_to(finite, wxyz.shape[:-1])[..., None]
-    status, steps = status.reshape(batch), steps.reshape(batch)
+    status = status.reshape(batch)
+    steps = jax.tree.map(lambda x: x.reshape(batch), steps)
     good = trajectory.status == Status.SUCCESSFUL
     samples = [jnp.where(is_finite, x, jnp.nan) for x in (wxyz, omega, *spins)]
     status = jnp.where(good, status, trajectory.status)
@@ -138,12 +140,12 @@ def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
         step = jnp.broadcast_to((end - begin)[..., None], (*wxyz.shape[:-1], 1))
         here = jnp.broadcast_to(there[..., None], step.shape)
         ends = [x[:, 0] for x in (result.wxyz, result.omega_body, result.spins) if x is not None]
-        near = _along(scene, start, begin, jnp.where(here, step, 0))
+        near = _along(scene, start, begin)(jnp.where(here, step, 0))
         states = [jnp.where(here, x, end) for x, end in zip(near, ends)]
         return (
             states,
             jnp.where(here[:, 0], Status.SUCCESSFUL, result.status),
-            jnp.where(here[:, 0], 0, result.steps),
+            jax.tree.map(lambda x: jnp.where(here[:, 0], 0, x), result.steps),
         )
 
     if ts.ndim == 1:
@@ -155,7 +157,7 @@ def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
 
         states, status, steps = jax.lax.map(one, (place, times))
         states = [jnp.moveaxis(x, 0, 1) for x in states]
-        return states, jnp.max(status, axis=0), jnp.sum(steps, axis=0)
+        return states, jnp.max(status, axis=0), jax.tree.map(lambda x: jnp.sum(x, axis=0), steps)
     n, count = times.shape
     place = jax.vmap(_nearest)(ts, times)
     begin = jnp.take_along_axis(ts, place, axis=-1).reshape(-1)
@@ -170,19 +172,24 @@ def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
     parts = {name: flatten(part, (n, count)) for name, part in parts.items()}
     states = from_sample(Scene(**parts), start, begin, times.reshape(-1), unit.reshape(-1))
     states, status, steps = jax.tree.map(lambda x: x.reshape(n, count, *x.shape[1:]), states)
-    return states, jnp.max(status, axis=-1), jnp.sum(steps, axis=-1)
+    return states, jnp.max(status, axis=-1), jax.tree.map(lambda x: jnp.sum(x, axis=-1), steps)
 
 
-def shortly_after(trajectory: Trajectory, late: Array) -> Trajectory:
-    """Samples so little later, by ``late`` (..., T) [s], that three terms of their Taylor series
-    lead there: of what is no later but for its derivatives, values and two derivatives."""
-    states = _along(trajectory._scene, trajectory._samples, trajectory._t, late[..., None])
+def shortly_after(trajectory: Trajectory) -> Callable[[Array], Trajectory]:
+    """A function of delays (..., T) [s] so short that three terms of the Taylor series of the
+    samples lead there: of what is no later but for its derivatives, values and two derivatives."""
     t = trajectory
-    return t._with_samples(t._t + late, states, t.status, t.steps, None)
+    along = _along(t._scene, t._samples, t._t)
+
+    def later(delay: Array) -> Trajectory:
+        return t._with_samples(t._t + delay, along(delay[..., None]), t.status, t._steps, None)
+
+    return later
 
 
-def _along(scene: Scene, samples: list[Array], t: Array, step: Array) -> list[Array]:
-    """Samples (..., 4), (..., 3) and momenta of coupled wheels, a ``step`` (..., 1) [s] later."""
+def _along(scene: Scene, samples: list[Array], t: Array) -> Callable[[Array], list[Array]]:
+    """A function of a step (..., 1) [s]: samples (..., 4), (..., 3) and momenta of coupled wheels
+    that much later."""
 
     def rates(samples, t):
         wxyz, omega, *spins = samples
@@ -194,7 +201,11 @@ def _along(scene: Scene, samples: list[Array], t: Array, step: Array) -> list[Ar
     begin = list(samples), jnp.asarray(t)
     first = rates(*begin)
     _, second = jax.jvp(rates, begin, (first, jnp.ones_like(begin[1])))
-    return [x + step * (a + step / 2 * b) for x, a, b in zip(samples, first, second)]
+
+    def later(step: Array) -> list[Array]:
+        return [x + step * (a + step / 2 * b) for x, a, b in zip(samples, first, second)]
+
+    return later
 
 
 def _nearest(ts: Array, times: Array) -> Array:

@@ -65,15 +65,15 @@ def with_saved(trajectory: Trajectory, save: Callable) -> Trajectory:
 
     t = trajectory
     parts = {name: flatten(getattr(t.scene, name), batch) for name in PARTS}
-    state = (t._wxyz, t._omega_body, t.status, t.steps, t._work, t._error, t._motor_work, t._spins)
-    samples = Samples(*map(lanes, state))
+    state = (t._wxyz, t._omega_body, t.status, t._steps, t._work, t._error, t._motor_work, t._spins)
+    samples = Samples(*jax.tree.map(lanes, state))
     values = values_of(save, Scene(**parts), lane_times(t.ts, batch), samples)
     return Trajectory(
         t.ts,
         None,
         None,
         t.status,
-        t.steps,
+        t._steps,
         t.scene,
         t._work,
         t._error,

@@ -16,7 +16,7 @@ from polhode import rotation
 from polhode._batch import PARTS, along_time, map_arrays
 from polhode._checks import ArrayLike, is_concrete
 from polhode._hamiltonian import components, from_quaternion
-from polhode._method import Status
+from polhode._method import Status, StepCounts
 from polhode._scene import Scene, State, Wheels
 from polhode._trajectory._exports import dataset, write_aem
 
@@ -71,10 +71,10 @@ class Trajectory(eqx.Module):
 
     **Attributes:** ``ts`` (T,) or (..., T) [s]; ``wxyz`` (..., T, 4) body -> space; ``omega_body``
     (..., T, 3) [rad/s]; ``status`` (...): ``ph.Status`` of each body; ``steps`` (...): steps of the
-    solver (0 for a closed form); ``scene``, with the motion of its wheels fixed by the initial
-    state; ``propagator``: method and tolerance, for ``at``. On request: ``work``, ``motor_work``,
-    ``error``, ``saved`` (see ``ph.Record``) and ``event_time`` (``until=``). With coupled wheels:
-    ``spins``.
+    solver (0 for a closed form), and ``step_counts``: why they were not longer; ``scene``, with the
+    motion of its wheels fixed by the initial state; ``propagator``: method and tolerance, for
+    ``at``. On request: ``work``, ``motor_work``, ``error``, ``saved`` (see ``ph.Record``) and
+    ``event_time`` (``until=``). With coupled wheels: ``spins``.
     What was not recorded raises ValueError, which says how to record it.
 
     Between the samples: ``traj.at(t)``. Indexed, a trajectory is an array of shape (..., T) of
@@ -85,7 +85,7 @@ class Trajectory(eqx.Module):
     _wxyz: Float[Array, "*b t 4"] | None
     _omega_body: Float[Array, "*b t 3"] | None
     status: Int[Array, "*b"]
-    steps: Int[Array, "*b"]
+    _steps: StepCounts
     scene: Scene
     _work: Float[Array, "*b t"] | None
     _error: Float[Array, "*b"] | None
@@ -103,7 +103,7 @@ class Trajectory(eqx.Module):
         wxyz: Array | None,
         omega_body: Array | None,
         status: Array,
-        steps: Array,
+        steps: Array | StepCounts,
         scene: Scene,
         work: Array | None = None,
         error: Array | None = None,
@@ -115,7 +115,8 @@ class Trajectory(eqx.Module):
         saved: PyTree[Array] = None,
         final: tuple[Array | None, ...] | None = None,
     ):
-        self.ts, self.status, self.steps, self.scene = ts, status, steps, scene
+        self.ts, self.status, self.scene = ts, status, scene
+        self._steps = steps if isinstance(steps, StepCounts) else StepCounts.of(steps)
         self._wxyz, self._omega_body = wxyz, omega_body
         self._work, self._error, self._motor_work = work, error, motor_work
         self._spins, self.propagator, self._event_time = spins, propagator, event_time
@@ -137,9 +138,11 @@ class Trajectory(eqx.Module):
         lines.append(f"status  {', '.join(outcomes)}")
         steps = np.asarray(self.steps)
         if steps.size and steps.max() > 0:
-            few, middle, many = steps.min(), np.median(steps), steps.max()
-            spread = "" if few == many else f", at least {few:,}, at most {many:,}"
-            lines.append(f"steps   {middle:,.0f}{spread}")
+            lines.append(f"steps   {_spread(steps)}")
+            names = ("refused", "ended at a switch or event", "ended at a saved time")
+            for name, counts in zip(names, map(np.asarray, self._steps[1:])):
+                if counts.max() > 0:
+                    lines.append(f"        {name}: {_spread(counts)}")
         elif steps.size:
             lines.append("steps   none: a closed form")
         return "\n".join(lines)
@@ -149,7 +152,7 @@ class Trajectory(eqx.Module):
         ts: Array,
         samples: Sequence[Array],
         status: Array,
-        steps: Array,
+        steps: StepCounts,
         event_time: Array | None,
         events: Events | None = None,
     ) -> "Trajectory":
@@ -178,6 +181,21 @@ class Trajectory(eqx.Module):
     def omega_body(self) -> Float[Array, "*b t 3"]:
         """Body rates (..., T, 3) [rad/s]."""
         return self._recorded("omega_body", "record=ph.Record(rates=True), the default")
+
+    @property
+    def steps(self) -> Int[Array, "*b"]:
+        """Steps (...) of the solver; 0 for a closed form."""
+        return self._steps.accepted
+
+    @property
+    def step_counts(self) -> StepCounts:
+        """How many steps (...) were refused, and how many ended at a switch or a saved time.
+
+        Many refused ones: the motion changes its pace abruptly. Many at switches: a torque changes
+        sides often; smooth it, or loosen the limit that it meets. Many at saved times: save fewer.
+        Zero for closed forms.
+        """
+        return self._steps
 
     @property
     def work(self) -> Float[Array, "*b t"]:
@@ -293,7 +311,7 @@ class Trajectory(eqx.Module):
         assert self._final is not None
         wxyz, omega, spins = (None if x is None else x[..., None, :] for x in self._final)
         return Trajectory(
-            self.ts[..., -1:], wxyz, omega, self.status, self.steps, self.scene, spins=spins
+            self.ts[..., -1:], wxyz, omega, self.status, self._steps, self.scene, spins=spins
         )
 
     def __getitem__(self, key: Any) -> "Trajectory":
@@ -333,7 +351,7 @@ class Trajectory(eqx.Module):
             of_both(self._wxyz, 2),
             of_both(self._omega_body, 2),
             of_bodies(self.status, 0),
-            of_bodies(self.steps, 0),
+            jax.tree.map(lambda x: of_bodies(x, 0), self._steps),
             Scene(**parts),
             of_both(self._work, 1),
             of_bodies(self._error, 0),
@@ -392,7 +410,7 @@ class Trajectory(eqx.Module):
             self._wxyz,
             self._omega_body,
             self.status,
-            self.steps,
+            self._steps,
             self.scene,
             spins=self._spins,
         )
@@ -495,6 +513,12 @@ class Trajectory(eqx.Module):
         not know, FileNotFoundError for a folder that is not there.
         """
         write_aem(path, self, epoch, **fields)
+
+
+def _spread(counts: np.ndarray) -> str:
+    """The median of numbers of bodies, and their range."""
+    few, middle, many = counts.min(), np.median(counts), counts.max()
+    return f"{middle:,.0f}" + ("" if few == many else f", at least {few:,}, at most {many:,}")
 
 
 def _momentum_body(bare: Trajectory) -> Array:

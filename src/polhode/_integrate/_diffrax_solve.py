@@ -1,15 +1,85 @@
-"""Solves from edge to edge of pulses, and solves of one step without the loop of diffrax."""
+"""Solves by diffrax: their arguments, from edge to edge of pulses, and in one step."""
 
 import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PyTree
 
-from polhode._method import Status
+from polhode._method import Status, StepCounts
+
+
+class Stepping(NamedTuple):
+    """Arguments of ``diffrax.diffeqsolve``."""
+
+    solver: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController
+    saveat: diffrax.SaveAt
+    max_steps: int
+    dt0: Any
+
+
+class Request(NamedTuple):
+    """Requirements of a solve: times, error at the last of them, first or longest step, maximum
+    number of steps; whether only the last state is saved, and whether the rates may jump."""
+
+    ts: Array
+    rtol: Array
+    dt0: Any
+    max_steps: int
+    final_only: bool
+    jumps: bool
+
+    def by_controller(self, solver, controller) -> Stepping:
+        """Steps of a controller that the user chose."""
+        saved = self._saved(diffrax.SubSaveAt(ts=self.ts))
+        return Stepping(solver, controller, saved, self.max_steps, self.dt0)
+
+    def in_one_call(self, solver) -> Stepping:
+        """One step of diffrax from each time to the next, which the solver subdivides."""
+        ends = self.ts[jnp.array([0, -1])] if self.final_only else self.ts
+        saved = self._saved(diffrax.SubSaveAt(t0=True, steps=1))
+        saved = eqx.tree_at(lambda s: s.solver_state, saved, True)
+        return Stepping(solver, GivenTimes(ends), saved, ends.shape[0] - 1, None)
+
+    def by_error_estimate(self, solver, y0, term, dynamics) -> Stepping:
+        """Steps of any solver with an error estimate, by diffrax's PID controller."""
+        leaves = jax.tree.leaves(y0)
+        weights, rate = dynamics.units(leaves, jax.tree.leaves(term.vf(self.ts[0], y0, dynamics)))
+        angle = jnp.maximum(1, jnp.max(rate) * jnp.abs(self.ts[-1] - self.ts[0]))
+        weights = [*weights, *[jnp.zeros_like(x) for x in leaves[len(weights) :]]]
+        weights, angle = jax.lax.stop_gradient((weights, angle))
+        atol = jnp.maximum(self.rtol / (2 * angle), 8 * jnp.finfo(self.rtol.dtype).eps)
+        controller = diffrax.PIDController(rtol=0.0, atol=atol, norm=LaneNorm(tuple(weights)))
+        if (
+            not self.final_only
+        ):  # samples at the ends of steps are more accurate than the interpolant
+            controller = diffrax.ClipStepSizeController(controller, step_ts=self.ts)
+        return self.by_controller(solver, controller)
+
+    def _saved(self, samples) -> diffrax.SaveAt:
+        last = diffrax.SubSaveAt(t1=True)
+        return diffrax.SaveAt(subs=[last if self.final_only else samples, last])
+
+
+class LaneNorm(eqx.Module):
+    """Error of the worst body: root mean square over its components, each times its weight.
+
+    A batch with shared steps thus satisfies the tolerance of every body.
+    """
+
+    weights: tuple[Array, ...]
+
+    def __call__(self, y: PyTree[Array]) -> Array:
+        leaves = jax.tree.leaves(y)
+        square = sum((w * x) ** 2 for w, x in zip(self.weights, leaves))
+        worst = jnp.max(square) / len(leaves)
+        positive = worst > 0  # the derivative of the root at zero is infinite
+        return jnp.where(positive, jnp.sqrt(jnp.where(positive, worst, 1)), 0)
 
 
 class Solution(NamedTuple):
@@ -18,7 +88,7 @@ class Solution(NamedTuple):
 
     samples: PyTree[Array]
     last: PyTree[Array]
-    steps: Array
+    steps: StepCounts
     status: Array
     error: Array | None
 
@@ -52,7 +122,7 @@ def in_segments(
         solution = move(jax.lax.stop_gradient((a + b) / 2), y, times, parts)
         successful = status == Status.SUCCESSFUL
         status = jnp.where(empty | ~successful, status, solution.status)
-        steps = steps + jnp.where(empty, 0, solution.steps)
+        steps = jax.tree.map(lambda a, b: a + jnp.where(empty, 0, b), steps, solution.steps)
         if error is not None:
             error = error + jnp.where(empty, 0, solution.error)
         if not final_only:
@@ -71,7 +141,8 @@ def in_segments(
     if not final_only:
         out = jax.tree.map(lambda x: jnp.zeros((ts.shape[0], *x.shape), x.dtype), y)
     none = None if shape.error is None else jnp.zeros(lane, shape.error.dtype)
-    begin = y, out, jnp.zeros(lane, shape.steps.dtype), jnp.zeros(lane, shape.status.dtype), none
+    none_taken = jnp.zeros(lane, shape.steps.accepted.dtype)
+    begin = y, out, StepCounts.of(none_taken), jnp.zeros(lane, shape.status.dtype), none
     (y, out, steps, status, error), _ = jax.lax.scan(one, begin, (bounds[:-1], bounds[1:]))
     last = jax.tree.map(lambda x: x[None], y)
     if final_only:

@@ -1,0 +1,40 @@
+"""A part of the fuzz of all parts (`benchmarks/fuzz.py`): motions and derivatives of random scenes
+against SciPy's DOP853 with equations in plain Python."""
+
+import jax
+import numpy as np
+import pytest
+
+from benchmarks import fuzz
+from benchmarks.fuzz_parts import PARTS
+
+SEED = 20261125
+
+
+@pytest.mark.parametrize("part", PARTS, ids=lambda part: part.name)
+@pytest.mark.slow  # 10 s to 60 s each, most of it in compiling and in the reference
+def test_random_motions_of_a_part_keep_rtol(part):
+    """All runs of regular motions within 10 rtol, at four tolerances; none flagged but for friction
+    in a narrow layer, which is stiff."""
+    rows = list(fuzz.results(fuzz.Group((part,), "float64", False), 3, SEED, 30.0))
+    ran = [row for row in rows if "kind" in row]
+    assert not [row for row in rows if "raised" in row]
+    assert ran, f"all cases were left out: {rows}"
+    assert not [row for row in ran if row["kind"] == "beyond"]
+    if not part.name.endswith("narrow"):
+        assert not [row for row in ran if row["kind"] == "flagged"]
+    jax.clear_caches()
+
+
+@pytest.mark.parametrize("part", PARTS, ids=lambda part: part.name)
+@pytest.mark.slow
+def test_derivatives_of_a_part_keep_rtol(part):
+    """Median error at most 50 rtol and the worst 1,000 rtol, beside differences of the reference,
+    whose own rounding is up to 1e-9."""
+    rows = [row for row in fuzz.derivatives(part, 1, SEED, 30.0) if row["status"] == 0]
+    if not rows:
+        pytest.skip("no reference: a small change of the case adds or removes a switch")
+    ratios = [row["error"] / (row["rtol"] + 1e-9 / 50) for row in rows]
+    assert np.median(ratios) <= 50
+    assert max(ratios) <= 1000
+    jax.clear_caches()
