@@ -250,15 +250,19 @@ def test_work_precision_times_and_scores_polhode():
         assert program.compile_s > 0
 
 
-def test_without_an_accelerator_its_benchmark_says_so(monkeypatch, capsys):
+def test_without_an_accelerator_its_benchmark_says_so(monkeypatch, capsys, tmp_path):
     from benchmarks import accelerator
 
-    monkeypatch.setattr("sys.argv", ["accelerator", "--quick"])
+    path = tmp_path / "accelerator.json"
+    monkeypatch.setattr("sys.argv", ["accelerator", "--quick", "--output", str(path)])
     monkeypatch.setattr(
         accelerator.jax, "devices", lambda: [accelerator.jax.local_devices(backend="cpu")[0]]
     )
     accelerator.main()
     assert capsys.readouterr().out.startswith("not run")
+    report = _report.read(path)
+    assert "no accelerator" in report["numbers"]["not_run"]
+    assert any("- not run: " in line for line in _page.SECTIONS["accelerator"].lines(report))
 
 
 @pytest.mark.slow
