@@ -200,7 +200,7 @@ def _satellite_cost(part: str) -> str:
     """Time of one satellite and of 50, over that without the part, and of the first call."""
     one, fifty = (row for row in _numbers("scene_cost")["parts"] if row["part"] == part)
     return (
-        f"{number(one['ratio'])} times as long ({number(fifty['ratio'])} times for"
+        f"{one['ratio']:.1f} times as long ({fifty['ratio']:.1f} times for"
         f" {fifty['bodies']} satellites; first call {number(one['first_call_s'])} s)"
     )
 

@@ -1,5 +1,8 @@
 """Mass properties from the model files of robots."""
 
+import warnings
+
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -101,3 +104,16 @@ def test_robot_files_that_say_too_little(arm, tmp_path):
     arm.write_text("no XML")
     with pytest.raises(ValueError, match="not XML"):
         MassProperties.from_urdf(arm, "hand")
+
+
+def test_a_link_is_read_without_a_warning_in_the_default_precision_of_jax(arm):
+    with jax.enable_x64(False), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        hand = MassProperties.from_urdf(arm, "hand")
+        both = hand + MassProperties.of(1.0, np.zeros(3), ph.Inertia.spherical(0.1))
+    assert both.inertia.tensor.dtype == both.centre.dtype == both.mass.dtype == np.float32
+
+
+def test_a_scene_of_mass_properties_names_their_inertia(arm):
+    with pytest.raises(TypeError, match=r"got MassProperties: pass its \.inertia"):
+        ph.Scene(MassProperties.from_urdf(arm, "hand"))
