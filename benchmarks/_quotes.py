@@ -81,6 +81,7 @@ RANGES: dict[str, Callable[[], Iterable[float]]] = {
     "exact-scipy": lambda: _over_ours(
         _tables("free", "near_symmetric", "extreme", "separatrix"), "SciPy closed form"
     ),
+    "read-first": lambda: (row["first_read_s"] for row in _numbers("scene_cost")["files"]),
     "racquet-torques": lambda: (
         row["slow_torque_rad_s2"]
         for row in _numbers("racquet")["likelihood_of_the_readings"].values()
@@ -179,6 +180,53 @@ def _() -> str:
 def _() -> str:
     lines = _page.controller_kinds(_numbers("controllers"))
     return _block(lines, f"({command(read('controllers'))})")
+
+
+# Parts of a scene
+
+SATELLITES = {
+    "cost-dipole": "magnetic dipole, field by formula",
+    "cost-table": "magnetic dipole, field by cubic table",
+    "cost-plates": "drag and sunlight on seven plates, with shadow",
+    "cost-inertia": "inertia that changes with time",
+    "cost-wheels": "four wheels under control",
+    "cost-dumping": "four wheels and momentum dumping",
+    "cost-gyro": "control moment gyro",
+    "cost-save": "momentum saved in place of states",
+}
+
+
+def _satellite_cost(part: str) -> str:
+    """Time of one satellite and of 50, over that without the part, and of the first call."""
+    one, fifty = (row for row in _numbers("scene_cost")["parts"] if row["part"] == part)
+    return (
+        f"{one['ratio']:.1f} times as long ({fifty['ratio']:.1f} times for"
+        f" {fifty['bodies']} satellites; first call {number(one['first_call_s'])} s)"
+    )
+
+
+QUOTES |= {name: lambda part=part: _satellite_cost(part) for name, part in SATELLITES.items()}
+
+
+@_quote("cost-base")
+def _() -> str:
+    one, fifty = (
+        row for row in _numbers("scene_cost")["parts"] if row["part"] == "gravity gradient"
+    )
+    return (
+        f"{number(one['later_call_ms'])} ms ({number(fifty['later_call_ms'])} ms for"
+        f" {fifty['bodies']} satellites; first call {number(one['first_call_s'])} s)"
+    )
+
+
+def _read_ms(kind: str) -> str:
+    (row,) = (row for row in _numbers("scene_cost")["files"] if row["file"].startswith(kind))
+    return number(row["later_read_ms"])
+
+
+QUOTES["read-urdf"] = lambda: _read_ms("URDF")
+QUOTES["read-mjcf"] = lambda: _read_ms("MJCF")
+QUOTES["read-mesh"] = lambda: _read_ms("STL")
 
 
 # Integrators

@@ -218,6 +218,7 @@ def in_turn(
     repeats: int = 7,
     least: float = 5e-3,
     budget: float = 1.0,
+    processor_time: bool = False,
 ) -> dict[str, Timing]:
     """Time calls that return when they are done (block on JAX's results), taking turns.
 
@@ -225,16 +226,19 @@ def in_turn(
     ``least`` seconds: calls are repeated within it, after one that is not counted. A call stops
     taking part when it has used ``budget`` seconds, but not before two repeats, or one where a
     single call lasts longer than that. The first call of each is not counted either.
+    ``processor_time``: of this process, in place of the time on the clock, which counts what other
+    processes of the machine take.
     """
+    now = time.process_time if processor_time else time.perf_counter
     first, count, spent = {}, {}, dict.fromkeys(calls, 0.0)
     spans: dict[str, list[float]] = {name: [] for name in calls}
     for name, call in calls.items():
-        begin = time.perf_counter()
+        begin = now()
         call()
-        first[name] = time.perf_counter() - begin
-        begin = time.perf_counter()
+        first[name] = now() - begin
+        begin = now()
         call()
-        once = time.perf_counter() - begin
+        once = now() - begin
         spent[name] = once
         count[name] = max(1, math.ceil(least / max(once, 1e-9)))
         if count[name] == 1:
@@ -248,10 +252,10 @@ def in_turn(
                 continue
             if count[name] > 1:
                 call()  # not counted: the caches hold what the others left there
-            begin = time.perf_counter()
+            begin = now()
             for _ in range(count[name]):
                 call()
-            span = time.perf_counter() - begin
+            span = now() - begin
             spent[name] += span
             spans[name].append(span / count[name])
     return {name: _summary(spans[name], first[name]) for name in calls}

@@ -2,16 +2,16 @@
 
     python -m benchmarks.accelerator [--quick] [--any-device] [--output out/accelerator.json]
 
-Runs where JAX finds an accelerator (``--any-device``: on the CPU too; ``--quick``: fewer and
-smaller rows, a minute or two). Beside polhode's default method stands diffrax as its documentation
-shows it (``vmap`` of a solve for each body, quaternion and rates, Dopri8), at the loosest tolerance
-1e-3, 1e-4, ... whose median error of the attitude is not above that of polhode or the tolerance of
-this one, whichever is larger; where none is, at the one with the least error. In the same run a
-vector sum
-measures the memory bandwidth and a chain of fused multiply-adds the arithmetic peak of the dtype;
-beside each time stand the share of the bandwidth that reading the state and writing the result
-takes, and the share of the arithmetic peak of the operations that the compiler counts (for
-programs without loops over steps, whose body it counts once).
+Runs where JAX finds an accelerator, and otherwise writes the result "not run" (``--any-device``: it
+runs on the CPU too; ``--quick``: fewer and smaller rows, a minute or two). Beside polhode's default
+method stands diffrax as its documentation shows it (``vmap`` of a solve for each body, quaternion
+and rates, Dopri8), at the loosest tolerance 1e-3, 1e-4, ... whose median error of the attitude is
+not above that of polhode or the tolerance of this one, whichever is larger; where none is, at the
+one with the least error. In the same run a vector sum measures the memory bandwidth and a chain of
+fused multiply-adds the arithmetic peak of the dtype; beside each time stand the share of the
+bandwidth that reading the state and writing the result takes, and the share of the arithmetic peak
+of the operations that the compiler counts (for programs without loops over steps, whose body it
+counts once).
 """
 
 import argparse
@@ -142,7 +142,9 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     device = jax.devices()[0]
     if device.platform == "cpu" and not options.any_device:
-        print("not run: there is no accelerator, JAX sees the CPU only (--any-device runs on it)")
+        reason = "there is no accelerator, JAX sees the CPU only"
+        print(f"not run: {reason} (--any-device runs on it)")
+        _report.write("accelerator", {"not_run": reason}, path=options.output)
         return
     rows, numbers = [], {}
     for dtype in ("float32", "float64"):

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 
 import benchmarks
+import polhode as ph
 from benchmarks import (
     __main__ as command,
     _figures,
@@ -249,15 +250,19 @@ def test_work_precision_times_and_scores_polhode():
         assert program.compile_s > 0
 
 
-def test_without_an_accelerator_its_benchmark_says_so(monkeypatch, capsys):
+def test_without_an_accelerator_its_benchmark_says_so(monkeypatch, capsys, tmp_path):
     from benchmarks import accelerator
 
-    monkeypatch.setattr("sys.argv", ["accelerator", "--quick"])
+    path = tmp_path / "accelerator.json"
+    monkeypatch.setattr("sys.argv", ["accelerator", "--quick", "--output", str(path)])
     monkeypatch.setattr(
         accelerator.jax, "devices", lambda: [accelerator.jax.local_devices(backend="cpu")[0]]
     )
     accelerator.main()
     assert capsys.readouterr().out.startswith("not run")
+    report = _report.read(path)
+    assert "no accelerator" in report["numbers"]["not_run"]
+    assert any("- not run: " in line for line in _page.SECTIONS["accelerator"].lines(report))
 
 
 @pytest.mark.slow
@@ -340,6 +345,27 @@ def test_scaling_and_scene_cost_run():
     (row,) = scene_cost.measure(["free, spherical, final state"], 4, repeats=1)
     assert row["ns"] > 0
     assert row["flops"] > 0
+    base, saved = scene_cost.measure_parts(["momentum saved in place of states"], (1,), repeats=1)
+    assert base["ratio"] == 1
+    assert saved["steps"] == base["steps"] > 60
+
+
+@pytest.mark.slow
+def test_every_satellite_of_the_table_of_parts_is_integrated():
+    from benchmarks import scene_cost
+
+    assert next(iter(scene_cost.satellites())) == scene_cost.BASE
+    for name, satellite in scene_cost.satellites().items():
+        plan = ph.explain(satellite.scene, scene_cost.satellite_states(2), [0.0, 60.0], rtol=1e-6)
+        assert isinstance(plan.method, ph.LiePoisson), name
+
+
+def test_reading_of_bodies_from_files_is_timed():
+    from benchmarks import scene_cost
+
+    rows = scene_cost.measure_files(repeats=1)
+    assert rows[0]["file"].startswith("URDF")
+    assert all(row["first_read_s"] >= 0 and row["later_read_ms"] > 0 for row in rows)
 
 
 @pytest.fixture

@@ -30,6 +30,7 @@ SKETCHES = {
     "identifiability": 2,
     "scale": 1,
     "how-to/use_tables": 2,
+    "how-to/import_mass_properties": 1,
 }  # `py`: need more than polhode
 WIDTH = 100  # columns of a code box
 

@@ -176,14 +176,14 @@ def as_floats(
     Python numbers and lists follow the dtype of the arrays among them; alone, they take the
     default one. A mixture of array dtypes takes the wider one.
     """
-    kinds = [
-        value.dtype
-        for value, _ in given.values()
-        if hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jnp.floating)
-    ]
     arrays = [
         as_float_array(name, value, suffix, finite=finite)
         for name, (value, suffix) in given.items()
+    ]
+    kinds = [  # of JAX's arrays: without jax_enable_x64 NumPy's float64 has become float32
+        array.dtype
+        for array, (value, _) in zip(arrays, given.values())
+        if hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jnp.floating)
     ]
     if kinds:
         common = kinds[0]

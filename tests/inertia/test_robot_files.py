@@ -1,5 +1,8 @@
 """Mass properties from the model files of robots."""
 
+import warnings
+
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -81,8 +84,36 @@ def test_robot_files_that_say_too_little(arm, tmp_path):
     with pytest.raises(ValueError, match="needs a number value, got 'heavy'"):
         MassProperties.from_urdf(arm, "hand")
     arm.write_text(URDF.replace('ixx="0.10"', 'ixx="1.0"'))
-    with pytest.raises(ValueError, match="sum"):
+    with pytest.raises(ValueError, match=r"'hand' of arm\.urdf: .* sum"):
+        MassProperties.from_urdf(arm, "hand")
+    arm.write_text(URDF.replace('value="2.5"', 'value="${mass}"'))
+    with pytest.raises(ValueError, match=r"got '\$\{mass\}' \(expand the file by xacro first\)"):
+        MassProperties.from_urdf(arm, "hand")
+    arm.write_text(URDF.replace('rpy="0.4 -0.5 0.6"', 'rpy="0 0 ${pi/2}"'))
+    with pytest.raises(ValueError, match=r"three numbers rpy, .* xacro"):
+        MassProperties.from_urdf(arm, "hand")
+    arm.write_text(URDF.replace('value="2.5"', 'value="0"'))
+    with pytest.raises(ValueError, match=r"'hand' of arm\.urdf: mass must be positive"):
+        MassProperties.from_urdf(arm, "hand")
+    arm.write_text(MJCF)
+    with pytest.raises(ValueError, match=r"is <mujoco>, .* <robot>; MJCF files are read by"):
+        MassProperties.from_urdf(arm, "hand")
+    arm.write_text("<sdf><model/></sdf>")
+    with pytest.raises(ValueError, match=r"is <sdf>, a URDF file has <robot>\.$"):
         MassProperties.from_urdf(arm, "hand")
     arm.write_text("no XML")
     with pytest.raises(ValueError, match="not XML"):
         MassProperties.from_urdf(arm, "hand")
+
+
+def test_a_link_is_read_without_a_warning_in_the_default_precision_of_jax(arm):
+    with jax.enable_x64(False), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        hand = MassProperties.from_urdf(arm, "hand")
+        both = hand + MassProperties.of(1.0, np.zeros(3), ph.Inertia.spherical(0.1))
+    assert both.inertia.tensor.dtype == both.centre.dtype == both.mass.dtype == np.float32
+
+
+def test_a_scene_of_mass_properties_names_their_inertia(arm):
+    with pytest.raises(TypeError, match=r"got MassProperties: pass its \.inertia"):
+        ph.Scene(MassProperties.from_urdf(arm, "hand"))

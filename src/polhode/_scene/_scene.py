@@ -32,7 +32,7 @@ from polhode._scene._potentials import (
 )
 from polhode._scene._torques import AbstractTorque
 from polhode._scene._wheels import AbstractRotor, Rotor, RotorSum, Wheels
-from polhode.inertia import Inertia
+from polhode.inertia import Inertia, MassProperties
 from polhode.inertia._inertia import VariableInertia, check_form, inertia_at
 
 
@@ -380,7 +380,8 @@ def _check_kinds(scene: Scene) -> None:
     for name, (kind, expected) in _KINDS.items():
         value = getattr(scene, name)
         if not (isinstance(value, kind) or (value is None and name != "inertia")):
-            raise TypeError(f"Scene {name} must be {expected}, got {type(value).__name__}.")
+            hint = ": pass its .inertia" if isinstance(value, MassProperties) else ""
+            raise TypeError(f"Scene {name} must be {expected}, got {type(value).__name__}{hint}.")
     if isinstance(scene.inertia, Inertia):
         check_form(scene.inertia)
 

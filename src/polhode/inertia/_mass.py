@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable
 from os import PathLike
-from os.path import isfile
+from os.path import basename, isfile
 from typing import Self
 
 import jax
@@ -120,29 +120,42 @@ class MassProperties(AbstractShaped):
 
     @classmethod
     def from_urdf(cls, path: str | PathLike[str], link: str) -> Self:
-        """Of a link of a robot's URDF file, in the axes and about the origin of the link.
+        """Of a link of a robot's URDF file, in the axes of the link.
 
-        SI units, as the format has them. Raises FileNotFoundError, and ValueError for a file that
-        is no URDF, a link that is not in it or has no inertia, and moments that no body has.
+        ``centre`` is measured from the origin of the link. SI units, as the format has them. Raises
+        FileNotFoundError, and ValueError for a file that is no URDF, a link that is not in it or
+        has no inertia, and moments that no body has.
         """
         from polhode.inertia._robots import read_urdf  # here: SciPy loads with it
 
-        return cls._of_file(*read_urdf(path, link))
+        return cls._of_file(path, link, *read_urdf(path, link))
 
     @classmethod
     def from_mjcf(cls, path: str | PathLike[str], body: str) -> Self:
-        """Of a body of an MJCF file, read by MuJoCo, in the axes and about the origin of the body.
+        """Of a body of an MJCF file, read by MuJoCo, in the axes of the body.
 
-        Where the file has no ``inertial`` element, MuJoCo computes one from the geoms. Raises as
-        ``from_urdf``, and ImportError without mujoco (extra ``robots``).
+        ``centre`` is measured from the origin of the body. Where the file has no ``inertial``
+        element, MuJoCo computes one from the geoms. Raises as ``from_urdf``, and ImportError
+        without mujoco (extra ``robots``).
         """
         from polhode.inertia._robots import read_mjcf  # here: SciPy loads with it
 
-        return cls._of_file(*read_mjcf(path, body))
+        return cls._of_file(path, body, *read_mjcf(path, body))
 
     @classmethod
-    def _of_file(cls, mass: float, centre: np.ndarray, tensor: np.ndarray) -> Self:
-        return cls.of(mass, centre, Inertia.from_tensor(tensor))
+    def _of_file(
+        cls,
+        path: str | PathLike[str],
+        part: str,
+        mass: float,
+        centre: np.ndarray,
+        tensor: np.ndarray,
+    ) -> Self:
+        """The errors name the part and the file."""
+        try:
+            return cls.of(mass, centre, Inertia.from_tensor(tensor))
+        except ValueError as error:
+            raise ValueError(f"{part!r} of {basename(path)}: {error}") from error
 
     @classmethod
     def from_log_cholesky(cls, parameters: ArrayLike) -> Self:

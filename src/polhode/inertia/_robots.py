@@ -18,6 +18,11 @@ def read_urdf(path: str | PathLike[str], link: str) -> tuple[float, np.ndarray, 
         root = ElementTree.parse(path).getroot()
     except ElementTree.ParseError as error:
         raise ValueError(f"{name} is not XML ({error}): expected a URDF file.") from error
+    if root.tag != "robot":
+        hint = "; MJCF files are read by from_mjcf" if root.tag == "mujoco" else ""
+        raise ValueError(
+            f"the root element of {name} is <{root.tag}>, a URDF file has <robot>{hint}."
+        )
     links = {found.get("name"): found for found in root.iter("link")}
     if link not in links:
         raise ValueError(f"{name} has no link {link!r}, it has: {_listed(links)}.")
@@ -72,7 +77,7 @@ def _number(element: Any, key: str, where: str) -> float:
         return float(text)
     except (TypeError, ValueError):
         given = "nothing" if text is None else repr(text)
-        raise ValueError(f"{where} needs a number {key}, got {given}.") from None
+        raise ValueError(f"{where} needs a number {key}, got {given}{_hint(text)}.") from None
 
 
 def _three(element: Any, key: str, where: str) -> np.ndarray:
@@ -80,5 +85,10 @@ def _three(element: Any, key: str, where: str) -> np.ndarray:
     try:
         first, second, third = (float(word) for word in text.split())
     except ValueError:
-        raise ValueError(f"{where} needs three numbers {key}, got {text!r}.") from None
+        raise ValueError(f"{where} needs three numbers {key}, got {text!r}{_hint(text)}.") from None
     return np.array([first, second, third])
+
+
+def _hint(text: str | None) -> str:
+    """What to do about a value that only xacro computes."""
+    return " (expand the file by xacro first)" if text is not None and "${" in text else ""
