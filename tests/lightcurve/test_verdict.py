@@ -355,6 +355,21 @@ def test_the_evidence_for_tumbling_is_that_of_the_best_listed_body(cases):
     assert both.misfit == alone.misfit
 
 
+def test_a_body_that_is_no_better_than_a_series_of_two_periods_is_ambiguous(cases):
+    """Its parameters are not worth more than the lines, whose sums the series does not know."""
+    case = cases["tumbler"]
+    model = offset_free(case, tumbling)
+    plain = verdict(case, solution(model))
+    series = next(m for m in plain.models if m.name.startswith("two periods"))
+    more = (plain.models[-1].log_evidence - series.log_evidence) / 2.5  # per half ln N, N about 150
+    found = verdict(case, solution(model, parameters=10.0 + more))
+    series, body = found.models[-2:]
+    assert abs(body.log_evidence - series.log_evidence) < 5
+    assert found.verdict is Verdict.AMBIGUOUS
+    (reason,) = found.reasons
+    assert "decisively better than a series of two periods" in reason
+
+
 def test_fourteen_points_are_too_few():
     curve = curve_of(tumbling, nights=2, days=4, each=7)
     pairs = pairs_of(curve)

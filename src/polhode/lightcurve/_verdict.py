@@ -33,7 +33,7 @@ from polhode.lightcurve._solutions import (
 _DECISIVE = 5.0  # difference of ln Z: odds of 150 to 1
 _FEW_POINTS = 36  # independent points below which no body of ten parameters is claimed
 _MISFIT = 2.0  # residuals over the curve's own errors from which no solution is certain
-_AGREEMENT = 0.9  # part of the resampled curves in which the best periods must stay the best
+_AGREEMENT = 0.95  # part of the resampled curves in which the best periods must stay the best
 _RESAMPLED, _BLOCKS = 400, 5
 _ELLIPSOIDS = 4  # rotating ellipsoids that are refined with a convex shape
 _CYCLES = 3.0  # of one period, below which its rating is the lowest
@@ -176,6 +176,12 @@ def judge(
     if single_rejected and body.log_evidence - null < _DECISIVE:
         reasons.append(
             "A series of two periods explains the points, but no tumbling body that was found does."
+        )
+    elif double is not None and body.log_evidence - double.log_evidence < _DECISIVE:
+        # which sums of the frequencies its lines are is what only the body can tell
+        reasons.append(
+            "No tumbling body explains the points decisively better than a series of two periods:"
+            f" ln Z {body.log_evidence - double.log_evidence:+.1f}, {_DECISIVE:g} are needed."
         )
     if own.misfit >= _MISFIT:
         reasons.append(
