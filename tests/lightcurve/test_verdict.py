@@ -133,7 +133,7 @@ def test_table_prints_null_hypotheses_before_bodies_and_the_verdict_last(cases):
     body = solution(
         offset_free(cases["tumbler"], tumbling), P_phi_std=1e-4, P_psi_std=1e-3, rms=NOISE,
         moments=np.array([0.5, 0.8, 1.0]), pole=np.array([10.0, 20.0]), pole_std=3.0,
-        parameters=18.3,
+        parameters=8.3,
     )  # fmt: skip
     found = verdict(cases["tumbler"], body)
     fit = lightcurve.LightCurveFit(
