@@ -743,7 +743,14 @@ SECTIONS = {
         "{curves} light curves of convex polyhedra, whose shapes, motions and light do not come"
         " from the package (see the top of `benchmarks/light_curves_unseen.py`), fitted with the"
         " default settings; periods in hours.",
-        keys=("tumblers", "others", "period_errors_over_stated", "processor_seconds", "not_right"),
+        keys=(
+            "commits",
+            "tumblers",
+            "others",
+            "period_errors_over_stated",
+            "processor_seconds",
+            "not_right",
+        ),
     ),
     "racquet": Section(
         "Tosses of a racquet",

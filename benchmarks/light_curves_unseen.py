@@ -28,7 +28,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.special import ellipj, ellipk
 
-from benchmarks._report import OUT, one_thread, write
+from benchmarks._report import OUT, commit, one_thread, write
 
 KINDS = ("tumbler",) * 5 + ("rotator", "noise") + ("tumbler",) * 5 + ("rotator", "few")
 RIGHT = {"rotator": "ONE_PERIOD", "noise": "NO_SIGNAL", "few": "TOO_FEW_POINTS"}
@@ -320,7 +320,7 @@ def case(seed: int) -> dict:
             for s in fit.solutions
         ],
         "models": [[m.name, m.log_evidence, m.misfit, list(m.periods)] for m in fit.models],
-        "seconds": seconds,
+        "seconds": seconds, "commit": commit(),
     }  # fmt: skip
     right = [kind_of(seed) in ("tumbler", "few") and same_motion(s, truth) for s in fit.solutions]
     row["score"] = score(truth, row["verdict"], right)
@@ -344,6 +344,10 @@ def summary(rows: list[dict]) -> dict:
 
     return {
         "curves": len(rows),
+        "commits": [
+            {"commit": name, "curves": len(seeds), "seeds": ", ".join(map(str, seeds))}
+            for name, seeds in _seeds_by_commit(rows).items()
+        ],
         "tumblers": [
             {"score": name, "meaning": meaning, "curves": count(name, "tumbler")}
             for name, meaning in TUMBLERS.items()
@@ -364,6 +368,18 @@ def summary(rows: list[dict]) -> dict:
         },
         "not_right": [_not_right(r) for r in rows if r["score"] != "right"],
     }
+
+
+def _seeds_by_commit(rows: list[dict]) -> dict[str, list[int]]:
+    """Seeds of the curves that were fitted by each commit, named by its first seven digits.
+
+    Rows of earlier versions of this script may have none.
+    """
+    seeds: dict[str, list[int]] = {}
+    for row in rows:
+        full, _, dirty = (row.get("commit") or "unknown").partition("-")
+        seeds.setdefault(full[:7] + ("-dirty" if dirty else ""), []).append(row["seed"])
+    return seeds
 
 
 def _not_right(row: dict) -> dict:

@@ -102,6 +102,9 @@ def test_a_run_continues_where_it_was_stopped(tmp_path, monkeypatch, capsys):
     assert seeds == [0, 1, 2, 5, 6]
     numbers = json.loads(output.read_text())["numbers"]
     assert numbers["curves"] == 5
+    (runs,) = numbers["commits"]
+    assert (runs["curves"], runs["seeds"]) == (5, "0, 1, 2, 5, 6")
+    assert len(runs["commit"].partition("-")[0]) == 7
     ends = {row["score"]: row["curves"] for row in numbers["tumblers"]}
     assert ends["told"] == sum(ends.values()) == 3
     assert numbers["others"][0] == {

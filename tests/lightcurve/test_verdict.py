@@ -133,7 +133,7 @@ def test_table_prints_null_hypotheses_before_bodies_and_the_verdict_last(cases):
     body = solution(
         offset_free(cases["tumbler"], tumbling), P_phi_std=1e-4, P_psi_std=1e-3, rms=NOISE,
         moments=np.array([0.5, 0.8, 1.0]), pole=np.array([10.0, 20.0]), pole_std=3.0,
-        parameters=18.3,
+        parameters=8.3,
     )  # fmt: skip
     found = verdict(cases["tumbler"], body)
     fit = lightcurve.LightCurveFit(
@@ -257,6 +257,25 @@ def test_periods_that_win_in_few_refits_are_ambiguous(cases):
         assert any("resampled" in reason for reason in found.reasons) == (not certain)
 
 
+def test_resampled_light_curves_count_the_priors_as_the_order_of_solutions_does(cases):
+    """A body that explains half of the nights better, by a shape that is all but excluded."""
+    curve, _, linear, _ = cases["tumbler"]
+    model = offset_free(cases["tumbler"], tumbling)
+    part = np.where(curve.group % 2 == 0, 0.2, -0.2)
+    best = solution(model)
+    other = solution(model + part * (curve.magnitude - model), P_psi=1.1 * P_PSI, odds=1e-4)
+    columns, none = np.zeros((curve.t.size, 1)), (np.zeros((1, 1)), np.zeros(1))
+    for prior_cost, certain in ((0.0, False), (1000.0, True)):
+        linearised = [
+            _solutions.Linearised((s.model - curve.magnitude) * linear.root, columns, *none, cost)
+            for s, cost in ((best, 0.0), (other, prior_cost))
+        ]
+        agreement = _verdict.bootstrap_agreement(
+            curve, linear.root, (best, other), [0, 1], 3.0, linearised
+        )
+        assert (agreement > 0.9) == certain
+
+
 def test_solutions_that_are_excluded_are_not_fitted_again(cases):
     """One that the linear model would improve beyond the best, with odds of 1e-10 and of 1e-4."""
     case = cases["tumbler"]
@@ -308,6 +327,49 @@ def test_a_mode_that_the_shape_decides_is_ambiguous(cases):
         assert found.verdict is expected
 
 
+def test_an_ellipsoid_whose_convex_body_is_excluded_does_not_make_a_result_ambiguous(cases):
+    """Its convex body is not in the list, which is cut at a number of solutions."""
+    _, pairs, linear, nulls = cases["tumbler"]
+    body = solution(offset_free(cases["tumbler"], tumbling))
+    ellipsoid = body._replace(P_psi=1.2 * P_PSI, model=body.model + 1e-3)
+    for convex, expected in (
+        (ellipsoid._replace(probability=1e-8), Verdict.TUMBLING),
+        (ellipsoid._replace(probability=1e-4), Verdict.AMBIGUOUS),
+        (body, Verdict.TUMBLING),  # with a convex shape it has the best motion
+    ):
+        found = _verdict.judge(
+            linear, nulls, pairs, (body,), reproduced=True, limit=3.0, others=(ellipsoid,),
+            refined=(convex,),
+        )  # fmt: skip
+        assert found.verdict is expected
+
+
+def test_the_evidence_for_tumbling_is_that_of_the_best_listed_body(cases):
+    """The first of the list fits better by parameters that are not worth it."""
+    case = cases["tumbler"]
+    model = offset_free(case, tumbling)
+    first, second = solution(model, parameters=60.0), solution(model + 1e-4, odds=0.5)
+    alone, both = verdict(case, first), verdict(case, first, second)
+    assert both.models[-1].parameters == 10.0
+    assert both.models[-1].log_evidence > alone.models[-1].log_evidence + 50
+    assert both.misfit == alone.misfit
+
+
+def test_a_body_that_is_no_better_than_a_series_of_two_periods_is_ambiguous(cases):
+    """Its parameters are not worth more than the lines, whose sums the series does not know."""
+    case = cases["tumbler"]
+    model = offset_free(case, tumbling)
+    plain = verdict(case, solution(model))
+    series = next(m for m in plain.models if m.name.startswith("two periods"))
+    more = (plain.models[-1].log_evidence - series.log_evidence) / 2.5  # per half ln N, N about 150
+    found = verdict(case, solution(model, parameters=10.0 + more))
+    series, body = found.models[-2:]
+    assert abs(body.log_evidence - series.log_evidence) < 5
+    assert found.verdict is Verdict.AMBIGUOUS
+    (reason,) = found.reasons
+    assert "decisively better than a series of two periods" in reason
+
+
 def test_fourteen_points_are_too_few():
     curve = curve_of(tumbling, nights=2, days=4, each=7)
     pairs = pairs_of(curve)
@@ -335,17 +397,52 @@ def test_the_rotating_ellipsoid_is_found_with_its_geometry():
     value = -2.5 * np.log10(np.asarray(light)) + 0.01 * rng.normal(size=blank.t.size)
     curve = blank._replace(magnitude=value, sigma=np.full(blank.t.size, 0.01))
     linear = _nulls.Linear(curve, 0.02)
-    found = _nulls.rotator(linear, [period / 2 * 1.0002], 10.0)
-    assert found is not None
-    rest, ellipsoid = found
-    assert rest.periods[0] == pytest.approx(period, rel=1e-4)
+    # periods that a fit would join are one start; of each period, its half and its double the
+    # best poles are listed
+    found = _nulls.rotators(linear, [period / 2 * 1.0002, period / 2 * 1.0003], 10.0)
+    assert len(found) == 2 * _nulls._POLES  # the double frequency is beyond the highest
+    assert [r.chi2 for r in found] == sorted(r.chi2 for r in found)
+    rest = found[0]
+    assert rest.period == pytest.approx(period, rel=1e-4)
     assert np.std(rest.values) < 0.0105
     # and with harmonics it still rotates about one axis, with more parameters
-    body = _convex.rotating_body(linear, ellipsoid, curve.points(0.0, 0.02), PHASE, 3.0)
+    body = _convex.rotating_body(linear, rest.parameters, curve.points(0.0, 0.02), PHASE, 3.0)
     assert np.std(body.values) < 1.01 * np.std(rest.values)
     np.testing.assert_array_equal(body.body.unknowns[0, 4:6], 0.0)
     assert 2 * np.pi / body.body.unknowns[0, 6] == pytest.approx(period, rel=1e-4)
     assert 6 < body.parameters < 30
+
+
+def test_a_rotating_body_is_found_where_the_best_ellipsoid_has_another_period():
+    """Its light has strong odd harmonics, which no ellipsoid has."""
+    period, blank = 0.42, curve_of(flat, noise=0.0)
+    attitude = np.array([0.8, 0.4, -0.3, 0.2])
+    state = ph.State(attitude / np.linalg.norm(attitude), [0, 0, 2 * np.pi / period])
+    inertia = ph.Inertia.from_moments([0.6, 0.8, 1.0])
+    back = ph.rotation.conjugate(ph.simulate(ph.Scene(inertia), state, blank.t).wxyz)
+    assert blank.sun is not None
+    assert blank.observer is not None
+    seen = [ph.rotation.rotate(back, v) for v in (blank.sun, blank.observer)]
+    sphere = lightcurve.Convex.from_ellipsoid(np.ones(3), 1500)
+    rows = np.asarray(lightcurve.harmonics(sphere.normals, 3))
+    rng = np.random.default_rng(2)
+    more = np.exp(0.5 * np.r_[np.zeros(4), rng.normal(size=12)] @ rows)
+    body = lightcurve.Convex(sphere.normals, sphere.areas * more)
+    value = -2.5 * np.log10(np.asarray(body.brightness(*seen)))
+    value = value + 0.01 * rng.normal(size=value.size)
+    curve = blank._replace(magnitude=value, sigma=np.full(value.size, 0.01))
+    linear, points = _nulls.Linear(curve, 0.02), curve.points(0.0, 0.02)
+
+    def cost(start):
+        return _convex.rotating_body(linear, start, points, PHASE, 3.0).cost
+
+    ellipsoid = _nulls.rotators(linear, [period], 10.0)[0]
+    starts = _nulls.round_rotators([period])
+    assert len({tuple(s[2:4]) for s in starts}) == len(starts)
+    least = min(cost(start) for start in starts[::3])
+    assert least < 1.5 * value.size
+    assert ellipsoid.period > 1.9 * period
+    assert least < 0.3 * cost(ellipsoid.parameters)
 
 
 def test_nights_with_a_trend_or_too_small_errors_are_named():
@@ -471,10 +568,12 @@ def test_a_convex_shape_leaves_the_noise_and_periods_within_their_errors(convex_
     near = start._replace(
         wxyz=np.asarray(ph.rotation.multiply(np.array([1.0, 0.01, 0.01, 0]), start.wxyz))
     )
-    found, scale, alike, linearised = _convex.refined_solutions(
+    found, scale, alike, linearised, refined = _convex.refined_solutions(
         (start, near), linear, curve.points(0.0, 0.02), phase, 3.0
     )
     assert len(found) == len(linearised) == 1
+    assert refined is not None
+    assert refined.P_psi == pytest.approx(found[0].P_psi, rel=1e-3)
     best = found[0]
     assert scale == pytest.approx(1.0, abs=0.12)
     assert alike < 1.5

@@ -145,9 +145,12 @@ def refine(
         rest = linear.projected(value[:n] + own) - linear.data
         return rest, whole, open_area, by_open
 
-    def costed(rest, coefficients, body, open_area):
+    def robust_cost(rest):
         squared = (rest / limit) ** 2
-        chi2 = float(2 * limit**2 * np.sum(squared / (1 + np.sqrt(1 + squared))))
+        return float(2 * limit**2 * np.sum(squared / (1 + np.sqrt(1 + squared))))
+
+    def costed(rest, coefficients, body, open_area):
+        chi2 = robust_cost(rest)
         off = np.asarray(body.unknowns)[0, :2] - start
         prior = (off**2).sum() * prior_precision[0, 0] + (coefficients**2).sum() * prior_precision[
             -1, -1
@@ -209,7 +212,9 @@ def refine(
         inverse[:8, :8],
         rest[:n] / linear.root,
         float(np.trace(inverse @ data)),
-        _linearised(rest[:n], slopes * linear.root[:, None], matrix - data, right - pull, linear),
+        _linearised(
+            rest[:n], slopes * linear.root[:, None], matrix - data, right - pull, linear
+        )._replace(prior_cost=cost - robust_cost(rest[:n])),
     )
 
 
@@ -237,7 +242,7 @@ def refined_solutions(
     phase: AbstractPhase,
     limit: float,
 ) -> Described:
-    """The solutions with convex shapes, the best first.
+    """The solutions with convex shapes, the best first. ``solutions``: the best first as well.
 
     Errors of a period hold the spread of the other poles of the same periods, by their odds.
     """
@@ -261,7 +266,13 @@ def refined_solutions(
         place = first.setdefault(roots[k], len(out))
         out.append(candidates[k]._replace(mirror_of=None if place == len(out) else place))
     linearised = tuple(bodies[order[k]].linearised for k in distinct)
-    return Described(_with_spread_of_poles(out, resolution), scale, alike, linearised)
+    return Described(
+        _with_spread_of_poles(out, resolution),
+        scale,
+        alike,
+        linearised,
+        candidates[order.index(0)],
+    )
 
 
 def rotating_body(

@@ -172,7 +172,7 @@ def fit_light_curve(
         say(f"fitting convex shapes to {len(described.solutions)} motions")
         exact = curve.points(0.0, offset_sigma)  # without the floor
         described = refined_solutions(described.solutions, linear, exact, phase, limit)
-    solutions, scale, alike, linearised = described
+    solutions, scale, alike, linearised, refined_ellipsoid = described
     solutions = solutions[: max(max_solutions, sum(s.probability > EXCLUDED for s in solutions))]
     notes = notes_on(curve, solutions, scale, alike) + pairs.warnings()
     notes += notes_on_groups(curve, solutions[0].model - curve.magnitude, alike)
@@ -189,6 +189,7 @@ def fit_light_curve(
         reproduced=reproduced,
         limit=limit,
         others=ellipsoids,
+        refined=() if refined_ellipsoid is None else (refined_ellipsoid,),
         linearised=linearised[: len(solutions)],
     )
     return LightCurveFit(

@@ -24,6 +24,10 @@ _CANDIDATES = 10  # peaks of the spectrum of one period that are refined
 _SCAN_ORDERS, _ORDERS = (2, 4), (1, 2, 3, 4, 6, 8)
 _MODULATED = 4  # harmonics whose amplitude may change linearly with time
 _BATCH = 32  # rotators improved together
+# poles of rotating ellipsoids of one period that are tried further, and their least distance
+_POLES, _APART = 2, np.radians(20)
+_ROUND = 8  # poles of nearly round bodies of one period from which a convex shape is fitted
+_JOINED = 0.25  # of the inverse span: frequencies of rotating ellipsoids that are one
 
 
 class Model(NamedTuple):
@@ -255,22 +259,34 @@ def _rotators(x, arrays, basis):
     return value, slopes
 
 
-def rotator(linear: Linear, periods, max_frequency: float) -> tuple[Residuals, np.ndarray] | None:
-    """The best ellipsoid that rotates about its third axis, near one of ``periods``.
+class Rotator(NamedTuple):
+    """An ellipsoid that rotates about its third axis."""
 
-    Its residuals, and logarithms of the second and third axis over the first, longitude and
-    latitude of the pole, phase [rad] and frequency. None without directions.
+    values: np.ndarray  # residuals (n,) [mag], model less data but for the sign
+    # logarithms of the second and third axis over the first, longitude and latitude of the pole
+    # and phase [rad], and frequency
+    parameters: np.ndarray  # (6,)
+    chi2: float
+
+    @property
+    def period(self) -> float:
+        return float(1 / self.parameters[5])
+
+
+def rotators(linear: Linear, periods, max_frequency: float) -> list[Rotator]:
+    """The best ellipsoids that rotate about their third axis, near one of ``periods``.
+
+    The best first; up to `_POLES` with different poles for each period, its half and its double:
+    which of them is true may be seen only with another shape. Empty without directions.
     """
     curve = linear.curve
     if curve.sun is None or curve.observer is None:
-        return None
+        return []
     # what the law gives a sphere is a part of the phase function
     arrays = (linear.t, curve.sun.T, curve.observer.T, linear.root, linear.data)
     arrays = tuple(map(jnp.asarray, arrays))
     basis = jnp.asarray(linear.basis)
-    k = np.arange(12) + 0.5
-    latitude = np.arcsin(1 - 2 * k / 12)
-    longitude = np.pi * (1 + 5**0.5) * k
+    longitude, latitude = _directions(12)
     turn = np.pi * np.arange(4) / 4
     grid = np.array(
         [
@@ -279,10 +295,14 @@ def rotator(linear: Linear, periods, max_frequency: float) -> tuple[Residuals, n
             for c in turn
         ]
     )
-    best, values, parameters = np.inf, None, np.zeros(6)
-    for f in sorted({float(f) for p in periods for f in (1 / p, 0.5 / p, 2 / p)}):
-        if f > max_frequency:
-            continue
+    frequencies: list[float] = []
+    for f in (f for p in periods for f in (1 / p, 0.5 / p, 2 / p)):
+        # those that steps of the fit would join are one start
+        known = min((abs(f - other) for other in frequencies), default=np.inf)
+        if f <= max_frequency and known > _JOINED / linear.t[-1]:
+            frequencies.append(float(f))
+    out: list[Rotator] = []
+    for f in sorted(frequencies):
         x = np.c_[grid, np.full(len(grid), f)]
         x = np.concatenate([x, x[: -len(x) % _BATCH]])
         parts = [x[k : k + _BATCH] for k in range(0, len(x), _BATCH)]
@@ -290,15 +310,37 @@ def rotator(linear: Linear, periods, max_frequency: float) -> tuple[Residuals, n
         x = x[np.argsort(np.concatenate(chi2))[:_BATCH]]
         x, residuals = _improve_rotators(x, arrays, basis)
         size = np.sum(residuals**2, axis=1)
-        k = int(np.argmin(size))
-        if size[k] < best:
-            best, values, parameters = size[k], residuals[k], x[k]
-    if values is None:
-        return None
-    log_trials = float(np.log(max(max_frequency * linear.t[-1], 1.0)))
-    rest = values[: linear.t.size] / np.asarray(linear.root)
-    period = (1 / float(parameters[5]),)
-    return Residuals("one period, rotating ellipsoid", rest, 6, log_trials, period), parameters
+        pole = np.stack(
+            [np.cos(x[:, 3]) * np.cos(x[:, 2]), np.cos(x[:, 3]) * np.sin(x[:, 2]), np.sin(x[:, 3])],
+            -1,
+        )
+        distinct: list[int] = []
+        for k in np.argsort(size):
+            apart = not distinct or (pole[distinct] @ pole[k]).max() < np.cos(_APART)
+            if np.isfinite(size[k]) and apart and len(distinct) < _POLES:
+                distinct.append(int(k))
+        rest = residuals[:, : linear.t.size] / np.asarray(linear.root)
+        out += [Rotator(rest[k], x[k], float(size[k])) for k in distinct]
+    return sorted(out, key=lambda r: r.chi2)
+
+
+def round_rotators(periods) -> list[np.ndarray]:
+    """Parameters of nearly round ellipsoids with poles all over the sky, in `Rotator`'s order.
+
+    Starts for convex bodies whose light is far from that of any ellipsoid: the best pole of an
+    ellipsoid is then unrelated to that of the body.
+    """
+    return [
+        np.array([-0.05, -0.2, longitude, latitude, 0.0, 1 / period])
+        for period in periods
+        for longitude, latitude in zip(*_directions(_ROUND), strict=True)
+    ]
+
+
+def _directions(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Longitudes and latitudes (count,) [rad], evenly on the sphere along a spiral."""
+    k = np.arange(count) + 0.5
+    return np.pi * (1 + 5**0.5) * k, np.arcsin(1 - 2 * k / count)
 
 
 def _improve_rotators(x, arrays, basis, steps: int = 25):

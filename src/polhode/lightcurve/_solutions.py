@@ -195,13 +195,14 @@ class Linearised(NamedTuple):
     """Residuals of a solution over their errors, and their first-order model; offsets included.
 
     The cost after a step x of the unknowns is that of ``residuals + derivatives @ x``, and of
-    what is known before ``x @ prior @ x + 2 gradient @ x``, but for a constant.
+    what is known before ``x @ prior @ x + 2 gradient @ x + prior_cost``.
     """
 
     residuals: np.ndarray  # (n,)
     derivatives: np.ndarray  # (n, u)
     prior: np.ndarray  # (u, u)
     gradient: np.ndarray  # (u,)
+    prior_cost: float = 0.0  # of the solution itself
 
 
 class Described(NamedTuple):
@@ -211,6 +212,8 @@ class Described(NamedTuple):
     scale: float  # residuals of the best over the errors assumed
     alike: float  # so many neighbouring residuals count as one
     linearised: tuple[Linearised, ...]  # of each solution
+    # what the best ellipsoid became with a convex shape, also where it is no solution of the list
+    refined_ellipsoid: Solution | None = None
 
 
 def describe_solutions(
@@ -231,10 +234,12 @@ def describe_solutions(
     robust, weight = np.asarray(robust)[:, :n], np.asarray(problem.points.weight)[:, :n]
     rest = model - curve.magnitude
     root = np.sqrt(weight[0])
-    _, prior, gradient = problem.prior(best.bodies, best.offsets)
+    prior_cost, prior, gradient = problem.prior(best.bodies, best.offsets)
     derivatives = np.asarray(derivatives)[: len(order), :, :n]
     linearised = tuple(
-        Linearised(rest[k] * root, (derivatives[k] * root).T, prior, gradient[k])
+        Linearised(
+            rest[k] * root, (derivatives[k] * root).T, prior, gradient[k], float(prior_cost[k])
+        )
         for k in range(len(order))
     )
     freedom = max(n - best.matrix.shape[1] + int((problem.stiffness > 0).sum()), 1)

@@ -17,7 +17,8 @@ from polhode.lightcurve._nulls import (
     compare_models,
     noise,
     one_period,
-    rotator,
+    rotators,
+    round_rotators,
     tumbler,
     two_periods,
 )
@@ -32,8 +33,9 @@ from polhode.lightcurve._solutions import (
 _DECISIVE = 5.0  # difference of ln Z: odds of 150 to 1
 _FEW_POINTS = 36  # independent points below which no body of ten parameters is claimed
 _MISFIT = 2.0  # residuals over the curve's own errors from which no solution is certain
-_AGREEMENT = 0.9  # part of the resampled curves in which the best periods must stay the best
+_AGREEMENT = 0.95  # part of the resampled curves in which the best periods must stay the best
 _RESAMPLED, _BLOCKS = 400, 5
+_ELLIPSOIDS = 4  # rotating ellipsoids that are refined with a convex shape
 _CYCLES = 3.0  # of one period, below which its rating is the lowest
 
 
@@ -73,19 +75,26 @@ def null_models(
         # the periods of the best series of few and of many harmonics
         best = sorted(series, key=lambda r: float(np.sum((r.values * linear.root) ** 2)))
         periods = dict.fromkeys(round(r.periods[0], 12) for r in (*best[:2], *series[:4]))
-        ellipsoid = rotator(linear, list(periods)[:4], end)
-        if ellipsoid is not None:
-            rest, parameters = ellipsoid
-            points = curve.points(0.0, offset_sigma)
-            body = rotating_body(linear, parameters, points, phase, limit)
-            period = 2 * np.pi / float(body.body.unknowns[0, 6])
-            convex = rest._replace(
-                name="one period, rotating convex body",
-                values=body.values,
-                parameters=body.parameters,
-                periods=(period,),
-            )
-            nulls += [rest] + ([convex] if np.isfinite(body.cost) else [])
+        ellipsoids = rotators(linear, list(periods)[:4], end)
+        log_trials = series[0].log_trials
+        nulls += [
+            Residuals("one period, rotating ellipsoid", e.values, 6, log_trials, (e.period,))
+            for e in ellipsoids[:1]
+        ]
+        starts = [e.parameters for e in ellipsoids[:_ELLIPSOIDS]]
+        models = compare_models(linear, nulls, effective_correlation)
+        series_best = max(models[1 : 1 + len(series)], key=lambda m: m.log_evidence)
+        # without a signal no pole is worth the time
+        if starts and series_best.log_evidence > models[0].log_evidence:
+            # Few harmonics of one period may be even ones of twice the period.
+            starts += round_rotators([series_best.periods[0], 2 * series_best.periods[0]])
+        points = curve.points(0.0, offset_sigma)
+        for start in starts:
+            body = rotating_body(linear, start, points, phase, limit)
+            if np.isfinite(body.cost):
+                period = 2 * np.pi / float(body.body.unknowns[0, 6])
+                name = "one period, rotating convex body"
+                nulls += [Residuals(name, body.values, body.parameters, log_trials, (period,))]
     return linear, nulls
 
 
@@ -98,17 +107,21 @@ def judge(
     reproduced: bool,
     limit: float,
     others: tuple[Solution, ...] = (),
+    refined: tuple[Solution, ...] = (),
     linearised: Sequence[Linearised] | None = None,
 ) -> Judgement:
     """Compare the null hypotheses with the best tumbling body, and say what may be claimed.
 
     ``others``: more bodies to compare, such as the best ellipsoid, which has fewer parameters;
+    ``refined``: what these became with a convex shape, with odds relative to the best solution;
     ``linearised``: of each solution, for fits to resampled light curves.
     """
     curve = linear.curve
     best = solutions[0]
     everything = [*nulls, *two_periods(linear, pairs, solutions)]
-    everything += [tumbler(linear, pairs, body) for body in (best, *others)]
+    # Evidence counts parameters, which the order of the solutions does not.
+    possible = [s for s in solutions[1:] if s.probability > EXCLUDED]
+    everything += [tumbler(linear, pairs, body) for body in (best, *others, *possible)]
     models = compare_models(linear, everything, effective_correlation)
     classes = same_periods(solutions, pairs.resolution)
     agreement = bootstrap_agreement(curve, linear.root, solutions, classes, limit, linearised)
@@ -118,7 +131,8 @@ def judge(
     listed = tuple(m for m in (silent, single, double, body) if m is not None)
     assert silent is not None  # both are always fitted
     assert body is not None
-    own = models[len(models) - 1 - len(others)]  # the best of the list, whatever its evidence
+    # the best of the list, whatever its evidence
+    own = models[len(models) - 1 - len(others) - len(possible)]
     null = max(m.log_evidence for m in (silent, single) if m is not None)
     two = max(m.log_evidence for m in (double, body) if m is not None)
     more = two - null  # of two periods over one or none
@@ -163,6 +177,12 @@ def judge(
         reasons.append(
             "A series of two periods explains the points, but no tumbling body that was found does."
         )
+    elif double is not None and body.log_evidence - double.log_evidence < _DECISIVE:
+        # which sums of the frequencies its lines are is what only the body can tell
+        reasons.append(
+            "No tumbling body explains the points decisively better than a series of two periods:"
+            f" ln Z {body.log_evidence - double.log_evidence:+.1f}, {_DECISIVE:g} are needed."
+        )
     if own.misfit >= _MISFIT:
         reasons.append(
             f"The best body leaves {own.misfit:.1f} times the errors of the points; no solution"
@@ -176,14 +196,11 @@ def judge(
         )
     # An ellipsoid has too few parameters to follow another body and a convex shape has many, which
     # can make up for a wrong motion. Where they disagree the shape must be decisive by far.
-    for other in others:
-        matches = [same_periods((s, other), pairs.resolution) == [0, 0] for s in solutions]
-        odds = [s.probability for s, same in zip(solutions, matches, strict=True) if same]
-        if not matches[0] and max(odds, default=1.0) > EXCLUDED**2:
-            reasons.append(
-                "The best ellipsoid has other periods or another mode than the best convex body:"
-                " the assumption on the shape decides."
-            )
+    if any(_odds_of(each, solutions, refined, pairs.resolution) > EXCLUDED**2 for each in others):
+        reasons.append(
+            "The best ellipsoid has other periods or another mode than the best convex body:"
+            " the assumption on the shape decides."
+        )
     if agreement < _AGREEMENT:
         reasons.append(
             f"The best periods stay the best in {agreement:.0%} of resampled light curves only;"
@@ -197,6 +214,28 @@ def judge(
         unique = len([s for s in solutions if s.probability > EXCLUDED]) == 1 and len(poles) == 1
         return result(Verdict.TUMBLING, -4 if unique else -3)
     return result(Verdict.AMBIGUOUS, -2 if single_rejected else -1)
+
+
+def _odds_of(
+    ellipsoid: Solution,
+    solutions: tuple[Solution, ...],
+    refined: tuple[Solution, ...],
+    resolution: float,
+) -> float:
+    """Odds of convex bodies with the motion of an ellipsoid, if that is not the best motion; or 0.
+
+    The list of solutions ends before the odds do. What the ellipsoid became, ``refined``, therefore
+    counts as well, unless its fit ended with the best motion. 1 if nothing is known.
+    """
+
+    def same_motion(one: Solution, other: Solution) -> bool:
+        return same_periods((one, other), resolution) == [0, 0]
+
+    if same_motion(ellipsoid, solutions[0]):
+        return 0.0
+    odds = [s.probability for s in solutions if same_motion(s, ellipsoid)]
+    odds += [0.0 if same_motion(s, solutions[0]) else s.probability for s in refined]
+    return max(odds, default=1.0)
 
 
 def _best_of(models: tuple[Model, ...], word: str) -> Model | None:
@@ -219,7 +258,8 @@ def bootstrap_agreement(
     contributions of the points to the cost of every solution are added, without new fits (RELL
     bootstrap: Kishino, Miyata & Hasegawa, J. Mol. Evol. 31 (1990) 151). With ``linearised`` the
     solutions with odds above 1 in a million are also fitted again to every resampled light curve,
-    by one step of Gauss and Newton from where they are. The smaller part counts.
+    by one step of Gauss and Newton from where they are. The smaller part counts. The priors' part
+    of the cost, by which the solutions are ordered too, is the same in all light curves.
     """
     if len(set(classes)) < 2:
         return 1.0
@@ -234,14 +274,18 @@ def bootstrap_agreement(
     rest = np.array([(s.model - curve.magnitude) * root for s in solutions])
     rest = rest / _scale_of(rest[0])
     blocks = np.stack([np.bincount(block, c) for c in _robust_cost(rest, limit)])
-    agreement = float(np.mean(number[np.argmin(blocks @ weight.T, axis=0)] == number[0]))
+    prior = np.zeros(len(solutions))
+    if linearised is not None:
+        scale = _scale_of(linearised[0].residuals)
+        prior = np.array([each.prior_cost for each in linearised]) / scale**2
+    cost = blocks @ weight.T + prior[:, None]
+    agreement = float(np.mean(number[np.argmin(cost, axis=0)] == number[0]))
     # Others have often not converged, and the linear model then promises them more than the step
     # would hold: one with odds of 1e-10 would win in most resampled light curves.
     possible = [k for k, s in enumerate(solutions) if s.probability > EXCLUDED**2]
     if linearised is None or len(set(number[possible])) < 2:
         return agreement
-    scale = _scale_of(linearised[0].residuals)
-    cost = [_refitted_cost(linearised[k], block, weight, scale, limit) for k in possible]
+    cost = [_refitted_cost(linearised[k], block, weight, scale, limit) + prior[k] for k in possible]
     best = number[possible][np.argmin(cost, axis=0)]
     return min(agreement, float(np.mean(best == number[0])))
 
