@@ -300,7 +300,10 @@ def possible_moments(moments: Float[Array, "*b 3"], triangle: bool) -> Bool[Arra
         quarter = moments / 4  # so that no sum overflows
         largest = xp.max(quarter, axis=-1)
         good = good & (xp.sum(quarter, axis=-1) >= (2 - tolerance(moments)) * largest)
-    return good
+    if xp is jnp:
+        return good
+    with jax.ensure_compile_time_eval():
+        return jax.device_put(np.asarray(good))
 
 
 def possible_tensor(tensor: Float[Array, "*b 3 3"], triangle: bool) -> Bool[Array, "*b"]:
