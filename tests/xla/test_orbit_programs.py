@@ -2,12 +2,14 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 from torques.orbit_scenes import last_rates, orbit_of, scene_of
 from xla.operations import operations
 
 import polhode as ph
 from polhode._integrate import _field, _flow_derivative, _problem
+from polhode._kernels import is_holdable
 
 
 @pytest.mark.parametrize(
@@ -87,3 +89,13 @@ def test_one_copy_in_the_field(copies):
     assert largest(shape, jax.grad(lambda e: made_inside(e, 6)), 0.1) == 1
     two = scene_of(orbit_of(0.1), orbit_of(0.1))
     assert largest(shape, lambda t: last_rates(two, t, 7), 1.5) == 2
+
+
+def test_a_table_fits_into_a_fused_kernel():
+    """Also while it is looked up: a comparison in the total order of floats, as in
+    ``jnp.searchsorted``, made the whole field of a satellite run apart, twelve times slower."""
+    times = np.linspace(0.0, 3600.0, 61)
+    for order in (1, 3):
+        table = ph.Table(times, np.sin(np.outer(times, [1e-3, 2e-3, 3e-3])), order=order)
+        for t in (0.0, jnp.array([-5.0, 30.0, 7200.0])):
+            assert is_holdable(jax.make_jaxpr(table)(t).jaxpr)
