@@ -191,7 +191,7 @@ class Trajectory(eqx.Module):
     def step_counts(self) -> StepCounts:
         """How many steps (...) were refused, and how many ended at a switch or a saved time.
 
-        Many refused ones: the motion changes its pace abruptly. Many at switches: a torque changes
+        Many refused ones: the motion changes abruptly. Many at switches: a torque changes
         sides often; smooth it, or loosen the limit that it meets. Many at saved times: save fewer.
         Zero for closed forms.
         """
