@@ -246,6 +246,7 @@ def test_counts_of_steps_show_what_limited_them():
     def spun(t):
         return jnp.array([0.0, 0.0, 5.0 / (1e-4 + (t - 3.0) ** 2)])
 
-    sudden = ph.simulate(ph.Scene(body, torque=ph.BodyTorque(spun)), states[0], [0.0, 6.0])
+    pushed = ph.Scene(body, torque=ph.BodyTorque(spun))
+    sudden = ph.simulate(pushed, ph.State([1.0, 0, 0, 0], [0.1, 0.1, 0.1]), [0.0, 6.0])
     assert int(sudden.step_counts.refused) > 0
     assert "refused" in str(sudden)
