@@ -77,7 +77,7 @@ jax.monitoring.register_event_duration_secs_listener(
     lambda name, seconds, **_: compiled.append(name) if "backend_compile" in name else None
 )
 state = ph.State([1, 0, 0, 0.2], np.deg2rad(5.0) * np.ones(3))
-boxes = ph.Inertia.from_box(12.0, [0.2263, 0.1, 0.366]), ph.Inertia.from_cylinder(2.0, 0.1, 0.3)
+box = ph.Inertia.from_box(12.0, [0.2263, 0.1, 0.366])
 body = ph.Inertia.from_moments([1.0, 2.0, 3.0])
 gravity = ph.UniformGravity(1.0, [0, 0, 0.5], [0, 0, -9.8])
 scene = ph.Scene(body, gravity, ph.LinearDamping([0.1, 0.1, 0.2]))

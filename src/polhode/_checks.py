@@ -38,12 +38,13 @@ def numbers(*arrays: Any) -> Any:
     return np if is_concrete(arrays) and all(_is_here(x) for x in arrays) else jnp
 
 
-def on_host(array: Any) -> Any:
+def on_host(array: Any, weak: bool = False) -> Any:
     """``array`` as a NumPy array where its values are known and it was not put on devices by hand.
 
-    A few operations on it then compile nothing."""
+    A few operations on it then compile nothing. ``weak``: also of weakly typed numbers, which lose
+    that: their dtype no longer follows that of others."""
     known = isinstance(array, jax.Array) and is_concrete(array) and not array.committed
-    return np.asarray(array) if known else array
+    return np.asarray(array) if known and (weak or not array.weak_type) else array
 
 
 def together(found: Sequence[Any]) -> Any:

@@ -52,3 +52,16 @@ def test_arrays_of_two_precisions_are_refused():
     )
     with pytest.raises(TypeError, match="mix the dtypes"):
         ph.explain(scene, ph.State(single(1.0, 0.0, 0.0, 0.0), X), [0.0, 1.0])
+
+
+def test_bodies_of_python_numbers_follow_the_state():
+    """Constructors compute with NumPy where that keeps the dtype, and not elsewhere."""
+    state = ph.State(single(1.0, 0.0, 0.0, 0.0), single(0.1, 0.2, 1.0))
+    for body in (ph.Inertia.from_cylinder(2.0, 0.1, 0.3), ph.Inertia.from_sphere(2.0, 0.1)):
+        assert ph.explain(ph.Scene(body), state, [0.0, 1.0]).dtype == "float32"
+    box = ph.Inertia.from_box(2.0, single(0.1, 0.2, 0.3))
+    assert box.moments.dtype == jnp.float32
+    traced = jax.jit(lambda m: ph.Inertia.from_cylinder(m, 0.1, 0.3).moments)(single(2.0))
+    assert traced.dtype == jnp.float32
+    weak = jax.vmap(lambda m: ph.Inertia.from_sphere(m, 0.1).moments)(single(1.0, 2.0))
+    assert weak.dtype == jnp.float32

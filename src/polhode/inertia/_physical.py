@@ -291,7 +291,7 @@ def possible_moments(moments: Float[Array, "*b 3"], triangle: bool) -> Bool[Arra
     The tolerance is that of the constructors; nothing is looked for, so that it costs a few
     operations in a compiled program.
     """
-    moments = on_host(moments)
+    moments = on_host(moments, weak=True)
     xp = numbers(moments)
     if xp is jnp:
         moments = jax.lax.stop_gradient(moments)

@@ -10,6 +10,9 @@ from collections.abc import Mapping
 from typing import Any, Self
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from polhode._checks import ArrayLike, as_float_array, as_floats, numbers, on_host, require_positive
@@ -35,7 +38,8 @@ def _axial(mass: Array, transverse: Array, axial: Array) -> Array:
 
 
 def _moments(mass: Array, *squares: Array) -> Array:
-    moments = mass[..., None] * numbers(mass, *squares).stack(squares, axis=-1)
+    xp = jnp if any(isinstance(x, jax.Array) for x in (mass, *squares)) else np
+    moments = mass[..., None] * xp.stack(squares, axis=-1)
     return as_float_array("the principal moments", moments, finite=False)
 
 
@@ -179,4 +183,5 @@ def _sized(
         if outer is not None:
             require_below(name, named[name], outer, named[outer])
     # so that the formulas compile nothing where the numbers are known
-    return tuple(map(on_host, arrays))
+    some_strong = any(not x.weak_type for x in arrays)
+    return tuple(on_host(x, weak=some_strong) for x in arrays)
