@@ -95,8 +95,6 @@ def as_float_array(
         # ``jnp.asarray`` compiles a program, and an array is copied: its owner may change it
         if isinstance(value, list | tuple) and all(type(x) in (float, int) for x in leaves):
             value = jax.device_put(np.array(value, float))
-        elif type(value) is float:
-            value = jax.device_put(value)
         elif isinstance(value, _NUMPY) and value.dtype in (np.float32, np.float64):
             value = jax.device_put(np.array(value))
         array = jnp.asarray(value)
