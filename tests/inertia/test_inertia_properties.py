@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 
 import polhode as ph
+from polhode.inertia import principal
 
 COUNT = 5
 coordinates = st.tuples(*[st.integers(-4, 4)] * (3 * COUNT)).map(
@@ -135,3 +136,20 @@ def test_moments_of_second_moments(decades, wxyz):
     impossible = np.array([moments[0], moments[1], 1.01 * (moments[0] + moments[1])])
     with pytest.raises(ValueError, match="triangle inequality"):
         ph.Inertia.from_moments(impossible)
+
+
+def test_principal_axes_half_a_turn_from_those_of_the_body():
+    """The scalar part of the quaternion is zero but for rounding; alone and in a batch."""
+    moments = np.array([11.0, 18.7827941003892276, 27.7827941003892276])
+    axes = np.random.default_rng(5).integers(-3, 4, (400, 3))
+    axes = np.concatenate([[[1.0, -3.0, 0.0]], axes[np.any(axes != 0, axis=1)]])
+    real = np.where(np.arange(len(axes)) == 0, -2.0, 0.0)  # the first needs -2 for half a turn
+    quaternions = ph.rotation.normalise(jnp.asarray(np.column_stack([real, axes])))
+    tensors = ph.Inertia.from_moments(moments).turned(quaternions).full
+    np.testing.assert_allclose(principal(tensors)[0], np.tile(moments, (len(axes), 1)), rtol=1e-12)
+    one = jax.jit(principal)
+    for tensor in [tensors[0], *tensors[1:60]]:
+        values, wxyz, _ = one(tensor)
+        np.testing.assert_allclose(values, moments, rtol=1e-12)
+        rotation = ph.rotation.wxyz_to_matrix(wxyz)
+        np.testing.assert_allclose(rotation @ np.diag(moments) @ rotation.T, tensor, atol=1e-11)

@@ -102,9 +102,10 @@ def _jacobi(diagonal, off):
     count = _SWEEPS[jnp.dtype(one.dtype).itemsize]
     diagonal, off, q = jax.lax.fori_loop(0, count, sweep, (diagonal, off, q))
     _, q = _ordered(diagonal, q)
+    # Of either sign. A scalar part that is zero but for rounding must not decide the sign: XLA may
+    # compute it anew for each component, rounded otherwise, and these then differ in sign.
     norm = jnp.sqrt(sum(c * c for c in q))
-    sign = jnp.where(q[0] < 0, -1, 1).astype(norm.dtype)
-    return tuple(sign * c / norm for c in q)
+    return tuple(c / norm for c in q)
 
 
 def _columns(q):
