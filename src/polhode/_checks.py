@@ -43,8 +43,9 @@ def on_host(array: Any, weak: bool = False) -> Any:
 
     A few operations on it then compile nothing. ``weak``: also of weakly typed numbers, which lose
     that: their dtype no longer follows that of others."""
-    known = isinstance(array, jax.Array) and is_concrete(array) and not array.committed
-    return np.asarray(array) if known and (weak or not array.weak_type) else array
+    if not isinstance(array, jax.Array) or not is_concrete(array) or array.committed:
+        return array
+    return np.asarray(array) if weak or not array.weak_type else array
 
 
 def together(found: Sequence[Any]) -> Any:

@@ -35,7 +35,7 @@ def signal_handlers() -> Iterator[None]:
         if number != alarm:
             _received.append(number)
         if alarm is not None and _is_importing(frame):
-            signal.signal(alarm, stop)
+            previous.setdefault(alarm, signal.signal(alarm, stop))
             signal.setitimer(signal.ITIMER_REAL, _AGAIN)
         else:
             check_signals()
@@ -44,9 +44,7 @@ def signal_handlers() -> Iterator[None]:
     watched = [signal.SIGTERM]
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not of a background job
         watched.append(signal.SIGINT)
-    previous = {number: signal.signal(number, stop) for number in watched}
-    if alarm is not None:
-        previous[alarm] = signal.getsignal(alarm)
+    previous: dict[int | None, Any] = {n: signal.signal(n, stop) for n in watched}
     try:
         yield
         check_signals()
@@ -54,10 +52,10 @@ def signal_handlers() -> Iterator[None]:
         check_signals()  # a library may have turned the interrupt into an error of its own
         raise
     finally:
-        if alarm is not None:
+        if alarm in previous:  # a timer of the caller stays as it is
             signal.setitimer(signal.ITIMER_REAL, 0)
         for number, handler in previous.items():
-            signal.signal(number, handler)
+            signal.signal(number, handler)  # type: ignore[arg-type]
 
 
 _AGAIN = 0.05

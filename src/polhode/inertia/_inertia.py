@@ -174,8 +174,8 @@ class Inertia(AbstractShaped, AbstractPart):
         """Moments (..., 3) in the form of a symmetry that they are known to have; unchecked."""
         if symmetry is Symmetry.NONE:
             return cls(diagonal=moments, physical=physical)
-        known = on_host(moments)
-        first, last = (as_float_array("a moment", known[..., i], finite=False) for i in (0, 2))
+        values = on_host(moments)
+        first, last = (as_float_array("a moment", values[..., i], finite=False) for i in (0, 2))
         if symmetry is Symmetry.AXISYMMETRIC:
             return cls(transverse=first, axial=last, physical=physical)
         return cls(moment=first, physical=physical)

@@ -189,10 +189,10 @@ def normalise(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
     Scaled by the largest component first, so that neither tiny nor huge input is lost.
     """
     wxyz = as_quaternions(wxyz)
-    known = on_host(wxyz)
-    if isinstance(known, np.ndarray) and known.ndim == 1:  # without compiling a program
-        known = known / np.max(np.abs(known))
-        return as_float_array("wxyz", known / np.sqrt(np.sum(known**2)), finite=False)
+    values = on_host(wxyz)
+    if isinstance(values, np.ndarray) and values.ndim == 1:  # without compiling a program
+        values = values / np.max(np.abs(values))
+        return as_float_array("wxyz", values / np.sqrt(np.sum(values**2)), finite=False)
     return _normalised(wxyz)
 
 
