@@ -1,5 +1,6 @@
 """The marked call: whatever XLA folds away, the process lives and the values stay."""
 
+import functools
 import subprocess
 import sys
 from pathlib import Path
@@ -135,6 +136,30 @@ def test_one_body_is_few_tasks_of_the_processor(times):
     tasks = [line for line in main.splitlines() if any(f" {k}(" in line for k in kinds)]
     assert any(" call(" in line for line in tasks)
     assert len(tasks) <= 8, tasks
+
+
+def test_a_batch_of_batches_is_too_wide_for_a_unit():
+    """XLA sums many numbers by a call of a library, which a unit cannot contain: it is no unit as
+    soon as a batch, around another batch that is one, makes its sums too wide."""
+
+    def power(weights, rows):
+        def step(_, rows):
+            total = jnp.sum(weights[:, None, None] * rows, axis=0)
+            return jax.lax.dynamic_update_index_in_dim(rows, total, 3, 0)
+
+        return jax.lax.fori_loop(0, 5, step, rows)
+
+    weights, rows = jnp.linspace(0.0, 1.0, 14), jnp.ones((240, 2, 14, 8, 4))
+
+    def batch(rows):
+        return jax.vmap(jax.vmap(functools.partial(kernel(power), weights)))(rows)
+
+    one = functools.partial(kernel(power), weights)
+    assert "xla_cpu_small_call" in jax.jit(one).lower(rows[0, 0]).as_text()
+    assert "xla_cpu_small_call" in jax.jit(jax.vmap(one)).lower(rows[0]).as_text()
+    assert "xla_cpu_small_call" not in jax.jit(batch).lower(rows).as_text()
+    expected = power(weights, rows[0, 0])
+    np.testing.assert_allclose(jax.jit(batch)(rows)[-1, -1], expected, rtol=1e-12)
 
 
 def test_units_within_a_unit():

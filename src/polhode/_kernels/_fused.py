@@ -7,7 +7,7 @@ the same array would be computed twice.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextvars import ContextVar
 from functools import reduce
 from typing import Any, NamedTuple
@@ -195,26 +195,34 @@ def _is_of_use() -> bool:
 
 def is_holdable(jaxpr: Any) -> bool:
     """Whether a unit can hold this program."""
+    return not _sums_widely(jaxpr) and all(
+        all(equation.primitive.name in _HOLDABLE for equation in program.eqns)
+        and all(_is_packable(v.aval.dtype) for v in (*program.invars, *program.constvars))
+        for program in _programs(jaxpr)
+    )
+
+
+def _sums_widely(jaxpr: Any) -> bool:
+    """Whether it reduces so many floats that XLA calls a library, which a unit cannot contain."""
+    return any(
+        equation.primitive.name.startswith("reduce_")
+        and jnp.issubdtype(equation.invars[0].aval.dtype, jnp.inexact)
+        and equation.invars[0].aval.size >= _policy.KERNEL_SUM
+        for program in _programs(jaxpr)
+        for equation in program.eqns
+    )
+
+
+def _programs(jaxpr: Any) -> Iterator[Any]:
+    """A program and those that its operations hold, such as the bodies of loops."""
+    yield jaxpr
     for equation in jaxpr.eqns:
-        if equation.primitive.name not in _HOLDABLE or _is_wide(equation):
-            return False
         for value in jax.tree.leaves(
             list(equation.params.values()), is_leaf=lambda v: hasattr(v, "eqns")
         ):
             nested = getattr(value, "jaxpr", value)
-            if hasattr(nested, "eqns") and not is_holdable(nested):
-                return False
-    return all(_is_packable(v.aval.dtype) for v in (*jaxpr.invars, *jaxpr.constvars))
-
-
-def _is_wide(equation) -> bool:
-    """Whether it reduces so many floats that XLA calls a library, which a unit cannot contain.
-
-    From 4096 on, measured with jaxlib 0.10."""
-    if not equation.primitive.name.startswith("reduce_"):
-        return False
-    operand = equation.invars[0].aval
-    return jnp.issubdtype(operand.dtype, jnp.inexact) and operand.size >= _policy.KERNEL_SUM
+            if hasattr(nested, "eqns"):
+                yield from _programs(nested)
 
 
 def _is_packable(dtype) -> bool:
@@ -385,17 +393,18 @@ def _unit_lowered(*arrays, whole, shapes):
 
 def _unit_batch(arrays, dims, *, whole, shapes):
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
+    shapes = tuple(((size, *shape), dtype) for shape, dtype in shapes)
+    closed = jax.make_jaxpr(jax.vmap(whole, dims))(*arrays)
+    batch = jaxpr_as_fun(closed)
+    # XLA divides loops over large arrays among threads, which it cannot do within a unit.
+    if size > _policy.KERNEL_BODIES or _sums_widely(closed.jaxpr):
+        return batch(*arrays), [0] * len(shapes)
 
-    def one(*x):
-        # XLA divides loops over large arrays among threads, which it cannot do within a unit
-        return list(
-            _unit_lowered(*x, whole=whole, shapes=shapes)
-            if size <= _policy.KERNEL_BODIES
-            else whole(*x)
-        )
+    def as_whole(*arrays):
+        with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):
+            return batch(*arrays)
 
-    out = jax.vmap(one, dims)(*arrays)
-    return out, [0] * len(out)
+    return _unit_p.bind(*arrays, whole=as_whole, shapes=shapes), [0] * len(shapes)
 
 
 mlir.register_lowering(_unit_p, mlir.lower_fun(_unit_lowered, multiple_results=True))
