@@ -209,7 +209,7 @@ def test_noise_in_closed_form_with_a_free_wheel():
     scene = ph.Scene(
         ph.Inertia.axisymmetric(1.0, 1.5),
         ph.UniformGravity.axial(1.0, 0.5),
-        rotors=ph.Rotor([0.0, 0.0, 1.0], 0.1, speed=5.0, torque=0.0),
+        rotors=ph.Rotor.axial(0.1, speed=5.0, torque=0.0),
     )
     state = ph.State(*WHEEL_STATE)
     closed = ph.propagate(scene, state, 0.5, method=ph.LagrangeTop())

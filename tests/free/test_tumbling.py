@@ -113,7 +113,7 @@ def test_derivatives_of_the_closed_form_agree():
             sign = np.sign(np.dot(final(start, jnp.array([0.0, sample["t"]]))[:4], sample["wxyz"]))
             stored[:4] *= sign
             size = np.abs(stored).max(axis=0)
-            np.testing.assert_allclose(found / size, stored / size, atol=1e-9)
+            np.testing.assert_allclose(np.asarray(found) / size, stored / size, atol=1e-9)
 
 
 def test_the_table_holds_the_numbers_of_the_file_with_all_digits():

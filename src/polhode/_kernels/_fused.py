@@ -155,7 +155,8 @@ def _put_all(size, batched, *operands):
         x if b else jnp.broadcast_to(x, (size, *x.shape)) for x, b in zip(operands, batched)
     )
     places = places + rows.shape[1] * jnp.arange(size, dtype=places.dtype)[:, None]
-    flat = _put(_flat(rows), places.reshape(-1), _flat(values))
+    # not ``_put``: a batch around this one would turn its places into a scatter
+    flat = _put_each(_flat(rows), places.reshape(-1), _flat(values))
     return flat.reshape(rows.shape), True
 
 
@@ -240,7 +241,7 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
     def marked(*leaves):
         closed, bare = traced or (jax.make_jaxpr(flat)(*leaves), 0)
         if traced is None and not is_holdable(closed.jaxpr):
-            return jaxpr_as_fun(closed)(*leaves)
+            return _batched_alike(jaxpr_as_fun(closed)(*leaves), leaves)
         return _unit_call(closed, leaves, bare)
 
     def derivative(leaves, tangents):
@@ -258,7 +259,8 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
             return value, _of_units(of_moving, moving, leaves, tangents, value)
         if again or not linearised:
             arguments = [leaves[k] for k in moving], [tangents[k] for k in moving]
-            return jax.jvp(lambda *x: of_moving(leaves, x), *arguments)
+            values, slopes = jax.jvp(lambda *x: of_moving(leaves, x), *arguments)
+            return _batched_alike(values, leaves), slopes
         # ``jax.linearize`` within the unit: values and coefficients leave it as results, and the
         # linear map alone is left outside, where JAX can transpose it.
         shape = []
@@ -281,6 +283,16 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
 
     marked.defjvp(derivative, symbolic_zeros=True)
     return marked
+
+
+def _batched_alike(results: Sequence[jax.Array], leaves: Sequence[Any]) -> list[jax.Array]:
+    """``results``, each with the batch axes of every one of ``leaves``.
+
+    Under ``vmap`` all results of a unit are batched, also those that depend on no batched operand,
+    and JAX requires the same of the values that a custom derivative returns."""
+    firsts = [x[(0,) * x.ndim] for x in map(jnp.asarray, leaves) if x.size]
+    sure = reduce(jnp.logical_or, (x == x for x in firsts), True)
+    return [jax.lax.select(jnp.broadcast_to(sure, x.shape), x, x) for x in results]
 
 
 def _of_units(of_moving: Callable, moving: Sequence[int], leaves, tangents, like) -> list[Any]:

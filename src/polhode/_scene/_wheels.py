@@ -161,8 +161,8 @@ class AbstractRotor(AbstractPart):
         for wheel in self.wheels:
             if wheel.inertia is None:
                 continue
-            axis = wheel.direction
             with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
+                axis = wheel.direction
                 momentum = inertia.momentum(axis)
                 about = jnp.sum(jnp.broadcast_to(axis, momentum.shape) * momentum, axis=-1)
             require(
