@@ -311,7 +311,7 @@ MUTANTS = (
     # integration: error control, switches, events and derivatives
     Mutant(
         LOOP,
-        "* options.rtol.astype(error.dtype) * angle / (whole * drift)",
+        "* options.rtol.astype(error.dtype) * angle / (total_angle * drift)",
         "* options.rtol.astype(error.dtype)",
         "each step may have the error of the whole motion",
         ("solvers/test_switches.py::test_states_through_switches",),
@@ -325,8 +325,8 @@ MUTANTS = (
     ),
     Mutant(
         STEPS,
-        "weight = jnp.sum(cotangent * (later - before), axis=0)",
-        "weight = jnp.sum(cotangent * (before - later), axis=0)",
+        "weight = jnp.sum(cotangent * (rates_after - rates_before), axis=0)",
+        "weight = jnp.sum(cotangent * (rates_before - rates_after), axis=0)",
         "the jump of the costate at a switch has the wrong sign",
         ("solvers/test_switches.py::test_a_gradient_through_a_jump",),
     ),

@@ -57,7 +57,7 @@ def test_every_switch_of_a_program_is_found(fn, count, jumps):
     found = program(fn, x)
     if count is not None:
         assert found.count == count
-    assert not found.hidden
+    assert not found.hidden_operations
     assert bool(found.jumps.any()) == jumps or count is None
     levels = found.levels(x)
     (value, *_), margins, _ = found.frozen(levels, x)
@@ -72,7 +72,7 @@ def test_what_cannot_be_looked_into_is_named():
     def halved(x):
         return jax.lax.while_loop(lambda s: jnp.sum(s * s) > 1, lambda s: s / 2, x)
 
-    assert program(halved, jnp.ones(3)).hidden == ("while",)
+    assert program(halved, jnp.ones(3)).hidden_operations == ("while",)
     scene = ph.Scene(INERTIA, None, ph.FeedbackTorque(lambda t, wxyz, omega: halved(omega)))
     state = ph.State(WXYZ, OMEGA)
     assert "contains while" in str(ph.explain(scene, state, TS))

@@ -43,8 +43,10 @@ def dynamics(scene):
 def prepared(system, t, y, control):
     problem = BoundTerm.of(diffrax.ODETerm(lie_poisson_field), system)
     leaves, tree = jax.tree.flatten(y)
-    ready = problem.prepared(t, y, jnp.float64)
-    return jax.tree.unflatten(tree, [control * x for x in ready.rates(ready.held, t, leaves)])
+    ready = problem.prepare(t, y, jnp.float64)
+    return jax.tree.unflatten(
+        tree, [control * x for x in ready.rates(ready.coefficients, t, leaves)]
+    )
 
 
 @pytest.mark.parametrize("name", scenes())
@@ -86,8 +88,10 @@ def test_the_derived_field_costs_what_the_one_written_by_hand_does():
         @jax.jit
         def count(y, args, field=field):
             problem = BoundTerm.of(diffrax.ODETerm(field), args)
-            ready = problem.prepared(jnp.zeros(()), y, jnp.float64)
-            closed = jax.make_jaxpr(lambda *y: ready.rates(ready.held, 0.0, y))(*jax.tree.leaves(y))
+            ready = problem.prepare(jnp.zeros(()), y, jnp.float64)
+            closed = jax.make_jaxpr(lambda *y: ready.rates(ready.coefficients, 0.0, y))(
+                *jax.tree.leaves(y)
+            )
             counts.append(_arithmetic(closed))
             return y
 
@@ -150,8 +154,10 @@ def test_what_rests_on_the_same_arrays_is_worked_out_once():
     for a, b, waves in ((2 * t, None, 1), (2 * t, 3 * t, 2)):
         b = a if b is None else b
         ready = specialise(jax.make_jaxpr(field)(a, b, t, y), [a, b])
-        program = jax.make_jaxpr(ready.run)(ready.held, t, y)
+        program = jax.make_jaxpr(ready.run)(ready.coefficients, t, y)
         names = [eqn.primitive.name for eqn in program.jaxpr.eqns]
         assert [names.count(name) for name in ("sin", "cos", "sinh")] == [waves] * 3
         assert names.count("atan2") == 2
-        np.testing.assert_allclose(ready.run(ready.held, t, y)[0], field(a, b, t, y), rtol=1e-14)
+        np.testing.assert_allclose(
+            ready.run(ready.coefficients, t, y)[0], field(a, b, t, y), rtol=1e-14
+        )

@@ -60,7 +60,7 @@ def copies(monkeypatch):
         def recorded(closed, known, original=original, **options):
             made = original(closed, known, **options)
             shapes = [v.aval for v in closed.jaxpr.invars[len(known) :]]
-            program = jax.make_jaxpr(made.run)(made.held, *shapes)
+            program = jax.make_jaxpr(made.run)(made.coefficients, *shapes)
             found.append(operations(program.jaxpr)["log"])
             return made
 

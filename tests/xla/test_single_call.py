@@ -45,8 +45,8 @@ def test_one_variable_switches_all_off(monkeypatch):
     monkeypatch.setenv("POLHODE_PLAIN", "0")
     assert "xla_cpu_small_call" in _lowered()
     closed = jax.make_jaxpr(lambda p, x: p * 2 * x)(1.0, 2.0)
-    assert len(specialise(closed, [jnp.array(3.0)]).held) == 1
-    assert float(specialise(closed, [jnp.array(3.0)]).held[0]) == 6
+    assert len(specialise(closed, [jnp.array(3.0)]).coefficients) == 1
+    assert float(specialise(closed, [jnp.array(3.0)]).coefficients[0]) == 6
     monkeypatch.setenv("POLHODE_PLAIN", "1")
     assert "xla_cpu_small_call" not in _lowered()
     held, run, *_ = specialise(closed, [jnp.array(3.0)])

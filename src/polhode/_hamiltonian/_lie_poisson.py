@@ -181,20 +181,20 @@ def spin_rates(
 class LiePoissonUnits(eqx.Module):
     """Natural units of body momentum and quaternion, updated with the state.
 
-    ``size`` (N,): of each inertia [kg m^2]; ``least`` (N,): momentum [kg m^2/s] by which a body at
-    rest is measured, which a torque may move later; ``wheels`` (static): how many have momenta that
-    are part of the state.
+    ``size`` (N,): of each inertia [kg m^2]; ``min_momentum`` (N,): unit of momentum
+    [kg m^2/s] of a body at rest, which a torque may move later; ``wheels`` (static): how many have
+    momenta that are part of the state.
     """
 
     size: Float[Array, "*n"]
-    least: Float[Array, "*n"]
+    min_momentum: Float[Array, "*n"]
     wheels: int = eqx.field(static=True, default=0)
 
     def __call__(self, y: Sequence[Array], rates: Sequence[Array]) -> tuple[list[Array], Array]:
         """Weights of the components, their squares to be summed (rad), and the rate [rad/s]."""
         torque = jnp.sqrt(sum(x * x for x in rates[:3]))
         carried = [*y[:3], *y[7 : 7 + self.wheels]]
-        unit = jnp.sqrt(sum(x * x for x in carried) + self.least**2 + 3 * self.size * torque)
+        unit = jnp.sqrt(sum(x * x for x in carried) + self.min_momentum**2 + 3 * self.size * torque)
         axes_rate = 4 * sum(x * x for x in rates[3:7])  # the square of the body rates
         others = [jnp.zeros_like(unit)] * (
             len(y) - 7 - self.wheels

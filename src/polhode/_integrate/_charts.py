@@ -59,7 +59,7 @@ class AbstractChart(eqx.Module):
         """Rates of the state."""
 
     @abc.abstractmethod
-    def seen(self, y: PyTree[Array]) -> tuple[Vector, Attitude]:
+    def momentum_and_attitude(self, y: PyTree[Array]) -> tuple[Vector, Attitude]:
         """Body momentum [kg m^2/s] and attitude."""
 
     @abc.abstractmethod
@@ -82,10 +82,10 @@ class AbstractChart(eqx.Module):
         """The field, and the power [W] of what is not conservative as one more group: all of it,
         then that of every wheel that is not held."""
         *state, _ = y
-        now, seen = dynamics.at(*state[2:]), self.seen(state[:2])
-        powers = (external_power(t, *seen, now),)
-        if now.wheels is not None:
-            powers += tuple(motor_powers(t, *seen, now, now.wheels.loose))
+        instant_dynamics, pose = dynamics.at(*state[2:]), self.momentum_and_attitude(state[:2])
+        powers = (external_power(t, *pose, instant_dynamics),)
+        if instant_dynamics.wheels is not None:
+            powers += tuple(motor_powers(t, *pose, instant_dynamics, instant_dynamics.wheels.loose))
         return *self.field(t, tuple(state), dynamics), powers
 
 
@@ -102,21 +102,23 @@ class LiePoissonChart(AbstractChart):
     def field(self, t, y, dynamics):
         return lie_poisson_field(t, y, dynamics)
 
-    def seen(self, y):
+    def momentum_and_attitude(self, y):
         return y[0], from_quaternion(y[1])
 
     def dynamics(self, scene, state, ts):
         lane = state.wxyz[..., 0]
         size = jnp.trace(_first_inertia(scene, ts).tensor, axis1=-2, axis2=-1) / 3
-        least = slow_momentum(scene, ts)
-        size, least, _ = jax.lax.stop_gradient(jnp.broadcast_arrays(size, least, lane))
-        moved = scene.dynamics
-        units = LiePoissonUnits(size, least, len(moved.coupled))
+        min_momentum = slow_momentum(scene, ts)
+        size, min_momentum, _ = jax.lax.stop_gradient(
+            jnp.broadcast_arrays(size, min_momentum, lane)
+        )
+        scene_dynamics = scene.dynamics
+        units = LiePoissonUnits(size, min_momentum, len(scene_dynamics.coupled))
         if self.upright:
             _, potential = _upright(scene.potential)
             scene = Scene(scene.inertia, potential, scene.torque, scene.rotors)
-        costate = None if moved.coupled else LiePoissonCostate.of
-        return Dynamics(scene.hamiltonian, scene.torque, units, costate, moved.wheels)
+        costate = None if scene_dynamics.coupled else LiePoissonCostate.of
+        return Dynamics(scene.hamiltonian, scene.torque, units, costate, scene_dynamics.wheels)
 
     def start(self, scene, state, t):
         momentum = scene.momentum(state.omega_body, t)
@@ -133,11 +135,11 @@ class LiePoissonChart(AbstractChart):
         omega = scene.with_spins(*y[2:]).rates(momentum, t)
         if self.upright:
             turn, _ = _upright(scene.potential)
-            wxyz = _turned(turn, wxyz)
+            wxyz = _rotate(turn, wxyz)
         return rotation.normalise(wxyz), omega, jnp.ones(momentum.shape[:-1], bool)
 
 
-def _turned(turn: Array, wxyz: Array) -> Array:
+def _rotate(turn: Array, wxyz: Array) -> Array:
     """Product of one quaternion (..., 1, 4) with many (..., T, 4): by its columns as a matrix,
     which takes half as long as ``rotation.multiply`` where there are many times."""
     a, b, c, d = (turn[..., i] for i in range(4))
@@ -165,8 +167,8 @@ def _upright(field: UniformGravity | GravityGradient) -> tuple[Array, AbstractPo
         (w, x, y), size = upward(gravity)
         # Without gravity any axis will do, but derivatives across the one that is taken are lost:
         # they are made NaN.
-        none = jnp.all(field.gravity_space == 0, axis=-1)
-        size = size + sum(underivable(g, none) - g for g in gravity[:2])
+        is_zero = jnp.all(field.gravity_space == 0, axis=-1)
+        size = size + sum(underivable(g, is_zero) - g for g in gravity[:2])
         size = jnp.multiply(*jnp.broadcast_arrays(field.mass, size))
     turn = jnp.stack([w, x, y, jnp.zeros_like(w)], axis=-1)
     return turn, AlongZ(field, size)
@@ -180,14 +182,14 @@ class EulerChart(AbstractChart):
     def field(self, t, y, dynamics):
         return euler_angle_field(t, y, dynamics)
 
-    def seen(self, y):
+    def momentum_and_attitude(self, y):
         return momentum_from_canonical(*y), from_euler_angles(*y[0])
 
     def dynamics(self, scene, state, ts):
         momenta = 1 / momentum_scale(scene, state, ts)
-        ones, moved = jnp.ones_like(momenta), scene.dynamics
-        units = FixedUnits((ones,) * 3 + (momenta,) * (3 + len(moved.coupled)))
-        return Dynamics(scene.hamiltonian, scene.torque, units, wheels=moved.wheels)
+        ones, scene_dynamics = jnp.ones_like(momenta), scene.dynamics
+        units = FixedUnits((ones,) * 3 + (momenta,) * (3 + len(scene_dynamics.coupled)))
+        return Dynamics(scene.hamiltonian, scene.torque, units, wheels=scene_dynamics.wheels)
 
     def start(self, scene, state, t):
         phi, theta, psi = q = wxyz_to_euler(state.wxyz)

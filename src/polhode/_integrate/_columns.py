@@ -76,14 +76,21 @@ def _row(order: int, length: int) -> list[np.ndarray]:
     ]
     if len(sequence) == 2:
         sums[2] = [Fraction(0)] * 2
-    whole, first, second = sums
-    given = np.zeros((3, length))
+    result, lower_result, lowest_result = sums
+    weights = np.zeros((3, length))
     counts = np.zeros(length, np.int32)
     for k, j in enumerate(place):
         counts[k] = sequence[j]
         if k:  # the others enter by their small differences to the base, which has weight one
-            given[:, k] = [float(x) for x in (whole[j], whole[j] - first[j], first[j] - second[j])]
-    return [counts, *given]
+            weights[:, k] = [
+                float(x)
+                for x in (
+                    result[j],
+                    result[j] - lower_result[j],
+                    lower_result[j] - lowest_result[j],
+                )
+            ]
+    return [counts, *weights]
 
 
 def table(order: int | Array, dtype: Any) -> Table:
@@ -113,30 +120,30 @@ def evaluations(order: int) -> int:
 
 class Columns(NamedTuple):
     """What one step yields: ``change`` of the state, or the new state where the step is not
-    compensated; ``sums``, what integrals have gained; ``last``, ``before``: differences of the
-    results of orders p and p - 2, and of p - 2 and p - 4."""
+    compensated; ``sums``, what integrals have gained; ``difference``: of the results of orders p
+    and p - 2; ``lower_difference``: of those of orders p - 2 and p - 4."""
 
     change: list[Array]
     sums: list[Array]
-    last: list[Array]
-    before: list[Array]
+    difference: list[Array]
+    lower_difference: list[Array]
 
 
 def extrapolated(
     rates: Rates,
-    given: Table,
+    columns: Table,
     t: Array,
     width: Array,
     y: list[Array],
-    first: list[Array],
+    start_rates: list[Array],
     integrals: list[Array],
     compensated: bool = False,
 ) -> Columns:
     """One step of the extrapolated midpoint rule.
 
     ``rates(t, y, along)``: rates of the state and, where ``along``, of integrals along it, which
-    need every other point only. ``first``: rates of ``y``. ``t`` and ``width`` are numbers, or one
-    each for every entry of the arrays. ``compensated``: changes are summed, not states.
+    need every other point only. ``start_rates``: rates of ``y``. ``t`` and ``width`` are numbers,
+    or one each for every entry of the arrays. ``compensated``: changes are summed, not states.
     """
     origin = [jnp.zeros_like(x) for x in y] if compensated else y
 
@@ -147,25 +154,25 @@ def extrapolated(
         h = width / n
         step = [2 * h.astype(x.dtype) for x in y]
 
-        def pair(i, found):
-            a, b, sums = found
-            now = t + (2 * i + 1).astype(h.dtype) * h
-            f, g = rates(now, place(b), True)
+        def pair(i, carry):
+            a, b, sums = carry
+            time = t + (2 * i + 1).astype(h.dtype) * h
+            f, g = rates(time, place(b), True)
             a, sums = _plus(a, step, f), _plus(sums, [step[0]] * len(g), g)
-            f, _ = rates(now + h, place(a), False)
+            f, _ = rates(time + h, place(a), False)
             return a, _plus(b, step, f), sums
 
-        b = _plus(origin, [x / 2 for x in step], first)
+        b = _plus(origin, [x / 2 for x in step], start_rates)
         start = origin, b, [jnp.zeros_like(x) for x in integrals]
         a, b, sums = jax.lax.fori_loop(0, n.astype(jnp.int32) // 2 - 1, pair, start)
         f, g = rates(t + (width - h), place(b), True)
         return _plus(a, step, f), _plus(sums, [step[0]] * len(g), g)
 
-    def add(j, found):
-        base, (new, sums), last, before = found
+    def add(j, carry):
+        base, (result, sums), difference, lower_difference = carry
         count, *shares = (
             jax.lax.dynamic_index_in_dim(x, j, keepdims=False)
-            for x in (given.counts, *given.weights)
+            for x in (columns.counts, *columns.weights)
         )
         this = column(count.astype(jnp.result_type(width)))
         base = jax.tree.map(lambda x, b: jnp.where(j == 0, x, b), this, base)
@@ -174,29 +181,33 @@ def extrapolated(
         def combine(x, s, d):
             return jnp.where(j == 0, x, s + shares[0].astype(d.dtype) * d)
 
-        new, sums = jax.tree.map(combine, this, (new, sums), gap)
-        last = [e + shares[1].astype(d.dtype) * d for e, d in zip(last, gap[0])]
-        before = [e + shares[2].astype(d.dtype) * d for e, d in zip(before, gap[0])]
-        return base, (new, sums), last, before
+        result, sums = jax.tree.map(combine, this, (result, sums), gap)
+        difference = [e + shares[1].astype(d.dtype) * d for e, d in zip(difference, gap[0])]
+        lower_difference = [
+            e + shares[2].astype(d.dtype) * d for e, d in zip(lower_difference, gap[0])
+        ]
+        return base, (result, sums), difference, lower_difference
 
-    empty = [jnp.zeros_like(x) for x in y], [jnp.zeros_like(x) for x in integrals]
-    start = empty, empty, empty[0], empty[0]
-    _, (new, sums), last, before = jax.lax.fori_loop(0, given.length, add, start)
-    return Columns(new, [q + s for q, s in zip(integrals, sums)], last, before)
+    zeros = [jnp.zeros_like(x) for x in y], [jnp.zeros_like(x) for x in integrals]
+    start = zeros, zeros, zeros[0], zeros[0]
+    _, (result, sums), difference, lower_difference = jax.lax.fori_loop(
+        0, columns.length, add, start
+    )
+    return Columns(result, [q + s for q, s in zip(integrals, sums)], difference, lower_difference)
 
 
 def _plus(y, step, f):
     return [a + h * b for a, h, b in zip(y, step, f)]
 
 
-def carried_on(
-    y: list[Array], low: list[Array], change: list[Array]
+def add_compensated(
+    y: list[Array], compensation: list[Array], change: list[Array]
 ) -> tuple[list[Array], list[Array]]:
-    """``y + low + change`` as a rounded sum and what rounding took from it.
+    """``y + compensation + change`` as a rounded sum, and its rounding error.
 
     D. E. Knuth, The Art of Computer Programming 2, section 4.2.2, theorem B.
     """
-    change = [a + b for a, b in zip(low, change)]
-    new = [a + b for a, b in zip(y, change)]
-    lost = [(a - (s - (s - a))) + (c - (s - a)) for a, c, s in zip(y, change, new)]
-    return new, lost
+    change = [a + b for a, b in zip(compensation, change)]
+    total = [a + b for a, b in zip(y, change)]
+    rounding_error = [(a - (s - (s - a))) + (c - (s - a)) for a, c, s in zip(y, change, total)]
+    return total, rounding_error

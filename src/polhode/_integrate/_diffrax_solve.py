@@ -36,15 +36,15 @@ class Request(NamedTuple):
 
     def by_controller(self, solver, controller) -> Stepping:
         """Steps of a controller that the user chose."""
-        saved = self._saved(diffrax.SubSaveAt(ts=self.ts))
-        return Stepping(solver, controller, saved, self.max_steps, self.dt0)
+        saveat = self._saveat(diffrax.SubSaveAt(ts=self.ts))
+        return Stepping(solver, controller, saveat, self.max_steps, self.dt0)
 
     def in_one_call(self, solver) -> Stepping:
         """One step of diffrax from each time to the next, which the solver subdivides."""
-        ends = self.ts[jnp.array([0, -1])] if self.final_only else self.ts
-        saved = self._saved(diffrax.SubSaveAt(t0=True, steps=1))
-        saved = eqx.tree_at(lambda s: s.solver_state, saved, True)
-        return Stepping(solver, GivenTimes(ends), saved, ends.shape[0] - 1, None)
+        times = self.ts[jnp.array([0, -1])] if self.final_only else self.ts
+        saveat = self._saveat(diffrax.SubSaveAt(t0=True, steps=1))
+        saveat = eqx.tree_at(lambda s: s.solver_state, saveat, True)
+        return Stepping(solver, GivenTimes(times), saveat, times.shape[0] - 1, None)
 
     def by_error_estimate(self, solver, y0, term, dynamics) -> Stepping:
         """Steps of any solver with an error estimate, by diffrax's PID controller."""
@@ -61,9 +61,9 @@ class Request(NamedTuple):
             controller = diffrax.ClipStepSizeController(controller, step_ts=self.ts)
         return self.by_controller(solver, controller)
 
-    def _saved(self, samples) -> diffrax.SaveAt:
-        last = diffrax.SubSaveAt(t1=True)
-        return diffrax.SaveAt(subs=[last if self.final_only else samples, last])
+    def _saveat(self, samples) -> diffrax.SaveAt:
+        end = diffrax.SubSaveAt(t1=True)
+        return diffrax.SaveAt(subs=[end if self.final_only else samples, end])
 
 
 class LaneNorm(eqx.Module):
@@ -87,7 +87,7 @@ class Solution(NamedTuple):
     where the method estimates it, the sum of the errors (N,)."""
 
     samples: PyTree[Array]
-    last: PyTree[Array]
+    end_state: PyTree[Array]
     steps: StepCounts
     status: Array
     error: Array | None
@@ -107,13 +107,13 @@ def in_segments(
     bounds = jnp.concatenate([start[None], cuts, end[None]])
     parts = bounds.shape[0] - 1
 
-    def one(carry, segment):
+    def solve_segment(carry, segment):
         y, out, steps, status, error = carry
         a, b = segment
-        empty = a == b
+        is_empty = a == b
         # an empty segment is solved over another length and discarded, for derivatives exist
-        stop = jnp.where(empty, a + (end - start) / 16, b)
-        inside = (sign * (ts - a) >= 0) & (sign * (b - ts) > 0) & ~empty
+        stop = jnp.where(is_empty, a + (end - start) / 16, b)
+        inside = (sign * (ts - a) >= 0) & (sign * (b - ts) > 0) & ~is_empty
         if final_only:
             times = jnp.stack([a, stop])
         else:
@@ -121,10 +121,10 @@ def in_segments(
             times = jnp.concatenate([times, stop[None]])
         solution = move(jax.lax.stop_gradient((a + b) / 2), y, times, parts)
         successful = status == Status.SUCCESSFUL
-        status = jnp.where(empty | ~successful, status, solution.status)
-        steps = jax.tree.map(lambda a, b: a + jnp.where(empty, 0, b), steps, solution.steps)
+        status = jnp.where(is_empty | ~successful, status, solution.status)
+        steps = jax.tree.map(lambda a, b: a + jnp.where(is_empty, 0, b), steps, solution.steps)
         if error is not None:
-            error = error + jnp.where(empty, 0, solution.error)
+            error = error + jnp.where(is_empty, 0, solution.error)
         if not final_only:
             later = jnp.sum(jnp.where(sign * (ts - b) >= 0, 1, 0))
             rows = jnp.minimum(jnp.arange(ts.shape[0]) + later, ts.shape[0])
@@ -132,7 +132,7 @@ def in_segments(
                 lambda old, new: jnp.where(inside[:, None], new[rows], old), out, solution.samples
             )
         # the last row: only samples have derivatives
-        y = jax.tree.map(lambda old, new: jnp.where(empty, old, new[-1]), y, solution.samples)
+        y = jax.tree.map(lambda old, new: jnp.where(is_empty, old, new[-1]), y, solution.samples)
         return (y, out, steps, status, error), None
 
     shape = jax.eval_shape(lambda y: move(start, y, jnp.stack([start, end]), parts), y)
@@ -140,15 +140,17 @@ def in_segments(
     out = None
     if not final_only:
         out = jax.tree.map(lambda x: jnp.zeros((ts.shape[0], *x.shape), x.dtype), y)
-    none = None if shape.error is None else jnp.zeros(lane, shape.error.dtype)
-    none_taken = jnp.zeros(lane, shape.steps.accepted.dtype)
-    begin = y, out, StepCounts.of(none_taken), jnp.zeros(lane, shape.status.dtype), none
-    (y, out, steps, status, error), _ = jax.lax.scan(one, begin, (bounds[:-1], bounds[1:]))
-    last = jax.tree.map(lambda x: x[None], y)
+    initial_error = None if shape.error is None else jnp.zeros(lane, shape.error.dtype)
+    zero_counts = jnp.zeros(lane, shape.steps.accepted.dtype)
+    begin = y, out, StepCounts.of(zero_counts), jnp.zeros(lane, shape.status.dtype), initial_error
+    (y, out, steps, status, error), _ = jax.lax.scan(
+        solve_segment, begin, (bounds[:-1], bounds[1:])
+    )
+    end_state = jax.tree.map(lambda x: x[None], y)
     if final_only:
-        return Solution(last, last, steps, status, error)
+        return Solution(end_state, end_state, steps, status, error)
     out = jax.tree.map(lambda rows, x: rows.at[-1].set(x), out, y)
-    return Solution(out, last, steps, status, error)
+    return Solution(out, end_state, steps, status, error)
 
 
 def min_of(a: Array, b: Array) -> Any:
@@ -200,15 +202,17 @@ def one_step(terms, args, solver, saveat: diffrax.SaveAt, state: Any) -> Any:
         terms, state.tprev, end, state.y, args, state.solver_state, state.made_jump
     )
 
-    def save(sub, found):
-        seen = [(state.tprev, state.y)] * sub.t0 + [(end, y)] * (sub.steps == 1 or sub.t1)
-        rows = [(t, sub.fn(t, now, args)) for t, now in seen]
-        ts, ys = (jax.tree.map(lambda *x: jnp.stack(x), *some) for some in zip(*rows))
+    def save(sub, save_state):
+        points = [(state.tprev, state.y)] * sub.t0 + [(end, y)] * (sub.steps == 1 or sub.t1)
+        rows = [(t, sub.fn(t, point_state, args)) for t, point_state in points]
+        ts, ys = (jax.tree.map(lambda *x: jnp.stack(x), *column) for column in zip(*rows))
         count = len(rows)  # rooms for more steps stay as they are
         ts, ys = jax.tree.map(
-            lambda new, room: jnp.concatenate([new, room[count:]]), (ts, ys), (found.ts, found.ys)
+            lambda new, room: jnp.concatenate([new, room[count:]]),
+            (ts, ys),
+            (save_state.ts, save_state.ys),
         )
-        return dataclasses.replace(found, ts=ts, ys=ys, save_index=count)
+        return dataclasses.replace(save_state, ts=ts, ys=ys, save_index=count)
 
     return dataclasses.replace(
         state,

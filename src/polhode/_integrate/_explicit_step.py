@@ -95,12 +95,12 @@ def attempt_step(
     the field stands in the program once."""
     dtype, rule = progress.y.dtype, motion.rule
     table, nodes = jnp.asarray(rule.weights, dtype), jnp.asarray(rule.nodes, dtype)
-    stages = _padded(progress.rate, rule)
-    margins = _padded(progress.margin, rule)
+    stages = _stage_buffer(progress.rate, rule)
+    margins = _stage_buffer(progress.margin, rule)
     events = motion.switches > 0
 
-    def stage(i, found):
-        stages, margins, new_levels = found
+    def stage(i, carry):
+        stages, margins, new_levels = carry
         y = progress.y + h[None] * weighted(table[i], stages)
         rate, margin, turn = motion.rates(motion.coefficients, progress.levels, t + nodes[i] * h, y)
         stages = jax.lax.dynamic_update_index_in_dim(stages, rate, i, 0)
@@ -109,17 +109,19 @@ def attempt_step(
             new_levels = jnp.where(i == 0, turn, new_levels)
         return stages, margins, new_levels
 
-    def phase(number, found):
-        *some, depths, inside = found
-        more = jnp.where(inside, rule.dense_stages, rule.stages)
-        first = jnp.where(any_of(jnp.where(progress.needs_rates, 1.0, 0.0)), 0, 1)
-        begin = jnp.where(number == 0, first, rule.stages)
-        end = jnp.where(number == 0, rule.stages, more)
-        some = jax.lax.fori_loop(begin, end, stage, tuple(some))
+    def phase(number, carry):
+        *stage_carry, depths, inside = carry
+        dense_end = jnp.where(inside, rule.dense_stages, rule.stages)
+        first_stage = jnp.where(any_of(jnp.where(progress.needs_rates, 1.0, 0.0)), 0, 1)
+        begin = jnp.where(number == 0, first_stage, rule.stages)
+        end = jnp.where(number == 0, rule.stages, dense_end)
+        stage_carry = jax.lax.fori_loop(begin, end, stage, tuple(stage_carry))
         if events:
-            depths = jnp.where(number == 0, _depths(margin_samples(some[1], rule), rule), depths)
-            inside = inside | any_of(_is_near(some[1], depths, rule))
-        return *some, depths, inside
+            depths = jnp.where(
+                number == 0, _depths(margin_samples(stage_carry[1], rule), rule), depths
+            )
+            inside = inside | any_of(_is_near(stage_carry[1], depths, rule))
+        return *stage_carry, depths, inside
 
     inside = any_of(jnp.where(needs_dense, 1.0, 0.0)) if not motion.events else jnp.ones((), bool)
     depths = (
@@ -127,8 +129,8 @@ def attempt_step(
         if events
         else progress.levels
     )
-    found = jax.lax.fori_loop(0, 2, phase, (stages, margins, progress.levels, depths, inside))
-    stages, margins, new_levels, depths, inside = found
+    carry = jax.lax.fori_loop(0, 2, phase, (stages, margins, progress.levels, depths, inside))
+    stages, margins, new_levels, depths, inside = carry
     return Attempt(h, stages, margins, new_levels, depths, dense_of(h, stages, rule))
 
 
@@ -137,9 +139,9 @@ def dense_of(h: Array, stages: Array, rule: Tableau) -> Array:
     h_rates = h[None, None] * stages
     end = rule.stages - 1
     change = weighted(rule.weights[end], h_rates)
-    first, last = h_rates[0], h_rates[end]
+    first_change, last_change = h_rates[0], h_rates[end]
     return jnp.stack(
-        [change, first - change, 2 * change - (first + last)]
+        [change, first_change - change, 2 * change - (first_change + last_change)]
         + [weighted(row, h_rates) for row in rule.dense]
     )
 
@@ -147,9 +149,9 @@ def dense_of(h: Array, stages: Array, rule: Tableau) -> Array:
 def dense_state(y: Array, dense: Array, x: Array) -> Array:
     """States (D, B) at the fractions ``x`` (B,) of a step from ``y``."""
     total, x = jnp.zeros_like(y), x[None]
-    rest = 1 - x
+    complement = 1 - x
     for k in range(dense.shape[0] - 1, -1, -1):
-        total = (total + dense[k]) * (x if k % 2 == 0 else rest)
+        total = (total + dense[k]) * (x if k % 2 == 0 else complement)
     return y + total
 
 
@@ -174,9 +176,9 @@ def _depths(sampled: Array, rule: Tableau) -> Array:
     falls = left - bend * column(x[1:-1] - x[:-2])
     rises = left + bend * column(2 * x[2:] - x[:-2] - x[1:-1])
     a = sampled[:-2]
-    least = jnp.minimum(jnp.minimum(a, sampled[1:-1]), sampled[2:])
-    turns = (falls < 0) & (rises > 0) & (bend > 0) & (least >= 0)
-    scale = jnp.where(turns & (least > 0), 4 * bend * least, 1)
+    least_margin = jnp.minimum(jnp.minimum(a, sampled[1:-1]), sampled[2:])
+    turns = (falls < 0) & (rises > 0) & (bend > 0) & (least_margin >= 0)
+    scale = jnp.where(turns & (least_margin > 0), 4 * bend * least_margin, 1)
     return jnp.where(turns, (4 * bend * a - falls * falls) / scale, 1)
 
 
@@ -194,9 +196,9 @@ def vertex_of(x, f):
 
 def _is_near(margins: Array, depths: Array, rule: Tableau) -> Array:
     """Whether (B,) a switch may turn within the step."""
-    near = jnp.any(margin_samples(margins, rule) < 0, axis=(0, 1))
-    near = near | jnp.any(depths <= 0.5, axis=(0, 1))
-    return jnp.where(near, 1.0, 0.0)
+    may_turn = jnp.any(margin_samples(margins, rule) < 0, axis=(0, 1))
+    may_turn = may_turn | jnp.any(depths <= 0.5, axis=(0, 1))
+    return jnp.where(may_turn, 1.0, 0.0)
 
 
 def column(storage: Array, k: Array) -> Array:
@@ -213,7 +215,7 @@ def weighted(weights: np.ndarray | Array, stages: Array) -> Array:
     return jnp.sum(weights[:, None, None] * stages[: weights.shape[0]], axis=0)
 
 
-def _padded(first: Array, rule: Tableau) -> Array:
+def _stage_buffer(first_stage: Array, rule: Tableau) -> Array:
     """Room for all stages, the first of them set."""
-    rest = jnp.zeros((rule.dense_stages - 1, *first.shape), first.dtype)
-    return jnp.concatenate([first[None], rest])
+    zeros = jnp.zeros((rule.dense_stages - 1, *first_stage.shape), first_stage.dtype)
+    return jnp.concatenate([first_stage[None], zeros])

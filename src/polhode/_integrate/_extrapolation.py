@@ -17,7 +17,7 @@ from polhode._hamiltonian import Dynamics
 from polhode._integrate._columns import (
     CHOSEN,
     SEQUENCES,
-    carried_on,
+    add_compensated,
     evaluations,
     extrapolated,
     table,
@@ -79,8 +79,8 @@ def collocate(terms, t0, t1, nodes, y1, args, order: int) -> dict:
 
         def sweep(_, ys):
             def integrate(y0, y1, slope):
-                inner = contract(matrix, slope)
-                return y0[None] + inner + column(x, y0) * ((y1 - y0)[None] - inner[-1:])
+                integral = contract(matrix, slope)
+                return y0[None] + integral + column(x, y0) * ((y1 - y0)[None] - integral[-1:])
 
             return jax.tree.map(integrate, y0, y1, slope(times, ys))
 
@@ -104,8 +104,8 @@ class CollocationInterpolation(diffrax.AbstractLocalInterpolation):
             return jax.tree.map(jnp.subtract, self.evaluate(t1), self.evaluate(t0))
         count = jax.tree.leaves(self.series)[0].shape[0]
         width = self.t1 - self.t0
-        empty = width == 0
-        place = jnp.where(empty, 0, (t0 - self.t0) / jnp.where(empty, 1, width)) * count
+        is_empty = width == 0
+        place = jnp.where(is_empty, 0, (t0 - self.t0) / jnp.where(is_empty, 1, width)) * count
         index = jnp.clip(jnp.floor(place).astype(jnp.int32), 0, count - 1)
         s = 2 * (place - index.astype(place.dtype)) - 1
 
@@ -201,8 +201,8 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         """Number of bodies of one solve: a whole work queue where bodies have steps of their own,
         else as many as there are lanes."""
         dtype = jnp.result_type(*jax.tree.leaves(y))
-        prepared = BoundTerm.of(terms, args).prepared(t, y, dtype)
-        return _policy.QUEUE if prepared.by_entry else _policy.LANES
+        rates = BoundTerm.of(terms, args).prepare(t, y, dtype)
+        return _policy.QUEUE if rates.by_entry else _policy.LANES
 
     def order(self, terms: PyTree) -> int:
         return self._fixed_order
@@ -231,31 +231,31 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
     ) -> tuple:
         del made_jump
         if self.accuracy is None:
-            return self._one(terms, t0, t1, y0, args, solver_state)
-        return self._many(self.accuracy, terms, t0, t1, y0, args, solver_state)
+            return self._take_one_step(terms, t0, t1, y0, args, solver_state)
+        return self._take_many_steps(self.accuracy, terms, t0, t1, y0, args, solver_state)
 
-    def _one(self, terms, t0, t1, y0, args, low):
+    def _take_one_step(self, terms, t0, t1, y0, args, compensation):
         """One step of the method."""
         y, tree = jax.tree.flatten(y0)
         dtype = jnp.result_type(*y)
-        problem = BoundTerm.of(terms, args).prepared(t0, y0, dtype)
+        problem = BoundTerm.of(terms, args).prepare(t0, y0, dtype)
 
-        def run(held, t, width, y, low):
+        def run(coefficients, t, width, y, compensation):
             def rates(t, y, along):
-                return problem.rates(held, t, y), []
+                return problem.rates(coefficients, t, y), []
 
-            given = table(self._fixed_order, dtype)
-            first, _ = rates(t, y, False)
-            found = extrapolated(rates, given, t, width, y, first, [], self.compensated)
+            columns = table(self._fixed_order, dtype)
+            start_rates, _ = rates(t, y, False)
+            result = extrapolated(rates, columns, t, width, y, start_rates, [], self.compensated)
             if not self.compensated:
-                return found.change, low, found.last
-            return *carried_on(y, low, found.change), found.last
+                return result.change, compensation, result.difference
+            return *add_compensated(y, compensation, result.change), result.difference
 
-        y1, low, error = kernel(run)(problem.held, t0, t1 - t0, y, low)
+        y1, compensation, error = kernel(run)(problem.coefficients, t0, t1 - t0, y, compensation)
         y1, error = (jax.tree.unflatten(tree, x) for x in (y1, error))
         nodes = jax.tree.map(lambda x: x[None], y0)
         dense = collocate(terms, t0, t1, nodes, y1, args, self._fixed_order)
-        return y1, error, dense, low, diffrax.RESULTS.successful
+        return y1, error, dense, compensation, diffrax.RESULTS.successful
 
     def spanning(self, controller: diffrax.StepTo, state: Any) -> tuple["Extrapolation", Any, Any]:
         """Itself, the controller and the ``state`` of a solve by diffrax, with one step from the
@@ -272,19 +272,19 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         state = eqx.tree_at(lambda s: (s.solver_state, s.tnext), state, (progress, times[-1]))
         return solver, GivenTimes(times[np.array([0, -1])]), state
 
-    def _many(self, accuracy: Accuracy, terms, t0, t1, y0, args, progress: Progress):
+    def _take_many_steps(self, accuracy: Accuracy, terms, t0, t1, y0, args, progress: Progress):
         """As many as the error asked for needs."""
         y, tree = jax.tree.flatten(y0)
         dtype = jnp.result_type(*y)
-        problem = BoundTerm.of(terms, args).prepared(t0, y0, dtype)
+        problem = BoundTerm.of(terms, args).prepare(t0, y0, dtype)
         rtol = jnp.asarray(accuracy.rtol, dtype)
         elapsed = None if accuracy.times is None else accuracy.times - t0
         horizon = jnp.asarray(accuracy.horizon, t0.dtype)
         units = units_of(args, y0, horizon)
 
-        def run(held, units, rtol, horizon, span, y, progress, elapsed):
-            def rates(held, t, y, along):
-                return problem.rates(held, t, y), []
+        def run(coefficients, units, rtol, horizon, span, y, progress, elapsed):
+            def rates(coefficients, t, y, along):
+                return problem.rates(coefficients, t, y), []
 
             def table_for(rate):
                 if self.formal_order is not None:
@@ -295,17 +295,19 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
                 return table(order_for(rtol, jnp.max(rate, initial=0) * gap.astype(dtype)), dtype)
 
             limits = Limits(rtol, horizon, self.max_steps, self.jumps)
-            own, known = not problem.asks_time, (held, units)
-            field = Field(rates, _as_told, known, own, problem.by_entry)
-            y, _, new = integrate(field, table_for, limits, span, y, [], progress, elapsed)
-            return y, new
+            individual_steps, field_data = not problem.depends_on_time, (coefficients, units)
+            field = Field(rates, _apply_units, field_data, individual_steps, problem.by_entry)
+            y, _, progress_after = integrate(
+                field, table_for, limits, span, y, [], progress, elapsed
+            )
+            return y, progress_after
 
         y1, progress = kernel(run)(
-            problem.held, units, rtol, horizon, (t0, t1), y, progress, elapsed
+            problem.coefficients, units, rtol, horizon, (t0, t1), y, progress, elapsed
         )
         y1 = jax.tree.unflatten(tree, y1)
-        none = jax.tree.map(lambda x: jnp.full((1, 1, *x.shape), jnp.nan, x.dtype), y1)
-        return y1, None, {"series": none}, progress, diffrax.RESULTS.successful
+        no_series = jax.tree.map(lambda x: jnp.full((1, 1, *x.shape), jnp.nan, x.dtype), y1)
+        return y1, None, {"series": no_series}, progress, diffrax.RESULTS.successful
 
 
 def units_of(args: Any, y0: PyTree, horizon: Array) -> Any:
@@ -315,7 +317,7 @@ def units_of(args: Any, y0: PyTree, horizon: Array) -> Any:
     return jax.lax.stop_gradient(args.units)
 
 
-def _as_told(units, y, rates):
+def _apply_units(units, y, rates):
     return units(y, rates)
 
 
@@ -336,13 +338,16 @@ def order_for(rtol: Array, angle: Array | float = jnp.inf) -> Array:
         best = 8 + 2 * sum(jnp.where(rtol < bound, 1, 0) for bound in (1e-3, 1e-4, 1e-5, 1e-10))
     if isinstance(angle, float):
         return staged(jnp.asarray(best, rtol.dtype), opaque_ones(rtol))
-    found, least, size = best, jnp.full((), jnp.inf, rtol.dtype), jnp.log(rtol)
+    order_found, least_work, size = best, jnp.full((), jnp.inf, rtol.dtype), jnp.log(rtol)
     for order in CHOSEN:
         step = 0.9 * (0.27 * order - 0.3) * jnp.exp(size / (order + 1))
         work = (evaluations(order) + _policy.STEP_OVERHEAD) * jnp.maximum(1, angle / step)
-        better = (order <= best) & (work < least) & (angle < step)
-        found, least = jnp.where(better, order, found), jnp.where(better, work, least)
-    return staged(jnp.asarray(found, rtol.dtype), opaque_ones(rtol))
+        better = (order <= best) & (work < least_work) & (angle < step)
+        order_found, least_work = (
+            jnp.where(better, order, order_found),
+            jnp.where(better, work, least_work),
+        )
+    return staged(jnp.asarray(order_found, rtol.dtype), opaque_ones(rtol))
 
 
 class Automatic(Extrapolation):
@@ -361,5 +366,5 @@ class Automatic(Extrapolation):
 
     def rule(self, switches: int) -> Tableau:
         """The explicit rule for a field with so many switches."""
-        many = switches >= _policy.LOW_ORDER_SWITCHES
-        return TSIT5 if not self.located or (self.low_order and many) else DOP853
+        has_many = switches >= _policy.LOW_ORDER_SWITCHES
+        return TSIT5 if not self.located or (self.low_order and has_many) else DOP853

@@ -37,20 +37,26 @@ class BoundTerm(eqx.Module):
         terms, args = eqx.combine(self.arrays, self.static)
         return terms.vf_prod(t, y, args, control)
 
-    def prepared(self, t, y, dtype) -> "Prepared":
+    def prepare(self, t, y, dtype) -> "Prepared":
         """Rates of states like ``y``, with all that rests on the arguments worked out."""
         arrays, tree = jax.tree.flatten(self.arrays)
         leaves, state_tree = jax.tree.flatten(y)
 
-        def rates(*given):
-            known, t, y = given[: len(arrays)], given[len(arrays)], given[len(arrays) + 1 :]
-            problem = BoundTerm(jax.tree.unflatten(tree, known), self.static)
-            found = problem.increment(t, jax.tree.unflatten(state_tree, y), problem.forward(dtype))
-            return jax.tree.leaves(found)
+        def rates(*operands):
+            values, t, y = (
+                operands[: len(arrays)],
+                operands[len(arrays)],
+                operands[len(arrays) + 1 :],
+            )
+            problem = BoundTerm(jax.tree.unflatten(tree, values), self.static)
+            increments = problem.increment(
+                t, jax.tree.unflatten(state_tree, y), problem.forward(dtype)
+            )
+            return jax.tree.leaves(increments)
 
-        closed = formula(rates, *arrays, t, *leaves)
-        held, run, _, by_entry = specialise(closed, arrays)
-        return Prepared(held, run, uses(closed.jaxpr, len(arrays)), by_entry)
+        closed_jaxpr = formula(rates, *arrays, t, *leaves)
+        coefficients, run, _, by_entry = specialise(closed_jaxpr, arrays)
+        return Prepared(coefficients, run, uses(closed_jaxpr.jaxpr, len(arrays)), by_entry)
 
 
 class FixedArguments(eqx.Module):
@@ -63,23 +69,24 @@ class FixedArguments(eqx.Module):
 
 def uses(jaxpr, place: int) -> bool:
     """Whether the results of a program depend on its operand at ``place``."""
-    _, used = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
-    return used[place]
+    _, is_used = partial_eval.dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
+    return is_used[place]
 
 
 class Prepared(NamedTuple):
-    """``held``: arrays that the rates rest on; ``run(held, t, *y)``: the rates; ``asks_time``:
-    whether these depend on the time; ``by_entry``: see ``xla.Specialised``."""
+    """``coefficients``: arrays on which the rates depend; ``run(coefficients, t, *y)``: the rates;
+    ``depends_on_time``: whether they depend explicitly on the time; ``by_entry``: see
+    ``xla.Specialised``."""
 
-    held: tuple[Any, ...]
+    coefficients: tuple[Any, ...]
     run: Callable[..., list[Any]]
-    asks_time: bool
+    depends_on_time: bool
     by_entry: bool
 
-    def rates(self, held, t, y) -> list[Any]:
-        """The rates, on lists of arrays; ``held`` is handed in again so that a compiled unit may
-        take it as its operand."""
-        return self.run(held, t, *y)
+    def rates(self, coefficients, t, y) -> list[Any]:
+        """The rates, on lists of arrays; ``coefficients`` are passed explicitly so that a fused
+        kernel may take them as its operands."""
+        return self.run(coefficients, t, *y)
 
 
 def weighted_length(weights: list[Array], error: list[Array]) -> Array:

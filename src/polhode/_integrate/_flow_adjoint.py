@@ -60,35 +60,48 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
         t0: Any,
         t1: Any,
         init_state: Any,
-        **rest: Any,
+        **loop_arguments: Any,
     ) -> Any:
         times = _saved_times(saveat, stepsize_controller, event, t0, t1)
         leaves, tree = jax.tree.flatten(init_state.y)
         rtol = self._accuracy(solver, leaves[0].dtype)
         midpoint = isinstance(solver, Extrapolation)
         compensated = midpoint and solver.compensated
-        own = midpoint and solver.accuracy is not None
-        equations, c = equations_of(terms, args, init_state.y, t0, rtol, compensated, own)
+        keeps_rtol = midpoint and solver.accuracy is not None
+        equations, c = equations_of(terms, args, init_state.y, t0, rtol, compensated, keeps_rtol)
 
-        held, rates, _ = equations.prepared(c, t0, leaves)
+        coefficients, rates, _ = equations.prepare(c, t0, leaves)
         rates = kernel(rates)  # for solvers that are not units themselves
 
-        def field(t, y, known):
-            return jax.tree.unflatten(tree, rates(known.arrays, t, *jax.tree.leaves(y)))
+        def field(t, y, fixed_arguments):
+            return jax.tree.unflatten(tree, rates(fixed_arguments.arrays, t, *jax.tree.leaves(y)))
 
         # The steps themselves are not differentiated, nor what the user's functions close over.
-        known = FixedArguments(held, args.units if isinstance(args, Dynamics) else None)
-        given = (known, solver, stepsize_controller, saveat, t0, t1, init_state, rest)
-        known, solver, controller, saveat, begin, end, state, rest = _stopped(given)
-        steps = isinstance(controller, diffrax.StepTo) and _first(saveat.subs).steps == 1
+        fixed_arguments = FixedArguments(
+            coefficients, args.units if isinstance(args, Dynamics) else None
+        )
+        inputs = (
+            fixed_arguments,
+            solver,
+            stepsize_controller,
+            saveat,
+            t0,
+            t1,
+            init_state,
+            loop_arguments,
+        )
+        fixed_arguments, solver, controller, saveat, begin, end, state, loop_arguments = (
+            _stop_gradient(inputs)
+        )
+        steps = isinstance(controller, diffrax.StepTo) and _first_sub(saveat.subs).steps == 1
         if midpoint and steps:
             solver, controller, state = solver.spanning(controller, state)
-        term, more = diffrax.ODETerm(field), [{}]
-        if is_one_step(controller, saveat, event, rest["progress_meter"]):
-            state = one_step(term, known, solver, saveat, state)
+        term, outputs = diffrax.ODETerm(field), [{}]
+        if is_one_step(controller, saveat, event, loop_arguments["progress_meter"]):
+            state = one_step(term, fixed_arguments, solver, saveat, state)
         else:
-            state, *more = diffrax.ForwardMode().loop(
-                args=known,
+            state, *outputs = diffrax.ForwardMode().loop(
+                args=fixed_arguments,
                 terms=term,
                 solver=solver,
                 stepsize_controller=controller,
@@ -97,26 +110,28 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
                 t0=begin,
                 t1=end,
                 init_state=state,
-                **rest,
+                **loop_arguments,
             )
         if times is None:  # whatever steps the controller took
-            times = _first(state.save_state).ts
-        saved = jax.tree.leaves(_first(state.save_state).ys)
+            times = _first_sub(state.save_state).ts
+        saved_states = jax.tree.leaves(_first_sub(state.save_state).ys)
         progress = state.solver_state
         if isinstance(progress, Progress) and progress.rows is not None:  # found in one step
             rows = progress.rows
-            count, room = times.shape[0], _first(state.save_state).ts
+            count, saved_times = times.shape[0], _first_sub(state.save_state).ts
             rows = jnp.transpose(rows[:, -1 - count : -1], (2, 1, 0))
-            saved = [jnp.concatenate([x, y[count:]]) for x, y in zip(rows, saved)]
-            ts = jnp.concatenate([_stopped(times), room[count:]])
-            state = eqx.tree_at(lambda s: _first(s.save_state).ts, state, ts)
-        count = min(times.shape[0], saved[0].shape[0])  # rooms for more steps stay as they are
-        kept = [x[:count] for x in saved]
-        path = path_of(equations, self.parts, c, leaves, t0, times[:count], kept)
-        path = [jnp.concatenate([x, s[count:]]) for x, s in zip(path, saved)]
+            saved_states = [jnp.concatenate([x, y[count:]]) for x, y in zip(rows, saved_states)]
+            ts = jnp.concatenate([_stop_gradient(times), saved_times[count:]])
+            state = eqx.tree_at(lambda s: _first_sub(s.save_state).ts, state, ts)
+        count = min(
+            times.shape[0], saved_states[0].shape[0]
+        )  # rooms for more steps stay as they are
+        states = [x[:count] for x in saved_states]
+        path = path_of(equations, self.parts, c, leaves, t0, times[:count], states)
+        path = [jnp.concatenate([x, s[count:]]) for x, s in zip(path, saved_states)]
         ys = jax.tree.unflatten(tree, path)
-        state = eqx.tree_at(lambda s: _first(s.save_state).ys, state, ys)
-        return (state, *more)
+        state = eqx.tree_at(lambda s: _first_sub(s.save_state).ys, state, ys)
+        return (state, *outputs)
 
     def _accuracy(self, solver, dtype) -> Array:
         if self.rtol is not None:
@@ -126,19 +141,19 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
         return jnp.asarray(1e-9 if jnp.finfo(dtype).eps < 1e-9 else 1e-5, dtype)
 
 
-def _first(subs: Any) -> Any:
+def _first_sub(subs: Any) -> Any:
     """Of one or several."""
     return subs[0] if isinstance(subs, list | tuple) and not hasattr(subs, "_fields") else subs
 
 
-def _stopped(tree: Any) -> Any:
-    arrays, rest = eqx.partition(tree, eqx.is_array)
-    return eqx.combine(jax.lax.stop_gradient(arrays), rest)
+def _stop_gradient(tree: Any) -> Any:
+    arrays, static = eqx.partition(tree, eqx.is_array)
+    return eqx.combine(jax.lax.stop_gradient(arrays), static)
 
 
 def _saved_times(saveat, controller, event, t0, t1) -> Array | None:
     """The times that will be saved, in order; None where only the solve tells them."""
-    sub = _first(saveat.subs)
+    sub = _first_sub(saveat.subs)
     if event is not None or not isinstance(sub, diffrax.SubSaveAt):
         raise ValueError(
             "FlowAdjoint differentiates states at saved times, of one SubSaveAt and without"
@@ -155,32 +170,32 @@ def _saved_times(saveat, controller, event, t0, t1) -> Array | None:
     return jnp.concatenate(times)
 
 
-def path_of(equations: Equations, parts: int, c, y0, t0, times, saved):
+def path_of(equations: Equations, parts: int, c, y0, t0, times, states):
     """The states saved, with the derivatives of the flow."""
     size = len(y0)
 
-    def rule(operands, tangents, saved):
+    def rule(operands, tangents, states):
         at = [i for i, x in enumerate(tangents) if is_slope(x)]
 
-        def followed(*some):
-            full = list(operands)
-            for i, x in zip(at, some):
-                full[i] = x
-            t0, times, start, c = full[0], full[1], full[2 : 2 + size], full[2 + size :]
-            split = -(-parts // times.shape[0])
+        def follow(*parameters):
+            inputs = list(operands)
+            for i, x in zip(at, parameters):
+                inputs[i] = x
+            t0, times, start, c = inputs[0], inputs[1], inputs[2 : 2 + size], inputs[2 + size :]
+            interval_parts = -(-parts // times.shape[0])
             # what was never reached is nothing to follow
             times = jnp.where(jnp.isfinite(times), times, jax.lax.stop_gradient(t0))
             horizon = jax.lax.stop_gradient(jnp.max(jnp.abs(times - t0)))
             starts = jnp.concatenate([jnp.stack([t0]), times[:-1]])
 
             def across(y, interval):
-                start, end, reached = interval
-                y = equations.follow(c, y, start, end, horizon, reached, split)
+                start, end, end_state = interval
+                y = equations.follow(c, y, start, end, horizon, end_state, interval_parts)
                 return y, y
 
-            _, later = jax.lax.scan(across, start, (starts, times, list(saved)))
+            _, later = jax.lax.scan(across, start, (starts, times, list(states)))
             return later
 
-        return jax.jvp(followed, [operands[i] for i in at], [tangents[i] for i in at])[1]
+        return jax.jvp(follow, [operands[i] for i in at], [tangents[i] for i in at])[1]
 
-    return attached(rule, [t0, times, *y0, *c], saved)
+    return attached(rule, [t0, times, *y0, *c], states)

@@ -83,19 +83,23 @@ def solve(make: Make, arrays: Any, unit_data: Any, start: Array, ts: Array, y: A
     motion, options = make(arrays, unit_data, False)
     bodies = y.shape[1]
 
-    def moved(coefficients, arguments, unit_data, rtol, start, ts, y):
-        now = motion._replace(coefficients=coefficients, arguments=arguments, unit_data=unit_data)
-        progress, storage = run(now, options._replace(rtol=rtol), *each_body(start, ts, bodies), y)
-        none = (None,) * 4
-        count, *events = (progress.count, *storage[1:]) if options.capacity else none
+    def integrate(coefficients, arguments, unit_data, rtol, start, ts, y):
+        bound_motion = motion._replace(
+            coefficients=coefficients, arguments=arguments, unit_data=unit_data
+        )
+        progress, storage = run(
+            bound_motion, options._replace(rtol=rtol), *each_body(start, ts, bodies), y
+        )
+        no_events = (None,) * 4
+        count, *events = (progress.count, *storage[1:]) if options.capacity else no_events
         # the first attempt has no width
-        refused = jnp.maximum(progress.attempts - progress.steps - 1, 0)
-        steps = StepCounts.of(progress.steps, refused, progress.at_switches)
+        rejected_steps = jnp.maximum(progress.attempts - progress.steps - 1, 0)
+        steps = StepCounts.of(progress.steps, rejected_steps, progress.at_switches)
         return Solved(steps, progress.outcome, progress.error, count, storage.samples, *events)
 
     # for more bodies a fused kernel takes four times as long to compile and is not faster
-    moved = kernel(moved) if bodies <= _policy.KERNEL_BODIES else moved
-    return moved(
+    integrate = kernel(integrate) if bodies <= _policy.KERNEL_BODIES else integrate
+    return integrate(
         motion.coefficients, motion.arguments, motion.unit_data, options.rtol, start, ts, y
     )
 
@@ -117,7 +121,7 @@ def begin(
 ) -> tuple[Progress, Storage]:
     """Carry and storage before the first step, which has no width and evaluates the rates."""
     zero = jnp.zeros_like(y[0])
-    none = jnp.zeros(zero.shape, jnp.int32)
+    zero_counts = jnp.zeros(zero.shape, jnp.int32)
     levels = motion.levels(motion.arguments, start, y)
     unknown = jnp.zeros_like(levels)
     progress = Progress(
@@ -127,18 +131,18 @@ def begin(
         levels=levels,
         margin=unknown,
         just_turned=unknown,
-        needs_rates=jnp.ones_like(none, bool),
+        needs_rates=jnp.ones_like(zero_counts, bool),
         width=zero,
         last_error=zero,
         angle=zero,
         error=zero,
-        steps=none,
-        attempts=none,
-        at_switches=none,
-        reversals=none,
-        place=none,
-        count=none,
-        outcome=none,
+        steps=zero_counts,
+        attempts=zero_counts,
+        at_switches=zero_counts,
+        reversals=zero_counts,
+        place=zero_counts,
+        count=zero_counts,
+        outcome=zero_counts,
     )
     dtype, bodies = y.dtype, y.shape[1]
     samples = jnp.full((bodies * (ts.shape[0] + 1), y.shape[0]), jnp.nan, dtype)
@@ -161,55 +165,57 @@ def advance(
     storage: Storage,
 ):
     """One attempt of every body that is still running."""
-    still = jax.lax.stop_gradient
+    stop_gradient = jax.lax.stop_gradient
     eps = float(jnp.finfo(progress.y.dtype).eps)
     length = jnp.abs(ts[-1] - start)
     sign = jnp.where(ts[-1] < start, -1, 1).astype(progress.y.dtype)
-    alive = progress.outcome == RUNNING
-    width, last = _width(progress, length, alive, eps)
+    is_running = progress.outcome == RUNNING
+    width, is_last = _width(progress, length, is_running, eps)
     t, h = start + sign * progress.elapsed, sign * width
-    needs_dense = alive & (progress.place < ts.shape[0])
+    needs_dense = is_running & (progress.place < ts.shape[0])
     needs_dense = needs_dense & (
         jnp.abs(column(ts, progress.place) - start) <= progress.elapsed + width
     )
     attempt = attempt_step(motion, progress, t, h, needs_dense)
-    error, allowed, angle = still(
+    error, tolerance, angle = stop_gradient(
         _error_and_tolerance(motion, options, progress, attempt, width, length, eps)
     )
-    ratio = error / allowed
+    ratio = error / tolerance
     is_first = progress.attempts == 0
-    accepted = (ratio <= 1) & alive & ~is_first
+    accepted = (ratio <= 1) & is_running & ~is_first
     end = dense_state(progress.y, attempt.dense, jnp.ones_like(width))
     turn = None
     if motion.switches:
-        wrong = (
+        wrong_levels = (
             progress.needs_rates[None]
             & (attempt.margins[0] < 0)
             & (progress.just_turned == 0)
             & ~is_first[None]
         )
-        accepted = accepted & ~jnp.any(wrong, axis=0)
+        accepted = accepted & ~jnp.any(wrong_levels, axis=0)
         turn = first_switch(motion, options, progress, attempt, t, accepted, eps)
     hit = jnp.zeros_like(accepted) if turn is None else turn.hit
     part = jnp.where(hit, turn.part, 1) if turn is not None else jnp.ones_like(width)
 
-    elapsed = jnp.where(last, length, progress.elapsed + width)
+    elapsed = jnp.where(is_last, length, progress.elapsed + width)
     elapsed = jnp.where(hit, progress.elapsed + part * width, elapsed)
     size = jnp.log(jnp.clip(ratio, control.MIN_RATIO, 1e12))
     memory = jnp.where(accepted, control.MEMORY * progress.last_error, 0)
     factor = control.SAFETY * jnp.exp((memory - size) / motion.rule.order)
     factor = jnp.clip(factor, *control.factor_bounds(accepted, control.MAX_EXPLICIT_FACTOR))
-    cut = accepted & (width < control.CUT * progress.width)
-    proposed = jnp.where(cut, jnp.maximum(progress.width, width * factor), width * factor)
-    guess = still(_first_width(motion, options, progress.y, attempt.stages[0], length))
+    is_cut = accepted & (width < control.CUT * progress.width)
+    proposed = jnp.where(is_cut, jnp.maximum(progress.width, width * factor), width * factor)
+    guess = stop_gradient(_first_width(motion, options, progress.y, attempt.stages[0], length))
     proposed = jnp.where(is_first, guess, proposed)
     undefined = None
     if motion.switches:
-        undefined, share = undefined_side(attempt, ratio, alive & ~is_first, motion.rule)
-        proposed = jnp.where(undefined.any, control.UNDEFINED_SIDE * width * share, proposed)
+        undefined, share = undefined_side(attempt, ratio, is_running & ~is_first, motion.rule)
+        proposed = jnp.where(
+            undefined.is_undefined, control.UNDEFINED_SIDE * width * share, proposed
+        )
         time = jnp.maximum(progress.elapsed, 0.01 * length)
-        near = width * share <= control.GRAIN * eps * time
-        undefined = undefined._replace(snaps=undefined.any & near)
+        is_close = width * share <= control.GRAIN * eps * time
+        undefined = undefined._replace(snaps=undefined.is_undefined & is_close)
         proposed = jnp.where(undefined.snaps, guess, proposed)
     storage, place = _save(
         attempt, progress, storage, ts, start, jnp.where(accepted, elapsed, -1), width
@@ -221,85 +227,103 @@ def advance(
     def count(n, where):
         return n + jnp.where(where, 1, 0).astype(n.dtype)
 
-    first = jnp.where(progress.needs_rates[None], attempt.stages[0], progress.rate)
-    now = progress._replace(
+    rate_at_start = jnp.where(progress.needs_rates[None], attempt.stages[0], progress.rate)
+    progress_after = progress._replace(
         elapsed=choose(elapsed, progress.elapsed),
         y=choose(jnp.where(hit[None], turn.state, end) if turn is not None else end, progress.y),
-        rate=choose(attempt.stages[motion.rule.stages - 1], first),
+        rate=choose(attempt.stages[motion.rule.stages - 1], rate_at_start),
         needs_rates=hit,
-        width=still(jnp.where(alive, proposed, progress.width)),
-        last_error=choose(still(size), progress.last_error),
-        angle=progress.angle + choose(angle * still(part), jnp.zeros_like(angle)),
+        width=stop_gradient(jnp.where(is_running, proposed, progress.width)),
+        last_error=choose(stop_gradient(size), progress.last_error),
+        angle=progress.angle + choose(angle * stop_gradient(part), jnp.zeros_like(angle)),
         error=progress.error + choose(error, jnp.zeros_like(error)),
         steps=count(progress.steps, accepted),
-        attempts=count(progress.attempts, alive),
+        attempts=count(progress.attempts, is_running),
         at_switches=count(progress.at_switches, hit & accepted),
         place=place,
     )
     if turn is not None and undefined is not None:
-        now, storage = _apply_switch(
-            motion, options, progress, now, storage, attempt, turn, wrong, accepted, width, start
+        progress_after, storage = _apply_switch(
+            motion,
+            options,
+            progress,
+            progress_after,
+            storage,
+            attempt,
+            turn,
+            wrong_levels,
+            accepted,
+            width,
+            start,
         )
         snaps = undefined.snaps[None] & undefined.flips
-        now = now._replace(
-            levels=jnp.where(snaps, 1 - progress.levels, now.levels),
-            just_turned=jnp.where(snaps, 1, now.just_turned),
-            needs_rates=now.needs_rates | undefined.snaps,
+        progress_after = progress_after._replace(
+            levels=jnp.where(snaps, 1 - progress.levels, progress_after.levels),
+            just_turned=jnp.where(snaps, 1, progress_after.just_turned),
+            needs_rates=progress_after.needs_rates | undefined.snaps,
         )
-    return now._replace(outcome=_outcome(options, now, alive, length, ratio, eps)), storage
+    return progress_after._replace(
+        outcome=_outcome(options, progress_after, is_running, length, ratio, eps)
+    ), storage
 
 
 def _first_width(
     motion: Motion, options: LoopOptions, y: Array, rate: Array, length: Array
 ) -> Array:
-    _, pace = motion.units(motion.unit_data, list(y), list(rate))
+    _, natural_rate = motion.units(motion.unit_data, list(y), list(rate))
     return (
         control.FIRST_WIDTH
         * options.rtol.astype(y.dtype) ** (1 / (motion.rule.order + 1))
-        / jnp.maximum(pace, 1 / length)
+        / jnp.maximum(natural_rate, 1 / length)
     )
 
 
-def _width(progress: Progress, length: Array, alive: Array, eps: float) -> tuple[Array, Array]:
+def _width(progress: Progress, length: Array, is_running: Array, eps: float) -> tuple[Array, Array]:
     """Width of the step, and whether it leads to the last time."""
-    left = length - progress.elapsed
-    last = left <= progress.width * (1 + 1e-9)
+    remaining = length - progress.elapsed
+    is_last = remaining <= progress.width * (1 + 1e-9)
     # no step is much shorter than its neighbours for the sake of the end
-    width = jnp.where(last, left, jnp.minimum(progress.width, left / 2))
+    width = jnp.where(is_last, remaining, jnp.minimum(progress.width, remaining / 2))
     # the width is the difference of two representable times: otherwise rounding of the sum would
     # accumulate over thousands of steps
-    near = progress.elapsed + width
-    exact = jax.lax.stop_gradient(near - progress.elapsed - width) + width
-    exact = jnp.maximum(exact, eps * near)
-    return jnp.where(alive, jnp.where(last, left, exact), 0), last
+    end = progress.elapsed + width
+    exact = jax.lax.stop_gradient(end - progress.elapsed - width) + width
+    exact = jnp.maximum(exact, eps * end)
+    return jnp.where(is_running, jnp.where(is_last, remaining, exact), 0), is_last
 
 
 def _error_and_tolerance(motion, options, progress, attempt, width, length, eps):
     """Error of a step [rad], its tolerance, and the angle of the step [rad]."""
     rule = motion.rule
-    first, later = attempt.stages[0], attempt.stages[rule.stages - 1]
+    first_rates, last_rates = attempt.stages[0], attempt.stages[rule.stages - 1]
     change = weighted(rule.weights[rule.stages - 1], attempt.h[None, None] * attempt.stages)
-    ends = (progress.y, first), (progress.y + change, later)
-    (weights, rate), (other, rate_) = (
+    ends = (progress.y, first_rates), (progress.y + change, last_rates)
+    (weights, rate), (end_weights, end_rate) = (
         motion.units(motion.unit_data, list(y), list(f)) for y, f in ends
     )
-    weights = [jnp.minimum(a, b) for a, b in zip(weights, other)]
-    rate = jnp.maximum(rate, rate_)
-    error, *lower = (
+    weights = [jnp.minimum(a, b) for a, b in zip(weights, end_weights)]
+    rate = jnp.maximum(rate, end_rate)
+    error, *lower_order_errors = (
         weighted_length(weights, list(attempt.h[None] * weighted(e, attempt.stages)))
         for e in rule.errors
     )
-    if lower:  # of two estimates as in DOP853, of higher order than either
-        both = jnp.sqrt(error * error + 0.01 * lower[0] * lower[0])
-        error = error * jnp.where(both > 0, error / jnp.where(both > 0, both, 1), 0)
+    if lower_order_errors:  # of two estimates as in DOP853, of higher order than either
+        combined_error = jnp.sqrt(
+            error * error + 0.01 * lower_order_errors[0] * lower_order_errors[0]
+        )
+        error = error * jnp.where(
+            combined_error > 0, error / jnp.where(combined_error > 0, combined_error, 1), 0
+        )
     angle = rate * width
-    whole = jnp.maximum(progress.angle + rate * (length - progress.elapsed), 1)
-    far = jnp.maximum(whole / control.DRIFT_ANGLE, 1)
-    drift = jnp.sqrt(far * jnp.sqrt(far))
-    allowed = control.EXPLICIT_SHARE * options.rtol.astype(error.dtype) * angle / (whole * drift)
-    allowed = jnp.maximum(allowed, control.ROUNDED_STEP * eps)
+    total_angle = jnp.maximum(progress.angle + rate * (length - progress.elapsed), 1)
+    drift_ratio = jnp.maximum(total_angle / control.DRIFT_ANGLE, 1)
+    drift = jnp.sqrt(drift_ratio * jnp.sqrt(drift_ratio))
+    tolerance = (
+        control.EXPLICIT_SHARE * options.rtol.astype(error.dtype) * angle / (total_angle * drift)
+    )
+    tolerance = jnp.maximum(tolerance, control.ROUNDED_STEP * eps)
     sound = jnp.isfinite(error) & jnp.isfinite(angle)
-    return tuple(jnp.where(sound, x, y) for x, y in ((error, jnp.inf), (allowed, 1), (angle, 0)))
+    return tuple(jnp.where(sound, x, y) for x, y in ((error, jnp.inf), (tolerance, 1), (angle, 0)))
 
 
 def _save(
@@ -309,19 +333,21 @@ def _save(
     size = ts.shape[0]
     base = (size + 1) * jnp.arange(width.shape[0], dtype=progress.place.dtype)
 
-    def due(place):
+    def is_due(place):
         return (place < size) & (jnp.abs(column(ts, place) - start) <= elapsed)
 
-    def one(carry):
+    def store_one(carry):
         place, samples = carry
-        here = due(place)
+        is_stored = is_due(place)
         x = (jnp.abs(column(ts, place) - start) - progress.elapsed) / jnp.where(width > 0, width, 1)
         y = dense_state(progress.y, attempt.dense, jnp.minimum(x, 1))
-        samples = put(samples, base + jnp.where(here, place, size), y.T)
-        return place + jnp.where(here, 1, 0).astype(place.dtype), samples
+        samples = put(samples, base + jnp.where(is_stored, place, size), y.T)
+        return place + jnp.where(is_stored, 1, 0).astype(place.dtype), samples
 
     place, samples = jax.lax.while_loop(
-        lambda c: any_of(jnp.where(due(c[0]), 1.0, 0.0)), one, (progress.place, storage.samples)
+        lambda c: any_of(jnp.where(is_due(c[0]), 1.0, 0.0)),
+        store_one,
+        (progress.place, storage.samples),
     )
     return storage._replace(samples=samples), place
 
@@ -330,11 +356,11 @@ def _apply_switch(
     motion,
     options,
     progress,
-    now,
+    progress_after,
     storage,
     attempt,
     turn: SwitchPoint,
-    wrong,
+    wrong_levels,
     accepted,
     width,
     start,
@@ -342,68 +368,76 @@ def _apply_switch(
     """Turn the switches that were met, and store events."""
     hit = turn.hit & accepted
     flips = turn.flips & hit[None]
-    repaired = jnp.any(wrong, axis=0) & (progress.outcome == RUNNING)
-    near = turn.part <= turn.near
-    again = hit & jnp.any(flips & (progress.just_turned > 0), axis=0) & near
-    there = attempt.margins[motion.rule.stages - 1]
+    repaired = jnp.any(wrong_levels, axis=0) & (progress.outcome == RUNNING)
+    is_at_start = turn.part <= turn.start_fraction
+    is_reversal = hit & jnp.any(flips & (progress.just_turned > 0), axis=0) & is_at_start
+    end_margins = attempt.margins[motion.rule.stages - 1]
     levels = jnp.where(flips, turn.levels, progress.levels)
-    levels = jnp.where(wrong & repaired[None], attempt.new_levels, levels)
-    kept = jnp.where((hit & near)[None], progress.just_turned, 0)
+    levels = jnp.where(wrong_levels & repaired[None], attempt.new_levels, levels)
+    earlier_turns = jnp.where((hit & is_at_start)[None], progress.just_turned, 0)
     just_turned = pick(accepted, jnp.zeros_like(progress.just_turned), progress.just_turned)
-    just_turned = pick(hit, jnp.where(flips, 1, kept).astype(just_turned.dtype), just_turned)
+    just_turned = pick(
+        hit, jnp.where(flips, 1, earlier_turns).astype(just_turned.dtype), just_turned
+    )
     # not at a root: its next one is a switch as any other, however soon
-    just_turned = jnp.where(wrong & repaired[None], 0, just_turned)
-    now = now._replace(
+    just_turned = jnp.where(wrong_levels & repaired[None], 0, just_turned)
+    progress_after = progress_after._replace(
         levels=levels,
         margin=pick(
-            accepted, there, pick(progress.needs_rates, attempt.margins[0], progress.margin)
+            accepted, end_margins, pick(progress.needs_rates, attempt.margins[0], progress.margin)
         ),
         just_turned=just_turned.astype(progress.just_turned.dtype),
         needs_rates=hit | repaired,
-        width=jnp.where(repaired, progress.width, jnp.where(again, width / 4, now.width)),
+        width=jnp.where(
+            repaired, progress.width, jnp.where(is_reversal, width / 4, progress_after.width)
+        ),
         reversals=jnp.where(
-            again, progress.reversals + 1, jnp.where(accepted & ~hit, 0, progress.reversals)
+            is_reversal, progress.reversals + 1, jnp.where(accepted & ~hit, 0, progress.reversals)
         ),
     )
     if not motion.events:
-        return now, storage
+        return progress_after, storage
     bodies, capacity = width.shape[0], options.capacity
     sign = jnp.where(attempt.h < 0, -1, 1)
-    base = (capacity + 1) * jnp.arange(bodies, dtype=now.count.dtype)
-    count, stopped = now.count, jnp.zeros_like(hit)
-    first = now.elapsed <= 1e-6 * jnp.abs(width)  # an event at the start is not one of the motion
+    base = (capacity + 1) * jnp.arange(bodies, dtype=progress_after.count.dtype)
+    count, stopped = progress_after.count, jnp.zeros_like(hit)
+    is_at_motion_start = progress_after.elapsed <= 1e-6 * jnp.abs(
+        width
+    )  # an event at the start is not one of the motion
     for k in range(motion.events):
         row = motion.switches - motion.events + k
         rises = jnp.where(turn.levels[row] > 0, 1, -1) * sign
-        met = flips[row] & ~first
+        is_event = flips[row] & ~is_at_motion_start
         if options.directions[k]:
-            met = met & (rises == options.directions[k])
-        here = base + jnp.where(met & (count < capacity), count, capacity)
-        t = start + sign * now.elapsed
+            is_event = is_event & (rises == options.directions[k])
+        rows = base + jnp.where(is_event & (count < capacity), count, capacity)
+        t = start + sign * progress_after.elapsed
         storage = storage._replace(
-            times=put(storage.times, here, t[:, None]),
-            which=put(storage.which, here, jnp.full((bodies, 1), k, t.dtype)),
-            states=put(storage.states, here, now.y.T),
+            times=put(storage.times, rows, t[:, None]),
+            which=put(storage.which, rows, jnp.full((bodies, 1), k, t.dtype)),
+            states=put(storage.states, rows, progress_after.y.T),
         )
-        count = count + jnp.where(met, 1, 0).astype(count.dtype)
+        count = count + jnp.where(is_event, 1, 0).astype(count.dtype)
         if options.terminal[k]:
-            stopped = stopped | met
-    outcome = jnp.where(stopped, AT_EVENT, now.outcome).astype(now.outcome.dtype)
-    return now._replace(count=count, outcome=outcome), storage
+            stopped = stopped | is_event
+    outcome = jnp.where(stopped, AT_EVENT, progress_after.outcome).astype(
+        progress_after.outcome.dtype
+    )
+    return progress_after._replace(count=count, outcome=outcome), storage
 
 
-def _outcome(options, now: Progress, alive, length, ratio, eps) -> Array:
+def _outcome(options, progress: Progress, is_running, length, ratio, eps) -> Array:
     """Whether each body is still running, or why not."""
     attempts = control.ATTEMPTS * options.max_steps
-    spent = (now.steps >= options.max_steps) | (now.attempts >= attempts)
-    short = ~(now.width > control.MIN_WIDTH * eps * length)
-    number = jnp.isfinite(ratio) & jnp.isfinite(now.width)
-    why = jnp.where(short, jnp.where(number, STEP_TOO_SHORT, NOT_FINITE), RUNNING)
-    why = jnp.where(now.reversals >= control.MAX_REVERSALS, SLIDING, why)
+    spent = (progress.steps >= options.max_steps) | (progress.attempts >= attempts)
+    is_too_short = ~(progress.width > control.MIN_WIDTH * eps * length)
+    number = jnp.isfinite(ratio) & jnp.isfinite(progress.width)
+    why = jnp.where(is_too_short, jnp.where(number, STEP_TOO_SHORT, NOT_FINITE), RUNNING)
+    why = jnp.where(progress.reversals >= control.MAX_REVERSALS, SLIDING, why)
     why = jnp.where(spent, OUT_OF_STEPS, why)
-    why = jnp.where(now.elapsed >= length, FINISHED, why)
-    why = jnp.where(now.outcome == AT_EVENT, AT_EVENT, why)
-    return jnp.where(alive, why, now.outcome).astype(now.outcome.dtype)
+    why = jnp.where(progress.elapsed >= length, FINISHED, why)
+    why = jnp.where(progress.outcome == AT_EVENT, AT_EVENT, why)
+    return jnp.where(is_running, why, progress.outcome).astype(progress.outcome.dtype)
 
 
 def each_body(start: Array, ts: Array, bodies: int) -> tuple[Array, Array]:
@@ -429,7 +463,7 @@ class Search(NamedTuple):
 
 class Found(NamedTuple):
     """Events of N bodies in the order of the motion: ``times`` (N, E) [s], inf where there is none,
-    ``which`` (N, E) event, ``count`` (N,) of those met; ``rows`` (N, T): times of the samples."""
+    ``which`` (N, E) event, ``count`` (N,): their number; ``rows`` (N, T): times of the samples."""
 
     times: Array
     which: Array
@@ -437,30 +471,30 @@ class Found(NamedTuple):
     rows: Array
 
 
-def with_events(search: Search, solved: Solved, times: Array, states: Array):
+def with_events(search: Search, solution: Solved, times: Array, states: Array):
     """The events, and times (N, T + E) and states (N, T + E, D) of samples and events; samples
     beyond a terminal event are that event."""
-    bodies, capacity = solved.outcome.shape[0], search.capacity
-    assert solved.times is not None
-    assert solved.states is not None
-    assert solved.which is not None
-    assert solved.count is not None
-    at = solved.times.reshape(bodies, capacity + 1)[:, :-1]
-    there = solved.states.reshape(bodies, capacity + 1, -1)[:, :-1]
-    which = solved.which.reshape(bodies, capacity + 1)[:, :-1].astype(jnp.int32)
+    bodies, capacity = solution.outcome.shape[0], search.capacity
+    assert solution.times is not None
+    assert solution.states is not None
+    assert solution.which is not None
+    assert solution.count is not None
+    event_times = solution.times.reshape(bodies, capacity + 1)[:, :-1]
+    event_states = solution.states.reshape(bodies, capacity + 1, -1)[:, :-1]
+    which = solution.which.reshape(bodies, capacity + 1)[:, :-1].astype(jnp.int32)
     times = jnp.broadcast_to(jnp.atleast_2d(times), states.shape[:2])
-    met = jnp.isfinite(at)
+    is_event = jnp.isfinite(event_times)
     if any(search.terminal):
         sign = jnp.where(times[:, -1:] < times[:, :1], -1, 1).astype(times.dtype)
-        end = jnp.where(solved.outcome == AT_EVENT, solved.count, capacity + 1)
+        end = jnp.where(solution.outcome == AT_EVENT, solution.count, capacity + 1)
         stop = jnp.arange(1, capacity + 1, dtype=end.dtype)[None] == end[:, None]
-        final = jnp.sum(jnp.where(stop, at, 0), axis=1, keepdims=True)
-        state = jnp.sum(jnp.where(stop[..., None], there, 0), axis=1, keepdims=True)
-        past = jnp.any(stop, axis=1, keepdims=True) & (sign * (times - final) >= 0)
-        times = jnp.where(past, final, times)
-        states = jnp.where(past[..., None], state, states)
-    at_events = jnp.where(met, at, times[:, -1:])
-    there = jnp.where(met[..., None], there, states[:, -1:])
+        final = jnp.sum(jnp.where(stop, event_times, 0), axis=1, keepdims=True)
+        state = jnp.sum(jnp.where(stop[..., None], event_states, 0), axis=1, keepdims=True)
+        is_past_end = jnp.any(stop, axis=1, keepdims=True) & (sign * (times - final) >= 0)
+        times = jnp.where(is_past_end, final, times)
+        states = jnp.where(is_past_end[..., None], state, states)
+    at_events = jnp.where(is_event, event_times, times[:, -1:])
+    event_states = jnp.where(is_event[..., None], event_states, states[:, -1:])
     times = jnp.concatenate([times, at_events], axis=1)
-    states = jnp.concatenate([states, there], axis=1)
-    return Found(at, which, solved.count, times), times, states
+    states = jnp.concatenate([states, event_states], axis=1)
+    return Found(event_times, which, solution.count, times), times, states

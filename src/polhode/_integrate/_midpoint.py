@@ -28,7 +28,7 @@ from jaxtyping import Array
 
 from polhode import _policy
 from polhode._integrate import _error_control as control
-from polhode._integrate._columns import Table, carried_on, extrapolated
+from polhode._integrate._columns import Table, add_compensated, extrapolated
 from polhode._integrate._field import weighted_length
 from polhode._kernels import any_of, put
 
@@ -39,14 +39,14 @@ class Field(NamedTuple):
 
     ``rates(coefficients, t, y, along)``: see ``extrapolated``. ``units(unit_data, y, rates)``:
     weights of the components of an error, whose squares are summed, and the natural rate [rad/s].
-    ``own``: each body in steps of its own; the rates must then not depend on the time.
+    ``individual_steps``: each body in steps of its own; the rates must then not depend on the time.
     ``by_entry``: whether bodies can be exchanged for others by exchanging the entries of all these
     arrays."""
 
     rates: Callable[..., tuple[list[Array], list[Array]]]
     units: Callable[..., tuple[list[Array], Array]]
     data: tuple[Any, Any]
-    own: bool
+    individual_steps: bool
     by_entry: bool = False
 
 
@@ -63,8 +63,8 @@ class Limits(NamedTuple):
 class Progress(NamedTuple):
     """State of the integration from one saved time to the next; arrays of one entry a body.
 
-    ``width``: of the next step [s], 0 if unknown; ``total_angle`` so far [rad]; ``low``: rounding
-    errors of the state (compensated steps); ``steps``; ``refused`` attempts; ``at_times``: steps
+    ``width``: of the next step [s], 0 if unknown; ``total_angle`` so far [rad]; ``compensation``:
+    rounding errors of the state (compensated steps); ``steps``; ``rejections``; ``at_times``: steps
     shortened to end at a saved time; ``error``: sum of the estimated errors [rad]; ``elapsed``:
     time since the first start [s]; ``reason``: 0, or why the body failed: 1 no steps are left, 2
     the steps became too short, 3 likewise because the rates are not finite; ``rows``: states (n, T
@@ -73,9 +73,9 @@ class Progress(NamedTuple):
 
     width: Array
     total_angle: Array
-    low: list[Array]
+    compensation: list[Array]
     steps: Array
-    refused: Array
+    rejections: Array
     at_times: Array
     error: Array
     elapsed: Array
@@ -86,47 +86,47 @@ class Progress(NamedTuple):
 def initial_progress(y: list[Array], compensated: bool, t: Array) -> Progress:
     """Progress before the first step."""
     zero = jnp.zeros_like(y[0])
-    low = [jnp.zeros_like(x) for x in y] if compensated else []
+    compensation = [jnp.zeros_like(x) for x in y] if compensated else []
     reason = jnp.zeros(zero.shape, jnp.int32)
-    return Progress(zero, zero, low, zero, zero, zero, zero, jnp.zeros_like(t), reason)
+    return Progress(zero, zero, compensation, zero, zero, zero, zero, jnp.zeros_like(t), reason)
 
 
 class _Saved(NamedTuple):
-    """Saved states: ``place`` (n,): index of the next one of each body, ``due`` (n,) [s] after the
-    start."""
+    """Saved states: ``place`` (n,): index of the next one of each body, ``next_time`` (n,)
+    [s] after the start."""
 
     place: Array
-    due: Array
+    next_time: Array
 
     @classmethod
-    def first(cls, rows: Array, save_times: Array, y: list[Array]) -> tuple["_Saved", Array]:
+    def at_start(cls, rows: Array, save_times: Array, y: list[Array]) -> tuple["_Saved", Array]:
         """Before the first step: what is saved at the start is the columns state, all else is NaN,
         whatever ``rows`` hold: to look at them takes longer than to write anew."""
-        now = save_times <= 0
-        here = jnp.concatenate([now, jnp.zeros((1,), bool)])
-        empty = jnp.full_like(rows, jnp.nan)
-        rows = jnp.where(here[:, None], jnp.stack(y, axis=-1)[:, None], empty)
-        place = jnp.broadcast_to(jnp.sum(jnp.where(now, 1, 0)).astype(jnp.int32), y[0].shape)
-        saved = cls(place, save_times.at[place].get(mode="clip"))
-        return saved, rows.reshape(-1, len(y))
+        is_start = save_times <= 0
+        is_set = jnp.concatenate([is_start, jnp.zeros((1,), bool)])
+        nan_rows = jnp.full_like(rows, jnp.nan)
+        rows = jnp.where(is_set[:, None], jnp.stack(y, axis=-1)[:, None], nan_rows)
+        place = jnp.broadcast_to(jnp.sum(jnp.where(is_start, 1, 0)).astype(jnp.int32), y[0].shape)
+        save_cursor = cls(place, save_times.at[place].get(mode="clip"))
+        return save_cursor, rows.reshape(-1, len(y))
 
-    def after(
-        self, reached: Array, body: Array, save_times: Array, y: list[Array], rows: Array
+    def update(
+        self, is_due: Array, body: Array, save_times: Array, y: list[Array], rows: Array
     ) -> tuple["_Saved", Array]:
-        """With the states of the bodies that have ``reached`` what was due among the ``rows``
-        (n (T + 1), C), the last of each body not used."""
+        """With the states of the bodies that have reached their next time (``is_due``) stored in
+        ``rows`` (n (T + 1), C); the last row of each body is not used."""
         unused = save_times.shape[0]
 
         def once(carry):
-            saved, rows, _ = carry
-            at = body * (unused + 1) + jnp.where(reached, saved.place, unused)
+            save_cursor, rows, _ = carry
+            at = body * (unused + 1) + jnp.where(is_due, save_cursor.place, unused)
             rows = put(rows, at, jnp.stack(y, axis=-1))
-            place = saved.place + jnp.where(reached, 1, 0)
+            place = save_cursor.place + jnp.where(is_due, 1, 0)
             return _Saved(place, save_times.at[place].get(mode="clip")), rows, False
 
-        some = any_of(reached.astype(self.due.dtype))
+        any_due = any_of(is_due.astype(self.next_time.dtype))
         # once or not at all: a branch would copy all that is saved
-        return jax.lax.while_loop(lambda carry: carry[2], once, (self, rows, some))[:2]
+        return jax.lax.while_loop(lambda carry: carry[2], once, (self, rows, any_due))[:2]
 
 
 class _Carry(NamedTuple):
@@ -136,16 +136,16 @@ class _Carry(NamedTuple):
     elapsed: Array  # time since the start of this call
     y: list[Array]
     rates: list[Array]
-    low: list[Array]
+    compensation: list[Array]
     integrals: list[Array]
     width: Array
-    before: Array  # logarithm of error over tolerance of the step before
-    refused: tuple[Array, Array]  # error and width of a step refused
+    last_error: Array  # logarithm of error over tolerance of the step before
+    rejected_step: tuple[Array, Array]  # error and width of a step refused
     total_angle: Array
     error: Array
     steps: Array
     at_times: Array
-    saved: _Saved | None
+    save_cursor: _Saved | None
 
 
 class _Fixed(NamedTuple):
@@ -174,7 +174,7 @@ def integrate(
     [s] in order, the last that of the end, at which the states are to be saved, as the ``rows`` of
     the progress: a body that has reached one goes on to its next without waiting for others.
     """
-    compensated, own = bool(progress.low), field.own
+    compensated, individual_steps = bool(progress.compensation), field.individual_steps
     start, end = span
     length, sign = jnp.abs(end - start), jnp.where(end < start, -1, 1)
     dtype = y[0].dtype
@@ -182,41 +182,58 @@ def integrate(
     remaining = jnp.abs(limits.horizon - progress.elapsed - length).astype(dtype)
     duration, length = length, length.astype(dtype)
     zero = jnp.zeros_like(y[0])
-    first, _ = field.rates(field.data[0], start, y, False)
-    _, rate = field.units(field.data[1], y, first)
+    start_rates, _ = field.rates(field.data[0], start, y, False)
+    _, rate = field.units(field.data[1], y, start_rates)
     columns = table_for(rate)
     power = 1 / (columns.order.astype(dtype) + 1)
 
-    def worst(x, dead):
+    def worst(x, has_failed):
         """Of the bodies that share their steps, but for those that are columns up."""
-        return x if own else jnp.broadcast_to(jnp.max(jnp.where(dead, 0, x)), x.shape)
+        return (
+            x
+            if individual_steps
+            else jnp.broadcast_to(jnp.max(jnp.where(has_failed, 0, x)), x.shape)
+        )
 
-    def failed(fixed, carry):
+    def failed(constants, carry):
         """Bodies whose steps ran out, or became so short that they lead nowhere."""
         able = (carry.steps < limits.steps) & (carry.width > control.MIN_WIDTH * eps * length)
-        return ~(able & (fixed.reason == 0))
+        return ~(able & (constants.reason == 0))
 
-    def live(fixed, carry):
-        return (carry.elapsed < duration) & ~failed(fixed, carry)
+    def live(constants, carry):
+        return (carry.elapsed < duration) & ~failed(constants, carry)
 
-    def bound(fixed):
+    def bound(constants):
         """Rates and units of bodies."""
-        coefficients, unit_data = fixed.data
+        coefficients, unit_data = constants.data
         return partial(field.rates, coefficients), partial(field.units, unit_data)
 
-    def error_and_tolerance(rates, units, carry, t, h, width, new, result, later):
+    def error_and_tolerance(rates, units, carry, t, h, width, end_state, result, end_rates):
         """Error of a step, and what it may be."""
-        (weights, rate), (weights_, rate_) = units(carry.y, carry.rates), units(new, later)
+        (weights, rate), (end_weights, end_rate) = (
+            units(carry.y, carry.rates),
+            units(end_state, end_rates),
+        )
         # by the larger and faster of both ends: errors of a body that a torque sets in motion are
         # not measured by its state at rest
-        weights = [jnp.minimum(a, b) for a, b in zip(weights, weights_)]
-        rate = jnp.maximum(rate, rate_)
-        last, before = (weighted_length(weights, e) for e in (result.last, result.before))
-        error = control.CALIBRATION * last * jnp.where(last < before, last / before, 1)
+        weights = [jnp.minimum(a, b) for a, b in zip(weights, end_weights)]
+        rate = jnp.maximum(rate, end_rate)
+        difference, lower_difference = (
+            weighted_length(weights, e) for e in (result.difference, result.lower_difference)
+        )
+        error = (
+            control.CALIBRATION
+            * difference
+            * jnp.where(difference < lower_difference, difference / lower_difference, 1)
+        )
         if limits.jumps:
-            error = error + _jump_error(rates, t, h, carry, new, later, weights)
-            fall = (width / jnp.where(carry.refused[1] > 0, carry.refused[1], 1)) ** columns.order
-            rough = (carry.refused[1] > 0) & (error > control.ROUGH_FALL * fall * carry.refused[0])
+            error = error + _jump_error(rates, t, h, carry, end_state, end_rates, weights)
+            fall = (
+                width / jnp.where(carry.rejected_step[1] > 0, carry.rejected_step[1], 1)
+            ) ** columns.order
+            rough = (carry.rejected_step[1] > 0) & (
+                error > control.ROUGH_FALL * fall * carry.rejected_step[0]
+            )
             error = jnp.where(
                 rough & (error > control.ROUGH_ROUNDING * eps), control.ROUGH_ERROR * error, error
             )
@@ -227,116 +244,120 @@ def integrate(
             + rate * (length - carry.elapsed.astype(dtype) - width + remaining)
         )
         expected = jnp.maximum(expected, 1)
-        done = jnp.minimum(carry.total_angle / expected, 1)
-        first = control.FIRST_SHARE
-        share = control.MIDPOINT_SHARE * (first + 3 * (1 - first) * done * done)
-        allowed = share * limits.rtol * angle / (expected * _drift(expected))
+        fraction = jnp.minimum(carry.total_angle / expected, 1)
+        first_share = control.FIRST_SHARE
+        share = control.MIDPOINT_SHARE * (first_share + 3 * (1 - first_share) * fraction * fraction)
+        tolerance = share * limits.rtol * angle / (expected * _drift(expected))
         rounding = control.COMPENSATED_STEP if compensated else control.ROUNDED_STEP
-        allowed = jnp.maximum(allowed, rounding * eps)
+        tolerance = jnp.maximum(tolerance, rounding * eps)
         sound = jnp.isfinite(error) & jnp.isfinite(angle)  # a step may well end beyond all numbers
-        error, allowed = jnp.where(sound, error, jnp.inf), jnp.where(sound, allowed, 1)
-        return jax.lax.stop_gradient((error, allowed, jnp.where(sound, angle, 0)))
+        error, tolerance = jnp.where(sound, error, jnp.inf), jnp.where(sound, tolerance, 1)
+        return jax.lax.stop_gradient((error, tolerance, jnp.where(sound, angle, 0)))
 
-    def one(fixed, carry, rows):
+    def step_bodies(constants, carry, rows):
         """One step of each body."""
-        rates, units = bound(fixed)
-        alive = live(fixed, carry)
-        due = duration if carry.saved is None else carry.saved.due
-        left = (due - carry.elapsed).astype(dtype)
+        rates, units = bound(constants)
+        is_running = live(constants, carry)
+        target_time = duration if carry.save_cursor is None else carry.save_cursor.next_time
+        time_left = (target_time - carry.elapsed).astype(dtype)
         # divide what remains evenly, so that no step is much shorter than its neighbours
-        width = jnp.where(left <= carry.width, left, jnp.minimum(carry.width, left / 2))
-        cut = width < control.CUT * carry.width  # shortened to end at a time, not by rounding
+        width = jnp.where(
+            time_left <= carry.width, time_left, jnp.minimum(carry.width, time_left / 2)
+        )
+        is_cut = width < control.CUT * carry.width  # shortened to end at a time, not by rounding
         # the width is the difference of two representable times, or rounding would accumulate;
         # rounded down after a refused step, which would otherwise be attempted again and again
-        near = carry.elapsed + width.astype(carry.elapsed.dtype)
-        grain = jnp.finfo(near.dtype).eps * near  # one or two units in its last place
-        exact = (near - carry.elapsed).astype(dtype)
-        down = (exact > width) & (carry.refused[1] > 0)
-        exact = jnp.where(down, (near - grain - carry.elapsed).astype(dtype), exact)
-        exact = jnp.minimum(jnp.maximum(exact, grain.astype(dtype)), left)
-        width = jnp.where(width == left, left, exact)
-        width = jnp.where(alive, width, 0)
-        elapsed, h = (x if own else jnp.max(x) for x in (carry.elapsed, width))
+        end_time = carry.elapsed + width.astype(carry.elapsed.dtype)
+        grain = jnp.finfo(end_time.dtype).eps * end_time  # one or two units in its last place
+        exact = (end_time - carry.elapsed).astype(dtype)
+        down = (exact > width) & (carry.rejected_step[1] > 0)
+        exact = jnp.where(down, (end_time - grain - carry.elapsed).astype(dtype), exact)
+        exact = jnp.minimum(jnp.maximum(exact, grain.astype(dtype)), time_left)
+        width = jnp.where(width == time_left, time_left, exact)
+        width = jnp.where(is_running, width, 0)
+        elapsed, h = (x if individual_steps else jnp.max(x) for x in (carry.elapsed, width))
         t, h = start + sign * elapsed, sign.astype(dtype) * h
         result = extrapolated(
             rates, columns, t, h, carry.y, carry.rates, carry.integrals, compensated
         )
-        low = carry.low
-        new = result.change
+        compensation = carry.compensation
+        end_state = result.change
         if compensated:
-            new, low = carried_on(carry.y, carry.low, result.change)
-        later, _ = rates(t + h.astype(t.dtype), new, False)
-        error, allowed, angle = error_and_tolerance(
-            rates, units, carry, t, h, width, new, result, later
+            end_state, compensation = add_compensated(carry.y, carry.compensation, result.change)
+        end_rates, _ = rates(t + h.astype(t.dtype), end_state, False)
+        error, tolerance, angle = error_and_tolerance(
+            rates, units, carry, t, h, width, end_state, result, end_rates
         )
-        ratio = worst(error / allowed, failed(fixed, carry))
-        accepted = (ratio <= 1) & alive
+        ratio = worst(error / tolerance, failed(constants, carry))
+        accepted = (ratio <= 1) & is_running
         # logarithms: a power takes as long as three of them
         size = jnp.log(jnp.maximum(ratio, control.MIN_RATIO))
-        memory = jnp.where(accepted, control.MEMORY * carry.before, 0)
+        memory = jnp.where(accepted, control.MEMORY * carry.last_error, 0)
         factor = control.SAFETY * jnp.exp(power * (memory - size))
         factor = jnp.clip(factor, *control.factor_bounds(accepted, control.MAX_MIDPOINT_FACTOR))
         # the error of a step that a jump has shortened to units in the last place of the time is
         # rounding and says nothing about the width that is possible
-        short = width < control.GRAIN * grain.astype(dtype)
-        factor = jnp.where(accepted & short & ~cut, control.MAX_MIDPOINT_FACTOR, factor)
+        is_short = width < control.GRAIN * grain.astype(dtype)
+        factor = jnp.where(accepted & is_short & ~is_cut, control.MAX_MIDPOINT_FACTOR, factor)
         proposed = jnp.where(
-            accepted & cut, jnp.maximum(carry.width, width * factor), width * factor
+            accepted & is_cut, jnp.maximum(carry.width, width * factor), width * factor
         )
         proposed = jnp.where(accepted | (width > grain.astype(dtype)), proposed, 0)
-        proposed = jnp.where(alive, proposed, carry.width)
+        proposed = jnp.where(is_running, proposed, carry.width)
         later_time = jnp.where(
-            width == left, due, carry.elapsed + width.astype(carry.elapsed.dtype)
+            width == time_left, target_time, carry.elapsed + width.astype(carry.elapsed.dtype)
         )
         elapsed = jnp.where(accepted, later_time, carry.elapsed)
-        saved = carry.saved
-        if saved is not None:
-            reached = accepted & (width == left)
-            saved, rows = saved.after(reached, fixed.body, save_times, new, rows)
+        save_cursor = carry.save_cursor
+        if save_cursor is not None:
+            is_due = accepted & (width == time_left)
+            save_cursor, rows = save_cursor.update(
+                is_due, constants.body, save_times, end_state, rows
+            )
 
         def pick(a, b):
             return [jnp.where(accepted, x, y) for x, y in zip(a, b)]
 
-        refused = (accepted, 0, error), (accepted, 0, width)
+        rejected_step = (accepted, 0, error), (accepted, 0, width)
         carry = _Carry(
-            carry.attempts + jnp.where(alive, 1, 0).astype(dtype),
+            carry.attempts + jnp.where(is_running, 1, 0).astype(dtype),
             elapsed,
-            pick(new, carry.y),
-            pick(later, carry.rates),
-            pick(low, carry.low),
-            _picked(accepted, result.sums, carry.integrals),
+            pick(end_state, carry.y),
+            pick(end_rates, carry.rates),
+            pick(compensation, carry.compensation),
+            _select_integrals(accepted, result.sums, carry.integrals),
             proposed,
-            jnp.where(accepted, size, carry.before),
-            tuple(jnp.where(*x) for x in refused),
+            jnp.where(accepted, size, carry.last_error),
+            tuple(jnp.where(*x) for x in rejected_step),
             carry.total_angle + jnp.where(accepted, angle, 0),
             carry.error + jnp.where(accepted, error, 0),
             carry.steps + jnp.where(accepted, 1, 0),
-            carry.at_times + jnp.where(accepted & cut, 1, 0),
-            saved,
+            carry.at_times + jnp.where(accepted & is_cut, 1, 0),
+            save_cursor,
         )
         return carry, rows
 
     body = jnp.arange(zero.size, dtype=jnp.int32).reshape(zero.shape)
-    fixed = _Fixed(field.data, body, progress.reason)
+    constants = _Fixed(field.data, body, progress.reason)
     # half of what a smooth motion allows, or everything at once if that is short
     guess = control.FIRST_WIDTH * limits.rtol.astype(dtype) ** power
     guess = guess / jnp.maximum(rate, 1 / (length + remaining))
     guess = jnp.where(progress.width > 0, progress.width, guess)  # NaN where the rates are
     guess = jax.lax.stop_gradient(guess)
-    if not own:
+    if not individual_steps:
         sound = jnp.where(
             guess > 0, guess, jnp.inf
         )  # a body that is not finite does not delay others
         guess = jnp.where(guess > 0, jnp.min(sound), guess)
-    saved, rows = None, None
+    save_cursor, rows = None, None
     if save_times is not None:
-        saved, rows = _Saved.first(progress.rows, save_times, y)
+        save_cursor, rows = _Saved.at_start(progress.rows, save_times, y)
     carry = _Carry(
         zero,
         jnp.zeros(zero.shape, start.dtype),
         y,
-        first,
-        progress.low,
+        start_rates,
+        progress.compensation,
         integrals,
         guess,
         zero,
@@ -345,60 +366,70 @@ def integrate(
         progress.error,
         progress.steps,
         progress.at_times,
-        saved,
+        save_cursor,
     )
 
-    def able(fixed, carry):
-        return live(fixed, carry) & (carry.attempts < control.ATTEMPTS * limits.steps)
+    def can_step(constants, carry):
+        return live(constants, carry) & (carry.attempts < control.ATTEMPTS * limits.steps)
 
-    def finished(fixed, carry):
-        arrived = (carry.elapsed >= duration) & (fixed.reason == 0)
-        y = [jnp.where(arrived, x, jnp.nan) for x in carry.y]
-        numbers = jnp.isfinite(carry.width) & jnp.isfinite(carry.refused[0])
-        left = (carry.steps < limits.steps) & (carry.attempts < control.ATTEMPTS * limits.steps)
-        why = jnp.where(left, jnp.where(numbers, 2, 3), 1)
-        reason = jnp.where(arrived, 0, jnp.where(fixed.reason > 0, fixed.reason, why))
+    def finish(constants, carry):
+        has_finished = (carry.elapsed >= duration) & (constants.reason == 0)
+        y = [jnp.where(has_finished, x, jnp.nan) for x in carry.y]
+        numbers = jnp.isfinite(carry.width) & jnp.isfinite(carry.rejected_step[0])
+        steps_remain = (carry.steps < limits.steps) & (
+            carry.attempts < control.ATTEMPTS * limits.steps
+        )
+        why = jnp.where(steps_remain, jnp.where(numbers, 2, 3), 1)
+        reason = jnp.where(has_finished, 0, jnp.where(constants.reason > 0, constants.reason, why))
         # as floats, like the other numbers
         reason = reason.astype(dtype)
         steps = carry.steps, carry.attempts, carry.at_times
         numbers = carry.width, carry.total_angle, *steps, carry.error, reason
-        return y, carry.integrals, carry.low, numbers
+        return y, carry.integrals, carry.compensation, numbers
 
-    queue = zero.ndim == 1 and field.by_entry and own and _policy.is_refilled(zero.size)
+    queue = (
+        zero.ndim == 1 and field.by_entry and individual_steps and _policy.is_refilled(zero.size)
+    )
     if queue:
-        result, rows = in_lanes(one, able, finished, fixed, carry, rows)
+        result, rows = in_lanes(step_bodies, can_step, finish, constants, carry, rows)
     else:
         carry, rows = jax.lax.while_loop(
-            lambda carry: any_of(able(fixed, carry[0]).astype(dtype)),
-            lambda carry: one(fixed, *carry),
+            lambda carry: any_of(can_step(constants, carry[0]).astype(dtype)),
+            lambda carry: step_bodies(constants, *carry),
             (carry, rows),
         )
-        result = finished(fixed, carry)
-    y, integrals, low, (width, total_angle, steps, attempts, at_times, error, reason) = result
-    refused = progress.refused + attempts - (steps - progress.steps)
+        result = finish(constants, carry)
+    y, integrals, compensation, (width, total_angle, steps, attempts, at_times, error, reason) = (
+        result
+    )
+    rejections = progress.rejections + attempts - (steps - progress.steps)
     elapsed = progress.elapsed + duration
     if rows is not None and save_times is not None:
         rows = rows.reshape(zero.size, save_times.shape[0] + 1, len(y))
     reason = reason.astype(jnp.int32)
-    counts = steps, refused, at_times
-    return y, integrals, Progress(width, total_angle, low, *counts, error, elapsed, reason, rows)
+    counts = steps, rejections, at_times
+    return (
+        y,
+        integrals,
+        Progress(width, total_angle, compensation, *counts, error, elapsed, reason, rows),
+    )
 
 
 def _drift(angle: Array) -> Array:
     """Reduction of the tolerance: the power 3/4 of the angle, by square roots, which are faster."""
-    far = jnp.maximum(angle / control.DRIFT_ANGLE, 1)
-    return jnp.sqrt(far * jnp.sqrt(far))
+    ratio = jnp.maximum(angle / control.DRIFT_ANGLE, 1)
+    return jnp.sqrt(ratio * jnp.sqrt(ratio))
 
 
-def _picked(accepted, new, old):
+def _select_integrals(accepted, candidates, integrals):
     """Integrals with a shape that all bodies share are accepted with the step that they share."""
     return [
         jnp.where(accepted if x.shape == accepted.shape else jnp.any(accepted), x, y)
-        for x, y in zip(new, old)
+        for x, y in zip(candidates, integrals)
     ]
 
 
-def _jump_error(rates, t, width, carry, new, later, weights) -> Array:
+def _jump_error(rates, t, width, carry, end_state, end_rates, weights) -> Array:
     """Error by rates that jump beside an end of a step, unseen by its estimate.
 
     No column of the midpoint rule looks between either end of a step and its first or last
@@ -412,12 +443,12 @@ def _jump_error(rates, t, width, carry, new, later, weights) -> Array:
     def pick(at_end, a, b):
         return [jnp.where(at_end, y, x) for x, y in zip(a, b)]
 
-    def beside(end, total):
+    def add_end(end, total):
         """One end: 0, the start, or 1. In loops, so that the rates stand in the program once."""
         at_end = end == 1
-        base, there = pick(at_end, carry.y, new), pick(at_end, carry.rates, later)
+        base, base_rates = pick(at_end, carry.y, end_state), pick(at_end, carry.rates, end_rates)
         # along the tangent at the start, back along the chord at the end
-        chord = [a - b for a, b in zip(carry.y, new)]
+        chord = [a - b for a, b in zip(carry.y, end_state)]
         part = [gap * f for f in carry.rates]
         part = pick(at_end, part, [control.JUMP_GAP * x for x in chord])
         start, sign = jnp.where(at_end, t + width, t), jnp.where(at_end, -1, 1)
@@ -425,87 +456,86 @@ def _jump_error(rates, t, width, carry, new, later, weights) -> Array:
         def further(k, result):
             """Differences of order 0, 1, ... up to the rates ``k`` times so far; the sizes of
             those from the end on, of which the one of order ``k`` is new."""
-            before, sizes = result
+            older_rows, sizes = result
             k = k.astype(width.dtype)
-            now = (start + sign * k * gap).reshape(-1)[0]
-            row = rates(now, [a + k * b for a, b in zip(base, part)], False)[0]
+            time = (start + sign * k * gap).reshape(-1)[0]
+            row = rates(time, [a + k * b for a, b in zip(base, part)], False)[0]
             rows = [row]
-            for older in before:
+            for older in older_rows:
                 row = [a - b for a, b in zip(row, older)]
                 rows.append(row)
             lengths = [weighted_length(weights, x) for x in rows[1:]]
             sizes = [jnp.where(k == n, x, y) for n, x, y in zip((1, 2, 3), lengths, sizes)]
             return rows[:3], sizes
 
-        zero = [jnp.zeros_like(x) for x in there]
+        zero = [jnp.zeros_like(x) for x in base_rates]
         sizes = [jnp.zeros_like(total)] * 3
-        _, sizes = jax.lax.fori_loop(1, 4, further, ([there, zero, zero], sizes))
+        _, sizes = jax.lax.fori_loop(1, 4, further, ([base_rates, zero, zero], sizes))
         first, second, third = sizes
-        noise = control.JUMP_NOISE * eps * weighted_length(weights, there)
+        noise = control.JUMP_NOISE * eps * weighted_length(weights, base_rates)
         jumps = third > jnp.maximum(0.5 * jnp.maximum(second, 0.5 * first), noise)
         return total + jnp.where(jumps, third * jnp.abs(4 * gap), 0)
 
-    return jax.lax.fori_loop(0, 2, beside, jnp.zeros_like(carry.width))
+    return jax.lax.fori_loop(0, 2, add_end, jnp.zeros_like(carry.width))
 
 
 def in_lanes(
     step: Callable[..., Any],
-    able: Callable[..., Array],
-    finished: Callable[..., Any],
-    fixed: Any,
+    can_step: Callable[..., Array],
+    finish: Callable[..., Any],
+    constants: Any,
     carry: Any,
     rows: Any,
 ) -> tuple[Any, Any]:
-    """``finished(fixed, carry)`` of every body after all the steps that it is able to take, and
-    the ``rows``.
+    """``finish(constants, carry)`` of every body after its last step, and the ``rows``.
 
-    ``step(fixed, carry, rows)``: the new ``carry`` and ``rows`` after one step of some bodies.
-    ``able(fixed, carry)`` (n,): whether a body goes on; one whose ``carry`` is all zero must not.
-    ``carry``: arrays (n,); ``fixed``: such arrays and numbers, which no step changes, among them
-    ``fixed.body`` (n,), the place of each body among all; ``rows``: anything that belongs to all.
+    ``step(constants, carry, rows)``: ``carry`` and ``rows`` after one step of some bodies.
+    ``can_step(constants, carry)`` (n,): whether a body continues; False if its ``carry`` is zero.
+    ``carry``: arrays (n,); ``constants``: such arrays and numbers that no step changes, among them
+    ``constants.body`` (n,), the index of each body; ``rows``: anything that belongs to all bodies.
     """
-    n = fixed.body.size
+    n = constants.body.size
     wide = -(-n // -(-n // _policy.LANES))  # no wider than where each lane leads as many bodies
     wide += -wide % 8
-    parts, tree = jax.tree.flatten(fixed)
+    parts, tree = jax.tree.flatten(constants)
     constant = [x for x in parts if x.shape == (n,)]
     changing, form = jax.tree.flatten(carry)
-    endings, shape = jax.tree.flatten(finished(fixed, carry))
+    endings, shape = jax.tree.flatten(finish(constants, carry))
     queue = _stacked(constant), _stacked(changing)
 
-    def fixed_of(fixed_rows):
+    def constants_of(fixed_rows):
         """What is fixed of the bodies in the lanes."""
-        some = iter(_as(constant, fixed_rows))
-        return jax.tree.unflatten(tree, [next(some) if x.shape == (n,) else x for x in parts])
+        lane_rows = iter(_as(constant, fixed_rows))
+        return jax.tree.unflatten(tree, [next(lane_rows) if x.shape == (n,) else x for x in parts])
 
     def settle(loop):
         """What became of the bodies that have arrived is stored, and others take their lanes."""
         fixed_rows, carry, results, next_body, _ = loop
-        fixed = fixed_of(fixed_rows)
-        done = ~able(fixed, carry)
-        endings = _stacked(jax.tree.leaves(finished(fixed, carry)))
-        results = put(results, fixed.body, endings.T)
+        constants = constants_of(fixed_rows)
+        is_finished = ~can_step(constants, carry)
+        endings = _stacked(jax.tree.leaves(finish(constants, carry)))
+        results = put(results, constants.body, endings.T)
         lane = jnp.arange(wide)
-        before = jnp.sum(jnp.where((lane[:, None] > lane[None]) & done[None], 1, 0), axis=1)
-        index = next_body + before
-        new = done & (index < n)
+        rank = jnp.sum(jnp.where((lane[:, None] > lane[None]) & is_finished[None], 1, 0), axis=1)
+        index = next_body + rank
+        is_refilled = is_finished & (index < n)
         others, start = (x.at[:, index].get(mode="clip") for x in queue)
         start = jax.tree.unflatten(form, _as(changing, start))
-        carry = jax.tree.map(lambda a, b: jnp.where(new, a, b), start, carry)
-        count = jnp.sum(jnp.where(done, 1, 0))
+        carry = jax.tree.map(lambda a, b: jnp.where(is_refilled, a, b), start, carry)
+        count = jnp.sum(jnp.where(is_finished, 1, 0))
         # n: none is waiting; n + 1: all have been stored, and stay so while others of a batch go on
-        last = (count == wide) & (next_body >= n)
-        next_body = jnp.where(last, n + 1, jnp.minimum(next_body + count, n))
-        return jnp.where(new, others, fixed_rows), carry, results, next_body, False
+        is_last = (count == wide) & (next_body >= n)
+        next_body = jnp.where(is_last, n + 1, jnp.minimum(next_body + count, n))
+        return jnp.where(is_refilled, others, fixed_rows), carry, results, next_body, False
 
     def turn(loop):
         fixed_rows, carry, results, next_body, rows = loop
-        idle = jnp.sum(jnp.where(able(fixed_of(fixed_rows), carry), 0, 1))
-        due = (idle >= _policy.REFILL_LANES) & (next_body < n) | (idle == wide)
+        idle = jnp.sum(jnp.where(can_step(constants_of(fixed_rows), carry), 0, 1))
+        needs_refill = (idle >= _policy.REFILL_LANES) & (next_body < n) | (idle == wide)
         # once or not at all: a branch would copy all that it may change
-        start = fixed_rows, carry, results, next_body, any_of(jnp.where(due, 1.0, 0.0))
+        start = fixed_rows, carry, results, next_body, any_of(jnp.where(needs_refill, 1.0, 0.0))
         fixed_rows, carry, results, next_body, _ = jax.lax.while_loop(lambda c: c[4], settle, start)
-        carry, rows = step(fixed_of(fixed_rows), carry, rows)
+        carry, rows = step(constants_of(fixed_rows), carry, rows)
         return fixed_rows, carry, results, next_body, rows
 
     # at first every lane is done with a body of zeros, whose end is overwritten

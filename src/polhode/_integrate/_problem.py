@@ -21,20 +21,20 @@ Pose = Callable[[Any], tuple[Any, Any]]
 class Problem(NamedTuple):
     """The field of one body as a program of arrays.
 
-    ``closed``: rates (and sides of events) of ``arrays``, the time and the components of the state;
+    ``closed_jaxpr``: rates (and sides of events) of ``arrays``, the time and the state components;
     ``arrays``: those of B bodies (B, ...) where ``lanes`` says so, else shared; ``switches``;
-    ``events``: how many of the last switches are events; ``passed``: how many switches the steps
-    pass without an end.
+    ``events``: how many of the last switches are events; ``passed_switches``: how many switches
+    the steps pass without ending there.
     """
 
-    closed: ClosedJaxpr
+    closed_jaxpr: ClosedJaxpr
     arrays: list[Any]
     lanes: tuple[bool, ...]
     switches: Switched
     events: int
     components: int
     dtype: Any
-    passed: int = 0
+    passed_switches: int = 0
 
     @classmethod
     def of(
@@ -50,8 +50,8 @@ class Problem(NamedTuple):
         """``parts``: arrays of all bodies, ``is_lane``: a tree of which have a lane axis; ``y0``: a
         state, components (B,); ``watch(parts, t, y)``: values (E,) of events, of one body;
         ``located``: False: the switches are passed, and only counted."""
-        marked = jax.tree.map(_Marked, parts, is_lane)
-        leaves, tree = jax.tree.flatten(marked, is_leaf=lambda x: isinstance(x, _Marked))
+        parts_and_lanes = jax.tree.map(_Marked, parts, is_lane)
+        leaves, tree = jax.tree.flatten(parts_and_lanes, is_leaf=lambda x: isinstance(x, _Marked))
         arrays = [x.value for x in leaves if eqx.is_array(x.value)]
         lanes = [bool(x.lane) for x in leaves if eqx.is_array(x.value)]
         distinct = Distinct(arrays)
@@ -61,12 +61,14 @@ class Problem(NamedTuple):
         components, state_tree = jax.tree.flatten(y0)
         events = 0
 
-        def one(t, *given):
+        def equations(t, *operands):
             nonlocal events
-            y = jax.tree.unflatten(state_tree, given[: len(components)])
-            found = iter([given[len(components) :][i] for i in distinct.places])
+            y = jax.tree.unflatten(state_tree, operands[: len(components)])
+            ordered_arrays = iter([operands[len(components) :][i] for i in distinct.places])
             values = [
-                (next(found)[None] if x.lane else next(found)) if eqx.is_array(x.value) else x.value
+                (next(ordered_arrays)[None] if x.lane else next(ordered_arrays))
+                if eqx.is_array(x.value)
+                else x.value
                 for x in leaves
             ]
             parts = jax.tree.unflatten(tree, values)
@@ -74,31 +76,31 @@ class Problem(NamedTuple):
             rates = jax.tree.leaves(term.vf(t, y, args))
             if watch is None:
                 return rates
-            seen = watch(parts, t, y)
-            events = seen.size
-            return [*rates, jnp.where(seen + 0 * t >= 0, 1, 0)]
+            event_values = watch(parts, t, y)
+            events = event_values.size
+            return [*rates, jnp.where(event_values + 0 * t >= 0, 1, 0)]
 
-        bare = [x[0] if lane else x for x, lane in zip(once, flags)]
+        single_lane = [x[0] if lane else x for x, lane in zip(once, flags)]
         dtype = jnp.result_type(*components)
-        closed = formula(one, t, *(jnp.ravel(x)[:1] for x in components), *bare)
-        closed, consts = _opened(closed, 1 + len(components))
-        moving = [
-            *[False] * (len(closed.jaxpr.invars) - 1 - len(components)),
+        closed_jaxpr = formula(equations, t, *(jnp.ravel(x)[:1] for x in components), *single_lane)
+        closed_jaxpr, consts = _with_consts_as_operands(closed_jaxpr, 1 + len(components))
+        varies = [
+            *[False] * (len(closed_jaxpr.jaxpr.invars) - 1 - len(components)),
             *[True] * (1 + len(components)),
         ]
-        found = switched(closed, moving, dtype)
-        passed = 0 if located else found.count
+        switches = switched(closed_jaxpr, varies, dtype)
+        passed_switches = 0 if located else switches.count
         if not located:
-            found = switched(closed, [False] * len(moving), dtype)
+            switches = switched(closed_jaxpr, [False] * len(varies), dtype)
         return cls(
-            closed,
+            closed_jaxpr,
             [*consts, *once],
             (*[False] * len(consts), *flags),
-            found,
+            switches,
             events,
             len(components),
             dtype,
-            passed,
+            passed_switches,
         )
 
     def motion(
@@ -108,27 +110,30 @@ class Problem(NamedTuple):
         size, count = self.components, self.switches.count
         fixed_count = len(arrays)
 
-        def frozen(*given):
-            fixed, (levels, t, *y) = given[:fixed_count], given[fixed_count:]
-            out, margins, turned = self.switches.frozen(levels, *fixed, t, *y)
-            return [*out[:size], margins, turned]
+        def frozen(*operands):
+            constants, (levels, t, *y) = operands[:fixed_count], operands[fixed_count:]
+            out, margins, new_levels = self.switches.frozen(levels, *constants, t, *y)
+            return [*out[:size], margins, new_levels]
 
-        bare = [x[0] if lane else x for x, lane in zip(arrays, self.lanes)]
+        single_lane = [x[0] if lane else x for x, lane in zip(arrays, self.lanes)]
         t, y = jnp.zeros((), self.dtype), [jnp.zeros(1, self.dtype)] * size
-        free = [jnp.zeros(count, self.dtype), t, *y]
-        closed = formula(frozen, *bare, *free)
+        variables = [jnp.zeros(count, self.dtype), t, *y]
+        closed_jaxpr = formula(frozen, *single_lane, *variables)
         program: list[Any] = []
 
-        def coefficients_of(*some):
-            folded = specialise(closed, some)
-            shapes = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in (*folded.held, *free)]
-            size = len(folded.held)
+        def coefficients_of(*parameters):
+            specialised = specialise(closed_jaxpr, parameters)
+            shapes = [
+                jax.ShapeDtypeStruct(x.shape, x.dtype)
+                for x in (*specialised.coefficients, *variables)
+            ]
+            size = len(specialised.coefficients)
             # traced as a program of its own: ``run`` closes over the traced coefficients
-            program[:] = [jax.make_jaxpr(lambda *x: folded.run(x[:size], *x[size:]))(*shapes)]
-            return list(folded.held)
+            program[:] = [jax.make_jaxpr(lambda *x: specialised.run(x[:size], *x[size:]))(*shapes)]
+            return list(specialised.coefficients)
 
         axes = [0 if lane else None for lane in self.lanes]
-        depends = _depends(jax.make_jaxpr(coefficients_of)(*bare).jaxpr, self.lanes)
+        depends = _depends(jax.make_jaxpr(coefficients_of)(*single_lane).jaxpr, self.lanes)
         out = [0 if moves else None for moves in depends]
         coefficients = (
             jax.vmap(coefficients_of, in_axes=tuple(axes), out_axes=out)(*arrays)
@@ -138,23 +143,25 @@ class Problem(NamedTuple):
         run = jaxpr_as_fun(program[0])
 
         def of_one(coefficients, levels, t, y):
-            *rates, margins, turned = run(
+            *rates, margins, new_levels = run(
                 *coefficients, levels, t, *(y[i][None] for i in range(size))
             )
-            return jnp.concatenate(rates), margins, turned
+            return jnp.concatenate(rates), margins, new_levels
 
         def rates(coefficients, levels, t, y):
             return jax.vmap(of_one, in_axes=(out, -1, 0, -1), out_axes=-1)(
                 coefficients, levels, t, y
             )
 
-        def levels_of_one(fixed, t, y):
-            return self.switches.levels(*fixed, t, *(y[i][None] for i in range(size)))
+        def levels_of_one(constants, t, y):
+            return self.switches.levels(*constants, t, *(y[i][None] for i in range(size)))
 
-        def levels(fixed, t, y):
+        def levels(constants, t, y):
             if not count:
                 return jnp.zeros((0, t.shape[0]), self.dtype)
-            return jax.vmap(levels_of_one, in_axes=(axes, 0, -1), out_axes=-1)(list(fixed), t, y)
+            return jax.vmap(levels_of_one, in_axes=(axes, 0, -1), out_axes=-1)(
+                list(constants), t, y
+            )
 
         jumps = bool(self.switches.jumps[: count - self.events].any())
         return Motion(
@@ -176,20 +183,22 @@ class _Marked(NamedTuple):
     lane: Any
 
 
-def _opened(closed: ClosedJaxpr, moving: int) -> tuple[ClosedJaxpr, list[Any]]:
+def _with_consts_as_operands(
+    closed_jaxpr: ClosedJaxpr, variable_count: int
+) -> tuple[ClosedJaxpr, list[Any]]:
     """The program of (what it closes over, arrays, what moves), and what it closes over."""
-    jaxpr = closed.jaxpr
-    given = [*jaxpr.constvars, *jaxpr.invars[moving:], *jaxpr.invars[:moving]]
-    names = jaxpr.debug_info._replace(arg_names=("",) * len(given))
-    return ClosedJaxpr(jaxpr.replace(constvars=[], invars=given, debug_info=names), []), list(
-        closed.consts
+    jaxpr = closed_jaxpr.jaxpr
+    invars = [*jaxpr.constvars, *jaxpr.invars[variable_count:], *jaxpr.invars[:variable_count]]
+    names = jaxpr.debug_info._replace(arg_names=("",) * len(invars))
+    return ClosedJaxpr(jaxpr.replace(constvars=[], invars=invars, debug_info=names), []), list(
+        closed_jaxpr.consts
     )
 
 
 def _depends(jaxpr, flags: Sequence[bool]) -> list[bool]:
     """Which results of a program rest on the arguments with a flag."""
-    seen = {v for v, flag in zip(jaxpr.invars, flags) if flag}
+    dependent_vars = {v for v, flag in zip(jaxpr.invars, flags) if flag}
     for eqn in jaxpr.eqns:
-        if any(not isinstance(v, Literal) and v in seen for v in eqn.invars):
-            seen.update(eqn.outvars)
-    return [not isinstance(v, Literal) and v in seen for v in jaxpr.outvars]
+        if any(not isinstance(v, Literal) and v in dependent_vars for v in eqn.invars):
+            dependent_vars.update(eqn.outvars)
+    return [not isinstance(v, Literal) and v in dependent_vars for v in jaxpr.outvars]

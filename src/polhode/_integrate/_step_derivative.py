@@ -36,39 +36,39 @@ from polhode._integrate._loop import FINISHED, RUNNING, Make, advance, begin, ea
 from polhode._kernels import any_of, attached, is_slope, kernel, linear, zeros
 
 
-def samples(make: Make, arrays, unit_data, y, start, ts, found, once: bool = False) -> Array:
-    """``found`` (B, T, D), samples at ``ts`` (T,) or (B, T) of the motion from ``y`` (D, B) at
+def samples(make: Make, arrays, unit_data, y, start, ts, states, once: bool = False) -> Array:
+    """``states`` (B, T, D), samples at ``ts`` (T,) or (B, T) of the motion from ``y`` (D, B) at
     ``start`` () or (B,), with their derivatives. Times of one body may stand in any order.
     ``once``: refuse second derivatives."""
     leaves, tree = jax.tree.flatten(unit_data)
     size, extra = len(arrays), len(leaves)
 
-    def problem_of(given, differentiable=False):
-        unit_data = jax.tree.unflatten(tree, given[size : size + extra])
-        return make(given[:size], unit_data, differentiable)
+    def problem_of(operands, differentiable=False):
+        unit_data = jax.tree.unflatten(tree, operands[size : size + extra])
+        return make(operands[:size], unit_data, differentiable)
 
     def rule(operands, tangents, values):
-        *fixed, y, start, ts = operands
-        *more, dy, dstart, dts = tangents
-        motion, _ = problem_of(fixed)
+        *inputs, y, start, ts = operands
+        *input_tangents, dy, dstart, dts = tangents
+        motion, _ = problem_of(inputs)
         starts, rows = each_body(start, ts, y.shape[1])
-        at = [i for i, x in enumerate(more[:size]) if is_slope(x)]
+        at = [i for i, x in enumerate(input_tangents[:size]) if is_slope(x)]
         dy = dy if is_slope(dy) else zeros(dy)
         if is_slope(dstart):
             dy = dy - dstart * _rates(motion, starts[None], y[None])[0]
         change = linear(
-            lambda given, moved: _tangent(problem_of, at, _checked(given, once), moved),
-            lambda given, cotangents: _cotangent(
-                problem_of, at, _checked(given, once), cotangents[0]
+            lambda primals, tangents: _tangent(problem_of, at, _checked(primals, once), tangents),
+            lambda primals, cotangents: _cotangent(
+                problem_of, at, _checked(primals, once), cotangents[0]
             ),
             list(operands),
-            [dy, *(more[i] for i in at)],
+            [dy, *(input_tangents[i] for i in at)],
             values,
         )
         if is_slope(dts):
             rate = _rates(motion, rows, jnp.moveaxis(values[0], 0, -1))
-            late = each_body(start, dts, y.shape[1])[1]
-            change = [change[0] + jnp.moveaxis(late[:, None] * rate, -1, 0)]
+            dtimes = each_body(start, dts, y.shape[1])[1]
+            change = [change[0] + jnp.moveaxis(dtimes[:, None] * rate, -1, 0)]
         return change
 
     order = None
@@ -76,51 +76,51 @@ def samples(make: Make, arrays, unit_data, y, start, ts, found, once: bool = Fal
         sign = jnp.where(ts[:, -1:] < jnp.reshape(start, (-1, 1)), -1, 1).astype(ts.dtype)
         order = jnp.argsort(jax.lax.stop_gradient(sign * ts), axis=1)
         ts = jnp.take_along_axis(ts, order, axis=1)
-        found = jnp.take_along_axis(found, order[..., None], axis=1)
-    (found,) = attached(rule, [*arrays, *leaves, y, start, ts], [found])
+        states = jnp.take_along_axis(states, order[..., None], axis=1)
+    (states,) = attached(rule, [*arrays, *leaves, y, start, ts], [states])
     if order is None:
-        return found
-    return jnp.take_along_axis(found, jnp.argsort(order, axis=1)[..., None], axis=1)
+        return states
+    return jnp.take_along_axis(states, jnp.argsort(order, axis=1)[..., None], axis=1)
 
 
-def _is_differentiated(given) -> bool:
-    return any(isinstance(x, ad.JVPTracer) for x in given)
+def _is_differentiated(operands) -> bool:
+    return any(isinstance(x, ad.JVPTracer) for x in operands)
 
 
-def _checked(given, once: bool):
+def _checked(operands, once: bool):
     """The operands of a derivative; raises where ``once`` and they are differentiated again."""
-    if once and _is_differentiated(given):
+    if once and _is_differentiated(operands):
         raise NotImplementedError(
             "second derivatives of steps that pass kinks or jumps are wrong: leave"
             " method=ph.CoarseSteps() out, so that the steps end there."
         )
-    return given
+    return operands
 
 
 def _rates(motion: Motion, ts: Array, states: Array) -> Array:
     """Rates (T, D, B) at times (T, B) and states (T, D, B)."""
 
-    def one(given):
-        t, y = given
+    def rates_at(point):
+        t, y = point
         return motion.rates(motion.coefficients, motion.levels(motion.arguments, t, y), t, y)[0]
 
-    return jax.lax.map(one, (ts, states))
+    return jax.lax.map(rates_at, (ts, states))
 
 
-def _tangent(problem_of, at, given, moved):
+def _tangent(problem_of, at, primals, tangents):
     """Tangents (B, T, D) of the samples."""
-    *arrays, y, start, ts = given
-    dy, *some = moved
+    *arrays, y, start, ts = primals
+    dy, *parameter_tangents = tangents
 
-    def path(y, *some):
-        full = list(arrays)
-        for i, x in zip(at, some):
-            full[i] = x
-        motion, options = problem_of(full, True)
+    def path(y, *parameters):
+        inputs = list(arrays)
+        for i, x in zip(at, parameters):
+            inputs[i] = x
+        motion, options = problem_of(inputs, True)
         _, rows = run(motion, options, *each_body(start, ts, y.shape[1]), y)
         return rows.samples.reshape(y.shape[1], ts.shape[-1] + 1, -1)[:, :-1]
 
-    return [jax.jvp(path, (y, *(arrays[i] for i in at)), (dy, *some))[1]]
+    return [jax.jvp(path, (y, *(arrays[i] for i in at)), (dy, *parameter_tangents))[1]]
 
 
 class _Note(NamedTuple):
@@ -132,39 +132,41 @@ class _Note(NamedTuple):
     elapsed: Array
 
 
-def _cotangent(problem_of, at, given, cotangents):
+def _cotangent(problem_of, at, primals, cotangents):
     """Cotangents of the state at the start and of ``arrays[i]``, i in ``at``."""
-    *arrays, y, start, ts = given
+    *arrays, y, start, ts = primals
     start, times = each_body(start, ts, y.shape[1])
     cotangents = jnp.moveaxis(cotangents, 0, -1)  # (T, D, B)
-    chosen = [arrays[i] for i in at]
+    parameters = [arrays[i] for i in at]
 
-    def coefficients_of(*some):
-        full = list(arrays)
-        for i, x in zip(at, some):
-            full[i] = x
-        return [x for x in problem_of(full)[0].coefficients if jnp.issubdtype(x.dtype, jnp.inexact)]
+    def coefficients_of(*parameters):
+        inputs = list(arrays)
+        for i, x in zip(at, parameters):
+            inputs[i] = x
+        return [
+            x for x in problem_of(inputs)[0].coefficients if jnp.issubdtype(x.dtype, jnp.inexact)
+        ]
 
     # second derivatives need those of the places of switches
-    differentiable = _is_differentiated(given)
+    differentiable = _is_differentiated(primals)
     motion, options = problem_of(arrays, differentiable)
     floats = [k for k, x in enumerate(motion.coefficients) if jnp.issubdtype(x.dtype, jnp.inexact)]
-    _, pull = jax.vjp(coefficients_of, *chosen)
+    _, pull = jax.vjp(coefficients_of, *parameters)
     sums = [jnp.zeros_like(motion.coefficients[k]) for k in floats]
-    found, sums = kernel(
-        lambda coefficients, arguments, unit_data, *rest: _backward(
+    y_cotangent, sums = kernel(
+        lambda coefficients, arguments, unit_data, *operands: _backward(
             motion._replace(coefficients=coefficients, arguments=arguments, unit_data=unit_data),
             options,
             floats,
-            *rest,
+            *operands,
         )
     )(motion.coefficients, motion.arguments, motion.unit_data, start, times, y, cotangents, sums)
-    return [found, *pull(sums)]
+    return [y_cotangent, *pull(sums)]
 
 
 def _backward(motion, options, floats, start, times, y, cotangents, sums):
     """Cotangents of the state at the start and of the floats among ``motion.coefficients``."""
-    first, rows = begin(motion, options, start, times[-1:], y)
+    first_progress, rows = begin(motion, options, start, times[-1:], y)
     end = times[-1:]
     length = -(-control.ATTEMPTS * options.max_steps // _policy.RECORD_SEGMENTS)
 
@@ -174,13 +176,16 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
     def stored(progress):
         """Checkpoint: rates and margins are evaluated again where a segment starts, on both
         passes, so that both take the same steps."""
-        levels, turned = (_packed(motion, x) for x in (progress.levels, progress.just_turned))
-        return progress._replace(levels=levels, just_turned=turned, rate=None, margin=None)
+        levels, just_turned = (_packed(motion, x) for x in (progress.levels, progress.just_turned))
+        return progress._replace(levels=levels, just_turned=just_turned, rate=None, margin=None)
 
     def restored(progress):
-        levels, turned = (x.astype(y.dtype) for x in (progress.levels, progress.just_turned))
+        levels, just_turned = (x.astype(y.dtype) for x in (progress.levels, progress.just_turned))
         return progress._replace(
-            levels=levels, just_turned=turned, rate=jnp.zeros_like(y), margin=jnp.zeros_like(levels)
+            levels=levels,
+            just_turned=just_turned,
+            rate=jnp.zeros_like(y),
+            margin=jnp.zeros_like(levels),
         )
 
     def buffers(size, tree):
@@ -197,40 +202,44 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
     def turn(carry):
         progress, checkpoints, notes, count = carry
         number, place = count // length, count % length
-        begins = place == 0
-        progress = progress._replace(needs_rates=progress.needs_rates | begins)
-        old = entry(checkpoints, number)
+        is_segment_start = place == 0
+        progress = progress._replace(needs_rates=progress.needs_rates | is_segment_start)
+        stored_entry = entry(checkpoints, number)
         checkpoints = put_in(
             checkpoints,
             number,
-            jax.tree.map(lambda x, o: jnp.where(begins, x, o), stored(progress), old),
+            jax.tree.map(
+                lambda x, o: jnp.where(is_segment_start, x, o), stored(progress), stored_entry
+            ),
         )
         notes = put_in(notes, place, noted(progress))
         progress, _ = advance(motion, options, start, end, progress, rows)
         return progress, checkpoints, notes, count + 1
 
-    last, checkpoints, notes, count = jax.lax.while_loop(
+    last_progress, checkpoints, notes, count = jax.lax.while_loop(
         lambda c: any_of(jnp.where(c[0].outcome == RUNNING, 1.0, 0.0)),
         turn,
         (
-            first,
-            buffers(_policy.RECORD_SEGMENTS, stored(first)),
-            buffers(length, noted(first)),
+            first_progress,
+            buffers(_policy.RECORD_SEGMENTS, stored(first_progress)),
+            buffers(length, noted(first_progress)),
             jnp.zeros((), jnp.int32),
         ),
     )
-    finished = last.outcome == FINISHED
+    finished = last_progress.outcome == FINISHED
     final = (count - 1) // length
     index = jnp.arange(finished.shape[0])  # not argmax, which a fused kernel cannot hold
-    other = jnp.min(jnp.where(finished, index, finished.shape[0] - 1))
+    finished_body = jnp.min(jnp.where(finished, index, finished.shape[0] - 1))
 
     def sound(note):
         # Where a body failed the rates may be NaN, and zero cotangents times NaN would reach
         # coefficients shared with bodies that finished: the state of one of these in its place.
-        return jax.tree.map(lambda x: jnp.where(finished, x, x[..., other][..., None]), note)
+        return jax.tree.map(
+            lambda x: jnp.where(finished, x, x[..., finished_body][..., None]), note
+        )
 
     def segment(carry):
-        number, notes, *some = carry
+        number, notes, *cotangent_carry = carry
         turns = jnp.minimum(length, count - number * length)
 
         def note_one(i, carry):
@@ -240,21 +249,23 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
             return progress, notes
 
         # the final segment has just been recorded
-        missing = jnp.where(number == final, 0, turns)
+        unrecorded_turns = jnp.where(number == final, 0, turns)
         begin_at = restored(entry(checkpoints, number))
-        _, notes = jax.lax.fori_loop(0, missing, note_one, (begin_at, notes))
+        _, notes = jax.lax.fori_loop(0, unrecorded_turns, note_one, (begin_at, notes))
 
-        def back(i, some):
+        def back(i, cotangent_carry):
             note = sound(entry(notes, turns - 1 - i))
-            return _step_back(motion, floats, start, times, cotangents, finished, note, *some)
+            return _step_back(
+                motion, floats, start, times, cotangents, finished, note, *cotangent_carry
+            )
 
-        return number - 1, notes, *jax.lax.fori_loop(0, turns, back, tuple(some))
+        return number - 1, notes, *jax.lax.fori_loop(0, turns, back, tuple(cotangent_carry))
 
     place = jnp.full(start.shape, times.shape[0] - 1, jnp.int32)
-    begun = final, notes, sound(noted(last)), jnp.zeros_like(y), sums, place
-    *_, cotangent, sums, _ = jax.lax.while_loop(lambda c: c[0] >= 0, segment, begun)
-    some = any_of(jnp.where(finished, 1.0, 0.0))
-    return jnp.where(finished[None], cotangent, 0), [jnp.where(some, x, 0) for x in sums]
+    initial_carry = final, notes, sound(noted(last_progress)), jnp.zeros_like(y), sums, place
+    *_, cotangent, sums, _ = jax.lax.while_loop(lambda c: c[0] >= 0, segment, initial_carry)
+    any_finished = any_of(jnp.where(finished, 1.0, 0.0))
+    return jnp.where(finished[None], cotangent, 0), [jnp.where(any_finished, x, 0) for x in sums]
 
 
 def _packed(motion: Motion, levels: Array) -> Array:
@@ -285,29 +296,33 @@ def _step_back(
     live = finished & ((h != 0) | jnp.any(note.levels != after.levels, axis=0))
     h = jnp.where(live, h, 0)
 
-    def of(some, levels, t, y):
+    def rates_of(parameters, levels, t, y):
         coefficients = list(motion.coefficients)
-        for k, x in zip(floats, some):
+        for k, x in zip(floats, parameters):
             coefficients[k] = x
         return motion.rates(coefficients, levels, t, y)
 
     values = [motion.coefficients[k] for k in floats]
     if motion.jumps:
-        pulled, more = _jump_back(of, values, motion, note, after, t + h, cotangent, live)
-        cotangent, sums = cotangent + pulled, [a + b for a, b in zip(sums, more)]
+        pulled, parameter_cotangents = _jump_back(
+            rates_of, values, motion, note, after, t + h, cotangent, live
+        )
+        cotangent, sums = cotangent + pulled, [a + b for a, b in zip(sums, parameter_cotangents)]
 
-    def met(place):
-        due = jnp.abs(column(times, place) - start)
-        return live & (place >= 0) & (h != 0) & ((due > note.elapsed) | (note.elapsed == 0))
+    def has_sample(place):
+        sample_time = jnp.abs(column(times, place) - start)
+        return live & (place >= 0) & (h != 0) & ((sample_time > note.elapsed) | (note.elapsed == 0))
 
     rule, dtype = motion.rule, cotangent.dtype
     table, nodes = jnp.asarray(rule.weights, dtype), jnp.asarray(rule.nodes, dtype)
-    top = jnp.where(any_of(jnp.where(met(place), 1.0, 0.0)), rule.dense_stages, rule.stages - 1)
+    top = jnp.where(
+        any_of(jnp.where(has_sample(place), 1.0, 0.0)), rule.dense_stages, rule.stages - 1
+    )
 
-    def stage(i, found):
-        rates, states = found
+    def stage(i, carry):
+        rates, states = carry
         y = note.y + h[None] * weighted(table[i], rates)
-        rate, *_ = of(values, levels, t + nodes[i] * h, y)
+        rate, *_ = rates_of(values, levels, t + nodes[i] * h, y)
         put_in = jax.lax.dynamic_update_index_in_dim
         return put_in(rates, rate, i, 0), put_in(states, y, i, 0)
 
@@ -316,34 +331,42 @@ def _step_back(
 
     def sample(carry):
         place, cotangent, bars = carry
-        here = met(place)
+        in_step = has_sample(place)
         x = jnp.abs(column(times, place) - start) - note.elapsed
         x = jnp.minimum(x / jnp.where(h != 0, jnp.abs(h), 1), 1)
         _, pull = jax.vjp(lambda y, k: dense_state(y, dense_of(h, k, rule), x), note.y, buffers)
-        some, more = pull(jnp.where(here[None], column(cotangents, place), 0))
-        return place - jnp.where(here, 1, 0).astype(place.dtype), cotangent + some, bars + more
+        y_cotangent, stage_cotangents = pull(jnp.where(in_step[None], column(cotangents, place), 0))
+        return (
+            place - jnp.where(in_step, 1, 0).astype(place.dtype),
+            cotangent + y_cotangent,
+            bars + stage_cotangents,
+        )
 
     bars = h[None, None] * cotangent[None] * table[rule.stages - 1][:, None, None]
-    passed = jnp.where(finished[None], cotangent, 0)
+    initial_cotangent = jnp.where(finished[None], cotangent, 0)
     place, cotangent, bars = jax.lax.while_loop(
-        lambda c: any_of(jnp.where(met(c[0]), 1.0, 0.0)), sample, (place, passed, bars)
+        lambda c: any_of(jnp.where(has_sample(c[0]), 1.0, 0.0)),
+        sample,
+        (place, initial_cotangent, bars),
     )
 
-    def back(j, found):
-        bars, cotangent, sums = found
+    def back(j, carry):
+        bars, cotangent, sums = carry
         i = top - 1 - j
         y = jax.lax.dynamic_index_in_dim(states, i, 0, False)
         bar = jax.lax.dynamic_index_in_dim(bars, i, 0, False)
-        _, pull = jax.vjp(lambda some, y: of(some, levels, t + nodes[i] * h, y)[0], values, y)
-        more, change = pull(bar)
+        _, pull = jax.vjp(
+            lambda parameters, y: rates_of(parameters, levels, t + nodes[i] * h, y)[0], values, y
+        )
+        parameter_cotangents, change = pull(bar)
         bars = bars + (h[None] * change)[None] * table[i][:, None, None]
-        return bars, cotangent + change, [a + b for a, b in zip(sums, more)]
+        return bars, cotangent + change, [a + b for a, b in zip(sums, parameter_cotangents)]
 
     _, cotangent, sums = jax.lax.fori_loop(0, top, back, (bars, cotangent, sums))
     return note, cotangent, sums, place
 
 
-def _jump_back(of, values, motion, note: _Note, after: _Note, t, cotangent, live):
+def _jump_back(rates_of, values, motion, note: _Note, after: _Note, t, cotangent, live):
     """Contribution of the time of a switch that turned, to the cotangents of the state and of
     ``values`` (the saltation term)."""
     flips = (note.levels != after.levels) & live[None]
@@ -352,15 +375,21 @@ def _jump_back(of, values, motion, note: _Note, after: _Note, t, cotangent, live
     flips = flips & field[:, None]
     share = jnp.where(flips, 1, 0).astype(cotangent.dtype)
     share = share / jnp.maximum(jnp.sum(share, axis=0, keepdims=True), 1)
-    before, *_ = of(values, note.levels, t, after.y)
-    later, *_ = of(values, after.levels, t, after.y)
+    rates_before, *_ = rates_of(values, note.levels, t, after.y)
+    rates_after, *_ = rates_of(values, after.levels, t, after.y)
 
-    def margin(some, t, y):
-        return jnp.sum(jnp.where(flips, share * of(some, note.levels, t, y)[1], 0), axis=0)
+    def margin(parameters, t, y):
+        return jnp.sum(
+            jnp.where(flips, share * rates_of(parameters, note.levels, t, y)[1], 0), axis=0
+        )
 
-    _, rate = jax.jvp(lambda t, y: margin(values, t, y), (t, after.y), (jnp.ones_like(t), before))
-    some = jnp.any(flips, axis=0) & (rate != 0)
-    weight = jnp.sum(cotangent * (later - before), axis=0) / jnp.where(some, rate, 1)
-    _, pull = jax.vjp(lambda some, y: margin(some, t, y), values, after.y)
-    more, change = pull(jnp.where(some, weight, 0))
-    return change, more
+    _, rate = jax.jvp(
+        lambda t, y: margin(values, t, y), (t, after.y), (jnp.ones_like(t), rates_before)
+    )
+    crosses_surface = jnp.any(flips, axis=0) & (rate != 0)
+    weight = jnp.sum(cotangent * (rates_after - rates_before), axis=0) / jnp.where(
+        crosses_surface, rate, 1
+    )
+    _, pull = jax.vjp(lambda parameters, y: margin(parameters, t, y), values, after.y)
+    parameter_cotangents, change = pull(jnp.where(crosses_surface, weight, 0))
+    return change, parameter_cotangents

@@ -84,7 +84,7 @@ class AbstractIntegration(AbstractMethod):
         """Description of the steps for a scene, for ``ph.explain``."""
         if not self._is_automatic:
             return f"steps of {type(self.solver).__name__}"
-        few, switches, hidden = self._are_few(scene, state), 0, ()
+        few, switches, hidden_operations = self._are_few(scene, state), 0, ()
         if few or may_jump(scene):
             program: list[Problem] = []
 
@@ -93,21 +93,22 @@ class AbstractIntegration(AbstractMethod):
 
             eqx.filter_eval_shape(trace, scene, state, ts)
             (problem,) = program
-            switches, hidden = problem.switches.count, problem.switches.hidden
-            if problem.passed:
+            switches, hidden_operations = problem.switches.count, problem.switches.hidden_operations
+            if problem.passed_switches:
                 return (
-                    f"explicit Runge-Kutta steps of order 5 that pass {problem.passed} switches"
-                    " (clip, where, ...): gradients are wrong by about sqrt(rtol), more at jumps"
+                    f"explicit Runge-Kutta steps of order 5 that pass {problem.passed_switches}"
+                    " switches (clip, where, ...): gradients are wrong by about sqrt(rtol), more at"
+                    " jumps"
                 )
-        if hidden:
+        if hidden_operations:
             return (
                 "extrapolated midpoint rule, searched for jumps: the torque contains"
-                f" {', '.join(hidden)}, in which kinks cannot be located"
+                f" {', '.join(hidden_operations)}, in which kinks cannot be located"
             )
         if few or switches:
-            ends = f", each ending where one of {switches} switches (clip, where, ...) turns"
+            ending = f", each ending where one of {switches} switches (clip, where, ...) turns"
             order = 5 if self._automatic.rule(switches) is TSIT5 else 8
-            return f"explicit Runge-Kutta steps of order {order}" + (ends if switches else "")
+            return f"explicit Runge-Kutta steps of order {order}" + (ending if switches else "")
         return "extrapolated midpoint rule"
 
     @property
@@ -148,7 +149,7 @@ class AbstractIntegration(AbstractMethod):
             size = self.chunk or self._bodies_at_once(scene, state, ts, record)
         lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
 
-        def one(chunk):
+        def solve_chunk(chunk):
             lanes, times = chunk.value()
             scene, state = eqx.combine(lanes, shared)
             times = ts if times is None else times[0]
@@ -156,12 +157,14 @@ class AbstractIntegration(AbstractMethod):
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
         if n <= min(size, _policy.SORTED_BODIES):
-            whole = kernel(one, of_units=True) if n <= _policy.KERNEL_BODIES else one
-            return whole(Distinct((lanes, times)))
+            solve_all = (
+                kernel(solve_chunk, of_units=True) if n <= _policy.KERNEL_BODIES else solve_chunk
+            )
+            return solve_all(Distinct((lanes, times)))
         # chunks of bodies with similar rates, the fastest first: no slow body is left for the end
         order = jnp.argsort(-natural_rates(scene, state, ts))
         sorted_lanes = jax.tree.map(lambda x: x[order], Distinct((lanes, times)))
-        results = map_chunks(one, sorted_lanes, n, size)
+        results = map_chunks(solve_chunk, sorted_lanes, n, size)
         return jax.tree.map(lambda x: x[jnp.argsort(order)], results)
 
     def _initial_state(self, scene, state, ts, record: Record):
@@ -195,7 +198,7 @@ class AbstractIntegration(AbstractMethod):
         it."""
         lanes, shared = eqx.partition((scene, state), is_lane_tree((scene, state)))
 
-        def one(chunk):
+        def solve_chunk(chunk):
             lanes, times = chunk.value()
             scene, state = eqx.combine(lanes, shared)
             times = ts if times is None else times
@@ -203,12 +206,12 @@ class AbstractIntegration(AbstractMethod):
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
         if n <= _policy.KERNEL_BODIES:
-            return map_chunks(kernel(one, of_units=True), Distinct((lanes, times)), n, n)
+            return map_chunks(kernel(solve_chunk, of_units=True), Distinct((lanes, times)), n, n)
         size = self.chunk or self._lanes_of_loop(scene, state, ts, record, search)
         # bodies of a chunk wait for one another: similar rates in each
         order = jnp.argsort(-natural_rates(scene, state, ts))
         sorted_lanes = jax.tree.map(lambda x: x[order], Distinct((lanes, times)))
-        results = map_chunks(one, sorted_lanes, n, size)
+        results = map_chunks(solve_chunk, sorted_lanes, n, size)
         return jax.tree.map(lambda x: x[jnp.argsort(order)], results)
 
     def _lanes_of_loop(self, scene, state, ts, record: Record, search) -> int:
@@ -216,7 +219,7 @@ class AbstractIntegration(AbstractMethod):
         satellites 64 at once take 3 times as long); where the field does not fit into one, as a
         network with its matrix products, as many as pay for the calls."""
         problem = self._problem(scene, state, ts, record, search)
-        fits = is_holdable(problem.closed.jaxpr)
+        fits = is_holdable(problem.closed_jaxpr.jaxpr)
         return _policy.KERNEL_BODIES if fits else _policy.LANES
 
     def search(
@@ -245,8 +248,8 @@ class AbstractIntegration(AbstractMethod):
         explicit steps do not do."""
         acts = scene.torque is not None or bool(scene.dynamics.coupled)
         few = 0 < state.wxyz.shape[0] <= _policy.EXPLICIT_BODIES
-        plain = isinstance(self.solver, Automatic) and not self.solver.compensated
-        return acts and few and plain
+        is_uncompensated = isinstance(self.solver, Automatic) and not self.solver.compensated
+        return acts and few and is_uncompensated
 
     def _suits_loop(self, scene, state, ts, record: Record, jumps: bool) -> tuple[bool, bool]:
         """Whether the loop of explicit steps is faster, or the only one that ends at switches; and
@@ -258,7 +261,7 @@ class AbstractIntegration(AbstractMethod):
         if not jumps or not state.wxyz.shape[0]:
             return False, jumps
         switches = self._problem(scene, state, ts, record).switches
-        return switches.count > 0, bool(switches.hidden)
+        return switches.count > 0, bool(switches.hidden_operations)
 
     def _problem(self, scene, state, ts, record: Record, search: Search | None = None) -> Problem:
         """The equations of one body as a program, with the functions of the events."""
@@ -289,7 +292,7 @@ class AbstractIntegration(AbstractMethod):
         y0, sound = self._initial_state(scene, state, ts, record)
         term, dynamics = self._equations(scene, state, ts, record)
         problem = self._problem(scene, state, ts, record, search)
-        if problem.switches.hidden:
+        if problem.switches.hidden_operations:
             return None
         leaves, tree = jax.tree.flatten(y0)
         rtol, bodies = jax.lax.stop_gradient(rtol), leaves[0].shape[0]
@@ -313,46 +316,46 @@ class AbstractIntegration(AbstractMethod):
             )
 
         constants = jax.lax.stop_gradient((problem.arrays, unit_data, start, times, y))
-        solved = solve(partial(make, searched=searched), *constants)
-        states = solved.samples.reshape(bodies, -1, len(leaves))[:, :-1]
+        loop_result = solve(partial(make, searched=searched), *constants)
+        states = loop_result.samples.reshape(bodies, -1, len(leaves))[:, :-1]
         events = None
         if search is not None:
-            events, times, states = with_events(search, solved, times, states)
+            events, times, states = with_events(search, loop_result, times, states)
         # backward along the exact equations errors of a damped motion grow; along its steps they
         # do not
         damped = scene.torque is not None or bool(scene.dynamics.coupled)
         recorded = problem.switches.count or not self._automatic.located
         if recorded or times.ndim > 1 or damped:
-            given = problem.arrays, unit_data, y, start, times, states
-            states = samples(make, *given, once=problem.passed > 0)
+            operands = problem.arrays, unit_data, y, start, times, states
+            states = samples(make, *operands, once=problem.passed_switches > 0)
         else:
             equations, c = equations_of(term, dynamics, y0, start, rtol, False)
             path = [jnp.moveaxis(states[..., i], 0, 1) for i in range(len(leaves))]
             path = path_of(equations, 1, c, leaves, start, times, path)
             states = jnp.stack([jnp.moveaxis(x, 0, 1) for x in path], axis=-1)
-        saved = jax.tree.unflatten(tree, [states[..., i].T for i in range(len(leaves))])
-        last = jax.tree.map(lambda x: x[-1:], saved)
-        status = jnp.array(_OF_LOOP)[solved.outcome]
-        solution = Solution(saved, last, solved.steps, status, solved.error)
+        sample_states = jax.tree.unflatten(tree, [states[..., i].T for i in range(len(leaves))])
+        end_state = jax.tree.map(lambda x: x[-1:], sample_states)
+        status = jnp.array(_OF_LOOP)[loop_result.outcome]
+        solution = Solution(sample_states, end_state, loop_result.steps, status, loop_result.error)
         return self._samples(scene, solution, times, sound, record), events
 
     def _solve(self, scene, state, ts, rtol, record: Record, jumps: bool) -> Samples:
         """One chunk of bodies by ``diffrax.diffeqsolve``, between the edges of pulses."""
         y0, sound = self._initial_state(scene, state, ts, record)
-        saved = ts[-1:] if record.final_only else ts
+        save_times = ts[-1:] if record.final_only else ts
         edges = None if scene.torque is None else scene.torque.edges
         if edges is None:
             solution = self._solve_smooth(scene, state, y0, ts, rtol, record, jumps)
-            return self._samples(scene, solution, saved, sound, record)
+            return self._samples(scene, solution, save_times, sound, record)
 
         def move(middle, y, times, parts):
             torque = scene.torque.during(middle)
-            now = Scene(scene.inertia, scene.potential, torque, scene.rotors)
+            segment_scene = Scene(scene.inertia, scene.potential, torque, scene.rotors)
             share = jnp.maximum(rtol / parts, 8 * jnp.finfo(rtol.dtype).eps)
-            return self._solve_smooth(now, state, y, times, share, record, jumps)
+            return self._solve_smooth(segment_scene, state, y, times, share, record, jumps)
 
         solution = in_segments(move, y0, ts, edges, record.final_only)
-        return self._samples(scene, solution, saved, sound, record)
+        return self._samples(scene, solution, save_times, sound, record)
 
     def _solve_smooth(self, scene, state, y0, ts, rtol, record, jumps: bool) -> Solution:
         """The solution from ``y0`` through ``ts``: the one call of diffrax."""
@@ -382,25 +385,25 @@ class AbstractIntegration(AbstractMethod):
         progress = solution.solver_state
         error = progress.error if isinstance(progress, Progress) else None
         ys: Any = solution.ys
-        samples, last = ys
+        samples, end_state = ys
         steps, status = _outcome(solution, y0[0][0].shape)
-        return Solution(samples, last, steps, status, error)
+        return Solution(samples, end_state, steps, status, error)
 
     def _samples(self, scene, solution: Solution, times, sound, record: Record) -> Samples:
         """Attitudes, rates and status from a solution; ``times`` of the samples (T,) or (N, T)."""
-        samples, last = (_lanes_first(y) for y in (solution.samples, solution.last))
+        samples, end_state = (_lanes_first(y) for y in (solution.samples, solution.end_state))
         dynamics = scene.dynamics
         work, motors, spins = None, None, None
         if record.work:
             *samples, (work, *powers) = samples
-            *last, _ = last
+            *end_state, _ = end_state
             motors = _of_wheels(dynamics.wheels, powers) if powers else None
         if dynamics.coupled:
             spins = jnp.stack(samples[2], axis=-1)
         later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
         times = jnp.atleast_2d(times)
         wxyz, omega, _ = self.chart.finish(later, tuple(samples), times)
-        *_, sound_at_end = self.chart.finish(later, tuple(last), times[:, -1:])
+        *_, sound_at_end = self.chart.finish(later, tuple(end_state), times[:, -1:])
         # diffrax fills the times that were not reached with inf
         wxyz, omega = (
             jnp.where(sound[:, None, None] & jnp.isfinite(x), x, jnp.nan) for x in (wxyz, omega)
@@ -408,15 +411,15 @@ class AbstractIntegration(AbstractMethod):
         outcome = solution.status
         finite = jnp.all(jnp.isfinite(wxyz), axis=(-1, -2))
         finite = finite & jnp.all(jnp.isfinite(omega), axis=(-1, -2))
-        done = outcome == Status.SUCCESSFUL
-        status = jnp.where(done & ~finite, Status.NOT_FINITE, outcome)
-        lost = ~sound | (~sound_at_end[:, -1] & ~done)
+        is_successful = outcome == Status.SUCCESSFUL
+        status = jnp.where(is_successful & ~finite, Status.NOT_FINITE, outcome)
+        is_singular = ~sound | (~sound_at_end[:, -1] & ~is_successful)
         if self.chart.canonical:  # steps become too short where the Euler angles are singular
-            lost = lost | (outcome == Status.STEP_FAILED)
+            is_singular = is_singular | (outcome == Status.STEP_FAILED)
         return Samples(
             wxyz if record.attitude else None,
             omega if record.rates else None,
-            jnp.where(lost, Status.CHART_SINGULAR, status),
+            jnp.where(is_singular, Status.CHART_SINGULAR, status),
             solution.steps,
             work,
             solution.error,
@@ -441,7 +444,7 @@ def _of_wheels(wheels, loose: Sequence[Array]) -> Array:
     """Values of the wheels that turn freely or by a motor, as (..., m) of all; else zero."""
     values = iter(loose)
     zero = jnp.zeros_like(loose[0])
-    return jnp.stack([zero if held else next(values) for held in wheels.held], axis=-1)
+    return jnp.stack([zero if is_held else next(values) for is_held in wheels.held], axis=-1)
 
 
 def _lanes_first(y):
@@ -453,18 +456,18 @@ def _outcome(solution, shape) -> tuple[StepCounts, Array]:
     """Steps and status of every body."""
     progress = solution.solver_state
     if isinstance(progress, Progress):  # each body has steps of its own
-        counts = progress.steps, progress.refused, None, progress.at_times
+        counts = progress.steps, progress.rejections, None, progress.at_times
         counts = jax.tree.map(lambda x: x.astype(jnp.int32), counts)
         return StepCounts.of(*counts), jnp.array(_OF_MIDPOINT)[progress.reason]
     limit = solution.result == diffrax.RESULTS.max_steps_reached
     status = jnp.where(limit, Status.MAX_STEPS, Status.STEP_FAILED)
     good = solution.result == diffrax.RESULTS.successful
     status = jnp.where(good, Status.SUCCESSFUL, status)
-    accepted, refused = (
+    accepted, rejected = (
         jnp.broadcast_to(solution.stats[f"num_{name}_steps"], shape)
         for name in ("accepted", "rejected")
     )
-    return StepCounts.of(accepted, refused), jnp.broadcast_to(status, shape)
+    return StepCounts.of(accepted, rejected), jnp.broadcast_to(status, shape)
 
 
 # in the order of the outcomes of ``_loop.py``

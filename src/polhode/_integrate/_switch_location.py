@@ -35,15 +35,15 @@ _SECANTS = 24
 
 class SwitchPoint(NamedTuple):
     """First switch within a step: ``hit`` (B,), the fraction ``part`` of the step, ``state`` (D, B)
-    there, ``levels`` (K, B) to which the switches ``flips`` (K, B) turn; fractions up to ``near``
-    (B,) count as the start itself."""
+    there, ``levels`` (K, B) to which the switches ``flips`` (K, B) turn; fractions up to
+    ``start_fraction`` (B,) count as the start itself."""
 
     hit: Array
     part: Array
     state: Array
     levels: Array
     flips: Array
-    near: Array
+    start_fraction: Array
 
 
 def first_switch(
@@ -60,16 +60,16 @@ def first_switch(
     switch; 5 if the upper end is checked first, and both ends must come that near."""
     # The search has no derivatives: a loop whose body closed over tangents would carry them through
     # every iteration. `_differentiable_part` gives the place its derivatives afterwards.
-    differentiated = motion.coefficients, progress, attempt, t
-    fixed = jax.lax.stop_gradient(differentiated)
-    _, progress, attempt, t = fixed
+    traced_constants = motion.coefficients, progress, attempt, t
+    stopped_constants = jax.lax.stop_gradient(traced_constants)
+    _, progress, attempt, t = stopped_constants
     nodes = motion.rule.margin_nodes
     sampled = margin_samples(attempt.margins, motion.rule)
     places = jnp.asarray(nodes, sampled.dtype)[:, None]
     size = len(nodes)
     below = jnp.any(sampled < 0, axis=1)  # (L, B)
     order = jnp.arange(size)[:, None]
-    first = jnp.min(jnp.where(below, order, size), axis=0)
+    first_below = jnp.min(jnp.where(below, order, size), axis=0)
 
     def entry(storage, k):
         """Entry ``k`` (B,) along the first axis, as a sum, which a fused kernel can hold."""
@@ -78,17 +78,20 @@ def first_switch(
         return jnp.sum(jnp.where(pick, storage, 0), axis=0)
 
     spots = jnp.broadcast_to(places, below.shape)
-    low, high = entry(spots, first - 1), entry(spots, jnp.minimum(first, size - 1))
-    at_low, at_high = entry(sampled, first - 1), entry(sampled, jnp.minimum(first, size - 1))
+    low, high = entry(spots, first_below - 1), entry(spots, jnp.minimum(first_below, size - 1))
+    at_low, at_high = (
+        entry(sampled, first_below - 1),
+        entry(sampled, jnp.minimum(first_below, size - 1)),
+    )
     # of the minima the one that comes nearest to zero, before any negative margin
     depth = attempt.depths
-    inner = jnp.arange(1, size - 1)[:, None, None]
-    depth = jnp.where(inner < first[None, None], depth, 1)
-    least = jnp.min(depth, axis=(0, 1))
-    dips = (least <= 0.5) & accepted
-    which = (depth == least[None, None]) & dips[None, None]  # (L - 2, K, B)
-    middle = jnp.min(jnp.where(jnp.any(which, axis=1), inner[:, 0], size), axis=0)
-    owner = jnp.any(which & (inner == middle[None, None]), axis=0)  # (K, B)
+    inner_order = jnp.arange(1, size - 1)[:, None, None]
+    depth = jnp.where(inner_order < first_below[None, None], depth, 1)
+    min_depth = jnp.min(depth, axis=(0, 1))
+    dips = (min_depth <= 0.5) & accepted
+    which = (depth == min_depth[None, None]) & dips[None, None]  # (L - 2, K, B)
+    middle = jnp.min(jnp.where(jnp.any(which, axis=1), inner_order[:, 0], size), axis=0)
+    owner = jnp.any(which & (inner_order == middle[None, None]), axis=0)  # (K, B)
 
     def lowest(margins):
         return jnp.min(jnp.where(owner, margins, jnp.inf), axis=0)
@@ -96,11 +99,13 @@ def first_switch(
     triple = tuple(entry(spots, middle + k) for k in (-1, 0, 1))
     around = [entry(sampled, middle + k) for k in (-1, 0, 1)]
     values = tuple(lowest(margins) for margins in around)
-    before = jnp.maximum(around[0], 0)  # enough for the first secant, though the low end moves
+    start_margins = jnp.maximum(
+        around[0], 0
+    )  # enough for the first secant, though the low end moves
     busy = accepted & jnp.any(below, axis=0)
     # a margin after the end is that of the state itself, those between are of stages
-    sure = busy & (first == size - 1)
-    bracket = jnp.where(sure, ROOT, jnp.where(busy, FIRST, DONE))
+    is_at_end = busy & (first_below == size - 1)
+    bracket = jnp.where(is_at_end, ROOT, jnp.where(busy, FIRST, DONE))
     mode = jnp.where(dips, MINIMUM, bracket)
     end = sampled[-1]
     zero = jnp.zeros_like(attempt.h)
@@ -111,7 +116,7 @@ def first_switch(
         located = LOCATED_JUMP if motion.jumps else LOCATED_KINK
         tolerance = jnp.maximum(tolerance, located * options.rtol.astype(tolerance.dtype))
 
-    def margins_at(x, constants=fixed):
+    def margins_at(x, constants=stopped_constants):
         coefficients, progress, attempt, t = constants
         y = dense_state(progress.y, attempt.dense, x)
         _, margins, new_levels = motion.rates(coefficients, progress.levels, t + x * attempt.h, y)
@@ -132,59 +137,61 @@ def first_switch(
         x = jnp.maximum(search.low + gap * share, search.low) + room
         return jnp.minimum(x, search.high - room)
 
-    def one(search: _RootSearch) -> _RootSearch:
-        turning, unsure = search.mode == MINIMUM, search.mode == UPPER_END
-        early, closing = search.mode == FIRST, search.mode == ROOT
+    def iterate(search: _RootSearch) -> _RootSearch:
+        in_minimum, in_upper_end = search.mode == MINIMUM, search.mode == UPPER_END
+        in_first, in_root = search.mode == FIRST, search.mode == ROOT
         (xa, xb, xc), (fa, fb, fc) = search.triple, search.values
         vertex, _ = vertex_of(search.triple, search.values)
         room = 0.05 * (xc - xa)
         vertex = jnp.clip(vertex, xa + room, xc - room)
         vertex = jnp.where(jnp.abs(vertex - xb) < 0.2 * room, xb + 0.3 * room, vertex)
-        x = jnp.where(turning, vertex, jnp.where(unsure, search.high, secant(search)))
+        x = jnp.where(in_minimum, vertex, jnp.where(in_upper_end, search.high, secant(search)))
         margins, new_levels = margins_at(x)
         under = jnp.any(margins < 0, axis=0)
         f = lowest(margins)
 
         # minimum
-        left = vertex < xb
-        lower = f < fb
-        ta = jnp.where(lower, jnp.where(left, xa, xb), jnp.where(left, vertex, xa))
-        tb = jnp.where(lower, vertex, xb)
-        tc = jnp.where(lower, jnp.where(left, xb, xc), jnp.where(left, xc, vertex))
-        va = jnp.where(lower, jnp.where(left, fa, fb), jnp.where(left, f, fa))
-        vb = jnp.where(lower, f, fb)
-        vc = jnp.where(lower, jnp.where(left, fb, fc), jnp.where(left, fc, f))
+        is_left = vertex < xb
+        is_lower = f < fb
+        ta = jnp.where(is_lower, jnp.where(is_left, xa, xb), jnp.where(is_left, vertex, xa))
+        tb = jnp.where(is_lower, vertex, xb)
+        tc = jnp.where(is_lower, jnp.where(is_left, xb, xc), jnp.where(is_left, xc, vertex))
+        va = jnp.where(is_lower, jnp.where(is_left, fa, fb), jnp.where(is_left, f, fa))
+        vb = jnp.where(is_lower, f, fb)
+        vc = jnp.where(is_lower, jnp.where(is_left, fb, fc), jnp.where(is_left, fc, f))
         _, bottom = vertex_of((ta, tb, tc), (va, vb, vc))
         over = (bottom > 0.7 * vb) | (search.count > 12)
-        dipped = turning & under
-        flat = turning & ~under & over  # no switch here: go on to the bracket of a later stage
+        dipped = in_minimum & under
+        flat = in_minimum & ~under & over  # no switch here: go on to the bracket of a later stage
 
         # a negative margin of a stage may be positive on dense output
-        false = unsure & ~under
-        late = false & jnp.any(end < 0, axis=0) & (search.high < 1)
-        again = jnp.where(search.count < _TRIES, FIRST, UPPER_END)
-        mode = jnp.where(early, jnp.where(under, ROOT, again), search.mode)
-        mode = jnp.where(unsure, jnp.where(under | late, ROOT, DONE), mode)
+        is_false = in_upper_end & ~under
+        has_later_root = is_false & jnp.any(end < 0, axis=0) & (search.high < 1)
+        retry_mode = jnp.where(search.count < _TRIES, FIRST, UPPER_END)
+        mode = jnp.where(in_first, jnp.where(under, ROOT, retry_mode), search.mode)
+        mode = jnp.where(in_upper_end, jnp.where(under | has_later_root, ROOT, DONE), mode)
         mode = jnp.where(dipped, ROOT, jnp.where(flat, bracket, mode))
 
         # between low and high
-        down = (closing | early | unsure | dipped) & under
-        up = (closing | early) & ~under
+        down = (in_root | in_first | in_upper_end | dipped) & under
+        up = (in_root | in_first) & ~under
         twice = search.side == jnp.where(under, 1, -1)
-        low_ = jnp.where(dipped, xa, jnp.where(flat, low, search.low))
+        start_low = jnp.where(dipped, xa, jnp.where(flat, low, search.low))
         m_low = pick(flat, at_low, search.at_low)
-        m_low = pick(dipped, before, m_low)
-        new_low = jnp.where(up, x, jnp.where(late, search.high, low_))
-        new_high = jnp.where(down, x, jnp.where(late, 1, jnp.where(flat, high, search.high)))
-        half = jnp.where((closing | early) & twice, 0.5, 1)
-        new_at_low = pick(up | late, margins, m_low * jnp.where(down, half, 1)[None])
-        upper = pick(late, end, pick(flat, at_high, search.at_high))
-        new_at_high = pick(down, margins, upper * jnp.where(up, half, 1)[None])
+        m_low = pick(dipped, start_margins, m_low)
+        new_low = jnp.where(up, x, jnp.where(has_later_root, search.high, start_low))
+        new_high = jnp.where(
+            down, x, jnp.where(has_later_root, 1, jnp.where(flat, high, search.high))
+        )
+        half = jnp.where((in_root | in_first) & twice, 0.5, 1)
+        new_at_low = pick(up | has_later_root, margins, m_low * jnp.where(down, half, 1)[None])
+        high_margins = pick(has_later_root, end, pick(flat, at_high, search.at_high))
+        new_at_high = pick(down, margins, high_margins * jnp.where(up, half, 1)[None])
         left_over = (new_high - new_low) * (1 - root_share(new_at_low, new_at_high))
-        tight = (mode == ROOT) & (left_over <= tolerance) & (down | (closing & up))
+        tight = (mode == ROOT) & (left_over <= tolerance) & (down | (in_root & up))
         stop = tight | (search.count >= _EVALUATIONS)
         hit = search.hit | ((mode == ROOT) & stop)
-        begins = dipped | flat
+        starts_bracket = dipped | flat
         return _RootSearch(
             jnp.where(stop, DONE, mode),
             new_low,
@@ -192,14 +199,18 @@ def first_switch(
             new_at_low,
             new_at_high,
             pick(down, new_levels, search.new_levels) if motion.jumps else None,
-            jnp.where(closing | early, jnp.where(under, 1, -1), jnp.where(begins, 0, search.side)),
+            jnp.where(
+                in_root | in_first,
+                jnp.where(under, 1, -1),
+                jnp.where(starts_bracket, 0, search.side),
+            ),
             (ta, tb, tc),
             (va, vb, vc),
-            jnp.where(begins, 0, search.count + 1),
+            jnp.where(starts_bracket, 0, search.count + 1),
             hit,
         )
 
-    none = jnp.zeros(zero.shape, jnp.int32)
+    zero_counts = jnp.zeros(zero.shape, jnp.int32)
     search = _RootSearch(
         mode,
         low,
@@ -207,26 +218,26 @@ def first_switch(
         at_low,
         at_high,
         progress.levels if motion.jumps else None,
-        none,
+        zero_counts,
         triple,
         values,
-        none,
+        zero_counts,
         jnp.zeros_like(accepted),
     )
-    search = jax.lax.while_loop(lambda c: any_of(jnp.where(c.mode > 0, 1.0, 0.0)), one, search)
+    search = jax.lax.while_loop(lambda c: any_of(jnp.where(c.mode > 0, 1.0, 0.0)), iterate, search)
     # halved margins keep their signs
     flips = search.at_high < 0
     part = search.high
-    _, progress, attempt, _ = differentiated
+    _, progress, attempt, _ = traced_constants
     if options.differentiable:
-        margins = partial(margins_at, constants=differentiated)
+        margins = partial(margins_at, constants=traced_constants)
         part = _differentiable_part(search.hit, flips, part, margins)
     state = dense_state(progress.y, attempt.dense, part)
-    lost = search.hit & ~jnp.any(flips, axis=0)
-    near = jnp.maximum(1e-3, 4 * tolerance)
+    is_lost = search.hit & ~jnp.any(flips, axis=0)
+    start_fraction = jnp.maximum(1e-3, 4 * tolerance)
     # kinks and events have the levels 0 and 1
     levels = 1 - progress.levels if search.new_levels is None else search.new_levels
-    return SwitchPoint(search.hit & ~lost, part, state, levels, flips, near)
+    return SwitchPoint(search.hit & ~is_lost, part, state, levels, flips, start_fraction)
 
 
 DONE, ROOT, UPPER_END, MINIMUM, FIRST = range(5)
@@ -256,7 +267,7 @@ class _RootSearch(NamedTuple):
 def _differentiable_part(hit: Array, flips: Array, part: Array, margins_at) -> Array:
     """The place of a switch with first and second derivatives: two steps of Newton's rule with one
     derivative for both."""
-    still = jax.lax.stop_gradient
+    stop_gradient = jax.lax.stop_gradient
     share = jnp.where(flips, 1, 0).astype(part.dtype)
     share = share / jnp.maximum(jnp.sum(share, axis=0, keepdims=True), 1)
 
@@ -264,10 +275,10 @@ def _differentiable_part(hit: Array, flips: Array, part: Array, margins_at) -> A
         return jnp.sum(jnp.where(flips, share * margins_at(x)[0], 0), axis=0)
 
     _, slope = jax.jvp(value, (part,), (jnp.ones_like(part),))
-    slope = still(jnp.where(hit & (slope != 0), slope, 1))
+    slope = stop_gradient(jnp.where(hit & (slope != 0), slope, 1))
     for _ in range(2):
         change = jnp.where(hit, -value(part) / slope, 0)
-        part = part + (change - still(change))
+        part = part + (change - stop_gradient(change))
     return part
 
 
@@ -278,16 +289,16 @@ def pick(where: Array, a: Array, b: Array) -> Array:
 
 class Undefined(NamedTuple):
     """Steps during which the field is undefined on the side that is assumed, as that of ``where(x >
-    0, sqrt(x), 0)`` with ``x > 0`` held: ``any`` (B,); ``flips`` (K, B): switches that were passed;
-    ``snaps`` (B,): whether the start is so near that they turn there."""
+    0, sqrt(x), 0)`` with ``x > 0`` held: ``is_undefined`` (B,); ``flips`` (K, B): switches that
+    were passed; ``snaps`` (B,): whether the start is so near that they turn there."""
 
-    any: Array
+    is_undefined: Array
     flips: Array
     snaps: Array
 
 
 def undefined_side(
-    attempt: Attempt, ratio: Array, alive: Array, rule: Tableau
+    attempt: Attempt, ratio: Array, is_running: Array, rule: Tableau
 ) -> tuple[Undefined, Array]:
     """Such steps, and the fraction of each up to the first switch."""
     margins, nodes = attempt.margins[: rule.stages], rule.nodes[: rule.stages]
@@ -295,10 +306,10 @@ def undefined_side(
     order = jnp.arange(rule.stages)[:, None]
     stage = jnp.min(jnp.where(jnp.any(below, axis=1), order, rule.stages), axis=0)
     pick = order == stage[None]
-    there = jnp.sum(jnp.where(pick[:, None], jnp.where(below, margins, 0), 0), axis=0)
+    stage_margins = jnp.sum(jnp.where(pick[:, None], jnp.where(below, margins, 0), 0), axis=0)
     node = jnp.sum(jnp.where(pick, jnp.asarray(nodes, ratio.dtype)[:, None], 0), axis=0)
     begin = jnp.maximum(margins[0], 0)
-    flips = there < 0
-    share = jnp.min(jnp.where(flips, begin / jnp.where(flips, begin - there, 1), 1), axis=0)
-    undefined = alive & ~jnp.isfinite(ratio) & jnp.any(flips, axis=0)
-    return Undefined(undefined, flips, undefined), jax.lax.stop_gradient(node * share)
+    flips = stage_margins < 0
+    share = jnp.min(jnp.where(flips, begin / jnp.where(flips, begin - stage_margins, 1), 1), axis=0)
+    is_undefined = is_running & ~jnp.isfinite(ratio) & jnp.any(flips, axis=0)
+    return Undefined(is_undefined, flips, is_undefined), jax.lax.stop_gradient(node * share)

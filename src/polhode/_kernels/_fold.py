@@ -122,16 +122,17 @@ class _Slot(NamedTuple):
 
 
 class Specialised(NamedTuple):
-    """``held``: arrays computed before the loop; ``run(held, *state_leaves)`` does the rest.
+    """``coefficients``: arrays computed before the loop; ``run(coefficients, *state_leaves)``: the
+    results.
 
-    ``seen``: the shapes to which the loop broadcasts each; where that is one only, an array of
+    ``shapes``: the shapes to which the loop broadcasts each; where that is one only, an array of
     this shape may stand in its place. ``by_entry``: whether every operation treats the entries of
     the state's arrays separately, so that ``run`` takes any number of them.
     """
 
-    held: tuple[Any, ...]
+    coefficients: tuple[Any, ...]
     run: Callable[..., list[Any]]
-    seen: tuple[frozenset[tuple[int, ...]], ...]
+    shapes: tuple[frozenset[tuple[int, ...]], ...]
     by_entry: bool
 
 
@@ -139,69 +140,78 @@ class _Step(NamedTuple):
     """An operation of the loop; ``operands``: where it finds each, its aval, to what shape;
     ``by_entry``: whether entries of its arrays have nothing to do with one another."""
 
-    made: list[int]
+    outputs: list[int]
     bind: Any
     by_entry: bool
     operands: list[tuple[Any, Any, tuple[int, ...]]]
 
 
 def specialise(
-    closed: ClosedJaxpr, known: Sequence[Any], *, fold: bool = True, stage: bool = True
+    closed_jaxpr: ClosedJaxpr, arguments: Sequence[Any], *, fold: bool = True, stage: bool = True
 ) -> Specialised:
-    """Compute the part of ``closed`` that depends on its first arguments, ``known``, alone.
+    """Compute the part of ``closed_jaxpr`` that depends on its first ``arguments`` alone.
 
     Without ``fold`` these arguments are only sliced and reshaped, without arithmetic. Without
     ``stage`` no values are staged: for a program that will be specialised again.
     """
     if _policy.is_plain():
-        shapes = tuple(frozenset([jnp.shape(x)]) for x in known)
+        shapes = tuple(frozenset([jnp.shape(x)]) for x in arguments)
         return Specialised(
-            tuple(known), lambda held, *state: jaxpr_as_fun(closed)(*held, *state), shapes, False
+            tuple(arguments),
+            lambda coefficients, *state: jaxpr_as_fun(closed_jaxpr)(*coefficients, *state),
+            shapes,
+            False,
         )
     # ``instantiate=True`` keeps operands that go unused: the first ones are counted by place.
-    jaxpr, _ = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals), True)
+    jaxpr, _ = partial_eval.dce_jaxpr(
+        closed_jaxpr.jaxpr, [True] * len(closed_jaxpr.out_avals), True
+    )
     work = _Work(fold and _policy.is_folded())
-    known = [_Held(x) for x in known]
-    free = [work.slot(v.aval) for v in jaxpr.invars[len(known) :]]
-    results = work.walk(jaxpr, closed.consts, [*known, *free])
+    arguments = [_Held(x) for x in arguments]
+    slots = [work.slot(v.aval) for v in jaxpr.invars[len(arguments) :]]
+    results = work.walk(jaxpr, closed_jaxpr.consts, [*arguments, *slots])
     avals: list[Any] = [v.aval for v in jaxpr.outvars]
     out = [(work.operand(x), aval, aval.shape) for x, aval in zip(results, avals)]
     steps = _steps_of_results(work.steps, out)
-    held: dict[int, Any] = {}
-    seen: dict[int, set[tuple[int, ...]]] = {}
+    coefficients: dict[int, Any] = {}
+    shapes_of: dict[int, set[tuple[int, ...]]] = {}
     for x, _, shape in (*(o for step in steps for o in step.operands), *out):
         if isinstance(x, _Held) and x.number is None:
-            held[x.key] = x.value
-            seen.setdefault(x.key, set()).add(tuple(shape))
-    places = {key: place for place, key in enumerate(held)}
+            coefficients[x.key] = x.value
+            shapes_of.setdefault(x.key, set()).add(tuple(shape))
+    places = {key: place for place, key in enumerate(coefficients)}
     # Where every operation treats entries separately, and every array is a number or of the shape
     # of the state, the program is traced for one shape and run for any.
-    lane = free[-1].aval.shape
+    lane = slots[-1].aval.shape
     by_entry = all(step.by_entry for step in steps)
     for _, aval, _ in (*(o for step in steps for o in step.operands), *out):
         by_entry = by_entry and aval.shape == lane
-    by_entry = by_entry and all(np.shape(x) in ((), lane) for x in held.values())
+    by_entry = by_entry and all(np.shape(x) in ((), lane) for x in coefficients.values())
     shared = _shared(steps, out) if stage and _policy.is_staged() else frozenset()
 
-    def run(held, *state):
+    def run(coefficients, *state):
         values = dict(enumerate(state))
 
         def read(operand):
             x, aval, _ = operand
             if not isinstance(x, _Held):
                 return values[x]
-            value = held[places[x.key]] if x.number is None else x.number
+            value = coefficients[places[x.key]] if x.number is None else x.number
             shape = jnp.shape(state[-1]) if by_entry else aval.shape
             shape = np.broadcast_shapes(np.shape(value), shape)
             return jnp.broadcast_to(jnp.asarray(value, aval.dtype), shape)
 
         for step in steps:
             results = step.bind(*(read(o) for o in step.operands))
-            for i, x in zip(step.made, results if isinstance(results, list | tuple) else [results]):
+            for i, x in zip(
+                step.outputs, results if isinstance(results, list | tuple) else [results]
+            ):
                 values[i] = staged(x, opaque_ones(x)) if i in shared else x
         return [read(o) for o in out]
 
-    return Specialised(tuple(held.values()), run, tuple(map(frozenset, seen.values())), by_entry)
+    return Specialised(
+        tuple(coefficients.values()), run, tuple(map(frozenset, shapes_of.values())), by_entry
+    )
 
 
 def _steps_of_results(steps: list[_Step], out) -> tuple[_Step, ...]:
@@ -209,7 +219,7 @@ def _steps_of_results(steps: list[_Step], out) -> tuple[_Step, ...]:
     values = {x for x, *_ in out if not isinstance(x, _Held)}
     needed_steps = []
     for step in reversed(steps):
-        if values.intersection(step.made):
+        if values.intersection(step.outputs):
             needed_steps.append(step)
             values.update(x for x, *_ in step.operands if not isinstance(x, _Held))
     return tuple(reversed(needed_steps))
@@ -220,28 +230,30 @@ def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
     # XLA fuses per result: a value is repeated for each result that it leads to, not for each of
     # its users. So both are counted, and the work that staging would save is the number of
     # operations between a value and the nearest staged ones before it (``behind``).
-    makers = {i: k for k, step in enumerate(steps) for i in step.made}
+    makers = {i: k for k, step in enumerate(steps) for i in step.outputs}
 
     def of(operands):
         return {i for i, *_ in operands if not isinstance(i, _Held) and i in makers}
 
     users = dict.fromkeys(makers, 0)
-    ends: dict[int, set[int]] = {i: set() for i in makers}  # the results that rest on it
+    dependent_results: dict[int, set[int]] = {
+        i: set() for i in makers
+    }  # the results that rest on it
     for k, operand in enumerate(out):
         for i in of([operand]):
             users[i] += 1
-            ends[i].add(k)
+            dependent_results[i].add(k)
     for step in reversed(steps):
         for i in of(step.operands):
             users[i] += 1
-            ends[i].update(*(ends[made] for made in step.made))
+            dependent_results[i].update(*(dependent_results[made] for made in step.outputs))
     shared: set[int] = set()
     behind: dict[int, set[int]] = {}  # the operations that a fused loop repeats for it
     for k, step in enumerate(steps):
         work = {k}.union(*(behind[i] for i in of(step.operands) - shared))
-        for i in step.made:
+        for i in step.outputs:
             behind[i] = work
-            if min(users[i], len(ends[i])) > 1 and len(work) >= _policy.STAGE_WORK:
+            if min(users[i], len(dependent_results[i])) > 1 and len(work) >= _policy.STAGE_WORK:
                 shared.add(i)
     return frozenset(shared)
 
@@ -254,8 +266,8 @@ class _Work:
         self.steps: list[_Step] = []
         self.count = 0
         self.scaled: dict[Any, int] = {}
-        self.met: dict[Any, list[Any]] = {}  # results of operations, by what they are made of
-        self.alive: list[Any] = []  # whose ids are keys above
+        self.results: dict[Any, list[Any]] = {}  # results of operations, by what they are made of
+        self.referenced: list[Any] = []  # whose ids are keys above
 
     def slot(self, aval) -> _Slot:
         self.count += 1
@@ -269,14 +281,14 @@ class _Work:
         """
         if key is None:
             return make()
-        # Arrays are compared by identity, as their numbers may be traced. ``alive`` keeps them: the
-        # id of an object that was deleted may be used again.
+        # Arrays are compared by identity, as their numbers may be traced. ``referenced`` keeps a
+        # reference to each, because the id of a deleted object may be used again.
         names = (_key_of(x) if isinstance(x, _Held) else x for x in inputs)
         key = key, *names, *((aval.shape, aval.dtype) for aval in outs)
-        if key not in self.met:
-            self.alive += [x.value for x in inputs if isinstance(x, _Held)]
-            self.met[key] = make()
-        return self.met[key]
+        if key not in self.results:
+            self.referenced += [x.value for x in inputs if isinstance(x, _Held)]
+            self.results[key] = make()
+        return self.results[key]
 
     def emit(self, bind, inputs, avals, outs, key, name="mul") -> list[_Slot]:
         shapes = [(outs[0] if name in _ELEMENTWISE else aval).shape for aval in avals]
@@ -292,7 +304,7 @@ class _Work:
     def operand(self, x) -> Any:
         """A value known before the loop, or the number of one that the loop has made."""
         if isinstance(x, _Held):
-            self.alive.append(x.value)
+            self.referenced.append(x.value)
             return x
         index = self.unsigned(x)
         if x.sign > 0:
@@ -308,11 +320,11 @@ class _Work:
             return x.index
         key = (x.index, x.scale.key)
         if key not in self.scaled:
-            self.alive.append(x.scale.value)
+            self.referenced.append(x.scale.value)
             a, b = _Slot(x.index, x.aval), x.scale
             if x.factors is not None:  # the scaled factor is likely to be met again
-                a, other = (_Slot(index, x.aval) for index in x.factors)
-                b = _Slot(self.unsigned(other._replace(scale=x.scale)), x.aval)
+                a, scaled_factor = (_Slot(index, x.aval) for index in x.factors)
+                b = _Slot(self.unsigned(scaled_factor._replace(scale=x.scale)), x.aval)
             self.scaled[key] = self.emit(lax.mul, [a, b], [x.aval] * 2, [x.aval], "mul")[0].index
         return self.scaled[key]
 
@@ -340,15 +352,17 @@ class _Work:
             numbers = all(x.number is not None for x in operands)
             if self.fold or numbers or name in _TAKING_APART:
                 outs = [v.aval for v in eqn.outvars]
-                return self.once(_operation(eqn), operands, outs, lambda: self.known(eqn, operands))
+                return self.once(
+                    _operation(eqn), operands, outs, lambda: self.evaluate(eqn, operands)
+                )
         elif self.fold and len(eqn.outvars) == 1:
-            simple = self.simplified(name, operands, eqn.outvars[0].aval)
+            simple = self.simplify(name, operands, eqn.outvars[0].aval)
             if simple is not None:
                 return [simple]
         avals, outs = ([v.aval for v in vs] for vs in (eqn.invars, eqn.outvars))
         return self.emit(_binder(eqn), operands, avals, outs, _operation(eqn), name)
 
-    def known(self, eqn, operands) -> list[_Held]:
+    def evaluate(self, eqn, operands) -> list[_Held]:
         """An equation before the loop; numbers stay numbers as long as they can."""
         name, out = eqn.primitive.name, eqn.outvars[0].aval
         # Only numbers can be compared with 0 and 1, and so remove an operation: they are computed
@@ -360,11 +374,13 @@ class _Work:
             return [_Held(out.dtype.type(_FOLDS[name](*(x.number for x in operands))))]
         if single and name in _ELEMENTWISE and len(eqn.outvars) == 1:
             return [_Held(_binder(eqn)(*(jnp.asarray(x.value) for x in operands)))]
-        full = [jnp.broadcast_to(x.value, v.aval.shape) for x, v in zip(operands, eqn.invars)]
-        results = _binder(eqn)(*full)
+        operand_arrays = [
+            jnp.broadcast_to(x.value, v.aval.shape) for x, v in zip(operands, eqn.invars)
+        ]
+        results = _binder(eqn)(*operand_arrays)
         return [_Held(x) for x in (results if isinstance(results, list | tuple) else [results])]
 
-    def simplified(self, name, operands, aval) -> _Held | _Slot | None:
+    def simplify(self, name, operands, aval) -> _Held | _Slot | None:
         """An operation with a known zero or factor, simplified; None where it is not."""
         if not jnp.issubdtype(aval.dtype, jnp.inexact):
             return None
@@ -397,13 +413,13 @@ class _Work:
         if isinstance(b, _Held):
             if b.number == 0:
                 return a
-            one = _Slot(self.unsigned(a), aval)
+            unsigned_slot = _Slot(self.unsigned(a), aval)
             if a.sign > 0:
-                return self.emit(lax.add, [one, b], [aval] * 2, [aval], "add")[0]
-            return self.emit(lax.sub, [b, one], [aval] * 2, [aval], "sub")[0]
+                return self.emit(lax.add, [unsigned_slot, b], [aval] * 2, [aval], "add")[0]
+            return self.emit(lax.sub, [b, unsigned_slot], [aval] * 2, [aval], "sub")[0]
         if a.index == b.index:  # p x + q x = (p + q) x, with the sum taken before the loop
             p, q = (_Held(aval.dtype.type(1)) if x.scale is None else x.scale for x in (a, b))
-            scale = self.combined("add" if a.sign == b.sign else "sub", p, q, aval)
+            scale = self.combine("add" if a.sign == b.sign else "sub", p, q, aval)
             return self.times(_Slot(a.index, a.aval, None, a.sign), scale, aval)
         key = [None if x.scale is None else x.scale.key for x in (a, b)]
         if key[0] == key[1]:  # one multiplication for both
@@ -417,8 +433,8 @@ class _Work:
     def product(self, a: _Slot, b: _Slot, aval) -> _Held | _Slot:
         """The product of two values of the loop; a scale of either becomes one of the product."""
         # sorted, so that x y and y x are one product
-        plain = [_Slot(index, aval) for index in sorted((a.index, b.index))]
-        (result,) = self.emit(lax.mul, plain, [aval] * 2, [aval], "mul")
+        unscaled = [_Slot(index, aval) for index in sorted((a.index, b.index))]
+        (result,) = self.emit(lax.mul, unscaled, [aval] * 2, [aval], "mul")
         product: Any = result._replace(sign=a.sign * b.sign)
         for x in (a, b):
             if x.scale is not None:
@@ -428,7 +444,7 @@ class _Work:
             product = product._replace(factors=factors)
         return product
 
-    def combined(self, name: str, a: _Held, b: _Held, aval) -> _Held:
+    def combine(self, name: str, a: _Held, b: _Held, aval) -> _Held:
         """Sum, difference or product of two known values; the same one when met again."""
         if a.number is not None and b.number is not None:
             return _Held(aval.dtype.type(_FOLDS[name](a.number, b.number)))
@@ -442,7 +458,7 @@ class _Work:
     def times(self, x, factor: _Held, aval) -> _Held | _Slot:
         """``x`` times a known factor, kept as a scale and a sign as long as possible."""
         if isinstance(x, _Held):
-            return self.combined("mul", x, factor, aval)
+            return self.combine("mul", x, factor, aval)
         number = factor.number
         if number is not None:
             if number == 0:  # also of a value that is not finite: the term is absent
@@ -452,7 +468,7 @@ class _Work:
             if abs(number) == 1:
                 return x
         if x.scale is not None:
-            factor = self.combined("mul", x.scale, factor, aval)
+            factor = self.combine("mul", x.scale, factor, aval)
         return x._replace(scale=None if factor.number == 1 else factor)
 
 
