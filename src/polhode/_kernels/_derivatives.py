@@ -81,14 +81,18 @@ def _jvp(arrays, tangents, *, count, **params):
     at = [i for i, x in enumerate(tangents[:count]) if is_slope(x)]
     if at:
 
-        def of_given(*some):
-            full = list(constants)
-            for i, x in zip(at, some):
-                full[i] = x
-            return params["forward"](full, operands)
+        def of_constants(*parameters):
+            inputs = list(constants)
+            for i, x in zip(at, parameters):
+                inputs[i] = x
+            return params["forward"](inputs, operands)
 
-        _, more = jax.jvp(of_given, [constants[i] for i in at], [tangents[i] for i in at])
-        changes = [a + b for a, b in zip(changes, more)] if changes else more
+        _, constant_changes = jax.jvp(
+            of_constants, [constants[i] for i in at], [tangents[i] for i in at]
+        )
+        changes = (
+            [a + b for a, b in zip(changes, constant_changes)] if changes else constant_changes
+        )
     return out, changes
 
 
@@ -118,12 +122,14 @@ def _batch(arrays, dims, *, forward, backward, count, shapes):
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
     given_dims, operands = dims[:count], []
     for x, d in zip(arrays[count:], dims[count:]):
-        full = jnp.broadcast_to(x, (size, *x.shape)) if d is None else jnp.moveaxis(x, d, 0)
-        operands.append(full)
+        batched_operand = (
+            jnp.broadcast_to(x, (size, *x.shape)) if d is None else jnp.moveaxis(x, d, 0)
+        )
+        operands.append(batched_operand)
 
     def batched(fn):
         return lambda constants, operands: jax.vmap(
-            lambda *both: list(fn(both[: len(constants)], both[len(constants) :])),
+            lambda *leaves: list(fn(leaves[: len(constants)], leaves[len(constants) :])),
             in_axes=(*given_dims, *[0] * len(operands)),
         )(*constants, *operands)
 
@@ -151,16 +157,16 @@ def spread(values: Any, axis: int, count: int) -> Any:
     the sum of a large array by a library call, which it cannot.
     """
     leaves, tree = jax.tree.flatten(values)
-    moving = {k: x for k, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.inexact)}
+    floats = {k: x for k, x in enumerate(leaves) if jnp.issubdtype(x.dtype, jnp.inexact)}
 
-    def repeated(x):
+    def repeat(x):
         x = jnp.expand_dims(x, axis)
         return jnp.broadcast_to(
             x, [count if k == axis % x.ndim else n for k, n in enumerate(x.shape)]
         )
 
-    def forward(_, some):
-        return [repeated(x) for x in some]
+    def forward(_, arrays):
+        return [repeat(x) for x in arrays]
 
     def backward(_, slopes):
         def row(i):
@@ -175,13 +181,13 @@ def spread(values: Any, axis: int, count: int) -> Any:
         return jax.lax.fori_loop(1, count, add, row(0))
 
     if not _policy.is_fused():
-        return jax.tree.map(repeated, values)
-    like = jax.eval_shape(lambda: forward(None, moving.values()))
-    repeated_floats = dict(zip(moving, linear(forward, backward, [], list(moving.values()), like)))
-    every = [
-        repeated_floats[k] if k in repeated_floats else repeated(x) for k, x in enumerate(leaves)
+        return jax.tree.map(repeat, values)
+    like = jax.eval_shape(lambda: forward(None, floats.values()))
+    repeated_floats = dict(zip(floats, linear(forward, backward, [], list(floats.values()), like)))
+    results = [
+        repeated_floats[k] if k in repeated_floats else repeat(x) for k, x in enumerate(leaves)
     ]
-    return jax.tree.unflatten(tree, every)
+    return jax.tree.unflatten(tree, results)
 
 
 Rule = Callable[[Sequence[Any], Sequence[Any], Sequence[Any]], Sequence[Any]]
@@ -224,7 +230,7 @@ def _attached_jvp(arrays, tangents, *, rule, count):
 
 def _attached_batch(arrays, dims, *, rule, count):
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
-    full = [
+    batched_arrays = [
         jnp.broadcast_to(x, (size, *x.shape)) if d is None else jnp.moveaxis(x, d, 0)
         for x, d in zip(arrays, dims)
     ]
@@ -232,15 +238,18 @@ def _attached_batch(arrays, dims, *, rule, count):
     def batched(operands, tangents, values):
         at = [i for i, x in enumerate(tangents) if is_slope(x)]
 
-        def one(operands, some, values):
-            each = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in operands]
-            for i, x in zip(at, some):
-                each[i] = x
-            return [zeros(x) if isinstance(x, ad.Zero) else x for x in rule(operands, each, values)]
+        def rule_of_one(operands, present_tangents, values):
+            all_tangents = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in operands]
+            for i, x in zip(at, present_tangents):
+                all_tangents[i] = x
+            return [
+                zeros(x) if isinstance(x, ad.Zero) else x
+                for x in rule(operands, all_tangents, values)
+            ]
 
-        return jax.vmap(one)(list(operands), [tangents[i] for i in at], list(values))
+        return jax.vmap(rule_of_one)(list(operands), [tangents[i] for i in at], list(values))
 
-    out = _attached_p.bind(*full, rule=batched, count=count)
+    out = _attached_p.bind(*batched_arrays, rule=batched, count=count)
     return out, [0] * len(out)
 
 
@@ -265,10 +274,12 @@ def underivable(x: Array, where: Array) -> Array:
 @underivable.defjvp
 def _underivable_rule(primals, tangents):
     x, where = primals
-    return underivable(x, where), linear(_spoiled, _spoiled, [where], [tangents[0]], [x])[0]
+    return underivable(x, where), linear(_nan_tangents, _nan_tangents, [where], [tangents[0]], [x])[
+        0
+    ]
 
 
-def _spoiled(constants: Any, tangents: Any) -> list[Array]:
+def _nan_tangents(constants: Any, tangents: Any) -> list[Array]:
     # Zero tangents pass: under ``vmap`` over the columns of a Jacobian, and in batches, most
     # directions do not move ``x`` at all.
     (where,), (tangent,) = constants, tangents
@@ -287,8 +298,8 @@ def over_gap(entry: Array, first: Array, second: Array) -> Array:
     It counts in derivatives alone. Where the two agree to half of their digits the derivative by
     the entry is NaN: it loses digits in proportion to their relative difference.
     """
-    close = are_close(first, second)
-    return underivable(entry, close) / jnp.where(close, 1, first - second)
+    is_close = are_close(first, second)
+    return underivable(entry, is_close) / jnp.where(is_close, 1, first - second)
 
 
 @jax.custom_jvp

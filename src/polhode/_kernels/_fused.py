@@ -72,17 +72,21 @@ def kernel(
         # ``of_units`` they stay units: a derivative, which is not a unit as a whole, keeps them.
         analysing = _ANALYSING.set(not of_units)
         try:
-            closed, shape = jax.make_jaxpr(
+            closed_jaxpr, shape = jax.make_jaxpr(
                 lambda *flat: fn(*jax.tree.unflatten(tree, flat)), return_shape=True
             )(*leaves)
         finally:
             _ANALYSING.reset(analysing)
-        if not is_holdable(closed.jaxpr):
+        if not is_holdable(closed_jaxpr.jaxpr):
             if of_units:  # the program is known, units inside it included
-                return jax.tree.unflatten(jax.tree.structure(shape), jaxpr_as_fun(closed)(*leaves))
+                return jax.tree.unflatten(
+                    jax.tree.structure(shape), jaxpr_as_fun(closed_jaxpr)(*leaves)
+                )
             return fn(*operands)
-        whole, constants = _with_constants_as_operands(closed)
-        results = _unit(jaxpr_as_fun(whole), linearised, (whole, 0), repeated)(*constants, *leaves)
+        program, constants = _with_constants_as_operands(closed_jaxpr)
+        results = _unit(jaxpr_as_fun(program), linearised, (program, 0), repeated)(
+            *constants, *leaves
+        )
         return jax.tree.unflatten(jax.tree.structure(shape), results)
 
     return call
@@ -141,11 +145,11 @@ def _put(rows: jax.Array, places: jax.Array, values: jax.Array) -> jax.Array:
 
     # A unit cannot hold a scatter. Rows are written one after another in it, so that bodies of a
     # chunk need not wait for one another at their saved times.
-    def one(i, rows):
+    def write_row(i, rows):
         place = places[i].astype(i.dtype)
         return jax.lax.dynamic_update_slice(rows, values[i][None], (place, jnp.zeros_like(i)))
 
-    return jax.lax.fori_loop(0, places.size, one, rows)
+    return jax.lax.fori_loop(0, places.size, write_row, rows)
 
 
 @_put_each.def_vmap
@@ -164,16 +168,23 @@ def _flat(x: jax.Array) -> jax.Array:
     return x.reshape(-1, x.shape[-1])
 
 
-def _with_constants_as_operands(closed: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
+def _with_constants_as_operands(closed_jaxpr: ClosedJaxpr) -> tuple[ClosedJaxpr, list[Any]]:
     """The program with its closed-over values as first operands, which may be differentiated.
 
     Small constant arrays, such as the table of a rule, stay inside: as operands they would be
     carried through every loop. Returns the program and these operands."""
-    jaxpr, own = closed.jaxpr, list(zip(closed.jaxpr.constvars, closed.consts, strict=True))
+    jaxpr, constants = (
+        closed_jaxpr.jaxpr,
+        list(zip(closed_jaxpr.jaxpr.constvars, closed_jaxpr.consts, strict=True)),
+    )
     tables = [
-        (v, x) for v, x in own if not isinstance(x, Tracer) and np.size(x) <= _policy.KERNEL_TABLE
+        (v, x)
+        for v, x in constants
+        if not isinstance(x, Tracer) and np.size(x) <= _policy.KERNEL_TABLE
     ]
-    others = [(v, x) for v, x in own if isinstance(x, Tracer) or np.size(x) > _policy.KERNEL_TABLE]
+    others = [
+        (v, x) for v, x in constants if isinstance(x, Tracer) or np.size(x) > _policy.KERNEL_TABLE
+    ]
     names = jaxpr.debug_info.arg_names
     names = None if names is None else ("",) * len(others) + (*names,)
     jaxpr_of_all = jaxpr.replace(
@@ -234,32 +245,32 @@ def _is_packable(dtype) -> bool:
 def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool = False) -> Callable:
     """``flat``, a function of arrays with a list of results, as one unit, differentiable.
 
-    ``traced``: the same where it is known already, and how many results are bare (``_unit_call``).
+    ``traced``: the same if it is already traced, and the ``exempt_count`` of ``_unit_call``.
     """
 
     @jax.custom_jvp
-    def marked(*leaves):
-        closed, bare = traced or (jax.make_jaxpr(flat)(*leaves), 0)
-        if traced is None and not is_holdable(closed.jaxpr):
-            return _batched_alike(jaxpr_as_fun(closed)(*leaves), leaves)
-        return _unit_call(closed, leaves, bare)
+    def unit(*leaves):
+        closed_jaxpr, exempt_count = traced or (jax.make_jaxpr(flat)(*leaves), 0)
+        if traced is None and not is_holdable(closed_jaxpr.jaxpr):
+            return _batched_alike(jaxpr_as_fun(closed_jaxpr)(*leaves), leaves)
+        return _unit_call(closed_jaxpr, leaves, exempt_count)
 
     def derivative(leaves, tangents):
         # What has no tangent stays a constant: its derivative is not worked out at all.
-        moving = [k for k, d in enumerate(tangents) if not isinstance(d, SymbolicZero)]
+        active_places = [k for k, d in enumerate(tangents) if not isinstance(d, SymbolicZero)]
 
-        def of_moving(whole, values):
-            whole = dict(enumerate(whole)) | dict(zip(moving, values, strict=True))
-            return flat(*whole.values())
+        def of_active(operands, values):
+            operands = dict(enumerate(operands)) | dict(zip(active_places, values, strict=True))
+            return flat(*operands.values())
 
         # A derivative of the coefficients takes twice as long to compile as one of the formulas.
-        again = any(isinstance(x, ad.JVPTracer) for x in leaves)
+        is_higher_order = any(isinstance(x, ad.JVPTracer) for x in leaves)
         if repeated:
-            value = marked(*leaves)
-            return value, _of_units(of_moving, moving, leaves, tangents, value)
-        if again or not linearised:
-            arguments = [leaves[k] for k in moving], [tangents[k] for k in moving]
-            values, slopes = jax.jvp(lambda *x: of_moving(leaves, x), *arguments)
+            value = unit(*leaves)
+            return value, _of_units(of_active, active_places, leaves, tangents, value)
+        if is_higher_order or not linearised:
+            arguments = [leaves[k] for k in active_places], [tangents[k] for k in active_places]
+            values, slopes = jax.jvp(lambda *x: of_active(leaves, x), *arguments)
             return _batched_alike(values, leaves), slopes
         # ``jax.linearize`` within the unit: values and coefficients leave it as results, and the
         # linear map alone is left outside, where JAX can transpose it.
@@ -267,22 +278,26 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
 
         def value_and_coefficients(*leaves):
             value, linear_map = jax.linearize(
-                lambda *x: of_moving(leaves, x), *(leaves[k] for k in moving)
+                lambda *x: of_active(leaves, x), *(leaves[k] for k in active_places)
             )
             coefficients, tree = jax.tree.flatten(linear_map)
             shape[:] = [tree, len(value)]
             return [*value, *coefficients, jnp.zeros((), jnp.float32)]
 
-        first = jax.make_jaxpr(value_and_coefficients)(*leaves)
+        linearisation = jax.make_jaxpr(value_and_coefficients)(*leaves)
         tree, count = shape
-        bare = len(first.out_avals) - 1 - count
-        *results, zero = _unit(jaxpr_as_fun(first), False, (first, bare))(*leaves)
+        exempt_count = len(linearisation.out_avals) - 1 - count
+        *results, zero = _unit(jaxpr_as_fun(linearisation), False, (linearisation, exempt_count))(
+            *leaves
+        )
         # Not marked: transposed, it would carry operands that go unused.
         linear_map = jax.tree.unflatten(tree, results[count:])
-        return results[:count], linear_map(*(_on_condition(zero, tangents[k]) for k in moving))
+        return results[:count], linear_map(
+            *(_on_condition(zero, tangents[k]) for k in active_places)
+        )
 
-    marked.defjvp(derivative, symbolic_zeros=True)
-    return marked
+    unit.defjvp(derivative, symbolic_zeros=True)
+    return unit
 
 
 def _batched_alike(results: Sequence[jax.Array], leaves: Sequence[Any]) -> list[jax.Array]:
@@ -291,27 +306,31 @@ def _batched_alike(results: Sequence[jax.Array], leaves: Sequence[Any]) -> list[
     Under ``vmap`` all results of a unit are batched, also those that depend on no batched operand,
     and JAX requires the same of the values that a custom derivative returns."""
     firsts = [x[(0,) * x.ndim] for x in map(jnp.asarray, leaves) if x.size]
-    sure = reduce(jnp.logical_or, (x == x for x in firsts), True)
-    return [jax.lax.select(jnp.broadcast_to(sure, x.shape), x, x) for x in results]
+    always_true = reduce(jnp.logical_or, (x == x for x in firsts), True)
+    return [jax.lax.select(jnp.broadcast_to(always_true, x.shape), x, x) for x in results]
 
 
-def _of_units(of_moving: Callable, moving: Sequence[int], leaves, tangents, like) -> list[Any]:
-    """Tangents of ``of_moving``: one unit for the linear map and another for its transpose."""
+def _of_units(
+    of_active: Callable, active_places: Sequence[int], leaves, tangents, like
+) -> list[Any]:
+    """Tangents of ``of_active``: one unit for the linear map and another for its transpose."""
     count = len(leaves)
     floats = {k: x for k, x in enumerate(like) if jnp.issubdtype(x.dtype, jnp.inexact)}
 
     def slope(leaves, changes):
-        some = [leaves[k] for k in moving]
-        results = jax.jvp(lambda *x: of_moving(leaves, x), some, list(changes))[1]
+        primals = [leaves[k] for k in active_places]
+        results = jax.jvp(lambda *x: of_active(leaves, x), primals, list(changes))[1]
         return [results[k] for k in floats]
 
-    def along(*both):
-        return slope(both[:count], both[count:])
+    def along(*arrays):
+        return slope(arrays[:count], arrays[count:])
 
-    def against(*both):
-        leaves, slopes = both[:count], list(both[count:])
+    def against(*arrays):
+        leaves, slopes = arrays[:count], list(arrays[count:])
         # ``jax.vjp`` would take half as long again to trace.
-        back = jax.linear_transpose(lambda *d: slope(leaves, d), *(leaves[k] for k in moving))
+        back = jax.linear_transpose(
+            lambda *d: slope(leaves, d), *(leaves[k] for k in active_places)
+        )
         return list(back(slopes))
 
     def forward(constants, changes):
@@ -322,64 +341,70 @@ def _of_units(of_moving: Callable, moving: Sequence[int], leaves, tangents, like
 
     # Tangents and cotangents are a map and its transpose, each computed from the operands alone. It
     # costs the motion once more, and saves hundreds of coefficients that would be stored and read.
-    changes = [tangents[k] for k in moving]
+    changes = [tangents[k] for k in active_places]
     by_place = dict(zip(floats, linear(forward, backward, leaves, changes, list(floats.values()))))
-    none = {k: np.zeros(x.shape, jax.dtypes.float0) for k, x in enumerate(like) if k not in floats}
-    return [(by_place | none)[k] for k in range(len(like))]
+    float0_tangents = {
+        k: np.zeros(x.shape, jax.dtypes.float0) for k, x in enumerate(like) if k not in floats
+    }
+    return [(by_place | float0_tangents)[k] for k in range(len(like))]
 
 
 def _on_condition(zero: jax.Array, tangent: jax.Array) -> jax.Array:
     """The tangent, selected on the condition that ``zero`` is 0, which it always is."""
     if tangent.dtype == jax.dtypes.float0:
         return tangent
-    sure = jnp.broadcast_to(zero == 0, tangent.shape)
-    return jax.lax.select(sure, tangent, jnp.zeros_like(tangent))
+    always_true = jnp.broadcast_to(zero == 0, tangent.shape)
+    return jax.lax.select(always_true, tangent, jnp.zeros_like(tangent))
 
 
-def _unit_call(closed: ClosedJaxpr, arguments: Sequence[Any], bare: int) -> list[jax.Array]:
+def _unit_call(
+    closed_jaxpr: ClosedJaxpr, arguments: Sequence[Any], exempt_count: int
+) -> list[jax.Array]:
     """The call of a unit, in which every operand is certainly used.
 
     XLA ends the process if an operand of such a call is unused, and it removes uses that it can
     simplify. An additional operand therefore holds two zeros that XLA cannot know: every result is
     selected on the condition that the first one is zero or any operand begins with another number.
-    The ``bare`` results before the last are exempt, since the selection would copy each of them in
+    The ``exempt_count`` results before the last are exempt, since the selection would copy each in
     a loop of its own; they are used only together with the last result, which is selected.
     """
-    jaxpr, is_used = partial_eval.dce_jaxpr(closed.jaxpr, [True] * len(closed.out_avals))
+    jaxpr, is_used = partial_eval.dce_jaxpr(
+        closed_jaxpr.jaxpr, [True] * len(closed_jaxpr.out_avals)
+    )
     arrays = [jnp.asarray(x) for x, keep in zip(arguments, is_used, strict=True) if keep]
     operands = [x for x in arrays if x.size]
     if not operands:
-        return jaxpr_as_fun(closed)(*arguments)
-    empty = {k: (x.shape, x.dtype) for k, x in enumerate(arrays) if not x.size}
+        return jaxpr_as_fun(closed_jaxpr)(*arguments)
+    empty_arrays = {k: (x.shape, x.dtype) for k, x in enumerate(arrays) if not x.size}
     # Behind a barrier, for XLA moves constants into what is called. Operands packed into one array
     # for each dtype were tried: they need the same condition and are copied, and the gradient of a
     # torqued body took 25 % longer to compile.
     zeros, *operands = jax.lax.optimization_barrier([jnp.zeros(2, jnp.float32), *operands])
 
-    def whole(zeros, *operands):
+    def program(zeros, *operands):
         with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):  # the call's own only
-            every = list(operands)
-            for k, (shape, dtype) in empty.items():
-                every.insert(k, jnp.zeros(shape, dtype))
-            results = jaxpr_as_fun(ClosedJaxpr(jaxpr, closed.consts))(*every)
+            all_operands = list(operands)
+            for k, (shape, dtype) in empty_arrays.items():
+                all_operands.insert(k, jnp.zeros(shape, dtype))
+            results = jaxpr_as_fun(ClosedJaxpr(jaxpr, closed_jaxpr.consts))(*all_operands)
             # one number of each operand is read, whatever XLA folds away of the program itself
             firsts = (x[(0,) * x.ndim].astype(bool) for x in operands)
-            sure = reduce(jnp.logical_or, firsts, zeros[0] == 0)
+            always_true = reduce(jnp.logical_or, firsts, zeros[0] == 0)
             # through a division, which XLA does not repeat: asked again for each result, the
             # condition was a quarter of the program
-            sure = jnp.where(sure, 1, 0) / (1 - zeros[1]) > 0
-            conditional = {*range(len(results) - 1 - bare), len(results) - 1}
-            other = {
+            always_true = jnp.where(always_true, 1, 0) / (1 - zeros[1]) > 0
+            conditional = {*range(len(results) - 1 - exempt_count), len(results) - 1}
+            alternatives = {
                 k: jnp.broadcast_to(zeros[1].astype(results[k].dtype), results[k].shape)
                 for k in conditional
             }
             return [
-                jax.lax.select(sure, x, other[k]) if k in conditional else x
+                jax.lax.select(always_true, x, alternatives[k]) if k in conditional else x
                 for k, x in enumerate(results)
             ]
 
-    shapes = tuple((x.shape, x.dtype) for x in closed.out_avals)
-    return _unit_p.bind(zeros, *operands, whole=whole, shapes=shapes)
+    shapes = tuple((x.shape, x.dtype) for x in closed_jaxpr.out_avals)
+    return _unit_p.bind(zeros, *operands, program=program, shapes=shapes)
 
 
 # A primitive, or the derivative of a loop around the call would take the constants in it for known
@@ -389,34 +414,34 @@ _unit_p.multiple_results = True
 
 
 @_unit_p.def_impl
-def _unit_at_once(*arrays, whole, shapes):
-    return list(whole(*arrays))
+def _unit_at_once(*arrays, program, shapes):
+    return list(program(*arrays))
 
 
 @_unit_p.def_abstract_eval
-def _unit_shapes(*_, whole, shapes):
+def _unit_shapes(*_, program, shapes):
     return [ShapedArray(shape, dtype) for shape, dtype in shapes]
 
 
-def _unit_lowered(*arrays, whole, shapes):
+def _unit_lowered(*arrays, program, shapes):
     with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
-        return jax.jit(whole)(*arrays)
+        return jax.jit(program)(*arrays)
 
 
-def _unit_batch(arrays, dims, *, whole, shapes):
+def _unit_batch(arrays, dims, *, program, shapes):
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
     shapes = tuple(((size, *shape), dtype) for shape, dtype in shapes)
-    closed = jax.make_jaxpr(jax.vmap(whole, dims))(*arrays)
-    batch = jaxpr_as_fun(closed)
+    closed_jaxpr = jax.make_jaxpr(jax.vmap(program, dims))(*arrays)
+    batch = jaxpr_as_fun(closed_jaxpr)
     # XLA divides loops over large arrays among threads, which it cannot do within a unit.
-    if size > _policy.KERNEL_BODIES or _sums_widely(closed.jaxpr):
+    if size > _policy.KERNEL_BODIES or _sums_widely(closed_jaxpr.jaxpr):
         return batch(*arrays), [0] * len(shapes)
 
-    def as_whole(*arrays):
+    def batched_program(*arrays):
         with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):
             return batch(*arrays)
 
-    return _unit_p.bind(*arrays, whole=as_whole, shapes=shapes), [0] * len(shapes)
+    return _unit_p.bind(*arrays, program=batched_program, shapes=shapes), [0] * len(shapes)
 
 
 mlir.register_lowering(_unit_p, mlir.lower_fun(_unit_lowered, multiple_results=True))
