@@ -225,12 +225,12 @@ def calibrated(count: int, seed: int) -> list[dict]:
         dynamics = chart.dynamics(scene, state, jnp.asarray(ts[:, 0]))
         y, _ = chart.start(scene, state, jnp.zeros(()))
         leaves, zero = jax.tree.leaves(y), jnp.zeros(())
-        problem = BoundTerm.of(diffrax.ODETerm(chart.field), dynamics).prepared(
+        problem = BoundTerm.of(diffrax.ODETerm(chart.field), dynamics).prepare(
             zero, y, jnp.float64
         )
 
         def field(t, y, along, problem=problem):
-            return problem.rates(problem.held, t, y), []
+            return problem.rates(problem.coefficients, t, y), []
 
         @jax.jit
         def step(y, width, given, field=field, zero=zero):
@@ -249,7 +249,7 @@ def calibrated(count: int, seed: int) -> list[dict]:
                 for _ in range(8):
                     fine = step(fine, wide / rate / 8, table(20, jnp.float64)).change
                 true = size([a - b for a, b in zip(found.change, fine)])
-                last, before = size(found.last), size(found.before)
+                last, before = size(found.difference), size(found.lower_difference)
                 seen = (true > 1e-13) & (true < 0.1)  # above rounding, where the table converges
                 if seen.sum() < count // 20:
                     continue

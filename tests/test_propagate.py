@@ -126,7 +126,7 @@ def check_wheels(scene, dt, t):
     state = ph.State(*WHEEL_STATE)
     wheels = scene.settled(state, jnp.asarray(t)).rotors
     loose = np.array(wheels.loose)
-    speeds = [wheels.speed(i, t, tuple(state.omega_body)) for i in range(len(wheels.held))]
+    speeds = [wheels.speed(i, t, tuple(state.omega_body)) for i in range(len(wheels.is_held))]
     n = 6 + len(loose)
 
     @jax.jit

@@ -137,33 +137,36 @@ def _propagated(scene, state, dt, t, places, method, rtol):
     dtype = dt.dtype
     leaves, tree = jax.tree.flatten(scene)
     sizes = [leaves[k].size for k in places]
-    settled = scene.settled(state, t)
-    wheels: Any = settled.rotors
-    loose = wheels.loose if isinstance(settled.rotors, Wheels) else ()
+    initial_scene = scene.settled(state, t)
+    wheels: Any = initial_scene.rotors
+    loose = wheels.loose if isinstance(initial_scene.rotors, Wheels) else ()
     start_speeds: Any = _speeds(wheels, t, state.omega_body) if loose else None
     begin = 6 + len(loose)
     n = begin + sum(sizes)
 
-    ends = jnp.stack([t, t + dt])
+    time_range = jnp.stack([t, t + dt])
     if method is None:
         method, _ = choose(scene, rtol)
     # In closed form there is no motion under a torque: its effect is integrated over the step.
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     nodes, weights = (jnp.asarray(x, dtype) for x in ((1 + nodes) / 2, weights / 2))
-    inner = t + dt * nodes if method.exact else ends[:0]
-    ts = jnp.concatenate([ends[:1], inner, ends[1:]])
+    node_times = t + dt * nodes if method.exact else time_range[:0]
+    ts = jnp.concatenate([time_range[:1], node_times, time_range[1:]])
 
-    def moved(error, push):
+    def states_after(error, push):
         turn = jnp.concatenate([jnp.ones(1, dtype), error[:3] / 2])
         speeds = None
         if loose:
             speeds = start_speeds.at[np.array(loose)].add(error[6:begin])
         start = State(rotation.multiply(state.wxyz, turn), state.omega_body + error[3:6], speeds)
-        changed, first = list(leaves), begin
+        perturbed_leaves, position = list(leaves), begin
         for k, size in zip(places, sizes):
-            change = error[first : first + size].reshape(leaves[k].shape)
-            changed[k], first = leaves[k] + change.astype(leaves[k].dtype), first + size
-        body = jax.tree.unflatten(tree, changed)
+            change = error[position : position + size].reshape(leaves[k].shape)
+            perturbed_leaves[k], position = (
+                leaves[k] + change.astype(leaves[k].dtype),
+                position + size,
+            )
+        body = jax.tree.unflatten(tree, perturbed_leaves)
         if not method.exact:
             push = BodyTorque(push)
             torque = push if body.torque is None else body.torque + push
@@ -171,25 +174,27 @@ def _propagated(scene, state, dt, t, places, method, rtol):
         traj = simulate(body, start, ts, method, rtol=rtol, throw=False)
         good = traj.status == Status.SUCCESSFUL
         speeds = traj.wheel_speed if loose else jnp.zeros((ts.size, 0), dtype)
-        given = traj.wxyz, traj.omega_body, speeds
-        wxyz, omega, speeds = (jnp.where(good, x, jnp.nan) for x in given)
-        moving = speeds[:, np.array(loose, int)]
-        return (wxyz, omega, moving), (wxyz[-1], omega[-1], speeds[-1], wxyz, traj.status)
+        samples = traj.wxyz, traj.omega_body, speeds
+        wxyz, omega, speeds = (jnp.where(good, x, jnp.nan) for x in samples)
+        loose_speeds = speeds[:, np.array(loose, int)]
+        return (wxyz, omega, loose_speeds), (wxyz[-1], omega[-1], speeds[-1], wxyz, traj.status)
 
-    none = jnp.zeros(n, dtype), jnp.zeros(3, dtype)
-    derivatives, (*last, wxyz, status) = jax.jacfwd(
-        lambda both: moved(both[:n], both[n:]), has_aux=True
-    )(jnp.concatenate(none))
+    zeros = jnp.zeros(n, dtype), jnp.zeros(3, dtype)
+    derivatives, (*end_samples, wxyz, status) = jax.jacfwd(
+        lambda inputs: states_after(inputs[:n], inputs[n:]), has_aux=True
+    )(jnp.concatenate(zeros))
     turns, *rates = derivatives  # (T, 4, n + 3), (T, 3, n + 3), (T, w, n + 3)
     turns = jnp.moveaxis(turns, -1, -2)
     back = jnp.broadcast_to(rotation.conjugate(wxyz)[:, None], turns.shape)
     angles = 2 * rotation.multiply(back, turns)[..., 1:]
     flow = jnp.concatenate([jnp.moveaxis(angles, -1, -2), *rates], axis=-2)
-    still = jnp.eye(n, n + 3, dtype=dtype)[begin:]
-    flow = jnp.concatenate([flow, jnp.broadcast_to(still, (ts.size, *still.shape))], axis=-2)
+    parameter_rows = jnp.eye(n, n + 3, dtype=dtype)[begin:]
+    flow = jnp.concatenate(
+        [flow, jnp.broadcast_to(parameter_rows, (ts.size, *parameter_rows.shape))], axis=-2
+    )
     end, noise = flow[-1, :, :n], flow[-1, :, n:]
     if method.exact:
-        inverse = settled.carrier.rates(jnp.eye(3, dtype=dtype))  # symmetric
+        inverse = initial_scene.carrier.rates(jnp.eye(3, dtype=dtype))  # symmetric
         push = jnp.zeros((n, 3), dtype).at[3:6].set(inverse)
         if loose:  # a torque on the body leaves the absolute momenta of its wheels as they are
             axes = wheels.axes[np.array(loose)]
@@ -200,11 +205,11 @@ def _propagated(scene, state, dt, t, places, method, rtol):
             return end @ jnp.linalg.solve(flow, push)
 
         noise = dt * jnp.tensordot(weights, jax.vmap(carried)(flow[1:-1, :, :n]), 1)
-    wxyz, omega, speeds = last
+    wxyz, omega, speeds = end_samples
     return State(wxyz, omega, speeds if loose else None), end, noise, status
 
 
 def _speeds(wheels: Wheels, t: Array, omega: Array) -> Array:
     """Speeds (m,) [rad/s] of the wheels of one body relative to it."""
     rates = tuple(omega[i] for i in range(3))
-    return jnp.stack([wheels.speed(i, t, rates) for i in range(len(wheels.held))])
+    return jnp.stack([wheels.speed(i, t, rates) for i in range(len(wheels.is_held))])

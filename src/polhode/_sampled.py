@@ -13,7 +13,7 @@ from polhode._checks import ArrayLike, is_concrete
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts
 from polhode._plan import choose
 from polhode._scene import BodyTorque, SampledTorque, Scene, State, TorqueSum
-from polhode._trajectory import Trajectory, begun
+from polhode._trajectory import Trajectory, with_initial_spins
 from polhode._trajectory._trajectory import AbstractPropagator
 
 _COINCIDENT = 1e-9
@@ -26,15 +26,15 @@ def is_sampled(scene: Scene) -> bool:
     return any(isinstance(term, SampledTorque) for term in _terms(scene.torque))
 
 
-def held(
+def sampled_method(
     method: AbstractMethod | None, scene: Scene, ts: Any, rtol: Array | float, record: Record
 ) -> "HeldCommands":
     """The method for a scene with a ``SampledTorque``; ``method``: that of each segment, or None.
 
     Raises ValueError for what is not possible with it.
     """
-    sampled = [term for term in _terms(scene.torque) if isinstance(term, SampledTorque)]
-    periods = {term.period for term in sampled}
+    sampled_torques = [term for term in _terms(scene.torque) if isinstance(term, SampledTorque)]
+    periods = {term.period for term in sampled_torques}
     if len(periods) > 1:
         raise ValueError(
             f"all SampledTorques of a scene must have one period, got {sorted(periods)}: join them"
@@ -72,15 +72,15 @@ class HeldCommands(AbstractMethod):
         ts = ts.astype(float)
         sign, start = np.sign(ts[-1] - ts[0]), ts[0]
         phase = sign * (ts - start) / period
-        near = np.abs(phase - np.round(phase)) < max(_COINCIDENT, rounding / period)
-        phase = np.where(near, np.round(phase), phase)
+        is_near_edge = np.abs(phase - np.round(phase)) < max(_COINCIDENT, rounding / period)
+        phase = np.where(is_near_edge, np.round(phase), phase)
         edges = np.arange(np.ceil(phase[-1]))
-        every = np.union1d(edges, phase)
+        all_phases = np.union1d(edges, phase)
         # samples as they are given, edges between them
-        times = start + sign * period * every
-        places = np.searchsorted(every, phase)
+        times = start + sign * period * all_phases
+        places = np.searchsorted(all_phases, phase)
         times[places] = ts
-        return cls(method, times, np.isin(every[:-1], edges), places, period)
+        return cls(method, times, np.isin(all_phases[:-1], edges), places, period)
 
     @property
     def keeps_rtol(self) -> bool:
@@ -108,29 +108,32 @@ class HeldCommands(AbstractMethod):
         laws = [x for x in _terms(scene.torque) if isinstance(x, SampledTorque)]
         final = Record(final_only=True)
 
-        def segment(carry, given):
+        def segment(carry, edge_and_span):
             samples, commands, status, steps = carry
-            is_edge, span = given
+            is_edge, span = edge_and_span
             wxyz, omega, *spins = samples
             fresh = [law.command(span[0], wxyz, omega) for law in laws]
             commands = [jnp.where(is_edge, a, b) for a, b in zip(fresh, commands)]
-            now = begun(_with_commands(scene, commands), spins)
-            found = self.method.run(now, State(wxyz, omega), span, share, final)
-            there = [x[:, 0] for x in (found.wxyz, found.omega_body, found.spins) if x is not None]
-            status = jnp.where(status == Status.SUCCESSFUL, found.status.astype(jnp.int32), status)
-            steps = jax.tree.map(lambda a, b: a + b.astype(a.dtype), steps, found.steps)
-            return (there, commands, status, steps), there
+            segment_scene = with_initial_spins(_with_commands(scene, commands), spins)
+            result = self.method.run(segment_scene, State(wxyz, omega), span, share, final)
+            states = [
+                x[:, 0] for x in (result.wxyz, result.omega_body, result.spins) if x is not None
+            ]
+            status = jnp.where(status == Status.SUCCESSFUL, result.status.astype(jnp.int32), status)
+            steps = jax.tree.map(lambda a, b: a + b.astype(a.dtype), steps, result.steps)
+            return (states, commands, status, steps), states
 
         begin = [state.wxyz, state.omega_body, *spins]
         zero = jnp.zeros(bodies, jnp.int32)
         commands = [jnp.zeros((bodies, 3), times.dtype) for _ in laws]
         spans = jnp.stack([times[:-1], times[1:]], axis=-1)
-        (_, _, status, steps), passed = jax.lax.scan(
+        (_, _, status, steps), segment_ends = jax.lax.scan(
             segment, (begin, commands, zero, StepCounts.of(zero)), (jnp.asarray(self.edges), spans)
         )
         places = self.places[-1:] if record.final_only else self.places
         wxyz, omega, *spins = (
-            jnp.moveaxis(jnp.concatenate([x[None], y])[places], 0, 1) for x, y in zip(begin, passed)
+            jnp.moveaxis(jnp.concatenate([x[None], y])[places], 0, 1)
+            for x, y in zip(begin, segment_ends)
         )
         return Samples(
             wxyz if record.attitude else None,
@@ -165,9 +168,12 @@ def _terms(torque: Any) -> tuple[Any, ...]:
 
 def _with_commands(scene: Scene, commands: list[Array]) -> Scene:
     """The scene with a constant torque in place of each ``SampledTorque``."""
-    given = iter(commands if len(commands) > 1 else commands * len(_terms(scene.torque)))
+    commands_in_order = iter(
+        commands if len(commands) > 1 else commands * len(_terms(scene.torque))
+    )
     terms = [
-        BodyTorque(next(given)) if isinstance(x, SampledTorque) else x for x in _terms(scene.torque)
+        BodyTorque(next(commands_in_order)) if isinstance(x, SampledTorque) else x
+        for x in _terms(scene.torque)
     ]
     torque = terms[0] if len(terms) == 1 else TorqueSum(tuple(terms))
     return dataclasses.replace(scene, torque=torque)

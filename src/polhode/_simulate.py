@@ -27,9 +27,9 @@ from polhode._events import (
     Event,
     check_until,
     checked_events,
-    found_by_search,
-    found_by_steps,
-    stopped,
+    events_by_search,
+    events_by_steps,
+    stop_at_event,
 )
 from polhode._kernels import Distinct, jit_distinct, kernel
 from polhode._method import (
@@ -45,7 +45,7 @@ from polhode._method import (
     raise_on_failure,
 )
 from polhode._plan import Plan, choose, plan
-from polhode._sampled import HeldPropagator, held, is_sampled
+from polhode._sampled import HeldPropagator, is_sampled, sampled_method
 from polhode._scene import Scene, State
 from polhode._trajectory import Propagator, Trajectory, final_of, values_of, with_saved
 
@@ -108,14 +108,14 @@ def simulate(
     checked_rtol = check_rtol(rtol, state.wxyz.dtype)
     split = split_of(scene, state, ts)
     if is_sampled(scene):
-        method = held(method, scene, ts, checked_rtol, record)
+        method = sampled_method(method, scene, ts, checked_rtol, record)
     elif method is None:
         method, _ = choose(scene, checked_rtol)
     if split is not None and is_concrete(scene, state, ts):
         scene, state, ts = place(split, scene, state, ts)
     if until is not None:
-        found = stopped(_begin(method, scene, state, ts, checked_rtol), ts, until)
-        return checked(_reduced(found, record), throw)
+        trajectory = stop_at_event(_begin(method, scene, state, ts, checked_rtol), ts, until)
+        return checked(_reduced(trajectory, record), throw)
     return checked(run(method, scene, state, ts, checked_rtol, record, split), throw)
 
 
@@ -136,11 +136,13 @@ def _with_events(scene, state, ts, method, rtol, record, until, events, throw) -
     checked_rtol = check_rtol(rtol, state.wxyz.dtype)
     if method is None:
         method, _ = choose(scene, checked_rtol)
-    found = found_by_steps(_begin(method, scene, state, ts, checked_rtol), ts, events)
-    if found is None:
+    trajectory_with_events = events_by_steps(
+        _begin(method, scene, state, ts, checked_rtol), ts, events
+    )
+    if trajectory_with_events is None:
         trajectory = run(method, scene, state, ts, checked_rtol, record.of_states, None)
-        found = found_by_search(checked(trajectory, throw), events)
-    return checked(_reduced(found, record), throw)
+        trajectory_with_events = events_by_search(checked(trajectory, throw), events)
+    return checked(_reduced(trajectory_with_events, record), throw)
 
 
 def _reduced(trajectory: Trajectory, record: Record) -> Trajectory:
@@ -169,8 +171,8 @@ def _checked_at_run_time(trajectory: Trajectory) -> Trajectory:
     messages = [f"a body did not finish: {status.explanation}" for status in Status]
 
     def samples(t):
-        saved, final = jax.tree.leaves(t._saved), t._final or ()
-        return [x for x in (t.ts, *t._samples, t._work, *final, *saved) if x is not None]
+        saved_values, final = jax.tree.leaves(t._saved), t._final or ()
+        return [x for x in (t.ts, *t._samples, t._work, *final, *saved_values) if x is not None]
 
     # a factor of one: derivatives too use it, of which a program may hold nothing else
     one = eqx.branched_error_if(jnp.ones((), trajectory.ts.dtype), failed, worst, messages)
@@ -197,7 +199,7 @@ def explain(
     check_method(method)
     checked_rtol = check_rtol(rtol, state.wxyz.dtype)
     if is_sampled(scene):
-        method = held(method, scene, ts, checked_rtol, record)
+        method = sampled_method(method, scene, ts, checked_rtol, record)
         return plan(scene, state, ts, method, checked_rtol, record, "the torque is sampled")
     return plan(scene, state, ts, method, checked_rtol, record)
 
@@ -207,14 +209,16 @@ def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> T
     """The compiled part: lanes out of batches, the method, and back."""
     scene, state = scene.settled(state, ts[..., 0]), state.without_wheels
     if split is None:
-        found = _moved(record, method, scene, state, ts, rtol)
+        samples = _motion_samples(record, method, scene, state, ts, rtol)
     else:
-        found = on_devices(split, partial(_moved, record), method, scene, state, ts, rtol)
-    wxyz, omega, status, steps, work, error, motors, spins, saved, final = found
-    kept = ts[..., -1:] if record.final_only else ts
+        samples = on_devices(
+            split, partial(_motion_samples, record), method, scene, state, ts, rtol
+        )
+    wxyz, omega, status, steps, work, error, motors, spins, saved, final = samples
+    saved_times = ts[..., -1:] if record.final_only else ts
     propagator = HeldPropagator() if is_sampled(scene) else Propagator.of(method, rtol)
     return Trajectory(
-        kept,
+        saved_times,
         wxyz,
         omega,
         status,
@@ -257,14 +261,14 @@ def _begin(method, scene, state, ts, rtol) -> Trajectory:
     )
 
 
-def _moved(record, method, scene, state, ts, rtol) -> Samples:
+def _motion_samples(record, method, scene, state, ts, rtol) -> Samples:
     parts = (getattr(scene, name) for name in PARTS)
     batch = common_batch(*parts, state, extra=(ts.shape[:-1],))
     parts = {name: flatten(getattr(scene, name), batch) for name in PARTS}
-    few = (
+    are_few = (
         state.wxyz.size <= 4 * _policy.KERNEL_BODIES
     )  # one task more costs as much as normalising them
-    unit = (kernel(State.as_unit) if few else State.as_unit)(state)
+    unit = (kernel(State.as_unit) if are_few else State.as_unit)(state)
     lanes = flatten(unit, batch, shared=False)
     times = lane_times(ts, batch)
     if record.save is None:
@@ -289,15 +293,15 @@ def _samples(record: Record, method, scene: Scene, lanes: State, times, rtol) ->
 def _saved(record: Record, method, scene: Scene, lanes: State, times, rtol) -> Samples:
     """Values of the function that is saved, of N lanes: a chunk of bodies at a time is integrated
     and reduced, so that no more states than those of a chunk are in memory."""
-    each, shared = eqx.partition((scene, lanes), is_lane_tree((scene, lanes)))
-    n, own = lanes.wxyz.shape[0], times if times.ndim == 2 else None
+    lanes_of_batch, shared = eqx.partition((scene, lanes), is_lane_tree((scene, lanes)))
+    n, body_times = lanes.wxyz.shape[0], times if times.ndim == 2 else None
     assert record.save is not None
     save = record.save
 
     def reduced(chunk):
-        each, own = chunk.value()
-        scene, lanes = eqx.combine(each, shared)
-        rows = times if own is None else own
+        chunk_lanes, chunk_times = chunk.value()
+        scene, lanes = eqx.combine(chunk_lanes, shared)
+        rows = times if chunk_times is None else chunk_times
         samples = _samples(record.of_states, method, scene, lanes, rows, rtol)
         rows = rows[..., -1:] if record.final_only else rows
         values = values_of(save, scene, rows, samples)
@@ -305,7 +309,7 @@ def _saved(record: Record, method, scene: Scene, lanes: State, times, rtol) -> S
         return samples._replace(wxyz=None, omega_body=None, spins=None, saved=values, final=final)
 
     size = _policy.bodies_to_save(1 if record.final_only else times.shape[-1])
-    return map_chunks(reduced, Distinct((each, own)), n, size)
+    return map_chunks(reduced, Distinct((lanes_of_batch, body_times)), n, size)
 
 
 def _work_of_exact(scene: Scene, state: State, ts: Array, samples: Samples, record: Record):
@@ -317,8 +321,8 @@ def _work_of_exact(scene: Scene, state: State, ts: Array, samples: Samples, reco
     def energy(t, wxyz, omega):
         return Trajectory(t, wxyz, omega, samples.status, samples.steps, scene).energy
 
-    first = energy(ts[..., :1], state.wxyz[:, None], state.omega_body[:, None])
-    return energy(rows, samples.wxyz, samples.omega_body) - first
+    start_energy = energy(ts[..., :1], state.wxyz[:, None], state.omega_body[:, None])
+    return energy(rows, samples.wxyz, samples.omega_body) - start_energy
 
 
 _COARSER = 30
@@ -337,12 +341,12 @@ def _with_error(method, scene, lanes, times, rtol, record) -> Samples:
     Two runs differ by the error of the coarser one, the finer one's is smaller by as much as the
     sum of its steps' errors: how the motion itself spreads errors is the same in both.
     """
-    plain = Record(record.attitude, record.rates, record.final_only, record.work)
+    record_of_states = Record(record.attitude, record.rates, record.final_only, record.work)
     size = jnp.linalg.norm(jax.lax.stop_gradient(lanes.omega_body), axis=-1)
-    turned = jnp.maximum(1, size * jnp.abs(times[..., -1] - times[..., 0]))
-    ulps = jnp.finfo(size.dtype).eps * turned
+    angle = jnp.maximum(1, size * jnp.abs(times[..., -1] - times[..., 0]))
+    ulps = jnp.finfo(size.dtype).eps * angle
     if method.exact:
-        return method.run(scene, lanes, times, rtol, plain)._replace(error=ulps)
+        return method.run(scene, lanes, times, rtol, record_of_states)._replace(error=ulps)
     if not method.keeps_rtol:
         raise ValueError(
             "Record(error=True) compares two tolerances, and the steps of this method do not follow"
@@ -350,10 +354,10 @@ def _with_error(method, scene, lanes, times, rtol, record) -> Samples:
         )
 
     def at(rtol):
-        return method.run(scene, lanes, times, rtol, plain)
+        return method.run(scene, lanes, times, rtol, record_of_states)
 
-    both = jax.lax.map(at, jnp.stack([rtol, _COARSER * rtol]))
-    fine, coarse = (jax.tree.map(lambda x, i=i: x[i], both) for i in (0, 1))
+    runs = jax.lax.map(at, jnp.stack([rtol, _COARSER * rtol]))
+    fine, coarse = (jax.tree.map(lambda x, i=i: x[i], runs) for i in (0, 1))
     if record.attitude:
         gap = rotation.angle_between(fine.wxyz[:, -1], coarse.wxyz[:, -1])
     else:
@@ -362,9 +366,9 @@ def _with_error(method, scene, lanes, times, rtol, record) -> Samples:
     if fine.error is None:
         error = gap / _COARSER
     else:
-        apart = coarse.error > 2 * fine.error  # else both took the same steps, few and short
-        share = fine.error / jnp.where(apart, coarse.error - fine.error, 1)
-        error = jnp.where(apart, gap * share, jnp.maximum(fine.error, gap))
+        steps_differ = coarse.error > 2 * fine.error  # else both took the same steps, few and short
+        share = fine.error / jnp.where(steps_differ, coarse.error - fine.error, 1)
+        error = jnp.where(steps_differ, gap * share, jnp.maximum(fine.error, gap))
     error = jax.lax.stop_gradient(error) + _ROUNDING * ulps
     good = (fine.status != Status.SUCCESSFUL) | (error <= _ALLOWED * rtol)
     status = jnp.where(good, fine.status, Status.INACCURATE)

@@ -124,7 +124,7 @@ def wheel_objection(scene: Scene) -> str | None:
     if rotors is None:
         return None
     if isinstance(rotors, Wheels):
-        axes, are_held = rotors.along, rotors.held
+        axes, are_held = rotors.along, rotors.is_held
     else:
         axes = tuple(wheel.axis for wheel in rotors.wheels)
         are_held = tuple(wheel.is_held for wheel in rotors.wheels)

@@ -5,7 +5,7 @@ from polhode._events._event import Event as Event
 from polhode._events._simulation import (
     check_until as check_until,
     checked_events as checked_events,
-    found_by_search as found_by_search,
-    found_by_steps as found_by_steps,
-    stopped as stopped,
+    events_by_search as events_by_search,
+    events_by_steps as events_by_steps,
+    stop_at_event as stop_at_event,
 )

@@ -15,7 +15,7 @@ from polhode._events._event import Event, at_least
 from polhode._integrate import Search, natural_rates
 from polhode._method import Status
 from polhode._scene import Scene, State
-from polhode._trajectory import Propagator, Trajectory, begun, moved_through, moved_to
+from polhode._trajectory import Propagator, Trajectory, moved_through, moved_to, with_initial_spins
 
 SAMPLES_PER_TURN = 32
 """Samples per revolution at the fastest natural rate."""
@@ -99,10 +99,14 @@ def crossings(
         )
     propagator: Any = trajectory.propagator
     if not propagator.method.exact:
-        met = _by_steps(trajectory, event, slots or CAPACITY)
-        if met is not None:
-            _raise_if_lost(met[1], "the steps to the last time")
-            return met[0] if capacity is not None else _all_of(met[0], trajectory, event)
+        step_result = _by_steps(trajectory, event, slots or CAPACITY)
+        if step_result is not None:
+            _raise_if_failed(step_result[1], "the steps to the last time")
+            return (
+                step_result[0]
+                if capacity is not None
+                else _all_of(step_result[0], trajectory, event)
+            )
     if size is None:
         size = _sample_count(trajectory)
     if slots is None:
@@ -111,33 +115,33 @@ def crossings(
                 "under jit, vmap or grad the number of stored crossings must be given: capacity=8."
             )
         slots = _MIN_CAPACITY
-    found, lost = _by_sampling(trajectory, event, slots, size)
-    _raise_if_lost(lost, f"the way through {size:,} samples")
-    while capacity is None and int(np.max(found.count, initial=0)) > slots:
-        slots = 2 ** int(np.ceil(np.log2(np.max(found.count))))
-        found, _ = _by_sampling(trajectory, event, slots, size)
+    result, has_failed = _by_sampling(trajectory, event, slots, size)
+    _raise_if_failed(has_failed, f"the way through {size:,} samples")
+    while capacity is None and int(np.max(result.count, initial=0)) > slots:
+        slots = 2 ** int(np.ceil(np.log2(np.max(result.count))))
+        result, _ = _by_sampling(trajectory, event, slots, size)
     if capacity is None:  # drop columns that no body uses
-        count = int(np.max(found.count, initial=0))
-        found = Crossings(found.times[..., :count], found.slope[..., :count], found.count)
-    return found
+        count = int(np.max(result.count, initial=0))
+        result = Crossings(result.times[..., :count], result.slope[..., :count], result.count)
+    return result
 
 
-def _raise_if_lost(lost: Array, way: str) -> None:
-    if is_concrete(lost) and np.any(np.asarray(lost)):
+def _raise_if_failed(has_failed: Array, way: str) -> None:
+    if is_concrete(has_failed) and np.any(np.asarray(has_failed)):
         raise ValueError(
             f"the steps of a body ran out on {way}: search a shorter time (traj.between), or ask"
             " for more steps, ph.LiePoisson(..., max_steps=2**20)."
         )
 
 
-def _all_of(found: Crossings, trajectory: Trajectory, event: Event) -> Crossings:
+def _all_of(result: Crossings, trajectory: Trajectory, event: Event) -> Crossings:
     """All crossings, in as many columns as there are, where their number is known."""
-    if not is_concrete(found):
-        return found
-    capacity = int(np.max(found.count, initial=0))
+    if not is_concrete(result):
+        return result
+    capacity = int(np.max(result.count, initial=0))
     if capacity > CAPACITY:
-        found, _ = _by_steps(trajectory, event, 2 ** int(np.ceil(np.log2(capacity))))
-    return Crossings(found.times[..., :capacity], found.slope[..., :capacity], found.count)
+        result, _ = _by_steps(trajectory, event, 2 ** int(np.ceil(np.log2(capacity))))
+    return Crossings(result.times[..., :capacity], result.slope[..., :capacity], result.count)
 
 
 @eqx.filter_jit
@@ -149,15 +153,15 @@ def _by_steps(trajectory: Trajectory, event: Event, capacity: int) -> Any:
     parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
     wxyz, omega, *spins = (x.reshape(-1, *x.shape[len(batch) :])[:, 0] for x in trajectory._samples)
     ts = lane_times(trajectory.ts[..., jnp.array([0, -1])], batch)
-    scene = begun(Scene(**parts), spins)
+    scene = with_initial_spins(Scene(**parts), spins)
     search = Search((event.fn,), (event.direction,), (False,), capacity)
     rtol = jnp.min(propagator.rtol)
-    found = propagator.method.search(scene, State(wxyz, omega), ts, rtol, search, True)
-    if found is None:
+    solution = propagator.method.search(scene, State(wxyz, omega), ts, rtol, search, True)
+    if solution is None:
         return None
-    samples, events = found
+    samples, events = solution
     spins = None if samples.spins is None else samples.spins[:, 1:]
-    there = Trajectory(
+    at_events = Trajectory(
         events.rows[:, 1:],
         samples.wxyz[:, 1:],
         samples.omega_body[:, 1:],
@@ -170,14 +174,14 @@ def _by_steps(trajectory: Trajectory, event: Event, capacity: int) -> Any:
     times = events.rows[:, 1:]
     use = jnp.isfinite(events.times)
     tolerance = 64 * jnp.finfo(times.dtype).eps * jnp.abs(times)
-    delay, there = event.differentiable_at(there, tolerance)
-    _, slope = event.values(there)
-    lost = samples.status != Status.SUCCESSFUL
-    lost = lost & (trajectory.status.reshape(-1) == Status.SUCCESSFUL)
-    count = jnp.where(lost, capacity + 1, events.count).astype(jnp.int32)
+    delay, at_events = event.differentiable_at(at_events, tolerance)
+    _, slope = event.values(at_events)
+    has_failed = samples.status != Status.SUCCESSFUL
+    has_failed = has_failed & (trajectory.status.reshape(-1) == Status.SUCCESSFUL)
+    count = jnp.where(has_failed, capacity + 1, events.count).astype(jnp.int32)
     times = jnp.where(use, times + delay, jnp.inf).reshape(*batch, capacity)
     slope = jnp.where(use, slope, 0).reshape(*batch, capacity)
-    return Crossings(times, slope, count.reshape(batch)), lost.reshape(batch)
+    return Crossings(times, slope, count.reshape(batch)), has_failed.reshape(batch)
 
 
 def _sample_count(trajectory: Trajectory) -> int:
@@ -187,7 +191,7 @@ def _sample_count(trajectory: Trajectory) -> int:
             "under jit, vmap or grad the number of samples must be known:"
             " ph.Event(fn, samples=1000), 32 or more per revolution of the fastest rate."
         )
-    angle = np.max(np.asarray(_turned_angle(trajectory)), initial=0)
+    angle = np.max(np.asarray(_max_angle(trajectory)), initial=0)
     size = max(
         17, 1 + int(np.ceil(SAMPLES_PER_TURN * angle / (2 * np.pi))) if np.isfinite(angle) else 17
     )
@@ -202,7 +206,7 @@ def _sample_count(trajectory: Trajectory) -> int:
 
 
 @eqx.filter_jit
-def _turned_angle(trajectory: Trajectory) -> Array:
+def _max_angle(trajectory: Trajectory) -> Array:
     """Most (...) that a body may turn from the first to the last time [rad]."""
     ts = trajectory._t
     span = jnp.max(ts, axis=-1) - jnp.min(ts, axis=-1)
@@ -231,32 +235,32 @@ def _by_sampling(
     trajectory: Trajectory, event: Event, capacity: int, size: int
 ) -> tuple[Crossings, Array]:
     """The first ``capacity`` crossings, and the bodies (...) that could not be sampled."""
-    still = jax.lax.stop_gradient
-    arrays, rest = eqx.partition(trajectory, eqx.is_inexact_array)
-    fixed: Trajectory = eqx.combine(still(arrays), rest)
+    stop_gradient = jax.lax.stop_gradient
+    arrays, static = eqx.partition(trajectory, eqx.is_inexact_array)
+    constant_trajectory: Trajectory = eqx.combine(stop_gradient(arrays), static)
     batch = trajectory.batch_shape
-    ts = fixed.ts
+    ts = constant_trajectory.ts
     share = jnp.linspace(0, 1, size, dtype=ts.dtype).at[0].set(AT_START / (size - 1))
     share = share.reshape((1,) * (ts.ndim - 1) + share.shape)
     grid = ts[..., :1] + share * (ts[..., -1:] - ts[..., :1])
-    samples = moved_through(fixed, grid)
+    samples = moved_through(constant_trajectory, grid)
     propagator: Any = trajectory.propagator
     # what is stepped goes on from the nearest look
-    origin = fixed if propagator.method.exact else samples
+    origin = constant_trajectory if propagator.method.exact else samples
     values, slopes = event.values(samples)
     values, slopes = (x.reshape(-1, size) for x in (values, slopes))
     grid = jnp.broadcast_to(grid, (*batch, size)).reshape(-1, size)
-    values, slopes, grid = still((values, slopes, grid))
-    ahead = jnp.where(grid[:, -1:] < grid[:, :1], -1, 1).astype(grid.dtype)
+    values, slopes, grid = stop_gradient((values, slopes, grid))
+    time_sign = jnp.where(grid[:, -1:] < grid[:, :1], -1, 1).astype(grid.dtype)
 
     def evaluate(t):
         pair = event.values(moved_to(origin, t.reshape(*batch, -1)))
-        return still(tuple(x.reshape(t.shape) for x in pair))
+        return stop_gradient(tuple(x.reshape(t.shape) for x in pair))
 
     sides = jnp.where(values >= 0, 1, -1)
     changes = sides[:, 1:] != sides[:, :-1]
     if event.direction:
-        changes = changes & (sides[:, 1:] * ahead == event.direction)
+        changes = changes & (sides[:, 1:] * time_sign == event.direction)
     stored = max(capacity, _MIN_CAPACITY)
     minima = minima_of(grid, values, slopes, sides)
 
@@ -267,48 +271,48 @@ def _by_sampling(
     low, high = entries(grid, place), entries(grid, place + 1)
     turns = low, high, entries(slopes, place), entries(slopes, place + 1), is_minimum
 
-    def brackets(turning, there):
+    def brackets(turning, turning_values):
         """Between samples, and on both sides of such a turning point; which are pairs of these."""
-        pairs = is_minimum & (jnp.where(there >= 0, 1, -1) != side)
+        pairs = is_minimum & (jnp.where(turning_values >= 0, 1, -1) != side)
         columns = (
             (entries(grid, single), low, turning),
             (entries(grid, single + 1), turning, high),
-            (entries(values, single), entries(values, place), there),
-            (entries(values, single + 1), there, entries(values, place + 1)),
+            (entries(values, single), entries(values, place), turning_values),
+            (entries(values, single + 1), turning_values, entries(values, place + 1)),
             (is_single, pairs, pairs),
             (entries(sides, single + 1) > 0, side < 0, side > 0),  # rising along the motion
         )
         *columns, use, rising = (jnp.concatenate(x, axis=-1) for x in columns)
         if event.direction:
-            use = use & (jnp.where(rising, 1, -1) * ahead == event.direction)
-        order = jnp.argsort(jnp.where(use, ahead * columns[0], jnp.inf), axis=-1)[:, :stored]
+            use = use & (jnp.where(rising, 1, -1) * time_sign == event.direction)
+        order = jnp.argsort(jnp.where(use, time_sign * columns[0], jnp.inf), axis=-1)[:, :stored]
         return tuple(entries(x, order) for x in (*columns, use)), pairs
 
-    def search(roots, second):
+    def search(roots, is_second_pass):
         """The turning points, then the roots: one copy of the motion in the program."""
-        arguments = [jnp.where(second, b, a) for a, b in zip(turns, brackets(*roots)[0])]
+        arguments = [jnp.where(is_second_pass, b, a) for a, b in zip(turns, brackets(*roots)[0])]
 
         def fn(t):
             value, slope = evaluate(t)
-            return jnp.where(second, value, slope), value
+            return jnp.where(is_second_pass, value, slope), value
 
-        roots = bracketed(fn, *arguments)
+        roots = bracketed_roots(fn, *arguments)
         return roots, roots
 
-    none = jnp.zeros_like(low)
-    _, (points, there) = jax.lax.scan(search, (none, none), jnp.array([False, True]))
-    (*_, use), pairs = brackets(points[0], there[0])
+    zeros = jnp.zeros_like(low)
+    _, (points, turning_values) = jax.lax.scan(search, (zeros, zeros), jnp.array([False, True]))
+    (*_, use), pairs = brackets(points[0], turning_values[0])
     times = points[1]
-    each = 1 if event.direction else 2
-    count = jnp.sum(changes, axis=-1) + each * jnp.sum(pairs, axis=-1)
+    per_pair = 1 if event.direction else 2
+    count = jnp.sum(changes, axis=-1) + per_pair * jnp.sum(pairs, axis=-1)
     # minima beyond the stored were not looked at: there may be as many pairs of them
     dipping = jnp.sum(minima, axis=-1)
-    count = jnp.where(dipping > stored, jnp.maximum(count, each * dipping), count)
+    count = jnp.where(dipping > stored, jnp.maximum(count, per_pair * dipping), count)
     times, use = (x[:, :capacity].reshape(*batch, capacity) for x in (times, use))
     slope, times = _differentiable_times(trajectory, event, times, use)
-    lost = (samples.status != Status.SUCCESSFUL) & (trajectory.status == Status.SUCCESSFUL)
-    count = jnp.where(lost, capacity + 1, count.reshape(batch)).astype(jnp.int32)
-    return Crossings(jnp.where(use, times, jnp.inf), jnp.where(use, slope, 0), count), lost
+    has_failed = (samples.status != Status.SUCCESSFUL) & (trajectory.status == Status.SUCCESSFUL)
+    count = jnp.where(has_failed, capacity + 1, count.reshape(batch)).astype(jnp.int32)
+    return Crossings(jnp.where(use, times, jnp.inf), jnp.where(use, slope, 0), count), has_failed
 
 
 def _differentiable_times(trajectory: Trajectory, event: Event, times: Array, use: Array):
@@ -316,8 +320,8 @@ def _differentiable_times(trajectory: Trajectory, event: Event, times: Array, us
     safe = jnp.where(use, times, trajectory.ts[..., :1])
     # of the value no more than rounding is left to correct, or of a touch all digits are noise
     tolerance = 64 * jnp.finfo(safe.dtype).eps * jnp.abs(safe)
-    delay, there = event.refined(moved_to(trajectory, safe), tolerance)
-    _, slope = event.values(there)
+    delay, at_events = event.refined(moved_to(trajectory, safe), tolerance)
+    _, slope = event.values(at_events)
     return slope, safe + delay
 
 
@@ -359,7 +363,7 @@ _MOST = 100
 """Evaluations: halving alone would need about sixty."""
 
 
-def bracketed(
+def bracketed_roots(
     fn: Callable[[Array], tuple[Array, Array]],
     low: Array,
     high: Array,
@@ -377,16 +381,16 @@ def bracketed(
     tolerance = 2 * jnp.finfo(low.dtype).eps * jnp.maximum(jnp.abs(low), jnp.abs(high))
 
     def on(walk):
-        count, done = walk[0], walk[1]
-        return (count < _MOST) & ~jnp.all(done)
+        count, is_done = walk[0], walk[1]
+        return (count < _MOST) & ~jnp.all(is_done)
 
-    def one(walk):
-        count, done, x1, x2, f1, f2, share, more = walk
+    def iterate(walk):
+        count, is_done, x1, x2, f1, f2, share, extra = walk
         x = x1 + share * (x2 - x1)
-        f, also = fn(jnp.where(done, low, x))
-        same = jnp.sign(f) == jnp.sign(f1)
-        x3, f3 = jnp.where(same, x1, x2), jnp.where(same, f1, f2)
-        new2, g2 = jnp.where(same, x2, x1), jnp.where(same, f2, f1)
+        f, new_extra = fn(jnp.where(is_done, low, x))
+        same_sign = jnp.sign(f) == jnp.sign(f1)
+        x3, f3 = jnp.where(same_sign, x1, x2), jnp.where(same_sign, f1, f2)
+        new2, g2 = jnp.where(same_sign, x2, x1), jnp.where(same_sign, f2, f1)
         bracket = jnp.abs(new2 - x)
         limit = tolerance / jnp.where(bracket > 0, bracket, 1)
         stop = (bracket <= 2 * tolerance) | (f == 0)
@@ -397,25 +401,25 @@ def bracketed(
         safe = (phi * phi < xi) & ((1 - phi) * (1 - phi) < 1 - xi)
         span = jnp.where(new2 == x, 1, new2 - x)
         inverse = -(f / ab) * (-f3 / bc) + (x3 - x) / span * (f / ac) * (g2 / bc)
-        new = jnp.clip(jnp.where(safe, inverse, 0.5), limit, 1 - limit)
+        new_share = jnp.clip(jnp.where(safe, inverse, 0.5), limit, 1 - limit)
 
         def where_busy(old, new):
-            return jnp.where(done, old, new)
+            return jnp.where(is_done, old, new)
 
         values = (
             where_busy(x1, x),
             where_busy(x2, new2),
             where_busy(f1, f),
             where_busy(f2, g2),
-            where_busy(share, new),
+            where_busy(share, new_share),
         )
-        values = (*values, where_busy(more, also))
-        return count + 1, done | stop, *values
+        values = (*values, where_busy(extra, new_extra))
+        return count + 1, is_done | stop, *values
 
     zero = at_low == 0
     start = jnp.where(zero, low, high), low, jnp.where(zero, at_low, at_high), at_low
-    done = ~use | zero | (at_high == 0)
-    walk = (0, done, *start, jnp.full_like(low, 0.5), jnp.zeros_like(low))
-    _, _, x1, x2, f1, f2, _, more = jax.lax.while_loop(on, one, walk)
+    is_done = ~use | zero | (at_high == 0)
+    walk = (0, is_done, *start, jnp.full_like(low, 0.5), jnp.zeros_like(low))
+    _, _, x1, x2, f1, f2, _, extra = jax.lax.while_loop(on, iterate, walk)
     root = jnp.where(jnp.abs(f1) <= jnp.abs(f2), x1, x2)
-    return jnp.where(use, root, low), more
+    return jnp.where(use, root, low), extra

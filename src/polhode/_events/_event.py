@@ -75,35 +75,35 @@ class Event(eqx.Module):
     def differentiable_at(self, approximate: Trajectory, limit: Array) -> tuple[Array, Trajectory]:
         """``refined`` for samples at which the function is zero to rounding: the same derivatives,
         and no computation where none is needed."""
-        arrays, rest = eqx.partition(approximate, eqx.is_inexact_array)
+        arrays, static = eqx.partition(approximate, eqx.is_inexact_array)
         leaves, tree = jax.tree.flatten((arrays, limit))
 
         def values_of(*leaves):
             arrays, limit = jax.tree.unflatten(tree, leaves)
-            delay, there = self.refined(eqx.combine(arrays, rest), limit)
-            return [delay, *there._samples]
+            delay, at_events = self.refined(eqx.combine(arrays, static), limit)
+            return [delay, *at_events._samples]
 
-        closed = jax.make_jaxpr(values_of)(*leaves)
-        size = len(closed.consts)
+        closed_jaxpr = jax.make_jaxpr(values_of)(*leaves)
+        size = len(closed_jaxpr.consts)
 
         def rule(operands, tangents, values):
             at = [i for i, x in enumerate(tangents) if is_slope(x)]
 
-            def some(*primals):
-                full = list(operands)
+            def of_active(*primals):
+                inputs = list(operands)
                 for i, x in zip(at, primals):
-                    full[i] = x
-                return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, full[:size]))(*full[size:])
+                    inputs[i] = x
+                return jaxpr_as_fun(ClosedJaxpr(closed_jaxpr.jaxpr, inputs[:size]))(*inputs[size:])
 
-            return jax.jvp(some, [operands[i] for i in at], [tangents[i] for i in at])[1]
+            return jax.jvp(of_active, [operands[i] for i in at], [tangents[i] for i in at])[1]
 
         values = [jnp.zeros_like(approximate._t), *approximate._samples]
-        operands = [*map(jnp.asarray, closed.consts), *leaves]
+        operands = [*map(jnp.asarray, closed_jaxpr.consts), *leaves]
         delay, *states = attached(rule, operands, values)
-        there = approximate._with_samples(
+        at_events = approximate._with_samples(
             approximate._t + delay, states, approximate.status, approximate._steps, None
         )
-        return delay, there
+        return delay, at_events
 
     def refined(self, approximate: Trajectory, limit: Array) -> tuple[Array, Trajectory]:
         """Samples moved to the events next to them.
@@ -114,16 +114,16 @@ class Event(eqx.Module):
         Steps t - g(t)/s with one constant s, the rate of change of g: where g(t) is zero they
         change nothing, and after two of them t has the first and second derivatives of the root.
         """
-        still = jax.lax.stop_gradient
+        stop_gradient = jax.lax.stop_gradient
         value, slope = self.values(approximate)
         later = shortly_after(approximate)
-        touch, chord = slope == 0, still(jnp.where(slope == 0, 1, slope))
+        touch, chord = slope == 0, stop_gradient(jnp.where(slope == 0, 1, slope))
         delay = jnp.where(touch, 0, -value / chord)
-        delay = delay - still(delay) + still(jnp.clip(delay, -limit, limit))
-        there = later(delay)
-        value = _FUNCTION.mapped(self.fn, there.wxyz, there.omega_body, there._t)
+        delay = delay - stop_gradient(delay) + stop_gradient(jnp.clip(delay, -limit, limit))
+        at_delay = later(delay)
+        value = _FUNCTION.mapped(self.fn, at_delay.wxyz, at_delay.omega_body, at_delay._t)
         change = jnp.where(touch, 0, -value / chord)
-        delay = _differentiable(delay + (change - still(change)), 2)
+        delay = _differentiable(delay + (change - stop_gradient(change)), 2)
         return delay, later(delay)
 
 
@@ -151,10 +151,10 @@ def _differentiable(x: Array, order: int) -> Array:
     return identity(x)
 
 
-def at_least(name: str, value: Any, least: int) -> int | None:
-    """A known integer not below ``least``, or None."""
+def at_least(name: str, value: Any, minimum: int) -> int | None:
+    """A concrete integer not below ``minimum``, or None."""
     if value is None:
         return None
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < least:
-        raise ValueError(f"{name} must be an integer, at least {least}, got {value!r:.40}.")
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
+        raise ValueError(f"{name} must be an integer, at least {minimum}, got {value!r:.40}.")
     return int(value)

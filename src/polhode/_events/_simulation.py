@@ -17,7 +17,7 @@ from polhode._batch import PARTS, flatten, lane_times
 from polhode._events._crossings import (
     AT_START,
     SAMPLES_PER_TURN,
-    bracketed,
+    bracketed_roots,
     crossings,
     entries,
     first_true,
@@ -28,19 +28,26 @@ from polhode._events._event import Event
 from polhode._integrate import Search, natural_rates
 from polhode._method import Record, Status
 from polhode._scene import Scene, State
-from polhode._trajectory import Events, Propagator, Trajectory, begun, moved_through, moved_to
+from polhode._trajectory import (
+    Events,
+    Propagator,
+    Trajectory,
+    moved_through,
+    moved_to,
+    with_initial_spins,
+)
 
 
 def checked_events(events: Any, until: Any, record: Record | None) -> tuple[Event, ...]:
     """``events`` as a tuple; raises TypeError or ValueError for what cannot be searched for."""
-    some = (events,) if isinstance(events, Event) else tuple(events)
-    for event in some:
+    all_events = (events,) if isinstance(events, Event) else tuple(events)
+    for event in all_events:
         if not isinstance(event, Event):
             raise TypeError(
                 f"events must be ph.Event objects, got {type(event).__name__}:"
                 " events=[ph.Event(fn, direction)]."
             )
-    if not some:
+    if not all_events:
         raise ValueError("events is empty: leave it out, or give one or several ph.Event.")
     if until is not None:
         raise ValueError(
@@ -52,11 +59,11 @@ def checked_events(events: Any, until: Any, record: Record | None) -> tuple[Even
             "events= needs attitude and rates at all times and does not record work or error:"
             " leave record= out."
         )
-    return some
+    return all_events
 
 
 @eqx.filter_jit
-def found_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Trajectory | None:
+def events_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Trajectory | None:
     """The motion from ``begin``, its state at the first of ``ts``, and the events that the
     integration meets; None where the method does not search for events."""
     batch, propagator = begin.batch_shape, cast(Propagator, begin.propagator)
@@ -74,14 +81,14 @@ def found_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tra
         capacity,
     )
     solution = method.search(
-        begun(scene, spins), State(wxyz, omega), times, propagator.rtol, search, False
+        with_initial_spins(scene, spins), State(wxyz, omega), times, propagator.rtol, search, False
     )
     if solution is None:
         return None
-    samples, found = solution
+    samples, record = solution
     count = ts.shape[-1]
-    there = Trajectory(
-        found.rows[:, count:],
+    at_events = Trajectory(
+        record.rows[:, count:],
         samples.wxyz[:, count:],
         samples.omega_body[:, count:],
         samples.status,
@@ -90,18 +97,18 @@ def found_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tra
         spins=None if samples.spins is None else samples.spins[:, count:],
         propagator=propagator,
     )
-    tolerance = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(there._t)
-    delay, states = jnp.zeros_like(there._t), there._samples
+    tolerance = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(at_events._t)
+    delay, states = jnp.zeros_like(at_events._t), at_events._samples
     for k, event in enumerate(events):
-        more, shifted = event.differentiable_at(there, tolerance)
-        is_this = found.which == k
-        delay = jnp.where(is_this, more, delay)
+        event_delay, at_event = event.differentiable_at(at_events, tolerance)
+        is_this = record.which == k
+        delay = jnp.where(is_this, event_delay, delay)
         states = [
             jnp.where(is_this[..., None], x, y)
-            for x, y in zip(shifted._samples, states, strict=True)
+            for x, y in zip(at_event._samples, states, strict=True)
         ]
     status = jnp.where(
-        (samples.status == Status.SUCCESSFUL) & (found.count > capacity),
+        (samples.status == Status.SUCCESSFUL) & (record.count > capacity),
         Status.TOO_MANY_EVENTS,
         samples.status,
     )
@@ -113,15 +120,26 @@ def found_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tra
         path,
         (status, samples.steps),
         events,
-        (jnp.where(jnp.isfinite(found.times), there._t + delay, jnp.inf), found.which, found.count),
+        (
+            jnp.where(jnp.isfinite(record.times), at_events._t + delay, jnp.inf),
+            record.which,
+            record.count,
+        ),
         states,
     )
 
 
-def found_by_search(trajectory: Trajectory, events: Sequence[Event]) -> Trajectory:
+def events_by_search(trajectory: Trajectory, events: Sequence[Event]) -> Trajectory:
     """The same for a motion that is known at every time: its trajectory is searched."""
-    each = [crossings(trajectory, event, capacity=event.capacity) for event in events]
-    return _in_order_of_time(trajectory, [x.times for x in each], [x.count for x in each], events)
+    crossings_of_events = [
+        crossings(trajectory, event, capacity=event.capacity) for event in events
+    ]
+    return _in_order_of_time(
+        trajectory,
+        [x.times for x in crossings_of_events],
+        [x.count for x in crossings_of_events],
+        events,
+    )
 
 
 @eqx.filter_jit
@@ -133,18 +151,18 @@ def _in_order_of_time(trajectory: Trajectory, times, counts, events) -> Trajecto
     at, which = (
         jnp.concatenate([y.reshape(rows.shape[0], -1) for y in x], axis=1) for x in (times, which)
     )
-    lost = sum(
+    overflows = sum(
         jnp.where(count > event.capacity, 1, 0) for count, event in zip(counts, events, strict=True)
     )
     order = jnp.argsort(jnp.where(jnp.isfinite(at), sign * at, jnp.inf), axis=1)
     at, which = (jnp.take_along_axis(x, order, axis=1) for x in (at, which))
     # what lies beyond a terminal event does not happen
-    ends = jnp.isfinite(at) & _is_terminal(which, events)
-    at = jnp.where(jnp.cumsum(ends, axis=1) - jnp.where(ends, 1, 0) > 0, jnp.inf, at)
-    met = jnp.isfinite(at)
-    there = moved_to(trajectory, jnp.where(met, at, rows[:, :1]).reshape(*batch, -1))
+    is_terminal = jnp.isfinite(at) & _is_terminal(which, events)
+    at = jnp.where(jnp.cumsum(is_terminal, axis=1) - jnp.where(is_terminal, 1, 0) > 0, jnp.inf, at)
+    happens = jnp.isfinite(at)
+    at_events = moved_to(trajectory, jnp.where(happens, at, rows[:, :1]).reshape(*batch, -1))
     status = jnp.where(
-        (trajectory.status == Status.SUCCESSFUL) & (lost > 0),
+        (trajectory.status == Status.SUCCESSFUL) & (overflows > 0),
         Status.TOO_MANY_EVENTS,
         trajectory.status,
     )
@@ -158,8 +176,8 @@ def _in_order_of_time(trajectory: Trajectory, times, counts, events) -> Trajecto
         lanes(trajectory._samples),
         jax.tree.map(jnp.ravel, (status, trajectory._steps)),
         events,
-        (at, which, jnp.sum(met, axis=1)),
-        lanes(there._samples),
+        (at, which, jnp.sum(happens, axis=1)),
+        lanes(at_events._samples),
     )
 
 
@@ -168,23 +186,25 @@ def _is_terminal(which: Array, events: Sequence[Event]) -> Array:
     return table[jnp.maximum(which, 0)] & (which >= 0)
 
 
-def _until_terminal(begin: Trajectory, rows, path, outcome, events, met, states):
+def _until_terminal(begin: Trajectory, rows, path, outcome, events, occurrences, states):
     """Samples beyond a terminal event are those of the event."""
     batch = begin.batch_shape
-    at, which, count = met
+    at, which, count = occurrences
     happens = jnp.isfinite(at)
     which = jnp.where(happens, which, -1)
     event_time = None
     if any(event.terminal for event in events):
-        ends = happens & _is_terminal(which, events)
-        last = jnp.argmax(ends, axis=1)[:, None]
-        stops = jnp.any(ends, axis=1, keepdims=True)
-        stop = jnp.take_along_axis(at, last, axis=1)
+        is_terminal = happens & _is_terminal(which, events)
+        terminal_index = jnp.argmax(is_terminal, axis=1)[:, None]
+        stops = jnp.any(is_terminal, axis=1, keepdims=True)
+        stop = jnp.take_along_axis(at, terminal_index, axis=1)
         sign = jnp.where(rows[:, -1:] < rows[:, :1], -1, 1).astype(rows.dtype)
-        past = stops & (sign * rows >= sign * jnp.where(stops, stop, 0))
-        rows = jnp.where(past, stop, rows)
+        is_past = stops & (sign * rows >= sign * jnp.where(stops, stop, 0))
+        rows = jnp.where(is_past, stop, rows)
         path = [
-            jnp.where(past[..., None], jnp.take_along_axis(y, last[..., None], axis=1), x)
+            jnp.where(
+                is_past[..., None], jnp.take_along_axis(y, terminal_index[..., None], axis=1), x
+            )
             for x, y in zip(path, states, strict=True)
         ]
         event_time = jnp.where(stops, stop, jnp.inf)[:, 0].reshape(batch)
@@ -237,7 +257,7 @@ def check_until(until: Any, record: Any) -> None:
 
 
 @eqx.filter_jit
-def stopped(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
+def stop_at_event(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
     """The motion from ``begin``, its state at the first of ``ts``, each body path from its first
     event on."""
     batch = begin.batch_shape
@@ -260,15 +280,18 @@ def _stopped_by_loop(lanes: Trajectory, ts: Array, until: Event):
     if method.exact:
         return None
     wxyz, omega, *spins = (x[:, 0] for x in lanes._samples)
-    scene, search = begun(lanes.scene, spins), Search((until.fn,), (until.direction,), (True,), 1)
+    scene, search = (
+        with_initial_spins(lanes.scene, spins),
+        Search((until.fn,), (until.direction,), (True,), 1),
+    )
     solution = method.search(scene, State(wxyz, omega), ts, propagator.rtol, search, False)
     if solution is None:
         return None
     samples, events = solution
     spins = [] if samples.spins is None else [samples.spins]
     path = [samples.wxyz, samples.omega_body, *spins]
-    met = jnp.isfinite(events.times[:, 0])
-    near = Trajectory(
+    has_event = jnp.isfinite(events.times[:, 0])
+    near_event = Trajectory(
         events.rows[:, -1:],
         path[0][:, -1:],
         path[1][:, -1:],
@@ -278,17 +301,17 @@ def _stopped_by_loop(lanes: Trajectory, ts: Array, until: Event):
         spins=spins[0][:, -1:] if spins else None,
         propagator=propagator,
     )
-    tolerance = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(near._t)
-    delay, at_event = until.differentiable_at(near, tolerance)
-    event = near._t + delay
-    rows = jnp.broadcast_to(ts, (met.size, ts.shape[-1]))
+    tolerance = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(near_event._t)
+    delay, at_event = until.differentiable_at(near_event, tolerance)
+    event = near_event._t + delay
+    rows = jnp.broadcast_to(ts, (has_event.size, ts.shape[-1]))
     sign = jnp.where(rows[:, -1:] < rows[:, :1], -1, 1).astype(ts.dtype)
-    past = met[:, None] & (sign * (rows - jax.lax.stop_gradient(event)) >= 0)
+    is_past = has_event[:, None] & (sign * (rows - jax.lax.stop_gradient(event)) >= 0)
     wxyz, omega, *spins = (
-        jnp.where(past[..., None], x, y[:, :-1]) for x, y in zip(at_event._samples, path)
+        jnp.where(is_past[..., None], x, y[:, :-1]) for x, y in zip(at_event._samples, path)
     )
-    times = jnp.where(past, event, rows)
-    event = jnp.where(met, event[:, 0], jnp.inf)
+    times = jnp.where(is_past, event, rows)
+    event = jnp.where(has_event, event[:, 0], jnp.inf)
     return (
         wxyz,
         omega,
@@ -302,12 +325,14 @@ def _stopped_by_loop(lanes: Trajectory, ts: Array, until: Event):
 
 def _stopped_by_windows(lanes: Trajectory, ts: Array, until: Event):
     """The same by samples at windows of the motion."""
-    arrays, rest = eqx.partition((lanes, until), eqx.is_inexact_array)
-    still = jax.lax.stop_gradient
-    fixed, event = eqx.combine(still(arrays), rest)
-    met, lost, near, step = still(_first_event(fixed, event, still(ts)))
-    path = _stopped_at(lanes, ts, until, met, near, step)
-    return (*path[:3], jnp.where(lost, Status.MAX_STEPS, path[3]), *path[4:])
+    arrays, static = eqx.partition((lanes, until), eqx.is_inexact_array)
+    stop_gradient = jax.lax.stop_gradient
+    constant_lanes, event = eqx.combine(stop_gradient(arrays), static)
+    has_event, gave_up, event_time, step = stop_gradient(
+        _first_event(constant_lanes, event, stop_gradient(ts))
+    )
+    path = _stopped_at(lanes, ts, until, has_event, event_time, step)
+    return (*path[:3], jnp.where(gave_up, Status.MAX_STEPS, path[3]), *path[4:])
 
 
 def _of_lanes(begin: Trajectory) -> Trajectory:
@@ -357,13 +382,13 @@ class _Minimum(NamedTuple):
 class _Window(NamedTuple):
     """The search under way: the next window begins at ``share`` of the whole, with ``samples``."""
 
-    tried: Array
+    count: Array
     share: Array
     width: Array
     samples: list[Array]
-    met: Array
-    alive: Array
-    found: _Bracket
+    has_event: Array
+    is_successful: Array
+    bracket: _Bracket
 
 
 def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...]:
@@ -371,28 +396,28 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
     between two samples there [s]."""
     propagator: Any = lanes.propagator
     exact = propagator.method.exact
-    first, last = ts[..., 0], ts[..., -1]
-    span, dtype = last - first, ts.dtype
+    start_time, end_time = ts[..., 0], ts[..., -1]
+    span, dtype = end_time - start_time, ts.dtype
     n = lanes.status.size
     forward = jnp.broadcast_to(jnp.where(span < 0, -1, 1), (n,))
-    least = 4 * _SAMPLES * float(jnp.finfo(dtype).eps)
+    min_width = 4 * _SAMPLES * float(jnp.finfo(dtype).eps)
 
     def times(share):
         """(K,) or (N, K) of parts (K,) of the whole."""
         share = share.reshape((1,) * span.ndim + share.shape)
-        grid = first[..., None] + share * span[..., None]
-        return jnp.where(share >= 1, last[..., None], grid)
+        grid = start_time[..., None] + share * span[..., None]
+        return jnp.where(share >= 1, end_time[..., None], grid)
 
     def at(time, samples, share_of_error=None):
         """The bodies at a time () or (N,), one sample each."""
         wxyz, omega, *spins = (x[:, None] for x in samples)
-        now = propagator
+        limited_propagator = propagator
         if share_of_error is not None and propagator.rtol is not None:
             eps = jnp.finfo(propagator.rtol.dtype).eps
             rtol = jnp.maximum(
                 propagator.rtol * share_of_error.astype(propagator.rtol.dtype), 8 * eps
             )
-            now = eqx.tree_at(lambda p: p.rtol, propagator, rtol)
+            limited_propagator = eqx.tree_at(lambda p: p.rtol, propagator, rtol)
         return Trajectory(
             time[..., None],
             wxyz,
@@ -401,20 +426,22 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
             lanes._steps,
             lanes.scene,
             spins=spins[0] if spins else None,
-            propagator=now,
+            propagator=limited_propagator,
         )
 
     def width_by_rate(share, samples, busy):
         if until.samples is not None:
             return jnp.asarray(_SAMPLES / (until.samples - 1), dtype)
-        ends = jnp.stack(jnp.broadcast_arrays(times(share[None])[..., 0], last), axis=-1)
-        rates = natural_rates(lanes.scene, State(*samples[:2]), ends)
+        time_range = jnp.stack(jnp.broadcast_arrays(times(share[None])[..., 0], end_time), axis=-1)
+        rates = natural_rates(lanes.scene, State(*samples[:2]), time_range)
         angle = jnp.max(jnp.where(busy & jnp.isfinite(rates), rates * jnp.abs(span), 0), initial=0)
         angle = jnp.maximum(angle, jnp.finfo(dtype).tiny)
-        return jnp.maximum(_SAMPLES * 2 * jnp.pi / SAMPLES_PER_TURN / angle, least).astype(dtype)
+        return jnp.maximum(_SAMPLES * 2 * jnp.pi / SAMPLES_PER_TURN / angle, min_width).astype(
+            dtype
+        )
 
-    def one(carry: _Window) -> _Window:
-        busy = ~carry.met & carry.alive
+    def search_window(carry: _Window) -> _Window:
+        busy = ~carry.has_event & carry.is_successful
         width = jnp.minimum(carry.width, 1 - carry.share)
         part = jnp.linspace(0, 1, _SAMPLES + 1, dtype=dtype)
         offset = jnp.where(carry.share == 0, AT_START / _SAMPLES, 0).astype(dtype)
@@ -445,9 +472,11 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
             turned_angle = turning_rates(sampled) * jnp.abs(span).reshape(-1, 1)
             turned_angle = jnp.where(busy[:, None] & jnp.isfinite(turned_angle), turned_angle, 0)
             angle = jnp.max(turned_angle, axis=0, initial=0) * width / _SAMPLES
-            slow = (angle <= _MAX_SPEED_UP * 2 * jnp.pi / SAMPLES_PER_TURN) | (width <= least)
-            fast = jnp.min(jnp.where(slow, _SAMPLES, jnp.arange(_SAMPLES + 1)))
-            reach = jnp.minimum(reach, jnp.maximum(fast, 1))
+            is_slow = (angle <= _MAX_SPEED_UP * 2 * jnp.pi / SAMPLES_PER_TURN) | (
+                width <= min_width
+            )
+            first_fast = jnp.min(jnp.where(is_slow, _SAMPLES, jnp.arange(_SAMPLES + 1)))
+            reach = jnp.minimum(reach, jnp.maximum(first_fast, 1))
         place, is_minimum = (
             place[:, :_MINIMA],
             is_minimum[:, :_MINIMA] & (place[:, :_MINIMA] < reach),
@@ -455,42 +484,48 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
         minimum = _first_minimum(
             until, begin if exact else sampled, grid, slopes, sides, place, is_minimum
         )
-        new = busy & (jnp.minimum(minimum.place, change) < reach)
-        fresh = _bracket(sampled, grid, values, change, minimum, until.direction * forward, new)
-        found = jax.tree.map(
-            lambda x, y: jnp.where(new.reshape(-1, *(1,) * (x.ndim - 1)), x, y), fresh, carry.found
+        is_new = busy & (jnp.minimum(minimum.place, change) < reach)
+        fresh = _bracket(sampled, grid, values, change, minimum, until.direction * forward, is_new)
+        bracket = jax.tree.map(
+            lambda x, y: jnp.where(is_new.reshape(-1, *(1,) * (x.ndim - 1)), x, y),
+            fresh,
+            carry.bracket,
         )
-        alive = carry.alive & (sampled.status == Status.SUCCESSFUL)
-        samples, met = [x[:, reach] for x in sampled._samples], carry.met | new
-        wider = jnp.where(reach < _SAMPLES, width, _GROWTH * width)
-        wider = jnp.minimum(wider, width_by_rate(share[reach], samples, alive & ~met))
-        return _Window(carry.tried + 1, share[reach], wider, samples, met, alive, found)
+        is_successful = carry.is_successful & (sampled.status == Status.SUCCESSFUL)
+        samples, has_event = [x[:, reach] for x in sampled._samples], carry.has_event | is_new
+        next_width = jnp.where(reach < _SAMPLES, width, _GROWTH * width)
+        next_width = jnp.minimum(
+            next_width, width_by_rate(share[reach], samples, is_successful & ~has_event)
+        )
+        return _Window(
+            carry.count + 1, share[reach], next_width, samples, has_event, is_successful, bracket
+        )
 
     def on(carry: _Window):
-        unfinished = (carry.share < 1) & (carry.tried < _MAX_WINDOWS)
-        return unfinished & jnp.any(~carry.met & carry.alive)
+        unfinished = (carry.share < 1) & (carry.count < _MAX_WINDOWS)
+        return unfinished & jnp.any(~carry.has_event & carry.is_successful)
 
     samples, zero = [x[:, 0] for x in lanes._samples], jnp.zeros(n, dtype)
-    alive = lanes.status == Status.SUCCESSFUL
-    begin = jnp.broadcast_to(first, (n,))
+    is_successful = lanes.status == Status.SUCCESSFUL
+    begin = jnp.broadcast_to(start_time, (n,))
     nowhere = _Bracket(begin, begin, zero, zero, begin, samples)
     start = jnp.zeros((), dtype)
-    width = width_by_rate(start, samples, alive)
+    width = width_by_rate(start, samples, is_successful)
     width = width if until.samples is not None else jnp.minimum(width, _FIRST)
     carry = _Window(
-        jnp.zeros((), jnp.int32), start, width, samples, jnp.zeros(n, bool), alive, nowhere
+        jnp.zeros((), jnp.int32), start, width, samples, jnp.zeros(n, bool), is_successful, nowhere
     )
-    carry = jax.lax.while_loop(on, one, carry)
-    low, high, at_low, at_high, look, samples = carry.found
+    carry = jax.lax.while_loop(on, search_window, carry)
+    low, high, at_low, at_high, look, samples = carry.bracket
 
     def fn(t):
         value, _ = until.values(moved_to(lanes if exact else at(look, samples), t))
         return value, value
 
-    arguments = (x[:, None] for x in (low, high, at_low, at_high, carry.met))
-    near, _ = bracketed(fn, *arguments)
-    lost = ~carry.met & carry.alive & (carry.share < 1)
-    return carry.met, lost, near[:, 0], jnp.abs(carry.width * span) / _SAMPLES
+    arguments = (x[:, None] for x in (low, high, at_low, at_high, carry.has_event))
+    roots, _ = bracketed_roots(fn, *arguments)
+    gave_up = ~carry.has_event & carry.is_successful & (carry.share < 1)
+    return carry.has_event, gave_up, roots[:, 0], jnp.abs(carry.width * span) / _SAMPLES
 
 
 def _first_minimum(
@@ -504,68 +539,72 @@ def _first_minimum(
             value, slope = until.values(moved_to(motion, t))
             return slope, value
 
-        return bracketed(
+        return bracketed_roots(
             fn, low, high, entries(slopes, place), entries(slopes, place + 1), is_minimum
         )
 
-    none = low, jnp.zeros_like(low)
-    time, value = jax.lax.cond(jnp.any(is_minimum), turning, lambda _: none, 0)
+    no_roots = low, jnp.zeros_like(low)
+    time, value = jax.lax.cond(jnp.any(is_minimum), turning, lambda _: no_roots, 0)
     side = entries(sides, place)
     across = is_minimum & (jnp.where(value >= 0, 1, -1) != side)
-    pair, some = first_true(across, 1)
-    interval = jnp.where(some, entries(place, pair), _SAMPLES)
+    pair, exists = first_true(across, 1)
+    interval = jnp.where(exists, entries(place, pair), _SAMPLES)
     return _Minimum(
         *(x[:, 0] for x in (interval, *(entries(x, pair) for x in (time, value, side))))
     )
 
 
-def _bracket(sampled: Trajectory, grid, values, change, minimum: _Minimum, wanted, new) -> _Bracket:
-    """Around the first event, a change of sign between two samples or a minimum; ``wanted`` (N,) is
-    the direction in the order of the samples, 0 for any. Where no event is ``new``, any numbers."""
-    here = jnp.where(new, jnp.minimum(minimum.place, change), 0)[:, None]
+def _bracket(
+    sampled: Trajectory, grid, values, change, minimum: _Minimum, direction, is_new
+) -> _Bracket:
+    """Around the first event, a change of sign between two samples or a minimum; ``direction``
+    (N,): in the order of the samples, 0 for any. Only entries that are ``is_new`` have a meaning."""
+    interval = jnp.where(is_new, jnp.minimum(minimum.place, change), 0)[:, None]
     # of the pair of crossings at a minimum the second, where the first has the other direction
-    second = (wanted != 0) & (jnp.where(minimum.side < 0, 1, -1) != wanted)
+    is_second = (direction != 0) & (jnp.where(minimum.side < 0, 1, -1) != direction)
     is_minimum = minimum.place < change
-    early, delay = is_minimum & ~second, is_minimum & second
-    a, b, fa, fb = (entries(x, here + k)[:, 0] for x in (grid, values) for k in (0, 1))
+    ends_at_minimum, starts_at_minimum = is_minimum & ~is_second, is_minimum & is_second
+    a, b, fa, fb = (entries(x, interval + k)[:, 0] for x in (grid, values) for k in (0, 1))
     return _Bracket(
-        jnp.where(delay, minimum.time, a),
-        jnp.where(early, minimum.time, b),
-        jnp.where(delay, minimum.value, fa),
-        jnp.where(early, minimum.value, fb),
+        jnp.where(starts_at_minimum, minimum.time, a),
+        jnp.where(ends_at_minimum, minimum.time, b),
+        jnp.where(starts_at_minimum, minimum.value, fa),
+        jnp.where(ends_at_minimum, minimum.value, fb),
         a,
-        [jnp.take_along_axis(x, here[..., None], axis=1)[:, 0] for x in sampled._samples],
+        [jnp.take_along_axis(x, interval[..., None], axis=1)[:, 0] for x in sampled._samples],
     )
 
 
-def _stopped_at(lanes: Trajectory, ts: Array, until: Event, met: Array, near: Array, step: Array):
+def _stopped_at(
+    lanes: Trajectory, ts: Array, until: Event, has_event: Array, event_time: Array, step: Array
+):
     """Samples, status, steps, times and event times, with the derivatives of the motion."""
     back = ts[..., -1] < ts[..., 0]
     sign = jnp.where(back, -1, 1).astype(ts.dtype)
-    end = jnp.where(met, near, ts[..., -1])
+    end = jnp.where(has_event, event_time, ts[..., -1])
     if ts.ndim == 1:  # as far as the last event of all bodies
         end = sign * jnp.max(sign * end)
-    far = (sign * end)[..., None] < sign[..., None] * ts
-    states = moved_through(lanes, jnp.where(far, end[..., None], ts))
-    if ts.ndim > 1 or met.size == 1:  # the last sample of each body is at its own event
-        there = states[..., -1:]
+    is_past_end = (sign * end)[..., None] < sign[..., None] * ts
+    states = moved_through(lanes, jnp.where(is_past_end, end[..., None], ts))
+    if ts.ndim > 1 or has_event.size == 1:  # the last sample of each body is at its own event
+        near_event = states[..., -1:]
     else:
-        there = moved_to(states, jnp.where(met, near, ts[..., 0])[:, None])
+        near_event = moved_to(states, jnp.where(has_event, event_time, ts[..., 0])[:, None])
     # the motion in windows differed from this one by no more than the tolerance allows
-    limit = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(there._t)
+    limit = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(near_event._t)
     propagator: Any = lanes.propagator
     if not propagator.method.exact:
         limit = jnp.maximum(limit, 1e-4 * step.reshape(-1, 1))
-    delay, at_event = until.refined(there, limit)
-    event = there._t + delay
+    delay, at_event = until.refined(near_event, limit)
+    event = near_event._t + delay
     rows = jnp.broadcast_to(ts, (event.shape[0], ts.shape[-1]))
-    past = met[:, None] & (sign.reshape(-1, 1) * (rows - event) >= 0)
+    is_past = has_event[:, None] & (sign.reshape(-1, 1) * (rows - event) >= 0)
     path = [
-        jnp.where(past[..., None], x, y)
+        jnp.where(is_past[..., None], x, y)
         for x, y in zip(at_event._samples, states._samples, strict=True)
     ]
     wxyz, omega, *spins = path
-    status = jnp.where(met, there.status, states.status)
-    times = jnp.where(past, event, rows)
-    event = jnp.where(met, event[:, 0], jnp.inf)
+    status = jnp.where(has_event, near_event.status, states.status)
+    times = jnp.where(is_past, event, rows)
+    event = jnp.where(has_event, event[:, 0], jnp.inf)
     return wxyz, omega, spins[0] if spins else None, status, states._steps, times, event

@@ -444,7 +444,7 @@ def _of_wheels(wheels, loose: Sequence[Array]) -> Array:
     """Values of the wheels that turn freely or by a motor, as (..., m) of all; else zero."""
     values = iter(loose)
     zero = jnp.zeros_like(loose[0])
-    return jnp.stack([zero if is_held else next(values) for is_held in wheels.held], axis=-1)
+    return jnp.stack([zero if is_held else next(values) for is_held in wheels.is_held], axis=-1)
 
 
 def _lanes_first(y):

@@ -283,20 +283,20 @@ class _ClusterMotor(AbstractCoupling):
     max_torque: Float[Array, "*#b"] | None = shaped()
 
     def torque(self, t, speed, attitude, omega):
-        return self._limited(self._commanded(t, attitude, omega))
+        return self._limit(self._command_torque(t, attitude, omega))
 
     def torque_among(self, t, i, speed_of, attitude, omega):
-        total = self._commanded(t, attitude, omega)
+        total = self._command_torque(t, attitude, omega)
         for j in range(self.null.shape[-1]):
             excess = speed_of(self.first + j) - self.bias[j]
             total = total - self.null[j] * excess
-        return self._limited(total)
+        return self._limit(total)
 
-    def _commanded(self, t, attitude: Attitude, omega: Sequence[Array]) -> Array:
+    def _command_torque(self, t, attitude: Attitude, omega: Sequence[Array]) -> Array:
         command = _CLUSTER_COMMAND.mapped(self.command, t, stacked(attitude.wxyz), stacked(omega))
         return -dot(components(self.share), components(command))
 
-    def _limited(self, torque: Array) -> Array:
+    def _limit(self, torque: Array) -> Array:
         if self.max_torque is None:
             return torque
         return jnp.clip(torque, -self.max_torque, self.max_torque)

@@ -98,16 +98,16 @@ def _functions(x: Array, hyperbolic: bool) -> tuple[Array, Array, Array]:
     square = x * x
     if hyperbolic:
         # of exponentials of |x|/2 itself: those of JAX add a logarithm of 2, which costs digits
-        grown = jnp.expm1(jnp.abs(x) / 2)
-        half = jnp.sign(x) * (grown + grown / (1 + grown)) / 2
-        sine, near = half * (1 + grown + 1 / (1 + grown)), 3
+        growth = jnp.expm1(jnp.abs(x) / 2)
+        half = jnp.sign(x) * (growth + growth / (1 + growth)) / 2
+        sine, series_bound = half * (1 + growth + 1 / (1 + growth)), 3
     else:
         half = jnp.sin(x / 2)
-        sine, near = 2 * half * jnp.cos(x / 2), 10
-    close = jnp.minimum(square, near)
-    series = x * square * _series(close if hyperbolic else -close)
+        sine, series_bound = 2 * half * jnp.cos(x / 2), 10
+    series_argument = jnp.minimum(square, series_bound)
+    series = x * square * _series(series_argument if hyperbolic else -series_argument)
     lag = sine - x if hyperbolic else x - sine
-    return sine, 2 * half * half, jnp.where(square < near, series, lag)
+    return sine, 2 * half * half, jnp.where(square < series_bound, series, lag)
 
 
 def _series(square: Array) -> Array:
@@ -200,11 +200,13 @@ class KeplerOrbit(AbstractOrbit):
         mean_anomaly: ArrayLike = 0.0,
         epoch: ArrayLike = 0.0,
     ):
-        given = locals()
+        arguments = locals()
         self.position = self.velocity = None
         if eccentricity is None:
-            self.eccentricity = given.pop("eccentricity")
-        numbers = {name: as_number(name, given[name]) for name in self.core_ranks if name in given}
+            self.eccentricity = arguments.pop("eccentricity")
+        numbers = {
+            name: as_number(name, arguments[name]) for name in self.core_ranks if name in arguments
+        }
         dtype = jnp.result_type(*(x for x in numbers.values()))
         for name, value in numbers.items():
             setattr(self, name, value.astype(dtype))
@@ -215,10 +217,10 @@ class KeplerOrbit(AbstractOrbit):
             e = np.asarray(self.eccentricity)
             fits = e > 1 if self.hyperbolic else (e >= 0) & (e < 1)
             bounds = "be above 1" if self.hyperbolic else "lie in [0, 1)"
-            other = "KeplerOrbit" if self.hyperbolic else "HyperbolicOrbit"
+            other_class = "KeplerOrbit" if self.hyperbolic else "HyperbolicOrbit"
             require(
                 fits,
-                lambda: f"eccentricity must {bounds}, got {eccentricity}; see ph.{other}.",
+                lambda: f"eccentricity must {bounds}, got {eccentricity}; see ph.{other_class}.",
             )
         if is_concrete(self.semi_major_axis):
             axis = np.asarray(self.semi_major_axis)
@@ -440,13 +442,13 @@ class LVLH(AbstractPart):
             momentum, normal = jnp.broadcast_to(self.orbit.momentum, r.shape), None
         else:  # what is no conic may leave its plane
 
-            def moving(t):
+            def place_and_velocity(t):
                 return jax.jvp(place, (t,), (jnp.ones_like(t),))
 
             place = self.orbit
             if not isinstance(place, AbstractOrbit):
                 place = jnp.vectorize(place, signature="()->(n)")
-            (r, v), (_, force) = jax.jvp(moving, (t,), (jnp.ones_like(t),))
+            (r, v), (_, force) = jax.jvp(place_and_velocity, (t,), (jnp.ones_like(t),))
             momentum = jnp.cross(r, v)
             normal = jnp.sum(force * momentum, axis=-1, keepdims=True)
         return _axes(r, momentum, normal)
@@ -467,7 +469,7 @@ class LVLH(AbstractPart):
 
         From attitude (..., 4) body -> space and body rates (..., 3) [rad/s] at times ``t``.
         """
-        wxyz, omega, frame, rates = self._given(wxyz, omega_body, t)
+        wxyz, omega, frame, rates = self._as_arrays(wxyz, omega_body, t)
         relative = rotation.multiply(rotation.conjugate(frame), wxyz)
         return relative, omega - rotation.rotate(rotation.conjugate(relative), rates)
 
@@ -479,9 +481,9 @@ class LVLH(AbstractPart):
         From attitude (..., 4) body -> frame, and rates (..., 3) [rad/s] against the frame in body
         axes.
         """
-        wxyz, omega, frame, rates = self._given(wxyz, omega_body, t)
-        turned = omega + rotation.rotate(rotation.conjugate(wxyz), rates)
-        return rotation.multiply(frame, wxyz), turned
+        wxyz, omega, frame, rates = self._as_arrays(wxyz, omega_body, t)
+        omega_space = omega + rotation.rotate(rotation.conjugate(wxyz), rates)
+        return rotation.multiply(frame, wxyz), omega_space
 
     def yaw_pitch_roll(self, trajectory: Any) -> tuple[Array, Array, Array]:
         """Angles ZYX [rad] of a trajectory's body axes in the frame, each (..., T)."""
@@ -491,7 +493,7 @@ class LVLH(AbstractPart):
         wxyz, _ = frame.to_frame(trajectory.wxyz, trajectory.omega_body, trajectory._t)
         return rotation.wxyz_to_euler(wxyz, rotation.Sequence.ZYX)
 
-    def _given(self, wxyz, omega_body, t):
+    def _as_arrays(self, wxyz, omega_body, t):
         wxyz = rotation.normalise(as_float_array("wxyz", wxyz, (4,)))
         omega = as_float_array("omega_body", omega_body, (3,))
         t = as_float_array("t", t).astype(omega.dtype)

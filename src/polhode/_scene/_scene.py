@@ -177,8 +177,8 @@ class Scene(eqx.Module):
         torque: AbstractTorque | None = None,
         rotors: AbstractRotor | None = None,
     ):
-        given: Any = inertia
-        self.inertia, self.potential = given, potential
+        any_inertia: Any = inertia
+        self.inertia, self.potential = any_inertia, potential
         self.torque, self.rotors = torque, rotors
 
     def __check_init__(self):
@@ -220,8 +220,8 @@ class Scene(eqx.Module):
         wheels = self.rotors
         if not isinstance(wheels, Wheels) or wheels.is_constant:
             return self.inertia.is_possible
-        found = self.inertia.is_possible, self.carrier.is_possible, wheels.is_possible
-        return reduce(jnp.logical_and, jnp.broadcast_arrays(*found))
+        conditions = self.inertia.is_possible, self.carrier.is_possible, wheels.is_possible
+        return reduce(jnp.logical_and, jnp.broadcast_arrays(*conditions))
 
     @property
     def _wheels(self) -> Wheels | None:
@@ -283,16 +283,16 @@ class Scene(eqx.Module):
         state = (tuple(momentum[..., i] for i in range(3)), tuple(wxyz[..., i] for i in range(4)))
         dynamics = self.dynamics
         spins = dynamics.wheels.spins if dynamics.coupled else ()
-        push, _, *more = lie_poisson_field(t, (*state, spins) if spins else state, dynamics)
+        push, _, *groups = lie_poisson_field(t, (*state, spins) if spins else state, dynamics)
         rate = jnp.stack(jnp.broadcast_arrays(*push), axis=-1)
-        spin_rates = tuple(more[0]) if spins else ()
+        spin_rates = tuple(groups[0]) if spins else ()
 
         def carried(t, spins):
             return self.with_spins(spins).wheel_momentum(t)
 
         if self.rotors is not None:  # what the wheels take up does not turn the body
-            _, gained = jax.jvp(carried, (t, spins), (jnp.ones_like(t), spin_rates))
-            rate = rate - jnp.broadcast_to(gained, rate.shape)
+            _, wheel_momentum_rate = jax.jvp(carried, (t, spins), (jnp.ones_like(t), spin_rates))
+            rate = rate - jnp.broadcast_to(wheel_momentum_rate, rate.shape)
         if isinstance(self.inertia, VariableInertia):  # I domega/dt = dL/dt - (dI/dt) omega
 
             def carried_momentum(t):
@@ -351,15 +351,17 @@ def places_of(scene: Scene, free: Any) -> tuple[int, ...]:
         )
     leaves, tree = jax.tree.flatten(scene)
     marks = [object() for _ in leaves]
-    wanted = "free must point at arrays that the scene holds, such as s.torque.c"
+    requirement = "free must point at arrays that the scene holds, such as s.torque.c"
     try:
         places = tuple(marks.index(x) for x in jax.tree.leaves(free(tree.unflatten(marks))))
     except (AttributeError, TypeError, ValueError, IndexError) as error:
-        raise TypeError(f"{wanted}, neither a part of one nor made from it: {error}.") from error
+        raise TypeError(
+            f"{requirement}, neither a part of one nor made from it: {error}."
+        ) from error
     if not places or not all(
         jnp.issubdtype(jnp.result_type(leaves[i]), jnp.floating) for i in places
     ):
-        raise TypeError(f"{wanted}: one or more of real numbers.")
+        raise TypeError(f"{requirement}: one or more of real numbers.")
     if len(set(places)) < len(places):
         raise ValueError("free points at the same array twice.")
     return places

@@ -90,14 +90,14 @@ class Table(AbstractPart):
             self.derivatives = _derivatives(self.values, knots)
             self.has_kinks = _has_kinks(self.values, self.derivatives, knots)
             return
-        known = as_float_array("Table derivatives", derivatives)
+        derivative_array = as_float_array("Table derivatives", derivatives)
         core = 1 if self.is_number else 2
-        if known.shape[-core:] != array.shape[-core:]:
+        if derivative_array.shape[-core:] != array.shape[-core:]:
             raise ValueError(
                 f"Table derivatives must have the shape of the values, {array.shape}, got"
-                f" {known.shape}."
+                f" {derivative_array.shape}."
             )
-        self.derivatives = known[..., None] if self.is_number else known
+        self.derivatives = derivative_array[..., None] if self.is_number else derivative_array
         self.has_kinks = _has_kinks(self.values, self.derivatives, knots)
 
     def __call__(self, t: Array | float) -> Array:
@@ -108,8 +108,8 @@ class Table(AbstractPart):
         times = self.times.astype(self.values.dtype)
         has_kinks = jnp.broadcast_to(self.has_kinks, t.shape)
         interpolate = _linear if self.order == 1 else _cubic
-        found = interpolate(self, times, t, has_kinks)
-        return found[..., 0] if self.is_number else found
+        interpolated = interpolate(self, times, t, has_kinks)
+        return interpolated[..., 0] if self.is_number else interpolated
 
 
 def _is_number(shape: tuple[int, ...], n: int, kind: str | None) -> bool:
@@ -129,8 +129,8 @@ def _is_number(shape: tuple[int, ...], n: int, kind: str | None) -> bool:
 
 def _linear(table: Table, times: Array, t: Array, has_kinks: Array) -> Array:
     i = _interval(times, t, has_kinks)
-    first, last = times[i], times[i + 1]
-    share = ((t - first) / (last - first))[..., None]
+    start, stop = times[i], times[i + 1]
+    share = ((t - start) / (stop - start))[..., None]
     low, high = _rows(table.values, i), _rows(table.values, i + 1)
     return low + share * (high - low)
 
@@ -176,8 +176,8 @@ def _interval(times: Array, t: Array, has_kinks: Array) -> Array:
     warning.
     """
     place = jnp.clip(jnp.floor(_place(times, t, has_kinks)), 0, times.size - 2)
-    last = _last_before(times, t)
-    return jnp.where(has_kinks > 0, place.astype(last.dtype), last)
+    index = _last_before(times, t)
+    return jnp.where(has_kinks > 0, place.astype(index.dtype), index)
 
 
 def _rows(values: Array, i: Array) -> Array:
@@ -194,23 +194,23 @@ def _derivatives(values: Array, times: Array) -> Array:
     n = times.size
     count = min(_NEIGHBOURS, n)
     place = np.arange(n)
-    first = np.clip(place - count // 2, 0, n - count)
+    first_index = np.clip(place - count // 2, 0, n - count)
     total = jnp.zeros_like(values)
     for j in range(count):
         # Lagrange's polynomial l_j, which is 1 at its own time: there its derivative is a sum, and
         # at the other times a product without the factor that is zero
-        own = first + j == place
-        at = times[first + j]
+        is_node = first_index + j == place
+        at = times[first_index + j]
         weight, product = jnp.zeros_like(times), jnp.ones_like(times)
         for k in range(count):
             if k == j:
                 continue
-            other = times[first + k]
-            weight = weight + 1 / jnp.where(own, times - other, 1)
-            here = first + k == place
-            product = product * jnp.where(here, 1, times - other) / (at - other)
-        weight = jnp.where(own, weight, product)[:, None]
-        rows = values[..., first + j, :]
+            node_time = times[first_index + k]
+            weight = weight + 1 / jnp.where(is_node, times - node_time, 1)
+            is_other_node = first_index + k == place
+            product = product * jnp.where(is_other_node, 1, times - node_time) / (at - node_time)
+        weight = jnp.where(is_node, weight, product)[:, None]
+        rows = values[..., first_index + j, :]
         total = total + weight.reshape((1,) * (values.ndim - 2) + weight.shape) * rows
     return total
 
@@ -231,5 +231,5 @@ def _has_kinks(values: Array, derivatives: Array, times: Array) -> Array:
     )
     size = jnp.max(jnp.abs(values), axis=(-1, -2))
     limit = max(_NEGLIGIBLE, 32 * float(jnp.finfo(values.dtype).eps))
-    found = jnp.max(jump, axis=(-1, -2), initial=0.0) > limit * size
-    return jax.lax.stop_gradient(jnp.where(found, 1, 0).astype(values.dtype))
+    has_kink = jnp.max(jump, axis=(-1, -2), initial=0.0) > limit * size
+    return jax.lax.stop_gradient(jnp.where(has_kink, 1, 0).astype(values.dtype))

@@ -84,8 +84,8 @@ class TorqueSum(AbstractTorque, AbstractSum):
         return TorqueSum(tuple(term.with_wheels(momentum) for term in self.terms))
 
     def slip(self, t, momentum, omega):
-        found = (term.slip(t, momentum, omega) for term in self.terms)
-        parts = list(zip(*(x for x in found if x is not None)))
+        slips = (term.slip(t, momentum, omega) for term in self.terms)
+        parts = list(zip(*(x for x in slips if x is not None)))
         return tuple(sum(rest, start=first) for first, *rest in parts) if parts else None
 
 
@@ -383,13 +383,13 @@ class Pulses(AbstractTorque):
 
     @property
     def edges(self) -> Array | None:
-        inner = self.torque.edges
-        own = [self.starts, self.ends] + ([] if inner is None else [inner])
-        return jnp.concatenate(own)
+        torque_edges = self.torque.edges
+        times = [self.starts, self.ends] + ([] if torque_edges is None else [torque_edges])
+        return jnp.concatenate(times)
 
     def during(self, t: Array | float) -> AbstractTorque:
-        inner = eqx.tree_at(lambda p: p.torque, self, self.torque.during(t))
-        return eqx.tree_at(lambda p: p.on, inner, self._acts(t), is_leaf=lambda x: x is None)
+        pulses = eqx.tree_at(lambda p: p.torque, self, self.torque.during(t))
+        return eqx.tree_at(lambda p: p.on, pulses, self._acts(t), is_leaf=lambda x: x is None)
 
     def with_wheels(self, momentum: Sequence[Array]) -> AbstractTorque:
         return eqx.tree_at(lambda p: p.torque, self, self.torque.with_wheels(momentum))
@@ -412,5 +412,5 @@ class Pulses(AbstractTorque):
     def slip(
         self, t: Array | float, momentum: Sequence[Array], omega: Sequence[Array]
     ) -> Vector | None:
-        found = self.torque.slip(t, momentum, omega)
-        return None if found is None else triple(self._acts(t) * x for x in found)
+        slip = self.torque.slip(t, momentum, omega)
+        return None if slip is None else triple(self._acts(t) * x for x in slip)

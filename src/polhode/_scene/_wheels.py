@@ -193,7 +193,7 @@ class AbstractRotor(AbstractPart):
         couplings = tuple(w.coupling for w in self.wheels if w.coupling is not None)
         return Wheels(
             impulses=tuple(wheel.impulse for wheel in self.wheels),
-            held=tuple(wheel.is_held for wheel in self.wheels),
+            is_held=tuple(wheel.is_held for wheel in self.wheels),
             along=tuple(wheel.axis for wheel in self.wheels),
             coupled=tuple(i for i, wheel in enumerate(self.wheels) if wheel.coupling is not None),
             axes=axes,
@@ -231,13 +231,13 @@ class Wheels(AbstractRotor):
     """Rotors whose motion is known: what ``Rotor`` becomes once the state of the body is.
 
     ``axes`` (..., m, 3); ``momentum`` (..., m) at the time ``start`` (...), relative to the body
-    where ``held``, else absolute; ``inertia`` (..., m), 0 where not known; ``torque`` (..., m).
+    where ``is_held``, else absolute; ``inertia`` (..., m), 0 where not known; ``torque`` (..., m).
     ``coupled`` (static): the wheels whose momenta are part of the state, the initial ones standing
     in ``momentum``; ``spins``: their momenta of the moment, see ``at``.
     """
 
     impulses: tuple[Callable | None, ...]
-    held: tuple[bool, ...] = eqx.field(static=True)
+    is_held: tuple[bool, ...] = eqx.field(static=True)
     along: tuple[int | None, ...] = eqx.field(static=True)
     coupled: tuple[int, ...] = eqx.field(static=True)
     axes: Float[Array, "*#b m 3"] = shaped(None, 3)
@@ -266,18 +266,18 @@ class Wheels(AbstractRotor):
     @property
     def is_constant(self) -> bool:
         """Whether every wheel is held (static); the momentum may be constant all the same."""
-        return all(self.held)
+        return all(self.is_held)
 
     @property
     def loose(self) -> tuple[int, ...]:
         """Which wheels are not held (static)."""
-        return tuple(i for i, held in enumerate(self.held) if not held)
+        return tuple(i for i, is_held in enumerate(self.is_held) if not is_held)
 
     def settle(self, omega_body, start, wheel_speed=None):
         if wheel_speed is None:
             return self
-        _speeds_of(wheel_speed, len(self.held))
-        loose = ~np.array(self.held)
+        _speeds_of(wheel_speed, len(self.is_held))
+        loose = ~np.array(self.is_held)
         axes, omega = jnp.broadcast_arrays(self.axes, omega_body[..., None, :])
         speeds, turning, inertia, momentum, loose = jnp.broadcast_arrays(
             wheel_speed, jnp.sum(axes * omega, axis=-1), self.inertia, self.momentum, loose
@@ -289,7 +289,7 @@ class Wheels(AbstractRotor):
         """The wheels at a moment when those that are coupled have these momenta [kg m^2/s]."""
         return dataclasses.replace(self, spins=tuple(spins))
 
-    def begun(self, spins: Array) -> "Wheels":
+    def with_spins_at_start(self, spins: Array) -> "Wheels":
         """The wheels with these initial momenta (..., k) of those that are coupled."""
         shape = jnp.broadcast_shapes(spins.shape[:-1], self.momentum.shape[:-1])
         momentum = jnp.broadcast_to(self.momentum, (*shape, self.momentum.shape[-1]))
@@ -304,21 +304,21 @@ class Wheels(AbstractRotor):
         """Speed of wheel i relative to the body [rad/s]; NaN where its inertia is not known."""
         inertia, momentum = self.inertia[..., i], self.axial_momentum(i, t)
         is_known = inertia > 0
-        own = jnp.where(is_known, momentum / jnp.where(is_known, inertia, 1), jnp.nan)
-        if self.held[i]:
-            return own
-        return own - dot(tuple(self.axes[..., i, k] for k in range(3)), omega)
+        spin_rate = jnp.where(is_known, momentum / jnp.where(is_known, inertia, 1), jnp.nan)
+        if self.is_held[i]:
+            return spin_rate
+        return spin_rate - dot(tuple(self.axes[..., i, k] for k in range(3)), omega)
 
     def motor_torques(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> list[Array]:
         """Torque [N m] on each wheel about its axis from the body; zero where it is held."""
         torques, couplings = [], iter(() if self.couplings is None else self.couplings.terms)
-        for i, held in enumerate(self.held):
+        for i, is_held in enumerate(self.is_held):
             if i in self.coupled:
                 speed_of = partial(self.speed, t=t, omega=omega)
                 torques.append(next(couplings).torque_among(t, i, speed_of, attitude, omega))
-            elif held:
+            elif is_held:
                 torques.append(jnp.zeros_like(omega[0]))
             else:
                 t = jnp.asarray(t, self.momentum.dtype)
@@ -332,8 +332,8 @@ class Wheels(AbstractRotor):
         """Power [W] that motor and friction of each wheel give to the motion; zero where held."""
         torques = self.motor_torques(t, attitude, omega)
         return [
-            torque if held else torque * self.speed(i, t, omega)
-            for i, (held, torque) in enumerate(zip(self.held, torques))
+            torque if is_held else torque * self.speed(i, t, omega)
+            for i, (is_held, torque) in enumerate(zip(self.is_held, torques))
         ]
 
     def axial_momentum(self, i: int, t: Array | float) -> Array:
@@ -341,21 +341,21 @@ class Wheels(AbstractRotor):
         if i in self.coupled and self.spins:
             return self.spins[self.coupled.index(i)]
         momentum, impulse = self.momentum[..., i], self.impulses[i]
-        if self.held[i] or i in self.coupled:
+        if self.is_held[i] or i in self.coupled:
             return momentum
         if impulse is None:
             return momentum + self.torque[..., i] * (t - self.start)
 
-        def given(t):
+        def impulse_at(t):
             return IMPULSE.mapped(impulse, t)
 
-        return momentum + (given(t) - given(self.start))
+        return momentum + (impulse_at(t) - impulse_at(self.start))
 
     def body_momentum(self, t: Array | float) -> Vector:
         """h(t): what L is more than the momentum of the body [kg m^2/s], body components."""
         parts = [
             tuple(self.axial_momentum(i, t) * self.axes[..., i, k] for k in range(3))
-            for i in range(len(self.held))
+            for i in range(len(self.is_held))
         ]
         return triple(sum(column[1:], start=column[0]) for column in zip(*parts))
 
@@ -371,15 +371,17 @@ class Wheels(AbstractRotor):
             return inertia
         along = [k for i in loose if (k := self.along[i]) is not None]
         if inertia.is_principal and len(along) == len(loose):
-            less = jnp.zeros((3,), inertia.dtype)
+            wheel_inertia = jnp.zeros((3,), inertia.dtype)
             for i, k in zip(loose, along):
                 column = [jnp.zeros_like(self.inertia[..., i])] * 3
                 column[k] = self.inertia[..., i]
-                less = jnp.add(*jnp.broadcast_arrays(less, jnp.stack(column, axis=-1)))
+                wheel_inertia = jnp.add(
+                    *jnp.broadcast_arrays(wheel_inertia, jnp.stack(column, axis=-1))
+                )
             axial = all(k == 2 for k in along)
             symmetric = axial and inertia.symmetry is not Symmetry.NONE
             kind = Symmetry.AXISYMMETRIC if symmetric else Symmetry.NONE
-            moments = jnp.subtract(*jnp.broadcast_arrays(inertia.moments, less))
+            moments = jnp.subtract(*jnp.broadcast_arrays(inertia.moments, wheel_inertia))
             return Inertia.of_symmetry(moments, kind, physical=False)
         tensor = inertia.tensor
         for i in loose:

@@ -2,10 +2,10 @@
 
 from polhode._trajectory._propagator import (
     Propagator as Propagator,
-    begun as begun,
     moved_through as moved_through,
     moved_to as moved_to,
     shortly_after as shortly_after,
+    with_initial_spins as with_initial_spins,
 )
 from polhode._trajectory._saved import (
     final_of as final_of,

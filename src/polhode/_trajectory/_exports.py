@@ -110,11 +110,11 @@ def write_aem(
         raise ValueError(f"time_system must be one of {', '.join(_TIME_SYSTEMS)}: {time_system!r}.")
     wxyz = np.asarray(trajectory.wxyz, np.float64)
     count, samples = int(np.prod(wxyz.shape[:-2], dtype=int)), wxyz.shape[-2]
-    names = _each("object_name", object_name, count)
-    identities = _each("object_id", object_id, count)
-    fixed = {"originator": originator, "frame": frame, "body_frame": body_frame}
+    names = _one_per_body("object_name", object_name, count)
+    identities = _one_per_body("object_id", object_id, count)
+    text_fields = {"originator": originator, "frame": frame, "body_frame": body_frame}
     for name, value in (
-        fixed | ({} if center_name is None else {"center_name": center_name})
+        text_fields | ({} if center_name is None else {"center_name": center_name})
     ).items():
         _text(name, value)
     omega = np.asarray(trajectory.omega_body, np.float64) if rates else wxyz[..., :0]
@@ -175,7 +175,7 @@ def _instant(name: str, value: Any) -> np.datetime64:
         raise ValueError(f"{name}: there is no time {value}: {error}.") from None
 
 
-def _each(name: str, value: Any, count: int) -> list[str]:
+def _one_per_body(name: str, value: Any, count: int) -> list[str]:
     values = [value] if isinstance(value, str) else list(value)
     if len(values) != count:
         raise ValueError(f"{name} must name each of {count} bodies, got {len(values)}.")

@@ -104,11 +104,13 @@ def _until_event(trajectory: Trajectory, times: Array) -> Array:
     return jnp.where(beyond, event, times)
 
 
-def begun(scene: Scene, spins: list[Array]) -> Scene:
+def with_initial_spins(scene: Scene, spins: list[Array]) -> Scene:
     """The scene with these momenta of its coupled wheels, if there are such."""
     if not spins or not isinstance(scene.rotors, Wheels):
         return scene
-    return Scene(scene.inertia, scene.potential, scene.torque, scene.rotors.begun(*spins))
+    return Scene(
+        scene.inertia, scene.potential, scene.torque, scene.rotors.with_spins_at_start(*spins)
+    )
 
 
 def _from_first(propagator: Propagator, scene: Scene, samples, ts, times):
@@ -116,7 +118,9 @@ def _from_first(propagator: Propagator, scene: Scene, samples, ts, times):
     wxyz, omega, *spins = (x[:, 0] for x in samples)
     times = jnp.concatenate([ts[..., :1], times], axis=-1)
     rtol = None if propagator.rtol is None else jnp.min(propagator.rtol)
-    result = propagator.method.run(begun(scene, spins), State(wxyz, omega), times, rtol, Record())
+    result = propagator.method.run(
+        with_initial_spins(scene, spins), State(wxyz, omega), times, rtol, Record()
+    )
     states = [x[:, 1:] for x in (result.wxyz, result.omega_body, result.spins) if x is not None]
     return states, result.status, result.steps
 
@@ -132,30 +136,32 @@ def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
     def from_sample(scene, start, begin, end, unit):
         """Lanes at ``end`` () or (N,), their status and steps."""
         wxyz, omega, *spins = start
-        scene = begun(scene, spins)
-        there = begin == end
-        span = jnp.stack([begin, jnp.where(there, begin + unit, end)], axis=-1)
+        scene = with_initial_spins(scene, spins)
+        is_sample_time = begin == end
+        span = jnp.stack([begin, jnp.where(is_sample_time, begin + unit, end)], axis=-1)
         result = propagator.method.run(scene, State(wxyz, omega), span, rtol, final)
         # where no time passes, the sample itself, with its derivatives by the time
         step = jnp.broadcast_to((end - begin)[..., None], (*wxyz.shape[:-1], 1))
-        here = jnp.broadcast_to(there[..., None], step.shape)
-        ends = [x[:, 0] for x in (result.wxyz, result.omega_body, result.spins) if x is not None]
-        near = _along(scene, start, begin)(jnp.where(here, step, 0))
-        states = [jnp.where(here, x, end) for x, end in zip(near, ends)]
+        is_sample = jnp.broadcast_to(is_sample_time[..., None], step.shape)
+        end_states = [
+            x[:, 0] for x in (result.wxyz, result.omega_body, result.spins) if x is not None
+        ]
+        start_states = _along(scene, start, begin)(jnp.where(is_sample, step, 0))
+        states = [jnp.where(is_sample, x, end) for x, end in zip(start_states, end_states)]
         return (
             states,
-            jnp.where(here[:, 0], Status.SUCCESSFUL, result.status),
-            jax.tree.map(lambda x: jnp.where(here[:, 0], 0, x), result.steps),
+            jnp.where(is_sample[:, 0], Status.SUCCESSFUL, result.status),
+            jax.tree.map(lambda x: jnp.where(is_sample[:, 0], 0, x), result.steps),
         )
 
     if ts.ndim == 1:
         place = _nearest(ts, times)
 
-        def one(arguments):
+        def state_at(arguments):
             k, t = arguments
             return from_sample(scene, [x[:, k] for x in samples], ts[k], t, unit)
 
-        states, status, steps = jax.lax.map(one, (place, times))
+        states, status, steps = jax.lax.map(state_at, (place, times))
         states = [jnp.moveaxis(x, 0, 1) for x in states]
         return states, jnp.max(status, axis=0), jax.tree.map(lambda x: jnp.sum(x, axis=0), steps)
     n, count = times.shape
@@ -193,17 +199,22 @@ def _along(scene: Scene, samples: list[Array], t: Array) -> Callable[[Array], li
 
     def rates(samples, t):
         wxyz, omega, *spins = samples
-        now = tuple(jnp.moveaxis(spins[0], -1, 0)) if spins else ()
-        acceleration, wheel_torques = scene.with_spins(now).changes(wxyz, omega, t)
-        more = [jnp.stack(jnp.broadcast_arrays(*wheel_torques), axis=-1)] if wheel_torques else []
-        return [wxyz_rate(wxyz, omega), acceleration, *more]
+        wheel_spins = tuple(jnp.moveaxis(spins[0], -1, 0)) if spins else ()
+        acceleration, wheel_torques = scene.with_spins(wheel_spins).changes(wxyz, omega, t)
+        spin_rates = (
+            [jnp.stack(jnp.broadcast_arrays(*wheel_torques), axis=-1)] if wheel_torques else []
+        )
+        return [wxyz_rate(wxyz, omega), acceleration, *spin_rates]
 
     begin = list(samples), jnp.asarray(t)
-    first = rates(*begin)
-    _, second = jax.jvp(rates, begin, (first, jnp.ones_like(begin[1])))
+    first_derivative = rates(*begin)
+    _, second_derivative = jax.jvp(rates, begin, (first_derivative, jnp.ones_like(begin[1])))
 
     def later(step: Array) -> list[Array]:
-        return [x + step * (a + step / 2 * b) for x, a, b in zip(samples, first, second)]
+        return [
+            x + step * (a + step / 2 * b)
+            for x, a, b in zip(samples, first_derivative, second_derivative)
+        ]
 
     return later
 

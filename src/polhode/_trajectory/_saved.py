@@ -24,13 +24,13 @@ def values_of(save: Callable, scene: Scene, ts: Array, samples: Samples) -> PyTr
     Rows of floats are NaN where the samples of a body are not finite.
     """
     lanes, shared = eqx.partition((scene, None), is_lane_tree((scene, None)))
-    times, own = (None, ts) if ts.ndim > 1 else (ts, None)
+    times, body_times = (None, ts) if ts.ndim > 1 else (ts, None)
     samples = samples._replace(saved=None, final=None)
 
-    def of_body(lanes, own, x: Samples):
+    def of_body(lanes, own_times, x: Samples):
         scene, _ = eqx.combine(lanes, shared)
         body = Trajectory(
-            own if times is None else times,
+            own_times if times is None else times,
             x.wxyz,
             x.omega_body,
             x.status,
@@ -53,7 +53,7 @@ def values_of(save: Callable, scene: Scene, ts: Array, samples: Samples) -> PyTr
 
         return jax.tree.map(masked, values)
 
-    return jax.vmap(of_body)(lanes, own, samples)
+    return jax.vmap(of_body)(lanes, body_times, samples)
 
 
 def with_saved(trajectory: Trajectory, save: Callable) -> Trajectory:

@@ -31,15 +31,15 @@ def _sample(wxyz: Array, omega: Array, place: int) -> tuple[Array, Array]:
 
 
 @eqx.filter_jit  # likewise
-def _speeds(bare: "Trajectory", place: int) -> Array | None:
+def _speeds(trajectory: "Trajectory", place: int) -> Array | None:
     """Wheel speeds (..., m) of one sample."""
-    speeds = bare[..., place].wheel_speed
+    speeds = trajectory[..., place].wheel_speed
     return None if speeds is None else speeds[..., 0, :]
 
 
 @eqx.filter_jit  # likewise
-def _derived(of: Callable[["Trajectory"], Any], bare: "Trajectory") -> Any:
-    return of(bare)
+def _derived(of: Callable[["Trajectory"], Any], trajectory: "Trajectory") -> Any:
+    return of(trajectory)
 
 
 class AbstractPropagator(eqx.Module):
@@ -303,7 +303,7 @@ class Trajectory(eqx.Module):
         wheels = self.scene.rotors
         if not isinstance(wheels, Wheels) or wheels.is_constant:
             return State(wxyz, omega)
-        return State(wxyz, omega, _speeds(self._bare, place))
+        return State(wxyz, omega, _speeds(self._without_records, place))
 
     @property
     def _last_sample(self) -> "Trajectory":
@@ -330,11 +330,11 @@ class Trajectory(eqx.Module):
         def of_bodies(x, rank):
             if x is None or (lead := x.shape[: x.ndim - rank]) == ():
                 return x
-            full = jnp.broadcast_to(
+            expanded = jnp.broadcast_to(
                 x.reshape((1,) * (len(shape) - len(lead)) + x.shape),
                 (*shape, *x.shape[x.ndim - rank :]),
             )
-            return full[bodies] if bodies else full
+            return expanded[bodies] if bodies else expanded
 
         def of_both(x, rank):
             entries = of_bodies(x, rank)
@@ -400,10 +400,10 @@ class Trajectory(eqx.Module):
 
     def _compiled(self, of: Callable[["Trajectory"], Any]) -> Any:
         """What ``of`` makes of this trajectory, in one program that other records of it share."""
-        return _derived(of, self._bare)
+        return _derived(of, self._without_records)
 
     @property
-    def _bare(self) -> "Trajectory":
+    def _without_records(self) -> "Trajectory":
         """The samples and the scene, without other records."""
         return Trajectory(
             self.ts,
@@ -454,7 +454,7 @@ class Trajectory(eqx.Module):
         if not isinstance(wheels, Wheels):
             raise ValueError("this trajectory has no wheel_speed: its scene has no wheels.")
         omega = components(self.omega_body)
-        speeds = [wheels.speed(i, self._t, omega) for i in range(len(wheels.held))]
+        speeds = [wheels.speed(i, self._t, omega) for i in range(len(wheels.is_held))]
         shape = omega[0].shape
         return jnp.stack([jnp.broadcast_to(x, shape) for x in speeds], axis=-1)
 
@@ -517,19 +517,21 @@ class Trajectory(eqx.Module):
 
 def _spread(counts: np.ndarray) -> str:
     """The median of numbers of bodies, and their range."""
-    few, middle, many = counts.min(), np.median(counts), counts.max()
-    return f"{middle:,.0f}" + ("" if few == many else f", at least {few:,}, at most {many:,}")
+    minimum, median, maximum = counts.min(), np.median(counts), counts.max()
+    return f"{median:,.0f}" + (
+        "" if minimum == maximum else f", at least {minimum:,}, at most {maximum:,}"
+    )
 
 
-def _momentum_body(bare: Trajectory) -> Array:
-    return bare._scene.momentum(bare.omega_body, bare._t)
+def _momentum_body(trajectory: Trajectory) -> Array:
+    return trajectory._scene.momentum(trajectory.omega_body, trajectory._t)
 
 
-def _energy(bare: Trajectory) -> Array:
-    scene, attitude = bare._scene, None
+def _energy(trajectory: Trajectory) -> Array:
+    scene, attitude = trajectory._scene, None
     if scene.potential is not None:
-        attitude = from_quaternion(tuple(bare.wxyz[..., i] for i in range(4)))
-    return scene.hamiltonian.total(components(_momentum_body(bare)), attitude, bare._t)
+        attitude = from_quaternion(tuple(trajectory.wxyz[..., i] for i in range(4)))
+    return scene.hamiltonian.total(components(_momentum_body(trajectory)), attitude, trajectory._t)
 
 
 # Keys: a trajectory is indexed as an array of samples, bodies first, then times.
