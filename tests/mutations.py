@@ -103,8 +103,8 @@ MUTANTS = (
     ),
     Mutant(
         ANGLES,
-        "moved = angle_rates_from_rates(q, slip), cross(momentum, slip)",
-        "moved = angle_rates_from_rates(q, slip), cross(slip, momentum)",
+        "coordinate_rates = angle_rates_from_rates(q, slip), cross(momentum, slip)",
+        "coordinate_rates = angle_rates_from_rates(q, slip), cross(slip, momentum)",
         "an energy sink does not keep the momentum in Euler angles",
         ("torques/test_dissipation.py", "torques/test_every_torque.py"),
     ),
@@ -375,8 +375,8 @@ MUTANTS = (
     ),
     Mutant(
         RESIDUALS,
-        "rest = jnp.where(side > 0, jnp.maximum(rest, 0), rest)",
-        "rest = jnp.where(side > 0, jnp.minimum(rest, 0), rest)",
+        "residual = jnp.where(side > 0, jnp.maximum(residual, 0), residual)",
+        "residual = jnp.where(side > 0, jnp.minimum(residual, 0), residual)",
         "saturated readings pull the fit the wrong way",
         ("fit/test_gyroscope.py::test_a_saturated_reading_is_a_bound_beside_errors_of_scale",),
     ),

@@ -59,19 +59,19 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
     information = linear.information()
     dtype = information.dtype
     has_prior, precision = _priors(solution, recording)
-    free = np.flatnonzero(~has_prior)
-    inner = information[np.ix_(free, free)]
+    free_indices = np.flatnonzero(~has_prior)
+    free_information = information[np.ix_(free_indices, free_indices)]
     # Scaled to unit diagonal: the threshold of a null direction must not depend on units.
-    size = jnp.sqrt(jnp.diagonal(inner))
+    size = jnp.sqrt(jnp.diagonal(free_information))
     safe = jnp.where(size > 0, size, 1)
-    values, vectors = eigh(inner / safe[:, None] / safe[None])
+    values, vectors = eigh(free_information / safe[:, None] / safe[None])
     determined = values > 1e3 * float(jnp.finfo(dtype).eps) * values[-1]
-    inverted = jnp.where(determined, 1 / jnp.where(determined, values, 1), 0)
-    covariance = (vectors * inverted[None]) @ vectors.T / safe[:, None] / safe[None]
+    inverse_values = jnp.where(determined, 1 / jnp.where(determined, values, 1), 0)
+    covariance = (vectors * inverse_values[None]) @ vectors.T / safe[:, None] / safe[None]
     null = jnp.where(determined, 0, 1)[None] * vectors / safe[:, None]
     count = jnp.sum(determined).astype(dtype)
-    square = jnp.sum(linear.rest**2)
-    total = size_of_data(recording, linear.rest.shape[-1])
+    square = jnp.sum(linear.residuals**2)
+    total = size_of_data(recording, linear.residuals.shape[-1])
     prior_std = jnp.full(has_prior.size, jnp.inf, dtype)
     if not has_prior.any():
         noise = jnp.sqrt(square / jnp.maximum(total - count, 1))
@@ -80,7 +80,7 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
             information, covariance * variance, null, safe, jnp.sum(~determined), noise, prior_std
         )
     with_prior_index = np.flatnonzero(has_prior)
-    cross = information[np.ix_(free, with_prior_index)]
+    cross = information[np.ix_(free_indices, with_prior_index)]
     width = precision**-0.5
     correction = covariance @ cross
     # information of the data about the calibration, its unit the standard deviation of the prior
@@ -105,21 +105,35 @@ def determination_of(solution: Solution, recording: Recording, trust_noise: bool
     ) @ axes.T
     spread = jnp.where(variance > 0, spread, 0) if not trust_noise else spread
     spread = spread * width[:, None] * width[None]
-    beside = -correction @ spread
-    full = jnp.zeros_like(information)
-    full = full.at[np.ix_(free, free)].set(covariance * variance - beside @ correction.T)
-    full = (
-        full.at[np.ix_(free, with_prior_index)]
-        .set(beside)
-        .at[np.ix_(with_prior_index, free)]
-        .set(beside.T)
+    cross_covariance = -correction @ spread
+    full_covariance = jnp.zeros_like(information)
+    full_covariance = full_covariance.at[np.ix_(free_indices, free_indices)].set(
+        covariance * variance - cross_covariance @ correction.T
     )
-    full = full.at[np.ix_(with_prior_index, with_prior_index)].set(spread)
-    order = jnp.zeros((has_prior.size, has_prior.size), dtype).at[np.ix_(free, free)].set(null)
-    sizes = jnp.ones(has_prior.size, dtype).at[free].set(safe).at[with_prior_index].set(1 / width)
+    full_covariance = (
+        full_covariance.at[np.ix_(free_indices, with_prior_index)]
+        .set(cross_covariance)
+        .at[np.ix_(with_prior_index, free_indices)]
+        .set(cross_covariance.T)
+    )
+    full_covariance = full_covariance.at[np.ix_(with_prior_index, with_prior_index)].set(spread)
+    order = (
+        jnp.zeros((has_prior.size, has_prior.size), dtype)
+        .at[np.ix_(free_indices, free_indices)]
+        .set(null)
+    )
+    sizes = (
+        jnp.ones(has_prior.size, dtype)
+        .at[free_indices]
+        .set(safe)
+        .at[with_prior_index]
+        .set(1 / width)
+    )
     with_prior = information.at[with_prior_index, with_prior_index].add(precision * variance)
     prior_std = prior_std.at[with_prior_index].set(width)
-    return Determination(with_prior, full, order, sizes, jnp.sum(~determined), noise, prior_std)
+    return Determination(
+        with_prior, full_covariance, order, sizes, jnp.sum(~determined), noise, prior_std
+    )
 
 
 def _priors(solution: Solution, recording: Recording) -> tuple[np.ndarray, Array]:
@@ -141,8 +155,8 @@ def _priors(solution: Solution, recording: Recording) -> tuple[np.ndarray, Array
     walk = np.ones(0 if parameters.walk is None else parameters.walk[0].size, bool)
     recordings = parameters.omega.shape[0]
     has_prior = np.concatenate([*shared, *[np.concatenate([*of_recording, walk])] * recordings])
-    each = [prior.bias, *prior.motion, prior.gain, prior.delay, prior.walk]
-    flat = [jnp.ravel(x) for x in each if x is not None]
+    precisions = [prior.bias, *prior.motion, prior.gain, prior.delay, prior.walk]
+    flat = [jnp.ravel(x) for x in precisions if x is not None]
     dtype = parameters.omega.dtype
     return has_prior, jnp.concatenate([jnp.zeros(0, dtype), *flat]).astype(dtype)
 
@@ -155,15 +169,15 @@ class _Split(NamedTuple):
     motion: list[Array]
 
 
-def _split(shared: Array, count: int, parameters: Parameters) -> _Split:
+def _sort_by_kind(shared: Array, count: int, parameters: Parameters) -> _Split:
     """``shared`` (s,), in the order of ``Unknowns``, by what it is of."""
-    first = count
+    position = count
     sensor, motion = {}, []
 
     def part(like):
-        nonlocal first
-        first += like.size
-        return shared[first - like.size : first].reshape(like.shape)
+        nonlocal position
+        position += like.size
+        return shared[position - like.size : position].reshape(like.shape)
 
     for name in ("bias", "mounting", "lever"):
         if (value := getattr(parameters, name)) is not None:
@@ -209,9 +223,11 @@ def _initial(parameters: Parameters, recording: Recording, attitude: Array | Non
     if recording.wxyz is not None:
         turn = rotation_vector_to_wxyz(require_channel("attitude", parameters.attitude))
         return State(multiply(recording.wxyz[:, 0], turn), parameters.omega)
-    first = jnp.asarray([1, 0, 0, 0]) if attitude is None else attitude
-    first = first.astype(parameters.omega.dtype)
-    return State(jnp.broadcast_to(first, (*parameters.omega.shape[:-1], 4)), parameters.omega)
+    first_attitude = jnp.asarray([1, 0, 0, 0]) if attitude is None else attitude
+    first_attitude = first_attitude.astype(parameters.omega.dtype)
+    return State(
+        jnp.broadcast_to(first_attitude, (*parameters.omega.shape[:-1], 4)), parameters.omega
+    )
 
 
 def _rms(parts: dict[str, Array], recording: Recording) -> Array:
@@ -248,16 +264,20 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
     determination = determination_of(solution, recording, noise_is_trusted(options))
     information, covariance, null, safe = determination[:4]
 
-    full = jnp.concatenate([slope, jnp.zeros((9, information.shape[0] - count), dtype)], axis=1)
-    spread = jnp.sqrt(jnp.maximum(jnp.sum((full @ covariance) * full, axis=1), 0))
+    full_derivative = jnp.concatenate(
+        [slope, jnp.zeros((9, information.shape[0] - count), dtype)], axis=1
+    )
+    spread = jnp.sqrt(
+        jnp.maximum(jnp.sum((full_derivative @ covariance) * full_derivative, axis=1), 0)
+    )
     # what leans on a null direction is not known at all
-    leaning = jnp.sqrt(jnp.sum((full @ null) ** 2, axis=1))
-    reach = jnp.sqrt(jnp.sum((full / safe[None]) ** 2, axis=1))
+    leaning = jnp.sqrt(jnp.sum((full_derivative @ null) ** 2, axis=1))
+    reach = jnp.sqrt(jnp.sum((full_derivative / safe[None]) ** 2, axis=1))
     reach = jnp.concatenate([reach[:3], reach[:3] / moments[2], reach[6:]])
     spread = jnp.where(leaning > 1e-3 * reach, jnp.inf, spread)
     axes_std = turn_std(moments, spread[6:])
 
-    std = _split(_deviations(determination, linear.shared.shape[-1]), count, parameters)
+    std = _sort_by_kind(_deviations(determination, linear.shared.shape[-1]), count, parameters)
     trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
     findings = {
         Finding.NOT_FINITE: ~(jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(tensor))),
@@ -296,7 +316,7 @@ def conclude_scene(solution: Solution, recording: Recording, options: FitOptions
     linear, parameters = solution.linear, solution.parameters
     determination = determination_of(solution, recording, noise_is_trusted(options))
     spread = _deviations(determination, linear.shared.shape[-1])
-    std = _split(spread, 0, parameters)
+    std = _sort_by_kind(spread, 0, parameters)
     findings = {
         Finding.NOT_FINITE: ~(jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(linear.at))),
         Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread)),
@@ -331,14 +351,14 @@ def _fit_of(
     """The result, with the ``findings`` of its kind and those that all fits share."""
     linear, parameters, model = solution.linear, solution.parameters, solution.model
     parts = residuals_by_channel(linear, recording)
-    whiteness = whiteness_of(linear.rest, recording.present)
+    whiteness = whiteness_of(linear.residuals, recording.present)
     findings = findings | {
         Finding.STEP_LIMIT: ~solution.stopped,
         Finding.NOT_WHITE: whiteness < 1e-4,
         Finding.POOR: misfit_of(linear, options.robust) > 4 * solution.expected,
         Finding.SATURATED: is_saturated(recording),
         Finding.CALIBRATION: _calibration_strained(solution, recording),
-        Finding.OUTLIERS: has_outliers(linear.rest, recording, options.robust),
+        Finding.OUTLIERS: has_outliers(linear.residuals, recording, options.robust),
     }
     return Fit(
         values=values,
@@ -394,17 +414,17 @@ def is_saturated(recording: Recording) -> Array:
 
 def _calibration_strained(solution: Solution, recording: Recording) -> Array:
     """Whether an unknown of the calibration is more than 3.5 standard deviations off its prior."""
-    far = jnp.asarray(False)
+    is_far = jnp.asarray(False)
     for name, precision in (
         prior_of(solution.parameters, recording, solution.model)._asdict().items()
     ):
         if name != "motion" and precision is not None:
             value = getattr(solution.parameters, name)
-            far = far | jnp.any(value**2 * precision > 3.5**2)
-    return far
+            is_far = is_far | jnp.any(value**2 * precision > 3.5**2)
+    return is_far
 
 
-def has_outliers(rest: Array, recording: Recording, robust: Any) -> Array:
+def has_outliers(residuals: Array, recording: Recording, robust: Any) -> Array:
     """Whether single residuals (r, t, c) are far off where the fit counts them by their square.
 
     Three at least and 0.3 % of all beyond five sigma, sigma from the median, their neighbours
@@ -412,16 +432,16 @@ def has_outliers(rest: Array, recording: Recording, robust: Any) -> Array:
     """
     if robust is not None:
         return jnp.asarray(False)
-    measured = (recording.present > 0)[..., None] & jnp.ones(rest.shape, bool)
+    measured = (recording.present > 0)[..., None] & jnp.ones(residuals.shape, bool)
     if recording.saturated is not None:
         # rates are the first channels; at a limit a residual may be zero
         measured = measured.at[..., :3].set(measured[..., :3] & (recording.saturated == 0))
-    size = jnp.where(measured, jnp.abs(rest), jnp.nan)
+    size = jnp.where(measured, jnp.abs(residuals), jnp.nan)
     scale = 1.4826 * jnp.nanmedian(size, axis=1, keepdims=True)
-    far = jnp.nan_to_num(size / jnp.where(scale > 0, scale, jnp.inf))
-    ends = jnp.pad(far, ((0, 0), (1, 1), (0, 0)))
-    alone = (far > 5) & (ends[:, :-2] < 3) & (ends[:, 2:] < 3)
-    count, total = (jnp.sum(x.astype(rest.dtype)) for x in (alone, measured))
+    deviation = jnp.nan_to_num(size / jnp.where(scale > 0, scale, jnp.inf))
+    padded_deviation = jnp.pad(deviation, ((0, 0), (1, 1), (0, 0)))
+    is_isolated = (deviation > 5) & (padded_deviation[:, :-2] < 3) & (padded_deviation[:, 2:] < 3)
+    count, total = (jnp.sum(x.astype(residuals.dtype)) for x in (is_isolated, measured))
     return (count >= 3) & (count >= 0.003 * total)
 
 
@@ -466,31 +486,31 @@ def residuals_by_channel(linear: Linear, recording: Recording) -> dict[str, Arra
     kinds = {"omega": recording.omega, "attitude": recording.wxyz, "force": recording.force}
     for name, measured in kinds.items():
         if measured is not None:
-            parts[name] = linear.rest[..., channel : channel + 3]
+            parts[name] = linear.residuals[..., channel : channel + 3]
             channel += 3
     return parts
 
 
 @partial(jax.jit, static_argnames="lags")  # one program, not one for each operation
-def whiteness_of(rest: Array, present: Array, lags: int = 5) -> Array:
+def whiteness_of(residuals: Array, present: Array, lags: int = 5) -> Array:
     """Ljung-Box probability of the first autocorrelations of all channels together."""
     total = jnp.sum(present, axis=-1)[:, None]
     # recordings that only fill a batch up have no samples and count nothing
     has_power = total > 0
     total = jnp.where(has_power, total, lags + 1)
-    rest = (rest - (jnp.sum(rest, axis=1) / total)[:, None]) * present[..., None]
-    power = jnp.sum(rest**2, axis=1)
+    residuals = (residuals - (jnp.sum(residuals, axis=1) / total)[:, None]) * present[..., None]
+    power = jnp.sum(residuals**2, axis=1)
     safe = jnp.where(power > 0, power, 1)
-    later = jnp.pad(rest, ((0, 0), (0, lags), (0, 0)))
+    later = jnp.pad(residuals, ((0, 0), (0, lags), (0, 0)))
 
-    def one(lag):
-        lagged = jax.lax.dynamic_slice_in_dim(later, lag, rest.shape[1], axis=1)
-        correlation = jnp.sum(rest * lagged, axis=1) / safe
+    def statistic_at(lag):
+        lagged = jax.lax.dynamic_slice_in_dim(later, lag, residuals.shape[1], axis=1)
+        correlation = jnp.sum(residuals * lagged, axis=1) / safe
         return jnp.sum(correlation**2 / (total - lag.astype(total.dtype)) * total * (total + 2))
 
-    statistic = jnp.sum(jax.lax.map(one, jnp.arange(1, lags + 1)))
+    statistic = jnp.sum(jax.lax.map(statistic_at, jnp.arange(1, lags + 1)))
     # Chi-square of many degrees by Wilson and Hilferty (PNAS 17 (1931) 684): the exact one would
     # take longer to compile than all else here.
-    degrees = lags * rest.shape[-1] * jnp.sum(has_power).astype(rest.dtype)
+    degrees = lags * residuals.shape[-1] * jnp.sum(has_power).astype(residuals.dtype)
     spread = 2 / (9 * degrees)
     return norm.sf(((statistic / degrees) ** (1 / 3) - 1 + spread) / spread**0.5)

@@ -151,7 +151,7 @@ def windows(recording: Recording, length: int) -> list[Recording]:
     count = recording.times.shape[-1]
     require(4 <= length <= count, f"a window needs 4 to {count} samples, got {length}.")
     # starts that leave at least four samples
-    cuts = [slice(first, first + length) for first in range(0, count - 3, length - 1)]
+    cuts = [slice(start, start + length) for start in range(0, count - 3, length - 1)]
     return [jax.tree.map(lambda leaf, cut=cut: leaf[cut], recording) for cut in cuts]
 
 
@@ -181,8 +181,8 @@ def _fit_one(recording: Recording, options: FitOptions, conclude: Callable) -> A
 def _fit_batch(recording: Recording, options: FitOptions, conclude: Callable) -> Any:
     """Fits of bodies on one leading axis."""
 
-    def fit(one):
-        return _fit_one(one, options, conclude)
+    def fit(body_recording):
+        return _fit_one(body_recording, options, conclude)
 
     # A processor core fills its vector units with the samples of a few bodies; more at a time would
     # only wait for the slowest of them.
@@ -264,24 +264,24 @@ def fit_scene(
     if not (
         isinstance(recordings, list | tuple)
         and recordings
-        and all(isinstance(one, Recording) for one in recordings)
+        and all(isinstance(recording, Recording) for recording in recordings)
     ):
         raise TypeError(
             "data must be a ph.fit.Recording (ph.fit.Recording.of(times, omega_body, ...)) or a"
             f" list of them, got {type(data).__name__}."
         )
-    for one in recordings:
+    for recording in recordings:
         require(
-            one.wheel is None,
+            recording.wheel is None,
             "fit_scene does not read wheel_speed: describe the wheel by rotors of the scene"
             " (ph.Rotor), and leave wheel_speed out of the recording.",
         )
         require(
-            one.force is None,
+            recording.force is None,
             "fit_scene does not model accelerometer readings: leave force_body out.",
         )
         require(
-            attitude is None or one.wxyz is None,
+            attitude is None or recording.wxyz is None,
             "attitude is for recordings without attitudes; these have wxyz, whose first one is"
             " fitted.",
         )

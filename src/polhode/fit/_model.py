@@ -163,10 +163,10 @@ def tensor_of(shape: Float[Array, " k"], base: Base, columns: np.ndarray) -> Arr
         # carry the tangent of turning axes
         return (1 + (values[i] + values[j]) / (root[i] + root[j])) / 2
 
-    inner = symmetric(positive, (slope(1, 2) * yz, slope(2, 0) * zx, slope(0, 1) * xy))
+    body_moments = symmetric(positive, (slope(1, 2) * yz, slope(2, 0) * zx, slope(0, 1) * xy))
     turn = wxyz_to_matrix(axes)
     exact = jax.lax.Precision.HIGHEST
-    sigma = jnp.einsum("ij,jk,lk->il", turn, inner, turn, precision=exact)
+    sigma = jnp.einsum("ij,jk,lk->il", turn, body_moments, turn, precision=exact)
     return inertia_of_second_moments(sigma)
 
 
@@ -296,10 +296,10 @@ class SteppedMotion(AbstractMotion):
         def interval(y, inputs):
             ts, spins = inputs
             for k in range(0, 2 * self.steps, 2):
-                now = dynamics(
+                step_dynamics = dynamics(
                     None if spins is None else _parabola(ts[k : k + 3], spins[k : k + 3])
                 )
-                y, *_ = solver.step(term, ts[k], ts[k + 2], y, now, None, made_jump=False)
+                y, *_ = solver.step(term, ts[k], ts[k + 2], y, step_dynamics, None, made_jump=False)
             return y, y
 
         momentum = inertia.momentum(omega)
@@ -312,8 +312,8 @@ class SteppedMotion(AbstractMotion):
         push, rates = jnp.stack(push, axis=-1), jnp.stack(rates, axis=-1)
         if wheel_at is not None:  # what the wheel takes up does not turn the body
             carried = jnp.stack(self._along(wheel_at(times)), axis=-1)
-            gained, step = (jnp.asarray(jnp.gradient(x, axis=0)) for x in (carried, times))
-            push = push - gained / step[:, None]
+            momentum_change, step = (jnp.asarray(jnp.gradient(x, axis=0)) for x in (carried, times))
+            push = push - momentum_change / step[:, None]
         if attitude is not None:
             attitude = normalise(jnp.stack(attitude, axis=-1))
         return Predicted(rates, inertia.rates(push), attitude)
@@ -477,36 +477,36 @@ def _to_bounded(number: Array, start: Array, low: Array, high: Array) -> Array:
     At one bound the smooth maximum ``low + (d + sqrt(d^2 + s^2)) / 2``, at two a sigmoid.
     """
     half, middle = (high - low) / 2, (high + low) / 2
-    both = jnp.isfinite(half)
-    half, middle = jnp.where(both, half, 1), jnp.where(both, middle, 0)
+    has_both = jnp.isfinite(half)
+    half, middle = jnp.where(has_both, half, 1), jnp.where(has_both, middle, 0)
     y = (number - middle) / half
     between = middle + half * y / jnp.sqrt(1 + y**2)
     # one bound: the distance from it, mirrored for an upper one
-    some = jnp.isfinite(low) | jnp.isfinite(high)
+    has_bound = jnp.isfinite(low) | jnp.isfinite(high)
     side = jnp.where(jnp.isfinite(low), 1, -1)
     end = jnp.where(jnp.isfinite(low), low, jnp.where(jnp.isfinite(high), high, 0))
     # any positive number where there is no bound, for finite derivatives of what is not chosen
-    soft = jnp.where(some, jnp.abs(start - end), 1)
+    soft = jnp.where(has_bound, jnp.abs(start - end), 1)
     d = side * (number - end)
     root = jnp.sqrt(d**2 + soft**2)
     # without cancellation far beyond the bound
     beyond = jnp.where(d > 0, (d + root) / 2, soft**2 / (2 * (root - jnp.where(d > 0, 0, d))))
-    return jnp.where(both, between, jnp.where(some, end + side * beyond, number))
+    return jnp.where(has_both, between, jnp.where(has_bound, end + side * beyond, number))
 
 
 def _to_unbounded(value: Array, start: Array, low: Array, high: Array) -> Array:
     """The inverse of ``_to_bounded``."""
     half, middle = (high - low) / 2, (high + low) / 2
-    both = jnp.isfinite(half)
-    half, middle = jnp.where(both, half, 1), jnp.where(both, middle, 0)
-    y = jnp.where(both, (value - middle) / half, 0)
+    has_both = jnp.isfinite(half)
+    half, middle = jnp.where(has_both, half, 1), jnp.where(has_both, middle, 0)
+    y = jnp.where(has_both, (value - middle) / half, 0)
     between = middle + half * y / jnp.sqrt(1 - y**2)
     side = jnp.where(jnp.isfinite(low), 1, -1)
-    some = jnp.isfinite(low) | jnp.isfinite(high)
+    has_bound = jnp.isfinite(low) | jnp.isfinite(high)
     end = jnp.where(jnp.isfinite(low), low, jnp.where(jnp.isfinite(high), high, 0))
-    d = jnp.where(some, side * (value - end), 1)
+    d = jnp.where(has_bound, side * (value - end), 1)
     beyond = end + side * (d - (start - end) ** 2 / (4 * d))
-    return jnp.where(both, between, jnp.where(some, beyond, value))
+    return jnp.where(has_both, between, jnp.where(has_bound, beyond, value))
 
 
 class LeafMotion(AbstractMotion):
@@ -544,11 +544,11 @@ class LeafMotion(AbstractMotion):
 
     def at_bound(self, values: list[Array]) -> Array:
         """Whether a value has come within a thousandth of the start's distance to a bound."""
-        near = jnp.asarray(False)
+        is_near = jnp.asarray(False)
         for x, at, ends in zip(values, self.start(), self.bounds or (), strict=False):
             for end in ends or ():
-                near = near | jnp.any(jnp.abs(x - end) < 1e-3 * jnp.abs(at - end))
-        return near
+                is_near = is_near | jnp.any(jnp.abs(x - end) < 1e-3 * jnp.abs(at - end))
+        return is_near
 
     def start(self) -> list[Array]:
         leaves = jax.tree.leaves(self.scene)

@@ -44,7 +44,7 @@ def single_use_programs() -> Iterator[None]:
 
 def compiled(function: Callable) -> Callable:
     """``eqx.filter_jit`` that compiles faster on processors, where this is the outermost jit."""
-    inner = eqx.filter_jit(function)
+    nested_jit = eqx.filter_jit(function)
     outermost = eqx.filter_jit(function, **_OPTIONS)
     single_use = eqx.filter_jit(function, **_SINGLE_USE)
 
@@ -52,7 +52,7 @@ def compiled(function: Callable) -> Callable:
     def call(*args):
         traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(args))
         if traced or not _options_are_supported():
-            return inner(*args)
+            return nested_jit(*args)
         return (single_use if _is_single_use.get() else outermost)(*args)
 
     return call
@@ -116,9 +116,11 @@ def _inverse(matrix: Array) -> Array:
 
 def inverse(matrix: Array) -> Array:
     """Inverses of matrices (..., n, n), with derivatives in both modes."""
-    fixed = jax.lax.stop_gradient(matrix)
-    result = _inverse(fixed)
-    return result - result @ (matrix - fixed) @ result  # loops of single matrices have none
+    constant_matrix = jax.lax.stop_gradient(matrix)
+    result = _inverse(constant_matrix)
+    return (
+        result - result @ (matrix - constant_matrix) @ result
+    )  # loops of single matrices have none
 
 
 @_one_matrix_at_a_time("(n,n)->(n,n),(n),(n,n)")
@@ -201,17 +203,17 @@ class LevenbergMarquardt(optx.AbstractGaussNewton):
 
     def terminate(self, fn, y, args, options, state, tags):
         stop, result = super().terminate(fn, y, args, options, state, tags)
-        jacobian, rest = state.f_info.jac.as_matrix(), state.f_info.residual
-        square, slope = jacobian.T @ jacobian, jacobian.T @ rest
+        jacobian, residual = state.f_info.jac.as_matrix(), state.f_info.residual
+        square, slope = jacobian.T @ jacobian, jacobian.T @ residual
         size = jnp.sqrt(jnp.diagonal(square))
         size = jnp.where(size > 0, size, 1)
         # A direction that the data hardly show, as towards a flat body, is not waited for.
-        ridge = 30 * jnp.finfo(rest.dtype).eps * size.shape[0] + _FAINT / size**2
+        ridge = 30 * jnp.finfo(residual.dtype).eps * size.shape[0] + _FAINT / size**2
         square = square / size[:, None] / size[None] + jnp.diag(ridge)
         slope = slope / size
         gain = slope @ solve(square, slope)
-        freedom = max(rest.shape[0] - size.shape[0], 1)
-        bound = self.offset**2 * jnp.sum(rest**2) / freedom * size.shape[0] + self.floor**2
+        freedom = max(residual.shape[0] - size.shape[0], 1)
+        bound = self.offset**2 * jnp.sum(residual**2) / freedom * size.shape[0] + self.floor**2
         return stop | (~state.first_step & (gain < bound)), result
 
 
@@ -242,13 +244,13 @@ class ClassicalRungeKutta(diffrax.AbstractSolver):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         h, middle = t1 - t0, (t0 + t1) / 2
 
-        def ahead(slope, by):
+        def advance(slope, by):
             return jax.tree.map(lambda y, k: y + by * k, y0, slope)
 
         first = terms.vf(t0, y0, args)
-        second = terms.vf(middle, ahead(first, h / 2), args)
-        third = terms.vf(middle, ahead(second, h / 2), args)
-        last = terms.vf(t1, ahead(third, h), args)
+        second = terms.vf(middle, advance(first, h / 2), args)
+        third = terms.vf(middle, advance(second, h / 2), args)
+        last = terms.vf(t1, advance(third, h), args)
         y1 = jax.tree.map(
             lambda y, a, b, c, d: y + h / 6 * (a + 2 * b + 2 * c + d),
             y0,

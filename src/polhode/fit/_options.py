@@ -151,25 +151,25 @@ def _check_not_negative(name: str, value: float) -> float:
 
 
 def _at(
-    omega: Float[Array, "*b t 3"], times: Float[Array, " t"], new: Float[Array, "*b t"]
+    omega: Float[Array, "*b t 3"], times: Float[Array, " t"], new_times: Float[Array, "*b t"]
 ) -> Float[Array, "*b t 3"]:
     """Rates at other times, by cubic Hermite interpolation; beyond the ends by the last cubic."""
 
-    def one(omega, new):
+    def interpolate(omega, new_times):
         slope = central_slope(omega, times)
-        k = jnp.clip(jnp.searchsorted(times, new, side="right") - 1, 0, times.shape[0] - 2)
+        k = jnp.clip(jnp.searchsorted(times, new_times, side="right") - 1, 0, times.shape[0] - 2)
         width = (times[k + 1] - times[k])[:, None]
-        s = (new - times[k])[:, None] / width
-        late = s * s * (3 - 2 * s)
-        first, last = s * (1 - s) ** 2, s * s * (s - 1)
+        s = (new_times - times[k])[:, None] / width
+        end_weight = s * s * (3 - 2 * s)
+        start_slope_weight, end_slope_weight = s * (1 - s) ** 2, s * s * (s - 1)
         return (
-            (1 - late) * omega[k]
-            + late * omega[k + 1]
-            + width * (first * slope[k] + last * slope[k + 1])
+            (1 - end_weight) * omega[k]
+            + end_weight * omega[k + 1]
+            + width * (start_slope_weight * slope[k] + end_slope_weight * slope[k + 1])
         )
 
-    flat = [omega.reshape(-1, *omega.shape[-2:]), new.reshape(-1, new.shape[-1])]
-    return jax.vmap(one)(*flat).reshape(omega.shape)
+    flat = [omega.reshape(-1, *omega.shape[-2:]), new_times.reshape(-1, new_times.shape[-1])]
+    return jax.vmap(interpolate)(*flat).reshape(omega.shape)
 
 
 def calibrate(recording: Recording, gyroscope: Gyroscope) -> Recording:
@@ -220,22 +220,24 @@ def saturation(recording: Recording, max_rate: float | None = None) -> Float[Arr
     samples = jnp.sum(present.astype(dtype), axis=-2)
     size = jnp.max(jnp.where(present, jnp.abs(omega), 0), axis=(-2, -1))[..., None]
 
-    def upper(values):
+    def at_upper_limit(values):
         values = jnp.where(present, values, -jnp.inf)
         greatest = jnp.max(values, axis=-2, keepdims=True)
         equal = values == greatest
         below = jnp.where(equal, -jnp.inf, values)
-        second = jnp.max(below, axis=-2, keepdims=True)
-        many = jnp.sum(equal.astype(dtype), axis=-2)
-        others = jnp.sum(((below == second) & jnp.isfinite(below)).astype(dtype), axis=-2)
-        enough = (many >= 4) & (many >= 0.01 * samples)
+        second_greatest = jnp.max(below, axis=-2, keepdims=True)
+        count = jnp.sum(equal.astype(dtype), axis=-2)
+        others = jnp.sum(((below == second_greatest) & jnp.isfinite(below)).astype(dtype), axis=-2)
+        is_enough = (count >= 4) & (count >= 0.01 * samples)
         # of a constant rate there are no others, or rounding errors only
-        least = jnp.min(jnp.where(present, values, jnp.inf), axis=-2)
-        varies = jnp.isfinite(second[..., 0, :]) & (greatest[..., 0, :] - least > 1e-6 * size)
-        clipped = enough & (many >= 5 * others) & varies
+        smallest = jnp.min(jnp.where(present, values, jnp.inf), axis=-2)
+        varies = jnp.isfinite(second_greatest[..., 0, :]) & (
+            greatest[..., 0, :] - smallest > 1e-6 * size
+        )
+        clipped = is_enough & (count >= 5 * others) & varies
         return (equal & present & clipped[..., None, :]).astype(dtype)
 
-    return upper(omega) - upper(-omega)
+    return at_upper_limit(omega) - at_upper_limit(-omega)
 
 
 class Huber(eqx.Module):
@@ -250,8 +252,8 @@ class Huber(eqx.Module):
     def __call__(self, residual: Array) -> Array:
         size = jnp.abs(residual)
         inside = size <= self.threshold
-        far = jnp.where(inside, self.threshold, size)
-        outside = jnp.sqrt(2 * self.threshold * far - self.threshold**2)
+        large_size = jnp.where(inside, self.threshold, size)
+        outside = jnp.sqrt(2 * self.threshold * large_size - self.threshold**2)
         return jnp.where(inside, residual, jnp.sign(residual) * outside)
 
 

@@ -114,21 +114,26 @@ class Recording(eqx.Module):
         xp = numbers(times, *arrays.values())
         arrays = {name: xp.broadcast_to(a, (*batch, *tails[name])) for name, a in arrays.items()}
         times = xp.broadcast_to(times, (*batch, count))
-        whole = {name: xp.isfinite(a) for name, a in arrays.items()}
-        values = {name: xp.where(whole[name], a, _blank(name, a)) for name, a in arrays.items()}
+        is_complete = {name: xp.isfinite(a) for name, a in arrays.items()}
+        values = {
+            name: xp.where(is_complete[name], a, _blank(name, a)) for name, a in arrays.items()
+        }
         wheel, wheel_present = values.pop("wheel_speed", None), None
         present = xp.ones_like(times)
         for name in values:
-            present = present * xp.all(whole[name], axis=-1).astype(dtype)
+            present = present * xp.all(is_complete[name], axis=-1).astype(dtype)
         if wheel is not None:
-            wheel_present = whole["wheel_speed"].astype(dtype)
+            wheel_present = is_complete["wheel_speed"].astype(dtype)
             if is_concrete(wheel_present):
-                least = int(np.min(np.sum(wheel_present, axis=-1)))
-                require(least >= 2, f"wheel_speed needs at least 2 numbers, got {least}.")
+                min_count = int(np.min(np.sum(wheel_present, axis=-1)))
+                require(min_count >= 2, f"wheel_speed needs at least 2 numbers, got {min_count}.")
             wheel = interpolate_gaps(*map(jnp.asarray, (times, wheel_present, wheel)))
         if is_concrete(present):
-            least = int(np.min(np.sum(present, axis=-1)))
-            require(least >= 4, f"a recording needs at least 4 samples without NaN, got {least}.")
+            min_count = int(np.min(np.sum(present, axis=-1)))
+            require(
+                min_count >= 4,
+                f"a recording needs at least 4 samples without NaN, got {min_count}.",
+            )
         omega, attitude, force = (values.get(n) for n in ("omega_body", "wxyz", "force_body"))
         if omega is not None and is_concrete(omega, times):
             _check_rates(omega, times)
@@ -185,31 +190,35 @@ def interpolate_gaps(
     """
     count = times.shape[-1]
 
-    def one(times, present, values):
+    def interpolate(times, present, values):
         place = jnp.arange(count)
-        there = present > 0
-        before = jnp.where(there, place, jnp.maximum(place - 1, 0))
-        after = jnp.where(there, place, jnp.minimum(place + 1, count - 1))
+        is_present = present > 0
+        previous_place = jnp.where(is_present, place, jnp.maximum(place - 1, 0))
+        next_place = jnp.where(is_present, place, jnp.minimum(place + 1, count - 1))
 
         # each round doubles the distance looked across
-        def farther(_, ends):
-            before, after = ends
-            return before[before], after[after]
+        def farther(_, neighbours):
+            previous_place, next_place = neighbours
+            return previous_place[previous_place], next_place[next_place]
 
         rounds = max(count - 1, 1).bit_length()
-        before, after = jax.lax.fori_loop(0, rounds, farther, (before, after))
-        before, after = (
-            jnp.where(there[before], before, after),
-            jnp.where(there[after], after, before),
+        previous_place, next_place = jax.lax.fori_loop(
+            0, rounds, farther, (previous_place, next_place)
         )
-        span = times[after] - times[before]
-        part = jnp.where(span > 0, (times - times[before]) / jnp.where(span > 0, span, 1), 0)
+        previous_place, next_place = (
+            jnp.where(is_present[previous_place], previous_place, next_place),
+            jnp.where(is_present[next_place], next_place, previous_place),
+        )
+        span = times[next_place] - times[previous_place]
+        part = jnp.where(
+            span > 0, (times - times[previous_place]) / jnp.where(span > 0, span, 1), 0
+        )
         part = part.reshape(-1, *[1] * (values.ndim - 1))
-        return values[before] + part * (values[after] - values[before])
+        return values[previous_place] + part * (values[next_place] - values[previous_place])
 
     batch = times.shape[:-1]
     flat = [x.reshape(-1, *x.shape[len(batch) :]) for x in (times, present, values)]
-    return jax.vmap(one)(*flat).reshape(values.shape)
+    return jax.vmap(interpolate)(*flat).reshape(values.shape)
 
 
 def stack(recordings: Sequence[Recording]) -> Recording:
@@ -218,20 +227,22 @@ def stack(recordings: Sequence[Recording]) -> Recording:
     Raises ValueError for recordings that have batch axes or different kinds of data.
     """
     require(len(recordings) > 0, "at least one recording is needed, got none.")
-    for one in recordings:
+    for recording in recordings:
         require(
-            not one.batch_shape,
-            f"recordings of one body have no batch axes, got {one.batch_shape}.",
+            not recording.batch_shape,
+            f"recordings of one body have no batch axes, got {recording.batch_shape}.",
         )
     longest = max(r.times.shape[-1] for r in recordings)
 
-    def padded(r):
-        short = longest - r.times.shape[-1]
-        if short == 0:
+    def pad(r):
+        missing_count = longest - r.times.shape[-1]
+        if missing_count == 0:
             return r
-        steps = jnp.maximum(jnp.arange(longest) - (longest - short - 1), 0).astype(r.times.dtype)
+        steps = jnp.maximum(jnp.arange(longest) - (longest - missing_count - 1), 0).astype(
+            r.times.dtype
+        )
         longer = jax.tree.map(
-            lambda array: jnp.concatenate([array, jnp.repeat(array[-1:], short, axis=0)]), r
+            lambda array: jnp.concatenate([array, jnp.repeat(array[-1:], missing_count, axis=0)]), r
         )
         return dataclasses.replace(
             longer,
@@ -241,7 +252,7 @@ def stack(recordings: Sequence[Recording]) -> Recording:
 
     kinds = {jax.tree.structure(r) for r in recordings}
     require(len(kinds) == 1, "the recordings must hold the same kinds of data, got a mixture.")
-    return jax.tree.map(lambda *parts: jnp.stack(parts), *map(padded, recordings))
+    return jax.tree.map(lambda *parts: jnp.stack(parts), *map(pad, recordings))
 
 
 def averaged(recording: Recording, count: int) -> Recording:
@@ -260,9 +271,9 @@ def averaged(recording: Recording, count: int) -> Recording:
     place = len(recording.batch_shape)
 
     def mean(array):
-        cut = jax.lax.slice_in_dim(array, 0, length * count, axis=place)
+        blocks = jax.lax.slice_in_dim(array, 0, length * count, axis=place)
         shape = (*array.shape[:place], length, count, *array.shape[place + 1 :])
-        return jnp.mean(cut.reshape(shape), axis=place + 1)
+        return jnp.mean(blocks.reshape(shape), axis=place + 1)
 
     means, noise_of_mean = jax.tree.map(mean, recording), lambda noise: noise / count**0.5
     return dataclasses.replace(
@@ -319,8 +330,8 @@ def central_slope(omega, times):
     """Central differences."""
     step = jnp.diff(times)[:, None]
     between = jnp.diff(omega, axis=0) / step
-    inner = (between[1:] * step[:-1] + between[:-1] * step[1:]) / (step[1:] + step[:-1])
-    return jnp.concatenate([between[:1], inner, between[-1:]])
+    inner_slopes = (between[1:] * step[:-1] + between[:-1] * step[1:]) / (step[1:] + step[:-1])
+    return jnp.concatenate([between[:1], inner_slopes, between[-1:]])
 
 
 # Recordings from CSV files, with messages that say which row or column is wrong.
@@ -372,14 +383,14 @@ def load_recording(
 ) -> LoadedCsv:
     """As ``read_recording``, with the columns and units that were recognised."""
     lines = _lines(path)
-    first = next(
+    header_line = next(
         (k for k, line in enumerate(lines) if line.strip() and not line.lstrip().startswith("#")),
         None,
     )
-    if first is None:
+    if header_line is None:
         raise ValueError(f"{path} is empty; expected a header line and rows of times and rates.")
-    separator = next((mark for mark in ",;\t" if mark in lines[first]), ",")
-    (header,) = csv.reader([lines[first]], delimiter=separator, skipinitialspace=True)
+    separator = next((mark for mark in ",;\t" if mark in lines[header_line]), ",")
+    (header,) = csv.reader([lines[header_line]], delimiter=separator, skipinitialspace=True)
     names = [name.strip() for name in header]
     header_names = _required_columns(path, names, {} if columns is None else columns)
     units = {role: unit for role, name in header_names.items() if (unit := unit_of(role, name))}
@@ -387,7 +398,7 @@ def load_recording(
         scale = _common(path, "rates", [units.get(role) for role in ("wx", "wy", "wz")], _RATES)
     if time_scale is None:
         time_scale = _common(path, "times", [units.get("t")], _TIMES)
-    table, numbers = _rows(path, lines, first, separator, names, header_names)
+    table, numbers = _rows(path, lines, header_line, separator, names, header_names)
     data = np.array(table)
     times = data[:, 0]
     not_ascending = np.flatnonzero(~(np.diff(times) > 0))
@@ -416,10 +427,12 @@ def _required_columns(path, names: list[str], columns: Mapping[str, str]) -> dic
     }
     if columns.get("wheel"):
         header_names["wheel"] = columns["wheel"]
-    missing = [f"{role} -> {name}" for role, name in header_names.items() if name not in names]
-    if missing:
+    missing_columns = [
+        f"{role} -> {name}" for role, name in header_names.items() if name not in names
+    ]
+    if missing_columns:
         raise ValueError(
-            f"{path} must have the columns asked for, missing: {', '.join(missing)}; its "
+            f"{path} must have the columns asked for, missing: {', '.join(missing_columns)}; its "
             f"columns are: {', '.join(names) or 'none'}{_headless(names)}."
         )
     twice = [name for name in header_names.values() if names.count(name) > 1]
@@ -431,21 +444,21 @@ def _required_columns(path, names: list[str], columns: Mapping[str, str]) -> dic
     return header_names
 
 
-def _rows(path, lines, first, separator, names, header_names) -> tuple[list, list[int]]:
+def _rows(path, lines, header_line, separator, names, header_names) -> tuple[list, list[int]]:
     """The numbers of the needed columns, and the line that each row stands in."""
     places = [names.index(name) for name in header_names.values()]
     table, numbers = [], []
-    reader = csv.reader(lines[first + 1 :], delimiter=separator, skipinitialspace=True)
+    reader = csv.reader(lines[header_line + 1 :], delimiter=separator, skipinitialspace=True)
     try:
         for row in reader:
             if not any(cell.strip() for cell in row):
                 continue
-            numbers.append(first + 1 + reader.line_num)
+            numbers.append(header_line + 1 + reader.line_num)
             cells = [row[k] if k < len(row) else "" for k in places]
             pairs = zip(header_names.values(), cells, strict=True)
             table.append([_number(path, numbers[-1], *pair, separator != ",") for pair in pairs])
     except csv.Error as error:
-        raise ValueError(f"{path}: line {first + 1 + reader.line_num}: {error}.") from None
+        raise ValueError(f"{path}: line {header_line + 1 + reader.line_num}: {error}.") from None
     if len(table) < 4:
         raise ValueError(f"{path} must hold at least 4 rows of data, got {len(table)}.")
     return table, numbers
@@ -495,7 +508,7 @@ _RATE = (
 )
 
 
-def _split(name: str) -> tuple[str, str]:
+def _split_unit(name: str) -> tuple[str, str]:
     """A column's name in lower case without its unit, and the unit as written."""
     text = name.strip().lower()
     if match := re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]", text):
@@ -508,7 +521,7 @@ def _split(name: str) -> tuple[str, str]:
 
 def unit_of(role: str, name: str) -> str:
     """The unit that a column's name states, or nothing. ValueError for one of another kind."""
-    unit = _split(name)[1]
+    unit = _split_unit(name)[1]
     unit = _SPELLINGS.get(unit, unit)
     factors = _TIMES if role == "t" else _RATES
     if unit in factors:
@@ -526,11 +539,11 @@ def usual_column(path, role: str, names: list[str]) -> str | None:
     if role in names:
         return role
     pattern = _TIME if role == "t" else re.compile(_RATE.replace("AXIS", role[-1]))
-    fitting = [name for name in names if pattern.fullmatch(_split(name)[0])]
+    fitting = [name for name in names if pattern.fullmatch(_split_unit(name)[0])]
     aviation = dict(zip(("wx", "wy", "wz"), "pqr"))
-    bare = {_split(name)[0]: name for name in names}
-    if not fitting and role in aviation and set("pqr") <= bare.keys():
-        fitting = [bare[aviation[role]]]
+    names_without_unit = {_split_unit(name)[0]: name for name in names}
+    if not fitting and role in aviation and set("pqr") <= names_without_unit.keys():
+        fitting = [names_without_unit[aviation[role]]]
     if len(set(fitting)) > 1:
         raise ValueError(
             f"{path}: the columns {', '.join(fitting)} could all be {role}; say which is"

@@ -82,10 +82,10 @@ def predict(
     if attitude is not None and parameters.attitude is not None:
         attitude = multiply(attitude, rotation_vector_to_wxyz(parameters.attitude))
 
-    def one(omega, wxyz, times, wheel):
+    def predict_recording(omega, wxyz, times, wheel):
         return model.motion(tensor, omega, wxyz, times, wheel, parameters.motion)
 
-    return jax.vmap(one)(parameters.omega, attitude, recording.times, recording.wheel)
+    return jax.vmap(predict_recording)(parameters.omega, attitude, recording.times, recording.wheel)
 
 
 def residuals(
@@ -110,17 +110,19 @@ def residuals_of_motion(
     parts = {}
     if recording.omega is not None:
         noise = require_channel("omega_noise", recording.omega_noise)
-        rest = weight * (recording.omega - _read(motion, parameters, recording, model)) / noise
+        residual = (
+            weight * (recording.omega - _readings(motion, parameters, recording, model)) / noise
+        )
         if recording.saturated is not None:
             # A reading at the upper limit says only that the rate is not smaller.
             side = recording.saturated
-            rest = jnp.where(side > 0, jnp.maximum(rest, 0), rest)
-            rest = jnp.where(side < 0, jnp.minimum(rest, 0), rest)
-        parts["omega"] = rest
+            residual = jnp.where(side > 0, jnp.maximum(residual, 0), residual)
+            residual = jnp.where(side < 0, jnp.minimum(residual, 0), residual)
+        parts["omega"] = residual
     if recording.wxyz is not None:
         noise = require_channel("attitude_noise", recording.attitude_noise)
-        apart = rotation_vector_between(motion.wxyz, recording.wxyz)
-        parts["attitude"] = weight * apart / noise[..., None]
+        rotation_error = rotation_vector_between(motion.wxyz, recording.wxyz)
+        parts["attitude"] = weight * rotation_error / noise[..., None]
     if recording.force is not None:
         if motion.omega_dot is None:
             raise ValueError(
@@ -129,16 +131,16 @@ def residuals_of_motion(
             )
         noise = require_channel("force_noise", recording.force_noise)
         lever = jnp.broadcast_to(parameters.lever, motion.omega.shape)
-        felt = jnp.cross(motion.omega_dot, lever) + jnp.cross(
+        simulated_force = jnp.cross(motion.omega_dot, lever) + jnp.cross(
             motion.omega, jnp.cross(motion.omega, lever)
         )
-        parts["force"] = weight * (recording.force - felt) / noise
+        parts["force"] = weight * (recording.force - simulated_force) / noise
     if model.robust is not None:
         parts = {name: model.robust(part) for name, part in parts.items()}
     return parts
 
 
-def _read(
+def _readings(
     motion: Predicted, parameters: Parameters, recording: Recording, model: Model
 ) -> Float[Array, "r t 3"]:
     """Noise-free readings of the gyroscope, in the units of ``Recording.omega``."""
@@ -265,22 +267,24 @@ def log_density(
 class Linear(NamedTuple):
     """Residuals (c channels side by side) and what their derivatives amount to.
 
-    ``shared``, ``own``, ``left``: the triangular factor of a recording's derivatives by shared and
-    own unknowns and of its residuals, column block by column block. Sums of squares and products
-    are those of all samples, so that an optimiser works on a handful of rows. ``at``: the shared
-    unknowns of the place.
+    ``shared``, ``own``, ``factored_residuals``: the triangular factor of a recording's derivatives
+    by shared and own unknowns and of its residuals, column block by column block. Sums of squares
+    and products are those of all samples, so that an optimiser works on a handful of rows. ``at``:
+    the shared unknowns of the place.
     """
 
-    rest: Float[Array, "r t c"]
+    residuals: Float[Array, "r t c"]
     shared: Float[Array, "r q s"]
     own: Float[Array, "r q o"]
-    left: Float[Array, "r q"]
+    factored_residuals: Float[Array, "r q"]
     at: Float[Array, " s"]
 
-    def shifted(self, shared: Float[Array, " s"], own: Float[Array, "r o"]) -> Float[Array, "r q"]:
-        """``left`` after small changes of the unknowns, to first order."""
+    def residuals_near(
+        self, shared: Float[Array, " s"], own: Float[Array, "r o"]
+    ) -> Float[Array, "r q"]:
+        """``factored_residuals`` after small changes of the unknowns, to first order."""
         return (
-            self.left
+            self.factored_residuals
             + jnp.einsum("rqs,s->rq", self.shared, shared)
             + jnp.einsum("rqo,ro->rq", self.own, own)
         )
@@ -292,8 +296,10 @@ class Linear(NamedTuple):
         side = jnp.einsum("rqs,rqo->sro", self.shared, self.own)
         side = side.reshape(corner.shape[0], recordings * size)
         blocks = jnp.einsum("rqo,rqz->roz", self.own, self.own)
-        each = jnp.eye(recordings, dtype=corner.dtype)[:, None, :, None] * blocks[:, :, None, :]
-        below = each.reshape(recordings * size, recordings * size)
+        own_blocks = (
+            jnp.eye(recordings, dtype=corner.dtype)[:, None, :, None] * blocks[:, :, None, :]
+        )
+        below = own_blocks.reshape(recordings * size, recordings * size)
         return jnp.block([[corner, side], [side.T, below]])
 
 
@@ -319,33 +325,33 @@ def unknowns(parameters: Parameters, model: Model) -> Unknowns:
     entries = entries_of(model.tensor(parameters), count)
     sensors = (parameters.bias, parameters.mounting, parameters.lever)
     calibration = (parameters.gain, parameters.delay)
-    rest, back = ravel_pytree((sensors, parameters.motion, calibration))
-    shared = jnp.concatenate([entries, rest.astype(entries.dtype)])
+    other_unknowns, back = ravel_pytree((sensors, parameters.motion, calibration))
+    shared = jnp.concatenate([entries, other_unknowns.astype(entries.dtype)])
     own = [parameters.omega]
     if parameters.attitude is not None:
         own.append(parameters.attitude)
-    moving = sum(part.shape[1] for part in own)
+    motion_count = sum(part.shape[1] for part in own)
     if parameters.walk is not None:
         own.append(parameters.walk.reshape(parameters.walk.shape[0], -1))
     own = jnp.concatenate(own, axis=1)
-    none = jnp.zeros(0, entries.dtype)
+    no_shape = jnp.zeros(0, entries.dtype)
     sizes = [
         sum(leaf.size for leaf in jax.tree.leaves(part))
         for part in (sensors, parameters.motion, calibration)
     ]
     of_motion = np.repeat([True, False, True, False], [count, *sizes])
-    of_own = np.arange(own.shape[1]) < moving
+    of_own = np.arange(own.shape[1]) < motion_count
 
-    def one(shared, own):
+    def parameters_of(shared, own):
         (bias, mounting, lever), motion, (gain, delay) = back(shared[count:])
         attitude = None if parameters.attitude is None else own[None, 3:6]
-        walk = None if parameters.walk is None else own[moving:].reshape(1, -1, 3)
+        walk = None if parameters.walk is None else own[motion_count:].reshape(1, -1, 3)
         values = Parameters(
-            none, own[None, :3], attitude, bias, mounting, lever, motion, gain, delay, walk
+            no_shape, own[None, :3], attitude, bias, mounting, lever, motion, gain, delay, walk
         )
         return values, whole_of(shared[:count], count)
 
-    return Unknowns(shared, own, of_motion, of_own, one)
+    return Unknowns(shared, own, of_motion, of_own, parameters_of)
 
 
 def linearise(
@@ -357,45 +363,55 @@ def linearise(
     is differentiated by the unknowns that it depends on; those of the sensors act on the motion
     that was predicted, which costs next to nothing for each of them.
     """
-    place, own_place = np.flatnonzero(layout.of_motion), np.flatnonzero(layout.of_own)
-    other, own_other = np.flatnonzero(~layout.of_motion), np.flatnonzero(~layout.of_own)
+    motion_places, own_motion_places = (
+        np.flatnonzero(layout.of_motion),
+        np.flatnonzero(layout.of_own),
+    )
+    sensor_places, own_sensor_places = (
+        np.flatnonzero(~layout.of_motion),
+        np.flatnonzero(~layout.of_own),
+    )
 
     def at(own, single, attitude):
-        lone = jax.tree.map(lambda leaf: leaf[None], single)
+        one_recording = jax.tree.map(lambda leaf: leaf[None], single)
         start = None if attitude is None else attitude[None]
-        here = dataclasses.replace(model, attitude=start)
+        one_model = dataclasses.replace(model, attitude=start)
 
         def flat(motion, parameters):
-            parts = residuals_of_motion(motion, parameters, lone, here)
+            parts = residuals_of_motion(motion, parameters, one_recording, one_model)
             return jnp.concatenate([part[0] for part in parts.values()], axis=-1)
 
-        def residuals_at(some, some_own):
+        def residuals_at(motion_unknowns, own_motion_unknowns):
             parameters, tensor = layout.parameters(
-                shared.at[place].set(some), own.at[own_place].set(some_own)
+                shared.at[motion_places].set(motion_unknowns),
+                own.at[own_motion_places].set(own_motion_unknowns),
             )
-            motion = predict(parameters, lone, here, tensor)
-            rest = flat(motion, parameters)
-            return rest, (rest, motion)
+            motion = predict(parameters, one_recording, one_model, tensor)
+            rows = flat(motion, parameters)
+            return rows, (rows, motion)
 
-        def sensed(some, some_own):
+        def sensor_residuals(sensor_unknowns, own_sensor_unknowns):
             parameters, _ = layout.parameters(
-                shared.at[other].set(some), own.at[own_other].set(some_own)
+                shared.at[sensor_places].set(sensor_unknowns),
+                own.at[own_sensor_places].set(own_sensor_unknowns),
             )
             return flat(motion, parameters)
 
         slopes = jax.jacfwd(residuals_at, argnums=(0, 1), has_aux=True)
-        (by_shared, by_own), (rest, motion) = slopes(shared[place], own[own_place])
-        if other.size or own_other.size:
-            also, own_also = jax.jacfwd(sensed, argnums=(0, 1))(shared[other], own[own_other])
-            by_shared = jnp.concatenate([by_shared, also], axis=-1)
-            by_own = jnp.concatenate([by_own, own_also], axis=-1)
-            by_shared = by_shared[..., np.argsort(np.concatenate([place, other]))]
-            by_own = by_own[..., np.argsort(np.concatenate([own_place, own_other]))]
-        return by_shared, by_own, rest
+        (by_shared, by_own), (rows, motion) = slopes(shared[motion_places], own[own_motion_places])
+        if sensor_places.size or own_sensor_places.size:
+            by_sensors, own_by_sensors = jax.jacfwd(sensor_residuals, argnums=(0, 1))(
+                shared[sensor_places], own[own_sensor_places]
+            )
+            by_shared = jnp.concatenate([by_shared, by_sensors], axis=-1)
+            by_own = jnp.concatenate([by_own, own_by_sensors], axis=-1)
+            by_shared = by_shared[..., np.argsort(np.concatenate([motion_places, sensor_places]))]
+            by_own = by_own[..., np.argsort(np.concatenate([own_motion_places, own_sensor_places]))]
+        return by_shared, by_own, rows
 
-    by_shared, by_own, rest = jax.vmap(at)(own, recording, model.attitude)
-    columns = jnp.concatenate([by_shared, by_own, rest[..., None]], axis=-1)
-    columns = columns.reshape(rest.shape[0], -1, columns.shape[-1])
+    by_shared, by_own, rows = jax.vmap(at)(own, recording, model.attitude)
+    columns = jnp.concatenate([by_shared, by_own, rows[..., None]], axis=-1)
+    columns = columns.reshape(rows.shape[0], -1, columns.shape[-1])
     factor = triangle(columns)
     count = shared.shape[0]
-    return Linear(rest, factor[..., :count], factor[..., count:-1], factor[..., -1], shared)
+    return Linear(rows, factor[..., :count], factor[..., count:-1], factor[..., -1], shared)

@@ -221,19 +221,21 @@ class Fit(eqx.Module):
             for x in (self.covariance, self.information)
         )
         # in the order of the covariance: entries, sensors, then the motion's values
-        full = np.zeros((value.size, covariance.shape[0]))
-        first = 0
+        full_derivative = np.zeros((value.size, covariance.shape[0]))
+        position = 0
         for k, slope in enumerate(slopes):
-            first += skipped if k == int(self._inertia is not None) else 0
-            full[:, first : first + slope.shape[1]] = slope
-            first += slope.shape[1]
-        std = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", full, covariance, full), 0))
+            position += skipped if k == int(self._inertia is not None) else 0
+            full_derivative[:, position : position + slope.shape[1]] = slope
+            position += slope.shape[1]
+        std = np.sqrt(
+            np.maximum(np.einsum("ij,jk,ik->i", full_derivative, covariance, full_derivative), 0)
+        )
         size = np.sqrt(np.diagonal(information))
         safe = np.where(size > 0, size, 1)
         eigenvalues, axes = np.linalg.eigh(information / safe[:, None] / safe)
         null = axes[:, eigenvalues <= 1e3 * np.finfo(information.dtype).eps * eigenvalues[-1]]
-        leaning = np.linalg.norm(full @ (null / safe[:, None]), axis=1)
-        reach = np.linalg.norm(full / safe, axis=1)
+        leaning = np.linalg.norm(full_derivative @ (null / safe[:, None]), axis=1)
+        reach = np.linalg.norm(full_derivative / safe, axis=1)
         std = np.where(leaning > MAX_NULL_PART * reach, np.inf, std)
         return np.asarray(value), std.reshape(value.shape)
 
@@ -306,7 +308,7 @@ class Fit(eqx.Module):
 
     def _calibration_part(self, body: int) -> float:
         """Part of the variance of the values that an exact calibration would remove, at most."""
-        first = self.model.entries
+        entry_count = self.model.entries
         lead = np.ndim(self.diagnostics)
         if self.parameters.gain is None:
             return 0.0
@@ -315,18 +317,20 @@ class Fit(eqx.Module):
             leaves = [x for name in names for x in jax.tree.leaves(getattr(self.parameters, name))]
             return sum(int(np.prod(np.shape(leaf)[lead:])) for leaf in leaves)
 
-        start = first + count("bias", "mounting", "lever")
-        moving = start + count("motion")
+        start = entry_count + count("bias", "mounting", "lever")
+        motion_end = start + count("motion")
         matrix = np.asarray(self.covariance)
         matrix = matrix.reshape(-1, *matrix.shape[-2:])[body]
-        own = np.arange(first) if self._inertia is not None else np.arange(start, moving)
-        gain = np.arange(moving, moving + 9)
+        value_places = (
+            np.arange(entry_count) if self._inertia is not None else np.arange(start, motion_end)
+        )
+        gain = np.arange(motion_end, motion_end + 9)
         gain = gain[np.diagonal(matrix)[gain] > 0]
-        if not gain.size or not own.size:
+        if not gain.size or not value_places.size:
             return 0.0
-        side = matrix[np.ix_(own, gain)]
+        side = matrix[np.ix_(value_places, gain)]
         removed = side @ np.linalg.pinv(matrix[np.ix_(gain, gain)], hermitian=True) @ side.T
-        total = np.diagonal(matrix)[own]
+        total = np.diagonal(matrix)[value_places]
         return float(np.max(np.diagonal(removed) / np.where(total > 0, total, np.inf)))
 
     def to_dict(self, body: int = 0) -> dict[str, Any]:
@@ -339,7 +343,7 @@ class Fit(eqx.Module):
         """
         lead = np.ndim(self.diagnostics)
 
-        def plain(value):
+        def as_list(value):
             value = np.asarray(value)
             value = value.reshape(-1, *value.shape[lead:])[body]
             return np.asarray(np.where(np.isfinite(value), value, None)).tolist()
@@ -347,18 +351,18 @@ class Fit(eqx.Module):
         names = self.value_names
         out = {
             "kind": "scene" if self._inertia is None else "inertia",
-            "values": {k: plain(x) for k, x in zip(names, self.values, strict=True)},
-            "std": {k: plain(x) for k, x in zip(names, self.std, strict=True)},
-            "sensor": {k: plain(x) for k, x in self.sensor.items()},
-            "sensor_std": {k: plain(x) for k, x in self.sensor_std.items()},
-            "initial_wxyz": plain(self.initial.wxyz),
-            "initial_omega_body": plain(self.initial.omega_body),
-            "covariance": plain(self.covariance),
-            "null_count": plain(self.null_count),
-            "noise": plain(self.noise),
-            "whiteness": plain(self.whiteness),
-            "rms": plain(self.rms),
-            "steps": plain(self.steps),
+            "values": {k: as_list(x) for k, x in zip(names, self.values, strict=True)},
+            "std": {k: as_list(x) for k, x in zip(names, self.std, strict=True)},
+            "sensor": {k: as_list(x) for k, x in self.sensor.items()},
+            "sensor_std": {k: as_list(x) for k, x in self.sensor_std.items()},
+            "initial_wxyz": as_list(self.initial.wxyz),
+            "initial_omega_body": as_list(self.initial.omega_body),
+            "covariance": as_list(self.covariance),
+            "null_count": as_list(self.null_count),
+            "noise": as_list(self.noise),
+            "whiteness": as_list(self.whiteness),
+            "rms": as_list(self.rms),
+            "steps": as_list(self.steps),
             "findings": self.findings(body),
             "warnings": self.warnings(body),
             "limit": self.limit(body),
@@ -371,21 +375,23 @@ class Fit(eqx.Module):
             low, high = self.interval()
             out |= {
                 "scale_known": self.scale_known,
-                "moments": plain(self.moments),
-                "moments_std": plain(self.moments_std),
-                "ratios": plain(self.ratios),
-                "ratios_std": plain(self.ratios_std),
-                "interval_95": [plain(low), plain(high)],
-                "axes_wxyz": plain(self.axes),
-                "axes_std": plain(self.axes_std),
+                "moments": as_list(self.moments),
+                "moments_std": as_list(self.moments_std),
+                "ratios": as_list(self.ratios),
+                "ratios_std": as_list(self.ratios_std),
+                "interval_95": [as_list(low), as_list(high)],
+                "axes_wxyz": as_list(self.axes),
+                "axes_std": as_list(self.axes_std),
             }
         return out
 
     def to_json(self, path: str | PathLike[str]) -> None:
         """Write ``to_dict`` of every body: one object, or a list of them for a batch."""
         bodies = [self.to_dict(k) for k in range(np.size(self.diagnostics))]
-        whole = bodies if np.ndim(self.diagnostics) else bodies[0]
-        Path(path).write_text(json.dumps(whole, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        content = bodies if np.ndim(self.diagnostics) else bodies[0]
+        Path(path).write_text(
+            json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8"
+        )
 
     def to_csv(self, path: str | PathLike[str]) -> None:
         """Write a row for every fitted number: body, name, component, value, standard deviation.

@@ -65,17 +65,19 @@ def integrate(
 
     def rate_at(s):
         # Hermite's basis on [0, 1]
-        late = s * s * (3 - 2 * s)
+        end_weight = s * s * (3 - 2 * s)
         start, end = s * (1 - s) ** 2, -s * s * (1 - s)
         return (
-            (1 - late) * omega[:-1]
-            + late * omega[1:]
+            (1 - end_weight) * omega[:-1]
+            + end_weight * omega[1:]
             + step * (start * slope[:-1] + end * slope[1:])
         )
 
     def half(middle):
-        first, second = rate_at(middle - offset), rate_at(middle + offset)
-        return step / 4 * (first + second) + step**2 / 4 * offset * jnp.cross(first, second)
+        first_rate, second_rate = rate_at(middle - offset), rate_at(middle + offset)
+        return step / 4 * (first_rate + second_rate) + step**2 / 4 * offset * jnp.cross(
+            first_rate, second_rate
+        )
 
     turns = multiply(rotation_vector_to_wxyz(half(0.25)), rotation_vector_to_wxyz(half(0.75)))
     unit = jnp.asarray([[1, 0, 0, 0]], omega.dtype)
@@ -90,17 +92,17 @@ def _products(turns: Float[Array, "n 4"], unit: Float[Array, "1 4"]) -> Float[Ar
     """
     count = turns.shape[0]
     side = math.isqrt(count - 1) + 1
-    padded = jnp.concatenate([turns, jnp.broadcast_to(unit, (side * side - count, 4))])
+    padded_turns = jnp.concatenate([turns, jnp.broadcast_to(unit, (side * side - count, 4))])
 
-    def on(before, turn):
-        now = multiply(before, turn)
-        return now, now
+    def on(product, turn):
+        next_product = multiply(product, turn)
+        return next_product, next_product
 
     start = jnp.broadcast_to(unit, (side, 4))
-    _, within = jax.lax.scan(on, start, jnp.swapaxes(padded.reshape(side, side, 4), 0, 1))
+    _, within = jax.lax.scan(on, start, jnp.swapaxes(padded_turns.reshape(side, side, 4), 0, 1))
     _, rows = jax.lax.scan(on, unit[0], within[-1])
-    before = jnp.concatenate([unit, rows[:-1]])
-    return multiply(before[:, None], jnp.swapaxes(within, 0, 1)).reshape(-1, 4)[:count]
+    row_starts = jnp.concatenate([unit, rows[:-1]])
+    return multiply(row_starts[:, None], jnp.swapaxes(within, 0, 1)).reshape(-1, 4)[:count]
 
 
 def _design(omega: Float[Array, "t 3"]) -> Float[Array, "t 3 6"]:
@@ -114,8 +116,8 @@ def _design(omega: Float[Array, "t 3"]) -> Float[Array, "t 3 6"]:
 def _nearest_physical(entries: Float[Array, " 6"]) -> Float[Array, "3 3"]:
     """Second moments of the nearest body that is not too flat."""
     values, axes = eigh(second_moments(whole_of(entries)))
-    least = _FLATTEST * jnp.sum(jnp.abs(values))
-    values = jnp.maximum(values, least)
+    min_moment = _FLATTEST * jnp.sum(jnp.abs(values))
+    values = jnp.maximum(values, min_moment)
     return jnp.einsum("ij,j,kj->ik", axes, values, axes)
 
 
@@ -137,7 +139,7 @@ def regression(
     """
 
     count = times.shape[1]
-    whole = jnp.ones((1, count), omega.dtype)
+    all_samples = jnp.ones((1, count), omega.dtype)
     # parts in which errors of the integrated attitude have no time to grow
     place = np.arange(count) * _PIECES // count
     pieces = jnp.asarray(place == np.arange(_PIECES)[:, None], omega.dtype)
@@ -160,7 +162,7 @@ def regression(
     def square(rows):
         return jnp.einsum("rtij,rtik->jk", rows, rows)
 
-    first = jax.vmap(central_slope)(omega, times)
+    first_derivatives = jax.vmap(central_slope)(omega, times)
     if momentum is None:
         metric = jnp.asarray([1, 1, 1, 2, 2, 2], omega.dtype) ** 0.5
 
@@ -170,33 +172,35 @@ def regression(
             entries = entries * jnp.where(jnp.sum(entries[:3]) < 0, -1, 1).astype(entries.dtype)
             return _nearest_physical(entries), values[0] / jnp.sum(values)
 
-        def again(_, carry):
+        def refine(_, carry):
             _, rows = rows_of(carry[0])
-            grams = jnp.stack([square(centred(rows, parts)) for parts in (whole, pieces)])
+            grams = jnp.stack([square(centred(rows, parts)) for parts in (all_samples, pieces)])
             sigma, misfit = jax.vmap(null)(grams)
             body = Inertia(full=inertia_of_second_moments(sigma[1]))
             return free_acceleration(body, omega), sigma, misfit
 
         unit = jnp.eye(3, dtype=omega.dtype)
-        start = (first, jnp.stack([unit, unit]), jnp.zeros(2, omega.dtype))
-        _, sigma, misfit = jax.lax.fori_loop(0, _ROUNDS, again, start)
+        start = (first_derivatives, jnp.stack([unit, unit]), jnp.zeros(2, omega.dtype))
+        _, sigma, misfit = jax.lax.fori_loop(0, _ROUNDS, refine, start)
         return sigma[0], sigma[1], misfit[0]
-    turn, rows = rows_of(first)
-    carried = jnp.einsum("rtij,rtj->rti", turn, momentum)
+    turn, rows = rows_of(first_derivatives)
+    rotated_momentum = jnp.einsum("rtij,rtj->rti", turn, momentum)
     solutions = []
-    for parts in (whole, pieces):
-        body, push = centred(rows, parts), centred(carried, parts)
+    for parts in (all_samples, pieces):
+        body, push = centred(rows, parts), centred(rotated_momentum, parts)
         entries = solve(square(body), -jnp.einsum("rtij,rti->j", body, push))
-        rest = jnp.einsum("rtij,j->rti", body, entries) + push
-        solutions.append((_nearest_physical(entries), jnp.sum(rest**2) / jnp.sum(push**2)))
+        residual = jnp.einsum("rtij,j->rti", body, entries) + push
+        solutions.append((_nearest_physical(entries), jnp.sum(residual**2) / jnp.sum(push**2)))
     return solutions[0][0], solutions[1][0], solutions[0][1]
 
 
-def alternative_starts(omega: Float[Array, "r t 3"], first: Float[Array, "3 3"]) -> list[Array]:
+def alternative_starts(
+    omega: Float[Array, "r t 3"], initial_moments: Float[Array, "3 3"]
+) -> list[Array]:
     """Other second moments: long, flat and middling bodies along the directions of the rates."""
     spread = jnp.einsum("rti,rtj->ij", omega, omega)
     _, axes = eigh(spread)
-    size = first[0, 0] + first[1, 1] + first[2, 2]
+    size = initial_moments[0, 0] + initial_moments[1, 1] + initial_moments[2, 2]
     return [
         size * jnp.einsum("ij,j,kj->ik", axes, jnp.asarray(widths, omega.dtype), axes)
         for widths in ((0.6, 0.25, 0.15), (0.15, 0.25, 0.6), (0.25, 0.6, 0.15))
@@ -268,7 +272,7 @@ class _Search(eqx.Module):
     """Where the search stands: the job at hand, where it left off, and the best so far."""
 
     job: Array
-    scaled: Parameters
+    scaled_parameters: Parameters
     best: Parameters
     base: Base
     linear: Linear
@@ -285,14 +289,14 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
     motion = FreeMotion() if options.motion is None else options.motion
     gyroscope = Gyroscope() if options.gyroscope is None else options.gyroscope
     unknown = FullTensor() if options.unknown is None else options.unknown
-    bases, first = _bases(recording, rates, motion, unknown, options.initial_inertia)
+    bases, initial_moments = _bases(recording, rates, motion, unknown, options.initial_inertia)
     scale_known = motion.fixes_scale()
     columns = free_columns(unknown, scale_known)
-    fixed = tuple(map(tuple, columns.tolist()))
+    column_tuples = tuple(map(tuple, columns.tolist()))
     attitude = None if recording.wxyz is None else recording.wxyz[:, 0]
 
     def model_of(base):
-        return Model(motion, base, attitude, options.robust, fixed, scale_known, gyroscope)
+        return Model(motion, base, attitude, options.robust, column_tuples, scale_known, gyroscope)
 
     dtype = rates.dtype
     zero = jnp.zeros(3, dtype)
@@ -313,8 +317,8 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
     )
     first_scaled = jax.tree.map(lambda a, b: (a / b).astype(optimiser_dtype), unbounded, scale)
 
-    def parameters_of(scaled):
-        solution = jax.tree.map(lambda a, b: a.astype(dtype) * b, scaled, scale)
+    def parameters_of(scaled_parameters):
+        solution = jax.tree.map(lambda a, b: a.astype(dtype) * b, scaled_parameters, scale)
         return dataclasses.replace(solution, motion=motion.bounded(solution.motion))
 
     weight = _weight(recording, rates)
@@ -340,21 +344,21 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
         is then proportional, to first order in 1/T, to the logarithm of the likelihood of an
         unknown noise.
         """
-        unit = jnp.ones((), dtype) if trusted else jnp.sqrt(jnp.sum(linear.rest**2) / count)
+        unit = jnp.ones((), dtype) if trusted else jnp.sqrt(jnp.sum(linear.residuals**2) / count)
         typical = 10 / weight / jnp.sqrt(count / rates.shape[0])
         return jnp.maximum(unit, _LEAST_NOISE * typical)
 
-    def misfits(scaled, job):
+    def misfits(scaled_parameters, job):
         base, data_part, shape_weight = job
-        parameters = parameters_of(scaled)
+        parameters = parameters_of(scaled_parameters)
         values = unknowns(parameters, model_of(base))
         # Residuals and Jacobian are computed here together, by blocks. The optimiser then
         # differentiates a linear function: its own Jacobian costs no further integration.
         at = jax.lax.stop_gradient((values.shared, values.own))
         linear = linear_at(*at, data_part, base)
-        misfit = linear.shifted(values.shared - at[0], values.own - at[1])
+        misfit = linear.residuals_near(values.shared - at[0], values.own - at[1])
         unit = jax.lax.stop_gradient(prior_unit(linear))
-        rows = [misfit.ravel(), shape_weight * scaled.shape.astype(dtype)]
+        rows = [misfit.ravel(), shape_weight * scaled_parameters.shape.astype(dtype)]
         rows += [unit * part for part in prior_residuals(parameters, recording, model_of(base))]
         return (weight * jnp.concatenate(rows)).astype(optimiser_dtype), linear
 
@@ -366,13 +370,15 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
 
     def attempt(search):
         job = search.job
-        early = (elapsed <= part[job] * span).astype(dtype)
-        data_part = recording.present * early
+        part_mask = (elapsed <= part[job] * span).astype(dtype)
+        data_part = recording.present * part_mask
         data_part = eqx.tree_at(lambda r: r.present, recording, data_part)
         base = jax.tree.map(lambda leaf: leaf[which[job]], bases)
         restarts = jnp.asarray(jobs["anew"])[job]
         shape_weight = jnp.where(part[job] < 1, noise / _SPREAD, 0)
-        start = jax.tree.map(lambda a, b: jnp.where(restarts, a, b), first_scaled, search.scaled)
+        start = jax.tree.map(
+            lambda a, b: jnp.where(restarts, a, b), first_scaled, search.scaled_parameters
+        )
         solution = optx.least_squares(
             misfits,
             solver,
@@ -384,7 +390,7 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
         )
         # the auxiliary output of the last accepted step; ``solution.aux`` is that of the one before
         linear = solution.state.aux
-        cost = jnp.sum(linear.rest**2) / 2
+        cost = jnp.sum(linear.residuals**2) / 2
         cost = cost + prior_unit(linear) ** 2 * prior_cost(
             parameters_of(solution.value), recording, model_of(base)
         )
@@ -410,17 +416,17 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
             stopped & (same_optimum | (misfit_of(linear, options.robust) <= _GOOD**2 * expected)),
         )
 
-    one = jax.tree.map(lambda leaf: leaf[0], bases)
-    _, struct = jax.eval_shape(misfits, first_scaled, (one, recording, noise))
+    first_base = jax.tree.map(lambda leaf: leaf[0], bases)
+    _, struct = jax.eval_shape(misfits, first_scaled, (first_base, recording, noise))
     empty_linear = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), struct)
     # the starting body, in case no attempt finishes
-    body = entries_of(inertia_of_second_moments(first), model_of(one).entries)
+    body = entries_of(inertia_of_second_moments(initial_moments), model_of(first_base).entries)
     empty_linear = empty_linear._replace(at=empty_linear.at.at[: body.shape[0]].set(body))
     first_search = _Search(
         jnp.asarray(0),
         first_scaled,
         first_scaled,
-        one,
+        first_base,
         empty_linear,
         jnp.asarray(jnp.inf, dtype),
         jnp.asarray(0),
@@ -428,8 +434,8 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
         jnp.asarray(False),
         jnp.asarray(False),
     )
-    last = len(jobs["base"])
-    last_search = jax.lax.while_loop(lambda s: (s.job < last) & ~s.good, attempt, first_search)
+    job_count = len(jobs["base"])
+    last_search = jax.lax.while_loop(lambda s: (s.job < job_count) & ~s.good, attempt, first_search)
     model = model_of(last_search.base)
     return Solution(
         parameters_of(last_search.best),
@@ -469,14 +475,14 @@ def _sequence_of_fits(bases: int, attempts: int) -> dict[str, np.ndarray]:
     tries = [[(base, 1.0, True)] for base in range(min(bases, 2))]
     for base in range(bases):
         tries.append([(base, part, part == _PARTS[0]) for part in _PARTS])
-    rows = [row for one in tries[: max(attempts, 1)] for row in one]
+    rows = [row for attempt_rows in tries[: max(attempts, 1)] for row in attempt_rows]
     base, part, anew = zip(*rows, strict=True)
     return {"base": np.array(base), "part": np.array(part), "anew": np.array(anew)}
 
 
 def misfit_of(linear: Linear, robust: Huber | None) -> Float[Array, ""]:
     """The sum of squares that is to be compared with the noise: an outlier counts as its bound."""
-    square = linear.rest**2
+    square = linear.residuals**2
     return jnp.sum(square if robust is None else jnp.minimum(square, robust.threshold**2))
 
 
@@ -536,8 +542,8 @@ def _rates(recording: Recording) -> Float[Array, "r t 3"]:
         wxyz = require_channel("wxyz", recording.wxyz)
         step = jnp.diff(recording.times, axis=-1)[..., None]
         between = rotation_vector_between(wxyz[:, :-1], wxyz[:, 1:]) / step
-        inner = (between[:, 1:] + between[:, :-1]) / 2
-        return jnp.concatenate([between[:, :1], inner, between[:, -1:]], axis=1)
+        mean_rates = (between[:, 1:] + between[:, :-1]) / 2
+        return jnp.concatenate([between[:, :1], mean_rates, between[:, -1:]], axis=1)
     return interpolate_gaps(recording.times, recording.present, recording.omega)
 
 
@@ -550,17 +556,19 @@ def _bases(
 ) -> tuple[Base, Array]:
     """Starting bodies (leading axis), the best first, and the second moments of that one."""
     if unknown.columns().shape[1] == 0:
-        first = jnp.eye(3, dtype=rates.dtype)
-        return jax.tree.map(lambda leaf: leaf[None], base_of(first, True)), first
+        whole_moments = jnp.eye(3, dtype=rates.dtype)
+        return jax.tree.map(lambda leaf: leaf[None], base_of(whole_moments, True)), whole_moments
     wheel_momentum = None
     if isinstance(motion, SteppedMotion) and motion.spin_inertia is not None:
         axis = jnp.asarray(motion.axis, rates.dtype)
         wheel = require_channel("wheel", recording.wheel)
         wheel_momentum = motion.spin_inertia * wheel[..., None] * axis[None, None]
-    first, second, _ = regression(rates, recording.times, recording.present, wheel_momentum)
+    whole_moments, piece_moments, _ = regression(
+        rates, recording.times, recording.present, wheel_momentum
+    )
     if initial is not None:
-        first = second_moments(initial.tensor)
-    bodies = jnp.stack([first, second, *alternative_starts(rates, first)])
+        whole_moments = second_moments(initial.tensor)
+    bodies = jnp.stack([whole_moments, piece_moments, *alternative_starts(rates, whole_moments)])
     if unknown.columns().shape[1] == 3:
         bodies = bodies * jnp.eye(3, dtype=bodies.dtype)[None]
     scale_known = motion.fixes_scale()
