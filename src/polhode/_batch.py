@@ -30,7 +30,7 @@ def _fields(part: Any) -> list[tuple[str, int]]:
     return [(name, n) for name, n in ranks if isinstance(getattr(part, name), _ARRAYS)]
 
 
-def _inner(part: Any) -> list[str]:
+def _part_fields(part: Any) -> list[str]:
     """Fields that are parts themselves, such as an orbit."""
     return [name for name in part.core_ranks if isinstance(getattr(part, name), AbstractPart)]
 
@@ -45,21 +45,21 @@ def map_arrays(part: Any, fn: Callable[[Any, int], Any]) -> Any:
         return None
     if isinstance(part, AbstractSum):
         return eqx.tree_at(lambda p: p.terms, part, tuple(map_arrays(t, fn) for t in part.terms))
-    for name in _inner(part):
-        inner = map_arrays(getattr(part, name), fn)
-        part = eqx.tree_at(lambda p, name=name: getattr(p, name), part, inner)
+    for name in _part_fields(part):
+        mapped_part = map_arrays(getattr(part, name), fn)
+        part = eqx.tree_at(lambda p, name=name: getattr(p, name), part, mapped_part)
     fields = _fields(part)
     if not fields:
         return part
-    new = [fn(getattr(part, name), rank) for name, rank in fields]
-    return eqx.tree_at(lambda p: [getattr(p, name) for name, _ in fields], part, new)
+    arrays = [fn(getattr(part, name), rank) for name, rank in fields]
+    return eqx.tree_at(lambda p: [getattr(p, name) for name, _ in fields], part, arrays)
 
 
 def batch_shapes(part: Any) -> list[tuple[int, ...]]:
     """Leading axes of every array of a part."""
-    found: list[tuple[int, ...]] = []
-    map_arrays(part, lambda x, rank: (found.append(_lead(x, rank)), x)[1])
-    return found
+    shapes: list[tuple[int, ...]] = []
+    map_arrays(part, lambda x, rank: (shapes.append(_lead(x, rank)), x)[1])
+    return shapes
 
 
 def common_batch(*parts: Any, extra: tuple[tuple[int, ...], ...] = ()) -> tuple[int, ...]:
@@ -68,14 +68,14 @@ def common_batch(*parts: Any, extra: tuple[tuple[int, ...], ...] = ()) -> tuple[
     try:
         return np.broadcast_shapes(*shapes)
     except ValueError as error:
-        given = ", ".join(
+        description = ", ".join(
             f"{type(part).__name__}: {sorted(set(batch_shapes(part)))}"
             for part in parts
             if part is not None
         )
         raise ValueError(
-            f"the batch axes do not broadcast together ({given}; ts: {list(extra)}): give every"
-            " array the same leading axes, or 1 where it is shared."
+            f"the batch axes do not broadcast together ({description}; ts: {list(extra)}): give"
+            " every array the same leading axes, or 1 where it is shared."
         ) from error
 
 
@@ -102,14 +102,14 @@ def is_lane_tree(parts: Any) -> Any:
     """Mask of the leaves that carry the lane axis, for ``eqx.partition`` of (scene, state)."""
     lane = object()
 
-    def marked(part):
+    def mark(part):
         return map_arrays(part, lambda x, rank: lane if x.ndim > rank else x)
 
     scene, state = parts
     for name in PARTS:
         if (part := getattr(scene, name)) is not None:
-            scene = eqx.tree_at(lambda s, name=name: getattr(s, name), scene, marked(part))
-    return jax.tree.map(lambda x: x is lane, (scene, marked(state)))
+            scene = eqx.tree_at(lambda s, name=name: getattr(s, name), scene, mark(part))
+    return jax.tree.map(lambda x: x is lane, (scene, mark(state)))
 
 
 def along_time(part: Any, batch_rank: int) -> Any:
@@ -167,24 +167,24 @@ def split_of(scene: Any, state: Any, ts: Array) -> Split | None:
     """
     if jax.device_count() == 1:
         return None
-    found: list[tuple[NamedSharding, tuple[int, ...]]] = []
+    shardings: list[tuple[NamedSharding, tuple[int, ...]]] = []
 
     def look(x, rank):
         sharding = _sharding(x)
         if sharding is not None:
-            found.append((sharding, x.shape[: x.ndim - rank]))
+            shardings.append((sharding, x.shape[: x.ndim - rank]))
         return x
 
     parts = [getattr(scene, name) for name in PARTS]
     for part in (*parts, state):
         map_arrays(part, look)
     look(ts, 1)
-    if not found:
+    if not shardings:
         return None
     batch = common_batch(*parts, state, extra=(ts.shape[:-1],))
     axes: list[Any] = [None] * len(batch)
     mesh = None
-    for sharding, lead in found:
+    for sharding, lead in shardings:
         spec = (*sharding.spec, *[None] * len(lead))[: len(lead)]
         for k, (axis, size) in enumerate(zip(spec, lead), len(batch) - len(lead)):
             if axis is None or size == 1 or axis is PartitionSpec.UNCONSTRAINED:
@@ -226,18 +226,20 @@ def on_devices(
     """``fn(method, scene, state, ts, rtol)`` by every device for its part of the batch; what it
     returns has the batch axes in front.
     """
-    arrays, rest = eqx.partition((method, scene, state, ts, rtol), eqx.is_array)
+    arrays, static = eqx.partition((method, scene, state, ts, rtol), eqx.is_array)
     specs = jax.tree.map(lambda _: PartitionSpec(), arrays)
     method_specs, scene_specs, *_ = specs
     for name in PARTS:
         if getattr(scene, name) is not None:
-            own = eqx.filter(map_arrays(getattr(scene, name), split.spec), _is_spec)
-            own = eqx.combine(own, getattr(scene_specs, name), is_leaf=_is_spec)
-            scene_specs = eqx.tree_at(lambda s, name=name: getattr(s, name), scene_specs, own)
+            part_specs = eqx.filter(map_arrays(getattr(scene, name), split.spec), _is_spec)
+            part_specs = eqx.combine(part_specs, getattr(scene_specs, name), is_leaf=_is_spec)
+            scene_specs = eqx.tree_at(
+                lambda s, name=name: getattr(s, name), scene_specs, part_specs
+            )
     state_specs = map_arrays(state, split.spec)
     in_specs = (method_specs, scene_specs, state_specs, split.spec(ts, 1), PartitionSpec())
     return jax.shard_map(
-        lambda arrays: fn(*eqx.combine(arrays, rest)),
+        lambda arrays: fn(*eqx.combine(arrays, static)),
         mesh=split.mesh,
         in_specs=(in_specs,),
         out_specs=PartitionSpec(*split.axes),

@@ -48,12 +48,12 @@ def on_host(array: Any, weak: bool = False) -> Any:
     return np.asarray(array) if weak or not array.weak_type else array
 
 
-def together(found: Sequence[Any]) -> Any:
+def together(conditions: Sequence[Any]) -> Any:
     """Where all of these truth values (...) hold, batch axes broadcast; None for none."""
-    if not found:
+    if not conditions:
         return None
-    xp = numbers(*found)
-    return reduce(xp.logical_and, xp.broadcast_arrays(*found))
+    xp = numbers(*conditions)
+    return reduce(xp.logical_and, xp.broadcast_arrays(*conditions))
 
 
 def _is_here(x: Any) -> bool:
@@ -111,9 +111,9 @@ def as_float_array(
     tail = array.shape[array.ndim - n :] if n else ()
     fits = array.ndim >= n and all(want in (None, got) for want, got in zip(suffix, tail))
     if not fits:
-        wanted = ", ".join(["...", *("n" if s is None else str(s) for s in suffix)])
+        expected_shape = ", ".join(["...", *("n" if s is None else str(s) for s in suffix)])
         raise ValueError(
-            f"{name} must have shape ({wanted}), got {array.shape}: put batch axes first"
+            f"{name} must have shape ({expected_shape}), got {array.shape}: put batch axes first"
             " and the components last."
         )
     if finite and is_concrete(array) and not bool(np.all(np.isfinite(np.asarray(array)))):
@@ -156,9 +156,12 @@ def require_positive(
     """ValueError if a concrete array holds negative values (or zeros, unless ``zero``)."""
     if not is_concrete(array) or np.size(array) == 0:
         return
-    least = float(np.min(np.asarray(array)))
-    wanted = "not be negative" if zero else "be positive"
-    require(least > 0 or (zero and least == 0), f"{name} must {wanted}, got {least:g}: {hint}.")
+    minimum = float(np.min(np.asarray(array)))
+    requirement = "not be negative" if zero else "be positive"
+    require(
+        minimum > 0 or (zero and minimum == 0),
+        f"{name} must {requirement}, got {minimum:g}: {hint}.",
+    )
 
 
 def as_positive(name: str, value: Any, **options: Any) -> Array:
@@ -169,7 +172,7 @@ def as_positive(name: str, value: Any, **options: Any) -> Array:
 
 
 def as_floats(
-    *, finite: bool = True, **given: tuple[Any, tuple[int | None, ...]]
+    *, finite: bool = True, **arguments: tuple[Any, tuple[int | None, ...]]
 ) -> tuple[Array, ...]:
     """Arrays ``name=(value, suffix)`` of one floating dtype and with common batch axes.
 
@@ -178,11 +181,11 @@ def as_floats(
     """
     arrays = [
         as_float_array(name, value, suffix, finite=finite)
-        for name, (value, suffix) in given.items()
+        for name, (value, suffix) in arguments.items()
     ]
     kinds = [  # of JAX's arrays: without jax_enable_x64 NumPy's float64 has become float32
         array.dtype
-        for array, (value, _) in zip(arrays, given.values())
+        for array, (value, _) in zip(arrays, arguments.values())
         if hasattr(value, "dtype") and jnp.issubdtype(value.dtype, jnp.floating)
     ]
     if kinds:
@@ -190,12 +193,12 @@ def as_floats(
         for kind in kinds[1:]:
             common = jnp.promote_types(common, kind)
         arrays = [array.astype(common) for array in arrays]
-    tails = [len(suffix) for _, suffix in given.values()]
+    tails = [len(suffix) for _, suffix in arguments.values()]
     leading = [array.shape[: array.ndim - tail] for array, tail in zip(arrays, tails)]
     try:
         batch = jnp.broadcast_shapes(*leading)
     except ValueError as error:
-        shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(given, arrays))
+        shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(arguments, arrays))
         raise ValueError(f"the batch axes must broadcast together, got {shapes}.") from error
     return tuple(
         jnp.broadcast_to(array, (*batch, *array.shape[array.ndim - tail :]))

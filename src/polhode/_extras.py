@@ -16,11 +16,11 @@ def imported(what: str, *modules: str, extra: str = "cli") -> Any:
     Raises ImportError that names ``what`` needs them, and the extra that installs them.
     """
     try:
-        first, *_ = map(importlib.import_module, modules)
-        return first
+        module, *_ = map(importlib.import_module, modules)
+        return module
     except ImportError as error:
-        missing = [name for name in modules if importlib.util.find_spec(name) is None]
-        if not missing:  # installed and broken: its own message is the better one
+        missing_modules = [name for name in modules if importlib.util.find_spec(name) is None]
+        if not missing_modules:  # installed and broken: its own message is the better one
             raise
-        needed = " and ".join(missing)
-        raise ImportError(f"{what} needs {needed}: {how_to_install(extra)}") from error
+        missing_names = " and ".join(missing_modules)
+        raise ImportError(f"{what} needs {missing_names}: {how_to_install(extra)}") from error

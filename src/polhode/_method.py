@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from polhode._checks import as_float_array, describe, is_concrete, require
-from polhode._parts import check_fields, kept, takes
+from polhode._parts import as_static, check_fields, takes
 from polhode._scene import Scene, State, check_scene
 
 # How the simulation of each body ended.
@@ -169,7 +169,7 @@ class Record(eqx.Module):
         self.work, self.error = work, error
         if save is not None:
             takes("Record(save=)", save, ("trajectory",))
-            save = kept(save)
+            save = as_static(save)
         self.save = save
         if not (self.attitude or self.rates):
             raise ValueError("Record keeps nothing: switch on attitude, rates or both.")
@@ -272,7 +272,7 @@ def check_options(
         if isinstance(value, type) and issubclass(value, kind):
             raise TypeError(
                 f"{name} must be an object, got the class {value.__name__}: make one of it,"
-                f" {made(value)}."
+                f" {constructor_call(value)}."
             )
         raise TypeError(
             f"{name} must be a diffrax object such as {example}, got {type(value).__name__}:"
@@ -304,7 +304,7 @@ def check_options(
             raise ValueError(f"{name} must be at least 1, got {value}.")
 
 
-def made(x: Any) -> str:
+def constructor_call(x: Any) -> str:
     """How an object of this class, or of the class of this object, is written."""
     kind = x if isinstance(x, type) else type(x)
     room = kind.__module__.split(".")[0]
@@ -322,18 +322,24 @@ def check_method(method: Any) -> None:
 
     kind = method if isinstance(method, type) else type(method)
     if isinstance(method, type) and issubclass(method, AbstractMethod):
-        given, remedy = f"the class {method.__name__}", f": make an object of it, {made(method)}"
+        description, remedy = (
+            f"the class {method.__name__}",
+            f": make an object of it, {constructor_call(method)}",
+        )
     elif issubclass(kind, diffrax.AbstractSolver):
-        given, remedy = (
+        description, remedy = (
             f"the solver {kind.__name__}",
-            f": hand it to a chart, ph.LiePoisson({made(method)})",
+            f": hand it to a chart, ph.LiePoisson({constructor_call(method)})",
         )
     else:
-        given, remedy = type(method).__name__, ""
+        description, remedy = type(method).__name__, ""
         if callable(method) and getattr(method, "__module__", "").startswith("polhode."):
-            given, remedy = f"the function {method.__name__}", f": call it, ph.{method.__name__}()"
+            description, remedy = (
+                f"the function {method.__name__}",
+                f": call it, ph.{method.__name__}()",
+            )
     raise TypeError(
-        f"method must be None or an object such as ph.LiePoisson(), got {given}{remedy}."
+        f"method must be None or an object such as ph.LiePoisson(), got {description}{remedy}."
     )
 
 
@@ -404,8 +410,8 @@ def _times(ts: Any, dtype: Any) -> Any:
     """Times (..., T) of the dtype; known ones in NumPy, which costs no dispatch."""
     if type(ts) is list and all(type(x) in (float, int) for x in ts):
         ts = np.asarray(ts, float)
-    plain = isinstance(ts, np.ndarray) and ts.dtype.kind == "f" and ts.ndim > 0
-    if plain and np.isfinite(ts).all():
+    is_float_array = isinstance(ts, np.ndarray) and ts.dtype.kind == "f" and ts.ndim > 0
+    if is_float_array and np.isfinite(ts).all():
         return np.asarray(ts, dtype)
     ts = as_float_array("ts", ts, (None,))
     return ts if ts.dtype == dtype else ts.astype(dtype)
@@ -474,10 +480,10 @@ def raise_on_failure(status: Array) -> None:
         return
     lines = []
     for code in np.unique(ended[ended != Status.SUCCESSFUL]):
-        found = np.argwhere(ended == code)
-        first = tuple(int(i) for i in found[0])
+        indices = np.argwhere(ended == code)
+        first = tuple(int(i) for i in indices[0])
         which = (
-            f"{len(found)} of {ended.size} bodies (first: index {first})" if first else "the body"
+            f"{len(indices)} of {ended.size} bodies (first: index {first})" if first else "the body"
         )
         lines.append(f"{which}: {Status(int(code)).explanation}")
     raise SimulationError(
@@ -486,16 +492,18 @@ def raise_on_failure(status: Array) -> None:
     )
 
 
-def judged(status: Array, scene: Scene, ts: Array, rtol: Array | float | None) -> Array:
+def status_with_input_errors(
+    status: Array, scene: Scene, ts: Array, rtol: Array | float | None
+) -> Array:
     """The status (N,) of lanes, or what is wrong with the input of those that were given nonsense.
 
     What ``check_inputs`` refuses where numbers are known, found in the compiled program where they
     are traced; a few operations for each body. ``scene``: that of the lanes; ``ts`` (T,) or (N, T).
     """
     if rtol is not None:
-        least = 8 * float(jnp.finfo(ts.dtype).eps)
-        missed = (status == Status.SUCCESSFUL) & ~(rtol >= least * 0.99)
-        status = jnp.where(missed, Status.INACCURATE, status)
+        min_rtol = 8 * float(jnp.finfo(ts.dtype).eps)
+        is_too_small = (status == Status.SUCCESSFUL) & ~(rtol >= min_rtol * 0.99)
+        status = jnp.where(is_too_small, Status.INACCURATE, status)
     status = jnp.where(scene.is_possible, status, Status.NOT_PHYSICAL)
     steps = jax.lax.stop_gradient(ts[..., 1:] - ts[..., :-1])
     ordered = jnp.all(steps > 0, axis=-1) | jnp.all(steps < 0, axis=-1)

@@ -79,9 +79,11 @@ def _refuse(value: Any, name: str, core: tuple[int | None, ...]) -> None:
     shape = ", ".join(["...", *("n" if size is None else str(size) for size in core)])
     if isinstance(value, _ARRAYS) and jnp.issubdtype(value.dtype, jnp.floating):
         raise ValueError(f"{name} must have shape ({shape}), got {value.shape}.")
-    given = f"{value.dtype} array" if isinstance(value, _ARRAYS) else f"{type(value).__name__}"
+    description = (
+        f"{value.dtype} array" if isinstance(value, _ARRAYS) else f"{type(value).__name__}"
+    )
     raise TypeError(
-        f"{name} must be a floating-point array ({shape}), got {given}: {value!r:.60}. Put"
+        f"{name} must be a floating-point array ({shape}), got {description}: {value!r:.60}. Put"
         " jnp.asarray(...) there, or build the part anew."
     )
 
@@ -137,7 +139,7 @@ class Function(eqx.Module):
         return self.fn(*args)
 
 
-def kept(fn: Callable) -> Callable:
+def as_static(fn: Callable) -> Callable:
     """The function, wrapped unless it is a pytree of its own (or wrapped already)."""
     if not jax.tree_util.all_leaves([fn]):
         return fn
@@ -150,29 +152,33 @@ def kept(fn: Callable) -> Callable:
 
 def takes(name: str, fn: Any, arguments: Sequence[str]) -> None:
     """TypeError unless ``fn`` takes these arguments, in this order as far as its names tell."""
-    wanted = f"fn({', '.join(arguments)})"
+    call = f"fn({', '.join(arguments)})"
     if not callable(fn):
-        raise TypeError(f"{name} takes a function {wanted}, got {type(fn).__name__}: {fn!r:.80}.")
+        raise TypeError(f"{name} takes a function {call}, got {type(fn).__name__}: {fn!r:.80}.")
     if isinstance(fn, type):
         raise TypeError(
-            f"{name} takes a function {wanted}, got the class {fn.__name__}: make an object of it."
+            f"{name} takes a function {call}, got the class {fn.__name__}: make an object of it."
         )
     try:
         signature = inspect.signature(fn)
     except (TypeError, ValueError):  # some built-in functions have none
         return
     try:
-        given = signature.bind(*arguments).arguments
+        bound_arguments = signature.bind(*arguments).arguments
     except TypeError as error:
         raise TypeError(
-            f"{name} is called as {wanted}, but the function given takes {signature} ({error})."
+            f"{name} is called as {call}, but the function given takes {signature} ({error})."
         ) from None
-    for own, called in given.items():
-        meant = next((k for k in arguments if own in _NAMES.get(k, ())), None)
-        if meant is not None and isinstance(called, str) and called != meant:
+    for parameter, argument in bound_arguments.items():
+        expected_argument = next((k for k in arguments if parameter in _NAMES.get(k, ())), None)
+        if (
+            expected_argument is not None
+            and isinstance(argument, str)
+            and argument != expected_argument
+        ):
             raise TypeError(
-                f"{name} is called as {wanted}, but the function given takes {signature}: its"
-                f" {own!r} would be given {called}. Put the arguments in the order {wanted}."
+                f"{name} is called as {call}, but the function given takes {signature}: its"
+                f" {parameter!r} would be given {argument}. Put the arguments in the order {call}."
             )
 
 
@@ -203,15 +209,15 @@ def _remedy_for(error: Exception) -> str:
 def _place_of(error: Exception) -> str:
     """File, line and text of the user's own line that raised; empty where it is not known."""
     libraries = tuple(str(Path(m.__file__).parent) for m in (jax, np, eqx) if m.__file__)
-    own = str(Path(__file__).parent)
+    package = str(Path(__file__).parent)
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        if not frame.filename.startswith((*libraries, own)) and frame.line:
+        if not frame.filename.startswith((*libraries, package)) and frame.line:
             return f" in line {frame.lineno} of {Path(frame.filename).name}, `{frame.line}`"
     return ""
 
 
-def call_traced(called: str, detail: str, fn: Callable, *args: Any) -> Any:
-    """What ``fn(*args)`` returns; ``called``, ``detail``: how messages describe the call.
+def call_traced(call: str, detail: str, fn: Callable, *args: Any) -> Any:
+    """What ``fn(*args)`` returns; ``call``, ``detail``: how messages describe the call.
 
     TypeError for NumPy, ``if`` or ``float`` on a traced array, with the line and its jax.numpy
     form; what the function raises otherwise passes, with a note on how it was called.
@@ -220,12 +226,12 @@ def call_traced(called: str, detail: str, fn: Callable, *args: Any) -> Any:
         return fn(*args)
     except _TRACED as error:
         raise TypeError(
-            f"the function given to {called}, needs the value of a traced array{_place_of(error)}:"
+            f"the function given to {call}, needs the value of a traced array{_place_of(error)}:"
             f" {_remedy_for(error)}."
         ) from error
     except Exception as error:
         error.add_note(
-            f"This was raised in the function given to {called}{detail}. It is"
+            f"This was raised in the function given to {call}{detail}. It is"
             " traced by JAX: write it with jax.numpy, and choose by jnp.where."
         )
         raise
@@ -240,9 +246,9 @@ def result_of(
     TypeError for NumPy, ``if`` or ``float`` on a traced array, with the line and its jax.numpy
     form; what the function raises otherwise passes, with a note on how it was called.
     """
-    called = f"{name}, called as fn({', '.join(arguments)})"
+    call = f"{name}, called as fn({', '.join(arguments)})"
     shapes = ", ".join(f"{k}: {jnp.shape(x)}" for k, x in zip(arguments, args))
-    value = call_traced(called, f" with the shapes {shapes}", fn, *args)
+    value = call_traced(call, f" with the shapes {shapes}", fn, *args)
     expected = f"an array of shape {shape}" if shape else "a single number"
     try:
         if value is None or any(
@@ -253,17 +259,17 @@ def result_of(
         array = jnp.asarray(value)
     except (TypeError, ValueError) as error:
         raise TypeError(
-            f"the function given to {called}, returned {type(value).__name__}: {value!r:.60};"
+            f"the function given to {call}, returned {type(value).__name__}: {value!r:.60};"
             f" {expected} is expected."
         ) from error
     if jnp.issubdtype(array.dtype, jnp.complexfloating) or array.dtype == jnp.bool_:
         raise TypeError(
-            f"the function given to {called}, returned dtype {array.dtype}; real numbers;"
+            f"the function given to {call}, returned dtype {array.dtype}; real numbers;"
             f" {expected} is expected."
         )
     if array.shape != shape:
         raise ValueError(
-            f"the function given to {called}, returned shape {array.shape}; {expected} is"
+            f"the function given to {call}, returned shape {array.shape}; {expected} is"
             " expected. It sees one body at one time: batches are mapped over it."
         )
     if dtype is None:
@@ -280,12 +286,12 @@ class Signature:
     returns: tuple[int, ...] = ()
 
     def checked(self, fn: Any) -> Callable:
-        """The function, kept (see ``kept``), after one look at what it takes and returns.
+        """The function (see ``as_static``) after a check of its arguments and its result.
 
         Nothing is computed: the function is traced once with arguments of these shapes.
         """
         takes(self.name, fn, tuple(self.arguments))
-        fn = kept(fn)
+        fn = as_static(fn)
         dtype = jnp.result_type(float)
         shapes = self.arguments.values()
         weak = [jax.ShapeDtypeStruct(s, dtype, weak_type=True) for s in shapes]  # of any dtype
@@ -295,14 +301,14 @@ class Signature:
 
     def mapped(self, fn: Callable, *args: Any) -> Array:
         """``fn`` over the leading axes of its arguments: (..., *returns) of their dtype."""
-        known = [x for x in args if hasattr(x, "dtype")]
-        dtype = jnp.result_type(*known) if known else None
-        taken, given = (
+        arrays = [x for x in args if hasattr(x, "dtype")]
+        dtype = jnp.result_type(*arrays) if arrays else None
+        inputs, outputs = (
             ",".join(f"({','.join(map(str, shape))})" for shape in shapes)
             for shapes in (self.arguments.values(), [self.returns])
         )
         return jnp.vectorize(
-            lambda *args: self._result(fn, dtype, *args), signature=f"{taken}->{given}"
+            lambda *args: self._result(fn, dtype, *args), signature=f"{inputs}->{outputs}"
         )(*args)
 
     def _result(self, fn: Callable, dtype: Any, *args: Any) -> Array:

@@ -132,13 +132,13 @@ CLOSED_FORMS = (
 
 def choose_closed_form(scene: Scene) -> tuple[Solution | None, tuple[str, ...]]:
     """The first closed form that the types make valid, or None; and why those before it are not."""
-    refused = []
+    refusals = []
     for solution in CLOSED_FORMS:
         reason = solution.why_not(scene)
         if reason is None:
-            return solution, tuple(refused)
-        refused.append(f"{solution.name}: {reason}")
-    return None, tuple(dict.fromkeys(refused))
+            return solution, tuple(refusals)
+        refusals.append(f"{solution.name}: {reason}")
+    return None, tuple(dict.fromkeys(refusals))
 
 
 def choose(scene: Scene, rtol: Array | float = 1e-9) -> tuple[AbstractMethod, str]:
@@ -156,7 +156,9 @@ def choose(scene: Scene, rtol: Array | float = 1e-9) -> tuple[AbstractMethod, st
         )
         compensated = _is_below(rtol, _policy.COMPENSATED_STEPS * eps, scene)
         also = ", its rounding carried along: it would miss rtol" if compensated else ""
-        return _stepped(_has_axis(scene), compensated, _low_order(scene, rtol)), reason + also
+        return _integration_method(
+            _has_axis(scene), compensated, _low_order(scene, rtol)
+        ), reason + also
     general = scene.is_free and scene.inertia.symmetry is Symmetry.NONE
     if general and _is_below(rtol, _policy.COMPENSATED_PHASES * eps, scene):
         also = ", its frequencies in sums of two floats: a rounded phase would miss rtol"
@@ -174,7 +176,7 @@ _COMPENSATED = ClosedForm(compensated=True)
 
 
 @functools.cache
-def _stepped(upright: bool, compensated: bool, low_order: bool) -> AbstractMethod:
+def _integration_method(upright: bool, compensated: bool, low_order: bool) -> AbstractMethod:
     # here, so that diffrax loads with the first scene that is integrated
     from polhode._integrate import Automatic, LiePoisson, LiePoissonChart
 
@@ -208,7 +210,7 @@ def _has_axis(scene: Scene) -> bool:
     return isinstance(potential, UniformGravity)
 
 
-def _turned(state: State, ts) -> float:
+def _max_angle(state: State, ts) -> float:
     """Angle [rad] of the body that turns farthest."""
     ts = np.asarray(ts)
     span = np.abs(ts[..., -1] - ts[..., 0])
@@ -231,11 +233,11 @@ def plan(
     reason: str = "as asked for",
 ) -> Plan:
     """The plan of checked input (see ``ph.explain``); ``reason``: why a given method runs."""
-    refused, narrower, stiff = (), (), None
+    refusals, narrower, stiff = (), (), None
     if method is None:
         method, reason = choose(scene, rtol)
         if not method.exact:
-            _, refused = choose_closed_form(scene)
+            _, refusals = choose_closed_form(scene)
             stiff = _stiff(scene, state, ts)
         narrower = _narrower(scene)
     steps = "" if method.exact else _steps(method, scene, state, ts, record)
@@ -251,7 +253,7 @@ def plan(
         samples,
         str(state.wxyz.dtype),
         _error(method, scene, state, ts, rtol),
-        refused,
+        refusals,
         narrower,
         _policy.plain_reason(),
         stiff,
@@ -293,28 +295,32 @@ def _decay(scene: Scene, state: State, ts: Array) -> np.ndarray:
         def speeds(spins):
             return [wheels.at(spins).speed(i, t, components) for i in wheels.coupled]
 
-        zero, one = (
+        speeds_at_zero, speeds_at_one = (
             speeds([jnp.full(batch, value, omega.dtype) for _ in points[0]]) for value in (0, 1)
         )
-        points.append(tuple(-a / (b - a) for a, b in zip(zero, one)))
+        points.append(tuple(-a / (b - a) for a, b in zip(speeds_at_zero, speeds_at_one)))
 
     def rates(y, spins):
         omega = omega_of(y)
-        now = tuple(x + y[..., 3 + k] for k, x in enumerate(spins))
-        acceleration, turned = scene.with_spins(now).changes(wxyz, omega, t)
+        wheel_spins = tuple(x + y[..., 3 + k] for k, x in enumerate(spins))
+        acceleration, wheel_torques = scene.with_spins(wheel_spins).changes(wxyz, omega, t)
         return jnp.concatenate(
-            [acceleration, *(jnp.broadcast_to(x, batch)[..., None] for x in turned)], axis=-1
+            [acceleration, *(jnp.broadcast_to(x, batch)[..., None] for x in wheel_torques)], axis=-1
         )
 
     def omega_of(y):
         return omega + y[..., :3]
 
-    found = []
+    decay_rates = []
     for spins in points:
         size = 3 + len(spins)
-        zero = jnp.zeros((*batch, size), omega.dtype)
+        speeds_at_zero = jnp.zeros((*batch, size), omega.dtype)
         columns = [
-            jax.jvp(lambda y, s=spins: rates(y, s), (zero,), (zero.at[..., k].set(1),))[1]
+            jax.jvp(
+                lambda y, s=spins: rates(y, s),
+                (speeds_at_zero,),
+                (speeds_at_zero.at[..., k].set(1),),
+            )[1]
             for k in range(size)
         ]
         jacobian = jnp.stack(columns, axis=-1)
@@ -322,8 +328,8 @@ def _decay(scene: Scene, state: State, ts: Array) -> np.ndarray:
             return np.zeros(batch)
         jacobian = np.asarray(jacobian, float)
         sound = np.where(np.isfinite(jacobian), jacobian, 0)
-        found.append(np.max(-np.linalg.eigvals(sound).real, axis=-1))
-    return np.max(np.stack(found), axis=0)
+        decay_rates.append(np.max(-np.linalg.eigvals(sound).real, axis=-1))
+    return np.max(np.stack(decay_rates), axis=0)
 
 
 def _narrower(scene: Scene) -> tuple[str, ...]:
@@ -356,9 +362,9 @@ def _steps(method, scene: Scene, state: State, ts: Array, record: Record) -> str
 
 def _skipped(scene: Scene, method: AbstractMethod, record: Record) -> tuple[str, ...]:
     reasons = []
-    absent = [name for name in PARTS if getattr(scene, name) is None]
-    if absent:
-        reasons.append(f"{', '.join(absent)}: not in the scene")
+    absent_parts = [name for name in PARTS if getattr(scene, name) is None]
+    if absent_parts:
+        reasons.append(f"{', '.join(absent_parts)}: not in the scene")
     if method.exact:
         reasons.append("steps, error control, checkpoints: the solution is exact")
     if isinstance(method, ClosedForm):
@@ -391,10 +397,10 @@ def _error(method: AbstractMethod, scene: Scene, state: State, ts: Array, rtol: 
             return "as the steps asked for make it"
         if not is_concrete(rtol):
             return f"about rtol rad at every saved time, {_MEANING}"
-        if is_concrete(state.omega_body, ts) and 4 * eps * _turned(state, ts) > float(rtol):
-            turned = _turned(state, ts)
+        if is_concrete(state.omega_body, ts) and 4 * eps * _max_angle(state, ts) > float(rtol):
+            angle = _max_angle(state, ts)
             return (
-                f"about {4 * eps * turned:.0e} rad at the last time: rounding of {turned:.2g} rad"
+                f"about {4 * eps * angle:.0e} rad at the last time: rounding of {angle:.2g} rad"
                 f" turned takes more than the {rtol:.0e} asked for"
             )
         return f"about {rtol:.0e} rad at every saved time, {_MEANING}"
@@ -402,8 +408,8 @@ def _error(method: AbstractMethod, scene: Scene, state: State, ts: Array, rtol: 
         return f"rounding only: about {4 * eps:.0e} rad at any time (compensated phases)"
     if not is_concrete(state.omega_body, ts):
         return f"rounding only: about {eps:.0e} per radian turned"
-    turned = _turned(state, ts)
+    angle = _max_angle(state, ts)
     return (
-        f"rounding only: about {max(1.0, turned) * eps:.0e} rad at the last time"
-        f" (one unit in the last place of {turned:.2g} rad turned)"
+        f"rounding only: about {max(1.0, angle) * eps:.0e} rad at the last time"
+        f" (one unit in the last place of {angle:.2g} rad turned)"
     )

@@ -41,8 +41,8 @@ from polhode._method import (
     check_inputs,
     check_method,
     check_rtol,
-    judged,
     raise_on_failure,
+    status_with_input_errors,
 )
 from polhode._plan import Plan, choose, plan
 from polhode._sampled import HeldPropagator, is_sampled, sampled_method
@@ -248,7 +248,7 @@ def _begin(method, scene, state, ts, rtol) -> Trajectory:
     lanes = {name: flatten(part, batch) for name, part in parts.items()}
     times = lane_times(ts, batch)
     good = jnp.full(omega[..., 0].size, Status.SUCCESSFUL)
-    status = judged(good, Scene(**lanes), times, rtol).reshape(batch)
+    status = status_with_input_errors(good, Scene(**lanes), times, rtol).reshape(batch)
     return Trajectory(
         ts[..., :1],
         wxyz[..., None, :],
@@ -284,7 +284,7 @@ def _samples(record: Record, method, scene: Scene, lanes: State, times, rtol) ->
         samples = _with_error(method, scene, lanes, times, rtol, record)
     else:
         samples = method.run(scene, lanes, times, rtol, record)._replace(error=None)
-    samples = samples._replace(status=judged(samples.status, scene, times, rtol))
+    samples = samples._replace(status=status_with_input_errors(samples.status, scene, times, rtol))
     if record.work and method.exact:
         samples = samples._replace(work=_work_of_exact(scene, lanes, times, samples, record))
     return samples

@@ -558,7 +558,7 @@ def _bracket(
     sampled: Trajectory, grid, values, change, minimum: _Minimum, direction, is_new
 ) -> _Bracket:
     """Around the first event, a change of sign between two samples or a minimum; ``direction``
-    (N,): in the order of the samples, 0 for any. Only entries that are ``is_new`` have a meaning."""
+    (N,): in the order of the samples, 0 for any. Entries that are not ``is_new`` are arbitrary."""
     interval = jnp.where(is_new, jnp.minimum(minimum.place, change), 0)[:, None]
     # of the pair of crossings at a minimum the second, where the first has the other direction
     is_second = (direction != 0) & (jnp.where(minimum.side < 0, 1, -1) != direction)

@@ -201,17 +201,17 @@ class Hamiltonian(eqx.Module):
         if potential is None:
             return ()
         row = jax.eval_shape(lambda: attitude.compute(2))  # not kept: no leak
-        used: tuple[int, ...] = ()
+        rows: tuple[int, ...] = ()
 
-        def traced_energy(rows):
-            nonlocal used
-            attitude_seen = Attitude(lambda i: rows[i])
+        def traced_energy(rows_of_attitude):
+            nonlocal rows
+            attitude_seen = Attitude(lambda i: rows_of_attitude[i])
             energy = potential.energy(attitude_seen, t, inertia_at(self.inertia, t))
-            used = attitude_seen.used
+            rows = attitude_seen.used
             return energy
 
         jax.eval_shape(traced_energy, dict.fromkeys(range(3), row))
-        return used
+        return rows
 
 
 def free_hamiltonian(inertia: Inertia, potential: EnergyOfAttitude | None = None) -> Hamiltonian:

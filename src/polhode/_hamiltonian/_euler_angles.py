@@ -125,9 +125,11 @@ def euler_angle_field(t, y, dynamics: Dynamics):
         momentum = momentum_from_canonical(q, p)
         slip = dynamics.torque.slip(t, momentum, omega)
         if slip is not None:  # axes that slip past a momentum which rests in space
-            moved = angle_rates_from_rates(q, slip), cross(momentum, slip)
-            _, more = jax.jvp(canonical_from_momentum, (q, momentum), moved)
-            rate_q = tuple(a + b for a, b in zip(rate_q, moved[0]))
-            rate_p = tuple(a + b for a, b in zip(rate_p, more))
-    moved = rate_q, rate_p
-    return (*moved, spin_rates(t, attitude, omega, dynamics)) if spins else moved
+            coordinate_rates = angle_rates_from_rates(q, slip), cross(momentum, slip)
+            _, momentum_change = jax.jvp(canonical_from_momentum, (q, momentum), coordinate_rates)
+            rate_q = tuple(a + b for a, b in zip(rate_q, coordinate_rates[0]))
+            rate_p = tuple(a + b for a, b in zip(rate_p, momentum_change))
+    coordinate_rates = rate_q, rate_p
+    return (
+        (*coordinate_rates, spin_rates(t, attitude, omega, dynamics)) if spins else coordinate_rates
+    )

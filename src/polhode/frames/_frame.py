@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike, as_float_array, as_vectors, is_concrete, require
-from polhode._parts import Signature, kept, takes
+from polhode._parts import Signature, as_static, takes
 from polhode._trajectory import Trajectory
 from polhode.rotation import (
     conjugate,
@@ -131,11 +131,15 @@ def _slopes(ts, wxyz, omega_body, angular_acceleration) -> tuple[Array, Array]:
         return jax.jvp(vector, (h,), (jnp.ones_like(h),))[1]
 
     zero = jnp.zeros((), ts.dtype)
-    first, second = jax.jvp(slope, (zero,), (jnp.ones_like(zero),))
+    first_derivative, second_derivative = jax.jvp(slope, (zero,), (jnp.ones_like(zero),))
     step = (ts[end] - ts[start])[:, None]
-    here = [jnp.zeros_like(first), step * omega_body[start], step**2 * angular_acceleration[start]]
-    there = [vector(zero), step * first, step**2 * second]
-    return jnp.stack(here, axis=1), jnp.stack(there, axis=1)
+    start_values = [
+        jnp.zeros_like(first_derivative),
+        step * omega_body[start],
+        step**2 * angular_acceleration[start],
+    ]
+    end_values = [vector(zero), step * first_derivative, step**2 * second_derivative]
+    return jnp.stack(start_values, axis=1), jnp.stack(end_values, axis=1)
 
 
 class SampledAttitude(eqx.Module):
@@ -165,9 +169,9 @@ class SampledAttitude(eqx.Module):
 
     def __call__(self, t: Float[Array, ""]) -> Float[Array, "4"]:
         backwards = self.ts[-1] < self.ts[0]
-        times, wanted = jnp.where(backwards, -self.ts, self.ts), jnp.where(backwards, -t, t)
-        last = self.ts.shape[0] - 2
-        k = jnp.clip(jnp.searchsorted(times, wanted, side="right") - 1, 0, last)
+        times, ascending_time = jnp.where(backwards, -self.ts, self.ts), jnp.where(backwards, -t, t)
+        last_interval = self.ts.shape[0] - 2
+        k = jnp.clip(jnp.searchsorted(times, ascending_time, side="right") - 1, 0, last_interval)
         s = (t - self.ts[k]) / (self.ts[k + 1] - self.ts[k])
         (_, v0, a0), (p1, v1, a1) = self.start_slope[k], self.end_slope[k]
         # Taylor at the start, and three terms that meet value, slope and bend at the end
@@ -278,16 +282,16 @@ class RotatingFrame(eqx.Module):
             )
         name = "RotatingFrame.from_attitude"
         takes(name, attitude, ("t",))
-        attitude = kept(attitude)
+        attitude = as_static(attitude)
         t = jax.ShapeDtypeStruct((), jnp.result_type(float), weak_type=True)
-        found: list[tuple[int, ...]] = []
+        shapes: list[tuple[int, ...]] = []
 
         def look(t):
             value = attitude(t)
-            found.append(() if value is None else jnp.shape(value))
+            shapes.append(() if value is None else jnp.shape(value))
 
         jax.eval_shape(look, t)
-        shape = (3, 3) if found == [(3, 3)] else (4,)
+        shape = (3, 3) if shapes == [(3, 3)] else (4,)
         return cls(PrescribedAttitude(Signature(name, {"t": ()}, shape).checked(attitude)), origin)
 
     @classmethod
@@ -357,19 +361,19 @@ class RotatingFrame(eqx.Module):
         if origin is None:
             raise ValueError("the origin of this frame does not move: it was given none.")
 
-        def moving(time):
+        def motion_at(time):
             def velocity(s):
                 return rate_of_change(origin, s)[1]
 
             return origin(time), *rate_of_change(velocity, time)
 
-        return _at_times(moving, jnp.asarray(t))
+        return _at_times(motion_at, jnp.asarray(t))
 
-    def _turned(self, t: Time, vector: Array, wxyz: Array | None = None) -> Array:
+    def _rotate_to_space(self, t: Time, vector: Array, wxyz: Array | None = None) -> Array:
         vector = as_vectors("vector", vector)
         return rotate(*_aligned(self.attitude(t) if wxyz is None else wxyz, vector))
 
-    def _turned_back(self, t: Time, vector: Array, wxyz: Array | None = None) -> Array:
+    def _rotate_to_frame(self, t: Time, vector: Array, wxyz: Array | None = None) -> Array:
         wxyz = self.attitude(t) if wxyz is None else wxyz
         return rotate(*_aligned(conjugate(wxyz), as_vectors("vector", vector)))
 
@@ -377,29 +381,29 @@ class RotatingFrame(eqx.Module):
 
     def position_to_space(self, t: Time, position: Vector, *, wxyz: ArrayLike = None) -> Vector:
         """Space position [m] of a point at frame ``position``. ``wxyz``: the attitude, if known."""
-        turned = self._turned(t, position, wxyz)
-        return turned if self.origin is None else _sum(turned, self._origin(t)[0])
+        space_vector = self._rotate_to_space(t, position, wxyz)
+        return space_vector if self.origin is None else _sum(space_vector, self._origin(t)[0])
 
     def position_to_frame(self, t: Time, position_space: Vector) -> Vector:
         """Frame position [m] of a point in space."""
         if self.origin is not None:
             position_space = _sum(position_space, -self._origin(t)[0])
-        return self._turned_back(t, position_space)
+        return self._rotate_to_frame(t, position_space)
 
     def velocity_to_space(
         self, t: Time, position: Vector, velocity: Vector, *, wxyz: ArrayLike = None
     ) -> Vector:
         """Space velocity [m/s] of a point with frame position and velocity (003: 8)."""
         carried = _sum(velocity, _cross(self.omega_body(t), position))
-        turned = self._turned(t, carried, wxyz)
-        return turned if self.origin is None else _sum(turned, self._origin(t)[1])
+        space_vector = self._rotate_to_space(t, carried, wxyz)
+        return space_vector if self.origin is None else _sum(space_vector, self._origin(t)[1])
 
     def velocity_to_frame(self, t: Time, position_space: Vector, velocity_space: Vector) -> Vector:
         """Frame velocity [m/s] of a point with space position and velocity."""
         position = self.position_to_frame(t, position_space)
         if self.origin is not None:
             velocity_space = _sum(velocity_space, -self._origin(t)[1])
-        relative = self._turned_back(t, velocity_space)
+        relative = self._rotate_to_frame(t, velocity_space)
         return _sum(relative, -_cross(self.omega_body(t), position))
 
     def acceleration_to_space(
@@ -407,8 +411,8 @@ class RotatingFrame(eqx.Module):
     ) -> Vector:
         """Space acceleration [m/s^2] of a point with this motion in the frame (003: 19)."""
         apparent = self._without_origin(t, position, velocity)
-        turned = self._turned(t, _sum(acceleration, -apparent))
-        return turned if self.origin is None else _sum(turned, self._origin(t)[2])
+        space_vector = self._rotate_to_space(t, _sum(acceleration, -apparent))
+        return space_vector if self.origin is None else _sum(space_vector, self._origin(t)[2])
 
     def acceleration_to_frame(
         self, t: Time, position_space: Vector, velocity_space: Vector, acceleration_space: Vector
@@ -418,7 +422,7 @@ class RotatingFrame(eqx.Module):
         velocity = self.velocity_to_frame(t, position_space, velocity_space)
         if self.origin is not None:
             acceleration_space = _sum(acceleration_space, -self._origin(t)[2])
-        relative = self._turned_back(t, acceleration_space)
+        relative = self._rotate_to_frame(t, acceleration_space)
         return _sum(relative, self._without_origin(t, position, velocity))
 
     # --- forces by name (docs/equations.md, 003: 20, 21) ---------------------------------
@@ -443,7 +447,7 @@ class RotatingFrame(eqx.Module):
         """Force of the accelerating origin [N], ``-mass R^T d2(origin)/dt2``."""
         if self.origin is None:
             return jnp.zeros_like(self.omega_body(t))
-        return _times(mass, -self._turned_back(t, self._origin(t)[2]))
+        return _times(mass, -self._rotate_to_frame(t, self._origin(t)[2]))
 
     def _without_origin(self, t: Time, position: Vector, velocity: Vector | None) -> Vector:
         omega, slope = self._rates(t)
@@ -463,7 +467,7 @@ class RotatingFrame(eqx.Module):
         apparent = self._without_origin(t, position, velocity)
         if self.origin is None:
             return apparent
-        return _sum(apparent, -self._turned_back(t, self._origin(t)[2], wxyz))
+        return _sum(apparent, -self._rotate_to_frame(t, self._origin(t)[2], wxyz))
 
 
 def _times(mass: ArrayLike, vector: Array) -> Array:

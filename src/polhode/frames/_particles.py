@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike, as_float_array, is_concrete, require_positive
 from polhode._method import check_options, check_rtol, check_times
-from polhode._parts import kept, result_of, takes
+from polhode._parts import as_static, result_of, takes
 from polhode.frames._frame import RotatingFrame, VariableRate
 from polhode.rotation import conjugate, normalise, rotate
 from polhode.rotation._quaternion import wxyz_rate
@@ -22,7 +22,7 @@ _ARGUMENTS = ("t", "position", "velocity")
 def _force(name: str):
     def converted(function):
         takes(name, function, _ARGUMENTS)
-        return kept(function)
+        return as_static(function)
 
     return eqx.field(converter=converted)
 
@@ -69,13 +69,13 @@ class ParticlePaths(eqx.Module):
 
 def _pushed(force, t, position, velocity):
     """The force on all particles, checked to be one for each, or one for all."""
-    name, given = type(force).__name__, (t, position, velocity)
+    name, arguments = type(force).__name__, (t, position, velocity)
 
-    def whole(*given):
-        value = jnp.asarray(force.function(*given))
+    def broadcast_force(*arguments):
+        value = jnp.asarray(force.function(*arguments))
         return jnp.broadcast_to(value, position.shape) if value.shape == (3,) else value
 
-    return result_of(name, _ARGUMENTS, whole, position.shape, position.dtype, *given)
+    return result_of(name, _ARGUMENTS, broadcast_force, position.shape, position.dtype, *arguments)
 
 
 def _acceleration(frame, force, mass, t, position, velocity, wxyz):
@@ -119,10 +119,10 @@ def _solve(frame, force, mass, position, velocity, ts, rtol, solver, controller,
     speed = jax.lax.stop_gradient(jnp.where(speed > 0, speed, length / step))
 
     def field(t, y, _):
-        at, moving = y[0] * length, y[1] * speed
+        at, speeds = y[0] * length, y[1] * speed
         wxyz = normalise(y[2]) if along else None
-        pushed = _acceleration(frame, force, mass, t, at, moving, wxyz)
-        rates = (moving / length, pushed / speed)
+        pushed = _acceleration(frame, force, mass, t, at, speeds, wxyz)
+        rates = (speeds / length, pushed / speed)
         return (*rates, wxyz_rate(wxyz, turning.omega_body(t))) if along else rates
 
     y0 = (position / length, velocity / speed)
@@ -144,10 +144,10 @@ def _solve(frame, force, mass, position, velocity, ts, rtol, solver, controller,
         throw=False,
     )
     position, velocity = (jnp.moveaxis(x, 0, -2) for x in jax.tree.leaves(solution.ys)[:2])
-    reached = solution.result == diffrax.RESULTS.successful
+    is_successful = solution.result == diffrax.RESULTS.successful
     position, velocity = position * length[..., None, :], velocity * speed[..., None, :]
     finite = jnp.isfinite(position).all() & jnp.isfinite(velocity).all()
-    return position, velocity, reached & finite, solution.stats["num_steps"]
+    return position, velocity, is_successful & finite, solution.stats["num_steps"]
 
 
 def simulate_particles(
@@ -222,10 +222,14 @@ def simulate_particles(
         diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint,
         max_steps,
     )
-    made = ParticlePaths(ts, paths[0], paths[1], frame, paths[2], steps)
-    if throw and is_concrete(made.successful) and not bool(made.successful):
+    paths_of_particles = ParticlePaths(ts, paths[0], paths[1], frame, paths[2], steps)
+    if (
+        throw
+        and is_concrete(paths_of_particles.successful)
+        and not bool(paths_of_particles.successful)
+    ):
         raise RuntimeError(
             f"the last time was not reached in {int(steps)} steps or the path is not finite: look"
             " for a singular force, raise max_steps or rtol, or pass throw=False."
         )
-    return made
+    return paths_of_particles

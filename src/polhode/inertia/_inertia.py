@@ -22,7 +22,7 @@ from polhode._checks import (
     require,
     require_positive,
 )
-from polhode._parts import AbstractPart, Signature, kept, shaped, takes
+from polhode._parts import AbstractPart, Signature, as_static, shaped, takes
 from polhode.inertia._physical import (
     check_moments,
     check_points,
@@ -35,8 +35,8 @@ from polhode.inertia._physical import (
     possible_tensor,
     principal,
     principal_moments,
+    rotate_tensor,
     tolerance,
-    turned,
 )
 from polhode.inertia._shapes import AbstractShaped, Symmetry
 from polhode.rotation import wxyz_to_matrix
@@ -87,16 +87,16 @@ class Inertia(AbstractShaped, AbstractPart):
             diagonal, physical = _moments_meant(moments), physical is not False
             if is_concrete(diagonal):
                 _checked("moments", diagonal, triangle=physical)
-        given = {
+        forms = {
             "diagonal": (diagonal, (3,)),
             "full": (full, (3, 3)),
             "transverse": (transverse, ()),
             "axial": (axial, ()),
             "moment": (moment, ()),
         }
-        for name, (value, core) in given.items():
-            whole = None if value is None else as_float_array(name, value, core, finite=False)
-            setattr(self, name, whole)
+        for name, (value, core) in forms.items():
+            array = None if value is None else as_float_array(name, value, core, finite=False)
+            setattr(self, name, array)
         self.physical = bool(physical)
         check_form(self)
 
@@ -261,7 +261,9 @@ class Inertia(AbstractShaped, AbstractPart):
 
         ``axes`` is such a rotation: ``Inertia(moments).turned(axes)`` is the body.
         """
-        return type(self)(full=turned(self.tensor, wxyz_to_matrix(wxyz)), physical=self.physical)
+        return type(self)(
+            full=rotate_tensor(self.tensor, wxyz_to_matrix(wxyz)), physical=self.physical
+        )
 
     def to_principal(self) -> tuple[Self, Float[Array, "*b 4"]]:
         """The body in principal axes, and the rotation ``wxyz`` from those to the present axes.
@@ -296,8 +298,8 @@ class Inertia(AbstractShaped, AbstractPart):
 def check_form(inertia: Inertia) -> None:
     """ValueError unless the numbers stand in one form, of which they are all there."""
     forms = (inertia.diagonal, inertia.full, inertia.transverse, inertia.moment)
-    whole = (inertia.transverse is None) == (inertia.axial is None)
-    if sum(x is not None for x in forms) != 1 or not whole:
+    is_complete = (inertia.transverse is None) == (inertia.axial is None)
+    if sum(x is not None for x in forms) != 1 or not is_complete:
         raise ValueError(_ONE_FORM)
 
 
@@ -336,14 +338,14 @@ def _checked(name, moments, triangle=True):
     return moments
 
 
-def _moments_meant(given) -> Array:
-    """The moments of ``ph.Inertia(given)``; an error that names the constructor otherwise."""
-    if isinstance(given, eqx.Module):
+def _moments_meant(value) -> Array:
+    """The moments of ``ph.Inertia(value)``; an error that names the constructor otherwise."""
+    if isinstance(value, eqx.Module):
         raise TypeError(
-            f"Inertia takes numbers, got {type(given).__name__}: of ph.MassProperties take .inertia"
+            f"Inertia takes numbers, got {type(value).__name__}: of ph.MassProperties take .inertia"
             " or .about(point)."
         )
-    array = as_float_array("Inertia(moments): moments", given)
+    array = as_float_array("Inertia(moments): moments", value)
     if array.shape[-2:] == (3, 3):
         raise ValueError(
             f"Inertia(...) of shape {array.shape} may mean tensors or the moments of three bodies:"
@@ -354,7 +356,7 @@ def _moments_meant(given) -> Array:
             "Inertia(...) takes three moments, got one number: use Inertia.spherical(moment) for a"
             " body with three equal ones."
         )
-    return as_float_array("Inertia(moments): moments", given, (3,))
+    return as_float_array("Inertia(moments): moments", value, (3,))
 
 
 def angular_acceleration(
@@ -427,15 +429,15 @@ class VariableInertia(AbstractPart):
             self.fn, self.is_principal = fn, width == 3
             return
         takes("VariableInertia", fn, ("t",))
-        given: Any = fn
+        function: Any = fn
         with jax.numpy_dtype_promotion("standard"):
-            shape = np.shape(jax.eval_shape(lambda t: as_float_array(_NAME, given(t)), 0.0))
+            shape = np.shape(jax.eval_shape(lambda t: as_float_array(_NAME, function(t)), 0.0))
         require(
             shape in ((3,), (3, 3)),
             "the function given to VariableInertia must return moments (3,) or a tensor (3, 3), got"
             f" shape {shape}.",
         )
-        self.fn, self.is_principal = kept(fn), shape == (3,)
+        self.fn, self.is_principal = as_static(fn), shape == (3,)
 
     def at(self, t: Array | float) -> Inertia:
         """The inertia at the times ``t`` (...)."""

@@ -446,10 +446,10 @@ def offset(mass: Float[Array, "*b"], shift: Float[Array, "*b 3"]) -> Float[Array
 
 
 @jax.jit
-def turned(
+def rotate_tensor(
     tensor: Float[Array, "*#b 3 3"], matrix: Float[Array, "*#b 3 3"]
 ) -> Float[Array, "*b 3 3"]:
     """``R I R^T``, exactly symmetric."""
     exact = jax.lax.Precision.HIGHEST  # accelerators may round matrix products more coarsely
-    found = jnp.einsum("...ij,...jk,...lk->...il", matrix, tensor, matrix, precision=exact)
-    return (found + jnp.swapaxes(found, -1, -2)) / 2
+    product = jnp.einsum("...ij,...jk,...lk->...il", matrix, tensor, matrix, precision=exact)
+    return (product + jnp.swapaxes(product, -1, -2)) / 2

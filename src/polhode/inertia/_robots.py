@@ -23,7 +23,7 @@ def read_urdf(path: str | PathLike[str], link: str) -> tuple[float, np.ndarray, 
         raise ValueError(
             f"the root element of {name} is <{root.tag}>, a URDF file has <robot>{hint}."
         )
-    links = {found.get("name"): found for found in root.iter("link")}
+    links = {element.get("name"): element for element in root.iter("link")}
     if link not in links:
         raise ValueError(f"{name} has no link {link!r}, it has: {_listed(links)}.")
     inertial = links[link].find("inertial")
@@ -37,15 +37,15 @@ def read_urdf(path: str | PathLike[str], link: str) -> tuple[float, np.ndarray, 
     }
     origin = inertial.find("origin")
     centre, angles = (_three(origin, key, where) for key in ("xyz", "rpy"))
-    own = np.array(
+    link_inertia = np.array(
         [
             [entries["ixx"], entries["ixy"], entries["ixz"]],
             [entries["ixy"], entries["iyy"], entries["iyz"]],
             [entries["ixz"], entries["iyz"], entries["izz"]],
         ]
     )
-    turned = Rotation.from_euler("xyz", angles).as_matrix()  # about fixed axes, roll first
-    return mass, centre, turned @ own @ turned.T
+    rotation_matrix = Rotation.from_euler("xyz", angles).as_matrix()  # about fixed axes, roll first
+    return mass, centre, rotation_matrix @ link_inertia @ rotation_matrix.T
 
 
 def read_mjcf(path: str | PathLike[str], body: str) -> tuple[float, np.ndarray, np.ndarray]:
@@ -61,10 +61,10 @@ def read_mjcf(path: str | PathLike[str], body: str) -> tuple[float, np.ndarray, 
     names = [model.body(i).name for i in range(model.nbody)]
     if body not in names:
         raise ValueError(f"{name} has no body {body!r}, it has: {_listed(names)}.")
-    found = model.body(body)
-    turned = Rotation.from_quat(found.iquat, scalar_first=True).as_matrix()
-    tensor = turned @ np.diag(found.inertia) @ turned.T
-    return float(found.mass[0]), np.array(found.ipos), tensor
+    model_body = model.body(body)
+    rotation_matrix = Rotation.from_quat(model_body.iquat, scalar_first=True).as_matrix()
+    tensor = rotation_matrix @ np.diag(model_body.inertia) @ rotation_matrix.T
+    return float(model_body.mass[0]), np.array(model_body.ipos), tensor
 
 
 def _listed(names: Any) -> str:
@@ -76,8 +76,8 @@ def _number(element: Any, key: str, where: str) -> float:
     try:
         return float(text)
     except (TypeError, ValueError):
-        given = "nothing" if text is None else repr(text)
-        raise ValueError(f"{where} needs a number {key}, got {given}{_hint(text)}.") from None
+        description = "nothing" if text is None else repr(text)
+        raise ValueError(f"{where} needs a number {key}, got {description}{_hint(text)}.") from None
 
 
 def _three(element: Any, key: str, where: str) -> np.ndarray:

@@ -124,8 +124,8 @@ def _of_scene(result, body: int) -> dict[str, Any]:
     first = sum(int(np.prod(np.shape(x)[lead:])) for x in sensors if x is not None)
     covariance = np.asarray(result.covariance)
     covariance = covariance.reshape(-1, *covariance.shape[-2:])[body]
-    own = slice(first, first + len(names))
-    covariance = covariance[own, own]
+    value_slice = slice(first, first + len(names))
+    covariance = covariance[value_slice, value_slice]
     size = np.sqrt(np.maximum(np.diagonal(covariance), 0))
     size = np.where(size > 0, size, 1)
     return {
@@ -201,7 +201,7 @@ def _region(ax, one):
     if not one["scale_known"]:
         limits = ax.get_xlim(), ax.get_ylim()
         line = np.linspace(0, 1, 201)
-        reached = limits[0][0] + limits[1][0] < 1
+        is_visible = limits[0][0] + limits[1][0] < 1
         ax.fill_between(
             line,
             0,
@@ -209,7 +209,7 @@ def _region(ax, one):
             color=GREY,
             alpha=0.35,
             linewidth=0,
-            label="no body" if reached else None,
+            label="no body" if is_visible else None,
         )
         ax.set_xlim(*limits[0])
         ax.set_ylim(*limits[1])

@@ -230,8 +230,8 @@ def _level(moments, twice_energy, inertia, axis):
     curve = np.zeros((angle.size, 3))
     for k, weight, wave in zip(others, weights, (np.cos(angle), np.sin(angle)), strict=True):
         curve[:, k] = wave / np.sqrt(weight)
-    rest = 1 - sum(moments[k] * curve[:, k] ** 2 for k in others)
-    height = np.sqrt(np.clip(rest, 0, None) / moments[axis])
+    remainder = 1 - sum(moments[k] * curve[:, k] ** 2 for k in others)
+    height = np.sqrt(np.clip(remainder, 0, None) / moments[axis])
     for side in (1, -1):
         curve[:, axis] = side * height
         yield curve * np.sqrt(twice_energy)

@@ -344,26 +344,26 @@ def view(
     Raises ValueError for too many bodies or times, meshes and names that do not fit them, and for
     a motion that is not finite; TypeError for other kinds of input.
     """
-    chosen = chosen_bodies(what, bodies)
-    start = min(float(one.ts[0]) for one in chosen)
-    duration = max(float(one.ts[-1]) for one in chosen) - start
+    bodies_drawn = chosen_bodies(what, bodies)
+    start = min(float(one.ts[0]) for one in bodies_drawn)
+    duration = max(float(one.ts[-1]) for one in bodies_drawn) - start
     if not duration > 0:
         raise ValueError("a page needs at least two different times, got one.")
     scale = Scale.of(duration) if scale is None else scale
     if seconds is None:
-        fastest = max(np.linalg.norm(one.omega_body, axis=-1).max() for one in chosen)
+        fastest = max(np.linalg.norm(one.omega_body, axis=-1).max() for one in bodies_drawn)
         seconds = max(8.0, float(fastest) * duration / (2 * np.pi) / _SHOWN_TURNS)
     if not seconds > 0:
         raise ValueError(f"seconds must be positive, got {seconds}.")
-    if names is not None and len(names) != len(chosen):
-        raise ValueError(f"names must name the {len(chosen)} bodies, got {len(names)}.")
-    most = max(2, MOST_SAMPLES // len(chosen))
-    meshes = per_body(mesh, len(chosen))
-    several = [drawing_of(one, start, most, m) for one, m in zip(chosen, meshes, strict=True)]
+    if names is not None and len(names) != len(bodies_drawn):
+        raise ValueError(f"names must name the {len(bodies_drawn)} bodies, got {len(names)}.")
+    most = max(2, MOST_SAMPLES // len(bodies_drawn))
+    meshes = per_body(mesh, len(bodies_drawn))
+    several = [drawing_of(one, start, most, m) for one, m in zip(bodies_drawn, meshes, strict=True)]
     for body, name in zip(several, names or [""] * len(several), strict=True):
         body["name"] = str(name)
-    free = all(one.free for one in chosen)
-    up, eye = camera([one.momentum for one in chosen] if free else [])
+    free = all(one.free for one in bodies_drawn)
+    up, eye = camera([one.momentum for one in bodies_drawn] if free else [])
     motion = {
         "title": title,
         "note": note(several),
@@ -410,8 +410,8 @@ def view_file(
     body, title = read(path)
     numbers = range(min(3, len(body))) if bodies is None else list(bodies)
     if len(body) > 1:
-        named = ["nominal body" if number == 0 else f"clone {number}" for number in numbers]
-        options = {"names": named, **options}
+        clone_names = ["nominal body" if number == 0 else f"clone {number}" for number in numbers]
+        options = {"names": clone_names, **options}
     return view(body, output, bodies=numbers, **{"title": title, **options})
 
 

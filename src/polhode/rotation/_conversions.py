@@ -247,10 +247,10 @@ def _half_sum(left: Array, right: Array) -> tuple[Array, Array]:
     rounding error is found exactly (Knuth 1969), and does not depend on the angles smoothly.
     """
     total = left + right
-    shifted = total - left
-    lost = jax.lax.stop_gradient((left - (total - shifted)) + (right - shifted)) / 2
+    right_part = total - left
+    rounding_error = jax.lax.stop_gradient((left - (total - right_part)) + (right - right_part)) / 2
     cos, sin = jnp.cos(total / 2), jnp.sin(total / 2)
-    return cos - lost * sin, sin + lost * cos
+    return cos - rounding_error * sin, sin + rounding_error * cos
 
 
 def euler_to_wxyz(

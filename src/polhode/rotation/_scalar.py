@@ -65,8 +65,8 @@ def _direction_jvp(primals, tangents):
     size = length(vector)[..., None]
     is_zero = size == 0
     across = tangent - unit * _dot(unit, tangent)[..., None]
-    turned = across / jnp.where(is_zero, jnp.ones_like(size), size)
-    return unit, jnp.where(is_zero, jnp.zeros_like(turned), turned)
+    direction_rate = across / jnp.where(is_zero, jnp.ones_like(size), size)
+    return unit, jnp.where(is_zero, jnp.zeros_like(direction_rate), direction_rate)
 
 
 # --- sin(a)/a as a function of a**2 --------------------------------------------------------------
@@ -87,11 +87,11 @@ def sine_ratio(squared: Float[Array, "*b"]) -> Float[Array, "*b"]:
 
 def _cubic_ratio(squared: Array) -> Array:
     """``(a - sin a)/a**3`` from ``a**2``."""
-    near = squared < _SERIES_BELOW
-    small = jnp.where(near, squared, jnp.zeros_like(squared))
-    large = jnp.where(near, jnp.full_like(squared, _SERIES_BELOW), squared)
-    series = jnp.polyval(jnp.asarray(_CUBIC_SERIES[::-1], squared.dtype), small)
-    return jnp.where(near, series, (1 - sine_ratio(large)) / large)
+    is_near_zero = squared < _SERIES_BELOW
+    small_square = jnp.where(is_near_zero, squared, jnp.zeros_like(squared))
+    large_square = jnp.where(is_near_zero, jnp.full_like(squared, _SERIES_BELOW), squared)
+    series = jnp.polyval(jnp.asarray(_CUBIC_SERIES[::-1], squared.dtype), small_square)
+    return jnp.where(is_near_zero, series, (1 - sine_ratio(large_square)) / large_square)
 
 
 @sine_ratio.defjvp
