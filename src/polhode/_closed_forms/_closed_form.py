@@ -86,9 +86,10 @@ def with_first(
     state: State, wxyz: Array | None, omega: Array | None
 ) -> tuple[Array | None, Array | None]:
     """Samples (N, T, ...) preceded by the initial state."""
-    both = ((state.wxyz, wxyz), (state.omega_body, omega))
+    pairs = ((state.wxyz, wxyz), (state.omega_body, omega))
     wxyz, omega = (
-        None if x is None else jnp.concatenate([first[:, None], x], axis=1) for first, x in both
+        None if x is None else jnp.concatenate([initial[:, None], x], axis=1)
+        for initial, x in pairs
     )
     return wxyz, omega
 

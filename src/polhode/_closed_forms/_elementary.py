@@ -134,10 +134,12 @@ class FixedAxis(AbstractChunkedForm):
         rates, torque = (
             jnp.where(along | ~is_moving, x, constant(x)) for x in (state.omega_body, torque)
         )
-        both = jnp.concatenate([rates, torque], axis=-1)
-        at_rest = jnp.broadcast_to(~is_moving, both.shape)
+        rates_and_torque = jnp.concatenate([rates, torque], axis=-1)
+        at_rest = jnp.broadcast_to(~is_moving, rates_and_torque.shape)
         # Zero, and NaN in second derivatives of a body at rest, which are not those of this motion.
-        zero = jnp.sum(derivable_once(both, at_rest) - both, axis=-1, keepdims=True)
+        zero = jnp.sum(
+            derivable_once(rates_and_torque, at_rest) - rates_and_torque, axis=-1, keepdims=True
+        )
         omega, angles = driven_spin(
             (rates + zero)[:, None],
             (damping / moments)[:, None],
@@ -152,17 +154,21 @@ class FixedAxis(AbstractChunkedForm):
 def decay(rate: Array, t: Array) -> Array:
     """(1 - exp(-k t))/k, t at k = 0: the integral of exp(-k t) [s]."""
     x = rate * t
-    near = jnp.abs(x) < 0.5
-    far = jnp.where(near, 1, x)
-    return t * jnp.where(near, _series(x, 1), -jnp.expm1(-far) / far)
+    is_small = jnp.abs(x) < 0.5
+    large_x = jnp.where(is_small, 1, x)
+    return t * jnp.where(is_small, _series(x, 1), -jnp.expm1(-large_x) / large_x)
 
 
 def decay_twice(rate: Array, t: Array) -> Array:
     """(t - decay)/k, t^2/2 at k = 0: the integral of ``decay`` [s^2]."""
     x = rate * t
-    near = jnp.abs(x) < 0.5
-    far = jnp.where(near, 1, x)
-    return t * t * jnp.where(near, _series(x, 2), (far + jnp.expm1(-far)) / (far * far))
+    is_small = jnp.abs(x) < 0.5
+    large_x = jnp.where(is_small, 1, x)
+    return (
+        t
+        * t
+        * jnp.where(is_small, _series(x, 2), (large_x + jnp.expm1(-large_x)) / (large_x * large_x))
+    )
 
 
 def _series(x: Array, first: int) -> Array:

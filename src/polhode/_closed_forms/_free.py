@@ -97,9 +97,9 @@ class ClosedForm(AbstractClosedForm):
         )
         if single_body:  # one body at many times: as several bodies, each at a part of them
             pieces = max(2, -(-samples // chunk))
-            each = -(-samples // pieces)
-            times = jnp.pad(t.reshape(-1), (0, pieces * each - samples), mode="edge")
-            times = times.reshape(pieces, each)
+            samples_per_piece = -(-samples // pieces)
+            times = jnp.pad(t.reshape(-1), (0, pieces * samples_per_piece - samples), mode="edge")
+            times = times.reshape(pieces, samples_per_piece)
             lanes = jax.tree.map(lambda x: jnp.repeat(x, pieces, axis=0), lanes)
         elif time_by_time:
             size = chunk_size(n)
@@ -209,8 +209,8 @@ def evaluate(
         raise ValueError(f"t has {t.ndim} axes, the motion {batch}: expected as many or one more")
     if attitude and motion.precession is None:
         raise ValueError("the motion was prepared without wxyz: pass it, or attitude=False")
-    many = t.ndim == batch + 1
-    if many:
+    has_time_axis = t.ndim == batch + 1
+    if has_time_axis:
         motion = jax.tree.map(lambda x: x[..., None], motion)
     elif t.ndim < batch:
         t = t.reshape((1,) * (batch - t.ndim) + t.shape)
@@ -224,7 +224,7 @@ def evaluate(
     )
     # Derivatives do not pass through the constants (see ``_free_derivatives``).
     constants = jax.lax.stop_gradient((motion.polhode, precession))
-    return _evaluate((attitude, rates, many), constants, arguments)
+    return _evaluate((attitude, rates, has_time_axis), constants, arguments)
 
 
 def free_motion(
@@ -312,8 +312,8 @@ def _chunked(fn, parts, t, rows):
     def pieces_of(x):
         if padding == 0:
             return x.reshape(-1, rows, *x.shape[1:])
-        last = jnp.broadcast_to(x[-1:], (padding, *x.shape[1:]))
-        return jnp.concatenate([x, last]).reshape(-1, rows, *x.shape[1:])
+        fill = jnp.broadcast_to(x[-1:], (padding, *x.shape[1:]))
+        return jnp.concatenate([x, fill]).reshape(-1, rows, *x.shape[1:])
 
     own_times = t.ndim > 0 and t.shape[0] == count
     pieces = jax.tree.map(pieces_of, (parts, t) if own_times else (parts, None))
@@ -387,10 +387,10 @@ def symmetric_motion(
         precession = rotation.rotation_vector_to_wxyz(angle)
         half = slip * t / 2
         zero = jnp.zeros_like(half)
-        own = jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=-1)
-        precession, own = computed_once((precession, own))
-        before = computed_once(rotation.multiply(precession, wxyz))
-        later = rotation.multiply(before, own)
+        axial_turn = jnp.stack([jnp.cos(half), zero, zero, jnp.sin(half)], axis=-1)
+        precession, axial_turn = computed_once((precession, axial_turn))
+        after_precession = computed_once(rotation.multiply(precession, wxyz))
+        later = rotation.multiply(after_precession, axial_turn)
     return SymmetricMotion(later, later_rates)
 
 

@@ -91,10 +91,10 @@ def _momentum_formula(polhode: Polhode, arguments):
     return momentum_of(polhode._replace(momentum=start, p=p, r=r, s=s), functions)
 
 
-def with_momentum_derivative(polhode: Polhode, functions: Triple, now: Triple) -> Triple:
+def with_momentum_derivative(polhode: Polhode, functions: Triple, momentum_at_t: Triple) -> Triple:
     """The momentum at time t, with its derivative by the start and by S, C, N."""
     arguments = (polhode.momentum, polhode.p, polhode.r, polhode.s, functions)
-    return with_formula_derivative(_momentum_formula, now, polhode, arguments)
+    return with_formula_derivative(_momentum_formula, momentum_at_t, polhode, arguments)
 
 
 def _difference_formula(_, arguments):
@@ -117,7 +117,9 @@ def _quarter_formula(circular, on_separatrix, x: Scalars, z: Scalars):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def with_functions_derivative(many: bool, value, constants, x: Scalars, z: Scalars, t: Scalars):
+def with_functions_derivative(
+    has_time_axis: bool, value, constants, x: Scalars, z: Scalars, t: Scalars
+):
     """``value``: S, C, N and the integrals of S^2 and (S/N)^2; with their derivatives.
 
     ``constants``: those of the polhode and its half turns so far; ``x`` = B r, ``z`` = B r - A p.
@@ -126,10 +128,10 @@ def with_functions_derivative(many: bool, value, constants, x: Scalars, z: Scala
 
 
 @with_functions_derivative.defjvp
-def _functions_rule(many, primals, tangents):
+def _functions_rule(has_time_axis, primals, tangents):
     value, constants, x, z, t = primals
     _, _, dx, dz, dt = tangents
-    value = with_functions_derivative(many, value, constants, x, z, t)
+    value = with_functions_derivative(has_time_axis, value, constants, x, z, t)
     polhode, half_turns = constants
     S, C, N, first, second = value
     y = with_formula_derivative(_difference_formula, polhode.A * polhode.p, (), (x, z))
@@ -137,7 +139,7 @@ def _functions_rule(many, primals, tangents):
     dS, dC, dN = dS + C * N * dt, dC - x * S * N * dt, dN - y * S * C * dt
     sign = sign_of_parity(half_turns)
     _, variation = jax.jvp(
-        lambda s, c, n: incomplete(s, c, n, many),
+        lambda s, c, n: incomplete(s, c, n, has_time_axis),
         (sign * S, sign * C, N),
         (sign * dS, sign * dC, dN),
     )
@@ -283,7 +285,7 @@ def _turn_tangent(
     polhode,
     frame: Frame,
     functions,
-    now,
+    momentum_at_t,
     relative,
     variation: Variation,
     variation_since_start,
@@ -301,7 +303,7 @@ def _turn_tangent(
         2 * (b - scalar * a) - m
         for a, b, m in zip(once, twice, frame.reflected(variation_since_start), strict=True)
     )
-    squares = squares_of_momenta(polhode, functions, now, first, t)
+    squares = squares_of_momenta(polhode, functions, momentum_at_t, first, t)
     start = polhode.momentum
     spin = tuple(x * y for x, y in zip(start, polhode.inverse_moments, strict=True))
     energy = dot(spin, variation.momentum) + dot(start, apply_variation(variation, start)) / 2
@@ -310,7 +312,7 @@ def _turn_tangent(
         about_L = about_L + dot(
             variation.off_diagonal, products_of_momenta(invariants, functions, sigma_pi)
         )
-    L_now = frame.reflected(now)
+    L_now = frame.reflected(momentum_at_t)
     inverse_square = 1 / dot(start, start)
     turn = tuple(
         (a + about_L * b) * inverse_square
@@ -347,14 +349,14 @@ class _Tangent(NamedTuple):
 
     polhode: Polhode
     frame: Frame
-    now: Triple
+    momentum_at_t: Triple
     variation: Variation
     momentum: Triple
     turn: Triple | None
 
 
 def _tangent(
-    many: bool, attitude: bool, motion: EvaluatedMotion, arguments, dm, dp, dw
+    has_time_axis: bool, attitude: bool, motion: EvaluatedMotion, arguments, dm, dp, dw
 ) -> _Tangent:
     """The formulas of _tangent.py, every value in them with a derivative of its own."""
     moments, _, omega, _, t = arguments
@@ -366,10 +368,10 @@ def _tangent(
     frame = Frame(polhode)
     variation = stage(start_variation(polhode, frame, dm, dp, dw))
     at = _regularised(motion.polhode, motion.at, scaled_time)
-    integrals = stage(second_kind(motion.polhode, at.half_turns, at.reduced, many))
+    integrals = stage(second_kind(motion.polhode, at.half_turns, at.reduced, has_time_axis))
     x, y = polhode.B * polhode.r, polhode.A * polhode.p
     *functions, first, second = with_functions_derivative(
-        many,
+        has_time_axis,
         (*at.functions, *integrals),
         (polhode, at.half_turns),
         x,
@@ -377,29 +379,31 @@ def _tangent(
         scaled_time,
     )
     functions = tuple(functions)
-    now = with_momentum_derivative(polhode, functions, at.momentum)
+    momentum_at_t = with_momentum_derivative(polhode, functions, at.momentum)
     by = stage(partials(x, y, functions, first, second))
-    variation_since_start = stage(momentum_tangent(polhode, functions, now, by, variation, stage))
+    variation_since_start = stage(
+        momentum_tangent(polhode, functions, momentum_at_t, by, variation, stage)
+    )
     total = tuple(g + m for g, m in zip(variation.momentum, variation_since_start, strict=True))
     turn = None
     if attitude:
-        relative = _relative(many, motion._replace(results=None), arguments)
+        relative = _relative(has_time_axis, motion._replace(results=None), arguments)
         turn = _turn_tangent(
             polhode,
             frame,
             functions,
-            now,
+            momentum_at_t,
             relative,
             variation,
             variation_since_start,
             first,
             scaled_time,
         )
-    return _Tangent(polhode, frame, now, variation, total, turn)
+    return _Tangent(polhode, frame, momentum_at_t, variation, total, turn)
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _relative(many: bool, motion: EvaluatedMotion, arguments):
+def _relative(has_time_axis: bool, motion: EvaluatedMotion, arguments):
     """Turn from the start to time t, of which the tangent of the attitude is made, as quaternion.
 
     Right-handed axes 1, 2, 3; its derivative is the tangent of the attitude itself.
@@ -417,11 +421,11 @@ def _relative(many: bool, motion: EvaluatedMotion, arguments):
     return _relative_turn(polhode, motion.precession, Frame(polhode), at, momentum_step)
 
 
-def _relative_rule(many, primals, tangents):
+def _relative_rule(has_time_axis, primals, tangents):
     motion, arguments = primals
     dm, dp, dw, _, dt = (dense_or_none(d, x) for d, x in zip(tangents[1], arguments, strict=True))
-    scalar, vector = value = _relative(many, motion, arguments)
-    tangent = _tangent(many, True, motion, arguments, dm, dp, dw)
+    scalar, vector = value = _relative(has_time_axis, motion, arguments)
+    tangent = _tangent(has_time_axis, True, motion, arguments, dm, dp, dw)
     turn = _turn_in_time(tangent, dt)
     half = tuple(x / 2 for x in tangent.frame.reflected(turn))
     vector_variation = tuple(scalar * a + b for a, b in zip(half, cross(vector, half), strict=True))
@@ -439,7 +443,7 @@ def _turn_in_time(tangent: _Tangent, dt) -> Triple:
         return turn
     return triple(
         e + n * d * (polhode.rate_unit * dt)
-        for e, n, d in zip(turn, tangent.now, polhode.inverse_moments, strict=True)
+        for e, n, d in zip(turn, tangent.momentum_at_t, polhode.inverse_moments, strict=True)
     )
 
 
@@ -465,7 +469,7 @@ def results_tangent(requested, motion: EvaluatedMotion, arguments, tangents, res
     if arguments[1] is not None:
         arguments, dm, dp, dw, to_body = along_turning_axes(arguments, dm, dp, dw)
     tangent = _tangent(requested[2], requested[0], motion, arguments, dm, dp, dw)
-    polhode, frame, (n1, n2, n3) = tangent.polhode, tangent.frame, tangent.now
+    polhode, frame, (n1, n2, n3) = tangent.polhode, tangent.frame, tangent.momentum_at_t
     at_rest = polhode.rate_unit == 0
     d_rates_at_rest, d_attitude_at_rest = variation_at_rest(at_rest, arguments, dw, dt)
     d_omega = d_wxyz = None
@@ -483,7 +487,7 @@ def results_tangent(requested, motion: EvaluatedMotion, arguments, tangents, res
             for d, x, e in zip(
                 polhode.inverse_moments,
                 total,
-                apply_variation(tangent.variation, tangent.now),
+                apply_variation(tangent.variation, tangent.momentum_at_t),
                 strict=True,
             )
         )
@@ -507,7 +511,7 @@ def results_tangent(requested, motion: EvaluatedMotion, arguments, tangents, res
     return d_omega, d_wxyz
 
 
-def _start_tangent(start: Quadruple, variation: Quadruple, now: Quadruple, other: Quadruple):
+def _start_tangent(start: Quadruple, variation: Quadruple, attitude: Quadruple, tangent: Quadruple):
     """Adds the answer to the initial attitude, which is normalised before use."""
     inverse_square = 1 / dot(start, start)
     along = dot(start, variation)
@@ -516,4 +520,6 @@ def _start_tangent(start: Quadruple, variation: Quadruple, now: Quadruple, other
         for d, q in zip(variation, start, strict=True)
     )
     relative = quaternion_product(unit, (start[0], -start[1], -start[2], -start[3]))
-    return tuple(a + b for a, b in zip(other, quaternion_product(relative, now), strict=True))
+    return tuple(
+        a + b for a, b in zip(tangent, quaternion_product(relative, attitude), strict=True)
+    )

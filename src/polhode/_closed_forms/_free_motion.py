@@ -225,16 +225,16 @@ def polhode_constants(roles: Roles) -> Polhode:
     B = (l2 * w2 * d12 + l3 * w3 * d13) * d1
     A, B = staged((A, B), one)
     x = B * r
-    moving = x > 0
-    divisor = jnp.where(moving, x, 1)
-    m = jnp.where(moving, A * p / divisor, 0)
-    m1 = jnp.where(moving, s * roles.gap * d2 / divisor, 1)
+    is_nonzero = x > 0
+    divisor = jnp.where(is_nonzero, x, 1)
+    m = jnp.where(is_nonzero, A * p / divisor, 0)
+    m1 = jnp.where(is_nonzero, s * roles.gap * d2 / divisor, 1)
     circular = m1 > 1 - _CIRCULAR_BELOW
-    on_separatrix = moving & (m1 < floor)
+    on_separatrix = is_nonzero & (m1 < floor)
     permanent = (jnp.abs(l1) + jnp.minimum(jnp.abs(l2), jnp.abs(l3))) == 0
     agm, nome, log_nome, rate = agm_and_nome(circular, on_separatrix, x, m, m1, one)
     half_turn_rate = rate / jnp.where(circular, math.pi, log_nome) * roles.rate_unit
-    inverse_rate = jnp.where(moving, 1 / jnp.where(moving, rate, 1), 0)
+    inverse_rate = jnp.where(is_nonzero, 1 / jnp.where(is_nonzero, rate, 1), 0)
     half_turn_rate = staged(half_turn_rate, one)
     return Polhode(
         momentum=(l1, l2, l3),
@@ -273,9 +273,9 @@ def descend(polhode: Polhode, length: Scalars) -> Scalars:
     Gauss's transformation, every step a sum of positive terms.
     """
     other = jnp.sqrt(jnp.where(polhode.circular, polhode.m1, polhode.m))
-    _, least = _limits(other.dtype)
+    _, smallest_ratio = _limits(other.dtype)
     aspherical = polhode.r > 0
-    p = jnp.maximum(polhode.p, polhode.r * least)
+    p = jnp.maximum(polhode.p, polhode.r * smallest_ratio)
     start = jnp.where(aspherical, jnp.sqrt(polhode.r / jnp.where(aspherical, p, 1)), 0)
     has_B = polhode.B > 0
     ratio = jnp.where(polhode.circular, polhode.s, polhode.p) / jnp.where(has_B, polhode.B, 1)
@@ -485,9 +485,10 @@ def momentum_of(polhode: Polhode, functions: Triple) -> Triple:
 
 def momentum(polhode: Polhode, functions: Triple) -> Triple:
     """The same; a permanent rotation about a principal axis keeps its rates to the last bit."""
-    now = momentum_of(polhode, functions)
+    momentum_at_t = momentum_of(polhode, functions)
     return triple(
-        jnp.where(polhode.permanent, l, x) for l, x in zip(polhode.momentum, now, strict=True)
+        jnp.where(polhode.permanent, l, x)
+        for l, x in zip(polhode.momentum, momentum_at_t, strict=True)
     )
 
 
@@ -555,13 +556,13 @@ def advance(
     reduced = extra_stage(reduced)
     sign = sign_of_parity(half_turns)
     S, C, N = stage((sign * reduced[0], sign * reduced[1], reduced[2]))
-    l1, l2, l3 = now = stage(momentum(polhode, (S, C, N)))
+    l1, l2, l3 = momentum_at_t = stage(momentum(polhode, (S, C, N)))
     if precession is None:
-        return Instant(half_turns, reduced, (S, C, N), now, None)
+        return Instant(half_turns, reduced, (S, C, N), momentum_at_t, None)
     c, s = half_angle(polhode, precession, t, fraction, half, N, (S, l2, l3), stage)
     height = precession.length + jnp.abs(l3)
     scale = jax.lax.rsqrt((c * c + s * s) * (height * height + l1 * l1 + l2 * l2))
-    return Instant(half_turns, reduced, (S, C, N), now, stage((c * scale, s * scale)))
+    return Instant(half_turns, reduced, (S, C, N), momentum_at_t, stage((c * scale, s * scale)))
 
 
 def body_rates(polhode: Polhode, at: Instant) -> Triple:

@@ -89,11 +89,11 @@ def _means(complement: Pair, pole: Pair) -> tuple[Pair, Pair, Scalars]:
     def step(_, state):
         a, b, p, weight, pi_sum = state
         product, square = multiply_pairs(a, b), multiply_pairs(p, p)
-        both = add_pairs(square, product)
+        total = add_pairs(square, product)
         weight = _halved(
-            multiply_pairs(weight, divide_pairs(subtract_pairs(square, product), both))
+            multiply_pairs(weight, divide_pairs(subtract_pairs(square, product), total))
         )
-        p = _halved(divide_pairs(both, p))
+        p = _halved(divide_pairs(total, p))
         return _halved(add_pairs(a, b)), root_of(product), p, weight, add_pairs(pi_sum, weight)
 
     # A loop and not an unrolled formula: it compiles in a tenth of the time.
@@ -165,13 +165,13 @@ def compensate(
 
 
 def _replaced(
-    plain: Scalars, compensated: Pair, converged, rate_unit: Scalars
+    rate: Scalars, compensated: Pair, converged, rate_unit: Scalars
 ) -> tuple[Scalars, Scalars]:
     """The pair that replaces a plain rate, unless it is NaN or disagrees with it."""
     high, low = compensated.high * rate_unit, compensated.low * rate_unit
-    tolerance = {4: 2.0**-13, 8: 2.0**-30}[plain.dtype.itemsize]
-    converged = converged & (jnp.abs(high - plain) <= tolerance * jnp.abs(plain))
-    return jnp.where(converged, high, plain), jnp.where(converged, low, 0)
+    tolerance = {4: 2.0**-13, 8: 2.0**-30}[rate.dtype.itemsize]
+    converged = converged & (jnp.abs(high - rate) <= tolerance * jnp.abs(rate))
+    return jnp.where(converged, high, rate), jnp.where(converged, low, 0)
 
 
 class Mode(enum.IntEnum):

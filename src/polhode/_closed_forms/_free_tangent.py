@@ -29,7 +29,7 @@ Scalars = Float[Array, "*b"]
 _DUPLICATIONS = 14
 
 
-def incomplete(S: Scalars, C: Scalars, N: Scalars, many: bool) -> tuple[Scalars, Scalars]:
+def incomplete(S: Scalars, C: Scalars, N: Scalars, has_time_axis: bool) -> tuple[Scalars, Scalars]:
     """Integrals of S^2 and (S/N)^2 over less than half a turn, by Carlson's duplication.
 
     They are S^3/3 R_D(C^2, N^2, 1) and S^3/3 R_D(C^2, 1, N^2), which share their square roots.
@@ -48,7 +48,7 @@ def incomplete(S: Scalars, C: Scalars, N: Scalars, many: bool) -> tuple[Scalars,
     zero, one = jnp.zeros_like(N), jnp.ones_like(N)
     # The first roots are known: C and N are smooth where the root of C^2 is not.
     carry = halve(zero, zero, C * C, N * N, one, jnp.ones((), N.dtype), C, N, one)
-    if many:
+    if has_time_axis:
         # With many times per body several kernels need the result, and each would repeat all of
         # it: as a loop it is computed once, and compiles in half of the time.
         carry = jax.lax.fori_loop(1, _DUPLICATIONS, duplicate, carry)
@@ -89,10 +89,10 @@ def quarter_turn(circular, on_separatrix, m, m1, agm, log_nome, inverse_rate):
 
 
 def second_kind(
-    polhode: Polhode, half_turns: Scalars, reduced: Triple, many: bool
+    polhode: Polhode, half_turns: Scalars, reduced: Triple, has_time_axis: bool
 ) -> tuple[Scalars, Scalars]:
     """Integrals of S^2 and (S/N)^2 from the start; ``reduced``: S, C, N less half turns."""
-    first, second = incomplete(*reduced, many)
+    first, second = incomplete(*reduced, has_time_axis)
     turn_first, turn_second = complete(polhode)
     return first + 2 * half_turns * turn_first, second + 2 * half_turns * turn_second
 
@@ -148,17 +148,19 @@ def _quotients(invariants: Invariants, functions: Triple):
     delta = C * C + tail
     # (1 - C)/r = B S^2/(1 + C) because 1 - C^2 = B r S^2: no divisor vanishes for C >= 0. Where C
     # is negative r cannot be zero, and the plain quotient loses nothing.
-    ahead = C >= 0
+    C_is_positive = C >= 0
     one_minus_C = jnp.where(
-        ahead, square * B / jnp.where(ahead, 1 + C, 1), (1 - C) / jnp.where(ahead, 1, r)
+        C_is_positive,
+        square * B / jnp.where(C_is_positive, 1 + C, 1),
+        (1 - C) / jnp.where(C_is_positive, 1, r),
     )
     one_minus_N = square * A / (1 + N)
     skew_numerator = square * (p * (l1 * l1) * tail - delta * (p * l1 * l1 + r * l3 * l3))
     product = C * N
     product_less_delta = jnp.where(
-        ahead,
-        skew_numerator / jnp.where(ahead, product + delta, 1),
-        (product - delta) / jnp.where(ahead, 1, s),
+        C_is_positive,
+        skew_numerator / jnp.where(C_is_positive, product + delta, 1),
+        (product - delta) / jnp.where(C_is_positive, 1, s),
     )
     return delta, one_minus_C, one_minus_N, product_less_delta
 
@@ -171,11 +173,11 @@ def products_of_momenta(invariants: Invariants, functions: Triple, sigma_pi: Sca
     square = S * S
     # (1 - C)/r - p (l2 S)^2 and (1 - N)/p - r (l2 S)^2: on a spin about the middle axis the second
     # term takes all but the last digits of the first.
-    ahead = C >= 0
+    C_is_positive = C >= 0
     one_minus_C = (invariants.s * l3 * l3 - invariants.p * l2 * l2 * C) * jnp.where(
-        ahead,
-        square / jnp.where(ahead, 1 + C, 1),
-        (1 - C) / jnp.where(ahead, 1, invariants.r * invariants.B),
+        C_is_positive,
+        square / jnp.where(C_is_positive, 1 + C, 1),
+        (1 - C) / jnp.where(C_is_positive, 1, invariants.r * invariants.B),
     )
     one_minus_N = (invariants.s * l1 * l1 - invariants.r * l2 * l2 * N) * square / (1 + N)
     return (
@@ -186,41 +188,41 @@ def products_of_momenta(invariants: Invariants, functions: Triple, sigma_pi: Sca
 
 
 def _off_diagonal_responses(
-    invariants: Invariants, functions: Triple, now: Triple, by: Partials, sigma_pi, sense
+    invariants: Invariants, functions: Triple, momentum_at_t: Triple, by: Partials, sigma_pi, sense
 ) -> tuple:
     """Answers of L(t) to the entries 12, 13, 23 of the inverse tensor."""
     S, C, N = functions
     (l1, l2, l3), p, r, s, *_ = invariants
-    n1, n2, n3 = now
+    n1, n2, n3 = momentum_at_t
     delta, one_minus_C, one_minus_N, _ = _quotients(invariants, functions)
     square = S * S
     aspherical = s > 0
     divisor = jnp.where(aspherical, s, 1)
-    ahead = C >= 0
+    C_is_positive = C >= 0
     # (p C + r N) / s, whose derivative in a nearly spherical body is not to be divided by s.
     blend_share = (
         p
         * r
         / divisor
         * square
-        * (invariants.B / jnp.where(ahead, 1 + C, 1) + invariants.A / (1 + N))
+        * (invariants.B / jnp.where(C_is_positive, 1 + C, 1) + invariants.A / (1 + N))
     )
-    blend = jnp.where(ahead, 1 - blend_share, (p * C + r * N) / divisor)
+    blend = jnp.where(C_is_positive, 1 - blend_share, (p * C + r * N) / divisor)
     split = jnp.where(
-        ahead,
-        -square * (r * l3 * l3 - p * l1 * l1) / jnp.where(ahead, C + N, 1),
+        C_is_positive,
+        -square * (r * l3 * l3 - p * l1 * l1) / jnp.where(C_is_positive, C + N, 1),
         (C - N) / divisor,
     )
 
     def response(product, dd, heads):
         dS, dC, dN = by.along(2 * r * product, 2 * s * product)
         dd = dd - 2 * p * r * l2 * l2 * S * dS
-        rest = (
+        terms = (
             -l1 * dC + sigma_pi * r * l2 * l3 * (dS * N + S * dN) + n1 * dd,
             -l2 * (dC * N + C * dN) - sigma_pi * s * l1 * l3 * dS + n2 * dd,
             -l3 * dN + sigma_pi * p * l1 * l2 * (dS * C + S * dC) + n3 * dd,
         )
-        return tuple(sense * (a + b) / delta for a, b in zip(heads, rest, strict=True))
+        return tuple(sense * (a + b) / delta for a, b in zip(heads, terms, strict=True))
 
     q12, q13, q23 = l1 * l2, l1 * l3, l2 * l3
     swap = 1 + r * one_minus_N
@@ -269,7 +271,12 @@ def invariants_variation(polhode: Polhode, variation: Variation):
 
 
 def momentum_tangent(
-    polhode: Polhode, functions: Triple, now: Triple, by: Partials, variation: Variation, stage
+    polhode: Polhode,
+    functions: Triple,
+    momentum_at_t: Triple,
+    by: Partials,
+    variation: Variation,
+    stage,
 ) -> Triple:
     """Variation of L(t) - L(0)."""
     sigma_pi = polhode.sense * polhode.parity
@@ -288,7 +295,9 @@ def momentum_tangent(
     )
     if variation.off_diagonal is None:
         return diagonal
-    responses = _off_diagonal_responses(invariants, functions, now, by, sigma_pi, polhode.sense)
+    responses = _off_diagonal_responses(
+        invariants, functions, momentum_at_t, by, sigma_pi, polhode.sense
+    )
     return tuple(
         total + sum(a[k] * h for a, h in zip(responses, variation.off_diagonal, strict=True))
         for k, total in enumerate(diagonal)
@@ -315,13 +324,15 @@ def _spread(invariants: Invariants, S: Scalars, first: Scalars, t: Scalars, is_s
     return jnp.where(is_short, series, (l2 * l2 * (t - S) - A * B * first) / divisor)
 
 
-def squares_of_momenta(polhode, functions: Triple, now: Triple, first: Scalars, t: Scalars):
+def squares_of_momenta(
+    polhode, functions: Triple, momentum_at_t: Triple, first: Scalars, t: Scalars
+):
     """Integrals of L1^2, L2^2, L3^2 over the time from the start."""
     S, _, _ = functions
     l1, l2, l3 = polhode.momentum
     sigma_pi = polhode.sense * polhode.parity
     invariants = Invariants(polhode.momentum, polhode.p, polhode.r, polhode.s, polhode.A, polhode.B)
-    square_2 = polhode.A * polhode.B * first + S * l2 * now[1]
+    square_2 = polhode.A * polhode.B * first + S * l2 * momentum_at_t[1]
     # (l2^2 t - middle) / s, of which the change of L2 is a part.
     is_short = (polhode.B * polhode.r + polhode.A * polhode.p) * t * t < _SHORT
     divisor = jnp.where(is_short, 1, polhode.s)
@@ -382,12 +393,12 @@ def quaternion_product(a: Quadruple, b: Quadruple) -> Quadruple:
 def apply_variation(variation: Variation, vector: Triple) -> Triple:
     """The variation of the inverse tensor, applied."""
     a, b, c = vector
-    plain = triple(e * x for e, x in zip(variation.inverse_moments, vector, strict=True))
+    diagonal_part = triple(e * x for e, x in zip(variation.inverse_moments, vector, strict=True))
     if variation.off_diagonal is None:
-        return plain
+        return diagonal_part
     h12, h13, h23 = variation.off_diagonal
     return (
-        plain[0] + h12 * b + h13 * c,
-        plain[1] + h12 * a + h23 * c,
-        plain[2] + h13 * a + h23 * b,
+        diagonal_part[0] + h12 * b + h13 * c,
+        diagonal_part[1] + h12 * a + h23 * c,
+        diagonal_part[2] + h13 * a + h23 * b,
     )

@@ -144,10 +144,10 @@ def cubic(weight: Array, vertical: tuple[Array, ...], momentum: tuple[Array, ...
     vertical u1, u2, then 1 + g and 1 - g; ``momentum``: body components [kg m^2/s].
     """
     square = momentum[0] ** 2 + momentum[1] ** 2 + momentum[2] ** 2 + jnp.abs(weight)
-    moving = square > 0
-    momentum_unit = jnp.sqrt(where_or_one(moving, square))
+    is_nonzero = square > 0
+    momentum_unit = jnp.sqrt(where_or_one(is_nonzero, square))
     l1, l2, b = (x / momentum_unit for x in momentum)
-    n = weight / where_or_one(moving, square)
+    n = weight / where_or_one(is_nonzero, square)
     u1, u2, one_plus_g, one_minus_g = vertical
     g = (one_plus_g - one_minus_g) / 2
     horizontal_product, nutation = u1 * l1 + u2 * l2, u1 * l2 - u2 * l1
@@ -182,7 +182,7 @@ def cubic(weight: Array, vertical: tuple[Array, ...], momentum: tuple[Array, ...
     distances = side * (2 * y - n * root_sum)
     mean_distance = jnp.sqrt(positive(y * y - n * root_sum * y + n * n * root_product))
     width = distances + 2 * mean_distance
-    nutating = moving & (width > 4 * jnp.finfo(g.dtype).tiny ** 0.5)
+    nutating = is_nonzero & (width > 4 * jnp.finfo(g.dtype).tiny ** 0.5)
     return Cubic(
         momentum_unit,
         nutating,
@@ -274,18 +274,18 @@ def _places(f: Cubic, c: Curve, raw: Array):
     # g = 1, where A g' = i (p - b)
     depth = f.third_distance - f.leading * f.one_minus_g
     upright = f.horizontal_product - f.axial_momentum * f.one_minus_g
-    close = (depth < f.mean_distance / 2) | ~circular
+    is_close = (depth < f.mean_distance / 2) | ~circular
     span = jnp.sqrt(
         where_or_one(
-            close, positive(f.one_minus_g**2 - f.root_sum * f.one_minus_g + f.root_product)
+            is_close, positive(f.one_minus_g**2 - f.root_sum * f.one_minus_g + f.root_product)
         )
     )
-    upper_push = _where_or_zero(~close, -2 * upright / jnp.sqrt(where_or_one(~close, depth)))
+    upper_push = _where_or_zero(~is_close, -2 * upright / jnp.sqrt(where_or_one(~is_close, depth)))
     mean = jnp.stack(
         [
             _where_or_zero(~state_close, f.root_sum),
             f.root_sum + 2 * f.one_plus_g,
-            _where_or_zero(~close, f.root_sum - 2 * f.one_minus_g),
+            _where_or_zero(~is_close, f.root_sum - 2 * f.one_minus_g),
         ]
     )
     step = Complex(
@@ -301,8 +301,8 @@ def _places(f: Cubic, c: Curve, raw: Array):
         ),
     )
     # near the third root
-    root = _where_or_zero(close, upright) / span
-    near = jnp.stack([state_close, jnp.zeros_like(close), close])
+    root = _where_or_zero(is_close, upright) / span
+    is_near_root = jnp.stack([state_close, jnp.zeros_like(is_close), is_close])
     depth = jnp.stack([f.third_distance, zero, depth])
     span = jnp.stack([state_span, jnp.ones_like(span), span])
     fall = Complex(
@@ -313,18 +313,21 @@ def _places(f: Cubic, c: Curve, raw: Array):
         (f.mean_distance, f.leading, jnp.sqrt(f.width), f.scale, c._replace(series=None)), 3
     )
     one = _rows_of_ones(3, raw)
-    near = staged(near, one)
-    scale = 1 / where_or_one(near, amount * span)
+    is_near_root = staged(is_near_root, one)
+    scale = 1 / where_or_one(is_near_root, amount * span)
     lift, fall = staged(((middle + depth) * scale, fall * (scale * width)), one)
     mean, step = staged((mean * reach, step * reach), one)
     e, partner = _reciprocal(step + mean, -step + mean, c.square)
     half = staged(((1 + partner) * (1 + e).inverse).root, one)
-    lead = where(near, -fall + lift, e * half)
-    rest = where(near, fall + lift, partner * half.inverse)
-    lead, rest = staged((lead, rest), one)
-    pull = jnp.where(near, c.square, 1) * c.steps[0]
-    first, second = point(lead, rest, pull, c, one)
-    return staged((first * jnp.where(near, -1, c.per), second * jnp.where(near, -c.h, c.per)), one)
+    lead = where(is_near_root, -fall + lift, e * half)
+    partner_place = where(is_near_root, fall + lift, partner * half.inverse)
+    lead, partner_place = staged((lead, partner_place), one)
+    pull = jnp.where(is_near_root, c.square, 1) * c.steps[0]
+    first, second = point(lead, partner_place, pull, c, one)
+    return staged(
+        (first * jnp.where(is_near_root, -1, c.per), second * jnp.where(is_near_root, -c.h, c.per)),
+        one,
+    )
 
 
 def _staged_start(c: Curve, start: Complex, partner: Complex):
@@ -360,8 +363,8 @@ def lagrange_constants(
     one shape.
     """
     alpha, beta = spinor
-    both = alpha * beta
-    vertical = (-2 * both.re, 2 * both.im, 2 * alpha.square, 2 * beta.square)
+    product = alpha * beta
+    vertical = (-2 * product.re, 2 * product.im, 2 * alpha.square, 2 * beta.square)
     one = opaque_ones(transverse)
     f = staged(cubic(2 * transverse * pull, vertical, momentum), one)
     c = curve(staged(f.landen_squared, one), one)
@@ -428,14 +431,14 @@ def lagrange_constants(
         where(first, smaller, where(second, -larger, d)),
     )
     scale = staged(inverse * origin, one)
-    plain = circular | (x.square == 0)
+    has_fixed_angle = circular | (x.square == 0)
     spinors = CayleyKlein(
         scale * coefficient_c,
         scale * d,
         x,
         mirror,
         k * frequency + spin / 2,
-        jnp.arctan2(_where_or_zero(~plain, x.im), jnp.where(plain, 1, x.re)),
+        jnp.arctan2(_where_or_zero(~has_fixed_angle, x.im), jnp.where(has_fixed_angle, 1, x.re)),
         jnp.stack([upward, ~upward]) & ~circular,
     )
     return constants._replace(spinors=staged(spinors, one))

@@ -213,12 +213,12 @@ def pair(
 @pair.defjvp
 def _pair_rule(primals, tangents):
     total, times, h_derivative, series, one = primals
-    unit, still = jnp.ones_like(total), jnp.zeros_like(times)
+    unit, zeros = jnp.ones_like(total), jnp.zeros_like(times)
     _, by_total = jax.jvp(lambda s: _pair(s, times, series.weights), (total,), (unit,))
     _, by_h = jax.jvp(
         lambda s, p, w: _pair(s, p, w),
         (total, times, series.weights),
-        (jnp.zeros_like(total), still + h_derivative, series.derivatives),
+        (jnp.zeros_like(total), zeros + h_derivative, series.derivatives),
     )
     by_total, by_h = staged((by_total, by_h), one)
     ds, dh = tangents[0], tangents[3].h  # the coefficients depend on h alone
