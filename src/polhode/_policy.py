@@ -231,8 +231,8 @@ def is_time_loop(bodies: int, samples: int) -> bool:
 def bodies_to_save(samples: int) -> int:
     """Bodies in a chunk where a function of the motion is saved in its place; as many as there are
     lanes at least."""
-    most = SAVE_SAMPLES if is_cpu() else ACCELERATOR_SAVE_SAMPLES
-    return max(LANES, most // samples)
+    sample_limit = SAVE_SAMPLES if is_cpu() else ACCELERATOR_SAVE_SAMPLES
+    return max(LANES, sample_limit // samples)
 
 
 def is_chunked() -> bool:

@@ -20,7 +20,7 @@ def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
     batch = ("body",) if rank == 1 else tuple(f"batch_{i}" for i in range(rank))
     shared = trajectory.ts.ndim == 1
     time = ("time",) if shared else (*batch, "time")
-    every, vectors = (*batch, "time"), (*batch, "time", "axis")
+    sample_dims, vectors = (*batch, "time"), (*batch, "time", "axis")
     data: dict[str, Any] = {}
 
     def put(name, array, dims, units, long_name):
@@ -28,14 +28,14 @@ def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
             data[name] = (dims, np.asarray(array), {"units": units, "long_name": long_name})
 
     quaternion = "attitude quaternion, scalar first, body to space"
-    put("wxyz", wxyz, (*every, "quaternion"), "1", quaternion)
+    put("wxyz", wxyz, (*sample_dims, "quaternion"), "1", quaternion)
     put("omega_body", omega, vectors, "rad s-1", "angular velocity in body axes")
     if omega is not None and (trajectory.scene.potential is None or wxyz is not None):
-        put("energy", trajectory.energy, every, "J", "kinetic plus potential energy")
+        put("energy", trajectory.energy, sample_dims, "J", "kinetic plus potential energy")
     if omega is not None and wxyz is not None:
         momentum = "angular momentum in space axes"
         put("momentum_space", trajectory.momentum_space, vectors, "kg m2 s-1", momentum)
-    put("work", trajectory._work, every, "J", "work done by the external torques")
+    put("work", trajectory._work, sample_dims, "J", "work done by the external torques")
     put("error", trajectory._error, batch, "rad", "estimated error at the last time")
     put("event_time", trajectory._event_time, batch, "s", "time of the event that ended the motion")
     data["status"] = (
@@ -104,8 +104,10 @@ def write_aem(
 ) -> None:
     """See ``Trajectory.to_aem``. Sections 4.2 to 4.4 and annex B of the standard."""
     start = _instant("epoch", epoch)
-    now = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S")
-    created = str(_instant("creation_date", now if creation_date is None else creation_date))
+    current_time = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S")
+    created = str(
+        _instant("creation_date", current_time if creation_date is None else creation_date)
+    )
     if time_system not in _TIME_SYSTEMS:
         raise ValueError(f"time_system must be one of {', '.join(_TIME_SYSTEMS)}: {time_system!r}.")
     wxyz = np.asarray(trajectory.wxyz, np.float64)

@@ -26,7 +26,7 @@ class Propagator(AbstractPropagator):
     """
 
     arrays: Any
-    rest: Any = eqx.field(static=True)
+    static: Any = eqx.field(static=True)
     rtol: Array | None
 
     @classmethod
@@ -37,7 +37,7 @@ class Propagator(AbstractPropagator):
     @property
     def method(self) -> AbstractMethod:
         """The method."""
-        return eqx.combine(self.arrays, self.rest)
+        return eqx.combine(self.arrays, self.static)
 
     def at(self, trajectory: Trajectory, t: ArrayLike) -> Trajectory:
         times = as_float_array("t", t, finite=False).astype(trajectory.ts.dtype)

@@ -94,19 +94,21 @@ class Ensemble(eqx.Module):
     def lanes(self, indices: np.ndarray) -> tuple[Any, Any]:
         """What ``draw`` needs of the bodies ``indices``: (leaves cut to them, shared leaves)."""
         parts = (self.scene, self.state)
-        each, shared = eqx.partition(parts, is_lane_tree(parts))
+        lane_parts, shared = eqx.partition(parts, is_lane_tree(parts))
         dtype = self.state.wxyz.dtype
         rows = {name: np.asarray(x[indices], dtype) for name, x in sorted(self.rows.items())}
-        return (jax.tree.map(lambda x: x[indices], each), rows), shared
+        return (jax.tree.map(lambda x: x[indices], lane_parts), rows), shared
 
     def draw(self, indices: Int[np.ndarray, " n"]) -> tuple[Scene, State]:
         """Scene and state of the bodies ``indices`` (n,), with the leading axis n."""
-        each, shared = self.lanes(indices)
+        lane_parts, shared = self.lanes(indices)
         seed = jnp.asarray(self.seed, jnp.uint32)
-        return draw(each, shared, jnp.asarray(indices, jnp.uint32), self.spreads, seed)
+        return draw(lane_parts, shared, jnp.asarray(indices, jnp.uint32), self.spreads, seed)
 
 
-def draw(each: Any, shared: Any, indices: Array, spreads: Any, seed: Array) -> tuple[Scene, State]:
+def draw(
+    lane_parts: Any, shared: Any, indices: Array, spreads: Any, seed: Array
+) -> tuple[Scene, State]:
     """The bodies of the indices (n,) of uint32 and a seed of uint32; traceable."""
     root = jax.random.key(seed, impl="threefry2x32")
 
@@ -129,7 +131,7 @@ def draw(each: Any, shared: Any, indices: Array, spreads: Any, seed: Array) -> t
         return scene, state
 
     return eqx.filter_vmap(draw_one, in_axes=(0, eqx.if_array(0)), out_axes=eqx.if_array(0))(
-        indices, each
+        indices, lane_parts
     )
 
 
@@ -182,8 +184,8 @@ class SpreadMoments(eqx.Module):
             return trial + 1, draw_moments(trial)
 
         zero = jnp.zeros((), jnp.int32)
-        first = (zero + 1, draw_moments(zero))
-        _, moments = jax.lax.while_loop(is_unfinished, draw_again, first)
+        initial_carry = (zero + 1, draw_moments(zero))
+        _, moments = jax.lax.while_loop(is_unfinished, draw_again, initial_carry)
         moments = jnp.where(possible_moments(moments), moments, jnp.nan)
         return dataclasses.replace(scene, inertia=Inertia.from_moments(moments)), state
 

@@ -122,10 +122,10 @@ class Moments(NamedTuple):
         """
         total, average, spread = self
         for n, m, s in zip(count.astype(float), mean.astype(float), squares.astype(float)):
-            both = np.maximum(total + n, 1)
+            total_count = np.maximum(total + n, 1)
             difference = m - average
-            average = average + difference * n / both
-            spread = spread + s + difference**2 * total * n / both
+            average = average + difference * n / total_count
+            spread = spread + s + difference**2 * total * n / total_count
             total = total + n
         return Moments(total, average, spread)
 

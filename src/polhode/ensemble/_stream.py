@@ -52,7 +52,7 @@ def block_size(samples: int) -> int:
 
 
 class Block:
-    """``Block(...)(first)`` computes the block that starts at the body ``first``, and returns
+    """``Block(...)(first_body)`` computes the block that starts at this body, and returns
     device arrays by name. Blocks go to the devices in turn, each by the
     same program of one device: how many devices there are changes no bit.
     """
@@ -81,20 +81,20 @@ class Block:
         self.counts = np.array([ensemble.seed, ensemble.bodies], np.uint32)
         self.compiled: list[Any] = []
 
-    def inputs(self, first: int) -> tuple:
-        """The arguments of ``program`` for the block from the body ``first``, on its device."""
-        device = self.devices[first // self.size % len(self.devices)]
-        indices = np.arange(first, first + self.size)
-        each, shared = self.ensemble.lanes(np.minimum(indices, self.ensemble.bodies - 1))
-        start = np.asarray(first, np.uint32)
+    def inputs(self, first_body: int) -> tuple:
+        """The arguments of ``program`` for the block from ``first_body`` on, on its device."""
+        device = self.devices[first_body // self.size % len(self.devices)]
+        indices = np.arange(first_body, first_body + self.size)
+        lane_parts, shared = self.ensemble.lanes(np.minimum(indices, self.ensemble.bodies - 1))
+        start = np.asarray(first_body, np.uint32)
         shared = (shared, self.ensemble.spreads, self.method, self.ts, self.rtol, self.counts)
-        arrays, static = eqx.partition((start, each, shared), eqx.is_array_like)
+        arrays, static = eqx.partition((start, lane_parts, shared), eqx.is_array_like)
         return *eqx.combine(jax.device_put(arrays, device), static), self.settings
 
-    def __call__(self, first: int) -> dict[str, Array]:
+    def __call__(self, first_body: int) -> dict[str, Array]:
         if not self.compiled:
             self.compile()
-        return self.compiled[first // self.size % len(self.devices)](*self.inputs(first))
+        return self.compiled[first_body // self.size % len(self.devices)](*self.inputs(first_body))
 
     def compile(self) -> None:
         """Compile the program for all devices at the same time. It is traced in the calling thread,
@@ -103,7 +103,9 @@ class Block:
         count = min(len(self.devices), -(-self.ensemble.bodies // self.size))
         lowered = [program.lower(*self.inputs(k * self.size)) for k in range(count)]
         with concurrent.futures.ThreadPoolExecutor(count) as threads:
-            self.compiled = list(threads.map(lambda one: one.compile(), lowered))
+            self.compiled = list(
+                threads.map(lambda lowered_program: lowered_program.compile(), lowered)
+            )
 
 
 class Settings(NamedTuple):
@@ -115,11 +117,13 @@ class Settings(NamedTuple):
 
 
 @eqx.filter_jit
-def program(first: Array, each: Any, shared: Any, settings: Settings) -> dict[str, Array]:
+def program(
+    first_body: Array, lane_parts: Any, shared: Any, settings: Settings
+) -> dict[str, Array]:
     """One block on one device. Compiled once per kind of run and device."""
     shared, spreads, method, ts, rtol, (seed, bodies) = shared
-    indices = first + jnp.arange(settings.size, dtype=jnp.uint32)
-    scene, state = draw(each, shared, indices, spreads, seed)
+    indices = first_body + jnp.arange(settings.size, dtype=jnp.uint32)
+    scene, state = draw(lane_parts, shared, indices, spreads, seed)
     trajectory = run(method, scene, state, ts, rtol, Record())
     arrays = {"status": trajectory.status.astype(jnp.uint8)}
     if settings.trajectories:
@@ -136,7 +140,7 @@ def compute(block: Block, layout: Mapping[str, Field], chunk: int, k: int) -> di
     Every device computes one block at a time. The result depends on ``k``, the seed and the scene
     alone: not on the size of the chunk, the number of devices or what was computed before.
     """
-    first, last = k * chunk, min((k + 1) * chunk, block.ensemble.bodies)
+    first_body, end_body = k * chunk, min((k + 1) * chunk, block.ensemble.bodies)
     arrays = {}
     for name, field in layout.items():
         rows = field.region(k)
@@ -151,10 +155,10 @@ def compute(block: Block, layout: Mapping[str, Field], chunk: int, k: int) -> di
             if axis == "chunk":
                 array[0] += part.sum(axis=0)
                 continue
-            row = (start - first) // (block.size if axis == "block" else 1)
+            row = (start - first_body) // (block.size if axis == "block" else 1)
             array[row : row + len(part)] = part[: len(array) - row]
 
-    for start in range(first, last, block.size):
+    for start in range(first_body, end_body, block.size):
         if len(pending) == len(block.devices):
             collect()
         pending.append((start, block(start)))
@@ -239,18 +243,18 @@ def stream(
             client = stack.enter_context(_dask.connection(scheduler))
         if not os.path.lexists(path):
             metadata = _title() | {"devices": device_names(devices)} | attributes
-            full = identity | {"chunk": size.chunk}
-            create(path, job.times, job.layout(size.chunk), metadata, full)
+            full_identity = identity | {"chunk": size.chunk}
+            create(path, job.times, job.layout(size.chunk), metadata, full_identity)
         store = job.open(compare_identity(path, identity, attributes)["chunk"])
-        first, step = (0, 1) if part is None else (part[0] - 1, part[1])
-        numbers = range(first, store.chunks, step)
+        first_chunk, step = (0, 1) if part is None else (part[0] - 1, part[1])
+        numbers = range(first_chunk, store.chunks, step)
         tally = _Tally(job, numbers, progress)
         if client is None:
-            finished = _complete_here(job, numbers, size.concurrent)
+            completed_chunks = _complete_here(job, numbers, size.concurrent)
         else:
-            finished = _dask.complete(client, job, numbers)
-        stack.enter_context(contextlib.closing(finished))
-        for k, computed in finished:
+            completed_chunks = _dask.complete(client, job, numbers)
+        stack.enter_context(contextlib.closing(completed_chunks))
+        for k, computed in completed_chunks:
             tally.add(k, computed)
     if part is None:
         write_summaries(store, statistics)

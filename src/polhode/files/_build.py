@@ -238,25 +238,28 @@ class _PointingLaw(eqx.Module):
         return jnp.stack(self.law.body_components(t, attitude, rates))
 
 
-def _cluster(file: SceneFile, table: Any, dtype: DTypeLike, first: int) -> Any:
+def _cluster(file: SceneFile, table: Any, dtype: DTypeLike, first_wheel: int) -> Any:
     kp, kd = np.asarray(table.kp, dtype), np.asarray(table.kd, dtype)
     law = polhode.Pointing(kp, kd, build_attitudes(table.attitude, dtype))
     numbers = _numbers(table, dtype, "wxyz", "euler", "kp", "kd", "viscous")
     if table.viscous is not None:
         numbers["friction"] = polhode.ViscousCoupling(np.asarray(table.viscous, dtype))
     law = _float_parts(law, dtype)
-    return polhode.wheel_cluster(command=_PointingLaw(law), first=first, **numbers)
+    return polhode.wheel_cluster(command=_PointingLaw(law), first=first_wheel, **numbers)
 
 
 def _wheels(file: SceneFile, dtype: DTypeLike) -> Any:
     """Single wheels and clusters, in this order."""
     wheels = _sum(file, "rotors", _rotor, None, dtype)
-    first = len(file.rotors)
+    first_wheel = len(file.rotors)
     for index, table in enumerate(file.clusters):
         place = "[clusters]" if len(file.clusters) == 1 else f"[clusters {index + 1}]"
         with scene_errors(file, place):
-            cluster = _float_parts(_cluster(file, table, dtype, first), dtype)
-        wheels, first = cluster if wheels is None else wheels + cluster, first + len(table.axes)
+            cluster = _float_parts(_cluster(file, table, dtype, first_wheel), dtype)
+        wheels, first_wheel = (
+            cluster if wheels is None else wheels + cluster,
+            first_wheel + len(table.axes),
+        )
     return wheels
 
 
@@ -331,14 +334,16 @@ def build_state(
     """The nominal state at the first time."""
     with scene_errors(file, "[state]"):
         value = jnp.asarray(file.state.value, dtype)
-        first = jnp.asarray(file.times.seconds[0], dtype)
+        start_time = jnp.asarray(file.times.seconds[0], dtype)
         omega = (
-            inertia_at(inertia, first).rates(value) if file.state.rate == "momentum_body" else value
+            inertia_at(inertia, start_time).rates(value)
+            if file.state.rate == "momentum_body"
+            else value
         )
         wxyz = build_attitudes(file.state.attitude, dtype)
         if file.state.frame == "lvlh":
             frame = polhode.LVLH(build_orbit(file, dtype))
-            wxyz, omega = frame.from_frame(wxyz, omega, first)
+            wxyz, omega = frame.from_frame(wxyz, omega, start_time)
         return polhode.State(wxyz=wxyz, omega_body=omega)
 
 
@@ -360,8 +365,8 @@ def build_method(file: SceneFile) -> "polhode.AbstractMethod | None":
         if method.step is not None:
             import diffrax
 
-            first, last = file.times.seconds[[0, -1]]
-            options["dt0"] = math.copysign(method.step, last - first)
+            start_time, end_time = file.times.seconds[[0, -1]]
+            options["dt0"] = math.copysign(method.step, end_time - start_time)
             options["controller"] = diffrax.ConstantStepSize()
         return coordinates(**options)
 
@@ -441,10 +446,10 @@ def draw_clones(file: SceneFile, dtype: DTypeLike) -> Clones:
     if file.state.rate in noise:
         rates = _around(rates, noise[file.state.rate], count)
     rates = jnp.broadcast_to(rates.astype(dtype), (count + 1, 3))
-    first = jnp.asarray(file.times.seconds[0], dtype)
+    start_time = jnp.asarray(file.times.seconds[0], dtype)
     omega = rates
     if file.state.rate == "momentum_body":
-        omega = inertia_at(inertia, first).rates(rates)
+        omega = inertia_at(inertia, start_time).rates(rates)
     return Clones(inertia, polhode.State(wxyz=wxyz, omega_body=omega), redrawn)
 
 

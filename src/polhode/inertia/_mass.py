@@ -93,8 +93,10 @@ class MassProperties(AbstractShaped):
         )
         vertices, faces = check_mesh(vertices, faces)
         volume, centre, sigma = mesh_integrals(vertices, faces)
-        name, given = ("density", density) if mass is None else ("mass", mass)
-        amount = jnp.broadcast_to(as_float_array(name, given).astype(volume.dtype), volume.shape)
+        name, amount_given = ("density", density) if mass is None else ("mass", mass)
+        amount = jnp.broadcast_to(
+            as_float_array(name, amount_given).astype(volume.dtype), volume.shape
+        )
         require_positive(name, amount)
         rho, total = (amount, amount * volume) if mass is None else (amount / volume, amount)
         tensor = rho[..., None, None] * inertia_of_second_moments(sigma)
@@ -217,12 +219,12 @@ class MassProperties(AbstractShaped):
         return type(self)(jnp.broadcast_to(self.mass, batch[:-1]), centre, central)
 
     def __add__(self, other: "MassProperties") -> Self:
-        return self._joined(other, 1)
+        return self._join(other, 1)
 
     def __sub__(self, other: "MassProperties") -> Self:
-        return self._joined(other, -1)
+        return self._join(other, -1)
 
-    def _joined(self, other: "MassProperties", sign: int) -> Self:
+    def _join(self, other: "MassProperties", sign: int) -> Self:
         if not isinstance(other, MassProperties):
             raise TypeError(
                 "ph.MassProperties join with ph.MassProperties, got"
@@ -245,10 +247,10 @@ def compose(parts: Iterable[MassProperties]) -> MassProperties:
     """One rigid body of all ``parts``, each given in (or ``moved`` to) the same axes."""
     parts = list(parts)
     require(len(parts) > 0, "a composite body needs at least one part, got none.")
-    whole = parts[0]
+    body = parts[0]
     for part in parts[1:]:
-        whole = whole + part
-    return whole
+        body = body + part
+    return body
 
 
 def _sum(left: Array, right: Array) -> Array:

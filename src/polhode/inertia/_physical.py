@@ -41,11 +41,11 @@ def _turn(q, axis, cosine, sine):
     """Quaternion components of ``q`` followed, in body axes, by a turn about one body axis."""
     w, v = q[0], q[1:]
     p, s = (axis + 1) % 3, (axis + 2) % 3
-    turned = [None, None, None]
-    turned[axis] = v[axis] * cosine + w * sine
-    turned[p] = v[p] * cosine + v[s] * sine
-    turned[s] = v[s] * cosine - v[p] * sine
-    return (w * cosine - v[axis] * sine, *turned)
+    vector_part = [None, None, None]
+    vector_part[axis] = v[axis] * cosine + w * sine
+    vector_part[p] = v[p] * cosine + v[s] * sine
+    vector_part[s] = v[s] * cosine - v[p] * sine
+    return (w * cosine - v[axis] * sine, *vector_part)
 
 
 def _rotate_plane(diagonal, off, q, plane):
@@ -167,12 +167,12 @@ def _curved(moments: Array, products: Array) -> Array:
 @_curved.defjvp
 def _curved_rule(primals, tangents):
     moments, products = primals
-    change, turned = tangents
+    change, product_tangents = tangents
     a, b, c = (moments[..., i] for i in range(3))
-    close = are_close(a, b) | are_close(b, c) | are_close(c, a)
-    yz, zx, xy = (underivable(products[..., i], close) for i in range(3))
+    is_close = are_close(a, b) | are_close(b, c) | are_close(c, a)
+    yz, zx, xy = (underivable(products[..., i], is_close) for i in range(3))
     by_yz, by_zx, by_xy = (
-        2 * turned[..., i] * x
+        2 * product_tangents[..., i] * x
         for i, x in enumerate((over_gap(yz, b, c), over_gap(zx, c, a), over_gap(xy, a, b)))
     )
     curved = jnp.stack([by_xy - by_zx, by_yz - by_xy, by_zx - by_yz], axis=-1)
@@ -271,13 +271,13 @@ def physical_margin(tensor: Float[Array, "*b 3 3"]) -> Float[Array, "*b"]:
     of Sigma to the nearest singular one in the Frobenius norm: positive inside (the smallest
     eigenvalue), zero for a flat body, negative outside (the norm of the negative part).
     """
-    least = principal(second_moments(tensor))[0]
-    negative = jnp.minimum(least, 0)
-    outside = least[..., 0] < 0
+    eigenvalues = principal(second_moments(tensor))[0]
+    negative = jnp.minimum(eigenvalues, 0)
+    outside = eigenvalues[..., 0] < 0
     square = jnp.sum(negative * negative, axis=-1)
     # both branches must be differentiable where the other one is taken
     distance = jnp.sqrt(jnp.where(outside, square, 1))
-    return jnp.where(outside, -distance, least[..., 0])
+    return jnp.where(outside, -distance, eigenvalues[..., 0])
 
 
 def is_physical(tensor: Float[Array, "*b 3 3"], slack: float = 0.0) -> Array:
@@ -349,18 +349,18 @@ def tolerance(array: Array) -> float:
 def require_below(small_name: str, small: Array, large_name: str, large: Array) -> None:
     """ValueError if a concrete ``small`` exceeds ``large`` anywhere."""
     if is_concrete(small, large):
-        least, most = np.asarray(small), np.asarray(large)
+        small_values, large_values = np.asarray(small), np.asarray(large)
         require(
-            least <= most,
-            f"{small_name} must not exceed {large_name}, got {least.max():g} against "
-            f"{most.min():g}; exchange them?",
+            small_values <= large_values,
+            f"{small_name} must not exceed {large_name}, got {small_values.max():g} against "
+            f"{large_values.min():g}; exchange them?",
         )
 
 
-def check_moments(name: str, moments: np.ndarray, slack: float, least: float = 0.0) -> None:
+def check_moments(name: str, moments: np.ndarray, slack: float, zero_fraction: float = 0.0) -> None:
     """ValueError unless rows of principal moments are positive and obey the triangle inequality.
 
-    ``slack`` is the relative tolerance of the inequality (flat bodies), ``least`` the fraction of
+    ``slack`` is the relative tolerance of the inequality (flat bodies), ``zero_fraction`` that of
     the largest moment that counts as zero.
     """
     if moments.size == 0:
@@ -370,7 +370,7 @@ def check_moments(name: str, moments: np.ndarray, slack: float, least: float = 0
     )  # NumPy reduces long axes faster
     largest, smallest = reduce(np.maximum, columns), reduce(np.minimum, columns)
     require(
-        smallest > least * largest,
+        smallest > zero_fraction * largest,
         lambda: (
             f"{name} must be positive (kg m^2), got {_worst(moments, smallest)}; a moment is zero"
             " only for a point or a thin line, which cannot turn about itself: give it a width."
@@ -404,10 +404,10 @@ def check_tensor(name: str, array: Array, *, triangle: bool = True) -> None:
         "transposed ones; pass (A + A.T) / 2 if that is what is meant.",
     )
     # moments within the rounding of the largest cannot be told from zero
-    least = 64 * float(jnp.finfo(array.dtype).eps)
+    zero_fraction = 64 * float(jnp.finfo(array.dtype).eps)
     moments = np.linalg.eigvalsh((entries + mirrored) / 2)
     slack = tolerance(array) if triangle else np.inf
-    check_moments(f"the principal moments of {name}", moments, slack, least)
+    check_moments(f"the principal moments of {name}", moments, slack, zero_fraction)
 
 
 def _worst(values: np.ndarray, badness: np.ndarray | np.floating) -> str:

@@ -176,12 +176,12 @@ def _sized(
     """
     inner = inner or {}
     arrays = as_floats(mass=(mass, ()), **{name: (x, core) for name, x in lengths.items()})
-    named = dict(zip(("mass", *lengths), arrays, strict=True))
-    for name, array in named.items():
+    arrays_by_name = dict(zip(("mass", *lengths), arrays, strict=True))
+    for name, array in arrays_by_name.items():
         require_positive(name, array, zero=name in inner)
     for name, outer in inner.items():
         if outer is not None:
-            require_below(name, named[name], outer, named[outer])
+            require_below(name, arrays_by_name[name], outer, arrays_by_name[outer])
     # so that the formulas compile nothing where the numbers are known
     some_strong = any(not x.weak_type for x in arrays)
     return tuple(on_host(x, weak=some_strong) for x in arrays)

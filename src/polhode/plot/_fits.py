@@ -27,41 +27,41 @@ def fit(result: Any, recording: Any, *, body: int = 0, title: str = "") -> Any:
     """
     if recording.omega is None:
         raise ValueError("the figure of a fit needs a recording of rates, got attitudes alone.")
-    one = _single(result, recording, body)
+    data = _single(result, recording, body)
     figure = new_figure(11.0, 7.0)
     sides = figure.add_gridspec(1, 2, width_ratios=(1.7, 1.0))
     left, right = sides[0].subgridspec(4, 1), sides[1].subgridspec(2, 1, height_ratios=(1.2, 1.0))
     rows = [figure.add_subplot(left[0])]
     rows += [figure.add_subplot(left[k], sharex=rows[0]) for k in (1, 2, 3)]
-    dense = one["times"].size > 300
+    dense = data["times"].size > 300
     for k, color in enumerate(AXES):
         ax = rows[k]
         ax.plot(
-            one["times"],
-            one["omega"][:, k],
+            data["times"],
+            data["omega"][:, k],
             ".",
             color=GREY,
             label="data",
             markersize=2 if dense else 5,
         )
-        ax.plot(one["times"], one["model"][:, k], color=color, label="model")
+        ax.plot(data["times"], data["model"][:, k], color=color, label="model")
         ax.set_title(f"Rate about {'xyz'[k]}")
         ax.set_ylabel("[rad/s]")
-        rows[3].plot(one["times"], one["residual"][:, k], ".", color=color, markersize=3)
+        rows[3].plot(data["times"], data["residual"][:, k], ".", color=color, markersize=3)
     rows[0].legend(loc="lower right", bbox_to_anchor=(1.0, 0.98), ncols=2, borderpad=0)
     for size in (-2, 0, 2):
-        rows[3].axhline(size * one["chi"], color=GREY, linewidth=0.8, zorder=1)
+        rows[3].axhline(size * data["chi"], color=GREY, linewidth=0.8, zorder=1)
     rows[3].set_title("Residuals over noise, lines at twice their spread")
     rows[3].set_xlabel("time [s]")
     for ax in rows:
         ax.margins(x=0.01)
         ax.label_outer()
-    if "correlation" in one:
-        _correlations(figure, figure.add_subplot(right[0]), one)
-        _scene_table(figure.add_subplot(right[1]), one)
+    if "correlation" in data:
+        _correlations(figure, figure.add_subplot(right[0]), data)
+        _scene_table(figure.add_subplot(right[1]), data)
     else:
-        _region(figure.add_subplot(right[0]), one)
-        _table(figure.add_subplot(right[1]), one)
+        _region(figure.add_subplot(right[0]), data)
+        _table(figure.add_subplot(right[1]), data)
     if title:
         figure.suptitle(plain(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
     return figure
@@ -121,10 +121,10 @@ def _of_scene(result, body: int) -> dict[str, Any]:
             values.append(value[place])
             spreads.append(std[place])
     sensors = [result.parameters.bias, result.parameters.mounting, result.parameters.lever]
-    first = sum(int(np.prod(np.shape(x)[lead:])) for x in sensors if x is not None)
+    first_entry = sum(int(np.prod(np.shape(x)[lead:])) for x in sensors if x is not None)
     covariance = np.asarray(result.covariance)
     covariance = covariance.reshape(-1, *covariance.shape[-2:])[body]
-    value_slice = slice(first, first + len(names))
+    value_slice = slice(first_entry, first_entry + len(names))
     covariance = covariance[value_slice, value_slice]
     size = np.sqrt(np.maximum(np.diagonal(covariance), 0))
     size = np.where(size > 0, size, 1)
@@ -136,10 +136,10 @@ def _of_scene(result, body: int) -> dict[str, Any]:
     }
 
 
-def _correlations(figure, ax, one):
+def _correlations(figure, ax, data):
     """Matrix of the correlations of the fitted numbers."""
-    names = [name if len(name) <= _LONGEST else "..." + name[-_LONGEST:] for name in one["names"]]
-    picture = ax.imshow(one["correlation"], vmin=-1, vmax=1, cmap="RdBu_r")
+    names = [name if len(name) <= _LONGEST else "..." + name[-_LONGEST:] for name in data["names"]]
+    picture = ax.imshow(data["correlation"], vmin=-1, vmax=1, cmap="RdBu_r")
     ax.set_title("Correlations of the fitted numbers")
     ax.set_xticks(range(len(names)), names, rotation=90, fontsize=7)
     ax.set_yticks(range(len(names)), names, fontsize=7)
@@ -147,19 +147,19 @@ def _correlations(figure, ax, one):
     figure.colorbar(picture, ax=ax, shrink=0.8)
 
 
-def _scene_table(ax, one):
+def _scene_table(ax, data):
     """The numbers of a scene, and the findings."""
     ax.set_axis_off()
-    rows = list(zip(one["names"], one["value"], one["spread"], strict=True))
+    rows = list(zip(data["names"], data["value"], data["spread"], strict=True))
     lines = [f"{name[-_LONGEST:]:<20}{_rounded(value, std)}" for name, value, std in rows[:_ROWS]]
     if len(rows) > _ROWS:
         lines.append(f"... and {len(rows) - _ROWS} more")
     lines += [
         "",
-        f"residual rms   {one['rms']:.3g} rad/s",
-        f"over the noise {one['chi']:.3g}",
-        f"whiteness      p = {one['white']:.2g}",
-        "findings       " + (", ".join(one["findings"]) or "none"),
+        f"residual rms   {data['rms']:.3g} rad/s",
+        f"over the noise {data['chi']:.3g}",
+        f"whiteness      p = {data['white']:.2g}",
+        "findings       " + (", ".join(data["findings"]) or "none"),
     ]
     _write_lines(ax, lines)
 
@@ -179,15 +179,15 @@ def _of_values(moments, axes, covariance, scale_known, count) -> np.ndarray:
     return (slope @ covariance[:count, :count] @ slope.T)[:2, :2]
 
 
-def _region(ax, one):
+def _region(ax, data):
     """Ellipses of the two smaller values and, for ratios, the edge of what is physical."""
-    value, covariance = one["value"][:2], one["covariance"]
+    value, covariance = data["value"][:2], data["covariance"]
     ax.set_title("What the data allow")
-    kind = "moment [kg m²]" if one["scale_known"] else "ratio to the largest moment"
+    kind = "moment [kg m²]" if data["scale_known"] else "ratio to the largest moment"
     ax.set_xlabel(f"smallest {kind}")
-    ax.set_ylabel(f"middle {kind}" if one["scale_known"] else "middle ratio")
+    ax.set_ylabel(f"middle {kind}" if data["scale_known"] else "middle ratio")
     ax.plot(*value, "+", color=INK, markersize=9)
-    if not np.isfinite(one["spread"][:2]).all():
+    if not np.isfinite(data["spread"][:2]).all():
         ax.text(0.5, 0.1, "not determined", transform=ax.transAxes, ha="center", color=ACCENT)
         return
     sizes, vectors = np.linalg.eigh(covariance)
@@ -198,7 +198,7 @@ def _region(ax, one):
         x, y = value[:, None] + np.sqrt(level) * (root @ unit)
         ax.fill(x, y, facecolor=ACCENT, alpha=0.22, linewidth=0, label=name)
     ax.autoscale_view()
-    if not one["scale_known"]:
+    if not data["scale_known"]:
         limits = ax.get_xlim(), ax.get_ylim()
         line = np.linspace(0, 1, 201)
         is_visible = limits[0][0] + limits[1][0] < 1
@@ -218,22 +218,22 @@ def _region(ax, one):
     ax.locator_params(axis="x", nbins=4)
 
 
-def _table(ax, one):
+def _table(ax, data):
     """The numbers, and remarks in short."""
     ax.set_axis_off()
-    head = "moments [kg m²]" if one["scale_known"] else "ratios"
+    head = "moments [kg m²]" if data["scale_known"] else "ratios"
     lines = [f"{'principal ' + head:<28}axis known to"]
-    for value, spread, turn in zip(one["value"], one["spread"], one["axes_std"], strict=True):
+    for value, spread, turn in zip(data["value"], data["spread"], data["axes_std"], strict=True):
         rounded = _rounded(value, spread)
         angle = f"{np.degrees(turn):.2g}°" if np.isfinite(turn) else "-"
         lines.append(f"{rounded:<28}{angle}")
     lines += [
         "",
-        f"residual rms   {one['rms']:.3g} rad/s",
-        f"over the noise {one['chi']:.3g}",
-        f"whiteness      p = {one['white']:.2g}",
-        "scale          " + ("known" if one["scale_known"] else "not shown by free motion"),
-        "remarks        " + (", ".join(one["findings"]) or "none"),
+        f"residual rms   {data['rms']:.3g} rad/s",
+        f"over the noise {data['chi']:.3g}",
+        f"whiteness      p = {data['white']:.2g}",
+        "scale          " + ("known" if data["scale_known"] else "not shown by free motion"),
+        "remarks        " + (", ".join(data["findings"]) or "none"),
     ]
     _write_lines(ax, lines)
 

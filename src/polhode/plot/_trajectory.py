@@ -241,8 +241,8 @@ def _body_axes(ax, tensor, twice_energy, size, names):
     for k, (name, color) in enumerate(zip(names, AXES, strict=True)):
         direction = np.eye(3)[k]
         surface = np.sqrt(twice_energy / tensor[k, k]) / size
-        near, far = direction * surface, direction * (surface + 0.28)
-        ax.plot(*np.stack([near, far]).T, color=color, linewidth=1.6, zorder=5)
+        inner_end, outer_end = direction * surface, direction * (surface + 0.28)
+        ax.plot(*np.stack([inner_end, outer_end]).T, color=color, linewidth=1.6, zorder=5)
         ax.text(
             *(direction * (surface + 0.36)), name, color=color, ha="center", va="center", zorder=8
         )

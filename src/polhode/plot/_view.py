@@ -55,10 +55,12 @@ class Body:
 
         To a thousandth, which no eye can tell.
         """
-        own = np.einsum("tij,jk,tk->ti", matrices(self.wxyz), self.tensor, self.omega_body)
+        body_momentum = np.einsum(
+            "tij,jk,tk->ti", matrices(self.wxyz), self.tensor, self.omega_body
+        )
         size = np.linalg.norm(self.momentum, axis=-1).max()
         steady = np.ptp(self.momentum, axis=0) <= 1e-3 * size
-        return bool(steady.all() and (np.abs(own - self.momentum) <= 1e-3 * size).all())
+        return bool(steady.all() and (np.abs(body_momentum - self.momentum) <= 1e-3 * size).all())
 
 
 def chosen_bodies(what: Any, bodies: Sequence[int] | None) -> list[Body]:
@@ -107,9 +109,9 @@ def per_body(mesh: Any, count: int) -> list[Any]:
     return mesh
 
 
-def drawing_of(body: Body, start: float, most: int, mesh: Any) -> dict[str, Any]:
+def drawing_of(body: Body, start: float, max_samples: int, mesh: Any) -> dict[str, Any]:
     """What the page knows of one body."""
-    step = max(1, -(-(len(body.ts) - 1) // (most - 1)))
+    step = max(1, -(-(len(body.ts) - 1) // (max_samples - 1)))
     rows = np.unique(np.append(np.arange(0, len(body.ts), step), len(body.ts) - 1))
     moments, turn = np.linalg.eigh(body.tensor)
     turn[:, 0] *= np.linalg.det(turn)  # right-handed
@@ -227,18 +229,18 @@ def read(path: str | os.PathLike) -> tuple[list[Body], str]:
     _require_hdf5(Path(path))
     _require_content(path)
     with xarray.open_dataset(path, engine="h5netcdf", decode_times=False) as data:
-        many = data["wxyz"].ndim > 2
+        has_body_axis = data["wxyz"].ndim > 2
         parts = [np.asarray(data[name], np.float64) for name in _NEEDED]
         wxyz, omega, momentum, moments = parts
         ts = np.asarray(data["time" if "time" in data.coords else "ts"], np.float64)
         text, title = data.attrs["scene"], str(data.attrs.get("title", ""))
-    if many and moments.ndim > 1:
+    if has_body_axis and moments.ndim > 1:
         tensors = moments[:, :, None] * np.eye(3)  # clones differ in moments about the body axes
     else:
         inertia = build_inertia(parse_scene(text, path), jnp.result_type(float))
         # one that changes with time is drawn as it is at the first time
         tensors = np.asarray(inertia_at(inertia, ts.flat[0]).tensor, np.float64)
-    count = wxyz.shape[0] if many else 1
+    count = wxyz.shape[0] if has_body_axis else 1
     ts = np.broadcast_to(ts, (count, ts.shape[-1]))
     tensors = np.broadcast_to(tensors, (count, 3, 3))
     arrays = [x.reshape(count, *x.shape[-2:]) for x in (wxyz, omega, momentum)]
@@ -357,9 +359,11 @@ def view(
         raise ValueError(f"seconds must be positive, got {seconds}.")
     if names is not None and len(names) != len(bodies_drawn):
         raise ValueError(f"names must name the {len(bodies_drawn)} bodies, got {len(names)}.")
-    most = max(2, MOST_SAMPLES // len(bodies_drawn))
+    max_samples = max(2, MOST_SAMPLES // len(bodies_drawn))
     meshes = per_body(mesh, len(bodies_drawn))
-    several = [drawing_of(one, start, most, m) for one, m in zip(bodies_drawn, meshes, strict=True)]
+    several = [
+        drawing_of(one, start, max_samples, m) for one, m in zip(bodies_drawn, meshes, strict=True)
+    ]
     for body, name in zip(several, names or [""] * len(several), strict=True):
         body["name"] = str(name)
     free = all(one.free for one in bodies_drawn)
