@@ -225,9 +225,7 @@ def calibrated(count: int, seed: int) -> list[dict]:
         dynamics = chart.dynamics(scene, state, jnp.asarray(ts[:, 0]))
         y, _ = chart.start(scene, state, jnp.zeros(()))
         leaves, zero = jax.tree.leaves(y), jnp.zeros(())
-        problem = BoundTerm.of(diffrax.ODETerm(chart.field), dynamics).prepare(
-            zero, y, jnp.float64
-        )
+        problem = BoundTerm.of(diffrax.ODETerm(chart.field), dynamics).prepare(zero, y, jnp.float64)
 
         def field(t, y, along, problem=problem):
             return problem.rates(problem.coefficients, t, y), []

@@ -360,8 +360,8 @@ def require_below(small_name: str, small: Array, large_name: str, large: Array) 
 def check_moments(name: str, moments: np.ndarray, slack: float, zero_fraction: float = 0.0) -> None:
     """ValueError unless rows of principal moments are positive and obey the triangle inequality.
 
-    ``slack`` is the relative tolerance of the inequality (flat bodies), ``zero_fraction`` the part of
-    the largest moment that counts as zero.
+    ``slack`` is the relative tolerance of the inequality (flat bodies), ``zero_fraction`` the part
+    of the largest moment that counts as zero.
     """
     if moments.size == 0:
         return
