@@ -134,32 +134,30 @@ def test_a_program_is_for_the_default_device(monkeypatch):
 
 
 def scene_values() -> list[np.ndarray]:
-    """Values and gradients of a few scenes: closed forms, steps of both rules, one body and more
-    than lanes."""
+    """Values and gradients of a few scenes: closed forms and steps, of one body and of more bodies
+    than SIMD lanes; each scene with one of the two numbers of bodies, as compilation takes long."""
     gravity = ph.UniformGravity(1.0, [0.0, 0.1, 0.5])
     body = ph.Inertia.from_moments([1.0, 1.5, 2.0])
     scenes = {
         "free": ph.Scene(body),
-        "symmetric": ph.Scene(ph.Inertia.axisymmetric(1.0, 0.5)),
         "Lagrange's top": ph.Scene(
             ph.Inertia.axisymmetric(1.0, 0.5), ph.UniformGravity.axial(1.0, 0.5)
         ),
-        "heavy top": ph.Scene(body, gravity),
         "damped": ph.Scene(body, gravity, ph.LinearDamping(0.1)),
     }
     rng = np.random.default_rng(1)
     many = np.concatenate([np.ones((70, 1)), rng.normal(size=(70, 2))], axis=1)
     values = []
-    for scene in scenes.values():
-        for omega in (many[0], many):
+    cases = ("free", many), ("Lagrange's top", many[0]), ("damped", many[0]), ("damped", many)
+    for name, omega in cases:
 
-            def end(omega, scene=scene):
-                state = ph.State([0.5, 0.5, 0.5, -0.5], omega)
-                found = ph.simulate(scene, state, [0.0, 0.5, 1.0], rtol=1e-9)
-                return (found.wxyz[..., 1:, :] ** 3).sum(), found.omega_body
+        def end(omega, scene=scenes[name]):
+            state = ph.State([0.5, 0.5, 0.5, -0.5], omega)
+            found = ph.simulate(scene, state, [0.0, 0.5, 1.0], rtol=1e-9)
+            return (found.wxyz[..., 1:, :] ** 3).sum(), found.omega_body
 
-            (_, rates), slope = jax.jit(jax.value_and_grad(end, has_aux=True))(omega)
-            values += [np.asarray(rates), np.asarray(slope)]
+        (_, rates), slope = jax.jit(jax.value_and_grad(end, has_aux=True))(omega)
+        values += [np.asarray(rates), np.asarray(slope)]
     return values
 
 
@@ -176,7 +174,7 @@ def test_plain_programs_agree_with_optimised_ones(tmp_path):
         assert ran.returncode == 0, ran.stderr[-2000:]
         with np.load(path) as file:
             results.append([file[name] for name in file.files])
-    assert len(results[0]) == len(results[1]) == 20
+    assert len(results[0]) == len(results[1]) == 8
     for optimised, plain in zip(*results):
         np.testing.assert_allclose(plain, optimised, rtol=1e-7, atol=1e-7)
 

@@ -52,8 +52,12 @@ def test_steps_of_a_symmetric_body_are_those_of_one_series(moments):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROWS)
 def test_stored_states_and_derivatives_agree_with_taylor_series(name):
-    for sample in TEXTS[name]["samples"]:
-        assert difference(TEXTS[name], sample, True, digits=70) < 0.5001
+    """States of all samples, derivatives of the last one; those of all samples are compared by
+    ``make_tumbling.py --check``, and of the first ones with the closed form below."""
+    *others, last = TEXTS[name]["samples"]
+    assert difference(TEXTS[name], last, True, digits=70) < 0.5001
+    for sample in others:
+        assert difference(TEXTS[name], sample, False) < 0.5001
 
 
 @pytest.mark.parametrize("name", ["t_handle", "permuted_axes"])

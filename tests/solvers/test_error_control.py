@@ -87,11 +87,8 @@ def test_nor_in_single_precision(kind):
 
 @pytest.mark.parametrize(
     ("kind", "count"),
-    [("top", 3), ("top", 600), ("gradient", 30)]
-    + [
-        pytest.param(*case, marks=pytest.mark.slow)
-        for case in (("top", 30), ("gradient", 3), ("gradient", 600))
-    ],
+    [("top", 30)]
+    + [pytest.param(*case, marks=pytest.mark.slow) for case in (("top", 600), ("gradient", 3))],
 )
 def test_saved_times_are_as_accurate_however_many_they_are(kind, count):
     """Bodies of a batch go on to their next saved times without waiting for others, in steps of an
