@@ -72,6 +72,7 @@ def test_directions_and_time_that_runs_backwards():
         assert np.all(np.diff(found.times) < 0)  # as the motion meets them
 
 
+@pytest.mark.slow  # of a simulation: below
 def test_each_body_of_a_batch_has_times_of_its_own():
     rates = np.array([0.05, 0.6, 1.3])
     state = ph.State(STATE.wxyz, jnp.stack([jnp.zeros(3), jnp.asarray(rates), jnp.zeros(3)], -1))
@@ -87,8 +88,7 @@ def test_each_body_of_a_batch_has_times_of_its_own():
     np.testing.assert_allclose(one.times[2, 0], known(0.4, 1.3)[0], rtol=1e-12)
 
 
-@pytest.mark.parametrize("method", [None, ph.LiePoisson()], ids=["exact", "stepped"])
-def test_event_times_have_derivatives(method):
+def test_event_times_have_derivatives():
     """t = x / rate for a fixed phase x: dt/drate = -t/rate; and in the level, 1/slope."""
 
     @jax.jit
@@ -96,7 +96,7 @@ def test_event_times_have_derivatives(method):
     def second(given):
         rate, level = given
         state = ph.State(STATE.wxyz, jnp.stack([0 * rate, rate, 0 * rate]))
-        traj = ph.simulate(BALL, state, TS, method, rtol=1e-10)
+        traj = ph.simulate(BALL, state, TS)  # in steps: test_events_of_a_simulation
         return ph.crossings(traj, Height(level), capacity=3, samples=64).times[1]
 
     time, (in_rate, in_level) = second((jnp.asarray(RATE), jnp.asarray(0.4)))
@@ -231,13 +231,9 @@ def test_derivatives_of_a_motion_that_stops():
     np.testing.assert_allclose(times[1:], [known(0.4, 0.6)[0], known(0.4, 1.3)[0]], rtol=1e-12)
 
 
+@pytest.mark.slow  # two derivatives are taken first; those of states: tests/free
 @pytest.mark.parametrize(
-    ("call", "modes"),
-    [("crossings", "fff")]
-    + [
-        pytest.param(call, modes, marks=pytest.mark.slow)
-        for call, modes in (("until", "rrr"), ("until", "ffr"))
-    ],
+    ("call", "modes"), [("crossings", "fff"), ("until", "rrr"), ("until", "ffr")]
 )
 def test_third_derivatives_of_events_are_refused(call, modes):
     def time_of(rate):
@@ -443,6 +439,7 @@ def test_events_of_a_simulation_in_order_of_time():
     assert traj[1].events.count == 2
 
 
+@pytest.mark.slow  # of a motion in steps: above
 def test_events_of_a_motion_in_closed_form():
     """The same as those of each event alone, merged; the terminal one cuts the rest."""
     state = ph.State([1.0, 0, 0, 0], [0.3, 0.2, 6.0])

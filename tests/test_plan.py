@@ -52,8 +52,9 @@ ALIKE = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("rtol", [None, 1e-12])
-@pytest.mark.parametrize("name", ALIKE)
+@pytest.mark.parametrize(
+    ("name", "rtol"), [*((name, None) for name in ALIKE), ("free", 1e-12), ("gradient", 1e-12)]
+)
 def test_plain_calls_jit_vmap_and_grad_choose_alike(name, rtol):
     """By types alone: no number of scene, state or times, however long, decides. Nothing is run."""
     scene, expected = ALIKE[name]
@@ -128,6 +129,7 @@ def test_specialise_keeps_what_is_no_narrower_and_refuses_traced_numbers():
         ph.specialise(TRIAXIAL)
 
 
+@pytest.mark.slow
 def test_gradients_across_absent_gravity_are_nan_and_those_along_the_axis_right():
     """The frame of the field has no direction then: never a number that is wrong."""
     state, ts = ph.State([1.0, 0, 0, 0], [0.1, 0.2, 0.3]), [0.0, 1.0]
@@ -247,11 +249,10 @@ def test_explain_says_why_no_exact_law_holds():
 
 @pytest.mark.parametrize(
     "inertia",
-    [  # axisymmetric bodies against truths: tests/systems
-        pytest.param(ph.Inertia.axisymmetric(2.0, 0.5), id="axial", marks=pytest.mark.slow),
-        pytest.param(ph.Inertia.spherical(2.0), id="sphere"),
-    ],
+    [ph.Inertia.axisymmetric(2.0, 0.5), ph.Inertia.spherical(2.0)],
+    ids=["axial", "sphere"],
 )
+@pytest.mark.slow  # other symmetric bodies: tests/systems and tests/free
 def test_static_symmetry_gives_the_same_motion_and_slope(inertia):
     """The programs for known symmetry agree with the general one (itself held to 50 digits)."""
     general = ph.Inertia.from_moments(inertia.moments)
@@ -292,7 +293,7 @@ def test_general_tensor_equals_its_principal_frame():
         np.testing.assert_allclose(slopes[0], slopes[1], rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("bodies", [1, 5_000])
+@pytest.mark.parametrize("bodies", [1, pytest.param(5_000, marks=pytest.mark.slow)])
 def test_known_states_and_times_may_be_closed_over_under_jit(bodies):
     """The planner looks at values, which every operation under ``jit`` would turn into tracers."""
     rng = np.random.default_rng(3)

@@ -21,7 +21,10 @@ def tangent(nominal, end):
     return np.concatenate([turn, end.omega_body - nominal.omega_body])
 
 
-@pytest.mark.parametrize("potential", [None, PULL], ids=["free", "gravity"])
+@pytest.mark.parametrize(
+    "potential",
+    [pytest.param(None, id="free", marks=pytest.mark.slow), pytest.param(PULL, id="gravity")],
+)
 def test_jacobian_and_noise_are_those_of_the_motion(potential):
     def ends(error, push=None):
         """The motion itself, by a method and a chart that ``propagate`` does not use."""
@@ -61,8 +64,9 @@ def test_jacobian_and_noise_are_those_of_the_motion(potential):
     np.testing.assert_array_equal(noise[6:], 0)
 
 
+@pytest.mark.slow
 def test_steps_join_and_map():
-    """Two half steps are a whole one; bodies are mapped; a batch is refused."""
+    """Two half steps are a whole one; bodies are mapped."""
     scene = ph.Scene(ph.Inertia.from_moments(MOMENTS))
     step = jax.jit(lambda state, dt: ph.propagate(scene, state, dt))
     whole, half = step(STATE, 2 * DT), step(STATE, DT)
@@ -70,10 +74,17 @@ def test_steps_join_and_map():
     np.testing.assert_allclose(again.jacobian @ half.jacobian, whole.jacobian, rtol=0, atol=1e-12)
     joined = again.noise + again.jacobian @ half.noise
     np.testing.assert_allclose(joined, whole.noise, rtol=0, atol=1e-11)
-    rates = jnp.stack([STATE.omega_body, 2 * STATE.omega_body])
-    both = ph.State(jnp.stack([STATE.wxyz, STATE.wxyz]), rates)
-    mapped = jax.vmap(lambda state: ph.propagate(scene, state, DT))(both)
+    mapped = jax.vmap(lambda state: ph.propagate(scene, state, DT))(BOTH)
     np.testing.assert_allclose(mapped.jacobian[0], half.jacobian, rtol=0, atol=1e-12)
+
+
+BOTH = ph.State(
+    jnp.stack([STATE.wxyz, STATE.wxyz]), jnp.stack([STATE.omega_body, 2 * STATE.omega_body])
+)
+
+
+def test_what_no_step_is_made_of_is_refused():
+    scene = ph.Scene(ph.Inertia.from_moments(MOMENTS))
     for free in (lambda s: s.inertia.size, lambda s: 2 * s.inertia.diagonal):
         with pytest.raises(TypeError, match="arrays that the scene holds"):
             ph.propagate(scene, STATE, DT, free=free)
@@ -81,7 +92,7 @@ def test_steps_join_and_map():
         with pytest.raises(TypeError, match=r"must be a ph\."):
             ph.propagate(*given, DT)
     with pytest.raises(ValueError, match="one body"):
-        ph.propagate(scene, both, DT)
+        ph.propagate(scene, BOTH, DT)
 
 
 # Wheels. The coordinates of those that are not held at their speed follow attitude and rates.
@@ -180,6 +191,7 @@ def check_wheels(scene, dt, t):
     np.testing.assert_allclose(joined, 0, rtol=0, atol=3e-11 * scale)
 
 
+@pytest.mark.slow  # shapes with wheels: below
 def test_a_free_wheel_keeps_its_momentum_under_a_disturbance():
     """Noise of its speed and of the rates against differences; the next step continues with it."""
     scene, dt = wheel_scene(FREE, torque=ph.BodyTorque(jnp.zeros(3))), 0.3

@@ -90,7 +90,10 @@ KINDS = {
 }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [x if x in ("damped", "Lagrange") else pytest.param(x, marks=pytest.mark.slow) for x in KINDS],
+)
 def test_scenes_that_differ_in_numbers_share_a_program(kind):
     scene, record = ph.Scene(*KINDS[kind]), ph.Record(work=kind == "damped")
     ph.simulate(scene, _state(), TS, record=record)

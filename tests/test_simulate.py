@@ -61,6 +61,7 @@ def test_chunks_with_a_remainder_and_vmap_agree():
     np.testing.assert_allclose(mapped, whole.wxyz, atol=1e-8)
 
 
+@pytest.mark.slow  # values under vmap: test_chunks_with_a_remainder_and_vmap_agree
 def test_one_attitude_for_many_rates_under_vmap():
     """What does not depend on the mapped numbers is batched alike in values and derivatives; few
     bodies within few are integrated as a unit, which can hold no scatter."""
@@ -188,6 +189,7 @@ def test_a_batch_by_a_solver_and_a_controller_of_diffrax():
     assert steps[0] < steps[1] / 3
 
 
+@pytest.mark.slow  # derivatives by states: tests/systems
 def test_forward_mode_and_times():
     """d/dt of the samples is the field; jvp by diffrax.ForwardMode, grad by the default."""
     forward = ph.LiePoisson(adjoint=diffrax.ForwardMode())
@@ -206,6 +208,7 @@ def test_forward_mode_and_times():
     np.testing.assert_allclose(back, want, atol=1e-9)
 
 
+@pytest.mark.slow  # derivatives by moments: tests/systems
 def test_gradient_with_respect_to_the_initial_state():
     """Time runs back: d(end)/d(start) times d(start)/d(end) is the identity."""
     name = "free_short_axis_mode"

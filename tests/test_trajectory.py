@@ -61,7 +61,9 @@ def truth(name, times, rates=STATE.omega_body):
     return np.array([found[t] for t in times])
 
 
-@pytest.mark.parametrize("name", ["free", pytest.param("pushed", marks=pytest.mark.slow), "wheel"])
+@pytest.mark.parametrize(
+    "name", [*(pytest.param(x, marks=pytest.mark.slow) for x in ("free", "pushed")), "wheel"]
+)
 def test_at_any_time(name):
     """Within rtol where steps are taken, within rounding where the law is exact."""
     traj = ph.simulate(SCENES[name], STATE, TS, rtol=1e-10)
@@ -80,7 +82,7 @@ def test_at_any_time(name):
     assert np.isnan(with_nan.wxyz[1]).all()
 
 
-@pytest.mark.parametrize("name", ["free", "top"])
+@pytest.mark.parametrize("name", [pytest.param("free", marks=pytest.mark.slow), "top"])
 def test_derivatives_of_a_motion_at_a_time(name):
     """In time, initial rates and moments: SciPy's, and differences of SciPy's motion."""
     potential = SCENES[name].potential
@@ -208,17 +210,19 @@ def test_a_printed_trajectory_shows_size_status_and_steps():
     assert shown == 0
 
 
-def test_counts_of_steps_show_what_limited_them():
-    """Switches, events and saved times that end steps are counted, and printed where there are any.
+TURNED_BODY = ph.Inertia.from_moments([2.0, 2.0, 2.0])
+
+
+def test_steps_that_end_at_switches_and_events_are_counted():
+    """And printed where there are any.
 
     The number of sign changes is known: a torque of constant size about one axis, directed against
     the turn by the angle so far, swings the body to and fro."""
-    body = ph.Inertia.from_moments([2.0, 2.0, 2.0])
 
     def against(t, wxyz, omega):
         return jnp.array([0.0, 0.0, jnp.where(wxyz[0] * wxyz[3] > 0, -1.0, 1.0)])
 
-    swing = ph.Scene(body, torque=ph.FeedbackTorque(against))
+    swing = ph.Scene(TURNED_BODY, torque=ph.FeedbackTorque(against))
     # the angle 0.16 + t / 2 - t^2 / 4 is zero at t = 2.28, then every 2.561 s, at last at 17.65
     start = ph.State([np.cos(0.08), 0, 0, np.sin(0.08)], [0, 0, 0.5])
     found = ph.simulate(swing, start, [0.0, 18.5])
@@ -231,6 +235,9 @@ def test_counts_of_steps_show_what_limited_them():
     both = ph.simulate(swing, start, [0.0, 18.5], events=[event])
     assert int(both.step_counts.at_switches) == 7 + 7
 
+
+@pytest.mark.slow  # the other counts: above
+def test_steps_that_end_at_saved_times_or_are_refused_are_counted():
     gravity = ph.UniformGravity(1.0, [0.1, 0.2, 0.3], [0.0, 0.0, -9.81])
     top = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), gravity)
     states = ph.State([1.0, 0, 0, 0], np.linspace(0.1, 2.0, 40)[:, None] * np.ones(3))
@@ -246,7 +253,7 @@ def test_counts_of_steps_show_what_limited_them():
     def spun(t):
         return jnp.array([0.0, 0.0, 5.0 / (1e-4 + (t - 3.0) ** 2)])
 
-    pushed = ph.Scene(body, torque=ph.BodyTorque(spun))
+    pushed = ph.Scene(TURNED_BODY, torque=ph.BodyTorque(spun))
     sudden = ph.simulate(pushed, ph.State([1.0, 0, 0, 0], [0.1, 0.1, 0.1]), [0.0, 6.0])
     assert int(sudden.step_counts.refused) > 0
     assert "refused" in str(sudden)

@@ -358,6 +358,7 @@ def test_programs_are_kept_between_runs_unless_told_otherwise(here, monkeypatch)
         jax.config.update("jax_compilation_cache_dir", before)
 
 
+@pytest.mark.slow  # two processes without programs
 def test_a_damaged_cache_is_no_error(here):
     """In processes of their own: what is compiled is shared within one."""
     environment = os.environ | {"POLHODE_CACHE": str(here / "kept")}

@@ -143,6 +143,7 @@ def test_there_is_a_chunk_for_each_part(parts, chunks, tmp_path):
     assert -(-40_000 // chunk_sizes(job, None, None, parts).chunk) == chunks
 
 
+@pytest.mark.slow
 def test_parts_that_begin_together_share_a_store(whole, tmp_path):
     path = tmp_path / "parts.zarr"
     command = [sys.executable, str(SCRIPT), str(path), "0"]

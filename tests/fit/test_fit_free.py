@@ -205,6 +205,7 @@ def test_recordings_of_different_length_stack():
     np.testing.assert_array_equal(both.present, [[1, 1, 1, 1, 0], [1, 1, 1, 1, 1]])
 
 
+@pytest.mark.slow  # gaps: test_gaps_are_left_out
 def test_a_missing_row_in_five_does_not_hide_the_noise(cases):
     """Nor do readings of no noise at all count as far from it."""
     times, clean, noisy, *_ = cases

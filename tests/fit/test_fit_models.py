@@ -70,6 +70,7 @@ def flight(times, omega, *, wheel=None, drag=(0.0, 0.0)):
     return y[:, :4], (y[:, 4:] - carried) @ inverse.T
 
 
+@pytest.mark.slow  # derivatives of the residuals: below
 def test_a_wheel_shows_the_scale_and_drag_and_delay_are_fitted():
     rng = np.random.default_rng(3)
     times = np.linspace(0, 2, 401)

@@ -176,6 +176,7 @@ INERTIA = (
 )  # fmt: skip
 
 
+@pytest.mark.slow  # a fitted scene: test_fit_exports
 def test_a_fit_of_a_scene_has_the_fields_of_every_fit(found):
     # the drag, then the initial rates
     spread = np.sqrt(np.diagonal(np.asarray(found.covariance), axis1=1, axis2=2))

@@ -32,8 +32,8 @@ def _fits_single(case: dict) -> bool:
     scope="module",
     params=[
         pytest.param(("float64", jax.jacfwd), id="float64"),
-        pytest.param(("float32", jax.jacfwd), id="float32"),
         # in tests/stress of hundreds of bodies, and in tests/systems
+        pytest.param(("float32", jax.jacfwd), id="float32", marks=pytest.mark.slow),
         pytest.param(("float64", jax.jacrev), id="float64-reverse", marks=pytest.mark.slow),
         pytest.param(("float32", jax.jacrev), id="float32-reverse", marks=pytest.mark.slow),
     ],
@@ -134,6 +134,7 @@ def _random_bodies(seed: int, count: int) -> tuple:
     return moments, *(jnp.asarray(rng.normal(size=(count, n))) for n in (4, 3))
 
 
+@pytest.mark.slow  # values: test_layouts
 def test_many_times_agree_with_single_ones_in_value_and_gradient():
     moments, wxyz, omega = _random_bodies(5, 7)
     ts = jnp.linspace(-3.0, 8.0, 4)

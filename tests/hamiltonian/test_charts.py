@@ -34,7 +34,7 @@ SCENES = {
 }
 
 
-@pytest.mark.parametrize("name", ["general_tensor", "weight"])
+@pytest.mark.parametrize("name", ["weight", pytest.param("general_tensor", marks=pytest.mark.slow)])
 def test_both_charts_give_the_same_motion(name):
     """Everything else that acts: tests/torques/test_every_torque.py."""
     scene = SCENES[name]

@@ -37,6 +37,7 @@ def blank():
 
 
 @pytest.mark.parametrize("mode", [0, 1])
+@pytest.mark.slow
 def test_any_phases_are_turned_to_those_of_the_points(blank, mode):
     """A body that explains the points; copies of it, anywhere on the polhode and about the pole."""
     meant = Hypotheses(*(x[mode : mode + 1] for x in MEANT))

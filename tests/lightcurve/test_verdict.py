@@ -370,6 +370,7 @@ def test_a_body_that_is_no_better_than_a_series_of_two_periods_is_ambiguous(case
     assert "decisively better than a series of two periods" in reason
 
 
+@pytest.mark.slow  # the other verdicts: above
 def test_fourteen_points_are_too_few():
     curve = curve_of(tumbling, nights=2, days=4, each=7)
     pairs = pairs_of(curve)
@@ -517,6 +518,7 @@ def convex_case():
     return curve, body, ph.periods(ph.Inertia(moments), state)
 
 
+@pytest.mark.slow  # of ellipsoids: test_fit
 def test_derivatives_of_convex_bodies(convex_case):
     curve, body, _ = convex_case
     points = curve.points(0.0, 0.02)
@@ -555,6 +557,7 @@ def test_derivatives_of_convex_bodies(convex_case):
     assert open_area.shape == (3,)
 
 
+@pytest.mark.slow
 def test_a_convex_shape_leaves_the_noise_and_periods_within_their_errors(convex_case):
     curve, body, truth = convex_case
     linear, phase = _nulls.Linear(curve, 0.02), lightcurve.SeeligerPhase()

@@ -13,8 +13,18 @@ for _sequence in (Sequence.ZYZ, Sequence.ZXY_SPACE):
     CASES += rotation_cases.euler_cases(_sequence, 4, stride=3)
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32], ids=["float64", "float32"])
-@pytest.mark.parametrize("case", CASES, ids=[case.name for case in CASES])
+PLAIN = "wxyz -> matrix", "matrix -> wxyz"  # in single precision; the other formulas: slow
+SINGLE = [
+    pytest.param(case, np.float32, id=f"{case.name}-float32",
+                 marks=() if case.name in PLAIN else pytest.mark.slow)
+    for case in CASES
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("case", "dtype"),
+    [*(pytest.param(case, np.float64, id=f"{case.name}-float64") for case in CASES), *SINGLE],
+)
 def test_worst_errors_against_mpmath(case, dtype):
     worst = rotation_stress.measure_case(case, dtype)
     assert all(worst[name] <= BOUNDS[name] for name in BOUNDS), worst

@@ -47,7 +47,13 @@ def _exact():
     return jax.jit(partial(_stepped, compensated=False))(*_tops(jnp.float64))
 
 
-@pytest.mark.parametrize("run", [_marched, _stepped], ids=["marched", "stepped"])
+@pytest.mark.parametrize(
+    "run",
+    [
+        pytest.param(_marched, id="marched", marks=pytest.mark.slow),
+        pytest.param(_stepped, id="stepped"),
+    ],
+)
 def test_compensated_steps_lose_less_to_rounding(run):
     """Single precision against double; over 400 steps plain ones lose 10 to 40 times more."""
     exact, lost = _exact(), []

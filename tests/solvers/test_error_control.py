@@ -54,7 +54,9 @@ def errors(found, wxyz):
     return np.asarray(rotation.angle_between(found.wxyz[:, -1].astype(float), jnp.asarray(wxyz)))
 
 
-@pytest.mark.parametrize("kind", MADE)
+@pytest.mark.parametrize(
+    "kind", [k if k == "gravity" else pytest.param(k, marks=pytest.mark.slow) for k in MADE]
+)
 def test_no_body_is_far_beyond_the_error_asked_for(kind):
     """Nor is the work of steps much finer than asked for done."""
     assert len(MADE[kind]["end"]) >= COUNT

@@ -201,9 +201,6 @@ def arguments(first, strength):
     return tuple(jnp.broadcast_to(i, 3) for i in inverse), jnp.broadcast_to(strength, 3)
 
 
-SLOW = pytest.mark.slow
-
-
 @pytest.mark.parametrize("name", SOLVES)
 @pytest.mark.slow
 def test_outside_of_simulate_any_solver_has_the_slopes_of_the_flow(name):
@@ -247,7 +244,8 @@ def test_one_step_is_what_the_loop_of_diffrax_makes_of_it(end):
         np.testing.assert_allclose(a, b, rtol=1e-15, atol=1e-15)
 
 
-@pytest.mark.parametrize("name", [pytest.param("marched", marks=SLOW), "stock"])
+@pytest.mark.slow  # by one end: test_forward_mode_and_times
+@pytest.mark.parametrize("name", ["marched", "stock"])
 def test_slopes_by_saved_times_are_the_field(name):
     """At each of them; a later start alone is an earlier end."""
     args, ts = arguments(jnp.array(bodies.MOMENTS[0]), jnp.array(bodies.STRENGTH)), bodies.TIMES

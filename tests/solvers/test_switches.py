@@ -117,7 +117,9 @@ def truth(p, omega, law):
     ).y[:, -1]
 
 
-@pytest.mark.parametrize("law", ["clip", "short way", "pulse"])
+@pytest.mark.parametrize(
+    "law", ["clip", "short way", pytest.param("pulse", marks=pytest.mark.slow)]
+)
 def test_states_through_switches(law):
     """Without a declaration, at every tolerance; SciPy's steps of 0.01 s miss a jump by 1e-5."""
     p = jnp.array([0.4, 0.3])

@@ -227,13 +227,20 @@ def rows(*heavy: str):
 ELSEWHERE = (
     *(name for name, way in METHODS.items() if set(way.names) <= set(PARTS)),
     *("LagrangeTop", "Extrapolation compensated", "Dopri8", "planner gradient"),
-    "planner axisymmetric",  # the method of the row ClosedForm
+    *("planner axisymmetric", "planner body and damping"),  # as ClosedForm and CoarseSteps
 )
 # Every method and coordinates in single precision, parts with jumps and wheels among them; the
 # other rows differ from these in the field alone.
-SINGLE = "planner gravity", "ClosedForm"
+SINGLE = ("ClosedForm",)
 SINGLE_SLOW = (
-    *("planner axisymmetric", "LagrangeTop", "SymmetricTop", "FixedAxis", "Dopri8"),
+    *(
+        "planner gravity",
+        "planner axisymmetric",
+        "LagrangeTop",
+        "SymmetricTop",
+        "FixedAxis",
+        "Dopri8",
+    ),
     *("Extrapolation compensated", "CoarseSteps", "EulerAngles of few"),
     *("planner of momentum_dumping", "planner of sunlight_and_shadow"),
 )

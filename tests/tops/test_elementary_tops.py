@@ -59,7 +59,10 @@ CASES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", list(CASES))
+@pytest.mark.parametrize(
+    "name",
+    [pytest.param(x, marks=pytest.mark.slow) if x in ("wheel", "driven") else x for x in CASES],
+)
 def test_exact_against_integration(name):
     scene, state, record = CASES[name]
     method = FixedAxis() if name == "one_axis" else SymmetricTop()

@@ -46,7 +46,10 @@ def exact():
     return [top_cases.truth(name) for name in NAMES]
 
 
-@pytest.mark.parametrize(("dtype", "bound"), [(jnp.float64, 2e-14), (jnp.float32, 2e-5)])
+@pytest.mark.parametrize(
+    ("dtype", "bound"),
+    [(jnp.float64, 2e-14), pytest.param(jnp.float32, 2e-5, marks=pytest.mark.slow)],
+)
 def test_every_regime_is_exact(exact, dtype, bound):
     x = jnp.asarray(NUMBERS, dtype)
     got = np.array(VALUE(tuple(x), jnp.full(len(NAMES), top_cases.TIME, dtype)), float).T
@@ -62,6 +65,7 @@ def bound_of(name):
     return 1e-2 if name == "marginal_sleeping" else 1e-11
 
 
+@pytest.mark.slow  # forward mode: below
 def test_every_gradient_is_exact(exact):
     x = jnp.asarray(NUMBERS)
     rows = np.stack([SENSITIVITY(x, jnp.zeros((7, len(NAMES))).at[k].set(1.0), TIMES)
@@ -72,7 +76,6 @@ def test_every_gradient_is_exact(exact):
         assert error < bound_of(name), (name, error)
 
 
-@pytest.mark.slow  # reverse mode, above, is the transpose of the same derivatives
 def test_every_forward_derivative_is_exact(exact):
     x, direction = jnp.asarray(NUMBERS), np.random.default_rng(4).normal(size=10)
     forward = np.array(SLOPE(x, jnp.asarray(direction[:, None] * np.ones_like(NUMBERS)), TIMES))

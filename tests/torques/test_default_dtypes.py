@@ -37,7 +37,9 @@ PARTS = {
 }
 
 
-@pytest.mark.parametrize("name", PARTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.slow) if x == "cluster" else x for x in PARTS]
+)
 def test_single_precision_needs_no_conversion_of_defaults(name):
     scene = ph.Scene(ph.Inertia.from_moments(single(1.0, 1.5, 2.0)), **PARTS[name]())
     state = ph.State(single(1.0, 0.0, 0.0, 0.0), single(0.1, 0.2, 1.0))

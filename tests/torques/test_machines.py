@@ -30,6 +30,7 @@ def test_no_pulse_is_missed():
     assert int(got.steps) < 40
 
 
+@pytest.mark.slow  # derivatives through a jump: solvers/test_switches
 def test_slopes_by_the_edges_of_pulses():
     """Rate and angle at the end by the length of the first pulse, and the way back in time."""
 

@@ -49,7 +49,10 @@ def damped(dtype, linear, quadratic):
     return scene, ph.State(a([1.0, 0, 0, 0]), a(OMEGA)), a([0.0, END])
 
 
-@pytest.mark.parametrize(("dtype", "rtol"), [(jnp.float64, 1e-9), (jnp.float32, 1e-5)])
+@pytest.mark.parametrize(
+    ("dtype", "rtol"),
+    [pytest.param(jnp.float64, 1e-9, marks=pytest.mark.slow), (jnp.float32, 1e-5)],
+)
 def test_strong_damping_is_right_or_marked(dtype, rtol):
     """Rates of damping times the horizon of 1e4 and more; of 1e8 the steps do not suffice."""
     record = ph.Record(final_only=True)
@@ -64,6 +67,7 @@ def test_strong_damping_is_right_or_marked(dtype, rtol):
     assert lost.value.status[3] == ph.Status.SUCCESSFUL
 
 
+@pytest.mark.slow  # strong damping: above
 def test_an_implicit_solver_takes_any_damping():
     method, linear = ph.LiePoisson(diffrax.Kvaerno5(), chunk=1), 1e4 * LINEAR[1:2]
     scene = damped(jnp.float64, linear, np.zeros(1))

@@ -58,7 +58,7 @@ def test_kovalevskaya_top():
     assert max(np.ptp(np.abs(x), axis=-1).max() for x in (xi, minus)) > 0.1  # the sign matters
 
 
-@pytest.mark.parametrize("wrap", ["alone", "in pulses"])
+@pytest.mark.parametrize("wrap", ["alone", pytest.param("in pulses", marks=pytest.mark.slow)])
 def test_pointing_through_half_a_turn_keeps_rtol(wrap):
     """The law jumps there; Dopri8 at a tight tolerance, step by step, is the truth."""
     rng = np.random.default_rng(3)

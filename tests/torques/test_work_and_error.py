@@ -26,7 +26,7 @@ METHODS = {
 @pytest.mark.parametrize(
     "method",
     [  # the planner's, which extrapolates, in test_every_torque
-        pytest.param(method, id=name, marks=pytest.mark.slow if name == "Extrapolation" else ())
+        pytest.param(method, id=name, marks=() if name == "Dopri8" else pytest.mark.slow)
         for name, method in METHODS.items()
     ],
 )
@@ -42,6 +42,7 @@ def test_energy_changes_by_the_work(method):
     np.testing.assert_allclose(plain.wxyz, traj.wxyz, rtol=0, atol=1e-9)
 
 
+@pytest.mark.slow  # work beside the energy: above
 def test_work_on_a_damped_and_driven_spin():
     """About one axis: -(I w0^2 / 2)(1 - exp(-2 c t / I)), and N times the angle."""
     state, record = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 1.5]), ph.Record(work=True)
@@ -57,7 +58,7 @@ def test_work_on_a_damped_and_driven_spin():
     np.testing.assert_array_equal(free.work, 0.0)
 
 
-@pytest.mark.parametrize("rtol", [1e-6, 1e-10])
+@pytest.mark.parametrize("rtol", [1e-6, pytest.param(1e-10, marks=pytest.mark.slow)])
 def test_the_estimate_bounds_the_error(rtol):
     """Heavy tops that end far apart, against a run near rounding; whoever misses is marked."""
     keys = jax.random.split(jax.random.key(5), 2)
