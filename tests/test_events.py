@@ -183,6 +183,7 @@ def test_bodies_that_are_set_in_motion_are_looked_at_often_enough():
 
 
 @pytest.mark.parametrize("way", [1.0, -1.0])
+@pytest.mark.slow
 def test_beyond_its_event_a_body_holds_the_state_of_the_event(way):
     """A ball that turns at rates of both signs: two of three bodies meet the event."""
     rates = jnp.array([0.6, 1.3, 0.0])
@@ -206,6 +207,7 @@ def test_beyond_its_event_a_body_holds_the_state_of_the_event(way):
     assert float(wait) == 0
 
 
+@pytest.mark.slow  # of crossings: test_event_times_have_derivatives
 def test_derivatives_of_a_motion_that_stops():
     """At a fixed phase x = rate t: dt/drate = -t/rate; the attitude is the phase's, the same for
     every rate, and moves with the level."""
@@ -232,9 +234,7 @@ def test_derivatives_of_a_motion_that_stops():
 
 
 @pytest.mark.slow  # two derivatives are taken first; those of states: tests/free
-@pytest.mark.parametrize(
-    ("call", "modes"), [("crossings", "fff"), ("until", "rrr"), ("until", "ffr")]
-)
+@pytest.mark.parametrize(("call", "modes"), [("crossings", "fff"), ("until", "ffr")])
 def test_third_derivatives_of_events_are_refused(call, modes):
     def time_of(rate):
         state = ph.State(STATE.wxyz, jnp.stack([0 * rate, rate, 0 * rate]))
@@ -461,6 +461,7 @@ def test_events_of_a_motion_in_closed_form():
     np.testing.assert_allclose(found.omega_body[want.size - 1], traj.last.omega_body)
 
 
+@pytest.mark.slow
 def test_more_events_than_are_stored_are_reported():
     """With the true count, and never silently."""
     state = ph.State([1.0, 0, 0, 0], [0.3, 0.2, 3.0])

@@ -158,7 +158,14 @@ def test_the_poles_of_the_chart_are_reported_per_body():
         ph.simulate(free(), state, TS, ph.EulerAngles(max_steps=256))
 
 
-@pytest.mark.parametrize("solver", [diffrax.Tsit5(), diffrax.Kvaerno5(), diffrax.Heun()])
+@pytest.mark.parametrize(
+    "solver",
+    [
+        pytest.param(diffrax.Tsit5(), marks=pytest.mark.slow),
+        pytest.param(diffrax.Kvaerno5(), marks=pytest.mark.slow),
+        diffrax.Heun(),
+    ],
+)
 def test_any_diffrax_solver_and_controller(solver):
     """Adaptive, implicit, and constant steps, all handed over whole."""
     constant = isinstance(solver, diffrax.Heun)
@@ -169,6 +176,7 @@ def test_any_diffrax_solver_and_controller(solver):
     assert float(jnp.max(rotation.angle_between(traj.wxyz, want.wxyz))) < 1e-5
 
 
+@pytest.mark.slow  # one body: above
 def test_a_batch_by_a_solver_and_a_controller_of_diffrax():
     """16 heavy tops with steps of the user's controller: as accurate as its tolerance."""
     rng = np.random.default_rng(3)
@@ -227,6 +235,7 @@ def test_gradient_with_respect_to_the_initial_state():
     np.testing.assert_allclose(back @ there, np.eye(3), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_progress_meter_does_not_break_the_gradient(capfd):
     method = ph.LiePoisson(progress_meter=diffrax.TextProgressMeter())
     slope = jax.grad(lambda m: ph.simulate(free(m), STATE, TS, method).energy[-1])(MOMENTS)
@@ -298,6 +307,7 @@ def energy_of(weight):
     return lambda t: weight * jnp.linalg.norm(t.last.omega_body, axis=-1)
 
 
+@pytest.mark.slow
 def test_the_mean_over_the_bodies_that_finished_is_theirs_alone():
     """With derivatives by shared parameters of the torque, and of the cost."""
 

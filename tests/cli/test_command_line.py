@@ -136,6 +136,7 @@ def test_observations_within_the_times_are_compared(here):
     assert np.isnan(found.rates[0]).all()
 
 
+@pytest.mark.slow
 def test_a_scene_with_a_wheel_runs(here, capsys):
     spread = 'omega_body = { sigma = 0.1, source = "test" }\n'
     text = TOP[: TOP.index("[potential]")] + TOP[TOP.index("[times]") : TOP.rindex("moments")]

@@ -231,6 +231,7 @@ def test_the_bias_and_the_model_of_a_fitted_scene():
     np.testing.assert_allclose(predicted[0], again, atol=1e-6)
 
 
+@pytest.mark.slow  # transformations of bounded values: below
 def test_bounds_and_priors_hold():
     """A coefficient that is zero, bounded by zero; one with a prior narrower than the data."""
     scene = ph.Scene(BODY, torque=ph.LinearDamping([0.1, 0.06, 0.0]))

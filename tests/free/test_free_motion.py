@@ -32,10 +32,8 @@ def _fits_single(case: dict) -> bool:
     scope="module",
     params=[
         pytest.param(("float64", jax.jacfwd), id="float64"),
-        # in tests/stress of hundreds of bodies, and in tests/systems
+        # reverse mode: of hundreds of bodies in tests/stress, in single precision in tests/systems
         pytest.param(("float32", jax.jacfwd), id="float32", marks=pytest.mark.slow),
-        pytest.param(("float64", jax.jacrev), id="float64-reverse", marks=pytest.mark.slow),
-        pytest.param(("float32", jax.jacrev), id="float32-reverse", marks=pytest.mark.slow),
     ],
 )
 def solved(request):

@@ -144,9 +144,8 @@ def _second(a, point, direction):
     return jax.jacfwd(jax.jacrev(numbers))(a)
 
 
-@pytest.mark.parametrize(
-    "omega", [(0.3, 0.2, 1.0), pytest.param((1.0, 0.2, 0.2), marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("omega", [(0.3, 0.2, 1.0), (1.0, 0.2, 0.2)])
+@pytest.mark.slow  # of states: test_second_derivatives
 def test_second_derivatives(omega):
     """Along a direction in moments and rates at once, against differences of 50 digits."""
     point = np.array([1.0, 2.0, 3.0, *omega])

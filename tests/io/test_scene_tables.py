@@ -157,6 +157,7 @@ null_gain = 0.01
 """
 
 
+@pytest.mark.slow
 def test_clusters_exert_the_torque_of_the_law():
     scene = build_scene(parse_scene(BODY + CLUSTER), np.float64)
     assert len(scene.rotors.terms) == 5

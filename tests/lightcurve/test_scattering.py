@@ -192,6 +192,7 @@ def _faceted(corners):
     return hull.equations[:, :3] @ turn, areas, np.sqrt(moments.sum() / 2 - moments)
 
 
+@pytest.mark.slow
 def test_what_ellipsoids_miss_of_other_bodies_grows_as_the_floor_does():
     """The best ellipsoid below 30 degrees, seen at greater phase angles: bodies at random."""
     rng, many = np.random.default_rng(5), 150

@@ -107,6 +107,7 @@ def _moved(chunk, acts):
     return jax.jit(jax.grad(total, (0, 1, 2), has_aux=True))
 
 
+@pytest.mark.slow
 def test_a_queue_does_not_change_values():
     """Beside chunks of 30, none of which has more bodies than there are lanes; and a body that is
     no number keeps none from its lane."""

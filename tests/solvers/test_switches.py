@@ -244,6 +244,7 @@ def test_gradients_of_a_batch_through_switches():
     np.testing.assert_allclose(few[3], one, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_torque_that_points_along_an_orbit():
     """The frame's quaternion changes its sign, and with it the shorter way of ``ph.Pointing``; the
     checks of a rotation matrix compare rounding errors. The body ends at rest in the frame."""
@@ -323,8 +324,9 @@ def test_many_switches_are_passed_by_steps_of_lower_order():
         value, plan = by_network(1.0, rtol)
         assert f"steps of order {order}, each ending" in str(plan)
         assert abs(value - want) < 2 * rtol
-        found = jax.grad(lambda s, rtol=rtol: by_network(s, rtol)[0])(1.0)
-        assert abs(found - gradient) < 5 * rtol * abs(gradient)
+        if order == 5:  # of order 8: test_gradients_through_switches
+            found = jax.grad(lambda s, rtol=rtol: by_network(s, rtol)[0])(1.0)
+            assert abs(found - gradient) < 5 * rtol * abs(gradient)
 
 
 @pytest.mark.slow

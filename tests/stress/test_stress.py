@@ -24,8 +24,7 @@ ROOM = {"tensors": 3.0, "dwelling": 3.0}
     scope="module",
     params=[
         pytest.param((np.float64, ("reverse",)), id="float64"),
-        pytest.param((np.float32, ()), id="float32"),
-        pytest.param((np.float32, ("forward",)), id="float32-forward", marks=pytest.mark.slow),
+        pytest.param((np.float32, ()), id="float32", marks=pytest.mark.slow),
     ],
 )
 def scores(request):
@@ -78,7 +77,8 @@ def test_spin_about_the_unstable_axis_for_ever(dtype):
         assert np.all(np.isfinite(part))
 
 
-@pytest.mark.parametrize("dtype", [np.float64, pytest.param(np.float32, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+@pytest.mark.slow  # long horizons of the family: above
 def test_compensated_horizons(dtype):
     """Up to a million turns the error is that of the last operations, not of the phase."""
     pairs = [pair for pair in PAIRS if pair[0].family in ("horizons", "separatrix", "ulps")]

@@ -47,6 +47,7 @@ def test_the_log_determinant_has_derivatives():
         np.testing.assert_allclose(np.sum(slopes[place] * along), slope, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_wheel_that_moves_more_tells_more():
     still = jnp.full_like(TIMES, -200.0)
     wheel = study.speed(TIMES)

@@ -59,6 +59,7 @@ def test_kovalevskaya_top():
 
 
 @pytest.mark.parametrize("wrap", ["alone", pytest.param("in pulses", marks=pytest.mark.slow)])
+@pytest.mark.slow  # a shorter way: solvers/test_switches
 def test_pointing_through_half_a_turn_keeps_rtol(wrap):
     """The law jumps there; Dopri8 at a tight tolerance, step by step, is the truth."""
     rng = np.random.default_rng(3)

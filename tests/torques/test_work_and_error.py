@@ -58,7 +58,8 @@ def test_work_on_a_damped_and_driven_spin():
     np.testing.assert_array_equal(free.work, 0.0)
 
 
-@pytest.mark.parametrize("rtol", [1e-6, pytest.param(1e-10, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("rtol", [1e-6, 1e-10])
+@pytest.mark.slow  # of three systems: below
 def test_the_estimate_bounds_the_error(rtol):
     """Heavy tops that end far apart, against a run near rounding; whoever misses is marked."""
     keys = jax.random.split(jax.random.key(5), 2)
@@ -123,6 +124,7 @@ def test_exact_motions_estimate_rounding_and_own_controllers_are_refused():
         ph.simulate(ph.Scene(INERTIA), STATE, TS, own, record=record)
 
 
+@pytest.mark.slow  # of an orbit: tests/test_published
 def test_libration_in_a_gravity_gradient():
     """About one axis: I3 a'' = -(s/2)(I2 - I1) sin 2a, s = 3 mu/r^3: a pendulum of the angle 2a.
 

@@ -68,6 +68,7 @@ def copies(monkeypatch):
     return found
 
 
+@pytest.mark.slow
 def test_one_copy_in_the_field(copies):
     """Plainly, under jit, vmap and grad, for one orbit and for one of each body."""
     orbit, several = orbit_of(0.1), orbit_of(0.1, jnp.array([2.0, 2.1, 2.2]))

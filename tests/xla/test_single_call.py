@@ -93,9 +93,8 @@ def test_special_functions_in_units(name):
     assert jnp.allclose(unit(x), fn(x), rtol=1e-15, atol=0)
 
 
-@pytest.mark.parametrize(
-    "kind", [*(pytest.param(k, marks=pytest.mark.slow) for k in ("free", "lagrange")), "damped"]
-)
+@pytest.mark.parametrize("kind", ["free", "lagrange", "damped"])
+@pytest.mark.slow
 def test_no_traced_value_outlives_its_program(kind):
     """Of exact and of stepped motions."""
     force = ph.UniformGravity.axial(1.0, 0.5) if kind == "lagrange" else None
