@@ -14,7 +14,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 import polhode as ph
 
 SCENE = ph.Scene(ph.Inertia.spherical(2.0))
-METHODS = {"exact": None, "stepped": ph.LiePoisson()}
+METHODS = {"stepped": ph.LiePoisson()}
 
 
 def level(wxyz, omega_body, t):

@@ -177,6 +177,7 @@ def test_a_tolerance_near_rounding_has_compensated_frequencies():
     assert 1e-13 < apart < 1e-9
 
 
+@pytest.mark.slow  # random bodies: solvers/test_error_control
 def test_many_bodies_under_a_potential_reach_the_error_asked_for():
     """The planner's steps for 40 heavy tops against the exact state of the systems table."""
     from systems.table import BY_NAME, truth

@@ -217,7 +217,7 @@ def test_a_free_wheel_keeps_its_momentum_under_a_disturbance():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "dt"),
-    [*((name, 0.3) for name in WHEELS), ("dry friction, impulse", -0.1), ("stiff", 1.0)],
+    [*((name, 0.3) for name in WHEELS), ("dry friction, impulse", -0.1)],
 )
 def test_wheels_of_every_kind(name, dt):
     check_wheels(WHEELS[name](), dt, 1.0)

@@ -219,7 +219,9 @@ def test_newton_bar_and_stem_turns_over():
     )
 
 
-@pytest.mark.parametrize(("dtype", "bound"), [(np.float64, 5e-8), (np.float32, 5e-5)])
+@pytest.mark.parametrize(
+    ("dtype", "bound"), [(np.float64, 5e-8), pytest.param(np.float32, 5e-5, marks=pytest.mark.slow)]
+)
 def test_dojo_and_jax_md_conservation(dtype, bound):
     """Dojo's test/momentum.jl: momentum to 1e-8 at h = 0.01, rates (10, 0.01, 0); jax_md's
     test_nve_3d: energy of 40 bodies within 5e-8 (float32: 5e-5) over 100 steps of 1e-3."""
@@ -369,7 +371,9 @@ def test_nasa_cylinder_librates_in_orbit(name):
     np.testing.assert_allclose(got.omega_body[-1], rates, rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("name", THRUSTS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=pytest.mark.slow) if k else x for k, x in enumerate(THRUSTS)]
+)
 def test_nasa_station_pushed_for_a_while(name):
     """NESC orbital cases 9A and 9B: 10 N m along body x from 1000 to 2000 s.
 

@@ -82,7 +82,8 @@ def test_at_any_time(name):
     assert np.isnan(with_nan.wxyz[1]).all()
 
 
-@pytest.mark.parametrize("name", ["free", pytest.param("top", marks=pytest.mark.slow)])
+@pytest.mark.slow  # derivatives at saved times: tests/systems
+@pytest.mark.parametrize("name", ["free", "top"])
 def test_derivatives_of_a_motion_at_a_time(name):
     """In time, initial rates and moments: SciPy's, and differences of SciPy's motion."""
     potential = SCENES[name].potential

@@ -48,7 +48,11 @@ def test_values_have_the_names_of_the_scene(of_scene, of_inertia):
 
 def test_ratios_are_known_where_only_a_common_factor_is_not(of_scene):
     fit, _ = of_scene
+    assert fit.findings() == ["undetermined"]
+    assert int(fit.null_count) == 1
     assert not np.any(np.isfinite(np.concatenate(fit.std)))
+    assert np.all(np.isinf(fit.derived(lambda v: v[0] + v[1])[1]))
+    assert "standard deviations are infinite" in fit.report()
     (first, moments, moments_std), (second, drag, drag_std) = fit.common_scale()
     assert (first, second) == ("inertia.diagonal", "torque.c")
     assert np.all(np.abs(moments - [0.4, 0.8, 1.0]) < 4 * moments_std + 1e-9)
@@ -115,3 +119,21 @@ def test_a_figure_of_a_fitted_scene(of_scene):
     np.testing.assert_allclose(np.diagonal(matrix), 1)
     text = [t.get_text() for ax in figure.axes for t in ax.texts]
     assert any("torque.c[2]" in x and "not determined" in x for x in text)
+
+
+INERTIA = (
+    "inertia", "moments", "axes", "ratios", "moments_std", "ratios_std", "axes_std", "scale_known",
+    "principal_values", "mirror_inertia",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", INERTIA)
+def test_what_a_fit_of_a_scene_lacks_is_named(of_scene, name):
+    with pytest.raises(AttributeError, match=f"has no {name}:"):
+        getattr(of_scene, name)
+    assert not hasattr(of_scene, name)
+
+
+def test_a_fit_of_a_scene_has_no_interval_of_moments(of_scene):
+    with pytest.raises(AttributeError, match="a fit of a scene has no principal_values"):
+        of_scene[0].interval()

@@ -119,27 +119,6 @@ def test_what_the_data_cannot_show_is_said():
     assert "standard deviations are infinite" in found.report()
 
 
-@pytest.mark.slow
-def test_a_common_size_is_anyones():
-    """Damping over inertia is all that a damped body shows: no unknown alone is to blame."""
-    scene = ph.Scene(BODY, torque=ph.LinearDamping(TRUE_DRAG))
-    rates = noisy(3, ph.simulate(scene, STATE, TIMES).omega_body)
-    data = Recording.of(TIMES, rates, omega_noise=NOISE)
-    options = FitOptions(max_starts=1)
-    free = lambda s: (s.inertia.diagonal, s.torque.c)  # noqa: E731
-    found = ph.fit_scene(scene, data, free, rtol=1e-7, options=options, throw=False)
-    assert found.findings() == ["undetermined"]
-    assert int(found.null_count) == 1
-    assert not np.any(np.isfinite(np.concatenate(found.std)))
-    assert "standard deviations are infinite" in found.report()
-    # ratios are known: of the moments, and of drag over inertia
-    ratio, std = found.derived(lambda v: jnp.stack([v[0][:2] / v[0][2], v[1][:2] / v[0][:2]]))
-    exact = np.array([[0.4, 0.8], TRUE_DRAG[:2] / np.array([1.0, 2.0])])
-    assert np.all(std < 0.05)
-    assert np.all(np.abs(ratio - exact) < 4 * std)
-    assert np.all(np.isinf(found.derived(lambda v: v[0] + v[1])[1]))
-
-
 @pytest.mark.parametrize(
     ("free", "word"),
     [
@@ -170,12 +149,6 @@ def test_refused_scenes_and_data():
         ph.fit_scene(several, data, lambda s: [s.torque.c])
 
 
-INERTIA = (
-    "inertia", "moments", "axes", "ratios", "moments_std", "ratios_std", "axes_std", "scale_known",
-    "principal_values", "mirror_inertia",
-)  # fmt: skip
-
-
 @pytest.mark.slow  # a fitted scene: test_fit_exports
 def test_a_fit_of_a_scene_has_the_fields_of_every_fit(found):
     # the drag, then the initial rates
@@ -193,18 +166,6 @@ def test_a_fit_of_a_scene_has_the_fields_of_every_fit(found):
     assert found.scene.torque.c.shape == (240, 3)
     assert found.report(3).startswith("body 3:\n")
     assert found.report().count("+-") == 3 * 240
-
-
-@pytest.mark.parametrize("name", INERTIA)
-def test_what_a_fit_of_a_scene_lacks_is_named(found, name):
-    with pytest.raises(AttributeError, match=f"has no {name}:"):
-        getattr(found, name)
-    assert not hasattr(found, name)
-
-
-def test_a_fit_of_a_scene_has_no_interval_of_moments(found):
-    with pytest.raises(AttributeError, match="a fit of a scene has no principal_values"):
-        found.interval()
 
 
 @pytest.mark.slow

@@ -150,18 +150,19 @@ def with_errors(omega, std, seed=0):
 
 @pytest.mark.slow
 def test_intervals_hold_with_errors_of_scale_and_misalignment():
-    """One per cent of each, 100 bodies; taken as exact they leave intervals that hold nothing."""
-    ratios, omega, _ = bodies(100)
-    data = Gyroscope(noise_density=0.002).read(KEY, TIMES, with_errors(omega, 0.01))
-    fit = fit_inertia(TIMES, data, omega_noise=0.02, throw=False)
+    """One per cent of each, 60 bodies; taken as exact they leave intervals that hold nothing."""
+    ratios, omega, _ = bodies(60)
+    data = Gyroscope(noise_density=0.002).read(KEY, TIMES, with_errors(omega, 0.01))[:, ::4]
+    times = TIMES[::4]
+    fit = fit_inertia(times, data, omega_noise=0.02, throw=False)
     inside = np.abs(deviations(fit, ratios)) < 1.96
-    print(f"95 % intervals hold in {100 * inside.mean():.1f} % of 200 ratios")
+    print(f"95 % intervals hold in {100 * inside.mean():.1f} % of 120 ratios")
     assert 0.92 <= inside.mean() <= 1
     assert 0.8 < np.sqrt(np.mean(deviations(fit, ratios) ** 2)) < 1.15
     assert np.mean(np.asarray(fit.diagnostics) == 0) > 0.95
     assert np.asarray(fit.noise).mean() == pytest.approx(1, abs=0.01)
     exact = FitOptions(gyroscope=Gyroscope.ideal())
-    fit = fit_inertia(TIMES, data, omega_noise=0.02, options=exact, throw=False)
+    fit = fit_inertia(times, data, omega_noise=0.02, options=exact, throw=False)
     narrow = np.abs(deviations(fit, ratios)) < 1.96
     print(f"with scale factors and axes taken as exact: {100 * narrow.mean():.1f} %")
     assert narrow.mean() < 0.3
@@ -257,7 +258,7 @@ def test_a_saturated_reading_is_a_bound_beside_errors_of_scale():
 
 @pytest.mark.slow
 def test_a_walk_of_the_bias_and_jitter_are_in_the_intervals():
-    ratios, omega, _ = bodies(60)
+    ratios, omega, _ = bodies(40)
     exact = {"scale_std": 0.0, "misalignment_std": 0.0}
     for part in ({"bias_walk": 0.02}, {"jitter": 0.002}):
         sensor = Gyroscope(noise_density=0.002, **part, **exact)

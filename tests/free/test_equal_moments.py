@@ -83,7 +83,7 @@ def right_or_nan(function, kind, *, turned, inner=jax.jacfwd, tolerance=1e-6):
     return known
 
 
-@pytest.mark.parametrize("turned", [False, True])
+@pytest.mark.parametrize("turned", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize("kind", BODIES)
 def test_second_derivatives_of_principal_moments_are_right_or_nan(kind, turned):
     if kind == "three":

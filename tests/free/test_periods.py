@@ -111,7 +111,14 @@ def _jacobians(*given):
     return jax.jacfwd(_numbers, (0, 1, 2))(*given), jax.jacrev(_numbers, (0, 1, 2))(*given)
 
 
-@pytest.mark.parametrize("omega", [(0.3, 0.2, 1.0), (1.0, 0.2, 0.2), (0.95, 0.3, 0.6)])
+@pytest.mark.parametrize(
+    "omega",
+    [
+        pytest.param((0.3, 0.2, 1.0), marks=pytest.mark.slow),
+        (1.0, 0.2, 0.2),
+        pytest.param((0.95, 0.3, 0.6), marks=pytest.mark.slow),
+    ],
+)
 def test_derivatives(omega):
     moments, omega = np.array([1.0, 2.0, 3.0]), np.array(omega)
 

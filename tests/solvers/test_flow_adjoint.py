@@ -119,17 +119,6 @@ def test_batches_of_slopes():
     np.testing.assert_allclose(slopes, forward, rtol=0, atol=1e-11)
 
 
-@pytest.mark.slow  # of a free body: tests/free
-def test_the_hessian_is_symmetric_and_the_change_of_the_slopes():
-    point = 1 / MOMENTS.T
-    forward = jax.jit(jax.jacfwd(value))
-    hessian = jax.jit(jax.jacfwd(jax.grad(value)))(point).reshape(9, 9)
-    np.testing.assert_allclose(hessian, hessian.T, rtol=0, atol=1e-10)
-    step = jax.random.normal(KEYS[2], (3, 3)) / 3
-    change = difference(forward, point, step)
-    np.testing.assert_allclose(hessian @ step.ravel(), change.ravel(), rtol=0, atol=1e-9)
-
-
 @pytest.mark.slow
 def test_second_derivatives_of_chunks():
     """Of bodies moved one chunk after another: the Hessian is that of one chunk, and symmetric."""

@@ -160,7 +160,7 @@ def _largest(tree):
     return jnp.max(jnp.stack([jnp.abs(x).max() for x in jax.tree.leaves(tree)]))
 
 
-@pytest.mark.parametrize("rtol", [1e-5, 1e-10])
+@pytest.mark.parametrize("rtol", [1e-5, pytest.param(1e-10, marks=pytest.mark.slow)])
 def test_step_control_and_error_estimate(rtol):
     control = diffrax.PIDController(rtol=0.0, atol=rtol, norm=_largest)
     solution = solve(Extrapolation(10), None, stepsize_controller=control)

@@ -118,6 +118,7 @@ def test_a_top_that_leaves_the_upright_and_comes_back():
     assert np.abs(vertical).max() < 1e-13
 
 
+@pytest.mark.slow
 def test_the_error_does_not_depend_on_the_horizon(shared):
     truth = np.load(shared / "peers" / "truth" / "J3_lag.npz")
     q, w = truth["q0"], truth["w0"]

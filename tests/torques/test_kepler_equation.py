@@ -243,6 +243,7 @@ def test_a_circle_by_construction():
         ph.KeplerOrbit(1.3, -2.1)
 
 
+@pytest.mark.slow
 def test_batches_and_edits_of_circles():
     axes, t = jnp.array([2.0, 3.0]), 1.7
     circles = ph.KeplerOrbit(1.0, axes)

@@ -22,7 +22,6 @@ def costs():
     return found
 
 
-@pytest.mark.slow
 def test_rates_alone_carry_no_attitude_and_no_third_kind(costs):
     both, rates = costs["free, final state"], costs["free, rates only, final state"]
     assert rates["flops"] < 0.5 * both["flops"]
