@@ -97,7 +97,7 @@ def test_event_times_have_derivatives():
     def second(given):
         rate, level = given
         state = ph.State(STATE.wxyz, jnp.stack([0 * rate, rate, 0 * rate]))
-        traj = ph.simulate(BALL, state, TS)  # in steps: test_events_of_a_simulation
+        traj = ph.simulate(BALL, state, TS)  # steps: test_events_of_a_simulation_in_order_of_time
         return ph.crossings(traj, Height(level), capacity=3, samples=64).times[1]
 
     time, (in_rate, in_level) = second((jnp.asarray(RATE), jnp.asarray(0.4)))

@@ -21,9 +21,10 @@ for _name, _system in BY_NAME.items():
     ACTING.setdefault(frozenset(_system.acts), []).append(_name)
 FREE = ACTING[frozenset()]
 ALL = [name for name, system in BY_NAME.items() if system.is_simple]
-# Sunlight alone and wheels without dumping act in sunlight_and_shadow and momentum_dumping too.
-CONTAINED = "sunlight", "cluster_of_wheels"
-PARTS = [name for name in BY_NAME if name not in (*ALL, *CONTAINED)]
+# Sunlight alone and wheels without dumping act in sunlight_and_shadow and momentum_dumping too;
+# states and derivatives with tables and held commands are in test_tables and test_sampled.
+ELSEWHERE = "sunlight", "cluster_of_wheels", "torque_from_a_table", "commands_held"
+PARTS = [name for name in BY_NAME if name not in (*ALL, *ELSEWHERE)]
 SYMMETRIC = ["symmetric_prolate", "symmetric_fading"]
 FEW = [name for name in ALL if {"gravity", "body", "damping"}.issuperset(BY_NAME[name].acts)]
 
@@ -46,7 +47,7 @@ METHODS = {
     **{  # the other fields, with the same steps, are in the rows of ALL
         f"planner {' and '.join(sorted(acts))}": Way(None, names)
         for acts, names in ACTING.items()
-        if acts in ({"gravity"}, {"body", "damping"}, {"gradient"})
+        if acts in ({"gravity"}, {"body", "damping"})
     },
     **{f"planner of {name}": Way(None, [name]) for name in PARTS},
     "planner axisymmetric": Way(None, ["symmetric_prolate"], EXACT, axial=True),
@@ -225,30 +226,23 @@ def rows(*heavy: str):
 
 # Methods with tests of their own of values and gradients, in tops and in solvers; and rows whose
 # fields and coordinates act in the others.
-ELSEWHERE = (
+COVERED = (
     *(name for name, way in METHODS.items() if set(way.names) <= set(PARTS)),
-    *("LagrangeTop", "Extrapolation compensated", "Dopri8", "planner gradient"),
+    *("LagrangeTop", "Extrapolation compensated", "Dopri8"),
     "EulerAngles of few",  # values: tests/hamiltonian
     *("planner axisymmetric", "planner body and damping"),  # as ClosedForm and CoarseSteps
 )
-# Every method and coordinates in single precision, and wheels; the
-# other rows differ from these in the field alone.
+# Every method and coordinates in single precision, and wheels; the other rows differ from these in
+# the field or the solver alone.
 SINGLE = ("ClosedForm",)
 SINGLE_SLOW = (
-    *(
-        "planner gravity",
-        "planner axisymmetric",
-        "LagrangeTop",
-        "SymmetricTop",
-        "FixedAxis",
-        "Dopri8",
-    ),
+    *("planner gravity", "planner axisymmetric", "LagrangeTop", "SymmetricTop", "FixedAxis"),
     *("Extrapolation compensated", "CoarseSteps", "EulerAngles of few"),
     "planner of momentum_dumping",
 )
 
 
-@pytest.mark.parametrize("name", rows(*ELSEWHERE))
+@pytest.mark.parametrize("name", rows(*COVERED))
 def test_state_and_gradient(name):
     check(METHODS[name], jnp.float64)
 
