@@ -130,8 +130,8 @@ INERTIA = (
 @pytest.mark.parametrize("name", INERTIA)
 def test_what_a_fit_of_a_scene_lacks_is_named(of_scene, name):
     with pytest.raises(AttributeError, match=f"has no {name}:"):
-        getattr(of_scene, name)
-    assert not hasattr(of_scene, name)
+        getattr(of_scene[0], name)
+    assert not hasattr(of_scene[0], name)
 
 
 def test_a_fit_of_a_scene_has_no_interval_of_moments(of_scene):
