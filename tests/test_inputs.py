@@ -295,6 +295,7 @@ def test_numbers_put_in_by_an_edit_raise_where_the_scene_is_used(field, value, u
         use(edited, STATE, TS)
 
 
+@pytest.mark.slow
 def test_scenes_hold_anything_while_they_are_not_used():
     """Masks, axes and names stand where arrays are: for tree_map, in_axes and optax."""
     mask = jax.tree.map(lambda x: x.ndim > 0, TOP)

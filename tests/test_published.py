@@ -239,6 +239,7 @@ def test_dojo_and_jax_md_conservation(dtype, bound):
     assert np.max(change[0]) < (1e-8 if dtype == np.float64 else 1e-4)
 
 
+@pytest.mark.slow
 def test_gyrostat_precession():
     """An axisymmetric gyrostat, wheel along its axis (P. C. Hughes, Spacecraft Attitude Dynamics,
     chapter 7): the transverse rate turns at ((C - A) s + h)/A in the body."""

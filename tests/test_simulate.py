@@ -28,6 +28,7 @@ def one_by_one(scene_of, n, **kwargs):
     return jnp.stack([r.wxyz for r in runs]), jnp.stack([r.omega_body for r in runs])
 
 
+@pytest.mark.slow  # chunks and vmap: below
 def test_batch_equals_single_bodies_in_any_shape():
     """Leaves (3, 1, 3) of inertia, (2, 4) of attitude and (3,) of gravity: 3 x 2 bodies."""
     moments = jnp.array([[[1.0, 1.5, 2.0]], [[2.0, 1.5, 1.0]], [[0.5, 0.5, 0.75]]])
@@ -86,6 +87,7 @@ def test_one_attitude_for_many_rates_under_vmap():
     np.testing.assert_allclose(nested[1], batch, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_times_per_body_and_backwards():
     ts = jnp.stack([TS, TS[::-1], -2 * TS])
     state = ph.State(jnp.tile(STATE.wxyz, (3, 1)), STATE.omega_body)

@@ -135,7 +135,8 @@ def test_a_gravity_gradient_is_the_same_seen_from_a_frame_upright_to_it():
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9), upright, general)
 
 
-@pytest.mark.parametrize("kind", [pytest.param("box", marks=pytest.mark.slow), "bell"])
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["box", "bell"])
 def test_a_push_after_rest_or_on_a_turning_body_is_seen(kind):
     """A torque that jumps beside the ends of a step is behind the estimate of the midpoint rule;
     and before a bell-shaped one the body has next to no momentum to be exact to."""

@@ -122,6 +122,7 @@ def batch():
     )
 
 
+@pytest.mark.slow
 def test_bodies_and_samples_are_chosen_as_from_an_array(batch):
     wxyz, energy = np.asarray(batch.wxyz), np.asarray(batch.energy)
     mask = np.array([[True, False, True], [False, True, False]])

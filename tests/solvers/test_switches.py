@@ -282,6 +282,7 @@ def test_switches_that_change_the_sides_of_others():
     np.testing.assert_allclose(found.omega_body[1:, 2], [0.6, 0.2], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_side_that_changes_with_another_switch_shortly_before_its_root():
     """The frame's quaternion changes its sign at 3.064 s, and with it the side of the shorter way
     to the target; between that and the next root of the side at 3.100 s it was taken for one that

@@ -209,6 +209,7 @@ def test_throws_of_objects_whose_inertia_is_known():
     assert axes <= 2.0
 
 
+@pytest.mark.slow
 def test_bodies_with_fewer_recordings_are_filled_up():
     places, used = estimator._by_body(np.array([1, 0, 1, 1]), 2)
     np.testing.assert_array_equal(places, [[1, 0, 0], [0, 2, 3]])

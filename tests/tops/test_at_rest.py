@@ -91,7 +91,6 @@ def test_wheels_against_integration(name):
     check(TILTED, numbers_of(rates, mass=0.0, gravity=SLANTED), wheel)
 
 
-@pytest.mark.slow  # derivatives of moving tops: test_lagrange_top
 def test_bodies_at_rest_among_others():
     """A batch over the distance, in which one body rests: nothing of it is NaN."""
     check_batch(jnp.float64, 1e-14, reverse=False)

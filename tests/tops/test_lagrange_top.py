@@ -65,7 +65,7 @@ def bound_of(name):
     return 1e-2 if name == "marginal_sleeping" else 1e-11
 
 
-@pytest.mark.slow  # forward mode: below
+@pytest.mark.slow
 def test_every_gradient_is_exact(exact):
     x = jnp.asarray(NUMBERS)
     rows = np.stack([SENSITIVITY(x, jnp.zeros((7, len(NAMES))).at[k].set(1.0), TIMES)
@@ -76,6 +76,7 @@ def test_every_gradient_is_exact(exact):
         assert error < bound_of(name), (name, error)
 
 
+@pytest.mark.slow  # derivatives at rest: test_at_rest
 def test_every_forward_derivative_is_exact(exact):
     x, direction = jnp.asarray(NUMBERS), np.random.default_rng(4).normal(size=10)
     forward = np.array(SLOPE(x, jnp.asarray(direction[:, None] * np.ones_like(NUMBERS)), TIMES))

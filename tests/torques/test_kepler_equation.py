@@ -211,6 +211,7 @@ def test_orbits_by_a_state(e):
                 assert error(got[:2], want) < 25 * bound, (start, t)
 
 
+@pytest.mark.slow
 def test_a_circle_by_construction():
     """Without an eccentricity: the same place as at eccentricity 0, and the same derivatives."""
     t = 7.3

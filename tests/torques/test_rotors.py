@@ -120,6 +120,7 @@ def test_the_last_state_continues_with_its_wheels():
     assert ph.simulate(ph.Scene(BODY, rotors=HELD), STATE, [0.0, 1.0]).last.wheel_speed is None
 
 
+@pytest.mark.slow
 def test_the_speeds_of_a_state_replace_those_of_the_rotors():
     scene = ph.Scene(BODY, rotors=FREE + HELD)
     other = eqx.tree_at(lambda s: s.rotors.terms[0].speed, scene, jnp.array(-1.5))
