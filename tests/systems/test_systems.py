@@ -229,8 +229,8 @@ def rows(*heavy: str):
 COVERED = (
     *(name for name, way in METHODS.items() if set(way.names) <= set(PARTS)),
     *("LagrangeTop", "Extrapolation compensated", "Dopri8"),
-    *("EulerAngles of few", "CoarseSteps"),  # values: tests/hamiltonian, tests/solvers
-    *("planner axisymmetric", "planner body and damping"),  # as ClosedForm and gravity
+    "EulerAngles of few",  # values: tests/hamiltonian
+    *("planner axisymmetric", "planner body and damping"),  # as ClosedForm and CoarseSteps
 )
 # Every method and coordinates in single precision, and wheels; the other rows differ from these in
 # the field or the solver alone.
