@@ -301,11 +301,11 @@ def test_a_side_that_changes_with_another_switch_shortly_before_its_root():
     assert float(ph.rotation.angle_between(coarse.wxyz, fine.wxyz)) < 1e-4
 
 
-WEIGHTS = jax.random.normal(jax.random.key(0), (24, 3)), jax.random.normal(jax.random.key(1), (24,))
+WEIGHTS = jax.random.normal(jax.random.key(0), (48, 3)), jax.random.normal(jax.random.key(1), (48,))
 
 
 def by_network(scale, rtol, method=None):
-    """The last state under a network of 24 relu, the weights of which have a common factor."""
+    """The last state under a network of 48 relu, the weights of which have a common factor."""
 
     def law(t, wxyz, omega):
         hidden = jax.nn.relu(WEIGHTS[0] @ (3 * omega) + WEIGHTS[1])

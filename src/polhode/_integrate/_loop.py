@@ -199,7 +199,9 @@ def advance(
 
     elapsed = jnp.where(is_last, length, progress.elapsed + width)
     elapsed = jnp.where(hit, progress.elapsed + part * width, elapsed)
-    size = jnp.log(jnp.clip(ratio, control.MIN_RATIO, 1e12))
+    # of a step that a switch cuts the state is that of dense output, which is less accurate
+    state_ratio = ratio * jnp.where(hit, motion.rule.dense_error, 1)
+    size = jnp.log(jnp.clip(state_ratio, control.MIN_RATIO, 1e12))
     memory = jnp.where(accepted, control.MEMORY * progress.last_error, 0)
     factor = control.SAFETY * jnp.exp((memory - size) / motion.rule.order)
     factor = jnp.clip(factor, *control.factor_bounds(accepted, control.MAX_EXPLICIT_FACTOR))

@@ -13,7 +13,8 @@ class Tableau:
     step; ``weights`` (S, S): of the stages before; ``stages``: how many the step needs, the others
     belong to dense output; ``errors``: weights of one error estimate, or of two of different
     order; ``dense`` (K, S): of the coefficients of dense output beyond the cubic of Hermite;
-    ``margin_stages``: in order of time, those at which switches are inspected."""
+    ``dense_error``: error of dense output over that at the end of the step, in the mean of turning
+    bodies; ``margin_stages``: in order of time, those at which switches are inspected."""
 
     order: int
     nodes: np.ndarray
@@ -21,6 +22,7 @@ class Tableau:
     stages: int
     errors: tuple[np.ndarray, ...]
     dense: np.ndarray
+    dense_error: float
     margin_stages: tuple[int, ...]
     margin_nodes: tuple[float, ...] = field(init=False)
 
@@ -262,6 +264,7 @@ DOP853 = Tableau(
         _filled(_DOP853_ERROR_3, (1, _DOP853_STAGES))[0],
     ),
     _filled(_DOP853_DENSE, (4, _DOP853_DENSE_STAGES)),
+    10,
     (0, 3, 6, 5, 9, 10, 12),
 )
 """Order 8, dense output of order 7; the table leaves out zeros. J. R. Dormand, P. J. Prince;
@@ -322,6 +325,7 @@ TSIT5 = Tableau(
     7,
     (np.array(_TSIT5_ERROR),),
     _TSIT5_DENSE,
+    3,
     # the sixth stage stands at the end too, less accurately than the seventh
     (0, 1, 2, 3, 4, 6),
 )
