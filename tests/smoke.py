@@ -150,8 +150,10 @@ def main():
     )
     print(*(f"{name} {version(name)}" for name in packages), sep=", ")
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    (lines,) = re.findall(r"## Ten lines\n\n```python\n(.*?)```", readme, re.S)
-    exec(lines, {})
+    blocks, scope = re.findall(r"^```python\n(.*?)^```", readme, re.S | re.M), {}
+    assert blocks, "README.md has no example"
+    for block in blocks:
+        exec(block, scope)
     failed, checks = [], {**SCENES, **OTHERS}
     for name, run in checks.items():
         if sys.argv[1:] and name not in sys.argv[1:]:
