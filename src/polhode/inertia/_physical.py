@@ -33,7 +33,6 @@ from polhode.rotation._quaternion import matrix_row
 _SWEEPS = {2: 4, 4: 5, 8: 7}
 
 
-
 def _turn(q, axis, cosine, sine):
     """Quaternion components of ``q`` followed, in body axes, by a turn about one body axis."""
     w, v = q[0], q[1:]
