@@ -250,23 +250,6 @@ def _() -> str:
     return _block(markdown(header, lines), f"({command(read('error_control'))})")
 
 
-@_quote("control-constants")
-def _() -> str:
-    report = read("error_control_constants")
-    rows = report["numbers"]["constants"]
-    base = {row["scene"]: row for row in rows if not row["constant"]}
-    lines = []
-    for name in dict.fromkeys(row["constant"] for row in rows if row["constant"]):
-        own = [row for row in rows if row["constant"] == name]
-        steps = [row["steps_ratio"] for row in own if not row["failed"]]
-        errors = [row["q95"] / base[row["scene"]]["q95"] for row in own if not row["failed"]]
-        failed = sum(row["failed"] for row in own)
-        spans = (f"{min(x):.2f} to {max(x):.2f}" for x in (steps, errors))
-        lines.append([f"`{name}`", f"{own[0]['value']:g}", *spans, str(failed) if failed else ""])
-    header = ["", "without it", "steps over those with it", "95 % of errors", "bodies that fail"]
-    return _block(markdown(header, lines), f"({command(report)})")
-
-
 @_quote("rtol-beyond")
 def _() -> str:
     kept = _numbers("error_control")["kept"]
