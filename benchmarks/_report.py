@@ -8,6 +8,7 @@ jax for single-threaded numbers.
 """
 
 import argparse
+import compileall
 import importlib.metadata
 import importlib.util
 import json
@@ -41,6 +42,12 @@ def one_thread() -> None:
         os.environ.setdefault(name, "1")
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+
+
+def compile_package() -> None:
+    """Write the package's bytecode, which pip writes when it installs the package: where Python
+    writes none (PYTHONDONTWRITEBYTECODE), each new process would compile the checkout's sources."""
+    compileall.compile_dir(ROOT / "src", quiet=1)
 
 
 def commit() -> str | None:

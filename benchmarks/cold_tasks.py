@@ -418,6 +418,7 @@ def apart(a: list[float], b: list[float]) -> float:
 
 def measured(names: list[str], repeats: int) -> list[dict]:
     """A row for each task: the least of some runs in turn."""
+    _report.compile_package()
     rows = []
     for name in names:
         _, other, peer = TASKS[name]

@@ -1,18 +1,21 @@
 """Whether ``rtol`` is kept: random scenes over six decades, against long-double truth.
 
-python -m benchmarks.error_control [--bodies 150] [--quick] [--output FILE]
+python -m benchmarks.error_control [--bodies 150] [--quick] [--constants] [--output FILE]
 
 Two tables. The first holds the estimate of a single step's error (``_integrate/_midpoint.py``)
 beside the step's true error, for orders and widths of step. The second holds the error of the
 attitude at the last time over the ``rtol`` asked for, on bodies whose moments, rates, fields and
 torques are drawn over six decades, ratios of torque to kinetic energy from 1e-6 to 1e3, 1 to 1,000
-radians.
+radians. ``--constants [NAME ...]`` prints a third one only: steps, time and errors of some of these
+bodies and of others with each constant of ``_integrate/_error_control.py`` at the value at which it
+does nothing.
 
 Truth: Gragg's extrapolation of order 20 in 80-bit arithmetic, written out in NumPy from Newton's
 law, with two widths of step that must agree. ``spread``: how much more than linearly with the angle
 turned a small change of the momentum grows; beyond 100 a body counts as chaotic and is left out."""
 
 import argparse
+import time
 from fractions import Fraction
 from pathlib import Path
 
@@ -262,14 +265,136 @@ def calibrated(count: int, seed: int) -> list[dict]:
     return rows
 
 
+NEUTRAL = {
+    "SAFETY": 1.0,
+    "MEMORY": 0.0,
+    "DRIFT_ANGLE": 1e30,
+    "ROUNDED_STEP": 0.0,
+    "MIN_FACTOR": 1e-3,
+    "MAX_FACTOR": 1e3,
+    "MIN_RATIO": 1e-30,
+    "FIRST_WIDTH": 1.0,
+    "CUT": 0.0,
+    "CALIBRATION": 1.0,
+    "MIDPOINT_SHARE": 1.0,
+    "FIRST_SHARE": 1.0,
+    "GRAIN": 0.0,
+    "ROUGH_FALL": 1e30,
+    "ROUGH_ROUNDING": 0.0,
+    "ROUGH_ERROR": 1.0,
+    "EXPLICIT_SHARE": 1.0,
+    "UNDEFINED_SIDE": 1.0,
+}
+"""The value at which each constant of the error control does nothing; those that only set a status
+have none."""
+
+
+def hidden_jump(t, wxyz, omega_body):
+    """A torque that jumps where a loop hides it, so that no step ends at the jump."""
+    x, zero = wxyz[..., 1:2], jnp.zeros_like(wxyz[..., 1:2])
+    turns = jax.lax.while_loop(lambda c: jnp.any((x > 0) & (c == 0)), lambda c: c + 1, zero)
+    return 0.02 * turns * jnp.ones_like(omega_body)
+
+
+def clipped(t, wxyz, omega_body):
+    """A torque with six kinks and a jump."""
+    return jnp.clip(-0.05 * omega_body, -0.02, 0.02) + jnp.where(wxyz[..., 1:2] > 0, 0.01, 0.0)
+
+
+def rooted(t, wxyz, omega_body):
+    """A torque that is not defined beyond its switch."""
+    x = wxyz[..., 1:2]
+    return 0.02 * jnp.where(x > 0, jnp.sqrt(x), 0.0) * jnp.ones_like(omega_body)
+
+
+def scenes_of_constants(count: int) -> dict[str, tuple]:
+    """Scene, state and times by name."""
+    found = {}
+    for k, name in enumerate(("uniform gravity", "gravity gradient", "gravity, damped")):
+        p = draw(name, count, 11 + k, 300.0)
+        found[name] = scene_and_state(p)
+        if name == "uniform gravity":
+            scene, state, ts = found[name]
+            between = ts[:, :1] + (ts[:, 1:] - ts[:, :1]) * np.linspace(0, 1, 101)
+            found["uniform gravity, 101 times"] = scene, state, between
+    rng = np.random.default_rng(4)
+    state = ph.State(rng.normal(size=(count, 4)), rng.normal(size=(count, 3)))
+    for law in (clipped, rooted, hidden_jump):
+        body = ph.Inertia.from_moments([1.0, 1.6, 2.1])
+        scene = ph.Scene(body, torque=ph.FeedbackTorque(law))
+        found[law.__name__] = scene, state, np.array([0.0, 60.0])
+    return found
+
+
+def without(count: int, names: list[str]) -> list[dict]:
+    """Rows of the third table: sums over the bodies and over three tolerances."""
+    from polhode._integrate import _error_control as control
+
+    scenes = scenes_of_constants(count)
+    rtols = (1e-4, 1e-7, 1e-10)
+
+    def run(scene, state, ts, rtol):
+        record = ph.Record(final_only=ts.shape[-1] == 2)
+        t = ph.simulate(scene, state, ts, rtol=rtol, record=record, throw=False)
+        return t.wxyz[:, -1], t.steps, t.status
+
+    best = {k: run(*x, 3e-13)[0] for k, x in scenes.items()}
+    moved = {k: run(*x, 1e-12)[0] for k, x in scenes.items()}
+    rows: list[dict] = []
+    for constant in ["", *(names or NEUTRAL)]:
+        value = NEUTRAL.get(constant, 0.0)
+        before = getattr(control, constant, None)
+        if constant:
+            setattr(control, constant, value)
+        jax.clear_caches()
+        for name, (scene, state, ts) in scenes.items():
+            program = jax.jit(
+                lambda rtol, scene=scene, state=state, ts=ts: run(scene, state, ts, rtol)
+            )
+            jax.block_until_ready(program(1e-4))
+            ratios, steps, failed, seconds = [], 0, 0, 0.0
+            calm = angle(np.asarray(best[name]).T, np.asarray(moved[name]).T) < 1e-10
+            for rtol in rtols:
+                begin = time.process_time()
+                wxyz, taken, status = jax.block_until_ready(program(rtol))
+                seconds += time.process_time() - begin
+                good = calm & (np.asarray(status) == 0)
+                error = angle(np.asarray(wxyz).T, np.asarray(best[name]).T) / rtol
+                ratios += error[good].tolist()
+                steps, failed = (
+                    steps + int(np.sum(taken)),
+                    failed + int(np.sum(np.asarray(status) != 0)),
+                )
+            row = {
+                "constant": constant, "value": value, "scene": name, "steps": steps,
+                "failed": failed, "seconds": seconds, "median": float(np.median(ratios)),
+                "q95": float(np.quantile(ratios, 0.95)),
+                "beyond_10": int(np.sum(np.array(ratios) > 10)),
+            }  # fmt: skip
+            base = next((r for r in rows if not r["constant"] and r["scene"] == name), row)
+            rows.append(
+                row
+                | {"steps_ratio": steps / base["steps"], "time_ratio": seconds / base["seconds"]}
+            )
+            print(rows[-1], flush=True)
+        if constant:
+            setattr(control, constant, before)
+    return rows
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--bodies", type=int, default=150, help="of each family")
     parser.add_argument("--quick", action="store_true", help="20 bodies, 30 radians")
+    parser.add_argument("--constants", nargs="*", help="the third table only; of all, or of these")
     parser.add_argument("--output", type=Path)
     given = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     count, longest = (20, 30.0) if given.quick else (given.bodies, 1000.0)
+    if given.constants is not None:
+        found = {"constants": without(40, given.constants)}
+        _report.write("error_control_constants", found, path=given.output)
+        return
     found = {"steps": calibrated(10 * count, 3), "kept": kept(count, 11, longest)}
     _report.write("error_control", found, path=given.output)
 

@@ -99,6 +99,7 @@ def _child(kind: str, staged: bool) -> dict:
 
 def measure(kind: str, repeats: int) -> dict:
     """One row: the least of the repeats of every number."""
+    _report.compile_package()
     environment = {
         **os.environ,
         "JAX_ENABLE_COMPILATION_CACHE": "false",

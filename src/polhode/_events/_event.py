@@ -61,15 +61,17 @@ class Event(eqx.Module):
         self.terminal = terminal
         self.capacity = at_least("capacity", capacity, 1) or 1
 
-    def values(self, trajectory: Trajectory) -> tuple[Array, Array]:
-        """The function and its rate of change [1/s] at every sample (..., T)."""
+    def values(
+        self, trajectory: Trajectory, rates: list[Array] | None = None
+    ) -> tuple[Array, Array]:
+        """The function and its rate of change [1/s] at every sample (..., T); ``rates``: those of
+        the samples, where they are known."""
         wxyz, omega = trajectory.wxyz, trajectory.omega_body
         t = jnp.broadcast_to(trajectory._t, omega.shape[:-1])
-        slopes = (
-            wxyz_rate(wxyz, omega),
-            trajectory._scene.acceleration(wxyz, omega, trajectory._t),
-            jnp.ones_like(t),
-        )
+        if rates is None:
+            acceleration = trajectory._scene.acceleration(wxyz, omega, trajectory._t)
+            rates = [wxyz_rate(wxyz, omega), acceleration]
+        slopes = (*rates[:2], jnp.ones_like(t))
         return jax.jvp(partial(_FUNCTION.mapped, self.fn), (wxyz, omega, t), slopes)
 
     def differentiable_at(self, approximate: Trajectory, limit: Array) -> tuple[Array, Trajectory]:
@@ -115,8 +117,8 @@ class Event(eqx.Module):
         change nothing, and after two of them t has the first and second derivatives of the root.
         """
         stop_gradient = jax.lax.stop_gradient
-        value, slope = self.values(approximate)
-        later = shortly_after(approximate)
+        rates, later = shortly_after(approximate)
+        value, slope = self.values(approximate, rates)
         touch, chord = slope == 0, stop_gradient(jnp.where(slope == 0, 1, slope))
         delay = jnp.where(touch, 0, -value / chord)
         delay = delay - stop_gradient(delay) + stop_gradient(jnp.clip(delay, -limit, limit))

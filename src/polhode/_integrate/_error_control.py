@@ -5,9 +5,6 @@ bodies with long-double solutions (docs/design_notes.md); where no other command
 the one that shows the effect of a constant. eps: one unit in the last place, relative.
 """
 
-import jax.numpy as jnp
-from jaxtyping import Array
-
 # Both rules.
 
 SAFETY = 0.9
@@ -24,14 +21,8 @@ had one sign, which is rare (1 body in 300)."""
 ROUNDED_STEP = 8
 """[eps] Below it the error of a step is rounding: no shorter step reduces it."""
 
-MIN_FACTOR = 0.2
-"""[factor] Smallest change of the width after an accepted step."""
-
-MIN_REFUSED_FACTOR = 0.1
-"""[factor] Smallest change of the width after a refused step."""
-
-MAX_REFUSED_FACTOR = 0.9
-"""[factor] Largest change of the width after a refused step."""
+MIN_FACTOR, MAX_FACTOR = 0.1, 5
+"""[factor] Smallest and largest change of the width from step to step."""
 
 MIN_RATIO = 1e-6
 """[1] Errors over tolerance below this count as this, for the logarithm."""
@@ -66,12 +57,6 @@ FIRST_SHARE = 0.05
 allowed in proportion to the square of the angle. An early error has the longest time to grow, and
 at a high order a step with a twentieth of the error is only a fifth shorter."""
 
-COMPENSATED_STEP = 4
-"""[eps] The same as ``ROUNDED_STEP`` where steps carry their rounding errors along."""
-
-MAX_MIDPOINT_FACTOR = 4
-"""[factor] Largest growth of the width from step to step."""
-
 GRAIN = 64
 """[units in the last place of the time] A step this short, which a jump has cut, has an error of
 rounding that says nothing about the width: the next one grows by the largest factor."""
@@ -91,9 +76,6 @@ ROUGH_ERROR = 32
 JUMP_GAP = 1 / 16
 """[step] The search for jumps samples one, two and three of these from either end of a step."""
 
-JUMP_NOISE = 64
-"""[eps] Third differences of the rates below this are rounding and not jumps."""
-
 
 # Explicit Runge-Kutta steps.
 
@@ -102,20 +84,9 @@ EXPLICIT_SHARE = 2.0
 ten times and more: with 0.6 satellites keep a hundredth of ``rtol`` and take 1.2 times the steps;
 with 4 the worst of 64 exceeds ``rtol`` four times (``python -m benchmarks.torqued``)."""
 
-MAX_EXPLICIT_FACTOR = 5
-"""[factor] Largest growth of the width from step to step."""
-
 MAX_REVERSALS = 16
 """[switches] Consecutive ones that turn back at once, after which the motion slides along a
 switch."""
 
 UNDEFINED_SIDE = 0.98
 """[factor] Of the part of a step up to a switch beyond which the field is not defined."""
-
-
-def factor_bounds(accepted: Array, largest: float) -> tuple[Array, Array]:
-    """Smallest and ``largest`` change of the width, by whether each step was accepted."""
-    return (
-        jnp.where(accepted, MIN_FACTOR, MIN_REFUSED_FACTOR),
-        jnp.where(accepted, largest, MAX_REFUSED_FACTOR),
-    )

@@ -204,7 +204,7 @@ def advance(
     size = jnp.log(jnp.clip(state_ratio, control.MIN_RATIO, 1e12))
     memory = jnp.where(accepted, control.MEMORY * progress.last_error, 0)
     factor = control.SAFETY * jnp.exp((memory - size) / motion.rule.order)
-    factor = jnp.clip(factor, *control.factor_bounds(accepted, control.MAX_EXPLICIT_FACTOR))
+    factor = jnp.clip(factor, control.MIN_FACTOR, control.MAX_FACTOR)
     is_cut = accepted & (width < control.CUT * progress.width)
     proposed = jnp.where(is_cut, jnp.maximum(progress.width, width * factor), width * factor)
     guess = stop_gradient(_first_width(motion, options, progress.y, attempt.stages[0], length))

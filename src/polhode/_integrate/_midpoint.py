@@ -248,8 +248,7 @@ def integrate(
         first_share = control.FIRST_SHARE
         share = control.MIDPOINT_SHARE * (first_share + 3 * (1 - first_share) * fraction * fraction)
         tolerance = share * limits.rtol * angle / (expected * _drift(expected))
-        rounding = control.COMPENSATED_STEP if compensated else control.ROUNDED_STEP
-        tolerance = jnp.maximum(tolerance, rounding * eps)
+        tolerance = jnp.maximum(tolerance, control.ROUNDED_STEP * eps)
         sound = jnp.isfinite(error) & jnp.isfinite(angle)  # a step may well end beyond all numbers
         error, tolerance = jnp.where(sound, error, jnp.inf), jnp.where(sound, tolerance, 1)
         return jax.lax.stop_gradient((error, tolerance, jnp.where(sound, angle, 0)))
@@ -294,11 +293,11 @@ def integrate(
         size = jnp.log(jnp.maximum(ratio, control.MIN_RATIO))
         memory = jnp.where(accepted, control.MEMORY * carry.last_error, 0)
         factor = control.SAFETY * jnp.exp(power * (memory - size))
-        factor = jnp.clip(factor, *control.factor_bounds(accepted, control.MAX_MIDPOINT_FACTOR))
+        factor = jnp.clip(factor, control.MIN_FACTOR, control.MAX_FACTOR)
         # the error of a step that a jump has shortened to units in the last place of the time is
         # rounding and says nothing about the width that is possible
         is_short = width < control.GRAIN * grain.astype(dtype)
-        factor = jnp.where(accepted & is_short & ~is_cut, control.MAX_MIDPOINT_FACTOR, factor)
+        factor = jnp.where(accepted & is_short & ~is_cut, control.MAX_FACTOR, factor)
         proposed = jnp.where(
             accepted & is_cut, jnp.maximum(carry.width, width * factor), width * factor
         )
@@ -438,7 +437,6 @@ def _jump_error(rates, t, width, carry, end_state, end_rates, weights) -> Array:
     differences of smooth rates fall with their order; those of rates that jump do not.
     """
     gap = control.JUMP_GAP * width
-    eps = float(jnp.finfo(width.dtype).eps)
 
     def pick(at_end, a, b):
         return [jnp.where(at_end, y, x) for x, y in zip(a, b)]
@@ -472,8 +470,7 @@ def _jump_error(rates, t, width, carry, end_state, end_rates, weights) -> Array:
         sizes = [jnp.zeros_like(total)] * 3
         _, sizes = jax.lax.fori_loop(1, 4, further, ([base_rates, zero, zero], sizes))
         first, second, third = sizes
-        noise = control.JUMP_NOISE * eps * weighted_length(weights, base_rates)
-        jumps = third > jnp.maximum(0.5 * jnp.maximum(second, 0.5 * first), noise)
+        jumps = third > 0.5 * jnp.maximum(second, 0.5 * first)
         return total + jnp.where(jumps, third * jnp.abs(4 * gap), 0)
 
     return jax.lax.fori_loop(0, 2, add_end, jnp.zeros_like(carry.width))

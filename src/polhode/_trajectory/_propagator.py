@@ -146,7 +146,8 @@ def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
         end_states = [
             x[:, 0] for x in (result.wxyz, result.omega_body, result.spins) if x is not None
         ]
-        start_states = _along(scene, start, begin)(jnp.where(is_sample, step, 0))
+        _, later = _along(scene, start, begin)
+        start_states = later(jnp.where(is_sample, step, 0))
         states = [jnp.where(is_sample, x, end) for x, end in zip(start_states, end_states)]
         return (
             states,
@@ -181,21 +182,26 @@ def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
     return states, jnp.max(status, axis=-1), jax.tree.map(lambda x: jnp.sum(x, axis=-1), steps)
 
 
-def shortly_after(trajectory: Trajectory) -> Callable[[Array], Trajectory]:
-    """A function of delays (..., T) [s] so short that three terms of the Taylor series of the
-    samples lead there: of what is no later but for its derivatives, values and two derivatives."""
+def shortly_after(
+    trajectory: Trajectory,
+) -> tuple[list[Array], Callable[[Array], Trajectory]]:
+    """Rates of the samples, and a function of delays (..., T) [s] so short that three terms of the
+    Taylor series of the samples lead there: of what is no later but for its derivatives, values and
+    two derivatives."""
     t = trajectory
-    along = _along(t._scene, t._samples, t._t)
+    rates, along = _along(t._scene, t._samples, t._t)
 
     def later(delay: Array) -> Trajectory:
         return t._with_samples(t._t + delay, along(delay[..., None]), t.status, t._steps, None)
 
-    return later
+    return rates, later
 
 
-def _along(scene: Scene, samples: list[Array], t: Array) -> Callable[[Array], list[Array]]:
-    """A function of a step (..., 1) [s]: samples (..., 4), (..., 3) and momenta of coupled wheels
-    that much later."""
+def _along(
+    scene: Scene, samples: list[Array], t: Array
+) -> tuple[list[Array], Callable[[Array], list[Array]]]:
+    """Rates of samples (..., 4), (..., 3) and momenta of coupled wheels, and a function of a step
+    (..., 1) [s]: the samples that much later."""
 
     def rates(samples, t):
         wxyz, omega, *spins = samples
@@ -216,7 +222,7 @@ def _along(scene: Scene, samples: list[Array], t: Array) -> Callable[[Array], li
             for x, a, b in zip(samples, first_derivative, second_derivative)
         ]
 
-    return later
+    return first_derivative, later
 
 
 def _nearest(ts: Array, times: Array) -> Array:

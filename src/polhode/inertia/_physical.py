@@ -32,10 +32,6 @@ from polhode.rotation._quaternion import matrix_row
 # moments included; one more is cheap insurance.
 _SWEEPS = {2: 4, 4: 5, 8: 7}
 
-# Planes (p, q) of the rotations and the remaining axis r, in cyclic order: p -> q is right-handed
-# about r.
-_PLANES = ((0, 1, 2), (1, 2, 0), (2, 0, 1))
-
 
 def _turn(q, axis, cosine, sine):
     """Quaternion components of ``q`` followed, in body axes, by a turn about one body axis."""
@@ -48,9 +44,9 @@ def _turn(q, axis, cosine, sine):
     return (w * cosine - v[axis] * sine, *vector_part)
 
 
-def _rotate_plane(diagonal, off, q, plane):
-    """One Jacobi rotation that annuls entry (p, q); ``off[r]`` is the entry opposite to axis r."""
-    p, s, r = plane
+def _rotate_plane(diagonal, off, q):
+    """One Jacobi rotation that annuls entry (0, 1); ``off[r]`` is the entry opposite to axis r."""
+    p, s, r = 0, 1, 2
     difference = diagonal[p] - diagonal[s]
     twice = 2 * off[r]
     size = jnp.abs(difference) + jnp.hypot(difference, twice)
@@ -93,14 +89,14 @@ def _jacobi(diagonal, off):
     one = jnp.ones_like(diagonal[0])
     q = (one, *(jnp.zeros_like(one) for _ in range(3)))
 
-    def sweep(_, carry):
-        diagonal, off, q = carry
-        for plane in _PLANES:
-            diagonal, off, q = _rotate_plane(diagonal, off, q, plane)
-        return diagonal, off, q
+    def rotate(_, carry):
+        # with the axes renamed in turn, so that one rotation stands in the program for all three
+        diagonal, off, (w, *v) = _rotate_plane(*carry)
+        diagonal, off, v = ((b, c, a) for a, b, c in (diagonal, off, v))
+        return diagonal, off, (w, *v)
 
-    count = _SWEEPS[jnp.dtype(one.dtype).itemsize]
-    diagonal, off, q = jax.lax.fori_loop(0, count, sweep, (diagonal, off, q))
+    count = 3 * _SWEEPS[jnp.dtype(one.dtype).itemsize]
+    diagonal, off, q = jax.lax.fori_loop(0, count, rotate, (diagonal, off, q))
     _, q = _ordered(diagonal, q)
     # Of either sign. A scalar part that is zero but for rounding must not decide the sign: XLA may
     # compute it anew for each component, rounded otherwise, and these then differ in sign.
@@ -111,6 +107,9 @@ def _jacobi(diagonal, off):
 def _columns(q):
     """Columns of the rotation matrix of a unit quaternion: the principal axes in body axes."""
     return tuple(zip(*(matrix_row(q, i) for i in range(3))))
+
+
+_DIAGONAL, _OFF_DIAGONAL = ((0, 0), (1, 1), (2, 2)), ((1, 2), (2, 0), (0, 1))
 
 
 @jax.jit  # a hundred operations: outside of a program each would be one of its own
@@ -129,22 +128,24 @@ def principal(
     moments, products and wxyz together. This holds to first order: the second derivative of an
     eigenvalue depends on the rotation of the axes, which is omitted (see ``principal_moments``).
     """
-    entries = [[(tensor[..., i, j] + tensor[..., j, i]) / 2 for j in range(3)] for i in range(3)]
+    # the axes of the matrix first: as sums of products of arrays, which make a short program
+    tensor = jnp.moveaxis(tensor, (-2, -1), (0, 1))
+    tensor = (tensor + jnp.swapaxes(tensor, 0, 1)) / 2
     fixed = jax.lax.stop_gradient(tensor)
-    scale = jnp.max(jnp.abs(fixed), axis=(-2, -1))
-    scale = jnp.where(scale > 0, scale, 1)
-    unit = [[jax.lax.stop_gradient(entry) / scale for entry in row] for row in entries]
-    q = _jacobi((unit[0][0], unit[1][1], unit[2][2]), (unit[1][2], unit[2][0], unit[0][1]))
-    columns = _columns(q)
-    image = [[sum(row[k] * c[k] for k in range(3)) for row in entries] for c in columns]
-
-    def entry(i, j):
-        return sum(columns[i][k] * image[j][k] for k in range(3))
-
+    scale = jnp.max(jnp.abs(fixed), axis=(0, 1))
+    unit = fixed / jnp.where(scale > 0, scale, 1)
+    diagonal, off = (tuple(unit[i, j] for i, j in pairs) for pairs in (_DIAGONAL, _OFF_DIAGONAL))
+    q = _jacobi(diagonal, off)
+    columns = jnp.stack([jnp.stack(column) for column in _columns(q)])
+    image = jnp.sum(tensor[None] * columns[:, None], axis=2)
+    turned = jnp.sum(columns[:, None] * image[None], axis=2)
+    moments, products = (
+        jnp.stack([turned[i, j] for i, j in pairs]) for pairs in (_DIAGONAL, _OFF_DIAGONAL)
+    )
     # Rayleigh quotients: the rounding of the quaternion's norm drops out
-    moments = jnp.stack([entry(i, i) / sum(x * x for x in columns[i]) for i in range(3)], axis=-1)
-    products = jnp.stack([entry(1, 2), entry(2, 0), entry(0, 1)], axis=-1)
-    return moments, jnp.stack(q, axis=-1), products - jax.lax.stop_gradient(products)
+    moments = moments / jnp.sum(columns * columns, axis=1)
+    products = products - jax.lax.stop_gradient(products)
+    return jnp.moveaxis(moments, 0, -1), jnp.stack(q, axis=-1), jnp.moveaxis(products, 0, -1)
 
 
 @jax.jit
