@@ -132,7 +132,7 @@ def principal(
     tensor = jnp.moveaxis(tensor, (-2, -1), (0, 1))
     tensor = (tensor + jnp.swapaxes(tensor, 0, 1)) / 2
     fixed = jax.lax.stop_gradient(tensor)
-    scale = jnp.max(jnp.abs(fixed), axis=(0, 1))
+    scale = jnp.max(jnp.abs(fixed), axis=(0, 1), keepdims=True)
     unit = fixed / jnp.where(scale > 0, scale, 1)
     diagonal, off = (tuple(unit[i, j] for i, j in pairs) for pairs in (_DIAGONAL, _OFF_DIAGONAL))
     q = _jacobi(diagonal, off)
