@@ -137,13 +137,13 @@ def principal(
     diagonal, off = (tuple(unit[i, j] for i, j in pairs) for pairs in (_DIAGONAL, _OFF_DIAGONAL))
     q = _jacobi(diagonal, off)
     columns = jnp.stack([jnp.stack(column) for column in _columns(q)])
-    image = jnp.sum(tensor[None] * columns[:, None], axis=2)
-    turned = jnp.sum(columns[:, None] * image[None], axis=2)
+    image = sum(tensor[None, :, k] * columns[:, None, k] for k in range(3))
+    turned = sum(columns[:, None, k] * image[None, :, k] for k in range(3))
     moments, products = (
         jnp.stack([turned[i, j] for i, j in pairs]) for pairs in (_DIAGONAL, _OFF_DIAGONAL)
     )
     # Rayleigh quotients: the rounding of the quaternion's norm drops out
-    moments = moments / jnp.sum(columns * columns, axis=1)
+    moments = moments / sum(columns[:, k] * columns[:, k] for k in range(3))
     products = products - jax.lax.stop_gradient(products)
     return jnp.moveaxis(moments, 0, -1), jnp.stack(q, axis=-1), jnp.moveaxis(products, 0, -1)
 
