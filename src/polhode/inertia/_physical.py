@@ -15,7 +15,9 @@ equal moments included.
 Shapes are always checked, values only where they are concrete.
 """
 
+from collections.abc import Iterable
 from functools import reduce
+from operator import add
 
 import jax
 import jax.numpy as jnp
@@ -112,6 +114,11 @@ def _columns(q):
 _DIAGONAL, _OFF_DIAGONAL = ((0, 0), (1, 1), (2, 2)), ((1, 2), (2, 0), (0, 1))
 
 
+def _total(terms: Iterable[Array]) -> Array:
+    """Their sum; ``jnp.sum`` would round otherwise."""
+    return reduce(add, terms)
+
+
 @jax.jit  # a hundred operations: outside of a program each would be one of its own
 def principal(
     tensor: Float[Array, "*b 3 3"],
@@ -137,13 +144,13 @@ def principal(
     diagonal, off = (tuple(unit[i, j] for i, j in pairs) for pairs in (_DIAGONAL, _OFF_DIAGONAL))
     q = _jacobi(diagonal, off)
     columns = jnp.stack([jnp.stack(column) for column in _columns(q)])
-    image = sum(tensor[None, :, k] * columns[:, None, k] for k in range(3))
-    turned = sum(columns[:, None, k] * image[None, :, k] for k in range(3))
+    image = _total(tensor[None, :, k] * columns[:, None, k] for k in range(3))
+    turned = _total(columns[:, None, k] * image[None, :, k] for k in range(3))
     moments, products = (
         jnp.stack([turned[i, j] for i, j in pairs]) for pairs in (_DIAGONAL, _OFF_DIAGONAL)
     )
     # Rayleigh quotients: the rounding of the quaternion's norm drops out
-    moments = moments / sum(columns[:, k] * columns[:, k] for k in range(3))
+    moments = moments / _total(columns[:, k] * columns[:, k] for k in range(3))
     products = products - jax.lax.stop_gradient(products)
     return jnp.moveaxis(moments, 0, -1), jnp.stack(q, axis=-1), jnp.moveaxis(products, 0, -1)
 
