@@ -367,8 +367,9 @@ def without(count: int, names: list[str]) -> list[dict]:
                 )
             row = {
                 "constant": constant, "value": value, "scene": name, "steps": steps,
-                "failed": failed, "seconds": seconds, "median": float(np.median(ratios)),
-                "q95": float(np.quantile(ratios, 0.95)),
+                "failed": failed, "seconds": seconds,
+                "median": float(np.median(ratios)) if ratios else None,
+                "q95": float(np.quantile(ratios, 0.95)) if ratios else None,
                 "beyond_10": int(np.sum(np.array(ratios) > 10)),
             }  # fmt: skip
             base = next((r for r in rows if not r["constant"] and r["scene"] == name), row)
