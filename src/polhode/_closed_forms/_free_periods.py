@@ -349,11 +349,13 @@ def _periods_rule(primals, tangents):
         (dangle - rate * 4 * dquarter) / period,
     )
     is_moving = about > 0
-    dP_psi = jnp.where(permanent, 0, 4 * dquarter / rate_unit)
+    # zero, but NaN once derived by what has no right derivatives
+    unmoved = 0 * energy
+    dP_psi = jnp.where(permanent, unmoved, 4 * dquarter / rate_unit)
     dP_phi = jnp.where(is_moving, -P_phi / jnp.where(is_moving, rate, 1) * drate, 0)
     dP_phi = jnp.where(is_moving, dP_phi, 0)
-    dm1 = jnp.where(x > 0, (dz - polhode.m1 * dx) / divisor, 0)
-    dk2 = jnp.where(x > 0, (dy - k2 * dx) / divisor, 0)
+    dm1 = jnp.where(x > 0, (dz - polhode.m1 * dx) / divisor, unmoved)
+    dk2 = jnp.where(x > 0, (dy - k2 * dx) / divisor, unmoved)
     dm1, dk2 = jnp.where(polhode.circular, -dk2, dm1), jnp.where(polhode.circular, dk2, -dm1)
     angles = jax.jvp(
         lambda *a: _angles(polhode.sense, *a),

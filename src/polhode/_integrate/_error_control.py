@@ -1,8 +1,9 @@
 """Constants of the error control, of both rules of steps: unit in brackets, meaning, what fits it.
 
 ``python -m benchmarks.error_control`` compares estimates, requested and reached errors of random
-bodies with long-double solutions (docs/design_notes.md); where no other command is named, it is
-the one that shows the effect of a constant. eps: one unit in the last place, relative.
+bodies with long-double solutions (docs/design_notes.md), and with ``--constants`` the steps and
+errors without each constant, where no other command is named. eps: one unit in the last place,
+relative.
 """
 
 # Both rules.

@@ -135,7 +135,8 @@ def principal(
     moments, products and wxyz together. This holds to first order: the second derivative of an
     eigenvalue depends on the rotation of the axes, which is omitted (see ``principal_moments``).
     """
-    # the axes of the matrix first: as sums of products of arrays, which make a short program
+    # Rows and columns are the first axes, and whole arrays are multiplied: written entry by entry
+    # the program takes twice as long to compile.
     tensor = jnp.moveaxis(tensor, (-2, -1), (0, 1))
     tensor = (tensor + jnp.swapaxes(tensor, 0, 1)) / 2
     fixed = jax.lax.stop_gradient(tensor)
