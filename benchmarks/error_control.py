@@ -278,6 +278,7 @@ NEUTRAL = {
     "CALIBRATION": 1.0,
     "MIDPOINT_SHARE": 1.0,
     "FIRST_SHARE": 1.0,
+    "COMPENSATED_STEP": 0.0,
     "GRAIN": 0.0,
     "ROUGH_FALL": 1e30,
     "ROUGH_ROUNDING": 0.0,

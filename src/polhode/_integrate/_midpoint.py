@@ -248,7 +248,8 @@ def integrate(
         first_share = control.FIRST_SHARE
         share = control.MIDPOINT_SHARE * (first_share + 3 * (1 - first_share) * fraction * fraction)
         tolerance = share * limits.rtol * angle / (expected * _drift(expected))
-        tolerance = jnp.maximum(tolerance, control.ROUNDED_STEP * eps)
+        rounding = control.COMPENSATED_STEP if compensated else control.ROUNDED_STEP
+        tolerance = jnp.maximum(tolerance, rounding * eps)
         sound = jnp.isfinite(error) & jnp.isfinite(angle)  # a step may well end beyond all numbers
         error, tolerance = jnp.where(sound, error, jnp.inf), jnp.where(sound, tolerance, 1)
         return jax.lax.stop_gradient((error, tolerance, jnp.where(sound, angle, 0)))
