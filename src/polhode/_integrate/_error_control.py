@@ -59,8 +59,8 @@ allowed in proportion to the square of the angle. An early error has the longest
 at a high order a step with a twentieth of the error is only a fifth shorter."""
 
 COMPENSATED_STEP = 4
-"""[eps] The same as ``ROUNDED_STEP`` where steps carry their rounding errors along. With 8, errors in
-single precision are two to three times as large (``tests/solvers/test_error_control.py``)."""
+"""[eps] The same as ``ROUNDED_STEP`` where steps carry their rounding errors along. With 8, errors
+in single precision are two to three times as large (``tests/solvers/test_error_control.py``)."""
 
 GRAIN = 64
 """[units in the last place of the time] A step this short, which a jump has cut, has an error of
