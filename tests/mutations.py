@@ -168,8 +168,8 @@ MUTANTS = (
     ),
     Mutant(
         PERIODS,
-        "dP_psi = jnp.where(permanent, 0, 4 * dquarter / rate_unit)",
-        "dP_psi = jnp.where(permanent, 0, 2 * dquarter / rate_unit)",
+        "dP_psi = jnp.where(permanent, unmoved, 4 * dquarter / rate_unit)",
+        "dP_psi = jnp.where(permanent, unmoved, 2 * dquarter / rate_unit)",
         "derivatives of the period about the long axis are half",
         ("free/test_periods.py::test_derivatives", "free/test_periods.py"),
     ),
