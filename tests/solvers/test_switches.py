@@ -79,6 +79,30 @@ def test_what_cannot_be_looked_into_is_named():
     assert ph.simulate(scene, state, TS[:3]).successful
 
 
+@pytest.mark.parametrize("torque", [1e-2, 1e-3])
+def test_jumps_that_a_loop_hides_are_found(torque):
+    """A ball is slowed down at 2 ``torque`` until its rate passes 1 rad/s, then at ``torque``: weak
+    beside the rates, so that the jump is easy to overlook."""
+
+    def law(t, wxyz, omega):
+        above = jax.lax.while_loop(
+            lambda x: (omega[2] > 1) & (x == 0), lambda x: x + 1.0, 0 * omega[2]
+        )
+        return -torque * (1 + above) * jnp.eye(3)[2]
+
+    span, rtol = 20.0, 1e-8
+    passing = np.random.default_rng(6).uniform(1, 19, 48)
+    omega = jnp.zeros((48, 3)).at[:, 2].set(1 + 2 * torque * passing)
+    later = span - passing
+    angle = (1 + torque * passing) * passing + (1 - torque * later / 2) * later
+    state = ph.State(jnp.tile(jnp.eye(4)[0], (48, 1)), omega)
+    scene = ph.Scene(ph.Inertia.spherical(1.0), torque=ph.FeedbackTorque(law))
+    last = ph.simulate(scene, state, [0.0, span], rtol=rtol).last
+    error = 2 * np.arctan2(last.wxyz[:, 3], last.wxyz[:, 0]) - angle
+    error = np.abs((error + np.pi) % (2 * np.pi) - np.pi)
+    assert error.max() < 3 * rtol
+
+
 LAWS = {
     "clip": lambda p: lambda t, q, w: jnp.clip(-p[0] * w - p[1] * q[1:], -0.2, 0.2),
     "dead band": lambda p: (

@@ -62,9 +62,9 @@ COMPENSATED_STEP = 4
 """[eps] The same as ``ROUNDED_STEP`` where steps carry their rounding errors along. With 8, errors
 in single precision are two to three times as large (``tests/solvers/test_error_control.py``)."""
 
-GRAIN = 64
-"""[units in the last place of the time] A step this short, which a jump has cut, has an error of
-rounding that says nothing about the width: the next one grows by the largest factor."""
+SHORT_STEP = 0.01
+"""[rad] A step as short as this whose error is rounding says nothing about the width that is
+possible: the next one is longer by the largest factor."""
 
 # Where a torque jumps within a step, the last two values of the table differ by less than their
 # errors. This shows in errors that do not fall with the order when a refused step is shortened.
@@ -79,7 +79,14 @@ ROUGH_ERROR = 32
 """[factor] Of the estimate in such a step."""
 
 JUMP_GAP = 1 / 16
-"""[step] The search for jumps samples one, two and three of these from either end of a step."""
+"""[step] The search for jumps samples one to four of these from either end of a step."""
+
+JUMP_RATIO = 0.75
+"""[factor] Fourth over third difference of the samples from which on they count as a jump: 1 to 3
+where the rates jump, two thirds at an extremum of smooth rates, less elsewhere."""
+
+JUMP_NOISE = 64
+"""[eps] Fourth differences below this, of the rates, are rounding."""
 
 
 # Explicit Runge-Kutta steps.
@@ -88,6 +95,10 @@ EXPLICIT_SHARE = 2.0
 """[rtol] Bound of the sum of the estimated errors. The estimate, of lower order, exceeds the error
 ten times and more: with 0.6 satellites keep a hundredth of ``rtol`` and take 1.2 times the steps;
 with 4 the worst of 64 exceeds ``rtol`` four times (``python -m benchmarks.torqued``)."""
+
+GRAIN = 64
+"""[units in the last place of the time] The motion starts anew beyond a switch that is this close
+and beyond which the field is not defined."""
 
 MAX_REVERSALS = 16
 """[switches] Consecutive ones that turn back at once, after which the motion slides along a

@@ -295,9 +295,10 @@ def integrate(
         memory = jnp.where(accepted, control.MEMORY * carry.last_error, 0)
         factor = control.SAFETY * jnp.exp(power * (memory - size))
         factor = jnp.clip(factor, control.MIN_FACTOR, control.MAX_FACTOR)
-        # the error of a step that a jump has shortened to units in the last place of the time is
-        # rounding and says nothing about the width that is possible
-        is_short = width < control.GRAIN * grain.astype(dtype)
+        # the error of a step that a jump has shortened is rounding, which says nothing about the
+        # width that is possible
+        is_rounding = jnp.maximum(angle / control.SHORT_STEP, error / (control.ROUNDED_STEP * eps))
+        is_short = worst(is_rounding, failed(constants, carry)) < 1
         factor = jnp.where(accepted & is_short & ~is_cut, control.MAX_FACTOR, factor)
         proposed = jnp.where(
             accepted & is_cut, jnp.maximum(carry.width, width * factor), width * factor
@@ -435,9 +436,11 @@ def _jump_error(rates, t, width, carry, end_state, end_rates, weights) -> Array:
     No column of the midpoint rule looks between either end of a step and its first or last
     substep but at the end itself, and steps that are refused again and again near a jump end up
     with it there. Along a straight line, the tangent at the start or the chord at the end,
-    differences of smooth rates fall with their order; those of rates that jump do not.
+    differences of smooth rates fall with their order; those of rates that jump do not. The rates
+    of a free body are quadratic there, so that a weak jump shows from the third difference on.
     """
     gap = control.JUMP_GAP * width
+    eps = float(jnp.finfo(width.dtype).eps)
 
     def pick(at_end, a, b):
         return [jnp.where(at_end, y, x) for x, y in zip(a, b)]
@@ -464,15 +467,16 @@ def _jump_error(rates, t, width, carry, end_state, end_rates, weights) -> Array:
                 row = [a - b for a, b in zip(row, older)]
                 rows.append(row)
             lengths = [weighted_length(weights, x) for x in rows[1:]]
-            sizes = [jnp.where(k == n, x, y) for n, x, y in zip((1, 2, 3), lengths, sizes)]
-            return rows[:3], sizes
+            sizes = [jnp.where(k == n, x, y) for n, x, y in zip((3, 4), lengths[2:], sizes)]
+            return rows[:4], sizes
 
         zero = [jnp.zeros_like(x) for x in base_rates]
-        sizes = [jnp.zeros_like(total)] * 3
-        _, sizes = jax.lax.fori_loop(1, 4, further, ([base_rates, zero, zero], sizes))
-        first, second, third = sizes
-        jumps = third > 0.5 * jnp.maximum(second, 0.5 * first)
-        return total + jnp.where(jumps, third * jnp.abs(4 * gap), 0)
+        sizes = [jnp.zeros_like(total)] * 2
+        _, sizes = jax.lax.fori_loop(1, 5, further, ([base_rates, zero, zero, zero], sizes))
+        third, fourth = sizes
+        noise = control.JUMP_NOISE * eps * weighted_length(weights, base_rates)
+        jumps = fourth > jnp.maximum(control.JUMP_RATIO * third, noise)
+        return total + jnp.where(jumps, fourth * jnp.abs(5 * gap), 0)
 
     return jax.lax.fori_loop(0, 2, add_end, jnp.zeros_like(carry.width))
 
