@@ -269,7 +269,10 @@ def _stiff(scene: Scene, state: State, ts: Array) -> str | None:
     """A warning where explicit steps are limited by stability; None where they are not."""
     if (scene.torque is None and scene.rotors is None) or not is_concrete(scene, state, ts):
         return None
-    rate = float(np.max(_decay(scene, state.as_unit(), ts), initial=0))
+    try:
+        rate = float(np.max(_decay(scene, state.as_unit(), ts), initial=0))
+    except ValueError:  # a part has no derivative, as one that calls Python back
+        return None
     number = rate * float(np.max(np.abs(ts[..., -1] - ts[..., 0])))
     if not number >= _STIFF:
         return None

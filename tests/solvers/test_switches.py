@@ -18,6 +18,7 @@ MOMENTS = np.array([1.0, 1.5, 2.0])
 INERTIA = ph.Inertia.from_moments(MOMENTS)
 WXYZ, OMEGA = np.array([1.0, 0.0, 0.0, 0.0]), np.array([0.31, -0.2, 1.0])
 TS = np.linspace(0.0, 10.0, 11)
+TABLE = jnp.array([-0.9, -0.1, 0.3, 0.8])
 
 
 def program(fn, *examples):
@@ -37,6 +38,13 @@ def program(fn, *examples):
         (jnp.floor, 3, True),
         (lambda x: jnp.round(2 * x), 3, True),
         (lambda x: x % 1.0, 6, True),
+        (lambda x: TABLE[jnp.searchsorted(TABLE[:3], x)], 6, True),
+        (lambda x: jnp.interp(x, TABLE, TABLE**2), None, True),
+        (lambda x: TABLE[jnp.argmax(x)] * x, 2, True),
+        (lambda x: TABLE[jnp.argsort(x)], 3, True),
+        (lambda x: jax.lax.top_k(x, 2)[0], 3, True),
+        (lambda x: jax.lax.cummax(x), 2, False),
+        (lambda x: jnp.sort(x), 3, False),
         (lambda x: x.astype(jnp.int32).astype(x.dtype), 3, True),
         (jnp.max, 2, False),
         (jnp.sort, 3, False),
@@ -101,6 +109,61 @@ def test_jumps_that_a_loop_hides_are_found(torque):
     error = 2 * np.arctan2(last.wxyz[:, 3], last.wxyz[:, 0]) - angle
     error = np.abs((error + np.pi) % (2 * np.pi) - np.pi)
     assert error.max() < 3 * rtol
+
+
+def looked_up(p, rate):
+    """Deceleration in five ranges of the rate, from a table with the knots ``p`` times ..."""
+    knots = p * jnp.array([0.2, 0.4, 0.6, 0.8])
+    return jnp.array([0.3, 0.05, 0.2, 0.1, 0.15])[jnp.digitize(rate, knots)]
+
+
+def largest(p, rate):
+    """The same in two ranges, by the place of the largest of three numbers."""
+    return jnp.array([0.1, 0.2, 0.3])[jnp.argmax(jnp.stack([p, rate, 0.1 * p]))]
+
+
+@pytest.mark.parametrize(
+    ("law", "p", "span", "slope"),
+    [
+        (looked_up, 1.1, 4.0, 0.6 + 0.2 * (0.2 / 0.1 - 0.8 / 0.15)),
+        pytest.param(largest, 0.7, 3.0, 0.5, marks=pytest.mark.slow),
+    ],
+)
+def test_derivatives_through_a_table(law, p, span, slope):
+    """A search in a table turns several comparisons at once."""
+
+    def final_rate(p):
+        scene = ph.Scene(
+            ph.Inertia.spherical(1.0),
+            torque=ph.FeedbackTorque(lambda t, q, w: -law(p, w[2]) * jnp.eye(3)[2]),
+        )
+        state = ph.State([1.0, 0, 0, 0], [0.0, 0, 1.0])
+        return ph.simulate(scene, state, [0.0, span], rtol=1e-9).last.omega_body[2]
+
+    np.testing.assert_allclose(jax.grad(final_rate)(p), slope, rtol=1e-7)
+
+
+def test_derivatives_that_would_miss_jumps_are_refused():
+    def signed(x, rate):
+        negative = jax.lax.bitcast_convert_type(rate - x, jnp.int64) < 0
+        return jnp.where(negative, 0.1, 0.2)
+
+    def final_rate(x):
+        law = lambda t, q, w: -signed(x, w[2]) * jnp.eye(3)[2]  # noqa: E731
+        scene = ph.Scene(ph.Inertia.spherical(1.0), torque=ph.FeedbackTorque(law))
+        state = ph.State([1.0, 0, 0, 0], [0.0, 0, 1.0])
+        return ph.simulate(scene, state, [0.0, 3.0]).last.omega_body[2]
+
+    with pytest.raises(NotImplementedError, match="bitcast_convert_type in a torque"):
+        jax.grad(final_rate)(0.7)
+
+
+def test_a_torque_that_calls_python_is_explained():
+    def braking(t, wxyz, omega):
+        return jax.pure_callback(lambda w: -0.1 * np.asarray(w), omega, omega)
+
+    scene = ph.Scene(INERTIA, None, ph.FeedbackTorque(braking))
+    assert "contains pure_callback" in str(ph.explain(scene, ph.State(WXYZ, OMEGA), TS))
 
 
 LAWS = {

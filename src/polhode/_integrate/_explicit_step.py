@@ -23,8 +23,8 @@ class Motion(NamedTuple):
     which each switch would turn, for levels (K, B), times (B,) and states (D, B);
     ``levels(arguments, t, y)``: the levels at a point; ``units(unit_data, y, rates)``: weights of
     the components of an error, the squares of which are summed, and natural rates [rad/s] (B,). The
-    last ``events`` of the K ``switches`` are events; ``jumps``: whether the rates may jump at one
-    of the others; ``rule``: of the steps."""
+    last ``events`` of the K ``switches`` are events; ``jumps``: for each switch, whether the rates
+    may jump there, empty where they do at none; ``rule``: of the steps."""
 
     rates: Callable[..., tuple[Array, Array, Array]]
     levels: Callable[..., Array]
@@ -35,7 +35,7 @@ class Motion(NamedTuple):
     rule: Tableau
     switches: int
     events: int = 0
-    jumps: bool = True
+    jumps: tuple[bool, ...] = ()
 
 
 class Progress(NamedTuple):

@@ -25,7 +25,13 @@ from polhode._integrate._explicit_step import (
     weighted,
 )
 from polhode._integrate._field import weighted_length
-from polhode._integrate._switch_location import SwitchPoint, first_switch, pick, undefined_side
+from polhode._integrate._switch_location import (
+    SwitchPoint,
+    first_of_jumps,
+    first_switch,
+    pick,
+    undefined_side,
+)
 from polhode._kernels import any_of, kernel, put
 from polhode._method import StepCounts
 
@@ -192,6 +198,7 @@ def advance(
             & (progress.just_turned == 0)
             & ~is_first[None]
         )
+        wrong_levels = first_of_jumps(motion, wrong_levels)
         accepted = accepted & ~jnp.any(wrong_levels, axis=0)
         turn = first_switch(motion, options, progress, attempt, t, accepted, eps)
     hit = jnp.zeros_like(accepted) if turn is None else turn.hit

@@ -163,7 +163,7 @@ class Problem(NamedTuple):
                 list(constants), t, y
             )
 
-        jumps = bool(self.switches.jumps[: count - self.events].any())
+        jumps = *self.switches.jumps[: count - self.events].tolist(), *[False] * self.events
         return Motion(
             rates,
             levels,
@@ -174,7 +174,7 @@ class Problem(NamedTuple):
             rule,
             count,
             self.events,
-            jumps,
+            jumps if any(jumps) else (),
         )
 
 

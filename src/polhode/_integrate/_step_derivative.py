@@ -262,7 +262,9 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums):
         return number - 1, notes, *jax.lax.fori_loop(0, turns, back, tuple(cotangent_carry))
 
     place = jnp.full(start.shape, times.shape[0] - 1, jnp.int32)
-    initial_carry = final, notes, sound(noted(last_progress)), jnp.zeros_like(y), sums, place
+    last = sound(noted(last_progress))
+    later = last.levels if motion.jumps else None
+    initial_carry = final, notes, last, later, jnp.zeros_like(y), sums, place
     *_, cotangent, sums, _ = jax.lax.while_loop(lambda c: c[0] >= 0, segment, initial_carry)
     any_finished = any_of(jnp.where(finished, 1.0, 0.0))
     return jnp.where(finished[None], cotangent, 0), [jnp.where(any_finished, x, 0) for x in sums]
@@ -283,12 +285,15 @@ def _step_back(
     finished,
     note: _Note,
     after: _Note,
+    later,
     cotangent,
     sums,
     place,
 ):
-    """From cotangents after a turn of the loop to those before it. ``place`` (B,): index of the
-    last sample that has not been passed yet."""
+    """From cotangents after a turn of the loop to those before it. ``later``: levels with which the
+    motion goes on from ``after``, once those are corrected that depend on the one that has turned
+    (of a search in a table every comparison but the first); ``place`` (B,): index of the last
+    sample that has not been passed yet."""
     levels = note.levels.astype(cotangent.dtype)
     sign = jnp.where(times[-1] < start, -1, 1).astype(cotangent.dtype)
     t = start + sign * note.elapsed
@@ -305,8 +310,11 @@ def _step_back(
     values = [motion.coefficients[k] for k in floats]
     if motion.jumps:
         pulled, parameter_cotangents = _jump_back(
-            rates_of, values, motion, note, after, t + h, cotangent, live
+            rates_of, values, motion, note, after, later, t + h, cotangent, live
         )
+        # levels corrected without a step belong to the turn before, of the same time
+        is_correction = (after.elapsed == note.elapsed) & (note.elapsed > 0)
+        later = jnp.where(is_correction[None], later, note.levels)
         cotangent, sums = cotangent + pulled, [a + b for a, b in zip(sums, parameter_cotangents)]
 
     def has_sample(place):
@@ -363,20 +371,23 @@ def _step_back(
         return bars, cotangent + change, [a + b for a, b in zip(sums, parameter_cotangents)]
 
     _, cotangent, sums = jax.lax.fori_loop(0, top, back, (bars, cotangent, sums))
-    return note, cotangent, sums, place
+    return note, later, cotangent, sums, place
 
 
-def _jump_back(rates_of, values, motion, note: _Note, after: _Note, t, cotangent, live):
+def _jump_back(rates_of, values, motion, note: _Note, after: _Note, later, t, cotangent, live):
     """Contribution of the time of a switch that turned, to the cotangents of the state and of
     ``values`` (the saltation term)."""
-    flips = (note.levels != after.levels) & live[None]
+    flips = note.levels != after.levels
+    flips = jnp.where(jnp.any(flips, axis=0), flips, after.levels != later)
+    is_correction = (after.elapsed == note.elapsed) & (note.elapsed > 0)
+    flips = flips & (live & ~is_correction)[None]
     # events do not change the rates
     field = jnp.arange(motion.switches) < motion.switches - motion.events
     flips = flips & field[:, None]
     share = jnp.where(flips, 1, 0).astype(cotangent.dtype)
     share = share / jnp.maximum(jnp.sum(share, axis=0, keepdims=True), 1)
     rates_before, *_ = rates_of(values, note.levels, t, after.y)
-    rates_after, *_ = rates_of(values, after.levels, t, after.y)
+    rates_after, *_ = rates_of(values, later, t, after.y)
 
     def margin(parameters, t, y):
         return jnp.sum(

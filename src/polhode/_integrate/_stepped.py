@@ -28,6 +28,7 @@ from polhode._integrate._loop import Found, LoopOptions, Search, solve, with_eve
 from polhode._integrate._midpoint import Progress
 from polhode._integrate._problem import Problem
 from polhode._integrate._step_derivative import samples
+from polhode._integrate._switches import NOT_DIFFERENTIABLE
 from polhode._integrate._tableau import TSIT5
 from polhode._kernels import Distinct, is_holdable, kernel
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts, check_options
@@ -144,6 +145,9 @@ class AbstractIntegration(AbstractMethod):
             result = self._run_by_loop(scene, state, ts, rtol, record)
             if result is not None:
                 return result[0]
+        hidden: tuple[str, ...] = ()
+        if self._is_automatic and jumps:
+            hidden = self._problem(scene, state, ts, record).switches.hidden_operations
         size = 1
         if ts.ndim == 1:
             size = self.chunk or self._bodies_at_once(scene, state, ts, record)
@@ -160,12 +164,12 @@ class AbstractIntegration(AbstractMethod):
             solve_all = (
                 kernel(solve_chunk, of_units=True) if n <= _policy.KERNEL_BODIES else solve_chunk
             )
-            return solve_all(Distinct((lanes, times)))
+            return _undifferentiable(solve_all(Distinct((lanes, times))), hidden)
         # chunks of bodies with similar rates, the fastest first: no slow body is left for the end
         order = jnp.argsort(-natural_rates(scene, state, ts))
         sorted_lanes = jax.tree.map(lambda x: x[order], Distinct((lanes, times)))
         results = map_chunks(solve_chunk, sorted_lanes, n, size)
-        return jax.tree.map(lambda x: x[jnp.argsort(order)], results)
+        return _undifferentiable(jax.tree.map(lambda x: x[jnp.argsort(order)], results), hidden)
 
     def _initial_state(self, scene, state, ts, record: Record):
         """The initial state, with the work where it is recorded, and whether the coordinates hold
@@ -589,3 +593,26 @@ class EulerAngles(AbstractIntegration):
         super().__init__(
             EulerChart(), 1, solver, controller, dt0, max_steps, adjoint, progress_meter, chunk
         )
+
+
+def _undifferentiable(tree: Any, hidden: tuple[str, ...]) -> Any:
+    """The same arrays, whose derivatives raise where they would leave out jumps inside of an
+    operation, which does not raise by itself."""
+    named = [name for name in hidden if name not in NOT_DIFFERENTIABLE]
+    if not named:
+        return tree
+
+    @jax.custom_jvp
+    def guarded(x):
+        return x
+
+    @guarded.defjvp
+    def rule(primals, tangents):
+        raise NotImplementedError(
+            f"derivatives through {', '.join(named)} in a torque would leave out the times at which"
+            " its result jumps. Write it with comparisons, jnp.where, jnp.searchsorted, jnp.argmax"
+            " or jnp.sort of at most 16 numbers: steps end where these turn, and derivatives are"
+            " right."
+        )
+
+    return jax.tree.map(lambda x: guarded(x) if eqx.is_inexact_array(x) else x, tree)

@@ -226,7 +226,7 @@ def first_switch(
     )
     search = jax.lax.while_loop(lambda c: any_of(jnp.where(c.mode > 0, 1.0, 0.0)), iterate, search)
     # halved margins keep their signs
-    flips = search.at_high < 0
+    flips = first_of_jumps(motion, search.at_high < 0)
     part = search.high
     _, progress, attempt, _ = traced_constants
     if options.differentiable:
@@ -238,6 +238,19 @@ def first_switch(
     # kinks and events have the levels 0 and 1
     levels = 1 - progress.levels if search.new_levels is None else search.new_levels
     return SwitchPoint(search.hit & ~is_lost, part, state, levels, flips, start_fraction)
+
+
+def first_of_jumps(motion, flips: Array) -> Array:
+    """Of switches (K, B) that would turn together, among which the rates jump at some, the first of
+    these, and events. The other ones may depend on it, as comparisons do in a search in a table:
+    whether they turn too is seen at the start of the next step."""
+    if not motion.jumps:
+        return flips
+    order = jnp.arange(motion.switches)[:, None]
+    is_jump = jnp.asarray(motion.jumps)[:, None]
+    first = jnp.min(jnp.where(flips & is_jump, order, motion.switches), axis=0)[None]
+    is_event = order >= motion.switches - motion.events
+    return flips & ((first == motion.switches) | (order == first) | is_event)
 
 
 DONE, ROOT, UPPER_END, MINIMUM, FIRST = range(5)

@@ -21,12 +21,18 @@ from polhode._kernels import SMOOTH
 _CALLS = frozenset(
     "jit pjit closed_call core_call custom_jvp_call custom_vjp_call remat2 checkpoint".split()  # noqa: SIM905
 )
-_ORDERED = frozenset(("gt", "ge", "lt", "le"))
+_ORDERED = frozenset(("gt", "ge", "lt", "le", "lt_to", "le_to"))  # ..._to: of searches in tables
 _ROUNDED = frozenset(("floor", "ceil", "round", "rem"))
 _OTHERS = frozenset(
-    "max min abs sign clamp atan2 reduce_max reduce_min argmax argmin sort scan cond".split()  # noqa: SIM905
+    "max min abs sign clamp atan2 reduce_max reduce_min argmax argmin scan cond".split()  # noqa: SIM905
 )
-_OPAQUE = frozenset("while pure_callback io_callback cummax cummin".split())  # noqa: SIM905
+_SORTS = frozenset(("sort", "top_k", "cummax", "cummin"))
+NOT_DIFFERENTIABLE = frozenset(("while", "pure_callback", "io_callback", "ffi_call"))
+"""Operations without a derivative of their own, that of a forward loop aside."""
+_OPAQUE = NOT_DIFFERENTIABLE | frozenset(
+    "bitcast_convert_type nextafter approx_top_k reduce reduce_window reduce_window_max"  # noqa: SIM905
+    " reduce_window_min select_and_gather_add scatter-max scatter-min".split()
+)
 """Operations whose switches are not found: ``Switched.hidden_operations`` names them."""
 
 _SORTED = 16
@@ -162,7 +168,10 @@ def _may_switch(jaxpr) -> bool:
         name = eqn.primitive.name
         if name in _CALLS and eqn.params.get("name") == SMOOTH:
             continue
-        if name in _ORDERED | _ROUNDED | _OTHERS | _OPAQUE and name not in ("scan", "cond"):
+        if name in _ORDERED | _ROUNDED | _OTHERS | _SORTS | _OPAQUE and name not in (
+            "scan",
+            "cond",
+        ):
             return True
         if name == "convert_element_type" and _to_integer(eqn):
             return True
@@ -251,7 +260,7 @@ class _Walk:
             ]
         if name in _ORDERED:
             a, b = jnp.asarray(x[0]), jnp.asarray(x[1])
-            rule = _ABOVE if name in ("gt", "lt") else _SIDE
+            rule = _ABOVE if name in ("gt", "lt", "lt_to") else _SIDE
             above = self.side(a - b if name in ("gt", "ge") else b - a, True, rule)
             return [(jnp.broadcast_to(above, out.shape), False)]
         if name == "floor":
@@ -278,14 +287,35 @@ class _Walk:
             value, _ = self._extreme(x[0], eqn.params["axes"], name == "reduce_max")
             return [(value, True)]
         if name in ("argmax", "argmin"):
-            _, place = self._extreme(x[0], eqn.params["axes"], name == "argmax")
+            _, place = self._extreme(x[0], eqn.params["axes"], name == "argmax", jumps=True)
             return [(place.astype(out.dtype), False)]
-        if name == "sort":
-            size = x[0].shape[eqn.params["dimension"]]
-            if len(x) > 1 or size > _SORTED:
-                self.hidden_operations.append(name)
-                return None
-            return [(self._sort(x[0], eqn.params["dimension"]), True)]
+        if name == "sort" and eqn.params["num_keys"] == 1:
+            axis = eqn.params["dimension"]
+            if x[0].shape[axis] <= _SORTED:
+                rows = self._sort([jnp.moveaxis(jnp.asarray(v), axis, 0) for v in x])
+                moving = [_is_float(v) for v in eqn.invars]
+                return [(jnp.moveaxis(v, 0, axis), m) for v, m in zip(rows, moving)]
+        if name == "top_k":
+            axis = eqn.params.get("axis", x[0].ndim - 1)
+            if x[0].shape[axis] <= _SORTED:
+                falling = -jnp.moveaxis(x[0], axis, 0)
+                places = jnp.arange(len(falling)).reshape(-1, *[1] * (x[0].ndim - 1))
+                values, places = self._sort([falling, jnp.broadcast_to(places, falling.shape)])
+                values, places = (
+                    jnp.moveaxis(v[: eqn.params["k"]], 0, axis) for v in (-values, places)
+                )
+                return [(values, True), (places.astype(eqn.outvars[1].aval.dtype), False)]
+        if name in ("cummax", "cummin"):
+            axis, larger = eqn.params["axis"], name == "cummax"
+            rows = list(jnp.moveaxis(x[0], axis, 0))
+            if len(rows) <= _SORTED:
+                rows = rows[::-1] if eqn.params["reverse"] else rows
+                for k in range(1, len(rows)):
+                    rows[k] = self._select_larger(rows[k - 1], rows[k], larger)
+                rows = rows[::-1] if eqn.params["reverse"] else rows
+                return [(jnp.moveaxis(jnp.stack(rows), 0, axis), True)]
+        if name in _SORTS:
+            self.hidden_operations.append(name)
         return None
 
     def _select_larger(self, a, b, larger: bool):
@@ -296,7 +326,7 @@ class _Walk:
         level = self.chooser.choose(jnp.broadcast_to(u, out.shape), rule, True)
         return level.astype(out.dtype)
 
-    def _extreme(self, x, axes, larger: bool):
+    def _extreme(self, x, axes, larger: bool, jumps: bool = False):
         """The largest number along ``axes`` and its place, by comparisons of pairs."""
         axes = [a % x.ndim for a in axes]
         shape = [n for k, n in enumerate(x.shape) if k not in axes]
@@ -306,21 +336,25 @@ class _Walk:
         while rows.shape[0] > 1:
             half = rows.shape[0] // 2
             a, b, rest = rows[:half], rows[half : 2 * half], rows[2 * half :]
-            is_first = self.side(a - b if larger else b - a)
+            is_first = self.side(a - b if larger else b - a, jumps)
             rows = jnp.concatenate([jnp.where(is_first, a, b), rest])
             pa, pb, rest = places[:half], places[half : 2 * half], places[2 * half :]
             places = jnp.concatenate([jnp.where(is_first, pa, pb), rest])
         return rows[0], places[0]
 
-    def _sort(self, x, axis: int):
-        """In rising order, by an odd-even network."""
-        rows = list(jnp.moveaxis(x, axis, 0))
-        for turn in range(len(rows)):
-            for k in range(turn % 2, len(rows) - 1, 2):
-                a, b = rows[k], rows[k + 1]
-                is_in_order = self.side(b - a)
-                rows[k], rows[k + 1] = jnp.where(is_in_order, a, b), jnp.where(is_in_order, b, a)
-        return jnp.moveaxis(jnp.stack(rows), 0, axis)
+    def _sort(self, columns):
+        """Columns (n, ...) by the first one in rising order: the place of a number is how many
+        others come before it."""
+        keys, jumps = columns[0], len(columns) > 1
+        place = jnp.zeros(keys.shape, jnp.int32)
+        for distance in range(1, len(keys)):
+            in_order = self.side(keys[distance:] - keys[:-distance], jumps).astype(jnp.int32)
+            place = place.at[distance:].add(in_order).at[:-distance].add(1 - in_order)
+        order = jnp.arange(len(keys), dtype=place.dtype).reshape(-1, *[1] * keys.ndim)
+        return [
+            jnp.sum(jnp.where(place[None] == order, x[None], 0), axis=1, dtype=x.dtype)
+            for x in columns
+        ]
 
     def _call(self, eqn, operands):
         subjaxpr = eqn.params.get(
