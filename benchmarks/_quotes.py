@@ -253,22 +253,13 @@ def _() -> str:
 @_quote("control-constants")
 def _() -> str:
     report = read("error_control_constants")
-    rows = report["numbers"]["constants"]
-    base = {row["scene"]: row for row in rows if not row["constant"]}
     lines = []
-    for name in dict.fromkeys(row["constant"] for row in rows if row["constant"]):
-        own = [row for row in rows if row["constant"] == name]
-        ended = [row for row in own if row["q95"] is not None]
-        most = max(ended, key=lambda row: row["steps_ratio"])
-        steps = [f"{min(row['steps_ratio'] for row in ended):.2f}", f"{most['steps_ratio']:.2f}"]
-        # where 95 % of the bodies keep a tenth of rtol anyway, the ratio of errors says nothing
-        errors = (row["q95"] / max(0.1, base[row["scene"]]["q95"]) for row in ended)
-        beyond = sum(row["beyond_10"] - base[row["scene"]]["beyond_10"] for row in ended)
-        failed = sum(row["failed"] - base[row["scene"]]["failed"] for row in own)
-        scene = most["scene"].replace("_", " ") if most["steps_ratio"] > 1.02 else ""
-        counts = (f"{x:+d}" if x else "" for x in (beyond, failed))
-        value, error = f"{own[0]['value']:g}", f"{max(errors):.1f}"
-        lines.append([f"`{name}`", value, *steps, scene, error, *counts])
+    for row in report["numbers"]["constants"]:
+        steps = (f"{row[key]:.2f}" for key in ("least_steps", "most_steps"))
+        counts = (f"{x:+d}" if x else "" for x in (row["beyond_10"], row["failed"]))
+        scene = row["most_in"] if row["most_steps"] > 1.02 else ""
+        name, value, error = f"`{row['constant']}`", f"{row['without']:g}", f"{row['error']:.1f}"
+        lines.append([name, value, *steps, scene, error, *counts])
     header = ["", "without it", "steps: least", "most", "in", "error", "beyond 10 `rtol`", "failed"]
     return _block(markdown(header, lines), f"({command(report)})")
 

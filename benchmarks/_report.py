@@ -137,9 +137,15 @@ def command(module: str) -> str:
 
 
 def write(
-    name: str, numbers: Any, *, path: str | os.PathLike | None = None, packages: tuple = ()
+    name: str,
+    numbers: Any,
+    *,
+    path: str | os.PathLike | None = None,
+    packages: tuple = (),
+    module: str | None = None,
 ) -> Path:
-    """Write ``numbers`` (anything JSON can hold) of benchmark ``name``; returns the file.
+    """Write ``numbers`` (anything JSON can hold) of benchmark ``name``, which is that of the module
+    if none is given; returns the file.
 
     ``path``: a file; None: ``out/benchmarks/<name>.json``. ``packages``: peers whose versions to
     record beside ours. Not-a-number and infinite values become null. Whole or not at all.
@@ -150,7 +156,7 @@ def write(
     path.parent.mkdir(parents=True, exist_ok=True)
     report = {
         "name": name,
-        "command": command(name),
+        "command": command(module or name),
         "date": today(),
         "commit": commit(),
         "versions": versions(*packages),

@@ -67,7 +67,9 @@ SHORT_STEP = 0.01
 possible: the next one is longer by the largest factor."""
 
 # Where a torque jumps within a step, the last two values of the table differ by less than their
-# errors. This shows in errors that do not fall with the order when a refused step is shortened.
+# errors. This shows in errors that do not fall with the order when a refused step is shortened. Of
+# 420 single bodies with jumps at random times, hidden by a loop, 4 exceed ten times ``rtol``
+# without this, 1 with it.
 
 ROUGH_FALL = 2
 """[factor] By so much more than the order predicts the error exceeds that of the refused step."""
@@ -84,10 +86,6 @@ JUMP_GAP = 1 / 16
 JUMP_RATIO = 0.75
 """[factor] Fourth over third difference of the samples from which on they count as a jump: 1 to 3
 where the rates jump, two thirds at an extremum of smooth rates, less elsewhere."""
-
-JUMP_NOISE = 64
-"""[eps] Fourth differences below this, of the rates, are rounding."""
-
 
 # Explicit Runge-Kutta steps.
 

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike, as_float_array, as_vectors, is_concrete, require
+from polhode._kernels import smooth
 from polhode._parts import Signature, as_static, takes
 from polhode._trajectory import Trajectory
 from polhode.rotation import (
@@ -142,6 +143,13 @@ def _slopes(ts, wxyz, omega_body, angular_acceleration) -> tuple[Array, Array]:
     return jnp.stack(start_values, axis=1), jnp.stack(end_values, axis=1)
 
 
+@smooth  # the pieces meet with their second derivatives: no step has to end at a sample
+def _interval(times: Array, t: Array) -> Array:
+    """Place of the last time that is not after ``t``, within [0, n - 2]."""
+    place = jnp.searchsorted(times, t, side="right") - 1
+    return jnp.clip(place, 0, times.shape[0] - 2)
+
+
 class SampledAttitude(eqx.Module):
     """Attitude through samples, with their angular velocities and angular accelerations.
 
@@ -170,8 +178,7 @@ class SampledAttitude(eqx.Module):
     def __call__(self, t: Float[Array, ""]) -> Float[Array, "4"]:
         backwards = self.ts[-1] < self.ts[0]
         times, ascending_time = jnp.where(backwards, -self.ts, self.ts), jnp.where(backwards, -t, t)
-        last_interval = self.ts.shape[0] - 2
-        k = jnp.clip(jnp.searchsorted(times, ascending_time, side="right") - 1, 0, last_interval)
+        k = _interval(times, ascending_time)
         s = (t - self.ts[k]) / (self.ts[k + 1] - self.ts[k])
         (_, v0, a0), (p1, v1, a1) = self.start_slope[k], self.end_slope[k]
         # Taylor at the start, and three terms that meet value, slope and bend at the end
