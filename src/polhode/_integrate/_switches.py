@@ -246,8 +246,8 @@ class _Walk:
     def _switch(self, eqn, name, x):
         out = eqn.outvars[0].aval
         if name in ("max", "min"):
-            x = [jnp.broadcast_to(jnp.asarray(v, out.dtype), out.shape) for v in x]
-            return [(self._select_larger(*x, name == "max"), True)]
+            a, b = (jnp.broadcast_to(jnp.asarray(v, out.dtype), out.shape) for v in x)
+            return [(self._select_larger(a, b, name == "max"), True)]
         if name == "abs":
             return [(jnp.where(self.side(x[0]), x[0], -x[0]), True)]
         if name == "sign":
