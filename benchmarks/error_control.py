@@ -282,6 +282,7 @@ NEUTRAL = {
     "SHORT_STEP": 0.0,
     "GRAIN": 0.0,
     "JUMP_RATIO": 1e30,
+    "JUMP_NOISE": 0.0,
     "ROUGH_FALL": 1e30,
     "ROUGH_ROUNDING": 0.0,
     "ROUGH_ERROR": 1.0,

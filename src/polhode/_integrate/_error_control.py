@@ -87,6 +87,10 @@ JUMP_RATIO = 0.75
 """[factor] Fourth over third difference of the samples from which on they count as a jump: 1 to 3
 where the rates jump, two thirds at an extremum of smooth rates, less elsewhere."""
 
+JUMP_NOISE = 64
+"""[eps] Fourth differences below this, of the rates, are rounding."""
+
+
 # Explicit Runge-Kutta steps.
 
 EXPLICIT_SHARE = 2.0

@@ -440,6 +440,7 @@ def _jump_error(rates, t, width, carry, end_state, end_rates, weights) -> Array:
     of a free body are quadratic there, so that a weak jump shows from the third difference on.
     """
     gap = control.JUMP_GAP * width
+    eps = float(jnp.finfo(width.dtype).eps)
 
     def pick(at_end, a, b):
         return [jnp.where(at_end, y, x) for x, y in zip(a, b)]
@@ -473,7 +474,9 @@ def _jump_error(rates, t, width, carry, end_state, end_rates, weights) -> Array:
         sizes = [jnp.zeros_like(total)] * 2
         _, sizes = jax.lax.fori_loop(1, 5, further, ([base_rates, zero, zero, zero], sizes))
         third, fourth = sizes
-        return total + jnp.where(fourth > control.JUMP_RATIO * third, fourth * jnp.abs(5 * gap), 0)
+        noise = control.JUMP_NOISE * eps * weighted_length(weights, base_rates)
+        jumps = fourth > jnp.maximum(control.JUMP_RATIO * third, noise)
+        return total + jnp.where(jumps, fourth * jnp.abs(5 * gap), 0)
 
     return jax.lax.fori_loop(0, 2, add_end, jnp.zeros_like(carry.width))
 
