@@ -68,7 +68,7 @@ possible: the next one is longer by the largest factor."""
 
 # Where a torque jumps within a step, the last two values of the table differ by less than their
 # errors. This shows in errors that do not fall with the order when a refused step is shortened. Of
-# 420 single bodies with jumps at random times, hidden by a loop, 4 exceed ten times ``rtol``
+# 396 single bodies with jumps at random times, hidden by a loop, 4 exceed ten times ``rtol``
 # without this, 1 with it.
 
 ROUGH_FALL = 2
