@@ -75,6 +75,13 @@ def test_every_switch_of_a_program_is_found(fn, count, jumps):
     assert np.abs(bends).max() < 0.5
 
 
+def test_samples_of_an_attitude_are_no_switches():
+    """The pieces between them meet with two derivatives. Two: of the sine of a small angle."""
+    lead = ph.simulate(ph.Scene(INERTIA), ph.State(WXYZ, OMEGA), TS)
+    attitude = ph.frames.RotatingFrame.from_trajectory(lead).attitude
+    assert program(attitude, jnp.zeros(())).count == 2
+
+
 def test_what_cannot_be_looked_into_is_named():
     def halved(x):
         return jax.lax.while_loop(lambda s: jnp.sum(s * s) > 1, lambda s: s / 2, x)
@@ -108,6 +115,28 @@ def test_jumps_that_a_loop_hides_are_found(torque):
     error = 2 * np.arctan2(last.wxyz[:, 3], last.wxyz[:, 0]) - angle
     error = np.abs((error + np.pi) % (2 * np.pi) - np.pi)
     assert error.max() < 3 * rtol
+
+
+def test_of_equal_numbers_the_first_is_the_largest():
+    x = jnp.array([0.0, 2.0, 2.0, 1.0, 2.0])
+    found = program(jnp.argmax, x)
+    assert found.frozen(found.levels(x), x)[0][0] == jnp.argmax(x) == 1
+
+
+def test_steps_end_at_the_knots_of_a_table():
+    """A torque linear between 101 times: two integrals of the table, exactly."""
+    times = jnp.linspace(0.0, 10.0, 101)
+    values = jnp.asarray(np.random.default_rng(8).normal(size=101))
+    law = lambda t, q, w: jnp.interp(t, times, values) * jnp.eye(3)[2]  # noqa: E731
+    scene = ph.Scene(ph.Inertia.spherical(1.0), torque=ph.FeedbackTorque(law))
+    trajectory = ph.simulate(scene, ph.State(WXYZ, np.zeros(3)), [0.0, 10.0], rtol=1e-4)
+    start, stop = np.asarray(values[:-1]), np.asarray(values[1:])
+    rates = np.concatenate([[0.0], np.cumsum(0.1 * (start + stop) / 2)])
+    angle = np.sum(0.1 * rates[:-1] + 0.1**2 * (2 * start + stop) / 6)
+    q = trajectory.last.wxyz
+    np.testing.assert_allclose(trajectory.last.omega_body[2], rates[-1], atol=1e-12)
+    np.testing.assert_allclose(np.cos(2 * np.arctan2(q[3], q[0]) - angle), 1, atol=1e-16)
+    assert trajectory.steps < 110
 
 
 def looked_up(p, rate):

@@ -24,7 +24,7 @@ _CALLS = frozenset(
 _ORDERED = frozenset(("gt", "ge", "lt", "le", "lt_to", "le_to"))  # ..._to: of searches in tables
 _ROUNDED = frozenset(("floor", "ceil", "round", "rem"))
 _OTHERS = frozenset(
-    "max min abs sign clamp atan2 reduce_max reduce_min argmax argmin scan cond".split()  # noqa: SIM905
+    "max min abs sign clamp atan2 reduce_max reduce_min argmax argmin".split()  # noqa: SIM905
 )
 _SORTS = frozenset(("sort", "top_k", "cummax", "cummin"))
 NOT_DIFFERENTIABLE = frozenset(("while", "pure_callback", "io_callback", "ffi_call"))
@@ -168,10 +168,7 @@ def _may_switch(jaxpr) -> bool:
         name = eqn.primitive.name
         if name in _CALLS and eqn.params.get("name") == SMOOTH:
             continue
-        if name in _ORDERED | _ROUNDED | _OTHERS | _SORTS | _OPAQUE and name not in (
-            "scan",
-            "cond",
-        ):
+        if name in _ORDERED | _ROUNDED | _OTHERS | _SORTS | _OPAQUE:
             return True
         if name == "convert_element_type" and _to_integer(eqn):
             return True
@@ -334,12 +331,16 @@ class _Walk:
         places = jnp.arange(rows.shape[0]).reshape(-1, *[1] * len(shape))
         places = jnp.broadcast_to(places, rows.shape)
         while rows.shape[0] > 1:
-            half = rows.shape[0] // 2
-            a, b, rest = rows[:half], rows[half : 2 * half], rows[2 * half :]
-            is_first = self.side(a - b if larger else b - a, jumps)
-            rows = jnp.concatenate([jnp.where(is_first, a, b), rest])
-            pa, pb, rest = places[:half], places[half : 2 * half], places[2 * half :]
-            places = jnp.concatenate([jnp.where(is_first, pa, pb), rest])
+            even = (
+                rows.shape[0] // 2 * 2
+            )  # neighbours are compared: of equal numbers the first wins
+            is_first = self.side(
+                rows[:even:2] - rows[1:even:2] if larger else rows[1:even:2] - rows[:even:2], jumps
+            )
+            rows, places = (
+                jnp.concatenate([jnp.where(is_first, x[:even:2], x[1:even:2]), x[even:]])
+                for x in (rows, places)
+            )
         return rows[0], places[0]
 
     def _sort(self, columns):

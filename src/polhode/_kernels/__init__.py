@@ -15,6 +15,7 @@ from polhode._kernels._derivatives import (
     smooth as smooth,
     spread as spread,
     underivable as underivable,
+    without_derivatives as without_derivatives,
     zeros as zeros,
 )
 from polhode._kernels._fold import (

@@ -2,7 +2,8 @@
 
 Two primitives: a linear map that one program computes and another transposes, such as ``spread``;
 and values with a rule for their derivatives, whatever computed them. Also values without known
-derivatives, which become NaN, and functions that are smooth although they contain comparisons.
+derivatives, which become NaN or raise, and functions that are smooth although they contain
+comparisons.
 """
 
 import functools
@@ -284,6 +285,20 @@ def _nan_tangents(constants: Any, tangents: Any) -> list[Array]:
     # directions do not move ``x`` at all.
     (where,), (tangent,) = constants, tangents
     return [jnp.where(where & (tangent != 0), np.nan, tangent)]
+
+
+def without_derivatives(tree: Any, why: str) -> Any:
+    """The same arrays, whose derivatives raise NotImplementedError with the words ``why``."""
+
+    @jax.custom_jvp
+    def same(x):
+        return x
+
+    @same.defjvp
+    def rule(primals, tangents):
+        raise NotImplementedError(why)
+
+    return jax.tree.map(lambda x: same(x) if jnp.issubdtype(x.dtype, jnp.inexact) else x, tree)
 
 
 def are_close(first: Array, second: Array) -> Array:
