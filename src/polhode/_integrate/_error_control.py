@@ -62,10 +62,6 @@ COMPENSATED_STEP = 4
 """[eps] The same as ``ROUNDED_STEP`` where steps carry their rounding errors along. With 8, errors
 in single precision are two to three times as large (``tests/solvers/test_error_control.py``)."""
 
-SHORT_STEP = 0.01
-"""[rad] A step as short as this whose error is rounding says nothing about the width that is
-possible: the next one is longer by the largest factor."""
-
 # Where a torque jumps within a step, the last two values of the table differ by less than their
 # errors. This shows in errors that do not fall with the order when a refused step is shortened. Of
 # 396 single bodies with jumps at random times, hidden by a loop, 4 exceed ten times ``rtol``
@@ -89,6 +85,11 @@ where the rates jump, two thirds at an extremum of smooth rates, less elsewhere.
 
 JUMP_NOISE = 64
 """[eps] Fourth differences below this, of the rates, are rounding."""
+
+SHORT_STEP = 0.01
+"""[rad] Where jumps are searched for, a step as short as this whose error is rounding says nothing
+about the width that is possible: the next one is longer by the largest factor. In other motions
+this would only lead to refused steps."""
 
 
 # Explicit Runge-Kutta steps.

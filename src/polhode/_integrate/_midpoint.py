@@ -295,11 +295,15 @@ def integrate(
         memory = jnp.where(accepted, control.MEMORY * carry.last_error, 0)
         factor = control.SAFETY * jnp.exp(power * (memory - size))
         factor = jnp.clip(factor, control.MIN_FACTOR, control.MAX_FACTOR)
-        # the error of a step that a jump has shortened is rounding, which says nothing about the
-        # width that is possible
-        is_rounding = jnp.maximum(angle / control.SHORT_STEP, error / (control.ROUNDED_STEP * eps))
-        is_short = worst(is_rounding, failed(constants, carry)) < 1
-        factor = jnp.where(accepted & is_short & ~is_cut, control.MAX_FACTOR, factor)
+        if limits.jumps:
+            # the error of a step that a jump has shortened is rounding, which says nothing about
+            # the width that is possible
+            is_rounding = jnp.maximum(
+                angle / control.SHORT_STEP, error / (control.ROUNDED_STEP * eps)
+            )
+            is_short = worst(is_rounding, failed(constants, carry)) < 1
+            is_short = is_short & (carry.rejected_step[1] == 0)
+            factor = jnp.where(accepted & is_short & ~is_cut, control.MAX_FACTOR, factor)
         proposed = jnp.where(
             accepted & is_cut, jnp.maximum(carry.width, width * factor), width * factor
         )
