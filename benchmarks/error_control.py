@@ -344,8 +344,8 @@ def scenes_of_constants(count: int) -> dict[str, tuple]:
 
 
 def without(count: int, names: list[str]) -> list[dict]:
-    """Rows of the third table: sums over the bodies and over three tolerances. ``steps``: with those
-    that were refused."""
+    """Rows of the third table: sums over the bodies and over three tolerances. ``steps``: refused
+    ones too."""
     from polhode._integrate import _error_control as control
 
     scenes = scenes_of_constants(count)
