@@ -28,9 +28,9 @@ from polhode._integrate._loop import Found, LoopOptions, Search, solve, with_eve
 from polhode._integrate._midpoint import Progress
 from polhode._integrate._problem import Problem
 from polhode._integrate._step_derivative import samples
-from polhode._integrate._switches import NOT_DIFFERENTIABLE
+from polhode._integrate._switches import guarded
 from polhode._integrate._tableau import TSIT5
-from polhode._kernels import Distinct, is_holdable, kernel, without_derivatives
+from polhode._kernels import Distinct, is_holdable, kernel
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts, check_options
 from polhode._parts import AbstractPart
 from polhode._scene import Scene, State
@@ -164,12 +164,12 @@ class AbstractIntegration(AbstractMethod):
             solve_all = (
                 kernel(solve_chunk, of_units=True) if n <= _policy.KERNEL_BODIES else solve_chunk
             )
-            return _guarded(solve_all(Distinct((lanes, times))), hidden)
+            return guarded(solve_all(Distinct((lanes, times))), hidden)
         # chunks of bodies with similar rates, the fastest first: no slow body is left for the end
         order = jnp.argsort(-natural_rates(scene, state, ts))
         sorted_lanes = jax.tree.map(lambda x: x[order], Distinct((lanes, times)))
         results = map_chunks(solve_chunk, sorted_lanes, n, size)
-        return _guarded(jax.tree.map(lambda x: x[jnp.argsort(order)], results), hidden)
+        return guarded(jax.tree.map(lambda x: x[jnp.argsort(order)], results), hidden)
 
     def _initial_state(self, scene, state, ts, record: Record):
         """The initial state, with the work where it is recorded, and whether the coordinates hold
@@ -593,17 +593,3 @@ class EulerAngles(AbstractIntegration):
         super().__init__(
             EulerChart(), 1, solver, controller, dt0, max_steps, adjoint, progress_meter, chunk
         )
-
-
-def _guarded(results: Any, hidden: tuple[str, ...]) -> Any:
-    """``results``, whose derivatives raise where they would leave out jumps inside the operations
-    ``hidden`` and these do not raise by themselves."""
-    named = ", ".join(name for name in hidden if name not in NOT_DIFFERENTIABLE)
-    if not named:
-        return results
-    return without_derivatives(
-        results,
-        f"derivatives through {named} in a torque would leave out the times at which its result"
-        " jumps. Write it with comparisons, jnp.where, jnp.searchsorted, jnp.argmax or jnp.sort of"
-        " at most 16 numbers: steps end where these turn, and derivatives are right.",
-    )

@@ -16,7 +16,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal
 from jaxtyping import Array
 
-from polhode._kernels import SMOOTH
+from polhode._kernels import SMOOTH, without_derivatives
 
 _CALLS = frozenset(
     "jit pjit closed_call core_call custom_jvp_call custom_vjp_call remat2 checkpoint".split()  # noqa: SIM905
@@ -27,9 +27,9 @@ _OTHERS = frozenset(
     "max min abs sign clamp atan2 reduce_max reduce_min argmax argmin".split()  # noqa: SIM905
 )
 _SORTS = frozenset(("sort", "top_k", "cummax", "cummin"))
-NOT_DIFFERENTIABLE = frozenset(("while", "pure_callback", "io_callback", "ffi_call"))
+_NOT_DIFFERENTIABLE = frozenset(("while", "pure_callback", "io_callback", "ffi_call"))
 """Operations without a derivative of their own, that of a forward loop aside."""
-_OPAQUE = NOT_DIFFERENTIABLE | frozenset(
+_OPAQUE = _NOT_DIFFERENTIABLE | frozenset(
     "bitcast_convert_type nextafter approx_top_k reduce reduce_window reduce_window_max"  # noqa: SIM905
     " reduce_window_min select_and_gather_add scatter-max scatter-min".split()
 )
@@ -91,6 +91,20 @@ def switched(closed_jaxpr: ClosedJaxpr, varies: Sequence[bool], dtype: Any) -> S
         note, *(jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in closed_jaxpr.jaxpr.invars)
     )
     return Switched(frozen, levels, np.array(jumps, bool), tuple(dict.fromkeys(hidden_operations)))
+
+
+def guarded(results: Any, hidden: tuple[str, ...]) -> Any:
+    """``results``, whose derivatives raise where they would leave out jumps inside the operations
+    ``hidden`` and these do not raise by themselves."""
+    named = ", ".join(name for name in hidden if name not in _NOT_DIFFERENTIABLE)
+    if not named:
+        return results
+    return without_derivatives(
+        results,
+        f"derivatives through {named} in a torque would leave out the times at which its result"
+        " jumps. Write it with comparisons, jnp.where, jnp.searchsorted, jnp.argmax or jnp.sort of"
+        " at most 16 numbers: steps end where these turn, and derivatives are right.",
+    )
 
 
 class _Rule(NamedTuple):
