@@ -258,7 +258,8 @@ def _() -> str:
         steps = (f"{row[key]:.2f}" for key in ("least_steps", "most_steps"))
         counts = (f"{x:+d}" if x else "" for x in (row["beyond_10"], row["failed"]))
         scene = row["most_in"] if row["most_steps"] > 1.02 else ""
-        name, value, error = f"`{row['constant']}`", f"{row['without']:g}", f"{row['error']:.1f}"
+        name, value = f"`{row['constant']}`", f"{row['without']:g}"
+        error = f"{row['error']:.1f}" if row["error"] < 1000 else f"{row['error']:.0e}"
         lines.append([name, value, *steps, scene, error, *counts])
     header = ["", "without it", "steps: least", "most", "in", "error", "beyond 10 `rtol`", "failed"]
     return _block(markdown(header, lines), f"({command(report)})")
