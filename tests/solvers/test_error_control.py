@@ -111,3 +111,13 @@ def test_saved_times_are_as_accurate_however_many_they_are(kind, count):
         off = np.max(np.asarray(rotation.angle_between(found.wxyz, fine.wxyz)), axis=1)
         assert np.max(off) < 10 * rtol, (rtol, np.max(off) / rtol)
         assert np.max(off) > 1e-3 * rtol or count == 600  # whose steps are short
+
+
+def test_few_steps_of_a_body_that_comes_to_rest_are_refused():
+    """It turns ever less in a step, whose error is rounding in the end."""
+    rng = np.random.default_rng(3)
+    state = ph.State(rng.normal(size=(16, 4)), rng.normal(size=(16, 3)))
+    torque = ph.FeedbackTorque(lambda t, wxyz, omega: -30 * omega)
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.6, 2.1]), torque=torque)
+    counts = ph.simulate(scene, state, [0.0, 5.0], rtol=1e-10).step_counts
+    assert int(counts.refused.sum()) < 0.3 * int(counts.accepted.sum())
