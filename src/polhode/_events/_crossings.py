@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from polhode import _integrate  # its names load diffrax at first use
 from polhode._batch import PARTS, flatten, lane_times
 from polhode._checks import is_concrete
 from polhode._events._event import Event, at_least
-from polhode._integrate import Search, natural_rates
 from polhode._method import Status
 from polhode._scene import Scene, State
 from polhode._trajectory import Propagator, Trajectory, moved_through, moved_to, with_initial_spins
@@ -154,7 +154,7 @@ def _by_steps(trajectory: Trajectory, event: Event, capacity: int) -> Any:
     wxyz, omega, *spins = (x.reshape(-1, *x.shape[len(batch) :])[:, 0] for x in trajectory._samples)
     ts = lane_times(trajectory.ts[..., jnp.array([0, -1])], batch)
     scene = with_initial_spins(Scene(**parts), spins)
-    search = Search((event.fn,), (event.direction,), (False,), capacity)
+    search = _integrate.Search((event.fn,), (event.direction,), (False,), capacity)
     rtol = jnp.min(propagator.rtol)
     solution = propagator.method.search(scene, State(wxyz, omega), ts, rtol, search, True)
     if solution is None:
@@ -227,7 +227,7 @@ def _natural_rates(trajectory: Trajectory) -> Array:
     parts = {name: flatten(getattr(trajectory.scene, name), batch) for name in PARTS}
     lanes = flatten(trajectory.first, batch, shared=False)
     ends = lane_times(trajectory.ts[..., jnp.array([0, -1])], batch)
-    return natural_rates(Scene(**parts), lanes, ends).reshape(batch)
+    return _integrate.natural_rates(Scene(**parts), lanes, ends).reshape(batch)
 
 
 @eqx.filter_jit

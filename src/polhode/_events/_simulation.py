@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from polhode import _integrate  # its names load diffrax at first use
 from polhode._batch import PARTS, flatten, lane_times
 from polhode._events._crossings import (
     AT_START,
@@ -25,7 +26,6 @@ from polhode._events._crossings import (
     turning_rates,
 )
 from polhode._events._event import Event
-from polhode._integrate import Search, natural_rates
 from polhode._method import Record, Status
 from polhode._scene import Scene, State
 from polhode._trajectory import (
@@ -74,7 +74,7 @@ def events_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tr
     wxyz, omega, *spins = (x.reshape(-1, *x.shape[len(batch) :])[:, 0] for x in begin._samples)
     times, scene = lane_times(ts, batch), Scene(**parts)
     capacity = sum(event.capacity for event in events)
-    search = Search(
+    search = _integrate.Search(
         tuple(event.fn for event in events),
         tuple(event.direction for event in events),
         tuple(event.terminal for event in events),
@@ -282,7 +282,7 @@ def _stopped_by_loop(lanes: Trajectory, ts: Array, until: Event):
     wxyz, omega, *spins = (x[:, 0] for x in lanes._samples)
     scene, search = (
         with_initial_spins(lanes.scene, spins),
-        Search((until.fn,), (until.direction,), (True,), 1),
+        _integrate.Search((until.fn,), (until.direction,), (True,), 1),
     )
     solution = method.search(scene, State(wxyz, omega), ts, propagator.rtol, search, False)
     if solution is None:
@@ -433,7 +433,7 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
         if until.samples is not None:
             return jnp.asarray(_SAMPLES / (until.samples - 1), dtype)
         time_range = jnp.stack(jnp.broadcast_arrays(times(share[None])[..., 0], end_time), axis=-1)
-        rates = natural_rates(lanes.scene, State(*samples[:2]), time_range)
+        rates = _integrate.natural_rates(lanes.scene, State(*samples[:2]), time_range)
         angle = jnp.max(jnp.where(busy & jnp.isfinite(rates), rates * jnp.abs(span), 0), initial=0)
         angle = jnp.maximum(angle, jnp.finfo(dtype).tiny)
         return jnp.maximum(_SAMPLES * 2 * jnp.pi / SAMPLES_PER_TURN / angle, min_width).astype(

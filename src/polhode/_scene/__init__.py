@@ -1,64 +1,8 @@
-"""Scenes and states, and what they are made of: potentials, torques, damping, rotors."""
+"""Scenes and states, and what they are made of: potentials, torques, damping, rotors.
 
-from polhode._scene._control import (
-    BDot as BDot,
-    ControlMomentGyro as ControlMomentGyro,
-    DipoleField as DipoleField,
-    MagneticDipole as MagneticDipole,
-    MomentumDumping as MomentumDumping,
-    Motor as Motor,
-    Pointing as Pointing,
-    RateDamping as RateDamping,
-    wheel_cluster as wheel_cluster,
-)
-from polhode._scene._orbits import (
-    LVLH as LVLH,
-    AbstractOrbit as AbstractOrbit,
-    HyperbolicOrbit as HyperbolicOrbit,
-    KeplerOrbit as KeplerOrbit,
-    RelativeTorque as RelativeTorque,
-)
-from polhode._scene._plates import (
-    Drag as Drag,
-    Eclipse as Eclipse,
-    Plates as Plates,
-    SolarPressure as SolarPressure,
-)
-from polhode._scene._potentials import (
-    AbstractPotential as AbstractPotential,
-    AlongZ as AlongZ,
-    GravityGradient as GravityGradient,
-    Potential as Potential,
-    PotentialSum as PotentialSum,
-    UniformGravity as UniformGravity,
-)
-from polhode._scene._scene import (
-    Scene as Scene,
-    State as State,
-    check_scene as check_scene,
-    constructors as constructors,
-    narrower as narrower,
-    specialise as specialise,
-)
-from polhode._scene._tables import Table as Table
-from polhode._scene._torques import (
-    AbstractTorque as AbstractTorque,
-    BodyTorque as BodyTorque,
-    EnergySink as EnergySink,
-    FeedbackTorque as FeedbackTorque,
-    LinearDamping as LinearDamping,
-    Pulses as Pulses,
-    QuadraticDamping as QuadraticDamping,
-    SampledTorque as SampledTorque,
-    SpaceTorque as SpaceTorque,
-    TorqueSum as TorqueSum,
-)
-from polhode._scene._wheels import (
-    AbstractCoupling as AbstractCoupling,
-    AbstractRotor as AbstractRotor,
-    CoulombFriction as CoulombFriction,
-    Rotor as Rotor,
-    RotorSum as RotorSum,
-    ViscousCoupling as ViscousCoupling,
-    Wheels as Wheels,
-)
+The names are imported at first use, so that a free body does not wait for control laws and orbits.
+"""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
