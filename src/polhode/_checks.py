@@ -94,7 +94,8 @@ def as_float_array(
         if any(leaf is None or isinstance(leaf, (str, bytes)) for leaf in leaves):
             raise TypeError("no number")  # jax would read some strings as the name of a dtype
         # ``jnp.asarray`` compiles a program, and an array is copied: its owner may change it
-        if isinstance(value, list | tuple) and all(type(x) in (float, int) for x in leaves):
+        is_plain = isinstance(value, list | tuple) or type(value) is int
+        if is_plain and all(type(x) in (float, int) for x in leaves):
             value = jax.device_put(np.array(value, float))
         elif isinstance(value, _NUMPY) and value.dtype in (np.float32, np.float64):
             value = jax.device_put(np.array(value))

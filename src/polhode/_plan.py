@@ -16,6 +16,7 @@ from polhode._batch import PARTS, common_batch, flatten, lane_times
 from polhode._checks import is_concrete
 from polhode._closed_forms import ClosedForm, FixedAxis, LagrangeTop, SymmetricTop
 from polhode._closed_forms._closed_form import VARIABLE, AbstractClosedForm
+from polhode._kernels import jit_distinct
 from polhode._method import AbstractMethod, Record, default_rtol
 from polhode._scene import GravityGradient, Scene, State, UniformGravity, constructors, specialise
 from polhode.inertia import Symmetry, VariableInertia
@@ -270,7 +271,7 @@ def _stiff(scene: Scene, state: State, ts: Array) -> str | None:
     if (scene.torque is None and scene.rotors is None) or not is_concrete(scene, state, ts):
         return None
     try:
-        rate = float(np.max(_decay(scene, state.as_unit(), ts), initial=0))
+        rate = float(np.max(_decay(scene, state, ts), initial=0))
     except ValueError:  # a part has no derivative, as one that calls Python back
         return None
     number = rate * float(np.max(np.abs(ts[..., -1] - ts[..., 0])))
@@ -285,6 +286,21 @@ def _stiff(scene: Scene, state: State, ts: Array) -> str | None:
 def _decay(scene: Scene, state: State, ts: Array) -> np.ndarray:
     """Rate [1/s] (...) of the fastest decay of body rates and wheel speeds, linearised at the start
     and, as friction changes most there, where the wheels are at rest in the body."""
+    rates = []
+    for jacobian in _jacobians(scene, state, ts):
+        if isinstance(jacobian, Tracer):  # a function of the scene closes over one
+            return np.zeros(jacobian.shape[:-2])
+        jacobian = np.asarray(jacobian, float)
+        sound = np.where(np.isfinite(jacobian), jacobian, 0)
+        rates.append(np.max(-np.linalg.eigvals(sound).real, axis=-1))
+    return np.max(np.stack(rates), axis=0)
+
+
+@jit_distinct  # one program: its operations one by one take ten times as long
+def _jacobians(scene: Scene, state: State, ts: Array) -> list[Array]:
+    """Derivatives (..., n, n) [1/s] of the rates of change of body rates and wheel momenta by these
+    themselves, at the points of ``_decay``."""
+    state = state.as_unit()
     scene, t = scene.settled(state, ts[..., 0]), ts[..., 0]
     parts = (getattr(scene, name) for name in PARTS)
     batch = common_batch(*parts, state.without_wheels, extra=(ts.shape[:-1],))
@@ -298,41 +314,28 @@ def _decay(scene: Scene, state: State, ts: Array) -> np.ndarray:
         def speeds(spins):
             return [wheels.at(spins).speed(i, t, components) for i in wheels.coupled]
 
-        speeds_at_zero, speeds_at_one = (
+        at_zero, at_one = (
             speeds([jnp.full(batch, value, omega.dtype) for _ in points[0]]) for value in (0, 1)
         )
-        points.append(tuple(-a / (b - a) for a, b in zip(speeds_at_zero, speeds_at_one)))
+        points.append(tuple(-a / (b - a) for a, b in zip(at_zero, at_one)))
 
-    def rates(y, spins):
-        omega = omega_of(y)
-        wheel_spins = tuple(x + y[..., 3 + k] for k, x in enumerate(spins))
-        acceleration, wheel_torques = scene.with_spins(wheel_spins).changes(wxyz, omega, t)
-        return jnp.concatenate(
-            [acceleration, *(jnp.broadcast_to(x, batch)[..., None] for x in wheel_torques)], axis=-1
-        )
+    def jacobian(spins):
+        def rates(y):
+            wheel_spins = tuple(x + y[..., 3 + k] for k, x in enumerate(spins))
+            acceleration, wheel_torques = scene.with_spins(wheel_spins).changes(
+                wxyz, omega + y[..., :3], t
+            )
+            columns = [jnp.broadcast_to(x, batch)[..., None] for x in wheel_torques]
+            return jnp.concatenate([acceleration, *columns], axis=-1)
 
-    def omega_of(y):
-        return omega + y[..., :3]
+        def along(direction):
+            origin = jnp.zeros((*batch, direction.size), omega.dtype)
+            return jax.jvp(rates, (origin,), (jnp.broadcast_to(direction, origin.shape),))[1]
 
-    decay_rates = []
-    for spins in points:
-        size = 3 + len(spins)
-        speeds_at_zero = jnp.zeros((*batch, size), omega.dtype)
-        columns = [
-            jax.jvp(
-                lambda y, s=spins: rates(y, s),
-                (speeds_at_zero,),
-                (speeds_at_zero.at[..., k].set(1),),
-            )[1]
-            for k in range(size)
-        ]
-        jacobian = jnp.stack(columns, axis=-1)
-        if isinstance(jacobian, Tracer):  # a function of the scene closes over one
-            return np.zeros(batch)
-        jacobian = np.asarray(jacobian, float)
-        sound = np.where(np.isfinite(jacobian), jacobian, 0)
-        decay_rates.append(np.max(-np.linalg.eigvals(sound).real, axis=-1))
-    return np.max(np.stack(decay_rates), axis=0)
+        directions = jnp.eye(3 + len(spins), dtype=omega.dtype)
+        return jax.vmap(along, out_axes=-1)(directions)
+
+    return [jacobian(spins) for spins in points]
 
 
 def _narrower(scene: Scene) -> tuple[str, ...]:

@@ -114,7 +114,7 @@ def simulate(
     if split is not None and is_concrete(scene, state, ts):
         scene, state, ts = place(split, scene, state, ts)
     if until is not None:
-        trajectory = stop_at_event(_begin(method, scene, state, ts, checked_rtol), ts, until)
+        trajectory = _stopped_at(until, method, scene, state, ts, checked_rtol)
         return checked(_reduced(trajectory, record), throw)
     return checked(run(method, scene, state, ts, checked_rtol, record, split), throw)
 
@@ -136,9 +136,7 @@ def _with_events(scene, state, ts, method, rtol, record, until, events, throw) -
     checked_rtol = check_rtol(rtol, state.wxyz.dtype)
     if method is None:
         method, _ = choose(scene, checked_rtol)
-    trajectory_with_events = events_by_steps(
-        _begin(method, scene, state, ts, checked_rtol), ts, events
-    )
+    trajectory_with_events = _events_met(events, method, scene, state, ts, checked_rtol)
     if trajectory_with_events is None:
         trajectory = run(method, scene, state, ts, checked_rtol, record.of_states, None)
         trajectory_with_events = events_by_search(checked(trajectory, throw), events)
@@ -235,6 +233,15 @@ def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> T
 
 
 @jit_distinct
+def _stopped_at(until, method, scene, state, ts, rtol) -> Trajectory:
+    return stop_at_event(_begin(method, scene, state, ts, rtol), ts, until)
+
+
+@jit_distinct
+def _events_met(events, method, scene, state, ts, rtol) -> Trajectory | None:
+    return events_by_steps(_begin(method, scene, state, ts, rtol), ts, events)
+
+
 def _begin(method, scene, state, ts, rtol) -> Trajectory:
     """The state at the first time, as the only sample of a trajectory."""
     state = state.as_unit()

@@ -62,7 +62,6 @@ def checked_events(events: Any, until: Any, record: Record | None) -> tuple[Even
     return all_events
 
 
-@eqx.filter_jit
 def events_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Trajectory | None:
     """The motion from ``begin``, its state at the first of ``ts``, and the events that the
     integration meets; None where the method does not search for events."""
@@ -256,15 +255,15 @@ def check_until(until: Any, record: Any) -> None:
         )
 
 
-@eqx.filter_jit
 def stop_at_event(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
     """The motion from ``begin``, its state at the first of ``ts``, each body path from its first
     event on."""
+    terminal = Event(until.fn, until.direction, until.samples, terminal=True, capacity=1)
+    trajectory = events_by_steps(begin, ts, (terminal,))
+    if trajectory is not None:
+        return eqx.tree_at(lambda x: x._events, trajectory, None)
     batch = begin.batch_shape
-    lanes, ts = _of_lanes(begin), lane_times(ts, batch)
-    path = _stopped_by_loop(lanes, ts, until)
-    if path is None:
-        path = _stopped_by_windows(lanes, ts, until)
+    path = _stopped_by_windows(_of_lanes(begin), lane_times(ts, batch), until)
     wxyz, omega, spins, status, steps, times, event = jax.tree.map(
         lambda x: x.reshape(*batch, *x.shape[1:]), path
     )
@@ -272,59 +271,9 @@ def stop_at_event(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
     return begin._with_samples(times, samples, status, steps, event)
 
 
-def _stopped_by_loop(lanes: Trajectory, ts: Array, until: Event):
-    """Where the steps themselves look for the event: samples, status, steps, times and event times,
-    with the derivatives of the motion; None where they cannot."""
-    propagator: Any = lanes.propagator
-    method = propagator.method
-    if method.exact:
-        return None
-    wxyz, omega, *spins = (x[:, 0] for x in lanes._samples)
-    scene, search = (
-        with_initial_spins(lanes.scene, spins),
-        _integrate.Search((until.fn,), (until.direction,), (True,), 1),
-    )
-    solution = method.search(scene, State(wxyz, omega), ts, propagator.rtol, search, False)
-    if solution is None:
-        return None
-    samples, events = solution
-    spins = [] if samples.spins is None else [samples.spins]
-    path = [samples.wxyz, samples.omega_body, *spins]
-    has_event = jnp.isfinite(events.times[:, 0])
-    near_event = Trajectory(
-        events.rows[:, -1:],
-        path[0][:, -1:],
-        path[1][:, -1:],
-        samples.status,
-        samples.steps,
-        lanes.scene,
-        spins=spins[0][:, -1:] if spins else None,
-        propagator=propagator,
-    )
-    tolerance = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(near_event._t)
-    delay, at_event = until.differentiable_at(near_event, tolerance)
-    event = near_event._t + delay
-    rows = jnp.broadcast_to(ts, (has_event.size, ts.shape[-1]))
-    sign = jnp.where(rows[:, -1:] < rows[:, :1], -1, 1).astype(ts.dtype)
-    is_past = has_event[:, None] & (sign * (rows - jax.lax.stop_gradient(event)) >= 0)
-    wxyz, omega, *spins = (
-        jnp.where(is_past[..., None], x, y[:, :-1]) for x, y in zip(at_event._samples, path)
-    )
-    times = jnp.where(is_past, event, rows)
-    event = jnp.where(has_event, event[:, 0], jnp.inf)
-    return (
-        wxyz,
-        omega,
-        spins[0] if spins else None,
-        samples.status,
-        samples.steps,
-        times,
-        event,
-    )
-
-
 def _stopped_by_windows(lanes: Trajectory, ts: Array, until: Event):
-    """The same by samples at windows of the motion."""
+    """By samples at windows of the motion: samples, status, steps, times and event times, with the
+    derivatives of the motion."""
     arrays, static = eqx.partition((lanes, until), eqx.is_inexact_array)
     stop_gradient = jax.lax.stop_gradient
     constant_lanes, event = eqx.combine(stop_gradient(arrays), static)

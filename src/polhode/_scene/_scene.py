@@ -473,8 +473,10 @@ def _inertia(inertia: Inertia) -> Inertia:
 
 
 def _weight(field: UniformGravity) -> UniformGravity:
-    centre = field.centre_body
-    if centre is None or np.any(np.asarray(centre)[..., :2] != 0):
+    if field.centre_body is None:
+        return field
+    centre = np.asarray(field.centre_body)
+    if np.any(centre[..., :2] != 0):
         return field
     return UniformGravity.axial(field.mass, centre[..., 2], field.gravity_space)
 

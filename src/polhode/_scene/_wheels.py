@@ -28,6 +28,7 @@ from polhode._checks import (
     as_number,
     as_positive,
     is_concrete,
+    on_host,
     require,
     require_positive,
 )
@@ -162,11 +163,9 @@ class AbstractRotor(AbstractPart):
             if wheel.inertia is None:
                 continue
             with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
-                axis = wheel.direction
-                momentum = inertia.momentum(axis)
-                about = jnp.sum(jnp.broadcast_to(axis, momentum.shape) * momentum, axis=-1)
+                about = _moment_about(inertia, wheel.direction)
             require(
-                np.asarray(wheel.inertia) < np.asarray(about),
+                np.asarray(wheel.inertia) < about,
                 f"a rotor's inertia ({wheel.inertia} kg m^2) must be less than the body's about the"
                 f" same axis ({about}): the scene's inertia is that of the whole body, its wheels"
                 " locked and included. Add the wheels to it.",
@@ -516,7 +515,8 @@ class Rotor(AbstractRotor):
         if self.axis_body is not None:
             return _unit(self.axis_body)
         number = self.speed if self.momentum is None else self.momentum
-        return jnp.eye(3, dtype=jnp.asarray(number).dtype)[self.axis]
+        unit = np.eye(3, dtype=jnp.asarray(number).dtype)[self.axis]
+        return as_float_array("axis", unit)
 
     @property
     def is_held(self) -> bool:
@@ -554,7 +554,20 @@ class Rotor(AbstractRotor):
         return axis, momentum + inertia * turning, inertia, torque
 
 
-def _unit(axis: Array) -> Array:
+def _moment_about(inertia: Inertia, axis: Array | np.ndarray) -> np.ndarray | np.floating:
+    """The body's moment of inertia (...) about unit axes (..., 3); all numbers are known."""
+    unit = np.asarray(axis)
+    if inertia.full is None:
+        return np.sum(np.asarray(inertia.moments) * unit**2, axis=-1)
+    return np.einsum("...i,...ij,...j", unit, np.asarray(inertia.full), unit)
+
+
+def _unit(axis: Array | np.ndarray) -> Array:
+    values = on_host(axis)
+    if isinstance(values, np.ndarray):  # without compiling a program
+        values = values / np.max(np.abs(values), axis=-1, keepdims=True)
+        length = np.sqrt(np.sum(values**2, axis=-1, keepdims=True))
+        return as_float_array("axis_body", values / length, finite=False)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(axis), axis=-1, keepdims=True))
     axis = axis / largest  # of any size: nothing overflows
     return axis / jnp.sqrt(jnp.sum(axis**2, axis=-1, keepdims=True))

@@ -124,7 +124,8 @@ class Inertia(AbstractShaped, AbstractPart):
         """
         first, last = as_floats(transverse=(transverse, ()), axial=(axial, ()))
         name = "(transverse, transverse, axial)"
-        _checked(name, jnp.stack([first, first, last], axis=-1), physical)
+        if is_concrete(first, last):
+            _checked(name, np.stack(np.broadcast_arrays(first, first, last), axis=-1), physical)
         return cls(transverse=first, axial=last, physical=physical)
 
     @classmethod
@@ -145,8 +146,11 @@ class Inertia(AbstractShaped, AbstractPart):
         """
         array = as_float_array("tensor", tensor, (3, 3))
         check_tensor("tensor", array, triangle=physical)
-        symmetric = (array + jnp.swapaxes(array, -1, -2)) / 2
-        if not is_concrete(array):
+        values = on_host(array)
+        symmetric = (values + values.mT) / 2
+        if isinstance(values, np.ndarray):  # without compiling a program
+            symmetric = as_float_array("tensor", symmetric)
+        elif not is_concrete(array):
             symmetric = jnp.where(is_symmetric(array)[..., None, None], symmetric, jnp.nan)
         return cls(full=symmetric, physical=physical)
 
@@ -226,9 +230,8 @@ class Inertia(AbstractShaped, AbstractPart):
         if self.full is not None:
             return principal_moments(self.full)
         if self.moment is not None:
-            return jnp.stack([self.moment] * 3, axis=-1)
-        transverse, axial = jnp.broadcast_arrays(self.transverse, self.axial)
-        return jnp.stack([transverse, transverse, axial], axis=-1)
+            return _stacked(self.moment, self.moment, self.moment)
+        return _stacked(self.transverse, self.transverse, self.axial)
 
     @property
     def is_possible(self) -> Bool[Array, "*b"]:
@@ -303,8 +306,24 @@ def check_form(inertia: Inertia) -> None:
         raise ValueError(_ONE_FORM)
 
 
+def _stacked(*moments: Array) -> Array:
+    values = [on_host(x) for x in moments]
+    if all(isinstance(x, np.ndarray) for x in values):  # without compiling a program
+        stacked = np.stack(np.broadcast_arrays(*values), axis=-1)
+        return as_float_array("moments", stacked, finite=False)
+    return jnp.stack(jnp.broadcast_arrays(*moments), axis=-1)
+
+
+def _diagonal(moments: Array) -> Array:
+    values = on_host(moments)
+    if isinstance(values, np.ndarray):
+        tensor = values[..., None] * np.eye(3, dtype=values.dtype)
+        return as_float_array("tensor", tensor, finite=False)
+    return _diagonal_of(moments)
+
+
 @jax.jit  # one program, not one for each operation; likewise below
-def _diagonal(moments):
+def _diagonal_of(moments):
     unit = jnp.eye(3, dtype=moments.dtype)
     return moments[..., None] * jnp.broadcast_to(unit, (*moments.shape, 3))
 
