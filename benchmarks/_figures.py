@@ -4,8 +4,17 @@ from pathlib import Path
 
 from benchmarks._report import read
 
-PEERS = ("polhode (default)", "polhode LiePoisson", "heyoka", "diffrax", "diffrax (Euler angles)",
-         "SciPy closed form", "SciPy solve_ivp", "Numba", "MuJoCo")  # fmt: skip
+PEERS = (
+    "polhode (default)",
+    "polhode LiePoisson",
+    "heyoka",
+    "diffrax",
+    "diffrax (Euler angles)",
+    "SciPy closed form",
+    "SciPy solve_ivp",
+    "Numba",
+    "MuJoCo",
+)
 SHOWN = {"bodies": 1000, "dtype": "float64"}
 
 
@@ -46,9 +55,10 @@ def work_precision(report: dict, families: tuple[str, ...] = (), **shown):
 
     shown = SHOWN | shown
     tables = [
-        t for t in report["numbers"]["tables"]
+        t
+        for t in report["numbers"]["tables"]
         if all(t[k] == v for k, v in shown.items()) and (not families or t["family"] in families)
-    ]  # fmt: skip
+    ]
     if not tables:
         raise ValueError(f"the result holds no table with {shown}")
     columns = min(3 if len(tables) <= 6 else 5, len(tables))
@@ -210,11 +220,21 @@ def throw_design(report: dict):
         figure = plt.figure(figsize=(10.0, 3.4), layout="constrained")
         left, right = figure.subplots(1, 2)
         for ax, rows, columns, values, labels in (
-            (left, "tilt_deg", "turn_deg", "spread_of_spins",
-             ("spin about the wheel's axis, turned by [deg]", "tilted by [deg]")),
-            (right, "begin_s", "length_s", "spread_of_programs",
-             ("wheel is on for [s]", "switched on after [s]")),
-        ):  # fmt: skip
+            (
+                left,
+                "tilt_deg",
+                "turn_deg",
+                "spread_of_spins",
+                ("spin about the wheel's axis, turned by [deg]", "tilted by [deg]"),
+            ),
+            (
+                right,
+                "begin_s",
+                "length_s",
+                "spread_of_programs",
+                ("wheel is on for [s]", "switched on after [s]"),
+            ),
+        ):
             table = [[100 * value for value in row] for row in numbers[values]]
             drawn = ax.contourf(numbers[columns], numbers[rows], table, levels=12, cmap="viridis_r")
             figure.colorbar(drawn, ax=ax, label="spread of the tensor [%]")
@@ -252,15 +272,22 @@ def engines(report: dict):
 
 
 ENGINE_COLOURS = {
-    "MuJoCo Euler": "#CC79A7", "MuJoCo implicitfast": "#009E73", "MuJoCo RK4": "#0072B2",
-    "Bullet": "#E69F00", "no gyroscopic term": "#888888",
-}  # fmt: skip
+    "MuJoCo Euler": "#CC79A7",
+    "MuJoCo implicitfast": "#009E73",
+    "MuJoCo RK4": "#0072B2",
+    "Bullet": "#E69F00",
+    "no gyroscopic term": "#888888",
+}
 
 
 DRAWN = {
-    "work_precision": work_precision, "scaling": scaling, "gradients": gradients,
-    "identification": identification, "throw_design": throw_design, "engines": engines,
-}  # fmt: skip
+    "work_precision": work_precision,
+    "scaling": scaling,
+    "gradients": gradients,
+    "identification": identification,
+    "throw_design": throw_design,
+    "engines": engines,
+}
 
 
 def draw(paths: list[Path], folder: Path, suffix: str = ".svg") -> list[Path]:

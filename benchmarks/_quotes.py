@@ -448,13 +448,22 @@ def _() -> str:
     for name, row in _numbers("throws")["varied"].items():
         count = sum(len(shifts) for shifts in row["shift_over_std"].values())
         wider = f"{row['rms_over_expected'] or 0:.2f} ({row['wider']} moments)"
-        lines.append([
-            names.get(name, name), f"{row['largest']:.1f} ({row['largest_percent']:.2f} %)",
-            f"{row['beyond_half']} of {count}", wider if row["wider"] else "nothing left out",
-            f"{row['means_rms_over_own_scatter']:.1f}",
-        ])  # fmt: skip
-    header = ["varied", "largest change over its deviation", "more than half",
-              "rms over that expected", "rms over own scatter, means"]  # fmt: skip
+        lines.append(
+            [
+                names.get(name, name),
+                f"{row['largest']:.1f} ({row['largest_percent']:.2f} %)",
+                f"{row['beyond_half']} of {count}",
+                wider if row["wider"] else "nothing left out",
+                f"{row['means_rms_over_own_scatter']:.1f}",
+            ]
+        )
+    header = [
+        "varied",
+        "largest change over its deviation",
+        "more than half",
+        "rms over that expected",
+        "rms over own scatter, means",
+    ]
     return _block(markdown(header, lines), f"({command(read('throws'))})")
 
 
@@ -473,14 +482,24 @@ def _() -> str:
         row = found["likelihood_of_the_readings"][f"over 15 rad/s, {cut} samples cut"]
         drag = _ratio(row["drag_fitted_ratios"], row["drag_fitted_ratios_std"])
         uncut = f"{_ratio(free['ratios'], free['ratios_std'])}, {free['rms_rad_s']:.2f} rad/s"
-        lines.append([
-            f"{cut / 100:g} s" if cut else "nothing", str(row["trials"]), "–" if cut else uncut,
-            f"{drag}, {row['drag_fitted_rms_rad_s']:.2f} rad/s",
-            _ratio(row["ratios"], row["ratios_std"]),
-            f"{row['rms_one_sample_ahead_rad_s']:.2f} rad/s",
-        ])  # fmt: skip
-    header = ["cut off both ends", "trials", "free motion", "with drag",
-              "likelihood of the readings", "its residuals one sample ahead"]  # fmt: skip
+        lines.append(
+            [
+                f"{cut / 100:g} s" if cut else "nothing",
+                str(row["trials"]),
+                "–" if cut else uncut,
+                f"{drag}, {row['drag_fitted_rms_rad_s']:.2f} rad/s",
+                _ratio(row["ratios"], row["ratios_std"]),
+                f"{row['rms_one_sample_ahead_rad_s']:.2f} rad/s",
+            ]
+        )
+    header = [
+        "cut off both ends",
+        "trials",
+        "free motion",
+        "with drag",
+        "likelihood of the readings",
+        "its residuals one sample ahead",
+    ]
     return _block(markdown(header, lines), f"({command(read('racquet'))})")
 
 
@@ -506,8 +525,13 @@ def _() -> str:
         ]
         for row in _numbers("satellites")["rows"]
     ]
-    header = ["", "least squares", "instrumental variables",
-              "likelihood of the readings", "95 % hold"]  # fmt: skip
+    header = [
+        "",
+        "least squares",
+        "instrumental variables",
+        "likelihood of the readings",
+        "95 % hold",
+    ]
     return _block(markdown(header, lines), f"({command(read('satellites'))})")
 
 

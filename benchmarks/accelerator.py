@@ -93,14 +93,21 @@ def measure(family: str, n: int, dtype: str, peak: dict[str, float]) -> dict:
     flops = float(about.get("flops", 0.0))
     stepped = not isinstance(method, ph.ClosedForm | ph.LagrangeTop)
     return {
-        "program": "polhode", "rtol": RTOL[dtype],
-        "family": family, "title": problem.title, "method": type(method).__name__, "bodies": n,
-        "dtype": dtype, "ns_per_body": wall.median / n * 1e9, "spread": wall.spread,
+        "program": "polhode",
+        "rtol": RTOL[dtype],
+        "family": family,
+        "title": problem.title,
+        "method": type(method).__name__,
+        "bodies": n,
+        "dtype": dtype,
+        "ns_per_body": wall.median / n * 1e9,
+        "spread": wall.spread,
         "samples_per_s": n * problem.saves / wall.median,
         "bandwidth_share": moved / wall.median / peak["bytes_per_s"],
         "arithmetic_share": None if stepped else flops / wall.median / peak["flop_per_s"],
-        "attitude_median": found["attitude_median"], "attitude_worst": found["attitude_worst"],
-    }  # fmt: skip
+        "attitude_median": found["attitude_median"],
+        "attitude_worst": found["attitude_worst"],
+    }
 
 
 def measure_diffrax(family: str, n: int, dtype: str, target: float) -> dict:
@@ -124,13 +131,20 @@ def measure_diffrax(family: str, n: int, dtype: str, target: float) -> dict:
     given = start, times, jnp.asarray(tolerance, dtype)
     wall = _report.clock(lambda: jax.block_until_ready(program(*given)), repeats=3)
     return {
-        "program": "diffrax", "rtol": float(tolerance),
+        "program": "diffrax",
+        "rtol": float(tolerance),
         "equal_error": bool(found["attitude_median"] <= target),
-        "family": family, "title": problem.title, "method": "Dopri8, vmap", "bodies": n,
-        "dtype": dtype, "ns_per_body": wall.median / n * 1e9, "spread": wall.spread,
+        "family": family,
+        "title": problem.title,
+        "method": "Dopri8, vmap",
+        "bodies": n,
+        "dtype": dtype,
+        "ns_per_body": wall.median / n * 1e9,
+        "spread": wall.spread,
         "samples_per_s": n * problem.saves / wall.median,
-        "attitude_median": found["attitude_median"], "attitude_worst": found["attitude_worst"],
-    }  # fmt: skip
+        "attitude_median": found["attitude_median"],
+        "attitude_worst": found["attitude_worst"],
+    }
 
 
 def main() -> None:

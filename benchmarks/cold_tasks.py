@@ -158,11 +158,13 @@ def _magnetorquers(np):
 
     def law(t, wxyz, omega):
         w, x, y, z = wxyz
-        turn = np.array([
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ])  # fmt: skip
+        turn = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
         c, s = np.cos(rate * t), np.sin(rate * t)
         place = AXIS * np.array([c, s * np.cos(tilt), s * np.sin(tilt)])
         along = np.dot(dipole, place) / AXIS**2
@@ -202,9 +204,14 @@ def event_scipy(tight: bool = False) -> Callable:
 
     def call():
         found = solve_ivp(
-            _rates(law, moments, np), (0.0, 86400.0), start, "DOP853", events=calm, rtol=rtol,
+            _rates(law, moments, np),
+            (0.0, 86400.0),
+            start,
+            "DOP853",
+            events=calm,
+            rtol=rtol,
             atol=rtol,
-        )  # fmt: skip
+        )
         return np.array(found.t_events[0][0])
 
     return call
@@ -353,10 +360,16 @@ def _diffrax(torque, moments, wxyz, omega, ts, tight: bool):
     rtol = 1e-12 if tight else 1e-9
     y0 = jnp.concatenate([jnp.asarray(wxyz, float), jnp.asarray(omega, float)])
     return diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, y, args: field(t, y)), diffrax.Dopri8(), ts[0], ts[-1], None, y0,
-        saveat=diffrax.SaveAt(ts=jnp.asarray(ts)), max_steps=2**20,
+        diffrax.ODETerm(lambda t, y, args: field(t, y)),
+        diffrax.Dopri8(),
+        ts[0],
+        ts[-1],
+        None,
+        y0,
+        saveat=diffrax.SaveAt(ts=jnp.asarray(ts)),
+        max_steps=2**20,
         stepsize_controller=diffrax.PIDController(rtol=rtol, atol=rtol),
-    ).ys  # fmt: skip
+    ).ys
 
 
 TASKS: dict[str, tuple[Callable, Callable | None, str]] = {
@@ -398,8 +411,9 @@ def _in_process(name: str, which: str, cache: str | None = None) -> dict:
     environment = dict(os.environ)
     if cache is not None:
         environment |= {
-            "JAX_COMPILATION_CACHE_DIR": cache, "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        }  # fmt: skip
+            "JAX_COMPILATION_CACHE_DIR": cache,
+            "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        }
     command = [sys.executable, "-m", "benchmarks.cold_tasks", "--child", name, which]
     ran = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if ran.returncode:

@@ -112,11 +112,17 @@ def diffrax_loss(state: ph.State, solver: Any) -> Callable:
     def loss(controller, tolerance):
         def one(y):
             y = diffrax.diffeqsolve(
-                diffrax.ODETerm(field), solver, 0 * end, end, end / 100, y, controller,
+                diffrax.ODETerm(field),
+                solver,
+                0 * end,
+                end,
+                end / 100,
+                y,
+                controller,
                 max_steps=4096,
                 stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
                 adjoint=diffrax.RecursiveCheckpointAdjoint(),
-            ).ys[-1]  # fmt: skip
+            ).ys[-1]
             return cost(y[:4] / jnp.linalg.norm(y[:4]), y[4:])
 
         return jnp.mean(jax.vmap(one)(jnp.concatenate([state.wxyz, state.omega_body], axis=1)))
@@ -205,9 +211,14 @@ def differences(activation: str, exact: np.ndarray, bodies: int, step: float = 1
 
 
 def measure(
-    activation: str, bodies: int, dtype: Any, ours: Iterable[float], peers: Iterable[float],
-    exact: np.ndarray, repeats: int = 3,
-) -> list[dict]:  # fmt: skip
+    activation: str,
+    bodies: int,
+    dtype: Any,
+    ours: Iterable[float],
+    peers: Iterable[float],
+    exact: np.ndarray,
+    repeats: int = 3,
+) -> list[dict]:
     """Rows of one network and number of bodies."""
     import diffrax
 
@@ -226,14 +237,18 @@ def measure(
     least = seconds(calls, repeats)
     return [
         {
-            "activation": activation, "bodies": bodies, "dtype": np.dtype(dtype).name,
-            "program": name, "tolerance": tolerance, "seconds": least[name, tolerance],
+            "activation": activation,
+            "bodies": bodies,
+            "dtype": np.dtype(dtype).name,
+            "program": name,
+            "tolerance": tolerance,
+            "seconds": least[name, tolerance],
             "error": apart(slopes[name, tolerance], exact),
             "compile_s": programs[name, tolerance].compile_s,
             "memory_MB": programs[name, tolerance].memory,
         }
         for name, tolerance in calls
-    ]  # fmt: skip
+    ]
 
 
 KINDS: dict[str, Callable] = {
@@ -260,11 +275,17 @@ def measure_kind(kind: str, bodies: int, rtol: float = 1e-6, repeats: int = 3) -
     found = both()[1]
     least = seconds({"value": lambda: value.compiled(value.arrays), "both": both}, repeats)
     return {
-        "kind": kind, "parameters": exact.size, "bodies": bodies, "rtol": rtol,
-        "value_s": least["value"], "gradient_s": least["both"],
-        "ratio": least["both"] / least["value"], "error": apart(found, exact),
-        "compile_s": both.compile_s, "memory_MB": both.memory,
-    }  # fmt: skip
+        "kind": kind,
+        "parameters": exact.size,
+        "bodies": bodies,
+        "rtol": rtol,
+        "value_s": least["value"],
+        "gradient_s": least["both"],
+        "ratio": least["both"] / least["value"],
+        "error": apart(found, exact),
+        "compile_s": both.compile_s,
+        "memory_MB": both.memory,
+    }
 
 
 def level_times(rows: list[dict], level: float) -> dict[str, float | None]:

@@ -86,9 +86,14 @@ def bullet_run(body: dict, saves: list[int]) -> tuple[np.ndarray, np.ndarray]:
         baseMass=1.0, baseOrientation=[x, y, z, body["wxyz"][0]], physicsClientId=client
     )
     pybullet.changeDynamics(
-        one, -1, localInertiaDiagonal=list(body["moments"]), linearDamping=0.0,
-        angularDamping=0.0, maxJointVelocity=1e6, physicsClientId=client,
-    )  # fmt: skip
+        one,
+        -1,
+        localInertiaDiagonal=list(body["moments"]),
+        linearDamping=0.0,
+        angularDamping=0.0,
+        maxJointVelocity=1e6,
+        physicsClientId=client,
+    )
     pybullet.setTimeStep(STEP, physicsClientId=client)
     spin = matrix(body["wxyz"]) @ body["omega"]
     pybullet.resetBaseVelocity(one, [0, 0, 0], list(spin), physicsClientId=client)
@@ -131,11 +136,13 @@ def engines() -> dict[str, tuple[str, Run]]:
 
 def matrix(wxyz: np.ndarray) -> np.ndarray:
     w, x, y, z = wxyz / np.linalg.norm(wxyz)
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def exact(body: dict, saves: list[int]) -> np.ndarray:

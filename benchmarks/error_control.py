@@ -202,18 +202,24 @@ def kept(count: int, seed: int, longest: float) -> list[dict]:
             error = angle(np.asarray(found.wxyz[:, 0]).T, best[3:]) / rtol
             status, estimate = np.asarray(found.status), np.asarray(found.error) / rtol / error
             here = error[calm]
-            rows.append({
-                "family": name, "rtol": rtol,
-                "bodies": int(calm.sum()), "left_out": int((~calm).sum()),
-                "median": float(np.median(here)), "q95": float(np.quantile(here, 0.95)),
-                "worst": float(here.max()), "beyond_10": int((here > 10).sum()),
-                "spread_of_worst": float(spread[calm][np.argmax(here)]),
-                "unsuccessful": int(((status != 0) & (status != 5))[calm].sum()),
-                "estimate_within_10": float(np.mean(np.abs(np.log10(estimate[calm])) < 1)),
-                "false_alarms": int(((status == 5) & (error <= 10) & calm).sum()),
-                "missed": int(((status == 0) & (error > 10) & calm).sum()),
-                "steps": float(np.mean(np.asarray(found.steps)[calm])),
-            })  # fmt: skip
+            rows.append(
+                {
+                    "family": name,
+                    "rtol": rtol,
+                    "bodies": int(calm.sum()),
+                    "left_out": int((~calm).sum()),
+                    "median": float(np.median(here)),
+                    "q95": float(np.quantile(here, 0.95)),
+                    "worst": float(here.max()),
+                    "beyond_10": int((here > 10).sum()),
+                    "spread_of_worst": float(spread[calm][np.argmax(here)]),
+                    "unsuccessful": int(((status != 0) & (status != 5))[calm].sum()),
+                    "estimate_within_10": float(np.mean(np.abs(np.log10(estimate[calm])) < 1)),
+                    "false_alarms": int(((status == 5) & (error <= 10) & calm).sum()),
+                    "missed": int(((status == 0) & (error > 10) & calm).sum()),
+                    "steps": float(np.mean(np.asarray(found.steps)[calm])),
+                }
+            )
             print(rows[-1], flush=True)
     return rows
 
@@ -256,11 +262,16 @@ def calibrated(count: int, seed: int) -> list[dict]:
                     continue
                 ratio = (true / (last * np.minimum(1, last / before)))[seen]
                 quantiles = [float(x) for x in np.quantile(ratio, (0.05, 0.5, 0.95))]
-                rows.append({
-                    "family": name, "order": order, "radians": wide, "bodies": int(seen.sum()),
-                    "true_over_estimate": quantiles,
-                    "true_over_difference": float(np.median((true / last)[seen])),
-                })  # fmt: skip
+                rows.append(
+                    {
+                        "family": name,
+                        "order": order,
+                        "radians": wide,
+                        "bodies": int(seen.sum()),
+                        "true_over_estimate": quantiles,
+                        "true_over_difference": float(np.median((true / last)[seen])),
+                    }
+                )
                 print(rows[-1], flush=True)
     return rows
 
@@ -384,12 +395,16 @@ def without(count: int, names: list[str]) -> list[dict]:
                     failed + int(np.sum(np.asarray(status) != 0)),
                 )
             row = {
-                "constant": constant, "value": value, "scene": name, "steps": steps,
-                "failed": failed, "seconds": seconds,
+                "constant": constant,
+                "value": value,
+                "scene": name,
+                "steps": steps,
+                "failed": failed,
+                "seconds": seconds,
                 "median": float(np.median(ratios)) if ratios else None,
                 "q95": float(np.quantile(ratios, 0.95)) if ratios else None,
                 "beyond_10": int(np.sum(np.array(ratios) > 10)),
-            }  # fmt: skip
+            }
             base = next((r for r in rows if not r["constant"] and r["scene"] == name), row)
             rows.append(
                 row
@@ -411,14 +426,20 @@ def summary(rows: list[dict]) -> list[dict]:
         most = max(ended, key=lambda row: row["steps_ratio"])
         # where 95 % of the bodies keep a tenth of rtol anyway, the ratio of errors says nothing
         errors = [row["q95"] / max(0.1, base[row["scene"]]["q95"]) for row in ended]
-        found.append({
-            "constant": name, "without": own[0]["value"],
-            "least_steps": min(row["steps_ratio"] for row in ended),
-            "most_steps": most["steps_ratio"], "most_in": most["scene"].replace("_", " "),
-            "error": max(errors),
-            "beyond_10": sum(row["beyond_10"] - base[row["scene"]]["beyond_10"] for row in ended),
-            "failed": sum(row["failed"] - base[row["scene"]]["failed"] for row in own),
-        })  # fmt: skip
+        found.append(
+            {
+                "constant": name,
+                "without": own[0]["value"],
+                "least_steps": min(row["steps_ratio"] for row in ended),
+                "most_steps": most["steps_ratio"],
+                "most_in": most["scene"].replace("_", " "),
+                "error": max(errors),
+                "beyond_10": sum(
+                    row["beyond_10"] - base[row["scene"]]["beyond_10"] for row in ended
+                ),
+                "failed": sum(row["failed"] - base[row["scene"]]["failed"] for row in own),
+            }
+        )
     return found
 
 

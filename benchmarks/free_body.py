@@ -150,8 +150,11 @@ def saved_times(count: int, times: int) -> dict:
     for name, wanted in (("both", {}), ("rates", {"attitude": False})):
         program, _ = compiled(
             lambda *a, wanted=wanted: free_motion(*a, **wanted),
-            moments, components(q), components(w), t,
-        )  # fmt: skip
+            moments,
+            components(q),
+            components(w),
+            t,
+        )
         given = moments, components(q), components(w), t
         least, _ = timed(lambda p=program, g=given: jax.block_until_ready(p(*g)), 15)
         row[f"ns_per_state_{name}"] = least / count / times * 1e9
@@ -171,8 +174,10 @@ def gradient(count: int, t: float = 100.0) -> dict:
     q, w = bodies("A", count)
     target = free_motion(
         components(np.broadcast_to(np.array((1.001, 1.998, 3.002)), (count, 3))),
-        components(q), components(w), jnp.full(count, t),
-    )  # fmt: skip
+        components(q),
+        components(w),
+        jnp.full(count, t),
+    )
     times = jnp.full(count, t)
     start, rates = components(q), components(w)
 

@@ -94,8 +94,13 @@ def draw(parts: tuple[Part, ...], dtype: str, seed: int, longest: float) -> Case
     inner = np.sort(rng.uniform(0.02, 0.98, SAVED - 2))
     ts = s.start + sign * span * np.concatenate([[0], inner, [1]])
     case = Case(parts, numbers, s.moments, s.direction(4), s.rate * s.direction(), ts)
-    return Case(parts, *(rounded(x, dtype) if not isinstance(x, tuple) else
-                         tuple(rounded(y, dtype) for y in x) for x in case[1:]))  # fmt: skip
+    return Case(
+        parts,
+        *(
+            rounded(x, dtype) if not isinstance(x, tuple) else tuple(rounded(y, dtype) for y in x)
+            for x in case[1:]
+        ),
+    )
 
 
 # The reference
@@ -366,10 +371,14 @@ def results(group: Group, count: int, seed: int, longest: float) -> Iterator[dic
                 t = ph.simulate(scene, state, ts, rtol=rtol, throw=False)
             except Exception as error:
                 yield {
-                    "parts": group.name, "dtype": group.dtype, "batch": group.batch,
-                    "draw": some[0][0], "seed": seed, "rtol": rtol,
+                    "parts": group.name,
+                    "dtype": group.dtype,
+                    "batch": group.batch,
+                    "draw": some[0][0],
+                    "seed": seed,
+                    "rtol": rtol,
                     "raised": f"{type(error).__name__}: {error}"[:300],
-                }  # fmt: skip
+                }
                 continue
             shape = (len(some), -1)
             wxyz = np.asarray(t.wxyz, float).reshape(*shape, 4)
@@ -397,14 +406,27 @@ def results(group: Group, count: int, seed: int, longest: float) -> Iterator[dic
                 kind = "kept" if error <= bound else "beyond"
                 kind = kind if status[i] == 0 else "flagged"
                 yield {
-                    "parts": group.name, "dtype": group.dtype, "batch": group.batch, "draw": k,
-                    "seed": seed, "rtol": rtol, "error": error, "ratio": error / rtol,
-                    "rates": rates / rtol, "wheels": None if wheel is None else wheel / rtol,
-                    "rounding": rounding / rtol, "growth": growth, "angle": best.angle,
-                    "switches": len(best.switches), "kind": kind, "status": int(status[i]),
-                    "steps": int(steps[i]), "backward": bool(case.ts[-1] < case.ts[0]),
-                    "seconds": seconds, "smooth": all(p.smooth for p in group.parts),
-                }  # fmt: skip
+                    "parts": group.name,
+                    "dtype": group.dtype,
+                    "batch": group.batch,
+                    "draw": k,
+                    "seed": seed,
+                    "rtol": rtol,
+                    "error": error,
+                    "ratio": error / rtol,
+                    "rates": rates / rtol,
+                    "wheels": None if wheel is None else wheel / rtol,
+                    "rounding": rounding / rtol,
+                    "growth": growth,
+                    "angle": best.angle,
+                    "switches": len(best.switches),
+                    "kind": kind,
+                    "status": int(status[i]),
+                    "steps": int(steps[i]),
+                    "backward": bool(case.ts[-1] < case.ts[0]),
+                    "seconds": seconds,
+                    "smooth": all(p.smooth for p in group.parts),
+                }
 
 
 # Derivatives
@@ -414,9 +436,12 @@ def value_of(wxyz: Any, xp: Any) -> Any:
     """A function of the attitude (4,), of either sign of the quaternion."""
     w, x, y, z = (wxyz[i] for i in range(4))
     return (
-        0.7 * (1 - 2 * (y * y + z * z)) - 0.4 * 2 * (x * y - w * z) + 1.1 * 2 * (x * z + w * y)
-        + 0.9 * 2 * (y * z + w * x) - 0.6 * (1 - 2 * (x * x + y * y))
-    )  # fmt: skip
+        0.7 * (1 - 2 * (y * y + z * z))
+        - 0.4 * 2 * (x * y - w * z)
+        + 1.1 * 2 * (x * z + w * y)
+        + 0.9 * 2 * (y * z + w * x)
+        - 0.6 * (1 - 2 * (x * x + y * y))
+    )
 
 
 def changed(case: Case, theta: Any, xp: Any) -> tuple[Any, Any, Any]:
@@ -503,10 +528,18 @@ def derivatives(part: Part, count: int, seed: int, longest: float) -> Iterator[d
                 size = max(1.0, float(np.linalg.norm(exact)))
                 error = float(np.linalg.norm(np.asarray(found) - exact)) / size
                 yield {
-                    "derivative": mode, "parts": part.name, "draw": k, "seed": seed, "rtol": rtol,
-                    "error": error, "ratio": error / rtol, "size": size, "status": int(status),
-                    "angle": case.angle, "smooth": part.smooth,
-                }  # fmt: skip
+                    "derivative": mode,
+                    "parts": part.name,
+                    "draw": k,
+                    "seed": seed,
+                    "rtol": rtol,
+                    "error": error,
+                    "ratio": error / rtol,
+                    "size": size,
+                    "status": int(status),
+                    "angle": case.angle,
+                    "smooth": part.smooth,
+                }
 
 
 # Tables
@@ -522,16 +555,21 @@ def table(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         kinds = [r["kind"] for r in ran]
         good = [r for r in ran if r["kind"] != "flagged"]
         worst = max(good, key=lambda r: r["ratio"], default=None)
-        found.append({
-            "part": name, "runs": len(ran), "kept": kinds.count("kept"),
-            "flagged": kinds.count("flagged"), "beyond": kinds.count("beyond"),
-            "left_out": sum("left_out" in r for r in own),
-            "raised": sum("raised" in r for r in own),
-            "median": float(np.median([r["ratio"] for r in good])) if good else None,
-            "worst": worst and worst["ratio"],
-            "worst_case": worst and {k: worst[k] for k in
-                                     ("parts", "dtype", "batch", "draw", "seed", "rtol")},
-        })  # fmt: skip
+        found.append(
+            {
+                "part": name,
+                "runs": len(ran),
+                "kept": kinds.count("kept"),
+                "flagged": kinds.count("flagged"),
+                "beyond": kinds.count("beyond"),
+                "left_out": sum("left_out" in r for r in own),
+                "raised": sum("raised" in r for r in own),
+                "median": float(np.median([r["ratio"] for r in good])) if good else None,
+                "worst": worst and worst["ratio"],
+                "worst_case": worst
+                and {k: worst[k] for k in ("parts", "dtype", "batch", "draw", "seed", "rtol")},
+            }
+        )
     return found
 
 
@@ -544,12 +582,17 @@ def derivative_table(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
             if not own:
                 continue
             worst = max(own, key=lambda r: r["ratio"])
-            found.append({
-                "part": name, "mode": mode, "runs": len(own),
-                "median": float(np.median([r["ratio"] for r in own])), "worst": worst["ratio"],
-                "worst_case": {k: worst[k] for k in ("draw", "seed", "rtol")},
-                "smooth": worst["smooth"],
-            })  # fmt: skip
+            found.append(
+                {
+                    "part": name,
+                    "mode": mode,
+                    "runs": len(own),
+                    "median": float(np.median([r["ratio"] for r in own])),
+                    "worst": worst["ratio"],
+                    "worst_case": {k: worst[k] for k in ("draw", "seed", "rtol")},
+                    "smooth": worst["smooth"],
+                }
+            )
     return found
 
 

@@ -1109,10 +1109,15 @@ class Cluster(Part):
         law = _Law(jnp.asarray(n["kp"]), jnp.asarray(n["kd"]))
         dtype = jnp.asarray(n["kp"]).dtype
         wheels = ph.wheel_cluster(
-            jnp.asarray(_CORNERS, dtype), n["J"], law, speed=n["speed"], max_torque=n["most"],
-            friction=ph.ViscousCoupling(n["c"]), null_gain=n["gain"],
+            jnp.asarray(_CORNERS, dtype),
+            n["J"],
+            law,
+            speed=n["speed"],
+            max_torque=n["most"],
+            friction=ph.ViscousCoupling(n["c"]),
+            null_gain=n["gain"],
             bias=jnp.zeros((), dtype),
-        )  # fmt: skip
+        )
         return {"rotors": wheels}
 
     def _commands(self, n, m, speeds) -> list[float]:
@@ -1204,9 +1209,12 @@ class Gyro(Part):
         size = float(np.mean(s.moments)) * s.rate * s.decades(-2, 0)
         s.size += size * s.rate
         return {
-            "h": size, "gimbal": gimbal, "spin": spin / np.linalg.norm(spin),
-            "size": s.rng.uniform(0.2, 2), "f": s.rate * s.decades(-1, 0),
-        }  # fmt: skip
+            "h": size,
+            "gimbal": gimbal,
+            "spin": spin / np.linalg.norm(spin),
+            "size": s.rng.uniform(0.2, 2),
+            "f": s.rate * s.decades(-1, 0),
+        }
 
     def build(self, n):
         law = _Angle(jnp.asarray(n["size"]), jnp.asarray(n["f"]))
@@ -1279,17 +1287,51 @@ class Breathing(Part):
 
 
 PARTS: list[Part] = [
-    Free(), Gravity(), Lagrange(), Gradient(), OrbitGradient("circle"), OrbitGradient("ellipse"),
-    OrbitGradient("hyperbola"), UserPotential(), BodyConstant(), BodySine(), SpaceConstant(),
-    SpaceSine(), TableTorque(1), TableTorque(3), TableTorque(3, True), PulsesOf(BodyConstant()),
-    PulsesOf(Aim()), Linear(), Quadratic(), Sink(), Rates(), Aim(), Relative(Linear(), "ellipse"),
-    Relative(Aim(), "circle"), Relative(Aim(), "ellipse"), Dipole(), Detumble(False),
+    Free(),
+    Gravity(),
+    Lagrange(),
+    Gradient(),
+    OrbitGradient("circle"),
+    OrbitGradient("ellipse"),
+    OrbitGradient("hyperbola"),
+    UserPotential(),
+    BodyConstant(),
+    BodySine(),
+    SpaceConstant(),
+    SpaceSine(),
+    TableTorque(1),
+    TableTorque(3),
+    TableTorque(3, True),
+    PulsesOf(BodyConstant()),
+    PulsesOf(Aim()),
+    Linear(),
+    Quadratic(),
+    Sink(),
+    Rates(),
+    Aim(),
+    Relative(Linear(), "ellipse"),
+    Relative(Aim(), "circle"),
+    Relative(Aim(), "ellipse"),
+    Dipole(),
+    Detumble(False),
     Detumble(True),
-    *(Feedback(kind) for kind in
-      ("relu", "clip", "where", "dead band", "floor", "window", "tanh")),
-    Sampled(), AirDrag(), Light(), Held(), Driven(), Impulse(), Viscous(), Coulomb(False),
-    Coulomb(True), LimitedMotor(), Cluster(), Dumping(), Gyro(), Tensor(), Breathing(),
-]  # fmt: skip
+    *(Feedback(kind) for kind in ("relu", "clip", "where", "dead band", "floor", "window", "tanh")),
+    Sampled(),
+    AirDrag(),
+    Light(),
+    Held(),
+    Driven(),
+    Impulse(),
+    Viscous(),
+    Coulomb(False),
+    Coulomb(True),
+    LimitedMotor(),
+    Cluster(),
+    Dumping(),
+    Gyro(),
+    Tensor(),
+    Breathing(),
+]
 """All of them."""
 
 

@@ -71,9 +71,15 @@ class Reference:
         if first is not None:
             first = min(first, abs(end - t))
         return DOP853(
-            field, t, y, end, max_step=self.longest, rtol=self.rtol,
-            atol=self.rtol * self.scale, first_step=first,
-        )  # fmt: skip
+            field,
+            t,
+            y,
+            end,
+            max_step=self.longest,
+            rtol=self.rtol,
+            atol=self.rtol * self.scale,
+            first_step=first,
+        )
 
     def _step(self, solver: DOP853) -> None:
         message = solver.step()
@@ -184,7 +190,7 @@ def cross(a: Vector, b: Vector) -> tuple[float, float, float]:
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],
         a[0] * b[1] - a[1] * b[0],
-    )  # fmt: skip
+    )
 
 
 def dot(a: Vector, b: Vector) -> float:

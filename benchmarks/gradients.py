@@ -34,9 +34,14 @@ HORIZON = 20.0
 FAMILIES = ("free", "near_symmetric", "lagrange", "heavy_top", "gradient", "damped_top")
 QUICK = ("free", "heavy_top")
 DAMPED = Problem(
-    "damped_top", "heavy top with drag and a torque", (1.0, 1.5, 2.0), 24, weight=1.0,
-    damping=0.05, push=(0.1, 0.02, 0.05),
-)  # fmt: skip
+    "damped_top",
+    "heavy top with drag and a torque",
+    (1.0, 1.5, 2.0),
+    24,
+    weight=1.0,
+    damping=0.05,
+    push=(0.1, 0.02, 0.05),
+)
 FEW = 3
 """Bodies scored where the derivatives are by other numbers than the moments."""
 SCORED = 8
@@ -80,9 +85,7 @@ def own(problem: Problem, n: int, rtol: float, by: str = "moments"):
     method = ph.explain(scene(moments), state, ts, rtol=rtol).method
 
     def value(moments):
-        end = ph.simulate(
-            scene(moments), state, ts, method, rtol=rtol, record=record, throw=False
-        )  # fmt: skip
+        end = ph.simulate(scene(moments), state, ts, method, rtol=rtol, record=record, throw=False)
         return loss(end.wxyz[:, 0].T, end.omega_body[:, 0].T)
 
     name = f"default: {type(getattr(method, 'solver', method)).__name__}"
@@ -120,9 +123,16 @@ def stock(problem: Problem, n: int, tolerance: float, chunk: int = 40):
     def one(block):
         y, moments = block
         end = diffrax.diffeqsolve(
-            diffrax.ODETerm(field), diffrax.Dopri8(), 0.0, problem.horizon, None, y.T, moments.T,
-            stepsize_controller=control, max_steps=2**12,
-        ).ys[0]  # fmt: skip
+            diffrax.ODETerm(field),
+            diffrax.Dopri8(),
+            0.0,
+            problem.horizon,
+            None,
+            y.T,
+            moments.T,
+            stepsize_controller=control,
+            max_steps=2**12,
+        ).ys[0]
         return loss(end[:4], end[4:])
 
     def value(moments):
@@ -154,22 +164,30 @@ def measure_jax(peer, made, problem, n, setting, exact) -> dict:
     )
     return {
         **_row(problem, peer, name, n, setting, found, exact, walls, n),
-        "compile_value_s": compile_s[0], "compile_s": compile_s[1],
-        "memory_value_MB": _memory(forward), "memory_MB": _memory(both),
-    }  # fmt: skip
+        "compile_value_s": compile_s[0],
+        "compile_s": compile_s[1],
+        "memory_value_MB": _memory(forward),
+        "memory_MB": _memory(both),
+    }
 
 
 def _row(problem, peer, name, n, setting, found, exact, walls, ran) -> dict:
     off = np.linalg.norm(found - exact, axis=1) / np.linalg.norm(exact, axis=1)
     off = np.where(np.isfinite(off), off, np.inf)
     return {
-        "family": problem.name, "title": problem.title, "peer": peer, "program": name,
-        "setting": setting, "bodies": n, "ns_value": walls["forward"].median / ran * 1e9,
+        "family": problem.name,
+        "title": problem.title,
+        "peer": peer,
+        "program": name,
+        "setting": setting,
+        "bodies": n,
+        "ns_value": walls["forward"].median / ran * 1e9,
         "ns_gradient": walls["both"].median / ran * 1e9,
         "ratio": walls["both"].median / walls["forward"].median,
         "spread": max(walls["forward"].spread, walls["both"].spread),
-        "error_median": float(np.median(off)), "error_worst": float(off.max()),
-    }  # fmt: skip
+        "error_median": float(np.median(off)),
+        "error_worst": float(off.max()),
+    }
 
 
 def _memory(program) -> float | None:
@@ -196,18 +214,23 @@ def variational(problem: Problem, n: int, tolerance: float, exact) -> dict:
     for label, given in (("forward", plain), ("both", system)):
         begin = time.perf_counter()
         size = 7 if label == "forward" else 28
-        made = hy.taylor_adaptive_batch(
-            given, np.zeros((7, width)), tol=tolerance, pars=moments
-        )  # fmt: skip
+        made = hy.taylor_adaptive_batch(given, np.zeros((7, width)), tol=tolerance, pars=moments)
         compile_s = time.perf_counter() - begin
         programs[label] = _heyoka_call(made, start, size, problem.horizon, width)
     ends = programs["both"]()
     found = np.einsum("k,nkm->nm", np.array(WEIGHTS), ends[:, 7:].reshape(-1, 7, 3))
     walls = _report.in_turn(programs, repeats=5)
     row = _row(
-        problem, "heyoka", f"variational, batches of {width}", n, f"{tolerance:.0e}",
-        found[: len(exact)], exact, walls, len(start),
-    )  # fmt: skip
+        problem,
+        "heyoka",
+        f"variational, batches of {width}",
+        n,
+        f"{tolerance:.0e}",
+        found[: len(exact)],
+        exact,
+        walls,
+        len(start),
+    )
     return row | {"compile_s": compile_s}
 
 
@@ -265,8 +288,10 @@ def main() -> None:
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     rows = []
-    print(f"{'gradient by the moments':66}{'us/body':>9}{'ratio':>7}{'median':>9}{'worst':>9}"
-          f"{'MB':>8}{'compile s':>10}")  # fmt: skip
+    print(
+        f"{'gradient by the moments':66}{'us/body':>9}{'ratio':>7}{'median':>9}{'worst':>9}"
+        f"{'MB':>8}{'compile s':>10}"
+    )
     for family in options.families or (QUICK if options.quick else FAMILIES):
         for row in measure(family, options.bodies, options.quick):
             rows.append(row)

@@ -117,16 +117,20 @@ def design(seed, turns, samples, noise, least, count):
     low, high = (np.asarray(end)[:, :2] for end in fit.interval(0.95))
     ratios = (moments / moments[:, 2:])[:, :2]
     inside = ((low <= ratios) & (ratios <= high))[told]
-    return square[told], inside, {
-        "turns": turns,
-        "samples": samples,
-        "noise_over_rate": noise,
-        "bodies": count,
-        "flagged_weak_or_flat": int(weak.sum()),
-        "flagged_not_converged": int(missed.sum()),
-        **summary(square[told], inside),
-        "chi_largest": float(np.asarray(fit.noise)[told].max()),
-    }  # fmt: skip
+    return (
+        square[told],
+        inside,
+        {
+            "turns": turns,
+            "samples": samples,
+            "noise_over_rate": noise,
+            "bodies": count,
+            "flagged_weak_or_flat": int(weak.sum()),
+            "flagged_not_converged": int(missed.sum()),
+            **summary(square[told], inside),
+            "chi_largest": float(np.asarray(fit.noise)[told].max()),
+        },
+    )
 
 
 def summary(square, inside):
@@ -222,10 +226,16 @@ def speed(count, quick):
         2,
     )
     cases = [
-        {"ours_s": a, "steps": n, "scipy_s": b, "faster": b / a, "error_ours": e[0],
-         "error_scipy": e[1]}
+        {
+            "ours_s": a,
+            "steps": n,
+            "scipy_s": b,
+            "faster": b / a,
+            "error_ours": e[0],
+            "error_scipy": e[1],
+        }
         for a, n, b, e in zip(ours, steps, peers, errors, strict=True)
-    ]  # fmt: skip
+    ]
     return {
         "samples": 1000,
         "cases": cases,

@@ -46,9 +46,10 @@ def directions(jd, lean=0.1):
     """Vectors to Sun and observer [au] of a body at 1.8 au, the observer at 1 au; circles."""
 
     def circle(radius, longitude, tilt):
-        return radius * np.stack([
-            np.cos(longitude), np.sin(longitude) * np.cos(tilt), np.sin(longitude) * np.sin(tilt)
-        ], -1)  # fmt: skip
+        return radius * np.stack(
+            [np.cos(longitude), np.sin(longitude) * np.cos(tilt), np.sin(longitude) * np.sin(tilt)],
+            -1,
+        )
 
     body = circle(1.8, 0.25 + 2 * np.pi * jd / (365.25 * 1.8**1.5), lean)
     return -body, circle(1.0, 2 * np.pi * jd / 365.25, 0.0) - body
@@ -94,11 +95,11 @@ def synthetic(seed: int, noise: float, *, nights=24, days=80.0, each=20, spread=
         if wide and 2 / P_phi + 2 / P_psi < 7 and P_psi < days / 20:
             break
     bodies = _brightness.Bodies(
-        jnp.asarray(np.r_[
-            np.log(square[1:] / square[0]) / 2, np.log(axes[1:]), omega * scale, 0.3, 0.35
-        ])[None],
+        jnp.asarray(
+            np.r_[np.log(square[1:] / square[0]) / 2, np.log(axes[1:]), omega * scale, 0.3, 0.35]
+        )[None],
         state.wxyz[None],
-    )  # fmt: skip
+    )
     blank = lightcurve.LightCurve.of(t, 0 * t, sun, observer, group=group, calibrated=True)
     points = blank.points(1.0)
     light = np.asarray(_magnitudes(lightcurve.HG1G2(), bodies, points))[0, : t.size]
@@ -129,9 +130,9 @@ def blunt(axes, blunting=3.0, taper=0.25):
     """
     turn = np.linspace(0, 2 * np.pi, 49)[:-1]
     rise = np.linspace(-np.pi / 2, np.pi / 2, 25)[1:-1, None]
-    ring = np.stack([
-        np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise) + 0 * turn
-    ])  # fmt: skip
+    ring = np.stack(
+        [np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise) + 0 * turn]
+    )
     unit = np.c_[ring.reshape(3, -1), [0, 0, -1], [0, 0, 1]].T
     unit = unit / (np.abs(unit) ** blunting).sum(1, keepdims=True) ** (1 / blunting)
     vertices = unit * axes / (1 + taper * unit[:, :1])
@@ -192,16 +193,26 @@ def case(seed: int, noise: float, egg: bool = False, **options) -> dict:
     place = next((k for k, s in enumerate(fit.solutions) if _right(s, truth)), None)
     best = fit.best
     return {
-        "seed": seed, "noise": noise, "truth": truth, "verdict": _verdict(fit, truth),
-        "place": place, "rms": best.rms, "cost": best.cost,
-        "scale": fit.scale, "points": curve.t.size, "possible": known,
+        "seed": seed,
+        "noise": noise,
+        "truth": truth,
+        "verdict": _verdict(fit, truth),
+        "place": place,
+        "rms": best.rms,
+        "cost": best.cost,
+        "scale": fit.scale,
+        "points": curve.t.size,
+        "possible": known,
         "offset_sigma": fit.offset_sigma,
-        "P_phi": best.P_phi, "P_psi": best.P_psi, "mode": best.mode.name,
+        "P_phi": best.P_phi,
+        "P_psi": best.P_psi,
+        "mode": best.mode.name,
         "odds": None if place is None else fit.solutions[place].probability,
         "pole_error_deg": apart(best.pole, truth["pole"]),
         "pole_error_listed_deg": min(apart(s.pole, truth["pole"]) for s in fit.solutions),
-        "notes": fit.notes, "seconds": seconds,
-    }  # fmt: skip
+        "notes": fit.notes,
+        "seconds": seconds,
+    }
 
 
 def best_possible(curve, body, learnt=None, floor=0.01, spread=0.02) -> dict:
@@ -218,28 +229,30 @@ def best_possible(curve, body, learnt=None, floor=0.01, spread=0.02) -> dict:
     problem = _search.Problem(phase, curve.points(floor, learnt))
     state = problem.improve(problem.evaluate(*state[:2], width), width, 20)
     return {
-        "P_phi_std": found.P_phi_std / found.P_phi, "P_psi_std": found.P_psi_std / found.P_psi,
+        "P_phi_std": found.P_phi_std / found.P_phi,
+        "P_psi_std": found.P_psi_std / found.P_psi,
         "cost": float(state.cost[0]),
-    }  # fmt: skip
+    }
 
 
 def summary(cases, noise: float) -> dict:
     """Counts of one noise; ``determined``: the points allow 0.1 % in both periods at 3 sigma."""
     rows = [r for r in cases if r["noise"] == noise]
     sharp = [
-        r for r in rows
-        if 3 * max(r["possible"]["P_phi_std"], r["possible"]["P_psi_std"]) < 1e-3
-    ]  # fmt: skip
+        r for r in rows if 3 * max(r["possible"]["P_phi_std"], r["possible"]["P_psi_std"]) < 1e-3
+    ]
 
     def counts(some):
         return {name: sum(r["verdict"] == name for r in some) for name in VERDICTS}
 
     return {
-        "noise": noise, "cases": len(rows), **counts(rows),
+        "noise": noise,
+        "cases": len(rows),
+        **counts(rows),
         "determined": {"cases": len(sharp), **counts(sharp)},
         "pole_within_10_deg_listed": sum(r["pole_error_listed_deg"] < 10 for r in rows),
         "seconds_median": float(np.median([r["seconds"] for r in rows])) if rows else None,
-    }  # fmt: skip
+    }
 
 
 def speed(states: int = 100_000, samples: int = 400) -> dict:
@@ -274,10 +287,16 @@ def toutatis(folder: Path):
 
     r, delta, magnitude, error = column(seen, "r_au", "delta_au", "mag", "mag_err").T
     return lightcurve.LightCurve.of(
-        column(geometry, "jd_utc_target")[:, 0], magnitude - 5 * np.log10(r * delta),
-        column(geometry, "sx", "sy", "sz"), column(geometry, "ox", "oy", "oz"), sigma=error,
-        group=[row["observer"] for row in seen], calibrated=True, at_body=True, reduced=True,
-    )  # fmt: skip
+        column(geometry, "jd_utc_target")[:, 0],
+        magnitude - 5 * np.log10(r * delta),
+        column(geometry, "sx", "sy", "sz"),
+        column(geometry, "ox", "oy", "oz"),
+        sigma=error,
+        group=[row["observer"] for row in seen],
+        calibrated=True,
+        at_body=True,
+        reduced=True,
+    )
 
 
 def radar(folder: Path, solution, start: float, until=2449000.0 + 365) -> list[float]:
@@ -311,8 +330,9 @@ def _passive(alpha, beta, gamma):
 
     def about(axis, angle):
         c, s = np.cos(angle), np.sin(angle)
-        return np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]] if axis == 3
-                        else [[1, 0, 0], [0, c, s], [0, -s, c]])  # fmt: skip
+        return np.array(
+            [[c, s, 0], [-s, c, 0], [0, 0, 1]] if axis == 3 else [[1, 0, 0], [0, c, s], [0, -s, c]]
+        )
 
     return about(3, gamma) @ about(1, beta) @ about(3, alpha)
 
@@ -331,13 +351,22 @@ def real(folder: Path, seeds: int, **options) -> dict:
         listed = []
         for k, s in enumerate(fit.solutions):
             errors = radar(folder, s, curve.t[0])
-            listed.append({
-                "number": k, "P_phi": s.P_phi, "P_psi": s.P_psi, "mode": s.mode.name, "rms": s.rms,
-                "odds": s.probability, "pole": s.pole.tolist(), "moments": s.moments.tolist(),
-                "moments_std": s.moments_std.tolist(), "mirror_of": s.mirror_of,
-                "pole_error_deg": apart(s.pole, TOUTATIS["pole"]),
-                "radar_median_deg": float(np.median(errors)),
-            })  # fmt: skip
+            listed.append(
+                {
+                    "number": k,
+                    "P_phi": s.P_phi,
+                    "P_psi": s.P_psi,
+                    "mode": s.mode.name,
+                    "rms": s.rms,
+                    "odds": s.probability,
+                    "pole": s.pole.tolist(),
+                    "moments": s.moments.tolist(),
+                    "moments_std": s.moments_std.tolist(),
+                    "mirror_of": s.mirror_of,
+                    "pole_error_deg": apart(s.pole, TOUTATIS["pole"]),
+                    "radar_median_deg": float(np.median(errors)),
+                }
+            )
             print(seed, listed[-1], flush=True)
         print(fit.notes, flush=True)
         runs.append({"seed": seed, "solutions": listed, "notes": fit.notes})
@@ -369,8 +398,9 @@ def main() -> None:
     if given.real:
         keep("real", real(given.real, given.seeds, trials=given.trials))
     for name, egg, count, noises in (
-        ("eggs", True, given.egg, [0.02]), ("cases", False, given.count, given.noise),
-    ):  # fmt: skip
+        ("eggs", True, given.egg, [0.02]),
+        ("cases", False, given.count, given.noise),
+    ):
         rows: list[dict] = []
         for seed in range(given.first, given.first + count):
             for noise in noises:

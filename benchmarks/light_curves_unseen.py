@@ -169,9 +169,9 @@ def geometry(t, rng):
         radius, tilt = rng.uniform(1.1, 2.4), rng.uniform(0, 0.4)
         begin, node = rng.uniform(0, 2 * np.pi, 2)
         angle = begin + 2 * np.pi * t / 365.25 / radius**1.5
-        place = radius * np.stack([
-            np.cos(angle), np.sin(angle) * np.cos(tilt), np.sin(angle) * np.sin(tilt)
-        ], -1)  # fmt: skip
+        place = radius * np.stack(
+            [np.cos(angle), np.sin(angle) * np.cos(tilt), np.sin(angle) * np.sin(tilt)], -1
+        )
         year = node + 2 * np.pi * t / 365.25
         earth = np.stack([np.cos(year), np.sin(year), 0 * year], -1)
         sun, observer = -place, earth - place
@@ -312,16 +312,24 @@ def case(seed: int) -> dict:
     seconds = time.process_time() - began
     best = fit.best
     row = {
-        "seed": seed, "truth": truth, "points": t.size, "calibrated": calibrated,
-        "verdict": fit.verdict.name, "par": fit.par, "reasons": list(fit.reasons),
-        "misfit": fit.misfit, "agreement": fit.agreement, "alike": fit.alike,
+        "seed": seed,
+        "truth": truth,
+        "points": t.size,
+        "calibrated": calibrated,
+        "verdict": fit.verdict.name,
+        "par": fit.par,
+        "reasons": list(fit.reasons),
+        "misfit": fit.misfit,
+        "agreement": fit.agreement,
+        "alike": fit.alike,
         "solutions": [
             [s.P_phi, s.P_phi_std, s.P_psi, s.P_psi_std, s.mode.name, s.probability, s.rms]
             for s in fit.solutions
         ],
         "models": [[m.name, m.log_evidence, m.misfit, list(m.periods)] for m in fit.models],
-        "seconds": seconds, "commit": commit(),
-    }  # fmt: skip
+        "seconds": seconds,
+        "commit": commit(),
+    }
     right = [kind_of(seed) in ("tumbler", "few") and same_motion(s, truth) for s in fit.solutions]
     row["score"] = score(truth, row["verdict"], right)
     row["place"] = right.index(True) if any(right) else None
@@ -387,13 +395,16 @@ def _not_right(row: dict) -> dict:
     truth, first = row["truth"], row["solutions"][0]
     true = [f"{24 * truth[k]:.3f}" for k in ("P_phi", "P_psi", "period") if k in truth]
     return {
-        "seed": row["seed"], "kind": truth["kind"], "verdict": row["verdict"],
-        "score": row["score"], "place": None if row["place"] is None else row["place"] + 1,
+        "seed": row["seed"],
+        "kind": truth["kind"],
+        "verdict": row["verdict"],
+        "score": row["score"],
+        "place": None if row["place"] is None else row["place"] + 1,
         "true": f"{', '.join(true)} {truth.get('mode', '')}".strip(),
         "first": f"{24 * first[0]:.3f}, {24 * first[2]:.3f} {first[4]}",
         "calibrated": row["calibrated"],
         "reasons": " ".join(row["reasons"]),
-    }  # fmt: skip
+    }
 
 
 def main() -> None:

@@ -59,12 +59,17 @@ def measure(family: str, n: int) -> dict:
     bare, plain = times["bare"].median, times["plain"].median
     hundred = times["hundred"].median if "hundred" in times else None
     return {
-        "family": family, "title": problem.title, "bodies": n,
-        "ns_bare": bare / n * 1e9, "ns_plain": plain / n * 1e9, "ratio": plain / bare,
+        "family": family,
+        "title": problem.title,
+        "bodies": n,
+        "ns_bare": bare / n * 1e9,
+        "ns_plain": plain / n * 1e9,
+        "ratio": plain / bare,
         "us_over_program": (plain - bare) * 1e6,
         "ns_sample": None if hundred is None else hundred / n / 100 * 1e9,
-        "attitude_median": found["attitude_median"], "attitude_worst": found["attitude_worst"],
-    }  # fmt: skip
+        "attitude_median": found["attitude_median"],
+        "attitude_worst": found["attitude_worst"],
+    }
 
 
 def layouts(n: int) -> dict:

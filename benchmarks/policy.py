@@ -25,8 +25,13 @@ if __name__ == "__main__":
 BODIES = 1000
 CLOSED = ("free body", "free bodies", "free bodies, 100 times", "Lagrange's tops")
 STEPS = ("heavy top", "heavy tops", "satellite", "satellites", "clipped satellites")
-GRADIENTS = ("gradient of free bodies", "gradient of Lagrange's tops", "gradient of a heavy top",
-             "gradient of heavy tops", "gradient of a satellite")  # fmt: skip
+GRADIENTS = (
+    "gradient of free bodies",
+    "gradient of Lagrange's tops",
+    "gradient of a heavy top",
+    "gradient of heavy tops",
+    "gradient of a satellite",
+)
 ALL = (*CLOSED, *STEPS, *GRADIENTS)
 FIELDS = (*STEPS, *GRADIENTS[2:])
 
@@ -186,7 +191,7 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
         "saved function of free bodies": saved(triaxial()),
         "saved function of tops": saved(triaxial(gravity)),
         "fits": fits,
-    }  # fmt: skip
+    }
 
 
 def serve(name: str, value: Any, scenes: list[str]) -> None:
@@ -229,10 +234,13 @@ def compare(name: str, rounds: int, words: list[str]) -> list[dict[str, Any]]:
         command = [sys.executable, "-m", "benchmarks.policy", own, "--serve", json.dumps(value)]
         servers.append(
             subprocess.Popen(
-                [*command, "--scenes", *scenes], env=environment, text=True,
-                stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                [*command, "--scenes", *scenes],
+                env=environment,
+                text=True,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
             )
-        )  # fmt: skip
+        )
     compiled = [json.loads(server.stdout.readline()) for server in servers]
     times = {scene: [float("inf")] * len(values) for scene in scenes}
     for _ in range(rounds):
@@ -246,14 +254,17 @@ def compare(name: str, rounds: int, words: list[str]) -> list[dict[str, Any]]:
         server.wait()
     return [
         {
-            "name": name, "value": value, "scene": scene,
-            "ms": 1e3 * least[0], "ratio": least[k] / least[0],
+            "name": name,
+            "value": value,
+            "scene": scene,
+            "ms": 1e3 * least[0],
+            "ratio": least[k] / least[0],
             "compile_ratio": compiled[k][scene] / compiled[0][scene],
         }
         for scene, least in times.items()
         for k, value in enumerate(values)
         if k
-    ]  # fmt: skip
+    ]
 
 
 def main() -> None:

@@ -72,15 +72,23 @@ PROBLEMS = {
         Problem("heavy_top", "asymmetric heavy top", (1.0, 1.5, 2.0), 22, weight=1.0),
         Problem("gradient", "gravity gradient", (1.0, 1.5, 2.0), 23, gradient=0.75),
         Problem("dense", "free body, 100 saved times", (1.0, 2.0, 3.0), 11, saves=100),
-        Problem("dense_top", "heavy top, 100 saved times", (1.0, 1.5, 2.0), 22, saves=100,
-                weight=1.0),
+        Problem(
+            "dense_top", "heavy top, 100 saved times", (1.0, 1.5, 2.0), 22, saves=100, weight=1.0
+        ),
         Problem("long", "free body, to t = 1e5", (1.0, 2.0, 3.0), 11, horizon=1e5),
     )
-}  # fmt: skip
+}
 SATELLITE = Problem(
-    "satellite", "satellite: gravity gradient, drag, thruster", (1.0, 1.5, 2.0), 25, horizon=50.0,
-    saves=10, gradient=0.75, damping=0.05, push=(0.02, -0.01, 0.03),
-)  # fmt: skip
+    "satellite",
+    "satellite: gravity gradient, drag, thruster",
+    (1.0, 1.5, 2.0),
+    25,
+    horizon=50.0,
+    saves=10,
+    gradient=0.75,
+    damping=0.05,
+    push=(0.02, -0.01, 0.03),
+)
 """Of the benchmark on accelerators: torques in closed form there are none for."""
 
 

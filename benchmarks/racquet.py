@@ -90,7 +90,7 @@ def alone(trials):
         },
         "rms_median_rad_s": float(np.median(np.asarray(fit.rms)[usable])),
         "ratios_median": np.median(np.asarray(fit.ratios)[usable], axis=0).tolist(),
-    }  # fmt: skip
+    }
 
 
 def crossings(times, x):

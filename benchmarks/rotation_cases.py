@@ -54,18 +54,36 @@ def eulers(dtype, count: int, is_proper: bool, stride: int) -> list[np.ndarray]:
     pi = float(dtype(np.pi))
     tiny = tiny_angles(dtype)[0]
     outer = [
-        (0.0, 0.0), (0.3, -0.3), (0.3, -0.3 + 1e-7), (tiny, tiny), (pi, pi), (pi, -pi), (-pi, -pi),
-        (pi / 2, pi / 2), (1.0, pi - 1), (1.0, pi - 1 - 1e-6), (1.0, pi - 1 + 1e-6), (-2.0, 2 - pi),
-        (3.0, 3.1), (2.5, 1.9), (-2.5, -1.9), (pi, pi - 1e-6), (0.4, -0.7),
-    ]  # fmt: skip
+        (0.0, 0.0),
+        (0.3, -0.3),
+        (0.3, -0.3 + 1e-7),
+        (tiny, tiny),
+        (pi, pi),
+        (pi, -pi),
+        (-pi, -pi),
+        (pi / 2, pi / 2),
+        (1.0, pi - 1),
+        (1.0, pi - 1 - 1e-6),
+        (1.0, pi - 1 + 1e-6),
+        (-2.0, 2 - pi),
+        (3.0, 3.1),
+        (2.5, 1.9),
+        (-2.5, -1.9),
+        (pi, pi - 1e-6),
+        (0.4, -0.7),
+    ]
     inner = [0.0, tiny, 1e-8, 1e-4, 0.5, pi / 2 - 1e-6, pi / 2]
     inner += [2.0, pi - 1e-6, pi] if is_proper else [-tiny, -0.5, -pi / 2]
     made = [(first, second, third) for (first, third), second in itertools.product(outer, inner)]
     low, high = (0, np.pi) if is_proper else (-np.pi / 2, np.pi / 2)
     random = np.stack(
-        [rng.uniform(-np.pi, np.pi, count), rng.uniform(low, high, count),
-         rng.uniform(-np.pi, np.pi, count)], axis=1
-    )  # fmt: skip
+        [
+            rng.uniform(-np.pi, np.pi, count),
+            rng.uniform(low, high, count),
+            rng.uniform(-np.pi, np.pi, count),
+        ],
+        axis=1,
+    )
     return [np.asarray(row, dtype) for row in [*made[::stride], *random]]
 
 
@@ -197,48 +215,77 @@ def plain_cases(count: int) -> list[Case]:
     """Every conversion that has nothing to do with Euler angles."""
     return [
         Case(
-            "rotation vector -> wxyz", rotation.rotation_vector_to_wxyz,
-            lambda point: truth.from_vector, _points_of_vectors(count), _straight,
+            "rotation vector -> wxyz",
+            rotation.rotation_vector_to_wxyz,
+            lambda point: truth.from_vector,
+            _points_of_vectors(count),
+            _straight,
             measure_quaternion,
         ),
         Case(
             "axis-angle -> wxyz",
             lambda row: rotation.axis_angle_to_wxyz(row[..., :3], row[..., 3]),
-            lambda point: truth.from_axis_angle, _points_of_axes(count), _straight,
+            lambda point: truth.from_axis_angle,
+            _points_of_axes(count),
+            _straight,
             measure_quaternion,
         ),
         Case(
-            "Rodrigues -> wxyz", rotation.modified_rodrigues_to_wxyz,
-            lambda point: truth.from_rodrigues, _points_of_rodrigues(count), _straight,
+            "Rodrigues -> wxyz",
+            rotation.modified_rodrigues_to_wxyz,
+            lambda point: truth.from_rodrigues,
+            _points_of_rodrigues(count),
+            _straight,
             measure_quaternion,
         ),
         Case(
             "matrix -> wxyz",
             lambda row: rotation.matrix_to_wxyz(row.reshape(*row.shape[:-1], 3, 3)),
             _on_side,
-            _points_unrounded(count), _turning, measure_quaternion,
+            _points_unrounded(count),
+            _turning,
+            measure_quaternion,
         ),
         _from_quaternion(
-            "wxyz -> rotation vector", rotation.wxyz_to_rotation_vector, truth.to_vector,
-            measure_vector, count,
+            "wxyz -> rotation vector",
+            rotation.wxyz_to_rotation_vector,
+            truth.to_vector,
+            measure_vector,
+            count,
         ),
         _from_quaternion(
-            "wxyz -> axis-angle", _axis_angle_row, truth.to_axis_angle, measure_axis_angle, count,
-            singular=at_identity, near=_size_of_turn,
+            "wxyz -> axis-angle",
+            _axis_angle_row,
+            truth.to_axis_angle,
+            measure_axis_angle,
+            count,
+            singular=at_identity,
+            near=_size_of_turn,
         ),
         _from_quaternion(
-            "wxyz -> Rodrigues", rotation.wxyz_to_modified_rodrigues, truth.to_rodrigues,
-            measure_vector, count,
+            "wxyz -> Rodrigues",
+            rotation.wxyz_to_modified_rodrigues,
+            truth.to_rodrigues,
+            measure_vector,
+            count,
         ),
         _from_quaternion(
-            "wxyz -> shadow Rodrigues", rotation.wxyz_to_shadow, truth.to_shadow, measure_vector,
-            count, singular=at_identity, near=_size_of_turn,
+            "wxyz -> shadow Rodrigues",
+            rotation.wxyz_to_shadow,
+            truth.to_shadow,
+            measure_vector,
+            count,
+            singular=at_identity,
+            near=_size_of_turn,
         ),
         _from_quaternion(
-            "wxyz -> matrix", _matrix_row, lambda moved, _: truth.to_matrix(moved),
-            measure_matrix, count,
+            "wxyz -> matrix",
+            _matrix_row,
+            lambda moved, _: truth.to_matrix(moved),
+            measure_matrix,
+            count,
         ),
-    ]  # fmt: skip
+    ]
 
 
 def _points_of_axes(count):
@@ -294,17 +341,25 @@ def euler_cases(sequence: Sequence, count: int, stride: int = 1) -> list[Case]:
 
     return [
         Case(
-            f"Euler {sequence.name} -> wxyz", forward,
+            f"Euler {sequence.name} -> wxyz",
+            forward,
             lambda point: lambda moved: truth.from_euler(moved, axes, extrinsic),
-            points, _straight, measure_quaternion,
+            points,
+            _straight,
+            measure_quaternion,
         ),
         Case(
-            f"wxyz -> Euler {sequence.name}", backward, angles, quaternions, _turning,
+            f"wxyz -> Euler {sequence.name}",
+            backward,
+            angles,
+            quaternions,
+            _turning,
             measure_euler(sequence),
             # closer than this a float cannot tell the two sides of the end apart
-            singular=lambda point: to_end(point) < 1e-40, near=to_end,
+            singular=lambda point: to_end(point) < 1e-40,
+            near=to_end,
         ),
-    ]  # fmt: skip
+    ]
 
 
 def composed_cases(count: int, stride: int = 1) -> list[Case]:
@@ -340,18 +395,31 @@ def composed_cases(count: int, stride: int = 1) -> list[Case]:
         return truth.norm(quaternion(point)[1:])
 
     rows = [
-        ("rotation vector", lambda row: rotation.euler_to_rotation_vector(*angles(row)),
-         truth.to_vector, measure_vector),
+        (
+            "rotation vector",
+            lambda row: rotation.euler_to_rotation_vector(*angles(row)),
+            truth.to_vector,
+            measure_vector,
+        ),
         ("axis-angle", axis_angle, truth.to_axis_angle, measure_axis_angle),
-        ("Rodrigues", lambda row: rotation.euler_to_modified_rodrigues(*angles(row)),
-         truth.to_rodrigues, measure_vector),
+        (
+            "Rodrigues",
+            lambda row: rotation.euler_to_modified_rodrigues(*angles(row)),
+            truth.to_rodrigues,
+            measure_vector,
+        ),
         ("matrix", matrix, lambda moved, _: truth.to_matrix(moved), measure_matrix),
-    ]  # fmt: skip
+    ]
     return [
         Case(
-            f"Euler ZYZ -> {name}", function, through(target), points, _straight, measure,
+            f"Euler ZYZ -> {name}",
+            function,
+            through(target),
+            points,
+            _straight,
+            measure,
             singular=unmoved if name == "axis-angle" else lambda point: False,
             near=size if name == "axis-angle" else lambda point: mp.mpf(1),
         )
         for name, function, target, measure in rows
-    ]  # fmt: skip
+    ]

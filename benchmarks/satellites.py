@@ -38,11 +38,14 @@ NOISE, PUSH, MEMORY = 1e-4, 1e-5, 30.0
 AXIS = np.ones(3) / np.sqrt(3)
 # inertia, kg m^2; the wheel's spin inertia, kg m^2, and speed that its sines reach, rad/s
 SATELLITES = {
-    "4 kg": ([[0.036, 0.0008, -0.0005], [0.0008, 0.034, 0.0004], [-0.0005, 0.0004, 0.0075]],
-             1e-5, 800.0),
+    "4 kg": (
+        [[0.036, 0.0008, -0.0005], [0.0008, 0.034, 0.0004], [-0.0005, 0.0004, 0.0075]],
+        1e-5,
+        800.0,
+    ),
     "20 kg": ([[0.32, 0.008, -0.006], [0.008, 0.27, 0.01], [-0.006, 0.01, 0.19]], 2e-4, 600.0),
     "60 kg": ([[3.1, 0.06, 0.09], [0.06, 2.6, -0.08], [0.09, -0.08, 2.1]], 2e-3, 600.0),
-}  # fmt: skip
+}
 # of the wheel: cycles in a minute and phases
 CYCLES, PHASES = np.array([1.3, 2.9, 5.1, 7.7, 9.1, 12.3]), np.array([0.3, 1.9, 4.1, 0.9, 5.2, 2.7])
 
@@ -89,8 +92,14 @@ def equations(rates, slopes, spin, fastest, times):
     def rows(v):
         x, y, z = v.T
         o = np.zeros_like(x)
-        return np.stack([np.stack([x, o, o, o, z, y], -1), np.stack([o, y, o, z, o, x], -1),
-                         np.stack([o, o, z, y, x, o], -1)], axis=1)  # fmt: skip
+        return np.stack(
+            [
+                np.stack([x, o, o, o, z, y], -1),
+                np.stack([o, y, o, z, o, x], -1),
+                np.stack([o, o, z, y, x, o], -1),
+            ],
+            axis=1,
+        )
 
     carried = spin * fastest * np.asarray(program(times))[:, None] * AXIS
     torque = spin * fastest * np.asarray(jax.vmap(jax.grad(program))(times))[:, None] * AXIS

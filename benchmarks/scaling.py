@@ -53,16 +53,22 @@ def measure(family: str, bodies: int, saves: int, horizons: tuple, budget: float
     for horizon in horizons:
         times = ts * (horizon / problem.horizon)
         wall = _report.clock(
-            lambda times=times: jax.block_until_ready(
-                program(state.wxyz, state.omega_body, times)
-            ),
-            repeats=5, budget=budget,
-        )  # fmt: skip
-        rows.append({
-            "bodies": bodies, "horizon": horizon, "saves": saves,
-            "ns_per_body": wall.median / bodies * 1e9, "spread": wall.spread,
-            "memory_MB": whole, "temporary_MB": temporary, "method": type(method).__name__,
-        })  # fmt: skip
+            lambda times=times: jax.block_until_ready(program(state.wxyz, state.omega_body, times)),
+            repeats=5,
+            budget=budget,
+        )
+        rows.append(
+            {
+                "bodies": bodies,
+                "horizon": horizon,
+                "saves": saves,
+                "ns_per_body": wall.median / bodies * 1e9,
+                "spread": wall.spread,
+                "memory_MB": whole,
+                "temporary_MB": temporary,
+                "method": type(method).__name__,
+            }
+        )
     return rows
 
 
@@ -84,15 +90,21 @@ def main() -> None:
         sweeps = {
             "bodies": [row for n in count for row in measure(family, n, 1, (100.0,))],
             "horizon": measure(family, 100, 1, reach),
-            "saves": [row for k in SAVES[:: 2 if quick else 1]
-                      for row in measure(family, 100, k, (100.0,))],
-        }  # fmt: skip
+            "saves": [
+                row
+                for k in SAVES[:: 2 if quick else 1]
+                for row in measure(family, 100, k, (100.0,))
+            ],
+        }
         for sweep, rows in sweeps.items():
             numbers[sweep][name] = rows
             for r in rows:
-                print(f"{family:12}{r['bodies']:>9}{r['horizon']:>9g}{r['saves']:>7}"
-                      f"{r['ns_per_body'] / 1e3:>10.3g}{r['memory_MB']:>9.2f}"
-                      f"{r['temporary_MB']:>10.2f}", flush=True)  # fmt: skip
+                print(
+                    f"{family:12}{r['bodies']:>9}{r['horizon']:>9g}{r['saves']:>7}"
+                    f"{r['ns_per_body'] / 1e3:>10.3g}{r['memory_MB']:>9.2f}"
+                    f"{r['temporary_MB']:>10.2f}",
+                    flush=True,
+                )
     path = _report.write("scaling", numbers, path=options.output)
     print(f"written: {path.name}")
 

@@ -59,14 +59,18 @@ def scenes() -> dict[str, tuple[ph.Scene, ph.Record, int]]:
         "free, 100 times": (ph.Scene(triaxial), every, 101),
         "free, general tensor, final state": (ph.Scene(tensor), FINAL, 2),
         "free, axisymmetric, final state": (
-            ph.Scene(ph.Inertia.axisymmetric(2.0, 1.0)), FINAL, 2,
+            ph.Scene(ph.Inertia.axisymmetric(2.0, 1.0)),
+            FINAL,
+            2,
         ),
         "free, spherical, final state": (ph.Scene(ph.Inertia.spherical(1.0)), FINAL, 2),
         "heavy top, final state": (ph.Scene(triaxial, gravity), FINAL, 2),
         "heavy top and damping, final state": (
-            ph.Scene(triaxial, gravity, ph.LinearDamping(0.01)), FINAL, 2,
+            ph.Scene(triaxial, gravity, ph.LinearDamping(0.01)),
+            FINAL,
+            2,
         ),
-    }  # fmt: skip
+    }
 
 
 def program(scene, state, ts, record):
@@ -216,11 +220,17 @@ def measure_parts(
         calls = {name: satellite_call(named[name], n) for name in [BASE, *names]}
         times = _report.in_turn(calls, repeats=repeats, budget=2.0, processor_time=True)
         for name, call in calls.items():
-            rows.append({
-                "part": name, "bodies": n, "steps": int(np.median(call().steps)),
-                "first_call_s": times[name].first, "later_call_ms": 1e3 * times[name].median,
-                "ratio": times[name].median / times[BASE].median, "spread": times[name].spread,
-            })  # fmt: skip
+            rows.append(
+                {
+                    "part": name,
+                    "bodies": n,
+                    "steps": int(np.median(call().steps)),
+                    "first_call_s": times[name].first,
+                    "later_call_ms": 1e3 * times[name].median,
+                    "ratio": times[name].median / times[BASE].median,
+                    "spread": times[name].spread,
+                }
+            )
     return rows
 
 

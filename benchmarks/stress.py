@@ -200,10 +200,15 @@ def table(result: dict) -> list[dict]:
         for family, entry in worst(scores).items():
             found = {name: entry[name][0] for name in COLUMNS if name in entry}
             last = list(found)[-1]
-            lines.append({
-                "dtype": dtype, "family": family, "bodies": entry["bodies"], **found,
-                "worst body": entry[last][1],
-            })  # fmt: skip
+            lines.append(
+                {
+                    "dtype": dtype,
+                    "family": family,
+                    "bodies": entry["bodies"],
+                    **found,
+                    "worst body": entry[last][1],
+                }
+            )
     return lines
 
 

@@ -175,9 +175,13 @@ def _inertias(made: _List) -> None:
     for axial in (1e-4, 0.5, 1.0, 1.75, 1e4):
         moments = single((1.0, 1.0, axial))
         made.add(
-            "symmetric", f"axial {axial:g}", moments, RATES, kind="axisymmetric",
+            "symmetric",
+            f"axial {axial:g}",
+            moments,
+            RATES,
+            kind="axisymmetric",
             inertia=moments[1:],
-        )  # fmt: skip
+        )
     for rates in (RATES, (0.0, 0.0, 0.0), (0.0, 1.5, 0.0)):
         made.add("symmetric", f"sphere {rates}", (2,) * 3, rates, kind="spherical", inertia=(2,))
 
@@ -212,9 +216,14 @@ def _states(made: _List) -> None:
         angles = (0.5, theta, -0.75)
         for rates in ((0.75, 0.5, -1.25), (2.0, 0.0, -2.0)):
             made.add(
-                "poles", f"theta {theta!r}, rates {rates}", (1.0, 2.0, 3.0), rates, 2.5,
-                kind="euler", start=angles,
-            )  # fmt: skip
+                "poles",
+                f"theta {theta!r}, rates {rates}",
+                (1.0, 2.0, 3.0),
+                rates,
+                2.5,
+                kind="euler",
+                start=angles,
+            )
 
 
 def _scales(made: _List) -> None:

@@ -69,7 +69,7 @@ def scene_of(name: str, moments, dtype) -> ph.Scene:
         "rotor free": (None, None, loose),
         "rotor driven": (None, None, driven),
         "several": (gravity + gradient, linear + ph.SpaceTorque(wave), held + loose),
-    }[name]  # fmt: skip
+    }[name]
     return ph.Scene(ph.Inertia.from_moments(jnp.asarray(moments, dtype)), *parts)
 
 
@@ -112,16 +112,25 @@ def reached(name, dtype, horizons, tolerances) -> list[dict]:
                 calm = (growth[which] < WILD) & (status == 0)
                 over = error / np.maximum(rtol, floor[which])
                 worst = int(np.argmax(np.where(calm, over, -1)))
-                rows.append({
-                    "scene": name, "dtype": dtype, "horizon": horizon, "rtol": rtol, "kind": kind,
-                    "median": np.median(error[calm]) if calm.any() else np.nan,
-                    "worst": error[calm].max() if calm.any() else np.nan,
-                    "over_median": np.median(over[calm]) if calm.any() else np.nan,
-                    "over_worst": over[worst] if calm.any() else np.nan,
-                    "worst_body": int(which[worst]), "turned": turned[which][worst],
-                    "tame": int(calm.sum()), "bodies": len(which),
-                    "flagged": int(np.sum(status != 0)), "steps": int(steps.max()),
-                })  # fmt: skip
+                rows.append(
+                    {
+                        "scene": name,
+                        "dtype": dtype,
+                        "horizon": horizon,
+                        "rtol": rtol,
+                        "kind": kind,
+                        "median": np.median(error[calm]) if calm.any() else np.nan,
+                        "worst": error[calm].max() if calm.any() else np.nan,
+                        "over_median": np.median(over[calm]) if calm.any() else np.nan,
+                        "over_worst": over[worst] if calm.any() else np.nan,
+                        "worst_body": int(which[worst]),
+                        "turned": turned[which][worst],
+                        "tame": int(calm.sum()),
+                        "bodies": len(which),
+                        "flagged": int(np.sum(status != 0)),
+                        "steps": int(steps.max()),
+                    }
+                )
     return rows
 
 
@@ -144,8 +153,10 @@ def main() -> None:
             tolerances = TOLERANCES[dtype]
             rows += (new := reached(name, dtype, horizons, tolerances))
             for row in new:
-                print("  ".join(f"{v:.2g}" if isinstance(v, float) else f"{v}"
-                                for v in row.values()), flush=True)  # fmt: skip
+                print(
+                    "  ".join(f"{v:.2g}" if isinstance(v, float) else f"{v}" for v in row.values()),
+                    flush=True,
+                )
         jax.clear_caches()  # the programs of all scenes at once do not fit
         path = _report.write("torqued", {"rows": rows}, path=options.output, packages=("heyoka",))
     print(path)

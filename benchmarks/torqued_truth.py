@@ -21,14 +21,28 @@ WILD = 10.0
 """Growth of a small change of the start, over the angle turned, beyond which a body is wild."""
 
 SCENES = (
-    "asymmetric top", "Lagrange's top", "gravity gradient", "gravity gradient, Kepler",
-    "potential of attitude", "body torque", "body torque of time", "space torque",
-    "space torque of time", "linear damping", "quadratic damping", "rotor held", "rotor free",
-    "rotor driven", "several",
-)  # fmt: skip
+    "asymmetric top",
+    "Lagrange's top",
+    "gravity gradient",
+    "gravity gradient, Kepler",
+    "potential of attitude",
+    "body torque",
+    "body torque of time",
+    "space torque",
+    "space torque of time",
+    "linear damping",
+    "quadratic damping",
+    "rotor held",
+    "rotor free",
+    "rotor driven",
+    "several",
+)
 _SHAPES = (
-    (1.0, 1.5, 2.0), (1.0, 1.0078125, 0.03125), (1.0, 1.125, 2.0), (1.0, 1.00390625, 1.0078125),
-)  # fmt: skip
+    (1.0, 1.5, 2.0),
+    (1.0, 1.0078125, 0.03125),
+    (1.0, 1.125, 2.0),
+    (1.0, 1.00390625, 1.0078125),
+)
 BODIES = 24
 MOMENTS = np.array([_SHAPES[i % 4] for i in range(BODIES)])
 
@@ -210,10 +224,14 @@ def _make(name: str) -> dict[str, np.ndarray]:
 def _product(p, q) -> np.ndarray:
     a, b, c, d = np.asarray(p, LONG) / np.linalg.norm(p)
     w, x, y, z = np.asarray(q, LONG)
-    return np.array([
-        a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w,
-    ])  # fmt: skip
+    return np.array(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ]
+    )
 
 
 if __name__ == "__main__":

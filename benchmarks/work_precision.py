@@ -23,16 +23,23 @@ from benchmarks import peers, problems, truth
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13, 1e-14)
 QUICK_TOLERANCES = (1e-5, 1e-8, 1e-11)
 QUICK = (
-    ("free", 1000, "float64"), ("separatrix", 1000, "float64"), ("lagrange", 1000, "float64"),
-    ("heavy_top", 1000, "float64"), ("gradient", 1000, "float64"), ("free", 1, "float64"),
+    ("free", 1000, "float64"),
+    ("separatrix", 1000, "float64"),
+    ("lagrange", 1000, "float64"),
+    ("heavy_top", 1000, "float64"),
+    ("gradient", 1000, "float64"),
+    ("free", 1, "float64"),
     ("free", 1000, "float32"),
-)  # fmt: skip
+)
 FULL = (
     *((name, 1000, "float64") for name in problems.PROBLEMS),
-    *((name, n, "float64") for name in ("free", "lagrange", "heavy_top", "gradient")
-      for n in (1, 100_000)),
+    *(
+        (name, n, "float64")
+        for name in ("free", "lagrange", "heavy_top", "gradient")
+        for n in (1, 100_000)
+    ),
     *((name, 1000, "float32") for name in ("free", "lagrange", "heavy_top")),
-)  # fmt: skip
+)
 
 
 def table(family, n, dtype, tolerances, quick, repeats=7, budget=1.0) -> list[dict]:
@@ -54,11 +61,19 @@ def table(family, n, dtype, tolerances, quick, repeats=7, budget=1.0) -> list[di
     rows = []
     for key, program in todo.items():
         wall = timings[key]
-        rows.append({
-            "peer": key[0], "program": key[1], "setting": key[2], "bodies_run": program.bodies,
-            "ns_per_body": wall.median / program.bodies * 1e9, "spread": wall.spread,
-            "repeats": wall.repeats, "compile_s": program.compile_s, **found[key],
-        })  # fmt: skip
+        rows.append(
+            {
+                "peer": key[0],
+                "program": key[1],
+                "setting": key[2],
+                "bodies_run": program.bodies,
+                "ns_per_body": wall.median / program.bodies * 1e9,
+                "spread": wall.spread,
+                "repeats": wall.repeats,
+                "compile_s": program.compile_s,
+                **found[key],
+            }
+        )
     return rows
 
 
@@ -96,14 +111,24 @@ def main() -> None:
         if options.bodies and n not in options.bodies:
             continue
         rows = table(
-            family, n, dtype, QUICK_TOLERANCES if options.quick else TOLERANCES, options.quick,
-            options.repeats, 0.3 if options.quick else 0.5,
-        )  # fmt: skip
+            family,
+            n,
+            dtype,
+            QUICK_TOLERANCES if options.quick else TOLERANCES,
+            options.quick,
+            options.repeats,
+            0.3 if options.quick else 0.5,
+        )
         problem = problems.PROBLEMS[family]
         entry = {
-            "family": family, "title": problem.title, "bodies": n, "dtype": dtype,
-            "horizon": problem.horizon, "saves": problem.saves, "rows": rows,
-        }  # fmt: skip
+            "family": family,
+            "title": problem.title,
+            "bodies": n,
+            "dtype": dtype,
+            "horizon": problem.horizon,
+            "saves": problem.saves,
+            "rows": rows,
+        }
         tables.append(entry)
         show(entry)
         written(options, installed, missing, tables)

@@ -311,9 +311,13 @@ def test_the_least_time_to_an_error_is_of_the_tolerances_that_reach_it():
     rows = [
         {"program": name, "error": error, "seconds": seconds}
         for name, error, seconds in [
-            ("a", 1e-3, 1.0), ("a", 1e-5, 3.0), ("a", 1e-7, 2.0), ("b", None, 0.1), ("b", 1e-2, 0.5)
+            ("a", 1e-3, 1.0),
+            ("a", 1e-5, 3.0),
+            ("a", 1e-7, 2.0),
+            ("b", None, 0.1),
+            ("b", 1e-2, 0.5),
         ]
-    ]  # fmt: skip
+    ]
     assert controllers.level_times(rows, 1e-2) == {"a": 1.0, "b": 0.5}
     assert controllers.level_times(rows, 1e-4) == {"a": 2.0, "b": None}
 
@@ -420,8 +424,10 @@ def test_programs_take_turns_and_slow_ones_are_run_less_often(monkeypatch):
 
     found = _report.in_turn(
         {"quick": lambda: call("quick", 1e-4), "slow": lambda: call("slow", 0.02)},
-        repeats=5, least=1e-3, budget=0.015,
-    )  # fmt: skip
+        repeats=5,
+        least=1e-3,
+        budget=0.015,
+    )
     assert found["quick"].median == pytest.approx(1e-4)
     assert found["slow"].median == pytest.approx(0.02)
     assert found["quick"].repeats == 5
@@ -433,16 +439,25 @@ def test_programs_take_turns_and_slow_ones_are_run_less_often(monkeypatch):
 def _table(times, errors=(1e-4, 1e-8, 1e-12)):
     def row(peer, program, time, error):
         return {
-            "peer": peer, "program": program, "setting": f"{error:.0e}", "ns_per_body": time,
-            "spread": 0.01, "attitude_median": error, "attitude_worst": 10 * error, "failed": 0,
+            "peer": peer,
+            "program": program,
+            "setting": f"{error:.0e}",
+            "ns_per_body": time,
+            "spread": 0.01,
+            "attitude_median": error,
+            "attitude_worst": 10 * error,
+            "failed": 0,
             "compile_s": None,
-        }  # fmt: skip
+        }
 
     rows = [row("other", "stepper", t, e) for t, e in zip(times, errors)]
     return {
-        "family": "free", "title": "free", "bodies": 1000, "dtype": "float64",
+        "family": "free",
+        "title": "free",
+        "bodies": 1000,
+        "dtype": "float64",
         "rows": [row("polhode", "default: ClosedForm", 50.0, 1e-14), *rows],
-    }  # fmt: skip
+    }
 
 
 def test_time_at_a_level_is_interpolated_and_never_extrapolated():
@@ -474,9 +489,14 @@ def test_numbers_are_shown_by_their_keys():
     """Entries that are alike as rows of one table, a list of a few numbers in a cell."""
     lines = _page.by_keys("", {"speed_of": {"a": {"ns": 1.5, "m": [1, 2]}, "b": {"ns": None}}})
     assert lines == [
-        "**speed of**", "", "|  | ns | m |", "|---|---:|---:|", "| a | 1.5 | 1, 2 |",
-        "| b | – | – |", "",
-    ]  # fmt: skip
+        "**speed of**",
+        "",
+        "|  | ns | m |",
+        "|---|---:|---:|",
+        "| a | 1.5 | 1, 2 |",
+        "| b | – | – |",
+        "",
+    ]
     assert _page.by_keys("x", {"n": 1200, "rows": []}) == ["**x**", "", "- n: 1,200", ""]
 
 
@@ -485,8 +505,11 @@ def test_figures_are_drawn_from_results(tmp_path):
 
     matplotlib.use("agg")
     path = tmp_path / "work_precision.json"
-    path.write_text(json.dumps({**_result((100.0, 400.0, 1600.0)), "command": "", "versions": {},
-                                "machine": {}}))  # fmt: skip
+    path.write_text(
+        json.dumps(
+            {**_result((100.0, 400.0, 1600.0)), "command": "", "versions": {}, "machine": {}}
+        )
+    )
     (made,) = _figures.draw([path], tmp_path)
     text = made.read_text()
     assert "<svg" in text
@@ -500,8 +523,14 @@ def test_engines_are_scored_by_attitude_energy_and_momentum():
     half = 0.5e-6
     turn = np.array([math.cos(half), math.sin(half), 0, 0])  # in space, by 1e-6 rad
     w, x, y, z = body["wxyz"]
-    turned = np.array([turn[0] * w - turn[1] * x, turn[0] * x + turn[1] * w,
-                       turn[0] * y - turn[1] * z, turn[0] * z + turn[1] * y])  # fmt: skip
+    turned = np.array(
+        [
+            turn[0] * w - turn[1] * x,
+            turn[0] * x + turn[1] * w,
+            turn[0] * y - turn[1] * z,
+            turn[0] * z + turn[1] * y,
+        ]
+    )
     exact = np.stack([body["wxyz"]] * 2)
     found = engines.score(
         body, [1, 2], exact, np.stack([-turned, exact[1]]), np.stack([1.5 * body["omega"]] * 2)
@@ -690,11 +719,13 @@ def test_the_table_of_cold_tasks_marks_what_others_do_sooner():
     alone = {key: value for key, value in ours.items() if key != "error"}
     report = {
         "command": "python -m benchmarks.cold_tasks",
-        "numbers": {"rows": [
-            {"task": name, "peer": peer, "polhode": ours},
-            {"task": name, "peer": "", "polhode": alone},
-        ]},
-    }  # fmt: skip
+        "numbers": {
+            "rows": [
+                {"task": name, "peer": peer, "polhode": ours},
+                {"task": name, "peer": "", "polhode": alone},
+            ]
+        },
+    }
     table = "\n".join(_page.cold_tasks_table(report))
     assert f"| {name}, SciPy | 2 / **0.7** | 0.001 / 0.3 | 1 | 300 / **90** | 1e-11 / 2e-08 |" in (
         table.replace("1.0e-03", "0.001")

@@ -212,9 +212,12 @@ def test_the_reference_documents_every_public_name_once():
 def test_the_reference_leaves_out_what_only_polhode_uses():
     pages = "\n".join(reference_pages.pages().values())
     entries = dict(
-        re.findall(r"^\.\. autoclass:: polhode\.(\w+)\n(?:   .*\n)*?   :exclude-members: (.*)$",
-                   pages, re.M)
-    )  # fmt: skip
+        re.findall(
+            r"^\.\. autoclass:: polhode\.(\w+)\n(?:   .*\n)*?   :exclude-members: (.*)$",
+            pages,
+            re.M,
+        )
+    )
     hidden = entries["Scene"].split(", ")
     assert {"settled", "dynamics"} & set(vars(ph.Scene)) <= set(hidden)
     assert not {"is_free", "momentum", "rates", "hamiltonian"} & set(hidden)
@@ -330,8 +333,11 @@ def test_a_class_shows_its_constructor_and_links_its_types(site):
     entry = page[page.index('id="polhode.Scene"') :]
     entry = entry[: entry.index("</dt>")]
     assert re.findall(r'class="n"><span class="pre">(\w+)<', entry)[:4] == [
-        "inertia", "potential", "torque", "rotors",
-    ]  # fmt: skip
+        "inertia",
+        "potential",
+        "torque",
+        "rotors",
+    ]
     assert 'href="bodies.html#polhode.Inertia"' in entry
     assert "jaxlib" not in page
 

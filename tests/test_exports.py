@@ -65,22 +65,37 @@ def test_a_message_of_the_ccsds_holds_the_motion(traj, tmp_path):
     head, segments = parsed(path.read_text("ascii"))
     assert list(head) == ["CCSDS_AEM_VERS", "CREATION_DATE", "ORIGINATOR"]
     assert head["CCSDS_AEM_VERS"] == "2.0"
-    order = ["OBJECT_NAME", "OBJECT_ID", "CENTER_NAME", "REF_FRAME_A", "REF_FRAME_B",
-             "TIME_SYSTEM", "START_TIME", "STOP_TIME", "ATTITUDE_TYPE", "ANGVEL_FRAME"]  # fmt: skip
+    order = [
+        "OBJECT_NAME",
+        "OBJECT_ID",
+        "CENTER_NAME",
+        "REF_FRAME_A",
+        "REF_FRAME_B",
+        "TIME_SYSTEM",
+        "START_TIME",
+        "STOP_TIME",
+        "ATTITUDE_TYPE",
+        "ANGVEL_FRAME",
+    ]
     vector = np.array([0.3, -0.5, 0.8])
     assert len(segments) == 2
     for k, (meta, rows) in enumerate(segments):
         assert list(meta) == order
         assert (meta["OBJECT_NAME"], meta["OBJECT_ID"]) == (
-            FIELDS["object_name"][k], FIELDS["object_id"][k])  # fmt: skip
+            FIELDS["object_name"][k],
+            FIELDS["object_id"][k],
+        )
         assert meta["START_TIME"] == "2029-04-13T21:46:00.250000000"
         assert meta["STOP_TIME"] == rows[-1][0] == "2029-04-13T21:46:04.250000000"
         numbers = np.array([[float(x) for x in row[1:]] for row in rows])
         np.testing.assert_allclose(np.deg2rad(numbers[:, 4:]), traj.omega_body[k], rtol=1e-15)
         q1, q2, q3, qc = numbers[:, :4].T
         x, y, z = vector  # the first row of the matrix of the standard's annex, A to B
-        first = ((q1**2 - q2**2 - q3**2 + qc**2) * x + 2 * (q1 * q2 + q3 * qc) * y
-                 + 2 * (q1 * q3 - q2 * qc) * z)  # fmt: skip
+        first = (
+            (q1**2 - q2**2 - q3**2 + qc**2) * x
+            + 2 * (q1 * q2 + q3 * qc) * y
+            + 2 * (q1 * q3 - q2 * qc) * z
+        )
         want = Rotation.from_quat(np.asarray(traj.wxyz[k])[:, [1, 2, 3, 0]]).inv().apply(vector)
         np.testing.assert_allclose(first, want[:, 0], rtol=1e-14)
 

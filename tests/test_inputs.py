@@ -221,9 +221,12 @@ def test_unsorted_times_have_a_status_where_they_are_traced():
         return ph.simulate(SCENE, STATE, ts).status
 
     for times, good in (
-        ([0.0, 1, 2], True), ([2.0, 1, 0], True), ([0.0, 2, 1], False), ([0.0, 1, 1], False),
+        ([0.0, 1, 2], True),
+        ([2.0, 1, 0], True),
+        ([0.0, 2, 1], False),
+        ([0.0, 1, 1], False),
         ([0.0, np.nan, 1], False),
-    ):  # fmt: skip
+    ):
         want = ph.Status.SUCCESSFUL if good else ph.Status.BAD_TIMES
         assert status(jnp.array(times)) == want
     own = jnp.array([[0.0, 1, 2], [0.0, 2, 1]])

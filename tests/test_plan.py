@@ -39,17 +39,21 @@ ALIKE = {
     "no weight": (ph.Scene(SYMMETRIC, ph.UniformGravity(0.0, [0.0, 0.1, 0.3])), "LiePoisson"),
     "no gravity": (ph.Scene(TRIAXIAL, ph.UniformGravity(1, [0.1, 0, 0], [0.0] * 3)), "LiePoisson"),
     "wheel on z": (
-        ph.Scene(SYMMETRIC, AXIAL, rotors=ph.Rotor([0.0, 0.0, 1.0], 0.1, speed=0.3)), "LiePoisson",
+        ph.Scene(SYMMETRIC, AXIAL, rotors=ph.Rotor([0.0, 0.0, 1.0], 0.1, speed=0.3)),
+        "LiePoisson",
     ),
-    "free wheel": (ph.Scene(SYMMETRIC, rotors=ph.Rotor.axial(0.1, speed=0.3, torque=0.0)),
-                   "LiePoisson"),
+    "free wheel": (
+        ph.Scene(SYMMETRIC, rotors=ph.Rotor.axial(0.1, speed=0.3, torque=0.0)),
+        "LiePoisson",
+    ),
     "axial damping": (ph.Scene(SYMMETRIC, torque=ph.LinearDamping([0.1, 0.1, 0.15])), "LiePoisson"),
     "spin about an axis": (ph.Scene(TRIAXIAL, torque=ph.BodyTorque([0.0, 0.0, 0.1])), "LiePoisson"),
     "gradient": (ph.Scene(TRIAXIAL, ph.GravityGradient(1.0, [0.0, 0.0, 2.0])), "LiePoisson"),
     "orbit": (
-        ph.Scene(TRIAXIAL, ph.GravityGradient(1.0, ph.KeplerOrbit(1.0, 2.0, 0.0))), "LiePoisson",
+        ph.Scene(TRIAXIAL, ph.GravityGradient(1.0, ph.KeplerOrbit(1.0, 2.0, 0.0))),
+        "LiePoisson",
     ),
-}  # fmt: skip
+}
 
 
 ALIKE_FAST = (  # one of each method, and what only numbers make symmetric
@@ -222,9 +226,14 @@ def test_explain_says_what_runs_what_is_skipped_and_why():
     state, ts = states(1000), [0.0, 50.0, 100.0]
     text = str(ph.explain(scene, state, ts))
     for part in (
-        "1,000 bodies x 3 samples, float64", "runs    ClosedForm", "nothing acts", "skips   ",
-        "potential, torque", "not in the scene", "error   rounding only",
-    ):  # fmt: skip
+        "1,000 bodies x 3 samples, float64",
+        "runs    ClosedForm",
+        "nothing acts",
+        "skips   ",
+        "potential, torque",
+        "not in the scene",
+        "error   rounding only",
+    ):
         assert part in text, text
     exact = ph.explain(scene, state, [0.0, 1e6], ph.ClosedForm(compensated=True))
     assert "at any time" in exact.error
@@ -255,8 +264,11 @@ def test_explain_says_why_no_exact_law_holds():
     scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]), ph.UniformGravity(1.0, [0, 0, 1.0]))
     stepped = ph.explain(scene, states(1), [0.0, 1.0])
     assert [line.partition(":")[0] for line in stepped.refused] == [
-        "free body", "Lagrange's top", "symmetric top", "fixed axis",
-    ]  # fmt: skip
+        "free body",
+        "Lagrange's top",
+        "symmetric top",
+        "fixed axis",
+    ]
     for reason in ("has a potential", "not one of ph.Inertia.axisymmetric", "a potential acts"):
         assert reason in str(stepped)
     assert ph.explain(ph.Scene(scene.inertia), states(1), [0.0, 1.0]).refused == ()

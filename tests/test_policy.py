@@ -107,9 +107,12 @@ def test_optimisations_follow_the_table_and_the_variable(monkeypatch, variable, 
         monkeypatch.setenv("POLHODE_PLAIN", variable)
     plan = ph.explain(ph.Scene(ph.Inertia.spherical(1.0)), STATE, [0.0, 1.0])
     switches = (
-        _policy.is_fused(), _policy.is_folded(), _policy.is_staged(),
-        _policy.is_refilled(10**6), _policy.is_time_loop(10**6, 10),
-    )  # fmt: skip
+        _policy.is_fused(),
+        _policy.is_folded(),
+        _policy.is_staged(),
+        _policy.is_refilled(10**6),
+        _policy.is_time_loop(10**6, 10),
+    )
     if reason is None:
         assert all(switches)
         assert plan.plain is None
@@ -169,8 +172,10 @@ def test_plain_programs_agree_with_optimised_ones(tmp_path):
         path = tmp_path / f"{variable}.npz"
         ran = subprocess.run(
             [sys.executable, __file__, path],
-            env={**os.environ, "POLHODE_PLAIN": variable}, capture_output=True, text=True,
-        )  # fmt: skip
+            env={**os.environ, "POLHODE_PLAIN": variable},
+            capture_output=True,
+            text=True,
+        )
         assert ran.returncode == 0, ran.stderr[-2000:]
         with np.load(path) as file:
             results.append([file[name] for name in file.files])

@@ -352,10 +352,13 @@ slow = pytest.mark.slow
 
 @pytest.mark.parametrize(
     "function",
-    [jax.grad(braked_sum), pytest.param(braked_sum, marks=slow),
-     pytest.param(mapped_sum, marks=slow)],
+    [
+        jax.grad(braked_sum),
+        pytest.param(braked_sum, marks=slow),
+        pytest.param(mapped_sum, marks=slow),
+    ],
     ids=["grad", "value", "vmap"],
-)  # fmt: skip
+)
 def test_throw_raises_in_a_compiled_program_where_it_is_written(function):
     run = jax.jit(function, static_argnums=1)
     assert np.isfinite(run(jnp.array([0.5]), True)).all()

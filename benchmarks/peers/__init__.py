@@ -14,8 +14,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-MODULES = ("stock_diffrax", "scipy_ivp", "scipy_closed_form", "taylor_heyoka", "numba_dopri8",
-           "mujoco_rk4")  # fmt: skip
+MODULES = (
+    "stock_diffrax",
+    "scipy_ivp",
+    "scipy_closed_form",
+    "taylor_heyoka",
+    "numba_dopri8",
+    "mujoco_rk4",
+)
 
 
 class Program(NamedTuple):

@@ -27,11 +27,20 @@ def programs(problem: Problem, n, dtype, tolerances, quick) -> list[Program]:
     wxyz, omega = problem.states(few)
     start = np.concatenate([wxyz, omega], axis=1)
     a, b, c = problem.moments
-    constants = np.array([
-        (b - c) / a, (c - a) / b, (a - b) / c, 2 * problem.weight / a, 2 * problem.weight / b,
-        problem.gradient * (c - b) / a, problem.gradient * (a - c) / b,
-        problem.gradient * (b - a) / c, DIRECTION[0], DIRECTION[2],
-    ])  # fmt: skip
+    constants = np.array(
+        [
+            (b - c) / a,
+            (c - a) / b,
+            (a - b) / c,
+            2 * problem.weight / a,
+            2 * problem.weight / b,
+            problem.gradient * (c - b) / a,
+            problem.gradient * (a - c) / b,
+            problem.gradient * (b - a) / c,
+            DIRECTION[0],
+            DIRECTION[2],
+        ]
+    )
     begin = time.perf_counter()
     _run(start[:1], constants, np.array([0.0, 0.01]), 1e-3, _A, _B, _E)
     spent = time.perf_counter() - begin

@@ -107,7 +107,12 @@ def _attitude(phi, la, lb, lc):
 def _multiply(p, q):
     a, b, c, d = (p[..., k] for k in range(4))
     w, x, y, z = (q[..., k] for k in range(4))
-    return np.stack([
-        a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y,
-        a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w,
-    ], axis=-1)  # fmt: skip
+    return np.stack(
+        [
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        ],
+        axis=-1,
+    )

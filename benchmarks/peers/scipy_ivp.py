@@ -34,11 +34,16 @@ def _loop(problem, start, tolerance):
     def call():
         ys = [
             solve_ivp(
-                field, (0.0, problem.horizon), y, "DOP853", problem.times[1:],
-                rtol=max(tolerance, 2.3e-14), atol=tolerance,
+                field,
+                (0.0, problem.horizon),
+                y,
+                "DOP853",
+                problem.times[1:],
+                rtol=max(tolerance, 2.3e-14),
+                atol=tolerance,
             ).y.T
             for y in start
-        ]  # fmt: skip
+        ]
         ys = np.stack(ys)
         return ys[..., :4], ys[..., 4:]
 
@@ -54,9 +59,14 @@ def _together(problem, start, tolerance):
 
     def call():
         ys = solve_ivp(
-            field, (0.0, problem.horizon), start.T.reshape(-1), "DOP853", problem.times[1:],
-            rtol=max(tolerance, 2.3e-14), atol=tolerance,
-        ).y  # fmt: skip
+            field,
+            (0.0, problem.horizon),
+            start.T.reshape(-1),
+            "DOP853",
+            problem.times[1:],
+            rtol=max(tolerance, 2.3e-14),
+            atol=tolerance,
+        ).y
         ys = ys.reshape(7, n, -1).transpose(1, 2, 0)
         return ys[..., :4], ys[..., 4:]
 

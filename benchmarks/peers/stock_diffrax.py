@@ -160,7 +160,13 @@ def _to_euler(problem, wxyz, omega):
     phi, psi = plus + minus, plus - minus
     p, q, r = np.array(problem.moments) * omega
     spin = -p * np.cos(psi) + q * np.sin(psi)
-    return np.array([
-        phi, theta, psi, spin * np.sin(theta) + r * np.cos(theta),
-        p * np.sin(psi) + q * np.cos(psi), r,
-    ])  # fmt: skip
+    return np.array(
+        [
+            phi,
+            theta,
+            psi,
+            spin * np.sin(theta) + r * np.cos(theta),
+            p * np.sin(psi) + q * np.cos(psi),
+            r,
+        ]
+    )

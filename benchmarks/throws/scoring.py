@@ -220,9 +220,14 @@ def solve_balance(data: Readings, known: Known, free: str) -> Fitted:
         distance = far(score, lost)
         if heard.size:
             lost, rounds = jax.lax.cond(
-                (distance < _NEAR) & (rounds < _ROUNDS), restricted, lambda *same: same[2:],
-                unknown, score.information, lost, rounds,
-            )  # fmt: skip
+                (distance < _NEAR) & (rounds < _ROUNDS),
+                restricted,
+                lambda *same: same[2:],
+                unknown,
+                score.information,
+                lost,
+                rounds,
+            )
             distance = far(score, lost)
         shown = score.information
         shown = shown + damping * jnp.diag(held * jnp.diagonal(shown))
@@ -302,6 +307,11 @@ def start_of(data: Readings, instrument: Instrument, count: int) -> tuple[Array,
     fast = jnp.max(jnp.abs(data.wheel))
     white = 1e-3 * size * typical / jnp.sqrt(span)
     return sigma, Noise(
-        3e-4 * typical, 1e-4 * typical, white, 0.3 * white, 0.01 * size * typical / span,
-        0.1 * span, 1e-3 * fast,
-    )  # fmt: skip
+        3e-4 * typical,
+        1e-4 * typical,
+        white,
+        0.3 * white,
+        0.01 * size * typical / span,
+        0.1 * span,
+        1e-3 * fast,
+    )

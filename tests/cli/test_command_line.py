@@ -165,9 +165,16 @@ def test_scenes_meet_the_reference_values_they_carry(name):
 
 @pytest.mark.parametrize(
     ("value", "width", "text"),
-    [(5.38, 0.03, "5.38 ± 0.03"), (7.4, 0.03, "7.40 ± 0.03"), (5.3685, 0.0624, "5.369 ± 0.062"),
-     (1234.5, 12.3, "1234 ± 12"), (5.0, None, "5"), (3.0, 0.0, "3"), (2.0, 1e-9, "2 ± 1e-09")],
-)  # fmt: skip
+    [
+        (5.38, 0.03, "5.38 ± 0.03"),
+        (7.4, 0.03, "7.40 ± 0.03"),
+        (5.3685, 0.0624, "5.369 ± 0.062"),
+        (1234.5, 12.3, "1234 ± 12"),
+        (5.0, None, "5"),
+        (3.0, 0.0, "3"),
+        (2.0, 1e-9, "2 ± 1e-09"),
+    ],
+)
 def test_values_are_printed_with_the_digits_of_their_spread(value, width, text):
     from polhode.cli import _job
 
@@ -275,8 +282,11 @@ def test_the_example_of_the_help_runs_where_only_polhode_is(here, capsys):
 
 
 def test_help_and_version(capsys):
-    for arguments, text in ((["--help"], "explain"), (["run", "--help"], "--precision"),
-                            (["--version"], ph.__version__)):  # fmt: skip
+    for arguments, text in (
+        (["--help"], "explain"),
+        (["run", "--help"], "--precision"),
+        (["--version"], ph.__version__),
+    ):
         with pytest.raises(SystemExit) as caught:
             main(arguments)
         assert caught.value.code == 0
@@ -307,9 +317,10 @@ def test_failed_write_keeps_the_old_file(here, capsys, monkeypatch, failure):
 def test_missing_packages_are_named_before_the_work(here, capsys, monkeypatch):
     find = importlib.util.find_spec
     monkeypatch.setattr(
-        importlib.util, "find_spec",
+        importlib.util,
+        "find_spec",
         lambda name: None if name in ("h5py", "matplotlib") else find(name),
-    )  # fmt: skip
+    )
     assert run("top.toml") == 1
     told = capsys.readouterr().err
     assert "`polhode run` needs h5py, matplotlib: pip install 'polhode[cli]'" in told
@@ -401,8 +412,17 @@ except KeyboardInterrupt:
 
 def test_interrupt_of_a_running_process_leaves_nothing_half_written(here):
     output = here / "new" / "top.nc"
-    command = [sys.executable, "-m", "polhode.cli", "run", "top.toml", "-o", str(output),
-               "--clones", "1000000"]  # fmt: skip
+    command = [
+        sys.executable,
+        "-m",
+        "polhode.cli",
+        "run",
+        "top.toml",
+        "-o",
+        str(output),
+        "--clones",
+        "1000000",
+    ]
     before = signal.getsignal(signal.SIGINT)
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores it
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:

@@ -80,8 +80,14 @@ def small_disk(tmp_path):
 
 def test_a_full_disk_is_told_and_nothing_is_half_written(here, capsys, small_disk):
     (here / "long.toml").write_text(FREE.replace("number = 5", "number = 2000"))
-    refused(capsys, ["run", "long.toml", "-o", small_disk / "out.nc", "--no-figure"], 1,
-            "No space left", "out.nc", str(small_disk))  # fmt: skip
+    refused(
+        capsys,
+        ["run", "long.toml", "-o", small_disk / "out.nc", "--no-figure"],
+        1,
+        "No space left",
+        "out.nc",
+        str(small_disk),
+    )
     assert list(small_disk.iterdir()) == []
 
 
@@ -90,8 +96,14 @@ def test_a_disk_that_fills_up_meanwhile(here, capsys, monkeypatch):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr(_write.os, "fsync", full)
-    refused(capsys, ["run", "free.toml", "-o", "out.nc", "--no-figure"], 1, "No space", "out.nc",
-            str(here))  # fmt: skip
+    refused(
+        capsys,
+        ["run", "free.toml", "-o", "out.nc", "--no-figure"],
+        1,
+        "No space",
+        "out.nc",
+        str(here),
+    )
     assert [path.name for path in here.iterdir()] == ["free.toml"]
 
 
@@ -101,8 +113,13 @@ def test_output_to_a_full_device_is_an_error(here, command):
         pytest.skip("this system has no /dev/full")
     code = "import sys; from polhode.cli import main; sys.exit(main(sys.argv[1:]))"
     with open("/dev/full", "w") as full:
-        done = subprocess.run([sys.executable, "-c", code, *command], stdout=full, text=True,
-                              stderr=subprocess.PIPE, timeout=300)  # fmt: skip
+        done = subprocess.run(
+            [sys.executable, "-c", code, *command],
+            stdout=full,
+            text=True,
+            stderr=subprocess.PIPE,
+            timeout=300,
+        )
     assert done.returncode == 1
     assert "No space left" in done.stderr
     assert "Traceback" not in done.stderr
@@ -326,9 +343,14 @@ def _modules(*arguments):
 
 @pytest.mark.parametrize(
     ("arguments", "code"),
-    [(["--help"], "0"), (["--version"], "0"), (["run", "bad.toml"], "2"), (["schema"], "0"),
-     (["fit", "--nosie", "1"], "2")],
-)  # fmt: skip
+    [
+        (["--help"], "0"),
+        (["--version"], "0"),
+        (["run", "bad.toml"], "2"),
+        (["schema"], "0"),
+        (["fit", "--nosie", "1"], "2"),
+    ],
+)
 def test_help_and_mistakes_come_without_jax(here, arguments, code):
     (here / "bad.toml").write_text(FREE.replace("axial", "axail"))
     assert _modules(*arguments) == [code, "[]"]

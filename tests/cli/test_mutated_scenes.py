@@ -12,8 +12,26 @@ from polhode.files import SceneFileError, build_scene, build_state, parse_scene,
 PAGE = Path(__file__).parents[2] / "docs" / "scene_files.md"
 SCENES = [path.read_text("utf-8") for path in shipped_scenes().values()]
 SCENES += re.findall(r"^```toml\n(.*?)^```", PAGE.read_text("utf-8"), re.S | re.M)
-VALUES = ["0", "-1", "1e308", "nan", "inf", "true", '""', '"x"', "[]", "{}", "[[]]", "2020-01-01",
-          "99999999999999999999", "[1, 2]", "[0, 0, 0]", '["a", 1]', "-0.0", "1e-320"]  # fmt: skip
+VALUES = [
+    "0",
+    "-1",
+    "1e308",
+    "nan",
+    "inf",
+    "true",
+    '""',
+    '"x"',
+    "[]",
+    "{}",
+    "[[]]",
+    "2020-01-01",
+    "99999999999999999999",
+    "[1, 2]",
+    "[0, 0, 0]",
+    '["a", 1]',
+    "-0.0",
+    "1e-320",
+]
 
 
 def mutated(text: str, seed: int) -> str:

@@ -40,9 +40,14 @@ def test_an_active_client_computes_the_chunks(whole, tmp_path):
     with distributed.LocalCluster(threads_per_worker=2, **options) as cluster:
         with distributed.Client(cluster):
             ens.stream(
-                make(), TS, path, chunk=CHUNK, statistics=[TILT], name="dask",
+                make(),
+                TS,
+                path,
+                chunk=CHUNK,
+                statistics=[TILT],
+                name="dask",
                 progress=reports.append,
-            )  # fmt: skip
+            )
         _dask._build.cache_clear()
     assert reports[-1].done == 40_000
     assert len(reports) == 6
@@ -107,8 +112,14 @@ def test_a_worker_that_is_killed_changes_no_bit(whole, tmp_path):
                 os.kill(pids[0], signal.SIGKILL)
 
         ens.stream(
-            make(), TS, path, chunk=CHUNK, statistics=[TILT], name="dask",
-            scheduler=cluster.scheduler_address, progress=progress,
-        )  # fmt: skip
+            make(),
+            TS,
+            path,
+            chunk=CHUNK,
+            statistics=[TILT],
+            name="dask",
+            scheduler=cluster.scheduler_address,
+            progress=progress,
+        )
     assert killed
     same(path, whole)

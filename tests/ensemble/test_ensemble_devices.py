@@ -29,6 +29,11 @@ def test_eight_devices_are_as_one_and_exchange_nothing(tmp_path):
     assert "in different ways" in found.pop("mixed")
     same = [True, True, True]
     assert found == {
-        "devices": 8, "wxyz": same, "omega_body": same, "status": same, "collectives": [],
-        "used": 8, "layouts": ["1 x cpu (cpu)", "8 x cpu (cpu)"],
-    }  # fmt: skip
+        "devices": 8,
+        "wxyz": same,
+        "omega_body": same,
+        "status": same,
+        "collectives": [],
+        "used": 8,
+        "layouts": ["1 x cpu (cpu)", "8 x cpu (cpu)"],
+    }

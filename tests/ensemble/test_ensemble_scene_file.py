@@ -127,7 +127,7 @@ def test_rows_of_files_and_torques(tmp_path):
         (["--memory", "100MB"], "too small"),
         (["--devices", "99"], "--devices 99: this machine has"),
     ],
-)  # fmt: skip
+)
 def test_bad_options_change_nothing(options, words, tmp_path, capsys):
     scene = tmp_path / "big.toml"
     scene.write_text(SCENE)

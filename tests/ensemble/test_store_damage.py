@@ -80,18 +80,25 @@ REFUSED = {
     "other codecs": (lambda p: _altered(p, "status", codecs=[]), "codecs"),
     "other attributes": (lambda p: _altered(p, "wxyz", attributes={"units": "m"}), "attributes"),
     "metadata that are no JSON": (
-        lambda p: (p / "status" / "zarr.json").write_text("[1, 2"), "status/zarr.json"),
+        lambda p: (p / "status" / "zarr.json").write_text("[1, 2"),
+        "status/zarr.json",
+    ),
     "metadata that are a list": (
-        lambda p: (p / "status" / "zarr.json").write_text("[1, 2]"), "status/zarr.json"),
-    "another title": (
-        lambda p: zarr.open_group(p, mode="r+").attrs.update(title="u"), "title"),
+        lambda p: (p / "status" / "zarr.json").write_text("[1, 2]"),
+        "status/zarr.json",
+    ),
+    "another title": (lambda p: zarr.open_group(p, mode="r+").attrs.update(title="u"), "title"),
     "no consolidated metadata": (
-        lambda p: (p / "zarr.json").write_text(json.dumps(
-            json.loads((p / "zarr.json").read_text()) | {"consolidated_metadata": None})),
-        "consolidated"),
+        lambda p: (p / "zarr.json").write_text(
+            json.dumps(json.loads((p / "zarr.json").read_text()) | {"consolidated_metadata": None})
+        ),
+        "consolidated",
+    ),
     "a file in the place of an array": (
-        lambda p: (shutil.rmtree(p / "wxyz"), (p / "wxyz").write_text("x")), "wxyz/zarr.json"),
-}  # fmt: skip
+        lambda p: (shutil.rmtree(p / "wxyz"), (p / "wxyz").write_text("x")),
+        "wxyz/zarr.json",
+    ),
+}
 
 
 @pytest.mark.parametrize("kind", COMPLETED)

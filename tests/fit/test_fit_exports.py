@@ -122,9 +122,17 @@ def test_a_figure_of_a_fitted_scene(of_scene):
 
 
 INERTIA = (
-    "inertia", "moments", "axes", "ratios", "moments_std", "ratios_std", "axes_std", "scale_known",
-    "principal_values", "mirror_inertia",
-)  # fmt: skip
+    "inertia",
+    "moments",
+    "axes",
+    "ratios",
+    "moments_std",
+    "ratios_std",
+    "axes_std",
+    "scale_known",
+    "principal_values",
+    "mirror_inertia",
+)
 
 
 @pytest.mark.parametrize("name", INERTIA)

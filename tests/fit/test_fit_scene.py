@@ -87,13 +87,17 @@ def test_whatever_a_scene_holds():
         )
     start = scene([0.0, 0.05, 0.4], 1.3, 0.1, 0.3)
     found = ph.fit_scene(
-        start, data,
+        start,
+        data,
         lambda s: [
-            s.potential.terms[0].centre_body, s.potential.terms[1].position_space.semi_major_axis,
-            s.torque.c, s.rotors.momentum,
+            s.potential.terms[0].centre_body,
+            s.potential.terms[1].position_space.semi_major_axis,
+            s.torque.c,
+            s.rotors.momentum,
         ],
-        rtol=1e-7, options=FitOptions(trust_noise=True),
-    )  # fmt: skip
+        rtol=1e-7,
+        options=FitOptions(trust_noise=True),
+    )
     assert found.findings() == []
     for value, std, exact in zip(found.values, found.std, true, strict=True):
         assert np.all(np.asarray(std) < 0.05)

@@ -80,8 +80,10 @@ def test_small_steps_turn_about_body_axes():
     small = []
     for h in (1e-3, 1e-4):
         after = np.asarray(attitude(TIME + h))
-        about = [rotation.rotation_vector_to_wxyz(jnp.asarray(w * h * e))
-                 for w, e in zip(omega, np.eye(3))]  # fmt: skip
+        about = [
+            rotation.rotation_vector_to_wxyz(jnp.asarray(w * h * e))
+            for w, e in zip(omega, np.eye(3))
+        ]
         x, y, z = (np.asarray(rotation.wxyz_to_matrix(q)) for q in about)
         steps = [np.eye(3) + h * hat(omega), x @ y @ z, z @ y @ x]
         left = [np.abs(after - matrix @ step).max() for step in steps]

@@ -87,9 +87,13 @@ def test_interpolated_attitude_converges_with_sixth_order(tumble):
     for stride in (16, 8):
         fine, coarse = slice(0, 20 * stride + 1, stride // 8), slice(0, 20 * stride + 1, stride)
         kept = ph.Trajectory(
-            tumble.ts[coarse], tumble.wxyz[coarse], tumble.omega_body[coarse], tumble.status,
-            tumble.steps, tumble.scene,
-        )  # fmt: skip
+            tumble.ts[coarse],
+            tumble.wxyz[coarse],
+            tumble.omega_body[coarse],
+            tumble.status,
+            tumble.steps,
+            tumble.scene,
+        )
         frame = RotatingFrame.from_trajectory(kept)
         attitude, omega, bend = everything(frame, tumble.ts[fine])
         apart = rotation.angle_between(attitude, tumble.wxyz[fine])
@@ -125,9 +129,13 @@ def test_missing_records_and_coarse_samples_are_named(tumble):
     with pytest.raises(ValueError, match="record"):
         gyroscope(lacking)
     coarse = ph.Trajectory(
-        20 * tumble.ts[::8], tumble.wxyz[::8], tumble.omega_body[::8], tumble.status,
-        tumble.steps, tumble.scene,
-    )  # fmt: skip
+        20 * tumble.ts[::8],
+        tumble.wxyz[::8],
+        tumble.omega_body[::8],
+        tumble.status,
+        tumble.steps,
+        tumble.scene,
+    )
     with pytest.raises(ValueError, match="more times"):
         RotatingFrame.from_trajectory(coarse)
 

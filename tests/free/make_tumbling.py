@@ -20,43 +20,89 @@ sys.path.insert(0, str(Path(__file__).parent))
 from reference_free import free_reference
 from tumbling import DIGITS, Motion, conjugate, differences, quaternion_product
 
-FILE = Path(__file__).resolve().parents[2] / "src" / "polhode" / "files" / "reference" / (
-    "tumbling.json"
-)  # fmt: skip
+FILE = (
+    Path(__file__).resolve().parents[2]
+    / "src"
+    / "polhode"
+    / "files"
+    / "reference"
+    / ("tumbling.json")
+)
 TURNS = (0.25, 1, 10, 100, 1_000, 10_000, 100_000)
 FLIPS = 3
 START = (0.7, 0.1, -0.5, 0.5)
 
 BODIES = (
-    ("short_axis", "short-axis mode: circulates about the axis of the largest moment",
-     (2.0, 3.0, 4.0), (0.25, -0.5, 1.0)),
-    ("long_axis", "long-axis mode: circulates about the axis of the smallest moment",
-     (2.0, 3.0, 4.0), (1.0, 0.5, -0.25)),
-    ("permuted_axes", "long-axis mode, moments in no order, axes left-handed when sorted",
-     (3.0, 2.0, 4.5), (0.5, -1.5, 0.25)),
-    ("t_handle", "turns over: starts almost about the intermediate axis",
-     (0.25, 0.375, 0.5), (0.03125, 10.0, 0.0625)),
-    ("near_separatrix", "turns over rarely: 1e-6 off the intermediate axis",
-     (1.0, 2.0, 2.5), (1e-6, 1.0, 1e-6)),
-    ("oblate", "symmetric about body z, the largest moment",
-     (1.0, 1.0, 1.5), (0.5, -0.25, 1.0)),
-    ("prolate", "symmetric about body x, the smallest moment",
-     (0.5, 2.0, 2.0), (2.0, 0.5, -0.25)),
-    ("nearly_oblate", "two moments that differ by 1e-9",
-     (1.0, 1.000000001, 1.5), (0.5, -0.25, 1.0)),
+    (
+        "short_axis",
+        "short-axis mode: circulates about the axis of the largest moment",
+        (2.0, 3.0, 4.0),
+        (0.25, -0.5, 1.0),
+    ),
+    (
+        "long_axis",
+        "long-axis mode: circulates about the axis of the smallest moment",
+        (2.0, 3.0, 4.0),
+        (1.0, 0.5, -0.25),
+    ),
+    (
+        "permuted_axes",
+        "long-axis mode, moments in no order, axes left-handed when sorted",
+        (3.0, 2.0, 4.5),
+        (0.5, -1.5, 0.25),
+    ),
+    (
+        "t_handle",
+        "turns over: starts almost about the intermediate axis",
+        (0.25, 0.375, 0.5),
+        (0.03125, 10.0, 0.0625),
+    ),
+    (
+        "near_separatrix",
+        "turns over rarely: 1e-6 off the intermediate axis",
+        (1.0, 2.0, 2.5),
+        (1e-6, 1.0, 1e-6),
+    ),
+    ("oblate", "symmetric about body z, the largest moment", (1.0, 1.0, 1.5), (0.5, -0.25, 1.0)),
+    ("prolate", "symmetric about body x, the smallest moment", (0.5, 2.0, 2.0), (2.0, 0.5, -0.25)),
+    (
+        "nearly_oblate",
+        "two moments that differ by 1e-9",
+        (1.0, 1.000000001, 1.5),
+        (0.5, -0.25, 1.0),
+    ),
     ("sphere", "all moments equal", (0.4, 0.4, 0.4), (0.3, -0.2, 0.9)),
-    ("needle", "moments 1 : 500 : 500.25, spins about its long axis",
-     (0.002, 1.0, 1.0005), (20.0, 0.25, -0.125)),
-    ("plate", "flat: the largest moment is the sum of the others",
-     (1.0, 1.5, 2.5), (0.5, 0.75, 1.0)),
-    ("permanent_rotation", "about the axis of the largest moment; only derivatives move",
-     (1.0, 1.5, 2.0), (0.0, 0.0, 1.25)),
-    ("book", "a book of 3 x 20 x 30 cm thrown about its intermediate axis",
-     (0.0108333, 0.007575, 0.00340833),
-     (0.0625, 12.0, 0.125)),
-    ("toutatis", "asteroid 4179 Toutatis, rad/day; relative moments (Takahashi et al. 2013)",
-     (3.0836, 3.235, 1.0), (0.253247, 0.585191, -1.722797)),
-)  # fmt: skip
+    (
+        "needle",
+        "moments 1 : 500 : 500.25, spins about its long axis",
+        (0.002, 1.0, 1.0005),
+        (20.0, 0.25, -0.125),
+    ),
+    (
+        "plate",
+        "flat: the largest moment is the sum of the others",
+        (1.0, 1.5, 2.5),
+        (0.5, 0.75, 1.0),
+    ),
+    (
+        "permanent_rotation",
+        "about the axis of the largest moment; only derivatives move",
+        (1.0, 1.5, 2.0),
+        (0.0, 0.0, 1.25),
+    ),
+    (
+        "book",
+        "a book of 3 x 20 x 30 cm thrown about its intermediate axis",
+        (0.0108333, 0.007575, 0.00340833),
+        (0.0625, 12.0, 0.125),
+    ),
+    (
+        "toutatis",
+        "asteroid 4179 Toutatis, rad/day; relative moments (Takahashi et al. 2013)",
+        (3.0836, 3.235, 1.0),
+        (0.253247, 0.585191, -1.722797),
+    ),
+)
 """Name, description, moments [kg m^2] and initial body rates [rad/s]; times of Toutatis in days."""
 
 
@@ -79,18 +125,29 @@ def body(name: str, title: str, moments, omega) -> dict:
         wxyz, rates = motion.state(t)
         changes = differences(at(t), moments, omega)
         samples.append(
-            {"turns": turns, "t": t, "wxyz": wxyz, "omega_body": rates,
-             "wxyz_derivative": changes[:4], "omega_body_derivative": changes[4:]}
-        )  # fmt: skip
+            {
+                "turns": turns,
+                "t": t,
+                "wxyz": wxyz,
+                "omega_body": rates,
+                "wxyz_derivative": changes[:4],
+                "omega_body_derivative": changes[4:],
+            }
+        )
     flips = motion.flips(FLIPS)
     changes = []
     if flips:
         changes = differences(lambda i, w: Motion.of(i, START, w).flips(FLIPS), moments, omega)
     return {
-        "name": name, "title": title, "moments": list(moments), "wxyz": list(START),
-        "omega_body": list(omega), "flip_times": flips, "flip_times_derivative": changes,
+        "name": name,
+        "title": title,
+        "moments": list(moments),
+        "wxyz": list(START),
+        "omega_body": list(omega),
+        "flip_times": flips,
+        "flip_times_derivative": changes,
         "samples": samples,
-    }  # fmt: skip
+    }
 
 
 def written(value, indent: int = 0) -> str:
@@ -175,8 +232,9 @@ def by_turns(moments, omega, t, step, digits: int) -> list:
     (k,) = (i for i in range(3) if moments[i - 1] == moments[i - 2] != moments[i])
     i, j = (k + 1) % 3, (k + 2) % 3
     f, after = free_reference(moments, (1, 0, 0, 0), omega, step, digits=digits)
-    angle = mp.atan2(omega[i] * after[j] - omega[j] * after[i],
-                     omega[i] * after[i] + omega[j] * after[j])  # fmt: skip
+    angle = mp.atan2(
+        omega[i] * after[j] - omega[j] * after[i], omega[i] * after[i] + omega[j] * after[j]
+    )
     count = mp.floor(mp.mpf(t) / step)
 
     def about_axis(angle):

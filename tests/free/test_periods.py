@@ -178,9 +178,9 @@ def test_derivatives_next_to_the_separatrix(off):
         above = c * w * w * (c - b) - a * u * u * (b - a)
         outer = b * v * v * (b - a) + c * w * w * (c - a)
         inner = a * u * u * (c - a) + b * v * v * (c - b)
-        square, share = ((c - b) * outer, (b - a) * inner) if above > 0 else (
-            (b - a) * inner, (c - b) * outer
-        )  # fmt: skip
+        square, share = (
+            ((c - b) * outer, (b - a) * inner) if above > 0 else ((b - a) * inner, (c - b) * outer)
+        )
         return 4 * mp.ellipk(share / square) / mp.sqrt(square / a / b / c)
 
     with mp.workdps(60):

@@ -102,8 +102,13 @@ class Motion(NamedTuple):
         u0 = mp.ellipf(start, m)
         A, B = square - (I3 * c) ** 2, (I3 * c) ** 2 * m
         n, share = -B / A, size * (twice - square / I3) / (A * p)
-        motion = cls(tuple(moments), tuple(q), tuple(omega), (one, two, three), (
-            a, b, c, p, m, u0, size, size / I3, n, share, even))  # fmt: skip
+        motion = cls(
+            tuple(moments),
+            tuple(q),
+            tuple(omega),
+            (one, two, three),
+            (a, b, c, p, m, u0, size, size / I3, n, share, even),
+        )
         frame, _ = motion._in_frame(mp.mpf(0))
         return motion._replace(wxyz=tuple(quaternion_product(q, conjugate(frame))))
 

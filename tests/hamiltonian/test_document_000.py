@@ -22,8 +22,12 @@ PRINTED_EQ_39 = -0.39019028674671222915
 
 
 BODIES = [
-    (1.0, 1.7, 2.1), (2.0, 2.0, 1.0), (1.0, 1.0, 1.0), (0.01, 1.0, 1.0005), (3e-4, 2e-4, 4e-4)
-]  # fmt: skip
+    (1.0, 1.7, 2.1),
+    (2.0, 2.0, 1.0),
+    (1.0, 1.0, 1.0),
+    (0.01, 1.0, 1.0005),
+    (3e-4, 2e-4, 4e-4),
+]
 
 
 def random_states(moments, dtype, n=1000):
@@ -75,8 +79,12 @@ def deviations(moments, q, qd, p) -> dict[str, jax.Array]:
     return {
         "H, eq. 1": deviation(energy, doc.energy(moments, q, p), size(V, p)),
         "d2H/dp2 = V, eq. 11": deviation(hessian, V, norm(V)),
-        "dq/dt = V p, eqs. 8-10": deviation(rate_q, qd, jnp.abs(V @ jnp.abs(p)[..., None])[..., 0]
-            + jnp.einsum("nij,nj->ni", jnp.abs(V), jnp.abs(p))),
+        "dq/dt = V p, eqs. 8-10": deviation(
+            rate_q,
+            qd,
+            jnp.abs(V @ jnp.abs(p)[..., None])[..., 0]
+            + jnp.einsum("nij,nj->ni", jnp.abs(V), jnp.abs(p)),
+        ),
         "-dH/dphi = 0, eq. 12": jnp.max(jnp.abs(rate_p[:, 0])),
         "-dH/dtheta = p.Theta p, eq. 14": deviation(
             rate_p[:, 1], doc.quadratic(theta, p), size(theta, p) + size(V, p)
@@ -96,7 +104,7 @@ def deviations(moments, q, qd, p) -> dict[str, jax.Array]:
             force + (size(theta, p) + size(psi, p) + size(V, p))[:, None],
         ),
         "accelerations, eqs. 37-39": deviation(qdd, doc.accelerations(moments, q, qd), scale),
-    }  # fmt: skip
+    }
 
 
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
@@ -192,7 +200,8 @@ def test_other_misprints_fail():
     for sine, holds in ((s, False), (c, True)):
         u2 = (p[0] - ct * p[2]) * s + st * sine * p[1]
         psi_dot = (
-            -c * ct * u1 / (moments[0] * st**2) - s * ct * u2 / (moments[1] * st**2)
+            -c * ct * u1 / (moments[0] * st**2)
+            - s * ct * u2 / (moments[1] * st**2)
             + p[2] / moments[2]
-        )  # fmt: skip
+        )
         assert bool(abs(psi_dot - rate_q[2]) < 1e-14) is holds

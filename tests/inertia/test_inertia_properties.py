@@ -45,19 +45,25 @@ def tensors(masses, points, wxyz, shift):
         "centre of the moved body": (moved.centre, body.centre + shift),
         "tensor of the moved body": (moved.central.tensor, body.central.tensor),
         "tensor of the rotated body": (
-            rotated.central.tensor, matrix @ body.central.tensor @ matrix.T,
+            rotated.central.tensor,
+            matrix @ body.central.tensor @ matrix.T,
         ),
         "turned": (body.central.turned(wxyz).tensor, rotated.central.tensor),
         "parallel axis": (
             about,
             body.central.tensor
-            + body.mass * (body.centre @ body.centre * jnp.eye(3, dtype=masses.dtype)
-            - jnp.outer(body.centre, body.centre)),
+            + body.mass
+            * (
+                body.centre @ body.centre * jnp.eye(3, dtype=masses.dtype)
+                - jnp.outer(body.centre, body.centre)
+            ),
         ),
         "about": (body.about(jnp.zeros(3, masses.dtype)).tensor, about),
-        "principal moments": (rotated.central.to_principal()[0].moments,
-                              body.central.to_principal()[0].moments),
-    }, body.central.is_possible  # fmt: skip
+        "principal moments": (
+            rotated.central.to_principal()[0].moments,
+            body.central.to_principal()[0].moments,
+        ),
+    }, body.central.is_possible
 
 
 @DTYPES

@@ -52,10 +52,18 @@ def test_traced_numbers_are_judged_as_known_ones(dtype):
 
 
 def test_the_status_tells_what_no_body_has():
-    moments = jnp.array([
-        [1.0, 1.5, 2.0], [1.0, 1.0, 2.0], [1.0, 1.0, 2.1], [1.0, -1.0, 1.0], [0.0, 1.0, 1.0],
-        [jnp.nan, 1.0, 1.0], [1.0, 1.0, jnp.inf], [-1.0, -1.0, -1.0],
-    ])  # fmt: skip
+    moments = jnp.array(
+        [
+            [1.0, 1.5, 2.0],
+            [1.0, 1.0, 2.0],
+            [1.0, 1.0, 2.1],
+            [1.0, -1.0, 1.0],
+            [0.0, 1.0, 1.0],
+            [jnp.nan, 1.0, 1.0],
+            [1.0, 1.0, jnp.inf],
+            [-1.0, -1.0, -1.0],
+        ]
+    )
     good = np.array([1, 1, 0, 0, 0, 0, 0, 0], bool)
 
     @eqx.filter_jit

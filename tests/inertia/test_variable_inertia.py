@@ -31,11 +31,13 @@ def tensor(t, a, xp):
 
 def matrix(q):
     a, b, c, d = q / np.linalg.norm(q)
-    return np.array([
-        [1 - 2 * (c * c + d * d), 2 * (b * c - a * d), 2 * (b * d + a * c)],
-        [2 * (b * c + a * d), 1 - 2 * (b * b + d * d), 2 * (c * d - a * b)],
-        [2 * (b * d - a * c), 2 * (c * d + a * b), 1 - 2 * (b * b + c * c)],
-    ])  # fmt: skip
+    return np.array(
+        [
+            [1 - 2 * (c * c + d * d), 2 * (b * c - a * d), 2 * (b * d + a * c)],
+            [2 * (b * c + a * d), 1 - 2 * (b * b + d * d), 2 * (c * d - a * b)],
+            [2 * (b * d - a * c), 2 * (c * d + a * b), 1 - 2 * (b * b + c * c)],
+        ]
+    )
 
 
 def by_hand(inertia_of, a, forced):
@@ -45,8 +47,12 @@ def by_hand(inertia_of, a, forced):
     def rates(t, y):
         q, w = y[:4], y[4:]
         I = inertia_of(t, a)
-        change = (inertia_of(t - 2 * h, a) - 8 * inertia_of(t - h, a) + 8 * inertia_of(t + h, a)
-                  - inertia_of(t + 2 * h, a)) / (12 * h)  # fmt: skip
+        change = (
+            inertia_of(t - 2 * h, a)
+            - 8 * inertia_of(t - h, a)
+            + 8 * inertia_of(t + h, a)
+            - inertia_of(t + 2 * h, a)
+        ) / (12 * h)
         momentum, torque = I @ w, np.zeros(3)
         if forced:
             r = matrix(q).T @ PLACE
@@ -83,8 +89,14 @@ def test_a_deployment_keeps_the_momentum_and_agrees_with_eulers_equations():
     np.testing.assert_allclose(traj.omega_body[-1], want[4:], atol=2e-9)
     momentum = traj.momentum_space
     np.testing.assert_allclose(momentum, np.broadcast_to(momentum[0], (3, 3)), rtol=1e-9)
-    energy = np.sum(np.stack([moments(t, 0.8, np) for t in (0.0, SPAN)])
-                    * np.asarray(traj.omega_body[::2]) ** 2, axis=-1) / 2  # fmt: skip
+    energy = (
+        np.sum(
+            np.stack([moments(t, 0.8, np) for t in (0.0, SPAN)])
+            * np.asarray(traj.omega_body[::2]) ** 2,
+            axis=-1,
+        )
+        / 2
+    )
     np.testing.assert_allclose(traj.energy[::2], energy, rtol=1e-12)
 
 
@@ -127,8 +139,9 @@ def test_motion_and_gradient_with_forces_and_a_wheel(full):
     def reference(a):
         return by_hand(
             (lambda t, a: tensor(t, a, np)) if full else (lambda t, a: np.diag(moments(t, a, np))),
-            a, True,
-        )  # fmt: skip
+            a,
+            True,
+        )
 
     value, change = jax.jvp(numbers, (0.8,), (1.0,))
     np.testing.assert_allclose(value, reference(0.8), atol=5e-9)

@@ -20,9 +20,9 @@ HEAD = "[inertia]\nmoments = [1.0, 2.0, 2.5]\n"
         ("[times]\nnumber = 0x" + "f" * 3900, ["[times] number", "less than or equal"]),
         ("a" * 100_000 + " = 1", ["aaa ...", "Extra inputs"]),
         ("title = '''" + "\n[" * 50, ["not valid TOML"]),
-        ("title = \"" + "\\u0000" * 10 + '"\n' + HEAD, ["state", "Field required"]),
+        ('title = "' + "\\u0000" * 10 + '"\n' + HEAD, ["state", "Field required"]),
     ],
-)  # fmt: skip
+)
 def test_what_would_take_the_parser_long_is_refused_at_once(text, hints):
     with pytest.raises(SceneFileError) as caught:
         parse_scene(text, "big.toml")
@@ -65,10 +65,15 @@ def test_the_schema_and_the_page_name_the_same_keys():
     assert len(keys) > 70
     assert keys - words == set()
     # choices too: shapes, kinds, units
-    choices = {c for t in tables for p in t.get("properties", {}).values()
-               for c in (*p.get("enum", ()), p.get("const"))} - {None}  # fmt: skip
+    choices = {
+        c
+        for t in tables
+        for p in t.get("properties", {}).values()
+        for c in (*p.get("enum", ()), p.get("const"))
+    } - {None}
     choices = {c for c in choices if isinstance(c, str)}
-    choices = {c for c in choices if len(c) > 3 or c.isalpha()} - {a for a in choices if len(a) == 3
-                and set(a) <= set("xyz")}  # fmt: skip
+    choices = {c for c in choices if len(c) > 3 or c.isalpha()} - {
+        a for a in choices if len(a) == 3 and set(a) <= set("xyz")
+    }
     assert {c for c in choices if c not in page} == set()
     assert schema["additionalProperties"] is False

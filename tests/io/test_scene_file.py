@@ -117,7 +117,7 @@ def test_euler_sequences_agree_with_scipy():
         ("moments = [1.0, 2, 2.5]", "[[inertia.parts]]\nshape='box'\nradius=1", "radius", "sides"),
         ("title", "title = [", "", "TOML"),
     ],
-)  # fmt: skip
+)
 def test_each_mistake_is_named_with_its_cure(old, new, key, hint):
     assert old in GOOD
     with pytest.raises(SceneFileError) as caught:
@@ -140,14 +140,41 @@ def test_files_that_are_no_text(tmp_path):
         read_scene(binary)
 
 
-KEYS = ["title", "inertia", "moments", "unit", "state", "euler", "angles", "wxyz", "omega_body",
-        "value", "times", "stop", "number", "values", "torque", "kind", "monte_carlo", "seed",
-        "observations", "rows", "utc", "published", "rotors", "epoch", "x"]  # fmt: skip
+KEYS = [
+    "title",
+    "inertia",
+    "moments",
+    "unit",
+    "state",
+    "euler",
+    "angles",
+    "wxyz",
+    "omega_body",
+    "value",
+    "times",
+    "stop",
+    "number",
+    "values",
+    "torque",
+    "kind",
+    "monte_carlo",
+    "seed",
+    "observations",
+    "rows",
+    "utc",
+    "published",
+    "rotors",
+    "epoch",
+    "x",
+]
 scalars = (
-    st.booleans() | st.integers() | st.floats() | st.text(max_size=8)
+    st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=8)
     | st.sampled_from(["deg", "rad/s", "zxz", "box", "P_psi", "auto"])
     | st.datetimes()
-)  # fmt: skip
+)
 garbage = st.recursive(
     scalars,
     lambda inner: (

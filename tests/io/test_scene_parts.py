@@ -189,7 +189,7 @@ def test_events_are_at_the_times_at_which_they_are(tmp_path, monkeypatch, capsys
         ("events = [{ name = 'a', rate = 1 }, { name = 'a', rate = 2 }]", "a name twice"),
         ("rotors = [" + "{ axis_body = [0, 0, 1], speed = 1 }," * 101 + "]", "at most 100 items"),
     ],
-)  # fmt: skip
+)
 def test_mistakes_are_named(text, hint):
     with pytest.raises(SceneFileError) as caught:
         parse_scene(BODY + text)

@@ -233,9 +233,12 @@ def test_tc4_in_the_night_of_2012(shared, tmp_path):
     few = tmp_path / "few.csv"
     few.write_text("\n".join([header, *rows[::3]]) + "\n")
     fit = lightcurve.run(
-        few, vectors=folder / "tc4_2012_vectors.csv", trials=8_000,
-        output=tmp_path / "tc4", say=said.append,
-    )  # fmt: skip
+        few,
+        vectors=folder / "tc4_2012_vectors.csv",
+        trials=8_000,
+        output=tmp_path / "tc4",
+        say=said.append,
+    )
     assert fit.best.mode == ph.Mode.LAM
     assert fit.best.P_phi * 1440 == pytest.approx(12.23, abs=0.05)
     assert fit.best.P_psi * 1440 == pytest.approx(27.8, abs=0.3)

@@ -74,8 +74,15 @@ def test_damit(tmp_path):
 
 
 def test_alcdef(tmp_path):
-    head = ["STARTMETADATA", "OBJECTNAME=Test", "DELIMITER=PIPE", "PHASE=10.0", "PABL=90.0",
-            "PABB=0.0", "ENDMETADATA"]  # fmt: skip
+    head = [
+        "STARTMETADATA",
+        "OBJECTNAME=Test",
+        "DELIMITER=PIPE",
+        "PHASE=10.0",
+        "PABL=90.0",
+        "PABB=0.0",
+        "ENDMETADATA",
+    ]
     data = [f"DATA={t}|{m}|0.01" for t, m in zip(JD, MAGNITUDE)]
     path = tmp_path / "alcdef.txt"
     path.write_text("\n".join([*head, *data, "ENDDATA", *head, *data, "ENDDATA"]))

@@ -20,9 +20,11 @@ magnitudes = jax.jit(_brightness.magnitudes, static_argnums=0)
 def moved(bodies, later):
     """Rates and attitudes of free bodies at one time each."""
     found = free_motion(
-        _brightness.moments_of(bodies.unknowns), tuple(bodies.wxyz.T),
-        tuple(bodies.unknowns[:, 4:7].T), later,
-    )  # fmt: skip
+        _brightness.moments_of(bodies.unknowns),
+        tuple(bodies.wxyz.T),
+        tuple(bodies.unknowns[:, 4:7].T),
+        later,
+    )
     return tuple(jnp.stack([x[:, 0] for x in part], -1) for part in found)
 
 
@@ -57,9 +59,12 @@ def test_any_phases_are_turned_to_those_of_the_points(blank, mode):
     wxyz = _search.rotation.multiply(_search.rotation.rotation_vector_to_wxyz(angle * pole), wxyz)
     away = _brightness.Bodies(same.unknowns.at[:, 4:7].set(rates), wxyz)
     found, fall = _search.align_phases(
-        away, *(np.repeat(x, MANY) for x in meant), np.repeat(right, MANY, 0),
-        np.repeat(matrix, MANY, 0), *_search.directions(points),
-    )  # fmt: skip
+        away,
+        *(np.repeat(x, MANY) for x in meant),
+        np.repeat(right, MANY, 0),
+        np.repeat(matrix, MANY, 0),
+        *_search.directions(points),
+    )
     np.testing.assert_allclose(_solutions.momentum(found), pole, atol=1e-9)
     f_phi, f_psi, _ = _solutions.frequencies(found)
     np.testing.assert_allclose(f_phi, meant.f_phi[0], rtol=1e-9)

@@ -19,11 +19,18 @@ STATE = ph.State([0.8, 0.4, -0.3, 0.2], np.array([11.0, 3.0, 5.0]))
 def a_solution(**others):
     entries = dict.fromkeys(_solutions.Solution._fields)
     entries |= {
-        "P_phi": 0.4, "P_psi": 0.9, "mode": ph.Mode.LAM, "moments": MOMENTS / MOMENTS.max(),
-        "axes": AXES, "wxyz": np.asarray(ph.rotation.normalise(STATE.wxyz)),
-        "omega_body": np.asarray(STATE.omega_body), "coefficients": np.array([0.03]),
-        "epoch": 0.0, "probability": 1.0, **others,
-    }  # fmt: skip
+        "P_phi": 0.4,
+        "P_psi": 0.9,
+        "mode": ph.Mode.LAM,
+        "moments": MOMENTS / MOMENTS.max(),
+        "axes": AXES,
+        "wxyz": np.asarray(ph.rotation.normalise(STATE.wxyz)),
+        "omega_body": np.asarray(STATE.omega_body),
+        "coefficients": np.array([0.03]),
+        "epoch": 0.0,
+        "probability": 1.0,
+        **others,
+    }
     return _solutions.Solution(**entries)  # pyright: ignore[reportArgumentType]
 
 
@@ -75,9 +82,15 @@ def test_unknown_phase_functions_are_refused(tmp_path):
     curve = lightcurve.LightCurve.of(t, np.sin(20 * t), *vectors)
     with pytest.raises(ValueError, match="one of seeliger, linear, hg, hg1g2"):
         _command.fit_file(
-            curve, "x", tmp_path / "x.png", tmp_path / "x.json", trials=1, floor=0.1, seed=0,
+            curve,
+            "x",
+            tmp_path / "x.png",
+            tmp_path / "x.json",
+            trials=1,
+            floor=0.1,
+            seed=0,
             phase="lambert",
-        )  # fmt: skip
+        )
 
 
 @pytest.mark.slow
@@ -100,15 +113,25 @@ def test_a_night_is_added_to_an_earlier_fit(tmp_path, monkeypatch):
         np.savetxt(name, table[rows], delimiter=",", header=names, comments="")
     truth = ph.periods(ph.Inertia.from_moments(MOMENTS), STATE)
     body = a_solution(
-        P_phi=float(truth.P_phi), P_psi=float(truth.P_psi), epoch=float(jd[0]),
-        wxyz=np.asarray(start.wxyz[1]), omega_body=np.asarray(start.omega_body[1]) * 1.001,
-    )  # fmt: skip
+        P_phi=float(truth.P_phi),
+        P_psi=float(truth.P_psi),
+        epoch=float(jd[0]),
+        wxyz=np.asarray(start.wxyz[1]),
+        omega_body=np.asarray(start.omega_body[1]) * 1.001,
+    )
     earlier, words = written(Path("known.json"), body), []
     for name in ("seven", "eight"):
         fit = lightcurve.run(
-            f"{name}.csv", reduced=True, calibrated=True, phase="linear", start=earlier,
-            searches=0, floor=0.01, output=name, say=words.append,
-        )  # fmt: skip
+            f"{name}.csv",
+            reduced=True,
+            calibrated=True,
+            phase="linear",
+            start=earlier,
+            searches=0,
+            floor=0.01,
+            output=name,
+            say=words.append,
+        )
         assert fit is not None
         earlier = Path(f"{name}.json")
         document = json.loads(earlier.read_text())

@@ -66,10 +66,13 @@ def test_scores_of_the_benchmark():
     assert not unseen.same_motion(good, truth | {"mode": "SAM"})
     assert not unseen.same_motion(SimpleNamespace(P_phi=0.302, P_psi=0.8, mode=good.mode), truth)
     for verdict, right, expected in (
-        ("TUMBLING", [True, False], "right"), ("TUMBLING", [False, True], "silent"),
-        ("AMBIGUOUS", [True], "right, ambiguous"), ("AMBIGUOUS", [False, True], "listed"),
-        ("AMBIGUOUS", [False], "told"), ("ONE_PERIOD", [True], "denied"),
-    ):  # fmt: skip
+        ("TUMBLING", [True, False], "right"),
+        ("TUMBLING", [False, True], "silent"),
+        ("AMBIGUOUS", [True], "right, ambiguous"),
+        ("AMBIGUOUS", [False, True], "listed"),
+        ("AMBIGUOUS", [False], "told"),
+        ("ONE_PERIOD", [True], "denied"),
+    ):
         assert unseen.score(truth, verdict, right) == expected
     assert unseen.score({"kind": "rotator"}, "ONE_PERIOD", [False]) == "right"
     assert unseen.score({"kind": "noise"}, "AMBIGUOUS", [False]) == "wrong"
@@ -83,13 +86,25 @@ def test_a_run_continues_where_it_was_stopped(tmp_path, monkeypatch, capsys):
     def fit(curve):
         fitted.append(curve.t.size)
         body = SimpleNamespace(
-            P_phi=1.0, P_psi=2.0, P_phi_std=0.1, P_psi_std=0.1, mode=ph.Mode.LAM, probability=1.0,
+            P_phi=1.0,
+            P_psi=2.0,
+            P_phi_std=0.1,
+            P_psi_std=0.1,
+            mode=ph.Mode.LAM,
+            probability=1.0,
             rms=0.1,
-        )  # fmt: skip
+        )
         return SimpleNamespace(
-            best=body, solutions=(body,), verdict=lightcurve.Verdict.AMBIGUOUS, par=-1,
-            reasons=("one",), misfit=1.0, agreement=1.0, alike=1.0, models=(),
-        )  # fmt: skip
+            best=body,
+            solutions=(body,),
+            verdict=lightcurve.Verdict.AMBIGUOUS,
+            par=-1,
+            reasons=("one",),
+            misfit=1.0,
+            agreement=1.0,
+            alike=1.0,
+            models=(),
+        )
 
     monkeypatch.setattr(lightcurve, "fit_light_curve", fit)
     lines, output = tmp_path / "lines.jsonl", tmp_path / "result.json"
@@ -108,8 +123,12 @@ def test_a_run_continues_where_it_was_stopped(tmp_path, monkeypatch, capsys):
     ends = {row["score"]: row["curves"] for row in numbers["tumblers"]}
     assert ends["told"] == sum(ends.values()) == 3
     assert numbers["others"][0] == {
-        "kind": "rotator", "expected": "ONE_PERIOD", "right": 0, "wrong": 1, "silent": 0
-    }  # fmt: skip
+        "kind": "rotator",
+        "expected": "ONE_PERIOD",
+        "right": 0,
+        "wrong": 1,
+        "silent": 0,
+    }
     assert "5 rotator  wrong" in capsys.readouterr().out
     page = "\n".join(_page.SECTIONS["light_curves_unseen"].lines(_report.read(output)))
     assert "| told | not in the list, AMBIGUOUS | 3 |" in page

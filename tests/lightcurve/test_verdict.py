@@ -48,10 +48,14 @@ def flat(t):
 def solution(model, P_phi=P_PHI, P_psi=P_PSI, odds=1.0, **others):
     entries = dict.fromkeys(_solutions.Solution._fields)
     entries |= {
-        "P_phi": P_phi, "P_psi": P_psi, "mode": ph.Mode.LAM, "probability": odds, "model": model,
+        "P_phi": P_phi,
+        "P_psi": P_psi,
+        "mode": ph.Mode.LAM,
+        "probability": odds,
+        "model": model,
         "parameters": 10.0,
         **others,
-    }  # fmt: skip
+    }
     return _solutions.Solution(**entries)  # pyright: ignore[reportArgumentType]
 
 
@@ -131,15 +135,32 @@ def test_the_list_of_models_begins_with_the_null_hypotheses(cases):
 def test_table_prints_null_hypotheses_before_bodies_and_the_verdict_last(cases):
     curve, pairs, *_ = cases["tumbler"]
     body = solution(
-        offset_free(cases["tumbler"], tumbling), P_phi_std=1e-4, P_psi_std=1e-3, rms=NOISE,
-        moments=np.array([0.5, 0.8, 1.0]), pole=np.array([10.0, 20.0]), pole_std=3.0,
+        offset_free(cases["tumbler"], tumbling),
+        P_phi_std=1e-4,
+        P_psi_std=1e-3,
+        rms=NOISE,
+        moments=np.array([0.5, 0.8, 1.0]),
+        pole=np.array([10.0, 20.0]),
+        pole_std=3.0,
         parameters=8.3,
-    )  # fmt: skip
+    )
     found = verdict(cases["tumbler"], body)
     fit = lightcurve.LightCurveFit(
-        (body,), curve, pairs, None, 1.0, 1.0, None, ("a note",), found.verdict, found.reasons,
-        found.par, found.models, found.misfit, found.agreement,
-    )  # fmt: skip
+        (body,),
+        curve,
+        pairs,
+        None,
+        1.0,
+        1.0,
+        None,
+        ("a note",),
+        found.verdict,
+        found.reasons,
+        found.par,
+        found.models,
+        found.misfit,
+        found.agreement,
+    )
     text = lightcurve.table(fit)
     places = [text.index(x) for x in ("noise only", "one period", "tumbling body", "P_phi short")]
     assert places == sorted(places)
@@ -338,9 +359,15 @@ def test_an_ellipsoid_whose_convex_body_is_excluded_does_not_make_a_result_ambig
         (body, Verdict.TUMBLING),  # with a convex shape it has the best motion
     ):
         found = _verdict.judge(
-            linear, nulls, pairs, (body,), reproduced=True, limit=3.0, others=(ellipsoid,),
+            linear,
+            nulls,
+            pairs,
+            (body,),
+            reproduced=True,
+            limit=3.0,
+            others=(ellipsoid,),
             refined=(convex,),
-        )  # fmt: skip
+        )
         assert found.verdict is expected
 
 
@@ -563,10 +590,14 @@ def test_a_convex_shape_leaves_the_noise_and_periods_within_their_errors(convex_
     linear, phase = _nulls.Linear(curve, 0.02), lightcurve.SeeligerPhase()
     body = body._replace(unknowns=body.unknowns[:, : 7 + len(phase.typical)])
     start = solution(
-        curve.magnitude, moments=np.array(_brightness.moments_of(body.unknowns[0])),
-        axes=np.exp(np.r_[0, body.unknowns[0, 2:4]]), omega_body=body.unknowns[0, 4:7],
-        coefficients=body.unknowns[0, 7:], wxyz=body.wxyz[0], offsets=np.zeros(13),
-    )  # fmt: skip
+        curve.magnitude,
+        moments=np.array(_brightness.moments_of(body.unknowns[0])),
+        axes=np.exp(np.r_[0, body.unknowns[0, 2:4]]),
+        omega_body=body.unknowns[0, 4:7],
+        coefficients=body.unknowns[0, 7:],
+        wxyz=body.wxyz[0],
+        offsets=np.zeros(13),
+    )
     # a second start whose pole is 2 degrees off ends as a copy of the first
     near = start._replace(
         wxyz=np.asarray(ph.rotation.multiply(np.array([1.0, 0.01, 0.01, 0]), start.wxyz))

@@ -43,12 +43,14 @@ def test_group_axioms_for_awkward_batches(dtype):
             (rotate(a, vector)[..., None], matrix(a) @ column),
             (matrix(multiply(a, b)), matrix(a) @ matrix(b)),
             (matrix(rotation.conjugate(a)), jnp.swapaxes(matrix(a), -1, -2)),
-            (matrix(a) @ jnp.swapaxes(matrix(a), -1, -2), jnp.broadcast_to(
-                jnp.eye(3, dtype=dtype), (*SHAPE, 3, 3))),
+            (
+                matrix(a) @ jnp.swapaxes(matrix(a), -1, -2),
+                jnp.broadcast_to(jnp.eye(3, dtype=dtype), (*SHAPE, 3, 3)),
+            ),
             (jnp.linalg.det(matrix(a)), jnp.ones(SHAPE, dtype)),
             (multiply(a, rotation.between(a, b)), b),
             (jnp.sum(rotation.normalise(dtype(1e-30) * a) ** 2, axis=-1), jnp.ones(SHAPE, dtype)),
-        ]  # fmt: skip
+        ]
 
     for number, (left, right) in enumerate(sides(a, b, c, vector)):
         assert left.dtype == dtype

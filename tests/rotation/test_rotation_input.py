@@ -9,12 +9,17 @@ from polhode import rotation
 from polhode.rotation import Sequence
 
 OF_QUATERNION = [
-    rotation.normalise, rotation.wxyz_to_matrix, rotation.wxyz_to_euler,
-    rotation.wxyz_to_rotation_vector, rotation.wxyz_to_axis_angle, rotation.wxyz_to_shadow,
-    rotation.wxyz_to_modified_rodrigues, rotation.wxyz_to_scipy,
+    rotation.normalise,
+    rotation.wxyz_to_matrix,
+    rotation.wxyz_to_euler,
+    rotation.wxyz_to_rotation_vector,
+    rotation.wxyz_to_axis_angle,
+    rotation.wxyz_to_shadow,
+    rotation.wxyz_to_modified_rodrigues,
+    rotation.wxyz_to_scipy,
     lambda q: rotation.rotate(q, [1.0, 2.0, 3.0]),
     lambda q: rotation.angle_between(q, [1, 0, 0, 0]),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("take", OF_QUATERNION)
@@ -61,10 +66,16 @@ def test_wrong_lengths_and_shapes(take, word):
 @pytest.mark.parametrize(
     "matrix",
     [
-        np.diag([1.0, 1, -1]), -np.eye(3), 2 * np.eye(3), np.zeros((3, 3)), np.ones((3, 3)),
-        np.diag([1.0, 1, 1.01]), np.eye(3)[[1, 0, 2]], np.diag([1.0, 0, 0]),
+        np.diag([1.0, 1, -1]),
+        -np.eye(3),
+        2 * np.eye(3),
+        np.zeros((3, 3)),
+        np.ones((3, 3)),
+        np.diag([1.0, 1, 1.01]),
+        np.eye(3)[[1, 0, 2]],
+        np.diag([1.0, 0, 0]),
     ],
-)  # fmt: skip
+)
 def test_matrices_that_are_no_rotations(matrix):
     for take in (rotation.matrix_to_wxyz, rotation.matrix_to_euler):
         with pytest.raises(ValueError, match=r"determinant \+1"):

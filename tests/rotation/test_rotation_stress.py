@@ -15,10 +15,14 @@ for _sequence in (Sequence.ZYZ, Sequence.ZXY_SPACE):
 
 PLAIN = "wxyz -> matrix", "matrix -> wxyz"  # in single precision; the other formulas: slow
 SINGLE = [
-    pytest.param(case, np.float32, id=f"{case.name}-float32",
-                 marks=() if case.name in PLAIN else pytest.mark.slow)
+    pytest.param(
+        case,
+        np.float32,
+        id=f"{case.name}-float32",
+        marks=() if case.name in PLAIN else pytest.mark.slow,
+    )
     for case in CASES
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(

@@ -65,9 +65,14 @@ def field(kind, body, y):
     turn = [a + b for a, b in zip(cross(momentum, rate), push)]
     a, b, c = (r / 2 for r in rate)
     return np.stack(
-        [*turn, -x * a - v * b - z * c, w * a + v * c - z * b, w * b + z * a - x * c,
-         w * c + x * b - v * a]
-    )  # fmt: skip
+        [
+            *turn,
+            -x * a - v * b - z * c,
+            w * a + v * c - z * b,
+            w * b + z * a - x * c,
+            w * c + x * b - v * a,
+        ]
+    )
 
 
 def last_state(kind, body, density, nudge=None):
@@ -158,8 +163,9 @@ def listed(body, end):
 
 
 def save(made):
-    rows = [f"{json.dumps(kind)}: {json.dumps(made[kind])}".replace("]], ", "]],\n")
-            for kind in made]  # fmt: skip
+    rows = [
+        f"{json.dumps(kind)}: {json.dumps(made[kind])}".replace("]], ", "]],\n") for kind in made
+    ]
     FILE.write_text("{" + ",\n".join(rows) + "}\n", encoding="utf-8")
 
 

@@ -47,8 +47,10 @@ def main():
 
         slope = jax.grad(loss, (0, 1))
         one = slope(omega, jnp.array(0.7), wxyz)
-        two = slope(*(jax.device_put(x, place) if x.ndim else x for x in (omega, jnp.array(0.7))),
-                    jax.device_put(wxyz, place))  # fmt: skip
+        two = slope(
+            *(jax.device_put(x, place) if x.ndim else x for x in (omega, jnp.array(0.7))),
+            jax.device_put(wxyz, place),
+        )
         found[name] = {
             "away": [float(jnp.max(jnp.abs(a - np.asarray(b)))) for a, b in zip(one, two)],
             "size": [float(jnp.max(jnp.abs(a))) for a in one],

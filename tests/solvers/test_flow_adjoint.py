@@ -54,9 +54,13 @@ def loss(p):
 
 def point():
     return {
-        "moments": MOMENTS, "centre": jnp.array([0.1, 0.0, 0.5]), "rate": jnp.array(0.7),
-        "wxyz": WXYZ, "omega": OMEGA, "last": jnp.array(3.0),
-    }  # fmt: skip
+        "moments": MOMENTS,
+        "centre": jnp.array([0.1, 0.0, 0.5]),
+        "rate": jnp.array(0.7),
+        "wxyz": WXYZ,
+        "omega": OMEGA,
+        "last": jnp.array(3.0),
+    }
 
 
 def difference(fn, p, direction, h=0.02):
@@ -104,9 +108,16 @@ def value(inverse):
     span = jnp.array([0.0, 1.0], dtype)
     solver = Extrapolation(None, accuracy=Accuracy(1e-12 if dtype == jnp.float64 else 1e-6, 1.0))
     end = diffrax.diffeqsolve(
-        diffrax.ODETerm(lie_poisson_field), solver, *span, None, y, dynamics,
-        stepsize_controller=diffrax.StepTo(span), adjoint=FlowAdjoint(), max_steps=1,
-    )  # fmt: skip
+        diffrax.ODETerm(lie_poisson_field),
+        solver,
+        *span,
+        None,
+        y,
+        dynamics,
+        stepsize_controller=diffrax.StepTo(span),
+        adjoint=FlowAdjoint(),
+        max_steps=1,
+    )
     return sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(end.ys))
 
 
@@ -162,9 +173,18 @@ def solved(name, args, ts, t0=0.0):
         for part in (np.array(bodies.OMEGA) * bodies.MOMENTS, bodies.WXYZ)
     )
     momentum, wxyz = diffrax.diffeqsolve(
-        diffrax.ODETerm(heavy_top), solver, t0, ts[-1], None, y0, args, saveat=saveat,
-        stepsize_controller=controller, adjoint=FlowAdjoint(1e-12), max_steps=256,
-    ).ys  # fmt: skip
+        diffrax.ODETerm(heavy_top),
+        solver,
+        t0,
+        ts[-1],
+        None,
+        y0,
+        args,
+        saveat=saveat,
+        stepsize_controller=controller,
+        adjoint=FlowAdjoint(1e-12),
+        max_steps=256,
+    ).ys
     return jnp.stack([x[: ts.shape[0]] for x in (*wxyz, *momentum)])
 
 
@@ -204,11 +224,19 @@ def test_one_step_is_what_the_loop_of_diffrax_makes_of_it(end):
 
     def solved(adjoint):
         return diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda t, y, args: (args * y[1], t - y[0])), diffrax.Dopri5(),
-            ts[0], ts[-1], None, (jnp.ones(2), jnp.zeros(2)), jnp.array(2.0), max_steps=3,
+            diffrax.ODETerm(lambda t, y, args: (args * y[1], t - y[0])),
+            diffrax.Dopri5(),
+            ts[0],
+            ts[-1],
+            None,
+            (jnp.ones(2), jnp.zeros(2)),
+            jnp.array(2.0),
+            max_steps=3,
             saveat=diffrax.SaveAt(subs=subs),
-            stepsize_controller=diffrax.StepTo(ts), adjoint=adjoint, throw=False,
-        )  # fmt: skip
+            stepsize_controller=diffrax.StepTo(ts),
+            adjoint=adjoint,
+            throw=False,
+        )
 
     ours, theirs = solved(FlowAdjoint()), solved(diffrax.ForwardMode())
     assert ours.ts[0].tolist() == [0, end, np.inf, np.inf]
@@ -262,10 +290,16 @@ def test_parts_keep_the_way_back_from_states_drawn_together(mode):
         a, c, v0 = p
         y0 = jnp.zeros(1), v0[None]
         end = diffrax.diffeqsolve(
-            diffrax.ODETerm(drawn_together), Extrapolation(None, accuracy=Accuracy(1e-12, 4.0)),
-            *span, None, y0, (a, c), stepsize_controller=diffrax.StepTo(span),
-            adjoint=FlowAdjoint(parts=parts), max_steps=1,
-        )  # fmt: skip
+            diffrax.ODETerm(drawn_together),
+            Extrapolation(None, accuracy=Accuracy(1e-12, 4.0)),
+            *span,
+            None,
+            y0,
+            (a, c),
+            stepsize_controller=diffrax.StepTo(span),
+            adjoint=FlowAdjoint(parts=parts),
+            max_steps=1,
+        )
         return end.ys[0][0, 0]
 
     p = jnp.array([1.75, 2.0, 0.5])
@@ -280,9 +314,17 @@ def test_what_cannot_be_differentiated_is_refused():
     def last(saveat, event=None):
         y0 = jnp.zeros(1), jnp.ones(1)
         return diffrax.diffeqsolve(
-            diffrax.ODETerm(drawn_together), diffrax.Dopri8(), 0.0, 1.0, 0.1, y0, (1.0, 2.0),
-            saveat=saveat, adjoint=FlowAdjoint(), event=event,
-        )  # fmt: skip
+            diffrax.ODETerm(drawn_together),
+            diffrax.Dopri8(),
+            0.0,
+            1.0,
+            0.1,
+            y0,
+            (1.0, 2.0),
+            saveat=saveat,
+            adjoint=FlowAdjoint(),
+            event=event,
+        )
 
     both = diffrax.SaveAt(subs={"a": diffrax.SubSaveAt(t1=True), "b": diffrax.SubSaveAt(t0=True)})
     event = diffrax.Event(lambda t, y, args, **_: t > 0.5)
@@ -292,8 +334,12 @@ def test_what_cannot_be_differentiated_is_refused():
 
 
 WEIGHTS = jnp.array([0.7, -0.4, 0.9, 0.3, -0.5, 0.8, 0.6])
-DRIVEN = {"moment": jnp.array(1.3), "drag": jnp.array(9.0), "push": jnp.array(7.0),
-          "rate": jnp.array(2.0)}  # fmt: skip
+DRIVEN = {
+    "moment": jnp.array(1.3),
+    "drag": jnp.array(9.0),
+    "push": jnp.array(7.0),
+    "rate": jnp.array(2.0),
+}
 
 
 def held(p, method):

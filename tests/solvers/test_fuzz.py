@@ -29,12 +29,18 @@ def test_random_motions_of_a_part_keep_rtol(part):
 # Parts whose derivatives tests/systems, test_every_torque and test_switches do not compare with an
 # independent motion, or which change more slowly than those; the script compares all of them.
 DIFFERENTIATED = (
-    "UniformGravity.axial, axisymmetric", "GravityGradient, ellipse", "Potential",
-    "SpaceTorque of time", "RateDamping",
-    "RelativeTorque(LinearDamping), ellipse", "MagneticDipole", "BDot on an orbit, limited",
-    "Rotor, ViscousCoupling", "Rotor, Motor with limits",
+    "UniformGravity.axial, axisymmetric",
+    "GravityGradient, ellipse",
+    "Potential",
+    "SpaceTorque of time",
+    "RateDamping",
+    "RelativeTorque(LinearDamping), ellipse",
+    "MagneticDipole",
+    "BDot on an orbit, limited",
+    "Rotor, ViscousCoupling",
+    "Rotor, Motor with limits",
     "Inertia with products",
-)  # fmt: skip
+)
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,12 @@ def field(t, y):
     """Quaternion and body momentum of a body under a torque fixed in it."""
     (w, x, y_, z), momentum = y[:4], y[4:]
     a, b, c = momentum / MOMENTS
-    turn = [-x * a - y_ * b - z * c, w * a + y_ * c - z * b, w * b + z * a - x * c,
-            w * c + x * b - y_ * a]  # fmt: skip
+    turn = [
+        -x * a - y_ * b - z * c,
+        w * a + y_ * c - z * b,
+        w * b + z * a - x * c,
+        w * c + x * b - y_ * a,
+    ]
     torque = np.cross(momentum, momentum / MOMENTS) + np.array([0.1, 0.2, -0.1])
     return np.concatenate([np.array(turn) / 2, torque])
 
@@ -38,9 +42,14 @@ def test_the_error_of_dense_output_is_that_many_times_the_one_at_the_end(rule):
                 stages.append(field(node * width, start + width * change))
             dense = dense_of(jnp.array([width]), jnp.asarray(stages)[:, :, None], rule)
             exact = solve_ivp(
-                field, (0, width), start, "DOP853", [x * width for x in (*PLACES, 1)],
-                rtol=3e-14, atol=1e-15,
-            ).y  # fmt: skip
+                field,
+                (0, width),
+                start,
+                "DOP853",
+                [x * width for x in (*PLACES, 1)],
+                rtol=3e-14,
+                atol=1e-15,
+            ).y
             *within, end = (
                 np.linalg.norm(dense_state(jnp.asarray(start)[:, None], dense, x)[:, 0] - y)
                 for x, y in zip(jnp.array((*PLACES, 1.0))[:, None], exact.T)

@@ -163,9 +163,14 @@ def test_principia_principal_spins(axis, size, angle, ulps):
 
 
 def test_principia_sphere():
-    a, b, c = (np.array([np.cos(x / 2), *(np.array(u) * np.sin(x / 2))]) for x, u in (
-        (0.5, (0, 1, 0)), (1.5, (0, 0, 1)), (-2.5, (0, 1, 0)),
-    ))  # fmt: skip
+    a, b, c = (
+        np.array([np.cos(x / 2), *(np.array(u) * np.sin(x / 2))])
+        for x, u in (
+            (0.5, (0, 1, 0)),
+            (1.5, (0, 0, 1)),
+            (-2.5, (0, 1, 0)),
+        )
+    )
     a, b, c = map(jnp.asarray, (a, b, c))
     start = rotation.multiply(rotation.multiply(a, b), c)
     wxyz, omega = _run((3, 3, 3), (1, 2, 4), np.arange(1001) / 100, start)

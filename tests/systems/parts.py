@@ -20,7 +20,7 @@ def field_of(system):
     if "gyro" in acts:
         return lambda moments, part, y: _with_gyro(moments, *acts["gyro"])
     torque = {"table": _polynomial, "drag": _drag, "light": _light, "sampled": _held}
-    (kind, numbers), = acts.items()  # fmt: skip
+    ((kind, numbers),) = acts.items()
     return lambda moments, part, y: taylor.body(moments, torque[kind](part, y, numbers))
 
 

@@ -109,8 +109,12 @@ def quaternion_rate(q, rates):
     """q (0, rates) / 2."""
     w, x, y, z = q
     a, b, c = (r * mpf("0.5") for r in rates)
-    return [-(x * a) - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c,
-            w * c + x * b - y * a]  # fmt: skip
+    return [
+        -(x * a) - y * b - z * c,
+        w * a + y * c - z * b,
+        w * b + z * a - x * c,
+        w * c + x * b - y * a,
+    ]
 
 
 def growing_body(moments, growth):

@@ -60,7 +60,7 @@ METHODS = {
     "CoarseSteps": Way(ph.CoarseSteps(), FEW),
     "EulerAngles of few": Way(ph.EulerAngles(Dopri8()), FEW),
     "Dopri8 of sunlight_and_shadow": Way(ph.LiePoisson(Dopri8()), ["sunlight_and_shadow"]),
-}  # fmt: skip
+}
 
 # Space axes of the systems seen from the axes that they are moved in: no path of the table meets a
 # pole of the Euler angles there, and nothing but the names of the space axes has changed.
@@ -107,7 +107,7 @@ def acting(names: Sequence[str], moments):
 
 def with_parts(system, moments):
     """Inertia, torque and rotors of a system that has more than simple torques; a batch of one."""
-    (kind, numbers), = system.acts.items()  # fmt: skip
+    ((kind, numbers),) = system.acts.items()
     dtype, ends = moments.dtype, jnp.array(system.span, moments.dtype)
     inertia = ph.Inertia.from_moments(moments)
 

@@ -40,7 +40,9 @@ def test_decay_on_both_sides_of_the_series(dtype, bound):
 CASES = {
     "wheel": (ph.Scene(SYMMETRIC, rotors=Rotor.axial(momentum=0.4)), STATE, None),
     "free_wheel": (
-        ph.Scene(SYMMETRIC, rotors=Rotor.axial(0.1, speed=4.0, torque=0.0)), STATE, None,
+        ph.Scene(SYMMETRIC, rotors=Rotor.axial(0.1, speed=4.0, torque=0.0)),
+        STATE,
+        None,
     ),
     "damped": (ph.Scene(SYMMETRIC, torque=ph.LinearDamping([0.25, 0.25, 0.1])), STATE, None),
     "driven": (
@@ -56,7 +58,7 @@ CASES = {
         ONE_AXIS,
         None,
     ),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(

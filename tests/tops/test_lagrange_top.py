@@ -68,8 +68,9 @@ def bound_of(name):
 @pytest.mark.slow
 def test_every_gradient_is_exact(exact):
     x = jnp.asarray(NUMBERS)
-    rows = np.stack([SENSITIVITY(x, jnp.zeros((7, len(NAMES))).at[k].set(1.0), TIMES)
-                     for k in range(7)])  # (7, 10, cases), in reverse mode  # fmt: skip
+    rows = np.stack(
+        [SENSITIVITY(x, jnp.zeros((7, len(NAMES))).at[k].set(1.0), TIMES) for k in range(7)]
+    )  # (7, 10, cases), in reverse mode
     for j, (name, entry) in enumerate(zip(NAMES, exact)):
         want = np.array(entry["gradient"])
         error = np.abs(rows[:, :, j] - want).max() / np.abs(want).max()
@@ -162,9 +163,14 @@ def test_gni_lagrange_top():
     got = np.array(VALUE(lanes, np.full(len(NAMES), 30.0)))[:, 0]
     want = [0.9599571778198639, -0.36416972569944916, 0.4]
     assert np.abs(got[:3] * moments - want).max() < 1e-13
-    wxyz = np.array([
-        -0.43556098558439443, -0.3700636549040742, 0.26480479131047296, -0.7766710639999446,
-    ])  # fmt: skip
+    wxyz = np.array(
+        [
+            -0.43556098558439443,
+            -0.3700636549040742,
+            0.26480479131047296,
+            -0.7766710639999446,
+        ]
+    )
     assert np.abs(got[3:] * np.sign(got[3:] @ wxyz) - wxyz).max() < 1e-13
 
 

@@ -21,9 +21,17 @@ def _steady():
     theta, b = math.pi / 3, 3.0
     rate = b - math.sqrt(b * b - 2)
     return (
-        1.0, 0.5, 1.0, -rate * math.sin(theta), 0.0, 2 * b,
-        math.cos(theta / 2), 0.0, math.sin(theta / 2), 0.0,
-    )  # fmt: skip
+        1.0,
+        0.5,
+        1.0,
+        -rate * math.sin(theta),
+        0.0,
+        2 * b,
+        math.cos(theta / 2),
+        0.0,
+        math.sin(theta / 2),
+        0.0,
+    )
 
 
 def _separatrix():

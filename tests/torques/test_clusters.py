@@ -23,11 +23,13 @@ def law(t, wxyz, omega_body):
 
 def matrix(q):
     a, b, c, d = q / np.linalg.norm(q)
-    return np.array([
-        [1 - 2 * (c * c + d * d), 2 * (b * c - a * d), 2 * (b * d + a * c)],
-        [2 * (b * c + a * d), 1 - 2 * (b * b + d * d), 2 * (c * d - a * b)],
-        [2 * (b * d - a * c), 2 * (c * d + a * b), 1 - 2 * (b * b + c * c)],
-    ])  # fmt: skip
+    return np.array(
+        [
+            [1 - 2 * (c * c + d * d), 2 * (b * c - a * d), 2 * (b * d + a * c)],
+            [2 * (b * c + a * d), 1 - 2 * (b * b + d * d), 2 * (c * d - a * b)],
+            [2 * (b * d - a * c), 2 * (c * d + a * b), 1 - 2 * (b * b + c * c)],
+        ]
+    )
 
 
 def torques_of(rotors, speeds, wxyz, omega):
@@ -75,8 +77,9 @@ def test_dumping_is_normal_to_the_field_and_limited():
     unload, h = ph.MomentumDumping(K, FIELD), np.array([0.3, -0.2, 0.1])
     omega = components(jnp.zeros(3))
     assert not np.any(np.stack(unload.body_components(0.0, STILL, omega)))  # no wheels
-    found = np.stack(unload.with_wheels(components(jnp.asarray(h))).body_components(
-        0.0, STILL, omega))  # fmt: skip
+    found = np.stack(
+        unload.with_wheels(components(jnp.asarray(h))).body_components(0.0, STILL, omega)
+    )
     normal = h - FIELD * (FIELD @ h) / (FIELD @ FIELD)
     np.testing.assert_allclose(found, -K * normal, rtol=1e-12)
     limited = ph.MomentumDumping(K, FIELD, max_moment=1e-3).with_wheels(components(jnp.asarray(h)))
@@ -125,14 +128,21 @@ def test_dumping_in_pulses_is_that_between_two_parts_without_it():
 def test_a_controlled_satellite_is_that_of_scipy():
     """Cluster with null motion and limits, dumping and a gyroscope, integrated by hand."""
     wheels = ph.wheel_cluster(
-        CORNERS, J, law, speed=SPEEDS, max_torque=LIMIT, null_gain=NULL, bias=BIAS,
+        CORNERS,
+        J,
+        law,
+        speed=SPEEDS,
+        max_torque=LIMIT,
+        null_gain=NULL,
+        bias=BIAS,
         friction=ph.ViscousCoupling(1e-3),
-    )  # fmt: skip
+    )
     gyro = ph.ControlMomentGyro(0.2, [0, 0, 1.0], [1.0, 0, 0], lambda t: 0.3 * jnp.sin(t))
     torque = ph.MomentumDumping(K, FIELD) + gyro
     scene = ph.Scene(ph.Inertia.from_moments(MOMENTS), torque=torque, rotors=wheels)
-    traj = ph.simulate(scene, ph.State(*START), [0.0, 4.0, 8.0], rtol=1e-9,
-                       record=ph.Record(work=True))  # fmt: skip
+    traj = ph.simulate(
+        scene, ph.State(*START), [0.0, 4.0, 8.0], rtol=1e-9, record=ph.Record(work=True)
+    )
     share = np.linalg.pinv(CORNERS.T)
     null = np.eye(4) - share @ CORNERS.T
 

@@ -97,8 +97,12 @@ def test_a_ring_against_newton_in_every_chart():
         rate = np.linalg.solve(carrier, total - own * axis)
         a, b, g = rate / 2
         w, x, v, z = wxyz
-        turn = [-x * a - v * b - z * g, w * a + v * g - z * b, w * b + z * a - x * g,
-                w * g + x * b - v * a]  # fmt: skip
+        turn = [
+            -x * a - v * b - z * g,
+            w * a + v * g - z * b,
+            w * b + z * a - x * g,
+            w * g + x * b - v * a,
+        ]
         return [*turn, *np.cross(total, rate), -c * (own / j - axis @ rate)]
 
     single = jax.tree.map(lambda x: x.astype(jnp.float32), (INSIDE["ring"], STATE))

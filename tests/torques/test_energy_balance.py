@@ -78,8 +78,13 @@ PARTS = {
     "pulses": {"torque": ph.Pulses(ph.BodyTorque([0.1, 0.2, -0.3]), [1.0, 3.0], [2.0, 4.0])},
 }
 PASSIVE = {
-    "uniform gravity", "gravity gradient", "potential", "momentum held", "speed held", "wheel free"
-}  # fmt: skip
+    "uniform gravity",
+    "gravity gradient",
+    "potential",
+    "momentum held",
+    "speed held",
+    "wheel free",
+}
 
 
 def growth(scene):

@@ -82,11 +82,13 @@ def newton(t, y, p, wheels):
     """d(wxyz, omega)/dt and d(wxyz, momentum)/dt of one body; complex numbers pass through."""
     w, x, v, z = y[:4] / np.sqrt(np.sum(y[:4] ** 2))
     rate = y[4:]
-    rows = np.array([
-        [1 - 2 * (v * v + z * z), 2 * (x * v - w * z), 2 * (x * z + w * v)],
-        [2 * (x * v + w * z), 1 - 2 * (x * x + z * z), 2 * (v * z - w * x)],
-        [2 * (x * z - w * v), 2 * (v * z + w * x), 1 - 2 * (x * x + v * v)],
-    ])  # fmt: skip
+    rows = np.array(
+        [
+            [1 - 2 * (v * v + z * z), 2 * (x * v - w * z), 2 * (x * z + w * v)],
+            [2 * (x * v + w * z), 1 - 2 * (x * x + z * z), 2 * (v * z - w * x)],
+            [2 * (x * z - w * v), 2 * (v * z + w * x), 1 - 2 * (x * x + v * v)],
+        ]
+    )
     moments = p["moments"]
     m, centre, field = p["weight"][0], p["weight"][1:4], p["weight"][4:]
     push = np.cross(centre, rows.T @ (m * field))

@@ -12,9 +12,23 @@ from mpmath import mp, mpf
 import polhode as ph
 
 ECCENTRICITIES = (
-    0.0, 1e-12, 1e-6, 1e-3, 0.1, 0.5, 0.9, 0.99, 0.999, 1 - 1e-4, 1 - 1e-6,
-    1 + 1e-6, 1 + 1e-4, 1.5, 5.0, 100.0,
-)  # fmt: skip
+    0.0,
+    1e-12,
+    1e-6,
+    1e-3,
+    0.1,
+    0.5,
+    0.9,
+    0.99,
+    0.999,
+    1 - 1e-4,
+    1 - 1e-6,
+    1 + 1e-6,
+    1 + 1e-4,
+    1.5,
+    5.0,
+    100.0,
+)
 DECADES = [10.0**k for k in range(-12, 3)]
 NEAR_PI = [np.nextafter(np.pi, 0), np.pi, np.nextafter(np.pi, 4), np.pi - 1e-9, np.pi + 1e-9]
 TURNS = [2 * np.pi, 2000 * np.pi + 1e-5, 6e4, 1e6, 1e9]

@@ -31,8 +31,16 @@ def test_an_orbit_by_place_and_velocity_is_the_same_one():
     for dtype, bound in ((jnp.float64, 2e-12), (jnp.float32, 2e-3)):
         e, tilt = (jnp.array(x, dtype) for x in ([0.0, 1e-9, 0.3, 0.95], [0.0, 1.0, jnp.pi, 0.4]))
         number = jnp.ones((), dtype)
-        elements = KeplerOrbit(1.7 * number, 1.3 * number, e, tilt, 0.3 * number, 1.1 * number,
-                               2.0 * number, 0.5 * number)  # fmt: skip
+        elements = KeplerOrbit(
+            1.7 * number,
+            1.3 * number,
+            e,
+            tilt,
+            0.3 * number,
+            1.1 * number,
+            2.0 * number,
+            0.5 * number,
+        )
         t0 = 4.0 * number
         velocity = jax.jacfwd(elements)(t0)
         by_state = KeplerOrbit.from_state(1.7 * number, elements(t0), velocity, t0)

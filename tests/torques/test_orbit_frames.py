@@ -20,10 +20,14 @@ def two_bodies(position, velocity, times):
 
     start = np.concatenate([position, velocity])
     scale = 1e-13 * np.repeat([np.linalg.norm(position), np.linalg.norm(velocity)], 3)
-    return np.array([
-        solve_ivp(field, (0, t), start, "DOP853", rtol=1e-13, atol=scale).y[:, -1] if t else start
-        for t in times
-    ])  # fmt: skip
+    return np.array(
+        [
+            solve_ivp(field, (0, t), start, "DOP853", rtol=1e-13, atol=scale).y[:, -1]
+            if t
+            else start
+            for t in times
+        ]
+    )
 
 
 @pytest.mark.parametrize("excess", [1.01, 1.5, 8.0])  # speed at periapsis over the circular one
@@ -106,7 +110,7 @@ JEOD_WXYZ = [
     [0.4134526073152647, 0.4134526073152648, 0.5736348503222319, -0.573634850322232],
     [0.3853120598769757, 0.3853120598769757, 0.5929035473948203, -0.5929035473948203],
 ]
-JEOD_PITCH_RATE = [-0.1, -0.06896551724137931, -0.01, -0.001030927835051546]  # fmt: skip
+JEOD_PITCH_RATE = [-0.1, -0.06896551724137931, -0.01, -0.001030927835051546]
 
 
 def test_the_frame_of_nasas_jeod():
@@ -114,16 +118,19 @@ def test_the_frame_of_nasas_jeod():
     yaw, pitch and roll of (0, -11.6, 0) degrees at rest to the frame of a circular orbit."""
     times = jnp.array([0.0, 1.0, 10.0, 40.0])
     line = ph.LVLH(lambda t: jnp.stack([10 + 2 * t, t, 0 * t]))
-    gap = ph.rotation.angle_between(line.attitude(times),
-                                    ph.rotation.conjugate(jnp.array(JEOD_WXYZ)))  # fmt: skip
+    gap = ph.rotation.angle_between(
+        line.attitude(times), ph.rotation.conjugate(jnp.array(JEOD_WXYZ))
+    )
     np.testing.assert_allclose(gap, 0, atol=1e-15)
     rates = np.array([[0.0, x, 0.0] for x in JEOD_PITCH_RATE])
     np.testing.assert_allclose(line.omega(times), rates, rtol=1e-15)
 
     place, speed = [-4292653.41, 955168.47, 5139356.57], [109.649663, -7527.72649, 1484.521489]
-    to_body = [[0.1412307175854335, -0.9892782736897275, 0.03718039289432368],
-               [-0.772691975098125, -0.1336331223242703, -0.6205556383087864],
-               [0.6188707425862547, 0.05891252687959725, -0.7832804849780175]]  # fmt: skip
+    to_body = [
+        [0.1412307175854335, -0.9892782736897275, 0.03718039289432368],
+        [-0.772691975098125, -0.1336331223242703, -0.6205556383087864],
+        [0.6188707425862547, 0.05891252687959725, -0.7832804849780175],
+    ]
     frame = ph.LVLH(ph.KeplerOrbit.from_state(3.986004415e14, place, speed))
     pitched = ph.rotation.euler_to_wxyz(
         0.0, np.deg2rad(-11.6), 0.0, sequence=ph.rotation.Sequence.ZYX
@@ -149,8 +156,9 @@ def test_damping_against_the_frame_brings_a_body_to_its_rate():
     n = np.sqrt(MU / np.array([7e6, 8e6]) ** 3)
     start, _ = frame.from_frame([1.0, 0, 0, 0], [0.0, 0, 0], 0.0)
     damping = ph.LinearDamping(0.01)
-    scene = ph.Scene(ph.Inertia.from_moments([2.0, 2.0, 2.0]), None,
-                     ph.RelativeTorque(damping, frame))  # fmt: skip
+    scene = ph.Scene(
+        ph.Inertia.from_moments([2.0, 2.0, 2.0]), None, ph.RelativeTorque(damping, frame)
+    )
     ts = jnp.linspace(0.0, 1000.0, 6)
     traj = ph.simulate(scene, ph.State(start, jnp.zeros((2, 3))), ts, rtol=1e-12)
     rate = -n[:, None] * (1 - np.exp(-0.01 * np.asarray(ts) / 2))

@@ -125,8 +125,11 @@ def test_tables_that_are_none_are_refused(given, match):
 
 def test_plates_that_are_none_are_refused():
     faces = ph.Plates(AREAS, NORMALS, CENTRES)
-    for wrong in ((-AREAS, NORMALS, CENTRES), (AREAS, 0 * NORMALS, CENTRES),
-                  (AREAS[:2], NORMALS, CENTRES)):  # fmt: skip
+    for wrong in (
+        (-AREAS, NORMALS, CENTRES),
+        (AREAS, 0 * NORMALS, CENTRES),
+        (AREAS[:2], NORMALS, CENTRES),
+    ):
         with pytest.raises(ValueError, match="Plates"):
             ph.Plates(*wrong)
     with pytest.raises(TypeError, match="Plates"):
@@ -139,11 +142,13 @@ def test_plates_that_are_none_are_refused():
 
 def matrix(q):
     a, b, c, d = q / np.linalg.norm(q)
-    return np.array([
-        [1 - 2 * (c * c + d * d), 2 * (b * c - a * d), 2 * (b * d + a * c)],
-        [2 * (b * c + a * d), 1 - 2 * (b * b + d * d), 2 * (c * d - a * b)],
-        [2 * (b * d - a * c), 2 * (c * d + a * b), 1 - 2 * (b * b + c * c)],
-    ])  # fmt: skip
+    return np.array(
+        [
+            [1 - 2 * (c * c + d * d), 2 * (b * c - a * d), 2 * (b * d + a * c)],
+            [2 * (b * c + a * d), 1 - 2 * (b * b + d * d), 2 * (c * d - a * b)],
+            [2 * (b * d - a * c), 2 * (c * d + a * b), 1 - 2 * (b * b + c * c)],
+        ]
+    )
 
 
 def lit_by_hand(t):

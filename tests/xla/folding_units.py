@@ -55,7 +55,9 @@ UNITS = {
     "a known truth": (lambda b: b | True, X > 1),
     "nothing": (_nothing, X),
     "nothing in a loop": (
-        lambda a, b: jax.lax.fori_loop(0, 3, lambda i, c: c + _nothing(b), a), X, Y,
+        lambda a, b: jax.lax.fori_loop(0, 3, lambda i, c: c + _nothing(b), a),
+        X,
+        Y,
     ),
     "arrays without entries": (lambda a, b: (a + 1, b * 2), X, NOTHING),
     "only arrays without entries": (lambda b: b * 2, NOTHING),
@@ -67,11 +69,14 @@ UNITS = {
     "a branch known": (lambda a, b: jax.lax.cond(True, lambda a, b: a, lambda a, b: b, a, b), X, Y),
     "branches of nothing": (
         lambda a, b, n: jax.lax.switch(n[1], [lambda a, b: a * 0, lambda a, b: b * 0], a, b),
-        X, Y, N,
+        X,
+        Y,
+        N,
     ),
     "a wide sum": (lambda a: jax.lax.fori_loop(0, 3, lambda i, c: c + jnp.sum(c) * 1e-7, a), WIDE),
     "a wide maximum": (
-        lambda a: jax.lax.fori_loop(0, 3, lambda i, c: c + jnp.max(c) * 1e-7, a), WIDE,
+        lambda a: jax.lax.fori_loop(0, 3, lambda i, c: c + jnp.max(c) * 1e-7, a),
+        WIDE,
     ),
     "a power of 0": (lambda a: a**0, X),
     "complex numbers": (lambda a: (a * 0).real, X + 1j),
@@ -85,7 +90,7 @@ UNITS = {
     "a product of matrices": (lambda a, b: jnp.outer(a, b) @ b, X, Y),
     "its own reverse rule": (_odd_vjp, X),
     "its own forward rule": (_odd_jvp, X),
-}  # fmt: skip
+}
 
 
 def _sum(tree):

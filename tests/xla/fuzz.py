@@ -177,9 +177,8 @@ def _special(rng, f, g):
 _MADE = {
     name.removeprefix("_leaf").strip("_"): make
     for name, make in list(globals().items())
-    if callable(make) and name.startswith("_")
-    and getattr(make, "__module__", None) == __name__
-}  # fmt: skip
+    if callable(make) and name.startswith("_") and getattr(make, "__module__", None) == __name__
+}
 _LEAVES = sum("_leaf" in make.__name__ for make in _MADE.values())
 KINDS = ("body torque", "space torque", "feedback", "potential", "rotor", "orbit", "spun drag")
 
@@ -232,10 +231,13 @@ def run(kind, functions, way):
     def end(scale, omega):
         state = ph.State(wxyz, omega)
         found = ph.simulate(
-            scene(kind, functions, scale), state, [0.0, 0.3],
-            ph.LiePoisson() if way == "stock" else None, rtol=1e-3,
+            scene(kind, functions, scale),
+            state,
+            [0.0, 0.3],
+            ph.LiePoisson() if way == "stock" else None,
+            rtol=1e-3,
             record=ph.Record(final_only=True),
-        )  # fmt: skip
+        )
         return found.wxyz[..., 0, :], found.omega_body[..., 0, :]
 
     def total(scale, omega):
@@ -365,9 +367,11 @@ def hunt(count, seed, *, each=200, patience=120, plain=False):
             command = [sys.executable, __file__, "--child", seed, start, stop, log]
             try:
                 ran = subprocess.run(
-                    [*map(str, command)], env=environment, capture_output=True,
+                    [*map(str, command)],
+                    env=environment,
+                    capture_output=True,
                     timeout=patience * (stop - start),
-                )  # fmt: skip
+                )
                 how = f"ENDED {ran.returncode}"
             except subprocess.TimeoutExpired:
                 how = "STUCK"
@@ -393,8 +397,10 @@ def main():
         ran, refused, largest, ends = hunt_units(int(sys.argv[2]), seed)
         for end in ends:
             print(*end)
-        print(f"{ran} combinations of marked functions ({refused} refused), {len(ends)} processes"
-              f" ended; largest difference to the plain functions {largest:.1e}")  # fmt: skip
+        print(
+            f"{ran} combinations of marked functions ({refused} refused), {len(ends)} processes"
+            f" ended; largest difference to the plain functions {largest:.1e}"
+        )
         return int(bool(ends))
     count, seed = int(sys.argv[1]), int(sys.argv[2]) if len(sys.argv) > 2 else 0
     found = hunt(count, seed)
@@ -405,8 +411,10 @@ def main():
             print(f"case {case}, {kind}, {way}: {verdict}\n    {words}")
     ended = sum(v.startswith(("ENDED", "STUCK")) for v in found.values())
     heads = [v.split()[0] for v in found.values()]
-    print(f"{len(found)} combinations, {ended} ended the process;",
-          {head: heads.count(head) for head in sorted(set(heads))})  # fmt: skip
+    print(
+        f"{len(found)} combinations, {ended} ended the process;",
+        {head: heads.count(head) for head in sorted(set(heads))},
+    )
     return int(ended > 0)
 
 

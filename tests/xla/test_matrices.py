@@ -65,8 +65,9 @@ def test_values_are_those_of_numpy(affected, dtype):
     bound = 300 * np.finfo(dtype).eps
     given, right = SPD.astype(dtype), BATCH[..., 0].astype(dtype)
     values, axes = matrices.eigh(given)
-    np.testing.assert_allclose(axes * values[..., None, :] @ np.swapaxes(axes, -1, -2), given,
-                               atol=bound)  # fmt: skip
+    np.testing.assert_allclose(
+        axes * values[..., None, :] @ np.swapaxes(axes, -1, -2), given, atol=bound
+    )
     left, sizes, other = matrices.svd(given)
     np.testing.assert_allclose(left * sizes[..., None, :] @ other, given, atol=bound)
     want = np.linalg.solve(SPD, BATCH[..., :1])[..., 0]

@@ -22,8 +22,10 @@ def test_units_that_fold_away():
     """In a process of its own; `folding_units.py each` names the unit that ends it."""
     ran = subprocess.run(
         [sys.executable, HERE / "folding_units.py"],
-        capture_output=True, text=True, timeout=600,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
     assert ran.returncode == 0, ran.stdout[-500:] + ran.stderr[-2000:]
     lines = dict(line.rsplit(": ", 1) for line in ran.stdout.splitlines())
     assert len(lines) > 250
