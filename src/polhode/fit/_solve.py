@@ -324,12 +324,12 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
     weight = _weight(recording, rates)
     solver = options.solver or LevenbergMarquardt(_OFFSET, float(jnp.finfo(dtype).eps) ** 0.75)
     expected = _expected_square_sum(recording, options)
+    count = _data_count(recording)
     # of one residual: 1 where the noise is known
-    noise = jnp.sqrt(expected / _data_count(recording))
+    noise = jnp.sqrt(expected / count)
     noise = jnp.where(jnp.isfinite(noise), noise, 0.1 / weight)
 
     layout = unknowns(first_parameters, model_of(jax.tree.map(lambda leaf: leaf[0], bases)))
-    count = _data_count(recording)
     trusted = noise_is_trusted(options)
 
     @jax.jit
@@ -467,7 +467,8 @@ def _sensor_start(
 
 def _data_count(recording: Recording) -> Float[Array, ""]:
     """How many numbers were measured."""
-    return size_of_data(recording, 3 * _channel_count(recording))
+    channels = (recording.omega, recording.wxyz, recording.force)
+    return size_of_data(recording, 3 * sum(channel is not None for channel in channels))
 
 
 def _sequence_of_fits(bases: int, attempts: int) -> dict[str, np.ndarray]:
@@ -484,11 +485,6 @@ def misfit_of(linear: Linear, robust: Huber | None) -> Float[Array, ""]:
     """The sum of squares that is to be compared with the noise: an outlier counts as its bound."""
     square = linear.residuals**2
     return jnp.sum(square if robust is None else jnp.minimum(square, robust.threshold**2))
-
-
-def _channel_count(recording: Recording) -> int:
-    """How many of rates, attitudes and forces there are."""
-    return sum(part is not None for part in (recording.omega, recording.wxyz, recording.force))
 
 
 def _expected_square_sum(recording: Recording, options: FitOptions) -> Float[Array, ""]:
