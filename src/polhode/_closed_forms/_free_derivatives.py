@@ -61,6 +61,8 @@ def _with_formula_derivative_rule(formula, primals, tangents):
 
 def _start_formula(polhode: Polhode, arguments):
     """Plain formulas of the constants in ``start_of``."""
+    # Plain: differences of moments and momenta, no branch. Their values would lose digits near
+    # symmetric bodies, which is why `start_of` has others; their derivatives are exact everywhere.
     frame = Frame(polhode)
     moments, omega = arguments
     rate_unit = jnp.where(polhode.rate_unit > 0, polhode.rate_unit, 1)
@@ -134,6 +136,8 @@ def _functions_rule(has_time_axis, primals, tangents):
     value = with_functions_derivative(has_time_axis, value, constants, x, z, t)
     polhode, half_turns = constants
     S, C, N, first, second = value
+    # y = A p has the derivative of x - z: z carries its own, exact where it vanishes (separatrix).
+    # S' = C N, C' = -x S N, N' = -y S C in the time, and `partials` are those by the coefficients.
     y = with_formula_derivative(_difference_formula, polhode.A * polhode.p, (), (x, z))
     dS, dC, dN = partials(x, y, (S, C, N), first, second).along(dx, dz)
     dS, dC, dN = dS + C * N * dt, dC - x * S * N * dt, dN - y * S * C * dt
@@ -143,6 +147,9 @@ def _functions_rule(has_time_axis, primals, tangents):
         (sign * S, sign * C, N),
         (sign * dS, sign * dC, dN),
     )
+    # Integrals grow by those of a quarter of a turn, twice with each half turn. The incomplete part
+    # and the complete one have derivatives of their own; together they are smooth where the number
+    # of half turns changes.
     _, turn = jax.jvp(
         functools.partial(_quarter_formula, polhode.circular, polhode.on_separatrix),
         (x, z),
@@ -172,6 +179,8 @@ def along_turning_axes(arguments, dm, dp, dw):
     none = tuple(jnp.zeros_like(x) for x in products)
     turn = with_formula_derivative(_axes_turn, none, (), (moments, products))
 
+    # Axes along which the products stay zero turn with the tensor. What is differentiated then
+    # depends on moments alone, as the closed form does, and the vectors are turned back.
     def along(v):
         return None if v is None else tuple(a - b for a, b in zip(v, cross(turn, v), strict=True))
 
@@ -195,6 +204,8 @@ def along_turning_axes(arguments, dm, dp, dw):
 
 def variation_at_rest(at_rest, arguments, dw, dt) -> tuple[Triple, Triple]:
     """Variations of rates and attitude of a body at rest, to second order in the rates."""
+    # The closed form divides by the size of the momentum. At rest Euler's equations are expanded
+    # instead: to second order, because this variation is differentiated once more for Hessians.
     (i1, i2, i3), _, omega, _, t = arguments
     w1, w2, w3 = w = triple(jnp.where(at_rest, x, 0) for x in omega)
     zero = jnp.zeros_like(t * i1)
@@ -293,6 +304,10 @@ def _turn_tangent(
     t,
 ):
     """Variation of the attitude: a rotation vector along axes 1, 2, 3 at time t."""
+    # Across L it follows from the conservation of L in space: the direction of L seen from the body
+    # must move as the momentum in the body does (`momentum_lag`). About L it is the variation of
+    # the energy times t and one integral along the motion, of L L with the variation of the inverse
+    # tensor: the precession angle itself, an integral of the third kind, is not differentiated.
     sigma_pi = polhode.sense * polhode.parity
     invariants = Invariants(polhode.momentum, polhode.p, polhode.r, polhode.s, polhode.A, polhode.B)
     scalar, vector = relative

@@ -160,6 +160,9 @@ def curve(square: Array, one: Array) -> Curve:
 
 @curve.defjvp
 def _curve_rule(primals, tangents):
+    # Everything on the curve is a function of one number: its derivatives are computed once, and a
+    # tangent is a product. Differentiated as usual the recurrences would stand in the program again
+    # for every tangent.
     square, one = primals
     _, derivatives = jax.jvp(_curve, (square,), (jnp.ones_like(square),))
     return curve(*primals), jax.tree.map(
@@ -212,6 +215,7 @@ def pair(
 
 @pair.defjvp
 def _pair_rule(primals, tangents):
+    # By the sum and by h: the product of a and b is a function of h.
     total, times, h_derivative, series, one = primals
     unit, zeros = jnp.ones_like(total), jnp.zeros_like(times)
     _, by_total = jax.jvp(lambda s: _pair(s, times, series.weights), (total,), (unit,))
@@ -269,6 +273,8 @@ def _descend(e: Complex, partner: Complex, c: Curve, one: Array) -> Complex:
     ``e`` and ``partner`` are those of n = 1. The last level, where the square is below 1e-20, is
     summed in closed form, so that e may be large.
     """
+    # From the last level up: each takes the square root of what lies below it. These roots stay on
+    # the principal branch, which a root of the product of all levels would leave.
     *levels, (_, _, roots) = _levels(e, partner, c, one)
     total = (1 + roots[1]) * (1 + roots[0]).inverse
     total = staged((levels[1][2] * (total * total)).root, one)

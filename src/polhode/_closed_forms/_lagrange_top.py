@@ -155,6 +155,9 @@ def lagrange_motion(
     ``_long_motion``; ``short_motion`` replaces it where the body hardly moves in that time, and
     ``with_weight`` gives the derivatives by a force that is zero.
     """
+    # Two motions are beyond the closed form: its constants for a body that hardly moves are
+    # quotients of rounding errors, and without weight its derivatives by the weight are 0/0. Both
+    # have plain formulas, which are evaluated only if a body of the batch needs them.
     arguments: tuple[Any, ...] = transverse, force_space, distance, wxyz, omega, axial_momentum
     constants = jax.lax.stop_gradient((transverse, force_space, distance, omega, axial_momentum))
     angle = momentum_frequency(*constants)[:, None] * jnp.abs(jax.lax.stop_gradient(elapsed))
@@ -211,6 +214,8 @@ def _long_motion(transverse, force_space, distance, wxyz, omega, axial_momentum,
     wxyz, omega = staged((tuple(wxyz[..., i] for i in range(4)), components(omega)), one)
     tilt, force_component = staged(upward(components(force_space)), one)
     inverse_tilt = (tilt[0], -tilt[1], -tilt[2])
+    # In axes along the force the motion is that of the textbook. As spinors (Cayley-Klein) instead
+    # of angles it has no pole where the body stands upright.
     q, spin = staged(_times_tilt(inverse_tilt, wxyz), one), omega[2]
     momentum = (transverse * omega[0], transverse * omega[1], axial_momentum)
     spinor = Complex(q[0], q[3]), Complex(q[2], q[1])
@@ -274,6 +279,9 @@ def short_motion(
         ),
     )
 
+    # One Runge-Kutta step of order 4, in space axes and without the rotation about the axis of
+    # symmetry, which is exact and added at the end: the fast spin of a top would shorten the time
+    # for which the step is exact to rounding.
     def field(q, rate):
         w, x, y, z = (q[..., i] for i in range(4))
         a, b, c = (rate[..., i] for i in range(3))
@@ -328,6 +336,9 @@ def with_weight(
         jnp.cross(v, weight)[:, None] for v in (axis, n_cross_axis, jnp.cross(n, n_cross_axis))
     )
 
+    # First order in the weight, about a motion without it (n: direction of L): the torque is a sum
+    # of a constant, a cosine and a sine of x, and its integrals are closed. Differences such as
+    # 1 - cos x are written without cancellation, as x may be small.
     # functions of x whose derivative is the one before; p: convolutions of them with sin and x
     x = (size * elapsed)[..., None]
     sine, cosine = jnp.sin(x), jnp.cos(x)

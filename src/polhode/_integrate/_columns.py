@@ -145,6 +145,8 @@ def extrapolated(
     need every other point only. ``start_rates``: rates of ``y``. ``t`` and ``width`` are numbers,
     or one each for every entry of the arrays. ``compensated``: changes are summed, not states.
     """
+    # Changes instead of states: their rounding is relative to the change of one step, not to the
+    # state. Costs an addition in every substep, and is only used where `rtol` is near rounding.
     origin = [jnp.zeros_like(x) for x in y] if compensated else y
 
     def place(a):
@@ -162,12 +164,16 @@ def extrapolated(
             f, _ = rates(time + h, place(a), False)
             return a, _plus(b, step, f), sums
 
+        # Leapfrog over a and b by turns, started by an Euler step. Gragg's smoothing of the end is
+        # left out: columns end at an even point, whose expansion has even powers without it.
         b = _plus(origin, [x / 2 for x in step], start_rates)
         start = origin, b, [jnp.zeros_like(x) for x in integrals]
         a, b, sums = jax.lax.fori_loop(0, n.astype(jnp.int32) // 2 - 1, pair, start)
         f, g = rates(t + (width - h), place(b), True)
         return _plus(a, step, f), _plus(sums, [step[0]] * len(g), g)
 
+    # The column with most substeps is the base, and the others enter by their differences to it:
+    # large weights then multiply small numbers, and amplify rounding less.
     def add(j, carry):
         base, (result, sums), difference, lower_difference = carry
         count, *shares = (

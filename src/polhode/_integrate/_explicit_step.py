@@ -109,6 +109,9 @@ def attempt_step(
             new_levels = jnp.where(i == 0, turn, new_levels)
         return stages, margins, new_levels
 
+    # The second phase runs only where it is needed, and the first one skips the stage that the
+    # previous step has left: the bounds of the inner loop decide both. A `cond` around a second
+    # loop would put the field into the program twice.
     def phase(number, carry):
         *stage_carry, depths, inside = carry
         dense_end = jnp.where(inside, rule.dense_stages, rule.stages)
@@ -116,6 +119,8 @@ def attempt_step(
         begin = jnp.where(number == 0, first_stage, rule.stages)
         end = jnp.where(number == 0, rule.stages, dense_end)
         stage_carry = jax.lax.fori_loop(begin, end, stage, tuple(stage_carry))
+        # Margins are known at the stages anyhow. Whether the dense output is needed to locate a
+        # switch is seen from them, before it is paid for.
         if events:
             depths = jnp.where(
                 number == 0, _depths(margin_samples(stage_carry[1], rule), rule), depths
@@ -148,6 +153,8 @@ def dense_of(h: Array, stages: Array, rule: Tableau) -> Array:
 
 def dense_state(y: Array, dense: Array, x: Array) -> Array:
     """States (D, B) at the fractions ``x`` (B,) of a step from ``y``."""
+    # Nested as x (a + (1 - x) (b + x (c + ...))): exact at both ends, where every factor beyond
+    # the first vanishes. In powers of x the ends would carry the rounding of all terms.
     total, x = jnp.zeros_like(y), x[None]
     complement = 1 - x
     for k in range(dense.shape[0] - 1, -1, -1):
@@ -157,6 +164,8 @@ def dense_state(y: Array, dense: Array, x: Array) -> Array:
 
 def margin_samples(margins: Array, rule: Tableau) -> Array:
     """Margins (M, K, B) in order of time; a switch that has just turned starts at zero."""
+    # The stages of a rule do not stand in order of time, and some lie so close together, or so far
+    # off the solution, that they tell nothing more: the tableau names those that are looked at.
     sampled = jnp.stack([margins[k] for k in rule.margin_stages])
     return jnp.concatenate([jnp.maximum(sampled[:1], 0), sampled[1:]])
 
@@ -164,6 +173,9 @@ def margin_samples(margins: Array, rule: Tableau) -> Array:
 def _depths(sampled: Array, rule: Tableau) -> Array:
     """Minimum of the parabola through three neighbouring margins (M - 2, K, B), relative to the
     least of the three; 1 where it does not lie between them."""
+    # A margin that dips below zero and returns between two stages shows in the parabola through
+    # its neighbours only. Sampling more densely instead would cost an evaluation for each sample;
+    # the parabolas cost none, and the search confirms a dip before it counts.
     x = np.array(rule.margin_nodes)
     inverse = 1 / np.diff(x)
 

@@ -52,6 +52,9 @@ def collocate(terms, t0, t1, nodes, y1, args, order: int) -> dict:
     Each series starts from the cubic of the end values and slopes; ``order`` Picard sweeps
     y <- y0 + int f(y) dt on ``order + 2`` nodes gain an order each. End values stay as given.
     """
+    # The midpoint rule leaves no stages from which its order could be had between the substeps.
+    # Picard iteration evaluates at new places instead, and only if someone asks for states within a
+    # step: otherwise the compiler removes it.
     x, matrix, series = _tables(order + 2)
     count = jax.tree.leaves(nodes)[0].shape[0]
     ends = jax.tree.map(lambda y, end: jnp.concatenate([y[1:], end[None]]), nodes, y1)
@@ -262,6 +265,8 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         first of the controller's times to the last, that finds the states at all of them: the
         ``rows`` (n, T + 1, C) of its own state are C components of n bodies."""
         leaves, times = jax.tree.leaves(state.y), controller.ts
+        # A step of diffrax for each saved time would make every body wait at each of them; in one
+        # step for all times a body that has reached one goes on.
         if self.accuracy is None or jnp.ndim(leaves[0]) != 1 or times.shape[0] == 2:
             return self, controller, state
         dtype = jnp.result_type(*leaves)
@@ -276,6 +281,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
         """As many as the error asked for needs."""
         y, tree = jax.tree.flatten(y0)
         dtype = jnp.result_type(*y)
+        # traced once, and taken apart into what is computed before the steps and in each of them
         problem = BoundTerm.of(terms, args).prepare(t0, y0, dtype)
         rtol = jnp.asarray(accuracy.rtol, dtype)
         elapsed = None if accuracy.times is None else accuracy.times - t0
@@ -333,6 +339,8 @@ def order_for(rtol: Array, angle: Array | float = jnp.inf) -> Array:
     (0.27 p - 0.3) rtol^(1 / (p + 1)) rad in the mean with order p from 6 to 14. Nine tenths of that
     cost least at 100 times in 10 to 30 s: three fifths up to a sixth more, 1.2 up to a third more.
     """
+    # Four bounds are enough for the order: a model of the work would have to know the motion, and
+    # gains a tenth at most.
     best = 10
     if jnp.finfo(rtol.dtype).eps < 1e-9:
         best = 8 + 2 * sum(jnp.where(rtol < bound, 1, 0) for bound in (1e-3, 1e-4, 1e-5, 1e-10))

@@ -62,6 +62,8 @@ class AnyCostate(NamedTuple):
             k = sum(a * f for a, f in zip(slopes, rate))
             return jnp.sum(k), (rate, k)
 
+        # the state goes back with its slopes: a stored path would need memory for every step, and
+        # its interpolation would limit the accuracy
         change, (rate, k) = jax.grad(pairing, has_aux=True)(list(y))
         return [*rate, *(-x for x in change)], k
 
@@ -70,6 +72,8 @@ class AnyCostate(NamedTuple):
 
     def units(self, state_units, z, rates):
         half = len(z) // 2
+        # Slopes are measured in the inverse units of what they belong to. They may grow by orders
+        # of magnitude on the way, so that their errors are relative to their present size.
         weights, rate = state_units(z[:half], rates[:half])
         dual = [jnp.where(w > 0, 1 / jnp.where(w > 0, w, 1), 0) for w in weights]
         return [*weights, *relative(dual, z[half:], rates[half:], rate)], rate
@@ -243,6 +247,8 @@ class Equations:
         return self.costate.at(*self._parts(c)[1:3], t, z)
 
     def follow(self, c, y, t0, t1, horizon, end, parts: int):
+        # Backwards, a contracting motion expands: over its whole length the state would be lost.
+        # Nodes on the way are computed first, and each part goes back from its own end.
         if parts == 1:
             return self._pinned(c, y, t0, t1, horizon, end)
         stop_gradient = jax.lax.stop_gradient
@@ -283,6 +289,8 @@ class Equations:
 
     def _end_tangents(self, operands, tangents, end):
         """Change of the end for changes of the start, of both times and of the arguments."""
+        # Times need no integration: the end moves along its rates with t1, and against those of
+        # the start with t0.
         (t0, t1, _), inputs = operands[:3], operands[3:]
         dt0, dt1, _ = tangents[:3]
         y, c = inputs[: self.size], inputs[self.size :]
@@ -352,7 +360,10 @@ class Equations:
                 ).coefficients
             )
 
-        # components of what is differentiated are fewer than what folding makes of them
+        # Each coefficient of the loop that depends on what is differentiated is one more integral
+        # to carry along. Folding makes products of them, which are more numerous than the numbers
+        # themselves, so the field is first taken apart without arithmetic. Only if some of these
+        # are not of the shape of the lanes is it folded after all.
         parameters, lane = [c[i] for i in at], end[0].shape
         for fold in (False, True):
             coefficients, run, broadcast_shapes, _ = specialise(
@@ -385,6 +396,8 @@ class Equations:
             slopes, rates = jax.grad(pairing, argnums=argnums, has_aux=True)(*wide)
             return [*rates, *(-x for x in slopes)]
 
+        # The midpoint rule needs the integrands at every other point only (`Rates`): a field that
+        # leaves them out is a second program in the loop, and half the work of the integrals.
         with_integrals, without_integrals = (
             specialise(
                 jax.make_jaxpr(partial(adjoint, along=b))(*coefficients, span[0], *z), coefficients

@@ -178,6 +178,8 @@ def advance(
     is_running = progress.outcome == RUNNING
     width, is_last = _width(progress, length, is_running, eps)
     t, h = start + sign * progress.elapsed, sign * width
+    # Three stages more (of order 8), evaluated only where a sample lies within the step or, in
+    # `attempt_step`, a switch comes near: a step without either costs what it does without both.
     needs_dense = is_running & (progress.place < ts.shape[0])
     needs_dense = needs_dense & (
         jnp.abs(column(ts, progress.place) - start) <= progress.elapsed + width
@@ -192,6 +194,10 @@ def advance(
     end = dense_state(progress.y, attempt.dense, jnp.ones_like(width))
     turn = None
     if motion.switches:
+        # At the first step, and where another switch has just turned, a level may be that of the
+        # wrong side already at the start: one comparison moves another one's argument, or rounding
+        # decides. The step is then repeated with the level turned, without moving on. A switch that
+        # has just turned itself stands at its root, where the sign of its margin is rounding.
         wrong_levels = (
             progress.needs_rates[None]
             & (attempt.margins[0] < 0)
@@ -208,6 +214,8 @@ def advance(
     elapsed = jnp.where(hit, progress.elapsed + part * width, elapsed)
     # of a step that a switch cuts the state is that of dense output, which is less accurate
     state_ratio = ratio * jnp.where(hit, motion.rule.dense_error, 1)
+    # Only the width is chosen by that larger error. Refusing such a step instead, to shorten it
+    # until dense output keeps the tolerance, would cost an attempt for every switch.
     size = jnp.log(jnp.clip(state_ratio, control.MIN_RATIO, 1e12))
     memory = jnp.where(accepted, control.MEMORY * progress.last_error, 0)
     factor = control.SAFETY * jnp.exp((memory - size) / motion.rule.order)
@@ -216,6 +224,9 @@ def advance(
     proposed = jnp.where(is_cut, jnp.maximum(progress.width, width * factor), width * factor)
     guess = stop_gradient(_first_width(motion, options, progress.y, attempt.stages[0], length))
     proposed = jnp.where(is_first, guess, proposed)
+    # With `x > 0` held, `where(x > 0, sqrt(x), 0)` is NaN beyond the switch, so that there is no
+    # root to search for. The step is shortened towards the switch instead, and turns it when it
+    # cannot come nearer ("snaps").
     undefined = None
     if motion.switches:
         undefined, share = undefined_side(attempt, ratio, is_running & ~is_first, motion.rule)
@@ -316,6 +327,8 @@ def _error_and_tolerance(motion, options, progress, attempt, width, length, eps)
         weighted_length(weights, list(attempt.h[None] * weighted(e, attempt.stages)))
         for e in rule.errors
     )
+    # Both estimates of DOP853 are far above the error of its result; their combination falls with
+    # the order of the result, so that the width is chosen by the right power.
     if lower_order_errors:  # of two estimates as in DOP853, of higher order than either
         combined_error = jnp.sqrt(
             error * error + 0.01 * lower_order_errors[0] * lower_order_errors[0]
@@ -345,6 +358,8 @@ def _save(
     def is_due(place):
         return (place < size) & (jnp.abs(column(ts, place) - start) <= elapsed)
 
+    # One sample of each body at a time. To evaluate all times of the whole motion by their step
+    # afterwards, as diffrax's dense output does, would need the stages of all steps in memory.
     def store_one(carry):
         place, samples = carry
         is_stored = is_due(place)
@@ -377,8 +392,12 @@ def _apply_switch(
     """Turn the switches that were met, and store events."""
     hit = turn.hit & accepted
     flips = turn.flips & hit[None]
+    # a body whose levels were wrong from the start has refused the step and goes on from there
     repaired = jnp.any(wrong_levels, axis=0) & (progress.outcome == RUNNING)
     is_at_start = turn.part <= turn.start_fraction
+    # A switch that turns back where it has just turned: once is chance, but at a sliding surface
+    # both sides push towards it and every step is shorter than the one before. Counted, to end
+    # with a status instead of with steps of rounding.
     is_reversal = hit & jnp.any(flips & (progress.just_turned > 0), axis=0) & is_at_start
     end_margins = attempt.margins[motion.rule.stages - 1]
     levels = jnp.where(flips, turn.levels, progress.levels)
@@ -413,12 +432,15 @@ def _apply_switch(
     is_at_motion_start = progress_after.elapsed <= 1e-6 * jnp.abs(
         width
     )  # an event at the start is not one of the motion
+    # An event costs one row of margins, whatever its kind: it is located by the search for
+    # switches, and only what happens at its root is different.
     for k in range(motion.events):
         row = motion.switches - motion.events + k
         rises = jnp.where(turn.levels[row] > 0, 1, -1) * sign
         is_event = flips[row] & ~is_at_motion_start
         if options.directions[k]:
             is_event = is_event & (rises == options.directions[k])
+        # lanes have no branches: every body writes, those without an event into the bin
         rows = base + jnp.where(is_event & (count < capacity), count, capacity)
         t = start + sign * progress_after.elapsed
         storage = storage._replace(

@@ -50,6 +50,8 @@ class Problem(NamedTuple):
         """``parts``: arrays of all bodies, ``is_lane``: a tree of which have a lane axis; ``y0``: a
         state, components (B,); ``watch(parts, t, y)``: values (E,) of events, of one body;
         ``located``: False: the switches are passed, and only counted."""
+        # An array that stands in several parts of the scene (an orbit in potential and torque) is
+        # one operand: otherwise what depends on it would be computed as often as it occurs.
         parts_and_lanes = jax.tree.map(_Marked, parts, is_lane)
         leaves, tree = jax.tree.flatten(parts_and_lanes, is_leaf=lambda x: isinstance(x, _Marked))
         arrays = [x.value for x in leaves if eqx.is_array(x.value)]
@@ -78,6 +80,8 @@ class Problem(NamedTuple):
                 return rates
             event_values = watch(parts, t, y)
             events = event_values.size
+            # a comparison, so that events are found as switches are; it moves with the time even if
+            # the function of the event does not
             return [*rates, jnp.where(event_values + 0 * t >= 0, 1, 0)]
 
         single_lane = [x[0] if lane else x for x, lane in zip(once, flags)]
@@ -132,6 +136,8 @@ class Problem(NamedTuple):
             program[:] = [jax.make_jaxpr(lambda *x: specialised.run(x[:size], *x[size:]))(*shapes)]
             return list(specialised.coefficients)
 
+        # What is the same for all bodies is computed once and gets no axis: the weights of a
+        # network would otherwise be copied for every body.
         axes = [0 if lane else None for lane in self.lanes]
         depends = _depends(jax.make_jaxpr(coefficients_of)(*single_lane).jaxpr, self.lanes)
         out = [0 if moves else None for moves in depends]
@@ -142,6 +148,8 @@ class Problem(NamedTuple):
         )
         run = jaxpr_as_fun(program[0])
 
+        # The field of one body under `vmap`, not one written for lanes: user functions with matrix
+        # products become one product for all bodies of a chunk.
         def of_one(coefficients, levels, t, y):
             *rates, margins, new_levels = run(
                 *coefficients, levels, t, *(y[i][None] for i in range(size))

@@ -54,6 +54,8 @@ def samples(make: Make, arrays, unit_data, y, start, ts, states, once: bool = Fa
         starts, rows = each_body(start, ts, y.shape[1])
         at = [i for i, x in enumerate(input_tangents[:size]) if is_slope(x)]
         dy = dy if is_slope(dy) else zeros(dy)
+        # A later start is a start from a state that has gone back along the rates, and a later
+        # sample has gone on along them: no integration for either.
         if is_slope(dstart):
             dy = dy - dstart * _rates(motion, starts[None], y[None])[0]
         change = linear(
@@ -72,6 +74,7 @@ def samples(make: Make, arrays, unit_data, y, start, ts, states, once: bool = Fa
         return change
 
     order = None
+    # `Trajectory.at` may ask for times of a body in any order; the loop goes one way.
     if ts.ndim > 1:
         sign = jnp.where(ts[:, -1:] < jnp.reshape(start, (-1, 1)), -1, 1).astype(ts.dtype)
         order = jnp.argsort(jax.lax.stop_gradient(sign * ts), axis=1)
@@ -151,6 +154,9 @@ def _cotangent(problem_of, at, primals, cotangents):
     differentiable = _is_differentiated(primals)
     motion, options = problem_of(arrays, differentiable)
     floats = [k for k, x in enumerate(motion.coefficients) if jnp.issubdtype(x.dtype, jnp.inexact)]
+    # Cotangents are summed over steps and bodies where they arise, for the coefficients of the
+    # loop (a network's weights once, not once for each body), and pulled back to the parameters
+    # once at the end.
     _, pull = jax.vjp(coefficients_of, *parameters)
     sums = [jnp.zeros_like(motion.coefficients[k]) for k in floats]
     y_cotangent, sums = kernel(
@@ -327,6 +333,8 @@ def _step_back(
         any_of(jnp.where(has_sample(place), 1.0, 0.0)), rule.dense_stages, rule.stages - 1
     )
 
+    # The stages are evaluated again from the state: to record them would take as many times the
+    # memory as there are stages.
     def stage(i, carry):
         rates, states = carry
         y = note.y + h[None] * weighted(table[i], rates)
@@ -350,6 +358,9 @@ def _step_back(
             bars + stage_cotangents,
         )
 
+    # Reverse of the rule: `bars` are the cotangents of the stages' rates. The result weighs each by
+    # its row of the table, dense output adds its own, and stage by stage, last first, each passes
+    # on to those that it was computed from.
     bars = h[None, None] * cotangent[None] * table[rule.stages - 1][:, None, None]
     initial_cotangent = jnp.where(finished[None], cotangent, 0)
     place, cotangent, bars = jax.lax.while_loop(
@@ -386,6 +397,8 @@ def _jump_back(rates_of, values, motion, note: _Note, after: _Note, later, t, co
     flips = flips & field[:, None]
     share = jnp.where(flips, 1, 0).astype(cotangent.dtype)
     share = share / jnp.maximum(jnp.sum(share, axis=0, keepdims=True), 1)
+    # Of switches that turn together each has the same share of the time: their margins vanish at
+    # once only where they are the same comparison in several places, or by symmetry.
     rates_before, *_ = rates_of(values, note.levels, t, after.y)
     rates_after, *_ = rates_of(values, later, t, after.y)
 
@@ -397,6 +410,8 @@ def _jump_back(rates_of, values, motion, note: _Note, after: _Note, later, t, co
     _, rate = jax.jvp(
         lambda t, y: margin(values, t, y), (t, after.y), (jnp.ones_like(t), rates_before)
     )
+    # A margin that stands still at its root has no time that could be differentiated (grazing);
+    # the derivative is then that of a motion whose switch turns at a fixed time.
     crosses_surface = jnp.any(flips, axis=0) & (rate != 0)
     weight = jnp.sum(cotangent * (rates_after - rates_before), axis=0) / jnp.where(
         crosses_surface, rate, 1

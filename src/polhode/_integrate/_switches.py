@@ -137,6 +137,12 @@ _TRUNC = _Rule(
 )
 
 
+# The program is walked through twice with the same order of choices: once with levels given
+# (`_Held`), once deciding them (`_Free`). A level is known by its place in that order alone, so the
+# walk must not depend on values; loops are unrolled and all branches of a `cond` evaluated for
+# that reason.
+
+
 class _Held:
     """Gives the levels one after another, and collects margins."""
 
@@ -144,6 +150,8 @@ class _Held:
         self.levels, self.place, self.margins, self.new_levels = levels, 0, [], []
 
     def choose(self, u, rule: _Rule, jumps: bool):
+        # The margin keeps the slope of u: it is also what the place of the switch is differentiated
+        # by, and a distance to the switch in any other measure would have to be differentiated too.
         u = jnp.asarray(u)
         level = self.levels[self.place : self.place + u.size].reshape(u.shape)
         self.place += u.size
@@ -261,6 +269,8 @@ class _Walk:
             return [(self._select_larger(a, b, name == "max"), True)]
         if name == "abs":
             return [(jnp.where(self.side(x[0]), x[0], -x[0]), True)]
+        # Comparisons give numbers that do not move while their level is held: what follows of them
+        # alone (a table index, a mask) needs no switch of its own.
         if name == "sign":
             one = jnp.ones((), out.dtype)
             return [(jnp.where(self.side(x[0], True), one, -one), False)]
@@ -287,6 +297,8 @@ class _Walk:
             return [
                 (self._integer_level(x[0], _TRUNC, eqn.invars[0].aval).astype(out.dtype), False)
             ]
+        # On the negative axis the angle jumps by a turn. With the side of y held it goes on
+        # smoothly, and the jump becomes a switch.
         if name == "atan2":
             y, x = x
             is_upper, around = self.side(y), jnp.asarray(2 * np.pi, out.dtype)
@@ -300,6 +312,8 @@ class _Walk:
         if name in ("argmax", "argmin"):
             _, place = self._extreme(x[0], eqn.params["axes"], name == "argmax", jumps=True)
             return [(place.astype(out.dtype), False)]
+        # Pairs are compared, n (n - 1) / 2 switches for n numbers. Beyond 16 that would be more
+        # than most fields have, and the operation is opaque.
         if name == "sort" and eqn.params["num_keys"] == 1:
             axis = eqn.params["dimension"]
             if x[0].shape[axis] <= _SORTED:
@@ -344,6 +358,8 @@ class _Walk:
         rows = jnp.moveaxis(x, axes, range(len(axes))).reshape(-1, *shape)
         places = jnp.arange(rows.shape[0]).reshape(-1, *[1] * len(shape))
         places = jnp.broadcast_to(places, rows.shape)
+        # A tournament: n - 1 comparisons like a chain of them, but in log n turns of this loop, so
+        # that the program does not grow with n.
         while rows.shape[0] > 1:
             even = (
                 rows.shape[0] // 2 * 2
@@ -401,6 +417,7 @@ class _Walk:
             operands[const_count : const_count + carry_count],
             operands[const_count + carry_count :],
         )
+        # Unrolled, since each turn has switches of its own. Only loops with switches come here.
         order = range(length)[::-1] if eqn.params["reverse"] else range(length)
         stacked: list[Any] = [None] * length
         for k in order:
