@@ -15,12 +15,12 @@ from polhode.lightcurve._brightness import (
     Points,
     _cross,
     _to_body,
-    apply_step,
     attitudes,
     harmonics,
     moments_of,
 )
 from polhode.lightcurve._nulls import Linear
+from polhode.lightcurve._search import stepped
 from polhode.lightcurve._solutions import (
     Described,
     Linearised,
@@ -100,9 +100,6 @@ def _light(body: Bodies, coefficients, points: Points, surface):
     open_area = areas @ normals / area
     by_open = (rows * areas[None]) @ normals / area - jnp.outer(rows @ areas, open_area) / area
     return value, jnp.stack([*motion, *by_turn], -1), by_shape, open_area, by_open
-
-
-_apply_step = jax.jit(apply_step)
 
 
 def refine(
@@ -188,7 +185,7 @@ def refine(
                 rotation.normalise(rotation.multiply(turn, body.wxyz)),
             )
         else:
-            trial = _apply_step(body, jnp.asarray(change))
+            trial = stepped(body, change)
         new = evaluated(trial, coefficients + step[8:])
         new_chi2, new_cost = costed(new[0], coefficients + step[8:], trial, new[2])
         better = np.isfinite(new_cost) and new_cost < cost

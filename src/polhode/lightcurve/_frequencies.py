@@ -163,14 +163,17 @@ class Scan(NamedTuple):
                 highest = min(end, max_nodes * step)
                 is_cut = end > highest
         count = int(np.ceil(highest / step)) + 1
-        window, data, *rest = _transforms(
-            jnp.asarray(t),
-            jnp.asarray(np.vstack([np.ones_like(t), values, basis])),
-            step,
-            2 * (most * count + 1),
+        transforms = np.asarray(
+            _transforms(
+                jnp.asarray(t),
+                jnp.asarray(np.vstack([np.ones_like(t), values, basis])),
+                step,
+                2 * (most * count + 1),
+            )
         )
+        window, data, columns = map(jnp.asarray, (transforms[0], transforms[1], transforms[2:]))
         return cls(
-            (window, jnp.stack(rest)),
+            (window, columns),
             data,
             step,
             count,

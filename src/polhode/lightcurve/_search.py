@@ -158,11 +158,7 @@ class Problem:
             # no step of more than half a unit in the logarithms, half a radian in attitude
             size = np.abs(np.delete(step[:, :many], (4, 5, 6), axis=1)).max(1)
             step *= np.minimum(1, 0.5 / np.maximum(size, 1e-30))[:, None]
-            parts = [
-                _apply_step(select(old.bodies, cut), step[cut, :many])
-                for cut in (slice(k, k + BATCH) for k in range(0, len(step), BATCH))
-            ]
-            bodies = jax.tree.map(lambda *x: np.concatenate(x), *parts)
+            bodies = stepped(old.bodies, step[:, :many])
             new = self.evaluate(bodies, old.offsets + step[:, many:], limit[active])
             better = new.cost < old.cost
             gain = np.where(better, old.cost - new.cost, 0)
@@ -213,6 +209,20 @@ def _solve_damped(matrix, right, damping):
 def select(tree, index):
     """The bodies of these numbers."""
     return jax.tree.map(lambda x: x[index], tree)
+
+
+def in_parts(function, size: int, bodies: Bodies, *arrays: np.ndarray):
+    """``function`` of bodies (b,) and arrays (b, ...), ``size`` of them at a time: one program
+    serves every number of bodies."""
+    total, operands = len(bodies.wxyz), jax.tree.map(np.asarray, (bodies, *arrays))
+    index = np.minimum(np.arange(total + -total % size), total - 1).reshape(-1, size)
+    parts = [function(*select(operands, part)) for part in index]
+    return jax.tree.map(lambda *x: np.concatenate(x)[:total], *parts)
+
+
+def stepped(bodies: Bodies, step: np.ndarray) -> Bodies:
+    """The bodies (b,) after the steps (b, u + 3)."""
+    return in_parts(_apply_step, BATCH, bodies, step)
 
 
 def select_padded(bodies: Bodies, index) -> Bodies:

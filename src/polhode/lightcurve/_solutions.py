@@ -19,7 +19,7 @@ from polhode.lightcurve._brightness import (
 from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._frequencies import LAM, SAM, Hypotheses, Pairs, sum_name
 from polhode.lightcurve._nulls import Model
-from polhode.lightcurve._search import BATCH, Problem, State, normal_equations, select
+from polhode.lightcurve._search import BATCH, Problem, State, in_parts, normal_equations, select
 
 if TYPE_CHECKING:
     from polhode.lightcurve._verdict import Verdict
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 # Chi-square per degree of freedom at which a body explains a light curve.
 REACHED = 1.3
+_PART = 256  # bodies whose periods are computed at once
 FIXED = 5.0  # deg: directions that change by less are one geometry
 EXCLUDED = 1e-3  # odds of a solution below which it is
 
@@ -133,12 +134,12 @@ class LightCurveFit(NamedTuple):
 
 def frequencies(bodies: Bodies):
     """f_phi, f_psi, and mode of bodies."""
-    return _in_parts(_periods, bodies)
+    return in_parts(_periods, _PART, bodies)
 
 
 def momentum(bodies: Bodies) -> np.ndarray:
     """Unit vectors of the angular momentum in space (b, 3)."""
-    return _in_parts(_momentum, bodies)
+    return in_parts(_momentum, _PART, bodies)
 
 
 @jax.jit
@@ -152,15 +153,6 @@ def _momentum(bodies: Bodies):
     body = jnp.stack(moments_of(bodies.unknowns), -1) * bodies.unknowns[:, 4:7]
     space = rotation.rotate(bodies.wxyz, body)
     return space / jnp.sqrt(jnp.sum(space**2, axis=-1, keepdims=True))
-
-
-def _in_parts(function, bodies: Bodies):
-    """``function`` of bodies (b,) by 256, so that one program serves every number of them."""
-    total = len(bodies.wxyz)
-    index = np.minimum(np.arange(total + -total % 256), total - 1).reshape(-1, 256)
-    bodies = jax.tree.map(np.asarray, bodies)
-    parts = [function(select(bodies, part)) for part in index]
-    return jax.tree.map(lambda *x: np.concatenate(x)[:total], *parts)
 
 
 def _derived_quantities(x, wxyz):
@@ -181,14 +173,16 @@ def _derived_quantities(x, wxyz):
     )
 
 
-_derivatives_of_derived = jax.jit(jax.vmap(jax.jacfwd(_derived_quantities)))
+@jax.jit
+def _derivatives_of_derived(bodies: Bodies):
+    no_turn = jnp.zeros((len(bodies.wxyz), 3))
+    x = jnp.concatenate([bodies.unknowns, no_turn], axis=1)
+    return jax.vmap(jax.jacfwd(_derived_quantities))(x, bodies.wxyz)
 
 
 def derivatives_of_derived(bodies: Bodies) -> np.ndarray:
     """Derivatives (b, 8, u + 3) of ln P_phi, ln P_psi, moments and momentum's direction."""
-    unknowns, wxyz = map(np.asarray, bodies)
-    x = jnp.asarray(np.c_[unknowns, np.zeros((len(unknowns), 3))])
-    return np.asarray(_derivatives_of_derived(x, jnp.asarray(wxyz)))
+    return in_parts(_derivatives_of_derived, BATCH, bodies)
 
 
 class Linearised(NamedTuple):
@@ -228,7 +222,7 @@ def describe_solutions(
         jax.tree.map(jnp.asarray, best.bodies),
         jnp.asarray(best.offsets),
         problem.points,
-        jnp.full(len(index), limit),
+        jnp.asarray(np.full(len(index), limit)),  # strong, as in the search: one program
     )
     model = np.asarray(value + best.offsets @ problem.points.columns)[:, :n]
     robust, weight = np.asarray(robust)[:, :n], np.asarray(problem.points.weight)[:, :n]
@@ -248,9 +242,8 @@ def describe_solutions(
     f_phi, f_psi, mode = frequencies(best.bodies)
     pole = momentum(best.bodies)
     unknowns, wxyz = best.bodies
-    x = jnp.asarray(np.c_[unknowns, np.zeros((len(index), 3))])
-    slopes = np.asarray(_derivatives_of_derived(x, jnp.asarray(wxyz)))
-    count = x.shape[1]
+    slopes = derivatives_of_derived(best.bodies)
+    count = slopes.shape[2]
     out = []
     for k in range(len(order)):
         covariance = np.linalg.pinv(best.matrix[k], hermitian=True)[:count, :count]
