@@ -117,6 +117,7 @@ def test_derivatives_of_the_closed_form_agree():
             sign = np.sign(np.dot(final(start, jnp.array([0.0, sample["t"]]))[:4], sample["wxyz"]))
             stored[:4] *= sign
             size = np.abs(stored).max(axis=0)
+            size[size == 0] = 1  # a permanent rotation does not depend on its moments
             np.testing.assert_allclose(np.asarray(found) / size, stored / size, atol=1e-9)
 
 
