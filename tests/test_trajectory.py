@@ -238,6 +238,19 @@ def test_steps_that_end_at_switches_and_events_are_counted():
     assert int(both.step_counts.at_switches) == 7 + 7
 
 
+def test_steps_limited_by_stability_are_counted():
+    def counts_of(damping):
+        scene = ph.Scene(TURNED_BODY, torque=ph.LinearDamping(damping))
+        start = ph.State([1.0, 0, 0, 0], [0.3, 0.4, 0.5])
+        return ph.simulate(scene, start, [0.0, 20.0], rtol=1e-6)
+
+    slow, fast = counts_of(0.01), counts_of(1e3)
+    assert int(slow.step_counts.at_stability) == 0
+    assert "stability" not in str(slow)
+    assert int(fast.step_counts.at_stability) > 0.9 * int(fast.steps)
+    assert f"limited by stability: {int(fast.step_counts.at_stability):,}" in str(fast)
+
+
 @pytest.mark.slow  # the other counts: above
 def test_steps_that_end_at_saved_times_or_are_refused_are_counted():
     gravity = ph.UniformGravity(1.0, [0.1, 0.2, 0.3], [0.0, 0.0, -9.81])

@@ -88,15 +88,17 @@ class StepCounts(NamedTuple):
 
     **Fields**, each (...) of integers: ``accepted``; ``refused``: attempts whose error was too
     large, repeated with a shorter step; ``at_switches``: steps that ended where a switch of a
-    torque turned or an event occurred; ``at_times``: steps shortened to end at a saved time. All
-    others were limited by the error of the step. Methods that step by diffrax count the first two
-    only.
+    torque turned or an event occurred; ``at_times``: steps shortened to end at a saved time;
+    ``at_stability``: explicit Runge-Kutta steps as long as their stability allows, because
+    something decays fast (``ph.explain`` names an implicit method). All others were limited by the
+    error of the step. Methods that step by diffrax count the first two only.
     """
 
     accepted: Array
     refused: Array
     at_switches: Array
     at_times: Array
+    at_stability: Array
 
     @classmethod
     def of(
@@ -105,10 +107,11 @@ class StepCounts(NamedTuple):
         refused: Array | None = None,
         at_switches: Array | None = None,
         at_times: Array | None = None,
+        at_stability: Array | None = None,
     ) -> "StepCounts":
         """These counts; what is not counted is zero."""
         accepted = jnp.asarray(accepted)
-        others = (refused, at_switches, at_times)
+        others = (refused, at_switches, at_times, at_stability)
         return cls(accepted, *(jnp.zeros_like(accepted) if x is None else x for x in others))
 
 

@@ -99,6 +99,10 @@ EXPLICIT_SHARE = 2.0
 ten times and more: with 0.6 satellites keep a hundredth of ``rtol`` and take 1.2 times the steps;
 with 4 the worst of 64 exceeds ``rtol`` four times (``python -m benchmarks.torqued``)."""
 
+NEAR_STABILITY = 0.8
+"""[factor] Of the width at which a step becomes unstable: steps from there on are counted as
+limited by stability. The controller moves to and fro about that width."""
+
 GRAIN = 64
 """[units in the last place of the time] The motion starts anew beyond a switch that is this close
 and beyond which the field is not defined."""

@@ -46,7 +46,8 @@ class Progress(NamedTuple):
     step; ``needs_rates``: whether ``rate`` must be evaluated anew; ``width``: of the next step [s];
     ``last_error``: logarithm of the last error over its tolerance; ``angle`` so far [rad];
     ``error``: sum of estimated errors; ``steps`` accepted and ``attempts``;
-    ``at_switches``: steps that ended where a switch turned; ``reversals``: consecutive switches
+    ``at_switches``: steps that ended where a switch turned; ``unstable``: as wide as stability
+    allows; ``reversals``: consecutive switches
     that turned back at once; ``place``: index of the next sample; ``count``:
     of events; ``outcome``."""
 
@@ -64,6 +65,7 @@ class Progress(NamedTuple):
     steps: Array
     attempts: Array
     at_switches: Array
+    unstable: Array
     reversals: Array
     place: Array
     count: Array

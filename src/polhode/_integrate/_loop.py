@@ -100,7 +100,9 @@ def solve(make: Make, arrays: Any, unit_data: Any, start: Array, ts: Array, y: A
         count, *events = (progress.count, *storage[1:]) if options.capacity else no_events
         # the first attempt has no width
         rejected_steps = jnp.maximum(progress.attempts - progress.steps - 1, 0)
-        steps = StepCounts.of(progress.steps, rejected_steps, progress.at_switches)
+        steps = StepCounts.of(
+            progress.steps, rejected_steps, progress.at_switches, at_stability=progress.unstable
+        )
         return Solved(steps, progress.outcome, progress.error, count, storage.samples, *events)
 
     # for more bodies a fused kernel takes four times as long to compile and is not faster
@@ -145,6 +147,7 @@ def begin(
         steps=zero_counts,
         attempts=zero_counts,
         at_switches=zero_counts,
+        unstable=zero_counts,
         reversals=zero_counts,
         place=zero_counts,
         count=zero_counts,
@@ -185,7 +188,7 @@ def advance(
         jnp.abs(column(ts, progress.place) - start) <= progress.elapsed + width
     )
     attempt = attempt_step(motion, progress, t, h, needs_dense)
-    error, tolerance, angle = stop_gradient(
+    error, tolerance, angle, is_unstable = stop_gradient(
         _error_and_tolerance(motion, options, progress, attempt, width, length, eps)
     )
     ratio = error / tolerance
@@ -260,6 +263,7 @@ def advance(
         steps=count(progress.steps, accepted),
         attempts=count(progress.attempts, is_running),
         at_switches=count(progress.at_switches, hit & accepted),
+        unstable=count(progress.unstable, accepted & ~hit & is_unstable),
         place=place,
     )
     if turn is not None and undefined is not None:
@@ -313,7 +317,8 @@ def _width(progress: Progress, length: Array, is_running: Array, eps: float) -> 
 
 
 def _error_and_tolerance(motion, options, progress, attempt, width, length, eps):
-    """Error of a step [rad], its tolerance, and the angle of the step [rad]."""
+    """Error of a step [rad], its tolerance, the angle of the step [rad], and whether its width is
+    one that stability allows just so."""
     rule = motion.rule
     first_rates, last_rates = attempt.stages[0], attempt.stages[rule.stages - 1]
     change = weighted(rule.weights[rule.stages - 1], attempt.h[None, None] * attempt.stages)
@@ -345,7 +350,17 @@ def _error_and_tolerance(motion, options, progress, attempt, width, length, eps)
     )
     tolerance = jnp.maximum(tolerance, control.ROUNDED_STEP * eps)
     sound = jnp.isfinite(error) & jnp.isfinite(angle)
-    return tuple(jnp.where(sound, x, y) for x, y in ((error, jnp.inf), (tolerance, 1), (angle, 0)))
+    error, tolerance, angle = (
+        jnp.where(sound, x, y) for x, y in ((error, jnp.inf), (tolerance, 1), (angle, 0))
+    )
+    # The last two stages stand at the same time: the change of their rates over that of their
+    # states is the fastest rate of decay or growth (Hairer & Wanner, Solving Ordinary Differential
+    # Equations II, section IV.2).
+    apart = [rule.weights[k] for k in (rule.stages - 2, rule.stages - 1)]
+    moved = list(attempt.h[None] * weighted(apart[1] - apart[0], attempt.stages))
+    change = list(attempt.h[None] * (last_rates - attempt.stages[rule.stages - 2]))
+    moved, change = weighted_length(weights, moved), weighted_length(weights, change)
+    return error, tolerance, angle, change > control.NEAR_STABILITY * rule.stability * moved
 
 
 def _save(

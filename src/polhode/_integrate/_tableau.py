@@ -14,7 +14,8 @@ class Tableau:
     belong to dense output; ``errors``: weights of one error estimate, or of two of different
     order; ``dense`` (K, S): of the coefficients of dense output beyond the cubic of Hermite;
     ``dense_error``: error of dense output over that at the end of the step, in the mean of turning
-    bodies; ``margin_stages``: in order of time, those at which switches are inspected."""
+    bodies; ``margin_stages``: in order of time, those at which switches are inspected;
+    ``stability``: the width times a rate of decay from which on a step amplifies errors."""
 
     order: int
     nodes: np.ndarray
@@ -24,6 +25,7 @@ class Tableau:
     dense: np.ndarray
     dense_error: float
     margin_stages: tuple[int, ...]
+    stability: float
     margin_nodes: tuple[float, ...] = field(init=False)
 
     def __post_init__(self):
@@ -266,6 +268,7 @@ DOP853 = Tableau(
     _filled(_DOP853_DENSE, (4, _DOP853_DENSE_STAGES)),
     10,
     (0, 3, 6, 5, 9, 10, 12),
+    6.4,
 )
 """Order 8, dense output of order 7; the table leaves out zeros. J. R. Dormand, P. J. Prince;
 E. Hairer, S. P. Norsett, G. Wanner, Solving Ordinary Differential Equations I (1993), sections
@@ -328,6 +331,7 @@ TSIT5 = Tableau(
     3,
     # the sixth stage stands at the end too, less accurately than the seventh
     (0, 1, 2, 3, 4, 6),
+    3.5,
 )
 """Order 5, dense output of order 4. C. Tsitouras, Computers & Mathematics with Applications 62
 (2011) 770-775."""

@@ -140,6 +140,7 @@ class Trajectory(eqx.Module):
         if steps.size and steps.max() > 0:
             lines.append(f"steps   {_spread(steps)}")
             names = ("refused", "ended at a switch or event", "ended at a saved time")
+            names += ("limited by stability",)
             for name, counts in zip(names, map(np.asarray, self._steps[1:])):
                 if counts.max() > 0:
                     lines.append(f"        {name}: {_spread(counts)}")
@@ -189,10 +190,12 @@ class Trajectory(eqx.Module):
 
     @property
     def step_counts(self) -> StepCounts:
-        """How many steps (...) were refused, and how many ended at a switch or a saved time.
+        """How many steps (...) were refused, ended at a switch or a saved time, or were as long as
+        stability allows.
 
         Many refused ones: the motion changes abruptly. Many at switches: a torque changes
         sides often; smooth it, or loosen the limit that it meets. Many at saved times: save fewer.
+        Many limited by stability: something decays fast; weaken it, or take an implicit method.
         Zero for closed forms.
         """
         return self._steps
