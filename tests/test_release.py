@@ -57,12 +57,13 @@ def test_installed_it_runs_the_lines_of_the_readme(built, kind, tmp_path):
     done = subprocess.run([*command, built[kind]], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
-    (lines,) = re.findall(r"^```python\n(.*?)^```", readme, re.S | re.M)
+    blocks = re.findall(r"^```python\n(.*?)^```", readme, re.S | re.M)
+    assert len(blocks) == 2  # the second goes on with the names of the first
     script = tmp_path / "readme.py"
     # its own dependencies come from this environment, polhode from the folder
     where = "import polhode, pathlib; print(pathlib.Path(polhode.__file__).resolve())\n"
     shown = "from polhode import plot; assert len(plot.view(traj).html) > 500_000\n"
-    script.write_text(where + lines + shown, encoding="utf-8")
+    script.write_text(where + "".join(blocks) + shown, encoding="utf-8")
     environment = {**os.environ, "PYTHONPATH": str(target)}
     done = subprocess.run(
         [sys.executable, script], capture_output=True, text=True, cwd=tmp_path, env=environment
