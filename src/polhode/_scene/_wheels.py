@@ -569,5 +569,5 @@ def _unit(axis: Array | np.ndarray) -> Array:
         length = np.sqrt(np.sum(values**2, axis=-1, keepdims=True))
         return as_float_array("axis_body", values / length, finite=False)
     largest = jax.lax.stop_gradient(jnp.max(jnp.abs(axis), axis=-1, keepdims=True))
-    axis = axis / largest  # of any size: nothing overflows
-    return axis / jnp.sqrt(jnp.sum(axis**2, axis=-1, keepdims=True))
+    scaled = jnp.asarray(axis) / largest  # of any size: nothing overflows
+    return scaled / jnp.sqrt(jnp.sum(scaled**2, axis=-1, keepdims=True))
