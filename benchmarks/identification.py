@@ -47,7 +47,7 @@ from polhode.fit import (
     stack,
 )
 from polhode.fit._model import base_of, free_columns
-from polhode.fit._solve import regression
+from polhode.fit._start import regression
 
 jax.config.update("jax_enable_x64", True)
 RATE = 6.0

@@ -84,7 +84,7 @@ _EXPLANATIONS = {
 
 
 class StepCounts(NamedTuple):
-    """Why the steps of each body were as short as they were; see ``Trajectory.step_counts``.
+    """What kept the steps of each body short; see ``Trajectory.step_counts``.
 
     **Fields**, each (...) of integers: ``accepted``; ``refused``: attempts whose error was too
     large, repeated with a shorter step; ``at_switches``: steps that ended where a switch of a

@@ -15,7 +15,7 @@ from polhode.fit import (
     fit_inertia,
     stack,
 )
-from polhode.fit._solve import regression
+from polhode.fit._start import regression
 from polhode.inertia import inertia_of_second_moments, is_physical
 
 BODIES, SAMPLES = 200, 80

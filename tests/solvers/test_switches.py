@@ -310,6 +310,21 @@ def test_a_gradient_through_a_jump():
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("push", [0.0, 0.3, 0.7])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_relay_that_slides_says_so(dtype, push):
+    """Single precision runs out of digits before 16 reversals."""
+
+    def relay(t, wxyz, omega):
+        return 0.3 * (jnp.where(omega[0] > 0, -1, 1) + push) * jnp.array([1, 0, 0], omega.dtype)
+
+    scene = ph.Scene(ph.Inertia.from_moments(MOMENTS.astype(dtype)), None, ph.FeedbackTorque(relay))
+    state = ph.State(WXYZ.astype(dtype), np.array([[0.2, 0.3, 0.1], [1.0, 0.2, -0.5]], dtype))
+    found = ph.simulate(scene, state, TS.astype(dtype), rtol=1e-5, throw=False)
+    np.testing.assert_array_equal(found.status, ph.Status.SLIDING)
+    assert found.wxyz.dtype == dtype
+
+
 def test_second_derivatives_through_a_jump():
     """By rate and level: of ``level - 0.1 (5 - log(level) / rate)``."""
 

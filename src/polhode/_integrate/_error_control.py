@@ -111,5 +111,10 @@ MAX_REVERSALS = 16
 """[switches] Consecutive ones that turn back at once, after which the motion slides along a
 switch."""
 
+SHORT_REVERSALS = 2
+"""[switches] The same where the steps have become too short: each reversal divides the width by
+four, and single precision has no room for 16. A chance step between two of them starts the count
+anew."""
+
 UNDEFINED_SIDE = 0.98
 """[factor] Of the part of a step up to a switch beyond which the field is not defined."""

@@ -479,7 +479,9 @@ def _outcome(options, progress: Progress, is_running, length, ratio, eps) -> Arr
     is_too_short = ~(progress.width > control.MIN_WIDTH * eps * length)
     number = jnp.isfinite(ratio) & jnp.isfinite(progress.width)
     why = jnp.where(is_too_short, jnp.where(number, STEP_TOO_SHORT, NOT_FINITE), RUNNING)
-    why = jnp.where(progress.reversals >= control.MAX_REVERSALS, SLIDING, why)
+    slides = progress.reversals >= control.MAX_REVERSALS
+    slides = slides | (is_too_short & number & (progress.reversals >= control.SHORT_REVERSALS))
+    why = jnp.where(slides, SLIDING, why)
     why = jnp.where(spent, OUT_OF_STEPS, why)
     why = jnp.where(progress.elapsed >= length, FINISHED, why)
     why = jnp.where(progress.outcome == AT_EVENT, AT_EVENT, why)

@@ -358,12 +358,11 @@ class _Walk:
         rows = jnp.moveaxis(x, axes, range(len(axes))).reshape(-1, *shape)
         places = jnp.arange(rows.shape[0]).reshape(-1, *[1] * len(shape))
         places = jnp.broadcast_to(places, rows.shape)
-        # A tournament: n - 1 comparisons like a chain of them, but in log n turns of this loop, so
-        # that the program does not grow with n.
+        # A tournament of neighbours, of which the first wins where they are equal: as many
+        # comparisons as a chain of them, but in log n turns of this loop, so that the program grows
+        # with log n only.
         while rows.shape[0] > 1:
-            even = (
-                rows.shape[0] // 2 * 2
-            )  # neighbours are compared: of equal numbers the first wins
+            even = rows.shape[0] // 2 * 2
             is_first = self.side(
                 rows[:even:2] - rows[1:even:2] if larger else rows[1:even:2] - rows[:even:2], jumps
             )

@@ -190,8 +190,7 @@ class Trajectory(eqx.Module):
 
     @property
     def step_counts(self) -> StepCounts:
-        """How many steps (...) were refused, ended at a switch or a saved time, or were as long as
-        stability allows.
+        """How many steps (...) each body took, and what kept them short.
 
         Many refused ones: the motion changes abruptly. Many at switches: a torque changes
         sides often; smooth it, or loosen the limit that it meets. Many at saved times: save fewer.

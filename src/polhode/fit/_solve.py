@@ -1,9 +1,6 @@
 """From recordings of one body to its best parameters: start, optimisation, information."""
 
 import dataclasses
-import math
-from functools import reduce
-from operator import mul
 
 import equinox as eqx
 import jax
@@ -22,215 +19,21 @@ from polhode.fit._model import (
     SteppedMotion,
     base_of,
     entries_of,
-    free_acceleration,
     free_columns,
     whole_of,
 )
-from polhode.fit._numerics import LevenbergMarquardt, eigh, solve
+from polhode.fit._numerics import LevenbergMarquardt
 from polhode.fit._options import WALK_KNOTS, FitOptions, Gyroscope, Huber, noise_is_trusted
 from polhode.fit._recording import (
     Recording,
-    central_slope,
     interpolate_gaps,
     require_channel,
     rotation_vector_between,
     size_of_data,
 )
 from polhode.fit._residuals import Linear, Model, linearise, prior_cost, prior_residuals, unknowns
+from polhode.fit._start import alternative_starts, neighbour_noise_variance, regression
 from polhode.inertia import Inertia, inertia_of_second_moments, second_moments
-from polhode.rotation import multiply, rotation_vector_to_wxyz, wxyz_to_matrix
-
-# Starting values from the data: linear regression on the conservation of angular momentum.
-#
-# The rates are integrated to the attitude R(t) relative to the first sample. The angular momentum
-# ``R (I omega + h) = L`` is constant, which is linear in the six entries of I and the three of L.
-# No noisy rates are differentiated.
-
-# second moments below this part of their sum are lifted to it before the logarithm is taken
-_FLATTEST = 3e-3
-# rounds of interpolation with the tensor of the round before
-_ROUNDS = 3
-_PIECES = 6
-
-
-def integrate(
-    omega: Float[Array, "t 3"], slope: Float[Array, "t 3"], times: Float[Array, " t"]
-) -> Float[Array, "t 4"]:
-    """Attitude quaternions relative to the first sample, from rates and their derivatives.
-
-    Cubic Hermite interpolation, two Magnus steps of order 4 (two Gauss points) per interval.
-    """
-    step = jnp.diff(times)[:, None]
-    offset = jnp.asarray(3, omega.dtype) ** 0.5 / 12
-
-    def rate_at(s):
-        # Hermite's basis on [0, 1]
-        end_weight = s * s * (3 - 2 * s)
-        start, end = s * (1 - s) ** 2, -s * s * (1 - s)
-        return (
-            (1 - end_weight) * omega[:-1]
-            + end_weight * omega[1:]
-            + step * (start * slope[:-1] + end * slope[1:])
-        )
-
-    def half(middle):
-        first_rate, second_rate = rate_at(middle - offset), rate_at(middle + offset)
-        return step / 4 * (first_rate + second_rate) + step**2 / 4 * offset * jnp.cross(
-            first_rate, second_rate
-        )
-
-    turns = multiply(rotation_vector_to_wxyz(half(0.25)), rotation_vector_to_wxyz(half(0.75)))
-    unit = jnp.asarray([[1, 0, 0, 0]], omega.dtype)
-    return jnp.concatenate([unit, _products(turns, unit)])
-
-
-def _products(turns: Float[Array, "n 4"], unit: Float[Array, "1 4"]) -> Float[Array, "n 4"]:
-    """Running products of quaternions: within rows of a square, all at a time, then over its rows.
-
-    As short a way as any for the machine, and the shortest program: its derivatives compile in
-    half the time that ``associative_scan`` takes.
-    """
-    count = turns.shape[0]
-    side = math.isqrt(count - 1) + 1
-    padded_turns = jnp.concatenate([turns, jnp.broadcast_to(unit, (side * side - count, 4))])
-
-    def on(product, turn):
-        next_product = multiply(product, turn)
-        return next_product, next_product
-
-    start = jnp.broadcast_to(unit, (side, 4))
-    _, within = jax.lax.scan(on, start, jnp.swapaxes(padded_turns.reshape(side, side, 4), 0, 1))
-    _, rows = jax.lax.scan(on, unit[0], within[-1])
-    row_starts = jnp.concatenate([unit, rows[:-1]])
-    return multiply(row_starts[:, None], jnp.swapaxes(within, 0, 1)).reshape(-1, 4)[:count]
-
-
-def _design(omega: Float[Array, "t 3"]) -> Float[Array, "t 3 6"]:
-    """``I omega`` as a matrix times (xx, yy, zz, yz, zx, xy)."""
-    x, y, z = (omega[..., i] for i in range(3))
-    o = jnp.zeros_like(x)
-    rows = [[x, o, o, o, z, y], [o, y, o, z, o, x], [o, o, z, y, x, o]]
-    return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def _nearest_physical(entries: Float[Array, " 6"]) -> Float[Array, "3 3"]:
-    """Second moments of the nearest body that is not too flat."""
-    values, axes = eigh(second_moments(whole_of(entries)))
-    min_moment = _FLATTEST * jnp.sum(jnp.abs(values))
-    values = jnp.maximum(values, min_moment)
-    return jnp.einsum("ij,j,kj->ik", axes, values, axes)
-
-
-def regression(
-    omega: Float[Array, "r t 3"],
-    times: Float[Array, "r t"],
-    present: Float[Array, "r t"],
-    momentum: Float[Array, "r t 3"] | None = None,
-) -> tuple[Float[Array, "3 3"], Float[Array, "3 3"], Float[Array, ""]]:
-    """Second moments (3, 3) to start from, in two ways, and the relative misfit of the first.
-
-    The first takes the momentum as constant over each recording, the second over pieces of it,
-    which forgives errors of the integrated attitude and a slow loss of momentum.
-
-    ``momentum``: body components of a wheel's momentum; without it the tensor is scaled to unit
-    Frobenius norm, since only its shape shows. Without it, too, the rates between the samples are
-    interpolated with the derivatives that Euler's equations give for the tensor found before:
-    records of few samples per turn need that.
-    """
-
-    count = times.shape[1]
-    all_samples = jnp.ones((1, count), omega.dtype)
-    # parts in which errors of the integrated attitude have no time to grow
-    place = np.arange(count) * _PIECES // count
-    pieces = jnp.asarray(place == np.arange(_PIECES)[:, None], omega.dtype)
-
-    def centred(values, parts):
-        # eliminate the constant momentum of each part: subtract its mean
-        shape = (*present.shape, *[1] * (values.ndim - 2))
-        weight = parts[None] * present[:, None]
-        total = jnp.sum(weight, axis=2)
-        safe = jnp.where(total > 0, total, 1)
-        mean = jnp.einsum("rpt,rt...->rp...", weight, values)
-        mean = mean / safe.reshape(*safe.shape, *shape[2:])
-        return (values - jnp.einsum("pt,rp...->rt...", parts, mean)) * present.reshape(shape)
-
-    def rows_of(slope):
-        attitude = jax.vmap(integrate)(omega, slope, times)
-        turn = wxyz_to_matrix(attitude) * present[..., None, None]
-        return turn, jnp.einsum("rtij,rtjk->rtik", turn, _design(omega))
-
-    def square(rows):
-        return jnp.einsum("rtij,rtik->jk", rows, rows)
-
-    first_derivatives = jax.vmap(central_slope)(omega, times)
-    if momentum is None:
-        metric = jnp.asarray([1, 1, 1, 2, 2, 2], omega.dtype) ** 0.5
-
-        def null(gram):
-            values, vectors = eigh(gram / metric[:, None] / metric[None])
-            entries = vectors[:, 0] / metric
-            entries = entries * jnp.where(jnp.sum(entries[:3]) < 0, -1, 1).astype(entries.dtype)
-            return _nearest_physical(entries), values[0] / jnp.sum(values)
-
-        def refine(_, carry):
-            _, rows = rows_of(carry[0])
-            grams = jnp.stack([square(centred(rows, parts)) for parts in (all_samples, pieces)])
-            sigma, misfit = jax.vmap(null)(grams)
-            body = Inertia(full=inertia_of_second_moments(sigma[1]))
-            return free_acceleration(body, omega), sigma, misfit
-
-        unit = jnp.eye(3, dtype=omega.dtype)
-        start = (first_derivatives, jnp.stack([unit, unit]), jnp.zeros(2, omega.dtype))
-        _, sigma, misfit = jax.lax.fori_loop(0, _ROUNDS, refine, start)
-        return sigma[0], sigma[1], misfit[0]
-    turn, rows = rows_of(first_derivatives)
-    rotated_momentum = jnp.einsum("rtij,rtj->rti", turn, momentum)
-    solutions = []
-    for parts in (all_samples, pieces):
-        body, push = centred(rows, parts), centred(rotated_momentum, parts)
-        entries = solve(square(body), -jnp.einsum("rtij,rti->j", body, push))
-        residual = jnp.einsum("rtij,j->rti", body, entries) + push
-        solutions.append((_nearest_physical(entries), jnp.sum(residual**2) / jnp.sum(push**2)))
-    return solutions[0][0], solutions[1][0], solutions[0][1]
-
-
-def alternative_starts(
-    omega: Float[Array, "r t 3"], initial_moments: Float[Array, "3 3"]
-) -> list[Array]:
-    """Other second moments: long, flat and middling bodies along the directions of the rates."""
-    spread = jnp.einsum("rti,rtj->ij", omega, omega)
-    _, axes = eigh(spread)
-    size = initial_moments[0, 0] + initial_moments[1, 1] + initial_moments[2, 2]
-    return [
-        size * jnp.einsum("ij,j,kj->ik", axes, jnp.asarray(widths, omega.dtype), axes)
-        for widths in ((0.6, 0.25, 0.15), (0.15, 0.25, 0.6), (0.25, 0.6, 0.15))
-    ]
-
-
-def neighbour_noise_variance(
-    times: Float[Array, " t"], omega: Float[Array, "t 3"], present: Float[Array, " t"]
-) -> Float[Array, ""]:
-    """Variance of the noise as neighbours show it: each sample against the cubic through four.
-
-    An upper bound in the mean: where the sampling is coarse the motion itself adds to it. Infinite
-    where no five samples follow each other.
-    """
-    offset = jnp.stack([times[k : times.shape[0] - 4 + k] for k in range(5)]) - times[None, 2:-2]
-    value = jnp.stack([omega[k : times.shape[0] - 4 + k] for k in range(5)])
-    windows = jnp.stack([present[k : times.shape[0] - 4 + k] for k in range(5)])
-    others = (0, 1, 3, 4)
-    weights = [
-        reduce(mul, (offset[j] / (offset[j] - offset[k]) for j in others if j != k)) for k in others
-    ]
-    guess = sum(w[:, None] * value[k] for w, k in zip(weights, others, strict=True))
-    share = 1 + sum(w * w for w in weights)
-    complete = jnp.prod(windows, axis=0)
-    total = jnp.sum(complete)
-    square = jnp.sum(complete * jnp.sum((value[2] - guess) ** 2, axis=1) / share) / 3
-    return jnp.where(total > 0, square / jnp.where(total > 0, total, 1), jnp.inf)
-
-
-# The search for the best parameters: starts, Levenberg-Marquardt, and the choice between optima.
 
 # Parts of the recording that are fitted one after the other where the whole misleads at first.
 _PARTS = (0.1, 0.2, 0.35, 0.6, 1.0)
