@@ -27,14 +27,10 @@ from benchmarks.peers import stock_diffrax
 from benchmarks.peers.polhode_own import scene
 
 SIZES = {
-    "free": (10**3, 10**4, 10**5, 10**6, 10**7),
-    "heavy_top": (10**3, 10**4, 10**5, 10**6),
-    "lagrange": (10**3, 10**4, 10**5, 10**6),
-    "satellite": (10**3, 10**4, 10**5, 10**6),
-    "gradient": (10**3, 10**5, 10**6),
-    "near_symmetric": (10**6,),
-    "separatrix": (10**6,),
-    "dense": (10**4, 10**5),
+    "free": (10**3, 10**5, 10**6, 10**7),
+    "heavy_top": (10**3, 10**5, 10**6),
+    "satellite": (10**3, 10**5, 10**6),
+    "lagrange": (10**3, 10**5, 10**6),
 }
 QUICK = {"free": (1_000,), "lagrange": (1_000,), "satellite": (1_000,)}
 KNOWN = problems.PROBLEMS | {problems.SATELLITE.name: problems.SATELLITE}
@@ -161,7 +157,7 @@ def main() -> None:
         _report.write("accelerator", {"not_run": reason}, path=options.output)
         return
     rows, numbers = [], {}
-    for dtype in ("float32", "float64"):
+    for dtype in ("float64", "float32"):
         peak = numbers[dtype] = peaks(dtype, 2**22 if options.quick else 2**26)
         print(f"{dtype}: {peak['bytes_per_s']:.2e} bytes/s, {peak['flop_per_s']:.2e} flop/s")
         for family, sizes in (QUICK if options.quick else SIZES).items():

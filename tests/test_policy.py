@@ -8,6 +8,7 @@ import tomllib
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import jaxlib.version
 import numpy as np
 import pytest
@@ -134,6 +135,44 @@ def test_a_program_is_for_the_default_device(monkeypatch):
     for device in (jax.devices("cpu")[0], "cpu"):
         with jax.default_device(device):
             assert _policy.is_cpu()
+
+
+def loops(run) -> int:
+    """Loops of the program that moves 20,000 bodies more than of the one that moves 4."""
+    counts = []
+    for n in (20_000, 4):
+        omega = jax.ShapeDtypeStruct((n, 3), float)
+        counts.append(str(jax.make_jaxpr(run)(omega)).count("scan["))
+    return counts[0] - counts[1]
+
+
+def test_an_accelerator_moves_a_batch_side_by_side(monkeypatch):
+    """The chunks of a CPU, one after the other, took a hundred times as long on a GPU."""
+    body, axial = ph.Inertia.from_moments([1.0, 1.5, 2.0]), ph.Inertia.axisymmetric(1.0, 0.5)
+    clipped = ph.FeedbackTorque(lambda t, wxyz, omega: jnp.clip(-omega, -0.1, 0.1))
+    scenes = (
+        (ph.Scene(body), None),
+        (ph.Scene(axial, ph.UniformGravity.axial(1.0, 0.5)), None),
+        (ph.Scene(axial, torque=ph.LinearDamping(0.1)), ph.SymmetricTop()),
+        (ph.Scene(body, torque=clipped), None),
+    )
+
+    def run(scene, method):
+        def rates(omega):
+            wxyz = jnp.broadcast_to(jnp.array([0.5, 0.5, 0.5, -0.5]), (omega.shape[0], 4))
+            record = ph.Record(final_only=True, attitude=not isinstance(method, ph.SymmetricTop))
+            state = ph.State(wxyz, omega)
+            return ph.simulate(scene, state, [0.0, 1.0], method, record=record).omega_body
+
+        return rates
+
+    on_cpu = [loops(run(*case)) for case in scenes]
+    assert min(on_cpu) >= 1
+    monkeypatch.setattr(_policy, "platform", lambda: "gpu")
+    jax.clear_caches()
+    on_gpu = [loops(run(*case)) for case in scenes]
+    jax.clear_caches()
+    assert on_gpu == [0] * len(scenes)
 
 
 def scene_values() -> list[np.ndarray]:

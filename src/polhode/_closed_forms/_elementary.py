@@ -33,7 +33,7 @@ class SymmetricTop(AbstractChunkedForm):
     (``c = k I``) and no wheel, so that otherwise ``ph.Record(attitude=False)`` is needed.
     """
 
-    chunk: int = eqx.field(static=True, default=_policy.ELEMENTARY_CHUNK)
+    chunk: int | None = eqx.field(static=True, default=None)
 
     def why_not(self, scene: Scene) -> str | None:
         refusal = self.objection(scene) or symmetry_objection(scene) or wheel_objection(scene)
@@ -47,7 +47,7 @@ class SymmetricTop(AbstractChunkedForm):
         return torque_objection(scene) or (None if scene.inertia.is_principal else NOT_PRINCIPAL)
 
     def _chunk_size(self, n: int, count: int) -> int:
-        return bodies_per_chunk(self.chunk, n, count)
+        return _chunk_size(self.chunk, n, count)
 
     def _motion(self, scene, state, elapsed):
         n = state.wxyz.shape[0]
@@ -89,6 +89,11 @@ class SymmetricTop(AbstractChunkedForm):
         return wxyz, omega, holds
 
 
+def _chunk_size(chunk: int | None, n: int, count: int) -> int:
+    chosen = _policy.samples_at_once(_policy.ELEMENTARY_CHUNK)
+    return bodies_per_chunk(chosen if chunk is None else chunk, n, count)
+
+
 def _equal(a: Array, b: Array) -> Array:
     """Equal to a few units in the last place: ratios of what was meant to be proportional."""
     return jnp.abs(a - b) <= 4 * jnp.finfo(a.dtype).eps * jnp.abs(a)
@@ -104,7 +109,7 @@ class FixedAxis(AbstractChunkedForm):
     ``ph.Status.NOT_FINITE``: ``ph.simulate`` never chooses this method itself.
     """
 
-    chunk: int = eqx.field(static=True, default=_policy.ELEMENTARY_CHUNK)
+    chunk: int | None = eqx.field(static=True, default=None)
 
     def why_not(self, scene: Scene) -> str | None:
         return self.objection(scene) or "only numbers can lie along one principal axis"
@@ -117,7 +122,7 @@ class FixedAxis(AbstractChunkedForm):
         return torque_objection(scene)
 
     def _chunk_size(self, n: int, count: int) -> int:
-        return bodies_per_chunk(self.chunk, n, count)
+        return _chunk_size(self.chunk, n, count)
 
     def _motion(self, scene, state, elapsed):
         n = state.wxyz.shape[0]

@@ -88,7 +88,9 @@ class ClosedForm(AbstractClosedForm):
         if inertia.symmetry is Symmetry.NONE:
             requested["compensated"] = self.compensated
 
-        chunk, samples = _policy.FREE_CHUNK if self.chunk is None else self.chunk, t.shape[-1]
+        samples, chunk = t.shape[-1], self.chunk
+        if chunk is None:
+            chunk = _policy.samples_at_once(_policy.FREE_CHUNK)
         single_body = n == 1 and samples >= _policy.FREE_PAIR
         size, pieces = max(1, chunk // samples), n
         lanes = (of_inertia, wxyz, omega)
@@ -103,7 +105,7 @@ class ClosedForm(AbstractClosedForm):
             lanes = jax.tree.map(lambda x: jnp.repeat(x, pieces, axis=0), lanes)
         elif time_by_time:
             size = chunk_size(n)
-        elif n * samples >= _policy.FREE_PAIR:
+        elif _policy.is_cpu() and n * samples >= _policy.FREE_PAIR:
             size = min(size, -(-n // 2))
 
         def move(chunk):
@@ -267,7 +269,8 @@ def free_motion(
     def whole_motion(arguments, t):
         return evaluate(prepare(*arguments, compensated=compensated), t, **requested)
 
-    rows = max(1, _policy.FREE_CHUNK // max(t.shape[1] if t.ndim == 2 else 1, 1))
+    chunk = _policy.samples_at_once(_policy.FREE_CHUNK)
+    rows = max(1, chunk // max(t.shape[1] if t.ndim == 2 else 1, 1))
     return _chunked(kernel(whole_motion, linearised=True), parts, t, rows)
 
 
@@ -303,7 +306,7 @@ def chunk_size(count: int, largest: int = _policy.FREE_LANES) -> int:
 def _chunked(fn, parts, t, rows):
     """``fn(parts, t)``, ``rows`` bodies at a time where a processor has many to do."""
     lanes = parts[0][0]
-    if not _policy.is_chunked() or lanes.ndim != 1 or lanes.shape[0] < 2 * rows:
+    if lanes.ndim != 1 or lanes.shape[0] < 2 * rows:
         return fn(parts, t)
     count = lanes.shape[0]
     rows = chunk_size(count, rows)

@@ -90,9 +90,10 @@ class LagrangeTop(AbstractChunkedForm):
     def _chunk_size(self, n: int, count: int) -> int:
         if self.chunk is not None:
             return bodies_per_chunk(self.chunk, n, count)
-        if n * count <= _policy.TOP_WHOLE:
+        if n * count <= _policy.samples_at_once(_policy.TOP_WHOLE):
             return n
-        return max(1, min(_policy.TOP_BODIES, _policy.TOP_CHUNK // count))
+        largest = _policy.bodies_at_once(_policy.TOP_BODIES)
+        return max(1, min(largest, _policy.samples_at_once(_policy.TOP_CHUNK) // count))
 
     def _motion(self, scene, state, elapsed):
         n = state.wxyz.shape[0]

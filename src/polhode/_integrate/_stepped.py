@@ -224,7 +224,7 @@ class AbstractIntegration(AbstractMethod):
         network with its matrix products, as many as pay for the calls."""
         problem = self._problem(scene, state, ts, record, search)
         fits = is_holdable(problem.closed_jaxpr.jaxpr)
-        return _policy.KERNEL_BODIES if fits else _policy.LANES
+        return _policy.bodies_at_once(_policy.KERNEL_BODIES if fits else _policy.LANES)
 
     def search(
         self, scene: Scene, state: State, ts: Array, rtol: Array, search: Search, final_only: bool
