@@ -115,6 +115,8 @@ def machine(report: dict) -> str:
     flags = f", `XLA_FLAGS={report['flags']}`" if report["flags"] else ""
     threads = report.get("threads")
     model = f" ({about['model']})" if about.get("model") else ""
+    device = about.get("device", "cpu")
+    model += "" if device == "cpu" else f" and one {device}"
     return (
         f"`{report['command']}` on {about['processor']}{model}, {about['system']},"
         f" {about.get('memory_GB', '?')} GB, {threads} core{'s' if threads != 1 else ''} of a"
@@ -699,8 +701,10 @@ SECTIONS = {
     "accelerator": Section(
         "Accelerators",
         "Free bodies, tops and satellites on a GPU or TPU, with the shares of its memory bandwidth"
-        " and arithmetic peak, beside diffrax: `python -m benchmarks.accelerator`, or with"
-        ' `--quick` in a minute or two. The result is "not run" where JAX finds no accelerator.',
+        " and arithmetic peak (those that two small programs reach), beside diffrax: `python -m"
+        ' benchmarks.accelerator`, or with `--quick` in a minute or two. The result is "not run"'
+        " where JAX finds no accelerator. Where `equal error` is false, no tolerance of diffrax"
+        " reaches the error of polhode in that precision.",
     ),
     "scaling": Section(
         "Scaling",

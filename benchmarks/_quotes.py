@@ -297,6 +297,27 @@ def _() -> str:
     return number(max(row["over_worst"] or 0.0 for row in rows if row["dtype"] == "float32"))
 
 
+# Accelerators
+
+
+@_quote("accelerator")
+def _() -> str:
+    report = read("accelerator")
+    times: dict[tuple, dict] = {}
+    for row in report["numbers"]["rows"]:
+        if row["bodies"] in (10**3, 10**5, 10**6):
+            of_row = times.setdefault((row["title"], row["bodies"]), {})
+            of_row[row["program"], row["dtype"]] = row["ns_per_body"] * row["bodies"] / 1e6
+    columns = ("polhode", "float64"), ("polhode", "float32"), ("diffrax", "float64")
+    header = ["scene", "bodies", *(f"{program}, {dtype}" for program, dtype in columns)]
+    lines = [
+        [title, f"{bodies:,}", *(number(of_row[key]) if key in of_row else "–" for key in columns)]
+        for (title, bodies), of_row in times.items()
+    ]
+    device = f"milliseconds on one {report['machine']['device']}, jax {report['versions']['jax']}"
+    return _block(markdown(header, lines), f"({device}; {command(report)})")
+
+
 # Fits
 
 
