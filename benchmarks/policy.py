@@ -69,6 +69,7 @@ CASES: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "TOP_BODIES": ((32, 512), ("Lagrange's tops, 20 times",)),
     "ELEMENTARY_CHUNK": ((2**11, 2**17), ("damped symmetric bodies, 100 times",)),
     "ACCELERATOR_SAMPLES": ((2**13, 2**20), ("free bodies", "Lagrange's tops")),
+    "BRIEF_FIT": ((0, 10**9), ("fits",)),
     "FIT_SAMPLES": ((128, 8192), ("fits",)),
     "SAVE_SAMPLES": ((2**15, 2**22), ("saved function of free bodies", "saved function of tops")),
     "ACCELERATOR_SAVE_SAMPLES": ((2**18,), ("saved function of tops",)),

@@ -160,6 +160,10 @@ Lagrange's tops 300 times; all at once, tops twice as long in float64."""
 
 # Fits.
 
+BRIEF_FIT = 2**13
+"""[samples] Of recordings whose fit, outside of a compiled function, is compiled without the
+optimisations of LLVM: it takes at most a second, and they take more."""
+
 FIT_SAMPLES = 1024
 """[samples] Of recordings that are fitted side by side on a CPU."""
 

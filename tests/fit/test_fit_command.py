@@ -2,13 +2,14 @@
 
 import json
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from polhode.cli import main
 from polhode.fit import SteppedMotion
-from polhode.fit._numerics import _is_single_use, compiled, single_use_programs
+from polhode.fit._numerics import compiled
 
 
 @pytest.fixture
@@ -136,15 +137,14 @@ def test_a_missing_file_is_an_error(tmp_path, capsys):
     assert "none.csv" in capsys.readouterr().err
 
 
-def test_programs_for_a_single_run_give_the_same():
-    @compiled
+def test_programs_for_brief_fits_give_the_same():
     def function(x):
         return jnp.sin(x) @ jnp.linspace(0.0, 1.0, 5)
 
-    x = jnp.arange(5.0)
-    with single_use_programs():
-        once = function(x)
-        assert _is_single_use.get()
-    assert not _is_single_use.get()
-    np.testing.assert_allclose(once, function(x), rtol=1e-14)
-    np.testing.assert_allclose(once, np.sin(np.arange(5.0)) @ np.linspace(0, 1, 5), rtol=1e-14)
+    x, asked = jnp.arange(5.0), []
+    for is_brief in (True, False):
+        run = compiled(lambda x, is_brief=is_brief: asked.append(x.size) or is_brief)(function)
+        expected = np.sin(np.arange(5.0)) @ np.linspace(0, 1, 5)
+        np.testing.assert_allclose(run(x), expected, rtol=1e-14)
+        np.testing.assert_allclose(jax.jit(run)(x), expected, rtol=1e-14)
+    assert asked == [5, 5]  # not where the fit is a part of another program

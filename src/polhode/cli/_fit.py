@@ -217,14 +217,12 @@ def _fit(
 
     jax.config.update("jax_enable_x64", True)
     from polhode import fit as fits
-    from polhode.fit._numerics import single_use_programs
 
     loaded = _read(path, names, options)
     show(f"fitting {loaded.recording.times.shape[-1]} samples (compiling first)")
     fit_options = _fit_options(options)
     try:
-        with single_use_programs():
-            result = fits.fit_recordings([loaded.recording], throw=False, options=fit_options)
+        result = fits.fit_recordings([loaded.recording], throw=False, options=fit_options)
     except ValueError as error:  # the recording does not suit the options
         raise UsageError(f"{path}: {error}") from error
     check_signals()

@@ -16,7 +16,7 @@ from polhode._method import AbstractMethod
 from polhode._scene import Scene
 from polhode._scene._scene import places_of
 from polhode.fit._conclude import conclude, conclude_scene
-from polhode.fit._model import LeafMotion, NoInertia
+from polhode.fit._model import FreeMotion, LeafMotion, NoInertia, SteppedMotion
 from polhode.fit._numerics import compiled
 from polhode.fit._options import FitOptions, Gyroscope, calibrate, check_usable, checked_options
 from polhode.fit._recording import Recording, stack
@@ -155,13 +155,19 @@ def windows(recording: Recording, length: int) -> list[Recording]:
     return [jax.tree.map(lambda leaf, cut=cut: leaf[cut], recording) for cut in cuts]
 
 
-@compiled
+def _is_brief(recording: Recording, options: FitOptions, *_: Any) -> bool:
+    """Few samples of a motion whose time follows from their number; that of a scene does not."""
+    is_bounded = isinstance(options.motion, FreeMotion | SteppedMotion | None)
+    return is_bounded and recording.times.size <= _policy.BRIEF_FIT
+
+
+@compiled(_is_brief)
 def fit_together(recording: Recording, options: FitOptions, conclude: Callable = conclude) -> Any:
     """One body from its recordings (leading axis); ``conclude`` makes the result."""
     return _fit_one(recording, options, conclude)
 
 
-@compiled
+@compiled(_is_brief)
 def fit_each(recording: Recording, options: FitOptions, conclude: Callable = conclude) -> Any:
     """Fits of all bodies (leading axes), one recording each, in one compiled call."""
     batch = recording.batch_shape

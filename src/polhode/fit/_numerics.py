@@ -1,9 +1,7 @@
 """Linear algebra, least-squares steps, a Runge-Kutta rule and compiler options of fits."""
 
-import contextlib
-import contextvars
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import diffrax
@@ -24,38 +22,35 @@ from polhode import _policy
 # XLA's older way to emit loops: for what a fit does the program is as fast and compiles in half the
 # time. The jaxlib of jax 0.10 knows the option, that of 0.12 no longer.
 _OPTIONS: dict[str, Any] = {"compiler_options": {"xla_cpu_use_fusion_emitters": False}}
-# Without LLVM's optimisations the program of one recording compiles in 6 s of processor time
-# instead of 11, and runs 3.6 times as long: worthwhile for a fit of milliseconds that runs once.
-_SINGLE_USE: dict[str, Any] = {
+# Without LLVM's optimisations the first fit of a recording takes 12 s of processor time in place of
+# 18, and every later one of 400 samples 34 ms in place of 8.
+_BRIEF: dict[str, Any] = {
     "compiler_options": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
 }
-_is_single_use: contextvars.ContextVar[bool] = contextvars.ContextVar("single_use", default=False)
 
 
-@contextlib.contextmanager
-def single_use_programs() -> Iterator[None]:
-    """Compile the fits of this context for a single run."""
-    token = _is_single_use.set(True)
-    try:
-        yield
-    finally:
-        _is_single_use.reset(token)
+def compiled(is_brief: Callable[..., bool]) -> Callable[[Callable], Callable]:
+    """``eqx.filter_jit`` that compiles faster on processors, where this is the outermost jit.
 
+    ``is_brief``: whether a call with these arguments takes so little time that the program need not
+    be optimised.
+    """
 
-def compiled(function: Callable) -> Callable:
-    """``eqx.filter_jit`` that compiles faster on processors, where this is the outermost jit."""
-    nested_jit = eqx.filter_jit(function)
-    outermost = eqx.filter_jit(function, **_OPTIONS)
-    single_use = eqx.filter_jit(function, **_SINGLE_USE)
+    def decorate(function: Callable) -> Callable:
+        nested_jit = eqx.filter_jit(function)
+        outermost = eqx.filter_jit(function, **_OPTIONS)
+        brief = eqx.filter_jit(function, **_BRIEF)
 
-    @functools.wraps(function)
-    def call(*args):
-        traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(args))
-        if traced or not _options_are_supported():
-            return nested_jit(*args)
-        return (single_use if _is_single_use.get() else outermost)(*args)
+        @functools.wraps(function)
+        def call(*args):
+            traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(args))
+            if traced or not _options_are_supported():
+                return nested_jit(*args)
+            return (brief if is_brief(*args) else outermost)(*args)
 
-    return call
+        return call
+
+    return decorate
 
 
 @functools.cache
@@ -64,7 +59,7 @@ def _options_are_supported() -> bool:
     if not _policy.is_cpu() or _policy.is_plain():
         return False
     try:
-        jax.jit(lambda x: -x, **_SINGLE_USE)(1.0)
+        jax.jit(lambda x: -x, **_BRIEF)(1.0)
     except (JaxRuntimeError, ValueError):
         return False
     return True
