@@ -120,8 +120,7 @@ class Trajectory(eqx.Module):
         self._wxyz, self._omega_body = wxyz, omega_body
         self._work, self._error, self._motor_work = work, error, motor_work
         self._spins, self.propagator, self._event_time = spins, propagator, event_time
-        self._events = events
-        self._saved, self._final = saved, final
+        self._events, self._saved, self._final = events, saved, final
 
     def __str__(self) -> str:
         """Size, status and steps, for ``print``; under ``jit`` the shapes of all arrays."""
@@ -157,8 +156,7 @@ class Trajectory(eqx.Module):
         event_time: Array | None,
         events: Events | None = None,
     ) -> "Trajectory":
-        """The same motion with other samples: attitude, rates and, if there are coupled wheels,
-        their momenta."""
+        """The same motion with other samples: attitude, rates, momenta of coupled wheels."""
         wxyz, omega, *spins = samples
         return Trajectory(
             ts,
@@ -192,10 +190,9 @@ class Trajectory(eqx.Module):
     def step_counts(self) -> StepCounts:
         """How many steps (...) each body took, and what kept them short.
 
-        Many refused ones: the motion changes abruptly. Many at switches: a torque changes
-        sides often; smooth it, or loosen the limit that it meets. Many at saved times: save fewer.
-        Many limited by stability: something decays fast; weaken it, or take an implicit method.
-        Zero for closed forms.
+        Many refused ones: the motion changes abruptly. At switches: a torque changes sides often;
+        smooth it, or loosen the limit that it meets. At saved times: save fewer. Limited by
+        stability: something decays fast; weaken it, or take an implicit method. Closed forms: 0.
         """
         return self._steps
 
