@@ -19,7 +19,7 @@ import jaxlib.version
 # Versions of jaxlib. ``python tests/versions.py next`` tests the newest one that exists: where it
 # passes, add it here, and raise the upper bound of jax in pyproject.toml to its minor version.
 
-FUSED_JAXLIB = ("0.10.0", "0.10.1", "0.10.2")
+FUSED_JAXLIB = ("0.10.0", "0.10.1", "0.10.2", "0.11.2", "0.12.0.1")
 """[versions] Those on which fused kernels, which rest on undocumented attributes of XLA, have been
 tested. All optimisations are off on others."""
 

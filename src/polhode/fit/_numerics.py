@@ -17,16 +17,14 @@ from jaxtyping import Array
 
 from polhode import _policy
 
-# Faster compilation of fits, where the compiler has the option.
+# Faster compilation of fits, by options of the compiler.
 
 # XLA's older way to emit loops: for what a fit does the program is as fast and compiles in half the
 # time. The jaxlib of jax 0.10 knows the option, that of 0.12 no longer.
-_OPTIONS: dict[str, Any] = {"compiler_options": {"xla_cpu_use_fusion_emitters": False}}
+_OLDER_LOOPS = {"xla_cpu_use_fusion_emitters": False}
 # Without LLVM's optimisations the first fit of a recording takes 12 s of processor time in place of
 # 18, and every later one of 400 samples 34 ms in place of 8.
-_BRIEF: dict[str, Any] = {
-    "compiler_options": {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
-}
+_BRIEF = {"xla_backend_optimization_level": 0}
 
 
 def compiled(is_brief: Callable[..., bool]) -> Callable[[Callable], Callable]:
@@ -38,15 +36,19 @@ def compiled(is_brief: Callable[..., bool]) -> Callable[[Callable], Callable]:
 
     def decorate(function: Callable) -> Callable:
         nested_jit = eqx.filter_jit(function)
-        outermost = eqx.filter_jit(function, **_OPTIONS)
-        brief = eqx.filter_jit(function, **_BRIEF)
+
+        @functools.cache
+        def outermost_jit(brief: bool) -> Callable:
+            wanted = _OLDER_LOOPS | (_BRIEF if brief else {})
+            known = {name: value for name, value in wanted.items() if _is_known(name, value)}
+            return eqx.filter_jit(function, compiler_options=known)
 
         @functools.wraps(function)
         def call(*args):
             traced = any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(args))
-            if traced or not _options_are_supported():
+            if traced or not _policy.is_cpu() or _policy.is_plain():
                 return nested_jit(*args)
-            return (brief if is_brief(*args) else outermost)(*args)
+            return outermost_jit(is_brief(*args))(*args)
 
         return call
 
@@ -54,12 +56,10 @@ def compiled(is_brief: Callable[..., bool]) -> Callable[[Callable], Callable]:
 
 
 @functools.cache
-def _options_are_supported() -> bool:
-    """Whether this jaxlib knows the options."""
-    if not _policy.is_cpu() or _policy.is_plain():
-        return False
+def _is_known(name: str, value: Any) -> bool:
+    """Whether this jaxlib knows an option."""
     try:
-        jax.jit(lambda x: -x, **_BRIEF)(1.0)
+        jax.jit(lambda x: -x, compiler_options={name: value})(1.0)
     except (JaxRuntimeError, ValueError):
         return False
     return True
