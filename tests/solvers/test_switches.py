@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.extend.core import Primitive
 from scipy.integrate import solve_ivp
 
 import polhode as ph
@@ -91,6 +92,18 @@ def test_what_cannot_be_looked_into_is_named():
     state = ph.State(WXYZ, OMEGA)
     assert "contains while" in str(ph.explain(scene, state, TS))
     assert ph.simulate(scene, state, TS[:3]).successful
+
+
+def test_an_unknown_operation_that_makes_integers_is_named():
+    """Newer versions of JAX have new ones: their jumps must not pass unseen."""
+    counted = Primitive("counted")
+    counted.def_impl(lambda x: jnp.sum(x > 0))
+    counted.def_abstract_eval(lambda x: jax.core.ShapedArray((), jnp.int32))
+    found = program(lambda x: counted.bind(x) * x, jnp.ones(3))
+    assert found.hidden_operations == ("counted",)
+    # pivots are integers, too, but what is solved with them does not jump
+    solved = program(lambda x: jnp.linalg.solve(jnp.outer(x, x) + jnp.eye(3), x), jnp.ones(3))
+    assert not solved.hidden_operations
 
 
 @pytest.mark.parametrize("torque", [1e-2, 1e-3])

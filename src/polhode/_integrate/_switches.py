@@ -35,6 +35,15 @@ _OPAQUE = _NOT_DIFFERENTIABLE | frozenset(
 )
 """Operations whose switches are not found: ``Switched.hidden_operations`` names them."""
 
+_CONSTANT = frozenset(("eq", "ne", "is_finite"))
+"""Comparisons that turn at single points of a motion, or in one that has failed."""
+
+_PIVOTED = frozenset(("lu",))
+"""Operations with integers among their results, of which what is solved with them is smooth."""
+
+_COMPOSED = "call_hi_primitive"
+"""Operations that are programs of others, as ``jnp.searchsorted`` from JAX 0.12 on."""
+
 _SORTED = 16
 """Most numbers that are sorted by comparisons of pairs."""
 
@@ -192,6 +201,8 @@ def _may_switch(jaxpr) -> bool:
             continue
         if name in _ORDERED | _ROUNDED | _OTHERS | _SORTS | _OPAQUE:
             return True
+        if name == _COMPOSED or _is_step(eqn):
+            return True
         if name == "convert_element_type" and _to_integer(eqn):
             return True
         if any(_may_switch(subjaxpr) for subjaxpr in _subjaxprs(eqn)):
@@ -208,6 +219,15 @@ def _subjaxprs(eqn):
 
 def _is_float(x) -> bool:
     return jnp.issubdtype(x.aval.dtype, jnp.floating)
+
+
+def _is_step(eqn) -> bool:
+    """Whether an operation that is not known here makes integers of floats: it must jump."""
+    name = eqn.primitive.name
+    if name in _CONSTANT | _CALLS | _OPAQUE | _PIVOTED or any(True for _ in _subjaxprs(eqn)):
+        return False
+    makes_integers = any(not _is_float(v) for v in eqn.outvars)
+    return makes_integers and any(_is_float(v) for v in eqn.invars)
 
 
 def _to_integer(eqn) -> bool:
@@ -247,6 +267,8 @@ class _Walk:
             return self._scan(eqn, operands)
         if moves and name == "cond" and any(map(_may_switch, _subjaxprs(eqn))):
             return self._cond(eqn, operands)
+        if moves and name == _COMPOSED:
+            return self._expanded(eqn, operands)
         if (
             moves
             and name in _OPAQUE
@@ -258,8 +280,10 @@ class _Walk:
             outputs = self._switch(eqn, name, x)
             if outputs is not None:
                 return outputs
+            if _is_step(eqn):
+                self.hidden_operations.append(name)
         out = _bind(eqn, x)
-        is_constant = name in ("eq", "ne", "is_finite")
+        is_constant = name in _CONSTANT
         return [(o, moves and not is_constant) for o in out]
 
     def _switch(self, eqn, name, x):
@@ -394,6 +418,16 @@ class _Walk:
             return self.jaxpr(subjaxpr.jaxpr, subjaxpr.consts, operands)
         return self.jaxpr(subjaxpr, (), operands)
 
+    def _expanded(self, eqn, operands):
+        """The program that an operation stands for."""
+        operation = eqn.params["_prim"]
+
+        def program(*x):
+            return jax.tree.leaves(operation.expand(*operation.in_tree.unflatten(x)))
+
+        closed_jaxpr = jax.make_jaxpr(program)(*(value for value, _ in operands))
+        return self.jaxpr(closed_jaxpr.jaxpr, closed_jaxpr.consts, operands)
+
     def _cond(self, eqn, operands):
         """All branches, of which the index picks one."""
         (index, _), branch_operands = operands[0], operands[1:]
@@ -410,7 +444,10 @@ class _Walk:
     def _scan(self, eqn, operands):
         """The turns of a loop one after another: its switches are those of all turns."""
         body, length = eqn.params["jaxpr"], eqn.params["length"]
-        const_count, carry_count = eqn.params["num_consts"], eqn.params["num_carry"]
+        if "num_consts" in eqn.params:
+            const_count, carry_count = eqn.params["num_consts"], eqn.params["num_carry"]
+        else:  # from JAX 0.11 on
+            const_count, carry_count, _ = (len(part.vals) for part in eqn.params["ft_in"].unpack())
         consts, carry, rows = (
             operands[:const_count],
             operands[const_count : const_count + carry_count],
