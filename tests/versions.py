@@ -4,10 +4,11 @@ Each set has an environment of its own beside the checkout, ``.venv-lowest`` and
 made with the interpreter that runs this file (JAX from 0.11 on needs Python 3.12) and holding every
 extra; name one set to run it alone. The lowest set is read from pyproject.toml.
 
-``python tests/versions.py next`` installs the newest JAX that exists, beyond the upper bound, and
-runs smoke.py and the functions that XLA folds away with fused kernels requested. Where both pass,
-the version may be added to ``FUSED_JAXLIB`` in ``src/polhode/_policy.py``, which is the table of
-versions on which fused kernels are used, and the bound raised.
+``python tests/versions.py next`` installs the newest JAX that exists, beyond the upper bound. With
+fused kernels requested it runs smoke.py, the functions that XLA folds away, and the tests that
+depend on JAX's own operations: kernels and switches of programs. Where they pass, add the version
+to ``FUSED_JAXLIB`` in ``src/polhode/_policy.py``, which is the table of versions on which fused
+kernels are used, raise the bound, and run all tests.
 """
 
 import os
@@ -19,11 +20,14 @@ import venv
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+OF_OPERATIONS = ("tests/xla", "tests/solvers/test_switches.py")
+"""Tests of what polhode does with the operations that a program of JAX consists of."""
 
 
 def floors() -> list[str]:
     """``name==version`` of the dependencies and of those of every extra, at the floors."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    project = PROJECT["project"]
     needs = {*project["dependencies"]}.union(*project["optional-dependencies"].values())
     needs = sorted(need for need in needs if not need.startswith("polhode["))
     found = [re.fullmatch(r"([\w-]+)>=([\d.]+)(,<[\d.]+)?", need) for need in needs]
@@ -42,16 +46,18 @@ def run(name: str) -> int:
     pins = floors() if name == "lowest" else ["--upgrade", "--upgrade-strategy", "eager"]
     install = [str(python), "-m", "pip", "install", "--quiet"]
     subprocess.run([*install, f"{ROOT}[all]", *pins], check=True)
-    environment, scripts = dict(os.environ), ["smoke.py"]
+    environment, commands = dict(os.environ), [["tests/smoke.py"]]
     if name == "next":
+        subprocess.run([*install, *PROJECT["dependency-groups"]["test"]], check=True)
         subprocess.run([*install, "--upgrade", "--no-deps", "jax", "jaxlib"], check=True)
         environment["POLHODE_PLAIN"] = "0"
-        scripts.append("xla/folding_units.py")
+        commands.append(["tests/xla/folding_units.py"])
+        commands.append(["-m", "pytest", "-q", "-m", "not slow", *OF_OPERATIONS])
     codes = []
-    for script in scripts:
-        print(f"{name}, {script}: ", end="", flush=True)
-        command = [str(python), str(ROOT / "tests" / script)]
-        codes.append(subprocess.run(command, env=environment).returncode)
+    for command in commands:
+        print(f"{name}, {' '.join(command)}: ", end="", flush=True)
+        done = subprocess.run([str(python), *command], env=environment, cwd=ROOT)
+        codes.append(done.returncode)
     return max(codes)
 
 
