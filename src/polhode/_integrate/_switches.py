@@ -224,15 +224,20 @@ def _is_float(x) -> bool:
 def _is_step(eqn) -> bool:
     """Whether an operation that is not known here makes integers of floats: it must jump."""
     name = eqn.primitive.name
+    if name == "convert_element_type":  # to integers: known; to bool: as ``ne``
+        return False
     if name in _CONSTANT | _CALLS | _OPAQUE | _PIVOTED or any(True for _ in _subjaxprs(eqn)):
         return False
-    makes_integers = any(not _is_float(v) for v in eqn.outvars)
-    return makes_integers and any(_is_float(v) for v in eqn.invars)
+    makes_steps = any(v.aval.dtype == bool or _is_integer(v.aval.dtype) for v in eqn.outvars)
+    return makes_steps and any(_is_float(v) for v in eqn.invars)
 
 
 def _to_integer(eqn) -> bool:
-    new_dtype = eqn.params["new_dtype"]
-    return _is_float(eqn.invars[0]) and jnp.issubdtype(new_dtype, jnp.integer)
+    return _is_float(eqn.invars[0]) and _is_integer(eqn.params["new_dtype"])
+
+
+def _is_integer(dtype) -> bool:
+    return jnp.issubdtype(dtype, jnp.integer)
 
 
 class _Walk:
