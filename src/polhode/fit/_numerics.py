@@ -41,7 +41,8 @@ def compiled(is_brief: Callable[..., bool]) -> Callable[[Callable], Callable]:
         def outermost_jit(brief: bool) -> Callable:
             wanted = _OLDER_LOOPS | (_BRIEF if brief else {})
             known = {name: value for name, value in wanted.items() if _is_known(name, value)}
-            return eqx.filter_jit(function, compiler_options=known)
+            options: dict[str, Any] = {"compiler_options": known}
+            return eqx.filter_jit(function, **options)
 
         @functools.wraps(function)
         def call(*args):
