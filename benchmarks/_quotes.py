@@ -303,6 +303,8 @@ def _() -> str:
 @_quote("accelerator")
 def _() -> str:
     report = read("accelerator")
+    if reason := report["numbers"].get("not_run"):
+        return f"not run: {reason}"
     times: dict[tuple, dict] = {}
     for row in report["numbers"]["rows"]:
         if row["bodies"] in (10**3, 10**5, 10**6):

@@ -251,6 +251,11 @@ def samples_at_once(chunk: int) -> int:
     return chunk if is_cpu() else ACCELERATOR_SAMPLES
 
 
+def is_paired(samples: int) -> bool:
+    """Whether free bodies are divided into two chunks at least: on a CPU."""
+    return is_cpu() and samples >= FREE_PAIR
+
+
 def bodies_at_once(lanes: int) -> int:
     """Bodies that are integrated side by side: ``lanes`` on a CPU."""
     return lanes if is_cpu() else ACCELERATOR_BODIES

@@ -105,7 +105,7 @@ class ClosedForm(AbstractClosedForm):
             lanes = jax.tree.map(lambda x: jnp.repeat(x, pieces, axis=0), lanes)
         elif time_by_time:
             size = chunk_size(n)
-        elif _policy.is_cpu() and n * samples >= _policy.FREE_PAIR:
+        elif _policy.is_paired(n * samples):
             size = min(size, -(-n // 2))
 
         def move(chunk):

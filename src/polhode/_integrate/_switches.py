@@ -223,13 +223,13 @@ def _is_float(x) -> bool:
 
 def _is_step(eqn) -> bool:
     """Whether an operation that is not known here makes integers of floats: it must jump."""
+    if not any(v.aval.dtype == bool or _is_integer(v.aval.dtype) for v in eqn.outvars):
+        return False
     name = eqn.primitive.name
-    if name == "convert_element_type":  # to integers: known; to bool: as ``ne``
+    # a conversion to integers is known, and one to bool is as ``ne``
+    if name == "convert_element_type" or name in _CONSTANT | _CALLS | _OPAQUE | _PIVOTED:
         return False
-    if name in _CONSTANT | _CALLS | _OPAQUE | _PIVOTED or any(True for _ in _subjaxprs(eqn)):
-        return False
-    makes_steps = any(v.aval.dtype == bool or _is_integer(v.aval.dtype) for v in eqn.outvars)
-    return makes_steps and any(_is_float(v) for v in eqn.invars)
+    return any(map(_is_float, eqn.invars)) and not any(True for _ in _subjaxprs(eqn))
 
 
 def _to_integer(eqn) -> bool:
@@ -285,8 +285,8 @@ class _Walk:
             outputs = self._switch(eqn, name, x)
             if outputs is not None:
                 return outputs
-            if _is_step(eqn):
-                self.hidden_operations.append(name)
+        if moves and _is_step(eqn):
+            self.hidden_operations.append(name)
         out = _bind(eqn, x)
         is_constant = name in _CONSTANT
         return [(o, moves and not is_constant) for o in out]
