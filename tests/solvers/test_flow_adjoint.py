@@ -276,38 +276,67 @@ def drawn_together(t, y, args):
 
 @pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
 @pytest.mark.slow
-def test_parts_keep_the_way_back_from_states_drawn_together(mode):
+def test_saved_times_keep_the_way_back_from_states_drawn_together(mode):
     """Like exp(-28): in one part the start would be found with exp(28) times the rounding."""
-    span = jnp.array([0.0, 4.0])
+    span = 4.0
 
     def exact(p):
         a, c, v0 = p
         k = jnp.arctanh(v0 / c)
-        log = [jnp.log(jnp.cosh(x)) for x in (a * c * span[1] + k, k)]
+        log = [jnp.log(jnp.cosh(x)) for x in (a * c * span + k, k)]
         return (log[0] - log[1]) / a
 
-    def angle(p, parts):
+    def angle(p, intervals):
         a, c, v0 = p
         y0 = jnp.zeros(1), v0[None]
-        end = diffrax.diffeqsolve(
+        ts = jnp.linspace(0, span, intervals + 1)
+        saved = diffrax.diffeqsolve(
             diffrax.ODETerm(drawn_together),
-            Extrapolation(None, accuracy=Accuracy(1e-12, 4.0)),
-            *span,
+            Extrapolation(None, accuracy=Accuracy(1e-12, span)),
+            ts[0],
+            ts[-1],
             None,
             y0,
             (a, c),
-            stepsize_controller=diffrax.StepTo(span),
-            adjoint=FlowAdjoint(parts=parts),
-            max_steps=1,
+            stepsize_controller=diffrax.StepTo(ts),
+            saveat=diffrax.SaveAt(steps=True),
+            adjoint=FlowAdjoint(),
+            max_steps=intervals,
         )
-        return end.ys[0][0, 0]
+        return saved.ys[0][-1, 0]
 
     p = jnp.array([1.75, 2.0, 0.5])
     want = jax.grad(exact)(p)
-    found = [jax.jit(mode(partial(angle, parts=parts)))(p) for parts in (1, 8)]
+    found = [jax.jit(mode(partial(angle, intervals=n)))(p) for n in (1, 8)]
     np.testing.assert_allclose(found[1], want, rtol=1e-9)
     if mode is jax.jacrev:
-        assert np.isnan(found[0]).all()  # what the parts are for
+        assert np.isnan(found[0]).all()  # what the saved times are for
+
+
+@pytest.mark.parametrize("final_only", [True, False])
+@pytest.mark.parametrize("times", [[0.0, 4.0], [0.0, 1.0, 2.5, 4.0]])
+def test_a_damped_batch_is_followed_back(times, final_only):
+    """Spheres that stop like exp(-28), by a gain that the torque closes over; a plain call takes
+    no step more for it."""
+    n, ts = 70, jnp.array(times)
+    omega = 1 + jax.random.uniform(jax.random.key(1), (n, 3))
+    state = ph.State(jnp.broadcast_to(jnp.array([1.0, 0, 0, 0]), (n, 4)), omega)
+    record = ph.Record(final_only=final_only)
+
+    def rates(gain):
+        drag = ph.FeedbackTorque(lambda t, wxyz, omega_body: -gain * omega_body)
+        scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.0, 1.0]), torque=drag)
+        trajectory = ph.simulate(scene, state, ts, record=record)
+        return trajectory.omega_body[:, -1], trajectory.steps
+
+    gain = jnp.array(7.0)
+    plain, steps = jax.jit(rates)(gain)
+    value, pull, steps_with_slopes = jax.jit(lambda k: jax.vjp(rates, k, has_aux=True))(gain)
+    want = omega * jnp.exp(-gain * 4)
+    np.testing.assert_allclose(plain, want, atol=1e-8)
+    np.testing.assert_allclose(value, want, atol=1e-8)
+    np.testing.assert_allclose(pull(jnp.ones((n, 3)))[0], -4 * jnp.sum(want), rtol=1e-5)
+    assert jnp.all(steps_with_slopes > steps)
 
 
 def test_what_cannot_be_differentiated_is_refused():

@@ -32,9 +32,9 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
 
     - ``rtol``: error of the derivatives relative to their size; None: that of the solver's
       ``accuracy``, or else 1e-9 in float64 and 1e-5 in float32.
-    - ``parts``: a field that contracts, as drag does, amplifies errors of the backward integration
-      by exp(rate of contraction * time). The backward integration restarts at every saved time, and
-      at the beginnings of at least this many equal parts of the time span.
+    - A field that contracts, as drag does, amplifies errors of the backward integration by
+      exp(rate of contraction * time). It restarts at every saved time; where torques act,
+      ``ph.simulate`` sees to it that there are eight.
     - The state: arrays of one shape, whose entries are bodies that the field treats separately.
     - Saved: the state itself, at the start, at given times, at the steps of ``diffrax.StepTo``, or
       at the end. Of several ``SubSaveAt`` the first is differentiated. Not for events.
@@ -46,7 +46,6 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
     """
 
     rtol: Array | float | None = None
-    parts: int = eqx.field(static=True, default=1)
 
     def loop(
         self,
@@ -127,7 +126,7 @@ class FlowAdjoint(diffrax.AbstractAdjoint):
             times.shape[0], saved_states[0].shape[0]
         )  # rooms for more steps stay as they are
         states = [x[:count] for x in saved_states]
-        path = path_of(equations, self.parts, c, leaves, t0, times[:count], states)
+        path = path_of(equations, c, leaves, t0, times[:count], states)
         path = [jnp.concatenate([x, s[count:]]) for x, s in zip(path, saved_states)]
         ys = jax.tree.unflatten(tree, path)
         state = eqx.tree_at(lambda s: _first_sub(s.save_state).ys, state, ys)
@@ -170,7 +169,7 @@ def _saved_times(saveat, controller, event, t0, t1) -> Array | None:
     return jnp.concatenate(times)
 
 
-def path_of(equations: Equations, parts: int, c, y0, t0, times, states):
+def path_of(equations: Equations, c, y0, t0, times, states):
     """The states saved, with the derivatives of the flow."""
     size = len(y0)
 
@@ -182,7 +181,6 @@ def path_of(equations: Equations, parts: int, c, y0, t0, times, states):
             for i, x in zip(at, parameters):
                 inputs[i] = x
             t0, times, start, c = inputs[0], inputs[1], inputs[2 : 2 + size], inputs[2 + size :]
-            interval_parts = -(-parts // times.shape[0])
             # what was never reached is nothing to follow
             times = jnp.where(jnp.isfinite(times), times, jax.lax.stop_gradient(t0))
             horizon = jax.lax.stop_gradient(jnp.max(jnp.abs(times - t0)))
@@ -190,7 +188,7 @@ def path_of(equations: Equations, parts: int, c, y0, t0, times, states):
 
             def across(y, interval):
                 start, end, end_state = interval
-                y = equations.follow(c, y, start, end, horizon, end_state, interval_parts)
+                y = equations.follow(c, y, start, end, horizon, end_state)
                 return y, y
 
             _, later = jax.lax.scan(across, start, (starts, times, list(states)))

@@ -210,8 +210,8 @@ def equations_of(
 class Equations:
     """A field f(c, t, y), and the derivatives of its solutions.
 
-    ``follow(c, y, t0, t1, horizon, end, parts)``: ``end``, the solution at t1 found by other
-    means, with its derivatives; the whole way takes ``horizon``.
+    ``follow(c, y, t0, t1, horizon, end)``: ``end``, the solution at t1 found by other means, with
+    its derivatives; the whole way takes ``horizon``.
     """
 
     def __init__(self, jaxpr, counts, size, costate, control_tree, compensated, keeps_rtol):
@@ -230,14 +230,14 @@ class Equations:
         consts, _, arrays, _ = self._parts(c)
         return jaxpr_as_fun(ClosedJaxpr(self.jaxpr, consts))(t, *y, *arrays)
 
-    def prepare(self, c: Sequence[Any], t, y: Sequence[Any], stage: bool = False):
+    def prepare(self, c: Sequence[Any], t, y: Sequence[Any]):
         """Coefficients, rates ``run(coefficients, t, *y)`` and ``by_entry``: see
         ``xla.Specialised``."""
         size = len(c)
         closed_jaxpr = jax.make_jaxpr(lambda *x: self.field(x[:size], x[size], x[size + 1 :]))(
             *c, t, *y
         )
-        coefficients, run, _, by_entry = specialise(closed_jaxpr, c, stage=stage)
+        coefficients, run, _, by_entry = specialise(closed_jaxpr, c, stage=False)
         return coefficients, run, by_entry
 
     def back(self, c: Sequence[Any], t, z: Sequence[Any]) -> tuple[list[Any], Any]:
@@ -246,45 +246,7 @@ class Equations:
             return self.costate.rates(c, t, z)
         return self.costate.at(*self._parts(c)[1:3], t, z)
 
-    def follow(self, c, y, t0, t1, horizon, end, parts: int):
-        # Backwards, a contracting motion expands: over its whole length the state would be lost.
-        # Nodes on the way are computed first, and each part goes back from its own end.
-        if parts == 1:
-            return self._pinned(c, y, t0, t1, horizon, end)
-        stop_gradient = jax.lax.stop_gradient
-        shares = jnp.arange(parts + 1, dtype=t0.dtype) / parts
-        times = t0 + (t1 - t0) * shares
-        times = times.at[-1].set(t1)
-        fixed_inputs = jax.tree.map(stop_gradient, (list(c), list(y), times))
-
-        def onward(y, span):
-            y = self._solution(fixed_inputs[0], y, span, stop_gradient(horizon))
-            return y, y
-
-        _, nodes = jax.lax.scan(
-            onward, fixed_inputs[1], (fixed_inputs[2][:-2], fixed_inputs[2][1:-1])
-        )
-        nodes = [jnp.concatenate([x, e[None]]) for x, e in zip(nodes, end)]
-
-        def across(y, part):
-            start, stop, end_state = part
-            return self._pinned(c, y, start, stop, horizon, end_state), None
-
-        y, _ = jax.lax.scan(across, list(y), (times[:-1], times[1:], nodes))
-        return y
-
-    def _solution(self, c, y, span, horizon):
-        """The solution itself."""
-        coefficients, run, by_entry = self.prepare(c, span[0], y, stage=True)
-
-        def rates(coefficients, t, y, along):
-            return run(coefficients, t, *y), []
-
-        return self._solve(c, rates, coefficients, y, [], span, horizon, _units_of_state, by_entry)[
-            0
-        ]
-
-    def _pinned(self, c, y, t0, t1, horizon, end):
+    def follow(self, c, y, t0, t1, horizon, end):
         return attached(self._end_tangents, [t0, t1, horizon, *y, *c], end)
 
     def _end_tangents(self, operands, tangents, end):
@@ -475,10 +437,6 @@ class Equations:
             return y, sums
 
         return kernel(run)(coefficients, state_units, rtol, horizon, span, list(y), list(integrals))
-
-
-def _units_of_state(state_units, y, rates):
-    return state_units(y, rates)
 
 
 def _put(values: Sequence[Any], at: Sequence[int], entries: Sequence[Any]) -> list[Any]:

@@ -14,6 +14,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from polhode import _policy
@@ -30,7 +31,7 @@ from polhode._integrate._problem import Problem
 from polhode._integrate._step_derivative import samples
 from polhode._integrate._switches import guarded
 from polhode._integrate._tableau import TSIT5
-from polhode._kernels import Distinct, is_holdable, kernel
+from polhode._kernels import Distinct, is_differentiated, is_holdable, kernel
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts, check_options
 from polhode._parts import AbstractPart
 from polhode._scene import Scene, State
@@ -335,7 +336,7 @@ class AbstractIntegration(AbstractMethod):
         else:
             equations, c = equations_of(term, dynamics, y0, start, rtol, False)
             path = [jnp.moveaxis(states[..., i], 0, 1) for i in range(len(leaves))]
-            path = path_of(equations, 1, c, leaves, start, times, path)
+            path = path_of(equations, c, leaves, start, times, path)
             states = jnp.stack([jnp.moveaxis(x, 0, 1) for x in path], axis=-1)
         sample_states = jax.tree.unflatten(tree, [states[..., i].T for i in range(len(leaves))])
         end_state = jax.tree.map(lambda x: x[-1:], sample_states)
@@ -364,7 +365,15 @@ class AbstractIntegration(AbstractMethod):
     def _solve_smooth(self, scene, state, y0, ts, rtol, record, jumps: bool) -> Solution:
         """The solution from ``y0`` through ``ts``: the one call of diffrax."""
         term, dynamics = self._equations(scene, state, ts, record)
-        request = Request(ts, rtol, self.dt0, self.max_steps, record.final_only, jumps)
+        acts = scene.torque is not None or bool(scene.dynamics.coupled)
+        rows = None
+        if isinstance(self.adjoint, FlowAdjoint) and acts and ts.shape[0] <= _WAY_BACK:
+            # functions of the user may close over what is differentiated
+            rates = term.vf(ts[0], y0, dynamics) if may_jump(scene) else ()
+            flag = is_differentiated(_inexact((scene, y0, ts, rates)))
+            ts, rows = _with_restarts(ts, record.final_only, flag)
+        final_only = record.final_only and rows is None
+        request = Request(ts, rtol, self.dt0, self.max_steps, final_only, jumps)
         if self.controller is not None:
             stepping = request.by_controller(self.solver, self.controller)
         elif isinstance(self.solver, Extrapolation):
@@ -381,7 +390,7 @@ class AbstractIntegration(AbstractMethod):
             args=dynamics,
             saveat=stepping.saveat,
             stepsize_controller=stepping.controller,
-            adjoint=_in_parts(self.adjoint, scene),
+            adjoint=self.adjoint,
             max_steps=stepping.max_steps,
             progress_meter=self.progress_meter,
             throw=False,
@@ -390,6 +399,8 @@ class AbstractIntegration(AbstractMethod):
         error = progress.error if isinstance(progress, Progress) else None
         ys: Any = solution.ys
         samples, end_state = ys
+        if rows is not None:
+            samples = jax.tree.map(lambda x: x[rows], samples)
         steps, status = _outcome(solution, y0[0][0].shape)
         return Solution(samples, end_state, steps, status, error)
 
@@ -436,12 +447,31 @@ def _by_units(units, y, rates):
     return units(y, rates)
 
 
-def _in_parts(adjoint: diffrax.AbstractAdjoint, scene: Scene) -> diffrax.AbstractAdjoint:
-    """The adjoint in at least eight parts where a torque acts: backward through damping errors
-    grow, and each part starts anew from a saved state."""
-    if isinstance(adjoint, FlowAdjoint) and (scene.torque is not None or scene.dynamics.coupled):
-        return FlowAdjoint(adjoint.rtol, max(adjoint.parts, 8))
-    return adjoint
+_WAY_BACK = 8
+"""Intervals between saved times from each of which a derivative goes back where torques act."""
+
+
+def _with_restarts(ts: Array, final_only: bool, is_differentiated: Array) -> tuple[Array, Array]:
+    """``ts`` with times in between from which a derivative starts anew, and the rows of ``ts`` (of
+    its last time if ``final_only``) among them.
+
+    Backward through damping errors grow by exp(rate of damping * time). Without a derivative the
+    times in between are the first, which costs no step.
+    """
+    intervals = ts.shape[0] - 1
+    parts = -(-_WAY_BACK // intervals)
+    inner = jnp.asarray(np.arange(1, parts) / parts, ts.dtype)
+    between = ts[:-1, None] + (ts[1:] - ts[:-1])[:, None] * inner[None]
+    spread = jnp.concatenate([between, ts[1:, None]], axis=1).reshape(-1)
+    at_start = jnp.concatenate([jnp.broadcast_to(ts[0], between.size), ts[1:]])
+    times = jnp.concatenate([ts[:1], jnp.where(is_differentiated, spread, at_start)])
+    number = np.arange(intervals + 1)
+    rows = jnp.where(is_differentiated, number * parts, number + (number > 0) * between.size)
+    return times, rows[-1:] if final_only else rows
+
+
+def _inexact(tree: Any) -> list[Any]:
+    return [x for x in jax.tree.leaves(tree) if eqx.is_inexact_array(x)]
 
 
 def _of_wheels(wheels, loose: Sequence[Array]) -> Array:

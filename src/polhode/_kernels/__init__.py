@@ -9,6 +9,7 @@ from polhode._kernels._derivatives import (
     are_close as are_close,
     attached as attached,
     derivable_once as derivable_once,
+    is_differentiated as is_differentiated,
     is_slope as is_slope,
     linear as linear,
     over_gap as over_gap,

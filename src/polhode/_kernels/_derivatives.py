@@ -259,6 +259,43 @@ batching.primitive_batchers[_attached_p] = _attached_batch
 mlir.register_lowering(_attached_p, mlir.lower_fun(_values, multiple_results=True))
 
 
+def is_differentiated(arrays: Sequence[Any]) -> Array:
+    """False; True in a program that computes a derivative along any of ``arrays``, the value that
+    comes with it included."""
+    return _is_differentiated_p.bind(*arrays)
+
+
+_is_differentiated_p = Primitive("is_differentiated")
+
+
+@_is_differentiated_p.def_impl
+def _not_differentiated(*arrays):
+    return jnp.zeros((), bool)
+
+
+@_is_differentiated_p.def_abstract_eval
+def _shape_of_flag(*avals):
+    return ShapedArray((), np.dtype(bool))
+
+
+def _is_differentiated_jvp(arrays, tangents):
+    flag = _is_differentiated_p.bind(*arrays)
+    if any(is_slope(x) for x in tangents):
+        flag = jnp.ones((), bool)
+    return flag, ad.Zero(jax.typeof(flag).to_tangent_aval())
+
+
+def _is_differentiated_batch(arrays, dims):
+    return _is_differentiated_p.bind(*arrays), batching.not_mapped
+
+
+ad.primitive_jvps[_is_differentiated_p] = _is_differentiated_jvp
+batching.primitive_batchers[_is_differentiated_p] = _is_differentiated_batch
+mlir.register_lowering(
+    _is_differentiated_p, mlir.lower_fun(_not_differentiated, multiple_results=False)
+)
+
+
 # Values whose derivatives are not known: they become NaN, never numbers that are wrong.
 
 
