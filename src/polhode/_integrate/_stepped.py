@@ -368,9 +368,11 @@ class AbstractIntegration(AbstractMethod):
         acts = scene.torque is not None or bool(scene.dynamics.coupled)
         rows = None
         if isinstance(self.adjoint, FlowAdjoint) and acts and ts.shape[0] <= _WAY_BACK:
-            # functions of the user may close over what is differentiated
-            rates = term.vf(ts[0], y0, dynamics) if may_jump(scene) else ()
-            flag = is_differentiated(_inexact((scene, y0, ts, rates)))
+            closed_over = ()
+            if may_jump(scene):  # a function of the user's may close over what is differentiated
+                program = jax.make_jaxpr(partial(term.vf, args=dynamics))(ts[0], y0)
+                closed_over = program.consts
+            flag = is_differentiated(_inexact((scene, y0, ts, closed_over)))
             ts, rows = _with_restarts(ts, record.final_only, flag)
         final_only = record.final_only and rows is None
         request = Request(ts, rtol, self.dt0, self.max_steps, final_only, jumps)

@@ -286,7 +286,7 @@ def _is_differentiated_jvp(arrays, tangents):
 
 
 def _is_differentiated_batch(arrays, dims):
-    return _is_differentiated_p.bind(*arrays), batching.not_mapped
+    return _is_differentiated_p.bind(*arrays), None  # not mapped
 
 
 ad.primitive_jvps[_is_differentiated_p] = _is_differentiated_jvp
