@@ -13,7 +13,7 @@ angle turned), *flagged* where its status is not SUCCESSFUL, and otherwise *beyo
 
 Derivatives of a function of the last attitude, by the initial rates, one moment of inertia and one
 gain of the part, in forward and reverse mode, are compared with central differences of the
-reference.
+reference, by Richardson's extrapolation of two steps.
 
 ``--parts``: only groups whose names contain one of the words. ``--lines``: a file to which each
 result is appended as it is computed; with it, groups that it already holds are not run again.
@@ -458,8 +458,9 @@ def changed(case: Case, theta: Any, xp: Any) -> tuple[Any, Any, Any]:
     return moments, omega, (n,)
 
 
-def differences(case: Case) -> np.ndarray:
-    """Derivatives of ``value_of`` by ``theta``, from references. Raises ``Failure``."""
+def differences(case: Case) -> tuple[np.ndarray, float]:
+    """Derivatives of ``value_of`` by ``theta``, from references, and by how much Richardson's
+    extrapolation has changed them. Raises ``Failure``."""
     step = 1e-3 / case.angle
     counts = set()
 
@@ -471,14 +472,16 @@ def differences(case: Case) -> np.ndarray:
         counts.add(len(found.switches))
         return value_of(found.wxyz[-1], np)
 
-    found = np.zeros(5)
+    fine, coarse = np.zeros(5), np.zeros(5)
     for i in range(5 if case.parts[0].gain else 4):
         unit = step * np.eye(5)[i]
-        a, b, c, d = (value(k * unit) for k in (-2, -1, 1, 2))
-        found[i] = (8 * (c - b) - (d - a)) / (12 * step)
+        a, b, c, d, e, f = (value(k * unit) for k in (-4, -2, -1, 1, 2, 4))
+        fine[i] = (8 * (d - c) - (e - b)) / (12 * step)
+        coarse[i] = (8 * (e - b) - (f - a)) / (24 * step)
     if len(counts) > 1:
         raise Failure("switches appear")
-    return found
+    change = (fine - coarse) / 15
+    return fine + change, float(np.linalg.norm(change))
 
 
 def derivatives(part: Part, count: int, seed: int, longest: float) -> Iterator[dict[str, Any]]:
@@ -493,7 +496,7 @@ def derivatives(part: Part, count: int, seed: int, longest: float) -> Iterator[d
         if isinstance(judged(case, "float64"), str):
             continue
         try:
-            exact = differences(case)
+            exact, uncertain = differences(case)
         except (Failure, OverflowError, ZeroDivisionError, ValueError):
             continue
         done += 1
@@ -536,6 +539,7 @@ def derivatives(part: Part, count: int, seed: int, longest: float) -> Iterator[d
                     "error": error,
                     "ratio": error / rtol,
                     "size": size,
+                    "uncertain": uncertain / size,
                     "status": int(status),
                     "angle": case.angle,
                     "smooth": part.smooth,
@@ -568,6 +572,47 @@ def table(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 "worst": worst and worst["ratio"],
                 "worst_case": worst
                 and {k: worst[k] for k in ("parts", "dtype", "batch", "draw", "seed", "rtol")},
+            }
+        )
+    return found
+
+
+def value_counts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Outcomes by precision, of parts alone and in pairs."""
+    found = []
+    for dtype, pairs in itertools.product(RTOLS, (False, True)):
+        own = [r for r in rows if r.get("dtype") == dtype and (" + " in r["parts"]) == pairs]
+        ran = [r for r in own if "kind" in r]
+        found.append(
+            {
+                "dtype": dtype,
+                "parts": "in pairs" if pairs else "alone",
+                "runs": len(ran),
+                "beyond": sum(r["kind"] == "beyond" for r in ran),
+                "flagged": sum(r["kind"] == "flagged" for r in ran),
+                "raised": sum("raised" in r for r in own),
+                "median": float(np.median([r["ratio"] for r in ran])) if ran else None,
+                "worst": max((r["ratio"] for r in ran if r["kind"] != "flagged"), default=None),
+                "left_out": sum("left_out" in r for r in own),
+            }
+        )
+    return found
+
+
+def slope_counts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Errors of derivatives over rtol, by rtol, of smooth parts and of parts with switches."""
+    found = []
+    for smooth, rtol in itertools.product((True, False), RTOLS["float64"]):
+        own = [r for r in rows if "derivative" in r and (r["smooth"], r["rtol"]) == (smooth, rtol)]
+        good = [r["ratio"] for r in own if r["status"] == 0]
+        found.append(
+            {
+                "parts": "smooth" if smooth else "with switches",
+                "rtol": rtol,
+                "runs": len(own),
+                "flagged": len(own) - len(good),
+                "median": float(np.median(good)) if good else None,
+                "worst": max(good, default=None),
             }
         )
     return found
@@ -670,7 +715,12 @@ def main():
         )
         jax.clear_caches()
         eqx.clear_caches()
-    numbers = {"parts": table(rows), "derivatives": derivative_table(rows)}
+    numbers = {
+        "values": value_counts(rows),
+        "slopes": slope_counts(rows),
+        "parts": table(rows),
+        "derivatives": derivative_table(rows),
+    }
     _report.write("fuzz", numbers, path=given.output, packages=("scipy",))
 
 
