@@ -687,6 +687,12 @@ SECTIONS = {
         " not get there.",
         more=_controllers,
     ),
+    "fuzz": Section(
+        "Every part against an independent integrator",
+        "Random scenes of every part, alone and in pairs, moments, rates, gains and times over six"
+        " decades, against SciPy's DOP853 restarted at every switch. Errors of attitudes and, along"
+        " the last table, of derivatives, over `rtol`.",
+    ),
     "conservation": Section(
         "Energy and angular momentum over many revolutions",
         "One body by `ph.simulate` with its defaults (but for `max_steps`): relative change of the"

@@ -291,6 +291,30 @@ QUOTES["rtol-false"] = lambda: _kept("false_alarms")
 QUOTES["rtol-missed"] = lambda: _kept("missed")
 
 
+@_quote("fuzz-values")
+def _() -> str:
+    report, keys = read("fuzz"), ("runs", "beyond", "flagged", "raised")
+    lines = [
+        [row["dtype"], row["parts"], *(f"{row[k]:,}" for k in keys)]
+        + [number(row[k]) for k in ("median", "worst")]
+        for row in report["numbers"]["values"]
+    ]
+    header = ["", "parts", "runs", "beyond 10 `rtol`", *keys[2:], "median [`rtol`]", "worst"]
+    return _block(markdown(header, lines), f"({command(report)})")
+
+
+@_quote("fuzz-slopes")
+def _() -> str:
+    report = read("fuzz")
+    lines = [
+        [row["parts"], f"{row['rtol']:.0e}", *(str(row[k]) for k in ("runs", "flagged"))]
+        + [number(row[k]) for k in ("median", "worst")]
+        for row in report["numbers"]["slopes"]
+    ]
+    header = ["parts", "`rtol`", "runs", "flagged", "median [`rtol`]", "worst"]
+    return _block(markdown(header, lines), f"({command(report)})")
+
+
 @_quote("single-worst")
 def _() -> str:
     rows = _numbers("torqued")["rows"]

@@ -345,9 +345,9 @@ MUTANTS = (
         ("solvers/test_flow_adjoint.py::test_slopes_by_saved_times_are_the_field",),
     ),
     Mutant(
-        "_integrate/_stepped.py",
-        "rows = jnp.where(is_differentiated, number * parts, number + (number > 0) * between.size)",
-        "rows = jnp.where(is_differentiated, number, number + (number > 0) * between.size)",
+        "_integrate/_diffrax_solve.py",
+        "rows = jnp.where(goes_back, number * parts, number + (number > 0) * between.size)",
+        "rows = jnp.where(goes_back, number, number + (number > 0) * between.size)",
         "the gradient of a damped batch is that of an earlier state",
         ("solvers/test_flow_adjoint.py::test_a_damped_batch_is_followed_back",),
     ),

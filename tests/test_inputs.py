@@ -42,6 +42,10 @@ TS = [0.0, 1.0]
         (lambda: ph.LinearDamping([0.1, -0.1, 0.1]), "must not be negative"),
         (lambda: ph.BodyTorque([1.0, 2.0]), r"shape \(\.\.\., 3\)"),
         (lambda: ph.simulate(SCENE, STATE, [0.0]), "at least two times"),
+        (
+            lambda: jax.jit(lambda t: ph.simulate(SCENE, STATE, t).wxyz)(np.zeros(1)),
+            r"at least two times, got an array of shape \(1,\)",
+        ),
         (lambda: ph.simulate(SCENE, STATE, [0.0, 1.0, 1.0]), "entries 1 and 2"),
         (lambda: ph.simulate(SCENE, STATE, [0.0, 2.0, 1.0]), "strictly increasing or strictly"),
         (lambda: ph.simulate(SCENE, STATE, [0.0, np.nan]), "ts holds NaN"),

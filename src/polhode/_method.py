@@ -379,8 +379,7 @@ def check_inputs(
             " arrays float32 or float64, for example with jnp.asarray(x, jnp.float32)."
         )
     ts = _times(ts, dtype)
-    if is_concrete(ts):
-        check_times(np.asarray(ts))
+    check_times(ts)
     return scene, state, ts, record
 
 
@@ -420,12 +419,14 @@ def _times(ts: Any, dtype: Any) -> Any:
     return ts if ts.dtype == dtype else ts.astype(dtype)
 
 
-def check_times(ts: np.ndarray) -> None:
-    """At least two times, strictly monotonic."""
+def check_times(ts: Array | np.ndarray) -> None:
+    """At least two times, strictly monotonic where they are known."""
     if ts.shape[-1] < 2:  # the message costs more than a small simulation
-        raise ValueError(
-            f"ts must hold at least two times, got {describe(ts)}: the state holds at ts[0]."
-        )
+        given = describe(ts) if is_concrete(ts) else f"an array of shape {ts.shape}"
+        raise ValueError(f"ts must hold at least two times, got {given}: the state holds at ts[0].")
+    if not is_concrete(ts):
+        return
+    ts = np.asarray(ts)
     steps = np.diff(ts, axis=-1)
     good = np.all(steps > 0, axis=-1) | np.all(steps < 0, axis=-1)
     if not np.all(good):

@@ -313,8 +313,15 @@ def test_saved_times_keep_the_way_back_from_states_drawn_together(mode):
         assert np.isnan(found[0]).all()  # what the saved times are for
 
 
-@pytest.mark.parametrize("final_only", [True, False])
-@pytest.mark.parametrize("times", [[0.0, 4.0], [0.0, 1.0, 2.5, 4.0]])
+@pytest.mark.parametrize(
+    "times, final_only",
+    [
+        ([0.0, 4.0], True),
+        pytest.param([0.0, 4.0], False, marks=pytest.mark.slow),
+        pytest.param([0.0, 1.0, 2.5, 4.0], True, marks=pytest.mark.slow),
+        pytest.param([0.0, 1.0, 2.5, 4.0], False, marks=pytest.mark.slow),
+    ],
+)
 def test_a_damped_batch_is_followed_back(times, final_only):
     """Spheres that stop like exp(-28), by a gain that the torque closes over; a plain call takes
     no step more for it."""

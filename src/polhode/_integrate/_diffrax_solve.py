@@ -8,8 +8,10 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, PyTree
 
+from polhode._kernels import is_differentiated
 from polhode._method import Status, StepCounts
 
 
@@ -151,6 +153,30 @@ def in_segments(
         return Solution(end_state, end_state, steps, status, error)
     out = jax.tree.map(lambda rows, x: rows.at[-1].set(x), out, y)
     return Solution(out, end_state, steps, status, error)
+
+
+WAY_BACK = 8
+"""Intervals between saved times from each of which a derivative goes back where torques act."""
+
+
+def with_restarts(ts: Array, final_only: bool, inputs: PyTree) -> tuple[Array, Array]:
+    """``ts`` with times in between from which derivatives by ``ts`` or ``inputs`` start anew, and
+    the rows of ``ts`` (of its last time if ``final_only``) among them.
+
+    Backward through damping errors grow by exp(rate of damping * time). Without a derivative the
+    times in between are the first, which costs no step.
+    """
+    arrays = [x for x in jax.tree.leaves((ts, inputs)) if eqx.is_inexact_array(x)]
+    intervals = ts.shape[0] - 1
+    parts = -(-WAY_BACK // intervals)
+    inner = jnp.asarray(np.arange(1, parts) / parts, ts.dtype)
+    between = ts[:-1, None] + (ts[1:] - ts[:-1])[:, None] * inner[None]
+    spread = jnp.concatenate([between, ts[1:, None]], axis=1).reshape(-1)
+    at_start = jnp.concatenate([jnp.broadcast_to(ts[0], between.size), ts[1:]])
+    goes_back, number = is_differentiated(arrays), np.arange(intervals + 1)
+    times = jnp.concatenate([ts[:1], jnp.where(goes_back, spread, at_start)])
+    rows = jnp.where(goes_back, number * parts, number + (number > 0) * between.size)
+    return times, rows[-1:] if final_only else rows
 
 
 def min_of(a: Array, b: Array) -> Any:

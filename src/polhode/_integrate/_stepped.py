@@ -14,14 +14,19 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from polhode import _policy
 from polhode._batch import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._hamiltonian import Dynamics
 from polhode._integrate._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
-from polhode._integrate._diffrax_solve import Request, Solution, in_segments
+from polhode._integrate._diffrax_solve import (
+    WAY_BACK,
+    Request,
+    Solution,
+    in_segments,
+    with_restarts,
+)
 from polhode._integrate._extrapolation import Automatic, Extrapolation
 from polhode._integrate._flow_adjoint import FlowAdjoint, path_of
 from polhode._integrate._flow_derivative import equations_of
@@ -31,7 +36,7 @@ from polhode._integrate._problem import Problem
 from polhode._integrate._step_derivative import samples
 from polhode._integrate._switches import guarded
 from polhode._integrate._tableau import TSIT5
-from polhode._kernels import Distinct, is_differentiated, is_holdable, kernel
+from polhode._kernels import Distinct, is_holdable, kernel
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts, check_options
 from polhode._parts import AbstractPart
 from polhode._scene import Scene, State
@@ -367,13 +372,12 @@ class AbstractIntegration(AbstractMethod):
         term, dynamics = self._equations(scene, state, ts, record)
         acts = scene.torque is not None or bool(scene.dynamics.coupled)
         rows = None
-        if isinstance(self.adjoint, FlowAdjoint) and acts and ts.shape[0] <= _WAY_BACK:
+        if isinstance(self.adjoint, FlowAdjoint) and acts and ts.shape[0] <= WAY_BACK:
             closed_over = ()
             if may_jump(scene):  # a function of the user's may close over what is differentiated
                 program = jax.make_jaxpr(partial(term.vf, args=dynamics))(ts[0], y0)
                 closed_over = program.consts
-            flag = is_differentiated(_inexact((scene, y0, ts, closed_over)))
-            ts, rows = _with_restarts(ts, record.final_only, flag)
+            ts, rows = with_restarts(ts, record.final_only, (scene, y0, closed_over))
         final_only = record.final_only and rows is None
         request = Request(ts, rtol, self.dt0, self.max_steps, final_only, jumps)
         if self.controller is not None:
@@ -447,33 +451,6 @@ class AbstractIntegration(AbstractMethod):
 
 def _by_units(units, y, rates):
     return units(y, rates)
-
-
-_WAY_BACK = 8
-"""Intervals between saved times from each of which a derivative goes back where torques act."""
-
-
-def _with_restarts(ts: Array, final_only: bool, is_differentiated: Array) -> tuple[Array, Array]:
-    """``ts`` with times in between from which a derivative starts anew, and the rows of ``ts`` (of
-    its last time if ``final_only``) among them.
-
-    Backward through damping errors grow by exp(rate of damping * time). Without a derivative the
-    times in between are the first, which costs no step.
-    """
-    intervals = ts.shape[0] - 1
-    parts = -(-_WAY_BACK // intervals)
-    inner = jnp.asarray(np.arange(1, parts) / parts, ts.dtype)
-    between = ts[:-1, None] + (ts[1:] - ts[:-1])[:, None] * inner[None]
-    spread = jnp.concatenate([between, ts[1:, None]], axis=1).reshape(-1)
-    at_start = jnp.concatenate([jnp.broadcast_to(ts[0], between.size), ts[1:]])
-    times = jnp.concatenate([ts[:1], jnp.where(is_differentiated, spread, at_start)])
-    number = np.arange(intervals + 1)
-    rows = jnp.where(is_differentiated, number * parts, number + (number > 0) * between.size)
-    return times, rows[-1:] if final_only else rows
-
-
-def _inexact(tree: Any) -> list[Any]:
-    return [x for x in jax.tree.leaves(tree) if eqx.is_inexact_array(x)]
 
 
 def _of_wheels(wheels, loose: Sequence[Array]) -> Array:

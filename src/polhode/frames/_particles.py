@@ -6,7 +6,6 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike, as_float_array, is_concrete, require_positive
@@ -203,8 +202,7 @@ def simulate_particles(
     ts, mass = ts.astype(dtype), mass.astype(dtype)[..., None]
     if ts.ndim != 1:
         raise ValueError(f"ts must have shape (T,), got {ts.shape}: particles share their times.")
-    if is_concrete(ts):
-        check_times(np.asarray(ts))
+    check_times(ts)
     require_positive("mass", mass)
     batch = jnp.broadcast_shapes(position.shape, velocity.shape, (*mass.shape[:-1], 3))
     position, velocity = (jnp.broadcast_to(x, batch) for x in (position, velocity))
