@@ -129,9 +129,9 @@ def command(module: str) -> str:
     """The command of this run, without where it wrote to."""
     words, given = [], iter(sys.argv[1:])
     for word in given:
-        if word in ("--output", "--out"):
+        if word in ("--output", "--out", "--lines"):
             next(given, None)
-        elif not word.startswith(("--output=", "--out=")):
+        elif not word.startswith(("--output=", "--out=", "--lines=")):
             words.append(word)
     return " ".join(["python -m", f"benchmarks.{module}", *words])
 

@@ -314,7 +314,7 @@ def test_saved_times_keep_the_way_back_from_states_drawn_together(mode):
 
 
 @pytest.mark.parametrize(
-    "times, final_only",
+    ("times", "final_only"),
     [
         ([0.0, 4.0], True),
         pytest.param([0.0, 4.0], False, marks=pytest.mark.slow),
