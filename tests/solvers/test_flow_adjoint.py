@@ -314,17 +314,18 @@ def test_saved_times_keep_the_way_back_from_states_drawn_together(mode):
 
 
 @pytest.mark.parametrize(
-    ("times", "final_only"),
+    ("times", "final_only", "pulsed"),
     [
-        ([0.0, 4.0], True),
-        pytest.param([0.0, 4.0], False, marks=pytest.mark.slow),
-        pytest.param([0.0, 1.0, 2.5, 4.0], True, marks=pytest.mark.slow),
-        pytest.param([0.0, 1.0, 2.5, 4.0], False, marks=pytest.mark.slow),
+        ([0.0, 4.0], True, False),
+        pytest.param([0.0, 4.0], False, False, marks=pytest.mark.slow),
+        pytest.param([0.0, 1.0, 2.5, 4.0], True, False, marks=pytest.mark.slow),
+        pytest.param([0.0, 1.0, 2.5, 4.0], False, False, marks=pytest.mark.slow),
+        pytest.param([0.0, 0.05, 4.0], False, True, marks=pytest.mark.slow),
     ],
 )
-def test_a_damped_batch_is_followed_back(times, final_only):
+def test_a_damped_batch_is_followed_back(times, final_only, pulsed):
     """Spheres that stop like exp(-28), by a gain that the torque closes over; a plain call takes
-    no step more for it."""
+    no step more for it. ``pulsed``: with edges in the program."""
     n, ts = 70, jnp.array(times)
     omega = 1 + jax.random.uniform(jax.random.key(1), (n, 3))
     state = ph.State(jnp.broadcast_to(jnp.array([1.0, 0, 0, 0]), (n, 4)), omega)
@@ -332,6 +333,8 @@ def test_a_damped_batch_is_followed_back(times, final_only):
 
     def rates(gain):
         drag = ph.FeedbackTorque(lambda t, wxyz, omega_body: -gain * omega_body)
+        if pulsed:
+            drag = ph.LinearDamping(gain) + ph.Pulses(ph.BodyTorque([0.0, 0.0, 0.0]), [0.1], [0.2])
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.0, 1.0]), torque=drag)
         trajectory = ph.simulate(scene, state, ts, record=record)
         return trajectory.omega_body[:, -1], trajectory.steps
@@ -344,6 +347,27 @@ def test_a_damped_batch_is_followed_back(times, final_only):
     np.testing.assert_allclose(value, want, atol=1e-8)
     np.testing.assert_allclose(pull(jnp.ones((n, 3)))[0], -4 * jnp.sum(want), rtol=1e-5)
     assert jnp.all(steps_with_slopes > steps)
+
+
+@pytest.mark.parametrize("ts", [[1e5, 1e5 + 1 / 32], [1e5, 1e5 - 1 / 128]])
+def test_a_span_of_few_units_in_the_last_place_is_followed_back(ts):
+    """Single precision resolves a 128th of a second there: no room for restarts."""
+    ts = jnp.array(ts, jnp.float32)
+    omega = jnp.broadcast_to(jnp.array([0.3, 0.2, 0.5], jnp.float32), (70, 3))
+    inertia = ph.Inertia.from_moments(jnp.ones(3, jnp.float32))
+
+    def rates(gain):
+        scene = ph.Scene(inertia, torque=ph.LinearDamping(gain) + ph.BodyTorque(0 * omega))
+        state = ph.State(jnp.array([1.0, 0, 0, 0], jnp.float32), omega)
+        return ph.simulate(scene, state, ts).omega_body[:, -1]
+
+    gain, span = jnp.float32(0.5), ts[1] - ts[0]
+    value, slope = jax.jvp(lambda k: jnp.sum(rates(k)), (gain,), (jnp.ones_like(gain),))
+    want = jnp.sum(omega) * jnp.exp(-gain * span)
+    np.testing.assert_allclose(value, want, rtol=1e-5)
+    np.testing.assert_allclose(slope, -span * want, rtol=1e-4)
+    back = jax.grad(lambda k: jnp.sum(rates(k)))(gain)
+    np.testing.assert_allclose(back, -span * want, rtol=1e-4)
 
 
 def test_what_cannot_be_differentiated_is_refused():

@@ -161,10 +161,11 @@ WAY_BACK = 8
 
 def with_restarts(ts: Array, final_only: bool, inputs: PyTree) -> tuple[Array, Array]:
     """``ts`` with times in between from which derivatives by ``ts`` or ``inputs`` start anew, and
-    the rows of ``ts`` (of its last time if ``final_only``) among them.
+    the rows of ``ts`` (of its last time if ``final_only``) among them. ``ts`` may repeat its first.
 
-    Backward through damping errors grow by exp(rate of damping * time). Without a derivative the
-    times in between are the first, which costs no step.
+    Backward through damping errors grow by exp(rate of damping * time). Without a derivative, and
+    where the dtype does not tell them apart, the times in between are the first, which costs no
+    step.
     """
     arrays = [x for x in jax.tree.leaves((ts, inputs)) if eqx.is_inexact_array(x)]
     intervals = ts.shape[0] - 1
@@ -173,7 +174,9 @@ def with_restarts(ts: Array, final_only: bool, inputs: PyTree) -> tuple[Array, A
     between = ts[:-1, None] + (ts[1:] - ts[:-1])[:, None] * inner[None]
     spread = jnp.concatenate([between, ts[1:, None]], axis=1).reshape(-1)
     at_start = jnp.concatenate([jnp.broadcast_to(ts[0], between.size), ts[1:]])
-    goes_back, number = is_differentiated(arrays), np.arange(intervals + 1)
+    steps = jnp.diff(spread, prepend=ts[:1])
+    is_apart = jnp.all((steps * jnp.sign(ts[-1] - ts[0]) > 0) | (spread == ts[0]))
+    goes_back, number = is_differentiated(arrays) & is_apart, np.arange(intervals + 1)
     times = jnp.concatenate([ts[:1], jnp.where(goes_back, spread, at_start)])
     rows = jnp.where(goes_back, number * parts, number + (number > 0) * between.size)
     return times, rows[-1:] if final_only else rows
