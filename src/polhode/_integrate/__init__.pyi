@@ -13,10 +13,9 @@ from ._extrapolation import (
 from ._field import GroupUnits as GroupUnits
 from ._flow_adjoint import FlowAdjoint as FlowAdjoint
 from ._loop import Search as Search
-from ._stepped import (
-    AbstractIntegration as AbstractIntegration,
+from ._methods import (
     CoarseSteps as CoarseSteps,
     EulerAngles as EulerAngles,
     LiePoisson as LiePoisson,
-    may_jump as may_jump,
 )
+from ._stepped import AbstractIntegration as AbstractIntegration, may_jump as may_jump

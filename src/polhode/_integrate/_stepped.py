@@ -1,4 +1,4 @@
-"""Methods that integrate: coordinates, solver, step control and adjoint, and one call of diffrax.
+"""The base of the methods that integrate: step control, adjoint, and one call of diffrax.
 
 ``AbstractIntegration.run`` has two paths: the loop of explicit steps (``_run_by_loop``: few bodies
 with torques, switches, events), and ``diffrax.diffeqsolve`` (``_solve``: the extrapolated midpoint
@@ -19,7 +19,7 @@ from jaxtyping import Array
 from polhode import _policy
 from polhode._batch import PARTS, along_time, is_lane_tree, map_chunks
 from polhode._hamiltonian import Dynamics
-from polhode._integrate._charts import AbstractChart, EulerChart, LiePoissonChart, natural_rates
+from polhode._integrate._charts import AbstractChart, natural_rates
 from polhode._integrate._diffrax_solve import (
     WAY_BACK,
     Request,
@@ -256,10 +256,9 @@ class AbstractIntegration(AbstractMethod):
     def _are_few(self, scene: Scene, state: State) -> bool:
         """Whether torques act on few bodies and rounding errors need not be compensated, which the
         explicit steps do not do."""
-        acts = scene.torque is not None or bool(scene.dynamics.coupled)
         few = 0 < state.wxyz.shape[0] <= _policy.EXPLICIT_BODIES
         is_uncompensated = isinstance(self.solver, Automatic) and not self.solver.compensated
-        return acts and few and is_uncompensated
+        return _torques_act(scene) and few and is_uncompensated
 
     def _suits_loop(self, scene, state, ts, record: Record, jumps: bool) -> tuple[bool, bool]:
         """Whether the loop of explicit steps is faster, or the only one that ends at switches; and
@@ -333,9 +332,8 @@ class AbstractIntegration(AbstractMethod):
             events, times, states = with_events(search, loop_result, times, states)
         # backward along the exact equations errors of a damped motion grow; along its steps they
         # do not
-        damped = scene.torque is not None or bool(scene.dynamics.coupled)
         recorded = problem.switches.count or not self._automatic.located
-        if recorded or times.ndim > 1 or damped:
+        if recorded or times.ndim > 1 or _torques_act(scene):
             operands = problem.arrays, unit_data, y, start, times, states
             states = samples(make, *operands, once=problem.passed_switches > 0)
         else:
@@ -370,9 +368,8 @@ class AbstractIntegration(AbstractMethod):
     def _solve_smooth(self, scene, state, y0, ts, rtol, record, jumps: bool) -> Solution:
         """The solution from ``y0`` through ``ts``: the one call of diffrax."""
         term, dynamics = self._equations(scene, state, ts, record)
-        acts = scene.torque is not None or bool(scene.dynamics.coupled)
-        rows = None
-        if isinstance(self.adjoint, FlowAdjoint) and acts and ts.shape[0] <= WAY_BACK:
+        rows, follows_flow = None, isinstance(self.adjoint, FlowAdjoint)
+        if follows_flow and _torques_act(scene) and ts.shape[0] <= WAY_BACK:
             closed_over = ()
             if may_jump(scene):  # a function of the user's may close over what is differentiated
                 program = jax.make_jaxpr(partial(term.vf, args=dynamics))(ts[0], y0)
@@ -497,6 +494,11 @@ _OF_LOOP = (
 _OF_MIDPOINT = (Status.SUCCESSFUL, Status.MAX_STEPS, Status.STEP_FAILED, Status.NOT_FINITE)
 
 
+def _torques_act(scene: Scene) -> bool:
+    """Whether torques act on the body, those of wheels and motors included: it may be damped."""
+    return scene.torque is not None or bool(scene.dynamics.coupled)
+
+
 def may_jump(scene: Scene) -> bool:
     """Whether a function of the user's or a part that is not smooth acts on the body."""
 
@@ -505,100 +507,3 @@ def may_jump(scene: Scene) -> bool:
 
     parts = (scene.inertia, scene.potential, scene.torque, scene.rotors)
     return any(is_sharp(x) for x in jax.tree.leaves(parts, is_leaf=is_sharp))
-
-
-class LiePoisson(AbstractIntegration):
-    """Unit quaternion and body momentum, free of singularities, with any diffrax solver.
-
-    **Arguments:**
-
-    - ``solver``: a ``diffrax.AbstractSolver`` for ODEs, ours or diffrax's; None: ``Dopri8``.
-    - ``controller``: a diffrax step-size controller; None: the estimated error at every saved time
-      is kept below the ``rtol`` of ``simulate`` (attitude in radians, momentum relative to the
-      scale of each body).
-    - ``dt0``: first (or constant) step [s], negative backwards; None: chosen.
-    - ``max_steps``: of each body, or of bodies that share their steps.
-    - ``adjoint``: None: ``ph.FlowAdjoint()``, the derivatives of the exact flow, in forward
-      and reverse mode; or an adjoint of diffrax, for the derivative of the steps (for bodies that
-      drag stops within the time simulated).
-    - ``progress_meter``: as in diffrax.
-    - ``chart``: set by the planner (None: no preferred direction in space).
-    - ``chunk``: number of bodies that are integrated together; chunks are processed one after the
-      other, which bounds the memory. None: 200 where the bodies of a chunk share their steps. For
-      ``Extrapolation``, in which each has its own, 1024, of which 64 are on their way at once, in a
-      processor's cache; 64 where the field is more than arithmetic on the numbers of one body; 2^18
-      on an accelerator.
-    """
-
-    def __init__(
-        self,
-        solver: diffrax.AbstractSolver | None = None,
-        controller: diffrax.AbstractStepSizeController | None = None,
-        dt0: float | Array | None = None,
-        max_steps: int = 2**16,
-        adjoint: diffrax.AbstractAdjoint | None = None,
-        progress_meter: diffrax.AbstractProgressMeter | None = None,
-        chunk: int | None = None,
-        *,
-        chart: LiePoissonChart | None = None,
-    ):
-        chart = LiePoissonChart() if chart is None else chart
-        super().__init__(
-            chart,
-            _policy.SHARED_STEP_BODIES,
-            solver,
-            controller,
-            dt0,
-            max_steps,
-            adjoint,
-            progress_meter,
-            chunk,
-        )
-
-
-class CoarseSteps(AbstractIntegration):
-    """Explicit steps of order 5 that do not end where the field kinks or jumps: coarse and fast.
-
-    For training, where a gradient with an error of a few per cent is enough and the controller has
-    many kinks (relu, clip): 2 to 20 times faster there than the default. The state keeps ``rtol``;
-    its derivative is wrong by about sqrt(rtol) at kinks, and by the whole contribution of the
-    switching time at jumps. Second derivatives through kinks or jumps raise NotImplementedError.
-    Unit quaternion and body momentum; derivatives are those of the steps, which are recorded.
-
-    **Arguments:** ``max_steps``: of each body; ``chunk``: number of bodies that are integrated side
-    by side (None: chosen).
-
-        trajectory = ph.simulate(scene, states, ts, ph.CoarseSteps(), rtol=1e-4)
-    """
-
-    def __init__(self, max_steps: int = 2**16, chunk: int | None = None):
-        solver = Automatic(located=False)
-        super().__init__(LiePoissonChart(), 1, solver, None, None, max_steps, None, None, chunk)
-
-    @property
-    def name(self) -> str:
-        """The name of the class."""
-        return "CoarseSteps"
-
-
-class EulerAngles(AbstractIntegration):
-    """Canonical ZYZ Euler angles by Hamilton's equations (docs/equations.md), any diffrax solver.
-
-    For comparison: the coordinates are singular where theta is 0 or pi, which is reported as
-    ``Status.CHART_SINGULAR``; passing near costs many steps. Arguments as ``ph.LiePoisson``. Bodies
-    are integrated one at a time if they would share steps, so that none waits for the worst.
-    """
-
-    def __init__(
-        self,
-        solver: diffrax.AbstractSolver | None = None,
-        controller: diffrax.AbstractStepSizeController | None = None,
-        dt0: float | Array | None = None,
-        max_steps: int = 2**16,
-        adjoint: diffrax.AbstractAdjoint | None = None,
-        progress_meter: diffrax.AbstractProgressMeter | None = None,
-        chunk: int | None = None,
-    ):
-        super().__init__(
-            EulerChart(), 1, solver, controller, dt0, max_steps, adjoint, progress_meter, chunk
-        )
