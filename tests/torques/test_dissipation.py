@@ -87,6 +87,14 @@ def test_a_wheel_with_friction_about_one_axis():
     np.testing.assert_allclose(got.work, lost, rtol=1e-10, atol=1e-14)
 
 
+def test_an_energy_sink_keeps_the_momentum_in_euler_angles():
+    scene = ph.Scene(ph.Inertia.from_moments(MOMENTS), torque=ph.EnergySink(0.1))
+    found = ph.simulate(scene, STATE, [0.0, 2.0], ph.EulerAngles(), rtol=1e-9)
+    momentum, energy = np.asarray(found.momentum_space), np.asarray(found.energy)
+    np.testing.assert_allclose(momentum[:, 1], momentum[:, 0], rtol=0, atol=1e-7)
+    assert np.all(energy[:, 1] < energy[:, 0] - 1e-3)
+
+
 def test_a_ring_against_newton_in_every_chart():
     """A batch with an oblique ring, written out and integrated by SciPy; in single precision."""
     axis, j, ts = np.array([0.0, 0.6, 0.8]), 0.2, [0.0, 6.0]
