@@ -583,6 +583,7 @@ def value_counts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     for dtype, pairs in itertools.product(RTOLS, (False, True)):
         own = [r for r in rows if r.get("dtype") == dtype and (" + " in r["parts"]) == pairs]
         ran = [r for r in own if "kind" in r]
+        good = [r["ratio"] for r in ran if r["kind"] != "flagged"]
         found.append(
             {
                 "dtype": dtype,
@@ -591,8 +592,8 @@ def value_counts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
                 "beyond": sum(r["kind"] == "beyond" for r in ran),
                 "flagged": sum(r["kind"] == "flagged" for r in ran),
                 "raised": sum("raised" in r for r in own),
-                "median": float(np.median([r["ratio"] for r in ran])) if ran else None,
-                "worst": max((r["ratio"] for r in ran if r["kind"] != "flagged"), default=None),
+                "median": float(np.median(good)) if good else None,
+                "worst": max(good, default=None),
                 "left_out": sum("left_out" in r for r in own),
             }
         )
