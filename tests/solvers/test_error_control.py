@@ -121,3 +121,21 @@ def test_few_steps_of_a_body_that_comes_to_rest_are_refused():
     scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.6, 2.1]), torque=torque)
     counts = ph.simulate(scene, state, [0.0, 5.0], rtol=1e-10).step_counts
     assert int(counts.refused.sum()) < 0.3 * int(counts.accepted.sum())
+
+
+def test_a_wheel_keeps_the_tolerance_through_its_band_of_friction():
+    """At every ``rtol``: a step that passes the band measures its error by chance."""
+    friction = ph.CoulombFriction(0.0443, 0.00164)
+    wheel = ph.Rotor([0.606, 0.751, 0.261], inertia=1060.0, speed=0.0152, coupling=friction)
+    scene = ph.Scene(ph.Inertia.from_moments([6503.0, 15672.0, 11624.0]), rotors=wheel)
+    start = ph.State([-0.65, -0.26, 0.69, 0.18], [-0.009, -0.11, -0.037])
+
+    def last(rtol):
+        return ph.simulate(scene, start, [0.0, 284.0], rtol=rtol).wxyz[-1]
+
+    exact = last(1e-13)
+    ratios = [
+        2 * float(jnp.linalg.norm(last(rtol) - exact)) / rtol
+        for rtol in np.geomspace(1e-5, 1e-9, 17)
+    ]
+    assert max(ratios) < 10, ratios

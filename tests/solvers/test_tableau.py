@@ -1,10 +1,11 @@
-"""Dense output of the explicit rules against SciPy."""
+"""Dense output and error estimates of the explicit rules, against SciPy and steps of 1/64."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from polhode._integrate import _error_control as control
 from polhode._integrate._explicit_step import dense_of, dense_state
 from polhode._integrate._tableau import DOP853, TSIT5
 
@@ -59,3 +60,60 @@ def test_the_error_of_dense_output_is_that_many_times_the_one_at_the_end(rule):
     assert rule.dense_error / 2 < ratio < 2 * rule.dense_error, ratio
     # what the steps themselves end with is more accurate than what lies within
     assert ratio > 2
+
+
+def narrow_fields(rng, bodies):
+    """Rates of one number, with something narrow in or beside a step from 0 to 1."""
+    width = 10 ** rng.uniform(-1.3, 0.5, bodies)
+    place, drive = rng.uniform(-0.2, 1.2, bodies), rng.uniform(1.2, 4, bodies)
+    return (
+        lambda t, y: -drive - np.tanh((y + 3 * place) / width),  # passes a band of friction
+        lambda t, y: np.tanh((t - place) / width),
+        lambda t, y: 1 / (1 + ((t - place) / width) ** 2),
+    )
+
+
+def one_step(field, t, y, width):
+    stages = np.zeros((DOP853.stages, y.size))
+    for k in range(DOP853.stages):
+        change = DOP853.weights[k, : DOP853.stages] @ stages
+        stages[k] = field(t + DOP853.nodes[k] * width, y + width * change)
+    return y + width * DOP853.weights[DOP853.stages - 1, : DOP853.stages] @ stages, width * stages
+
+
+def test_steps_that_pass_something_narrow_are_noticed():
+    """Error over estimate, with the sixth divided difference and without it."""
+    rng = np.random.default_rng(0)
+    found = {True: [], False: []}
+    for field in narrow_fields(rng, 5000):
+        begin = np.zeros(5000)
+        end, stages = one_step(field, 0, begin, 1)
+        exact = begin
+        for k in range(64):
+            exact, _ = one_step(field, k / 64, exact, 1 / 64)
+        error, lower, difference = (
+            np.abs(row @ stages) for row in (*DOP853.errors, DOP853.difference)
+        )
+        estimate = error**2 / np.sqrt(error**2 + 0.01 * lower**2)
+        counts = np.abs(end - exact) > 1e-11
+        for with_difference, values in found.items():
+            extra = control.SIXTH_DIFFERENCE * difference * with_difference
+            values.append((np.abs(end - exact) / (estimate + extra))[counts])
+    without, with_it = (np.concatenate(found[key]) for key in (False, True))
+    assert np.mean(without > 10) > 0.05, "the difference is not needed"
+    assert np.mean(with_it > 10) < 0.01
+    assert np.quantile(without, 0.999) > 1000
+    assert np.quantile(with_it, 0.999) < 50
+
+
+def test_the_difference_vanishes_for_polynomials_of_degree_six():
+    """And is of the seventh order in the width for a decay, as the error of a step is of the
+    ninth."""
+    for power in range(6):
+        rates = DOP853.nodes[: DOP853.stages] ** power
+        assert abs(control.SIXTH_DIFFERENCE * DOP853.difference @ rates) < 1e-13
+    sizes = []
+    for width in (0.25, 0.5):
+        _, stages = one_step(lambda t, y: -y, 0, np.ones(1), width)
+        sizes.append(abs(float(DOP853.difference @ stages[:, 0])))
+    assert np.log2(sizes[1] / sizes[0]) > 6.5

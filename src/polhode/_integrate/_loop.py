@@ -328,10 +328,13 @@ def _error_and_tolerance(motion, options, progress, attempt, width, length, eps)
     )
     weights = [jnp.minimum(a, b) for a, b in zip(weights, end_weights)]
     rate = jnp.maximum(rate, end_rate)
-    error, *lower_order_errors = (
-        weighted_length(weights, list(attempt.h[None] * weighted(e, attempt.stages)))
-        for e in rule.errors
-    )
+
+    def length_of(stage_weights):
+        return weighted_length(
+            weights, list(attempt.h[None] * weighted(stage_weights, attempt.stages))
+        )
+
+    error, *lower_order_errors = map(length_of, rule.errors)
     # Both estimates of DOP853 are far above the error of its result; their combination falls with
     # the order of the result, so that the width is chosen by the right power.
     if lower_order_errors:  # of two estimates as in DOP853, of higher order than either
@@ -341,6 +344,10 @@ def _error_and_tolerance(motion, options, progress, attempt, width, length, eps)
         error = error * jnp.where(
             combined_error > 0, error / jnp.where(combined_error > 0, combined_error, 1), 0
         )
+    # The combination is far too small where the first estimate vanishes by chance, as it may where
+    # something narrow lies within the step; the difference does not vanish at the same place.
+    if rule.difference is not None:
+        error = error + control.SIXTH_DIFFERENCE * length_of(rule.difference)
     angle = rate * width
     total_angle = jnp.maximum(progress.angle + rate * (length - progress.elapsed), 1)
     drift_ratio = jnp.maximum(total_angle / control.DRIFT_ANGLE, 1)

@@ -12,9 +12,10 @@ class Tableau:
     ``order`` of the error estimate in the width; ``nodes`` (S,): where all S stages stand in the
     step; ``weights`` (S, S): of the stages before; ``stages``: how many the step needs, the others
     belong to dense output; ``errors``: weights of one error estimate, or of two of different
-    order; ``dense`` (K, S): of the coefficients of dense output beyond the cubic of Hermite;
-    ``dense_error``: error of dense output over that at the end of the step, in the mean of turning
-    bodies; ``margin_stages``: in order of time, those at which switches are inspected;
+    order; ``difference``: weights of a divided difference of the rates, or None; ``dense`` (K, S):
+    of the coefficients of dense output beyond the cubic of Hermite; ``dense_error``: error of dense
+    output over that at the end of the step, in the mean of turning bodies; ``margin_stages``: in
+    order of time, those at which switches are inspected;
     ``stability``: the width times a rate of decay from which on a step amplifies errors."""
 
     order: int
@@ -22,6 +23,7 @@ class Tableau:
     weights: np.ndarray
     stages: int
     errors: tuple[np.ndarray, ...]
+    difference: np.ndarray | None
     dense: np.ndarray
     dense_error: float
     margin_stages: tuple[int, ...]
@@ -255,6 +257,15 @@ def _filled(rows: dict[int, dict[int, float]], shape: tuple[int, int]) -> np.nda
     return table
 
 
+def _divided_difference(stages: tuple[int, ...]) -> np.ndarray:
+    """Weights of the divided difference of the rates at some stages of DOP853."""
+    places = np.array([_DOP853_NODES[k] for k in stages])
+    gaps = places[:, None] - places + np.eye(len(stages))
+    weights = np.zeros(_DOP853_STAGES)
+    weights[list(stages)] = 1 / np.prod(gaps, axis=1)
+    return weights
+
+
 DOP853 = Tableau(
     7,
     np.array(_DOP853_NODES),
@@ -265,6 +276,9 @@ DOP853 = Tableau(
         _filled(_DOP853_ERROR_5, (1, _DOP853_STAGES))[0],
         _filled(_DOP853_ERROR_3, (1, _DOP853_STAGES))[0],
     ),
+    # Of the stages that enter the result all but those before its end: no other combination of
+    # stages vanishes for every solution that is a polynomial of degree 6.
+    _divided_difference((0, 5, 6, 7, 8, 9, 10)),
     _filled(_DOP853_DENSE, (4, _DOP853_DENSE_STAGES)),
     10,
     (0, 3, 6, 5, 9, 10, 12),
@@ -327,6 +341,7 @@ TSIT5 = Tableau(
     np.array([[0.0] * 7] + [[*row, *[0.0] * (7 - len(row))] for row in _TSIT5_ROWS]),
     7,
     (np.array(_TSIT5_ERROR),),
+    None,
     _TSIT5_DENSE,
     3,
     # the sixth stage stands at the end too, less accurately than the seventh
