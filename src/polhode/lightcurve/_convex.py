@@ -136,7 +136,7 @@ def refine(
     )
 
     def evaluated(body, coefficients):
-        out = _light(body, jnp.asarray(coefficients), points, surface)
+        out = _light(body, jnp.asarray(coefficients), points.without_offsets(), surface)
         value, motion, shape, open_area, by_open = map(np.asarray, out)
         whole = np.hstack([np.where(moving, motion, 0.0), shape])[:n]
         rest = linear.projected(value[:n] + own) - linear.data

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 # on the number of points, only on the square of the number of terms.
 
 _CHUNK = 4096
+_BLOCK = 128  # points are filled up to multiples of it
 # Nodes of the grid of frequencies, for pairs over the whole square of it and for lines.
 _MAX_PAIR_NODES, _MAX_LINE_NODES = 600, 15_000
 _FASTEST = 24.0  # per day: the second harmonic of a rotation in two hours
@@ -163,12 +164,15 @@ class Scan(NamedTuple):
                 highest = min(end, max_nodes * step)
                 is_cut = end > highest
         count = int(np.ceil(highest / step)) + 1
+        # Points, columns and frequencies are filled up, for programs that serve many light curves.
+        missing, spare = -t.size % _BLOCK, -len(basis) % 8
+        rows = np.vstack([np.ones_like(t), values, basis, np.zeros((spare, t.size))])
         transforms = np.asarray(
             _transforms(
-                jnp.asarray(t),
-                jnp.asarray(np.vstack([np.ones_like(t), values, basis])),
+                jnp.asarray(np.pad(t, (0, missing))),
+                jnp.asarray(np.pad(rows, ((0, 0), (0, missing)))),
                 step,
-                2 * (most * count + 1),
+                _filled_up(2 * (most * count + 1)),
             )
         )
         window, data, columns = map(jnp.asarray, (transforms[0], transforms[1], transforms[2:]))
@@ -193,7 +197,7 @@ class Scan(NamedTuple):
 
         ``soft`` (..., m): added to the diagonal of the normal equations, over the number of points.
         """
-        chunk = min(_CHUNK, 256 * -(-len(nodes) // 256))
+        chunk = min(_CHUNK, _filled_up(len(nodes)))
         whole = np.concatenate([nodes, np.repeat(nodes[-1:], -len(nodes) % chunk, 0)])
         power, size = np.empty((2, len(whole)))
         # Two sums of a pair may share a node, or be zero: the ridge keeps the matrix regular. With
@@ -299,6 +303,11 @@ def fourier_lattices(
     return scan.pairs(g, h, power[index])
 
 
+def _filled_up(count: int) -> int:
+    """The next power of two."""
+    return max(1 << (count - 1).bit_length(), 256)
+
+
 def _maxima(values: np.ndarray) -> np.ndarray:
     """Numbers of the local maxima, the highest first."""
     around = np.pad(values, 1, constant_values=-np.inf)
@@ -323,8 +332,10 @@ def _strong_lines(t, values, step) -> tuple[float, float]:
     gaps = gaps[gaps > 0]
     limit = max(0.5 / np.median(gaps), min(0.5 / np.quantile(gaps, 0.05), _FASTEST))
     count = max(int(min(limit / step, 4 * _MAX_LINE_NODES)), 8)
-    (table,) = _transforms(jnp.asarray(t), jnp.asarray(values)[None], step, count)
-    power = np.abs(np.asarray(table)) ** 2
+    missing = -len(t) % _BLOCK
+    t, values = np.pad(np.asarray(t, float), (0, missing)), np.pad(values, (0, missing))
+    (table,) = _transforms(jnp.asarray(t), jnp.asarray(values)[None], step, _filled_up(count))
+    power = np.abs(np.asarray(table))[:count] ** 2
     strong = step * np.flatnonzero(power > 0.1 * power.max())[-1]
     strongest = step * int(np.argmax(power))
     return strongest, min(max(1.3 * strong, 2.2 * strongest), max(count * step, 8 * step))

@@ -283,9 +283,7 @@ def rotators(linear: Linear, periods, max_frequency: float) -> list[Rotator]:
     if curve.sun is None or curve.observer is None:
         return []
     # what the law gives a sphere is a part of the phase function
-    arrays = (linear.t, curve.sun.T, curve.observer.T, linear.root, linear.data)
-    arrays = tuple(map(jnp.asarray, arrays))
-    basis = jnp.asarray(linear.basis)
+    arrays, basis = _filled_up(linear, curve.sun, curve.observer)
     longitude, latitude = _directions(12)
     turn = np.pi * np.arange(4) / 4
     grid = np.array(
@@ -319,9 +317,32 @@ def rotators(linear: Linear, periods, max_frequency: float) -> list[Rotator]:
             apart = not distinct or (pole[distinct] @ pole[k]).max() < np.cos(_APART)
             if np.isfinite(size[k]) and apart and len(distinct) < _POLES:
                 distinct.append(int(k))
-        rest = residuals[:, : linear.t.size] / np.asarray(linear.root)
+        rest = residuals[:, : linear.t.size] / linear.root
         out += [Rotator(rest[k], x[k], float(size[k])) for k in distinct]
     return sorted(out, key=lambda r: r.chi2)
+
+
+def _filled_up(linear: Linear, sun: np.ndarray, observer: np.ndarray):
+    """Arrays of `_rotators`, with points of no weight and columns of zeros: one program serves many
+    light curves."""
+    n, priors, columns = linear.t.size, len(linear.rows) - linear.t.size, linear.basis.shape[1]
+    missing, more, spare = -n % 128, -priors % 16, -columns % 16
+
+    def rows(x):
+        """The points, then the rows of the priors."""
+        points, prior = x[:n], x[n:]
+        rest = ((0, 0),) * (x.ndim - 1)
+        return np.concatenate(
+            [np.pad(points, ((0, missing), *rest)), np.pad(prior, ((0, more), *rest))]
+        )
+
+    def at_points(x, **how):
+        return np.pad(x, (*((0, 0),) * (x.ndim - 1), (0, missing)), **how)
+
+    directions = (at_points(v.T, mode="edge") for v in (sun, observer))
+    arrays = (at_points(linear.t, mode="edge"), *directions, at_points(linear.root))
+    basis = np.pad(rows(linear.basis), ((0, 0), (0, spare)))
+    return tuple(map(jnp.asarray, (*arrays, rows(linear.data)))), jnp.asarray(basis)
 
 
 def round_rotators(periods) -> list[np.ndarray]:

@@ -53,12 +53,21 @@ def _priors(phase: AbstractPhase, columns: int):
     return np.array(rows), np.array(targets), np.array(precision)
 
 
+_light = jax.jit(magnitudes, static_argnums=0)
+_light_and_derivatives = jax.jit(magnitudes_and_derivatives, static_argnums=0)
+
+
 def normal_equations(phase, bodies: Bodies, offsets, points: Points, limit):
     """Robust cost (b,), and matrix and right side of the normal equations of data, all unknowns.
 
     The cost of a residual of r sigma is 2 limit^2 (sqrt(1 + (r / limit)^2) - 1).
     """
-    value, slopes = magnitudes_and_derivatives(phase, bodies, points)
+    light = _light_and_derivatives(phase, bodies, points.without_offsets())
+    return _robust_equations(*light, offsets, points, limit)
+
+
+@jax.jit
+def _robust_equations(value, slopes, offsets, points: Points, limit):
     rest = value + offsets @ points.columns - points.magnitude
     squared = rest * rest * points.weight / limit[:, None] ** 2
     cost = 2 * limit**2 * jnp.sum(squared / (1 + jnp.sqrt(1 + squared)), axis=-1)
@@ -72,8 +81,6 @@ def normal_equations(phase, bodies: Bodies, offsets, points: Points, limit):
     return cost, matrix, right, jnp.sum(rest * rest * points.weight, -1), (value, robust, whole)
 
 
-normal_equations = jax.jit(normal_equations, static_argnums=0)
-_light = jax.jit(magnitudes, static_argnums=0)
 _apply_step = jax.jit(apply_step)
 
 
@@ -133,7 +140,9 @@ class Problem:
         solver = np.linalg.inv((c * weight) @ c.T + np.diag(self.stiffness + 1e-9 * weight.sum()))
         light = np.concatenate(
             [
-                _light(self.phase, select(bodies, slice(k, k + BATCH)), self.points)
+                _light(
+                    self.phase, select(bodies, slice(k, k + BATCH)), self.points.without_offsets()
+                )
                 for k in range(0, len(limit), BATCH)
             ]
         )
@@ -486,13 +495,14 @@ def draw(key, hypotheses: Hypotheses, each: int) -> tuple[Draws, np.ndarray]:
     return draws, long_axis
 
 
-def _misfit(phase, bodies: Bodies, points: Points, solver):
+@jax.jit
+def _misfit(light, points: Points, solver):
     """Misfit (b,) and gain (b,): what the body's variations are multiplied by to fit best."""
 
     def free_of_offsets(x):
         return x - ((x * points.weight) @ points.columns.T @ solver) @ points.columns
 
-    model = free_of_offsets(magnitudes(phase, bodies, points))
+    model = free_of_offsets(light)
     data = free_of_offsets(points.magnitude)
     both, own = ((model * x * points.weight).sum(-1, keepdims=True) for x in (data, model))
     gain = jnp.clip(both / jnp.maximum(own, 1e-12), *GAIN)
@@ -501,9 +511,6 @@ def _misfit(phase, bodies: Bodies, points: Points, solver):
     scale = jnp.sum(rest * points.weight, -1, keepdims=True) / jnp.sum(points.weight)
     size = jnp.sum(points.weight * scale * jnp.log1p(rest / scale), -1) / jnp.sum(points.weight)
     return size, gain[..., 0]
-
-
-_misfit_jit = jax.jit(_misfit, static_argnums=0)
 
 
 def misfits(phase: AbstractPhase, bodies: Bodies, points: Points) -> tuple[np.ndarray, np.ndarray]:
@@ -525,7 +532,8 @@ def misfits(phase: AbstractPhase, bodies: Bodies, points: Points) -> tuple[np.nd
     for start in range(0, total, CHUNK):
         index = np.minimum(np.arange(start, start + CHUNK), total - 1)
         part = Bodies(bodies.unknowns[index], bodies.wxyz[index])
-        out.append(np.asarray(_misfit_jit(phase, part, points, jnp.asarray(solver))))
+        light = _light(phase, part, points.without_offsets())
+        out.append(np.asarray(_misfit(light, points, jnp.asarray(solver))))
     misfit, gain = np.concatenate(out, axis=-1)[:, :total]
     return np.nan_to_num(misfit, nan=np.inf), gain
 
