@@ -298,6 +298,7 @@ NEUTRAL = {
     "ROUGH_ROUNDING": 0.0,
     "ROUGH_ERROR": 1.0,
     "EXPLICIT_SHARE": 1.0,
+    "SIXTH_DIFFERENCE": 0.0,
     "UNDEFINED_SIDE": 1.0,
 }
 """The value at which each constant of the error control does nothing; those that only set a status
