@@ -40,6 +40,7 @@ TUMBLERS = {
     "denied": "not called tumbling",
     "silent": "other periods, TUMBLING",
 }
+FRESH = 20  # curves, after which compiled programs are given up: each holds memory maps
 LIGHT_TIME = 499.00478384 / 86400  # days per au
 OFFSET = 0.03  # standard deviation of the zero points of nights [mag]
 
@@ -408,6 +409,8 @@ def _not_right(row: dict) -> dict:
 
 
 def main() -> None:
+    import jax  # after `one_thread`
+
     parser = argparse.ArgumentParser(description="Verdicts on light curves of convex polyhedra.")
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--count", type=int, default=140)
@@ -424,6 +427,8 @@ def main() -> None:
             continue
         row = case(seed)
         rows.append(row)
+        if len(rows) % FRESH == 0:
+            jax.clear_caches()
         with options.lines.open("a") as file:
             file.write(json.dumps(row) + "\n")
         truth = row["truth"]
