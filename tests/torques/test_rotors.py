@@ -58,7 +58,7 @@ def test_euler_equation_with_wheels():
 
 
 def test_a_wheel_against_newton():
-    """One axis: (C - J) domega/dt = -tau; held wheels do not change a spin about their axis."""
+    """One axis: (C - J) domega/dt = -tau, J dOmega/dt = tau - J domega/dt for the relative speed."""
     wheel = Rotor([0.0, 0.0, 1.0], inertia=0.5, speed=2.0, torque=[0.0, 0.3])
     scene = ph.Scene(INERTIA, rotors=wheel)
     state = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 1.0])
@@ -71,6 +71,9 @@ def test_a_wheel_against_newton():
     got = ph.simulate(scene, state, TS, ph.LiePoisson(), rtol=1e-11)
     want = 1 - np.array([[0.0], [0.3]]) / 2.0 * (np.array(TS) - 0.5)
     assert np.abs(np.array(got.omega_body)[..., 2] - want).max() < 1e-10
+    # relative to the body, which turns the other way
+    speed = 2 + np.array([[0.0], [0.3]]) * (1 / 0.5 + 1 / 2.0) * (np.array(TS) - 0.5)
+    assert np.abs(np.array(got.wheel_speed)[..., 0] - speed).max() < 1e-9
     assert abs(jax.jacfwd(last)(0.3) + 5.5 / 2.0) < 1e-9
 
 
