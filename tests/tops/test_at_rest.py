@@ -109,17 +109,20 @@ def check_batch(dtype, bound, reverse):
     gravity = jnp.array(SLANTED, dtype)
     ts = jnp.asarray([0.0, 3.0], dtype)
 
-    def moved(distance, rates):
-        potential = ph.UniformGravity.axial(jnp.ones((), dtype), distance, gravity)
+    def moved(distance, rates, mass):
+        potential = ph.UniformGravity.axial(mass, distance, gravity)
         traj = ph.simulate(ph.Scene(inertia, potential), ph.State(axes, rates), ts)
         return traj.wxyz[:, -1], traj.omega_body[:, -1]
 
     @jax.jit
-    def moved_and_slopes(distance):
-        return jax.jvp(lambda d: moved(d, rates), (distance,), (jnp.ones_like(distance),))
+    def moved_and_slopes(distance, mass):
+        """By the distance, of the last body by the mass."""
+        along = jnp.array([1.0, 1.0, 1.0, 0.0], dtype)
+        return jax.jvp(lambda d, m: moved(d, rates, m), (distance, mass), (along, 1 - along))
 
-    distance = jnp.array([0.0, 0.1, 0.5, 0.0], dtype)
-    (wxyz, omega), by_distance = moved_and_slopes(distance)
+    distance = jnp.array([0.0, 0.1, 0.5, 0.7], dtype)
+    mass = jnp.array([1.0, 1.0, 1.0, 0.0], dtype)
+    (wxyz, omega), by_distance = moved_and_slopes(distance, mass)
     start = ph.State(axes, rates).wxyz[0]
     np.testing.assert_allclose(wxyz[0], start, rtol=0, atol=bound)
     np.testing.assert_array_equal(omega[0], 0)
@@ -130,16 +133,16 @@ def check_batch(dtype, bound, reverse):
     turn = jnp.concatenate([jnp.zeros(1, dtype), pull * 9 / 4])
     want = ph.rotation.multiply(start, turn)
     np.testing.assert_allclose(by_distance[0][0], want, rtol=0, atol=30 * bound)
-    # a body that turns: central differences over distances that are not zero
+    # a body that turns: central differences over masses that are not zero
     near = bound ** (1 / 3)
-    (above, _), (below, _) = (moved_and_slopes(distance + dtype(d)) for d in (near, -near))
+    (above, _), (below, _) = (moved_and_slopes(distance, mass.at[3].set(x)) for x in (near, -near))
     for slope, high, low in zip(by_distance, above, below):
         gap = (high - low)[3] / (2 * near)
         np.testing.assert_allclose(slope[3], gap, rtol=0, atol=100 * bound ** (2 / 3))
     assert all(bool(jnp.all(jnp.isfinite(x))) for x in by_distance)
     if not reverse:
         return
-    total = jax.grad(lambda d, w: jnp.sum(moved(d, w)[1]), argnums=(0, 1))
+    total = jax.grad(lambda d, w: jnp.sum(moved(d, w, mass)[1]), argnums=(0, 1))
     found = jax.jit(total)(distance, rates)
     assert all(bool(jnp.all(jnp.isfinite(x))) for x in found)
     np.testing.assert_allclose(found[0][0], 3 * jnp.sum(pull), rtol=0, atol=50 * bound)

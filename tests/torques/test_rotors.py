@@ -58,7 +58,7 @@ def test_euler_equation_with_wheels():
 
 
 def test_a_wheel_against_newton():
-    """One axis: (C - J) domega/dt = -tau, J dOmega/dt = tau - J domega/dt for the relative speed."""
+    """One axis: (C - J) domega/dt = -tau, and d(Omega + omega)/dt = tau / J, Omega relative."""
     wheel = Rotor([0.0, 0.0, 1.0], inertia=0.5, speed=2.0, torque=[0.0, 0.3])
     scene = ph.Scene(INERTIA, rotors=wheel)
     state = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 1.0])
