@@ -362,12 +362,13 @@ class Points(NamedTuple):
     sphere: Float[Array, "1 n"]  # magnitude that the law itself gives a sphere
     magnitude: Float[Array, "1 n"]
     weight: Float[Array, "1 n"]  # 1 / sigma^2; 0 pads
-    columns: Float[Array, "c n"] | None  # of the offsets
-    stiffness: Float[Array, " c"] | None  # 1 / sigma^2 of what is known of them
+    columns: Float[Array, "c n"]  # of the offsets
+    stiffness: Float[Array, " c"]  # 1 / sigma^2 of what is known of them
 
     def without_offsets(self) -> "Points":
         """For programs that take long to compile: one serves every number of offsets."""
-        return self._replace(columns=None, stiffness=None)
+        none = jnp.zeros((0, self.t.shape[-1]), self.t.dtype)
+        return self._replace(columns=none, stiffness=none[:, 0])
 
 
 class Bodies(NamedTuple):
