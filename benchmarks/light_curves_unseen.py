@@ -427,10 +427,10 @@ def main() -> None:
             continue
         row = case(seed)
         rows.append(row)
-        if len(rows) % FRESH == 0:
-            jax.clear_caches()
         with options.lines.open("a") as file:
             file.write(json.dumps(row) + "\n")
+        if len(rows) % FRESH == 0:
+            jax.clear_caches()
         truth = row["truth"]
         print(
             f"{seed:4d} {truth['kind']:8s} {row['score']:17s} {row['verdict']:14s}"

@@ -318,6 +318,16 @@ MUTANTS = (
     ),
     Mutant(
         LOOP,
+        "error = error + control.SIXTH_DIFFERENCE * length_of",
+        "error = error + 0 * length_of",
+        "a step that passes something narrow measures its error by chance",
+        (
+            "solvers/test_error_control.py"
+            "::test_a_wheel_keeps_the_tolerance_through_its_band_of_friction",
+        ),
+    ),
+    Mutant(
+        LOOP,
         "rises = jnp.where(turn.levels[row] > 0, 1, -1) * sign",
         "rises = jnp.where(turn.levels[row] > 0, -1, 1) * sign",
         "the direction of an event is the opposite",

@@ -124,7 +124,7 @@ def test_few_steps_of_a_body_that_comes_to_rest_are_refused():
 
 
 def test_a_wheel_keeps_the_tolerance_through_its_band_of_friction():
-    """At every ``rtol``: a step that passes the band measures its error by chance."""
+    """At every ``rtol``: without a third estimate steps that pass the band have errors of 100."""
     friction = ph.CoulombFriction(0.0443, 0.00164)
     wheel = ph.Rotor([0.606, 0.751, 0.261], inertia=1060.0, speed=0.0152, coupling=friction)
     scene = ph.Scene(ph.Inertia.from_moments([6503.0, 15672.0, 11624.0]), rotors=wheel)

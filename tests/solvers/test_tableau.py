@@ -1,5 +1,7 @@
 """Dense output and error estimates of the explicit rules, against SciPy and steps of 1/64."""
 
+from functools import cache
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -106,14 +108,33 @@ def test_steps_that_pass_something_narrow_are_noticed():
     assert np.quantile(with_it, 0.999) < 50
 
 
-def test_the_difference_vanishes_for_polynomials_of_degree_six():
-    """And is of the seventh order in the width for a decay, as the error of a step is of the
-    ninth."""
-    for power in range(6):
-        rates = DOP853.nodes[: DOP853.stages] ** power
-        assert abs(control.SIXTH_DIFFERENCE * DOP853.difference @ rates) < 1e-13
-    sizes = []
-    for width in (0.25, 0.5):
-        _, stages = one_step(lambda t, y: -y, 0, np.ones(1), width)
-        sizes.append(abs(float(DOP853.difference @ stages[:, 0])))
-    assert np.log2(sizes[1] / sizes[0]) > 6.5
+@cache
+def order_conditions(order):
+    """For every rooted tree of so many nodes the weights of its order condition: as factors of one
+    stage, products of those of the trees below (Hairer, Norsett & Wanner, section II.2)."""
+
+    def forests(nodes, largest):
+        """Products of the trees of as many nodes in all, each of at most ``largest``."""
+        if nodes == 0:
+            return [np.ones(DOP853.stages)]
+        table = DOP853.weights[: DOP853.stages, : DOP853.stages]
+        return [
+            (table @ tree) * rest
+            for size in range(1, min(nodes, largest) + 1)
+            for tree in order_conditions(size)
+            for rest in forests(nodes - size, size)
+        ]
+
+    return forests(order - 1, order - 1)
+
+
+def test_the_difference_is_the_only_combination_of_the_seventh_order():
+    """All order conditions up to the sixth hold, and no other combination of stages solves them.
+
+    Trees that differ in the order of their branches are repeated, which changes neither."""
+    conditions = np.array([row for order in range(1, 7) for row in order_conditions(order)])
+    size = np.linalg.norm(DOP853.difference)
+    np.testing.assert_allclose(conditions @ DOP853.difference / size, 0, atol=1e-13)
+    values = np.linalg.svd(conditions, compute_uv=False)
+    assert np.sum(values > 1e-9) == DOP853.stages - 1
+    assert np.max(np.abs(np.array(order_conditions(7)) @ DOP853.difference)) / size > 1e-6

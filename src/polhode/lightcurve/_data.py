@@ -24,7 +24,7 @@ _FAINTEST = 45.0
 _ORBIT = 0.03
 # Points of one night at its brightest magnitude that count as saturated, at least.
 _REPEATED = 4
-_BLOCK = 128  # samples are padded to multiples, so that few programs are compiled
+BLOCK = 128  # samples are padded to multiples, so that few programs are compiled
 
 
 class LightCurve(NamedTuple):
@@ -230,7 +230,7 @@ class LightCurve(NamedTuple):
         """
         sun, observer = self._known_directions()
         n, (columns, stiffness) = self.t.size, self.columns(offset_sigma)
-        missing, spare = -n % _BLOCK, -len(columns) % 4
+        missing, spare = -n % BLOCK, -len(columns) % 4
         floors = floor * (1 + (self.alpha / _DOUBLED) ** 2)
         weight = np.pad(1 / (self.sigma**2 + floors**2), (0, missing))
         columns = np.pad(columns, ((0, spare), (0, missing)))

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from polhode.lightcurve._data import BLOCK
+
 # Two-dimensional Fourier series: which pairs of frequencies a light curve allows.
 #
 # The brightness of a free body, seen from constant directions, is a series in ``cos`` and ``sin``
@@ -17,7 +19,6 @@ from jaxtyping import Array, Float
 # on the number of points, only on the square of the number of terms.
 
 _CHUNK = 4096
-_BLOCK = 128  # points are filled up to multiples of it
 # Nodes of the grid of frequencies, for pairs over the whole square of it and for lines.
 _MAX_PAIR_NODES, _MAX_LINE_NODES = 600, 15_000
 _FASTEST = 24.0  # per day: the second harmonic of a rotation in two hours
@@ -165,7 +166,7 @@ class Scan(NamedTuple):
                 is_cut = end > highest
         count = int(np.ceil(highest / step)) + 1
         # Points, columns and frequencies are filled up, for programs that serve many light curves.
-        missing, spare = -t.size % _BLOCK, -len(basis) % 8
+        missing, spare = -t.size % BLOCK, -len(basis) % 8
         rows = np.vstack([np.ones_like(t), values, basis, np.zeros((spare, t.size))])
         transforms = np.asarray(
             _transforms(
@@ -304,7 +305,7 @@ def fourier_lattices(
 
 
 def _filled_up(count: int) -> int:
-    """The next power of two."""
+    """The next power of two, 256 at least."""
     return max(1 << (count - 1).bit_length(), 256)
 
 
@@ -332,7 +333,7 @@ def _strong_lines(t, values, step) -> tuple[float, float]:
     gaps = gaps[gaps > 0]
     limit = max(0.5 / np.median(gaps), min(0.5 / np.quantile(gaps, 0.05), _FASTEST))
     count = max(int(min(limit / step, 4 * _MAX_LINE_NODES)), 8)
-    missing = -len(t) % _BLOCK
+    missing = -len(t) % BLOCK
     t, values = np.pad(np.asarray(t, float), (0, missing)), np.pad(values, (0, missing))
     (table,) = _transforms(jnp.asarray(t), jnp.asarray(values)[None], step, _filled_up(count))
     power = np.abs(np.asarray(table))[:count] ** 2

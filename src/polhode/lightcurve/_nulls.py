@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from polhode.lightcurve._brightness import seeliger_ellipsoid
-from polhode.lightcurve._data import LightCurve
+from polhode.lightcurve._data import BLOCK, LightCurve
 from polhode.lightcurve._frequencies import LINES, Pairs, Scan, _maxima, terms
 
 _CLIP = 4.0  # residuals beyond as many times the scale of the best model count as that
@@ -326,7 +326,7 @@ def _filled_up(linear: Linear, sun: np.ndarray, observer: np.ndarray):
     """Arrays of `_rotators`, with points of no weight and columns of zeros: one program serves many
     light curves."""
     n, priors, columns = linear.t.size, len(linear.rows) - linear.t.size, linear.basis.shape[1]
-    missing, more, spare = -n % 128, -priors % 16, -columns % 16
+    missing, more, spare = -n % BLOCK, -priors % 16, -columns % 16
 
     def rows(x):
         """The points, then the rows of the priors."""
