@@ -28,7 +28,7 @@ from polhode._closed_forms._free_motion import (
 )
 from polhode._closed_forms._free_periods import compensate
 from polhode._closed_forms._free_tangent import Quadruple
-from polhode._kernels import computed_once, kernel, opaque_ones
+from polhode._kernels import computed_once, kernel
 from polhode._method import Record, Samples, Status, StepCounts
 from polhode._scene import Scene, State
 from polhode.inertia import Symmetry, principal
@@ -334,17 +334,15 @@ def _results(requested, polhode: Polhode, precession: Precession | None, at: Ins
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _evaluate(requested, constants, arguments):
     polhode, precession = constants
-    one = None if requested[2] else polhode.one
-    return _results(
-        requested, polhode, precession, advance(polhode, precession, arguments[-1], one)
-    )
+    at = advance(polhode, precession, arguments[-1])
+    return _results(requested, polhode, precession, at)
 
 
 def _evaluate_rule(requested, primals, tangents):
     (polhode, precession), arguments = primals
     t = jax.lax.stop_gradient(arguments[-1])
     # The tangent has many kernels, and each would repeat the motion itself.
-    at = advance(polhode, precession, t, opaque_ones(t * polhode.one), fine=True)
+    at = advance(polhode, precession, t, fine=True)
     motion = EvaluatedMotion(polhode, precession, at, _results(requested, polhode, precession, at))
     return results_rule(requested, (motion, arguments), (None, tangents[1]))
 

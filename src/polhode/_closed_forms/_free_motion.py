@@ -540,16 +540,18 @@ def half_angle(
     return cosine * f - sine * g, cosine * g + sine * f
 
 
-def advance(
-    polhode: Polhode, precession: Precession | None, t: Scalars, one: Scalars | None, fine=False
-):
-    """The ``Instant`` of time t; with ``one``, of the shape of t, in stages (see ``staged``).
+def advance(polhode: Polhode, precession: Precession | None, t: Scalars, fine: bool = False):
+    """The ``Instant`` of time t.
 
-    ``fine``: in more stages, for results that many kernels need.
+    Computed in stages (see ``staged``): without them the loop over each component of the result
+    repeats all arithmetic, and is compiled with it. ``fine``: in more stages, for results that many
+    kernels need.
     """
-    # One kernel per output repeats the arithmetic of all stages, which costs less than to write
-    # and read them when every lane has many times, and more when it has one.
-    stage = (lambda x: x) if one is None else (lambda x: staged(x, one))
+    one = opaque_ones(t * polhode.one)
+
+    def stage(values):
+        return staged(values, one)
+
     extra_stage = stage if fine else (lambda x: x)
     half_turns, fraction = extra_stage(half_turns_at(polhode, t))
     half, reduced = jacobi(polhode, fraction, stage)
