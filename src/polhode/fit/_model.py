@@ -174,7 +174,7 @@ def tensor_of(shape: Float[Array, " k"], base: Base, columns: np.ndarray) -> Arr
 
 
 class Predicted(NamedTuple):
-    """Body rates, their derivatives (None: unknown) and attitudes (None: not computed)."""
+    """Body rates, their derivatives (None: unknown or not needed), attitudes (None: not needed)."""
 
     omega: Float[Array, "t 3"]
     omega_dot: Float[Array, "t 3"] | None
@@ -217,8 +217,12 @@ class AbstractMotion(eqx.Module):
         times: Float[Array, " t"],
         wheel: Float[Array, " t"] | None,
         unknown: Any,
+        acceleration: bool,
     ) -> Predicted:
-        """Motion with the inertia ``tensor`` from ``omega`` and ``wxyz`` at ``times[0]``."""
+        """Motion with the inertia ``tensor`` from ``omega`` and ``wxyz`` at ``times[0]``.
+
+        ``acceleration``: whether ``omega_dot`` is needed.
+        """
 
 
 class Drag(eqx.Module):
@@ -278,6 +282,7 @@ class SteppedMotion(AbstractMotion):
         times: Float[Array, " t"],
         wheel: Float[Array, " t"] | None,
         unknown: Any,
+        acceleration: bool,
     ) -> Predicted:
         inertia = Inertia(full=tensor)
         drag = unknown["drag"] if self.fit_drag else self.drag
@@ -310,12 +315,14 @@ class SteppedMotion(AbstractMotion):
         momentum, attitude = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), y, path)
         push, rates = momentum_rate(times, momentum, _attitude(), dynamics(wheel_at))
         push, rates = jnp.stack(push, axis=-1), jnp.stack(rates, axis=-1)
+        if attitude is not None:
+            attitude = normalise(jnp.stack(attitude, axis=-1))
+        if not acceleration:
+            return Predicted(rates, None, attitude)
         if wheel_at is not None:  # what the wheel takes up does not turn the body
             carried = jnp.stack(self._along(wheel_at(times)), axis=-1)
             momentum_change, step = (jnp.asarray(jnp.gradient(x, axis=0)) for x in (carried, times))
             push = push - momentum_change / step[:, None]
-        if attitude is not None:
-            attitude = normalise(jnp.stack(attitude, axis=-1))
         return Predicted(rates, inertia.rates(push), attitude)
 
     def _wheel(self, times, wheel, delay) -> Callable[[Array], Array] | None:
@@ -376,6 +383,7 @@ class FreeMotion(AbstractMotion):
         times: Float[Array, " t"],
         wheel: Float[Array, " t"] | None,
         unknown: Any,
+        acceleration: bool,
     ) -> Predicted:
         moments, axes, (yz, zx, xy) = principal(tensor)
         start = rotate(conjugate(axes), omega)
@@ -391,7 +399,8 @@ class FreeMotion(AbstractMotion):
         path = _combined(wxyz_to_matrix(axes), rates)
         if path_wxyz is not None:
             path_wxyz = _combined(_right_product(conjugate(axes)), path_wxyz)
-        return Predicted(path, free_acceleration(Inertia(full=tensor), path), path_wxyz)
+        omega_dot = free_acceleration(Inertia(full=tensor), path) if acceleration else None
+        return Predicted(path, omega_dot, path_wxyz)
 
 
 def _combined(matrix: Float[Array, "n n"], components: tuple[Array, ...]) -> Float[Array, "t n"]:
@@ -466,6 +475,7 @@ class SceneMotion(AbstractMotion):
         times: Float[Array, " t"],
         wheel: Float[Array, " t"] | None,
         unknown: Any,
+        acceleration: bool,
     ) -> Predicted:
         scene = self.build(Inertia(full=tensor), unknown)
         return simulated(scene, omega, wxyz, times, self.method, self.rtol)
@@ -572,6 +582,7 @@ class LeafMotion(AbstractMotion):
         times: Float[Array, " t"],
         wheel: Float[Array, " t"] | None,
         unknown: Any,
+        acceleration: bool,
     ) -> Predicted:
         scene = self.with_values(unknown)
         return simulated(scene, omega, wxyz, times, self.method, self.rtol, self.attitude)

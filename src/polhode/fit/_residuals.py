@@ -13,6 +13,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from polhode._kernels import kernel
 from polhode.fit._model import (
     AbstractMotion,
     Base,
@@ -82,8 +83,11 @@ def predict(
     if attitude is not None and parameters.attitude is not None:
         attitude = multiply(attitude, rotation_vector_to_wxyz(parameters.attitude))
 
+    is_delayed = bool(model.gyroscope.delay) or parameters.delay is not None
+    acceleration = is_delayed or recording.force is not None
+
     def predict_recording(omega, wxyz, times, wheel):
-        return model.motion(tensor, omega, wxyz, times, wheel, parameters.motion)
+        return model.motion(tensor, omega, wxyz, times, wheel, parameters.motion, acceleration)
 
     return jax.vmap(predict_recording)(parameters.omega, attitude, recording.times, recording.wheel)
 
@@ -159,7 +163,7 @@ def _readings(
         omega = rotate(jnp.broadcast_to(turn, (*omega.shape[:-1], 4)), omega)
     if parameters.gain is not None:
         errors = parameters.gain.reshape(3, 3)
-        omega = omega + jnp.einsum("ij,rtj->rti", errors, omega)
+        omega = omega + sum(errors[:, j] * omega[..., j, None] for j in range(3))
     if parameters.bias is not None:
         omega = omega + parameters.bias[None, None]
     if parameters.walk is not None:
@@ -354,6 +358,13 @@ def unknowns(parameters: Parameters, model: Model) -> Unknowns:
     return Unknowns(shared, own, of_motion, of_own, parameters_of)
 
 
+def with_entries(x: Array, places: np.ndarray, values: Array) -> Array:
+    """``x`` (n,) with ``values`` at ``places``, by a gather: a kernel holds no scatter."""
+    order = np.arange(x.shape[0])
+    order[places] = x.shape[0] + np.arange(places.size)
+    return jnp.concatenate([x, values])[order]
+
+
 def linearise(
     shared: Array, own: Array, layout: Unknowns, recording: Recording, model: Model
 ) -> Linear:
@@ -383,8 +394,8 @@ def linearise(
 
         def residuals_at(motion_unknowns, own_motion_unknowns):
             parameters, tensor = layout.parameters(
-                shared.at[motion_places].set(motion_unknowns),
-                own.at[own_motion_places].set(own_motion_unknowns),
+                with_entries(shared, motion_places, motion_unknowns),
+                with_entries(own, own_motion_places, own_motion_unknowns),
             )
             motion = predict(parameters, one_recording, one_model, tensor)
             rows = flat(motion, parameters)
@@ -392,8 +403,8 @@ def linearise(
 
         def sensor_residuals(sensor_unknowns, own_sensor_unknowns):
             parameters, _ = layout.parameters(
-                shared.at[sensor_places].set(sensor_unknowns),
-                own.at[own_sensor_places].set(own_sensor_unknowns),
+                with_entries(shared, sensor_places, sensor_unknowns),
+                with_entries(own, own_sensor_places, own_sensor_unknowns),
             )
             return flat(motion, parameters)
 
@@ -409,7 +420,7 @@ def linearise(
             by_own = by_own[..., np.argsort(np.concatenate([own_motion_places, own_sensor_places]))]
         return by_shared, by_own, rows
 
-    by_shared, by_own, rows = jax.vmap(at)(own, recording, model.attitude)
+    by_shared, by_own, rows = kernel(jax.vmap(at))(own, recording, model.attitude)
     columns = jnp.concatenate([by_shared, by_own, rows[..., None]], axis=-1)
     columns = columns.reshape(rows.shape[0], -1, columns.shape[-1])
     factor = triangle(columns)
