@@ -43,6 +43,7 @@ CASES: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "REFILLING": ((False,), ("heavy tops", "gradient of heavy tops")),
     "TIME_LOOP": ((False,), ("free bodies, 100 times",)),
     "KERNEL_BODIES": ((0, 64), ("heavy top", "ten heavy tops", "satellite", "clipped satellites")),
+    "KERNEL_BATCH": ((4, 64), ("tops under vmap", "free bodies under vmap", "Jacobian of a top")),
     "KERNEL_SUM": ((64,), ("gradient of heavy tops", "gradient of Lagrange's tops")),
     "KERNEL_TABLE": ((0,), ("heavy top", "heavy tops", "Lagrange's tops")),
     "STAGE_WORK": ((2, 10**6), ("satellites", "gradient of heavy tops", "gradient of satellites")),
@@ -157,6 +158,37 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
 
         return ready
 
+    def mapped(build, n):
+        """``jax.vmap`` of a simulation of one body."""
+
+        def ready():
+            ts, start = jnp.linspace(0.0, 20.0, 21), motion(build, n)[1]
+
+            def one(m, q, w):
+                return ph.simulate(build(m), ph.State(q, w), ts).wxyz
+
+            program = jax.jit(jax.vmap(one)).lower(*start).compile()
+            return lambda: jax.block_until_ready(program(*start))
+
+        return ready
+
+    def jacobian(build):
+        """Forward mode, by 16 numbers: the start and an inertia with products."""
+
+        def ready():
+            m, q, w = motion(build, 1)[1]
+            start = jnp.concatenate([q, w, jnp.diag(m).ravel()])
+
+            def last(x):
+                scene = build(m)
+                scene = ph.Scene(ph.Inertia(full=x[7:].reshape(3, 3)), scene.potential)
+                return ph.simulate(scene, ph.State(x[:4], x[4:7]), [0.0, 10.0]).wxyz[-1]
+
+            program = jax.jit(jax.jacfwd(last)).lower(start).compile()
+            return lambda: jax.block_until_ready(program(start))
+
+        return ready
+
     def fits():
         times = np.linspace(0, 6, 150)
         _, start = motion(triaxial(), 20)
@@ -183,6 +215,9 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
         "ten satellites": value(satellite, 10),
         "satellites": value(satellite, 200),
         "clipped satellites": value(triaxial(gradient, ph.FeedbackTorque(clipped)), 50),
+        "tops under vmap": mapped(triaxial(gravity), 64),
+        "free bodies under vmap": mapped(triaxial(), 64),
+        "Jacobian of a top": jacobian(triaxial(gravity)),
         "network": value(triaxial(None, ph.FeedbackTorque(network)), 10),
         "gradient of free bodies": slope(triaxial(), BODIES),
         "gradient of Lagrange's tops": slope(symmetric(axial), BODIES),

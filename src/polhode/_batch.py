@@ -122,26 +122,6 @@ def along_time(part: Any, batch_rank: int) -> Any:
     return map_arrays(part, expand)
 
 
-def map_chunks(fn: Callable[[Any], Any], lanes: Any, n: int, size: int) -> Any:
-    """``fn`` over chunks of at most ``size`` of the ``n`` lanes, one after the other.
-
-    Memory stays bounded by a chunk and its arrays stay in the cache. Chunks are of one size; the
-    last is filled up with copies of the last lane, which are dropped again.
-    """
-    if n <= size:
-        return fn(lanes)
-    count = -(-n // size)
-    size = -(-n // count)
-
-    def split(x):
-        fill = jnp.broadcast_to(x[-1:], (count * size - n, *x.shape[1:]))
-        return jnp.concatenate([x, fill]).reshape(count, size, *x.shape[1:])
-
-    chunks = jax.lax.map(fn, jax.tree.map(split, lanes))
-    # -1 would be ambiguous for arrays without elements
-    return jax.tree.map(lambda x: x.reshape(count * size, *x.shape[2:])[:n], chunks)
-
-
 # Several devices. Chunks of lanes are worked on one after the other, which a compiler that splits
 # arrays by itself could only do by gathering them: the batch is split by hand, by jax.shard_map.
 

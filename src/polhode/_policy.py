@@ -52,6 +52,9 @@ KERNEL_BODIES = 8
 """[bodies] Up to so many, everything around the integration is part of one fused kernel too. For
 more the integration is up to 1.05 times slower as a kernel within a kernel."""
 
+KERNEL_BATCH = 16
+"""[bodies] In a kernel under ``jax.vmap``; more are moved in such batches, one after the other."""
+
 KERNEL_SUM = 2048
 """[floats] Sums of so many or more are not part of a kernel: XLA hands sums of 4,096 floats to a
 library, and a kernel cannot contain that call."""

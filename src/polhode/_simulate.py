@@ -17,7 +17,6 @@ from polhode._batch import (
     flatten,
     is_lane_tree,
     lane_times,
-    map_chunks,
     on_devices,
     place,
     split_of,
@@ -31,7 +30,7 @@ from polhode._events import (
     events_by_steps,
     stop_at_event,
 )
-from polhode._kernels import Distinct, jit_distinct, kernel
+from polhode._kernels import Distinct, jit_distinct, kernel, map_chunks
 from polhode._method import (
     AbstractMethod,
     Record,

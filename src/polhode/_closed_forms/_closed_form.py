@@ -7,7 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode._batch import is_lane_tree, map_chunks
+from polhode._batch import is_lane_tree
+from polhode._kernels import map_chunks
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts
 from polhode._scene import BodyTorque, LinearDamping, Scene, State, TorqueSum, Wheels
 from polhode.inertia import Symmetry, VariableInertia

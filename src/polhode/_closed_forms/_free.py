@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode import _policy, rotation
-from polhode._batch import PARTS, map_chunks
+from polhode._batch import PARTS
 from polhode._closed_forms._closed_form import AbstractClosedForm, with_first
 from polhode._closed_forms._free_derivatives import EvaluatedMotion, results_rule
 from polhode._closed_forms._free_motion import (
@@ -28,7 +28,7 @@ from polhode._closed_forms._free_motion import (
 )
 from polhode._closed_forms._free_periods import compensate
 from polhode._closed_forms._free_tangent import Quadruple
-from polhode._kernels import computed_once, kernel
+from polhode._kernels import computed_once, kernel, map_chunks
 from polhode._method import Record, Samples, Status, StepCounts
 from polhode._scene import Scene, State
 from polhode.inertia import Symmetry, principal

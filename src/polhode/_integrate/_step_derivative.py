@@ -52,6 +52,14 @@ def samples(make: Make, arrays, unit_data, y, start, ts, states, once: bool = Fa
         *input_tangents, dy, dstart, dts = tangents
         motion, _ = problem_of(inputs)
         starts, rows = each_body(start, ts, y.shape[1])
+        order = None
+        ordered_ts, ordered_values = ts, values
+        # `Trajectory.at` may ask for times of a body in any order; the loop goes one way.
+        if ts.ndim > 1:
+            sign = jnp.where(ts[:, -1:] < jnp.reshape(start, (-1, 1)), -1, 1).astype(ts.dtype)
+            order = jnp.argsort(jax.lax.stop_gradient(sign * ts), axis=1)
+            ordered_ts = jnp.take_along_axis(ts, order, axis=1)
+            ordered_values = [jnp.take_along_axis(values[0], order[..., None], axis=1)]
         at = [i for i, x in enumerate(input_tangents[:size]) if is_slope(x)]
         dy = dy if is_slope(dy) else zeros(dy)
         # A later start is a start from a state that has gone back along the rates, and a later
@@ -63,27 +71,21 @@ def samples(make: Make, arrays, unit_data, y, start, ts, states, once: bool = Fa
             lambda primals, cotangents: _cotangent(
                 problem_of, at, _checked(primals, once), cotangents[0]
             ),
-            list(operands),
+            [*inputs, y, start, ordered_ts],
             [dy, *(input_tangents[i] for i in at)],
-            values,
+            ordered_values,
         )
+        if order is not None:
+            place = jnp.argsort(order, axis=1)[..., None]
+            change = [jnp.take_along_axis(change[0], place, axis=1)]
         if is_slope(dts):
             rate = _rates(motion, rows, jnp.moveaxis(values[0], 0, -1))
             dtimes = each_body(start, dts, y.shape[1])[1]
             change = [change[0] + jnp.moveaxis(dtimes[:, None] * rate, -1, 0)]
         return change
 
-    order = None
-    # `Trajectory.at` may ask for times of a body in any order; the loop goes one way.
-    if ts.ndim > 1:
-        sign = jnp.where(ts[:, -1:] < jnp.reshape(start, (-1, 1)), -1, 1).astype(ts.dtype)
-        order = jnp.argsort(jax.lax.stop_gradient(sign * ts), axis=1)
-        ts = jnp.take_along_axis(ts, order, axis=1)
-        states = jnp.take_along_axis(states, order[..., None], axis=1)
     (states,) = attached(rule, [*arrays, *leaves, y, start, ts], [states])
-    if order is None:
-        return states
-    return jnp.take_along_axis(states, jnp.argsort(order, axis=1)[..., None], axis=1)
+    return states
 
 
 def _is_differentiated(operands) -> bool:
@@ -123,7 +125,11 @@ def _tangent(problem_of, at, primals, tangents):
         _, rows = run(motion, options, *each_body(start, ts, y.shape[1]), y)
         return rows.samples.reshape(y.shape[1], ts.shape[-1] + 1, -1)[:, :-1]
 
-    return [jax.jvp(path, (y, *(arrays[i] for i in at)), (dy, *parameter_tangents))[1]]
+    def tangent(primals, tangents):
+        return jax.jvp(path, primals, tangents)[1]
+
+    parameters = tuple(arrays[i] for i in at)
+    return [kernel(tangent)((y, *parameters), (dy, *parameter_tangents))]
 
 
 class _Note(NamedTuple):

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode import _policy
-from polhode._batch import PARTS, along_time, is_lane_tree, map_chunks
+from polhode._batch import PARTS, along_time, is_lane_tree
 from polhode._hamiltonian import Dynamics
 from polhode._integrate._charts import AbstractChart, natural_rates
 from polhode._integrate._diffrax_solve import (
@@ -36,7 +36,7 @@ from polhode._integrate._problem import Problem
 from polhode._integrate._step_derivative import samples
 from polhode._integrate._switches import guarded
 from polhode._integrate._tableau import TSIT5
-from polhode._kernels import Distinct, is_holdable, kernel
+from polhode._kernels import Distinct, is_holdable, kernel, map_chunks
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts, check_options
 from polhode._parts import AbstractPart
 from polhode._scene import Scene, State

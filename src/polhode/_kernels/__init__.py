@@ -33,5 +33,6 @@ from polhode._kernels._fused import (
     is_holdable as is_holdable,
     jit_distinct as jit_distinct,
     kernel as kernel,
+    map_chunks as map_chunks,
     put as put,
 )

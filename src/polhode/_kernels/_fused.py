@@ -428,20 +428,52 @@ def _unit_lowered(*arrays, program, shapes):
         return jax.jit(program)(*arrays)
 
 
+def map_chunks(fn: Callable[[Any], Any], lanes: Any, n: int, size: int) -> Any:
+    """``fn`` over chunks of at most ``size`` of the ``n`` lanes, one after the other.
+
+    Memory stays bounded by a chunk and its arrays stay in the cache. Chunks are of one size; the
+    last is filled up with copies of the last lane, which are dropped again.
+    """
+    if n <= size:
+        return fn(lanes)
+    count = -(-n // size)
+    size = -(-n // count)
+
+    def split(x):
+        fill = jnp.broadcast_to(x[-1:], (count * size - n, *x.shape[1:]))
+        return jnp.concatenate([x, fill]).reshape(count, size, *x.shape[1:])
+
+    chunks = jax.lax.map(fn, jax.tree.map(split, lanes))
+    # -1 would be ambiguous for arrays without elements
+    return jax.tree.map(lambda x: x.reshape(count * size, *x.shape[2:])[:n], chunks)
+
+
 def _unit_batch(arrays, dims, *, program, shapes):
+    """A unit of a few bodies, and a loop over such units: outside of one the same arithmetic takes
+    a hundred times as long, for XLA repeats what several results need."""
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
-    shapes = tuple(((size, *shape), dtype) for shape, dtype in shapes)
-    closed_jaxpr = jax.make_jaxpr(jax.vmap(program, dims))(*arrays)
-    batch = jaxpr_as_fun(closed_jaxpr)
-    # XLA divides loops over large arrays among threads, which it cannot do within a unit.
-    if size > _policy.KERNEL_BODIES or _sums_widely(closed_jaxpr.jaxpr):
-        return batch(*arrays), [0] * len(shapes)
+    places = [k for k, d in enumerate(dims) if d is not None]
 
-    def batched_program(*arrays):
-        with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):
-            return batch(*arrays)
+    def unit_of(lanes):
+        whole = list(arrays)
+        for k, x in zip(places, lanes):
+            whole[k] = x
+        count = lanes[0].shape[0]
+        in_axes = [0 if k in places else None for k in range(len(arrays))]
+        closed_jaxpr = jax.make_jaxpr(jax.vmap(program, in_axes))(*whole)
+        batch = jaxpr_as_fun(closed_jaxpr)
+        if _sums_widely(closed_jaxpr.jaxpr):
+            return batch(*whole)
 
-    return _unit_p.bind(*arrays, program=batched_program, shapes=shapes), [0] * len(shapes)
+        def batched_program(*arrays):
+            with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):
+                return batch(*arrays)
+
+        of_batch = tuple(((count, *shape), dtype) for shape, dtype in shapes)
+        return _unit_p.bind(*whole, program=batched_program, shapes=of_batch)
+
+    lanes = [jnp.moveaxis(arrays[k], dims[k], 0) for k in places]
+    return map_chunks(unit_of, lanes, size, _policy.KERNEL_BATCH), [0] * len(shapes)
 
 
 mlir.register_lowering(_unit_p, mlir.lower_fun(_unit_lowered, multiple_results=True))

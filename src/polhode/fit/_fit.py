@@ -10,8 +10,9 @@ import numpy as np
 from jaxtyping import Array
 
 from polhode import _policy
-from polhode._batch import PARTS, batch_shapes, map_chunks
+from polhode._batch import PARTS, batch_shapes
 from polhode._checks import ArrayLike, as_float_array, require, require_positive
+from polhode._kernels import map_chunks
 from polhode._method import AbstractMethod
 from polhode._scene import Scene
 from polhode._scene._scene import places_of

@@ -217,7 +217,7 @@ class AbstractMotion(eqx.Module):
         times: Float[Array, " t"],
         wheel: Float[Array, " t"] | None,
         unknown: Any,
-        acceleration: bool,
+        acceleration: bool = True,
     ) -> Predicted:
         """Motion with the inertia ``tensor`` from ``omega`` and ``wxyz`` at ``times[0]``.
 
@@ -282,7 +282,7 @@ class SteppedMotion(AbstractMotion):
         times: Float[Array, " t"],
         wheel: Float[Array, " t"] | None,
         unknown: Any,
-        acceleration: bool,
+        acceleration: bool = True,
     ) -> Predicted:
         inertia = Inertia(full=tensor)
         drag = unknown["drag"] if self.fit_drag else self.drag
@@ -383,7 +383,7 @@ class FreeMotion(AbstractMotion):
         times: Float[Array, " t"],
         wheel: Float[Array, " t"] | None,
         unknown: Any,
-        acceleration: bool,
+        acceleration: bool = True,
     ) -> Predicted:
         moments, axes, (yz, zx, xy) = principal(tensor)
         start = rotate(conjugate(axes), omega)
@@ -475,7 +475,7 @@ class SceneMotion(AbstractMotion):
         times: Float[Array, " t"],
         wheel: Float[Array, " t"] | None,
         unknown: Any,
-        acceleration: bool,
+        acceleration: bool = True,
     ) -> Predicted:
         scene = self.build(Inertia(full=tensor), unknown)
         return simulated(scene, omega, wxyz, times, self.method, self.rtol)
@@ -582,7 +582,7 @@ class LeafMotion(AbstractMotion):
         times: Float[Array, " t"],
         wheel: Float[Array, " t"] | None,
         unknown: Any,
-        acceleration: bool,
+        acceleration: bool = True,
     ) -> Predicted:
         scene = self.with_values(unknown)
         return simulated(scene, omega, wxyz, times, self.method, self.rtol, self.attitude)

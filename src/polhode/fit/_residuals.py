@@ -163,7 +163,7 @@ def _readings(
         omega = rotate(jnp.broadcast_to(turn, (*omega.shape[:-1], 4)), omega)
     if parameters.gain is not None:
         errors = parameters.gain.reshape(3, 3)
-        omega = omega + sum(errors[:, j] * omega[..., j, None] for j in range(3))
+        omega = omega + sum(errors[None, None, :, j] * omega[..., j, None] for j in range(3))
     if parameters.bias is not None:
         omega = omega + parameters.bias[None, None]
     if parameters.walk is not None:

@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from polhode._checks import is_concrete, numbers, on_host, require, require_positive
-from polhode._kernels import are_close, over_gap, underivable
+from polhode._kernels import are_close, kernel, over_gap, underivable
 from polhode.rotation._quaternion import matrix_row
 
 # Cyclic Jacobi converges quadratically once the off-diagonal part is small against the gaps, and
@@ -120,6 +120,7 @@ def _total(terms: Iterable[Array]) -> Array:
 
 
 @jax.jit  # a hundred operations: outside of a program each would be one of its own
+@kernel
 def principal(
     tensor: Float[Array, "*b 3 3"],
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 4"], Float[Array, "*b 3"]]:

@@ -74,7 +74,11 @@ def _quaternion_of_matrix(matrix: Array, good: Array) -> Array:
 
 def rotation_vector_to_wxyz(rotation_vector: Float[ArrayLike, "*b 3"]) -> Float[Array, "*b 4"]:
     """Unit quaternion of a rotation vector (rad); smooth everywhere, any angle."""
-    rotation_vector = as_vectors("rotation_vector", rotation_vector, 3)
+    return _turned_by(as_vectors("rotation_vector", rotation_vector, 3))
+
+
+@jax.jit
+def _turned_by(rotation_vector: Array) -> Array:
     quarter_squared = jnp.sum(rotation_vector * rotation_vector, axis=-1, keepdims=True) / 4
     vector = sine_ratio(quarter_squared) * rotation_vector / 2
     return jnp.concatenate([cosine(quarter_squared), vector], axis=-1)
@@ -86,7 +90,12 @@ def wxyz_to_rotation_vector(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 
     Smooth at the identity, with right derivatives of every order; at an angle of pi, where it jumps
     between two opposite vectors, its derivative is one-sided.
     """
-    upper = canonical(as_quaternions(wxyz))
+    return _rotation_vector(as_quaternions(wxyz))
+
+
+@jax.jit
+def _rotation_vector(wxyz: Array) -> Array:
+    upper = canonical(wxyz)
     return 2 * arc_ratio(upper[..., 0], upper[..., 1:])[..., None] * upper[..., 1:]
 
 
@@ -110,7 +119,12 @@ def wxyz_to_axis_angle(
     At the identity the axis is undefined and (0, 0, 1) is returned. There neither axis nor angle
     has a derivative, and zero is returned for it; `wxyz_to_rotation_vector` is smooth there.
     """
-    upper = canonical(as_quaternions(wxyz))
+    return _axis_angle(as_quaternions(wxyz))
+
+
+@jax.jit
+def _axis_angle(wxyz: Array) -> tuple[Array, Array]:
+    upper = canonical(wxyz)
     angle = 2 * jnp.arctan2(length(upper[..., 1:]), upper[..., 0])
     return direction(upper[..., 1:]), angle
 
@@ -121,7 +135,11 @@ def modified_rodrigues_to_wxyz(parameters: Float[ArrayLike, "*b 3"]) -> Float[Ar
     The scalar part is negative for parameters longer than 1, so that each set is given back by
     `wxyz_to_modified_rodrigues` or `wxyz_to_shadow` respectively.
     """
-    parameters = as_vectors("parameters", parameters, 3)
+    return _of_modified_rodrigues(as_vectors("parameters", parameters, 3))
+
+
+@jax.jit
+def _of_modified_rodrigues(parameters: Array) -> Array:
     # Both terms are scaled alike, which cannot change the quotient: no overflow for huge
     # parameters, and the derivative of the scale may be left out.
     largest = jnp.max(jnp.abs(parameters), axis=-1, keepdims=True)
@@ -133,8 +151,10 @@ def modified_rodrigues_to_wxyz(parameters: Float[ArrayLike, "*b 3"]) -> Float[Ar
     return jnp.concatenate([scalar, 2 * one * scaled / total], axis=-1)
 
 
-def _project(wxyz: Array) -> Array:
-    return wxyz[..., 1:] / (length(wxyz) + wxyz[..., 0])[..., None]
+@jax.jit
+def _modified_rodrigues(wxyz: Array) -> Array:
+    upper = canonical(wxyz)
+    return upper[..., 1:] / (length(upper) + upper[..., 0])[..., None]
 
 
 def wxyz_to_modified_rodrigues(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3"]:
@@ -142,12 +162,17 @@ def wxyz_to_modified_rodrigues(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "
 
     The scale of the quaternion does not matter.
     """
-    return _project(canonical(as_quaternions(wxyz)))
+    return _modified_rodrigues(as_quaternions(wxyz))
 
 
 def wxyz_to_shadow(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3"]:
     """The set of length at least 1 of a rotation; infinite at the identity."""
-    lower = -canonical(as_quaternions(wxyz))
+    return _shadow(as_quaternions(wxyz))
+
+
+@jax.jit
+def _shadow(wxyz: Array) -> Array:
+    lower = -canonical(wxyz)
     size = length(lower[..., 1:])
     # norm + scalar = vector**2/(norm - scalar), without cancellation for a negative scalar part
     return lower[..., 1:] * ((length(lower) - lower[..., 0]) / size)[..., None] / size[..., None]
