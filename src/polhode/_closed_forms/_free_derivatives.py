@@ -523,7 +523,8 @@ def results_tangent(requested, motion: EvaluatedMotion, arguments, tangents, res
         d_wxyz = quaternion_product(results[1], (jnp.zeros_like(n1), *(x / 2 for x in turn)))
         if dq is not None:
             d_wxyz = _start_tangent(start, dq, results[1], d_wxyz)
-    return d_omega, d_wxyz
+    # or what puts the components together would compute all of them for each entry
+    return staged((d_omega, d_wxyz), opaque_ones(motion.polhode.rate_unit * arguments[4]))
 
 
 def _start_tangent(start: Quadruple, variation: Quadruple, attitude: Quadruple, tangent: Quadruple):

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.core import ShapedArray
-from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
-from jax.interpreters import partial_eval
+from jax.extend.core import ClosedJaxpr, Literal, Primitive, jaxpr_as_fun
+from jax.interpreters import ad, batching, mlir, partial_eval
 from jaxtyping import Array
 
 from polhode import _policy
@@ -54,9 +54,47 @@ def staged(values: Any, *ones: Array) -> Any:
         if not jnp.issubdtype(x.dtype, jnp.inexact):
             return x
         one = next((one for one in ones if one.shape == x.shape), ones[0])
-        return x / (one if one.ndim >= x.ndim else jnp.broadcast_to(one, x.shape))
+        x, one = jnp.broadcast_arrays(x, one) if one.ndim >= x.ndim else (x, one)
+        return _stage_p.bind(x, jnp.broadcast_to(one, x.shape))
 
     return jax.tree.map(divided, values)
+
+
+# A division whose divisor has every axis of the value under ``jax.vmap`` too: that of a derivative
+# in many directions would otherwise be broadcast along them.
+_stage_p = Primitive("stage")
+_stage_p.def_impl(jax.lax.div)
+_stage_p.def_abstract_eval(lambda x, _: ShapedArray(x.shape, x.dtype))
+
+
+def _stage_jvp(primals, tangents):
+    change = tangents[0]
+    if type(change) is not ad.Zero:
+        change = _stage_p.bind(change, primals[1])
+    return _stage_p.bind(*primals), change
+
+
+def _stage_transpose(cotangent, _, one):
+    return (cotangent if type(cotangent) is ad.Zero else _stage_p.bind(cotangent, one)), None
+
+
+def _stage_batch(arrays, dims):
+    (x, one), size = arrays, next(a.shape[d] for a, d in zip(arrays, dims) if d is not None)
+    x, one = (
+        jnp.broadcast_to(a, (size, *a.shape)) if d is None else jnp.moveaxis(a, d, 0)
+        for a, d in zip((x, one), dims)
+    )
+    if dims[1] is None:
+        # ones along the new axis that XLA does not recognise as ones either
+        axis = 1 + (jax.lax.broadcasted_iota(jnp.int32, one.shape, 0) >> 31).astype(one.dtype)
+        one = one * axis
+    return _stage_p.bind(x, one), 0
+
+
+mlir.register_lowering(_stage_p, mlir.lower_fun(jax.lax.div, multiple_results=False))
+ad.primitive_jvps[_stage_p] = _stage_jvp
+ad.primitive_transposes[_stage_p] = _stage_transpose
+batching.primitive_batchers[_stage_p] = _stage_batch
 
 
 def computed_once(values: Any) -> Any:

@@ -34,8 +34,8 @@ _HOLDABLE = frozenset(
      exp exp2 expm1 floor gather ge gt integer_pow iota is_finite jit le linear_map log log1p
      logistic lt max min mul ne neg not optimization_barrier or pad pjit pow reduce_and
      reduce_max reduce_min reduce_or reduce_sum rem reshape round rsqrt scan select_n
-     shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stop_gradient sub
-     tan tanh transpose unit unstack while xor""".split()  # noqa: SIM905
+     shift_right_arithmetic sign sin sinh slice split sqrt square squeeze stack stage
+     stop_gradient sub tan tanh transpose unit unstack while xor""".split()  # noqa: SIM905
 )
 """Operations that a unit may contain; functions with others are compiled as usual."""
 
