@@ -100,7 +100,8 @@ def test_steps_that_pass_something_narrow_are_noticed():
         counts = np.abs(end - exact) > 1e-11
         for with_difference, values in found.items():
             extra = control.SIXTH_DIFFERENCE * difference * with_difference
-            values.append((np.abs(end - exact) / (estimate + extra))[counts])
+            with np.errstate(divide="ignore"):  # without the difference some estimates vanish
+                values.append(np.abs(end - exact)[counts] / (estimate + extra)[counts])
     without, with_it = (np.concatenate(found[key]) for key in (False, True))
     assert np.mean(without > 10) > 0.05, "the difference is not needed"
     assert np.mean(with_it > 10) < 0.01

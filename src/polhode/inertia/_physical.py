@@ -119,8 +119,6 @@ def _total(terms: Iterable[Array]) -> Array:
     return reduce(add, terms)
 
 
-@jax.jit  # a hundred operations: outside of a program each would be one of its own
-@kernel
 def principal(
     tensor: Float[Array, "*b 3 3"],
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 4"], Float[Array, "*b 3"]]:
@@ -136,6 +134,12 @@ def principal(
     moments, products and wxyz together. This holds to first order: the second derivative of an
     eigenvalue depends on the rotation of the axes, which is omitted (see ``principal_moments``).
     """
+    return _principal(tensor)
+
+
+@jax.jit  # a hundred operations: outside of a program each would be one of its own
+@kernel  # compiles in half the time
+def _principal(tensor: Array) -> tuple[Array, Array, Array]:
     # Rows and columns are the first axes, and whole arrays are multiplied: written entry by entry
     # the program takes twice as long to compile.
     tensor = jnp.moveaxis(tensor, (-2, -1), (0, 1))
