@@ -16,6 +16,7 @@ import numpy as np
 from jax import lax
 from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Literal, Primitive, jaxpr_as_fun
+from jax.extend.mlir.dialects import stablehlo
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jaxtyping import Array
 
@@ -91,7 +92,7 @@ def _stage_batch(arrays, dims):
     return _stage_p.bind(x, one), 0
 
 
-mlir.register_lowering(_stage_p, mlir.lower_fun(jax.lax.div, multiple_results=False))
+mlir.register_lowering(_stage_p, lambda _, x, one: [stablehlo.divide(x, one)])
 ad.primitive_jvps[_stage_p] = _stage_jvp
 ad.primitive_transposes[_stage_p] = _stage_transpose
 batching.primitive_batchers[_stage_p] = _stage_batch
