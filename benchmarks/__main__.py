@@ -2,7 +2,7 @@
 
 python -m benchmarks [--quick] [--output FOLDER]   every benchmark, each in its own process
 python -m benchmarks figures FILE ... [--output FOLDER]
-python -m benchmarks page                          results page, numbers in pages
+python -m benchmarks page                          results page, tables in README.md
 """
 
 import argparse
@@ -59,7 +59,7 @@ def main() -> int:
     figures.add_argument("files", nargs="+", type=Path)
     figures.add_argument("--output", type=Path, default=_report.OUT)
     figures.add_argument("--format", choices=("svg", "png"), default="svg")
-    actions.add_parser("page", help="write benchmarks/README.md and the numbers in other pages")
+    actions.add_parser("page", help="write benchmarks/README.md and tables in README.md")
     options = parser.parse_args()
     if options.action == "figures":
         for path in _figures.draw(options.files, options.output, f".{options.format}"):
@@ -68,13 +68,10 @@ def main() -> int:
     if options.action == "page":
         merged = _page.merged()
         if merged:
-            for name, families in (("work_precision", _figures.MAIN), ("work_precision_all", ())):
+            for name, families in (("work_precision", ()), ("work_precision_main", _figures.MAIN)):
                 drawn = _figures.work_precision(merged, families)
                 _figures.save(drawn, _report.RESULTS / f"{name}.svg")
-        others = [
-            _report.RESULTS / f"{name}.json"
-            for name in ("scaling", "gradients", "throw_design", "engines")
-        ]
+        others = [_report.RESULTS / f"{name}.json" for name in _figures.DRAWN]
         _figures.draw([path for path in others if path.exists()], _report.RESULTS)
         for path in _page.write():
             print(path.relative_to(_page.ROOT))

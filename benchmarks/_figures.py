@@ -1,6 +1,9 @@
 """Figures of the benchmarks, drawn from their JSON only."""
 
+import functools
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from benchmarks._report import read
 
@@ -15,11 +18,35 @@ PEERS = (
     "Numba",
     "MuJoCo",
 )
-SHOWN = {"bodies": 1000, "dtype": "float64"}
-
-
 MAIN = ("free", "separatrix", "lagrange", "heavy_top", "gradient", "dense")
 """Families in the figure of the README."""
+
+ENGINE_COLOURS = {
+    "MuJoCo Euler": "#CC79A7",
+    "MuJoCo implicitfast": "#009E73",
+    "MuJoCo RK4": "#0072B2",
+    "Bullet": "#E69F00",
+    "no gyroscopic term": "#888888",
+}
+
+DRAWN: dict[str, Callable] = {}
+"""By name of the result."""
+
+
+def _drawn(function: Callable) -> Callable:
+    """A figure of a result, drawn in the style of the package."""
+
+    @functools.wraps(function)
+    def draw_report(report: dict, *options: Any) -> Any:
+        import matplotlib.pyplot as plt
+
+        from polhode.plot._samples import STYLE
+
+        with plt.rc_context(STYLE):
+            return function(plt, report, *options)
+
+    DRAWN[function.__name__] = draw_report
+    return draw_report
 
 
 def _name(peer: str, program: str) -> str:
@@ -46,49 +73,188 @@ def fronts(rows: list[dict]) -> dict[str, tuple[list, list]]:
     return found
 
 
-def work_precision(report: dict, families: tuple[str, ...] = (), **shown):
-    """A panel per family: attitude error of the median body against time per body."""
-    import matplotlib.pyplot as plt
-
+@_drawn
+def work_precision(plt, report: dict, families: tuple[str, ...] = ()):
+    """A panel per family: attitude error of the median of 1,000 bodies against time per body."""
     from polhode import plot
-    from polhode.plot._samples import STYLE
 
-    shown = SHOWN | shown
-    tables = [
-        t
-        for t in report["numbers"]["tables"]
-        if all(t[k] == v for k, v in shown.items()) and (not families or t["family"] in families)
-    ]
+    tables = [t for t in report["numbers"]["tables"] if t["bodies"] == 1000]
+    tables = [t for t in tables if t["dtype"] == "float64"]
+    tables = [t for t in tables if not families or t["family"] in families]
     if not tables:
-        raise ValueError(f"the result holds no table with {shown}")
+        raise ValueError("the result holds no table of 1,000 bodies in float64")
     columns = min(3 if len(tables) <= 6 else 5, len(tables))
     rows = -(-len(tables) // columns)
-    with plt.rc_context(STYLE):
-        figure = plt.figure(figsize=(3.3 * columns + 1.9, 2.6 * rows + 0.3), layout="constrained")
-        axes = list(figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat)
-        drawn = {}
-        for ax, table in zip(axes, tables):
-            plot.work_precision(
-                fronts(table["rows"]), ax=ax, highlight=PEERS[0], error_label="", time_label=""
-            )
-            for line in ax.lines:
-                if len(line.get_xdata()):
-                    drawn[line.get_label()] = line
-                if len(line.get_xdata()) == 1:  # an exact method: one point serves every error
-                    line.set_markersize(10)
-            ax.get_legend().remove()
-            ax.set_title(table["title"])
-            ax.set_ylim(3e-16 if shown["dtype"] == "float64" else 1e-8, 5)
-            ax.minorticks_off()
+    figure = plt.figure(figsize=(3.3 * columns + 1.9, 2.6 * rows + 0.3), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).flat)
+    drawn = {}
+    for ax, table in zip(axes, tables):
+        plot.work_precision(
+            fronts(table["rows"]), ax=ax, highlight=PEERS[0], error_label="", time_label=""
+        )
+        for line in ax.lines:
+            if len(line.get_xdata()):
+                drawn[line.get_label()] = line
+            if len(line.get_xdata()) == 1:  # an exact method: one point serves every error
+                line.set_markersize(10)
+        ax.get_legend().remove()
+        ax.set_title(table["title"])
+        ax.set_ylim(3e-16, 5)
+        ax.minorticks_off()
+        ax.label_outer()
+        for text in ax.texts:
+            text.remove()
+    for ax in axes[len(tables) :]:
+        ax.set_axis_off()
+    figure.supxlabel("time per body [µs]", fontsize=9.5)
+    figure.supylabel("attitude error at the end [rad], median body", fontsize=9.5)
+    order = list(drawn)
+    figure.legend([drawn[name] for name in order], order, loc="outside right upper")
+    return figure
+
+
+@_drawn
+def scaling(plt, report: dict):
+    """Time and memory per body against the number of bodies, the horizon and saved times."""
+    sweeps = ("bodies", "horizon", "saves")
+    labels = {"bodies": "bodies", "horizon": "horizon [s]", "saves": "saved times"}
+    figure = plt.figure(figsize=(10.5, 5.0), layout="constrained")
+    axes = figure.subplots(2, 3, sharex="col", sharey="row")
+    for column, sweep in enumerate(sweeps):
+        for name, points in report["numbers"][sweep].items():
+            x = [point[sweep] for point in points]
+            axes[0, column].plot(x, [p["ns_per_body"] * 1e-3 for p in points], "o-", label=name)
+            memory = [p["memory_MB"] for p in points]
+            axes[1, column].plot(x, memory, "o-", label=name)
+        axes[1, column].set_xlabel(labels[sweep])
+        for ax in axes[:, column]:
+            ax.set_xscale("log")
+            ax.set_yscale("log")
             ax.label_outer()
-            for text in ax.texts:
-                text.remove()
-        for ax in axes[len(tables) :]:
-            ax.set_axis_off()
-        figure.supxlabel("time per body [µs]", fontsize=9.5)
-        figure.supylabel("attitude error at the end [rad], median body", fontsize=9.5)
-        order = list(drawn)
-        figure.legend([drawn[name] for name in order], order, loc="outside right upper")
+    axes[0, 0].set_ylabel("time per body [µs]")
+    axes[1, 0].set_ylabel("memory of the program [MB]")
+    axes[0, 2].legend(loc="upper left")
+    return figure
+
+
+@_drawn
+def gradients(plt, report: dict):
+    """Cost of value and gradient over the forward run, and the error of the gradient."""
+    rows = report["numbers"]["rows"]
+    figure = plt.figure(figsize=(10.5, 0.3 * len(rows) + 0.9), layout="constrained")
+    left, right = figure.subplots(1, 2, sharey=True)
+    kinds = {"polhode": "#222222", "diffrax": "#CC79A7", "heyoka": "#009E73"}
+    for k, row in enumerate(rows):
+        style = {"color": kinds[row["peer"]], "height": 0.6}
+        left.barh(k, row["ns_gradient"] * 1e-3, **style)
+        left.text(row["ns_gradient"] * 1.15e-3, k, f"{row['ratio']:.2g} x", va="center", size=8)
+        right.barh(k, row["error_median"], **style)
+    by = [row["program"].partition(", by ")[2] for row in rows]
+    names = [
+        f"{row['title']}{', by ' + what if what else ''}: {row['peer']}, {row['setting']}"
+        for row, what in zip(rows, by)
+    ]
+    left.set_yticks(range(len(rows)), names)
+    left.invert_yaxis()
+    left.set_xscale("log")
+    left.margins(x=0.12)
+    left.set_xlabel("both, per body [µs]; over the value alone")
+    right.set_xscale("log")
+    right.set_xlim(1e-16, 1)
+    right.set_xlabel("relative error, median")
+    for ax in (left, right):
+        ax.grid(visible=False, axis="y")
+    return figure
+
+
+@_drawn
+def identification(plt, report: dict):
+    """Errors over the bound and cover of intervals, two standard errors; times beside SciPy."""
+    numbers = report["numbers"]
+    rows = [*numbers["designs"], numbers["designs_pooled"]]
+    names = [
+        f"{row['turns']} turns, {100 * row['noise_over_rate']:g} %" if "turns" in row else "all"
+        for row in rows
+    ]
+    figure = plt.figure(figsize=(10.5, 3.2), layout="constrained")
+    error, cover, speed = figure.subplots(1, 3)
+    for ax, name, target, label in (
+        (error, "error_over_bound", (0.9, 1.1), "error / Cramér-Rao bound"),
+        (cover, "interval_cover", (0.93, 0.97), "cover of 95 % intervals"),
+    ):
+        values = [row.get(name, row.get(f"{name}_95")) for row in rows]
+        spread = [2 * row[f"{name}_std"] for row in rows]
+        ax.axvspan(*target, color="#009E73", alpha=0.15, linewidth=0)
+        ax.errorbar(values, range(len(rows)), xerr=spread, fmt="o", color="#222222")
+        ax.set_yticks(range(len(rows)), names if ax is error else [""] * len(rows))
+        ax.invert_yaxis()
+        ax.set_xlabel(label)
+        ax.grid(visible=False, axis="y")
+    cases = numbers["speed"]["cases"]
+    for kind, colour in (("ours", "#222222"), ("scipy", "#CC79A7")):
+        times = [1e3 * case[f"{kind}_s"] for case in cases]
+        off = [case[f"error_{kind}"] for case in cases]
+        name = {"ours": "polhode", "scipy": "SciPy"}[kind]
+        speed.plot(times, off, "o", color=colour, label=name, alpha=0.8)
+    speed.set_xscale("log")
+    speed.set_yscale("log")
+    speed.set_xlabel("time of one fit [ms]")
+    speed.set_ylabel("error of the tensor")
+    speed.legend()
+    return figure
+
+
+@_drawn
+def throw_design(plt, report: dict):
+    """What a throw tells of the tensor, by direction of its spin and by program of the wheel."""
+    numbers = report["numbers"]
+    figure = plt.figure(figsize=(10.0, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for ax, rows, columns, values, labels in (
+        (
+            left,
+            "tilt_deg",
+            "turn_deg",
+            "spread_of_spins",
+            ("spin about the wheel's axis, turned by [deg]", "tilted by [deg]"),
+        ),
+        (
+            right,
+            "begin_s",
+            "length_s",
+            "spread_of_programs",
+            ("wheel is on for [s]", "switched on after [s]"),
+        ),
+    ):
+        table = [[100 * value for value in row] for row in numbers[values]]
+        drawn = ax.contourf(numbers[columns], numbers[rows], table, levels=12, cmap="viridis_r")
+        figure.colorbar(drawn, ax=ax, label="spread of the tensor [%]")
+        ax.set_xlabel(labels[0])
+        ax.set_ylabel(labels[1])
+        ax.grid(visible=False)
+    return figure
+
+
+@_drawn
+def engines(plt, report: dict):
+    """Attitude error and change of the energy of physics engines against revolutions."""
+    figure = plt.figure(figsize=(9.0, 3.1), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    for row in report["numbers"]["rows"]:
+        if row["body"] != "t_handle":
+            continue
+        for ax, name in ((left, "attitude"), (right, "energy")):
+            values = [None if x is None else abs(x) for x in row[name]]
+            points = [(t, x) for t, x in zip(row["turns"], values) if x]
+            if points and max(x for _, x in points) > 1e-14:
+                (line,) = ax.loglog(*zip(*points), label=row["engine"])
+                line.set_color(ENGINE_COLOURS.get(row["engine"], "#888888"))
+    left.set_ylabel("attitude error [rad]")
+    right.set_ylabel("relative change of the energy")
+    right.set_ylim(1e-13, 1e2)
+    for ax in (left, right):
+        ax.set_xlabel("revolutions")
+    left.legend()
     return figure
 
 
@@ -104,190 +270,6 @@ def save(figure, path: Path) -> Path:
         figure.savefig(partial, metadata={"Date": None} if path.suffix == ".svg" else None)
     plt.close(figure)
     return path
-
-
-def scaling(report: dict):
-    """Time and memory per body against the number of bodies, the horizon and saved times."""
-    import matplotlib.pyplot as plt
-
-    from polhode.plot._samples import STYLE
-
-    sweeps = ("bodies", "horizon", "saves")
-    labels = {"bodies": "bodies", "horizon": "horizon [s]", "saves": "saved times"}
-    with plt.rc_context(STYLE):
-        figure = plt.figure(figsize=(10.5, 5.0), layout="constrained")
-        axes = figure.subplots(2, 3, sharex="col", sharey="row")
-        for column, sweep in enumerate(sweeps):
-            for name, points in report["numbers"][sweep].items():
-                x = [point[sweep] for point in points]
-                axes[0, column].plot(x, [p["ns_per_body"] * 1e-3 for p in points], "o-", label=name)
-                memory = [p["memory_MB"] for p in points]
-                axes[1, column].plot(x, memory, "o-", label=name)
-            axes[1, column].set_xlabel(labels[sweep])
-            for ax in axes[:, column]:
-                ax.set_xscale("log")
-                ax.set_yscale("log")
-                ax.label_outer()
-        axes[0, 0].set_ylabel("time per body [µs]")
-        axes[1, 0].set_ylabel("memory of the program [MB]")
-        axes[0, 2].legend(loc="upper left")
-    return figure
-
-
-def gradients(report: dict):
-    """Cost of value and gradient over the forward run, and the error of the gradient."""
-    import matplotlib.pyplot as plt
-
-    from polhode.plot._samples import STYLE
-
-    rows = report["numbers"]["rows"]
-    with plt.rc_context(STYLE):
-        figure = plt.figure(figsize=(10.5, 0.3 * len(rows) + 0.9), layout="constrained")
-        left, right = figure.subplots(1, 2, sharey=True)
-        kinds = {"polhode": "#222222", "diffrax": "#CC79A7", "heyoka": "#009E73"}
-        for k, row in enumerate(rows):
-            style = {"color": kinds[row["peer"]], "height": 0.6}
-            left.barh(k, row["ns_gradient"] * 1e-3, **style)
-            left.text(row["ns_gradient"] * 1.15e-3, k, f"{row['ratio']:.2g} x", va="center", size=8)
-            right.barh(k, row["error_median"], **style)
-        by = [row["program"].partition(", by ")[2] for row in rows]
-        names = [
-            f"{row['title']}{', by ' + what if what else ''}: {row['peer']}, {row['setting']}"
-            for row, what in zip(rows, by)
-        ]
-        left.set_yticks(range(len(rows)), names)
-        left.invert_yaxis()
-        left.set_xscale("log")
-        left.margins(x=0.12)
-        left.set_xlabel("both, per body [µs]; over the value alone")
-        right.set_xscale("log")
-        right.set_xlim(1e-16, 1)
-        right.set_xlabel("relative error, median")
-        for ax in (left, right):
-            ax.grid(visible=False, axis="y")
-    return figure
-
-
-def identification(report: dict):
-    """Errors over the bound and cover of intervals, two standard errors; times beside SciPy."""
-    import matplotlib.pyplot as plt
-
-    from polhode.plot._samples import STYLE
-
-    numbers = report["numbers"]
-    rows = [*numbers["designs"], numbers["designs_pooled"]]
-    names = [
-        f"{row['turns']} turns, {100 * row['noise_over_rate']:g} %" if "turns" in row else "all"
-        for row in rows
-    ]
-    with plt.rc_context(STYLE):
-        figure = plt.figure(figsize=(10.5, 3.2), layout="constrained")
-        error, cover, speed = figure.subplots(1, 3)
-        for ax, name, target, label in (
-            (error, "error_over_bound", (0.9, 1.1), "error / Cramér-Rao bound"),
-            (cover, "interval_cover", (0.93, 0.97), "cover of 95 % intervals"),
-        ):
-            values = [row.get(name, row.get(f"{name}_95")) for row in rows]
-            spread = [2 * row[f"{name}_std"] for row in rows]
-            ax.axvspan(*target, color="#009E73", alpha=0.15, linewidth=0)
-            ax.errorbar(values, range(len(rows)), xerr=spread, fmt="o", color="#222222")
-            ax.set_yticks(range(len(rows)), names if ax is error else [""] * len(rows))
-            ax.invert_yaxis()
-            ax.set_xlabel(label)
-            ax.grid(visible=False, axis="y")
-        cases = numbers["speed"]["cases"]
-        for kind, colour in (("ours", "#222222"), ("scipy", "#CC79A7")):
-            times = [1e3 * case[f"{kind}_s"] for case in cases]
-            off = [case[f"error_{kind}"] for case in cases]
-            name = {"ours": "polhode", "scipy": "SciPy"}[kind]
-            speed.plot(times, off, "o", color=colour, label=name, alpha=0.8)
-        speed.set_xscale("log")
-        speed.set_yscale("log")
-        speed.set_xlabel("time of one fit [ms]")
-        speed.set_ylabel("error of the tensor")
-        speed.legend()
-    return figure
-
-
-def throw_design(report: dict):
-    """What a throw tells of the tensor, by direction of its spin and by program of the wheel."""
-    import matplotlib.pyplot as plt
-
-    from polhode.plot._samples import STYLE
-
-    numbers = report["numbers"]
-    with plt.rc_context(STYLE):
-        figure = plt.figure(figsize=(10.0, 3.4), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        for ax, rows, columns, values, labels in (
-            (
-                left,
-                "tilt_deg",
-                "turn_deg",
-                "spread_of_spins",
-                ("spin about the wheel's axis, turned by [deg]", "tilted by [deg]"),
-            ),
-            (
-                right,
-                "begin_s",
-                "length_s",
-                "spread_of_programs",
-                ("wheel is on for [s]", "switched on after [s]"),
-            ),
-        ):
-            table = [[100 * value for value in row] for row in numbers[values]]
-            drawn = ax.contourf(numbers[columns], numbers[rows], table, levels=12, cmap="viridis_r")
-            figure.colorbar(drawn, ax=ax, label="spread of the tensor [%]")
-            ax.set_xlabel(labels[0])
-            ax.set_ylabel(labels[1])
-            ax.grid(visible=False)
-    return figure
-
-
-def engines(report: dict):
-    """Attitude error and change of the energy of physics engines against revolutions."""
-    import matplotlib.pyplot as plt
-
-    from polhode.plot._samples import STYLE
-
-    with plt.rc_context(STYLE):
-        figure = plt.figure(figsize=(9.0, 3.1), layout="constrained")
-        left, right = figure.subplots(1, 2)
-        for row in report["numbers"]["rows"]:
-            if row["body"] != "t_handle":
-                continue
-            for ax, name in ((left, "attitude"), (right, "energy")):
-                values = [None if x is None else abs(x) for x in row[name]]
-                points = [(t, x) for t, x in zip(row["turns"], values) if x]
-                if points and max(x for _, x in points) > 1e-14:
-                    (line,) = ax.loglog(*zip(*points), label=row["engine"])
-                    line.set_color(ENGINE_COLOURS.get(row["engine"], "#888888"))
-        left.set_ylabel("attitude error [rad]")
-        right.set_ylabel("relative change of the energy")
-        right.set_ylim(1e-13, 1e2)
-        for ax in (left, right):
-            ax.set_xlabel("revolutions")
-        left.legend()
-    return figure
-
-
-ENGINE_COLOURS = {
-    "MuJoCo Euler": "#CC79A7",
-    "MuJoCo implicitfast": "#009E73",
-    "MuJoCo RK4": "#0072B2",
-    "Bullet": "#E69F00",
-    "no gyroscopic term": "#888888",
-}
-
-
-DRAWN = {
-    "work_precision": work_precision,
-    "scaling": scaling,
-    "gradients": gradients,
-    "identification": identification,
-    "throw_design": throw_design,
-    "engines": engines,
-}
 
 
 def draw(paths: list[Path], folder: Path, suffix: str = ".svg") -> list[Path]:

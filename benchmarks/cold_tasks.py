@@ -457,6 +457,29 @@ def measured(names: list[str], repeats: int) -> list[dict]:
     return rows
 
 
+def side_by_side(rows: list[dict]) -> list[dict]:
+    """polhode and the other library in one flat row for each task."""
+    found = []
+    for row in rows:
+        ours, other = row["polhode"], row["peer"] or {}
+        found.append(
+            {
+                "task": row["task"],
+                "other_library": TASKS[row["task"]][2] or None,
+                "first_s": ours["first"],
+                "other_first_s": other.get("first"),
+                "second_s": ours["second"],
+                "other_second_s": other.get("second"),
+                "first_stored_s": ours["cached"],
+                "memory_MB": ours["memory"],
+                "other_memory_MB": other.get("memory"),
+                "error": ours.get("error"),
+                "other_error": other.get("error"),
+            }
+        )
+    return found
+
+
 def main() -> None:
     """Run the benchmark."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -469,7 +492,8 @@ def main() -> None:
     if args.child:
         print(json.dumps(_child(*args.child)))
         return
-    numbers = {"rows": measured(args.tasks, 1 if args.quick else 3)}
+    rows = measured(args.tasks, 1 if args.quick else 3)
+    numbers = {"rows": rows, "side_by_side": side_by_side(rows)}
     _report.write("cold_tasks", numbers, path=args.output)
 
 

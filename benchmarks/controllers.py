@@ -288,20 +288,22 @@ def measure_kind(kind: str, bodies: int, rtol: float = 1e-6, repeats: int = 3) -
     }
 
 
-def level_times(rows: list[dict], level: float) -> dict[str, float | None]:
-    """Of each program the least time of its tolerances at which the error is below ``level``."""
-    programs = dict.fromkeys(row["program"] for row in rows)
-    return {
-        name: min(
-            (
-                row["seconds"]
-                for row in rows
-                if row["program"] == name and row["error"] is not None and row["error"] <= level
-            ),
-            default=None,
-        )
-        for name in programs
-    }
+def time_to_error(rows: list[dict]) -> list[dict]:
+    """Of each program the least time [ms] of its tolerances whose error is below a level; None:
+    no tolerance reaches it."""
+    names = "activation", "bodies", "dtype", "program"
+    groups: dict[tuple, list[dict]] = {}
+    for row in rows:
+        groups.setdefault(tuple(row[name] for name in names), []).append(row)
+
+    def least(group: list[dict], level: float) -> float | None:
+        reached = (row for row in group if row["error"] is not None and row["error"] <= level)
+        return min((1e3 * row["seconds"] for row in reached), default=None)
+
+    return [
+        dict(zip(names, key)) | {f"ms_to_{level:.0e}": least(group, level) for level in LEVELS}
+        for key, group in groups.items()
+    ]
 
 
 def main() -> None:
@@ -338,6 +340,7 @@ def main() -> None:
     for kind in list(KINDS)[:1] if few else KINDS:
         numbers["kinds"].append(measure_kind(kind, 4 if few else 32))
         print(numbers["kinds"][-1], flush=True)
+    numbers["time_to_error"] = time_to_error(numbers["rows"])
     path = _report.write("controllers", numbers, path=options.output, packages=("scipy",))
     print(f"written: {path.name}")
 

@@ -190,10 +190,23 @@ def measure(turns: float, count: int = 25) -> list[dict]:
     return rows
 
 
-def at_turns(row: dict, turns: float) -> tuple[float, float]:
-    """Attitude error and relative change of the energy at the saved time nearest to ``turns``."""
-    k = int(np.argmin(np.abs(np.log(np.array(row["turns"]) / turns))))
-    return row["attitude"][k], row["energy"][k]
+def after_turns(rows: list[dict]) -> list[dict]:
+    """Attitude errors [rad] and relative changes of the energy after 1 to 1,000 revolutions, at
+    the nearest saved times."""
+    found = []
+    for row in rows:
+        at = {
+            turns: int(np.argmin(np.abs(np.log(np.array(row["turns"]) / turns))))
+            for turns in (1, 10, 100, 1000)
+            if turns < 1.1 * row["turns"][-1]
+        }
+        found.append(
+            {"body": row["body"], "engine": row["engine"]}
+            | {f"rad_after_{turns}": row["attitude"][k] for turns, k in at.items()}
+            | {f"energy_after_{turns}": row["energy"][k] for turns, k in at.items()}
+            | {"us_per_step": row["us_per_step"]}
+        )
+    return found
 
 
 def main() -> None:
@@ -204,16 +217,15 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     rows = measure(10.0 if options.quick else 1000.0)
     for row in rows:
-        angle, energy = at_turns(row, row["turns"][-1])
         print(
-            f"{row['body']:12}{row['engine']:20}{row['turns'][-1]:>7.0f} turns: {angle:.1e} rad,"
-            f" energy {energy:+.1e}, momentum {row['momentum'][-1]:.1e},"
+            f"{row['body']:12}{row['engine']:20}{row['turns'][-1]:>7.0f} turns:"
+            f" {row['attitude'][-1]:.1e} rad,"
+            f" energy {row['energy'][-1]:+.1e}, momentum {row['momentum'][-1]:.1e},"
             f" {row['us_per_step']:.2g} us a step"
         )
     packages = tuple({package for package, _ in engines().values() if package})
-    path = _report.write(
-        "engines", {"step": STEP, "rows": rows}, path=options.output, packages=packages
-    )
+    numbers = {"step": STEP, "rows": rows, "after_turns": after_turns(rows)}
+    path = _report.write("engines", numbers, path=options.output, packages=packages)
     print(path)
 
 

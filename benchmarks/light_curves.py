@@ -373,6 +373,11 @@ def real(folder: Path, seeds: int, **options) -> dict:
     return {"tc4_minutes": minutes, "toutatis": runs}
 
 
+def best_solutions(runs: list[dict], count: int = 4) -> list[dict]:
+    """The first solutions of each seed."""
+    return [{"seed": run["seed"], **row} for run in runs for row in run["solutions"][:count]]
+
+
 def main() -> None:
     jax.config.update("jax_enable_x64", True)
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -397,6 +402,7 @@ def main() -> None:
         print(keep("speed", speed()), result["speed"], flush=True)
     if given.real:
         keep("real", real(given.real, given.seeds, trials=given.trials))
+        keep("toutatis", best_solutions(result["real"]["toutatis"]))
     for name, egg, count, noises in (
         ("eggs", True, given.egg, [0.02]),
         ("cases", False, given.count, given.noise),

@@ -119,6 +119,21 @@ def measure_case(case: Case, dtype) -> dict[str, float]:
     return worst
 
 
+def worst_by_conversion(rows: list[dict]) -> list[dict]:
+    """One row for each conversion, and one each way for the worst of all Euler sequences."""
+    groups: dict[str, dict[str, float]] = {}
+    for row in rows:
+        name = row["conversion"]
+        if {"Euler", "wxyz"} <= set(name.split()):
+            to_wxyz = name.startswith("Euler")
+            name = "Euler (any sequence) -> wxyz" if to_wxyz else "wxyz -> Euler (any sequence)"
+        worst = groups.setdefault(name, {})
+        for column in COLUMNS:
+            key = f"{row['dtype']}_{column}"
+            worst[key] = max(worst.get(key, 0.0), row[column])
+    return [{"conversion": name, **worst} for name, worst in groups.items()]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="few random samples, ZYZ and XYZ only")
@@ -140,7 +155,11 @@ def main() -> None:
             rows.append({"conversion": case.name, "dtype": dtype.__name__, **worst})
             cells = "".join(f"{worst[name]:>10.2f}" for name in COLUMNS)
             print(f"{case.name:<32}{dtype.__name__:<10}{cells}", flush=True)
-    numbers = {"random_points": {"plain": count, "euler": count // 4}, "rows": rows}
+    numbers = {
+        "random_points": {"plain": count, "euler": count // 4},
+        "rows": rows,
+        "worst_by_conversion": worst_by_conversion(rows),
+    }
     print(_report.write("rotation_stress", numbers, path=options.output, packages=("mpmath",)))
 
 

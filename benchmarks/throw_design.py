@@ -86,6 +86,10 @@ def main() -> int:
         "length_s": lengths.tolist(),
         "spread_of_programs": programs.tolist(),
     }
+    numbers["largest_over_least_spread"] = {
+        "spin": np.max(spins) / np.min(spins),
+        "program": np.max(programs) / np.min(programs),
+    }
     for name in ("spread_of_spins", "spread_of_programs"):
         least, most = np.min(numbers[name]), np.max(numbers[name])
         print(f"{name:20s} {100 * least:.3f} to {100 * most:.3f} %")

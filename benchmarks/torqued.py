@@ -134,6 +134,37 @@ def reached(name, dtype, horizons, tolerances) -> list[dict]:
     return rows
 
 
+def over_tolerance(rows: list[dict]) -> list[dict]:
+    """One row for each scene, dtype and tolerance: errors over the larger of ``rtol`` and
+    rounding. The largest median of all horizons; the worst body by horizon; the fewest bodies that
+    count, of those in the batch; how often a body was flagged."""
+    groups: dict[tuple, list[dict]] = {}
+    for row in rows:
+        groups.setdefault((row["scene"], row["dtype"], row["rtol"]), []).append(row)
+
+    def largest(some: list[dict], key: str) -> float | None:
+        values = (row[key] for row in some if row[key] is not None and np.isfinite(row[key]))
+        return max(values, default=None)
+
+    found = []
+    for (scene, dtype, rtol), group in groups.items():
+        worst = {
+            f"worst_t_{horizon:g}": largest(
+                [r for r in group if r["horizon"] == horizon], "over_worst"
+            )
+            for horizon in dict.fromkeys(row["horizon"] for row in group)
+        }
+        found.append(
+            {"scene": scene, "dtype": dtype, "rtol": rtol, "median": largest(group, "over_median")}
+            | worst
+            | {
+                "bodies_counted": min(row["tame"] for row in group if row["kind"] == "batch"),
+                "flagged": sum(row["flagged"] for row in group),
+            }
+        )
+    return found
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("scenes", nargs="*", help="all when none is named")
@@ -158,7 +189,8 @@ def main() -> None:
                     flush=True,
                 )
         jax.clear_caches()  # the programs of all scenes at once do not fit
-        path = _report.write("torqued", {"rows": rows}, path=options.output, packages=("heyoka",))
+        numbers = {"rows": rows, "over_tolerance": over_tolerance(rows)}
+        path = _report.write("torqued", numbers, path=options.output, packages=("heyoka",))
     print(path)
 
 

@@ -8,6 +8,8 @@ compiling is apart. ``--quick`` takes fewer tolerances, bodies and families (und
 """
 
 import argparse
+import itertools
+import math
 from pathlib import Path
 
 from benchmarks import _report
@@ -20,6 +22,9 @@ import numpy as np
 
 from benchmarks import peers, problems, truth
 
+OURS = "polhode"
+LEVELS = (1e-3, 1e-6, 1e-9, 1e-12)
+"""Errors [rad] at which times are compared."""
 TOLERANCES = (1e-3, 1e-5, 1e-7, 1e-9, 1e-11, 1e-13, 1e-14)
 QUICK_TOLERANCES = (1e-5, 1e-8, 1e-11)
 QUICK = (
@@ -75,6 +80,114 @@ def table(family, n, dtype, tolerances, quick, repeats=7, budget=1.0) -> list[di
             }
         )
     return rows
+
+
+def is_default(row: dict) -> bool:
+    """Whether a row is of the method that polhode chooses."""
+    return row["peer"] == OURS and row["program"].startswith("default")
+
+
+def time_at(rows: list[dict], level: float, error: str = "attitude_median") -> float | None:
+    """Time [ns per body] of one program to reach an error; None where it never does.
+
+    Interpolated between neighbouring settings on logarithmic scales, never extrapolated: where all
+    settings are better than requested, the cheapest one counts.
+    """
+    points = [
+        (max(row[error], 1e-17), row["ns_per_body"])
+        for row in rows
+        if row[error] is not None and not row["failed"]
+    ]
+    times = [time for value, time in points if value <= level]
+    if not times:
+        return None
+    best = min(times)
+    for left, right in itertools.pairwise(points):
+        (high, cheap), (low, dear) = sorted((left, right), key=lambda p: -p[0])
+        if low <= level < high and cheap < dear:
+            share = math.log(level / high) / math.log(low / high)
+            best = min(best, cheap * (dear / cheap) ** share)
+    return best
+
+
+def time_to_error(tables: list[dict], error: str = "attitude_median") -> list[dict]:
+    """Per table and peer: time [us per body] of its best program to each error, the best error,
+    and the longest compilation. polhode: of the default alone, whose method may change with the
+    tolerance."""
+    found = []
+    for entry in tables:
+        programs: dict[str, dict[str, list[dict]]] = {}
+        for row in entry["rows"]:
+            if row["peer"] != OURS or is_default(row):
+                name = OURS if row["peer"] == OURS else row["program"]
+                programs.setdefault(row["peer"], {}).setdefault(name, []).append(row)
+        for peer, curves in programs.items():
+            rows = list(itertools.chain.from_iterable(curves.values()))
+            line = {"scene": entry["title"], "bodies": entry["bodies"], "dtype": entry["dtype"]}
+            line["program"] = peer
+            for level in LEVELS:
+                times = [time_at(curve, level, error) for curve in curves.values()]
+                reached = [time / 1e3 for time in times if time is not None]
+                line[f"us_to_{level:.0e}_rad"] = min(reached, default=None)
+            line["best_rad"] = min(row[error] for row in rows if row[error] is not None)
+            compiled = [row["compile_s"] for row in rows if row["compile_s"] is not None]
+            line["compile_s"] = max(compiled, default=None)
+            found.append(line)
+    return found
+
+
+def fastest_peer(lines: list[dict]) -> list[dict]:
+    """Per table and error, from the lines of ``time_to_error``: the fastest peer, and its time over
+    that of polhode's default."""
+    tables: dict[tuple, list[dict]] = {}
+    for line in lines:
+        tables.setdefault((line["scene"], line["bodies"], line["dtype"]), []).append(line)
+
+    def words(ours: float | None, others: list[tuple[float, str]]) -> str:
+        if not others:
+            return "none" if ours is None else f"only {OURS}"
+        time, peer = min(others)
+        return f"only {peer}" if ours is None else f"{time / ours:.3g} x {peer}"
+
+    found = []
+    for (scene, bodies, dtype), group in tables.items():
+        line = {"scene": scene, "bodies": bodies, "dtype": dtype}
+        for level in LEVELS:
+            times = {row["program"]: row[f"us_to_{level:.0e}_rad"] for row in group}
+            ours = times.pop(OURS, None)
+            others = [(time, peer) for peer, time in times.items() if time is not None]
+            line[f"to_{level:.0e}_rad"] = words(ours, others)
+        found.append(line)
+    return found
+
+
+def default_errors(tables: list[dict]) -> list[dict]:
+    """What polhode's default reaches where it integrates, beside its tolerance."""
+    return [
+        {
+            "scene": entry["title"],
+            "bodies": entry["bodies"],
+            "dtype": entry["dtype"],
+            "rtol": row["setting"],
+            "median_rad": row["attitude_median"],
+            "worst_rad": row["attitude_worst"],
+            "us_per_body": row["ns_per_body"] / 1e3,
+        }
+        for entry in tables
+        for row in entry["rows"]
+        if is_default(row) and row["setting"] != "exact"
+    ]
+
+
+def derived(tables: list[dict]) -> dict[str, list[dict]]:
+    """The short tables of the results page."""
+    median, worst = (time_to_error(tables, f"attitude_{of}") for of in ("median", "worst"))
+    return {
+        "fastest_peer_median_body": fastest_peer(median),
+        "fastest_peer_worst_body": fastest_peer(worst),
+        "time_to_error_median_body": median,
+        "default_errors": default_errors(tables),
+    }
 
 
 def show(entry: dict) -> None:
@@ -139,7 +252,7 @@ def main() -> None:
 def written(options, installed, missing, tables) -> Path:
     """Write what there is so far."""
     packages = tuple(p for module in installed.values() for p in module.PACKAGES)
-    numbers = {"quick": options.quick, "missing": missing, "tables": tables}
+    numbers = {"quick": options.quick, "missing": missing, "tables": tables, **derived(tables)}
     return _report.write("work_precision", numbers, path=options.output, packages=packages)
 
 

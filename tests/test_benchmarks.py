@@ -21,7 +21,6 @@ from benchmarks import (
     __main__ as command,
     _figures,
     _page,
-    _quotes,
     _report,
     cold_tasks,
     problems,
@@ -225,9 +224,7 @@ def test_times_of_imports_are_written_and_shown(tmp_path):
     rows = imports.measure({"nothing": "pass"}, 1)
     assert rows[0]["seconds"] > 0
     path = _report.write("imports", {"runs": 1, "rows": rows}, path=tmp_path / "imports.json")
-    assert any(
-        "| nothing |" in line for line in _page.SECTIONS["imports"].lines(_report.read(path))
-    )
+    assert any("| nothing |" in line for line in _page.section("imports", _report.read(path)))
 
 
 def test_the_operations_of_a_scene_are_counted():
@@ -262,7 +259,7 @@ def test_without_an_accelerator_its_benchmark_says_so(monkeypatch, capsys, tmp_p
     assert capsys.readouterr().out.startswith("not run")
     report = _report.read(path)
     assert "no accelerator" in report["numbers"]["not_run"]
-    assert any("- not run: " in line for line in _page.SECTIONS["accelerator"].lines(report))
+    assert any("- not run: " in line for line in _page.section("accelerator", report))
 
 
 @pytest.mark.slow
@@ -308,8 +305,9 @@ def test_gradients_are_scored_against_high_precision(monkeypatch):
 def test_the_least_time_to_an_error_is_of_the_tolerances_that_reach_it():
     from benchmarks import controllers
 
+    kind = {"activation": "tanh", "bodies": 4, "dtype": "float64"}
     rows = [
-        {"program": name, "error": error, "seconds": seconds}
+        kind | {"program": name, "error": error, "seconds": seconds}
         for name, error, seconds in [
             ("a", 1e-3, 1.0),
             ("a", 1e-5, 3.0),
@@ -318,8 +316,15 @@ def test_the_least_time_to_an_error_is_of_the_tolerances_that_reach_it():
             ("b", 1e-2, 0.5),
         ]
     ]
-    assert controllers.level_times(rows, 1e-2) == {"a": 1.0, "b": 0.5}
-    assert controllers.level_times(rows, 1e-4) == {"a": 2.0, "b": None}
+    a, b = controllers.time_to_error(rows)
+    assert a == kind | {
+        "program": "a",
+        "ms_to_1e-02": 1e3,
+        "ms_to_1e-03": 1e3,
+        "ms_to_1e-04": 2e3,
+        "ms_to_1e-06": 2e3,
+    }
+    assert (b["ms_to_1e-02"], b["ms_to_1e-04"]) == (500, None)
 
 
 @pytest.mark.slow
@@ -441,7 +446,7 @@ def _table(times, errors=(1e-4, 1e-8, 1e-12)):
         return {
             "peer": peer,
             "program": program,
-            "setting": f"{error:.0e}",
+            "setting": "exact" if peer == "polhode" else f"{error:.0e}",
             "ns_per_body": time,
             "spread": 0.01,
             "attitude_median": error,
@@ -461,23 +466,39 @@ def _table(times, errors=(1e-4, 1e-8, 1e-12)):
 
 
 def test_time_at_a_level_is_interpolated_and_never_extrapolated():
+    from benchmarks.work_precision import time_at
+
     rows = _table((100.0, 400.0, 1600.0))["rows"][1:]
-    assert _page.time_at(rows, 1e-3) == 100  # cheaper settings were not run
-    assert _page.time_at(rows, 1e-6) == pytest.approx(200)
-    assert _page.time_at(rows, 1e-12) == 1600
-    assert _page.time_at(rows, 1e-13) is None
-    assert _page.time_at(rows, 1e-6, "attitude_worst") > 200
+    assert time_at(rows, 1e-3) == 100  # cheaper settings were not run
+    assert time_at(rows, 1e-6) == pytest.approx(200)
+    assert time_at(rows, 1e-12) == 1600
+    assert time_at(rows, 1e-13) is None
+    assert time_at(rows, 1e-6, "attitude_worst") > 200
     rows[1]["failed"] = 1
-    assert _page.time_at(rows, 1e-8) == pytest.approx(100 * 16**0.5)
+    assert time_at(rows, 1e-8) == pytest.approx(100 * 16**0.5)
 
 
-def test_standing_names_the_peer_that_is_faster():
-    slow, fast = (_page.standing(_table(t)) for t in ((100.0, 400.0, 1600.0), (10.0, 40.0, 60.0)))
-    assert [at["ratio"] for at in slow] == pytest.approx([2, 4, 11.3137085, 32], rel=1e-6)
-    assert fast[0]["ratio"] == pytest.approx(0.2)
-    assert fast[0]["peer"] == "other"
-    lines = _page.faster_peers([_table((10.0, 40.0, 60.0))])
-    assert any("other (stepper) reaches 1e-03" in line for line in lines)
+def test_the_fastest_peer_is_named_with_its_time_over_that_of_the_default():
+    from benchmarks.work_precision import derived
+
+    levels = "to_1e-03_rad", "to_1e-06_rad", "to_1e-09_rad", "to_1e-12_rad"
+    slow, fast = (derived([_table(t)]) for t in ((100.0, 400.0, 1600.0), (10.0, 40.0, 60.0)))
+    ours, other = slow["time_to_error_median_body"]
+    assert (ours["program"], other["program"]) == ("polhode", "other")
+    assert [ours[f"us_{level}"] for level in levels] == [0.05] * 4
+    assert [other[f"us_{level}"] for level in levels] == pytest.approx([0.1, 0.2, 0.566, 1.6], 1e-3)
+    (line,) = slow["fastest_peer_median_body"]
+    assert [line[level] for level in levels] == [
+        "2 x other",
+        "4 x other",
+        "11.3 x other",
+        "32 x other",
+    ]
+    (line,) = fast["fastest_peer_median_body"]
+    assert line["to_1e-03_rad"] == "0.2 x other"
+    (line,) = slow["fastest_peer_worst_body"]
+    assert line["to_1e-12_rad"] == "only polhode"
+    assert slow["default_errors"] == []  # an exact method
 
 
 def _result(times, **more):
@@ -498,6 +519,24 @@ def test_numbers_are_shown_by_their_keys():
         "",
     ]
     assert _page.by_keys("x", {"n": 1200, "rows": []}) == ["**x**", "", "- n: 1,200", ""]
+
+
+def test_long_tables_are_folded():
+    rows = [{"n": n} for n in range(_page.FOLDED_ROWS + 1)]
+    assert _page.by_keys("x", rows[1:])[0] == "**x**"
+    lines = _page.by_keys("x", rows)
+    assert lines[0] == f"<details><summary>x, {len(rows)} rows</summary>"
+    assert lines[-2] == "</details>"
+
+
+def test_parts_of_another_run_are_named():
+    made = {"date": "2026-01-02", "commit": "0123456789" * 4}
+    numbers = {"a": 1, "b_c": 2, "origin": {"b_c": made | {"command": "python -m x"}, "a": made}}
+    assert _page.origins({"numbers": numbers}) == [
+        "- b c: `python -m x`, 2026-01-02, commit `0123456`.",
+        "- a: 2026-01-02, commit `0123456`.",
+    ]
+    assert not any("origin" in line for line in _page.by_keys("", numbers))
 
 
 def test_figures_are_drawn_from_results(tmp_path):
@@ -554,45 +593,104 @@ def test_engines_are_given_the_same_body(name):
         assert max(row["attitude"]) < 1e-2  # steps of order 1, 0.02 rad each
 
 
+def test_engines_are_shown_after_the_revolutions_that_were_run():
+    from benchmarks import engines
+
+    turns = [0.25, 1.05, 9.8]
+    row = {"body": "a", "engine": "b", "us_per_step": 2.0, "turns": turns}
+    (found,) = engines.after_turns([row | {"attitude": [1, 2, 3], "energy": [4, 5, 6]}])
+    assert found == {
+        "body": "a",
+        "engine": "b",
+        "rad_after_1": 2,
+        "rad_after_10": 3,
+        "energy_after_1": 5,
+        "energy_after_10": 6,
+        "us_per_step": 2.0,
+    }
+
+
+def test_conversions_are_shown_by_their_worst_and_euler_sequences_together():
+    from benchmarks.rotation_stress import worst_by_conversion
+
+    def row(name, value):
+        worst = {"value": value, "first": 2.0, "second": 3.0}
+        return {"conversion": name, "dtype": "float64", **worst}
+
+    rows = [row("Euler ZYZ -> wxyz", 1.0), row("Euler XYZ -> wxyz", 4.0), row("a -> wxyz", 5.0)]
+    euler, other = worst_by_conversion(rows)
+    assert euler["conversion"] == "Euler (any sequence) -> wxyz"
+    assert (euler["float64_value"], euler["float64_first"], other["float64_value"]) == (4, 2, 5)
+
+
+def test_errors_over_the_tolerance_are_shown_by_scene():
+    pytest.importorskip("heyoka")
+    from benchmarks.torqued import over_tolerance
+
+    def row(horizon, kind, median, worst):
+        scene = {"scene": "top", "dtype": "float64", "rtol": 1e-5, "horizon": horizon, "kind": kind}
+        return scene | {"over_median": median, "over_worst": worst, "tame": 20, "flagged": 1}
+
+    rows = [row(1.0, "batch", 0.1, 2.0), row(1.0, "alone", 0.2, 1.0), row(16.0, "batch", 0.1, None)]
+    (found,) = over_tolerance(rows)
+    assert found["median"] == 0.2
+    assert (found["worst_t_1"], found["worst_t_16"]) == (2.0, None)
+    assert (found["bodies_counted"], found["flagged"]) == (20, 3)
+
+
+def test_a_result_holds_its_derived_tables():
+    """As its benchmark derives them from its rows."""
+    from benchmarks import controllers, engines, rotation_stress, work_precision
+
+    derived = {
+        "cold_tasks": lambda n: {"side_by_side": cold_tasks.side_by_side(n["rows"])},
+        "controllers": lambda n: {"time_to_error": controllers.time_to_error(n["rows"])},
+        "engines": lambda n: {"after_turns": engines.after_turns(n["rows"])},
+        "rotation_stress": lambda n: {
+            "worst_by_conversion": rotation_stress.worst_by_conversion(n["rows"])
+        },
+        **{
+            path.stem: lambda n: work_precision.derived(n["tables"])
+            for path in _report.RESULTS.glob("work_precision*.json")
+        },
+    }
+    for name, derive in derived.items():
+        numbers = _report.read(name)["numbers"]
+        for key, rows in derive(numbers).items():
+            for row, own in zip(numbers[key], rows, strict=True):
+                assert row.keys() == own.keys(), (name, key)
+                for column, value in row.items():
+                    if isinstance(value, float):  # rows are rounded when they are written
+                        assert value == pytest.approx(own[column], rel=1e-3), (name, key, column)
+                    elif value is None:
+                        assert own[column] is None, (name, key, column)
+
+
 WRITE = "run: python -m benchmarks page"
 
 
 def test_the_results_page_holds_the_numbers_of_the_committed_results():
     text = (_page.ROOT / "benchmarks" / "README.md").read_text(encoding="utf-8")
-    assert text == _page.page(_page.names_on(text)), WRITE
+    assert text == _page.page(), WRITE
 
 
-QUOTING = [p for p in _quotes.pages() if "<!-- result: " in p.read_text(encoding="utf-8")]
+def readme() -> str:
+    return (_page.ROOT / "README.md").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("path", QUOTING, ids=lambda path: path.stem)
-def test_pages_quote_the_committed_results(path):
-    text = path.read_text(encoding="utf-8")
-    assert _quotes.fill(text) == text, WRITE
+def test_the_tables_of_the_readme_are_those_of_the_committed_results():
+    text = readme()
+    assert [match[1] for match in _page.MARK.finditer(text)] == list(_page.BLOCKS)
+    assert text.count("<!-- result: ") == text.count("<!-- end -->") == len(_page.BLOCKS)
+    assert _page.fill(text) == text, WRITE
 
 
-@pytest.mark.parametrize("path", QUOTING, ids=lambda path: path.stem)
-def test_a_changed_number_in_a_page_is_found(path):
-    text = path.read_text(encoding="utf-8")
-    for match in _quotes.MARK.finditer(text):
+def test_a_changed_number_in_a_table_of_the_readme_is_found():
+    text = readme()
+    for match in _page.MARK.finditer(text):
         digit = max(k for k, letter in enumerate(match[2]) if letter.isdigit()) + match.start(2)
         changed = text[:digit] + str(9 - int(text[digit])) + text[digit + 1 :]
-        assert _quotes.fill(changed) == text != changed, match[1]
-
-
-def test_markers_of_results_come_in_pairs_within_lines_or_around_blocks():
-    used = set()
-    for path in QUOTING:
-        text = path.read_text(encoding="utf-8")
-        matches = list(_quotes.MARK.finditer(text))
-        assert len(matches) == text.count("<!-- result: ") == text.count("<!-- end -->"), path.name
-        for match in matches:
-            used.add(match[1])
-            block = match[2].startswith("\n")
-            assert match[2].endswith("\n") == block, match[1]
-            before = text[: match.start()].rpartition("\n")[2].lstrip()
-            assert bool(before) != block, f"{path.name}: {match[1]} begins a line, or does not"
-    assert used == set(_quotes.QUOTES)
+        assert _page.fill(changed) == text != changed, match[1]
 
 
 HASH = re.compile(r"[0-9a-f]{40}")
@@ -616,9 +714,24 @@ def test_a_committed_result_names_its_commit(path):
         assert HASH.fullmatch(part.get("commit") or part["committed_with"])
 
 
+def holds(now: object, then: object) -> bool:
+    """Whether every number of ``then`` is in ``now``, which may have further keys."""
+    if isinstance(then, dict):
+        return isinstance(now, dict) and all(k in now and holds(now[k], then[k]) for k in then)
+    return now == then
+
+
+def test_numbers_that_were_changed_or_removed_are_found():
+    then = {"rows": [{"a": 1}], "b": {"c": 2}}
+    assert holds(then | {"table": [], "b": {"c": 2, "d": 3}}, then)
+    assert not holds({"rows": [{"a": 1}], "b": {}}, then)
+    assert not holds({"rows": [{"a": 2}], "b": {"c": 2}}, then)
+    assert not holds({"rows": [], "b": {"c": 2}}, then)
+
+
 @pytest.mark.parametrize("path", sorted(_report.RESULTS.glob("*.json")), ids=lambda p: p.stem)
 def test_the_commit_named_holds_the_same_numbers(path):
-    """As far as the clone has the history."""
+    """As far as the clone has the history; tables that are derived from them may be added."""
     report = _report.read(path)
     parts = dict(report["numbers"].pop("origin", {}))
     origins = {None: report, **parts}
@@ -631,7 +744,7 @@ def test_the_commit_named_holds_the_same_numbers(path):
         then = json.loads(text)["numbers"]
         then.pop("origin", None)
         if part is None:
-            assert then == report["numbers"]
+            assert holds(report["numbers"], then)
         else:
             assert then[part] == report["numbers"][part], part
 
@@ -712,22 +825,17 @@ def test_one_table_is_of_one_commit_machine_and_day(tmp_path, monkeypatch, chang
         _page.merged()
 
 
-def test_the_table_of_cold_tasks_marks_what_others_do_sooner():
+def test_cold_tasks_are_shown_side_by_side():
     name = next(iter(cold_tasks.TASKS))
     ours = {"first": 2.0, "second": 0.001, "cached": 1.0, "memory": 300.0, "error": 1e-11}
     peer = {"first": 0.7, "second": 0.3, "memory": 90.0, "error": 2e-8}
     alone = {key: value for key, value in ours.items() if key != "error"}
-    report = {
-        "command": "python -m benchmarks.cold_tasks",
-        "numbers": {
-            "rows": [
-                {"task": name, "peer": peer, "polhode": ours},
-                {"task": name, "peer": "", "polhode": alone},
-            ]
-        },
-    }
-    table = "\n".join(_page.cold_tasks_table(report))
-    assert f"| {name}, SciPy | 2 / **0.7** | 0.001 / 0.3 | 1 | 300 / **90** | 1e-11 / 2e-08 |" in (
-        table.replace("1.0e-03", "0.001")
+    rows = [
+        {"task": name, "peer": peer, "polhode": ours},
+        {"task": "flyby of 500", "peer": "", "polhode": alone},
+    ]
+    lines = _page.table(cold_tasks.side_by_side(rows))
+    assert lines[2] == (
+        f"| {name} | SciPy | 2 | 0.7 | 1.0e-03 | 0.3 | 1 | 300 | 90 | 1.0e-11 | 2.0e-08 |"
     )
-    assert f"| {name} | 2 / – |" in table
+    assert lines[3].startswith("| flyby of 500 | – | 2 | – |")

@@ -130,6 +130,6 @@ def test_a_run_continues_where_it_was_stopped(tmp_path, monkeypatch, capsys):
         "silent": 0,
     }
     assert "5 rotator  wrong" in capsys.readouterr().out
-    page = "\n".join(_page.SECTIONS["light_curves_unseen"].lines(_report.read(output)))
+    page = "\n".join(_page.section("light_curves_unseen", _report.read(output)))
     assert "| told | not in the list, AMBIGUOUS | 3 |" in page
     assert "| rotator | ONE_PERIOD | 0 | 1 | 0 |" in page
