@@ -108,25 +108,23 @@ def work_precision(plt, report: dict, families: tuple[str, ...] = ()):
         ax.set_axis_off()
     figure.supxlabel("time per body [µs]", fontsize=9.5)
     figure.supylabel("attitude error at the end [rad], median body", fontsize=9.5)
-    order = list(drawn)
-    figure.legend([drawn[name] for name in order], order, loc="outside right upper")
+    figure.legend(list(drawn.values()), list(drawn), loc="outside right upper")
     return figure
 
 
 @_drawn
 def scaling(plt, report: dict):
     """Time and memory per body against the number of bodies, the horizon and saved times."""
-    sweeps = ("bodies", "horizon", "saves")
     labels = {"bodies": "bodies", "horizon": "horizon [s]", "saves": "saved times"}
     figure = plt.figure(figsize=(10.5, 5.0), layout="constrained")
     axes = figure.subplots(2, 3, sharex="col", sharey="row")
-    for column, sweep in enumerate(sweeps):
+    for column, (sweep, label) in enumerate(labels.items()):
         for name, points in report["numbers"][sweep].items():
             x = [point[sweep] for point in points]
             axes[0, column].plot(x, [p["ns_per_body"] * 1e-3 for p in points], "o-", label=name)
             memory = [p["memory_MB"] for p in points]
             axes[1, column].plot(x, memory, "o-", label=name)
-        axes[1, column].set_xlabel(labels[sweep])
+        axes[1, column].set_xlabel(label)
         for ax in axes[:, column]:
             ax.set_xscale("log")
             ax.set_yscale("log")
@@ -206,31 +204,21 @@ def identification(plt, report: dict):
 
 @_drawn
 def throw_design(plt, report: dict):
-    """What a throw tells of the tensor, by direction of its spin and by program of the wheel."""
-    numbers = report["numbers"]
+    """Deviation of the tensor after a throw, by direction of the spin and program of the wheel."""
     figure = plt.figure(figsize=(10.0, 3.4), layout="constrained")
-    left, right = figure.subplots(1, 2)
-    for ax, rows, columns, values, labels in (
-        (
-            left,
-            "tilt_deg",
-            "turn_deg",
-            "spread_of_spins",
-            ("spin about the wheel's axis, turned by [deg]", "tilted by [deg]"),
-        ),
-        (
-            right,
-            "begin_s",
-            "length_s",
-            "spread_of_programs",
-            ("wheel is on for [s]", "switched on after [s]"),
-        ),
-    ):
+    axes = figure.subplots(1, 2)
+    x = {
+        "turn_deg": "spin about the wheel's axis, turned by [deg]",
+        "length_s": "wheel is on for [s]",
+    }
+    y = {"tilt_deg": "tilted by [deg]", "begin_s": "switched on after [s]"}
+    for ax, across, up, values in zip(axes, x, y, ("spread_of_spins", "spread_of_programs")):
+        numbers = report["numbers"]
         table = [[100 * value for value in row] for row in numbers[values]]
-        drawn = ax.contourf(numbers[columns], numbers[rows], table, levels=12, cmap="viridis_r")
+        drawn = ax.contourf(numbers[across], numbers[up], table, levels=12, cmap="viridis_r")
         figure.colorbar(drawn, ax=ax, label="spread of the tensor [%]")
-        ax.set_xlabel(labels[0])
-        ax.set_ylabel(labels[1])
+        ax.set_xlabel(x[across])
+        ax.set_ylabel(y[up])
         ax.grid(visible=False)
     return figure
 

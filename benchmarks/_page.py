@@ -1,12 +1,12 @@
 """The results page, benchmarks/README.md, from the JSON in benchmarks/results only.
 
 A result is shown by its own keys; ``SECTIONS`` holds the titles, the texts and the choice of keys.
-Two tables in README.md are written from the same files.
+The tables of README.md are written from the same files.
 """
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -183,51 +183,36 @@ def merged() -> dict | None:
 
 
 class Section(NamedTuple):
-    """``keys``: those of the numbers that are shown; None: all."""
+    """``keys``: those of the numbers that are shown, separated by spaces; none: all."""
 
     title: str
     text: str = ""
-    keys: tuple[str, ...] | None = None
+    keys: str = ""
 
 
 SECTIONS = {
     "work_precision": Section(
         "Error against run time",
-        "First, how many times as long as polhode's default the fastest peer takes until the"
-        " attitude error is below a level, and which peer that is: below 1 the peer is faster."
-        " Times are interpolated between settings on logarithmic scales, never extrapolated; an"
-        " exact method has one setting. Then the times of every peer, and what the default reaches"
-        " where it integrates. MuJoCo simulates contacts and articulated bodies, heyoka any system"
-        " of ODEs with event detection and 128-bit or longer arithmetic, diffrax any equation in"
-        " JAX; polhode does rotating rigid bodies only.",
-        keys=(
-            "missing",
-            "fastest_peer_median_body",
-            "fastest_peer_worst_body",
-            "time_to_error_median_body",
-            "default_errors",
-        ),
+        "How many times as long as polhode's default the fastest peer takes until the attitude"
+        " error is below a level; below 1 the peer is faster. Interpolated between settings on"
+        " logarithmic scales, never extrapolated; an exact method has one setting. Then the times"
+        " of every peer, and what the default reaches where it integrates.",
+        "missing fastest_peer_median_body fastest_peer_worst_body time_to_error_median_body "
+        "default_errors",
     ),
     "cold_tasks": Section(
         "Tasks from a cold process",
         "Seconds from the start of a process to the first answer, imports and compilation included;"
-        " the second call in the same process; the first answer of a later process that finds"
-        " compiled programs in JAX's persistent cache (`first stored`); the largest resident size."
-        " The script of each task is in `benchmarks/cold_tasks.py`.",
-        keys=("side_by_side",),
+        " the second call; the first answer of a later process that finds compiled programs in"
+        " JAX's persistent cache (`first stored`); the largest resident size.",
+        "side_by_side",
     ),
-    "imports": Section(
-        "Imports",
-        "Least seconds of a new process over alternated runs, beside the libraries that polhode"
-        " builds on.",
-    ),
+    "imports": Section("Imports", "Least seconds of a new process over alternated runs."),
     "plain_calls": Section(
         "Plain calls",
         "`ph.simulate` as typed, with its checks and both times, beside the compiled program for"
-        " the last state alone, at the default `rtol`, with the errors reached. Error against run"
-        " time, above, interpolates to an error instead, and takes the time of one body from three."
-        " Then free bodies by saved times, ns per body, and how far the most expensive lies above a"
-        " straight line between its neighbours (`spread`).",
+        " the last state alone, at the default `rtol`. Then free bodies by saved times, and how far"
+        " the most expensive lies above a straight line between its neighbours (`spread`).",
     ),
     "first_calls": Section(
         "First calls",
@@ -242,43 +227,36 @@ SECTIONS = {
     "controllers": Section(
         "Gradients through controllers",
         "The mean cost of bodies under a network of 1,411 parameters, differentiated by all of"
-        " them. Errors are norms over that of the gradient, against polhode at `rtol=1e-11`, which"
-        " is compared with central differences of SciPy's DOP853 along the gradient and across it"
-        " (`checks`). Times are the least processor time of one core, of the tolerances that reach"
-        " an error; then the cost by kind of controller.",
-        keys=("horizon", "time_to_error", "kinds", "checks"),
+        " them: least processor time of the tolerances whose error, over the norm of the gradient,"
+        " is below a level. The reference is polhode at `rtol=1e-11`, which is compared with"
+        " central differences of SciPy's DOP853 along the gradient and across it (`checks`).",
+        "horizon time_to_error kinds checks",
     ),
     "fuzz": Section(
         "Every part against an independent integrator",
-        "Random scenes of every part, alone and in pairs, moments, rates, gains and times over six"
-        " decades, against SciPy's DOP853 restarted at every switch. Errors of attitudes and of"
-        " derivatives (`slopes`: by the initial rates, a moment of inertia and a gain, in forward"
-        " and in reverse mode) over `rtol`; `beyond`: more than ten times `rtol` and than rounding"
-        " explains.",
-        keys=("values", "slopes", "parts"),
+        "Random scenes over six decades against SciPy's DOP853, restarted at every switch. Errors"
+        " of attitudes, and of derivatives by the initial rates, a moment of inertia and a gain"
+        " (`slopes`), over `rtol`; `beyond`: more than ten, and more than rounding explains.",
+        "values slopes parts",
     ),
     "conservation": Section(
         "Energy and angular momentum over many revolutions",
-        "One body by `ph.simulate` with its defaults (but for `max_steps`): relative change of the"
-        " energy, and of the components of the angular momentum that the scene conserves, the"
-        " largest up to each number of revolutions. Integrated motions accumulate the error that"
-        " `rtol` allows.",
+        "Relative change of the energy, and of the components of the angular momentum that the"
+        " scene conserves, the largest up to each number of revolutions. Integrated motions"
+        " accumulate the error that `rtol` allows.",
     ),
     "scene_cost": Section(
         "Cost of each kind of scene",
         "Operations and bytes per body as the compiler counts them (the body of a loop once), and"
-        " times that compare the rows of this table alone. Then what a part costs: a satellite, and"
-        " 50 of them, for an hour under the gravity gradient and with one part more; 61 samples,"
-        " `rtol=1e-6`, processor time of one core, `ratio` over the gravity gradient alone. Methods"
-        " differ in the work of a step. Last, reading the mass properties of one body.",
+        " times that compare the rows of this table alone. Then a satellite, and 50 of them, for an"
+        " hour under the gravity gradient and with one part more: 61 samples, `rtol=1e-6`,"
+        " processor time of one core. Last, reading the mass properties of one body.",
     ),
     "accelerator": Section(
         "Accelerators",
-        "Free bodies, tops and satellites on a GPU or TPU, with the shares of its memory bandwidth"
-        " and arithmetic peak (those that two small programs reach), beside diffrax at the loosest"
-        ' tolerance whose median error is at most 1e-9 rad. The result is "not run" where JAX finds'
-        " no accelerator. Where `equal error` is False, no tolerance of diffrax reaches the error"
-        " of polhode in that precision.",
+        "Beside diffrax at the loosest tolerance whose median error is at most 1e-9 rad; where"
+        " `equal error` is False, no tolerance reaches the error of polhode. Shares are of the"
+        " bandwidth and arithmetic peak that two small programs reach.",
     ),
     "scaling": Section("Time and memory against bodies, horizon and saved times"),
     "identification": Section(
@@ -288,16 +266,10 @@ SECTIONS = {
     ),
     "throws": Section(
         "Throws with a flywheel",
-        "Real recordings (TU Delft, arXiv:2503.13137; not part of the project); every throw alone,"
-        " the instrument known from all, or those of a configuration together. Errors where the"
-        " reference is known, means over throws; then the mean of single throws beside the joint"
-        " fit, by principal moment, and other choices of the analysis.",
-        keys=(
-            "every_throw_alone",
-            "throws_of_a_configuration_together",
-            "single_throws_and_joint_fit",
-            "varied",
-        ),
+        "Real recordings (TU Delft, arXiv:2503.13137; not part of the project). Errors where the"
+        " reference is known, means over throws; the mean of single throws beside the joint fit, by"
+        " principal moment; other choices of the analysis.",
+        "every_throw_alone throws_of_a_configuration_together single_throws_and_joint_fit varied",
     ),
     "throws_synthetic": Section(
         "Simulated throws",
@@ -307,46 +279,34 @@ SECTIONS = {
     ),
     "throw_design": Section(
         "Information of a throw by its design",
-        "Geometric mean of the standard deviations of the tensor after one throw, from the"
-        " log-determinant of `benchmarks.throws.throw_information`: by direction of a spin of 18"
-        " rad/s, and by the program of the wheel.",
-        keys=("best_spin_rad_s", "largest_over_least_spread"),
+        "Geometric mean of the standard deviations of the tensor after one throw, by direction of a"
+        " spin of 18 rad/s, and by the program of the wheel.",
+        "best_spin_rad_s largest_over_least_spread",
     ),
     "satellites": Section(
         "Satellites with a wheel",
         "Mean relative error of the tensor from 60 s of rates at 10 Hz with noise of 1e-4 rad/s;"
-        " satellites and the wheel's program are assumed (`benchmarks/satellites.py`). `covered"
-        " percent`: how often the intervals of 95 % of the likelihood contain the truth.",
+        " `covered percent`: how often the intervals of 95 % of the likelihood contain the truth.",
     ),
     "light_curves": Section(
         "Light curves",
-        "Synthetic tumblers: how the fit from the light alone ends (see the top of"
-        " `benchmarks/light_curves.py`), bodies that are no ellipsoids (`eggs`), and the best"
-        " solutions of Toutatis in 1992 by seed of the search.",
-        keys=("speed", "summary", "eggs", "toutatis"),
+        "Synthetic tumblers, bodies that are no ellipsoids (`eggs`), and the best solutions of"
+        " Toutatis in 1992 by seed of the search (see the top of `benchmarks/light_curves.py`).",
+        "speed summary eggs toutatis",
     ),
     "light_curves_unseen": Section(
         "Light curves of other bodies",
-        "Light curves of convex polyhedra, whose shapes, motions and light do not come from the"
-        " package (see the top of `benchmarks/light_curves_unseen.py`), fitted with the default"
-        " settings; periods in hours.",
-        keys=(
-            "curves",
-            "commits",
-            "tumblers",
-            "others",
-            "period_errors_over_stated",
-            "processor_seconds",
-            "not_right",
-        ),
+        "Convex polyhedra, whose shapes, motions and light do not come from the package (see the"
+        " top of `benchmarks/light_curves_unseen.py`), fitted with the default settings; periods in"
+        " hours.",
+        "curves commits tumblers others period_errors_over_stated processor_seconds not_right",
     ),
     "racquet": Section(
         "Tosses of a racquet",
         "Real recordings of a phone's gyroscope (University of British Columbia,"
-        " doi:10.14288/1.0448943; not part of the project). The trials of a round together; the"
-        " seven of the first, fast spins about all axes, are not the free motion of one body, and"
-        " those of the fourth are mostly fast, where the air matters. Standard deviations are those"
-        " of white residuals, which these are not (the model lacks the air).",
+        " doi:10.14288/1.0448943; not part of the project). The seven trials of the first round are"
+        " not the free motion of one body; those of the fourth are mostly fast, where the air"
+        " matters. Standard deviations are those of white residuals, which these are not.",
     ),
     "stress": Section(
         "Stress suite of the exact free motion",
@@ -354,46 +314,41 @@ SECTIONS = {
         " radians, of the rates relative to their size, of derivatives relative to the larger of"
         " the exact one and the natural size. Fast needles lose digits of the gradient in"
         " proportion to the ratio of their moments.",
-        keys=("worst",),
+        "worst",
     ),
     "free_body": Section("The exact free motion"),
     "rotation_stress": Section(
         "Conversions of rotations",
-        "Worst errors against 120 digits over random samples and samples at and near the identity,"
-        " half turns, the ends of the angle ranges and every threshold, in units of eps: values"
-        " relative to the rotation's angle where it is small, first and second derivatives (forward"
-        " and reverse) relative to the largest of the sample; of the Euler sequences the worst.",
-        keys=("random_points", "worst_by_conversion"),
+        "Worst errors against 120 digits in units of eps, over random and special samples: values"
+        " relative to the rotation's angle where it is small, first and second derivatives relative"
+        " to the largest of the sample.",
+        "random_points worst_by_conversion",
     ),
     "torqued": Section(
         "Tolerance and error where something acts",
-        "`method=None`, 24 bodies that share nothing (needles, discs, near-spheres; 1/32 to 8"
-        " rad/s) in one batch, four of them alone too. Error over the larger of `rtol` and 4 eps"
-        " angle^1.5: largest median, and worst body by horizon, of the bodies whose attitude at the"
-        " end depends on the start less than ten times as strongly as that of free rotation (no"
-        " method can keep the others; `bodies counted`: the fewest of a batch). Truth: 80-bit"
-        " Taylor series by heyoka.",
-        keys=("over_tolerance",),
+        "Error over the larger of `rtol` and 4 eps angle^1.5, of 24 bodies that share nothing:"
+        " largest median, and worst body by horizon. Counted are bodies whose attitude at the end"
+        " depends on the start less than ten times as strongly as that of free rotation (no method"
+        " can keep the others). Truth: 80-bit Taylor series by heyoka.",
+        "over_tolerance",
     ),
     "error_control": Section(
         "Error estimate and tolerance",
-        "First the true error of single steps over the estimate and over the difference of two"
-        " orders (quantiles of 5, 50 and 95 %), then the error of the attitude at the last time"
-        " over `rtol`, of random bodies (see docs/design_notes.md).",
+        "The true error of single steps over the estimate and over the difference of two orders"
+        " (quantiles of 5, 50 and 95 %); the error of the attitude at the last time over `rtol`.",
     ),
     "error_control_constants": Section(
         "Constants of the error control",
-        "Each constant at the value at which it does nothing (`without`), one at a time, in eleven"
-        " kinds of motion: steps over those with the constant, least and most of the motions; the"
-        " largest ratio of the errors that 95 % of the bodies keep; changes of the numbers of"
-        " bodies with an error beyond ten times `rtol`, and of bodies that fail.",
+        "Each constant at the value at which it does nothing (`without`), one at a time: steps over"
+        " those with the constant, least and most of eleven kinds of motion; the largest ratio of"
+        " the errors that 95 % of the bodies keep; changes of the numbers of bodies with an error"
+        " beyond ten `rtol`, and of bodies that fail.",
     ),
     "engines": Section(
         "Physics engines beside the exact motion",
-        "Free bodies of `polhode reference` at about 10 rad/s, without damping, in steps of `step`"
-        " seconds: attitude error and relative change of the energy after numbers of revolutions; a"
-        " dash: the motion has diverged.",
-        keys=("step", "after_turns"),
+        "Free bodies at about 10 rad/s in steps of `step` seconds: attitude error and relative"
+        " change of the energy after numbers of revolutions; a dash: the motion has diverged.",
+        "step after_turns",
     ),
 }
 """By name of the result, in the order of the page; others have their name only."""
@@ -409,7 +364,7 @@ def section(name: str, report: dict) -> list[str]:
     lines += [""] if lines[-1] else []
     if (RESULTS / f"{name}.svg").exists():
         lines += [f"![{title}](results/{name}.svg)", ""]
-    return lines + by_keys("", {k: numbers[k] for k in keys or numbers if k in numbers})
+    return lines + by_keys("", {k: numbers[k] for k in keys.split() or numbers if k in numbers})
 
 
 def page() -> str:
@@ -436,86 +391,68 @@ PROGRAMS = (
     "Numba",
     "MuJoCo",
 )
+MARK = re.compile(r"<!-- result: ([\w-]+) -->(.*?)<!-- end -->", re.DOTALL)
 
 
-def cold_tasks_block() -> str:
+def cold_tasks_block() -> list[str]:
     """First and later answers of tasks from a cold process."""
     report = read("cold_tasks")
-    return "\n".join([*table(report["numbers"]["side_by_side"]), f"({command(report)})"])
+    return [*table(report["numbers"]["side_by_side"]), f"({command(report)})"]
 
 
-def work_precision_block() -> str:
-    """A figure, times of polhode and its peers to one error, and the cost of ordinary calls."""
+def work_precision_block() -> list[str]:
+    """Microseconds per body of polhode and its peers to an error of 1e-9 rad."""
     report = merged()
     if report is None:
         raise FileNotFoundError("no work_precision*.json in benchmarks/results")
-    numbers = report["numbers"]
-    integrated = {row["scene"] for row in numbers["default_errors"]}
+    integrated = {row["scene"] for row in report["numbers"]["default_errors"]}
     rows: dict[str, dict[str, Any]] = {}
-    for row in numbers["time_to_error_median_body"]:
+    for row in report["numbers"]["time_to_error_median_body"]:
         scene, bodies = row["scene"], row["bodies"]
         sizes = (1, 1000) if scene in integrated else (1000,)
         if row["dtype"] == "float64" and bodies in sizes:
             name = scene + ", integrated" * (scene in integrated) + ", one body" * (bodies == 1)
             rows.setdefault(name, {"": name})[row["program"]] = row["us_to_1e-09_rad"]
     sources = dict.fromkeys(source(each) for each in report["reports"])
-    calls = read("plain_calls")
-    return "\n".join(
-        [
-            "![error against run time per body](benchmarks/results/work_precision_main.svg)",
-            "",
-            "Microseconds per body, on one core, for a median attitude error of 1e-9 rad at t = 100"
-            " where no other time is named, 1,000 bodies where none are named, float64, compiling"
-            " apart; a dash: never reached, or not offered; rows that are not marked as integrated"
-            " are closed forms in polhode:",
-            "",
-            *table(rows.values(), ("", *PROGRAMS)),
-            f"Made by `python -m benchmarks.work_precision` ({'; '.join(sources)});"
-            " quick tables by `make bench`; all results, other precisions and sizes, and where"
-            " others are better: [benchmarks](benchmarks/README.md).",
-            "",
-            "Cost of an ordinary call, `ph.simulate(scene, state, [0, 100])`, beside that of its"
-            " compiled program for the last state, at the default `rtol`, microseconds per body"
-            f" ({command(calls)}):",
-            "",
-            *table(_call(row) for row in calls["numbers"]["rows"] if _is_in_readme(row)),
-        ]
-    )
+    made = f"(`python -m benchmarks.work_precision`, {'; '.join(sources)})"
+    return [*table(rows.values(), ("", *PROGRAMS)), made]
 
 
-def _is_in_readme(row: dict) -> bool:
-    return row["bodies"] == 1000 or (row["family"] == "heavy_top" and row["bodies"] == 1)
+def plain_calls_block() -> list[str]:
+    """Microseconds per body of ordinary calls."""
+    report = read("plain_calls")
+    rows = [
+        {
+            "": f"{row['title']}, {row['bodies']:,} {'body' if row['bodies'] == 1 else 'bodies'}",
+            "program": row["ns_bare"] / 1e3,
+            "call": row["ns_plain"] / 1e3,
+            "each of 100 saved times": row["ns_sample"] / 1e3,
+            "median error": row["attitude_median"],
+        }
+        for row in report["numbers"]["rows"]
+        if row["bodies"] == 1000 or (row["family"] == "heavy_top" and row["bodies"] == 1)
+    ]
+    return [*table(rows), f"({command(report)})"]
 
 
-def _call(row: dict) -> dict:
-    """Microseconds of an ordinary call."""
-    return {
-        "": f"{row['title']}, {row['bodies']:,} {'body' if row['bodies'] == 1 else 'bodies'}",
-        "program": row["ns_bare"] / 1e3,
-        "call": row["ns_plain"] / 1e3,
-        "each of 100 saved times": row["ns_sample"] / 1e3,
-        "median error": row["attitude_median"],
-    }
-
-
-MARK = re.compile(r"<!-- result: ([\w-]+) -->(.*?)<!-- end -->", re.DOTALL)
-BLOCKS: dict[str, Callable[[], str]] = {
+BLOCKS = {
     "cold-tasks": cold_tasks_block,
-    "readme-tables": work_precision_block,
+    "work-precision": work_precision_block,
+    "plain-calls": plain_calls_block,
 }
 
 
 def fill(text: str) -> str:
-    """README.md with its blocks written anew."""
+    """README.md with its tables written anew."""
 
     def block(match: re.Match) -> str:
-        return f"<!-- result: {match[1]} -->\n{BLOCKS[match[1]]().strip()}\n<!-- end -->"
+        return "\n".join([f"<!-- result: {match[1]} -->", *BLOCKS[match[1]](), "<!-- end -->"])
 
     return MARK.sub(block, text)
 
 
 def write() -> list[Path]:
-    """Write benchmarks/README.md and the blocks of README.md; the files."""
+    """Write benchmarks/README.md and the tables of README.md; the files."""
     target, readme = ROOT / "benchmarks" / "README.md", ROOT / "README.md"
     target.write_text(page(), encoding="utf-8")
     readme.write_text(fill(readme.read_text(encoding="utf-8")), encoding="utf-8")

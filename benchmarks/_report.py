@@ -82,7 +82,8 @@ def machine() -> dict[str, Any]:
     processor, model = platform.machine(), platform.processor()
     about = Path("/proc/cpuinfo")
     if about.exists():
-        fields = dict(_field(line) for line in reversed(about.read_text().splitlines()))
+        lines = [line.partition(":") for line in reversed(about.read_text().splitlines())]
+        fields = {name.strip(): value.strip() for name, _, value in lines}
         flags = set(fields.get("flags", "").split())
         wide = [name for name in ("avx512f", "avx2", "avx") if name in flags]
         processor += f" with {wide[0].upper().removesuffix('F')}" if wide else ""
@@ -96,12 +97,6 @@ def machine() -> dict[str, Any]:
         device = sys.modules["jax"].devices()[0]
         found["device"] = device.device_kind if device.platform != "cpu" else "cpu"
     return found
-
-
-def _field(line: str) -> tuple[str, str]:
-    """Name and value of a line of /proc/cpuinfo."""
-    name, _, value = line.partition(":")
-    return name.strip(), value.strip()
 
 
 def versions(*more: str) -> dict[str, str | None]:

@@ -624,7 +624,6 @@ def test_conversions_are_shown_by_their_worst_and_euler_sequences_together():
 
 
 def test_errors_over_the_tolerance_are_shown_by_scene():
-    pytest.importorskip("heyoka")
     from benchmarks.torqued import over_tolerance
 
     def row(horizon, kind, median, worst):
@@ -640,7 +639,7 @@ def test_errors_over_the_tolerance_are_shown_by_scene():
 
 def test_a_result_holds_its_derived_tables():
     """As its benchmark derives them from its rows."""
-    from benchmarks import controllers, engines, rotation_stress, work_precision
+    from benchmarks import controllers, engines, rotation_stress, torqued, work_precision
 
     derived = {
         "cold_tasks": lambda n: {"side_by_side": cold_tasks.side_by_side(n["rows"])},
@@ -649,6 +648,7 @@ def test_a_result_holds_its_derived_tables():
         "rotation_stress": lambda n: {
             "worst_by_conversion": rotation_stress.worst_by_conversion(n["rows"])
         },
+        "torqued": lambda n: {"over_tolerance": torqued.over_tolerance(n["rows"])},
         **{
             path.stem: lambda n: work_precision.derived(n["tables"])
             for path in _report.RESULTS.glob("work_precision*.json")
@@ -672,6 +672,19 @@ WRITE = "run: python -m benchmarks page"
 def test_the_results_page_holds_the_numbers_of_the_committed_results():
     text = (_page.ROOT / "benchmarks" / "README.md").read_text(encoding="utf-8")
     assert text == _page.page(), WRITE
+
+
+def test_links_to_the_results_page_name_its_sections():
+    text = (_page.ROOT / "benchmarks" / "README.md").read_text(encoding="utf-8")
+    titles = re.findall(r"^## (.*)$", text, re.MULTILINE)
+    anchors = {re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-") for title in titles}
+    links = [
+        (path.name, anchor)
+        for path in (_page.ROOT / "docs").rglob("*.md")
+        for anchor in re.findall(r"benchmarks\.md#([\w-]+)", path.read_text(encoding="utf-8"))
+    ]
+    assert links
+    assert not [link for link in links if link[1] not in anchors]
 
 
 def readme() -> str:
