@@ -249,8 +249,8 @@ SECTIONS = {
         "Cost of each kind of scene",
         "Operations and bytes per body as the compiler counts them (the body of a loop once), and"
         " times that compare the rows of this table alone. Then a satellite, and 50 of them, for an"
-        " hour under the gravity gradient and with one part more: 61 samples, `rtol=1e-6`,"
-        " processor time of one core. Last, reading the mass properties of one body.",
+        " hour under the gravity gradient and with one part more (`ratio` over that without): 61"
+        " samples, `rtol=1e-6`, processor time of one core. Last, reading mass properties.",
     ),
     "accelerator": Section(
         "Accelerators",
