@@ -397,7 +397,22 @@ MARK = re.compile(r"<!-- result: ([\w-]+) -->(.*?)<!-- end -->", re.DOTALL)
 def cold_tasks_block() -> list[str]:
     """First and later answers of tasks from a cold process."""
     report = read("cold_tasks")
-    return [*table(report["numbers"]["side_by_side"]), f"({command(report)})"]
+    rows = [
+        {
+            "": ", beside ".join(filter(None, (row["task"], row["other_library"]))),
+            "first [s]": row["first_s"],
+            "its first [s]": row["other_first_s"],
+            "stored [s]": row["first_stored_s"],
+            "second [s]": row["second_s"],
+            "its second [s]": row["other_second_s"],
+            "memory [MB]": row["memory_MB"],
+            "its memory [MB]": row["other_memory_MB"],
+            "error": row["error"],
+            "its error": row["other_error"],
+        }
+        for row in report["numbers"]["side_by_side"]
+    ]
+    return [*table(rows), f"({command(report)})"]
 
 
 def work_precision_block() -> list[str]:
