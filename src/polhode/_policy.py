@@ -143,14 +143,8 @@ FREE_LANES = 512
 TIME_LOOP_BODIES = 64
 """[bodies] From which TIME_LOOP applies."""
 
-TOP_WHOLE = 2**14
-"""[bodies times samples] Of Lagrange's tops that are evaluated without a loop over chunks."""
-
-TOP_CHUNK = 2**12
-"""[bodies times samples] In a chunk of more tops."""
-
-TOP_BODIES = 128
-"""[bodies] In a chunk of more tops, at the most."""
+TOP_CHUNK = 2**11
+"""[bodies times samples] Of Lagrange's tops in one chunk."""
 
 ELEMENTARY_CHUNK = 2**14
 """[bodies times samples] In a chunk of motions in elementary functions."""

@@ -88,12 +88,8 @@ class LagrangeTop(AbstractChunkedForm):
         return None
 
     def _chunk_size(self, n: int, count: int) -> int:
-        if self.chunk is not None:
-            return bodies_per_chunk(self.chunk, n, count)
-        if n * count <= _policy.samples_at_once(_policy.TOP_WHOLE):
-            return n
-        largest = _policy.bodies_at_once(_policy.TOP_BODIES)
-        return max(1, min(largest, _policy.samples_at_once(_policy.TOP_CHUNK) // count))
+        chunk = self.chunk or _policy.samples_at_once(_policy.TOP_CHUNK)
+        return bodies_per_chunk(chunk, n, count)
 
     def _motion(self, scene, state, elapsed):
         n = state.wxyz.shape[0]
