@@ -1,6 +1,5 @@
 """Events: times known in closed form, pairs between looks, derivatives, and motions that stop."""
 
-from functools import partial
 from pathlib import Path
 
 import equinox as eqx
@@ -461,7 +460,7 @@ def test_events_of_a_simulation_in_order_of_time():
     assert traj[1].events.count == 2
 
 
-@pytest.mark.slow  # of a motion in closed form, with the same rule: test_event_times_have_derivatives
+@pytest.mark.slow  # by the same rule in closed form: test_event_times_have_derivatives
 def test_times_of_events_of_a_motion_in_steps_have_derivatives():
     events = [below(0.5), below(0.8), below(0.3, terminal=True), below(0.2)]
     state = ph.State([1.0, 0, 0, 0], jnp.array([[0.0, 0, 1.0], [0.0, 0, 2.0]]))

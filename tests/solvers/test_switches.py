@@ -193,7 +193,7 @@ def largest(p, rate):
     ids=["digitize", "argmax"],
 )
 def test_derivatives_through_a_table(law, p, span, slope, mode):
-    """A search in a table turns several comparisons at once. Reverse mode: through one jump below."""
+    """A search in a table turns several comparisons at once. In reverse mode: a jump below."""
 
     def final_rate(p):
         scene = ph.Scene(
