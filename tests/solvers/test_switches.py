@@ -269,7 +269,7 @@ def truth(p, omega, law):
 
 
 @pytest.mark.parametrize(
-    "law", [*(pytest.param(x, marks=pytest.mark.slow) for x in ("clip", "pulse")), "short way"]
+    "law", [pytest.param("clip", marks=pytest.mark.slow), "pulse", "short way"]
 )
 def test_states_through_switches(law):
     """Without a declaration, at every tolerance; SciPy's steps of 0.01 s miss a jump by 1e-5."""
