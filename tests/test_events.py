@@ -1,6 +1,5 @@
 """Events: times known in closed form, pairs between looks, derivatives, and motions that stop."""
 
-from functools import partial
 from pathlib import Path
 
 import equinox as eqx
@@ -97,7 +96,7 @@ def test_event_times_have_derivatives():
     def second(given):
         rate, level = given
         state = ph.State(STATE.wxyz, jnp.stack([0 * rate, rate, 0 * rate]))
-        traj = ph.simulate(BALL, state, TS)  # steps: test_events_of_a_simulation_in_order_of_time
+        traj = ph.simulate(BALL, state, TS)  # in steps: below
         return ph.crossings(traj, Height(level), capacity=3, samples=64).times[1]
 
     time, (in_rate, in_level) = second((jnp.asarray(RATE), jnp.asarray(0.4)))
@@ -116,18 +115,51 @@ def test_a_pendulum_passes_below_after_a_quarter_period():
     np.testing.assert_allclose(found.times, want[want < 6], rtol=1e-9)
 
 
+class Rate(eqx.Module):
+    """About body y over a level, a leaf."""
+
+    level: jax.Array
+
+    def __call__(self, wxyz, omega_body, t):
+        return omega_body[1] - self.level
+
+
 def test_a_motion_stops_at_its_event_and_goes_on_with_another_scene():
-    """A thruster brings the body to a rate, w = a t; then it turns freely to an attitude."""
+    """Thrusters bring the body to a rate, w = a t, and push it on harder to another one."""
     inertia = ph.Inertia.from_moments([1.0, 2.0, 2.5])
-    burning = ph.Scene(inertia, None, ph.BodyTorque([0.0, 0.5, 0.0]))  # 0.25 rad/s^2 about y
+
+    def pushed(torque, state, ts, rate):  # the same program in every call
+        scene = ph.Scene(inertia, None, ph.BodyTorque(torque * jnp.array([0.0, 1.0, 0.0])))
+        return ph.simulate(scene, state, ts, until=ph.Event(Rate(jnp.asarray(rate)), 1))
+
     rest = ph.State([1.0, 0, 0, 0], jnp.zeros((2, 3)).at[1, 1].set(0.75))
-    reached = ph.Event(lambda wxyz, omega_body, t: omega_body[1] - 1.0, 1)
-    ts = np.linspace(0.0, 6.0, 4) + np.zeros((2, 1))  # below times of as many: the same programs
-    on = ph.simulate(burning, rest, ts, until=reached)
+    ts = np.linspace(0.0, 6.0, 4) + np.zeros((2, 1))
+    on = pushed(0.5, rest, ts, 1.0)  # 0.25 rad/s^2
     np.testing.assert_allclose(on.event_time, [4.0, 1.0], rtol=1e-12)
     np.testing.assert_allclose(on.ts, [[0, 2, 4, 4], [0, 1, 1, 1]], rtol=1e-12)
     np.testing.assert_allclose(on.last.omega_body[:, 1], 1.0, rtol=1e-12)
     np.testing.assert_allclose(on.omega_body[0, :2, 1], [0.0, 0.5], atol=1e-14)
+    ts = np.asarray(on.event_time)[:, None] + np.array([0.0, 1.0, 2.0, 3.0]) * [[1.0], [0.25]]
+    off = pushed(1.0, on.last, ts, 2.0)  # 0.5 rad/s^2
+    np.testing.assert_allclose(off.event_time, [6.0, np.inf], rtol=1e-11)
+    turned = np.array(
+        [0.25 * 4**2 / 2 + 2 + 0.5 * 2**2 / 2, 0.75 + 0.25 / 2 + 0.75 + 0.5 * 0.75**2 / 2]
+    )
+    np.testing.assert_allclose(np.abs(off.last.wxyz[:, 0]), np.abs(np.cos(turned / 2)), atol=1e-11)
+    # at the surface of the event itself the motion starts: that is no crossing
+    again = pushed(0.5, on.last, ts, 1.0)
+    assert np.all(np.isinf(again.event_time))
+
+
+@pytest.mark.slow  # one scene after another, of motions in steps: above
+def test_a_motion_in_steps_goes_on_in_closed_form():
+    """A thruster brings the body to a rate, w = a t; then it turns freely to an attitude."""
+    inertia = ph.Inertia.from_moments([1.0, 2.0, 2.5])
+    burning = ph.Scene(inertia, None, ph.BodyTorque([0.0, 0.5, 0.0]))  # 0.25 rad/s^2 about y
+    rest = ph.State([1.0, 0, 0, 0], jnp.zeros((2, 3)).at[1, 1].set(0.75))
+    reached = ph.Event(Rate(jnp.asarray(1.0)), 1)
+    ts = np.linspace(0.0, 6.0, 4) + np.zeros((2, 1))
+    on = ph.simulate(burning, rest, ts, until=reached)
     ts = np.asarray(on.event_time)[:, None] + np.array([0.0, 1.0, 2.0, 5.0])
     off = ph.simulate(ph.Scene(inertia), on.last, ts, until=ph.Event(height(0.0), -1))
     turned = np.array([0.25 * 4**2 / 2, 0.75 + 0.25 / 2])  # at the switch; body x falls at 2 pi k
@@ -135,9 +167,6 @@ def test_a_motion_stops_at_its_event_and_goes_on_with_another_scene():
     reached_again = want < np.asarray(ts[:, -1])
     assert reached_again.tolist() == [True, False]
     np.testing.assert_allclose(off.event_time, [want[0], np.inf], rtol=1e-11)
-    # at the surface of the event itself the motion starts: that is no crossing
-    again = ph.simulate(burning, on.last, ts, until=reached)
-    assert np.all(np.isinf(again.event_time))
 
 
 @pytest.mark.parametrize("side", [1, -1])
@@ -414,15 +443,7 @@ def test_events_of_a_simulation_in_order_of_time():
     """The times are known; a terminal one ends the motion, the samples after it are its own."""
     state = ph.State([1.0, 0, 0, 0], jnp.array([[0.0, 0, 1.0], [0.0, 0, 2.0]]))
     events = [below(0.5), below(0.8), below(0.3, terminal=True), below(0.2)]
-    ts = jnp.linspace(0.0, 15.0, 16)
-
-    @jax.jit
-    @partial(jax.value_and_grad, has_aux=True)
-    def run(rate):
-        traj = ph.simulate(slowing(rate=rate), state, ts, events=events)
-        return traj.events.times[1, 1], traj
-
-    (value, traj), slope = run(0.1)
+    traj = ph.simulate(slowing(), state, jnp.linspace(0.0, 15.0, 16), events=events)
     found = traj.events
     want = 10 * np.log([1 / 0.8, 1 / 0.5, 1 / 0.3])
     np.testing.assert_allclose(found.times[0, :3], want, rtol=1e-9)
@@ -435,9 +456,25 @@ def test_events_of_a_simulation_in_order_of_time():
     np.testing.assert_allclose(traj.event_time, [want[2], np.inf], rtol=1e-9)
     np.testing.assert_allclose(traj.ts[0, -2:], want[2], rtol=1e-9)
     np.testing.assert_allclose(traj.omega_body[0, -1, 2], 0.3, rtol=1e-9)
+    np.testing.assert_allclose(found.times[1, 1], 10 * np.log(4), rtol=1e-9)
+    assert traj[1].events.count == 2
+
+
+@pytest.mark.slow  # by the same rule in closed form: test_event_times_have_derivatives
+def test_times_of_events_of_a_motion_in_steps_have_derivatives():
+    events = [below(0.5), below(0.8), below(0.3, terminal=True), below(0.2)]
+    state = ph.State([1.0, 0, 0, 0], jnp.array([[0.0, 0, 1.0], [0.0, 0, 2.0]]))
+    ts = jnp.linspace(0.0, 15.0, 16)
+
+    @jax.jit
+    @jax.value_and_grad
+    def time(rate):
+        traj = ph.simulate(slowing(rate=rate), state, ts, events=events)
+        return traj.events.times[1, 1]
+
+    value, slope = time(0.1)
     np.testing.assert_allclose(value, 10 * np.log(4), rtol=1e-9)
     np.testing.assert_allclose(slope, -100 * np.log(4), rtol=1e-7)
-    assert traj[1].events.count == 2
 
 
 @pytest.mark.slow  # of a motion in steps: above

@@ -183,6 +183,7 @@ def test_principia_spin_about_each_principal_axis(momentum, turn):
     np.testing.assert_allclose(end.omega_body[-1], state.omega_body, rtol=4e-16)
 
 
+@pytest.mark.slow  # the same case in closed form: tests/tops; tops in steps: tests/systems
 def test_gni_lagrange_top():
     """GNI example VII.5.4 with I = (0.5, 0.5, 1) and U = q_33, t = 30."""
     scene = ph.Scene(

@@ -54,7 +54,7 @@ def test_a_body_depends_on_its_index_alone():
     assert not np.any(np.asarray(other.wxyz) == np.asarray(many.wxyz))
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.slow), jnp.float64])
 def test_draws_have_the_distribution_asked_for(dtype):
     scene = ph.Scene(ph.Inertia.from_moments(jnp.array([1.0, 2.0, 2.9], dtype)))
     state = ph.State(jnp.array([1.0, 0, 0, 0], dtype), jnp.array([0.1, 1.0, 0.2], dtype))

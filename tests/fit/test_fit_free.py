@@ -51,14 +51,34 @@ def cases():
     return times, clean, noisy, ratios / ratios[:, 2:], tensors
 
 
+OPTIONS = FitOptions(gyroscope=Gyroscope.ideal())
+
+
 def fitted(times, rates):
-    options = FitOptions(gyroscope=Gyroscope.ideal())
-    return fit_inertia(times, rates, omega_noise=SIGMA[:, None, None], options=options, throw=False)
+    """Fits of eight recordings at once, put together: the program of all 200 compiles for three
+    times as long."""
+    noise = SIGMA[:, None, None]
+    parts = [
+        fit_inertia(
+            times, rates[k : k + 8], omega_noise=noise[k : k + 8], options=OPTIONS, throw=False
+        )
+        for k in range(0, BODIES, 8)
+    ]
+    return jax.tree.map(lambda *x: jnp.concatenate(x), *parts)
 
 
 @pytest.fixture(scope="module")
 def fits(cases):
     return fitted(cases[0], cases[2])
+
+
+@pytest.mark.slow  # eight at once: above
+def test_recordings_fitted_at_once_have_the_fits_of_parts(cases, fits):
+    noise = SIGMA[:, None, None]
+    found = fit_inertia(cases[0], cases[2], omega_noise=noise, options=OPTIONS, throw=False)
+    np.testing.assert_array_equal(found.diagnostics, fits.diagnostics)
+    off = np.abs(found.ratios - fits.ratios)[:, :2] / np.asarray(fits.ratios_std)[:, :2]
+    assert np.nanmax(off) < 1e-2
 
 
 def test_every_fit_is_a_physical_body(fits):

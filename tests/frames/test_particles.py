@@ -114,6 +114,7 @@ def test_foucault_pendulum_turns_at_its_analytic_rate():
     assert np.abs(np.asarray(paths.position[..., 2])).max() < 1e-11
 
 
+@pytest.mark.slow  # a force in the frame: test_foucault_pendulum_turns_at_its_analytic_rate
 def test_falling_body_is_deflected_east_and_a_little_south():
     """r = g t^2/2 - w x g t^3/3 + w x (w x g) t^4/8 + O(w^3 t^5): axes south, east, up."""
     rate, latitude, gravity = 1e-3, 0.8, 9.81

@@ -65,7 +65,13 @@ def test_forces_vanish_where_they_must():
     assert not frame.origin_force(t).any()
 
 
-@pytest.mark.parametrize("with_origin", [False, True], ids=["fixed", "moving origin"])
+@pytest.mark.parametrize(
+    "with_origin",
+    [
+        pytest.param(False, id="fixed", marks=pytest.mark.slow),
+        pytest.param(True, id="moving origin"),
+    ],
+)
 def test_transformations_against_differentiated_paths(with_origin):
     """x_space(t) = origin + R x(t) differentiated directly, and back again."""
     origin = wobbling_origin if with_origin else None

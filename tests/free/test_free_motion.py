@@ -32,7 +32,8 @@ def _fits_single(case: dict) -> bool:
     scope="module",
     params=[
         pytest.param(("float64", jax.jacfwd), id="float64"),
-        # reverse mode: of hundreds of bodies in tests/stress, in single precision in tests/systems
+        # reverse mode: test_second_derivatives, of hundreds of bodies in tests/stress, in single
+        # precision in tests/systems
         pytest.param(("float32", jax.jacfwd), id="float32", marks=pytest.mark.slow),
     ],
 )

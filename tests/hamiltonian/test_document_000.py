@@ -107,7 +107,7 @@ def deviations(moments, q, qd, p) -> dict[str, jax.Array]:
     }
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.slow), jnp.float64])
 @pytest.mark.parametrize("moments", BODIES)
 def test_autodiff_is_document_000(moments, dtype):
     tolerance = 450 * float(jnp.finfo(dtype).eps)  # 1e-13 in float64

@@ -62,7 +62,13 @@ SHORT_AXIS = ((1, 1, 0.2, 1.0), (2, 0, 0.15, 2.0), (2, 2, 0.05, 0.5))
 
 
 @pytest.mark.parametrize(
-    ("waves", "long_axis"), [(MIXED, True), (ONE_LINE, True), (SHORT_AXIS, False)]
+    ("waves", "long_axis"),
+    [
+        (MIXED, True),
+        (ONE_LINE, True),
+        # a body in short-axis mode: test_default_range_holds_the_lines_of_a_fast_tumbler
+        pytest.param(SHORT_AXIS, False, marks=pytest.mark.slow),
+    ],
 )
 def test_hypotheses_hold_the_body(waves, long_axis):
     """Also where the harmonics of one line are nearly all: no multiple of it is taken for two."""

@@ -314,19 +314,21 @@ def test_saved_times_keep_the_way_back_from_states_drawn_together(mode):
 
 
 @pytest.mark.parametrize(
-    ("times", "final_only", "pulsed"),
+    ("n", "times", "final_only", "pulsed"),
     [
-        ([0.0, 4.0], True, False),
-        pytest.param([0.0, 4.0], False, False, marks=pytest.mark.slow),
-        pytest.param([0.0, 1.0, 2.5, 4.0], True, False, marks=pytest.mark.slow),
-        pytest.param([0.0, 1.0, 2.5, 4.0], False, False, marks=pytest.mark.slow),
-        pytest.param([0.0, 0.05, 4.0], False, True, marks=pytest.mark.slow),
+        (5, [0.0, 4.0], True, False),
+        pytest.param(70, [0.0, 4.0], True, False, marks=pytest.mark.slow),
+        pytest.param(70, [0.0, 4.0], False, False, marks=pytest.mark.slow),
+        pytest.param(70, [0.0, 1.0, 2.5, 4.0], True, False, marks=pytest.mark.slow),
+        pytest.param(70, [0.0, 1.0, 2.5, 4.0], False, False, marks=pytest.mark.slow),
+        pytest.param(70, [0.0, 0.05, 4.0], False, True, marks=pytest.mark.slow),
     ],
 )
-def test_a_damped_batch_is_followed_back(times, final_only, pulsed):
+def test_a_damped_batch_is_followed_back(n, times, final_only, pulsed):
     """Spheres that stop like exp(-28), by a gain that the torque closes over; a plain call takes
-    no step more for it. ``pulsed``: with edges in the program."""
-    n, ts = 70, jnp.array(times)
+    no step more for it. ``pulsed``: with edges in the program. Of more bodies than SIMD lanes the
+    program takes twice as long to compile."""
+    ts = jnp.array(times)
     omega = 1 + jax.random.uniform(jax.random.key(1), (n, 3))
     state = ph.State(jnp.broadcast_to(jnp.array([1.0, 0, 0, 0]), (n, 4)), omega)
     record = ph.Record(final_only=final_only)
@@ -349,25 +351,44 @@ def test_a_damped_batch_is_followed_back(times, final_only, pulsed):
     assert jnp.all(steps_with_slopes > steps)
 
 
-@pytest.mark.parametrize("ts", [[1e5, 1e5 + 1 / 32], [1e5, 1e5 - 1 / 128]])
-def test_a_span_of_few_units_in_the_last_place_is_followed_back(ts):
-    """Single precision resolves a 128th of a second there: no room for restarts."""
-    ts = jnp.array(ts, jnp.float32)
-    omega = jnp.broadcast_to(jnp.array([0.3, 0.2, 0.5], jnp.float32), (70, 3))
+SHORT_SPANS = [[1e5, 1e5 + 1 / 32], [1e5, 1e5 - 1 / 128]]
+
+
+def total_rate(gain, ts, n):
+    """The sum of the last rates of spheres under drag with a gain."""
+    omega = np.broadcast_to(np.array([0.3, 0.2, 0.5], np.float32), (n, 3))
     inertia = ph.Inertia.from_moments(jnp.ones(3, jnp.float32))
+    scene = ph.Scene(inertia, torque=ph.LinearDamping(gain) + ph.BodyTorque(0 * omega))
+    state = ph.State(jnp.array([1.0, 0, 0, 0], jnp.float32), omega)
+    return jnp.sum(ph.simulate(scene, state, ts).omega_body[:, -1])
 
-    def rates(gain):
-        scene = ph.Scene(inertia, torque=ph.LinearDamping(gain) + ph.BodyTorque(0 * omega))
-        state = ph.State(jnp.array([1.0, 0, 0, 0], jnp.float32), omega)
-        return ph.simulate(scene, state, ts).omega_body[:, -1]
 
-    gain, span = jnp.float32(0.5), ts[1] - ts[0]
-    value, slope = jax.jvp(lambda k: jnp.sum(rates(k)), (gain,), (jnp.ones_like(gain),))
-    want = jnp.sum(omega) * jnp.exp(-gain * span)
+@partial(jax.jit, static_argnums=2)
+def forward(gain, ts, n):
+    return jax.jvp(lambda k: total_rate(k, ts, n), (gain,), (jnp.ones_like(gain),))
+
+
+reverse = jax.jit(jax.value_and_grad(total_rate), static_argnums=2)
+
+
+@pytest.mark.parametrize("ts", SHORT_SPANS)
+@pytest.mark.parametrize(
+    ("n", "both"),
+    [
+        (5, reverse),
+        pytest.param(70, reverse, marks=pytest.mark.slow),
+        pytest.param(70, forward, marks=pytest.mark.slow),  # of longer spans: test_work_and_error
+    ],
+    ids=["few", "reverse", "forward"],
+)
+def test_a_span_of_few_units_in_the_last_place_is_followed_back(n, both, ts):
+    """Single precision resolves a 128th of a second there: no room for restarts."""
+    ts, gain = jnp.array(ts, jnp.float32), jnp.float32(0.5)
+    value, slope = both(gain, ts, n)
+    span = ts[1] - ts[0]
+    want = n * jnp.exp(-gain * span)  # the rates of each sum to 1 rad/s
     np.testing.assert_allclose(value, want, rtol=1e-5)
     np.testing.assert_allclose(slope, -span * want, rtol=1e-4)
-    back = jax.grad(lambda k: jnp.sum(rates(k)))(gain)
-    np.testing.assert_allclose(back, -span * want, rtol=1e-4)
 
 
 def test_what_cannot_be_differentiated_is_refused():

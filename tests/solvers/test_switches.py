@@ -1,6 +1,9 @@
 """Kinks and jumps of a field: found in its program, ended at, and passed by derivatives."""
 
+import functools
+
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -111,24 +114,30 @@ def test_an_unknown_operation_that_makes_integers_is_named():
     assert not solved.hidden_operations
 
 
+class HiddenJump(eqx.Module):
+    """A torque about z that is twice as strong above a rate of 1 rad/s, by way of a loop."""
+
+    torque: jax.Array
+
+    def __call__(self, t, wxyz, omega):
+        above = jax.lax.while_loop(
+            lambda x: (omega[2] > 1) & (x == 0), lambda x: x + 1.0, 0 * omega[2]
+        )
+        return -self.torque * (1 + above) * jnp.eye(3)[2]
+
+
 @pytest.mark.parametrize("torque", [1e-2, 1e-3])
 def test_jumps_that_a_loop_hides_are_found(torque):
     """A ball is slowed down at 2 ``torque`` until its rate passes 1 rad/s, then at ``torque``: weak
     beside the rates, so that the jump is easy to overlook."""
-
-    def law(t, wxyz, omega):
-        above = jax.lax.while_loop(
-            lambda x: (omega[2] > 1) & (x == 0), lambda x: x + 1.0, 0 * omega[2]
-        )
-        return -torque * (1 + above) * jnp.eye(3)[2]
-
     span, rtol = 20.0, 1e-8
     passing = np.random.default_rng(6).uniform(1, 19, 48)
     omega = jnp.zeros((48, 3)).at[:, 2].set(1 + 2 * torque * passing)
     later = span - passing
     angle = (1 + torque * passing) * passing + (1 - torque * later / 2) * later
     state = ph.State(jnp.tile(jnp.eye(4)[0], (48, 1)), omega)
-    scene = ph.Scene(ph.Inertia.spherical(1.0), torque=ph.FeedbackTorque(law))
+    law = ph.FeedbackTorque(HiddenJump(jnp.asarray(torque)))
+    scene = ph.Scene(ph.Inertia.spherical(1.0), torque=law)
     last = ph.simulate(scene, state, [0.0, span], rtol=rtol).last
     error = 2 * np.arctan2(last.wxyz[:, 3], last.wxyz[:, 0]) - angle
     error = np.abs((error + np.pi) % (2 * np.pi) - np.pi)
@@ -169,14 +178,22 @@ def largest(p, rate):
 
 
 @pytest.mark.parametrize(
+    "mode",
+    [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)],
+    ids=["forward", "reverse"],
+)
+@pytest.mark.parametrize(
     ("law", "p", "span", "slope"),
     [
-        (looked_up, 1.1, 4.0, 0.6 + 0.2 * (0.2 / 0.1 - 0.8 / 0.15)),
-        pytest.param(largest, 0.7, 3.0, 0.5, marks=pytest.mark.slow),
+        pytest.param(
+            *(looked_up, 1.1, 4.0, 0.6 + 0.2 * (0.2 / 0.1 - 0.8 / 0.15)), marks=pytest.mark.slow
+        ),
+        (largest, 0.7, 3.0, 0.5),
     ],
+    ids=["digitize", "argmax"],
 )
-def test_derivatives_through_a_table(law, p, span, slope):
-    """A search in a table turns several comparisons at once."""
+def test_derivatives_through_a_table(law, p, span, slope, mode):
+    """A search in a table turns several comparisons at once. In reverse mode: a jump below."""
 
     def final_rate(p):
         scene = ph.Scene(
@@ -186,7 +203,7 @@ def test_derivatives_through_a_table(law, p, span, slope):
         state = ph.State([1.0, 0, 0, 0], [0.0, 0, 1.0])
         return ph.simulate(scene, state, [0.0, span], rtol=1e-9).last.omega_body[2]
 
-    np.testing.assert_allclose(jax.grad(final_rate)(p), slope, rtol=1e-7)
+    np.testing.assert_allclose(jax.jit(mode(final_rate))(p), slope, rtol=1e-7)
 
 
 def test_derivatives_that_would_miss_jumps_are_refused():
@@ -226,6 +243,7 @@ LAWS = {
 }
 
 
+@functools.partial(jax.jit, static_argnums=2)
 def moved(p, omega, law, rtol):
     scene = ph.Scene(INERTIA, None, ph.FeedbackTorque(LAWS[law](p)))
     return ph.simulate(scene, ph.State(WXYZ, omega), TS, rtol=rtol)
@@ -251,7 +269,7 @@ def truth(p, omega, law):
 
 
 @pytest.mark.parametrize(
-    "law", [*(pytest.param(x, marks=pytest.mark.slow) for x in ("clip", "pulse")), "short way"]
+    "law", [pytest.param("clip", marks=pytest.mark.slow), "pulse", "short way"]
 )
 def test_states_through_switches(law):
     """Without a declaration, at every tolerance; SciPy's steps of 0.01 s miss a jump by 1e-5."""
@@ -288,43 +306,45 @@ def test_gradients_through_switches(law):
             assert np.linalg.norm(found - want) < max(2 * rtol, 1e-8) * size
 
 
+# w = w0 exp(p0 t) down to p1 < w0, then 0.1 t less
+RATE, LEVEL, BEGIN = -0.2, 0.7, 1.0
+MET = np.log(LEVEL / BEGIN) / RATE
+FALLING = jnp.array([RATE, LEVEL]), jnp.array([0.0, 0.0, BEGIN])
+# d MET / d RATE = -MET / RATE, d MET / d LEVEL = 1 / (RATE LEVEL), d MET / d BEGIN likewise
+FALLING_SLOPES = np.array([-0.1 * MET / RATE, 1 + 0.1 / (RATE * LEVEL), -0.1 / (RATE * BEGIN)])
+
+
+def falling(p, omega):
+    def law(t, wxyz, omega):
+        return jnp.where(omega[2] > p[1], p[0] * omega, -0.1)
+
+    scene = ph.Scene(ph.Inertia.spherical(1.0), None, ph.FeedbackTorque(law))
+    # of 128 steps two are noted at once: the others are taken once more on the way back
+    method = ph.LiePoisson(Automatic(), max_steps=128)
+    return ph.simulate(scene, ph.State(WXYZ, omega), [0.0, 5.0], method).omega_body[-1, 2]
+
+
 def test_a_gradient_through_a_jump():
     """The time of a jump moves with the state and with the threshold, a parameter."""
+    value, (by_p, by_omega) = jax.jit(jax.value_and_grad(falling, (0, 1)))(*FALLING)
+    np.testing.assert_allclose(value, LEVEL - 0.1 * (5 - MET), rtol=1e-9)
+    np.testing.assert_allclose([*by_p, by_omega[2]], FALLING_SLOPES, rtol=1e-8)
 
-    def end(p, omega):
-        def law(t, wxyz, omega):
-            return jnp.where(omega[2] > p[1], p[0] * omega, 0.1)
 
-        scene = ph.Scene(ph.Inertia.spherical(1.0), None, ph.FeedbackTorque(law))
-        return ph.simulate(scene, ph.State(WXYZ, omega), [0.0, 5.0]).omega_body[-1, 2]
-
-    # w = w0 exp(p0 t) down to p1 < w0, then 0.1 t more
-    rate, level, begin = -0.2, 0.7, 1.0
-    met = np.log(level / begin) / rate
-    with pytest.raises(ph.SimulationError, match="slides along a switch"):
-        end(jnp.array([rate, level]), jnp.array([0.0, 0.0, begin]))
-
-    def falling(p, omega):
-        def law(t, wxyz, omega):
-            return jnp.where(omega[2] > p[1], p[0] * omega, -0.1)
-
-        scene = ph.Scene(ph.Inertia.spherical(1.0), None, ph.FeedbackTorque(law))
-        # of 128 steps two are noted at once: the others are taken once more on the way back
-        method = ph.LiePoisson(Automatic(), max_steps=128)
-        return ph.simulate(scene, ph.State(WXYZ, omega), [0.0, 5.0], method).omega_body[-1, 2]
-
-    given = jnp.array([rate, level]), jnp.array([0.0, 0.0, begin])
-    value, (by_p, by_omega) = jax.value_and_grad(falling, (0, 1))(*given)
-    np.testing.assert_allclose(value, level - 0.1 * (5 - met), rtol=1e-9)
-    # d met / d rate = -met / rate, d met / d level = 1 / (rate level), d met / d begin likewise
-    want = [-0.1 * met / rate, 1 + 0.1 / (rate * level)]
-    np.testing.assert_allclose(by_p, want, rtol=1e-8)
-    np.testing.assert_allclose(by_omega[2], -0.1 / (rate * begin), rtol=1e-8)
+@pytest.mark.slow  # forward mode through jumps: test_derivatives_through_a_table
+def test_a_tangent_through_a_jump():
     along = jnp.array([0.3, -0.2]), jnp.array([0.0, 0.0, 0.5])
-    _, change = jax.jvp(falling, given, along)
-    np.testing.assert_allclose(
-        change, 0.3 * want[0] - 0.2 * want[1] - 0.5 * 0.1 / (rate * begin), rtol=1e-8
-    )
+    _, change = jax.jvp(falling, FALLING, along)
+    np.testing.assert_allclose(change, FALLING_SLOPES @ [0.3, -0.2, 0.5], rtol=1e-8)
+
+
+class Relay(eqx.Module):
+    """A torque about x against the rate, and a push beside it, both in units of 0.3 N m."""
+
+    push: jax.Array
+
+    def __call__(self, t, wxyz, omega):
+        return 0.3 * (jnp.where(omega[0] > 0, -1, 1) + self.push) * jnp.eye(3, dtype=omega.dtype)[0]
 
 
 @pytest.mark.parametrize("push", [0.0, 0.7])
@@ -332,14 +352,14 @@ def test_a_gradient_through_a_jump():
 def test_a_relay_that_slides_says_so(dtype, push):
     """Single precision runs out of digits before 16 reversals."""
 
-    def relay(t, wxyz, omega):
-        return 0.3 * (jnp.where(omega[0] > 0, -1, 1) + push) * jnp.array([1, 0, 0], omega.dtype)
-
-    scene = ph.Scene(ph.Inertia.from_moments(MOMENTS.astype(dtype)), None, ph.FeedbackTorque(relay))
+    relay = ph.FeedbackTorque(Relay(jnp.asarray(push, dtype)))
+    scene = ph.Scene(ph.Inertia.from_moments(MOMENTS.astype(dtype)), None, relay)
     state = ph.State(WXYZ.astype(dtype), np.array([[0.2, 0.3, 0.1], [1.0, 0.2, -0.5]], dtype))
     found = ph.simulate(scene, state, TS.astype(dtype), rtol=1e-5, throw=False)
     np.testing.assert_array_equal(found.status, ph.Status.SLIDING)
     assert found.wxyz.dtype == dtype
+    with pytest.raises(ph.SimulationError, match="slides along a switch"):
+        ph.simulate(scene, state, TS.astype(dtype), rtol=1e-5)
 
 
 @pytest.mark.slow

@@ -58,6 +58,9 @@ METHODS = {
     "Dopri8": Way(ph.LiePoisson(Dopri8()), ALL),
     "Extrapolation compensated": Way(ph.LiePoisson(Extrapolation(8, compensated=True)), FEW),
     "CoarseSteps": Way(ph.CoarseSteps(), FEW),
+    "CoarseSteps without a potential": Way(
+        ph.CoarseSteps(), [name for name in FEW if "gravity" not in BY_NAME[name].acts]
+    ),
     "EulerAngles of few": Way(ph.EulerAngles(Dopri8()), FEW),
     "Dopri8 of sunlight_and_shadow": Way(ph.LiePoisson(Dopri8()), ["sunlight_and_shadow"]),
 }
@@ -231,6 +234,7 @@ COVERED = (
     *("LagrangeTop", "Extrapolation compensated", "Dopri8"),
     "EulerAngles of few",  # values: tests/hamiltonian
     *("planner axisymmetric", "planner body and damping"),  # as ClosedForm and CoarseSteps
+    "CoarseSteps",  # without a potential; with one: planner gravity
 )
 # Every method and coordinates in single precision, and wheels; the other rows differ from these in
 # the field or the solver alone.

@@ -18,7 +18,13 @@ ROTORS = {
 }
 
 
-@pytest.mark.parametrize("name", list(ROTORS))
+@pytest.mark.parametrize(
+    "name",
+    [
+        "free and held",
+        pytest.param("driven", marks=pytest.mark.slow),  # such wheels: test_every_torque
+    ],
+)
 def test_momentum_and_energy(name):
     scene = ph.Scene(INERTIA, rotors=ROTORS[name])
     got = ph.simulate(scene, STATE, TS, ph.LiePoisson(), rtol=1e-11)

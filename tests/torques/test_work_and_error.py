@@ -92,7 +92,14 @@ def test_the_estimate_bounds_the_error(rtol):
             ph.simulate(scene, state, ts, rtol=rtol, record=record)
 
 
-@pytest.mark.parametrize("name", ["driven_and_damped", "pushed_in_space", "gravity_gradient"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "driven_and_damped",
+        pytest.param("pushed_in_space", marks=pytest.mark.slow),
+        "gravity_gradient",
+    ],
+)
 def test_reached_and_estimated_error_keep_to_what_was_asked(name):
     system, exact = BY_NAME[name], truth(name)
     state = ph.State(np.array(system.wxyz, float), system.omega)
