@@ -48,7 +48,15 @@ from polhode._closed_forms._elementary import rotation_about
 from polhode._closed_forms._lagrange_curve import cayley_klein, lagrange_constants
 from polhode._closed_forms._lagrange_series import Complex, Series
 from polhode._hamiltonian import components
-from polhode._kernels import any_of, derivable_once, kernel, opaque_ones, spread, staged
+from polhode._kernels import (
+    any_of,
+    derivable_once,
+    kernel,
+    map_chunks,
+    opaque_ones,
+    spread,
+    staged,
+)
 from polhode._scene import Scene, UniformGravity, Wheels
 
 
@@ -168,9 +176,12 @@ def lagrange_motion(
     closed_form: Any = kernel(_long_motion, repeated=True)
     motion = closed_form(*other)
 
+    # Body by body: side by side the program of this branch, which is hardly ever taken, would be
+    # a third of the compilation of a gradient.
     def with_corrections(motion, arguments, elapsed):
         corrected: Any = kernel(_corrected, repeated=True)
-        return corrected(motion, arguments, elapsed, short, weightless, at_rest)
+        lanes = list(motion), arguments, elapsed, short, weightless, at_rest
+        return map_chunks(lambda lane: corrected(*lane), lanes, elapsed.shape[0], 1)
 
     def unchanged(motion, arguments, elapsed):
         return list(motion)
