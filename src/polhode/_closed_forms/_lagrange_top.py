@@ -50,7 +50,9 @@ from polhode._closed_forms._lagrange_series import Complex, Series
 from polhode._hamiltonian import components
 from polhode._kernels import (
     any_of,
+    attached,
     derivable_once,
+    is_slope,
     kernel,
     map_chunks,
     opaque_ones,
@@ -326,11 +328,39 @@ def with_weight(
     elapsed: Array,
     motion: tuple[Array, Array],
     applies: Array,
-) -> tuple[Array, Array]:
+) -> list[Array]:
     """The ``motion`` without weight, with the derivatives by ``force``, which is zero.
 
-    Second derivatives by it are NaN. ``where`` (N, 1): bodies that turn and have no weight; of
+    Second derivatives by it are NaN. ``applies`` (N, 1): bodies that turn and have no weight; of
     others the result is finite and of no use. Other arguments as for ``lagrange_motion``.
+    """
+
+    # No part of a program that is not differentiated by the force: the changes are zero.
+    def rule(operands, tangents, values):
+        if not is_slope(tangents[0]):
+            return [jnp.zeros_like(x) for x in values]
+        along = jax.jvp(lambda f: _first_order(f, *operands[1:]), operands[:1], tangents[:1])
+        return along[1]
+
+    operands = [force, transverse, distance, wxyz, omega, axial, elapsed, *motion, applies]
+    changes = attached(rule, operands, [jnp.zeros_like(x) for x in motion])
+    return [x + change for x, change in zip(motion, changes)]
+
+
+def _first_order(
+    force: Array,
+    transverse: Array,
+    distance: Array,
+    wxyz: Array,
+    omega: Array,
+    axial: Array,
+    elapsed: Array,
+    q: Array,
+    rates: Array,
+    applies: Array,
+) -> list[Array]:
+    """Changes of attitude (N, T, 4) and rates (N, T, 3) of a motion without weight by a small one,
+    to first order. Arguments as for ``with_weight``.
     """
     moment = transverse[:, None]
     momentum = jnp.concatenate([moment * omega[:, :2], axial[:, None]], axis=-1)
@@ -366,11 +396,10 @@ def with_weight(
     angle = angle / (size * size * moment)[:, None]
     rate_change = (a * x + b * one_less_cosine + c * x_less_sine) / size[:, None]
 
-    q, rates = motion
     half_angle = jnp.concatenate([jnp.zeros_like(x), angle / 2], axis=-1)
     rate_change = rate_change / moment[:, None] + jnp.cross(
         jnp.broadcast_to(rate[:, None], n.shape), angle
     )
     rate_change = rotation.rotate(rotation.conjugate(q), rate_change)
     rate_change = jnp.concatenate([rate_change[..., :2], jnp.zeros_like(x)], axis=-1)
-    return q + rotation.multiply(half_angle, q), rates + rate_change
+    return [rotation.multiply(half_angle, q), rate_change]
