@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import polhode as ph
+from polhode._closed_forms import _lagrange_top
 
 TILTED = [0.8, 0.6, 0.0, 0.0]
 UP, DOWN = [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0]
@@ -147,6 +148,28 @@ def check_batch(dtype, bound, reverse):
     assert all(bool(jnp.all(jnp.isfinite(x))) for x in found)
     np.testing.assert_allclose(found[0][0], 3 * jnp.sum(pull), rtol=0, atol=50 * bound)
     np.testing.assert_allclose(found[1][0], 1, rtol=0, atol=bound)
+
+
+def test_the_first_order_in_the_weight_is_left_to_derivatives_by_the_force(monkeypatch):
+    """Otherwise it is a tenth of the program of every gradient."""
+    asked, first_order = [], _lagrange_top._first_order
+    monkeypatch.setattr(
+        _lagrange_top, "_first_order", lambda *given: asked.append(0) or first_order(*given)
+    )
+    one, turning = jnp.ones(1), jnp.array([[0.5, -0.3, 2.0]])
+    motion = jnp.array([[[0.8, 0.6, 0.0, 0.0]]]), turning[:, None]
+
+    def corrected(force, transverse):
+        given = transverse, force, one, motion[0][0], turning, 2 * one, one[:, None]
+        return _lagrange_top.with_weight(*given, motion, jnp.ones((1, 1), bool))
+
+    none = jnp.zeros((1, 3))
+    np.testing.assert_array_equal(corrected(none, one)[1], motion[1])
+    jax.jvp(lambda a: corrected(none, a), (one,), (one,))
+    assert not asked
+    _, (by_force, _) = jax.jvp(lambda f: corrected(f, one), (none,), (none + 1,))
+    assert asked
+    assert jnp.any(by_force != 0)
 
 
 @pytest.mark.slow

@@ -98,7 +98,9 @@ class LagrangeTop(AbstractChunkedForm):
         return None
 
     def _chunk_size(self, n: int, count: int) -> int:
-        chunk = self.chunk or _policy.samples_at_once(_policy.TOP_CHUNK)
+        chunk = self.chunk
+        if chunk is None:
+            chunk = _policy.samples_at_once(_policy.TOP_CHUNK)
         return bodies_per_chunk(chunk, n, count)
 
     def _motion(self, scene, state, elapsed):
