@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from polhode._integrate import _error_control as control
-from polhode._integrate._explicit_step import dense_of, dense_state
+from polhode._integrate._explicit_step import dense_of, dense_state, in_parts
 from polhode._integrate._tableau import DOP853, TSIT5
 
 MOMENTS = np.array([1.0, 1.7, 2.1])
@@ -139,3 +139,12 @@ def test_the_difference_is_the_only_combination_of_the_seventh_order():
     values = np.linalg.svd(conditions, compute_uv=False)
     assert np.sum(values > 1e-9) == DOP853.stages - 1
     assert np.max(np.abs(np.array(order_conditions(7)) @ DOP853.difference)) / size > 1e-6
+
+
+@pytest.mark.parametrize("rule", [DOP853, TSIT5], ids=["DOP853", "Tsit5"])
+def test_weights_in_single_precision_are_those_of_the_rule(rule):
+    for dtype in (np.float32, np.float64):
+        parts = in_parts(rule.weights, np.dtype(dtype))
+        assert all(part.dtype == dtype for part in parts)
+        total = sum(np.asarray(part, float) for part in parts)
+        np.testing.assert_allclose(total, rule.weights, rtol=0, atol=1e-13)

@@ -4,6 +4,7 @@ The stages are a loop, so that the field stands in the compiled program once. Co
 ``_tableau.py``.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -96,14 +97,14 @@ def attempt_step(
     Both phases, the stages of the step and those of dense output, are turns of one loop, so that
     the field stands in the program once."""
     dtype, rule = progress.y.dtype, motion.rule
-    table, nodes = jnp.asarray(rule.weights, dtype), jnp.asarray(rule.nodes, dtype)
+    table, nodes = in_parts(rule.weights, dtype), jnp.asarray(rule.nodes, dtype)
     stages = _stage_buffer(progress.rate, rule)
     margins = _stage_buffer(progress.margin, rule)
     events = motion.switches > 0
 
     def stage(i, carry):
         stages, margins, new_levels = carry
-        y = progress.y + h[None] * weighted(table[i], stages)
+        y = progress.y + h[None] * weighted([part[i] for part in table], stages)
         rate, margin, turn = motion.rates(motion.coefficients, progress.levels, t + nodes[i] * h, y)
         stages = jax.lax.dynamic_update_index_in_dim(stages, rate, i, 0)
         if events:
@@ -222,11 +223,26 @@ def column(storage: Array, k: Array) -> Array:
     return jnp.take_along_axis(storage, k, axis=0)[0]
 
 
-def weighted(weights: np.ndarray | Array, stages: Array) -> Array:
-    """Sum (D, B) of ``stages`` (S, D, B) with ``weights`` (S,), without those known to be zero.
-    Summed term by term it is one fused loop; a matrix product would not fit into a fused kernel."""
-    weights = jnp.asarray(weights, stages.dtype)
-    return jnp.sum(weights[:, None, None] * stages[: weights.shape[0]], axis=0)
+def in_parts(weights: np.ndarray, dtype: np.dtype) -> list[Array]:
+    """Weights as a sum of arrays of ``dtype``: two in single precision, one in double.
+
+    A rounded weight is off by the same amount in every step, so that in single precision momenta
+    drift in proportion to the steps and attitudes to their square: after some hundred radians up to
+    30 times as far as by rounding of the steps, which has either sign."""
+    rounded = np.asarray(weights, dtype)
+    rest = np.asarray(weights - rounded, dtype)
+    return [jnp.asarray(part) for part in ([rounded, rest] if rest.any() else [rounded])]
+
+
+def weighted(weights: np.ndarray | list[Array], stages: Array) -> Array:
+    """Sum (D, B) of ``stages`` (S, D, B) with ``weights`` (S,), or with the sum of several arrays
+    of weights. Summed term by term it is one fused loop; a matrix product would not fit into a
+    fused kernel."""
+    parts = in_parts(weights, stages.dtype) if isinstance(weights, np.ndarray) else weights
+    sums = [
+        jnp.sum(part[:, None, None] * stages[: part.shape[0]], axis=0) for part in reversed(parts)
+    ]
+    return functools.reduce(jnp.add, sums)
 
 
 def _stage_buffer(first_stage: Array, rule: Tableau) -> Array:

@@ -194,7 +194,6 @@ def advance(
     ratio = error / tolerance
     is_first = progress.attempts == 0
     accepted = (ratio <= 1) & is_running & ~is_first
-    end = dense_state(progress.y, attempt.dense, jnp.ones_like(width))
     turn = None
     if motion.switches:
         # At the first step, and where another switch has just turned, a level may be that of the
@@ -253,7 +252,7 @@ def advance(
     rate_at_start = jnp.where(progress.needs_rates[None], attempt.stages[0], progress.rate)
     progress_after = progress._replace(
         elapsed=choose(elapsed, progress.elapsed),
-        y=choose(jnp.where(hit[None], turn.state, end) if turn is not None else end, progress.y),
+        y=choose(dense_state(progress.y, attempt.dense, part), progress.y),
         rate=choose(attempt.stages[motion.rule.stages - 1], rate_at_start),
         needs_rates=hit,
         width=stop_gradient(jnp.where(is_running, proposed, progress.width)),

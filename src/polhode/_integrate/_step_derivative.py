@@ -30,6 +30,7 @@ from polhode._integrate._explicit_step import (
     column,
     dense_of,
     dense_state,
+    in_parts,
     weighted,
 )
 from polhode._integrate._loop import FINISHED, RUNNING, Make, advance, begin, each_body, run
@@ -334,7 +335,7 @@ def _step_back(
         return live & (place >= 0) & (h != 0) & ((sample_time > note.elapsed) | (note.elapsed == 0))
 
     rule, dtype = motion.rule, cotangent.dtype
-    table, nodes = jnp.asarray(rule.weights, dtype), jnp.asarray(rule.nodes, dtype)
+    table, nodes = in_parts(rule.weights, dtype), jnp.asarray(rule.nodes, dtype)
     top = jnp.where(
         any_of(jnp.where(has_sample(place), 1.0, 0.0)), rule.dense_stages, rule.stages - 1
     )
@@ -343,7 +344,7 @@ def _step_back(
     # memory as there are stages.
     def stage(i, carry):
         rates, states = carry
-        y = note.y + h[None] * weighted(table[i], rates)
+        y = note.y + h[None] * weighted([part[i] for part in table], rates)
         rate, *_ = rates_of(values, levels, t + nodes[i] * h, y)
         put_in = jax.lax.dynamic_update_index_in_dim
         return put_in(rates, rate, i, 0), put_in(states, y, i, 0)
@@ -367,7 +368,7 @@ def _step_back(
     # Reverse of the rule: `bars` are the cotangents of the stages' rates. The result weighs each by
     # its row of the table, dense output adds its own, and stage by stage, last first, each passes
     # on to those that it was computed from.
-    bars = h[None, None] * cotangent[None] * table[rule.stages - 1][:, None, None]
+    bars = h[None, None] * cotangent[None] * table[0][rule.stages - 1][:, None, None]
     initial_cotangent = jnp.where(finished[None], cotangent, 0)
     place, cotangent, bars = jax.lax.while_loop(
         lambda c: any_of(jnp.where(has_sample(c[0]), 1.0, 0.0)),
@@ -384,7 +385,7 @@ def _step_back(
             lambda parameters, y: rates_of(parameters, levels, t + nodes[i] * h, y)[0], values, y
         )
         parameter_cotangents, change = pull(bar)
-        bars = bars + (h[None] * change)[None] * table[i][:, None, None]
+        bars = bars + (h[None] * change)[None] * table[0][i][:, None, None]
         return bars, cotangent + change, [a + b for a, b in zip(sums, parameter_cotangents)]
 
     _, cotangent, sums = jax.lax.fori_loop(0, top, back, (bars, cotangent, sums))

@@ -34,13 +34,12 @@ _SECANTS = 24
 
 
 class SwitchPoint(NamedTuple):
-    """First switch within a step: ``hit`` (B,), the fraction ``part`` of the step, ``state`` (D, B)
-    there, ``levels`` (K, B) to which the switches ``flips`` (K, B) turn; fractions up to
-    ``start_fraction`` (B,) count as the start itself."""
+    """First switch within a step: ``hit`` (B,), the fraction ``part`` of the step, ``levels``
+    (K, B) to which the switches ``flips`` (K, B) turn there; fractions up to ``start_fraction``
+    (B,) count as the start itself."""
 
     hit: Array
     part: Array
-    state: Array
     levels: Array
     flips: Array
     start_fraction: Array
@@ -109,9 +108,12 @@ def first_switch(
     mode = jnp.where(dips, MINIMUM, bracket)
     end = sampled[-1]
     zero = jnp.zeros_like(attempt.h)
-    # of times far from zero the rounding: margins of the time are constant in between
+    # Far from zero, margins of the time are constant between representable times (``grain`` eps of
+    # the step). The search ends on the far side of the root: switches located to no more than that
+    # would all turn late, and the jumps of a torque do work on the body.
     moment = jnp.maximum(progress.elapsed, jnp.abs(t))
-    tolerance = 4 * eps * jnp.maximum(1, moment / jnp.where(zero != attempt.h, abs(attempt.h), 1))
+    grain = moment / jnp.where(zero != attempt.h, abs(attempt.h), 1)
+    tolerance = 4 * eps * jnp.maximum(1, grain / 16)
     if not motion.events:  # an event is located to rounding, a change of the rates is not
         located = LOCATED_JUMP if motion.jumps else LOCATED_KINK
         tolerance = jnp.maximum(tolerance, located * options.rtol.astype(tolerance.dtype))
@@ -228,16 +230,14 @@ def first_switch(
     # halved margins keep their signs
     flips = first_of_jumps(motion, search.at_high < 0)
     part = search.high
-    _, progress, attempt, _ = traced_constants
     if options.differentiable:
         margins = partial(margins_at, constants=traced_constants)
         part = _differentiable_part(search.hit, flips, part, margins)
-    state = dense_state(progress.y, attempt.dense, part)
     is_lost = search.hit & ~jnp.any(flips, axis=0)
-    start_fraction = jnp.maximum(1e-3, 4 * tolerance)
+    start_fraction = jnp.maximum(1e-3, 16 * eps * grain)
     # kinks and events have the levels 0 and 1
     levels = 1 - progress.levels if search.new_levels is None else search.new_levels
-    return SwitchPoint(search.hit & ~is_lost, part, state, levels, flips, start_fraction)
+    return SwitchPoint(search.hit & ~is_lost, part, levels, flips, start_fraction)
 
 
 def first_of_jumps(motion, flips: Array) -> Array:
