@@ -76,7 +76,7 @@ def test_light_has_the_sums_of_its_mode(trial):
     t = np.r_[0, np.sort(np.random.default_rng(4).uniform(0, 60, 127))]
     sun, observer = np.tile([1.0, 0, 0], (128, 1)), np.tile([0.8, 0.6, 0], (128, 1))
     curve = lightcurve.LightCurve.of(t, 0 * t, sun, observer)
-    light = np.asarray(magnitudes(trial, curve.points(0.01)))
+    light = np.asarray(magnitudes(trial, curve.points(0.01)))[:, :128]
     left = []
     for sums in (_frequencies.LAM, _frequencies.SAM):
         phases = 2 * np.pi * np.outer(t, np.array(list(sums)) @ [1.2, 0.7])

@@ -455,11 +455,9 @@ def magnitudes_and_derivatives(phase: AbstractPhase, bodies: Bodies, points: Poi
     # the light.
     value, pull = jax.vjp(brightness_of, q, turn, shape, coefficients)
     by_q, by_turn, by_shape, by_coefficients = pull(jnp.ones(whole, u.dtype))
-    # One tangent at a time: under vmap the mapped axis would separate the samples in memory.
-    motion = [
-        cast(Array, sum(a * b for a, b in zip(by_q, along(e), strict=True)))
-        for e in jnp.eye(5, dtype=u.dtype)
-    ]
+    # one tangent at a time, by a loop: one copy in the program, and samples stay side by side
+    turned = jax.lax.map(along, jnp.eye(5, dtype=u.dtype))
+    motion = cast(Array, sum(a[None] * b for a, b in zip(by_q, turned, strict=True)))
     by_phase_function = [by_coefficients[..., k] for k in range(many)]
     return value, jnp.stack(
         [*motion[:2], *by_shape, *motion[2:], *by_phase_function, *by_turn], axis=1
@@ -484,8 +482,9 @@ def _with_corrected_rates(old, step):
     # periods, without the light curve.
     (before, mode), (change, _) = jax.jvp(_frequencies, (old,), (step,))
     plain = old + step
-    rates, near = plain[RATES], True
-    for _ in range(2):
+
+    def correct(_, corrected):
+        rates, near = corrected
 
         def residual(x):
             now, mode = _frequencies(plain.at[RATES].set(x))
@@ -497,7 +496,9 @@ def _with_corrected_rates(old, step):
         weights = jnp.stack([c * rest[0] - b * rest[1], a * rest[1] - b * rest[0]]) / (
             a * c - b * b
         )
-        rates, near = rates - weights @ slopes, near & (now == mode)
+        return rates - weights @ slopes, near & (now == mode)
+
+    rates, near = jax.lax.fori_loop(0, 2, correct, (plain[RATES], jnp.array(True)))
     change = rates - plain[RATES]
     near = near & (jnp.sum(change**2) < 0.1 * jnp.sum(plain[RATES] ** 2))  # false if not finite
     return plain.at[RATES].set(jnp.where(near, rates, plain[RATES]))

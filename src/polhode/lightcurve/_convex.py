@@ -92,14 +92,13 @@ def _light(body: Bodies, coefficients, points: Points, surface):
     zero = tuple(jnp.zeros(points.t.shape[1], u.dtype) for _ in range(3))
     value, pull, (parts, total) = jax.vjp(brightness_of, q, zero, has_aux=True)
     by_q, by_turn = pull(jnp.ones_like(value))
-    motion = [
-        sum(a * b for a, b in zip(by_q, along(e), strict=True)) for e in jnp.eye(5, dtype=u.dtype)
-    ]
+    turned = jax.vmap(along)(jnp.eye(5, dtype=u.dtype))
+    motion = sum(a[None] * b for a, b in zip(by_q, turned, strict=True))
     by_shape = -2.5 / jnp.log(10.0) * (parts @ rows.T) / total[:, None]
     area = jnp.sum(areas)
     open_area = areas @ normals / area
     by_open = (rows * areas[None]) @ normals / area - jnp.outer(rows @ areas, open_area) / area
-    return value, jnp.stack([*motion, *by_turn], -1), by_shape, open_area, by_open
+    return value, jnp.concatenate([motion, jnp.stack(by_turn)]).T, by_shape, open_area, by_open
 
 
 def refine(

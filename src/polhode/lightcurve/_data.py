@@ -24,7 +24,7 @@ _FAINTEST = 45.0
 _ORBIT = 0.03
 # Points of one night at its brightest magnitude that count as saturated, at least.
 _REPEATED = 4
-BLOCK = 128  # samples are padded to multiples, so that few programs are compiled
+BLOCK = 160  # samples are padded to multiples, so that few programs are compiled
 
 
 class LightCurve(NamedTuple):

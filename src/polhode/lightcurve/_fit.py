@@ -10,7 +10,7 @@ from polhode import rotation
 from polhode._closed_forms import Mode
 from polhode.lightcurve._brightness import HG1G2, AbstractPhase, Bodies, Points, SeeligerPhase
 from polhode.lightcurve._convex import refined_solutions
-from polhode.lightcurve._data import LightCurve
+from polhode.lightcurve._data import BLOCK, LightCurve
 from polhode.lightcurve._frequencies import Hypotheses, Pairs, fourier_lattices, hypotheses
 from polhode.lightcurve._search import (
     BATCH,
@@ -42,7 +42,7 @@ from polhode.lightcurve._verdict import judge, null_models
 # misfit to `_FEW` points, the rest by a few steps of least squares on these points, with fewer
 # bodies and more steps in each round (`_DESCENT`). Only the best are fitted to all points.
 
-_FEW = 160  # points that a search looks at
+_FEW = BLOCK  # points that a search looks at
 _DESCENT = ((1.0, 2), (0.5, 3), (0.25, 6))  # parts of the starts, and their steps
 _LAST = 12  # steps of the better half of what is left
 _WIDE = 10.0  # limit of the first steps' residuals, in sigma

@@ -20,6 +20,7 @@ from polhode.lightcurve._brightness import (
     moments_of,
     seeliger_ellipsoid,
 )
+from polhode.lightcurve._data import BLOCK
 from polhode.lightcurve._frequencies import Hypotheses
 
 # Damped least squares for batches of bodies, robust, with exact derivatives.
@@ -57,17 +58,27 @@ _light = jax.jit(magnitudes, static_argnums=0)
 _light_and_derivatives = jax.jit(magnitudes_and_derivatives, static_argnums=0)
 
 
-def normal_equations(phase, bodies: Bodies, offsets, points: Points, limit):
+def blocks_of(points: Points) -> list[Points]:
+    """Of `BLOCK` points each, without offsets: one program of the light serves every number."""
+    plain = points.without_offsets()
+    return [
+        jax.tree.map(lambda x, k=k: x[..., k : k + BLOCK], plain)
+        for k in range(0, plain.t.shape[1], BLOCK)
+    ]
+
+
+def light_and_derivatives(phase: AbstractPhase, bodies: Bodies, blocks: list[Points]):
+    """Magnitudes (b, n) and derivatives (b, 10 + c, n) of a batch at all points."""
+    values, slopes = zip(*(_light_and_derivatives(phase, bodies, block) for block in blocks))
+    return jnp.concatenate(values, axis=-1), jnp.concatenate(slopes, axis=-1)
+
+
+@jax.jit
+def robust_equations(value, slopes, offsets, points: Points, limit):
     """Robust cost (b,), and matrix and right side of the normal equations of data, all unknowns.
 
     The cost of a residual of r sigma is 2 limit^2 (sqrt(1 + (r / limit)^2) - 1).
     """
-    light = _light_and_derivatives(phase, bodies, points.without_offsets())
-    return _robust_equations(*light, offsets, points, limit)
-
-
-@jax.jit
-def _robust_equations(value, slopes, offsets, points: Points, limit):
     rest = value + offsets @ points.columns - points.magnitude
     squared = rest * rest * points.weight / limit[:, None] ** 2
     cost = 2 * limit**2 * jnp.sum(squared / (1 + jnp.sqrt(1 + squared)), axis=-1)
@@ -101,18 +112,36 @@ class Problem:
         self.columns = points.columns.shape[0]
         self.priors = _priors(phase, self.columns)
         self.stiffness = np.asarray(points.stiffness)
+        self.blocks = blocks_of(points)
 
     def evaluate(self, bodies: Bodies, offsets: np.ndarray, limit: np.ndarray) -> State:
         """Cost and normal equations of bodies (b,), b a multiple of the batch."""
+        return self._evaluate(bodies, lambda cut, _: offsets[cut], limit)
+
+    def start(self, bodies: Bodies, limit: np.ndarray) -> State:
+        """With the offsets that fit best."""
+        c, weight = np.asarray(self.points.columns), np.asarray(self.points.weight)
+        solver = np.linalg.inv((c * weight) @ c.T + np.diag(self.stiffness + 1e-9 * weight.sum()))
+
+        def best_offsets(_, light):
+            rest = np.nan_to_num((self.points.magnitude - light) * weight, posinf=0, neginf=0)
+            return rest @ c.T @ solver
+
+        return self._evaluate(bodies, best_offsets, limit)
+
+    def _evaluate(self, bodies: Bodies, offsets_of, limit: np.ndarray) -> State:
+        """``offsets_of(cut, light)``: offsets (b, c) of a slice of the bodies with that light."""
         parts = []
-        for start in range(0, len(offsets), BATCH):
-            cut = slice(start, start + BATCH)
+        for first in range(0, len(limit), BATCH):
+            cut = slice(first, first + BATCH)
             piece = jax.tree.map(jnp.asarray, select(bodies, cut))
-            out = normal_equations(
-                self.phase, piece, jnp.asarray(offsets[cut]), self.points, jnp.asarray(limit[cut])
+            light, slopes = light_and_derivatives(self.phase, piece, self.blocks)
+            offsets = offsets_of(cut, light)
+            out = robust_equations(
+                light, slopes, jnp.asarray(offsets), self.points, jnp.asarray(limit[cut])
             )
-            parts.append([np.asarray(x) for x in out[:4]])
-        cost, matrix, right, square = (np.concatenate(x) for x in zip(*parts))
+            parts.append([offsets, *(np.asarray(x) for x in out[:4])])
+        offsets, cost, matrix, right, square = (np.concatenate(x) for x in zip(*parts))
         prior_cost, prior_matrix, prior_right = self.prior(bodies, offsets)
         cost, matrix, right = cost + prior_cost, matrix + prior_matrix, right + prior_right
         return State(bodies, offsets, np.nan_to_num(cost, nan=np.inf), matrix, right, square)
@@ -133,21 +162,6 @@ class Problem:
             (rows.T * precision) @ rows + np.diag(soft),
             (rest * precision) @ rows + x * soft,
         )
-
-    def start(self, bodies: Bodies, limit: np.ndarray) -> State:
-        """With the offsets that fit best."""
-        c, weight = np.asarray(self.points.columns), np.asarray(self.points.weight)
-        solver = np.linalg.inv((c * weight) @ c.T + np.diag(self.stiffness + 1e-9 * weight.sum()))
-        light = np.concatenate(
-            [
-                _light(
-                    self.phase, select(bodies, slice(k, k + BATCH)), self.points.without_offsets()
-                )
-                for k in range(0, len(limit), BATCH)
-            ]
-        )
-        rest = np.nan_to_num((self.points.magnitude - light) * weight, posinf=0, neginf=0)
-        return self.evaluate(bodies, rest @ c.T @ solver, limit)
 
     def improve(self, state: State, limit: np.ndarray, steps: int, ending: float = 1e-3):
         """Levenberg-Marquardt; ends when no cost fell by ``ending`` in three steps."""

@@ -19,7 +19,15 @@ from polhode.lightcurve._brightness import (
 from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._frequencies import LAM, SAM, Hypotheses, Pairs, sum_name
 from polhode.lightcurve._nulls import Model
-from polhode.lightcurve._search import BATCH, Problem, State, in_parts, normal_equations, select
+from polhode.lightcurve._search import (
+    BATCH,
+    Problem,
+    State,
+    in_parts,
+    light_and_derivatives,
+    robust_equations,
+    select,
+)
 
 if TYPE_CHECKING:
     from polhode.lightcurve._verdict import Verdict
@@ -217,9 +225,11 @@ def describe_solutions(
     n = curve.t.size
     index = np.pad(order, (0, -len(order) % BATCH), mode="edge")
     best = select(state, index)
-    _, _, _, _, (value, robust, derivatives) = normal_equations(
-        problem.phase,
-        jax.tree.map(jnp.asarray, best.bodies),
+    bodies = jax.tree.map(jnp.asarray, best.bodies)
+    light, slopes = light_and_derivatives(problem.phase, bodies, problem.blocks)
+    _, _, _, _, (value, robust, derivatives) = robust_equations(
+        light,
+        slopes,
         jnp.asarray(best.offsets),
         problem.points,
         jnp.asarray(np.full(len(index), limit)),  # strong, as in the search: one program
