@@ -47,7 +47,7 @@ def test_any_phases_are_turned_to_those_of_the_points(blank, mode):
     bodies, good = _search.build(draws, long_axis, PHASE)
     (first,) = np.flatnonzero(good)[:1]
     points = blank.points(0.0)
-    light = np.asarray(magnitudes(PHASE, bodies, points))[first]
+    light = np.asarray(magnitudes(PHASE, bodies, points))[first, : blank.t.size]
     points = blank._replace(magnitude=light + 0.3 * (blank.t > 5)).points(0.0)
     right, matrix = _search.series(points, *meant)
     # the same body at other times and turned about its momentum: all that phases are
