@@ -490,16 +490,18 @@ def differences(case: Case) -> tuple[np.ndarray, float]:
     return fine + change, float(np.linalg.norm(change))
 
 
-def derivatives(part: Part, count: int, seed: int, longest: float) -> Iterator[dict[str, Any]]:
+def derivatives(
+    part: Part, dtype: str, count: int, seed: int, longest: float
+) -> Iterator[dict[str, Any]]:
     """Rows of the derivatives of a part, one for each case, mode and tolerance."""
-    group = Group((part,), "float64", False)
+    group = Group((part,), dtype, False)
     programs: dict[str, Any] = {}
     done = 0
     for k in range(3 * count):
         if done == count:
             break
-        case = draw(group.parts, "float64", group.seed(seed + 1000, k), longest)
-        if isinstance(judged(case, "float64"), str):
+        case = draw(group.parts, dtype, group.seed(seed + 1000, k), longest)
+        if isinstance(judged(case, dtype), str):
             continue
         try:
             exact, uncertain = differences(case)
@@ -513,7 +515,7 @@ def derivatives(part: Part, count: int, seed: int, longest: float) -> Iterator[d
             size = jnp.linalg.norm(omega)
             rates = omega + size * theta[:3]
             pair = part.name.startswith("UniformGravity.axial")
-            mask = jnp.asarray([1.0, 1.0 if pair else 0.0, 0.0])
+            mask = jnp.asarray([1.0, 1.0 if pair else 0.0, 0.0], dtype)
             n = dict(own.numbers[0])
             if part.gain:
                 n[part.gain] = n[part.gain] * (1 + theta[4])
@@ -522,23 +524,25 @@ def derivatives(part: Part, count: int, seed: int, longest: float) -> Iterator[d
             t = ph.simulate(scene, state, ts if times is None else times, rtol=rtol, throw=False)
             return value_of(t.wxyz[-1], jnp), t.status
 
+        ts = np.asarray(case.ts, dtype)
         arrays = (
-            tuple(jax.tree.map(jnp.asarray, n) for n in case.numbers),
-            *(jnp.asarray(x) for x in (case.moments, case.wxyz, case.omega, case.ts)),
+            tuple(jax.tree.map(jnp.asarray, typed(n, dtype)) for n in case.numbers),
+            *(jnp.asarray(x, dtype) for x in (case.moments, case.wxyz, case.omega, ts)),
         )
         for mode, transform in (("reverse", jax.jacrev), ("forward", jax.jacfwd)):
             if mode not in programs:
                 fn = transform(loss, has_aux=True)
                 programs[mode] = fn if part.rate is not None else jax.jit(fn)
-            for rtol in RTOLS["float64"]:
-                extra = (case.ts,) if part.rate is not None else ()
+            for rtol in RTOLS[dtype]:
+                extra = (ts,) if part.rate is not None else ()
                 given = rtol if part.rate is not None else jnp.asarray(rtol)
-                found, status = programs[mode](jnp.zeros(5), arrays, given, *extra)
+                found, status = programs[mode](jnp.zeros(5, dtype), arrays, given, *extra)
                 size = max(1.0, float(np.linalg.norm(exact)))
-                error = float(np.linalg.norm(np.asarray(found) - exact)) / size
+                error = float(np.linalg.norm(np.asarray(found, float) - exact)) / size
                 yield {
                     "derivative": mode,
                     "parts": part.name,
+                    "dtype": dtype,
                     "draw": k,
                     "seed": seed,
                     "rtol": rtol,
@@ -587,7 +591,8 @@ def value_counts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Outcomes by precision, of parts alone and in pairs."""
     found = []
     for dtype, pairs in itertools.product(RTOLS, (False, True)):
-        own = [r for r in rows if r.get("dtype") == dtype and (" + " in r["parts"]) == pairs]
+        values = [r for r in rows if "derivative" not in r]
+        own = [r for r in values if r.get("dtype") == dtype and (" + " in r["parts"]) == pairs]
         ran = [r for r in own if "kind" in r]
         good = [r["ratio"] for r in ran if r["kind"] != "flagged"]
         found.append(
@@ -609,12 +614,16 @@ def value_counts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def slope_counts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Errors of derivatives over rtol, by rtol, of smooth parts and of parts with switches."""
     found = []
-    for smooth, rtol in itertools.product((True, False), RTOLS["float64"]):
-        own = [r for r in rows if "derivative" in r and (r["smooth"], r["rtol"]) == (smooth, rtol)]
+    tolerances = [(dtype, rtol) for dtype, rtols in RTOLS.items() for rtol in rtols]
+    for smooth, (dtype, rtol) in itertools.product((True, False), tolerances):
+        kind = smooth, dtype, rtol
+        slopes = [r for r in rows if "derivative" in r]
+        own = [r for r in slopes if (r["smooth"], r["dtype"], r["rtol"]) == kind]
         good = [r["ratio"] for r in own if r["status"] == 0]
         found.append(
             {
                 "parts": "smooth" if smooth else "with switches",
+                "dtype": dtype,
                 "rtol": rtol,
                 "runs": len(own),
                 "flagged": len(own) - len(good),
@@ -628,15 +637,18 @@ def slope_counts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def derivative_table(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     found = []
     some = [r for r in rows if "derivative" in r and r["status"] == 0]
-    for name in dict.fromkeys(r["parts"] for r in some):
+    for name, dtype in dict.fromkeys((r["parts"], r["dtype"]) for r in some):
         for mode in ("forward", "reverse"):
-            own = [r for r in some if r["parts"] == name and r["derivative"] == mode]
+            own = [
+                r for r in some if (r["parts"], r["dtype"], r["derivative"]) == (name, dtype, mode)
+            ]
             if not own:
                 continue
             worst = max(own, key=lambda r: r["ratio"])
             found.append(
                 {
                     "part": name,
+                    "dtype": dtype,
                     "mode": mode,
                     "runs": len(own),
                     "median": float(np.median([r["ratio"] for r in own])),
@@ -703,7 +715,9 @@ def main():
     ]
     for part in PARTS if slopes else []:
         if not given.parts or any(w.lower() in part.name.lower() for w in given.parts):
-            tasks.append((f"d {part.name}", derivatives(part, slopes, given.seed, 100.0)))
+            for dtype in RTOLS:
+                cases = derivatives(part, dtype, slopes, given.seed, 100.0)
+                tasks.append((f"d {part.name} {dtype}", cases))
     for name, rest in tasks:
         if name in done:
             continue
