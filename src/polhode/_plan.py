@@ -156,10 +156,7 @@ def choose(scene: Scene, rtol: Array | float = 1e-9) -> tuple[AbstractMethod, st
             " rtol at every saved time"
         )
         compensated = _is_below(rtol, _policy.COMPENSATED_STEPS * eps, scene)
-        also = ", its rounding carried along: it would miss rtol" if compensated else ""
-        return _integration_method(
-            _has_axis(scene), compensated, _low_order(scene, rtol)
-        ), reason + also
+        return _integration_method(_has_axis(scene), compensated, _low_order(scene, rtol)), reason
     general = scene.is_free and scene.inertia.symmetry is Symmetry.NONE
     if general and _is_below(rtol, _policy.COMPENSATED_PHASES * eps, scene):
         also = ", its frequencies in sums of two floats: a rounded phase would miss rtol"

@@ -116,7 +116,8 @@ class AbstractIntegration(AbstractMethod):
             ending = f", each ending where one of {switches} switches (clip, where, ...) turns"
             order = 5 if self._automatic.rule(switches) is TSIT5 else 8
             return f"explicit Runge-Kutta steps of order {order}" + (ending if switches else "")
-        return "extrapolated midpoint rule"
+        carried = ", its rounding carried along" if self._automatic.compensated else ""
+        return f"extrapolated midpoint rule{carried}"
 
     @property
     def keeps_rtol(self) -> bool:
@@ -254,8 +255,9 @@ class AbstractIntegration(AbstractMethod):
         return self.solver
 
     def _are_few(self, scene: Scene, state: State) -> bool:
-        """Whether torques act on few bodies and rounding errors need not be compensated, which the
-        explicit steps do not do."""
+        """Whether torques act on few bodies and rounding errors need not be carried along, which
+        the explicit steps do not do: in single precision their errors are up to 16 times as large.
+        """
         few = 0 < state.wxyz.shape[0] <= _policy.EXPLICIT_BODIES
         is_uncompensated = isinstance(self.solver, Automatic) and not self.solver.compensated
         return _torques_act(scene) and few and is_uncompensated
