@@ -342,10 +342,28 @@ MUTANTS = (
     ),
     Mutant(
         STEPS,
-        "bars = bars + (h[None] * change)[None] * table[i][:, None, None]",
-        "bars = bars + (h[None] * change)[None] * table[i - 1][:, None, None]",
+        "bars = bars + (h[None] * change)[None] * table[0][i][:, None, None]",
+        "bars = bars + (h[None] * change)[None] * table[0][i - 1][:, None, None]",
         "the derivative of a Runge-Kutta step uses the wrong row of its table",
         ("solvers/test_switches.py::test_a_gradient_through_a_jump",),
+    ),
+    Mutant(
+        "_integrate/_explicit_step.py",
+        "([rounded, rest] if rest.any() else [rounded])",
+        "[rounded]",
+        "the weights of a Runge-Kutta step are rounded in single precision",
+        (
+            "solvers/test_switches.py::test_single_precision_turns_no_switch_late_and_rounds_no_weight",
+        ),
+    ),
+    Mutant(
+        FOUND,
+        "tolerance = 4 * eps * jnp.maximum(1, grain / 16)",
+        "tolerance = 4 * eps * jnp.maximum(1, grain)",
+        "switches turn late, by a few units of rounding of the time",
+        (
+            "solvers/test_switches.py::test_single_precision_turns_no_switch_late_and_rounds_no_weight",
+        ),
     ),
     Mutant(
         FLOW,
