@@ -139,11 +139,14 @@ class EnergyOfAttitude(Protocol):
 
 def inverse_components(tensor: Array) -> tuple[Array, ...]:
     """(xx, yy, zz, xy, xz, yz) of the inverse of a symmetric tensor of shape (..., 3, 3)."""
-    a, b, c = tensor[..., 0, 0], tensor[..., 1, 1], tensor[..., 2, 2]
-    d, e, f = tensor[..., 0, 1], tensor[..., 0, 2], tensor[..., 1, 2]
+    # In units of its own trace: the derivative of one over the determinant has the moments to the
+    # sixth power, which in single precision underflows from moments of 1e6 on.
+    unit = jax.lax.stop_gradient(tensor[..., 0, 0] + tensor[..., 1, 1] + tensor[..., 2, 2])
+    a, b, c = (tensor[..., k, k] / unit for k in range(3))
+    d, e, f = (tensor[..., i, j] / unit for i, j in ((0, 1), (0, 2), (1, 2)))
     xx, yy, zz = b * c - f * f, a * c - e * e, a * b - d * d
     xy, xz, yz = e * f - c * d, d * f - b * e, d * e - a * f
-    scale = 1 / (a * xx + d * xy + e * xz)
+    scale = 1 / (a * xx + d * xy + e * xz) / unit
     return tuple(scale * entry for entry in (xx, yy, zz, xy, xz, yz))
 
 
