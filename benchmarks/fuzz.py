@@ -612,14 +612,16 @@ def value_counts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def slope_counts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Errors of derivatives over rtol, by rtol, of smooth parts and of parts with switches."""
+    """Errors of derivatives over rtol, by rtol, of smooth parts and of parts with switches.
+
+    A derivative that is NaN counts as flagged."""
     found = []
     tolerances = [(dtype, rtol) for dtype, rtols in RTOLS.items() for rtol in rtols]
     for smooth, (dtype, rtol) in itertools.product((True, False), tolerances):
         kind = smooth, dtype, rtol
         slopes = [r for r in rows if "derivative" in r]
         own = [r for r in slopes if (r["smooth"], r["dtype"], r["rtol"]) == kind]
-        good = [r["ratio"] for r in own if r["status"] == 0]
+        good = [r["ratio"] for r in own if r["status"] == 0 and math.isfinite(r["ratio"])]
         found.append(
             {
                 "parts": "smooth" if smooth else "with switches",
@@ -636,7 +638,8 @@ def slope_counts(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def derivative_table(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     found = []
-    some = [r for r in rows if "derivative" in r and r["status"] == 0]
+    slopes = [r for r in rows if "derivative" in r and r["status"] == 0]
+    some = [r for r in slopes if math.isfinite(r["ratio"])]
     for name, dtype in dict.fromkeys((r["parts"], r["dtype"]) for r in some):
         for mode in ("forward", "reverse"):
             own = [
