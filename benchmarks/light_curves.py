@@ -33,7 +33,7 @@ from scipy.spatial import ConvexHull
 
 import polhode as ph
 from polhode import lightcurve
-from polhode.lightcurve import _brightness, _fit, _frequencies, _search, _solutions
+from polhode.lightcurve import _brightness, _fit, _frequencies, _least_squares, _search, _solutions
 
 _magnitudes = jax.jit(_brightness.magnitudes, static_argnums=0)
 
@@ -220,13 +220,13 @@ def best_possible(curve, body, learnt=None, floor=0.01, spread=0.02) -> dict:
 
     The errors with the nights' ``spread`` known, the cost with the one ``learnt``.
     """
-    phase, width = lightcurve.HG1G2(), np.full(_search.BATCH, 3.0)
-    problem = _search.Problem(phase, curve.points(floor, spread))
-    start = _search.select_padded(jax.tree.map(np.asarray, body), np.zeros(1, int))
+    phase, width = lightcurve.HG1G2(), np.full(_least_squares.BATCH, 3.0)
+    problem = _least_squares.Problem(phase, curve.points(floor, spread))
+    start = _least_squares.select_padded(jax.tree.map(np.asarray, body), np.zeros(1, int))
     state = problem.improve(problem.start(start, width), width, 20)
     normals, one = _fit._mirrors(curve), np.array([0])
     (found,), *_ = _solutions.describe_solutions(problem, state, one, curve, normals, 3.0)
-    problem = _search.Problem(phase, curve.points(floor, learnt))
+    problem = _least_squares.Problem(phase, curve.points(floor, learnt))
     state = problem.improve(problem.evaluate(*state[:2], width), width, 20)
     return {
         "P_phi_std": found.P_phi_std / found.P_phi,

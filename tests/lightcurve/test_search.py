@@ -8,7 +8,7 @@ import pytest
 import polhode as ph
 from benchmarks import light_curves
 from polhode import lightcurve
-from polhode.lightcurve import _brightness, _fit, _frequencies, _search, _solutions
+from polhode.lightcurve import _brightness, _fit, _frequencies, _least_squares, _search, _solutions
 
 PHASE = lightcurve.HG1G2()
 Hypotheses = _frequencies.Hypotheses
@@ -46,7 +46,7 @@ def test_steps_from_the_best_of_each_hypothesis_tell_the_right_one():
     assert np.all(np.diff(misfit, axis=1) >= 0)
     few, _ = _search.build(*_search.draw(jax.random.key(1), meant, 3), PHASE)
     assert misfit.mean() < 0.7 * _search.misfits(PHASE, few, points)[0].mean()
-    problem = _search.Problem(PHASE, points)
+    problem = _least_squares.Problem(PHASE, points)
     state, reached = _fit._descend(key, meant, 1800, 3, problem, problem, 0.0)
     assert np.argmin(reached) == 0
     assert reached.min() == state.cost.min()
@@ -82,7 +82,7 @@ def test_poles_of_one_pair_do_not_crowd_out_others():
         bodies.unknowns[index], wxyz / np.linalg.norm(wxyz, axis=1, keepdims=True)
     )
     nothing = np.zeros(21)
-    state = _search.State(bodies, nothing, np.arange(21.0), nothing, nothing, nothing)
+    state = _least_squares.State(bodies, nothing, np.arange(21.0), nothing, nothing, nothing)
     kept = _fit._distinct_solutions(state, 0.01, 12)
     assert len(kept) == 1 + _fit._ALIKE
     assert kept[0] == 0
@@ -113,7 +113,7 @@ def test_spread_of_offsets_is_the_likeliest():
         return -(left @ inverse @ left + sizes) / 2
 
     best = spreads[np.argmax([evidence(s) for s in spreads])]
-    found = _search.spread_of_offsets(matrix, right, x[2:], stiffness, slice(1, 13))
+    found = _least_squares.spread_of_offsets(matrix, right, x[2:], stiffness, slice(1, 13))
     assert found == pytest.approx(best, rel=0.01)
 
 

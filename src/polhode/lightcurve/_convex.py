@@ -19,8 +19,8 @@ from polhode.lightcurve._brightness import (
     harmonics,
     moments_of,
 )
+from polhode.lightcurve._least_squares import stepped
 from polhode.lightcurve._nulls import Linear
-from polhode.lightcurve._search import stepped
 from polhode.lightcurve._solutions import (
     Described,
     Linearised,

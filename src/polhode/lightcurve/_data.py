@@ -24,7 +24,8 @@ _FAINTEST = 45.0
 _ORBIT = 0.03
 # Points of one night at its brightest magnitude that count as saturated, at least.
 _REPEATED = 4
-BLOCK = 160  # samples are padded to multiples, so that few programs are compiled
+# Points of one program: light curves are padded to multiples, and a search looks at so many.
+BLOCK = 160
 
 
 class LightCurve(NamedTuple):

@@ -12,15 +12,15 @@ from polhode.lightcurve._brightness import HG1G2, AbstractPhase, Bodies, Points,
 from polhode.lightcurve._convex import refined_solutions
 from polhode.lightcurve._data import BLOCK, LightCurve
 from polhode.lightcurve._frequencies import Hypotheses, Pairs, fourier_lattices, hypotheses
-from polhode.lightcurve._search import (
+from polhode.lightcurve._least_squares import (
     BATCH,
     Problem,
     State,
-    best_trials,
     select,
     select_padded,
     spread_of_offsets,
 )
+from polhode.lightcurve._search import best_trials
 from polhode.lightcurve._solutions import (
     EXCLUDED,
     FIXED,

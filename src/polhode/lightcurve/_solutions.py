@@ -18,8 +18,7 @@ from polhode.lightcurve._brightness import (
 )
 from polhode.lightcurve._data import LightCurve
 from polhode.lightcurve._frequencies import LAM, SAM, Hypotheses, Pairs, sum_name
-from polhode.lightcurve._nulls import Model
-from polhode.lightcurve._search import (
+from polhode.lightcurve._least_squares import (
     BATCH,
     Problem,
     State,
@@ -28,6 +27,7 @@ from polhode.lightcurve._search import (
     robust_equations,
     select,
 )
+from polhode.lightcurve._nulls import Model
 
 if TYPE_CHECKING:
     from polhode.lightcurve._verdict import Verdict
