@@ -341,6 +341,13 @@ MUTANTS = (
         ("solvers/test_switches.py::test_a_gradient_through_a_jump",),
     ),
     Mutant(
+        LOOP,
+        "record = count + 1, put_in(notes, count, noted(motion, progress))",
+        "record = count + 1, put_in(notes, count + 1, noted(motion, progress))",
+        "steps are recorded one place too late",
+        ("solvers/test_switches.py::test_a_gradient_through_a_jump",),
+    ),
+    Mutant(
         STEPS,
         "bars = bars + (h[None] * change)[None] * table[0][i][:, None, None]",
         "bars = bars + (h[None] * change)[None] * table[0][i - 1][:, None, None]",

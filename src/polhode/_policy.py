@@ -119,6 +119,16 @@ RECORD_SEGMENTS = 256
 """[segments] Of the recorded steps: reverse mode replays one segment at a time, which bounds the
 memory to a state for each segment and each step of one."""
 
+RECORDED_TURNS = 512
+"""[turns] Of the loop of explicit steps that are recorded where values with derivatives are
+computed, at most: reverse mode need not integrate again if there are not more."""
+
+RECORDED_MEMORY = 2**26
+"""[bytes] Of such records of all bodies, at most."""
+
+FEWEST_TURNS = 64
+"""[turns] If there is room for fewer, none are recorded: most motions take more."""
+
 COMPENSATED_STEPS = 20_000
 """[units of rounding] Tolerance below which steps carry their rounding errors along. Without that
 they lose about eps * angle**1.5, more than rtol from (rtol/eps)**(2/3) = 740 rad on."""
@@ -240,6 +250,12 @@ def bodies_to_save(samples: int) -> int:
     lanes at least."""
     sample_limit = SAVE_SAMPLES if is_cpu() else ACCELERATOR_SAVE_SAMPLES
     return max(LANES, sample_limit // samples)
+
+
+def recorded_turns(memory: int) -> int:
+    """Turns of the loop that are recorded, of which each takes so many bytes."""
+    turns = min(RECORDED_TURNS, RECORDED_MEMORY // memory)
+    return turns if turns >= FEWEST_TURNS else 0
 
 
 def samples_at_once(chunk: int) -> int:

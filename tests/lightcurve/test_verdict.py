@@ -70,7 +70,7 @@ def cases():
     """Curves of each kind, their pairs, and the null hypotheses fitted."""
     out = {}
     for name, light in (("noise", flat), ("rotator", rotating), ("tumbler", tumbling)):
-        curve = curve_of(light)
+        curve = curve_of(light, each=12)
         pairs = pairs_of(curve)
         out[name] = curve, pairs, *_verdict.null_models(curve, pairs, 0.02, PHASE)
     return out

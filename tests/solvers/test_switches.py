@@ -315,21 +315,56 @@ FALLING = jnp.array([RATE, LEVEL]), jnp.array([0.0, 0.0, BEGIN])
 FALLING_SLOPES = np.array([-0.1 * MET / RATE, 1 + 0.1 / (RATE * LEVEL), -0.1 / (RATE * BEGIN)])
 
 
-def falling(p, omega):
+def falling(p, omega, max_steps=128):
     def law(t, wxyz, omega):
         return jnp.where(omega[2] > p[1], p[0] * omega, -0.1)
 
     scene = ph.Scene(ph.Inertia.spherical(1.0), None, ph.FeedbackTorque(law))
-    # of 128 steps two are noted at once: the others are taken once more on the way back
-    method = ph.LiePoisson(Automatic(), max_steps=128)
+    method = ph.LiePoisson(Automatic(), max_steps=max_steps)
     return ph.simulate(scene, ph.State(WXYZ, omega), [0.0, 5.0], method).omega_body[-1, 2]
 
 
-def test_a_gradient_through_a_jump():
-    """The time of a jump moves with the state and with the threshold, a parameter."""
-    value, (by_p, by_omega) = jax.jit(jax.value_and_grad(falling, (0, 1)))(*FALLING)
+@pytest.mark.parametrize("max_steps", [128, 2**16], ids=["integrated again", "recorded"])
+def test_a_gradient_through_a_jump(max_steps):
+    """The time of a jump moves with the state and with the threshold, a parameter. Of the steps
+    that are allowed the 256th part is recorded: if more are taken, they are integrated again."""
+    slope = jax.jit(jax.value_and_grad(lambda *x: falling(*x, max_steps), (0, 1)))
+    value, (by_p, by_omega) = slope(*FALLING)
     np.testing.assert_allclose(value, LEVEL - 0.1 * (5 - MET), rtol=1e-9)
     np.testing.assert_allclose([*by_p, by_omega[2]], FALLING_SLOPES, rtol=1e-8)
+
+
+@pytest.mark.slow  # a single body: test_a_gradient_through_a_jump
+@pytest.mark.parametrize("how", ["batch", "grad of vmap", "vmap of grad"])
+def test_recorded_steps_and_those_integrated_again_have_the_same_derivatives(how):
+    starts = jnp.array(np.outer([1.0, 0.7, 1.3], OMEGA))
+    gains = jnp.array([0.3, 0.8])
+
+    def loss(gains, omega, max_steps):
+        def law(t, wxyz, omega):
+            return -gains[0] * jax.nn.relu(omega) - 0.1 * jnp.where(wxyz[0] > gains[1], 1, 0)
+
+        wxyz = jnp.broadcast_to(jnp.array(WXYZ), (*omega.shape[:-1], 4))
+        scene = ph.Scene(INERTIA, None, ph.FeedbackTorque(law))
+        method = ph.LiePoisson(Automatic(), max_steps=max_steps)
+        path = ph.simulate(scene, ph.State(wxyz, omega), [0.0, 3.0, 6.0], method)
+        return jnp.sum(path.omega_body**2) + jnp.sum(path.wxyz[..., 1])
+
+    def slopes(max_steps):
+        one = lambda gains, omega: loss(gains, omega, max_steps)  # noqa: E731
+        all_of = {
+            "batch": jax.grad(one, (0, 1)),
+            "grad of vmap": jax.grad(
+                lambda gains, omega: jnp.sum(jax.vmap(one, (None, 0))(gains, omega)), (0, 1)
+            ),
+            "vmap of grad": jax.vmap(jax.grad(one, (0, 1)), (None, 0)),
+        }[how]
+        by_gains, by_omega = jax.jit(all_of)(gains, starts)
+        return jnp.sum(by_gains.reshape(-1, 2), axis=0), by_omega
+
+    for found, again in zip(slopes(2**16), slopes(128), strict=True):
+        assert np.all(np.abs(found) > 1e-3)
+        np.testing.assert_allclose(found, again, rtol=1e-10, atol=1e-10)
 
 
 @pytest.mark.slow  # forward mode through jumps: test_derivatives_through_a_table

@@ -12,7 +12,7 @@ from jaxtyping import Array
 from polhode._integrate._explicit_step import Motion
 from polhode._integrate._switches import Switched, switched
 from polhode._integrate._tableau import Tableau
-from polhode._kernels import Distinct, formula, specialise
+from polhode._kernels import Distinct, formula, is_holdable, specialise
 
 Pose = Callable[[Any], tuple[Any, Any]]
 """From the parts of one body, arrays with one lane, to the term of its equations and arguments."""
@@ -24,7 +24,7 @@ class Problem(NamedTuple):
     ``closed_jaxpr``: rates (and sides of events) of ``arrays``, the time and the state components;
     ``arrays``: those of B bodies (B, ...) where ``lanes`` says so, else shared; ``switches``;
     ``events``: how many of the last switches are events; ``passed_switches``: how many switches
-    the steps pass without ending there.
+    the steps pass without ending there; ``specialised``: what ``motion`` has traced, if it has.
     """
 
     closed_jaxpr: ClosedJaxpr
@@ -34,7 +34,8 @@ class Problem(NamedTuple):
     events: int
     components: int
     dtype: Any
-    passed_switches: int = 0
+    passed_switches: int
+    specialised: list["_Specialised"]
 
     @classmethod
     def of(
@@ -105,54 +106,44 @@ class Problem(NamedTuple):
             len(components),
             dtype,
             passed_switches,
+            [],
         )
+
+    @property
+    def note_bytes(self) -> int:
+        """Memory of what is recorded of a body before a turn of the loop (``Note``)."""
+        number = jnp.dtype(self.dtype).itemsize
+        level = number if self.switches.jumps.any() else 1
+        return number * (self.components + 1) + level * self.switches.count
 
     def motion(
         self, arrays: Sequence[Any], units: Callable[..., Any], unit_data: Any, rule: Tableau
     ) -> Motion:
         """Equations of motion for the loop; ``units(unit_data, y, rates)``: see ``Motion``."""
         size, count = self.components, self.switches.count
-        fixed_count = len(arrays)
-
-        def frozen(*operands):
-            constants, (levels, t, *y) = operands[:fixed_count], operands[fixed_count:]
-            out, margins, new_levels = self.switches.frozen(levels, *constants, t, *y)
-            return [*out[:size], margins, new_levels]
-
-        single_lane = [x[0] if lane else x for x, lane in zip(arrays, self.lanes)]
-        t, y = jnp.zeros((), self.dtype), [jnp.zeros(1, self.dtype)] * size
-        variables = [jnp.zeros(count, self.dtype), t, *y]
-        closed_jaxpr = formula(frozen, *single_lane, *variables)
-        program: list[Any] = []
+        if not self.specialised:  # once: derivatives ask for the same motion of other arrays
+            self.specialised.append(self._specialised())
+        prepared, field, stacks = self.specialised[0]
+        prepare, run = jaxpr_as_fun(prepared), jaxpr_as_fun(field)
 
         def coefficients_of(*parameters):
-            specialised = specialise(closed_jaxpr, parameters)
-            shapes = [
-                jax.ShapeDtypeStruct(x.shape, x.dtype)
-                for x in (*specialised.coefficients, *variables)
-            ]
-            size = len(specialised.coefficients)
-            # traced as a program of its own: ``run`` closes over the traced coefficients
-            program[:] = [jax.make_jaxpr(lambda *x: specialised.run(x[:size], *x[size:]))(*shapes)]
-            return list(specialised.coefficients)
+            return stacks.of(prepare(*parameters))
 
         # What is the same for all bodies is computed once and gets no axis: the weights of a
         # network would otherwise be copied for every body.
         axes = [0 if lane else None for lane in self.lanes]
-        depends = _depends(jax.make_jaxpr(coefficients_of)(*single_lane).jaxpr, self.lanes)
-        out = [0 if moves else None for moves in depends]
+        out = [0 if moves else None for moves, *_ in stacks.kinds]
         coefficients = (
             jax.vmap(coefficients_of, in_axes=tuple(axes), out_axes=out)(*arrays)
             if arrays
             else coefficients_of()
         )
-        run = jaxpr_as_fun(program[0])
 
         # The field of one body under `vmap`, not one written for lanes: user functions with matrix
         # products become one product for all bodies of a chunk.
         def of_one(coefficients, levels, t, y):
             *rates, margins, new_levels = run(
-                *coefficients, levels, t, *(y[i][None] for i in range(size))
+                *stacks.apart(coefficients), levels, t, *(y[i][None] for i in range(size))
             )
             return jnp.concatenate(rates), margins, new_levels
 
@@ -183,12 +174,85 @@ class Problem(NamedTuple):
             count,
             self.events,
             jumps if any(jumps) else (),
+            is_holdable(field.jaxpr),
         )
+
+    def _specialised(self) -> "_Specialised":
+        size = self.components
+        avals = self.closed_jaxpr.in_avals[: -1 - size]
+        fixed_count = len(avals)
+
+        def frozen(*operands):
+            constants, (levels, t, *y) = operands[:fixed_count], operands[fixed_count:]
+            out, margins, new_levels = self.switches.frozen(levels, *constants, t, *y)
+            return [*out[:size], margins, new_levels]
+
+        single_lane = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in avals]
+        t, y = jnp.zeros((), self.dtype), [jnp.zeros(1, self.dtype)] * size
+        variables = [jnp.zeros(self.switches.count, self.dtype), t, *y]
+        closed_jaxpr = formula(frozen, *single_lane, *variables)
+        fields: list[ClosedJaxpr] = []
+
+        def coefficients_of(*parameters):
+            specialised = specialise(closed_jaxpr, parameters)
+            shapes = [
+                jax.ShapeDtypeStruct(x.shape, x.dtype)
+                for x in (*specialised.coefficients, *variables)
+            ]
+            size = len(specialised.coefficients)
+            # traced as a program of its own: ``run`` closes over the traced coefficients
+            fields.append(jax.make_jaxpr(lambda *x: specialised.run(x[:size], *x[size:]))(*shapes))
+            return list(specialised.coefficients)
+
+        prepared = jax.make_jaxpr(coefficients_of)(*single_lane)
+        depends = _depends(prepared.jaxpr, self.lanes)
+        kinds = [(moves, x.shape, x.dtype) for moves, x in zip(depends, prepared.out_avals)]
+        return _Specialised(prepared, fields[0], _Stacks(kinds))
+
+
+class _Specialised(NamedTuple):
+    """``prepared``: from the arrays of one body to all that does not move; ``field``: from this,
+    levels, time and state to rates, margins and new levels; ``stacks`` of the former."""
+
+    prepared: ClosedJaxpr
+    field: ClosedJaxpr
+    stacks: "_Stacks"
 
 
 class _Marked(NamedTuple):
     value: Any
     lane: Any
+
+
+class _Stacks:
+    """Arrays of one kind as one array: the loop carries few in place of fifty, and XLA compiles it
+    in less time."""
+
+    def __init__(self, kinds: Sequence[Any]):
+        self.kinds = list(dict.fromkeys(kinds))
+        self.members = [[i for i, x in enumerate(kinds) if x == kind] for kind in self.kinds]
+        self.count = len(kinds)
+
+    def of(self, arrays: Sequence[Any]) -> list[Any]:
+        """One array for each kind; one that is alone as it is."""
+        return [
+            jnp.stack([arrays[i] for i in members]) if len(members) > 1 else arrays[members[0]]
+            for members in self.members
+        ]
+
+    def apart(self, stacks: Sequence[Any]) -> list[Any]:
+        """The arrays in their order."""
+        arrays: list[Any] = [None] * self.count
+        for stack, members in zip(stacks, self.members, strict=True):
+            # The cotangent of a split is one concatenation, that of an index a padded array each.
+            parts = (
+                [x[0] for x in jax.lax.split(stack, [1] * len(members))]
+                if len(members) > 1
+                else [stack]
+            )
+            for i, part in zip(members, parts, strict=True):
+                arrays[i] = part
+        return arrays
 
 
 def _with_consts_as_operands(

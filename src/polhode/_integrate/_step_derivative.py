@@ -8,16 +8,15 @@ Dynamical Systems (2008), section 2.5). Without this term derivatives through a 
 any step width, and those through a kink by about the square root of the tolerance.
 
 *Forward mode* differentiates the loop, with the place of each switch by two steps of Newton's rule.
-*Reverse mode* integrates once more and records every step (state, levels and time), then passes
-the steps in reverse order. The attempts that are allowed are divided into ``RECORD_SEGMENTS`` equal
-segments, and there is room for the records of one. If there are more steps, the carry of the loop
-is stored at the start of each segment, and those before the last one are integrated a third time.
-Full records of all steps would take 100 times the memory; a checkpoint at every 16th step takes one
-more integration of all.
+*Reverse mode* passes recorded steps (state, levels and time) in reverse order. The first
+``RECORDED_TURNS`` are recorded where the values are computed. If there are more, the motion is
+integrated once more: the attempts that are allowed are divided into ``RECORD_SEGMENTS`` equal
+segments, the carry of the loop is stored at the start of each, there is room for the records of
+one, and those before the last one are integrated a third time. Full records of all steps would take
+100 times the memory; a checkpoint at every 16th step takes one more integration of all.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,54 +27,97 @@ from polhode import _policy
 from polhode._integrate import _error_control as control
 from polhode._integrate._explicit_step import (
     Motion,
+    Progress,
     column,
     dense_of,
     dense_state,
     in_parts,
     weighted,
 )
-from polhode._integrate._loop import FINISHED, RUNNING, Make, advance, begin, each_body, run
-from polhode._kernels import any_of, attached, is_slope, kernel, linear, zeros
+from polhode._integrate._loop import (
+    FINISHED,
+    Make,
+    Note,
+    Solved,
+    advance,
+    begin,
+    each_body,
+    is_any_running,
+    noted,
+    packed,
+    put_in,
+    room_for,
+    run,
+    solve,
+)
+from polhode._kernels import any_of, attached, is_slope, kernel, linear, most_of, zeros
 
 
-def samples(make: Make, arrays, unit_data, y, start, ts, states, once: bool = False) -> Array:
+def samples(
+    make: Make,
+    arrays,
+    unit_data,
+    y,
+    start,
+    ts,
+    states: Array,
+    solved: Solved,
+    turns: int = 0,
+    once: bool = False,
+) -> tuple[Array, Solved]:
     """``states`` (B, T, D), samples at ``ts`` (T,) or (B, T) of the motion from ``y`` (D, B) at
-    ``start`` () or (B,), with their derivatives. Times of one body may stand in any order.
-    ``once``: refuse second derivatives."""
+    ``start`` () or (B,), with their derivatives, and ``solved``. Times of one body may stand in any
+    order. Where derivatives are taken and ``turns`` is not zero, both are results of an integration
+    that records the first ``turns`` of the loop. ``once``: refuse second derivatives."""
     leaves, tree = jax.tree.flatten(unit_data)
-    size, extra = len(arrays), len(leaves)
+    size = len(arrays)
 
     def problem_of(operands, differentiable=False):
-        unit_data = jax.tree.unflatten(tree, operands[size : size + extra])
+        unit_data = jax.tree.unflatten(tree, operands[size : size + len(leaves)])
         return make(operands[:size], unit_data, differentiable)
 
-    def rule(operands, tangents, values):
+    def again(operands):
+        *inputs, y, start, ts = operands
+        unit_data = jax.tree.unflatten(tree, inputs[size:])
+        solved, record = solve(make, inputs[:size], unit_data, start, ts, y, turns)
+        return [solved.states, *jax.tree.leaves(solved._replace(samples=None))], record
+
+    def rule(operands, tangents, values, record=None):
         *inputs, y, start, ts = operands
         *input_tangents, dy, dstart, dts = tangents
         motion, _ = problem_of(inputs)
         starts, rows = each_body(start, ts, y.shape[1])
         order = None
-        ordered_ts, ordered_values = ts, values
+        states, ordered_ts = values[0], ts
         # `Trajectory.at` may ask for times of a body in any order; the loop goes one way.
         if ts.ndim > 1:
             sign = jnp.where(ts[:, -1:] < jnp.reshape(start, (-1, 1)), -1, 1).astype(ts.dtype)
             order = jnp.argsort(jax.lax.stop_gradient(sign * ts), axis=1)
             ordered_ts = jnp.take_along_axis(ts, order, axis=1)
-            ordered_values = [jnp.take_along_axis(values[0], order[..., None], axis=1)]
+            states = jnp.take_along_axis(states, order[..., None], axis=1)
         at = [i for i, x in enumerate(input_tangents[:size]) if is_slope(x)]
         dy = dy if is_slope(dy) else zeros(dy)
         # A later start is a start from a state that has gone back along the rates, and a later
         # sample has gone on along them: no integration for either.
         if is_slope(dstart):
             dy = dy - dstart * _rates(motion, starts[None], y[None])[0]
+        recorded, record_tree = jax.tree.flatten(record)
+        count = len(operands)
+
+        def tangent(known, tangents):
+            return _tangent(problem_of, at, _checked(known[:count], once), tangents)
+
+        def cotangent(known, cotangents):
+            record = jax.tree.unflatten(record_tree, known[count:])
+            primals = _checked(known[:count], once)
+            return _cotangent(problem_of, at, primals, record, cotangents[0])
+
         change = linear(
-            lambda primals, tangents: _tangent(problem_of, at, _checked(primals, once), tangents),
-            lambda primals, cotangents: _cotangent(
-                problem_of, at, _checked(primals, once), cotangents[0]
-            ),
-            [*inputs, y, start, ordered_ts],
+            tangent,
+            cotangent,
+            [*inputs, y, start, ordered_ts, *recorded],
             [dy, *(input_tangents[i] for i in at)],
-            ordered_values,
+            [states],
         )
         if order is not None:
             place = jnp.argsort(order, axis=1)[..., None]
@@ -86,8 +128,15 @@ def samples(make: Make, arrays, unit_data, y, start, ts, states, once: bool = Fa
             change = [change[0] + jnp.moveaxis(dtimes[:, None] * rate, -1, 0)]
         return change
 
-    (states,) = attached(rule, [*arrays, *leaves, y, start, ts], [states])
-    return states
+    others, tree_of_others = jax.tree.flatten(solved._replace(samples=None))
+    operands, values = [*arrays, *leaves, y, start, ts], [states, *others]
+    states, *others = attached(rule, operands, values, again if turns else None)
+    return states, jax.tree.unflatten(tree_of_others, others)
+
+
+def segment_turns(max_steps: int) -> int:
+    """Turns of the loop from one checkpoint to the next."""
+    return -(-control.ATTEMPTS * max_steps // _policy.RECORD_SEGMENTS)
 
 
 def _is_differentiated(operands) -> bool:
@@ -124,7 +173,7 @@ def _tangent(problem_of, at, primals, tangents):
         for i, x in zip(at, parameters):
             inputs[i] = x
         motion, options = problem_of(inputs, True)
-        _, rows = run(motion, options, *each_body(start, ts, y.shape[1]), y)
+        _, rows, _ = run(motion, options, *each_body(start, ts, y.shape[1]), y)
         return rows.samples.reshape(y.shape[1], ts.shape[-1] + 1, -1)[:, :-1]
 
     def tangent(primals, tangents):
@@ -134,16 +183,7 @@ def _tangent(problem_of, at, primals, tangents):
     return [kernel(tangent)((y, *parameters), (dy, *parameter_tangents))]
 
 
-class _Note(NamedTuple):
-    """Before a turn of the loop: state, levels, and the time since the start. What a turn leads to
-    stands in the note of the next one. Levels as ``_packed`` leaves them."""
-
-    y: Array
-    levels: Array
-    elapsed: Array
-
-
-def _cotangent(problem_of, at, primals, cotangents):
+def _cotangent(problem_of, at, primals, record, cotangents):
     """Cotangents of the state at the start and of ``arrays[i]``, i in ``at``."""
     *arrays, y, start, ts = primals
     start, times = each_body(start, ts, y.shape[1])
@@ -158,8 +198,9 @@ def _cotangent(problem_of, at, primals, cotangents):
             x for x in problem_of(inputs)[0].coefficients if jnp.issubdtype(x.dtype, jnp.inexact)
         ]
 
-    # second derivatives need those of the places of switches
+    # Second derivatives need those of the places of switches; the record has none.
     differentiable = _is_differentiated(primals)
+    record = None if differentiable else record
     motion, options = problem_of(arrays, differentiable)
     floats = [k for k, x in enumerate(motion.coefficients) if jnp.issubdtype(x.dtype, jnp.inexact)]
     # Cotangents are summed over steps and bodies where they arise, for the coefficients of the
@@ -167,127 +208,142 @@ def _cotangent(problem_of, at, primals, cotangents):
     # once at the end.
     _, pull = jax.vjp(coefficients_of, *parameters)
     sums = [jnp.zeros_like(motion.coefficients[k]) for k in floats]
-    y_cotangent, sums = kernel(
-        lambda coefficients, arguments, unit_data, *operands: _backward(
-            motion._replace(coefficients=coefficients, arguments=arguments, unit_data=unit_data),
-            options,
-            floats,
-            *operands,
+
+    def backward(coefficients, arguments, unit_data, *operands):
+        bound_motion = motion._replace(
+            coefficients=coefficients, arguments=arguments, unit_data=unit_data
         )
-    )(motion.coefficients, motion.arguments, motion.unit_data, start, times, y, cotangents, sums)
+        return _backward(bound_motion, options, floats, *operands)
+
+    y_cotangent, sums = (kernel(backward) if motion.is_whole else backward)(
+        motion.coefficients,
+        motion.arguments,
+        motion.unit_data,
+        start,
+        times,
+        y,
+        cotangents,
+        sums,
+        record,
+    )
     return [y_cotangent, *pull(sums)]
 
 
-def _backward(motion, options, floats, start, times, y, cotangents, sums):
+def _backward(motion, options, floats, start, times, y, cotangents, sums, record):
     """Cotangents of the state at the start and of the floats among ``motion.coefficients``."""
     first_progress, rows = begin(motion, options, start, times[-1:], y)
     end = times[-1:]
-    length = -(-control.ATTEMPTS * options.max_steps // _policy.RECORD_SEGMENTS)
-
-    def noted(progress):
-        return _Note(progress.y, _packed(motion, progress.levels), progress.elapsed)
+    length = segment_turns(options.max_steps)
 
     def stored(progress):
         """Checkpoint: rates and margins are evaluated again where a segment starts, on both
-        passes, so that both take the same steps."""
-        levels, just_turned = (_packed(motion, x) for x in (progress.levels, progress.just_turned))
-        return progress._replace(levels=levels, just_turned=just_turned, rate=None, margin=None)
+        passes, so that both take the same steps. The rest is one array and the levels, as each
+        array of a checkpoint is three operations in every turn."""
+        numbers = [getattr(progress, name).astype(y.dtype) for name in _NUMBERS]
+        levels, just_turned = (packed(motion, x) for x in (progress.levels, progress.just_turned))
+        return jnp.concatenate([progress.y, jnp.stack(numbers)]), levels, just_turned
 
-    def restored(progress):
-        levels, just_turned = (x.astype(y.dtype) for x in (progress.levels, progress.just_turned))
-        return progress._replace(
-            levels=levels,
-            just_turned=just_turned,
-            rate=jnp.zeros_like(y),
-            margin=jnp.zeros_like(levels),
-        )
-
-    def buffers(size, tree):
-        return jax.tree.map(lambda x: jnp.zeros((size, *x.shape), x.dtype), tree)
-
-    def put_in(rows, k, tree):
-        return jax.tree.map(
-            lambda r, x: jax.lax.dynamic_update_index_in_dim(r, x, k, 0), rows, tree
+    def restored(checkpoint):
+        rows, *switches = checkpoint
+        levels, just_turned = (x.astype(y.dtype) for x in switches)
+        kinds = [getattr(first_progress, name).dtype for name in _NUMBERS]
+        numbers = {
+            name: row.astype(kind)
+            for name, row, kind in zip(_NUMBERS, rows[y.shape[0] :], kinds, strict=True)
+        }
+        return first_progress._replace(
+            y=rows[: y.shape[0]], levels=levels, just_turned=just_turned, **numbers
         )
 
     def entry(rows, k):
         return jax.tree.map(lambda x: jax.lax.dynamic_index_in_dim(x, k, 0, False), rows)
+
+    def choose(where, a, b):
+        return jax.tree.map(lambda a, b: jnp.where(where, a, b), a, b)
 
     def turn(carry):
         progress, checkpoints, notes, count = carry
         number, place = count // length, count % length
         is_segment_start = place == 0
         progress = progress._replace(needs_rates=progress.needs_rates | is_segment_start)
-        stored_entry = entry(checkpoints, number)
-        checkpoints = put_in(
-            checkpoints,
-            number,
-            jax.tree.map(
-                lambda x, o: jnp.where(is_segment_start, x, o), stored(progress), stored_entry
-            ),
-        )
-        notes = put_in(notes, place, noted(progress))
+        checkpoint = choose(is_segment_start, stored(progress), entry(checkpoints, number))
+        checkpoints = put_in(checkpoints, number, checkpoint)
+        notes = put_in(notes, place, noted(motion, progress))
         progress, _ = advance(motion, options, start, end, progress, rows)
         return progress, checkpoints, notes, count + 1
 
-    last_progress, checkpoints, notes, count = jax.lax.while_loop(
-        lambda c: any_of(jnp.where(c[0].outcome == RUNNING, 1.0, 0.0)),
-        turn,
-        (
-            first_progress,
-            buffers(_policy.RECORD_SEGMENTS, stored(first_progress)),
-            buffers(length, noted(first_progress)),
-            jnp.zeros((), jnp.int32),
-        ),
-    )
-    finished = last_progress.outcome == FINISHED
-    final = (count - 1) // length
-    index = jnp.arange(finished.shape[0])  # not argmax, which a fused kernel cannot hold
-    finished_body = jnp.min(jnp.where(finished, index, finished.shape[0] - 1))
-
-    def sound(note):
+    def sound(finished, note):
         # Where a body failed the rates may be NaN, and zero cotangents times NaN would reach
         # coefficients shared with bodies that finished: the state of one of these in its place.
+        index = jnp.arange(finished.shape[0])  # not argmax, which a fused kernel cannot hold
+        finished_body = jnp.min(jnp.where(finished, index, finished.shape[0] - 1))
         return jax.tree.map(
             lambda x: jnp.where(finished, x, x[..., finished_body][..., None]), note
         )
 
+    # The first segment that is passed in reverse order is the last one. The same loop integrates
+    # until the end in order to record it, and again each of those before it from its checkpoint.
     def segment(carry):
-        number, notes, *cotangent_carry = carry
-        turns = jnp.minimum(length, count - number * length)
+        number, count, stop, checkpoints, notes, finished, after, later, *sums_so_far = carry
+        progress, checkpoints, notes, count = jax.lax.while_loop(
+            lambda c: is_any_running(c[0]) & (c[3] < stop),
+            turn,
+            (restored(entry(checkpoints, number)), checkpoints, notes, count),
+        )
+        is_last = stop == _NEVER
+        finished = jnp.where(is_last, progress.outcome == FINISHED, finished)
+        after = choose(is_last, sound(finished, noted(motion, progress)), after)
+        if motion.jumps:
+            later = jnp.where(is_last, after.levels, later)
+        number = (count - 1) // length
+        turns = count - number * length
 
-        def note_one(i, carry):
-            progress, notes = carry
-            notes = put_in(notes, i, noted(progress))
-            progress, _ = advance(motion, options, start, end, progress, rows)
-            return progress, notes
+        def back(i, carry):
+            note = sound(finished, entry(notes, turns - 1 - i))
+            return _step_back(motion, floats, start, times, cotangents, finished, note, *carry)
 
-        # the final segment has just been recorded
-        unrecorded_turns = jnp.where(number == final, 0, turns)
-        begin_at = restored(entry(checkpoints, number))
-        _, notes = jax.lax.fori_loop(0, unrecorded_turns, note_one, (begin_at, notes))
+        carry = jax.lax.fori_loop(0, turns, back, (after, later, *sums_so_far))
+        before = number * length
+        return number - 1, before - length, before, checkpoints, notes, finished, *carry
 
-        def back(i, cotangent_carry):
-            note = sound(entry(notes, turns - 1 - i))
-            return _step_back(
-                motion, floats, start, times, cotangents, finished, note, *cotangent_carry
-            )
-
-        return number - 1, notes, *jax.lax.fori_loop(0, turns, back, tuple(cotangent_carry))
-
-    place = jnp.full(start.shape, times.shape[0] - 1, jnp.int32)
-    last = sound(noted(last_progress))
-    later = last.levels if motion.jumps else None
-    initial_carry = final, notes, last, later, jnp.zeros_like(y), sums, place
-    *_, cotangent, sums, _ = jax.lax.while_loop(lambda c: c[0] >= 0, segment, initial_carry)
+    first = stored(first_progress)
+    note = noted(motion, first_progress)
+    notes, count = room_for(length, note), jnp.zeros((), jnp.int32)
+    if record is not None:
+        # A record of all turns: the loop finds that every body has stopped, and takes none.
+        room = record.notes.elapsed.shape[0]
+        is_complete = most_of(record.turns) <= room
+        notes = jax.tree.map(lambda x, r: jnp.concatenate([r, x[room:]]), notes, record.notes)
+        count = jnp.where(is_complete, most_of(record.turns), 0)
+        levels = record.last.levels.astype(y.dtype)
+        after_all = first_progress._replace(
+            **record.last._replace(levels=levels)._asdict(), outcome=record.outcome
+        )
+        first = choose(is_complete, stored(after_all), first)
+    checkpoints = put_in(room_for(_policy.RECORD_SEGMENTS, first), jnp.zeros_like(count), first)
+    carry = (
+        jnp.zeros_like(count),
+        count,
+        jnp.full_like(count, _NEVER),
+        checkpoints,
+        notes,
+        jnp.zeros(start.shape, bool),
+        note,
+        note.levels if motion.jumps else None,
+        jnp.zeros_like(y),
+        sums,
+        jnp.full(start.shape, times.shape[0] - 1, jnp.int32),
+    )
+    carry = jax.lax.while_loop(lambda c: c[2] > 0, segment, carry)
+    *_, finished, _, _, cotangent, sums, _ = carry
     any_finished = any_of(jnp.where(finished, 1.0, 0.0))
     return jnp.where(finished[None], cotangent, 0), [jnp.where(any_finished, x, 0) for x in sums]
 
 
-def _packed(motion: Motion, levels: Array) -> Array:
-    """Levels (K, B) in an eighth of the memory: those of kinks are 0 or 1, those of jumps may be
-    any integer (``floor``). Records of a network of 64 relu would else be ten times the states."""
-    return levels if motion.jumps else levels.astype(jnp.int8)
+_NEVER = jnp.iinfo(jnp.int32).max
+_ARRAYS = "y", "rate", "levels", "margin", "just_turned"
+_NUMBERS = tuple(name for name in Progress._fields if name not in _ARRAYS)
+"""One of each body."""
 
 
 def _step_back(
@@ -297,8 +353,8 @@ def _step_back(
     times,
     cotangents,
     finished,
-    note: _Note,
-    after: _Note,
+    note: Note,
+    after: Note,
     later,
     cotangent,
     sums,
@@ -406,20 +462,28 @@ def _step_back(
 
 def _taken_apart(linear_map, known: list[Array]) -> tuple[list[Array], Callable]:
     """The arrays that a linear map of ``jax.vjp`` holds, without those ``known``, and a function
-    that builds the map from them."""
+    that builds the map from them. Arrays of one shape are stacked: of a field of formulas there
+    are a hundred, each a number of every body."""
     leaves, structure = jax.tree.flatten(linear_map)
     numbers = {id(x): k for k, x in enumerate(known)}
-    places = [numbers.get(id(x)) for x in leaves]
+    held = [x for x in leaves if id(x) not in numbers]
+    kinds = list(dict.fromkeys((x.shape, x.dtype) for x in held))
+    groups = [[x for x in held if (x.shape, x.dtype) == kind] for kind in kinds]
 
-    def rebuild(arrays):
-        rest = iter(arrays)
-        found = [next(rest) if k is None else known[k] for k in places]
+    def rebuild(stacks):
+        rows = [iter([stack[i] for i in range(stack.shape[0])]) for stack in stacks]
+        found = [
+            known[numbers[id(x)]]
+            if id(x) in numbers
+            else next(rows[kinds.index((x.shape, x.dtype))])
+            for x in leaves
+        ]
         return jax.tree.unflatten(structure, found)
 
-    return [x for x, k in zip(leaves, places) if k is None], rebuild
+    return [jnp.stack(group) for group in groups], rebuild
 
 
-def _jump_back(rates_of, values, motion, note: _Note, after: _Note, later, t, cotangent, live):
+def _jump_back(rates_of, values, motion, note: Note, after: Note, later, t, cotangent, live):
     """Contribution of the time of a switch that turned, to the cotangents of the state and of
     ``values`` (the saltation term)."""
     flips = note.levels != after.levels

@@ -33,7 +33,7 @@ from polhode._integrate._flow_derivative import equations_of
 from polhode._integrate._loop import Found, LoopOptions, Search, solve, with_events
 from polhode._integrate._midpoint import Progress
 from polhode._integrate._problem import Problem
-from polhode._integrate._step_derivative import samples
+from polhode._integrate._step_derivative import samples, segment_turns
 from polhode._integrate._switches import guarded
 from polhode._integrate._tableau import TSIT5
 from polhode._kernels import Distinct, is_holdable, kernel, map_chunks
@@ -213,7 +213,7 @@ class AbstractIntegration(AbstractMethod):
             lanes, times = chunk.value()
             scene, state = eqx.combine(lanes, shared)
             times = ts if times is None else times
-            return self._solve_by_loop(scene, state, times, rtol, record, search)
+            return self._solve_by_loop(scene, state, times, rtol, record, search, n)
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
         if n <= _policy.KERNEL_BODIES:
@@ -297,16 +297,16 @@ class AbstractIntegration(AbstractMethod):
         return Problem.of(equations, (scene, state), masks, y0, ts.reshape(-1)[0], values, located)
 
     def _solve_by_loop(
-        self, scene, state, ts, rtol, record: Record, search: Search | None = None
+        self, scene, state, ts, rtol, record: Record, search: Search | None, n: int
     ) -> tuple[Samples, Found | None] | None:
-        """One chunk of bodies by the loop of explicit steps; ``ts`` (T,) or (N, T)."""
+        """One chunk of ``n`` bodies by the loop of explicit steps; ``ts`` (T,) or (N, T)."""
         y0, sound = self._initial_state(scene, state, ts, record)
         term, dynamics = self._equations(scene, state, ts, record)
         problem = self._problem(scene, state, ts, record, search)
         if problem.switches.hidden_operations:
             return None
         leaves, tree = jax.tree.flatten(y0)
-        rtol, bodies = jax.lax.stop_gradient(rtol), leaves[0].shape[0]
+        rtol = jax.lax.stop_gradient(rtol)
         times = ts[..., -1:] if record.final_only else ts
         unit_data, start, y = (dynamics.units, rtol), ts[..., 0], jnp.stack(leaves)
         searched = Search() if search is None else search
@@ -327,17 +327,21 @@ class AbstractIntegration(AbstractMethod):
             )
 
         constants = jax.lax.stop_gradient((problem.arrays, unit_data, start, times, y))
-        loop_result = solve(partial(make, searched=searched), *constants)
-        states = loop_result.samples.reshape(bodies, -1, len(leaves))[:, :-1]
-        events = None
+        loop_result, _ = solve(partial(make, searched=searched), *constants)
+        states, events = loop_result.states, None
         if search is not None:
             events, times, states = with_events(search, loop_result, times, states)
         # backward along the exact equations errors of a damped motion grow; along its steps they
         # do not
         recorded = problem.switches.count or not self._automatic.located
         if recorded or times.ndim > 1 or _torques_act(scene):
-            operands = problem.arrays, unit_data, y, start, times, states
-            states = samples(make, *operands, once=problem.passed_switches > 0)
+            operands = problem.arrays, unit_data, y, start, times, states, loop_result
+            turns = 0
+            if search is None and times.ndim == 1:
+                turns = _policy.recorded_turns(n * problem.note_bytes)
+                turns = min(turns, segment_turns(self.max_steps))
+            once = problem.passed_switches > 0
+            states, loop_result = samples(make, *operands, turns=turns, once=once)
         else:
             equations, c = equations_of(term, dynamics, y0, start, rtol, False)
             path = [jnp.moveaxis(states[..., i], 0, 1) for i in range(len(leaves))]

@@ -34,5 +34,6 @@ from polhode._kernels._fused import (
     jit_distinct as jit_distinct,
     kernel as kernel,
     map_chunks as map_chunks,
+    most_of as most_of,
     put as put,
 )

@@ -194,15 +194,23 @@ def spread(values: Any, axis: int, count: int) -> Any:
 Rule = Callable[[Sequence[Any], Sequence[Any], Sequence[Any]], Sequence[Any]]
 
 
-def attached(rule: Rule, operands: Sequence[Any], values: Sequence[Any]) -> list[Any]:
+def attached(
+    rule: Rule,
+    operands: Sequence[Any],
+    values: Sequence[Any],
+    again: Callable[[Sequence[Any]], tuple[Sequence[Any], Any]] | None = None,
+) -> list[Any]:
     """``values``, a function of ``operands`` computed elsewhere, with its derivatives.
 
-    ``rule(operands, tangents, values)``: the tangents of the values; those of operands may be
-    absent (``is_slope``). It may not close over traced values. Derivatives of the rule see the
-    values with their derivatives. Unlike ``jax.custom_jvp`` this is never replaced by the
-    function itself, as loops do on the way to second derivatives.
+    ``rule(operands, tangents, values)``: the tangents of the values, or of the first of them if the
+    others have none; those of operands may be absent (``is_slope``). It may not close over traced
+    values. Derivatives of the rule see the values with their derivatives. Unlike ``jax.custom_jvp``
+    this is never replaced by the function itself, as loops do on the way to second derivatives.
+
+    ``again(operands)``: where derivatives are taken, the values are computed by this function
+    instead, together with something that helps the rule, its fourth argument.
     """
-    return _attached_p.bind(*operands, *values, rule=rule, count=len(operands))
+    return _attached_p.bind(*operands, *values, rule=rule, count=len(operands), again=again)
 
 
 _attached_p = Primitive("attached")
@@ -210,47 +218,62 @@ _attached_p.multiple_results = True
 
 
 @_attached_p.def_impl
-def _values(*arrays, rule, count):
+def _values(*arrays, rule, count, again):
     return list(arrays[count:])
 
 
 @_attached_p.def_abstract_eval
-def _shapes_of_values(*avals, rule, count):
+def _shapes_of_values(*avals, rule, count, again):
     return list(avals[count:])
 
 
-def _attached_jvp(arrays, tangents, *, rule, count):
+def _attached_jvp(arrays, tangents, *, rule, count, again):
     # The rule sees ``out``, values with their derivatives, so derivatives of the rule are second
     # derivatives. Tangents of the values themselves are dropped: those are derivatives of how the
     # values were computed.
-    out = _attached_p.bind(*arrays, rule=rule, count=count)
-    if not any(is_slope(x) for x in tangents[:count]):
-        return out, [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in out]
-    return out, list(rule(arrays[:count], tangents[:count], out))
+    operands, values, help_of_rule = arrays[:count], arrays[count:], []
+    is_sloped = any(is_slope(x) for x in tangents[:count])
+    if is_sloped and again is not None:
+        values, *help_of_rule = again(jax.lax.stop_gradient(operands))
+    out = _attached_p.bind(*operands, *values, rule=rule, count=count, again=again)
+    changes = list(rule(operands, tangents[:count], out, *help_of_rule)) if is_sloped else []
+    return out, changes + [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in out[len(changes) :]]
 
 
-def _attached_batch(arrays, dims, *, rule, count):
+def _attached_batch(arrays, dims, *, rule, count, again):
+    # Operands keep their axes, so that what the whole batch shares, such as the weights of a
+    # network, is not multiplied; all values have the axis.
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
-    batched_arrays = [
+    axes = [None if d is None else 0 for d in dims[:count]]
+    operands = [x if d is None else jnp.moveaxis(x, d, 0) for x, d in zip(arrays, dims[:count])]
+    values = [
         jnp.broadcast_to(x, (size, *x.shape)) if d is None else jnp.moveaxis(x, d, 0)
-        for x, d in zip(arrays, dims)
+        for x, d in zip(arrays[count:], dims[count:])
     ]
 
-    def batched(operands, tangents, values):
+    def batched(operands, tangents, values, *help_of_rule):
         at = [i for i, x in enumerate(tangents) if is_slope(x)]
 
-        def rule_of_one(operands, present_tangents, values):
+        def rule_of_one(operands, present_tangents, values, *help_of_rule):
             all_tangents = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in operands]
             for i, x in zip(at, present_tangents):
                 all_tangents[i] = x
             return [
                 zeros(x) if isinstance(x, ad.Zero) else x
-                for x in rule(operands, all_tangents, values)
+                for x in rule(operands, all_tangents, values, *help_of_rule)
             ]
 
-        return jax.vmap(rule_of_one)(list(operands), [tangents[i] for i in at], list(values))
+        in_axes = axes, [axes[i] for i in at], *[0] * (1 + len(help_of_rule))
+        return jax.vmap(rule_of_one, in_axes, axis_size=size)(
+            list(operands), [tangents[i] for i in at], list(values), *help_of_rule
+        )
 
-    out = _attached_p.bind(*batched_arrays, rule=batched, count=count)
+    def batched_again(operands):
+        assert again is not None
+        return jax.vmap(again, (axes,), axis_size=size)(list(operands))
+
+    of_batch = None if again is None else batched_again
+    out = _attached_p.bind(*operands, *values, rule=batched, count=count, again=of_batch)
     return out, [0] * len(out)
 
 

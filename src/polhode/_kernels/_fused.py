@@ -39,8 +39,8 @@ _HOLDABLE = frozenset(
 )
 """Operations that a unit may contain; functions with others are compiled as usual."""
 
-_ANALYSING = ContextVar("analysing", default=False)
-"""Set while a function is traced for analysis: units inside it are then traced as plain code."""
+_ANALYSING: ContextVar[list[Callable] | None] = ContextVar("analysing", default=None)
+"""Units met so far in a function that is traced for analysis, as plain code; else None."""
 
 
 def kernel(
@@ -63,14 +63,18 @@ def kernel(
     """
 
     def call(*operands):
-        if _ANALYSING.get() or not _is_of_use():
+        outer = _ANALYSING.get()
+        if outer is not None:
+            outer.append(fn)
+        if outer is not None or not _is_of_use():
             return fn(*operands)
         leaves, tree = jax.tree.flatten(operands)
         if not any(isinstance(leaf, Tracer) for leaf in leaves):
             return fn(*operands)  # run at once, the mark would reach every call inside as well
         # Units inside are traced plain, so that ``is_holdable`` sees their operations. With
         # ``of_units`` they stay units: a derivative, which is not a unit as a whole, keeps them.
-        analysing = _ANALYSING.set(not of_units)
+        inner: list[Callable] = []
+        analysing = _ANALYSING.set(None if of_units else inner)
         try:
             closed_jaxpr, shape = jax.make_jaxpr(
                 lambda *flat: fn(*jax.tree.unflatten(tree, flat)), return_shape=True
@@ -78,7 +82,7 @@ def kernel(
         finally:
             _ANALYSING.reset(analysing)
         if not is_holdable(closed_jaxpr.jaxpr):
-            if of_units:  # the program is known, units inside it included
+            if not inner:  # what was traced is the program
                 return jax.tree.unflatten(
                     jax.tree.structure(shape), jaxpr_as_fun(closed_jaxpr)(*leaves)
                 )
@@ -94,7 +98,7 @@ def kernel(
 
 def formula(fn: Callable, *operands: Any) -> ClosedJaxpr:
     """``fn`` traced, with the operations of units inside it in the open."""
-    analysing = _ANALYSING.set(True)
+    analysing = _ANALYSING.set([])
     try:
         return jax.make_jaxpr(fn)(*operands)
     finally:
@@ -115,6 +119,18 @@ def any_of(these: jax.Array) -> jax.Array:
 def _any_of_all(size, batched, these):
     del size, batched
     return any_of(these), False
+
+
+@custom_vmap
+def most_of(count: jax.Array) -> jax.Array:
+    """``count``, under ``vmap`` the largest of the whole batch, as a bound of a loop for all."""
+    return count
+
+
+@most_of.def_vmap
+def _most_of_all(size, batched, count):
+    del size, batched
+    return most_of(jnp.max(count)), False
 
 
 @jax.custom_jvp
