@@ -334,6 +334,13 @@ MUTANTS = (
         ("test_events.py::test_events_of_a_simulation_in_order_of_time",),
     ),
     Mutant(
+        "_integrate/_switch_location.py",
+        "kink = jnp.minimum(LOCATED_KINK * rtol, LOCATED_ROOT * jnp.sqrt(rtol))",
+        "kink = LOCATED_ROOT * jnp.sqrt(rtol)",
+        "kinks are located to the root of the tolerance, and so are derivatives through them",
+        ("solvers/test_switches.py::test_the_gradient_through_a_kink_keeps_a_tight_tolerance",),
+    ),
+    Mutant(
         STEPS,
         "weight = jnp.sum(cotangent * (rates_after - rates_before), axis=0)",
         "weight = jnp.sum(cotangent * (rates_before - rates_after), axis=0)",

@@ -334,6 +334,26 @@ def test_a_gradient_through_a_jump(max_steps):
     np.testing.assert_allclose([*by_p, by_omega[2]], FALLING_SLOPES, rtol=1e-8)
 
 
+def test_the_gradient_through_a_kink_keeps_a_tight_tolerance():
+    """Located to more than some ``rtol`` of a step, a kink leaves an error of this size.
+    w' = -k (w - p) - c above p, then w' = -c."""
+    k, c, rtol = 2.0, 0.1, 1e-10
+
+    def last(p, w):
+        law = ph.FeedbackTorque(lambda t, wxyz, omega: -k * jax.nn.relu(omega - p) - c)
+        scene, state = (
+            ph.Scene(ph.Inertia.spherical(1.0), None, law),
+            ph.State(WXYZ, w * jnp.ones(3)),
+        )
+        return ph.simulate(scene, state, [0.0, 5.0], rtol=rtol).omega_body[-1, 2]
+
+    value, found = jax.jit(jax.value_and_grad(last, (0, 1)))(0.7, 1.0)
+    above = 0.3 + c / k
+    np.testing.assert_allclose(value, 0.7 - c * (5 - np.log(above * k / c) / k), rtol=1e-9)
+    share = c / (k * above)
+    np.testing.assert_allclose(found, [1 - share, share], rtol=0, atol=20 * rtol)
+
+
 @pytest.mark.slow  # a single body: test_a_gradient_through_a_jump
 @pytest.mark.parametrize("how", ["batch", "grad of vmap", "vmap of grad"])
 def test_recorded_steps_and_those_integrated_again_have_the_same_derivatives(how):

@@ -17,10 +17,12 @@ from polhode._integrate._explicit_step import (
 from polhode._integrate._tableau import Tableau
 from polhode._kernels import any_of
 
-LOCATED_JUMP, LOCATED_KINK = 1e-4, 0.1
+LOCATED_JUMP, LOCATED_KINK, LOCATED_ROOT = 1e-4, 10.0, 0.1
 """Width of the bracket of a switch of the field, relative to the step: times ``rtol`` at a jump,
-times its square root at a kink. A step beyond a jump adds an error of the change of the rates times
-this width, one beyond a kink of its square: both are far below the error of a step. With a tenth of
+and at a kink, there at most ``LOCATED_ROOT`` times its square root. A step beyond a jump adds an
+error of the change of the rates times this width, one beyond a kink of its square: both are far
+below the error of a step. Derivatives through a kink are off by the width itself, so that the root
+alone, which is enough from 1e-4 on, would leave errors of 100 ``rtol`` at 1e-10. With a tenth of
 ``rtol`` at kinks too, gradients through networks of relu have the same errors and take a tenth more
 time."""
 
@@ -117,7 +119,8 @@ def first_switch(
     tolerance = 4 * eps * jnp.maximum(1, grain / 16)
     if not motion.events:  # an event is located to rounding, a change of the rates is not
         rtol = options.rtol.astype(tolerance.dtype)
-        located = LOCATED_JUMP * rtol if motion.jumps else LOCATED_KINK * jnp.sqrt(rtol)
+        kink = jnp.minimum(LOCATED_KINK * rtol, LOCATED_ROOT * jnp.sqrt(rtol))
+        located = LOCATED_JUMP * rtol if motion.jumps else kink
         tolerance = jnp.maximum(tolerance, located)
 
     def margins_at(x, constants=stopped_constants):
