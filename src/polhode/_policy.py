@@ -123,6 +123,10 @@ RECORDED_TURNS = 512
 """[turns] Of the loop of explicit steps that are recorded where values with derivatives are
 computed, at most: reverse mode need not integrate again if there are not more."""
 
+RECORDED_TURNS_OF_FEW = 128
+"""[turns] The same of a few bodies, for ``jax.vmap`` may multiply their number afterwards: by
+100,000 the records take 2 GB."""
+
 RECORDED_MEMORY = 2**26
 """[bytes] Of such records of all bodies, at most."""
 
@@ -252,9 +256,10 @@ def bodies_to_save(samples: int) -> int:
     return max(LANES, sample_limit // samples)
 
 
-def recorded_turns(memory: int) -> int:
-    """Turns of the loop that are recorded, of which each takes so many bytes."""
-    turns = min(RECORDED_TURNS, RECORDED_MEMORY // memory)
+def recorded_turns(bodies: int, memory: int) -> int:
+    """Turns of the loop that are recorded, of which each takes so many bytes for each body."""
+    most = RECORDED_TURNS if bodies > KERNEL_BODIES else RECORDED_TURNS_OF_FEW
+    turns = min(most, RECORDED_MEMORY // (bodies * memory))
     return turns if turns >= FEWEST_TURNS else 0
 
 

@@ -338,7 +338,7 @@ class AbstractIntegration(AbstractMethod):
             operands = problem.arrays, unit_data, y, start, times, states, loop_result
             turns = 0
             if search is None and times.ndim == 1:
-                turns = _policy.recorded_turns(n * problem.note_bytes)
+                turns = _policy.recorded_turns(n, problem.note_bytes)
                 turns = min(turns, segment_turns(self.max_steps))
             once = problem.passed_switches > 0
             states, loop_result = samples(make, *operands, turns=turns, once=once)
