@@ -1,6 +1,6 @@
 """Gradients through controllers: a mean cost by all weights of a network, and by a few gains.
 
-    python -m benchmarks.controllers [--quick] [--many] [--output out/controllers.json]
+    python -m benchmarks.controllers [--quick] [--many] [--lines FILE] [--output FILE]
 
 A network of 7, 32, 32 and 3 units (1,411 parameters, relu or tanh) sees the attitude and rates of a
 body and gives a torque of at most 2 along each axis, for 5 s. The mean over the bodies of the cost
@@ -8,10 +8,14 @@ of their last states is differentiated in reverse mode: by polhode's plain call,
 user writes it (``jax.vmap``, ``PIDController``, ``RecursiveCheckpointAdjoint``). Errors are norms
 over that of the gradient, against polhode at a tolerance of 1e-11, which is compared along two
 directions with central differences of solutions by SciPy's DOP853. Times are processor time of one
-core, the least of some runs in turn. ``--many`` adds 4,096 bodies.
+core, the least of some runs in turn, or the only run of a program that takes longer than 4 s.
+``--many`` adds 4,096 bodies. ``--lines``: a file to which results are appended as they are
+computed; with it, those that it already holds are not computed again.
 """
 
 import argparse
+import functools
+import json
 import time
 from collections.abc import Callable, Iterable
 from functools import partial
@@ -151,17 +155,19 @@ class Program:
         return float(value), np.asarray(ravel_pytree(slope)[0], float)
 
 
-def seconds(calls: dict[Any, Callable], repeats: int) -> dict[Any, float]:
-    """Least processor time of each, taking turns."""
-    least, spent = dict.fromkeys(calls, np.inf), dict.fromkeys(calls, 0.0)
-    for _ in range(repeats):
+def seconds(calls: dict[Any, Callable], repeats: int) -> tuple[dict[Any, float], dict[Any, Any]]:
+    """Least processor time of each, taking turns, and the results. The first run is only counted
+    where there is no second one."""
+    least, spent, results = {}, dict.fromkeys(calls, 0.0), {}
+    for turn in range(1 + repeats):
         for name, call in calls.items():
             if spent[name] < BUDGET:
                 begin = time.process_time()
-                jax.block_until_ready(call())
+                results[name] = jax.block_until_ready(call())
                 took = time.process_time() - begin
-                least[name], spent[name] = min(least[name], took), spent[name] + took
-    return least
+                least[name] = took if turn < 2 else min(least[name], took)
+                spent[name] += took
+    return least, results
 
 
 def apart(slope: np.ndarray, exact: np.ndarray) -> float:
@@ -231,8 +237,7 @@ def measure(
         for tolerance in tolerances:
             programs[name, tolerance] = program
             calls[name, tolerance] = partial(program, jnp.asarray(tolerance, dtype))
-    slopes = {key: call()[1] for key, call in calls.items()}
-    least = seconds(calls, repeats)
+    least, results = seconds(calls, repeats)
     return [
         {
             "activation": activation,
@@ -241,7 +246,7 @@ def measure(
             "program": name,
             "tolerance": tolerance,
             "seconds": least[name, tolerance],
-            "error": apart(slopes[name, tolerance], exact),
+            "error": apart(results[name, tolerance][1], exact),
             "compile_s": programs[name, tolerance].compile_s,
             "memory_MB": programs[name, tolerance].memory,
         }
@@ -270,8 +275,8 @@ def measure_kind(kind: str, bodies: int, rtol: float = 1e-6, repeats: int = 3) -
     value = Program(polhode_loss(state, rtol), controller, slope=False)
     both = Program(polhode_loss(state, rtol), controller)
     _, exact = Program(polhode_loss(state, REFERENCE), controller)()
-    found = both()[1]
-    least = seconds({"value": lambda: value.compiled(value.arrays), "both": both}, repeats)
+    calls = {"value": lambda: value.compiled(value.arrays), "both": both}
+    least, results = seconds(calls, repeats)
     return {
         "kind": kind,
         "parameters": exact.size,
@@ -280,7 +285,7 @@ def measure_kind(kind: str, bodies: int, rtol: float = 1e-6, repeats: int = 3) -
         "value_s": least["value"],
         "gradient_s": least["both"],
         "ratio": least["both"] / least["value"],
-        "error": apart(found, exact),
+        "error": apart(results["both"][1], exact),
         "compile_s": both.compile_s,
         "memory_MB": both.memory,
     }
@@ -304,40 +309,76 @@ def time_to_error(rows: list[dict]) -> list[dict]:
     ]
 
 
+def _exact(activation: str, bodies: int) -> Callable[[], np.ndarray]:
+    """The gradient at the tolerance of reference, computed when it is first asked for."""
+    return functools.cache(
+        lambda: Program(polhode_loss(states(bodies), REFERENCE), Network(activation))()[1]
+    )
+
+
+def _check(activation: str, bodies: int, exact: np.ndarray) -> dict:
+    along, across = differences(activation, exact, bodies)
+    return {"activation": activation, "along": along, "across": across}
+
+
+def _known(lines: Path | None) -> dict[tuple, list[dict]]:
+    """Results that a file holds, by table and key."""
+    if lines is None or not lines.exists():
+        return {}
+    entries = [json.loads(line) for line in lines.read_text().splitlines()]
+    return {(table, *key): found for table, key, found in entries}
+
+
+def _line(row: dict) -> str:
+    if "tolerance" not in row:
+        return str(row)
+    return (
+        f"{row['activation']} {row['bodies']:>5} {row['dtype']} {row['program']:<14}"
+        f"{row['tolerance']:>8.0e}{row['seconds']:>10.4f} s{row['error']:>9.1e}"
+        f"{row['compile_s']:>7.1f} s{row['memory_MB'] or 0:>9.2f} MB"
+    )
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--many", action="store_true", help="4,096 bodies too")
+    parser.add_argument("--lines", type=Path)
     parser.add_argument("--output", type=Path)
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     sizes = BODIES[:1] if options.quick else BODIES + ((4096,) if options.many else ())
     few = options.quick
     numbers: dict[str, Any] = {"horizon": HORIZON, "rows": [], "checks": [], "kinds": []}
+    known = _known(options.lines)
+
+    def results(table: str, key: list, compute: Callable[[], list[dict]]) -> None:
+        found = known.get((table, *key))
+        if found is None:
+            found = compute()
+            if options.lines is not None:
+                with options.lines.open("a") as file:
+                    file.write(json.dumps([table, key, found]) + "\n")
+        for row in found:
+            numbers[table].append(row)
+            print(_line(row), flush=True)
+
     for bodies in sizes:
         for activation in ("relu",) if few else ("tanh", "relu"):
-            program = Program(polhode_loss(states(bodies), REFERENCE), Network(activation))
-            _, exact = program()
+            exact = _exact(activation, bodies)
             if bodies == sizes[0]:
-                along, across = differences(activation, exact, bodies)
-                check = {"activation": activation, "along": along, "across": across}
-                numbers["checks"].append(check)
-                print(check, flush=True)
+                results("checks", [activation], lambda: [_check(activation, bodies, exact())])  # noqa: B023
             runs = [(np.float64, TOLERANCES[4:5] if few else TOLERANCES)]
             if not few and bodies == 32:
                 runs.append((np.float32, SINGLE))
-            for run in runs:
-                for row in measure(activation, bodies, *run, exact):
-                    numbers["rows"].append(row)
-                    print(
-                        f"{activation} {bodies:>5} {row['dtype']} {row['program']:<14}"
-                        f"{row['tolerance']:>8.0e}{row['seconds']:>10.4f} s{row['error']:>9.1e}"
-                        f"{row['compile_s']:>7.1f} s{row['memory_MB'] or 0:>9.2f} MB",
-                        flush=True,
-                    )
+            for dtype, tolerances in runs:
+                results(
+                    "rows",
+                    [activation, bodies, np.dtype(dtype).name],
+                    lambda: measure(activation, bodies, dtype, tolerances, exact()),  # noqa: B023
+                )
     for kind in list(KINDS)[:1] if few else KINDS:
-        numbers["kinds"].append(measure_kind(kind, 4 if few else 32))
-        print(numbers["kinds"][-1], flush=True)
+        results("kinds", [kind], lambda: [measure_kind(kind, 4 if few else 32)])  # noqa: B023
     numbers["time_to_error"] = time_to_error(numbers["rows"])
     path = _report.write("controllers", numbers, path=options.output, packages=("scipy",))
     print(f"written: {path.name}")
