@@ -62,7 +62,7 @@ CASES: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "RECORDED_TURNS": ((0, 128), ("gradient of networks",)),
     "RECORDED_TURNS_OF_FEW": ((0, 512), ("gradient of a satellite",)),
     "RECORDED_MEMORY": ((0,), ("gradient of networks",)),
-    "FEWEST_TURNS": ((1024,), ("gradient of networks",)),
+    "FEWEST_RECORDED_TURNS": ((1024,), ("gradient of networks",)),
     "COMPENSATED_STEPS": ((0, 10**9), ("heavy top", "heavy tops")),
     "COMPENSATED_PHASES": ((10**9,), ("free body", "free bodies")),
     "FREE_CHUNK": ((2**10, 2**16), ("free bodies", "free bodies, 100 times")),

@@ -130,7 +130,7 @@ RECORDED_TURNS_OF_FEW = 128
 RECORDED_MEMORY = 2**26
 """[bytes] Of such records of all bodies, at most."""
 
-FEWEST_TURNS = 64
+FEWEST_RECORDED_TURNS = 64
 """[turns] If there is room for fewer, none are recorded: most motions take more."""
 
 COMPENSATED_STEPS = 20_000
@@ -260,7 +260,7 @@ def recorded_turns(bodies: int, memory: int) -> int:
     """Turns of the loop that are recorded, of which each takes so many bytes for each body."""
     most = RECORDED_TURNS if bodies > KERNEL_BODIES else RECORDED_TURNS_OF_FEW
     turns = min(most, RECORDED_MEMORY // (bodies * memory))
-    return turns if turns >= FEWEST_TURNS else 0
+    return turns if turns >= FEWEST_RECORDED_TURNS else 0
 
 
 def samples_at_once(chunk: int) -> int:

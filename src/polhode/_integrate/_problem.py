@@ -117,14 +117,22 @@ class Problem(NamedTuple):
         return number * (self.components + 1) + level * self.switches.count
 
     def motion(
-        self, arrays: Sequence[Any], units: Callable[..., Any], unit_data: Any, rule: Tableau
+        self,
+        arrays: Sequence[Any],
+        units: Callable[..., Any],
+        unit_data: Any,
+        rule: Tableau,
+        differentiable: bool,
     ) -> Motion:
-        """Equations of motion for the loop; ``units(unit_data, y, rates)``: see ``Motion``."""
+        """Equations of motion for the loop; ``units(unit_data, y, rates)``: see ``Motion``;
+        ``differentiable``: whether JAX differentiates the loop itself."""
         size, count = self.components, self.switches.count
         if not self.specialised:  # once: derivatives ask for the same motion of other arrays
             self.specialised.append(self._specialised())
-        prepared, field, stacks = self.specialised[0]
+        prepared, field, kinds = self.specialised[0]
         prepare, run = jaxpr_as_fun(prepared), jaxpr_as_fun(field)
+        # In a stack one array with a tangent would give all of them one.
+        stacks = _Stacks([(*kind, i) for i, kind in enumerate(kinds)] if differentiable else kinds)
 
         def coefficients_of(*parameters):
             return stacks.of(prepare(*parameters))
@@ -178,6 +186,7 @@ class Problem(NamedTuple):
         )
 
     def _specialised(self) -> "_Specialised":
+        """The program of one body, divided into what moves and what does not."""
         size = self.components
         avals = self.closed_jaxpr.in_avals[: -1 - size]
         fixed_count = len(avals)
@@ -207,16 +216,17 @@ class Problem(NamedTuple):
         prepared = jax.make_jaxpr(coefficients_of)(*single_lane)
         depends = _depends(prepared.jaxpr, self.lanes)
         kinds = [(moves, x.shape, x.dtype) for moves, x in zip(depends, prepared.out_avals)]
-        return _Specialised(prepared, fields[0], _Stacks(kinds))
+        return _Specialised(prepared, fields[0], kinds)
 
 
 class _Specialised(NamedTuple):
     """``prepared``: from the arrays of one body to all that does not move; ``field``: from this,
-    levels, time and state to rates, margins and new levels; ``stacks`` of the former."""
+    levels, time and state to rates, margins and new levels; ``kinds`` of the results of the former:
+    whether each has a value for each body, its shape and dtype."""
 
     prepared: ClosedJaxpr
     field: ClosedJaxpr
-    stacks: "_Stacks"
+    kinds: list[tuple]
 
 
 class _Marked(NamedTuple):

@@ -190,17 +190,17 @@ def _cotangent(problem_of, at, primals, record, cotangents):
     cotangents = jnp.moveaxis(cotangents, 0, -1)  # (T, D, B)
     parameters = [arrays[i] for i in at]
 
+    # Second derivatives need those of the places of switches; the record has none.
+    differentiable = _is_differentiated(primals)
+    record = None if differentiable else record
+
     def coefficients_of(*parameters):
         inputs = list(arrays)
         for i, x in zip(at, parameters):
             inputs[i] = x
-        return [
-            x for x in problem_of(inputs)[0].coefficients if jnp.issubdtype(x.dtype, jnp.inexact)
-        ]
+        coefficients = problem_of(inputs, differentiable)[0].coefficients
+        return [x for x in coefficients if jnp.issubdtype(x.dtype, jnp.inexact)]
 
-    # Second derivatives need those of the places of switches; the record has none.
-    differentiable = _is_differentiated(primals)
-    record = None if differentiable else record
     motion, options = problem_of(arrays, differentiable)
     floats = [k for k, x in enumerate(motion.coefficients) if jnp.issubdtype(x.dtype, jnp.inexact)]
     # Cotangents are summed over steps and bodies where they arise, for the coefficients of the
@@ -239,17 +239,17 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums, record
         """Checkpoint: rates and margins are evaluated again where a segment starts, on both
         passes, so that both take the same steps. The rest is one array and the levels, as each
         array of a checkpoint is three operations in every turn."""
-        numbers = [getattr(progress, name).astype(y.dtype) for name in _NUMBERS]
+        numbers = [progress._asdict()[name].astype(y.dtype) for name in _NUMBERS]
         levels, just_turned = (packed(motion, x) for x in (progress.levels, progress.just_turned))
         return jnp.concatenate([progress.y, jnp.stack(numbers)]), levels, just_turned
 
     def restored(checkpoint):
         rows, *switches = checkpoint
         levels, just_turned = (x.astype(y.dtype) for x in switches)
-        kinds = [getattr(first_progress, name).dtype for name in _NUMBERS]
+        like = first_progress._asdict()
         numbers = {
-            name: row.astype(kind)
-            for name, row, kind in zip(_NUMBERS, rows[y.shape[0] :], kinds, strict=True)
+            name: row.astype(like[name].dtype)
+            for name, row in zip(_NUMBERS, rows[y.shape[0] :], strict=True)
         }
         return first_progress._replace(
             y=rows[: y.shape[0]], levels=levels, just_turned=just_turned, **numbers
@@ -341,9 +341,11 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums, record
 
 
 _NEVER = jnp.iinfo(jnp.int32).max
+"""A number of turns that no motion takes."""
+
 _ARRAYS = "y", "rate", "levels", "margin", "just_turned"
 _NUMBERS = tuple(name for name in Progress._fields if name not in _ARRAYS)
-"""One of each body."""
+"""Fields of the carry of the loop that are one number of each body."""
 
 
 def _step_back(

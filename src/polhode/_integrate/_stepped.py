@@ -316,7 +316,7 @@ class AbstractIntegration(AbstractMethod):
 
         def make(arrays, unit_data, differentiable, searched=passing):
             units, rtol = unit_data
-            motion = program.motion(arrays, _by_units, units, rule)
+            motion = program.motion(arrays, _by_units, units, rule, differentiable)
             return motion, LoopOptions(
                 rtol,
                 self.max_steps,
