@@ -43,6 +43,7 @@ TANGENT = "_closed_forms/_free_tangent.py"
 ORBIT, WHEELS, FRAME = "_scene/_orbits.py", "_scene/_wheels.py", "frames/_frame.py"
 LAWS, LVLH = "_scene/_control.py", "_scene/_orbits.py"
 STEPS, LOOP = "_integrate/_step_derivative.py", "_integrate/_loop.py"
+TURN = "_integrate/_turn.py"
 FLOW, FOUND = "_integrate/_flow_derivative.py", "_integrate/_switch_location.py"
 CROSSINGS, RESIDUALS = "_events/_crossings.py", "fit/_residuals.py"
 LIGHT, PROPAGATE = "lightcurve/_brightness.py", "_propagate.py"
@@ -310,14 +311,14 @@ MUTANTS = (
     ),
     # integration: error control, switches, events and derivatives
     Mutant(
-        LOOP,
+        TURN,
         "* options.rtol.astype(error.dtype) * angle / (total_angle * drift)",
         "* options.rtol.astype(error.dtype)",
         "each step may have the error of the whole motion",
         ("solvers/test_switches.py::test_states_through_switches",),
     ),
     Mutant(
-        LOOP,
+        TURN,
         "error = error + control.SIXTH_DIFFERENCE * length_of",
         "error = error + 0 * length_of",
         "a step that passes something narrow measures its error by chance",
@@ -327,7 +328,7 @@ MUTANTS = (
         ),
     ),
     Mutant(
-        LOOP,
+        TURN,
         "rises = jnp.where(turn.levels[row] > 0, 1, -1) * sign",
         "rises = jnp.where(turn.levels[row] > 0, -1, 1) * sign",
         "the direction of an event is the opposite",

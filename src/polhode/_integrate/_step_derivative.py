@@ -1,4 +1,4 @@
-"""Derivatives of the steps of ``_loop.py``, in both modes, through the switches that end them.
+"""Derivatives of the steps of ``_turn.py``, in both modes, through the switches that end them.
 
 With the levels held a step is a smooth map, and its derivative is that of an ordinary Runge-Kutta
 step of fixed width. Where a switch turns at the time tau, the rates change from f to f', and a
@@ -35,11 +35,9 @@ from polhode._integrate._explicit_step import (
     weighted,
 )
 from polhode._integrate._loop import (
-    FINISHED,
     Make,
     Note,
     Solved,
-    advance,
     begin,
     each_body,
     is_any_running,
@@ -50,6 +48,7 @@ from polhode._integrate._loop import (
     run,
     solve,
 )
+from polhode._integrate._turn import FINISHED, advance
 from polhode._kernels import any_of, attached, is_slope, kernel, linear, most_of, zeros
 
 

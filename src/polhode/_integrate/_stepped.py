@@ -30,12 +30,13 @@ from polhode._integrate._diffrax_solve import (
 from polhode._integrate._extrapolation import Automatic, Extrapolation
 from polhode._integrate._flow_adjoint import FlowAdjoint, path_of
 from polhode._integrate._flow_derivative import equations_of
-from polhode._integrate._loop import Found, LoopOptions, Search, solve, with_events
+from polhode._integrate._loop import Found, Search, solve, with_events
 from polhode._integrate._midpoint import Progress
 from polhode._integrate._problem import Problem
 from polhode._integrate._step_derivative import samples, segment_turns
 from polhode._integrate._switches import guarded
 from polhode._integrate._tableau import TSIT5
+from polhode._integrate._turn import LoopOptions
 from polhode._kernels import Distinct, is_holdable, kernel, map_chunks
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts, check_options
 from polhode._parts import AbstractPart
@@ -486,7 +487,7 @@ def _outcome(solution, shape) -> tuple[StepCounts, Array]:
     return StepCounts.of(accepted, rejected), jnp.broadcast_to(status, shape)
 
 
-# in the order of the outcomes of ``_loop.py``
+# in the order of the outcomes of ``_turn.py``
 _OF_LOOP = (
     Status.SUCCESSFUL,
     Status.SUCCESSFUL,

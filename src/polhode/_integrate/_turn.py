@@ -1,0 +1,453 @@
+"""One turn of the loop of explicit Runge-Kutta steps: try a step, and accept, refuse or cut it.
+
+A step holds the levels of all switches of the field (``_switches.py``), so the field within it is
+smooth. If the margin of a switch falls below zero within the step, the step ends where it does, on
+the polynomial of dense output, and the switch turns. An event is a switch on which the field does
+not depend.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from polhode._integrate import _error_control as control
+from polhode._integrate._explicit_step import (
+    Attempt,
+    Motion,
+    Progress,
+    attempt_step,
+    column,
+    dense_state,
+    weighted,
+)
+from polhode._integrate._field import weighted_length
+from polhode._integrate._switch_location import (
+    SwitchPoint,
+    first_of_jumps,
+    first_switch,
+    pick,
+    undefined_side,
+)
+from polhode._kernels import any_of, kernel, put
+
+RUNNING, FINISHED, OUT_OF_STEPS, STEP_TOO_SHORT, NOT_FINITE, SLIDING, AT_EVENT = range(7)
+"""Values of ``Progress.outcome``."""
+
+
+class LoopOptions(NamedTuple):
+    """Options of the integration loop.
+
+    ``rtol``: bound of the sum of the errors of the steps [rad]; ``max_steps``: of each body;
+    ``capacity``: events stored for each body; ``directions``: of each event 1, -1 or 0 for both;
+    ``terminal``: whether a body stops at each; ``differentiable``: whether the place of a switch
+    carries derivatives."""
+
+    rtol: Array
+    max_steps: int
+    capacity: int = 0
+    directions: tuple[int, ...] = ()
+    terminal: tuple[bool, ...] = ()
+    differentiable: bool = False
+
+
+class Storage(NamedTuple):
+    """Output of the loop: ``samples`` (B * (T + 1), D); of events ``times``, ``which`` (B * (E +
+    1), 1) and ``states`` (B * (E + 1), D). The last row of each body is a bin for what is not
+    stored."""
+
+    samples: Array
+    times: Array
+    which: Array
+    states: Array
+
+
+def advance(
+    motion: Motion,
+    options: LoopOptions,
+    start: Array,
+    ts: Array,
+    progress: Progress,
+    storage: Storage,
+):
+    """One attempt of every body that is still running."""
+    stop_gradient = jax.lax.stop_gradient
+    eps = float(jnp.finfo(progress.y.dtype).eps)
+    length = jnp.abs(ts[-1] - start)
+    sign = jnp.where(ts[-1] < start, -1, 1).astype(progress.y.dtype)
+    is_running = progress.outcome == RUNNING
+    width, is_last = _width(progress, length, is_running, eps)
+    t, h = start + sign * progress.elapsed, sign * width
+    # Three stages more (of order 8), evaluated only where a sample lies within the step or, in
+    # `attempt_step`, a switch comes near: a step without either costs what it does without both.
+    needs_dense = is_running & (progress.place < ts.shape[0])
+    needs_dense = needs_dense & (
+        jnp.abs(column(ts, progress.place) - start) <= progress.elapsed + width
+    )
+    attempt = attempt_step(motion, progress, t, h, needs_dense)
+    error, tolerance, angle, is_unstable = stop_gradient(
+        _error_and_tolerance(motion, options, progress, attempt, width, length, eps)
+    )
+    ratio = error / tolerance
+    is_first = progress.attempts == 0
+    accepted = (ratio <= 1) & is_running & ~is_first
+    turn = wrong_levels = None
+    if motion.switches:
+        # At the first step, and where another switch has just turned, a level may be that of the
+        # wrong side already at the start: one comparison moves another one's argument, or rounding
+        # decides. The step is then repeated with the level turned, without moving on. A switch that
+        # has just turned itself stands at its root, where the sign of its margin is rounding.
+        wrong_levels = (
+            progress.needs_rates[None]
+            & (attempt.margins[0] < 0)
+            & (progress.just_turned == 0)
+            & ~is_first[None]
+        )
+        wrong_levels = first_of_jumps(motion, wrong_levels)
+        accepted = accepted & ~jnp.any(wrong_levels, axis=0)
+        turn = first_switch(motion, options, progress, attempt, t, accepted, eps)
+    trial = _Trial(
+        attempt,
+        width,
+        is_last,
+        is_running,
+        accepted,
+        error,
+        ratio,
+        angle,
+        is_unstable,
+        wrong_levels,
+        turn,
+    )
+
+    def conclude(*operands):
+        return _conclude(motion, options, eps, *operands)
+
+    # Many short loops over the bodies, and no field in them: a unit also where the whole loop
+    # cannot be one. Gradients through networks take a tenth less time, and a tenth less to compile.
+    conclude = conclude if motion.is_whole else kernel(conclude)
+    return conclude(start, ts, progress, storage, trial)
+
+
+class _Trial(NamedTuple):
+    """A step that was tried, of unsigned ``width``, with its ``error`` [rad], the ``ratio`` of that
+    to its tolerance, and its ``angle`` [rad]; ``wrong_levels`` (K, B): switches on the wrong side
+    at its start; ``turn``: the first switch in it; None where there are no switches."""
+
+    attempt: Attempt
+    width: Array
+    is_last: Array
+    is_running: Array
+    accepted: Array
+    error: Array
+    ratio: Array
+    angle: Array
+    is_unstable: Array
+    wrong_levels: Array | None
+    turn: SwitchPoint | None
+
+
+def _conclude(
+    motion: Motion,
+    options: LoopOptions,
+    eps: float,
+    start: Array,
+    ts: Array,
+    progress: Progress,
+    storage: Storage,
+    trial: _Trial,
+) -> tuple[Progress, Storage]:
+    """What follows from a step that was tried: the next state, width, levels and outcome."""
+    stop_gradient = jax.lax.stop_gradient
+    attempt, width, is_running, accepted = (
+        trial.attempt,
+        trial.width,
+        trial.is_running,
+        trial.accepted,
+    )
+    ratio, turn, length = trial.ratio, trial.turn, jnp.abs(ts[-1] - start)
+    is_first = progress.attempts == 0
+    hit = jnp.zeros_like(accepted) if turn is None else turn.hit
+    part = jnp.where(hit, turn.part, 1) if turn is not None else jnp.ones_like(width)
+
+    elapsed = jnp.where(trial.is_last, length, progress.elapsed + width)
+    elapsed = jnp.where(hit, progress.elapsed + part * width, elapsed)
+    # of a step that a switch cuts the state is that of dense output, which is less accurate
+    state_ratio = ratio * jnp.where(hit, motion.rule.dense_error, 1)
+    # Only the width is chosen by that larger error. Refusing such a step instead, to shorten it
+    # until dense output keeps the tolerance, would cost an attempt for every switch.
+    size = jnp.log(jnp.clip(state_ratio, control.MIN_RATIO, 1e12))
+    memory = jnp.where(accepted, control.MEMORY * progress.last_error, 0)
+    factor = control.SAFETY * jnp.exp((memory - size) / motion.rule.order)
+    factor = jnp.clip(factor, control.MIN_FACTOR, control.MAX_FACTOR)
+    is_cut = accepted & (width < control.CUT * progress.width)
+    proposed = jnp.where(is_cut, jnp.maximum(progress.width, width * factor), width * factor)
+    guess = stop_gradient(_first_width(motion, options, progress.y, attempt.stages[0], length))
+    proposed = jnp.where(is_first, guess, proposed)
+    # With `x > 0` held, `where(x > 0, sqrt(x), 0)` is NaN beyond the switch, so that there is no
+    # root to search for. The step is shortened towards the switch instead, and turns it when it
+    # cannot come nearer ("snaps").
+    undefined = None
+    if motion.switches:
+        undefined, share = undefined_side(attempt, ratio, is_running & ~is_first, motion.rule)
+        proposed = jnp.where(
+            undefined.is_undefined, control.UNDEFINED_SIDE * width * share, proposed
+        )
+        time = jnp.maximum(progress.elapsed, 0.01 * length)
+        is_close = width * share <= control.GRAIN * eps * time
+        undefined = undefined._replace(snaps=undefined.is_undefined & is_close)
+        proposed = jnp.where(undefined.snaps, guess, proposed)
+    storage, place = _save(
+        attempt, progress, storage, ts, start, jnp.where(accepted, elapsed, -1), width
+    )
+
+    def choose(a, b):
+        return jnp.where(accepted if a.ndim == 1 else accepted[None], a, b)
+
+    def count(n, where):
+        return n + jnp.where(where, 1, 0).astype(n.dtype)
+
+    rate_at_start = jnp.where(progress.needs_rates[None], attempt.stages[0], progress.rate)
+    progress_after = progress._replace(
+        elapsed=choose(elapsed, progress.elapsed),
+        y=choose(dense_state(progress.y, attempt.dense, part), progress.y),
+        rate=choose(attempt.stages[motion.rule.stages - 1], rate_at_start),
+        needs_rates=hit,
+        width=stop_gradient(jnp.where(is_running, proposed, progress.width)),
+        last_error=choose(stop_gradient(size), progress.last_error),
+        angle=progress.angle + choose(trial.angle * stop_gradient(part), jnp.zeros_like(width)),
+        error=progress.error + choose(trial.error, jnp.zeros_like(width)),
+        steps=count(progress.steps, accepted),
+        attempts=count(progress.attempts, is_running),
+        at_switches=count(progress.at_switches, hit & accepted),
+        unstable=count(progress.unstable, accepted & ~hit & trial.is_unstable),
+        place=place,
+    )
+    if turn is not None and undefined is not None and trial.wrong_levels is not None:
+        progress_after, storage = _apply_switch(
+            motion,
+            options,
+            progress,
+            progress_after,
+            storage,
+            attempt,
+            turn,
+            trial.wrong_levels,
+            accepted,
+            width,
+            start,
+        )
+        snaps = undefined.snaps[None] & undefined.flips
+        progress_after = progress_after._replace(
+            levels=jnp.where(snaps, 1 - progress.levels, progress_after.levels),
+            just_turned=jnp.where(snaps, 1, progress_after.just_turned),
+            needs_rates=progress_after.needs_rates | undefined.snaps,
+        )
+    return progress_after._replace(
+        outcome=_outcome(options, progress_after, is_running, length, ratio, eps)
+    ), storage
+
+
+def _first_width(
+    motion: Motion, options: LoopOptions, y: Array, rate: Array, length: Array
+) -> Array:
+    _, natural_rate = motion.units(motion.unit_data, list(y), list(rate))
+    return (
+        control.FIRST_WIDTH
+        * options.rtol.astype(y.dtype) ** (1 / (motion.rule.order + 1))
+        / jnp.maximum(natural_rate, 1 / length)
+    )
+
+
+def _width(progress: Progress, length: Array, is_running: Array, eps: float) -> tuple[Array, Array]:
+    """Width of the step, and whether it leads to the last time."""
+    remaining = length - progress.elapsed
+    is_last = remaining <= progress.width * (1 + 1e-9)
+    # no step is much shorter than its neighbours for the sake of the end
+    width = jnp.where(is_last, remaining, jnp.minimum(progress.width, remaining / 2))
+    # the width is the difference of two representable times: otherwise rounding of the sum would
+    # accumulate over thousands of steps
+    end = progress.elapsed + width
+    exact = jax.lax.stop_gradient(end - progress.elapsed - width) + width
+    exact = jnp.maximum(exact, eps * end)
+    return jnp.where(is_running, jnp.where(is_last, remaining, exact), 0), is_last
+
+
+def _error_and_tolerance(motion, options, progress, attempt, width, length, eps):
+    """Error of a step [rad], its tolerance, the angle of the step [rad], and whether its width is
+    one that stability allows just so."""
+    rule = motion.rule
+    first_rates, last_rates = attempt.stages[0], attempt.stages[rule.stages - 1]
+    change = weighted(rule.weights[rule.stages - 1], attempt.h[None, None] * attempt.stages)
+    ends = (progress.y, first_rates), (progress.y + change, last_rates)
+    (weights, rate), (end_weights, end_rate) = (
+        motion.units(motion.unit_data, list(y), list(f)) for y, f in ends
+    )
+    weights = [jnp.minimum(a, b) for a, b in zip(weights, end_weights)]
+    rate = jnp.maximum(rate, end_rate)
+
+    def length_of(stage_weights):
+        return weighted_length(
+            weights, list(attempt.h[None] * weighted(stage_weights, attempt.stages))
+        )
+
+    error, *lower_order_errors = map(length_of, rule.errors)
+    # Both estimates of DOP853 are far above the error of its result; their combination falls with
+    # the order of the result, so that the width is chosen by the right power.
+    if lower_order_errors:  # of two estimates as in DOP853, of higher order than either
+        combined_error = jnp.sqrt(
+            error * error + 0.01 * lower_order_errors[0] * lower_order_errors[0]
+        )
+        error = error * jnp.where(
+            combined_error > 0, error / jnp.where(combined_error > 0, combined_error, 1), 0
+        )
+    # The combination is far too small where the first estimate vanishes by chance, as it may where
+    # something narrow lies within the step; the difference does not vanish at the same place.
+    if rule.difference is not None:
+        error = error + control.SIXTH_DIFFERENCE * length_of(rule.difference)
+    angle = rate * width
+    total_angle = jnp.maximum(progress.angle + rate * (length - progress.elapsed), 1)
+    drift_ratio = jnp.maximum(total_angle / control.DRIFT_ANGLE, 1)
+    drift = jnp.sqrt(drift_ratio * jnp.sqrt(drift_ratio))
+    tolerance = (
+        control.EXPLICIT_SHARE * options.rtol.astype(error.dtype) * angle / (total_angle * drift)
+    )
+    tolerance = jnp.maximum(tolerance, control.ROUNDED_STEP * eps)
+    sound = jnp.isfinite(error) & jnp.isfinite(angle)
+    error, tolerance, angle = (
+        jnp.where(sound, x, y) for x, y in ((error, jnp.inf), (tolerance, 1), (angle, 0))
+    )
+    # The last two stages stand at the same time: the change of their rates over that of their
+    # states is the fastest rate of decay or growth (Hairer & Wanner, Solving Ordinary Differential
+    # Equations II, section IV.2).
+    apart = [rule.weights[k] for k in (rule.stages - 2, rule.stages - 1)]
+    moved = list(attempt.h[None] * weighted(apart[1] - apart[0], attempt.stages))
+    change = list(attempt.h[None] * (last_rates - attempt.stages[rule.stages - 2]))
+    moved, change = weighted_length(weights, moved), weighted_length(weights, change)
+    return error, tolerance, angle, change > control.NEAR_STABILITY * rule.stability * moved
+
+
+def _save(
+    attempt: Attempt, progress: Progress, storage: Storage, ts, start, elapsed, width
+) -> tuple[Storage, Array]:
+    """Store the samples up to ``elapsed`` (B,); the index of the next one."""
+    size = ts.shape[0]
+    base = (size + 1) * jnp.arange(width.shape[0], dtype=progress.place.dtype)
+
+    def is_due(place):
+        return (place < size) & (jnp.abs(column(ts, place) - start) <= elapsed)
+
+    # One sample of each body at a time. To evaluate all times of the whole motion by their step
+    # afterwards, as diffrax's dense output does, would need the stages of all steps in memory.
+    def store_one(carry):
+        place, samples = carry
+        is_stored = is_due(place)
+        x = (jnp.abs(column(ts, place) - start) - progress.elapsed) / jnp.where(width > 0, width, 1)
+        y = dense_state(progress.y, attempt.dense, jnp.minimum(x, 1))
+        samples = put(samples, base + jnp.where(is_stored, place, size), y.T)
+        return place + jnp.where(is_stored, 1, 0).astype(place.dtype), samples
+
+    place, samples = jax.lax.while_loop(
+        lambda c: any_of(jnp.where(is_due(c[0]), 1.0, 0.0)),
+        store_one,
+        (progress.place, storage.samples),
+    )
+    return storage._replace(samples=samples), place
+
+
+def _apply_switch(
+    motion,
+    options,
+    progress,
+    progress_after,
+    storage,
+    attempt,
+    turn: SwitchPoint,
+    wrong_levels,
+    accepted,
+    width,
+    start,
+):
+    """Turn the switches that were met, and store events."""
+    hit = turn.hit & accepted
+    flips = turn.flips & hit[None]
+    # a body whose levels were wrong from the start has refused the step and goes on from there
+    repaired = jnp.any(wrong_levels, axis=0) & (progress.outcome == RUNNING)
+    is_at_start = turn.part <= turn.start_fraction
+    # A switch that turns back where it has just turned: once is chance, but at a sliding surface
+    # both sides push towards it and every step is shorter than the one before. Counted, to end
+    # with a status instead of with steps of rounding.
+    is_reversal = hit & jnp.any(flips & (progress.just_turned > 0), axis=0) & is_at_start
+    end_margins = attempt.margins[motion.rule.stages - 1]
+    levels = jnp.where(flips, turn.levels, progress.levels)
+    levels = jnp.where(wrong_levels & repaired[None], attempt.new_levels, levels)
+    earlier_turns = jnp.where((hit & is_at_start)[None], progress.just_turned, 0)
+    just_turned = pick(accepted, jnp.zeros_like(progress.just_turned), progress.just_turned)
+    just_turned = pick(
+        hit, jnp.where(flips, 1, earlier_turns).astype(just_turned.dtype), just_turned
+    )
+    # not at a root: its next one is a switch as any other, however soon
+    just_turned = jnp.where(wrong_levels & repaired[None], 0, just_turned)
+    progress_after = progress_after._replace(
+        levels=levels,
+        margin=pick(
+            accepted, end_margins, pick(progress.needs_rates, attempt.margins[0], progress.margin)
+        ),
+        just_turned=just_turned.astype(progress.just_turned.dtype),
+        needs_rates=hit | repaired,
+        width=jnp.where(
+            repaired, progress.width, jnp.where(is_reversal, width / 4, progress_after.width)
+        ),
+        reversals=jnp.where(
+            is_reversal, progress.reversals + 1, jnp.where(accepted & ~hit, 0, progress.reversals)
+        ),
+    )
+    if not motion.events:
+        return progress_after, storage
+    bodies, capacity = width.shape[0], options.capacity
+    sign = jnp.where(attempt.h < 0, -1, 1)
+    base = (capacity + 1) * jnp.arange(bodies, dtype=progress_after.count.dtype)
+    count, stopped = progress_after.count, jnp.zeros_like(hit)
+    is_at_motion_start = progress_after.elapsed <= 1e-6 * jnp.abs(
+        width
+    )  # an event at the start is not one of the motion
+    # An event costs one row of margins, whatever its kind: it is located by the search for
+    # switches, and only what happens at its root is different.
+    for k in range(motion.events):
+        row = motion.switches - motion.events + k
+        rises = jnp.where(turn.levels[row] > 0, 1, -1) * sign
+        is_event = flips[row] & ~is_at_motion_start
+        if options.directions[k]:
+            is_event = is_event & (rises == options.directions[k])
+        # lanes have no branches: every body writes, those without an event into the bin
+        rows = base + jnp.where(is_event & (count < capacity), count, capacity)
+        t = start + sign * progress_after.elapsed
+        storage = storage._replace(
+            times=put(storage.times, rows, t[:, None]),
+            which=put(storage.which, rows, jnp.full((bodies, 1), k, t.dtype)),
+            states=put(storage.states, rows, progress_after.y.T),
+        )
+        count = count + jnp.where(is_event, 1, 0).astype(count.dtype)
+        if options.terminal[k]:
+            stopped = stopped | is_event
+    outcome = jnp.where(stopped, AT_EVENT, progress_after.outcome).astype(
+        progress_after.outcome.dtype
+    )
+    return progress_after._replace(count=count, outcome=outcome), storage
+
+
+def _outcome(options, progress: Progress, is_running, length, ratio, eps) -> Array:
+    """Whether each body is still running, or why not."""
+    attempts = control.ATTEMPTS * options.max_steps
+    spent = (progress.steps >= options.max_steps) | (progress.attempts >= attempts)
+    is_too_short = ~(progress.width > control.MIN_WIDTH * eps * length)
+    number = jnp.isfinite(ratio) & jnp.isfinite(progress.width)
+    why = jnp.where(is_too_short, jnp.where(number, STEP_TOO_SHORT, NOT_FINITE), RUNNING)
+    slides = progress.reversals >= control.MAX_REVERSALS
+    slides = slides | (is_too_short & number & (progress.reversals >= control.SHORT_REVERSALS))
+    why = jnp.where(slides, SLIDING, why)
+    why = jnp.where(spent, OUT_OF_STEPS, why)
+    why = jnp.where(progress.elapsed >= length, FINISHED, why)
+    why = jnp.where(progress.outcome == AT_EVENT, AT_EVENT, why)
+    return jnp.where(is_running, why, progress.outcome).astype(progress.outcome.dtype)
