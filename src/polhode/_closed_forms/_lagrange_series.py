@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from polhode._closed_forms._arithmetic import nome_per_parameter, theta3_squared_less_one
-from polhode._kernels import staged
+from polhode._kernels import opaque_ones, staged
 
 
 class Complex(NamedTuple):
@@ -232,30 +232,47 @@ def _pair_rule(primals, tangents):
 @jax.custom_jvp
 def unpaired(a: Complex, b: Complex, series: Series, one: Array) -> tuple[Complex, Complex]:
     """(a; h)(b; h), and a d/da less b d/db of it (Euler's series, DLMF 17.2.37)."""
-    first = _derivative_of(series.weights)
-    x, y = _polynomial(a, series.weights), _polynomial(b, series.weights)
-    dx, dy = a * _polynomial(a, first), b * _polynomial(b, first)
-    x, y, dx, dy = staged((x, y, dx, dy), one)
+    both, weights = _both(a, b), _for_both(series.weights)
+    value = _polynomial(both, weights)
+    derivative = both * _polynomial(both, _derivative_of(weights))
+    value, derivative = staged((value, derivative), rows_of_ones(2, one))
+    (x, y), (dx, dy) = ((v.at(0), v.at(1)) for v in (value, derivative))
     return x * y, dx * y - x * dy
+
+
+def _both(a: Complex, b: Complex) -> Complex:
+    """Two numbers along a new first axis: formulas of both stand in the program once."""
+    return jax.tree.map(lambda x, y: jnp.stack([x, y]), a, b)
+
+
+def _for_both(weights: tuple[Array, ...]) -> list[Array]:
+    return [w[None] for w in weights]
+
+
+def rows_of_ones(rows: int, x: Array) -> Array:
+    """Ones (rows, *x.shape) that are no broadcast to XLA, of one body neither."""
+    scale = jnp.arange(1, rows + 1, dtype=x.dtype)
+    return opaque_ones(x[None] * scale.reshape(-1, *(1,) * x.ndim))
 
 
 @unpaired.defjvp
 def _unpaired_rule(primals, tangents):
     a, b, series, one = primals
     da, db, dh = *tangents[:2], tangents[2].h
-
-    def parts(a):
-        first = _derivative_of(series.weights)
-        value, derivative = _polynomial(a, series.weights), _polynomial(a, first)
-        second_derivative = derivative + a * _polynomial(a, _derivative_of(first))
-        by_h = (
-            _polynomial(a, series.derivatives),
-            a * _polynomial(a, _derivative_of(series.derivatives)),
-        )
-        return staged((value, derivative, a * derivative, second_derivative, *by_h), one)
-
-    x, x1, dx, dx1, xh, dxh = parts(a)
-    y, y1, dy, dy1, yh, dyh = parts(b)
+    both, weights = _both(a, b), _for_both(series.weights)
+    h_weights, first = _for_both(series.derivatives), _derivative_of(weights)
+    value, derivative = _polynomial(both, weights), _polynomial(both, first)
+    second_derivative = derivative + both * _polynomial(both, _derivative_of(first))
+    by_h = (
+        _polynomial(both, h_weights),
+        both * _polynomial(both, _derivative_of(h_weights)),
+    )
+    parts = staged(
+        (value, derivative, both * derivative, second_derivative, *by_h), rows_of_ones(2, one)
+    )
+    (x, x1, dx, dx1, xh, dxh), (y, y1, dy, dy1, yh, dyh) = (
+        [v.at(k) for v in parts] for k in range(2)
+    )
     of_value = x1 * y, x * y1, xh * y + x * yh
     of_twist = (
         dx1 * y - x1 * dy,
