@@ -270,7 +270,7 @@ def parts(folder: Path, bodies: int = 262_144) -> dict:
 
     def run(name: str, *words: object) -> list:
         store = folder / f"{name}.zarr"
-        return ["polhode.cli", "run", scene, "-o", store, "--chunk", 8192, "-q", *words]
+        return ["polhode", "run", scene, "-o", store, "--chunk", 8192, "-q", *words]
 
     def clock(name: str, commands: list) -> None:
         """Wall time, and the processor time of the slowest process of each group."""

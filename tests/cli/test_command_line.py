@@ -416,7 +416,7 @@ def test_interrupt_of_a_running_process_leaves_nothing_half_written(here):
     command = [
         sys.executable,
         "-m",
-        "polhode.cli",
+        "polhode",
         "run",
         "top.toml",
         "-o",

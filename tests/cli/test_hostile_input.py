@@ -385,7 +385,7 @@ def test_a_damaged_cache_is_no_error(here):
     """In processes of their own: what is compiled is shared within one."""
     environment = os.environ | {"POLHODE_CACHE": str(here / "kept")}
     environment.pop("JAX_COMPILATION_CACHE_DIR", None)
-    command = [sys.executable, "-m", "polhode.cli", "run", "free.toml", "--no-figure", "-q"]
+    command = [sys.executable, "-m", "polhode", "run", "free.toml", "--no-figure", "-q"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     kept = list((here / "kept").rglob("*-cache"))

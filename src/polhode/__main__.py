@@ -1,4 +1,4 @@
-"""`python -m polhode.cli`: the same as the `polhode` command."""
+"""`python -m polhode`: the same as the `polhode` command."""
 
 from polhode.cli import command
 
