@@ -17,14 +17,14 @@ from polhode._integrate._explicit_step import (
 from polhode._integrate._tableau import Tableau
 from polhode._kernels import any_of
 
-LOCATED_JUMP, LOCATED_KINK, LOCATED_ROOT = 1e-4, 10.0, 0.1
+LOCATED_JUMP, LOCATED_KINK, LOCATED_ROOT = 1e-4, 1.0, 0.1
 """Width of the bracket of a switch of the field, relative to the step: times ``rtol`` at a jump,
 and at a kink, there at most ``LOCATED_ROOT`` times its square root. A step beyond a jump adds an
 error of the change of the rates times this width, one beyond a kink of its square: both are far
 below the error of a step. Derivatives through a kink are off by the width itself, so that the root
-alone, which is enough from 1e-4 on, would leave errors of 100 ``rtol`` at 1e-10. With a tenth of
-``rtol`` at kinks too, gradients through networks of relu have the same errors and take a tenth more
-time."""
+alone, which is enough from 1e-2 on, would leave errors of 100 ``rtol`` at 1e-10. With ten times
+``rtol`` gradients through networks of relu take as long, and with a tenth of it a tenth more time;
+their errors are the same."""
 
 _TRIES = 2
 """Evaluations below the root after which the upper end of the bracket is checked."""
