@@ -342,6 +342,20 @@ MUTANTS = (
         ("solvers/test_switches.py::test_the_gradient_through_a_kink_keeps_a_tight_tolerance",),
     ),
     Mutant(
+        TURN,
+        "reach = jnp.where(moves, reach, 0)",
+        "reach = jnp.where(moves, 0.0, 0)",
+        "a switch turns where the field of its other side is undefined",
+        ("solvers/test_switches.py::test_roots_of_a_size_that_passes_zero",),
+    ),
+    Mutant(
+        TURN,
+        "proposed = jnp.where(snaps, reach, proposed)",
+        "proposed = jnp.where(snaps, guess, proposed)",
+        "the first step from a point of infinite slope is long, and derivatives are wrong",
+        ("solvers/test_switches.py::test_roots_of_a_size_that_passes_zero",),
+    ),
+    Mutant(
         STEPS,
         "weight = jnp.sum(cotangent * (rates_after - rates_before), axis=0)",
         "weight = jnp.sum(cotangent * (rates_before - rates_after), axis=0)",

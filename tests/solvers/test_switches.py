@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from jax.extend.core import Primitive
 from scipy.integrate import solve_ivp
+from scipy.optimize import brentq
 
 import polhode as ph
 from polhode import rotation
@@ -448,6 +449,44 @@ def test_a_side_beyond_which_the_field_is_no_number():
     found = ph.simulate(scene, ph.State(WXYZ, [0.0, 0.0, 1.0]), [0.0, 5.0])
     met = 2 / 0.3 * (1 - np.log(2))  # dw/dt = -0.3 (1 + sqrt(w)), then -0.3
     np.testing.assert_allclose(found.omega_body[1, 2], -0.3 * (5 - met), rtol=1e-8)
+
+
+def _root_time(s):
+    """Time in which dw/dt = -(1 + sqrt(abs(w))) leads from w = s^2 to 0."""
+    return 2 * (s - np.log1p(s))
+
+
+FIRST, SPAN = np.sqrt(0.5), 3.0
+REST = SPAN - _root_time(FIRST)
+LAST = brentq(lambda s: _root_time(s) - REST, 0, 10, xtol=1e-15)
+ROOTS = {
+    "root": (lambda t, w, x: -(1 + jnp.sqrt(jnp.abs(w))), -(LAST**2), (1 + LAST) / (1 + FIRST)),
+    "jump": (
+        lambda t, w, x: -jnp.where(w > 0, 1 + jnp.sqrt(jnp.where(w > 0, w, 1)), 0.5),
+        -0.5 * REST,
+        0.5 / (1 + FIRST),
+    ),
+    "time": (lambda t, w, x: jnp.sqrt(jnp.abs(t - 2 * x)), 0.5 + (2 + 4 * 2**0.5) / 3, 3 - 8**0.5),
+}
+"""Rates of change, which no step can continue beyond the switch: w at the end from 0.5, and its
+derivative by x, the start and a parameter."""
+
+
+@pytest.mark.parametrize("kind", ROOTS)
+def test_roots_of_a_size_that_passes_zero(kind):
+    """The side after the switch is no number before it either, and its slope is infinite there."""
+    rate, last, slope = ROOTS[kind]
+
+    def end(x):
+        law = ph.FeedbackTorque(lambda t, q, w: rate(t, w[2], x) * jnp.array([0.0, 0, 1]))
+        scene = ph.Scene(ph.Inertia.spherical(1.0), None, law)
+        state = ph.State(WXYZ, x * jnp.array([0.0, 0, 1]))
+        return ph.simulate(scene, state, [0.0, SPAN], rtol=1e-8).last.omega_body[2]
+
+    value, reverse = jax.jit(jax.value_and_grad(end))(0.5)
+    np.testing.assert_allclose(value, last, rtol=1e-8)
+    np.testing.assert_allclose(reverse, slope, atol=1e-4)
+    np.testing.assert_allclose(jax.jvp(end, (0.5,), (1.0,))[1], slope, atol=1e-4)
 
 
 @pytest.mark.slow

@@ -48,7 +48,7 @@ from polhode._integrate._loop import (
     run,
     solve,
 )
-from polhode._integrate._turn import FINISHED, advance
+from polhode._integrate._turn import FINISHED, advance, snap_reach
 from polhode._kernels import any_of, attached, is_slope, kernel, linear, most_of, zeros
 
 
@@ -369,8 +369,14 @@ def _step_back(
     sign = jnp.where(times[-1] < start, -1, 1).astype(cotangent.dtype)
     t = start + sign * note.elapsed
     h = sign * (after.elapsed - note.elapsed)
-    live = finished & ((h != 0) | jnp.any(note.levels != after.levels, axis=0))
-    h = jnp.where(live, h, 0)
+    has_turned = jnp.any(note.levels != after.levels, axis=0)
+    # Past a switch beyond which the field is undefined on the side held, the state moves without a
+    # step: see `_snap` in `_turn.py`.
+    length, eps = jnp.abs(times[-1] - start), float(jnp.finfo(cotangent.dtype).eps)
+    is_snap = has_turned & (jnp.abs(h) <= 2 * snap_reach(note.elapsed, length, eps))
+    live = finished & ((h != 0) | has_turned)
+    end = t + h
+    h = jnp.where(live & ~is_snap, h, 0)
 
     def rates_of(parameters, levels, t, y):
         coefficients = list(motion.coefficients)
@@ -381,7 +387,7 @@ def _step_back(
     values = [motion.coefficients[k] for k in floats]
     if motion.jumps:
         pulled, parameter_cotangents = _jump_back(
-            rates_of, values, motion, note, after, later, t + h, cotangent, live
+            rates_of, values, motion, note, after, later, end, cotangent, live, is_snap
         )
         # levels corrected without a step belong to the turn before, of the same time
         is_correction = (after.elapsed == note.elapsed) & (note.elapsed > 0)
@@ -484,7 +490,9 @@ def _taken_apart(linear_map, known: list[Array]) -> tuple[list[Array], Callable]
     return [jnp.stack(group) for group in groups], rebuild
 
 
-def _jump_back(rates_of, values, motion, note: Note, after: Note, later, t, cotangent, live):
+def _jump_back(
+    rates_of, values, motion, note: Note, after: Note, later, t, cotangent, live, is_snap
+):
     """Contribution of the time of a switch that turned, to the cotangents of the state and of
     ``values`` (the saltation term)."""
     flips = note.levels != after.levels
@@ -498,7 +506,9 @@ def _jump_back(rates_of, values, motion, note: Note, after: Note, later, t, cota
     share = share / jnp.maximum(jnp.sum(share, axis=0, keepdims=True), 1)
     # Of switches that turn together each has the same share of the time: their margins vanish at
     # once only where they are the same comparison in several places, or by symmetry.
-    rates_before, *_ = rates_of(values, note.levels, t, after.y)
+    # past the switch the field of the side before it may be undefined
+    y_before = jnp.where(is_snap[None], note.y, after.y)
+    rates_before, *_ = rates_of(values, note.levels, t, y_before)
     rates_after, *_ = rates_of(values, later, t, after.y)
 
     def margin(parameters, t, y):
@@ -507,7 +517,7 @@ def _jump_back(rates_of, values, motion, note: Note, after: Note, later, t, cota
         )
 
     _, rate = jax.jvp(
-        lambda t, y: margin(values, t, y), (t, after.y), (jnp.ones_like(t), rates_before)
+        lambda t, y: margin(values, t, y), (t, y_before), (jnp.ones_like(t), rates_before)
     )
     # A margin that stands still at its root has no time that could be differentiated (grazing);
     # the derivative is then that of a motion whose switch turns at a fixed time.
@@ -515,6 +525,6 @@ def _jump_back(rates_of, values, motion, note: Note, after: Note, later, t, cota
     weight = jnp.sum(cotangent * (rates_after - rates_before), axis=0) / jnp.where(
         crosses_surface, rate, 1
     )
-    _, pull = jax.vjp(lambda parameters, y: margin(parameters, t, y), values, after.y)
+    _, pull = jax.vjp(lambda parameters, y: margin(parameters, t, y), values, y_before)
     parameter_cotangents, change = pull(jnp.where(crosses_surface, weight, 0))
     return change, parameter_cotangents

@@ -25,6 +25,7 @@ from polhode._integrate._explicit_step import (
 from polhode._integrate._field import weighted_length
 from polhode._integrate._switch_location import (
     SwitchPoint,
+    Undefined,
     first_of_jumps,
     first_switch,
     pick,
@@ -194,10 +195,13 @@ def _conclude(
         proposed = jnp.where(
             undefined.is_undefined, control.UNDEFINED_SIDE * width * share, proposed
         )
-        time = jnp.maximum(progress.elapsed, 0.01 * length)
-        is_close = width * share <= control.GRAIN * eps * time
-        undefined = undefined._replace(snaps=undefined.is_undefined & is_close)
-        proposed = jnp.where(undefined.snaps, guess, proposed)
+        grain = snap_reach(progress.elapsed, length, eps)
+        snaps = undefined.is_undefined & (width * share <= grain)
+        undefined = undefined._replace(snaps=snaps)
+        reach = jnp.minimum(jnp.maximum(2 * width * share, grain), (length - progress.elapsed) / 2)
+        # as short as the last step towards the switch: derivatives may be unbounded there
+        proposed = jnp.where(snaps, reach, proposed)
+        reach = _with_slope(reach, width * share, attempt.margins[0], undefined.flips)
     storage, place = _save(
         attempt, progress, storage, ts, start, jnp.where(accepted, elapsed, -1), width
     )
@@ -238,15 +242,52 @@ def _conclude(
             width,
             start,
         )
-        snaps = undefined.snaps[None] & undefined.flips
-        progress_after = progress_after._replace(
-            levels=jnp.where(snaps, 1 - progress.levels, progress_after.levels),
-            just_turned=jnp.where(snaps, 1, progress_after.just_turned),
-            needs_rates=progress_after.needs_rates | undefined.snaps,
-        )
+        sign = jnp.where(attempt.h < 0, -1, 1)
+        progress_after = _snap(progress, progress_after, undefined, rate_at_start, reach, sign)
     return progress_after._replace(
         outcome=_outcome(options, progress_after, is_running, length, ratio, eps)
     ), storage
+
+
+def snap_reach(elapsed: Array, length: Array, eps: float) -> Array:
+    """How near to a switch, in time, the state is moved past it (see ``_snap``)."""
+    return control.GRAIN * eps * jnp.maximum(elapsed, 0.01 * length)
+
+
+def _snap(
+    progress: Progress,
+    progress_after: Progress,
+    undefined: Undefined,
+    rate: Array,
+    reach: Array,
+    sign: Array,
+) -> Progress:
+    """Turn switches beyond which the field is undefined on the side that was held.
+
+    ``reach`` (B,): time from the start of the step to as far beyond the switch, along the ``rate``
+    (D, B); ``sign`` of time. The field of ``sqrt(abs(x))`` is undefined before the switch as soon
+    as that has turned, so the state must have passed it."""
+    snaps = undefined.snaps
+    flips = snaps[None] & undefined.flips
+    moves = snaps & jnp.all(jnp.isfinite(rate), axis=0)
+    reach = jnp.where(moves, reach, 0)
+    return progress_after._replace(
+        elapsed=progress_after.elapsed + reach,
+        y=progress_after.y + (sign * reach)[None] * jnp.where(moves[None], rate, 0),
+        levels=jnp.where(flips, 1 - progress.levels, progress_after.levels),
+        just_turned=jnp.where(flips, 1, progress_after.just_turned),
+        needs_rates=progress_after.needs_rates | snaps,
+    )
+
+
+def _with_slope(reach: Array, root: Array, margins: Array, flips: Array) -> Array:
+    """``reach`` with the derivative of the time ``root`` after which the margins (K, B) of the
+    switches ``flips`` vanish, along the secant that gave it."""
+    stop_gradient = jax.lax.stop_gradient
+    margin = jnp.sum(jnp.where(flips, margins, 0), axis=0)
+    present = stop_gradient(margin) > 0
+    relative = jnp.where(present, margin / stop_gradient(jnp.where(present, margin, 1)), 1)
+    return stop_gradient(reach) + stop_gradient(root) * (relative - 1)
 
 
 def _first_width(
