@@ -88,11 +88,11 @@ def simulate(
       than the sum of their ``capacity`` has the status ``TOO_MANY_EVENTS``. A motion in closed form
       is searched as by ``ph.crossings`` (under ``jit`` each event needs ``samples``).
     - ``throw``: whether a body that did not finish raises. None: ``ph.SimulationError`` where the
-      status is known; under ``jit``, ``vmap`` or ``grad`` nothing is raised: check
-      ``Trajectory.status``. True: there too, when the compiled program runs (by
-      ``equinox.error_if``: a RuntimeError under ``equinox.filter_jit``, an error of JAX under
-      ``jax.jit``). False: never. The states of a failed body are NaN from its failure on; for a
-      mean over the others see ``ph.successful_mean``.
+      status is known, as it is in ``jax.grad`` outside of ``jit``; under ``jit`` or ``vmap``
+      nothing is raised: check ``Trajectory.status``. True: there too, when the compiled program
+      runs (by ``equinox.error_if``: a RuntimeError under ``equinox.filter_jit``, an error of JAX
+      under ``jax.jit``). False: never. The states of a failed body are NaN from its failure on;
+      for a mean over the others see ``ph.successful_mean``.
 
     Raises ValueError or TypeError for bad input: wrong kinds or shapes, unsorted times, mixed
     dtypes, a tolerance that the dtype cannot reach.

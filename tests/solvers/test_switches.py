@@ -489,6 +489,25 @@ def test_roots_of_a_size_that_passes_zero(kind):
     np.testing.assert_allclose(jax.jvp(end, (0.5,), (1.0,))[1], slope, atol=1e-4)
 
 
+def test_derivatives_of_failed_bodies_are_no_zeros():
+    """A zero would tell an optimiser that it has arrived; the others keep their gradient."""
+
+    def last(gain, omega):
+        brake = ph.FeedbackTorque(lambda t, q, w: -gain * w * jnp.sqrt(4 - w @ w))
+        scene, state = ph.Scene(INERTIA, None, brake), ph.State(WXYZ, omega)
+        return ph.simulate(scene, state, [0.0, 5.0]).last.omega_body[..., 2]
+
+    failing, other = jnp.array([0.3, 0.6, 3.0]), jnp.array([0.1, 0.2, 0.3])
+    both = jnp.stack([failing, other])
+    reverse = jax.jit(jax.grad(lambda g, w: jnp.sum(last(g, w)), argnums=(0, 1)))
+    forward = jax.jit(jax.jacfwd(last))
+    assert all(jnp.isnan(x).all() for x in (*reverse(0.3, failing), forward(0.3, failing)))
+    np.testing.assert_allclose(reverse(0.3, both)[0], reverse(0.3, other)[0], rtol=1e-6)
+    of_failing, of_other = forward(0.3, both)
+    assert jnp.isnan(of_failing)
+    np.testing.assert_allclose(of_other, forward(0.3, other), rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_gradients_of_a_batch_through_switches():
     """Wider than a fused kernel, and in segments of four steps, as of one body."""
