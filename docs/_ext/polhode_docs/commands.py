@@ -12,7 +12,7 @@ from polhode.cli._main import app
 INTRODUCTION = """# Command line
 
 From a checkout: `pip install '.[cli]'`; ensembles need `.[cli,scale]`, runs on a dask cluster
-`.[cli,dask]`. Every command has `--help`. Progress is shown on a terminal only; `--quiet`
+`.[cli,dask]`. `python -m polhode` is the same as `polhode`. Every command has `--help`. Progress is shown on a terminal only; `--quiet`
 prints errors only.
 
 | exit code | meaning |
