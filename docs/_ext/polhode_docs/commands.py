@@ -12,8 +12,8 @@ from polhode.cli._main import app
 INTRODUCTION = """# Command line
 
 From a checkout: `pip install '.[cli]'`; ensembles need `.[cli,scale]`, runs on a dask cluster
-`.[cli,dask]`. `python -m polhode` is the same as `polhode`. Every command has `--help`. Progress is shown on a terminal only; `--quiet`
-prints errors only.
+`.[cli,dask]`. `python -m polhode` is the same as `polhode`. Every command has `--help`.
+Progress is shown on a terminal only; `--quiet` prints errors only.
 
 | exit code | meaning |
 |---|---|
