@@ -335,12 +335,8 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums, record
     )
     carry = jax.lax.while_loop(lambda c: c[2] > 0, segment, carry)
     *_, finished, _, _, cotangent, sums, _ = carry
-    # NaN if no body finished: zeros would tell an optimiser that it has arrived
-    lost = jnp.where(any_of(jnp.where(finished, 1.0, 0.0)), 0, jnp.nan)
-    return (
-        jnp.where(finished[None], cotangent, lost),
-        [jnp.where(jnp.isnan(lost), lost, x).astype(x.dtype) for x in sums],
-    )
+    any_finished = any_of(jnp.where(finished, 1.0, 0.0))
+    return jnp.where(finished[None], cotangent, 0), [jnp.where(any_finished, x, 0) for x in sums]
 
 
 _NEVER = jnp.iinfo(jnp.int32).max
