@@ -141,6 +141,8 @@ def test_step_limit_is_reported_per_body():
     traj = ph.simulate(free(), ph.State(wxyz, omega), TS, method, throw=False)
     assert traj.status.tolist() == [ph.Status.SUCCESSFUL, ph.Status.MAX_STEPS]
     assert traj.successful.tolist() == [True, False]
+    assert bool(jnp.isnan(traj.last.wxyz[1]).all())
+    assert bool(jnp.isfinite(traj.last.wxyz[0]).all())
 
 
 def test_nan_is_reported_per_body():

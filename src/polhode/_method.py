@@ -477,7 +477,10 @@ def _number(name: str, value: Any) -> float:
         ) from error
 
 
-def raise_on_failure(status: Array) -> None:
+def raise_on_failure(
+    status: Array,
+    remedy: str = "Pass throw=False to get the trajectory with its status per body.",
+) -> None:
     """SimulationError naming what happened to how many bodies, and which came first."""
     ended = np.asarray(status)
     if not ended.any():  # all Status.SUCCESSFUL
@@ -490,10 +493,7 @@ def raise_on_failure(status: Array) -> None:
             f"{len(indices)} of {ended.size} bodies (first: index {first})" if first else "the body"
         )
         lines.append(f"{which}: {Status(int(code)).explanation}")
-    raise SimulationError(
-        "; ".join(lines) + ". Pass throw=False to get the trajectory with its status per body.",
-        ended,
-    )
+    raise SimulationError(f"{'; '.join(lines)}. {remedy}", ended)
 
 
 def status_with_input_errors(

@@ -114,7 +114,7 @@ def propagate(
         scene, state, dt, t, places, method, check_rtol(rtol, dtype)
     )
     if not isinstance(status, Tracer):
-        raise_on_failure(status)
+        raise_on_failure(status, "Under jax.jit nothing is raised, and the result is NaN.")
     return Propagation(state, jacobian, noise)
 
 
@@ -206,7 +206,7 @@ def _propagated(scene, state, dt, t, places, method, rtol):
 
         noise = dt * jnp.tensordot(weights, jax.vmap(carried)(flow[1:-1, :, :n]), 1)
     wxyz, omega, speeds = end_samples
-    return State(wxyz, omega, speeds if loose else None), end, noise, status
+    return State.of_samples(wxyz, omega, speeds if loose else None), end, noise, status
 
 
 def _speeds(wheels: Wheels, t: Array, omega: Array) -> Array:

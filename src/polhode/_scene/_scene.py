@@ -84,6 +84,18 @@ class State(AbstractPart):
         self.wheel_speed = wheel_speed
 
     @classmethod
+    def of_samples(
+        cls, wxyz: Array, omega_body: Array, wheel_speed: Array | None = None
+    ) -> "State":
+        """Unit quaternions and rates that a simulation computed: unchecked, for they are NaN where
+        it failed."""
+        state = object.__new__(cls)
+        values = {"wxyz": wxyz, "omega_body": omega_body, "wheel_speed": wheel_speed}
+        for name, value in values.items():
+            object.__setattr__(state, name, value)
+        return state
+
+    @classmethod
     def from_euler(
         cls,
         phi: ArrayLike,

@@ -301,8 +301,8 @@ class Trajectory(eqx.Module):
         wxyz, omega = _sample(self.wxyz, self.omega_body, place)
         wheels = self.scene.rotors
         if not isinstance(wheels, Wheels) or wheels.is_constant:
-            return State(wxyz, omega)
-        return State(wxyz, omega, _speeds(self._without_records, place))
+            return State.of_samples(wxyz, omega)
+        return State.of_samples(wxyz, omega, _speeds(self._without_records, place))
 
     @property
     def _last_sample(self) -> "Trajectory":
