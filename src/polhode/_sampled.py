@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from polhode._checks import ArrayLike, is_concrete
+from polhode._failed import sound_state, where_lost
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts
 from polhode._plan import choose
 from polhode._scene import BodyTorque, SampledTorque, Scene, State, TorqueSum
@@ -112,12 +113,16 @@ class HeldCommands(AbstractMethod):
             samples, commands, status, steps = carry
             is_edge, span = edge_and_span
             wxyz, omega, *spins = samples
-            fresh = [law.command(span[0], wxyz, omega) for law in laws]
+            state, is_sound = sound_state(State.of_samples(wxyz, omega))
+            fresh = [law.command(span[0], state.wxyz, state.omega_body) for law in laws]
             commands = [jnp.where(is_edge, a, b) for a, b in zip(fresh, commands)]
+            spins = [jnp.where(is_sound[:, None], x, 0) for x in spins]
             segment_scene = with_initial_spins(_with_commands(scene, commands), spins)
-            result = self.method.run(segment_scene, State(wxyz, omega), span, share, final)
+            result = self.method.run(segment_scene, state, span, share, final)
             states = [
-                x[:, 0] for x in (result.wxyz, result.omega_body, result.spins) if x is not None
+                where_lost(x[:, 0], is_sound)
+                for x in (result.wxyz, result.omega_body, result.spins)
+                if x is not None
             ]
             status = jnp.where(status == Status.SUCCESSFUL, result.status.astype(jnp.int32), status)
             steps = jax.tree.map(lambda a, b: a + b.astype(a.dtype), steps, result.steps)

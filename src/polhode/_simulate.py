@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -30,7 +31,8 @@ from polhode._events import (
     events_by_steps,
     stop_at_event,
 )
-from polhode._kernels import Distinct, jit_distinct, kernel, map_chunks
+from polhode._failed import sound_state, with_gradients
+from polhode._kernels import Distinct, is_differentiated, jit_distinct, kernel, map_chunks
 from polhode._method import (
     AbstractMethod,
     Record,
@@ -204,6 +206,7 @@ def explain(
 @jit_distinct
 def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> Trajectory:
     """The compiled part: lanes out of batches, the method, and back."""
+    state, is_sound = _sound(method, scene, state, ts)
     scene, state = scene.settled(state, ts[..., 0]), state.without_wheels
     if split is None:
         samples = _motion_samples(record, method, scene, state, ts, rtol)
@@ -214,7 +217,7 @@ def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> T
     wxyz, omega, status, steps, work, error, motors, spins, saved, final = samples
     saved_times = ts[..., -1:] if record.final_only else ts
     propagator = HeldPropagator() if is_sampled(scene) else Propagator.of(method, rtol)
-    return Trajectory(
+    trajectory = Trajectory(
         saved_times,
         wxyz,
         omega,
@@ -229,16 +232,53 @@ def run(method, scene, state, ts, rtol, record, split: Split | None = None) -> T
         saved=saved,
         final=final,
     )
+    return _with_failures(trajectory, is_sound)
 
 
 @jit_distinct
 def _stopped_at(until, method, scene, state, ts, rtol) -> Trajectory:
-    return stop_at_event(_begin(method, scene, state, ts, rtol), ts, until)
+    state, is_sound = _sound(method, scene, state, ts)
+    trajectory = stop_at_event(_begin(method, scene, state, ts, rtol), ts, until)
+    return _with_failures(trajectory, is_sound)
 
 
 @jit_distinct
 def _events_met(events, method, scene, state, ts, rtol) -> Trajectory | None:
-    return events_by_steps(_begin(method, scene, state, ts, rtol), ts, events)
+    state, is_sound = _sound(method, scene, state, ts)
+    trajectory = events_by_steps(_begin(method, scene, state, ts, rtol), ts, events)
+    return None if trajectory is None else _with_failures(trajectory, is_sound)
+
+
+def _sound(method: AbstractMethod, scene: Scene, state: State, ts: Array) -> tuple[State, Array]:
+    """See ``sound_state``. Steps need few from rest; closed forms, which pass NaN on, need a state
+    for derivatives alone, and at rest select others than those that they have elsewhere."""
+    if not method.exact:
+        return sound_state(state)
+    inputs = jax.tree.leaves(eqx.filter((scene, state, ts), eqx.is_inexact_array))
+    return sound_state(state, is_differentiated(inputs), rate=1.0)
+
+
+def _with_failures(trajectory: Trajectory, is_sound: Array) -> Trajectory:
+    """The trajectory, NaN where the state was not ``is_sound``, with gradients that count the
+    bodies that finished."""
+    is_sound = jnp.broadcast_to(is_sound, trajectory.batch_shape)
+    status = jnp.where(is_sound, trajectory.status, Status.NOT_FINITE)
+    finished = (status == Status.SUCCESSFUL) | (status == Status.TOO_MANY_EVENTS)
+    any_finished = jnp.where(jnp.any(finished), 1.0, 0.0)
+    computed = jax.tree.map(
+        lambda x: (
+            with_gradients(x, is_sound, any_finished) if jnp.issubdtype(x.dtype, jnp.inexact) else x
+        ),
+        _computed(trajectory),
+    )
+    trajectory = eqx.tree_at(_computed, trajectory, computed, is_leaf=lambda x: x is None)
+    return eqx.tree_at(lambda t: t.status, trajectory, status)
+
+
+def _computed(t: Trajectory) -> list[Any]:
+    """What a trajectory holds of the bodies: arrays whose first axes are the batch."""
+    samples = [t._wxyz, t._omega_body, t._spins, t._work, t._motor_work, t._saved, t._final]
+    return [*samples, t._error, t._event_time, t._events]
 
 
 def _begin(method, scene, state, ts, rtol) -> Trajectory:

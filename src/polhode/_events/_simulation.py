@@ -26,6 +26,7 @@ from polhode._events._crossings import (
     turning_rates,
 )
 from polhode._events._event import Event
+from polhode._failed import where_lost
 from polhode._method import Record, Status
 from polhode._scene import Scene, State
 from polhode._trajectory import (
@@ -86,14 +87,19 @@ def events_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tr
         return None
     samples, record = solution
     count = ts.shape[-1]
+    at_events = [
+        x[:, count:] for x in (samples.wxyz, samples.omega_body, samples.spins) if x is not None
+    ]
+    is_known = jnp.isfinite(sum(x.sum(-1) for x in at_events))
+    wxyz, omega, *spins = (where_lost(x, is_known, 0.5) for x in at_events)
     at_events = Trajectory(
         record.rows[:, count:],
-        samples.wxyz[:, count:],
-        samples.omega_body[:, count:],
+        wxyz,
+        omega,
         samples.status,
         samples.steps,
         scene,
-        spins=None if samples.spins is None else samples.spins[:, count:],
+        spins=spins[0] if spins else None,
         propagator=propagator,
     )
     tolerance = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(at_events._t)

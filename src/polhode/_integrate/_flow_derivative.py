@@ -3,6 +3,7 @@
 Both are integrated by the extrapolated midpoint rule, with an error control of their own.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -144,6 +145,9 @@ _LOST = 1000
 
 _LOST_BY_OTHERS = 1e-3
 """The same of states found by other solvers, whose error is not known."""
+
+_AT_REST = 0.0, 0.0, 0.0, 0.5, 0.5, 0.5, 0.5
+"""Momentum and quaternion of a body at rest; from the fifth on, Euler angles."""
 
 _STEPS = 2**20
 """Most steps of a derivative between two saved times."""
@@ -307,7 +311,10 @@ class Equations:
     def _cotangent(self, at, primals, slopes):
         """The transpose: slopes with respect to the start and to ``c[i]``."""
         span, horizon, start, end, c = self._split(primals)
-        z, size = self.costate.begin(end, slopes), len(c)
+        rtol, natural_units = jax.tree.unflatten(self.control_tree, self._parts(c)[3])
+        is_lie_poisson = isinstance(natural_units, LiePoissonUnits)
+        (z, start, end, slopes), is_known, nothing = self._begin(is_lie_poisson, start, end, slopes)
+        size = len(c)
 
         def rates_and_pairing(*operands):
             rates, k = self.back(operands[:size], operands[size], operands[size + 1 :])
@@ -392,12 +399,11 @@ class Equations:
         )
         # Backwards, what damping has drawn together runs apart: where the state found on the way
         # has missed the start, the slopes found beside it mean nothing.
-        rtol, natural_units = jax.tree.unflatten(self.control_tree, self._parts(c)[3])
-        floor = natural_units.min_momentum**2 if isinstance(natural_units, LiePoissonUnits) else 0
+        floor = natural_units.min_momentum**2 if is_lie_poisson else 0
         square_miss = sum((a - b) ** 2 for a, b in zip(z[:3], start[:3]))
         unit = sum((a * a + b * b for a, b in zip(start[:3], end[:3])), start=floor)
         max_miss = _LOST * rtol if self.keeps_rtol else _LOST_BY_OTHERS
-        has_missed = jnp.asarray(square_miss > max_miss**2 * unit)
+        has_missed = jnp.asarray(square_miss > max_miss**2 * unit) & is_known
         z = [jnp.where(has_missed, jnp.nan, x) for x in z]
         mu = [
             jnp.where(
@@ -405,8 +411,28 @@ class Equations:
             )
             for m in mu
         ]
+        mu = [
+            jnp.where(is_known, m, 0) + nothing
+            if m.shape == nothing.shape
+            else m + jnp.sum(nothing)
+            for m in mu
+        ]
         mu = [_summed(m, jnp.shape(coefficients[i])) for m, i in zip(mu, which)]
-        return [*self.costate.finish(z, start, end, slopes), *pull(mu)]
+
+        start_slopes = self.costate.finish(z, start, end, slopes)
+        return [*(jnp.where(is_known, x, 0) + nothing for x in start_slopes), *pull(mu)]
+
+    def _begin(self, is_lie_poisson: bool, start, end, slopes):
+        """The state to integrate backwards, the start, the end and the slopes there, with numbers
+        in place of NaN: a body that failed is followed as one at rest. Then which bodies did not
+        fail, and what to add to all slopes: zero, or NaN where those at the end are NaN, as they
+        are if no body of the whole call finished."""
+        is_known = functools.reduce(jnp.logical_and, map(jnp.isfinite, (*start, *end)))
+        nothing = 0 * functools.reduce(jnp.add, slopes)
+        rest = [*(_AT_REST if is_lie_poisson else _AT_REST[4:]), *[0.0] * self.size]
+        start, end = ([jnp.where(is_known, x, r) for x, r in zip(y, rest)] for y in (start, end))
+        slopes = [jnp.where(is_known & (nothing == 0), x, 0) for x in slopes]
+        return (self.costate.begin(end, slopes), start, end, slopes), is_known, nothing
 
     def _solve(
         self,

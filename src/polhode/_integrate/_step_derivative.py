@@ -335,8 +335,13 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums, record
     )
     carry = jax.lax.while_loop(lambda c: c[2] > 0, segment, carry)
     *_, finished, _, _, cotangent, sums, _ = carry
-    any_finished = any_of(jnp.where(finished, 1.0, 0.0))
-    return jnp.where(finished[None], cotangent, 0), [jnp.where(any_finished, x, 0) for x in sums]
+    # NaN, not zero, where the cotangents are: no body of the whole call finished
+    nothing = 0 * jnp.sum(cotangents[0] + cotangents[-1], axis=0)
+    any_finished = jnp.sum(jnp.where(finished, 1, 0)) > 0
+    return (
+        jnp.where(finished[None], cotangent, nothing),
+        [jnp.where(any_finished, x, jnp.sum(nothing).astype(x.dtype)) for x in sums],
+    )
 
 
 _NEVER = jnp.iinfo(jnp.int32).max

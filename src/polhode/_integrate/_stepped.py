@@ -18,6 +18,7 @@ from jaxtyping import Array
 
 from polhode import _policy
 from polhode._batch import PARTS, along_time, is_lane_tree
+from polhode._failed import where_lost
 from polhode._hamiltonian import Dynamics
 from polhode._integrate._charts import AbstractChart, natural_rates
 from polhode._integrate._diffrax_solve import (
@@ -37,7 +38,7 @@ from polhode._integrate._step_derivative import samples, segment_turns
 from polhode._integrate._switches import guarded
 from polhode._integrate._tableau import TSIT5
 from polhode._integrate._turn import LoopOptions
-from polhode._kernels import Distinct, attached, is_holdable, kernel, linear, map_chunks
+from polhode._kernels import Distinct, is_holdable, kernel, map_chunks
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts, check_options
 from polhode._parts import AbstractPart
 from polhode._scene import Scene, State
@@ -427,12 +428,12 @@ class AbstractIntegration(AbstractMethod):
             spins = jnp.stack(samples[2], axis=-1)
         later = Scene(**{name: along_time(getattr(scene, name), 1) for name in PARTS})
         times = jnp.atleast_2d(times)
+        # diffrax fills the times that were not reached with inf
+        reached = jnp.isfinite(sum(jax.tree.leaves(samples)))
         wxyz, omega, _ = self.chart.finish(later, tuple(samples), times)
         *_, sound_at_end = self.chart.finish(later, tuple(end_state), times[:, -1:])
-        # diffrax fills the times that were not reached with inf
-        wxyz, omega = (
-            _nan_where_lost(x, sound[:, None, None] & jnp.isfinite(x)) for x in (wxyz, omega)
-        )
+        is_known = sound[:, None, None] & reached[..., None]
+        wxyz, omega = (where_lost(x, is_known & jnp.isfinite(x)) for x in (wxyz, omega))
         outcome = solution.status
         finite = jnp.all(jnp.isfinite(wxyz), axis=(-1, -2))
         finite = finite & jnp.all(jnp.isfinite(omega), axis=(-1, -2))
@@ -462,22 +463,6 @@ def _of_wheels(wheels, loose: Sequence[Array]) -> Array:
     values = iter(loose)
     zero = jnp.zeros_like(loose[0])
     return jnp.stack([zero if is_held else next(values) for is_held in wheels.is_held], axis=-1)
-
-
-def _nan_where_lost(x: Array, is_known: Array) -> Array:
-    """``x`` where it is known, elsewhere NaN, and so are its tangents. Cotangents are zero there:
-    a mean that leaves failed bodies out has the gradient of the others."""
-
-    def rule(operands, tangents, values):
-        def tangent(known, tangents):
-            return [jnp.where(known[0], tangents[0], jnp.nan)]
-
-        def cotangent(known, cotangents):
-            return [jnp.where(known[0], cotangents[0], 0)]
-
-        return linear(tangent, cotangent, [operands[1]], [tangents[0]], [operands[0]])
-
-    return attached(rule, [x, is_known], [jnp.where(is_known, x, jnp.nan)])[0]
 
 
 def _lanes_first(y):

@@ -11,7 +11,8 @@ from jaxtyping import Array
 
 from polhode._batch import PARTS, flatten, lane_times, map_arrays
 from polhode._checks import ArrayLike, as_float_array
-from polhode._kernels import jit_distinct
+from polhode._failed import with_gradients
+from polhode._kernels import is_differentiated, jit_distinct
 from polhode._method import AbstractMethod, Record, Status, raise_on_failure
 from polhode._scene import Scene, State, Wheels
 from polhode._trajectory._trajectory import AbstractPropagator, Trajectory
@@ -81,6 +82,10 @@ def _at_times(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
         ts, times = (lane_times(jnp.atleast_2d(x), batch) for x in (ts, times))
     times = jnp.where(jnp.isfinite(times), times, ts[..., :1])
     move = _from_first if in_order or propagator.method.exact else _from_nearest
+    # nothing is computed from a sample that is NaN where there are derivatives
+    inputs = jax.tree.leaves(eqx.filter((parts, samples, t), eqx.is_inexact_array))
+    is_sound = jnp.isfinite(sum(x.sum((-1, -2)) for x in samples)) | ~is_differentiated(inputs)
+    samples = [jnp.where(is_sound[:, None, None], x, 0.5) for x in samples]
     states, status, steps = move(propagator, Scene(**parts), samples, ts, times)
     wxyz, omega, *spins = (x.reshape(*batch, *x.shape[1:]) for x in states)
     is_finite = jnp.broadcast_to(finite, wxyz.shape[:-1])[..., None]
@@ -89,6 +94,8 @@ def _at_times(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
     good = trajectory.status == Status.SUCCESSFUL
     samples = [jnp.where(is_finite, x, jnp.nan) for x in (wxyz, omega, *spins)]
     status = jnp.where(good, status, trajectory.status)
+    any_finished = jnp.where(jnp.any(status == Status.SUCCESSFUL), 1.0, 0.0)
+    samples = [with_gradients(x, is_sound.reshape(batch), any_finished) for x in samples]
     return trajectory._with_samples(t, samples, status, steps, trajectory._event_time)
 
 
