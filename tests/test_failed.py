@@ -43,7 +43,7 @@ def simulated(scene, wxyz, omega, way):
     elif way == "until":
         motion = ph.simulate(scene, state, ts, until=ph.Event(lambda q, w, t: w[2] - 50.0))
     elif way == "saved":
-        record = ph.Record(save=lambda motion: motion.omega_body)
+        record = ph.Record(save=lambda motion: motion.omega_body * abs(motion.omega_body))
         motion = ph.simulate(scene, state, ts, record=record)
         return motion.saved[:, -1], motion.status
     else:

@@ -16,9 +16,8 @@ from polhode._scene import State
 def sound_state(
     state: State, is_needed: Array | bool = True, rate: float = 0.0
 ) -> tuple[State, Array]:
-    """The state with attitudes and rates that are NaN or infinite replaced where that
-    ``is_needed``, and which bodies (...) were finite. ``rate`` [rad/s]: about every axis in their
-    place."""
+    """The state with attitudes and rates that are NaN or infinite replaced if that ``is_needed``,
+    and which bodies (...) were finite. ``rate`` [rad/s]: about every axis in their place."""
     is_attitude, is_rate = (
         jnp.isfinite(x).all(-1) | ~jnp.asarray(is_needed) for x in (state.wxyz, state.omega_body)
     )

@@ -250,12 +250,10 @@ def _events_met(events, method, scene, state, ts, rtol) -> Trajectory | None:
 
 
 def _sound(method: AbstractMethod, scene: Scene, state: State, ts: Array) -> tuple[State, Array]:
-    """See ``sound_state``. Steps need few from rest; closed forms, which pass NaN on, need a state
-    for derivatives alone, and at rest select others than those that they have elsewhere."""
-    if not method.exact:
-        return sound_state(state)
+    """See ``sound_state``, where derivatives are computed: values that are NaN pass through every
+    method. Steps need few from rest; closed forms select others there than elsewhere."""
     inputs = jax.tree.leaves(eqx.filter((scene, state, ts), eqx.is_inexact_array))
-    return sound_state(state, is_differentiated(inputs), rate=1.0)
+    return sound_state(state, is_differentiated(inputs), rate=1.0 if method.exact else 0.0)
 
 
 def _with_failures(trajectory: Trajectory, is_sound: Array) -> Trajectory:

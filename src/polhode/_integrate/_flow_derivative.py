@@ -313,8 +313,13 @@ class Equations:
         span, horizon, start, end, c = self._split(primals)
         rtol, natural_units = jax.tree.unflatten(self.control_tree, self._parts(c)[3])
         is_lie_poisson = isinstance(natural_units, LiePoissonUnits)
-        (z, start, end, slopes), is_known, nothing = self._begin(is_lie_poisson, start, end, slopes)
-        size = len(c)
+        # A body that failed is followed from rest, as NaN would reach what all bodies share, and
+        # adds nothing: zero, or NaN where its slopes are NaN, as they are if no body finished.
+        is_known = functools.reduce(jnp.logical_and, map(jnp.isfinite, (*start, *end)))
+        nothing = 0 * functools.reduce(jnp.add, slopes)
+        rest = [*(_AT_REST if is_lie_poisson else _AT_REST[4:]), *[0.0] * self.size]
+        end = [jnp.where(is_known, x, r) for x, r in zip(end, rest)]
+        z, size = self.costate.begin(end, slopes), len(c)
 
         def rates_and_pairing(*operands):
             rates, k = self.back(operands[:size], operands[size], operands[size + 1 :])
@@ -421,18 +426,6 @@ class Equations:
 
         start_slopes = self.costate.finish(z, start, end, slopes)
         return [*(jnp.where(is_known, x, 0) + nothing for x in start_slopes), *pull(mu)]
-
-    def _begin(self, is_lie_poisson: bool, start, end, slopes):
-        """The state to integrate backwards, the start, the end and the slopes there, with numbers
-        in place of NaN: a body that failed is followed as one at rest. Then which bodies did not
-        fail, and what to add to all slopes: zero, or NaN where those at the end are NaN, as they
-        are if no body of the whole call finished."""
-        is_known = functools.reduce(jnp.logical_and, map(jnp.isfinite, (*start, *end)))
-        nothing = 0 * functools.reduce(jnp.add, slopes)
-        rest = [*(_AT_REST if is_lie_poisson else _AT_REST[4:]), *[0.0] * self.size]
-        start, end = ([jnp.where(is_known, x, r) for x, r in zip(y, rest)] for y in (start, end))
-        slopes = [jnp.where(is_known & (nothing == 0), x, 0) for x in slopes]
-        return (self.costate.begin(end, slopes), start, end, slopes), is_known, nothing
 
     def _solve(
         self,

@@ -10,6 +10,8 @@ from jaxtyping import Array, PyTree
 
 from polhode._batch import PARTS, flatten, is_lane_tree, lane_times
 from polhode._checks import require
+from polhode._failed import where_lost
+from polhode._kernels import is_differentiated
 from polhode._method import Samples
 from polhode._parts import call_traced
 from polhode._scene import Scene
@@ -21,7 +23,8 @@ _CALLED = "ph.Record(save=), called as fn(trajectory)"
 def values_of(save: Callable, scene: Scene, ts: Array, samples: Samples) -> PyTree[Array]:
     """``save`` of each of N bodies at ``ts`` (T,) or (N, T): leaves (N, T, ...).
 
-    Rows of floats are NaN where the samples of a body are not finite.
+    Rows of floats are NaN where the samples of a body are not finite; in programs of derivatives
+    all rows of such a body, for ``save`` gets numbers in place of NaN there: see ``_failed``.
     """
     lanes, shared = eqx.partition((scene, None), is_lane_tree((scene, None)))
     times, body_times = (None, ts) if ts.ndim > 1 else (ts, None)
@@ -29,6 +32,17 @@ def values_of(save: Callable, scene: Scene, ts: Array, samples: Samples) -> PyTr
 
     def of_body(lanes, own_times, x: Samples):
         scene, _ = eqx.combine(lanes, shared)
+        states = [y for y in (x.wxyz, x.omega_body, x.spins) if y is not None]
+        finite = jnp.isfinite(sum(y.sum(-1) for y in states))
+        needs_numbers = is_differentiated(states) & ~finite.all()
+        x = x._replace(
+            **{
+                name: where_lost(y, finite | ~needs_numbers, 0.5)
+                for name, y in x._asdict().items()
+                if name in ("wxyz", "omega_body", "spins") and y is not None
+            }
+        )
+        finite = finite & ~needs_numbers
         body = Trajectory(
             own_times if times is None else times,
             x.wxyz,
@@ -42,14 +56,11 @@ def values_of(save: Callable, scene: Scene, ts: Array, samples: Samples) -> PyTr
             x.spins,
         )
         values = _checked(call_traced(_CALLED, "", save, body), body.ts.shape[-1])
-        finite = jnp.ones(body.ts.shape, bool)
-        for sample in body._samples:
-            finite = finite & jnp.all(jnp.isfinite(sample), axis=-1)
 
         def masked(value):
             if not jnp.issubdtype(value.dtype, jnp.inexact):
                 return value
-            return jnp.where(finite.reshape(-1, *(1,) * (value.ndim - 1)), value, jnp.nan)
+            return where_lost(value, finite)
 
         return jax.tree.map(masked, values)
 
