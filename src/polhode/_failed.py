@@ -1,9 +1,11 @@
-"""Bodies that failed: their samples and tangents are NaN, and what they contribute to gradients.
+"""Bodies that failed: samples and tangents of NaN, and no contribution to gradients.
 
-Zero, as long as another body of the call finished, so that a loss that leaves failed bodies out has
-the gradient of the others. If none finished the gradient is NaN: zeros would tell an optimiser that
-it has arrived. For both, no state that is NaN may be in a program of derivatives: a cotangent of
-zero times NaN is NaN, and reaches the parameters that all bodies share.
+A failed body contributes zero, so that a loss that leaves it out has the gradient of the others. If
+no body of a call finished, the gradient is NaN: zeros would tell an optimiser that it has arrived.
+
+A cotangent of zero is not enough for that: zero times a state that is NaN is NaN, and the sum over
+the bodies carries it to every parameter that they share. So programs of derivatives compute with
+numbers in place of NaN, and put NaN back into their results.
 """
 
 import jax.numpy as jnp
@@ -16,8 +18,8 @@ from polhode._scene import State
 def sound_state(
     state: State, is_needed: Array | bool = True, rate: float = 0.0
 ) -> tuple[State, Array]:
-    """The state with attitudes and rates that are NaN or infinite replaced if that ``is_needed``,
-    and which bodies (...) were finite. ``rate`` [rad/s]: about every axis in their place."""
+    """The state with numbers in place of NaN and infinity if that ``is_needed``, and which bodies
+    (...) were finite. ``rate`` [rad/s]: about every axis, in place of such rates."""
     is_attitude, is_rate = (
         jnp.isfinite(x).all(-1) | ~jnp.asarray(is_needed) for x in (state.wxyz, state.omega_body)
     )
@@ -49,10 +51,10 @@ def where_lost(x: Array, is_known: Array, value: float = jnp.nan) -> Array:
 
 
 def with_gradients(x: Array, is_sound: Array, any_finished: Array) -> Array:
-    """``x``, NaN with its tangents for bodies that are not ``is_sound``, with cotangents of zero
-    where it is NaN or infinite, and of NaN if no body has finished.
+    """``x``, NaN with its tangents for bodies that are not ``is_sound``. Its cotangents are zero
+    where it is NaN or infinite, and NaN everywhere if no body finished.
 
-    One value of a motion at a time: cotangents that nobody asks for are not computed.
+    Each array of a trajectory by itself: only the cotangents that a gradient needs are computed.
     """
     mask = jnp.expand_dims(is_sound, tuple(range(is_sound.ndim, x.ndim)))
 

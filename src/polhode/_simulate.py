@@ -250,15 +250,18 @@ def _events_met(events, method, scene, state, ts, rtol) -> Trajectory | None:
 
 
 def _sound(method: AbstractMethod, scene: Scene, state: State, ts: Array) -> tuple[State, Array]:
-    """See ``sound_state``, where derivatives are computed: values that are NaN pass through every
-    method. Steps need few from rest; closed forms select others there than elsewhere."""
+    """``sound_state`` in programs of derivatives; in others NaN passes through every method.
+
+    Integrated, a body at rest takes few steps. Closed forms have formulas of their own for rest, so
+    there the body turns.
+    """
     inputs = jax.tree.leaves(eqx.filter((scene, state, ts), eqx.is_inexact_array))
     return sound_state(state, is_differentiated(inputs), rate=1.0 if method.exact else 0.0)
 
 
 def _with_failures(trajectory: Trajectory, is_sound: Array) -> Trajectory:
-    """The trajectory, NaN where the state was not ``is_sound``, with gradients that count the
-    bodies that finished."""
+    """The trajectory, NaN where the initial state was not ``is_sound``, with gradients of the
+    bodies that finished: see ``_failed``."""
     is_sound = jnp.broadcast_to(is_sound, trajectory.batch_shape)
     status = jnp.where(is_sound, trajectory.status, Status.NOT_FINITE)
     finished = (status == Status.SUCCESSFUL) | (status == Status.TOO_MANY_EVENTS)
