@@ -49,6 +49,9 @@ CROSSINGS, RESIDUALS = "_events/_crossings.py", "fit/_residuals.py"
 LIGHT, PROPAGATE = "lightcurve/_brightness.py", "_propagate.py"
 MOMENTS, QUATERNION = "inertia/_physical.py", "rotation/_quaternion.py"
 
+FAILED, CHARTS, HELD = "_failed.py", "_integrate/_charts.py", "_sampled.py"
+
+OTHERS = "test_failed.py::test_a_gradient_is_that_of_the_bodies_that_finished[batch-"
 BALANCE = "torques/test_energy_balance.py::test_energy_grows_by_the_power_from_outside"
 
 MUTANTS = (
@@ -340,6 +343,48 @@ MUTANTS = (
         "kink = LOCATED_ROOT * jnp.sqrt(rtol)",
         "kinks are located to the root of the tolerance, and so are derivatives through them",
         ("solvers/test_switches.py::test_the_gradient_through_a_kink_keeps_a_tight_tolerance",),
+    ),
+    Mutant(
+        FAILED,
+        "nothing = jnp.where(any_finished, 0, jnp.nan)",
+        "nothing = jnp.where(any_finished, 0, 0.0)",
+        "a gradient of zero where all bodies failed",
+        (OTHERS + "kinks, overflow]",),
+    ),
+    Mutant(
+        CHARTS,
+        "numbers(jnp.stack(group, axis=-1), 1.0) for group in y",
+        "jnp.stack(group, axis=-1) for group in y",
+        "a failed body makes the gradient by the moments NaN",
+        (OTHERS + "kinks, overflow]",),
+    ),
+    Mutant(
+        FLOW,
+        "jnp.where(is_known, x, r) for x, r in zip(end, rest)",
+        "x for x in end",
+        "a failed body makes gradients through a matrix NaN",
+        (OTHERS + "steps too short, a matrix]",),
+    ),
+    Mutant(
+        FLOW,
+        "(jnp.where(is_known, x, 0) + nothing for x in start_slopes)",
+        "(x + nothing for x in start_slopes)",
+        "a failed body makes gradients of a batch NaN",
+        (OTHERS + "weight, overflow]",),
+    ),
+    Mutant(
+        STEPS,
+        "jnp.where(any_finished, x, jnp.sum(nothing).astype(x.dtype))",
+        "jnp.where(any_finished, x, 0.0)",
+        "a gradient of zero where all bodies failed",
+        (OTHERS + "kinks, overflow]",),
+    ),
+    Mutant(
+        HELD,
+        "is_used = is_defined | ~is_differentiated([wxyz, omega])",
+        "is_used = is_defined | True",
+        "a command that is not defined makes the gradient of the law NaN",
+        (OTHERS + "undefined at a command]",),
     ),
     Mutant(
         TURN,

@@ -50,6 +50,26 @@ def where_lost(x: Array, is_known: Array, value: float = jnp.nan) -> Array:
     return attached(rule, [x, is_known], [jnp.where(is_known, x, value)])[0]
 
 
+def numbers(x: Array, value: float) -> Array:
+    """``x``, where it is differentiated with ``value`` in place of NaN and infinity and tangents of
+    zero there. Cotangents pass unchanged: see ``with_gradients``."""
+
+    def again(operands):
+        is_known = jnp.isfinite(operands[0])
+        return [jnp.where(is_known, operands[0], value)], is_known
+
+    def rule(operands, tangents, values, is_known):
+        def tangent(known, tangents):
+            return [jnp.where(known[0], tangents[0], 0)]
+
+        def cotangent(known, cotangents):
+            return cotangents
+
+        return linear(tangent, cotangent, [is_known], [tangents[0]], values)
+
+    return attached(rule, [x], [x], again)[0]
+
+
 def with_gradients(x: Array, is_sound: Array, any_finished: Array) -> Array:
     """``x``, NaN with its tangents for bodies that are not ``is_sound``. Its cotangents are zero
     where it is NaN or infinite, and NaN everywhere if no body finished.

@@ -11,6 +11,7 @@ from jaxtyping import Array
 
 from polhode._checks import ArrayLike, is_concrete
 from polhode._failed import sound_state, where_lost
+from polhode._kernels import is_differentiated
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts
 from polhode._plan import choose
 from polhode._scene import BodyTorque, SampledTorque, Scene, State, TorqueSum
@@ -109,12 +110,15 @@ class HeldCommands(AbstractMethod):
         laws = [x for x in _terms(scene.torque) if isinstance(x, SampledTorque)]
         final = Record(final_only=True)
 
+        def commanded(t, state):
+            return [law.command(t, state.wxyz, state.omega_body) for law in laws]
+
         def segment(carry, edge_and_span):
             samples, commands, status, steps = carry
             is_edge, span = edge_and_span
             wxyz, omega, *spins = samples
-            state, is_sound = sound_state(State.of_samples(wxyz, omega))
-            fresh = [law.command(span[0], state.wxyz, state.omega_body) for law in laws]
+            state, is_sound = _commandable(commanded, span[0], wxyz, omega)
+            fresh = commanded(span[0], state)
             commands = [jnp.where(is_edge, a, b) for a, b in zip(fresh, commands)]
             spins = [jnp.where(is_sound[:, None], x, 0) for x in spins]
             segment_scene = with_initial_spins(_with_commands(scene, commands), spins)
@@ -124,7 +128,8 @@ class HeldCommands(AbstractMethod):
                 for x in (result.wxyz, result.omega_body, result.spins)
                 if x is not None
             ]
-            status = jnp.where(status == Status.SUCCESSFUL, result.status.astype(jnp.int32), status)
+            ended = jnp.where(is_sound, result.status, Status.NOT_FINITE).astype(jnp.int32)
+            status = jnp.where(status == Status.SUCCESSFUL, ended, status)
             steps = jax.tree.map(lambda a, b: a + b.astype(a.dtype), steps, result.steps)
             return (states, commands, status, steps), states
 
@@ -147,6 +152,16 @@ class HeldCommands(AbstractMethod):
             steps,
             spins=spins[0] if spins else None,
         )
+
+
+def _commandable(commanded, t: Array, wxyz: Array, omega: Array) -> tuple[State, Array]:
+    """``sound_state`` of the samples, in programs of derivatives also where a command is not
+    finite: zero times its slope would reach the parameters of the law."""
+    state, _ = sound_state(State.of_samples(wxyz, omega))
+    commands = jax.lax.stop_gradient(commanded(t, state))
+    is_defined = jnp.isfinite(sum(x.sum(-1, keepdims=True) for x in commands))
+    is_used = is_defined | ~is_differentiated([wxyz, omega])
+    return sound_state(State.of_samples(*(jnp.where(is_used, x, jnp.nan) for x in (wxyz, omega))))
 
 
 class HeldPropagator(AbstractPropagator):

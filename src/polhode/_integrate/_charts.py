@@ -13,7 +13,7 @@ from jaxtyping import Array, PyTree
 
 from polhode import rotation
 from polhode._closed_forms._lagrange_top import upward
-from polhode._failed import where_lost
+from polhode._failed import numbers
 from polhode._hamiltonian import (
     Attitude,
     Dynamics,
@@ -132,17 +132,22 @@ class LiePoissonChart(AbstractChart):
         return y, jnp.ones(wxyz.shape[0], bool)
 
     def finish(self, scene, y, t):
-        momentum, wxyz = (_as_numbers(jnp.stack(group, axis=-1)) for group in y[:2])
-        omega = scene.with_spins(*y[2:]).rates(momentum, t)
+        momentum, wxyz, *spins = _as_numbers(y)
+        omega = scene.with_spins(*map(_apart, spins)).rates(momentum, t)
         if self.upright:
             turn, _ = _upright(scene.potential)
             wxyz = _rotate(turn, wxyz)
         return rotation.normalise(wxyz), omega, jnp.ones(momentum.shape[:-1], bool)
 
 
-def _as_numbers(x: Array) -> Array:
-    """Numbers in place of NaN and inf: see ``_failed``."""
-    return where_lost(x, jnp.isfinite(x), 1.0)
+def _as_numbers(y: PyTree[Array]) -> list[Array]:
+    """The groups of a state as arrays (..., n), in programs of derivatives with numbers in place of
+    NaN: see ``_failed``."""
+    return [numbers(jnp.stack(group, axis=-1), 1.0) for group in y]
+
+
+def _apart(x: Array) -> tuple[Array, ...]:
+    return tuple(x[..., i] for i in range(x.shape[-1]))
 
 
 def _rotate(turn: Array, wxyz: Array) -> Array:
@@ -206,8 +211,7 @@ class EulerChart(AbstractChart):
         return (q, tuple(jnp.where(sound, x, 0) for x in p), *_spins(scene, state)), sound
 
     def finish(self, scene, y, t):
-        q, p = (_as_numbers(jnp.stack(group, axis=-1)) for group in y[:2])
-        q, p, spins = components(q), components(p), y[2:]
+        q, p, *spins = map(_apart, _as_numbers(y))
         momentum = jnp.stack(momentum_from_canonical(q, p), axis=-1)
         omega = scene.with_spins(*spins).rates(momentum, t)
         return euler_to_wxyz(*q), omega, _away_from_poles(q)

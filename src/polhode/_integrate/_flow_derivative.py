@@ -3,9 +3,8 @@
 Both are integrated by the extrapolated midpoint rule, with an error control of their own.
 """
 
-import functools
 from collections.abc import Callable, Sequence
-from functools import cached_property, partial
+from functools import cached_property, partial, reduce
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -146,8 +145,11 @@ _LOST = 1000
 _LOST_BY_OTHERS = 1e-3
 """The same of states found by other solvers, whose error is not known."""
 
-_AT_REST = 0.0, 0.0, 0.0, 0.5, 0.5, 0.5, 0.5
-"""Momentum and quaternion of a body at rest; from the fifth on, Euler angles."""
+_RESTING = 0.0, 0.0, 0.0, 0.5, 0.5, 0.5, 0.5
+"""Momentum and quaternion of a body at rest."""
+
+_RESTING_ANGLES = 0.5, 0.5, 0.5
+"""Euler angles of a body at rest, away from their poles; the momenta that follow are zero."""
 
 _STEPS = 2**20
 """Most steps of a derivative between two saved times."""
@@ -315,9 +317,9 @@ class Equations:
         is_lie_poisson = isinstance(natural_units, LiePoissonUnits)
         # A body that failed is followed from rest, as NaN would reach what all bodies share, and
         # adds nothing: zero, or NaN where its slopes are NaN, as they are if no body finished.
-        is_known = functools.reduce(jnp.logical_and, map(jnp.isfinite, (*start, *end)))
-        nothing = 0 * functools.reduce(jnp.add, slopes)
-        rest = [*(_AT_REST if is_lie_poisson else _AT_REST[4:]), *[0.0] * self.size]
+        is_known = reduce(jnp.logical_and, map(jnp.isfinite, (*start, *end)))
+        nothing = 0 * reduce(jnp.add, slopes)
+        rest = [*(_RESTING if is_lie_poisson else _RESTING_ANGLES), *[0.0] * self.size]
         end = [jnp.where(is_known, x, r) for x, r in zip(end, rest)]
         z, size = self.costate.begin(end, slopes), len(c)
 
@@ -416,14 +418,8 @@ class Equations:
             )
             for m in mu
         ]
-        mu = [
-            jnp.where(is_known, m, 0) + nothing
-            if m.shape == nothing.shape
-            else m + jnp.sum(nothing)
-            for m in mu
-        ]
+        mu = [m + (nothing if m.shape == nothing.shape else jnp.sum(nothing)) for m in mu]
         mu = [_summed(m, jnp.shape(coefficients[i])) for m, i in zip(mu, which)]
-
         start_slopes = self.costate.finish(z, start, end, slopes)
         return [*(jnp.where(is_known, x, 0) + nothing for x in start_slopes), *pull(mu)]
 

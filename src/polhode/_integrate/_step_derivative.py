@@ -69,10 +69,10 @@ def samples(
     order. Where derivatives are taken and ``turns`` is not zero, both are results of an integration
     that records the first ``turns`` of the loop. ``once``: refuse second derivatives."""
     leaves, tree = jax.tree.flatten(unit_data)
-    size = len(arrays)
+    size, end = len(arrays), len(arrays) + len(leaves)
 
     def problem_of(operands, differentiable=False):
-        unit_data = jax.tree.unflatten(tree, operands[size : size + len(leaves)])
+        unit_data = jax.tree.unflatten(tree, operands[size:end])
         return make(operands[:size], unit_data, differentiable)
 
     def again(operands):
