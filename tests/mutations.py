@@ -345,6 +345,13 @@ MUTANTS = (
         ("solvers/test_switches.py::test_the_gradient_through_a_kink_keeps_a_tight_tolerance",),
     ),
     Mutant(
+        PERIODS,
+        "low = rate - _cast(_cast(rate, jnp.float32), jnp.float64)",
+        "low = 0 * rate",
+        "phases in single precision lose eps times the angle",
+        ("free/test_free_motion.py::test_single_precision_keeps_its_digits_over_long_times",),
+    ),
+    Mutant(
         FAILED,
         "nothing = jnp.where(any_finished, 0, jnp.nan)",
         "nothing = jnp.where(any_finished, 0, 0.0)",

@@ -20,13 +20,11 @@ from polhode._closed_forms._free_motion import (
     Triple,
     advance,
     as_components,
-    assign_roles,
     attitude_at,
     body_rates,
-    polhode_constants,
-    precession_constants,
+    motion_constants,
 )
-from polhode._closed_forms._free_periods import compensate
+from polhode._closed_forms._free_periods import compensated_constants
 from polhode._closed_forms._free_tangent import Quadruple
 from polhode._kernels import computed_once, kernel, map_chunks
 from polhode._method import Record, Samples, Status, StepCounts
@@ -42,10 +40,10 @@ class ClosedForm(AbstractClosedForm):
     few units in the last place of the phase. ``chunk`` bounds the bodies times samples worked on at
     once; None: chosen by the library. Steps are reported as 0.
 
-    ``compensated``: frequencies in sums of two floats (double-double in float64), so that over a
-    long horizon the error no longer grows with the phase. It costs a few hundred nanoseconds per
-    body, and 2 per sample, and no digit elsewhere. Bodies within 1e-15 of the separatrix or of a
-    symmetry, or known to be symmetric, have none of it.
+    ``compensated``: frequencies in sums of two floats, so that over a long horizon the error no
+    longer grows with the phase. It costs a few hundred nanoseconds per body, and 2 per sample, and
+    no digit elsewhere. In float64, bodies within 1e-15 of the separatrix or of a symmetry have none
+    of it, nor do those known to be symmetric.
     """
 
     chunk: int | None = eqx.field(static=True, default=None)
@@ -189,12 +187,8 @@ def prepare(moments, wxyz, omega, products=None, *, compensated: bool = False) -
     moments, omega = as_components(moments, 3), as_components(omega, 3)
     products = None if products is None else as_components(products, 3)
     wxyz = None if wxyz is None else as_components(wxyz, 4)
-    roles = assign_roles(moments, omega)
-    polhode = polhode_constants(roles)
-    precession = None if wxyz is None else precession_constants(polhode, wxyz)
-    if compensated:
-        polhode, precession = compensate(polhode, precession, roles)
-    return FreeConstants(moments, products, omega, wxyz, polhode, precession)
+    constants_of = compensated_constants if compensated else motion_constants
+    return FreeConstants(moments, products, omega, wxyz, *constants_of(moments, omega, wxyz))
 
 
 def evaluate(

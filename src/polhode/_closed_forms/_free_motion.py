@@ -418,6 +418,14 @@ def precession_constants(polhode: Polhode, wxyz: tuple[Scalars, ...]) -> Precess
     )
 
 
+def motion_constants(
+    moments: Triple, omega: Triple, wxyz: tuple[Scalars, ...] | None
+) -> tuple[Polhode, Precession | None]:
+    """All constants; without ``wxyz`` only those of the momentum."""
+    polhode = polhode_constants(assign_roles(moments, omega))
+    return polhode, None if wxyz is None else precession_constants(polhode, wxyz)
+
+
 def _phase(motion: Polhode | Precession, t: Scalars) -> tuple[Scalars, Scalars]:
     half_turns, fraction = whole_and_fraction(motion.half_turn_rate, t)
     return (

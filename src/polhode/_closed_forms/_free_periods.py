@@ -1,10 +1,11 @@
 """Frequencies and periods of the free motion; (13) of docs/free_motion.md.
 
-``compensate`` computes the two frequencies in unevaluated sums of two floats: over a long horizon
-the error of the exact motion is that of its phases, one unit in the last place of the frequencies
-times the time. With axis 3 the one that the momentum circles, p = |1/I1 - 1/I2|,
-r = |1/I2 - 1/I3|, s = p + r, the momentum's half period is 2 K(m) / omega_p, and the mean rate of
-the Euler angle about L is |L| (1/I3 +- s Pi(-p/r, m) / K(m)). Pi/K by DLMF 19.8.6.
+``compensated_constants`` has the two frequencies in unevaluated sums of two floats: over a long
+horizon the error of the exact motion is that of its phases, one unit in the last place of the
+frequencies times the time. In single precision they come from the same formulas in double; in
+double, from means in sums of two floats: with axis 3 the one that the momentum circles,
+p = |1/I1 - 1/I2|, r = |1/I2 - 1/I3|, s = p + r, the momentum's half period is 2 K(m) / omega_p, and
+the mean rate of the Euler angle about L is |L| (1/I3 +- s Pi(-p/r, m) / K(m)). Pi/K by DLMF 19.8.6.
 
 ``periods`` are those of the long axis, in the convention of Samarasinha and A'Hearn.
 """
@@ -12,12 +13,12 @@ the Euler angle about L is |L| (1/I3 +- s Pi(-p/r, m) / K(m)). Pi/K by DLMF 19.8
 import enum
 import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from polhode import rotation
 from polhode._batch import common_batch
@@ -42,9 +43,11 @@ from polhode._closed_forms._free_motion import (
     Polhode,
     Precession,
     Roles,
+    Triple,
     as_components,
     assign_roles,
     descend,
+    motion_constants,
     polhode_constants,
     precession_constants,
 )
@@ -55,18 +58,16 @@ from polhode._closed_forms._free_tangent import (
     dot,
     invariants_variation,
 )
-from polhode._kernels import are_close, kernel, staged, underivable
+from polhode._kernels import are_close, in_double, kernel, staged, underivable
 from polhode._scene import State
 from polhode.inertia import Inertia, principal
 
 Scalars = Float[Array, "*b"]
+_Motion = TypeVar("_Motion", Polhode, Precession)
 
 # Enough for 1 - m down to 1e-20 and moments that differ by a millionth: then one more bit each.
 _AGM_STEPS = 8
-_INVERSE_PI = {
-    4: (0.31830987334251404, 1.2841276633452237e-08),
-    8: (0.3183098861837907, -1.9678676675182486e-17),
-}
+_INVERSE_PI = 0.3183098861837907, -1.9678676675182486e-17
 
 
 def _where(condition, x: Pair, y: Pair) -> Pair:
@@ -126,7 +127,7 @@ def compensated_rates(roles: Roles) -> tuple[Pair, Pair, Scalars]:
     near_zero = n_small.high < n_large.high
     pole = root_of(_where(near_zero, n_small, n_large))
     mean, pi_sum, last_step = _means(complement, pole)
-    inverse_pi = Pair(*(jnp.full_like(i1, x) for x in _INVERSE_PI[i1.dtype.itemsize]))
+    inverse_pi = Pair(*(jnp.full_like(i1, x) for x in _INVERSE_PI))
     volume = scale_pair(product_of(i1, i2), i3)
     half_turn_rate = multiply_pairs(
         multiply_pairs(root_of(divide_pairs(square, volume)), mean), inverse_pi
@@ -148,30 +149,61 @@ def compensated_rates(roles: Roles) -> tuple[Pair, Pair, Scalars]:
     return half_turn_rate, add_pairs(angle, own_turn), last_step
 
 
-def compensate(
-    polhode: Polhode, precession: Precession | None, roles: Roles
+def compensated_constants(
+    moments: Triple, omega: Triple, wxyz: tuple[Scalars, ...] | None
 ) -> tuple[Polhode, Precession | None]:
-    """Both motions with low parts of their paces, where the means have converged."""
+    """All constants, with the rounding errors of both rates beside them."""
+    if omega[0].dtype == jnp.float32:
+        return in_double(_rounded_constants, moments, omega, wxyz)
+    roles = assign_roles(moments, omega)
+    polhode = polhode_constants(roles)
     # Staged: the two parts of a pair must come out of one and the same sum.
     half_turn_rate, angle, last_step = staged(compensated_rates(roles), roles.one)
     # Convergence is quadratic: what is left is the square of the last step.
     converged = (last_step < jnp.finfo(last_step.dtype).eps / 64) & ~polhode.on_separatrix
-    high, low = _replaced(polhode.half_turn_rate, half_turn_rate, converged, roles.rate_unit)
-    polhode = polhode._replace(half_turn_rate=high, half_turn_rate_low=low)
+    precession = None if wxyz is None else precession_constants(polhode, wxyz)
+    polhode = _with_rate(polhode, half_turn_rate, converged, roles.rate_unit)
     if precession is not None:
-        high, low = _replaced(precession.half_turn_rate, angle, converged, roles.rate_unit)
-        precession = precession._replace(half_turn_rate=high, half_turn_rate_low=low)
+        precession = _with_rate(precession, angle, converged, roles.rate_unit)
     return polhode, precession
 
 
-def _replaced(
-    rate: Scalars, compensated: Pair, converged, rate_unit: Scalars
-) -> tuple[Scalars, Scalars]:
-    """The pair that replaces a plain rate, unless it is NaN or disagrees with it."""
-    high, low = compensated.high * rate_unit, compensated.low * rate_unit
-    tolerance = {4: 2.0**-13, 8: 2.0**-30}[rate.dtype.itemsize]
-    converged = converged & (jnp.abs(high - rate) <= tolerance * jnp.abs(rate))
-    return jnp.where(converged, high, rate), jnp.where(converged, low, 0)
+def _with_rate(
+    motion: _Motion, compensated: Pair, converged: Bool[Array, "*b"], rate_unit: Scalars
+) -> _Motion:
+    """With the pair in place of the plain rate, unless it is NaN or disagrees with it."""
+    rate, high, low = motion.half_turn_rate, *(x * rate_unit for x in compensated)
+    converged = converged & (jnp.abs(high - rate) <= 2.0**-30 * jnp.abs(rate))
+    return motion._replace(
+        half_turn_rate=jnp.where(converged, high, rate),
+        half_turn_rate_low=jnp.where(converged, low, 0),
+    )
+
+
+def _rounded_constants(moments, omega, wxyz) -> tuple[Polhode, Precession | None]:
+    """Constants of numbers in double precision, rounded to single.
+
+    Sums of two floats of single precision took three times as long to compile and were less
+    accurate.
+    """
+    polhode, precession = motion_constants(moments, omega, wxyz)
+
+    def rounded(motion):
+        rate = motion.half_turn_rate
+        low = rate - _cast(_cast(rate, jnp.float32), jnp.float64)
+        return _cast(motion._replace(half_turn_rate_low=low), jnp.float32)
+
+    return rounded(polhode), None if precession is None else rounded(precession)
+
+
+def _cast(tree: Any, dtype) -> Any:
+    """The floats of a tree in another precision."""
+    return jax.tree.map(
+        lambda x: (
+            jax.lax.convert_element_type(x, dtype) if jnp.issubdtype(x.dtype, jnp.inexact) else x
+        ),
+        tree,
+    )
 
 
 class Mode(enum.IntEnum):

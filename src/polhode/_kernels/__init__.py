@@ -37,3 +37,4 @@ from polhode._kernels._fused import (
     most_of as most_of,
     put as put,
 )
+from polhode._kernels._precision import in_double as in_double
