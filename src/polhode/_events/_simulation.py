@@ -312,18 +312,6 @@ def _of_lanes(begin: Trajectory) -> Trajectory:
     )
 
 
-class _Bracket(NamedTuple):
-    """Where each of N bodies meets its event: between two times, the values there, and the look
-    before it."""
-
-    low: Array
-    high: Array
-    at_low: Array
-    at_high: Array
-    look: Array  # its time
-    samples: list[Array]
-
-
 class _Minimum(NamedTuple):
     """Where a function that keeps its sign at the samples crosses zero and turns back: after which
     look (N,), ``_SAMPLES`` for nowhere; when it turns, its value there and its sign before."""
@@ -343,7 +331,7 @@ class _Window(NamedTuple):
     samples: list[Array]
     has_event: Array
     is_successful: Array
-    bracket: _Bracket
+    event_time: Array
 
 
 def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...]:
@@ -436,16 +424,41 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
             place[:, :_MINIMA],
             is_minimum[:, :_MINIMA] & (place[:, :_MINIMA] < reach),
         )
-        minimum = _first_minimum(
-            until, begin if exact else sampled, grid, slopes, sides, place, is_minimum
+        turns = (
+            entries(grid, place),
+            entries(grid, place + 1),
+            entries(slopes, place),
+            entries(slopes, place + 1),
+            is_minimum,
         )
-        is_new = busy & (jnp.minimum(minimum.place, change) < reach)
-        fresh = _bracket(sampled, grid, values, change, minimum, until.direction * forward, is_new)
-        bracket = jax.tree.map(
-            lambda x, y: jnp.where(is_new.reshape(-1, *(1,) * (x.ndim - 1)), x, y),
-            fresh,
-            carry.bracket,
-        )
+
+        def bracket(points):
+            minimum = _first_minimum(points[0], points[1], sides, place, is_minimum)
+            is_new = busy & (jnp.minimum(minimum.place, change) < reach)
+            ends = _bracket(grid, values, change, minimum, until.direction * forward, is_new)
+            return *ends, is_new
+
+        def search(points, turn):
+            """One turning point of each body after the other, then the event: one copy of the
+            motion in the program."""
+            is_last, column = turn == _MINIMA, jnp.minimum(turn, _MINIMA - 1)
+            arguments = [
+                jnp.where(is_last, b, a[:, column])[:, None] for a, b in zip(turns, bracket(points))
+            ]
+
+            def fn(t):
+                value, slope = until.values(moved_to(begin if exact else sampled, t))
+                return jnp.where(is_last, value, slope), value
+
+            found = bracketed_roots(fn, *arguments)
+            is_here = jnp.arange(_MINIMA)[None] == turn
+            points = [jnp.where(is_here, x, y) for x, y in zip(found, points)]
+            return points, found[0][:, 0]
+
+        no_points = [turns[0], jnp.zeros_like(turns[0])]
+        points, times_found = jax.lax.scan(search, no_points, jnp.arange(_MINIMA + 1))
+        *_, is_new = bracket(points)
+        event_time = jnp.where(is_new, times_found[-1], carry.event_time)
         is_successful = carry.is_successful & (sampled.status == Status.SUCCESSFUL)
         samples, has_event = [x[:, reach] for x in sampled._samples], carry.has_event | is_new
         next_width = jnp.where(reach < _SAMPLES, width, _GROWTH * width)
@@ -453,53 +466,29 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
             next_width, width_by_rate(share[reach], samples, is_successful & ~has_event)
         )
         return _Window(
-            carry.count + 1, share[reach], next_width, samples, has_event, is_successful, bracket
+            carry.count + 1, share[reach], next_width, samples, has_event, is_successful, event_time
         )
 
     def on(carry: _Window):
         unfinished = (carry.share < 1) & (carry.count < _MAX_WINDOWS)
         return unfinished & jnp.any(~carry.has_event & carry.is_successful)
 
-    samples, zero = [x[:, 0] for x in lanes._samples], jnp.zeros(n, dtype)
+    samples = [x[:, 0] for x in lanes._samples]
     is_successful = lanes.status == Status.SUCCESSFUL
     begin = jnp.broadcast_to(start_time, (n,))
-    nowhere = _Bracket(begin, begin, zero, zero, begin, samples)
     start = jnp.zeros((), dtype)
     width = width_by_rate(start, samples, is_successful)
     width = width if until.samples is not None else jnp.minimum(width, _FIRST)
     carry = _Window(
-        jnp.zeros((), jnp.int32), start, width, samples, jnp.zeros(n, bool), is_successful, nowhere
+        jnp.zeros((), jnp.int32), start, width, samples, jnp.zeros(n, bool), is_successful, begin
     )
     carry = jax.lax.while_loop(on, search_window, carry)
-    low, high, at_low, at_high, look, samples = carry.bracket
-
-    def fn(t):
-        value, _ = until.values(moved_to(lanes if exact else at(look, samples), t))
-        return value, value
-
-    arguments = (x[:, None] for x in (low, high, at_low, at_high, carry.has_event))
-    roots, _ = bracketed_roots(fn, *arguments)
     gave_up = ~carry.has_event & carry.is_successful & (carry.share < 1)
-    return carry.has_event, gave_up, roots[:, 0], jnp.abs(carry.width * span) / _SAMPLES
+    return carry.has_event, gave_up, carry.event_time, jnp.abs(carry.width * span) / _SAMPLES
 
 
-def _first_minimum(
-    until: Event, motion: Trajectory, grid, slopes, sides, place, is_minimum
-) -> _Minimum:
-    """Of the places (N, D) where the function may turn back, the first where it crosses zero."""
-    low, high = entries(grid, place), entries(grid, place + 1)
-
-    def turning(_):
-        def fn(t):
-            value, slope = until.values(moved_to(motion, t))
-            return slope, value
-
-        return bracketed_roots(
-            fn, low, high, entries(slopes, place), entries(slopes, place + 1), is_minimum
-        )
-
-    no_roots = low, jnp.zeros_like(low)
-    time, value = jax.lax.cond(jnp.any(is_minimum), turning, lambda _: no_roots, 0)
+def _first_minimum(time, value, sides, place, is_minimum) -> _Minimum:
+    """Of the turning points (N, D) after the samples ``place``, the first beyond zero."""
     side = entries(sides, place)
     across = is_minimum & (jnp.where(value >= 0, 1, -1) != side)
     pair, exists = first_true(across, 1)
@@ -509,24 +498,21 @@ def _first_minimum(
     )
 
 
-def _bracket(
-    sampled: Trajectory, grid, values, change, minimum: _Minimum, direction, is_new
-) -> _Bracket:
-    """Around the first event, a change of sign between two samples or a minimum; ``direction``
-    (N,): in the order of the samples, 0 for any. Entries that are not ``is_new`` are arbitrary."""
+def _bracket(grid, values, change, minimum: _Minimum, direction, is_new) -> tuple[Array, ...]:
+    """Two times (N,) around the first event, a change of sign between two samples or a minimum,
+    and the values there; ``direction`` (N,): in the order of the samples, 0 for any. Entries that
+    are not ``is_new`` are arbitrary."""
     interval = jnp.where(is_new, jnp.minimum(minimum.place, change), 0)[:, None]
     # of the pair of crossings at a minimum the second, where the first has the other direction
     is_second = (direction != 0) & (jnp.where(minimum.side < 0, 1, -1) != direction)
     is_minimum = minimum.place < change
     ends_at_minimum, starts_at_minimum = is_minimum & ~is_second, is_minimum & is_second
     a, b, fa, fb = (entries(x, interval + k)[:, 0] for x in (grid, values) for k in (0, 1))
-    return _Bracket(
+    return (
         jnp.where(starts_at_minimum, minimum.time, a),
         jnp.where(ends_at_minimum, minimum.time, b),
         jnp.where(starts_at_minimum, minimum.value, fa),
         jnp.where(ends_at_minimum, minimum.value, fb),
-        a,
-        [jnp.take_along_axis(x, interval[..., None], axis=1)[:, 0] for x in sampled._samples],
     )
 
 
