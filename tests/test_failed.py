@@ -77,6 +77,11 @@ def simulated(scene, wxyz, omega, way):
 
 
 SLOW = pytest.mark.slow
+# Where no other body shares the steps, midpoint steps become too short before a number overflows.
+REFUSED = {
+    "weight, overflow": ("batch", "vmap", "saved", "between"),
+    "wheel, overflow": ("batch", "saved", "between"),
+}
 FAST = "steps too short", "kinks, overflow", "NaN in closed form"
 
 
@@ -114,6 +119,7 @@ def test_a_gradient_is_that_of_the_bodies_that_finished(case, way):
         np.testing.assert_allclose(got, want, rtol=1e-7, atol=1e-9)
     assert not found_by_rates[0].any()
     (found, _), status = gradient(parameters, jnp.tile(failing, (BODIES, 1)), everyone)
-    assert status.all()  # not always for the same reason as beside others
+    alone = ph.Status.STEP_FAILED if way in REFUSED.get(case, ()) else expected
+    assert (status == alone).all()
     assert bool(jnp.isnan(found[0]).any())
     assert case == "NaN in closed form" or bool(jnp.isnan(found[1]))

@@ -137,6 +137,7 @@ def test_bodies_and_samples_are_chosen_as_from_an_array(batch):
     np.testing.assert_array_equal(one[-1].ts, TS[-1:])  # the axis of time stays
     np.testing.assert_array_equal(batch[..., -1].wxyz, wxyz[..., -1:, :])
     np.testing.assert_array_equal(batch.between(2.0, 3.0).ts, [2.0, 2.5, 3.0])
+    assert batch.last.wheel_speed is None
     np.testing.assert_array_equal(batch.last.wxyz, batch.wxyz[..., -1, :])
     np.testing.assert_array_equal(batch.last.omega_body, batch.omega_body[..., -1, :])
     # each moves on by its own numbers

@@ -11,20 +11,17 @@ from jaxtyping import Array, Float
 from polhode import _policy, rotation
 from polhode._batch import PARTS
 from polhode._closed_forms._closed_form import AbstractClosedForm, with_first
-from polhode._closed_forms._free_derivatives import EvaluatedMotion, results_rule
-from polhode._closed_forms._free_motion import (
+from polhode._closed_forms._free_constants import (
     FreeConstants,
-    Instant,
     Polhode,
     Precession,
     Triple,
-    advance,
     as_components,
-    attitude_at,
-    body_rates,
+    compensated_constants,
     motion_constants,
 )
-from polhode._closed_forms._free_periods import compensated_constants
+from polhode._closed_forms._free_derivatives import EvaluatedMotion, results_rule
+from polhode._closed_forms._free_motion import Instant, advance, attitude_at, body_rates
 from polhode._closed_forms._free_tangent import Quadruple
 from polhode._kernels import computed_once, kernel, map_chunks
 from polhode._method import Record, Samples, Status, StepCounts
@@ -42,8 +39,8 @@ class ClosedForm(AbstractClosedForm):
 
     ``compensated``: frequencies in sums of two floats, so that over a long horizon the error no
     longer grows with the phase. It costs a few hundred nanoseconds per body, and 2 per sample, and
-    no digit elsewhere. In float64, bodies within 1e-15 of the separatrix or of a symmetry have none
-    of it, nor do those known to be symmetric.
+    no digit elsewhere. Bodies known to be symmetric have none of it; nor have, in float64, bodies
+    within 1e-15 of the separatrix or of a symmetry.
     """
 
     chunk: int | None = eqx.field(static=True, default=None)

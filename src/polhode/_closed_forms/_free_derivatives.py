@@ -16,13 +16,8 @@ from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array, Float
 
 from polhode._closed_forms._arithmetic import agm_and_nome, sign_of_parity
-from polhode._closed_forms._free_motion import (
-    Instant,
-    Polhode,
-    Precession,
-    Triple,
-    momentum_of,
-)
+from polhode._closed_forms._free_constants import Polhode, Precession, Triple
+from polhode._closed_forms._free_motion import Instant, momentum_of
 from polhode._closed_forms._free_tangent import (
     Frame,
     Invariants,

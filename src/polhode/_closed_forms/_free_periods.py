@@ -1,11 +1,4 @@
-"""Frequencies and periods of the free motion; (13) of docs/free_motion.md.
-
-``compensated_constants`` has the two frequencies in unevaluated sums of two floats: over a long
-horizon the error of the exact motion is that of its phases, one unit in the last place of the
-frequencies times the time. In single precision they come from the same formulas in double; in
-double, from means in sums of two floats: with axis 3 the one that the momentum circles,
-p = |1/I1 - 1/I2|, r = |1/I2 - 1/I3|, s = p + r, the momentum's half period is 2 K(m) / omega_p, and
-the mean rate of the Euler angle about L is |L| (1/I3 +- s Pi(-p/r, m) / K(m)). Pi/K by DLMF 19.8.6.
+"""Periods of the free motion, by the mean rates (13) of docs/free_motion.md.
 
 ``periods`` are those of the long axis, in the convention of Samarasinha and A'Hearn.
 """
@@ -13,43 +6,28 @@ the mean rate of the Euler angle about L is |L| (1/I3 +- s Pi(-p/r, m) / K(m)). 
 import enum
 import functools
 import math
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from polhode import rotation
 from polhode._batch import common_batch
 from polhode._checks import describe, is_concrete, require
-from polhode._closed_forms._arithmetic import (
-    Pair,
-    add_pairs,
-    divide_pairs,
-    multiply_pairs,
-    product_of,
-    root_of,
-    scale_pair,
-    subtract_pairs,
-    sum_of,
+from polhode._closed_forms._free_constants import (
+    Polhode,
+    as_components,
+    assign_roles,
+    descend,
+    polhode_constants,
+    precession_constants,
 )
 from polhode._closed_forms._free_derivatives import (
     along_turning_axes,
     dense_or_none,
     start_variation,
-)
-from polhode._closed_forms._free_motion import (
-    Polhode,
-    Precession,
-    Roles,
-    Triple,
-    as_components,
-    assign_roles,
-    descend,
-    motion_constants,
-    polhode_constants,
-    precession_constants,
 )
 from polhode._closed_forms._free_tangent import (
     Frame,
@@ -58,152 +36,11 @@ from polhode._closed_forms._free_tangent import (
     dot,
     invariants_variation,
 )
-from polhode._kernels import are_close, in_double, kernel, staged, underivable
+from polhode._kernels import are_close, kernel, underivable
 from polhode._scene import State
 from polhode.inertia import Inertia, principal
 
 Scalars = Float[Array, "*b"]
-_Motion = TypeVar("_Motion", Polhode, Precession)
-
-# Enough for 1 - m down to 1e-20 and moments that differ by a millionth: then one more bit each.
-_AGM_STEPS = 8
-_INVERSE_PI = 0.3183098861837907, -1.9678676675182486e-17
-
-
-def _where(condition, x: Pair, y: Pair) -> Pair:
-    return Pair(*(jnp.where(condition, a, b) for a, b in zip(x, y, strict=True)))
-
-
-def _absolute(x: Pair) -> Pair:
-    sign = jnp.where(x.high < 0, -1, 1).astype(x.high.dtype)
-    return Pair(sign * x.high, sign * x.low)
-
-
-def _halved(x: Pair) -> Pair:
-    return Pair(x.high / 2, x.low / 2)
-
-
-def _means(complement: Pair, pole: Pair) -> tuple[Pair, Pair, Scalars]:
-    """agm(1, complement), the sum of Q (DLMF 19.8.6; ``pole``: root of 1 - n), the last step."""
-    one = Pair(jnp.ones_like(pole.high), jnp.zeros_like(pole.high))
-
-    def step(_, state):
-        a, b, p, weight, pi_sum = state
-        product, square = multiply_pairs(a, b), multiply_pairs(p, p)
-        total = add_pairs(square, product)
-        weight = _halved(
-            multiply_pairs(weight, divide_pairs(subtract_pairs(square, product), total))
-        )
-        p = _halved(divide_pairs(total, p))
-        return _halved(add_pairs(a, b)), root_of(product), p, weight, add_pairs(pi_sum, weight)
-
-    # A loop and not an unrolled formula: it compiles in a tenth of the time.
-    a, b, _, weight, pi_sum = jax.lax.fori_loop(
-        0, _AGM_STEPS, step, (one, complement, pole, one, one)
-    )
-    return a, pi_sum, jnp.abs(weight.high) + jnp.abs(subtract_pairs(a, b).high)
-
-
-def compensated_rates(roles: Roles) -> tuple[Pair, Pair, Scalars]:
-    """Half-turn rates of ``Polhode`` and ``Precession`` per scaled time, and size of the last step.
-
-    Of the two characteristics -p/r and that of DLMF 19.7.9 the one near zero is taken: with the
-    latter Pi stands for the angle counted with the momentum's own turns in the body.
-    """
-    i1, i2, i3 = roles.moments
-    d12, d23, d13 = (_absolute(sum_of(a, -b)) for a, b in ((i2, i1), (i3, i2), (i3, i1)))
-    x1, x2, x3 = (
-        scale_pair(product_of(w, w), i) for w, i in zip(roles.rates, roles.moments, strict=True)
-    )
-    A = add_pairs(multiply_pairs(x2, d12), multiply_pairs(x3, d13))
-    B = add_pairs(multiply_pairs(x1, d13), multiply_pairs(x2, d23))
-    gap = _absolute(subtract_pairs(multiply_pairs(x3, d23), multiply_pairs(x1, d12)))
-    square = multiply_pairs(A, d23)
-    length2 = add_pairs(add_pairs(scale_pair(x1, i1), scale_pair(x2, i2)), scale_pair(x3, i3))
-    length = root_of(length2)
-    complement = root_of(divide_pairs(multiply_pairs(d13, gap), square))
-    n_small = divide_pairs(scale_pair(d13, i2), scale_pair(d23, i1))
-    n_large = divide_pairs(multiply_pairs(length2, d13), scale_pair(A, i3))
-    near_zero = n_small.high < n_large.high
-    pole = root_of(_where(near_zero, n_small, n_large))
-    mean, pi_sum, last_step = _means(complement, pole)
-    inverse_pi = Pair(*(jnp.full_like(i1, x) for x in _INVERSE_PI))
-    volume = scale_pair(product_of(i1, i2), i3)
-    half_turn_rate = multiply_pairs(
-        multiply_pairs(root_of(divide_pairs(square, volume)), mean), inverse_pi
-    )
-    # |L|/I1 (1 -+ (I2 - I1) total / (2 I2)) less a turn per period, or |L|/I3 +- A total / (2 |L|).
-    parts = _where(near_zero, multiply_pairs(length, d12), divide_pairs(B, length))
-    pi_part = multiply_pairs(_halved(parts), pi_sum)
-    span = scale_pair(
-        _where(near_zero, product_of(i1, i2), Pair(i3, jnp.zeros_like(i3))), roles.sense
-    )
-    pi_part = divide_pairs(pi_part, span)
-    plain_rate = divide_pairs(length, Pair(jnp.where(near_zero, i1, i3), jnp.zeros_like(i1)))
-    pi_part = Pair(
-        jnp.where(near_zero, -pi_part.high, pi_part.high),
-        jnp.where(near_zero, -pi_part.low, pi_part.low),
-    )
-    angle = _halved(multiply_pairs(add_pairs(plain_rate, pi_part), inverse_pi))
-    own_turn = scale_pair(_halved(half_turn_rate), jnp.where(near_zero, -roles.sense, 0))
-    return half_turn_rate, add_pairs(angle, own_turn), last_step
-
-
-def compensated_constants(
-    moments: Triple, omega: Triple, wxyz: tuple[Scalars, ...] | None
-) -> tuple[Polhode, Precession | None]:
-    """All constants, with the rounding errors of both rates beside them."""
-    if omega[0].dtype == jnp.float32:
-        return in_double(_rounded_constants, moments, omega, wxyz)
-    roles = assign_roles(moments, omega)
-    polhode = polhode_constants(roles)
-    # Staged: the two parts of a pair must come out of one and the same sum.
-    half_turn_rate, angle, last_step = staged(compensated_rates(roles), roles.one)
-    # Convergence is quadratic: what is left is the square of the last step.
-    converged = (last_step < jnp.finfo(last_step.dtype).eps / 64) & ~polhode.on_separatrix
-    precession = None if wxyz is None else precession_constants(polhode, wxyz)
-    polhode = _with_rate(polhode, half_turn_rate, converged, roles.rate_unit)
-    if precession is not None:
-        precession = _with_rate(precession, angle, converged, roles.rate_unit)
-    return polhode, precession
-
-
-def _with_rate(
-    motion: _Motion, compensated: Pair, converged: Bool[Array, "*b"], rate_unit: Scalars
-) -> _Motion:
-    """With the pair in place of the plain rate, unless it is NaN or disagrees with it."""
-    rate, high, low = motion.half_turn_rate, *(x * rate_unit for x in compensated)
-    converged = converged & (jnp.abs(high - rate) <= 2.0**-30 * jnp.abs(rate))
-    return motion._replace(
-        half_turn_rate=jnp.where(converged, high, rate),
-        half_turn_rate_low=jnp.where(converged, low, 0),
-    )
-
-
-def _rounded_constants(moments, omega, wxyz) -> tuple[Polhode, Precession | None]:
-    """Constants of numbers in double precision, rounded to single.
-
-    Sums of two floats of single precision took three times as long to compile and were less
-    accurate.
-    """
-    polhode, precession = motion_constants(moments, omega, wxyz)
-
-    def rounded(motion):
-        rate = motion.half_turn_rate
-        low = rate - _cast(_cast(rate, jnp.float32), jnp.float64)
-        return _cast(motion._replace(half_turn_rate_low=low), jnp.float32)
-
-    return rounded(polhode), None if precession is None else rounded(precession)
-
-
-def _cast(tree: Any, dtype) -> Any:
-    """The floats of a tree in another precision."""
-    return jax.tree.map(
-        lambda x: (
-            jax.lax.convert_element_type(x, dtype) if jnp.issubdtype(x.dtype, jnp.inexact) else x
-        ),
-        tree,
-    )
 
 
 class Mode(enum.IntEnum):

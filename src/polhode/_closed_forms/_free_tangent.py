@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode._closed_forms._arithmetic import deficit_per_parameter, nome_per_parameter, rd_series
-from polhode._closed_forms._free_motion import Polhode, Triple, component_at, restore
+from polhode._closed_forms._free_constants import Polhode, Triple, component_at, restore
 from polhode._hamiltonian import triple
 
 Scalars = Float[Array, "*b"]

@@ -41,9 +41,7 @@ def _evaluated(*leaves, fn, tree):
         return jax.tree.leaves(fn(*jax.tree.unflatten(tree, doubles)))
 
 
-@_double_p.def_impl
-def _evaluated_at_once(*leaves, fn, tree):
-    return jax.jit(partial(_evaluated, fn=fn, tree=tree))(*leaves)
+_double_p.def_impl(jax.jit(_evaluated, static_argnames=("fn", "tree")))
 
 
 @_double_p.def_abstract_eval

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from polhode import rotation
 from polhode._checks import ArrayLike
 from polhode._closed_forms import free_motion, principal_periods
-from polhode._closed_forms._free_motion import Triple
+from polhode._closed_forms._free_constants import Triple
 from polhode.inertia._mass import check_mesh
 
 # Light scattered by a convex body, integrated over what is both lit and seen.
