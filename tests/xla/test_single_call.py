@@ -323,6 +323,29 @@ def test_units_that_repeat_their_work_in_derivatives(bodies, times):
     agree(*(jax.vmap(f, (0, None, None))(many, b, t) for f in (own, slope(plain))))
 
 
+@pytest.mark.parametrize(
+    "derivative", [jax.grad, pytest.param(jax.hessian, marks=pytest.mark.slow)]
+)
+def test_derivatives_of_a_free_body_are_units(derivative):
+    """Outside of units what several results need is repeated: Hessians took minutes to compile."""
+
+    def end(x):
+        inertia = ph.Inertia.from_moments(x[:3])
+        last = ph.simulate(ph.Scene(inertia), ph.State([1.0, 0, 0, 0], x[3:]), [0.0, 10.0]).last
+        return jnp.sum(last.omega_body) + last.wxyz @ jnp.arange(4.0)
+
+    x = jnp.array([1.0, 1.5, 2.0, 0.3, 0.2, 1.1])
+    functions = jax.jit(derivative(end)).lower(x).as_text().split("func.func ")
+    lines = [line for function in functions for line in function.splitlines()]
+    calls = [line for line in lines if " call @" in line and "xla_cpu_small_call" in line]
+    units = {line.split("call @")[1].split("(")[0] for line in calls}
+    sizes = {f.split("(")[0].split("@")[-1]: len(f.splitlines()) for f in functions if "@" in f}
+    assert len(units) == 2
+    assert sum(sizes[name] for name in units) > 4000
+    # functions that others call stand inside of units too, but are short
+    assert max(size for name, size in sizes.items() if name not in units) < 500
+
+
 def test_a_seeded_slice_of_the_fuzz():
     """`fuzz.py` does thousands."""
     ran, refused, largest, ends = fuzz.hunt_units(8, seed=7, each=8)

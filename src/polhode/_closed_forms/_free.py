@@ -261,6 +261,11 @@ def free_motion(
         return evaluate(prepare(*arguments, compensated=compensated), t, **requested)
 
     chunk = _policy.samples_at_once(_policy.FREE_CHUNK)
+    if t.ndim <= parts[0][0].ndim:
+        # With one time a body, derivatives work everything out again: storing the coefficients,
+        # hundreds of them, takes longer, and Hessians compile in minutes. With many times storing
+        # them takes less time to compile.
+        return _chunked(kernel(whole_motion, repeated=True), parts, t, chunk)
     rows = max(1, chunk // max(t.shape[1] if t.ndim == 2 else 1, 1))
     return _chunked(kernel(whole_motion, linearised=True), parts, t, rows)
 
