@@ -259,3 +259,16 @@ def test_held_wheels_have_no_coordinate_and_parameters_follow():
         shapes(scene, lambda s: s.rotors.terms[1].speed)
     with pytest.raises(ValueError, match="speeds of 3 wheels, the scene 2"):
         shapes(scene, state=ph.State(*WHEEL_STATE, [0.0, 0.0, 0.0]))
+
+
+@pytest.mark.slow
+def test_a_disturbance_over_many_turns():
+    """In closed form it is integrated over the step: in parts, or it is NaN, but never wrong."""
+    scene, state, dt = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.2])), STATE, 40.0
+    found = ph.propagate(scene, state, dt)
+    want = ph.propagate(scene, state, dt, method=ph.LiePoisson(), rtol=1e-12)
+    np.testing.assert_allclose(found.noise, want.noise, rtol=0, atol=1e-9 * jnp.max(want.noise))
+    traced = jax.jit(lambda dt: ph.propagate(scene, state, dt))
+    assert jnp.all(jnp.isnan(traced(dt).noise))
+    np.testing.assert_allclose(traced(dt).jacobian, found.jacobian, atol=1e-9)
+    assert jnp.all(jnp.isfinite(traced(5.0).noise))

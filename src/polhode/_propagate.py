@@ -1,5 +1,6 @@
 """One step of a filter: a state carried on, with the Jacobian of the exact flow."""
 
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -27,9 +28,13 @@ from polhode._scene._scene import places_of
 from polhode._simulate import simulate
 
 _NODES = 8
-"""Gauss points that the effect of a disturbance is integrated over where the motion has a closed
-form; their error falls with the 16th power of the angle turned in a step: 1e-12 of it for a third
-of a turn."""
+"""Gauss points of each part of a step that the effect of a disturbance is integrated over where the
+motion has a closed form; their error falls with the 16th power of the angle turned in a part: 1e-12
+of the effect for a third of a turn."""
+
+_TURN = np.pi
+"""Angle [rad] by the largest body rate that a part of a step may take. With twice that the effect
+is in error by up to 2e-7 of itself."""
 
 
 class Propagation(NamedTuple):
@@ -76,7 +81,9 @@ def propagate(
     The Jacobian is that of the exact flow, by forward differentiation through ``ph.simulate``.
     ``noise`` is the derivative by a disturbance torque on the body [N m] that is constant over the
     step, in body axes: a torque of spectral density s [N^2 m^2 s] adds ``noise @ noise.T * s / dt``
-    to the covariance.
+    to the covariance. In closed form it is integrated over the step. There it is NaN under ``jit``
+    and ``vmap`` if the body turns by more than half a turn in a step: propagate in shorter steps,
+    or by ``method=ph.LiePoisson()``.
 
     **Arguments:** ``scene``, ``state``: of one body; for several ``jax.vmap``. ``dt``: not zero.
     ``free``: None, or a function that picks leaves of the scene, ``lambda s: s.inertia.diagonal``:
@@ -110,9 +117,11 @@ def propagate(
             "free picks the speed or momentum of a rotor that is not held at its speed: it is part"
             " of the state, and its error one of the tangent coordinates already. Leave it out."
         )
-    state, jacobian, noise, status = _propagated(
-        scene, state, dt, t, places, method, check_rtol(rtol, dtype)
-    )
+    arguments = scene, state, dt, t, places, method, check_rtol(rtol, dtype)
+    start, (state, jacobian, noise, status, turned) = state, _propagated(*arguments, 1)
+    if not isinstance(turned, Tracer) and np.isfinite(turned) and turned > _TURN:
+        parts = 2 ** math.ceil(math.log2(turned / _TURN))
+        state, jacobian, noise, status, _ = _propagated(scene, start, *arguments[2:], parts)
     if not isinstance(status, Tracer):
         raise_on_failure(status, "Under jax.jit nothing is raised, and the result is NaN.")
     return Propagation(state, jacobian, noise)
@@ -133,7 +142,8 @@ def _starts_of_loose(scene: Scene) -> tuple[int, ...]:
 
 
 @eqx.filter_jit
-def _propagated(scene, state, dt, t, places, method, rtol):
+def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
+    """Also the angle turned by the largest body rate; the effect of a disturbance in ``parts``."""
     dtype = dt.dtype
     leaves, tree = jax.tree.flatten(scene)
     sizes = [leaves[k].size for k in places]
@@ -149,7 +159,9 @@ def _propagated(scene, state, dt, t, places, method, rtol):
         method, _ = choose(scene, rtol)
     # In closed form there is no motion under a torque: its effect is integrated over the step.
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    nodes, weights = (jnp.asarray(x, dtype) for x in ((1 + nodes) / 2, weights / 2))
+    nodes = ((1 + nodes) / 2 + np.arange(parts)[:, None]).reshape(-1) / parts
+    weights = np.tile(weights / 2, parts) / parts
+    nodes, weights = jnp.asarray(nodes, dtype), jnp.asarray(weights, dtype)
     node_times = t + dt * nodes if method.exact else time_range[:0]
     ts = jnp.concatenate([time_range[:1], node_times, time_range[1:]])
 
@@ -177,10 +189,13 @@ def _propagated(scene, state, dt, t, places, method, rtol):
         samples = traj.wxyz, traj.omega_body, speeds
         wxyz, omega, speeds = (jnp.where(good, x, jnp.nan) for x in samples)
         loose_speeds = speeds[:, np.array(loose, int)]
-        return (wxyz, omega, loose_speeds), (wxyz[-1], omega[-1], speeds[-1], wxyz, traj.status)
+        fastest = jnp.sqrt(jnp.max(jnp.sum(jax.lax.stop_gradient(omega) ** 2, axis=-1)))
+        turned = jnp.abs(dt) * fastest if method.exact else jnp.zeros((), dtype)
+        others = wxyz, traj.status, turned
+        return (wxyz, omega, loose_speeds), (wxyz[-1], omega[-1], speeds[-1], *others)
 
     zeros = jnp.zeros(n, dtype), jnp.zeros(3, dtype)
-    derivatives, (*end_samples, wxyz, status) = jax.jacfwd(
+    derivatives, (*end_samples, wxyz, status, turned) = jax.jacfwd(
         lambda inputs: states_after(inputs[:n], inputs[n:]), has_aux=True
     )(jnp.concatenate(zeros))
     turns, *rates = derivatives  # (T, 4, n + 3), (T, 3, n + 3), (T, w, n + 3)
@@ -205,8 +220,10 @@ def _propagated(scene, state, dt, t, places, method, rtol):
             return end @ jnp.linalg.solve(flow, push)
 
         noise = dt * jnp.tensordot(weights, jax.vmap(carried)(flow[1:-1, :, :n]), 1)
+        noise = jnp.where(turned <= parts * _TURN, noise, jnp.nan)
     wxyz, omega, speeds = end_samples
-    return State.of_samples(wxyz, omega, speeds if loose else None), end, noise, status
+    state = State.of_samples(wxyz, omega, speeds if loose else None)
+    return state, end, noise, status, turned
 
 
 def _speeds(wheels: Wheels, t: Array, omega: Array) -> Array:

@@ -1,11 +1,14 @@
 """The [ensemble] of a scene file: what it draws, what it refuses, and `polhode run` of it."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import polhode as ph
+from polhode import ensemble as ens
 from polhode.cli import main
 from polhode.ensemble import build_ensemble, open_store
-from polhode.files import SceneFileError, parse_scene
+from polhode.files import SceneFileError, build_scene, build_state, parse_scene, read_scene
 
 xarray = pytest.importorskip("xarray")
 
@@ -202,3 +205,49 @@ def test_heavy_tops_on_their_axis_follow_the_closed_form():
         ensemble, _ = build_ensemble(parse_scene(SCENE + text), np.float64)
         block = Block(ensemble, [0.0, 1.0], None, None, True, (), jax.devices()[:1])
         assert isinstance(block.method, kind)
+
+
+BODY = ph.Inertia.from_moments([1.0, 1.5, 2.2])
+TURNING = ph.State([1.0, 0.2, 0.1, 0.3], [0.6, 1.1, -0.4])
+
+
+def test_spread_moments_keep_the_principal_axes():
+    tensor = np.array([[1.5, 0.3, 0.1], [0.3, 1.7, 0.2], [0.1, 0.2, 2.2]])
+    scene = ph.Scene(ph.Inertia.from_tensor(tensor))
+    narrow = ens.SpreadMoments(ens.Deviate(jnp.full(3, 1e-9)))
+    moments = np.tile(scene.inertia.moments, (2, 1))
+    of_rows = ens.Ensemble(scene, TURNING, 2, rows={"moments": moments})
+    for ensemble in (ens.Ensemble(scene, TURNING, 2, (narrow,)), of_rows):
+        drawn, _ = ensemble.draw(np.arange(2))
+        np.testing.assert_allclose(drawn.inertia.tensor, [tensor, tensor], atol=1e-7)
+
+
+@pytest.mark.parametrize("loose", [{}, {"torque": 0.1}])
+def test_a_momentum_includes_that_of_the_wheels(loose, tmp_path):
+    wheels = ph.Rotor([0.0, 0.6, 0.8], inertia=0.1, speed=20.0, **loose)
+    wheels = wheels + ph.Rotor([1.0, 0.0, 0.0], momentum=0.4)
+    rows = {"momentum_body": np.array([[0.6, 1.0, 3.0]] * 2)}
+    drawn = ens.Ensemble(ph.Scene(BODY, rotors=wheels), TURNING, 2, rows=rows).draw(np.arange(2))
+    momentum = ph.simulate(*drawn, [0.0, 1.0]).momentum_body[:, 0]
+    np.testing.assert_allclose(momentum, rows["momentum_body"], rtol=1e-13)
+    file = tmp_path / "wheel.toml"
+    torque = "torque = 0.1" if loose else ""
+    file.write_text(
+        "inertia.moments = [1.0, 1.5, 2.2]\nstate.momentum_body = [0.6, 1.0, 3.0]\n"
+        "times = { stop = 5.0, number = 3 }\n"
+        f"[[rotors]]\naxis_body = [0, 0.6, 0.8]\ninertia = 0.1\nspeed = 20.0\n{torque}\n"
+    )
+    scene_file = read_scene(file)
+    scene = build_scene(scene_file, float)
+    state = build_state(scene_file, float, scene.inertia)
+    found = ph.simulate(scene, state, [0.0, 1.0]).momentum_body[0]
+    np.testing.assert_allclose(found, [0.6, 1.0, 3.0], rtol=1e-13)
+
+
+def test_the_method_is_that_of_the_bodies_drawn(tmp_path):
+    """A symmetric top whose moments are spread has three of them."""
+    scene = ph.Scene(ph.Inertia.axisymmetric(1.0, 0.5), ph.UniformGravity.axial(1.0, 0.3))
+    spread = ens.SpreadMoments(ens.Deviate(jnp.full(3, 0.02)))
+    ensemble = ens.Ensemble(scene, TURNING, 4, (spread,))
+    ens.stream(ensemble, jnp.linspace(0, 5, 3), tmp_path / "s.zarr", name="tops")
+    assert not ens.open_store(tmp_path / "s.zarr").status.values.any()

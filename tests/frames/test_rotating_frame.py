@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import polhode as ph
 from polhode import rotation
 from polhode.frames import RotatingFrame
 
@@ -168,3 +169,32 @@ def test_times_broadcast_against_particles():
 def test_bad_input_is_named(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+@pytest.mark.parametrize("t", [0.0, pytest.param(0.5, marks=pytest.mark.slow)])
+def test_the_attitude_of_a_given_rate_has_its_derivatives_by_time(t):
+    """At the first time too, where nothing is integrated; in forward and reverse mode."""
+    frame = RotatingFrame.from_rate(lambda t: jnp.array([0.1, 0.2 * t, 1.0 + t]))
+
+    def rate(t):
+        turn = rotation.multiply(frame.attitude(t), jnp.array([0.0, 0.1, 0.2 * t, 1.0 + t]))
+        return turn / 2
+
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(frame.attitude)(t), rate(t), atol=1e-12)
+    bend = jax.jacfwd(jax.jacrev(frame.attitude))(t)
+    gap = (rate(t + 1e-4) - rate(t - 1e-4)) / 2e-4
+    np.testing.assert_allclose(bend, gap, atol=1e-7)
+
+
+def test_a_frame_of_a_motion_that_stopped_at_an_event():
+    """Its last times are that of the event, again and again."""
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.2]))
+    state, ts = ph.State([1.0, 0.2, 0.1, 0.3], [0.6, 1.1, -0.4]), jnp.linspace(0, 5, 11)
+    motion = ph.simulate(scene, state, ts, until=ph.Event(lambda wxyz, omega, t: t - 2.3))
+    frame = RotatingFrame.from_trajectory(motion)
+    np.testing.assert_allclose(frame.attitude(motion.ts), motion.wxyz, atol=1e-14)
+    np.testing.assert_allclose(frame.omega_body(motion.ts), motion.omega_body, atol=1e-12)
+    last = ph.simulate(scene, state, ts, record=ph.Record(final_only=True))
+    with pytest.raises(ValueError, match="two at least"):
+        RotatingFrame.from_trajectory(last)

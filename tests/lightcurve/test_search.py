@@ -157,5 +157,7 @@ def test_normal_points_are_means_of_one_group():
     np.testing.assert_allclose(few.sigma, 0.1 / np.sqrt([2, 1, 2, 4]))
     assert few.group.tolist() in ([0, 1, 0, 0], [1, 0, 0, 0])
     np.testing.assert_allclose(few.sun, sun[:4])
+    unknown = curve._replace(sigma=np.where(np.arange(9) == 8, 0.0, 0.1)).binned(0.01)
+    np.testing.assert_allclose(unknown.sigma, few.sigma * [1, 1, 1, 0])
     with pytest.raises(ValueError, match="positive number of days"):
         curve.binned(0.0)

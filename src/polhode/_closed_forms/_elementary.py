@@ -31,6 +31,9 @@ class SymmetricTop(AbstractChunkedForm):
     wheels of constant momentum on it. The rates are elementary in all these; the attitude where
     the momentum keeps its direction: without torque, and with damping proportional to the moments
     (``c = k I``) and no wheel, so that otherwise ``ph.Record(attitude=False)`` is needed.
+
+    Derivatives are those within these motions: by numbers that break their symmetry, such as one of
+    two equal coefficients of damping, they are zero or wrong. Those of ``ph.LiePoisson()`` are not.
     """
 
     chunk: int | None = eqx.field(static=True, default=None)

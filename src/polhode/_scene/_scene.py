@@ -221,6 +221,29 @@ class Scene(eqx.Module):
         wheels = self.rotors.settle(state.omega_body, start, state.wheel_speed)
         return Scene(self.inertia, self.potential, self.torque, wheels)
 
+    def with_momentum(
+        self, state: State, momentum: Float[Array, "*#b 3"], t: Array | float = 0.0
+    ) -> State:
+        """The state with the body rates that give this momentum in body axes at the time ``t``.
+
+        ``momentum`` [kg m^2/s] includes that of the wheels, whose speeds are those of the state, or
+        those that the rotors were given.
+        """
+        if self.rotors is None:
+            rates = inertia_at(self.inertia, t).rates(momentum)
+            return State(state.wxyz, rates, state.wheel_speed)
+        zero = jnp.zeros_like(momentum)
+
+        def momentum_of(omega):
+            turning = State(state.wxyz, omega, state.wheel_speed)
+            return self.settled(turning, jnp.asarray(t, momentum.dtype)).momentum(omega, t)
+
+        # affine in the rates
+        at_rest = momentum_of(zero)
+        columns = [momentum_of(zero + row) - at_rest for row in jnp.eye(3, dtype=momentum.dtype)]
+        rates = jnp.linalg.solve(jnp.stack(columns, axis=-1), (momentum - at_rest)[..., None])
+        return State(state.wxyz, rates[..., 0], state.wheel_speed)
+
     @property
     def is_possible(self) -> Bool[Array, "*#b"]:
         """Whether (...) a body can have this inertia and these wheels, also while traced.

@@ -126,8 +126,7 @@ def draw(
             streams.append(stream)
             scene, state = spread(spread_key, scene, state)
         if "momentum_body" in rows:
-            omega = scene.constant_inertia.rates(rows["momentum_body"])
-            state = State(state.wxyz, omega, state.wheel_speed)
+            state = scene.with_momentum(state, rows["momentum_body"])
         return scene, state
 
     return eqx.filter_vmap(draw_one, in_axes=(0, eqx.if_array(0)), out_axes=eqx.if_array(0))(
@@ -138,13 +137,19 @@ def draw(
 def _replace_rows(scene: Scene, state: State, rows: Mapping[str, Array]) -> tuple[Scene, State]:
     """One body with its rows in place of the nominal numbers."""
     if "moments" in rows:
-        scene = dataclasses.replace(scene, inertia=Inertia.from_moments(rows["moments"]))
+        scene = _with_moments(scene, rows["moments"])
     if "torque" in rows:
         scene = with_torque(scene, rows["torque"])
     wxyz, omega = rows.get("wxyz", state.wxyz), rows.get("omega_body", state.omega_body)
     if "wxyz" in rows or "omega_body" in rows:
         state = State(wxyz, omega, state.wheel_speed)
     return scene, state
+
+
+def _with_moments(scene: Scene, moments: Array) -> Scene:
+    """The scene with these principal moments, about the principal axes that it has."""
+    inertia, axes = Inertia.from_moments(moments), scene.constant_inertia.axes
+    return dataclasses.replace(scene, inertia=inertia if axes is None else inertia.turned(axes))
 
 
 class Deviate(eqx.Module):
@@ -162,7 +167,8 @@ class Deviate(eqx.Module):
 
 
 class SpreadMoments(eqx.Module):
-    """Principal moments times (1 + deviate); draws that no body can have are drawn again.
+    """Principal moments times (1 + deviate), about the same axes; draws that no body can have are
+    drawn again.
 
     After 100 impossible draws the moments become NaN, and the status of the body says so.
     """
@@ -187,7 +193,7 @@ class SpreadMoments(eqx.Module):
         initial_carry = (zero + 1, draw_moments(zero))
         _, moments = jax.lax.while_loop(is_unfinished, draw_again, initial_carry)
         moments = jnp.where(possible_moments(moments), moments, jnp.nan)
-        return dataclasses.replace(scene, inertia=Inertia.from_moments(moments)), state
+        return _with_moments(scene, moments), state
 
 
 class SpreadAttitude(eqx.Module):
@@ -233,8 +239,8 @@ class SpreadRates(eqx.Module):
 
 
 class SpreadMomentum(eqx.Module):
-    """Body momentum ``momentum`` (3,) [kg m^2/s] plus a deviate: rates follow from the inertia
-    that the spreads before this one left.
+    """Body momentum ``momentum`` (3,) [kg m^2/s], that of wheels included, plus a deviate: rates
+    follow from the inertia that the spreads before this one left.
     """
 
     momentum: Float[Array, " 3"]
@@ -242,7 +248,7 @@ class SpreadMomentum(eqx.Module):
 
     def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
         momentum = self.momentum if self.deviate is None else self.momentum + self.deviate(key)
-        return scene, State(state.wxyz, scene.constant_inertia.rates(momentum), state.wheel_speed)
+        return scene, scene.with_momentum(state, momentum)
 
 
 class SpreadTorque(eqx.Module):

@@ -68,13 +68,15 @@ class Block:
         devices: Sequence[Any],
     ):
         check_method(method)
-        scene, _, ts, _ = check_inputs(ensemble.scene, ensemble.state, ts, Record())
+        _, _, ts, _ = check_inputs(ensemble.scene, ensemble.state, ts, Record())
         if ts.ndim != 1:
             raise ValueError(f"the bodies of an ensemble share their times (T,), got {ts.shape}.")
         self.ensemble, self.ts, self.devices = ensemble, ts, tuple(devices)
         self.size = block_size(ts.shape[0])
         if method is None:
-            method, _ = choose(scene)
+            # by the bodies drawn: those of a symmetric one may have three moments
+            drawn, _ = eqx.filter_eval_shape(ensemble.draw, np.zeros(1, int))
+            method, _ = choose(drawn)
         self.method = method
         self.rtol = check_rtol(rtol, ts.dtype)
         self.settings = Settings(self.size, trajectories, statistics)

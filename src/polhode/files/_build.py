@@ -22,7 +22,6 @@ from polhode.files._read import SceneFileError, did_you_mean, possible_moments, 
 from polhode.files._tables import AnySolid, Attitudes
 from polhode.files._values import MOMENTS, Table, TimeTable
 from polhode.inertia import Inertia, MassProperties, VariableInertia, compose
-from polhode.inertia._inertia import inertia_at
 
 if TYPE_CHECKING:
     import diffrax
@@ -328,6 +327,12 @@ class _Angle(eqx.Module):
         return jnp.sum(axis * self.direction_space) - jnp.cos(self.angle)
 
 
+def _rates_of(file: SceneFile, inertia, wxyz: Array, momentum: Array, start: Array) -> Array:
+    """Body rates (..., 3) of the momentum (..., 3), that of the wheels included."""
+    scene = polhode.Scene(inertia, rotors=_wheels(file, momentum.dtype))
+    return scene.with_momentum(polhode.State(wxyz, momentum), momentum, start).omega_body
+
+
 def build_state(
     file: SceneFile, dtype: DTypeLike, inertia: "Inertia | VariableInertia"
 ) -> "polhode.State":
@@ -335,12 +340,9 @@ def build_state(
     with scene_errors(file, "[state]"):
         value = jnp.asarray(file.state.value, dtype)
         start_time = jnp.asarray(file.times.seconds[0], dtype)
-        omega = (
-            inertia_at(inertia, start_time).rates(value)
-            if file.state.rate == "momentum_body"
-            else value
-        )
-        wxyz = build_attitudes(file.state.attitude, dtype)
+        omega, wxyz = value, build_attitudes(file.state.attitude, dtype)
+        if file.state.rate == "momentum_body":
+            omega = _rates_of(file, inertia, wxyz, value, start_time)
         if file.state.frame == "lvlh":
             frame = polhode.LVLH(build_orbit(file, dtype))
             wxyz, omega = frame.from_frame(wxyz, omega, start_time)
@@ -449,7 +451,7 @@ def draw_clones(file: SceneFile, dtype: DTypeLike) -> Clones:
     start_time = jnp.asarray(file.times.seconds[0], dtype)
     omega = rates
     if file.state.rate == "momentum_body":
-        omega = inertia_at(inertia, start_time).rates(rates)
+        omega = _rates_of(file, inertia, wxyz, rates, start_time)
     return Clones(inertia, polhode.State(wxyz=wxyz, omega_body=omega), redrawn)
 
 

@@ -74,7 +74,19 @@ class VariableRate(AbstractTurning):
         return rate_of_change(self.omega_body, t)
 
     def attitude(self, t):
-        """One adaptive integration from ``t0``, at about 50 times the rounding error per step."""
+        """One adaptive integration from ``t0``, at about 50 times the rounding error per step.
+
+        Its first and second derivatives by the time are those of the angular velocity.
+        """
+        # Derivatives through the steps would be zero at t0, where there is none, and have no
+        # forward mode.
+        end = jax.lax.stop_gradient(t)
+        rate, slope = rate_of_change(self.omega_body, end)
+        after = t - end
+        turn = after * (rate + after / 2 * slope)
+        return multiply(self._integrated(end), rotation_vector_to_wxyz(turn))
+
+    def _integrated(self, t: Array) -> Array:
         accuracy = 50 * float(jnp.finfo(self.start.dtype).eps)
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(lambda s, wxyz, _: wxyz_rate(wxyz, self.omega_body(s))),
@@ -145,9 +157,11 @@ def _slopes(ts, wxyz, omega_body, angular_acceleration) -> tuple[Array, Array]:
 
 @smooth  # the pieces meet with their second derivatives: no step has to end at a sample
 def _interval(times: Array, t: Array) -> Array:
-    """Place of the last time that is not after ``t``, within [0, n - 2]."""
+    """Place of the last time that is not after ``t``, within [0, n - 2], before the first time that
+    is repeated, as the time of an event is."""
     place = jnp.searchsorted(times, t, side="right") - 1
-    return jnp.clip(place, 0, times.shape[0] - 2)
+    widths = jnp.sum(times[1:] > times[:-1], dtype=place.dtype)
+    return jnp.clip(place, 0, jnp.maximum(widths - 1, 0))
 
 
 class SampledAttitude(eqx.Module):
@@ -326,6 +340,10 @@ class RotatingFrame(eqx.Module):
                 " body, or build the frames under jax.vmap."
             )
         ts = trajectory.ts
+        if ts.shape[0] < 2:
+            raise ValueError(
+                f"the trajectory has {ts.shape[0]} sample: two at least are needed to interpolate."
+            )
         if is_concrete(ts, omega):
             speed = np.linalg.norm(np.asarray(omega), axis=-1)
             turn = np.abs(np.diff(np.asarray(ts))) * np.maximum(speed[1:], speed[:-1])

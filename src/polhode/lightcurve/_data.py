@@ -128,8 +128,9 @@ class LightCurve(NamedTuple):
     def binned(self, width: float) -> "LightCurve":
         """Means of the points of one group within ``width`` days: normal points.
 
-        Errors given are combined; many noisy points cost no more than few good ones. ``width``
-        should be below a twentieth of the shortest period sought.
+        Errors given are combined, and a mean that holds a point of unknown error has none; many
+        noisy points cost no more than few good ones. ``width`` should be below a twentieth of the
+        shortest period sought.
         """
         if not width > 0:
             raise ValueError(f"width must be a positive number of days, got {width}.")
@@ -148,6 +149,7 @@ class LightCurve(NamedTuple):
             return x / np.linalg.norm(x, axis=1, keepdims=True)
 
         sigma = np.sqrt(np.bincount(place, self.sigma**2)) / many
+        sigma = np.where(np.bincount(place, self.sigma == 0) > 0, 0.0, sigma)
         rows = (mean(self.t), mean(self.magnitude), sigma, np.rint(mean(self.group)).astype(int))
         order = np.argsort(rows[0], kind="stable")
         sun, observer = (
