@@ -534,3 +534,27 @@ def test_options_of_an_event_are_checked():
         below(1.0, terminal=1)
     with pytest.raises(ValueError, match="capacity"):
         below(1.0, capacity=0)
+
+
+@pytest.mark.parametrize(("capacities", "terminal"), [((1, 10), False), ((1, 2), True)])
+def test_events_share_their_places_in_closed_form_too(capacities, terminal):
+    """More of one event than its own capacity are stored while there is room; all are counted."""
+    events = [
+        ph.Event(lambda wxyz, omega, t: jnp.sin(3 * t), capacity=capacities[0], samples=200),
+        ph.Event(lambda wxyz, omega, t: t - 4.5, capacity=capacities[1], terminal=terminal),
+    ]
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.2]))
+    state = ph.State([1.0, 0.2, 0.1, 0.3], [0.6, 1.1, -0.4])
+    traj = ph.simulate(scene, state, [0.0, 6.0], events=events, throw=False)
+    times = [*(np.arange(1, 5) * np.pi / 3), 4.5, *([] if terminal else [5 * np.pi / 3])]
+    places = sum(capacities)
+    kept = np.array(times[:places])
+    np.testing.assert_allclose(traj.events.times[: kept.size], kept, atol=1e-12)
+    assert not np.isfinite(traj.events.times[kept.size :]).any()
+    assert traj.events.times.shape == (places,)
+    if len(times) <= places:
+        assert int(traj.status) == ph.Status.SUCCESSFUL
+        assert int(traj.events.count) == len(times)
+    else:
+        assert int(traj.status) == ph.Status.TOO_MANY_EVENTS
+        assert int(traj.events.count) > places

@@ -136,9 +136,8 @@ def events_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tr
 
 def events_by_search(trajectory: Trajectory, events: Sequence[Event]) -> Trajectory:
     """The same for a motion that is known at every time: its trajectory is searched."""
-    crossings_of_events = [
-        crossings(trajectory, event, capacity=event.capacity) for event in events
-    ]
+    capacity = sum(event.capacity for event in events)  # each may need all of it
+    crossings_of_events = [crossings(trajectory, event, capacity=capacity) for event in events]
     return _in_order_of_time(
         trajectory,
         [x.times for x in crossings_of_events],
@@ -156,18 +155,25 @@ def _in_order_of_time(trajectory: Trajectory, times, counts, events) -> Trajecto
     at, which = (
         jnp.concatenate([y.reshape(rows.shape[0], -1) for y in x], axis=1) for x in (times, which)
     )
-    overflows = sum(
-        jnp.where(count > event.capacity, 1, 0) for count, event in zip(counts, events, strict=True)
-    )
+    capacity = at.shape[1] // len(events)
     order = jnp.argsort(jnp.where(jnp.isfinite(at), sign * at, jnp.inf), axis=1)
     at, which = (jnp.take_along_axis(x, order, axis=1) for x in (at, which))
     # what lies beyond a terminal event does not happen
     is_terminal = jnp.isfinite(at) & _is_terminal(which, events)
     at = jnp.where(jnp.cumsum(is_terminal, axis=1) - jnp.where(is_terminal, 1, 0) > 0, jnp.inf, at)
     happens = jnp.isfinite(at)
+    met = jnp.sum(happens, axis=1, dtype=jnp.int32)
+    for k, (found, total) in enumerate(zip(times, counts, strict=True)):
+        # those that were not listed come after the listed ones
+        listed = jnp.sum(jnp.isfinite(found.reshape(-1, capacity)), axis=1, dtype=met.dtype)
+        all_happen = jnp.sum(happens & (which == k), axis=1, dtype=met.dtype) == listed
+        more = jnp.ravel(total).astype(met.dtype) - listed
+        met = met + jnp.where(all_happen, jnp.maximum(more, 0), 0)
+    overflows = (met > capacity).reshape(batch)
+    at, which, happens = at[:, :capacity], which[:, :capacity], happens[:, :capacity]
     at_events = moved_to(trajectory, jnp.where(happens, at, rows[:, :1]).reshape(*batch, -1))
     status = jnp.where(
-        (trajectory.status == Status.SUCCESSFUL) & (overflows > 0),
+        (trajectory.status == Status.SUCCESSFUL) & overflows,
         Status.TOO_MANY_EVENTS,
         trajectory.status,
     )
@@ -181,7 +187,7 @@ def _in_order_of_time(trajectory: Trajectory, times, counts, events) -> Trajecto
         lanes(trajectory._samples),
         jax.tree.map(jnp.ravel, (status, trajectory._steps)),
         events,
-        (at, which, jnp.sum(happens, axis=1)),
+        (at, which, met),
         lanes(at_events._samples),
     )
 
