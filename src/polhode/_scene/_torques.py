@@ -330,8 +330,10 @@ class SampledTorque(AbstractTorque):
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> tuple[Array, Array, Array]:
         raise ValueError(
-            "SampledTorque holds a command that the state does not contain: simulate it with"
-            " ph.simulate without events, as the torque of the scene or a term of its sum."
+            "SampledTorque holds a command that the state does not contain. It is for ph.simulate"
+            " without events, as the torque of the scene or a term of its sum; what needs the"
+            " torque at a state, such as ph.accelerometer, frames of a trajectory and ensembles,"
+            " does not take it: use a ph.FeedbackTorque."
         )
 
 
