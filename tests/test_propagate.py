@@ -272,3 +272,4 @@ def test_a_disturbance_over_many_turns():
     assert jnp.all(jnp.isnan(traced(dt).noise))
     np.testing.assert_allclose(traced(dt).jacobian, found.jacobian, atol=1e-9)
     assert jnp.all(jnp.isfinite(traced(5.0).noise))
+    assert jnp.all(jnp.isnan(ph.propagate(scene, state, 1e6).noise))  # more parts than memory holds

@@ -32,6 +32,8 @@ _NODES = 8
 motion has a closed form; their error falls with the 16th power of the angle turned in a part: 1e-12
 of the effect for a third of a turn."""
 
+_MOST_PARTS = 1024
+
 _TURN = np.pi
 """Angle [rad] by the largest body rate that a part of a step may take. With twice that the effect
 is in error by up to 2e-7 of itself."""
@@ -81,9 +83,9 @@ def propagate(
     The Jacobian is that of the exact flow, by forward differentiation through ``ph.simulate``.
     ``noise`` is the derivative by a disturbance torque on the body [N m] that is constant over the
     step, in body axes: a torque of spectral density s [N^2 m^2 s] adds ``noise @ noise.T * s / dt``
-    to the covariance. In closed form it is integrated over the step. There it is NaN under ``jit``
-    and ``vmap`` if the body turns by more than half a turn in a step: propagate in shorter steps,
-    or by ``method=ph.LiePoisson()``.
+    to the covariance. In closed form it is integrated over the step. There it is NaN if the body
+    turns by more than half a turn in a step under ``jit`` or ``vmap``, or by more than 512 turns
+    elsewhere: propagate in shorter steps, or by ``method=ph.LiePoisson()``.
 
     **Arguments:** ``scene``, ``state``: of one body; for several ``jax.vmap``. ``dt``: not zero.
     ``free``: None, or a function that picks leaves of the scene, ``lambda s: s.inertia.diagonal``:
@@ -119,7 +121,7 @@ def propagate(
         )
     arguments = scene, state, dt, t, places, method, check_rtol(rtol, dtype)
     start, (state, jacobian, noise, status, turned) = state, _propagated(*arguments, 1)
-    if not isinstance(turned, Tracer) and np.isfinite(turned) and turned > _TURN:
+    if not isinstance(turned, Tracer) and _TURN < turned <= _MOST_PARTS * _TURN:
         parts = 2 ** math.ceil(math.log2(turned / _TURN))
         state, jacobian, noise, status, _ = _propagated(scene, start, *arguments[2:], parts)
     if not isinstance(status, Tracer):

@@ -186,6 +186,13 @@ def test_the_attitude_of_a_given_rate_has_its_derivatives_by_time(t):
     gap = (rate(t + 1e-4) - rate(t - 1e-4)) / 2e-4
     np.testing.assert_allclose(bend, gap, atol=1e-7)
 
+    def of_strength(strength):
+        frame = RotatingFrame.from_rate(lambda t: strength * jnp.array([0.1, 0.2 * t, 1.0 + t]))
+        return jax.jacfwd(frame.attitude)(0.5)
+
+    gap = (of_strength(1.001) - of_strength(0.999)) / 2e-3
+    np.testing.assert_allclose(jax.jacrev(of_strength)(1.0), gap, atol=1e-6)
+
 
 def test_a_frame_of_a_motion_that_stopped_at_an_event():
     """Its last times are that of the event, again and again."""

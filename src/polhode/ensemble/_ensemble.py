@@ -126,7 +126,7 @@ def draw(
             streams.append(stream)
             scene, state = spread(spread_key, scene, state)
         if "momentum_body" in rows:
-            state = scene.with_momentum(state, rows["momentum_body"])
+            state = _with_momentum(scene, state, rows["momentum_body"])
         return scene, state
 
     return eqx.filter_vmap(draw_one, in_axes=(0, eqx.if_array(0)), out_axes=eqx.if_array(0))(
@@ -150,6 +150,11 @@ def _with_moments(scene: Scene, moments: Array) -> Scene:
     """The scene with these principal moments, about the principal axes that it has."""
     inertia, axes = Inertia.from_moments(moments), scene.constant_inertia.axes
     return dataclasses.replace(scene, inertia=inertia if axes is None else inertia.turned(axes))
+
+
+def _with_momentum(scene: Scene, state: State, momentum: Array) -> State:
+    _ = scene.constant_inertia  # refuses one that changes, as the first time is not known here
+    return scene.with_momentum(state, momentum)
 
 
 class Deviate(eqx.Module):
@@ -248,7 +253,7 @@ class SpreadMomentum(eqx.Module):
 
     def __call__(self, key: Array, scene: Scene, state: State) -> tuple[Scene, State]:
         momentum = self.momentum if self.deviate is None else self.momentum + self.deviate(key)
-        return scene, scene.with_momentum(state, momentum)
+        return scene, _with_momentum(scene, state, momentum)
 
 
 class SpreadTorque(eqx.Module):

@@ -4,6 +4,7 @@ Equations: docs/equations.md, 003.
 """
 
 import abc
+import functools
 from collections.abc import Callable
 
 import diffrax
@@ -63,6 +64,20 @@ class ConstantRate(AbstractTurning):
         return multiply(self.start, rotation_vector_to_wxyz(self.omega_body * (t - self.t0)))
 
 
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _turning(omega_body: Callable, t: Array, wxyz: Array, *hoisted: Array) -> Array:
+    """The attitude ``wxyz`` at ``t``, with the derivative that the angular velocity gives it."""
+    return wxyz
+
+
+@_turning.defjvp
+def _turning_rule(omega_body, primals, tangents):
+    # Through the steps of an integration it would be zero at its start, where there is no step.
+    t, _, *hoisted = primals
+    value = _turning(omega_body, *primals)
+    return value, tangents[1] + wxyz_rate(value, omega_body(t, *hoisted)) * tangents[0]
+
+
 class VariableRate(AbstractTurning):
     """Angular velocity as a function of time; attitude ``start`` at ``t0``, by integration."""
 
@@ -74,17 +89,10 @@ class VariableRate(AbstractTurning):
         return rate_of_change(self.omega_body, t)
 
     def attitude(self, t):
-        """One adaptive integration from ``t0``, at about 50 times the rounding error per step.
-
-        Its first and second derivatives by the time are those of the angular velocity.
-        """
-        # Derivatives through the steps would be zero at t0, where there is none, and have no
-        # forward mode.
-        end = jax.lax.stop_gradient(t)
-        rate, slope = rate_of_change(self.omega_body, end)
-        after = t - end
-        turn = after * (rate + after / 2 * slope)
-        return multiply(self._integrated(end), rotation_vector_to_wxyz(turn))
+        """One adaptive integration from ``t0``, at about 50 times the rounding error per step."""
+        omega_body, hoisted = jax.closure_convert(self.omega_body, t)
+        integrated = self._integrated(jax.lax.stop_gradient(t))
+        return _turning(omega_body, t, integrated, *hoisted)
 
     def _integrated(self, t: Array) -> Array:
         accuracy = 50 * float(jnp.finfo(self.start.dtype).eps)
