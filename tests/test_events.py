@@ -11,6 +11,7 @@ from devices import told_by
 from scipy.special import ellipk
 
 import polhode as ph
+from polhode import rotation
 from polhode._events._crossings import minima_of
 
 RATE = 1.7
@@ -558,3 +559,15 @@ def test_events_share_their_places_in_closed_form_too(capacities, terminal):
     else:
         assert int(traj.status) == ph.Status.TOO_MANY_EVENTS
         assert int(traj.events.count) > places
+
+
+@pytest.mark.parametrize("depth", [0.3, 0.999999])
+def test_a_motion_in_closed_form_stops_at_its_first_event(depth):
+    """Also at one of two crossings between two looks, which only the turning point shows."""
+    scene, state = ph.Scene(ph.Inertia.spherical(2.0)), ph.State([1.0, 0, 0, 0], [0.0, 0.0, 1.0])
+
+    def height(wxyz, omega, t):
+        return rotation.rotate(wxyz, jnp.array([1.0, 0.0, 0.0]))[0] + depth
+
+    traj = ph.simulate(scene, state, [0.0, 20.0], until=ph.Event(height))
+    assert float(traj.event_time) == pytest.approx(np.arccos(-depth), abs=1e-8)
