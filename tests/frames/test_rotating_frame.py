@@ -8,7 +8,7 @@ import pytest
 
 import polhode as ph
 from polhode import rotation
-from polhode.frames import RotatingFrame
+from polhode.frames import RotatingFrame, SampledAttitude
 
 # theory section 8.3
 OMEGA, SLOPE = np.array([0.3, -0.5, 0.7]), np.array([0.1, 0.2, -0.3])
@@ -186,6 +186,7 @@ def test_the_attitude_of_a_given_rate_has_its_derivatives_by_time(t):
     gap = (rate(t + 1e-4) - rate(t - 1e-4)) / 2e-4
     np.testing.assert_allclose(bend, gap, atol=1e-7)
 
+    @jax.jit
     def of_strength(strength):
         frame = RotatingFrame.from_rate(lambda t: strength * jnp.array([0.1, 0.2 * t, 1.0 + t]))
         return jax.jacfwd(frame.attitude)(0.5)
@@ -196,12 +197,17 @@ def test_the_attitude_of_a_given_rate_has_its_derivatives_by_time(t):
 
 def test_a_frame_of_a_motion_that_stopped_at_an_event():
     """Its last times are that of the event, again and again."""
-    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.2]))
+    times, rate = jnp.array([0.0, 0.5, 1.0, 1.2, 1.2, 1.2]), jnp.array([0.3, 0.4, 1.2])
+    turns = rotation.rotation_vector_to_wxyz(jnp.outer(times, rate))
+    omega = jnp.broadcast_to(rate, (6, 3))
+    frame = RotatingFrame.from_attitude(SampledAttitude(times, turns, omega, 0 * omega))
+    np.testing.assert_allclose(frame.attitude(times), turns, atol=1e-14)
+    np.testing.assert_allclose(frame.omega_body(times), omega, atol=1e-12)
+
+
+def test_a_frame_needs_two_samples():
+    scene = ph.Scene(ph.Inertia.spherical(2.0))
     state, ts = ph.State([1.0, 0.2, 0.1, 0.3], [0.6, 1.1, -0.4]), jnp.linspace(0, 5, 11)
-    motion = ph.simulate(scene, state, ts, until=ph.Event(lambda wxyz, omega, t: t - 2.3))
-    frame = RotatingFrame.from_trajectory(motion)
-    np.testing.assert_allclose(frame.attitude(motion.ts), motion.wxyz, atol=1e-14)
-    np.testing.assert_allclose(frame.omega_body(motion.ts), motion.omega_body, atol=1e-12)
     last = ph.simulate(scene, state, ts, record=ph.Record(final_only=True))
     with pytest.raises(ValueError, match="two at least"):
         RotatingFrame.from_trajectory(last)

@@ -91,24 +91,30 @@ class VariableRate(AbstractTurning):
     def attitude(self, t):
         """One adaptive integration from ``t0``, at about 50 times the rounding error per step."""
         omega_body, hoisted = jax.closure_convert(self.omega_body, t)
-        integrated = self._integrated(jax.lax.stop_gradient(t))
+        # compiled once for every frame; a function of traced values lives no longer than its trace
+        integrate = _integrated if hoisted else _compiled
+        integrated = integrate(self, jax.lax.stop_gradient(t))
         return _turning(omega_body, t, integrated, *hoisted)
 
-    def _integrated(self, t: Array) -> Array:
-        accuracy = 50 * float(jnp.finfo(self.start.dtype).eps)
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(lambda s, wxyz, _: wxyz_rate(wxyz, self.omega_body(s))),
-            diffrax.Dopri8(),
-            self.t0,
-            t,
-            None,
-            self.start,
-            stepsize_controller=diffrax.PIDController(rtol=0.0, atol=accuracy),
-            max_steps=2**14,
-            adjoint=diffrax.RecursiveCheckpointAdjoint(),
-        )
-        (path,) = jax.tree.leaves(solution.ys)
-        return normalise(path[-1])
+
+def _integrated(turning: VariableRate, t: Array) -> Array:
+    accuracy = 50 * float(jnp.finfo(turning.start.dtype).eps)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda s, wxyz, _: wxyz_rate(wxyz, turning.omega_body(s))),
+        diffrax.Dopri8(),
+        turning.t0,
+        t,
+        None,
+        turning.start,
+        stepsize_controller=diffrax.PIDController(rtol=0.0, atol=accuracy),
+        max_steps=2**14,
+        adjoint=diffrax.RecursiveCheckpointAdjoint(),
+    )
+    (path,) = jax.tree.leaves(solution.ys)
+    return normalise(path[-1])
+
+
+_compiled = eqx.filter_jit(_integrated)
 
 
 class PrescribedAttitude(AbstractTurning):
