@@ -12,7 +12,7 @@ from scipy.special import ellipk
 
 import polhode as ph
 from polhode import rotation
-from polhode._events._crossings import minima_of
+from polhode._events._search import minima_of
 
 RATE = 1.7
 BALL = ph.Scene(ph.Inertia.spherical(2.0))
@@ -544,7 +544,7 @@ def test_events_share_their_places_in_closed_form_too(capacities, terminal):
         ph.Event(lambda wxyz, omega, t: jnp.sin(3 * t), capacity=capacities[0], samples=200),
         ph.Event(lambda wxyz, omega, t: t - 4.5, capacity=capacities[1], terminal=terminal),
     ]
-    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.2]))
+    scene = ph.Scene(ph.Inertia.spherical(2.0))
     state = ph.State([1.0, 0.2, 0.1, 0.3], [0.6, 1.1, -0.4])
     traj = ph.simulate(scene, state, [0.0, 6.0], events=events, throw=False)
     times = [*(np.arange(1, 5) * np.pi / 3), 4.5, *([] if terminal else [5 * np.pi / 3])]
@@ -571,3 +571,20 @@ def test_a_motion_in_closed_form_stops_at_its_first_event(depth):
 
     traj = ph.simulate(scene, state, [0.0, 20.0], until=ph.Event(height))
     assert float(traj.event_time) == pytest.approx(np.arccos(-depth), abs=1e-8)
+
+
+def test_pairs_of_events_that_no_sample_shows_have_their_states():
+    """A direction that dips below a plane for a three thousandth of a turn."""
+    scene, depth = ph.Scene(ph.Inertia.spherical(2.0)), 1 - 5e-7
+    below = ph.Event(
+        lambda wxyz, omega, t: rotation.rotate(wxyz, jnp.array([1.0, 0.0, 0.0]))[0] + depth,
+        capacity=3,
+    )
+    for speed in np.linspace(0.9, 1.1, 12):
+        state = ph.State([1.0, 0, 0, 0], [0.0, 0.0, speed])
+        events = ph.simulate(scene, state, [0.0, 7.0], events=below).events
+        assert int(events.count) == 2
+        half = (np.pi + np.array([-1, 1]) * np.arccos(depth)) / 2
+        np.testing.assert_allclose(events.times[:2], 2 * half / speed, atol=1e-9)
+        turned = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
+        np.testing.assert_allclose(events.wxyz[:2], turned, atol=1e-9)

@@ -1,7 +1,7 @@
 """When a function of attitude, rates and time crosses zero along a trajectory."""
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,6 +13,8 @@ from polhode import _integrate  # its names load diffrax at first use
 from polhode._batch import PARTS, flatten, lane_times
 from polhode._checks import is_concrete
 from polhode._events._event import Event, at_least
+from polhode._events._search import Brackets, Looks, entries, first_true, minima_of, searched
+from polhode._kernels import attached_to
 from polhode._method import Status
 from polhode._scene import Scene, State
 from polhode._trajectory import Propagator, Trajectory, moved_through, moved_to, with_initial_spins
@@ -25,6 +27,9 @@ _MAX_SAMPLES = 20_000_000
 
 _MIN_CAPACITY = 16
 """Minimum number of minima of the function that are examined."""
+
+_SAMPLING_LOOKS = 64
+"""Looks in which all samples are taken, at most: roots take about 16 of the same width."""
 
 CAPACITY = 256
 """Crossings of each body that the steps store unless told otherwise."""
@@ -88,17 +93,7 @@ def crossings(
     event = fn if isinstance(fn, Event) else Event(fn, direction, samples)
     slots = at_least("capacity", capacity, 1)
     size = event.samples if samples is None else at_least("samples", samples, 2)
-    for name in ("wxyz", "omega_body"):
-        getattr(trajectory, name)  # raises where it was not recorded
-    if trajectory.propagator is None:
-        raise ValueError("this trajectory was made by hand: use one that ph.simulate returns.")
-    if not isinstance(trajectory.propagator, Propagator):
-        raise ValueError(
-            "a SampledTorque holds a command that the samples do not contain: events between them"
-            " are not searched for."
-        )
-    propagator: Any = trajectory.propagator
-    if not propagator.method.exact:
+    if not _propagator(trajectory).method.exact:
         step_result = _by_steps(trajectory, event, slots or CAPACITY)
         if step_result is not None:
             _raise_if_failed(step_result[1], "the steps to the last time")
@@ -115,15 +110,29 @@ def crossings(
                 "under jit, vmap or grad the number of stored crossings must be given: capacity=8."
             )
         slots = _MIN_CAPACITY
-    result, has_failed = _by_sampling(trajectory, event, slots, size)
+    (result,), _, has_failed = _by_sampling(trajectory, [event], slots, size)
     _raise_if_failed(has_failed, f"the way through {size:,} samples")
     while capacity is None and int(np.max(result.count, initial=0)) > slots:
         slots = 2 ** int(np.ceil(np.log2(np.max(result.count))))
-        result, _ = _by_sampling(trajectory, event, slots, size)
+        (result,), *_ = _by_sampling(trajectory, [event], slots, size)
     if capacity is None:  # drop columns that no body uses
         count = int(np.max(result.count, initial=0))
         result = Crossings(result.times[..., :count], result.slope[..., :count], result.count)
     return result
+
+
+def _propagator(trajectory: Trajectory) -> Propagator:
+    """What moves the trajectory; raises ValueError where nothing does."""
+    for name in ("wxyz", "omega_body"):
+        getattr(trajectory, name)  # raises where it was not recorded
+    if trajectory.propagator is None:
+        raise ValueError("this trajectory was made by hand: use one that ph.simulate returns.")
+    if not isinstance(trajectory.propagator, Propagator):
+        raise ValueError(
+            "a SampledTorque holds a command that the samples do not contain: events between them"
+            " are not searched for."
+        )
+    return trajectory.propagator
 
 
 def _raise_if_failed(has_failed: Array, way: str) -> None:
@@ -230,196 +239,134 @@ def _natural_rates(trajectory: Trajectory) -> Array:
     return _integrate.natural_rates(Scene(**parts), lanes, ends).reshape(batch)
 
 
+class Met(NamedTuple):
+    """Crossings of E events, their states, and the bodies (...) that could not be sampled."""
+
+    crossings: list[Crossings]
+    states: list[list[Array]]
+    has_failed: Array
+
+
+def all_crossings(trajectory: Trajectory, events: Sequence[Event], capacity: int) -> Met:
+    """The first ``capacity`` crossings of each event in one search, of a motion that is known."""
+    _propagator(trajectory)
+    sizes = [event.samples for event in events]
+    default = _sample_count(trajectory) if None in sizes else 2
+    size = max(default if x is None else x for x in sizes)
+    met = _by_sampling(trajectory, events, capacity, size)
+    _raise_if_failed(met.has_failed, f"the way through {size:,} samples")
+    return met
+
+
 @eqx.filter_jit
-def _by_sampling(
-    trajectory: Trajectory, event: Event, capacity: int, size: int
-) -> tuple[Crossings, Array]:
-    """The first ``capacity`` crossings, and the bodies (...) that could not be sampled."""
+def _by_sampling(trajectory: Trajectory, events: Sequence[Event], capacity: int, size: int) -> Met:
+    """The first ``capacity`` crossings of each event."""
     stop_gradient = jax.lax.stop_gradient
     arrays, static = eqx.partition(trajectory, eqx.is_inexact_array)
     constant_trajectory: Trajectory = eqx.combine(stop_gradient(arrays), static)
-    batch = trajectory.batch_shape
+    batch, rank = trajectory.batch_shape, len(trajectory.batch_shape)
     ts = constant_trajectory.ts
     share = jnp.linspace(0, 1, size, dtype=ts.dtype).at[0].set(AT_START / (size - 1))
     share = share.reshape((1,) * (ts.ndim - 1) + share.shape)
-    grid = ts[..., :1] + share * (ts[..., -1:] - ts[..., :1])
-    samples = moved_through(constant_trajectory, grid)
-    propagator: Any = trajectory.propagator
-    # what is stepped goes on from the nearest look
-    origin = constant_trajectory if propagator.method.exact else samples
-    values, slopes = event.values(samples)
-    values, slopes = (x.reshape(-1, size) for x in (values, slopes))
-    grid = jnp.broadcast_to(grid, (*batch, size)).reshape(-1, size)
-    values, slopes, grid = stop_gradient((values, slopes, grid))
+    times = ts[..., :1] + share * (ts[..., -1:] - ts[..., :1])
+    grid = stop_gradient(jnp.broadcast_to(times, (*batch, size)).reshape(-1, size))
     time_sign = jnp.where(grid[:, -1:] < grid[:, :1], -1, 1).astype(grid.dtype)
+    time_sign = jnp.tile(time_sign, (len(events), 1))
+    direction = jnp.asarray([event.direction for event in events], grid.dtype)
+    direction = jnp.repeat(direction, grid.shape[0])[:, None]
 
-    def evaluate(t):
-        pair = event.values(moved_to(origin, t.reshape(*batch, -1)))
-        return stop_gradient(tuple(x.reshape(t.shape) for x in pair))
+    def looks(moved: Trajectory) -> Looks:
+        pairs = [event.values(moved) for event in events]
+        values, slopes = (
+            jnp.stack(x).reshape(len(events), -1, x[0].shape[-1]) for x in zip(*pairs)
+        )
+        states = [x.reshape(-1, *x.shape[rank:]) for x in moved._samples]
+        is_successful = jnp.ravel(moved.status == Status.SUCCESSFUL)
+        return stop_gradient(Looks(values, slopes, states, is_successful))
 
-    sides = jnp.where(values >= 0, 1, -1)
-    changes = sides[:, 1:] != sides[:, :-1]
-    if event.direction:
-        changes = changes & (sides[:, 1:] * time_sign == event.direction)
+    origin, samples = constant_trajectory, None
+    if not _propagator(trajectory).method.exact:  # what is stepped goes on from the nearest sample
+        origin = moved_through(constant_trajectory, times)
+        samples = looks(origin)._replace(states=[])
+
+    def look(t):
+        return looks(moved_to(origin, t.reshape(*batch, -1)))
+
+    def analyse(samples):
+        """Where the function changes its sign, and where it may do so twice between two samples:
+        the first of these places, and how many there are."""
+        values, slopes = (x.reshape(-1, size) for x in (samples.values, samples.slopes))
+        sides = jnp.where(values >= 0, 1, -1)
+        changes = sides[:, 1:] != sides[:, :-1]
+        changes = changes & ((direction == 0) | (sides[:, 1:] * time_sign == direction))
+        minima = minima_of(rows, values, slopes, sides)
+        counts = (jnp.sum(x, axis=-1) for x in (changes, minima))
+        return first_true(changes, stored), first_true(minima, stored), *counts
+
+    rows = jnp.tile(grid, (len(events), 1))
     stored = max(capacity, _MIN_CAPACITY)
-    minima = minima_of(grid, values, slopes, sides)
 
-    # a minimum between two samples is evaluated
-    place, is_minimum = first_true(minima, stored)
-    single, is_single = first_true(changes, stored)
-    side = entries(sides, place)
-    low, high = entries(grid, place), entries(grid, place + 1)
-    turns = low, high, entries(slopes, place), entries(slopes, place + 1), is_minimum
+    def turns(samples, analysis):
+        slopes, (_, (place, is_minimum), *_) = samples.slopes.reshape(-1, size), analysis
+        low, high, at_low, at_high = (entries(x, place + k) for x in (rows, slopes) for k in (0, 1))
+        return Brackets(low, high, at_low, at_high, is_minimum)
 
-    def brackets(turning, turning_values):
-        """Between samples, and on both sides of such a turning point; which are pairs of these."""
+    def brackets(samples, analysis, turning, turning_values):
+        """Between samples, and on both sides of turning points beyond zero, in order of time; the
+        number of all, or of all that there may be."""
+        values = samples.values.reshape(-1, size)
+        (single, is_single), (place, is_minimum), changes, dipping = analysis
+        sides = jnp.where(values >= 0, 1, -1)
+        side = entries(sides, place)
         pairs = is_minimum & (jnp.where(turning_values >= 0, 1, -1) != side)
         columns = (
-            (entries(grid, single), low, turning),
-            (entries(grid, single + 1), turning, high),
+            (entries(rows, single), entries(rows, place), turning),
+            (entries(rows, single + 1), turning, entries(rows, place + 1)),
             (entries(values, single), entries(values, place), turning_values),
             (entries(values, single + 1), turning_values, entries(values, place + 1)),
             (is_single, pairs, pairs),
             (entries(sides, single + 1) > 0, side < 0, side > 0),  # rising along the motion
         )
         *columns, use, rising = (jnp.concatenate(x, axis=-1) for x in columns)
-        if event.direction:
-            use = use & (jnp.where(rising, 1, -1) * time_sign == event.direction)
+        use = use & ((direction == 0) | (jnp.where(rising, 1, -1) * time_sign == direction))
         order = jnp.argsort(jnp.where(use, time_sign * columns[0], jnp.inf), axis=-1)[:, :stored]
-        return tuple(entries(x, order) for x in (*columns, use)), pairs
+        per_pair = jnp.where(direction[:, 0] == 0, 2, 1)
+        count = changes + per_pair * jnp.sum(pairs, axis=-1)
+        # minima beyond the stored were not looked at: there may be as many pairs of them
+        count = jnp.where(dipping > stored, jnp.maximum(count, per_pair * dipping), count)
+        return Brackets(*(entries(x, order) for x in (*columns, use))), count
 
-    def search(roots, is_second_pass):
-        """The turning points, then the roots: one copy of the motion in the program."""
-        arguments = [jnp.where(is_second_pass, b, a) for a, b in zip(turns, brackets(*roots)[0])]
+    width = max(len(events) * stored, -(-size // _SAMPLING_LOOKS))
+    found = searched(look, grid, stored, width, analyse, turns, brackets, samples, keep=False)
+    has_failed = ~found.samples.is_successful.reshape(batch)
+    has_failed = has_failed & (trajectory.status == Status.SUCCESSFUL)
 
-        def fn(t):
-            value, slope = evaluate(t)
-            return jnp.where(is_second_pass, value, slope), value
+    def of_event(x, k):
+        return x.reshape(len(events), *batch, *x.shape[1:])[k]
 
-        roots = bracketed_roots(fn, *arguments)
-        return roots, roots
-
-    zeros = jnp.zeros_like(low)
-    _, (points, turning_values) = jax.lax.scan(search, (zeros, zeros), jnp.array([False, True]))
-    (*_, use), pairs = brackets(points[0], turning_values[0])
-    times = points[1]
-    per_pair = 1 if event.direction else 2
-    count = jnp.sum(changes, axis=-1) + per_pair * jnp.sum(pairs, axis=-1)
-    # minima beyond the stored were not looked at: there may be as many pairs of them
-    dipping = jnp.sum(minima, axis=-1)
-    count = jnp.where(dipping > stored, jnp.maximum(count, per_pair * dipping), count)
-    times, use = (x[:, :capacity].reshape(*batch, capacity) for x in (times, use))
-    slope, times = _differentiable_times(trajectory, event, times, use)
-    has_failed = (samples.status != Status.SUCCESSFUL) & (trajectory.status == Status.SUCCESSFUL)
-    count = jnp.where(has_failed, capacity + 1, count.reshape(batch)).astype(jnp.int32)
-    return Crossings(jnp.where(use, times, jnp.inf), jnp.where(use, slope, 0), count), has_failed
+    crossings, states = [], []
+    for k, event in enumerate(events):
+        times, use = (of_event(x, k)[..., :capacity] for x in (found.roots, found.use))
+        slope = of_event(found.slopes, k)[..., :capacity]
+        at_events = [of_event(x, k)[..., :capacity, :] for x in found.states]
+        slope, times, at_events = _differentiable(trajectory, event, times, use, slope, at_events)
+        total = jnp.where(has_failed, capacity + 1, of_event(found.beside, k)).astype(jnp.int32)
+        times, slope = jnp.where(use, times, jnp.inf), jnp.where(use, slope, 0)
+        crossings.append(Crossings(times, slope, total))
+        states.append(at_events)
+    return Met(crossings, states, has_failed)
 
 
-def _differentiable_times(trajectory: Trajectory, event: Event, times: Array, use: Array):
-    """Slopes and times with their derivatives."""
-    safe = jnp.where(use, times, trajectory.ts[..., :1])
-    # of the value no more than rounding is left to correct, or of a touch all digits are noise
-    tolerance = 64 * jnp.finfo(safe.dtype).eps * jnp.abs(safe)
-    delay, at_events = event.refined(moved_to(trajectory, safe), tolerance)
-    _, slope = event.values(at_events)
-    return slope, safe + delay
+def _differentiable(trajectory: Trajectory, event: Event, times, use, slope, states):
+    """Slopes, times and states at events with their derivatives."""
+    safe = jnp.where(use, times, jax.lax.stop_gradient(trajectory.ts[..., :1]))
+    arrays, static = eqx.partition(trajectory, eqx.is_inexact_array)
 
+    def refined(arrays, safe):
+        # of the value no more than rounding is left to correct, or of a touch all digits are noise
+        tolerance = 64 * jnp.finfo(safe.dtype).eps * jnp.abs(safe)
+        delay, at_events = event.refined(moved_to(eqx.combine(arrays, static), safe), tolerance)
+        return [event.values(at_events)[1], safe + delay, *at_events._samples]
 
-def minima_of(grid, values, slopes, sides) -> Array:
-    """Between which samples (N, S - 1) the function turns back before zero, and comes near it.
-
-    Near by the cubic through values and slopes, whose error is a hundredth of what it changes by.
-    """
-    step = grid[:, 1:] - grid[:, :-1]
-    side = sides[:, :-1].astype(values.dtype)
-    a, end = side * values[:, :-1], side * values[:, 1:]
-    b, b_end = side * step * slopes[:, :-1], side * step * slopes[:, 1:]
-    turns = (sides[:, 1:] == sides[:, :-1]) & (b < 0) & (b_end > 0)
-    jump = end - a
-    c, d = 3 * jump - 2 * b - b_end, b + b_end - 2 * jump
-    root = jnp.sqrt(jnp.maximum(c * c - 3 * d * b, 0))
-    s = -b / jnp.where(c + root > 0, c + root, 1)
-    s = jnp.clip(s, 0, 1)
-    lowest = a + s * (b + s * (c + s * d))
-    return turns & (lowest <= jnp.minimum(a, end) / 2)
-
-
-def entries(x: Array, k: Array) -> Array:
-    """Entries ``k`` (N, D) of the rows of ``x``."""
-    return jnp.take_along_axis(x, k, axis=-1)
-
-
-def first_true(mask: Array, capacity: int) -> tuple[Array, Array]:
-    """Places (N, capacity) of the first that are true, and which of these there are."""
-    size = mask.shape[-1]
-    places = jnp.where(mask, jnp.arange(size), size)
-    if capacity > size:
-        places = jnp.pad(places, ((0, 0), (0, capacity - size)), constant_values=size)
-    places = jnp.sort(places, axis=-1)[:, :capacity]
-    return jnp.where(places < size, places, 0), places < size
-
-
-_MOST = 100
-"""Evaluations: halving alone would need about sixty."""
-
-
-def bracketed_roots(
-    fn: Callable[[Array], tuple[Array, Array]],
-    low: Array,
-    high: Array,
-    at_low: Array,
-    at_high: Array,
-    use: Array,
-) -> tuple[Array, Array]:
-    """Roots of ``fn``, entry by entry, between ``low`` and ``high``, to a few units in the last
-    place of the larger; entries that are not in ``use`` stay at ``low``. ``fn`` returns its values
-    and something else, which is returned as it is where the root was last looked at.
-
-    Inverse quadratic interpolation where it is safe, halving elsewhere: T. R. Chandrupatla, Adv.
-    Eng. Software 28 (1997) 145.
-    """
-    tolerance = 2 * jnp.finfo(low.dtype).eps * jnp.maximum(jnp.abs(low), jnp.abs(high))
-
-    def on(walk):
-        count, is_done = walk[0], walk[1]
-        return (count < _MOST) & ~jnp.all(is_done)
-
-    def iterate(walk):
-        count, is_done, x1, x2, f1, f2, share, extra = walk
-        x = x1 + share * (x2 - x1)
-        f, new_extra = fn(jnp.where(is_done, low, x))
-        same_sign = jnp.sign(f) == jnp.sign(f1)
-        x3, f3 = jnp.where(same_sign, x1, x2), jnp.where(same_sign, f1, f2)
-        new2, g2 = jnp.where(same_sign, x2, x1), jnp.where(same_sign, f2, f1)
-        bracket = jnp.abs(new2 - x)
-        limit = tolerance / jnp.where(bracket > 0, bracket, 1)
-        stop = (bracket <= 2 * tolerance) | (f == 0)
-        a, b, c = f - g2, f3 - g2, f3 - f
-        ab, ac, bc = (jnp.where(z == 0, 1, z) for z in (a, c, b))
-        across = jnp.where(x3 == new2, 1, x3 - new2)
-        xi, phi = (x - new2) / across, a / bc
-        safe = (phi * phi < xi) & ((1 - phi) * (1 - phi) < 1 - xi)
-        span = jnp.where(new2 == x, 1, new2 - x)
-        inverse = -(f / ab) * (-f3 / bc) + (x3 - x) / span * (f / ac) * (g2 / bc)
-        new_share = jnp.clip(jnp.where(safe, inverse, 0.5), limit, 1 - limit)
-
-        def where_busy(old, new):
-            return jnp.where(is_done, old, new)
-
-        values = (
-            where_busy(x1, x),
-            where_busy(x2, new2),
-            where_busy(f1, f),
-            where_busy(f2, g2),
-            where_busy(share, new_share),
-        )
-        values = (*values, where_busy(extra, new_extra))
-        return count + 1, is_done | stop, *values
-
-    zero = at_low == 0
-    start = jnp.where(zero, low, high), low, jnp.where(zero, at_low, at_high), at_low
-    is_done = ~use | zero | (at_high == 0)
-    walk = (0, is_done, *start, jnp.full_like(low, 0.5), jnp.zeros_like(low))
-    _, _, x1, x2, f1, f2, _, extra = jax.lax.while_loop(on, iterate, walk)
-    root = jnp.where(jnp.abs(f1) <= jnp.abs(f2), x1, x2)
-    return jnp.where(use, root, low), extra
+    slope, times, *states = attached_to(refined, (arrays, safe), [slope, safe, *states])
+    return slope, times, states

@@ -8,10 +8,9 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array
 
-from polhode._kernels import attached, is_slope
+from polhode._kernels import attached_to
 from polhode._parts import Signature
 from polhode._trajectory import Trajectory, shortly_after
 from polhode.rotation._quaternion import wxyz_rate
@@ -78,30 +77,13 @@ class Event(eqx.Module):
         """``refined`` for samples at which the function is zero to rounding: the same derivatives,
         and no computation where none is needed."""
         arrays, static = eqx.partition(approximate, eqx.is_inexact_array)
-        leaves, tree = jax.tree.flatten((arrays, limit))
 
-        def values_of(*leaves):
-            arrays, limit = jax.tree.unflatten(tree, leaves)
+        def values_of(arrays, limit):
             delay, at_events = self.refined(eqx.combine(arrays, static), limit)
             return [delay, *at_events._samples]
 
-        closed_jaxpr = jax.make_jaxpr(values_of)(*leaves)
-        size = len(closed_jaxpr.consts)
-
-        def rule(operands, tangents, values):
-            at = [i for i, x in enumerate(tangents) if is_slope(x)]
-
-            def of_active(*primals):
-                inputs = list(operands)
-                for i, x in zip(at, primals):
-                    inputs[i] = x
-                return jaxpr_as_fun(ClosedJaxpr(closed_jaxpr.jaxpr, inputs[:size]))(*inputs[size:])
-
-            return jax.jvp(of_active, [operands[i] for i in at], [tangents[i] for i in at])[1]
-
         values = [jnp.zeros_like(approximate._t), *approximate._samples]
-        operands = [*map(jnp.asarray, closed_jaxpr.consts), *leaves]
-        delay, *states = attached(rule, operands, values)
+        delay, *states = attached_to(values_of, (arrays, limit), values)
         at_events = approximate._with_samples(
             approximate._t + delay, states, approximate.status, approximate._steps, None
         )

@@ -18,14 +18,12 @@ from polhode._batch import PARTS, flatten, lane_times
 from polhode._events._crossings import (
     AT_START,
     SAMPLES_PER_TURN,
-    bracketed_roots,
-    crossings,
-    entries,
-    first_true,
-    minima_of,
+    Met,
+    all_crossings,
     turning_rates,
 )
 from polhode._events._event import Event
+from polhode._events._search import Brackets, Looks, entries, first_true, minima_of, searched
 from polhode._failed import where_lost
 from polhode._method import Record, Status
 from polhode._scene import Scene, State
@@ -137,17 +135,12 @@ def events_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tr
 def events_by_search(trajectory: Trajectory, events: Sequence[Event]) -> Trajectory:
     """The same for a motion that is known at every time: its trajectory is searched."""
     capacity = sum(event.capacity for event in events)  # each may need all of it
-    crossings_of_events = [crossings(trajectory, event, capacity=capacity) for event in events]
-    return _in_order_of_time(
-        trajectory,
-        [x.times for x in crossings_of_events],
-        [x.count for x in crossings_of_events],
-        events,
-    )
+    return _in_order_of_time(trajectory, all_crossings(trajectory, events, capacity), events)
 
 
 @eqx.filter_jit
-def _in_order_of_time(trajectory: Trajectory, times, counts, events) -> Trajectory:
+def _in_order_of_time(trajectory: Trajectory, met: Met, events: Sequence[Event]) -> Trajectory:
+    times, counts = ([getattr(x, name) for x in met.crossings] for name in ("times", "count"))
     batch, ts = trajectory.batch_shape, trajectory.ts
     rows = jnp.broadcast_to(ts, (*batch, ts.shape[-1])).reshape(-1, ts.shape[-1])
     sign = jnp.where(rows[:, -1:] < rows[:, :1], -1, 1).astype(ts.dtype)
@@ -155,40 +148,40 @@ def _in_order_of_time(trajectory: Trajectory, times, counts, events) -> Trajecto
     at, which = (
         jnp.concatenate([y.reshape(rows.shape[0], -1) for y in x], axis=1) for x in (times, which)
     )
-    capacity = at.shape[1] // len(events)
+    capacity = at.shape[1] // len(events)  # of each, for it may need all of it
+    states = [
+        jnp.concatenate([y.reshape(rows.shape[0], -1, y.shape[-1]) for y in x], axis=1)
+        for x in zip(*met.states)
+    ]
     order = jnp.argsort(jnp.where(jnp.isfinite(at), sign * at, jnp.inf), axis=1)
     at, which = (jnp.take_along_axis(x, order, axis=1) for x in (at, which))
+    states = [jnp.take_along_axis(x, order[..., None], axis=1)[:, :capacity] for x in states]
     # what lies beyond a terminal event does not happen
     is_terminal = jnp.isfinite(at) & _is_terminal(which, events)
     at = jnp.where(jnp.cumsum(is_terminal, axis=1) - jnp.where(is_terminal, 1, 0) > 0, jnp.inf, at)
     happens = jnp.isfinite(at)
-    met = jnp.sum(happens, axis=1, dtype=jnp.int32)
+    count = jnp.sum(happens, axis=1, dtype=jnp.int32)
     for k, (found, total) in enumerate(zip(times, counts, strict=True)):
         # those that were not listed come after the listed ones
-        listed = jnp.sum(jnp.isfinite(found.reshape(-1, capacity)), axis=1, dtype=met.dtype)
-        all_happen = jnp.sum(happens & (which == k), axis=1, dtype=met.dtype) == listed
-        more = jnp.ravel(total).astype(met.dtype) - listed
-        met = met + jnp.where(all_happen, jnp.maximum(more, 0), 0)
-    overflows = (met > capacity).reshape(batch)
-    at, which, happens = at[:, :capacity], which[:, :capacity], happens[:, :capacity]
-    at_events = moved_to(trajectory, jnp.where(happens, at, rows[:, :1]).reshape(*batch, -1))
+        listed = jnp.sum(jnp.isfinite(found.reshape(-1, capacity)), axis=1, dtype=count.dtype)
+        all_happen = jnp.sum(happens & (which == k), axis=1, dtype=count.dtype) == listed
+        more = jnp.ravel(total).astype(count.dtype) - listed
+        count = count + jnp.where(all_happen, jnp.maximum(more, 0), 0)
+    overflows = (count > capacity).reshape(batch)
+    at, which = at[:, :capacity], which[:, :capacity]
     status = jnp.where(
         (trajectory.status == Status.SUCCESSFUL) & overflows,
         Status.TOO_MANY_EVENTS,
         trajectory.status,
     )
-
-    def lanes(samples):
-        return [x.reshape(-1, *x.shape[len(batch) :]) for x in samples]
-
     return _until_terminal(
         trajectory,
         rows,
-        lanes(trajectory._samples),
+        [x.reshape(-1, *x.shape[len(batch) :]) for x in trajectory._samples],
         jax.tree.map(jnp.ravel, (status, trajectory._steps)),
         events,
-        (at, which, met),
-        lanes(at_events._samples),
+        (at, which, count),
+        states,
     )
 
 
@@ -249,6 +242,9 @@ _MAX_SPEED_UP = 1.5
 
 _MAX_WINDOWS = 2**20
 """Windows, of a thousandth of a second or less each: what has no event by then is given up."""
+
+_LOOKED_AT = 128
+"""Bodies times samples in one look at the motion; a body has two samples at least in each."""
 
 _MINIMA = 2
 """Places in a window, of each body, where the function may turn back before zero."""
@@ -397,76 +393,78 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
         share = carry.share + width * part.at[0].set(offset)
         share = share.at[-1].set(jnp.where(width < carry.width, 1, share[-1]))
         begin = lanes if exact else at(times(carry.share[None])[..., 0], carry.samples, width)
-        sampled = moved_through(begin, times(share))
-        values, slopes = until.values(sampled)
-        grid = jnp.broadcast_to(sampled.ts, values.shape)
-        sides = jnp.where(values >= 0, 1, -1)
-        changes = sides[:, 1:] != sides[:, :-1]
-        if until.direction:
-            changes = changes & (sides[:, 1:] * forward[:, None] == until.direction)
-        samples = jnp.arange(_SAMPLES)
-        change = jnp.min(jnp.where(changes, samples, _SAMPLES), axis=-1)
-        minima = (
-            minima_of(grid, values, slopes, sides)
-            & (samples[None] < change[:, None])
-            & busy[:, None]
-        )
-        place, is_minimum = first_true(minima, _MINIMA + 1)
+        sampled = None if exact else moved_through(begin, times(share))
+        grid = jnp.broadcast_to(times(share), (n, _SAMPLES + 1))
+        intervals = jnp.arange(_SAMPLES)
 
-        # as far as the bodies turn about as fast as thought, and no minimum is left out
-        reach = jnp.min(
-            jnp.where(is_minimum[:, _MINIMA], place[:, _MINIMA], _SAMPLES), initial=_SAMPLES
-        )
-        if until.samples is None:
-            turned_angle = turning_rates(sampled) * jnp.abs(span).reshape(-1, 1)
-            turned_angle = jnp.where(busy[:, None] & jnp.isfinite(turned_angle), turned_angle, 0)
-            angle = jnp.max(turned_angle, axis=0, initial=0) * width / _SAMPLES
-            is_slow = (angle <= _MAX_SPEED_UP * 2 * jnp.pi / SAMPLES_PER_TURN) | (
-                width <= min_width
+        def looks(moved: Trajectory) -> Looks:
+            values, slopes = until.values(moved)
+            is_successful = moved.status == Status.SUCCESSFUL
+            return Looks(values[None], slopes[None], moved._samples, is_successful)
+
+        def analyse(seen: Looks):
+            """The first change of sign (N,), where the function turns back, and how far the samples
+            serve: as far as the bodies turn about as fast as thought, and no minimum is left out.
+            """
+            values, slopes = seen.values[0], seen.slopes[0]
+            sides = jnp.where(values >= 0, 1, -1)
+            changes = sides[:, 1:] != sides[:, :-1]
+            if until.direction:
+                changes = changes & (sides[:, 1:] * forward[:, None] == until.direction)
+            change = jnp.min(jnp.where(changes, intervals, _SAMPLES), axis=-1)
+            minima = minima_of(grid, values, slopes, sides) & (intervals[None] < change[:, None])
+            place, is_minimum = first_true(minima & busy[:, None], _MINIMA + 1)
+            reach = jnp.min(
+                jnp.where(is_minimum[:, _MINIMA], place[:, _MINIMA], _SAMPLES), initial=_SAMPLES
             )
-            first_fast = jnp.min(jnp.where(is_slow, _SAMPLES, jnp.arange(_SAMPLES + 1)))
-            reach = jnp.minimum(reach, jnp.maximum(first_fast, 1))
-        place, is_minimum = (
-            place[:, :_MINIMA],
-            is_minimum[:, :_MINIMA] & (place[:, :_MINIMA] < reach),
-        )
-        turns = (
-            entries(grid, place),
-            entries(grid, place + 1),
-            entries(slopes, place),
-            entries(slopes, place + 1),
-            is_minimum,
-        )
+            if until.samples is None:
+                moved = lanes._with_samples(grid, seen.states, lanes.status, lanes._steps, None)
+                angle = turning_rates(moved) * jnp.abs(span).reshape(-1, 1)
+                angle = jnp.where(busy[:, None] & jnp.isfinite(angle), angle, 0)
+                angle = jnp.max(angle, axis=0, initial=0) * width / _SAMPLES
+                is_slow = (angle <= _MAX_SPEED_UP * 2 * jnp.pi / SAMPLES_PER_TURN) | (
+                    width <= min_width
+                )
+                first_fast = jnp.min(jnp.where(is_slow, _SAMPLES, jnp.arange(_SAMPLES + 1)))
+                reach = jnp.minimum(reach, jnp.maximum(first_fast, 1))
+            place, is_minimum = place[:, :_MINIMA], is_minimum[:, :_MINIMA]
+            return sides, change, place, is_minimum & (place < reach), reach
 
-        def bracket(points):
-            minimum = _first_minimum(points[0], points[1], sides, place, is_minimum)
+        def turns(seen: Looks, analysis) -> Brackets:
+            _, _, place, is_minimum, _ = analysis
+            slopes = seen.slopes[0]
+            low, high, at_low, at_high = (
+                entries(x, place + k) for x in (grid, slopes) for k in (0, 1)
+            )
+            return Brackets(low, high, at_low, at_high, is_minimum)
+
+        def brackets(seen: Looks, analysis, turning, turning_values):
+            """The event in the first of the columns; which bodies have one, and the reach."""
+            sides, change, place, is_minimum, reach = analysis
+            minimum = _first_minimum(turning, turning_values, sides, place, is_minimum)
             is_new = busy & (jnp.minimum(minimum.place, change) < reach)
-            ends = _bracket(grid, values, change, minimum, until.direction * forward, is_new)
-            return *ends, is_new
+            direction = until.direction * forward
+            ends = _bracket(grid, seen.values[0], change, minimum, direction, is_new)
+            low, high, at_low, at_high = (jnp.repeat(x[:, None], _MINIMA, axis=1) for x in ends)
+            use = is_new[:, None] & (jnp.arange(_MINIMA) == 0)[None]
+            return Brackets(low, high, at_low, at_high, use), (is_new, reach)
 
-        def search(points, turn):
-            """One turning point of each body after the other, then the event: one copy of the
-            motion in the program."""
-            is_last, column = turn == _MINIMA, jnp.minimum(turn, _MINIMA - 1)
-            arguments = [
-                jnp.where(is_last, b, a[:, column])[:, None] for a, b in zip(turns, bracket(points))
-            ]
-
-            def fn(t):
-                value, slope = until.values(moved_to(begin if exact else sampled, t))
-                return jnp.where(is_last, value, slope), value
-
-            found = bracketed_roots(fn, *arguments)
-            is_here = jnp.arange(_MINIMA)[None] == turn
-            points = [jnp.where(is_here, x, y) for x, y in zip(found, points)]
-            return points, found[0][:, 0]
-
-        no_points = [turns[0], jnp.zeros_like(turns[0])]
-        points, times_found = jax.lax.scan(search, no_points, jnp.arange(_MINIMA + 1))
-        *_, is_new = bracket(points)
-        event_time = jnp.where(is_new, times_found[-1], carry.event_time)
-        is_successful = carry.is_successful & (sampled.status == Status.SUCCESSFUL)
-        samples, has_event = [x[:, reach] for x in sampled._samples], carry.has_event | is_new
+        origin = begin if exact else sampled
+        look_width = min(max(_MINIMA, _LOOKED_AT // max(n, 1)), _SAMPLES + 1)
+        found = searched(
+            lambda t: looks(moved_to(origin, t)),
+            grid,
+            _MINIMA,
+            look_width,
+            analyse,
+            turns,
+            brackets,
+            None if exact else looks(sampled),
+        )
+        seen, (is_new, reach) = found.samples, found.beside
+        event_time = jnp.where(is_new, found.roots[:, 0], carry.event_time)
+        is_successful = carry.is_successful & seen.is_successful
+        samples, has_event = [x[:, reach] for x in seen.states], carry.has_event | is_new
         next_width = jnp.where(reach < _SAMPLES, width, _GROWTH * width)
         next_width = jnp.minimum(
             next_width, width_by_rate(share[reach], samples, is_successful & ~has_event)

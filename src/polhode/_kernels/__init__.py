@@ -8,6 +8,7 @@ from polhode._kernels._derivatives import (
     SMOOTH as SMOOTH,
     are_close as are_close,
     attached as attached,
+    attached_to as attached_to,
     derivable_once as derivable_once,
     is_differentiated as is_differentiated,
     is_slope as is_slope,

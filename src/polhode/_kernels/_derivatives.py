@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import Primitive
+from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array
 
@@ -211,6 +211,29 @@ def attached(
     instead, together with something that helps the rule, its fourth argument.
     """
     return _attached_p.bind(*operands, *values, rule=rule, count=len(operands), again=again)
+
+
+def attached_to(
+    function: Callable[..., Sequence[Array]], arguments: Any, values: Sequence[Array]
+) -> list[Array]:
+    """``values`` of ``function(*arguments)``, found in another way, with its derivatives: it is not
+    evaluated where none are taken. It may close over traced values."""
+    leaves, tree = jax.tree.flatten(arguments)
+    closed = jax.make_jaxpr(lambda *x: list(function(*jax.tree.unflatten(tree, x))))(*leaves)
+    size = len(closed.consts)
+
+    def rule(operands, tangents, values):
+        at = [i for i, x in enumerate(tangents) if is_slope(x)]
+
+        def of_active(*primals):
+            inputs = list(operands)
+            for i, x in zip(at, primals):
+                inputs[i] = x
+            return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, inputs[:size]))(*inputs[size:])
+
+        return jax.jvp(of_active, [operands[i] for i in at], [tangents[i] for i in at])[1]
+
+    return attached(rule, [*map(jnp.asarray, closed.consts), *leaves], values)
 
 
 _attached_p = Primitive("attached")

@@ -1,0 +1,260 @@
+"""Zeros of functions of a motion that is known at every time.
+
+A motion in closed form takes long to compile, so a search contains it once: the samples, the
+turning points between them, the roots, and the bodies at these are passes of one loop, which looks
+at the motion at some times and decides by what it finds where to look next.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from polhode._kernels import kernel
+
+_SAMPLES, _TURNS, _ROOTS, _STATES = range(4)
+"""The passes of the loop."""
+
+_MAX_LOOKS = 100
+"""Looks for one root: halving alone would need about sixty."""
+
+
+class Looks(NamedTuple):
+    """N bodies at times (N, W): values and slopes (E, N, W) of E functions, states (N, W, ...), and
+    which bodies (N,) the method could move."""
+
+    values: Array
+    slopes: Array
+    states: list[Array]
+    is_successful: Array
+
+
+class Brackets(NamedTuple):
+    """Times (E N, K) before and after zeros of a function, its values there, and which are used."""
+
+    low: Array
+    high: Array
+    at_low: Array
+    at_high: Array
+    use: Array
+
+
+class Found(NamedTuple):
+    """Samples; roots (E N, K), which entries are used, and what ``brackets`` returned beside them;
+    the slopes there, and the states (E N, K, ...)."""
+
+    samples: Looks
+    roots: Array
+    use: Array
+    beside: Any
+    slopes: Array
+    states: list[Array]
+
+
+def searched(
+    look: Callable[[Array], Looks],
+    grid: Array,
+    columns: int,
+    width: int,
+    analyse: Callable[[Looks], Any],
+    turns: Callable[[Looks, Any], Brackets],
+    brackets: Callable[[Looks, Any, Array, Array], tuple[Brackets, Any]],
+    samples: Looks | None = None,
+    keep: bool = True,
+) -> Found:
+    """Samples at the times ``grid`` (N, S), and the roots between them.
+
+    ``look``: the motion at times (N, W), of which there are ``width`` or more, E K at least.
+    ``turns(samples, analysis)``: where slopes vanish; ``brackets(samples, analysis, turns,
+    turning_values)``: where values do, given these turning points, and anything else; both with
+    K = ``columns`` entries. ``analysis``: that of all samples, which is made once. ``samples``:
+    those at ``grid``, where they are known without ``look``; ``keep``: whether they hold their
+    states.
+    """
+    (n, size), is_sampled = grid.shape, samples is not None
+    blank = _blank(look, jnp.broadcast_to(grid[:, :1], (n, width)))
+    rows = blank.values.shape[0]
+    assert width >= rows * columns
+    chunks = -(-size // width)
+    padded = jnp.pad(grid, ((0, 0), (0, chunks * width - size)), mode="edge")
+
+    def of_bodies(t):
+        """Times (E N, K) of each row -> (N, W)."""
+        t = jnp.moveaxis(t.reshape(rows, n, columns), 0, 1).reshape(n, rows * columns)
+        return jnp.pad(t, ((0, 0), (0, width - rows * columns)), mode="edge")
+
+    def of_rows(x):
+        """Every function at the times of all rows (E, N, W, ...) -> at those of its own row."""
+        x = x[:, :, : rows * columns].reshape(rows, n, rows, columns, *x.shape[3:])
+        own = jnp.stack([x[k, :, k] for k in range(rows)])
+        return own.reshape(rows * n, columns, *x.shape[4:])
+
+    def one_pass(carry, number):
+        store, analysis, points, point_values, seen, use = carry
+        is_sampling, is_turning, is_last = (number == k for k in (_SAMPLES, _TURNS, _STATES))
+        known = _cut(store, size)
+        if not is_sampled:
+            analysis = jax.lax.cond(is_turning, analyse, lambda _: analysis, known)
+        of_roots, beside = brackets(known, analysis, points, point_values)
+        problems = turns(known, analysis), of_roots
+        walk = _walk_between(*(jnp.where(is_turning, a, b) for a, b in zip(*problems)))
+        limit = jnp.where(is_sampling, chunks, jnp.where(is_last, 1, _MAX_LOOKS))
+
+        def on(loop):
+            count, walk, *_ = loop
+            wanted = jnp.where(is_last, jnp.any(use), ~jnp.all(walk.is_done))
+            return (count < limit) & (is_sampling | wanted)
+
+        def iterate(loop):
+            count, walk, store, _ = loop
+            t = of_bodies(jnp.where(is_last, points, walk.next))
+            if not is_sampled:
+                start = jnp.where(is_sampling, count, 0) * width
+                part = jax.lax.dynamic_slice_in_dim(padded, start, width, axis=1)
+                t = jnp.where(is_sampling, part, t)
+            seen = look(t)
+            if not is_sampled:
+                store = _written(store, seen, start, is_sampling)
+            values, slopes = of_rows(seen.values), of_rows(seen.slopes)
+            walk = kernel(_next)(walk, jnp.where(is_turning, slopes, values), values)
+            return count + 1, walk, store, seen
+
+        loop = jnp.zeros((), jnp.int32), walk, store, seen
+        _, walk, store, seen = jax.lax.while_loop(on, iterate, loop)
+        points = jnp.where(is_last, points, _root(walk))
+        return (store, analysis, points, walk.value, seen, of_roots.use), (of_roots.use, beside)
+
+    store = samples
+    if store is None:
+        store = _repeated(blank, chunks, keep)
+    zeros = jnp.zeros((rows * n, columns), grid.dtype)
+    passes = (_SAMPLES, _TURNS, _ROOTS, _STATES)[is_sampled:]
+    analysis = analyse(_cut(store, size)) if is_sampled else _blank(analyse, _cut(store, size))
+    carry = store, analysis, zeros, zeros.astype(store.values.dtype), blank, zeros > 0
+    (store, _, roots, _, seen, _), of_passes = jax.lax.scan(one_pass, carry, jnp.array(passes))
+    use, beside = jax.tree.map(lambda x: x[-2], of_passes)  # of the roots
+    states = [of_rows(jnp.broadcast_to(x, (rows, *x.shape))) for x in seen.states]
+    return Found(_cut(store, size), roots, use, beside, of_rows(seen.slopes), states)
+
+
+def _blank(function: Callable, argument: Any) -> Any:
+    """Ones in the place of what the function returns."""
+    return jax.tree.map(lambda x: jnp.ones(x.shape, x.dtype), jax.eval_shape(function, argument))
+
+
+def _repeated(looks: Looks, count: int, keep: bool) -> Looks:
+    """Room for so many looks one after the other."""
+    values, slopes = (jnp.tile(x, (1, 1, count)) for x in (looks.values, looks.slopes))
+    states = [jnp.tile(x, (1, count, 1)) for x in looks.states] if keep else []
+    return Looks(values, slopes, states, looks.is_successful)
+
+
+def _cut(store: Looks, size: int) -> Looks:
+    states = [x[:, :size] for x in store.states]
+    return Looks(store.values[..., :size], store.slopes[..., :size], states, store.is_successful)
+
+
+def _written(store: Looks, seen: Looks, start: Array, is_sampling: Array) -> Looks:
+    """The samples with what was seen from the sample ``start`` on, if this is the first pass."""
+
+    def put(old, new, axis):
+        there = jax.lax.dynamic_slice_in_dim(old, start, new.shape[axis], axis)
+        new = jnp.where(is_sampling, new, there)
+        return jax.lax.dynamic_update_slice_in_dim(old, new, start, axis)
+
+    return Looks(
+        put(store.values, seen.values, 2),
+        put(store.slopes, seen.slopes, 2),
+        [put(x, y, 1) for x, y in zip(store.states, seen.states)],
+        store.is_successful & (seen.is_successful | ~is_sampling),
+    )
+
+
+class _Walk(NamedTuple):
+    """On the way to a root between two times, the first of which was looked at last: these times,
+    the function there, the time to look at next, how near the root must be, and a value that was
+    seen with the last."""
+
+    is_done: Array
+    x1: Array
+    x2: Array
+    f1: Array
+    f2: Array
+    next: Array
+    tolerance: Array
+    value: Array
+
+
+def _walk_between(low: Array, high: Array, at_low: Array, at_high: Array, use: Array) -> _Walk:
+    zero = at_low == 0
+    x1, f1 = jnp.where(zero, low, high), jnp.where(zero, at_low, at_high)
+    is_done = ~use | zero | (at_high == 0)
+    tolerance = 2 * jnp.finfo(low.dtype).eps * jnp.maximum(jnp.abs(low), jnp.abs(high))
+    middle = jnp.where(is_done, x1, x1 + (low - x1) / 2)
+    return _Walk(is_done, x1, low, f1, at_low, middle, tolerance, jnp.zeros_like(at_low))
+
+
+def _next(walk: _Walk, f: Array, value: Array) -> _Walk:
+    """After a look at ``walk.next``, where the function is ``f``.
+
+    Inverse quadratic interpolation where it is safe, halving elsewhere: T. R. Chandrupatla, Adv.
+    Eng. Software 28 (1997) 145; to a few units in the last place of the larger time.
+    """
+    is_done, x1, x2, f1, f2, x, tolerance, _ = walk
+    same_sign = jnp.sign(f) == jnp.sign(f1)
+    x3, f3 = jnp.where(same_sign, x1, x2), jnp.where(same_sign, f1, f2)
+    new2, g2 = jnp.where(same_sign, x2, x1), jnp.where(same_sign, f2, f1)
+    bracket = jnp.abs(new2 - x)
+    limit = tolerance / jnp.where(bracket > 0, bracket, 1)
+    stop = (bracket <= 2 * tolerance) | (f == 0)
+    a, b, c = f - g2, f3 - g2, f3 - f
+    ab, ac, bc = (jnp.where(z == 0, 1, z) for z in (a, c, b))
+    across = jnp.where(x3 == new2, 1, x3 - new2)
+    xi, phi = (x - new2) / across, a / bc
+    safe = (phi * phi < xi) & ((1 - phi) * (1 - phi) < 1 - xi)
+    span = jnp.where(new2 == x, 1, new2 - x)
+    inverse = -(f / ab) * (-f3 / bc) + (x3 - x) / span * (f / ac) * (g2 / bc)
+    share = jnp.clip(jnp.where(safe, inverse, 0.5), limit, 1 - limit)
+    after = jnp.where(stop, x, x + share * (new2 - x))
+    new = stop, x, new2, f, g2, after, tolerance, value
+    return _Walk(is_done | stop, *(jnp.where(is_done, o, w) for o, w in zip(walk[1:], new[1:])))
+
+
+def _root(walk: _Walk) -> Array:
+    return jnp.where(jnp.abs(walk.f1) <= jnp.abs(walk.f2), walk.x1, walk.x2)
+
+
+def minima_of(grid, values, slopes, sides) -> Array:
+    """Between which samples (N, S - 1) the function turns back before zero, and comes near it.
+
+    Near by the cubic through values and slopes, whose error is a hundredth of what it changes by.
+    """
+    step = grid[:, 1:] - grid[:, :-1]
+    side = sides[:, :-1].astype(values.dtype)
+    a, end = side * values[:, :-1], side * values[:, 1:]
+    b, b_end = side * step * slopes[:, :-1], side * step * slopes[:, 1:]
+    turns = (sides[:, 1:] == sides[:, :-1]) & (b < 0) & (b_end > 0)
+    jump = end - a
+    c, d = 3 * jump - 2 * b - b_end, b + b_end - 2 * jump
+    root = jnp.sqrt(jnp.maximum(c * c - 3 * d * b, 0))
+    s = -b / jnp.where(c + root > 0, c + root, 1)
+    s = jnp.clip(s, 0, 1)
+    lowest = a + s * (b + s * (c + s * d))
+    return turns & (lowest <= jnp.minimum(a, end) / 2)
+
+
+def entries(x: Array, k: Array) -> Array:
+    """Entries ``k`` (N, D) of the rows of ``x``."""
+    return jnp.take_along_axis(x, k, axis=-1)
+
+
+def first_true(mask: Array, capacity: int) -> tuple[Array, Array]:
+    """Places (N, capacity) of the first that are true, and which of these there are."""
+    size = mask.shape[-1]
+    places = jnp.where(mask, jnp.arange(size), size)
+    if capacity > size:
+        places = jnp.pad(places, ((0, 0), (0, capacity - size)), constant_values=size)
+    places = jnp.sort(places, axis=-1)[:, :capacity]
+    return jnp.where(places < size, places, 0), places < size
