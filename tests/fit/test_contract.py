@@ -101,8 +101,8 @@ BODY = ph.Inertia.from_moments([1.0, 2.0, 2.5])
         ({"solver": "lm"}, TypeError, "solver of FitOptions must be a Gauss-Newton solver"),
         ({"bias": [0.0, 0, 0]}, TypeError, "bias of FitOptions must be True or False"),
         ({"trust_noise": 0.01}, TypeError, "trust_noise of FitOptions must be True, False"),
-        ({"max_starts": 0}, ValueError, "max_starts of FitOptions must be at least 1"),
-        ({"max_steps": 0}, ValueError, "max_steps of FitOptions must be at least 1"),
+        ({"max_starts": 0}, ValueError, "max_starts of FitOptions must be an integer, at least 1"),
+        ({"max_steps": 0}, ValueError, "max_steps of FitOptions must be an integer, at least 1"),
         ({"known": BODY}, TypeError, "known"),
     ],
 )

@@ -53,6 +53,20 @@ def test_constant_rates_are_not_saturated():
     assert not is_saturated(omega)
 
 
+def test_digitised_rates_that_hardly_vary_are_not_saturated():
+    """Most of their readings are one number, and the next one is rare."""
+    omega = np.stack([0.1 * np.sin(T), 0.1 * np.cos(T), np.full(T.size, 1.43)], -1)
+    for place, other in ((slice(0, 44), 1.42), (slice(0, 1), 1.44)):
+        omega[:, 2] = 1.43
+        omega[place, 2] = other
+        assert not is_saturated(omega)
+        assert not is_saturated(-omega)
+
+
+def test_a_lower_limit_is_not_positive():
+    assert not is_saturated(np.maximum(noisy() + 4.0, 3.5))
+
+
 def test_single_samples_far_off_are_outliers_and_runs_are_not():
     rng = np.random.default_rng(1)
     rest = rng.normal(size=(1, 500, 3))

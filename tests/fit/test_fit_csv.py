@@ -91,6 +91,8 @@ def test_what_is_no_text_or_has_a_gap_is_named(tmp_path):
         ("seconds_elapsed,rotationRate x (rad/s),rotation_rate_y,rotation_rate_z", 1.0, 1.0),
         ("t,p,q,r", 1.0, 1.0),
         ("t (ms),wx (rpm),wy (rpm),wz (rpm)", np.pi / 30, 1e-3),
+        ("t,wx_rpm,wy_rpm,wz_rpm", np.pi / 30, 1.0),
+        ("t,wx_mdeg/s,wy_mdeg/s,wz_mdeg/s", np.pi / 180e3, 1.0),
     ],
 )
 def test_usual_names_and_units_are_found(tmp_path, head, factor, seconds):
@@ -112,6 +114,7 @@ def test_usual_names_and_units_are_found(tmp_path, head, factor, seconds):
         ("t,gyro_x [ms],gyro_y,gyro_z,n", "states the unit ms"),
         ("x,gyro_x,gyro_y,gyro_z,n", "missing: t -> t"),
         ("t,p,q,z,n", "missing: wx -> wx, wy -> wy, wz -> wz"),
+        ("t,gyro_x_rps,gyro_y_rps,gyro_z_rps,n", "rad/s or revolutions per second"),
     ],
 )
 def test_names_that_could_mean_several_things_are_refused(tmp_path, head, message):
@@ -122,6 +125,32 @@ def test_names_that_could_mean_several_things_are_refused(tmp_path, head, messag
         return
     with pytest.raises(ValueError, match=message):
         load_recording(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"), [("wheel", 1.0), ("wheel [rpm]", np.pi / 30), ("w_deg/s", np.pi / 180)]
+)
+def test_speeds_of_a_wheel_have_the_unit_of_their_column(tmp_path, name, factor):
+    path = tmp_path / "wheel.csv"
+    path.write_text(f"t,wx,wy,wz,{name}\n" + "".join(f"{k / 10},1,2,3,{k}\n" for k in range(6)))
+    found = read_recording(path, {"wheel": name}).wheel
+    np.testing.assert_allclose(found, np.arange(6) * factor, rtol=1e-14)
+
+
+def test_a_column_has_one_role_and_one_unit(tmp_path):
+    path = tmp_path / "roles.csv"
+    path.write_text(
+        "t [s],x [rad/s],y [rad/s],z [rad/s]\n" + "".join(f"{k},.1,.2,.3\n" for k in range(6))
+    )
+    roles = dict(zip(("t", "wx", "wy", "wz"), path.read_text().split("\n")[0].split(",")))
+    with pytest.raises(ValueError, match=r"in rad/s by the names .* read as deg/s"):
+        read_recording(path, roles, scale=np.pi / 180)
+    with pytest.raises(ValueError, match=r"in s by the names .* read as ms"):
+        read_recording(path, roles, time_scale=1e-3)
+    found = read_recording(path, roles, scale=1.02)  # of a calibration
+    np.testing.assert_allclose(found.omega[0], [0.102, 0.204, 0.306], rtol=1e-14)
+    with pytest.raises(ValueError, match="is to be wx and wy"):
+        read_recording(path, roles | {"wy": roles["wx"]})
 
 
 def test_a_file_without_an_end_is_no_text():

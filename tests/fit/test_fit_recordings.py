@@ -3,9 +3,11 @@
 import csv
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import polhode as ph
 from polhode.fit import FitOptions, Recording, averaged, fit_inertia, fit_recordings
 from polhode.rotation import wxyz_to_matrix
 
@@ -90,3 +92,17 @@ def test_gaps_of_the_wheel_are_bridged_and_remembered():
         averaged(one, 6)
     with pytest.raises(ValueError, match="wheel_speed needs at least 2 numbers, got 0"):
         Recording.of(times, np.ones((11, 3)), wheel_speed=np.full(11, np.nan))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("given", [{"attitude_noise": 0.03}, {}])
+def test_noisy_attitudes_alone_give_the_body(given):
+    """Their differences start the search so far off that the first starts meet in local minima."""
+    moments, times = np.array([1.0, 1.6, 2.2]), np.linspace(0, 8, 201)
+    state = ph.State([0.6, 0.3, -0.2, 0.7], [0.6, 2.0, 0.8])
+    wxyz = ph.simulate(ph.Scene(ph.Inertia.from_moments(moments)), state, times).wxyz
+    noise = 0.03 * np.random.default_rng(0).normal(size=(60, times.size, 3))
+    read = ph.rotation.multiply(wxyz[None], ph.rotation.rotation_vector_to_wxyz(jnp.array(noise)))
+    fit = ph.fit_inertia(times, wxyz=read, throw=False, **given)
+    ratios = np.broadcast_to(moments / moments.max(), fit.ratios.shape)
+    np.testing.assert_allclose(fit.ratios, ratios, atol=0.02)

@@ -95,8 +95,8 @@ def test_a_delayed_gyroscope_fits_its_own_motion():
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"noise_density": -1.0}, "noise_density of Gyroscope must be a finite number"),
-        ({"scale_std": np.nan}, "scale_std of Gyroscope must be a finite number"),
+        ({"noise_density": -1.0}, "noise_density of Gyroscope must be one finite number"),
+        ({"scale_std": np.nan}, "scale_std of Gyroscope must be one finite number"),
         ({"max_rate": 0.0}, "max_rate of Gyroscope must be positive"),
         ({"delay": np.inf}, "delay of Gyroscope must be a finite number"),
         ({"gain": np.eye(2)}, "gain must have shape"),

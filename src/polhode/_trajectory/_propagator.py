@@ -43,6 +43,8 @@ class Propagator(AbstractPropagator):
     def at(self, trajectory: Trajectory, t: ArrayLike) -> Trajectory:
         times = as_float_array("t", t, finite=False).astype(trajectory.ts.dtype)
         times = times[None] if times.ndim == 0 else times
+        if times.size == 0:
+            raise ValueError("t must hold at least one time, got none.")
         batch = trajectory.batch_shape
         try:
             fits = jnp.broadcast_shapes(times.shape[:-1], batch) == batch

@@ -149,6 +149,8 @@ def fit_recordings(
 
 def windows(recording: Recording, length: int) -> list[Recording]:
     """A recording (without batch) cut into windows of ``length`` samples sharing their ends."""
+    if not isinstance(recording, Recording):
+        raise TypeError(f"recording must be a Recording, got {type(recording).__name__}.")
     count = recording.times.shape[-1]
     require(4 <= length <= count, f"a window needs 4 to {count} samples, got {length}.")
     # starts that leave at least four samples
@@ -322,7 +324,7 @@ def _bounds(bounds: Sequence, starts: Sequence[Array]) -> tuple[tuple[Array, Arr
         ends = [
             jnp.full(start.shape, sign * jnp.inf, start.dtype)
             if end is None
-            else jnp.broadcast_to(jnp.asarray(end, start.dtype), start.shape)
+            else _like_start(f"bounds[{k}]", end, start)
             for end, sign in zip(pair, (-1, 1), strict=True)
         ]
         inside = (ends[0] < start) & (start < ends[1])
@@ -343,8 +345,19 @@ def _widths(prior_std: Sequence, starts: Sequence[Array]) -> tuple[Array | None,
             arrays.append(None)
             continue
         require_positive(f"prior_std[{k}]", std, hint="None stands for no prior")
-        arrays.append(jnp.broadcast_to(jnp.asarray(std, start.dtype), start.shape))
+        arrays.append(_like_start(f"prior_std[{k}]", std, start))
     return tuple(arrays)
+
+
+def _like_start(name: str, value: ArrayLike, start: Array) -> Array:
+    array = jnp.asarray(value, start.dtype)
+    try:
+        return jnp.broadcast_to(array, start.shape)
+    except ValueError:
+        raise ValueError(
+            f"{name} must be a number or have the shape {start.shape} of its array, got"
+            f" {array.shape}."
+        ) from None
 
 
 def _check_count(name: str, values: Sequence, starts: Sequence[Array]) -> None:

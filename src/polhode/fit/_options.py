@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from numbers import Real
 
 import equinox as eqx
 import jax
@@ -142,10 +143,10 @@ class Gyroscope(eqx.Module):
 
 
 def _check_not_negative(name: str, value: float) -> float:
-    number = float(value)
+    number = float(value) if np.ndim(value) == 0 else math.nan
     require(
         math.isfinite(number) and number >= 0,
-        f"{name} of Gyroscope must be a finite number that is not negative, got {value}.",
+        f"{name} of Gyroscope must be one finite number that is not negative, got {value}.",
     )
     return number
 
@@ -207,7 +208,8 @@ def saturation(recording: Recording, max_rate: float | None = None) -> Float[Arr
 
     With ``max_rate`` those are the readings of that size. Without it an axis counts as saturated
     if at least four samples and 1 % of all are equal to its extreme value, and five times as many
-    as to the next value: a coarse digitisation repeats both.
+    as to the next value: a coarse digitisation repeats both. An upper limit is positive and a
+    lower one negative; a rate that varies by a few steps of the digitisation is at none.
     """
     omega = recording.omega
     if omega is None:
@@ -230,11 +232,10 @@ def saturation(recording: Recording, max_rate: float | None = None) -> Float[Arr
         others = jnp.sum(((below == second_greatest) & jnp.isfinite(below)).astype(dtype), axis=-2)
         is_enough = (count >= 4) & (count >= 0.01 * samples)
         # of a constant rate there are no others, or rounding errors only
-        smallest = jnp.min(jnp.where(present, values, jnp.inf), axis=-2)
-        varies = jnp.isfinite(second_greatest[..., 0, :]) & (
-            greatest[..., 0, :] - smallest > 1e-6 * size
-        )
-        clipped = is_enough & (count >= 5 * others) & varies
+        top, second = greatest[..., 0, :], second_greatest[..., 0, :]
+        extent = top - jnp.min(jnp.where(present, values, jnp.inf), axis=-2)
+        varies = jnp.isfinite(second) & (extent > 1e-6 * size) & (extent >= 4 * (top - second))
+        clipped = is_enough & (count >= 5 * others) & varies & (top > 0)
         return (equal & present & clipped[..., None, :]).astype(dtype)
 
     return at_upper_limit(omega) - at_upper_limit(-omega)
@@ -246,8 +247,8 @@ class Huber(eqx.Module):
     threshold: float = 3.0
 
     def __check_init__(self) -> None:
-        if not self.threshold > 0:
-            raise ValueError(f"the threshold of Huber must be positive, got {self.threshold}.")
+        if not (isinstance(self.threshold, Real | np.ndarray | Array) and self.threshold > 0):
+            raise ValueError(f"the threshold of Huber must be positive, got {self.threshold!r}.")
 
     def __call__(self, residual: Array) -> Array:
         size = jnp.abs(residual)
@@ -331,7 +332,11 @@ class FitOptions(eqx.Module):
                 )
         for name in ("max_starts", "max_steps"):
             value = getattr(self, name)
-            require(value >= 1, f"{name} of FitOptions must be at least 1, got {value}.")
+            is_integer = isinstance(value, int | np.integer) and not isinstance(value, bool)
+            if not is_integer or value < 1:
+                raise ValueError(
+                    f"{name} of FitOptions must be an integer, at least 1, got {value!r}."
+                )
 
 
 def noise_is_trusted(options: FitOptions) -> bool:

@@ -1,5 +1,6 @@
 """``Recording``: gyroscope rates, attitudes, forces and their noise; and CSV files of them."""
 
+import contextlib
 import csv
 import dataclasses
 import math
@@ -71,7 +72,8 @@ class Recording(eqx.Module):
     ) -> Self:
         """A checked recording. A sample whose row holds NaN is a gap and is left out.
 
-        A sample with a NaN of ``wheel_speed`` alone is used, with the speed interpolated.
+        A sample with a NaN of ``wheel_speed`` alone is used, with the speed interpolated. Noises
+        are numbers, or arrays of one for each axis (3,), sample (T,), or both (T, 3).
 
         Times must increase; they are shared or carry the same leading axes as the data. Raises
         ValueError for unsorted or repeated times, fewer than four samples, shapes that do not fit,
@@ -107,9 +109,15 @@ class Recording(eqx.Module):
             if value is not None
         }
         tails = {name: channels[name][1] for name in arrays}
-        batch = jnp.broadcast_shapes(
-            times.shape[:-1], *(a.shape[: a.ndim - len(tails[n])] for n, a in arrays.items())
-        )
+        batches = {n: a.shape[: a.ndim - len(tails[n])] for n, a in arrays.items()}
+        batches = {"times": times.shape[:-1]} | batches
+        try:
+            batch = jnp.broadcast_shapes(*batches.values())
+        except ValueError:
+            raise ValueError(
+                f"the leading axes of a recording must agree, got {batches}."
+            ) from None
+        require(0 not in batch, f"a recording needs at least one body, got the axes {batch}.")
         # what is known now is worked on by NumPy, which has a hundredth of JAX's overhead
         xp = numbers(times, *arrays.values())
         arrays = {name: xp.broadcast_to(a, (*batch, *tails[name])) for name, a in arrays.items()}
@@ -226,6 +234,8 @@ def stack(recordings: Sequence[Recording]) -> Recording:
 
     Raises ValueError for recordings that have batch axes or different kinds of data.
     """
+    if isinstance(recordings, Recording) or not all(isinstance(r, Recording) for r in recordings):
+        raise TypeError("recordings must be a list of Recording objects: [Recording.of(...), ...].")
     require(len(recordings) > 0, "at least one recording is needed, got none.")
     for recording in recordings:
         require(
@@ -261,6 +271,8 @@ def averaged(recording: Recording, count: int) -> Recording:
     For readings that are much faster than the motion. Raises ValueError for fewer than four
     blocks, and for recordings with attitudes.
     """
+    if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+        raise ValueError(f"count must be an integer, at least 1, got {count!r}.")
     length = recording.times.shape[-1] // count
     require(
         length >= 4,
@@ -323,7 +335,14 @@ def _check_rates(omega, times):
 def _noise(name, value, shape, dtype):
     array = as_float_array(name, value).astype(dtype)
     require_positive(name, array, hint="it is a standard deviation")
-    return numbers(array).broadcast_to(array, shape)
+    xp = numbers(array)
+    for fitting in (array, array[..., None]):  # as it is, or one number of each sample
+        with contextlib.suppress(ValueError):
+            return xp.broadcast_to(fitting, shape)
+    raise ValueError(
+        f"{name} must be a number or an array that broadcasts to {shape}, one number of each sample"
+        f" included, got the shape {array.shape}."
+    )
 
 
 def central_slope(omega, times):
@@ -361,14 +380,15 @@ def read_recording(
     those it leaves out are recognised by their usual names (``t``, ``time_s``, ``wx``, ``gyro_x``,
     ``omega_x``, ``angular_velocity.x``, ...). ``scale`` multiplies the rates (pi/180 for deg/s),
     ``time_scale`` the times (1e-3 for ms); None: by the unit that the column's name states (in
-    brackets, or at its end), or 1. ``noise``, rad/s: standard deviation of the rates. An empty or
+    brackets, or at its end), or 1. So are the speeds of ``wheel``, always by their column's name.
+    ``noise``, rad/s: standard deviation of the rates. An empty or
     NaN cell makes its row a gap; one of ``wheel`` alone is interpolated linearly. Cells are
     separated by commas, or, where the header has none, by semicolons or tabs, and may then have a
     decimal comma. Lines before the header that are empty or start with # are skipped.
 
     Raises FileNotFoundError, and ValueError for a file that is not text, missing, ambiguous or
-    repeated columns, cells that are no numbers, unsorted or repeated times (each with its line) and
-    rates that appear to be in deg/s.
+    repeated columns, a ``scale`` of another unit than the columns state, cells that are no numbers,
+    unsorted or repeated times (each with its line) and rates that appear to be in deg/s.
     """
     return load_recording(path, columns, scale=scale, time_scale=time_scale, noise=noise).recording
 
@@ -394,10 +414,9 @@ def load_recording(
     names = [name.strip() for name in header]
     header_names = _required_columns(path, names, {} if columns is None else columns)
     units = {role: unit for role, name in header_names.items() if (unit := unit_of(role, name))}
-    if scale is None:
-        scale = _common(path, "rates", [units.get(role) for role in ("wx", "wy", "wz")], _RATES)
-    if time_scale is None:
-        time_scale = _common(path, "times", [units.get("t")], _TIMES)
+    scale = _factor(path, "rates", [units.get(role) for role in ("wx", "wy", "wz")], _RATES, scale)
+    time_scale = _factor(path, "times", [units.get("t")], _TIMES, time_scale)
+    wheel_scale = _factor(path, "wheel speeds", [units.get("wheel")], _RATES, None)
     table, numbers = _rows(path, lines, header_line, separator, names, header_names)
     data = np.array(table)
     times = data[:, 0]
@@ -409,7 +428,7 @@ def load_recording(
             f"follow line {numbers[k]} ({times[k]:g}); sort the rows, drop repeated or empty "
             f"ones ({not_ascending.size} such places)."
         )
-    wheel = data[:, 4] if "wheel" in header_names else None
+    wheel = data[:, 4] * wheel_scale if "wheel" in header_names else None
     try:
         recording = Recording.of(
             times * time_scale, data[:, 1:4] * scale, wheel_speed=wheel, omega_noise=noise
@@ -434,6 +453,13 @@ def _required_columns(path, names: list[str], columns: Mapping[str, str]) -> dic
         raise ValueError(
             f"{path} must have the columns asked for, missing: {', '.join(missing_columns)}; its "
             f"columns are: {', '.join(names) or 'none'}{_headless(names)}."
+        )
+    shared = [name for name in header_names.values() if [*header_names.values()].count(name) > 1]
+    if shared:
+        roles = [role for role, name in header_names.items() if name == shared[0]]
+        raise ValueError(
+            f"{path}: the column {shared[0]} is to be {' and '.join(roles)}; each needs a column of"
+            " its own."
         )
     twice = [name for name in header_names.values() if names.count(name) > 1]
     if twice:
@@ -485,7 +511,6 @@ _SPELLINGS = {
     "rads": "rad/s",
     "rad_per_s": "rad/s",
     "radps": "rad/s",
-    "rps": "rad/s",
     "rad/sec": "rad/s",
     "rad s-1": "rad/s",
     "rad*s^-1": "rad/s",
@@ -500,6 +525,7 @@ _SPELLINGS = {
     "deg s-1": "deg/s",
     "mdps": "mdeg/s",
 }
+_AMBIGUOUS = ("rps",)
 _TIME = re.compile(r"t|time|times|timestamp|seconds[_ ]?elapsed|elapsed([_ ]?time)?|clock")
 _RATE = (
     r"(?:gyro(?:scope)?|w|omega|omega[_. ]?body|ang(?:ular)?[_. ]?vel(?:ocity)?|"
@@ -513,8 +539,8 @@ def _split_unit(name: str) -> tuple[str, str]:
     text = name.strip().lower()
     if match := re.fullmatch(r"(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]", text):
         return match[1], match[2]
-    for unit in sorted((*_TIMES, *_SPELLINGS), key=len, reverse=True):
-        if unit.isidentifier() and text.endswith(f"_{unit}"):
+    for unit in sorted((*_TIMES, *_RATES, *_SPELLINGS, *_AMBIGUOUS), key=len, reverse=True):
+        if text.endswith(f"_{unit}"):
             return text[: -len(unit) - 1], unit
     return text, ""
 
@@ -524,7 +550,7 @@ def unit_of(role: str, name: str) -> str:
     unit = _split_unit(name)[1]
     unit = _SPELLINGS.get(unit, unit)
     factors = _TIMES if role == "t" else _RATES
-    if unit in factors:
+    if unit in factors or (unit in _AMBIGUOUS and role != "t"):
         return unit
     if unit in _TIMES or unit in _RATES:
         raise ValueError(
@@ -552,11 +578,26 @@ def usual_column(path, role: str, names: list[str]) -> str | None:
     return fitting[0] if fitting else None
 
 
-def _common(path, what: str, units: list, factors: Mapping[str, float]) -> float:
-    """The factor of the one unit that columns state."""
+def _factor(
+    path, what: str, units: list, factors: Mapping[str, float], given: float | None
+) -> float:
+    """The factor that was given, or that of the one unit that columns state."""
     stated = sorted({str(unit) for unit in units if unit})
+    if given is not None:
+        meant = next((unit for unit, factor in factors.items() if factor == given), None)
+        if meant and given != 1 and stated and stated != [meant]:
+            raise ValueError(
+                f"{path}: the {what} are in {', '.join(stated)} by the names of their columns, but"
+                f" are to be read as {meant}; leave that out, or rename the columns."
+            )
+        return given
     if len(stated) > 1:
         raise ValueError(f"{path}: the {what} are in different units: {', '.join(stated)}.")
+    if stated and stated[0] in _AMBIGUOUS:
+        raise ValueError(
+            f"{path}: the {what} are in {stated[0]} by the names of their columns, which may mean"
+            " rad/s or revolutions per second; rename the columns, to rad/s or rpm for example."
+        )
     return factors[stated[0]] if stated else 1.0
 
 

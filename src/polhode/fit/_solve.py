@@ -42,6 +42,8 @@ _SPREAD = 0.1
 # Residuals up to this multiple of the noise, or of what neighbouring samples show of it, end the
 # search for a better valley.
 _GOOD = 1.5
+# Residuals, in standard deviations, beyond which no start is taken for the best that there is.
+_BAD = 5.0
 # Relative difference of two costs that are those of one optimum.
 _SAME = 1e-4
 # Part of the readings that always counts as noise beside the calibration's prior: without it
@@ -199,13 +201,16 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
         )
         uses_all_data = part[job] == 1
         better = uses_all_data & (cost < search.cost)
-        # Two starts that reach the same optimum end the search: a third rarely finds a better one.
+        # Two starts that reach the same optimum near the noise end the search: a third rarely finds
+        # a better one. Far above the noise both may have met the same local minimum.
         same_optimum = uses_all_data & (jnp.abs(cost - search.cost) < _SAME * cost)
         candidate = (solution.value, base, linear, cost, solution.result == optx.RESULTS.successful)
         previous = (search.best, search.base, search.linear, search.cost, search.stopped)
         best, base, linear, cost, stopped = jax.tree.map(
             lambda a, b: jnp.where(better, a, b), candidate, previous
         )
+        misfit = misfit_of(linear, options.robust)
+        limit = jnp.where(same_optimum, _BAD, _GOOD) ** 2 * expected
         return _Search(
             job + 1,
             solution.value,
@@ -216,7 +221,7 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
             search.steps + solution.stats["num_steps"],
             search.attempts + jnp.where(uses_all_data, 1, 0),
             stopped,
-            stopped & (same_optimum | (misfit_of(linear, options.robust) <= _GOOD**2 * expected)),
+            stopped & (misfit <= limit),
         )
 
     first_base = jax.tree.map(lambda leaf: leaf[0], bases)
@@ -293,18 +298,21 @@ def misfit_of(linear: Linear, robust: Huber | None) -> Float[Array, ""]:
 def _expected_square_sum(recording: Recording, options: FitOptions) -> Float[Array, ""]:
     """The sum of squares that noise alone would leave.
 
-    An unknown noise is taken from neighbouring samples; without rates nothing is known of it.
+    An unknown noise is taken from neighbouring samples: of the rates, or without these of the
+    angles that the body has turned by along its axes.
     """
     expected = _data_count(recording)
     if noise_is_trusted(options):
         return expected
     if recording.omega is None:
-        return jnp.full_like(expected, jnp.inf)
-    omega_noise = require_channel("omega_noise", recording.omega_noise)
-    variance = jax.vmap(neighbour_noise_variance)(
-        recording.times, recording.omega, recording.present
-    )
-    variance = variance / jnp.mean(omega_noise, axis=(1, 2)) ** 2
+        values = _turned(recording)
+        values = jnp.pad(jnp.cumsum(values, axis=1), ((0, 0), (1, 0), (0, 0)))
+        noise = require_channel("attitude_noise", recording.attitude_noise)[..., None]
+    else:
+        values = recording.omega
+        noise = require_channel("omega_noise", recording.omega_noise)
+    variance = jax.vmap(neighbour_noise_variance)(recording.times, values, recording.present)
+    variance = variance / jnp.mean(noise, axis=(1, 2)) ** 2
     # infinite for recordings without five samples in a row
     is_finite = jnp.isfinite(variance)
     count = jnp.maximum(jnp.sum(is_finite), 1).astype(variance.dtype)
@@ -312,7 +320,7 @@ def _expected_square_sum(recording: Recording, options: FitOptions) -> Float[Arr
     mean = jnp.where(jnp.any(is_finite), mean, jnp.inf)
     # noise-free readings can be fitted only to the optimiser's tolerance
     rounding = float(jnp.finfo(mean.dtype).eps) ** 0.75
-    least_variance = rounding**2 * jnp.mean((recording.omega / omega_noise) ** 2)
+    least_variance = rounding**2 * jnp.mean((values / noise) ** 2)
     return expected * jnp.maximum(mean, least_variance)
 
 
@@ -335,12 +343,16 @@ def _weight(recording: Recording, rates: Array) -> Float[Array, ""]:
     return 10 / jnp.sqrt(jnp.where(mean > 0, mean, 1))
 
 
+def _turned(recording: Recording) -> Float[Array, "r t-1 3"]:
+    """Rotation vectors from each attitude to the next."""
+    wxyz = require_channel("wxyz", recording.wxyz)
+    return rotation_vector_between(wxyz[:, :-1], wxyz[:, 1:])
+
+
 def _rates(recording: Recording) -> Float[Array, "r t 3"]:
     """Measured rates, or those between successive attitudes; gaps filled by interpolation."""
     if recording.omega is None:
-        wxyz = require_channel("wxyz", recording.wxyz)
-        step = jnp.diff(recording.times, axis=-1)[..., None]
-        between = rotation_vector_between(wxyz[:, :-1], wxyz[:, 1:]) / step
+        between = _turned(recording) / jnp.diff(recording.times, axis=-1)[..., None]
         mean_rates = (between[:, 1:] + between[:, :-1]) / 2
         return jnp.concatenate([between[:, :1], mean_rates, between[:, -1:]], axis=1)
     return interpolate_gaps(recording.times, recording.present, recording.omega)
