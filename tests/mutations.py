@@ -46,7 +46,7 @@ LAWS, LVLH = "_scene/_control.py", "_scene/_orbits.py"
 STEPS, LOOP = "_integrate/_step_derivative.py", "_integrate/_loop.py"
 TURN = "_integrate/_turn.py"
 FLOW, FOUND = "_integrate/_flow_derivative.py", "_integrate/_switch_location.py"
-CROSSINGS, RESIDUALS = "_events/_crossings.py", "fit/_residuals.py"
+SEARCH, RESIDUALS = "_events/_search.py", "fit/_residuals.py"
 LIGHT, PROPAGATE = "lightcurve/_brightness.py", "_propagate.py"
 MOMENTS, QUATERNION = "inertia/_physical.py", "rotation/_quaternion.py"
 
@@ -469,7 +469,28 @@ MUTANTS = (
         ("solvers/test_switches.py::test_derivatives_through_a_table[argmax-forward]",),
     ),
     Mutant(
-        CROSSINGS,
+        SEARCH,
+        "use, beside = jax.tree.map(lambda x: x[-2], of_passes)",
+        "use, beside = jax.tree.map(lambda x: x[-1], of_passes)",
+        "events between two samples are those of a pass that did not know their turning points",
+        ("test_events.py::test_pairs_of_events_that_no_sample_shows_have_their_states",),
+    ),
+    Mutant(
+        SEARCH,
+        "walk = kernel(_next)(walk, jnp.where(is_turning, slopes, values), values)",
+        "walk = kernel(_next)(walk, values, values)",
+        "turning points between two samples are not found",
+        ("test_events.py::test_a_motion_in_closed_form_stops_at_its_first_event",),
+    ),
+    Mutant(
+        "fit/_solve.py",
+        "limit = jnp.where(same_optimum, _BAD, _GOOD) ** 2 * expected",
+        "limit = jnp.where(same_optimum, jnp.inf, _GOOD) ** 2 * expected",
+        "two starts that end in one local minimum end the search of a fit",
+        ("fit/test_fit_recordings.py::test_noisy_attitudes_alone_give_the_body",),
+    ),
+    Mutant(
+        SEARCH,
         "c, d = 3 * jump - 2 * b - b_end, b + b_end - 2 * jump",
         "c, d = 3 * jump + 2 * b - b_end, b + b_end - 2 * jump",
         "tangencies of an event function between two samples are misjudged",

@@ -146,6 +146,7 @@ def loops(run) -> int:
     return counts[0] - counts[1]
 
 
+@pytest.mark.slow  # it drops the programs of all tests before it
 def test_an_accelerator_moves_a_batch_side_by_side(monkeypatch):
     """The chunks of a CPU, one after the other, took a hundred times as long on a GPU."""
     body, axial = ph.Inertia.from_moments([1.0, 1.5, 2.0]), ph.Inertia.axisymmetric(1.0, 0.5)
