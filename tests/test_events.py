@@ -530,6 +530,16 @@ def test_bad_events_are_refused(events, more, message):
         ph.simulate(slowing(), state, [0.0, 1.0], events=events, **more)
 
 
+def test_an_empty_batch_has_no_events_to_search_for():
+    scene = ph.Scene(ph.Inertia.spherical(2.0))
+    nobody = ph.State(jnp.ones((0, 4)), jnp.ones((0, 3)))
+    for more in ({"until": below(0.5)}, {"events": [below(0.5)]}):
+        with pytest.raises(ValueError, match="one body at least"):
+            ph.simulate(scene, nobody, [0.0, 1.0], **more)
+    with pytest.raises(ValueError, match="one body at least"):
+        ph.crossings(ph.simulate(scene, nobody, [0.0, 1.0]), below(0.5))
+
+
 def test_options_of_an_event_are_checked():
     with pytest.raises(TypeError, match="terminal"):
         below(1.0, terminal=1)

@@ -29,6 +29,7 @@ from polhode._events import (
     checked_events,
     events_by_search,
     events_by_steps,
+    require_bodies,
     stop_at_event,
 )
 from polhode._failed import sound_state, with_gradients
@@ -115,6 +116,7 @@ def simulate(
     if split is not None and is_concrete(scene, state, ts):
         scene, state, ts = place(split, scene, state, ts)
     if until is not None:
+        require_bodies(state.wxyz)
         trajectory = _stopped_at(until, method, scene, state, ts, checked_rtol)
         return checked(_reduced(trajectory, record), throw)
     return checked(run(method, scene, state, ts, checked_rtol, record, split), throw)
@@ -134,6 +136,7 @@ def _with_events(scene, state, ts, method, rtol, record, until, events, throw) -
     events = checked_events(events, until, record)
     scene, state, ts, record = check_inputs(scene, state, ts, record)
     check_method(method)
+    require_bodies(state.wxyz)
     checked_rtol = check_rtol(rtol, state.wxyz.dtype)
     if method is None:
         method, _ = choose(scene, checked_rtol)

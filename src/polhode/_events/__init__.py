@@ -1,7 +1,7 @@
 """Events: when a function of attitude, rates and time crosses zero, and motions that stop there."""
 
 from polhode._events._crossings import Crossings as Crossings, crossings as crossings
-from polhode._events._event import Event as Event
+from polhode._events._event import Event as Event, require_bodies as require_bodies
 from polhode._events._simulation import (
     check_until as check_until,
     checked_events as checked_events,

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int
 from polhode import _integrate  # its names load diffrax at first use
 from polhode._batch import PARTS, flatten, lane_times
 from polhode._checks import is_concrete
-from polhode._events._event import Event, at_least
+from polhode._events._event import Event, at_least, require_bodies
 from polhode._events._search import Brackets, Looks, entries, first_true, minima_of, searched
 from polhode._kernels import attached_to
 from polhode._method import Status
@@ -124,7 +124,7 @@ def crossings(
 def _propagator(trajectory: Trajectory) -> Propagator:
     """What moves the trajectory; raises ValueError where nothing does."""
     for name in ("wxyz", "omega_body"):
-        getattr(trajectory, name)  # raises where it was not recorded
+        require_bodies(getattr(trajectory, name))  # raises where it was not recorded, too
     if trajectory.propagator is None:
         raise ValueError("this trajectory was made by hand: use one that ph.simulate returns.")
     if not isinstance(trajectory.propagator, Propagator):

@@ -142,3 +142,12 @@ def at_least(name: str, value: Any, minimum: int) -> int | None:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < minimum:
         raise ValueError(f"{name} must be an integer, at least {minimum}, got {value!r:.40}.")
     return int(value)
+
+
+def require_bodies(wxyz: Array) -> None:
+    """ValueError for an empty batch."""
+    if wxyz.size == 0:
+        raise ValueError(
+            f"events are searched for in one body at least, got attitudes of shape {wxyz.shape}:"
+            " leave the search out where there is no body."
+        )

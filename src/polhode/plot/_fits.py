@@ -284,6 +284,10 @@ def work_precision(
     of the curve to draw bold. Entries that are not positive and finite are left out, and a curve
     left with nothing is named in the legend as failed.
     """
+    if not isinstance(curves, Mapping):
+        raise TypeError(
+            f"curves must be a mapping of names to (errors, times), got {type(curves).__name__}."
+        )
     if not curves:
         raise ValueError("work_precision needs at least one curve, got an empty mapping.")
     if ax is None:

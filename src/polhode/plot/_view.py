@@ -411,6 +411,11 @@ def view_file(
     without xarray and h5netcdf, FileNotFoundError without the file, ValueError for a file that
     lacks what is shown.
     """
+    if not isinstance(path, str | os.PathLike):
+        raise TypeError(
+            f"path must be that of a NetCDF file, got {type(path).__name__}: a trajectory is shown"
+            " by plot.view."
+        )
     body, title = read(path)
     numbers = range(min(3, len(body))) if bodies is None else list(bodies)
     if len(body) > 1:
