@@ -72,6 +72,7 @@ CASES: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "TOP_CHUNK": ((2**9, 2**12, 2**14), ("Lagrange's tops", "Lagrange's tops, 100 times")),
     "ELEMENTARY_CHUNK": ((2**11, 2**17), ("damped symmetric bodies, 100 times",)),
     "ACCELERATOR_SAMPLES": ((2**13, 2**20), ("free bodies", "Lagrange's tops")),
+    "EVENT_LOOK": ((2, 2**16), ("first event of a body", "first events of bodies")),
     "BRIEF_FIT": ((0, 10**9), ("fits",)),
     "FIT_SAMPLES": ((128, 8192), ("fits",)),
     "SAVE_SAMPLES": ((2**15, 2**22), ("saved function of free bodies", "saved function of tops")),
@@ -130,6 +131,21 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
             samples, start = motion(*arguments, **options)
             program = jax.jit(samples).lower(*start).compile()
             return lambda: jax.block_until_ready(program(*start))
+
+        return ready
+
+    def first_event(n):
+        def ready():
+            m, q, w = (jnp.asarray(x[:n] if n > 1 else x[0]) for x in (moments, wxyz, omega))
+            speed = jnp.max(jnp.abs(w[..., 0]))
+            event = ph.Event(lambda wxyz, omega, t: omega[0] - speed * jnp.cos(0.05 * t))
+
+            def stopped(m, q, w):
+                scene, ts = triaxial()(m), jnp.array([0.0, 60.0])
+                return ph.simulate(scene, ph.State(q, w), ts, until=event).event_time
+
+            program = jax.jit(stopped).lower(m, q, w).compile()
+            return lambda: jax.block_until_ready(program(m, q, w))
 
         return ready
 
@@ -229,6 +245,8 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
         "gradient of satellites": slope(satellite, 200),
         "saved function of free bodies": saved(triaxial()),
         "saved function of tops": saved(triaxial(gravity)),
+        "first event of a body": first_event(1),
+        "first events of bodies": first_event(BODIES),
         "fits": fits,
     }
 

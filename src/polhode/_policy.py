@@ -168,6 +168,12 @@ ACCELERATOR_SAMPLES = 2**18
 the chunks of a CPU a million free bodies take 4 times as long on an H200, and a million of
 Lagrange's tops 300 times; all at once, tops twice as long in float64."""
 
+EVENT_LOOK = 128
+"""[bodies times samples] At which a search for the first event of a closed form evaluates it at
+once, for two samples of each body at least. Two samples at a time take a single body three to six
+times as long, as each look computes the constants of the motion; a whole window takes 1,000 bodies
+with events at times of their own three times as long, as roots are looked at with that width."""
+
 
 # Fits.
 

@@ -33,6 +33,7 @@ motion has a closed form; their error falls with the 16th power of the angle tur
 of the effect for a third of a turn."""
 
 _MOST_PARTS = 1024
+"""Parts of a step: what they take of memory grows with their number."""
 
 _TURN = np.pi
 """Angle [rad] by the largest body rate that a part of a step may take. With twice that the effect

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from polhode import _integrate  # its names load diffrax at first use
+from polhode import _integrate, _policy  # names of _integrate load diffrax at first use
 from polhode._batch import PARTS, flatten, lane_times
 from polhode._events._crossings import (
     AT_START,
@@ -243,9 +243,6 @@ _MAX_SPEED_UP = 1.5
 _MAX_WINDOWS = 2**20
 """Windows, of a thousandth of a second or less each: what has no event by then is given up."""
 
-_LOOKED_AT = 128
-"""Bodies times samples in one look at the motion; a body has two samples at least in each."""
-
 _MINIMA = 2
 """Places in a window, of each body, where the function may turn back before zero."""
 
@@ -404,7 +401,7 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
 
         def analyse(seen: Looks):
             """The first change of sign (N,), where the function turns back, and how far the samples
-            serve: as far as the bodies turn about as fast as thought, and no minimum is left out.
+            reach: up to where a body turns too fast for them, or a minimum is left out.
             """
             values, slopes = seen.values[0], seen.slopes[0]
             sides = jnp.where(values >= 0, 1, -1)
@@ -450,7 +447,7 @@ def _first_event(lanes: Trajectory, until: Event, ts: Array) -> tuple[Array, ...
             return Brackets(low, high, at_low, at_high, use), (is_new, reach)
 
         origin = begin if exact else sampled
-        look_width = min(max(_MINIMA, _LOOKED_AT // max(n, 1)), _SAMPLES + 1)
+        look_width = min(max(_MINIMA, _policy.EVENT_LOOK // n), _SAMPLES + 1)
         found = searched(
             lambda t: looks(moved_to(origin, t)),
             grid,
