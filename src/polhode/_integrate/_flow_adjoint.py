@@ -19,7 +19,7 @@ from polhode._integrate._extrapolation import Extrapolation
 from polhode._integrate._field import FixedArguments
 from polhode._integrate._flow_derivative import Equations, equations_of
 from polhode._integrate._midpoint import Progress
-from polhode._kernels import attached, is_slope, kernel
+from polhode._kernels import along_slopes, attached, kernel
 
 
 class FlowAdjoint(diffrax.AbstractAdjoint):
@@ -174,12 +174,7 @@ def path_of(equations: Equations, c, y0, t0, times, states):
     size = len(y0)
 
     def rule(operands, tangents, states):
-        at = [i for i, x in enumerate(tangents) if is_slope(x)]
-
-        def follow(*parameters):
-            inputs = list(operands)
-            for i, x in zip(at, parameters):
-                inputs[i] = x
+        def follow(inputs):
             t0, times, start, c = inputs[0], inputs[1], inputs[2 : 2 + size], inputs[2 + size :]
             # what was never reached is nothing to follow
             times = jnp.where(jnp.isfinite(times), times, jax.lax.stop_gradient(t0))
@@ -194,6 +189,6 @@ def path_of(equations: Equations, c, y0, t0, times, states):
             _, later = jax.lax.scan(across, start, (starts, times, list(states)))
             return later
 
-        return jax.jvp(follow, [operands[i] for i in at], [tangents[i] for i in at])[1]
+        return along_slopes(follow, operands, tangents)
 
     return attached(rule, [t0, times, *y0, *c], states)

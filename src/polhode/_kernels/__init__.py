@@ -6,6 +6,7 @@ part buys, ``polhode._policy`` where it is used and how all of it is switched of
 
 from polhode._kernels._derivatives import (
     SMOOTH as SMOOTH,
+    along_slopes as along_slopes,
     are_close as are_close,
     attached as attached,
     attached_to as attached_to,

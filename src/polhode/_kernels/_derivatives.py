@@ -79,17 +79,9 @@ def _jvp(arrays, tangents, *, count, **params):
     if not all(isinstance(x, ad.Zero) for x in operand_tangents):
         operand_tangents = [zeros(x) if isinstance(x, ad.Zero) else x for x in operand_tangents]
         changes = _linear_p.bind(*constants, *operand_tangents, count=count, **params)
-    at = [i for i, x in enumerate(tangents[:count]) if is_slope(x)]
-    if at:
-
-        def of_constants(*parameters):
-            inputs = list(constants)
-            for i, x in zip(at, parameters):
-                inputs[i] = x
-            return params["forward"](inputs, operands)
-
-        _, constant_changes = jax.jvp(
-            of_constants, [constants[i] for i in at], [tangents[i] for i in at]
+    if any(is_slope(x) for x in tangents[:count]):
+        constant_changes = along_slopes(
+            lambda inputs: params["forward"](inputs, operands), constants, tangents[:count]
         )
         changes = (
             [a + b for a, b in zip(changes, constant_changes)] if changes else constant_changes
@@ -213,6 +205,19 @@ def attached(
     return _attached_p.bind(*operands, *values, rule=rule, count=len(operands), again=again)
 
 
+def along_slopes(function: Callable, operands: Sequence[Any], tangents: Sequence[Any]) -> Any:
+    """Tangents of ``function(operands)`` along those of ``tangents`` that are slopes."""
+    at = [i for i, x in enumerate(tangents) if is_slope(x)]
+
+    def of_sloped(*parameters):
+        inputs = list(operands)
+        for i, x in zip(at, parameters):
+            inputs[i] = x
+        return function(inputs)
+
+    return jax.jvp(of_sloped, [operands[i] for i in at], [tangents[i] for i in at])[1]
+
+
 def attached_to(
     function: Callable[..., Sequence[Array]], arguments: Any, values: Sequence[Array]
 ) -> list[Array]:
@@ -222,16 +227,11 @@ def attached_to(
     closed = jax.make_jaxpr(lambda *x: list(function(*jax.tree.unflatten(tree, x))))(*leaves)
     size = len(closed.consts)
 
+    def of_operands(inputs):
+        return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, inputs[:size]))(*inputs[size:])
+
     def rule(operands, tangents, values):
-        at = [i for i, x in enumerate(tangents) if is_slope(x)]
-
-        def of_active(*primals):
-            inputs = list(operands)
-            for i, x in zip(at, primals):
-                inputs[i] = x
-            return jaxpr_as_fun(ClosedJaxpr(closed.jaxpr, inputs[:size]))(*inputs[size:])
-
-        return jax.jvp(of_active, [operands[i] for i in at], [tangents[i] for i in at])[1]
+        return along_slopes(of_operands, operands, tangents)
 
     return attached(rule, [*map(jnp.asarray, closed.consts), *leaves], values)
 
