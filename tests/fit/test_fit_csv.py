@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from polhode.fit import read_recording
-from polhode.fit._recording import load_recording
+from polhode.fit._csv import load_recording
 
 COLUMNS = {"t": "time", "wx": "x", "wy": "y", "wz": "z"}
 GOOD = """time, x, y, z, n

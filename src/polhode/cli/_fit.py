@@ -62,8 +62,9 @@ def fit(
         option(
             "--columns",
             "NAME=COLUMN ...",
-            "columns of t [s], wx, wy, wz and, if there is a wheel, wheel [rad/s]; those left out"
-            " are found by their usual names (t, time_s, wx, gyro_x, omega_x, ...)",
+            "columns of t [s], wx, wy, wz and, if there is a wheel, wheel [rad/s, or the unit of"
+            " its name]; those left out are found by their usual names (t, time_s, wx, gyro_x,"
+            " omega_x, ...)",
             show_default=False,
         ),
     ] = [],  # noqa: B006 - typer reads it
@@ -246,7 +247,7 @@ def _exit_code(result: Any, allow_undetermined: bool) -> int:
 
 
 def _read(path: Path, names: dict[str, str], options: _Options) -> Any:
-    from polhode.fit._recording import load_recording
+    from polhode.fit._csv import load_recording
 
     try:
         with usage_errors(path, ".csv", _EXPECTED):

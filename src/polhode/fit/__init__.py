@@ -1,6 +1,7 @@
 """Inertia and other numbers of a scene from recordings, with their uncertainty."""
 
 from polhode.fit._conclude import sensor_axes as sensor_axes
+from polhode.fit._csv import read_recording as read_recording
 from polhode.fit._findings import (
     Finding as Finding,
     FitError as FitError,
@@ -25,7 +26,6 @@ from polhode.fit._options import FitOptions as FitOptions, Gyroscope as Gyroscop
 from polhode.fit._recording import (
     Recording as Recording,
     averaged as averaged,
-    read_recording as read_recording,
     stack as stack,
 )
 from polhode.fit._residuals import (
