@@ -152,8 +152,9 @@ def main():
     readme = (ROOT / "README.md").read_text(encoding="utf-8")
     blocks, scope = re.findall(r"^```python\n(.*?)^```", readme, re.S | re.M), {}
     assert blocks, "README.md has no example"
-    for block in blocks:
-        exec(block, scope)
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        for block in blocks:
+            exec(block, scope)
     failed, checks = [], {**SCENES, **OTHERS}
     for name, run in checks.items():
         if sys.argv[1:] and name not in sys.argv[1:]:

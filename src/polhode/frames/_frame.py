@@ -91,12 +91,11 @@ class VariableRate(AbstractTurning):
     def attitude(self, t):
         """One adaptive integration from ``t0``, at about 50 times the rounding error per step."""
         omega_body, hoisted = jax.closure_convert(self.omega_body, t)
-        # compiled once for every frame; a function of traced values lives no longer than its trace
-        integrate = _integrated if hoisted else _compiled
-        integrated = integrate(self, jax.lax.stop_gradient(t))
+        integrated = _integrated(self, jax.lax.stop_gradient(t))
         return _turning(omega_body, t, integrated, *hoisted)
 
 
+@eqx.filter_jit  # once for every frame: diffrax would compile its loop at every eager call
 def _integrated(turning: VariableRate, t: Array) -> Array:
     accuracy = 50 * float(jnp.finfo(turning.start.dtype).eps)
     solution = diffrax.diffeqsolve(
@@ -112,9 +111,6 @@ def _integrated(turning: VariableRate, t: Array) -> Array:
     )
     (path,) = jax.tree.leaves(solution.ys)
     return normalise(path[-1])
-
-
-_compiled = eqx.filter_jit(_integrated)
 
 
 class PrescribedAttitude(AbstractTurning):
