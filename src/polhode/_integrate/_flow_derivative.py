@@ -14,6 +14,7 @@ import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array, PyTree
 
+from polhode import _policy
 from polhode._checks import is_concrete
 from polhode._hamiltonian import Dynamics, LiePoissonUnits, relative
 from polhode._integrate._columns import table
@@ -269,7 +270,11 @@ class Equations:
             dy = [a - dt0 * f for a, f in zip(dy, self.field(c, t0, y))]
         maps = (partial(self._tangent, at), partial(self._cotangent, at))
         primals = [*operands[:3], *y, *end, *c]
-        end_tangents = linear(*maps, primals, [*dy, *(dc[i] for i in at)], end)
+        few = end[0].size <= _policy.KERNEL_BODIES
+        compiled = (
+            partial(kernel, of_units=True) if few else None
+        )  # what comes before and after the steps, too
+        end_tangents = linear(*maps, primals, [*dy, *(dc[i] for i in at)], end, compiled)
         if is_slope(dt1):
             end_tangents = [a + dt1 * f for a, f in zip(end_tangents, self.field(c, t1, end))]
         return end_tangents

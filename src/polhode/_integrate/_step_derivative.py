@@ -17,6 +17,7 @@ one, and those before the last one are integrated a third time. Full records of 
 """
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -117,6 +118,7 @@ def samples(
             [*inputs, y, start, ordered_ts, *recorded],
             [dy, *(input_tangents[i] for i in at)],
             [states],
+            partial(kernel, of_units=True) if motion.is_whole else None,
         )
         if order is not None:
             place = jnp.argsort(order, axis=1)[..., None]

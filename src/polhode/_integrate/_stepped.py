@@ -170,9 +170,10 @@ class AbstractIntegration(AbstractMethod):
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
         if n <= min(size, _policy.SORTED_BODIES):
-            solve_all = (
-                kernel(solve_chunk, of_units=True) if n <= _policy.KERNEL_BODIES else solve_chunk
-            )
+            # A loop in a derivative that JAX traces would be run for the values and again for it.
+            linearised = isinstance(self.adjoint, FlowAdjoint)
+            unit = kernel(solve_chunk, linearised=linearised, of_units=True)
+            solve_all = unit if n <= _policy.KERNEL_BODIES else solve_chunk
             return guarded(solve_all(Distinct((lanes, times))), hidden)
         # chunks of bodies with similar rates, the fastest first: no slow body is left for the end
         order = jnp.argsort(-natural_rates(scene, state, ts))
@@ -219,7 +220,8 @@ class AbstractIntegration(AbstractMethod):
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
         if n <= _policy.KERNEL_BODIES:
-            return map_chunks(kernel(solve_chunk, of_units=True), Distinct((lanes, times)), n, n)
+            unit = kernel(solve_chunk, linearised=True, of_units=True)
+            return map_chunks(unit, Distinct((lanes, times)), n, n)
         size = self.chunk or self._lanes_of_loop(scene, state, ts, record, search)
         # bodies of a chunk wait for one another: similar rates in each
         order = jnp.argsort(-natural_rates(scene, state, ts))

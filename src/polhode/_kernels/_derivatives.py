@@ -30,14 +30,17 @@ def linear(
     constants: Sequence[Any],
     operands: Sequence[Any],
     like: Sequence[Any],
+    compiled: Callable[[Callable], Callable] | None = None,
 ) -> list[Any]:
     """``forward(constants, operands)``, linear in ``operands``; ``backward(constants, out)`` is its
     transpose.
 
     All are lists of arrays; ``like``: arrays of the shapes and dtypes of the result. Neither
-    function may close over traced values. Unlike ``jax.custom_vjp`` this leaves forward mode as it
-    is, and unlike ``jax.custom_derivatives.linear_call`` it takes ``vmap`` and derivatives with
-    respect to ``constants``.
+    function may close over traced values. ``compiled``, such as ``kernel``, is applied to either
+    as a function of arrays where a program is made of it, not where it is differentiated. Unlike
+    ``jax.custom_vjp`` this leaves forward mode as it is, and unlike
+    ``jax.custom_derivatives.linear_call`` it takes ``vmap`` and derivatives with respect to
+    ``constants``.
     """
     shapes = tuple((tuple(x.shape), x.dtype) for x in like)
     return _linear_p.bind(
@@ -47,6 +50,7 @@ def linear(
         backward=backward,
         count=len(constants),
         shapes=shapes,
+        compiled=compiled,
     )
 
 
@@ -55,17 +59,18 @@ _linear_p.multiple_results = True
 
 
 @_linear_p.def_impl
-def _compute(*arrays, forward, backward, count, shapes):
+def _compute(*arrays, forward, backward, count, shapes, compiled):
     return list(forward(arrays[:count], arrays[count:]))
 
 
-def _lowered(*arrays, **params):
+def _lowered(*arrays, compiled, **params):
     with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):  # a unit's mark is its call's
-        return _compute(*arrays, **params)
+        compute = functools.partial(_compute, compiled=None, **params)
+        return (compute if compiled is None else compiled(compute))(*arrays)
 
 
 @_linear_p.def_abstract_eval
-def _shapes(*_, forward, backward, count, shapes):
+def _shapes(*_, forward, backward, count, shapes, compiled):
     return [ShapedArray(shape, dtype) for shape, dtype in shapes]
 
 
@@ -99,17 +104,17 @@ def zeros(x: Any) -> Any:
     return jnp.zeros(x.aval.shape, x.aval.dtype)
 
 
-def _transpose(slopes, *arrays, forward, backward, count, shapes):
+def _transpose(slopes, *arrays, forward, backward, count, shapes, compiled):
     constants, operands = arrays[:count], arrays[count:]
     unknown = [ad.is_undefined_primal(x) for x in operands]
     avals = [x.aval if u else x for u, x in zip(unknown, operands)]
     slopes = [zeros(x) if isinstance(x, ad.Zero) else x for x in slopes]
     # the same primitive with both programs exchanged: its transpose is the map itself again
-    cotangents = linear(backward, forward, constants, slopes, avals)
+    cotangents = linear(backward, forward, constants, slopes, avals, compiled)
     return [None] * count + [x if u else None for u, x in zip(unknown, cotangents)]
 
 
-def _batch(arrays, dims, *, forward, backward, count, shapes):
+def _batch(arrays, dims, *, forward, backward, count, shapes, compiled):
     # All operands get the axis, batched or not: the transpose has to return cotangents of the same
     # shapes. The constants have no cotangents here, and keep their axes.
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
@@ -133,6 +138,7 @@ def _batch(arrays, dims, *, forward, backward, count, shapes):
         backward=batched(backward),
         count=count,
         shapes=tuple(((size, *shape), dtype) for shape, dtype in shapes),
+        compiled=None,
     )
     return out, [0] * len(out)
 

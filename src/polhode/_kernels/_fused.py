@@ -20,7 +20,7 @@ from jax.core import ShapedArray, Tracer
 from jax.custom_batching import custom_vmap
 from jax.custom_derivatives import SymbolicZero
 from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, Primitive, jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, Literal, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.sharding import AxisType
 
@@ -59,7 +59,7 @@ def kernel(
     cotangents another, each of which evaluates the function again: only the operands are stored,
     which is several times as fast, also to compile, where there would be hundreds of coefficients.
     Sums over many bodies or times are then written as ``spread``. With ``of_units`` the units
-    inside ``fn`` stay units, within the whole and in its derivatives.
+    inside ``fn`` stay units, within the whole, in its derivatives and under ``vmap``.
     """
 
     def call(*operands):
@@ -88,7 +88,7 @@ def kernel(
                 )
             return fn(*operands)
         program, constants = _with_constants_as_operands(closed_jaxpr)
-        results = _unit(jaxpr_as_fun(program), linearised, (program, 0), repeated)(
+        results = _unit(jaxpr_as_fun(program), linearised, (program, 0), repeated, of_units)(
             *constants, *leaves
         )
         return jax.tree.unflatten(jax.tree.structure(shape), results)
@@ -258,10 +258,17 @@ def _is_packable(dtype) -> bool:
     return isinstance(dtype, np.dtype) and dtype != jax.dtypes.float0
 
 
-def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool = False) -> Callable:
+def _unit(
+    flat: Callable,
+    linearised: bool,
+    traced: Any = None,
+    repeated: bool = False,
+    of_units: bool = False,
+) -> Callable:
     """``flat``, a function of arrays with a list of results, as one unit, differentiable.
 
-    ``traced``: the same if it is already traced, and the ``exempt_count`` of ``_unit_call``.
+    ``traced``: the same if it is already traced, and the ``exempt_count`` of ``_unit_call``; the
+    others as of ``kernel``.
     """
 
     @jax.custom_jvp
@@ -269,7 +276,7 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
         closed_jaxpr, exempt_count = traced or (jax.make_jaxpr(flat)(*leaves), 0)
         if traced is None and not is_holdable(closed_jaxpr.jaxpr):
             return _batched_alike(jaxpr_as_fun(closed_jaxpr)(*leaves), leaves)
-        return _unit_call(closed_jaxpr, leaves, exempt_count)
+        return _unit_call(closed_jaxpr, leaves, exempt_count, of_units)
 
     def derivative(leaves, tangents):
         # What has no tangent stays a constant: its derivative is not worked out at all.
@@ -303,9 +310,10 @@ def _unit(flat: Callable, linearised: bool, traced: Any = None, repeated: bool =
         linearisation = jax.make_jaxpr(value_and_coefficients)(*leaves)
         tree, count = shape
         exempt_count = len(linearisation.out_avals) - 1 - count
-        *results, zero = _unit(jaxpr_as_fun(linearisation), False, (linearisation, exempt_count))(
-            *leaves
+        of_all = _unit(
+            jaxpr_as_fun(linearisation), False, (linearisation, exempt_count), of_units=of_units
         )
+        *results, zero = of_all(*leaves)
         # Not marked: transposed, it would carry operands that go unused.
         linear_map = jax.tree.unflatten(tree, results[count:])
         return results[:count], linear_map(
@@ -374,7 +382,7 @@ def _on_condition(zero: jax.Array, tangent: jax.Array) -> jax.Array:
 
 
 def _unit_call(
-    closed_jaxpr: ClosedJaxpr, arguments: Sequence[Any], exempt_count: int
+    closed_jaxpr: ClosedJaxpr, arguments: Sequence[Any], exempt_count: int, of_units: bool
 ) -> list[jax.Array]:
     """The call of a unit, in which every operand is certainly used.
 
@@ -419,8 +427,8 @@ def _unit_call(
                 for k, x in enumerate(results)
             ]
 
-    shapes = tuple((x.shape, x.dtype) for x in closed_jaxpr.out_avals)
-    return _unit_p.bind(zeros, *operands, program=program, shapes=shapes)
+    shapes = tuple((x.shape, x.dtype, x.weak_type) for x in closed_jaxpr.out_avals)
+    return _unit_p.bind(zeros, *operands, program=program, shapes=shapes, of_units=of_units)
 
 
 # A primitive, or the derivative of a loop around the call would take the constants in it for known
@@ -430,16 +438,16 @@ _unit_p.multiple_results = True
 
 
 @_unit_p.def_impl
-def _unit_at_once(*arrays, program, shapes):
+def _unit_at_once(*arrays, program, shapes, of_units):
     return list(program(*arrays))
 
 
 @_unit_p.def_abstract_eval
-def _unit_shapes(*_, program, shapes):
-    return [ShapedArray(shape, dtype) for shape, dtype in shapes]
+def _unit_shapes(*_, program, shapes, of_units):
+    return [ShapedArray(shape, dtype, weak_type) for shape, dtype, weak_type in shapes]
 
 
-def _unit_lowered(*arrays, program, shapes):
+def _unit_lowered(*arrays, program, shapes, of_units):
     with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
         return jax.jit(program)(*arrays)
 
@@ -464,9 +472,12 @@ def map_chunks(fn: Callable[[Any], Any], lanes: Any, n: int, size: int) -> Any:
     return jax.tree.map(lambda x: x.reshape(count * size, *x.shape[2:])[:n], chunks)
 
 
-def _unit_batch(arrays, dims, *, program, shapes):
+def _unit_batch(arrays, dims, *, program, shapes, of_units):
     """A unit of a few bodies, and a loop over such units: outside of one the same arithmetic takes
     a hundred times as long, for XLA repeats what several results need."""
+    if of_units:  # those inside become units of a few bodies
+        out_axes = [0 if x else None for x in _depend_on(program, arrays, dims)]
+        return jax.vmap(program, list(dims), out_axes)(*arrays), out_axes
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
     places = [k for k, d in enumerate(dims) if d is not None]
 
@@ -485,11 +496,26 @@ def _unit_batch(arrays, dims, *, program, shapes):
             with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):
                 return batch(*arrays)
 
-        of_batch = tuple(((count, *shape), dtype) for shape, dtype in shapes)
-        return _unit_p.bind(*whole, program=batched_program, shapes=of_batch)
+        of_batch = tuple(((count, *shape), *kind) for shape, *kind in shapes)
+        return _unit_p.bind(*whole, program=batched_program, shapes=of_batch, of_units=False)
 
     lanes = [jnp.moveaxis(arrays[k], dims[k], 0) for k in places]
     return map_chunks(unit_of, lanes, size, _policy.KERNEL_BATCH), [0] * len(shapes)
+
+
+def _depend_on(program: Callable, arrays: Sequence[Any], dims: Sequence[int | None]) -> list[bool]:
+    """Which results of a program depend on those arrays that have a batch axis.
+
+    What does not, such as times that bodies share, gets none: with times of its own every body
+    would take its own steps backwards."""
+    lanes = [jnp.shape(x) if d is None else np.delete(x.shape, d) for x, d in zip(arrays, dims)]
+    lanes = [jax.ShapeDtypeStruct(tuple(shape), x.dtype) for shape, x in zip(lanes, arrays)]
+    jaxpr = jax.make_jaxpr(program)(*lanes).jaxpr
+    dependent = {v for v, d in zip(jaxpr.invars, dims) if d is not None}
+    for equation in jaxpr.eqns:
+        if any(not isinstance(v, Literal) and v in dependent for v in equation.invars):
+            dependent.update(equation.outvars)
+    return [not isinstance(v, Literal) and v in dependent for v in jaxpr.outvars]
 
 
 mlir.register_lowering(_unit_p, mlir.lower_fun(_unit_lowered, multiple_results=True))
