@@ -65,8 +65,7 @@ CASES: dict[str, tuple[tuple[Any, ...], tuple[str, ...]]] = {
     "FEWEST_RECORDED_TURNS": ((1024,), ("gradient of networks",)),
     "COMPENSATED_STEPS": ((0, 10**9), ("heavy top", "heavy tops")),
     "COMPENSATED_PHASES": ((10**9,), ("free body", "free bodies")),
-    "FREE_CHUNK": ((2**10, 2**16), ("free bodies", "free bodies, 100 times")),
-    "FREE_PAIR": ((10**9,), ("free bodies",)),
+    "FREE_CHUNK": ((2**10, 2**40), ("free bodies", "gradient of 100,000 free bodies")),
     "FREE_LANES": ((64, 4096), ("free bodies, 100 times",)),
     "TIME_LOOP_BODIES": ((8, 10**4), ("free bodies, 100 times",)),
     "TOP_CHUNK": ((2**9, 2**12, 2**14), ("Lagrange's tops", "Lagrange's tops, 100 times")),
@@ -118,7 +117,8 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
 
     def motion(build, n, times=2, seconds=20.0, method=None):
         ts = jnp.linspace(0.0, seconds, times)
-        start = [jnp.asarray(x[:n] if n > 1 else x[0]) for x in (moments, wxyz, omega)]
+        rows = np.arange(n) % BODIES if n > 1 else 0
+        start = [jnp.asarray(x[rows]) for x in (moments, wxyz, omega)]
 
         def samples(m, q, w):
             found = ph.simulate(build(m), ph.State(q, w), ts, method)
@@ -238,6 +238,7 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
         "network": value(triaxial(None, ph.FeedbackTorque(network)), 10),
         "gradient of networks": slope(triaxial(None, ph.FeedbackTorque(network)), 64),
         "gradient of free bodies": slope(triaxial(), BODIES),
+        "gradient of 100,000 free bodies": slope(triaxial(), 100 * BODIES),
         "gradient of Lagrange's tops": slope(symmetric(axial), BODIES),
         "gradient of a heavy top": slope(triaxial(gravity), 1),
         "gradient of heavy tops": slope(triaxial(gravity), BODIES),

@@ -144,12 +144,8 @@ COMPENSATED_PHASES = 1e5
 """[units of rounding] Tolerance below which a free body has its frequencies in sums of two floats:
 its phase loses eps times the angle, more than rtol from 1e5 rad on."""
 
-FREE_CHUNK = 2**13
+FREE_CHUNK = 2**12
 """[bodies times samples] Of free bodies in one chunk, whose arrays stay in the cache of a core."""
-
-FREE_PAIR = 8
-"""[bodies times samples] From which free bodies are divided into two chunks at least: the loop
-keeps XLA from fusing the motion with the assembly of the results."""
 
 FREE_LANES = 512
 """[bodies] Whose constants stay in the cache while they are moved to many times (TIME_LOOP)."""
@@ -273,11 +269,6 @@ def samples_at_once(chunk: int) -> int:
     """Bodies times samples of a closed form in one chunk: ``chunk`` on a CPU, where its arrays stay
     in the cache of a core. An accelerator evaluates all side by side."""
     return chunk if is_cpu() else ACCELERATOR_SAMPLES
-
-
-def is_paired(samples: int) -> bool:
-    """Whether free bodies are divided into two chunks at least: on a CPU."""
-    return is_cpu() and samples >= FREE_PAIR
 
 
 def bodies_at_once(lanes: int) -> int:

@@ -72,8 +72,7 @@ class ClosedForm(AbstractClosedForm):
             tensor = jnp.broadcast_to(inertia.full, (wxyz.shape[0], 3, 3))
             moments, axes, products = principal(tensor)
             products = products[..., ::-1]  # (yz, zx, xy) -> (xy, xz, yz)
-            wxyz = rotation.multiply(wxyz, axes)
-            omega = rotation.rotate(rotation.conjugate(axes), omega)
+            wxyz, omega = kernel(_in_axes)(axes, wxyz, omega)
         n, requested = wxyz.shape[0], {"attitude": record.attitude, "rates": record.rates}
         of_inertia = jax.tree.map(
             lambda x: jnp.broadcast_to(x, (n, x.shape[-1])), (moments, products)
@@ -86,22 +85,20 @@ class ClosedForm(AbstractClosedForm):
         samples, chunk = t.shape[-1], self.chunk
         if chunk is None:
             chunk = _policy.samples_at_once(_policy.FREE_CHUNK)
-        single_body = n == 1 and samples >= _policy.FREE_PAIR
+        single_body = n == 1 and samples > chunk
         size, pieces = max(1, chunk // samples), n
         lanes = (of_inertia, wxyz, omega)
         time_by_time = (
             self.chunk is None and motion is _triaxial and _policy.is_time_loop(n, samples)
         )
         if single_body:  # one body at many times: as several bodies, each at a part of them
-            pieces = max(2, -(-samples // chunk))
+            pieces = -(-samples // chunk)
             samples_per_piece = -(-samples // pieces)
             times = jnp.pad(t.reshape(-1), (0, pieces * samples_per_piece - samples), mode="edge")
             times = times.reshape(pieces, samples_per_piece)
             lanes = jax.tree.map(lambda x: jnp.repeat(x, pieces, axis=0), lanes)
         elif time_by_time:
             size = chunk_size(n)
-        elif _policy.is_paired(n * samples):
-            size = min(size, -(-n // 2))
 
         def move(chunk):
             (moments, products), wxyz, omega, times = chunk
@@ -130,14 +127,17 @@ class ClosedForm(AbstractClosedForm):
                 size,
             )
         else:
-            # Components are put together only here: fused with the motion, the stacking would have
-            # all of them computed again for each entry. A loop of two chunks prevents that.
             parts = map_chunks(move, (*lanes, times), pieces, size)
             if single_body:
                 parts = jax.tree.map(lambda x: x.reshape(1, -1)[:, :samples], parts)
             wxyz, omega, finite = assemble(parts, axes, state)
         status = jnp.where(finite, Status.SUCCESSFUL, Status.NOT_FINITE)
         return Samples(wxyz, omega, status, StepCounts.of(jnp.zeros_like(status)))
+
+
+def _in_axes(axes, wxyz, omega):
+    """Attitude and rates of the frame that ``axes`` (wxyz) turns the body's into."""
+    return rotation.multiply(wxyz, axes), rotation.rotate(rotation.conjugate(axes), omega)
 
 
 def _triaxial(moments, products, wxyz, omega, t, requested):
