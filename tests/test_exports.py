@@ -1,5 +1,7 @@
 """What trajectories are written as: labels in xarray, SciPy's rotations, CCSDS messages."""
 
+from datetime import datetime, timedelta
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -115,3 +117,43 @@ def test_messages_that_nobody_could_read_are_not_written(traj, tmp_path):
         with pytest.raises(ValueError, match="epoch"):
             traj.to_aem(path, epoch, **FIELDS)
     assert not path.exists()
+
+
+def test_messages_of_other_centuries(traj, tmp_path):
+    """Nanoseconds in 64 bits hold the years 1678 to 2262 only, and wrap."""
+    path, start = tmp_path / "far.aem", "START_TIME = "
+    shift = float(traj.ts[0])
+    for epoch in ("2300-01-01T00:00:00", "1600-02-28T23:59:59", "0001-01-01T00:00:00.5"):
+        traj.to_aem(path, epoch, **FIELDS)
+        begun = next(x for x in path.read_text().splitlines() if x.startswith(start))
+        expected = datetime.fromisoformat(epoch) + timedelta(seconds=shift)
+        assert datetime.fromisoformat(begun.removeprefix(start)) == expected
+
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.6, 2.2]))
+    slow = ph.State([1.0, 0, 0, 0], [3e-10, 1e-9, -4e-10])
+    fields = {"object_name": "X", "object_id": "1"}
+    for seconds in (8e9, 1e10, -2e10):
+        ts = np.sort([0.0, seconds])
+        ph.simulate(scene, slow, ts).to_aem(path, "2029-01-01T00:00:00", **fields)
+        times = [x.split(" = ")[1] for x in path.read_text().splitlines() if "_TIME = " in x]
+        expected = [datetime(2029, 1, 1) + timedelta(seconds=x) for x in ts.tolist()]
+        assert [datetime.fromisoformat(x) for x in times] == expected
+    with pytest.raises(ValueError, match="years 0 to 9999"):
+        ph.simulate(scene, slow, [0.0, 1e12]).to_aem(path, "2029-01-01T00:00:00", **fields)
+    with pytest.raises(ValueError, match="object_name"):
+        traj.to_aem(path, "2029-01-01T00:00:00", **FIELDS | {"object_name": 3})
+
+
+def test_wheels_are_exported():
+    pytest.importorskip("xarray")
+    wheel = ph.Rotor(axis_body=[0, 0, 1.0], inertia=0.05, momentum=0.3, torque=0.02)
+    scene = ph.Scene(
+        ph.Inertia.from_moments([1.0, 1.6, 2.2]), torque=ph.LinearDamping(0.1), rotors=wheel
+    )
+    state = ph.State([1.0, 0, 0, 0], [0.3, 1, -0.4])
+    traj = ph.simulate(scene, state, np.linspace(0, 2, 5), record=ph.Record(work=True))
+    data = traj.to_xarray()
+    assert data["wheel_speed"].dims == data["motor_work"].dims == ("time", "wheel")
+    np.testing.assert_array_equal(data["wheel_speed"], traj.wheel_speed)
+    np.testing.assert_array_equal(data["motor_work"], traj.motor_work)
+    assert "motors" in data["work"].attrs["long_name"]

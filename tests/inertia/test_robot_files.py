@@ -117,3 +117,21 @@ def test_a_link_is_read_without_a_warning_in_the_default_precision_of_jax(arm):
 def test_a_scene_of_mass_properties_names_their_inertia(arm):
     with pytest.raises(TypeError, match=r"got MassProperties: pass its \.inertia"):
         ph.Scene(MassProperties.from_urdf(arm, "hand"))
+
+
+def test_links_of_extensions_are_not_those_of_the_robot(arm):
+    own = MassProperties.from_urdf(arm, "hand")
+    inertial = (
+        '<inertial><mass value="9"/><inertia ixx="9" iyy="9" izz="9" ixy="0" ixz="0" iyz="0"/>'
+        "</inertial>"
+    )
+    for inside in (inertial, ""):
+        extension = f'<gazebo><plugin><link name="hand">{inside}</link></plugin></gazebo></robot>'
+        arm.write_text(URDF.replace("</robot>", extension))
+        assert float(MassProperties.from_urdf(arm, "hand").mass) == float(own.mass)
+    arm.write_text(URDF.replace("</robot>", f'<link name="hand">{inertial}</link></robot>'))
+    with pytest.raises(ValueError, match="2 links 'hand'"):
+        MassProperties.from_urdf(arm, "hand")
+    arm.write_text('<?xml version="1.0" encoding="nowhere"?>' + URDF)
+    with pytest.raises(ValueError, match="not XML"):
+        MassProperties.from_urdf(arm, "hand")

@@ -199,3 +199,32 @@ def test_unsorted_times_are_sorted_with_their_points():
     curve = lightcurve.LightCurve.of(t, 15 + t)
     assert np.all(np.diff(curve.t) > 0)
     np.testing.assert_allclose(curve.magnitude, 15 + curve.t)
+
+
+def test_nothing_of_a_file_is_dropped_in_silence(tmp_path):
+    rows = [(t, m, m + 1) for t, m in zip(JD, MAGNITUDE)]
+    with pytest.raises(ValueError, match="more than one column mag"):
+        lightcurve.read_light_curve(_write(tmp_path / "twice.csv", "jd,mag,mag", rows))
+    rows = [(t, t - 2400000.5, m) for t, m in zip(JD, MAGNITUDE)]
+    curve = lightcurve.read_light_curve(_write(tmp_path / "times.csv", "mjd,jd,mag", rows))
+    assert any("columns jd, mjd the first is taken" in note for note in curve.notes)
+    path = tmp_path / "lc.txt"
+    lines = [f"{t} 1.0{k} 1 0.1 0 0.2 0.9 0" for k, t in enumerate(JD)]
+    path.write_text("\n".join(["1", f"{ROWS - 1} 0", *lines]) + "\n")
+    with pytest.raises(ValueError, match=rf"1 line\(s\) from line {ROWS + 2} on"):
+        lightcurve.read_light_curve(path)
+
+
+def test_errors_of_points_are_checked():
+    sigma = np.full(ROWS, 0.02)
+    for wrong, match in ((np.ones(5), r"shape \(5,\)"), (sigma - 0.03, "must not be negative")):
+        with pytest.raises(ValueError, match=match):
+            lightcurve.LightCurve.of(JD, MAGNITUDE, sigma=wrong)
+    sigma[2] = np.nan
+    assert lightcurve.LightCurve.of(JD, MAGNITUDE, sigma=sigma).sigma[2] == 0
+
+
+def test_means_that_leave_too_few_points():
+    curve = lightcurve.LightCurve.of(JD, MAGNITUDE)
+    with pytest.raises(ValueError, match=rf"leave 1 of {ROWS} points"):
+        curve.binned(10.0)

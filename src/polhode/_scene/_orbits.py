@@ -273,7 +273,7 @@ class KeplerOrbit(AbstractOrbit):
         )
 
     def __call__(self, t: Array | float) -> Float[Array, "*b 3"]:
-        return _place(self, t)
+        return _place(self, jnp.asarray(t) if isinstance(t, list | tuple) else t)
 
     @property
     def mean_motion(self) -> Array:

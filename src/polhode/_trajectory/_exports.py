@@ -1,7 +1,7 @@
 """Trajectories for others: xarray, and attitude ephemeris messages of the CCSDS."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 from polhode import __version__
 from polhode._extras import imported
 from polhode._method import Status
+from polhode._scene import Wheels
 
 
 def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
@@ -35,7 +36,20 @@ def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
     if omega is not None and wxyz is not None:
         momentum = "angular momentum in space axes"
         put("momentum_space", trajectory.momentum_space, vectors, "kg m2 s-1", momentum)
-    put("work", trajectory._work, sample_dims, "J", "work done by the external torques")
+    put(
+        "work",
+        trajectory._work,
+        sample_dims,
+        "J",
+        "work done from outside and by the motors of wheels",
+    )
+    if isinstance(trajectory.scene.rotors, Wheels):
+        wheels = (*sample_dims, "wheel")
+        if omega is not None:
+            speed = "speed of each wheel relative to the body"
+            put("wheel_speed", trajectory.wheel_speed, wheels, "rad s-1", speed)
+        done = "part of the work done by motor and friction of each wheel"
+        put("motor_work", trajectory._motor_work, wheels, "J", done)
     put("error", trajectory._error, batch, "rad", "estimated error at the last time")
     put("event_time", trajectory._event_time, batch, "s", "time of the event that ended the motion")
     data["status"] = (
@@ -105,9 +119,9 @@ def write_aem(
     """See ``Trajectory.to_aem``. Sections 4.2 to 4.4 and annex B of the standard."""
     start = _instant("epoch", epoch)
     current_time = datetime.now(UTC).strftime("%Y-%m-%dT%H:%M:%S")
-    created = str(
-        _instant("creation_date", current_time if creation_date is None else creation_date)
-    )
+    created = current_time if creation_date is None else creation_date
+    _instant("creation_date", created)
+    created = created.removesuffix("Z")
     if time_system not in _TIME_SYSTEMS:
         raise ValueError(f"time_system must be one of {', '.join(_TIME_SYSTEMS)}: {time_system!r}.")
     wxyz = np.asarray(trajectory.wxyz, np.float64)
@@ -125,7 +139,7 @@ def write_aem(
     for k in range(count):
         t = ts.reshape(count, samples)[k]
         places = np.unique(t, return_index=True)[1]  # in the order of time, each time once
-        moments = [str(start + np.timedelta64(round(x * 1e9), "ns")) for x in t[places]]
+        moments = [_later(start, x) for x in t[places]]
         if len(set(moments)) < len(moments):
             raise ValueError(
                 "times closer than a nanosecond cannot be written: keep fewer samples."
@@ -164,21 +178,36 @@ def _rows(wxyz: np.ndarray, omega: np.ndarray) -> Iterator[str]:
         yield " ".join(f"{x:.16e}" for x in row)
 
 
-def _instant(name: str, value: Any) -> np.datetime64:
-    pattern = r"\d{4}-\d{2}-\d{2}T\d{2}:\d{2}:\d{2}(\.\d{1,9})?Z?"
-    if not isinstance(value, str) or not re.fullmatch(pattern, value):
+def _instant(name: str, value: Any) -> tuple[np.datetime64, int]:
+    """A calendar time as whole seconds and nanoseconds: ``datetime64`` in nanoseconds holds the
+    years 1678 to 2262 only, and wraps."""
+    pattern = r"(\d{4}-\d{2}-\d{2}T\d{2}:\d{2}:\d{2})(?:\.(\d{1,9}))?Z?"
+    parts = re.fullmatch(pattern, value) if isinstance(value, str) else None
+    if parts is None:
         raise ValueError(
             f'{name} must be a calendar time such as "2029-04-13T21:46:00", got {value!r:.60}.'
         )
-    fine = "." in value or name == "epoch"
     try:
-        return np.datetime64(value.removesuffix("Z"), "ns" if fine else "s")
+        return np.datetime64(parts[1], "s"), int((parts[2] or "0").ljust(9, "0"))
     except ValueError as error:
         raise ValueError(f"{name}: there is no time {value}: {error}.") from None
 
 
+def _later(start: tuple[np.datetime64, int], seconds: float) -> str:
+    """The calendar time so many seconds after another."""
+    whole, rest = divmod(start[1] + round(float(seconds) * 1e9), 10**9)
+    years = abs(whole) / 31_556_952
+    text = "" if years > 10_000 else str(start[0] + np.timedelta64(whole, "s"))
+    if not re.match(r"\d{4}-", text):
+        raise ValueError(
+            f"{seconds:.6g} s after {start[0]} is outside of the years 0 to 9999, which an attitude"
+            " ephemeris message can hold."
+        )
+    return f"{text}.{rest:09d}"
+
+
 def _one_per_body(name: str, value: Any, count: int) -> list[str]:
-    values = [value] if isinstance(value, str) else list(value)
+    values = [value] if isinstance(value, str) or not isinstance(value, Iterable) else list(value)
     if len(values) != count:
         raise ValueError(f"{name} must name each of {count} bodies, got {len(values)}.")
     return [_text(name, x) for x in values]

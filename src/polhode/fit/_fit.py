@@ -239,8 +239,10 @@ def fit_scene(
     - ``attitude`` (4,): initial attitude ``wxyz``, for recordings without attitudes; None: the
       body axes are those of space at the first time.
     - ``method``, ``rtol``: as in ``ph.simulate``.
-    - ``options``: ``FitOptions`` of which ``robust``, ``bias``, ``trust_noise``, ``max_starts``
-      (2 at most: all data, then growing parts of them), ``solver`` and ``max_steps`` apply.
+    - ``options``: ``FitOptions`` of which ``robust``, ``bias``, ``trust_noise``, ``gyroscope``
+      (the default is one of 1 % uncertain scale, which widens ``std``; without such errors give
+      ``Gyroscope.ideal()``), ``max_starts`` (2 at most: all data, then growing parts of them),
+      ``solver`` and ``max_steps`` apply.
     - ``throw``: whether a fit that is not finite or stopped early raises FitError.
 
     Returns a ``Fit``: ``values`` and ``std`` in the order of ``free``, ``scene`` with the values.

@@ -16,17 +16,19 @@ def read_urdf(path: str | PathLike[str], link: str) -> tuple[float, np.ndarray, 
     name = Path(path).name
     try:
         root = ElementTree.parse(path).getroot()
-    except ElementTree.ParseError as error:
+    except (ElementTree.ParseError, LookupError) as error:  # the second: an unknown encoding
         raise ValueError(f"{name} is not XML ({error}): expected a URDF file.") from error
     if root.tag != "robot":
         hint = "; MJCF files are read by from_mjcf" if root.tag == "mujoco" else ""
         raise ValueError(
             f"the root element of {name} is <{root.tag}>, a URDF file has <robot>{hint}."
         )
-    links = {element.get("name"): element for element in root.iter("link")}
-    if link not in links:
-        raise ValueError(f"{name} has no link {link!r}, it has: {_listed(links)}.")
-    inertial = links[link].find("inertial")
+    # links of the robot itself: extensions, such as <gazebo>, hold others
+    names = [element.get("name") for element in root.findall("link")]
+    if names.count(link) != 1:
+        how_many = "no link" if link not in names else f"{names.count(link)} links"
+        raise ValueError(f"{name} has {how_many} {link!r}, it has: {_listed(names)}.")
+    inertial = root.findall("link")[names.index(link)].find("inertial")
     if inertial is None:
         raise ValueError(f"the link {link!r} of {name} has no <inertial> element.")
     where = f"the <inertial> of {link!r} in {name}"

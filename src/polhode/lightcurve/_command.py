@@ -276,7 +276,10 @@ def read_solutions(path: str | PathLike[str]) -> tuple[Solution, ...]:
             fields |= {"mode": Mode[row["mode"]], "epoch": float(row["epoch"])}
             out.append(Solution(**fields))
     except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path} is not a result of polhode lightcurve: {error!r}.") from None
+        what = "it is not JSON in UTF-8"
+        if not isinstance(error, UnicodeDecodeError | json.JSONDecodeError):
+            what = "it lacks the solutions of one, or parts of them"
+        raise ValueError(f"{path} is not a result of polhode lightcurve: {what}.") from error
     if not out:
         raise ValueError(f"{path} holds no solutions.")
     return tuple(out)

@@ -24,6 +24,8 @@ _FAINTEST = 45.0
 _ORBIT = 0.03
 # Points of one night at its brightest magnitude that count as saturated, at least.
 _REPEATED = 4
+# Points of a light curve.
+_FEWEST = 8
 # Points of one program: light curves are padded to multiples, and a search looks at so many.
 BLOCK = 160
 
@@ -65,15 +67,15 @@ class LightCurve(NamedTuple):
 
         ``t`` (n,) [day]; ``magnitude`` (n,); ``sun``, ``observer`` (n, 3): vectors from the body
         [au], or unit vectors where distances are unknown or already taken off (``at_body``: light
-        time, ``reduced``: 5 log10(r Delta)). ``sigma``: standard deviations, 0: unknown.
+        time, ``reduced``: 5 log10(r Delta)). ``sigma``: standard deviations, 0 or NaN: unknown.
         ``group`` (n,): names of nights or observers. ``calibrated``: groups share a zero point
         but for small errors. Raises ValueError for shapes that differ, values not finite, and times
         that are all the same.
         """
         t, magnitude = np.asarray(t, float), np.asarray(magnitude, float)
-        if t.ndim != 1 or t.shape != magnitude.shape or t.size < 8:
+        if t.ndim != 1 or t.shape != magnitude.shape or t.size < _FEWEST:
             raise ValueError(
-                "a light curve needs at least 8 times and as many magnitudes, got shapes"
+                f"a light curve needs at least {_FEWEST} times and as many magnitudes, got shapes"
                 f" {t.shape} and {magnitude.shape}."
             )
         bad = np.flatnonzero(~(np.isfinite(t) & np.isfinite(magnitude)))
@@ -102,7 +104,18 @@ class LightCurve(NamedTuple):
         if group.shape != t.shape:
             raise ValueError(f"group must name each of {t.size} points, got {group.shape}.")
         names, number = np.unique(group, return_inverse=True)
-        sigma = np.broadcast_to(np.asarray(sigma, float), t.shape)
+        sigma = np.asarray(sigma, float)
+        if sigma.shape not in ((), t.shape):
+            raise ValueError(
+                f"sigma must be one number or one of each of {t.size} points, got shape"
+                f" {sigma.shape}."
+            )
+        sigma = np.broadcast_to(sigma, t.shape)
+        if np.any(sigma < 0):
+            raise ValueError(
+                f"sigma must not be negative; that of point {np.argmax(sigma < 0)} is"
+                f" {sigma[np.argmax(sigma < 0)]:.6g}. Give 0 where the error is unknown."
+            )
         order = np.argsort(t, kind="stable")
         notes = (*notes, *_photometry_notes(magnitude, number, names))
         copies = t.size - len(np.unique(np.stack([t, magnitude, number]), axis=1).T)
@@ -116,7 +129,7 @@ class LightCurve(NamedTuple):
         return cls(
             sort(t),
             sort(magnitude),
-            sort(np.nan_to_num(np.maximum(sigma, 0))),
+            sort(np.nan_to_num(sigma)),
             sort(number),
             tuple(str(x) for x in names),
             sort(sun),
@@ -156,6 +169,11 @@ class LightCurve(NamedTuple):
             None if v is None else v[order] for v in map(means, (self.sun, self.observer))
         )
         t, magnitude, sigma, group = (x[order] for x in rows)
+        if t.size < _FEWEST:
+            raise ValueError(
+                f"means of {width:g} days leave {t.size} of {self.t.size} points, a light curve"
+                f" needs at least {_FEWEST}: make width smaller."
+            )
         return self._replace(
             t=t, magnitude=magnitude, sigma=sigma, group=group, sun=sun, observer=observer
         )
@@ -369,6 +387,9 @@ def _rows(path, lines) -> tuple[dict[str, list[str]], list[int]]:
         return [c.strip() for c in row_cells]
 
     names = [name.lower() for name in cells(content[0][1])]
+    twice = sorted({name for name in names if name and names.count(name) > 1})
+    if twice:
+        raise ValueError(f"{path} has more than one column {', '.join(twice)}: rename the others.")
     table, numbers = [], []
     for number, text in content[1:]:
         row = cells(text)
@@ -398,10 +419,12 @@ def _table(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve:
             )
         return None
 
-    t = values(_TIME)
+    t, notes = values(_TIME), []
+    several = [name for name in _TIME if name in columns]
+    if len(several) > 1:
+        notes.append(f"Of the columns {', '.join(several)} the first is taken for the time.")
     sigma = values(("sigma", "mag_err", "magerr", "error"), required=False)
     magnitude = values(("magnitude", "mag"), required=False)
-    notes = []
     if magnitude is None:
         flux = values(("magnitude", "mag", "flux", "brightness", "intensity"))
         assert flux is not None  # it is needed
@@ -495,6 +518,11 @@ def _damit(path, lines) -> LightCurve:
                 raise ValueError(f"{path}: line {number}: an intensity must be positive.")
             group.append(f"{block + 1:04d}")
         place += 1 + points
+    if place < len(rows):
+        raise ValueError(
+            f"{path}: {len(rows) - place} line(s) from line {rows[place][0]} on belong to none of"
+            f" the {count} light curves and their numbers of points."
+        )
     data = np.array(table)
     # by its documentation: JD corrected for light time, intensity reduced to 1 au
     return LightCurve.of(
@@ -523,7 +551,8 @@ def _alcdef(path, lines, calibrated: bool) -> LightCurve:
             if len(cells) < 2:
                 raise ValueError(f"{path}: line {number} must be DATA=JD|magnitude, got {line!r}.")
             numbers = [_number(path, number, "DATA", c) for c in cells[:3] if c.strip()]
-            table.append((*numbers, 0.0)[:3])
+            # public files write -9.99 or the like for an unknown error
+            table.append((*numbers[:2], max((*numbers, 0.0)[2], 0.0)))
             group.append(f"{session:04d}")
             rays.append(tuple(keys.get(k) for k in ("PHASE", "PABL", "PABB")))
         elif name:
