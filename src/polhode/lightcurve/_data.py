@@ -24,8 +24,8 @@ _FAINTEST = 45.0
 _ORBIT = 0.03
 # Points of one night at its brightest magnitude that count as saturated, at least.
 _REPEATED = 4
-# Points of a light curve.
-_FEWEST = 8
+# Points that a light curve has at least.
+FEWEST_POINTS = 8
 # Points of one program: light curves are padded to multiples, and a search looks at so many.
 BLOCK = 160
 
@@ -73,10 +73,10 @@ class LightCurve(NamedTuple):
         that are all the same.
         """
         t, magnitude = np.asarray(t, float), np.asarray(magnitude, float)
-        if t.ndim != 1 or t.shape != magnitude.shape or t.size < _FEWEST:
+        if t.ndim != 1 or t.shape != magnitude.shape or t.size < FEWEST_POINTS:
             raise ValueError(
-                f"a light curve needs at least {_FEWEST} times and as many magnitudes, got shapes"
-                f" {t.shape} and {magnitude.shape}."
+                f"a light curve needs at least {FEWEST_POINTS} times and as many magnitudes, got"
+                f" shapes {t.shape} and {magnitude.shape}."
             )
         bad = np.flatnonzero(~(np.isfinite(t) & np.isfinite(magnitude)))
         if bad.size:
@@ -169,11 +169,6 @@ class LightCurve(NamedTuple):
             None if v is None else v[order] for v in map(means, (self.sun, self.observer))
         )
         t, magnitude, sigma, group = (x[order] for x in rows)
-        if t.size < _FEWEST:
-            raise ValueError(
-                f"means of {width:g} days leave {t.size} of {self.t.size} points, a light curve"
-                f" needs at least {_FEWEST}: make width smaller."
-            )
         return self._replace(
             t=t, magnitude=magnitude, sigma=sigma, group=group, sun=sun, observer=observer
         )
