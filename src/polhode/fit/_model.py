@@ -192,6 +192,11 @@ class AbstractMotion(eqx.Module):
     def fixes_scale(self) -> bool:
         """Whether rates alone depend on the absolute size of the inertia (static)."""
 
+    @property
+    def has_bounds(self) -> bool:
+        """Whether ``bounded`` is more than the identity."""
+        return False
+
     def bounded(self, unknown: Any) -> Any:
         """Values of the motion's unknowns from numbers that may be anything."""
         return unknown
@@ -481,42 +486,52 @@ class SceneMotion(AbstractMotion):
         return simulated(scene, omega, wxyz, times, self.method, self.rtol)
 
 
-def _to_bounded(number: Array, start: Array, low: Array, high: Array) -> Array:
-    """A value between its bounds; any number may be given, and an inner one hardly changes.
+_BENT = 0.02
+"""Distance from a bound within which values are bent, over that of the start."""
 
-    At one bound the smooth maximum ``low + (d + sqrt(d^2 + s^2)) / 2``, at two a sigmoid.
+
+def _to_bounded(number: Array, start: Array, low: Array, high: Array) -> Array:
+    """A value between its bounds; any number may be given.
+
+    At one bound a hyperbola, ``low + sqrt(s^2 + number^2) - s``: a straight line but for a parabola
+    near the bound, where steps may arrive from either side. A smooth maximum, flat beyond the bound
+    and bent as far from it as the start, took hundreds of steps: of 24 recordings of a body without
+    one of two kinds of drag it found 3 in time, this finds all. At two bounds a sigmoid.
     """
-    half, middle = (high - low) / 2, (high + low) / 2
-    has_both = jnp.isfinite(half)
-    half, middle = jnp.where(has_both, half, 1), jnp.where(has_both, middle, 0)
+    side, end, soft, has_bound = _one_sided(start, low, high)
+    half, middle, has_both = _two_sided(low, high)
     y = (number - middle) / half
     between = middle + half * y / jnp.sqrt(1 + y**2)
-    # one bound: the distance from it, mirrored for an upper one
-    has_bound = jnp.isfinite(low) | jnp.isfinite(high)
-    side = jnp.where(jnp.isfinite(low), 1, -1)
-    end = jnp.where(jnp.isfinite(low), low, jnp.where(jnp.isfinite(high), high, 0))
-    # any positive number where there is no bound, for finite derivatives of what is not chosen
-    soft = jnp.where(has_bound, jnp.abs(start - end), 1)
-    d = side * (number - end)
-    root = jnp.sqrt(d**2 + soft**2)
-    # without cancellation far beyond the bound
-    beyond = jnp.where(d > 0, (d + root) / 2, soft**2 / (2 * (root - jnp.where(d > 0, 0, d))))
-    return jnp.where(has_both, between, jnp.where(has_bound, end + side * beyond, number))
+    distance = number**2 / (soft + jnp.sqrt(soft**2 + number**2))
+    return jnp.where(has_both, between, jnp.where(has_bound, end + side * distance, number))
 
 
 def _to_unbounded(value: Array, start: Array, low: Array, high: Array) -> Array:
     """The inverse of ``_to_bounded``."""
-    half, middle = (high - low) / 2, (high + low) / 2
-    has_both = jnp.isfinite(half)
-    half, middle = jnp.where(has_both, half, 1), jnp.where(has_both, middle, 0)
+    side, end, soft, has_bound = _one_sided(start, low, high)
+    half, middle, has_both = _two_sided(low, high)
     y = jnp.where(has_both, (value - middle) / half, 0)
     between = middle + half * y / jnp.sqrt(1 - y**2)
+    distance = jnp.where(has_bound, side * (value - end), 1)
+    inside = jnp.sqrt(distance * (distance + 2 * soft))
+    return jnp.where(has_both, between, jnp.where(has_bound, inside, value))
+
+
+def _two_sided(low: Array, high: Array) -> tuple[Array, Array, Array]:
+    """Half the width between two bounds, their middle, and whether there are two."""
+    half, middle = (high - low) / 2, (high + low) / 2
+    has_both = jnp.isfinite(half)
+    return jnp.where(has_both, half, 1), jnp.where(has_both, middle, 0), has_both
+
+
+def _one_sided(start: Array, low: Array, high: Array) -> tuple[Array, Array, Array, Array]:
+    """Of one bound the sign of values inside, the bound, the distance within which values are bent,
+    and whether there is one."""
     side = jnp.where(jnp.isfinite(low), 1, -1)
     has_bound = jnp.isfinite(low) | jnp.isfinite(high)
     end = jnp.where(jnp.isfinite(low), low, jnp.where(jnp.isfinite(high), high, 0))
-    d = jnp.where(has_bound, side * (value - end), 1)
-    beyond = end + side * (d - (start - end) ** 2 / (4 * d))
-    return jnp.where(has_both, between, jnp.where(has_bound, beyond, value))
+    # any positive number where there is no bound, for finite derivatives of what is not chosen
+    return side, end, jnp.where(has_bound, _BENT * jnp.abs(start - end), 1), has_bound
 
 
 class LeafMotion(AbstractMotion):
@@ -536,6 +551,10 @@ class LeafMotion(AbstractMotion):
     rtol: float | None = eqx.field(static=True, default=None)
     bounds: tuple[tuple[Array, Array] | None, ...] | None = None
     widths: tuple[Array | None, ...] | None = None
+
+    @property
+    def has_bounds(self) -> bool:
+        return self.bounds is not None
 
     def bounded(self, unknown: list[Array]) -> list[Array]:
         if self.bounds is None:
