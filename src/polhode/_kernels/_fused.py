@@ -43,6 +43,10 @@ _ANALYSING: ContextVar[list[Callable] | None] = ContextVar("analysing", default=
 """Units met so far in a function that is traced for analysis, as plain code; else None."""
 
 
+# In jax 0.10.0 what ``jax.linearize`` returns for a program of units may hold tracers as constants.
+_LINEARISES_UNITS = jax.__version_info__ >= (0, 10, 2)
+
+
 def kernel(
     fn: Callable, *, linearised: bool = False, repeated: bool = False, of_units: bool = False
 ) -> Callable:
@@ -61,6 +65,8 @@ def kernel(
     Sums over many bodies or times are then written as ``spread``. With ``of_units`` the units
     inside ``fn`` stay units, within the whole, in its derivatives and under ``vmap``.
     """
+
+    linearised = linearised and (_LINEARISES_UNITS or not of_units)
 
     def call(*operands):
         outer = _ANALYSING.get()
