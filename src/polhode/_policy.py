@@ -245,6 +245,14 @@ def is_refilled(bodies: int) -> bool:
     return REFILLING and is_cpu() and not is_plain() and bodies > LANES
 
 
+def linearises_units() -> bool:
+    """Whether the values of a derivative may be one unit that holds others.
+
+    In jax 0.10.0 what ``jax.linearize`` returns for such a program may hold tracers as constants:
+    fits of scenes did not compile."""
+    return jax.__version_info__ >= (0, 10, 2)
+
+
 def is_time_loop(bodies: int, samples: int) -> bool:
     """Whether free bodies are moved to one time after the other."""
     usable = TIME_LOOP and is_cpu() and not is_plain()

@@ -270,10 +270,9 @@ class Equations:
             dy = [a - dt0 * f for a, f in zip(dy, self.field(c, t0, y))]
         maps = (partial(self._tangent, at), partial(self._cotangent, at))
         primals = [*operands[:3], *y, *end, *c]
+        # one unit of the steps and of what comes before and after them
         few = end[0].size <= _policy.KERNEL_BODIES
-        compiled = (
-            partial(kernel, of_units=True) if few else None
-        )  # what comes before and after the steps, too
+        compiled = partial(kernel, of_units=True) if few else None
         end_tangents = linear(*maps, primals, [*dy, *(dc[i] for i in at)], end, compiled)
         if is_slope(dt1):
             end_tangents = [a + dt1 * f for a, f in zip(end_tangents, self.field(c, t1, end))]

@@ -170,7 +170,7 @@ class AbstractIntegration(AbstractMethod):
 
         n, times = state.wxyz.shape[0], ts if ts.ndim == 2 else None
         if n <= min(size, _policy.SORTED_BODIES):
-            # A loop in a derivative that JAX traces would be run for the values and again for it.
+            # Of other adjoints JAX differentiates the loop itself, and would run it twice.
             linearised = isinstance(self.adjoint, FlowAdjoint)
             unit = kernel(solve_chunk, linearised=linearised, of_units=True)
             solve_all = unit if n <= _policy.KERNEL_BODIES else solve_chunk

@@ -4,6 +4,7 @@ Nothing here changes a result by more than rounding. `README.md` beside this fil
 part buys, ``polhode._policy`` where it is used and how all of it is switched off.
 """
 
+from polhode._kernels._calls import Distinct as Distinct, jit_distinct as jit_distinct
 from polhode._kernels._derivatives import (
     SMOOTH as SMOOTH,
     along_slopes as along_slopes,
@@ -29,11 +30,9 @@ from polhode._kernels._fold import (
     staged as staged,
 )
 from polhode._kernels._fused import (
-    Distinct as Distinct,
     any_of as any_of,
     formula as formula,
     is_holdable as is_holdable,
-    jit_distinct as jit_distinct,
     kernel as kernel,
     map_chunks as map_chunks,
     most_of as most_of,

@@ -27,6 +27,7 @@ from polhode._integrate import LiePoisson
 from polhode._method import AbstractMethod
 from polhode._scene import AbstractTorque, LinearDamping, QuadraticDamping, Scene, State
 from polhode._simulate import simulate
+from polhode.fit._bounds import to_bounded, to_unbounded
 from polhode.fit._numerics import ClassicalRungeKutta, inverse
 from polhode.inertia import Inertia, inertia_of_second_moments, principal
 from polhode.inertia._physical import symmetric
@@ -486,54 +487,6 @@ class SceneMotion(AbstractMotion):
         return simulated(scene, omega, wxyz, times, self.method, self.rtol)
 
 
-_BENT = 0.02
-"""Distance from a bound within which values are bent, over that of the start."""
-
-
-def _to_bounded(number: Array, start: Array, low: Array, high: Array) -> Array:
-    """A value between its bounds; any number may be given.
-
-    At one bound a hyperbola, ``low + sqrt(s^2 + number^2) - s``: a straight line but for a parabola
-    near the bound, where steps may arrive from either side. A smooth maximum, flat beyond the bound
-    and bent as far from it as the start, took hundreds of steps: of 24 recordings of a body without
-    one of two kinds of drag it found 3 in time, this finds all. At two bounds a sigmoid.
-    """
-    side, end, soft, has_bound = _one_sided(start, low, high)
-    half, middle, has_both = _two_sided(low, high)
-    y = (number - middle) / half
-    between = middle + half * y / jnp.sqrt(1 + y**2)
-    distance = number**2 / (soft + jnp.sqrt(soft**2 + number**2))
-    return jnp.where(has_both, between, jnp.where(has_bound, end + side * distance, number))
-
-
-def _to_unbounded(value: Array, start: Array, low: Array, high: Array) -> Array:
-    """The inverse of ``_to_bounded``."""
-    side, end, soft, has_bound = _one_sided(start, low, high)
-    half, middle, has_both = _two_sided(low, high)
-    y = jnp.where(has_both, (value - middle) / half, 0)
-    between = middle + half * y / jnp.sqrt(1 - y**2)
-    distance = jnp.where(has_bound, side * (value - end), 1)
-    inside = jnp.sqrt(distance * (distance + 2 * soft))
-    return jnp.where(has_both, between, jnp.where(has_bound, inside, value))
-
-
-def _two_sided(low: Array, high: Array) -> tuple[Array, Array, Array]:
-    """Half the width between two bounds, their middle, and whether there are two."""
-    half, middle = (high - low) / 2, (high + low) / 2
-    has_both = jnp.isfinite(half)
-    return jnp.where(has_both, half, 1), jnp.where(has_both, middle, 0), has_both
-
-
-def _one_sided(start: Array, low: Array, high: Array) -> tuple[Array, Array, Array, Array]:
-    """Of one bound the sign of values inside, the bound, the distance within which values are bent,
-    and whether there is one."""
-    side = jnp.where(jnp.isfinite(low), 1, -1)
-    has_bound = jnp.isfinite(low) | jnp.isfinite(high)
-    end = jnp.where(jnp.isfinite(low), low, jnp.where(jnp.isfinite(high), high, 0))
-    # any positive number where there is no bound, for finite derivatives of what is not chosen
-    return side, end, jnp.where(has_bound, _BENT * jnp.abs(start - end), 1), has_bound
-
-
 class LeafMotion(AbstractMotion):
     """Motion of a scene some of whose arrays are unknown, by ``ph.simulate``.
 
@@ -560,13 +513,13 @@ class LeafMotion(AbstractMotion):
         if self.bounds is None:
             return unknown
         pairs = zip(unknown, self.start(), self.bounds, strict=True)
-        return [x if ends is None else _to_bounded(x, at, *ends) for x, at, ends in pairs]
+        return [x if ends is None else to_bounded(x, at, *ends) for x, at, ends in pairs]
 
     def unbounded(self, values: list[Array]) -> list[Array]:
         if self.bounds is None:
             return values
         pairs = zip(values, self.start(), self.bounds, strict=True)
-        return [x if ends is None else _to_unbounded(x, at, *ends) for x, at, ends in pairs]
+        return [x if ends is None else to_unbounded(x, at, *ends) for x, at, ends in pairs]
 
     def prior_std(self) -> list[Array | None]:
         return super().prior_std() if self.widths is None else list(self.widths)

@@ -1,8 +1,6 @@
 """From recordings of one body to its best parameters: start, optimisation, information."""
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -11,6 +9,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
+from polhode.fit._bounds import curvature_rows
 from polhode.fit._model import (
     AbstractInertiaUnknown,
     AbstractMotion,
@@ -176,7 +175,8 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
             return sum(jnp.sum(x**2) for x in (misfit, *(unit * part for part in prior))) / 2
 
         if motion.has_bounds:
-            rows += _bends(motion, scaled_parameters.motion, scale.motion, cost_at)
+            numbers = scaled_parameters.motion
+            rows += curvature_rows(motion.bounded, numbers, scale.motion, cost_at)
         return (weight * jnp.concatenate(rows)).astype(optimiser_dtype), linear
 
     jobs = _sequence_of_fits(bases.soft.shape[0], options.max_starts)
@@ -268,31 +268,6 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
         last_search.stopped,
         expected,
     )
-
-
-def _bends(motion, scaled: Any, scale: Any, cost_at: Callable) -> list[Array]:
-    """Residuals of value zero that give steps of Gauss and Newton the curvature of bounds.
-
-    Of a cost C(x(n)), x the bounded value of a number n, the second derivative is x'^2 C'' + x''
-    C'. Steps know the first term only, and where C' presses x against its bound, as a parabola in
-    n, that vanishes with n: they would go to and fro across it. ``cost_at``: C, near the present
-    ``scaled`` numbers.
-    """
-    numbers = jax.tree.map(lambda a, b: a.astype(b.dtype) * b, scaled, scale)
-    numbers = jax.lax.stop_gradient(numbers)
-
-    def slope(step):
-        moved = jax.tree.map(lambda n, b: n + step * b, numbers, scale)
-        return jax.jvp(motion.bounded, (moved,), (scale,))[1]
-
-    zero = jnp.zeros((), jax.tree.leaves(numbers)[0].dtype)
-    bends = jax.jvp(slope, (zero,), (jnp.ones_like(zero),))[1]
-    slopes = jax.grad(cost_at)(jax.lax.stop_gradient(motion.bounded(numbers)))
-    rows = []
-    for x, bend, by_value in zip(*map(jax.tree.leaves, (scaled, bends, slopes))):
-        size = jax.lax.stop_gradient(jnp.sqrt(jnp.maximum(bend * by_value, 0)))
-        rows.append(jnp.ravel(size * (x - jax.lax.stop_gradient(x)).astype(size.dtype)))
-    return rows
 
 
 def _sensor_start(

@@ -69,8 +69,8 @@ class LightCurve(NamedTuple):
         [au], or unit vectors where distances are unknown or already taken off (``at_body``: light
         time, ``reduced``: 5 log10(r Delta)). ``sigma``: standard deviations, 0 or NaN: unknown.
         ``group`` (n,): names of nights or observers. ``calibrated``: groups share a zero point
-        but for small errors. Raises ValueError for shapes that differ, values not finite, and times
-        that are all the same.
+        but for small errors. Raises ValueError for shapes that differ, values not finite, negative
+        ``sigma``, and times that are all the same.
         """
         t, magnitude = np.asarray(t, float), np.asarray(magnitude, float)
         if t.ndim != 1 or t.shape != magnitude.shape or t.size < FEWEST_POINTS:
