@@ -10,6 +10,7 @@ from polhode.cli import main
 from polhode.ensemble import build_ensemble, open_store
 from polhode.files import SceneFileError, build_scene, build_state, parse_scene, read_scene
 
+pytest.importorskip("zarr")
 xarray = pytest.importorskip("xarray")
 
 SCENE = """

@@ -557,7 +557,8 @@ def _rounded_constants(moments, omega, wxyz) -> tuple[Polhode, Precession | None
 
     def rounded(motion):
         rate = motion.half_turn_rate
-        low = rate - _cast(_cast(rate, jnp.float32), jnp.float64)
+        # Not by a conversion there and back: XLA removes the pair on a GPU, and low becomes zero.
+        low = rate - jax.lax.reduce_precision(rate, exponent_bits=8, mantissa_bits=23)
         return _cast(motion._replace(half_turn_rate_low=low), jnp.float32)
 
     return rounded(polhode), None if precession is None else rounded(precession)
