@@ -159,9 +159,7 @@ def _spherical(moments, products, wxyz, omega, t, requested):
 
 def _components(motion):
     wxyz, omega = motion
-    return tuple(
-        None if x is None else tuple(x[..., k] for k in range(x.shape[-1])) for x in (omega, wxyz)
-    )
+    return tuple(None if x is None else jnp.unstack(x, axis=-1) for x in (omega, wxyz))
 
 
 _MOTION = {

@@ -46,7 +46,7 @@ def as_components(values, count: int) -> tuple[Scalars, ...]:
     """A tuple of component arrays, from one or from an array with the components last."""
     if isinstance(values, tuple | list):
         return tuple(values)
-    return tuple(values[..., k] for k in range(count))
+    return jnp.unstack(values, axis=-1)
 
 
 class Roles(NamedTuple):

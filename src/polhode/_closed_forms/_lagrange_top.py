@@ -223,7 +223,7 @@ def _long_motion(transverse, force_space, distance, wxyz, omega, axial_momentum,
         times = jnp.squeeze(times, axis)
     transverse, force_space, distance, wxyz, omega, axial_momentum = arguments
     one = opaque_ones(transverse)
-    wxyz, omega = staged((tuple(wxyz[..., i] for i in range(4)), components(omega)), one)
+    wxyz, omega = staged((jnp.unstack(wxyz, axis=-1), components(omega)), one)
     tilt, force_component = staged(upward(components(force_space)), one)
     inverse_tilt = (tilt[0], -tilt[1], -tilt[2])
     # In axes along the force the motion is that of the textbook. As spinors (Cayley-Klein) instead
@@ -295,8 +295,8 @@ def short_motion(
     # symmetry, which is exact and added at the end: the fast spin of a top would shorten the time
     # for which the step is exact to rounding.
     def field(q, rate):
-        w, x, y, z = (q[..., i] for i in range(4))
-        a, b, c = (rate[..., i] for i in range(3))
+        w, x, y, z = jnp.unstack(q, axis=-1)
+        a, b, c = jnp.unstack(rate, axis=-1)
         q_rate = [-a * x - b * y - c * z, a * w + b * z - c * y, b * w + c * x - a * z]
         axis = [2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z]
         q_rate = jnp.stack([*q_rate, c * w + a * y - b * x], axis=-1) / 2

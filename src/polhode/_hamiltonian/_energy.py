@@ -39,7 +39,7 @@ def triple(values: Iterable[Array]) -> Vector:
 
 def components(array: Array) -> Vector:
     """The last axis of an array as a triple of component arrays."""
-    return array[..., 0], array[..., 1], array[..., 2]
+    return triple(jnp.unstack(array, axis=-1))
 
 
 class Attitude:

@@ -27,7 +27,7 @@ Matrix3 = Float[Array, "*b 3 3"]
 
 
 def _parts(moments, q):
-    ix, iy, iz = (moments[..., i] for i in range(3))
+    ix, iy, iz = jnp.unstack(moments, axis=-1)
     theta, psi = q[..., 1], q[..., 2]
     return ix, iy, iz, jnp.sin(theta), jnp.cos(theta), jnp.sin(psi), jnp.cos(psi)
 
@@ -167,7 +167,7 @@ def generalised_force(moments: Vector3, q: Vector3, qd: Vector3) -> Float[Array,
     """The unnumbered x after eq. 36: x = V^-1 d2q/dt2 [N m]."""
     ix, iy, iz, st, ct, s, c = _parts(moments, q)
     be, ga = beta(moments), gamma(moments, q)
-    f, h, g = (qd[..., i] for i in range(3))
+    f, h, g = jnp.unstack(qd, axis=-1)
     cos2, k = c**2 - s**2, ix * iy * be
     x1 = (
         (2 * iz - 2 * ix * iy * ga) * st * ct * f * h
@@ -184,7 +184,7 @@ def accelerations(moments: Vector3, q: Vector3, qd: Vector3) -> Float[Array, "*b
     """Eqs. 37-39 with eq. 39 corrected: d2(phi, theta, psi)/dt2 of the free body [rad/s^2]."""
     ix, iy, iz, st, ct, s, c = _parts(moments, q)
     al, be, ga = alpha(moments, q), beta(moments), gamma(moments, q)
-    f, h, g = (qd[..., i] for i in range(3))
+    f, h, g = jnp.unstack(qd, axis=-1)
     sin2, k = 2 * s * c, ix * iy
     e1, e2 = k * (c**2 / ix**2 + s**2 / iy**2), k * (s**2 / ix**2 + c**2 / iy**2)
     skew = k * be * (al + ga) - iz * be

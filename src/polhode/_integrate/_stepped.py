@@ -348,10 +348,10 @@ class AbstractIntegration(AbstractMethod):
             states, loop_result = samples(make, *operands, turns=turns, once=once)
         else:
             equations, c = equations_of(term, dynamics, y0, start, rtol, False)
-            path = [jnp.moveaxis(states[..., i], 0, 1) for i in range(len(leaves))]
+            path = list(jnp.unstack(jnp.swapaxes(states, 0, 1), axis=-1))
             path = path_of(equations, c, leaves, start, times, path)
-            states = jnp.stack([jnp.moveaxis(x, 0, 1) for x in path], axis=-1)
-        sample_states = jax.tree.unflatten(tree, [states[..., i].T for i in range(len(leaves))])
+            states = jnp.swapaxes(jnp.stack(path, axis=-1), 0, 1)
+        sample_states = jax.tree.unflatten(tree, jnp.unstack(jnp.swapaxes(states, 0, 1), axis=-1))
         end_state = jax.tree.map(lambda x: x[-1:], sample_states)
         status = jnp.array(_OF_LOOP)[loop_result.outcome]
         solution = Solution(sample_states, end_state, loop_result.steps, status, loop_result.error)

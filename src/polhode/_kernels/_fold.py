@@ -127,7 +127,8 @@ _BY_ENTRY = _ELEMENTWISE | frozenset(
 """Operations that treat the entries of arrays of one shape separately."""
 
 _TAKING_APART = frozenset(
-    "broadcast_in_dim convert_element_type copy gather reshape slice squeeze stop_gradient".split()  # noqa: SIM905
+    """broadcast_in_dim convert_element_type copy gather reshape slice split squeeze stop_gradient
+    unstack""".split()  # noqa: SIM905
 )
 _CALLS = frozenset(("jit", "pjit", "closed_call"))
 
@@ -284,7 +285,7 @@ def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
             dependent_results[i].add(k)
     for step in reversed(steps):
         for i in of(step.operands):
-            users[i] += 1
+            users[i] += len(step.outputs)
             dependent_results[i].update(*(dependent_results[made] for made in step.outputs))
     shared: set[int] = set()
     behind: dict[int, set[int]] = {}  # the operations that a fused loop repeats for it

@@ -66,7 +66,7 @@ class Pointing(AbstractTorque):
     def body_components(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
     ) -> tuple[Array, Array, Array]:
-        a, *b = (self.target[..., i] for i in range(4))
+        a, *b = jnp.unstack(self.target, axis=-1)
         w, *v = attitude.wxyz
         scalar = a * w + b[0] * v[0] + b[1] * v[1] + b[2] * v[2]
         b_cross_v = cross(b, v)

@@ -545,7 +545,7 @@ class RelativeTorque(AbstractTorque):
             body = stacked(attitude.wxyz)
             frame = jnp.broadcast_to(rotation.conjugate(frame), body.shape)
             relative = rotation.multiply(frame, body)
-            return tuple(relative[..., i] for i in range(4))
+            return jnp.unstack(relative, axis=-1)
 
         relative = Attitude(lambda i: attitude.to_body(components(axes[i])), quaternion)
         turning = relative.to_body(components(rates))

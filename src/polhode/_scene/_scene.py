@@ -315,7 +315,7 @@ class Scene(eqx.Module):
         if wxyz is None:
             wxyz = jnp.zeros((*omega.shape[:-1], 4), omega.dtype).at[..., 0].set(1)
         momentum = self.momentum(omega, t)
-        state = (tuple(momentum[..., i] for i in range(3)), tuple(wxyz[..., i] for i in range(4)))
+        state = jnp.unstack(momentum, axis=-1), jnp.unstack(wxyz, axis=-1)
         dynamics = self.dynamics
         spins = dynamics.wheels.spins if dynamics.coupled else ()
         push, _, *groups = lie_poisson_field(t, (*state, spins) if spins else state, dynamics)

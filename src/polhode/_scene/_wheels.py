@@ -223,7 +223,7 @@ def _speeds_of(wheel_speed: Array | None, count: int) -> Sequence[Array | None]:
             f"the state has the speeds of {wheel_speed.shape[-1]} wheels, the scene {count}: give"
             " wheel_speed one entry for each rotor, or leave it out."
         )
-    return [wheel_speed[..., i] for i in range(count)]
+    return list(jnp.unstack(wheel_speed, axis=-1))
 
 
 class Wheels(AbstractRotor):

@@ -529,7 +529,7 @@ def _momentum_body(trajectory: Trajectory) -> Array:
 def _energy(trajectory: Trajectory) -> Array:
     scene, attitude = trajectory._scene, None
     if scene.potential is not None:
-        attitude = from_quaternion(tuple(trajectory.wxyz[..., i] for i in range(4)))
+        attitude = from_quaternion(jnp.unstack(trajectory.wxyz, axis=-1))
     return scene.hamiltonian.total(components(_momentum_body(trajectory)), attitude, trajectory._t)
 
 

@@ -81,7 +81,7 @@ def _products(turns: Float[Array, "n 4"], unit: Float[Array, "1 4"]) -> Float[Ar
 
 def _design(omega: Float[Array, "t 3"]) -> Float[Array, "t 3 6"]:
     """``I omega`` as a matrix times (xx, yy, zz, yz, zx, xy)."""
-    x, y, z = (omega[..., i] for i in range(3))
+    x, y, z = jnp.unstack(omega, axis=-1)
     o = jnp.zeros_like(x)
     rows = [[x, o, o, o, z, y], [o, y, o, z, o, x], [o, o, z, y, x, o]]
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)

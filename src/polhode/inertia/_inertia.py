@@ -338,7 +338,7 @@ def _product(tensor, vector):
 def _solve(tensor, vector):
     """Solution of a symmetric positive definite 3x3 system by its L D L^T factors, elementwise."""
     a, p, q, r = (tensor[..., 0, 0], tensor[..., 1, 0], tensor[..., 2, 0], tensor[..., 2, 1])
-    x, y, z = (vector[..., i] for i in range(3))
+    x, y, z = jnp.unstack(vector, axis=-1)
     l10, l20 = p / a, q / a
     d1 = tensor[..., 1, 1] - l10 * p
     e21 = r - l20 * p

@@ -182,7 +182,7 @@ def _curved(moments: Array, products: Array) -> Array:
 def _curved_rule(primals, tangents):
     moments, products = primals
     change, product_tangents = tangents
-    a, b, c = (moments[..., i] for i in range(3))
+    a, b, c = jnp.unstack(moments, axis=-1)
     is_close = are_close(a, b) | are_close(b, c) | are_close(c, a)
     yz, zx, xy = (underivable(products[..., i], is_close) for i in range(3))
     by_yz, by_zx, by_xy = (
@@ -238,8 +238,8 @@ def inertia_from_log_cholesky(parameters: Float[Array, "*b 6"]) -> Float[Array, 
     ``Sigma = S S^T`` with ``S = N diag(exp d)`` and N unit upper triangular: adding a constant
     to the three d scales the body and changes nothing else. d in log of sqrt(kg) m, n without unit.
     """
-    d1, d2, d3 = (jnp.exp(parameters[..., i]) for i in range(3))
-    n12, n13, n23 = (parameters[..., i] for i in range(3, 6))
+    *logarithms, n12, n13, n23 = jnp.unstack(parameters, axis=-1)
+    d1, d2, d3 = map(jnp.exp, logarithms)
     sigma = _upper_product(d1, d2, d3, n12 * d2, n13 * d3, n23 * d3)
     return inertia_of_second_moments(sigma)
 
@@ -445,7 +445,7 @@ def of_points(
     masses: Float[Array, "*b n"], positions: Float[Array, "*b n 3"]
 ) -> Float[Array, "*b 3 3"]:
     """``sum m (x.x 1 - x x^T)`` about the origin (docs/equations.md, 003: 24)."""
-    x, y, z = (positions[..., i] for i in range(3))
+    x, y, z = jnp.unstack(positions, axis=-1)
 
     def second(u, v):
         return jnp.sum(masses * u * v, axis=-1)

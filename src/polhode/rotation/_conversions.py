@@ -35,7 +35,7 @@ def wxyz_to_matrix(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3 3"]:
 
 @jax.jit  # one program, not one for each operation
 def _matrix(wxyz: Array) -> Array:
-    q = tuple(wxyz[..., i] for i in range(4))
+    q = jnp.unstack(wxyz, axis=-1)
     return jnp.stack([jnp.stack(matrix_row(q, i), axis=-1) for i in range(3)], axis=-2)
 
 

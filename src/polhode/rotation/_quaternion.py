@@ -129,7 +129,7 @@ def wxyz_rate(
     wxyz: Float[Array, "*#b 4"], omega_body: Float[Array, "*#b 3"]
 ) -> Float[Array, "*b 4"]:
     """dq/dt [1/s] of an attitude (..., 4) with body rates (..., 3) [rad/s]."""
-    q, omega = (tuple(x[..., i] for i in range(x.shape[-1])) for x in (wxyz, omega_body))
+    q, omega = (jnp.unstack(x, axis=-1) for x in (wxyz, omega_body))
     return jnp.stack(quaternion_rate(q, omega), axis=-1)
 
 
@@ -147,8 +147,8 @@ def multiply(
 
 @jax.jit  # one program, not one for each operation; likewise below
 def _product(left: Array, right: Array) -> Array:
-    a, b, c, d = (left[..., i] for i in range(4))
-    w, x, y, z = (right[..., i] for i in range(4))
+    a, b, c, d = jnp.unstack(left, axis=-1)
+    w, x, y, z = jnp.unstack(right, axis=-1)
     return jnp.stack(
         [
             a * w - b * x - c * y - d * z,
@@ -206,7 +206,7 @@ def _largest_of(*parts: Array) -> Array:
 def _normalised(wxyz: Array) -> Array:
     # Written out: XLA's sums over a short axis take twice as long as all else here. The result
     # does not depend on the scale, so that its derivative may be left out.
-    parts = [wxyz[..., i] for i in range(4)]
+    parts = jnp.unstack(wxyz, axis=-1)
     scale = jax.lax.stop_gradient(_largest_of(*parts))
     size = jnp.sqrt(sum((x / scale) ** 2 for x in parts))
     return wxyz / scale[..., None] / size[..., None]
