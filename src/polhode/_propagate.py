@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from polhode import rotation
 from polhode._checks import ArrayLike
+from polhode._integrate._field import uses
 from polhode._method import (
     AbstractMethod,
     Status,
@@ -38,6 +39,10 @@ _MOST_PARTS = 1024
 _TURN = np.pi
 """Angle [rad] by the largest body rate that a part of a step may take. With twice that the effect
 is in error by up to 2e-7 of itself."""
+
+
+_ROUNDED = 1e-2
+"""Part of a step by which rounding of the time may change its length."""
 
 
 class Propagation(NamedTuple):
@@ -89,13 +94,15 @@ def propagate(
     elsewhere: propagate in shorter steps, or by ``method=ph.LiePoisson()``.
 
     **Arguments:** ``scene``, ``state``: of one body; for several ``jax.vmap``. ``dt``: not zero.
+    ``t``: matters only to a scene that depends on time; there ``t + dt`` must be within 1 % of
+    ``dt`` from ``t``, which in single precision ends at some 16,000 s for steps of 0.1 s.
     ``free``: None, or a function that picks leaves of the scene, ``lambda s: s.inertia.diagonal``:
     their entries are the parameters. ``method``, ``rtol``: as for ``ph.simulate``, which raises;
-    under ``jit`` all is NaN where the body did not finish.
+    under ``jit`` all is NaN where the body did not finish or ``t + dt`` is rounded too much.
 
-    Raises ValueError for a batch, or a ``free`` that picks the speed or momentum of a wheel that is
-    a coordinate already; TypeError for what is no scene or no state, or a ``free`` that picks what
-    is no array of the scene.
+    Raises ValueError for a batch, a ``dt`` that times near ``t`` do not resolve, or a ``free`` that
+    picks the speed or momentum of a wheel that is a coordinate already; TypeError for what is no
+    scene or no state, or a ``free`` that picks what is no array of the scene.
 
         state, jacobian, noise = ph.propagate(scene, state, 0.1)
         covariance = jacobian @ covariance @ jacobian.T + noise @ noise.T * density / 0.1
@@ -113,7 +120,12 @@ def propagate(
         )
     dtype = state.omega_body.dtype
     dt, t = jnp.asarray(dt, dtype), jnp.asarray(t, dtype)
-    scene, state, _, _ = check_inputs(scene, state, jnp.stack([t, t + dt]), None)
+    if dt.ndim or t.ndim:
+        raise ValueError(
+            f"dt and t are one number each, got shapes {dt.shape}, {t.shape}: for several steps"
+            " jax.vmap or jax.lax.scan."
+        )
+    scene, state, _, _ = check_inputs(scene, state, jnp.stack([jnp.zeros_like(dt), dt]), None)
     places = () if free is None else places_of(scene, free)
     if not set(places).isdisjoint(_starts_of_loose(scene)):
         raise ValueError(
@@ -121,10 +133,16 @@ def propagate(
             " of the state, and its error one of the tangent coordinates already. Leave it out."
         )
     arguments = scene, state, dt, t, places, method, check_rtol(rtol, dtype)
-    start, (state, jacobian, noise, status, turned) = state, _propagated(*arguments, 1)
+    start, (state, jacobian, noise, status, turned, is_resolved) = state, _propagated(*arguments, 1)
+    if not isinstance(is_resolved, Tracer) and not is_resolved:
+        raise ValueError(
+            f"dt = {dt:g} s at t = {t:g} s, where numbers of {dtype} are {np.spacing(abs(t)):.2g} s"
+            " apart, in a scene that depends on time: count t, and the times of the scene, from a"
+            " later epoch, or enable float64 (jax.config.update('jax_enable_x64', True))."
+        )
     if not isinstance(turned, Tracer) and _TURN < turned <= _MOST_PARTS * _TURN:
         parts = 2 ** math.ceil(math.log2(turned / _TURN))
-        state, jacobian, noise, status, _ = _propagated(scene, start, *arguments[2:], parts)
+        state, jacobian, noise, status, *_ = _propagated(scene, start, *arguments[2:], parts)
     if not isinstance(status, Tracer):
         raise_on_failure(status, "Under jax.jit nothing is raised, and the result is NaN.")
     return Propagation(state, jacobian, noise)
@@ -146,7 +164,8 @@ def _starts_of_loose(scene: Scene) -> tuple[int, ...]:
 
 @eqx.filter_jit
 def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
-    """Also the angle turned by the largest body rate; the effect of a disturbance in ``parts``."""
+    """Also the angle turned by the largest body rate, and whether times near ``t`` resolve ``dt``;
+    the effect of a disturbance in ``parts``."""
     dtype = dt.dtype
     leaves, tree = jax.tree.flatten(scene)
     sizes = [leaves[k].size for k in places]
@@ -157,6 +176,15 @@ def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
     begin = 6 + len(loose)
     n = begin + sum(sizes)
 
+    # Where time does not matter, the step starts at zero: in single precision t + dt is rounded, by
+    # a fifth of a step of 10 ms after a day.
+    dynamics, like = initial_scene.dynamics, state.omega_body[..., 0]
+    spins = dynamics.wheels.initial_spins(like) if dynamics.coupled else ()
+    changes = initial_scene.with_spins(spins).changes
+    program = jax.make_jaxpr(changes)(state.wxyz, state.omega_body, t)
+    if not uses(program.jaxpr, 2):
+        t = jnp.zeros_like(t)
+    is_resolved = jnp.abs((t + dt) - t - dt) <= _ROUNDED * jnp.abs(dt)
     time_range = jnp.stack([t, t + dt])
     if method is None:
         method, _ = choose(scene, rtol)
@@ -187,18 +215,18 @@ def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
             torque = push if body.torque is None else body.torque + push
             body = Scene(body.inertia, body.potential, torque, body.rotors)
         traj = simulate(body, start, ts, method, rtol=rtol, throw=False)
-        good = traj.status == Status.SUCCESSFUL
+        good = (traj.status == Status.SUCCESSFUL) & is_resolved
         speeds = traj.wheel_speed if loose else jnp.zeros((ts.size, 0), dtype)
         samples = traj.wxyz, traj.omega_body, speeds
         wxyz, omega, speeds = (jnp.where(good, x, jnp.nan) for x in samples)
         loose_speeds = speeds[:, np.array(loose, int)]
         fastest = jnp.sqrt(jnp.max(jnp.sum(jax.lax.stop_gradient(omega) ** 2, axis=-1)))
         turned = jnp.abs(dt) * fastest if method.exact else jnp.zeros((), dtype)
-        others = wxyz, traj.status, turned
+        others = wxyz, traj.status, good, turned
         return (wxyz, omega, loose_speeds), (wxyz[-1], omega[-1], speeds[-1], *others)
 
     zeros = jnp.zeros(n, dtype), jnp.zeros(3, dtype)
-    derivatives, (*end_samples, wxyz, status, turned) = jax.jacfwd(
+    derivatives, (*end_samples, wxyz, status, good, turned) = jax.jacfwd(
         lambda inputs: states_after(inputs[:n], inputs[n:]), has_aux=True
     )(jnp.concatenate(zeros))
     turns, *rates = derivatives  # (T, 4, n + 3), (T, 3, n + 3), (T, w, n + 3)
@@ -224,9 +252,10 @@ def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
 
         noise = dt * jnp.tensordot(weights, jax.vmap(carried)(flow[1:-1, :, :n]), 1)
         noise = jnp.where(turned <= parts * _TURN, noise, jnp.nan)
+    end, noise = (jnp.where(good, x, jnp.nan) for x in (end, noise))
     wxyz, omega, speeds = end_samples
     state = State.of_samples(wxyz, omega, speeds if loose else None)
-    return state, end, noise, status, turned
+    return state, end, noise, status, turned, is_resolved
 
 
 def _speeds(wheels: Wheels, t: Array, omega: Array) -> Array:

@@ -105,8 +105,8 @@ class HeldCommands(AbstractMethod):
         coupled = bool(scene.dynamics.coupled)
         spins = ()
         if coupled:
-            rates = tuple(jnp.moveaxis(state.omega_body, -1, 0))
-            spins = (jnp.stack(scene.dynamics.wheels.initial_spins(rates), axis=-1),)
+            like = state.omega_body[..., 0]
+            spins = (jnp.stack(scene.dynamics.wheels.initial_spins(like), axis=-1),)
         laws = [x for x in _terms(scene.torque) if isinstance(x, SampledTorque)]
         final = Record(final_only=True)
 

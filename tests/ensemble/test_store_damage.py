@@ -1,6 +1,7 @@
 """Stores that lost something or were altered: completed to the same bits, or refused."""
 
 import json
+import os
 import shutil
 
 import numpy as np
@@ -53,6 +54,12 @@ def _settings(path, change):
     group.attrs["polhode"] = change(group.attrs["polhode"])
 
 
+def _left(path):
+    """A file that was left half-written long ago."""
+    path.write_text("x")
+    os.utime(path, (0, 0))
+
+
 COMPLETED = {
     "flip": lambda p: _flip(p / "wxyz" / "c" / "1" / "0" / "0"),
     "flip at the beginning": lambda p: _flip(p / "wxyz" / "c" / "0" / "0" / "0", 0.0),
@@ -68,7 +75,10 @@ COMPLETED = {
     "flip of the times": lambda p: _flip(p / "time" / "c" / "0"),
     "altered times": lambda p: zarr.open_array(p / "time", mode="r+").__setitem__(1, 9.0),
     "lost summary": lambda p: shutil.rmtree(p / "tilt_summary_mean"),
-    "partial file": lambda p: (p / "wxyz" / "c" / "0" / "0" / "0.ab12.partial").write_text("x"),
+    "partial file": lambda p: _left(p / "wxyz" / "c" / "0" / "0" / "0.ab12.partial"),
+    "foreign metadata of a summary": lambda p: (p / "tilt_summary_std" / "zarr.json").write_text(
+        "[]"
+    ),
     "foreign file": lambda p: (p / "wxyz" / "c" / "1" / "0" / "0").write_text("foreign"),
 }
 REFUSED = {

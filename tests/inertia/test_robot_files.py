@@ -71,6 +71,9 @@ def test_a_body_of_an_mjcf_file(tmp_path):
     assert ph.simulate(scene, ph.State([1.0, 0, 0, 0], [0.1, 1.0, 0.1]), [0.0, 1.0]).successful
     with pytest.raises(ValueError, match="no body 'foot', it has: world, hand"):
         MassProperties.from_mjcf(path, "foot")
+    path.write_text(MJCF.replace(' name="hand"', ""))
+    with pytest.raises(ValueError, match="no body '', it has: world, and 1 without a name"):
+        MassProperties.from_mjcf(path, "")
 
 
 def test_robot_files_that_say_too_little(arm, tmp_path):

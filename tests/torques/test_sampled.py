@@ -53,6 +53,35 @@ def test_a_held_command_against_scipy():
     assert "8 segments, with a command held over every 0.25 s" in plan
 
 
+def test_a_held_command_beside_a_wheel_with_friction():
+    """The momentum of the wheel goes on over the edges: against SciPy, segment by segment."""
+    spin_inertia, friction, speed = 0.05, 0.02, 20.0
+    carrier = np.diag(MOMENTS) - np.diag([0, 0, spin_inertia])
+
+    def rates_of(y):
+        return np.linalg.solve(carrier, y[4:7] - [0, 0, y[7]])
+
+    def field(t, y, command):
+        q, w = y[:4], rates_of(y)
+        turn = np.concatenate([[-q[1:] @ w], q[0] * w + np.cross(q[1:], w)]) / 2
+        motor = -friction * (y[7] / spin_inertia - w[2])
+        return np.concatenate([turn, command + np.cross(y[4:7], w), [motor]])
+
+    spin = spin_inertia * (speed + OMEGA[2])
+    y = np.concatenate([WXYZ, carrier @ OMEGA + [0, 0, spin], [spin]])
+    for begin in np.arange(4) * PERIOD:
+        command = np.asarray(law(begin, y[:4], rates_of(y)))
+        options = {"method": "DOP853", "rtol": 1e-12, "atol": 1e-13, "args": (command,)}
+        y = solve_ivp(field, (begin, begin + PERIOD), y, **options).y[:, -1]
+    wheel = ph.Rotor([0, 0, 1], spin_inertia, speed=speed, coupling=ph.ViscousCoupling(friction))
+    wheels = ph.Scene(INERTIA, torque=ph.SampledTorque(law, PERIOD), rotors=wheel)
+    found = ph.simulate(wheels, ph.State(WXYZ, OMEGA), [0.0, 4 * PERIOD], rtol=1e-10)
+    np.testing.assert_allclose(found.last.wxyz, y[:4], atol=1e-9)
+    np.testing.assert_allclose(found.last.omega_body, rates_of(y), atol=1e-9)
+    at_end = y[7] / spin_inertia - rates_of(y)[2]
+    np.testing.assert_allclose(found.wheel_speed[-1, 0], at_end, rtol=1e-9)
+
+
 @pytest.mark.slow
 def test_a_held_command_beside_damping_of_a_batch():
     """Bodies enough for the midpoint rule, a sum of torques, and times of which one is kept."""

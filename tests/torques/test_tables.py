@@ -123,6 +123,32 @@ def test_tables_that_are_none_are_refused(given, match):
         ph.Table(**given)
 
 
+NUMBERS = ph.Table([0.0, 1.0, 5.0], [1.0, 2.0, 3.0])
+VECTORS = ph.Table([0.0, 1.0, 5.0], [[1.0, 0.0, 0.0]] * 3, kind="vector")
+TWO = ph.Table([0.0, 1.0, 5.0], [[1.0, 0.0]] * 3)
+
+
+@pytest.mark.parametrize(
+    ("make", "wanted"),
+    [
+        (lambda plates: ph.Drag(plates, 1e-9, NUMBERS), "Drag velocity takes a Table of vectors"),
+        (lambda plates: ph.Drag(plates, VECTORS, VELOCITY), "Drag density takes a Table of numb"),
+        (lambda plates: ph.SolarPressure(plates, NUMBERS), "vectors of 3, got one of numbers"),
+        (lambda plates: ph.SolarPressure(plates, VELOCITY, VECTORS), "numbers, got one of vectors"),
+        (lambda _: ph.ControlMomentGyro(1.0, [0, 0, 1], [1, 0, 0], VECTORS), "angle takes a Table"),
+        (lambda _: ph.BodyTorque(TWO), "vectors of 3, got one of vectors of 2"),
+        (lambda _: ph.MagneticDipole([1.0, 0, 0], NUMBERS), "field takes a Table of vectors of 3"),
+        (lambda plates: ph.SolarPressure(plates, [0.0, 0, 0]), "direction must not be zero"),
+        (lambda _: ph.Eclipse([7e6, 0, 0], [0.0, 0, 0]), "direction must not be zero"),
+        (lambda _: ph.Plates(AREAS[:0], NORMALS[:0], CENTRES[:0]), "one plate at least"),
+        (lambda _: ph.BDot(4e4, max_moment=-0.2), "max_moment must be positive"),
+    ],
+)
+def test_a_part_of_another_kind_is_refused_where_it_is_made(make, wanted):
+    with pytest.raises(ValueError, match=wanted):
+        make(ph.Plates(AREAS, NORMALS, CENTRES))
+
+
 def test_plates_that_are_none_are_refused():
     faces = ph.Plates(AREAS, NORMALS, CENTRES)
     for wrong in (

@@ -21,7 +21,7 @@ from polhode._checks import (
 )
 from polhode._hamiltonian import Attitude, Vector, components, cross, dot, triple
 from polhode._parts import AbstractPart, Signature, shaped
-from polhode._scene._tables import Table
+from polhode._scene._tables import Table, check_kind
 from polhode._scene._torques import AbstractTorque, coefficients, stacked, value_at, vector_of_time
 from polhode._scene._wheels import AbstractCoupling, AbstractRotor, Rotor, RotorSum
 
@@ -137,6 +137,7 @@ class MagneticDipole(AbstractTorque):
             else as_float_array(_MOMENT.name, moment, (3,))
         )
         if isinstance(field, Table):
+            check_kind(_FIELD.name, field, 3)
             self.field = field
         elif callable(field):
             self.field = _FIELD.checked(field)
@@ -178,7 +179,7 @@ class BDot(eqx.Module):
 
     def __init__(self, k: ArrayLike, max_moment: ArrayLike | None = None):
         self.k = as_number("BDot k", k)
-        self.max_moment = None if max_moment is None else as_number("BDot max_moment", max_moment)
+        self.max_moment = None if max_moment is None else as_positive("BDot max_moment", max_moment)
 
     def __call__(self, t: Array | float, omega_body: Array, field_body: Array) -> Array:
         moment = self.k * jnp.cross(omega_body, field_body)
@@ -454,6 +455,7 @@ class ControlMomentGyro(AbstractTorque):
                 f"the spin axis must be normal to the gimbal, got {spin} and {gimbal}.",
             )
         if isinstance(angle, AbstractPart) and callable(angle):
+            check_kind("ControlMomentGyro angle", angle, None)
             self.angle = angle
         else:
             self.angle = Signature("ControlMomentGyro angle", {"t": ()}).checked(angle)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 from polhode._checks import ArrayLike, as_float_array, as_positive, is_concrete, require
 from polhode._hamiltonian import Attitude, Vector, cross, dot, triple
 from polhode._parts import AbstractPart, Signature, shaped
+from polhode._scene._tables import check_kind
 from polhode._scene._torques import AbstractTorque, value_at, vector_of_time
 
 
@@ -46,6 +47,7 @@ class Plates(AbstractPart):
             f"Plates need one area, normal and centre each, got {counts[0]}, {counts[1]} and"
             f" {counts[2]}.",
         )
+        require(counts[0] > 0, "Plates needs one plate at least.")
 
     def torque(self, force: Callable[[int, Vector], Vector]) -> Vector:
         """Sum of centre x force(i, normal) over the plates, as components [N m]."""
@@ -63,8 +65,18 @@ def number_of_time(name: str, value: Any) -> Array | Callable:
     if not callable(value):
         return as_positive(name, value, zero=True)
     if isinstance(value, AbstractPart) and callable(value):
+        check_kind(name, value, None)
         return value
     return Signature(name, {"t": ()}).checked(value)
+
+
+def _direction_of_time(name: str, value: Any) -> Array | Callable:
+    """A vector of time that is not zero where it is constant."""
+    direction = vector_of_time(name, value)
+    if not callable(direction) and is_concrete(direction):
+        nonzero = np.any(np.asarray(direction) != 0, axis=-1)
+        require(nonzero, f"{name} must not be zero, got {value}.")
+    return direction
 
 
 def number_at(name: str, value: Any, t: Array | float) -> Array:
@@ -177,7 +189,7 @@ class SolarPressure(AbstractTorque):
         pressure: ArrayLike = 4.54e-6,
     ):
         self.plates = _check_plates("SolarPressure", plates)
-        self.direction = vector_of_time("SolarPressure direction", direction)
+        self.direction = _direction_of_time("SolarPressure direction", direction)
         self.lit = number_of_time("SolarPressure lit", lit)
         self.specular = _for_each("SolarPressure specular", specular, plates)
         self.diffuse = _for_each("SolarPressure diffuse", diffuse, plates)
@@ -232,7 +244,7 @@ class Eclipse(AbstractPart):
         radius: ArrayLike = 6.378137e6,
     ):
         self.position = vector_of_time("Eclipse position", position)
-        self.direction = vector_of_time("Eclipse direction", direction)
+        self.direction = _direction_of_time("Eclipse direction", direction)
         self.radius = as_positive("Eclipse radius", radius)
 
     def __call__(self, t: Array | float) -> Array:

@@ -112,6 +112,15 @@ class Table(AbstractPart):
         return interpolated[..., 0] if self.is_number else interpolated
 
 
+def check_kind(name: str, part: AbstractPart, count: int | None) -> None:
+    """Raise ValueError for a table that is not of vectors of ``count``, or of numbers if None."""
+    if not isinstance(part, Table):
+        return
+    wanted = "numbers" if count is None else f"vectors of {count}"
+    found = "numbers" if part.is_number else f"vectors of {part.values.shape[-1]}"
+    require(found == wanted, f"{name} takes a Table of {wanted}, got one of {found}.")
+
+
 def _is_number(shape: tuple[int, ...], n: int, kind: str | None) -> bool:
     number, vector = shape[-1:] == (n,), len(shape) > 1 and shape[-2] == n
     fits = {None: number or vector, "number": number, "vector": vector}

@@ -19,6 +19,7 @@ from polhode._checks import (
 )
 from polhode._hamiltonian import Attitude, Vector, components, cross, triple
 from polhode._parts import AbstractPart, AbstractSum, Signature, shaped, terms_of
+from polhode._scene._tables import check_kind
 
 
 class AbstractTorque(AbstractPart):
@@ -99,6 +100,7 @@ def vector_of_time(name: str, n: Any) -> Array | Callable:
     if not callable(n):
         return as_float_array(name, n, (3,))
     if isinstance(n, AbstractPart) and callable(n):
+        check_kind(name, n, 3)
         return n
     return Signature(name, {"t": ()}, (3,)).checked(n)
 

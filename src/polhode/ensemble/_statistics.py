@@ -169,8 +169,8 @@ def write_summaries(store: Store, statistics: tuple[Statistic, ...]) -> None:
                 "count": (count.astype(np.int64), "1"),
                 "mean": (np.where(count > 0, moments.mean, np.nan), s.units),
                 "std": (np.sqrt(moments.squares / count), s.units),
-                "min": (np.asarray(minimum), s.units),
-                "max": (np.asarray(maximum), s.units),
+                "min": (np.where(count > 0, minimum, np.nan), s.units),
+                "max": (np.where(count > 0, maximum, np.nan), s.units),
             }
         for kind, (values, units) in summary.items():
             store.put(f"{name}_summary_{kind}", values, ("time",), units)

@@ -16,6 +16,7 @@ import os
 import re
 import secrets
 import shutil
+import time
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -261,11 +262,13 @@ class Store:
                 self.arrays[name][field.region(k)] = arrays[name]
 
     def remove_partial(self) -> None:
-        """Remove what killed processes left half-written."""
+        """Remove what killed processes left half-written: others may still write theirs."""
         for file in self.path.rglob("*.partial"):
-            file.unlink(missing_ok=True)
+            if _is_abandoned(file):
+                file.unlink(missing_ok=True)
         for folder in self.path.parent.glob(f".{glob.escape(self.path.name)}.*.partial"):
-            shutil.rmtree(folder, ignore_errors=True)
+            if _is_abandoned(folder):
+                shutil.rmtree(folder, ignore_errors=True)
 
     @contextlib.contextmanager
     def _write_errors(self) -> Iterator[None]:
@@ -282,8 +285,10 @@ class Store:
 
     def put(self, name: str, values: np.ndarray, dimensions: tuple, units: str) -> None:
         """Write a small array as a whole."""
-        with self._write_errors():
-            array = self.group.create_array(
+        zarr = _zarr()
+
+        def make(group, overwrite=False):
+            return group.create_array(
                 name,
                 shape=values.shape,
                 chunks=values.shape,
@@ -291,14 +296,37 @@ class Store:
                 dimension_names=dimensions,
                 attributes={"units": units},
                 compressors=_codecs(),
-                overwrite=True,
+                overwrite=overwrite,
             )
+
+        # An array that is there and sound is kept and its one file replaced: another process may
+        # write the same to it at the same time.
+        expected = make(zarr.create_group(zarr.storage.MemoryStore())).metadata
+        with self._write_errors():
+            try:
+                array = self.group[name]
+                is_sound = getattr(array, "metadata", None) == expected
+            except Exception:  # missing, or damaged: its description is read by several libraries
+                is_sound = False
+            if not is_sound:
+                array = make(self.group, overwrite=True)
             array[...] = values
 
     def consolidate(self) -> None:
         """Gather the metadata of all arrays in one file, which xarray reads first."""
         with self._write_errors():
             _consolidate(self.path)
+
+
+_ABANDONED = 600.0
+"""[s] Without a change, after which what is half-written belongs to no process any more."""
+
+
+def _is_abandoned(path: Path) -> bool:
+    try:
+        return time.time() - path.stat().st_mtime > _ABANDONED
+    except OSError:  # renamed or removed in the meantime
+        return False
 
 
 def digest(*values: Any) -> str:

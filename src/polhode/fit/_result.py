@@ -250,7 +250,8 @@ class Fit(eqx.Module):
             paths = [
                 path for path, _ in jax.tree_util.tree_flatten_with_path(self.parameters.motion)[0]
             ]
-        names = [jax.tree_util.keystr(path, simple=True, separator=".") for path in paths]
+        texts = (jax.tree_util.keystr(path, simple=True, separator=".") for path in paths)
+        names = [text or "unknown" for text in texts]  # of a motion whose unknown is one array
         return names if self._inertia is None else ["inertia", *names]
 
     def common_scale(self, body: int = 0) -> list[tuple[str, np.ndarray, np.ndarray]]:

@@ -61,8 +61,11 @@ def read_mjcf(path: str | PathLike[str], body: str) -> tuple[float, np.ndarray, 
     except ValueError as error:
         raise ValueError(f"MuJoCo does not read {name}: {error}") from error
     names = [model.body(i).name for i in range(model.nbody)]
-    if body not in names:
-        raise ValueError(f"{name} has no body {body!r}, it has: {_listed(names)}.")
+    if not body or body not in names:
+        listed = _listed(name for name in names if name)
+        unnamed = names.count("")
+        also = f", and {unnamed} without a name: give it one" if unnamed else ""
+        raise ValueError(f"{name} has no body {body!r}, it has: {listed}{also}.")
     model_body = model.body(body)
     rotation_matrix = Rotation.from_quat(model_body.iquat, scalar_first=True).as_matrix()
     tensor = rotation_matrix @ np.diag(model_body.inertia) @ rotation_matrix.T
