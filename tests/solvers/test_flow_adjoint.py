@@ -130,6 +130,22 @@ def test_batches_of_slopes():
     np.testing.assert_allclose(slopes, forward, rtol=0, atol=1e-11)
 
 
+@pytest.mark.parametrize("kind", ["exact equations", "recorded steps"])
+@pytest.mark.parametrize("inner", [jax.jacrev, jax.jacfwd])
+def test_reverse_mode_of_a_derivative_says_what_to_take(kind, inner):
+    """JAX would say that its own loops cannot be differentiated; of closed forms it is right."""
+    torque = ph.FeedbackTorque(lambda t, wxyz, omega: -jnp.maximum(omega, 0))
+    pull = ph.UniformGravity(1.0, [0.1, 0.0, 0.5])
+    acts = {"exact equations": (pull,), "recorded steps": (None, torque)}[kind]
+
+    def loss(moments):
+        scene = ph.Scene(ph.Inertia.from_moments(moments), *acts)
+        return ph.simulate(scene, ph.State(WXYZ[0], OMEGA[0]), [0.0, 1.0]).last.omega_body[0]
+
+    with pytest.raises(NotImplementedError, match=r"take jax.hessian\(f\)"):
+        jax.make_jaxpr(jax.jacrev(inner(loss)))(MOMENTS[0])
+
+
 @pytest.mark.slow
 def test_second_derivatives_of_chunks():
     """Of bodies moved one chunk after another: the Hessian is that of one chunk, and symmetric."""

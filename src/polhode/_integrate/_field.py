@@ -59,6 +59,13 @@ class BoundTerm(eqx.Module):
         return Prepared(coefficients, run, uses(closed_jaxpr.jaxpr, len(arrays)), by_entry)
 
 
+REVERSE_ONCE = (
+    "an integrated motion, a loop of unknown length, has one derivative in reverse mode, the"
+    " innermost: for second derivatives take jax.hessian(f) or jax.jacfwd(jax.grad(f)), not"
+    " jax.grad(jax.grad(f)) or jax.jacrev(jax.jacfwd(f))."
+)
+
+
 class FixedArguments(eqx.Module):
     """All ``arrays`` that a field depends on, in place of its arguments; ``units``: the natural
     units of its states, or None."""

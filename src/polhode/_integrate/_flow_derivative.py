@@ -19,7 +19,7 @@ from polhode._checks import is_concrete
 from polhode._hamiltonian import Dynamics, LiePoissonUnits, relative
 from polhode._integrate._columns import table
 from polhode._integrate._extrapolation import order_for, units_of
-from polhode._integrate._field import BoundTerm, uses
+from polhode._integrate._field import REVERSE_ONCE, BoundTerm, uses
 from polhode._integrate._midpoint import Field, Limits, initial_progress, integrate
 from polhode._kernels import Distinct, attached, is_slope, kernel, linear, specialise, zeros
 
@@ -273,7 +273,8 @@ class Equations:
         # one unit of the steps and of what comes before and after them
         few = end[0].size <= _policy.KERNEL_BODIES
         compiled = partial(kernel, of_units=True) if few else None
-        end_tangents = linear(*maps, primals, [*dy, *(dc[i] for i in at)], end, compiled)
+        slopes = [*dy, *(dc[i] for i in at)]
+        end_tangents = linear(*maps, primals, slopes, end, compiled, REVERSE_ONCE)
         if is_slope(dt1):
             end_tangents = [a + dt1 * f for a, f in zip(end_tangents, self.field(c, t1, end))]
         return end_tangents

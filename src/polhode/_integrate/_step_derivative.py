@@ -35,6 +35,7 @@ from polhode._integrate._explicit_step import (
     in_parts,
     weighted,
 )
+from polhode._integrate._field import REVERSE_ONCE
 from polhode._integrate._loop import (
     Make,
     Note,
@@ -119,6 +120,7 @@ def samples(
             [dy, *(input_tangents[i] for i in at)],
             [states],
             partial(kernel, of_units=True) if motion.is_whole else None,
+            REVERSE_ONCE,
         )
         if order is not None:
             place = jnp.argsort(order, axis=1)[..., None]

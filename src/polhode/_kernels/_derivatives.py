@@ -26,11 +26,12 @@ Map = Callable[[Sequence[Any], Sequence[Any]], Sequence[Any]]
 
 def linear(
     forward: Map,
-    backward: Map,
+    backward: Map | None,
     constants: Sequence[Any],
     operands: Sequence[Any],
     like: Sequence[Any],
     compiled: Callable[[Callable], Callable] | None = None,
+    loops: str = "",
 ) -> list[Any]:
     """``forward(constants, operands)``, linear in ``operands``; ``backward(constants, out)`` is its
     transpose.
@@ -40,7 +41,9 @@ def linear(
     as a function of arrays where a program is made of it, not where it is differentiated. Unlike
     ``jax.custom_vjp`` this leaves forward mode as it is, and unlike
     ``jax.custom_derivatives.linear_call`` it takes ``vmap`` and derivatives with respect to
-    ``constants``.
+    ``constants``. Of functions that loop until they are done JAX cannot transpose the latter;
+    ``loops`` are the words of the NotImplementedError that this raises. So does the transpose of a
+    map without ``backward``.
     """
     shapes = tuple((tuple(x.shape), x.dtype) for x in like)
     return _linear_p.bind(
@@ -51,6 +54,7 @@ def linear(
         count=len(constants),
         shapes=shapes,
         compiled=compiled,
+        loops=loops,
     )
 
 
@@ -59,7 +63,7 @@ _linear_p.multiple_results = True
 
 
 @_linear_p.def_impl
-def _compute(*arrays, forward, backward, count, shapes, compiled):
+def _compute(*arrays, forward, backward, count, shapes, compiled, loops):
     return list(forward(arrays[:count], arrays[count:]))
 
 
@@ -70,7 +74,7 @@ def _lowered(*arrays, compiled, **params):
 
 
 @_linear_p.def_abstract_eval
-def _shapes(*_, forward, backward, count, shapes, compiled):
+def _shapes(*_, forward, backward, count, shapes, compiled, loops):
     return [ShapedArray(shape, dtype) for shape, dtype in shapes]
 
 
@@ -85,13 +89,31 @@ def _jvp(arrays, tangents, *, count, **params):
         operand_tangents = [zeros(x) if isinstance(x, ad.Zero) else x for x in operand_tangents]
         changes = _linear_p.bind(*constants, *operand_tangents, count=count, **params)
     if any(is_slope(x) for x in tangents[:count]):
-        constant_changes = along_slopes(
-            lambda inputs: params["forward"](inputs, operands), constants, tangents[:count]
-        )
+        constant_changes = _by_constants(constants, operands, tangents[:count], out, **params)
         changes = (
             [a + b for a, b in zip(changes, constant_changes)] if changes else constant_changes
         )
     return out, changes
+
+
+def _by_constants(constants, operands, tangents, out, *, forward, loops, **_):
+    """Change of the map for changes of its constants."""
+    if not loops:
+        return along_slopes(lambda inputs: forward(inputs, operands), constants, tangents)
+    at = [i for i, x in enumerate(tangents) if is_slope(x)]
+    size = len(constants)
+
+    def changes(arrays, slopes):
+        all_tangents = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in arrays[:size]]
+        for i, x in zip(at, slopes):
+            all_tangents[i] = x
+        return along_slopes(
+            lambda inputs: forward(inputs, arrays[size:]), arrays[:size], all_tangents
+        )
+
+    return linear(
+        changes, None, [*constants, *operands], [tangents[i] for i in at], out, None, loops
+    )
 
 
 def is_slope(x: Any) -> bool:
@@ -104,17 +126,19 @@ def zeros(x: Any) -> Any:
     return jnp.zeros(x.aval.shape, x.aval.dtype)
 
 
-def _transpose(slopes, *arrays, forward, backward, count, shapes, compiled):
+def _transpose(slopes, *arrays, forward, backward, count, shapes, compiled, loops):
+    if backward is None:
+        raise NotImplementedError(loops)
     constants, operands = arrays[:count], arrays[count:]
     unknown = [ad.is_undefined_primal(x) for x in operands]
     avals = [x.aval if u else x for u, x in zip(unknown, operands)]
     slopes = [zeros(x) if isinstance(x, ad.Zero) else x for x in slopes]
     # the same primitive with both programs exchanged: its transpose is the map itself again
-    cotangents = linear(backward, forward, constants, slopes, avals, compiled)
+    cotangents = linear(backward, forward, constants, slopes, avals, compiled, loops)
     return [None] * count + [x if u else None for u, x in zip(unknown, cotangents)]
 
 
-def _batch(arrays, dims, *, forward, backward, count, shapes, compiled):
+def _batch(arrays, dims, *, forward, backward, count, shapes, compiled, loops):
     # All operands get the axis, batched or not: the transpose has to return cotangents of the same
     # shapes. The constants have no cotangents here, and keep their axes.
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
@@ -135,10 +159,11 @@ def _batch(arrays, dims, *, forward, backward, count, shapes, compiled):
         *arrays[:count],
         *operands,
         forward=batched(forward),
-        backward=batched(backward),
+        backward=None if backward is None else batched(backward),
         count=count,
         shapes=tuple(((size, *shape), dtype) for shape, dtype in shapes),
         compiled=None,
+        loops=loops,
     )
     return out, [0] * len(out)
 
