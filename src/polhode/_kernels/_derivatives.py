@@ -31,7 +31,7 @@ def linear(
     operands: Sequence[Any],
     like: Sequence[Any],
     compiled: Callable[[Callable], Callable] | None = None,
-    loops: str = "",
+    reverse_error: str = "",
 ) -> list[Any]:
     """``forward(constants, operands)``, linear in ``operands``; ``backward(constants, out)`` is its
     transpose.
@@ -41,9 +41,9 @@ def linear(
     as a function of arrays where a program is made of it, not where it is differentiated. Unlike
     ``jax.custom_vjp`` this leaves forward mode as it is, and unlike
     ``jax.custom_derivatives.linear_call`` it takes ``vmap`` and derivatives with respect to
-    ``constants``. Of functions that loop until they are done JAX cannot transpose the latter;
-    ``loops`` are the words of the NotImplementedError that this raises. So does the transpose of a
-    map without ``backward``.
+    ``constants``. ``reverse_error``: message of the NotImplementedError that reverse mode by
+    ``constants`` raises, for functions with loops of unknown length, which JAX cannot transpose;
+    so does the transpose of a map without ``backward``.
     """
     shapes = tuple((tuple(x.shape), x.dtype) for x in like)
     return _linear_p.bind(
@@ -54,7 +54,7 @@ def linear(
         count=len(constants),
         shapes=shapes,
         compiled=compiled,
-        loops=loops,
+        reverse_error=reverse_error,
     )
 
 
@@ -63,7 +63,7 @@ _linear_p.multiple_results = True
 
 
 @_linear_p.def_impl
-def _compute(*arrays, forward, backward, count, shapes, compiled, loops):
+def _compute(*arrays, forward, backward, count, shapes, compiled, reverse_error):
     return list(forward(arrays[:count], arrays[count:]))
 
 
@@ -74,7 +74,7 @@ def _lowered(*arrays, compiled, **params):
 
 
 @_linear_p.def_abstract_eval
-def _shapes(*_, forward, backward, count, shapes, compiled, loops):
+def _shapes(*_, forward, backward, count, shapes, compiled, reverse_error):
     return [ShapedArray(shape, dtype) for shape, dtype in shapes]
 
 
@@ -96,9 +96,9 @@ def _jvp(arrays, tangents, *, count, **params):
     return out, changes
 
 
-def _by_constants(constants, operands, tangents, out, *, forward, loops, **_):
+def _by_constants(constants, operands, tangents, out, *, forward, reverse_error, **_):
     """Change of the map for changes of its constants."""
-    if not loops:
+    if not reverse_error:
         return along_slopes(lambda inputs: forward(inputs, operands), constants, tangents)
     at = [i for i, x in enumerate(tangents) if is_slope(x)]
     size = len(constants)
@@ -112,7 +112,7 @@ def _by_constants(constants, operands, tangents, out, *, forward, loops, **_):
         )
 
     return linear(
-        changes, None, [*constants, *operands], [tangents[i] for i in at], out, None, loops
+        changes, None, [*constants, *operands], [tangents[i] for i in at], out, None, reverse_error
     )
 
 
@@ -126,19 +126,19 @@ def zeros(x: Any) -> Any:
     return jnp.zeros(x.aval.shape, x.aval.dtype)
 
 
-def _transpose(slopes, *arrays, forward, backward, count, shapes, compiled, loops):
+def _transpose(slopes, *arrays, forward, backward, count, shapes, compiled, reverse_error):
     if backward is None:
-        raise NotImplementedError(loops)
+        raise NotImplementedError(reverse_error)
     constants, operands = arrays[:count], arrays[count:]
     unknown = [ad.is_undefined_primal(x) for x in operands]
     avals = [x.aval if u else x for u, x in zip(unknown, operands)]
     slopes = [zeros(x) if isinstance(x, ad.Zero) else x for x in slopes]
     # the same primitive with both programs exchanged: its transpose is the map itself again
-    cotangents = linear(backward, forward, constants, slopes, avals, compiled, loops)
+    cotangents = linear(backward, forward, constants, slopes, avals, compiled, reverse_error)
     return [None] * count + [x if u else None for u, x in zip(unknown, cotangents)]
 
 
-def _batch(arrays, dims, *, forward, backward, count, shapes, compiled, loops):
+def _batch(arrays, dims, *, forward, backward, count, shapes, compiled, reverse_error):
     # All operands get the axis, batched or not: the transpose has to return cotangents of the same
     # shapes. The constants have no cotangents here, and keep their axes.
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
@@ -163,7 +163,7 @@ def _batch(arrays, dims, *, forward, backward, count, shapes, compiled, loops):
         count=count,
         shapes=tuple(((size, *shape), dtype) for shape, dtype in shapes),
         compiled=None,
-        loops=loops,
+        reverse_error=reverse_error,
     )
     return out, [0] * len(out)
 
