@@ -2,6 +2,7 @@
 
 from datetime import datetime, timedelta
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -39,6 +40,9 @@ def test_scipy_there_and_back(traj):
     assert float(ph.rotation.angle_between(back.wxyz, traj.wxyz[1]).max()) < 1e-15
     assert ph.State(turned, np.zeros(3, np.float32)).wxyz.dtype == np.float32
     assert len(traj.to_scipy()) == 6
+    lost = eqx.tree_at(lambda t: t._wxyz, traj, traj.wxyz.at[0].set(jnp.nan))
+    with pytest.raises(ValueError, match="3 attitudes are NaN"):
+        lost.to_scipy()
 
 
 def parsed(text):

@@ -353,6 +353,27 @@ def check_kinds(scene: Any, state: Any) -> None:
             raise TypeError(f"{name} must be a ph.{kind.__name__}, got {type(value).__name__}.")
 
 
+def of_one_dtype(name: str, tree: Any) -> tuple[Any, Any]:
+    """The tree with numbers of Python in the dtype of its arrays, and that dtype. Raises TypeError
+    for several dtypes, or one that is too coarse."""
+    dtypes = _dtypes(jax.tree.leaves(tree))
+    if len(dtypes) > 1:
+        tree = _in_one_dtype(tree)
+        dtypes = _dtypes(jax.tree.leaves(tree))
+    if len(dtypes) != 1:
+        raise TypeError(
+            f"{name} mix the dtypes {sorted(map(str, dtypes))}: make all arrays of one"
+            " dtype, for example with jnp.asarray(x, jnp.float64)."
+        )
+    dtype = dtypes.pop()
+    if dtype not in (jnp.float32, jnp.float64):
+        raise TypeError(
+            f"{name} are of {dtype}, which is too coarse to move a body by: make all"
+            " arrays float32 or float64, for example with jnp.asarray(x, jnp.float32)."
+        )
+    return tree, dtype
+
+
 def check_inputs(
     scene: Any, state: Any, ts: Any, record: Any
 ) -> tuple[Scene, State, Array, Record]:
@@ -363,21 +384,7 @@ def check_inputs(
         raise TypeError(f"record must be a ph.Record or None, got {type(record).__name__}.")
     check_scene(scene)
     check_fields(state, "state")
-    dtypes = _dtypes(jax.tree.leaves((scene, state)))
-    if len(dtypes) > 1:
-        scene, state = _in_one_dtype((scene, state))
-        dtypes = _dtypes(jax.tree.leaves((scene, state)))
-    if len(dtypes) != 1:
-        raise TypeError(
-            f"scene and state mix the dtypes {sorted(map(str, dtypes))}: make all arrays of one"
-            " dtype, for example with jnp.asarray(x, jnp.float64)."
-        )
-    dtype = dtypes.pop()
-    if dtype not in (jnp.float32, jnp.float64):
-        raise TypeError(
-            f"scene and state are of {dtype}, which is too coarse to move a body by: make all"
-            " arrays float32 or float64, for example with jnp.asarray(x, jnp.float32)."
-        )
+    (scene, state), dtype = of_one_dtype("scene and state", (scene, state))
     ts = _times(ts, dtype)
     check_times(ts)
     return scene, state, ts, record

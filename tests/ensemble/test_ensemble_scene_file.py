@@ -1,5 +1,8 @@
 """The [ensemble] of a scene file: what it draws, what it refuses, and `polhode run` of it."""
 
+import os
+import signal
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -221,6 +224,32 @@ def test_spread_moments_keep_the_principal_axes():
     for ensemble in (ens.Ensemble(scene, TURNING, 2, (narrow,)), of_rows):
         drawn, _ = ensemble.draw(np.arange(2))
         np.testing.assert_allclose(drawn.inertia.tensor, [tensor, tensor], atol=1e-7)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_run_says_how_it_goes_on(number, tmp_path, monkeypatch, capsys):
+    """Its chunks are in the store already: "no file was changed" would be wrong."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "s.toml").write_text(SCENE)
+    monkeypatch.setattr(ens, "stream", lambda *_, **__: os.kill(os.getpid(), number))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        code = main(["run", "s.toml"])
+    except SystemExit as ended:
+        code = ended.code
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert code == 128 + number
+    assert "ed; the same command finishes what is missing" in capsys.readouterr().err
+
+
+def test_rows_are_moved_by_the_method_that_the_planner_chooses(tmp_path):
+    rates = np.array([[0.1, 1.0, 0.2], [0.3, 0.2, 0.9]])
+    ensemble = ens.Ensemble(ph.Scene(BODY), TURNING, 2, rows={"omega_body": rates})
+    path = ens.stream(ensemble, [0.0, 1.0], tmp_path / "rows.zarr")
+    with ens.open_store(path) as stored:
+        moved = ph.simulate(ph.Scene(BODY), ph.State(TURNING.wxyz, rates), [0.0, 1.0])
+        np.testing.assert_allclose(stored.omega_body, moved.omega_body, rtol=1e-13)
 
 
 @pytest.mark.parametrize("loose", [{}, {"torque": 0.1}])

@@ -6,6 +6,7 @@ import mpmath as mp
 import numpy as np
 import pytest
 
+import polhode as ph
 from polhode import Mode
 from polhode._closed_forms import principal_periods
 
@@ -222,3 +223,10 @@ def test_derivative_of_the_period_of_a_permanent_rotation(moments, omega):
     size = float(jnp.linalg.norm(omega))
     found = float(gradient @ omega) / size
     np.testing.assert_allclose(found, -2 * np.pi / size**2, rtol=1e-13)
+
+
+def test_mixed_dtypes_are_refused():
+    single = ph.Inertia.from_moments(jnp.array([1.0, 1.5, 2.0], jnp.float32))
+    state = ph.State(jnp.array([1.0, 0, 0, 0]), jnp.array([0.3, 1.0, 0.2]))
+    with pytest.raises(TypeError, match="inertia and state mix the dtypes"):
+        ph.periods(single, state)

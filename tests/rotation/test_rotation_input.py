@@ -136,5 +136,8 @@ def test_lists_and_integers_are_arrays():
     np.testing.assert_allclose(rotation.multiply([0, 1, 0, 0], [0, 0, 1, 0]), [0, 0, 0, 1])
     np.testing.assert_allclose(rotation.axis_angle_to_wxyz([0, 0, 1], np.pi / 2), quarter)
     np.testing.assert_allclose(rotation.rotation_vector_to_wxyz([0, 0, np.pi / 2]), quarter)
+    several = rotation.axis_angle_to_wxyz([[[0, 0, 1]], [[0, 1, 0]]], [0, np.pi / 2, np.pi])
+    assert several.shape == (2, 3, 4)
+    np.testing.assert_allclose(several[0, 1], quarter)
     single = rotation.rotate(jnp.array([1, 0, 0, 0], jnp.float32), jnp.ones(3, jnp.float32))
     assert single.dtype == jnp.float32

@@ -37,6 +37,7 @@ from polhode._closed_forms._free_tangent import (
     invariants_variation,
 )
 from polhode._kernels import are_close, kernel, underivable
+from polhode._method import of_one_dtype
 from polhode._scene import State
 from polhode.inertia import Inertia, principal
 
@@ -249,7 +250,7 @@ def periods(inertia: Inertia, state: State) -> Periods:
     Infinite where there is no such motion. Differentiable. Formulas: Landau & Lifshitz, Mechanics,
     section 37; Samarasinha & A'Hearn, Icarus 93 (1991).
 
-    Raises TypeError for anything but a ``ph.Inertia`` and a ``ph.State``.
+    Raises TypeError for anything but a ``ph.Inertia`` and a ``ph.State`` of one dtype.
     """
     if not isinstance(inertia, Inertia) or not isinstance(state, State):
         raise TypeError(
@@ -261,6 +262,7 @@ def periods(inertia: Inertia, state: State) -> Periods:
             np.asarray(inertia.is_possible),
             f"periods needs moments that a body can have, got {describe(inertia.moments)}.",
         )
+    (inertia, state), _ = of_one_dtype("inertia and state", (inertia, state))
     batch = common_batch(inertia, state)
     moments, products, omega = inertia.moments, None, _spread(state.omega_body, batch)
     if not inertia.is_principal:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from polhode import rotation
 from polhode._batch import PARTS, along_time, map_arrays
-from polhode._checks import ArrayLike, is_concrete
+from polhode._checks import ArrayLike, is_concrete, require
 from polhode._hamiltonian import components, from_quaternion
 from polhode._method import Status, StepCounts
 from polhode._scene import Scene, State, Wheels
@@ -487,8 +487,15 @@ class Trajectory(eqx.Module):
         """The attitudes, body -> space, as one SciPy ``Rotation`` of all samples.
 
         In the order of ``wxyz`` with its leading axes flattened. Conversely, ``ph.State`` accepts a
-        ``Rotation`` in place of a quaternion. Not under ``jit``.
+        ``Rotation`` in place of a quaternion. Not under ``jit``. Raises ValueError where attitudes
+        are NaN, those of bodies that did not finish.
         """
+        missing = int(np.sum(np.isnan(np.asarray(self.wxyz)[..., 0])))
+        require(
+            missing == 0,
+            f"{missing} attitudes are NaN, those of bodies that did not finish (see status): take"
+            " the others, rotation.wxyz_to_scipy(traj.wxyz[traj.status == 0]).",
+        )
         return rotation.wxyz_to_scipy(self.wxyz)
 
     def to_xarray(self, labels: Sequence[str] | None = None) -> Any:

@@ -18,7 +18,7 @@ import typer
 import typer.core
 
 from polhode.cli import _commands, _fit, _run
-from polhode.cli._options import READERS, UsageError, reset_outputs, written_outputs
+from polhode.cli._options import READERS, UsageError, reset_outputs, state_of_outputs
 from polhode.cli._process import INTERRUPTED, TERMINATED, signal_handlers
 from polhode.files import SceneFileError
 from polhode.files._read import escape
@@ -128,11 +128,11 @@ def _run_guarded(command: Callable[[], int], debug: bool) -> int:
             sys.stdout.flush()
             return code
     except KeyboardInterrupt:
-        print(f"\npolhode: interrupted; {_state_of_files()}", file=sys.stderr)
+        print(f"\npolhode: interrupted; {state_of_outputs()}", file=sys.stderr)
         return INTERRUPTED
     except SystemExit as ended:
         if ended.code == TERMINATED:
-            print(f"\npolhode: terminated; {_state_of_files()}", file=sys.stderr)
+            print(f"\npolhode: terminated; {state_of_outputs()}", file=sys.stderr)
         raise
     except BrokenPipeError:  # the reader of our output went away: nobody reads it
         _silence(sys.stdout)
@@ -145,14 +145,6 @@ def _run_guarded(command: Callable[[], int], debug: bool) -> int:
 
 def _print_warning(message: Warning | str, *_: Any) -> None:
     print(f"polhode: {escape(str(message))}", file=sys.stderr)
-
-
-def _state_of_files() -> str:
-    written, unchanged = ([escape(str(path)) for path in paths] for paths in written_outputs())
-    if not written:
-        return "no file was changed"
-    text = f"written: {', '.join(written)}"
-    return text + (f"; not written: {', '.join(unchanged)}" if unchanged else "")
 
 
 def _report(error: Exception, debug: bool) -> int:

@@ -193,6 +193,7 @@ READERS = {
     ".zarr": "xarray.open_zarr reads the stores of ensembles",
 }
 _outputs: dict[Path, tuple[int, int] | None] = {}  # with what was there before
+_stores: list[Path] = []
 
 
 class UsageError(Exception):
@@ -293,6 +294,12 @@ def _other_command(path: Path, suffix: str) -> str:
 def reset_outputs() -> None:
     """Forget the output files of the command before."""
     _outputs.clear()
+    _stores.clear()
+
+
+def resumable_store(path: Path) -> None:
+    """Note a store to which chunks are written as they are computed."""
+    _stores.append(path)
 
 
 def check_suffix(text: str, *suffixes: str, what: str) -> None:
@@ -359,6 +366,17 @@ def output_path(path: Path | str, suffix: str, *, force: bool, confined: bool = 
         ) from error
     _outputs[path] = _identity(path)
     return path
+
+
+def state_of_outputs() -> str:
+    """What an interrupted command has written, in words."""
+    if _stores:
+        return "the same command finishes what is missing"
+    written, unchanged = ([escape(str(path)) for path in paths] for paths in written_outputs())
+    if not written:
+        return "no file was changed"
+    text = f"written: {', '.join(written)}"
+    return text + (f"; not written: {', '.join(unchanged)}" if unchanged else "")
 
 
 def written_outputs() -> tuple[list[Path], list[Path]]:

@@ -31,6 +31,7 @@ from polhode.cli._options import (
     parse_part,
     read_scene,
     require,
+    resumable_store,
     whole_number,
     write_figure,
 )
@@ -337,9 +338,6 @@ def _run_ensemble(
     try:
         with program_cache(not no_cache), _Meter(console) as meter:
             last = _stream(file, ensemble, statistics, path, precision, meter, options)
-    except KeyboardInterrupt:
-        print("\npolhode: interrupted; the same command finishes what is missing", file=sys.stderr)
-        return 130
     except StoreError:
         raise
     except ValueError as error:  # of sizes, which options gave
@@ -378,6 +376,7 @@ def _stream(file, ensemble, statistics, path, precision, meter, options):
     from polhode.ensemble import stream
     from polhode.files import build_method
 
+    resumable_store(path)
     stream(
         ensemble,
         file.times.seconds,

@@ -75,7 +75,8 @@ class Block:
         self.size = block_size(ts.shape[0])
         if method is None:
             # by the bodies drawn: those of a symmetric one may have three moments
-            drawn, _ = eqx.filter_eval_shape(ensemble.draw, np.zeros(1, int))
+            # the arrays of the ensemble are closed over: rows are read by NumPy
+            drawn, _ = eqx.filter_eval_shape(lambda: ensemble.draw(np.zeros(1, int)))
             method, _ = choose(drawn)
         self.method = method
         self.rtol = check_rtol(rtol, ts.dtype)

@@ -100,14 +100,17 @@ def _rotation_vector(wxyz: Array) -> Array:
 
 
 def axis_angle_to_wxyz(
-    axis: Float[ArrayLike, "*b 3"], angle: Float[ArrayLike, "*b"]
+    axis: Float[ArrayLike, "*#b 3"], angle: Float[ArrayLike, "*#b"]
 ) -> Float[Array, "*b 4"]:
     """Unit quaternion of the rotation by ``angle`` (rad) about the unit vector ``axis``.
 
     Raises ValueError for an axis that is known not to be of unit length.
     """
     axis = as_axes("axis", axis)
-    half = jnp.asarray(angle, axis.dtype)[..., None] / 2
+    half = jnp.asarray(angle, axis.dtype) / 2
+    shape = jnp.broadcast_shapes(axis.shape[:-1], half.shape)
+    half = jnp.broadcast_to(half, shape)[..., None]
+    axis = jnp.broadcast_to(axis, (*shape, 3))
     return jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], axis=-1)
 
 
@@ -166,7 +169,8 @@ def wxyz_to_modified_rodrigues(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "
 
 
 def wxyz_to_shadow(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3"]:
-    """The set of length at least 1 of a rotation; infinite at the identity."""
+    """The set of length at least 1 of a rotation; NaN at the identity, where it is infinite in no
+    direction."""
     return _shadow(as_quaternions(wxyz))
 
 
@@ -179,7 +183,8 @@ def _shadow(wxyz: Array) -> Array:
 
 
 def shadow(parameters: Float[ArrayLike, "*b 3"]) -> Float[Array, "*b 3"]:
-    """The other set of the same rotation, ``-p/|p|**2``; infinite for the identity."""
+    """The other set of the same rotation, ``-p/|p|**2``; NaN for the identity, of which it is
+    infinite in no direction."""
     parameters = as_vectors("parameters", parameters, 3)
     size = length(parameters)[..., None]
     return -(parameters / size) / size
@@ -442,7 +447,9 @@ def euler_to_axis_angle(
 
 
 def axis_angle_to_euler(
-    axis: Float[ArrayLike, "*b 3"], angle: Float[ArrayLike, "*b"], sequence: Sequence = Sequence.ZYZ
+    axis: Float[ArrayLike, "*#b 3"],
+    angle: Float[ArrayLike, "*#b"],
+    sequence: Sequence = Sequence.ZYZ,
 ) -> _Angles:
     """Euler angles of the rotation by ``angle`` about the unit vector ``axis``."""
     return wxyz_to_euler(axis_angle_to_wxyz(axis, angle), sequence)
