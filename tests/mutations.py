@@ -347,7 +347,7 @@ MUTANTS = (
     ),
     Mutant(
         CONSTANTS,
-        "low = rate - _cast(_cast(rate, jnp.float32), jnp.float64)",
+        "low = rate - jax.lax.reduce_precision(rate, exponent_bits=8, mantissa_bits=23)",
         "low = 0 * rate",
         "phases in single precision lose eps times the angle",
         ("free/test_free_motion.py::test_single_precision_keeps_its_digits_over_long_times",),

@@ -10,8 +10,6 @@ import pytest
 
 from polhode._closed_forms import free_motion
 from polhode._closed_forms._free import evaluate, prepare
-from polhode._closed_forms._free_constants import _rounded_constants
-from polhode._integrate._switches import _subjaxprs
 
 CASES = json.loads(Path(__file__).with_name("free_cases.json").read_text())
 FAMILIES = sorted({case["family"] for case in CASES})
@@ -214,28 +212,6 @@ def test_single_precision_keeps_its_digits_over_long_times(x64, over_bodies):
     sign = np.sign(np.sum(attitude * exact_attitude, -1, keepdims=True))
     np.testing.assert_allclose(attitude * sign, exact_attitude, atol=5e-7)
     np.testing.assert_allclose(rates, exact_rates, atol=2e-6)
-
-
-def _conversions(jaxpr):
-    """From the dtype of what was converted, of every variable that a conversion made."""
-    found, again = {}, []
-    for equation in jaxpr.eqns:
-        for inner in _subjaxprs(equation):
-            again += _conversions(inner)
-        if equation.primitive.name == "convert_element_type":
-            (given,), (made,) = equation.invars, equation.outvars
-            found[made] = given.aval.dtype
-            again += [(found[given], made.aval.dtype)] if given in found else []
-    return again
-
-
-def test_rates_are_not_rounded_by_a_conversion_there_and_back():
-    """XLA removes one on a GPU, and the digits beyond single precision with it."""
-    double = (jnp.ones(2, jnp.float64),) * 3
-    made = jax.make_jaxpr(_rounded_constants)(double, double, (*double, double[0]))
-    there_and_back = jax.make_jaxpr(lambda x: x - x.astype(jnp.float32).astype(jnp.float64))
-    assert _conversions(there_and_back(double[0]).jaxpr) == [(jnp.float64, jnp.float64)]
-    assert _conversions(made.jaxpr) == []
 
 
 def test_conserved_over_long_times():

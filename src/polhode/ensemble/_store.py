@@ -303,10 +303,13 @@ class Store:
         # write the same to it at the same time.
         expected = make(zarr.create_group(zarr.storage.MemoryStore())).metadata
         with self._write_errors():
+            if not (self.path / name / "zarr.json").exists():
+                with contextlib.suppress(zarr.errors.ContainsArrayError):
+                    make(self.group)
             try:
                 array = self.group[name]
                 is_sound = getattr(array, "metadata", None) == expected
-            except Exception:  # missing, or damaged: its description is read by several libraries
+            except Exception:  # damaged: its description is read by several libraries
                 is_sound = False
             if not is_sound:
                 array = make(self.group, overwrite=True)
