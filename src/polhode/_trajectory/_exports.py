@@ -4,14 +4,29 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from polhode import __version__
+from polhode import __version__, rotation
+from polhode._checks import require
 from polhode._extras import imported
 from polhode._method import Status
 from polhode._scene import Wheels
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
+
+
+def scipy_rotation(wxyz: Any) -> "Rotation":
+    """Attitudes as a SciPy ``Rotation``, which takes no NaN."""
+    missing = int(np.sum(np.isnan(np.asarray(wxyz)[..., 0])))
+    require(
+        missing == 0,
+        f"{missing} attitudes are NaN, those of bodies that did not finish (see status): take the"
+        " others, rotation.wxyz_to_scipy(traj.wxyz[traj.status == 0]).",
+    )
+    return rotation.wxyz_to_scipy(wxyz)
 
 
 def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:

@@ -14,11 +14,11 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from polhode import rotation
 from polhode._batch import PARTS, along_time, map_arrays
-from polhode._checks import ArrayLike, is_concrete, require
+from polhode._checks import ArrayLike, is_concrete
 from polhode._hamiltonian import components, from_quaternion
 from polhode._method import Status, StepCounts
 from polhode._scene import Scene, State, Wheels
-from polhode._trajectory._exports import dataset, write_aem
+from polhode._trajectory._exports import dataset, scipy_rotation, write_aem
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
@@ -490,13 +490,7 @@ class Trajectory(eqx.Module):
         ``Rotation`` in place of a quaternion. Not under ``jit``. Raises ValueError where attitudes
         are NaN, those of bodies that did not finish.
         """
-        missing = int(np.sum(np.isnan(np.asarray(self.wxyz)[..., 0])))
-        require(
-            missing == 0,
-            f"{missing} attitudes are NaN, those of bodies that did not finish (see status): take"
-            " the others, rotation.wxyz_to_scipy(traj.wxyz[traj.status == 0]).",
-        )
-        return rotation.wxyz_to_scipy(self.wxyz)
+        return scipy_rotation(self.wxyz)
 
     def to_xarray(self, labels: Sequence[str] | None = None) -> Any:
         """An ``xarray.Dataset`` with named dimensions, units and attributes (needs xarray).
