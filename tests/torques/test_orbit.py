@@ -155,3 +155,10 @@ def test_pitch_libration_on_a_circular_orbit():
     want, want_slope = jax.value_and_grad(linear)(moments)
     assert abs(value - want) < 1e-8 * small + 2 * small**3 + 1e-11
     assert np.abs(np.array(slope - want_slope)).max() < 1e-3 * small
+
+
+def test_times_that_do_not_broadcast_with_the_orbits_are_named():
+    orbits = ph.KeplerOrbit(1.0, jnp.array([1.0, 2.0, 3.0]), 0.1)
+    assert orbits(jnp.zeros(3)).shape == (3, 3)
+    with pytest.raises(ValueError, match=r"KeplerOrbit: .*\(3,\).*; ts: \[\(5,\)\]"):
+        orbits(jnp.zeros(5))

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._batch import along_time
+from polhode._batch import along_time, common_batch
 from polhode._checks import (
     ArrayLike,
     as_float_array,
@@ -273,7 +273,9 @@ class KeplerOrbit(AbstractOrbit):
         )
 
     def __call__(self, t: Array | float) -> Float[Array, "*b 3"]:
-        return _place(self, jnp.asarray(t) if isinstance(t, list | tuple) else t)
+        t = jnp.asarray(t) if isinstance(t, list | tuple) else t
+        common_batch(self, extra=(jnp.shape(t),))  # raises where they do not broadcast
+        return _place(self, t)
 
     @property
     def mean_motion(self) -> Array:
