@@ -179,9 +179,9 @@ def prepare(moments, wxyz, omega, products=None, *, compensated: bool = False) -
     components share one shape, the batch. ``compensated``: the frequencies in sums of two floats,
     for long horizons.
     """
-    moments, omega = as_components(moments, 3), as_components(omega, 3)
-    products = None if products is None else as_components(products, 3)
-    wxyz = None if wxyz is None else as_components(wxyz, 4)
+    moments, omega = as_components(moments), as_components(omega)
+    products = None if products is None else as_components(products)
+    wxyz = None if wxyz is None else as_components(wxyz)
     constants_of = compensated_constants if compensated else motion_constants
     return FreeConstants(moments, products, omega, wxyz, *constants_of(moments, omega, wxyz))
 
@@ -239,10 +239,10 @@ def free_motion(
     rates lose the ratio of a radian to the angle turned through, except at rest.
     """
     parts = (
-        as_components(moments, 3),
-        as_components(wxyz, 4) if attitude else None,
-        as_components(omega, 3),
-        None if products is None else as_components(products, 3),
+        as_components(moments),
+        as_components(wxyz) if attitude else None,
+        as_components(omega),
+        None if products is None else as_components(products),
     )
 
     t = jnp.asarray(t)

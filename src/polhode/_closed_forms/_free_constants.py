@@ -42,7 +42,7 @@ Scalars = Float[Array, "*b"]
 Triple = tuple[Scalars, Scalars, Scalars]
 
 
-def as_components(values, count: int) -> tuple[Scalars, ...]:
+def as_components(values) -> tuple[Scalars, ...]:
     """A tuple of component arrays, from one or from an array with the components last."""
     if isinstance(values, tuple | list):
         return tuple(values)

@@ -79,8 +79,8 @@ def principal_periods(moments, omega, products=None) -> Periods:
     ``products`` as in `prepare`. Formulas: Landau & Lifshitz, Mechanics, section 37, in the L
     convention of Samarasinha & A'Hearn, Icarus 93 (1991).
     """
-    moments, omega = as_components(moments, 3), as_components(omega, 3)
-    products = None if products is None else as_components(products, 3)
+    moments, omega = as_components(moments), as_components(omega)
+    products = None if products is None else as_components(products)
     values, mode = _periods((moments, products, omega))
     P_psi, P_phi, k2, low, high = values
     return Periods(P_psi, P_phi, mode, k2, low, high)

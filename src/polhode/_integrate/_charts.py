@@ -133,7 +133,7 @@ class LiePoissonChart(AbstractChart):
 
     def finish(self, scene, y, t):
         momentum, wxyz, *spins = _as_numbers(y)
-        omega = scene.with_spins(*map(_apart, spins)).rates(momentum, t)
+        omega = scene.with_spins(*(jnp.unstack(x, axis=-1) for x in spins)).rates(momentum, t)
         if self.upright:
             turn, _ = _upright(scene.potential)
             wxyz = _rotate(turn, wxyz)
@@ -144,10 +144,6 @@ def _as_numbers(y: PyTree[Array]) -> list[Array]:
     """The groups of a state as arrays (..., n), in programs of derivatives with numbers in place of
     NaN: see ``_failed``."""
     return [numbers(jnp.stack(group, axis=-1), 1.0) for group in y]
-
-
-def _apart(x: Array) -> tuple[Array, ...]:
-    return jnp.unstack(x, axis=-1)
 
 
 def _rotate(turn: Array, wxyz: Array) -> Array:
@@ -211,7 +207,7 @@ class EulerChart(AbstractChart):
         return (q, tuple(jnp.where(sound, x, 0) for x in p), *_spins(scene, state)), sound
 
     def finish(self, scene, y, t):
-        q, p, *spins = map(_apart, _as_numbers(y))
+        q, p, *spins = (jnp.unstack(x, axis=-1) for x in _as_numbers(y))
         momentum = jnp.stack(momentum_from_canonical(q, p), axis=-1)
         omega = scene.with_spins(*spins).rates(momentum, t)
         return euler_to_wxyz(*q), omega, _away_from_poles(q)

@@ -308,7 +308,7 @@ class Store:
                     make(self.group)
             try:
                 array = self.group[name]
-                is_sound = getattr(array, "metadata", None) == expected
+                is_sound = array.metadata == expected
             except Exception:  # damaged: its description is read by several libraries
                 is_sound = False
             if not is_sound:
