@@ -461,7 +461,19 @@ def test_events_of_a_simulation_in_order_of_time():
     assert traj[1].events.count == 2
 
 
-@pytest.mark.slow  # by the same rule in closed form: test_event_times_have_derivatives
+def test_the_end_of_a_motion_in_steps_has_a_derivative():
+    """Without ``jit``, as a user takes it first."""
+    state = ph.State([1.0, 0, 0, 0], [0.0, 0, 1.0])
+
+    def time(rate):
+        return ph.simulate(slowing(rate=rate), state, [0.0, 15.0], until=below(0.5)).event_time
+
+    value, slope = jax.value_and_grad(time)(0.1)
+    np.testing.assert_allclose(value, 10 * np.log(2), rtol=1e-9)
+    np.testing.assert_allclose(slope, -100 * np.log(2), rtol=1e-7)
+
+
+@pytest.mark.slow  # of one event: above
 def test_times_of_events_of_a_motion_in_steps_have_derivatives():
     events = [below(0.5), below(0.8), below(0.3, terminal=True), below(0.2)]
     state = ph.State([1.0, 0, 0, 0], jnp.array([[0.0, 0, 1.0], [0.0, 0, 2.0]]))

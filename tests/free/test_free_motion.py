@@ -187,8 +187,15 @@ def test_a_sphere_has_no_axis_that_the_momentum_may_not_be_across():
         np.testing.assert_allclose(turned, exact, atol=2 * np.finfo(dtype).eps)
 
 
-@pytest.mark.parametrize("over_bodies", [False, True], ids=["batch", "vmap"])
-@pytest.mark.parametrize("x64", [True, False], ids=["x64", "default"])
+@pytest.mark.parametrize(
+    ("x64", "over_bodies"),
+    [
+        pytest.param(True, False, id="x64-batch"),
+        pytest.param(True, True, id="x64-vmap", marks=pytest.mark.slow),
+        pytest.param(False, False, id="default-batch", marks=pytest.mark.slow),
+        pytest.param(False, True, id="default-vmap"),
+    ],
+)
 def test_single_precision_keeps_its_digits_over_long_times(x64, over_bodies):
     """Against double precision, 1e4 rad on; in both modes of JAX, whose transformations drop double
     precision in one of them."""

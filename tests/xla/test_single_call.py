@@ -314,6 +314,22 @@ def test_stages_stay_under_vmap_and_in_derivatives():
     assert " divide(" in directions
 
 
+def test_a_derivative_that_no_unit_can_hold_is_none():
+    """XLA's units know no sort: one in a rule of derivatives alone ended the first gradient."""
+
+    @jax.custom_jvp
+    def total(x):
+        return jnp.sum(x)
+
+    @total.defjvp
+    def rule(primals, tangents):
+        return total(*primals), jnp.dot(jnp.sort(primals[0]), tangents[0])
+
+    x = jnp.array([0.7, 0.3, 0.5])
+    for way in (jax.grad, jax.jacfwd, lambda f: jax.jit(jax.grad(f))):
+        np.testing.assert_array_equal(way(jax.jit(kernel(total, linearised=True)))(x), jnp.sort(x))
+
+
 def test_units_within_a_unit():
     """They stay units, in its derivatives too; a known table stands inside."""
     table, wide = jnp.arange(3.0), jnp.arange(2000.0)

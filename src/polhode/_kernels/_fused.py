@@ -280,15 +280,19 @@ def _unit(
             operands = dict(enumerate(operands)) | dict(zip(active_places, values, strict=True))
             return flat(*operands.values())
 
-        # A derivative of the coefficients takes twice as long to compile as one of the formulas.
-        is_higher_order = any(isinstance(x, ad.JVPTracer) for x in leaves)
         if repeated:
             value = unit(*leaves)
             return value, _of_units(of_active, active_places, leaves, tangents, value)
-        if is_higher_order or not linearised:
+
+        def without_units():
             arguments = [leaves[k] for k in active_places], [tangents[k] for k in active_places]
             values, slopes = jax.jvp(lambda *x: of_active(leaves, x), *arguments)
             return _batched_alike(values, leaves), slopes
+
+        # A derivative of the coefficients takes twice as long to compile as one of the formulas.
+        is_higher_order = any(isinstance(x, ad.JVPTracer) for x in leaves)
+        if is_higher_order or not linearised:
+            return without_units()
         # ``jax.linearize`` within the unit: values and coefficients leave it as results, and the
         # linear map alone is left outside, where JAX can transpose it.
         shape = []
@@ -302,6 +306,8 @@ def _unit(
             return [*value, *coefficients, jnp.zeros((), jnp.float32)]
 
         linearisation = jax.make_jaxpr(value_and_coefficients)(*leaves)
+        if not is_holdable(linearisation.jaxpr):  # a rule may hold what the value does not, a sort
+            return without_units()
         tree, count = shape
         exempt_count = len(linearisation.out_avals) - 1 - count
         of_all = _unit(
