@@ -583,7 +583,18 @@ def test_events_share_their_places_in_closed_form_too(capacities, terminal):
         assert int(traj.events.count) > places
 
 
-@pytest.mark.parametrize("depth", [0.3, 0.999999])
+def test_an_event_at_the_time_of_a_terminal_one_is_listed():
+    """Also where the terminal one stands first."""
+    ends = ph.Event(lambda wxyz, omega, t: t - 2.5, samples=50, terminal=True)
+    same = ph.Event(lambda wxyz, omega, t: 2.5 - t, samples=50)
+    scene = ph.Scene(ph.Inertia.spherical(2.0))
+    state = ph.State([1.0, 0.2, 0.1, 0.3], [0.6, 1.1, -0.4])
+    found = ph.simulate(scene, state, [0.0, 6.0], events=[ends, same]).events
+    np.testing.assert_allclose(found.times[:2], 2.5, atol=1e-12)
+    assert sorted(found.which[:2].tolist()) == [0, 1]
+
+
+@pytest.mark.parametrize("depth", [pytest.param(0.3, marks=pytest.mark.slow), 0.999999])
 def test_a_motion_in_closed_form_stops_at_its_first_event(depth):
     """Also at one of two crossings between two looks, which only the turning point shows."""
     scene, state = ph.Scene(ph.Inertia.spherical(2.0)), ph.State([1.0, 0, 0, 0], [0.0, 0.0, 1.0])

@@ -172,6 +172,18 @@ def as_positive(name: str, value: Any, **options: Any) -> Array:
     return number
 
 
+def batch_of(**arguments: tuple[Array, int]) -> tuple[int, ...]:
+    """The common batch axes of arrays ``name=(array, number of trailing axes)``.
+
+    Raises ValueError that names all shapes where they do not broadcast together.
+    """
+    try:
+        return np.broadcast_shapes(*(x.shape[: x.ndim - tail] for x, tail in arguments.values()))
+    except ValueError as error:
+        shapes = ", ".join(f"{name} {x.shape}" for name, (x, _) in arguments.items())
+        raise ValueError(f"the batch axes must broadcast together, got {shapes}.") from error
+
+
 def as_floats(
     *, finite: bool = True, **arguments: tuple[Any, tuple[int | None, ...]]
 ) -> tuple[Array, ...]:
@@ -195,12 +207,7 @@ def as_floats(
             common = jnp.promote_types(common, kind)
         arrays = [array.astype(common) for array in arrays]
     tails = [len(suffix) for _, suffix in arguments.values()]
-    leading = [array.shape[: array.ndim - tail] for array, tail in zip(arrays, tails)]
-    try:
-        batch = jnp.broadcast_shapes(*leading)
-    except ValueError as error:
-        shapes = ", ".join(f"{name} {array.shape}" for name, array in zip(arguments, arrays))
-        raise ValueError(f"the batch axes must broadcast together, got {shapes}.") from error
+    batch = batch_of(**dict(zip(arguments, zip(arrays, tails))))
     return tuple(
         jnp.broadcast_to(array, (*batch, *array.shape[array.ndim - tail :]))
         for array, tail in zip(arrays, tails)

@@ -210,6 +210,7 @@ def test_prediction_is_the_exact_motion_and_differentiable(cases):
         ([0, 1, 2, 3], np.full((4, 3), np.nan), "without NaN"),
         ([0, 1, 2, 3], np.full((4, 3), np.inf), "infinity"),
         ([0, 1, 2, 3], np.full((4, 3), 200.0), "deg/s"),
+        (np.arange(20.0), np.eye(20)[:, [7, 0, 0]] * 50, "sample 7 would turn .* an outlier"),
     ],
 )
 def test_bad_recordings_are_refused(times, rates, message):

@@ -153,6 +153,14 @@ def test_derivatives_at_the_identity_are_right():
     np.testing.assert_allclose(through, np.zeros((3, 3, 3)), atol=1e-15)
 
 
+@pytest.mark.parametrize("scale", [1e-18, 1e18])
+def test_the_derivative_of_a_rotation_vector_follows_the_scale(scale):
+    """Of quaternions in single precision, powers of whose length would overflow."""
+    wxyz = jnp.array([0.1, -0.5, 0.3, 0.8], jnp.float32)
+    slopes = jax.jit(jax.jacfwd(rotation.wxyz_to_rotation_vector))
+    np.testing.assert_allclose(scale * slopes(scale * wxyz), slopes(wxyz), rtol=2e-6)
+
+
 def test_an_euler_angle_gradient_is_smooth_at_no_rotation():
     """From ZYZ angles at theta = 0 to the rotation vector and back to a scalar: no NaN, right."""
     jacobian = jax.jacrev(rotation.euler_to_rotation_vector, argnums=(0, 1, 2))

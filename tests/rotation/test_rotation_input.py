@@ -56,6 +56,15 @@ def test_half_precision_is_looked_at_as_any_other():
             r"vector must have shape \(\.\.\., 3\)",
         ),
         (lambda: rotation.euler_to_wxyz(np.ones(2), np.ones(3), 0.1), "broadcast together"),
+        (
+            lambda: rotation.rotate(np.ones((3, 4)) / 2, np.ones((2, 3))),
+            r"broadcast together, got wxyz \(3, 4\), vector \(2, 3\)",
+        ),
+        (lambda: rotation.multiply(np.ones((3, 4)), np.ones((2, 4))), r"left \(3, 4\), right"),
+        (
+            lambda: rotation.axis_angle_to_wxyz(np.eye(3)[:2], np.ones(3)),
+            r"axis \(2, 3\), angle \(3,\)",
+        ),
     ],
 )
 def test_wrong_lengths_and_shapes(take, word):

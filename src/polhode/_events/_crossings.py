@@ -74,7 +74,8 @@ def crossings(
     Times are as accurate as the motion: to rounding for closed forms, to ``rtol`` over the
     derivative of the function for integrated motions. Times and ``slope`` have first and second
     derivatives, by the implicit function theorem; third derivatives raise. A zero at the first time
-    (within 1e-6 of the time between two samples) does not count as a crossing.
+    (within 1e-6 of the time between two samples) does not count as a crossing; one exactly at the
+    last time may not either: let the times go on past it.
 
     The function and its derivative are sampled 32 times per revolution of the fastest natural rate,
     the largest of |L| over the smallest moment at the saved samples and of the rate of gravity. If

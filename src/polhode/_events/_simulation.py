@@ -158,7 +158,8 @@ def _in_order_of_time(trajectory: Trajectory, met: Met, events: Sequence[Event])
     states = [jnp.take_along_axis(x, order[..., None], axis=1)[:, :capacity] for x in states]
     # what lies beyond a terminal event does not happen
     is_terminal = jnp.isfinite(at) & _is_terminal(which, events)
-    at = jnp.where(jnp.cumsum(is_terminal, axis=1) - jnp.where(is_terminal, 1, 0) > 0, jnp.inf, at)
+    stop = jnp.min(jnp.where(is_terminal, sign * at, jnp.inf), axis=1, keepdims=True)
+    at = jnp.where(sign * at > stop, jnp.inf, at)
     happens = jnp.isfinite(at)
     count = jnp.sum(happens, axis=1, dtype=jnp.int32)
     for k, (found, total) in enumerate(zip(times, counts, strict=True)):

@@ -473,7 +473,7 @@ class RotatingFrame(eqx.Module):
 
     def euler(self, t: Time, position: Vector, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
         """Euler force [N], ``-mass d(omega)/dt x r``; plain zeros for a constant rate."""
-        slope = self._rates(t)[1]
+        slope, position = self._rates(t)[1], as_vectors("position", position)
         if slope is None:
             return jnp.zeros_like(position)
         return _times(mass, -_cross(slope, position))

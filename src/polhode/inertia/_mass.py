@@ -14,6 +14,7 @@ from polhode._checks import (
     ArrayLike,
     as_float_array,
     as_floats,
+    batch_of,
     is_concrete,
     require,
     require_positive,
@@ -193,7 +194,7 @@ class MassProperties(AbstractShaped):
     def about(self, point: ArrayLike) -> Inertia:
         """Inertia about a fixed ``point`` (..., 3) of the body, m (parallel-axis theorem)."""
         at = as_float_array("point", point, (3,)).astype(self.mass.dtype)
-        batch = jnp.broadcast_shapes(at.shape, self.centre.shape)
+        batch = (*batch_of(point=(at, 1), centre=(self.centre, 1)), 3)
         shift = jnp.broadcast_to(self.centre, batch) - jnp.broadcast_to(at, batch)
         return Inertia.from_tensor(
             _sum(self.central.tensor, offset(jnp.broadcast_to(self.mass, batch[:-1]), shift))

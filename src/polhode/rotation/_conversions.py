@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._checks import ArrayLike, as_floats, as_vectors
+from polhode._checks import ArrayLike, as_float_array, as_floats, as_vectors, batch_of
 from polhode.rotation._quaternion import as_axes, as_matrices, as_quaternions, canonical, matrix_row
 from polhode.rotation._scalar import arc_ratio, cosine, direction, largest, length, sine_ratio
 
@@ -107,8 +107,8 @@ def axis_angle_to_wxyz(
     Raises ValueError for an axis that is known not to be of unit length.
     """
     axis = as_axes("axis", axis)
-    half = jnp.asarray(angle, axis.dtype) / 2
-    shape = jnp.broadcast_shapes(axis.shape[:-1], half.shape)
+    half = as_float_array("angle", angle, finite=False).astype(axis.dtype) / 2
+    shape = batch_of(axis=(axis, 1), angle=(half, 0))
     half = jnp.broadcast_to(half, shape)[..., None]
     axis = jnp.broadcast_to(axis, (*shape, 3))
     return jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], axis=-1)

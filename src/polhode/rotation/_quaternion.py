@@ -25,6 +25,7 @@ from polhode._checks import (
     ArrayLike,
     as_float_array,
     as_vectors,
+    batch_of,
     describe,
     is_concrete,
     on_host,
@@ -142,7 +143,9 @@ def multiply(
     left: Float[ArrayLike, "*#b 4"], right: Float[ArrayLike, "*#b 4"]
 ) -> Float[Array, "*b 4"]:
     """Hamilton product ``left right``: the rotation ``right`` followed by ``left``."""
-    return _product(as_vectors("left", left, 4), as_vectors("right", right, 4))
+    left, right = as_vectors("left", left, 4), as_vectors("right", right, 4)
+    batch_of(left=(left, 1), right=(right, 1))
+    return _product(left, right)
 
 
 @jax.jit  # one program, not one for each operation; likewise below
@@ -173,7 +176,9 @@ def rotate(
 
     Raises ValueError for a quaternion that is known not to be of unit length.
     """
-    return _rotated(as_quaternions(wxyz, unit=True), as_vectors("vector", vector, 3))
+    wxyz, vector = as_quaternions(wxyz, unit=True), as_vectors("vector", vector, 3)
+    batch_of(wxyz=(wxyz, 1), vector=(vector, 1))
+    return _rotated(wxyz, vector)
 
 
 @jax.jit

@@ -171,7 +171,7 @@ def _arc_ratio_jvp(primals, tangents):
     (scalar, vector), (scalar_tangent, vector_tangent) = primals, tangents
     norm = length(jnp.concatenate([scalar[..., None], vector], axis=-1))
     slope = jnp.polyval(jnp.asarray(_ARC_SLOPE[::-1], scalar.dtype), 2 * (scalar / norm) - 1)
-    by_square = slope / norm**3
-    by_scalar = -1 / norm**2
-    change = by_scalar * scalar_tangent + 2 * by_square * _dot(vector, vector_tangent)
+    # one division after the other: powers of the length overflow in single precision from 1e13 on
+    along = _dot(vector / norm[..., None], vector_tangent)
+    change = (2 * slope * along - scalar_tangent) / norm / norm
     return arc_ratio(scalar, vector), change
