@@ -81,6 +81,32 @@ def test_at_any_time(name):
     assert np.isnan(with_nan.wxyz[1]).all()
 
 
+def between_samples(scene):
+    return ph.simulate(scene, STATE, [0.0, 1.0, 2.0]).at([1.6, 0.7]).omega_body
+
+
+def legs(scene):
+    def leg(state, _):
+        end = ph.simulate(scene, state, [0.0, 1.0]).last
+        return end, end.omega_body
+
+    return jax.lax.scan(leg, STATE, None, length=2)[1]
+
+
+@pytest.mark.slow  # in loops of JAX; by units alone: tests/xla/test_single_call.py
+@pytest.mark.parametrize("rates", [between_samples, legs])
+def test_second_derivatives_in_loops(rates):
+    def total(moments):
+        damping = ph.LinearDamping(0.1)
+        return jnp.sum(rates(ph.Scene(ph.Inertia.from_moments(moments), torque=damping)))
+
+    slope, moments = jax.jit(jax.grad(total)), jnp.array(MOMENTS)
+    steps = 1e-4 * np.eye(3)
+    want = np.stack([(slope(moments + d) - slope(moments - d)) / 2e-4 for d in steps])
+    found = jax.jit(jax.hessian(total))(moments)
+    np.testing.assert_allclose(found, want, rtol=0, atol=1e-6 * np.abs(want).max())
+
+
 @pytest.mark.slow  # derivatives at saved times: tests/systems
 @pytest.mark.parametrize("name", ["free", "top"])
 def test_derivatives_of_a_motion_at_a_time(name):

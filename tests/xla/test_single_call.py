@@ -330,6 +330,22 @@ def test_a_derivative_that_no_unit_can_hold_is_none():
         np.testing.assert_array_equal(way(jax.jit(kernel(total, linearised=True)))(x), jnp.sort(x))
 
 
+@pytest.mark.parametrize("how", [{"linearised": True}, {"repeated": True}, {"of_units": True}])
+def test_second_derivatives_of_units_in_a_loop(how):
+    """JAX traces the first one of a loop's body without knowing that there will be a second."""
+
+    def plain(x):
+        return jnp.sin(x) ** 2 * jnp.exp(x)
+
+    def total(fn):
+        return lambda x: jnp.sum(jax.lax.map(fn, jnp.stack([x, 2 * x])) ** 2)
+
+    x = jnp.array([0.3, 0.5])
+    for outer, inner in ((jax.jacfwd, jax.jacrev), (jax.jacrev, jax.jacfwd)):
+        found, want = (jax.jit(outer(inner(total(fn))))(x) for fn in (kernel(plain, **how), plain))
+        np.testing.assert_allclose(found, want, rtol=1e-13)
+
+
 def test_units_within_a_unit():
     """They stay units, in its derivatives too; a known table stands inside."""
     table, wide = jnp.arange(3.0), jnp.arange(2000.0)

@@ -17,7 +17,7 @@ from jax.interpreters import ad, batching, mlir, partial_eval
 from jax.sharding import AxisType
 
 from polhode import _policy
-from polhode._kernels._derivatives import linear
+from polhode._kernels._derivatives import is_slope, linear
 
 _HOLDABLE = frozenset(
     """abs acos acosh add add_any and asin asinh atan atan2 atanh attached bitcast_convert_type
@@ -518,5 +518,19 @@ def _depend_on(program: Callable, arrays: Sequence[Any], dims: Sequence[int | No
     return [not isinstance(v, Literal) and v in dependent for v in jaxpr.outvars]
 
 
+def _unit_jvp(arrays, tangents, *, program, **_):
+    """Of a derivative that JAX has traced without knowing that it will be differentiated again, as
+    in a loop: that of the formulas."""
+    at = [k for k, x in enumerate(tangents) if is_slope(x)]
+
+    def of_active(*values):
+        return list(program(*(dict(enumerate(arrays)) | dict(zip(at, values))).values()))
+
+    values, slopes = jax.jvp(of_active, [arrays[k] for k in at], [tangents[k] for k in at])
+    zero = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in values]
+    return values, [x if is_slope(x) else z for x, z in zip(slopes, zero)]
+
+
+ad.primitive_jvps[_unit_p] = _unit_jvp
 mlir.register_lowering(_unit_p, mlir.lower_fun(_unit_lowered, multiple_results=True))
 batching.primitive_batchers[_unit_p] = _unit_batch
