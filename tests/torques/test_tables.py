@@ -283,3 +283,25 @@ def test_bodies_with_tables_of_their_own():
     each = [final(x)[0] for x in values]
     np.testing.assert_allclose(wxyz, np.stack(each), atol=1e-9)
     np.testing.assert_allclose(balance[:, 1], balance[:, 0], rtol=1e-9)
+
+
+def test_mapped_gradients_go_back_through_the_steps_of_each_body():
+    """More bodies than a unit holds, those with strong torques in more steps than others: of a
+    sphere with damping, w' = (p torque - c w) / I."""
+    times, moment, drag = np.linspace(0.0, 1.0, 5), 2.0, 0.5
+    torques = np.stack([np.sin(3 * times), 1 - times, times**2], axis=-1)
+
+    def end(rates, strength):
+        torque = ph.BodyTorque(ph.Table(times, strength * torques, 1)) + ph.LinearDamping(drag)
+        scene = ph.Scene(ph.Inertia.spherical(moment), torque=torque)
+        motion = ph.simulate(scene, ph.State([1.0, 0.0, 0.0, 0.0], rates), [0.0, 1.0])
+        return jnp.sum(motion.omega_body[-1])
+
+    strengths = jnp.linspace(0.1, 60.0, 20)
+    rates = jnp.outer(strengths, jnp.array([0.3, 0.4, 0.5]))
+    by_rates, by_strength = jax.jit(jax.vmap(jax.grad(end, argnums=(0, 1))))(rates, strengths)
+    np.testing.assert_allclose(by_rates, np.exp(-drag / moment), rtol=1e-8)
+    fine = np.linspace(0.0, 1.0, 20001)
+    pull = sum(np.interp(fine, times, torques[:, k]) for k in range(3))
+    want = np.trapezoid(pull * np.exp(-drag * (1 - fine) / moment), fine) / moment
+    np.testing.assert_allclose(by_strength, want, rtol=1e-7)

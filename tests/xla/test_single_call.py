@@ -346,6 +346,18 @@ def test_second_derivatives_of_units_in_a_loop(how):
         np.testing.assert_allclose(found, want, rtol=1e-13)
 
 
+@pytest.mark.parametrize("bodies", [4, 20])
+def test_a_batch_of_units_updates_slices_at_places_of_its_own(bodies):
+    """Which ``vmap`` turns into a scatter, which no unit can hold."""
+
+    def updated(x, place):
+        return jax.lax.dynamic_update_slice(jnp.sin(x), 2 * x[:1], (place,))
+
+    x, places = jnp.linspace(0.0, 1.0, 100).reshape(20, 5)[:bodies], jnp.arange(bodies) % 5
+    found, want = (jax.jit(jax.vmap(fn))(x, places) for fn in (kernel(updated), updated))
+    np.testing.assert_allclose(found, want, rtol=1e-14)
+
+
 def test_units_within_a_unit():
     """They stay units, in its derivatives too; a known table stands inside."""
     table, wide = jnp.arange(3.0), jnp.arange(2000.0)

@@ -302,7 +302,11 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums, record
         turns = count - number * length
 
         def back(i, carry):
-            note = sound(finished, entry(notes, turns - 1 - i))
+            place = turns - 1 - i
+            note = entry(notes, place)
+            if record is not None:
+                note = choose(place < recorded_turns, note, record.last)
+            note = sound(finished, note)
             return _step_back(motion, floats, start, times, cotangents, finished, note, *carry)
 
         carry = jax.lax.fori_loop(0, turns, back, (after, later, *sums_so_far))
@@ -316,6 +320,9 @@ def _backward(motion, options, floats, start, times, y, cotangents, sums, record
         # A record of all turns: the loop finds that every body has stopped, and takes none.
         room = record.notes.elapsed.shape[0]
         is_complete = most_of(record.turns) <= room
+        # Under ``vmap`` bodies may have been integrated a part at a time, each with turns of its
+        # own: after these they stand still, while others go on.
+        recorded_turns = jnp.where(is_complete, record.turns, _NEVER)
         notes = jax.tree.map(lambda x, r: jnp.concatenate([r, x[room:]]), notes, record.notes)
         count = jnp.where(is_complete, most_of(record.turns), 0)
         levels = record.last.levels.astype(y.dtype)

@@ -215,13 +215,22 @@ def _is_of_use() -> bool:
     return by_hand or jax.device_count() == 1
 
 
-def is_holdable(jaxpr: Any) -> bool:
-    """Whether a unit can hold this program."""
+def is_holdable(jaxpr: Any, batched: bool = False) -> bool:
+    """Whether a unit can hold this program, which ``vmap`` has made if it is ``batched``."""
     return not _sums_widely(jaxpr) and all(
-        all(equation.primitive.name in _HOLDABLE for equation in program.eqns)
+        all(
+            equation.primitive.name in _HOLDABLE or (batched and _updates_slice(equation))
+            for equation in program.eqns
+        )
         and all(_is_packable(v.aval.dtype) for v in (*program.invars, *program.constvars))
         for program in _programs(jaxpr)
     )
+
+
+def _updates_slice(equation: Any) -> bool:
+    """Whether it is the scatter that ``vmap`` makes of a slice's update at one place for all, which
+    XLA turns back into such an update."""
+    return equation.primitive.name == "scatter" and equation.invars[1].aval.ndim == 1
 
 
 def _sums_widely(jaxpr: Any) -> bool:
@@ -481,6 +490,10 @@ def _unit_batch(arrays, dims, *, program, shapes, of_units):
     size = next(x.shape[d] for x, d in zip(arrays, dims) if d is not None)
     places = [k for k, d in enumerate(dims) if d is not None]
 
+    def unit_of_one(lane):
+        whole = dict(enumerate(arrays)) | dict(zip(places, lane))
+        return _unit_p.bind(*whole.values(), program=program, shapes=shapes, of_units=False)
+
     def unit_of(lanes):
         whole = list(arrays)
         for k, x in zip(places, lanes):
@@ -491,6 +504,8 @@ def _unit_batch(arrays, dims, *, program, shapes, of_units):
         batch = jaxpr_as_fun(closed_jaxpr)
         if _sums_widely(closed_jaxpr.jaxpr):
             return batch(*whole)
+        if not is_holdable(closed_jaxpr.jaxpr, batched=True):  # a slice at a place of each body
+            return jax.lax.map(unit_of_one, lanes)
 
         def batched_program(*arrays):
             with set_xla_metadata(xla_cpu_small_call=None, inlineable=None):
