@@ -1,5 +1,6 @@
 """Batches: leading axes of every array are broadcast, flattened to one axis of N lanes, and
-put back; a batch that lies on several devices is moved where it lies.
+put back; a batch that lies on several devices is moved where it lies. Bodies and times are chosen
+by keys.
 
 A part (inertia, state, potential, ...) tells the rank that each of its array fields has without
 batch axes in ``core_ranks``; parts made of other parts keep them in ``terms``.
@@ -229,3 +230,70 @@ def on_devices(
 
 def _is_spec(x: Any) -> bool:
     return isinstance(x, PartitionSpec)
+
+
+# Keys: a trajectory is indexed as an array of samples, bodies first, then times.
+
+
+def is_integer(key: Any) -> bool:
+    """Whether a key is one number, which takes an axis away."""
+    if isinstance(key, bool | np.bool_):
+        return False
+    if hasattr(key, "shape"):
+        return key.shape == () and np.issubdtype(key.dtype, np.integer)
+    return isinstance(key, int | np.integer)
+
+
+def _entry(key: Any) -> Any:
+    """One entry of a key, lists as arrays."""
+    if key is Ellipsis or isinstance(key, slice) or is_integer(key):
+        return key
+    array = key if isinstance(key, jax.Array) else np.asarray(key)
+    if array.ndim and (array.dtype == np.bool_ or np.issubdtype(array.dtype, np.integer)):
+        return array
+    raise IndexError(
+        "a trajectory is indexed by integers, slices, ... and arrays of integers or truth values,"
+        f" bodies first and then times, got {key!r:.60}; for the motion at a time in seconds use"
+        " traj.at(t)."
+    )
+
+
+def _axes_of(key: Any) -> int:
+    """Axes that an entry stands for."""
+    return key.ndim if getattr(key, "dtype", None) == np.bool_ else 1
+
+
+def split_key(key: Any, rank: int) -> tuple[tuple[Any, ...], Any]:
+    """Entries of the ``rank`` axes of bodies, and the entry of the times."""
+    entries = [_entry(k) for k in (key if isinstance(key, tuple) else (key,))]
+    dots = [i for i, k in enumerate(entries) if k is Ellipsis]
+    count = sum(_axes_of(k) for k in entries if k is not Ellipsis)
+    if len(dots) > 1 or count > rank + 1:
+        raise IndexError(
+            f"this trajectory has {rank + 1} axes to index, {rank} of bodies and one of times, got"
+            f" {len(entries)} entries."
+        )
+    place = dots[0] if dots else len(entries)
+    full_key = entries[:place] + [slice(None)] * (rank + 1 - count) + entries[place + 1 :]
+    *bodies, times = full_key
+    if _axes_of(times) != 1:
+        raise IndexError("truth values that choose samples must have one axis, that of the times.")
+    return tuple(bodies), times
+
+
+def ends_at_last(times: tuple[Any, ...]) -> bool:
+    """Whether the entry of the times chooses the last sample as its last one, whatever T is."""
+    (key,) = times
+    return isinstance(key, slice) and key.stop is None and key.step in (None, 1)
+
+
+def check_key(key: Any, shape: tuple[int, ...], what: str) -> None:
+    """IndexError for a known key outside the shape, where JAX would take the nearest entry."""
+    if not is_concrete(key):
+        return
+    concrete = key if isinstance(key, tuple) else (key,)
+    concrete = tuple(k if isinstance(k, slice) else np.asarray(k) for k in concrete)
+    try:
+        np.broadcast_to(np.int8(0), shape)[concrete]
+    except IndexError as error:
+        raise IndexError(f"there are {what} of shape {shape}, got {key!r:.60}: {error}.") from None

@@ -534,8 +534,8 @@ def _depend_on(program: Callable, arrays: Sequence[Any], dims: Sequence[int | No
 
 
 def _unit_jvp(arrays, tangents, *, program, **_):
-    """Of a derivative that JAX has traced without knowing that it will be differentiated again, as
-    in a loop: that of the formulas."""
+    """The derivative of a unit, that of its formulas. It is asked for where JAX has traced one
+    derivative without knowing of a second, as in a loop."""
     at = [k for k, x in enumerate(tangents) if is_slope(x)]
 
     def of_active(*values):
