@@ -313,12 +313,12 @@ def _check_rates(omega, times):
     # a gap in an otherwise dense recording
     if 0 < np.sum(worst > _TURN_PER_SAMPLE) <= 0.1 * worst.size:
         place = int(np.argmax(worst))
-        intervals = np.abs(np.diff(np.asarray(times), axis=-1)).reshape(flat.shape)
+        intervals = np.abs(np.diff(np.asarray(times), axis=-1)).reshape(-1, worst.size)
         if intervals[:, place].max() > 1.5 * np.median(intervals):
             raise ValueError(
                 f"times leave a gap after sample {place}, in which the body turns by some "
-                f"{worst[place]:.3g} rad: cut the recording there and give the pieces as recordings "
-                "of one body (fit_recordings)."
+                f"{worst[place]:.3g} rad: cut the recording there and give the pieces as "
+                "recordings of one body (fit_recordings)."
             )
         raise ValueError(
             f"omega_body of sample {place + 1} would turn the body by {worst[place]:.3g} rad within"
