@@ -250,7 +250,7 @@ def save(figure, path: Path) -> Path:
     """Write a figure, whole or not at all, without anything that changes from run to run."""
     import matplotlib.pyplot as plt
 
-    from polhode.files._write import atomic_write
+    from polhode._atomic import atomic_write
 
     path.parent.mkdir(parents=True, exist_ok=True)
     quiet = {"svg.hashsalt": "polhode", "svg.fonttype": "path"}

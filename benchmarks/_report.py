@@ -145,7 +145,7 @@ def write(
     ``path``: a file; None: ``out/benchmarks/<name>.json``. ``packages``: peers whose versions to
     record beside ours. Not-a-number and infinite values become null. Whole or not at all.
     """
-    from polhode.files._write import atomic_write
+    from polhode._atomic import atomic_write
 
     path = OUT / f"{name}.json" if path is None else Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)

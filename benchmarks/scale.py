@@ -354,8 +354,8 @@ def model() -> str:
         "",
         f"One core: {cost['ns_per_body']:.0f} ns per body and {cost['ns_per_state']:.0f} ns per"
         f" saved state of {cost['bytes_per_state']} bytes, that is {rate:.2g} GB/s when many times"
-        f" are saved. That disk takes {disk:.2g} GB/s: from {disk / rate:.1f} cores on the store is"
-        " what one waits for.",
+        f" are saved. That disk takes {disk:.2g} GB/s: with more than {disk / rate:.1f} cores the"
+        " disk is the bottleneck.",
         "",
         _others(*(_report.read(f"scale_{name}")["numbers"] for name in ("kills", "devices"))),
     ]
@@ -363,14 +363,14 @@ def model() -> str:
 
 
 def _others(kills: dict, devices: dict) -> str:
-    over = ", ".join(f"{100 * devices['over_one_device'][n]:+.0f} %" for n in ("2", "4", "8"))
+    over = ", ".join(f"{100 + 100 * devices['over_one_device'][n]:.0f} %" for n in ("2", "4", "8"))
     away = max(devices["greatest_difference"].values())
     return (
         f"Kills: {kills['kills']} at random moments of {kills['stores']} runs;"
         f" {kills['stores_equal']} of the {kills['stores']} stores equal an undisturbed one bit by"
         " bit.\n\n"
         f"Devices: `ph.simulate` of {devices['bodies']:,} bodies x {devices['times']} times sharded"
-        f" over 2, 4 and 8 forced devices of two cores takes {over} against one device, and"
+        f" over 2, 4 and 8 forced devices of two cores takes {over} of the time on one device, and"
         f" its attitudes lie within {away:.0e} of those (more than a factor of two cannot be seen"
         " on two cores)."
     )

@@ -85,7 +85,8 @@ print(f"the energy only fell: {bool(jnp.all(jnp.diff(path.energy) < 1e-9))}")
 
 # %% [markdown]
 # ## The loss within one orbit
-# Time scales with the loss: half the `k`, twice the time. From 0.1° to 80° in an orbit of 115
+# The time is inversely proportional to `k`: half the `k` takes twice the time. From 0.1° to 80° in
+# an orbit of 115
 # minutes:
 
 # %%

@@ -13,7 +13,7 @@
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/inertia.ipynb)
 #
-# A spacecraft, drawn in its designer's axes, shall rotate about z. Whether it can depends on its
+# A spacecraft, drawn in its designer's axes, must rotate about z. Whether it can depends on its
 # principal axes. This notebook goes from the parts to the inertia tensor, to its principal axes,
 # and to the motion.
 

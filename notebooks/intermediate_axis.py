@@ -141,7 +141,8 @@ for size, seen in zip((1e-2, 1e-6, 1e-10), measured, strict=True):
 # Real bodies bend and contain fluids: they lose energy, but no angular momentum, and end in a
 # rotation about the axis of the *largest* moment of inertia, as Explorer 1 did in 1958.
 # `ph.FeedbackTorque` takes any torque that depends on the state; one that acts along
-# $L\times(L\times\omega)$ removes energy and keeps the magnitude of the momentum.
+# $L\times(L\times\omega)$ removes energy and keeps the magnitude of the momentum; its direction in
+# space drifts.
 
 
 # %%

@@ -145,9 +145,8 @@ print("1 - 3/8 (start / length)^2  :", round(1 - 3 / 8 * float(start / length) *
 # %% [markdown]
 # The plane rotates clockwise in the north, a little more slowly than the law of the sine predicts.
 # A bob released at rest on the rotating Earth moves on a thin ellipse, and an
-# ellipse of finite size precesses by itself, here against the Earth, by 3/8 of the square of
-# amplitude over length (Airy 1851).
-#
+# ellipse of finite size precesses by itself, here against the rotation of Foucault's plane, at 3/8
+# (amplitude / length)^2 of the frequency of its swing (Airy 1851).
 # ## 2. A body dropped into a shaft
 #
 # In 1831 Reich dropped balls down a mine shaft at Freiberg, 158.5 m deep, and found them 28 mm to

@@ -13,8 +13,8 @@
 #
 # [![Open in Colab](https://colab.research.google.com/assets/colab-badge.svg)](https://colab.research.google.com/github/polhode/polhode/blob/main/notebooks/training.ipynb)
 #
-# Satellites leave the launcher with random attitudes and rates. A controller is to stop and to turn
-# them to a fixed attitude within ten seconds. Two are trained by gradient descent through the
+# Satellites leave the launcher with random attitudes and rates. A controller must stop them and
+# turn them to a fixed attitude within ten seconds. Two are trained by gradient descent through the
 # simulation: a linear law and a small network. Then a slew by two pulses is optimised, and the
 # shape of a body is designed such that it wobbles with a given period.
 
@@ -159,7 +159,8 @@ plt.show()
 # %% [markdown]
 # ## A slew by two pulses
 #
-# From rest to rest by 90 degrees about an axis that is not principal, with thrusters that push
+# The satellite turns by 90 degrees, from rest to rest, about an axis that is not principal, with
+# thrusters that push
 # along two directions for a while. The unknowns are the impulses and when the second pulse begins.
 
 # %%
@@ -194,7 +195,7 @@ for step in range(301):
 # ## A shape with a given period
 #
 # A free cylinder of 10 kg and 0.1 m radius wobbles (its angular velocity goes round the axis in
-# body axes) with a period that depends on its length. Newton's rule, applied to the frequency,
+# body axes) with a period that depends on its length. Newton's method, applied to the frequency,
 # finds the length for which the rate about x passes zero upwards after 20 s.
 
 

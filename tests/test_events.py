@@ -621,3 +621,42 @@ def test_pairs_of_events_that_no_sample_shows_have_their_states():
         np.testing.assert_allclose(events.times[:2], 2 * half / speed, atol=1e-9)
         turned = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
         np.testing.assert_allclose(events.wxyz[:2], turned, atol=1e-9)
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0])
+@pytest.mark.parametrize("by_steps", [False, True])
+def test_times_before_an_event_are_known_from_any_samples(by_steps, way):
+    """Samples in another order, or at the event alone, do not show which way the motion goes."""
+    torque = ph.LinearDamping(0.0) if by_steps else None
+    scene = ph.Scene(BALL.inertia, torque=torque)
+    traj = ph.simulate(scene, STATE, way * TS, until=ph.Event(height(-way * 0.5)))
+    event, time = float(traj.event_time), way * 0.2
+    assert 0.2 < abs(event) < 3
+    want = ph.simulate(scene, STATE, [0.0, time]).wxyz[-1]
+    for samples in (traj, traj[..., ::-1], traj[..., :1], traj[..., -1:], traj.at([time, 0.0])):
+        np.testing.assert_allclose(samples.at(time).wxyz[0], want, atol=1e-8)
+        np.testing.assert_allclose(samples.at(way * 9.0).ts, event)
+
+
+def test_bodies_that_go_either_way_stop_each_at_its_event():
+    both = jnp.stack([TS, -TS])
+    states = ph.State(jnp.tile(STATE.wxyz, (2, 1)), jnp.array([[0, RATE, 0], [0, -RATE, 0]]))
+    traj = ph.simulate(BALL, states, both, until=ph.Event(height(-0.5)))
+    np.testing.assert_allclose(traj.event_time, np.array([1, -1]) * np.pi / 6 / RATE)
+    np.testing.assert_allclose(traj.at([[0.1, 9.0], [-0.1, -9.0]]).ts[:, 0], [0.1, -0.1])
+    np.testing.assert_allclose(traj.at([[0.1, 9.0], [-0.1, -9.0]]).ts[:, 1], traj.event_time)
+
+
+def test_the_direction_of_an_event_and_that_of_the_search_agree():
+    traj = ph.simulate(BALL, STATE, TS)
+    for direction in (1, -1):
+        want = ph.crossings(traj, height(0.4), direction).times
+        for event, given in (
+            (ph.Event(height(0.4)), direction),
+            (ph.Event(height(0.4), direction), 0),
+        ):
+            np.testing.assert_array_equal(ph.crossings(traj, event, given).times, want)
+    with pytest.raises(ValueError, match="direction=1, and crossings was given direction=-1"):
+        ph.crossings(traj, ph.Event(height(0.4), 1), -1)
+    with pytest.raises(TypeError, match=r"must be ph\.Event objects, got Height"):
+        ph.simulate(BALL, STATE, TS, events=height(0.4))

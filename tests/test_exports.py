@@ -161,3 +161,21 @@ def test_wheels_are_exported():
     np.testing.assert_array_equal(data["wheel_speed"], traj.wheel_speed)
     np.testing.assert_array_equal(data["motor_work"], traj.motor_work)
     assert "motors" in data["work"].attrs["long_name"]
+
+
+def test_what_a_run_was_asked_to_save_is_exported():
+    pytest.importorskip("xarray")
+    record = ph.Record(save=lambda t: {"energy": t.energy, "rates": t.omega_body})
+    saved = ph.simulate(SCENE, STATE, jnp.array([0.0, 1.0, 2.0]), record=record)
+    data = saved.to_xarray()
+    assert data.saved_energy.dims == ("body", "time")
+    np.testing.assert_array_equal(data.saved_energy, saved.saved["energy"])
+    np.testing.assert_array_equal(data.saved_rates, saved.saved["rates"])
+    event = ph.Event(lambda wxyz, omega_body, t: omega_body[0], capacity=4)
+    met = ph.simulate(SCENE, STATE, jnp.array([0.0, 9.0]), events=[event])
+    data = met.to_xarray()
+    assert int(met.events.count.max()) > 0
+    for name in ("times", "which", "wxyz", "omega_body", "count"):
+        field = data[f"events_{name.replace('times', 'time')}"]
+        np.testing.assert_array_equal(field, getattr(met.events, name))
+        assert field.dims[0] == "body"

@@ -155,8 +155,9 @@ FOREIGN = {
     "_fields",
     "energy",
     "__module__",
+    "O_DIRECTORY",
 }
-"""Attributes of objects of JAX, NumPy, SciPy, diffrax, trimesh and of the user."""
+"""Attributes of objects of JAX, NumPy, SciPy, diffrax, trimesh, os and of the user."""
 
 APPLICATIONS = ("cli", "ensemble", "files", "fit", "frames", "lightcurve", "plot")
 

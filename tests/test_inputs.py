@@ -35,6 +35,10 @@ TS = [0.0, 1.0]
             lambda: ph.State.from_euler(0.1, 0.0, 0.3, momenta=[1.0, 2, 3], inertia=INERTIA),
             "theta at 0 or pi",
         ),
+        (
+            lambda: ph.State.from_euler(0.1, np.pi, 0.3, momenta=[1.0, 2, 3], inertia=INERTIA),
+            "theta at 0 or pi",
+        ),
         (lambda: ph.Inertia.from_moments([1.0, -1.0, 1.0]), "positive"),
         (lambda: ph.Inertia.from_moments([1.0, 1.0, 3.0]), "triangle inequality"),
         (lambda: ph.UniformGravity(-1.0, [0.0, 0, 1]), "mass must not be negative"),
@@ -47,6 +51,15 @@ TS = [0.0, 1.0]
             r"at least two times, got an array of shape \(1,\)",
         ),
         (lambda: ph.simulate(SCENE, STATE, [0.0, 1.0, 1.0]), "entries 1 and 2"),
+        (
+            lambda: ph.simulate(SCENE, STATE, np.array([[0.0, 1, 2], [0, 5, 5]])),
+            "entries 1 and 2 are 5.0 and 5.0",
+        ),
+        (lambda: ph.propagate(SCENE, STATE, 0.0), "dt must be a number other than zero, got 0.0"),
+        (
+            lambda: ph.Table(np.array([8e8, 8e8 + 10, 8e8 + 20]), np.float32([0, 1, 2])),
+            r"ascend, in the dtype of its values \(float32\)",
+        ),
         (lambda: ph.simulate(SCENE, STATE, [0.0, 2.0, 1.0]), "strictly increasing or strictly"),
         (lambda: ph.simulate(SCENE, STATE, [0.0, np.nan]), "ts holds NaN"),
         (lambda: ph.simulate(SCENE, STATE, TS, rtol=-1.0), "rtol must be positive"),

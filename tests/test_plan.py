@@ -372,3 +372,21 @@ def test_explain_while_a_function_of_the_scene_closes_over_what_is_traced():
 
     stiff(1e5)
     jax.eval_shape(stiff, 1e5)
+
+
+def test_orbits_of_torques_become_circles_too():
+    orbit = ph.KeplerOrbit(3.986e14, 6.9e6, 0.0)
+    field = ph.DipoleField([0.0, 0.0, 7.8e22])
+    torque = ph.MagneticDipole([1.0, 0, 0], field=field, position=orbit) + ph.LinearDamping(0.1)
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]), torque=torque)
+    special = ph.specialise(scene).torque
+    assert special.terms[0].position.eccentricity is None
+    assert torque.terms[0].position.eccentricity is not None
+
+
+def test_an_orbit_of_plain_numbers_has_no_precision_of_its_own():
+    gravity = ph.GravityGradient(3.986e14, ph.KeplerOrbit(3.986e14, 6.9e6, 0.1))
+    single = [np.float32([1, 2, 3]), np.float32([1, 0, 0, 0]), np.float32([0.1, 1, 0.2])]
+    scene = ph.Scene(ph.Inertia.from_moments(single[0]), gravity)
+    traj = ph.simulate(scene, ph.State(*single[1:]), np.float32([0, 10]))
+    assert traj.omega_body.dtype == np.float32

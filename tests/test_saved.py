@@ -198,3 +198,14 @@ def test_mean_over_bodies_that_finished():
     )(omega)
     mean = ph.successful_mean(traj, lambda x: x.saved[:, -1])
     np.testing.assert_allclose(mean, 2.0, rtol=1e-12)
+
+
+def test_work_is_known_where_rates_are_not_kept():
+    inertia, state = ph.Inertia.axisymmetric(1.0, 2.0), ph.State([1.0, 0, 0, 0], [0.1, 1.0, 0.2])
+    scene = ph.Scene(inertia, torque=ph.LinearDamping([0.1, 0.1, 0.2]))
+    kept, left = (
+        ph.simulate(scene, state, [0.0, 1.0, 2.0], record=ph.Record(rates=rates, work=True))
+        for rates in (True, False)
+    )
+    assert left._omega_body is None
+    np.testing.assert_array_equal(left.work, kept.work)

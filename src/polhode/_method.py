@@ -43,7 +43,7 @@ _EXPLANATIONS = {
     Status.SUCCESSFUL: "finished",
     Status.MAX_STEPS: (
         "the solver used up max_steps before the last time: raise max_steps on the method,"
-        " loosen rtol, or shorten ts; damping far faster than the motion wants an implicit solver,"
+        " loosen rtol, or shorten ts; damping far faster than the motion needs an implicit solver,"
         " such as ph.LiePoisson(diffrax.Kvaerno5(), chunk=1)"
     ),
     Status.NOT_FINITE: (
@@ -56,12 +56,12 @@ _EXPLANATIONS = {
         " method=None) for this body"
     ),
     Status.STEP_FAILED: (
-        "the steps became too short to lead on, or an implicit solve gave up: a torque that jumps"
-        " again and again, or damping far faster than the motion, which wants an implicit solver"
+        "the steps became too short to continue, or an implicit solve gave up: a torque that jumps"
+        " again and again, or damping far faster than the motion, which needs an implicit solver"
         " such as ph.LiePoisson(diffrax.Kvaerno5(), chunk=1)"
     ),
     Status.INACCURATE: (
-        "the estimated error exceeds the tolerance asked for tenfold: the body is chaotic, or its"
+        "the estimated error exceeds ten times the requested tolerance: the body is chaotic, or its"
         " rounding alone is more; loosen rtol, shorten ts, or use float64"
     ),
     Status.NOT_PHYSICAL: (
@@ -437,11 +437,13 @@ def check_times(ts: Array | np.ndarray) -> None:
     steps = np.diff(ts, axis=-1)
     good = np.all(steps > 0, axis=-1) | np.all(steps < 0, axis=-1)
     if not np.all(good):
-        turn = int(np.argwhere((steps <= 0) if steps.flat[0] > 0 else (steps >= 0))[0][-1])
+        row = np.argmin(good.reshape(-1))
+        ts, steps = (x.reshape(-1, x.shape[-1])[row] for x in (ts, steps))
+        turn = int(np.argmax((steps <= 0) if steps[0] > 0 else (steps >= 0)))
         raise ValueError(
             "ts must be strictly increasing or strictly decreasing (in the dtype of the state,"
-            f" {ts.dtype}); entries {turn} and {turn + 1} are {ts[..., turn].flat[0]!r} and"
-            f" {ts[..., turn + 1].flat[0]!r}: sort them and drop repeated ones."
+            f" {ts.dtype}); entries {turn} and {turn + 1} are {ts[turn]} and"
+            f" {ts[turn + 1]}: sort them and drop repeated ones."
         )
 
 

@@ -238,7 +238,13 @@ def call_traced(call: str, detail: str, fn: Callable, *args: Any) -> Any:
 
 
 def result_of(
-    name: str, arguments: Sequence[str], fn: Callable, shape: tuple[int, ...], dtype: Any, *args
+    name: str,
+    arguments: Sequence[str],
+    fn: Callable,
+    shape: tuple[int, ...],
+    dtype: Any,
+    *args,
+    hint: str = "It sees one body at one time: batches are mapped over it.",
 ) -> Array:
     """What ``fn(*args)`` returns as an array of ``shape`` and ``dtype`` (None: its own).
 
@@ -270,7 +276,7 @@ def result_of(
     if array.shape != shape:
         raise ValueError(
             f"the function given to {call}, returned shape {array.shape}; {expected} is"
-            " expected. It sees one body at one time: batches are mapped over it."
+            f" expected. {hint}"
         )
     if dtype is None:
         return array

@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._checks import ArrayLike
+from polhode._checks import ArrayLike, is_concrete, require
 from polhode._integrate._field import uses
 from polhode._method import (
     AbstractMethod,
@@ -50,8 +50,8 @@ class Propagation(NamedTuple):
 
     ``state``: at the end of the step, the speeds of all wheels in its ``wheel_speed`` where w > 0,
     so that the next step continues from it; ``jacobian`` (n, n): derivatives of the tangent
-    coordinates at the end by those at the start; ``noise`` (n, 3): change of the coordinates at the
-    end by a constant disturbance torque [N m] in body axes.
+    coordinates at the end with respect to those at the start; ``noise`` (n, 3): derivatives of the
+    coordinates at the end with respect to a constant disturbance torque [N m] in body axes.
     """
 
     state: State
@@ -94,11 +94,12 @@ def propagate(
     elsewhere: propagate in shorter steps, or by ``method=ph.LiePoisson()``.
 
     **Arguments:** ``scene``, ``state``: of one body; for several ``jax.vmap``. ``dt``: not zero.
-    ``t``: matters only to a scene that depends on time; there ``t + dt`` must be within 1 % of
-    ``dt`` from ``t``, which in single precision ends at some 16,000 s for steps of 0.1 s.
-    ``free``: None, or a function that picks leaves of the scene, ``lambda s: s.inertia.diagonal``:
-    their entries are the parameters. ``method``, ``rtol``: as for ``ph.simulate``, which raises;
-    under ``jit`` all is NaN where the body did not finish or ``t + dt`` is rounded too much.
+    ``t``: matters only to a scene that depends on time; there the rounded difference ``(t + dt) -
+    t`` must equal ``dt`` to 1 %; in single precision and for steps of 0.1 s this holds up to about
+    16,000 s. ``free``: None, or a function that picks leaves of the scene, ``lambda s:
+    s.inertia.diagonal``: their entries are the parameters. ``method``, ``rtol``: as for
+    ``ph.simulate``, which raises; under ``jit`` all is NaN where the body did not finish or ``t +
+    dt`` is rounded too much.
 
     Raises ValueError for a batch, a ``dt`` that times near ``t`` do not resolve, or a ``free`` that
     picks the speed or momentum of a wheel that is a coordinate already; TypeError for what is no
@@ -125,6 +126,10 @@ def propagate(
             f"dt and t are one number each, got shapes {dt.shape}, {t.shape}: for several steps"
             " jax.vmap or jax.lax.scan."
         )
+    require(
+        not is_concrete(dt) or (np.isfinite(dt) and dt != 0),
+        f"dt must be a number other than zero, got {dt}.",
+    )
     scene, state, _, _ = check_inputs(scene, state, jnp.stack([jnp.zeros_like(dt), dt]), None)
     places = () if free is None else places_of(scene, free)
     if not set(places).isdisjoint(_starts_of_loose(scene)):
@@ -132,7 +137,10 @@ def propagate(
             "free picks the speed or momentum of a rotor that is not held at its speed: it is part"
             " of the state, and its error one of the tangent coordinates already. Leave it out."
         )
-    arguments = scene, state, dt, t, places, method, check_rtol(rtol, dtype)
+    tolerance = check_rtol(rtol, dtype)
+    if method is None:  # here, where the tolerance is known
+        method, _ = choose(scene, tolerance)
+    arguments = scene, state, dt, t, places, method, tolerance
     start, (state, jacobian, noise, status, turned, is_resolved) = state, _propagated(*arguments, 1)
     if not isinstance(is_resolved, Tracer) and not is_resolved:
         raise ValueError(
@@ -186,8 +194,6 @@ def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
         t = jnp.zeros_like(t)
     is_resolved = jnp.abs((t + dt) - t - dt) <= _ROUNDED * jnp.abs(dt)
     time_range = jnp.stack([t, t + dt])
-    if method is None:
-        method, _ = choose(scene, rtol)
     # In closed form there is no motion under a torque: its effect is integrated over the step.
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     nodes = ((1 + nodes) / 2 + np.arange(parts)[:, None]).reshape(-1) / parts

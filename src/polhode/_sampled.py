@@ -177,6 +177,7 @@ class HeldPropagator(AbstractPropagator):
 def _share(state: State, times: Array, rtol: Array) -> Array:
     """Tolerance of a segment: that of a radian, where errors add up over the whole angle."""
     rates = jnp.linalg.norm(jax.lax.stop_gradient(state.omega_body), axis=-1)
+    rates = jnp.where(jnp.isfinite(rates), rates, 0)  # of a body that failed
     angle = jnp.max(rates, initial=0) * jnp.abs(times[-1] - times[0])
     share = rtol / jnp.maximum(jnp.maximum(angle, 1), len(times) ** 0.5)
     return jnp.maximum(share, 8 * jnp.finfo(times.dtype).eps)

@@ -1,5 +1,6 @@
 """The one entry point: a scene, a state and times give a trajectory."""
 
+import dataclasses
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -282,7 +283,7 @@ def _with_failures(trajectory: Trajectory, is_sound: Array) -> Trajectory:
 def _computed(t: Trajectory) -> list[Any]:
     """What a trajectory holds of the bodies: arrays whose first axes are the batch."""
     samples = [t._wxyz, t._omega_body, t._spins, t._work, t._motor_work, t._saved, t._final]
-    return [*samples, t._error, t._event_time, t._events]
+    return [*samples, t._error, t._ending, t._events]
 
 
 def _begin(method, scene, state, ts, rtol) -> Trajectory:
@@ -330,14 +331,18 @@ def _motion_samples(record, method, scene, state, ts, rtol) -> Samples:
 
 def _samples(record: Record, method, scene: Scene, lanes: State, times, rtol) -> Samples:
     """Samples of N lanes."""
+    run_record = record
+    if record.work and method.exact:  # the rates give the work
+        run_record = dataclasses.replace(record, rates=True)
     if record.error:
-        samples = _with_error(method, scene, lanes, times, rtol, record)
+        samples = _with_error(method, scene, lanes, times, rtol, run_record)
     else:
-        samples = method.run(scene, lanes, times, rtol, record)._replace(error=None)
+        samples = method.run(scene, lanes, times, rtol, run_record)._replace(error=None)
     samples = samples._replace(status=status_with_input_errors(samples.status, scene, times, rtol))
-    if record.work and method.exact:
-        samples = samples._replace(work=_work_of_exact(scene, lanes, times, samples, record))
-    return samples
+    if not (record.work and method.exact):
+        return samples
+    work = _work_of_exact(scene, lanes, times, samples, record)
+    return samples._replace(work=work, omega_body=samples.omega_body if record.rates else None)
 
 
 def _saved(record: Record, method, scene: Scene, lanes: State, times, rtol) -> Samples:

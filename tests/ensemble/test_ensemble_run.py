@@ -18,8 +18,8 @@ import pytest
 
 import polhode as ph
 from polhode import ensemble as ens
-from polhode.ensemble._statistics import tilt
-from polhode.ensemble._stream import Job, chunk_sizes
+from polhode.ensemble._statistics import summarise, tilt
+from polhode.ensemble._stream import Block, Job, chunk_sizes
 
 xarray = pytest.importorskip("xarray")
 zarr = pytest.importorskip("zarr")
@@ -27,6 +27,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from ensemble_case import CHUNK, TS, make
 
 SCRIPT = Path(__file__).with_name("ensemble_case.py")
+STATE = ph.State([1.0, 0.0, 0.0, 0.0], [0.1, 1.0, 0.2])
 TILT = ens.Statistic("tilt", tilt, "rad", 0.0, 3.2, 64)
 
 
@@ -329,3 +330,23 @@ def test_spreads_of_one_name_draw_independently():
     alone = ens.Ensemble(scene, state, 200, (shifted(0),), seed=3)
     _, first = alone.draw(jnp.arange(200))
     np.testing.assert_array_equal(first.omega_body[:, 0], x)
+
+
+def test_the_tolerance_chooses_the_method():
+    """As in ``ph.simulate``: near rounding the frequencies of free bodies are compensated."""
+    bodies = ens.Ensemble(ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0])), STATE, 8)
+    for rtol in (None, 1e-13):
+        block = Block(bodies, np.asarray(TS), None, rtol, True, (), jax.devices()[:1])
+        tolerance = {} if rtol is None else {"rtol": rtol}
+        want = ph.explain(bodies.scene, bodies.state, TS, **tolerance).method
+        assert str(block.method) == str(want)
+
+
+def test_the_last_bin_holds_its_end():
+    """As that of ``numpy.histogram``, so that quantiles of what sits at an end are known."""
+    at_end = ens.Statistic("one", lambda t: jnp.ones_like(t.energy), "1", 0.0, 1.0, 4)
+    ts = jnp.array([0.0, 1.0])
+    states = ph.State(jnp.tile(STATE.wxyz, (4, 1)), jnp.tile(STATE.omega_body, (4, 1)))
+    traj = ph.simulate(ph.Scene(ph.Inertia.spherical(1.0)), states, ts)
+    counts = summarise(at_end, traj, jnp.ones(4, bool))["histogram"]
+    np.testing.assert_array_equal(counts, [[0, 0, 0, 0, 4, 0]] * 2)

@@ -93,11 +93,13 @@ def test_what_is_no_text_or_has_a_gap_is_named(tmp_path):
         ("t (ms),wx (rpm),wy (rpm),wz (rpm)", np.pi / 30, 1e-3),
         ("t,wx_rpm,wy_rpm,wz_rpm", np.pi / 30, 1.0),
         ("t,wx_mdeg/s,wy_mdeg/s,wz_mdeg/s", np.pi / 180e3, 1.0),
+        ("time [h],wx [rev/s],wy [rev/s],wz [rev/s]", 2 * np.pi, 3600.0),
+        ("Time (days),wx (deg/h),wy (deg/h),wz (deg/h)", np.pi / 180 / 3600, 86400.0),
     ],
 )
 def test_usual_names_and_units_are_found(tmp_path, head, factor, seconds):
     path = tmp_path / "usual.csv"
-    rows = "".join(f"{k / 10 / seconds:g},1,2,3,7\n" for k in range(6))
+    rows = "".join(f"{k / 10 / seconds!r},1,2,3,7\n" for k in range(6))
     path.write_text(f"{head},accel_x\n{rows}")
     loaded = load_recording(path)
     np.testing.assert_allclose(loaded.recording.omega[0], np.array([1, 2, 3]) * factor, rtol=1e-14)
@@ -112,6 +114,8 @@ def test_usual_names_and_units_are_found(tmp_path, head, factor, seconds):
         ("t,gyro_x,wy,wz,omega_x", "gyro_x, omega_x could all be wx"),
         ("t,gyro_x [deg/s],gyro_y,gyro_z [rad/s],n", "different units: deg/s, rad/s"),
         ("t,gyro_x [ms],gyro_y,gyro_z,n", "states the unit ms"),
+        ("t [weeks],gyro_x,gyro_y,gyro_z,n", "states the unit weeks; expected one of s, ms"),
+        ("t,gyro_x (Hz),gyro_y (Hz),gyro_z (Hz),n", r"states the unit hz; expected one of rad/s"),
         ("x,gyro_x,gyro_y,gyro_z,n", "missing: t -> t"),
         ("t,p,q,z,n", "missing: wx -> wx, wy -> wy, wz -> wz"),
         ("t,gyro_x_rps,gyro_y_rps,gyro_z_rps,n", "rad/s or revolutions per second"),
@@ -156,3 +160,10 @@ def test_a_column_has_one_role_and_one_unit(tmp_path):
 def test_a_file_without_an_end_is_no_text():
     with pytest.raises(ValueError, match="not text"):
         read_recording("/dev/zero")
+
+
+def test_a_given_factor_stands_for_a_unit_that_is_not_known(tmp_path):
+    path = tmp_path / "furlongs.csv"
+    path.write_text("t [fortnight],wx,wy,wz\n" + "".join(f"{k / 10},0,0,1e-7\n" for k in range(6)))
+    recording = load_recording(path, time_scale=1209600.0).recording
+    np.testing.assert_allclose(recording.times, 120960.0 * np.arange(6))

@@ -321,3 +321,21 @@ def test_gradient_of_the_residuals_against_30_digits():
 def test_a_loss_needs_a_positive_threshold(threshold):
     with pytest.raises(ValueError, match="positive"):
         Huber(threshold)
+
+
+@pytest.mark.slow  # the inverse alone: test_the_loss_of_large_residuals_has_an_inverse
+def test_residuals_of_outliers_are_reported_as_measured():
+    times = np.linspace(0, 8, 161)
+    state = ph.State([1.0, 0, 0, 0], [0.3, 1.0, 0.6])
+    rates = ph.simulate(ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.2])), state, times).omega_body
+    rates = np.array(rates) + np.random.default_rng(0).normal(0, 0.01, rates.shape)
+    rates[40, 1] += 0.5
+    options = FitOptions(robust=Huber(3.0))
+    fit = fit_inertia(times, rates, omega_noise=0.01, options=options)
+    assert float(np.abs(fit.residuals["omega"]).max()) == pytest.approx(50, abs=4)
+    assert float(fit.rms) == pytest.approx(np.sqrt(0.01**2 + 0.5**2 / 483), rel=0.1)
+
+
+def test_the_loss_of_large_residuals_has_an_inverse():
+    size = jnp.array([-50.0, -3.0, -1.0, 0.0, 2.9, 3.1, 1e4])
+    np.testing.assert_allclose(Huber(3.0).inverse(Huber(3.0)(size)), size, rtol=1e-12)

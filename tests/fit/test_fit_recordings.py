@@ -8,7 +8,16 @@ import numpy as np
 import pytest
 
 import polhode as ph
-from polhode.fit import FitOptions, Recording, averaged, fit_inertia, fit_recordings
+from polhode.fit import (
+    FitOptions,
+    Gyroscope,
+    Recording,
+    averaged,
+    fit_inertia,
+    fit_recordings,
+    stack,
+)
+from polhode.fit._solve import _rates
 from polhode.rotation import wxyz_to_matrix
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data"
@@ -106,3 +115,27 @@ def test_noisy_attitudes_alone_give_the_body(given):
     fit = ph.fit_inertia(times, wxyz=read, throw=False, **given)
     ratios = np.broadcast_to(moments / moments.max(), fit.ratios.shape)
     np.testing.assert_allclose(fit.ratios, ratios, atol=0.02)
+
+
+@pytest.mark.parametrize("gap", [[10], [0, 1], [3, 4, 5], [20]])
+def test_gaps_of_attitudes_do_not_enter_the_rates_to_start_from(gap):
+    times = np.linspace(0, 2, 21)
+    state = ph.State([1.0, 0, 0, 0], [0.1, 1.0, 0.2])
+    motion = ph.simulate(ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0])), state, times)
+    wxyz = np.array(motion.wxyz)
+    wxyz[gap] = np.nan
+    rates = _rates(stack([Recording.of(times, wxyz=wxyz)]))
+    np.testing.assert_allclose(rates[0], motion.omega_body, atol=0.06)
+
+
+def test_a_flat_body_is_a_start():
+    times = np.linspace(0, 8, 161)
+    state = ph.State([1.0, 0, 0, 0], [0.3, 1.0, 0.6])
+    rates = ph.simulate(ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.2])), state, times).omega_body
+    options = FitOptions(
+        initial_inertia=ph.Inertia.from_disc(1.0, 1.0),
+        max_starts=1,
+        gyroscope=Gyroscope(scale_std=0, misalignment_std=0),
+    )
+    fit = ph.fit_inertia(times, rates, options=options)
+    np.testing.assert_allclose(fit.ratios, np.array([1.0, 1.5, 2.2]) / 2.2, rtol=1e-6)

@@ -286,6 +286,28 @@ def test_a_delay_of_the_gyroscope_shows_beside_attitudes():
 
 
 @pytest.mark.slow
+def test_deviations_are_those_of_readings():
+    """``sensor`` gives bias and gain in readings, so does ``sensor_std``."""
+    _, omega, _ = bodies(1)
+    std = {}
+    for size in (1.0, 2.0):
+        gain = np.diag([1.0, size, 1.0])
+        data = (
+            np.asarray(omega[0]) @ gain
+            + np.random.default_rng(0).normal(0, 0.002, (TIMES.size, 3)) @ gain
+        )
+        sensor = Gyroscope(gain, noise_density=0.002, bias_std=0.01)
+        fit = fit_recordings([Recording.of(TIMES, data)], options=FitOptions(gyroscope=sensor))
+        std[size] = fit.sensor_std
+    np.testing.assert_allclose(
+        std[2.0]["bias"], std[1.0]["bias"] * np.array([1.0, 2, 1]), rtol=1e-3
+    )
+    np.testing.assert_allclose(
+        std[2.0]["gain"], std[1.0]["gain"] * np.array([[1.0], [2], [1]]), rtol=1e-3
+    )
+
+
+@pytest.mark.slow  # a fit with the usual sensor model: test_fit_exports
 def test_calibrated_readings_are_corrected():
     """``gain`` and ``bias`` as calibrated: the fit is that of the rates, ``sensor`` has both."""
     _, omega, _ = bodies(1)

@@ -211,3 +211,12 @@ def test_a_frame_needs_two_samples():
     last = ph.simulate(scene, state, ts, record=ph.Record(final_only=True))
     with pytest.raises(ValueError, match="two at least"):
         RotatingFrame.from_trajectory(last)
+
+
+def test_integers_are_times_and_rates_have_the_shape_of_the_times():
+    turning = RotatingFrame.from_rate(lambda t: jnp.array([0.0, 0, 2]) * t)
+    np.testing.assert_allclose(turning.omega_body(3), [0, 0, 6])
+    np.testing.assert_allclose(turning.attitude(1), turning.attitude(1.0))
+    uniform = RotatingFrame.from_rate([0.0, 0, 2])
+    for rates in (uniform.omega_body, turning.omega_body, uniform.angular_acceleration):
+        assert rates(jnp.arange(3.0)).shape == (3, 3)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import xarray
 
+from polhode._atomic import atomic_write
 from polhode.files import write_netcdf
-from polhode.files._write import atomic_write
 
 
 @pytest.mark.parametrize("failure", [OSError, KeyboardInterrupt, SystemExit])

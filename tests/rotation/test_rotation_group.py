@@ -184,3 +184,10 @@ def test_interchange_goes_through_named_converters():
     np.testing.assert_array_equal(rotation.xyzw_to_wxyz(rotation.wxyz_to_xyzw(wxyz)), wxyz)
     with pytest.raises(TypeError, match="outside jit"):
         jax.jit(lambda q: rotation.wxyz_to_scipy(q) and q)(wxyz)
+
+
+def test_the_angle_between_quaternions_of_any_size():
+    tiny = [[1e-200, 0, 0, 0], [0, 1e-200, 0, 0]]
+    np.testing.assert_allclose(rotation.angle_between(*tiny), np.pi, rtol=1e-15)
+    with pytest.raises(ValueError, match=r"start \(2, 4\), end \(3, 4\)"):
+        rotation.angle_between(np.ones((2, 4)), np.ones((3, 4)))

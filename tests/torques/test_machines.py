@@ -8,6 +8,7 @@ from scipy.integrate import solve_ivp
 
 import polhode as ph
 from polhode._hamiltonian import from_quaternion
+from polhode._integrate._stepped import may_jump
 
 INERTIA = ph.Inertia.from_moments([1.0, 1.5, 2.0])
 REST = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 0.1])
@@ -161,3 +162,38 @@ def test_a_dipole_in_a_field_of_place_and_time():
 def test_what_is_refused(make, error, word):
     with pytest.raises(error, match=word):
         make()
+
+
+def test_limits_of_a_motor_with_a_constant_command_in_a_batch():
+    """Its torque has a kink where the wheel reaches ``max_speed``: steps end there, alone and in a
+    batch."""
+
+    def wheel(speed):
+        motor = ph.Motor(0.05, max_torque=0.1, max_speed=5.0)
+        return ph.Rotor([0.0, 0.0, 1.0], 0.1, speed=speed, coupling=motor)
+
+    assert may_jump(ph.Scene(INERTIA, rotors=wheel(0.0)))
+    states = ph.State(np.tile(REST.wxyz, (8, 1)), np.tile([0.1, 1.0, 0.2], (8, 1)))
+    many = ph.simulate(ph.Scene(INERTIA, rotors=wheel(jnp.zeros(8))), states, [0.0, 30.0])
+
+    def newton(t, y):
+        omega, spin = y[:3], y[3]
+        speed = spin / 0.1 - omega[2]
+        torque = np.clip(
+            0.05, -0.1 * np.clip(1 + speed / 5, 0, 1), 0.1 * np.clip(1 - speed / 5, 0, 1)
+        )
+        momentum = np.array([1.0, 1.5, 2.0]) * omega + [0, 0, 0.1 * speed]
+        pull = np.cross(momentum, omega) - [0, 0, torque]
+        return [*(pull / [1.0, 1.5, 1.9]), torque]
+
+    start = [0.1, 1.0, 0.2, 0.1 * 0.2]
+    truth = solve_ivp(newton, (0, 30), start, "DOP853", rtol=1e-12, atol=1e-13, max_step=0.02)
+    np.testing.assert_allclose(many.omega_body[:, -1], [truth.y[:3, -1]] * 8, atol=1e-8)
+
+
+def test_without_a_field_there_is_no_torque():
+    wheel = ph.Rotor([0.0, 0.0, 1.0], 0.1, speed=100.0)
+    torque = ph.MomentumDumping(1e-3, field=[0.0, 0.0, 0.0])
+    got = ph.simulate(ph.Scene(INERTIA, torque=torque, rotors=wheel), REST, [0.0, 1.0])
+    assert got.status == ph.Status.SUCCESSFUL
+    np.testing.assert_allclose(got.omega_body[-1], REST.omega_body, atol=1e-12)

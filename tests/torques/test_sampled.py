@@ -141,3 +141,14 @@ def test_samples_at_the_ends_of_periods_are_edges_in_single_precision():
     state = ph.State(jnp.asarray(WXYZ, jnp.float32), jnp.asarray(OMEGA, jnp.float32))
     plan = ph.explain(ph.Scene(body, torque=fn), state, [100.0, 100.1, 100.7, 101.0])
     assert "; 10 segments" in plan.reason
+
+
+def test_a_body_that_fails_does_not_fail_the_others():
+    scene = ph.Scene(INERTIA, torque=ph.SampledTorque(law, PERIOD))
+    rates = jnp.array([OMEGA, [jnp.nan, 1.0, 0.0]])
+
+    @jax.jit
+    def status(rates):
+        return ph.simulate(scene, ph.State(jnp.asarray(WXYZ), rates), TS).status
+
+    np.testing.assert_array_equal(status(rates), [ph.Status.SUCCESSFUL, ph.Status.NOT_FINITE])

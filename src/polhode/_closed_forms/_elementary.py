@@ -28,9 +28,10 @@ class SymmetricTop(AbstractChunkedForm):
     """A symmetric body without potential, in elementary functions: exact.
 
     Constant torque about the axis of symmetry (body z), linear damping symmetric about it and
-    wheels of constant momentum on it. The rates are elementary in all these; the attitude where
-    the momentum keeps its direction: without torque, and with damping proportional to the moments
-    (``c = k I``) and no wheel, so that otherwise ``ph.Record(attitude=False)`` is needed.
+    wheels of constant momentum on it. The rates are elementary functions in all these cases, the
+    attitude only where the momentum keeps its direction: without torque, and with no damping, or
+    with damping proportional to the moments (``c = k I``) and no wheel. Otherwise the attitude is
+    NaN: pass ``ph.Record(attitude=False)``.
 
     Derivatives are those within these motions: by numbers that break their symmetry, such as one of
     two equal coefficients of damping, they are zero or wrong. Those of ``ph.LiePoisson()`` are not.

@@ -60,9 +60,9 @@ class Periods(NamedTuple):
     """Periods and nutation limits; every field has the shape of the batch."""
 
     P_psi: Scalars
-    """Of the rotation about the long axis (LAM) or the oscillation about it (SAM)."""
+    """Period [s] of the rotation about the long axis (LAM) or the oscillation about it (SAM)."""
     P_phi: Scalars
-    """Mean, of the precession of the long axis about the angular momentum."""
+    """Mean period [s] of the precession of the long axis about the angular momentum."""
     mode: Int[Array, "*b"]
     k2: Scalars
     """Elliptic parameter, 0 for a symmetric body and 1 on the separatrix."""

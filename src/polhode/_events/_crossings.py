@@ -67,9 +67,10 @@ def crossings(
     """Times within those of ``trajectory`` at which ``fn(wxyz, omega_body, t)`` crosses zero.
 
     **Arguments:** ``fn``: see ``ph.Event``, which may be given in its place; ``direction``: 1
-    rising, -1 falling (in time), 0 both; ``capacity``: how many crossings of a body are
-    stored; None: all of them; ``samples``: see ``ph.Event``. Under ``jit``, ``vmap`` and ``grad``
-    both are required.
+    rising, -1 falling (in time), 0 both, or as the event says; ``capacity``: how many crossings of
+    a body are stored; None: all of them; ``samples``: see ``ph.Event``. Under ``jit``, ``vmap`` and
+    ``grad`` a motion in closed form needs both; an integrated one needs neither, and stores
+    at most 64 crossings of a body.
 
     Times are as accurate as the motion: to rounding for closed forms, to ``rtol`` over the
     derivative of the function for integrated motions. Times and ``slope`` have first and second
@@ -85,13 +86,21 @@ def crossings(
     that vary faster than the body rotates (high powers, other frequencies of the time) and rates
     that rise and fall again between two saved samples need ``samples``.
 
-    Raises ValueError if the samples do not fit into memory, if the steps of a body run out (under
-    ``jit`` it is not ``complete``), or if their number is not known under ``jit``.
+    Raises ValueError for two different directions, if the samples do not fit into memory, if the
+    steps of a body run out (under ``jit`` it is not ``complete``), or if their number is not known
+    under ``jit``.
 
         up = ph.crossings(traj, lambda wxyz, omega_body, t: omega_body[0], direction=1)
         traj.at(up.times).euler()
     """
     event = fn if isinstance(fn, Event) else Event(fn, direction, samples)
+    if isinstance(fn, Event) and direction not in (0, fn.direction):
+        if fn.direction != 0:
+            raise ValueError(
+                f"the event has direction={fn.direction}, and crossings was given"
+                f" direction={direction!r}: leave one out."
+            )
+        event = Event(fn.fn, direction, fn.samples)
     slots = at_least("capacity", capacity, 1)
     size = event.samples if samples is None else at_least("samples", samples, 2)
     if not _propagator(trajectory).method.exact:

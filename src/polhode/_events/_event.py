@@ -24,10 +24,10 @@ class Event(eqx.Module):
     **Arguments:** ``fn``: of the unit quaternion (4,) body -> space (of either sign), the body
     rates (3,) [rad/s] and the time () [s], smooth; batches are mapped over it. ``direction``: 1
     where fn rises through zero in time, -1 where it falls, 0 for both. ``samples``: number of
-    equally spaced times at which a motion in closed form is sampled; None: 32 per revolution of
-    the fastest natural rate (see ``ph.crossings``). ``crossings`` needs it under ``jit``. In a
-    simulation (``simulate(..., events=)``): ``terminal``: whether a body stops at the event;
-    ``capacity``: number of events of a body that are stored.
+    equally spaced times at which a motion in closed form is sampled; None: 32 per revolution of the
+    fastest natural rate (see ``ph.crossings``). Under ``jit``, ``crossings`` of a motion in closed
+    form needs it. In a simulation (``simulate(..., events=)``): ``terminal``: whether a body stops
+    at the event; ``capacity``: number of events of a body that are stored.
 
     Raises TypeError or ValueError for a function that takes or returns something else, another
     direction, fewer than two samples, or no capacity.

@@ -28,6 +28,7 @@ from polhode._failed import where_lost
 from polhode._method import Record, Status
 from polhode._scene import Scene, State
 from polhode._trajectory import (
+    Ending,
     Events,
     Propagator,
     Trajectory,
@@ -39,7 +40,8 @@ from polhode._trajectory import (
 
 def checked_events(events: Any, until: Any, record: Record | None) -> tuple[Event, ...]:
     """``events`` as a tuple; raises TypeError or ValueError for what cannot be searched for."""
-    all_events = (events,) if isinstance(events, Event) else tuple(events)
+    is_several = isinstance(events, (list, tuple))
+    all_events = tuple(events) if is_several else (events,)
     for event in all_events:
         if not isinstance(event, Event):
             raise TypeError(
@@ -197,7 +199,7 @@ def _until_terminal(begin: Trajectory, rows, path, outcome, events, occurrences,
     at, which, count = occurrences
     happens = jnp.isfinite(at)
     which = jnp.where(happens, which, -1)
-    event_time = None
+    ending = None
     if any(event.terminal for event in events):
         is_terminal = happens & _is_terminal(which, events)
         terminal_index = jnp.argmax(is_terminal, axis=1)[:, None]
@@ -212,7 +214,9 @@ def _until_terminal(begin: Trajectory, rows, path, outcome, events, occurrences,
             )
             for x, y in zip(path, states, strict=True)
         ]
-        event_time = jnp.where(stops, stop, jnp.inf)[:, 0].reshape(batch)
+        event_time = jnp.where(stops, stop, jnp.inf)
+        sign = jnp.broadcast_to(sign, event_time.shape)
+        ending = Ending(event_time.reshape(batch), sign.reshape(batch))
     path = [x.reshape(*batch, *x.shape[1:]) for x in path]
     status, steps = jax.tree.map(lambda x: x.reshape(batch), outcome)
     nothing = ~happens[..., None]
@@ -226,9 +230,9 @@ def _until_terminal(begin: Trajectory, rows, path, outcome, events, occurrences,
         omega_body=rates,
         count=count.reshape(batch),
     )
-    one_row = event_time is None and begin.ts.ndim == 1
+    one_row = ending is None and begin.ts.ndim == 1
     times = rows[0] if one_row else rows.reshape(*batch, -1)
-    return begin._with_samples(times, path, status, steps, event_time, record)
+    return begin._with_samples(times, path, status, steps, ending, record)
 
 
 _SAMPLES = 64
@@ -270,11 +274,11 @@ def stop_at_event(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
         return eqx.tree_at(lambda x: x._events, trajectory, None)
     batch = begin.batch_shape
     path = _stopped_by_windows(_of_lanes(begin), lane_times(ts, batch), until)
-    wxyz, omega, spins, status, steps, times, event = jax.tree.map(
+    wxyz, omega, spins, status, steps, times, ending = jax.tree.map(
         lambda x: x.reshape(*batch, *x.shape[1:]), path
     )
     samples = [wxyz, omega] if spins is None else [wxyz, omega, spins]
-    return begin._with_samples(times, samples, status, steps, event)
+    return begin._with_samples(times, samples, status, steps, ending)
 
 
 def _stopped_by_windows(lanes: Trajectory, ts: Array, until: Event):
@@ -550,4 +554,5 @@ def _stopped_at(
     status = jnp.where(has_event, near_event.status, states.status)
     times = jnp.where(is_past, event, rows)
     event = jnp.where(has_event, event[:, 0], jnp.inf)
-    return wxyz, omega, spins[0] if spins else None, status, states._steps, times, event
+    ending = Ending(event, jnp.broadcast_to(sign, event.shape))
+    return wxyz, omega, spins[0] if spins else None, status, states._steps, times, ending

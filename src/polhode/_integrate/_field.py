@@ -83,7 +83,7 @@ def uses(jaxpr, place: int) -> bool:
 class Prepared(NamedTuple):
     """``coefficients``: arrays on which the rates depend; ``run(coefficients, t, *y)``: the rates;
     ``depends_on_time``: whether they depend explicitly on the time; ``by_entry``: see
-    ``xla.Specialised``."""
+    ``_kernels._fold.Specialised``."""
 
     coefficients: tuple[Any, ...]
     run: Callable[..., list[Any]]

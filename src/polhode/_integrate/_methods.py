@@ -14,7 +14,8 @@ class LiePoisson(AbstractIntegration):
 
     **Arguments:**
 
-    - ``solver``: a ``diffrax.AbstractSolver`` for ODEs, ours or diffrax's; None: ``Dopri8``.
+    - ``solver``: a ``diffrax.AbstractSolver`` for ODEs, polhode's or diffrax's; None:
+      ``diffrax.Dopri8``.
     - ``controller``: a diffrax step-size controller; None: the estimated error at every saved time
       is kept below the ``rtol`` of ``simulate`` (attitude in radians, momentum relative to the
       scale of each body).
@@ -27,9 +28,9 @@ class LiePoisson(AbstractIntegration):
     - ``chart``: set by the planner (None: no preferred direction in space).
     - ``chunk``: number of bodies that are integrated together; chunks are processed one after the
       other, which bounds the memory. None: 200 where the bodies of a chunk share their steps. For
-      ``Extrapolation``, in which each has its own, 1024, of which 64 are on their way at once, in a
-      processor's cache; 64 where the field is more than arithmetic on the numbers of one body; 2^18
-      on an accelerator.
+      ``Extrapolation``, in which each has its own, 1024, of which 64 are in progress at once, as
+      many as fit into the cache of a core; 64 where the field is more than arithmetic on the
+      numbers of one body; 2^18 on an accelerator.
     """
 
     def __init__(

@@ -35,9 +35,9 @@ class Pointing(AbstractTorque):
     e is the vector part of the quaternion from the attitude ``target`` to that of the body, of the
     sign of the shorter rotation: for small angles the torque is kp times the angle.
 
-    **Arguments:** ``kp`` [N m/rad] and ``kd`` [N m s], (..., 3) or (...) for the same about every
-    axis, not negative; ``target`` (..., 4): ``wxyz`` body -> space. At exactly half a revolution
-    the direction is undefined.
+    **Arguments:** ``kp`` [N m/rad] and ``kd`` [N m s], (..., 3) or one number for the same about
+    every axis, not negative; ``target`` (..., 4): ``wxyz`` body -> space. At exactly half a
+    revolution the direction is undefined.
 
         law = ph.Pointing(kp=0.3, kd=0.8)
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), torque=law)
@@ -79,8 +79,8 @@ class Pointing(AbstractTorque):
 class RateDamping(AbstractTorque):
     """A control law for the body rates: N = -c (omega - rates) in body axes.
 
-    ``c`` (..., 3), or (...) for the same about every axis [N m s], not negative; ``rates`` (..., 3)
-    [rad/s]. Raises ValueError for a negative c.
+    ``c`` (..., 3), or one number for the same about every axis [N m s], not negative; ``rates``
+    (..., 3) [rad/s]. Raises ValueError for a negative c.
     """
 
     c: Float[Array, "*#b 3"] = shaped(3)
@@ -216,7 +216,7 @@ class Motor(AbstractCoupling):
     function ``fn(t, wxyz, omega_body, speed)`` of one body, the wheel's speed [rad/s] relative to
     it; ``max_torque`` (...) [N m], positive: it gives no more than that; ``max_speed`` (...)
     [rad/s], positive: the accelerating torque falls linearly to zero there (the line of a DC
-    motor); the braking torque does not. The speed needs the torque.
+    motor); the braking torque does not. It needs ``max_torque``.
 
     A wheel that controls the attitude, with friction in its bearing:
 
@@ -229,6 +229,8 @@ class Motor(AbstractCoupling):
     Raises TypeError or ValueError for other numbers, or a function that takes or returns something
     else.
     """
+
+    smooth: ClassVar[bool] = False  # the limits
 
     command: Float[Array, "*#b"] | Callable = shaped()
     max_torque: Float[Array, "*#b"] | None = shaped()
@@ -368,7 +370,7 @@ class MomentumDumping(AbstractTorque):
     """Magnetorquers that remove the momentum of the wheels: m = -k (B x h)/|B|^2, N = m x B.
 
     h is the momentum of the wheels of the scene; the torque is -k times its part normal to the
-    field, and the wheels' control passes it on to them.
+    field, which the wheels counteract, so that they lose momentum.
 
     **Arguments:** ``k`` (...) [1/s], not negative; ``field`` and ``position``: as in
     ``ph.MagneticDipole``; ``max_moment`` (...) [A m^2]: limit of each of three rods, or None.
@@ -412,6 +414,7 @@ class MomentumDumping(AbstractTorque):
             return triple([jnp.zeros_like(omega[0])] * 3)
         field = self.dipole.field_body(t, attitude)
         square = dot(field, field)
+        square = jnp.where(square > 0, square, 1)  # no field, no torque
         moment = triple(-self.k * x / square for x in cross(field, self.momentum))
         if self.max_moment is not None:
             moment = triple(jnp.clip(x, -self.max_moment, self.max_moment) for x in moment)

@@ -154,7 +154,7 @@ def _place(orbit: "KeplerOrbit", t: Array) -> Array:
 
 
 class KeplerOrbit(AbstractOrbit):
-    """Position of a body on a conic about an attracting centre: ``orbit(t)`` (..., 3) [m].
+    """Position of a body on an ellipse about an attracting centre: ``orbit(t)`` (..., 3) [m].
 
     ``KeplerOrbit(...)`` takes orbital elements, ``KeplerOrbit.from_state(...)`` a position and a
     velocity. Use it in ``ph.GravityGradient(mu, orbit)``, ``ph.LVLH(orbit)`` and
@@ -174,7 +174,7 @@ class KeplerOrbit(AbstractOrbit):
         same = ph.KeplerOrbit.from_state(3.986e14, orbit(0.0), orbit.velocity_at(0.0))
 
     Raises ValueError for mu that is not positive, an axis of the wrong sign, or an eccentricity
-    that is negative or 1.
+    outside [0, 1).
     """
 
     mu: Float[Array, "*#b"] = shaped()
@@ -209,7 +209,8 @@ class KeplerOrbit(AbstractOrbit):
         }
         dtype = jnp.result_type(*(x for x in numbers.values()))
         for name, value in numbers.items():
-            setattr(self, name, value.astype(dtype))
+            # a plain number stays one: it has no precision of its own
+            setattr(self, name, value if value.weak_type else value.astype(dtype))
         require_positive("mu", self.mu)
         if self.eccentricity is None:
             require(not self.hyperbolic, "HyperbolicOrbit needs an eccentricity, which is above 1.")

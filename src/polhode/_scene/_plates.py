@@ -107,9 +107,9 @@ class Drag(AbstractTorque):
 
     **Arguments:** ``plates``: ``ph.Plates``; ``density`` [kg/m^3]: a number (...), a function of
     time [s] or a ``ph.Table``; ``velocity`` [m/s]: of the body relative to the air, space axes,
-    (..., 3), a function of time -> (3,) or a ``ph.Table``; ``coefficient`` Cd: (p,) or one number.
-    The rotation of the body is neglected against ``velocity``. The torque has a kink where a plate
-    turns away from the wind; steps end there.
+    (..., 3), a function of time -> (3,) or a ``ph.Table``; ``coefficient`` Cd: (p,) or one number,
+    2.2 by default. The rotation of the body is neglected against ``velocity``. The torque has a
+    kink where a plate turns away from the wind; steps end there.
 
         air = ph.Drag(faces, density=1e-11, velocity=[7.6e3, 0.0, 0.0])
 
@@ -161,8 +161,8 @@ class SolarPressure(AbstractTorque):
     of time [s] -> (3,) or a ``ph.Table``, normalised; ``lit``: the visible part of the Sun, from 0
     to 1: a number, a function of time, a ``ph.Table`` or a ``ph.Eclipse``; ``specular`` and
     ``diffuse``: reflected fractions, (p,) or one number, the rest is absorbed; ``pressure`` (...)
-    [N/m^2], at 1 au 4.54e-6. Steps end where a plate turns away from the Sun and at the edges of
-    the shadow.
+    [N/m^2], by default 4.54e-6, that at 1 au. Steps end where a plate turns away from the Sun and
+    at the edges of the shadow.
 
         light = ph.SolarPressure(faces, [1.0, 0.0, 0.0], specular=0.2, diffuse=0.3)
 
@@ -223,8 +223,8 @@ class Eclipse(AbstractPart):
 
     **Arguments:** ``position`` [m]: of the body from the centre of the planet, space axes: an
     orbit, a function of time -> (3,), a ``ph.Table`` or (..., 3); ``direction``: to the Sun, space
-    axes, of the same kinds; ``radius`` (...) of the planet [m]. For ``ph.SolarPressure(lit=...)``.
-    Steps of the integrator end at the edges of the shadow.
+    axes, of the same kinds; ``radius`` (...) of the planet [m], by default that of the Earth. For
+    ``ph.SolarPressure(lit=...)``. Steps of the integrator end at the edges of the shadow.
 
         shadow = ph.Eclipse(ph.KeplerOrbit(3.986e14, 6.9e6), [1.0, 0.0, 0.0])
 

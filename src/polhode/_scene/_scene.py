@@ -133,8 +133,9 @@ class State(AbstractPart):
             )
         momenta = as_float_array("momenta", momenta, (3,))
         if is_concrete(angles[1]):
+            theta = np.asarray(angles[1])  # pi is rounded, and its sine not zero
             require(
-                np.sin(np.asarray(angles[1])) != 0,
+                np.abs(np.sin(theta)) > np.finfo(theta.dtype).eps * np.abs(theta),
                 "theta at 0 or pi: canonical momenta do not determine the body rates there;"
                 " give rates, or build the State from a quaternion.",
             )
@@ -453,7 +454,8 @@ def specialise(scene: Scene) -> Scene:
         raise ValueError("specialise needs concrete numbers: call it outside of jit and grad.")
     with jax.ensure_compile_time_eval():  # the numbers are known, also under jit
         inertia, potential, rotors = map(narrower, (scene.inertia, scene.potential, scene.rotors))
-    return Scene(inertia, potential, scene.torque, rotors)
+        torque = jax.tree.map(narrower, scene.torque, is_leaf=lambda x: isinstance(x, KeplerOrbit))
+    return Scene(inertia, potential, torque, rotors)
 
 
 def narrower(part: Any) -> Any:

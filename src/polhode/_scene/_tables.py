@@ -28,10 +28,10 @@ class Table(AbstractPart):
     polynomials through five neighbouring values. ``kind``: "number" or "vector", where the shape
     of the values leaves both open.
 
-    A derivative of the interpolated values jumps at the times, the second one of a cubic table.
-    Steps of the integrator end there, so that ``rtol`` holds: a simulation takes at least one step
-    for each of the times within its span. Cubic tables are exempt that are so dense (about 700
-    times in a period of their values) that the jumps are negligible.
+    At the table times the first derivative of a linear table and the second derivative of a cubic
+    table jump. Steps of the integrator end there, so that ``rtol`` holds: a simulation takes at
+    least one step for each of the times within its span. Cubic tables are exempt that are so dense
+    (about 700 times in a period of their values) that the jumps are negligible.
 
     ``table(t)`` is a number or a vector (k,) for each of the times ``t`` (...). Before the first
     time and after the last one the outermost polynomials continue: cover the simulated span.
@@ -76,10 +76,13 @@ class Table(AbstractPart):
             raise ValueError(
                 f"Table times must be two or more, of shape (n,), got {self.times.shape}."
             )
-        if is_concrete(self.times):
-            require(np.diff(np.asarray(self.times)) > 0, "Table times must ascend.")
         array = as_float_array("Table values", values)
         self.times = self.times.astype(array.dtype)  # a list is of the default precision
+        if is_concrete(self.times):
+            require(
+                np.diff(np.asarray(self.times)) > 0,
+                f"Table times must ascend, in the dtype of its values ({array.dtype}).",
+            )
         self.order, self.is_number = order, _is_number(array.shape, self.times.size, kind)
         self.values = array[..., None] if self.is_number else array
         knots = self.times.astype(array.dtype)

@@ -165,7 +165,7 @@ def coefficients(name: str, c, hint: str = "a positive c takes energy away") -> 
 class LinearDamping(AbstractTorque):
     """Linear damping N = -c omega, component by component in body axes.
 
-    ``c`` (..., 3), or (...) for the same about every axis [N m s]; it must not be negative.
+    ``c`` (..., 3), or one number for the same about every axis [N m s]; it must not be negative.
     """
 
     c: Float[Array, "*#b 3"] = shaped(3)
@@ -182,7 +182,7 @@ class LinearDamping(AbstractTorque):
 class QuadraticDamping(AbstractTorque):
     """Quadratic damping N = -c |omega| omega, component by component in body axes.
 
-    ``c`` (..., 3), or (...) for the same about every axis [N m s^2]; it must not be negative.
+    ``c`` (..., 3), or one number for the same about every axis [N m s^2]; it must not be negative.
     """
 
     c: Float[Array, "*#b 3"] = shaped(3)
@@ -259,7 +259,8 @@ class EnergySink(AbstractTorque):
 
     ``omega_body`` of a trajectory is I^-1 L. The body rotates in addition by ``slip``, which is
     small where little energy is lost in a revolution; ``docs/how-to/dissipate_energy.md`` derives
-    this and gives rate laws. It adds to torques and potentials that are weak against L x omega.
+    this and gives rate laws. Other torques and potentials may act as well, if they are small
+    compared with |L x omega|.
 
         sink = ph.EnergySink(0.01)
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 2.0, 3.0]), torque=sink)
@@ -347,8 +348,8 @@ class Pulses(AbstractTorque):
 
     **Arguments:** ``torque``: the torque during the pulses, such as ``ph.BodyTorque``; ``starts``,
     ``ends`` (k,) [s]: shared by all bodies, each end after its start. Steps end at every edge, so
-    that no pulse is missed however short, and derivatives by starts and ends are exact. Pulses that
-    overlap act once. A motion with k pulses is solved in 2 k + 1 parts.
+    that no pulse is missed however short, and derivatives with respect to starts and ends are
+    exact. Pulses that overlap act once. A motion with k pulses is solved in 2 k + 1 parts.
 
         burn = ph.Pulses(ph.BodyTorque([0.0, 0.0, 2.0]), [1.0, 5.0], [1.05, 5.001])
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), torque=burn)

@@ -94,10 +94,10 @@ def _not_negative(name: str, value) -> Array:
 
 
 class ViscousCoupling(AbstractCoupling):
-    """Viscous friction -c Omega on a wheel: a bearing, or a ring in a fluid that damps nutation.
+    """Viscous friction -c Omega on a wheel: a bearing, or a ring of fluid that damps nutation.
 
-    ``c`` (...) [N m s], not negative. A wheel with nothing else damps the motion of its body at
-    constant angular momentum:
+    ``c`` (...) [N m s], not negative. A wheel with this coupling alone damps the motion of its body
+    at constant angular momentum:
 
         ring = ph.ViscousCoupling(0.01)
         damper = ph.Rotor([0.0, 1.0, 0.0], inertia=0.02, speed=0.0, coupling=ring)
@@ -410,7 +410,8 @@ class Rotor(AbstractRotor):
     - ``impulse``: instead of ``torque``, an antiderivative of a motor torque that varies: a
       function of time [s] returning N m s.
     - ``coupling``: instead of both, what acts between wheel and body by the wheel's speed, the time
-      and the state: ``ph.ViscousCoupling`` or a sum of such. Exact methods have no such wheels.
+      and the state: ``ph.ViscousCoupling`` or a sum of such. Closed-form methods do not accept such
+      wheels.
 
     Raises ValueError for a zero axis, J <= 0, or more or less than one of momentum and speed.
     """

@@ -13,4 +13,8 @@ from polhode._trajectory._saved import (
     values_of as values_of,
     with_saved as with_saved,
 )
-from polhode._trajectory._trajectory import Events as Events, Trajectory as Trajectory
+from polhode._trajectory._trajectory import (
+    Ending as Ending,
+    Events as Events,
+    Trajectory as Trajectory,
+)

@@ -6,9 +6,11 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 
 from polhode import __version__, rotation
+from polhode._atomic import atomic_write
 from polhode._checks import require
 from polhode._extras import imported
 from polhode._method import Status
@@ -67,6 +69,20 @@ def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
         put("motor_work", trajectory._motor_work, wheels, "J", done)
     put("error", trajectory._error, batch, "rad", "estimated error at the last time")
     put("event_time", trajectory._event_time, batch, "s", "time of the event that ended the motion")
+    for path, values in jax.tree_util.tree_leaves_with_path(trajectory._saved):
+        key = jax.tree_util.keystr(path, simple=True, separator="_")
+        name = f"saved_{key}" if key else "saved"
+        axes = (f"{name}_{k}" for k in range(values.ndim - len(sample_dims)))
+        source = {"long_name": "value of the function of ph.Record(save=...)"}
+        data[name] = ((*sample_dims, *axes), np.asarray(values), source)
+    if trajectory._events is not None:
+        events, each = trajectory._events, (*batch, "event")
+        put("events_time", events.times, each, "s", "times of the events in order, inf for none")
+        put("events_which", events.which, each, "1", "index of the event function, -1 for none")
+        put("events_wxyz", events.wxyz, (*each, "quaternion"), "1", f"{quaternion}, at the events")
+        rates_there = "angular velocity in body axes at the events"
+        put("events_omega_body", events.omega_body, (*each, "axis"), "rad s-1", rates_there)
+        put("events_count", events.count, batch, "1", "number of events, also beyond those stored")
     data["status"] = (
         batch,
         np.asarray(trajectory.status, np.int8),
@@ -179,7 +195,8 @@ def write_aem(
         )
         lines += [f"{m} {row}" for m, row in zip(moments, _rows(*rows))]
         lines.append("DATA_STOP")
-    Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")
+    with atomic_write(path) as temporary:
+        temporary.write_text("\n".join(lines) + "\n", encoding="ascii")
 
 
 def _rows(wxyz: np.ndarray, omega: np.ndarray) -> Iterator[str]:

@@ -15,7 +15,7 @@ from polhode._failed import with_gradients
 from polhode._kernels import is_differentiated, jit_distinct
 from polhode._method import AbstractMethod, Record, Status, raise_on_failure
 from polhode._scene import Scene, State, Wheels
-from polhode._trajectory._trajectory import AbstractPropagator, Trajectory
+from polhode._trajectory._trajectory import AbstractPropagator, Ending, Trajectory
 from polhode.rotation._quaternion import wxyz_rate
 
 
@@ -55,8 +55,8 @@ class Propagator(AbstractPropagator):
                 f"t must have shape (K,), or (..., K) with the batch axes {batch} of the bodies,"
                 f" got {times.shape}."
             )
-        if trajectory._event_time is not None:
-            times = _until_event(trajectory, times)
+        if trajectory._ending is not None:
+            times = _until_event(trajectory._ending, times, batch)
         result = moved_to(trajectory, times)
         if not isinstance(result.status, Tracer):
             raise_on_failure(result.status)
@@ -98,17 +98,13 @@ def _at_times(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
     status = jnp.where(good, status, trajectory.status)
     any_finished = jnp.where(jnp.any(status == Status.SUCCESSFUL), 1.0, 0.0)
     samples = [with_gradients(x, is_sound.reshape(batch), any_finished) for x in samples]
-    return trajectory._with_samples(t, samples, status, steps, trajectory._event_time)
+    return trajectory._with_samples(t, samples, status, steps, trajectory._ending)
 
 
-def _until_event(trajectory: Trajectory, times: Array) -> Array:
+def _until_event(ending: Ending, times: Array, batch: tuple[int, ...]) -> Array:
     """Times (..., K), those beyond the event of a body replaced by the time of its event."""
-    batch, ts = trajectory.batch_shape, trajectory.ts
     times = jnp.broadcast_to(times, (*batch, times.shape[-1]))
-    event = jnp.broadcast_to(trajectory.event_time[..., None], times.shape)
-    # all bodies go one way; one that starts at its event does not show which
-    backwards = jnp.any(ts[..., -1] < ts[..., 0])
-    sign = jnp.where(backwards, -1, 1).astype(times.dtype)
+    event, sign = (jnp.broadcast_to(x[..., None], times.shape) for x in ending)
     beyond = jnp.isfinite(event) & jnp.isfinite(times) & (sign * times > sign * event)
     return jnp.where(beyond, event, times)
 

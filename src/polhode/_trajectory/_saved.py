@@ -91,7 +91,7 @@ def with_saved(trajectory: Trajectory, save: Callable) -> Trajectory:
         t._motor_work,
         None,
         t.propagator,
-        t._event_time,
+        t._ending,
         t._events,
         jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), values),
         final_of(t._wxyz, t._omega_body, t._spins),

@@ -4,7 +4,7 @@ import abc
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -74,6 +74,14 @@ class Events(eqx.Module):
     count: Int[Array, "*b"]
 
 
+class Ending(NamedTuple):
+    """The event that ended the motion of each body (...): its time [s], inf without one, and the
+    sign of time steps of the motion, 1 or -1, which samples at the event alone do not show."""
+
+    time: Array
+    sign: Array
+
+
 class Trajectory(eqx.Module):
     """Samples of the motion; leading axes (...) are the batch, then T times.
 
@@ -100,7 +108,7 @@ class Trajectory(eqx.Module):
     _motor_work: Float[Array, "*b t m"] | None
     _spins: Float[Array, "*b t k"] | None
     propagator: AbstractPropagator | None
-    _event_time: Float[Array, "*b"] | None
+    _ending: Ending | None
     _events: Events | None
     _saved: PyTree[Array]
     _final: tuple[Array | None, ...] | None
@@ -118,7 +126,7 @@ class Trajectory(eqx.Module):
         motor_work: Array | None = None,
         spins: Array | None = None,
         propagator: AbstractPropagator | None = None,
-        event_time: Array | None = None,
+        ending: Ending | None = None,
         events: Events | None = None,
         saved: PyTree[Array] = None,
         final: tuple[Array | None, ...] | None = None,
@@ -127,7 +135,7 @@ class Trajectory(eqx.Module):
         self._steps = steps if isinstance(steps, StepCounts) else StepCounts.of(steps)
         self._wxyz, self._omega_body = wxyz, omega_body
         self._work, self._error, self._motor_work = work, error, motor_work
-        self._spins, self.propagator, self._event_time = spins, propagator, event_time
+        self._spins, self.propagator, self._ending = spins, propagator, ending
         self._events, self._saved, self._final = events, saved, final
 
     def __str__(self) -> str:
@@ -161,7 +169,7 @@ class Trajectory(eqx.Module):
         samples: Sequence[Array],
         status: Array,
         steps: StepCounts,
-        event_time: Array | None,
+        ending: Ending | None,
         events: Events | None = None,
     ) -> "Trajectory":
         """The same motion with other samples: attitude, rates, momenta of coupled wheels."""
@@ -175,7 +183,7 @@ class Trajectory(eqx.Module):
             self.scene,
             spins=spins[0] if spins else None,
             propagator=self.propagator,
-            event_time=event_time,
+            ending=ending,
             events=events,
         )
 
@@ -198,9 +206,9 @@ class Trajectory(eqx.Module):
     def step_counts(self) -> StepCounts:
         """How many steps (...) each body took, and what kept them short.
 
-        Many refused ones: the motion changes abruptly. At switches: a torque changes sides often;
-        smooth it, or loosen the limit that it meets. At saved times: save fewer. Limited by
-        stability: something decays fast; weaken it, or take an implicit method. Closed forms: 0.
+        Many refused ones: the motion changes abruptly. At switches: a torque switches often; smooth
+        it, or widen its limit. At saved times: save fewer. Limited by stability: something decays
+        fast; weaken it, or use an implicit solver. Closed forms: 0.
         """
         return self._steps
 
@@ -235,6 +243,10 @@ class Trajectory(eqx.Module):
     def event_time(self) -> Float[Array, "*b"]:
         """Time (...) [s] of the event that ended the motion; inf for a body without one."""
         return self._recorded("event_time", "until=ph.Event(...)")
+
+    @property
+    def _event_time(self) -> Array | None:
+        return None if self._ending is None else self._ending.time
 
     @property
     def events(self) -> Events:
@@ -365,7 +377,7 @@ class Trajectory(eqx.Module):
             of_both(self._motor_work, 2),
             of_both(self._spins, 2),
             self.propagator,
-            of_bodies(self._event_time, 0),
+            jax.tree.map(lambda x: of_bodies(x, 0), self._ending),
             None
             if self._events is None
             else Events(
@@ -441,13 +453,13 @@ class Trajectory(eqx.Module):
 
     @property
     def momentum_body(self) -> Float[Array, "*b t 3"]:
-        """Angular momentum in body axes, that of rotors included [kg m^2/s]."""
+        """Angular momentum (..., T, 3) in body axes, that of rotors included [kg m^2/s]."""
         _ = self.omega_body  # must have been recorded
         return self._compiled(_momentum_body)
 
     @property
     def momentum_space(self) -> Float[Array, "*b t 3"]:
-        """Angular momentum in space axes [kg m^2/s]."""
+        """Angular momentum (..., T, 3) in space axes [kg m^2/s]."""
         return rotation.rotate(self.wxyz, self.momentum_body)
 
     @property
@@ -503,6 +515,8 @@ class Trajectory(eqx.Module):
     def to_xarray(self, labels: Sequence[str] | None = None) -> Any:
         """An ``xarray.Dataset`` with named dimensions, units and attributes (needs xarray).
 
+        It holds all that was recorded: states and what follows from them, ``saved`` (an array of a
+        dictionary as ``saved_<key>``), ``event_time`` and, as ``events_<field>``, ``events``.
         ``labels``: names of the bodies of a batch of one axis, the coordinate ``body``.
         """
         return dataset(self, labels)
@@ -516,9 +530,9 @@ class Trajectory(eqx.Module):
         ``body_frame`` ("SC_BODY_1"), ``time_system`` ("TAI"), ``originator`` ("POLHODE"),
         ``center_name`` (None), ``rates`` (True: body rates too), ``creation_date`` (now).
 
-        One segment a body, in the order of time. Seconds are counted on from ``epoch``: over a leap
-        second leave UTC to others. Raises ValueError or TypeError for fields that the standard does
-        not know, FileNotFoundError for a folder that is not there.
+        One segment a body, in the order of time. Seconds are counted on from ``epoch``: do not use
+        ``time_system="UTC"`` across a leap second. Raises ValueError or TypeError for fields that
+        the standard does not know, FileNotFoundError for a folder that is not there.
         """
         write_aem(path, self, epoch, **fields)
 

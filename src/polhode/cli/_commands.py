@@ -84,7 +84,7 @@ def scenes(
     """List the scenes that come with polhode, which `polhode run NAME` runs; or copy one."""
     import tomllib
 
-    from polhode.files._write import atomic_write
+    from polhode._atomic import atomic_write
 
     shipped = shipped_scenes()
     if name is None:
@@ -123,7 +123,8 @@ def reference(
 
     Attitudes, rates, flip times and their derivatives of 14 bodies at times up to 1e5 revolutions.
     """
-    from polhode.files._write import REFERENCE, atomic_write, reference_csv
+    from polhode._atomic import atomic_write
+    from polhode.files._write import REFERENCE, reference_csv
 
     stem = output_stem(output, ".json", ".csv", what="the reference data")
     texts = {".json": REFERENCE.read_text(encoding="utf-8"), ".csv": reference_csv()}
@@ -211,7 +212,7 @@ def lightcurve(
     floor: Annotated[
         float, option("--floor", "MAG", "least error of a point [mag]", not_negative)
     ] = 0.03,
-    seed: Annotated[int, option("--seed", "N", "of the trials", whole_number(0))] = 0,
+    seed: Annotated[int, option("--seed", "N", "seed of the trials", whole_number(0))] = 0,
     searches: Annotated[
         int,
         option(
@@ -243,7 +244,7 @@ def lightcurve(
         ),
     ] = None,
     calibrated: Annotated[
-        bool, typer.Option("--calibrated", help="nights share a zero point, but for small errors")
+        bool, typer.Option("--calibrated", help="nights share a zero point up to small errors")
     ] = False,
     reduced: Annotated[
         bool, typer.Option("--reduced", help="the brightness is reduced for distance already")

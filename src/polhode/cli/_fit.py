@@ -108,11 +108,14 @@ def fit(
         ),
     ] = None,
     bias: Annotated[bool, _flag("--bias", "fit a constant gyroscope bias")] = False,
-    drag: Annotated[bool, _flag("--drag", "fit a drag of the air")] = False,
+    drag: Annotated[bool, _flag("--drag", "fit aerodynamic drag")] = False,
     robust: Annotated[
         float | None,
         option(
-            "--robust", "K", "count residuals beyond K noises linearly (needs --noise)", positive
+            "--robust",
+            "K",
+            "count residuals beyond K sigma of the noise linearly (needs --noise)",
+            positive,
         ),
     ] = None,
     wheel_inertia: Annotated[
@@ -329,7 +332,7 @@ def _write(path: Path, recording_path: Path, options: _Options, loaded: Any, res
     import numpy as np
 
     import polhode
-    from polhode.files._write import atomic_write
+    from polhode._atomic import atomic_write
     from polhode.fit._result import mirror_moments
     from polhode.rotation import wxyz_to_matrix
 

@@ -259,16 +259,24 @@ class Figures(NamedTuple):
     momentum: float | None
 
 
+def _has_orbit(scene: polhode.Scene) -> bool:
+    def is_orbit(x):
+        return isinstance(x, polhode.AbstractOrbit)
+
+    return any(map(is_orbit, jax.tree.leaves(scene.potential, is_leaf=is_orbit)))
+
+
 def measure(job: Job, outcome: Outcome) -> Figures:
     """Periods of every body; the largest change of energy and of angular momentum in space.
 
-    Energy is given where no torque and no motor works on the body, momentum where nothing acts.
+    Energy is given where no torque, no motor and no potential that changes along an orbit works on
+    the body, momentum where nothing acts.
     """
     scene, trajectory = job.scene, outcome.trajectory
     energy = momentum = None
     periods, modes = {}, []
     constant = not isinstance(scene.inertia, VariableInertia)
-    if scene.torque is None and scene.rotors is None and constant:
+    if scene.torque is None and scene.rotors is None and constant and not _has_orbit(scene):
         energies = np.asarray(trajectory.energy, np.float64)
         rates, momenta = trajectory.omega_body, trajectory.momentum_body
         kinetic = np.sum(np.asarray(rates, float) * np.asarray(momenta, float), axis=-1) / 2

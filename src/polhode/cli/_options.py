@@ -393,7 +393,7 @@ def write_figure(path: Path, draw: Callable[[], Any]) -> Path:
     from matplotlib import pyplot
 
     from polhode import __version__
-    from polhode.files._write import atomic_write
+    from polhode._atomic import atomic_write
 
     figure, data = draw(), io.BytesIO()
     figure.savefig(data, format="png", dpi=160, metadata={"Software": f"polhode {__version__}"})

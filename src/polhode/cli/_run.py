@@ -102,8 +102,8 @@ def run(
     scheduler: SchedulerOption = None,
 ) -> int:
     """Simulate a scene with its Monte Carlo clones. Writes a NetCDF file and a PNG figure beside
-    it, each whole or not at all, and prints a summary table. A scene with an [ensemble] goes into a
-    Zarr store instead.
+    it, each complete or not at all, and prints a summary table. A scene with an [ensemble] goes
+    into a Zarr store instead.
     """
     file = read_scene(scene, clones, seed)
     options = dict(memory=memory, chunk=chunk, devices=devices, part=part, scheduler=scheduler)  # noqa: C408

@@ -188,7 +188,7 @@ class SpreadMoments(eqx.Module):
 
         def is_unfinished(carry):
             trial, moments = carry
-            return ~possible_moments(moments) & (trial < _MAX_DRAWS)
+            return ~possible_moments(moments, rounded=False) & (trial < _MAX_DRAWS)
 
         def draw_again(carry):
             trial, _ = carry
@@ -197,7 +197,7 @@ class SpreadMoments(eqx.Module):
         zero = jnp.zeros((), jnp.int32)
         initial_carry = (zero + 1, draw_moments(zero))
         _, moments = jax.lax.while_loop(is_unfinished, draw_again, initial_carry)
-        moments = jnp.where(possible_moments(moments), moments, jnp.nan)
+        moments = jnp.where(possible_moments(moments, rounded=False), moments, jnp.nan)
         return _with_moments(scene, moments), state
 
 

@@ -98,7 +98,9 @@ def summarise(statistic: Statistic, trajectory: Trajectory, is_body: Bool[Array,
     }
     if statistic.low is not None:
         edges = jnp.asarray(statistic.edges, values.dtype)
-        place = jnp.where(counted, jnp.searchsorted(edges, values, side="right"), 0)
+        place = jnp.searchsorted(edges, values, side="right")
+        place = jnp.where(values == edges[-1], statistic.bins, place)  # the last bin holds its end
+        place = jnp.where(counted, place, 0)
         columns = jnp.broadcast_to(jnp.arange(values.shape[1])[None], values.shape)
         empty = jnp.zeros((values.shape[1], statistic.bins + 2), jnp.int32)
         summary["histogram"] = empty.at[columns, place].add(counted.astype(jnp.int32))

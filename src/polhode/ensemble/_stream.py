@@ -73,13 +73,13 @@ class Block:
             raise ValueError(f"the bodies of an ensemble share their times (T,), got {ts.shape}.")
         self.ensemble, self.ts, self.devices = ensemble, ts, tuple(devices)
         self.size = block_size(ts.shape[0])
+        self.rtol = check_rtol(rtol, ts.dtype)
         if method is None:
             # by the bodies drawn: those of a symmetric one may have three moments
             # the arrays of the ensemble are closed over: rows are read by NumPy
             drawn, _ = eqx.filter_eval_shape(lambda: ensemble.draw(np.zeros(1, int)))
-            method, _ = choose(drawn)
+            method, _ = choose(drawn, self.rtol)
         self.method = method
-        self.rtol = check_rtol(rtol, ts.dtype)
         self.settings = Settings(self.size, trajectories, statistics)
         self.counts = np.array([ensemble.seed, ensemble.bodies], np.uint32)
         self.compiled: list[Any] = []
@@ -219,7 +219,7 @@ def stream(
     - ``method``, ``rtol``: as in ``ph.simulate``.
     - ``trajectories``, ``statistics``: what is stored beside the status of each body.
     - ``memory``: limit [bytes] from which the size of a chunk follows; ``chunk``: bodies per chunk
-      instead, a multiple of the block (see ``polhode.ensemble`` in docs/scale.md). A store retains
+      instead, a multiple of the block (docs/scale.md, Reproducibility). A store retains
       the chunks it began with.
     - ``devices``: local JAX devices that share the bodies; None: the first one.
     - ``part``: (i, n) computes every n-th chunk from the i-th on, i from 1 to n; chunks are then

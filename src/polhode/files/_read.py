@@ -355,9 +355,14 @@ def _read_table(place: str, text: str, scene: Path) -> list[list[float]]:
     return rows
 
 
-def possible_moments(moments: Any) -> Any:
-    """Which rows (..., 3) of NumPy or JAX are positive and obey the triangle inequality."""
-    return (moments.min(axis=-1) > 0) & (2 * moments.max(axis=-1) <= moments.sum(axis=-1))
+def possible_moments(moments: Any, rounded: bool = True) -> Any:
+    """Which rows (..., 3) of NumPy or JAX are positive and obey the triangle inequality; numbers
+    that are ``rounded``, such as those of a flat body, within the tolerance of ``ph.Inertia``."""
+    import numpy as np
+
+    tolerance = float(np.sqrt(np.finfo(moments.dtype).eps)) if rounded else 0.0
+    largest = (2 - tolerance) * moments.max(axis=-1)
+    return (moments.min(axis=-1) > 0) & (largest <= moments.sum(axis=-1))
 
 
 def _first_invalid(name: str, rows: "np.ndarray", step: int = 2**20) -> int | None:
@@ -365,7 +370,8 @@ def _first_invalid(name: str, rows: "np.ndarray", step: int = 2**20) -> int | No
     import numpy as np
 
     for start in range(0, len(rows), step):
-        part = np.asarray(rows[start : start + step], np.float64)
+        part = np.asarray(rows[start : start + step])
+        part = part if np.issubdtype(part.dtype, np.floating) else part.astype(np.float64)
         valid = np.isfinite(part).all(axis=1)
         if name == "moments":
             valid &= possible_moments(part)

@@ -1,9 +1,6 @@
-"""Writing files: atomically (beside the target, synced, then renamed), and what is written.
+"""What is written to files: NetCDF, the versions of the libraries that computed it, and the
+reference motions of free bodies."""
 
-NetCDF, the versions of the libraries that computed it, and the reference motions of free bodies.
-"""
-
-import contextlib
 import csv
 import functools
 import importlib.metadata
@@ -11,12 +8,12 @@ import io
 import json
 import os
 import platform
-import secrets
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from polhode._atomic import atomic_write
 from polhode._extras import imported
 
 if TYPE_CHECKING:
@@ -24,46 +21,6 @@ if TYPE_CHECKING:
 
 
 LIBRARIES = ("jax", "jaxlib", "diffrax", "equinox", "numpy")
-
-
-@contextlib.contextmanager
-def atomic_write(target: str | os.PathLike) -> Iterator[Path]:
-    """A temporary path in the folder of `target` that replaces `target` when the block succeeds.
-
-    When the block raises anything, KeyboardInterrupt included, the temporary file is removed and an
-    existing `target` is left as it was. The folder must exist. An OSError of the system names the
-    target and its folder.
-    """
-    target = Path(target).resolve()
-    # the suffix stays last: writers of figures choose the format by it
-    temporary = target.with_name(f".{target.stem}.{secrets.token_hex(6)}.part{target.suffix}")
-    try:
-        yield temporary
-        with open(temporary, "rb+") as file:
-            os.fsync(file.fileno())
-        os.replace(temporary, target)
-    except OSError as error:
-        if error.errno is None or error.strerror is None:
-            raise
-        raise OSError(
-            error.errno,
-            f"{error.strerror}: cannot write {target.name} in the folder {target.parent}; nothing"
-            " was changed there",
-        ) from error
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-    if hasattr(os, "O_DIRECTORY"):  # Windows cannot open folders
-        sync(target.parent)
-
-
-def sync(path: Path) -> None:
-    """Have a file, or the names in a folder, on the disk, also when the power goes."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 def write_netcdf(dataset: "xarray.Dataset", target: str | os.PathLike) -> Path:

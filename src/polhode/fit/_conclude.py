@@ -15,7 +15,7 @@ from polhode._scene import State
 from polhode.fit._findings import Finding
 from polhode.fit._model import Parameters, entries_of, whole_of
 from polhode.fit._numerics import eigh, inverse, svd
-from polhode.fit._options import FitOptions, Gyroscope, noise_is_trusted
+from polhode.fit._options import FitOptions, Gyroscope, Huber, noise_is_trusted
 from polhode.fit._recording import Recording, require_channel, rotation_vector_between, size_of_data
 from polhode.fit._residuals import Linear, prior_of
 from polhode.fit._result import (
@@ -169,7 +169,7 @@ class _Split(NamedTuple):
     motion: list[Array]
 
 
-def _sort_by_kind(shared: Array, count: int, parameters: Parameters) -> _Split:
+def _sort_by_kind(shared: Any, count: int, parameters: Parameters) -> _Split:
     """``shared`` (s,), in the order of ``Unknowns``, by what it is of."""
     position = count
     sensor, motion = {}, []
@@ -216,6 +216,27 @@ def _deviations(determination: Determination, count: int) -> Array:
     std = jnp.sqrt(jnp.maximum(jnp.diagonal(determination.covariance), 0))
     null_part = jnp.sqrt(jnp.sum((determination.null * determination.safe[:, None]) ** 2, axis=1))
     return jnp.where(null_part > MAX_NULL_PART, jnp.inf, std)[:count]
+
+
+def _deviations_by_kind(determination: Determination, solution: Solution, count: int) -> _Split:
+    """Standard deviations of the shared unknowns, those of gain and bias in readings, as
+    ``_sensor`` gives them."""
+    parameters, gain = solution.parameters, solution.model.gyroscope.gain
+    std = _deviations(determination, solution.linear.shared.shape[-1])
+    split = _sort_by_kind(std, count, parameters)
+    if gain is None:
+        return split
+    places = _sort_by_kind(np.arange(std.size), count, parameters).sensor
+    for name in {"bias", "gain"} & set(places):
+        place = np.ravel(places[name])
+        # entries of a gain row by row
+        turn = jnp.kron(gain, jnp.eye(place.size // 3)).astype(std.dtype)
+        covariance = turn @ determination.covariance[np.ix_(place, place)] @ turn.T
+        is_unknown = (jnp.abs(turn) > 0) & jnp.isinf(std[place])[None]
+        reading_std = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
+        reading_std = jnp.where(jnp.any(is_unknown, axis=1), jnp.inf, reading_std)
+        split.sensor[name] = reading_std.reshape(split.sensor[name].shape)
+    return split
 
 
 def _initial(parameters: Parameters, recording: Recording, attitude: Array | None) -> State:
@@ -277,7 +298,7 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
     spread = jnp.where(leaning > 1e-3 * reach, jnp.inf, spread)
     axes_std = turn_std(moments, spread[6:])
 
-    std = _sort_by_kind(_deviations(determination, linear.shared.shape[-1]), count, parameters)
+    std = _deviations_by_kind(determination, solution, count)
     trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
     findings = {
         Finding.NOT_FINITE: ~(jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(tensor))),
@@ -316,7 +337,7 @@ def conclude_scene(solution: Solution, recording: Recording, options: FitOptions
     linear, parameters = solution.linear, solution.parameters
     determination = determination_of(solution, recording, noise_is_trusted(options))
     spread = _deviations(determination, linear.shared.shape[-1])
-    std = _sort_by_kind(spread, 0, parameters)
+    std = _deviations_by_kind(determination, solution, 0)
     findings = {
         Finding.NOT_FINITE: ~(jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(linear.at))),
         Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread)),
@@ -350,7 +371,7 @@ def _fit_of(
 ) -> Fit:
     """The result, with the ``findings`` of its kind and those that all fits share."""
     linear, parameters, model = solution.linear, solution.parameters, solution.model
-    parts = residuals_by_channel(linear, recording)
+    parts = residuals_by_channel(linear, recording, options.robust)
     whiteness = whiteness_of(linear.residuals, recording.present)
     findings = findings | {
         Finding.STEP_LIMIT: ~solution.stopped,
@@ -480,13 +501,16 @@ def _turns(recording: Recording, centred: bool) -> tuple[Array, Array]:
     return weight * measured, weight * recorded
 
 
-def residuals_by_channel(linear: Linear, recording: Recording) -> dict[str, Array]:
+def residuals_by_channel(
+    linear: Linear, recording: Recording, robust: Huber | None
+) -> dict[str, Array]:
     """Residuals of rates, attitudes and forces, each (r, t, 3), over their noise."""
+    residuals = linear.residuals if robust is None else robust.inverse(linear.residuals)
     parts, channel = {}, 0
     kinds = {"omega": recording.omega, "attitude": recording.wxyz, "force": recording.force}
     for name, measured in kinds.items():
         if measured is not None:
-            parts[name] = linear.residuals[..., channel : channel + 3]
+            parts[name] = residuals[..., channel : channel + 3]
             channel += 3
     return parts
 

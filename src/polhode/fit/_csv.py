@@ -69,7 +69,12 @@ def load_recording(
     (header,) = csv.reader([lines[header_line]], delimiter=separator, skipinitialspace=True)
     names = [name.strip() for name in header]
     header_names = _required_columns(path, names, {} if columns is None else columns)
-    units = {role: unit for role, name in header_names.items() if (unit := unit_of(role, name))}
+    given = {"t": time_scale, "wx": scale, "wy": scale, "wz": scale}
+    units = {
+        role: unit
+        for role, name in header_names.items()
+        if (unit := unit_of(role, name, is_scaled=given.get(role) is not None))
+    }
     scale = _factor(path, "rates", [units.get(role) for role in ("wx", "wy", "wz")], _RATES, scale)
     time_scale = _factor(path, "times", [units.get("t")], _TIMES, time_scale)
     wheel_scale = _factor(path, "wheel speeds", [units.get("wheel")], _RATES, None)
@@ -146,8 +151,17 @@ def _rows(path, lines, header_line, separator, names, header_names) -> tuple[lis
     return table, numbers
 
 
-_TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
-_RATES = {"rad/s": 1.0, "deg/s": math.pi / 180, "mdeg/s": math.pi / 180e3, "rpm": math.pi / 30}
+_TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0, "day": 86400.0}
+_DEGREE = math.pi / 180
+_RATES = {
+    "rad/s": 1.0,
+    "mrad/s": 1e-3,
+    "deg/s": _DEGREE,
+    "mdeg/s": _DEGREE / 1000,
+    "deg/h": _DEGREE / 3600,
+    "rpm": math.pi / 30,
+    "rev/s": 2 * math.pi,
+}
 _SPELLINGS = {
     "sec": "s",
     "secs": "s",
@@ -163,6 +177,9 @@ _SPELLINGS = {
     "nsec": "ns",
     "nanoseconds": "ns",
     "minutes": "min",
+    "hour": "h",
+    "hours": "h",
+    "days": "day",
     "rad_s": "rad/s",
     "rads": "rad/s",
     "rad_per_s": "rad/s",
@@ -180,6 +197,10 @@ _SPELLINGS = {
     "°/s": "deg/s",
     "deg s-1": "deg/s",
     "mdps": "mdeg/s",
+    "deg/hr": "deg/h",
+    "°/h": "deg/h",
+    "rev/min": "rpm",
+    "r/min": "rpm",
 }
 _AMBIGUOUS = ("rps",)
 _TIME = re.compile(r"t|time|times|timestamp|seconds[_ ]?elapsed|elapsed([_ ]?time)?|clock")
@@ -201,17 +222,19 @@ def _split_unit(name: str) -> tuple[str, str]:
     return text, ""
 
 
-def unit_of(role: str, name: str) -> str:
-    """The unit that a column's name states, or nothing. ValueError for one of another kind."""
+def unit_of(role: str, name: str, is_scaled: bool = False) -> str:
+    """The unit that a column's name states, or nothing. ValueError for one of another kind, and for
+    an unknown one in brackets unless a factor is given."""
     unit = _split_unit(name)[1]
     unit = _SPELLINGS.get(unit, unit)
     factors = _TIMES if role == "t" else _RATES
     if unit in factors or (unit in _AMBIGUOUS and role != "t"):
         return unit
-    if unit in _TIMES or unit in _RATES:
+    is_known = unit in _TIMES or unit in _RATES
+    if is_known or (name.rstrip()[-1:] in ("]", ")") and unit and not is_scaled):
         raise ValueError(
             f"column {name} is to be {role}, but states the unit {unit}; expected one of"
-            f" {', '.join(factors)}."
+            f" {', '.join(factors)}. Rename the column, or state the factor."
         )
     return ""
 

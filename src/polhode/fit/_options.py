@@ -34,7 +34,7 @@ class Gyroscope(eqx.Module):
       other entries), as calibrated; None: the identity.
     - ``bias`` (3,) [rad/s], as calibrated; None: zero.
     - ``noise_density`` [rad/s/sqrt(Hz)]: white noise (angle random walk): a sample has the standard
-      deviation ``noise_density / sqrt(step)``.
+      deviation ``noise_density / sqrt(step)``, in fits with the median step of the recording.
     - ``bias_walk`` [rad/s/sqrt(s)]: random walk of the bias (rate random walk).
     - ``max_rate`` [rad/s]: readings saturate at plus and minus this rate; None: no limit is known.
     - ``delay`` [s] of the readings behind their time stamps, beside attitudes or a wheel.
@@ -256,6 +256,12 @@ class Huber(eqx.Module):
         large_size = jnp.where(inside, self.threshold, size)
         outside = jnp.sqrt(2 * self.threshold * large_size - self.threshold**2)
         return jnp.where(inside, residual, jnp.sign(residual) * outside)
+
+    def inverse(self, reduced: Array) -> Array:
+        """The residual of which the loss makes ``reduced``."""
+        size = jnp.abs(reduced)
+        outside = (size**2 + self.threshold**2) / (2 * self.threshold)
+        return jnp.where(size <= self.threshold, reduced, jnp.sign(reduced) * outside)
 
 
 # Options of a fit, and checks of which of them a function supports.

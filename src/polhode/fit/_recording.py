@@ -185,7 +185,7 @@ def size_of_data(recording: Recording, channels: int) -> Array:
 def interpolate_gaps(
     times: Float[Array, "*b t"], present: Float[Array, "*b t"], values: Array
 ) -> Array:
-    """Values with those that are not ``known`` interpolated linearly between their neighbours.
+    """Values with those that are not ``present`` interpolated linearly between their neighbours.
 
     ``values`` (..., t), or (..., t, c) for channels with the same gaps. Before the first known one
     and after the last they are held.

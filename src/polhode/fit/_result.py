@@ -4,7 +4,6 @@ import csv
 import json
 from collections.abc import Callable
 from os import PathLike
-from pathlib import Path
 from statistics import NormalDist
 from typing import Any
 
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from polhode._atomic import atomic_write
 from polhode._checks import ArrayLike, require
 from polhode._scene import Scene, State
 from polhode.fit._findings import (
@@ -55,8 +55,9 @@ class Fit(eqx.Module):
       what the data do not show). Of ``fit_scene`` these are the arrays that ``free`` listed; of an
       inertia the tensor (..., 3, 3) [kg m^2] in sensor axes and the unknowns of the motion (leaves
       of ``parameters.motion``: drag, delay).
-    - ``sensor``, ``sensor_std``: those fitted of ``"bias"`` (..., 3) [rad/s] and ``"mounting"``
-      (..., 3) [rad] of the gyroscope and ``"lever"`` (..., 3) [m] of the accelerometer.
+    - ``sensor``, ``sensor_std``: those fitted of ``"gain"`` (..., 3, 3), ``"bias"`` (..., 3)
+      [rad/s], ``"delay"`` (...) [s] and ``"mounting"`` (..., 3) [rad] of the gyroscope and
+      ``"lever"`` (..., 3) [m] of the accelerometer.
     - ``initial``: ``ph.State`` (..., r) at the first time of each recording. Without recorded
       attitudes the space axes are those of the body then, or the ``attitude`` of ``fit_scene``.
     - ``covariance`` (..., p, p) of all unknowns: the tensor's entries xx, yy, zz, yz, zx, xy (three
@@ -184,7 +185,7 @@ class Fit(eqx.Module):
 
     @property
     def is_usable(self) -> bool:
-        """Whether no fit stopped early, is not finite or contradicts the attitudes."""
+        """Whether every fit converged, is finite and agrees with the recorded attitudes."""
         return not bool((np.asarray(self.diagnostics) & int(UNUSABLE)).any())
 
     def derived(
@@ -390,9 +391,9 @@ class Fit(eqx.Module):
         """Write ``to_dict`` of every body: one object, or a list of them for a batch."""
         bodies = [self.to_dict(k) for k in range(np.size(self.diagnostics))]
         content = bodies if np.ndim(self.diagnostics) else bodies[0]
-        Path(path).write_text(
-            json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8"
-        )
+        text = json.dumps(content, indent=1, allow_nan=False) + "\n"
+        with atomic_write(path) as temporary:
+            temporary.write_text(text, encoding="utf-8")
 
     def to_csv(self, path: str | PathLike[str]) -> None:
         """Write a row for every fitted number: body, name, component, value, standard deviation.
@@ -409,7 +410,10 @@ class Fit(eqx.Module):
                 ("moments", self.moments, self.moments_std),
                 ("ratios", self.ratios, self.ratios_std),
             ]
-        with Path(path).open("w", newline="", encoding="utf-8") as file:
+        with (
+            atomic_write(path) as temporary,
+            temporary.open("w", newline="", encoding="utf-8") as file,
+        ):
             writer = csv.writer(file)
             writer.writerow(["body", "name", "component", "value", "std"])
             for body in range(np.size(self.diagnostics)):
@@ -442,8 +446,8 @@ class Fit(eqx.Module):
                 twin = np.sort(mirror_moments(np.asarray(self.moments).reshape(-1, 3)[body]))
                 about.append(
                     "free rates do not show the handedness of the axes: with one axis inverted the "
-                    f"same data mean {twin[0]:.4f} : {twin[1]:.4f} : 1; compare with what you know "
-                    "of the body"
+                    f"same data give the ratios {twin[0]:.4f} : {twin[1]:.4f} : 1; compare with "
+                    "what you know of the body"
                 )
         texts = self._texts()
         return about + [texts[flag] for flag in self._flags(body)]
@@ -512,7 +516,7 @@ class Fit(eqx.Module):
                 stretch.append(even)
                 turn.append(odd)
         for name, directions in (
-            ("scale factors and skewness of the gyroscope", stretch),
+            ("scale factors and non-orthogonality of the gyroscope", stretch),
             ("rotation of the gyroscope", turn),
         ):
             basis = np.array([part.ravel() for part in directions])

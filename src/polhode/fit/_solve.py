@@ -33,7 +33,12 @@ from polhode.fit._recording import (
     size_of_data,
 )
 from polhode.fit._residuals import Linear, Model, linearise, prior_cost, prior_residuals, unknowns
-from polhode.fit._start import alternative_starts, neighbour_noise_variance, regression
+from polhode.fit._start import (
+    alternative_starts,
+    nearest_physical,
+    neighbour_noise_variance,
+    regression,
+)
 from polhode.inertia import Inertia, inertia_of_second_moments, second_moments
 
 # Parts of the recording that are fitted one after the other where the whole misleads at first.
@@ -361,12 +366,21 @@ def _turned(recording: Recording) -> Float[Array, "r t-1 3"]:
     return rotation_vector_between(wxyz[:, :-1], wxyz[:, 1:])
 
 
+def _beside(steps: Float[Array, "r t-1 c"]) -> Float[Array, "r t c"]:
+    """At each sample the sum of the numbers of the steps before and after it."""
+    return sum(jnp.pad(steps, ((0, 0), side, (0, 0))) for side in ((1, 0), (0, 1)))
+
+
 def _rates(recording: Recording) -> Float[Array, "r t 3"]:
     """Measured rates, or those between successive attitudes; gaps filled by interpolation."""
     if recording.omega is None:
-        between = _turned(recording) / jnp.diff(recording.times, axis=-1)[..., None]
-        mean_rates = (between[:, 1:] + between[:, :-1]) / 2
-        return jnp.concatenate([between[:, :1], mean_rates, between[:, -1:]], axis=1)
+        # at each sample the mean of the rates before and after it, as far as both ends are present
+        known = recording.present[:, 1:] * recording.present[:, :-1]
+        steps = jnp.diff(recording.times, axis=-1)
+        rates = known[..., None] * _turned(recording) / steps[..., None]
+        sums, counts = (_beside(x) for x in (rates, known[..., None]))
+        values, has_rate = sums / jnp.maximum(counts, 1), (counts[..., 0] > 0).astype(rates.dtype)
+        return interpolate_gaps(recording.times, has_rate, values)
     return interpolate_gaps(recording.times, recording.present, recording.omega)
 
 
@@ -390,7 +404,7 @@ def _bases(
         rates, recording.times, recording.present, wheel_momentum
     )
     if initial is not None:
-        whole_moments = second_moments(initial.tensor)
+        whole_moments = nearest_physical(second_moments(initial.tensor))
     bodies = jnp.stack([whole_moments, piece_moments, *alternative_starts(rates, whole_moments)])
     if unknown.columns().shape[1] == 3:
         bodies = bodies * jnp.eye(3, dtype=bodies.dtype)[None]

@@ -87,9 +87,9 @@ def _design(omega: Float[Array, "t 3"]) -> Float[Array, "t 3 6"]:
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def _nearest_physical(entries: Float[Array, " 6"]) -> Float[Array, "3 3"]:
+def nearest_physical(sigma: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
     """Second moments of the nearest body that is not too flat."""
-    values, axes = eigh(second_moments(whole_of(entries)))
+    values, axes = eigh(sigma)
     min_moment = _FLATTEST * jnp.sum(jnp.abs(values))
     values = jnp.maximum(values, min_moment)
     return jnp.einsum("ij,j,kj->ik", axes, values, axes)
@@ -144,7 +144,7 @@ def regression(
             values, vectors = eigh(gram / metric[:, None] / metric[None])
             entries = vectors[:, 0] / metric
             entries = entries * jnp.where(jnp.sum(entries[:3]) < 0, -1, 1).astype(entries.dtype)
-            return _nearest_physical(entries), values[0] / jnp.sum(values)
+            return nearest_physical(second_moments(whole_of(entries))), values[0] / jnp.sum(values)
 
         def refine(_, carry):
             _, rows = rows_of(carry[0])
@@ -164,7 +164,8 @@ def regression(
         body, push = centred(rows, parts), centred(rotated_momentum, parts)
         entries = solve(square(body), -jnp.einsum("rtij,rti->j", body, push))
         residual = jnp.einsum("rtij,j->rti", body, entries) + push
-        solutions.append((_nearest_physical(entries), jnp.sum(residual**2) / jnp.sum(push**2)))
+        sigma = nearest_physical(second_moments(whole_of(entries)))
+        solutions.append((sigma, jnp.sum(residual**2) / jnp.sum(push**2)))
     return solutions[0][0], solutions[1][0], solutions[0][1]
 
 

@@ -218,8 +218,9 @@ Time = Float[ArrayLike, "*#b"]
 Vector = Float[Array, "*#b 3"]
 
 
-def _at_times(function: Callable, t: Array):
+def _at_times(function: Callable, t: Time):
     """The function of one time, at every entry of an array of times."""
+    t = as_float_array("t", t, finite=False)
     for _ in range(t.ndim):
         function = jax.vmap(function)
     return function(t)
@@ -339,11 +340,6 @@ class RotatingFrame(eqx.Module):
         apart.
         """
         wxyz, omega = trajectory.wxyz, trajectory.omega_body
-        if wxyz is None or omega is None:
-            raise ValueError(
-                "the trajectory lacks attitude or rates: simulate with"
-                " record=ph.Record(attitude=True, rates=True)"
-            )
         if wxyz.ndim != 2:
             raise ValueError(
                 f"the trajectory holds a batch of bodies of shape {wxyz.shape[:-2]}: choose one"
@@ -374,7 +370,7 @@ class RotatingFrame(eqx.Module):
 
     def attitude(self, t: Time) -> Float[Array, "*b 4"]:
         """Unit quaternion, frame -> space."""
-        return _at_times(self.turning.attitude, jnp.asarray(t))
+        return _at_times(self.turning.attitude, t)
 
     def omega_body(self, t: Time) -> Float[Array, "*b 3"]:
         """Angular velocity in frame components [rad/s]."""
@@ -387,8 +383,9 @@ class RotatingFrame(eqx.Module):
 
     def _rates(self, t: Time) -> tuple[Array, Array | None]:
         if self.is_uniform:
-            return self.turning.rates(t)
-        return _at_times(self.turning.rates, jnp.asarray(t))
+            omega, slope = self.turning.rates(t)
+            return jnp.broadcast_to(omega, (*jnp.shape(t), 3)), slope
+        return _at_times(self.turning.rates, t)
 
     def _origin(self, t: Time) -> tuple[Array, Array, Array]:
         """Position, velocity and acceleration of the origin in space components."""
@@ -509,28 +506,19 @@ def _times(mass: ArrayLike, vector: Array) -> Array:
     return jnp.multiply(*_aligned(jnp.asarray(mass, vector.dtype)[..., None], vector))
 
 
-def _recorded(trajectory: Trajectory, name: str) -> Array:
-    value = getattr(trajectory, name)
-    if value is None:
-        raise ValueError(
-            f"this trajectory holds no {name}: simulate with"
-            " record=ph.Record(attitude=True, rates=True)"
-        )
-    return value
-
-
 @eqx.filter_jit
 def angular_acceleration(trajectory: Trajectory) -> Float[Array, "*b t 3"]:
-    """Derivative of the body rates at every sample [rad/s^2], from the equations of motion."""
+    """Derivative (..., T, 3) of the body rates [rad/s^2] by the equations of motion."""
     scene, t = trajectory._scene, trajectory._t
-    omega = _recorded(trajectory, "omega_body")
-    wxyz = None if trajectory.scene.is_free else _recorded(trajectory, "wxyz")
+    omega = trajectory.omega_body
+    wxyz = None if trajectory.scene.is_free else trajectory.wxyz
     return scene.acceleration(wxyz, omega, t)
 
 
 def gyroscope(trajectory: Trajectory) -> Float[Array, "*b t 3"]:
-    """Reading of a gyroscope along the body axes [rad/s]: the body rates, wherever mounted."""
-    return _recorded(trajectory, "omega_body")
+    """Reading (..., T, 3) of a gyroscope along the body axes [rad/s]: the body rates, wherever it
+    is mounted."""
+    return trajectory.omega_body
 
 
 def accelerometer(
@@ -538,7 +526,7 @@ def accelerometer(
     position_body: Float[ArrayLike, "*#b 3"],
     gravity_space: Float[ArrayLike, "3"] | None = None,
 ) -> Float[Array, "*b t 3"]:
-    """Reading of an accelerometer along the body axes [m/s^2], mounted at ``position_body`` [m].
+    """Reading (..., T, 3) of an accelerometer along body axes [m/s^2], at ``position_body`` [m].
 
     The reading is acceleration minus gravity:
     ``omega x (omega x r) + d(omega)/dt x r - R^T gravity`` (docs/equations.md, 003: 17-21), with
@@ -548,7 +536,7 @@ def accelerometer(
 
     Raises ValueError if the trajectory has no rates (or no attitude where it is needed).
     """
-    omega = _recorded(trajectory, "omega_body")
+    omega = trajectory.omega_body
     lever = as_float_array("position_body", position_body, (3,)).astype(omega.dtype)
     lever = jnp.broadcast_to(lever[..., None, :], omega.shape)
     reading = jnp.cross(omega, jnp.cross(omega, lever))
@@ -557,4 +545,4 @@ def accelerometer(
         return reading
     gravity = as_float_array("gravity_space", gravity_space, (3,)).astype(omega.dtype)
     down = jnp.broadcast_to(gravity, omega.shape)
-    return reading - rotate(conjugate(_recorded(trajectory, "wxyz")), down)
+    return reading - rotate(conjugate(trajectory.wxyz), down)

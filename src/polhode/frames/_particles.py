@@ -74,7 +74,9 @@ def _pushed(force, t, position, velocity):
         value = jnp.asarray(force.function(*arguments))
         return jnp.broadcast_to(value, position.shape) if value.shape == (3,) else value
 
-    return result_of(name, _ARGUMENTS, broadcast_force, position.shape, position.dtype, *arguments)
+    hint = "It sees all particles at one time."
+    shape, dtype = position.shape, position.dtype
+    return result_of(name, _ARGUMENTS, broadcast_force, shape, dtype, *arguments, hint=hint)
 
 
 def _acceleration(frame, force, mass, t, position, velocity, wxyz):

@@ -61,7 +61,8 @@ class Inertia(AbstractShaped, AbstractPart):
     (``ph.Status.NOT_PHYSICAL``).
 
     ``physical`` (static): whether the triangle inequality is required; positive moments and a
-    symmetric tensor always are. Only numbers that are given by name may do without.
+    symmetric tensor always are. Default: True for ``moments``, False for numbers passed by name
+    (``diagonal``, ``full``, ...).
     """
 
     diagonal: Float[Array, "*b 3"] | None = shaped(3)
@@ -221,9 +222,10 @@ class Inertia(AbstractShaped, AbstractPart):
 
     @property
     def moments(self) -> Float[Array, "*b 3"]:
-        """Principal moments, kg m^2: as given, or ascending for a full tensor.
+        """Principal moments (..., 3) [kg m^2]: as given, or ascending for a full tensor.
 
-        Differentiable twice; second derivatives of equal moments by the full tensor are NaN.
+        Differentiable twice; second derivatives of equal moments with respect to the full tensor
+        are NaN.
         """
         if self.diagonal is not None:
             return self.diagonal
@@ -246,7 +248,7 @@ class Inertia(AbstractShaped, AbstractPart):
 
     @property
     def axes(self) -> Float[Array, "*b 4"] | None:
-        """Rotation ``wxyz`` from principal to body axes, or None when they are the same.
+        """Rotation ``wxyz`` (..., 4) from principal to body axes, or None when they are the same.
 
         Carries no derivative (``principal`` says how to get derivatives right).
         """
@@ -254,7 +256,7 @@ class Inertia(AbstractShaped, AbstractPart):
 
     @property
     def tensor(self) -> Float[Array, "*b 3 3"]:
-        """The tensor in body axes, kg m^2."""
+        """The tensor (..., 3, 3) in body axes [kg m^2]."""
         if self.full is not None:
             return self.full
         return _diagonal(self.moments)

@@ -95,9 +95,17 @@ class MassProperties(AbstractShaped):
         vertices, faces = check_mesh(vertices, faces)
         volume, centre, sigma = mesh_integrals(vertices, faces)
         name, amount_given = ("density", density) if mass is None else ("mass", mass)
-        amount = jnp.broadcast_to(
-            as_float_array(name, amount_given).astype(volume.dtype), volume.shape
-        )
+        amount = as_float_array(name, amount_given).astype(volume.dtype)
+        try:
+            fits = np.broadcast_shapes(amount.shape, volume.shape) == volume.shape
+        except ValueError:
+            fits = False
+        if not fits:
+            raise ValueError(
+                f"{name} must be one number, or one for each mesh of the batch {volume.shape}, got"
+                f" the shape {amount.shape}."
+            )
+        amount = jnp.broadcast_to(amount, volume.shape)
         require_positive(name, amount)
         rho, total = (amount, amount * volume) if mass is None else (amount / volume, amount)
         tensor = rho[..., None, None] * inertia_of_second_moments(sigma)
@@ -123,7 +131,7 @@ class MassProperties(AbstractShaped):
 
     @classmethod
     def from_urdf(cls, path: str | PathLike[str], link: str) -> Self:
-        """Of a link of a robot's URDF file, in the axes of the link.
+        """Mass properties of a link in a URDF file, in the axes of the link.
 
         ``centre`` is measured from the origin of the link. SI units, as the format has them. Raises
         FileNotFoundError, and ValueError for a file that is no URDF, a link that is not in it or
@@ -135,7 +143,7 @@ class MassProperties(AbstractShaped):
 
     @classmethod
     def from_mjcf(cls, path: str | PathLike[str], body: str) -> Self:
-        """Of a body of an MJCF file, read by MuJoCo, in the axes of the body.
+        """Mass properties of a body in an MJCF file, read by MuJoCo, in the axes of the body.
 
         ``centre`` is measured from the origin of the body. Where the file has no ``inertial``
         element, MuJoCo computes one from the geoms. Raises as ``from_urdf``, and ImportError

@@ -93,7 +93,7 @@ class AbstractShaped(eqx.Module):
 
     @classmethod
     def from_sphere(cls, mass: ArrayLike, radius: ArrayLike, inner_radius: ArrayLike = 0.0) -> Self:
-        """A solid ball, or a ball around a concentric cavity of ``inner_radius`` (...)."""
+        """A solid ball, or a hollow ball with a concentric cavity of ``inner_radius`` (...)."""
         lengths = {"radius": radius, "inner_radius": inner_radius}
         mass, outer, inner = _sized(mass, lengths, _HOLLOW)
         q = inner / outer
@@ -131,7 +131,8 @@ class AbstractShaped(eqx.Module):
 
     @classmethod
     def from_rod(cls, mass: ArrayLike, length: ArrayLike, radius: ArrayLike = 0.0) -> Self:
-        """A round rod along body z. A thin one (radius 0) cannot turn by itself: as part only."""
+        """A round rod along body z. A rod of radius 0 has no moment about its axis: use it only as
+        a part of a composite body."""
         lengths = {"length": length, "radius": radius}
         mass, length, radius = _sized(mass, lengths, {"radius": None})
         axial = radius**2 / 2

@@ -295,7 +295,7 @@ def _write(
     import matplotlib.pyplot as plt
 
     from polhode import __version__
-    from polhode.files._write import atomic_write
+    from polhode._atomic import atomic_write
 
     page = figure(fit, title=name)
     with atomic_write(picture) as temporary:

@@ -312,7 +312,9 @@ def _solution(
         probability=float(np.exp(-(body.cost - least) / 2 / root**2)),
         moments=moments / moments.max(),
         moments_std=std[2:5],
-        pole=np.degrees([np.arctan2(pole[1], pole[0]) % (2 * np.pi), np.arcsin(pole[2])]),
+        pole=np.degrees(
+            [np.arctan2(pole[1], pole[0]) % (2 * np.pi), np.arcsin(np.clip(pole[2], -1, 1))]
+        ),
         pole_std=float(np.degrees(np.linalg.norm(std[5:]))),
         wxyz=wxyz,
         omega_body=unknowns[4:7],

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from polhode import rotation
+from polhode._atomic import atomic_write
 from polhode._closed_forms import Mode
-from polhode.files._write import atomic_write
 
 if TYPE_CHECKING:
     from polhode.lightcurve._solutions import Solution
@@ -76,7 +76,10 @@ def tumbler_of(solution: "Solution", axes: np.ndarray, jd_of_zero: float) -> dic
     matrix = np.asarray(rotation.wxyz_to_matrix(np.asarray(solution.wxyz, float)))
     momentum = matrix @ (solution.moments * solution.omega_body)
     momentum = momentum / np.linalg.norm(momentum)
-    longitude, latitude = np.arctan2(momentum[1], momentum[0]), np.arcsin(momentum[2])
+    longitude, latitude = (
+        np.arctan2(momentum[1], momentum[0]),
+        np.arcsin(np.clip(momentum[2], -1, 1)),
+    )
     # columns of Rz(lambda) Ry(90 deg - beta)
     c, s = np.cos(longitude), np.sin(longitude)
     frame = np.array(

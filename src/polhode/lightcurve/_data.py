@@ -31,7 +31,7 @@ BLOCK = 160
 
 
 class LightCurve(NamedTuple):
-    """Photometry of one body. Build with ``LightCurve.of`` or ``read``.
+    """Photometry of one body. Build with ``LightCurve.of`` or ``read_light_curve``.
 
     Times in days (such as Julian dates), at which the light left the body; magnitudes reduced to
     1 au from Sun and observer, where distances are known; unit vectors from the body to Sun and
@@ -473,8 +473,7 @@ def _interpolated(path, t) -> np.ndarray:
     if six is None or name is None:
         raise ValueError(f"{path} must have the columns jd, {', '.join(_VECTORS)}.")
     at = np.array([_number(path, k, name, c) for k, c in zip(numbers, columns[name], strict=True)])
-    margin = np.diff(at).max() if at.size > 1 else 0
-    if np.any(np.diff(at) <= 0) or t.min() < at[0] - margin or t.max() > at[-1] + margin:
+    if np.any(np.diff(at) <= 0) or t.min() < at[0] or t.max() > at[-1]:
         raise ValueError(
             f"{path}: the times of the vectors must increase and cover the light curve,"
             f" {t.min():.5f} to {t.max():.5f}; they are {at[0]:.5f} to {at[-1]:.5f}."

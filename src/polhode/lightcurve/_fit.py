@@ -83,15 +83,14 @@ def fit_light_curve(
 
     ``phase``: a phase function (default: ``HG1G2()`` where the phase angle changes by more than 5
     degrees, else ``SeeligerPhase()``). ``pairs``: instead of those from the series.
-    ``max_frequency``: the highest frequency of the search, per day. ``floor`` [mag]: added
-    to the errors in quadrature, growing with the phase angle, for what an ellipsoid cannot be.
-    ``offset_sigma``: see ``LightCurve.columns``;
-    None: of a calibrated curve with eight groups or more it is estimated from the best motion, and
-    all are fitted again with it. ``limit``: residuals beyond as many sigma count by their size,
-    not their square. Needs float64 (``jax_enable_x64``).
-    ``start``: solutions of an earlier fit, such as one to fewer nights. They are fitted to this
-    light curve first and count as a search; ``searches=0`` adds no other. ``progress`` is called
-    with a few words on what is done next.
+    ``max_frequency``: the highest frequency of the search, per day. ``floor`` [mag]: added to the
+    errors in quadrature, growing with the phase angle, for what an ellipsoid cannot represent.
+    ``offset_sigma``: see ``LightCurve.columns``; None: of a calibrated curve with eight groups or
+    more it is estimated from the best motion, and all are fitted again with it. ``limit``:
+    residuals beyond as many sigma count by their size, not their square. Needs float64
+    (``jax_enable_x64``). ``start``: solutions of an earlier fit, such as one to fewer nights. They
+    are fitted to this light curve first and count as a search; ``searches=0`` adds no other.
+    ``progress`` is called with a few words on what is done next.
 
     Raises RuntimeError in float32, ValueError for a light curve without directions, and for
     ``searches`` below 1, or 0 with ``start``.
@@ -228,7 +227,7 @@ def _blur(curve: LightCurve) -> float:
 def _second_round(meant: Hypotheses, least_cost: np.ndarray) -> Hypotheses:
     """Those to try again, several times over: each time has trials and starts of its own.
 
-    The likeliest, and those whose best body ``reached`` (h,) the lowest costs, in turn.
+    The likeliest, and those whose best body has the ``least_cost`` (h,), in turn.
     """
     many = len(least_cost)
     place = np.minimum(np.arange(many), np.argsort(np.argsort(least_cost)) + 0.5)
@@ -352,7 +351,7 @@ def _subsample(points: Points, count: int) -> Points:
 
 
 def _distinct_solutions(state: State, resolution: float, max_count: int) -> np.ndarray:
-    """Numbers of the ``max_solutions`` best solutions that differ in mode, frequencies or pole.
+    """Numbers of the ``max_count`` best solutions that differ in mode, frequencies or pole.
 
     Of one mode and frequencies no more than `_ALIKE`, so that others are not crowded out.
     """

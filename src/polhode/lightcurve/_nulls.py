@@ -42,7 +42,7 @@ class Model(NamedTuple):
 
 
 class Residuals(NamedTuple):
-    """Residuals (n,) [mag] of a model of ``parameters`` parameters, from ``trials`` tried."""
+    """Residuals (n,) [mag] of a model of so many ``parameters``, from exp(``log_trials``) tried."""
 
     name: str
     values: np.ndarray

@@ -284,7 +284,10 @@ def describe_solutions(
                 std[2:5],
                 axes / axes.max(),
                 np.degrees(
-                    [np.arctan2(pole[k, 1], pole[k, 0]) % (2 * np.pi), np.arcsin(pole[k, 2])]
+                    [
+                        np.arctan2(pole[k, 1], pole[k, 0]) % (2 * np.pi),
+                        np.arcsin(np.clip(pole[k, 2], -1, 1)),
+                    ]
                 ),
                 float(np.degrees(np.linalg.norm(std[5:]))),
                 wxyz[k],

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from polhode._atomic import atomic_write
 from polhode._trajectory import Trajectory
-from polhode.files._write import atomic_write
 from polhode.plot._samples import (
     ACCENT,
     AXES,
@@ -33,7 +33,7 @@ def history(
     scale: Scale | None = None,
     axis_names: tuple[str, str, str] = ("x", "y", "z"),
 ) -> Any:
-    """Stacked panels of one body: rates, attitude, drift of energy and momentum; the Figure.
+    """Stacked panels of one body: rates, attitude, drifts. Returns the Figure.
 
     The attitude is shown as the quaternion `wxyz`. The drift is |E/E0 - 1| and |L - L0|/|L0| with L
     in space axes: rounding and truncation of a free body; where torques act, real change.
@@ -265,7 +265,7 @@ def herpolhode(
     ax: Any = None,
     scale: Scale | None = None,
 ) -> Any:
-    """Draw the angular velocity's trace in the plane normal to the angular momentum; Axes.
+    """Draw the trace of the angular velocity in the invariable plane. Returns the Axes.
 
     The plane is normal to the angular momentum at the first time, its first direction that of the
     rates' part in the plane then. Dashed circles are the smallest and the largest distance reached.

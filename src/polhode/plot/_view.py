@@ -15,9 +15,9 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from polhode._atomic import atomic_write
 from polhode._extras import imported
 from polhode._trajectory import Trajectory
-from polhode.files._write import atomic_write
 from polhode.inertia._inertia import inertia_at
 from polhode.inertia._mass import as_triangles, load_mesh
 from polhode.plot._samples import Samples, Scale, as_samples, box_sides, matrices

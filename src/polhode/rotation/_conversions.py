@@ -161,7 +161,9 @@ def _modified_rodrigues(wxyz: Array) -> Array:
 
 
 def wxyz_to_modified_rodrigues(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3"]:
-    """The set of length at most 1, smooth at the identity; its shadow follows at an angle of pi.
+    """Modified Rodrigues parameters (..., 3) of length at most 1.
+
+    They are smooth at the identity and jump to the shadow set at an angle of pi.
 
     The scale of the quaternion does not matter.
     """
@@ -169,8 +171,10 @@ def wxyz_to_modified_rodrigues(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "
 
 
 def wxyz_to_shadow(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3"]:
-    """The set of length at least 1 of a rotation; NaN at the identity, where it is infinite in no
-    direction."""
+    """Modified Rodrigues parameters (..., 3) of length at least 1, the shadow set.
+
+    NaN at the identity, where their direction is undefined.
+    """
     return _shadow(as_quaternions(wxyz))
 
 

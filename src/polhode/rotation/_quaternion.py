@@ -226,7 +226,7 @@ def canonical(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 4"]:
 def between(
     start: Float[ArrayLike, "*#b 4"], end: Float[ArrayLike, "*#b 4"]
 ) -> Float[Array, "*b 4"]:
-    """Rotation from ``start`` to ``end`` in body axes: ``end = start between``."""
+    """Rotation (..., 4) in body axes: ``end = multiply(start, between(start, end))``."""
     return multiply(conjugate(start), end)
 
 
@@ -234,12 +234,14 @@ def angle_between(
     start: Float[ArrayLike, "*#b 4"], end: Float[ArrayLike, "*#b 4"]
 ) -> Float[Array, "*b"]:
     """Angle in [0, pi] (rad) of the rotation from one attitude to the other."""
-    return _angle(as_quaternions(start, "start"), as_quaternions(end, "end"))
+    start, end = as_quaternions(start, "start"), as_quaternions(end, "end")
+    batch_of(start=(start, 1), end=(end, 1))
+    return _angle(start, end)
 
 
 @jax.jit
 def _angle(start: Array, end: Array) -> Array:
-    turn = between(start, end)
+    turn = between(normalise(start), normalise(end))
     return 2 * jnp.arctan2(length(turn[..., 1:]), jnp.abs(turn[..., 0]))
 
 
