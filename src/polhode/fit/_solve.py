@@ -368,7 +368,8 @@ def _turned(recording: Recording) -> Float[Array, "r t-1 3"]:
 
 def _beside(steps: Float[Array, "r t-1 c"]) -> Float[Array, "r t c"]:
     """At each sample the sum of the numbers of the steps before and after it."""
-    return sum(jnp.pad(steps, ((0, 0), side, (0, 0))) for side in ((1, 0), (0, 1)))
+    before, after = (jnp.pad(steps, ((0, 0), side, (0, 0))) for side in ((1, 0), (0, 1)))
+    return before + after
 
 
 def _rates(recording: Recording) -> Float[Array, "r t 3"]:
