@@ -337,7 +337,7 @@ def test_the_table_names_what_shows_it():
     rotation = rows["rotation of the gyroscope (3)"]
     assert (rotation.shown, rotation.count, rotation.source) == (0, 3, "calibration")
     assert "attitudes" in rotation.remedy
-    stretch = rows["scale factors and skewness of the gyroscope (6)"]
+    stretch = rows["scale factors and non-orthogonality of the gyroscope (6)"]
     assert (stretch.shown, stretch.source) == (4, "data and calibration")
     assert rows["ratios of the moments (2)"].source == "data and calibration"
     assert "what this recording can show" in fit.report()
