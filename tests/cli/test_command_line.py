@@ -476,3 +476,33 @@ def test_the_reference_motions_are_written(here, capsys):
     (here / "tumbling.csv").write_text("not of this program")
     assert main(["reference"]) == 1
     assert main(["reference", "--force"]) == 0
+
+
+@pytest.mark.parametrize("clones", [0, 3])
+def test_wheels_with_friction_are_written_as_simulated(tmp_path, monkeypatch, clones):
+    """Without an external torque the momentum in space is constant, also in the file."""
+    monkeypatch.chdir(tmp_path)
+    text = (
+        TOP.partition("[potential]")[0]
+        + """
+[[rotors]]
+axis_body = [0, 0, 1]
+inertia = 0.1
+speed = 5.0
+viscous = 0.01
+[times]
+stop = 20.0
+number = 5
+"""
+    )
+    if clones:
+        text += f"[monte_carlo]\nclones = {clones}\nseed = 1\n"
+        text += 'moments = { relative_sigma = 0.01, source = "assumed: for the test" }\n'
+    Path("wheel.toml").write_text(text)
+    assert main(["run", "wheel.toml", "-o", "wheel.nc"]) == 0
+    with xarray.open_dataset("wheel.nc", engine="h5netcdf") as data:
+        momentum = data.momentum_space.values
+        speed = data.wheel_speed.values[..., 0]
+    first = momentum[..., :1, :]
+    assert np.abs(momentum - first).max() < 1e-7 * np.abs(first).max()
+    assert np.all(np.abs(speed[..., -1]) < 2.5)

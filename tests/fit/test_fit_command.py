@@ -117,6 +117,7 @@ def test_wrong_units_are_suspected(toss, capsys):
         (["--columns", "time"], "NAME=COLUMN"),
         ([*NAMES, "--robust", "3"], "--noise"),
         ([*NAMES, "--wheel-inertia", "1e-6"], "wheel=COLUMN"),
+        ([*NAMES, "wheel=wheel"], "wheel=COLUMN needs --wheel-inertia"),
     ],
 )
 def test_bad_options_and_files_are_named(toss, capsys, more, message):

@@ -220,3 +220,10 @@ def test_integers_are_times_and_rates_have_the_shape_of_the_times():
     uniform = RotatingFrame.from_rate([0.0, 0, 2])
     for rates in (uniform.omega_body, turning.omega_body, uniform.angular_acceleration):
         assert rates(jnp.arange(3.0)).shape == (3, 3)
+
+
+def test_lists_are_vectors(unchecked):
+    frame = RotatingFrame.from_rate([0.0, 0, 2.0])
+    want = frame.apparent_acceleration(0.0, jnp.array([1.0, 0, 0]), jnp.array([0.0, 1, 0]))
+    np.testing.assert_allclose(frame.apparent_acceleration(0.0, [1.0, 0, 0], [0.0, 1, 0]), want)
+    np.testing.assert_allclose(frame.velocity_to_space(0.0, [1.0, 0, 0], [0.0, 1, 0]), [0, 3, 0])

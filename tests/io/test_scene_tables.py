@@ -207,6 +207,20 @@ def test_clusters_exert_the_torque_of_the_law():
             f'kind = "solar-pressure"\ndirection = [0, 0, 1]\nlit = 1\neclipse = {{}}{PLATES}',
             "at most one of lit, eclipse",
         ),
+        (
+            'kind = "magnetorquer"\nmoment_body = [0, 0, 1]\nfield_space = [1e-5, 0, 0]\n'
+            'frame = "lvlh"',
+            "[torque] frame",
+        ),
+        (
+            f'kind = "drag"\ndensity = 1\nvelocity = "orbit"\nframe = "lvlh"{PLATES}',
+            "known in space axes",
+        ),
+        (
+            f'kind = "solar-pressure"\ndirection = [0, 0, 1]\neclipse = {{}}\nframe = "lvlh"'
+            f"{PLATES}",
+            "known in space axes",
+        ),
         ('kind = "momentum-dumping"\nk = 1', "field_space, dipole_space"),
         (
             'kind = "momentum-dumping"\nk = 1\nfield_space = [0, 0, 1]\nframe = "lvlh"',

@@ -93,6 +93,22 @@ def test_alcdef(tmp_path):
     assert any("approximate" in note for note in curve.notes)
     path.write_text("\n".join([*(x for x in head if "PAB" not in x), *data]))
     assert lightcurve.read_light_curve(path).sun is None
+    # unit vectors of five digits, between which the light curve lies: directions, no distances
+    angles = np.radians(np.array([0.0, 60.0]))
+    sun = np.stack([np.cos(angles), np.sin(angles), 0 * angles], -1)
+    ends = [JD[0] - 0.5, JD[-1] + 0.5]
+    rows = [f"{t},{x:.5f},{y:.5f},0,0,1,0" for t, (x, y, _) in zip(ends, sun)]
+    vectors = tmp_path / "vectors.csv"
+    header = "jd,sun_x,sun_y,sun_z,observer_x,observer_y,observer_z"
+    vectors.write_text("\n".join([header, *rows]))
+    given = lightcurve.read_light_curve(path, vectors)
+    np.testing.assert_allclose(np.linalg.norm(given.sun, axis=1), 1)
+    np.testing.assert_array_equal(given.t, np.sort(JD))
+    with pytest.raises(FileNotFoundError):
+        lightcurve.read_light_curve(path, tmp_path / "none.csv")
+    vectors.write_bytes(b"\xff\xfe")
+    with pytest.raises(ValueError, match=r"vectors\.csv is not text"):
+        lightcurve.read_light_curve(path, vectors)
 
 
 @pytest.mark.parametrize(
@@ -107,6 +123,8 @@ def test_alcdef(tmp_path):
         ("jd,mag,sun_x\n1,2,3\n", "lacks the columns sun_y"),
         ("jd,mag\n" + "1,2\n" * 9, "must span some time"),
         ("0\n", "announces no light curve"),
+        ("STARTMETADATA\nENDMETADATA\nDATA=1.0||0.02\n", "line 3, DATA must be a number, got ''"),
+        ("STARTMETADATA\nENDMETADATA\nDATA=1.0|\n", "line 3, DATA must be a number, got ''"),
         ("1\n-3 0\n", "line 2, number of points must be a whole number above 0, got '-3'"),
         ("1\n2 0\n1 1 1 0 0 1 0 0\n2 -1 1 0 0 1 0 0\n", "line 4: an intensity must be positive"),
     ],

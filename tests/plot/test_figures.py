@@ -209,3 +209,35 @@ def test_message_without_matplotlib(trajectory, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     with pytest.raises(ImportError, match=r"pip install 'polhode\[plot\]'"):
         plot.history(trajectory)
+
+
+def test_momentum_is_that_of_body_and_wheels():
+    """The drift of a body with a wheel is rounding, and the herpolhode lies in its own plane."""
+    wheel = ph.Rotor([0.0, 0.0, 1.0], momentum=3.0)
+    scene = ph.Scene(ph.Inertia.from_moments(MOMENTS), rotors=wheel)
+    state = ph.State([1.0, 0, 0, 0], [0.1, 1.0, 0.2])
+    traj = ph.simulate(scene, state, np.linspace(0, 20, 101))
+    data = plot._samples.as_samples(traj)
+    np.testing.assert_allclose(data.momentum_space[0], traj.momentum_space, rtol=1e-12)
+    lines = plot.history(traj).axes[-1].lines
+    drift = next(line for line in lines if line.get_label() == "momentum").get_ydata()
+    assert np.nanmax(drift) < 1e-7
+
+
+def test_a_body_that_starts_at_rest_has_an_overview():
+    torque = ph.BodyTorque([0.0, 0.0, 0.1])
+    scene = ph.Scene(ph.Inertia.from_moments(MOMENTS), torque=torque)
+    rest = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 0.0])
+    page = plot.overview(ph.simulate(scene, rest, [0.0, 1.0, 2.0]))
+    assert "Energy [J]" in [ax.get_title("left") for ax in page.axes]
+
+
+def test_the_band_is_that_of_the_clones_that_are_there(trajectory):
+    ts = np.linspace(0, 1, 5)
+    omega = np.ones((6, 5, 3)) * np.arange(6)[:, None, None]
+    omega[3, 2:] = np.nan
+    wxyz = np.broadcast_to([1.0, 0, 0, 0], (6, 5, 4))
+    page = plot.overview(plot.samples(ts, omega + 1, wxyz, ph.Inertia.from_moments(MOMENTS)))
+    band = page.axes[3].collections[0].get_paths()[0].vertices
+    assert np.all(np.isfinite(band))
+    assert band[:, 0].max() == pytest.approx(1.0)

@@ -673,3 +673,21 @@ def test_the_rule_of_lower_order():
     dense = dense_of(jnp.array([h]), rates, TSIT5)
     found = jnp.stack([dense_state(jnp.zeros((1, 1)), dense, x[None, i])[0, 0] for i in range(11)])
     np.testing.assert_allclose(found, (x * h) ** 4 / 4, atol=1e-14)
+
+
+def test_a_heading_that_passes_half_a_turn_has_its_derivative():
+    """The angle jumps by a turn there, and so does the torque: in reverse mode, too."""
+
+    def heading(t, wxyz, omega_body):
+        angle = jnp.arctan2(2 * wxyz[0] * wxyz[3], wxyz[0] ** 2 - wxyz[3] ** 2)
+        return jnp.array([0.0, 0.0, -0.4]) * angle
+
+    def end(rate):
+        scene = ph.Scene(ph.Inertia.spherical(1.0), torque=ph.FeedbackTorque(heading))
+        state = ph.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3).at[2].set(rate))
+        return ph.simulate(scene, state, jnp.array([0.0, 4.0])).omega_body[-1, 2]
+
+    value, step = jax.jit(jax.value_and_grad(end)), 1e-5
+    slope = value(2.2)[1]
+    ends = (value(2.2 + s * step)[0] for s in (1, -1))
+    np.testing.assert_allclose(slope, np.subtract(*ends) / (2 * step), rtol=1e-5)

@@ -187,3 +187,21 @@ def test_derivatives_across_a_fixed_axis_are_those_of_this_motion():
         assert jnp.all(jnp.isfinite(got[:, 2]))
     second = jax.jit(jax.jacfwd(jax.jacrev(last)))(jnp.zeros(3))
     assert jnp.all(jnp.isnan(second[6]))
+
+
+def test_strong_damping_has_a_derivative_in_single_precision():
+    """The series for weak damping is not evaluated where it would overflow."""
+    state = ph.State(np.float32([1, 0, 0, 0]), np.float32([0, 0, 1]))
+
+    @jax.jit
+    def end(c):
+        scene = ph.Scene(
+            ph.Inertia.from_moments(np.float32([1, 2, 2])),
+            torque=ph.LinearDamping(c * jnp.ones(3, c.dtype))
+            + ph.BodyTorque(np.float32([0, 0, 1])),
+        )
+        motion = ph.simulate(scene, state, np.float32([0, 2e4]), ph.FixedAxis())
+        return motion.omega_body[-1, 2]
+
+    value, slope = jax.value_and_grad(end)(jnp.float32(2.0))
+    np.testing.assert_allclose([value, slope], [0.5, -0.25], rtol=1e-5)

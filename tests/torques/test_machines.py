@@ -197,3 +197,22 @@ def test_without_a_field_there_is_no_torque():
     got = ph.simulate(ph.Scene(INERTIA, torque=torque, rotors=wheel), REST, [0.0, 1.0])
     assert got.status == ph.Status.SUCCESSFUL
     np.testing.assert_allclose(got.omega_body[-1], REST.omega_body, atol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("final_only", [False, True])
+def test_derivatives_by_times_within_a_pulse_of_a_batch(final_only):
+    """A pulse that is on at an end of the span, for bodies that go from edge to edge."""
+    burn = ph.Pulses(ph.BodyTorque([0.0, 0.0, 2.0]), [-1.0, 1.2], [0.5, 5.0])
+    states = ph.State(np.tile(REST.wxyz, (6, 1)), np.tile([0.1, 1.0, 0.2], (6, 1)))
+    record = ph.Record(final_only=final_only)
+
+    def end(ts):
+        motion = ph.simulate(ph.Scene(INERTIA, torque=burn), states, ts, record=record)
+        return jnp.sum(motion.omega_body[:, -1] @ jnp.array([1.0, -0.5, 0.7]))
+
+    ts, step = jnp.array([0.0, 1.0, 2.0]), 1e-5
+    found = jax.jit(jax.grad(end))(ts)
+    for k in (0, 2):
+        ends = (float(end(ts.at[k].add(s * step))) for s in (1, -1))
+        np.testing.assert_allclose(found[k], np.subtract(*ends) / (2 * step), rtol=1e-6)

@@ -161,3 +161,29 @@ def test_what_rests_on_the_same_arrays_is_worked_out_once():
         np.testing.assert_allclose(
             ready.run(ready.coefficients, t, y)[0], field(a, b, t, y), rtol=1e-14
         )
+
+
+@pytest.mark.parametrize(
+    "fn",
+    [
+        lambda o: 0.01 * (jnp.sum(jnp.ones(3)) * o[0] - jnp.sum(jnp.ones(8)) * o[1]) * o,
+        lambda o: (jnp.pad(o, (0, 2)) + jnp.pad(o, (1, 1)) + jnp.pad(o, (2, 0)))[1:4],
+        lambda o: o.at[0:2].set(0.0) - 0.5 * o.at[0:1].set(0.0),
+        lambda o: (
+            jnp.concatenate([jnp.zeros(1), o, jnp.zeros(2)])[:3] + jnp.zeros(3).at[2].add(o[0])
+        ),
+    ],
+    ids=["sums", "pads", "updates", "concatenations"],
+)
+def test_what_a_broadcast_number_stands_for_is_told_apart(fn):
+    """Operations on one number, broadcast to different shapes, are not the same one."""
+    torque = ph.FeedbackTorque(lambda t, wxyz, omega_body: fn(omega_body))
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), torque=torque)
+    system = dynamics(scene)
+    omega = np.array([0.3, -0.2, 0.5])
+    momentum = tuple(jnp.asarray(x)[None] for x in np.array([1.0, 1.5, 2.0]) * omega)
+    y = (momentum, tuple(jnp.asarray(x)[None] for x in (1.0, 0.0, 0.0, 0.0)))
+    folded = prepared(system, jnp.array(0.0), y, 1.0)
+    plain = lie_poisson_field(jnp.array(0.0), y, system)
+    for a, b in zip(jax.tree.leaves(folded), jax.tree.leaves(plain)):
+        np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-15)

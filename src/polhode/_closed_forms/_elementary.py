@@ -181,7 +181,8 @@ def decay_twice(rate: Array, t: Array) -> Array:
 
 
 def _series(x: Array, first: int) -> Array:
-    """Sum of (-x)^n/(n + first)! for |x| < 1/2."""
+    """Sum of (-x)^n/(n + first)! for |x| < 1/2; elsewhere a number with finite derivatives."""
+    x = jnp.where(jnp.abs(x) < 0.5, x, 0)
     total, n = jnp.ones_like(x), 14
     for k in range(n + first, first, -1):
         total = 1 - x * total / k

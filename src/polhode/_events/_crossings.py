@@ -69,8 +69,8 @@ def crossings(
     **Arguments:** ``fn``: see ``ph.Event``, which may be given in its place; ``direction``: 1
     rising, -1 falling (in time), 0 both, or as the event says; ``capacity``: how many crossings of
     a body are stored; None: all of them; ``samples``: see ``ph.Event``. Under ``jit``, ``vmap`` and
-    ``grad`` a motion in closed form needs both; an integrated one needs neither, and stores
-    at most 64 crossings of a body.
+    ``grad`` a motion in closed form needs both; an integrated one needs neither, and stores at most
+    256 crossings of a body.
 
     Times are as accurate as the motion: to rounding for closed forms, to ``rtol`` over the
     derivative of the function for integrated motions. Times and ``slope`` have first and second

@@ -105,7 +105,9 @@ def in_segments(
     """
     start, end = ts[0], ts[-1]
     sign = jnp.where(end < start, -1, 1).astype(ts.dtype)
-    cuts = sign * jnp.sort(sign * jnp.clip(edges, min_of(start, end), max_of(start, end)))
+    # an edge outside stands at the end of the span, and moves with it
+    within = jnp.clip(edges, jnp.minimum(start, end), jnp.maximum(start, end))
+    cuts = sign * jnp.sort(sign * within)
     bounds = jnp.concatenate([start[None], cuts, end[None]])
     parts = bounds.shape[0] - 1
 
@@ -180,16 +182,6 @@ def with_restarts(ts: Array, final_only: bool, inputs: PyTree) -> tuple[Array, A
     times = jnp.concatenate([ts[:1], jnp.where(goes_back, spread, at_start)])
     rows = jnp.where(goes_back, number * parts, number + (number > 0) * between.size)
     return times, rows[-1:] if final_only else rows
-
-
-def min_of(a: Array, b: Array) -> Any:
-    """The lesser, without a derivative of its own."""
-    return jax.lax.stop_gradient(jnp.minimum(a, b))
-
-
-def max_of(a: Array, b: Array) -> Any:
-    """The larger, likewise."""
-    return jax.lax.stop_gradient(jnp.maximum(a, b))
 
 
 class GivenTimes(diffrax.StepTo):

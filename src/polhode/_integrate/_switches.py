@@ -330,7 +330,7 @@ class _Walk:
         # smoothly, and the jump becomes a switch.
         if name == "atan2":
             y, x = x
-            is_upper, around = self.side(y), jnp.asarray(2 * np.pi, out.dtype)
+            is_upper, around = self.side(y, True), jnp.asarray(2 * np.pi, out.dtype)
             turn = jnp.where(
                 is_upper & (y < 0), around, jnp.where(~is_upper & (y >= 0), -around, 0)
             )
@@ -465,6 +465,9 @@ class _Walk:
             row = [(jnp.asarray(x)[k], m) for x, m in rows]
             out = self.jaxpr(body.jaxpr, body.consts, [*consts, *carry, *row])
             carry, stacked[k] = out[:carry_count], out[carry_count:]
+        if not length:
+            rows = (v.aval for v in eqn.outvars[carry_count:])
+            return [*carry, *((jnp.zeros(x.shape, x.dtype), False) for x in rows)]
         sums = [
             (jnp.stack([x for x, _ in column]), any(m for _, m in column))
             for column in zip(*stacked)

@@ -298,6 +298,12 @@ def _shared(steps: Sequence[_Step], out) -> frozenset[int]:
     return frozenset(shared)
 
 
+def _shaped(operation: Any, avals) -> Any:
+    """The key of an operation with the shapes of its inputs: a broadcast number stays one number,
+    whose sum or place in a concatenation depends on the shape that it stands for."""
+    return None if operation is None else (operation, *(aval.shape for aval in avals))
+
+
 class _Work:
     """One pass over a jaxpr: computes what is known, and records the other operations."""
 
@@ -316,8 +322,9 @@ class _Work:
     def once(self, key, inputs, outs, make: Callable[[], list[Any]]) -> list[Any]:
         """The result of ``make``, cached by operation and inputs (common subexpressions).
 
-        ``key``: of the operation; None where it cannot be compared with others. Parts of a scene
-        that share arrays, such as one orbit, are therefore evaluated once.
+        ``key``: of the operation and the shapes of its inputs; None where it cannot be compared
+        with others. Parts of a scene that share arrays, such as one orbit, are therefore evaluated
+        once.
         """
         if key is None:
             return make()
@@ -339,7 +346,7 @@ class _Work:
             self.steps.append(_Step([s.index for s in slots], bind, name in _BY_ENTRY, operands))
             return slots
 
-        return self.once(key, [x for x, *_ in operands], outs, make)
+        return self.once(_shaped(key, avals), [x for x, *_ in operands], outs, make)
 
     def operand(self, x) -> Any:
         """A value known before the loop, or the number of one that the loop has made."""
@@ -391,10 +398,9 @@ class _Work:
         if not eqn.effects and all(isinstance(x, _Held) for x in operands):
             numbers = all(x.number is not None for x in operands)
             if self.fold or numbers or name in _TAKING_APART:
-                outs = [v.aval for v in eqn.outvars]
-                return self.once(
-                    _operation(eqn), operands, outs, lambda: self.evaluate(eqn, operands)
-                )
+                avals, outs = ([v.aval for v in vs] for vs in (eqn.invars, eqn.outvars))
+                key = _shaped(_operation(eqn), avals)
+                return self.once(key, operands, outs, lambda: self.evaluate(eqn, operands))
         elif self.fold and len(eqn.outvars) == 1:
             simple = self.simplify(name, operands, eqn.outvars[0].aval)
             if simple is not None:

@@ -163,6 +163,8 @@ def fit(
         wheel_inertia,
         wheel_axis,
     )
+    if "wheel" in names and not wheel_inertia:
+        raise UsageError("wheel=COLUMN needs --wheel-inertia, which makes its speed a momentum.")
     if wheel_inertia and "wheel" not in names:
         raise UsageError("--wheel-inertia needs the wheel's speed: add wheel=COLUMN to --columns.")
     if robust and not noise:

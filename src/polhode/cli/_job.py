@@ -165,9 +165,10 @@ def run(job: Job, progress: Callable[[int], None]) -> Outcome:
         if start == 0:
             _require_nominal(np.asarray(piece.status))
             residuals = _residuals(job, piece)
-        for name in ("wxyz", "omega_body", "status", "steps"):
+        recorded = ("wxyz", "omega_body", *(() if piece._spins is None else ("spins",)))
+        for name in (*recorded, "status", "steps"):
             part = np.asarray(getattr(piece, name))
-            if name in ("wxyz", "omega_body"):
+            if name in recorded:
                 part = part[..., sample_of_times, :]
             if not job.batch_shape:
                 arrays[name] = part

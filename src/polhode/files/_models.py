@@ -512,8 +512,11 @@ class SceneFile(Table):
             raise ValueError(
                 "[inertia] table is that of one body or of clones: remove the [ensemble]"
             )
-        if self.events and self.ensemble is not None:
-            raise ValueError("[[events]] are not computed for an [ensemble]: remove one of them")
+        if self.ensemble is not None:
+            unused = {"[[events]]": self.events, "[observations]": self.observations}
+            for name, table in unused.items():
+                if table:
+                    raise ValueError(f"{name} has no use in an [ensemble]: remove one of them")
         names = [event.name for event in self.events]
         if len(set(names)) < len(names):
             raise ValueError(f"[[events]] have a name twice: {', '.join(names)}")

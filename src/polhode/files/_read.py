@@ -346,7 +346,7 @@ def _read_table(place: str, text: str, scene: Path) -> list[list[float]]:
         try:
             row = [float(cell) for cell in cells.split(",")]
         except ValueError:
-            if not rows and number == next(i for i, x in enumerate(lines, 1) if x.strip()):
+            if number == next(i for i, x in enumerate(lines, 1) if x.partition("#")[0].strip()):
                 continue  # the names of the columns
             raise error_of("not numbers separated by commas", f"line {number}: {line}") from None
         if not all(map(math.isfinite, row)):

@@ -319,6 +319,7 @@ class Magnetorquer(Torque):
 
     kind: Literal["magnetorquer"]
     one_of = (("moment_body", "b_dot"), ("field_space", "dipole_space"))
+    frame: Literal["inertial"] = "inertial"
     moment_body: Vector | None = Field(None, description="A m^2")
     b_dot: BDot | None = None
     field_space: Vector | None = Field(None, description="T")
@@ -326,7 +327,7 @@ class Magnetorquer(Torque):
 
     @property
     def needs_orbit(self) -> bool:
-        return self.frame == "lvlh" or self.dipole_space is not None
+        return self.dipole_space is not None
 
 
 class MomentumDumping(Torque):
@@ -351,6 +352,9 @@ class Plate(Table):
     area: NotNegative = Field(description="m^2")
     normal: Direction
     centre: Vector = Field(description="from the centre of mass, m")
+
+
+_ALONG = '{} is known in space axes, and frame = "lvlh" reads vectors along its own: remove frame'
 
 
 class Plated(Torque):
@@ -378,6 +382,8 @@ class Drag(Plated):
     @model_validator(mode="after")
     def _one_for_each_plate(self) -> Self:
         self.coefficients_of_plates("coefficient")
+        if self.frame == "lvlh" and self.velocity == "orbit":
+            raise ValueError(_ALONG.format('velocity = "orbit"'))
         return self
 
     @property
@@ -407,6 +413,8 @@ class SolarPressure(Plated):
         self.coefficients_of_plates("specular", "diffuse")
         if self.eclipse is not None and "lit" in self.model_fields_set:
             raise ValueError("at most one of lit, eclipse is possible: remove one of them")
+        if self.frame == "lvlh" and self.eclipse is not None:
+            raise ValueError(_ALONG.format("eclipse"))
         if isinstance(self.direction, list) and not any(self.direction):
             raise ValueError("direction must not be zero")
         return self

@@ -237,7 +237,7 @@ def _aligned(*arrays: Array) -> list[Array]:
 
 
 def _sum(left: Array, right: Array) -> Array:
-    return jnp.add(*_aligned(left, right))
+    return jnp.add(*_aligned(as_vectors("vector", left), as_vectors("vector", right)))
 
 
 def _origin(function):
@@ -485,7 +485,7 @@ class RotatingFrame(eqx.Module):
         omega, slope = self._rates(t)
         carried = _cross(omega, position)
         if velocity is not None:
-            carried = carried + 2 * velocity
+            carried = _sum(carried, 2 * as_vectors("velocity", velocity))
         turning = -_cross(omega, carried)
         return turning if slope is None else _sum(turning, -_cross(slope, position))
 

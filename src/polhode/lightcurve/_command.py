@@ -17,9 +17,15 @@ from polhode.lightcurve._brightness import (
     LinearPhase,
     SeeligerPhase,
 )
-from polhode.lightcurve._data import LightCurve, read_light_curve
+from polhode.lightcurve._data import LightCurve, check_max_frequency, read_light_curve
 from polhode.lightcurve._fit import fit_light_curve
-from polhode.lightcurve._frequencies import Pairs, fourier_lattices, fourier_pairs, meaning
+from polhode.lightcurve._frequencies import (
+    Pairs,
+    fourier_lattices,
+    fourier_pairs,
+    meaning,
+    reaches_beyond_pairs,
+)
 from polhode.lightcurve._solutions import COVARIANCE_OF, LightCurveFit, Solution
 
 # of the JSON file; other numbers have none
@@ -218,17 +224,15 @@ def fit_file(
     """
     say(f"{title}: {curve.t.size} points, {len(curve.names)} groups, {np.ptp(curve.t):.4g} d")
     if curve.sun is None:
-        pairs = fourier_pairs(
-            curve.t, curve.magnitude, columns=curve.columns(np.inf)[0], max_frequency=max_frequency
-        )
-        lines = pairs.is_cut
+        check_max_frequency(curve, max_frequency)
+        columns = curve.columns(np.inf)[0]
+        given = {"columns": columns, "max_frequency": max_frequency}
+        lines = reaches_beyond_pairs(curve.t, max_frequency)
+        if not lines:
+            pairs = fourier_pairs(curve.t, curve.magnitude, **given)
+            lines = pairs.is_cut
         if lines:  # the square of the grid is too small: pairs of lines reach further
-            pairs = fourier_lattices(
-                curve.t,
-                curve.magnitude,
-                columns=curve.columns(np.inf)[0],
-                max_frequency=max_frequency,
-            )
+            pairs = fourier_lattices(curve.t, curve.magnitude, **given)
         say(frequency_table(pairs, lines=lines))
         missing = "without vectors to Sun and observer no body can be fitted."
         for note in (*curve.notes, *pairs.warnings(), missing):
@@ -363,7 +367,8 @@ def _figure(fit: LightCurveFit, number: int, title: str) -> Any:
     below = rows[2].subgridspec(1, 2, width_ratios=(1.15, 1.0))
     t, unit = _clock(curve.t - curve.t[0])
     x = _without_gaps(t)
-    offsets = solution.offsets[: len(curve.columns()[0])] @ curve.columns()[0]
+    columns = curve.columns(fit.offset_sigma)[0]
+    offsets = solution.offsets[: len(columns)] @ columns
     rest = curve.magnitude - solution.model
     inlier = solution.weights > 0.5
     for ax, value, model in (

@@ -18,6 +18,7 @@ from polhode.lightcurve._brightness import Points, seeliger_sphere
 LIGHT_TIME = 499.00478384 / 86400  # days per au
 _DOUBLED = math.radians(40)  # phase angle at which the floor has doubled
 _FAR = 1e4  # au, beyond which vectors are not in au
+_ROUNDED = 1e-4  # lengths that differ from 1 by less are those of unit vectors in a few digits
 # Magnitudes beyond this are none: the Sun has -27, the faintest stars seen 32.
 _FAINTEST = 45.0
 # Deviation of the distance from Sun to observer from 1 au that an observer near the Earth has [au].
@@ -93,8 +94,8 @@ class LightCurve(NamedTuple):
         if sun is not None:
             sun, r = _directions("sun", sun, t.size)
             observer, delta = _directions("observer", observer, t.size)
-            far = np.abs(delta - 1).max() > 1e-6
-            if far or np.abs(r - 1).max() > 1e-6:
+            far = np.abs(delta - 1).max() > _ROUNDED
+            if far or np.abs(r - 1).max() > _ROUNDED:
                 notes = (*notes, *_distance_notes(sun * r[:, None], observer * delta[:, None]))
             if far and not at_body:
                 t = t - LIGHT_TIME * delta
@@ -228,6 +229,8 @@ class LightCurve(NamedTuple):
         """
         if offset_sigma is None:
             offset_sigma = 0.2 if self.calibrated else math.inf
+        if not offset_sigma > 0:
+            raise ValueError(f"offset_sigma must be positive, got {offset_sigma}.")
         own = (self.group[None] == np.arange(len(self.names))[:, None]).astype(float)
         if len(self.names) == 1:
             return own, np.zeros(1)
@@ -266,6 +269,16 @@ class LightCurve(NamedTuple):
             jnp.asarray(weight)[None],
             jnp.asarray(columns),
             jnp.asarray(stiffness),
+        )
+
+
+def check_max_frequency(curve: LightCurve, max_frequency: float | None) -> None:
+    """ValueError for a search that ends below one turn within the light curve."""
+    least = 1 / float(np.ptp(curve.t))
+    if max_frequency is not None and not max_frequency > least:
+        raise ValueError(
+            f"max_frequency must exceed one turn within the light curve, {least:.4g} per day, got"
+            f" {max_frequency:g}."
         )
 
 
@@ -355,8 +368,10 @@ def read_light_curve(
     if not content:
         raise ValueError(f"{path} is empty; expected a light curve.")
     if any(line.strip().upper().startswith("STARTMETADATA") for line in content[:50]):
-        return _alcdef(path, lines, calibrated)
+        return _alcdef(path, lines, vectors, calibrated)
     if len(content[0].split()) == 1 and content[0].strip().isdigit():
+        if vectors is not None:
+            raise ValueError(f"{path} holds vectors of its own: leave those of {vectors} out.")
         return _damit(path, lines)
     return _table(path, lines, vectors, calibrated, reduced)
 
@@ -467,7 +482,11 @@ def _six(path, columns, numbers):
 
 
 def _interpolated(path, t) -> np.ndarray:
-    columns, numbers = _rows(path, Path(path).read_text(encoding="utf-8-sig").splitlines())
+    try:
+        lines = Path(path).read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise ValueError(f"{path} is not text in UTF-8: expected a CSV file.") from None
+    columns, numbers = _rows(path, lines)
     six = _six(path, columns, numbers)
     name = next((n for n in _TIME if n in columns), None)
     if six is None or name is None:
@@ -478,7 +497,11 @@ def _interpolated(path, t) -> np.ndarray:
             f"{path}: the times of the vectors must increase and cover the light curve,"
             f" {t.min():.5f} to {t.max():.5f}; they are {at[0]:.5f} to {at[-1]:.5f}."
         )
-    return np.stack([np.interp(t, at, column) for column in six.T], -1)
+    # length and direction apart: the chord between two directions is too short
+    between = np.stack([np.interp(t, at, column) for column in six.T], -1).reshape(-1, 2, 3)
+    lengths = np.linalg.norm(six.reshape(-1, 2, 3), axis=-1)
+    wanted = np.stack([np.interp(t, at, column) for column in lengths.T], -1)
+    return (between * (wanted / np.linalg.norm(between, axis=-1))[..., None]).reshape(-1, 6)
 
 
 def _damit(path, lines) -> LightCurve:
@@ -531,7 +554,7 @@ def _damit(path, lines) -> LightCurve:
     )
 
 
-def _alcdef(path, lines, calibrated: bool) -> LightCurve:
+def _alcdef(path, lines, vectors, calibrated: bool) -> LightCurve:
     """Sessions of KEYWORD=value and DATA=JD|magnitude|error lines."""
     table, group, keys, session, rays = [], [], {}, 0, []
     for number, line in enumerate(lines, 1):
@@ -544,7 +567,8 @@ def _alcdef(path, lines, calibrated: bool) -> LightCurve:
             cells = value.split(mark)
             if len(cells) < 2:
                 raise ValueError(f"{path}: line {number} must be DATA=JD|magnitude, got {line!r}.")
-            numbers = [_number(path, number, "DATA", c) for c in cells[:3] if c.strip()]
+            given = cells[:2] if len(cells) == 2 or not cells[2].strip() else cells[:3]
+            numbers = [_number(path, number, "DATA", c) for c in given]
             # public files write -9.99 or the like for an unknown error
             table.append((*numbers[:2], max((*numbers, 0.0)[2], 0.0)))
             group.append(f"{session:04d}")
@@ -557,7 +581,10 @@ def _alcdef(path, lines, calibrated: bool) -> LightCurve:
     are_numbers = all(all(_is_number(x) for x in ray) for ray in rays)
     sun = observer = None
     notes = ["ALCDEF gives no distances: nights have free offsets, times keep their light time."]
-    if are_numbers:
+    if vectors is not None:
+        six = _interpolated(vectors, data[:, 0])
+        sun, observer, notes = six[:, :3], six[:, 3:], []
+    elif are_numbers:
         phase, longitude, latitude = np.radians(np.array(rays, float)).T
         sun = _ray(longitude - phase / 2, latitude)
         observer = _ray(longitude + phase / 2, latitude)

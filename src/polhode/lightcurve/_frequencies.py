@@ -217,6 +217,12 @@ class Scan(NamedTuple):
         return self.fit_nodes(np.rint(pairs @ multiples.T).astype(int))[0]
 
 
+def reaches_beyond_pairs(t: np.ndarray, max_frequency: float | None, oversampling: int = 4) -> bool:
+    """Whether the grid of ``fourier_pairs`` to this frequency would not fit into memory."""
+    nodes = 0.0 if max_frequency is None else max_frequency * np.ptp(t) * oversampling
+    return nodes > _MAX_PAIR_NODES
+
+
 def fourier_pairs(
     t: Float[Array | np.ndarray, " n"],
     values: Float[Array | np.ndarray, " n"],

@@ -57,6 +57,7 @@ class Linear:
     def __init__(self, curve: LightCurve, offset_sigma: float | None = None):
         self.curve, self.t = curve, curve.t - curve.t[0]
         columns, stiffness = curve.columns(offset_sigma)
+        self.offset_count = len(columns)
         if curve.sun is not None and np.ptp(curve.alpha) > np.radians(1):
             columns = np.vstack([columns, curve.alpha, curve.alpha**2])
             stiffness = np.r_[stiffness, 0.0, 0.0]
@@ -94,7 +95,7 @@ class Linear:
         ``model``: a solution with offsets near them, from which they differ by what fits best.
         """
         change = self.curve.magnitude + residuals - model.model
-        count = len(self.curve.columns()[0])
+        count = self.offset_count
         own = self.columns[:count].T
         matrix, data = own * self.root[:, None], change * self.root
         out = np.array(model.offsets, float)
@@ -135,7 +136,8 @@ def one_period(linear: Linear, max_frequency: float) -> list[Residuals]:
     chi2 = [linear.chi2(waves(t, f * np.arange(1, 5))) for f in frequencies]
     best = [frequencies[k] for k in np.argsort(chi2)[:4]]
     # a series of f / 2 and few harmonics may be that of f
-    best += [f * part for f in best[:2] for part in (0.5, 2.0) if f * part < max_frequency]
+    others = (f * part for f in best[:2] for part in (0.5, 2.0))
+    best += [f for f in others if 1 <= f * span < max_frequency * span]
     log_trials = float(np.log(max(max_frequency * span, 1.0)))
     out = []
     for order in _ORDERS:
@@ -175,10 +177,11 @@ def _peaks(linear: Linear, max_frequency: float) -> list[float]:
 
 
 def _refine_frequency(linear: Linear, frequency: float, columns, steps: int = 11) -> float:
-    """The frequency near ``frequency`` at which ``columns(f)`` explain most."""
+    """The frequency near ``frequency`` at which ``columns(f)`` explain most, of a turn within the
+    light curve at least."""
     width = 0.25 / linear.t[-1]
     for _ in range(2):
-        near = frequency + width * np.linspace(-1, 1, steps)
+        near = np.maximum(frequency + width * np.linspace(-1, 1, steps), 1 / linear.t[-1])
         frequency = float(near[int(np.argmin([linear.chi2(columns(f)) for f in near]))])
         width *= 2.5 / steps
     return frequency

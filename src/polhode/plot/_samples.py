@@ -93,7 +93,8 @@ class Scale(NamedTuple):
 class Samples:
     """Samples of N bodies: ts (N, T), wxyz (N, T, 4), omega_body (N, T, 3), tensor (N, 3, 3).
 
-    `wxyz`, `tensor` and `energy` (N, T) may be None: the plots that need them say so.
+    `wxyz`, `tensor` and `energy` (N, T) may be None: the plots that need them say so. `momentum`
+    (N, T, 3): that of the body and its wheels, in body axes; None: `tensor` times the rates.
     """
 
     ts: np.ndarray
@@ -101,6 +102,7 @@ class Samples:
     wxyz: np.ndarray | None = None
     tensor: np.ndarray | None = None
     energy: np.ndarray | None = None
+    momentum: np.ndarray | None = None
 
     def need(self, name: str, what: str) -> np.ndarray:
         value = getattr(self, name)
@@ -108,7 +110,7 @@ class Samples:
             remedy = "inertia" if name in ("tensor", "energy") else name
             raise ValueError(
                 f"plotting {what} needs {remedy}, which was not given: pass it to plot.samples, or "
-                "plot a Trajectory that recorded attitude and rates."
+                "plot a Trajectory that recorded attitude and rates, of a body of constant inertia."
             )
         return value
 
@@ -119,6 +121,8 @@ class Samples:
 
     @property
     def momentum_body(self) -> np.ndarray:
+        if self.momentum is not None:
+            return self.momentum
         tensor = self.need("tensor", "the angular momentum")
         return np.einsum("nij,ntj->nti", tensor, self.omega_body)
 
@@ -188,7 +192,10 @@ def as_samples(what: Trajectory | Samples) -> Samples:
     result = samples(what.ts, what.omega_body, what._wxyz, constant)
     has_energy = what.scene.potential is None or what._wxyz is not None
     energy = np.asarray(what.energy, np.float64).reshape(result.ts.shape) if has_energy else None
-    return dataclasses.replace(result, energy=energy)
+    momentum = None
+    if what.scene.rotors is not None or constant is None:
+        momentum = np.asarray(what.momentum_body, np.float64).reshape(result.omega_body.shape)
+    return dataclasses.replace(result, energy=energy, momentum=momentum)
 
 
 def pick(what: Trajectory | Samples, body: int | None) -> tuple[Samples, int]:

@@ -1,6 +1,7 @@
 """Figures of trajectories: histories, polhode and herpolhode, an overview, and animations."""
 
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -324,7 +325,7 @@ def overview(
     Left: the three body axes as directions in space (components along space x, y, z) and the body
     rates, lines for body 0 and bands from the 5th to the 95th percentile of the others; dots are
     `observed` (`plot.samples` of one body; NaN where nothing was observed). Right: the polhode, or
-    the energy of a body whose inertia changes with time.
+    the energy of a body that starts at rest or whose inertia changes with time.
     """
     data = as_samples(what)
     names = tuple(plain(name, 30) for name in axis_names)
@@ -365,7 +366,8 @@ def overview(
             handlelength=1.4,
             columnspacing=1.2,
         )
-    if data.tensor is None and data.energy is not None:
+    is_at_rest = not np.any(data.omega_body[0, 0])
+    if data.energy is not None and (data.tensor is None or is_at_rest):
         ax = figure.add_subplot(grid[:3, 1])
         ax.plot(t, data.energy[0], color=INK, linewidth=1.3)
         ax.set_title("Energy [J]")
@@ -382,7 +384,9 @@ def overview(
 
 def _curve(ax, t, values, color, label, band):
     if band:
-        low, high = np.percentile(values[1:], _BAND, axis=0)
+        with np.errstate(invalid="ignore"), warnings.catch_warnings():
+            warnings.simplefilter("ignore", RuntimeWarning)  # at a time that no clone reached
+            low, high = np.nanpercentile(values[1:], _BAND, axis=0)
         ax.fill_between(t, low, high, color=color, alpha=0.22, linewidth=0, zorder=2)
     ax.plot(t, values[0], color=color, label=label, linewidth=1.3, zorder=3)
 

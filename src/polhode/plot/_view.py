@@ -93,11 +93,7 @@ def bodies_of(what: Trajectory | Samples) -> list[Body]:
     """The bodies of a motion, batch axes flattened."""
     data = as_samples(what)
     wxyz, tensor = data.need("wxyz", "a page"), data.need("tensor", "a page")
-    if isinstance(what, Trajectory):  # that of rotors included
-        momentum = np.asarray(what.momentum_space, np.float64).reshape(data.omega_body.shape)
-    else:
-        momentum = data.momentum_space
-    samples = zip(data.ts, wxyz, data.omega_body, momentum, tensor, strict=True)
+    samples = zip(data.ts, wxyz, data.omega_body, data.momentum_space, tensor, strict=True)
     return [Body.sorted(*parts) for parts in samples]
 
 
