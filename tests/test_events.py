@@ -660,3 +660,30 @@ def test_the_direction_of_an_event_and_that_of_the_search_agree():
         ph.crossings(traj, ph.Event(height(0.4), 1), -1)
     with pytest.raises(TypeError, match=r"must be ph\.Event objects, got Height"):
         ph.simulate(BALL, STATE, TS, events=height(0.4))
+
+
+@pytest.mark.slow
+def test_functions_that_vanish_together_have_one_event_each():
+    """The same height in four ways, which differ by rounding, at every crossing in turn."""
+    up = jnp.array([0.0, 0.0, 1.0])
+    functions = [
+        lambda wxyz, omega_body, t: ph.rotation.rotate(wxyz, up)[2],
+        lambda q, omega_body, t: q[0] ** 2 - q[1] ** 2 - q[2] ** 2 + q[3] ** 2,
+        lambda q, omega_body, t: 1 - 2 * (q[1] ** 2 + q[2] ** 2),
+        lambda wxyz, omega_body, t: ph.rotation.rotate(wxyz, 3 * up)[2],
+    ]
+
+    def damping(t, wxyz, omega_body):
+        return jnp.where(ph.rotation.rotate(wxyz, up)[2] > 0, -0.05, 0.03) * omega_body
+
+    inertia = ph.Inertia.from_moments([1.0, 1.5, 2.0])
+    scene = ph.Scene(inertia, torque=ph.FeedbackTorque(damping))
+    state = ph.State([1.0, 0.0, 0.0, 0.0], [0.3, 1.0, 0.2])
+    ts = jnp.linspace(0.0, 60.0, 31)
+    alone = ph.simulate(scene, state, ts, events=[ph.Event(functions[0])]).events
+    together = ph.simulate(scene, state, ts, events=[ph.Event(fn) for fn in functions]).events
+    want = alone.times[: int(alone.count)]
+    assert want.size == 19
+    for k in range(len(functions)):
+        found = together.times[together.which == k]
+        np.testing.assert_allclose(found, want, rtol=1e-8)

@@ -453,12 +453,17 @@ def _apply_switch(
     is_at_motion_start = progress_after.elapsed <= 1e-6 * jnp.abs(
         width
     )  # an event at the start is not one of the motion
+    # Two functions that vanish together: the one that is found later turns at the start of the next
+    # step, and by rounding of its margin back and again. These two turns are no events.
+    moment = jnp.maximum(jnp.maximum(jnp.abs(start), progress.elapsed), jnp.abs(attempt.h))
+    is_rounding = turn.part * jnp.abs(attempt.h) <= 16 * jnp.finfo(width.dtype).eps * moment
     # An event costs one row of margins, whatever its kind: it is located by the search for
     # switches, and only what happens at its root is different.
     for k in range(motion.events):
         row = motion.switches - motion.events + k
         rises = jnp.where(turn.levels[row] > 0, 1, -1) * sign
         is_event = flips[row] & ~is_at_motion_start
+        is_event = is_event & ~(is_rounding & (progress.just_turned[row] > 0))
         if options.directions[k]:
             is_event = is_event & (rises == options.directions[k])
         # lanes have no branches: every body writes, those without an event into the bin
