@@ -294,8 +294,8 @@ MUTANTS = (
     # frames and sensors
     Mutant(
         FRAME,
-        "carried = carried + 2 * velocity",
-        "carried = carried + velocity",
+        "_sum(carried, 2 * as_vectors(",
+        "_sum(carried, as_vectors(",
         "the Coriolis acceleration is half",
         ("frames/test_rotating_frame.py::test_transformations_against_differentiated_paths",),
     ),
