@@ -98,7 +98,11 @@ CASES = [
     ("fit bin.csv", 2, ["not text"]),
     ("fit words.csv", 2, ["line 2", "fast"]),
     ("fit imu.csv", 2, ["stamp", "--columns t=COLUMN wx=COLUMN wy=COLUMN wz=COLUMN"]),
-    ("fit wheel.csv --columns wheel=w", 2, ["wheel -> w", "--columns wheel=COLUMN"]),
+    (
+        "fit wheel.csv --columns wheel=w --wheel-inertia 1e-6",
+        2,
+        ["wheel -> w", "--columns wheel=COLUMN"],
+    ),
     ("fit tip.toml", 2, ["polhode run"]),
     ("fit foreign.nc", 2, ["polhode view"]),
     ("fit wheel.csv --noise 0", 2, ["positive"]),

@@ -54,7 +54,7 @@ def program(fn, *examples):
         (jnp.max, 2, False),
         (jnp.sort, 3, False),
         (lambda x: x[jnp.argmax(x)], 2, True),
-        (lambda x: jnp.arctan2(x[0], x[1]), 1, False),
+        (lambda x: jnp.arctan2(x[0], x[1]), 1, True),
         (lambda x: jax.lax.cond(x[0] > 0, jnp.sin, jnp.cos, x), 1, True),
         (jax.jit(lambda x: jnp.maximum(x, 0.0)), 3, False),
         (jax.checkpoint(lambda x: jnp.maximum(x, 0.0)), 3, False),
