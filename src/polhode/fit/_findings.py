@@ -58,6 +58,11 @@ SCENE_WARNINGS = WARNINGS | {
     Finding.POOR: "the residuals are more than twice as large as the noise: a wrong model, wrong"
     " units, outliers (robust=Huber()), or a start too far away",
 }
+SCALE_UNKNOWN = (
+    "Only ratios of moments are determined: free motion does not depend on the size of the inertia "
+    "(null direction of the information matrix). A known wheel, torque or moment would fix it."
+)
+"""What a fit to free rates says of every body."""
 UNUSABLE = Finding.STEP_LIMIT | Finding.NOT_FINITE | Finding.AXES_DISAGREE
 """Findings that raise an error unless ``throw=False``."""
 

@@ -27,8 +27,7 @@ from polhode._integrate import LiePoisson
 from polhode._method import AbstractMethod
 from polhode._scene import AbstractTorque, LinearDamping, QuadraticDamping, Scene, State
 from polhode._simulate import simulate
-from polhode.fit._bounds import to_bounded, to_unbounded
-from polhode.fit._numerics import ClassicalRungeKutta, inverse
+from polhode.fit._numerics import ClassicalRungeKutta, inverse, to_bounded, to_unbounded
 from polhode.inertia import Inertia, inertia_of_second_moments, principal
 from polhode.inertia._physical import symmetric
 from polhode.rotation import conjugate, multiply, normalise, rotate, wxyz_to_matrix

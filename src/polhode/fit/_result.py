@@ -17,6 +17,7 @@ from polhode._atomic import atomic_write
 from polhode._checks import ArrayLike, require
 from polhode._scene import Scene, State
 from polhode.fit._findings import (
+    SCALE_UNKNOWN,
     SCENE_WARNINGS,
     UNUSABLE,
     WARNINGS,
@@ -441,7 +442,7 @@ class Fit(eqx.Module):
         """What to know before using the fit of one body: sentences with cause and remedy."""
         about = []
         if self._inertia is not None and not self._inertia.scale_known:
-            about.append(_SCALE)
+            about.append(SCALE_UNKNOWN)
             if not self._inertia.handedness_known:
                 twin = np.sort(mirror_moments(np.asarray(self.moments).reshape(-1, 3)[body]))
                 about.append(
@@ -533,10 +534,10 @@ class Fit(eqx.Module):
         bodies = range(count) if body is None else [body]
         lines = []
         if self._inertia is not None and not self._inertia.scale_known:
-            lines.append(_SCALE)
+            lines.append(SCALE_UNKNOWN)
         for k in bodies:
             lines += self._value_lines(k) if self._inertia is None else [self._inertia_line(k)]
-            lines += [f"  - {text}" for text in self.warnings(k) if text != _SCALE]
+            lines += [f"  - {text}" for text in self.warnings(k) if text != SCALE_UNKNOWN]
             if body is not None or count == 1:
                 lines.append("  what this recording can show:")
                 for row in self.observability(k):
@@ -577,12 +578,6 @@ class Fit(eqx.Module):
 
     def _texts(self) -> dict[Finding, str]:
         return SCENE_WARNINGS if self._inertia is None else WARNINGS
-
-
-_SCALE = (
-    "Only ratios of moments are determined: free motion does not depend on the size of the inertia "
-    "(null direction of the information matrix). A known wheel, torque or moment would fix it."
-)
 
 
 def checked_fit(fit: Fit, throw: bool) -> Fit:

@@ -9,7 +9,6 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from polhode.fit._bounds import curvature_rows
 from polhode.fit._model import (
     AbstractInertiaUnknown,
     AbstractMotion,
@@ -23,7 +22,7 @@ from polhode.fit._model import (
     free_columns,
     whole_of,
 )
-from polhode.fit._numerics import LevenbergMarquardt
+from polhode.fit._numerics import LevenbergMarquardt, curvature_rows
 from polhode.fit._options import WALK_KNOTS, FitOptions, Gyroscope, Huber, noise_is_trusted
 from polhode.fit._recording import (
     Recording,

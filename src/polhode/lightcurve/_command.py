@@ -17,10 +17,11 @@ from polhode.lightcurve._brightness import (
     LinearPhase,
     SeeligerPhase,
 )
-from polhode.lightcurve._data import LightCurve, check_max_frequency, read_light_curve
+from polhode.lightcurve._data import LightCurve, read_light_curve
 from polhode.lightcurve._fit import fit_light_curve
 from polhode.lightcurve._frequencies import (
     Pairs,
+    check_max_frequency,
     fourier_lattices,
     fourier_pairs,
     meaning,
@@ -224,7 +225,7 @@ def fit_file(
     """
     say(f"{title}: {curve.t.size} points, {len(curve.names)} groups, {np.ptp(curve.t):.4g} d")
     if curve.sun is None:
-        check_max_frequency(curve, max_frequency)
+        check_max_frequency(curve.t, max_frequency)
         columns = curve.columns(np.inf)[0]
         given = {"columns": columns, "max_frequency": max_frequency}
         lines = reaches_beyond_pairs(curve.t, max_frequency)

@@ -272,16 +272,6 @@ class LightCurve(NamedTuple):
         )
 
 
-def check_max_frequency(curve: LightCurve, max_frequency: float | None) -> None:
-    """ValueError for a search that ends below one turn within the light curve."""
-    least = 1 / float(np.ptp(curve.t))
-    if max_frequency is not None and not max_frequency > least:
-        raise ValueError(
-            f"max_frequency must exceed one turn within the light curve, {least:.4g} per day, got"
-            f" {max_frequency:g}."
-        )
-
-
 def _directions(name: str, vectors, count: int) -> tuple[np.ndarray, np.ndarray]:
     vectors = np.asarray(vectors, float)
     if vectors.shape != (count, 3):

@@ -10,8 +10,14 @@ from polhode import rotation
 from polhode._closed_forms import Mode
 from polhode.lightcurve._brightness import HG1G2, AbstractPhase, Bodies, Points, SeeligerPhase
 from polhode.lightcurve._convex import refined_solutions
-from polhode.lightcurve._data import BLOCK, FEWEST_POINTS, LightCurve, check_max_frequency
-from polhode.lightcurve._frequencies import Hypotheses, Pairs, fourier_lattices, hypotheses
+from polhode.lightcurve._data import BLOCK, FEWEST_POINTS, LightCurve
+from polhode.lightcurve._frequencies import (
+    Hypotheses,
+    Pairs,
+    check_max_frequency,
+    fourier_lattices,
+    hypotheses,
+)
 from polhode.lightcurve._least_squares import (
     BATCH,
     Problem,
@@ -106,7 +112,7 @@ def fit_light_curve(
             " means of wide bins leave few."
         )
     curve._known_directions()
-    check_max_frequency(curve, max_frequency)
+    check_max_frequency(curve.t, max_frequency)
     if searches < (0 if start else 1):
         raise ValueError(f"searches must be at least 1, or 0 with a start, got {searches}.")
     say = progress or (lambda words: None)

@@ -217,6 +217,16 @@ class Scan(NamedTuple):
         return self.fit_nodes(np.rint(pairs @ multiples.T).astype(int))[0]
 
 
+def check_max_frequency(t: np.ndarray, max_frequency: float | None) -> None:
+    """ValueError for a search that ends below one turn within the times."""
+    least = 1 / float(np.ptp(t))
+    if max_frequency is not None and not max_frequency > least:
+        raise ValueError(
+            f"max_frequency must exceed one turn within the light curve, {least:.4g} per day, got"
+            f" {max_frequency:g}."
+        )
+
+
 def reaches_beyond_pairs(t: np.ndarray, max_frequency: float | None, oversampling: int = 4) -> bool:
     """Whether the grid of ``fourier_pairs`` to this frequency would not fit into memory."""
     nodes = 0.0 if max_frequency is None else max_frequency * np.ptp(t) * oversampling
