@@ -17,7 +17,8 @@ from polhode.lightcurve._command import (
     run as run,
     table as table,
 )
-from polhode.lightcurve._data import LightCurve as LightCurve, read_light_curve as read_light_curve
+from polhode.lightcurve._data import LightCurve as LightCurve
+from polhode.lightcurve._files import read_light_curve as read_light_curve
 from polhode.lightcurve._fit import fit_light_curve as fit_light_curve
 from polhode.lightcurve._frequencies import (
     Pairs as Pairs,

@@ -17,7 +17,8 @@ from polhode.lightcurve._brightness import (
     LinearPhase,
     SeeligerPhase,
 )
-from polhode.lightcurve._data import LightCurve, read_light_curve
+from polhode.lightcurve._data import LightCurve
+from polhode.lightcurve._files import read_light_curve
 from polhode.lightcurve._fit import fit_light_curve
 from polhode.lightcurve._frequencies import (
     Pairs,

@@ -102,7 +102,7 @@ class Solution(NamedTuple):
         Raises ValueError for a solution with a convex shape, or one that does not tumble,
         FileNotFoundError for a folder that is not there.
         """
-        from polhode.lightcurve._damit import write_damit
+        from polhode.lightcurve._files import write_damit
 
         return write_damit(self, folder, jd_of_zero=jd_of_zero)
 
