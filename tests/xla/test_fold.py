@@ -167,13 +167,9 @@ def test_what_rests_on_the_same_arrays_is_worked_out_once():
     "fn",
     [
         lambda o: 0.01 * (jnp.sum(jnp.ones(3)) * o[0] - jnp.sum(jnp.ones(8)) * o[1]) * o,
-        lambda o: (jnp.pad(o, (0, 2)) + jnp.pad(o, (1, 1)) + jnp.pad(o, (2, 0)))[1:4],
         lambda o: o.at[0:2].set(0.0) - 0.5 * o.at[0:1].set(0.0),
-        lambda o: (
-            jnp.concatenate([jnp.zeros(1), o, jnp.zeros(2)])[:3] + jnp.zeros(3).at[2].add(o[0])
-        ),
     ],
-    ids=["sums", "pads", "updates", "concatenations"],
+    ids=["sums", "updates"],
 )
 def test_what_a_broadcast_number_stands_for_is_told_apart(fn):
     """Operations on one number, broadcast to different shapes, are not the same one."""
