@@ -165,6 +165,9 @@ def test_wheels_are_exported():
 
 def test_what_a_run_was_asked_to_save_is_exported():
     pytest.importorskip("xarray")
+    nested = ph.Record(save=lambda t: {"a": {"b": t.energy}, "a_b": 2 * t.energy})
+    data = ph.simulate(SCENE, STATE, jnp.array([0.0, 1.0]), record=nested).to_xarray()
+    np.testing.assert_array_equal(2 * data["saved_a_b"], data["saved_a_b_"])
     record = ph.Record(save=lambda t: {"energy": t.energy, "rates": t.omega_body})
     saved = ph.simulate(SCENE, STATE, jnp.array([0.0, 1.0, 2.0]), record=record)
     data = saved.to_xarray()

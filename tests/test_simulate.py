@@ -277,15 +277,25 @@ def test_import_has_no_side_effects():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
+_MOMENTS = ph.Inertia.from_moments([1.0, 1.5, 2.0])
+
+
 @pytest.mark.parametrize(
-    "potential", [None, ph.UniformGravity(1.0, [0.1, 0.2, 0.3], [0.0, 0.0, -1.0])]
+    "scene",
+    [
+        ph.Scene(_MOMENTS),
+        ph.Scene(_MOMENTS, ph.UniformGravity(1.0, [0.1, 0.2, 0.3], [0.0, 0.0, -1.0])),
+        ph.Scene(ph.Inertia.axisymmetric(1.0, 0.5), ph.UniformGravity.axial(9.81, 0.1)),
+        ph.Scene(_MOMENTS, torque=ph.FeedbackTorque(lambda t, wxyz, omega_body: -omega_body)),
+    ],
 )
-def test_no_bodies_give_an_empty_trajectory(potential):
-    state = ph.State(np.zeros((0, 4)), np.zeros((0, 3)))
-    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), potential)
-    got = ph.simulate(scene, state, [0.0, 1.0, 2.0])
-    assert got.wxyz.shape == (0, 3, 4)
-    assert got.status.shape == (0,)
+def test_no_bodies_give_an_empty_trajectory(scene):
+    state = ph.State(np.zeros((2, 0, 4)), np.zeros((2, 0, 3)))
+    record = ph.Record(work=True)
+    got = ph.simulate(scene, state, [0.0, 1.0, 2.0], record=record)
+    assert got.wxyz.shape == (2, 0, 3, 4)
+    assert got.work.shape == (2, 0, 3)
+    assert got.status.shape == (2, 0)
 
 
 # Bodies that fail, in a batch with others

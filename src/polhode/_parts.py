@@ -52,6 +52,13 @@ class AbstractSum(AbstractPart):
     terms: tuple[Any, ...]
 
 
+def summands(part: AbstractPart | None) -> tuple[Any, ...]:
+    """The terms of a sum, a part that is no sum alone, nothing for None."""
+    if part is None:
+        return ()
+    return part.terms if isinstance(part, AbstractSum) else (part,)
+
+
 def check_fields(part: AbstractPart, name: str) -> None:
     """TypeError unless the array fields of a part, and of what it is made of, hold arrays.
 
@@ -88,17 +95,14 @@ def _refuse(value: Any, name: str, core: tuple[int | None, ...]) -> None:
     )
 
 
-def terms_of(
-    name: str, kind: type, total: type[AbstractSum], one: Any, other: Any
-) -> tuple[Any, ...]:
-    """The terms of ``one + other``, either of which may be a ``total`` of several already.
+def terms_of(name: str, kind: type, one: Any, other: Any) -> tuple[Any, ...]:
+    """The terms of ``one + other``, either of which may be a sum already.
 
     TypeError unless ``other`` is of the same ``kind``, called ``name``.
     """
     if not isinstance(other, kind):
         raise TypeError(f"a {name} adds to another {name}, not to {type(other).__name__}")
-    several = (part.terms if isinstance(part, total) else (part,) for part in (one, other))
-    return tuple(term for terms in several for term in terms)
+    return summands(one) + summands(other)
 
 
 def _fits(value: Any, core: tuple[int | None, ...]) -> bool:

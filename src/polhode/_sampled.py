@@ -13,6 +13,7 @@ from polhode._checks import ArrayLike, is_concrete
 from polhode._failed import sound_state, where_lost
 from polhode._kernels import is_differentiated
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts
+from polhode._parts import summands
 from polhode._plan import choose
 from polhode._scene import BodyTorque, SampledTorque, Scene, State, TorqueSum
 from polhode._trajectory import Trajectory, with_initial_spins
@@ -25,7 +26,7 @@ units in the last place of the times, which single precision rounds far more."""
 
 def is_sampled(scene: Scene) -> bool:
     """Whether a term of the torque is a ``SampledTorque``."""
-    return any(isinstance(term, SampledTorque) for term in _terms(scene.torque))
+    return any(isinstance(term, SampledTorque) for term in summands(scene.torque))
 
 
 def sampled_method(
@@ -35,7 +36,7 @@ def sampled_method(
 
     Raises ValueError for what is not possible with it.
     """
-    sampled_torques = [term for term in _terms(scene.torque) if isinstance(term, SampledTorque)]
+    sampled_torques = [term for term in summands(scene.torque) if isinstance(term, SampledTorque)]
     periods = {term.period for term in sampled_torques}
     if len(periods) > 1:
         raise ValueError(
@@ -107,7 +108,7 @@ class HeldCommands(AbstractMethod):
         if coupled:
             like = state.omega_body[..., 0]
             spins = (jnp.stack(scene.dynamics.wheels.initial_spins(like), axis=-1),)
-        laws = [x for x in _terms(scene.torque) if isinstance(x, SampledTorque)]
+        laws = [x for x in summands(scene.torque) if isinstance(x, SampledTorque)]
         final = Record(final_only=True)
 
         def commanded(t, state):
@@ -183,18 +184,14 @@ def _share(state: State, times: Array, rtol: Array) -> Array:
     return jnp.maximum(share, 8 * jnp.finfo(times.dtype).eps)
 
 
-def _terms(torque: Any) -> tuple[Any, ...]:
-    return torque.terms if isinstance(torque, TorqueSum) else (torque,)
-
-
 def _with_commands(scene: Scene, commands: list[Array]) -> Scene:
     """The scene with a constant torque in place of each ``SampledTorque``."""
     commands_in_order = iter(
-        commands if len(commands) > 1 else commands * len(_terms(scene.torque))
+        commands if len(commands) > 1 else commands * len(summands(scene.torque))
     )
     terms = [
         BodyTorque(next(commands_in_order)) if isinstance(x, SampledTorque) else x
-        for x in _terms(scene.torque)
+        for x in summands(scene.torque)
     ]
     torque = terms[0] if len(terms) == 1 else TorqueSum(tuple(terms))
     return dataclasses.replace(scene, torque=torque)

@@ -19,6 +19,7 @@ from polhode._batch import (
     flatten,
     is_lane_tree,
     lane_times,
+    map_arrays,
     on_devices,
     place,
     split_of,
@@ -315,6 +316,8 @@ def _begin(method, scene, state, ts, rtol) -> Trajectory:
 def _motion_samples(record, method, scene, state, ts, rtol) -> Samples:
     parts = (getattr(scene, name) for name in PARTS)
     batch = common_batch(*parts, state, extra=(ts.shape[:-1],))
+    if 0 in batch:
+        return _samples_of_no_body(batch, record, method, scene, state, ts, rtol)
     parts = {name: flatten(getattr(scene, name), batch) for name in PARTS}
     are_few = (
         state.wxyz.size <= 4 * _policy.KERNEL_BODIES
@@ -327,6 +330,19 @@ def _motion_samples(record, method, scene, state, ts, rtol) -> Samples:
     else:
         samples = _saved(record, method, Scene(**parts), lanes, times, rtol)
     return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), samples)
+
+
+def _samples_of_no_body(batch, record, method, scene, state, ts, rtol) -> Samples:
+    """Samples of an empty batch: those of one body tell their shapes, and nothing is computed."""
+
+    def one(x, rank):
+        lead = tuple(max(1, n) for n in x.shape[: x.ndim - rank])
+        return jnp.ones((*lead, *x.shape[x.ndim - rank :]), x.dtype)
+
+    parts = {name: map_arrays(getattr(scene, name), one) for name in PARTS}
+    body = record, method, type(scene)(**parts), map_arrays(state, one), one(ts, 1), rtol
+    shapes = eqx.filter_eval_shape(_motion_samples, *body)
+    return jax.tree.map(lambda x: jnp.zeros((*batch, *x.shape[len(batch) :]), x.dtype), shapes)
 
 
 def _samples(record: Record, method, scene: Scene, lanes: State, times, rtol) -> Samples:

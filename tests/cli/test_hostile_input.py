@@ -149,7 +149,7 @@ def test_targets_that_cannot_or_must_not_be_written(here, capsys, output, code, 
 
 
 def test_only_files_of_polhode_are_replaced_unasked(here, capsys):
-    (here / "free.png").write_text("a picture of the user's")
+    (here / "free.png").write_text("a picture of the user's, made from results of polhode")
     refused(capsys, ["run", "free.toml"], 1, "free.png", "--force")
     assert not (here / "free.nc").exists()
     assert main(["run", "free.toml", "-q", "--force"]) == 0

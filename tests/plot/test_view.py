@@ -190,6 +190,12 @@ def test_a_file_of_the_command_line_is_shown(tmp_path):
     for i, body in enumerate(motion["bodies"]):
         np.testing.assert_allclose(body["wxyz"], moved.wxyz[i], atol=1e-6)
         np.testing.assert_allclose(np.reshape(body["tensor"], (3, 3)), inertia.tensor[i])
+    torque = '[torque]\nkind = "body"\nn = { file = "gone.csv" }\n'
+    data = moved[0].to_xarray()
+    data["moments"] = ("axis", MOMENTS)
+    data.attrs.update(title="table", scene=text.replace("    ", "") + torque)
+    (body,) = known(plot.view_file(write_netcdf(data, tmp_path / "t.nc")))["bodies"]
+    np.testing.assert_allclose(body["wxyz"], moved.wxyz[0], atol=1e-6)
     with pytest.raises(FileNotFoundError):
         plot.view_file(tmp_path / "b.nc")
     with pytest.raises(ValueError, match="moments"):

@@ -10,7 +10,8 @@ from jaxtyping import Array
 from polhode._batch import is_lane_tree
 from polhode._kernels import map_chunks
 from polhode._method import AbstractMethod, Record, Samples, Status, StepCounts
-from polhode._scene import BodyTorque, LinearDamping, Scene, State, TorqueSum, Wheels
+from polhode._parts import summands
+from polhode._scene import BodyTorque, LinearDamping, Scene, State, Wheels
 from polhode.inertia import Symmetry, VariableInertia
 
 
@@ -169,17 +170,11 @@ def wheels_have_constant_momentum(scene: Scene, n: int) -> Array:
     return jnp.all(as_lanes(wheels.torque, n, 1) == 0, axis=-1)
 
 
-def _terms(torque: Any) -> tuple[Any, ...]:
-    if torque is None:
-        return ()
-    return torque.terms if isinstance(torque, TorqueSum) else (torque,)
-
-
 def torque_objection(scene: Scene) -> str | None:
     """Objection to anything but constant body torques and linear damping."""
     if scene.potential is not None:
         return "a potential acts"
-    for term in _terms(scene.torque):
+    for term in summands(scene.torque):
         constant = isinstance(term, BodyTorque) and not callable(term.n)
         if not (constant or isinstance(term, LinearDamping)):
             return "a torque acts that is neither constant in body axes nor linear damping"
@@ -189,7 +184,7 @@ def torque_objection(scene: Scene) -> str | None:
 def torque_and_damping(scene: Scene) -> tuple[Array, Array]:
     """Total constant body torque and coefficients of damping, (..., 3) each."""
     torque = damping = jnp.zeros(3, scene.inertia.dtype)
-    for term in _terms(scene.torque):
+    for term in summands(scene.torque):
         if isinstance(term, BodyTorque):
             torque = jnp.add(*broadcast(torque, term.n))
         else:

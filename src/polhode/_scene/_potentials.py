@@ -36,7 +36,7 @@ class AbstractPotential(AbstractPart):
         """Potential energy [J]."""
 
     def __add__(self, other: "AbstractPotential") -> "PotentialSum":
-        return PotentialSum(terms_of("potential", AbstractPotential, PotentialSum, self, other))
+        return PotentialSum(terms_of("potential", AbstractPotential, self, other))
 
 
 class PotentialSum(AbstractPotential, AbstractSum):

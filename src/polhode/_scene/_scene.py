@@ -22,7 +22,7 @@ from polhode._hamiltonian import (
     momentum_from_canonical,
     rates_from_angle_rates,
 )
-from polhode._parts import AbstractPart, AbstractSum, check_fields, shaped
+from polhode._parts import AbstractPart, check_fields, shaped, summands
 from polhode._scene._orbits import KeplerOrbit
 from polhode._scene._potentials import (
     AbstractPotential,
@@ -491,7 +491,7 @@ def _is_axial_wheel(part: Any) -> bool:
 
 
 def _count(part: Any, condition: Any) -> int:
-    return sum(map(condition, part.terms if isinstance(part, AbstractSum) else (part,)))
+    return sum(map(condition, summands(part)))
 
 
 def _inertia(inertia: Inertia) -> Inertia:

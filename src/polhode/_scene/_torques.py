@@ -61,7 +61,7 @@ class AbstractTorque(AbstractPart):
         return self
 
     def __add__(self, other: "AbstractTorque") -> "TorqueSum":
-        return TorqueSum(terms_of("torque", AbstractTorque, TorqueSum, self, other))
+        return TorqueSum(terms_of("torque", AbstractTorque, self, other))
 
 
 class TorqueSum(AbstractTorque, AbstractSum):

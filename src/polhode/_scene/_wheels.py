@@ -65,7 +65,7 @@ class AbstractCoupling(AbstractPart):
         return self.torque(t, speed_of(i), attitude, omega)
 
     def __add__(self, other: "AbstractCoupling") -> "CouplingSum":
-        return CouplingSum(terms_of("coupling", AbstractCoupling, CouplingSum, self, other))
+        return CouplingSum(terms_of("coupling", AbstractCoupling, self, other))
 
 
 class CouplingSum(AbstractCoupling, AbstractSum):

@@ -72,6 +72,8 @@ def dataset(trajectory: Any, labels: Sequence[str] | None) -> Any:
     for path, values in jax.tree_util.tree_leaves_with_path(trajectory._saved):
         key = jax.tree_util.keystr(path, simple=True, separator="_")
         name = f"saved_{key}" if key else "saved"
+        while name in data:  # of {"a_b": x, "a": {"b": y}}
+            name += "_"
         axes = (f"{name}_{k}" for k in range(values.ndim - len(sample_dims)))
         source = {"long_name": "value of the function of ph.Record(save=...)"}
         data[name] = ((*sample_dims, *axes), np.asarray(values), source)

@@ -411,6 +411,10 @@ def _identity(path: Path) -> tuple[int, int] | None:
     return status.st_ino, status.st_mtime_ns
 
 
+_MAKER = re.compile(rb'polhode(\W{1,5}\d+\.\d|">)')
+"""How files of polhode name their maker: with its version, or as the generator of a page."""
+
+
 def _is_replaceable(path: Path) -> bool:
     """Whether a file is empty or names polhode as its maker."""
     status = path.lstat()
@@ -429,4 +433,4 @@ def _is_replaceable(path: Path) -> bool:
         maker = maker.decode(errors="replace") if isinstance(maker, bytes) else str(maker)
         return maker.startswith("polhode")
     with open(path, "rb") as file:
-        return b"polhode" in file.read(65536)
+        return _MAKER.search(file.read(65536)) is not None

@@ -133,14 +133,18 @@ def read_scene(path: str | os.PathLike) -> "SceneFile":
     return parse_scene(text, path)
 
 
-def parse_scene(text: str, path: str | os.PathLike = "<text>") -> "SceneFile":
+def parse_scene(
+    text: str, path: str | os.PathLike = "<text>", *, files: bool = True
+) -> "SceneFile":
     """`read_scene` of a text; `path` is the name used in messages, and its folder that of the files
-    of [ensemble.arrays] and of tables over time.
+    of [ensemble.arrays] and of tables over time, which are not read without `files`.
     """
     path = Path(path)
     file = _validate(text, path)
     file = file.model_copy(update={"title": file.title or escape(path.stem)})
     file._path, file._text = path, text
+    if not files:
+        return file
     plan = file.ensemble
     if plan is not None and plan.arrays is not None:
         file._rows = _read_arrays(dict(plan.arrays.entries()), plan.bodies, path)

@@ -233,7 +233,10 @@ def read(path: str | os.PathLike) -> tuple[list[Body], str]:
     if has_body_axis and moments.ndim > 1:
         tensors = moments[:, :, None] * np.eye(3)  # clones differ in moments about the body axes
     else:
-        inertia = build_inertia(parse_scene(text, path), jnp.result_type(float))
+        scene = parse_scene(text, path, files=False)
+        if scene.inertia.table is not None:  # else what drives the body is no part of the picture
+            scene = parse_scene(text, path)
+        inertia = build_inertia(scene, jnp.result_type(float))
         # one that changes with time is drawn as it is at the first time
         tensors = np.asarray(inertia_at(inertia, ts.flat[0]).tensor, np.float64)
     count = wxyz.shape[0] if has_body_axis else 1
