@@ -16,7 +16,7 @@ from polhode.fit._findings import Finding
 from polhode.fit._model import Parameters, entries_of, whole_of
 from polhode.fit._numerics import eigh, inverse, svd
 from polhode.fit._options import FitOptions, Gyroscope, Huber, noise_is_trusted
-from polhode.fit._recording import Recording, require_channel, rotation_vector_between, size_of_data
+from polhode.fit._recording import Recording, require_channel, size_of_data, turns_between_samples
 from polhode.fit._residuals import Linear, prior_of
 from polhode.fit._result import (
     MAX_NULL_PART,
@@ -191,6 +191,11 @@ def _sort_by_kind(shared: Any, count: int, parameters: Parameters) -> _Split:
     return _Split(shared[:count], sensor, motion)
 
 
+def _count_after_motion(parameters: Parameters) -> int:
+    """How many of the shared unknowns follow those of the motion."""
+    return sum(x.size for x in (parameters.gain, parameters.delay) if x is not None)
+
+
 def _sensor(parameters: Parameters, gyroscope: Gyroscope) -> dict[str, Array]:
     """The fitted unknowns of the sensors by name: gain, bias and delay with those calibrated."""
     names = ("bias", "mounting", "lever", "gain", "delay")
@@ -274,12 +279,18 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
         return jnp.concatenate([values, ratios, products]), (values, axes)
 
     slope, (moments, axes) = jax.jacfwd(derived, has_aux=True)(entries)
-    if not model.scale_known:
+    motion = parameters.motion
+    relative = None if model.scale_known else model.motion.over(motion, moments[2])
+    if relative is not None:
         # size that the data do not show: a largest moment of one
-        size = moments[2]
+        size, motion = moments[2], relative
         tensor, moments = tensor / size, moments / size
         slope = slope * jnp.where(jnp.arange(9) // 3 == 1, size, 1)[:, None]
-        sizes = jnp.where(jnp.arange(linear.shared.shape[-1]) < count, size, 1)
+        factors = model.motion.over(jax.tree.map(jnp.ones_like, motion), size)
+        factors = jnp.concatenate([jnp.ones(0, dtype), *map(jnp.ravel, jax.tree.leaves(factors))])
+        first = linear.shared.shape[-1] - _count_after_motion(parameters) - factors.size
+        sizes = jnp.ones(linear.shared.shape[-1], dtype).at[:count].set(size)
+        sizes = sizes.at[first : first + factors.size].divide(factors)
         linear = linear._replace(shared=linear.shared * sizes[None, None])
         solution = dataclasses.replace(solution, linear=linear)
     determination = determination_of(solution, recording, noise_is_trusted(options))
@@ -325,7 +336,7 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
         options,
         determination,
         findings,
-        values=[tensor, *jax.tree.leaves(parameters.motion)],
+        values=[tensor, *jax.tree.leaves(motion)],
         values_std=[symmetric_std(std.entries), *std.motion],
         sensor_std=std.sensor,
         inertia=inertia,
@@ -474,13 +485,19 @@ def _axes_disagree(recording: Recording, options: FitOptions) -> Array:
     # the proper rotation nearest to the correlation of both, and how much its mirror image gains
     left_vectors, sizes, right_vectors = svd(jnp.einsum("rti,rtj->ij", measured, from_attitudes))
     hand = jnp.sign(jnp.linalg.det(left_vectors) * jnp.linalg.det(right_vectors))
-    inverted = (hand < 0) & (sizes[2] > 0.1 * sizes[1])
+    # A body that turns about one axis shows where that is, and noise alone turns the others.
+    shows_turn = sizes[1] > 0.02 * sizes[0]
+    inverted = shows_turn & (hand < 0) & (sizes[2] > 0.1 * sizes[1])
     if options.mounting:
         return inverted
     signs = jnp.stack([jnp.ones_like(hand), jnp.ones_like(hand), hand])
     turn = left_vectors @ (signs[:, None] * right_vectors)
-    # less than this is a turn of more than 60 degrees between the axes
-    return inverted | (turn[0, 0] + turn[1, 1] + turn[2, 2] < 2)
+    turned = jnp.where(
+        shows_turn,
+        turn[0, 0] + turn[1, 1] + turn[2, 2] < 2,  # by more than 60 degrees
+        jnp.dot(left_vectors[:, 0], right_vectors[0]) < 0.5,
+    )
+    return inverted | turned
 
 
 def _turns(recording: Recording, centred: bool) -> tuple[Array, Array]:
@@ -488,11 +505,11 @@ def _turns(recording: Recording, centred: bool) -> tuple[Array, Array]:
 
     ``centred``: less their means, whose difference may be the gyroscope's bias.
     """
-    wxyz, omega = require_channel("wxyz", recording.wxyz), require_channel("omega", recording.omega)
+    omega = require_channel("omega", recording.omega)
     weight = (recording.present[..., 1:] * recording.present[..., :-1])[..., None]
     step = jnp.diff(recording.times, axis=-1)[..., None]
     measured = step * (omega[..., 1:, :] + omega[..., :-1, :]) / 2
-    recorded = rotation_vector_between(wxyz[..., :-1, :], wxyz[..., 1:, :])
+    recorded = turns_between_samples(recording)
     if centred:
         total = jnp.sum(weight, axis=-2, keepdims=True)
         measured, recorded = (
@@ -520,21 +537,28 @@ def whiteness_of(residuals: Array, present: Array, lags: int = 5) -> Array:
     """Ljung-Box probability of the first autocorrelations of all channels together."""
     total = jnp.sum(present, axis=-1)[:, None]
     # recordings that only fill a batch up have no samples and count nothing
-    has_power = total > 0
-    total = jnp.where(has_power, total, lags + 1)
+    total = jnp.where(total > 0, total, 1)
     residuals = (residuals - (jnp.sum(residuals, axis=1) / total)[:, None]) * present[..., None]
     power = jnp.sum(residuals**2, axis=1)
     safe = jnp.where(power > 0, power, 1)
     later = jnp.pad(residuals, ((0, 0), (0, lags), (0, 0)))
+    later_present = jnp.pad(present, ((0, 0), (0, lags)))
 
     def statistic_at(lag):
-        lagged = jax.lax.dynamic_slice_in_dim(later, lag, residuals.shape[1], axis=1)
+        lagged, present_too = (
+            jax.lax.dynamic_slice_in_dim(x, lag, residuals.shape[1], axis=1)
+            for x in (later, later_present)
+        )
+        # without gaps the number of samples less the lag
+        pairs = jnp.sum(present * present_too, axis=1)[:, None]
         correlation = jnp.sum(residuals * lagged, axis=1) / safe
-        return jnp.sum(correlation**2 / (total - lag.astype(total.dtype)) * total * (total + 2))
+        terms = correlation**2 / jnp.where(pairs > 0, pairs, jnp.inf) * total * (total + 2)
+        return jnp.sum(terms), jnp.sum(pairs > 0).astype(residuals.dtype)
 
-    statistic = jnp.sum(jax.lax.map(statistic_at, jnp.arange(1, lags + 1)))
+    statistics, counted = jax.lax.map(statistic_at, jnp.arange(1, lags + 1))
+    statistic = jnp.sum(statistics)
     # Chi-square of many degrees by Wilson and Hilferty (PNAS 17 (1931) 684): the exact one would
     # take longer to compile than all else here.
-    degrees = lags * residuals.shape[-1] * jnp.sum(has_power).astype(residuals.dtype)
+    degrees = residuals.shape[-1] * jnp.sum(counted)
     spread = 2 / (9 * degrees)
     return norm.sf(((statistic / degrees) ** (1 / 3) - 1 + spread) / spread**0.5)

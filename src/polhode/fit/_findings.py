@@ -71,8 +71,8 @@ class Observability(NamedTuple):
     """A row of ``Fit.observability``: a quantity and the source of its estimate.
 
     **Fields:** ``quantity``, with the number of its components in brackets; ``count`` of them, of
-    which the data show ``shown``; ``source``: ``"data"``, ``"data and calibration"``,
-    ``"calibration"`` or ``"nothing"``; ``remedy``: a recording that would show it, or empty.
+    which the data show ``shown``; ``source``: ``"data"``, ``"prior"``, ``"calibration"``, several
+    of them joined by "and", or ``"nothing"``; ``remedy``: a recording that would show it, or empty.
     """
 
     quantity: str

@@ -148,13 +148,17 @@ def fit_recordings(
 
 
 def windows(recording: Recording, length: int) -> list[Recording]:
-    """A recording (without batch) cut into windows of ``length`` samples sharing their ends."""
+    """A recording (without batch) cut into windows of ``length`` samples sharing their ends.
+
+    The last one has those that remain, and of less than four the one before it is longer.
+    """
     if not isinstance(recording, Recording):
         raise TypeError(f"recording must be a Recording, got {type(recording).__name__}.")
     count = recording.times.shape[-1]
     require(4 <= length <= count, f"a window needs 4 to {count} samples, got {length}.")
     # starts that leave at least four samples
     cuts = [slice(start, start + length) for start in range(0, count - 3, length - 1)]
+    cuts[-1] = slice(cuts[-1].start, count)
     return [jax.tree.map(lambda leaf, cut=cut: leaf[cut], recording) for cut in cuts]
 
 

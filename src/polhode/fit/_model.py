@@ -213,6 +213,11 @@ class AbstractMotion(eqx.Module):
         """Standard deviations of normal priors about the start, one for each unknown leaf."""
         return [None for _ in jax.tree.leaves(self.start())]
 
+    def over(self, unknown: Any, size: Array) -> Any | None:
+        """The unknowns that with an inertia divided by ``size`` give the same motion; None where
+        that is not known. Linear in ``unknown``."""
+        return None if jax.tree.leaves(unknown) else unknown
+
     @abc.abstractmethod
     def __call__(
         self,
@@ -272,9 +277,12 @@ class SteppedMotion(AbstractMotion):
 
     def start(self) -> dict[str, Any]:
         return {
-            "drag": self.drag if self.fit_drag else None,
+            "drag": (self.drag or Drag()) if self.fit_drag else None,
             "delay": self.delay if self.fit_delay else None,
         }
+
+    def over(self, unknown: dict[str, Any], size: Array) -> dict[str, Any]:
+        return unknown | {"drag": jax.tree.map(lambda x: x / size, unknown["drag"])}
 
     def fixes_scale(self) -> bool:
         return self.spin_inertia is not None or (self.drag is not None and not self.fit_drag)

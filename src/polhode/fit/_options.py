@@ -11,7 +11,7 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float
 
-from polhode._checks import ArrayLike, as_float_array, require
+from polhode._checks import ArrayLike, as_float_array, is_concrete, require
 from polhode.fit._model import AbstractInertiaUnknown, AbstractMotion, SteppedMotion
 from polhode.fit._numerics import inverse
 from polhode.fit._recording import Recording, central_slope, interpolate_gaps
@@ -187,12 +187,16 @@ def calibrate(recording: Recording, gyroscope: Gyroscope) -> Recording:
         limits = saturation(recording, gyroscope.max_rate)
     if gyroscope.bias is not None:
         omega = omega - jnp.broadcast_to(gyroscope.bias.astype(dtype), omega.shape)
-    if gyroscope.gain is not None:
-        back = inverse(gyroscope.gain).astype(dtype)
-        omega = jnp.einsum("ij,...j->...i", back, omega)
     if gyroscope.noise_density:
         step = jnp.median(jnp.diff(recording.times, axis=-1), axis=-1)[..., None, None]
         noise = jnp.broadcast_to(gyroscope.noise_density / step**0.5, omega.shape)
+    present = recording.present
+    if gyroscope.gain is not None:
+        back = inverse(gyroscope.gain).astype(dtype)
+        omega = jnp.einsum("ij,...j->...i", back, omega)
+        if noise is not None:
+            noise = jnp.sqrt(jnp.einsum("ij,...j->...i", back**2, noise**2))
+        limits, present = _limits_of_rates(limits, present, back)
     if gyroscope.jitter and noise is not None:
         flat = [
             x.reshape(-1, *x.shape[len(recording.batch_shape) :])
@@ -200,7 +204,24 @@ def calibrate(recording: Recording, gyroscope: Gyroscope) -> Recording:
         ]
         slope = jax.vmap(central_slope)(*flat).reshape(omega.shape)
         noise = jnp.sqrt(noise**2 + (gyroscope.jitter * slope) ** 2)
-    return dataclasses.replace(recording, omega=omega, omega_noise=noise, saturated=limits)
+    return dataclasses.replace(
+        recording, omega=omega, omega_noise=noise, saturated=limits, present=present
+    )
+
+
+def _limits_of_rates(limits: Array, present: Array, back: Array) -> tuple[Array, Array]:
+    """``saturated`` of the rates ``back`` times readings, and which samples remain.
+
+    Where each rate is that of one reading, a tenth of others aside, it has the bounds of that one.
+    Of other matrices a sample with a saturated reading bounds no rate: it is a gap.
+    """
+    size = jnp.abs(back)
+    own = size == jnp.max(size, axis=1, keepdims=True)
+    of_rates = jnp.einsum("ij,...j->...i", jnp.where(own, jnp.sign(back), 0), limits)
+    has_own_bounds = jnp.all(jnp.sum(size, axis=1) < 1.1 * jnp.max(size, axis=1))
+    is_bound = jnp.any(limits != 0, axis=-1)
+    kept = jnp.where(is_bound & ~has_own_bounds, jnp.zeros_like(present), present)
+    return jnp.where(has_own_bounds, of_rates, jnp.zeros_like(of_rates)), kept
 
 
 def saturation(recording: Recording, max_rate: float | None = None) -> Float[Array, "*b t 3"]:
@@ -371,6 +392,18 @@ def check_usable(options: FitOptions, recording: Recording) -> None:
             recording.omega is not None or not getattr(options, name),
             f"{name}=True needs rates of a gyroscope (omega_body), got attitudes alone.",
         )
+    noises = (recording.omega_noise, recording.attitude_noise, recording.force_noise)
+    known = [np.asarray(x) for x in noises if x is not None and is_concrete(x)]
+    density = options.gyroscope is not None and options.gyroscope.noise_density > 0
+    require(
+        options.robust is None
+        or bool(options.trust_noise)
+        or density
+        or any(np.any(x != 1) for x in known)
+        or not known,
+        "robust counts residuals in standard deviations of the noise: give omega_noise (rad/s), or"
+        " FitOptions(trust_noise=True) for one of 1 rad/s.",
+    )
     count = recording.times.shape[-1]
     require(
         recording.wheel is None or count >= 8,
@@ -381,6 +414,11 @@ def check_usable(options: FitOptions, recording: Recording) -> None:
         require(
             recording.omega is not None,
             "the option gyroscope needs its rates (omega_body), got attitudes alone.",
+        )
+        require(
+            not (options.bias and sensor.bias_std),
+            "bias=True fits the bias without a prior and bias_std of the gyroscope is its prior:"
+            " give one of them.",
         )
         require(
             not (sensor.delay or sensor.delay_std)

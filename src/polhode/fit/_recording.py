@@ -19,7 +19,7 @@ from polhode._checks import (
     require,
     require_positive,
 )
-from polhode.rotation import conjugate, multiply, normalise
+from polhode.rotation import conjugate, multiply, normalise, wxyz_to_rotation_vector
 
 # angles per sample above which a record under-samples its own rotation
 _TURN_PER_SAMPLE = np.pi
@@ -164,6 +164,12 @@ def rotation_vector_between(
     turn = multiply(conjugate(first), second)
     sign = jnp.where(turn[..., :1] < 0, -1, 1).astype(turn.dtype)
     return 2 * sign * turn[..., 1:]
+
+
+def turns_between_samples(recording: "Recording") -> Float[Array, "*b t-1 3"]:
+    """Rotation vectors, body axes, from each attitude to the next, of up to half a turn."""
+    wxyz = require_channel("wxyz", recording.wxyz)
+    return wxyz_to_rotation_vector(multiply(conjugate(wxyz[..., :-1, :]), wxyz[..., 1:, :]))
 
 
 def require_channel(name: str, array: Array | None) -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from polhode._checks import ArrayLike
 from polhode._kernels import kernel
 from polhode.fit._model import (
     AbstractMotion,
@@ -24,7 +25,7 @@ from polhode.fit._model import (
     whole_of,
 )
 from polhode.fit._numerics import triangle
-from polhode.fit._options import Gyroscope, Huber
+from polhode.fit._options import Gyroscope, Huber, calibrate
 from polhode.fit._recording import (
     Recording,
     central_slope,
@@ -97,10 +98,11 @@ def residuals(
 ) -> dict[str, Float[Array, "r t 3"]]:
     """Residuals of rates, attitudes (rotation vectors) and accelerometer, over their noise.
 
-    ``recording`` carries one leading axis r: recordings of one body. Gaps count zero, and so does a
-    saturated reading while the model is beyond the limit. Any optimiser can minimise the sum of
-    squares; ``jax.grad`` and ``jax.jacfwd`` go through it.
+    ``recording`` carries one leading axis r: recordings of one body, with the readings as recorded.
+    Gaps count zero, and so does a saturated reading while the model is beyond the limit. Any
+    optimiser can minimise the sum of squares; ``jax.grad`` and ``jax.jacfwd`` go through it.
     """
+    recording = calibrate(recording, model.gyroscope)
     return residuals_of_motion(
         predict(parameters, recording, model, tensor), parameters, recording, model
     )
@@ -241,20 +243,26 @@ def prior_cost(parameters: Parameters, recording: Recording, model: Model) -> Fl
 
 
 def log_density(
-    recording: Recording, model: Model, prior: Callable[[Parameters], Array] | None = None
+    recording: Recording,
+    model: Model,
+    prior: Callable[[Parameters], Array] | None = None,
+    *,
+    noise: ArrayLike = 1.0,
 ) -> Callable[[Parameters], Float[Array, ""]]:
     """Logarithm of the posterior density of ``Parameters``, up to a constant, for any sampler.
 
     ``recording`` as in ``residuals`` (one leading axis: ``stack([recording])``), ``model`` that of
     a fit, whose ``parameters`` are the place to start from; ``prior`` adds the logarithm of its
     density (None: flat in the parameters, that is in the second moments away from flat bodies),
-    beside that of the gyroscope's calibration, which is always included.
+    beside that of the gyroscope's calibration, which is always included. ``noise``: standard
+    deviation of the residuals over the noise of the recording; ``Fit.noise`` where that is not
+    known.
     The result is a density for BlackJAX; its negative is a ``potential_fn`` for NumPyro.
     """
 
     def density(parameters):
         parts = residuals(parameters, recording, model)
-        misfit = -reduce(add, (jnp.sum(part**2) for part in parts.values())) / 2
+        misfit = -reduce(add, (jnp.sum(part**2) for part in parts.values())) / noise**2 / 2
         misfit = misfit - prior_cost(parameters, recording, model)
         return misfit if prior is None else misfit + prior(parameters)
 

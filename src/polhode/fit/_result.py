@@ -65,7 +65,8 @@ class Fit(eqx.Module):
       for ``MomentsOnly``, none of a scene), bias, mounting, lever, the motion's unknowns or the
       scene's values, gain (row by row) and delay, then of each recording rates and attitude
       (rotation vector) at its start and the walk of the bias. It is the pseudo-inverse of
-      ``information`` (..., p, p), which includes the calibration.
+      ``information`` (..., p, p), which includes the calibration, times ``noise**2`` where the
+      level of the noise was estimated.
     - ``null_count`` (...): number of directions of the unknowns that the data do not show.
     - ``noise`` (...): standard deviation of the residuals over the assumed one (reduced chi).
     - ``whiteness`` (...): probability of autocorrelations as large as observed, for independent
@@ -114,7 +115,8 @@ class Fit(eqx.Module):
     def inertia(self) -> Inertia:
         """Full tensor (...) in sensor axes about the centre of mass, reaction wheels locked.
 
-        Where ``scale_known`` is False the data show only its shape: the largest moment is 1.
+        Where ``scale_known`` is False the data show only its shape: the largest moment is 1 (any
+        number for a ``SceneMotion`` with unknowns of its own, whose values belong to it).
         """
         return self._of_inertia("inertia").inertia
 
@@ -254,7 +256,9 @@ class Fit(eqx.Module):
             ]
         texts = (jax.tree_util.keystr(path, simple=True, separator=".") for path in paths)
         names = [text or "unknown" for text in texts]  # of a motion whose unknown is one array
-        return names if self._inertia is None else ["inertia", *names]
+        if self._inertia is None:
+            return names
+        return ["inertia", *("motion.inertia" if x == "inertia" else x for x in names)]
 
     def common_scale(self, body: int = 0) -> list[tuple[str, np.ndarray, np.ndarray]]:
         """What is known of ``values`` where the data show all of them but for a common factor.
@@ -301,6 +305,8 @@ class Fit(eqx.Module):
             )
         if not np.all(np.isfinite(std)):
             return "the motion, which does not show all unknowns: record another spin"
+        if any("prior" in row.source and row.shown < row.count for row in self.observability(body)):
+            return "the prior, which alone states some of the values: record another motion"
         part = self._calibration_part(body)
         if part > 0.5:
             return (
@@ -474,9 +480,13 @@ class Fit(eqx.Module):
         else:
             for k, spread in enumerate(self.std):
                 flat = np.asarray(spread).reshape(max(np.size(self.diagnostics), 1), -1)[body]
+                has_prior = self._prior_std[k] is not None
                 shown_count = int(np.isfinite(flat).sum())
+                if has_prior:
+                    shown_count = self._count_shown_beside_prior(k, body)
                 remedy = "" if shown_count == flat.size else "another motion, or fewer free numbers"
-                source = rests if shown_count else "nothing"
+                sources = [rests] * (shown_count > 0) + ["prior"] * has_prior
+                source = " and ".join(sources) or "nothing"
                 name = f"{self.value_names[k]} ({flat.size})"
                 rows.append(Observability(name, flat.size, shown_count, source, remedy))
         for name, count, shown_count in gained or []:
@@ -486,6 +496,25 @@ class Fit(eqx.Module):
             remedy = "" if shown_count == count else "attitudes (wxyz), or rates of a rate table"
             rows.append(Observability(f"{name} ({count})", count, shown_count, source, remedy))
         return rows
+
+    @property
+    def _prior_std(self) -> list[Array | None]:
+        """Of each of ``values`` of a scene the standard deviation of its prior."""
+        return self.model.motion.prior_std()
+
+    def _count_shown_beside_prior(self, k: int, body: int) -> int:
+        """Of how many directions of a value with a prior the data at least halve the variance."""
+        lead = np.ndim(self.diagnostics)
+        sizes = [int(np.prod(np.shape(x)[lead:])) for x in self.values]
+        sensors = (self.parameters.bias, self.parameters.mounting, self.parameters.lever)
+        first = sum(int(np.prod(np.shape(x)[lead:])) for x in sensors if x is not None)
+        first += sum(sizes[:k])
+        place = slice(first, first + sizes[k])
+        covariance = np.asarray(self.covariance)
+        block = covariance.reshape(-1, *covariance.shape[-2:])[body][place, place]
+        widths = np.asarray(self._prior_std[k]).reshape(-1, sizes[k])
+        width = widths[min(body, len(widths) - 1)]
+        return int(np.sum(np.linalg.eigvalsh(block / width[:, None] / width) < 0.5))
 
     def _calibration_shown(self, body: int) -> list[tuple[str, int, int]] | None:
         """Of the gyroscope's gain: name, number and how many directions the data show.

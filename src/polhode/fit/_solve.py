@@ -28,8 +28,8 @@ from polhode.fit._recording import (
     Recording,
     interpolate_gaps,
     require_channel,
-    rotation_vector_between,
     size_of_data,
+    turns_between_samples,
 )
 from polhode.fit._residuals import Linear, Model, linearise, prior_cost, prior_residuals, unknowns
 from polhode.fit._start import (
@@ -321,7 +321,7 @@ def _expected_square_sum(recording: Recording, options: FitOptions) -> Float[Arr
     if noise_is_trusted(options):
         return expected
     if recording.omega is None:
-        values = _turned(recording)
+        values = turns_between_samples(recording)
         values = jnp.pad(jnp.cumsum(values, axis=1), ((0, 0), (1, 0), (0, 0)))
         noise = require_channel("attitude_noise", recording.attitude_noise)[..., None]
     else:
@@ -359,12 +359,6 @@ def _weight(recording: Recording, rates: Array) -> Float[Array, ""]:
     return 10 / jnp.sqrt(jnp.where(mean > 0, mean, 1))
 
 
-def _turned(recording: Recording) -> Float[Array, "r t-1 3"]:
-    """Rotation vectors from each attitude to the next."""
-    wxyz = require_channel("wxyz", recording.wxyz)
-    return rotation_vector_between(wxyz[:, :-1], wxyz[:, 1:])
-
-
 def _beside(steps: Float[Array, "r t-1 c"]) -> Float[Array, "r t c"]:
     """At each sample the sum of the numbers of the steps before and after it."""
     before, after = (jnp.pad(steps, ((0, 0), side, (0, 0))) for side in ((1, 0), (0, 1)))
@@ -377,7 +371,7 @@ def _rates(recording: Recording) -> Float[Array, "r t 3"]:
         # at each sample the mean of the rates before and after it, as far as both ends are present
         known = recording.present[:, 1:] * recording.present[:, :-1]
         steps = jnp.diff(recording.times, axis=-1)
-        rates = known[..., None] * _turned(recording) / steps[..., None]
+        rates = known[..., None] * turns_between_samples(recording) / steps[..., None]
         sums, counts = (_beside(x) for x in (rates, known[..., None]))
         values, has_rate = sums / jnp.maximum(counts, 1), (counts[..., 0] > 0).astype(rates.dtype)
         return interpolate_gaps(recording.times, has_rate, values)

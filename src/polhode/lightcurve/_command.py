@@ -277,8 +277,11 @@ def read_solutions(path: str | PathLike[str]) -> tuple[Solution, ...]:
         out = []
         for row in rows:
             fields = {name: row.get(name) for name in Solution._fields}
-            arrays = ("moments", "axes", "wxyz", "omega_body", "coefficients")
-            fields |= {name: np.asarray(row[name], float) for name in arrays}
+            needed = ("moments", "axes", "wxyz", "omega_body", "coefficients")
+            arrays = {name: row[name] for name in needed} | {
+                name: value for name, value in fields.items() if isinstance(value, list)
+            }
+            fields |= {name: np.asarray(value, float) for name, value in arrays.items()}
             fields |= {"mode": Mode[row["mode"]], "epoch": float(row["epoch"])}
             out.append(Solution(**fields))
     except (UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError, AttributeError) as error:

@@ -51,7 +51,7 @@ def read_light_curve(
     if not content:
         raise ValueError(f"{path} is empty; expected a light curve.")
     if any(line.strip().upper().startswith("STARTMETADATA") for line in content[:50]):
-        return _alcdef(path, lines, vectors, calibrated)
+        return _alcdef(path, lines, vectors, calibrated, reduced)
     if len(content[0].split()) == 1 and content[0].strip().isdigit():
         if vectors is not None:
             raise ValueError(f"{path} holds vectors of its own: leave those of {vectors} out.")
@@ -189,7 +189,11 @@ def _interpolated(path, t) -> np.ndarray:
 
 def _damit(path, lines) -> LightCurve:
     """Blocks of ``points calibrated`` and rows of JD, intensity, vectors to Sun and Earth."""
-    rows = [(k + 1, line.split()) for k, line in enumerate(lines) if line.strip()]
+    rows = [
+        (k + 1, line.split())
+        for k, line in enumerate(lines)
+        if line.strip() and not line.lstrip().startswith("#")
+    ]
     count, place, table, group, kinds = int(rows[0][1][0]), 1, [], [], []
     if count == 0:
         raise ValueError(f"{path} announces no light curve.")
@@ -237,7 +241,7 @@ def _damit(path, lines) -> LightCurve:
     )
 
 
-def _alcdef(path, lines, vectors, calibrated: bool) -> LightCurve:
+def _alcdef(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve:
     """Sessions of KEYWORD=value and DATA=JD|magnitude|error lines."""
     table, group, keys, session, rays = [], [], {}, 0, []
     for number, line in enumerate(lines, 1):
@@ -263,7 +267,8 @@ def _alcdef(path, lines, vectors, calibrated: bool) -> LightCurve:
     data = np.array(table)
     are_numbers = all(all(_is_number(x) for x in ray) for ray in rays)
     sun = observer = None
-    notes = ["ALCDEF gives no distances: nights have free offsets, times keep their light time."]
+    nights = "" if calibrated else "nights have free offsets, "
+    notes = [f"ALCDEF gives no distances: {nights}times keep their light time."]
     if vectors is not None:
         six = _interpolated(vectors, data[:, 0])
         sun, observer, notes = six[:, :3], six[:, 3:], []
@@ -286,6 +291,7 @@ def _alcdef(path, lines, vectors, calibrated: bool) -> LightCurve:
         group=group,
         notes=notes,
         calibrated=calibrated,
+        reduced=reduced,
     )
 
 

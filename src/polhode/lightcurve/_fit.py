@@ -85,7 +85,7 @@ def fit_light_curve(
     parameters drawn at random; Levenberg-Marquardt, with exact derivatives, on the best ``starts``
     of each interpretation, then again on the most probable; mirror images; the ``max_solutions``
     best distinct solutions and all others that cannot be excluded. Repeated until two searches
-    agree, at most ``searches`` times.
+    agree and the residuals are those of the errors, at most ``searches`` times.
 
     ``phase``: a phase function (default: ``HG1G2()`` where the phase angle changes by more than 5
     degrees, else ``SeeligerPhase()``). ``pairs``: instead of those from the series.
@@ -128,6 +128,8 @@ def fit_light_curve(
         pairs = fourier_lattices(
             curve.t, curve.magnitude, columns=columns, max_frequency=max_frequency
         )
+    if not np.isfinite(pairs.max_frequency):  # of pairs that were given: how many were tried
+        pairs = pairs._replace(max_frequency=2 * float(max(pairs.f_phi.max(), pairs.f_psi.max())))
     meant = hypotheses(pairs, curve.t, curve.magnitude, columns=columns)
     key = jax.random.key(seed)
     rough, problem = Problem(phase, _subsample(points, _FEW)), Problem(phase, points)
@@ -146,7 +148,10 @@ def fit_light_curve(
         result = _search_once(
             search_key, meant, trials, starts, rough, problem, _blur(curve), pairs.resolution
         )
-        reproduced = state is not None and _searches_agree(state, result, pairs.resolution)
+        if state is not None:
+            agree = _searches_agree(state, result, pairs.resolution)
+            # a search that misses the best motion of two others does not make it less certain
+            reproduced = agree or (reproduced and state.cost.min() <= result.cost.min())
         state = result if state is None else _concatenate(state, result)
         # found again, and the errors assumed are reached: nothing is left to be found
         freedom = max(curve.t.size - state.matrix.shape[1], 1)

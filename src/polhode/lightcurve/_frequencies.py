@@ -257,7 +257,7 @@ def fourier_pairs(
     multiples = terms(order, even)
     most = int(np.abs(multiples).sum(1).max())
     scan = Scan.of(t, values, columns, max_frequency, oversampling, most, _MAX_PAIR_NODES)
-    # a tenth of a cycle at least; neither frequency may be that of the other
+    # half a cycle at least; neither frequency may be that of the other
     nodes = np.arange(max(oversampling // 2, 1), scan.count)
     pairs = np.stack(np.meshgrid(nodes, nodes, indexing="ij"), -1).reshape(-1, 2)
     if not even:

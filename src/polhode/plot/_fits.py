@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from polhode._checks import ArrayLike
+from polhode.fit._options import calibrate
 from polhode.plot._samples import ACCENT, AXES, GREY, INK, matrices, new_figure, plain, styled
 
 # chi-square of two degrees of freedom: 68 % and 95 % of a plane
@@ -78,6 +79,7 @@ def _single(result, recording, body) -> dict[str, Any]:
         return value.reshape(-1, *value.shape[value.ndim - tail :])[place]
 
     place = body if lead else 0
+    recording = calibrate(recording, result.model.gyroscope)
     omega, noise = (pick(x, 2, place) for x in (recording.omega, recording.omega_noise))
     present, times = (pick(x, 1, place) for x in (recording.present, recording.times))
     present = present > 0
