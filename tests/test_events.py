@@ -525,6 +525,39 @@ def test_more_events_than_are_stored_are_reported():
     many = ph.crossings(ph.simulate(scene, state, [0.0, 20.0]), few)
     assert int(traj.events.count) == many.times.size > 2
     np.testing.assert_allclose(traj.events.times, many.times[:2], rtol=1e-9)
+    np.testing.assert_allclose(traj.at([1.0]).omega_body[0, 2], 3 * np.exp(-1e-3 / 2), rtol=1e-2)
+
+
+@pytest.mark.parametrize("torque", [None, ph.LinearDamping(1e-3)])
+def test_a_terminal_event_is_stored_when_the_places_are_taken(torque):
+    scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), None, torque)
+    state = ph.State([1.0, 0, 0, 0], [0.3, 0.2, 3.0])
+    events = [
+        ph.Event(lambda wxyz, omega, t: omega[0], capacity=1),
+        ph.Event(lambda wxyz, omega, t: t - 15.0, capacity=1, terminal=True),
+    ]
+    traj = ph.simulate(scene, state, [0.0, 10.0, 20.0], events=events, throw=False)
+    assert int(traj.status) == ph.Status.TOO_MANY_EVENTS
+    assert traj.events.which.tolist() == [0, 1]
+    np.testing.assert_allclose([traj.event_time, traj.ts[-1], traj.events.times[1]], 15.0)
+    assert np.isfinite(traj.omega_body).all()
+
+
+def test_bad_input_is_told_where_events_are_searched_for():
+    """Under jit, where nothing is raised."""
+    event = ph.Event(lambda wxyz, omega, t: t - 1.5, samples=20)
+
+    @jax.jit
+    def statuses(moments, ts):
+        scene = ph.Scene(ph.Inertia.from_moments(moments), None, ph.LinearDamping(0.01))
+        state = ph.State([1.0, 0, 0, 0], [0.1, 0.2, 1.3])
+        runs = [{"events": event}, {"until": event}]
+        return jnp.stack([ph.simulate(scene, state, ts, **run).status for run in runs])
+
+    unsorted = statuses(jnp.array([1.0, 1.5, 2.0]), jnp.array([0.0, 2.0, 1.0, 3.0]))
+    assert (unsorted == ph.Status.BAD_TIMES).all()
+    needle = statuses(jnp.array([1.0, 1.0, 3.0]), jnp.arange(4.0))
+    assert (needle == ph.Status.NOT_PHYSICAL).all()
 
 
 @pytest.mark.parametrize(
@@ -572,6 +605,8 @@ def test_events_share_their_places_in_closed_form_too(capacities, terminal):
     times = [*(np.arange(1, 5) * np.pi / 3), 4.5, *([] if terminal else [5 * np.pi / 3])]
     places = sum(capacities)
     kept = np.array(times[:places])
+    if terminal:
+        kept[-1] = 4.5  # where the motion ends is stored in any case
     np.testing.assert_allclose(traj.events.times[: kept.size], kept, atol=1e-12)
     assert not np.isfinite(traj.events.times[kept.size :]).any()
     assert traj.events.times.shape == (places,)

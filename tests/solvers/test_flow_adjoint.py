@@ -121,6 +121,28 @@ def value(inverse):
     return sum(jnp.sum(jnp.sin(x)) for x in jax.tree.leaves(end.ys))
 
 
+def test_an_array_as_long_as_the_batch_is_one_that_the_bodies_share():
+    """The moment (3,) of a magnet in three bodies, of which each takes steps of its own."""
+    inertia, field = ph.Inertia.from_moments([1.0, 1.5, 2.0]), jnp.array([0.0, 0.0, 0.5])
+    state = ph.State(
+        jnp.tile(jnp.array([0.9, 0.1, 0.4, 0.1]), (3, 1)),
+        jnp.array([[0.1, 0.2, 0.3], [1.0, 2.0, 0.5], [0.3, 0.1, 3.0]]),
+    )
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss(magnet):
+        potential = ph.Potential(lambda R, t: -field @ (R @ magnet))
+        motion = ph.simulate(ph.Scene(inertia, potential), state, [0.0, 5.0])
+        return jnp.sum(motion.omega_body[0, -1])
+
+    magnet, h = jnp.array([0.1, 0.4, 0.2]), 1e-4
+    slopes = loss(magnet)[1]
+    ends = [[loss(magnet.at[i].add(s * h))[0] for s in (1, -1)] for i in range(3)]
+    expected = [(a - b) / (2 * h) for a, b in ends]
+    np.testing.assert_allclose(slopes, expected, rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_batches_of_slopes():
     """vmap over gradients, Jacobians both ways."""

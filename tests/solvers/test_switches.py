@@ -231,6 +231,27 @@ def test_a_torque_that_calls_python_is_explained():
     assert "contains pure_callback" in str(ph.explain(scene, ph.State(WXYZ, OMEGA), TS))
 
 
+@pytest.mark.parametrize("limit", [100.0, 0.2])
+def test_checks_and_prints_in_a_torque_do_as_they_say(limit, capfd):
+    """A check raises where its condition holds, and a print shows what it is given."""
+
+    def braking(t, wxyz, omega):
+        jax.debug.print("t={}", t)
+        return -0.1 * eqx.error_if(omega, omega[2] > limit, "too fast")
+
+    scene = ph.Scene(INERTIA, None, ph.FeedbackTorque(braking))
+    state = ph.State(WXYZ, [0.1, 0.2, 0.3])
+    if limit < 1:
+        with pytest.raises(RuntimeError, match="too fast"):
+            jax.block_until_ready(ph.simulate(scene, state, [0.0, 1.0]).omega_body)
+        return
+    law = ph.FeedbackTorque(lambda t, wxyz, omega: -0.1 * omega)
+    expected = ph.simulate(ph.Scene(INERTIA, None, law), state, [0.0, 1.0]).omega_body
+    np.testing.assert_allclose(ph.simulate(scene, state, [0.0, 1.0]).omega_body, expected)
+    jax.effects_barrier()
+    assert "t=0.0" in capfd.readouterr().out
+
+
 LAWS = {
     "clip": lambda p: lambda t, q, w: jnp.clip(-p[0] * w - p[1] * q[1:], -0.2, 0.2),
     "dead band": lambda p: (

@@ -168,11 +168,14 @@ def test_what_rests_on_the_same_arrays_is_worked_out_once():
     [
         lambda o: 0.01 * (jnp.sum(jnp.ones(3)) * o[0] - jnp.sum(jnp.ones(8)) * o[1]) * o,
         lambda o: o.at[0:2].set(0.0) - 0.5 * o.at[0:1].set(0.0),
+        lambda o: 0.3 * jnp.real(1j * jax.lax.complex(o[0], o[1])) * o,
+        lambda o: jnp.imag(jax.lax.complex(o[0], o[1]) / 2) * o,
     ],
-    ids=["sums", "updates"],
+    ids=["sums", "updates", "imaginary unit", "complex half"],
 )
-def test_what_a_broadcast_number_stands_for_is_told_apart(fn):
-    """Operations on one number, broadcast to different shapes, are not the same one."""
+def test_fields_are_folded_to_the_same_numbers(fn):
+    """Operations on one number, broadcast to different shapes, are not the same one; factors of
+    complex numbers have no sign."""
     torque = ph.FeedbackTorque(lambda t, wxyz, omega_body: fn(omega_body))
     scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), torque=torque)
     system = dynamics(scene)

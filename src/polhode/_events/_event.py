@@ -127,7 +127,7 @@ def _differentiable(x: Array, order: int) -> Array:
         if order == 0:
             raise NotImplementedError(
                 "event times and states at events have first and second derivatives, and a third"
-                " one was asked for: differentiate twice at limit, or take differences of second"
+                " one was asked for: differentiate twice at most, or take differences of second"
                 " derivatives."
             )
         return _differentiable(primals[0], order - 1), tangents[0]

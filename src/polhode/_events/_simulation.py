@@ -117,6 +117,8 @@ def events_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tr
         Status.TOO_MANY_EVENTS,
         samples.status,
     )
+    bad_input = begin.status.reshape(-1)  # known before the motion: times, moments
+    status = jnp.where(bad_input == Status.SUCCESSFUL, status, bad_input)
     path = [x[:, :count] for x in (samples.wxyz, samples.omega_body)]
     path += [] if samples.spins is None else [samples.spins[:, :count]]
     return _until_terminal(
@@ -157,7 +159,7 @@ def _in_order_of_time(trajectory: Trajectory, met: Met, events: Sequence[Event])
     ]
     order = jnp.argsort(jnp.where(jnp.isfinite(at), sign * at, jnp.inf), axis=1)
     at, which = (jnp.take_along_axis(x, order, axis=1) for x in (at, which))
-    states = [jnp.take_along_axis(x, order[..., None], axis=1)[:, :capacity] for x in states]
+    states = [jnp.take_along_axis(x, order[..., None], axis=1) for x in states]
     # what lies beyond a terminal event does not happen
     is_terminal = jnp.isfinite(at) & _is_terminal(which, events)
     stop = jnp.min(jnp.where(is_terminal, sign * at, jnp.inf), axis=1, keepdims=True)
@@ -171,7 +173,12 @@ def _in_order_of_time(trajectory: Trajectory, met: Met, events: Sequence[Event])
         more = jnp.ravel(total).astype(count.dtype) - listed
         count = count + jnp.where(all_happen, jnp.maximum(more, 0), 0)
     overflows = (count > capacity).reshape(batch)
-    at, which = at[:, :capacity], which[:, :capacity]
+    # a terminal event is stored in any case, for it is where the motion ends
+    end = jnp.where(jnp.any(is_terminal, axis=1), jnp.argmax(is_terminal, axis=1), 0)
+    stored = jnp.broadcast_to(jnp.arange(capacity), (at.shape[0], capacity))
+    stored = stored.at[:, -1].max(end)
+    at, which = (jnp.take_along_axis(x, stored, axis=1) for x in (at, which))
+    states = [jnp.take_along_axis(x, stored[..., None], axis=1) for x in states]
     status = jnp.where(
         (trajectory.status == Status.SUCCESSFUL) & overflows,
         Status.TOO_MANY_EVENTS,
@@ -239,7 +246,7 @@ _SAMPLES = 64
 """Steps between samples in a window: two turns of the fastest body."""
 
 _FIRST, _GROWTH = 2**-10, 4.0
-"""Part of the whole that the first window is at limit, and how much longer the next may be: a body
+"""Part of the whole that the first window is at most, and how much longer the next may be: a body
 that rests at first may be set in motion soon."""
 
 _MAX_SPEED_UP = 1.5
@@ -266,7 +273,7 @@ def check_until(until: Any, record: Any) -> None:
 
 
 def stop_at_event(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
-    """The motion from ``begin``, its state at the first of ``ts``, each body path from its first
+    """The motion from ``begin``, its state at the first of ``ts``, each body at rest from its first
     event on."""
     terminal = Event(until.fn, until.direction, until.samples, terminal=True, capacity=1)
     trajectory = events_by_steps(begin, ts, (terminal,))

@@ -239,7 +239,7 @@ class Equations:
 
     def prepare(self, c: Sequence[Any], t, y: Sequence[Any]):
         """Coefficients, rates ``run(coefficients, t, *y)`` and ``by_entry``: see
-        ``xla.Specialised``."""
+        ``Specialised``."""
         size = len(c)
         closed_jaxpr = jax.make_jaxpr(lambda *x: self.field(x[:size], x[size], x[size + 1 :]))(
             *c, t, *y
@@ -358,8 +358,9 @@ class Equations:
         )
         del loop_coefficients
         # a number that all bodies share gets a slope in each: no sum in the loop
+        is_lane = [broadcast_shapes[i] == {lane} for i in which]
         shapes = [
-            lane if broadcast_shapes[i] == {lane} else jnp.shape(coefficients[i]) for i in which
+            lane if of_lane else jnp.shape(coefficients[i]) for i, of_lane in zip(which, is_lane)
         ]
         mu = [jnp.zeros(s, coefficients[i].dtype) for i, s in zip(which, shapes)]
 
@@ -394,7 +395,7 @@ class Equations:
 
         loop_coefficients, individual_steps = (
             (with_integrals.coefficients, without_integrals.coefficients),
-            all(s == lane for s in shapes),
+            all(is_lane),
         )
         by_entry, units = with_integrals.by_entry and without_integrals.by_entry, self.costate.units
         z, mu = self._solve(
@@ -418,12 +419,10 @@ class Equations:
         has_missed = jnp.asarray(square_miss > max_miss**2 * unit) & is_known
         z = [jnp.where(has_missed, jnp.nan, x) for x in z]
         mu = [
-            jnp.where(
-                has_missed if m.shape == has_missed.shape else jnp.any(has_missed), jnp.nan, m
-            )
-            for m in mu
+            jnp.where(has_missed if of_lane else jnp.any(has_missed), jnp.nan, m)
+            + (nothing if of_lane else jnp.sum(nothing))
+            for m, of_lane in zip(mu, is_lane)
         ]
-        mu = [m + (nothing if m.shape == nothing.shape else jnp.sum(nothing)) for m in mu]
         mu = [_summed(m, jnp.shape(coefficients[i])) for m, i in zip(mu, which)]
         start_slopes = self.costate.finish(z, start, end, slopes)
         return [*(jnp.where(is_known, x, 0) + nothing for x in start_slopes), *pull(mu)]

@@ -230,7 +230,8 @@ def with_events(search: Search, solution: Solved, times: Array, states: Array):
     is_event = jnp.isfinite(event_times)
     if any(search.terminal):
         sign = jnp.where(times[:, -1:] < times[:, :1], -1, 1).astype(times.dtype)
-        end = jnp.where(solution.outcome == AT_EVENT, solution.count, capacity + 1)
+        last = jnp.minimum(solution.count, capacity)
+        end = jnp.where(solution.outcome == AT_EVENT, last, capacity + 1)
         stop = jnp.arange(1, capacity + 1, dtype=end.dtype)[None] == end[:, None]
         final = jnp.sum(jnp.where(stop, event_times, 0), axis=1, keepdims=True)
         state = jnp.sum(jnp.where(stop[..., None], event_states, 0), axis=1, keepdims=True)

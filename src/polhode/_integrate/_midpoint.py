@@ -100,7 +100,7 @@ class _Saved(NamedTuple):
 
     @classmethod
     def at_start(cls, rows: Array, save_times: Array, y: list[Array]) -> tuple["_Saved", Array]:
-        """Before the first step: what is saved at the start is the columns state, all else is NaN,
+        """Before the first step: what is saved at the start is the first state, all else is NaN,
         whatever ``rows`` hold: to look at them takes longer than to write anew."""
         is_start = save_times <= 0
         is_set = jnp.concatenate([is_start, jnp.zeros((1,), bool)])
@@ -188,7 +188,7 @@ def integrate(
     power = 1 / (columns.order.astype(dtype) + 1)
 
     def worst(x, has_failed):
-        """Of the bodies that share their steps, but for those that are columns up."""
+        """Of the bodies that share their steps, but for those that are given up."""
         return (
             x
             if individual_steps

@@ -217,6 +217,14 @@ def _subjaxprs(eqn):
             yield subjaxpr
 
 
+def _calls_back(jaxpr) -> bool:
+    """Whether a program calls functions outside of JAX, which may raise or print."""
+    return any(
+        eqn.effects or "callback" in eqn.primitive.name or any(map(_calls_back, _subjaxprs(eqn)))
+        for eqn in jaxpr.eqns
+    )
+
+
 def _is_float(x) -> bool:
     return jnp.issubdtype(x.aval.dtype, jnp.floating)
 
@@ -270,7 +278,9 @@ class _Walk:
                     return self._call(eqn, operands)
         if moves and name == "scan" and any(map(_may_switch, _subjaxprs(eqn))):
             return self._scan(eqn, operands)
-        if moves and name == "cond" and any(map(_may_switch, _subjaxprs(eqn))):
+        branches = list(_subjaxprs(eqn)) if moves and name == "cond" else []
+        # a check (``eqx.error_if``) runs in its own branch alone
+        if any(map(_may_switch, branches)) and not any(map(_calls_back, branches)):
             return self._cond(eqn, operands)
         if moves and name == _COMPOSED:
             return self._expanded(eqn, operands)
@@ -281,7 +291,7 @@ class _Walk:
         ):
             self.hidden_operations.append(name)
         first_var = next((v for v in eqn.invars if not isinstance(v, Literal)), None)
-        if moves and first_var is not None and _is_float(first_var):
+        if moves and eqn.outvars and first_var is not None and _is_float(first_var):
             outputs = self._switch(eqn, name, x)
             if outputs is not None:
                 return outputs

@@ -468,6 +468,8 @@ def _apply_switch(
             is_event = is_event & (rises == options.directions[k])
         # lanes have no branches: every body writes, those without an event into the bin
         rows = base + jnp.where(is_event & (count < capacity), count, capacity)
+        if options.terminal[k]:  # stored in any case, for it is where the motion ends
+            rows = jnp.where(is_event & (count >= capacity), base + capacity - 1, rows)
         t = start + sign * progress_after.elapsed
         storage = storage._replace(
             times=put(storage.times, rows, t[:, None]),

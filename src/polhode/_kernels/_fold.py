@@ -161,13 +161,19 @@ class _Slot(NamedTuple):
     factors: tuple[int, int] | None = None
 
 
+MIXED = (-1,)
+"""In place of a shape: the entries of a coefficient are no entries of the state, as in a product
+with a matrix."""
+
+
 class Specialised(NamedTuple):
     """``coefficients``: arrays computed before the loop; ``run(coefficients, *state_leaves)``: the
     results.
 
-    ``shapes``: the shapes to which the loop broadcasts each; where that is one only, an array of
-    this shape may stand in its place. ``by_entry``: whether every operation treats the entries of
-    the state's arrays separately, so that ``run`` takes any number of them.
+    ``shapes``: the shapes to which the loop broadcasts each, and ``MIXED`` for one whose entries an
+    operation mixes; where there is one shape only, an array of it may stand in its place, whose
+    entries belong to those of the state. ``by_entry``: whether every operation treats the entries
+    of the state's arrays separately, so that ``run`` takes any number of them.
     """
 
     coefficients: tuple[Any, ...]
@@ -195,7 +201,7 @@ def specialise(
     ``stage`` no values are staged: for a program that will be specialised again.
     """
     if _policy.is_plain():
-        shapes = tuple(frozenset([jnp.shape(x)]) for x in arguments)
+        shapes = tuple(frozenset([jnp.shape(x), MIXED]) for x in arguments)
         return Specialised(
             tuple(arguments),
             lambda coefficients, *state: jaxpr_as_fun(closed_jaxpr)(*coefficients, *state),
@@ -219,6 +225,9 @@ def specialise(
         if isinstance(x, _Held) and x.number is None:
             coefficients[x.key] = x.value
             shapes_of.setdefault(x.key, set()).add(tuple(shape))
+    for x, *_ in (o for step in steps if not step.by_entry for o in step.operands):
+        if isinstance(x, _Held) and x.number is None:
+            shapes_of[x.key].add(MIXED)
     places = {key: place for place, key in enumerate(coefficients)}
     # Where every operation treats entries separately, and every array is a number or of the shape
     # of the state, the program is traced for one shape and run for any.
@@ -255,11 +264,11 @@ def specialise(
 
 
 def _steps_of_results(steps: list[_Step], out) -> tuple[_Step, ...]:
-    """The steps that the results depend on."""
+    """The steps that the results depend on, and those without results, which print or check."""
     values = {x for x, *_ in out if not isinstance(x, _Held)}
     needed_steps = []
     for step in reversed(steps):
-        if values.intersection(step.outputs):
+        if not step.outputs or values.intersection(step.outputs):
             needed_steps.append(step)
             values.update(x for x, *_ in step.operands if not isinstance(x, _Held))
     return tuple(reversed(needed_steps))
@@ -428,7 +437,7 @@ class _Work:
 
     def simplify(self, name, operands, aval) -> _Held | _Slot | None:
         """An operation with a known zero or factor, simplified; None where it is not."""
-        if not jnp.issubdtype(aval.dtype, jnp.inexact):
+        if not jnp.issubdtype(aval.dtype, jnp.floating):  # complex numbers have no sign
             return None
         if any(isinstance(x, _Slot) and x.aval.shape != aval.shape for x in operands):
             return None  # one number of the loop meets an array

@@ -93,7 +93,8 @@ def _at_times(trajectory: Trajectory, t: Array, in_order: bool) -> Trajectory:
     is_finite = jnp.broadcast_to(finite, wxyz.shape[:-1])[..., None]
     status = status.reshape(batch)
     steps = jax.tree.map(lambda x: x.reshape(batch), steps)
-    good = trajectory.status == Status.SUCCESSFUL
+    # a body of which more events were counted than stored has moved as it should
+    good = (trajectory.status == Status.SUCCESSFUL) | (trajectory.status == Status.TOO_MANY_EVENTS)
     samples = [jnp.where(is_finite, x, jnp.nan) for x in (wxyz, omega, *spins)]
     status = jnp.where(good, status, trajectory.status)
     any_finished = jnp.where(jnp.any(status == Status.SUCCESSFUL), 1.0, 0.0)
