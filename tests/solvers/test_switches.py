@@ -231,6 +231,26 @@ def test_a_torque_that_calls_python_is_explained():
     assert "contains pure_callback" in str(ph.explain(scene, ph.State(WXYZ, OMEGA), TS))
 
 
+@pytest.mark.parametrize("rate", [0.0, 1e-4])
+def test_no_window_is_passed_by_a_body_that_hardly_turns(rate):
+    """Torque in windows of the time: between them, and in them, steps could be of any length."""
+    period, torque, size = 300.0, 1e-9, 2.0
+
+    def law(t, wxyz, omega):
+        return jnp.where(jnp.cos(2 * jnp.pi * t / period) > 0.9, torque, 0.0) * jnp.eye(3)[2]
+
+    scene = ph.Scene(ph.Inertia.spherical(size), torque=ph.FeedbackTorque(law))
+    event = ph.Event(lambda wxyz, omega, t: jnp.cos(2 * jnp.pi * t / period) - 0.9)
+    motion = ph.simulate(
+        scene, ph.State([1.0, 0, 0, 0], [0.0, 0, rate]), [0.0, 30 * period], events=event
+    )
+    width = np.arccos(0.9) / np.pi * period
+    np.testing.assert_allclose(
+        motion.omega_body[-1, 2] - rate, 30 * width * torque / size, rtol=1e-9
+    )
+    assert int(motion.events.count) == 60
+
+
 @pytest.mark.parametrize("limit", [100.0, 0.2])
 def test_checks_and_prints_in_a_torque_do_as_they_say(limit, capfd):
     """A check raises where its condition holds, and a print shows what it is given."""

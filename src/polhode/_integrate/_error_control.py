@@ -114,6 +114,19 @@ GRAIN = 64
 """[units in the last place of the time] The motion starts anew beyond a switch that is this close
 and beyond which the field is not defined."""
 
+MARGIN_TURN = 0.05
+"""[factor] Of the largest margin of a switch within a step: the least by which it turns back. One
+that dips to zero turns by all of it."""
+
+DEEP_TURN = 0.5
+"""[factor] The same of a single turn that is too large for one step: of a sine, 120 degrees about
+an extreme. Without it two of 63 passes of a body at rest by a window of a seventh of the period are
+missed (``tests/test_events.py``)."""
+
+MARGIN_STEPS = 4.0
+"""[steps of ``max_steps``] Shorter steps are not refused for margins that turn back: those of a
+margin that is rounding alone would not end."""
+
 MAX_REVERSALS = 16
 """[switches] Consecutive ones that turn back at once, after which the motion slides along a
 switch."""

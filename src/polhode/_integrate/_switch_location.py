@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from polhode._integrate import _error_control as control
 from polhode._integrate._explicit_step import (
     Attempt,
     Progress,
@@ -243,6 +244,36 @@ def first_switch(
     # kinks and events have the levels 0 and 1
     levels = 1 - progress.levels if search.new_levels is None else search.new_levels
     return SwitchPoint(search.hit & ~is_lost, part, levels, flips, start_fraction)
+
+
+def is_unresolved(motion, margins: Array, rule: Tableau) -> Array:
+    """Whether a margin of a jump or an event turns back more than once within the step (B,), or
+    once by most of its size: its next turn may then lie between two stages.
+
+    The field with its levels held may hardly change where they do: a body that the Sun lights turns
+    so slowly that one step could lead from sunlight to sunlight, several shadows between. Margins
+    of kinks are not looked at, for networks have many and their rates hardly change there."""
+    jumps = motion.jumps or [False] * (motion.switches - motion.events)
+    rows = [k for k, jump in enumerate(jumps[: motion.switches - motion.events]) if jump]
+    rows += range(motion.switches - motion.events, motion.switches)
+    sampled = jnp.stack([margin_samples(margins, rule)[:, k] for k in rows], axis=1)
+    size = jnp.max(jnp.abs(sampled), axis=0)
+    least, deep = control.MARGIN_TURN * size, control.DEEP_TURN * size
+    # extremes since the last turn: smaller turns than the least are rounding, or errors of stages
+    low = high = sampled[0]
+    rises = falls = turns = jnp.zeros_like(low)
+    for margin in sampled[1:]:
+        up = (margin - low > least) & (rises == 0)
+        down = (high - margin > least) & (falls == 0) & ~up
+        turns = turns + jnp.where((up & (falls > 0)) | (down & (rises > 0)), 1, 0)
+        rises = jnp.where(up, 1, jnp.where(down, 0, rises))
+        falls = jnp.where(down, 1, jnp.where(up, 0, falls))
+        low = jnp.where(down, margin, jnp.minimum(low, margin))
+        high = jnp.where(up, margin, jnp.maximum(high, margin))
+    top, bottom = jnp.max(sampled, axis=0), jnp.min(sampled, axis=0)
+    ends = jnp.maximum(sampled[0], sampled[-1]), jnp.minimum(sampled[0], sampled[-1])
+    is_deep = (top - ends[0] > deep) | (ends[1] - bottom > deep)
+    return jnp.any((turns > 1) | is_deep, axis=0)
 
 
 def first_of_jumps(motion, flips: Array) -> Array:

@@ -28,6 +28,7 @@ from polhode._integrate._switch_location import (
     Undefined,
     first_of_jumps,
     first_switch,
+    is_unresolved,
     pick,
     undefined_side,
 )
@@ -94,6 +95,7 @@ def advance(
     is_first = progress.attempts == 0
     accepted = (ratio <= 1) & is_running & ~is_first
     turn = wrong_levels = None
+    is_long = jnp.zeros_like(accepted)
     if motion.switches:
         # At the first step, and where another switch has just turned, a level may be that of the
         # wrong side already at the start: one comparison moves another one's argument, or rounding
@@ -107,6 +109,10 @@ def advance(
         )
         wrong_levels = first_of_jumps(motion, wrong_levels)
         accepted = accepted & ~jnp.any(wrong_levels, axis=0)
+        if motion.jumps or motion.events:
+            is_long = width > control.MARGIN_STEPS * length / options.max_steps
+            is_long = is_long & is_unresolved(motion, attempt.margins, motion.rule)
+            accepted = accepted & ~is_long
         turn = first_switch(motion, options, progress, attempt, t, accepted, eps)
     trial = _Trial(
         attempt,
@@ -118,6 +124,7 @@ def advance(
         ratio,
         angle,
         is_unstable,
+        is_long,
         wrong_levels,
         turn,
     )
@@ -133,8 +140,9 @@ def advance(
 
 class _Trial(NamedTuple):
     """A step that was tried, of unsigned ``width``, with its ``error`` [rad], the ``ratio`` of that
-    to its tolerance, and its ``angle`` [rad]; ``wrong_levels`` (K, B): switches on the wrong side
-    at its start; ``turn``: the first switch in it; None where there are no switches."""
+    to its tolerance, and its ``angle`` [rad]; ``is_long``: a margin turns back more than once in
+    it; ``wrong_levels`` (K, B): switches on the wrong side at its start; ``turn``: the first switch
+    in it; None where there are no switches."""
 
     attempt: Attempt
     width: Array
@@ -145,6 +153,7 @@ class _Trial(NamedTuple):
     ratio: Array
     angle: Array
     is_unstable: Array
+    is_long: Array
     wrong_levels: Array | None
     turn: SwitchPoint | None
 
@@ -185,7 +194,7 @@ def _conclude(
     is_cut = accepted & (width < control.CUT * progress.width)
     proposed = jnp.where(is_cut, jnp.maximum(progress.width, width * factor), width * factor)
     guess = stop_gradient(_first_width(motion, options, progress.y, attempt.stages[0], length))
-    proposed = jnp.where(is_first, guess, proposed)
+    proposed = jnp.where(is_first, guess, jnp.where(trial.is_long, width / 2, proposed))
     # With `x > 0` held, `where(x > 0, sqrt(x), 0)` is NaN beyond the switch, so that there is no
     # root to search for. The step is shortened towards the switch instead, and turns it when it
     # cannot come nearer ("snaps").
