@@ -25,7 +25,8 @@ class Motion(NamedTuple):
     ``levels(arguments, t, y)``: the levels at a point; ``units(unit_data, y, rates)``: weights of
     the components of an error, the squares of which are summed, and natural rates [rad/s] (B,). The
     last ``events`` of the K ``switches`` are events; ``jumps``: for each switch, whether the rates
-    may jump there, empty where they do at none; ``rule``: of the steps; ``is_whole``: whether one
+    may jump there, empty where they do at none; ``swift``: the switches whose margins must be
+    resolved by the steps (see ``is_unresolved``); ``rule``: of the steps; ``is_whole``: whether one
     unit can hold the field, and so the whole loop."""
 
     rates: Callable[..., tuple[Array, Array, Array]]
@@ -38,6 +39,7 @@ class Motion(NamedTuple):
     switches: int
     events: int = 0
     jumps: tuple[bool, ...] = ()
+    swift: tuple[int, ...] = ()
     is_whole: bool = True
 
 

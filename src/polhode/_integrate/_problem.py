@@ -6,11 +6,12 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.extend.core import ClosedJaxpr, Literal, jaxpr_as_fun
 from jaxtyping import Array
 
 from polhode._integrate._explicit_step import Motion
-from polhode._integrate._switches import Switched, switched
+from polhode._integrate._switches import STATE, TIME, Switched, switched
 from polhode._integrate._tableau import Tableau
 from polhode._kernels import Distinct, formula, is_holdable, specialise
 
@@ -90,13 +91,14 @@ class Problem(NamedTuple):
         closed_jaxpr = formula(equations, t, *(jnp.ravel(x)[:1] for x in components), *single_lane)
         closed_jaxpr, consts = _with_consts_as_operands(closed_jaxpr, 1 + len(components))
         varies = [
-            *[False] * (len(closed_jaxpr.jaxpr.invars) - 1 - len(components)),
-            *[True] * (1 + len(components)),
+            *[0] * (len(closed_jaxpr.jaxpr.invars) - 1 - len(components)),
+            TIME,
+            *[STATE] * len(components),
         ]
         switches = switched(closed_jaxpr, varies, dtype)
         passed_switches = 0 if located else switches.count
         if not located:
-            switches = switched(closed_jaxpr, [False] * len(varies), dtype)
+            switches = switched(closed_jaxpr, [0] * len(varies), dtype)
         return cls(
             closed_jaxpr,
             [*consts, *once],
@@ -171,6 +173,8 @@ class Problem(NamedTuple):
             )
 
         jumps = *self.switches.jumps[: count - self.events].tolist(), *[False] * self.events
+        swift = self.switches.jumps | self.switches.timed
+        swift[count - self.events :] = True
         return Motion(
             rates,
             levels,
@@ -182,6 +186,7 @@ class Problem(NamedTuple):
             count,
             self.events,
             jumps if any(jumps) else (),
+            tuple(np.flatnonzero(swift).tolist()),
             is_holdable(field.jaxpr),
         )
 

@@ -247,16 +247,14 @@ def first_switch(
 
 
 def is_unresolved(motion, margins: Array, rule: Tableau) -> Array:
-    """Whether a margin of a jump or an event turns back more than once within the step (B,), or
-    once by most of its size: its next turn may then lie between two stages.
+    """Whether a margin of a jump, of an event or of the time turns back more than once within the
+    step (B,), or once by most of its size: its next turn may then lie between two stages.
 
     The field with its levels held may hardly change where they do: a body that the Sun lights turns
     so slowly that one step could lead from sunlight to sunlight, several shadows between. Margins
-    of kinks are not looked at, for networks have many and their rates hardly change there."""
-    jumps = motion.jumps or [False] * (motion.switches - motion.events)
-    rows = [k for k, jump in enumerate(jumps[: motion.switches - motion.events]) if jump]
-    rows += range(motion.switches - motion.events, motion.switches)
-    sampled = jnp.stack([margin_samples(margins, rule)[:, k] for k in rows], axis=1)
+    of kinks that move with the state are not looked at: they are as smooth as the state, networks
+    have many, and where one is rounding alone steps would become short for nothing."""
+    sampled = jnp.stack([margin_samples(margins, rule)[:, k] for k in motion.swift], axis=1)
     size = jnp.max(jnp.abs(sampled), axis=0)
     least, deep = control.MARGIN_TURN * size, control.DEEP_TURN * size
     # extremes since the last turn: smaller turns than the least are rounding, or errors of stages

@@ -8,6 +8,8 @@ a step can be held and the step ended where the first margin vanishes.
 """
 
 from collections.abc import Callable, Sequence
+from functools import reduce
+from operator import or_
 from typing import Any, NamedTuple
 
 import jax
@@ -54,12 +56,14 @@ class Switched(NamedTuple):
     ``frozen(levels, *args)``: results with the levels (K,) held, the margins (K,), and the level
     that each switch turns to where its margin falls below zero; ``levels(*args)``: those at a
     point, in the dtype of the state; ``jumps`` (K,): whether the results may jump there (else they
-    kink); ``hidden_operations``: those inside which there may be switches that were not found.
+    kink); ``timed`` (K,): whether the margin moves with the time alone; ``hidden_operations``:
+    those inside which there may be switches that were not found.
     """
 
     frozen: Callable[..., tuple[list[Any], Array, Array]]
     levels: Callable[..., Array]
     jumps: np.ndarray
+    timed: np.ndarray
     hidden_operations: tuple[str, ...]
 
     @property
@@ -68,8 +72,13 @@ class Switched(NamedTuple):
         return len(self.jumps)
 
 
-def switched(closed_jaxpr: ClosedJaxpr, varies: Sequence[bool], dtype: Any) -> Switched:
-    """The switches of a program; ``varies``: which of its arguments change along a motion."""
+STATE, TIME = 1, 2
+"""What a value moves with; 3 with both, 0 with neither."""
+
+
+def switched(closed_jaxpr: ClosedJaxpr, varies: Sequence[int], dtype: Any) -> Switched:
+    """The switches of a program; ``varies``: what each of its arguments moves with, ``STATE``,
+    ``TIME`` or 0."""
 
     def run(args, chooser):
         walk = _Walk(chooser)
@@ -87,19 +96,27 @@ def switched(closed_jaxpr: ClosedJaxpr, varies: Sequence[bool], dtype: Any) -> S
         return chooser.collect()
 
     jumps: list[bool] = []
+    timed: list[bool] = []
     hidden_operations: list[str] = []
 
     def note(*args):
         chooser = _Free(dtype)
         _, walk = run(args, chooser)
         jumps.extend(chooser.jumps)
+        timed.extend(walk.timed)
         hidden_operations.extend(walk.hidden_operations)
         return chooser.collect()
 
     jax.eval_shape(
         note, *(jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in closed_jaxpr.jaxpr.invars)
     )
-    return Switched(frozen, levels, np.array(jumps, bool), tuple(dict.fromkeys(hidden_operations)))
+    return Switched(
+        frozen,
+        levels,
+        np.array(jumps, bool),
+        np.array(timed, bool),
+        tuple(dict.fromkeys(hidden_operations)),
+    )
 
 
 def guarded(results: Any, hidden: tuple[str, ...]) -> Any:
@@ -249,17 +266,18 @@ def _is_integer(dtype) -> bool:
 
 
 class _Walk:
-    """Goes through a program once; values are pairs (array, whether it moves)."""
+    """Goes through a program once; values are pairs (array, what it moves with)."""
 
     def __init__(self, chooser):
         self.chooser, self.hidden_operations = chooser, []
+        self.moves, self.timed = 0, []  # of the operation at hand; of each switch
 
     def jaxpr(self, jaxpr, consts, args):
-        env: dict[Any, Any] = {v: (c, False) for v, c in zip(jaxpr.constvars, consts)}
+        env: dict[Any, Any] = {v: (c, 0) for v, c in zip(jaxpr.constvars, consts)}
         env.update(zip(jaxpr.invars, args))
 
         def read(v):
-            return (v.val, False) if isinstance(v, Literal) else env[v]
+            return (v.val, 0) if isinstance(v, Literal) else env[v]
 
         for eqn in jaxpr.eqns:
             env.update(zip(eqn.outvars, self.equation(eqn, [read(v) for v in eqn.invars])))
@@ -267,11 +285,15 @@ class _Walk:
 
     def side(self, u, jumps: bool = False, rule: _Rule = _SIDE):
         """Whether ``u`` is not below zero, held within a step."""
-        return self.chooser.choose(u, rule, jumps) > 0
+        return self.choose(u, rule, jumps) > 0
+
+    def choose(self, u, rule: _Rule, jumps: bool):
+        self.timed.extend([self.moves == TIME] * jnp.size(u))
+        return self.chooser.choose(u, rule, jumps)
 
     def equation(self, eqn, operands):
         name, x = eqn.primitive.name, [value for value, _ in operands]
-        moves = any(m for _, m in operands)
+        self.moves = moves = reduce(or_, (m for _, m in operands), 0)
         if moves and name in _CALLS and eqn.params.get("name") != SMOOTH:
             for subjaxpr in _subjaxprs(eqn):
                 if _may_switch(subjaxpr):
@@ -294,12 +316,12 @@ class _Walk:
         if moves and eqn.outvars and first_var is not None and _is_float(first_var):
             outputs = self._switch(eqn, name, x)
             if outputs is not None:
-                return outputs
+                return [(o, moves if m else 0) for o, m in outputs]
         if moves and _is_step(eqn):
             self.hidden_operations.append(name)
         out = _bind(eqn, x)
         is_constant = name in _CONSTANT
-        return [(o, moves and not is_constant) for o in out]
+        return [(o, 0 if is_constant else moves) for o in out]
 
     def _switch(self, eqn, name, x):
         out = eqn.outvars[0].aval
@@ -387,7 +409,7 @@ class _Walk:
         return jnp.where(self.side(a - b if larger else b - a), a, b)
 
     def _integer_level(self, u, rule, out):
-        level = self.chooser.choose(jnp.broadcast_to(u, out.shape), rule, True)
+        level = self.choose(jnp.broadcast_to(u, out.shape), rule, True)
         return level.astype(out.dtype)
 
     def _extreme(self, x, axes, larger: bool, jumps: bool = False):
@@ -445,7 +467,7 @@ class _Walk:
 
     def _cond(self, eqn, operands):
         """All branches, of which the index picks one."""
-        (index, _), branch_operands = operands[0], operands[1:]
+        (index, moves), branch_operands = operands[0], operands[1:]
         branches = [self.jaxpr(b.jaxpr, b.consts, branch_operands) for b in eqn.params["branches"]]
         index = jnp.clip(jnp.asarray(index, jnp.int32), 0, len(branches) - 1)
         out = []
@@ -453,7 +475,7 @@ class _Walk:
             value = values[0][0]
             for k, (branch_value, _) in enumerate(values[1:], 1):
                 value = jnp.where(index == k, branch_value, value)
-            out.append((value, True))
+            out.append((value, reduce(or_, (m for _, m in values), moves)))
         return out
 
     def _scan(self, eqn, operands):
@@ -479,7 +501,7 @@ class _Walk:
             rows = (v.aval for v in eqn.outvars[carry_count:])
             return [*carry, *((jnp.zeros(x.shape, x.dtype), False) for x in rows)]
         sums = [
-            (jnp.stack([x for x, _ in column]), any(m for _, m in column))
+            (jnp.stack([x for x, _ in column]), reduce(or_, (m for _, m in column), 0))
             for column in zip(*stacked)
         ]
         return [*carry, *sums]

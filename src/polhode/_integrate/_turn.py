@@ -109,7 +109,7 @@ def advance(
         )
         wrong_levels = first_of_jumps(motion, wrong_levels)
         accepted = accepted & ~jnp.any(wrong_levels, axis=0)
-        if motion.jumps or motion.events:
+        if motion.swift:
             is_long = width > control.MARGIN_STEPS * length / options.max_steps
             is_long = is_long & is_unresolved(motion, attempt.margins, motion.rule)
             accepted = accepted & ~is_long
