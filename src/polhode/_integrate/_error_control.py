@@ -114,6 +114,10 @@ GRAIN = 64
 """[units in the last place of the time] The motion starts anew beyond a switch that is this close
 and beyond which the field is not defined."""
 
+COINCIDENT = 1e-6
+"""[length of the motion] Switches whose roots are as close as this may be found in one place: it is
+``LOCATED_JUMP`` times the coarsest ``rtol``. Knots of a table are much farther apart."""
+
 MARGIN_TURN = 0.05
 """[factor] Of the largest margin of a switch within a step: the least by which it turns back. One
 that dips to zero turns by all of it."""

@@ -50,7 +50,7 @@ from polhode._integrate._loop import (
     run,
     solve,
 )
-from polhode._integrate._turn import FINISHED, advance, snap_reach
+from polhode._integrate._turn import FINISHED, advance, snap_reach, turns_by_itself
 from polhode._kernels import any_of, attached, is_slope, kernel, linear, most_of, zeros
 
 
@@ -402,11 +402,9 @@ def _step_back(
 
     values = [motion.coefficients[k] for k in floats]
     if motion.jumps:
-        pulled, parameter_cotangents = _jump_back(
-            rates_of, values, motion, note, after, later, end, cotangent, live, is_snap
+        pulled, parameter_cotangents, is_correction = _jump_back(
+            rates_of, values, motion, note, after, later, end, length, cotangent, live, is_snap
         )
-        # levels corrected without a step belong to the turn before, of the same time
-        is_correction = (after.elapsed == note.elapsed) & (note.elapsed > 0)
         later = jnp.where(is_correction[None], later, note.levels)
         cotangent, sums = cotangent + pulled, [a + b for a, b in zip(sums, parameter_cotangents)]
 
@@ -507,24 +505,31 @@ def _taken_apart(linear_map, known: list[Array]) -> tuple[list[Array], Callable]
 
 
 def _jump_back(
-    rates_of, values, motion, note: Note, after: Note, later, t, cotangent, live, is_snap
+    rates_of, values, motion, note: Note, after: Note, later, t, length, cotangent, live, is_snap
 ):
     """Contribution of the time of a switch that turned, to the cotangents of the state and of
-    ``values`` (the saltation term)."""
+    ``values`` (the saltation term), and whether the turn corrected levels that moved with the one
+    before, whose time is theirs too."""
     flips = note.levels != after.levels
     flips = jnp.where(jnp.any(flips, axis=0), flips, after.levels != later)
-    is_correction = (after.elapsed == note.elapsed) & (note.elapsed > 0)
-    flips = flips & (live & ~is_correction)[None]
     # events do not change the rates
     field = jnp.arange(motion.switches) < motion.switches - motion.events
     flips = flips & field[:, None]
+    # past the switch the field of the side before it may be undefined
+    y_before = jnp.where(is_snap[None], note.y, after.y)
+    rates_before, *_ = rates_of(values, note.levels, t, y_before)
+    margins, slopes = jax.jvp(
+        lambda t, y: rates_of(values, note.levels, t, y)[1],
+        (t, y_before),
+        (jnp.ones_like(t), rates_before),
+    )
+    stands_alone = jnp.any(flips & turns_by_itself(margins, slopes, length), axis=0)
+    is_correction = (after.elapsed == note.elapsed) & (note.elapsed > 0) & ~stands_alone
+    flips = flips & (live & ~is_correction)[None]
     share = jnp.where(flips, 1, 0).astype(cotangent.dtype)
     share = share / jnp.maximum(jnp.sum(share, axis=0, keepdims=True), 1)
     # Of switches that turn together each has the same share of the time: their margins vanish at
     # once only where they are the same comparison in several places, or by symmetry.
-    # past the switch the field of the side before it may be undefined
-    y_before = jnp.where(is_snap[None], note.y, after.y)
-    rates_before, *_ = rates_of(values, note.levels, t, y_before)
     rates_after, *_ = rates_of(values, later, t, after.y)
 
     def margin(parameters, t, y):
@@ -532,9 +537,7 @@ def _jump_back(
             jnp.where(flips, share * rates_of(parameters, note.levels, t, y)[1], 0), axis=0
         )
 
-    _, rate = jax.jvp(
-        lambda t, y: margin(values, t, y), (t, y_before), (jnp.ones_like(t), rates_before)
-    )
+    rate = jnp.sum(jnp.where(flips, share * slopes, 0), axis=0)
     # A margin that stands still at its root has no time that could be differentiated (grazing);
     # the derivative is then that of a motion whose switch turns at a fixed time.
     crosses_surface = jnp.any(flips, axis=0) & (rate != 0)
@@ -543,4 +546,4 @@ def _jump_back(
     )
     _, pull = jax.vjp(lambda parameters, y: margin(parameters, t, y), values, y_before)
     parameter_cotangents, change = pull(jnp.where(crosses_surface, weight, 0))
-    return change, parameter_cotangents
+    return change, parameter_cotangents, is_correction

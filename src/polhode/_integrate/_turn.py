@@ -251,6 +251,11 @@ def _conclude(
             width,
             start,
         )
+        if options.differentiable and motion.jumps:
+            y = _with_coincident_switch(
+                motion, progress, progress_after, attempt.stages[0], trial.wrong_levels, ts, start
+            )
+            progress_after = progress_after._replace(y=y)
         sign = jnp.where(attempt.h < 0, -1, 1)
         progress_after = _snap(progress, progress_after, undefined, rate_at_start, reach, sign)
     return progress_after._replace(
@@ -492,6 +497,35 @@ def _apply_switch(
         progress_after.outcome.dtype
     )
     return progress_after._replace(count=count, outcome=outcome), storage
+
+
+def _with_coincident_switch(
+    motion, progress, progress_after, rate, wrong_levels, ts, start
+) -> Array:
+    """The state after switches ``wrong_levels`` have turned where another one has just turned, with
+    the derivative by the time at which each turns by itself (two pulses, of which one begins where
+    the other ends); ``rate`` (D, B): rates before they turned."""
+    sign = jnp.where(ts[-1] < start, -1, 1).astype(rate.dtype)
+    t, y = start + sign * progress_after.elapsed, progress_after.y
+    flips = wrong_levels & (progress.levels != progress_after.levels)
+    flips = flips & (jnp.arange(motion.switches) < motion.switches - motion.events)[:, None]
+
+    def margins_at(t, y):
+        return motion.rates(motion.coefficients, progress.levels, t, y)[1]
+
+    margins, slopes = jax.jvp(margins_at, (t, y), (jnp.ones_like(t), rate))
+    flips = flips & turns_by_itself(margins, slopes, jnp.abs(ts[-1] - start))
+    slopes = jax.lax.stop_gradient(jnp.where(flips, slopes, 1))
+    delay = jnp.sum(jnp.where(flips, -margins / slopes, 0), axis=0)
+    rate_after = motion.rates(motion.coefficients, progress_after.levels, t, y)[0]
+    delay = delay - jax.lax.stop_gradient(delay)
+    return y + jnp.where(jnp.any(flips, axis=0), (rate - rate_after) * delay, 0)
+
+
+def turns_by_itself(margins: Array, slopes: Array, length: Array) -> Array:
+    """Whether switches that turn after another one, at the same time, stand at roots of their own;
+    others turn because that one has moved what they compare, as in a search in a table."""
+    return (slopes != 0) & (jnp.abs(margins) <= control.COINCIDENT * length * jnp.abs(slopes))
 
 
 def _outcome(options, progress: Progress, is_running, length, ratio, eps) -> Array:
