@@ -431,6 +431,42 @@ def test_recorded_steps_and_those_integrated_again_have_the_same_derivatives(how
         np.testing.assert_allclose(found, again, rtol=1e-10, atol=1e-10)
 
 
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_switches_that_turn_together_have_times_of_their_own(mode):
+    """A relay on each axis, all three at the same rate: w' = -0.2 above a half, -0.05 below, so
+    that a quarter of a change of the rate is left."""
+
+    def final_rates(rates):
+        law = lambda t, q, w: jnp.where(w > 0.5, -0.2, -0.05)  # noqa: E731
+        scene = ph.Scene(ph.Inertia.spherical(1.0), torque=ph.FeedbackTorque(law))
+        return ph.simulate(scene, ph.State(WXYZ, rates), [0.0, 4.0]).last.omega_body
+
+    np.testing.assert_allclose(jax.jit(mode(final_rates))(jnp.ones(3)), np.eye(3) / 4, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bodies", [1, 5])
+@pytest.mark.parametrize("ts", [[0.0, 3.0], [3.0, 0.0], [0.0, 0.25, 1.0, 1.7, 3.0]])
+def test_a_pulse_may_begin_where_another_ends(bodies, ts):
+    first, second = (jnp.array(n) for n in ([0.3, 0.0, 0.1], [0.0, 0.4, -0.2]))
+    state = ph.State(WXYZ, jnp.tile(jnp.array([0.1, 0.2, 0.3]), (bodies, 1)))
+
+    @jax.jit
+    def final_rates(edges):
+        pulses = (
+            ph.Pulses(ph.BodyTorque(n), edges[2 * k, None], edges[2 * k + 1, None])
+            for k, n in enumerate((first, second))
+        )
+        scene = ph.Scene(INERTIA, torque=sum(pulses, start=ph.BodyTorque(jnp.zeros(3))))
+        return ph.simulate(scene, state, ts).omega_body[0, -1]
+
+    edges, h = jnp.array([0.5, 1.0, 1.0, 2.0]), 1e-5
+    moves = h * jnp.eye(4)
+    expected = [(final_rates(edges + d) - final_rates(edges - d)) / (2 * h) for d in moves]
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(mode(final_rates)(edges).T, expected, atol=1e-7)
+
+
 @pytest.mark.slow  # forward mode through jumps: test_derivatives_through_a_table
 def test_a_tangent_through_a_jump():
     along = jnp.array([0.3, -0.2]), jnp.array([0.0, 0.0, 0.5])

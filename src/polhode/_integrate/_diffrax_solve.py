@@ -13,6 +13,7 @@ from jaxtyping import Array, PyTree
 
 from polhode._kernels import is_differentiated
 from polhode._method import Status, StepCounts
+from polhode._scene import AbstractTorque
 
 
 class Stepping(NamedTuple):
@@ -96,25 +97,36 @@ class Solution(NamedTuple):
 
 
 def in_segments(
-    move: Callable[..., Solution], y: PyTree[Array], ts: Array, edges: Array, final_only: bool
+    move: Callable[..., Solution],
+    rates: Callable[..., PyTree[Array]],
+    y: PyTree[Array],
+    ts: Array,
+    torque: AbstractTorque,
+    final_only: bool,
 ) -> Solution:
-    """``move(middle, y, times, parts)`` from edge to edge: from ``times[0]`` to ``times[-1]``, by
-    what acts at the time ``middle``, with one of ``parts`` equal shares of the error.
+    """``move(acting, y, times, parts)`` from edge to edge of ``torque``: from ``times[0]`` to
+    ``times[-1]``, by the torque ``acting`` between them, with one of ``parts`` equal shares of the
+    error; ``rates(acting, t, y)``: of the state.
 
     ``times`` may repeat its first. Derivatives by the edges are those of the ends of segments.
     """
     start, end = ts[0], ts[-1]
     sign = jnp.where(end < start, -1, 1).astype(ts.dtype)
     # an edge outside stands at the end of the span, and moves with it
-    within = jnp.clip(edges, jnp.minimum(start, end), jnp.maximum(start, end))
-    cuts = sign * jnp.sort(sign * within)
-    bounds = jnp.concatenate([start[None], cuts, end[None]])
+    within = jnp.clip(torque.edges, jnp.minimum(start, end), jnp.maximum(start, end))
+    order = jnp.argsort(sign * within)
+    bounds = jnp.concatenate([start[None], within[order], end[None]])
     parts = bounds.shape[0] - 1
+    # Of edges at one time, too, one comes first: what acts between two is told by their numbers.
+    numbers = jnp.arange(parts - 1, dtype=within.dtype)
+    numbered = _with_edges(torque, sign * jnp.zeros_like(within).at[order].set(numbers))
+    moves = is_differentiated([ts, within])
 
     def solve_segment(carry, segment):
         y, out, steps, status, error = carry
-        a, b = segment
+        a, b, number = segment
         is_empty = a == b
+        acting = numbered.during(sign * (number - 0.5))
         # an empty segment is solved over another length and discarded, for derivatives exist
         stop = jnp.where(is_empty, a + (end - start) / 16, b)
         inside = (sign * (ts - a) >= 0) & (sign * (b - ts) > 0) & ~is_empty
@@ -123,7 +135,7 @@ def in_segments(
         else:
             times = sign * jnp.sort(sign * jnp.where(inside, ts, a))
             times = jnp.concatenate([times, stop[None]])
-        solution = move(jax.lax.stop_gradient((a + b) / 2), y, times, parts)
+        solution = move(acting, y, times, parts)
         successful = status == Status.SUCCESSFUL
         status = jnp.where(is_empty | ~successful, status, solution.status)
         steps = jax.tree.map(lambda a, b: a + jnp.where(is_empty, 0, b), steps, solution.steps)
@@ -135,11 +147,20 @@ def in_segments(
             out = jax.tree.map(
                 lambda old, new: jnp.where(inside[:, None], new[rows], old), out, solution.samples
             )
+        # through an empty segment, whose ends have derivatives of their own
+        step = jnp.where(is_empty, b - a - jax.lax.stop_gradient(b - a), 0)
+        y = jax.lax.cond(
+            moves,
+            lambda y: jax.tree.map(lambda x, f: x + step * f, y, rates(acting, a, y)),
+            lambda y: y,
+            y,
+        )
         # the last row: only samples have derivatives
         y = jax.tree.map(lambda old, new: jnp.where(is_empty, old, new[-1]), y, solution.samples)
         return (y, out, steps, status, error), None
 
-    shape = jax.eval_shape(lambda y: move(start, y, jnp.stack([start, end]), parts), y)
+    acting = numbered.during(-0.5)
+    shape = jax.eval_shape(lambda y: move(acting, y, jnp.stack([start, end]), parts), y)
     lane = jax.tree.leaves(y)[0].shape
     out = None
     if not final_only:
@@ -148,13 +169,23 @@ def in_segments(
     zero_counts = jnp.zeros(lane, shape.steps.accepted.dtype)
     begin = y, out, StepCounts.of(zero_counts), jnp.zeros(lane, shape.status.dtype), initial_error
     (y, out, steps, status, error), _ = jax.lax.scan(
-        solve_segment, begin, (bounds[:-1], bounds[1:])
+        solve_segment, begin, (bounds[:-1], bounds[1:], jnp.arange(parts, dtype=bounds.dtype))
     )
     end_state = jax.tree.map(lambda x: x[None], y)
     if final_only:
         return Solution(end_state, end_state, steps, status, error)
     out = jax.tree.map(lambda rows, x: rows.at[-1].set(x), out, y)
     return Solution(out, end_state, steps, status, error)
+
+
+def _with_edges(torque: AbstractTorque, edges: Array) -> AbstractTorque:
+    """The torque with other edges, in the order of ``AbstractTorque.edges``."""
+    arrays, static = eqx.partition(torque, eqx.is_inexact_array)
+    # each edge is one number of one array: the transpose puts numbers where they come from
+    _, put = jax.vjp(lambda arrays: eqx.combine(arrays, static).edges, arrays)
+    (places,), (values,) = put(jnp.ones_like(edges)), put(edges)
+    arrays = jax.tree.map(lambda x, at, new: jnp.where(at != 0, new, x), arrays, places, values)
+    return eqx.combine(arrays, static)
 
 
 WAY_BACK = 8

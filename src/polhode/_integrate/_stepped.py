@@ -361,18 +361,23 @@ class AbstractIntegration(AbstractMethod):
         """One chunk of bodies by ``diffrax.diffeqsolve``, between the edges of pulses."""
         y0, sound = self._initial_state(scene, state, ts, record)
         save_times = ts[-1:] if record.final_only else ts
-        edges = None if scene.torque is None else scene.torque.edges
-        if edges is None:
+        if scene.torque is None or scene.torque.edges is None:
             solution = self._solve_smooth(scene, state, y0, ts, rtol, record, jumps)
             return self._samples(scene, solution, save_times, sound, record)
 
-        def move(middle, y, times, parts):
-            torque = scene.torque.during(middle)
-            segment_scene = Scene(scene.inertia, scene.potential, torque, scene.rotors)
+        def scene_with(acting):
+            return Scene(scene.inertia, scene.potential, acting, scene.rotors)
+
+        def rates(acting, t, y):
+            term, dynamics = self._equations(scene_with(acting), state, ts, record)
+            return term.vf(t, y, dynamics)
+
+        def move(acting, y, times, parts):
+            segment_scene = scene_with(acting)
             share = jnp.maximum(rtol / parts, 8 * jnp.finfo(rtol.dtype).eps)
             return self._solve_smooth(segment_scene, state, y, times, share, record, jumps)
 
-        solution = in_segments(move, y0, ts, edges, record.final_only)
+        solution = in_segments(move, rates, y0, ts, scene.torque, record.final_only)
         return self._samples(scene, solution, save_times, sound, record)
 
     def _solve_smooth(self, scene, state, y0, ts, rtol, record, jumps: bool) -> Solution:

@@ -519,13 +519,14 @@ def _with_coincident_switch(
     delay = jnp.sum(jnp.where(flips, -margins / slopes, 0), axis=0)
     rate_after = motion.rates(motion.coefficients, progress_after.levels, t, y)[0]
     delay = delay - jax.lax.stop_gradient(delay)
-    return y + jnp.where(jnp.any(flips, axis=0), (rate - rate_after) * delay, 0)
+    return y + jnp.where(jnp.any(flips, axis=0)[None], (rate - rate_after) * delay[None], 0)
 
 
 def turns_by_itself(margins: Array, slopes: Array, length: Array) -> Array:
     """Whether switches that turn after another one, at the same time, stand at roots of their own;
     others turn because that one has moved what they compare, as in a search in a table."""
-    return (slopes != 0) & (jnp.abs(margins) <= control.COINCIDENT * length * jnp.abs(slopes))
+    near = control.COINCIDENT * length[None] * jnp.abs(slopes)
+    return (slopes != 0) & (jnp.abs(margins) <= near)
 
 
 def _outcome(options, progress: Progress, is_running, length, ratio, eps) -> Array:
