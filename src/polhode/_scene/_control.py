@@ -203,7 +203,10 @@ class DipoleField(eqx.Module):
     def __call__(self, position: Array, t: Array | float) -> Array:
         size = jnp.sqrt(jnp.sum(position * position))
         n = position / size
-        return 1e-7 * (3 * n * jnp.sum(n * self.moment) - self.moment) / size**3
+        # factor by factor: the derivative of x / size**3 holds size**-6, subnormal in float32
+        inverse = 1 / size
+        field = 1e-7 * (3 * n * jnp.sum(n * self.moment) - self.moment)
+        return field * inverse * inverse * inverse
 
 
 _MOTOR_COMMAND = Signature("Motor", {"t": (), "wxyz": (4,), "omega_body": (3,), "speed": ()})

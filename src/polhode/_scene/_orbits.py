@@ -512,7 +512,7 @@ def _axes(r: Array, momentum: Array, normal: Array | None) -> tuple[Array, ...]:
     distance = jnp.linalg.norm(r, axis=-1, keepdims=True)
     z, y = -r / distance, -momentum / size
     zero = jnp.zeros_like(distance)
-    yawing = zero if normal is None else -distance * normal / size**2
+    yawing = zero if normal is None else -distance * (normal / size) / size  # size**4 overflows
     rates = jnp.concatenate([zero, -size / distance**2, yawing], axis=-1)
     return jnp.cross(y, z), y, z, rates
 
