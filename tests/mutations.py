@@ -233,8 +233,8 @@ MUTANTS = (
     ),
     Mutant(
         "_scene/_potentials.py",
-        "return -mu / (2 * square * distance) * (trace - 3 * project)",
-        "return -mu / (2 * square * distance) * (trace - 2 * project)",
+        "return -mu / 2 * inverse * inverse * inverse * (trace - 3 * project)",
+        "return -mu / 2 * inverse * inverse * inverse * (trace - 2 * project)",
         "the gravity gradient is two thirds of what it is",
         ("hamiltonian/test_charts.py::test_gravity_gradient_torque_is_three_mu_over_r_cubed",),
     ),
@@ -248,8 +248,8 @@ MUTANTS = (
     # torques and wheels
     Mutant(
         LAWS,
-        "return 1e-7 * (3 * n * jnp.sum(n * self.moment) - self.moment) / size**3",
-        "return 1e-7 * (2 * n * jnp.sum(n * self.moment) - self.moment) / size**3",
+        "field = 1e-7 * (3 * n * jnp.sum(n * self.moment) - self.moment)",
+        "field = 1e-7 * (2 * n * jnp.sum(n * self.moment) - self.moment)",
         "the magnetic field of a dipole is wrong away from its equator",
         ("torques/test_machines.py::test_a_dipole_in_a_field_of_place_and_time",),
     ),

@@ -250,6 +250,107 @@ def test_unsorted_times_have_a_status_where_they_are_traced():
     np.testing.assert_array_equal(status(own), [ph.Status.SUCCESSFUL, ph.Status.BAD_TIMES])
 
 
+def with_motor(torque, speed):
+    motor = ph.Motor(lambda t, q, w, s: 0.4 * q[1] + w[0], torque, speed)
+    return ph.Scene(INERTIA, rotors=ph.Rotor.axial(0.05, speed=1.0, coupling=motor, axis=0))
+
+
+def acted(torque):
+    return ph.Scene(INERTIA, torque=torque)
+
+
+PLATES = ph.Plates([1.0], [[1.0, 0, 0]], [[0, 0.1, 0]])
+FIELD = [0.0, 0, 1e-5]
+LIMITS = {  # a scene of two numbers that comparisons alone see, and numbers that are right
+    "motor": (with_motor, [0.05, 10.0]),
+    "pulse": (lambda a, b: acted(ph.Pulses(ph.BodyTorque([1.0, 0, 0]), a, b)), [0.2, 0.5]),
+    "rods": (
+        lambda a, b: ph.Scene(
+            INERTIA,
+            torque=ph.MagneticDipole(ph.BDot(1e9, a), FIELD)
+            + ph.MomentumDumping(0.1, FIELD, max_moment=b),
+            rotors=ph.Rotor.axial(0.05, speed=1.0),
+        ),
+        [100.0, 10.0],
+    ),
+    "shadow": (
+        lambda a, b: acted(
+            ph.SolarPressure(
+                PLATES, [1.0, 0, 0], ph.Eclipse([-7e6, 0.0, 0], jnp.stack([1.0, 0 * b, b]), a)
+            )
+        ),
+        [6.4e6, 0.1],
+    ),
+    "plate": (
+        lambda a, b: acted(
+            ph.Drag(
+                ph.Plates([1.0], jnp.stack([1.0, a, b])[None], [[0, 0.1, 0]]), 1e-7, [7e3, 0, 0]
+            )
+        ),
+        [0.2, 0.1],
+    ),
+    "table": (
+        lambda a, b: acted(
+            ph.BodyTorque(ph.Table(jnp.stack([0 * a, a, b]), np.eye(3, 3), 1, kind="vector"))
+        ),
+        [0.5, 2.0],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_limits_and_edges_that_are_wrong_have_a_status_where_they_are_traced(name):
+    make, good = LIMITS[name]
+
+    @jax.jit
+    @jax.vmap
+    def status(numbers):
+        return ph.simulate(make(*numbers), STATE, TS).status
+
+    given = [good, [np.nan, good[1]], [good[0], np.nan]]
+    if name in ("motor", "pulse", "rods"):
+        given += [[-good[0], good[1]] if name != "pulse" else [0.5, 0.2]]
+    expected = [ph.Status.SUCCESSFUL] + [ph.Status.NOT_FINITE] * (len(given) - 1)
+    np.testing.assert_array_equal(status(jnp.array(given)), expected)
+
+
+def test_a_limit_that_is_wrong_raises_outside_of_jit():
+    def end(limit):
+        return ph.simulate(with_motor(limit, None), STATE, TS).omega_body[-1, 0]
+
+    with pytest.raises(ValueError, match="max_torque must be positive"):
+        end(-0.1)
+    with pytest.raises(ph.SimulationError, match="limits that must be positive"):
+        jax.grad(end)(-0.1)
+    edited = eqx.tree_at(
+        lambda s: s.rotors.coupling.max_torque, with_motor(0.1, None), jnp.array(np.nan)
+    )
+    with pytest.raises(ph.SimulationError, match="limits that must be positive"):
+        ph.simulate(edited, STATE, TS)
+
+
+class Spring(ph.AbstractTorque):
+    k: jax.Array
+    ranks: dict = eqx.field(static=True, default_factory=dict)
+
+    @property
+    def core_ranks(self):
+        return self.ranks
+
+    def body_components(self, t, attitude, omega):
+        x, y, z = attitude.row(2)
+        return -self.k * y, self.k * x, 0.0 * z
+
+
+def test_fields_of_a_class_of_the_user_are_named():
+    with pytest.raises(TypeError, match=r"core_ranks of Spring names kk, .* it has k, ranks"):
+        ph.simulate(acted(Spring(jnp.array(1.0), {"kk": 0})), STATE, TS)
+    with pytest.raises(
+        ValueError, match=r"(?s)Spring.body_components returned.*\(3,\).*If k of it"
+    ):
+        ph.simulate(acted(Spring(jnp.array([1.0, 2.0, 3.0]))), STATE, TS)
+
+
 FRAME = ph.RotatingFrame.from_rate([0.0, 0, 1])
 BALL = ph.MassProperties.from_sphere(1.0, 1.0)
 

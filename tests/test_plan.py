@@ -8,6 +8,7 @@ import pytest
 import polhode as ph
 from benchmarks.scene_cost import states
 from polhode import rotation
+from polhode._batch import common_batch
 from polhode._plan import choose
 
 
@@ -131,6 +132,15 @@ def test_specialised_inertia_holds_the_same_moments(inertia, symmetry):
     assert special.symmetry.name == symmetry
     np.testing.assert_array_equal(special.tensor, inertia.tensor)
     assert special.is_principal
+
+
+def test_specialise_keeps_the_batch():
+    axes = np.outer([1.0, 2.0, 3.0], [0.0, 0.0, 1.0])
+    orbit = ph.KeplerOrbit(1.0, 2.0, np.zeros(3))
+    scene = ph.Scene(TRIAXIAL, ph.GravityGradient(1.0, orbit))
+    assert common_batch(ph.specialise(scene).potential) == (3,)
+    for wheel in (ph.Rotor(axes, momentum=0.1), ph.Rotor(axes, 0.1, speed=[0.1, 0.2, 0.3])):
+        assert common_batch(ph.specialise(ph.Scene(TRIAXIAL, rotors=wheel)).rotors) == (3,)
 
 
 def test_specialise_keeps_what_is_no_narrower_and_refuses_traced_numbers():

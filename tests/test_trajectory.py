@@ -172,6 +172,14 @@ def test_bodies_and_samples_are_chosen_as_from_an_array(batch):
     np.testing.assert_allclose(batch.at(own).wxyz[1, 2], one.at(ASKED + 0.2).wxyz, atol=1e-11)
 
 
+def test_samples_between_two_times_where_times_are_in_any_order():
+    traj = ph.simulate(SCENES["free"], STATE, TS).at([3.0, 1.0, 2.0, 5.0])
+    chosen = traj.between(2.5, 5.5)
+    np.testing.assert_array_equal(chosen.ts, [3.0, 5.0])
+    np.testing.assert_array_equal(chosen.wxyz, traj.wxyz[..., np.array([0, 3]), :])
+    np.testing.assert_array_equal(traj.between(1.0, 2.0).ts, [1.0, 2.0])
+
+
 def test_what_no_sample_has_is_refused(batch):
     for key in (2, (0, 3), (0, 0, 13), (0, 0, 0, 0), "x", None, 1.5):
         with pytest.raises(IndexError):

@@ -45,6 +45,29 @@ class AbstractPart(eqx.Module):
         """The array fields by name, each with its rank without batch axes."""
         return {name: len(core) for name, core in _cores(type(self)).items()}
 
+    @property
+    def input_conditions(self) -> tuple[Array, ...]:
+        """What must hold (...) of limits and edges, in compiled programs too.
+
+        A comparison takes NaN, or a limit of the wrong sign, for a number like others: the motion
+        stays finite, and its derivative is zero. The status of such a body is ``NOT_FINITE``.
+        """
+        return ()
+
+
+def above_zero(*limits: Array | None) -> tuple[Array, ...]:
+    """That limits are positive, and hence not NaN; nothing for those that are None."""
+    return tuple(limit > 0 for limit in limits if limit is not None)
+
+
+def all_input_conditions(part: Any) -> tuple[Array, ...]:
+    """``input_conditions`` of a part and of what it is made of."""
+    if not isinstance(part, AbstractPart):
+        return ()
+    names = () if isinstance(part, AbstractSum) else part.core_ranks
+    inner = part.terms if isinstance(part, AbstractSum) else [getattr(part, n) for n in names]
+    return sum(map(all_input_conditions, inner), start=part.input_conditions)
+
 
 class AbstractSum(AbstractPart):
     """Base of the sums of parts of one kind: ``terms`` carry the batch axes, each its own."""
@@ -71,6 +94,14 @@ def check_fields(part: AbstractPart, name: str) -> None:
     # which takes longer than the check.
     for i, term in enumerate(part.terms if isinstance(part, AbstractSum) else ()):
         check_fields(term, f"{name}.terms[{i}]")
+    if type(part).core_ranks is not AbstractPart.core_ranks:  # a class of the user
+        missing = [field for field in part.core_ranks if not hasattr(part, field)]
+        if missing:
+            fields = ", ".join(field.name for field in dataclasses.fields(part))
+            raise TypeError(
+                f"core_ranks of {type(part).__name__} names {', '.join(missing)}, which is no field"
+                f" of it: it has {fields or 'none'}."
+            )
     for field, core in _cores(type(part)).items():
         value = getattr(part, field)
         if value is None:

@@ -70,6 +70,8 @@ CASES = [
     ("run named.toml", 2, ["x.csv", ".nc"]),
     ("run tip.toml --clones -1", 2, ["whole number from 0"]),
     ("run tip.toml --seed 0.5", 2, ["whole number from 0"]),
+    ("run tip.toml --seed 9223372036854775808", 2, ["from 0 to 9223372036854775807"]),
+    ("run tip.toml --clones 10000001", 2, ["from 0 to 10000000"]),
     ("run tip.toml --seed 7", 2, ["[monte_carlo]"]),
     ("run tip.toml --chunk 7", 2, ["--chunk", "[ensemble]"]),
     ("run tip.toml -o folder.nc", 1, ["is a folder"]),

@@ -11,6 +11,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -55,6 +56,68 @@ def test_a_body_depends_on_its_index_alone():
     np.testing.assert_array_equal(few.omega_body[1], many.omega_body[3])
     _, other = make(seed=8).draw(np.arange(8))
     assert not np.any(np.asarray(other.wxyz) == np.asarray(many.wxyz))
+
+
+class Gain(eqx.Module):
+    k: jax.Array
+
+    def __call__(self, t, wxyz, omega_body):
+        return -self.k * omega_body
+
+
+def shared_parts():
+    """Scenes that hold arrays without axes of bodies, by what holds them."""
+    body, t = ph.Inertia.from_moments([1.0, 1.5, 2.0]), np.linspace(0.0, 9.0, 5)
+    table = ph.Table(t, np.stack([np.sin(t), np.cos(t), 0 * t + 0.3], -1), order=1)
+    rods = ph.MagneticDipole(
+        ph.BDot(4e4, 0.2), ph.DipoleField([0, 0, -7.8e22]), ph.KeplerOrbit(3.986e14, 6.9e6)
+    )
+    torques = rods + ph.Pulses(ph.BodyTorque(table), [0.2, 0.5], [0.3, 0.7])
+    wheels = ph.wheel_cluster(np.eye(3), 1e-2, lambda t, q, w: -0.1 * w)
+    growing = ph.VariableInertia(ph.Table(t, np.outer(1 + 0.1 * t, [1.0, 1.5, 2.0])))
+    return {
+        "torques": ph.Scene(body, torque=torques + ph.FeedbackTorque(Gain(jnp.array(0.3)))),
+        "wheels": ph.Scene(growing, rotors=wheels),
+        "table": ph.Scene(ph.Inertia.spherical(2.0), torque=ph.BodyTorque(table)),
+    }
+
+
+RATES = (ens.SpreadRates(ens.Deviate(jnp.full(3, 0.1))),)
+
+
+@pytest.mark.parametrize("name", ["torques", "wheels"])
+def test_drawn_bodies_share_what_bodies_cannot_differ_in(name):
+    scene = shared_parts()[name]
+    drawn, state = ens.Ensemble(scene, STATE, 20, RATES).draw(np.arange(3))
+    assert state.omega_body.shape == (3, 3)
+    leaves = jax.tree.leaves(drawn), jax.tree.leaves(scene)
+    assert {x.ndim - own.ndim for x, own in zip(*leaves, strict=True)} == {0, 1}
+    for x, own in zip(*leaves, strict=True):
+        np.testing.assert_array_equal(x[1] if x.ndim > own.ndim else x, own)
+
+
+def test_a_store_of_bodies_that_share_a_table(tmp_path):
+    scene = shared_parts()["table"]
+    ensemble = ens.Ensemble(scene, STATE, np.int64(20), RATES, np.uint32(1))
+    moments = ens.Statistic("tilt", tilt, "rad", np.float32(0), np.float64(3), np.int64(8))
+    options = {"rtol": np.float64(1e-8), "statistics": [moments]}
+    path = ens.stream(ensemble, [0.0, 1.0], tmp_path / "shared.zarr", name="x", **options)
+    assert ens.stream(ensemble, [0.0, 1.0], path, name="x", **options) == path
+    _, state = ensemble.draw(np.arange(20))
+    # a sphere turns by the integral of the torque, which is linear until the second time
+    gain = np.asarray(scene.torque.n(0.0) + scene.torque.n(1.0)) / 2 / 2.0
+    found = arrays(path)["omega_body"]
+    np.testing.assert_allclose(found[:, 1], np.asarray(state.omega_body) + gain, atol=1e-9)
+
+
+def test_a_spread_of_what_bodies_share_is_refused():
+    def later(key, scene, state):
+        times = scene.torque.n.times + jax.random.uniform(key)
+        return eqx.tree_at(lambda s: s.torque.n.times, scene, times), state
+
+    ensemble = ens.Ensemble(shared_parts()["table"], STATE, 20, (later,))
+    with pytest.raises(ValueError, match="changes an array that all bodies share"):
+        ensemble.draw(np.arange(3))
 
 
 @pytest.mark.parametrize("dtype", [pytest.param(jnp.float32, marks=pytest.mark.slow), jnp.float64])

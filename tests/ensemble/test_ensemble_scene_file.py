@@ -116,8 +116,16 @@ def test_rows_of_files_and_torques(tmp_path):
         parse_scene(ARRAYS.replace("moments.npy", "nothing.npy"), scene)
     with pytest.raises(SceneFileError, match="given twice"):
         parse_scene(SCENE + '[ensemble.arrays]\nwxyz = "omega.npy"', scene)
-    with pytest.raises(SceneFileError, match=r"one .torque. of kind"):
-        parse_scene(SCENE + "[ensemble.torque]\nsigma = 1.0", scene)
+    orbit = "[orbit]\nmu = 4e14\nsemi_major_axis = 7e6\n[ensemble]"
+    for text in (
+        SCENE + "[ensemble.torque]\nsigma = 1.0",
+        ARRAYS.replace(
+            "n = [0.0, 0.0, 0.1]", "n = { times = [0, 9], values = [[0, 0, 1], [0, 1, 0]] }"
+        ),
+        ARRAYS.replace('"body"', '"body"\nframe = "lvlh"').replace("[ensemble]", orbit, 1),
+    ):
+        with pytest.raises(SceneFileError, match=r"\[ensemble\] torque.*one .torque. of kind"):
+            parse_scene(text, scene)
 
 
 @pytest.mark.parametrize(

@@ -136,6 +136,29 @@ def test_overview_draws_bands_and_observations(trajectory):
     np.testing.assert_array_equal(dots.get_ydata(), line.get_ydata()[first])
 
 
+def test_bodies_with_times_of_their_own_are_lines_at_these(trajectory):
+    ts = np.linspace(0, 1, trajectory.ts.size) * np.array([[1.0], [3.0], [3.0]])
+    bodies = np.array([0, 1, 1])
+    three = plot.samples(
+        ts, trajectory.omega_body[bodies], trajectory.wxyz[bodies], trajectory.scene.inertia
+    )
+    panel = plot.overview(three).axes[0]
+    assert not panel.collections
+    drawn = {(line.get_xdata()[-1] / line.get_xdata()[1]).round(6) for line in panel.lines}
+    assert len(panel.lines) == 9
+    ends = sorted(line.get_xdata()[-1] for line in panel.lines)
+    np.testing.assert_allclose(ends, np.array([1.0] * 3 + [3.0] * 6) * ends[0])
+    assert len(drawn) == 1
+
+
+@pytest.mark.parametrize(("family", "levels"), [(0, 0), (1, 1), (5, 5), (8, 8)])
+def test_the_family_has_as_many_levels_as_are_asked_for(family, levels):
+    curves = list(_trajectory._family(MOMENTS, 3.0, family))
+    momenta = {round(float((curve[0] ** 2) @ MOMENTS**2), 9) for curve in curves}
+    assert len(momenta) == levels
+    assert len(curves) == 2 * levels
+
+
 def test_boxes_have_the_inertia_of_their_body():
     tensor = _tensor()
     corners = _trajectory._box(tensor)

@@ -63,6 +63,11 @@ def test_the_page_holds_the_motion(trajectory):
             np.testing.assert_allclose(body[name], getattr(trajectory, name)[i], atol=3e-7)
 
 
+def test_several_motions_may_be_a_tuple(trajectory):
+    bodies = _view.chosen_bodies((trajectory, trajectory), None)
+    assert len(bodies) == 2 * len(_view.chosen_bodies(trajectory, None))
+
+
 def test_momentum_of_wheels_is_shown():
     wheel = ph.Rotor(axis_body=[0.0, 0.0, 1.0], inertia=0.1, momentum=5.0)
     scene = ph.Scene(ph.Inertia.axisymmetric(1.0, 2.0), rotors=wheel)

@@ -53,7 +53,29 @@ def test_wheels_share_the_command_and_null_motion_exerts_no_torque():
     assert np.dot(extra, SPEEDS - BIAS) < 0  # towards the bias
 
 
+def test_a_cluster_has_one_limit_or_one_for_each_motor():
+    wxyz, omega = np.array(START[0]), np.array(START[1])
+    free = torques_of(ph.wheel_cluster(CORNERS, J, law), SPEEDS, wxyz, omega)
+    for limit in (0.05, [0.01, 0.02, 0.03, 0.5]):
+        cluster = ph.wheel_cluster(CORNERS, J, law, max_torque=limit)
+        motors = torques_of(cluster, SPEEDS, wxyz, omega)
+        np.testing.assert_allclose(motors, np.clip(free, -np.array(limit), limit), rtol=1e-12)
+    assert (
+        ph.simulate(
+            ph.Scene(ph.Inertia.from_moments(MOMENTS), rotors=cluster), ph.State(*START), [0.0, 0.1]
+        ).batch_shape
+        == ()
+    )
+
+
 def test_clusters_that_are_none_are_refused():
+    with pytest.raises(ValueError, match=r"axes must have shape \(n, 3\), got \(2, 4, 3\)"):
+        ph.wheel_cluster(np.stack([CORNERS, CORNERS]), J, law)
+    for name in ("max_torque", "speed"):
+        with pytest.raises(ValueError, match=rf"{name} must be one number or one for each of 4"):
+            ph.wheel_cluster(CORNERS, J, law, **{name: [0.1, 0.2]})
+    with pytest.raises(ValueError, match="max_torque must be positive"):
+        ph.wheel_cluster(CORNERS, J, law, max_torque=[0.1, 0.1, 0.1, -0.1])
     with pytest.raises(ValueError, match="span space"):
         ph.wheel_cluster([[1.0, 0, 0], [0, 1, 0], [1, 1, 0]], J, law)
     with pytest.raises(ValueError, match="command"):

@@ -50,6 +50,31 @@ def test_an_orbit_by_place_and_velocity_is_the_same_one():
             assert np.abs(np.array(got - want)).max() < bound / (1 - 0.95)
 
 
+@pytest.mark.parametrize("radius", [6.9e6, 4.2164e7])
+def test_derivatives_by_the_size_of_an_orbit_in_single_precision(radius):
+    """Fields fall with the cube of the distance: derivatives -3 and 12 times the field."""
+    for dtype, bound in ((jnp.float64, 1e-13), (jnp.float32, 1e-5)):
+        place = jnp.array([0.6, -0.48, 0.64], dtype) * radius
+        dipole = ph.DipoleField(jnp.array([1e22, 2e22, -7.8e22], dtype))
+        body = ph.Inertia(jnp.array([1.0, 1.5, 2.0], dtype))
+        wxyz, rates = jnp.array([0.5, 0.1, 0.7, 0.5], dtype), jnp.zeros(3, dtype)
+
+        def turn(size, place=place, body=body, wxyz=wxyz, rates=rates):
+            gradient = ph.GravityGradient(jnp.asarray(3.986e14, size.dtype), size * place)
+            return ph.Scene(body, gradient).acceleration(wxyz, rates, 0.0)
+
+        def field(size, place=place, dipole=dipole):
+            return dipole(size * place, 0.0)
+
+        one = jnp.ones((), dtype)
+        for fn in (jax.jit(field), jax.jit(turn)):
+            value = np.asarray(fn(one))
+            assert value.dtype == dtype
+            for mode in (jax.jacfwd, jax.jacrev):
+                np.testing.assert_allclose(mode(fn)(one), -3 * value, rtol=bound)
+            np.testing.assert_allclose(jax.jacfwd(jax.jacrev(fn))(one), 12 * value, rtol=bound)
+
+
 def test_an_orbit_through_a_state_is_a_kepler_orbit():
     elements = KeplerOrbit(1.7, 1.3, 0.3, 0.7, 0.3, 1.1, 0.2, 0.5)
     place, velocity = elements(2.0), elements.velocity_at(2.0)

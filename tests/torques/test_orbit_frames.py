@@ -1,5 +1,6 @@
 """Hyperbolas, the frame that goes along with an orbit, torques in it, and Apophis in 2029."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -111,6 +112,33 @@ JEOD_WXYZ = [
     [0.3853120598769757, 0.3853120598769757, 0.5929035473948203, -0.5929035473948203],
 ]
 JEOD_PITCH_RATE = [-0.1, -0.06896551724137931, -0.01, -0.001030927835051546]
+
+
+def test_rates_do_not_depend_on_the_size_of_the_orbit_in_single_precision():
+    """Nor does the yaw rate, of an orbit that leaves its plane."""
+
+    def rates(size):
+        def place(t):
+            tilt = 0.3 * jnp.sin(2e-3 * t)
+            return 6.9e6 * size * jnp.stack([jnp.cos(1e-3 * t), jnp.sin(1e-3 * t), tilt])
+
+        return ph.LVLH(place).omega(jnp.float32(500.0))
+
+    one = jnp.ones((), jnp.float32)
+    assert jnp.abs(rates(one)[2]) > 1e-4
+    assert jnp.abs(jax.jacrev(rates)(one)).max() < 1e-8
+
+
+def test_a_table_of_positions_may_be_that_of_a_batch():
+    t = np.linspace(0.0, 1000.0, 41)
+    places = np.stack([np.cos(1e-3 * t), np.sin(1e-3 * t), 0.1 * np.cos(2e-3 * t)], -1) * 7e6
+    tables = np.stack([places, 2 * places[:, [1, 2, 0]]])
+    many, state = ph.LVLH(ph.Table(t, tables)), ([1.0, 0, 0, 0], [0.0, 0.1, 0])
+    both, rates = many.from_frame(*state, 300.0)
+    for i in range(2):
+        one = ph.LVLH(ph.Table(t, tables[i])).from_frame(*state, 300.0)
+        np.testing.assert_allclose(both[i], one[0], atol=1e-14)
+        np.testing.assert_allclose(rates[i], one[1], atol=1e-14)
 
 
 def test_the_frame_of_nasas_jeod():

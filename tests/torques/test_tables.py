@@ -74,6 +74,20 @@ def test_a_batch_of_tables_and_one_precision(order):
     np.testing.assert_array_equal(rows[0], table(7.0))
 
 
+@pytest.mark.parametrize("batched", ["values", "derivatives"])
+def test_values_and_derivatives_have_common_batch_axes(batched):
+    slopes = np.stack([np.cos(TIMES), TIMES, 0 * TIMES], -1)
+    given = {"values": sun(TIMES), "derivatives": slopes}
+    two = given | {batched: np.stack([given[batched], 2 * given[batched]])}
+    table = ph.Table(TIMES, **two)
+    assert table.values.shape == table.derivatives.shape == (2, TIMES.size, 3)
+    for i in range(2):
+        one = ph.Table(TIMES, **(given | {batched: two[batched][i]}))
+        np.testing.assert_array_equal(table(7.0)[i], one(7.0))
+    with pytest.raises(ValueError, match="derivatives"):
+        ph.Table(TIMES, np.ones((2, 13, 3)), derivatives=np.ones((3, 13, 3)))
+
+
 @pytest.mark.parametrize("order", [1, 3])
 def test_kinks_of_a_table_end_steps(order):
     """The torque is a polynomial between them, so that steps of high order are exact; a second

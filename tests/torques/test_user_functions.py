@@ -64,6 +64,7 @@ def test_only_the_documented_shape_passes(name):
         (lambda: ph.Potential(ph.UniformGravity), "got the class UniformGravity"),
         (lambda: ph.GravityGradient(1.0, ph.KeplerOrbit), "got the class KeplerOrbit"),
         (lambda: ph.BodyTorque(lambda: jnp.ones(3)), r"called as fn\(t\)"),
+        (lambda: ph.SampledTorque(lambda t, q: -q, 1.0), r"^SampledTorque is called as"),
         (lambda: wheel(3.0), "takes a function"),
         (lambda: ph.frames.FrameForce(lambda position, velocity, t: position), "order fn"),
     ],

@@ -18,9 +18,10 @@ from polhode._checks import (
     default_array,
     is_concrete,
     require,
+    require_positive,
 )
 from polhode._hamiltonian import Attitude, Vector, components, cross, dot, triple
-from polhode._parts import AbstractPart, Signature, shaped
+from polhode._parts import AbstractPart, Signature, above_zero, shaped
 from polhode._scene._tables import Table, check_kind
 from polhode._scene._torques import AbstractTorque, coefficients, stacked, value_at, vector_of_time
 from polhode._scene._wheels import AbstractCoupling, AbstractRotor, Rotor, RotorSum
@@ -154,6 +155,10 @@ class MagneticDipole(AbstractTorque):
             moment = _MOMENT.mapped(moment, t, stacked(omega), stacked(field))
         return cross(components(moment), field)
 
+    @property
+    def input_conditions(self) -> tuple[Array, ...]:
+        return above_zero(self.moment.max_moment) if isinstance(self.moment, BDot) else ()
+
     def field_body(self, t: Array | float, attitude: Attitude) -> tuple[Array, Array, Array]:
         """The field in body axes [T]."""
         field = self.field
@@ -203,7 +208,10 @@ class DipoleField(eqx.Module):
     def __call__(self, position: Array, t: Array | float) -> Array:
         size = jnp.sqrt(jnp.sum(position * position))
         n = position / size
-        return 1e-7 * (3 * n * jnp.sum(n * self.moment) - self.moment) / size**3
+        # factor by factor: the derivative of x / size**3 holds size**-6, subnormal in float32
+        inverse = 1 / size
+        field = 1e-7 * (3 * n * jnp.sum(n * self.moment) - self.moment)
+        return field * inverse * inverse * inverse
 
 
 _MOTOR_COMMAND = Signature("Motor", {"t": (), "wxyz": (4,), "omega_body": (3,), "speed": ()})
@@ -251,6 +259,10 @@ class Motor(AbstractCoupling):
         if max_speed is not None and max_torque is None:
             raise ValueError("Motor max_speed needs max_torque, the torque that falls with it.")
 
+    @property
+    def input_conditions(self) -> tuple[Array, ...]:
+        return above_zero(self.max_torque, self.max_speed)
+
     def torque(
         self, t: Array | float, speed: Array, attitude: Attitude, omega: Sequence[Array]
     ) -> Array:
@@ -284,6 +296,10 @@ class _ClusterMotor(AbstractCoupling):
     bias: Array
     first: int = eqx.field(static=True)
     max_torque: Float[Array, "*#b"] | None = shaped()
+
+    @property
+    def input_conditions(self) -> tuple[Array, ...]:
+        return above_zero(self.max_torque)
 
     def torque(self, t, speed, attitude, omega):
         return self._limit(self._command_torque(t, attitude, omega))
@@ -322,10 +338,11 @@ def wheel_cluster(
     **Arguments:** ``axes`` (n, 3): of n >= 3 wheels in body axes, which span space; ``inertia``:
     of each wheel about its axis [kg m^2], (n,) or one number; ``command``: a function
     ``fn(t, wxyz, omega_body)`` -> (3,), the torque on the body [N m]; ``speed``: initial speeds
-    [rad/s], (n,) or one number; ``max_torque`` of each motor [N m] or None; ``friction`` of each
-    bearing, such as ``ph.ViscousCoupling``; ``null_gain`` [1/s] and ``bias`` [rad/s], (n,) or one
-    number: null motion drives the speeds to the bias as far as that exerts no torque on the body;
-    ``first``: the number of other wheels that stand before these in the scene.
+    [rad/s], (n,) or one number; ``max_torque`` of each motor [N m], (n,) or one number, or None;
+    ``friction`` of each bearing, such as ``ph.ViscousCoupling``; ``null_gain`` [1/s] and ``bias``
+    [rad/s], (n,) or one number: null motion drives the speeds to the bias as far as that exerts no
+    torque on the body; ``first``: the number of other wheels that stand before these in the scene.
+    All bodies of a batch share these numbers.
 
     The wheels share the command by the pseudo-inverse of their axes, with the least sum of squares
     of the motor torques. The result is a sum of ``ph.Rotor`` for ``ph.Scene(rotors=...)``.
@@ -335,10 +352,15 @@ def wheel_cluster(
         wheels = ph.wheel_cluster(corners, 1e-3, law, max_torque=0.02)
 
     F. L. Markley and J. L. Crassidis, Fundamentals of Spacecraft Attitude Determination and
-    Control, 2014, section 7.3.4. Raises ValueError for fewer than three wheels or axes in one
-    plane, TypeError or ValueError for a command that takes or returns something else.
+    Control, 2014, section 7.3.4. Raises ValueError for fewer than three wheels, axes in one plane
+    or other shapes, TypeError or ValueError for a command that takes or returns something else.
     """
     directions = as_float_array("wheel_cluster axes", axes, (None, 3))
+    if directions.ndim != 2:
+        raise ValueError(
+            f"wheel_cluster axes must have shape (n, 3), got {directions.shape}: all bodies of a"
+            " batch share the cluster; for axes that differ add ph.Rotor objects."
+        )
     directions = directions / jnp.sqrt(jnp.sum(directions**2, axis=-1, keepdims=True))
     n = directions.shape[0]
     if is_concrete(directions):
@@ -347,7 +369,7 @@ def wheel_cluster(
             f"wheel_cluster axes must be three or more that span space, got {axes}.",
         )
     moments, speeds, bias_speeds = (
-        jnp.broadcast_to(as_float_array(f"wheel_cluster {name}", value), (n,))
+        _for_each_wheel(f"wheel_cluster {name}", value, n)
         for name, value in (("inertia", inertia), ("speed", speed), ("bias", bias))
     )
     gain = as_number("wheel_cluster null_gain", null_gain)
@@ -356,21 +378,36 @@ def wheel_cluster(
     # Momenta, not speeds, have to cancel: the projector acts on J times the speeds.
     inverse = jnp.linalg.solve(directions.T @ directions, directions.T).T
     projector = jnp.eye(n, dtype=directions.dtype) - inverse @ directions.T
-    limit = None if max_torque is None else as_positive("wheel_cluster max_torque", max_torque)
+    limits: Any = [None] * n
+    if max_torque is not None:
+        limits = _for_each_wheel("wheel_cluster max_torque", max_torque, n)
+        require_positive("wheel_cluster max_torque", limits)
     rotors = []
     for i in range(n):
         null = gain * projector[i] * moments
-        motor: Any = _ClusterMotor(law, inverse[i], null, bias_speeds, first, limit)
+        motor: Any = _ClusterMotor(law, inverse[i], null, bias_speeds, first, limits[i])
         coupling = motor if friction is None else motor + friction
         rotors.append(Rotor(directions[i], inertia=moments[i], speed=speeds[i], coupling=coupling))
     return RotorSum(tuple(rotors))
 
 
+def _for_each_wheel(name: str, value: ArrayLike, n: int) -> Array:
+    """Numbers (n,) from one for all wheels, or one each."""
+    array = as_float_array(name, value)
+    if array.shape not in ((), (n,)):
+        raise ValueError(
+            f"{name} must be one number or one for each of {n} wheels, got shape {array.shape}."
+        )
+    return jnp.broadcast_to(array, (n,))
+
+
 class MomentumDumping(AbstractTorque):
     """Magnetorquers that remove the momentum of the wheels: m = -k (B x h)/|B|^2, N = m x B.
 
-    h is the momentum of the wheels of the scene; the torque is -k times its part normal to the
-    field, which the wheels counteract, so that they lose momentum.
+    h is the momentum of the wheels of the scene: J Omega along the axis a of a wheel of prescribed
+    speed Omega relative to the body, and J (Omega + a . omega), the rotation of the body included,
+    of a wheel with a motor, a torque or a coupling. The torque is -k times the part of h normal to
+    the field, which the wheels counteract, so that they lose momentum.
 
     **Arguments:** ``k`` (...) [1/s], not negative; ``field`` and ``position``: as in
     ``ph.MagneticDipole``; ``max_moment`` (...) [A m^2]: limit of each of three rods, or None.
@@ -401,6 +438,10 @@ class MomentumDumping(AbstractTorque):
         if max_moment is not None:
             self.max_moment = as_positive("MomentumDumping max_moment", max_moment)
         self.momentum = None
+
+    @property
+    def input_conditions(self) -> tuple[Array, ...]:
+        return above_zero(self.max_moment)
 
     def with_wheels(self, momentum: Sequence[Array]) -> AbstractTorque:
         return eqx.tree_at(

@@ -449,7 +449,7 @@ class LVLH(AbstractPart):
                 return jax.jvp(place, (t,), (jnp.ones_like(t),))
 
             place = self.orbit
-            if not isinstance(place, AbstractOrbit):
+            if not isinstance(place, AbstractPart):  # which carries batch axes itself
                 place = jnp.vectorize(place, signature="()->(n)")
             (r, v), (_, force) = jax.jvp(place_and_velocity, (t,), (jnp.ones_like(t),))
             momentum = jnp.cross(r, v)
@@ -491,7 +491,7 @@ class LVLH(AbstractPart):
     def yaw_pitch_roll(self, trajectory: Any) -> tuple[Array, Array, Array]:
         """Angles ZYX [rad] of a trajectory's body axes in the frame, each (..., T)."""
         frame = self
-        if isinstance(self.orbit, AbstractOrbit):  # which may be one for each body
+        if isinstance(self.orbit, AbstractPart):  # which may be one for each body
             frame = LVLH(along_time(self.orbit, len(trajectory.batch_shape)))
         wxyz, _ = frame.to_frame(trajectory.wxyz, trajectory.omega_body, trajectory._t)
         return rotation.wxyz_to_euler(wxyz, rotation.Sequence.ZYX)
@@ -512,7 +512,7 @@ def _axes(r: Array, momentum: Array, normal: Array | None) -> tuple[Array, ...]:
     distance = jnp.linalg.norm(r, axis=-1, keepdims=True)
     z, y = -r / distance, -momentum / size
     zero = jnp.zeros_like(distance)
-    yawing = zero if normal is None else -distance * normal / size**2
+    yawing = zero if normal is None else -distance * (normal / size) / size  # size**4 overflows
     rates = jnp.concatenate([zero, -size / distance**2, yawing], axis=-1)
     return jnp.cross(y, z), y, z, rates
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike, as_float_array, as_positive, is_concrete, require
 from polhode._hamiltonian import Attitude, Vector, cross, dot, triple
-from polhode._parts import AbstractPart, Signature, shaped
+from polhode._parts import AbstractPart, Signature, above_zero, shaped
 from polhode._scene._tables import check_kind
 from polhode._scene._torques import AbstractTorque, value_at, vector_of_time
 
@@ -48,6 +48,10 @@ class Plates(AbstractPart):
             f" {counts[2]}.",
         )
         require(counts[0] > 0, "Plates needs one plate at least.")
+
+    @property
+    def input_conditions(self) -> tuple[Array, ...]:
+        return (jnp.all(jnp.isfinite(self.normal), axis=(-2, -1)),)
 
     def torque(self, force: Callable[[int, Vector], Vector]) -> Vector:
         """Sum of centre x force(i, normal) over the plates, as components [N m]."""
@@ -246,6 +250,13 @@ class Eclipse(AbstractPart):
         self.position = vector_of_time("Eclipse position", position)
         self.direction = _direction_of_time("Eclipse direction", direction)
         self.radius = as_positive("Eclipse radius", radius)
+
+    @property
+    def input_conditions(self) -> tuple[Array, ...]:
+        conditions = above_zero(self.radius)
+        if not callable(self.direction):
+            conditions += (jnp.all(jnp.isfinite(self.direction), axis=-1),)
+        return conditions
 
     def __call__(self, t: Array | float) -> Array:
         r = value_at("Eclipse position", self.position, t)

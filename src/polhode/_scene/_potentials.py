@@ -136,7 +136,7 @@ class AlongZ(AbstractPotential):
         if isinstance(self.field, UniformGravity):
             return -self.strength * self.field.height(row)
         distance = jnp.abs(self.strength)
-        return _gradient_energy(self.field.mu, distance, distance * distance, row, inertia)
+        return _gradient_energy(self.field.mu, distance, row, inertia)
 
 
 class GravityGradient(AbstractPotential):
@@ -164,13 +164,12 @@ class GravityGradient(AbstractPotential):
 
     def energy(self, attitude: Attitude, t: Array | float, inertia: Inertia) -> Array:
         place = value_at("GravityGradient", self.position_space, t)
-        square = dot(place, place)
-        distance = jnp.sqrt(square)
+        distance = jnp.sqrt(dot(place, place))
         direction = attitude.to_body(tuple(x / distance for x in place))
-        return _gradient_energy(self.mu, distance, square, direction, inertia)
+        return _gradient_energy(self.mu, distance, direction, inertia)
 
 
-def _gradient_energy(mu, distance, square, direction, inertia: Inertia) -> Array:
+def _gradient_energy(mu, distance, direction, inertia: Inertia) -> Array:
     """``direction``: components in the body of the unit vector to the centre, of either sign."""
     if inertia.is_principal:
         moments = components(inertia.moments)
@@ -181,7 +180,9 @@ def _gradient_energy(mu, distance, square, direction, inertia: Inertia) -> Array
         trace = jnp.trace(tensor, axis1=-2, axis2=-1)
         rows = tuple(dot(components(tensor[..., i, :]), direction) for i in range(3))
         project = dot(direction, rows)
-    return -mu / (2 * square * distance) * (trace - 3 * project)
+    # factor by factor: the derivative of x / distance**3 holds distance**-6, subnormal in float32
+    inverse = 1 / distance
+    return -mu / 2 * inverse * inverse * inverse * (trace - 3 * project)
 
 
 _FUNCTION = Signature("Potential", {"R": (3, 3), "t": ()})

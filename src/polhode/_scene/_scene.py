@@ -1,5 +1,6 @@
 """Scene and state: a body with what acts on it, how its motion starts; narrower constructors."""
 
+import dataclasses
 from collections.abc import Sequence
 from functools import reduce
 from typing import TYPE_CHECKING, Any, Protocol
@@ -11,12 +12,14 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from polhode import rotation
+from polhode._batch import map_arrays
 from polhode._checks import ArrayLike, as_float_array, is_concrete, require
 from polhode._hamiltonian import (
     Dynamics,
     Hamiltonian,
     canonical_from_momentum,
     components,
+    from_quaternion,
     inverse_inertia,
     lie_poisson_field,
     momentum_from_canonical,
@@ -431,6 +434,39 @@ def check_scene(scene: Scene) -> None:
         part = getattr(scene, name)
         if part is not None:
             check_fields(part, f"scene.{name}")
+    for torque in summands(scene.torque):
+        _check_batch_axes(torque)
+
+
+def _check_batch_axes(torque: AbstractTorque) -> None:
+    """ValueError for a torque of the user's class with batch axes that ``core_ranks`` leaves out.
+
+    Nothing is computed: the torque of one body is traced.
+    """
+    if type(torque).__module__.partition(".")[0] == "polhode":
+        return
+    arrays = {f.name: getattr(torque, f.name) for f in dataclasses.fields(torque)}
+    others = [
+        name
+        for name, x in arrays.items()
+        if name not in torque.core_ranks and isinstance(x, jax.Array | np.ndarray) and x.ndim
+    ]
+    if not others:
+        return
+    one = map_arrays(torque, lambda x, rank: x[(0,) * (x.ndim - rank)])
+    dtype = jnp.result_type(*(arrays[name] for name in others))
+    numbers = [jax.ShapeDtypeStruct((), dtype, weak_type=True)] * 8
+
+    def components_of(t, *numbers):
+        return one.body_components(t, from_quaternion(numbers[:4]), numbers[4:])
+
+    shapes = [np.shape(x) for x in jax.eval_shape(components_of, *numbers)]
+    if any(shapes):
+        raise ValueError(
+            f"{type(torque).__name__}.body_components returned components of the shapes {shapes}"
+            f" for one body, where () is expected. If {', '.join(others)} of it may have batch"
+            ' axes, let core_ranks return {"NAME": n} for each, n being the axes of one body.'
+        )
 
 
 def specialise(scene: Scene) -> Scene:
@@ -527,12 +563,16 @@ def _wheel(wheel: Rotor) -> Rotor:
     if wheel.axis_body is None:
         return wheel
     vector = np.asarray(wheel.axis_body)
+    momentum, speed = (  # with the batch axes of the axis, which is dropped
+        None if x is None else jnp.broadcast_to(x, np.broadcast_shapes(x.shape, vector.shape[:-1]))
+        for x in (wheel.momentum, wheel.speed)
+    )
     for axis in range(3):
         if np.all(np.delete(vector, axis, axis=-1) == 0) and np.all(vector[..., axis] > 0):
             return Rotor.axial(
                 wheel.inertia,
-                wheel.momentum,
-                wheel.speed,
+                momentum,
+                speed,
                 wheel.torque,
                 wheel.impulse,
                 wheel.coupling,
@@ -544,7 +584,9 @@ def _wheel(wheel: Rotor) -> Rotor:
 def _orbit(orbit: KeplerOrbit) -> KeplerOrbit:
     if orbit.eccentricity is None or np.any(np.asarray(orbit.eccentricity) != 0):
         return orbit
-    return eqx.tree_at(lambda o: o.eccentricity, orbit, None)
+    shape = np.broadcast_shapes(orbit.mu.shape, orbit.eccentricity.shape)  # of the batch
+    circle = eqx.tree_at(lambda o: o.mu, orbit, jnp.broadcast_to(orbit.mu, shape))
+    return eqx.tree_at(lambda o: o.eccentricity, circle, None)
 
 
 _RULES = {

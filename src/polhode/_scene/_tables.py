@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import ArrayLike, as_float_array, is_concrete, require
+from polhode._checks import ArrayLike, as_float_array, batch_of, is_concrete, require
 from polhode._kernels import smooth
 from polhode._parts import AbstractPart, shaped
 
@@ -24,8 +24,9 @@ class Table(AbstractPart):
     number, (..., n, k) of a vector of k components, with leading axes for a batch; ``order``
     (static): 3 for cubic interpolation, whose error falls with the fourth power of the spacing, or
     1 for linear interpolation. ``derivatives``: of the values [1/s], of their shape, for cubic
-    interpolation where they are known, such as the velocities of an ephemeris; None: those of the
-    polynomials through five neighbouring values. ``kind``: "number" or "vector", where the shape
+    interpolation where they are known, such as the velocities of an ephemeris, their leading axes
+    broadcast with those of the values; None: those of the polynomials through five neighbouring
+    values. ``kind``: "number" or "vector", where the shape
     of the values leaves both open.
 
     At the table times the first derivative of a linear table and the second derivative of a cubic
@@ -100,8 +101,16 @@ class Table(AbstractPart):
                 f"Table derivatives must have the shape of the values, {array.shape}, got"
                 f" {derivative_array.shape}."
             )
-        self.derivatives = derivative_array[..., None] if self.is_number else derivative_array
+        given = derivative_array[..., None] if self.is_number else derivative_array
+        lead = batch_of(values=(self.values, 2), derivatives=(given, 2))
+        self.values, self.derivatives = (
+            jnp.broadcast_to(x, (*lead, *x.shape[-2:])) for x in (self.values, given)
+        )
         self.has_kinks = _has_kinks(self.values, self.derivatives, knots)
+
+    @property
+    def input_conditions(self) -> tuple[Array, ...]:
+        return (jnp.all(self.times[1:] > self.times[:-1]),)
 
     def __call__(self, t: Array | float) -> Array:
         """Value at the times ``t`` (...): (...) of a number, (..., k) of a vector."""

@@ -1,6 +1,7 @@
 """Torques: in body and space axes, of the state, damping, pulses, and an energy sink."""
 
 import abc
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -291,6 +292,9 @@ class EnergySink(AbstractTorque):
         return triple(rate * x for x in cross(momentum, omega))
 
 
+_COMMAND = dataclasses.replace(_FEEDBACK, name="SampledTorque")
+
+
 class SampledTorque(AbstractTorque):
     """A controller that runs once in every period; its torque is held in between.
 
@@ -315,7 +319,7 @@ class SampledTorque(AbstractTorque):
     period: float = eqx.field(static=True)
 
     def __init__(self, fn: Callable, period: float):
-        self.fn = _FEEDBACK.checked(fn)
+        self.fn = _COMMAND.checked(fn)
         if isinstance(period, bool) or not isinstance(period, (int, float)):
             raise TypeError(
                 "SampledTorque period must be a number in seconds such as 0.1, got"
@@ -327,7 +331,7 @@ class SampledTorque(AbstractTorque):
 
     def command(self, t: Array, wxyz: Array, omega: Array) -> Array:
         """The torque (N, 3) [N m] that N bodies will hold from the time ``t`` on."""
-        return _FEEDBACK.mapped(self.fn, t, wxyz, omega)
+        return _COMMAND.mapped(self.fn, t, wxyz, omega)
 
     def body_components(
         self, t: Array | float, attitude: Attitude, omega: Sequence[Array]
@@ -385,6 +389,10 @@ class Pulses(AbstractTorque):
                 np.asarray(self.ends) > np.asarray(self.starts),
                 f"each pulse must end after it starts, got {starts} and {ends}.",
             )
+
+    @property
+    def input_conditions(self) -> tuple[Array, ...]:
+        return (jnp.all(self.ends > self.starts),)
 
     @property
     def edges(self) -> Array | None:

@@ -405,7 +405,9 @@ class Trajectory(eqx.Module):
                 f"no sample lies between {start} and {end}; they run from {ts[0]} to {ts[-1]}:"
                 " for times between samples use traj.at(times)."
             )
-        return self[..., places[0] : places[-1] + 1]
+        first, last = int(places[0]), int(places[-1])
+        is_contiguous = last - first + 1 == places.size  # not where times are in another order
+        return self[..., slice(first, last + 1) if is_contiguous else places]
 
     @property
     def batch_shape(self) -> tuple[int, ...]:

@@ -19,20 +19,22 @@ import typer
 
 from polhode.files import SceneFileError, shipped_scenes
 from polhode.files._read import escape, reason
+from polhode.files._values import MAX_CLONES, MAX_SEED
 
 _SIZES = {"": 1, "k": 10**3, "m": 10**6, "g": 10**9, "t": 10**12}
 
 
-def whole_number(minimum: int) -> Callable[[str], int]:
-    """A whole number not below `minimum`."""
+def whole_number(minimum: int, maximum: int | None = None) -> Callable[[str], int]:
+    """A whole number not below `minimum` and not above `maximum`, if there is one."""
+    bounds = f"from {minimum} up" if maximum is None else f"from {minimum} to {maximum}"
 
     def convert(text: str | int) -> int:
         try:
             value = int(str(text))
         except ValueError:
             value = minimum - 1
-        if value < minimum:
-            raise typer.BadParameter(f"{str(text)[:80]!r} is not a whole number from {minimum} up")
+        if value < minimum or (maximum is not None and value > maximum):
+            raise typer.BadParameter(f"{str(text)[:80]!r} is not a whole number {bounds}")
         return value
 
     return convert
@@ -116,12 +118,12 @@ ClonesOption = Annotated[
         "--clones",
         "N",
         "number of Monte Carlo clones, instead of the scene's; 0: the nominal body only",
-        whole_number(0),
+        whole_number(0, MAX_CLONES),
     ),
 ]
 SeedOption = Annotated[
     int | None,
-    option("--seed", "N", "seed of the clones, instead of the scene's", whole_number(0)),
+    option("--seed", "N", "seed of the clones, instead of the scene's", whole_number(0, MAX_SEED)),
 ]
 PrecisionOption = Annotated[
     str, option("--precision", "float64|float32", "numbers to compute with", _precision)

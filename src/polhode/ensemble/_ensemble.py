@@ -20,6 +20,7 @@ from polhode import rotation
 from polhode._batch import PARTS, batch_shapes, is_lane_tree
 from polhode._scene import BodyTorque, Scene, SpaceTorque, State
 from polhode.ensemble._statistics import QUANTITIES, Statistic
+from polhode.ensemble._store import plain_number
 from polhode.files._read import possible_moments
 from polhode.inertia import Inertia
 
@@ -55,9 +56,9 @@ class Ensemble(eqx.Module):
 
     scene: Scene
     state: State
-    bodies: int = eqx.field(static=True)
+    bodies: int = eqx.field(static=True, converter=plain_number)
     spreads: tuple[Spread, ...] = ()
-    seed: int = eqx.field(static=True, default=0)
+    seed: int = eqx.field(static=True, default=0, converter=plain_number)
     rows: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     def __check_init__(self):
@@ -112,7 +113,7 @@ def draw(
     """The bodies of the indices (n,) of uint32 and a seed of uint32; traceable."""
     root = jax.random.key(seed, impl="threefry2x32")
 
-    def draw_one(index, leaves_and_rows):
+    def draw_one(index, leaves_and_rows) -> tuple[Any, Any]:
         leaves, rows = leaves_and_rows
         scene, state = eqx.combine(leaves, shared)
         scene, state = _replace_rows(scene, state, rows)
@@ -127,11 +128,27 @@ def draw(
             scene, state = spread(spread_key, scene, state)
         if "momentum_body" in rows:
             state = _with_momentum(scene, state, rows["momentum_body"])
-        return scene, state
+        return eqx.partition((scene, state), _may_differ((scene, state)))
 
-    return eqx.filter_vmap(draw_one, in_axes=(0, eqx.if_array(0)), out_axes=eqx.if_array(0))(
-        indices, lane_parts
-    )
+    axes = (eqx.if_array(0), None)  # what all bodies share has no axis of bodies
+    try:
+        drawn = eqx.filter_vmap(draw_one, in_axes=(0, eqx.if_array(0)), out_axes=axes)(
+            indices, lane_parts
+        )
+    except ValueError as error:
+        if "out_axes" not in str(error):
+            raise
+        raise ValueError(
+            "a spread changes an array that all bodies share, such as the moment of a"
+            " ph.DipoleField, the edges of ph.Pulses or the times of a ph.Table: let it change"
+            " arrays that bodies may differ in, such as scene.inertia or the state."
+        ) from error
+    return eqx.combine(*drawn)
+
+
+def _may_differ(parts: Any) -> Any:
+    """Mask of the leaves of one body that bodies may differ in."""
+    return is_lane_tree(jax.tree.map(lambda x: x[None] if eqx.is_array(x) else x, parts))
 
 
 def _replace_rows(scene: Scene, state: State, rows: Mapping[str, Array]) -> tuple[Scene, State]:
@@ -268,10 +285,13 @@ class SpreadTorque(eqx.Module):
 def constant_torque(scene: Scene) -> Array:
     """The numbers of the one constant torque of a scene [N m]. Raises TypeError without one."""
     torque = scene.torque
-    if not isinstance(torque, BodyTorque | SpaceTorque) or not isinstance(torque.n, Array):
+    is_of_kind = isinstance(torque, BodyTorque | SpaceTorque)
+    if not is_of_kind or not isinstance(torque.n, Array):
+        kind = type(torque).__name__
         raise TypeError(
             "torques of an ensemble vary around one constant ph.BodyTorque or ph.SpaceTorque, got"
-            f" {type(torque).__name__}: give the scene such a torque, or write your own spread."
+            f" {f'a {kind} that depends on time' if is_of_kind else kind}: give the scene such a"
+            " torque, or write your own spread."
         )
     return torque.n
 

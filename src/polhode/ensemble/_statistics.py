@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from polhode import rotation
 from polhode._trajectory import Trajectory
-from polhode.ensemble._store import Store
+from polhode.ensemble._store import Store, plain_number
 
 SUMMARY_QUANTILES = (0.05, 0.25, 0.5, 0.75, 0.95)
 
@@ -33,6 +33,8 @@ class Statistic:
     bins: int = 100
 
     def __post_init__(self):
+        for name in ("low", "high", "bins"):
+            object.__setattr__(self, name, plain_number(getattr(self, name)))
         if not self.name.isidentifier():
             raise ValueError(f"the name of a statistic must be an identifier, got {self.name!r}.")
         if (self.low is None) != (self.high is None):

@@ -332,6 +332,11 @@ def _is_abandoned(path: Path) -> bool:
         return False
 
 
+def plain_number(x: Any) -> Any:
+    """A number of NumPy or JAX as one of Python, which JSON can hold; anything else as it is."""
+    return x.item() if getattr(x, "shape", None) == () else x
+
+
 def digest(*values: Any) -> str:
     """A SHA-256 of the structure, the static fields and the numbers of the values.
 

@@ -39,6 +39,7 @@ from polhode.ensemble._store import (
     digest,
     has_user_code,
     make_layout,
+    plain_number,
     versions,
 )
 
@@ -316,7 +317,7 @@ class Job:
             "seed": ensemble.seed,
             "times": self.times.size,
             "dtype": str(self.times.dtype),
-            "rtol": self.rtol,
+            "rtol": plain_number(self.rtol),
             "block": block.size,
             "trajectories": self.trajectories,
             "statistics": [[s.name, s.low, s.high, s.bins] for s in self.statistics],
@@ -354,6 +355,7 @@ def chunk_sizes(job: Job, memory: int | None, chunk: int | None, parts: int = 1)
     blocks. Raises ValueError for a memory or a chunk that is not possible.
     """
     block, devices = job.block.size, len(job.block.devices)
+    chunk = plain_number(chunk)
     if chunk is not None and (chunk < 1 or chunk % block):
         raise ValueError(
             f"chunk must be a positive multiple of the block of {block} bodies, got {chunk}: leave"

@@ -273,8 +273,8 @@ class MomentumSigma(Sigma):
 class MonteCarlo(Spreads):
     """Clones around the nominal body, each quantity drawn from a normal distribution."""
 
-    clones: Annotated[int, Field(ge=1, le=10_000_000)]
-    seed: Annotated[int, Field(ge=0, le=2**63 - 1)]
+    clones: Annotated[int, Field(ge=1, le=_values.MAX_CLONES)]
+    seed: Annotated[int, Field(ge=0, le=_values.MAX_SEED)]
     moments: MomentsSigma | None = None
     euler: AngleSigma | None = None
     attitude: AngleSigma | None = None
@@ -474,13 +474,19 @@ class SceneFile(Table):
                 "[monte_carlo] and [ensemble] exclude each other: keep [monte_carlo] for a file"
                 " with a figure, [ensemble] for a store of any size"
             )
-        constant = len(self.torque) == 1 and isinstance(self.torque[0], ConstantTorque)
+        constant = len(self.torque) == 1 and all(
+            isinstance(x, ConstantTorque) and isinstance(x.n, list) and not x.needs_orbit
+            for x in self.torque
+        )
         needs = {
             "moments": (self.inertia.moments, "an [inertia] given by its moments"),
             "euler": (self.state.euler, "a [state] given by Euler angles"),
             "omega_body": (self.state.omega_body, "a [state] with omega_body"),
             "momentum_body": (self.state.momentum_body, "a [state] with momentum_body"),
-            "torque": (constant or None, "one [torque] of kind body or space"),
+            "torque": (
+                constant or None,
+                "one [torque] of kind body or space, constant and inertial",
+            ),
         }
         tables = {}
         if self.monte_carlo is not None:

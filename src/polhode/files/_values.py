@@ -21,6 +21,8 @@ from pydantic import (
 )
 
 MAX_SAMPLES = 10_000_000
+MAX_CLONES = 10_000_000
+MAX_SEED = 2**63 - 1  # NetCDF stores it as a 64-bit number
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]

@@ -96,15 +96,16 @@ def polhode(
     *,
     body: int | None = None,
     ax: Any = None,
-    family: int = 7,
+    family: int = 8,
     axis_names: tuple[str, str, str] = ("x", "y", "z"),
     view: tuple[float, float] | None = None,
 ) -> Any:
     """Draw the polhode of one body on its inertia ellipsoid; returns the 3-D Axes.
 
     The ellipsoid is that of constant kinetic energy at the first time, in the space of body rates,
-    scaled so that its largest semi-axis is 1. Thin lines are `family` other polhodes of the same
-    energy on either side of the separatrix (dashed), which passes through the intermediate axis.
+    scaled so that its largest semi-axis is 1. Thin lines are polhodes of the same energy for
+    `family` other sizes of the momentum, two curves each, half of them on either side of the
+    separatrix (dashed), which passes through the intermediate axis; 0: none.
     Parts of a curve behind the ellipsoid are faint; a dot marks the first time. `view` is
     (elevation, azimuth) in degrees; None: towards the curve.
     """
@@ -201,11 +202,13 @@ def _surface(ax, semi, turn, eye):
 
 
 def _family(moments, twice_energy, count):
-    """Polhodes of the same energy: closed curves around the first and the last principal axis."""
+    """Polhodes of the same energy and `count` momenta: closed curves around the first principal
+    axis and, the smaller half of them, around the last one."""
     low, middle, high = moments
-    for axis, (start, stop) in ((0, (low, middle)), (2, (middle, high))):
+    halves = (0, (low, middle), count - count // 2), (2, (middle, high), count // 2)
+    for axis, (start, stop), levels in halves:
         # at equal gaps of the height above the separatrix plane rather than of |L|^2
-        for fraction in (np.arange(count // 2 + 1) + 0.5) / (count // 2 + 1):
+        for fraction in (np.arange(levels) + 0.5) / levels:
             inertia = start + (stop - start) * (fraction**2 if axis == 0 else 1 - fraction**2)
             yield from _level(moments, twice_energy, inertia, axis)
 
@@ -323,9 +326,10 @@ def overview(
     """A figure of the first body, with the spread of the others, and observations.
 
     Left: the three body axes as directions in space (components along space x, y, z) and the body
-    rates, lines for body 0 and bands from the 5th to the 95th percentile of the others; dots are
-    `observed` (`plot.samples` of one body; NaN where nothing was observed). Right: the polhode, or
-    the energy of a body that starts at rest or whose inertia changes with time.
+    rates, lines for body 0 and bands from the 5th to the 95th percentile of the others, or thin
+    lines of up to 64 of them where bodies have times of their own; dots are `observed`
+    (`plot.samples` of one body; NaN where nothing was observed). Right: the polhode, or the energy
+    of a body that starts at rest or whose inertia changes with time.
     """
     data = as_samples(what)
     names = tuple(plain(name, 30) for name in axis_names)
@@ -335,11 +339,12 @@ def overview(
     rows = [figure.add_subplot(grid[0, 0])]
     rows += [figure.add_subplot(grid[k, 0], sharex=rows[0]) for k in (1, 2, 3)]
     t = data.ts[0] / scale.seconds
-    direction, band = data.matrices, data.count > 2
+    times, direction = data.ts / scale.seconds, data.matrices
+    is_shared = bool(np.all(data.ts == data.ts[0]))
     observed_times = None if observed is None else observed.ts[0] / scale.seconds
     for k, ax in enumerate(rows[:3]):
         for i, color in enumerate(AXES):
-            _curve(ax, t, direction[:, :, i, k], color, f"space {'xyz'[i]}", band)
+            _curve(ax, times, direction[:, :, i, k], color, f"space {'xyz'[i]}", is_shared)
             if observed is not None and observed.wxyz is not None:
                 _dots(ax, observed_times, observed.matrices[0, :, i, k], color)
         ax.set_ylim(-1.1, 1.1)
@@ -348,7 +353,7 @@ def overview(
         ax.set_title(f"Body {letter} axis{name}: direction in space")
     for k, color in enumerate(AXES):
         unit = scale.radians_per_second
-        _curve(rows[3], t, data.omega_body[:, :, k] / unit, color, names[k], band)
+        _curve(rows[3], times, data.omega_body[:, :, k] / unit, color, names[k], is_shared)
         if observed is not None:
             _dots(rows[3], observed_times, observed.omega_body[0, :, k] / unit, color)
     rows[3].set_title("Body rates")
@@ -376,14 +381,19 @@ def overview(
         ax = figure.add_subplot(grid[:3, 1], projection="3d")
         polhode(data, ax=ax, axis_names=names)
         ax.set_title("Polhode on the inertia ellipsoid", loc="center")
-    _key(figure.add_subplot(grid[3, 1]), observed is not None, data.count - 1)
+    _key(figure.add_subplot(grid[3, 1]), observed is not None, data.count - 1, is_shared)
     if title:
         figure.suptitle(plain(title), x=0.01, ha="left", fontsize=13, fontweight="bold", color=INK)
     return figure
 
 
-def _curve(ax, t, values, color, label, band):
-    if band:
+def _curve(ax, times, values, color, label, is_shared):
+    """Body 0 as a line; three or more bodies as a band, or as lines unless they share the times."""
+    t = times[0]
+    if len(values) > 2 and not is_shared:
+        others = slice(1, 1 + _MOST_BODIES)
+        ax.plot(times[others].T, values[others].T, color=color, alpha=0.3, linewidth=0.6, zorder=2)
+    elif len(values) > 2:
         with np.errstate(invalid="ignore"), warnings.catch_warnings():
             warnings.simplefilter("ignore", RuntimeWarning)  # at a time that no clone reached
             low, high = np.nanpercentile(values[1:], _BAND, axis=0)
@@ -404,14 +414,17 @@ def _dots(ax, t, values, color):
     )
 
 
-def _key(ax, observed, clones):
+def _key(ax, observed, clones, is_shared):
     """What lines, bands and dots mean."""
     from matplotlib.artist import Artist
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     entries: list[tuple[Artist, str]] = [(Line2D([], [], color=INK, linewidth=1.3), "nominal body")]
-    if clones > 1:
+    if clones > 1 and not is_shared:
+        line = Line2D([], [], color=INK, alpha=0.3, linewidth=0.6)
+        entries.append((line, f"{min(clones, _MOST_BODIES)} of {clones:,} other bodies"))
+    elif clones > 1:
         entries.append((Patch(color=INK, alpha=0.22), f"5 % to 95 % of {clones:,} clones"))
     if observed:
         dot = Line2D([], [], color=INK, marker="o", linestyle="", markersize=4.2)

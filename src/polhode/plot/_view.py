@@ -65,7 +65,7 @@ class Body:
 
 def chosen_bodies(what: Any, bodies: Sequence[int] | None) -> list[Body]:
     """The bodies to show, by number, of one motion or of several."""
-    several = what if isinstance(what, list) else [what]
+    several = what if isinstance(what, Sequence) else [what]
     candidates: list[Body] = []
     for one in several:
         candidates += [one] if isinstance(one, Body) else bodies_of(one)
