@@ -543,6 +543,23 @@ def test_a_terminal_event_is_stored_when_the_places_are_taken(torque):
     assert np.isfinite(traj.omega_body).all()
 
 
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_an_event_where_a_relay_turns_has_the_derivatives_of_the_motion_before(mode):
+    """w' = (0.3, 0, 0.05) up to the event, w_0 = 1/2, beyond which the torque is another one."""
+
+    def end(rates):
+        below, above = jnp.array([0.3, 0.0, 0.05]), jnp.array([-0.6, 0.1, 0.0])
+        relay = ph.FeedbackTorque(lambda t, wxyz, omega: jnp.where(omega[0] > 0.5, above, below))
+        scene = ph.Scene(ph.Inertia.spherical(1.0), torque=relay)
+        event = ph.Event(lambda wxyz, omega, t: omega[0] - 0.5)
+        motion = ph.simulate(scene, ph.State([1.0, 0, 0, 0], rates), [0.0, 6.0], until=event)
+        return jnp.append(motion.last.omega_body, motion.event_time)
+
+    found = jax.jit(mode(end))(jnp.array([0.1, 0.2, 0.3]))
+    expected = [[0, 0, 0], [0, 1, 0], [-1 / 6, 0, 1], [-1 / 0.3, 0, 0]]
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+
+
 def test_bad_input_is_told_where_events_are_searched_for():
     """Under jit, where nothing is raised."""
     event = ph.Event(lambda wxyz, omega, t: t - 1.5, samples=20)

@@ -193,7 +193,7 @@ def _by_steps(trajectory: Trajectory, event: Event, capacity: int) -> Any:
     times = events.rows[:, 1:]
     use = jnp.isfinite(events.times)
     tolerance = 64 * jnp.finfo(times.dtype).eps * jnp.abs(times)
-    delay, at_events = event.differentiable_at(at_events, tolerance)
+    delay, at_events = event.differentiable_at(at_events, tolerance, events.side)
     _, slope = event.values(at_events)
     has_failed = samples.status != Status.SUCCESSFUL
     has_failed = has_failed & (trajectory.status.reshape(-1) == Status.SUCCESSFUL)

@@ -73,33 +73,39 @@ class Event(eqx.Module):
         slopes = (*rates[:2], jnp.ones_like(t))
         return jax.jvp(partial(_FUNCTION.mapped, self.fn), (wxyz, omega, t), slopes)
 
-    def differentiable_at(self, approximate: Trajectory, limit: Array) -> tuple[Array, Trajectory]:
+    def differentiable_at(
+        self, approximate: Trajectory, limit: Array, side: Array
+    ) -> tuple[Array, Trajectory]:
         """``refined`` for samples at which the function is zero to rounding: the same derivatives,
-        and no computation where none is needed."""
+        and no computation where none is needed. ``side`` (..., T): sign of the function before."""
         arrays, static = eqx.partition(approximate, eqx.is_inexact_array)
 
-        def values_of(arrays, limit):
-            delay, at_events = self.refined(eqx.combine(arrays, static), limit)
+        def values_of(arrays, limit, side):
+            delay, at_events = self.refined(eqx.combine(arrays, static), limit, side)
             return [delay, *at_events._samples]
 
         values = [jnp.zeros_like(approximate._t), *approximate._samples]
-        delay, *states = attached_to(values_of, (arrays, limit), values)
+        delay, *states = attached_to(values_of, (arrays, limit, side), values)
         at_events = approximate._with_samples(
             approximate._t + delay, states, approximate.status, approximate._steps, None
         )
         return delay, at_events
 
-    def refined(self, approximate: Trajectory, limit: Array) -> tuple[Array, Trajectory]:
+    def refined(
+        self, approximate: Trajectory, limit: Array, side: Array | None = None
+    ) -> tuple[Array, Trajectory]:
         """Samples moved to the events next to them.
 
         ``approximate``: samples (..., T) near events; ``limit`` [s]: the longest move. Returns the
-        moves (..., T) [s], and the samples at the events.
+        moves (..., T) [s], and the samples at the events. ``side``: where the rates may jump at the
+        event, the sign of the function before it, whose rates lead there.
 
         Steps t - g(t)/s with one constant s, the rate of change of g: where g(t) is zero they
         change nothing, and after two of them t has the first and second derivatives of the root.
         """
         stop_gradient = jax.lax.stop_gradient
-        rates, later = shortly_after(approximate)
+        shift = None if side is None else self._towards(approximate, side)
+        rates, later = shortly_after(approximate, shift)
         value, slope = self.values(approximate, rates)
         touch, chord = slope == 0, stop_gradient(jnp.where(slope == 0, 1, slope))
         delay = jnp.where(touch, 0, -value / chord)
@@ -109,6 +115,34 @@ class Event(eqx.Module):
         change = jnp.where(touch, 0, -value / chord)
         delay = _differentiable(delay + (change - stop_gradient(change)), 2)
         return delay, later(delay)
+
+    def _towards(self, trajectory: Trajectory, side: Array) -> list[Array]:
+        """Changes of attitude, rates and time by some units in the last place, which lead from the
+        surface where the function is zero to the ``side`` where it has this sign."""
+        wxyz, omega = trajectory.wxyz, trajectory.omega_body
+        t = jnp.broadcast_to(trajectory._t, omega.shape[:-1])
+        units = [
+            jnp.ones_like(wxyz),
+            jnp.broadcast_to(jnp.linalg.norm(omega, axis=-1, keepdims=True), omega.shape),
+            jnp.maximum(jnp.abs(t), jnp.finfo(t.dtype).tiny),
+        ]
+
+        def total(*point):
+            return jnp.sum(_FUNCTION.mapped(self.fn, *point))
+
+        slopes = jax.grad(total, argnums=(0, 1, 2))(wxyz, omega, t)
+        slopes = [x * unit for x, unit in zip(slopes, units, strict=True)]
+        square = slopes[2] ** 2 + sum(jnp.sum(x * x, axis=-1) for x in slopes[:2])
+        reach = _TOWARDS * jnp.finfo(t.dtype).eps * side
+        reach = reach * jax.lax.rsqrt(jnp.where(square > 0, square, 1))
+        *vectors, change = (x * unit for x, unit in zip(slopes, units, strict=True))
+        moves = [reach[..., None] * x for x in vectors] + [reach * change]
+        return [jax.lax.stop_gradient(x) for x in moves]
+
+
+_TOWARDS = 256
+"""[units in the last place] How far from the surface of an event rates are evaluated where a torque
+may jump there; it is found to some of them."""
 
 
 def _differentiable(x: Array, order: int) -> Array:

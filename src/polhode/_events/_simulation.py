@@ -105,7 +105,7 @@ def events_by_steps(begin: Trajectory, ts: Array, events: Sequence[Event]) -> Tr
     tolerance = 64 * jnp.finfo(ts.dtype).eps * jnp.abs(at_events._t)
     delay, states = jnp.zeros_like(at_events._t), at_events._samples
     for k, event in enumerate(events):
-        event_delay, at_event = event.differentiable_at(at_events, tolerance)
+        event_delay, at_event = event.differentiable_at(at_events, tolerance, record.side)
         is_this = record.which == k
         delay = jnp.where(is_this, event_delay, delay)
         states = [

@@ -207,10 +207,12 @@ class Search(NamedTuple):
 
 class Found(NamedTuple):
     """Events of N bodies in the order of the motion: ``times`` (N, E) [s], inf where there is none,
-    ``which`` (N, E) event, ``count`` (N,): their number; ``rows`` (N, T): times of the samples."""
+    ``which`` (N, E) event, ``side`` (N, E): 1 where its function is positive before it, or else -1;
+    ``count`` (N,): their number; ``rows`` (N, T): times of the samples."""
 
     times: Array
     which: Array
+    side: Array
     count: Array
     rows: Array
 
@@ -225,7 +227,9 @@ def with_events(search: Search, solution: Solved, times: Array, states: Array):
     assert solution.count is not None
     event_times = solution.times.reshape(bodies, capacity + 1)[:, :-1]
     event_states = solution.states_at_events.reshape(bodies, capacity + 1, -1)[:, :-1]
-    which = solution.which.reshape(bodies, capacity + 1)[:, :-1].astype(jnp.int32)
+    code = solution.which.reshape(bodies, capacity + 1)[:, :-1]
+    which = jnp.floor(code).astype(jnp.int32)
+    side = jnp.where(code > which.astype(code.dtype), -1, 1).astype(code.dtype)
     times = jnp.broadcast_to(jnp.atleast_2d(times), states.shape[:2])
     is_event = jnp.isfinite(event_times)
     if any(search.terminal):
@@ -242,4 +246,4 @@ def with_events(search: Search, solution: Solved, times: Array, states: Array):
     event_states = jnp.where(is_event[..., None], event_states, states[:, -1:])
     times = jnp.concatenate([times, at_events], axis=1)
     states = jnp.concatenate([states, event_states], axis=1)
-    return Found(event_times, which, solution.count, times), times, states
+    return Found(event_times, which, side, solution.count, times), times, states

@@ -485,9 +485,11 @@ def _apply_switch(
         if options.terminal[k]:  # stored in any case, for it is where the motion ends
             rows = jnp.where(is_event & (count >= capacity), base + capacity - 1, rows)
         t = start + sign * progress_after.elapsed
+        # a half more where the function is positive after the event
+        which = k + jnp.where(turn.levels[row] > 0, 0.5, 0.0).astype(t.dtype)
         storage = storage._replace(
             times=put(storage.times, rows, t[:, None]),
-            which=put(storage.which, rows, jnp.full((bodies, 1), k, t.dtype)),
+            which=put(storage.which, rows, which[:, None]),
             states=put(storage.states, rows, progress_after.y.T),
         )
         count = count + jnp.where(is_event, 1, 0).astype(count.dtype)

@@ -189,13 +189,13 @@ def _from_nearest(propagator: Propagator, scene: Scene, samples, ts, times):
 
 
 def shortly_after(
-    trajectory: Trajectory,
+    trajectory: Trajectory, shift: list[Array] | None = None
 ) -> tuple[list[Array], Callable[[Array], Trajectory]]:
     """Rates of the samples, and a function of delays (..., T) [s] so short that three terms of the
     Taylor series of the samples lead there: of what is no later but for its derivatives, values and
-    two derivatives."""
+    two derivatives. ``shift``: of attitudes, rates and times to where the rates are evaluated."""
     t = trajectory
-    rates, along = _along(t._scene, t._samples, t._t)
+    rates, along = _along(t._scene, t._samples, t._t, shift)
 
     def later(delay: Array) -> Trajectory:
         return t._with_samples(t._t + delay, along(delay[..., None]), t.status, t._steps, None)
@@ -204,7 +204,7 @@ def shortly_after(
 
 
 def _along(
-    scene: Scene, samples: list[Array], t: Array
+    scene: Scene, samples: list[Array], t: Array, shift: list[Array] | None = None
 ) -> tuple[list[Array], Callable[[Array], list[Array]]]:
     """Rates of samples (..., 4), (..., 3) and momenta of coupled wheels, and a function of a step
     (..., 1) [s]: the samples that much later."""
@@ -219,6 +219,10 @@ def _along(
         return [wxyz_rate(wxyz, omega), acceleration, *spin_rates]
 
     begin = list(samples), jnp.asarray(t)
+    if shift is not None:
+        *moves, delay = shift
+        moved = [x + move for x, move in zip(samples, moves)]
+        begin = [*moved, *samples[2:]], begin[1] + delay
     first_derivative = rates(*begin)
     _, second_derivative = jax.jvp(rates, begin, (first_derivative, jnp.ones_like(begin[1])))
 
