@@ -2,14 +2,17 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import polhode as ph
-from polhode.fit import Finding, Recording, fit_inertia, stack
-from polhode.fit._conclude import has_outliers
+from polhode.fit import Finding, FitOptions, Recording, fit_inertia, stack
+from polhode.fit._conclude import _axes_disagree, has_outliers, whiteness_of
 from polhode.fit._options import saturation
+from polhode.fit._recording import rotation_vector_between, turns_between_samples
+from polhode.rotation import multiply, rotation_vector_to_wxyz
 
 T = np.linspace(0, 20, 500)
 RATES = np.stack([3 * np.sin(T), 2 * np.cos(1.3 * T), 1 + 0.5 * np.sin(2 * T)], -1)
@@ -89,6 +92,48 @@ def test_single_samples_far_off_are_outliers_and_runs_are_not():
     at_limit = rest * (limits == 0)
     saturated = dataclasses.replace(whole, saturated=jnp.asarray(limits))
     assert not has_outliers(jnp.asarray(at_limit), saturated, None)
+
+
+@pytest.mark.parametrize("gaps", [0.0, 0.5, 0.9])
+def test_white_residuals_are_white_beside_gaps(gaps):
+    """Their probabilities are uniform: of 300, 15 +- 4 lie below 0.05."""
+    rng = np.random.default_rng(0)
+    present = (rng.uniform(size=(300, 1, 200)) >= gaps).astype(float)
+    residuals = rng.normal(size=(300, 1, 200, 3)) * present[..., None]
+    found = jax.vmap(whiteness_of)(jnp.asarray(residuals), jnp.asarray(present))
+    assert 3 <= int(jnp.sum(found < 0.05)) <= 30
+    assert 0.4 < float(jnp.median(found)) < 0.6
+    # a recording of a few samples, fewer than the lags
+    short = np.zeros((2, 200))
+    short[0], short[1, :5] = 1, 1
+    wave = np.sin(0.3 * np.arange(200))[None, :, None] * np.ones((2, 200, 3)) * short[..., None]
+    assert float(whiteness_of(jnp.asarray(wave), jnp.asarray(short))) < 1e-6
+
+
+def test_spin_about_one_axis_agrees_with_attitudes_and_against_it_does_not():
+    """Noise alone turns the axes across; an inverted axis turns the body the other way."""
+    spin = ph.State([1.0, 0, 0, 0], [0.0, 0, 2.0])
+    motion = ph.simulate(ph.Scene(ph.Inertia.spherical(1.0)), spin, np.linspace(0, 6, 121))
+    for seed in range(12):
+        rates, turns = np.random.default_rng(seed).normal(size=(2, 121, 3))
+        rates = np.asarray(motion.omega_body) + 0.01 * rates
+        wxyz = multiply(motion.wxyz, rotation_vector_to_wxyz(0.003 * turns))
+        for sign, disagrees in ((1, False), (-1, True)):
+            recording = stack([Recording.of(motion.ts, sign * rates, wxyz=wxyz)])
+            assert bool(_axes_disagree(recording, FitOptions())) == disagrees
+
+
+def test_sensor_axes_of_coarse_samples():
+    """Turns of two radians between samples are compared as angles, not as their sines."""
+    body = ph.Inertia.spherical(1.0)
+    motion = ph.simulate(
+        ph.Scene(body), ph.State([1.0, 0, 0, 0], [1.0, 2.0, 2.5]), 0.6 * np.arange(9)
+    )
+    turned = rotation_vector_between(motion.wxyz[0], motion.wxyz[1])
+    assert np.linalg.norm(turned) < 0.9 * 0.6 * np.sqrt(11.25)
+    recording = Recording.of(motion.ts, motion.omega_body, wxyz=motion.wxyz)
+    turns = np.asarray(turns_between_samples(recording))
+    np.testing.assert_allclose(turns, np.tile([0.6, 1.2, 1.5], (8, 1)), rtol=1e-9)
 
 
 @pytest.mark.slow

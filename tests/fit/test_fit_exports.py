@@ -11,7 +11,9 @@ import pytest
 
 import polhode as ph
 from polhode import plot
-from polhode.fit import FitOptions, Gyroscope, Recording
+from polhode.fit import FitOptions, Gyroscope, Recording, log_density, residuals, stack, windows
+from polhode.fit._residuals import prior_cost
+from polhode.plot._fits import _single
 
 BODY = ph.Inertia.from_moments([1.0, 2.0, 2.5])
 STATE = ph.State([0.8, 0.0, 0.6, 0.0], [1.2, -0.8, 1.0])
@@ -38,6 +40,12 @@ def of_inertia():
     return ph.fit_inertia(times, rates, omega_noise=NOISE)
 
 
+def test_windows_hold_every_sample():
+    recording = Recording.of(np.arange(101.0), np.zeros((101, 3)))
+    ends = [(float(w.times[0]), float(w.times[-1])) for w in windows(recording, 50)]
+    assert ends == [(0.0, 49.0), (49.0, 100.0)]
+
+
 def test_values_have_the_names_of_the_scene(of_scene, of_inertia):
     fit, _ = of_scene
     assert fit.value_names == ["inertia.diagonal", "torque.c"]
@@ -62,6 +70,30 @@ def test_ratios_are_known_where_only_a_common_factor_is_not(of_scene):
     assert "ratios to the largest" in fit.report()
     expected = fit.derived(lambda v: v[1] / v[0][2])
     np.testing.assert_allclose(drag_std, expected[1])
+
+
+def test_residuals_of_readings_are_those_of_the_fit(of_inertia):
+    """Also where a calibrated bias stands between readings and rates, in figures too."""
+    times, bias = np.linspace(0.0, 20.0, 60), np.array([0.3, -0.2, 0.1])
+    rates = ph.simulate(ph.Scene(BODY), STATE, times).omega_body
+    rates = rates + NOISE * jax.random.normal(jax.random.key(1), rates.shape)
+    model = of_inertia.model
+    biased = eqx.tree_at(
+        lambda m: m.gyroscope, model, Gyroscope(bias=bias, scale_std=0.01, misalignment_std=0.01)
+    )
+    plain = stack([Recording.of(times, rates, omega_noise=NOISE)])
+    readings = stack([Recording.of(times, rates + bias[None], omega_noise=NOISE)])
+    expected = residuals(of_inertia.parameters, plain, model)["omega"]
+    np.testing.assert_allclose(expected, of_inertia.residuals["omega"], rtol=1e-9, atol=1e-12)
+    found = residuals(of_inertia.parameters, readings, biased)["omega"]
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
+    fit = eqx.tree_at(lambda f: f.model, of_inertia, biased)
+    shown = _single(fit, readings, 0)["omega"]
+    np.testing.assert_allclose(shown, rates, rtol=1e-12, atol=1e-12)
+    doubled = log_density(readings, biased, noise=2.0)(of_inertia.parameters)
+    single = log_density(readings, biased)(of_inertia.parameters)
+    prior = prior_cost(of_inertia.parameters, readings, biased)
+    np.testing.assert_allclose(4 * (doubled + prior), single + prior)
 
 
 def test_the_result_as_json_and_csv(of_scene, of_inertia, tmp_path):

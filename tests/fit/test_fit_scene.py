@@ -224,6 +224,9 @@ def test_bounds_and_priors_hold():
     derived, spread = fit.derived(lambda v: v[0])
     np.testing.assert_allclose(derived, value)
     np.testing.assert_allclose(spread, std, rtol=1e-6)
+    row = fit.observability()[0]
+    assert (row.shown, row.count, row.source) == (2, 3, "data and prior")
+    assert "the prior" in fit.limit()
 
 
 @pytest.mark.slow  # 25 s of compilation: test_bounds_and_priors_hold

@@ -13,6 +13,7 @@ from polhode.fit import (
     FitOptions,
     FreeMotion,
     Gyroscope,
+    Huber,
     Model,
     Parameters,
     Recording,
@@ -20,6 +21,7 @@ from polhode.fit import (
     fit_recordings,
 )
 from polhode.fit._model import Predicted, base_of
+from polhode.fit._options import calibrate
 from polhode.fit._residuals import residuals_of_motion
 
 TIMES = np.arange(400) / 100
@@ -119,6 +121,42 @@ def test_what_a_fit_cannot_use_is_refused(sensor, more, message):
     rates = np.sin(np.outer(TIMES, [3.0, 4, 5]))
     with pytest.raises(ValueError, match=message):
         fit_inertia(TIMES, rates, options=FitOptions(gyroscope=sensor), **more)
+
+
+def test_options_that_contradict_each_other_are_refused():
+    rates = np.sin(np.outer(TIMES, [3.0, 4, 5]))
+    options = FitOptions(bias=True, gyroscope=Gyroscope(bias_std=0.1))
+    with pytest.raises(ValueError, match="bias_std of the gyroscope is its prior"):
+        fit_inertia(TIMES, rates, options=options)
+    with pytest.raises(ValueError, match="robust counts residuals"):
+        fit_recordings([Recording.of(TIMES, rates)], options=FitOptions(robust=Huber(3.0)))
+
+
+@pytest.mark.parametrize(
+    ("gain", "rates_std", "sides"),
+    [
+        (2 * np.eye(3), [0.05, 0.1, 0.15], [0, 0, 1]),
+        (np.eye(3)[[1, 0, 2]] * [1, -1, 1], [0.2, 0.1, 0.3], [0, 0, 1]),
+        (np.diag([1.0, 1.0, -1.0]), [0.1, 0.2, 0.3], [0, 0, -1]),
+    ],
+)
+def test_noise_and_limits_of_readings_become_those_of_rates(gain, rates_std, sides):
+    readings = np.tile([0.1, -0.2, 3.0], (8, 1))
+    recording = Recording.of(TIMES[:8], readings, omega_noise=[0.1, 0.2, 0.3])
+    rates = calibrate(recording, Gyroscope(gain, max_rate=3.0))
+    np.testing.assert_allclose(rates.omega @ gain.T, readings, atol=1e-12)
+    np.testing.assert_allclose(rates.omega_noise[0], rates_std)
+    np.testing.assert_array_equal(rates.saturated[0], sides)
+    assert rates.present.all()
+
+
+def test_a_saturated_reading_that_is_of_several_rates_is_a_gap():
+    gain = np.array([[1.0, 0.5, 0.0], [0.0, 1.0, 0.3], [0.2, 0.0, 1.0]])
+    readings = np.tile([0.1, -0.2, 2.0], (8, 1))
+    readings[3, 2] = 3.0
+    rates = calibrate(Recording.of(TIMES[:8], readings), Gyroscope(gain, max_rate=3.0))
+    np.testing.assert_array_equal(rates.present, np.arange(8) != 3)
+    assert not rates.saturated.any()
 
 
 def bodies(count, seed=5):

@@ -61,7 +61,7 @@ def test_damit(tmp_path):
         for t, m in zip(JD, MAGNITUDE)
     ]
     path = tmp_path / "lc.txt"
-    path.write_text("\n".join(["2", f"{ROWS} 0", *block, f"{ROWS} 1", *block]) + "\n")
+    path.write_text("\n".join(["# DAMIT", "2", f"{ROWS} 0", *block, f"{ROWS} 1", *block]) + "\n")
     curve = lightcurve.read_light_curve(path)
     assert curve.t.size == 2 * ROWS
     assert len(curve.names) == 2
@@ -104,6 +104,11 @@ def test_alcdef(tmp_path):
     given = lightcurve.read_light_curve(path, vectors)
     np.testing.assert_allclose(np.linalg.norm(given.sun, axis=1), 1)
     np.testing.assert_array_equal(given.t, np.sort(JD))
+    vectors.write_text("\n".join([header, *(f"{t},2,0,0,0,1.5,0" for t in ends)]))
+    apparent, reduced = (
+        lightcurve.read_light_curve(path, vectors, reduced=r).magnitude for r in (False, True)
+    )
+    np.testing.assert_allclose(reduced - apparent, 5 * np.log10(2 * 1.5))
     with pytest.raises(FileNotFoundError):
         lightcurve.read_light_curve(path, tmp_path / "none.csv")
     vectors.write_bytes(b"\xff\xfe")

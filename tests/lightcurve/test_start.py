@@ -47,6 +47,9 @@ def written(path, *solutions):
 def test_earlier_solutions_move_to_the_first_time_of_the_new_curve(tmp_path):
     path = written(tmp_path / "earlier.json", a_solution())
     (earlier,) = lightcurve.read_solutions(path)
+    for name, kind in _solutions.Solution.__annotations__.items():
+        if kind is np.ndarray:
+            assert isinstance(getattr(earlier, name), np.ndarray | None), name
     bodies = _solutions.bodies_of((earlier, earlier), 3.7, lightcurve.LinearPhase())
     scene = ph.Scene(ph.Inertia.from_moments(MOMENTS))
     path = ph.simulate(scene, STATE, np.array([0.0, 3.7]))

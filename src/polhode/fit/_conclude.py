@@ -280,10 +280,9 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
 
     slope, (moments, axes) = jax.jacfwd(derived, has_aux=True)(entries)
     motion = parameters.motion
-    relative = None if model.scale_known else model.motion.over(motion, moments[2])
-    if relative is not None:
+    if not model.scale_known and model.motion.scales:
         # size that the data do not show: a largest moment of one
-        size, motion = moments[2], relative
+        size, motion = moments[2], model.motion.over(motion, moments[2])
         tensor, moments = tensor / size, moments / size
         slope = slope * jnp.where(jnp.arange(9) // 3 == 1, size, 1)[:, None]
         factors = model.motion.over(jax.tree.map(jnp.ones_like, motion), size)
@@ -560,5 +559,7 @@ def whiteness_of(residuals: Array, present: Array, lags: int = 5) -> Array:
     # Chi-square of many degrees by Wilson and Hilferty (PNAS 17 (1931) 684): the exact one would
     # take longer to compile than all else here.
     degrees = residuals.shape[-1] * jnp.sum(counted)
+    has_pairs, degrees = degrees > 0, jnp.maximum(degrees, 1)
     spread = 2 / (9 * degrees)
-    return norm.sf(((statistic / degrees) ** (1 / 3) - 1 + spread) / spread**0.5)
+    probability = norm.sf(((statistic / degrees) ** (1 / 3) - 1 + spread) / spread**0.5)
+    return jnp.where(has_pairs, probability, 1)

@@ -213,10 +213,15 @@ class AbstractMotion(eqx.Module):
         """Standard deviations of normal priors about the start, one for each unknown leaf."""
         return [None for _ in jax.tree.leaves(self.start())]
 
-    def over(self, unknown: Any, size: Array) -> Any | None:
-        """The unknowns that with an inertia divided by ``size`` give the same motion; None where
-        that is not known. Linear in ``unknown``."""
-        return None if jax.tree.leaves(unknown) else unknown
+    @property
+    def scales(self) -> bool:
+        """Whether ``over`` is known."""
+        return not jax.tree.leaves(self.start())
+
+    def over(self, unknown: Any, size: Array) -> Any:
+        """The unknowns that with an inertia divided by ``size`` give the same motion, linear in
+        ``unknown``."""
+        return unknown
 
     @abc.abstractmethod
     def __call__(
@@ -280,6 +285,10 @@ class SteppedMotion(AbstractMotion):
             "drag": (self.drag or Drag()) if self.fit_drag else None,
             "delay": self.delay if self.fit_delay else None,
         }
+
+    @property
+    def scales(self) -> bool:
+        return True
 
     def over(self, unknown: dict[str, Any], size: Array) -> dict[str, Any]:
         return unknown | {"drag": jax.tree.map(lambda x: x / size, unknown["drag"])}
