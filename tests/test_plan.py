@@ -1,5 +1,6 @@
 """The choice of the method: by types alone, the same in every call, and explained."""
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -267,6 +268,16 @@ def test_explain_knows_the_method_of_a_user():
     plan = ph.explain(ph.Scene(ph.Inertia.from_moments([1.0, 2, 3])), states(1), [0.0, 1.0], Own())
     assert "runs    Own: as asked for" in str(plan)
     assert plan.error == "as the steps asked for make it"
+
+
+def test_explain_says_that_steps_of_another_solver_pass_jumps():
+    body, ts = ph.Inertia.from_moments([1.0, 2.0, 3.0]), [0.0, 1.0]
+    relay = ph.FeedbackTorque(lambda t, wxyz, omega: -jnp.sign(omega))
+    for torque, passes in ((relay, True), (ph.LinearDamping(0.1), False)):
+        scene = ph.Scene(body, torque=torque)
+        plan = ph.explain(scene, states(1), ts, ph.LiePoisson(diffrax.Tsit5()))
+        assert ("pass jumps of a torque" in str(plan)) == passes
+        assert "pass jumps" not in str(ph.explain(scene, states(1), ts))
 
 
 def test_explain_says_why_no_exact_law_holds():

@@ -92,7 +92,10 @@ class AbstractIntegration(AbstractMethod):
     def steps_of(self, scene: Scene, state: State, ts: Array, record: Record) -> str:
         """Description of the steps for a scene, for ``ph.explain``."""
         if not self._is_automatic:
-            return f"steps of {type(self.solver).__name__}"
+            name = f"steps of {type(self.solver).__name__}"
+            if isinstance(self.solver, Extrapolation) or not may_jump(scene):
+                return name
+            return f"{name}, which pass jumps of a torque and may then miss rtol"
         few, switches, hidden_operations = self._are_few(scene, state), 0, ()
         if few or may_jump(scene):
             program: list[Problem] = []
