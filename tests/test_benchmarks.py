@@ -838,6 +838,7 @@ def test_one_table_is_of_one_commit_machine_and_day(tmp_path, monkeypatch, chang
         _page.merged()
 
 
+@pytest.mark.slow
 def test_cold_tasks_are_shown_side_by_side():
     name = next(iter(cold_tasks.TASKS))
     ours = {"first": 2.0, "second": 0.001, "cached": 1.0, "memory": 300.0, "error": 1e-11}

@@ -275,7 +275,11 @@ def test_a_disturbance_over_many_turns():
     assert jnp.all(jnp.isnan(ph.propagate(scene, state, 1e6).noise))  # more parts than memory holds
 
 
-@pytest.mark.parametrize("torque", [None, ph.LinearDamping(1e-9)], ids=["free", "damped"])
+@pytest.mark.parametrize(
+    "torque",
+    [None, pytest.param(ph.LinearDamping(1e-9), marks=pytest.mark.slow)],
+    ids=["free", "damped"],
+)
 def test_a_step_is_not_rounded_after_a_day_in_single_precision(torque):
     """Where the scene does not depend on time, at which t + dt has three digits of dt."""
     inertia = ph.Inertia.from_moments(jnp.ones(3, jnp.float32))

@@ -14,9 +14,8 @@ START = (0.5, -0.125, 0.75, 0.5)
 CASES = json.loads(Path(__file__).with_name("second_cases.json").read_text())
 
 
-@pytest.mark.parametrize(
-    "products", [False, pytest.param(True, marks=pytest.mark.slow)], ids=["moments", "tensors"]
-)
+@pytest.mark.slow  # 30 s of compilation
+@pytest.mark.parametrize("products", [False, True], ids=["moments", "tensors"])
 def test_second_derivatives(products):
     """Forward over reverse. By entries off the tensor's diagonal with ``products``, which adds the
     derivatives of principal axes to the program; without, along pairs of directions that have no

@@ -551,9 +551,8 @@ ROOTS = {
 derivative by x, the start and a parameter."""
 
 
-@pytest.mark.parametrize(
-    "kind", ["root", *(pytest.param(k, marks=pytest.mark.slow) for k in ("jump", "time"))]
-)
+@pytest.mark.slow  # a root of the state: test_a_side_beyond_which_the_field_is_no_number
+@pytest.mark.parametrize("kind", ROOTS)
 def test_roots_of_a_size_that_passes_zero(kind):
     """The side after the switch is no number before it either, and its slope is infinite there."""
     rate, last, slope = ROOTS[kind]

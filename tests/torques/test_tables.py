@@ -299,6 +299,7 @@ def test_bodies_with_tables_of_their_own():
     np.testing.assert_allclose(balance[:, 1], balance[:, 0], rtol=1e-9)
 
 
+@pytest.mark.slow  # of one body: solvers/test_switches.py::test_derivatives_through_a_table
 def test_mapped_gradients_go_back_through_the_steps_of_each_body():
     """More bodies than a unit holds, those with strong torques in more steps than others: of a
     sphere with damping, w' = (p torque - c w) / I."""

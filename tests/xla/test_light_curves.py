@@ -18,6 +18,7 @@ def problem(points, nights):
     return _least_squares.Problem(lightcurve.SeeligerPhase(), curve.points(0.01))
 
 
+@pytest.mark.slow
 def test_one_program_of_light_serves_other_numbers_of_points_and_nights():
     for function in (_least_squares._light_and_derivatives, _least_squares.robust_equations):
         function.clear_cache()
