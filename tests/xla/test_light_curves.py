@@ -2,6 +2,7 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from polhode import lightcurve
 from polhode.lightcurve import _least_squares
