@@ -308,8 +308,8 @@ MUTANTS = (
     ),
     Mutant(
         "frames/_frame.py",
-        "reading = reading + jnp.cross(angular_acceleration(trajectory), lever)",
-        "reading = reading - jnp.cross(angular_acceleration(trajectory), lever)",
+        "reading = reading + jnp.cross(acceleration, lever)",
+        "reading = reading - jnp.cross(acceleration, lever)",
         "the tangential acceleration of an accelerometer has the wrong sign",
         ("frames/test_sensors.py::test_sensors_read_what_a_differentiated_path_tells",),
     ),

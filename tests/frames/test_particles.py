@@ -187,3 +187,10 @@ def test_bad_particles_are_named(change, error, message):
     }
     with pytest.raises(error, match=message):
         simulate_particles(**(good | change))
+
+
+def test_no_particles_have_empty_paths():
+    frame = RotatingFrame.from_rate(OMEGA)
+    paths = simulate_particles(frame, np.zeros((2, 0, 3)), np.zeros(3), [0.0, 1.0, 2.0])
+    assert paths.position.shape == paths.velocity_space.shape == (2, 0, 3, 3)
+    assert bool(paths.successful)

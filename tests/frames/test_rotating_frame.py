@@ -227,3 +227,37 @@ def test_lists_are_vectors(unchecked):
     want = frame.apparent_acceleration(0.0, jnp.array([1.0, 0, 0]), jnp.array([0.0, 1, 0]))
     np.testing.assert_allclose(frame.apparent_acceleration(0.0, [1.0, 0, 0], [0.0, 1, 0]), want)
     np.testing.assert_allclose(frame.velocity_to_space(0.0, [1.0, 0, 0], [0.0, 1, 0]), [0, 3, 0])
+
+
+@pytest.mark.parametrize("time", [0.3, 1.1])
+def test_derivative_by_the_time_of_the_start(time):
+    """At that time itself, where nothing is integrated, and later."""
+
+    def attitude(t0):
+        rate = lambda t: jnp.array([0.1, 0.2, 1.0]) * (1 + t)  # noqa: E731
+        return RotatingFrame.from_rate(rate, wxyz=[0.5, 0.5, -0.5, 0.5], t0=t0).attitude(time)
+
+    # about one axis: the angle is an integral
+    axis = jnp.array([0.1, 0.2, 1.0])
+
+    def exact(t0):
+        turn = rotation.rotation_vector_to_wxyz(axis * (time - t0) * (1 + (time + t0) / 2))
+        return rotation.multiply([0.5, 0.5, -0.5, 0.5], turn)
+
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jacobian(attitude)(0.3), jacobian(exact)(0.3), atol=1e-12)
+
+
+@pytest.mark.parametrize("rate", [[0.0, 0, 2.0], lambda t: np.float32([0, 0, 2]) * t])
+def test_forces_of_batches_and_no_times(rate):
+    if not callable(rate):
+        rate = jnp.array(rate, jnp.float32)
+    frame = RotatingFrame.from_rate(rate, wxyz=jnp.array([1, 0, 0, 0], jnp.float32))
+    position, masses = jnp.ones(3, jnp.float32), jnp.ones(4, jnp.float32)
+    assert frame.euler(1.0, position, masses).shape == (4, 3)
+    assert frame.euler(jnp.ones(2, jnp.float32), position).shape == (2, 3)
+    assert frame.origin_force(1.0, masses).shape == (4, 3)
+    assert frame.attitude(jnp.zeros(0, jnp.float32)).shape == (0, 4)
+    assert frame.omega_body(jnp.zeros((2, 0), jnp.float32)).shape == (2, 0, 3)
+    for times in (1, [1, 2], jnp.array([1, 2]), 1.5):
+        assert frame.attitude(times).dtype == jnp.float32

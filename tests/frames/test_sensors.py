@@ -122,6 +122,19 @@ def test_a_torqued_body_and_a_batch_of_bodies():
         RotatingFrame.from_trajectory(made)
 
 
+def test_several_accelerometers_on_one_body(tumble):
+    places = jnp.array([POSITION, 2 * POSITION, [0.0, 0.0, 1.0], [0.1, 0.0, 0.0]])
+    gravity = [0.0, 0.0, -9.8]
+    readings = accelerometer(tumble, places, gravity)
+    for reading, place in zip(readings, places, strict=True):
+        np.testing.assert_allclose(reading, accelerometer(tumble, place, gravity), atol=1e-14)
+    several = ph.simulate(
+        ph.Scene(ph.Inertia.spherical(1.0)), ph.State([1.0, 0, 0, 0], np.ones((2, 3))), [0.0, 1.0]
+    )
+    with pytest.raises(ValueError, match=r"broadcast together, got position_body \(4, 3\)"):
+        accelerometer(several, places)
+
+
 def test_missing_records_and_coarse_samples_are_named(tumble):
     lacking = ph.Trajectory(tumble.ts, None, None, tumble.status, tumble.steps, tumble.scene)
     with pytest.raises(ValueError, match="record"):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import mpmath as mp
 import numpy as np
 import pytest
 
@@ -219,6 +220,22 @@ def test_single_precision_keeps_its_digits_over_long_times(x64, over_bodies):
     sign = np.sign(np.sum(attitude * exact_attitude, -1, keepdims=True))
     np.testing.assert_allclose(attitude * sign, exact_attitude, atol=5e-7)
     np.testing.assert_allclose(rates, exact_rates, atol=2e-6)
+
+
+def test_compensated_phases_next_to_the_separatrix():
+    """After a hundred thousand periods of the rates, whose length is computed in 50 digits."""
+    moments, omega = (1.0, 2.0, 3.0), (1.1, 0.7, 1.1 / 3**0.5 * (1 + 1e-12))
+    with mp.workdps(50):
+        (a, b, c), (u, v, w) = ([mp.mpf(x) for x in triple] for triple in (moments, omega))
+        outer = (c - b) * (b * v * v * (b - a) + c * w * w * (c - a))
+        inner = (b - a) * (a * u * u * (c - a) + b * v * v * (c - b))
+        period = 4 * mp.ellipk(inner / outer) / mp.sqrt(outer / a / b / c)
+        elapsed = float(100_000 * period)
+        times = jnp.array([elapsed, float(elapsed - 100_000 * period)])
+    wxyz = jnp.array([1.0, 0, 0, 0])
+    rates = free_motion(jnp.array(moments), wxyz, jnp.array(omega), times, compensated=True)[0]
+    late, early = np.stack(rates, axis=-1)
+    np.testing.assert_allclose(late, early, rtol=0, atol=1e-11)
 
 
 def test_conserved_over_long_times():

@@ -77,6 +77,13 @@ def _by_quadrature(moments, omega, digits=30):
         ((1.0, 2.0, 3.0), (0.95, 0.3, 0.6)),
         ((1.0, 2.0, 3.0), (1.0, 0.3, 0.575)),
         ((1.0, 1.001, 0.01), (0.3, 0.2, 5.0)),
+        # a thin body far from a permanent rotation, of which the theta series converges slowest
+        (
+            (0.007142514668163261, 0.8252089701268291, 0.8320578071836973),
+            (140.0067128258563, 0.0, 126.43734614976562),
+        ),
+        # 1 - k2 = 1e-14: the frequency needs all digits of a difference of products
+        ((1.0, 2.0, 3.0), (1.1, 0.7, 1.1 / 3**0.5 * (1 + 1e-14))),
     ],
 )
 def test_against_quadrature(moments, omega):
@@ -230,3 +237,21 @@ def test_mixed_dtypes_are_refused():
     state = ph.State(jnp.array([1.0, 0, 0, 0]), jnp.array([0.3, 1.0, 0.2]))
     with pytest.raises(TypeError, match="inertia and state mix the dtypes"):
         ph.periods(single, state)
+
+
+@jax.jit
+def _derivatives_by_rates(moments, omega):
+    """Forward and reverse, of each body by its own rates: (5, N, 3)."""
+    one = [jacobian(_numbers, 1) for jacobian in (jax.jacfwd, jax.jacrev)]
+    return [jax.vmap(f, (0, 0, None), 1)(moments, omega, jnp.zeros(3)) for f in one]
+
+
+def test_derivatives_at_rest_and_of_spheres_are_finite_in_both_modes():
+    moments = jnp.array([[1.0, 2.0, 2.5], [1.0, 1.0, 1.5], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0]])
+    omega = jnp.array([[0.0, 0, 0], [0, 0, 0], [0, 0, 0], [0.5, 0.4, 0.8]])
+    forward, reverse = _derivatives_by_rates(moments, omega)
+    size = np.linalg.norm(omega[3])
+    want = np.zeros((5, 4, 3))
+    want[1, 3] = -2 * np.pi * omega[3] / size**3
+    np.testing.assert_allclose(forward, want, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(reverse, want, rtol=0, atol=1e-14)

@@ -205,3 +205,30 @@ def test_other_misprints_fail():
             + p[2] / moments[2]
         )
         assert bool(abs(psi_dot - rate_q[2]) < 1e-14) is holds
+
+
+@pytest.mark.parametrize(
+    ("symmetric", "moments"),
+    [
+        (Inertia.axisymmetric([2.0, 3.0], 1.0), [[2.0, 2.0, 1.0], [3.0, 3.0, 1.0]]),
+        (Inertia.spherical(1.5), [1.5, 1.5, 1.5]),
+    ],
+    ids=["axisymmetric", "spherical"],
+)
+def test_matrices_of_symmetric_bodies(symmetric, moments):
+    q = jnp.broadcast_to(jnp.array(Q), jnp.shape(jnp.array(moments)))
+    got = ph.hamiltonian_matrices(symmetric, q)
+    for matrix, want in zip(got, ph.hamiltonian_matrices(Inertia.from_moments(moments), q)):
+        np.testing.assert_array_equal(matrix, want)
+
+
+def test_hamiltons_equations_of_angles_and_momenta_that_broadcast(unchecked):
+    equations = ph.hamiltons_equations(ph.hamiltonian(Inertia.from_moments(MOMENTS)))
+    momenta = jnp.array([P, [1.0, 2.0, 3.0]])
+    for angles in (Q, jnp.array(Q)):
+        for got, want in zip(equations(angles, momenta), equations(jnp.array([Q, Q]), momenta)):
+            np.testing.assert_array_equal(got, want)
+    for got, want in zip(
+        equations(np.array([1, 1, 1]), [1, 2, 3]), equations([1.0] * 3, [1.0, 2, 3])
+    ):
+        np.testing.assert_array_equal(got, want)

@@ -100,3 +100,16 @@ def test_euler_equation_is_the_lie_poisson_form_of_the_one_hamiltonian():
         inertia.rates(momentum_rate),
         atol=1e-15,
     )
+
+
+def test_lists_are_vectors_and_others_are_named():
+    body = Inertia.from_moments([1.0, 2.0, 2.5])
+    np.testing.assert_allclose(angular_acceleration(body, [1, 2, 3], [1, 0, 0]), [-2, 2.25, -0.8])
+    np.testing.assert_allclose(required_torque(body, [1, 2, 3], [-2, 2.25, -0.8]), [1, 0, 0])
+    for call in (
+        lambda: angular_acceleration(body, [1, 2]),
+        lambda: angular_acceleration(body, [1, 2, 3], 1.0),
+        lambda: required_torque(body, [1, 2, 3], [0, 0]),
+    ):
+        with pytest.raises(ValueError, match=r"must have shape \(\.\.\., 3\)"):
+            call()

@@ -6,7 +6,16 @@ import mpmath as mp
 import numpy as np
 import pytest
 
-from polhode.inertia import Inertia, MassProperties, compose, is_physical, physical_margin
+from polhode.inertia import (
+    Inertia,
+    MassProperties,
+    compose,
+    inertia_from_log_cholesky,
+    inertia_to_log_cholesky,
+    is_physical,
+    physical_margin,
+)
+from polhode.rotation import axis_angle_to_wxyz, wxyz_to_matrix
 
 
 def of_revolution(outer, inner, low, high):
@@ -248,6 +257,26 @@ def test_log_cholesky_of_the_pseudo_inertia():
         jnp.zeros(10)
     )
     np.testing.assert_allclose(jacobian[..., 1], np.diag([0.0, 2.0, 2.0]), atol=1e-15)
+
+
+@pytest.mark.parametrize("flat", [[1.0, 2.0, 3.0], [3.0, 1.0, 2.0], [2.0, 3.0, 1.0]])
+def test_log_cholesky_of_a_flat_body_is_infinite_and_no_more(flat):
+    tensor = jnp.diag(jnp.array(flat))
+    parameters = inertia_to_log_cholesky(tensor)
+    assert not jnp.any(jnp.isnan(parameters))
+    assert jnp.sum(parameters == -jnp.inf) == 1
+    np.testing.assert_allclose(inertia_from_log_cholesky(parameters), tensor, rtol=1e-14)
+    several = Inertia.from_moments([flat, [1.0, 2.0, 2.5]])
+    body = MassProperties.of(1.5, [0.1, 0.2, 0.3], several)
+    parameters = body.to_log_cholesky()
+    np.testing.assert_array_equal(jnp.sum(parameters == -jnp.inf, axis=-1), [1, 0])
+    back = MassProperties.from_log_cholesky(parameters[1])
+    np.testing.assert_allclose(back.central.tensor, several.tensor[1], rtol=1e-14)
+    # rounding may leave a square below zero, which is not that of a body beyond the boundary
+    matrix = wxyz_to_matrix(axis_angle_to_wxyz([1 / 3, 2 / 3, 2 / 3], jnp.linspace(0.1, 3, 100)))
+    turned = inertia_to_log_cholesky(jnp.einsum("nij,jk,nlk->nil", matrix, tensor, matrix))
+    assert not jnp.any(jnp.isnan(turned))
+    assert jnp.any(jnp.isnan(inertia_to_log_cholesky(jnp.diag(jnp.array([1.0, 2.0, 4.0])))))
 
 
 def test_margin_is_the_distance_to_the_boundary():

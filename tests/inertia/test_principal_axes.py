@@ -6,6 +6,7 @@ import mpmath
 import numpy as np
 import pytest
 
+from polhode import inertia
 from polhode.inertia import Inertia, inertia_of_second_moments, principal, second_moments
 
 DTYPES = [jnp.float32, jnp.float64]
@@ -163,3 +164,22 @@ def test_second_moments_and_back():
     np.testing.assert_allclose(
         second_moments(full), np.trace(full) / 2 * np.eye(3) - full, atol=1e-15
     )
+
+
+def test_lists_are_tensors_and_others_are_named():
+    tensor = [[2, 0, 0], [0, 2, 0], [0, 0, 3]]
+    array = jnp.array(tensor, float)
+    for function in (
+        inertia.principal,
+        inertia.second_moments,
+        inertia.inertia_of_second_moments,
+        inertia.physical_margin,
+        inertia.is_physical,
+        inertia.inertia_to_log_cholesky,
+    ):
+        got, want = jax.tree.leaves(function(tensor)), jax.tree.leaves(function(array))
+        for x, y in zip(got, want, strict=True):
+            np.testing.assert_array_equal(x, y)
+        with pytest.raises(ValueError, match=r"must have shape \(\.\.\., 3, 3\)"):
+            function([1, 2, 3])
+    np.testing.assert_array_equal(inertia.inertia_from_log_cholesky([0] * 6), 2 * jnp.eye(3))

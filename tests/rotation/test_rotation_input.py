@@ -124,8 +124,44 @@ def test_quaternions_whose_squares_are_no_numbers_are_seen():
     assert np.isnan(rotation.rotate([np.nan, 0, 0, 0], [1.0, 2, 3])).all()
 
 
-def test_a_traced_zero_has_no_angles():
-    assert all(jnp.isnan(x) for x in jax.jit(rotation.wxyz_to_euler)(jnp.zeros(4)))
+@pytest.mark.parametrize(
+    "take", [rotation.wxyz_to_euler, rotation.wxyz_to_axis_angle, rotation.wxyz_to_rotation_vector]
+)
+def test_a_traced_zero_has_no_angles(take):
+    assert all(jnp.isnan(x).all() for x in jax.tree.leaves(jax.jit(take)(jnp.zeros(4))))
+
+
+@pytest.mark.parametrize("sequence", [Sequence.ZYX, Sequence.XYZ_SPACE, Sequence.ZYZ])
+def test_euler_angles_of_a_quaternion_of_any_size(sequence):
+    unit = jnp.array([0.8, 0.3, -0.2, 0.4])
+    want = jnp.stack(rotation.wxyz_to_euler(unit, sequence))
+    for dtype, sizes, rtol in (
+        (jnp.float64, (1e-200, 1e200), 1e-14),
+        (jnp.float32, (1e-20, 1e20), 1e-6),
+    ):
+        for size in sizes:
+            got = rotation.wxyz_to_euler((size * unit).astype(dtype), sequence)
+            np.testing.assert_allclose(jnp.stack(got), want, rtol=rtol)
+
+
+def test_the_quaternion_of_a_rotation_vector_whose_square_overflows_is_of_unit_length():
+    for dtype, size in ((jnp.float64, 1e200), (jnp.float32, 1e20), (jnp.float64, 1.7e308)):
+        vector = jnp.array([size, 0.0, -size], dtype)
+        wxyz = rotation.rotation_vector_to_wxyz(vector)
+        np.testing.assert_allclose(jnp.sum(wxyz * wxyz), 1, rtol=1e-6)
+        np.testing.assert_array_equal([wxyz[2], wxyz[1] + wxyz[3]], 0)
+
+
+@pytest.mark.parametrize(
+    ("call", "word"),
+    [
+        (lambda: Sequence.of(("Z", "Y", "X")), "axes must be a string"),
+        (lambda: rotation.matrix_to_wxyz(jnp.eye(3, dtype=bool)), "real numbers, got dtype bool"),
+    ],
+)
+def test_what_holds_no_numbers_is_named(call, word):
+    with pytest.raises(TypeError, match=word):
+        call()
 
 
 @pytest.mark.parametrize("odd", ["ZYX", "zyx", None, 3, Sequence])
@@ -150,3 +186,21 @@ def test_lists_and_integers_are_arrays():
     np.testing.assert_allclose(several[0, 1], quarter)
     single = rotation.rotate(jnp.array([1, 0, 0, 0], jnp.float32), jnp.ones(3, jnp.float32))
     assert single.dtype == jnp.float32
+
+
+def test_lists_follow_the_dtype_of_arrays_and_mixed_arrays_the_wider_one():
+    axis, turn = jnp.array([0, 0, 1], jnp.float32), jnp.array([1, 0, 0, 0], jnp.float32)
+    with jax.numpy_dtype_promotion("standard"):
+        for got, dtype in (
+            (rotation.axis_angle_to_wxyz([0, 0, 1], jnp.float32(0.5)), jnp.float32),
+            (rotation.axis_angle_to_wxyz(axis, [0.5]), jnp.float32),
+            (rotation.axis_angle_to_wxyz(axis, np.ones(2)), jnp.float64),
+            (rotation.multiply([1, 0, 0, 0], turn), jnp.float32),
+            (rotation.multiply(np.ones(4), turn), jnp.float64),
+            (rotation.rotate(turn, [1, 2, 3]), jnp.float32),
+        ):
+            assert got.dtype == dtype
+
+
+def test_no_quaternions_are_no_rotations_of_scipy():
+    assert len(rotation.wxyz_to_scipy(jnp.zeros((0, 4)))) == 0

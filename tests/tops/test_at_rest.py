@@ -176,3 +176,20 @@ def test_second_derivatives_without_weight_are_no_wrong_numbers():
     np.testing.assert_allclose(bend(0.0, jnp.zeros(3)), near, rtol=1e-4)
     mixed = jax.jit(jax.jacfwd(jax.grad(height), argnums=1))(0.0, jnp.array([0.5, -0.3, 2.0]))
     assert jnp.all(jnp.isfinite(mixed))
+
+
+def test_a_weight_has_second_derivatives_beside_the_first_order_in_it():
+    """Bodies with a weight use no part of it, so that it may not make their Hessian NaN."""
+    one, turning = jnp.ones(1), jnp.array([[0.5, -0.3, 2.0]])
+    motion = jnp.array([[[0.8, 0.6, 0.0, 0.0]]]), turning[:, None]
+    arguments = one, turning[:, 2], motion[0][0], turning, 2 * one, one[:, None]
+
+    def rate(force, applies):
+        _, rates = _lagrange_top.with_weight(one, force, *arguments[1:], motion, applies[None])
+        return jnp.sum(jnp.where(applies, rates[0, 0, 0], force[0, 0] ** 2))
+
+    second = jax.jacfwd(jax.jacrev(rate))
+    force = jnp.array([[0.0, 0.0, -9.81]])
+    want = jnp.zeros((1, 3, 1, 3)).at[0, 0, 0, 0].set(2)
+    np.testing.assert_array_equal(second(force, jnp.array([False])), want)
+    assert jnp.all(jnp.isnan(second(0 * force, jnp.array([True]))))

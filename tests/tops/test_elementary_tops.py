@@ -205,3 +205,27 @@ def test_strong_damping_has_a_derivative_in_single_precision():
 
     value, slope = jax.value_and_grad(end)(jnp.float32(2.0))
     np.testing.assert_allclose([value, slope], [0.5, -0.25], rtol=1e-5)
+
+
+def test_derivatives_that_turn_the_momentum_are_nan_in_the_attitude_alone():
+    """By axial torque, by a wheel's momentum beside damping, and by damping beside a wheel."""
+
+    def end(torque, momentum, damping):
+        acting = ph.LinearDamping(damping * SYMMETRIC.moments)
+        acting = acting + ph.BodyTorque(torque * jnp.array([0.0, 0.0, 1.0]))
+        scene = ph.Scene(SYMMETRIC, torque=acting, rotors=Rotor.axial(momentum=momentum))
+        state = ph.State([0.5, 0.5, 0.5, -0.5], [0.3, 0.2, 0.7])
+        traj = ph.simulate(scene, state, [0.0, 1.5], SymmetricTop())
+        return traj.wxyz[-1], traj.omega_body[-1]
+
+    for jacobian in (jax.jacfwd, jax.jacrev):
+        by_all = jax.jit(jacobian(end, argnums=(0, 1, 2)))
+        for momentum, damping, want in (
+            (0.0, 0.0, [True, False, False]),
+            (0.0, 0.25, [True, True, False]),
+            (0.5, 0.0, [True, False, True]),
+        ):
+            attitude, rates = by_all(0.0, momentum, damping)
+            assert [bool(jnp.all(jnp.isnan(x))) for x in attitude] == want
+            assert [bool(jnp.all(jnp.isfinite(x))) for x in attitude] == [not x for x in want]
+            assert all(bool(jnp.all(jnp.isfinite(x))) for x in rates)

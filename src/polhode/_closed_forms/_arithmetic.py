@@ -72,9 +72,13 @@ def sum_of(a: Scalars, b: Scalars) -> Pair:
 
 
 def product_of(a: Scalars, b: Scalars) -> Pair:
-    """a b with its error (to half a significand beyond the first one)."""
+    """a b with its error, to a few units in the last place of the error itself."""
     x, y = split(a), split(b)
-    return quick_sum(x.high * y.high, (x.high * y.low + x.low * y.high) + x.low * y.low)
+    # Added as plain floats, the products of a high and a low half would lose a quarter of the
+    # digits of the error.
+    middle = sum_of(x.high * y.low, x.low * y.high)
+    total = sum_of(x.high * y.high, middle.high)
+    return quick_sum(total.high, total.low + (middle.low + x.low * y.low))
 
 
 def scale_pair(x: Pair, factor: Scalars) -> Pair:

@@ -153,11 +153,16 @@ def axial_state(scene: Scene, state: State) -> tuple[Array, Array, Array]:
     """Moments A, C of the carrier, and the axial momentum, of lanes."""
     n = state.wxyz.shape[0]
     moments = as_lanes(scene.carrier.moments, n, 1)
-    axial = moments[:, 2] * state.omega_body[:, 2]
-    wheels: Any = scene.rotors
-    if wheels is not None:
-        axial = axial + as_lanes(wheels.body_momentum(wheels.start)[2], n)
+    axial = moments[:, 2] * state.omega_body[:, 2] + axial_wheel_momentum(scene, n)
     return (moments[:, 0] + moments[:, 1]) / 2, moments, axial
+
+
+def axial_wheel_momentum(scene: Scene, n: int) -> Array:
+    """Momentum (N,) along body z that wheels carry relative to the body [kg m^2/s]."""
+    wheels: Any = scene.rotors
+    if wheels is None:
+        return jnp.zeros(n, scene.inertia.dtype)
+    return as_lanes(wheels.body_momentum(wheels.start)[2], n)
 
 
 def wheels_have_constant_momentum(scene: Scene, n: int) -> Array:

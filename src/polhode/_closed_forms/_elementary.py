@@ -12,6 +12,7 @@ from polhode._closed_forms._closed_form import (
     AbstractChunkedForm,
     as_lanes,
     axial_state,
+    axial_wheel_momentum,
     bodies_per_chunk,
     symmetry_objection,
     torque_and_damping,
@@ -19,7 +20,7 @@ from polhode._closed_forms._closed_form import (
     wheel_objection,
     wheels_have_constant_momentum,
 )
-from polhode._kernels import derivable_once
+from polhode._kernels import derivable_once, underivable
 from polhode._scene import Scene, Wheels
 from polhode.rotation import multiply, rotation_vector_to_wxyz
 
@@ -34,7 +35,10 @@ class SymmetricTop(AbstractChunkedForm):
     NaN: pass ``ph.Record(attitude=False)``.
 
     Derivatives are those within these motions: by numbers that break their symmetry, such as one of
-    two equal coefficients of damping, they are zero or wrong. Those of ``ph.LiePoisson()`` are not.
+    two equal coefficients of damping, they are zero or wrong. Those of the attitude by damping and
+    moments hold in sums along ``c = k I`` only, so that the one by axial damping alone is zero; by
+    axial torque, by the momentum of a wheel beside damping and by damping beside a wheel they are
+    NaN. Those of ``ph.LiePoisson()`` are right.
     """
 
     chunk: int | None = eqx.field(static=True, default=None)
@@ -58,7 +62,7 @@ class SymmetricTop(AbstractChunkedForm):
         transverse, moments, axial = axial_state(scene, state)
         torque, damping = (as_lanes(x, n, 1) for x in torque_and_damping(scene))
         axial_moment = moments[:, 2]
-        wheel_momentum = axial - axial_moment * state.omega_body[:, 2]
+        wheel_momentum = axial_wheel_momentum(scene, n)
         transverse_decay, axial_decay = damping[:, 0] / transverse, damping[:, 2] / axial_moment
         spin, angle = driven_spin(
             state.omega_body[:, 2, None],
@@ -89,8 +93,26 @@ class SymmetricTop(AbstractChunkedForm):
             & _equal(transverse_decay, axial_decay)
             & ((wheel_momentum == 0) | (transverse_decay == 0))
         )
+        if scene.torque is not None:
+            zero = _zero_of_fixed_direction(torque[:, 2], damping[:, 0], wheel_momentum)
+            wxyz = wxyz + zero[:, None, None]
         wxyz = jnp.where(direction_is_constant[:, None, None], wxyz, jnp.nan)
         return wxyz, omega, holds
+
+
+def _zero_of_fixed_direction(torque: Array, damping: Array, wheel_momentum: Array) -> Array:
+    """Zero (N,), with NaN for its derivatives by numbers that turn a momentum of fixed direction.
+
+    The attitude has no formula for a momentum that turns, nor derivatives towards one. Damping
+    alone is not marked: in reverse mode its two coefficients would be NaN also where they stay
+    proportional to the moments.
+    """
+    marked = (
+        (torque, jnp.ones_like(torque, bool)),
+        (wheel_momentum, damping != 0),
+        (damping, wheel_momentum != 0),
+    )
+    return sum((underivable(x, where) - x for x, where in marked), jnp.zeros_like(torque))
 
 
 def _chunk_size(chunk: int | None, n: int, count: int) -> int:

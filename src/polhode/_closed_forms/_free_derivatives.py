@@ -355,7 +355,10 @@ def _staged(ones, values):
 
 
 class _Tangent(NamedTuple):
-    """Variations at time t along axes 1, 2, 3, scaled: of L, of the attitude, but for the time."""
+    """Variations of L and of the attitude at time t, along axes 1, 2, 3 in scaled units.
+
+    The contribution of a variation of t itself is left out.
+    """
 
     polhode: Polhode
     frame: Frame
@@ -368,7 +371,7 @@ class _Tangent(NamedTuple):
 def _tangent(
     has_time_axis: bool, attitude: bool, motion: EvaluatedMotion, arguments, dm, dp, dw
 ) -> _Tangent:
-    """The formulas of _tangent.py, every value in them with a derivative of its own."""
+    """The formulas of _free_tangent.py, every value in them with a derivative of its own."""
     moments, _, omega, _, t = arguments
     scaled_time = t * motion.polhode.rate_unit
     ones = opaque_ones(scaled_time), motion.polhode.one
@@ -523,7 +526,7 @@ def results_tangent(requested, motion: EvaluatedMotion, arguments, tangents, res
 
 
 def _start_tangent(start: Quadruple, variation: Quadruple, attitude: Quadruple, tangent: Quadruple):
-    """Adds the answer to the initial attitude, which is normalised before use."""
+    """Adds the variation that comes from the initial attitude, which is normalised before use."""
     inverse_square = 1 / dot(start, start)
     along = dot(start, variation)
     unit = tuple(

@@ -33,9 +33,9 @@ from polhode._closed_forms._free_tangent import (
     Frame,
     apply_variation,
     complete,
-    dot,
     invariants_variation,
 )
+from polhode._hamiltonian import dot
 from polhode._kernels import are_close, kernel, underivable
 from polhode._method import of_one_dtype
 from polhode._scene import State
@@ -97,8 +97,13 @@ def _mean_precession(polhode: Polhode, precession, rate_unit: Scalars) -> Scalar
     decay = 1 / (growth * growth)
     q = polhode.nome
     first, second = (q * growth) ** 2, (q * q * (q * growth * growth)) ** 2
+    # ``growth`` is less than 1/q, and q less than exp(-pi): the fifth terms, q^30 growth^10, are
+    # below rounding
+    third, fourth = (q**6 * growth**3) ** 2, (q**6 * (q * growth) ** 4) ** 2
     above = decay - first * (1 + 2 * decay**3) + second * (2 + 3 * decay**5)
+    above = above - third * (3 + 4 * decay**7) + fourth * (4 + 5 * decay**9)
     below = (1 - decay) - first * (1 - decay**3) + second * (1 - decay**5)
+    below = below - third * (1 - decay**7) + fourth * (1 - decay**9)
     level = precession.length * polhode.inverse_moments[0]
     series = level + polhode.rate * 2 * above / jnp.where(below > 0, below, 1)
     long = jnp.where(polhode.circular & (below > 0), series, about_L - half_turns)
@@ -206,7 +211,9 @@ def _periods_rule(primals, tangents):
         square_2,
         start[2] ** 2 * period + polhode.p / s_divisor * difference,
     )
-    length = precession.length
+    at_rest, is_sphere = polhode.rate_unit == 0, polhode.s == 0
+    # finite in the branches that are not used: in reverse mode zero times infinity is NaN
+    length = jnp.where(at_rest, 1, precession.length)
     dangle = period * energy + dot(variation.inverse_moments, squares) / 2
     dangle = (dangle + dot(spin, start) * 4 * dquarter) / length
     rate_unit = jnp.where(polhode.rate_unit > 0, polhode.rate_unit, 1)
@@ -222,18 +229,20 @@ def _periods_rule(primals, tangents):
     # zero, but NaN once derived by what has no right derivatives
     unmoved = 0 * energy
     dP_psi = jnp.where(permanent, unmoved, 4 * dquarter / rate_unit)
-    dP_phi = jnp.where(is_moving, -P_phi / jnp.where(is_moving, rate, 1) * drate, 0)
-    dP_phi = jnp.where(is_moving, dP_phi, 0)
+    log_derivative = drate / jnp.where(is_moving, rate, 1)
+    dP_phi = jnp.where(is_moving, -jnp.where(is_moving, P_phi, 1) * log_derivative, 0)
     dm1 = jnp.where(x > 0, (dz - polhode.m1 * dx) / divisor, unmoved)
     dk2 = jnp.where(x > 0, (dy - k2 * dx) / divisor, unmoved)
     dm1, dk2 = jnp.where(polhode.circular, -dk2, dm1), jnp.where(polhode.circular, dk2, -dm1)
+    # of a sphere, and at rest, the limits are constants; their formula is 0/0
+    is_fixed = at_rest | is_sphere
+    amplitudes = polhode.A, polhode.B, polhode.r, polhode.s, polhode.m1
     angles = jax.jvp(
         lambda *a: _angles(polhode.sense, *a),
-        (polhode.A, polhode.B, polhode.r, polhode.s, polhode.m1),
+        tuple(jnp.where(is_fixed, 1, a) for a in amplitudes),
         (dA, dB, dr, ds, dm1),
     )[1]
-    at_rest = polhode.rate_unit == 0
-    angles = tuple(jnp.where(at_rest, 0, a) for a in angles)
+    angles = tuple(jnp.where(is_fixed, unmoved, a) for a in angles)
     none = jnp.zeros(mode.shape, jax.dtypes.float0)
     return (values, mode), ((dP_psi, dP_phi, dk2, *angles), none)
 

@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from polhode._closed_forms._arithmetic import deficit_per_parameter, nome_per_parameter, rd_series
 from polhode._closed_forms._free_constants import Polhode, Triple, component_at, restore
-from polhode._hamiltonian import triple
+from polhode._hamiltonian import cross, dot, triple
 
 Scalars = Float[Array, "*b"]
 
@@ -190,7 +190,7 @@ def products_of_momenta(invariants: Invariants, functions: Triple, sigma_pi: Sca
 def _off_diagonal_responses(
     invariants: Invariants, functions: Triple, momentum_at_t: Triple, by: Partials, sigma_pi, sense
 ) -> tuple:
-    """Answers of L(t) to the entries 12, 13, 23 of the inverse tensor."""
+    """Derivatives of L(t) by the entries 12, 13, 23 of the inverse tensor."""
     S, C, N = functions
     (l1, l2, l3), p, r, s, *_ = invariants
     n1, n2, n3 = momentum_at_t
@@ -368,20 +368,6 @@ class Frame:
 
     def reflected(self, values: Triple) -> Triple:
         return triple(e * x for e, x in zip(self.signs, values, strict=True))
-
-
-def cross(a: Triple, b: Triple) -> Triple:
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
-
-
-def dot(a, b) -> Scalars:
-    """Scalar product of vectors or quaternions."""
-    first, *rest = (x * y for x, y in zip(a, b, strict=True))
-    return sum(rest, start=first)
 
 
 def quaternion_product(a: Quadruple, b: Quadruple) -> Quadruple:

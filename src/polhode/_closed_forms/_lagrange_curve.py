@@ -89,7 +89,7 @@ def where_or_one(condition: Array, value: Array) -> Array:
 
 
 def positive(x: Array) -> Array:
-    """x, or the least positive number where rounding made it none."""
+    """x, or the smallest positive number where rounding made it zero or negative."""
     return jnp.where(x > 0, x, jnp.finfo(x.dtype).tiny)
 
 
@@ -231,8 +231,8 @@ class LagrangeConstants(NamedTuple):
     spinors: CayleyKlein
 
 
-def _where_or_zero(condition: Array, value: Array, other=0) -> Array:
-    return jnp.where(condition, value, other)
+def _where_or_zero(condition: Array, value: Array) -> Array:
+    return jnp.where(condition, value, 0)
 
 
 def _stack(*trees):
@@ -245,8 +245,8 @@ def _row(tree, rows: int):
 
 
 def _reciprocal(a: Complex, b: Complex, times: Array) -> tuple[Complex, Complex]:
-    """The pair so that its product is ``times`` where that is small and one is large, so that the
-    other is rounding: near three equal roots all would be."""
+    """The pair a, b with the product ``times``: beside a large one the other, which may be nothing
+    but rounding, is computed from the product. Near three equal roots both are left as they are."""
     first, second = (x.square > 1 / 4 for x in (a, b))
     large = where(first, a, where(second, b, Complex(jnp.ones_like(a.re), jnp.zeros_like(a.re))))
     other = large.inverse * times
@@ -326,9 +326,9 @@ def _places(f: Cubic, c: Curve, raw: Array):
 
 
 def _staged_start(c: Curve, start: Complex, partner: Complex):
-    """E and h/E so that their product is h although it may be rounding (near the separatrix).
+    """E and h/E with the product h; near the separatrix the smaller one may be mere rounding.
 
-    E and E/h are the same place; taken is the one far from 0, unless both are small.
+    E and E/h are the same place: the one far from 0 determines the other, unless both are small.
     """
     large, other = start.square > _SMALL**2, partner.square > _SMALL**2
     one = Complex(jnp.ones_like(c.h), jnp.zeros_like(c.h))

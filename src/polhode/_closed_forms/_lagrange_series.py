@@ -250,7 +250,7 @@ def _for_both(weights: tuple[Array, ...]) -> list[Array]:
 
 
 def rows_of_ones(rows: int, x: Array) -> Array:
-    """Ones (rows, *x.shape) that are no broadcast to XLA, of one body neither."""
+    """Ones (rows, *x.shape) that are not a broadcast to XLA, not even those of one body."""
     scale = jnp.arange(1, rows + 1, dtype=x.dtype)
     return opaque_ones(x[None] * scale.reshape(-1, *(1,) * x.ndim))
 

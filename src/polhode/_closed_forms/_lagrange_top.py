@@ -70,9 +70,9 @@ class LagrangeTop(AbstractChunkedForm):
     (``ph.UniformGravity.axial``), wheels of constant momentum on the axis allowed. All motions:
     looping, cuspidal and regular precession, sleeping and hanging tops, the separatrix, the
     pendulum, no gravity. The error is rounding: a few units in the last place of the phase.
-    Derivatives are those of symmetric bodies. Within a hair of the marginal sleeping top (L_z^2 = 4
-    A m g l and axis and rates within 1e-9 of upright) they lose digits: 1e-8 there, 1e-2 on it;
-    values do not. ``chunk`` bounds bodies times samples worked on at once (None: chosen).
+    Derivatives are those of symmetric bodies. Next to the marginal sleeping top (L_z^2 = 4 A m g l,
+    axis and rates within 1e-9 of upright) their relative error is 1e-8, on it 1e-2; values are
+    accurate there. ``chunk`` bounds bodies times samples worked on at once (None: chosen).
 
     Source: Klein & Sommerfeld, Theorie des Kreisels, chapter VI.
     """
@@ -264,7 +264,7 @@ def momentum_frequency(
 
 
 def short_angle(dtype) -> float:
-    """The angle ``frequency`` times the time [rad] up to which the step is exact to rounding."""
+    """``momentum_frequency`` times the time [rad] up to which the step is exact to rounding."""
     # The local error of fourth order is taken as angle^5 / 100.
     return (100 * float(jnp.finfo(dtype).eps)) ** (1 / 5)
 
@@ -334,7 +334,8 @@ def with_weight(
     """The ``motion`` without weight, with the derivatives by ``force``, which is zero.
 
     Second derivatives by it are NaN. ``applies`` (N, 1): bodies that turn and have no weight; of
-    others the result is finite and of no use. Other arguments as for ``lagrange_motion``.
+    others the result and its derivatives are finite and unused. Other arguments as for
+    ``lagrange_motion``.
     """
 
     # No part of a program that is not differentiated by the force: the changes are zero.
@@ -370,7 +371,9 @@ def _first_order(
     size = jnp.sqrt(jnp.sum(rate * rate, axis=-1, keepdims=True))
     n = rate / size
     axis = rotation.rotate(wxyz, jnp.broadcast_to(jnp.array([0, 0, 1], n.dtype), n.shape))
-    weight = derivable_once(force, jnp.ones_like(force, bool)) * distance[:, None]
+    # of bodies whose result is of no use nothing is NaN either
+    once = derivable_once(force, jnp.broadcast_to(applies, force.shape))
+    weight = once * distance[:, None]
     n_cross_axis = jnp.cross(n, axis)
     a, b, c = (
         jnp.cross(v, weight)[:, None] for v in (axis, n_cross_axis, jnp.cross(n, n_cross_axis))

@@ -22,8 +22,9 @@ Vector = tuple[Array, Array, Array]
 
 
 def dot(a: Sequence[Array], b: Sequence[Array]) -> Array:
-    """Scalar product of two component triples."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+    """Scalar product of the components of two vectors or quaternions."""
+    first, *rest = (x * y for x, y in zip(a, b, strict=True))
+    return sum(rest, start=first)
 
 
 def cross(a: Sequence[Array], b: Sequence[Array]) -> Vector:

@@ -5,13 +5,14 @@ Hamilton's equations are its derivatives by ``jax.grad``. The chart needs sin(th
 """
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._checks import ArrayLike, as_float_array, as_vectors
+from polhode._checks import ArrayLike, as_floats, as_vectors
 from polhode._hamiltonian._energy import (
     EnergyOfAttitude,
     Hamiltonian,
@@ -76,16 +77,22 @@ def hamiltons_equations(
 ) -> Callable[..., tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]]:
     """Hamilton's equations of any ``H(q, p, ...)`` by ``jax.grad`` (docs/equations.md: 2, 3).
 
-    Returns ``equations(q, p, *args) -> (dq/dt, dp/dt)``; leading batch axes are allowed as long
-    as H treats them one by one. Lists of numbers are taken as arrays.
+    Returns ``equations(q, p, *args) -> (dq/dt, dp/dt)``; leading batch axes broadcast, and are
+    allowed as long as H treats them one by one. Lists and integers are taken as arrays of floats.
     """
 
     def equations(q, p, *args):
-        q, p = (as_float_array(n, x) if isinstance(x, list) else x for n, x in (("q", q), ("p", p)))
+        if not _are_components(q, p):
+            q, p = as_floats(finite=False, q=(q, ()), p=(p, ()))
         slope_q, slope_p = jax.grad(lambda q, p: jnp.sum(H(q, p, *args)), argnums=(0, 1))(q, p)
         return slope_p, jax.tree.map(jnp.negative, slope_q)
 
     return equations
+
+
+def _are_components(*values: Any) -> bool:
+    """Whether values are tuples of component arrays, which need not be converted."""
+    return all(isinstance(v, tuple) and all(isinstance(x, Array) for x in v) for v in values)
 
 
 def rates_from_angle_rates(q: Sequence[Array], rates: Sequence[Array]) -> Vector:

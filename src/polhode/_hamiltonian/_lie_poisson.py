@@ -264,7 +264,7 @@ class LiePoissonCostate(NamedTuple):
     def begin(self, y, cotangents):
         """State to integrate backwards, (L, attitude, a, m), of the end and its cotangents."""
         momentum, wxyz = y
-        turn = tuple(_scalar_product(cotangents[1], quaternion_rate(wxyz, axis)) for axis in _AXES)
+        turn = tuple(dot(cotangents[1], quaternion_rate(wxyz, axis)) for axis in _AXES)
         place = wxyz if self.row is None else from_quaternion(wxyz).row(self.row)
         return tuple(momentum), tuple(place), tuple(cotangents[0]), turn
 
@@ -281,9 +281,7 @@ class LiePoissonCostate(NamedTuple):
         (by_L, by_place), (rate, omega, k) = cotangents(momentum, place)
         if self.row is None:
             place_rate = quaternion_rate(place, omega)
-            energy_by_turn = tuple(
-                _scalar_product(by_place, quaternion_rate(place, axis)) for axis in _AXES
-            )
+            energy_by_turn = tuple(dot(by_place, quaternion_rate(place, axis)) for axis in _AXES)
         else:
             place_rate, energy_by_turn = cross(place, omega), cross(by_place, place)
         turn_rate = tuple(a - b for a, b in zip(cross(turn, omega), energy_by_turn))
@@ -293,7 +291,7 @@ class LiePoissonCostate(NamedTuple):
         """Cotangents of the initial state; ``cotangents``: those of the state at its ``end``."""
         _, place, by_momentum, turn = z
         wxyz = place if self.row is None else start[1]  # not integrated back: the start is known
-        along_wxyz = _scalar_product(cotangents[1], end[1])
+        along_wxyz = dot(cotangents[1], end[1])
         by_wxyz = quaternion_rate(wxyz, tuple(4 * x for x in turn))
         return by_momentum, tuple(a + along_wxyz * q for a, q in zip(by_wxyz, wxyz))
 
@@ -316,7 +314,3 @@ class LiePoissonCostate(NamedTuple):
 
     def _attitude(self, place):
         return from_quaternion(place) if self.row is None else from_rows({self.row: place})
-
-
-def _scalar_product(a: Sequence[Array], b: Sequence[Array]) -> Array:
-    return sum((x * y for x, y in zip(a[1:], b[1:])), start=a[0] * b[0])

@@ -247,7 +247,7 @@ def hamiltonian_matrices(inertia: Inertia, q: ArrayLike) -> HamiltonianMatrices:
             "the closed forms hold about principal axes, and this inertia has products of inertia:"
             " use ph.Inertia.from_moments of its principal moments."
         )
-    moments, q = inertia.diagonal, as_float_array("q", q, (3,)).astype(inertia.dtype)
+    moments, q = inertia.moments, as_float_array("q", q, (3,)).astype(inertia.dtype)
     return HamiltonianMatrices(
         inverse_mass_matrix(moments, q), theta_form(moments, q), psi_form(moments, q)
     )

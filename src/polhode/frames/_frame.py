@@ -6,6 +6,7 @@ Equations: docs/equations.md, 003.
 import abc
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -14,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import ArrayLike, as_float_array, as_vectors, is_concrete, require
+from polhode._checks import ArrayLike, as_float_array, as_vectors, batch_of, is_concrete, require
 from polhode._kernels import smooth
 from polhode._parts import Signature, as_static, takes
 from polhode._trajectory import Trajectory
@@ -41,6 +42,12 @@ def rate_of_change(function: Callable, t: Array) -> tuple[Array, Array]:
 class AbstractTurning(eqx.Module):
     """Attitude and angular velocity of a frame at one time ``t`` (a scalar)."""
 
+    @property
+    def dtype(self) -> Any:
+        """Floating dtype of the numbers of the frame; that of JAX for functions of time alone."""
+        leaves = [x for x in jax.tree.leaves(self) if eqx.is_inexact_array(x)]
+        return jnp.result_type(*leaves) if leaves else jnp.result_type(float)
+
     @abc.abstractmethod
     def rates(self, t: Array) -> Rates:
         """Angular velocity and its derivative [rad/s, rad/s^2]; None where it is always zero."""
@@ -65,17 +72,24 @@ class ConstantRate(AbstractTurning):
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _turning(omega_body: Callable, t: Array, wxyz: Array, *hoisted: Array) -> Array:
-    """The attitude ``wxyz`` at ``t``, with the derivative that the angular velocity gives it."""
+def _turning(
+    omega_body: Callable, t: Array, t0: Array, start: Array, wxyz: Array, *hoisted: Array
+) -> Array:
+    """The attitude ``wxyz`` at ``t``, with the derivatives by ``t`` and by the time ``t0`` of the
+    attitude ``start`` that the angular velocity gives it."""
     return wxyz
 
 
 @_turning.defjvp
 def _turning_rule(omega_body, primals, tangents):
-    # Through the steps of an integration it would be zero at its start, where there is no step.
-    t, _, *hoisted = primals
+    # Through the steps of an integration they would be zero at its start, where there is no step.
+    t, t0, start, _, *hoisted = primals
     value = _turning(omega_body, *primals)
-    return value, tangents[1] + wxyz_rate(value, omega_body(t, *hoisted)) * tangents[0]
+    rate = wxyz_rate(value, omega_body(t, *hoisted))
+    # a later t0 leaves out the rotation that the start would have made until then
+    start_rate = wxyz_rate(start, omega_body(t0, *hoisted))
+    rate_by_t0 = -multiply(multiply(start_rate, conjugate(start)), value)
+    return value, tangents[3] + rate * tangents[0] + rate_by_t0 * tangents[1]
 
 
 class VariableRate(AbstractTurning):
@@ -90,9 +104,13 @@ class VariableRate(AbstractTurning):
 
     def attitude(self, t):
         """One adaptive integration from ``t0``, at about 50 times the rounding error per step."""
+        if t.weak_type:
+            t = t.astype(self.t0.dtype)
         omega_body, hoisted = jax.closure_convert(self.omega_body, t)
-        integrated = _integrated(self, jax.lax.stop_gradient(t))
-        return _turning(omega_body, t, integrated, *hoisted)
+        t0 = self.t0.astype(t.dtype)
+        fixed = eqx.tree_at(lambda x: x.t0, self, jax.lax.stop_gradient(self.t0))
+        integrated = _integrated(fixed, jax.lax.stop_gradient(t))
+        return _turning(omega_body, t, t0, self.start, integrated, *hoisted)
 
 
 @eqx.filter_jit  # once for every frame: diffrax would compile its loop at every eager call
@@ -167,8 +185,12 @@ def _slopes(ts, wxyz, omega_body, angular_acceleration) -> tuple[Array, Array]:
 
 @smooth  # the pieces meet with their second derivatives: no step has to end at a sample
 def _interval(times: Array, t: Array) -> Array:
-    """Place of the last time that is not after ``t``, within [0, n - 2], before the first time that
-    is repeated, as the time of an event is."""
+    """Index k of the interval from ``times[k]`` to ``times[k + 1]`` that contains ``t``; beyond the
+    samples, the nearest one.
+
+    The last time is repeated after an event that ends a simulation: intervals of no width are left
+    out.
+    """
     place = jnp.searchsorted(times, t, side="right") - 1
     widths = jnp.sum(times[1:] > times[:-1], dtype=place.dtype)
     return jnp.clip(place, 0, jnp.maximum(widths - 1, 0))
@@ -218,12 +240,20 @@ Time = Float[ArrayLike, "*#b"]
 Vector = Float[Array, "*#b 3"]
 
 
-def _at_times(function: Callable, t: Time):
-    """The function of one time, at every entry of an array of times."""
-    t = as_float_array("t", t, finite=False)
-    for _ in range(t.ndim):
+def _at_times(function: Callable, t: Time, dtype: Any):
+    """The function of one time, at every entry of an array of times.
+
+    Lists and integers become floats of ``dtype``.
+    """
+    times = as_float_array("t", t, finite=False)
+    if not (isinstance(t, float) or jnp.issubdtype(getattr(t, "dtype", int), jnp.floating)):
+        times = times.astype(dtype)
+    if times.size == 0:  # an integration has no empty batches
+        like = jax.eval_shape(function, jax.ShapeDtypeStruct((), times.dtype))
+        return jax.tree.map(lambda x: jnp.zeros((*times.shape, *x.shape), x.dtype), like)
+    for _ in range(times.ndim):
         function = jax.vmap(function)
-    return function(t)
+    return function(times)
 
 
 def _cross(left: Array, right: Array) -> Array:
@@ -370,7 +400,7 @@ class RotatingFrame(eqx.Module):
 
     def attitude(self, t: Time) -> Float[Array, "*b 4"]:
         """Unit quaternion, frame -> space."""
-        return _at_times(self.turning.attitude, t)
+        return _at_times(self.turning.attitude, t, self.turning.dtype)
 
     def omega_body(self, t: Time) -> Float[Array, "*b 3"]:
         """Angular velocity in frame components [rad/s]."""
@@ -385,7 +415,7 @@ class RotatingFrame(eqx.Module):
         if self.is_uniform:
             omega, slope = self.turning.rates(t)
             return jnp.broadcast_to(omega, (*jnp.shape(t), 3)), slope
-        return _at_times(self.turning.rates, t)
+        return _at_times(self.turning.rates, t, self.turning.dtype)
 
     def _origin(self, t: Time) -> tuple[Array, Array, Array]:
         """Position, velocity and acceleration of the origin in space components."""
@@ -399,7 +429,7 @@ class RotatingFrame(eqx.Module):
 
             return origin(time), *rate_of_change(velocity, time)
 
-        return _at_times(motion_at, jnp.asarray(t))
+        return _at_times(motion_at, t, self.turning.dtype)
 
     def _rotate_to_space(self, t: Time, vector: Array, wxyz: Array | None = None) -> Array:
         vector = as_vectors("vector", vector)
@@ -470,15 +500,15 @@ class RotatingFrame(eqx.Module):
 
     def euler(self, t: Time, position: Vector, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
         """Euler force [N], ``-mass d(omega)/dt x r``; plain zeros for a constant rate."""
-        slope, position = self._rates(t)[1], as_vectors("position", position)
+        (omega, slope), position = self._rates(t), as_vectors("position", position)
         if slope is None:
-            return jnp.zeros_like(position)
+            return _no_force(mass, omega, position)
         return _times(mass, -_cross(slope, position))
 
     def origin_force(self, t: Time, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
         """Force of the accelerating origin [N], ``-mass R^T d2(origin)/dt2``."""
         if self.origin is None:
-            return jnp.zeros_like(self.omega_body(t))
+            return _no_force(mass, self.omega_body(t))
         return _times(mass, -self._rotate_to_frame(t, self._origin(t)[2]))
 
     def _without_origin(self, t: Time, position: Vector, velocity: Vector | None) -> Vector:
@@ -500,6 +530,13 @@ class RotatingFrame(eqx.Module):
         if self.origin is None:
             return apparent
         return _sum(apparent, -self._rotate_to_frame(t, self._origin(t)[2], wxyz))
+
+
+def _no_force(mass: ArrayLike, *vectors: Array) -> Array:
+    """Zeros of the shape of a force that depends on these vectors."""
+    masses = as_float_array("mass", mass)
+    shape = np.broadcast_shapes((*masses.shape, 3), *(x.shape for x in vectors))
+    return jnp.zeros(shape, vectors[-1].dtype)
 
 
 def _times(mass: ArrayLike, vector: Array) -> Array:
@@ -532,17 +569,25 @@ def accelerometer(
     ``omega x (omega x r) + d(omega)/dt x r - R^T gravity`` (docs/equations.md, 003: 17-21), with
     the lever arm r from the point about which the body rotates. ``gravity_space`` (3,) [m/s^2] is
     for a body that rotates about a point fixed in space; leave it None for a body in free fall,
-    where gravity and the acceleration of the mass centre cancel.
+    where gravity and the acceleration of the mass centre cancel. Leading axes of positions
+    broadcast against the bodies: (n, 3) are n places on one body.
 
-    Raises ValueError if the trajectory has no rates (or no attitude where it is needed).
+    Raises ValueError if the trajectory has no rates (or no attitude where it is needed), or for
+    positions whose leading axes do not fit the bodies.
     """
     omega = trajectory.omega_body
     lever = as_float_array("position_body", position_body, (3,)).astype(omega.dtype)
-    lever = jnp.broadcast_to(lever[..., None, :], omega.shape)
-    reading = jnp.cross(omega, jnp.cross(omega, lever))
-    reading = reading + jnp.cross(angular_acceleration(trajectory), lever)
+    batch = batch_of(position_body=(lever, 1), omega_body=(omega, 2))
+
+    def of_batch(samples):
+        return jnp.broadcast_to(samples, (*batch, *omega.shape[-2:]))
+
+    lever, omega_of_batch = of_batch(lever[..., None, :]), of_batch(omega)
+    acceleration = of_batch(angular_acceleration(trajectory))
+    reading = jnp.cross(omega_of_batch, jnp.cross(omega_of_batch, lever))
+    reading = reading + jnp.cross(acceleration, lever)
     if gravity_space is None:
         return reading
     gravity = as_float_array("gravity_space", gravity_space, (3,)).astype(omega.dtype)
     down = jnp.broadcast_to(gravity, omega.shape)
-    return reading - rotate(conjugate(trajectory.wxyz), down)
+    return reading - of_batch(rotate(conjugate(trajectory.wxyz), down))

@@ -209,6 +209,9 @@ def simulate_particles(
     batch = jnp.broadcast_shapes(position.shape, velocity.shape, (*mass.shape[:-1], 3))
     position, velocity = (jnp.broadcast_to(x, batch) for x in (position, velocity))
     mass = jnp.broadcast_to(mass, (*batch[:-1], 1))
+    if 0 in batch:
+        none = jnp.zeros((*batch[:-1], len(ts), 3), dtype)
+        return ParticlePaths(ts, none, none, frame, jnp.ones((), bool), jnp.zeros((), int))
     *paths, steps = _solve(
         frame,
         force,

@@ -194,7 +194,7 @@ class Inertia(AbstractShaped, AbstractPart):
     def to_log_cholesky(self) -> Float[Array, "*b 6"]:
         """Unconstrained parameters (..., 6) of the tensor: log-Cholesky of its second moments.
 
-        A flat body lies on the boundary, where the parameters are infinite.
+        A flat body lies on the boundary, where a logarithm is infinite.
         """
         return inertia_to_log_cholesky(self.tensor)
 
@@ -382,8 +382,8 @@ def _moments_meant(value) -> Array:
 
 def angular_acceleration(
     inertia: Inertia,
-    omega_body: Float[Array | np.ndarray, "*#b 3"],
-    torque_body: Float[Array | np.ndarray, "*#b 3"] | None = None,
+    omega_body: Float[ArrayLike, "*#b 3"],
+    torque_body: Float[ArrayLike, "*#b 3"] | None = None,
 ) -> Float[Array, "*b 3"]:
     """``domega/dt`` (..., 3), rad/s^2, of ``I domega/dt + omega x (I omega) = N``.
 
@@ -391,18 +391,22 @@ def angular_acceleration(
     axes. Without ``omega x (I omega)``, as often printed, it is right only when that vanishes,
     i.e. when omega is along a principal axis.
     """
+    omega_body = as_vectors("omega_body", omega_body)
     drive = _cross(inertia.momentum(omega_body), omega_body)
     if torque_body is not None:
+        torque_body = as_vectors("torque_body", torque_body)
         drive = jnp.add(*jnp.broadcast_arrays(drive, torque_body))
     return inertia.rates(drive)
 
 
 def required_torque(
     inertia: Inertia,
-    omega_body: Float[Array | np.ndarray, "*#b 3"],
-    omega_dot_body: Float[Array | np.ndarray, "*#b 3"],
+    omega_body: Float[ArrayLike, "*#b 3"],
+    omega_dot_body: Float[ArrayLike, "*#b 3"],
 ) -> Float[Array, "*b 3"]:
     """The torque ``I domega/dt + omega x (I omega)`` (..., 3), N m, that a given motion needs."""
+    omega_body = as_vectors("omega_body", omega_body)
+    omega_dot_body = as_vectors("omega_dot_body", omega_dot_body)
     gyroscopic = _cross(omega_body, inertia.momentum(omega_body))
     return jnp.add(*jnp.broadcast_arrays(inertia.momentum(omega_dot_body), gyroscopic))
 

@@ -187,11 +187,17 @@ class MassProperties(AbstractShaped):
 
     def to_log_cholesky(self) -> Float[Array, "*b 10"]:
         """Inverse of ``from_log_cholesky``; infinite for a flat body, which is on the boundary."""
-        return pseudo_to_log_cholesky(self.mass, self.centre, self.central.tensor)
+        tensor = self.central.tensor
+        batch = np.broadcast_shapes(self.mass.shape, self.centre.shape[:-1], tensor.shape[:-2])
+        return pseudo_to_log_cholesky(
+            jnp.broadcast_to(self.mass, batch),
+            jnp.broadcast_to(self.centre, (*batch, 3)),
+            jnp.broadcast_to(tensor, (*batch, 3, 3)),
+        )
 
     @property
     def inertia(self) -> Inertia:
-        """Inertia about the centre of mass; ValueError if it is that of no extended body."""
+        """Inertia about the centre of mass; ValueError for that of a point or of a thin line."""
         if not self.central.is_principal:
             check_tensor("the inertia", self.central.tensor)
         elif is_concrete(self.central):

@@ -18,20 +18,30 @@ Shapes are always checked, values only where they are concrete.
 from collections.abc import Iterable
 from functools import reduce
 from operator import add
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from polhode._checks import is_concrete, numbers, on_host, require, require_positive
+from polhode._checks import (
+    ArrayLike,
+    as_float_array,
+    as_vectors,
+    is_concrete,
+    numbers,
+    on_host,
+    require,
+    require_positive,
+)
 from polhode._kernels import are_close, kernel, over_gap, underivable
 from polhode.rotation._quaternion import matrix_row
 
 # Cyclic Jacobi converges quadratically once the off-diagonal part is small against the gaps, and
 # linearly fast before that. Sweeps beyond the last needed one do nothing (t = 0 exactly or below
 # rounding). 4 sweeps reach float32 and 6 float64 rounding on every tensor tried, clustered
-# moments included; one more is cheap insurance.
+# moments included; float64 has one more as a margin.
 _SWEEPS = {2: 4, 4: 5, 8: 7}
 
 
@@ -120,7 +130,7 @@ def _total(terms: Iterable[Array]) -> Array:
 
 
 def principal(
-    tensor: Float[Array, "*b 3 3"],
+    tensor: Float[ArrayLike, "*b 3 3"],
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b 4"], Float[Array, "*b 3"]]:
     """Principal moments, axes and products of inertia of symmetric tensors.
 
@@ -134,7 +144,15 @@ def principal(
     moments, products and wxyz together. This holds to first order: the second derivative of an
     eigenvalue depends on the rotation of the axes, which is omitted (see ``principal_moments``).
     """
-    return _principal(tensor)
+    return _principal(_as_tensors(tensor))
+
+
+def _as_tensors(value: Any, name: str = "tensor") -> Array:
+    """Tensors (..., 3, 3) of floats, also from lists; NaN passes, and arrays at no cost."""
+    fits = isinstance(value, jax.Array) and value.shape[-2:] == (3, 3)
+    if fits and jnp.issubdtype(value.dtype, jnp.floating):
+        return value
+    return as_float_array(name, value, (3, 3), finite=False)
 
 
 @jax.jit  # a hundred operations: outside of a program each would be one of its own
@@ -200,15 +218,17 @@ def symmetric(diagonal, off):
     return jnp.stack([jnp.stack(row, axis=-1) for row in rows], axis=-2)
 
 
-def second_moments(tensor: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
+def second_moments(tensor: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
     """Second moments ``Sigma = tr(I)/2 - I`` (..., 3, 3), kg m^2, of inertia tensors."""
+    tensor = _as_tensors(tensor)
     a, b, c = (tensor[..., i, i] for i in range(3))
     off = (-tensor[..., 1, 2], -tensor[..., 0, 2], -tensor[..., 0, 1])
     return symmetric(((b + c - a) / 2, (c + a - b) / 2, (a + b - c) / 2), off)
 
 
-def inertia_of_second_moments(sigma: Float[Array, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
+def inertia_of_second_moments(sigma: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b 3 3"]:
     """Inertia tensors ``I = tr(Sigma) - Sigma`` (..., 3, 3), kg m^2, of second moments."""
+    sigma = _as_tensors(sigma, "sigma")
     a, b, c = (sigma[..., i, i] for i in range(3))
     off = (-sigma[..., 1, 2], -sigma[..., 0, 2], -sigma[..., 0, 1])
     return symmetric((b + c, c + a, a + b), off)
@@ -223,32 +243,51 @@ def _upper_product(d1, d2, d3, s12, s13, s23):
 
 
 def _upper_factor(sigma):
-    """The upper triangle S with positive diagonal of ``sigma = S S^T``."""
-    d3 = jnp.sqrt(sigma[..., 2, 2])
-    s23, s13 = sigma[..., 1, 2] / d3, sigma[..., 0, 2] / d3
-    d2 = jnp.sqrt(sigma[..., 1, 1] - s23 * s23)
-    s12 = (sigma[..., 0, 1] - s13 * s23) / d2
-    d1 = jnp.sqrt(sigma[..., 0, 0] - s13 * s13 - s12 * s12)
+    """The upper triangle S of ``sigma = S S^T``, its diagonal positive, or zero for a flat body."""
+    trace = sigma[..., 0, 0] + sigma[..., 1, 1] + sigma[..., 2, 2]
+    limit = -tolerance(sigma) * trace  # as far beyond the boundary as the constructors accept
+
+    def root(square):
+        is_positive = square > 0
+        zero = jnp.where(square >= limit, 0.0, jnp.nan).astype(square.dtype)  # NaN: of no body
+        return jnp.where(is_positive, jnp.sqrt(jnp.where(is_positive, square, 1)), zero)
+
+    d3 = root(sigma[..., 2, 2])
+    s23, s13 = _quotient(sigma[..., 1, 2], d3), _quotient(sigma[..., 0, 2], d3)
+    d2 = root(sigma[..., 1, 1] - s23 * s23)
+    s12 = _quotient(sigma[..., 0, 1] - s13 * s23, d2)
+    d1 = root(sigma[..., 0, 0] - s13 * s13 - s12 * s12)
     return d1, d2, d3, s12, s13, s23
 
 
-def inertia_from_log_cholesky(parameters: Float[Array, "*b 6"]) -> Float[Array, "*b 3 3"]:
+def _quotient(entry, diagonal):
+    """An entry of a column over the diagonal one; 0 where that is 0, as is the column then."""
+    is_zero = diagonal == 0
+    return jnp.where(is_zero, 0, entry / jnp.where(is_zero, 1, diagonal))
+
+
+def inertia_from_log_cholesky(parameters: Float[ArrayLike, "*b 6"]) -> Float[Array, "*b 3 3"]:
     """Inertia tensor (..., 3, 3) of ``(d1, d2, d3, n12, n13, n23)``, any real numbers.
 
     ``Sigma = S S^T`` with ``S = N diag(exp d)`` and N unit upper triangular: adding a constant
     to the three d scales the body and changes nothing else. d in log of sqrt(kg) m, n without unit.
     """
-    *logarithms, n12, n13, n23 = jnp.unstack(parameters, axis=-1)
+    *logarithms, n12, n13, n23 = jnp.unstack(as_vectors("parameters", parameters, 6), axis=-1)
     d1, d2, d3 = map(jnp.exp, logarithms)
     sigma = _upper_product(d1, d2, d3, n12 * d2, n13 * d3, n23 * d3)
     return inertia_of_second_moments(sigma)
 
 
-def inertia_to_log_cholesky(tensor: Float[Array, "*b 3 3"]) -> Float[Array, "*b 6"]:
-    """Inverse of ``inertia_from_log_cholesky``; a flat body (on the boundary) has infinite ones."""
+def inertia_to_log_cholesky(tensor: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b 6"]:
+    """Inverse of ``inertia_from_log_cholesky``.
+
+    Of a flat body, which is on the boundary, a logarithm is ``-inf``, and the entries of its column
+    are 0; NaN for a tensor that no body has.
+    """
     d1, d2, d3, s12, s13, s23 = _upper_factor(second_moments(tensor))
     logs = [jnp.log(d1), jnp.log(d2), jnp.log(d3)]
-    return jnp.stack([*logs, s12 / d2, s13 / d3, s23 / d3], axis=-1)
+    off_diagonal = [_quotient(x, d) for x, d in ((s12, d2), (s13, d3), (s23, d3))]
+    return jnp.stack([*logs, *off_diagonal], axis=-1)
 
 
 def pseudo_from_log_cholesky(
@@ -277,7 +316,7 @@ def pseudo_to_log_cholesky(
     return jnp.concatenate([jnp.stack(head, axis=-1), centre], axis=-1)
 
 
-def physical_margin(tensor: Float[Array, "*b 3 3"]) -> Float[Array, "*b"]:
+def physical_margin(tensor: Float[ArrayLike, "*b 3 3"]) -> Float[Array, "*b"]:
     """Signed distance (...), kg m^2, of a tensor to the boundary of the physical ones.
 
     A tensor belongs to a body exactly when its second moments ``Sigma = tr(I)/2 - I`` have no
@@ -294,8 +333,9 @@ def physical_margin(tensor: Float[Array, "*b 3 3"]) -> Float[Array, "*b"]:
     return jnp.where(outside, -distance, eigenvalues[..., 0])
 
 
-def is_physical(tensor: Float[Array, "*b 3 3"], slack: float = 0.0) -> Array:
+def is_physical(tensor: Float[ArrayLike, "*b 3 3"], slack: float = 0.0) -> Array:
     """Whether (...) a body can have this tensor; ``slack``: tolerance relative to its trace."""
+    tensor = _as_tensors(tensor)
     trace = tensor[..., 0, 0] + tensor[..., 1, 1] + tensor[..., 2, 2]
     return physical_margin(tensor) >= -slack * trace
 

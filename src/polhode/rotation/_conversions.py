@@ -20,7 +20,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._checks import ArrayLike, as_float_array, as_floats, as_vectors, batch_of
+from polhode._checks import ArrayLike, as_floats, as_vectors
+from polhode._kernels import smooth
 from polhode.rotation._quaternion import as_axes, as_matrices, as_quaternions, canonical, matrix_row
 from polhode.rotation._scalar import arc_ratio, cosine, direction, largest, length, sine_ratio
 
@@ -73,12 +74,32 @@ def _quaternion_of_matrix(matrix: Array, good: Array) -> Array:
 
 
 def rotation_vector_to_wxyz(rotation_vector: Float[ArrayLike, "*b 3"]) -> Float[Array, "*b 4"]:
-    """Unit quaternion of a rotation vector (rad); smooth everywhere, any angle."""
+    """Unit quaternion of a rotation vector (rad), smooth everywhere.
+
+    A vector so long that its square overflows counts as a shorter one of the same direction: its
+    rounding error is many turns.
+    """
     return _turned_by(as_vectors("rotation_vector", rotation_vector, 3))
+
+
+@smooth  # the quaternion jumps from turn to turn there anyway
+def _is_long(vector: Array) -> Array:
+    """Whether (..., 1) the square of a vector may overflow."""
+    limit = 2.0 ** (_half_range(vector) - 2)
+    # Written out: a maximum over a short axis would double the time of the whole conversion.
+    a, b, c = (jnp.abs(vector[..., i, None]) > limit for i in range(3))
+    return a | b | c
+
+
+def _half_range(vector: Array) -> int:
+    """Half of the largest exponent of two."""
+    return int(jnp.finfo(vector.dtype).maxexp) // 2
 
 
 @jax.jit
 def _turned_by(rotation_vector: Array) -> Array:
+    scale = 2.0 ** -(_half_range(rotation_vector) + 2)
+    rotation_vector = jnp.where(_is_long(rotation_vector), scale, 1) * rotation_vector
     quarter_squared = jnp.sum(rotation_vector * rotation_vector, axis=-1, keepdims=True) / 4
     vector = sine_ratio(quarter_squared) * rotation_vector / 2
     return jnp.concatenate([cosine(quarter_squared), vector], axis=-1)
@@ -106,11 +127,9 @@ def axis_angle_to_wxyz(
 
     Raises ValueError for an axis that is known not to be of unit length.
     """
-    axis = as_axes("axis", axis)
-    half = as_float_array("angle", angle, finite=False).astype(axis.dtype) / 2
-    shape = batch_of(axis=(axis, 1), angle=(half, 0))
-    half = jnp.broadcast_to(half, shape)[..., None]
-    axis = jnp.broadcast_to(axis, (*shape, 3))
+    as_axes("axis", axis)
+    axis, angle = as_floats(finite=False, axis=(axis, (3,)), angle=(angle, ()))
+    half = angle[..., None] / 2
     return jnp.concatenate([jnp.cos(half), jnp.sin(half) * axis], axis=-1)
 
 
@@ -121,15 +140,21 @@ def wxyz_to_axis_angle(
 
     At the identity the axis is undefined and (0, 0, 1) is returned. There neither axis nor angle
     has a derivative, and zero is returned for it; `wxyz_to_rotation_vector` is smooth there.
+    Raises ValueError for a quaternion that is zero; of a traced one axis and angle are NaN.
     """
     return _axis_angle(as_quaternions(wxyz))
 
 
 @jax.jit
 def _axis_angle(wxyz: Array) -> tuple[Array, Array]:
-    upper = canonical(wxyz)
+    upper = canonical(_nan_if_zero(wxyz))
     angle = 2 * jnp.arctan2(length(upper[..., 1:]), upper[..., 0])
     return direction(upper[..., 1:]), angle
+
+
+def _nan_if_zero(wxyz: Array) -> Array:
+    """The quaternions, with NaN for those that are zero and describe no rotation."""
+    return jnp.where(jnp.any(wxyz != 0, axis=-1, keepdims=True), wxyz, jnp.nan)
 
 
 def modified_rodrigues_to_wxyz(parameters: Float[ArrayLike, "*b 3"]) -> Float[Array, "*b 4"]:
@@ -187,8 +212,10 @@ def _shadow(wxyz: Array) -> Array:
 
 
 def shadow(parameters: Float[ArrayLike, "*b 3"]) -> Float[Array, "*b 3"]:
-    """The other set of the same rotation, ``-p/|p|**2``; NaN for the identity, of which it is
-    infinite in no direction."""
+    """The other set of the same rotation, ``-p/|p|**2``.
+
+    NaN for the identity: its other set is infinite, and of no direction.
+    """
     parameters = as_vectors("parameters", parameters, 3)
     size = length(parameters)[..., None]
     return -(parameters / size) / size
@@ -235,8 +262,13 @@ class Sequence(enum.Enum):
     def of(cls, axes: str) -> "Sequence":
         """The sequence that SciPy writes so: ``"ZYX"`` intrinsic, ``"zyx"`` extrinsic.
 
-        Raises ValueError for anything but three letters of one case, neighbours different.
+        Raises TypeError for what is no string, ValueError for anything but three letters of one
+        case, neighbours different.
         """
+        if not isinstance(axes, str):
+            raise TypeError(
+                f'axes must be a string such as "ZYX", got {type(axes).__name__}: {axes!r:.40}.'
+            )
         name = axes.upper() + ("_SPACE" if axes.islower() else "")
         if name not in cls.__members__ or not (axes.islower() or axes.isupper()):
             raise ValueError(
@@ -363,7 +395,12 @@ def wxyz_to_euler(
 
 @partial(jax.jit, static_argnums=0)
 def _angles(sequence: Sequence, wxyz: Array) -> tuple[Array, Array, Array]:
-    wxyz = jnp.where(jnp.any(wxyz != 0, axis=-1, keepdims=True), wxyz, jnp.nan)
+    wxyz = _nan_if_zero(wxyz)
+    # Products of components of tiny or huge quaternions would underflow or overflow. The scale does
+    # not matter, so that its derivative may be left out. It is a power of two: where the second
+    # angle is near an end of its range, rounded components would change the other two.
+    size = jax.lax.stop_gradient(largest(wxyz))
+    wxyz = wxyz / (size / jnp.frexp(size)[0])
     i, j, k = sequence.axes
     if sequence.is_extrinsic:
         i, j, k = k, j, i

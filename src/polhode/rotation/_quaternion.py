@@ -24,6 +24,7 @@ from jaxtyping import Array, Float
 from polhode._checks import (
     ArrayLike,
     as_float_array,
+    as_floats,
     as_vectors,
     batch_of,
     describe,
@@ -79,7 +80,8 @@ def _check_length(name: str, values: np.ndarray, unit: bool, hint: str) -> None:
 def as_matrices(value: Any) -> tuple[Array, Array]:
     """Matrices (..., 3, 3), and which of them (...) are rotations: orthogonal, of determinant 1."""
     matrix = value
-    if not isinstance(value, jax.Array) or value.shape[-2:] != (3, 3):
+    fits = isinstance(value, jax.Array) and value.shape[-2:] == (3, 3)
+    if not fits or not jnp.issubdtype(value.dtype, jnp.floating):
         matrix = as_float_array("matrix", value, (3, 3), finite=False)
     if not is_concrete(matrix):
         return matrix, _rotation_error(jax.lax.stop_gradient(matrix))[0]
@@ -143,9 +145,11 @@ def multiply(
     left: Float[ArrayLike, "*#b 4"], right: Float[ArrayLike, "*#b 4"]
 ) -> Float[Array, "*b 4"]:
     """Hamilton product ``left right``: the rotation ``right`` followed by ``left``."""
-    left, right = as_vectors("left", left, 4), as_vectors("right", right, 4)
-    batch_of(left=(left, 1), right=(right, 1))
-    return _product(left, right)
+    first, second = as_vectors("left", left, 4), as_vectors("right", right, 4)
+    batch_of(left=(first, 1), right=(second, 1))
+    if first.dtype != second.dtype:
+        first, second = as_floats(finite=False, left=(left, (4,)), right=(right, (4,)))
+    return _product(first, second)
 
 
 @jax.jit  # one program, not one for each operation; likewise below
@@ -176,9 +180,11 @@ def rotate(
 
     Raises ValueError for a quaternion that is known not to be of unit length.
     """
-    wxyz, vector = as_quaternions(wxyz, unit=True), as_vectors("vector", vector, 3)
-    batch_of(wxyz=(wxyz, 1), vector=(vector, 1))
-    return _rotated(wxyz, vector)
+    turn, turned = as_quaternions(wxyz, unit=True), as_vectors("vector", vector, 3)
+    batch_of(wxyz=(turn, 1), vector=(turned, 1))
+    if turn.dtype != turned.dtype:
+        turn, turned = as_floats(finite=False, wxyz=(wxyz, (4,)), vector=(vector, (3,)))
+    return _rotated(turn, turned)
 
 
 @jax.jit
@@ -274,7 +280,7 @@ def wxyz_to_scipy(wxyz: Float[ArrayLike, "*b 4"]) -> "Rotation":
         )
     from scipy.spatial.transform import Rotation
 
-    xyzw = np.asarray(wxyz_to_xyzw(as_quaternions(wxyz)), np.float64)
+    xyzw = np.array(wxyz_to_xyzw(as_quaternions(wxyz)), np.float64)  # SciPy needs a writable one
     return Rotation.from_quat(xyzw if xyzw.ndim == 1 else xyzw.reshape(-1, 4))
 
 
