@@ -260,9 +260,11 @@ def log_density(
     The result is a density for BlackJAX; its negative is a ``potential_fn`` for NumPyro.
     """
 
+    variance = jnp.asarray(noise) ** 2
+
     def density(parameters):
         parts = residuals(parameters, recording, model)
-        misfit = -reduce(add, (jnp.sum(part**2) for part in parts.values())) / noise**2 / 2
+        misfit = -reduce(add, (jnp.sum(part**2) for part in parts.values())) / variance / 2
         misfit = misfit - prior_cost(parameters, recording, model)
         return misfit if prior is None else misfit + prior(parameters)
 
