@@ -438,11 +438,11 @@ def check_scene(scene: Scene) -> None:
         _check_batch_axes(torque)
 
 
-def _check_batch_axes(torque: AbstractTorque) -> None:
-    """ValueError for a torque of the user's class with batch axes that ``core_ranks`` leaves out.
+_CHECKED: set[Any] = set()  # classes and shapes, for the check takes as long as a trace
 
-    Nothing is computed: the torque of one body is traced.
-    """
+
+def _check_batch_axes(torque: AbstractTorque) -> None:
+    """ValueError for batch axes of a class of the user's that its ``core_ranks`` leaves out."""
     if type(torque).__module__.partition(".")[0] == "polhode":
         return
     arrays = {f.name: getattr(torque, f.name) for f in dataclasses.fields(torque)}
@@ -451,7 +451,8 @@ def _check_batch_axes(torque: AbstractTorque) -> None:
         for name, x in arrays.items()
         if name not in torque.core_ranks and isinstance(x, jax.Array | np.ndarray) and x.ndim
     ]
-    if not others:
+    key = type(torque), *(arrays[name].shape for name in others)
+    if not others or key in _CHECKED:
         return
     one = map_arrays(torque, lambda x, rank: x[(0,) * (x.ndim - rank)])
     dtype = jnp.result_type(*(arrays[name] for name in others))
@@ -467,6 +468,7 @@ def _check_batch_axes(torque: AbstractTorque) -> None:
             f" for one body, where () is expected. If {', '.join(others)} of it may have batch"
             ' axes, let core_ranks return {"NAME": n} for each, n being the axes of one body.'
         )
+    _CHECKED.add(key)
 
 
 def specialise(scene: Scene) -> Scene:
