@@ -21,7 +21,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike, as_floats, as_vectors
-from polhode._kernels import smooth
 from polhode.rotation._quaternion import as_axes, as_matrices, as_quaternions, canonical, matrix_row
 from polhode.rotation._scalar import arc_ratio, cosine, direction, largest, length, sine_ratio
 
@@ -76,30 +75,13 @@ def _quaternion_of_matrix(matrix: Array, good: Array) -> Array:
 def rotation_vector_to_wxyz(rotation_vector: Float[ArrayLike, "*b 3"]) -> Float[Array, "*b 4"]:
     """Unit quaternion of a rotation vector (rad), smooth everywhere.
 
-    A vector so long that its square overflows counts as a shorter one of the same direction: its
-    rounding error is many turns.
+    NaN where the square of the vector overflows: its rounding error is many turns.
     """
     return _turned_by(as_vectors("rotation_vector", rotation_vector, 3))
 
 
-@smooth  # the quaternion jumps from turn to turn there anyway
-def _is_long(vector: Array) -> Array:
-    """Whether (..., 1) the square of a vector may overflow."""
-    limit = 2.0 ** (_half_range(vector) - 2)
-    # Written out: a maximum over a short axis would double the time of the whole conversion.
-    a, b, c = (jnp.abs(vector[..., i, None]) > limit for i in range(3))
-    return a | b | c
-
-
-def _half_range(vector: Array) -> int:
-    """Half of the largest exponent of two."""
-    return int(jnp.finfo(vector.dtype).maxexp) // 2
-
-
 @jax.jit
 def _turned_by(rotation_vector: Array) -> Array:
-    scale = 2.0 ** -(_half_range(rotation_vector) + 2)
-    rotation_vector = jnp.where(_is_long(rotation_vector), scale, 1) * rotation_vector
     quarter_squared = jnp.sum(rotation_vector * rotation_vector, axis=-1, keepdims=True) / 4
     vector = sine_ratio(quarter_squared) * rotation_vector / 2
     return jnp.concatenate([cosine(quarter_squared), vector], axis=-1)
