@@ -3,6 +3,8 @@
 import enum
 from typing import NamedTuple
 
+import numpy as np
+
 
 class Finding(enum.IntFlag):
     """Diagnostics of a fit, as flags (per body; 0: none)."""
@@ -80,6 +82,41 @@ class Observability(NamedTuple):
     shown: int
     source: str
     remedy: str
+
+
+def shown_beside_prior(covariance: np.ndarray, std: np.ndarray) -> int:
+    """In how many directions of a value the data at least halve the variance of its prior;
+    ``covariance`` (n, n), ``std`` (n,) of the prior."""
+    return int(np.sum(np.linalg.eigvalsh(covariance / std[:, None] / std) < 0.5))
+
+
+def shown_of_gain(covariance: np.ndarray, std: np.ndarray) -> list[tuple[str, int, int]]:
+    """What the data show of the errors of a gain matrix: name, number of directions and how many
+    of them are shown. ``covariance`` (9, 9), row by row; ``std`` (3, 3) of the calibration."""
+    # symmetric and antisymmetric combinations of opposite entries
+    stretch, turn = [], []
+    for i in range(3):
+        unit = np.zeros((3, 3))
+        unit[i, i] = 1
+        stretch.append(unit)
+        for j in range(i):
+            even, odd = np.zeros((3, 3)), np.zeros((3, 3))
+            even[i, j] = even[j, i] = odd[i, j] = 0.5
+            odd[j, i] = -0.5
+            stretch.append(even)
+            turn.append(odd)
+    rows = []
+    for name, directions in (
+        ("scale factors and non-orthogonality of the gyroscope", stretch),
+        ("rotation of the gyroscope", turn),
+    ):
+        basis = np.array([part.ravel() for part in directions])
+        prior = np.sqrt(np.sum((basis * std.ravel()) ** 2, axis=1))
+        basis = basis[prior > 0] / prior[prior > 0, None]
+        if basis.shape[0]:
+            remaining = np.linalg.eigvalsh(basis @ covariance @ basis.T)
+            rows.append((name, basis.shape[0], int(np.sum(remaining < 0.5))))
+    return rows
 
 
 class FitError(RuntimeError):

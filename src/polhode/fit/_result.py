@@ -24,6 +24,8 @@ from polhode.fit._findings import (
     Finding,
     FitError,
     Observability,
+    shown_beside_prior,
+    shown_of_gain,
 )
 from polhode.fit._model import LeafMotion, Parameters, entries_of, whole_of
 from polhode.fit._residuals import Model
@@ -218,8 +220,7 @@ class Fit(eqx.Module):
 
         value, slopes = of_unknowns(values), jax.jacfwd(of_unknowns)(values)
         slopes = [np.reshape(np.asarray(x), (value.size, -1)) for x in slopes]
-        sensors = (self.parameters.bias, self.parameters.mounting, self.parameters.lever)
-        skipped = sum(int(np.prod(np.shape(x)[lead:])) for x in sensors if x is not None)
+        skipped = self._count("bias", "mounting", "lever")
         covariance, information = (
             np.asarray(x).reshape(-1, *np.shape(x)[-2:])[body]
             for x in (self.covariance, self.information)
@@ -315,19 +316,18 @@ class Fit(eqx.Module):
             )
         return "the noise of the readings: more samples, or faster rotation, help"
 
+    def _count(self, *names: str) -> int:
+        """How many unknowns of one body belong to these fields of ``parameters``."""
+        leaves = [x for name in names for x in jax.tree.leaves(getattr(self.parameters, name))]
+        return sum(int(np.prod(np.shape(x)[np.ndim(self.diagnostics) :])) for x in leaves)
+
     def _calibration_part(self, body: int) -> float:
         """Part of the variance of the values that an exact calibration would remove, at most."""
         entry_count = self.model.entries
-        lead = np.ndim(self.diagnostics)
         if self.parameters.gain is None:
             return 0.0
-
-        def count(*names):
-            leaves = [x for name in names for x in jax.tree.leaves(getattr(self.parameters, name))]
-            return sum(int(np.prod(np.shape(leaf)[lead:])) for leaf in leaves)
-
-        start = entry_count + count("bias", "mounting", "lever")
-        motion_end = start + count("motion")
+        start = entry_count + self._count("bias", "mounting", "lever")
+        motion_end = start + self._count("motion")
         matrix = np.asarray(self.covariance)
         matrix = matrix.reshape(-1, *matrix.shape[-2:])[body]
         value_places = (
@@ -503,59 +503,26 @@ class Fit(eqx.Module):
         return self.model.motion.prior_std()
 
     def _count_shown_beside_prior(self, k: int, body: int) -> int:
-        """Of how many directions of a value with a prior the data at least halve the variance."""
+        """``shown_beside_prior`` of a value of one body."""
         lead = np.ndim(self.diagnostics)
         sizes = [int(np.prod(np.shape(x)[lead:])) for x in self.values]
-        sensors = (self.parameters.bias, self.parameters.mounting, self.parameters.lever)
-        first = sum(int(np.prod(np.shape(x)[lead:])) for x in sensors if x is not None)
-        first += sum(sizes[:k])
+        first = self._count("bias", "mounting", "lever") + sum(sizes[:k])
         place = slice(first, first + sizes[k])
         covariance = np.asarray(self.covariance)
         block = covariance.reshape(-1, *covariance.shape[-2:])[body][place, place]
         widths = np.asarray(self._prior_std[k]).reshape(-1, sizes[k])
         width = widths[min(body, len(widths) - 1)]
-        return int(np.sum(np.linalg.eigvalsh(block / width[:, None] / width) < 0.5))
+        return shown_beside_prior(block, width)
 
     def _calibration_shown(self, body: int) -> list[tuple[str, int, int]] | None:
-        """Of the gyroscope's gain: name, number and how many directions the data show.
-
-        A direction is shown where the data at least halve the variance of its calibration.
-        """
+        """``shown_of_gain`` of the gyroscope; None where its gain is not fitted."""
         if self.parameters.gain is None:
             return None
-        rows = []
-        lead = np.ndim(self.diagnostics)
-        count = self.model.entries
-        for name in ("bias", "mounting", "lever", "motion"):
-            leaves = jax.tree.leaves(getattr(self.parameters, name))
-            count += sum(int(np.prod(np.shape(leaf)[lead:])) for leaf in leaves)
+        count = self.model.entries + self._count("bias", "mounting", "lever", "motion")
         covariance = np.asarray(self.covariance)
         covariance = covariance.reshape(-1, *covariance.shape[-2:])[body]
         block = covariance[count : count + 9, count : count + 9]
-        width = self.model.gyroscope.gain_std
-        # symmetric and antisymmetric combinations of opposite entries
-        stretch, turn = [], []
-        for i in range(3):
-            unit = np.zeros((3, 3))
-            unit[i, i] = 1
-            stretch.append(unit)
-            for j in range(i):
-                even, odd = np.zeros((3, 3)), np.zeros((3, 3))
-                even[i, j] = even[j, i] = odd[i, j] = 0.5
-                odd[j, i] = -0.5
-                stretch.append(even)
-                turn.append(odd)
-        for name, directions in (
-            ("scale factors and non-orthogonality of the gyroscope", stretch),
-            ("rotation of the gyroscope", turn),
-        ):
-            basis = np.array([part.ravel() for part in directions])
-            prior = np.sqrt(np.sum((basis * width.ravel()) ** 2, axis=1))
-            basis = basis[prior > 0] / prior[prior > 0, None]
-            if basis.shape[0]:
-                remaining = np.linalg.eigvalsh(basis @ block @ basis.T)
-                rows.append((name, basis.shape[0], int(np.sum(remaining < 0.5))))
-        return rows
+        return shown_of_gain(block, self.model.gyroscope.gain_std)
 
     def report(self, body: int | None = None) -> str:
         """A short text on one body, or on all (None): values, uncertainty and warnings."""
