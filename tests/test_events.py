@@ -543,7 +543,7 @@ def test_a_terminal_event_is_stored_when_the_places_are_taken(torque):
     assert np.isfinite(traj.omega_body).all()
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("mode", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
 def test_an_event_where_a_relay_turns_has_the_derivatives_of_the_motion_before(mode):
     """w' = (0.3, 0, 0.05) up to the event, w_0 = 1/2, beyond which the torque is another one."""
 
