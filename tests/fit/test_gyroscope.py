@@ -1,7 +1,5 @@
 """The sensor model of gyroscopes: its simulated noise, and fits of readings with its errors."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -334,8 +332,9 @@ def test_deviations_are_those_of_readings():
             np.asarray(omega[0]) @ gain
             + np.random.default_rng(0).normal(0, 0.002, (TIMES.size, 3)) @ gain
         )
-        sensor = Gyroscope(gain, noise_density=0.002, bias_std=0.01)
-        fit = fit_recordings([Recording.of(TIMES, data)], options=FitOptions(gyroscope=sensor))
+        recording = Recording.of(TIMES, data, omega_noise=0.02 * np.diag(gain))
+        options = FitOptions(gyroscope=Gyroscope(gain, bias_std=0.01), trust_noise=True)
+        fit = fit_recordings([recording], options=options)
         std[size] = fit.sensor_std
     np.testing.assert_allclose(
         std[2.0]["bias"], std[1.0]["bias"] * np.array([1.0, 2, 1]), rtol=1e-3
@@ -354,9 +353,13 @@ def test_calibrated_readings_are_corrected():
     data = sensor.read(KEY, TIMES, omega[0])
     options = FitOptions(gyroscope=sensor)
     fit = fit_recordings([Recording.of(TIMES, data)], options=options)
-    ideal = FitOptions(gyroscope=dataclasses.replace(sensor, gain=None, bias=None))
-    rates = (np.asarray(data) - [0.3, -0.2, 0.1]) @ np.linalg.inv(gain).T
-    plain = fit_recordings([Recording.of(TIMES, rates)], options=ideal)
+    back = np.linalg.inv(gain)
+    rates = (np.asarray(data) - [0.3, -0.2, 0.1]) @ back.T
+    noise = 0.002 / 0.01**0.5 * np.linalg.norm(back, axis=1)  # of samples 0.01 s apart
+    recording = Recording.of(TIMES, rates, omega_noise=noise)
+    plain = fit_recordings(
+        [recording], options=FitOptions(gyroscope=Gyroscope(bias_std=0.01), trust_noise=True)
+    )
     np.testing.assert_allclose(fit.ratios, plain.ratios, atol=1e-9)
     assert np.abs(np.asarray(fit.sensor["gain"]) - gain).max() < 0.03
     assert np.abs(np.asarray(fit.sensor["bias"]) - [0.3, -0.2, 0.1]).max() < 0.04
