@@ -304,14 +304,38 @@ def test_limits_and_edges_that_are_wrong_have_a_status_where_they_are_traced(nam
 
     @jax.jit
     @jax.vmap
-    def status(numbers):
-        return ph.simulate(make(*numbers), STATE, TS).status
+    def outcome(numbers):
+        motion = ph.simulate(make(*numbers), STATE, TS)
+        return motion.status, motion.omega_body
 
     given = [good, [np.nan, good[1]], [good[0], np.nan]]
     if name in ("motor", "pulse", "rods"):
         given += [[-good[0], good[1]] if name != "pulse" else [0.5, 0.2]]
     expected = [ph.Status.SUCCESSFUL] + [ph.Status.NOT_FINITE] * (len(given) - 1)
-    np.testing.assert_array_equal(status(jnp.array(given)), expected)
+    status, rates = outcome(jnp.array(given))
+    np.testing.assert_array_equal(status, expected)
+    assert np.isfinite(rates[0]).all()
+    assert np.isnan(rates[1:]).all()
+
+
+def test_a_body_with_a_wrong_limit_adds_nothing_to_the_gradient_of_the_others():
+    """A gain that bodies share, and limits of each motor; the mean is NaN if all are wrong."""
+
+    @jax.jit
+    @jax.value_and_grad
+    def mean(gain, limits):
+        motor = ph.Motor(lambda t, q, w, s: gain * q[1] + w[0], max_torque=limits)
+        wheel = ph.Rotor([1.0, 0, 0], 0.05, speed=1.0, coupling=motor)
+        scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), rotors=wheel)
+        motion = ph.simulate(scene, STATE, TS)
+        return ph.successful_mean(motion, lambda motion: motion.omega_body[:, -1, 0])
+
+    value, slope = mean(0.4, jnp.array([0.5, 0.5]))
+    assert abs(slope) > 1e-6
+    for wrong in (-0.5, np.nan):
+        found = mean(0.4, jnp.array([0.5, wrong]))
+        np.testing.assert_allclose(found, (value, slope), rtol=1e-9)
+        assert np.isnan(mean(0.4, jnp.array([wrong, wrong]))[0])
 
 
 def test_a_limit_that_is_wrong_raises_outside_of_jit():

@@ -13,7 +13,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from polhode._checks import as_float_array, describe, is_concrete, require
-from polhode._parts import all_input_conditions, as_static, check_fields, takes
+from polhode._parts import as_static, check_fields, takes
 from polhode._scene import Scene, State, check_scene
 
 # How the simulation of each body ended.
@@ -519,9 +519,6 @@ def status_with_input_errors(
         min_rtol = 8 * float(jnp.finfo(ts.dtype).eps)
         is_too_small = (status == Status.SUCCESSFUL) & ~(rtol >= min_rtol * 0.99)
         status = jnp.where(is_too_small, Status.INACCURATE, status)
-    for part in (scene.inertia, scene.potential, scene.torque, scene.rotors):
-        for condition in all_input_conditions(part):
-            status = jnp.where(condition, status, Status.NOT_FINITE)
     status = jnp.where(scene.is_possible, status, Status.NOT_PHYSICAL)
     steps = jax.lax.stop_gradient(ts[..., 1:] - ts[..., :-1])
     ordered = jnp.all(steps > 0, axis=-1) | jnp.all(steps < 0, axis=-1)

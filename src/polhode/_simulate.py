@@ -48,6 +48,7 @@ from polhode._method import (
     raise_on_failure,
     status_with_input_errors,
 )
+from polhode._parts import all_input_conditions
 from polhode._plan import Plan, choose, plan
 from polhode._sampled import HeldPropagator, is_sampled, sampled_method
 from polhode._scene import Scene, State
@@ -255,13 +256,19 @@ def _events_met(events, method, scene, state, ts, rtol) -> Trajectory | None:
 
 
 def _sound(method: AbstractMethod, scene: Scene, state: State, ts: Array) -> tuple[State, Array]:
-    """``sound_state`` in programs of derivatives; in others NaN passes through every method.
+    """``sound_state`` in programs of derivatives; in others NaN passes through every method. Bodies
+    with limits or edges that a comparison would take for good ones are not sound in either.
 
     Integrated, a body at rest takes few steps. Closed forms have formulas of their own for rest, so
     there the body turns.
     """
     inputs = jax.tree.leaves(eqx.filter((scene, state, ts), eqx.is_inexact_array))
-    return sound_state(state, is_differentiated(inputs), rate=1.0 if method.exact else 0.0)
+    rate = 1.0 if method.exact else 0.0
+    state, is_sound = sound_state(state, is_differentiated(inputs), rate)
+    for name in PARTS:
+        for condition in all_input_conditions(getattr(scene, name)):
+            is_sound = jnp.logical_and(*jnp.broadcast_arrays(is_sound, condition))
+    return state, is_sound
 
 
 def _with_failures(trajectory: Trajectory, is_sound: Array) -> Trajectory:

@@ -119,8 +119,10 @@ class Event(eqx.Module):
     def _towards(self, trajectory: Trajectory, side: Array) -> list[Array]:
         """Changes of attitude, rates and time by some units in the last place, which lead from the
         surface where the function is zero to the ``side`` where it has this sign."""
-        wxyz, omega = trajectory.wxyz, trajectory.omega_body
-        t = jnp.broadcast_to(trajectory._t, omega.shape[:-1])
+        wxyz, omega, t = jax.lax.stop_gradient(
+            (trajectory.wxyz, trajectory.omega_body, jnp.asarray(trajectory._t))
+        )
+        t = jnp.broadcast_to(t, omega.shape[:-1])
         units = [
             jnp.ones_like(wxyz),
             jnp.broadcast_to(jnp.linalg.norm(omega, axis=-1, keepdims=True), omega.shape),

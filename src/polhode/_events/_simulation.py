@@ -273,8 +273,8 @@ def check_until(until: Any, record: Any) -> None:
 
 
 def stop_at_event(begin: Trajectory, ts: Array, until: Event) -> Trajectory:
-    """The motion from ``begin``, its state at the first of ``ts``, each body at rest from its first
-    event on."""
+    """The motion from ``begin``, its state at the first of ``ts``, each body in the state
+    of its first event from then on."""
     terminal = Event(until.fn, until.direction, until.samples, terminal=True, capacity=1)
     trajectory = events_by_steps(begin, ts, (terminal,))
     if trajectory is not None:
