@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import polhode.rotation as rotation
-from polhode.rotation import _scalar
+from polhode.rotation import _quaternion
 from polhode.rotation._conversions import shadow
 
 SHAPE = (3, 1, 2, 1)
@@ -118,8 +118,8 @@ def test_no_jump_at_the_threshold_of_the_series(dtype):
     exact = 0.13633782164678979  # (2 - sin 2)/8
     at = dtype(4)
     below, above = np.nextafter(at, dtype(0)), at
-    values = [_scalar._cubic_ratio(jnp.asarray(x)) for x in (below, above)]
-    slopes = [jax.grad(_scalar._cubic_ratio)(jnp.asarray(x)) for x in (below, above)]
+    values = [_quaternion._cubic_ratio(jnp.asarray(x)) for x in (below, above)]
+    slopes = [jax.grad(_quaternion._cubic_ratio)(jnp.asarray(x)) for x in (below, above)]
     eps = np.finfo(dtype).eps
     for value in values:
         assert abs(float(value) - exact) < 2 * eps * exact

@@ -21,8 +21,19 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from polhode._checks import ArrayLike, as_floats, as_vectors
-from polhode.rotation._quaternion import as_axes, as_matrices, as_quaternions, canonical, matrix_row
-from polhode.rotation._scalar import arc_ratio, cosine, direction, largest, length, sine_ratio
+from polhode.rotation._quaternion import (
+    arc_ratio,
+    as_axes,
+    as_matrices,
+    as_quaternions,
+    canonical,
+    cosine,
+    direction,
+    largest,
+    length,
+    matrix_row,
+    sine_ratio,
+)
 
 
 def wxyz_to_matrix(wxyz: Float[ArrayLike, "*b 4"]) -> Float[Array, "*b 3 3"]:
