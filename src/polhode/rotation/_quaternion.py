@@ -35,7 +35,6 @@ from polhode._checks import (
 )
 from polhode._kernels import smooth
 
-
 # Scalar functions that every conversion rests on, smooth where the mathematics is smooth. A square
 # root, a quotient 0/0 or an arctangent of two zeros has a value but no usable derivative under
 # automatic differentiation. Here each such function carries its analytic derivative, written with
