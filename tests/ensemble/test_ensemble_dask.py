@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from polhode import ensemble as ens
-from polhode.ensemble import _dask
+from polhode.ensemble import _stream
 
 distributed = pytest.importorskip("distributed")
 xarray = pytest.importorskip("xarray")
@@ -48,7 +48,7 @@ def test_an_active_client_computes_the_chunks(whole, tmp_path):
                 name="dask",
                 progress=reports.append,
             )
-        _dask._build.cache_clear()
+        _stream._build.cache_clear()
     assert reports[-1].done == 40_000
     assert len(reports) == 6
     same(path, whole)
@@ -60,11 +60,11 @@ def test_mapped_rows_are_sent_as_the_name_of_their_file(tmp_path):
     np.save(tmp_path / "columns.npy", np.asfortranarray(rows))
     for name in ("rows", "columns"):
         mapped = np.load(tmp_path / f"{name}.npy", mmap_mode="r")
-        reference = _dask._reference(mapped)
+        reference = _stream._reference(mapped)
         assert isinstance(reference[0], Path)
-        np.testing.assert_array_equal(_dask._dereference(reference), rows)
-    np.testing.assert_array_equal(_dask._reference(mapped[7:]), rows[7:])
-    np.testing.assert_array_equal(_dask._reference(rows), rows)
+        np.testing.assert_array_equal(_stream._dereference(reference), rows)
+    np.testing.assert_array_equal(_stream._reference(mapped[7:]), rows[7:])
+    np.testing.assert_array_equal(_stream._reference(rows), rows)
 
 
 def test_no_scheduler_at_the_address(tmp_path):
