@@ -64,12 +64,12 @@ def test_euler_sequences_agree_with_scipy():
     from scipy.spatial.transform import Rotation
 
     angles = [0.3, -1.1, 2.5]
-    for sequence in ("zyz", "zxz", "xyz", "zyx", "yxy"):
+    for sequence in ("ZYZ", "ZXZ", "XYZ", "ZYX", "YXY"):
         text = GOOD.replace("ZYZ", sequence).replace("[90, 0, 0]", str(angles))
         state = parse_scene(text.replace("deg", "rad", 1)).state
         mine = np.asarray(build_attitudes(state.attitude, np.float64))
         # an upper-case sequence is intrinsic in SciPy: the product R_a R_b R_c
-        truth = Rotation.from_euler(sequence.upper(), angles).as_quat(scalar_first=True)
+        truth = Rotation.from_euler(sequence, angles).as_quat(scalar_first=True)
         np.testing.assert_allclose(mine * np.sign(mine @ truth), truth, atol=4e-16)
 
 
@@ -85,7 +85,8 @@ def test_euler_sequences_agree_with_scipy():
         ("[1.0, 2, 2.5]", f"[1, 2, 1{'0' * 400}]", "[inertia] moments", "a valid number"),
         ("[1.0, 2, 2.5]", "[1.0, 2, 2.5]\nspherical = 1", "[inertia]", "exactly one of"),
         ('"deg/s" }\n[times]', '"deg/sec" }\n[times]', "[state.omega_body] unit", "deg/s"),
-        ('"ZYZ"', '"ZZY"', "[state.euler] sequence", 'did you mean "zyz"?'),
+        ('"ZYZ"', '"ZZY"', "[state.euler] sequence", 'did you mean "ZYZ"?'),
+        ('"ZYZ"', '"zyx"', "[state.euler] sequence", 'reverse letters and angles: "XYZ"'),
         ("stop = 2.0", "stop = 0.0", "[times]", "stop must be other than start"),
         ("stop = 2.0\nnumber = 5", "values = [0, 2, 1]", "[times] values", "sort them"),
         ("stop = 2.0\nnumber = 5", "values = [0, 0]", "[times] values", "sort them"),

@@ -78,6 +78,11 @@ def test_sphere_and_darkness():
     np.testing.assert_allclose(found[1:3], published, rtol=1e-12)
     np.testing.assert_allclose(found[0], 1, rtol=1e-14)
     np.testing.assert_allclose(lightcurve.seeliger_sphere(alpha), found, atol=1e-12)
+    rows = (jnp.stack(v, axis=-1) for v in (sun, observer))
+    found_of_rows = lightcurve.seeliger_ellipsoid(np.ones(3), *rows) / (jnp.pi / 2)
+    np.testing.assert_allclose(found_of_rows, found, rtol=1e-14)
+    with pytest.raises(ValueError, match=r"sun must be an array \(..., 3\).*got shape \(3, 4\)"):
+        lightcurve.seeliger_ellipsoid(np.ones(3), jnp.stack(sun), jnp.stack(observer))
     dark = jax.grad(
         lambda y: lightcurve.seeliger_ellipsoid((1.0, 0.7, y), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
     )

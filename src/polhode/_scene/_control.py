@@ -171,12 +171,13 @@ class MagneticDipole(AbstractTorque):
 
 
 class BDot(eqx.Module):
-    """Magnetic moment that detumbles a body: m = k omega x B [A m^2], -k times the rate of B.
+    """Magnetic moment that detumbles a body: m = k omega x B [A m^2].
 
-    In body axes a field that hardly changes in space changes by B x omega. ``k`` [A m^2 s/T] (a
-    number, a leaf that gradients tune); ``max_moment`` [A m^2]: limit of each of
-    three rods, or None.
-    For ``ph.MagneticDipole``: the torque is -k |B|^2 times the part of omega normal to B.
+    That is -k times the rate of B in body axes where B hardly changes in space. The change of B
+    along an orbit, which magnetometers also show, is not included: with it the body comes to rest
+    relative to the field, at about twice the orbital rate, not in space. ``k`` [A m^2 s/T] (a
+    number, a leaf that gradients tune); ``max_moment`` [A m^2]: limit of each of three rods, or
+    None. For ``ph.MagneticDipole``: the torque is -k |B|^2 times the part of omega normal to B.
     """
 
     k: Array

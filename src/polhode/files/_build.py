@@ -42,7 +42,7 @@ def build_attitudes(attitudes: Attitudes, dtype: DTypeLike) -> Float[Array, "*b 
     values = jnp.asarray(attitudes.values, dtype)
     if attitudes.sequence is None:
         return rotation.normalise(values)
-    sequence = rotation.Sequence[attitudes.sequence.upper()]
+    sequence = rotation.Sequence[attitudes.sequence]
     return rotation.euler_to_wxyz(values[..., 0], values[..., 1], values[..., 2], sequence)
 
 

@@ -165,7 +165,7 @@ class Observations(Table):
     """Attitudes and body rates that were observed."""
 
     source: str = ""
-    sequence: Sequence = "zyz"
+    sequence: Sequence = "ZYZ"
     angle_unit: _values.Angle = "rad"
     rate_unit: _values.Rate = "rad/s"
     time_unit: _values.Seconds = "s"

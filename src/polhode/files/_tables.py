@@ -44,7 +44,7 @@ class Euler(Measured):
     """Turns about the body's own axes, first letter first: R = R_a(1) R_b(2) R_c(3)."""
 
     measures = ("angles",)
-    sequence: Sequence = "zyz"
+    sequence: Sequence = "ZYZ"
     angles: Vector
     unit: _values.Angle = "rad"
 

@@ -71,13 +71,19 @@ Times = Annotated[
 ]
 
 
-def _lower(value: Any) -> Any:
-    return value.lower() if isinstance(value, str) else value
+def _about_body_axes(value: Any) -> Any:
+    if isinstance(value, str) and value.islower():
+        raise ValueError(
+            f'angles of a scene are about body axes, written in upper case: "{value.upper()}". In'
+            f' SciPy and in Trajectory.euler "{value}" is about space axes; for these reverse'
+            f' letters and angles: "{value.upper()[::-1]}"'
+        )
+    return value
 
 
 Sequence = Annotated[
-    Literal["xyx", "xyz", "xzx", "xzy", "yxy", "yxz", "yzx", "yzy", "zxy", "zxz", "zyx", "zyz"],
-    BeforeValidator(_lower),
+    Literal["XYX", "XYZ", "XZX", "XZY", "YXY", "YXZ", "YZX", "YZY", "ZXY", "ZXZ", "ZYX", "ZYZ"],
+    BeforeValidator(_about_body_axes),
 ]
 
 

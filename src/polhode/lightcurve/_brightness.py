@@ -2,7 +2,7 @@
 
 import math
 from functools import partial
-from typing import ClassVar, NamedTuple, cast
+from typing import Any, ClassVar, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -25,6 +25,16 @@ from polhode.inertia._mass import check_mesh
 Scalars = Float[Array, "*b"]
 
 
+def _components(name: str, vector: Any) -> Triple:
+    """The three components of a tuple, a list, or an array (..., 3)."""
+    shape = (len(vector),) if isinstance(vector, (tuple, list)) else np.shape(vector)
+    if shape[-1:] != (3,):
+        raise ValueError(
+            f"{name} must be an array (..., 3) or a tuple of three components, got shape {shape}."
+        )
+    return tuple(vector if isinstance(vector, (tuple, list)) else jnp.unstack(vector, axis=-1))
+
+
 def _dot(a: Triple, b: Triple) -> Scalars:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
@@ -37,18 +47,23 @@ def _cross(a: Triple, b: Triple) -> Triple:
     )
 
 
-def seeliger_ellipsoid(axes: Triple, sun: Triple, observer: Triple) -> Scalars:
+def seeliger_ellipsoid(
+    axes: Triple | Float[Array, "*b 3"],
+    sun: Triple | Float[Array, "*b 3"],
+    observer: Triple | Float[Array, "*b 3"],
+) -> Scalars:
     """Lommel-Seeliger brightness of triaxial ellipsoids, in closed form.
 
-    ``axes``: semi-axes along x, y, z; ``sun``, ``observer``: unit vectors in body axes; tuples of
-    component arrays that broadcast together. Scale: pi a^2 / 2 for a sphere at opposition.
+    ``axes``: semi-axes along x, y, z; ``sun``, ``observer``: unit vectors in body axes; each an
+    array (..., 3), or a tuple or list of the three components, which broadcast together. Scale:
+    pi a^2 / 2 for a sphere at opposition. Raises ValueError for another number of components.
     Source: Muinonen & Lumme, Astron. Astrophys. 584 (2015) A23, here without angles: in the space
     where the ellipsoid is a unit sphere only squares of sines occur, so that value and derivatives
     are right at opposition too. Zero, with derivative zero, at a phase angle of exactly pi.
     """
-    a, b, c = axes
-    toward = (sun[0] / a, sun[1] / b, sun[2] / c)
-    away = (observer[0] / a, observer[1] / b, observer[2] / c)
+    a, b, c = _components("axes", axes)
+    toward = tuple(x / y for x, y in zip(_components("sun", sun), (a, b, c)))
+    away = tuple(x / y for x, y in zip(_components("observer", observer), (a, b, c)))
     lit2, seen2, product = _dot(toward, toward), _dot(away, away), _dot(toward, away)
     whole = tuple(x + y for x, y in zip(toward, away, strict=True))
     size2 = _dot(whole, whole)
