@@ -37,6 +37,27 @@ def test_halley():
     assert abs(ratio - 2.2778) < 1e-4
 
 
+@pytest.mark.parametrize("omega", [[0.3, 0.2, 1.0], [1.0, 0.1, 0.1]], ids=["SAM", "LAM"])
+def test_precession_of_the_short_axis(omega):
+    """Turns of the axis about the momentum, counted over whole periods of the rates."""
+    body, state = ph.Inertia.from_moments([1.0, 2.0, 3.0]), ph.State([1.0, 0, 0, 0], omega)
+    found = ph.periods(body, state)
+    motion = ph.simulate(ph.Scene(body), state, np.linspace(0, 4 * float(found.P_psi), 401))
+    axis = np.asarray(ph.rotation.wxyz_to_matrix(motion.wxyz))[..., 2]
+    up = np.asarray(motion.momentum_space[0])
+    across = np.cross(up, [0.3, 0.5, -0.8])
+    azimuth = np.arctan2(axis @ np.cross(up, across) / np.linalg.norm(up), axis @ across)
+    turns = np.ptp(np.unwrap(azimuth)[[0, -1]]) / (2 * np.pi)
+    np.testing.assert_allclose(motion.ts[-1] / found.P_phi_short_axis, turns, rtol=1e-9)
+
+
+def test_a_plate_wobbles_twice_as_fast_as_it_spins():
+    disc = ph.periods(
+        ph.Inertia.from_moments([1.0, 1.0, 2.0]), ph.State([1, 0, 0, 0], [1e-3, 0, 20.0])
+    )
+    np.testing.assert_allclose(disc.P_phi_short_axis, np.pi / 20, rtol=1e-6)
+
+
 def _exact(I, w):
     """P_psi by mpmath's K; P_phi by the mean of the long axis' precession over a period."""
     low, mid, high = sorted(range(3), key=lambda k: I[k])

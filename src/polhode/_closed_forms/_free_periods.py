@@ -70,6 +70,16 @@ class Periods(NamedTuple):
     """Least angle between long axis and momentum [rad]; in LAM that to the nearer of its ends."""
     theta_max: Scalars
 
+    @property
+    def P_phi_short_axis(self) -> Scalars:
+        """Mean period [s] of the precession of the axis of greatest moment about the momentum.
+
+        ``P_phi`` in the short-axis convention, the wobble of a plate or of a body in SAM:
+        1 / (1 / P_phi + 1 / P_psi); P_psi is the same in both conventions (Samarasinha & A'Hearn,
+        Icarus 93 (1991) 194).
+        """
+        return 1 / (1 / self.P_phi + 1 / self.P_psi)
+
 
 def principal_periods(moments, omega, products=None) -> Periods:
     """Periods of bodies of principal ``moments`` (..., 3) and body rates ``omega`` (..., 3).
