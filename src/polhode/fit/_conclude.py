@@ -484,9 +484,13 @@ def _axes_disagree(recording: Recording, options: FitOptions) -> Array:
     # the proper rotation nearest to the correlation of both, and how much its mirror image gains
     left_vectors, sizes, right_vectors = svd(jnp.einsum("rti,rtj->ij", measured, from_attitudes))
     hand = jnp.sign(jnp.linalg.det(left_vectors) * jnp.linalg.det(right_vectors))
-    # A body that turns about one axis shows where that is, and noise alone turns the others.
-    shows_turn = sizes[1] > 0.02 * sizes[0]
-    inverted = shows_turn & (hand < 0) & (sizes[2] > 0.1 * sizes[1])
+    power = jnp.sum((measured @ left_vectors) ** 2, axis=(0, 1))
+    power = power * jnp.sum((from_attitudes @ right_vectors.T) ** 2, axis=(0, 1))
+    # Directions that show: noise alone turns those in which both are hardly correlated, and of a
+    # body that turns about one axis the two others.
+    shown = sizes > 0.5 * jnp.sqrt(power)
+    shows_turn = shown[1] & (sizes[1] > 0.02 * sizes[0])
+    inverted = shows_turn & shown[2] & (hand < 0) & (sizes[2] > 0.1 * sizes[1])
     if options.mounting:
         return inverted
     signs = jnp.stack([jnp.ones_like(hand), jnp.ones_like(hand), hand])
@@ -494,7 +498,7 @@ def _axes_disagree(recording: Recording, options: FitOptions) -> Array:
     turned = jnp.where(
         shows_turn,
         turn[0, 0] + turn[1, 1] + turn[2, 2] < 2,  # by more than 60 degrees
-        jnp.dot(left_vectors[:, 0], right_vectors[0]) < 0.5,
+        shown[0] & (jnp.dot(left_vectors[:, 0], right_vectors[0]) < 0.5),
     )
     return inverted | turned
 
