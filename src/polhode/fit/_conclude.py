@@ -13,10 +13,16 @@ from jaxtyping import Array, Float
 
 from polhode._scene import State
 from polhode.fit._findings import Finding
-from polhode.fit._model import Parameters, entries_of, whole_of
+from polhode.fit._model import Parameters, entries_of, is_nearly_flat, whole_of
 from polhode.fit._numerics import eigh, inverse, svd
 from polhode.fit._options import FitOptions, Gyroscope, Huber, noise_is_trusted
-from polhode.fit._recording import Recording, require_channel, size_of_data, turns_between_samples
+from polhode.fit._recording import (
+    Recording,
+    require_channel,
+    size_of_data,
+    turns_between_samples,
+    turns_of_rates,
+)
 from polhode.fit._residuals import Linear, prior_of
 from polhode.fit._result import (
     MAX_NULL_PART,
@@ -206,11 +212,8 @@ def _sensor(parameters: Parameters, gyroscope: Gyroscope) -> dict[str, Array]:
         parts["gain"] = jnp.eye(3, dtype=parts["gain"].dtype) + parts["gain"].reshape(3, 3)
         if gain is not None:
             parts["gain"] = gain @ parts["gain"]
-    if "bias" in parts:
-        if gain is not None:
-            parts["bias"] = gain @ parts["bias"]
-        if gyroscope.bias is not None:
-            parts["bias"] = parts["bias"] + gyroscope.bias.astype(parts["bias"].dtype)
+    if "bias" in parts and gyroscope.bias is not None:
+        parts["bias"] = parts["bias"] + gyroscope.bias.astype(parts["bias"].dtype)
     if "delay" in parts:
         parts["delay"] = parts["delay"] + gyroscope.delay
     return parts
@@ -224,23 +227,19 @@ def _deviations(determination: Determination, count: int) -> Array:
 
 
 def _deviations_by_kind(determination: Determination, solution: Solution, count: int) -> _Split:
-    """Standard deviations of the shared unknowns, those of gain and bias in readings, as
-    ``_sensor`` gives them."""
+    """Standard deviations of the shared unknowns, those of the gain as ``_sensor`` gives it."""
     parameters, gain = solution.parameters, solution.model.gyroscope.gain
     std = _deviations(determination, solution.linear.shared.shape[-1])
     split = _sort_by_kind(std, count, parameters)
-    if gain is None:
+    if gain is None or parameters.gain is None:
         return split
-    places = _sort_by_kind(np.arange(std.size), count, parameters).sensor
-    for name in {"bias", "gain"} & set(places):
-        place = np.ravel(places[name])
-        # entries of a gain row by row
-        turn = jnp.kron(gain, jnp.eye(place.size // 3)).astype(std.dtype)
-        covariance = turn @ determination.covariance[np.ix_(place, place)] @ turn.T
-        is_unknown = (jnp.abs(turn) > 0) & jnp.isinf(std[place])[None]
-        reading_std = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
-        reading_std = jnp.where(jnp.any(is_unknown, axis=1), jnp.inf, reading_std)
-        split.sensor[name] = reading_std.reshape(split.sensor[name].shape)
+    place = np.ravel(_sort_by_kind(np.arange(std.size), count, parameters).sensor["gain"])
+    # entries row by row
+    turn = jnp.kron(gain, jnp.eye(3)).astype(std.dtype)
+    covariance = turn @ determination.covariance[np.ix_(place, place)] @ turn.T
+    is_unknown = jnp.any((jnp.abs(turn) > 0) & jnp.isinf(std[place])[None], axis=1)
+    reading_std = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
+    split.sensor["gain"] = jnp.where(is_unknown, jnp.inf, reading_std).reshape(3, 3)
     return split
 
 
@@ -309,11 +308,9 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
     axes_std = turn_std(moments, spread[6:])
 
     std = _deviations_by_kind(determination, solution, count)
-    trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
     findings = {
         Finding.NOT_FINITE: ~(jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(tensor))),
-        # the smallest of the second moments
-        Finding.NEARLY_FLAT: trace / 2 - moments[2] < 1e-4 * trace,
+        Finding.NEARLY_FLAT: is_nearly_flat(tensor, moments),
         Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread[3:6])),
         Finding.WEAK: jnp.any(spread[3:6] > 0.05),
         Finding.AXES_DISAGREE: _axes_disagree(recording, options),
@@ -508,11 +505,8 @@ def _turns(recording: Recording, centred: bool) -> tuple[Array, Array]:
 
     ``centred``: less their means, whose difference may be the gyroscope's bias.
     """
-    omega = require_channel("omega", recording.omega)
     weight = (recording.present[..., 1:] * recording.present[..., :-1])[..., None]
-    step = jnp.diff(recording.times, axis=-1)[..., None]
-    measured = step * (omega[..., 1:, :] + omega[..., :-1, :]) / 2
-    recorded = turns_between_samples(recording)
+    measured, recorded = turns_of_rates(recording), turns_between_samples(recording)
     if centred:
         total = jnp.sum(weight, axis=-2, keepdims=True)
         measured, recorded = (

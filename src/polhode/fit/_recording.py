@@ -172,6 +172,13 @@ def turns_between_samples(recording: "Recording") -> Float[Array, "*b t-1 3"]:
     return wxyz_to_rotation_vector(multiply(conjugate(wxyz[..., :-1, :]), wxyz[..., 1:, :]))
 
 
+def turns_of_rates(recording: "Recording") -> Float[Array, "*b t-1 3"]:
+    """Rotation vectors, body axes, between samples by the mean of the rates at both."""
+    omega = require_channel("omega_body", recording.omega)
+    step = jnp.diff(recording.times, axis=-1)[..., None]
+    return step * (omega[..., 1:, :] + omega[..., :-1, :]) / 2
+
+
 def require_channel(name: str, array: Array | None) -> Array:
     """The field ``name`` of a recording; ValueError where it is None."""
     if array is None:
