@@ -91,7 +91,7 @@ class LightCurve(NamedTuple):
         if sun is not None:
             sun, r = _directions("sun", sun, t.size)
             observer, delta = _directions("observer", observer, t.size)
-            far = np.abs(delta - 1).max() > _ROUNDED
+            far = has_distances(delta)
             if far or np.abs(r - 1).max() > _ROUNDED:
                 notes = (*notes, *_distance_notes(sun * r[:, None], observer * delta[:, None]))
             if far and not at_body:
@@ -267,6 +267,11 @@ class LightCurve(NamedTuple):
             jnp.asarray(columns),
             jnp.asarray(stiffness),
         )
+
+
+def has_distances(lengths: np.ndarray) -> bool:
+    """Whether vectors of these lengths hold distances, and are no unit vectors."""
+    return bool(np.abs(lengths - 1).max() > _ROUNDED)
 
 
 def _directions(name: str, vectors, count: int) -> tuple[np.ndarray, np.ndarray]:
