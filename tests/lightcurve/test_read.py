@@ -265,7 +265,8 @@ def test_nothing_of_a_file_is_dropped_in_silence(tmp_path):
 
 def test_errors_of_points_are_checked():
     sigma = np.full(ROWS, 0.02)
-    for wrong, match in ((np.ones(5), r"shape \(5,\)"), (sigma - 0.03, "must not be negative")):
+    cases = (np.ones(5), r"shape \(5,\)"), (sigma - 0.03, "not be negative"), (np.inf, "be finite")
+    for wrong, match in cases:
         with pytest.raises(ValueError, match=match):
             lightcurve.LightCurve.of(JD, MAGNITUDE, sigma=wrong)
     sigma[2] = np.nan

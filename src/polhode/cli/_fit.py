@@ -17,6 +17,7 @@ from polhode.cli._options import (
     NoFigureOption,
     QuietOption,
     UsageError,
+    not_negative,
     option,
     output_option,
     output_path,
@@ -95,7 +96,7 @@ def fit(
             "PART",
             "standard deviation of the gyroscope's scale factors and of its misalignment [rad]; 0:"
             " exact",
-            min=0.0,
+            not_negative,
         ),
     ] = 0.01,
     max_rate: Annotated[

@@ -114,6 +114,11 @@ class LightCurve(NamedTuple):
                 f"sigma must not be negative; that of point {np.argmax(sigma < 0)} is"
                 f" {sigma[np.argmax(sigma < 0)]:.6g}. Give 0 where the error is unknown."
             )
+        if np.any(np.isinf(sigma)):
+            raise ValueError(
+                f"sigma must be finite; that of point {np.argmax(np.isinf(sigma))} is not. Leave"
+                " the point out, or give 0 where the error is unknown."
+            )
         order = np.argsort(t, kind="stable")
         notes = (*notes, *_photometry_notes(magnitude, number, names))
         copies = t.size - len(np.unique(np.stack([t, magnitude, number]), axis=1).T)
@@ -202,6 +207,14 @@ class LightCurve(NamedTuple):
         )
         sigma = np.where(missing, size, self.sigma)
         return self._replace(sigma=sigma, notes=(*self.notes, text))
+
+    def require_points(self) -> None:
+        """ValueError for fewer points than a light curve has at least."""
+        if self.t.size < FEWEST_POINTS:
+            raise ValueError(
+                f"a light curve needs at least {FEWEST_POINTS} points, this one has {self.t.size}:"
+                " means of wide bins leave few."
+            )
 
     @property
     def alpha(self) -> np.ndarray:
