@@ -9,7 +9,7 @@ import pytest
 
 import polhode as ph
 from polhode.fit import Finding, FitOptions, Recording, fit_inertia, stack
-from polhode.fit._conclude import _axes_disagree, has_outliers, whiteness_of
+from polhode.fit._conclude import _axes_disagree, has_outliers, is_weak, whiteness_of
 from polhode.fit._options import saturation
 from polhode.fit._recording import rotation_vector_between, turns_between_samples
 from polhode.rotation import multiply, rotation_vector_to_wxyz
@@ -124,6 +124,15 @@ def test_spin_about_one_axis_agrees_with_attitudes_and_against_it_does_not():
         for sign, disagrees in ((1, False), (-1, True)):
             recording = stack([Recording.of(motion.ts, sign * rates, wxyz=wxyz)])
             assert [bool(x) for x in found(recording)] == [disagrees, False]
+
+
+@pytest.mark.parametrize(
+    ("ratio", "std", "weak"),
+    [(0.4, 0.06, True), (0.4, 0.04, False), (0.016, 0.016, True), (0.016, 0.007, False)],
+)
+def test_ratios_that_hardly_show_are_weak(ratio, std, weak):
+    """A rod spinning across its axis does not show the moment about it: 0.016 +- 0.016 of 0.38."""
+    assert bool(is_weak(jnp.array([ratio, 1.0, 1.0]), jnp.array([std, 0.0, 0.0]))) == weak
 
 
 def test_sensor_axes_of_coarse_samples():

@@ -312,7 +312,7 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
         Finding.NOT_FINITE: ~(jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(tensor))),
         Finding.NEARLY_FLAT: is_nearly_flat(tensor, moments),
         Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread[3:6])),
-        Finding.WEAK: jnp.any(spread[3:6] > 0.05),
+        Finding.WEAK: is_weak(moments / moments[2], spread[3:6]),
         Finding.AXES_DISAGREE: _axes_disagree(recording, options),
     }
     inertia = InertiaEstimate(
@@ -337,6 +337,12 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
         sensor_std=std.sensor,
         inertia=inertia,
     )
+
+
+def is_weak(ratios: Float[Array, " 3"], std: Float[Array, " 3"]) -> Array:
+    """Whether a ratio is known to no better than 5 %, or than half of itself: near zero the misfit
+    is far from quadratic over such a range."""
+    return jnp.any((std > 0.05) | (2 * std > ratios))
 
 
 def conclude_scene(solution: Solution, recording: Recording, options: FitOptions) -> Fit:
