@@ -53,6 +53,9 @@ _GOOD = 1.5
 _BAD = 5.0
 # Relative difference of two costs that are those of one optimum.
 _SAME = 1e-4
+# Difference of two costs, in units of the variance of the noise, that is no reason to take a fit
+# that did not converge.
+_ALIKE = 2.0
 # Part of the readings that always counts as noise beside the calibration's prior: without it
 # noise-free readings would leave the calibration free.
 _LEAST_NOISE = 1e-6
@@ -221,11 +224,14 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
             parameters_of(solution.value), recording, model_of(base)
         )
         uses_all_data = part[job] == 1
-        better = uses_all_data & (cost < search.cost)
+        # of two that the data hardly tell apart the one that converged
+        converged = solution.result == optx.RESULTS.successful
+        ahead = converged.astype(dtype) - search.stopped.astype(dtype)
+        better = uses_all_data & (cost < search.cost + ahead * _ALIKE * prior_unit(linear) ** 2)
         # Two starts that reach the same optimum near the noise end the search: a third rarely finds
         # a better one. Far above the noise both may have met the same local minimum.
         same_optimum = uses_all_data & (jnp.abs(cost - search.cost) < _SAME * cost)
-        candidate = (solution.value, base, linear, cost, solution.result == optx.RESULTS.successful)
+        candidate = (solution.value, base, linear, cost, converged)
         previous = (search.best, search.base, search.linear, search.cost, search.stopped)
         best, base, linear, cost, stopped = jax.tree.map(
             lambda a, b: jnp.where(better, a, b), candidate, previous
