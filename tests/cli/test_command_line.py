@@ -248,6 +248,7 @@ def test_failures_are_one_readable_block(here, capsys, arguments, code, hints):
         (["run", "top.toml", "--clones", "many"], "whole number from 0"),
         (["run", "top.toml", "--precision", "float16"], "float64"),
         (["run", "top.toml", "--nofigure"], "--no-figure"),
+        (["fit", "toss.csv", "--calibration", "inf"], "'inf' is not a number from 0 up"),
     ],
 )
 def test_wrong_options_are_usage_errors(here, capsys, arguments, hint):

@@ -212,3 +212,5 @@ def test_a_light_curve_that_does_not_vary_is_wrong_input(here, capsys):
     told = capsys.readouterr().err
     assert told.startswith("polhode: flat.csv: the brightness does not vary")
     assert "--debug" not in told
+    assert main(["lightcurve", "flat.csv", "--binned", "20"]) == 2
+    assert "at least 8 points, this one has 1" in capsys.readouterr().err

@@ -9,7 +9,7 @@ import pytest
 
 import polhode as ph
 from polhode.fit import Finding, FitOptions, Recording, fit_inertia, stack
-from polhode.fit._conclude import _axes_disagree, has_outliers, whiteness_of
+from polhode.fit._conclude import _axes_disagree, has_outliers, is_weak, whiteness_of
 from polhode.fit._options import saturation
 from polhode.fit._recording import rotation_vector_between, turns_between_samples
 from polhode.rotation import multiply, rotation_vector_to_wxyz
@@ -111,16 +111,28 @@ def test_white_residuals_are_white_beside_gaps(gaps):
 
 
 def test_spin_about_one_axis_agrees_with_attitudes_and_against_it_does_not():
-    """Noise alone turns the axes across; an inverted axis turns the body the other way."""
+    """Noise alone turns the axes across; an inverted axis turns the body the other way. Beside a
+    bias a spin about one axis shows no axes."""
     spin = ph.State([1.0, 0, 0, 0], [0.0, 0, 2.0])
     motion = ph.simulate(ph.Scene(ph.Inertia.spherical(1.0)), spin, np.linspace(0, 6, 121))
+    options = FitOptions(), FitOptions(bias=True)
+    found = jax.jit(lambda recording: [_axes_disagree(recording, each) for each in options])
     for seed in range(12):
         rates, turns = np.random.default_rng(seed).normal(size=(2, 121, 3))
         rates = np.asarray(motion.omega_body) + 0.01 * rates
         wxyz = multiply(motion.wxyz, rotation_vector_to_wxyz(0.003 * turns))
         for sign, disagrees in ((1, False), (-1, True)):
             recording = stack([Recording.of(motion.ts, sign * rates, wxyz=wxyz)])
-            assert bool(_axes_disagree(recording, FitOptions())) == disagrees
+            assert [bool(x) for x in found(recording)] == [disagrees, False]
+
+
+@pytest.mark.parametrize(
+    ("ratio", "std", "weak"),
+    [(0.4, 0.06, True), (0.4, 0.04, False), (0.016, 0.016, True), (0.016, 0.007, False)],
+)
+def test_ratios_that_hardly_show_are_weak(ratio, std, weak):
+    """A rod spinning across its axis does not show the moment about it: 0.016 +- 0.016 of 0.38."""
+    assert bool(is_weak(jnp.array([ratio, 1.0, 1.0]), jnp.array([std, 0.0, 0.0]))) == weak
 
 
 def test_sensor_axes_of_coarse_samples():

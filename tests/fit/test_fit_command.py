@@ -95,14 +95,18 @@ def test_a_wheel_shows_the_size(tmp_path, capsys):
     path, out = tmp_path / "wheel.csv", tmp_path / "out"
     rows = [",".join(repr(float(x)) for x in row) for row in table]
     path.write_text("\n".join(["t,wx,wy,wz,wheel", *rows]) + "\n")
-    options = "--columns wheel=wheel --wheel-inertia 1e-6 --wheel-axis 0 2 0 --calibration 0"
+    options = "--columns wheel=wheel --wheel-inertia 1e-6 --wheel-axis 0 2 0 --calibration 0 --drag"
     command = ["fit", str(path), *options.split(), "--noise", "1e-3", "--no-figure"]
     assert main([*command, "-o", str(out)]) == 0
-    assert "moment [kg m^2]" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert "moment [kg m^2]" in printed
+    assert "drag, N m s, N m s^2: linear" in printed
     found = json.loads(out.with_suffix(".json").read_text())
     off = (np.array(found["moments"]) - moments) / np.array(found["moments_std"])
     assert np.abs(off).max() < 4
-    assert np.all(np.array(found["moments_std"]) < 0.01 * moments)
+    for name in ("linear", "quadratic"):  # there is none
+        assert abs(found["drag"][name]) < 4 * found["drag_std"][name] < 1e-4
+    assert np.all(np.array(found["moments_std"]) < 0.05 * moments)
 
 
 def test_wrong_units_are_suspected(toss, capsys):

@@ -1,9 +1,10 @@
 """Recordings from CSV files: what is read, and what is refused with which words."""
 
+import jax
 import numpy as np
 import pytest
 
-from polhode.fit import read_recording
+from polhode.fit import Recording, read_recording
 from polhode.fit._csv import load_recording
 
 COLUMNS = {"t": "time", "wx": "x", "wy": "y", "wz": "z"}
@@ -39,6 +40,8 @@ def test_a_good_file(tmp_path):
         ("a\0b", "not text in UTF-8"),
         ("time,x,y,z\n0,1,2,3\n", "at least 4 rows"),
         (GOOD.replace(",1,", ",400,"), "deg/s"),
+        # decimal commas between commas
+        (GOOD.replace("0.1,1,2,3,9", "1,0,1,0,2,0,3"), "line 3 has 7 cells, its header 5; .*semi"),
     ],
 )
 def test_bad_files_say_what_is_wrong(tmp_path, text, message):
@@ -155,6 +158,19 @@ def test_a_column_has_one_role_and_one_unit(tmp_path):
     np.testing.assert_allclose(found.omega[0], [0.102, 0.204, 0.306], rtol=1e-14)
     with pytest.raises(ValueError, match="is to be wx and wy"):
         read_recording(path, roles | {"wy": roles["wx"]})
+
+
+@pytest.mark.parametrize(("start", "step"), [(1.7e9, 0.1), (1e5, 0.01)])
+def test_times_without_digits_in_single_precision_are_named(start, step):
+    with jax.enable_x64(False), pytest.raises(ValueError, match="in float32: subtract the first"):
+        Recording.of(start + step * np.arange(20), 0.1 * np.ones((20, 3)))
+
+
+def test_columns_of_other_names_are_refused(tmp_path):
+    path = tmp_path / "good.csv"
+    path.write_text(GOOD)
+    with pytest.raises(ValueError, match="t, wx, wy, wz and wheel, got the keys flywheel"):
+        read_recording(path, COLUMNS | {"flywheel": "n"})
 
 
 def test_a_file_without_an_end_is_no_text():

@@ -139,6 +139,14 @@ def test_what_limits_a_fit_is_said(of_scene, of_inertia):
     assert wrong.limit() == "the model, which does not explain the readings (not white)"
 
 
+def test_a_figure_of_a_batch_needs_its_recording(of_inertia):
+    pytest.importorskip("matplotlib")
+    batch = jax.tree.map(lambda x: jnp.stack([x, x]), of_inertia)
+    times = np.linspace(0.0, 20.0, 60)
+    with pytest.raises(ValueError, match=r"leading axes \(2,\), got \(\)"):
+        plot.fit(batch, Recording.of(times, np.ones((60, 3))), body=1)
+
+
 def test_a_figure_of_a_fitted_scene(of_scene):
     pytest.importorskip("matplotlib")
     figure = plot.fit(*of_scene, title="damping")

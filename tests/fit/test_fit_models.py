@@ -38,7 +38,8 @@ from polhode.fit import (
 )
 from polhode.fit._conclude import _axes_disagree
 from polhode.fit._model import base_of, free_columns
-from polhode.rotation import wxyz_to_matrix
+from polhode.fit._solve import _bias_of_rates, _sensor_start
+from polhode.rotation import multiply, rotation_vector_to_wxyz, wxyz_to_matrix
 
 TENSOR = np.array([[2.0, 0.1, 0.2], [0.1, 2.5, -0.3], [0.2, -0.3, 3.2]])
 
@@ -204,6 +205,51 @@ def test_bias_mounting_lever_and_outliers():
     off = (np.asarray(fit.ratios) - true / true[2])[:2] / np.asarray(fit.ratios_std)[:2]
     assert np.abs(off).max() < 4
     assert not int(fit.diagnostics) & int(Finding.STEP_LIMIT | Finding.AXES_DISAGREE)
+
+
+def biased_prolate_bodies(seeds):
+    """Times, rates with biases (b, 3), attitudes, biases and smallest ratios (b,)."""
+    draws = []
+    for seed in seeds:
+        rng = np.random.default_rng(seed)
+        ratio, spin = rng.uniform(0.2, 0.5), rng.normal(size=3)
+        spin *= 3 / np.linalg.norm(spin)
+        spin = spin if seed % 2 else np.array([0.1 * spin[0], 0.1 * spin[1], 3.0])
+        draws.append((ratio, spin, *rng.normal(size=(2, 81, 3)), 6 * rng.normal(size=3)))
+    ratio, spin, of_rates, of_turns, bias = map(np.array, zip(*draws))
+    inertia = ph.Inertia.from_moments(
+        np.stack([ratio, np.ones_like(ratio), np.ones_like(ratio)], -1)
+    )
+    state = ph.State(np.tile([1.0, 0, 0, 0], (len(ratio), 1)), spin)
+    motion = ph.simulate(ph.Scene(inertia), state, np.linspace(0, 8, 81))
+    rates = motion.omega_body + bias[:, None] + 0.02 * of_rates
+    wxyz = multiply(motion.wxyz, rotation_vector_to_wxyz(0.01 * of_turns))
+    return motion.ts, rates, wxyz, bias, ratio
+
+
+def test_the_bias_to_start_from_is_that_beside_the_attitudes():
+    wxyz, omega = flight(TIMES, np.array([2.56, 1.82, 1.91]))
+    gain, bias = np.diag([2.0, 1.0, 1.0]), np.array([5.0, -8.0, 3.0])
+    recording = stack([Recording.of(TIMES, omega + bias, wxyz=wxyz)])
+    for mounting, expected in ((False, bias), (True, np.zeros(3))):
+        options = FitOptions(bias=True, mounting=mounting)
+        start = _bias_of_rates(recording, options, Gyroscope(gain))
+        np.testing.assert_allclose(start, expected, atol=0.01)
+    start = _sensor_start(recording, Gyroscope(gain), jnp.asarray(bias), jnp.float64)["bias"]
+    np.testing.assert_allclose(start, gain @ bias)
+
+
+@pytest.mark.slow
+def test_a_bias_of_twice_the_rates_and_flat_bodies_are_no_traps():
+    """The fit starts from the bias that attitudes show, and does not end with a flat body that
+    explains the readings less well than another (the last one)."""
+    times, rates, wxyz, bias, ratio = biased_prolate_bodies([1, 3, 5, 7, 13, 26])
+    data = {"omega_noise": 0.02, "attitude_noise": 0.01, "options": FitOptions(bias=True)}
+    fit = fit_inertia(times, rates, wxyz=wxyz, **data)
+    assert np.asarray(fit.noise).max() < 1.06
+    assert np.abs((fit.sensor["bias"] - bias) / fit.sensor_std["bias"]).max() < 3
+    assert np.abs((fit.ratios[:, 0] - ratio) / fit.ratios_std[:, 0]).max() < 3
+    assert np.all(np.asarray(fit.steps)[:5] < 20)
 
 
 @pytest.mark.parametrize("mounting", [True, False])

@@ -38,6 +38,19 @@ def test_table_is_reduced_to_unit_distance_and_to_the_body(table):
     np.testing.assert_allclose(np.cos(curve.alpha), cosine)
 
 
+def test_barycentric_times_are_moved_to_the_body(table):
+    """The Sun, at the origin, stands for the barycentre; the body is at -SUN."""
+    text = table.read_text()
+    observer, delta = OBSERVER - SUN, np.linalg.norm(OBSERVER)
+    shift = LIGHT_TIME * observer @ -OBSERVER / delta
+    rows = text.split("\n")
+    for k, t in enumerate(np.atleast_1d(JD)):
+        rows[k + 1] = ",".join([repr(float(t + shift)), *rows[k + 1].split(",")[1:]])
+    table.write_text("\n".join(["b" + rows[0], *rows[1:]]))
+    curve = lightcurve.read_light_curve(table)
+    np.testing.assert_allclose(curve.t, np.sort(JD) - LIGHT_TIME * delta, atol=1e-9)
+
+
 def test_flux_and_vectors_from_another_file(tmp_path):
     flux = 10 ** (-0.4 * (MAGNITUDE - MAGNITUDE.mean()))
     flux /= flux.mean()
@@ -109,6 +122,18 @@ def test_alcdef(tmp_path):
         lightcurve.read_light_curve(path, vectors, reduced=r).magnitude for r in (False, True)
     )
     np.testing.assert_allclose(reduced - apparent, 5 * np.log10(2 * 1.5))
+    # a second session, corrected already
+    times = [f"DATA={t + 1}|{m}|0.01" for t, m in zip(JD, MAGNITUDE)]
+    metadata = ["LTCAPP=POINT", "REDUCEDMAGS=AVERAGE", "ENDMETADATA"]
+    path.write_text("\n".join([*head, *data, *head[:-1], *metadata, *times]))
+    vectors.write_text(
+        "\n".join([header, f"{ends[0]},2,0,0,0,1.5,0", f"{ends[1] + 1},2,0,0,0,1.5,0"])
+    )
+    curve = lightcurve.read_light_curve(path, vectors)
+    moved = np.where(curve.group == 0, LIGHT_TIME * 1.5, 0)
+    np.testing.assert_allclose(curve.t + moved, [*np.sort(JD), *(np.sort(JD) + 1)], atol=1e-9)
+    np.testing.assert_allclose(curve.magnitude[curve.group == 1], MAGNITUDE[np.argsort(JD)])
+    np.testing.assert_allclose(curve.magnitude[curve.group == 0], apparent)
     with pytest.raises(FileNotFoundError):
         lightcurve.read_light_curve(path, tmp_path / "none.csv")
     vectors.write_bytes(b"\xff\xfe")
@@ -240,7 +265,8 @@ def test_nothing_of_a_file_is_dropped_in_silence(tmp_path):
 
 def test_errors_of_points_are_checked():
     sigma = np.full(ROWS, 0.02)
-    for wrong, match in ((np.ones(5), r"shape \(5,\)"), (sigma - 0.03, "must not be negative")):
+    cases = (np.ones(5), r"shape \(5,\)"), (sigma - 0.03, "not be negative"), (np.inf, "be finite")
+    for wrong, match in cases:
         with pytest.raises(ValueError, match=match):
             lightcurve.LightCurve.of(JD, MAGNITUDE, sigma=wrong)
     sigma[2] = np.nan

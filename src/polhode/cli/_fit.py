@@ -17,6 +17,7 @@ from polhode.cli._options import (
     NoFigureOption,
     QuietOption,
     UsageError,
+    not_negative,
     option,
     output_option,
     output_path,
@@ -95,7 +96,7 @@ def fit(
             "PART",
             "standard deviation of the gyroscope's scale factors and of its misalignment [rad]; 0:"
             " exact",
-            min=0.0,
+            not_negative,
         ),
     ] = 0.01,
     max_rate: Annotated[
@@ -326,6 +327,24 @@ def _bias(result: Any) -> tuple[Any, Any] | None:
     return np.asarray(result.sensor["bias"]), np.asarray(result.sensor_std["bias"])
 
 
+def _drag(result: Any) -> dict[str, tuple[float, float]] | None:
+    """Coefficients of the drag and their standard deviations by name, over the largest moment where
+    the size of the inertia is not known; None where no drag was fitted."""
+    import jax.numpy as jnp
+
+    places = [k for k, name in enumerate(result.value_names) if name.startswith("drag.")]
+    if not places:
+        return None
+
+    def coefficients(values):
+        size = 1.0 if result.scale_known else jnp.linalg.eigvalsh(values[0])[-1]
+        return jnp.stack([values[k] for k in places]) / size
+
+    pairs = zip(*(x.tolist() for x in result.derived(coefficients)), strict=True)
+    names = (result.value_names[k].removeprefix("drag.") for k in places)
+    return dict(zip(names, pairs, strict=True))
+
+
 def _write(path: Path, recording_path: Path, options: _Options, loaded: Any, result: Any) -> Path:
     import json
 
@@ -344,7 +363,7 @@ def _write(path: Path, recording_path: Path, options: _Options, loaded: Any, res
 
     recording = loaded.recording
     low, high = result.interval(0.95)
-    bias = _bias(result)
+    bias, drag = _bias(result), _drag(result)
     document = {
         "recording": str(recording_path),
         "columns": loaded.columns,
@@ -366,6 +385,8 @@ def _write(path: Path, recording_path: Path, options: _Options, loaded: Any, res
         "axes_std_rad": [0.0] * 3 if options.moments_only else plain(result.axes_std),
         "bias_rad_per_s": None if bias is None else plain(bias[0]),
         "bias_std_rad_per_s": None if bias is None else plain(bias[1]),
+        "drag": drag and {name: plain(value) for name, (value, _) in drag.items()},
+        "drag_std": drag and {name: plain(std) for name, (_, std) in drag.items()},
         "gyroscope_gain": plain(result.sensor["gain"]) if "gain" in result.sensor else None,
         "gyroscope_gain_std": (
             plain(result.sensor_std["gain"]) if "gain" in result.sensor else None
@@ -462,6 +483,10 @@ def _table(path: Path, options: _Options, recording: Any, result: Any) -> Any:
     if (bias := _bias(result)) is not None:
         parts = (f"{b:.3g} +- {s:.2g}" for b, s in zip(*bias, strict=True))
         lines.append(f"bias of the gyroscope, rad/s: {', '.join(parts)}")
+    if drag := _drag(result):
+        parts = (f"{name} {c:.3g} +- {s:.2g}" for name, (c, s) in drag.items())
+        units = "N m s, N m s^2" if is_absolute else "over the largest moment, 1/s, 1"
+        lines.append(f"drag, {units}: {', '.join(parts)}")
     grid.caption = Text("\n".join(lines))
     grid.caption_justify = "left"
     return grid

@@ -13,10 +13,16 @@ from jaxtyping import Array, Float
 
 from polhode._scene import State
 from polhode.fit._findings import Finding
-from polhode.fit._model import Parameters, entries_of, whole_of
+from polhode.fit._model import Parameters, entries_of, is_nearly_flat, whole_of
 from polhode.fit._numerics import eigh, inverse, svd
 from polhode.fit._options import FitOptions, Gyroscope, Huber, noise_is_trusted
-from polhode.fit._recording import Recording, require_channel, size_of_data, turns_between_samples
+from polhode.fit._recording import (
+    Recording,
+    require_channel,
+    size_of_data,
+    turns_between_samples,
+    turns_of_rates,
+)
 from polhode.fit._residuals import Linear, prior_of
 from polhode.fit._result import (
     MAX_NULL_PART,
@@ -206,11 +212,8 @@ def _sensor(parameters: Parameters, gyroscope: Gyroscope) -> dict[str, Array]:
         parts["gain"] = jnp.eye(3, dtype=parts["gain"].dtype) + parts["gain"].reshape(3, 3)
         if gain is not None:
             parts["gain"] = gain @ parts["gain"]
-    if "bias" in parts:
-        if gain is not None:
-            parts["bias"] = gain @ parts["bias"]
-        if gyroscope.bias is not None:
-            parts["bias"] = parts["bias"] + gyroscope.bias.astype(parts["bias"].dtype)
+    if "bias" in parts and gyroscope.bias is not None:
+        parts["bias"] = parts["bias"] + gyroscope.bias.astype(parts["bias"].dtype)
     if "delay" in parts:
         parts["delay"] = parts["delay"] + gyroscope.delay
     return parts
@@ -224,23 +227,19 @@ def _deviations(determination: Determination, count: int) -> Array:
 
 
 def _deviations_by_kind(determination: Determination, solution: Solution, count: int) -> _Split:
-    """Standard deviations of the shared unknowns, those of gain and bias in readings, as
-    ``_sensor`` gives them."""
+    """Standard deviations of the shared unknowns, those of the gain as ``_sensor`` gives it."""
     parameters, gain = solution.parameters, solution.model.gyroscope.gain
     std = _deviations(determination, solution.linear.shared.shape[-1])
     split = _sort_by_kind(std, count, parameters)
-    if gain is None:
+    if gain is None or parameters.gain is None:
         return split
-    places = _sort_by_kind(np.arange(std.size), count, parameters).sensor
-    for name in {"bias", "gain"} & set(places):
-        place = np.ravel(places[name])
-        # entries of a gain row by row
-        turn = jnp.kron(gain, jnp.eye(place.size // 3)).astype(std.dtype)
-        covariance = turn @ determination.covariance[np.ix_(place, place)] @ turn.T
-        is_unknown = (jnp.abs(turn) > 0) & jnp.isinf(std[place])[None]
-        reading_std = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
-        reading_std = jnp.where(jnp.any(is_unknown, axis=1), jnp.inf, reading_std)
-        split.sensor[name] = reading_std.reshape(split.sensor[name].shape)
+    place = np.ravel(_sort_by_kind(np.arange(std.size), count, parameters).sensor["gain"])
+    # entries row by row
+    turn = jnp.kron(gain, jnp.eye(3)).astype(std.dtype)
+    covariance = turn @ determination.covariance[np.ix_(place, place)] @ turn.T
+    is_unknown = jnp.any((jnp.abs(turn) > 0) & jnp.isinf(std[place])[None], axis=1)
+    reading_std = jnp.sqrt(jnp.maximum(jnp.diagonal(covariance), 0))
+    split.sensor["gain"] = jnp.where(is_unknown, jnp.inf, reading_std).reshape(3, 3)
     return split
 
 
@@ -309,13 +308,11 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
     axes_std = turn_std(moments, spread[6:])
 
     std = _deviations_by_kind(determination, solution, count)
-    trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
     findings = {
         Finding.NOT_FINITE: ~(jnp.isfinite(solution.cost) & jnp.all(jnp.isfinite(tensor))),
-        # the smallest of the second moments
-        Finding.NEARLY_FLAT: trace / 2 - moments[2] < 1e-4 * trace,
+        Finding.NEARLY_FLAT: is_nearly_flat(tensor, moments),
         Finding.UNDETERMINED: jnp.any(~jnp.isfinite(spread[3:6])),
-        Finding.WEAK: jnp.any(spread[3:6] > 0.05),
+        Finding.WEAK: is_weak(moments / moments[2], spread[3:6]),
         Finding.AXES_DISAGREE: _axes_disagree(recording, options),
     }
     inertia = InertiaEstimate(
@@ -340,6 +337,12 @@ def conclude(solution: Solution, recording: Recording, options: FitOptions) -> F
         sensor_std=std.sensor,
         inertia=inertia,
     )
+
+
+def is_weak(ratios: Float[Array, " 3"], std: Float[Array, " 3"]) -> Array:
+    """Whether a ratio is known to no better than 5 %, or than half of itself: near zero the misfit
+    is far from quadratic over such a range."""
+    return jnp.any((std > 0.05) | (2 * std > ratios))
 
 
 def conclude_scene(solution: Solution, recording: Recording, options: FitOptions) -> Fit:
@@ -484,9 +487,13 @@ def _axes_disagree(recording: Recording, options: FitOptions) -> Array:
     # the proper rotation nearest to the correlation of both, and how much its mirror image gains
     left_vectors, sizes, right_vectors = svd(jnp.einsum("rti,rtj->ij", measured, from_attitudes))
     hand = jnp.sign(jnp.linalg.det(left_vectors) * jnp.linalg.det(right_vectors))
-    # A body that turns about one axis shows where that is, and noise alone turns the others.
-    shows_turn = sizes[1] > 0.02 * sizes[0]
-    inverted = shows_turn & (hand < 0) & (sizes[2] > 0.1 * sizes[1])
+    power = jnp.sum((measured @ left_vectors) ** 2, axis=(0, 1))
+    power = power * jnp.sum((from_attitudes @ right_vectors.T) ** 2, axis=(0, 1))
+    # Directions that show: noise alone turns those in which both are hardly correlated, and of a
+    # body that turns about one axis the two others.
+    shown = sizes > 0.5 * jnp.sqrt(power)
+    shows_turn = shown[1] & (sizes[1] > 0.02 * sizes[0])
+    inverted = shows_turn & shown[2] & (hand < 0) & (sizes[2] > 0.1 * sizes[1])
     if options.mounting:
         return inverted
     signs = jnp.stack([jnp.ones_like(hand), jnp.ones_like(hand), hand])
@@ -494,7 +501,7 @@ def _axes_disagree(recording: Recording, options: FitOptions) -> Array:
     turned = jnp.where(
         shows_turn,
         turn[0, 0] + turn[1, 1] + turn[2, 2] < 2,  # by more than 60 degrees
-        jnp.dot(left_vectors[:, 0], right_vectors[0]) < 0.5,
+        shown[0] & (jnp.dot(left_vectors[:, 0], right_vectors[0]) < 0.5),
     )
     return inverted | turned
 
@@ -504,11 +511,8 @@ def _turns(recording: Recording, centred: bool) -> tuple[Array, Array]:
 
     ``centred``: less their means, whose difference may be the gyroscope's bias.
     """
-    omega = require_channel("omega", recording.omega)
     weight = (recording.present[..., 1:] * recording.present[..., :-1])[..., None]
-    step = jnp.diff(recording.times, axis=-1)[..., None]
-    measured = step * (omega[..., 1:, :] + omega[..., :-1, :]) / 2
-    recorded = turns_between_samples(recording)
+    measured, recorded = turns_of_rates(recording), turns_between_samples(recording)
     if centred:
         total = jnp.sum(weight, axis=-2, keepdims=True)
         measured, recorded = (

@@ -101,6 +101,10 @@ def load_recording(
 
 def _required_columns(path, names: list[str], columns: Mapping[str, str]) -> dict[str, str]:
     """The column of each role: the one given, or the one whose name is usual for it."""
+    if unknown := sorted(set(columns) - {"t", "wx", "wy", "wz", "wheel"}):
+        raise ValueError(
+            f"columns names those of t, wx, wy, wz and wheel, got the keys {', '.join(unknown)}."
+        )
     header_names = {
         role: columns.get(role) or usual_column(path, role, names) or role
         for role in ("t", "wx", "wy", "wz")
@@ -141,6 +145,11 @@ def _rows(path, lines, header_line, separator, names, header_names) -> tuple[lis
             if not any(cell.strip() for cell in row):
                 continue
             numbers.append(header_line + 1 + reader.line_num)
+            if any(cell.strip() for cell in row[len(names) :]):
+                raise ValueError(
+                    f"{path}: line {numbers[-1]} has {len(row)} cells, its header {len(names)}; of"
+                    " numbers with decimal commas separate the cells by semicolons."
+                )
             cells = [row[k] if k < len(row) else "" for k in places]
             pairs = zip(header_names.values(), cells, strict=True)
             table.append([_number(path, numbers[-1], *pair, separator != ",") for pair in pairs])

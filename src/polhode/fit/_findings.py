@@ -38,9 +38,9 @@ WARNINGS = {
     "axis is inverted, or axes are exchanged; correct the columns (sensor_axes shows how)",
     Finding.NOT_WHITE: "the residuals are correlated in time: the model lacks something (drag, "
     "bias, a moving part) and the intervals are too narrow",
-    Finding.WEAK: "a ratio is known to no better than 5 % (a nearly symmetric body, a spin near a "
-    "principal axis, a short record): the interval is approximate, since the misfit is no longer "
-    "quadratic over such a range",
+    Finding.WEAK: "a ratio is known to no better than 5 %, or than half of itself (a nearly "
+    "symmetric body, a spin near a principal axis, a short record): the interval is approximate, "
+    "since the misfit is no longer quadratic over such a range",
     Finding.POOR: "the residuals are more than twice as large as the noise: a wrong model, wrong "
     "axes or units, outliers (robust=Huber()), or a local minimum that is not the best",
     Finding.SATURATED: "a gyroscope axis is saturated: readings at its limit count as bounds only;"

@@ -54,17 +54,23 @@ def whole_of(entries: Float[Array, " e"], count: int = 6) -> Float[Array, "3 3"]
     return symmetric(entries[:3], entries[3:6] if count == 6 else jnp.zeros_like(entries[:3]))
 
 
+def is_nearly_flat(tensor: Float[Array, "3 3"], moments: Float[Array, " 3"]) -> Array:
+    """Whether the smallest second moment is next to zero; ``moments``: ascending."""
+    trace = tensor[0, 0] + tensor[1, 1] + tensor[2, 2]
+    return trace / 2 - moments[2] < 1e-4 * trace
+
+
 class Parameters(eqx.Module):
     """Unconstrained unknowns of one body and its recordings (None: not fitted).
 
     **Fields:** ``shape`` (k,): free entries of the Cholesky factor, relative to the start;
     ``omega`` (r, 3), rad/s: rates at the first time of each recording; ``attitude`` (r, 3), rad:
     rotation vector (body axes) from the start attitude to the initial one; ``bias`` (3,), rad/s, of
-    the gyroscope; ``mounting`` (3,), rad: rotation vector of the sensor axes; ``lever`` (3,), m:
-    accelerometer position from the centre of mass; ``motion``: the motion's own unknowns; ``gain``
-    (9,): errors of the gyroscope's gain matrix beside the calibrated one, row by row; ``delay``, s,
-    of its readings; ``walk`` (r, k, 3), rad/s: changes of its bias over each of k equal parts of a
-    recording.
+    the readings beside the calibrated one; ``mounting`` (3,), rad: rotation vector of the sensor
+    axes; ``lever`` (3,), m: accelerometer position from the centre of mass; ``motion``: the
+    motion's own unknowns; ``gain`` (9,): errors of the gyroscope's gain matrix relative to the
+    calibrated one, row by row; ``delay``, s, of its readings; ``walk`` (r, k, 3), rad/s: changes of
+    its bias over each of k equal parts of a recording.
     """
 
     shape: Float[Array, " k"]

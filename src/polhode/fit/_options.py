@@ -43,6 +43,7 @@ class Gyroscope(eqx.Module):
       deviations of the calibration. A fit estimates what is not zero with a normal prior of that
       width. The defaults are 1 % for ``scale_std`` and ``misalignment_std``, as data sheets of MEMS
       gyroscopes state, and zero for the others. Misalignments include rotations of the sensor.
+      Errors of the gain are relative to the calibrated one, ``gain (1 + errors)``.
 
     The terms are those of IEEE Std 952-1997, annex C. ``read`` simulates readings;
     ``FitOptions(gyroscope=...)`` uses the model in a fit.
@@ -137,7 +138,7 @@ class Gyroscope(eqx.Module):
 
     @property
     def gain_std(self) -> np.ndarray:
-        """Standard deviations (3, 3) of the entries of ``gain``."""
+        """Standard deviations (3, 3) of the errors of ``gain``, relative to it."""
         unit = np.eye(3)
         return self.scale_std * unit + self.misalignment_std * (1 - unit)
 

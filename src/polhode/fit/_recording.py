@@ -74,12 +74,19 @@ class Recording(eqx.Module):
         infinite values, noise that is not positive, and rates that turn the body by more than
         half a turn between samples (degrees taken for radians?).
         """
-        times = as_float_array("times", times, (None,))
+        given, times = times, as_float_array("times", times, (None,))
         require(
             times.shape[-1] >= 4, f"a recording needs at least 4 samples, got {times.shape[-1]}."
         )
         if is_concrete(times):
             step = np.diff(np.asarray(times), axis=-1)
+            exact_step = np.diff(np.asarray(given, float), axis=-1)
+            require(
+                np.abs(step - exact_step) <= 0.1 * np.abs(exact_step),
+                f"times of up to {np.abs(np.asarray(given, float)).max():.4g} s leave no digits for"
+                f" steps of {np.median(exact_step):.3g} s in {times.dtype}: subtract the first time"
+                " from all, or compute in float64 (jax_enable_x64).",
+            )
             place = int(np.argmin(step.reshape(-1, step.shape[-1]).min(axis=0)))
             require(
                 step > 0,
@@ -170,6 +177,13 @@ def turns_between_samples(recording: "Recording") -> Float[Array, "*b t-1 3"]:
     """Rotation vectors, body axes, from each attitude to the next, of up to half a turn."""
     wxyz = require_channel("wxyz", recording.wxyz)
     return wxyz_to_rotation_vector(multiply(conjugate(wxyz[..., :-1, :]), wxyz[..., 1:, :]))
+
+
+def turns_of_rates(recording: "Recording") -> Float[Array, "*b t-1 3"]:
+    """Rotation vectors, body axes, between samples by the mean of the rates at both."""
+    omega = require_channel("omega_body", recording.omega)
+    step = jnp.diff(recording.times, axis=-1)[..., None]
+    return step * (omega[..., 1:, :] + omega[..., :-1, :]) / 2
 
 
 def require_channel(name: str, array: Array | None) -> Array:

@@ -166,11 +166,23 @@ def _readings(
     if parameters.gain is not None:
         errors = parameters.gain.reshape(3, 3)
         omega = omega + sum(errors[None, None, :, j] * omega[..., j, None] for j in range(3))
+    gain = model.gyroscope.gain
     if parameters.bias is not None:
-        omega = omega + parameters.bias[None, None]
+        omega = omega + _in_rates(parameters.bias, gain)[None, None]
     if parameters.walk is not None:
-        omega = omega + jax.vmap(walk_of)(parameters.walk, recording.times)
+        omega = omega + jax.vmap(walk_of)(_in_rates(parameters.walk, gain), recording.times)
     return omega
+
+
+def _in_rates(readings: Float[Array, "*b 3"], gain: Array | None) -> Float[Array, "*b 3"]:
+    """Readings as rates of a calibrated gain, which a solver of linear equations would take out of
+    the kernel."""
+    if gain is None:
+        return readings
+    columns = jnp.unstack(gain.astype(readings.dtype), axis=1)
+    rows = [jnp.cross(columns[k - 2], columns[k - 1]) for k in range(3)]
+    back = jnp.stack(rows) / jnp.sum(columns[0] * rows[0])
+    return jnp.sum(back * readings[..., None, :], axis=-1)
 
 
 def walk_of(steps: Float[Array, "k 3"], times: Float[Array, " t"]) -> Float[Array, "t 3"]:

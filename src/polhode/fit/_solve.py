@@ -20,9 +20,10 @@ from polhode.fit._model import (
     base_of,
     entries_of,
     free_columns,
+    is_nearly_flat,
     whole_of,
 )
-from polhode.fit._numerics import LevenbergMarquardt, curvature_rows
+from polhode.fit._numerics import LevenbergMarquardt, curvature_rows, eigh
 from polhode.fit._options import WALK_KNOTS, FitOptions, Gyroscope, Huber, noise_is_trusted
 from polhode.fit._recording import (
     Recording,
@@ -30,6 +31,7 @@ from polhode.fit._recording import (
     require_channel,
     size_of_data,
     turns_between_samples,
+    turns_of_rates,
 )
 from polhode.fit._residuals import Linear, Model, linearise, prior_cost, prior_residuals, unknowns
 from polhode.fit._start import (
@@ -51,6 +53,9 @@ _GOOD = 1.5
 _BAD = 5.0
 # Relative difference of two costs that are those of one optimum.
 _SAME = 1e-4
+# Difference of two costs, in units of the variance of the noise, that is no reason to take a fit
+# that did not converge.
+_ALIKE = 2.0
 # Part of the readings that always counts as noise beside the calibration's prior: without it
 # noise-free readings would leave the calibration free.
 _LEAST_NOISE = 1e-6
@@ -95,9 +100,12 @@ class _Search(eqx.Module):
 
 def solve_fit(recording: Recording, options: FitOptions) -> Solution:
     """Fit one body to its recordings (leading axis r). Pure; works under jit and vmap."""
-    rates = _rates(recording)
     motion = FreeMotion() if options.motion is None else options.motion
     gyroscope = Gyroscope() if options.gyroscope is None else options.gyroscope
+    bias = _bias_of_rates(recording, options, gyroscope)
+    rates = _rates(recording)
+    if bias is not None:
+        rates = rates - bias[None, None]
     unknown = FullTensor() if options.unknown is None else options.unknown
     bases, initial_moments = _bases(recording, rates, motion, unknown, options.initial_inertia)
     scale_known = motion.fixes_scale()
@@ -117,9 +125,9 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
         mounting=zero if options.mounting else None,
         lever=zero if recording.force is not None else None,
         motion=jax.tree.map(lambda x: jnp.asarray(x, dtype), motion.start()),
-        **_sensor_start(recording, gyroscope, options.bias, dtype),
+        **_sensor_start(recording, gyroscope, bias, dtype),
     )
-    scale = _scale(first_parameters, recording, rates)
+    scale = _scale(first_parameters, recording, rates, gyroscope)
     # The optimiser computes in the default precision, whatever the precision of the data.
     optimiser_dtype = jnp.result_type(float)
     unbounded = dataclasses.replace(
@@ -216,11 +224,14 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
             parameters_of(solution.value), recording, model_of(base)
         )
         uses_all_data = part[job] == 1
-        better = uses_all_data & (cost < search.cost)
+        # of two that the data hardly tell apart the one that converged
+        converged = solution.result == optx.RESULTS.successful
+        ahead = converged.astype(dtype) - search.stopped.astype(dtype)
+        better = uses_all_data & (cost < search.cost + ahead * _ALIKE * prior_unit(linear) ** 2)
         # Two starts that reach the same optimum near the noise end the search: a third rarely finds
         # a better one. Far above the noise both may have met the same local minimum.
         same_optimum = uses_all_data & (jnp.abs(cost - search.cost) < _SAME * cost)
-        candidate = (solution.value, base, linear, cost, solution.result == optx.RESULTS.successful)
+        candidate = (solution.value, base, linear, cost, converged)
         previous = (search.best, search.base, search.linear, search.cost, search.stopped)
         best, base, linear, cost, stopped = jax.tree.map(
             lambda a, b: jnp.where(better, a, b), candidate, previous
@@ -237,7 +248,8 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
             search.steps + solution.stats["num_steps"],
             search.attempts + jnp.where(uses_all_data, 1, 0),
             stopped,
-            stopped & (misfit <= limit),
+            # the limit of what is physical has local minima of its own
+            stopped & (misfit <= limit) & ~_is_flat(linear, model_of(base)),
         )
 
     first_base = jax.tree.map(lambda leaf: leaf[0], bases)
@@ -274,15 +286,41 @@ def solve_fit(recording: Recording, options: FitOptions) -> Solution:
     )
 
 
+def _bias_of_rates(
+    recording: Recording, options: FitOptions, gyroscope: Gyroscope
+) -> Float[Array, " 3"] | None:
+    """The bias to start from, in rates: the mean turn beside attitudes, else zero; None where it is
+    not fitted."""
+    if recording.omega is None or not (options.bias or gyroscope.bias_std):
+        return None
+    if recording.wxyz is None or options.mounting:
+        return jnp.zeros(3, recording.omega.dtype)
+    known = recording.present[:, 1:] * recording.present[:, :-1]
+    turns = turns_of_rates(recording) - turns_between_samples(recording)
+    total = jnp.sum(known * jnp.diff(recording.times, axis=-1))
+    return jnp.sum(known[..., None] * turns, axis=(0, 1)) / jnp.where(total > 0, total, 1)
+
+
+def _is_flat(linear: Linear, model: Model) -> Array:
+    """Whether the body is nearly flat."""
+    if model.entries == 0:
+        return jnp.asarray(False)
+    tensor = whole_of(linear.at, model.entries)
+    return is_nearly_flat(tensor, eigh(tensor)[0])
+
+
 def _sensor_start(
-    recording: Recording, gyroscope: Gyroscope, bias: bool, dtype: jnp.dtype
+    recording: Recording, gyroscope: Gyroscope, bias: Array | None, dtype: jnp.dtype
 ) -> dict[str, Array | None]:
-    """The unknowns of the gyroscope, at their calibrated values; none without its readings."""
+    """The unknowns of the gyroscope, at their calibrated values but for the ``bias`` of its rates;
+    none without its readings."""
     if recording.omega is None:
         return {}
     walk = (recording.times.shape[0], WALK_KNOTS, 3)
+    if bias is not None and gyroscope.gain is not None:
+        bias = gyroscope.gain.astype(dtype) @ bias
     return {
-        "bias": jnp.zeros(3, dtype) if bias or gyroscope.bias_std else None,
+        "bias": bias,
         "gain": jnp.zeros(9, dtype) if gyroscope.gain_std.any() else None,
         "delay": jnp.zeros((), dtype) if gyroscope.delay_std else None,
         "walk": jnp.zeros(walk, dtype) if gyroscope.bias_walk else None,
@@ -406,9 +444,14 @@ def _bases(
     return jax.vmap(lambda sigma: base_of(sigma, scale_known))(bodies), bodies[0]
 
 
-def _scale(begin: Parameters, recording: Recording, rates: Array) -> Parameters:
+def _scale(
+    begin: Parameters, recording: Recording, rates: Array, gyroscope: Gyroscope
+) -> Parameters:
     """Natural sizes of the unknowns, so that one damping suits them all."""
     typical = jnp.sqrt(jnp.mean(rates**2)) + jnp.finfo(rates.dtype).tiny
+    of_reading = typical
+    if gyroscope.gain is not None:
+        of_reading = typical * jnp.max(jnp.abs(gyroscope.gain)).astype(rates.dtype)
     one = jnp.ones((), rates.dtype)
 
     def like(leaf, size):
@@ -421,13 +464,13 @@ def _scale(begin: Parameters, recording: Recording, rates: Array) -> Parameters:
         shape=like(begin.shape, one),
         omega=like(begin.omega, typical),
         attitude=like(begin.attitude, one),
-        bias=like(begin.bias, typical),
+        bias=like(begin.bias, of_reading),
         mounting=like(begin.mounting, one),
         lever=like(begin.lever, length),
         motion=jax.tree.map(_size, begin.motion),
         gain=like(begin.gain, jnp.asarray(0.1, rates.dtype)),
         delay=like(begin.delay, jnp.mean(jnp.diff(recording.times))),
-        walk=like(begin.walk, typical),
+        walk=like(begin.walk, of_reading),
     )
 
 

@@ -224,6 +224,7 @@ def fit_file(
 
     ``reading``: how the light curve was read, for the settings in the JSON file.
     """
+    curve.require_points()
     say(f"{title}: {curve.t.size} points, {len(curve.names)} groups, {np.ptp(curve.t):.4g} d")
     if curve.sun is None:
         check_max_frequency(curve.t, max_frequency)

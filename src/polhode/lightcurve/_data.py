@@ -91,7 +91,7 @@ class LightCurve(NamedTuple):
         if sun is not None:
             sun, r = _directions("sun", sun, t.size)
             observer, delta = _directions("observer", observer, t.size)
-            far = np.abs(delta - 1).max() > _ROUNDED
+            far = has_distances(delta)
             if far or np.abs(r - 1).max() > _ROUNDED:
                 notes = (*notes, *_distance_notes(sun * r[:, None], observer * delta[:, None]))
             if far and not at_body:
@@ -113,6 +113,11 @@ class LightCurve(NamedTuple):
             raise ValueError(
                 f"sigma must not be negative; that of point {np.argmax(sigma < 0)} is"
                 f" {sigma[np.argmax(sigma < 0)]:.6g}. Give 0 where the error is unknown."
+            )
+        if np.any(np.isinf(sigma)):
+            raise ValueError(
+                f"sigma must be finite; that of point {np.argmax(np.isinf(sigma))} is not. Leave"
+                " the point out, or give 0 where the error is unknown."
             )
         order = np.argsort(t, kind="stable")
         notes = (*notes, *_photometry_notes(magnitude, number, names))
@@ -203,6 +208,14 @@ class LightCurve(NamedTuple):
         sigma = np.where(missing, size, self.sigma)
         return self._replace(sigma=sigma, notes=(*self.notes, text))
 
+    def require_points(self) -> None:
+        """ValueError for fewer points than a light curve has at least."""
+        if self.t.size < FEWEST_POINTS:
+            raise ValueError(
+                f"a light curve needs at least {FEWEST_POINTS} points, this one has {self.t.size}:"
+                " means of wide bins leave few."
+            )
+
     @property
     def alpha(self) -> np.ndarray:
         """Phase angles (n,) [rad]. Raises ValueError where the directions are unknown."""
@@ -267,6 +280,11 @@ class LightCurve(NamedTuple):
             jnp.asarray(columns),
             jnp.asarray(stiffness),
         )
+
+
+def has_distances(lengths: np.ndarray) -> bool:
+    """Whether vectors of these lengths hold distances, and are no unit vectors."""
+    return bool(np.abs(lengths - 1).max() > _ROUNDED)
 
 
 def _directions(name: str, vectors, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,7 +10,7 @@ import numpy as np
 from polhode import rotation
 from polhode._atomic import atomic_write
 from polhode._closed_forms import Mode
-from polhode.lightcurve._data import LightCurve
+from polhode.lightcurve._data import LIGHT_TIME, LightCurve, has_distances
 
 if TYPE_CHECKING:
     from polhode.lightcurve._solutions import Solution
@@ -33,10 +33,12 @@ def read_light_curve(
     CSV: columns ``jd`` (or ``time``, ``t``; days), ``magnitude`` (``mag``) or ``flux``
     (``brightness``), ``sun_x`` ... ``observer_z`` (``earth_x``; from the body, au), and optionally
     ``sigma`` (``mag_err``; in the unit of the brightness), ``group`` (``observer``, ``night``,
-    ``block``). Times are those at the observer, not corrected for light time, and brightness is
-    not reduced for distance, except a flux of mean 1. ``vectors``: a second CSV of ``jd`` and the
-    six components, interpolated linearly, for a file that has none. ALCDEF: magnitudes with their
-    geometry from PHASE, PABL and PABB. DAMIT: intensities with vectors. Of CSV and ALCDEF:
+    ``block``). Times are those at the observer, not corrected for light time (of a column ``bjd``
+    barycentric ones), and brightness is not reduced for distance, except a flux of mean 1.
+    ``vectors``: a second CSV of ``jd`` and the six components, interpolated linearly, for a file
+    that has none. ALCDEF: magnitudes with their
+    geometry from PHASE, PABL and PABB; sessions whose LTCAPP or REDUCEDMAGS is not NONE are
+    corrected for light time or reduced already. DAMIT: intensities with vectors. Of CSV and ALCDEF:
     ``calibrated``: groups share a zero point but for small errors; ``reduced``: brightness is
     reduced for distance already.
 
@@ -138,6 +140,8 @@ def _table(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve:
     if six is None and vectors is not None:
         six = _interpolated(vectors, t)
     sun, observer = (None, None) if six is None else (six[:, :3], six[:, 3:])
+    if several == ["bjd"] and six is not None:
+        t = _at_observer(t, sun, observer)
     return LightCurve.of(
         t,
         magnitude,
@@ -149,6 +153,17 @@ def _table(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve:
         reduced=reduced,
         notes=notes,
     )
+
+
+def _at_observer(t, sun, observer) -> np.ndarray:
+    """Times of observation from barycentric ones, at which the light passed the Sun's distance.
+
+    The body's light is taken as that of a star in its direction, which is how such times are made.
+    """
+    delta = np.linalg.norm(observer, axis=1)
+    if not has_distances(delta):
+        return t
+    return t + LIGHT_TIME * (delta - np.sum(sun * observer, axis=1) / delta)
 
 
 def _six(path, columns, numbers):
@@ -243,7 +258,7 @@ def _damit(path, lines) -> LightCurve:
 
 def _alcdef(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve:
     """Sessions of KEYWORD=value and DATA=JD|magnitude|error lines."""
-    table, group, keys, session, rays = [], [], {}, 0, []
+    table, group, keys, session, rays, applied = [], [], {}, 0, [], []
     for number, line in enumerate(lines, 1):
         name, _, value = (part.strip() for part in line.partition("="))
         name = name.upper()
@@ -260,6 +275,8 @@ def _alcdef(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve
             table.append((*numbers[:2], max((*numbers, 0.0)[2], 0.0)))
             group.append(f"{session:04d}")
             rays.append(tuple(keys.get(k) for k in ("PHASE", "PABL", "PABB")))
+            corrections = (keys.get(k, "").upper() for k in ("LTCAPP", "REDUCEDMAGS"))
+            applied.append([word not in ("", "NONE", "FALSE") for word in corrections])
         elif name:
             keys[name] = value
     if len(table) == 0:
@@ -272,6 +289,11 @@ def _alcdef(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve
     if vectors is not None:
         six = _interpolated(vectors, data[:, 0])
         sun, observer, notes = six[:, :3], six[:, 3:], []
+        r, delta = (np.linalg.norm(v, axis=1) for v in (sun, observer))
+        if has_distances(delta):  # taken off again by the light curve
+            at_body, is_reduced = np.array(applied).T
+            data[:, 0] += np.where(at_body, LIGHT_TIME * delta, 0)
+            data[:, 1] += np.where(is_reduced & (not reduced), 5 * np.log10(r * delta), 0)
     elif are_numbers:
         phase, longitude, latitude = np.radians(np.array(rays, float)).T
         sun = _ray(longitude - phase / 2, latitude)

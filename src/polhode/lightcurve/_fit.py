@@ -10,7 +10,7 @@ from polhode import rotation
 from polhode._closed_forms import Mode
 from polhode.lightcurve._brightness import HG1G2, AbstractPhase, Bodies, Points, SeeligerPhase
 from polhode.lightcurve._convex import refined_solutions
-from polhode.lightcurve._data import BLOCK, FEWEST_POINTS, LightCurve
+from polhode.lightcurve._data import BLOCK, LightCurve
 from polhode.lightcurve._frequencies import (
     Hypotheses,
     Pairs,
@@ -106,11 +106,7 @@ def fit_light_curve(
         raise RuntimeError(
             "fits of light curves need float64: jax.config.update('jax_enable_x64', True)."
         )
-    if curve.t.size < FEWEST_POINTS:
-        raise ValueError(
-            f"a light curve needs at least {FEWEST_POINTS} points, this one has {curve.t.size}:"
-            " means of wide bins leave few."
-        )
+    curve.require_points()
     curve._known_directions()
     check_max_frequency(curve.t, max_frequency)
     if searches < (0 if start else 1):

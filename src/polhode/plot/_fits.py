@@ -24,7 +24,7 @@ def fit(result: Any, recording: Any, *, body: int = 0, title: str = "") -> Any:
     Right, of an inertia: the region of the two smaller ratios (or moments) that the data allow, and
     the limit of what a body can be; of a scene: the correlations of the fitted numbers. Below, a
     table of the results. ``body`` picks one of a batch. Raises ValueError for a recording without
-    rates.
+    rates, or with other leading axes than those of a batch of fits.
     """
     if recording.omega is None:
         raise ValueError("the figure of a fit needs a recording of rates, got attitudes alone.")
@@ -73,6 +73,12 @@ def _single(result, recording, body) -> dict[str, Any]:
     lead = np.asarray(result.diagnostics).ndim
     if not 0 <= body < max(np.asarray(result.diagnostics).size, 1):
         raise ValueError(f"body must be one of the fit's, got {body}.")
+
+    if lead and recording.batch_shape != np.shape(result.diagnostics):
+        raise ValueError(
+            "recording must be that of the fit, with the leading axes"
+            f" {np.shape(result.diagnostics)}, got {recording.batch_shape}."
+        )
 
     def pick(value, tail, place=body):
         value = np.asarray(value)
