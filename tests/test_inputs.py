@@ -234,9 +234,12 @@ def test_half_precision_is_refused_by_name(dtype):
 
 
 def test_unsorted_times_have_a_status_where_they_are_traced():
+    """And their samples are NaN."""
+
     @jax.jit
-    def status(ts):
-        return ph.simulate(SCENE, STATE, ts).status
+    def outcome(ts):
+        motion = ph.simulate(SCENE, STATE, ts)
+        return motion.status, motion.omega_body
 
     for times, good in (
         ([0.0, 1, 2], True),
@@ -246,9 +249,12 @@ def test_unsorted_times_have_a_status_where_they_are_traced():
         ([0.0, np.nan, 1], False),
     ):
         want = ph.Status.SUCCESSFUL if good else ph.Status.BAD_TIMES
-        assert status(jnp.array(times)) == want
-    own = jnp.array([[0.0, 1, 2], [0.0, 2, 1]])
-    np.testing.assert_array_equal(status(own), [ph.Status.SUCCESSFUL, ph.Status.BAD_TIMES])
+        status, rates = outcome(jnp.array(times))
+        assert status == want
+        assert (np.isnan(rates) != good).all()
+    status, rates = outcome(jnp.array([[0.0, 1, 2], [0.0, 2, 1]]))
+    np.testing.assert_array_equal(status, [ph.Status.SUCCESSFUL, ph.Status.BAD_TIMES])
+    np.testing.assert_array_equal(np.isnan(rates).all((1, 2)), [False, True])
 
 
 def with_motor(torque, speed):
