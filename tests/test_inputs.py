@@ -1,6 +1,7 @@
 """Bad input gets a clear error: what was given, what is expected, how to mend it."""
 
 import re
+from functools import partial
 
 import diffrax
 import equinox as eqx
@@ -233,9 +234,12 @@ def test_half_precision_is_refused_by_name(dtype):
 
 
 def test_unsorted_times_have_a_status_where_they_are_traced():
+    """And their samples are NaN."""
+
     @jax.jit
-    def status(ts):
-        return ph.simulate(SCENE, STATE, ts).status
+    def outcome(ts):
+        motion = ph.simulate(SCENE, STATE, ts)
+        return motion.status, motion.omega_body
 
     for times, good in (
         ([0.0, 1, 2], True),
@@ -245,9 +249,12 @@ def test_unsorted_times_have_a_status_where_they_are_traced():
         ([0.0, np.nan, 1], False),
     ):
         want = ph.Status.SUCCESSFUL if good else ph.Status.BAD_TIMES
-        assert status(jnp.array(times)) == want
-    own = jnp.array([[0.0, 1, 2], [0.0, 2, 1]])
-    np.testing.assert_array_equal(status(own), [ph.Status.SUCCESSFUL, ph.Status.BAD_TIMES])
+        status, rates = outcome(jnp.array(times))
+        assert status == want
+        assert (np.isnan(rates) != good).all()
+    status, rates = outcome(jnp.array([[0.0, 1, 2], [0.0, 2, 1]]))
+    np.testing.assert_array_equal(status, [ph.Status.SUCCESSFUL, ph.Status.BAD_TIMES])
+    np.testing.assert_array_equal(np.isnan(rates).all((1, 2)), [False, True])
 
 
 def with_motor(torque, speed):
@@ -319,23 +326,25 @@ def test_limits_and_edges_that_are_wrong_have_a_status_where_they_are_traced(nam
 
 
 def test_a_body_with_a_wrong_limit_adds_nothing_to_the_gradient_of_the_others():
-    """A gain that bodies share, and limits of each motor; the mean is NaN if all are wrong."""
+    """A gain that bodies share, a weight of the cost, and limits of each motor; the mean and the
+    derivative by the weight are NaN if all are wrong."""
 
     @jax.jit
-    @jax.value_and_grad
-    def mean(gain, limits):
+    @partial(jax.value_and_grad, argnums=(0, 1))
+    def mean(gain, weight, limits):
         motor = ph.Motor(lambda t, q, w, s: gain * q[1] + w[0], max_torque=limits)
         wheel = ph.Rotor([1.0, 0, 0], 0.05, speed=1.0, coupling=motor)
         scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), rotors=wheel)
         motion = ph.simulate(scene, STATE, TS)
-        return ph.successful_mean(motion, lambda motion: motion.omega_body[:, -1, 0])
+        return ph.successful_mean(motion, lambda motion: weight * motion.omega_body[:, -1, 0])
 
-    value, slope = mean(0.4, jnp.array([0.5, 0.5]))
-    assert abs(slope) > 1e-6
+    both = jax.tree.leaves(mean(0.4, 1.0, jnp.array([0.5, 0.5])))
+    assert min(abs(x) for x in both) > 1e-6
     for wrong in (-0.5, np.nan):
-        found = mean(0.4, jnp.array([0.5, wrong]))
-        np.testing.assert_allclose(found, (value, slope), rtol=1e-9)
-        assert np.isnan(mean(0.4, jnp.array([wrong, wrong]))[0])
+        found = mean(0.4, 1.0, jnp.array([0.5, wrong]))
+        np.testing.assert_allclose(jax.tree.leaves(found), both, rtol=1e-9)
+        value, (_, by_weight) = mean(0.4, 1.0, jnp.array([wrong, wrong]))
+        assert np.isnan([value, by_weight]).all()
 
 
 def test_a_limit_that_is_wrong_raises_outside_of_jit():

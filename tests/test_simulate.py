@@ -341,9 +341,10 @@ def test_the_mean_over_the_bodies_that_finished_is_theirs_alone():
     mapped = jax.vmap(lambda size: braked(GAINS, size))(jnp.array([0.5, 9.0]))
     np.testing.assert_allclose(ph.successful_mean(mapped, energy_of(2.0)), alone[0], rtol=1e-6)
     np.testing.assert_allclose(ph.successful_mean(mapped[0], energy_of(2.0)), alone[0], rtol=1e-6)
-    value, (gains, _) = slope(GAINS, 2.0, jnp.array([9.0, 9.0]))
+    value, (gains, weight) = slope(GAINS, 2.0, jnp.array([9.0, 9.0]))
     assert np.isnan(value)
     assert np.isnan(gains).all()
+    assert np.isnan(weight)
     with pytest.raises(ValueError, match="one row for each body"):
         ph.successful_mean(mapped, lambda t: jnp.ones(3))
 

@@ -150,7 +150,7 @@ def successful_mean(trajectory: Trajectory, cost: Callable[[Trajectory], Array])
     - ``cost``: a function of a trajectory; values (..., *k), one row for each body.
 
     **Returns:** the mean (*k) over the batch axes. If no body finished, it is NaN, and so are its
-    derivatives with respect to the numbers of the scene.
+    derivatives with respect to the numbers of the scene and of ``cost``.
 
     Raises ValueError if the values do not begin with the batch axes.
 
@@ -180,9 +180,12 @@ def successful_mean(trajectory: Trajectory, cost: Callable[[Trajectory], Array])
         f" got {values.shape}.",
     )
     mask = good.reshape(*batch, *(1,) * (values.ndim - len(batch)))
-    axes = tuple(range(len(batch)))
-    count = jnp.sum(good).astype(values.dtype)
-    mean = jnp.sum(jnp.where(mask, values, 0), axis=axes) / jnp.maximum(count, 1)
+    dtype = values.dtype if jnp.issubdtype(values.dtype, jnp.inexact) else trajectory.ts.dtype
+    count = jnp.sum(good).astype(dtype)
+    # if no body finished, all values are divided by NaN: derivatives of the cost are NaN, not zero
+    counted = jnp.where(mask | (count == 0), values, 0)
+    total = jnp.sum(counted, axis=tuple(range(len(batch))), dtype=dtype)
+    mean = total / jnp.where(count > 0, count, jnp.nan)
     return mean + _nothing(trajectory, count)
 
 
