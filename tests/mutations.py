@@ -294,8 +294,8 @@ MUTANTS = (
     # frames and sensors
     Mutant(
         FRAME,
-        "_sum(carried, 2 * as_vectors(",
-        "_sum(carried, as_vectors(",
+        "_sum(2 * vectors_like(carried, ",
+        "_sum(vectors_like(carried, ",
         "the Coriolis acceleration is half",
         ("frames/test_rotating_frame.py::test_transformations_against_differentiated_paths",),
     ),

@@ -114,6 +114,19 @@ def test_lists_of_single_precision_stay_so():
     assert ph.Inertia.from_moments([1, 1.5, 2]).moments.dtype == jnp.float64
 
 
+def test_the_length_of_a_quaternion_keeps_its_digits_and_has_no_derivative():
+    """Also of a unit quaternion, which is not normalised again."""
+    rows = np.random.default_rng(0).normal(size=(100, 4))
+    state = ph.State(rows, np.zeros(3))
+
+    def normalised(wxyz):
+        return eqx.tree_at(lambda s: s.wxyz, state, wxyz).as_unit().wxyz
+
+    wxyz, change = jax.jvp(normalised, (state.wxyz,), (state.wxyz,))
+    np.testing.assert_array_equal(wxyz, state.wxyz)
+    np.testing.assert_allclose(change, 0, atol=1e-15)
+
+
 def test_non_unit_quaternions_are_normalised_at_every_scale():
     for scale in (1e-300, 1e-5, 1.0, 1e300):
         state = ph.State(np.array([3.0, 0, 4.0, 0]) * scale, [0.0, 0, 1])

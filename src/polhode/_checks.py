@@ -146,6 +146,13 @@ def as_vectors(name: str, value: Any, size: int = 3) -> Array:
     return as_float_array(name, value, (size,), finite=False)
 
 
+def vectors_like(array: Any, value: Any, name: str = "vector") -> Array:
+    """Vectors (..., 3) of floats; lists and integers take the dtype of the array."""
+    vectors = as_vectors(name, value)
+    has_dtype = jnp.issubdtype(getattr(value, "dtype", int), jnp.floating)
+    return vectors if has_dtype else vectors.astype(array.dtype)
+
+
 def as_number(name: str, value: Any) -> Array:
     """A floating-point scalar or batch of scalars."""
     return as_float_array(name, value, ())

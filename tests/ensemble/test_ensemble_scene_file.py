@@ -60,6 +60,11 @@ def test_draws_in_the_units_of_the_file():
         ('quantity = "rate"', 'quantity = "tlt"', "tilt"),
         ("high = 2", "", "both low and high"),
         ("high = 2", "high = -2", "high must be above low"),
+        (
+            "[[ensemble.statistics]]",
+            '[[published]]\nname = "P_psi"\nvalue = 1.0\nsource = ""\n[[ensemble.statistics]]',
+            "published.* has no use in an",
+        ),
     ],
 )
 def test_mistakes_are_named(old, new, words):

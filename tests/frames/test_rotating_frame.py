@@ -249,7 +249,7 @@ def test_derivative_by_the_time_of_the_start(time):
 
 
 @pytest.mark.parametrize("rate", [[0.0, 0, 2.0], lambda t: np.float32([0, 0, 2]) * t])
-def test_forces_of_batches_and_no_times(rate):
+def test_forces_of_batches_and_no_times(rate, unchecked):
     if not callable(rate):
         rate = jnp.array(rate, jnp.float32)
     frame = RotatingFrame.from_rate(rate, wxyz=jnp.array([1, 0, 0, 0], jnp.float32))
@@ -261,3 +261,10 @@ def test_forces_of_batches_and_no_times(rate):
     assert frame.omega_body(jnp.zeros((2, 0), jnp.float32)).shape == (2, 0, 3)
     for times in (1, [1, 2], jnp.array([1, 2]), 1.5):
         assert frame.attitude(times).dtype == jnp.float32
+    for got in (  # of lists and integers
+        frame.position_to_space(1.5, [1, 2, 3]),
+        frame.velocity_to_frame(1.5, [1.0, 2.0, 3.0], [1, 2, 3]),
+        frame.apparent_acceleration(1.5, [1.0, 2.0, 3.0], [1.0, 2.0, 3.0]),
+        frame.euler(1.5, [1.0, 2.0, 3.0]),
+    ):
+        assert got.dtype == jnp.float32

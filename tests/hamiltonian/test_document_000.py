@@ -232,3 +232,8 @@ def test_hamiltons_equations_of_angles_and_momenta_that_broadcast(unchecked):
         equations(np.array([1, 1, 1]), [1, 2, 3]), equations([1.0] * 3, [1.0, 2, 3])
     ):
         np.testing.assert_array_equal(got, want)
+    bodies = Inertia.from_moments([MOMENTS, [1.0, 1.0, 1.0]])  # a batch of their own
+    of_bodies = ph.hamiltons_equations(ph.hamiltonian(bodies))
+    for got, want in zip(of_bodies(Q, P), equations(Q, P)):
+        assert got.shape == (2, 3)
+        np.testing.assert_allclose(got[0], want, rtol=1e-15)

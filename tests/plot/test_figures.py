@@ -220,6 +220,19 @@ def test_missing_data_and_wrong_bodies_are_named(trajectory):
     )
     with pytest.raises(ValueError, match="at rest"):
         plot.polhode(rest)
+    with pytest.raises(ValueError, match="number of bodies, 2"):
+        plot.animate(trajectory, bodies=[2])
+
+
+def test_a_body_that_did_not_finish_is_not_said_to_be_at_rest():
+    omega = np.ones((2, 3, 3))
+    omega[0] = np.nan
+    wxyz = np.broadcast_to([1.0, 0, 0, 0], (2, 3, 4))
+    failed = plot.samples([0.0, 1.0, 2.0], omega, wxyz, ph.Inertia.from_moments(MOMENTS))
+    for figure in (plot.polhode, plot.herpolhode):
+        with pytest.raises(ValueError, match="did not finish"):
+            figure(failed)
+    assert "Energy [J]" in [ax.get_title("left") for ax in plot.overview(failed).axes]
 
 
 def test_settings_of_the_user_are_left_alone(trajectory):

@@ -190,6 +190,9 @@ def test_lists_follow_the_dtype_of_arrays_and_mixed_arrays_the_wider_one():
             (rotation.multiply([1, 0, 0, 0], turn), jnp.float32),
             (rotation.multiply(np.ones(4), turn), jnp.float64),
             (rotation.rotate(turn, [1, 2, 3]), jnp.float32),
+            (rotation.between([1, 0, 0, 0], turn), jnp.float32),
+            (rotation.between(turn, [1, 0, 0, 0]), jnp.float32),
+            (rotation.angle_between([1, 0, 0, 0], turn), jnp.float32),
         ):
             assert got.dtype == dtype
 

@@ -77,13 +77,16 @@ def hamiltons_equations(
 ) -> Callable[..., tuple[Float[Array, "*b 3"], Float[Array, "*b 3"]]]:
     """Hamilton's equations of any ``H(q, p, ...)`` by ``jax.grad`` (docs/equations.md: 2, 3).
 
-    Returns ``equations(q, p, *args) -> (dq/dt, dp/dt)``; leading batch axes broadcast, and are
-    allowed as long as H treats them one by one. Lists and integers are taken as arrays of floats.
+    Returns ``equations(q, p, *args) -> (dq/dt, dp/dt)``; leading batch axes, also those that H adds
+    of its own (a batch of inertias), broadcast, and are allowed as long as H treats them one by
+    one. Lists and integers are taken as arrays of floats.
     """
 
     def equations(q, p, *args):
         if not _are_components(q, p):
             q, p = as_floats(finite=False, q=(q, ()), p=(p, ()))
+            batch = jax.eval_shape(lambda q, p: H(q, p, *args), q, p).shape
+            q, p = (jnp.broadcast_to(x, (*batch, x.shape[-1])) for x in (q, p))
         slope_q, slope_p = jax.grad(lambda q, p: jnp.sum(H(q, p, *args)), argnums=(0, 1))(q, p)
         return slope_p, jax.tree.map(jnp.negative, slope_q)
 

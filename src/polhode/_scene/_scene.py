@@ -155,9 +155,9 @@ class State(AbstractPart):
 
     def as_unit(self) -> "State":
         """The state with quaternions of unit length, where an edit or a step left another."""
-        square = jnp.sum(self.wxyz * self.wxyz, axis=-1, keepdims=True)
-        unit = jnp.abs(square - 1) <= 8 * jnp.finfo(self.wxyz.dtype).eps
-        wxyz = jnp.where(unit, self.wxyz, rotation.normalise(self.wxyz))
+        square, wxyz = jnp.sum(self.wxyz**2, -1, keepdims=True), rotation.normalise(self.wxyz)
+        is_unit = jnp.abs(square - 1) <= 8 * jnp.finfo(wxyz.dtype).eps  # keeps its digits
+        wxyz = wxyz + jax.lax.stop_gradient(jnp.where(is_unit, self.wxyz - wxyz, 0))
         return eqx.tree_at(lambda s: s.wxyz, self, wxyz)
 
     def canonical(self, inertia: Inertia) -> tuple[Array, Array]:

@@ -519,7 +519,11 @@ class SceneFile(Table):
                 "[inertia] table is that of one body or of clones: remove the [ensemble]"
             )
         if self.ensemble is not None:
-            unused = {"[[events]]": self.events, "[observations]": self.observations}
+            unused = {
+                "[[events]]": self.events,
+                "[observations]": self.observations,
+                "[[published]]": self.published,
+            }
             for name, table in unused.items():
                 if table:
                     raise ValueError(f"{name} has no use in an [ensemble]: remove one of them")

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from polhode._checks import ArrayLike, as_float_array, as_vectors, batch_of, is_concrete, require
+from polhode._checks import ArrayLike, as_float_array, batch_of, is_concrete, require, vectors_like
 from polhode._kernels import smooth
 from polhode._parts import Signature, as_static, takes
 from polhode._trajectory import Trajectory
@@ -256,8 +256,8 @@ def _at_times(function: Callable, t: Time, dtype: Any):
     return function(times)
 
 
-def _cross(left: Array, right: Array) -> Array:
-    return jnp.cross(*_aligned(as_vectors("vector", left), as_vectors("vector", right)))
+def _cross(left: Array, right: ArrayLike) -> Array:
+    return jnp.cross(*_aligned(left, vectors_like(left, right)))
 
 
 def _aligned(*arrays: Array) -> list[Array]:
@@ -266,8 +266,8 @@ def _aligned(*arrays: Array) -> list[Array]:
     return [array.reshape((1,) * (rank - array.ndim) + array.shape) for array in arrays]
 
 
-def _sum(left: Array, right: Array) -> Array:
-    return jnp.add(*_aligned(as_vectors("vector", left), as_vectors("vector", right)))
+def _sum(left: ArrayLike, right: Array) -> Array:
+    return jnp.add(*_aligned(vectors_like(right, left), right))
 
 
 def _origin(function):
@@ -432,12 +432,12 @@ class RotatingFrame(eqx.Module):
         return _at_times(motion_at, t, self.turning.dtype)
 
     def _rotate_to_space(self, t: Time, vector: Array, wxyz: Array | None = None) -> Array:
-        vector = as_vectors("vector", vector)
-        return rotate(*_aligned(self.attitude(t) if wxyz is None else wxyz, vector))
+        wxyz = self.attitude(t) if wxyz is None else wxyz
+        return rotate(*_aligned(wxyz, vectors_like(wxyz, vector)))
 
     def _rotate_to_frame(self, t: Time, vector: Array, wxyz: Array | None = None) -> Array:
         wxyz = self.attitude(t) if wxyz is None else wxyz
-        return rotate(*_aligned(conjugate(wxyz), as_vectors("vector", vector)))
+        return rotate(*_aligned(conjugate(wxyz), vectors_like(wxyz, vector)))
 
     # --- transformations, both ways (docs/equations.md, 003: 4-19) -----------------------
 
@@ -500,9 +500,9 @@ class RotatingFrame(eqx.Module):
 
     def euler(self, t: Time, position: Vector, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
         """Euler force [N], ``-mass d(omega)/dt x r``; plain zeros for a constant rate."""
-        (omega, slope), position = self._rates(t), as_vectors("position", position)
+        omega, slope = self._rates(t)
         if slope is None:
-            return _no_force(mass, omega, position)
+            return _no_force(mass, omega, vectors_like(omega, position))
         return _times(mass, -_cross(slope, position))
 
     def origin_force(self, t: Time, mass: Float[ArrayLike, "*#b"] = 1.0) -> Vector:
@@ -515,7 +515,7 @@ class RotatingFrame(eqx.Module):
         omega, slope = self._rates(t)
         carried = _cross(omega, position)
         if velocity is not None:
-            carried = _sum(carried, 2 * as_vectors("velocity", velocity))
+            carried = _sum(2 * vectors_like(carried, velocity), carried)
         turning = -_cross(omega, carried)
         return turning if slope is None else _sum(turning, -_cross(slope, position))
 

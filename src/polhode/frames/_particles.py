@@ -8,7 +8,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from polhode._checks import ArrayLike, as_float_array, is_concrete, require_positive
+from polhode._checks import (
+    ArrayLike,
+    as_float_array,
+    is_concrete,
+    require_positive,
+    vectors_like,
+)
 from polhode._method import check_options, check_rtol, check_times
 from polhode._parts import as_static, result_of, takes
 from polhode.frames._frame import RotatingFrame, VariableRate
@@ -190,8 +196,8 @@ def simulate_particles(
         )
     solver = diffrax.Dopri8() if solver is None else solver
     check_options(solver, controller, adjoint, max_steps=max_steps)
-    position = as_float_array("position", position, (3,))
-    velocity = as_float_array("velocity", velocity, (3,))
+    position = as_float_array("position", vectors_like(frame.turning, position, "position"), (3,))
+    velocity = as_float_array("velocity", vectors_like(frame.turning, velocity, "velocity"), (3,))
     ts, mass = as_float_array("ts", ts, (None,)), as_float_array("mass", mass)
     leaves = (frame, position, velocity)
     dtypes = {x.dtype for x in jax.tree.leaves(eqx.filter(leaves, eqx.is_inexact_array))}

@@ -115,8 +115,7 @@ def polhode(
     turn[:, 0] *= np.linalg.det(turn)  # right-handed
     omega = data.omega_body[body] @ turn
     twice_energy = omega[0] ** 2 @ moments
-    if not twice_energy > 0:
-        raise ValueError("the body is at rest at the first time: it has no inertia ellipsoid.")
+    _require_motion(twice_energy, "inertia ellipsoid")
     semi = np.sqrt(twice_energy / moments)
     size = semi.max()
     if ax is None:
@@ -149,6 +148,17 @@ def polhode(
     _body_axes(ax, tensor, twice_energy, size, axis_names)
     _tidy(ax)
     return ax
+
+
+def _require_motion(size: float, name: str) -> None:
+    """ValueError for a body of which the energy or momentum ``size`` is zero or not finite."""
+    if not np.isfinite(size):
+        raise ValueError(
+            f"the body did not finish, it has no {name}: its samples at the first time are not"
+            " finite. Choose another one with body=."
+        )
+    if not size > 0:
+        raise ValueError(f"the body is at rest at the first time: it has no {name}.")
 
 
 def _towards(omega) -> tuple[float, float]:
@@ -279,8 +289,7 @@ def herpolhode(
     scale = Scale.of(np.ptp(data.ts[body])) if scale is None else scale
     omega = np.einsum("tij,tj->ti", data.matrices[body], data.omega_body[body])
     momentum = data.momentum_space[body, 0]
-    if not np.linalg.norm(momentum) > 0:
-        raise ValueError("the body is at rest at the first time: it has no invariable plane.")
+    _require_motion(np.linalg.norm(momentum), "invariable plane")
     normal = momentum / np.linalg.norm(momentum)
     first = omega[0] - normal * (normal @ omega[0])
     if np.linalg.norm(first) <= 1e-12 * np.linalg.norm(omega[0]):
@@ -329,7 +338,7 @@ def overview(
     rates, lines for body 0 and bands from the 5th to the 95th percentile of the others, or thin
     lines of up to 64 of them where bodies have times of their own; dots are `observed`
     (`plot.samples` of one body; NaN where nothing was observed). Right: the polhode, or the energy
-    of a body that starts at rest or whose inertia changes with time.
+    of a body that starts at rest, did not finish, or whose inertia changes with time.
     """
     data = as_samples(what)
     names = tuple(plain(name, 30) for name in axis_names)
@@ -371,8 +380,8 @@ def overview(
             handlelength=1.4,
             columnspacing=1.2,
         )
-    is_at_rest = not np.any(data.omega_body[0, 0])
-    if data.energy is not None and (data.tensor is None or is_at_rest):
+    size = np.linalg.norm(data.omega_body[0, 0])
+    if data.energy is not None and (data.tensor is None or not 0 < size < np.inf):
         ax = figure.add_subplot(grid[:3, 1])
         ax.plot(t, data.energy[0], color=INK, linewidth=1.3)
         ax.set_title("Energy [J]")
@@ -466,6 +475,7 @@ def animate(
     numbers = list(range(min(data.count, _MOST_BODIES))) if bodies is None else list(bodies)
     if not 1 <= len(numbers) <= _MOST_BODIES:
         raise ValueError(f"animate shows 1 to {_MOST_BODIES} bodies, got {len(numbers)}.")
+    numbers = [pick(data, number)[1] for number in numbers]
     if path is not None:
         _check_writer(Path(path))
     scale = Scale.of(np.ptp(data.ts)) if scale is None else scale

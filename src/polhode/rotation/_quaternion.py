@@ -316,11 +316,17 @@ def multiply(
     left: Float[ArrayLike, "*#b 4"], right: Float[ArrayLike, "*#b 4"]
 ) -> Float[Array, "*b 4"]:
     """Hamilton product ``left right``: the rotation ``right`` followed by ``left``."""
-    first, second = as_vectors("left", left, 4), as_vectors("right", right, 4)
-    batch_of(left=(first, 1), right=(second, 1))
+    return _product(*_as_pair(left=(left, 4), right=(right, 4)))
+
+
+def _as_pair(**arguments: tuple[Any, int]) -> tuple[Array, Array]:
+    """Two arrays ``name=(value, size)`` of vectors, of one dtype; their batch axes broadcast."""
+    first, second = (as_vectors(name, value, n) for name, (value, n) in arguments.items())
+    batch_of(**dict(zip(arguments, ((first, 1), (second, 1)))))
     if first.dtype != second.dtype:
-        first, second = as_floats(finite=False, left=(left, (4,)), right=(right, (4,)))
-    return _product(first, second)
+        sizes = {name: (value, (n,)) for name, (value, n) in arguments.items()}
+        first, second = as_floats(finite=False, **sizes)
+    return first, second
 
 
 @jax.jit  # one program, not one for each operation; likewise below
@@ -351,11 +357,8 @@ def rotate(
 
     Raises ValueError for a quaternion that is known not to be of unit length.
     """
-    turn, turned = as_quaternions(wxyz, unit=True), as_vectors("vector", vector, 3)
-    batch_of(wxyz=(turn, 1), vector=(turned, 1))
-    if turn.dtype != turned.dtype:
-        turn, turned = as_floats(finite=False, wxyz=(wxyz, (4,)), vector=(vector, (3,)))
-    return _rotated(turn, turned)
+    as_quaternions(wxyz, unit=True)
+    return _rotated(*_as_pair(wxyz=(wxyz, 4), vector=(vector, 3)))
 
 
 @jax.jit
@@ -404,16 +407,17 @@ def between(
     start: Float[ArrayLike, "*#b 4"], end: Float[ArrayLike, "*#b 4"]
 ) -> Float[Array, "*b 4"]:
     """Rotation (..., 4) in body axes: ``end = multiply(start, between(start, end))``."""
-    return multiply(conjugate(start), end)
+    first, second = _as_pair(start=(start, 4), end=(end, 4))
+    return _product(conjugate(first), second)
 
 
 def angle_between(
     start: Float[ArrayLike, "*#b 4"], end: Float[ArrayLike, "*#b 4"]
 ) -> Float[Array, "*b"]:
     """Angle in [0, pi] (rad) of the rotation from one attitude to the other."""
-    start, end = as_quaternions(start, "start"), as_quaternions(end, "end")
-    batch_of(start=(start, 1), end=(end, 1))
-    return _angle(start, end)
+    as_quaternions(start, "start")
+    as_quaternions(end, "end")
+    return _angle(*_as_pair(start=(start, 4), end=(end, 4)))
 
 
 @jax.jit
