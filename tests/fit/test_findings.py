@@ -9,7 +9,13 @@ import pytest
 
 import polhode as ph
 from polhode.fit import Finding, FitOptions, Recording, fit_inertia, stack
-from polhode.fit._conclude import _axes_disagree, has_outliers, is_weak, whiteness_of
+from polhode.fit._conclude import (
+    _axes_disagree,
+    _with_repulsion,
+    has_outliers,
+    is_weak,
+    whiteness_of,
+)
 from polhode.fit._options import saturation
 from polhode.fit._recording import rotation_vector_between, turns_between_samples
 from polhode.rotation import multiply, rotation_vector_to_wxyz
@@ -167,3 +173,23 @@ def test_fits_name_clipped_records_and_outliers():
         seen = int(fit.diagnostics) & int(Finding.OUTLIERS | Finding.SATURATED)
         assert seen == int(expected)
         assert ("saturated" in fit.findings()) == (expected is Finding.SATURATED)
+
+
+def test_errors_of_moments_that_are_nearly_equal_hold_what_drives_them_apart():
+    """Eigenvalues of tensors with noise in every entry, beside the noise itself, which is 5 times
+    the gap. To first order the products of inertia change none of them."""
+    rng = np.random.default_rng(3)
+    moments, noise = np.array([1.0, 1.002, 2.0]), 0.01
+    errors = noise * rng.normal(size=(4000, 3, 3))
+    errors = np.diag(moments) + np.tril(errors) + np.swapaxes(np.tril(errors, -1), 1, 2)
+    found = np.linalg.eigvalsh(errors)
+    z = []
+    for values in found[::20]:
+        first = [noise] * 3 + [*(noise * np.hypot(1, values / values[2])[:2]) / values[2], 0]
+        std = _with_repulsion(jnp.asarray(values), jnp.asarray([*first, *[noise] * 3]))
+        truth = np.concatenate([moments, moments / moments[2]])[:5]
+        z.append((np.concatenate([values, values / values[2]])[:5] - truth) / std[:5])
+    rms = np.sqrt(np.mean(np.square(z), axis=0))
+    assert np.all((rms > 0.8) & (rms < 1.2)), rms
+    alone = np.sqrt(np.mean((found[:, :2] - moments[:2]) ** 2, axis=0)) / noise
+    assert np.all(alone[:2] > 1.3), alone  # without what is added the intervals would be too narrow
