@@ -501,8 +501,6 @@ class Trajectory(eqx.Module):
         about the axes of the body one after the other (yaw, pitch, roll), ``"zyx"`` about those of
         space. Angles are in the order of the axes. Raises ValueError for other letters.
         """
-        if isinstance(sequence, str):
-            sequence = rotation.Sequence.of(sequence)
         return rotation.wxyz_to_euler(self.wxyz, sequence)
 
     def to_scipy(self) -> "Rotation":
