@@ -45,6 +45,8 @@ TS = [0.0, 1.0]
         (lambda: ph.GravityGradient(1.0, [0.0, 0, 0]), "must not be zero"),
         (lambda: ph.LinearDamping([0.1, -0.1, 0.1]), "must not be negative"),
         (lambda: ph.BodyTorque([1.0, 2.0]), r"shape \(\.\.\., 3\)"),
+        (lambda: ph.UniformGravity(1.0, 0.3), r"UniformGravity\.axial\(mass, distance\)"),
+        (lambda: ph.simulate(SCENE, STATE, 10), r"got \(\): give a row of numbers, such as \[0\.0"),
         (lambda: ph.simulate(SCENE, STATE, [0.0]), "at least two times"),
         (
             lambda: jax.jit(lambda t: ph.simulate(SCENE, STATE, t).wxyz)(np.zeros(1)),
@@ -77,6 +79,12 @@ def test_values(call, message):
         (lambda: ph.Scene([1.0, 2.0, 3.0]), r"ph\.Inertia\.from_moments"),
         (lambda: ph.Scene(INERTIA, potential=ph.LinearDamping(0.1)), "must be a potential"),
         (lambda: ph.Scene(INERTIA, torque=3.0), "must be a torque"),
+        (lambda: ph.Scene(INERTIA, ph.LinearDamping(0.1)), "got LinearDamping: pass it as torque="),
+        (
+            lambda: ph.Scene(INERTIA, torque=lambda t, q, w: -w),
+            r"ph\.BodyTorque\(fn\) of fn\(t\), or ph\.FeedbackTorque\(fn\) of fn\(t, wxyz, omega",
+        ),
+        (lambda: ph.Scene(INERTIA, lambda R, t: R[2, 2]), r"ph\.Potential\(fn\) of fn\(R, t\)"),
         (lambda: ph.simulate(STATE, SCENE, TS), r"scene must be a ph\.Scene, got State"),
         (lambda: ph.simulate(SCENE, STATE, TS, "rk4"), "object such as"),
         (lambda: ph.simulate(SCENE, STATE, TS, record="all"), r"ph\.Record"),

@@ -69,10 +69,10 @@ class State(AbstractPart):
         omega_body: ArrayLike,
         wheel_speed: ArrayLike | None = None,
     ):
-        if hasattr(wxyz, "as_quat"):
-            wxyz = rotation.scipy_to_wxyz(wxyz, getattr(omega_body, "dtype", None))
-        quaternion = as_float_array("wxyz", wxyz, (4,))
         rates = as_float_array("omega_body", omega_body, (3,))
+        if hasattr(wxyz, "as_quat"):
+            wxyz = rotation.scipy_to_wxyz(wxyz, rates.dtype)
+        quaternion = as_float_array("wxyz", wxyz, (4,))
         arrays = {"wxyz": quaternion, "omega_body": rates}
         if wheel_speed is not None:
             wheel_speed = as_float_array("wheel_speed", wheel_speed, (None,), finite=False)
@@ -409,10 +409,14 @@ def places_of(scene: Scene, free: Any) -> tuple[int, ...]:
 _KINDS = {
     "inertia": (
         Inertia | VariableInertia,
-        "ph.Inertia, for example ph.Inertia.from_moments([1., 2., 3.])",
+        "ph.Inertia, such as ph.Inertia.from_moments([1, 2, 3])",
     ),
-    "potential": (AbstractPotential, "a potential (ph.UniformGravity, ...) or None"),
-    "torque": (AbstractTorque, "a torque (ph.BodyTorque, ...) or None"),
+    "potential": (AbstractPotential, "a potential (such as ph.Potential(fn) of fn(R, t)) or None"),
+    "torque": (
+        AbstractTorque,
+        "a torque (such as ph.BodyTorque(fn) of fn(t), or ph.FeedbackTorque(fn) of"
+        " fn(t, wxyz, omega_body)) or None",
+    ),
     "rotors": (AbstractRotor, "rotors (ph.Rotor, a sum of them) or None"),
 }
 
@@ -422,6 +426,8 @@ def _check_kinds(scene: Scene) -> None:
         value = getattr(scene, name)
         if not (isinstance(value, kind) or (value is None and name != "inertia")):
             hint = ": pass its .inertia" if isinstance(value, MassProperties) else ""
+            for field in (k for k, (other, _) in _KINDS.items() if isinstance(value, other)):
+                hint = f": pass it as {field}="
             raise TypeError(f"Scene {name} must be {expected}, got {type(value).__name__}{hint}.")
     if isinstance(scene.inertia, Inertia):
         check_form(scene.inertia)
@@ -571,15 +577,8 @@ def _wheel(wheel: Rotor) -> Rotor:
     )
     for axis in range(3):
         if np.all(np.delete(vector, axis, axis=-1) == 0) and np.all(vector[..., axis] > 0):
-            return Rotor.axial(
-                wheel.inertia,
-                momentum,
-                speed,
-                wheel.torque,
-                wheel.impulse,
-                wheel.coupling,
-                axis=axis,
-            )
+            rest = wheel.torque, wheel.impulse, wheel.coupling
+            return Rotor.axial(wheel.inertia, momentum, speed, *rest, axis=axis)
     return wheel
 
 
