@@ -169,6 +169,21 @@ def test_moments_near_the_largest_number_are_judged_like_others():
         ph.Inertia.from_moments(np.array([0.1, 0.2, 1.7]) * 1e308)
 
 
+def test_parts_print_their_numbers_where_they_are_known_and_few():
+    body = ph.MassProperties.of(3.0, [0.0, 0, 0], INERTIA)
+    for part in (
+        INERTIA,
+        body,
+        ph.Scene(INERTIA),
+        ph.Scene(INERTIA, torque=ph.BodyTorque([1, 1.5, 2])),
+    ):
+        assert "[1. , 1.5, 2. ]" in str(part)
+    assert "f64[99,3]" in str(ph.Inertia.from_moments(np.ones((99, 3))))
+    texts = []
+    jax.eval_shape(lambda x: texts.append(f"{ph.State(STATE.wxyz, x)}"), STATE.omega_body)
+    assert "omega_body=f64[3]" in texts[0]
+
+
 METHOD = ph.LiePoisson(max_steps=64)
 
 

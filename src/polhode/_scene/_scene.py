@@ -25,7 +25,7 @@ from polhode._hamiltonian import (
     momentum_from_canonical,
     rates_from_angle_rates,
 )
-from polhode._parts import AbstractPart, check_fields, shaped, summands
+from polhode._parts import AbstractPart, check_fields, shaped, summands, with_numbers
 from polhode._scene._orbits import KeplerOrbit
 from polhode._scene._potentials import (
     AbstractPotential,
@@ -196,6 +196,8 @@ class Scene(eqx.Module):
         any_inertia: Any = inertia
         self.inertia, self.potential = any_inertia, potential
         self.torque, self.rotors = torque, rotors
+
+    __str__ = with_numbers
 
     def __check_init__(self):
         _check_kinds(self)
@@ -397,9 +399,8 @@ def places_of(scene: Scene, free: Any) -> tuple[int, ...]:
         raise TypeError(
             f"{requirement}, neither a part of one nor made from it: {error}."
         ) from error
-    if not places or not all(
-        jnp.issubdtype(jnp.result_type(leaves[i]), jnp.floating) for i in places
-    ):
+    kinds = (jnp.result_type(leaves[i]) for i in places)
+    if not places or not all(jnp.issubdtype(kind, jnp.floating) for kind in kinds):
         raise TypeError(f"{requirement}: one or more of real numbers.")
     if len(set(places)) < len(places):
         raise ValueError("free points at the same array twice.")
