@@ -95,12 +95,12 @@ class Trajectory(eqx.Module):
     motion of its wheels fixed by the initial state; ``propagator``: method and tolerance, for
     ``at``. On request: ``work``, ``motor_work``, ``error``, ``saved`` (see ``ph.Record``) and
     ``event_time`` (``until=``). Where wheels have a coupling: ``spins`` (..., T, k), their momenta.
-    What was not recorded raises an error, both an AttributeError and a ValueError, that says how to
-    record it: ``hasattr(traj, "work")`` tells whether it was.
+    What was not recorded raises an error, both AttributeError and ValueError, that says how to
+    record it; ``hasattr(traj, "work")`` is False then.
 
     Between the samples: ``traj.at(t)``. Indexed, a trajectory is an array of shape (..., T) of
     samples: ``traj[i]`` is a body of a batch, ``traj[..., ::10]`` every tenth sample. A loop over a
-    batch yields its bodies, of which there are ``traj.batch_shape``.
+    batch yields its bodies; their number is in ``traj.batch_shape``.
     """
 
     ts: Float[Array, "*t"]
