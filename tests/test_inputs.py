@@ -46,6 +46,8 @@ TS = [0.0, 1.0]
         (lambda: ph.GravityGradient(1.0, [0.0, 0, 0]), "must not be zero"),
         (lambda: ph.LinearDamping([0.1, -0.1, 0.1]), "must not be negative"),
         (lambda: ph.BodyTorque([1.0, 2.0]), r"shape \(\.\.\., 3\)"),
+        (lambda: ph.UniformGravity(1.0, 0.3), r"UniformGravity\.axial\(mass, distance\)"),
+        (lambda: ph.simulate(SCENE, STATE, 10), r"got \(\): give a row of numbers, such as \[0\.0"),
         (lambda: ph.simulate(SCENE, STATE, [0.0]), "at least two times"),
         (
             lambda: jax.jit(lambda t: ph.simulate(SCENE, STATE, t).wxyz)(np.zeros(1)),
@@ -78,6 +80,12 @@ def test_values(call, message):
         (lambda: ph.Scene([1.0, 2.0, 3.0]), r"ph\.Inertia\.from_moments"),
         (lambda: ph.Scene(INERTIA, potential=ph.LinearDamping(0.1)), "must be a potential"),
         (lambda: ph.Scene(INERTIA, torque=3.0), "must be a torque"),
+        (lambda: ph.Scene(INERTIA, ph.LinearDamping(0.1)), "got LinearDamping: pass it as torque="),
+        (
+            lambda: ph.Scene(INERTIA, torque=lambda t, q, w: -w),
+            r"ph\.BodyTorque\(fn\) of fn\(t\), or ph\.FeedbackTorque\(fn\) of fn\(t, wxyz, omega",
+        ),
+        (lambda: ph.Scene(INERTIA, lambda R, t: R[2, 2]), r"ph\.Potential\(fn\) of fn\(R, t\)"),
         (lambda: ph.simulate(STATE, SCENE, TS), r"scene must be a ph\.Scene, got State"),
         (lambda: ph.simulate(SCENE, STATE, TS, "rk4"), "object such as"),
         (lambda: ph.simulate(SCENE, STATE, TS, record="all"), r"ph\.Record"),
@@ -173,6 +181,21 @@ def test_moments_near_the_largest_number_are_judged_like_others():
     np.testing.assert_allclose(moments, np.array([1.0, 1.5, 1.7]) * 1e308)
     with pytest.raises(ValueError, match="triangle inequality"):
         ph.Inertia.from_moments(np.array([0.1, 0.2, 1.7]) * 1e308)
+
+
+def test_parts_print_their_numbers_where_they_are_known_and_few():
+    body = ph.MassProperties.of(3.0, [0.0, 0, 0], INERTIA)
+    for part in (
+        INERTIA,
+        body,
+        ph.Scene(INERTIA),
+        ph.Scene(INERTIA, torque=ph.BodyTorque([1, 1.5, 2])),
+    ):
+        assert "[1. , 1.5, 2. ]" in str(part)
+    assert "f64[99,3]" in str(ph.Inertia.from_moments(np.ones((99, 3))))
+    texts = []
+    jax.eval_shape(lambda x: texts.append(f"{ph.State(STATE.wxyz, x)}"), STATE.omega_body)
+    assert "omega_body=f64[3]" in texts[0]
 
 
 METHOD = ph.LiePoisson(max_steps=64)

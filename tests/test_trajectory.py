@@ -81,6 +81,19 @@ def test_at_any_time(name):
     assert np.isnan(with_nan.wxyz[1]).all()
 
 
+def test_records_of_a_trajectory_are_attributes_where_they_were_made():
+    traj = ph.simulate(SCENES["free"], STATE, TS)
+    for name in ("work", "spins", "event_time", "wheel_speed"):
+        assert not hasattr(traj, name)
+        assert getattr(traj, name, None) is None
+    for error in (AttributeError, ValueError):
+        with pytest.raises(error, match=r"no spins: .* only where a wheel has a coupling"):
+            _ = traj.spins
+    want = traj.to_scipy().apply(np.array(traj.omega_body))
+    np.testing.assert_allclose(traj.omega_space, want, atol=1e-14)
+    assert len(list(traj[:3])) == 3
+
+
 def between_samples(scene):
     return ph.simulate(scene, STATE, [0.0, 1.0, 2.0]).at([1.6, 0.7]).omega_body
 

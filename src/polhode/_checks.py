@@ -81,13 +81,19 @@ _NUMPY = (np.ndarray, np.float32, np.float64)
 
 
 def as_float_array(
-    name: str, value: Any, suffix: Sequence[int | None] = (), *, finite: bool = True
+    name: str,
+    value: Any,
+    suffix: Sequence[int | None] = (),
+    *,
+    finite: bool = True,
+    hint: str = "put batch axes first and the components last",
 ) -> Array:
     """A floating-point array whose trailing axes are ``suffix`` (None: any length).
 
     Lists and integers become the default float type, floating arrays keep theirs.
     Raises TypeError for what is no array of real numbers, ValueError for a wrong shape or,
-    where the values are known and ``finite``, for NaN or infinity.
+    where the values are known and ``finite``, for NaN or infinity. ``hint``: how to correct a
+    wrong shape.
     """
     try:
         leaves = jax.tree.leaves(value, is_leaf=lambda leaf: leaf is None)
@@ -101,8 +107,10 @@ def as_float_array(
             value = jax.device_put(np.array(value))
         array = jnp.asarray(value)
     except (TypeError, ValueError, OverflowError) as error:
+        fix = ": convert it by ph.rotation.scipy_to_wxyz" if hasattr(value, "as_quat") else ""
         raise TypeError(
-            f"{name} must be an array of real numbers, got {type(value).__name__}: {value!r:.80}."
+            f"{name} must be an array of real numbers, got {type(value).__name__}:"
+            f" {value!r:.80}{fix}."
         ) from error
     if jnp.issubdtype(array.dtype, jnp.complexfloating) or array.dtype == jnp.bool_:
         raise TypeError(f"{name} must hold real numbers, got dtype {array.dtype}.")
@@ -113,10 +121,9 @@ def as_float_array(
     fits = array.ndim >= n and all(want in (None, got) for want, got in zip(suffix, tail))
     if not fits:
         expected_shape = ", ".join(["...", *("n" if s is None else str(s) for s in suffix)])
-        raise ValueError(
-            f"{name} must have shape ({expected_shape}), got {array.shape}: put batch axes first"
-            " and the components last."
-        )
+        if tuple(suffix) == (None,):  # of any length: only a number does not fit
+            hint = "give a row of numbers, such as [0.0, 10.0]"
+        raise ValueError(f"{name} must have shape ({expected_shape}), got {array.shape}: {hint}.")
     if finite and is_concrete(array) and not bool(np.all(np.isfinite(np.asarray(array)))):
         raise ValueError(
             f"{name} holds NaN or infinity ({describe(array)}): remove or correct these entries"

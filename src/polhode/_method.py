@@ -69,7 +69,7 @@ _EXPLANATIONS = {
     Status.NOT_PHYSICAL: (
         "no body has this inertia: moments must be positive and each at most the sum of the two"
         " others, a tensor symmetric, and a wheel's moment less than the body's about its axis;"
-        " published numbers that break the inequality pass with"
+        " to use published values that violate the inequality, call"
         " ph.Inertia.from_moments(..., physical=False)"
     ),
     Status.SLIDING: (

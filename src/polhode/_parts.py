@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from polhode._checks import is_concrete
+
 # Modules whose array fields state the shape of the numbers of one body.
 
 
@@ -28,6 +30,13 @@ def _cores(kind: type) -> dict[str, tuple[int | None, ...]]:
     return {field.name: field.metadata["core"] for field in fields if "core" in field.metadata}
 
 
+def with_numbers(part: eqx.Module) -> str:
+    """The text of a part for ``print``: its numbers where they are known and few, else shapes."""
+    leaves = jax.tree.leaves(part)
+    few = is_concrete(leaves) and sum(map(np.size, leaves)) <= 100
+    return eqx.tree_pformat(part, short_arrays=not few)
+
+
 class AbstractPart(eqx.Module):
     """Base of all that may carry batch axes: the state, and what a scene is made of.
 
@@ -39,6 +48,9 @@ class AbstractPart(eqx.Module):
     """
 
     smooth: ClassVar[bool] = True
+
+    def __str__(self) -> str:
+        return with_numbers(self)
 
     @property
     def core_ranks(self) -> dict[str, int]:

@@ -385,7 +385,7 @@ def _skipped(scene: Scene, method: AbstractMethod, record: Record) -> tuple[str,
     if record.final_only:
         reasons.append("the trajectory buffer: only the last time is recorded")
     if not method.exact:
-        reasons.append("checkpoints: kept only under jax.grad")
+        reasons.append("checkpoints: stored only under jax.grad")
     return tuple(reasons)
 
 

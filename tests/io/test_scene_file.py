@@ -130,6 +130,15 @@ def test_each_mistake_is_named_with_its_cure(old, new, key, hint):
     assert len(message) < 700
 
 
+def test_only_keys_of_the_same_table_are_suggested():
+    """Not ``seed`` and ``speed`` of other tables, nor those of other kinds of torques."""
+    torque = "[torque]\nkind='pointing'\nkp=1\n{}\n[state]"
+    for keys, hint in (("kd=1\nspeed=3", ""), ("kdd=1", "kd"), ("kd=1\nmax_moment=1", "")):
+        with pytest.raises(SceneFileError) as caught:
+            parse_scene(GOOD.replace("[state]", torque.format(keys), 1))
+        assert caught.value.fix == (f'did you mean "{hint}"?' if hint else "")
+
+
 def test_files_that_are_no_text(tmp_path):
     with pytest.raises(SceneFileError, match="No such file"):
         read_scene(tmp_path / "absent.toml")

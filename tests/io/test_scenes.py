@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
@@ -27,6 +28,10 @@ def test_scene_builds(path, dtype):
     scene = build_scene(file, dtype)
     state = build_state(file, dtype, scene.inertia)
     assert scene.inertia.dtype == state.wxyz.dtype == state.omega_body.dtype == dtype
+    with jax.enable_x64(dtype is np.float64):  # the default is the precision of JAX
+        default = build_scene(file), build_state(file)
+    assert default[1].wxyz.dtype == dtype
+    jax.tree.map(np.testing.assert_array_equal, default, (scene, state))
     np.testing.assert_allclose(np.linalg.norm(state.wxyz), 1, rtol=1e-6)
     assert file.source
     if file.monte_carlo is not None:

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import polhode as ph
 from polhode import rotation
 from polhode.rotation import Sequence
 
@@ -156,12 +157,41 @@ def test_what_holds_no_numbers_is_named(call, word):
         call()
 
 
-@pytest.mark.parametrize("odd", ["ZYX", "zyx", None, 3, Sequence])
-def test_a_sequence_is_one(odd):
-    with pytest.raises(TypeError, match=r"Sequence\.ZYX"):
+@pytest.mark.parametrize(
+    ("odd", "error", "word"),
+    [
+        (None, TypeError, r"a ph\.rotation\.Sequence, got NoneType"),
+        (3, TypeError, r"a ph\.rotation\.Sequence, got int"),
+        (Sequence, TypeError, r"a ph\.rotation\.Sequence"),
+        ("ZYy", ValueError, "no sequence is called 'ZYy'"),
+    ],
+)
+def test_a_sequence_is_one(odd, error, word, unchecked):
+    with pytest.raises(error, match=word):
         rotation.euler_to_wxyz(0.1, 0.2, 0.3, odd)
-    with pytest.raises(TypeError, match=r"Sequence\.ZYX"):
+    with pytest.raises(error, match=word):
         rotation.wxyz_to_euler([1.0, 0, 0, 0], odd)
+
+
+def test_a_sequence_is_written_in_letters_too():
+    for letters, sequence in (("ZYX", Sequence.ZYX), ("zyx", Sequence.ZYX_SPACE)):
+        wxyz = rotation.euler_to_wxyz(0.1, 0.2, 0.3, letters)
+        np.testing.assert_array_equal(wxyz, rotation.euler_to_wxyz(0.1, 0.2, 0.3, sequence))
+        angles = rotation.matrix_to_euler(rotation.wxyz_to_matrix(wxyz), letters)
+        np.testing.assert_allclose(angles, [0.1, 0.2, 0.3], rtol=1e-14)
+
+
+def test_a_scipy_rotation_is_named_with_its_converter(unchecked):
+    from scipy.spatial.transform import Rotation
+
+    for turn in (Rotation.identity(), Rotation.identity(2)):
+        for call in (
+            lambda turn: rotation.angle_between(turn, turn),
+            lambda turn: ph.Pointing(1.0, 1.0, turn),
+            lambda turn: ph.LVLH(ph.KeplerOrbit(1.0, 5.0)).from_frame(turn, np.zeros(3), 0.0),
+        ):
+            with pytest.raises(TypeError, match=r"by ph\.rotation\.scipy_to_wxyz"):
+                call(turn)
 
 
 def test_lists_and_integers_are_arrays():
@@ -199,3 +229,16 @@ def test_lists_follow_the_dtype_of_arrays_and_mixed_arrays_the_wider_one():
 
 def test_no_quaternions_are_no_rotations_of_scipy():
     assert len(rotation.wxyz_to_scipy(jnp.zeros((0, 4)))) == 0
+
+
+def test_a_state_from_scipy_has_the_precision_of_its_rates(recwarn):
+    from scipy.spatial.transform import Rotation
+
+    turn = Rotation.from_rotvec([0.1, 0.2, 0.3])
+    for rates in (np.zeros(3), np.zeros(3, int), np.zeros(3, np.float32), [0, 0, 0]):
+        for x64 in (True, False):
+            with jax.enable_x64(x64):
+                state = ph.State(turn, rates)
+                assert state.wxyz.dtype == state.omega_body.dtype
+                np.testing.assert_allclose(state.wxyz[1:], turn.as_quat()[:3], rtol=1e-6)
+    assert not recwarn.list

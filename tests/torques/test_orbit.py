@@ -85,6 +85,8 @@ def test_an_orbit_through_a_state_is_a_kepler_orbit():
     assert len(jax.tree.leaves(orbit)) == 4
     np.testing.assert_allclose(orbit.mean_motion, elements.mean_motion, rtol=1e-14)
     np.testing.assert_allclose(orbit.momentum, elements.momentum, rtol=1e-13)
+    np.testing.assert_allclose(orbit(2.0 + orbit.period), place, rtol=1e-13)
+    assert np.isinf(HyperbolicOrbit.from_state(1.7, place, 2 * velocity).period)
 
     for scale, kind in ((1.0, KeplerOrbit), (2.0, HyperbolicOrbit)):
 

@@ -64,11 +64,21 @@ def page_links(text: str) -> str:
 
 def adapt_links(app, document, source) -> None:
     """Links of a page, which lead to files of the repository, lead to pages of the site."""
-    if "/" in document:  # a folder down
-        source[0] = source[0].replace("](../../notebooks/", "](../notebooks/")
-        return
-    text = source[0].replace("](../notebooks/", "](notebooks/")
-    source[0] = text.replace("](../benchmarks/README.md", "](benchmarks.md")
+    up = "../" if "/" in document else ""  # a folder down
+    text = source[0].replace(f"]({up}../notebooks/", f"]({up}notebooks/")
+    text = text.replace(f"]({up}../benchmarks/README.md", f"]({up}benchmarks.md")
+    text = text.replace(f"]({up}../src/polhode/__init__.pyi", f"]({up}reference/index.rst")
+    source[0] = with_thumbnails(text) if document == "gallery" else text
+
+
+def with_thumbnails(text: str) -> str:
+    """The tables of the gallery with the first figure of each notebook above its title."""
+
+    def with_figures(row: re.Match) -> str:
+        figures = re.sub(r"\[[^]]+\]\((\S+)\.ipynb\)", r"[![](\1.png)](\1.ipynb)", row[0])
+        return f"{figures}\n{row[0]}"
+
+    return re.sub(r"^\| \[.*", with_figures, text, flags=re.MULTILINE)
 
 
 def write_motion(app, error) -> None:

@@ -288,6 +288,12 @@ class KeplerOrbit(AbstractOrbit):
         return jnp.sqrt(self.mu / axis) / axis
 
     @property
+    def period(self) -> Array:
+        """Time of one revolution (...) [s]; inf for a hyperbola."""
+        period = 2 * jnp.pi / self.mean_motion
+        return jnp.full_like(period, jnp.inf) if self.hyperbolic else period
+
+    @property
     def momentum(self) -> Float[Array, "*b 3"]:
         """Angular momentum r x v (..., 3) per unit of mass, space axes [m^2/s]; constant."""
         if self.position is not None:

@@ -85,7 +85,8 @@ class UniformGravity(AbstractPotential):
         )
         self.centre_body = self.distance = None
         if centre_body is not None:
-            self.centre_body = as_float_array("centre_body", centre_body, (3,))
+            hint = "for a distance along body z use UniformGravity.axial(mass, distance)"
+            self.centre_body = as_float_array("centre_body", centre_body, (3,), hint=hint)
         else:
             self.distance = as_number("distance", distance)
         gravity = default_array(_STANDARD) if gravity_space is _STANDARD else gravity_space

@@ -25,7 +25,7 @@ from polhode._hamiltonian import (
     momentum_from_canonical,
     rates_from_angle_rates,
 )
-from polhode._parts import AbstractPart, check_fields, shaped, summands
+from polhode._parts import AbstractPart, check_fields, shaped, summands, with_numbers
 from polhode._scene._orbits import KeplerOrbit
 from polhode._scene._potentials import (
     AbstractPotential,
@@ -69,10 +69,10 @@ class State(AbstractPart):
         omega_body: ArrayLike,
         wheel_speed: ArrayLike | None = None,
     ):
-        if hasattr(wxyz, "as_quat"):
-            wxyz = rotation.scipy_to_wxyz(wxyz, getattr(omega_body, "dtype", None))
-        quaternion = as_float_array("wxyz", wxyz, (4,))
         rates = as_float_array("omega_body", omega_body, (3,))
+        if hasattr(wxyz, "as_quat"):
+            wxyz = rotation.scipy_to_wxyz(wxyz, rates.dtype)
+        quaternion = as_float_array("wxyz", wxyz, (4,))
         arrays = {"wxyz": quaternion, "omega_body": rates}
         if wheel_speed is not None:
             wheel_speed = as_float_array("wheel_speed", wheel_speed, (None,), finite=False)
@@ -196,6 +196,8 @@ class Scene(eqx.Module):
         any_inertia: Any = inertia
         self.inertia, self.potential = any_inertia, potential
         self.torque, self.rotors = torque, rotors
+
+    __str__ = with_numbers
 
     def __check_init__(self):
         _check_kinds(self)
@@ -397,9 +399,8 @@ def places_of(scene: Scene, free: Any) -> tuple[int, ...]:
         raise TypeError(
             f"{requirement}, neither a part of one nor made from it: {error}."
         ) from error
-    if not places or not all(
-        jnp.issubdtype(jnp.result_type(leaves[i]), jnp.floating) for i in places
-    ):
+    kinds = (jnp.result_type(leaves[i]) for i in places)
+    if not places or not all(jnp.issubdtype(kind, jnp.floating) for kind in kinds):
         raise TypeError(f"{requirement}: one or more of real numbers.")
     if len(set(places)) < len(places):
         raise ValueError("free points at the same array twice.")
@@ -409,10 +410,14 @@ def places_of(scene: Scene, free: Any) -> tuple[int, ...]:
 _KINDS = {
     "inertia": (
         Inertia | VariableInertia,
-        "ph.Inertia, for example ph.Inertia.from_moments([1., 2., 3.])",
+        "ph.Inertia, such as ph.Inertia.from_moments([1, 2, 3])",
     ),
-    "potential": (AbstractPotential, "a potential (ph.UniformGravity, ...) or None"),
-    "torque": (AbstractTorque, "a torque (ph.BodyTorque, ...) or None"),
+    "potential": (AbstractPotential, "a potential (such as ph.Potential(fn) of fn(R, t)) or None"),
+    "torque": (
+        AbstractTorque,
+        "a torque (such as ph.BodyTorque(fn) of fn(t), or ph.FeedbackTorque(fn) of"
+        " fn(t, wxyz, omega_body)) or None",
+    ),
     "rotors": (AbstractRotor, "rotors (ph.Rotor, a sum of them) or None"),
 }
 
@@ -422,6 +427,8 @@ def _check_kinds(scene: Scene) -> None:
         value = getattr(scene, name)
         if not (isinstance(value, kind) or (value is None and name != "inertia")):
             hint = ": pass its .inertia" if isinstance(value, MassProperties) else ""
+            for field in (k for k, (other, _) in _KINDS.items() if isinstance(value, other)):
+                hint = f": pass it as {field}="
             raise TypeError(f"Scene {name} must be {expected}, got {type(value).__name__}{hint}.")
     if isinstance(scene.inertia, Inertia):
         check_form(scene.inertia)
@@ -571,15 +578,8 @@ def _wheel(wheel: Rotor) -> Rotor:
     )
     for axis in range(3):
         if np.all(np.delete(vector, axis, axis=-1) == 0) and np.all(vector[..., axis] > 0):
-            return Rotor.axial(
-                wheel.inertia,
-                momentum,
-                speed,
-                wheel.torque,
-                wheel.impulse,
-                wheel.coupling,
-                axis=axis,
-            )
+            rest = wheel.torque, wheel.impulse, wheel.coupling
+            return Rotor.axial(wheel.inertia, momentum, speed, *rest, axis=axis)
     return wheel
 
 

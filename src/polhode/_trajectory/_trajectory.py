@@ -82,6 +82,10 @@ class Ending(NamedTuple):
     sign: Array
 
 
+class NotRecordedError(ValueError, AttributeError):
+    """A quantity that the simulation did not record: for ``hasattr`` a missing attribute."""
+
+
 class Trajectory(eqx.Module):
     """Samples of the motion; leading axes (...) are the batch, then T times.
 
@@ -90,11 +94,13 @@ class Trajectory(eqx.Module):
     solver (0 for a closed form), and ``step_counts``: why they were not longer; ``scene``, with the
     motion of its wheels fixed by the initial state; ``propagator``: method and tolerance, for
     ``at``. On request: ``work``, ``motor_work``, ``error``, ``saved`` (see ``ph.Record``) and
-    ``event_time`` (``until=``). With coupled wheels: ``spins``.
-    What was not recorded raises ValueError, which says how to record it.
+    ``event_time`` (``until=``). Where wheels have a coupling: ``spins`` (..., T, k), their momenta.
+    What was not recorded raises an error, both AttributeError and ValueError, that says how to
+    record it; ``hasattr(traj, "work")`` is False then.
 
     Between the samples: ``traj.at(t)``. Indexed, a trajectory is an array of shape (..., T) of
-    samples: ``traj[i]`` is a body of a batch, ``traj[..., ::10]`` every tenth sample.
+    samples: ``traj[i]`` is a body of a batch, ``traj[..., ::10]`` every tenth sample. A loop over a
+    batch yields its bodies; their number is in ``traj.batch_shape``.
     """
 
     ts: Float[Array, "*t"]
@@ -190,12 +196,12 @@ class Trajectory(eqx.Module):
     @property
     def wxyz(self) -> Float[Array, "*b t 4"]:
         """Attitudes (..., T, 4), body -> space, scalar first."""
-        return self._recorded("wxyz", "record=ph.Record(attitude=True), the default")
+        return self._recorded("wxyz", "with record=ph.Record(attitude=True), the default")
 
     @property
     def omega_body(self) -> Float[Array, "*b t 3"]:
         """Body rates (..., T, 3) [rad/s]."""
-        return self._recorded("omega_body", "record=ph.Record(rates=True), the default")
+        return self._recorded("omega_body", "with record=ph.Record(rates=True), the default")
 
     @property
     def steps(self) -> Int[Array, "*b"]:
@@ -219,7 +225,7 @@ class Trajectory(eqx.Module):
         It includes external torques, potentials that change with time (also orbits) and the motors
         of wheels, so that ``energy - work`` is constant.
         """
-        return self._recorded("work", "record=ph.Record(work=True)")
+        return self._recorded("work", "with record=ph.Record(work=True)")
 
     @property
     def error(self) -> Float[Array, "*b"]:
@@ -227,22 +233,25 @@ class Trajectory(eqx.Module):
 
         Without attitude it is the error of the rates, relative to their size.
         """
-        return self._recorded("error", "record=ph.Record(error=True)")
+        return self._recorded("error", "with record=ph.Record(error=True)")
 
     @property
     def motor_work(self) -> Float[Array, "*b t m"]:
         """The part (..., T, m) [J] of ``work`` that motor and friction of each wheel have done."""
-        return self._recorded("motor_work", "record=ph.Record(work=True) and wheels that turn")
+        return self._recorded("motor_work", "with record=ph.Record(work=True) and wheels that turn")
 
     @property
     def spins(self) -> Float[Array, "*b t k"]:
-        """Momenta (..., T, k) [kg m^2/s] of the wheels with a coupling."""
-        return self._recorded("spins", "a scene with wheels that have a coupling")
+        """Momenta (..., T, k) [kg m^2/s] of the k wheels with a coupling, in their order.
+
+        Each along the axis of its wheel, that of the rotation with the body included.
+        """
+        return self._recorded("spins", "only where a wheel has a coupling")
 
     @property
     def event_time(self) -> Float[Array, "*b"]:
         """Time (...) [s] of the event that ended the motion; inf for a body without one."""
-        return self._recorded("event_time", "until=ph.Event(...)")
+        return self._recorded("event_time", "with until=ph.Event(...)")
 
     @property
     def _event_time(self) -> Array | None:
@@ -251,24 +260,24 @@ class Trajectory(eqx.Module):
     @property
     def events(self) -> Events:
         """The events of each body; see ``Events``."""
-        return self._recorded("events", "events=[ph.Event(...)]")
+        return self._recorded("events", "with events=[ph.Event(...)]")
 
     @property
     def saved(self) -> PyTree[Array]:
         """The values of the function that was saved in place of the states; leaves (..., T, *k)."""
-        return self._recorded("saved", "record=ph.Record(save=fn)")
+        return self._recorded("saved", "with record=ph.Record(save=fn)")
 
     def _recorded(self, name: str, request: str) -> Any:
         value = getattr(self, f"_{name}")
         if value is None and self._saved is not None and name in ("wxyz", "omega_body", "spins"):
-            raise ValueError(
+            raise NotRecordedError(
                 f"this trajectory has no {name}: it was not recorded, because"
                 " ph.Record(save=fn) stores the values of a function in its place, traj.saved."
                 f" Return trajectory.{name} from the function as well."
             )
         if value is None:
-            raise ValueError(
-                f"this trajectory has no {name}: ph.simulate records it with {request}."
+            raise NotRecordedError(
+                f"this trajectory has no {name}: ph.simulate records it {request}."
             )
         return value
 
@@ -465,6 +474,11 @@ class Trajectory(eqx.Module):
         return rotation.rotate(self.wxyz, self.momentum_body)
 
     @property
+    def omega_space(self) -> Float[Array, "*b t 3"]:
+        """Angular velocity (..., T, 3) in space axes [rad/s]."""
+        return rotation.rotate(self.wxyz, self.omega_body)
+
+    @property
     def wheel_speed(self) -> Float[Array, "*b t m"]:
         """Speed of each wheel relative to the body (..., T, m) [rad/s].
 
@@ -473,7 +487,7 @@ class Trajectory(eqx.Module):
         """
         wheels = self._scene.rotors
         if not isinstance(wheels, Wheels):
-            raise ValueError("this trajectory has no wheel_speed: its scene has no wheels.")
+            raise NotRecordedError("this trajectory has no wheel_speed: its scene has no wheels.")
         omega = components(self.omega_body)
         speeds = [wheels.speed(i, self._t, omega) for i in range(len(wheels.is_held))]
         shape = omega[0].shape
@@ -501,8 +515,6 @@ class Trajectory(eqx.Module):
         about the axes of the body one after the other (yaw, pitch, roll), ``"zyx"`` about those of
         space. Angles are in the order of the axes. Raises ValueError for other letters.
         """
-        if isinstance(sequence, str):
-            sequence = rotation.Sequence.of(sequence)
         return rotation.wxyz_to_euler(self.wxyz, sequence)
 
     def to_scipy(self) -> "Rotation":

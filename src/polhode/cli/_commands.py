@@ -40,7 +40,7 @@ def explain(
     precision: PrecisionOption = "float64",
     debug: DebugOption = False,
 ) -> int:
-    """Say how a scene would be computed, and why, without computing it."""
+    """Explain which method computes a scene, and why, without computing it."""
     file = read_scene(scene, clones, seed)
     import polhode
     from polhode.cli._job import prepare

@@ -71,7 +71,7 @@ def _hint(name: str) -> str:
 app = typer.Typer(
     name="polhode",
     cls=_Commands,
-    help="Rotating rigid bodies: simulate scenes written as TOML files, fit inertia, look at them.",
+    help="Simulate, fit and visualise rotating rigid bodies.",
     epilog="Exit codes: 0 done, 1 failed, 2 wrong options or input file, 130 interrupted.",
     add_completion=False,
     rich_markup_mode=None,

@@ -61,7 +61,7 @@ def _over_time(file: SceneFile, value: Any, dtype: DTypeLike) -> Any:
     return np.asarray(value, dtype)
 
 
-def build_inertia(file: SceneFile, dtype: DTypeLike) -> "Inertia | VariableInertia":
+def build_inertia(file: SceneFile, dtype: DTypeLike = float) -> "Inertia | VariableInertia":
     """The nominal inertia. Raises SceneFileError for moments that no body has."""
     table = file.inertia
     kind, value = next((name, value) for name, value in table.entries() if name != "unit")
@@ -272,9 +272,13 @@ def _sum(file: SceneFile, key: str, build: Callable, orbit: Any, dtype: DTypeLik
 
 
 def build_scene(
-    file: SceneFile, dtype: DTypeLike, inertia: "Inertia | VariableInertia | None" = None
+    file: SceneFile,
+    dtype: DTypeLike = float,
+    inertia: "Inertia | VariableInertia | None" = None,
 ) -> "polhode.Scene":
     """The scene with `inertia`, or with the nominal one of the file.
+
+    `dtype`: of its numbers; `float` is the default precision of JAX.
 
     Raises SceneFileError, naming the place, for numbers that a constructor refuses.
     """
@@ -287,7 +291,7 @@ def build_scene(
         return polhode.Scene(inertia, **parts)
 
 
-def build_events(file: SceneFile, dtype: DTypeLike) -> dict[str, "polhode.Event"]:
+def build_events(file: SceneFile, dtype: DTypeLike = float) -> dict[str, "polhode.Event"]:
     """The [[events]] by name."""
     events = {}
     directions = {"rising": 1, "falling": -1, "both": 0}
@@ -334,9 +338,12 @@ def _rates_of(file: SceneFile, inertia, wxyz: Array, momentum: Array, start: Arr
 
 
 def build_state(
-    file: SceneFile, dtype: DTypeLike, inertia: "Inertia | VariableInertia"
+    file: SceneFile,
+    dtype: DTypeLike = float,
+    inertia: "Inertia | VariableInertia | None" = None,
 ) -> "polhode.State":
-    """The nominal state at the first time."""
+    """The nominal state at the first time, of the body with `inertia` (None: that of the file)."""
+    inertia = build_inertia(file, dtype) if inertia is None else inertia
     with scene_errors(file, "[state]"):
         value = jnp.asarray(file.state.value, dtype)
         start_time = jnp.asarray(file.times.seconds[0], dtype)
@@ -416,7 +423,7 @@ class Clones(NamedTuple):
     redrawn: int
 
 
-def draw_clones(file: SceneFile, dtype: DTypeLike) -> Clones:
+def draw_clones(file: SceneFile, dtype: DTypeLike = float) -> Clones:
     """The nominal body followed by the clones of [monte_carlo], drawn in float64 from its seed.
 
     Every quantity has its own stream of random numbers, so that adding a spread for one does not

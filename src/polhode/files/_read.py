@@ -13,7 +13,7 @@ import stat
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from polhode._extras import imported
 
@@ -202,7 +202,7 @@ def _scene_error(path: Path, data: Any, errors: list[Any]) -> SceneFileError:
     if len(others) > 2:
         also.append(f"{len(others) - 2} more")
     return SceneFileError(
-        path, place, _message(first), value, fix=_suggestion(first), also="; ".join(also)
+        path, place, _message(first), value, fix=_suggestion(first, data), also="; ".join(also)
     )
 
 
@@ -210,10 +210,10 @@ def _message(error: Any) -> str:
     return error["msg"].removeprefix("Value error, ")
 
 
-def _suggestion(error: Any) -> str:
+def _suggestion(error: Any, data: Any) -> str:
     """The key or the choice that was probably meant, or nothing."""
     if error["type"] == "extra_forbidden":
-        word, choices = str(error["loc"][-1]), _keys()
+        word, choices = str(error["loc"][-1]), _keys(error["loc"][:-1], data)
     elif error["type"] in ("literal_error", "union_tag_invalid"):
         context = error["ctx"]
         word = context.get("tag") or error["input"]
@@ -223,16 +223,37 @@ def _suggestion(error: Any) -> str:
     return did_you_mean(word, (name for name in choices if name != word))
 
 
-def _keys() -> set[str]:
-    """The keys of all tables."""
+def _keys(place: Iterable[str | int], data: Any) -> set[str]:
+    """The keys of the table at a place of an error, of all kinds that its own keys leave open."""
+    from polhode.files._models import SceneFile
+
+    tables: list[Any] = [SceneFile]
+    for step in place:
+        if isinstance(step, int):  # a row of a list, or of a table that stands for one
+            data = data[step] if isinstance(data, list) else data
+        elif isinstance(data, dict) and step in data:
+            data = data[step]
+            fields = [table.model_fields[step] for table in tables if step in table.model_fields]
+            tables = [table for field in fields for table in _tables(field.annotation)]
+        else:  # a mark of pydantic's own: the kind of a table
+            tables = [table for table in tables if step in _choices(table)] or tables
+    return {key for table in tables for key in table.model_fields}
+
+
+def _tables(annotation: Any) -> Iterator[Any]:
+    """The classes of tables that an annotation names."""
     from polhode.files._values import Table
 
-    tables, keys = [Table], set()
-    while tables:
-        table = tables.pop()
-        tables += table.__subclasses__()
-        keys |= table.model_fields.keys()
-    return keys
+    if isinstance(annotation, type) and issubclass(annotation, Table):
+        yield annotation
+    for part in get_args(annotation):
+        yield from _tables(part)
+
+
+def _choices(table: Any) -> set[Any]:
+    """The words that select this kind of table: those of its key ``kind`` or ``shape``."""
+    kinds = [table.model_fields.get(name) for name in ("kind", "shape")]
+    return {word for field in kinds if field for word in get_args(field.annotation)}
 
 
 def _place(error: Any, data: Any) -> str:

@@ -20,6 +20,7 @@ from polhode._checks import (
     require_positive,
 )
 from polhode._extras import imported
+from polhode._parts import with_numbers
 from polhode.inertia._inertia import Inertia
 from polhode.inertia._physical import (
     check_moments,
@@ -46,6 +47,8 @@ class MassProperties(AbstractShaped):
     mass: Float[Array, "*b"]
     centre: Float[Array, "*b 3"]
     central: Inertia
+
+    __str__ = with_numbers
 
     @classmethod
     def of(cls, mass: ArrayLike, centre: ArrayLike, inertia: Inertia) -> Self:

@@ -436,8 +436,8 @@ def check_moments(name: str, moments: np.ndarray, slack: float, zero_fraction: f
         lambda: (
             f"{name} must satisfy the triangle inequality (each at most the sum of the two"
             f" others), got {_worst(moments, -excess)}; check the units, and that these are moments"
-            " of inertia, not second moments or a gyration tensor. Published numbers that no body"
-            " has pass with Inertia.from_moments(..., physical=False)."
+            " of inertia, not second moments or a gyration tensor. To use published values that"
+            " violate this, call Inertia.from_moments(..., physical=False)."
         ),
     )
 

@@ -105,6 +105,7 @@ class Samples:
     momentum: np.ndarray | None = None
 
     def need(self, name: str, what: str) -> np.ndarray:
+        """The array ``name``; ValueError where it is missing, for a plot of ``what``."""
         value = getattr(self, name)
         if value is None:
             remedy = "inertia" if name in ("tensor", "energy") else name
@@ -121,6 +122,7 @@ class Samples:
 
     @property
     def momentum_body(self) -> np.ndarray:
+        """Angular momentum (N, T, 3) in body axes, wheels included [kg m^2/s]."""
         if self.momentum is not None:
             return self.momentum
         tensor = self.need("tensor", "the angular momentum")
@@ -133,6 +135,7 @@ class Samples:
 
     @property
     def momentum_space(self) -> np.ndarray:
+        """Angular momentum (N, T, 3) in space axes [kg m^2/s]."""
         return np.einsum("ntij,ntj->nti", self.matrices, self.momentum_body)
 
 

@@ -7,9 +7,10 @@ of length at most 1 (angle up to pi) and its shadow ``-p/|p|**2`` (Schaub and Ju
 
 Of Euler angles, ZYZ, ``R = Rz(phi) Ry(theta) Rz(psi)``, is the convention of docs/equations.md; the
 other 23 sequences are reduced to the same formulas by a quarter turn (Bernardes and Viollet 2022).
-All angles are in rad; ``sequence`` defaults to ZYZ. Every conversion passes through the unit
-quaternion, the only description that is smooth and well scaled everywhere: small rotations keep
-their relative accuracy, half turns their axis.
+All angles are in rad. ``sequence``, by default ZYZ, is a ``Sequence`` or its axes as SciPy writes
+them: ``"ZYX"`` about body axes, ``"zyx"`` about space axes. Every conversion passes through the
+unit quaternion, the only description that is smooth and well scaled everywhere: small rotations
+keep their relative accuracy, half turns their axis.
 """
 
 import enum
@@ -286,13 +287,16 @@ class Sequence(enum.Enum):
         return self.axes[0] == self.axes[2]
 
 
-def check_sequence(sequence: Any) -> None:
-    """TypeError for anything but a ``Sequence``."""
+def as_sequence(sequence: Any) -> Sequence:
+    """A ``Sequence``, also from the letters that SciPy writes; TypeError for anything else."""
+    if isinstance(sequence, str):
+        return Sequence.of(sequence)
     if not isinstance(sequence, Sequence):
         raise TypeError(
-            "sequence must be a ph.rotation.Sequence, such as Sequence.ZYX (about body axes) or"
-            f" Sequence.ZYX_SPACE, got {type(sequence).__name__}: {sequence!r:.40}."
+            'sequence must be letters such as "ZYX" (about body axes) or "zyx" (about space axes),'
+            f" or a ph.rotation.Sequence, got {type(sequence).__name__}: {sequence!r:.40}."
         )
+    return sequence
 
 
 def _parity(i: int, j: int, k: int) -> int:
@@ -316,16 +320,19 @@ def euler_to_wxyz(
     phi: Float[ArrayLike, "*#b"],
     theta: Float[ArrayLike, "*#b"],
     psi: Float[ArrayLike, "*#b"],
-    sequence: Sequence = Sequence.ZYZ,
+    sequence: Sequence | str = Sequence.ZYZ,
 ) -> Float[Array, "*b 4"]:
     """Unit quaternion of Euler angles (rad), smooth for all angles.
 
-    The angles are given in the order of the sequence's axes. The sign of the quaternion follows the
-    angles continuously; `canonical` picks the one with scalar part >= 0.
+    The angles are given in the order of the sequence's axes; ``sequence``: a ``Sequence``, or its
+    axes as SciPy writes them, ``"ZYX"`` about body axes, ``"zyx"`` about space axes. The sign of
+    the quaternion follows the angles continuously; `canonical` picks the one with scalar part >= 0.
+
+    Raises ValueError for letters that are no sequence, TypeError for anything else.
     """
-    check_sequence(sequence)
     return _quaternion(
-        sequence, *as_floats(finite=False, phi=(phi, ()), theta=(theta, ()), psi=(psi, ()))
+        as_sequence(sequence),
+        *as_floats(finite=False, phi=(phi, ()), theta=(theta, ()), psi=(psi, ())),
     )
 
 
@@ -370,20 +377,20 @@ def _phase(real: Array, imaginary: Array) -> tuple[Array, Array, Array]:
 
 
 def wxyz_to_euler(
-    wxyz: Float[ArrayLike, "*b 4"], sequence: Sequence = Sequence.ZYZ
+    wxyz: Float[ArrayLike, "*b 4"], sequence: Sequence | str = Sequence.ZYZ
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"], Float[Array, "*b"]]:
     """Euler angles (rad) of a quaternion (its scale and its sign do not matter).
 
     First and third angle lie in [-pi, pi]; the second in [0, pi] (same first and last axis) or
     [-pi/2, pi/2]. Where the second angle reaches an end of its range only the sum or the difference
     of the other two is defined, and it is shared equally between them; derivatives of the angles
-    do not exist there, and the missing parts are returned as zero.
+    do not exist there, and the missing parts are returned as zero. ``sequence`` as for
+    `euler_to_wxyz`.
 
-    Raises ValueError for a quaternion that is zero, TypeError for what is no ``Sequence``; the
+    Raises ValueError for a quaternion that is zero, or as `euler_to_wxyz` for a ``sequence``; the
     angles of a traced quaternion that is zero are NaN.
     """
-    check_sequence(sequence)
-    return _angles(sequence, as_quaternions(wxyz))
+    return _angles(as_sequence(sequence), as_quaternions(wxyz))
 
 
 @partial(jax.jit, static_argnums=0)
@@ -437,14 +444,14 @@ def euler_to_matrix(
     phi: Float[ArrayLike, "*#b"],
     theta: Float[ArrayLike, "*#b"],
     psi: Float[ArrayLike, "*#b"],
-    sequence: Sequence = Sequence.ZYZ,
+    sequence: Sequence | str = Sequence.ZYZ,
 ) -> Float[Array, "*b 3 3"]:
     """Rotation matrix R of Euler angles."""
     return wxyz_to_matrix(euler_to_wxyz(phi, theta, psi, sequence))
 
 
 def matrix_to_euler(
-    matrix: Float[ArrayLike, "*b 3 3"], sequence: Sequence = Sequence.ZYZ
+    matrix: Float[ArrayLike, "*b 3 3"], sequence: Sequence | str = Sequence.ZYZ
 ) -> _Angles:
     """Euler angles of a rotation matrix; ranges and ends as in `wxyz_to_euler`."""
     return wxyz_to_euler(matrix_to_wxyz(matrix), sequence)
@@ -454,14 +461,14 @@ def euler_to_rotation_vector(
     phi: Float[ArrayLike, "*#b"],
     theta: Float[ArrayLike, "*#b"],
     psi: Float[ArrayLike, "*#b"],
-    sequence: Sequence = Sequence.ZYZ,
+    sequence: Sequence | str = Sequence.ZYZ,
 ) -> Float[Array, "*b 3"]:
     """Rotation vector, of length at most pi, of Euler angles."""
     return wxyz_to_rotation_vector(euler_to_wxyz(phi, theta, psi, sequence))
 
 
 def rotation_vector_to_euler(
-    rotation_vector: Float[ArrayLike, "*b 3"], sequence: Sequence = Sequence.ZYZ
+    rotation_vector: Float[ArrayLike, "*b 3"], sequence: Sequence | str = Sequence.ZYZ
 ) -> _Angles:
     """Euler angles of a rotation vector; ranges and ends as in `wxyz_to_euler`."""
     return wxyz_to_euler(rotation_vector_to_wxyz(rotation_vector), sequence)
@@ -471,7 +478,7 @@ def euler_to_axis_angle(
     phi: Float[ArrayLike, "*#b"],
     theta: Float[ArrayLike, "*#b"],
     psi: Float[ArrayLike, "*#b"],
-    sequence: Sequence = Sequence.ZYZ,
+    sequence: Sequence | str = Sequence.ZYZ,
 ) -> tuple[Float[Array, "*b 3"], Float[Array, "*b"]]:
     """Unit axis and angle in [0, pi] of Euler angles: robust (docs/equations.md, 002: 3-12).
 
@@ -483,7 +490,7 @@ def euler_to_axis_angle(
 def axis_angle_to_euler(
     axis: Float[ArrayLike, "*#b 3"],
     angle: Float[ArrayLike, "*#b"],
-    sequence: Sequence = Sequence.ZYZ,
+    sequence: Sequence | str = Sequence.ZYZ,
 ) -> _Angles:
     """Euler angles of the rotation by ``angle`` about the unit vector ``axis``."""
     return wxyz_to_euler(axis_angle_to_wxyz(axis, angle), sequence)
@@ -493,14 +500,14 @@ def euler_to_modified_rodrigues(
     phi: Float[ArrayLike, "*#b"],
     theta: Float[ArrayLike, "*#b"],
     psi: Float[ArrayLike, "*#b"],
-    sequence: Sequence = Sequence.ZYZ,
+    sequence: Sequence | str = Sequence.ZYZ,
 ) -> Float[Array, "*b 3"]:
     """Modified Rodrigues parameters, of length at most 1, of Euler angles."""
     return wxyz_to_modified_rodrigues(euler_to_wxyz(phi, theta, psi, sequence))
 
 
 def modified_rodrigues_to_euler(
-    parameters: Float[ArrayLike, "*b 3"], sequence: Sequence = Sequence.ZYZ
+    parameters: Float[ArrayLike, "*b 3"], sequence: Sequence | str = Sequence.ZYZ
 ) -> _Angles:
     """Euler angles of modified Rodrigues parameters, either set."""
     return wxyz_to_euler(modified_rodrigues_to_wxyz(parameters), sequence)
