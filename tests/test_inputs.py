@@ -269,6 +269,17 @@ def test_half_precision_is_refused_by_name(dtype):
         ph.simulate(scene, state, TS)
 
 
+def test_times_that_single_precision_does_not_resolve_are_refused():
+    """Steps of 0.02 s of a clock that has run for a day; those of a motion from zero pass."""
+    times = np.linspace(0.0, 2.0, 101)
+    state = jax.tree.map(lambda x: x.astype(np.float32), STATE)
+    scene = jax.tree.map(lambda x: x.astype(np.float32), SCENE)
+    with pytest.raises(ValueError, match=r"ts of up to 8.64e.04 s leave no digits .* in float32"):
+        ph.simulate(scene, state, times + 86400)
+    assert ph.simulate(scene, state, times).ts.dtype == np.float32
+    assert ph.simulate(SCENE, STATE, times + 86400).ts[0] == 86400
+
+
 def test_unsorted_times_have_a_status_where_they_are_traced():
     """And their samples are NaN."""
 

@@ -80,6 +80,17 @@ def describe(value: Any, limit: int = 8) -> str:
 _NUMPY = (np.ndarray, np.float32, np.float64)
 
 
+def require_digits(name: str, given: np.ndarray, times: np.ndarray) -> None:
+    """ValueError for ``times`` in whose dtype the steps of those ``given`` are off by a tenth."""
+    exact, steps = np.diff(given, axis=-1), np.diff(times, axis=-1)
+    if np.any(np.abs(steps - exact) > 0.1 * np.abs(exact)):
+        raise ValueError(
+            f"{name} of up to {np.abs(given).max():.4g} s leave no digits for steps of"
+            f" {np.median(np.abs(exact)):.3g} s in {times.dtype}: subtract the first time from all,"
+            " or compute in float64 (jax_enable_x64)."
+        )
+
+
 def as_float_array(
     name: str,
     value: Any,

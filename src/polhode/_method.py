@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-from polhode._checks import as_float_array, describe, is_concrete, require
+from polhode._checks import as_float_array, describe, is_concrete, require, require_digits
 from polhode._parts import as_static, check_fields, takes
 from polhode._scene import Scene, State, check_scene
 
@@ -423,7 +423,10 @@ def _times(ts: Any, dtype: Any) -> Any:
         ts = np.asarray(ts, float)
     is_float_array = isinstance(ts, np.ndarray) and ts.dtype.kind == "f" and ts.ndim > 0
     if is_float_array and np.isfinite(ts).all():
-        return np.asarray(ts, dtype)
+        given, ts = ts, np.asarray(ts, dtype)
+        if given.dtype.itemsize > ts.dtype.itemsize:
+            require_digits("ts", given, ts)
+        return ts
     ts = as_float_array("ts", ts, (None,))
     return ts if ts.dtype == dtype else ts.astype(dtype)
 

@@ -267,13 +267,25 @@ def test_windows_are_of_one_length_and_share_their_ends():
     whole = Recording.of(times, np.ones((241, 3), np.float32), omega_noise=np.float32(0.02))
     parts = windows(whole, 61)
     assert [part.times.shape for part in parts] == [(61,)] * 4
-    assert parts[0].times.dtype == jnp.float32
+    assert parts[0].times.dtype == jnp.float64
     for before, after in pairwise(parts):
         assert float(after.times[0]) == float(before.times[-1])
 
 
+def test_a_fit_in_single_precision_names_what_it_needs():
+    with jax.enable_x64(False):
+        recording = Recording.of(np.arange(5.0), np.ones((5, 3)))
+        for fit in (
+            lambda: fit_inertia(np.arange(5.0), np.ones((5, 3))),
+            lambda: fit_recordings([recording]),
+            lambda: ph.fit_scene(ph.Scene(ph.Inertia([1, 2, 3])), recording, lambda s: s.inertia),
+        ):
+            with pytest.raises(RuntimeError, match="fits need float64"):
+                fit()
+
+
 @pytest.mark.slow
-def test_windows_of_a_long_recording_in_single_precision():
+def test_windows_of_a_long_recording_stored_in_single_precision():
     rng = np.random.default_rng(4)
     times = np.linspace(0, 12, 241, dtype=np.float32)
     moments = np.linalg.eigvalsh(TENSOR)
@@ -286,7 +298,6 @@ def test_windows_of_a_long_recording_in_single_precision():
     assert len(parts) == 4
     assert float(parts[1].times[0]) == float(parts[0].times[-1])
     fit = fit_recordings(parts, options=FitOptions(unknown=MomentsOnly(), trust_noise=True))
-    assert fit.moments.dtype == jnp.float32
     assert fit.parameters.omega.shape == (4, 3)
     off = (np.asarray(fit.ratios) - moments / moments[2])[:2] / np.asarray(fit.ratios_std)[:2]
     assert np.abs(off).max() < 4

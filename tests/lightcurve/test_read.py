@@ -256,6 +256,10 @@ def test_nothing_of_a_file_is_dropped_in_silence(tmp_path):
     rows = [(t, t - 2400000.5, m) for t, m in zip(JD, MAGNITUDE)]
     curve = lightcurve.read_light_curve(_write(tmp_path / "times.csv", "mjd,jd,mag", rows))
     assert any("columns jd, mjd the first is taken" in note for note in curve.notes)
+    rows = [(t, m, 0.02, 1.3) for t, m in zip(JD, MAGNITUDE)]
+    curve = lightcurve.read_light_curve(_write(tmp_path / "e.csv", "hjd,mag,err,airmass", rows))
+    np.testing.assert_allclose(curve.sigma, 0.02)
+    assert "Columns that are not read: airmass." in curve.notes
     path = tmp_path / "lc.txt"
     lines = [f"{t} 1.0{k} 1 0.1 0 0.2 0.9 0" for k, t in enumerate(JD)]
     path.write_text("\n".join(["1", f"{ROWS - 1} 0", *lines]) + "\n")

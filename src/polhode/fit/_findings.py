@@ -35,14 +35,16 @@ WARNINGS = {
     Finding.UNDETERMINED: "some of the tensor does not show in this motion (an axis hardly "
     "excited, or a symmetric body): their intervals are infinite; add a recording of another spin",
     Finding.AXES_DISAGREE: "rates and attitudes contradict each other for right-handed axes: one "
-    "axis is inverted, or axes are exchanged; correct the columns (sensor_axes shows how)",
+    "axis is inverted, axes are exchanged, or the attitudes are not wxyz, body -> space (xyzw, or "
+    "inverse); correct the columns (sensor_axes shows how)",
     Finding.NOT_WHITE: "the residuals are correlated in time: the model lacks something (drag, "
     "bias, a moving part) and the intervals are too narrow",
     Finding.WEAK: "a ratio is known to no better than 5 %, or than half of itself (a nearly "
     "symmetric body, a spin near a principal axis, a short record): the interval is approximate, "
     "since the misfit is no longer quadratic over such a range",
     Finding.POOR: "the residuals are more than twice as large as the noise: a wrong model, wrong "
-    "axes or units, outliers (robust=Huber()), or a local minimum that is not the best",
+    "axes or units, attitudes that are not wxyz, body -> space (xyzw, or inverse), outliers "
+    "(robust=Huber()), or a local minimum that is not the best",
     Finding.SATURATED: "a gyroscope axis is saturated: readings at its limit count as bounds only;"
     " state the limit, Gyroscope(max_rate=...), where an axis is beyond it throughout",
     Finding.OUTLIERS: "single samples are more than five times as far off as others: fit with"
@@ -58,7 +60,8 @@ SCENE_WARNINGS = WARNINGS | {
     " other: their standard deviations are infinite; free fewer of them, or add a recording that"
     " shows them",
     Finding.POOR: "the residuals are more than twice as large as the noise: a wrong model, wrong"
-    " units, outliers (robust=Huber()), or a start too far away",
+    " units, outliers (robust=Huber()), a start too far away, or, where something acts that depends"
+    " on it, no initial attitude (attitude=, or wxyz in the recording)",
 }
 SCALE_UNKNOWN = (
     "Only ratios of moments are determined: free motion does not depend on the size of the inertia "

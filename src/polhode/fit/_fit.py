@@ -60,8 +60,9 @@ def fit_inertia(
     the moments (``Fit.scale_known``). Every iterate is a physical body. Left-handed axes are
     detected where attitudes are given; otherwise see ``Fit.mirror_inertia``.
 
-    Raises ValueError for bad input and for options that do not apply; FitError for a fit that is
-    not finite or stopped early, or where rates and attitudes contradict each other.
+    Needs float64 (``jax_enable_x64``). Raises RuntimeError in float32; ValueError for bad input and
+    for options that do not apply; FitError for a fit that is not finite or stopped early, or where
+    rates and attitudes contradict each other.
     """
     options = checked_options(options)
     _check_wheel(wheel_speed is not None, options)
@@ -260,7 +261,8 @@ def fit_scene(
         fit = ph.fit_scene(scene, data, free=lambda s: [s.torque.c], options=options)
         print(fit.report())                              # fit.values[0], fit.std[0]: (3,)
 
-    Raises TypeError or ValueError for bad input and for options that do not apply, and FitError.
+    Needs float64 (``jax_enable_x64``). Raises RuntimeError in float32; TypeError or ValueError for
+    bad input and for options that do not apply; and FitError.
     """
     _check_single(scene)
     options = checked_options(options)

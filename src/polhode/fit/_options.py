@@ -387,7 +387,12 @@ def checked_options(options: FitOptions | None) -> FitOptions:
 
 
 def check_usable(options: FitOptions, recording: Recording) -> None:
-    """ValueError for options that a recording cannot serve."""
+    """ValueError for options that a recording cannot serve, RuntimeError for one in float32."""
+    if recording.times.dtype != np.float64:
+        raise RuntimeError(
+            "fits need float64, for they compare motions that are nearly equal:"
+            " jax.config.update('jax_enable_x64', True) before the recording is made."
+        )
     for name in ("bias", "mounting"):
         require(
             recording.omega is not None or not getattr(options, name),

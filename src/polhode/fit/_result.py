@@ -190,7 +190,10 @@ class Fit(eqx.Module):
 
     @property
     def is_usable(self) -> bool:
-        """Whether every fit converged, is finite and agrees with the recorded attitudes."""
+        """Whether every fit converged and is finite, and rates do not contradict attitudes.
+
+        ``findings`` says what else is doubtful, such as residuals far above the noise (POOR).
+        """
         return not bool((np.asarray(self.diagnostics) & int(UNUSABLE)).any())
 
     def derived(

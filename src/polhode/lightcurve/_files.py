@@ -17,7 +17,9 @@ if TYPE_CHECKING:
 
 # Light curves from files: CSV with a header line, ALCDEF, and DAMIT's lc.txt.
 
-_TIME = ("jd", "time", "t", "mjd", "bjd")
+_TIME = ("jd", "time", "t", "mjd", "bjd", "hjd")
+_ERROR = ("sigma", "mag_err", "magerr", "e_mag", "dmag", "flux_err", "err", "error", "uncertainty")
+_GROUP = ("group", "observer", "night", "session", "block")
 _VECTORS = tuple(f"{body}_{c}" for body in ("sun", "observer") for c in "xyz")
 
 
@@ -32,9 +34,10 @@ def read_light_curve(
 
     CSV: columns ``jd`` (or ``time``, ``t``; days), ``magnitude`` (``mag``) or ``flux``
     (``brightness``), ``sun_x`` ... ``observer_z`` (``earth_x``; from the body, au), and optionally
-    ``sigma`` (``mag_err``; in the unit of the brightness), ``group`` (``observer``, ``night``,
-    ``block``). Times are those at the observer, not corrected for light time (of a column ``bjd``
-    barycentric ones), and brightness is not reduced for distance, except a flux of mean 1.
+    ``sigma`` (``mag_err``, ``err``, ``uncertainty``, ...; in the unit of the brightness),
+    ``group`` (``observer``, ``night``, ``block``); ``notes`` names columns that are not read. Times
+    are those at the observer, not corrected for light time (of a column ``bjd`` or ``hjd`` those at
+    the Sun), and brightness is not reduced for distance, except a flux of mean 1.
     ``vectors``: a second CSV of ``jd`` and the six components, interpolated linearly, for a file
     that has none. ALCDEF: magnitudes with their
     geometry from PHASE, PABL and PABB; sessions whose LTCAPP or REDUCEDMAGS is not NONE are
@@ -101,10 +104,12 @@ def _rows(path, lines) -> tuple[dict[str, list[str]], list[int]]:
 
 def _table(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve:
     columns, numbers = _rows(path, lines)
+    read = {*_TIME, *_GROUP, *_VECTORS, *(name.replace("observer", "earth") for name in _VECTORS)}
 
     def values(names, required=True):
         for name in names:
             if name in columns:
+                read.add(name)
                 cells = zip(numbers, columns[name], strict=True)
                 return np.array([_number(path, k, name, c) for k, c in cells])
         if required:
@@ -118,7 +123,7 @@ def _table(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve:
     several = [name for name in _TIME if name in columns]
     if len(several) > 1:
         notes.append(f"Of the columns {', '.join(several)} the first is taken for the time.")
-    sigma = values(("sigma", "mag_err", "magerr", "error"), required=False)
+    sigma = values(_ERROR, required=False)
     magnitude = values(("magnitude", "mag"), required=False)
     if magnitude is None:
         flux = values(("magnitude", "mag", "flux", "brightness", "intensity"))
@@ -132,15 +137,15 @@ def _table(path, lines, vectors, calibrated: bool, reduced: bool) -> LightCurve:
             notes.append("The flux has mean 1: taken as reduced for distance.")
         if sigma is not None:
             sigma = 2.5 / np.log(10) * sigma / flux
-    group = next(
-        (columns[n] for n in ("group", "observer", "night", "session", "block") if n in columns),
-        None,
-    )
+    group = next((columns[name] for name in _GROUP if name in columns), None)
+    unread = [name for name in columns if name and name not in read]
+    if unread:
+        notes.append(f"Columns that are not read: {', '.join(unread)}.")
     six = _six(path, columns, numbers)
     if six is None and vectors is not None:
         six = _interpolated(vectors, t)
     sun, observer = (None, None) if six is None else (six[:, :3], six[:, 3:])
-    if several == ["bjd"] and six is not None:
+    if several in (["bjd"], ["hjd"]) and six is not None:
         t = _at_observer(t, sun, observer)
     return LightCurve.of(
         t,
