@@ -103,7 +103,7 @@ def test_facets_of_ellipsoid_and_of_harmonics():
         np.asarray(basis).T, density - np.log(4 * np.pi / 4000), rcond=None
     )[0]
     again = lightcurve.Convex.from_harmonics(coefficients, 4000)
-    other = again.brightness(jnp.asarray(sun), jnp.asarray(observer), lambert=0.3)
+    other = again.brightness(list(sun), list(observer), lambert=0.3)
     assert other == pytest.approx(float(found), rel=0.02)
 
 

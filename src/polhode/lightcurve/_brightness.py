@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._checks import ArrayLike
+from polhode._checks import ArrayLike, as_float_array
 from polhode._closed_forms import free_motion, principal_periods
 from polhode._closed_forms._free_constants import Triple
 from polhode.inertia._mass import check_mesh
@@ -311,13 +311,20 @@ class Convex(NamedTuple):
 
     def brightness(
         self,
-        sun: Array,
-        observer: Array,
+        sun: ArrayLike,
+        observer: ArrayLike,
         *,
         lambert: Array | float = 0.0,
         seeliger: Array | float = 1.0,
     ) -> Scalars:
-        """Of bodies lit and seen from directions (..., 3) in body axes: see `facets`."""
+        """Of bodies lit and seen from directions (..., 3), unit vectors in body axes: see `facets`.
+
+        Raises ValueError for vectors of another shape.
+        """
+        sun, observer = (
+            as_float_array(name, vector, (3,), finite=False)
+            for name, vector in (("sun", sun), ("observer", observer))
+        )
         return facets(self.normals, self.areas, sun, observer, lambert, seeliger)
 
 
