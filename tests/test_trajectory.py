@@ -87,7 +87,7 @@ def test_records_of_a_trajectory_are_attributes_where_they_were_made():
         assert not hasattr(traj, name)
         assert getattr(traj, name, None) is None
     for error in (AttributeError, ValueError):
-        with pytest.raises(error, match=r"no spins: .* only where a wheel has a coupling"):
+        with pytest.raises(error, match=r"no spins, .* only where a wheel has a coupling"):
             _ = traj.spins
     want = traj.to_scipy().apply(np.array(traj.omega_body))
     np.testing.assert_allclose(traj.omega_space, want, atol=1e-14)

@@ -30,14 +30,16 @@ def _cores(kind: type) -> dict[str, tuple[int | None, ...]]:
     return {field.name: field.metadata["core"] for field in fields if "core" in field.metadata}
 
 
-def with_numbers(part: eqx.Module) -> str:
-    """The text of a part for ``print``: its numbers where they are known and few, else shapes."""
-    leaves = jax.tree.leaves(part)
-    few = is_concrete(leaves) and sum(map(np.size, leaves)) <= 100
-    return eqx.tree_pformat(part, short_arrays=not few)
+class Printable(eqx.Module):
+    """Base of what ``print`` shows with its numbers where they are known and few, else shapes."""
+
+    def __str__(self) -> str:
+        leaves = jax.tree.leaves(self)
+        few = is_concrete(leaves) and sum(map(np.size, leaves)) <= 100
+        return eqx.tree_pformat(self, short_arrays=not few)
 
 
-class AbstractPart(eqx.Module):
+class AbstractPart(Printable):
     """Base of all that may carry batch axes: the state, and what a scene is made of.
 
     Array fields that bodies may differ in are declared by ``shaped``; what stands in any other
@@ -48,9 +50,6 @@ class AbstractPart(eqx.Module):
     """
 
     smooth: ClassVar[bool] = True
-
-    def __str__(self) -> str:
-        return with_numbers(self)
 
     @property
     def core_ranks(self) -> dict[str, int]:

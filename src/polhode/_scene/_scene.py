@@ -25,7 +25,7 @@ from polhode._hamiltonian import (
     momentum_from_canonical,
     rates_from_angle_rates,
 )
-from polhode._parts import AbstractPart, check_fields, shaped, summands, with_numbers
+from polhode._parts import AbstractPart, Printable, check_fields, shaped, summands
 from polhode._scene._orbits import KeplerOrbit
 from polhode._scene._potentials import (
     AbstractPotential,
@@ -167,7 +167,7 @@ class State(AbstractPart):
         return jnp.stack(q, axis=-1), jnp.stack(jnp.broadcast_arrays(*p), axis=-1)
 
 
-class Scene(eqx.Module):
+class Scene(Printable):
     """A rigid body and what acts on it; absent parts are None and add nothing to the program.
 
     **Arguments:** ``inertia``: ``ph.Inertia`` or ``ph.VariableInertia``; ``potential``:
@@ -196,8 +196,6 @@ class Scene(eqx.Module):
         any_inertia: Any = inertia
         self.inertia, self.potential = any_inertia, potential
         self.torque, self.rotors = torque, rotors
-
-    __str__ = with_numbers
 
     def __check_init__(self):
         _check_kinds(self)

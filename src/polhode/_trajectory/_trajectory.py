@@ -277,7 +277,7 @@ class Trajectory(eqx.Module):
             )
         if value is None:
             raise NotRecordedError(
-                f"this trajectory has no {name}: ph.simulate records it {request}."
+                f"this trajectory has no {name}, which ph.simulate records {request}."
             )
         return value
 

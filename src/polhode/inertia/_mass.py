@@ -20,7 +20,7 @@ from polhode._checks import (
     require_positive,
 )
 from polhode._extras import imported
-from polhode._parts import with_numbers
+from polhode._parts import Printable
 from polhode.inertia._inertia import Inertia
 from polhode.inertia._physical import (
     check_moments,
@@ -37,7 +37,7 @@ from polhode.inertia._shapes import AbstractShaped, Symmetry
 from polhode.rotation import normalise, rotate
 
 
-class MassProperties(AbstractShaped):
+class MassProperties(AbstractShaped, Printable):
     """Mass (...), kg; centre of mass (..., 3), m; inertia about it, all in the body's axes.
 
     ``a + b`` joins bodies given in the same axes, ``a - b`` cuts b out of a, ``moved`` places a
@@ -47,8 +47,6 @@ class MassProperties(AbstractShaped):
     mass: Float[Array, "*b"]
     centre: Float[Array, "*b 3"]
     central: Inertia
-
-    __str__ = with_numbers
 
     @classmethod
     def of(cls, mass: ArrayLike, centre: ArrayLike, inertia: Inertia) -> Self:
