@@ -281,12 +281,9 @@ def test_times_that_single_precision_does_not_resolve_are_refused():
 
 
 def test_unsorted_times_have_a_status_where_they_are_traced():
-    """And their samples are NaN."""
-
     @jax.jit
-    def outcome(ts):
-        motion = ph.simulate(SCENE, STATE, ts)
-        return motion.status, motion.omega_body
+    def status(ts):
+        return ph.simulate(SCENE, STATE, ts).status
 
     for times, good in (
         ([0.0, 1, 2], True),
@@ -296,12 +293,9 @@ def test_unsorted_times_have_a_status_where_they_are_traced():
         ([0.0, np.nan, 1], False),
     ):
         want = ph.Status.SUCCESSFUL if good else ph.Status.BAD_TIMES
-        status, rates = outcome(jnp.array(times))
-        assert status == want
-        assert (np.isnan(rates) != good).all()
-    status, rates = outcome(jnp.array([[0.0, 1, 2], [0.0, 2, 1]]))
-    np.testing.assert_array_equal(status, [ph.Status.SUCCESSFUL, ph.Status.BAD_TIMES])
-    np.testing.assert_array_equal(np.isnan(rates).all((1, 2)), [False, True])
+        assert status(jnp.array(times)) == want
+    own = jnp.array([[0.0, 1, 2], [0.0, 2, 1]])
+    np.testing.assert_array_equal(status(own), [ph.Status.SUCCESSFUL, ph.Status.BAD_TIMES])
 
 
 def with_motor(torque, speed):

@@ -523,10 +523,6 @@ def status_with_input_errors(
         is_too_small = (status == Status.SUCCESSFUL) & ~(rtol >= min_rtol * 0.99)
         status = jnp.where(is_too_small, Status.INACCURATE, status)
     status = jnp.where(scene.is_possible, status, Status.NOT_PHYSICAL)
-    return jnp.where(is_in_order(ts), status, Status.BAD_TIMES)
-
-
-def is_in_order(ts: Array) -> Array:
-    """Whether times (..., T) strictly increase or strictly decrease."""
     steps = jax.lax.stop_gradient(ts[..., 1:] - ts[..., :-1])
-    return jnp.all(steps > 0, axis=-1) | jnp.all(steps < 0, axis=-1)
+    ordered = jnp.all(steps > 0, axis=-1) | jnp.all(steps < 0, axis=-1)
+    return jnp.where(ordered, status, Status.BAD_TIMES)

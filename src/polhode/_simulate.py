@@ -45,7 +45,6 @@ from polhode._method import (
     check_inputs,
     check_method,
     check_rtol,
-    is_in_order,
     raise_on_failure,
     status_with_input_errors,
 )
@@ -257,22 +256,17 @@ def _events_met(events, method, scene, state, ts, rtol) -> Trajectory | None:
 
 
 def _sound(method: AbstractMethod, scene: Scene, state: State, ts: Array) -> tuple[State, Array]:
-    """``sound_state`` in programs of derivatives; in others NaN passes through every method, as the
-    rates of bodies with unsorted times. Bodies with limits or edges that a comparison would take
-    for good ones are not sound in either.
+    """``sound_state`` in programs of derivatives; in others NaN passes through every method. Bodies
+    with limits or edges that a comparison would take for good ones are not sound in either.
 
     Integrated, a body at rest takes few steps. Closed forms have formulas of their own for rest, so
     there the body turns.
     """
     inputs = jax.tree.leaves(eqx.filter((scene, state, ts), eqx.is_inexact_array))
     rate = 1.0 if method.exact else 0.0
-    parts = [getattr(scene, name) for name in PARTS]
-    common_batch(*parts, state, extra=(ts.shape[:-1],))  # raises for axes that do not broadcast
-    rates = jnp.where(is_in_order(ts)[..., None], state.omega_body, jnp.nan)
-    state = State.of_samples(state.wxyz, rates, state.wheel_speed)
     state, is_sound = sound_state(state, is_differentiated(inputs), rate)
-    for part in parts:
-        for condition in all_input_conditions(part):
+    for name in PARTS:
+        for condition in all_input_conditions(getattr(scene, name)):
             is_sound = jnp.logical_and(*jnp.broadcast_arrays(is_sound, condition))
     return state, is_sound
 
@@ -281,8 +275,7 @@ def _with_failures(trajectory: Trajectory, is_sound: Array) -> Trajectory:
     """The trajectory, NaN where the initial state was not ``is_sound``, with gradients of the
     bodies that finished: see ``_failed``."""
     is_sound = jnp.broadcast_to(is_sound, trajectory.batch_shape)
-    status = trajectory.status
-    status = jnp.where(is_sound | (status == Status.BAD_TIMES), status, Status.NOT_FINITE)
+    status = jnp.where(is_sound, trajectory.status, Status.NOT_FINITE)
     finished = (status == Status.SUCCESSFUL) | (status == Status.TOO_MANY_EVENTS)
     any_finished = jnp.where(jnp.any(finished), 1.0, 0.0)
     computed = jax.tree.map(
