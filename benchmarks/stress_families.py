@@ -97,6 +97,8 @@ def nutation(moments, rates) -> tuple[float, float]:
 def duration(moments, rates, angle: float = ANGLE) -> float:
     size = max(map(abs, rates)) or 1.0
     scaled = [x / size for x in rates]
+    if max(moments) > 1e100:  # the time depends on their ratios alone, their products overflow
+        moments = [x / max(moments) for x in moments]
     energy = sum(i * w * w for i, w in zip(moments, scaled, strict=True))
     fast = max(math.hypot(*scaled), math.sqrt(energy / min(moments)))
     return angle / (max(fast, float(nutation(moments, scaled)[0])) or 1.0) / size

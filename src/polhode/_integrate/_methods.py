@@ -19,7 +19,7 @@ class LiePoisson(AbstractIntegration):
     - ``controller``: a diffrax step-size controller; None: the estimated error at every saved time
       is kept below the ``rtol`` of ``simulate`` (attitude in radians, momentum relative to the
       scale of each body).
-    - ``dt0``: first (or constant) step [s], negative backwards; None: chosen.
+    - ``dt0``: first (or constant) step [s], in the direction of the times; None: chosen.
     - ``max_steps``: of each body, or of bodies that share their steps.
     - ``adjoint``: None: ``ph.FlowAdjoint()``, the derivatives of the exact flow, in forward
       and reverse mode; or an adjoint of diffrax, for the derivative of the steps (for bodies that

@@ -394,7 +394,8 @@ class AbstractIntegration(AbstractMethod):
                 closed_over = program.consts
             ts, rows = with_restarts(ts, record.final_only, (scene, y0, closed_over))
         final_only = record.final_only and rows is None
-        request = Request(ts, rtol, self.dt0, self.max_steps, final_only, jumps)
+        dt0 = None if self.dt0 is None else jnp.copysign(self.dt0, ts[-1] - ts[0])
+        request = Request(ts, rtol, dt0, self.max_steps, final_only, jumps)
         if self.controller is not None:
             stepping = request.by_controller(self.solver, self.controller)
         elif isinstance(self.solver, Extrapolation):

@@ -2,7 +2,6 @@
 
 import functools
 import inspect
-import math
 import operator
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -374,9 +373,7 @@ def build_method(file: SceneFile) -> "polhode.AbstractMethod | None":
         if method.step is not None:
             import diffrax
 
-            start_time, end_time = file.times.seconds[[0, -1]]
-            options["dt0"] = math.copysign(method.step, end_time - start_time)
-            options["controller"] = diffrax.ConstantStepSize()
+            options |= {"dt0": method.step, "controller": diffrax.ConstantStepSize()}
         return coordinates(**options)
 
 

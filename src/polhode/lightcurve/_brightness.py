@@ -48,9 +48,9 @@ def _cross(a: Triple, b: Triple) -> Triple:
 
 
 def seeliger_ellipsoid(
-    axes: Triple | Float[Array, "*b 3"],
-    sun: Triple | Float[Array, "*b 3"],
-    observer: Triple | Float[Array, "*b 3"],
+    axes: Triple | Float[ArrayLike, "*b 3"],
+    sun: Triple | Float[ArrayLike, "*b 3"],
+    observer: Triple | Float[ArrayLike, "*b 3"],
 ) -> Scalars:
     """Lommel-Seeliger brightness of triaxial ellipsoids, in closed form.
 
