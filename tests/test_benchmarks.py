@@ -681,7 +681,9 @@ def test_links_to_the_results_page_name_its_sections():
     links = [
         (path.name, anchor)
         for path in (_page.ROOT / "docs").rglob("*.md")
-        for anchor in re.findall(r"benchmarks/README\.md#([\w-]+)", path.read_text(encoding="utf-8"))
+        for anchor in re.findall(
+            r"benchmarks/README\.md#([\w-]+)", path.read_text(encoding="utf-8")
+        )
     ]
     assert links
     assert not [link for link in links if link[1] not in anchors]

@@ -528,7 +528,9 @@ def test_more_events_than_are_stored_are_reported():
     np.testing.assert_allclose(traj.at([1.0]).omega_body[0, 2], 3 * np.exp(-1e-3 / 2), rtol=1e-2)
 
 
-@pytest.mark.parametrize("torque", [None, ph.LinearDamping(1e-3)])
+@pytest.mark.parametrize(
+    "torque", [pytest.param(None, marks=pytest.mark.slow), ph.LinearDamping(1e-3)]
+)
 def test_a_terminal_event_is_stored_when_the_places_are_taken(torque):
     scene = ph.Scene(ph.Inertia.from_moments([1.0, 1.5, 2.0]), None, torque)
     state = ph.State([1.0, 0, 0, 0], [0.3, 0.2, 3.0])
@@ -675,8 +677,15 @@ def test_pairs_of_events_that_no_sample_shows_have_their_states():
         np.testing.assert_allclose(events.wxyz[:2], turned, atol=1e-9)
 
 
-@pytest.mark.parametrize("way", [1.0, -1.0])
-@pytest.mark.parametrize("by_steps", [False, True])
+@pytest.mark.parametrize(
+    ("by_steps", "way"),
+    [
+        (False, 1.0),
+        (True, -1.0),
+        pytest.param(False, -1.0, marks=pytest.mark.slow),
+        pytest.param(True, 1.0, marks=pytest.mark.slow),
+    ],
+)
 def test_times_before_an_event_are_known_from_any_samples(by_steps, way):
     """Samples in another order, or at the event alone, do not show which way the motion goes."""
     torque = ph.LinearDamping(0.0) if by_steps else None

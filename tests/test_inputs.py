@@ -346,7 +346,13 @@ LIMITS = {  # a scene of two numbers that comparisons alone see, and numbers tha
 }
 
 
-@pytest.mark.parametrize("name", LIMITS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name in ("motor", "table") else pytest.mark.slow)
+        for name in LIMITS
+    ],
+)
 def test_limits_and_edges_that_are_wrong_have_a_status_where_they_are_traced(name):
     make, good = LIMITS[name]
 

@@ -51,7 +51,7 @@ def test_the_field_of_a_heavy_top_stands_twelve_calls_below_simulate_at_most(mon
     assert 3 < min(depths) <= 12, min(found, key=len)
 
 
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("sign", [pytest.param(1, marks=pytest.mark.slow), -1])
 def test_samples_at_uneven_times_are_as_exact_as_asked(sign):
     """Many times within a step, many steps within an interval; also backwards."""
     ts = sign * np.concatenate([[0.0, 1e-6, 0.5, 0.5001], np.linspace(0.6, 4, 30), [20.0]])

@@ -65,7 +65,7 @@ SHORT_AXIS = ((1, 1, 0.2, 1.0), (2, 0, 0.15, 2.0), (2, 2, 0.05, 0.5))
     ("waves", "long_axis"),
     [
         (MIXED, True),
-        (ONE_LINE, True),
+        pytest.param(ONE_LINE, True, marks=pytest.mark.slow),
         # a body in short-axis mode: test_default_range_holds_the_lines_of_a_fast_tumbler
         pytest.param(SHORT_AXIS, False, marks=pytest.mark.slow),
     ],

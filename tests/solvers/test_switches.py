@@ -128,7 +128,7 @@ class HiddenJump(eqx.Module):
         return -self.torque * (1 + above) * jnp.eye(3)[2]
 
 
-@pytest.mark.parametrize("torque", [1e-2, 1e-3])
+@pytest.mark.parametrize("torque", [1e-2, pytest.param(1e-3, marks=pytest.mark.slow)])
 def test_jumps_that_a_loop_hides_are_found(torque):
     """A ball is slowed down at 2 ``torque`` until its rate passes 1 rad/s, then at ``torque``: weak
     beside the rates, so that the jump is easy to overlook."""
@@ -368,7 +368,13 @@ def falling(p, omega, max_steps=128):
     return ph.simulate(scene, ph.State(WXYZ, omega), [0.0, 5.0], method).omega_body[-1, 2]
 
 
-@pytest.mark.parametrize("max_steps", [128, 2**16], ids=["integrated again", "recorded"])
+@pytest.mark.parametrize(
+    "max_steps",
+    [
+        pytest.param(128, id="integrated again", marks=pytest.mark.slow),
+        pytest.param(2**16, id="recorded"),
+    ],
+)
 def test_a_gradient_through_a_jump(max_steps):
     """The time of a jump moves with the state and with the threshold, a parameter. Of the steps
     that are allowed the 256th part is recorded: if more are taken, they are integrated again."""
@@ -431,7 +437,7 @@ def test_recorded_steps_and_those_integrated_again_have_the_same_derivatives(how
         np.testing.assert_allclose(found, again, rtol=1e-10, atol=1e-10)
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("mode", [pytest.param(jax.jacfwd, marks=pytest.mark.slow), jax.jacrev])
 def test_switches_that_turn_together_have_times_of_their_own(mode):
     """A relay on each axis, all three at the same rate: w' = -0.2 above a half, -0.05 below, so
     that a quarter of a change of the rate is left."""

@@ -50,7 +50,7 @@ def test_an_orbit_by_place_and_velocity_is_the_same_one():
             assert np.abs(np.array(got - want)).max() < bound / (1 - 0.95)
 
 
-@pytest.mark.parametrize("radius", [6.9e6, 4.2164e7])
+@pytest.mark.parametrize("radius", [pytest.param(6.9e6, marks=pytest.mark.slow), 4.2164e7])
 def test_derivatives_by_the_size_of_an_orbit_in_single_precision(radius):
     """Fields fall with the cube of the distance: derivatives -3 and 12 times the field."""
     for dtype, bound in ((jnp.float64, 1e-13), (jnp.float32, 1e-5)):
