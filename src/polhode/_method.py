@@ -421,12 +421,11 @@ def _times(ts: Any, dtype: Any) -> Any:
     """Times (..., T) of the dtype; known ones in NumPy, which costs no dispatch."""
     if type(ts) is list and all(type(x) in (float, int) for x in ts):
         ts = np.asarray(ts, float)
-    is_float_array = isinstance(ts, np.ndarray) and ts.dtype.kind == "f" and ts.ndim > 0
-    if is_float_array and np.isfinite(ts).all():
-        given, ts = ts, np.asarray(ts, dtype)
-        if given.dtype.itemsize > ts.dtype.itemsize:
-            require_digits("ts", given, ts)
-        return ts
+    if isinstance(ts, np.ndarray) and ts.dtype.kind == "f" and ts.ndim and np.isfinite(ts).all():
+        times = np.asarray(ts, dtype)
+        if ts.itemsize > times.itemsize:
+            require_digits("ts", ts, times)
+        return times
     ts = as_float_array("ts", ts, (None,))
     return ts if ts.dtype == dtype else ts.astype(dtype)
 

@@ -32,7 +32,8 @@ def _components(name: str, vector: Any) -> Triple:
         raise ValueError(
             f"{name} must be an array (..., 3) or a tuple of three components, got shape {shape}."
         )
-    return tuple(vector if isinstance(vector, (tuple, list)) else jnp.unstack(vector, axis=-1))
+    x, y, z = vector if isinstance(vector, (tuple, list)) else jnp.unstack(vector, axis=-1)
+    return x, y, z
 
 
 def _dot(a: Triple, b: Triple) -> Scalars:
