@@ -207,8 +207,9 @@ def test_missing_data_and_wrong_bodies_are_named(trajectory):
         plot.polhode(bare)
     with pytest.raises(ValueError, match="needs wxyz"):
         plot.herpolhode(bare)
-    with pytest.raises(ValueError, match="number of bodies, 2"):
-        plot.history(bare, body=2)
+    for body in (2, 0.5):
+        with pytest.raises(ValueError, match="whole number below that of the bodies, 2"):
+            plot.history(bare, body=body)
     with pytest.raises(TypeError, match=r"ph\.Trajectory"):
         plot.polhode(np.zeros((3, 3)))
     with pytest.raises(ValueError, match="omega_body must have shape"):
@@ -220,7 +221,7 @@ def test_missing_data_and_wrong_bodies_are_named(trajectory):
     )
     with pytest.raises(ValueError, match="at rest"):
         plot.polhode(rest)
-    with pytest.raises(ValueError, match="number of bodies, 2"):
+    with pytest.raises(ValueError, match="that of the bodies, 2"):
         plot.animate(trajectory, bodies=[2])
 
 

@@ -205,8 +205,10 @@ def pick(what: Trajectory | Samples, body: int | None) -> tuple[Samples, int]:
     """The samples, and the index of the body to plot (counted over flattened batch axes)."""
     result = as_samples(what)
     body = 0 if body is None else body
-    if not -result.count <= body < result.count:
-        raise ValueError(f"body must be below the number of bodies, {result.count}, got {body}.")
+    if not (isinstance(body, int | np.integer) and -result.count <= body < result.count):
+        raise ValueError(
+            f"body must be a whole number below that of the bodies, {result.count}, got {body!r}."
+        )
     return result, body % result.count
 
 
