@@ -274,8 +274,9 @@ def test_times_that_single_precision_does_not_resolve_are_refused():
     times = np.linspace(0.0, 2.0, 101)
     state = jax.tree.map(lambda x: x.astype(np.float32), STATE)
     scene = jax.tree.map(lambda x: x.astype(np.float32), SCENE)
-    with pytest.raises(ValueError, match=r"ts of up to 8.64e.04 s leave no digits .* in float32"):
-        ph.simulate(scene, state, times + 86400)
+    for late in (times + 86400, list(times + 86400), tuple((times + 86400).tolist())):
+        with pytest.raises(ValueError, match=r"ts of up to 8.64e.04 s leave no digits .* float32"):
+            ph.simulate(scene, state, late)
     assert ph.simulate(scene, state, times).ts.dtype == np.float32
     assert ph.simulate(SCENE, STATE, times + 86400).ts[0] == 86400
 

@@ -419,7 +419,8 @@ _ARRAYS = (jax.Array, np.ndarray)
 
 def _times(ts: Any, dtype: Any) -> Any:
     """Times (..., T) of the dtype; known ones in NumPy, which costs no dispatch."""
-    if type(ts) is list and all(type(x) in (float, int) for x in ts):
+    kinds = (float, int, np.float64, np.int64)
+    if isinstance(ts, list | tuple) and all(type(x) in kinds for x in ts):
         ts = np.asarray(ts, float)
     if isinstance(ts, np.ndarray) and ts.dtype.kind == "f" and ts.ndim and np.isfinite(ts).all():
         times = np.asarray(ts, dtype)

@@ -110,6 +110,21 @@ def test_errors_are_as_large_as_the_bound_says(fits, cases):
     assert abs(np.asarray(fits.noise).mean() - 1) < 0.02
 
 
+def test_errors_of_moments_that_are_nearly_equal_are_larger_than_their_covariance_says(fits):
+    """Against linear propagation of the covariance, of the body whose axes are known least."""
+    told = np.asarray(fits.diagnostics) & int(Finding.WEAK | Finding.NEARLY_FLAT) == 0
+    body = int(np.argmax(np.where(told, np.asarray(fits.axes_std).max(-1), 0)))
+
+    def ratios(values):
+        moments = jnp.linalg.eigvalsh(values[0])
+        return moments[:2] / moments[2]
+
+    found, linear = fits.derived(ratios, body)
+    np.testing.assert_allclose(found, fits.ratios[body][:2], rtol=1e-9)
+    assert np.all(fits.ratios_std[body][:2] >= 0.999 * linear)
+    assert np.max(fits.ratios_std[body][:2] / linear) > 1.01
+
+
 def entries(tensors):
     return np.stack(
         [tensors[:, i, j] for i, j in ((0, 0), (1, 1), (2, 2), (1, 2), (2, 0), (0, 1))], axis=-1

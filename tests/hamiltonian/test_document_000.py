@@ -237,3 +237,5 @@ def test_hamiltons_equations_of_angles_and_momenta_that_broadcast(unchecked):
     for got, want in zip(of_bodies(Q, P), equations(Q, P)):
         assert got.shape == (2, 3)
         np.testing.assert_allclose(got[0], want, rtol=1e-15)
+    total = ph.hamiltons_equations(lambda q, p: jnp.sum(p**2) / 2)  # of all bodies together
+    np.testing.assert_allclose(total(jnp.array([Q, Q]), momenta)[0], momenta, rtol=1e-15)

@@ -85,7 +85,8 @@ def hamiltons_equations(
     def equations(q, p, *args):
         if not _are_components(q, p):
             q, p = as_floats(finite=False, q=(q, ()), p=(p, ()))
-            batch = jax.eval_shape(lambda q, p: H(q, p, *args), q, p).shape
+            energies = jax.eval_shape(lambda q, p: H(q, p, *args), q, p).shape
+            batch = jnp.broadcast_shapes(energies, q.shape[:-1], p.shape[:-1])
             q, p = (jnp.broadcast_to(x, (*batch, x.shape[-1])) for x in (q, p))
         slope_q, slope_p = jax.grad(lambda q, p: jnp.sum(H(q, p, *args)), argnums=(0, 1))(q, p)
         return slope_p, jax.tree.map(jnp.negative, slope_q)

@@ -37,13 +37,12 @@ def read_light_curve(
     ``sigma`` (``mag_err``, ``err``, ``uncertainty``, ...; in the unit of the brightness),
     ``group`` (``observer``, ``night``, ``block``); ``notes`` names columns that are not read. Times
     are those at the observer, not corrected for light time (of a column ``bjd`` or ``hjd`` those at
-    the Sun), and brightness is not reduced for distance, except a flux of mean 1.
-    ``vectors``: a second CSV of ``jd`` and the six components, interpolated linearly, for a file
-    that has none. ALCDEF: magnitudes with their
-    geometry from PHASE, PABL and PABB; sessions whose LTCAPP or REDUCEDMAGS is not NONE are
-    corrected for light time or reduced already. DAMIT: intensities with vectors. Of CSV and ALCDEF:
-    ``calibrated``: groups share a zero point but for small errors; ``reduced``: brightness is
-    reduced for distance already.
+    the Sun), and brightness is not reduced for distance, except a flux of mean 1. ``vectors``: a
+    second CSV of ``jd`` and the six components, interpolated linearly, for a file that has none.
+    ALCDEF: magnitudes with their geometry from PHASE, PABL and PABB; sessions whose LTCAPP or
+    REDUCEDMAGS is not NONE are corrected for light time or reduced already. DAMIT: intensities with
+    vectors. Of CSV and ALCDEF: ``calibrated``: groups share a zero point but for small errors;
+    ``reduced``: brightness is reduced for distance already.
 
     Raises FileNotFoundError, and ValueError that names the line or column that is wrong.
     """
