@@ -7,7 +7,14 @@ import pytest
 from hypothesis import example, given, settings, strategies as st
 
 from polhode import GravityGradient, Scene
-from polhode.inertia import Inertia, MassProperties, Symmetry, physical_margin
+from polhode.inertia import (
+    Inertia,
+    MassProperties,
+    Symmetry,
+    inertia_of_second_moments,
+    physical_margin,
+    second_moments,
+)
 from polhode.rotation import normalise
 
 DTYPES = [jnp.float32, jnp.float64]
@@ -186,8 +193,10 @@ GRADIENT = GravityGradient(1.0, [1.0, 0.5, 0.2])
         lambda body: jnp.sum(body.rates(OMEGA) * jnp.array([1.0, 0.3, 2.0])),
         lambda body: jnp.sum(Scene(body).acceleration(None, jnp.asarray(OMEGA), 0.0) ** 3),
         lambda body: jnp.sum(Scene(body, GRADIENT).acceleration(WXYZ, jnp.asarray(OMEGA), 0.0)),
+        lambda body: physical_margin(body.full),
+        lambda body: jnp.sum(inertia_of_second_moments(second_moments(body.full) ** 2) ** 2),
     ],
-    ids=["momentum", "rates", "free", "gravity gradient"],
+    ids=["momentum", "rates", "free", "gravity gradient", "margin", "second moments"],
 )
 def test_a_step_along_a_gradient_keeps_the_tensor_symmetric(value):
     body = Inertia.from_tensor(TENSOR)

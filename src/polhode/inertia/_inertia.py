@@ -37,6 +37,7 @@ from polhode.inertia._physical import (
     principal_moments,
     rotate_tensor,
     tolerance,
+    with_symmetric_derivatives,
 )
 from polhode.inertia._shapes import AbstractShaped, Symmetry
 from polhode.rotation import wxyz_to_matrix
@@ -258,7 +259,7 @@ class Inertia(AbstractShaped, AbstractPart):
     def tensor(self) -> Float[Array, "*b 3 3"]:
         """The tensor (..., 3, 3) in body axes [kg m^2]."""
         if self.full is not None:
-            return _with_symmetric_derivatives(self.full)
+            return with_symmetric_derivatives(self.full)
         return _diagonal(self.moments)
 
     def turned(self, wxyz: Float[Array, "*#b 4"]) -> Self:
@@ -314,19 +315,6 @@ def _stacked(*moments: Array) -> Array:
         stacked = np.stack(np.broadcast_arrays(*values), axis=-1)
         return as_float_array("moments", stacked, finite=False)
     return jnp.stack(jnp.broadcast_arrays(*moments), axis=-1)
-
-
-@jax.custom_jvp
-def _with_symmetric_derivatives(tensor: Array) -> Array:
-    """The tensor. Derivatives by opposite entries are equal, whichever of them a formula uses, so
-    that a step along a gradient keeps the tensor symmetric."""
-    return tensor
-
-
-@_with_symmetric_derivatives.defjvp
-def _with_symmetric_derivatives_rule(primals, tangents):
-    (tensor,), (change,) = primals, tangents
-    return _with_symmetric_derivatives(tensor), (change + jnp.swapaxes(change, -1, -2)) / 2
 
 
 def _diagonal(moments: Array) -> Array:
