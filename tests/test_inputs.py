@@ -193,6 +193,8 @@ def test_parts_print_their_numbers_where_they_are_known_and_few():
     ):
         assert "[1. , 1.5, 2. ]" in str(part)
     assert "f64[99,3]" in str(ph.Inertia.from_moments(np.ones((99, 3))))
+    top = str(ph.Scene(INERTIA, ph.UniformGravity(1.0, [0.0, 0, 1])))
+    assert not any(text in top for text in ("None", "weak", ",\n)"))
     texts = []
     jax.eval_shape(lambda x: texts.append(f"{ph.State(STATE.wxyz, x)}"), STATE.omega_body)
     assert "omega_body=f64[3]" in texts[0]

@@ -3,6 +3,7 @@
 import dataclasses
 import functools
 import inspect
+import re
 import traceback
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -30,13 +31,19 @@ def _cores(kind: type) -> dict[str, tuple[int | None, ...]]:
     return {field.name: field.metadata["core"] for field in fields if "core" in field.metadata}
 
 
+_UNSHOWN = re.compile(r"(?<=\()\s*\w+=None,|,\s*\w+=None(?=[,\s)])|, weak_type=True")
+
+
 class Printable(eqx.Module):
-    """Base of what ``print`` shows with its numbers where they are known and few, else shapes."""
+    """Base of what ``print`` shows with its numbers where they are known and few, else shapes.
+
+    Fields that are None and JAX's weak types are not shown.
+    """
 
     def __str__(self) -> str:
         leaves = jax.tree.leaves(self)
         few = is_concrete(leaves) and sum(map(np.size, leaves)) <= 100
-        return eqx.tree_pformat(self, short_arrays=not few)
+        return _UNSHOWN.sub("", eqx.tree_pformat(self, short_arrays=not few))
 
 
 class AbstractPart(Printable):

@@ -36,6 +36,8 @@ def test_table_is_reduced_to_unit_distance_and_to_the_body(table):
     assert np.all(curve.sigma == 0.02)
     cosine = SUN @ OBSERVER / r / delta
     np.testing.assert_allclose(np.cos(curve.alpha), cosine)
+    assert str(curve).startswith("LightCurve: 9 points of 2 group(s), day 2456210.59")
+    assert "median error 0.02, with directions" in str(curve)
 
 
 def test_barycentric_times_are_moved_to_the_body(table):

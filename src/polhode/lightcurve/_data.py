@@ -46,6 +46,15 @@ class LightCurve(NamedTuple):
     calibrated: bool  # magnitudes of different groups may be compared
     notes: tuple[str, ...] = ()  # what a reader had to assume
 
+    def __str__(self) -> str:
+        sigma = np.median(self.sigma)
+        return (
+            f"LightCurve: {self.t.size} points of {len(self.names)} group(s), day {self.t[0]:.10g}"
+            f" to {self.t[-1]:.10g}, magnitudes {self.magnitude.min():.4g} to"
+            f" {self.magnitude.max():.4g}, median error {f'{sigma:.2g}' if sigma else 'unknown'},"
+            f" {'with' if self.sun is not None else 'without'} directions"
+        )
+
     @classmethod
     def of(
         cls,
