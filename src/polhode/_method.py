@@ -459,11 +459,11 @@ def default_rtol(dtype: Any) -> float:
 
 def check_rtol(rtol: float | None, dtype) -> Array | np.ndarray:
     """The tolerance in the state's dtype; a number that is known stays known under ``jit``."""
-    eps = float(jnp.finfo(dtype).eps)
     if rtol is None:
-        rtol = default_rtol(dtype)
+        return np.asarray(default_rtol(dtype), dtype)
     if isinstance(rtol, Tracer) and rtol.ndim == 0:
         return jnp.asarray(rtol, dtype)
+    eps = float(jnp.finfo(dtype).eps)
     number = _number("rtol", rtol)
     require(np.isfinite(number) and number > 0, f"rtol must be positive, got {rtol}.")
     require(

@@ -86,6 +86,22 @@ class NotRecordedError(ValueError, AttributeError):
     """A quantity that the simulation did not record: for ``hasattr`` a missing attribute."""
 
 
+def _recorded(trajectory: Any, name: str, request: str) -> Any:
+    # A function, and not a method: Equinox builds an object for every method that is looked up.
+    value = getattr(trajectory, f"_{name}")
+    if value is None and trajectory._saved is not None and name in ("wxyz", "omega_body", "spins"):
+        raise NotRecordedError(
+            f"this trajectory has no {name}: it was not recorded, because"
+            " ph.Record(save=fn) stores the values of a function in its place, traj.saved."
+            f" Return trajectory.{name} from the function as well."
+        )
+    if value is None:
+        raise NotRecordedError(
+            f"this trajectory has no {name}, which ph.simulate records {request}."
+        )
+    return value
+
+
 class Trajectory(eqx.Module):
     """Samples of the motion; leading axes (...) are the batch, then T times.
 
@@ -196,12 +212,12 @@ class Trajectory(eqx.Module):
     @property
     def wxyz(self) -> Float[Array, "*b t 4"]:
         """Attitudes (..., T, 4), body -> space, scalar first."""
-        return self._recorded("wxyz", "with record=ph.Record(attitude=True), the default")
+        return _recorded(self, "wxyz", "with record=ph.Record(attitude=True), the default")
 
     @property
     def omega_body(self) -> Float[Array, "*b t 3"]:
         """Body rates (..., T, 3) [rad/s]."""
-        return self._recorded("omega_body", "with record=ph.Record(rates=True), the default")
+        return _recorded(self, "omega_body", "with record=ph.Record(rates=True), the default")
 
     @property
     def steps(self) -> Int[Array, "*b"]:
@@ -225,7 +241,7 @@ class Trajectory(eqx.Module):
         It includes external torques, potentials that change with time (also orbits) and the motors
         of wheels, so that ``energy - work`` is constant.
         """
-        return self._recorded("work", "with record=ph.Record(work=True)")
+        return _recorded(self, "work", "with record=ph.Record(work=True)")
 
     @property
     def error(self) -> Float[Array, "*b"]:
@@ -233,12 +249,14 @@ class Trajectory(eqx.Module):
 
         Without attitude it is the error of the rates, relative to their size.
         """
-        return self._recorded("error", "with record=ph.Record(error=True)")
+        return _recorded(self, "error", "with record=ph.Record(error=True)")
 
     @property
     def motor_work(self) -> Float[Array, "*b t m"]:
         """The part (..., T, m) [J] of ``work`` that motor and friction of each wheel have done."""
-        return self._recorded("motor_work", "with record=ph.Record(work=True) and wheels that turn")
+        return _recorded(
+            self, "motor_work", "with record=ph.Record(work=True) and wheels that turn"
+        )
 
     @property
     def spins(self) -> Float[Array, "*b t k"]:
@@ -246,12 +264,12 @@ class Trajectory(eqx.Module):
 
         Each along the axis of its wheel, that of the rotation with the body included.
         """
-        return self._recorded("spins", "only where a wheel has a coupling")
+        return _recorded(self, "spins", "only where a wheel has a coupling")
 
     @property
     def event_time(self) -> Float[Array, "*b"]:
         """Time (...) [s] of the event that ended the motion; inf for a body without one."""
-        return self._recorded("event_time", "with until=ph.Event(...)")
+        return _recorded(self, "event_time", "with until=ph.Event(...)")
 
     @property
     def _event_time(self) -> Array | None:
@@ -260,26 +278,12 @@ class Trajectory(eqx.Module):
     @property
     def events(self) -> Events:
         """The events of each body; see ``Events``."""
-        return self._recorded("events", "with events=[ph.Event(...)]")
+        return _recorded(self, "events", "with events=[ph.Event(...)]")
 
     @property
     def saved(self) -> PyTree[Array]:
         """The values of the function that was saved in place of the states; leaves (..., T, *k)."""
-        return self._recorded("saved", "with record=ph.Record(save=fn)")
-
-    def _recorded(self, name: str, request: str) -> Any:
-        value = getattr(self, f"_{name}")
-        if value is None and self._saved is not None and name in ("wxyz", "omega_body", "spins"):
-            raise NotRecordedError(
-                f"this trajectory has no {name}: it was not recorded, because"
-                " ph.Record(save=fn) stores the values of a function in its place, traj.saved."
-                f" Return trajectory.{name} from the function as well."
-            )
-        if value is None:
-            raise NotRecordedError(
-                f"this trajectory has no {name}, which ph.simulate records {request}."
-            )
-        return value
+        return _recorded(self, "saved", "with record=ph.Record(save=fn)")
 
     def at(self, t: Float[ArrayLike, "*#b k"]) -> "Trajectory":
         """The motion at other times ``t`` [s]: a trajectory of the same bodies at these.
