@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,8 +11,9 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from polhode import rotation
-from polhode._checks import ArrayLike, is_concrete, require
+from polhode._checks import ArrayLike, is_concrete, numbers, require
 from polhode._integrate._field import uses
+from polhode._kernels import jit_distinct
 from polhode._method import (
     AbstractMethod,
     Status,
@@ -120,7 +120,7 @@ def propagate(
             f" {state.wxyz.shape}, {state.omega_body.shape}: map it, jax.vmap(ph.propagate, ...)."
         )
     dtype = state.omega_body.dtype
-    dt, t = jnp.asarray(dt, dtype), jnp.asarray(t, dtype)
+    dt, t = _number(dt, dtype), _number(t, dtype)
     if dt.ndim or t.ndim:
         raise ValueError(
             f"dt and t are one number each, got shapes {dt.shape}, {t.shape}: for several steps"
@@ -130,7 +130,8 @@ def propagate(
         not is_concrete(dt) or (np.isfinite(dt) and dt != 0),
         f"dt must be a number other than zero, got {dt}.",
     )
-    scene, state, _, _ = check_inputs(scene, state, jnp.stack([jnp.zeros_like(dt), dt]), None)
+    lib: Any = numbers(dt)
+    scene, state, _, _ = check_inputs(scene, state, lib.stack([lib.zeros_like(dt), dt]), None)
     places = () if free is None else places_of(scene, free)
     if not set(places).isdisjoint(_starts_of_loose(scene)):
         raise ValueError(
@@ -156,6 +157,12 @@ def propagate(
     return Propagation(state, jacobian, noise)
 
 
+def _number(value: Any, dtype: Any) -> Array | np.ndarray:
+    """A number of the dtype, in NumPy where it is known: an operation of JAX takes 50 us."""
+    is_plain = isinstance(value, float | int | np.floating | np.integer)
+    return np.asarray(value, dtype) if is_plain else jnp.asarray(value, dtype)
+
+
 def _starts_of_loose(scene: Scene) -> tuple[int, ...]:
     """The leaves of the scene that give initial speeds of wheels that are not held."""
 
@@ -170,7 +177,7 @@ def _starts_of_loose(scene: Scene) -> tuple[int, ...]:
     return places_of(scene, starts)
 
 
-@eqx.filter_jit
+@jit_distinct
 def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
     """Also the angle turned by the largest body rate, and whether times near ``t`` resolve ``dt``;
     the effect of a disturbance in ``parts``."""
