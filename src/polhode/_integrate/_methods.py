@@ -1,4 +1,5 @@
-"""The methods that integrate: quaternions or Euler angles, and coarse steps for training."""
+"""Public integration methods: Lie-Poisson coordinates, Euler angles, and coarse steps for
+training."""
 
 import diffrax
 from jaxtyping import Array
