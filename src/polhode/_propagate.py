@@ -1,4 +1,4 @@
-"""One step of a filter: a state carried on, with the Jacobian of the exact flow."""
+"""The prediction step of a filter: the next state, with the Jacobian of the exact flow."""
 
 import math
 from collections.abc import Callable
@@ -29,20 +29,20 @@ from polhode._scene._scene import places_of
 from polhode._simulate import simulate
 
 _NODES = 8
-"""Gauss points of each part of a step that the effect of a disturbance is integrated over where the
-motion has a closed form; their error falls with the 16th power of the angle turned in a part: 1e-12
-of the effect for a third of a turn."""
+"""Gauss points of each part of a step, for the integral of the effect of a disturbance on a motion
+in closed form. The error falls with the 16th power of the angle of rotation in a part: for a third
+of a revolution it is 1e-12 of the effect."""
 
 _MOST_PARTS = 1024
-"""Parts of a step: what they take of memory grows with their number."""
+"""Maximum number of parts of a step; the memory is proportional to it."""
 
 _TURN = np.pi
-"""Angle [rad] by the largest body rate that a part of a step may take. With twice that the effect
-is in error by up to 2e-7 of itself."""
+"""Maximum angle [rad] of rotation in a part, by the largest body rate. With twice this angle the
+relative error of the effect is up to 2e-7."""
 
 
 _ROUNDED = 1e-2
-"""Part of a step by which rounding of the time may change its length."""
+"""Maximum relative change of the length of a step by rounding of the time."""
 
 
 class Propagation(NamedTuple):
@@ -157,7 +157,8 @@ def propagate(
 
 
 def _starts_of_loose(scene: Scene) -> tuple[int, ...]:
-    """The leaves of the scene that give initial speeds of wheels that are not held."""
+    """Indices of the leaves of the scene that are initial speeds or momenta of wheels that are not
+    held."""
 
     def starts(scene):
         if isinstance(scene.rotors, Wheels):
@@ -172,8 +173,8 @@ def _starts_of_loose(scene: Scene) -> tuple[int, ...]:
 
 @eqx.filter_jit
 def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
-    """Also the angle turned by the largest body rate, and whether times near ``t`` resolve ``dt``;
-    the effect of a disturbance in ``parts``."""
+    """State, Jacobian, effect of a disturbance (integrated in ``parts``), status, the angle of
+    rotation by the largest body rate, and whether times close to ``t`` resolve ``dt``."""
     dtype = dt.dtype
     leaves, tree = jax.tree.flatten(scene)
     sizes = [leaves[k].size for k in places]
@@ -184,8 +185,8 @@ def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
     begin = 6 + len(loose)
     n = begin + sum(sizes)
 
-    # Where time does not matter, the step starts at zero: in single precision t + dt is rounded, by
-    # a fifth of a step of 10 ms after a day.
+    # If the scene does not depend on time, the step starts at t = 0: in single precision t + dt is
+    # rounded, after a day by a fifth of a step of 10 ms.
     dynamics, like = initial_scene.dynamics, state.omega_body[..., 0]
     spins = dynamics.wheels.initial_spins(like) if dynamics.coupled else ()
     changes = initial_scene.with_spins(spins).changes
@@ -194,7 +195,7 @@ def _propagated(scene, state, dt, t, places, method, rtol, parts: int):
         t = jnp.zeros_like(t)
     is_resolved = jnp.abs((t + dt) - t - dt) <= _ROUNDED * jnp.abs(dt)
     time_range = jnp.stack([t, t + dt])
-    # In closed form there is no motion under a torque: its effect is integrated over the step.
+    # A closed form does not permit a torque: its effect is integrated over the step.
     nodes, weights = np.polynomial.legendre.leggauss(_NODES)
     nodes = ((1 + nodes) / 2 + np.arange(parts)[:, None]).reshape(-1) / parts
     weights = np.tile(weights / 2, parts) / parts

@@ -130,8 +130,8 @@ that counts. A margin that falls to zero and returns changes by all of it."""
 
 DEEP_TURN = 0.5
 """[factor] The same for a single turning point, if it is too large for one step: for a sine, 120
-degrees about an extremum. Without it, 2 of 63 events of a body at rest, in a window of a seventh of
-the period, are missed (``tests/test_events.py``)."""
+degrees about an extremum. Without it, 2 of 63 short windows, each a seventh of the period long, in
+which an event function changes its sign, are missed (``tests/test_events.py``)."""
 
 MARGIN_STEPS = 4.0
 """[steps] Of the length of the motion divided by ``max_steps``: shorter steps are not rejected for
