@@ -9,7 +9,7 @@ from pathlib import Path
 
 @contextlib.contextmanager
 def atomic_write(target: str | os.PathLike) -> Iterator[Path]:
-    """A temporary path in the folder of `target` that replaces `target` when the block succeeds.
+    """A temporary path in the folder of `target`; it replaces `target` if the block succeeds.
 
     If the block raises, KeyboardInterrupt included, the temporary file is removed and an existing
     `target` is not changed. The folder must exist. An OSError of the operating system is raised

@@ -152,7 +152,7 @@ def split_of(scene: Any, state: Any, ts: Array) -> Split | None:
         return None
     shardings: list[tuple[NamedSharding, tuple[int, ...]]] = []
 
-    def look(x, rank):
+    def collect(x, rank):
         sharding = _sharding(x)
         if sharding is not None:
             shardings.append((sharding, x.shape[: x.ndim - rank]))
@@ -160,8 +160,8 @@ def split_of(scene: Any, state: Any, ts: Array) -> Split | None:
 
     parts = [getattr(scene, name) for name in PARTS]
     for part in (*parts, state):
-        map_arrays(part, look)
-    look(ts, 1)
+        map_arrays(part, collect)
+    collect(ts, 1)
     if not shardings:
         return None
     batch = common_batch(*parts, state, extra=(ts.shape[:-1],))

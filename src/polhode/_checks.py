@@ -134,7 +134,7 @@ def as_float_array(
     fits = array.ndim >= n and all(want in (None, got) for want, got in zip(suffix, tail))
     if not fits:
         expected_shape = ", ".join(["...", *("n" if s is None else str(s) for s in suffix)])
-        if tuple(suffix) == (None,):  # of any length: only a number does not fit
+        if tuple(suffix) == (None,):  # any length is valid: the value is a single number
             hint = "give a row of numbers, such as [0.0, 10.0]"
         raise ValueError(f"{name} must have shape ({expected_shape}), got {array.shape}: {hint}.")
     if finite and is_concrete(array) and not bool(np.all(np.isfinite(np.asarray(array)))):
@@ -182,7 +182,7 @@ def as_number(name: str, value: Any) -> Array:
 def require_positive(
     name: str, array: Any, *, zero: bool = False, hint: str = "check its sign and its units"
 ) -> None:
-    """ValueError if a concrete array holds negative values (or zeros, unless ``zero``)."""
+    """ValueError if a concrete array contains negative values (or zeros, unless ``zero``)."""
     if not is_concrete(array) or np.size(array) == 0:
         return
     minimum = float(np.min(np.asarray(array)))
@@ -217,8 +217,8 @@ def as_floats(
 ) -> tuple[Array, ...]:
     """Arrays ``name=(value, suffix)`` of one floating dtype and with common batch axes.
 
-    Python numbers and lists follow the dtype of the arrays among them; alone, they take the
-    default one. A mixture of array dtypes takes the wider one.
+    Python numbers and lists get the dtype of the arrays among the arguments, or the default one if
+    there are none. Arrays of several dtypes get the widest one.
     """
     arrays = [
         as_float_array(name, value, suffix, finite=finite)

@@ -16,7 +16,7 @@ from polhode._checks import as_float_array, describe, is_concrete, require, requ
 from polhode._parts import as_static, check_fields, takes
 from polhode._scene import Scene, State, check_scene
 
-# How the simulation of each body ended.
+# Outcomes of a simulation.
 
 
 class Status(enum.IntEnum):
@@ -35,7 +35,7 @@ class Status(enum.IntEnum):
 
     @property
     def explanation(self) -> str:
-        """What happened and how to correct it."""
+        """The cause and the remedy."""
         return _EXPLANATIONS[self]
 
 

@@ -357,7 +357,7 @@ def _steps(method, scene: Scene, state: State, ts: Array, record: Record) -> str
     """The description of the steps, for the lanes that ``simulate`` would integrate."""
     words: list[str] = []
 
-    def look(scene, state, ts):
+    def describe_lanes(scene, state, ts):
         scene, state = scene.settled(state, ts[..., 0]), state.without_wheels
         parts = {name: getattr(scene, name) for name in PARTS}
         batch = common_batch(*parts.values(), state, extra=(ts.shape[:-1],))
@@ -365,7 +365,7 @@ def _steps(method, scene: Scene, state: State, ts: Array, record: Record) -> str
         times = lane_times(ts, batch)
         words.append(method.steps_of(lanes, flatten(state, batch, shared=False), times, record))
 
-    eqx.filter_eval_shape(look, scene, state, ts)
+    eqx.filter_eval_shape(describe_lanes, scene, state, ts)
     return words[0]
 
 

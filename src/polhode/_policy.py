@@ -40,7 +40,8 @@ STAGING = True
 them again in the loop over each result."""
 
 REFILLING = True
-"""[switch] A SIMD lane whose body is finished takes the next body of the batch (``in_lanes``)."""
+"""[switch] The SIMD lane of a finished body is given to the next body of the batch
+(``in_lanes``)."""
 
 TIME_LOOP = True
 """[switch] Closed forms of many free bodies at many times are evaluated in a loop over the times,
@@ -158,7 +159,7 @@ FREE_LANES = 512
 """[bodies] In one chunk of the loop over times (TIME_LOOP): their constants stay in the cache."""
 
 TIME_LOOP_BODIES = 64
-"""[bodies] From which TIME_LOOP applies."""
+"""[bodies] Smallest batch to which TIME_LOOP applies."""
 
 TOP_CHUNK = 2**11
 """[bodies times samples] Of Lagrange's tops in one chunk."""
@@ -207,7 +208,7 @@ def platform_of(device: Any) -> str:
 
 
 def kind_of(device: Any) -> str:
-    """The platform and model of one device, for records of runs."""
+    """The platform and model of one device, for benchmark records."""
     return f"{device.platform} ({device.device_kind})"
 
 
@@ -233,7 +234,7 @@ def plain_reason() -> str | None:
 
 
 def is_fused() -> bool:
-    """Whether functions become fused kernels: on a CPU."""
+    """Whether functions become fused kernels."""
     return FUSION and is_cpu() and not is_plain()
 
 
@@ -249,7 +250,7 @@ def is_staged() -> bool:
 
 def is_refilled(bodies: int) -> bool:
     """Whether the lanes of a batch are refilled: on a CPU, for more bodies than lanes. An
-    accelerator integrates all bodies side by side."""
+    accelerator integrates all bodies at the same time."""
     return REFILLING and is_cpu() and not is_plain() and bodies > LANES
 
 

@@ -89,21 +89,22 @@ def propagate(
     The Jacobian is that of the exact flow, by forward differentiation through ``ph.simulate``.
     ``noise`` is the derivative by a disturbance torque on the body [N m] that is constant over the
     step, in body axes: a torque of spectral density s [N^2 m^2 s] adds ``noise @ noise.T * s / dt``
-    to the covariance. In closed form it is integrated over the step. There it is NaN if the body
-    turns by more than half a turn in a step under ``jit`` or ``vmap``, or by more than 512 turns
-    elsewhere: propagate in shorter steps, or by ``method=ph.LiePoisson()``.
+    to the covariance. For a motion in closed form it is integrated over the step. It is then NaN if
+    the body rotates by more than half a revolution in a step under ``jit`` or ``vmap``, or by more
+    than 512 revolutions otherwise: use shorter steps, or ``method=ph.LiePoisson()``.
 
-    **Arguments:** ``scene``, ``state``: of one body; for several ``jax.vmap``. ``dt``: not zero.
-    ``t``: matters only to a scene that depends on time; there the rounded difference ``(t + dt) -
-    t`` must equal ``dt`` to 1 %; in single precision and for steps of 0.1 s this holds up to about
-    16,000 s. ``free``: None, or a function that picks leaves of the scene, ``lambda s:
+    **Arguments:** ``scene``, ``state``: of one body; for several use ``jax.vmap``. ``dt``: not
+    zero. ``t``: has an effect only if the scene depends on time; the rounded difference ``(t + dt)
+    - t`` must then equal ``dt`` to 1 %, which in single precision and for steps of 0.1 s is so up
+    to about 16,000 s. ``free``: None, or a function that selects leaves of the scene, ``lambda s:
     s.inertia.diagonal``: their entries are the parameters. ``method``, ``rtol``: as for
-    ``ph.simulate``, which raises; under ``jit`` all is NaN where the body did not finish or ``t +
-    dt`` is rounded too much.
+    ``ph.simulate``, whose errors are raised; under ``jit`` the result is NaN if the body did not
+    finish or ``t + dt`` is rounded too much.
 
-    Raises ValueError for a batch, a ``dt`` that times near ``t`` do not resolve, or a ``free`` that
-    picks the speed or momentum of a wheel that is a coordinate already; TypeError for what is no
-    scene or no state, or a ``free`` that picks what is no array of the scene.
+    Raises ValueError for a batch, a ``dt`` that times close to ``t`` do not resolve, or a ``free``
+    that selects the speed or momentum of a wheel that is a coordinate already; TypeError for a
+    scene or state of another type, or a ``free`` that selects other objects than arrays of the
+    scene.
 
         state, jacobian, noise = ph.propagate(scene, state, 0.1)
         covariance = jacobian @ covariance @ jacobian.T + noise @ noise.T * density / 0.1

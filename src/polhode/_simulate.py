@@ -81,24 +81,24 @@ def simulate(
     - ``rtol``: bound of the accumulated local error at the saved times, of the attitude in radians
       and of the momentum relative to its size; None: 1e-9 in float64, 1e-5 in float32. Closed
       forms ignore it. What it controls and what not: docs/methods.md, "What `rtol` means".
-    - ``record``: what is saved; None: attitude and rates at all times. A function of the motion
-      in their place: ``ph.Record(save=fn)``.
+    - ``record``: what is saved; None: attitude and rates at all times. ``ph.Record(save=fn)`` saves
+      a function of the motion instead.
     - ``until``: a ``ph.Event`` at which each body stops. Its times and samples from there on are
       those of the event, so that ``Trajectory.last`` is the state from which to continue;
       ``Trajectory.event_time`` is inf for a body without an event. The cost depends on the time
       of the last event of the batch, not on the last of ``ts``. Times and states have first and
       second derivatives; a third one raises NotImplementedError.
     - ``events``: one or several ``ph.Event``, searched for while the motion is integrated:
-      ``Trajectory.events`` holds times, states and which event it was, in the order of the motion.
-      A body stops at an event with ``terminal=True`` as with ``until``. One that meets more events
-      than the sum of their ``capacity`` has the status ``TOO_MANY_EVENTS``. A motion in closed form
-      is searched as by ``ph.crossings`` (under ``jit`` each event needs ``samples``).
-    - ``throw``: whether a body that did not finish raises. None: ``ph.SimulationError`` where the
-      status is known, as it is in ``jax.grad`` outside of ``jit``; under ``jit`` or ``vmap``
-      nothing is raised: check ``Trajectory.status``. True: there too, when the compiled program
-      runs (by ``equinox.error_if``: a RuntimeError under ``equinox.filter_jit``, an error of JAX
-      under ``jax.jit``). False: never. The states of a failed body are NaN from its failure on;
-      for a mean over the others see ``ph.successful_mean``.
+      ``Trajectory.events`` contains their times, states and indices, in the order of the motion. A
+      body stops at an event with ``terminal=True`` as with ``until``. A body with more events than
+      the sum of their ``capacity`` has the status ``TOO_MANY_EVENTS``. A motion in closed form is
+      searched as by ``ph.crossings`` (under ``jit`` each event needs ``samples``).
+    - ``throw``: whether an error is raised if a body did not finish. None: ``ph.SimulationError``
+      if the status is concrete, as it is in ``jax.grad`` outside of ``jit``; under ``jit`` or
+      ``vmap`` nothing is raised: check ``Trajectory.status``. True: under ``jit`` as well, when the
+      compiled program runs (by ``equinox.error_if``: a RuntimeError under ``equinox.filter_jit``,
+      an error of JAX under ``jax.jit``). False: never. The states of a failed body are NaN from its
+      failure on; for a mean over the others see ``ph.successful_mean``.
 
     Raises ValueError or TypeError for bad input: wrong kinds or shapes, unsorted times, mixed
     dtypes, a tolerance that the dtype cannot reach.

@@ -1,4 +1,4 @@
-"""Symmetric tops and bodies on a fixed axis: driven and damped spin in elementary functions."""
+"""Symmetric tops and rotation about a fixed axis, driven and damped, in elementary functions."""
 
 import equinox as eqx
 import jax

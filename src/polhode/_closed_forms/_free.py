@@ -270,7 +270,7 @@ def free_motion(
 
 
 def _time_by_time(arguments, t, compensated: bool, requested):
-    """The motion of many bodies, one time after the other; the constants are computed once."""
+    """The motion of many bodies in a loop over the times; the constants are computed once."""
 
     def constants(arguments):
         motion = prepare(*arguments, compensated=compensated)

@@ -107,7 +107,7 @@ class Instant(NamedTuple):
     reduced: Triple  # S, C, N since the last half turn
     functions: Triple  # S = sn / omega_p, C = cn, N = dn
     momentum: Triple
-    half: tuple[Scalars, Scalars] | None  # cosine and sine of half the angle about L, over |M|
+    half: tuple[Scalars, Scalars] | None  # cosine and sine of half the angle about L, scaled
 
     @property
     def precession_half_angle(self) -> tuple[Scalars, Scalars]:

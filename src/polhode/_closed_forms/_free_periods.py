@@ -67,7 +67,8 @@ class Periods(NamedTuple):
     k2: Scalars
     """Elliptic parameter, 0 for a symmetric body and 1 on the separatrix."""
     theta_min: Scalars
-    """Least angle between long axis and momentum [rad]; in LAM that to the nearer of its ends."""
+    """Smallest angle between long axis and momentum [rad]; in LAM from the closer end of the
+    axis."""
     theta_max: Scalars
 
     @property
@@ -84,8 +85,9 @@ class Periods(NamedTuple):
 def principal_periods(moments, omega, products=None) -> Periods:
     """Periods of bodies of principal ``moments`` (..., 3) and body rates ``omega`` (..., 3).
 
-    Infinite where there is no such motion: P_psi on the separatrix, for a sphere and for a
-    symmetric body that spins across its axis, both for a body at rest (nutation limits: 0, pi).
+    Periods are infinite if there is no such motion: P_psi on the separatrix, for a sphere and for a
+    symmetric body that rotates about a transverse axis; both for a body at rest (with nutation
+    limits 0 and pi).
     ``products`` as in `prepare`. Formulas: Landau & Lifshitz, Mechanics, section 37, in the L
     convention of Samarasinha & A'Hearn, Icarus 93 (1991).
     """
@@ -266,8 +268,8 @@ def periods(inertia: Inertia, state: State) -> Periods:
     ``P_psi``: rotation about (LAM) or oscillation about (SAM) the long axis; ``P_phi``: mean
     precession of the long axis about the angular momentum; ``mode``: ``ph.Mode``; ``k2``: the
     elliptic parameter; ``theta_min``, ``theta_max``: angle between long axis and momentum.
-    Infinite where there is no such motion. Differentiable. Formulas: Landau & Lifshitz, Mechanics,
-    section 37; Samarasinha & A'Hearn, Icarus 93 (1991).
+    Periods are infinite if there is no such motion. Differentiable. Formulas: Landau & Lifshitz,
+    Mechanics, section 37; Samarasinha & A'Hearn, Icarus 93 (1991).
 
     Raises TypeError for anything but a ``ph.Inertia`` and a ``ph.State`` of one dtype.
     """

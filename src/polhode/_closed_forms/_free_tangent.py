@@ -7,11 +7,11 @@ which depend on x = B r and y = A p alone; their derivatives need the integrals 
 moments are carried out analytically, so that the code does not divide by differences that may
 vanish.
 
-The attitude follows from two conserved quantities. With e the variation of the attitude (a
-rotation vector in body axes), R e x L = delta(ell) - R delta L is known because ell = R L is
-constant, and e . L = t delta E + 1/2 delta D : integral of L L^T, because the rate of e . L is
-omega . delta L + L . delta D L, of which omega . delta L + 1/2 L . delta D L is the constant
-delta E (D: inverse inertia tensor, E: energy).
+The variation of the attitude follows from two conserved quantities. Let e be this variation (a
+rotation vector in body axes), D the inverse inertia tensor and E the energy. Its part perpendicular
+to L is given by R e x L = delta(ell) - R delta L, because ell = R L is constant. Its part along L
+is e . L = t delta E + 1/2 delta D : integral of L L^T, because the rate of e . L is
+omega . delta L + L . delta D L, where omega . delta L + 1/2 L . delta D L is the constant delta E.
 """
 
 import math
@@ -109,7 +109,7 @@ class Variation(NamedTuple):
 
 
 class Partials(NamedTuple):
-    """Derivatives of S, C, N with respect to x, at fixed z = x - y, and to z."""
+    """Derivatives of S, C, N with respect to x at constant z = x - y, and with respect to z."""
 
     S: tuple[Scalars, Scalars]
     C: tuple[Scalars, Scalars]

@@ -46,16 +46,18 @@ class Cubic(NamedTuple):
     """f as a polynomial in g minus its initial value, reversed if needed so that its third root is
     the isolated one.
 
-    ``momentum_unit`` [kg m^2/s]: momenta below are in this unit; ``nutating``: whether it and the
-    frequency of the nutation differ from 0; ``circular``: whether the motion lies between the first
-    two roots (the lower pair of f), else it lies between the third and the second (the upper pair
-    is the close one); ``sign``: -1 where g was reversed; ``axial_momentum``: about the axis;
-    ``nutation`` = A dg/dt; ``horizontal_product``: scalar product of the horizontal momentum and
-    the vertical; ``one_plus_g``, ``one_minus_g``; ``leading``: size of the leading coefficient;
-    ``root_sum``, ``root_product``: of the first two roots, counted from g; ``third_distance``:
-    distance of the third root times ``leading``; ``mean_distance``: geometric mean of the distances
-    of the third root from the two others, times ``leading``; ``width``: (sum of the square roots of
-    those distances)^2.
+    - ``momentum_unit`` [kg m^2/s]: unit of all momenta below;
+    - ``nutating``: whether this unit and the frequency of the nutation differ from 0;
+    - ``circular``: whether the motion is between the first two roots (the lower pair of f);
+      otherwise it is between the third and the second (the upper pair is the close one);
+    - ``sign``: -1 where g was reversed;
+    - ``axial_momentum``: about the axis; ``nutation`` = A dg/dt; ``horizontal_product``: scalar
+      product of the horizontal momentum and the vertical; ``one_plus_g``, ``one_minus_g``;
+    - ``leading``: absolute value of the leading coefficient;
+    - ``root_sum``, ``root_product``: of the first two roots minus g;
+    - ``third_distance``: distance of the third root from g times ``leading``;
+    - ``mean_distance``: geometric mean of the distances of the third root from the two others,
+      times ``leading``; ``width``: (sum of the square roots of those distances)^2.
     """
 
     momentum_unit: Array

@@ -40,7 +40,7 @@ AT_START = 1e-6
 
 
 class Crossings(eqx.Module):
-    """Crossings of zero of each body, in the order of the motion.
+    """Zero crossings of a function for each body, in the order of the motion.
 
     **Fields:** ``times`` (..., M) [s], inf where there is none; ``slope`` (..., M): derivative
     of the function there [1/s], 0 where there is none; ``count`` (...): number of crossings, which
@@ -65,19 +65,19 @@ def crossings(
     capacity: int | None = None,
     samples: int | None = None,
 ) -> Crossings:
-    """Times within those of ``trajectory`` at which ``fn(wxyz, omega_body, t)`` crosses zero.
+    """Times at which ``fn(wxyz, omega_body, t)`` crosses zero during a ``trajectory``.
 
-    **Arguments:** ``fn``: see ``ph.Event``, which may be given in its place; ``direction``: 1
-    rising, -1 falling (in time), 0 both, or as the event says; ``capacity``: how many crossings of
-    a body are stored; None: all of them; ``samples``: see ``ph.Event``. Under ``jit``, ``vmap`` and
-    ``grad`` a motion in closed form needs both; an integrated one needs neither, and stores at most
-    256 crossings of a body.
+    **Arguments:** ``fn``: a function as in ``ph.Event``, or a ``ph.Event``; ``direction``: 1
+    rising, -1 falling (in time), 0 both, or that of the event; ``capacity``: number of crossings
+    stored for each body; None: all of them; ``samples``: see ``ph.Event``. Under ``jit``, ``vmap``
+    and ``grad`` a motion in closed form needs both; an integrated one needs neither, and stores at
+    most 256 crossings of a body.
 
     Times are as accurate as the motion: to rounding for closed forms, to ``rtol`` over the
     derivative of the function for integrated motions. Times and ``slope`` have first and second
-    derivatives, by the implicit function theorem; third derivatives raise. A zero at the first time
-    (within 1e-6 of the time between two samples) does not count as a crossing; one exactly at the
-    last time may not either: let the times go on past it.
+    derivatives, by the implicit function theorem; third derivatives raise NotImplementedError. A
+    zero at the first time (within 1e-6 of the time between two samples) does not count as a
+    crossing. A zero exactly at the last time may not be found: use a later last time.
 
     The function and its derivative are sampled 32 times per revolution of the fastest natural rate,
     the largest of |L| over the smallest moment at the saved samples and of the rate of gravity. If
@@ -88,8 +88,8 @@ def crossings(
     that rise and fall again between two saved samples need ``samples``.
 
     Raises ValueError for two different directions, if the samples do not fit into memory, if the
-    steps of a body run out (under ``jit`` it is not ``complete``), or if their number is not known
-    under ``jit``.
+    maximum number of steps of a body is reached (under ``jit`` the result is not ``complete``), or
+    if ``capacity`` or ``samples`` are missing under ``jit``.
 
         up = ph.crossings(traj, lambda wxyz, omega_body, t: omega_body[0], direction=1)
         traj.at(up.times).euler()

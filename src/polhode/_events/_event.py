@@ -29,8 +29,8 @@ class Event(eqx.Module):
     form needs it. In a simulation (``simulate(..., events=)``): ``terminal``: whether a body stops
     at the event; ``capacity``: number of events of a body that are stored.
 
-    Raises TypeError or ValueError for a function that takes or returns something else, another
-    direction, fewer than two samples, or no capacity.
+    Raises TypeError or ValueError for a function with other arguments or results, another
+    direction, fewer than two samples, or a capacity below one.
 
         horizontal = ph.Event(lambda wxyz, omega_body, t: ph.rotation.rotate(wxyz, z)[2])
     """

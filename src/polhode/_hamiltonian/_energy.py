@@ -47,9 +47,9 @@ def components(array: Array) -> Vector:
 class Attitude:
     """Rotation body -> space by the rows of its matrix R (``x_space = R x_body``).
 
-    Row ``i`` holds the body components of the space axis ``i``. Rows are evaluated when first
-    used and remembered, so that rows on which a potential does not depend cost nothing; ``used``
-    lists the rows used.
+    Row ``i`` contains the body components of the space axis ``i``. Rows are computed when they are
+    first used, and cached, so that rows on which a potential does not depend are not computed;
+    ``used`` lists the rows used.
     """
 
     def __init__(

@@ -35,7 +35,7 @@ amplifies it 3 (order 10) to 30 (order 20) times more.
 """
 
 CHOSEN = (6, 8, 10, 12, 14, 16)
-"""Orders that a program may choose between."""
+"""Orders between which a compiled program may choose."""
 
 
 def extrapolation_weights(sequence: tuple[int, ...]) -> tuple[Fraction, ...]:
@@ -81,7 +81,7 @@ def _row(order: int, length: int) -> list[np.ndarray]:
     counts = np.zeros(length, np.int32)
     for k, j in enumerate(place):
         counts[k] = sequence[j]
-        if k:  # the others enter by their small differences to the base, which has weight one
+        if k:  # the others contribute small differences from the base, whose weight is one
             weights[:, k] = [
                 float(x)
                 for x in (

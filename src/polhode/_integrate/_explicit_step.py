@@ -180,7 +180,7 @@ def margin_samples(margins: Array, rule: Tableau) -> Array:
 
 def _depths(sampled: Array, rule: Tableau) -> Array:
     """Minimum of the parabola through three neighbouring margins (M - 2, K, B), relative to the
-    least of the three; 1 where it does not lie between them."""
+    smallest of the three; 1 if the minimum is not between them."""
     # A margin that falls below zero and returns between two stages can only be recognised from the
     # parabola through its neighbours. More samples would cost an evaluation each; the parabolas
     # cost none, and the search verifies every minimum.
@@ -204,7 +204,8 @@ def _depths(sampled: Array, rule: Tableau) -> Array:
 
 
 def vertex_of(x, f):
-    """Minimum of the parabola through three points and its value; far away if there is none."""
+    """Position and value of the minimum of the parabola through three points; the position is
+    beyond the step if there is no minimum."""
     (x0, x1, x2), (a, b, c) = x, f
     left, right = (b - a) / (x1 - x0), (c - b) / (x2 - x1)
     bend = (right - left) / (x2 - x0)

@@ -146,7 +146,7 @@ class Extrapolation(diffrax.AbstractAdaptiveSolver):
 
     - ``formal_order``: order $p$. None: chosen from ``accuracy`` in the program (8 to 16; 10 in
       float32).
-    - Conserves nothing exactly; $|q|$, energy and momenta to the accuracy of the step.
+    - No quantity is conserved exactly; $|q|$, energy and momenta to the accuracy of the step.
     - ``evaluations`` of the field per step (order 8: 21, order 12: 43, order 16: 81).
     - ``compensated``: sums the changes within a step, not the states, and carries the rounding
       error of the state to the next step: less rounding, at a third more time.

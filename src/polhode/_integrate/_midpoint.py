@@ -142,7 +142,7 @@ class _Carry(NamedTuple):
     integrals: list[Array]
     width: Array
     last_error: Array  # logarithm of error over tolerance of the step before
-    rejected_step: tuple[Array, Array]  # error and width of a step refused
+    rejected_step: tuple[Array, Array]  # error and width; 0 after an accepted step
     total_angle: Array
     error: Array
     steps: Array
@@ -527,7 +527,7 @@ def in_lanes(
         lane_rows = iter(_as(constant, fixed_rows))
         return jax.tree.unflatten(tree, [next(lane_rows) if x.shape == (n,) else x for x in parts])
 
-    def settle(loop):
+    def refill(loop):
         """Store the results of the finished bodies and refill their lanes."""
         fixed_rows, carry, results, next_body, _ = loop
         constants = constants_of(fixed_rows)
@@ -554,7 +554,7 @@ def in_lanes(
         needs_refill = (idle >= _policy.REFILL_LANES) & (next_body < n) | (idle == wide)
         # a loop of one iteration or none, because a branch (``cond``) would copy all its results
         start = fixed_rows, carry, results, next_body, any_of(jnp.where(needs_refill, 1.0, 0.0))
-        fixed_rows, carry, results, next_body, _ = jax.lax.while_loop(lambda c: c[4], settle, start)
+        fixed_rows, carry, results, next_body, _ = jax.lax.while_loop(lambda c: c[4], refill, start)
         carry, rows = step(constants_of(fixed_rows), carry, rows)
         return fixed_rows, carry, results, next_body, rows
 

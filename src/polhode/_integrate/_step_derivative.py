@@ -442,16 +442,16 @@ def _step_back(
         return rate, arrays
 
     def stage(i, carry):
-        rates, kept = carry
+        rates, residuals = carry
         rate, arrays = linearised(i, rates)
         put_in = jax.lax.dynamic_update_index_in_dim
-        kept = [put_in(rows, x, i, 0) for rows, x in zip(kept, arrays, strict=True)]
-        return put_in(rates, rate, i, 0), kept
+        residuals = [put_in(rows, x, i, 0) for rows, x in zip(residuals, arrays, strict=True)]
+        return put_in(rates, rate, i, 0), residuals
 
     buffers = jnp.zeros((rule.dense_stages, *cotangent.shape), cotangent.dtype)
     _, shapes = jax.eval_shape(linearised, 0, buffers)
-    kept = [jnp.zeros((rule.dense_stages, *x.shape), x.dtype) for x in shapes]
-    _, kept = jax.lax.fori_loop(0, top, stage, (buffers, kept))
+    residuals = [jnp.zeros((rule.dense_stages, *x.shape), x.dtype) for x in shapes]
+    _, residuals = jax.lax.fori_loop(0, top, stage, (buffers, residuals))
 
     def sample(carry):
         place, cotangent, bars = carry
@@ -481,7 +481,7 @@ def _step_back(
         bars, cotangent, sums = carry
         i = top - 1 - j
         bar = jax.lax.dynamic_index_in_dim(bars, i, 0, False)
-        pull = rebuild[-1]([jax.lax.dynamic_index_in_dim(rows, i, 0, False) for rows in kept])
+        pull = rebuild[-1]([jax.lax.dynamic_index_in_dim(rows, i, 0, False) for rows in residuals])
         parameter_cotangents, change = pull(bar)
         bars = bars + (h[None] * change)[None] * table[0][i][:, None, None]
         return bars, cotangent + change, [a + b for a, b in zip(sums, parameter_cotangents)]
@@ -496,19 +496,19 @@ def _taken_apart(linear_map, known: list[Array]) -> tuple[list[Array], Callable]
     components has about a hundred of them, each with one number for every body."""
     leaves, structure = jax.tree.flatten(linear_map)
     numbers = {id(x): k for k, x in enumerate(known)}
-    held = [x for x in leaves if id(x) not in numbers]
-    kinds = list(dict.fromkeys((x.shape, x.dtype) for x in held))
-    groups = [[x for x in held if (x.shape, x.dtype) == kind] for kind in kinds]
+    residuals = [x for x in leaves if id(x) not in numbers]
+    kinds = list(dict.fromkeys((x.shape, x.dtype) for x in residuals))
+    groups = [[x for x in residuals if (x.shape, x.dtype) == kind] for kind in kinds]
 
     def rebuild(stacks):
         rows = [iter([stack[i] for i in range(stack.shape[0])]) for stack in stacks]
-        found = [
+        arrays = [
             known[numbers[id(x)]]
             if id(x) in numbers
             else next(rows[kinds.index((x.shape, x.dtype))])
             for x in leaves
         ]
-        return jax.tree.unflatten(structure, found)
+        return jax.tree.unflatten(structure, arrays)
 
     return [jnp.stack(group) for group in groups], rebuild
 

@@ -107,7 +107,7 @@ def first_switch(
     values = tuple(lowest(margins) for margins in around)
     start_margins = jnp.maximum(
         around[0], 0
-    )  # enough for the first secant, though the low end moves
+    )  # sufficient for the first secant, although the lower end moves
     busy = accepted & jnp.any(below, axis=0)
     # A negative margin at the last node is that of the state at the end of the step, and is
     # certain. Those at other nodes belong to stages, which are less accurate than dense output.

@@ -326,8 +326,8 @@ def _width(progress: Progress, length: Array, is_running: Array, eps: float) -> 
     is_last = remaining <= progress.width * (1 + 1e-9)
     # the remainder is divided in two so that the last step is not much shorter than the one before
     width = jnp.where(is_last, remaining, jnp.minimum(progress.width, remaining / 2))
-    # the width is the difference of two representable times: otherwise rounding of the sum would
-    # accumulate over thousands of steps
+    # The width is the difference of two representable times; otherwise rounding of the sums would
+    # accumulate over thousands of steps.
     end = progress.elapsed + width
     exact = jax.lax.stop_gradient(end - progress.elapsed - width) + width
     exact = jnp.maximum(exact, eps * end)
