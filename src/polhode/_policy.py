@@ -81,8 +81,8 @@ LANES = 64
 fit into the innermost cache of a core; in larger batches more bodies wait for the slowest one."""
 
 REFILL_LANES = 8
-"""[lanes] That have to be free before they are refilled, together: a refill touches the arrays of
-all lanes and takes a considerable part of the time of a step."""
+"""[lanes] Number of idle lanes that are refilled together: a refill writes the arrays of all lanes
+and takes a considerable part of the time of a step."""
 
 QUEUE = 1024
 """[bodies] In one work queue, from which lanes are refilled; limits the memory."""
