@@ -223,8 +223,8 @@ def test_a_tolerance_is_small():
     [
         (ph.LiePoisson, r"the class LiePoisson: make an object of it, ph\.LiePoisson\(\)"),
         (ph.ClosedForm, r"the class ClosedForm: make an object of it, ph\.ClosedForm\(\)"),
-        (diffrax.Tsit5, r"hand it to a chart, ph\.LiePoisson\(diffrax\.Tsit5\(\)\)"),
-        (diffrax.Tsit5(), r"hand it to a chart, ph\.LiePoisson\(diffrax\.Tsit5\(\)\)"),
+        (diffrax.Tsit5, r"pass it to a coordinate system, ph\.LiePoisson\(diffrax\.Tsit5\(\)\)"),
+        (diffrax.Tsit5(), r"pass it to a coordinate system, ph\.LiePoisson\(diffrax\.Tsit5\(\)\)"),
         ("Tsit5", "got str"),
     ],
 )

@@ -250,7 +250,7 @@ def test_explain_says_what_runs_what_is_skipped_and_why():
     assert "at any time" in exact.error
     assert "at the last time" in ph.explain(scene, state, [0.0, 1e6]).error
     asked = str(ph.explain(scene, state, ts, ph.LiePoisson(), record=ph.Record(final_only=True)))
-    assert "LiePoisson(Dopri8): as asked for" in asked
+    assert "LiePoisson(Dopri8): as requested" in asked
     assert "only the last time is recorded" in asked
     with pytest.raises(ValueError, match="strictly"):
         ph.explain(scene, state, [0.0, 0.0])
@@ -266,8 +266,8 @@ class Own(ph.AbstractMethod):
 def test_explain_knows_the_method_of_a_user():
     """It asks of it what every method has, and promises no error in its name."""
     plan = ph.explain(ph.Scene(ph.Inertia.from_moments([1.0, 2, 3])), states(1), [0.0, 1.0], Own())
-    assert "runs    Own: as asked for" in str(plan)
-    assert plan.error == "as the steps asked for make it"
+    assert "runs    Own: as requested" in str(plan)
+    assert plan.error == "unknown: the requested steps do not follow from rtol"
 
 
 def test_explain_says_that_steps_of_another_solver_pass_jumps():

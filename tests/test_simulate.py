@@ -126,7 +126,7 @@ def test_record_keeps_what_is_asked():
     last = ph.simulate(free(), STATE, TS, record=ph.Record(final_only=True))
     assert last.wxyz.shape == (1, 4)
     assert last.ts.tolist() == [2.0]
-    with pytest.raises(ValueError, match="keeps nothing"):
+    with pytest.raises(ValueError, match="would save nothing"):
         ph.Record(attitude=False, rates=False)
 
 

@@ -174,7 +174,7 @@ def split_of(scene: Any, state: Any, ts: Array) -> Split | None:
                 continue
             if mesh not in (None, sharding.mesh) or axes[k] not in (None, axis):
                 raise ValueError(
-                    f"the arrays of a batch lie on their devices in different ways: axis {k} by"
+                    f"the arrays of a batch are sharded in different ways: axis {k} by"
                     f" {axes[k] or axis} and by {axis}, on {mesh} and {sharding.mesh}; place them"
                     " alike with jax.device_put."
                 )

@@ -177,7 +177,7 @@ class Record(eqx.Module):
             save = as_static(save)
         self.save = save
         if not (self.attitude or self.rates):
-            raise ValueError("Record keeps nothing: switch on attitude, rates or both.")
+            raise ValueError("this Record would save nothing: set attitude, rates or both to True.")
 
     @property
     def of_states(self) -> "Record":
@@ -287,8 +287,8 @@ def check_options(
         )
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
-            "adjoint=diffrax.BacksolveAdjoint() finds the way back by integrating it, which misses"
-            " rtol, and cannot reach the scene's numbers: use ph.FlowAdjoint() (the"
+            "adjoint=diffrax.BacksolveAdjoint() integrates the motion backward, which misses rtol,"
+            " and gives no derivatives with respect to the scene: use ph.FlowAdjoint() (the"
             " default), diffrax.RecursiveCheckpointAdjoint(), or diffrax.ForwardMode() for jax.jvp."
         )
     if isinstance(getattr(solver, "term_structure", None), tuple):
@@ -336,7 +336,7 @@ def check_method(method: Any) -> None:
     elif issubclass(kind, diffrax.AbstractSolver):
         description, remedy = (
             f"the solver {kind.__name__}",
-            f": hand it to a chart, ph.LiePoisson({constructor_call(method)})",
+            f": pass it to a coordinate system, ph.LiePoisson({constructor_call(method)})",
         )
     else:
         description, remedy = type(method).__name__, ""
@@ -372,7 +372,7 @@ def of_one_dtype(name: str, tree: Any) -> tuple[Any, Any]:
     dtype = dtypes.pop()
     if dtype not in (jnp.float32, jnp.float64):
         raise TypeError(
-            f"{name} are of {dtype}, which is too coarse to move a body by: make all"
+            f"{name} are of {dtype}, whose precision is too low: make all"
             " arrays float32 or float64, for example with jnp.asarray(x, jnp.float32)."
         )
     return tree, dtype

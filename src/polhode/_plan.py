@@ -232,7 +232,7 @@ def plan(
     method: AbstractMethod | None,
     rtol: Array,
     record: Record,
-    reason: str = "as asked for",
+    reason: str = "as requested",
 ) -> Plan:
     """The plan for checked input (see ``ph.explain``); ``reason``: why ``method`` is used, if it is
     not None."""
@@ -403,14 +403,14 @@ def _error(method: AbstractMethod, scene: Scene, state: State, ts: Array, rtol: 
     eps = float(jnp.finfo(state.wxyz.dtype).eps)
     if not method.exact:
         if not method.keeps_rtol:
-            return "as the steps asked for make it"
+            return "unknown: the requested steps do not follow from rtol"
         if not is_concrete(rtol):
             return f"about rtol rad at every saved time, {_MEANING}"
         if is_concrete(state.omega_body, ts) and 4 * eps * _max_angle(state, ts) > float(rtol):
             angle = _max_angle(state, ts)
             return (
-                f"about {4 * eps * angle:.0e} rad at the last time: rounding of {angle:.2g} rad"
-                f" turned takes more than the {rtol:.0e} asked for"
+                f"about {4 * eps * angle:.0e} rad at the last time: over a rotation of {angle:.2g}"
+                f" rad, rounding exceeds the requested {rtol:.0e}"
             )
         return f"about {rtol:.0e} rad at every saved time, {_MEANING}"
     if method.is_compensated and scene.inertia.symmetry is Symmetry.NONE:

@@ -130,7 +130,7 @@ def _refuse_events_of_commands(scene: Scene, until, events) -> None:
         return
     raise ValueError(
         "events are not searched for in a scene with a SampledTorque: save the motion at the ends"
-        " of its periods and look there, or use ph.FeedbackTorque."
+        " of its periods and search the samples, or use ph.FeedbackTorque."
     )
 
 

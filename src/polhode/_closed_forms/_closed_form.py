@@ -135,7 +135,7 @@ def wheel_objection(scene: Scene) -> str | None:
         are_held = tuple(wheel.is_held for wheel in rotors.wheels)
     if any(axis != 2 for axis in axes):
         return NOT_AXIAL
-    return None if all(are_held) else "a motor turns a rotor, or it spins freely"
+    return None if all(are_held) else "a rotor spins freely or is driven by a motor"
 
 
 VARIABLE = "the inertia changes with time"

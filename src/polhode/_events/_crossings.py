@@ -107,7 +107,7 @@ def crossings(
     if not _propagator(trajectory).method.exact:
         step_result = _by_steps(trajectory, event, slots or CAPACITY)
         if step_result is not None:
-            _raise_if_failed(step_result[1], "the steps to the last time")
+            _raise_if_failed(step_result[1], "before the last time")
             return (
                 step_result[0]
                 if capacity is not None
@@ -122,7 +122,7 @@ def crossings(
             )
         slots = _MIN_CAPACITY
     (result,), _, has_failed = _by_sampling(trajectory, [event], slots, size)
-    _raise_if_failed(has_failed, f"the way through {size:,} samples")
+    _raise_if_failed(has_failed, f"while {size:,} samples were computed")
     while capacity is None and int(np.max(result.count, initial=0)) > slots:
         slots = 2 ** int(np.ceil(np.log2(np.max(result.count))))
         (result,), *_ = _by_sampling(trajectory, [event], slots, size)
@@ -146,11 +146,11 @@ def _propagator(trajectory: Trajectory) -> Propagator:
     return trajectory.propagator
 
 
-def _raise_if_failed(has_failed: Array, way: str) -> None:
+def _raise_if_failed(has_failed: Array, where: str) -> None:
     if is_concrete(has_failed) and np.any(np.asarray(has_failed)):
         raise ValueError(
-            f"the steps of a body ran out on {way}: search a shorter time (traj.between), or ask"
-            " for more steps, ph.LiePoisson(..., max_steps=2**20)."
+            f"a body reached the limit of steps {where}: search a shorter time (traj.between), or"
+            " allow more steps, ph.LiePoisson(..., max_steps=2**20)."
         )
 
 
@@ -265,7 +265,7 @@ def all_crossings(trajectory: Trajectory, events: Sequence[Event], capacity: int
     default = _sample_count(trajectory) if None in sizes else 2
     size = max(default if x is None else x for x in sizes)
     met = _by_sampling(trajectory, events, capacity, size)
-    _raise_if_failed(met.has_failed, f"the way through {size:,} samples")
+    _raise_if_failed(met.has_failed, f"while {size:,} samples were computed")
     return met
 
 

@@ -164,9 +164,8 @@ def _differentiable(x: Array, order: int) -> Array:
     def derivative(primals, tangents):
         if order == 0:
             raise NotImplementedError(
-                "event times and states at events have first and second derivatives, and a third"
-                " one was asked for: differentiate twice at most, or take differences of second"
-                " derivatives."
+                "event times and states at events have first and second derivatives only: a third"
+                " derivative needs finite differences of the second."
             )
         return _differentiable(primals[0], order - 1), tangents[0]
 

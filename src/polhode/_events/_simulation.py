@@ -268,8 +268,8 @@ def check_until(until: Any, record: Any) -> None:
         )
     if record is not None and record.of_states != Record():
         raise ValueError(
-            "until= needs attitude and rates at all times and knows no work and error: leave"
-            " record= out."
+            "until= needs attitude and rates at all times and computes neither work nor error:"
+            " leave record= out."
         )
 
 

@@ -386,7 +386,7 @@ class RotatingFrame(eqx.Module):
             require(
                 np.all(turn < np.pi),
                 f"the body turns by up to {turn.max():.3g} rad between samples; less than pi is"
-                " needed to interpolate: ask for more times in ph.simulate.",
+                " needed to interpolate: pass more times to ph.simulate.",
             )
         bend = angular_acceleration(trajectory)
         return cls(PrescribedAttitude(SampledAttitude(ts, wxyz, omega, bend)), origin)
