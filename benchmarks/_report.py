@@ -142,11 +142,11 @@ def write(
     packages: tuple = (),
     module: str | None = None,
 ) -> Path:
-    """Write the ``numbers`` of benchmark ``name`` (anything that JSON can represent) to a file.
+    """Write the ``numbers`` of benchmark ``name`` to a JSON file; returns its path.
 
-    ``path``: the file, by default ``out/benchmarks/<name>.json``; it is returned. ``packages``: other
-    programs whose versions are recorded. ``module``: the module in the recorded command, by default
-    ``name``. NaN and infinite values become null. The file is written atomically.
+    ``path``: by default ``out/benchmarks/<name>.json``. ``packages``: other programs whose versions
+    are recorded. ``module``: the module in the recorded command, by default ``name``. NaN and
+    infinite values become null. The file is written atomically.
     """
     from polhode._atomic import atomic_write
 
