@@ -1334,7 +1334,7 @@ PARTS: list[Part] = [
     Tensor(),
     Breathing(),
 ]
-"""All of them."""
+"""All parts."""
 
 
 def fits(parts: tuple[Part, ...]) -> bool:

@@ -191,7 +191,7 @@ def programs() -> dict[str, Callable[[], Callable[[], Any]]]:
         return ready
 
     def jacobian(build):
-        """Forward mode, by 16 numbers: the start and an inertia with products."""
+        """Forward mode with respect to 16 numbers: the initial state and a full inertia tensor."""
 
         def ready():
             m, q, w = motion(build, 1)[1]

@@ -90,7 +90,7 @@ SATELLITE = Problem(
     damping=0.05,
     push=(0.02, -0.01, 0.03),
 )
-"""Of the benchmark on accelerators: torques in closed form there are none for."""
+"""The problem of the benchmark on accelerators, with torques that have no closed form."""
 
 
 def errors(
@@ -110,7 +110,7 @@ def errors(
         q = q / np.linalg.norm(q, axis=-1, keepdims=True)
         sign = np.where(np.sum(q * true, axis=-1, keepdims=True) < 0, -1, 1)
         half = np.linalg.norm(sign * q - true, axis=-1) / 2
-        angle = 4 * np.arcsin(np.minimum(half, math.sqrt(0.5)))  # no cancellation near zero
+        angle = 4 * np.arcsin(np.minimum(half, math.sqrt(0.5)))  # accurate near zero
         angle = np.where(np.isfinite(angle), angle, math.pi).max(axis=1)
     found = {
         "scored": n,
