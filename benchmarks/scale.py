@@ -353,9 +353,9 @@ def model() -> str:
     lines += [
         "",
         f"One core needs {cost['ns_per_body']:.0f} ns per body and {cost['ns_per_state']:.0f} ns"
-        f" per saved state of {cost['bytes_per_state']} bytes, that is {rate:.2g} GB/s when many times"
-        f" are saved. The disk writes {disk:.2g} GB/s: with more than {disk / rate:.1f} cores it is"
-        " the bottleneck.",
+        f" per saved state of {cost['bytes_per_state']} bytes, that is {rate:.2g} GB/s when many"
+        f" times are saved. The disk writes {disk:.2g} GB/s: with more than {disk / rate:.1f} cores"
+        " it is the bottleneck.",
         "",
         _others(*(_report.read(f"scale_{name}")["numbers"] for name in ("kills", "devices"))),
     ]
