@@ -173,7 +173,7 @@ CASES = [
 
 @pytest.fixture
 def here(tmp_path, monkeypatch):
-    """A folder with good and bad input of every kind."""
+    """A folder with valid and invalid input of every kind."""
     monkeypatch.chdir(tmp_path)
     for name, text in TEXTS.items():
         (tmp_path / name).write_text(text)

@@ -1,4 +1,4 @@
-"""The main job on asteroid 4179 Toutatis, against published numbers."""
+"""A complete run for asteroid 4179 Toutatis, against published numbers."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""``polhode fit``: a recording in, a table, numbers and a figure out; bad files named as such."""
+"""``polhode fit``: from a recording to a table, numbers and a figure; errors for bad files."""
 
 import json
 
@@ -14,7 +14,8 @@ from polhode.fit._numerics import compiled
 
 @pytest.fixture
 def toss(tmp_path):
-    """A long box tumbling freely, by small Runge-Kutta steps, in deg/s, with noise and a gap."""
+    """A long box that tumbles freely, by small Runge-Kutta steps, in deg/s, with noise and a gap.
+    """
     moments = np.array([1.0, 2.6, 3.2])
     rng = np.random.default_rng(5)
 
@@ -84,7 +85,7 @@ def test_a_recording_that_shows_nothing_ends_with_an_error(tmp_path, capsys):
 
 @pytest.mark.slow  # compiles for half a minute
 def test_a_wheel_shows_the_size(tmp_path, capsys):
-    """A wheel that is driven up at a steady pace, along the axis y."""
+    """A wheel along the y axis that accelerates uniformly."""
     times = np.linspace(0, 2, 101)
     moments = np.array([2e-4, 3e-4, 3.5e-4])
     flight = SteppedMotion(1e-6, (0.0, 1.0, 0.0), steps=4)

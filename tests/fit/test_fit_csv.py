@@ -1,4 +1,4 @@
-"""Recordings from CSV files: what is read, and what is refused with which words."""
+"""Recordings from CSV files: what is read, and the errors for invalid files."""
 
 import jax
 import numpy as np

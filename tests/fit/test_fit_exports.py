@@ -22,7 +22,7 @@ DRAG, NOISE, TIMES = np.array([0.1, 0.05, 0.2]), 0.01, np.linspace(0.0, 8.0, 25)
 
 @pytest.fixture(scope="module")
 def of_scene():
-    """Moments and drag, whose common size the rates do not show."""
+    """Moments and drag, whose common scale the rates do not determine."""
     scene = ph.Scene(BODY, torque=ph.LinearDamping(DRAG))
     path = ph.simulate(scene, STATE, TIMES).omega_body
     rates = path + NOISE * jax.random.normal(jax.random.key(3), path.shape)
@@ -73,7 +73,7 @@ def test_ratios_are_known_where_only_a_common_factor_is_not(of_scene):
 
 
 def test_residuals_of_readings_are_those_of_the_fit(of_inertia):
-    """Also where a calibrated bias stands between readings and rates, in figures too."""
+    """Also, and in figures, if a calibrated bias relates readings to rates."""
     times, bias = np.linspace(0.0, 20.0, 60), np.array([0.3, -0.2, 0.1])
     rates = ph.simulate(ph.Scene(BODY), STATE, times).omega_body
     rates = rates + NOISE * jax.random.normal(jax.random.key(1), rates.shape)

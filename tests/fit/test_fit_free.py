@@ -55,8 +55,9 @@ OPTIONS = FitOptions(gyroscope=Gyroscope.ideal())
 
 
 def fitted(times, rates):
-    """Fits of eight recordings at once, put together: the program of all 200 compiles for three
-    times as long."""
+    """Fits in groups of eight recordings, concatenated: the program for all 200 would take three
+    times as long to compile.
+    """
     noise = SIGMA[:, None, None]
     parts = [
         fit_inertia(
@@ -92,7 +93,7 @@ def test_every_fit_converges(fits):
 
 
 def test_errors_are_as_large_as_the_bound_says(fits, cases):
-    """Errors of all six entries at once, in the metric of the information about them."""
+    """Errors of all six entries together, in the metric of their information."""
     information = np.asarray(fits.information)
     inner = np.linalg.solve(information[:, 6:, 6:], information[:, 6:, :6])
     marginal = information[:, :6, :6] - information[:, :6, 6:] @ inner
@@ -243,7 +244,7 @@ def test_recordings_of_different_length_stack():
 
 @pytest.mark.slow  # gaps: test_gaps_are_left_out
 def test_a_missing_row_in_five_does_not_hide_the_noise(cases):
-    """Nor do readings of no noise at all count as far from it."""
+    """And readings without any noise do not count as far from it."""
     times, clean, noisy, *_ = cases
     holed = np.stack([noisy[2], noisy[4], np.broadcast_to(clean[0, :1], clean[0].shape)])
     holed[:2, ::5] = np.nan

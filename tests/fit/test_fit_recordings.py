@@ -1,4 +1,4 @@
-"""Fits of real tosses (skipped where the recordings are absent): known answers, named traps."""
+"""Fits of real tosses with known results and known pitfalls (skipped without the recordings)."""
 
 import csv
 from pathlib import Path
@@ -64,7 +64,7 @@ def crossings(times, x):
 @pytest.mark.skipif(not PISA.exists(), reason="needs ../shared/data/pisa_racket")
 @pytest.mark.slow
 def test_a_toss_recorded_with_left_handed_axes():
-    """The author's fit, made with the mended sign, is 18(5) : 19(5) : 1."""
+    """The author's fit, with the corrected sign, is 18(5) : 19(5) : 1."""
     table = np.loadtxt(PISA)
     fit = fit_inertia(table[:, 0], table[:, 1:4], throw=False)
     assert "step limit" not in fit.findings()
@@ -106,7 +106,8 @@ def test_gaps_of_the_wheel_are_bridged_and_remembered():
 @pytest.mark.slow
 @pytest.mark.parametrize("given", [{"attitude_noise": 0.03}, {}])
 def test_noisy_attitudes_alone_give_the_body(given):
-    """Their differences start the search so far off that the first starts meet in local minima."""
+    """Differences of the attitudes start the search so far away that it reaches local minima first.
+    """
     moments, times = np.array([1.0, 1.6, 2.2]), np.linspace(0, 8, 201)
     state = ph.State([0.6, 0.3, -0.2, 0.7], [0.6, 2.0, 0.8])
     wxyz = ph.simulate(ph.Scene(ph.Inertia.from_moments(moments)), state, times).wxyz

@@ -14,7 +14,7 @@ decades = st.floats(-3, 3)
 
 @eqx.filter_jit
 def motions(omega, wxyz, t, inner):
-    """The motion of a particle in a frame, in space, and again in the frame."""
+    """Motion of a particle in the frame, in space, and transformed back to the frame."""
     frame = ph.RotatingFrame.from_rate(omega, wxyz=wxyz)
     position = frame.position_to_space(t, inner[0])
     velocity = frame.velocity_to_space(t, *inner[:2])
@@ -64,7 +64,7 @@ def local_vertical(frame, wxyz, omega, t):
 @settings(max_examples=40, deadline=None)
 @given(decades, st.tuples(*[st.integers(-3, 3)] * 4).filter(any), vectors, st.floats(0, 6))
 def test_attitudes_to_the_orbit_frame_and_back(decade, wxyz, omega, anomaly):
-    """Of orbits from 1e-3 to 1e3 of one size, whose rates are scaled with them."""
+    """Orbits of sizes from 1e-3 to 1e3, with rates scaled accordingly."""
     axis = 10.0**decade
     rate = axis**-1.5
     frame = ph.LVLH(ph.KeplerOrbit(1.0, axis, 0.1, 0.5))

@@ -1,4 +1,4 @@
-"""The formulas of docs/free_motion.md against quadrature, in 30 digits, without the library."""
+"""The formulas of docs/free_motion.md against quadrature in 30 digits, without the package."""
 
 import mpmath as mp
 import pytest

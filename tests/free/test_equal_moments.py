@@ -45,7 +45,7 @@ def periods(x, base):
 
 @functools.cache
 def programs(function, inner):
-    """First derivatives, and second ones."""
+    """Programs of first and second derivatives."""
     return jax.jit(jax.jacfwd(function)), jax.jit(jax.jacfwd(inner(function)))
 
 
@@ -70,7 +70,7 @@ BODIES = {
 
 
 def right_or_nan(function, kind, *, turned, inner=jax.jacfwd, tolerance=1e-6):
-    """Second derivatives, of which those that are finite agree with differences."""
+    """Finite second derivatives must agree with differences; the others are NaN."""
     base = np.diag(BODIES[kind])
     if turned:
         base = TURN @ base @ TURN.T

@@ -1,4 +1,4 @@
-"""However bodies and times are cut into chunks, the motion is the same."""
+"""The motion does not depend on how bodies and times are divided into chunks."""
 
 import jax
 import jax.numpy as jnp

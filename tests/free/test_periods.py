@@ -39,7 +39,7 @@ def test_halley():
 
 @pytest.mark.parametrize("omega", [[0.3, 0.2, 1.0], [1.0, 0.1, 0.1]], ids=["SAM", "LAM"])
 def test_precession_of_the_short_axis(omega):
-    """Turns of the axis about the momentum, counted over whole periods of the rates."""
+    """Revolutions of the axis about the momentum, counted over whole periods of the rates."""
     body, state = ph.Inertia.from_moments([1.0, 2.0, 3.0]), ph.State([1.0, 0, 0, 0], omega)
     found = ph.periods(body, state)
     motion = ph.simulate(ph.Scene(body), state, np.linspace(0, 4 * float(found.P_psi), 401))
@@ -59,7 +59,7 @@ def test_a_plate_wobbles_twice_as_fast_as_it_spins():
 
 
 def _exact(I, w):
-    """P_psi by mpmath's K; P_phi by the mean of the long axis' precession over a period."""
+    """P_psi by mpmath's K; P_phi by the mean precession of the long axis over a period."""
     low, mid, high = sorted(range(3), key=lambda k: I[k])
     M2 = sum((a * b) ** 2 for a, b in zip(I, w, strict=True))
     E2 = sum(a * b * b for a, b in zip(I, w, strict=True))
@@ -183,7 +183,7 @@ def _second(a, point, direction):
 @pytest.mark.parametrize("omega", [(0.3, 0.2, 1.0), (1.0, 0.2, 0.2)])
 @pytest.mark.slow  # of states: test_second_derivatives
 def test_second_derivatives(omega):
-    """Along a direction in moments and rates at once, against differences of 50 digits."""
+    """Along a direction in moments and rates together, against differences of 50 digits."""
     point = np.array([1.0, 2.0, 3.0, *omega])
     direction = np.array([0.25, -0.5, 0.125, 0.75, -0.25, 0.5])
 
@@ -200,7 +200,7 @@ def test_second_derivatives(omega):
 
 @pytest.mark.parametrize("off", [1e-4, -1e-9, 1e-13])
 def test_derivatives_next_to_the_separatrix(off):
-    """P_psi there is a logarithm of the distance: against 50-digit differences of 4 K / rate."""
+    """P_psi is logarithmic in the distance: against 50-digit differences of 4 K / rate."""
     moments, omega = (1.0, 2.0, 2.25), (0.75, 0.5, 1.0 + off)
 
     def exact(a, b, c, u, v, w):
@@ -245,7 +245,7 @@ def test_derivatives_are_finite_in_the_limits():
     ids=["sphere", "intermediate axis"],
 )
 def test_derivative_of_the_period_of_a_permanent_rotation(moments, omega):
-    """P = 2 pi/|omega|, of which the derivative along the axis is -2 pi omega/|omega|^3."""
+    """P = 2 pi/|omega|, whose derivative along the axis is -2 pi omega/|omega|^3."""
     omega = jnp.array(omega)
     gradient = jax.jit(jax.grad(lambda w: principal_periods(jnp.array(moments), w).P_phi))(omega)
     size = float(jnp.linalg.norm(omega))
@@ -262,7 +262,7 @@ def test_mixed_dtypes_are_refused():
 
 @jax.jit
 def _derivatives_by_rates(moments, omega):
-    """Forward and reverse, of each body by its own rates: (5, N, 3)."""
+    """Forward and reverse, of each body with respect to its own rates: (5, N, 3)."""
     one = [jacobian(_numbers, 1) for jacobian in (jax.jacfwd, jax.jacrev)]
     return [jax.vmap(f, (0, 0, None), 1)(moments, omega, jnp.zeros(3)) for f in one]
 

@@ -1,4 +1,4 @@
-"""Second derivatives of the exact free motion against 50 digits (second_cases.json)."""
+"""Second derivatives of the closed-form free motion against 50 digits (second_cases.json)."""
 
 import json
 from pathlib import Path
@@ -17,9 +17,9 @@ CASES = json.loads(Path(__file__).with_name("second_cases.json").read_text())
 @pytest.mark.slow  # 30 s of compilation
 @pytest.mark.parametrize("products", [False, True], ids=["moments", "tensors"])
 def test_second_derivatives(products):
-    """Forward over reverse. By entries off the tensor's diagonal with ``products``, which adds the
-    derivatives of principal axes to the program; without, along pairs of directions that have no
-    such entries."""
+    """Forward over reverse mode. ``products``: with respect to products of inertia, which adds the
+    derivatives of the principal axes to the program; otherwise along directions without them.
+    """
     dtype = np.float64
     rows = {True: 0, False: 0}
 
@@ -68,7 +68,7 @@ def test_second_derivatives(products):
 
 @pytest.mark.slow
 def test_second_derivatives_of_many_bodies_at_once():
-    """Forward over a mapped reverse mode differentiates the compiled coefficients themselves."""
+    """Forward over vmapped reverse mode differentiates the coefficients of the derivative rule."""
     rng = np.random.default_rng(4)
     moments = 1 + rng.random((3, 3))
     omega, move = rng.normal(size=(2, 3, 3))

@@ -1,4 +1,4 @@
-"""The reference data of `polhode reference`: 17 digits, by Taylor series and polhode."""
+"""The reference data of `polhode reference`: 17 digits, against Taylor series and polhode."""
 
 import csv
 import io
@@ -41,7 +41,7 @@ def test_stored_states_agree_with_taylor_series(name, place):
 
 @pytest.mark.parametrize("moments", [(1.0, 1.0, 1.5), (0.5, 2.0, 2.0)])
 def test_steps_of_a_symmetric_body_are_those_of_one_series(moments):
-    """By which the sphere with one moment changed is moved, whose rates do not return."""
+    """For the sphere with one changed moment, whose rates do not return within a period."""
     omega = (0.5, -0.25, 1.0)
     with mp.workdps(60):
         found = by_turns([*map(mp.mpf, moments)], [*map(mp.mpf, omega)], 7.3, mp.mpf("1.1"), 40)
@@ -52,8 +52,9 @@ def test_steps_of_a_symmetric_body_are_those_of_one_series(moments):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ROWS)
 def test_stored_states_and_derivatives_agree_with_taylor_series(name):
-    """States of all samples, derivatives of the last one; those of all samples are compared by
-    ``make_tumbling.py --check``, and of the first ones with the closed form below."""
+    """States of all samples, derivatives of the last one. ``make_tumbling.py --check`` compares the
+    derivatives of all samples, a test below those of the first ones with the closed form.
+    """
     *others, last = TEXTS[name]["samples"]
     assert difference(TEXTS[name], last, True, digits=70) < 0.5001
     for sample in others:

@@ -1,4 +1,4 @@
-"""Autodiff of the one H gives exactly the closed forms of document 000 (corrected)."""
+"""Autodiff of the Hamiltonian gives the closed forms of document 000 (corrected)."""
 
 import json
 
@@ -31,7 +31,7 @@ BODIES = [
 
 
 def random_states(moments, dtype, n=1000):
-    """Angles with sin(theta) >= 0.1, momenta of the size that the body's rates of order 1 give."""
+    """Angles with sin(theta) >= 0.1, and momenta that correspond to body rates of order 1."""
     rng = np.random.default_rng(7)
     q = np.stack([rng.uniform(-3, 3, n), rng.uniform(0.11, 3.03, n), rng.uniform(-3, 3, n)], -1)
     qd = rng.normal(size=(n, 3))
@@ -46,9 +46,9 @@ def deviation(got, want, scale):
 
 @jax.jit
 def deviations(moments, q, qd, p) -> dict[str, jax.Array]:
-    """Largest deviation of autodiff from each closed form, over the size of the terms it adds up.
+    """Largest deviation of autodiff from each closed form, relative to the size of its terms.
 
-    So it measures rounding, not cancellation.
+    It therefore measures rounding, not cancellation.
     """
     dtype = q.dtype
     hamiltonian = ph.hamiltonian(Inertia.from_moments(moments))
@@ -190,7 +190,7 @@ def test_printed_eq_39_fails():
 
 
 def test_other_misprints_fail():
-    """Eq. 14 with its stray p_theta and eq. 10 with sin psi do not survive the check."""
+    """The check rejects eq. 14 with its stray p_theta, and eq. 10 with sin psi."""
     moments, q, p = (jnp.array(x) for x in (MOMENTS, Q, P))
     rate_q, rate_p = ph.hamiltons_equations(ph.hamiltonian(Inertia.from_moments(moments)))(q, p)
     stray = doc.theta_form(moments, q).at[2, 1].multiply(p[1])

@@ -1,4 +1,4 @@
-"""Euler's equation: theory.md 8.3 and 8.4, and where document 003's shortened form holds."""
+"""Euler's equation: theory.md 8.3 and 8.4, and where document 003's shortened form is valid."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Shapes against their defining integrals, points, composite bodies, log-Cholesky, boundary."""
+"""Shapes against their defining integrals, points, composite bodies, log-Cholesky, flat bodies."""
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ from polhode.rotation import axis_angle_to_wxyz, wxyz_to_matrix
 
 
 def of_revolution(outer, inner, low, high):
-    """Moments per mass and height of the centre of a solid of revolution, by quadrature."""
+    """Moments per mass, and height of the centre, of a solid of revolution, by quadrature."""
     with mp.workdps(25):
         volume = mp.quad(lambda z: outer(z) ** 2 - inner(z) ** 2, [low, high])
         height = mp.quad(lambda z: z * (outer(z) ** 2 - inner(z) ** 2), [low, high]) / volume

@@ -1,4 +1,4 @@
-"""The scenes that come with the project read, build in both dtypes and say what they claim."""
+"""The included scenes can be read and built in both dtypes, and agree with their stated values."""
 
 from pathlib import Path
 

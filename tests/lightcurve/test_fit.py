@@ -1,4 +1,4 @@
-"""Tumblers found again from their light alone; derivatives, mirrors, messages."""
+"""Tumbling bodies recovered from their light curves; derivatives, mirror images, messages."""
 
 import types
 
@@ -30,7 +30,7 @@ def seen():
 
 @pytest.fixture(scope="module")
 def trial(seen):
-    """Eight bodies of given periods in each mode."""
+    """Eight bodies with the same periods in each mode."""
     meant = _frequencies.Hypotheses(
         np.array([1.2, 1.2]), np.array([0.7, 0.7]), np.array([True, False])
     )
@@ -50,7 +50,7 @@ def test_trial_bodies_have_the_periods_asked(trial):
 
 
 def test_model_is_that_of_simulate(seen, trial):
-    """Light worked out by the public pieces, one body at a time."""
+    """Brightness computed with public functions, one body at a time."""
     curve, _, points = seen
     values = magnitudes(trial, points)
     x = np.asarray(trial.unknowns[0])
@@ -72,7 +72,9 @@ def test_model_is_that_of_simulate(seen, trial):
 
 
 def test_light_has_the_sums_of_its_mode(trial):
-    """Constant directions: the variance is in a few sums, whose parity is that of the mode."""
+    """With constant directions few combinations of the frequencies contain the variance; their
+    parity depends on the mode.
+    """
     t = np.r_[0, np.sort(np.random.default_rng(4).uniform(0, 60, 127))]
     sun, observer = np.tile([1.0, 0, 0], (128, 1)), np.tile([0.8, 0.6, 0], (128, 1))
     curve = lightcurve.LightCurve.of(t, 0 * t, sun, observer)
@@ -105,7 +107,9 @@ def test_derivatives_by_every_unknown(seen, trial):
 
 
 def test_steps_keep_the_frequencies_that_they_mean(trial):
-    """To first order as plain steps; to second only the frequencies are as the step says."""
+    """Equal to plain steps to first order; to second order the frequencies change as the step
+    intends.
+    """
 
     @jax.jit
     def logs(unknowns):
@@ -163,7 +167,7 @@ def test_a_list_that_ends_before_the_odds_do_says_so():
 
 @pytest.mark.slow
 def test_a_tumbler_is_found_again():
-    """One night of one geometry, with a gap: the body, or its mirror image."""
+    """One night in one geometry, with a gap: the body, or its mirror image."""
     minute, rng = 1 / 1440, np.random.default_rng(1)
     square = np.array([1.0, 0.6, 0.4]) ** 2
     inertia = ph.Inertia(square.sum() - square)

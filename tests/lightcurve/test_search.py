@@ -1,4 +1,6 @@
-"""Trial bodies: they have the periods asked, the best of each are kept; normal points."""
+"""Trial bodies have the requested periods, and the best of each hypothesis are retained; normal
+points.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -90,7 +92,8 @@ def test_poles_of_one_pair_do_not_crowd_out_others():
 
 
 def test_spread_of_offsets_is_the_likeliest():
-    """Twelve groups of a linear model with three other unknowns; all of them integrated out."""
+    """Twelve groups of a linear model with three other unknowns, all of which are integrated out.
+    """
     rng = np.random.default_rng(1)
     group = np.repeat(np.arange(12), 6)
     other = np.c_[rng.normal(size=(72, 2)), np.ones(72)]
@@ -130,7 +133,7 @@ def test_misfit_is_that_of_the_light_times_the_gain():
 
 
 def test_likeness_is_the_variance_of_sums_over_that_of_independent_ones():
-    """Nights of 20 points with a correlation of 0.7 from one to the next; the sums of 400 draws."""
+    """Nights of 20 points with a correlation of 0.7 between neighbours; the sums of 400 draws."""
     rng = np.random.default_rng(2)
     night = np.repeat(np.arange(20), 20)
     t = night + 0.01 * np.tile(np.arange(20), 20)

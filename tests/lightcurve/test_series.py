@@ -1,4 +1,4 @@
-"""Bodies are turned to where their light comes nearest to the series of the points."""
+"""Phases of trial bodies are chosen so that their series is closest to that of the points."""
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ def moved(bodies, later):
 
 @pytest.fixture(scope="module")
 def blank():
-    """Directions that keep still, and a night that is brighter than the other."""
+    """Constant directions, and two nights with different offsets."""
     t = np.sort(np.random.default_rng(0).uniform(0, 10, 256))
     sun, observer = np.array([1.0, 0, 0.1]), np.array([np.cos(0.4), np.sin(0.4), -0.1])
     return lightcurve.LightCurve.of(
@@ -41,7 +41,9 @@ def blank():
 @pytest.mark.parametrize("mode", [0, 1])
 @pytest.mark.slow
 def test_any_phases_are_turned_to_those_of_the_points(blank, mode):
-    """A body that explains the points; copies of it, anywhere on the polhode and about the pole."""
+    """A body that explains the points; copies of it with other phases on the polhode and about the
+    momentum.
+    """
     meant = Hypotheses(*(x[mode : mode + 1] for x in MEANT))
     draws, long_axis = _search.draw(jax.random.key(3), meant, MANY)
     bodies, good = _search.build(draws, long_axis, PHASE)

@@ -1,4 +1,4 @@
-"""A headless Chromium, spoken to over two pipes: opens a page, moves what is on it, looks at it."""
+"""A headless Chromium, controlled over two pipes: open a page, use its controls, read its image."""
 
 import base64
 import contextlib
@@ -28,12 +28,12 @@ _OPTIONS = (
 
 
 def find() -> str | None:
-    """The path of a Chromium or Chrome, None without one."""
+    """The path of Chromium or Chrome; None if there is none."""
     return next(filter(None, map(shutil.which, NAMES)), None)
 
 
 class Browser:
-    """One tab. ``events`` are what the browser told without being asked."""
+    """One tab. ``events`` are unsolicited messages of the browser."""
 
     def __init__(self, program: str, profile: Path, size: tuple[int, int]):
         get, give_back = os.pipe()
@@ -83,7 +83,7 @@ class Browser:
         return json.loads(line)
 
     def run(self, script: str):
-        """The value of an expression in the page; a promise is waited for."""
+        """The value of an expression in the page; waits for a promise."""
         found = self.ask(
             "Runtime.evaluate", expression=script, returnByValue=True, awaitPromise=True
         )
@@ -98,7 +98,7 @@ class Browser:
         self.wait(f"document.readyState === 'complete' && location.href === {address!r}")
 
     def wait(self, condition: str, seconds: float = 180.0) -> None:
-        """Until the expression is true."""
+        """Wait until the expression is true."""
         end = time.monotonic() + seconds
         while not self.run(condition):
             if time.monotonic() > end:
@@ -106,7 +106,7 @@ class Browser:
             time.sleep(0.05)
 
     def look(self) -> np.ndarray:
-        """What the page shows, (rows, columns, 3) from 0 to 1."""
+        """Image of the page, (rows, columns, 3) from 0 to 1."""
         from matplotlib.image import imread
 
         twice = "new Promise(r => requestAnimationFrame(() => requestAnimationFrame(() => r(1))))"
@@ -115,7 +115,7 @@ class Browser:
         return imread(io.BytesIO(picture), format="png")[..., :3]
 
     def box(self, selector: str) -> tuple[slice, slice]:
-        """Where an element is in the picture: rows, columns."""
+        """Position of an element in the image: rows, columns."""
         place = f"document.querySelector({selector!r}).getBoundingClientRect().toJSON()"
         found = {name: round(value) for name, value in self.run(place).items()}
         return slice(found["top"], found["bottom"]), slice(found["left"], found["right"])
@@ -128,7 +128,7 @@ class Browser:
 
     @property
     def requests(self) -> list[str]:
-        """Addresses that the page asked for since it was opened."""
+        """Addresses that the page requested since it was opened."""
         sent = [e for e in self.events if e.get("method") == "Network.requestWillBeSent"]
         return [event["params"]["request"]["url"] for event in sent]
 
@@ -147,7 +147,7 @@ class Browser:
 
 @contextlib.contextmanager
 def opened(program: str, profile: Path, size: tuple[int, int] = (720, 480)) -> Iterator[Browser]:
-    """A browser that ends with the block."""
+    """Context manager for a browser."""
     browser = Browser(program, profile, size)
     try:
         yield browser

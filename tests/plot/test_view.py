@@ -1,4 +1,5 @@
-"""The page of moving bodies: it holds the motion, stands alone, and shows it in a browser."""
+"""The HTML page of moving bodies: it contains the motion, needs no network, and works in a browser.
+"""
 
 import base64
 import json
@@ -19,7 +20,7 @@ TURN = 2 * np.pi  # s: one turn of the spinning body
 
 
 def known(page: plot.View) -> dict:
-    """What the page knows, its arrays decoded."""
+    """Data of the page, with decoded arrays."""
     text = re.search(r'<script id="motion"[^>]*>(.*?)</script>', page.html, re.S)[1]
     motion = json.loads(text)
     for body in motion["bodies"]:
@@ -36,7 +37,7 @@ def decoded(text: str, dtype: str = "<f4") -> np.ndarray:
 
 
 def spinning(samples: int, end: float, tensor=None, start: float = 0.0) -> plot.Samples:
-    """A body that turns about its own and space's z axis, 1 rad/s."""
+    """A body that rotates about its own and space's z axis at 1 rad/s."""
     ts = np.linspace(start, end, samples)
     half = (ts - start) / 2
     wxyz = np.stack([np.cos(half), 0 * half, 0 * half, np.sin(half)], axis=-1)
@@ -46,7 +47,7 @@ def spinning(samples: int, end: float, tensor=None, start: float = 0.0) -> plot.
 
 @pytest.fixture(scope="module")
 def trajectory():
-    """Two free bodies, exact."""
+    """Two free bodies in closed form."""
     scene = ph.Scene(ph.Inertia.from_moments(MOMENTS))
     omega = jnp.array([[0.01, 1.0, 0.01], [1.0, 0.3, 0.1]])
     return ph.simulate(scene, ph.State(wxyz=[1.0, 0, 0, 0], omega_body=omega), [10.0, 10.5, 12.0])
@@ -217,7 +218,7 @@ def browser(tmp_path_factory):
 
 
 def at(browser, seconds: float) -> np.ndarray:
-    """The page's picture of the body with the slider at a time."""
+    """Image of the body with the slider at a time."""
     browser.run(
         f"(s => {{ s.value = {seconds}; s.dispatchEvent(new Event('input')); }})"
         "(document.getElementById('time'))"
@@ -228,7 +229,7 @@ def at(browser, seconds: float) -> np.ndarray:
 
 
 def changed(one: np.ndarray, other: np.ndarray) -> float:
-    """Share of the pixels that differ visibly."""
+    """Fraction of the pixels that differ visibly."""
     return float((np.abs(one - other).max(axis=-1) > 0.1).mean())
 
 
@@ -276,6 +277,6 @@ def test_a_browser_plays_and_hides(browser, trajectory, tmp_path):
 
 
 def test_a_page_carries_the_licence_of_what_it_carries(trajectory):
-    """three.js may be passed on with its copyright notice and the text of its licence."""
+    """The licence of three.js requires its copyright notice and the licence text."""
     licence = Path(plot.__file__).parent / "viewer" / "three.LICENSE.txt"
     assert licence.read_text(encoding="utf-8").strip() in plot.view(trajectory).html

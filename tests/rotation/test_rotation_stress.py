@@ -1,4 +1,4 @@
-"""Every conversion against 120-digit arithmetic: the stress table with few random samples."""
+"""Every conversion against 120-digit arithmetic: the stress test with few random samples."""
 
 import numpy as np
 import pytest
