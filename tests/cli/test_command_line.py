@@ -88,7 +88,7 @@ def test_options_replace_the_scene(here, capsys):
         assert data.sizes["clone"] == 4
         assert data["wxyz"].dtype == np.float32
         first = data["moments"].values[1:]
-    again = ("--precision", "float32", "--no-figure", "-q")  # the same program
+    again = ("--precision", "float32", "--no-figure", "-q")  # reuses the compiled program
     assert run("top.toml", "--clones", 3, "--seed", 10, *again) == 0
     captured = capsys.readouterr()
     assert captured.out == captured.err == ""
@@ -431,7 +431,7 @@ def test_interrupt_of_a_running_process_leaves_nothing_half_written(here):
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         signal.signal(signal.SIGINT, before)
         deadline = time.monotonic() + 120
-        # the folder is made once the scene is read and the work is about to begin
+        # the folder is created after the scene is read, just before the computation
         while not output.parent.exists() and time.monotonic() < deadline:
             assert process.poll() is None
             time.sleep(0.05)

@@ -245,10 +245,10 @@ def test_a_kill_costs_the_chunks_in_progress(whole, tmp_path):
     path, k = tmp_path / "killed.zarr", random.randint(1, 15)
     killed(path, -k)
     assert list(tmp_path.rglob("*.partial"))
-    (tmp_path / ".killed.zarr.ab12.partial").mkdir()  # of one that was killed while it made it
+    (tmp_path / ".killed.zarr.ab12.partial").mkdir()  # left by a process that was killed
     for left in tmp_path.rglob("*.partial"):
         os.utime(left, (0, 0))
-    (tmp_path / ".killed.zarr.cd34.partial").mkdir()  # of one that makes it now
+    (tmp_path / ".killed.zarr.cd34.partial").mkdir()  # of a process that is still running
     ens.stream(make(), TS, path, chunk=CHUNK)
     assert equal(path, whole), k
     assert [left.name for left in tmp_path.rglob("*.partial")] == [".killed.zarr.cd34.partial"]

@@ -84,15 +84,15 @@ def test_single_samples_far_off_are_outliers_and_runs_are_not():
     some = rest.copy()
     some[0, rng.choice(500, 8, replace=False), 1] += 15
     assert has_outliers(jnp.asarray(some), whole, None)
-    # the fit is robust already
+    # with a robust fit
     assert not has_outliers(jnp.asarray(some), whole, object())
-    # a model that lacks something
+    # an incomplete model
     wrong = rest + 10 * (np.sin(T) > 0.9)[None, :, None]
     assert not has_outliers(jnp.asarray(wrong), whole, None)
-    # samples that are not there
+    # missing samples
     gaps = dataclasses.replace(whole, present=jnp.asarray(np.abs(some[..., 1]) < 6, float))
     assert not has_outliers(jnp.asarray(some), gaps, None)
-    # readings at a limit, whose residuals are zero while the model is beyond it
+    # saturated readings, whose residuals are zero while the model exceeds the limit
     limits = np.zeros((1, 500, 3))
     limits[0, :400, 2] = 1
     at_limit = rest * (limits == 0)
@@ -196,4 +196,4 @@ def test_errors_of_moments_that_are_nearly_equal_hold_what_drives_them_apart():
     rms = np.sqrt(np.mean(np.square(z), axis=0))
     assert np.all((rms > 0.8) & (rms < 1.2)), rms
     alone = np.sqrt(np.mean((found[:, :2] - moments[:2]) ** 2, axis=0)) / noise
-    assert np.all(alone[:2] > 1.3), alone  # without what is added the intervals would be too narrow
+    assert np.all(alone[:2] > 1.3), alone  # without the addition the intervals would be too narrow

@@ -14,8 +14,7 @@ from polhode.fit._numerics import compiled
 
 @pytest.fixture
 def toss(tmp_path):
-    """A long box that tumbles freely, by small Runge-Kutta steps, in deg/s, with noise and a gap.
-    """
+    """A long box that tumbles freely, by small Runge-Kutta steps, in deg/s, with noise and gap."""
     moments = np.array([1.0, 2.6, 3.2])
     rng = np.random.default_rng(5)
 

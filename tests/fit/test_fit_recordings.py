@@ -106,8 +106,7 @@ def test_gaps_of_the_wheel_are_bridged_and_remembered():
 @pytest.mark.slow
 @pytest.mark.parametrize("given", [{"attitude_noise": 0.03}, {}])
 def test_noisy_attitudes_alone_give_the_body(given):
-    """Differences of the attitudes start the search so far away that it reaches local minima first.
-    """
+    """Their differences start the search so far away that it first reaches local minima."""
     moments, times = np.array([1.0, 1.6, 2.2]), np.linspace(0, 8, 201)
     state = ph.State([0.6, 0.3, -0.2, 0.7], [0.6, 2.0, 0.8])
     wxyz = ph.simulate(ph.Scene(ph.Inertia.from_moments(moments)), state, times).wxyz

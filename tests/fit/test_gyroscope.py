@@ -187,8 +187,7 @@ def with_errors(omega, std, seed=0):
 
 @pytest.mark.slow
 def test_intervals_hold_with_errors_of_scale_and_misalignment():
-    """One per cent of each, 60 bodies; if they are treated as exact, the intervals miss the truth.
-    """
+    """One per cent of each, 60 bodies; treated as exact, their intervals miss the truth."""
     ratios, omega, _ = bodies(60)
     data = Gyroscope(noise_density=0.002).read(KEY, TIMES, with_errors(omega, 0.01))[:, ::4]
     times = TIMES[::4]
@@ -208,8 +207,7 @@ def test_intervals_hold_with_errors_of_scale_and_misalignment():
 
 @pytest.mark.slow
 def test_errors_of_scale_and_misalignment_do_not_leave_residuals():
-    """Few bodies; ``noise`` is not stated, so that the prior is weighted by the residuals' noise.
-    """
+    """Few bodies; ``noise`` is not stated, so the residuals' noise weights the prior."""
     ratios, omega, _ = bodies(4)
     data = Gyroscope(noise_density=0.002).read(KEY, TIMES, with_errors(omega, 0.01))
     fit = fit_inertia(TIMES[::4], data[:, ::4])
@@ -356,8 +354,7 @@ def test_deviations_are_those_of_readings():
 
 @pytest.mark.slow  # a fit with the usual sensor model: test_fit_exports
 def test_calibrated_readings_are_corrected():
-    """With calibrated ``gain`` and ``bias`` the fit is that of the true rates; ``sensor`` has both.
-    """
+    """With calibrated ``gain`` and ``bias`` the fit is that of true rates; ``sensor`` has both."""
     _, omega, _ = bodies(1)
     gain = np.array([[1.05, 0.02, 0.0], [0.0, 0.93, 0.04], [-0.03, 0.0, 1.0]])
     sensor = Gyroscope(gain, [0.3, -0.2, 0.1], noise_density=0.002)

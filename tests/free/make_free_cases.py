@@ -22,8 +22,7 @@ def _separatrix(distance: float) -> tuple:
 
 
 def _short(values) -> list[float]:
-    """Rounded to single precision for use in both precisions, unless this removes the special case.
-    """
+    """Rounded to single precision, for both precisions, unless this removes the special case."""
     kept = []
     for x in values:
         y = float(np.float32(x)) if 1e-30 < abs(x) < 1e30 else float(x)

@@ -268,8 +268,7 @@ def stored() -> list[dict]:
 
 
 def in_last_digits(exact, text: str) -> float:
-    """Error of a number in units of its 17th significant digit; at most 0.5 if rounded correctly.
-    """
+    """Error of a number in units of its 17th significant digit; rounding allows 0.5."""
     size = max(abs(exact), mp.mpf(10) ** -30)
     return float(abs(exact - mp.mpf(text)) / mp.mpf(10) ** (mp.floor(mp.log10(size)) - 16))
 

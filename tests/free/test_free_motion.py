@@ -119,7 +119,7 @@ def test_initial_attitude_carries_its_derivative():
 
     slope = jax.jit(lambda q, dq: jax.jvp(attitude, (q,), (dq,)))
     _, found = slope(wxyz, jnp.asarray(change))
-    # The turn from the start is the same for every start: q(t) = q(0) p.
+    # The rotation from the start does not depend on the initial attitude: q(t) = q(0) p.
     turn = np.asarray(slope(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.asarray(change))[0])
     unit = np.asarray(wxyz) / np.linalg.norm(wxyz)
     moved = (change - unit * (unit @ change)) / np.linalg.norm(wxyz)

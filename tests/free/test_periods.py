@@ -10,7 +10,7 @@ import polhode as ph
 from polhode import Mode
 from polhode._closed_forms import principal_periods
 
-# Compiled once: eager dispatch would cost far more than the numbers.
+# Compiled once: eager dispatch would take much longer than the computation.
 _periods = jax.jit(principal_periods)
 
 TOUTATIS = (3.0836, 3.235, 1.0), np.deg2rad([14.51, 33.529, -98.709])  # rad per day

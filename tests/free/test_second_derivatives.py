@@ -54,9 +54,8 @@ def test_second_derivatives(products):
             size = max(1, *(np.linalg.norm(row) for row in case["second"]))
             size *= np.linalg.norm(weights[n])
             off = abs(found[n] - np.dot(weights[n], exact)) / size
-            # Sixteen e-folds at the unstable axis, squared by the second derivative; a slow body
-            # loses the ratio of a radian to what it turns through; the axes of nearly equal
-            # moments turn fast with the tensor.
+            # Larger bounds: growth by sixteen e-folds at the unstable axis, squared by the second
+            # derivative; small rotation angles; axes of nearly equal moments, which rotate fast.
             rooms = {"long at the unstable axis": 200, "slow": 2000}
             near = case["name"].startswith("sphere within") and case["products"]
             room = 400 if near else rooms.get(case["name"], 20)

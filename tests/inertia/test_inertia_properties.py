@@ -128,8 +128,7 @@ def test_density_scales_mass_and_inertia(cloud, wxyz, decade):
 @settings(max_examples=60, deadline=None)
 @given(st.tuples(*[st.floats(-3, 3)] * 3), quaternions)
 def test_moments_of_second_moments(decades, wxyz):
-    """Any non-negative second moments, from needles to plates, belong to a body, and only those do.
-    """
+    """Non-negative second moments, from needles to plates, belong to a body; others do not."""
     second = 10.0 ** np.array(decades)
     moments = second.sum() - second
     body = ph.Inertia.from_moments(moments)

@@ -130,8 +130,7 @@ def test_the_obvious_call_does_what_is_meant():
 
 
 def test_a_step_keeps_the_symmetry():
-    """A step in the leaves of a symmetric inertia preserves the symmetry, and derivatives add up.
-    """
+    """A step in the leaves of a symmetric inertia preserves the symmetry; derivatives add up."""
     omega = jnp.array([0.5, -1.0, 2.0])
 
     def energy(inertia):

@@ -58,8 +58,7 @@ def test_mujoco_reads_the_same_link(arm):
 
 
 def test_a_body_of_an_mjcf_file(tmp_path):
-    """Without an inertial element it follows from the geoms: a box rotated about z by 90 degrees.
-    """
+    """Without an inertial element it follows from the geoms: a box rotated about z by 90 deg."""
     pytest.importorskip("mujoco", reason="needs mujoco, extra robots")
     path = tmp_path / "box.xml"
     path.write_text(MJCF)

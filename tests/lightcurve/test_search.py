@@ -92,8 +92,7 @@ def test_poles_of_one_pair_do_not_crowd_out_others():
 
 
 def test_spread_of_offsets_is_the_likeliest():
-    """Twelve groups of a linear model with three other unknowns, all of which are integrated out.
-    """
+    """Twelve groups of a linear model with three other unknowns, which are integrated out."""
     rng = np.random.default_rng(1)
     group = np.repeat(np.arange(12), 6)
     other = np.c_[rng.normal(size=(72, 2)), np.ones(72)]

@@ -1,5 +1,4 @@
-"""The HTML page of moving bodies: it contains the motion, needs no network, and works in a browser.
-"""
+"""The HTML page of moving bodies: contains the motion, needs no network, runs in a browser."""
 
 import base64
 import json

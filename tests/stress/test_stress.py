@@ -30,13 +30,13 @@ ROOM = {"tensors": 3.0, "dwelling": 3.0}
     ],
 )
 def scores(request):
-    """Modes and scores. One program each: values with one mode of derivatives at most."""
+    """Modes and scores, in one program each: values with at most one mode of derivatives."""
     dtype, modes = request.param
     return modes, stress.measure(dtype, PAIRS, "forward" in modes, "reverse" in modes)
 
 
 def _spread(name: str) -> float:
-    """Middle over smallest moment of a family named by its moments."""
+    """Intermediate over smallest moment of a family that is named by its moments."""
     low, middle, _ = sorted(float(x) for x in name[1 : name.index(")")].split(","))
     return middle / low
 
@@ -58,7 +58,7 @@ def test_family(scores, family):
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.slow
 def test_spin_about_the_unstable_axis_for_ever(dtype):
-    """Values stay exact; derivatives grow without bound and must not become NaN."""
+    """Values remain exact; derivatives grow without bound and must not become NaN."""
     x = jnp.asarray((2.0, 3.0, 5.0), dtype)
 
     def run(moments, omega):
@@ -83,7 +83,7 @@ def test_spin_about_the_unstable_axis_for_ever(dtype):
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 @pytest.mark.slow  # long horizons of the family: above
 def test_compensated_horizons(dtype):
-    """Up to a million turns the error is that of the last operations, not of the phase."""
+    """Up to a million revolutions the error is that of the last operations, not of the phase."""
     pairs = [pair for pair in PAIRS if pair[0].family in ("horizons", "separatrix", "ulps")]
     pairs = [pair for pair in pairs if dtype == np.float64 or pair[0].fits_single]
     x = jnp.asarray(np.array([body.inputs for body, _ in pairs]), dtype)

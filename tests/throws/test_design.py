@@ -1,4 +1,4 @@
-"""Which throw tells most: information of a planned throw, with derivatives."""
+"""Design of throws: information of a planned throw, with derivatives."""
 
 import jax
 import jax.numpy as jnp

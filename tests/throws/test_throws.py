@@ -1,4 +1,4 @@
-"""``benchmarks.throws``: throws in air with a wheel, by a gyroscope that is not quite right."""
+"""``benchmarks.throws``: throws in air with a wheel and an imperfect gyroscope."""
 
 import itertools
 
@@ -35,14 +35,14 @@ DELAY, STEP, ARM = 6e-4, 1e-3, np.array([0.01, -0.004, 0.03])
 
 
 def speed(t):
-    """Of the wheel: 200 rad/s, 1300 from 0.1 s on, and down again from 0.3 s on."""
+    """Speed of the wheel: 200 rad/s, 1300 from 0.1 s on, and down again from 0.3 s on."""
     first = 1 - np.exp(-np.maximum(t - 0.1, 0) / 0.03)
     last = 1 - np.exp(-np.maximum(t - 0.3, 0) / 0.03)
     return -200 - 1100 * first + 1100 * last
 
 
 def throw(rng, tensor, drag=True):
-    """Times, readings of gyroscope, wheel and accelerometer in half a second of flight."""
+    """Times, and readings of gyroscope, wheel and accelerometer, in half a second of flight."""
     times = np.arange(0, 0.48, STEP)
     inverse = np.linalg.inv(tensor)
 
@@ -156,7 +156,9 @@ def test_throws_without_a_wheel_show_ratios():
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [1.0, 30.0])
 def test_single_throws_are_unbiased_and_their_errors_are_the_bound(size):
-    """Of light and of heavy bodies, which the wheel hardly moves: 120 throws, each alone."""
+    """Of light bodies, and of heavy ones that the wheel hardly moves: 120 throws, each fitted
+    alone.
+    """
     number = 120
     found = study.study(size, number, together=30)
     chance = 2.5 / number**0.5

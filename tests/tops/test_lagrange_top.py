@@ -21,7 +21,7 @@ NUMBERS = np.array(list(top_cases.CASES.values())).T  # (10, cases): cases are l
 
 
 def moved(numbers, t):
-    """State (7, N) after t (N,) of lanes of ten numbers."""
+    """State (7, N) after t (N,), from ten numbers for each of N lanes."""
     a, c, pull, *rest = numbers
     omega = jnp.stack(rest[:3], axis=-1)
     q = jnp.stack(rest[3:], axis=-1)
@@ -61,7 +61,7 @@ def test_every_regime_is_exact(exact, dtype, bound):
 
 
 def bound_of(name):
-    """Relative error of a gradient: of three equal roots the value is exact, the gradient not."""
+    """Bound on the relative error of a gradient: with three equal roots only the value is exact."""
     return 1e-2 if name == "marginal_sleeping" else 1e-11
 
 
@@ -88,7 +88,7 @@ def test_every_forward_derivative_is_exact(exact):
 
 
 def test_within_a_hair_of_the_marginal_sleeping_top(exact):
-    """Three roots of the cubic nearly coincide: states stay near that of the sleeping top."""
+    """Three roots of the cubic nearly coincide: states remain near that of the sleeping top."""
     case = np.array(top_cases.CASES["marginal_sleeping"])
     want = exact[NAMES.index("marginal_sleeping")]
     near = np.repeat(case[:, None], len(NAMES), axis=1)
@@ -175,7 +175,7 @@ def test_gni_lagrange_top():
 
 
 def test_what_the_solution_is_valid_for():
-    """By type where the planner asks; a body whose numbers do not fit has NaN, never a number."""
+    """Chosen by type; a body whose numbers violate the condition is NaN, never a wrong number."""
     state = ph.State([1.0, 0, 0, 0], [0.0, 0.1, 1.0])
     axial = UniformGravity.axial(1.0, 0.5)
     top = ph.Scene(ph.Inertia.axisymmetric(1.0, 0.5), axial)

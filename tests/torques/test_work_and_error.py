@@ -1,4 +1,4 @@
-"""Work of the external torques, the error estimate of each body, librations of a satellite."""
+"""Work of external torques, the error estimate of each body, librations of a satellite."""
 
 import jax
 import jax.numpy as jnp
@@ -61,7 +61,7 @@ def test_work_on_a_damped_and_driven_spin():
 @pytest.mark.parametrize("rtol", [1e-6, 1e-10])
 @pytest.mark.slow  # of three systems: below
 def test_the_estimate_bounds_the_error(rtol):
-    """Heavy tops that end far apart, against a run near rounding; whoever misses is marked."""
+    """Heavy tops with very different errors, against a run near rounding; others are flagged."""
     keys = jax.random.split(jax.random.key(5), 2)
     wxyz = rotation.normalise(jax.random.normal(keys[0], (40, 4)))
     state = ph.State(wxyz, 2 * jax.random.normal(keys[1], (40, 3)))
@@ -136,7 +136,7 @@ def test_libration_in_a_gravity_gradient():
     """About one axis: I3 a'' = -(s/2)(I2 - I1) sin 2a, s = 3 mu/r^3: a pendulum of the angle 2a.
 
     Its period is 4 K(sin a0) / Omega, Omega^2 = s (I2 - I1)/I3, and a quarter of it after release
-    the rate is -Omega sin a0; what I2 does to the angle there follows from the scaling of time.
+    the rate is -Omega sin a0; the derivative with respect to I2 follows from scaling of time.
     """
     s, a0, moments = 3.0, 0.01, jnp.array([1.0, 1.5, 2.0])
     omega = np.sqrt(s * 0.5 / 2.0)

@@ -1,4 +1,4 @@
-"""LAPACK is called for one matrix at a time: a batch of them could wait for itself for ever."""
+"""LAPACK is called for one matrix at a time: batched calls may deadlock."""
 
 import re
 
@@ -23,12 +23,12 @@ SPD = BATCH @ np.swapaxes(BATCH, -1, -2) + np.eye(4)
 
 @pytest.fixture
 def affected(monkeypatch):
-    """As with a jaxlib that shares the matrices of a batch among threads, whichever is here."""
+    """Behave as with a jaxlib that distributes the matrices of a batch over threads."""
     monkeypatch.setattr(matrices, "_AFFECTED", True)
 
 
 def largest_batch(function, *args):
-    """Most matrices that a call of LAPACK in the program has, and how many calls there are."""
+    """Largest number of matrices in a LAPACK call of the program, and number of calls."""
     text = jax.jit(lambda *args: function(*args)).lower(*args).as_text()  # traced anew
     calls = [line for line in text.splitlines() if "@lapack_" in line]
     shapes = [
