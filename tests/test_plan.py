@@ -194,7 +194,7 @@ def test_a_tolerance_near_rounding_has_compensated_frequencies():
     assert 1e-13 < apart < 1e-9
 
 
-@pytest.mark.slow  # random bodies: solvers/test_error_control
+@pytest.mark.slow  # faster: random bodies, solvers/test_error_control
 def test_many_bodies_under_a_potential_reach_the_error_asked_for():
     """The default method for 40 heavy tops against the exact state of the table of systems."""
     from systems.table import BY_NAME, truth
@@ -302,7 +302,7 @@ def test_explain_says_why_no_exact_law_holds():
     [ph.Inertia.axisymmetric(2.0, 0.5), ph.Inertia.spherical(2.0)],
     ids=["axial", "sphere"],
 )
-@pytest.mark.slow  # other symmetric bodies: tests/systems and tests/free
+@pytest.mark.slow  # faster: other symmetric bodies, tests/systems and tests/free
 def test_static_symmetry_gives_the_same_motion_and_slope(inertia):
     """The programs for declared symmetry agree with the general one, which is tested against 50
     digits.

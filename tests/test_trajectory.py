@@ -120,7 +120,7 @@ def test_second_derivatives_in_loops(rates):
     np.testing.assert_allclose(found, want, rtol=0, atol=1e-6 * np.abs(want).max())
 
 
-@pytest.mark.slow  # derivatives at saved times: tests/systems
+@pytest.mark.slow  # faster: derivatives at saved times, tests/systems
 @pytest.mark.parametrize("name", ["free", "top"])
 def test_derivatives_of_a_motion_at_a_time(name):
     """With respect to time, initial rates and moments: SciPy's rates, and differences of SciPy's

@@ -69,7 +69,7 @@ def test_a_recording_becomes_numbers_and_a_figure(toss, tmp_path, capsys):
     assert "NaN" not in output.with_suffix(".json").read_text()
 
 
-@pytest.mark.slow  # the command: the test above
+@pytest.mark.slow  # faster: the command, the test above
 def test_a_recording_that_shows_nothing_ends_with_an_error(tmp_path, capsys):
     path = tmp_path / "still.csv"
     path.write_text("t,wx,wy,wz\n" + "".join(f"{k / 100},0,0,0\n" for k in range(60)))

@@ -73,7 +73,7 @@ def fits(cases):
     return fitted(cases[0], cases[2])
 
 
-@pytest.mark.slow  # eight at once: above
+@pytest.mark.slow  # faster: eight at once, above
 def test_recordings_fitted_at_once_have_the_fits_of_parts(cases, fits):
     noise = SIGMA[:, None, None]
     found = fit_inertia(cases[0], cases[2], omega_noise=noise, options=OPTIONS, throw=False)
@@ -242,7 +242,7 @@ def test_recordings_of_different_length_stack():
     np.testing.assert_array_equal(both.present, [[1, 1, 1, 1, 0], [1, 1, 1, 1, 1]])
 
 
-@pytest.mark.slow  # gaps: test_gaps_are_left_out
+@pytest.mark.slow  # faster: gaps, test_gaps_are_left_out
 def test_a_missing_row_in_five_does_not_hide_the_noise(cases):
     """And readings without any noise do not count as far from it."""
     times, clean, noisy, *_ = cases

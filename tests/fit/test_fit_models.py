@@ -71,7 +71,7 @@ def flight(times, omega, *, wheel=None, drag=(0.0, 0.0)):
     return y[:, :4], (y[:, 4:] - carried) @ inverse.T
 
 
-@pytest.mark.slow  # derivatives of the residuals: below
+@pytest.mark.slow  # faster: derivatives of the residuals, below
 def test_a_wheel_shows_the_scale_and_drag_and_delay_are_fitted():
     rng = np.random.default_rng(3)
     times = np.linspace(0, 2, 401)
@@ -381,7 +381,7 @@ def test_a_loss_needs_a_positive_threshold(threshold):
         Huber(threshold)
 
 
-@pytest.mark.slow  # the inverse alone: test_the_loss_of_large_residuals_has_an_inverse
+@pytest.mark.slow  # faster: the inverse alone, test_the_loss_of_large_residuals_has_an_inverse
 def test_residuals_of_outliers_are_reported_as_measured():
     times = np.linspace(0, 8, 161)
     state = ph.State([1.0, 0, 0, 0], [0.3, 1.0, 0.6])

@@ -153,7 +153,7 @@ def test_refused_scenes_and_data():
         ph.fit_scene(several, data, lambda s: [s.torque.c])
 
 
-@pytest.mark.slow  # a fitted scene: test_fit_exports
+@pytest.mark.slow  # faster: a fitted scene, test_fit_exports
 def test_a_fit_of_a_scene_has_the_fields_of_every_fit(found):
     # the drag, then the initial rates
     spread = np.sqrt(np.diagonal(np.asarray(found.covariance), axis1=1, axis2=2))
@@ -196,7 +196,7 @@ def test_the_bias_and_the_model_of_a_fitted_scene():
     np.testing.assert_allclose(predicted[0], again, atol=1e-6)
 
 
-@pytest.mark.slow  # transformations of bounded values: below
+@pytest.mark.slow  # faster: transformations of bounded values, below
 def test_bounds_and_priors_hold():
     """A coefficient that is zero, bounded by zero; another with a prior narrower than the data."""
     scene = ph.Scene(BODY, torque=ph.LinearDamping([0.1, 0.06, 0.0]))
@@ -229,7 +229,7 @@ def test_bounds_and_priors_hold():
     assert "the prior" in fit.limit()
 
 
-@pytest.mark.slow  # 25 s of compilation: test_bounds_and_priors_hold
+@pytest.mark.slow  # 25 s of compilation; faster: test_bounds_and_priors_hold
 def test_optima_at_a_bound_are_found():
     """Of a body without quadratic drag half of the coefficients end at zero, each of 8 recordings
     in fewer steps than the limit."""

@@ -352,7 +352,7 @@ def test_deviations_are_those_of_readings():
     )
 
 
-@pytest.mark.slow  # a fit with the usual sensor model: test_fit_exports
+@pytest.mark.slow  # faster: a fit with the usual sensor model, test_fit_exports
 def test_calibrated_readings_are_corrected():
     """With calibrated ``gain`` and ``bias`` the fit is that of true rates; ``sensor`` has both."""
     _, omega, _ = bodies(1)
@@ -373,7 +373,7 @@ def test_calibrated_readings_are_corrected():
     assert float(fit.noise) == pytest.approx(1, abs=0.1)
 
 
-@pytest.mark.slow  # a fit with the usual sensor model: test_fit_exports
+@pytest.mark.slow  # faster: a fit with the usual sensor model, test_fit_exports
 def test_the_table_names_what_shows_it():
     """Rates alone: no size, no rotation of the sensor, two scale factors only by calibration."""
     _, omega, _ = bodies(1)

@@ -39,7 +39,7 @@ def test_free_particles_seen_from_a_steady_frame():
     np.testing.assert_allclose(velocity_space, still, rtol=0, atol=1e-12)
 
 
-@pytest.mark.slow  # a Kepler orbit: below
+@pytest.mark.slow  # faster: a Kepler orbit, below
 def test_free_particle_seen_from_a_varying_frame_with_accelerating_origin():
     def rate(t):
         return jnp.stack([jnp.sin(t), 0.4 * t, jnp.cos(2 * t)])

@@ -95,7 +95,7 @@ def test_second_derivatives_of_principal_moments_are_right_or_nan(kind, turned):
         assert np.all(np.isfinite(jax.jit(jax.jacrev(moments))(jnp.zeros(6), jnp.asarray(base))))
 
 
-@pytest.mark.slow  # of principal moments, by which those of periods are NaN: above
+@pytest.mark.slow  # faster: derivatives of principal moments, above
 @pytest.mark.parametrize("kind", BODIES)
 def test_second_derivatives_of_periods_are_right_or_nan(kind):
     if kind == "three":

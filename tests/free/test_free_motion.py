@@ -134,7 +134,7 @@ def _random_bodies(seed: int, count: int) -> tuple:
     return moments, *(jnp.asarray(rng.normal(size=(count, n))) for n in (4, 3))
 
 
-@pytest.mark.slow  # values: test_layouts
+@pytest.mark.slow  # faster: values, test_layouts
 def test_many_times_agree_with_single_ones_in_value_and_gradient():
     moments, wxyz, omega = _random_bodies(5, 7)
     ts = jnp.linspace(-3.0, 8.0, 4)

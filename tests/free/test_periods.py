@@ -181,7 +181,7 @@ def _second(a, point, direction):
 
 
 @pytest.mark.parametrize("omega", [(0.3, 0.2, 1.0), (1.0, 0.2, 0.2)])
-@pytest.mark.slow  # of states: test_second_derivatives
+@pytest.mark.slow  # faster: derivatives of states, test_second_derivatives
 def test_second_derivatives(omega):
     """Along a direction in moments and rates together, against differences of 50 digits."""
     point = np.array([1.0, 2.0, 3.0, *omega])

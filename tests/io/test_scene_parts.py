@@ -136,7 +136,7 @@ unit = "deg/s"
 """
 
 
-@pytest.mark.slow  # events: tests/test_events
+@pytest.mark.slow  # faster: events, tests/test_events
 def test_events_are_at_the_times_at_which_they_are(tmp_path, monkeypatch, capsys):
     """A ball rotates about x at 0.5 rad/s: its y axis is cos(t/2) along space y and sin(t/2) along
     space z, so that the angle to space z rises through 60 degrees when t/2 = 150 degrees.

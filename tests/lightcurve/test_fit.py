@@ -90,7 +90,7 @@ def test_light_has_the_sums_of_its_mode(trial):
     assert np.median(other) > 0.3
 
 
-@pytest.mark.slow  # values: test_model_is_that_of_simulate
+@pytest.mark.slow  # faster: values, test_model_is_that_of_simulate
 def test_derivatives_by_every_unknown(seen, trial):
     _, _, points = seen
     value, slopes = jax.jit(lambda *x: _brightness.magnitudes_and_derivatives(PHASE, *x))(

@@ -107,7 +107,7 @@ def test_facets_of_ellipsoid_and_of_harmonics():
     assert other == pytest.approx(float(found), rel=0.02)
 
 
-@pytest.mark.slow  # of ellipsoids: test_fit
+@pytest.mark.slow  # faster: of ellipsoids, test_fit
 def test_derivatives_of_facets_through_motion_and_shape():
     """With respect to moments, rates, attitude, mesh vertices, and harmonics of the curvature."""
     moments, vertices, faces = light_curves.blunt(np.array([1.0, 0.7, 0.5]))

@@ -403,7 +403,7 @@ def test_a_body_that_is_no_better_than_a_series_of_two_periods_is_ambiguous(case
     assert "decisively better than a series of two periods" in reason
 
 
-@pytest.mark.slow  # the other verdicts: above
+@pytest.mark.slow  # faster: the other verdicts, above
 def test_fourteen_points_are_too_few():
     curve = curve_of(tumbling, nights=2, days=4, each=7)
     pairs = pairs_of(curve)
@@ -551,7 +551,7 @@ def convex_case():
     return curve, body, ph.periods(ph.Inertia(moments), state)
 
 
-@pytest.mark.slow  # of ellipsoids: test_fit
+@pytest.mark.slow  # faster: of ellipsoids, test_fit
 def test_derivatives_of_convex_bodies(convex_case):
     curve, body, _ = convex_case
     points = curve.points(0.0, 0.02)

@@ -88,7 +88,7 @@ def test_nor_in_single_precision(kind):
 
 
 @pytest.mark.parametrize(("kind", "count"), [("top", 600), ("gradient", 3)])
-@pytest.mark.slow  # the last time: above
+@pytest.mark.slow  # faster: the last time, above
 def test_saved_times_are_as_accurate_however_many_they_are(kind, count):
     """Bodies of a batch proceed to their next saved times independently, with an order of the steps
     that suits the distance between these.

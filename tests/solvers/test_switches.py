@@ -410,7 +410,7 @@ def test_the_gradient_through_a_kink_keeps_a_tight_tolerance():
     np.testing.assert_allclose(found, [1 - share, share], rtol=0, atol=20 * rtol)
 
 
-@pytest.mark.slow  # a single body: test_a_gradient_through_a_jump
+@pytest.mark.slow  # faster: a single body, test_a_gradient_through_a_jump
 @pytest.mark.parametrize("how", ["batch", "grad of vmap", "vmap of grad"])
 def test_recorded_steps_and_those_integrated_again_have_the_same_derivatives(how):
     starts = jnp.array(np.outer([1.0, 0.7, 1.3], OMEGA))
@@ -480,7 +480,7 @@ def test_a_pulse_may_begin_where_another_ends(bodies, ts):
         np.testing.assert_allclose(mode(final_rates)(edges).T, expected, atol=1e-7)
 
 
-@pytest.mark.slow  # forward mode through jumps: test_derivatives_through_a_table
+@pytest.mark.slow  # faster: forward mode through jumps, test_derivatives_through_a_table
 def test_a_tangent_through_a_jump():
     along = jnp.array([0.3, -0.2]), jnp.array([0.0, 0.0, 0.5])
     _, change = jax.jvp(falling, FALLING, along)
@@ -564,7 +564,7 @@ ROOTS = {
 derivative by x, the start and a parameter."""
 
 
-@pytest.mark.slow  # a root of the state: test_a_side_beyond_which_the_field_is_no_number
+@pytest.mark.slow  # faster: a root of the state, test_a_side_beyond_which_the_field_is_no_number
 @pytest.mark.parametrize("kind", ROOTS)
 def test_roots_of_a_size_that_passes_zero(kind):
     """Neither branch can be continued past the switch, where the derivative is infinite."""

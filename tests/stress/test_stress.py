@@ -81,7 +81,7 @@ def test_spin_about_the_unstable_axis_for_ever(dtype):
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-@pytest.mark.slow  # long horizons of the family: above
+@pytest.mark.slow  # faster: long horizons of the family, above
 def test_compensated_horizons(dtype):
     """Up to a million revolutions the error is that of the last operations, not of the phase."""
     pairs = [pair for pair in PAIRS if pair[0].family in ("horizons", "separatrix", "ulps")]

@@ -77,7 +77,7 @@ def test_every_gradient_is_exact(exact):
         assert error < bound_of(name), (name, error)
 
 
-@pytest.mark.slow  # derivatives at rest: test_at_rest
+@pytest.mark.slow  # faster: derivatives at rest, test_at_rest
 def test_every_forward_derivative_is_exact(exact):
     x, direction = jnp.asarray(NUMBERS), np.random.default_rng(4).normal(size=10)
     forward = np.array(SLOPE(x, jnp.asarray(direction[:, None] * np.ones_like(NUMBERS)), TIMES))

@@ -138,7 +138,7 @@ def test_a_ring_against_newton_in_every_chart(name):
         np.testing.assert_allclose(got.spins[k, -1, 0], end[7], rtol=0, atol=atol)
 
 
-@pytest.mark.slow  # of the field: test_every_torque.py
+@pytest.mark.slow  # faster: derivatives of the field, test_every_torque.py
 def test_slopes_of_a_damped_motion():
     """With respect to every number of the body and of the damping, against differences of the
     motion.

@@ -33,7 +33,7 @@ def test_no_pulse_is_missed():
     assert int(got.steps) < 40
 
 
-@pytest.mark.slow  # derivatives through a jump: solvers/test_switches
+@pytest.mark.slow  # faster: derivatives through a jump, solvers/test_switches
 def test_slopes_by_the_edges_of_pulses():
     """Final rate and angle with respect to the length of the first pulse; also backward in time."""
 

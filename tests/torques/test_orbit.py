@@ -152,7 +152,7 @@ def test_refused_orbits():
         KeplerOrbit(1.0, -1.0)
 
 
-@pytest.mark.slow  # librations of other bodies: test_published.py
+@pytest.mark.slow  # faster: librations of other bodies, test_published.py
 def test_pitch_libration_on_a_circular_orbit():
     """theta'' = -3 n^2 (Ix - Iz)/Iy sin theta cos theta in the rotating frame of the orbit.
 

@@ -202,7 +202,7 @@ def test_damping_against_the_frame_brings_a_body_to_its_rate():
 HOUR = 3600.0
 
 
-@pytest.mark.slow  # the frame itself: below
+@pytest.mark.slow  # faster: the frame itself, below
 def test_apophis_is_spun_anew_in_2029():
     """Perigee 38,000 km, 5.84 km/s at infinity; periods of 27.4 h and 263 h before.
 

@@ -68,7 +68,7 @@ def test_strong_damping_is_right_or_marked(dtype, rtol):
     assert lost.value.status[3] == ph.Status.SUCCESSFUL
 
 
-@pytest.mark.slow  # strong damping: above
+@pytest.mark.slow  # faster: strong damping, above
 def test_an_implicit_solver_takes_any_damping():
     method, linear = ph.LiePoisson(diffrax.Kvaerno5(), chunk=1), 1e4 * LINEAR[1:2]
     scene = damped(jnp.float64, linear, np.zeros(1))

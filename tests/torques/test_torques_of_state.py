@@ -61,7 +61,7 @@ def test_kovalevskaya_top():
 
 
 @pytest.mark.parametrize("wrap", ["alone", pytest.param("in pulses", marks=pytest.mark.slow)])
-@pytest.mark.slow  # a shorter way: solvers/test_switches
+@pytest.mark.slow  # faster: a shorter way, solvers/test_switches
 def test_pointing_through_half_a_turn_keeps_rtol(wrap):
     """The law jumps there; the reference is Dopri8 at a tight tolerance."""
     rng = np.random.default_rng(3)

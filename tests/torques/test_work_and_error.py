@@ -42,7 +42,7 @@ def test_energy_changes_by_the_work(method):
     np.testing.assert_allclose(plain.wxyz, traj.wxyz, rtol=0, atol=1e-9)
 
 
-@pytest.mark.slow  # work beside the energy: above
+@pytest.mark.slow  # faster: work beside the energy, above
 def test_work_on_a_damped_and_driven_spin():
     """About one axis: -(I w0^2 / 2)(1 - exp(-2 c t / I)), and N times the angle."""
     state, record = ph.State([1.0, 0, 0, 0], [0.0, 0.0, 1.5]), ph.Record(work=True)
@@ -59,7 +59,7 @@ def test_work_on_a_damped_and_driven_spin():
 
 
 @pytest.mark.parametrize("rtol", [1e-6, 1e-10])
-@pytest.mark.slow  # of three systems: below
+@pytest.mark.slow  # faster: of three systems, below
 def test_the_estimate_bounds_the_error(rtol):
     """Heavy tops with very different errors, against a run near rounding; others are flagged."""
     keys = jax.random.split(jax.random.key(5), 2)
@@ -131,7 +131,7 @@ def test_exact_motions_estimate_rounding_and_own_controllers_are_refused():
         ph.simulate(ph.Scene(INERTIA), STATE, TS, own, record=record)
 
 
-@pytest.mark.slow  # of an orbit: tests/test_published
+@pytest.mark.slow  # faster: of an orbit, tests/test_published
 def test_libration_in_a_gravity_gradient():
     """About one axis: I3 a'' = -(s/2)(I2 - I1) sin 2a, s = 3 mu/r^3: a pendulum of the angle 2a.
 

@@ -47,7 +47,7 @@ def recordings(count):
     return stack([Recording.of(times, k + rates, wheel_speed=100 * times) for k in range(count)])
 
 
-@pytest.mark.slow  # the matrices alone: below
+@pytest.mark.slow  # faster: the matrices alone, below
 @pytest.mark.parametrize("fit", ["fit_each", "fit_together"])
 def test_the_fits_hand_over_no_batch(affected, fit):
     options = FitOptions(FreeMotion(), FullTensor())

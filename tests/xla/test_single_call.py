@@ -18,7 +18,7 @@ from polhode._kernels import _fused, kernel, linear, opaque_ones, specialise, sp
 HERE = Path(__file__).parent
 
 
-@pytest.mark.slow  # random ones: test_a_seeded_slice_of_the_fuzz
+@pytest.mark.slow  # faster: random ones, test_a_seeded_slice_of_the_fuzz
 def test_units_that_fold_away():
     """In its own process; `folding_units.py each` names the kernel that ends it."""
     ran = subprocess.run(
